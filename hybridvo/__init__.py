@@ -1,0 +1,44 @@
+"""hybridvo: optical flow, depth and intrinsics in; metric camera motion with covariance out.
+
+Importing does nothing but define names: each public name loads its module on first use, so that
+``import hybridvo`` costs milliseconds and sets no thread count, no device and no handler.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+__version__ = "0.1.0"
+
+_HOME = {
+    "Camera": "hybridvo.types",
+    "Frame": "hybridvo.types",
+    "FramePair": "hybridvo.types",
+    "PairBatch": "hybridvo.types",
+    "PixelwisePrediction": "hybridvo.types",
+    "RelativePose": "hybridvo.types",
+    "Status": "hybridvo.types",
+    "Step": "hybridvo.types",
+    "HybridVOError": "hybridvo.errors",
+    "Odometry": "hybridvo.odometry",
+    "Trajectory": "hybridvo.trajectory",
+    "estimate": "hybridvo.hybrid",
+    "open_sequence": "hybridvo.data.sequence",
+    "iter_pairs": "hybridvo.data.sequence",
+    "refine": "hybridvo.pose.refinement",
+}
+
+__all__ = ["__version__", *_HOME]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOME:
+        value = getattr(importlib.import_module(_HOME[name]), name)
+        globals()[name] = value
+        return value
+    raise AttributeError(f"module 'hybridvo' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

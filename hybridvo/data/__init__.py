@@ -1,0 +1,1 @@
+"""Disk or camera to frames, and frames to pairs."""

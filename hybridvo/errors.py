@@ -1,0 +1,34 @@
+"""Exceptions of hybridvo. Bad input raises one of these at the door; a failed estimate never does.
+
+Every message says what is wrong, where, what was found, what was expected and how to mend it.
+"""
+
+from __future__ import annotations
+
+
+class HybridVOError(Exception):
+    """Base class of everything that hybridvo raises on purpose."""
+
+
+class InputError(HybridVOError, ValueError):
+    """An argument, option or sequence that cannot be used as it is (exit code 2)."""
+
+
+class FormatError(InputError):
+    """A file whose content does not fit its format (exit code 2)."""
+
+
+class CheckpointError(InputError):
+    """A weights file that is damaged, foreign or of another architecture (exit code 2)."""
+
+
+class DegenerateError(HybridVOError, ValueError):
+    """A quantity that the data does not determine, asked for outside the estimation loop."""
+
+
+class OutputError(HybridVOError, OSError):
+    """A result that could not be written (exit code 5)."""
+
+
+class LockedError(HybridVOError, RuntimeError):
+    """An output folder that another run holds (exit code 4)."""

@@ -1,0 +1,1 @@
+"""Trajectories and truth to numbers, and numbers to pages."""

@@ -1,0 +1,192 @@
+"""Camera geometry and rotations: each fact once.
+
+Numpy functions work on single images in float64; the differentiable torch twins of the projection
+live in :mod:`hybridvo.pose.residuals`, on kornia and pypose.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from hybridvo.errors import InputError
+from hybridvo.types import Camera
+
+__all__ = [
+    "NED_TO_CAMERA",
+    "backproject",
+    "ego_flow",
+    "euler_deg_to_matrix",
+    "invert",
+    "make_transform",
+    "matrix_to_euler_deg",
+    "ned_to_camera",
+    "pixel_grid",
+    "project",
+    "rotation_angle",
+    "se3_exp",
+    "se3_log",
+    "to_gtsam_covariance",
+    "wxyz_to_xyzw",
+    "xyzw_to_wxyz",
+]
+
+NED_TO_CAMERA = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
+"""Maps north-east-down coordinates (x forward, y right, z down) to camera axes."""
+
+
+def pixel_grid(height: int, width: int) -> np.ndarray:
+    """(H, W, 2) float64 pixel coordinates (u, v); (0, 0) is the centre of the top-left pixel."""
+    v, u = np.mgrid[0:height, 0:width].astype(np.float64)
+    return np.stack([u, v], axis=-1)
+
+
+def backproject(depth: np.ndarray, camera: Camera) -> np.ndarray:
+    """(H, W, 3) points in metres in the camera frame from an (H, W) depth map (z, metres)."""
+    uv = pixel_grid(*camera.shape)
+    if depth.shape != camera.shape:
+        raise InputError(f"backproject: expected depth of {camera.shape}, got {depth.shape}.")
+    x = (uv[..., 0] - camera.cx) / camera.fx * depth
+    y = (uv[..., 1] - camera.cy) / camera.fy * depth
+    return np.stack([x, y, depth.astype(np.float64)], axis=-1)
+
+
+def project(points: np.ndarray, camera: Camera) -> np.ndarray:
+    """(..., 2) pixels of (..., 3) points in the camera frame; NaN for points not in front of it."""
+    z = points[..., 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u = camera.fx * points[..., 0] / z + camera.cx
+        v = camera.fy * points[..., 1] / z + camera.cy
+    uv = np.stack([u, v], axis=-1)
+    return np.where((z > 0)[..., None], uv, np.nan)
+
+
+def ego_flow(
+    depth: np.ndarray, T_curr_prev: np.ndarray, camera_prev: Camera, camera_curr: Camera
+) -> np.ndarray:
+    """(H, W, 2) flow in pixels that the camera motion alone causes (paper, equation 8).
+
+    F_ego = pi(K_curr, T_curr_prev D K_prev^-1 x) - x. NaN where depth is invalid or the moved point
+    is not in front of the camera.
+    """
+    depth = np.asarray(depth, dtype=np.float64)
+    valid = np.isfinite(depth) & (depth > 0)
+    points = backproject(np.where(valid, depth, np.nan), camera_prev)
+    moved = points @ T_curr_prev[:3, :3].T + T_curr_prev[:3, 3]
+    return project(moved, camera_curr) - pixel_grid(*camera_prev.shape)
+
+
+def make_transform(R: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """(4, 4) homogeneous transform from a rotation matrix and a translation."""
+    T = np.eye(4)
+    T[:3, :3] = R
+    T[:3, 3] = t
+    return T
+
+
+def invert(T: np.ndarray) -> np.ndarray:
+    """Inverse of (..., 4, 4) rigid transforms."""
+    T = np.asarray(T, dtype=np.float64)
+    R = np.swapaxes(T[..., :3, :3], -1, -2)
+    out = np.zeros_like(T)
+    out[..., :3, :3] = R
+    out[..., :3, 3] = -np.einsum("...ij,...j->...i", R, T[..., :3, 3])
+    out[..., 3, 3] = 1.0
+    return out
+
+
+def _skew(w: np.ndarray) -> np.ndarray:
+    return np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
+
+
+def se3_exp(delta: np.ndarray) -> np.ndarray:
+    """(4, 4) exponential of a 6-vector (translation, rotation); pypose's ``se3.Exp``, in numpy.
+
+    For the solver's inner loop, where a tensor round trip per step would dominate; a test holds it
+    equal to pypose.
+    """
+    delta = np.asarray(delta, dtype=np.float64)
+    rho, phi = delta[:3], delta[3:]
+    theta2 = float(phi @ phi)
+    W = _skew(phi)
+    if theta2 < 1e-8:
+        a, b, c = 1 - theta2 / 6, 0.5 - theta2 / 24, 1 / 6 - theta2 / 120
+    else:
+        theta = np.sqrt(theta2)
+        a = np.sin(theta) / theta
+        b = 2 * np.sin(theta / 2) ** 2 / theta2
+        c = (1 - a) / theta2
+    W2 = W @ W
+    return make_transform(np.eye(3) + a * W + b * W2, (np.eye(3) + b * W + c * W2) @ rho)
+
+
+def se3_log(T: np.ndarray) -> np.ndarray:
+    """6-vector (translation, rotation) with ``se3_exp(se3_log(T)) == T``."""
+    T = np.asarray(T, dtype=np.float64)
+    phi = Rotation.from_matrix(T[:3, :3]).as_rotvec()
+    theta2 = float(phi @ phi)
+    W = _skew(phi)
+    if theta2 < 1e-8:
+        c = 1 / 12 + theta2 / 720
+    else:
+        theta = np.sqrt(theta2)
+        c = (1 - theta / (2 * np.tan(theta / 2))) / theta2
+    V_inverse = np.eye(3) - 0.5 * W + c * (W @ W)
+    return np.concatenate([V_inverse @ T[:3, 3], phi])
+
+
+def rotation_angle(R: np.ndarray) -> np.ndarray:
+    """Geodesic angle in radians of (..., 3, 3) rotation matrices; exact near 0 and pi."""
+    R = np.asarray(R, dtype=np.float64)
+    axis = np.stack(
+        [
+            R[..., 2, 1] - R[..., 1, 2],
+            R[..., 0, 2] - R[..., 2, 0],
+            R[..., 1, 0] - R[..., 0, 1],
+        ],
+        axis=-1,
+    )
+    trace = np.trace(R, axis1=-2, axis2=-1)
+    return np.arctan2(np.linalg.norm(axis, axis=-1), trace - 1.0)
+
+
+def euler_deg_to_matrix(angles_deg: np.ndarray) -> np.ndarray:
+    """(..., 3, 3) R = Rx(x) Ry(y) Rz(z) from (..., 3) angles in degrees (the paper's convention)."""
+    angles = np.asarray(angles_deg, dtype=np.float64)
+    flat = Rotation.from_euler("XYZ", angles.reshape(-1, 3), degrees=True).as_matrix()
+    return flat.reshape(*angles.shape[:-1], 3, 3)
+
+
+def matrix_to_euler_deg(R: np.ndarray) -> np.ndarray:
+    """(..., 3) Euler angles X-Y-Z in degrees with R = Rx Ry Rz (the paper's convention)."""
+    R = np.asarray(R, dtype=np.float64)
+    flat = Rotation.from_matrix(R.reshape(-1, 3, 3)).as_euler("XYZ", degrees=True)
+    return flat.reshape(*R.shape[:-2], 3)
+
+
+def ned_to_camera(T_world_cam_ned: np.ndarray) -> np.ndarray:
+    """(..., 4, 4) camera-to-world pose in NED axes -> the same pose in camera axes (both sides)."""
+    C = np.eye(4)
+    C[:3, :3] = NED_TO_CAMERA
+    return C @ np.asarray(T_world_cam_ned, dtype=np.float64) @ C.T
+
+
+def xyzw_to_wxyz(quaternion: np.ndarray) -> np.ndarray:
+    """(..., 4) pypose and TUM order -> kornia and evo order."""
+    return np.roll(np.asarray(quaternion), 1, axis=-1)
+
+
+def wxyz_to_xyzw(quaternion: np.ndarray) -> np.ndarray:
+    """(..., 4) kornia and evo order -> pypose and TUM order."""
+    return np.roll(np.asarray(quaternion), -1, axis=-1)
+
+
+def to_gtsam_covariance(covariance: np.ndarray) -> np.ndarray:
+    """(6, 6) covariance for a GTSAM ``BetweenFactorPose3`` whose measurement is ``T_prev_curr``.
+
+    Ours is of ``Exp(d) T_curr_prev``, d = (translation, rotation). Its inverse is
+    ``T_prev_curr Exp(-d)``: the same covariance, now of a right perturbation, which is GTSAM's
+    side. Only the order changes, to (rotation, translation).
+    """
+    order = [3, 4, 5, 0, 1, 2]
+    return np.asarray(covariance)[np.ix_(order, order)]

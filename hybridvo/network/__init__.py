@@ -1,0 +1,1 @@
+"""Frame pairs to pixel-wise predictions (PWVO and its baselines)."""

@@ -1,0 +1,1 @@
+"""Frame pairs to relative poses: residuals, refinement, hypotheses and baselines."""

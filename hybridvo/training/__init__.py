@@ -1,0 +1,1 @@
+"""Data streams, training loop and checkpoints."""

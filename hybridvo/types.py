@@ -1,0 +1,496 @@
+"""The nouns: camera, frame, pair, prediction, relative pose, status and step.
+
+Conventions (pinned in ``tests/test_conventions.py``): ``T_target_source`` maps homogeneous points
+of ``source`` into ``target``; camera axes x right, y down, z forward; pixel (0, 0) is the centre of
+the top-left pixel; depth is z in metres with NaN, inf, zero and negative values invalid; flow is in
+pixels from the previous to the current frame, on the previous grid; tangent vectors are
+(translation, rotation) of a left perturbation in the current camera.
+"""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from hybridvo.errors import InputError
+
+if TYPE_CHECKING:
+    import torch
+
+__all__ = [
+    "Camera",
+    "Frame",
+    "FramePair",
+    "Hypothesis",
+    "PairBatch",
+    "PixelwisePrediction",
+    "Reason",
+    "RelativePose",
+    "State",
+    "Status",
+    "Step",
+]
+
+MAX_PIXELS = 2**28
+"""Largest image, in pixels, that a frame or a file header may declare."""
+
+
+def _as_float_image(value: Any, name: str, channels: int | None) -> np.ndarray:
+    """Numpy view (or native-endian float32 copy) of an (H, W[, channels]) image of real numbers."""
+    array = np.asarray(value)
+    expected = "(H, W)" if channels is None else f"(H, W, {channels})"
+    ndim = 2 if channels is None else 3
+    if array.ndim == 3 and channels is None and array.shape[2] == 1:
+        array = array[:, :, 0]
+    if array.ndim != ndim or (channels is not None and array.shape[2] != channels):
+        raise InputError(f"{name}: expected shape {expected}, got {array.shape}.")
+    if array.dtype.kind != "f":
+        raise InputError(
+            f"{name}: expected a floating-point array, got dtype {array.dtype}. "
+            f"Convert to metres (depth) or pixels (flow) as float32 first."
+        )
+    if array.dtype != np.float32:
+        array = array.astype(np.float32)
+    return array
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Pinhole camera without distortion.
+
+    Args:
+        fx, fy: focal lengths in pixels, positive.
+        cx, cy: principal point in pixels; (0, 0) is the centre of the top-left pixel.
+        height, width: image size in pixels.
+
+    Raises:
+        InputError: a value that is not finite, a focal length that is not positive, an image size
+            that is not positive, or a principal point farther than one image size outside.
+    """
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    height: int
+    width: int
+
+    def __post_init__(self) -> None:
+        for name in ("fx", "fy", "cx", "cy"):
+            value = getattr(self, name)
+            try:
+                value = float(value)
+            except (TypeError, ValueError):
+                raise InputError(f"Camera.{name}: expected a number, got {value!r}.") from None
+            if not np.isfinite(value):
+                raise InputError(f"Camera.{name}: expected a finite number, got {value}.")
+            object.__setattr__(self, name, value)
+        for name in ("height", "width"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or int(value) != value or value <= 0:
+                raise InputError(f"Camera.{name}: expected a positive integer, got {value!r}.")
+            object.__setattr__(self, name, int(value))
+        if self.height * self.width > MAX_PIXELS:
+            raise InputError(
+                f"Camera: {self.width}x{self.height} pixels is above the limit of {MAX_PIXELS}."
+            )
+        for name in ("fx", "fy"):
+            if getattr(self, name) <= 0:
+                raise InputError(
+                    f"Camera.{name}: expected a positive focal length in pixels, "
+                    f"got {getattr(self, name)}."
+                )
+        for name, size in (("cx", self.width), ("cy", self.height)):
+            value = getattr(self, name)
+            if not -size <= value <= 2 * size:
+                raise InputError(
+                    f"Camera.{name}: {value} lies far outside an image of {size} pixels. "
+                    f"Are the intrinsics those of this image size?"
+                )
+
+    @classmethod
+    def from_matrix(cls, K: np.ndarray, height: int, width: int) -> Camera:
+        """Camera from a 3x3 intrinsic matrix without skew.
+
+        Raises:
+            InputError: not 3x3, not finite, skewed, or with a last row other than (0, 0, 1).
+        """
+        K = np.asarray(K, dtype=np.float64)
+        if K.shape != (3, 3) or not np.isfinite(K).all():
+            raise InputError(f"Camera: expected a finite 3x3 intrinsic matrix, got {K.tolist()}.")
+        tolerance = 1e-6 * max(abs(K[0, 0]), abs(K[1, 1]), 1.0)
+        if not np.allclose(K[2], (0, 0, 1)) or abs(K[0, 1]) > tolerance or abs(K[1, 0]) > tolerance:
+            raise InputError(
+                f"Camera: expected K = [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], got {K.tolist()}."
+            )
+        return cls(K[0, 0], K[1, 1], K[0, 2], K[1, 2], height, width)
+
+    @property
+    def K(self) -> np.ndarray:
+        """Intrinsic matrix, (3, 3) float64."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(height, width)."""
+        return self.height, self.width
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One RGB-D frame.
+
+    Args:
+        rgb: (H, W, 3) uint8, or None where only depth and flow are used. (H, W) and (H, W, 1) gray
+            images are accepted and repeated.
+        depth: (H, W) float metres along the optical axis; NaN, inf, 0 and negative are invalid.
+            None where the sensor delivered none: the pair then ends as ``failed(no_valid_depth)``.
+        camera: pinhole intrinsics of this very image size.
+        timestamp: seconds. Values above 1e14 are nanoseconds and are converted by the readers.
+        index: position in its sequence.
+        depth_variance: (H, W) float, variance of log depth (relative variance), or None.
+        mask: (H, W) bool, True where pixels may be used, or None.
+
+    Raises:
+        InputError: shapes that do not match the camera, or dtypes that cannot be meant.
+    """
+
+    rgb: np.ndarray | None
+    depth: np.ndarray | None
+    camera: Camera
+    timestamp: float = 0.0
+    index: int = 0
+    depth_variance: np.ndarray | None = None
+    mask: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.camera, Camera):
+            raise InputError(f"Frame.camera: expected a Camera, got {type(self.camera).__name__}.")
+        if self.rgb is not None:
+            rgb = np.asarray(self.rgb)
+            if rgb.dtype != np.uint8:
+                raise InputError(f"Frame.rgb: expected uint8 values 0..255, got dtype {rgb.dtype}.")
+            if rgb.ndim == 2 or (rgb.ndim == 3 and rgb.shape[2] == 1):
+                rgb = np.repeat(rgb.reshape(*rgb.shape[:2], 1), 3, axis=2)
+            if rgb.ndim != 3 or rgb.shape[2] != 3:
+                raise InputError(
+                    f"Frame.rgb: expected shape (H, W, 3), got {rgb.shape}. "
+                    f"Images are height, width, channels, in RGB order."
+                )
+            self._check_size("rgb", rgb)
+            object.__setattr__(self, "rgb", rgb)
+        if self.depth is not None:
+            depth = _as_float_image(self.depth, "Frame.depth", None)
+            self._check_size("depth", depth)
+            object.__setattr__(self, "depth", depth)
+        if self.depth_variance is not None:
+            variance = _as_float_image(self.depth_variance, "Frame.depth_variance", None)
+            self._check_size("depth_variance", variance)
+            object.__setattr__(self, "depth_variance", variance)
+        if self.mask is not None:
+            mask = np.asarray(self.mask)
+            if mask.dtype != np.bool_ or mask.ndim != 2:
+                raise InputError(
+                    f"Frame.mask: expected a boolean (H, W) array, got {mask.dtype} {mask.shape}."
+                )
+            self._check_size("mask", mask)
+            object.__setattr__(self, "mask", mask)
+        object.__setattr__(self, "timestamp", float(self.timestamp))
+
+    def _check_size(self, name: str, array: np.ndarray) -> None:
+        if array.shape[:2] != self.camera.shape:
+            raise InputError(
+                f"Frame.{name}: expected shape {self.camera.shape} to match the camera, got "
+                f"{array.shape[:2]}. Resize with hybridvo.data.resize.resize_frame, which also "
+                f"scales the camera."
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class FramePair:
+    """Two frames with the optical flow between them: what every estimator takes.
+
+    Ground-truth motion is no part of it. ``flow_source`` and ``depth_source`` name where the inputs
+    come from; ``file`` flow of a synthetic data set is true flow, and every report says so.
+
+    Args:
+        prev, curr: frames t and t+1, each with its own camera.
+        flow: (H, W, 2) float pixels, previous to current, on the previous grid; NaN is invalid.
+            None where no flow could be had: the pair then ends as ``failed(no_flow)``.
+        flow_variance: (H, W) float px^2 per component, relative or absolute, or None.
+        flow_valid: (H, W) bool, False at pixels whose flow is known to be wrong (occluded), or None.
+        flow_source: ``file``, ``dis``, or the name of a callable.
+        flow_is_true: whether the flow is ground truth (an oracle).
+        depth_source: ``sensor``, ``true`` (synthetic, an oracle), ``stereo``.
+
+    Raises:
+        InputError: shapes that do not match.
+    """
+
+    prev: Frame
+    curr: Frame
+    flow: np.ndarray | None
+    flow_variance: np.ndarray | None = None
+    flow_valid: np.ndarray | None = None
+    flow_source: str = "unknown"
+    flow_is_true: bool = False
+    depth_source: str = "unknown"
+
+    def __post_init__(self) -> None:
+        for name in ("prev", "curr"):
+            if not isinstance(getattr(self, name), Frame):
+                got = type(getattr(self, name)).__name__
+                raise InputError(f"FramePair.{name}: expected a Frame, got {got}.")
+        shape = self.prev.camera.shape
+        if self.curr.camera.shape != shape:
+            raise InputError(
+                f"FramePair: the previous frame is {shape}, the current one "
+                f"{self.curr.camera.shape} (height, width). All frames must have one size; resize "
+                f"with hybridvo.data.resize.resize_frame."
+            )
+        if self.flow is not None:
+            flow = _as_float_image(self.flow, "FramePair.flow", 2)
+            self._check("flow", flow, shape)
+        if self.flow_variance is not None:
+            variance = _as_float_image(self.flow_variance, "FramePair.flow_variance", None)
+            self._check("flow_variance", variance, shape)
+        if self.flow_valid is not None:
+            valid = np.asarray(self.flow_valid)
+            if valid.dtype != np.bool_:
+                raise InputError(f"FramePair.flow_valid: expected bool, got dtype {valid.dtype}.")
+            self._check("flow_valid", valid, shape)
+
+    def _check(self, name: str, array: np.ndarray, shape: tuple[int, int]) -> None:
+        if array.shape[:2] != shape:
+            raise InputError(
+                f"FramePair.{name}: expected {shape} (height, width) to match the frames, "
+                f"got {array.shape[:2]}."
+            )
+        object.__setattr__(self, name, array)
+
+
+class State(enum.Enum):
+    """Outcome of one estimate."""
+
+    OK = "ok"
+    DEGRADED = "degraded"
+    FAILED = "failed"
+
+
+class Reason(enum.Enum):
+    """Why an estimate is not simply ok."""
+
+    NONE = ""
+    LOW_INLIERS = "low_inliers"
+    DEGENERATE_GEOMETRY = "degenerate_geometry"
+    NO_VALID_DEPTH = "no_valid_depth"
+    NO_FLOW = "no_flow"
+    MISSING_FRAME = "missing_frame"
+    SOLVER_DIVERGED = "solver_diverged"
+    NAN_INPUT = "nan_input"
+    AMBIGUOUS_MOTION = "ambiguous_motion"
+
+
+@dataclass(frozen=True)
+class Status:
+    """State, reason and a sentence for people."""
+
+    state: State = State.OK
+    reason: Reason = Reason.NONE
+    message: str = ""
+
+    @property
+    def ok(self) -> bool:
+        """True unless the estimate failed; a degraded estimate may be used with its covariance."""
+        return self.state is not State.FAILED
+
+    @classmethod
+    def degraded(cls, reason: Reason, message: str) -> Status:
+        """An estimate that may be used with care."""
+        return cls(State.DEGRADED, reason, message)
+
+    @classmethod
+    def failed(cls, reason: Reason, message: str) -> Status:
+        """An estimate that must not be used."""
+        return cls(State.FAILED, reason, message)
+
+    def __str__(self) -> str:
+        return self.state.value + (f"({self.reason.value})" if self.reason.value else "")
+
+
+def _identity() -> np.ndarray:
+    return np.eye(4)
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """One strong motion found in the picture.
+
+    Args:
+        T_curr_prev: (4, 4).
+        support: (h, w) float32 in [0, 1], robust weight of each pixel under this motion, on the
+            grid of ``stride``.
+        stride: pixels of the full image per step of the support grid.
+        share: fraction of the valid pixels that follow this motion.
+        score: value by which the world was chosen among the hypotheses; larger is better.
+        source: which start led here (``identity``, ``last``, ``seed``, ``sampled``).
+        cues: named cues that went into the score.
+    """
+
+    T_curr_prev: np.ndarray
+    support: np.ndarray
+    stride: int
+    share: float
+    score: float
+    source: str = ""
+    cues: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class RelativePose:
+    """Camera motion of one pair: the result of every estimator.
+
+    Args:
+        T_curr_prev: (4, 4) float64, points of the previous camera into the current one; metres.
+        covariance: (6, 6) of the left perturbation ``Exp(delta) T_curr_prev``, delta =
+            (translation, rotation) in the current camera; m^2, m rad, rad^2.
+        status: ok, degraded or failed with its reason. A failed motion is the identity.
+        inlier_ratio: share of the valid pixels that follow the motion.
+        iterations: Gauss-Newton steps spent (or RANSAC iterations).
+        cost: final robust cost per valid pixel, dimensionless.
+        residual_scale_px: estimated standard deviation of the flow noise, px.
+        depth_noise: estimated standard deviation of the log depth noise.
+        weights: (h, w) float32 robust weight of each pixel on the grid of ``weights_stride``.
+        translation_direction_valid: whether the translation is longer than three of its own
+            standard deviations; its direction means nothing otherwise.
+        information_eigenvalues: (6,) ascending, of the information matrix scaled to pixels.
+        hypotheses: every strong motion found, the chosen one first.
+        method: name of the estimator. ms: time spent, milliseconds.
+    """
+
+    T_curr_prev: np.ndarray = field(default_factory=_identity)
+    covariance: np.ndarray = field(default_factory=lambda: np.eye(6))
+    status: Status = field(default_factory=Status)
+    inlier_ratio: float = 0.0
+    iterations: int = 0
+    cost: float = 0.0
+    residual_scale_px: float = 0.0
+    depth_noise: float = 0.0
+    weights: np.ndarray | None = None
+    weights_stride: int = 1
+    translation_direction_valid: bool = False
+    information_eigenvalues: np.ndarray = field(default_factory=lambda: np.zeros(6))
+    hypotheses: tuple[Hypothesis, ...] = ()
+    method: str = ""
+    ms: float = 0.0
+
+    @property
+    def ok(self) -> bool:
+        """True unless the estimate failed."""
+        return self.status.ok
+
+    @property
+    def T_prev_curr(self) -> np.ndarray:
+        """Inverse of ``T_curr_prev``: what a pose-graph "between" factor wants."""
+        R, t = self.T_curr_prev[:3, :3], self.T_curr_prev[:3, 3]
+        T = np.eye(4)
+        T[:3, :3] = R.T
+        T[:3, 3] = -R.T @ t
+        return T
+
+    @classmethod
+    def failed(cls, reason: Reason, message: str, method: str = "", **extra: Any) -> RelativePose:
+        """A failed estimate: identity with a covariance that carries no information."""
+        return cls(
+            covariance=np.diag([1e4] * 3 + [10.0] * 3),
+            status=Status.failed(reason, message),
+            method=method,
+            **extra,
+        )
+
+    def replace(self, **changes: Any) -> RelativePose:
+        """Copy with some fields changed."""
+        return replace(self, **changes)
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """One tracked frame of :class:`hybridvo.Odometry`.
+
+    Args:
+        index, timestamp: of the current frame.
+        T_world_cam: (4, 4) camera to world; world = first camera unless set.
+        motion: relative pose from the previous frame; identity with status ok for the first frame.
+    """
+
+    index: int
+    timestamp: float
+    T_world_cam: np.ndarray
+    motion: RelativePose
+
+    @property
+    def ok(self) -> bool:
+        """True unless the motion of this step failed."""
+        return self.motion.ok
+
+    @property
+    def status(self) -> Status:
+        """Status of the motion."""
+        return self.motion.status
+
+    @property
+    def T_curr_prev(self) -> np.ndarray:
+        """(4, 4) points of the previous camera into the current one."""
+        return self.motion.T_curr_prev
+
+    @property
+    def T_prev_curr(self) -> np.ndarray:
+        """(4, 4) pose of the current camera in the previous one."""
+        return self.motion.T_prev_curr
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """(6, 6) covariance of the motion."""
+        return self.motion.covariance
+
+
+@dataclass(frozen=True, eq=False)
+class PixelwisePrediction:
+    """What a pixel-wise network says of a batch of pairs (paper, section 3.2).
+
+    Args:
+        rotation: (B, 3, h, w) Euler angles X-Y-Z in degrees (R = Rx Ry Rz), of T_curr_prev.
+        translation: (B, 3, h, w) metres, of T_curr_prev.
+        log_scale_rotation, log_scale_translation: (B, 3, h, w), s = log of the Laplace scale U, or
+            None where the network predicts no uncertainty.
+    """
+
+    rotation: torch.Tensor
+    translation: torch.Tensor
+    log_scale_rotation: torch.Tensor | None = None
+    log_scale_translation: torch.Tensor | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class PairBatch:
+    """A batch of pairs as torch tensors: the differentiable, batched input.
+
+    Args:
+        flow: (B, H, W, 2) px. depth_prev: (B, H, W) metres; values that are not finite and positive
+            are invalid. K_prev, K_curr: (B, 3, 3).
+        depth_curr: (B, H, W) metres on the current grid, or None.
+        flow_variance: (B, H, W) px^2 or None. depth_variance: (B, H, W) of log depth, or None.
+        valid: (B, H, W) bool or None.
+    """
+
+    flow: torch.Tensor
+    depth_prev: torch.Tensor
+    K_prev: torch.Tensor
+    K_curr: torch.Tensor
+    depth_curr: torch.Tensor | None = None
+    flow_variance: torch.Tensor | None = None
+    depth_variance: torch.Tensor | None = None
+    valid: torch.Tensor | None = None
