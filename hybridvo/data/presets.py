@@ -1,0 +1,116 @@
+"""YAML presets: a strict reader from plain mappings to frozen option dataclasses.
+
+A preset file names its kind (``preset: paper``) and repeats every option with its unit and reason.
+Nothing is guessed: an unknown key, a missing file or a value of another type is an error that names
+the file, the key and the nearest known name. Only ``yaml.safe_load`` is used.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import types
+import typing
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+
+from hybridvo.errors import FormatError, InputError
+
+__all__ = ["build_options", "read_yaml"]
+
+MAX_YAML_BYTES = 1 << 20
+"""Largest preset file that is read; a preset is a few kilobytes."""
+
+OptionsT = TypeVar("OptionsT")
+
+
+def read_yaml(path: str | Path) -> dict[str, Any]:
+    """Mapping stored in a YAML file.
+
+    Raises:
+        InputError: no such file. FormatError: not YAML, not a mapping, or larger than a megabyte.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; presets of the project are in configs/.")
+    if path.stat().st_size > MAX_YAML_BYTES:
+        raise FormatError(f"{path}: a preset above {MAX_YAML_BYTES} bytes is not plausible.")
+    try:
+        mapping = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        reason = " ".join(str(error).split())
+        raise FormatError(f"{path}: not a YAML file ({reason}).") from error
+    if not isinstance(mapping, dict):
+        raise FormatError(f"{path}: expected a mapping of keys, got {type(mapping).__name__}.")
+    return mapping
+
+
+def build_options(cls: type[OptionsT], mapping: Any, where: str) -> OptionsT:
+    """Frozen dataclass ``cls`` from a plain mapping; fields that are left out keep their default.
+
+    Args:
+        cls: a dataclass whose fields are numbers, strings, booleans, tuples of these, or further
+            such dataclasses.
+        mapping: keys and values as YAML delivers them.
+        where: file and key, for the message.
+
+    Raises:
+        InputError: an unknown key (the nearest known one is named) or a value of another type.
+    """
+    if isinstance(mapping, cls):
+        return mapping
+    if not isinstance(mapping, dict):
+        raise InputError(f"{where}: expected a mapping of keys, got {mapping!r}.")
+    names = [field.name for field in dataclasses.fields(typing.cast(Any, cls))]
+    hints = typing.get_type_hints(cls)
+    values = {}
+    for key, value in mapping.items():
+        if key not in names:
+            near = difflib.get_close_matches(str(key), names, n=1, cutoff=0.0)
+            hint = f" (did you mean '{near[0]}'?)" if near else ""
+            raise InputError(f"{where}: unknown key '{key}'{hint}. Known keys: {', '.join(names)}.")
+        values[key] = _convert(hints[key], value, f"{where}: '{key}'")
+    try:
+        return cls(**values)
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from error
+    except TypeError as error:
+        raise InputError(f"{where}: {error}.") from error
+
+
+def _convert(hint: Any, value: Any, where: str) -> Any:
+    """The value as the annotated type, or an InputError."""
+    origin = typing.get_origin(hint)
+    arguments = typing.get_args(hint)
+    if origin in (types.UnionType, typing.Union):
+        if value is None and type(None) in arguments:
+            return None
+        return _convert(next(a for a in arguments if a is not type(None)), value, where)
+    if dataclasses.is_dataclass(hint):
+        return build_options(typing.cast(Any, hint), value, where)
+    if origin is tuple:
+        if not isinstance(value, list | tuple):
+            raise InputError(f"{where}: expected a list, got {value!r}.")
+        if len(arguments) == 2 and arguments[1] is Ellipsis:
+            kinds = (arguments[0],) * len(value)
+        else:
+            kinds = arguments
+        if len(kinds) != len(value):
+            raise InputError(f"{where}: expected {len(kinds)} values, got {len(value)}: {value!r}.")
+        return tuple(
+            _convert(kind, item, f"{where}[{i}]")
+            for i, (kind, item) in enumerate(zip(kinds, value, strict=True))
+        )
+    if hint is Any:
+        return value
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    if hint is float and is_number:
+        return float(value)
+    if hint is int and is_number and float(value).is_integer():
+        return int(value)
+    if hint in (bool, str) and isinstance(value, hint):
+        return value
+    name = getattr(hint, "__name__", str(hint))
+    raise InputError(f"{where}: expected {name}, got {value!r}.")
