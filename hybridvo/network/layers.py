@@ -1,0 +1,197 @@
+"""Building blocks that PWVO and the VONet baselines share: blocks, the encoder, self-attention.
+
+Stride-2 convolutions pad one pixel on every side (output pixel j is centred on input pixel 2j). The
+published TensorFlow code pads bottom and right only, which shifts its centres by half a step; that
+matters when weights are ported, not when they are trained here, and is not copied.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import torch
+import torch.nn.functional as F
+from torch import nn
+
+from hybridvo.errors import InputError
+from hybridvo.network.inputs import NetworkInputs
+
+__all__ = [
+    "ENCODER_CHANNELS",
+    "Encoder",
+    "InputBranches",
+    "ResidualBlock",
+    "SelfAttention",
+    "initialize",
+    "match_size",
+    "scaled",
+]
+
+ENCODER_CHANNELS = (64, 128, 128, 256, 256)
+"""Output channels of layer1 to layer5 at full width."""
+
+ENCODER_BLOCKS = (3, 4, 6, 7, 3)
+STEM_CHANNELS = 32
+BRANCH_CHANNELS = 8
+
+INPUT_LIMIT = 100.0
+"""Inputs are clipped to this magnitude (20 000 px of flow, a depth of 1 cm): no finite input can
+then overflow the activations, and no measurement that could be meant is touched."""
+
+
+def scaled(channels: int, width: float) -> int:
+    """Number of channels at a width factor, at least one."""
+    return max(1, round(channels * width))
+
+
+def match_size(x: torch.Tensor, like: torch.Tensor) -> torch.Tensor:
+    """Drop the last row or column of ``x`` (B, C, h, w) where upsampling gave one too many."""
+    return x[:, :, : like.shape[2], : like.shape[3]]
+
+
+class ResidualBlock(nn.Module):
+    """Two 3x3 convolutions with a shortcut and ELU.
+
+    Args:
+        in_channels, out_channels: channels before and after.
+        stride: of the first convolution and of the shortcut.
+        inner_activation: ELU after the second convolution, before the sum (PWVO has it, the VONet
+            baselines do not).
+        project: use a 1x1 convolution as shortcut even where the shapes agree.
+    """
+
+    def __init__(
+        self,
+        in_channels: int,
+        out_channels: int,
+        stride: int = 1,
+        inner_activation: bool = True,
+        project: bool = False,
+    ) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(in_channels, out_channels, 3, stride, 1)
+        self.conv2 = nn.Conv2d(out_channels, out_channels, 3, 1, 1)
+        self.inner_activation = inner_activation
+        self.shortcut: nn.Module = nn.Identity()
+        if stride != 1 or in_channels != out_channels or project:
+            self.shortcut = nn.Conv2d(in_channels, out_channels, 1, stride)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """(B, in_channels, h, w) -> (B, out_channels, ceil(h / stride), ceil(w / stride))."""
+        y = self.conv2(F.elu(self.conv1(x), inplace=True))
+        if self.inner_activation:
+            y = F.elu(y, inplace=True)
+        return F.elu(y + self.shortcut(x), inplace=True)
+
+
+class InputBranches(nn.Module):
+    """The three inputs side by side: flow as it is, depths and rays through a 1x1 convolution."""
+
+    out_channels = 2 + 2 * BRANCH_CHANNELS
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.depth = nn.Conv2d(2, BRANCH_CHANNELS, 1)
+        self.rays = nn.Conv2d(2, BRANCH_CHANNELS, 1)
+
+    def forward(self, inputs: NetworkInputs) -> torch.Tensor:
+        """Network inputs -> (B, 18, h, w)."""
+        flow, depth, rays = (
+            self._clean(x, name)
+            for x, name in (
+                (inputs.flow, "flow"),
+                (inputs.inverse_depth, "inverse_depth"),
+                (inputs.rays, "rays"),
+            )
+        )
+        branches = [flow, F.elu(self.depth(depth)), F.elu(self.rays(rays))]
+        return torch.cat([x.to(branches[1].dtype) for x in branches], dim=1)
+
+    @staticmethod
+    def _clean(x: torch.Tensor, name: str) -> torch.Tensor:
+        if x.ndim != 4 or x.shape[1] != 2:
+            raise InputError(
+                f"NetworkInputs.{name}: expected shape (B, 2, h, w), got {tuple(x.shape)}. "
+                f"Build the inputs with hybridvo.network.inputs.assemble_inputs."
+            )
+        return torch.nan_to_num(x, nan=0.0, posinf=0.0, neginf=0.0).clamp(-INPUT_LIMIT, INPUT_LIMIT)
+
+
+class Encoder(nn.Module):
+    """Stem of three convolutions and five stages of residual blocks, each halving the picture.
+
+    Args:
+        in_channels: channels of the assembled inputs.
+        width: factor on all channel counts.
+        inner_activation: see :class:`ResidualBlock`.
+    """
+
+    def __init__(self, in_channels: int, width: float = 1.0, inner_activation: bool = True) -> None:
+        super().__init__()
+        stem = scaled(STEM_CHANNELS, width)
+        self.stem = nn.ModuleList(
+            [
+                nn.Conv2d(in_channels, stem, 3, 2, 1),
+                nn.Conv2d(stem, stem, 3, 1, 1),
+                nn.Conv2d(stem, stem, 3, 1, 1),
+            ]
+        )
+        self.channels = tuple(scaled(c, width) for c in ENCODER_CHANNELS)
+        stages = []
+        for count, (before, after) in zip(
+            ENCODER_BLOCKS, pairwise((stem, *self.channels)), strict=True
+        ):
+            blocks = [ResidualBlock(before, after, 2, inner_activation)]
+            blocks += [ResidualBlock(after, after, 1, inner_activation) for _ in range(count - 1)]
+            stages.append(nn.Sequential(*blocks))
+        self.layer1, self.layer2, self.layer3, self.layer4, self.layer5 = stages
+
+    def forward(self, x: torch.Tensor) -> list[torch.Tensor]:
+        """(B, C, h, w) -> features of the stem and of layer1 to layer5, finest first.
+
+        The stem has half the resolution of the input, the last feature (the paper's psi) a 64th.
+        """
+        for convolution in self.stem:
+            x = F.elu(convolution(x), inplace=True)
+        features = [x]
+        for layer in (self.layer1, self.layer2, self.layer3, self.layer4, self.layer5):
+            features.append(layer(features[-1]))
+        return features
+
+
+class SelfAttention(nn.Module):
+    """Self-attention over all positions with a learned gain that starts at zero.
+
+    The baseline "VONet + self-att." of the paper: 1x1 query and key with an eighth of the channels,
+    unscaled dot products, softmax over positions, ``x + gain * attended``.
+    """
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        inner = max(1, channels // 8)
+        self.query = nn.Conv2d(channels, inner, 1)
+        self.key = nn.Conv2d(channels, inner, 1)
+        self.value = nn.Conv2d(channels, channels, 1)
+        self.gain = nn.Parameter(torch.zeros(()))
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """(B, C, h, w) -> (B, C, h, w)."""
+        query, key, value = (f(x).flatten(2) for f in (self.query, self.key, self.value))
+        attention = torch.softmax(query.transpose(1, 2) @ key, dim=-1)
+        return x + self.gain * (value @ attention.transpose(1, 2)).view_as(x)
+
+
+def initialize(network: nn.Module, uniform: tuple[nn.Module, ...] = ()) -> None:
+    """Glorot-normal weights and zero biases; Glorot-uniform weights inside ``uniform`` (the heads).
+
+    Draws from torch's global generator: seed it to get the same network again.
+    """
+    heads = {id(m) for head in uniform for m in head.modules()}
+    for module in network.modules():
+        if isinstance(module, nn.Conv2d | nn.ConvTranspose2d | nn.Linear):
+            if id(module) in heads:
+                nn.init.xavier_uniform_(module.weight)
+            else:
+                nn.init.xavier_normal_(module.weight)
+            if module.bias is not None:
+                nn.init.zeros_(module.bias)

@@ -1,0 +1,230 @@
+"""PWVO: a pose and its uncertainty at every pixel, and the one door to all networks.
+
+Architecture of the published code, layer by layer (reference/pwvo.md, section 2): one shared U-Net
+decoder with two heads of two convolutions. The paper's text has two decoders; ``decoders=2`` builds
+them.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import nn
+
+from hybridvo.errors import InputError
+from hybridvo.network.inputs import NetworkInputs
+from hybridvo.network.layers import (
+    Encoder,
+    InputBranches,
+    ResidualBlock,
+    initialize,
+    match_size,
+    scaled,
+)
+from hybridvo.network.vonet import OUTPUT_SCALE, VONet
+from hybridvo.types import PixelwisePrediction
+
+__all__ = ["INVALID_LOG_SCALE", "KINDS", "PWVO", "NetworkOptions", "build_network"]
+
+KINDS = ("pwvo", "vonet", "vonet-attention")
+
+INVALID_LOG_SCALE = 3.0
+"""Least log scale where flow or depth is missing: U = 20 degrees or 20 m, "nothing was seen"."""
+
+PATCH = 32
+"""Side of the paper's selection patches in pixels of the network's input."""
+
+
+@dataclass(frozen=True)
+class NetworkOptions:
+    """What decides the shapes of a network's weights.
+
+    Args:
+        kind: ``pwvo`` (also PWVO naive and the pixel-wise network: same shapes, other losses),
+            ``vonet`` or ``vonet-attention``.
+        width: factor on all channel counts, in (0, 4]; 0.5 has about a quarter of the parameters.
+        decoders: 1 = one decoder shared by both heads (published code), 2 = one for the pose and
+            one for the uncertainty (the paper's text).
+        head_stride: 1 = predictions at the resolution of the input, 2 = at half of it, without the
+            decoder's last stage: the same pose at about half the time on a CPU.
+        uncertainty: whether the pixel-wise network has an uncertainty head.
+
+    Raises:
+        InputError: a value outside of what is listed.
+    """
+
+    kind: str = "pwvo"
+    width: float = 1.0
+    decoders: int = 1
+    head_stride: int = 1
+    uncertainty: bool = True
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise InputError(
+                f"NetworkOptions.kind: {self.kind!r} unknown; known: {', '.join(KINDS)}. "
+                f"'pwvo-naive' and 'pixelwise' are kind='pwvo' with other losses and selection."
+            )
+        number = isinstance(self.width, int | float) and not isinstance(self.width, bool)
+        if not number or not math.isfinite(self.width) or not 0 < self.width <= 4:
+            raise InputError(
+                f"NetworkOptions.width: expected a number in (0, 4], got {self.width!r}."
+            )
+        for name in ("decoders", "head_stride"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or value not in (1, 2):
+                raise InputError(f"NetworkOptions.{name}: expected 1 or 2, got {value!r}.")
+        if not isinstance(self.uncertainty, bool):
+            raise InputError(
+                f"NetworkOptions.uncertainty: expected a bool, got {self.uncertainty!r}."
+            )
+        if self.decoders == 2 and not self.uncertainty:
+            raise InputError(
+                "NetworkOptions: decoders=2 gives the uncertainty its own decoder, but "
+                "uncertainty=False. Set decoders=1."
+            )
+
+    @property
+    def patch(self) -> int:
+        """Side of the paper's 32-pixel selection patches, in cells of the prediction's grid."""
+        return PATCH // self.head_stride
+
+
+class _UpStage(nn.Module):
+    """Transposed 2x2 convolution, the encoder's feature of that size beside it, residual block."""
+
+    def __init__(self, in_channels: int, up: int, skip: int, out: int, project: bool = False):
+        super().__init__()
+        self.up = nn.ConvTranspose2d(in_channels, up, 2, 2)
+        self.block = ResidualBlock(up + skip, out, project=project)
+
+    def forward(self, x: torch.Tensor, like: torch.Tensor, skip: bool) -> torch.Tensor:
+        x = match_size(self.up(x), like)
+        if skip:
+            x = torch.cat([x, like.to(x.dtype)], dim=1)
+        return self.block(x)
+
+
+class Decoder(nn.Module):
+    """U-Net decoder from the embedding to a feature map of the heads' resolution.
+
+    Args:
+        channels: of the encoder's layer1 to layer5.
+        width: factor on all channel counts.
+        head_stride: 1 or 2; 2 leaves out the last stage.
+    """
+
+    def __init__(self, channels: tuple[int, ...], width: float, head_stride: int) -> None:
+        super().__init__()
+        c32, c64, c128 = (scaled(c, width) for c in (32, 64, 128))
+        layer1, layer2, layer3, layer4, layer5 = channels
+        self.up5 = _UpStage(layer5, layer4, layer4, c128)
+        self.up4 = _UpStage(c128, c128, layer3, c128)
+        self.up3 = _UpStage(c128, c128, layer2, c128)
+        self.up2 = _UpStage(c128, c64, layer1, c64)
+        # The shortcut of up1 is a 1x1 convolution although the shapes agree: as published.
+        self.up1 = _UpStage(c64, c64, 0, c64, project=True)
+        self.up0 = _UpStage(c64, c32, 0, c32) if head_stride == 1 else None
+        self.out = nn.Conv2d(c32 if head_stride == 1 else c64, c32, 1)
+
+    def forward(self, inputs: torch.Tensor, features: list[torch.Tensor]) -> torch.Tensor:
+        """Inputs (B, 18, h, w) and the encoder's features -> (B, 32, h / stride, w / stride)."""
+        stem, layer1, layer2, layer3, layer4, x = features
+        x = self.up5(x, layer4, True)
+        x = self.up4(x, layer3, True)
+        x = self.up3(x, layer2, True)
+        x = self.up2(x, layer1, True)
+        x = self.up1(x, stem, False)
+        if self.up0 is not None:
+            x = self.up0(x, inputs, False)
+        return self.out(x)
+
+
+class _Head(nn.Sequential):
+    """Two 3x3 convolutions to six channels: rx, ry, rz, tx, ty, tz."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__(
+            nn.Conv2d(channels, channels, 3, 1, 1),
+            nn.ELU(inplace=True),
+            nn.Conv2d(channels, 6, 3, 1, 1),
+        )
+
+
+class PWVO(nn.Module):
+    """Pixel-wise prediction of the camera motion with uncertainty (paper, section 3.2).
+
+    Args:
+        options: kind ``pwvo``; see :class:`NetworkOptions`.
+    """
+
+    def __init__(self, options: NetworkOptions | None = None) -> None:
+        super().__init__()
+        options = NetworkOptions() if options is None else options
+        width, stride = options.width, options.head_stride
+        self.head_stride = stride
+        self.branches = InputBranches()
+        self.encoder = Encoder(InputBranches.out_channels, width)
+        self.decoder = Decoder(self.encoder.channels, width, stride)
+        self.decoder_uncertainty = (
+            Decoder(self.encoder.channels, width, stride) if options.decoders == 2 else None
+        )
+        channels = scaled(32, width)
+        self.head_motion = _Head(channels)
+        self.head_uncertainty = _Head(channels) if options.uncertainty else None
+        heads = [h for h in (self.head_motion, self.head_uncertainty) if h is not None]
+        initialize(self, uniform=tuple(heads))
+
+    def forward(self, inputs: NetworkInputs) -> PixelwisePrediction:
+        """Pose and log scale at every pixel.
+
+        Where flow or depth is missing (``inputs.valid`` is False) the log scale is at least
+        ``INVALID_LOG_SCALE``, in training and in use: no selection prefers such a pixel.
+
+        Args:
+            inputs: of size (h, w); multiples of 32 waste no border, any size works.
+
+        Returns:
+            Maps of (ceil(h / head_stride), ceil(w / head_stride)), float32 (float64 for a float64
+            network), also under autocast. Finite for any input.
+        """
+        x = self.branches(inputs)
+        features = self.encoder(x)
+        dtype = next(self.parameters()).dtype
+        shared = self.decoder(x, features)
+        motion = OUTPUT_SCALE * self.head_motion(shared).to(dtype)
+        if self.head_uncertainty is None:
+            return PixelwisePrediction(motion[:, :3], motion[:, 3:])
+        if self.decoder_uncertainty is not None:
+            shared = self.decoder_uncertainty(x, features)
+        log_scale = self.head_uncertainty(shared).to(dtype)
+        seen = inputs.valid[:, None].to(dtype)
+        if self.head_stride > 1:
+            seen = F.max_pool2d(seen, self.head_stride, ceil_mode=True)
+        log_scale = torch.where(seen > 0, log_scale, log_scale.clamp(min=INVALID_LOG_SCALE))
+        return PixelwisePrediction(motion[:, :3], motion[:, 3:], log_scale[:, :3], log_scale[:, 3:])
+
+
+def build_network(options: NetworkOptions | None = None) -> nn.Module:
+    """Network with fresh weights (Glorot, from torch's global generator).
+
+    Args:
+        options: kind and shapes; PWVO at full width by default.
+
+    Returns:
+        :class:`PWVO`, whose output is a :class:`~hybridvo.types.PixelwisePrediction`, or
+        :class:`~hybridvo.network.vonet.VONet`, whose output is (rotation_deg, translation).
+
+    Example:
+        >>> from hybridvo.network.pwvo import NetworkOptions, build_network
+        >>> network = build_network(NetworkOptions(width=0.5, head_stride=2))
+        >>> round(sum(p.numel() for p in network.parameters()) / 1e6, 1)
+        4.3
+    """
+    options = NetworkOptions() if options is None else options
+    if options.kind == "pwvo":
+        return PWVO(options)
+    return VONet(options.width, attention=options.kind == "vonet-attention")
