@@ -125,8 +125,11 @@ def assemble_aligned(
     point one step later.
 
     Args:
-        flow: (B, h, w, 2) px. depth_prev, depth_curr: (B, h, w) metres, both on the grid of t.
-        K_prev, K_curr: (B, 3, 3); the current camera is the previous one by default.
+        flow: (B, h, w, 2) px.
+        depth_prev: (B, h, w) metres.
+        depth_curr: (B, h, w) metres, on the grid of t like the previous one.
+        K_prev: (B, 3, 3) intrinsics.
+        K_curr: (B, 3, 3) intrinsics; the previous ones by default.
         valid: (B, h, w) bool or None.
 
     Raises:
@@ -207,7 +210,10 @@ def _sample_at_flow(
     """Current depth at x + F, nearest pixel: interpolation would invent depths at edges.
 
     Args:
-        depth_curr: (B, H, W) at native size. flow: (B, h, w, 2) native pixels at (rows, cols).
+        depth_curr: (B, H, W) metres, at native size.
+        flow: (B, h, w, 2) in native pixels.
+        rows: (h,) native rows of the flow's pixels.
+        cols: (w,) native columns.
 
     Returns:
         (B, h, w); NaN where x + F leaves the picture or the flow is not finite.
@@ -309,9 +315,9 @@ def _check_batch(batch: PairBatch) -> None:
         if value is None and name in ("depth_curr", "valid"):
             continue
         if not isinstance(value, torch.Tensor) or tuple(value.shape) != shape:
-            got = tuple(value.shape) if isinstance(value, torch.Tensor) else type(value).__name__
+            found = tuple(value.shape) if isinstance(value, torch.Tensor) else type(value).__name__
             raise InputError(
-                f"PairBatch.{name}: expected a tensor of shape {shape} to match the flow, got {got}."
+                f"PairBatch.{name}: expected shape {shape} to match the flow, got {found}."
             )
         if name == "valid" and value.dtype != torch.bool:
             raise InputError(f"PairBatch.valid: expected bool, got {value.dtype}.")
