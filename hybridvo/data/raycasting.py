@@ -35,7 +35,9 @@ def screen_bounds(A_cam_body: np.ndarray, K: np.ndarray, height: int, width: int
 
     Args:
         A_cam_body: (P, 3, 4) affine maps, unit shape to camera frame (metres).
-        K: (3, 3) intrinsics. height, width: pixels.
+        K: (3, 3) intrinsics.
+        height: pixels.
+        width: pixels.
 
     Returns:
         (P, 4) int64 inclusive (u0, u1, v0, v1), clipped to the image; u0 > u1 where unseen.
@@ -147,7 +149,9 @@ def cast(shapes, B_body_cam, bounds, K, height, width):  # pragma: no cover - co
         shapes: (P,) int64 of BOX, ELLIPSOID, CYLINDER.
         B_body_cam: (P, 3, 4) affine maps, camera frame (metres) to unit shape.
         bounds: (P, 4) from :func:`screen_bounds`.
-        K: (3, 3) intrinsics. height, width: pixels.
+        K: (3, 3) intrinsics.
+        height: pixels.
+        width: pixels.
 
     Returns:
         (H, W) float64 depth, inf where nothing is hit; (H, W) int32 solid index, -1 there.
@@ -175,9 +179,15 @@ def motion(  # pragma: no cover - compiled
     camera; a ray cast exactly there says whether it is seen.
 
     Args:
-        depth, index: (H, W) from :func:`cast` of the previous frame.
-        B_prev, B_curr: (P, 3, 4) camera frame to unit shape. A_curr: (P, 3, 4) unit shape to
-            camera frame. K_prev, K_curr: (3, 3). shapes, bounds_curr: as in :func:`cast`.
+        depth: (H, W) from :func:`cast` of the previous frame.
+        index: (H, W) from the same call.
+        B_prev: (P, 3, 4) previous camera frame to unit shape.
+        K_prev: (3, 3) intrinsics of the previous camera.
+        shapes: (P,) as in :func:`cast`.
+        A_curr: (P, 3, 4) unit shape to current camera frame.
+        B_curr: (P, 3, 4) its inverse.
+        bounds_curr: (P, 4) from :func:`screen_bounds` of the current frame.
+        K_curr: (3, 3) intrinsics of the current camera.
 
     Returns:
         (H, W, 2) float64 flow in pixels, NaN where there is no surface or it ends behind the next
@@ -263,9 +273,14 @@ def shade(  # pragma: no cover - compiled
     Octaves finer than about three pixels fade out, so that the picture does not alias.
 
     Args:
-        depth, index, shapes, B_body_cam, K: as in :func:`cast`.
+        depth: (H, W) from :func:`cast`.
+        index: (H, W) from the same call.
+        shapes: (P,) as in :func:`cast`.
+        B_body_cam: (P, 3, 4) as in :func:`cast`.
+        K: (3, 3) as in :func:`cast`.
         scale: (P, 3) lattice steps of the coarsest octave per unit of the unit shape.
-        offset: (P, 3) place in the noise. colours: (P, 2, 3) in [0, 1].
+        offset: (P, 3) place in the noise.
+        colours: (P, 2, 3) in [0, 1].
         light_cam: (3,) unit direction towards the light, camera frame.
 
     Returns:
@@ -327,8 +342,8 @@ def shade(  # pragma: no cover - compiled
                 value += amplitude * fade * n
                 amplitude *= _PERSISTENCE
                 frequency *= 2.0
-            brightness = min(max(0.55 + 0.55 * value, 0.03), 1.2)
-            brightness *= 0.75 + 0.25 * lit
+            brightness = min(max(0.68 + 0.62 * value, 0.05), 1.25)
+            brightness *= 0.82 + 0.18 * lit
             mix = min(max(0.5 + 1.4 * coarse, 0.0), 1.0)
             for c in range(3):
                 colour = colours[p, 0, c] + mix * (colours[p, 1, c] - colours[p, 0, c])

@@ -111,9 +111,7 @@ class Scene:
         scale, offset, colours = self._texture()
         light = self.T_world_cam[index][:3, :3].T @ np.asarray(self.world.light, dtype=float)
         light /= np.linalg.norm(light)
-        fine = shade(
-            depth2, solid2, self.world.shapes, B, K2, scale, offset, colours, light
-        )  # fmt: skip
+        fine = shade(depth2, solid2, self.world.shapes, B, K2, scale, offset, colours, light)
         image = 255.0 * fine.reshape(height, 2, width, 2, 3).mean(axis=(1, 3))
         if self.noise > 0:
             rng = np.random.default_rng([self.world.seed, index])
@@ -143,9 +141,8 @@ class Scene:
         _, B, _, depth, solid = self._cast(index, camera.K, *camera.shape)
         A1 = self.world.A_cam_body(index + 1)
         bounds1 = screen_bounds(A1, following.K, *following.shape)
-        flow, hidden = motion(
-            depth, solid, B, camera.K, self.world.shapes, A1, invert_affine(A1), bounds1, following.K
-        )  # fmt: skip
+        B1, K1 = invert_affine(A1), following.K
+        flow, hidden = motion(depth, solid, B, camera.K, self.world.shapes, A1, B1, bounds1, K1)
         return flow.astype(np.float32), hidden, self._object_id(solid) > 0
 
     def object_id(self, index: int) -> np.ndarray:
@@ -172,7 +169,9 @@ def make_scene(
             random); ``heavy_rigid``, ``heavy_deforming``, ``heavy_two``, ``heavy_ten`` (46 to 75 %
             of the pixels moving in every frame).
         seed: the same seed gives the same pictures.
-        height, width: pixels. frames: default 20, for ``pair`` 2.
+        height: pixels.
+        width: pixels.
+        frames: default 20, for ``pair`` 2.
         moving: median share of moving pixels; None for the family's own.
         zoom: relative amplitude of a slow change of focal length.
         noise: sensor noise, standard deviation in grey levels.
@@ -268,7 +267,9 @@ def write_sintel(scene: Scene, root: str | os.PathLike[str], name: str) -> None:
     for each frame.
 
     Args:
-        scene: what to write. root: created where absent. name: of the sequence, one path part.
+        scene: what to write.
+        root: created where absent.
+        name: of the sequence, one path part.
 
     Raises:
         InputError: a name that is not a plain folder name.
