@@ -178,9 +178,10 @@ def _motion(rng: np.random.Generator, cell: Cell) -> np.ndarray:
 def _object_motion(
     rng: np.random.Generator, centre: np.ndarray, depth: float, focal: float
 ) -> np.ndarray:
-    """Rigid motion about the object's centre: 8-40 px of translation and up to 5 degrees."""
-    pixels = rng.uniform(8, 40) * focal / 1120
-    t = pixels * depth / focal * _direction(rng) * np.array([1.0, 1.0, 0.5])
+    """Rigid motion about the object's centre: 20-80 px sideways, some depth, up to 5 degrees."""
+    heading = rng.uniform(0, 2 * np.pi)
+    metres = rng.uniform(20, 80) * focal / 1120 * depth / focal
+    t = metres * np.array([np.cos(heading), np.sin(heading), rng.uniform(-0.5, 0.5)])
     R = Rotation.from_rotvec(np.deg2rad(rng.uniform(0, 5)) * _direction(rng)).as_matrix()
     return make_transform(R, centre - R @ centre + t)
 
