@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -216,7 +217,8 @@ def build_network(options: NetworkOptions | None = None) -> nn.Module:
 
     Returns:
         :class:`PWVO`, whose output is a :class:`~hybridvo.types.PixelwisePrediction`, or
-        :class:`~hybridvo.network.vonet.VONet`, whose output is (rotation_deg, translation).
+        :class:`~hybridvo.network.vonet.VONet`, whose output is (rotation_deg, translation). Its
+        attribute ``options`` keeps the options.
 
     Example:
         >>> from hybridvo.network.pwvo import NetworkOptions, build_network
@@ -225,6 +227,10 @@ def build_network(options: NetworkOptions | None = None) -> nn.Module:
         4.3
     """
     options = NetworkOptions() if options is None else options
-    if options.kind == "pwvo":
-        return PWVO(options)
-    return VONet(options.width, attention=options.kind == "vonet-attention")
+    network: Any = (
+        PWVO(options)
+        if options.kind == "pwvo"
+        else VONet(options.width, attention=options.kind == "vonet-attention")
+    )
+    network.options = options
+    return network

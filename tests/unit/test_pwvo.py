@@ -1,0 +1,257 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from hybridvo.errors import InputError
+from hybridvo.network.inputs import NetworkInputs, assemble_aligned
+from hybridvo.network.pwvo import INVALID_LOG_SCALE, NetworkOptions, build_network
+
+TINY = NetworkOptions(width=0.125)
+
+
+def make_inputs(batch: int = 2, height: int = 64, width: int = 96, seed: int = 0) -> NetworkInputs:
+    generator = torch.Generator().manual_seed(seed)
+    K = torch.tensor([[80.0, 0, width / 2 - 0.5], [0, 80.0, height / 2 - 0.5], [0, 0, 1]])
+    return assemble_aligned(
+        5 * torch.randn(batch, height, width, 2, generator=generator),
+        1 + 5 * torch.rand(batch, height, width, generator=generator),
+        1 + 5 * torch.rand(batch, height, width, generator=generator),
+        K.repeat(batch, 1, 1),
+    )
+
+
+def make_network(options: NetworkOptions = TINY, seed: int = 0) -> torch.nn.Module:
+    torch.manual_seed(seed)
+    return build_network(options).eval()
+
+
+def count(module: torch.nn.Module) -> int:
+    return sum(p.numel() for p in module.parameters())
+
+
+def on_meta(options: NetworkOptions) -> torch.nn.Module:
+    with torch.device("meta"):
+        return build_network(options)
+
+
+@pytest.mark.parametrize(
+    ("options", "parameters"),
+    [
+        (NetworkOptions(), 17_181_276),
+        (NetworkOptions(uncertainty=False), 17_170_294),
+        (NetworkOptions(decoders=2), 17_181_276 + 2_422_016),
+        (NetworkOptions(width=0.5), 4_300_364),
+    ],
+)
+def test_parameter_totals(options, parameters):
+    assert count(on_meta(options)) == parameters
+
+
+def test_parameters_of_every_row_of_the_table():
+    network = on_meta(NetworkOptions())
+    encoder, decoder = network.encoder, network.decoder
+    rows = {
+        "branch depth": (network.branches.depth, 24),
+        "branch rays": (network.branches.rays, 24),
+        "stem 1": (encoder.stem[0], 5_216),
+        "stem 2": (encoder.stem[1], 9_248),
+        "stem 3": (encoder.stem[2], 9_248),
+        "layer1": (encoder.layer1, 205_248),
+        "layer2": (encoder.layer2, 1_115_264),
+        "layer3": (encoder.layer3, 1_787_520),
+        "layer4": (encoder.layer4, 7_999_232),
+        "layer5": (encoder.layer5, 3_606_272),
+        "encoder": (encoder, 14_737_248),
+        "up5 up": (decoder.up5.up, 262_400),
+        "up5 block": (decoder.up5.block, 803_200),
+        "up4 up": (decoder.up4.up, 65_664),
+        "up4 block": (decoder.up4.block, 475_520),
+        "up3 up": (decoder.up3.up, 65_664),
+        "up3 block": (decoder.up3.block, 475_520),
+        "up2 up": (decoder.up2.up, 32_832),
+        "up2 block": (decoder.up2.block, 118_976),
+        "up1 up": (decoder.up1.up, 16_448),
+        "up1 block": (decoder.up1.block, 78_016),
+        "up0 up": (decoder.up0.up, 8_224),
+        "up0 block": (decoder.up0.block, 18_496),
+        "out": (decoder.out, 1_056),
+        "decoder": (decoder, 2_422_016),
+        "head rt": (network.head_motion, 10_982),
+        "head un": (network.head_uncertainty, 10_982),
+    }
+    assert {name: count(m) for name, (m, _) in rows.items()} == {k: n for k, (_, n) in rows.items()}
+
+
+def test_feature_sizes_of_the_table():
+    network = on_meta(NetworkOptions())
+    with torch.device("meta"):
+        features = network.encoder(torch.zeros(1, 18, 128, 256))
+    assert [tuple(f.shape[1:]) for f in features] == [
+        (32, 64, 128),
+        (64, 32, 64),
+        (128, 16, 32),
+        (128, 8, 16),
+        (256, 4, 8),
+        (256, 2, 4),
+    ]
+
+
+@pytest.mark.parametrize("size", [(64, 96), (128, 256), (32, 32), (50, 71)])
+@pytest.mark.parametrize("stride", [1, 2])
+def test_any_size_gives_maps_of_that_size(size, stride):
+    network = make_network(NetworkOptions(width=0.125, head_stride=stride))
+    with torch.inference_mode():
+        prediction = network(make_inputs(1, *size))
+    expected = (1, 3, -(-size[0] // stride), -(-size[1] // stride))
+    for value in vars(prediction).values():
+        assert value.shape == expected
+        assert torch.isfinite(value).all()
+
+
+@pytest.mark.parametrize("options", [TINY, NetworkOptions(width=0.125, decoders=2)])
+def test_batch_elements_are_independent(options):
+    network = make_network(options)
+    inputs = make_inputs(3)
+    with torch.inference_mode():
+        together = network(inputs)
+        for i in range(3):
+            alone = network(inputs[i : i + 1])
+            for name, value in vars(alone).items():
+                # Float32 sums in another order: measured 2e-8 on values up to 0.3.
+                torch.testing.assert_close(value[0], getattr(together, name)[i], atol=1e-6, rtol=0)
+
+
+def test_a_nan_pair_changes_no_neighbour_and_is_uncertain():
+    network = make_network()
+    inputs = make_inputs(2)
+    broken = replace(
+        inputs,
+        flow=inputs.flow.clone().index_fill_(0, torch.tensor([1]), torch.nan),
+        inverse_depth=inputs.inverse_depth.clone().index_fill_(0, torch.tensor([1]), torch.inf),
+        valid=inputs.valid & torch.tensor([True, False])[:, None, None],
+    )
+    with torch.inference_mode():
+        good, bad = network(inputs), network(broken)
+    for name, value in vars(bad).items():
+        torch.testing.assert_close(value[0], getattr(good, name)[0], atol=1e-6, rtol=0)
+        assert torch.isfinite(value).all()
+    assert (bad.log_scale_rotation[1] >= INVALID_LOG_SCALE).all()
+    assert (bad.log_scale_translation[1] >= INVALID_LOG_SCALE).all()
+    assert (bad.log_scale_rotation[0] < INVALID_LOG_SCALE).any()
+
+
+@pytest.mark.parametrize("stride", [1, 2])
+def test_invalid_pixels_alone_are_raised(stride):
+    network = make_network(NetworkOptions(width=0.125, head_stride=stride))
+    inputs = make_inputs(1)
+    valid = torch.ones_like(inputs.valid)
+    valid[:, 10:20, 30:50] = False
+    with torch.inference_mode():
+        s = network(replace(inputs, valid=valid)).log_scale_rotation
+        free = network(inputs).log_scale_rotation
+    hole = torch.zeros(s.shape[2:], dtype=torch.bool)
+    hole[10 // stride : 20 // stride, 30 // stride : 50 // stride] = True
+    assert (s[:, :, hole] >= INVALID_LOG_SCALE).all()
+    torch.testing.assert_close(s[:, :, ~hole], free[:, :, ~hole])
+
+
+@pytest.mark.parametrize("magnitude", [1e3, 1e20, 3e38, torch.inf])
+def test_extreme_inputs_give_finite_outputs(magnitude):
+    network = make_network()
+    inputs = make_inputs(1)
+    extreme = replace(
+        inputs,
+        flow=torch.full_like(inputs.flow, magnitude),
+        inverse_depth=torch.full_like(inputs.flow, -magnitude),
+        rays=torch.full_like(inputs.flow, magnitude),
+    )
+    with torch.inference_mode():
+        for value in vars(network(extreme)).values():
+            assert torch.isfinite(value).all()
+
+
+def test_bfloat16_autocast_gives_float32_close_to_float32():
+    network = make_network()
+    inputs = make_inputs(1)
+    with torch.inference_mode():
+        exact = network(inputs)
+        with torch.autocast("cpu", torch.bfloat16):
+            coarse = network(inputs)
+    for name, value in vars(coarse).items():
+        reference = getattr(exact, name)
+        assert value.dtype == torch.float32
+        # bfloat16 keeps 8 bits; 40 layers in sequence add up to a few per cent of the spread.
+        assert (value - reference).abs().max() < 0.2 * reference.abs().max()
+
+
+def test_gradients_reach_every_parameter():
+    network = make_network(NetworkOptions(width=0.125, decoders=2))
+    prediction = network(make_inputs(1))
+    sum(v.square().sum() for v in vars(prediction).values()).backward()
+    for name, parameter in network.named_parameters():
+        assert parameter.grad is not None, name
+        assert torch.isfinite(parameter.grad).all(), name
+        assert parameter.grad.abs().sum() > 0, name
+
+
+def test_same_seed_gives_the_same_network_and_heads_start_small():
+    first, second = make_network(seed=3), make_network(seed=3)
+    for a, b in zip(first.state_dict().values(), second.state_dict().values(), strict=True):
+        assert torch.equal(a, b)
+    with torch.inference_mode():
+        prediction = first(make_inputs(1))
+    assert prediction.rotation.abs().max() < 0.1
+    assert prediction.translation.abs().max() < 0.1
+
+
+def test_without_uncertainty_there_are_no_scales():
+    network = make_network(NetworkOptions(width=0.125, uncertainty=False))
+    prediction = network(make_inputs(1))
+    assert prediction.log_scale_rotation is None
+    assert prediction.log_scale_translation is None
+
+
+def test_channels_last_and_float64_give_the_same():
+    network = make_network()
+    inputs = make_inputs(1)
+    with torch.inference_mode():
+        plain = network(inputs).rotation
+        last = network.to(memory_format=torch.channels_last)(inputs).rotation
+        double = network.double()(inputs.to(torch.float64)).rotation
+    torch.testing.assert_close(last, plain, atol=1e-6, rtol=0)
+    assert double.dtype == torch.float64
+    torch.testing.assert_close(double.float(), plain, atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"kind": "pwvo-naive"}, "known: pwvo, vonet"),
+        ({"width": 0}, "width"),
+        ({"width": float("nan")}, "width"),
+        ({"width": "wide"}, "width"),
+        ({"width": 5}, "width"),
+        ({"head_stride": 3}, "head_stride"),
+        ({"head_stride": True}, "head_stride"),
+        ({"decoders": 0}, "decoders"),
+        ({"uncertainty": 1}, "uncertainty"),
+        ({"decoders": 2, "uncertainty": False}, "decoders=1"),
+    ],
+)
+def test_bad_options_are_refused(changes, message):
+    with pytest.raises(InputError, match=message):
+        NetworkOptions(**changes)
+
+
+def test_patch_follows_the_head_stride():
+    assert NetworkOptions().patch == 32
+    assert NetworkOptions(head_stride=2).patch == 16
+
+
+def test_wrong_channels_are_refused():
+    inputs = make_inputs(1)
+    with pytest.raises(InputError, match="flow"):
+        make_network()(replace(inputs, flow=inputs.flow[:, :1]))

@@ -1,0 +1,253 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hybridvo.errors import InputError
+from hybridvo.geometry import euler_deg_to_matrix
+from hybridvo.pose.selection import SELECTION_METHODS, select, selected_transform
+from hybridvo.types import PixelwisePrediction
+
+
+def random_prediction(seed: int, shape=(2, 3, 7, 9), dtype=torch.float64) -> PixelwisePrediction:
+    generator = torch.Generator().manual_seed(seed)
+    return PixelwisePrediction(
+        *(torch.randn(shape, generator=generator, dtype=dtype) for _ in range(4))
+    )
+
+
+def by_loop(value, s, method, patch, joint):
+    """Selection of (3, h, w) maps, written as plainly as possible."""
+    _, height, width = value.shape
+    out = []
+    rank = np.broadcast_to(s.mean(0), s.shape) if joint else s
+    for c in range(3):
+        if method == "mean":
+            out.append(value[c].mean())
+            continue
+        picked = []
+        for top in range(0, height, patch):
+            for left in range(0, width, patch):
+                cells = [
+                    (rank[c, i, j], value[c, i, j])
+                    for i in range(top, min(top + patch, height))
+                    for j in range(left, min(left + patch, width))
+                ]
+                picked.append(min(cells))
+        scales = np.array([p[0] for p in picked])
+        values = np.array([p[1] for p in picked])
+        if method == "median":
+            weights = np.exp(-scales) / np.exp(-scales).sum()
+            order = np.argsort(values)
+            reached = np.cumsum(weights[order])
+            out.append(values[order][np.searchsorted(reached, 0.5)])
+            continue
+        logits = {"softmax": -scales, "min_variance": -2 * scales, "paper": np.exp(scales)}[method]
+        weights = np.exp(logits - logits.max())
+        out.append((weights / weights.sum() * values).sum())
+    return np.array(out)
+
+
+@pytest.mark.parametrize("method", SELECTION_METHODS)
+@pytest.mark.parametrize("joint", [False, True])
+@pytest.mark.parametrize(("shape", "patch"), [((8, 8), 4), ((7, 9), 4), ((5, 6), 10), ((3, 2), 1)])
+def test_equals_a_loop(method, joint, shape, patch):
+    prediction = random_prediction(5, (2, 3, *shape))
+    rotation, translation = select(prediction, method, patch, joint)
+    for b in range(2):
+        for got, value, s in (
+            (rotation, prediction.rotation, prediction.log_scale_rotation),
+            (translation, prediction.translation, prediction.log_scale_translation),
+        ):
+            expected = by_loop(value[b].numpy(), s[b].numpy(), method, patch, joint)
+            np.testing.assert_allclose(got[b].numpy(), expected, rtol=1e-12, atol=1e-12)
+
+
+def worked_example() -> PixelwisePrediction:
+    """2x4 maps, patches of 2: left winner 1.0 with U = 1, right winner 4.0 with U = 2."""
+    value = torch.tensor([[1.0, 9, 9, 9], [9, 9, 9, 4]]).expand(1, 3, 2, 4)
+    scale = torch.tensor([[1.0, 5, 7, 5], [3, 4, 6, 2]]).log().expand(1, 3, 2, 4)
+    return PixelwisePrediction(value, 10 * value, scale, scale)
+
+
+@pytest.mark.parametrize(
+    ("method", "expected"),
+    [
+        ("softmax", (2 * 1 + 1 * 4) / 3),  # 1/U: weights 2/3, 1/3
+        ("min_variance", (4 * 1 + 1 * 4) / 5),  # 1/U^2: weights 4/5, 1/5
+        ("median", 1.0),  # two thirds of the weight
+        ("mean", (1 + 4 + 6 * 9) / 8),
+        ("paper", (1 + math.e * 4) / (1 + math.e)),  # exp(1), exp(2)
+    ],
+)
+def test_worked_by_hand(method, expected):
+    rotation, translation = select(worked_example(), method, patch=2)
+    torch.testing.assert_close(rotation, torch.full((1, 3), expected))
+    torch.testing.assert_close(translation, torch.full((1, 3), 10 * expected))
+
+
+def test_joint_takes_one_pixel_for_three_components():
+    # Component 0 is surest at the left pixel, 1 and 2 at the right; the sum is least at the right.
+    s = torch.tensor([[0.0, 1.0], [2.0, 0.5], [2.0, 0.5]])[None, :, None, :]
+    value = torch.tensor([[1.0, 2.0]]).expand(3, 2)[None, :, None, :]
+    prediction = PixelwisePrediction(value, value, s, s)
+    assert select(prediction, patch=2)[0].tolist() == [[1.0, 2.0, 2.0]]
+    assert select(prediction, patch=2, joint=True)[0].tolist() == [[2.0, 2.0, 2.0]]
+
+
+def test_default_patch_is_the_papers_grid():
+    prediction = random_prediction(0, (1, 3, 128, 256), torch.float32)
+    for got, expected in zip(select(prediction), select(prediction, patch=32), strict=True):
+        assert torch.equal(got, expected)
+    half = random_prediction(0, (1, 3, 64, 128), torch.float32)
+    for got, expected in zip(select(half), select(half, patch=16), strict=True):
+        assert torch.equal(got, expected)
+
+
+def test_padding_never_wins():
+    # Every real s is far above the zero that padding would have; values are all 3.
+    shape = (1, 3, 5, 5)
+    value, s = torch.full(shape, 3.0), torch.full(shape, 40.0)
+    prediction = PixelwisePrediction(value, value, s, s)
+    for method in SELECTION_METHODS:
+        torch.testing.assert_close(select(prediction, method, patch=4)[0], torch.full((1, 3), 3.0))
+    extreme = PixelwisePrediction(value, value, torch.full(shape, 3e38), torch.full(shape, 3e38))
+    torch.testing.assert_close(select(extreme, patch=4)[0], torch.full((1, 3), 3.0))
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    seed=st.integers(0, 2**31),
+    height=st.integers(1, 9),
+    width=st.integers(1, 9),
+    patch=st.integers(1, 10),
+    method=st.sampled_from(SELECTION_METHODS),
+    joint=st.booleans(),
+)
+def test_result_lies_within_the_values_and_is_equivariant(
+    seed, height, width, patch, method, joint
+):
+    prediction = random_prediction(seed, (1, 3, height, width))
+    rotation, _ = select(prediction, method, patch, joint)
+    flat = prediction.rotation.flatten(2)
+    assert (rotation >= flat.min(-1).values - 1e-12).all()
+    assert (rotation <= flat.max(-1).values + 1e-12).all()
+    moved = PixelwisePrediction(
+        2 * prediction.rotation + 5,
+        prediction.translation,
+        prediction.log_scale_rotation,
+        prediction.log_scale_translation,
+    )
+    torch.testing.assert_close(select(moved, method, patch, joint)[0], 2 * rotation + 5)
+    if method in ("softmax", "min_variance", "median"):
+        louder = PixelwisePrediction(
+            prediction.rotation,
+            prediction.translation,
+            prediction.log_scale_rotation + 3,
+            prediction.log_scale_translation,
+        )
+        torch.testing.assert_close(select(louder, method, patch, joint)[0], rotation)
+
+
+@pytest.mark.parametrize("method", SELECTION_METHODS)
+@pytest.mark.parametrize("joint", [False, True])
+def test_damage_is_not_heard(method, joint):
+    clean = random_prediction(2, (2, 3, 8, 8))
+    maps = [v.clone() for v in vars(clean).values()]
+    for i, broken in enumerate((torch.nan, torch.inf, torch.nan, -torch.inf)):
+        maps[i][0, :, :4, :4] = broken  # a whole patch, and one pixel of another
+        maps[i][0, :, 6, 6] = broken
+    prediction = PixelwisePrediction(*maps)
+    rotation, translation = select(prediction, method, 4, joint)
+    reference = select(clean, method, 4, joint)
+    assert torch.isfinite(rotation).all()
+    assert torch.isfinite(translation).all()
+    torch.testing.assert_close(rotation[1], reference[0][1])
+    # Of three patches, of which the last lacks one pixel, something is chosen among real values.
+    real = prediction.rotation[0][torch.isfinite(prediction.rotation[0])]
+    assert rotation[0].min() >= real.min() and rotation[0].max() <= real.max()
+
+
+def test_nothing_usable_is_zero_motion_even_for_the_printed_form():
+    nan = torch.full((1, 3, 8, 8), torch.nan)
+    for method in SELECTION_METHODS:
+        rotation, translation = select(PixelwisePrediction(nan, nan, nan, nan), method, 4)
+        assert rotation.tolist() == [[0.0] * 3]
+        assert translation.tolist() == [[0.0] * 3]
+
+
+def test_extreme_scales_stay_finite_in_value_and_gradient():
+    for extreme in (-1e4, 1e4):
+        value = torch.randn(1, 3, 8, 8, requires_grad=True)
+        s = torch.full((1, 3, 8, 8), extreme, requires_grad=True)
+        for method in SELECTION_METHODS:
+            rotation, translation = select(PixelwisePrediction(value, value, s, s), method, 4)
+            assert torch.isfinite(rotation).all()
+            (rotation.sum() + translation.sum()).backward()
+        assert torch.isfinite(value.grad).all()
+        assert s.grad is None or torch.isfinite(s.grad).all()
+
+
+@pytest.mark.parametrize("method", ["softmax", "min_variance", "mean", "paper", "median"])
+@pytest.mark.parametrize("joint", [False, True])
+def test_gradcheck(method, joint):
+    maps = [v.requires_grad_() for v in vars(random_prediction(3, (1, 3, 3, 4))).values()]
+
+    def pose(*values):
+        return torch.cat(select(PixelwisePrediction(*values), method, 2, joint), dim=1)
+
+    torch.autograd.gradcheck(pose, maps)
+    if method in ("softmax", "min_variance", "paper"):
+        pose(*maps).sum().backward()
+        assert maps[2].grad.abs().sum() > 0
+
+
+def test_batch_elements_are_independent():
+    prediction = random_prediction(8, (4, 3, 8, 8))
+    alone = PixelwisePrediction(*(v[2:3] for v in vars(prediction).values()))
+    for method in SELECTION_METHODS:
+        for a, b in zip(select(prediction, method), select(alone, method), strict=True):
+            torch.testing.assert_close(a[2:3], b)
+
+
+def test_transform_matches_scipy_and_is_differentiable():
+    angles = torch.tensor([[10.0, -20, 30], [0, 0, 0], [179, 60, -100]], dtype=torch.float64)
+    translation = torch.tensor([[1.0, 2, 3], [0, 0, 0], [-1, 5, 2]], dtype=torch.float64)
+    T = selected_transform(angles, translation)
+    np.testing.assert_allclose(T[:, :3, :3], euler_deg_to_matrix(angles.numpy()), atol=1e-15)
+    np.testing.assert_allclose(T[:, :3, 3], translation)
+    assert T[:, 3].tolist() == [[0, 0, 0, 1]] * 3
+    torch.autograd.gradcheck(
+        selected_transform, (angles.requires_grad_(), translation.requires_grad_())
+    )
+
+
+def test_transform_stays_exact_under_autocast():
+    angles = torch.tensor([[0.1, -0.2, 0.3]])
+    plain = selected_transform(angles, angles)
+    with torch.autocast("cpu", torch.bfloat16):
+        assert torch.equal(selected_transform(angles, angles), plain)
+
+
+def test_bad_arguments_are_refused():
+    prediction = random_prediction(0)
+    with pytest.raises(InputError, match="known: softmax"):
+        select(prediction, "best")
+    for patch in (0, -1, 2.5, True):
+        with pytest.raises(InputError, match="patch"):
+            select(prediction, patch=patch)
+    bare = PixelwisePrediction(prediction.rotation, prediction.translation)
+    with pytest.raises(InputError, match="method='mean'"):
+        select(bare)
+    assert select(bare, "mean")[0].shape == (2, 3)
+    with pytest.raises(InputError, match="translation"):
+        select(PixelwisePrediction(prediction.rotation, prediction.translation[:, :2]), "mean")
+    with pytest.raises(InputError, match=r"\(B, 3, h, w\)"):
+        select(PixelwisePrediction(prediction.rotation[0], prediction.translation[0]), "mean")
+    with pytest.raises(InputError, match=r"\(B, 3\)"):
+        selected_transform(torch.zeros(3), torch.zeros(3))
