@@ -1,0 +1,166 @@
+"""Pictures of trajectories: the only file that imports matplotlib.
+
+Uses the object interface with the Agg canvas: no window, no pyplot, no global state.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from hybridvo.errors import InputError
+from hybridvo.evaluation.metrics import AbsoluteError, Alignment, ate
+from hybridvo.geometry import invert
+from hybridvo.trajectory import Trajectory, atomic_write
+
+__all__ = ["plot_trajectories"]
+
+# Okabe and Ito's palette without yellow: told apart by colour-blind readers, in print too
+_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
+_STYLES = ("-", "--", "-.", ":")
+_TRUTH_COLOUR = "#222222"
+_GRID_COLOUR = "#e4e4e4"
+_FORMATS = (".png", ".pdf", ".svg")
+
+
+def _fit(
+    est: Trajectory, truth: Trajectory, alignment: Alignment
+) -> tuple[Trajectory, AbsoluteError | None]:
+    """Estimate in the truth's world, by the best alignment that the paths determine."""
+    for kind in dict.fromkeys((alignment, "origin")):
+        error = ate(est, truth, kind)
+        if error.T_gt_est is not None:
+            return est.transformed(error.T_gt_est, error.scale or 1.0), error
+    # nothing could be matched: both start at the same place, and no error is drawn
+    T_gt_est = truth.T_world_cam[0] @ invert(est.T_world_cam[0])
+    return est.transformed(T_gt_est), None
+
+
+def _label(name: str, error: AbsoluteError | None) -> str:
+    if error is None or error.rmse is None:
+        return f"{name} (no error: poses do not match)"
+    unit, factor = ("m", 1.0) if error.rmse >= 1.0 else ("cm", 100.0)
+    return f"{name}: ATE {error.rmse * factor:.3g} {unit} ({error.alignment})"
+
+
+def _style(axes: Any, title: str, x: str, y: str) -> None:
+    axes.set_title(title, fontsize=10, loc="left")
+    axes.set_xlabel(x, fontsize=9)
+    axes.set_ylabel(y, fontsize=9)
+    axes.tick_params(labelsize=8)
+    axes.grid(True, color=_GRID_COLOUR, linewidth=0.8)
+    axes.set_axisbelow(True)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+
+
+def _equal_scale(axes: Any, centre: np.ndarray) -> None:
+    """Same metres per inch on both axes; at least a millimetre, for a camera that does not move."""
+    axes.update_datalim([centre - 5e-4, centre + 5e-4])
+    axes.margins(0.06)
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.autoscale_view()
+
+
+def plot_trajectories(
+    trajectories: Mapping[str, Trajectory],
+    path: str | os.PathLike[str],
+    *,
+    truth: Trajectory | None = None,
+    alignment: Alignment = "se3",
+    title: str = "",
+) -> None:
+    """Draw trajectories from above and from the side, and their errors where truth is given.
+
+    Everything is drawn in the first camera of the truth (or of each trajectory without truth):
+    x right, y down, z forward. Estimates are aligned as ``alignment`` says, or by their first pose
+    where a path does not determine it (the legend says which).
+
+    Args:
+        trajectories: name to trajectory, at least one.
+        path: picture to write: .png, .pdf or .svg.
+        truth: true trajectory, or None.
+        alignment: see :func:`hybridvo.evaluation.metrics.ate`.
+        title: line above the picture.
+
+    Raises:
+        InputError: no trajectory, or another kind of file. OutputError: it cannot be written.
+    """
+    if not trajectories:
+        raise InputError("plot_trajectories: expected at least one trajectory, got none.")
+    path = Path(path)
+    kind = path.suffix.lower()
+    if kind not in _FORMATS:
+        raise InputError(f"{path}: expected a picture name ending in {', '.join(_FORMATS)}.")
+    drawn: list[tuple[str, np.ndarray, dict[str, Any]]] = []
+    errors: list[tuple[AbsoluteError, dict[str, Any]]] = []
+    if truth is not None:
+        T_first_world = invert(truth.T_world_cam[0])
+        style: dict[str, Any] = {"color": _TRUTH_COLOUR, "linewidth": 2.6, "alpha": 0.55}
+        drawn.append(("truth", truth.transformed(T_first_world).positions, style))
+    for index, (name, trajectory) in enumerate(trajectories.items()):
+        style = {
+            "color": _COLOURS[index % len(_COLOURS)],
+            "linestyle": _STYLES[index // len(_COLOURS) % len(_STYLES)],
+            "linewidth": 1.4,
+        }
+        if truth is None:
+            moved, label = trajectory.transformed(invert(trajectory.T_world_cam[0])), name
+        else:
+            fitted, error = _fit(trajectory, truth, alignment)
+            moved, label = fitted.transformed(T_first_world), _label(name, error)
+            if error is not None:
+                errors.append((error, style))
+        drawn.append((label, moved.positions, style))
+
+    # the figure's own canvas: nothing is registered with pyplot, so threads do not meet
+    figure = Figure(figsize=(10.0, 7.4 if errors else 4.8), dpi=130, layout="constrained")
+    FigureCanvasAgg(figure)
+    grid = figure.add_gridspec(2 if errors else 1, 2, height_ratios=[2.0, 1.0] if errors else [1.0])
+    everything = np.concatenate([positions for _, positions, _ in drawn])
+    views = (
+        ("Top view", 0, 2, "x right [m]", "z forward [m]"),
+        ("Side view", 2, 1, "z forward [m]", "y down [m]"),
+    )
+    for column, (heading, a, b, x_label, y_label) in enumerate(views):
+        axes = figure.add_subplot(grid[0, column])
+        _style(axes, heading, x_label, y_label)
+        for _, positions, style in drawn:
+            axes.plot(positions[:, a], positions[:, b], **style)
+        start = drawn[0][1][0]
+        axes.plot(start[a], start[b], "o", color=_TRUTH_COLOUR, markersize=5, zorder=5)
+        _equal_scale(axes, everything[:, [a, b]].mean(axis=0))
+        if b == 1:
+            axes.invert_yaxis()  # y points down in the camera: down on the page as well
+    if errors:
+        axes = figure.add_subplot(grid[1, :])
+        timed = truth is not None and truth.has_timestamps
+        largest = max(float(np.max(error.errors)) for error, _ in errors)  # type: ignore[arg-type]
+        unit, factor = ("m", 1.0) if largest >= 1.0 else ("cm", 100.0)
+        _style(axes, "Position error", "time [s]" if timed else "frame", f"error [{unit}]")
+        start_time = truth.timestamps[0] if truth is not None and timed else 0.0
+        for error, style in errors:
+            axes.plot(error.timestamps - start_time, error.errors * factor, **style)  # type: ignore[operator]
+        axes.set_ylim(bottom=0.0)
+        axes.margins(x=0.01)
+    handles = [figure.axes[0].lines[i] for i in range(len(drawn))]
+    figure.legend(
+        handles,
+        [label for label, _, _ in drawn],
+        loc="outside lower center",
+        ncols=min(3, len(drawn)),
+        frameon=False,
+        fontsize=9,
+    )
+    if title:
+        figure.suptitle(title, fontsize=11)
+    # no date and no version in the file: the same input gives the same bytes
+    metadata = {".png": {"Software": None}, ".pdf": {"CreationDate": None}, ".svg": {"Date": None}}
+    with atomic_write(path, "wb") as file:
+        figure.savefig(file, format=kind[1:], metadata=metadata[kind])
