@@ -131,7 +131,8 @@ def cluster(rng: np.random.Generator, half: np.ndarray, count: int) -> Parts:
     shape = int(rng.choice([BOX, ELLIPSOID]))
     parts = [(shape, affine(half * (1.15 if shape == ELLIPSOID else 1.0), np.zeros(3)))]
     for _ in range(count - 1):
-        at = rng.uniform((-1, -1, -1.3), (1, 1, 0.5)) * half
+        # mostly on the side that faces the camera: relief, so that no mover is one plane
+        at = rng.uniform((-0.95, -0.95, -1.3), (0.95, 0.95, -0.4)) * half
         R = Rotation.random(random_state=rng).as_matrix()
         part = rng.uniform(0.25, 0.55, 3) * half.mean()
         parts.append((int(rng.choice([BOX, ELLIPSOID, CYLINDER])), affine(part, at, R)))

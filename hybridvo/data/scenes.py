@@ -156,7 +156,7 @@ def _draw_movers(
         centre = _direction(side * spread, rng.uniform(-0.2, 0.2) * rise, depth)
         speed, spin_deg = rng.uniform(0.03, 0.09), rng.uniform(0.4, 1.6)
         if kind == "heavy_rigid":
-            parts = cluster(rng, half, int(rng.integers(4, 8)))
+            parts = cluster(rng, half, int(rng.integers(6, 11)))
         else:
             parts = cloud(rng, frames, half * (1.2, 1.0, 0.6), rng.uniform(0.03, 0.06))
             spin_deg *= 0.5
