@@ -1,0 +1,279 @@
+from __future__ import annotations
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hybridvo.errors import InputError
+from hybridvo.geometry import ego_flow, euler_deg_to_matrix, make_transform
+from hybridvo.network.inputs import NetworkInputs, assemble_aligned, assemble_inputs
+from hybridvo.types import Camera, Frame, FramePair, PairBatch
+
+CAMERA = Camera(20.0, 25.0, 3.5, 1.5, 4, 8)
+
+
+def make_pair(height=4, width=8, camera=CAMERA, seed=0, flow=None, **changes) -> FramePair:
+    rng = np.random.default_rng(seed)
+    prev, curr = rng.uniform(1, 5, (2, height, width)).astype(np.float32)
+    if flow is None:
+        flow = rng.normal(0, 1, (height, width, 2)).astype(np.float32)
+    return FramePair(Frame(None, prev, camera), Frame(None, curr, camera), flow, **changes)
+
+
+def test_values_at_native_size_by_hand():
+    flow = np.zeros((4, 8, 2), np.float32)
+    flow[1, 2] = (3.0, 1.0)  # pixel (2, 1) goes to (5, 2)
+    flow[0, 0] = (-1.0, 0.0)  # leaves the picture
+    pair = make_pair(flow=flow)
+    inputs = assemble_inputs(pair, (4, 8))
+    assert inputs.size == (4, 8)
+    assert inputs.flow[0, :, 1, 2].tolist() == pytest.approx([3 / 200, 1 / 200])
+    assert inputs.flow_px[0, :, 1, 2].tolist() == pytest.approx([3.0, 1.0])
+    assert inputs.inverse_depth[0, 0, 1, 2].item() == pytest.approx(1 / pair.prev.depth[1, 2])
+    assert inputs.inverse_depth[0, 1, 1, 2].item() == pytest.approx(1 / pair.curr.depth[2, 5])
+    assert inputs.inverse_depth[0, 1, 0, 0] == 0
+    assert inputs.inverse_depth[0, 1, 3, 3].item() == pytest.approx(1 / pair.curr.depth[3, 3])
+    assert inputs.rays[0, :, 1, 2].tolist() == pytest.approx([(2 - 3.5) / 20, (1 - 1.5) / 25])
+    assert inputs.valid.all()
+    assert inputs.depth_curr[0, 1, 2].item() == pytest.approx(pair.curr.depth[2, 5])
+    np.testing.assert_allclose(inputs.K_prev[0], CAMERA.K)
+
+
+def test_halving_keeps_the_pixel_centre_convention():
+    flow = np.full((4, 8, 2), (2.0, -3.0), np.float32)
+    inputs = assemble_inputs(make_pair(flow=flow), (2, 2))
+    # s_x = 1/4, s_y = 1/2; c' = s (c + 0.5) - 0.5
+    expected = [[5.0, 0, 0.5], [0, 12.5, 0.5], [0, 0, 1]]
+    np.testing.assert_allclose(inputs.K_prev[0], expected)
+    np.testing.assert_allclose(inputs.K_curr[0], expected)
+    np.testing.assert_allclose(inputs.flow_px[0].flatten(1).T, [[0.5, -1.5]] * 4, rtol=1e-6)
+
+
+def test_flow_depth_and_ray_belong_to_one_measured_pixel():
+    pair = make_pair()
+    inputs = assemble_inputs(pair, (2, 2))
+    # The centre of target pixel (0, 0) is native (1.5, 0.5); the tie goes to (2, 1).
+    assert inputs.depth_prev[0, 0, 0].item() == pair.prev.depth[1, 2]
+    assert inputs.rays[0, :, 0, 0].tolist() == pytest.approx([(2 - 3.5) / 20, (1 - 1.5) / 25])
+    np.testing.assert_allclose(inputs.flow_px[0, :, 0, 0], pair.flow[1, 2] * [0.25, 0.5], rtol=1e-6)
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    height=st.integers(1, 20),
+    width=st.integers(1, 20),
+    size=st.tuples(st.integers(1, 24), st.integers(1, 24)),
+    seed=st.integers(0, 1000),
+)
+def test_any_size_stays_within_half_a_target_pixel(height, width, size, seed):
+    camera = Camera(20, 25, (width - 1) / 2, (height - 1) / 2, height, width)
+    inputs = assemble_inputs(make_pair(height, width, camera, seed), size)
+    assert inputs.flow.shape == (1, 2, *size)
+    K = inputs.K_prev[0]
+    u = inputs.rays[0, 0] * K[0, 0] + K[0, 2]
+    v = inputs.rays[0, 1] * K[1, 1] + K[1, 2]
+    # Nearest: half a native pixel away at most, counted in target pixels.
+    assert (u - torch.arange(size[1])).abs().max() <= 0.5 * size[1] / width + 1e-3
+    assert (v - torch.arange(size[0])[:, None]).abs().max() <= 0.5 * size[0] / height + 1e-3
+
+
+def test_a_rigid_scene_keeps_its_equation_after_resizing():
+    camera_prev = Camera(300, 300, 160, 110, 218, 320)
+    camera_curr = Camera(310, 310, 158, 108, 218, 320)
+    v, u = np.mgrid[0:218, 0:320]
+    depth = 4 + 0.005 * u + 0.003 * v
+    T = make_transform(euler_deg_to_matrix(np.array([0.5, -1, 0.3])), np.array([0.1, -0.05, 0.2]))
+    flow = ego_flow(depth, T, camera_prev, camera_curr).astype(np.float32)
+    depth = depth.astype(np.float32)
+    pair = FramePair(Frame(None, depth, camera_prev), Frame(None, depth, camera_curr), flow)
+    inputs = assemble_inputs(pair, (128, 256))
+    # F = pi(K', M D ray) - K ray, with the ray of the pixel that was taken: exact to float32.
+    X = torch.cat([inputs.rays, torch.ones(1, 1, 128, 256)], dim=1) * inputs.depth_prev[:, None]
+    R, t = (torch.tensor(x, dtype=torch.float32) for x in (T[:3, :3], T[:3, 3]))
+    moved = torch.einsum("ij,bjhw->bihw", R, X) + t[None, :, None, None]
+
+    def pixels(K, x):
+        return torch.einsum("bij,bjhw->bihw", K, x / x[:, 2:])[:, :2]
+
+    expected = pixels(inputs.K_curr, moved) - pixels(inputs.K_prev, X)
+    torch.testing.assert_close(inputs.flow_px, expected, atol=2e-4, rtol=0)
+
+
+@pytest.mark.parametrize("damage", [np.nan, np.inf, -np.inf])
+def test_damaged_flow_is_zero_and_marked(damage):
+    pair = make_pair()
+    flow = pair.flow.copy()
+    flow[1, 2, 0] = damage
+    inputs = assemble_inputs(replace(pair, flow=flow), (4, 8))
+    assert inputs.flow[0, :, 1, 2].tolist() == [0, 0]
+    assert inputs.inverse_depth[0, 1, 1, 2] == 0
+    assert not inputs.valid[0, 1, 2]
+    assert inputs.valid.sum() == 31
+
+
+@pytest.mark.parametrize("damage", [np.nan, np.inf, -np.inf, 0.0, -2.0, 1e-30])
+def test_damaged_depth_is_zero_and_marked(damage):
+    pair = make_pair(flow=np.zeros((4, 8, 2), np.float32))
+    prev, curr = pair.prev.depth.copy(), pair.curr.depth.copy()
+    prev[1, 2] = damage
+    curr[3, 4] = damage
+    pair = replace(pair, prev=replace(pair.prev, depth=prev), curr=replace(pair.curr, depth=curr))
+    inputs = assemble_inputs(pair, (4, 8))
+    assert inputs.inverse_depth[0, 0, 1, 2] == 0
+    assert inputs.inverse_depth[0, 1, 3, 4] == 0
+    assert not inputs.valid[0, 1, 2]
+    assert inputs.valid[0, 3, 4]
+    for field in fields(NetworkInputs):
+        assert torch.isfinite(getattr(inputs, field.name)).all()
+
+
+def test_masks_are_respected():
+    flow_valid, mask = np.ones((2, 4, 8), bool)
+    flow_valid[0, 0] = mask[1, 1] = False
+    pair = make_pair(flow=np.ones((4, 8, 2), np.float32), flow_valid=flow_valid)
+    curr_mask = np.ones((4, 8), bool)
+    curr_mask[3, 3] = False
+    pair = replace(
+        pair, prev=replace(pair.prev, mask=mask), curr=replace(pair.curr, mask=curr_mask)
+    )
+    inputs = assemble_inputs(pair, (4, 8))
+    assert not inputs.valid[0, 0, 0] and not inputs.valid[0, 1, 1]
+    assert inputs.valid.sum() == 30
+    assert inputs.inverse_depth[0, 1, 2, 2] == 0  # lands on the masked pixel (3, 3)
+
+
+def test_missing_flow_or_depth_is_all_invalid_and_finite():
+    pair = make_pair()
+    for broken in (
+        replace(pair, flow=None),
+        replace(pair, prev=replace(pair.prev, depth=None)),
+    ):
+        inputs = assemble_inputs(broken, (8, 8))
+        assert not inputs.valid.any()
+        assert all(torch.isfinite(getattr(inputs, f.name)).all() for f in fields(inputs))
+    inputs = assemble_inputs(replace(pair, curr=replace(pair.curr, depth=None)), (4, 8))
+    assert inputs.valid.all()
+    assert (inputs.inverse_depth[:, 1] == 0).all()
+
+
+def test_sequences_and_batches_equal_single_pairs():
+    pairs = [make_pair(seed=1), replace(make_pair(seed=2), flow=None), make_pair(seed=3)]
+    together = assemble_inputs(pairs, (8, 16))
+    assert len(together) == 3
+    batch = PairBatch(
+        flow=torch.stack(
+            [
+                torch.full((4, 8, 2), torch.nan) if p.flow is None else torch.tensor(p.flow)
+                for p in pairs
+            ]
+        ),
+        depth_prev=torch.stack([torch.tensor(p.prev.depth) for p in pairs]),
+        K_prev=torch.tensor(CAMERA.K, dtype=torch.float32).repeat(3, 1, 1),
+        K_curr=torch.tensor(CAMERA.K, dtype=torch.float32).repeat(3, 1, 1),
+        depth_curr=torch.stack([torch.tensor(p.curr.depth) for p in pairs]),
+    )
+    batched = assemble_inputs(batch, (8, 16))
+    for i, pair in enumerate(pairs):
+        alone = assemble_inputs(pair, (8, 16))
+        for field in fields(NetworkInputs):
+            assert torch.equal(getattr(together, field.name)[i], getattr(alone, field.name)[0])
+            assert torch.equal(getattr(batched, field.name)[i], getattr(alone, field.name)[0])
+
+
+def test_pairs_of_different_sizes_share_a_batch():
+    other = make_pair(6, 6, Camera(10, 10, 3, 3, 6, 6))
+    assert assemble_inputs([make_pair(), other], (8, 8)).flow.shape == (2, 2, 8, 8)
+
+
+def test_aligned_depth_is_taken_as_it_is():
+    generator = torch.Generator().manual_seed(0)
+    flow = torch.randn(2, 4, 8, 2, generator=generator)
+    prev, curr = 1 + torch.rand(2, 2, 4, 8, generator=generator)
+    K = torch.tensor(CAMERA.K, dtype=torch.float32).repeat(2, 1, 1)
+    inputs = assemble_aligned(flow, prev, curr, K)
+    assert torch.equal(inputs.depth_curr, curr)
+    torch.testing.assert_close(inputs.flow_px, flow.permute(0, 3, 1, 2))
+    assert torch.equal(inputs.K_curr, K)
+    still = assemble_inputs(PairBatch(0 * flow, prev, K, K, depth_curr=curr), (4, 8))
+    torch.testing.assert_close(still.inverse_depth, inputs.inverse_depth)
+    torch.testing.assert_close(still.rays, inputs.rays)
+
+
+def test_read_only_and_flipped_arrays_are_taken():
+    flow = np.zeros((4, 8, 2), np.float32)[::-1, ::-1]
+    depth = np.ones((4, 8), np.float32)
+    depth.flags.writeable = False
+    frame = Frame(None, depth, CAMERA)
+    assert assemble_inputs(FramePair(frame, frame, flow), (4, 8)).valid.all()
+
+
+def test_assembling_changes_nothing_in_the_pair():
+    pair = make_pair()
+    before = pair.flow.copy(), pair.prev.depth.copy(), pair.curr.depth.copy()
+    assemble_inputs(pair, (4, 8)).flow.add_(1)
+    for a, b in zip(before, (pair.flow, pair.prev.depth, pair.curr.depth), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_gradients_flow_to_the_batch():
+    flow = torch.zeros(1, 4, 8, 2, requires_grad=True)
+    depth = torch.ones(1, 4, 8)
+    depth[0, 0, 0] = torch.nan
+    depth.requires_grad_()
+    K = torch.tensor(CAMERA.K, dtype=torch.float32)[None]
+    inputs = assemble_inputs(PairBatch(flow, depth, K, K), (4, 8))
+    (inputs.flow.sum() + inputs.inverse_depth.sum()).backward()
+    assert torch.isfinite(flow.grad).all() and torch.isfinite(depth.grad).all()
+
+
+def test_moving_to_a_type_keeps_the_mask():
+    inputs = assemble_inputs(make_pair(), (4, 8)).to(torch.float64)
+    assert inputs.flow.dtype == torch.float64
+    assert inputs.valid.dtype == torch.bool
+
+
+def test_bad_arguments_are_refused():
+    for thing in (None, [], [1, 2], np.zeros((4, 8, 2))):
+        with pytest.raises(InputError, match="FramePair"):
+            assemble_inputs(thing)
+    for size in ((0, 8), (4,), (4.5, 8), None, "48"):
+        with pytest.raises(InputError, match="size"):
+            assemble_inputs(make_pair(), size)
+    flow, depth, K = torch.zeros(1, 4, 8, 2), torch.ones(1, 4, 8), torch.eye(3)[None]
+    good = PairBatch(flow, depth, K, K)
+    for changes in (
+        {"flow": flow.permute(0, 3, 1, 2)},
+        {"flow": flow.long()},
+        {"flow": flow.numpy()},
+        {"flow": flow[:0], "depth_prev": depth[:0], "K_prev": K[:0], "K_curr": K[:0]},
+        {"depth_prev": depth[:, :2]},
+        {"depth_prev": None},
+        {"depth_prev": depth.int()},
+        {"depth_curr": depth[0]},
+        {"K_prev": K[0]},
+        {"K_curr": K.repeat(2, 1, 1)},
+        {"valid": depth},
+        {"valid": depth[:, :2] > 0},
+    ):
+        with pytest.raises(InputError, match="PairBatch"):
+            assemble_inputs(replace(good, **changes))
+
+
+def test_a_real_pair(shared_data):
+    """Any Sintel-sized pair: the layout of the shared data decides whether there is one."""
+    flows = sorted(shared_data.rglob("*.flo"))
+    if not flows:
+        pytest.skip("no .flo file in the shared data")
+    raw = np.fromfile(flows[0], np.float32)
+    width, height = np.frombuffer(raw[1:3].tobytes(), np.int32)
+    flow = raw[3:].reshape(height, width, 2)
+    camera = Camera(1120, 1120, (width - 1) / 2, (height - 1) / 2, int(height), int(width))
+    depth = np.full((height, width), 5.0, np.float32)
+    frame = Frame(None, depth, camera)
+    inputs = assemble_inputs(FramePair(frame, frame, flow))
+    assert inputs.flow.shape == (1, 2, 128, 256)
+    assert torch.isfinite(inputs.flow).all()
