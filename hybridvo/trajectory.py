@@ -56,8 +56,10 @@ _logger = logging.getLogger(__name__)
 
 def _orthonormality_error(R: np.ndarray) -> np.ndarray:
     """(...,) largest entry of |R^T R - I| of (..., 3, 3); 2 or more for a reflection."""
-    error = np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)).max(axis=(-1, -2))
-    return np.where(np.linalg.det(R) > 0, error, error + 2.0)
+    with np.errstate(over="ignore", invalid="ignore"):
+        error = np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)).max(axis=(-1, -2))
+        error = np.where(np.linalg.det(R) > 0, error, error + 2.0)
+    return np.nan_to_num(error, nan=np.inf)
 
 
 def _nearest_rotation(R: np.ndarray) -> np.ndarray:
@@ -354,7 +356,7 @@ def _read_rows(path: Path, format: Format) -> tuple[str, np.ndarray, list[int]]:
 
 
 def _quaternions_to_matrices(path: Path, xyzw: np.ndarray, lines: list[int]) -> np.ndarray:
-    norms = np.linalg.norm(xyzw, axis=1)
+    norms = np.hypot(np.hypot(xyzw[:, 0], xyzw[:, 1]), np.hypot(xyzw[:, 2], xyzw[:, 3]))
     bad = np.abs(norms - 1.0) > _QUATERNION_NORM_TOLERANCE
     if bad.any():
         index = int(np.argmax(bad))
