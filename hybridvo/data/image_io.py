@@ -400,15 +400,11 @@ def _decode(path: str | os.PathLike[str], flags: int) -> np.ndarray:
         )
     try:
         # Ignore EXIF rotation: the intrinsics belong to the pixels as they are stored.
-        image = cv2.imdecode(
-            np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION
-        )
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error as error:
         raise FormatError(f"{path}: the image cannot be decoded ({error.err}).") from None
     if image is None:
-        raise FormatError(
-            f"{path}: the image cannot be decoded. Copy or download the file again."
-        )
+        raise FormatError(f"{path}: the image cannot be decoded. Copy or download the file again.")
     return image
 
 
@@ -452,7 +448,7 @@ def read_mask_png(path: str | os.PathLike[str]) -> np.ndarray:
     Raises:
         FormatError: damaged or of another format. FileNotFoundError: no such file.
     """
-    return _decode(path, cv2.IMREAD_GRAYSCALE) > 0
+    return np.asarray(_decode(path, cv2.IMREAD_GRAYSCALE) > 0)
 
 
 def read_depth_rgba_png(path: str | os.PathLike[str]) -> np.ndarray:
@@ -482,7 +478,7 @@ def read_flow_kitti_png(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.nd
     """
     image = _decode_exact(path, np.uint16, 3, "a 16-bit flow PNG")
     flow = _flow_from_png16(image[:, :, 2:0:-1])
-    valid = image[:, :, 0] > 0
+    valid = np.asarray(image[:, :, 0] > 0)
     flow[~valid] = np.nan
     return flow, valid
 
@@ -493,7 +489,8 @@ def write_flow_kitti_png(
     """Write (H, W, 2) flow in pixels as a KITTI 16-bit PNG (1/64 px steps, |flow| < 512 px).
 
     Args:
-        path: file to write. flow: pixels; values that are not finite or too long become invalid.
+        path: file to write.
+        flow: pixels; values that are not finite or too long become invalid.
         valid: (H, W) bool, or None for all valid.
 
     Raises:
@@ -546,9 +543,7 @@ def image_size(path: str | os.PathLike[str]) -> tuple[int, int]:
         return _png_header(data, path)[:2]
     if head[:2] == JPEG_MAGIC:
         return _jpeg_header(data, path)[:2]
-    raise FormatError(
-        f"{path}: expected a PNG, JPEG, .npy, .flo or .dpt file, got bytes {head!r}."
-    )
+    raise FormatError(f"{path}: expected a PNG, JPEG, .npy, .flo or .dpt file, got bytes {head!r}.")
 
 
 def read_text(path: str | os.PathLike[str], *, limit: int = 2**26) -> str:
