@@ -204,6 +204,8 @@ class Sample:
         depth_curr: (H, W) float32 metres of t+1 **on the grid of t** (what lies at x + flow); 0 is
             invalid.
         depth_true: (H, W) float32 metres of t without noise or holes; 0 where there is none (sky).
+        depth_target: (H, W) float32 metres, what L^D compares with; 0 where there is none. The paper's
+            five steps include the object's own motion here; ``wide`` means the camera's alone.
         K: (3, 3) float32 intrinsics of both frames.
         T_curr_prev: (4, 4) float32, points of the previous camera into the current one.
         rotation_deg, translation: (3,) float32, the same motion as Euler angles X-Y-Z in degrees
@@ -216,6 +218,7 @@ class Sample:
     depth_prev: np.ndarray
     depth_curr: np.ndarray
     depth_true: np.ndarray
+    depth_target: np.ndarray
     K: np.ndarray
     T_curr_prev: np.ndarray
     rotation_deg: np.ndarray
@@ -323,12 +326,14 @@ def paper_sample(rng: np.random.Generator, options: PaperOptions | None = None) 
         flow[box] += np.stack([u * inside, v * inside], axis=-1)
         dz[box] += np.float32(object_depth) * (ratio - 1.0) * inside
         moving |= mask
+    depth_curr = np.maximum(depth + dz, 0.0)
     return Sample(
         flow=flow,
         ego_flow=ego_flow,
         depth_prev=depth,
-        depth_curr=np.maximum(depth + dz, 0.0),
+        depth_curr=depth_curr,
         depth_true=depth,
+        depth_target=depth_curr,
         K=np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float32),
         T_curr_prev=T.astype(np.float32),
         rotation_deg=angles.astype(np.float32),
