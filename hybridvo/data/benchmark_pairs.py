@@ -178,9 +178,9 @@ def _motion(rng: np.random.Generator, cell: Cell) -> np.ndarray:
 def _object_motion(
     rng: np.random.Generator, centre: np.ndarray, depth: float, focal: float
 ) -> np.ndarray:
-    """Rigid motion about the object's centre: 20-80 px sideways, some depth, up to 5 degrees."""
+    """Rigid motion about the object's centre: 8-70 px sideways, some depth, up to 5 degrees."""
     heading = rng.uniform(0, 2 * np.pi)
-    metres = rng.uniform(20, 80) * focal / 1120 * depth / focal
+    metres = rng.uniform(8, 70) * focal / 1120 * depth / focal
     t = metres * np.array([np.cos(heading), np.sin(heading), rng.uniform(-0.5, 0.5)])
     R = Rotation.from_rotvec(np.deg2rad(rng.uniform(0, 5)) * _direction(rng)).as_matrix()
     return make_transform(R, centre - R @ centre + t)

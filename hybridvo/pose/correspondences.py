@@ -177,6 +177,8 @@ def check_pose(
         The motion with its covariance; failed with the identity where a check says no.
     """
     if T is None or not is_rigid(T):
+        if _undetermined(data, camera):
+            return _degenerate(method, len(data.uv))
         return RelativePose.failed(
             Reason.SOLVER_DIVERGED, f"{method}: the solver found no finite rigid motion", method
         )
@@ -190,30 +192,16 @@ def check_pose(
     count = int(inlier.sum())
     ratio = count / len(inlier)
     if count < MIN_POINTS or ratio < MIN_INLIER_RATIO:
+        if _undetermined(data, camera):
+            return _degenerate(method, len(data.uv))
         message = f"{method}: {count} of {len(inlier)} sampled pixels follow the motion"
         return RelativePose.failed(Reason.LOW_INLIERS, message, method, inlier_ratio=ratio)
 
-    x, y, z = x[inlier], y[inlier], z[inlier]
-    zero = np.zeros_like(x)
-    J = np.concatenate(
-        [
-            camera.fx * np.stack([1 / z, zero, -x / z, -x * y, 1 + x * x, -y], axis=-1),
-            camera.fy * np.stack([zero, 1 / z, -y / z, -1 - y * y, x * y, x], axis=-1),
-        ]
-    )
     # metres in units of the typical depth: both halves of the tangent are then in radians
-    scale = np.array([float(np.median(z))] * 3 + [1.0] * 3)
-    information = (J * scale).T @ (J * scale)
-    values, vectors = np.linalg.eigh(information)
+    scale = np.array([float(np.median(z[inlier]))] * 3 + [1.0] * 3)
+    values, vectors = _information(moved[inlier], camera, scale)
     if values[0] <= SINGULAR_RATIO * values[-1]:
-        message = f"{method}: the {count} inliers leave a direction of the motion undetermined"
-        return RelativePose.failed(
-            Reason.DEGENERATE_GEOMETRY,
-            message,
-            method,
-            inlier_ratio=ratio,
-            information_eigenvalues=np.maximum(values, 0.0),
-        )
+        return _degenerate(method, count, ratio, np.maximum(values, 0.0))
     status = Status()
     if values[0] <= WEAK_RATIO * values[-1]:
         status = Status.degraded(
@@ -239,6 +227,42 @@ def check_pose(
         translation_direction_valid=bool(t @ np.linalg.solve(covariance[:3, :3], t) > 9.0),
         information_eigenvalues=values,
         method=method,
+    )
+
+
+def _information(
+    points: np.ndarray, camera: Camera, scale: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Ascending eigenvalues and the eigenvectors of J^T J, its columns times ``scale``."""
+    z = points[:, 2]
+    x, y, zero = points[:, 0] / z, points[:, 1] / z, np.zeros_like(z)
+    J = np.concatenate(
+        [
+            camera.fx * np.stack([1 / z, zero, -x / z, -x * y, 1 + x * x, -y], axis=-1),
+            camera.fy * np.stack([zero, 1 / z, -y / z, -1 - y * y, x * y, x], axis=-1),
+        ]
+    )
+    J *= scale
+    values, vectors = np.linalg.eigh(J.T @ J)
+    return values, vectors
+
+
+def _undetermined(data: Correspondences, camera: Camera) -> bool:
+    """Whether no solver could have found the motion: the points themselves are degenerate."""
+    scale = np.array([float(np.median(data.xyz[:, 2]))] * 3 + [1.0] * 3)
+    values, _ = _information(data.xyz, camera, scale)
+    return bool(values[0] <= SINGULAR_RATIO * values[-1])
+
+
+def _degenerate(
+    method: str, count: int, ratio: float = 0.0, eigenvalues: np.ndarray | None = None
+) -> RelativePose:
+    return RelativePose.failed(
+        Reason.DEGENERATE_GEOMETRY,
+        f"{method}: the {count} points leave a direction of the motion undetermined",
+        method,
+        inlier_ratio=ratio,
+        information_eigenvalues=np.zeros(6) if eigenvalues is None else eigenvalues,
     )
 
 
