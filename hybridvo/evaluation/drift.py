@@ -39,7 +39,7 @@ class KittiDrift:
         per_length: for each length that occurs: (length in metres, sub-paths, translation,
             rotation_deg_per_m).
         segments: number of sub-paths.
-        path_length: length of the true path, metres.
+        path_length: length of the true path, metres; None where it is not a finite number.
         start_step, averaging: how it was computed.
         reasons: why a value is None, by name of the value.
     """
@@ -48,7 +48,7 @@ class KittiDrift:
     rotation_deg_per_m: float | None
     per_length: tuple[tuple[float, int, float, float], ...]
     segments: int
-    path_length: float
+    path_length: float | None
     start_step: int
     averaging: Averaging
     reasons: dict[str, str] = field(default_factory=dict)
@@ -62,8 +62,8 @@ class KittiDrift:
                 {
                     "length_m": length,
                     "segments": count,
-                    "translation": translation,
-                    "rotation_deg_per_m": rotation,
+                    "translation": translation if np.isfinite(translation) else None,
+                    "rotation_deg_per_m": rotation if np.isfinite(rotation) else None,
                 }
                 for length, count, translation, rotation in self.per_length
             ],
@@ -75,6 +75,7 @@ class KittiDrift:
         }
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def kitti_drift(
     T_world_cam_est: np.ndarray,
     T_world_cam_true: np.ndarray,
@@ -153,7 +154,7 @@ def kitti_drift(
         rotation_deg_per_m=rotation_mean,
         per_length=tuple(per_length),
         segments=segments,
-        path_length=path_length,
+        path_length=path_length if np.isfinite(path_length) else None,
         start_step=int(start_step),
         averaging=averaging,
         reasons={"translation": reason, "rotation_deg_per_m": reason} if reason else {},

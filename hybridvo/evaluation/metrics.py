@@ -134,8 +134,7 @@ def _degeneracy(est: np.ndarray, gt: np.ndarray) -> str:
     if len(est) < MIN_POSES:
         return f"not enough poses: {len(est)} matched, an alignment needs {MIN_POSES}"
     x, y = est - est.mean(axis=0), gt - gt.mean(axis=0)
-    with np.errstate(over="ignore", invalid="ignore"):
-        size_x, size_y = np.linalg.norm(x), np.linalg.norm(y)
+    size_x, size_y = np.linalg.norm(x), np.linalg.norm(y)
     if not np.isfinite([size_x, size_y]).all():
         return "positions too large: the error is not a finite number"
     for name, positions, size in (("estimate", est, size_x), ("truth", gt, size_y)):
@@ -191,13 +190,12 @@ def _check_options(alignment: str, scale: str) -> None:
 
 def _statistics(errors: np.ndarray) -> dict[str, float] | None:
     """rmse, mean, median and max of the errors, or None where one of them is not finite."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        values = {
-            "rmse": float(np.sqrt(np.mean(errors**2))),
-            "mean": float(np.mean(errors)),
-            "median": float(np.median(errors)),
-            "max": float(np.max(errors)),
-        }
+    values = {
+        "rmse": float(np.sqrt(np.mean(errors**2))),
+        "mean": float(np.mean(errors)),
+        "median": float(np.median(errors)),
+        "max": float(np.max(errors)),
+    }
     return values if np.isfinite(list(values.values())).all() else None
 
 
@@ -208,11 +206,11 @@ def _ape(est: Any, gt: Any) -> np.ndarray:
     from evo.core.metrics import APE, PoseRelation
 
     metric = APE(PoseRelation.translation_part)
-    with np.errstate(over="ignore", invalid="ignore"):
-        metric.process_data((gt, est))
+    metric.process_data((gt, est))
     return np.asarray(metric.error, dtype=np.float64)
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def ate(
     est: Trajectory,
     gt: Trajectory,
@@ -282,6 +280,7 @@ def ate(
     )
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def rpe(
     est: Trajectory,
     gt: Trajectory,
@@ -328,8 +327,7 @@ def rpe(
         found = []
         for relation in (PoseRelation.translation_part, PoseRelation.rotation_angle_deg):
             metric = RPE(relation, int(delta), Unit.frames, all_pairs=True)
-            with np.errstate(over="ignore", invalid="ignore"):
-                metric.process_data((gt_path, est_path))
+            metric.process_data((gt_path, est_path))
             found.append(_statistics(np.asarray(metric.error, dtype=np.float64)))
         trans, rot = found
     values: dict[str, float | None] = {}
@@ -353,6 +351,7 @@ def rpe(
     )
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def evaluate_trajectories(
     est: Trajectory,
     gt: Trajectory,
@@ -403,11 +402,13 @@ def evaluate_trajectories(
         "max_time_difference_s": match.max_diff,
         "poses_estimate": len(est),
         "poses_truth": len(gt),
-        "length_estimate_m": est.length,
-        "length_truth_m": gt.length,
         "evo_version": main.evo_version,
     }
     reasons: dict[str, str] = {}
+    for key, trajectory in (("length_estimate_m", est), ("length_truth_m", gt)):
+        report[key] = trajectory.length if np.isfinite(trajectory.length) else None
+        if report[key] is None:
+            reasons[key] = _NOT_FINITE
 
     def put(key: str, result: AbsoluteError | RelativeError, name: str) -> None:
         report[key] = getattr(result, name)
