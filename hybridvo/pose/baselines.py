@@ -9,6 +9,7 @@ six degrees of freedom. Bad data gives a failed status, never an exception and n
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 import time
 from collections.abc import Callable
@@ -42,6 +43,8 @@ __all__ = [
 ]
 
 Estimator = Callable[..., RelativePose]
+
+POSELIB_REMEDY = "PoseLib is not installed; pip install 'hybridvo[baselines]'"
 
 _IDENTITY_COVARIANCE = np.diag([1.0] * 3 + [0.1] * 3)
 _NO_DISTORTION = np.zeros(4)
@@ -133,7 +136,7 @@ def poselib(pair: FramePair, *, seed: int = 0, points: int = POINTS) -> Relative
     try:
         import poselib as library
     except ImportError:
-        raise InputError(f"poselib: {missing().get('poselib', 'cannot be imported')}.") from None
+        raise InputError(f"poselib: {POSELIB_REMEDY}.") from None
 
     def solve(data: Correspondences, camera: Camera, seed: int) -> np.ndarray | None:
         model = {
@@ -182,12 +185,19 @@ def baselines() -> dict[str, Estimator]:
 def missing() -> dict[str, str]:
     """Name -> reason and remedy, of every baseline that cannot run here."""
     absent = {}
-    if importlib.util.find_spec("poselib") is None:
-        absent["poselib"] = "PoseLib is not installed; pip install 'hybridvo[baselines]'"
+    for name, library, remedy in (
+        ("poselib", "poselib", POSELIB_REMEDY),
+        ("open3d-rgbd", "open3d", REMEDIES["open3d-rgbd"]),
+    ):
+        if importlib.util.find_spec(library) is None:
+            absent[name] = remedy
+            continue
+        try:
+            importlib.import_module(library)
+        except ImportError as error:  # Open3D without its system libraries
+            absent[name] = f"{library} is installed but cannot be imported: {error}; {remedy}"
     if not hasattr(cv2, "Odometry"):
         absent["opencv-rgbd"] = REMEDIES["opencv-rgbd"]
-    if importlib.util.find_spec("open3d") is None:
-        absent["open3d-rgbd"] = REMEDIES["open3d-rgbd"]
     return absent
 
 

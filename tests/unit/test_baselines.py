@@ -523,6 +523,16 @@ def test_f44_absent_library_says_what_to_install(monkeypatch, name):
         function(_pair())
 
 
+def test_f44_broken_library_is_missing_too(monkeypatch):
+    def broken(name):
+        raise ImportError("libusb-1.0.so.0: cannot open shared object file")
+
+    monkeypatch.setattr(module.importlib.util, "find_spec", lambda _: object())
+    monkeypatch.setattr(module.importlib, "import_module", broken)
+    assert "libusb" in missing()["open3d-rgbd"] and "pip install" in missing()["open3d-rgbd"]
+    assert "open3d-rgbd" not in baselines()
+
+
 def test_opencv_4_has_no_rgbd_odometry(monkeypatch):
     monkeypatch.delattr(cv2, "Odometry", raising=False)
     assert "pip install" in missing()["opencv-rgbd"]

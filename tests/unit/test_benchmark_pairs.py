@@ -61,6 +61,16 @@ def test_static_pixels_follow_the_camera_and_moving_ones_do_not():
     assert np.median(error[truth["moving"]]) > 8.0
 
 
+def test_no_object_rivals_the_world():
+    """In ``moving70`` 30 % stand still: no rigid object may cover as much."""
+    for seed in range(6):
+        _, truth = make_pair("moving70", seed, height=109, width=256)
+        label_map = truth["object"]
+        shares = np.bincount(label_map.ravel(), minlength=6) / label_map.size
+        assert shares[0] == pytest.approx(0.3, abs=0.02)
+        assert len(shares) == 6 and shares[1:].max() < 0.26
+
+
 def test_one60_is_one_object_on_most_of_the_picture():
     _, truth = make_pair("one60", 1)
     assert label(truth["moving"])[1] == 1
