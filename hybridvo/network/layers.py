@@ -85,12 +85,17 @@ class ResidualBlock(nn.Module):
 
 
 class InputBranches(nn.Module):
-    """The three inputs side by side: flow as it is, depths and rays through a 1x1 convolution."""
+    """The three inputs side by side: flow as it is, depths and rays through a 1x1 convolution.
+
+    Args:
+        flow_gain: factor on the normalised flow.
+    """
 
     out_channels = 2 + 2 * BRANCH_CHANNELS
 
-    def __init__(self) -> None:
+    def __init__(self, flow_gain: float = 1.0) -> None:
         super().__init__()
+        self.flow_gain = flow_gain
         self.depth = nn.Conv2d(2, BRANCH_CHANNELS, 1)
         self.rays = nn.Conv2d(2, BRANCH_CHANNELS, 1)
 
@@ -104,7 +109,7 @@ class InputBranches(nn.Module):
                 (inputs.rays, "rays"),
             )
         )
-        branches = [flow, F.elu(self.depth(depth)), F.elu(self.rays(rays))]
+        branches = [self.flow_gain * flow, F.elu(self.depth(depth)), F.elu(self.rays(rays))]
         return torch.cat([x.to(branches[1].dtype) for x in branches], dim=1)
 
     @staticmethod

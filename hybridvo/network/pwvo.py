@@ -52,6 +52,9 @@ class NetworkOptions:
         head_stride: 1 = predictions at the resolution of the input, 2 = at half of it, without the
             decoder's last stage: the same pose at about half the time on a CPU.
         uncertainty: whether the pixel-wise network has an uncertainty head.
+        flow_gain: factor in (0, 1000] on the normalised flow (px / 200) inside the network. 1 as
+            published; with 10 a flow of a few pixels enters with the size of the other inputs,
+            which short trainings need.
 
     Raises:
         InputError: a value outside of what is listed.
@@ -62,6 +65,7 @@ class NetworkOptions:
     decoders: int = 1
     head_stride: int = 1
     uncertainty: bool = True
+    flow_gain: float = 1.0
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
@@ -69,11 +73,13 @@ class NetworkOptions:
                 f"NetworkOptions.kind: {self.kind!r} unknown; known: {', '.join(KINDS)}. "
                 f"'pwvo-naive' and 'pixelwise' are kind='pwvo' with other losses and selection."
             )
-        number = isinstance(self.width, int | float) and not isinstance(self.width, bool)
-        if not number or not math.isfinite(self.width) or not 0 < self.width <= 4:
-            raise InputError(
-                f"NetworkOptions.width: expected a number in (0, 4], got {self.width!r}."
-            )
+        for name, most in (("width", 4), ("flow_gain", 1000)):
+            value = getattr(self, name)
+            number = isinstance(value, int | float) and not isinstance(value, bool)
+            if not number or not math.isfinite(value) or not 0 < value <= most:
+                raise InputError(
+                    f"NetworkOptions.{name}: expected a number in (0, {most}], got {value!r}."
+                )
         for name in ("decoders", "head_stride"):
             value = getattr(self, name)
             if isinstance(value, bool) or value not in (1, 2):
@@ -167,7 +173,7 @@ class PWVO(nn.Module):
         options = NetworkOptions() if options is None else options
         width, stride = options.width, options.head_stride
         self.head_stride = stride
-        self.branches = InputBranches()
+        self.branches = InputBranches(options.flow_gain)
         self.encoder = Encoder(InputBranches.out_channels, width)
         self.decoder = Decoder(self.encoder.channels, width, stride)
         self.decoder_uncertainty = (
@@ -230,7 +236,7 @@ def build_network(options: NetworkOptions | None = None) -> nn.Module:
     network: Any = (
         PWVO(options)
         if options.kind == "pwvo"
-        else VONet(options.width, attention=options.kind == "vonet-attention")
+        else VONet(options.width, options.kind == "vonet-attention", options.flow_gain)
     )
     network.options = options
     return network

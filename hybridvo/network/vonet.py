@@ -36,11 +36,12 @@ class VONet(nn.Module):
     Args:
         width: factor on all channel counts of the encoder.
         attention: self-attention on the embedding (the paper's "VONet + self-att.").
+        flow_gain: factor on the normalised flow.
     """
 
-    def __init__(self, width: float = 1.0, attention: bool = False) -> None:
+    def __init__(self, width: float = 1.0, attention: bool = False, flow_gain: float = 1.0) -> None:
         super().__init__()
-        self.branches = InputBranches()
+        self.branches = InputBranches(flow_gain)
         self.encoder = Encoder(InputBranches.out_channels, width, inner_activation=False)
         channels = self.encoder.channels[-1]
         self.attention = SelfAttention(channels) if attention else nn.Identity()

@@ -193,11 +193,13 @@ def _read_header(path: Path, metadata: Mapping[str, str]) -> tuple[NetworkOption
         if not isinstance(parsed[key], dict):
             raise CheckpointError(f"{path}: expected the header's {key!r} to be a JSON object.")
     names = {field.name for field in fields(NetworkOptions)}
-    if set(parsed["options"]) != names:
+    unknown = set(parsed["options"]) - names
+    if unknown:
         raise CheckpointError(
-            f"{path}: expected the options {sorted(names)} in the header, got "
-            f"{sorted(parsed['options'])}. Was it written by another version of hybridvo?"
+            f"{path}: unknown network options {sorted(unknown)}; known: {sorted(names)}. Was it "
+            f"written by a later version of hybridvo?"
         )
+    # An option that is younger than the file has its default, which is what the file was made with.
     try:
         return NetworkOptions(**parsed["options"]), parsed["card"]
     except (InputError, TypeError) as error:

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 from dataclasses import fields, replace
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -264,16 +265,23 @@ def test_bad_arguments_are_refused():
 
 
 def test_a_real_pair(shared_data):
-    """Any Sintel-sized pair: the layout of the shared data decides whether there is one."""
-    flows = sorted(shared_data.rglob("*.flo"))
-    if not flows:
-        pytest.skip("no .flo file in the shared data")
-    raw = np.fromfile(flows[0], np.float32)
-    width, height = np.frombuffer(raw[1:3].tobytes(), np.int32)
-    flow = raw[3:].reshape(height, width, 2)
-    camera = Camera(1120, 1120, (width - 1) / 2, (height - 1) / 2, int(height), int(width))
-    depth = np.full((height, width), 5.0, np.float32)
-    frame = Frame(None, depth, camera)
-    inputs = assemble_inputs(FramePair(frame, frame, flow))
-    assert inputs.flow.shape == (1, 2, 128, 256)
-    assert torch.isfinite(inputs.flow).all()
+    """TartanAir v2: the second depth, fetched along the true flow, is that of the same points."""
+    root = shared_data / "tartanair_v2" / "P000"
+    if not root.is_dir():
+        pytest.skip("no TartanAir v2 sequence in the shared data")
+    depths = [
+        cv2.imread(str(p), cv2.IMREAD_UNCHANGED).view("<f4").squeeze()
+        for p in sorted((root / "depth_lcam_front").glob("*.png"))[:2]
+    ]
+    raw = cv2.imread(str(min((root / "flow_lcam_front").glob("*.png"))), cv2.IMREAD_UNCHANGED)
+    flow = (raw[..., :2].astype(np.float32) - 32768) / 64
+    height, width = depths[0].shape
+    camera = Camera(width / 2, width / 2, (width - 1) / 2, (height - 1) / 2, height, width)
+    pair = FramePair(Frame(None, depths[0], camera), Frame(None, depths[1], camera), flow)
+    inputs = assemble_inputs(pair)
+    assert inputs.valid.float().mean() > 0.95
+    # Within 5 % where x + F is visible: measured 98.4 % of the pixels, but 90.5 % without the flow
+    # and 59.0 % with u and v swapped.
+    both = inputs.valid & (inputs.inverse_depth[:, 1] > 0)
+    ratio = (inputs.depth_curr / inputs.depth_prev)[both]
+    assert ((ratio - 1).abs() < 0.05).float().mean() > 0.97

@@ -253,6 +253,14 @@ def test_damaged_card(saved, card):
     refuses(saved, "card")
 
 
+def test_options_younger_than_the_file_have_their_default(saved):
+    options = {"kind": "pwvo", "width": 0.125, "uncertainty": True}
+    rewrite(saved, metadata={"options": json.dumps(options)})
+    assert load_weights(saved)[0].options == OPTIONS
+    rewrite(saved, metadata={"options": json.dumps({**options, "depth": 3})})
+    refuses(saved, "unknown network options ['depth']")
+
+
 def test_pretrained_names_what_is_known(tmp_path, monkeypatch, network):
     monkeypatch.setattr(weights, "SHIPPED", tmp_path)
     with pytest.raises(CheckpointError, match="No weights are shipped"):
