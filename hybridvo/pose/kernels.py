@@ -1,0 +1,453 @@
+"""Numba kernels of the refinement: one pass over the pixels gives the 6x6 normal equations.
+
+The same definition as :mod:`hybridvo.pose.residuals` (torch); a test holds both equal. Pixels are
+gathered into short structure-of-arrays buffers that stay in the L1 cache, and branch-free loops sum
+over them in float32 per block, float64 in total. Nothing here changes thread settings.
+
+Per pixel, with X' = T X, a = X'/Z', b = Y'/Z', i = 1/Z' (conventions of :mod:`hybridvo.types`):
+
+- residual r = (x + F) - pi(X');
+- Jacobian of pi(X') with respect to the left perturbation (translation, rotation):
+  diag(fx, fy) B, B = [[i, 0, -a i, -a b, 1 + a^2, -b], [0, i, -b i, -(1 + b^2), a b, a]];
+- q = d pi(X') / d log Z = (fx i (a tz - tx), fy i (b tz - ty));
+- covariance sf^2 v_f I + sd^2 v_d q q^T (flow noise and propagated depth noise);
+- robust weight of Geman-McClure, (c^2 / (c^2 + d^2))^2, of the squared Mahalanobis distance d^2.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, prange, types
+from numba.extending import intrinsic
+
+FASTMATH = {"reassoc", "contract", "arcp", "nsz"}  # not nnan/ninf: invalid values are tested for
+
+XN, YN, Z, MU, MV, PF, PD, W = range(8)
+"""Rows of a pixel buffer: ray x, ray y, depth, flow target u, v, inverse relative flow variance,
+relative depth variance, external weight (0 where the pixel cannot be used)."""
+BUFFER_ROWS = 8
+WORK_ROWS = 9
+BLOCK = 512
+
+SUMS = 30
+"""Length of an accumulator: 21 upper-triangle sums of the Hessian, 6 of the gradient, cost, sum of
+robust weights, sum of external weights."""
+
+HAS_FLOW_VARIANCE, HAS_DEPTH_VARIANCE, HAS_WEIGHTS, HAS_VALID = 1, 2, 4, 8
+
+MIN_DEPTH = np.float32(1e-6)
+MAX_VALUE = np.float32(1e9)
+ONE = np.float32(1.0)
+ZERO = np.float32(0.0)
+
+
+@intrinsic
+def keep_apart(typing_context):
+    """Forbid LLVM to inline the calling function.
+
+    Inlined into a loop over rows its reductions are no longer recognised and the vector code is
+    lost (measured: 27 ns a pixel instead of 4).
+    """
+
+    def codegen(context, builder, signature, args):
+        builder.function.attributes.add("noinline")
+        return context.get_dummy_value()
+
+    return types.none(), codegen
+
+
+@njit(fastmath=FASTMATH, error_model="numpy", cache=True)
+def gather_row(v, data, camera, flags, scale, buf):
+    """Fill ``buf`` with the whole row ``v`` of the picture.
+
+    ``data`` = (depth, flow, flow_variance, depth_variance, weights, valid), each (H, W) but the
+    flow, (H, W, 2); absent ones are dummies, as ``flags`` says. ``camera`` = (1/fx, 1/fy, cx, cy)
+    of the previous frame. ``scale`` = (typical flow variance, typical depth variance). Unusable
+    pixels get weight 0 and harmless values.
+    """
+    keep_apart()
+    depth, flow, flow_variance, depth_variance, weights, valid = data
+    ifx, ify, cx, cy = camera[0], camera[1], camera[2], camera[3]
+    vf = np.float32(v)
+    yn = (vf - cy) * ify
+    zrow = depth[v]
+    frow = flow[v]
+    n = zrow.shape[0]
+    b_x, b_y, b_z, b_u, b_v = buf[XN], buf[YN], buf[Z], buf[MU], buf[MV]
+    b_f, b_d, b_w = buf[PF], buf[PD], buf[W]
+    for k in range(n):
+        b_x[k] = (np.float32(k) - cx) * ifx
+        b_y[k] = yn
+    for k in range(n):
+        b_u[k] = frow[k, 0] + np.float32(k)
+        b_v[k] = frow[k, 1] + vf
+    for k in range(n):
+        z = zrow[k]
+        mu = b_u[k]
+        mv = b_v[k]
+        good = (z > MIN_DEPTH) & (z < MAX_VALUE) & (abs(mu) < MAX_VALUE) & (abs(mv) < MAX_VALUE)
+        b_z[k] = z if good else ONE
+        b_u[k] = mu if good else ZERO
+        b_v[k] = mv if good else ZERO
+        b_w[k] = ONE if good else ZERO
+    if flags & HAS_FLOW_VARIANCE:
+        row = flow_variance[v]
+        for k in range(n):
+            p = row[k]
+            good = (p > ZERO) & (p < MAX_VALUE)
+            b_f[k] = scale[0] / (p if good else ONE)
+            b_w[k] = b_w[k] if good else ZERO
+    else:
+        for k in range(n):
+            b_f[k] = ONE
+    if flags & HAS_DEPTH_VARIANCE:
+        row = depth_variance[v]
+        for k in range(n):
+            p = row[k]
+            good = (p >= ZERO) & (p < MAX_VALUE)
+            b_d[k] = (p if good else ONE) / scale[1]
+            b_w[k] = b_w[k] if good else ZERO
+    else:
+        for k in range(n):
+            b_d[k] = ONE
+    if flags & HAS_WEIGHTS:
+        row = weights[v]
+        for k in range(n):
+            p = row[k]
+            b_w[k] = b_w[k] * (p if (p > ZERO) & (p < MAX_VALUE) else ZERO)
+    if flags & HAS_VALID:
+        vrow = valid[v]
+        for k in range(n):
+            b_w[k] = b_w[k] if vrow[k] else ZERO
+
+
+@njit(fastmath=FASTMATH, error_model="numpy", cache=True)
+def gather_grid(stride, data, camera, flags, scale, out):
+    """Gather every ``stride``-th pixel of both axes into ``out`` (BUFFER_ROWS, h w).
+
+    The grid starts half a stride in, so that its centre is that of the picture. Returns (h, w).
+    """
+    H, width = data[0].shape
+    first = stride // 2
+    h = (H - first + stride - 1) // stride
+    w = (width - first + stride - 1) // stride
+    buf = np.empty((BUFFER_ROWS, width), np.float32)
+    for r in range(h):
+        gather_row(first + r * stride, data, camera, flags, scale, buf)
+        for q in range(BUFFER_ROWS):
+            for k in range(w):
+                out[q, r * w + k] = buf[q, first + k * stride]
+    return h, w
+
+
+@njit(fastmath=FASTMATH, error_model="numpy", cache=True)
+def project_block(buf, o, n, R, t, K, noise, work, acc):
+    """First stage: residuals, robust weights and weighted 2x2 information of ``n`` pixels from ``o``.
+
+    ``K`` = (fx, fy, cx, cy) of the current frame; ``noise`` = (1/sf^2, sd^2, c^2); all float32.
+    ``work`` rows: a, b, i, m00, m01, m11 (information in units of B), n0, n1 (gradient), robust
+    weight without the external one (0 where unusable).
+    """
+    keep_apart()
+    fx, fy, cx, cy = K[0], K[1], K[2], K[3]
+    r00, r01, r02 = R[0, 0], R[0, 1], R[0, 2]
+    r10, r11, r12 = R[1, 0], R[1, 1], R[1, 2]
+    r20, r21, r22 = R[2, 0], R[2, 1], R[2, 2]
+    tx, ty, tz = t[0], t[1], t[2]
+    isf2, sd2, c2 = noise[0], noise[1], noise[2]
+    b_x, b_y, b_z, b_u = buf[XN][o:], buf[YN][o:], buf[Z][o:], buf[MU][o:]
+    b_v, b_f, b_d, b_w = buf[MV][o:], buf[PF][o:], buf[PD][o:], buf[W][o:]
+    A, B, I, M0, M1, M2 = work[0], work[1], work[2], work[3], work[4], work[5]
+    N0, N1, S = work[6], work[7], work[8]
+    cost = wsum = count = ZERO
+    for k in range(n):
+        xn = b_x[k]
+        yn = b_y[k]
+        z = b_z[k]
+        X = z * (r00 * xn + r01 * yn + r02) + tx
+        Y = z * (r10 * xn + r11 * yn + r12) + ty
+        Zc = z * (r20 * xn + r21 * yn + r22) + tz
+        front = Zc > MIN_DEPTH
+        i = ONE / (Zc if front else ONE)
+        wx = b_w[k] if front else ZERO
+        a = X * i
+        b = Y * i
+        ru = b_u[k] - (fx * a + cx)
+        rv = b_v[k] - (fy * b + cy)
+        qu = fx * i * (a * tz - tx)
+        qv = fy * i * (b * tz - ty)
+        ip = isf2 * b_f[k]
+        g = sd2 * b_d[k] * ip
+        kap = g / (ONE + g * (qu * qu + qv * qv))
+        dot = kap * (qu * ru + qv * rv)
+        n0 = ip * (ru - dot * qu)
+        n1 = ip * (rv - dot * qv)
+        d2 = ru * n0 + rv * n1
+        s = c2 / (c2 + d2)
+        s2 = s * s if wx > ZERO else ZERO
+        S[k] = s2
+        w = wx * s2
+        wf = w * ip
+        A[k] = a
+        B[k] = b
+        I[k] = i
+        M0[k] = wf * (ONE - kap * qu * qu) * fx * fx
+        M1[k] = -wf * kap * qu * qv * fx * fy
+        M2[k] = wf * (ONE - kap * qv * qv) * fy * fy
+        N0[k] = w * fx * n0
+        N1[k] = w * fy * n1
+        cost += wx * s * d2
+        wsum += w
+        count += wx
+    acc[27] += np.float32(0.5) * cost
+    acc[28] += wsum
+    acc[29] += count
+
+
+@njit(fastmath=FASTMATH, error_model="numpy", cache=True)
+def sum_translation(n, work, acc):
+    """Second stage: sums of the rows of H and g that belong to the translation."""
+    keep_apart()
+    A, B, I, M0, M1, M2 = work[0], work[1], work[2], work[3], work[4], work[5]
+    N0, N1 = work[6], work[7]
+    h00 = h01 = h02 = h03 = h04 = h05 = ZERO
+    h11 = h12 = h13 = h14 = h15 = ZERO
+    h22 = h23 = h24 = h25 = ZERO
+    g0 = g1 = g2 = ZERO
+    for k in range(n):
+        a = A[k]
+        b = B[k]
+        i = I[k]
+        ab = a * b
+        aa = ONE + a * a
+        bb = ONE + b * b
+        k0 = M0[k] * i
+        k1 = M1[k] * i
+        k2 = M2[k] * i
+        c02 = -(k0 * a + k1 * b)
+        c12 = -(k1 * a + k2 * b)
+        c03 = -(k0 * ab + k1 * bb)
+        c13 = -(k1 * ab + k2 * bb)
+        c04 = k0 * aa + k1 * ab
+        c14 = k1 * aa + k2 * ab
+        c05 = k1 * a - k0 * b
+        c15 = k2 * a - k1 * b
+        h00 += k0 * i
+        h01 += k1 * i
+        h11 += k2 * i
+        h02 += c02 * i
+        h12 += c12 * i
+        h03 += c03
+        h04 += c04
+        h05 += c05
+        h13 += c13
+        h14 += c14
+        h15 += c15
+        h22 -= (a * c02 + b * c12) * i
+        h23 -= a * c03 + b * c13
+        h24 -= a * c04 + b * c14
+        h25 -= a * c05 + b * c15
+        x = N0[k] * i
+        y = N1[k] * i
+        g0 += x
+        g1 += y
+        g2 -= a * x + b * y
+    acc[0] += h00
+    acc[1] += h01
+    acc[2] += h02
+    acc[3] += h03
+    acc[4] += h04
+    acc[5] += h05
+    acc[6] += h11
+    acc[7] += h12
+    acc[8] += h13
+    acc[9] += h14
+    acc[10] += h15
+    acc[11] += h22
+    acc[12] += h23
+    acc[13] += h24
+    acc[14] += h25
+    acc[21] += g0
+    acc[22] += g1
+    acc[23] += g2
+
+
+@njit(fastmath=FASTMATH, error_model="numpy", cache=True)
+def sum_rotation(n, work, acc):
+    """Third stage: sums of the rows of H and g that belong to the rotation."""
+    keep_apart()
+    A, B, M0, M1, M2 = work[0], work[1], work[3], work[4], work[5]
+    N0, N1 = work[6], work[7]
+    h33 = h34 = h35 = h44 = h45 = h55 = ZERO
+    g3 = g4 = g5 = ZERO
+    for k in range(n):
+        a = A[k]
+        b = B[k]
+        m0 = M0[k]
+        m1 = M1[k]
+        m2 = M2[k]
+        x = N0[k]
+        y = N1[k]
+        ab = a * b
+        aa = ONE + a * a
+        bb = ONE + b * b
+        c03 = m0 * ab + m1 * bb
+        c13 = m1 * ab + m2 * bb
+        c04 = m0 * aa + m1 * ab
+        c14 = m1 * aa + m2 * ab
+        c05 = m1 * a - m0 * b
+        c15 = m2 * a - m1 * b
+        h33 += ab * c03 + bb * c13
+        h34 -= ab * c04 + bb * c14
+        h35 -= ab * c05 + bb * c15
+        h44 += aa * c04 + ab * c14
+        h45 += aa * c05 + ab * c15
+        h55 += a * c15 - b * c05
+        g3 -= ab * x + bb * y
+        g4 += aa * x + ab * y
+        g5 += a * y - b * x
+    acc[15] += h33
+    acc[16] += h34
+    acc[17] += h35
+    acc[18] += h44
+    acc[19] += h45
+    acc[20] += h55
+    acc[24] += g3
+    acc[25] += g4
+    acc[26] += g5
+
+
+@njit(error_model="numpy", cache=True)
+def sum_samples(samples, n, R, t, K, noise, work, acc):
+    """Normal equations of gathered pixels, set in ``acc`` (30,) float64."""
+    acc[:] = 0.0
+    for o in range(0, n, BLOCK):
+        m = min(BLOCK, n - o)
+        project_block(samples, o, m, R, t, K, noise, work, acc)
+        sum_translation(m, work, acc)
+        sum_rotation(m, work, acc)
+
+
+@njit(error_model="numpy", cache=True)
+def sum_rows(data, camera, flags, scale, R, t, K, noise, v0, v1, out):
+    """Normal equations of the full-grid rows ``v0 .. v1 - 1``, added to ``out`` (30,)."""
+    width = data[0].shape[1]
+    buf = np.empty((BUFFER_ROWS, width), np.float32)
+    work = np.empty((WORK_ROWS, width), np.float32)
+    for v in range(v0, v1):
+        gather_row(v, data, camera, flags, scale, buf)
+        project_block(buf, 0, width, R, t, K, noise, work, out)
+        sum_translation(width, work, out)
+        sum_rotation(width, work, out)
+
+
+@njit(parallel=True, error_model="numpy", cache=True)
+def sum_grid(data, camera, flags, scale, R, t, K, noise, out):
+    """Normal equations of the full grid, row chunks in parallel: ``out`` (chunks, 30), zeroed."""
+    H = data[0].shape[0]
+    chunks = out.shape[0]
+    for c in prange(chunks):
+        v0 = c * H // chunks
+        v1 = (c + 1) * H // chunks
+        sum_rows(data, camera, flags, scale, R, t, K, noise, v0, v1, out[c])
+
+
+@njit(fastmath=FASTMATH, error_model="numpy", cache=True)
+def sum_curvature(n, external, work, c2, acc):
+    """Add the curvature of the robust weights, ``sum -2 (dw / dd^2) s s^T``, to ``acc`` (21,).
+
+    s = J^T Sigma^-1 r. Subtracted from the Gauss-Newton Hessian it gives the derivative of the
+    estimating equation, the "bread" of the sandwich covariance.
+    """
+    A, B, I, N0, N1, S = work[0], work[1], work[2], work[6], work[7], work[8]
+    row = np.empty(6, np.float64)
+    for k in range(n):
+        if S[k] < np.float32(1e-12):
+            continue
+        a, b, i, x, y = A[k], B[k], I[k], N0[k], N1[k]
+        row[0] = x * i
+        row[1] = y * i
+        row[2] = -(a * x + b * y) * i
+        row[3] = -(a * b * x + (ONE + b * b) * y)
+        row[4] = (ONE + a * a) * x + a * b * y
+        row[5] = a * y - b * x
+        # row = w s with w = x_w S, S = (c2 / (c2 + d2))^2; wanted 4 w / (c2 + d2) s s^T
+        factor = 4.0 / (c2 * external[k] * np.sqrt(S[k]))
+        q = 0
+        for p in range(6):
+            for r in range(p, 6):
+                acc[q] += factor * row[p] * row[r]
+                q += 1
+
+
+@njit(fastmath=FASTMATH, error_model="numpy", cache=True)
+def add_scores(n, work, columns):
+    """Add w s = w J^T Sigma^-1 r of ``n`` pixels to ``columns`` (6, W), pixel by pixel."""
+    keep_apart()
+    A, B, I, N0, N1 = work[0], work[1], work[2], work[6], work[7]
+    c0, c1, c2, c3, c4, c5 = columns[0], columns[1], columns[2], columns[3], columns[4], columns[5]
+    for k in range(n):
+        a = A[k]
+        b = B[k]
+        i = I[k]
+        x = N0[k]
+        y = N1[k]
+        ab = a * b
+        c0[k] += x * i
+        c1[k] += y * i
+        c2[k] -= (a * x + b * y) * i
+        c3[k] -= ab * x + (ONE + b * b) * y
+        c4[k] += (ONE + a * a) * x + ab * y
+        c5[k] += a * y - b * x
+
+
+@njit(error_model="numpy", cache=True)
+def score_rows(
+    data, camera, flags, scale, R, t, K, noise, band0, band1, tile, weights, scores, out
+):
+    """The last pass over the bands of ``tile`` rows ``band0 .. band1 - 1``.
+
+    Adds the normal equations to ``out`` (30,), writes the robust weights (without the external
+    ones) to ``weights`` (H, W) and the sum of w J^T Sigma^-1 r of each tile to ``scores`` (rows of
+    tiles, columns of tiles, 6), from which the sandwich covariance is made.
+    """
+    H, width = data[0].shape
+    buf = np.empty((BUFFER_ROWS, width), np.float32)
+    work = np.empty((WORK_ROWS, width), np.float32)
+    columns = np.empty((6, width), np.float32)
+    for band in range(band0, band1):
+        columns[:] = ZERO
+        for v in range(band * tile, min(H, (band + 1) * tile)):
+            gather_row(v, data, camera, flags, scale, buf)
+            project_block(buf, 0, width, R, t, K, noise, work, out)
+            sum_translation(width, work, out)
+            sum_rotation(width, work, out)
+            add_scores(width, work, columns)
+            weights[v] = work[8]
+        for k in range(width):
+            for q in range(6):
+                scores[band, k // tile, q] += columns[q, k]
+
+
+@njit(parallel=True, error_model="numpy", cache=True)
+def score_grid(data, camera, flags, scale, R, t, K, noise, tile, weights, scores, out):
+    """:func:`score_rows` over the whole picture; ``out`` (chunks, 30) and ``scores`` zeroed."""
+    chunks = out.shape[0]
+    bands = scores.shape[0]
+    for c in prange(chunks):
+        score_rows(
+            data,
+            camera,
+            flags,
+            scale,
+            R,
+            t,
+            K,
+            noise,
+            c * bands // chunks,
+            (c + 1) * bands // chunks,
+            tile,
+            weights,
+            scores,
+            out[c],
+        )

@@ -1,0 +1,339 @@
+"""Every strong motion in the picture, one after the other (numba).
+
+Starts come from three sources: poses that the caller hands in (identity, the last motion, a
+network's seed), robust dense fits of overlapping windows, and minimal three-pixel samples. They are
+scored at several residual scales at once, the best few are refined, and the pixels that follow the
+winner are set aside before the next round. Everything is deterministic for a seed.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from hybridvo.pose.kernels import BUFFER_ROWS, MAX_VALUE, MU, MV, XN, YN, W, Z
+from hybridvo.pose.solver import (
+    gauss_newton,
+    graduate,
+    new_work,
+    polish,
+    residual_scale,
+    robust_weights,
+    set_noise,
+)
+
+WINDOW_ROWS, WINDOW_COLUMNS = 3, 4
+MINIMAL_SAMPLES = 192
+REFINED = 4
+MAX_STARTS = 8
+
+SHARE, FLOW_NOISE, DEPTH_NOISE, SOURCE, ITERATIONS, CONVERGED, SCORE = range(7)
+FACTS = 7
+"""Columns of the table of facts of the hypotheses."""
+SOURCE_WINDOW, SOURCE_MINIMAL = 100, 101
+
+
+@njit(error_model="numpy", cache=True)
+def next_random(state):
+    """xorshift64*: a float in [0, 1)."""
+    x = state[0]
+    x ^= x >> np.uint64(12)
+    x ^= x << np.uint64(25)
+    x ^= x >> np.uint64(27)
+    state[0] = x
+    return np.float64((x * np.uint64(2685821657736338717)) >> np.uint64(11)) / 9007199254740992.0
+
+
+@njit(fastmath={"reassoc", "contract", "arcp", "nsz"}, error_model="numpy", cache=True)
+def agreement(samples, n, R, t, K):
+    """Multi-scale score of a pose: sum of weight / (1 + r^2 / s^2) over s = 0.15, 0.6, 2.4 px.
+
+    Fine scales let an exact motion win over a vague one, coarse scales keep noisy flow in play.
+    """
+    r00, r01, r02 = R[0, 0], R[0, 1], R[0, 2]
+    r10, r11, r12 = R[1, 0], R[1, 1], R[1, 2]
+    r20, r21, r22 = R[2, 0], R[2, 1], R[2, 2]
+    tx, ty, tz = t[0], t[1], t[2]
+    fx, fy, cx, cy = K[0], K[1], K[2], K[3]
+    b_x, b_y, b_z, b_u = samples[XN], samples[YN], samples[Z], samples[MU]
+    b_v, b_w = samples[MV], samples[W]
+    one = np.float32(1.0)
+    score = np.float32(0.0)
+    for k in range(n):
+        z = b_z[k]
+        Zc = z * (r20 * b_x[k] + r21 * b_y[k] + r22) + tz
+        front = Zc > np.float32(1e-6)
+        i = one / (Zc if front else one)
+        ru = b_u[k] - (fx * (z * (r00 * b_x[k] + r01 * b_y[k] + r02) + tx) * i + cx)
+        rv = b_v[k] - (fy * (z * (r10 * b_x[k] + r11 * b_y[k] + r12) + ty) * i + cy)
+        r2 = ru * ru + rv * rv
+        near = one / (one + np.float32(44.4) * r2)
+        mid = one / (one + np.float32(2.78) * r2)
+        far = one / (one + np.float32(0.174) * r2)
+        w = b_w[k] if front else np.float32(0.0)
+        score += w * (np.float32(0.3) * near + np.float32(0.4) * mid + np.float32(0.3) * far)
+    return np.float64(score)
+
+
+@njit(error_model="numpy", cache=True)
+def score_pose(samples, n, pose, K):
+    """:func:`agreement` of a (3, 4) float64 pose."""
+    return agreement(samples, n, pose[:, :3].astype(np.float32), pose[:, 3].astype(np.float32), K)
+
+
+@njit(error_model="numpy", cache=True)
+def fit_minimal(samples, pick, K, tiny, pose, work):
+    """Three pixels, six equations: a few Gauss-Newton steps from the identity, in place."""
+    noise = np.empty(3, np.float32)
+    set_noise(1.0, 0.0, 1e4, noise)
+    for k in range(3):
+        tiny[:, k] = samples[:, pick[k]]
+        tiny[W, k] = 1.0
+    pose[:, :] = 0.0
+    for i in range(3):
+        pose[i, i] = 1.0
+    gauss_newton(tiny, 3, 3.0, K, noise, 4, 1e-2, pose, work)
+    for i in range(3):
+        for j in range(4):
+            if not abs(pose[i, j]) < 1e4:
+                return False
+    return True
+
+
+@njit(error_model="numpy", cache=True)
+def draw_three(samples, n, h, w, local, state, pick):
+    """Draw three distinct usable pixels, near each other if ``local``; False where none is left."""
+    tries = 0
+    m = 0
+    while m < 3:
+        tries += 1
+        if tries > 60:
+            return False
+        if m == 0 or not local:
+            k = int(next_random(state) * n)
+        else:
+            row = pick[0] // w + int((next_random(state) - 0.5) * 0.5 * h)
+            column = pick[0] % w + int((next_random(state) - 0.5) * 0.4 * w)
+            if row < 0 or row >= h or column < 0 or column >= w:
+                continue
+            k = row * w + column
+        if k >= n or samples[W, k] < next_random(state):
+            continue
+        if (m > 0 and k == pick[0]) or (m > 1 and k == pick[1]):
+            continue
+        pick[m] = k
+        m += 1
+    return True
+
+
+@njit(error_model="numpy", cache=True)
+def fit_window(samples, h, w, r0, r1, c0, c1, K, buffer, pose, work):
+    """Robust dense fit of the usable pixels of a window, from the identity, in place."""
+    m = 0
+    total = 0.0
+    for r in range(r0, r1):
+        for c in range(c0, c1):
+            k = r * w + c
+            if samples[W, k] > 0.05:
+                for q in range(BUFFER_ROWS):
+                    buffer[q, m] = samples[q, k]
+                total += samples[W, k]
+                m += 1
+    if m < 20 or total < 12.0:
+        return False
+    pose[:, :] = 0.0
+    for i in range(3):
+        pose[i, i] = 1.0
+    scale = min(64.0, max(1.0, residual_scale(buffer, m, pose, K)))
+    graduate(buffer, m, K, scale, 0.7, 0.4, 2, pose, work)
+    for i in range(3):
+        for j in range(4):
+            if not abs(pose[i, j]) < MAX_VALUE:
+                return False
+    return True
+
+
+@njit(error_model="numpy", cache=True)
+def keep_best(pose, score, source, poses, scores, sources, similar):
+    """Insert into the list of the best distinct candidates, best first."""
+    count = scores.shape[0]
+    # a candidate that scores alike and stands close by is the same motion
+    for k in range(count):
+        if scores[k] <= 0:
+            break
+        gap = 0.0
+        for i in range(3):
+            for j in range(3):
+                gap = max(gap, abs(poses[k, i, j] - pose[i, j]))
+            gap = max(gap, similar * abs(poses[k, i, 3] - pose[i, 3]))
+        if gap < 2e-4:
+            if score <= scores[k]:
+                return
+            for q in range(k, count - 1):
+                scores[q] = scores[q + 1]
+                sources[q] = sources[q + 1]
+                poses[q] = poses[q + 1]
+            scores[count - 1] = 0.0
+            break
+    at = count
+    while at > 0 and score > scores[at - 1]:
+        at -= 1
+    if at == count:
+        return
+    for q in range(count - 1, at, -1):
+        scores[q] = scores[q - 1]
+        sources[q] = sources[q - 1]
+        poses[q] = poses[q - 1]
+    scores[at] = score
+    sources[at] = source
+    poses[at] = pose
+
+
+@njit(error_model="numpy", cache=True)
+def search_round(
+    small, sh, sw, coarse, n, K, starts, wide, cutoff, similar, state, pose, facts, work
+):
+    """One motion among the pixels that are left (their weights in row W of both sample sets).
+
+    ``small`` (sh x sw) serves starts and scores, ``coarse`` (n pixels) the refinement. ``starts``
+    (S, 3, 4) are handed in; with ``wide`` windows and minimal samples compete. Sets ``pose`` and
+    ``facts``; returns whether anything was found.
+    """
+    ns = sh * sw
+    poses = np.zeros((REFINED, 3, 4))
+    scores = np.zeros(REFINED)
+    sources = np.zeros(REFINED)
+    candidate = np.empty((3, 4))
+    for s in range(starts.shape[0]):
+        candidate[:, :] = starts[s]
+        scale = min(64.0, max(1.0, 1.5 * residual_scale(small, ns, candidate, K)))
+        graduate(small, ns, K, scale, 0.7, 0.4, 2, candidate, work)
+        keep_best(
+            candidate, score_pose(small, ns, candidate, K), s, poses, scores, sources, similar
+        )
+    if wide:
+        buffer = np.empty((BUFFER_ROWS, ns + 1), np.float32)
+        height = max(3, (2 * sh) // (WINDOW_ROWS + 1))
+        width = max(3, (2 * sw) // (WINDOW_COLUMNS + 1))
+        for i in range(WINDOW_ROWS):
+            for j in range(WINDOW_COLUMNS):
+                r0 = i * (sh - height) // (WINDOW_ROWS - 1)
+                c0 = j * (sw - width) // (WINDOW_COLUMNS - 1)
+                if fit_window(
+                    small, sh, sw, r0, min(sh, r0 + height), c0, min(sw, c0 + width), K, buffer,
+                    candidate, work,
+                ):  # fmt: skip
+                    score = score_pose(small, ns, candidate, K)
+                    keep_best(candidate, score, SOURCE_WINDOW, poses, scores, sources, similar)
+        tiny = np.empty((BUFFER_ROWS, 3), np.float32)
+        pick = np.zeros(3, np.int64)
+        for s in range(MINIMAL_SAMPLES):
+            if not draw_three(small, ns, sh, sw, s % 3 != 0, state, pick):
+                break
+            if fit_minimal(small, pick, K, tiny, candidate, work):
+                score = score_pose(small, ns, candidate, K)
+                keep_best(candidate, score, SOURCE_MINIMAL, poses, scores, sources, similar)
+    best = -1.0
+    for s in range(REFINED):
+        if scores[s] <= 0:
+            break
+        candidate[:, :] = poses[s]
+        steps = graduate(coarse, n, K, 1.5, 0.7, 0.4, 2, candidate, work)
+        sf, sd, share, more, converged = polish(
+            coarse, n, K, 0.7, 0.01, cutoff, 2, 4, candidate, work
+        )
+        score = score_pose(coarse, n, candidate, K)
+        if score > best:
+            best = score
+            pose[:, :] = candidate
+            facts[SHARE] = share
+            facts[FLOW_NOISE] = sf
+            facts[DEPTH_NOISE] = sd
+            facts[SOURCE] = sources[s]
+            facts[ITERATIONS] = steps + more
+            facts[CONVERGED] = 1.0 if converged else 0.0
+            facts[SCORE] = score
+    return best > 0
+
+
+@njit(error_model="numpy", cache=True)
+def set_aside(samples, n, pose, K, sf, sd, cutoff, work, scratch):
+    """Scale the weights of the pixels that follow ``pose`` down to what it leaves unexplained."""
+    noise = np.empty(3, np.float32)
+    set_noise(max(sf, 0.05), sd, 2.0 * cutoff, noise)
+    robust_weights(samples, n, pose, K, noise, work, scratch)
+    for k in range(n):
+        samples[W, k] *= np.float32(1.0) - scratch[k]
+
+
+@njit(error_model="numpy", cache=True)
+def find_motions(
+    small, sh, sw, coarse, n, K, starts, cutoff, decisive, least, most, similar, seed, poses, facts
+):
+    """All strong motions, in the order of their strength; returns their number.
+
+    ``decisive``: share of the usable pixels above which the first motion stands alone. ``least``:
+    smallest share of a further motion. ``most``: largest number of motions. ``poses`` (most, 3, 4)
+    and ``facts`` (most, FACTS) receive them. The weights in row W of ``small`` and ``coarse`` are
+    used up.
+    """
+    work = new_work()
+    state = np.empty(1, np.uint64)
+    state[0] = np.uint64(seed) * np.uint64(2) + np.uint64(88172645463325253)
+    all_weight = 0.0
+    for k in range(n):
+        all_weight += coarse[W, k]
+    if all_weight <= 0:
+        return 0
+    scratch = np.empty(max(n, sh * sw), np.float32)
+    none = np.empty((0, 3, 4))
+    found = 0
+    first_wide = False
+    while found < most:
+        left = 0.0
+        for k in range(n):
+            left += coarse[W, k]
+        if found > 0 and left < least * all_weight:
+            break
+        pose = poses[found]
+        fact = facts[found]
+        ok = search_round(
+            small, sh, sw, coarse, n, K, starts if found == 0 else none,
+            found > 0 or first_wide, cutoff, similar, state, pose, fact, work,
+        )  # fmt: skip
+        if not ok:
+            break
+        fact[SHARE] *= left / all_weight
+        if found == 0 and not first_wide and fact[SHARE] < decisive:
+            # the handed-in starts did not settle it: let every start compete for the first place
+            first_wide = True
+            continue
+        if found > 0 and fact[SHARE] < least:
+            break
+        found += 1
+        if found == 1 and fact[SHARE] >= decisive:
+            break
+        set_aside(coarse, n, pose, K, fact[FLOW_NOISE], fact[DEPTH_NOISE], cutoff, work, scratch)
+        set_aside(
+            small, sh * sw, pose, K, fact[FLOW_NOISE], fact[DEPTH_NOISE], cutoff, work, scratch
+        )
+    if found == 0:
+        return 0
+    return found
+
+
+@njit(error_model="numpy", cache=True)
+def translation_scale(samples, n, K):
+    """Focal length over the median depth: turns metres of translation into radians of picture."""
+    m = 0
+    step = max(1, n // 1000)
+    values = np.empty(n // step + 1)
+    for k in range(0, n, step):
+        if samples[W, k] > 0:
+            values[m] = samples[Z, k]
+            m += 1
+    if m == 0:
+        return 1.0
+    return 1.0 / max(1e-9, np.median(values[:m])) if math.isfinite(K[0]) else 1.0
