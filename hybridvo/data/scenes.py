@@ -21,7 +21,7 @@ from hybridvo.data.bodies import (
     mover_path,
 )
 from hybridvo.data.raycasting import BOX, CYLINDER, ELLIPSOID
-from hybridvo.data.world import Solid, World, moving_share
+from hybridvo.data.world import Solid, World, dynamic_share, moving_share
 from hybridvo.errors import InputError
 from hybridvo.types import Camera
 
@@ -165,7 +165,7 @@ def _draw_movers(
         depths = rng.permutation([rng.uniform(3.8, 5.5), rng.uniform(6.0, 9.0)])
         return [
             blob(side * rng.uniform(0.4, 0.65), rng.uniform(-0.3, 0.3), depth, 0.33,
-                 int(rng.integers(3, 6)), rng.uniform(0.03, 0.09), rng.uniform(0.4, 1.8),
+                 int(rng.integers(3, 6)), rng.uniform(0.06, 0.1), rng.uniform(0.4, 1.8),
                  follow(lag()))
             for side, depth in zip((-1.0, 1.0), depths, strict=True)
         ]  # fmt: skip
@@ -211,7 +211,8 @@ def compose_world(
 
     Args:
         kind: one of ``SCENE_KINDS``. ``heavy_*`` families have 46 to 75 % of the pixels on movers
-            in every frame.
+            in every frame, and at least 46 % whose flow differs from the camera's by over 1/512 of
+            the width.
         seed: not negative; the same seed gives the same world.
         height: pixels.
         width: pixels.
@@ -298,4 +299,9 @@ def _draw(
         share, nearest = moving_share(world, index)
         if nearest < _MIN_DEPTH or not low <= share <= high:
             return None
+    if kind.startswith("heavy"):
+        for index in range(frames - 1):
+            # one pixel of a picture 512 wide: small pictures are judged alike
+            if dynamic_share(world, index, 64, width / 512) < 0.47:
+                return None
     return world

@@ -225,9 +225,9 @@ class SyntheticSequence:
         return self.scene.T_world_cam
 
     @property
-    def notices(self) -> list[str]:
+    def notices(self) -> tuple[str, ...]:
         """Nothing was mended."""
-        return []
+        return ()
 
     def __len__(self) -> int:
         return self.scene.frames

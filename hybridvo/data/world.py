@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hybridvo.data.raycasting import cast, screen_bounds
+from hybridvo.data.raycasting import cast, motion, screen_bounds
 from hybridvo.errors import InputError
 from hybridvo.geometry import invert
 from hybridvo.types import Camera
 
-__all__ = ["Solid", "World", "invert_affine", "moving_share"]
+__all__ = ["Solid", "World", "dynamic_share", "invert_affine", "moving_share"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,13 +73,16 @@ class World:
                     f"got {shape}."
                 )
 
-    def A_cam_body(self, index: int) -> np.ndarray:
-        """(P, 3, 4) affine maps, unit shapes to the camera of frame ``index``."""
+    def A_cam_body(self, index: int, camera_index: int | None = None) -> np.ndarray:
+        """(P, 3, 4) maps, unit shapes of frame ``index`` to the camera of ``camera_index``.
+
+        Without ``camera_index``, to the camera of the same frame.
+        """
         A = np.stack(
             [s.A_world_body if np.ndim(s.A_world_body) == 2 else s.A_world_body[index]
              for s in self.solids]
         )  # fmt: skip
-        E = invert(self.T_world_cam[index])[:3]
+        E = invert(self.T_world_cam[index if camera_index is None else camera_index])[:3]
         out = E[:, :3] @ A
         out[:, :, 3] += E[:, 3]
         return out
@@ -101,13 +104,38 @@ def invert_affine(A: np.ndarray) -> np.ndarray:
     return np.concatenate([inverse, -inverse @ A[:, :, 3:]], axis=2)
 
 
-def moving_share(world: World, index: int, width: int = 96) -> tuple[float, float]:
-    """Share of the pixels of a frame on movers, and the smallest depth; from a small picture."""
-    camera = world.cameras[index]
+def _small_view(camera: Camera, width: int) -> tuple[np.ndarray, int, int]:
+    """Intrinsics, height and width of a picture of at most ``width`` columns."""
     ratio = min(1.0, width / camera.width)
     small_width, small_height = round(camera.width * ratio), max(1, round(camera.height * ratio))
-    K = np.diag([ratio, small_height / camera.height, 1.0]) @ camera.K
+    scale = np.diag([small_width / camera.width, small_height / camera.height, 1.0])
+    return scale @ camera.K, small_height, small_width
+
+
+def moving_share(world: World, index: int, width: int = 96) -> tuple[float, float]:
+    """Share of the pixels of a frame on movers, and the smallest depth; from a small picture."""
+    view = _small_view(world.cameras[index], width)
     A = world.A_cam_body(index)
-    bounds = screen_bounds(A, K, small_height, small_width)
-    depth, hit = cast(world.shapes, invert_affine(A), bounds, K, small_height, small_width)
+    depth, hit = cast(world.shapes, invert_affine(A), screen_bounds(A, *view), *view)
     return float(np.mean((world.object_ids[hit] > 0) & (hit >= 0))), float(depth.min())
+
+
+def dynamic_share(world: World, index: int, width: int = 96, threshold_px: float = 1.0) -> float:
+    """Share of the pixels whose flow differs from the camera's own by more than a threshold.
+
+    Seen in a small picture; the threshold is in pixels of the full one. This is the
+    ``dynamic_fraction`` of the reports, smaller than the share on movers wherever a mover happens
+    to stand nearly still.
+    """
+    view = _small_view(world.cameras[index], width)
+    K1, height, small_width = _small_view(world.cameras[index + 1], width)
+    A = world.A_cam_body(index)
+    B = invert_affine(A)
+    depth, hit = cast(world.shapes, B, screen_bounds(A, *view), *view)
+    flows = []
+    for A1 in (world.A_cam_body(index + 1), world.A_cam_body(index, index + 1)):
+        bounds1 = screen_bounds(A1, K1, height, small_width)
+        B1 = invert_affine(A1)
+        flows.append(motion(depth, hit, B, view[0], world.shapes, A1, B1, bounds1, K1)[0])
+    difference = np.linalg.norm(flows[0] - flows[1], axis=-1)
+    return float(np.mean(difference > threshold_px * small_width / world.cameras[index].width))

@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 from hybridvo.data.image_io import read_cam, read_dpt, read_flo, read_mask_png, read_rgb
 from hybridvo.data.raycasting import BOX, CYLINDER, ELLIPSOID
 from hybridvo.data.scenes import SCENE_KINDS
+from hybridvo.data.sequence import Sequence
 from hybridvo.data.synthetic import Scene, SyntheticSequence, make_scene, write_sintel
-from hybridvo.data.world import Solid, World, moving_share
+from hybridvo.data.world import Solid, World, dynamic_share, moving_share
 from hybridvo.errors import InputError, OutputError
 from hybridvo.geometry import ego_flow, invert, make_transform, pixel_grid, rotation_angle
 from hybridvo.types import Camera
@@ -286,8 +287,13 @@ def test_heavy_families_keep_their_share_in_every_pair(kind, seed):
     shares = [moving_share(scene.world, i)[0] for i in range(60)]
     assert min(shares) >= 0.46
     assert max(shares) <= 0.75
-    full = scene.object_id(17)
-    assert np.mean(full > 0) == pytest.approx(shares[17], abs=0.02)
+    flow, _, moving = scene.flow(17)
+    assert np.mean(moving) == pytest.approx(shares[17], abs=0.02)
+    T = invert(scene.T_world_cam[18]) @ scene.T_world_cam[17]
+    ego = ego_flow(scene.render(17).depth, T, scene.camera(17), scene.camera(18))
+    dynamic = np.mean(np.linalg.norm(flow - ego, axis=-1) > 1.0)
+    assert dynamic_share(scene.world, 17) == pytest.approx(dynamic, abs=0.02)
+    assert min(dynamic_share(scene.world, i) for i in range(59)) >= 0.46
     movers = {"heavy_rigid": 1, "heavy_deforming": 1, "heavy_two": 2, "heavy_ten": 10}[kind]
     assert len(set(scene.world.object_ids)) == movers + 1
 
@@ -421,6 +427,7 @@ def test_sequence(scenes):
     np.testing.assert_array_equal(sequence.occlusion(2), occlusion)
     np.testing.assert_array_equal(sequence.moving(2), moving)
     assert sequence.files() == []
+    assert isinstance(sequence, Sequence)
     with pytest.raises(InputError):
         sequence.flow(5)
 
