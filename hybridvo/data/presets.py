@@ -16,9 +16,17 @@ from typing import Any, TypeVar
 
 import yaml
 
+from hybridvo.data.wide import WideOptions
+from hybridvo.data.workflow import PaperOptions
 from hybridvo.errors import FormatError, InputError
 
-__all__ = ["build_options", "read_yaml"]
+__all__ = ["PRESETS", "build_options", "load_preset", "read_yaml"]
+
+PRESETS: dict[str, type[PaperOptions] | type[WideOptions]] = {
+    "paper": PaperOptions,
+    "wide": WideOptions,
+}
+"""Kinds of training data by the name that a preset file gives under ``preset``."""
 
 MAX_YAML_BYTES = 1 << 20
 """Largest preset file that is read; a preset is a few kilobytes."""
@@ -45,6 +53,19 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
     if not isinstance(mapping, dict):
         raise FormatError(f"{path}: expected a mapping of keys, got {type(mapping).__name__}.")
     return mapping
+
+
+def load_preset(path: str | Path) -> PaperOptions | WideOptions:
+    """Options of a data preset file, ``configs/data_paper.yaml`` for one.
+
+    Raises:
+        InputError: no such file, an unknown kind or key, or a value that cannot be meant.
+    """
+    mapping = read_yaml(path)
+    kind = mapping.pop("preset", None)
+    if kind not in PRESETS:
+        raise InputError(f"{path}: 'preset' must be one of {', '.join(PRESETS)}, got {kind!r}.")
+    return build_options(PRESETS[kind], mapping, str(path))
 
 
 def build_options(cls: type[OptionsT], mapping: Any, where: str) -> OptionsT:
