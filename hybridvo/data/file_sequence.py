@@ -151,13 +151,7 @@ class FileSequence:
                 f"{self.name}: there is no flow file from frame {index} to {index + 1}."
             )
         flow, valid = self._read_flow(path, index)
-        for array in (flow, valid):
-            if array is not None and array.shape[:2] != (self.height, self.width):
-                raise FormatError(
-                    f"{path}: expected flow of {self.width}x{self.height} pixels as the frames "
-                    f"have, got {array.shape[1]}x{array.shape[0]}. "
-                    f"Resize it with hybridvo.data.resize.resize_flow."
-                )
+        self._check_shape(flow, path, "flow")
         return flow, valid
 
     def files(self) -> list[Path]:
@@ -191,6 +185,13 @@ class FileSequence:
             return self._read_depth(path, index, rgb) if depth else read_rgb(path)
         except FileNotFoundError:
             return None
+
+    def _check_shape(self, array: np.ndarray, path: Path, what: str) -> None:
+        if array.shape[:2] != (self.height, self.width):
+            raise FormatError(
+                f"{path}: expected {what} of {self.width}x{self.height} pixels as the frames have, "
+                f"got {array.shape[1]}x{array.shape[0]}. Resize the whole sequence to one size."
+            )
 
     def _check_index(self, index: int) -> int:
         if not 0 <= int(index) < len(self):
@@ -310,6 +311,7 @@ def resolve_inside(root: Path, name: str, allow_outside: bool, source: str) -> P
         path = root / name
         resolved = path.resolve()
         inside = resolved.is_relative_to(root.resolve())
+        path.exists()  # raises for a name that the system cannot hold
     except (OSError, RuntimeError, ValueError) as error:
         raise InputError(f"{source}: {name!r} is not a usable file name ({error}).") from None
     if not inside and not allow_outside:

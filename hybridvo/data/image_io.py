@@ -18,15 +18,21 @@ import os
 import re
 import struct
 import warnings
-import zlib
 from pathlib import Path
 from typing import IO
 
 import cv2
 import numpy as np
 
+from hybridvo.data.encoded_image import (
+    check_image_size,
+    decode,
+    decode_exact,
+    encoded_size,
+    file_size,
+    open_file,
+)
 from hybridvo.errors import FormatError, InputError, OutputError
-from hybridvo.types import MAX_PIXELS
 
 __all__ = [
     "HybridVOWarning",
@@ -50,45 +56,14 @@ __all__ = [
 
 SINTEL_TAG = 202021.25
 TAG_BYTES = struct.pack("<f", SINTEL_TAG)
-PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
-JPEG_MAGIC = b"\xff\xd8"
 NPY_MAGIC = b"\x93NUMPY"
 HEADER_BYTES = 2**18
 """How much of an image file is read to learn its size (a JPEG may carry a thumbnail first)."""
-MAX_IMAGE_BYTES = 2**30
-DEFLATE_MAX_RATIO = 1032
-"""Deflate cannot expand by more than this factor, so a smaller PNG cannot hold its pixels."""
 FLOW_OFFSET, FLOW_SCALE = 32768.0, 64.0
 
 
 class HybridVOWarning(UserWarning):
     """Something in the input that a user should look at and that does not stop the work."""
-
-
-def _open(path: str | os.PathLike[str]) -> IO[bytes]:
-    try:
-        return open(path, "rb")
-    except IsADirectoryError:
-        raise FormatError(f"{path}: expected a file, got a folder.") from None
-    except ValueError as error:  # a null byte in the name
-        raise FormatError(f"{path!r}: not a file name ({error}).") from None
-
-
-def _size(file: IO[bytes]) -> int:
-    return os.fstat(file.fileno()).st_size
-
-
-def _check_image_size(path: object, width: int, height: int) -> None:
-    if width <= 0 or height <= 0:
-        raise FormatError(
-            f"{path}: expected a positive image size, got width {width}, height {height}. "
-            f"The file is damaged or of another format."
-        )
-    if width * height > MAX_PIXELS:
-        raise FormatError(
-            f"{path}: the header declares {width}x{height} pixels, above the limit of {MAX_PIXELS}."
-            f" The header is damaged, or the image must be tiled or resized first."
-        )
 
 
 def _check_bytes(path: object, expected: int, got: int, what: str, strict: bool) -> None:
@@ -128,18 +103,18 @@ def _read_tagged_header(file: IO[bytes], path: object, suffix: str) -> tuple[int
         )
     _check_tag(path, head, suffix)
     width, height = struct.unpack("<ii", head[4:])
-    _check_image_size(path, width, height)
+    check_image_size(path, width, height)
     return height, width
 
 
 def _read_tagged(
     path: str | os.PathLike[str], suffix: str, channels: int, strict: bool
 ) -> np.ndarray:
-    with _open(path) as file:
+    with open_file(path) as file:
         height, width = _read_tagged_header(file, path, suffix)
         expected = 12 + 4 * channels * height * width
         what = f"{suffix} of {width}x{height}"
-        size = _size(file)
+        size = file_size(file)
         _check_bytes(path, expected, size, what, strict)
         data = file.read(expected - 12)
     if len(data) != expected - 12:  # the file shrank after its size was read
@@ -182,11 +157,12 @@ def read_cam(
         FormatError: wrong tag or size, values that are not finite, or a left 3x3 block that is no
             rotation (to 1e-3). FileNotFoundError: no such file.
     """
-    with _open(path) as file:
-        size = _size(file)
+    with open_file(path) as file:
+        size = file_size(file)
         data = file.read(4 + 21 * 8)
     _check_tag(path, data, ".cam")
-    _check_bytes(path, 4 + 21 * 8, min(size, len(data)) if size < 172 else size, ".cam", strict)
+    expected = 4 + 21 * 8
+    _check_bytes(path, expected, size if len(data) == expected else len(data), ".cam", strict)
     values = np.frombuffer(data, dtype="<f8", offset=4).astype(np.float64)
     if not np.isfinite(values).all():
         raise FormatError(f"{path}: expected finite intrinsics and extrinsics, got {values}.")
@@ -294,17 +270,17 @@ def read_npy(
         FormatError: not a ``.npy`` file, objects inside, another shape, truncated.
         FileNotFoundError: no such file.
     """
-    with _open(path) as file:
+    with open_file(path) as file:
         dtype, fortran, shape = _read_npy_header(file, path)
         expected_shape = "(H, W)" if channels is None else f"(H, W, {channels})"
         if len(shape) != (2 if channels is None else 3) or shape[2:] not in ((), (channels,)):
             raise FormatError(f"{path}: expected an array of shape {expected_shape}, got {shape}.")
-        _check_image_size(path, shape[1], shape[0])
+        check_image_size(path, shape[1], shape[0])
         count = math.prod(shape)
         start = file.tell()
         expected = start + count * dtype.itemsize
         what = f".npy {dtype} {shape}"
-        _check_bytes(path, expected, _size(file), what, strict)
+        _check_bytes(path, expected, file_size(file), what, strict)
         data = file.read(expected - start)
     if len(data) != expected - start:
         _check_bytes(path, expected, start + len(data), what, strict)
@@ -315,99 +291,6 @@ def read_npy(
         return np.ascontiguousarray(array, dtype=target)
 
 
-def _png_header(data: bytes, path: object) -> tuple[int, int, int]:
-    """(height, width, bits per pixel)."""
-    if len(data) < 33 or data[12:16] != b"IHDR":
-        raise FormatError(f"{path}: truncated PNG: expected a header of 33 bytes, got {len(data)}.")
-    width, height, depth, color = struct.unpack(">IIBB", data[16:26])
-    _check_image_size(path, width, height)
-    channels = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}.get(color)
-    if channels is None or depth not in (1, 2, 4, 8, 16):
-        raise FormatError(f"{path}: damaged PNG header: bit depth {depth}, colour type {color}.")
-    return height, width, depth * channels
-
-
-def _check_png(data: bytes, path: object) -> None:
-    """Walk the chunks, so that a cut or a flipped byte is found before anything is decoded."""
-    height, width, bits = _png_header(data, path)
-    if height * width * bits // 8 > DEFLATE_MAX_RATIO * len(data):
-        raise FormatError(
-            f"{path}: truncated PNG: {width}x{height} pixels of {bits} bits cannot fit into "
-            f"{len(data)} bytes. Copy or download the file again."
-        )
-    position = len(PNG_MAGIC)
-    while position + 12 <= len(data):
-        length, name = struct.unpack(">I4s", data[position : position + 8])
-        end = position + 12 + length
-        if end > len(data):
-            break
-        checksum = struct.unpack(">I", data[end - 4 : end])[0]
-        if zlib.crc32(memoryview(data)[position + 4 : end - 4]) != checksum:
-            raise FormatError(
-                f"{path}: damaged PNG: the checksum of chunk {name!r} at byte {position} is wrong. "
-                f"Copy or download the file again."
-            )
-        if name == b"IEND":
-            return
-        position = end
-    raise FormatError(
-        f"{path}: truncated PNG: {len(data)} bytes end before the closing chunk. "
-        f"Copy or download the file again."
-    )
-
-
-def _jpeg_header(data: bytes, path: object) -> tuple[int, int, int]:
-    """(height, width, position of the header's end)."""
-    position = 2
-    while position + 9 <= len(data) and data[position] == 0xFF:
-        marker = data[position + 1]
-        if marker == 0xFF:  # fill byte
-            position += 1
-            continue
-        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
-            height, width = struct.unpack(">HH", data[position + 5 : position + 9])
-            _check_image_size(path, width, height)
-            return height, width, position
-        position += 2 + struct.unpack(">H", data[position + 2 : position + 4])[0]
-    raise FormatError(f"{path}: truncated or damaged JPEG: no image header in {len(data)} bytes.")
-
-
-def _check_jpeg(data: bytes, path: object) -> None:
-    _, _, start = _jpeg_header(data, path)
-    scan = data.find(b"\xff\xda", start)
-    if scan < 0 or data.rfind(b"\xff\xd9") < scan:
-        raise FormatError(
-            f"{path}: truncated JPEG: {len(data)} bytes end before the closing marker. "
-            f"Copy or download the file again."
-        )
-
-
-def _decode(path: str | os.PathLike[str], flags: int) -> np.ndarray:
-    """Decoded PNG or JPEG in OpenCV's channel order."""
-    with _open(path) as file:
-        size = _size(file)
-        if size > MAX_IMAGE_BYTES:
-            raise FormatError(f"{path}: {size} bytes, above the limit of {MAX_IMAGE_BYTES}.")
-        data = file.read()
-    if data[:8] == PNG_MAGIC:
-        _check_png(data, path)
-    elif data[:2] == JPEG_MAGIC:
-        _check_jpeg(data, path)
-    else:
-        raise FormatError(
-            f"{path}: expected a PNG or JPEG image, got {len(data)} bytes that start with "
-            f"{data[:8]!r}. Convert the image to PNG."
-        )
-    try:
-        # Ignore EXIF rotation: the intrinsics belong to the pixels as they are stored.
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
-    except cv2.error as error:
-        raise FormatError(f"{path}: the image cannot be decoded ({error.err}).") from None
-    if image is None:
-        raise FormatError(f"{path}: the image cannot be decoded. Copy or download the file again.")
-    return image
-
-
 def read_rgb(path: str | os.PathLike[str]) -> np.ndarray:
     """(H, W, 3) uint8 RGB from a PNG or JPEG; grey is repeated, alpha is dropped.
 
@@ -416,21 +299,7 @@ def read_rgb(path: str | os.PathLike[str]) -> np.ndarray:
     Raises:
         FormatError: truncated, damaged or of another format. FileNotFoundError: no such file.
     """
-    return cv2.cvtColor(_decode(path, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
-
-
-def _decode_exact(
-    path: str | os.PathLike[str], dtype: type, channels: int, what: str
-) -> np.ndarray:
-    # IMREAD_UNCHANGED is -1: it leaves orientation alone and cannot be combined with other flags
-    image = _decode(path, cv2.IMREAD_UNCHANGED)
-    got = 1 if image.ndim == 2 else image.shape[2]
-    if image.dtype != dtype or got != channels:
-        raise FormatError(
-            f"{path}: expected {what} ({np.dtype(dtype)}, {channels} channels), got {image.dtype} "
-            f"with {got} channels."
-        )
-    return image
+    return cv2.cvtColor(decode(path, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
 
 
 def read_png16(path: str | os.PathLike[str]) -> np.ndarray:
@@ -439,7 +308,7 @@ def read_png16(path: str | os.PathLike[str]) -> np.ndarray:
     Raises:
         FormatError: another depth (an 8-bit preview, say), damaged. FileNotFoundError: no file.
     """
-    return _decode_exact(path, np.uint16, 1, "a 16-bit depth PNG")
+    return decode_exact(path, np.uint16, 1, "a 16-bit depth PNG")
 
 
 def read_mask_png(path: str | os.PathLike[str]) -> np.ndarray:
@@ -448,7 +317,7 @@ def read_mask_png(path: str | os.PathLike[str]) -> np.ndarray:
     Raises:
         FormatError: damaged or of another format. FileNotFoundError: no such file.
     """
-    return np.asarray(_decode(path, cv2.IMREAD_GRAYSCALE) > 0)
+    return np.asarray(decode(path, cv2.IMREAD_GRAYSCALE) > 0)
 
 
 def read_depth_rgba_png(path: str | os.PathLike[str]) -> np.ndarray:
@@ -460,7 +329,7 @@ def read_depth_rgba_png(path: str | os.PathLike[str]) -> np.ndarray:
     Raises:
         FormatError: not an 8-bit PNG of four channels, damaged. FileNotFoundError: no such file.
     """
-    image = _decode_exact(path, np.uint8, 4, "a float32 depth PNG of TartanAir V2")
+    image = decode_exact(path, np.uint8, 4, "a float32 depth PNG of TartanAir V2")
     return np.ascontiguousarray(image).view("<f4")[:, :, 0].astype(np.float32)
 
 
@@ -476,9 +345,9 @@ def read_flow_kitti_png(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.nd
     Raises:
         FormatError: not a 16-bit PNG of three channels, damaged. FileNotFoundError: no such file.
     """
-    image = _decode_exact(path, np.uint16, 3, "a 16-bit flow PNG")
+    image = decode_exact(path, np.uint16, 3, "a 16-bit flow PNG")
     flow = _flow_from_png16(image[:, :, 2:0:-1])
-    valid = np.asarray(image[:, :, 0] > 0)
+    valid: np.ndarray = image[:, :, 0] > 0
     flow[~valid] = np.nan
     return flow, valid
 
@@ -501,7 +370,7 @@ def write_flow_kitti_png(
         raise InputError(f"write_flow_kitti_png: expected shape (H, W, 2), got {flow.shape}.")
     with np.errstate(invalid="ignore"):
         encoded = np.round(flow * FLOW_SCALE + FLOW_OFFSET)
-        inside = ((encoded >= 0) & (encoded <= 65535)).all(axis=2)
+        inside = np.logical_and.reduce((encoded >= 0) & (encoded <= 65535), axis=2)
     if valid is not None:
         inside &= np.asarray(valid, dtype=bool)
     encoded = np.where(inside[..., None], encoded, 0)
@@ -517,8 +386,9 @@ def read_flow_tartanair_png(path: str | os.PathLike[str]) -> tuple[np.ndarray, n
     Raises:
         FormatError: not a 16-bit PNG of three channels, damaged. FileNotFoundError: no such file.
     """
-    image = _decode_exact(path, np.uint16, 3, "a 16-bit flow PNG")
-    return _flow_from_png16(image[:, :, :2]), image[:, :, 2] == 0
+    image = decode_exact(path, np.uint16, 3, "a 16-bit flow PNG")
+    valid: np.ndarray = image[:, :, 2] == 0
+    return _flow_from_png16(image[:, :, :2]), valid
 
 
 def image_size(path: str | os.PathLike[str]) -> tuple[int, int]:
@@ -527,22 +397,21 @@ def image_size(path: str | os.PathLike[str]) -> tuple[int, int]:
     Raises:
         FormatError: none of these, or a damaged header. FileNotFoundError: no such file.
     """
-    with _open(path) as file:
+    with open_file(path) as file:
         head = file.read(8)
         file.seek(0)
         if head[:6] == NPY_MAGIC:
             _, _, shape = _read_npy_header(file, path)
             if len(shape) not in (2, 3):
                 raise FormatError(f"{path}: expected an image, got an array of shape {shape}.")
-            _check_image_size(path, shape[1], shape[0])
+            check_image_size(path, shape[1], shape[0])
             return shape[0], shape[1]
         if head[:4] == TAG_BYTES:
             return _read_tagged_header(file, path, Path(path).suffix)
         data = file.read(HEADER_BYTES)
-    if head == PNG_MAGIC:
-        return _png_header(data, path)[:2]
-    if head[:2] == JPEG_MAGIC:
-        return _jpeg_header(data, path)[:2]
+    size = encoded_size(data, path)
+    if size is not None:
+        return size
     raise FormatError(f"{path}: expected a PNG, JPEG, .npy, .flo or .dpt file, got bytes {head!r}.")
 
 
@@ -554,8 +423,8 @@ def read_text(path: str | os.PathLike[str], *, limit: int = 2**26) -> str:
     Raises:
         FormatError: longer than ``limit``. FileNotFoundError: no such file.
     """
-    with _open(path) as file:
-        size = _size(file)
+    with open_file(path) as file:
+        size = file_size(file)
         if size > limit:
             raise FormatError(f"{path}: {size} bytes, above the limit of {limit} for a text file.")
         return file.read(limit).decode("utf-8-sig", errors="surrogateescape")

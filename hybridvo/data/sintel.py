@@ -160,12 +160,15 @@ class SintelSequence(FileSequence):
 
     def _read_flow(self, path: Path, index: int) -> tuple[np.ndarray, np.ndarray | None]:
         flow = read_flo(path, strict=self.strict)
+        self._check_shape(flow, path, "flow")
         with np.errstate(invalid="ignore"):
             known = (np.abs(flow) < UNKNOWN_FLOW).all(axis=2)
         mask = self._invalid[index]
-        if mask is None:
+        if mask is None or not mask.exists():
             return flow, None if known.all() else known
-        return flow, known & ~read_mask_png(mask)
+        invalid = read_mask_png(mask)
+        self._check_shape(invalid, mask, "a mask")
+        return flow, known & ~invalid
 
 
 def _find(base: Path, folder: str, name: str) -> Path | None:

@@ -125,6 +125,7 @@ class TartanAirSequence(FileSequence):
         if mask is None:
             return flow, None
         occluded = read_mask_png(mask) if mask.suffix == ".png" else read_npy(mask) != 0
+        self._check_shape(occluded, mask, "a mask")
         return flow, ~occluded
 
 
