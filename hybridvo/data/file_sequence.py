@@ -358,7 +358,7 @@ def read_rows(path: Path, columns: str, *, text_columns: int = 0) -> list[tuple]
 def to_seconds(stamps: Many[float] | np.ndarray, name: str) -> tuple[np.ndarray, list[str]]:
     """Stamps in seconds; values above 1e14 are nanoseconds and are converted with a notice."""
     values = np.asarray(stamps, dtype=np.float64)
-    if values.size and np.nanmax(values) > NANOSECONDS_ABOVE:
+    if (values > NANOSECONDS_ABOVE).any():
         return values / 1e9, [f"{name}: stamps are nanoseconds (above 1e14); converted to seconds."]
     return values, []
 

@@ -246,7 +246,7 @@ def _read_poses(
     T_cam_cam0 = np.eye(4)
     T_cam_cam0[:3, 3] = np.linalg.solve(P_left[:, :3], P_left[:, 3])
     for i, n in enumerate(numbers):
-        if n < len(rows):
+        if n < len(rows) and np.isfinite(rows[n]).all():
             T_world_cam0 = np.vstack([np.reshape(rows[n], (3, 4)), (0.0, 0.0, 0.0, 1.0)])
             poses[i] = T_world_cam0 @ invert(T_cam_cam0)
     missing = int(np.isnan(poses[:, 0, 0]).sum())

@@ -7,7 +7,6 @@ import os
 import numpy as np
 import pytest
 import sequences as write
-
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -374,5 +373,6 @@ def test_damaged_text_files_raise_input_errors_only(kind, name, tmp_path, data):
     try:
         sequence = open_sequence(root, kind.split("-")[0])
         sequence.frame(0)
+        assert sequence.poses is None or not np.isinf(sequence.poses).any()
     except InputError as error:
         assert root.name in str(error) or "07" in str(error)
