@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import math
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +35,8 @@ MAX_YAML_BYTES = 2**20
 REQUIRED = ("fx", "fy", "cx", "cy", "width", "height")
 OPTIONAL = ("distortion", "depth_scale", "fps")
 DEFAULT_FPS = 30.0
+LARGEST = 1e12
+"""No setting is larger; NaN, infinity and integers beyond any float are not smaller."""
 
 
 class FolderSequence(FileSequence):
@@ -189,7 +190,7 @@ def _read_settings(path: Path) -> dict[str, Any]:
         value = content[key]
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise FormatError(f"{path}: {key}: expected a number, got a {type(value).__name__}.")
-        if not math.isfinite(value) or (key not in ("cx", "cy") and value <= 0):
+        if not abs(value) < LARGEST or (key not in ("cx", "cy") and value <= 0):
             raise FormatError(f"{path}: {key}: expected a positive finite number, got {value}.")
         if key in ("width", "height") and int(value) != value:
             raise FormatError(f"{path}: {key}: expected a whole number of pixels, got {value}.")
@@ -198,7 +199,7 @@ def _read_settings(path: Path) -> dict[str, Any]:
 
 def _distortion(value: Any, path: Path) -> tuple[float, ...]:
     numbers = isinstance(value, list) and all(
-        isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v) for v in value
+        isinstance(v, int | float) and not isinstance(v, bool) and abs(v) < LARGEST for v in value
     )
     if not numbers or len(value) not in (4, 5):
         raise FormatError(f"{path}: distortion: expected a list of 5 numbers [k1, k2, p1, p2, k3].")

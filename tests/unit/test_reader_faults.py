@@ -30,6 +30,7 @@ def edit(path, old, new):
         ("fx: 20.0", "fx: 0", "fx: expected a positive"),
         ("fx: 20.0", "fx: -3", "fx: expected a positive"),
         ("fx: 20.0", "fx: .nan", "fx: expected a positive finite"),
+        ("fx: 20.0", "fx: 1" + "0" * 400, "fx: expected a positive finite"),
         ("cx: 4.5", "cx: 400", "far outside"),
         ("width: 10", "width: 11", "camera.yaml says 11x6"),
         ("width: 10", "width: 10.5", "whole number"),
