@@ -22,6 +22,7 @@ __all__ = [
     "matrix_to_euler_deg",
     "ned_to_camera",
     "pixel_grid",
+    "pose_matrix",
     "project",
     "rotation_angle",
     "se3_exp",
@@ -190,3 +191,9 @@ def to_gtsam_covariance(covariance: np.ndarray) -> np.ndarray:
     """
     order = [3, 4, 5, 0, 1, 2]
     return np.asarray(covariance)[np.ix_(order, order)]
+
+
+def pose_matrix(pose: np.ndarray) -> np.ndarray:
+    """(4, 4) transform from a (3, 4) one, its rotation made orthonormal (polar decomposition)."""
+    U, _, Vt = np.linalg.svd(pose[:, :3])
+    return make_transform(U @ Vt, pose[:, 3])
