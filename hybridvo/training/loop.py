@@ -120,14 +120,18 @@ class Trainer:
         return self.network if self.ema is None else self.ema
 
     def _groups(self) -> list[dict[str, Any]]:
-        """Parameters by the factor on their learning rate: all others, motion heads."""
-        heads = ("head_motion.", "head_rotation.", "head_translation.")
+        """Parameters in two groups: the motion heads' last layers have a rate of their own."""
+        last = []
+        for name in ("head_motion", "head_rotation", "head_translation"):
+            head = getattr(self.network, name, None)
+            if head is not None:
+                last.append(f"{name}.{len(head) - 1}.")
         groups: list[dict[str, Any]] = [
             {"params": [], "rate_factor": 1.0},
             {"params": [], "rate_factor": self.options.optimizer.head_rate},
         ]
         for name, parameter in self.network.named_parameters():
-            groups[name.startswith(heads)]["params"].append(parameter)
+            groups[name.startswith(tuple(last))]["params"].append(parameter)
         return groups
 
     def update(self, batch: TrainingBatch, progress: float) -> dict[str, float]:

@@ -23,8 +23,9 @@ class OptimizerOptions:
         learning_rate: at its peak.
         betas: of Adam.
         clip_norm: largest global norm of the gradient.
-        head_rate: factor on the rate of the motion head. Its output is scaled by 0.01, so that at
-            the common rate a short run spends itself on growing the head's weights.
+        head_rate: factor on the rate of the motion heads' last layer. Its output is scaled by
+            0.01; at the common rate a short run spends itself on growing that layer's weights. 100
+            undoes the scale for Adam.
 
     Raises:
         InputError: a rate or a norm that is not positive, betas outside [0, 1).
