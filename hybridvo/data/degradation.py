@@ -136,7 +136,7 @@ def degrade_flow(
         area = field > np.float32(rng.uniform(0.5, 1.6))
         spread = 2 * int(rng.integers(4, 17)) + 1
         guess = cv2.blur(out, (spread, spread)) * np.float32(rng.uniform(0.3, 1.0))
-        out[area] = guess[area]
+        np.copyto(out, guess, where=area[..., None])
     block = int(rng.integers(3, 9))
     rows, columns = -(-height // block), -(-width // block)
     bad = rng.random((rows, columns), dtype=np.float32) < log_uniform(rng, o.block_share)
@@ -147,7 +147,7 @@ def degrade_flow(
     if hidden.any():
         around = cv2.blur(out, (9, 9))
         error = smooth_field(rng, height, width, 24, 2) * np.float32(log_uniform(rng, o.hidden_px))
-        out[hidden] = (around + error)[hidden]
+        np.copyto(out, around + error, where=hidden[..., None])
     smooth = smooth_field(rng, height, width, int(rng.integers(4, 17)), 2)
     out += smooth * np.float32(log_uniform(rng, o.flow_smooth_px))
     white = rng.standard_normal(flow.shape, dtype=np.float32)

@@ -211,7 +211,7 @@ def test_wide_has_large_movers_sky_and_still_scenes():
     # About 0.37 over thousands of samples; four standard errors of a share are 0.12 here.
     assert 0.25 < large < 0.52
     assert (moving < 0.01).mean() > 0.03
-    border = np.concatenate([[0, -1]])
+    border = np.array([0, -1])
     touching = [s.moving[border].any() or s.moving[:, border].any() for s in samples]
     assert np.mean([t for t, m in zip(touching, moving, strict=True) if m > 0.4]) > 0.9
     sky = np.array([(s.depth_true == 0).mean() for s in samples])
