@@ -1,0 +1,278 @@
+"""The command line: ``hybridvo run | demo | evaluate | doctor``.
+
+Parses, calls, prints. Heavy modules are imported after parsing, so that ``--help`` is instant. Data
+goes to stdout, progress and errors to stderr. Exit codes: 0 done, 1 a bug, 2 bad input or usage,
+3 too many failed frames, 4 folder locked, 5 output cannot be written, 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import logging
+import os
+import sys
+import tempfile
+import traceback
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from hybridvo import __version__
+
+__all__ = ["build_parser", "main"]
+
+EXIT_BUG, EXIT_INPUT, EXIT_LOCKED, EXIT_OUTPUT, EXIT_INTERRUPTED = 1, 2, 4, 5, 130
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """Parser of the whole command line."""
+    parser = argparse.ArgumentParser(
+        prog="hybridvo",
+        description="Metric camera motion with covariance from optical flow, depth and intrinsics.",
+    )
+    parser.add_argument("--version", action="version", version=f"hybridvo {__version__}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    _add_run(commands)
+    _add_demo(commands)
+    _add_evaluate(commands)
+    doctor = commands.add_parser(
+        "doctor", help="versions, devices, threads, and what is missing", parents=[_common()]
+    )
+    doctor.set_defaults(call=_doctor)
+    return parser
+
+
+def _common() -> argparse.ArgumentParser:
+    common = argparse.ArgumentParser(add_help=False)
+    common.add_argument("--json", action="store_true", help="print the result as JSON on stdout")
+    loudness = common.add_mutually_exclusive_group()
+    loudness.add_argument("-v", "--verbose", action="store_true", help="more, and tracebacks")
+    loudness.add_argument("-q", "--quiet", action="store_true", help="errors only")
+    return common
+
+
+def _add_run(commands: Any) -> None:
+    run = commands.add_parser(
+        "run", help="estimate the camera motion of a sequence", parents=[_common()]
+    )
+    run.add_argument("--sequence", required=True, metavar="DIR", help="folder of the sequence")
+    run.add_argument("--dataset", metavar="KIND", help="kind of the sequence (default: detected)")
+    run.add_argument("--out", metavar="DIR", help="output folder (default: runs/NAME)")
+    run.add_argument("--method", metavar="NAME", help="estimator (default: refine)")
+    run.add_argument(
+        "--flow", metavar="WHAT", help="auto (default), file or dis; auto: files, else DIS"
+    )
+    run.add_argument("--start", type=int, metavar="N", help="first frame (default 0)")
+    run.add_argument("--stop", type=int, metavar="N", help="the one after the last frame")
+    run.add_argument("--stride", type=int, metavar="N", help="step between frames (default 1)")
+    run.add_argument("--device", metavar="NAME", help="auto (default), cpu or cuda")
+    run.add_argument("--config", metavar="FILE", help="YAML file of options")
+    run.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        dest="assignments",
+        metavar="KEY=VALUE",
+        help="one option, as in refinement.cutoff=2.5; may be repeated",
+    )
+    exists = run.add_mutually_exclusive_group()
+    exists.add_argument("--resume", action="store_true", help="go on with a run that was cut off")
+    exists.add_argument("--overwrite", action="store_true", help="replace the results in --out")
+    run.add_argument(
+        "--max-failed", type=float, metavar="SHARE", help="failed frames allowed (default 0.2)"
+    )
+    run.add_argument(
+        "--strict",
+        action="store_true",
+        default=None,
+        help="a broken frame ends the run with exit code 2",
+    )
+    run.add_argument("--rrd", action="store_true", help="write a Rerun recording")
+    run.set_defaults(call=_run)
+
+
+def _add_demo(commands: Any) -> None:
+    demo = commands.add_parser(
+        "demo", help="render a scene with moving objects and run on it", parents=[_common()]
+    )
+    demo.add_argument("--out", default="runs/demo", metavar="DIR", help="default: runs/demo")
+    demo.add_argument("--overwrite", action="store_true", help="replace the results in --out")
+    demo.add_argument("--frames", type=int, default=20, metavar="N", help="default: 20")
+    demo.add_argument("--seed", type=int, default=0, metavar="N", help="of the scene")
+    demo.set_defaults(call=_demo)
+
+
+def _add_evaluate(commands: Any) -> None:
+    evaluate = commands.add_parser(
+        "evaluate", help="errors of a trajectory file against the truth", parents=[_common()]
+    )
+    evaluate.add_argument("estimate", metavar="EST", help="estimated trajectory")
+    evaluate.add_argument("truth", metavar="GT", help="true trajectory")
+    evaluate.add_argument(
+        "--alignment", choices=("se3", "sim3", "origin", "none"), default="se3", help="of the ATE"
+    )
+    evaluate.add_argument("--delta", type=int, default=1, metavar="N", help="frames of the RPE")
+    evaluate.add_argument("--max-diff", type=float, metavar="S", help="seconds between matches")
+    formats = ("auto", "tum", "kitti", "tartanair")
+    evaluate.add_argument("--format-est", choices=formats, default="auto")
+    evaluate.add_argument("--format-gt", choices=formats, default="auto")
+    evaluate.add_argument("--axes-est", choices=("auto", "camera", "ned"), default="auto")
+    evaluate.add_argument("--axes-gt", choices=("auto", "camera", "ned"), default="auto")
+    evaluate.set_defaults(call=_evaluate)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit code."""
+    try:
+        args = build_parser().parse_args(argv)
+    except SystemExit as end:  # argparse: 0 after --help and --version, 2 for wrong usage
+        return int(end.code or 0)
+    command = ["hybridvo", *(sys.argv[1:] if argv is None else argv)]
+    try:
+        return _guarded(args.call, args, command)
+    except BrokenPipeError:
+        # the reader of stdout has gone (`| head`); Python would complain again at exit
+        with contextlib.suppress(OSError, ValueError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+
+
+def _guarded(
+    call: Callable[[argparse.Namespace, list[str]], int],
+    args: argparse.Namespace,
+    command: list[str],
+) -> int:
+    """Exit code of a command; errors become one line on stderr."""
+    from hybridvo.errors import HybridVOError, LockedError, OutputError
+
+    _prepare_caches()
+    handler = logging.StreamHandler()
+    handler.setFormatter(logging.Formatter("%(message)s"))
+    logger = logging.getLogger("hybridvo")
+    level = logging.DEBUG if args.verbose else logging.ERROR if args.quiet else logging.WARNING
+    before = logger.level
+    logger.addHandler(handler)
+    logger.setLevel(level)
+    try:
+        return call(args, command)
+    except KeyboardInterrupt:
+        _complain("interrupted.")
+        return EXIT_INTERRUPTED
+    except BrokenPipeError:
+        raise
+    except HybridVOError as error:
+        if args.verbose:
+            traceback.print_exc()
+        _complain(str(error))
+        if isinstance(error, OutputError):
+            return EXIT_OUTPUT
+        return EXIT_LOCKED if isinstance(error, LockedError) else EXIT_INPUT
+    except Exception:
+        traceback.print_exc()
+        _complain("this is a bug in hybridvo; please report it with the lines above.")
+        return EXIT_BUG
+    finally:
+        logger.removeHandler(handler)
+        logger.setLevel(before)
+
+
+def _complain(message: str) -> None:
+    with contextlib.suppress(OSError, ValueError):
+        print(f"hybridvo: {message}", file=sys.stderr)
+
+
+def _prepare_caches() -> None:
+    """Give numba and matplotlib a place to write where neither home nor package is writable."""
+    home = Path.home()
+    package = Path(__file__).resolve().parent
+    if os.access(home, os.W_OK):
+        return
+    scratch = (
+        Path(tempfile.gettempdir()) / f"hybridvo-{os.getuid() if hasattr(os, 'getuid') else 0}"
+    )
+    with contextlib.suppress(OSError):
+        scratch.mkdir(mode=0o700, exist_ok=True)
+        os.environ.setdefault("MPLCONFIGDIR", str(scratch))
+        if not os.access(package, os.W_OK):
+            os.environ.setdefault("NUMBA_CACHE_DIR", str(scratch))
+
+
+def _print(text: str) -> None:
+    print(text, end="" if text.endswith("\n") else "\n", flush=True)
+
+
+def _run(args: argparse.Namespace, command: list[str]) -> int:
+    from hybridvo.errors import InputError
+
+    if args.rrd:
+        raise InputError("--rrd: Rerun recordings are not part of this version yet.")
+    from hybridvo.configuration import load_options
+    from hybridvo.evaluation.report import to_json
+    from hybridvo.run import run
+    from hybridvo.run_report import summary_text
+
+    named = ("method", "flow", "start", "stop", "stride", "device", "max_failed", "strict")
+    options = load_options(
+        args.config, args.assignments, {name: getattr(args, name) for name in named}
+    )
+    mode: Any = "resume" if args.resume else "overwrite" if args.overwrite else "new"
+    result = run(
+        args.sequence,
+        args.out,
+        options,
+        dataset=args.dataset,
+        mode=mode,
+        command=command,
+        quiet=args.quiet,
+    )
+    _print(to_json(result.summary) if args.json else summary_text(result.summary))
+    if not args.quiet:
+        for warning in result.summary.get("warnings", []):
+            _complain(f"warning: {warning}.")
+    return result.exit_code
+
+
+def _demo(args: argparse.Namespace, command: list[str]) -> int:
+    from hybridvo.demo import demo
+
+    text, code = demo(
+        args.out,
+        frames=args.frames,
+        seed=args.seed,
+        overwrite=args.overwrite,
+        command=command,
+        quiet=args.quiet,
+        as_json=args.json,
+    )
+    _print(text)
+    return code
+
+
+def _evaluate(args: argparse.Namespace, command: list[str]) -> int:
+    from hybridvo.evaluation.metrics import evaluate_files
+    from hybridvo.evaluation.report import to_json
+    from hybridvo.run_report import evaluation_text
+
+    report = evaluate_files(
+        args.estimate,
+        args.truth,
+        format_est=args.format_est,
+        format_gt=args.format_gt,
+        axes_est=args.axes_est,
+        axes_gt=args.axes_gt,
+        alignment=args.alignment,
+        delta=args.delta,
+        max_diff=args.max_diff,
+    )
+    _print(to_json(report) if args.json else evaluation_text(report))
+    return 0
+
+
+def _doctor(args: argparse.Namespace, command: list[str]) -> int:
+    from hybridvo.doctor import doctor, doctor_text
+    from hybridvo.evaluation.report import to_json
+
+    report = doctor()
+    _print(to_json(report) if args.json else doctor_text(report))
+    return 0 if report["usable"] else EXIT_INPUT

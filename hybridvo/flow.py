@@ -1,0 +1,268 @@
+"""Optical flow for a pair of frames: from files, from OpenCV's DIS, or from any callable.
+
+A provider is a callable ``(prev: Frame, curr: Frame) -> FlowField``. It may be slow or wrong, but it
+never raises on bad pictures: what it cannot see it marks invalid, and where it sees nothing at all
+the flow is None, which the estimators answer with ``failed(no_flow)``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import cv2
+import numpy as np
+
+from hybridvo.errors import InputError
+from hybridvo.types import Frame
+
+__all__ = [
+    "DIS_PRESETS",
+    "FlowField",
+    "FlowProvider",
+    "as_provider",
+    "dis_flow",
+    "fallback",
+    "file_flow",
+    "forward_backward_check",
+]
+
+DIS_PRESETS = {
+    "ultrafast": cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST,
+    "fast": cv2.DISOPTICAL_FLOW_PRESET_FAST,
+    "medium": cv2.DISOPTICAL_FLOW_PRESET_MEDIUM,
+}
+"""Names of OpenCV's DIS presets."""
+
+BASE_STD_PX = 0.15
+ERROR_FACTOR = 0.35
+MAX_STD_PX = 5.0
+"""Flow noise: std^2 = BASE_STD_PX^2 + (ERROR_FACTOR * error)^2, at most MAX_STD_PX."""
+MAX_ERROR_PX = 1.5
+MAX_RELATIVE_ERROR = 0.05
+"""A forward-backward error above both limits says that the pixel is occluded or mismatched."""
+
+
+@dataclass(frozen=True, eq=False)
+class FlowField:
+    """Optical flow of one pair.
+
+    Args:
+        flow: (H, W, 2) float32 px, previous to current, on the previous grid; None where no flow
+            could be had.
+        variance: (H, W) float32 px^2 per component, or None.
+        valid: (H, W) bool, False where the flow is known to be wrong, or None.
+        source: ``file``, ``dis`` or the name of a callable.
+        is_true: whether the flow is ground truth (an oracle).
+    """
+
+    flow: np.ndarray | None
+    variance: np.ndarray | None = None
+    valid: np.ndarray | None = None
+    source: str = "unknown"
+    is_true: bool = False
+
+
+class FlowProvider(Protocol):
+    """What finds the flow of a pair."""
+
+    def __call__(self, prev: Frame, curr: Frame) -> FlowField:
+        """Flow from ``prev`` to ``curr``."""
+
+
+class _FlowFiles(Protocol):
+    """The part of a sequence that flow files need."""
+
+    flow_is_true: bool
+
+    def flow(self, index: int) -> tuple[np.ndarray, np.ndarray | None]:
+        """Flow from frame ``index`` to the next, and its validity or None."""
+
+
+def dis_flow(preset: str = "medium", forward_backward: bool = True) -> FlowProvider:
+    """Provider of OpenCV's DIS flow on grey images (Kroeger et al., ECCV 2016).
+
+    The provider owns its DIS object: use one provider per thread.
+
+    Args:
+        preset: ``ultrafast``, ``fast`` or ``medium``.
+        forward_backward: compute the backward flow as well, and turn the disagreement of the two
+            into a variance and a validity per pixel; twice the time.
+
+    Raises:
+        InputError: an unknown preset.
+    """
+    if preset not in DIS_PRESETS:
+        raise InputError(f"DIS preset: expected {', '.join(DIS_PRESETS)}, got {preset!r}.")
+    return _Dis(preset, forward_backward)
+
+
+class _Dis:
+    """See :func:`dis_flow`."""
+
+    def __init__(self, preset: str, forward_backward: bool) -> None:
+        self._dis = cv2.DISOpticalFlow.create(DIS_PRESETS[preset])
+        self._forward_backward = bool(forward_backward)
+
+    def __call__(self, prev: Frame, curr: Frame) -> FlowField:
+        """Flow from ``prev`` to ``curr``; None where an image is missing or too small for DIS."""
+        if prev.rgb is None or curr.rgb is None or prev.rgb.shape != curr.rgb.shape:
+            return FlowField(None, source="dis")
+        first = cv2.cvtColor(prev.rgb, cv2.COLOR_RGB2GRAY)
+        second = cv2.cvtColor(curr.rgb, cv2.COLOR_RGB2GRAY)
+        try:
+            forward = self._dis.calc(first, second, None)
+            backward = self._dis.calc(second, first, None) if self._forward_backward else None
+        except cv2.error:  # smaller than DIS's patches
+            return FlowField(None, source="dis")
+        if backward is None:
+            return FlowField(forward, None, _lands_inside(forward), "dis")
+        variance, valid = forward_backward_check(forward, backward)
+        return FlowField(forward, variance, valid, "dis")
+
+
+def forward_backward_check(
+    forward: np.ndarray, backward: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Variance and validity from the disagreement of the flows in both directions.
+
+    The error is e(x) = |F(x) + B(x + F(x))| with B sampled bilinearly. The constants of the
+    variance were measured on the synthetic world (see ``BASE_STD_PX``).
+
+    Args:
+        forward: (H, W, 2) float32 px, previous to current, on the previous grid.
+        backward: (H, W, 2) float32 px, current to previous, on the current grid.
+
+    Returns:
+        variance (H, W) float32 px^2 per component, and valid (H, W) bool: False where the error
+        exceeds 1.5 px and 5 % of the flow, or where the flow leaves the image or is not finite.
+
+    Raises:
+        InputError: shapes that are not (H, W, 2) or differ.
+    """
+    if forward.ndim != 3 or forward.shape[2] != 2 or backward.shape != forward.shape:
+        raise InputError(
+            f"forward_backward_check: expected two flows of one shape (H, W, 2), got "
+            f"{forward.shape} and {backward.shape}."
+        )
+    height, width = forward.shape[:2]
+    columns = np.arange(width, dtype=np.float32)
+    rows = np.arange(height, dtype=np.float32)[:, None]
+    finite_forward = np.nan_to_num(forward.astype(np.float32), nan=1e9, posinf=1e9, neginf=-1e9)
+    du, dv = cv2.split(finite_forward)
+    u, v = du + columns, dv + rows
+    back = cv2.remap(
+        backward.astype(np.float32), u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
+    squared = (du + back[..., 0]) ** 2 + (dv + back[..., 1]) ** 2
+    limit = np.maximum(MAX_ERROR_PX**2, MAX_RELATIVE_ERROR**2 * (du * du + dv * dv))
+    valid = (squared <= limit) & (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)
+    variance = np.float32(BASE_STD_PX**2) + np.float32(ERROR_FACTOR**2) * squared
+    np.clip(variance, None, np.float32(MAX_STD_PX**2), out=variance)
+    variance[~np.isfinite(variance)] = MAX_STD_PX**2
+    return variance, valid
+
+
+def _lands_inside(flow: np.ndarray) -> np.ndarray:
+    """(H, W) bool, True where the flow ends within the image; False for NaN."""
+    height, width = flow.shape[:2]
+    u = flow[..., 0] + np.arange(width, dtype=np.float32)
+    v = flow[..., 1] + np.arange(height, dtype=np.float32)[:, None]
+    return (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)
+
+
+def file_flow(sequence: _FlowFiles) -> FlowProvider:
+    """Provider of the flow files of a sequence.
+
+    Flow files lead from one frame to the next: for any other two frames, and where the file of a
+    pair is missing, the flow is None. A damaged file raises what the reader raises.
+
+    Args:
+        sequence: an open sequence, see :func:`hybridvo.data.sequence.open_sequence`.
+    """
+
+    def provide(prev: Frame, curr: Frame) -> FlowField:
+        if curr.index != prev.index + 1:
+            return FlowField(None, source="file", is_true=sequence.flow_is_true)
+        try:
+            flow, valid = sequence.flow(prev.index)
+        except FileNotFoundError:
+            return FlowField(None, source="file", is_true=sequence.flow_is_true)
+        return FlowField(flow, None, valid, "file", sequence.flow_is_true)
+
+    return provide
+
+
+def fallback(first: FlowProvider, second: FlowProvider) -> FlowProvider:
+    """Provider that asks ``second`` where ``first`` has no flow; the field names its source."""
+
+    def provide(prev: Frame, curr: Frame) -> FlowField:
+        field = first(prev, curr)
+        return second(prev, curr) if field.flow is None else field
+
+    return provide
+
+
+def as_provider(
+    function: Callable[..., Any], *, name: str | None = None, is_true: bool = False
+) -> FlowProvider:
+    """Provider from a user's own function of two images.
+
+    Args:
+        function: ``(rgb_prev, rgb_curr) -> (H, W, 2)`` px on the previous grid; images are
+            (H, W, 3) uint8 in RGB order. NaN, inf and None mean that there is no flow.
+        name: what reports call it; default: the function's own name.
+        is_true: whether its flow is ground truth.
+
+    Raises:
+        InputError: ``function`` cannot be called. The provider raises it for a result of another
+            shape or type.
+
+    Example:
+        >>> import numpy as np
+        >>> from hybridvo.types import Camera
+        >>> still = as_provider(lambda a, b: np.zeros((*a.shape[:2], 2)), name="still")
+        >>> frame = Frame(np.zeros((4, 6, 3), np.uint8), None, Camera(5, 5, 2.5, 1.5, 4, 6))
+        >>> still(frame, frame).flow.shape
+        (4, 6, 2)
+    """
+    if not callable(function):
+        raise InputError(f"flow: expected a callable, got {type(function).__name__}.")
+    label = name or getattr(function, "__name__", type(function).__name__)
+
+    def provide(prev: Frame, curr: Frame) -> FlowField:
+        if prev.rgb is None or curr.rgb is None:
+            return FlowField(None, source=label, is_true=is_true)
+        result = function(prev.rgb, curr.rgb)
+        return check_field(result, prev, label, is_true)
+
+    return provide
+
+
+def check_field(result: Any, prev: Frame, source: str, is_true: bool = False) -> FlowField:
+    """FlowField from an array, a FlowField or None, with its shape checked against the frame.
+
+    Raises:
+        InputError: another shape than the frame's, or values that are not numbers.
+    """
+    if isinstance(result, FlowField):
+        if result.flow is None or result.flow.shape == (*prev.camera.shape, 2):
+            return result
+        result = result.flow
+    if result is None:
+        return FlowField(None, source=source, is_true=is_true)
+    array = np.asarray(result)
+    expected = (*prev.camera.shape, 2)
+    if array.shape != expected or array.dtype.kind not in "fiu":
+        raise InputError(
+            f"flow ({source}): expected numbers of shape {expected} = (H, W, 2), pixels on the "
+            f"previous grid, got {array.dtype} {array.shape}."
+            + (" Transpose (2, H, W) first." if array.shape == (2, *expected[:2]) else "")
+        )
+    flow = array.astype(np.float32)
+    finite = np.isfinite(flow).all(axis=2)
+    if finite.all():
+        return FlowField(flow, source=source, is_true=is_true)
+    flow[~finite] = np.nan
+    return FlowField(flow, None, finite, source, is_true)

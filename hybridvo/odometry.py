@@ -1,0 +1,264 @@
+"""Odometry: a stateful tracker for SLAM front ends, one frame in, one step out, constant memory."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from hybridvo.errors import InputError
+from hybridvo.flow import FlowField, FlowProvider, check_field, dis_flow
+from hybridvo.geometry import invert
+from hybridvo.hybrid import DEFAULT_METHOD, check_method, estimate, warm_up
+from hybridvo.pose.refinement import RefinementOptions
+from hybridvo.trajectory import chain
+from hybridvo.types import Frame, FramePair, Reason, RelativePose, Step
+
+__all__ = ["Anchor", "Odometry", "Policy"]
+
+Policy = Literal["hold", "constant_velocity"]
+POLICIES = ("hold", "constant_velocity")
+
+FAILED_STD_M = 1.0
+FAILED_STD_RAD = 0.3
+"""Smallest standard deviations that a failed motion claims."""
+
+
+@dataclass(frozen=True, eq=False)
+class Anchor:
+    """What a tracker needs to go on where another one stopped.
+
+    Args:
+        frame: the last frame that could be read; None before the first one.
+        T_world_cam: (4, 4) its pose.
+        T_world_last: (4, 4) pose last handed out: another one than ``T_world_cam`` after frames
+            that could not be read.
+        T_last: (4, 4) last motion found between neighbours, or None.
+        gap: frames that could not be read since ``frame``.
+    """
+
+    frame: Frame | None
+    T_world_cam: np.ndarray
+    T_world_last: np.ndarray
+    T_last: np.ndarray | None
+    gap: int = 0
+
+
+class Odometry:
+    """Chains the motions of consecutive frames; keeps one previous frame and nothing else.
+
+    Two trackers share no state and may run in two threads; one tracker belongs to one thread.
+
+    Args:
+        network: None; networks come with their weights in a later version.
+        flow: provider ``(prev, curr) -> FlowField or (H, W, 2) array``; default: OpenCV DIS with a
+            forward-backward check. Functions of two images go through
+            :func:`hybridvo.flow.as_provider`.
+        method: see :data:`hybridvo.hybrid.METHODS`.
+        policy: pose of a frame whose motion failed: ``hold`` (no motion) or ``constant_velocity``
+            (the last motion again). The status stays failed and the covariance is large.
+        options: of the refinement.
+        seed: of everything drawn at random.
+        prepare: compile now rather than at the first pair (see :func:`hybridvo.hybrid.warm_up`).
+
+    Raises:
+        InputError: an unknown method or policy, or a network.
+
+    Example:
+        >>> import numpy as np
+        >>> from hybridvo.types import Camera
+        >>> vo = Odometry(method="identity")
+        >>> camera = Camera(30, 30, 15.5, 11.5, 24, 32)
+        >>> step = vo.track(Frame(None, np.ones((24, 32)), camera, timestamp=0.1))
+        >>> step.ok, step.T_world_cam[0, 0]
+        (True, 1.0)
+    """
+
+    def __init__(
+        self,
+        network: Any = None,
+        *,
+        flow: FlowProvider | Callable[[Frame, Frame], Any] | None = None,
+        method: str = DEFAULT_METHOD,
+        policy: Policy = "hold",
+        options: RefinementOptions | None = None,
+        seed: int = 0,
+        prepare: bool = True,
+    ) -> None:
+        if network is not None:
+            raise InputError("Odometry.network: expected None; networks are not supported yet.")
+        if policy not in POLICIES:
+            raise InputError(f"Odometry.policy: expected {' or '.join(POLICIES)}, got {policy!r}.")
+        if flow is not None and not callable(flow):
+            raise InputError(
+                f"Odometry.flow: expected a callable (prev, curr), got {type(flow).__name__}."
+            )
+        check_method(method)
+        self.method = method
+        self.policy = policy
+        self.options = options or RefinementOptions()
+        self.seed = seed
+        self._flow = flow or dis_flow()
+        self.reset()
+        if prepare:
+            warm_up(method)
+
+    @classmethod
+    def from_pretrained(cls, name: str = "default", **options: Any) -> Odometry:
+        """Tracker with the shipped network weights.
+
+        Raises:
+            InputError: always, in this version: no weights are shipped yet.
+        """
+        raise InputError(
+            f"Odometry.from_pretrained({name!r}): this version ships no network weights yet; "
+            f"use hybridvo.Odometry(), the classical refinement."
+        )
+
+    @property
+    def anchor(self) -> Anchor:
+        """State after the last frame: hand it to :meth:`resume` to go on later."""
+        return self._anchor
+
+    def reset(self) -> None:
+        """Forget everything: the next frame is the first one, at the identity."""
+        self._anchor = Anchor(None, np.eye(4), np.eye(4), None)
+
+    def set_pose(self, T_world_cam: np.ndarray) -> None:
+        """Say where the camera is now (or where it starts), as after a loop closure.
+
+        Args:
+            T_world_cam: (4, 4) camera to world of the last frame, or of the first one to come.
+
+        Raises:
+            InputError: no finite rigid transform.
+        """
+        T = _rigid(T_world_cam, "Odometry.set_pose")
+        anchor = self._anchor
+        # the frame that the next pair starts from keeps its place relative to the last pose
+        T_anchor = T @ invert(anchor.T_world_last) @ anchor.T_world_cam if anchor.gap else T
+        self._anchor = replace(anchor, T_world_cam=T_anchor, T_world_last=T)
+
+    def resume(self, anchor: Anchor) -> None:
+        """Go on where another tracker stopped; the steps that follow have the same bytes."""
+        self._anchor = anchor
+
+    def track(self, frame: Frame, flow: FlowField | np.ndarray | None = None) -> Step:
+        """Pose of the next frame.
+
+        Args:
+            frame: the next frame. Its arrays are copied: a driver may reuse its buffers.
+            flow: (H, W, 2) px from the previous frame to this one, or a FlowField, where it is known
+                already; by default the tracker's own provider is asked.
+
+        Returns:
+            The step. The first frame has the identity as motion, status ok.
+
+        Raises:
+            InputError: ``frame`` is no Frame, has another size than the one before, or the flow
+                does not fit it. The tracker is then as it was.
+        """
+        if not isinstance(frame, Frame):
+            raise InputError(f"Odometry.track: expected a Frame, got {type(frame).__name__}.")
+        anchor = self._anchor
+        if anchor.frame is None:
+            return self._start(frame, anchor)
+        prev = anchor.frame
+        pair = self._pair(prev, frame, flow)
+        motion = estimate(
+            pair,
+            T_last=anchor.T_last if anchor.gap == 0 else None,
+            method=self.method,
+            options=self.options,
+            seed=self.seed,
+        )
+        if motion.ok:
+            T_world_cam = chain(anchor.T_world_cam, motion.T_curr_prev)
+            T_last = motion.T_curr_prev if anchor.gap == 0 else None
+        else:
+            T_world_cam, motion = self._instead(anchor, motion)
+            T_last = anchor.T_last
+        # without an image nothing can be matched from here: the next pair spans this frame
+        blind = frame.rgb is None and pair.flow is None
+        if blind:
+            self._anchor = replace(anchor, T_world_last=T_world_cam, gap=anchor.gap + 1)
+        else:
+            self._anchor = Anchor(_own(frame), T_world_cam, T_world_cam, T_last)
+        return Step(frame.index, frame.timestamp, T_world_cam.copy(), motion)
+
+    def skip(self, index: int, timestamp: float, message: str = "") -> Step:
+        """A frame that could not be read: a failed step; the next pair spans it.
+
+        Args:
+            index: of the frame. timestamp: seconds. message: why.
+        """
+        anchor = self._anchor
+        failed = RelativePose.failed(
+            Reason.MISSING_FRAME, message or "the frame cannot be read", self.method
+        )
+        if anchor.frame is None:
+            return Step(index, timestamp, anchor.T_world_last.copy(), failed)
+        T_world_cam, motion = self._instead(anchor, failed)
+        self._anchor = replace(anchor, T_world_last=T_world_cam, gap=anchor.gap + 1)
+        return Step(index, timestamp, T_world_cam.copy(), motion)
+
+    def _start(self, frame: Frame, anchor: Anchor) -> Step:
+        T = anchor.T_world_last
+        self._anchor = Anchor(_own(frame), T, T, None)
+        first = RelativePose(covariance=np.zeros((6, 6)), method=self.method)
+        return Step(frame.index, frame.timestamp, T.copy(), first)
+
+    def _pair(self, prev: Frame, curr: Frame, flow: Any) -> FramePair:
+        if curr.camera.shape != prev.camera.shape:
+            raise InputError(
+                f"Odometry.track: expected a frame of {prev.camera.shape} (height, width) as "
+                f"before, got {curr.camera.shape}. Resize it with "
+                f"hybridvo.data.resize.resize_frame, or reset() the tracker."
+            )
+        given = self._flow(prev, curr) if flow is None else flow
+        field = check_field(given, prev, "given" if flow is not None else "callable")
+        return FramePair(
+            prev, curr, field.flow, field.variance, field.valid, field.source, field.is_true
+        )
+
+    def _instead(self, anchor: Anchor, failed: RelativePose) -> tuple[np.ndarray, RelativePose]:
+        """(pose, motion) by policy, where a motion was not found."""
+        covariance = np.diag([FAILED_STD_M**2] * 3 + [FAILED_STD_RAD**2] * 3)
+        covariance = np.maximum(covariance, np.diag(np.diag(failed.covariance)))
+        if self.policy == "hold" or anchor.T_last is None:
+            T_world_cam = anchor.T_world_last
+        else:
+            T_world_cam = chain(anchor.T_world_last, anchor.T_last)
+        if anchor.gap or self.policy != "hold":
+            T_curr_prev = invert(T_world_cam) @ anchor.T_world_cam
+        else:
+            T_curr_prev = np.eye(4)
+        return T_world_cam, failed.replace(T_curr_prev=T_curr_prev, covariance=covariance)
+
+
+def _own(frame: Frame) -> Frame:
+    """Copy whose arrays nobody else can change."""
+
+    def copy(array: np.ndarray | None) -> np.ndarray | None:
+        return None if array is None else array.copy()
+
+    return replace(
+        frame,
+        rgb=copy(frame.rgb),
+        depth=copy(frame.depth),
+        depth_variance=copy(frame.depth_variance),
+        mask=copy(frame.mask),
+    )
+
+
+def _rigid(T: Any, where: str) -> np.ndarray:
+    """(4, 4) float64 copy of a rigid transform, or InputError."""
+    T = np.array(T, dtype=np.float64)
+    if T.shape != (4, 4) or not np.isfinite(T).all():
+        raise InputError(f"{where}: expected a finite (4, 4) transform, got shape {T.shape}.")
+    R = T[:3, :3]
+    if np.abs(R.T @ R - np.eye(3)).max() > 1e-6 or np.linalg.det(R) < 0:
+        raise InputError(f"{where}: expected a rotation in the upper left, got {R.tolist()}.")
+    return T

@@ -1,0 +1,480 @@
+"""One run: a sequence from disk in, trajectory, steps and scores out.
+
+Truth is used for scoring alone; what the estimate took from an oracle (true flow, true depth) is
+said in every output.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import logging
+import os
+import platform
+import re
+import time
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import hybridvo
+from hybridvo.configuration import RunOptions
+from hybridvo.console import Progress, interruptible
+from hybridvo.data.sequence import Sequence, open_sequence
+from hybridvo.errors import InputError
+from hybridvo.evaluation.metrics import evaluate_trajectories, mean_pair_errors, pair_errors
+from hybridvo.evaluation.report import write_csv, write_json
+from hybridvo.flow import FlowField, FlowProvider, dis_flow, fallback, file_flow
+from hybridvo.geometry import invert, pose_matrix, se3_log
+from hybridvo.hybrid import check_method
+from hybridvo.odometry import Anchor, Odometry
+from hybridvo.run_folder import RESULTS, Mode, RunFolder
+from hybridvo.trajectory import Trajectory, atomic_write, write_kitti, write_tum
+from hybridvo.types import Frame, Step
+
+__all__ = ["EXIT_DONE", "EXIT_FAILED_FRAMES", "EXIT_INTERRUPTED", "RunResult", "run", "run_name"]
+
+EXIT_DONE, EXIT_FAILED_FRAMES, EXIT_INTERRUPTED = 0, 3, 130
+
+SAMPLED_BYTES = 4096
+"""Bytes at either end of an input file that go into the input hash, beside its size."""
+
+STEP_COLUMNS = (
+    *("index", "timestamp", "status", "reason", "tx", "ty", "tz", "rx", "ry", "rz"),
+    *("inlier_ratio", "iterations", "cost", "ms", "prev_index", "flow_source", "message"),
+)
+
+_logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class RunResult:
+    """What a run leaves.
+
+    Args:
+        exit_code: 0, 3 (too many failed frames) or 130 (interrupted).
+        summary: JSON-ready: state, counts, oracles, times, metrics, files.
+        trajectory: the poses so far. truth: true poses, or None.
+    """
+
+    exit_code: int
+    summary: dict[str, Any]
+    trajectory: Trajectory
+    truth: Trajectory | None
+
+
+def run_name(sequence: Sequence) -> str:
+    """Name of a sequence as one plain path part."""
+    return re.sub(r"[^\w.-]+", "_", sequence.name).strip("._") or "sequence"
+
+
+def run(
+    path: str | os.PathLike[str],
+    out: str | os.PathLike[str] | None,
+    options: RunOptions,
+    *,
+    dataset: str | None = None,
+    mode: Mode = "new",
+    command: Iterable[str] = (),
+    quiet: bool = False,
+) -> RunResult:
+    """Estimate, chain, write and score a sequence.
+
+    Args:
+        path: sequence folder. out: output folder, default ``runs/NAME``.
+        options: see :class:`hybridvo.configuration.RunOptions`.
+        dataset: kind of the sequence; detected by default.
+        mode: ``new``, ``resume`` or ``overwrite``.
+        command: for ``run.json``.
+        quiet: no progress.
+
+    Raises:
+        InputError: input or options that cannot be used, or a broken frame with ``strict``.
+        LockedError: another run holds the folder. OutputError: a result cannot be written.
+    """
+    check_method(options.method)
+    _check_device(options.device)
+    sequence = open_sequence(path, dataset, **({"strict": True} if options.strict else {}))
+    frames = range(options.start, min(options.stop or len(sequence), len(sequence)), options.stride)
+    if not frames:
+        raise InputError(
+            f"{sequence.name}: no frames from {options.start} on: there are {len(sequence)}."
+        )
+    provider = _provider(sequence, options)
+    out = Path("runs") / run_name(sequence) if out is None else Path(out)
+    identity = {
+        "input_hash": input_hash(sequence),
+        "options": _deciding(options),
+        "hybridvo": hybridvo.__version__,
+    }
+    header = {
+        "command": list(command),
+        "versions": versions(),
+        "machine": {"platform": platform.platform(), "cpus": os.cpu_count()},
+        "options": dataclasses.asdict(options),
+        "input_hash": identity["input_hash"],
+        "sequence": {
+            "name": sequence.name,
+            "kind": sequence.kind,
+            "path": os.fspath(path),
+            "frames": len(frames),
+            "depth_source": sequence.depth_source,
+            "notices": list(sequence.notices),
+        },
+    }
+    with RunFolder(out, identity, header, mode) as folder:
+        if folder.finished:
+            return _finished_before(folder, sequence)
+        return _run(sequence, frames, provider, options, folder, quiet)
+
+
+def _run(
+    sequence: Sequence,
+    frames: range,
+    provider: _Recorder,
+    options: RunOptions,
+    folder: RunFolder,
+    quiet: bool,
+) -> RunResult:
+    label = f"{sequence.name} [{options.method}]"
+    with interruptible() as interruption, Progress(len(frames), label, quiet=quiet) as progress:
+        for notice in sequence.notices:
+            progress.say(f"note: {notice}")
+        vo = Odometry(
+            flow=provider,
+            method=options.method,
+            policy=options.policy,  # type: ignore[arg-type]
+            options=options.refinement,
+            seed=options.seed,
+        )
+        done = folder.frames_done
+        failed = int(folder.last["failed_so_far"]) if folder.last else 0
+        if folder.last is not None:
+            vo.resume(_load_anchor(folder.last["anchor"], sequence))
+            progress.say(f"resumed after {done} of {len(frames)} frames")
+        for index in frames[done:]:
+            if interruption:
+                break
+            row = _track(vo, sequence, index, provider, options.strict, progress)
+            failed += row["status"] == "failed"
+            folder.append(row | {"failed_so_far": failed})
+            progress.update(folder.frames_done, failed)
+        if interruption:
+            progress.say(f"interrupted: {folder.frames_done} frames are kept; go on with --resume")
+            return _write(sequence, frames, options, folder, interrupted=True)
+        return _write(sequence, frames, options, folder, interrupted=False)
+
+
+def _track(
+    vo: Odometry,
+    sequence: Sequence,
+    index: int,
+    provider: _Recorder,
+    strict: bool,
+    progress: Progress,
+) -> dict[str, Any]:
+    """Row of one frame."""
+    stamp = float(sequence.timestamps[index])
+    before = vo.anchor
+    provider.field = None
+    try:
+        frame = sequence.frame(index)
+    except (InputError, OSError) as error:
+        if strict:
+            raise InputError(f"frame {index}: {error}") from error
+        progress.say(f"frame {index} cannot be read: {error}")
+        step, ms = vo.skip(index, stamp, str(error)), 0.0
+    else:
+        started = time.perf_counter()
+        step = vo.track(frame)
+        ms = 1e3 * (time.perf_counter() - started)
+    field = provider.field
+    motion = step.motion
+    row: dict[str, Any] = {
+        "index": index,
+        "timestamp": stamp,
+        "status": step.status.state.value,
+        "reason": step.status.reason.value,
+        "message": step.status.message,
+        "T_curr_prev": motion.T_curr_prev.ravel(),
+        "T_world_cam": step.T_world_cam.ravel(),
+        "covariance": motion.covariance.ravel(),
+        "inlier_ratio": motion.inlier_ratio,
+        "iterations": motion.iterations,
+        "cost": motion.cost,
+        "ms": round(ms, 3),
+        "prev_index": None if before.frame is None else before.frame.index,
+        "flow_source": None if field is None else field.source,
+        "flow_is_true": field is not None and field.flow is not None and field.is_true,
+        "errors": _errors(sequence, before.frame, step),
+        "anchor": _dump_anchor(vo.anchor),
+    }
+    return row
+
+
+def _errors(sequence: Sequence, prev: Frame | None, step: Step) -> dict[str, Any] | None:
+    """Errors of a step against the truth, or None where there is none."""
+    if sequence.poses is None or prev is None or prev.depth is None:
+        return None
+    T_world_prev, T_world_curr = sequence.poses[prev.index], sequence.poses[step.index]
+    if not (np.isfinite(T_world_prev).all() and np.isfinite(T_world_curr).all()):
+        return None
+    T_true = invert(T_world_curr) @ T_world_prev
+    camera = sequence.camera(step.index)
+    return pair_errors(step.T_curr_prev, T_true, prev.depth, prev.camera, camera)
+
+
+def _write(
+    sequence: Sequence, frames: range, options: RunOptions, folder: RunFolder, *, interrupted: bool
+) -> RunResult:
+    """Results of the rows kept so far; all of them and the scores where the run is complete."""
+    rows = list(folder.rows())
+    if not rows:  # interrupted before the first frame
+        folder.write_state("interrupted")
+        empty = Trajectory([0.0], np.eye(4)[None], has_timestamps=False)
+        return RunResult(EXIT_INTERRUPTED, {"state": "interrupted", "frames": 0}, empty, None)
+    poses = np.array([row["T_world_cam"] for row in rows]).reshape(-1, 4, 4)
+    trajectory = Trajectory(np.array([row["timestamp"] for row in rows]), poses)
+    truth = _truth(sequence, frames)
+    write_tum(trajectory, folder.path / "trajectory.tum")
+    write_kitti(trajectory, folder.path / "trajectory.kitti")
+    _write_steps(folder.path, rows)
+    failed = rows[-1]["failed_so_far"]
+    pairs = len(frames) - 1
+    tracked = [row["ms"] for row in rows[1:] if row["reason"] != "missing_frame"]
+    summary: dict[str, Any] = {
+        "out": os.fspath(folder.path),
+        "sequence": sequence.name,
+        "method": options.method,
+        "frames": len(rows),
+        "failed": failed,
+        "failed_share": failed / max(pairs, 1),
+        "degraded": sum(row["status"] == "degraded" for row in rows),
+        "missing_frames": [row["index"] for row in rows if row["reason"] == "missing_frame"],
+        "flow_source": _names(row["flow_source"] for row in rows),
+        "depth_source": sequence.depth_source,
+        "oracle": _oracles(rows, sequence),
+        "ms_per_pair_median": float(np.median(tracked)) if tracked else None,
+        "warnings": [],
+    }
+    if interrupted:
+        folder.write_state("interrupted", summary=summary)
+        return RunResult(EXIT_INTERRUPTED, summary | {"state": "interrupted"}, trajectory, truth)
+    if len(rows) == 1:
+        summary["warnings"].append("one frame: one pose at the identity, there is no motion to see")
+    if truth is not None:
+        metrics = _score(rows, trajectory, truth, options, summary)
+        write_json(folder.path / "metrics.json", metrics)
+        summary["metrics"] = metrics
+    _draw(folder.path / "trajectory.png", trajectory, truth, summary)
+    too_many = failed > 0 and summary["failed_share"] > options.max_failed
+    if too_many:
+        summary["warnings"].append(
+            f"{failed} of {max(pairs, 1)} motions failed, more than --max-failed "
+            f"{options.max_failed:g} allows"
+        )
+    folder.finish(summary={k: v for k, v in summary.items() if k != "metrics"})
+    summary["files"] = [
+        os.fspath(folder.path / name)
+        for name in (*RESULTS, "run.json")
+        if (folder.path / name).exists()
+    ]
+    exit_code = EXIT_FAILED_FRAMES if too_many else EXIT_DONE
+    return RunResult(exit_code, summary | {"state": "done"}, trajectory, truth)
+
+
+def _score(
+    rows: list[dict[str, Any]],
+    trajectory: Trajectory,
+    truth: Trajectory,
+    options: RunOptions,
+    summary: Mapping[str, Any],
+) -> dict[str, Any]:
+    """Content of ``metrics.json``; no times, so that equal runs give equal bytes."""
+    report = evaluate_trajectories(trajectory, truth, alignment=options.alignment)  # type: ignore[arg-type]
+    per_pair = mean_pair_errors(row["errors"] for row in rows if row["errors"] is not None)
+    reasons = report.pop("reasons") | per_pair.pop("reasons")
+    named = ("method", "failed", "degraded", "flow_source", "depth_source", "oracle", "sequence")
+    return report | per_pair | {"reasons": reasons} | {key: summary[key] for key in named}
+
+
+def _write_steps(folder: Path, rows: list[dict[str, Any]]) -> None:
+    T = np.array([row["T_curr_prev"] for row in rows]).reshape(-1, 4, 4)
+    table = []
+    for row, motion in zip(rows, T, strict=True):
+        rotation = se3_log(motion)[3:]
+        values = dict(
+            zip(("tx", "ty", "tz", "rx", "ry", "rz"), [*motion[:3, 3], *rotation], strict=True)
+        )
+        message = " ".join(str(row["message"]).split())
+        table.append({**row, **values, "message": message})
+    write_csv(folder / "steps.csv", table, STEP_COLUMNS)
+    covariance = np.array([row["covariance"] for row in rows]).reshape(-1, 6, 6)
+    with atomic_write(folder / "steps.npz", "wb") as file:
+        np.savez(file, T_curr_prev=T, covariance=covariance)
+
+
+def _draw(
+    path: Path, trajectory: Trajectory, truth: Trajectory | None, summary: Mapping[str, Any]
+) -> None:
+    from hybridvo.evaluation.plots import plot_trajectories
+
+    title = f"{summary['sequence']}, flow: {', '.join(summary['flow_source']) or 'none'}"
+    if summary["oracle"]:
+        title += f" (oracle: {', '.join(summary['oracle'])})"
+    plot_trajectories({summary["method"]: trajectory}, path, truth=truth, title=title)
+
+
+def _truth(sequence: Sequence, frames: range) -> Trajectory | None:
+    """True poses of the frames of the run that have one."""
+    if sequence.poses is None:
+        return None
+    known = [i for i in frames if np.isfinite(sequence.poses[i]).all()]
+    if not known:
+        return None
+    # text files carry six digits: made orthonormal as the trajectory demands
+    T = np.stack([pose_matrix(sequence.poses[i][:3]) for i in known])
+    return Trajectory(sequence.timestamps[known], T)
+
+
+def _finished_before(folder: RunFolder, sequence: Sequence) -> RunResult:
+    """Result of a run that was complete when it was resumed."""
+    from hybridvo.trajectory import read_trajectory
+
+    summary = folder.state.get("summary", {})
+    metrics = folder.read_json("metrics.json")
+    if metrics is not None:
+        summary["metrics"] = metrics
+    trajectory = read_trajectory(folder.path / "trajectory.tum", "tum")
+    limit = folder.state["options"]["max_failed"]
+    exit_code = EXIT_FAILED_FRAMES if summary.get("failed_share", 0) > limit else EXIT_DONE
+    return RunResult(exit_code, summary | {"state": "done"}, trajectory, None)
+
+
+class _Recorder:
+    """A flow provider that remembers the last field, and survives flow files that are damaged."""
+
+    def __init__(self, provider: FlowProvider) -> None:
+        self._provider = provider
+        self.field: FlowField | None = None
+
+    def __call__(self, prev: Frame, curr: Frame) -> FlowField:
+        self.field = self._provider(prev, curr)
+        return self.field
+
+
+def _tolerant(provider: FlowProvider, strict: bool) -> FlowProvider:
+    """No flow, with a line in the log, where a file is damaged."""
+
+    def provide(prev: Frame, curr: Frame) -> FlowField:
+        try:
+            return provider(prev, curr)
+        except (InputError, OSError) as error:
+            if strict:
+                raise InputError(f"flow of frame {prev.index}: {error}") from error
+            _logger.warning("flow of frame %d: %s", prev.index, error)
+            return FlowField(None, source="file")
+
+    return provide
+
+
+def _provider(sequence: Sequence, options: RunOptions) -> _Recorder:
+    if options.flow == "file":
+        if not sequence.has_flow:
+            raise InputError(f"{sequence.name}: there are no flow files; pass --flow dis.")
+        if options.stride > 1:
+            raise InputError(
+                f"{sequence.name}: flow files lead from one frame to the next, not over a stride "
+                f"of {options.stride}; pass --flow dis."
+            )
+        return _Recorder(_tolerant(file_flow(sequence), options.strict))
+    dis = dis_flow(options.dis.preset, options.dis.forward_backward)
+    if options.flow == "auto" and sequence.has_flow and options.stride == 1:
+        return _Recorder(fallback(_tolerant(file_flow(sequence), options.strict), dis))
+    return _Recorder(dis)
+
+
+def _check_device(device: str) -> None:
+    if device == "cuda":
+        import torch
+
+        if not torch.cuda.is_available():
+            raise InputError(
+                "--device cuda: this machine, or this build of torch, has no CUDA device; "
+                "use --device cpu."
+            )
+
+
+def _deciding(options: RunOptions) -> dict[str, Any]:
+    """The options that decide the result: what a resumed run must share."""
+    values = dataclasses.asdict(options)
+    for name in ("max_failed", "strict", "device"):
+        del values[name]
+    return values
+
+
+def input_hash(sequence: Sequence) -> str:
+    """SHA-256 over names, sizes and both ends of every input file: milliseconds, not minutes."""
+    digest = hashlib.sha256()
+    for path in sequence.files():
+        try:
+            with path.open("rb") as file:
+                size = os.fstat(file.fileno()).st_size
+                content = file.read(SAMPLED_BYTES)
+                if size > SAMPLED_BYTES:
+                    file.seek(max(SAMPLED_BYTES, size - SAMPLED_BYTES))
+                    content += file.read(SAMPLED_BYTES)
+        except OSError:
+            size, content = -1, b""
+        digest.update(f"{path.name}\0{size}\0".encode(errors="surrogateescape"))
+        digest.update(content)
+    return digest.hexdigest()
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of the packages that decide numbers; absent ones are left out."""
+    from importlib.metadata import PackageNotFoundError, version
+
+    found = {"python": platform.python_version(), "hybridvo": hybridvo.__version__}
+    for name in ("numpy", "scipy", "opencv-python-headless", "numba", "torch", "evo", "poselib"):
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def _names(values: Iterable[str | None]) -> list[str]:
+    return sorted({value for value in values if value})
+
+
+def _oracles(rows: list[dict[str, Any]], sequence: Sequence) -> list[str]:
+    """What the estimate was given that no sensor gives."""
+    oracles = ["true flow"] if any(row["flow_is_true"] for row in rows) else []
+    return oracles + (["true depth"] if sequence.depth_source == "true" else [])
+
+
+def _dump_anchor(anchor: Anchor) -> dict[str, Any]:
+    return {
+        "index": None if anchor.frame is None else anchor.frame.index,
+        "T_world_cam": anchor.T_world_cam.ravel(),
+        "T_world_last": anchor.T_world_last.ravel(),
+        "T_last": None if anchor.T_last is None else anchor.T_last.ravel(),
+        "gap": anchor.gap,
+    }
+
+
+def _load_anchor(stored: Mapping[str, Any], sequence: Sequence) -> Anchor:
+    def matrix(name: str) -> np.ndarray:
+        return np.array(stored[name], dtype=np.float64).reshape(4, 4)
+
+    return Anchor(
+        None if stored["index"] is None else sequence.frame(stored["index"]),
+        matrix("T_world_cam"),
+        matrix("T_world_last"),
+        None if stored["T_last"] is None else matrix("T_last"),
+        int(stored["gap"]),
+    )
