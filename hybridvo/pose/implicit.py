@@ -17,7 +17,8 @@ from typing import Any
 import torch
 from torch.autograd.function import once_differentiable
 
-from hybridvo.pose.residuals import Pixels, gather_pixels, score_sum
+from hybridvo.pose.pixels import Pixels, gather_pixels
+from hybridvo.pose.residuals import score_sum
 from hybridvo.types import PairBatch
 
 __all__ = ["attach_gradient", "estimating_hessian", "solve_small", "tangent_gradient"]
