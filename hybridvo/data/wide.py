@@ -25,15 +25,13 @@ from hybridvo.data.degradation import (
     sample_at,
     smooth_field,
 )
+from hybridvo.data.layered_scene import SKY_INVERSE_DEPTH, LayeredScene
 from hybridvo.data.silhouettes import Silhouette, outline, random_silhouette
 from hybridvo.data.workflow import Sample, rigid_flow
 from hybridvo.errors import InputError
 from hybridvo.geometry import euler_deg_to_matrix, make_transform
 
 __all__ = ["WideOptions", "wide_sample"]
-
-SKY_INVERSE_DEPTH = 1.0 / 2000.0
-"""Surfaces farther than two kilometres are sky."""
 
 
 @dataclass(frozen=True)
@@ -149,119 +147,7 @@ def _about(R: np.ndarray, t: np.ndarray, centre: np.ndarray) -> np.ndarray:
     return make_transform(R, centre - R @ centre + t)
 
 
-class _Scene:
-    """Inverse depth, owner and motion of every pixel while layers are laid over each other."""
-
-    def __init__(self, rng: np.random.Generator, options: WideOptions) -> None:
-        o, self.rng, self.options = options, rng, options
-        half_angle = np.deg2rad(log_uniform(rng, o.field_of_view_deg)) / 2
-        self.fx = float(o.width / 2 / np.tan(half_angle))
-        self.fy = self.fx * log_uniform(rng, o.aspect)
-        shift = o.centre_shift * rng.uniform(-1, 1, 2)
-        self.cx = (o.width - 1) / 2 + shift[0] * o.width
-        self.cy = (o.height - 1) / 2 + shift[1] * o.height
-        self.x = ((np.arange(o.width) - self.cx) / self.fx).astype(np.float32)
-        self.y = ((np.arange(o.height) - self.cy) / self.fy).astype(np.float32)[:, None]
-        self.scale = log_uniform(rng, o.scene_depth)
-        self.rho = self._background()
-        self.owner = np.full((o.height, o.width), -1, np.int16)
-        self.motions: list[np.ndarray | None] = []
-        self.bends: list[np.ndarray | None] = []
-
-    def _background(self) -> np.ndarray:
-        """(H, W) inverse depth of walls, ground or one slanted surface; 0 is sky."""
-        o, rng = self.options, self.rng
-        kind = rng.random()
-        yaw, pitch, roll = rng.uniform(-40, 40), rng.normal(0, 10), rng.normal(0, 4)
-        R = euler_deg_to_matrix(np.array([pitch, yaw, roll]))
-        size = self.scale
-        planes: list[tuple[np.ndarray, float]] = []
-        floor = (np.array([0.0, 1.0, 0.0]), size * rng.uniform(0.25, 0.7))
-        if kind < o.room_probability:
-            planes = [
-                floor,
-                (np.array([0.0, -1.0, 0.0]), size * rng.uniform(0.25, 0.9)),
-                (np.array([1.0, 0.0, 0.0]), size * rng.uniform(0.3, 2.0)),
-                (np.array([-1.0, 0.0, 0.0]), size * rng.uniform(0.3, 2.0)),
-                (np.array([0.0, 0.0, 1.0]), size * rng.uniform(0.7, 3.0)),
-            ]
-        elif kind < o.room_probability + o.outdoor_probability:
-            planes = [floor]
-            for side in (1.0, -1.0):
-                if rng.random() < 0.4:
-                    planes.append((np.array([side, 0.0, 0.0]), size * rng.uniform(0.3, 4.0)))
-            if rng.random() < 0.4:
-                planes.append((np.array([0.0, 0.0, 1.0]), size * rng.uniform(1.0, 20.0)))
-        else:
-            tilt = rng.uniform(-0.9, 0.9, 2)
-            normal = np.array([tilt[0], tilt[1], 1.0])
-            planes = [(normal / np.linalg.norm(normal), size * rng.uniform(0.6, 1.5))]
-            R = np.eye(3)
-        rho = np.zeros((o.height, o.width), np.float32)
-        for normal, distance in planes:
-            n = (R.T @ normal / distance).astype(np.float32)
-            np.maximum(rho, n[0] * self.x + (n[1] * self.y + n[2]), out=rho)
-        if kind >= o.room_probability + o.outdoor_probability:
-            # A single surface has no sky: it bends away instead.
-            np.maximum(rho, np.float32(0.05 / size), out=rho)
-        relief = o.relief * rng.random() ** 2
-        rho *= np.exp(relief * smooth_field(rng, o.height, o.width, int(rng.integers(3, 12))))
-        rho[rho < SKY_INVERSE_DEPTH] = 0.0
-        return np.minimum(rho, np.float32(5.0))
-
-    def add(
-        self,
-        mask: np.ndarray,
-        in_front: bool,
-        inverse_depth: float | None = None,
-    ) -> tuple[int, np.ndarray] | None:
-        """Lay a curved, slanted piece of surface over the picture.
-
-        Args:
-            mask: (H, W) uint8.
-            in_front: nearer than everything under it; else at any depth, possibly hidden.
-            inverse_depth: 1 / metres, or None to draw it.
-
-        Returns:
-            Its number and the point (3,) in metres at its middle, or None if nothing of it is seen.
-        """
-        rng = self.rng
-        left, top, width, height = cv2.boundingRect(mask)
-        if not width * height:
-            return None
-        box = np.s_[top : top + height, left : left + width]
-        inside = mask[box] > 0
-        under = self.rho[box]
-        if inverse_depth is None:
-            most = max(float(np.quantile(under[::2, ::2], 0.9)), 0.1 / self.scale)
-            factor = rng.uniform(0.05, 1.2) if in_front else rng.uniform(-0.9, 1.4)
-            inverse_depth = min(most * float(np.exp(factor)), 5.0)
-        dx = np.linspace(-1, 1, width, dtype=np.float32)
-        dy = np.linspace(-1, 1, height, dtype=np.float32)[:, None]
-        slope = rng.uniform(-0.15, 0.15, 2).astype(np.float32)
-        bulge = np.float32(rng.uniform(0, 0.2))
-        shape = 1 + slope[0] * dx + slope[1] * dy + bulge * (1 - dx**2 - dy**2)
-        rho = np.float32(inverse_depth) * np.maximum(shape, 0.3)
-        shown = inside & (rho > under)
-        count = int(shown.sum())
-        if count < 4:
-            return None
-        number = len(self.motions)
-        under[shown] = rho[shown]
-        self.owner[box][shown] = number
-        self.motions.append(None)
-        self.bends.append(None)
-        rows, columns = np.nonzero(shown)
-        u, v = left + columns.mean(), top + rows.mean()
-        ray = np.array([(u - self.cx) / self.fx, (v - self.cy) / self.fy, 1.0])
-        return number, ray / inverse_depth
-
-    def new_mask(self) -> np.ndarray:
-        """Empty (H, W) uint8 mask."""
-        return np.zeros((self.options.height, self.options.width), np.uint8)
-
-
-def _camera(scene: _Scene, follow: bool) -> tuple[np.ndarray, np.ndarray]:
+def _camera(scene: LayeredScene, follow: bool) -> tuple[np.ndarray, np.ndarray]:
     """Euler angles in degrees and translation in metres of the camera's T_curr_prev."""
     o, rng = scene.options, scene.rng
     angles = _magnitude(rng, o.camera_rotation_deg) * _direction(rng)
@@ -279,7 +165,7 @@ def _camera(scene: _Scene, follow: bool) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _add_mover(
-    scene: _Scene,
+    scene: LayeredScene,
     shape: Silhouette,
     mask: np.ndarray,
     radius: float,
@@ -336,7 +222,7 @@ def _add_mover(
             scene.motions[part[0]] = total @ turn
 
 
-def _populate(scene: _Scene) -> tuple[np.ndarray, np.ndarray]:
+def _populate(scene: LayeredScene) -> tuple[np.ndarray, np.ndarray]:
     """Occluders and movers; returns the camera's Euler angles and translation."""
     o, rng = scene.options, scene.rng
     still = rng.random() < o.still_probability
@@ -388,7 +274,7 @@ def wide_sample(rng: np.random.Generator, options: WideOptions | None = None) ->
     """
     o = options or WideOptions()
     while True:
-        scene = _Scene(rng, o)
+        scene = LayeredScene(rng, o)
         angles, translation = _populate(scene)
         T_cam = make_transform(euler_deg_to_matrix(angles), translation)
         ego_flow, ego_ratio, flow, ratio = _flows(scene, T_cam)
@@ -427,7 +313,7 @@ def wide_sample(rng: np.random.Generator, options: WideOptions | None = None) ->
 
 
 def _flows(
-    scene: _Scene, T_cam: np.ndarray
+    scene: LayeredScene, T_cam: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Ego flow (H, W, 2) and its depth ratio (H, W), total flow and its depth ratio."""
     t_cam = T_cam[:3, 3].astype(np.float32)
@@ -452,7 +338,7 @@ def _plausible(flow: np.ndarray, ratio: np.ndarray, o: WideOptions) -> bool:
 
 
 def _move(
-    scene: _Scene,
+    scene: LayeredScene,
     number: int,
     T: np.ndarray,
     flow: np.ndarray,

@@ -204,8 +204,8 @@ class Sample:
         depth_curr: (H, W) float32 metres of t+1 **on the grid of t** (what lies at x + flow); 0 is
             invalid.
         depth_true: (H, W) float32 metres of t without noise or holes; 0 where there is none (sky).
-        depth_target: (H, W) float32 metres, what L^D compares with; 0 where there is none. The paper's
-            five steps include the object's own motion here; ``wide`` means the camera's alone.
+        depth_target: (H, W) float32 metres, what L^D compares with; 0 where there is none. It
+            includes the object's own motion in the paper's five steps, not in ``wide``.
         K: (3, 3) float32 intrinsics of both frames.
         T_curr_prev: (4, 4) float32, points of the previous camera into the current one.
         rotation_deg, translation: (3,) float32, the same motion as Euler angles X-Y-Z in degrees
