@@ -1,8 +1,8 @@
 """Optical flow for a pair of frames: from files, from OpenCV's DIS, or from any callable.
 
-A provider is a callable ``(prev: Frame, curr: Frame) -> FlowField``. It may be slow or wrong, but it
-never raises on bad pictures: what it cannot see it marks invalid, and where it sees nothing at all
-the flow is None, which the estimators answer with ``failed(no_flow)``.
+A provider is a callable ``(prev: Frame, curr: Frame) -> FlowField``. It may be slow or wrong, but
+it never raises on bad pictures: what it cannot see it marks invalid, and where it sees nothing at
+all the flow is None, which the estimators answer with ``failed(no_flow)``.
 """
 
 from __future__ import annotations
@@ -102,7 +102,8 @@ class _Dis:
     """See :func:`dis_flow`."""
 
     def __init__(self, preset: str, forward_backward: bool) -> None:
-        self._dis = cv2.DISOpticalFlow.create(DIS_PRESETS[preset])
+        # OpenCV's stubs do not know that calc takes None for "no initial flow"
+        self._dis: Any = cv2.DISOpticalFlow.create(DIS_PRESETS[preset])
         self._forward_backward = bool(forward_backward)
 
     def __call__(self, prev: Frame, curr: Frame) -> FlowField:
@@ -229,7 +230,7 @@ def as_provider(
     """
     if not callable(function):
         raise InputError(f"flow: expected a callable, got {type(function).__name__}.")
-    label = name or getattr(function, "__name__", type(function).__name__)
+    label = str(name or getattr(function, "__name__", type(function).__name__))
 
     def provide(prev: Frame, curr: Frame) -> FlowField:
         if prev.rgb is None or curr.rgb is None:
@@ -261,7 +262,7 @@ def check_field(result: Any, prev: Frame, source: str, is_true: bool = False) ->
             + (" Transpose (2, H, W) first." if array.shape == (2, *expected[:2]) else "")
         )
     flow = array.astype(np.float32)
-    finite = np.isfinite(flow).all(axis=2)
+    finite = np.asarray(np.isfinite(flow).all(axis=2))
     if finite.all():
         return FlowField(flow, source=source, is_true=is_true)
     flow[~finite] = np.nan

@@ -150,8 +150,8 @@ class Odometry:
 
         Args:
             frame: the next frame. Its arrays are copied: a driver may reuse its buffers.
-            flow: (H, W, 2) px from the previous frame to this one, or a FlowField, where it is known
-                already; by default the tracker's own provider is asked.
+            flow: (H, W, 2) px from the previous frame to this one, or a FlowField, where it is
+                known already; by default the tracker's own provider is asked.
 
         Returns:
             The step. The first frame has the identity as motion, status ok.
@@ -192,7 +192,9 @@ class Odometry:
         """A frame that could not be read: a failed step; the next pair spans it.
 
         Args:
-            index: of the frame. timestamp: seconds. message: why.
+            index: of the frame.
+            timestamp: seconds.
+            message: why.
         """
         anchor = self._anchor
         failed = RelativePose.failed(

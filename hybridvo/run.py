@@ -25,14 +25,15 @@ from hybridvo.configuration import RunOptions
 from hybridvo.console import Progress, interruptible
 from hybridvo.data.sequence import Sequence, open_sequence
 from hybridvo.errors import InputError
-from hybridvo.evaluation.metrics import evaluate_trajectories, mean_pair_errors, pair_errors
-from hybridvo.evaluation.report import write_csv, write_json
+from hybridvo.evaluation.metrics import pair_errors
+from hybridvo.evaluation.report import write_json
 from hybridvo.flow import FlowField, FlowProvider, dis_flow, fallback, file_flow
-from hybridvo.geometry import invert, pose_matrix, se3_log
+from hybridvo.geometry import invert
 from hybridvo.hybrid import check_method
 from hybridvo.odometry import Anchor, Odometry
 from hybridvo.run_folder import RESULTS, Mode, RunFolder
-from hybridvo.trajectory import Trajectory, atomic_write, write_kitti, write_tum
+from hybridvo.run_results import draw, score, summarise, true_trajectory, write_steps
+from hybridvo.trajectory import Trajectory, write_kitti, write_tum
 from hybridvo.types import Frame, Step
 
 __all__ = ["EXIT_DONE", "EXIT_FAILED_FRAMES", "EXIT_INTERRUPTED", "RunResult", "run", "run_name"]
@@ -41,11 +42,6 @@ EXIT_DONE, EXIT_FAILED_FRAMES, EXIT_INTERRUPTED = 0, 3, 130
 
 SAMPLED_BYTES = 4096
 """Bytes at either end of an input file that go into the input hash, beside its size."""
-
-STEP_COLUMNS = (
-    *("index", "timestamp", "status", "reason", "tx", "ty", "tz", "rx", "ry", "rz"),
-    *("inlier_ratio", "iterations", "cost", "ms", "prev_index", "flow_source", "message"),
-)
 
 _logger = logging.getLogger(__name__)
 
@@ -84,7 +80,8 @@ def run(
     """Estimate, chain, write and score a sequence.
 
     Args:
-        path: sequence folder. out: output folder, default ``runs/NAME``.
+        path: sequence folder.
+        out: output folder, default ``runs/NAME``.
         options: see :class:`hybridvo.configuration.RunOptions`.
         dataset: kind of the sequence; detected by default.
         mode: ``new``, ``resume`` or ``overwrite``.
@@ -234,31 +231,16 @@ def _write(
     rows = list(folder.rows())
     if not rows:  # interrupted before the first frame
         folder.write_state("interrupted")
-        empty = Trajectory([0.0], np.eye(4)[None], has_timestamps=False)
+        empty = Trajectory(np.zeros(1), np.eye(4)[None], has_timestamps=False)
         return RunResult(EXIT_INTERRUPTED, {"state": "interrupted", "frames": 0}, empty, None)
     poses = np.array([row["T_world_cam"] for row in rows]).reshape(-1, 4, 4)
     trajectory = Trajectory(np.array([row["timestamp"] for row in rows]), poses)
-    truth = _truth(sequence, frames)
+    truth = true_trajectory(sequence, frames)
     write_tum(trajectory, folder.path / "trajectory.tum")
     write_kitti(trajectory, folder.path / "trajectory.kitti")
-    _write_steps(folder.path, rows)
-    failed = rows[-1]["failed_so_far"]
-    pairs = len(frames) - 1
-    tracked = [row["ms"] for row in rows[1:] if row["reason"] != "missing_frame"]
-    summary: dict[str, Any] = {
-        "out": os.fspath(folder.path),
-        "sequence": sequence.name,
-        "method": options.method,
-        "frames": len(rows),
-        "failed": failed,
-        "failed_share": failed / max(pairs, 1),
-        "degraded": sum(row["status"] == "degraded" for row in rows),
-        "missing_frames": [row["index"] for row in rows if row["reason"] == "missing_frame"],
-        "flow_source": _names(row["flow_source"] for row in rows),
-        "depth_source": sequence.depth_source,
-        "oracle": _oracles(rows, sequence),
-        "ms_per_pair_median": float(np.median(tracked)) if tracked else None,
-        "warnings": [],
+    write_steps(folder.path, rows)
+    summary = summarise(rows, sequence, options.method, len(frames) - 1) | {
+        "out": os.fspath(folder.path)
     }
     if interrupted:
         folder.write_state("interrupted", summary=summary)
@@ -266,14 +248,14 @@ def _write(
     if len(rows) == 1:
         summary["warnings"].append("one frame: one pose at the identity, there is no motion to see")
     if truth is not None:
-        metrics = _score(rows, trajectory, truth, options, summary)
+        metrics = score(rows, trajectory, truth, options.alignment, summary)
         write_json(folder.path / "metrics.json", metrics)
         summary["metrics"] = metrics
-    _draw(folder.path / "trajectory.png", trajectory, truth, summary)
-    too_many = failed > 0 and summary["failed_share"] > options.max_failed
+    draw(folder.path / "trajectory.png", trajectory, truth, summary)
+    too_many = summary["failed_share"] > options.max_failed
     if too_many:
         summary["warnings"].append(
-            f"{failed} of {max(pairs, 1)} motions failed, more than --max-failed "
+            f"{summary['failed']} of {len(rows) - 1} motions failed, more than --max-failed "
             f"{options.max_failed:g} allows"
         )
     folder.finish(summary={k: v for k, v in summary.items() if k != "metrics"})
@@ -284,60 +266,6 @@ def _write(
     ]
     exit_code = EXIT_FAILED_FRAMES if too_many else EXIT_DONE
     return RunResult(exit_code, summary | {"state": "done"}, trajectory, truth)
-
-
-def _score(
-    rows: list[dict[str, Any]],
-    trajectory: Trajectory,
-    truth: Trajectory,
-    options: RunOptions,
-    summary: Mapping[str, Any],
-) -> dict[str, Any]:
-    """Content of ``metrics.json``; no times, so that equal runs give equal bytes."""
-    report = evaluate_trajectories(trajectory, truth, alignment=options.alignment)  # type: ignore[arg-type]
-    per_pair = mean_pair_errors(row["errors"] for row in rows if row["errors"] is not None)
-    reasons = report.pop("reasons") | per_pair.pop("reasons")
-    named = ("method", "failed", "degraded", "flow_source", "depth_source", "oracle", "sequence")
-    return report | per_pair | {"reasons": reasons} | {key: summary[key] for key in named}
-
-
-def _write_steps(folder: Path, rows: list[dict[str, Any]]) -> None:
-    T = np.array([row["T_curr_prev"] for row in rows]).reshape(-1, 4, 4)
-    table = []
-    for row, motion in zip(rows, T, strict=True):
-        rotation = se3_log(motion)[3:]
-        values = dict(
-            zip(("tx", "ty", "tz", "rx", "ry", "rz"), [*motion[:3, 3], *rotation], strict=True)
-        )
-        message = " ".join(str(row["message"]).split())
-        table.append({**row, **values, "message": message})
-    write_csv(folder / "steps.csv", table, STEP_COLUMNS)
-    covariance = np.array([row["covariance"] for row in rows]).reshape(-1, 6, 6)
-    with atomic_write(folder / "steps.npz", "wb") as file:
-        np.savez(file, T_curr_prev=T, covariance=covariance)
-
-
-def _draw(
-    path: Path, trajectory: Trajectory, truth: Trajectory | None, summary: Mapping[str, Any]
-) -> None:
-    from hybridvo.evaluation.plots import plot_trajectories
-
-    title = f"{summary['sequence']}, flow: {', '.join(summary['flow_source']) or 'none'}"
-    if summary["oracle"]:
-        title += f" (oracle: {', '.join(summary['oracle'])})"
-    plot_trajectories({summary["method"]: trajectory}, path, truth=truth, title=title)
-
-
-def _truth(sequence: Sequence, frames: range) -> Trajectory | None:
-    """True poses of the frames of the run that have one."""
-    if sequence.poses is None:
-        return None
-    known = [i for i in frames if np.isfinite(sequence.poses[i]).all()]
-    if not known:
-        return None
-    # text files carry six digits: made orthonormal as the trajectory demands
-    T = np.stack([pose_matrix(sequence.poses[i][:3]) for i in known])
-    return Trajectory(sequence.timestamps[known], T)
 
 
 def _finished_before(folder: RunFolder, sequence: Sequence) -> RunResult:
@@ -445,16 +373,6 @@ def versions() -> dict[str, str]:
         except PackageNotFoundError:
             continue
     return found
-
-
-def _names(values: Iterable[str | None]) -> list[str]:
-    return sorted({value for value in values if value})
-
-
-def _oracles(rows: list[dict[str, Any]], sequence: Sequence) -> list[str]:
-    """What the estimate was given that no sensor gives."""
-    oracles = ["true flow"] if any(row["flow_is_true"] for row in rows) else []
-    return oracles + (["true depth"] if sequence.depth_source == "true" else [])
 
 
 def _dump_anchor(anchor: Anchor) -> dict[str, Any]:

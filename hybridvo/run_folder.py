@@ -1,8 +1,8 @@
 """The folder of one run: lock, refusal to overwrite, steps kept as they finish, atomic results.
 
-``run.json`` says what the run is and how far it came; ``steps.partial.jsonl`` holds a line for every
-finished frame until the results are written. A run that was killed loses at most the frame it was
-working on, and a resumed one ends with the bytes of an uninterrupted one.
+``run.json`` says what the run is and how far it came; ``steps.partial.jsonl`` holds a line for
+every finished frame until the results are written. A run that was killed loses at most the frame
+it was working on, and a resumed one ends with the bytes of an uninterrupted one.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ class RunFolder:
         header: what else ``run.json`` says (command, versions, machine).
         mode: ``new`` refuses a folder with results, ``overwrite`` removes them, ``resume`` goes on.
 
-    ``frames_done`` counts the kept rows, ``last`` is the latest; the rows themselves stay on disk, so
-    that memory does not grow with the sequence.
+    ``frames_done`` counts the kept rows, ``last`` is the latest of an earlier run; the rows stay on
+    disk, so that memory does not grow with the sequence.
 
     Raises:
         LockedError: another run holds the folder.

@@ -3,7 +3,8 @@
 The torch twin of :mod:`hybridvo.pose.refinement` with the residual of
 :mod:`hybridvo.pose.residuals`. Every start is refined side by side on a sparse set of pixels under
 a kernel whose scale is graduated; the start of least cost at one common scale is fitted on the
-whole grid. Samples never see each other: damping, acceptance, convergence and failure are per sample.
+whole grid. Samples never see each other: damping, acceptance, convergence and failure are per
+sample.
 """
 
 from __future__ import annotations
@@ -185,8 +186,8 @@ def _checked_pair(
     """The batch in one floating type, on one device."""
     where = "refine_batch"
     flow, depth = pair.flow, pair.depth_prev
-    for name, value in (("flow", flow), ("depth_prev", depth)):
-        if not isinstance(value, torch.Tensor) or not value.is_floating_point():
+    for name, image_like in (("flow", flow), ("depth_prev", depth)):
+        if not isinstance(image_like, torch.Tensor) or not image_like.is_floating_point():
             raise InputError(f"{where}: expected PairBatch.{name} as a floating-point tensor.")
     if flow.ndim != 4 or flow.shape[3] != 2 or flow.numel() == 0:
         raise InputError(
@@ -196,8 +197,7 @@ def _checked_pair(
     dtype = torch.promote_types(flow.dtype, depth.dtype)
     if dtype not in (torch.float32, torch.float64):
         dtype = torch.float32
-    values: dict[str, torch.Tensor | None] = {}
-    value: Any
+    values: dict[str, Any] = {}
     if weights is not None:
         weights = torch.as_tensor(weights, device=flow.device)
         if weights.ndim == 2 and batch == 1:
@@ -230,7 +230,7 @@ def _checked_pair(
     if use_second_depth and pair.depth_curr is None:
         raise InputError(f"{where}: use_second_depth needs PairBatch.depth_curr, which is None.")
     weights = values.pop("weights")
-    return PairBatch(**values), weights  # type: ignore[arg-type]
+    return PairBatch(**values), weights
 
 
 def _starts(T_init: Any, like: torch.Tensor) -> torch.Tensor:

@@ -17,7 +17,7 @@ Per pixel, with X' = T X, a = X'/Z', b = Y'/Z', i = 1/Z' (conventions of :mod:`h
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange, types
+from numba import njit, types
 from numba.extending import intrinsic
 
 FASTMATH = {"reassoc", "contract", "arcp", "nsz"}  # not nnan/ninf: invalid values are tested for
@@ -56,7 +56,7 @@ def keep_apart(typing_context):
     return types.none(), codegen
 
 
-@njit(fastmath=FASTMATH, error_model="numpy", cache=True)
+@njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
 def gather_row(v, data, camera, flags, scale, buf):
     """Fill ``buf`` with the whole row ``v`` of the picture.
 
@@ -121,7 +121,7 @@ def gather_row(v, data, camera, flags, scale, buf):
             b_w[k] = b_w[k] if vrow[k] else ZERO
 
 
-@njit(fastmath=FASTMATH, error_model="numpy", cache=True)
+@njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
 def gather_grid(stride, data, camera, flags, scale, out):
     """Gather every ``stride``-th pixel of both axes into ``out`` (BUFFER_ROWS, h w).
 
@@ -140,7 +140,7 @@ def gather_grid(stride, data, camera, flags, scale, out):
     return h, w
 
 
-@njit(fastmath=FASTMATH, error_model="numpy", cache=True)
+@njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
 def project_block(buf, o, n, R, t, K, noise, work, acc):
     """First stage: residuals, robust weights and weighted 2x2 information of ``n`` pixels from ``o``.
 
@@ -204,7 +204,7 @@ def project_block(buf, o, n, R, t, K, noise, work, acc):
     acc[29] += count
 
 
-@njit(fastmath=FASTMATH, error_model="numpy", cache=True)
+@njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
 def sum_translation(n, work, acc):
     """Second stage: sums of the rows of H and g that belong to the translation."""
     keep_apart()
@@ -272,7 +272,7 @@ def sum_translation(n, work, acc):
     acc[23] += g2
 
 
-@njit(fastmath=FASTMATH, error_model="numpy", cache=True)
+@njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
 def sum_rotation(n, work, acc):
     """Third stage: sums of the rows of H and g that belong to the rotation."""
     keep_apart()
@@ -317,7 +317,7 @@ def sum_rotation(n, work, acc):
     acc[26] += g5
 
 
-@njit(error_model="numpy", cache=True)
+@njit(error_model="numpy", cache=True, nogil=True)
 def sum_samples(samples, n, R, t, K, noise, work, acc):
     """Normal equations of gathered pixels, set in ``acc`` (30,) float64."""
     acc[:] = 0.0
@@ -328,7 +328,7 @@ def sum_samples(samples, n, R, t, K, noise, work, acc):
         sum_rotation(m, work, acc)
 
 
-@njit(error_model="numpy", cache=True)
+@njit(error_model="numpy", cache=True, nogil=True)
 def sum_rows(data, camera, flags, scale, R, t, K, noise, v0, v1, out):
     """Normal equations of the full-grid rows ``v0 .. v1 - 1``, added to ``out`` (30,)."""
     width = data[0].shape[1]
@@ -341,18 +341,7 @@ def sum_rows(data, camera, flags, scale, R, t, K, noise, v0, v1, out):
         sum_rotation(width, work, out)
 
 
-@njit(parallel=True, error_model="numpy", cache=True)
-def sum_grid(data, camera, flags, scale, R, t, K, noise, out):
-    """Normal equations of the full grid, row chunks in parallel: ``out`` (chunks, 30), zeroed."""
-    H = data[0].shape[0]
-    chunks = out.shape[0]
-    for c in prange(chunks):
-        v0 = c * H // chunks
-        v1 = (c + 1) * H // chunks
-        sum_rows(data, camera, flags, scale, R, t, K, noise, v0, v1, out[c])
-
-
-@njit(fastmath=FASTMATH, error_model="numpy", cache=True)
+@njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
 def sum_curvature(n, external, work, c2, acc):
     """Add the curvature of the robust weights, ``sum -2 (dw / dd^2) s s^T``, to ``acc`` (21,).
 
@@ -380,7 +369,7 @@ def sum_curvature(n, external, work, c2, acc):
                 q += 1
 
 
-@njit(fastmath=FASTMATH, error_model="numpy", cache=True)
+@njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
 def add_scores(n, work, columns):
     """Add w s = w J^T Sigma^-1 r of ``n`` pixels to ``columns`` (6, W), pixel by pixel."""
     keep_apart()
@@ -401,11 +390,9 @@ def add_scores(n, work, columns):
         c5[k] += a * y - b * x
 
 
-@njit(error_model="numpy", cache=True)
-def score_rows(
-    data, camera, flags, scale, R, t, K, noise, band0, band1, tile, weights, scores, out
-):
-    """The last pass over the bands of ``tile`` rows ``band0 .. band1 - 1``.
+@njit(error_model="numpy", cache=True, nogil=True)
+def score_rows(data, camera, flags, scale, R, t, K, noise, band, tile, weights, scores, out):
+    """The last pass over the rows of one band of tiles.
 
     Adds the normal equations to ``out`` (30,), writes the robust weights (without the external
     ones) to ``weights`` (H, W) and the sum of w J^T Sigma^-1 r of each tile to ``scores`` (rows of
@@ -414,40 +401,14 @@ def score_rows(
     H, width = data[0].shape
     buf = np.empty((BUFFER_ROWS, width), np.float32)
     work = np.empty((WORK_ROWS, width), np.float32)
-    columns = np.empty((6, width), np.float32)
-    for band in range(band0, band1):
-        columns[:] = ZERO
-        for v in range(band * tile, min(H, (band + 1) * tile)):
-            gather_row(v, data, camera, flags, scale, buf)
-            project_block(buf, 0, width, R, t, K, noise, work, out)
-            sum_translation(width, work, out)
-            sum_rotation(width, work, out)
-            add_scores(width, work, columns)
-            weights[v] = work[8]
-        for k in range(width):
-            for q in range(6):
-                scores[band, k // tile, q] += columns[q, k]
-
-
-@njit(parallel=True, error_model="numpy", cache=True)
-def score_grid(data, camera, flags, scale, R, t, K, noise, tile, weights, scores, out):
-    """:func:`score_rows` over the whole picture; ``out`` (chunks, 30) and ``scores`` zeroed."""
-    chunks = out.shape[0]
-    bands = scores.shape[0]
-    for c in prange(chunks):
-        score_rows(
-            data,
-            camera,
-            flags,
-            scale,
-            R,
-            t,
-            K,
-            noise,
-            c * bands // chunks,
-            (c + 1) * bands // chunks,
-            tile,
-            weights,
-            scores,
-            out[c],
-        )
+    columns = np.zeros((6, width), np.float32)
+    for v in range(band * tile, min(H, (band + 1) * tile)):
+        gather_row(v, data, camera, flags, scale, buf)
+        project_block(buf, 0, width, R, t, K, noise, work, out)
+        sum_translation(width, work, out)
+        sum_rotation(width, work, out)
+        add_scores(width, work, columns)
+        weights[v] = work[8]
+    for k in range(width):
+        for q in range(6):
+            scores[band, k // tile, q] += columns[q, k]

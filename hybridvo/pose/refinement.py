@@ -17,13 +17,13 @@ import numpy as np
 from hybridvo.errors import InputError
 from hybridvo.geometry import pose_matrix
 from hybridvo.pose import kernels, search, solver
+from hybridvo.pose.covariance import sandwich_covariance
 from hybridvo.pose.judgement import Judge, cues, default_judge
-from hybridvo.types import Camera, FramePair, Hypothesis, PairBatch, Reason, RelativePose, Status
+from hybridvo.pose.picture import Picture
+from hybridvo.types import FramePair, Hypothesis, PairBatch, Reason, RelativePose, Status
 
 __all__ = ["RefinementOptions", "refine"]
 
-PARALLEL_PIXELS = 100_000
-"""Below this many pixels the serial kernel is as fast and steadier under load."""
 SUPPORT_CUTOFF = 3.0
 
 
@@ -65,97 +65,6 @@ class RefinementOptions:
             raise InputError(
                 f"RefinementOptions.hypotheses: expected 1 to 16, got {self.hypotheses}."
             )
-
-
-class _Picture:
-    """The arrays of a pair as the kernels take them, cropped to the usable pixels if these are few."""
-
-    def __init__(self, pair: FramePair, weights: np.ndarray | None) -> None:
-        prev, curr = pair.prev, pair.curr
-        assert pair.flow is not None and prev.depth is not None
-        flags = 0
-        dummy = np.ones((1, 1), np.float32)
-        depth = np.ascontiguousarray(prev.depth)
-        flow = np.ascontiguousarray(pair.flow)
-        flow_variance = depth_variance = external = dummy
-        scale = np.ones(2, np.float32)
-        if pair.flow_variance is not None:
-            flow_variance = np.ascontiguousarray(pair.flow_variance)
-            flags |= kernels.HAS_FLOW_VARIANCE
-            scale[0] = _typical(flow_variance)
-        if prev.depth_variance is not None:
-            depth_variance = np.ascontiguousarray(prev.depth_variance)
-            flags |= kernels.HAS_DEPTH_VARIANCE
-            scale[1] = _typical(depth_variance)
-        if weights is not None:
-            external = np.ascontiguousarray(weights, dtype=np.float32)
-            flags |= kernels.HAS_WEIGHTS
-        valid = np.ones((1, 1), np.bool_)
-        masks = [m for m in (prev.mask, pair.flow_valid) if m is not None]
-        if masks:
-            valid = np.ascontiguousarray(masks[0] if len(masks) == 1 else masks[0] & masks[1])
-            flags |= kernels.HAS_VALID
-        self.data = (depth, flow, flow_variance, depth_variance, external, valid)
-        self.flags, self.scale = flags, scale
-        self.set_cameras(prev.camera, curr.camera, 0, 0)
-
-    def set_cameras(self, prev: Camera, curr: Camera, u0: int, v0: int) -> None:
-        """Intrinsics for a crop whose top-left pixel is (u0, v0)."""
-        self.camera = np.array([1 / prev.fx, 1 / prev.fy, prev.cx - u0, prev.cy - v0], np.float32)
-        self.K = np.array([curr.fx, curr.fy, curr.cx - u0, curr.cy - v0], np.float32)
-
-    def crop(self, prev: Camera, curr: Camera, box: tuple[int, int, int, int]) -> None:
-        """Restrict to rows v0..v1-1 and columns u0..u1-1."""
-        v0, v1, u0, u1 = box
-        self.data = tuple(
-            np.ascontiguousarray(a[v0:v1, u0:u1]) if a.shape[:2] != (1, 1) else a for a in self.data
-        )
-        self.set_cameras(prev, curr, u0, v0)
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """(height, width)."""
-        return self.data[0].shape
-
-    def samples(self, pixels: int) -> tuple[np.ndarray, int, int, int]:
-        """(buffer, h, w, stride) of a regular grid of about ``pixels`` pixels."""
-        height, width = self.shape
-        stride = max(1, round(np.sqrt(height * width / pixels)))
-        h = (height - stride // 2 + stride - 1) // stride
-        w = (width - stride // 2 + stride - 1) // stride
-        n = h * w
-        # an odd number of cache lines keeps the rows out of each other's cache sets
-        buffer = np.empty((kernels.BUFFER_ROWS, ((n + 15) // 16 | 1) * 16), np.float32)
-        kernels.gather_grid(stride, self.data, self.camera, self.flags, self.scale, buffer)
-        return buffer, h, w, stride
-
-    def usable_box(self) -> tuple[int, tuple[int, int, int, int]]:
-        """(number of usable pixels, their bounding box) of the full grid."""
-        depth, flow, flow_variance, depth_variance, weights, valid = self.data
-        with np.errstate(invalid="ignore"):
-            usable = (depth > kernels.MIN_DEPTH) & (depth < kernels.MAX_VALUE)
-            usable &= (np.abs(flow) < kernels.MAX_VALUE).all(axis=2)
-            if self.flags & kernels.HAS_FLOW_VARIANCE:
-                usable &= (flow_variance > 0) & (flow_variance < kernels.MAX_VALUE)
-            if self.flags & kernels.HAS_DEPTH_VARIANCE:
-                usable &= (depth_variance >= 0) & (depth_variance < kernels.MAX_VALUE)
-            if self.flags & kernels.HAS_WEIGHTS:
-                usable &= (weights > 0) & (weights < kernels.MAX_VALUE)
-        if self.flags & kernels.HAS_VALID:
-            usable &= valid
-        count = int(np.count_nonzero(usable))
-        if count == 0:
-            return 0, (0, 0, 0, 0)
-        rows = np.flatnonzero(usable.any(axis=1))
-        columns = np.flatnonzero(usable.any(axis=0))
-        return count, (rows[0], rows[-1] + 1, columns[0], columns[-1] + 1)
-
-
-def _typical(variance: np.ndarray) -> float:
-    """Median of the positive finite values on a sparse grid; 1 where there are none."""
-    sparse = variance[::7, ::7]
-    good = sparse[(sparse > 0) & (sparse < kernels.MAX_VALUE)]
-    return float(np.median(good)) if good.size else 1.0
 
 
 def refine(
@@ -231,7 +140,7 @@ def _refine(
         return RelativePose.failed(Reason.NO_FLOW, "no optical flow for this pair", "refine")
     if pair.prev.depth is None:
         return RelativePose.failed(Reason.NO_VALID_DEPTH, "no depth for this frame", "refine")
-    picture = _Picture(pair, weights)
+    picture = Picture(pair, weights)
     coarse, h, w, stride = picture.samples(options.coarse_pixels)
     usable = np.count_nonzero(coarse[kernels.W, : h * w] > 0)
     box = (0, picture.shape[0], 0, picture.shape[1])
@@ -302,7 +211,7 @@ def _too_few(pair: FramePair, count: int, minimum: int) -> RelativePose:
 
 
 def _hypotheses(
-    picture: _Picture,
+    picture: Picture,
     coarse: np.ndarray,
     h: int,
     w: int,
@@ -334,7 +243,7 @@ def _hypotheses(
             name = "minimal"
         else:
             name = "identity" if source == 0 else "handed-in"
-        found.append((T, support, name, cues(support, usable, depth, T, T_last)))
+        found.append((T, support, name, cues(support, usable, depth, T, T_last, sf)))
     scores = np.asarray(judge([f[3] for f in found]), dtype=np.float64)
     return [
         Hypothesis(T, support, stride, cue["share"], float(score), name, cue)
@@ -344,7 +253,7 @@ def _hypotheses(
 
 def _finish(
     pair: FramePair,
-    picture: _Picture,
+    picture: Picture,
     coarse: np.ndarray,
     n: int,
     pose: np.ndarray,
@@ -356,43 +265,36 @@ def _finish(
 ) -> RelativePose:
     """Fit the chosen motion on the full grid; covariance, status and weights."""
     work = solver.new_work()
+    sf, sd = facts[search.FLOW_NOISE], facts[search.DEPTH_NOISE]
     sf, sd, share, more, _ = solver.polish(
-        coarse, n, picture.K, facts[search.FLOW_NOISE], facts[search.DEPTH_NOISE],
-        options.cutoff, 1, 4, pose, work,
-    )  # fmt: skip
+        coarse,
+        n,
+        picture.K,
+        sf,
+        sd,
+        2.5 * sf,
+        max(2.5 * sd, 0.02),
+        options.cutoff,
+        1,
+        4,
+        pose,
+        work,
+    )
     iterations = int(facts[search.ITERATIONS] + more)
     noise = np.empty(3, np.float32)
     solver.set_noise(sf, sd, options.cutoff, noise)
-    height, width = picture.shape
-    chunks = 2 if height * width >= PARALLEL_PIXELS else 1
     delta = np.zeros(6)
-    arguments = (picture.data, picture.camera, picture.flags, picture.scale)
     for _ in range(options.full_steps):
-        sums = np.zeros((chunks, kernels.SUMS))
-        R, t = pose[:, :3].astype(np.float32), pose[:, 3].astype(np.float32)
-        if chunks > 1:
-            kernels.sum_grid(*arguments, R, t, picture.K, noise, sums)
-        else:
-            kernels.sum_rows(*arguments, R, t, picture.K, noise, 0, height, sums[0])
-        total = sums.sum(axis=0)
+        total = picture.normal_equations(pose, noise, options.tile)
         if not solver.solve6(total, solver.DAMPING, delta):
             break
         iterations += 1
         solver.left_update(delta, pose.copy(), pose)
-        moved = np.sqrt(max(delta @ total[21:27], 0) / max(total[28], 1e-12)) * sf
-        if moved < 1e-3 * sf:
+        # mean motion of the picture that the step makes, in standard deviations of the flow
+        if delta @ total[21:27] < 1e-6 * max(total[28], 1e-12):
             break
-    tiles = (-(-height // options.tile), -(-width // options.tile))
-    weights = np.empty((height, width), np.float32)
-    scores = np.zeros((*tiles, 6))
-    sums = np.zeros((chunks, kernels.SUMS))
+    total, scores, weights = picture.last_pass(pose, noise, options.tile)
     R, t = pose[:, :3].astype(np.float32), pose[:, 3].astype(np.float32)
-    last = (*arguments, R, t, picture.K, noise)
-    if chunks > 1:
-        kernels.score_grid(*last, options.tile, weights, scores, sums)
-    else:
-        kernels.score_rows(*last, 0, tiles[0], options.tile, weights, scores, sums[0])
-    total = sums.sum(axis=0)
     curvature = np.zeros(21)
     acc = np.zeros(kernels.SUMS)
     for o in range(0, n, kernels.BLOCK):
@@ -400,7 +302,7 @@ def _finish(
         kernels.project_block(coarse, o, m, R, t, picture.K, noise, work, acc)
         kernels.sum_curvature(m, coarse[kernels.W, o : o + m], work, float(noise[2]), curvature)
     curvature *= total[29] / max(acc[29], 1e-12)
-    covariance, eigenvalues, definite = _covariance(total, curvature, scores, depth_scale)
+    covariance, eigenvalues, definite = sandwich_covariance(total, curvature, scores, depth_scale)
     if box != (0, *pair.prev.camera.shape[:1], 0, *pair.prev.camera.shape[1:]):
         whole = np.zeros(pair.prev.camera.shape, np.float32)
         whole[box[0] : box[1], box[2] : box[3]] = weights
@@ -453,51 +355,3 @@ def _status(share: float, hypotheses: list[Hypothesis]) -> Status:
             Reason.LOW_INLIERS, f"only {100 * share:.0f} % of the pixels follow the motion"
         )
     return Status()
-
-
-def _symmetric(upper: np.ndarray) -> np.ndarray:
-    """(6, 6) from its 21 upper-triangle values, row by row."""
-    out = np.zeros((6, 6))
-    out[np.triu_indices(6)] = upper
-    return out + np.triu(out, 1).T
-
-
-def _covariance(
-    total: np.ndarray, curvature: np.ndarray, scores: np.ndarray, depth_scale: float
-) -> tuple[np.ndarray, np.ndarray, bool]:
-    """Sandwich covariance, eigenvalues of the information in px, and whether it is definite.
-
-    Bread: the derivative of the estimating equation (Gauss-Newton Hessian less the curvature of the
-    robust weights). Meat: outer products of the scores summed over tiles, so that errors correlated
-    within a tile count as such (cluster-robust, with its small-sample factor).
-    """
-    H = _symmetric(total[:21])
-    scaling = np.array([1 / depth_scale] * 3 + [1.0] * 3)  # metres at the typical depth -> radians
-    H_scaled = H * np.outer(scaling, scaling)
-    eigenvalues = np.linalg.eigvalsh(H_scaled)
-    floor = 1e-8 * eigenvalues[-1]
-    nothing = np.diag([1e4] * 3 + [10.0] * 3)
-    if not np.isfinite(eigenvalues).all() or eigenvalues[0] <= max(floor, 1e-12):
-        return nothing, np.nan_to_num(eigenvalues), False
-    bread = H_scaled - _symmetric(curvature) * np.outer(scaling, scaling)
-    if np.linalg.eigvalsh(bread)[0] <= 0.2 * eigenvalues[0]:
-        bread = H_scaled  # too few inliers for the curvature to be believed
-    flat = scores.reshape(-1, 6) * scaling
-    flat = flat[np.abs(flat).max(axis=1) > 0]
-    clusters = len(flat)
-    inverse = np.linalg.inv(bread)
-    if clusters >= 12:
-        meat = flat.T @ flat * (clusters / (clusters - 6))
-        sandwich = inverse @ meat @ inverse
-    else:
-        sandwich = np.zeros((6, 6))
-    # never below what independent noise of the estimated size would give
-    model = np.linalg.inv(H_scaled)
-    covariance = sandwich if clusters >= 24 else np.maximum(1.0, 24 / max(clusters, 1)) * (
-        model + sandwich
-    )
-    covariance = covariance / np.outer(1 / scaling, 1 / scaling)
-    covariance = 0.5 * (covariance + covariance.T)
-    if not np.isfinite(covariance).all():
-        return nothing, eigenvalues, False
-    return covariance, eigenvalues, True

@@ -15,6 +15,8 @@ from numba import njit
 
 from hybridvo.pose.kernels import BUFFER_ROWS, MAX_VALUE, MU, MV, XN, YN, W, Z
 from hybridvo.pose.solver import (
+    DEPTH_NOISE_CAP,
+    FLOW_NOISE_CAP,
     gauss_newton,
     graduate,
     new_work,
@@ -25,9 +27,11 @@ from hybridvo.pose.solver import (
 )
 
 WINDOW_ROWS, WINDOW_COLUMNS = 3, 4
-MINIMAL_SAMPLES = 192
+MINIMAL_SAMPLES = 256
 REFINED = 4
-MAX_STARTS = 8
+CLEAR_FLOW = 1.1
+CLEAR_DEPTH = 0.075
+"""Noise (px, log depth) above which even a motion that holds the picture is not beyond doubt."""
 
 SHARE, FLOW_NOISE, DEPTH_NOISE, SOURCE, ITERATIONS, CONVERGED, SCORE = range(7)
 FACTS = 7
@@ -35,7 +39,7 @@ FACTS = 7
 SOURCE_WINDOW, SOURCE_MINIMAL = 100, 101
 
 
-@njit(error_model="numpy", cache=True)
+@njit(error_model="numpy", cache=True, nogil=True)
 def next_random(state):
     """xorshift64*: a float in [0, 1)."""
     x = state[0]
@@ -46,11 +50,12 @@ def next_random(state):
     return np.float64((x * np.uint64(2685821657736338717)) >> np.uint64(11)) / 9007199254740992.0
 
 
-@njit(fastmath={"reassoc", "contract", "arcp", "nsz"}, error_model="numpy", cache=True)
+@njit(fastmath={"reassoc", "contract", "arcp", "nsz"}, error_model="numpy", cache=True, nogil=True)
 def agreement(samples, n, R, t, K):
-    """Multi-scale score of a pose: sum of weight / (1 + r^2 / s^2) over s = 0.15, 0.6, 2.4 px.
+    """Two-scale score of a pose: weighted mean of 1 / (1 + (r / 0.15)^2) and 1 / (1 + (r / 0.9)^2)^2.
 
-    Fine scales let an exact motion win over a vague one, coarse scales keep noisy flow in play.
+    The fine scale lets an exact motion win over a vague one, the coarse one keeps noisy flow in
+    play; a wider scale yet makes compromises between two motions win (measured).
     """
     r00, r01, r02 = R[0, 0], R[0, 1], R[0, 2]
     r10, r11, r12 = R[1, 0], R[1, 1], R[1, 2]
@@ -70,20 +75,19 @@ def agreement(samples, n, R, t, K):
         rv = b_v[k] - (fy * (z * (r10 * b_x[k] + r11 * b_y[k] + r12) + ty) * i + cy)
         r2 = ru * ru + rv * rv
         near = one / (one + np.float32(44.4) * r2)
-        mid = one / (one + np.float32(2.78) * r2)
-        far = one / (one + np.float32(0.174) * r2)
+        mid = one / (one + np.float32(1.2) * r2)
         w = b_w[k] if front else np.float32(0.0)
-        score += w * (np.float32(0.3) * near + np.float32(0.4) * mid + np.float32(0.3) * far)
+        score += w * (np.float32(0.5) * near + np.float32(0.5) * mid * mid)
     return np.float64(score)
 
 
-@njit(error_model="numpy", cache=True)
+@njit(error_model="numpy", cache=True, nogil=True)
 def score_pose(samples, n, pose, K):
     """:func:`agreement` of a (3, 4) float64 pose."""
     return agreement(samples, n, pose[:, :3].astype(np.float32), pose[:, 3].astype(np.float32), K)
 
 
-@njit(error_model="numpy", cache=True)
+@njit(error_model="numpy", cache=True, nogil=True)
 def fit_minimal(samples, pick, K, tiny, pose, work):
     """Three pixels, six equations: a few Gauss-Newton steps from the identity, in place."""
     noise = np.empty(3, np.float32)
@@ -102,7 +106,7 @@ def fit_minimal(samples, pick, K, tiny, pose, work):
     return True
 
 
-@njit(error_model="numpy", cache=True)
+@njit(error_model="numpy", cache=True, nogil=True)
 def draw_three(samples, n, h, w, local, state, pick):
     """Draw three distinct usable pixels, near each other if ``local``; False where none is left."""
     tries = 0
@@ -128,7 +132,7 @@ def draw_three(samples, n, h, w, local, state, pick):
     return True
 
 
-@njit(error_model="numpy", cache=True)
+@njit(error_model="numpy", cache=True, nogil=True)
 def fit_window(samples, h, w, r0, r1, c0, c1, K, buffer, pose, work):
     """Robust dense fit of the usable pixels of a window, from the identity, in place."""
     m = 0
@@ -155,7 +159,7 @@ def fit_window(samples, h, w, r0, r1, c0, c1, K, buffer, pose, work):
     return True
 
 
-@njit(error_model="numpy", cache=True)
+@njit(error_model="numpy", cache=True, nogil=True)
 def keep_best(pose, score, source, poses, scores, sources, similar):
     """Insert into the list of the best distinct candidates, best first."""
     count = scores.shape[0]
@@ -191,7 +195,7 @@ def keep_best(pose, score, source, poses, scores, sources, similar):
     poses[at] = pose
 
 
-@njit(error_model="numpy", cache=True)
+@njit(error_model="numpy", cache=True, nogil=True)
 def search_round(
     small, sh, sw, coarse, n, K, starts, wide, cutoff, similar, state, pose, facts, work
 ):
@@ -236,29 +240,37 @@ def search_round(
                 score = score_pose(small, ns, candidate, K)
                 keep_best(candidate, score, SOURCE_MINIMAL, poses, scores, sources, similar)
     best = -1.0
+    steps = 0
     for s in range(REFINED):
         if scores[s] <= 0:
             break
         candidate[:, :] = poses[s]
-        steps = graduate(coarse, n, K, 1.5, 0.7, 0.4, 2, candidate, work)
-        sf, sd, share, more, converged = polish(
-            coarse, n, K, 0.7, 0.01, cutoff, 2, 4, candidate, work
-        )
+        steps += graduate(small, ns, K, 1.5, 0.7, 0.4, 3, candidate, work)
         score = score_pose(coarse, n, candidate, K)
         if score > best:
             best = score
             pose[:, :] = candidate
-            facts[SHARE] = share
-            facts[FLOW_NOISE] = sf
-            facts[DEPTH_NOISE] = sd
             facts[SOURCE] = sources[s]
-            facts[ITERATIONS] = steps + more
-            facts[CONVERGED] = 1.0 if converged else 0.0
-            facts[SCORE] = score
-    return best > 0
+    if best <= 0:
+        return False
+    steps += graduate(coarse, n, K, 0.7, 0.5, 0.4, 3, pose, work)
+    candidate[:, :] = pose
+    sf, sd, share, more, converged = polish(
+        coarse, n, K, 0.5, 0.01, FLOW_NOISE_CAP, DEPTH_NOISE_CAP, cutoff, 2, 4, candidate, work
+    )
+    if score_pose(coarse, n, candidate, K) > 0.95 * score_pose(coarse, n, pose, K):
+        pose[:, :] = candidate
+    best = score_pose(coarse, n, pose, K)
+    facts[SHARE] = share
+    facts[FLOW_NOISE] = sf
+    facts[DEPTH_NOISE] = sd
+    facts[ITERATIONS] = steps + more
+    facts[CONVERGED] = 1.0 if converged else 0.0
+    facts[SCORE] = best
+    return True
 
 
-@njit(error_model="numpy", cache=True)
+@njit(error_model="numpy", cache=True, nogil=True)
 def set_aside(samples, n, pose, K, sf, sd, cutoff, work, scratch):
     """Scale the weights of the pixels that follow ``pose`` down to what it leaves unexplained."""
     noise = np.empty(3, np.float32)
@@ -268,7 +280,7 @@ def set_aside(samples, n, pose, K, sf, sd, cutoff, work, scratch):
         samples[W, k] *= np.float32(1.0) - scratch[k]
 
 
-@njit(error_model="numpy", cache=True)
+@njit(error_model="numpy", cache=True, nogil=True)
 def find_motions(
     small, sh, sw, coarse, n, K, starts, cutoff, decisive, least, most, similar, seed, poses, facts
 ):
@@ -306,14 +318,19 @@ def find_motions(
         if not ok:
             break
         fact[SHARE] *= left / all_weight
-        if found == 0 and not first_wide and fact[SHARE] < decisive:
+        clear = (
+            fact[SHARE] >= decisive
+            and fact[FLOW_NOISE] < CLEAR_FLOW
+            and fact[DEPTH_NOISE] < CLEAR_DEPTH
+        )
+        if found == 0 and not first_wide and not clear:
             # the handed-in starts did not settle it: let every start compete for the first place
             first_wide = True
             continue
         if found > 0 and fact[SHARE] < least:
             break
         found += 1
-        if found == 1 and fact[SHARE] >= decisive:
+        if found == 1 and clear:
             break
         set_aside(coarse, n, pose, K, fact[FLOW_NOISE], fact[DEPTH_NOISE], cutoff, work, scratch)
         set_aside(
@@ -324,7 +341,7 @@ def find_motions(
     return found
 
 
-@njit(error_model="numpy", cache=True)
+@njit(error_model="numpy", cache=True, nogil=True)
 def translation_scale(samples, n, K):
     """Focal length over the median depth: turns metres of translation into radians of picture."""
     m = 0

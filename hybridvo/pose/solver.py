@@ -12,16 +12,34 @@ import math
 import numpy as np
 from numba import njit
 
-from hybridvo.pose.kernels import BLOCK, SUMS, W, WORK_ROWS, project_block, sum_samples
-from hybridvo.pose.kernels import MU, MV, PD, PF, XN, YN, Z
+from hybridvo.pose.kernels import (
+    BLOCK,
+    MU,
+    MV,
+    PD,
+    PF,
+    SUMS,
+    WORK_ROWS,
+    XN,
+    YN,
+    W,
+    Z,
+    project_block,
+    sum_samples,
+)
 
 FLOW_NOISE_FLOOR = 2e-3
 """Smallest flow noise assumed, px: float32 coordinates of an 8k picture are good to 5e-4 px."""
-DEPTH_NOISE_CAP = 0.5
+FLOW_NOISE_CAP = 1.2
+DEPTH_NOISE_CAP = 0.08
+"""Largest noise (px, log depth) that a motion may claim in the search; beyond it the fit would be a
+compromise between motions. The final fit may claim 2.5 times what the search found."""
 DAMPING = 1e-6
+NOISE_PIXELS = 1000
+"""Pixels that the noise estimate looks at: good to 2 % of sigma."""
 
 
-@njit(error_model="numpy", cache=True)
+@njit(error_model="numpy", cache=True, nogil=True)
 def solve6(acc, damping, delta):
     """Solve (H + damping diag H) delta = g by Cholesky; False where H is not positive definite."""
     L = np.zeros((6, 6))
@@ -67,7 +85,7 @@ def solve6(acc, damping, delta):
     return True
 
 
-@njit(error_model="numpy", cache=True)
+@njit(error_model="numpy", cache=True, nogil=True)
 def left_update(delta, pose, out):
     """``out`` = Exp(delta) pose, delta = (translation, rotation)."""
     wx, wy, wz = delta[3], delta[4], delta[5]
@@ -101,7 +119,7 @@ def left_update(delta, pose, out):
             out[i, j] = value + shift if j == 3 else value
 
 
-@njit(error_model="numpy", cache=True)
+@njit(error_model="numpy", cache=True, nogil=True)
 def set_noise(flow_sigma, depth_sigma, cutoff, out):
     """``out`` (3,) float32 = (1/sf^2, sd^2, c^2)."""
     out[0] = 1.0 / (flow_sigma * flow_sigma)
@@ -109,7 +127,7 @@ def set_noise(flow_sigma, depth_sigma, cutoff, out):
     out[2] = cutoff * cutoff
 
 
-@njit(error_model="numpy", cache=True)
+@njit(error_model="numpy", cache=True, nogil=True)
 def evaluate(samples, n, pose, K, noise, work, acc):
     """Normal equations at ``pose``; returns the cost, pixels behind the camera at the full cost."""
     R = pose[:, :3].astype(np.float32)
@@ -118,7 +136,7 @@ def evaluate(samples, n, pose, K, noise, work, acc):
     return acc[27]
 
 
-@njit(error_model="numpy", cache=True)
+@njit(error_model="numpy", cache=True, nogil=True)
 def gauss_newton(samples, n, total, K, noise, steps, tolerance_px, pose, work):
     """Damped Gauss-Newton in place; a step is taken only where the robust cost does not rise.
 
@@ -163,7 +181,7 @@ def gauss_newton(samples, n, total, K, noise, steps, tolerance_px, pose, work):
     return done, cost, False
 
 
-@njit(error_model="numpy", cache=True)
+@njit(error_model="numpy", cache=True, nogil=True)
 def residual_scale(samples, n, pose, K):
     """Median length of the residual in px over up to about 1000 usable pixels."""
     step = max(1, n // 1000)
@@ -180,7 +198,7 @@ def residual_scale(samples, n, pose, K):
     return np.median(values[:m])
 
 
-@njit(error_model="numpy", cache=True)
+@njit(error_model="numpy", cache=True, nogil=True)
 def residual(samples, k, pose, K):
     """(ru, rv, qu, qv, in front) of pixel ``k`` in double precision."""
     x, y, z = samples[XN, k], samples[YN, k], samples[Z, k]
@@ -198,14 +216,14 @@ def residual(samples, k, pose, K):
     return ru, rv, qu, qv, True
 
 
-@njit(error_model="numpy", cache=True)
-def estimate_noise(samples, n, pose, K, sf, sd, rounds, limit):
+@njit(error_model="numpy", cache=True, nogil=True)
+def estimate_noise(samples, n, pose, K, sf, sd, sf_cap, sd_cap, rounds, limit):
     """Flow noise (px) and depth noise (of log Z) of the pixels that follow ``pose``.
 
     Expectation-maximisation of a mixture of N(0, sf^2 v_f I + sd^2 v_d q q^T) and a uniform density
     over a disc; the two variances by Fisher scoring of the components along and across q. Only the
     shape of the residuals is used, never a given noise level. ``limit`` bounds the number of pixels
-    looked at. Returns (sf, sd, share of the weight that follows the pose).
+    looked at, ``sf_cap`` and ``sd_cap`` the noise. Returns (sf, sd, share of the weight that follows the pose).
     """
     step = max(1, n // limit)
     m = 0
@@ -278,13 +296,13 @@ def estimate_noise(samples, n, pose, K, sf, sd, rounds, limit):
         else:
             vf = max(0.0, b1 - a12 * vd) / a11
         floor = FLOW_NOISE_FLOOR * FLOW_NOISE_FLOOR
-        vf = min(max(vf, floor), radius * radius)
-        vd = min(vd, DEPTH_NOISE_CAP * DEPTH_NOISE_CAP)
+        vf = min(max(vf, floor), sf_cap * sf_cap)
+        vd = min(vd, sd_cap * sd_cap)
         vd = max(vd, 1e-10)  # stays estimable in the next round
     return math.sqrt(vf), math.sqrt(vd), share * inside / total
 
 
-@njit(error_model="numpy", cache=True)
+@njit(error_model="numpy", cache=True, nogil=True)
 def graduate(samples, n, K, start_px, end_px, ratio, steps, pose, work):
     """Graduated Geman-McClure with isotropic noise, from ``start_px`` down to ``end_px``."""
     noise = np.empty(3, np.float32)
@@ -300,8 +318,8 @@ def graduate(samples, n, K, start_px, end_px, ratio, steps, pose, work):
         scale = max(end_px, scale * ratio)
 
 
-@njit(error_model="numpy", cache=True)
-def polish(samples, n, K, sf, sd, cutoff, rounds, steps, pose, work):
+@njit(error_model="numpy", cache=True, nogil=True)
+def polish(samples, n, K, sf, sd, sf_cap, sd_cap, cutoff, rounds, steps, pose, work):
     """Alternate noise estimate and Gauss-Newton with the full covariance, in place.
 
     Returns (sf, sd, share, iterations, converged).
@@ -312,7 +330,7 @@ def polish(samples, n, K, sf, sd, cutoff, rounds, steps, pose, work):
     converged = False
     share = 0.0
     for _ in range(rounds):
-        sf, sd, share = estimate_noise(samples, n, pose, K, sf, sd, 6, 2000)
+        sf, sd, share = estimate_noise(samples, n, pose, K, sf, sd, sf_cap, sd_cap, 6, NOISE_PIXELS)
         set_noise(sf, sd, cutoff, noise)
         done, _, converged = gauss_newton(
             samples, n, total, K, noise, steps, 1e-3 * sf + 1e-5, pose, work
@@ -321,7 +339,7 @@ def polish(samples, n, K, sf, sd, cutoff, rounds, steps, pose, work):
     return sf, sd, share, iterations, converged
 
 
-@njit(error_model="numpy", cache=True)
+@njit(error_model="numpy", cache=True, nogil=True)
 def robust_weights(samples, n, pose, K, noise, work, out):
     """Robust weight in [0, 1] of ``n`` pixels, without the external weight; 0 where unusable."""
     R = pose[:, :3].astype(np.float32)
@@ -334,7 +352,7 @@ def robust_weights(samples, n, pose, K, noise, work, out):
             out[o + k] = work[8, k]
 
 
-@njit(error_model="numpy", cache=True)
+@njit(error_model="numpy", cache=True, nogil=True)
 def new_work():
     """Scratch memory of one solver."""
     return np.empty((WORK_ROWS, BLOCK), np.float32)
