@@ -1,0 +1,119 @@
+"""Results of a run from its rows: steps, summary, scores and the picture."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hybridvo.data.sequence import Sequence
+from hybridvo.evaluation.metrics import evaluate_trajectories, mean_pair_errors
+from hybridvo.evaluation.report import write_csv
+from hybridvo.geometry import pose_matrix, se3_log
+from hybridvo.trajectory import Trajectory, atomic_write
+
+__all__ = ["STEP_COLUMNS", "draw", "score", "summarise", "true_trajectory", "write_steps"]
+
+STEP_COLUMNS = (
+    *("index", "timestamp", "status", "reason", "tx", "ty", "tz", "rx", "ry", "rz"),
+    *("inlier_ratio", "iterations", "cost", "ms", "prev_index", "flow_source", "message"),
+)
+
+Row = Mapping[str, Any]
+
+
+def summarise(
+    rows: list[dict[str, Any]], sequence: Sequence, method: str, pairs: int
+) -> dict[str, Any]:
+    """Counts, sources, oracles and times of a run, JSON-ready.
+
+    Args:
+        rows: of the frames done, at least one.
+        sequence: what was run on.
+        method: name of the estimator.
+        pairs: motions that a complete run has.
+    """
+    tracked = [row["ms"] for row in rows[1:] if row["reason"] != "missing_frame"]
+    failed = rows[-1]["failed_so_far"]
+    return {
+        "sequence": sequence.name,
+        "method": method,
+        "frames": len(rows),
+        "failed": failed,
+        "failed_share": failed / max(pairs, 1),
+        "degraded": sum(row["status"] == "degraded" for row in rows),
+        "missing_frames": [row["index"] for row in rows if row["reason"] == "missing_frame"],
+        "flow_source": _names(row["flow_source"] for row in rows),
+        "depth_source": sequence.depth_source,
+        "oracle": _oracles(rows, sequence),
+        "ms_per_pair_median": float(np.median(tracked)) if tracked else None,
+        "warnings": [],
+    }
+
+
+def score(
+    rows: list[dict[str, Any]],
+    trajectory: Trajectory,
+    truth: Trajectory,
+    alignment: str,
+    summary: Mapping[str, Any],
+) -> dict[str, Any]:
+    """Content of ``metrics.json``; no times, so that equal runs give equal bytes."""
+    report = evaluate_trajectories(trajectory, truth, alignment=alignment)  # type: ignore[arg-type]
+    per_pair = mean_pair_errors(row["errors"] for row in rows if row["errors"] is not None)
+    reasons = report.pop("reasons") | per_pair.pop("reasons")
+    named = ("method", "failed", "degraded", "flow_source", "depth_source", "oracle", "sequence")
+    return report | per_pair | {"reasons": reasons} | {key: summary[key] for key in named}
+
+
+def write_steps(folder: Path, rows: list[dict[str, Any]]) -> None:
+    """Write ``steps.csv`` (a line per frame) and ``steps.npz`` (motions and covariances)."""
+    T = np.array([row["T_curr_prev"] for row in rows]).reshape(-1, 4, 4)
+    table = []
+    for row, motion in zip(rows, T, strict=True):
+        rotation = se3_log(motion)[3:]
+        values = dict(
+            zip(("tx", "ty", "tz", "rx", "ry", "rz"), [*motion[:3, 3], *rotation], strict=True)
+        )
+        message = " ".join(str(row["message"]).split())
+        table.append({**row, **values, "message": message})
+    write_csv(folder / "steps.csv", table, STEP_COLUMNS)
+    covariance = np.array([row["covariance"] for row in rows]).reshape(-1, 6, 6)
+    with atomic_write(folder / "steps.npz", "wb") as file:
+        np.savez(file, T_curr_prev=T, covariance=covariance)
+
+
+def draw(
+    path: Path, trajectory: Trajectory, truth: Trajectory | None, summary: Mapping[str, Any]
+) -> None:
+    """Draw the trajectory, over the truth where there is one."""
+    from hybridvo.evaluation.plots import plot_trajectories
+
+    title = f"{summary['sequence']}, flow: {', '.join(summary['flow_source']) or 'none'}"
+    if summary["oracle"]:
+        title += f" (oracle: {', '.join(summary['oracle'])})"
+    plot_trajectories({summary["method"]: trajectory}, path, truth=truth, title=title)
+
+
+def true_trajectory(sequence: Sequence, frames: range) -> Trajectory | None:
+    """True poses of the frames of the run that have one."""
+    if sequence.poses is None:
+        return None
+    known = [i for i in frames if np.isfinite(sequence.poses[i]).all()]
+    if not known:
+        return None
+    # text files carry six digits: made orthonormal as the trajectory demands
+    T = np.stack([pose_matrix(sequence.poses[i][:3]) for i in known])
+    return Trajectory(sequence.timestamps[known], T)
+
+
+def _names(values: Iterable[str | None]) -> list[str]:
+    return sorted({value for value in values if value})
+
+
+def _oracles(rows: list[dict[str, Any]], sequence: Sequence) -> list[str]:
+    """What the estimate was given that no sensor gives."""
+    oracles = ["true flow"] if any(row["flow_is_true"] for row in rows) else []
+    return oracles + (["true depth"] if sequence.depth_source == "true" else [])
