@@ -17,6 +17,7 @@ from typing import Any
 
 import torch
 import torch.distributed as dist
+import torch.nn.functional as F
 from torch import nn
 from torch.nn.parallel import DistributedDataParallel
 
@@ -34,6 +35,9 @@ __all__ = ["Trainer", "training_loss"]
 
 MAX_SKIPPED_IN_A_ROW = 50
 """Updates with a loss or gradient that is not finite, after which a run gives up."""
+
+SEPARATION_SLOPE = 4.0
+"""Logits per unit of s."""
 
 STOPPED_BY = ("steps", "time", "signal")
 
@@ -64,7 +68,38 @@ def training_loss(
             term = 0.5 * (error * (-s.clamp(min=-11.5)).exp() + s.clamp(min=-11.5)).mean()
         loss = loss + options.loss.translation_weight * term
         parts = {**parts, "translation": term.detach()}
+    if options.moving_weight and isinstance(output, PixelwisePrediction):
+        term = _separation(output, batch.moving)
+        loss = loss + options.moving_weight * term
+        parts = {**parts, "moving": term.detach()}
     return loss, parts
+
+
+def _separation(output: PixelwisePrediction, moving: torch.Tensor) -> torch.Tensor:
+    """Cross-entropy of "s is above the middle between the two kinds of pixels" with the truth.
+
+    Both kinds weigh the same; pairs with one kind only do not count. It saturates once U differs
+    by a factor of three or so, and leaves the rest of s to the other terms.
+    """
+    rotation, translation = output.log_scale_rotation, output.log_scale_translation
+    if rotation is None or translation is None:
+        return output.rotation.new_zeros(())
+    share = F.interpolate(moving[:, None].to(rotation.dtype), rotation.shape[2:], mode="area")
+    masks = [(share > 0.5).flatten(1).to(share.dtype), (share < 0.5).flatten(1).to(share.dtype)]
+    counts = [mask.sum(1, keepdim=True) for mask in masks]
+    both = (counts[0] > 0) & (counts[1] > 0)
+    term = output.rotation.new_zeros(())
+    for s in (rotation, translation):
+        score = s.mean(1).flatten(1)
+        means = [
+            (score * m).sum(1, True) / n.clamp(min=1) for m, n in zip(masks, counts, strict=True)
+        ]
+        middle = (0.5 * (means[0] + means[1])).detach()
+        for sign, mask, count in zip((1, -1), masks, counts, strict=True):
+            surprise = F.softplus(-sign * SEPARATION_SLOPE * (score - middle))
+            each = (surprise * mask).sum(1, True) / count.clamp(min=1)
+            term = term + 0.25 * torch.where(both, each, 0.0).mean()
+    return term
 
 
 class Trainer:

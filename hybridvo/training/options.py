@@ -100,6 +100,9 @@ class TrainingOptions:
         loss: terms and switches.
         translation_loss: ``direction`` (the paper's: direction and length) or ``laplace``
             (L1 of each component in metres with its own s: exp(s) is then in metres).
+        moving_weight: weight of a term that the paper does not have: s should be larger on moving
+            pixels than on static ones of the same pair. 0 = none, as in the paper, whose s need
+            not tell the two apart once every pixel knows the answer of its neighbours.
         selection: method of ``hybridvo.pose.selection.select`` that L^F and L^D look through.
         data: preset files, beside the file that names them.
         data_weights: share of each.
@@ -122,6 +125,7 @@ class TrainingOptions:
     network: NetworkOptions = field(default_factory=NetworkOptions)
     loss: LossOptions = field(default_factory=LossOptions)
     translation_loss: str = "direction"
+    moving_weight: float = 0.0
     selection: str = "softmax"
     data: tuple[str, ...] = ("data_paper.yaml",)
     data_weights: tuple[float, ...] = (1.0,)
@@ -157,6 +161,8 @@ class TrainingOptions:
             raise InputError(
                 "TrainingOptions: expected checkpoint_minutes > 0 and evaluate_every >= 0."
             )
+        if not self.moving_weight >= 0:
+            raise InputError("TrainingOptions.moving_weight: expected a number >= 0.")
         if len(self.data) != len(self.data_weights):
             raise InputError("TrainingOptions: expected one of data_weights for each of data.")
 

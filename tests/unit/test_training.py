@@ -478,3 +478,17 @@ def test_two_processes_have_the_gradient_of_one(tmp_path):
         torch.testing.assert_close(
             shared[name], parameter.grad, rtol=1e-3, atol=1e-4, msg=lambda m, n=name: f"{n}: {m}"
         )
+
+
+def test_separation_by_hand():
+    # Left half moves; s is 1 there and 0 elsewhere: half a unit from the middle, softplus(-2).
+    moving = torch.zeros(2, 4, 4, dtype=torch.bool)
+    moving[0, :, :2] = True
+    s = moving[:, None, :, :].expand(-1, 3, -1, -1).float()
+    output = PixelwisePrediction(s, s, s, s)
+    # The second pair has one kind only and does not count: half of the mean.
+    expected = 0.5 * np.log1p(np.exp(-2.0))
+    assert float(loop._separation(output, moving)) == pytest.approx(expected, rel=1e-5)
+    upside_down = PixelwisePrediction(s, s, -s, -s)
+    expected = 0.5 * np.log1p(np.exp(2.0))
+    assert float(loop._separation(upside_down, moving)) == pytest.approx(expected, rel=1e-5)
