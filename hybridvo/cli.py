@@ -276,3 +276,7 @@ def _doctor(args: argparse.Namespace, command: list[str]) -> int:
     report = doctor()
     _print(to_json(report) if args.json else doctor_text(report))
     return 0 if report["usable"] else EXIT_INPUT
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -35,10 +35,15 @@ DIS_PRESETS = {
 }
 """Names of OpenCV's DIS presets."""
 
-BASE_STD_PX = 0.15
-ERROR_FACTOR = 0.35
+BASE_STD_PX = 0.035
+ERROR_FACTOR = 1.2
 MAX_STD_PX = 5.0
-"""Flow noise: std^2 = BASE_STD_PX^2 + (ERROR_FACTOR * error)^2, at most MAX_STD_PX."""
+"""Flow noise: std^2 = BASE_STD_PX^2 + (ERROR_FACTOR * error)^2 per component, at most MAX_STD_PX.
+
+Measured on 18 pairs of the synthetic world (light, static and heavy_two scenes, DIS medium): among
+pixels that disagree by 0.015, 0.035, 0.075, 0.15, 0.25, 0.4, 0.6, 0.9, 1.2 px the true error has a
+(median-based) standard deviation of 0.038, 0.046, 0.077, 0.16, 0.32, 0.53, 0.86, 1.25, 1.8 px.
+"""
 MAX_ERROR_PX = 1.5
 MAX_RELATIVE_ERROR = 0.05
 """A forward-backward error above both limits says that the pixel is occluded or mismatched."""

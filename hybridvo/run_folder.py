@@ -8,13 +8,14 @@ it was working on, and a resumed one ends with the bytes of an uninterrupted one
 from __future__ import annotations
 
 import contextlib
+import io
 import json
 import os
 import secrets
 import socket
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import IO, Any, Literal
+from typing import Any, Literal
 
 from hybridvo.errors import InputError, LockedError, OutputError
 from hybridvo.evaluation.report import jsonable, write_json
@@ -66,7 +67,7 @@ class RunFolder:
         self.path = Path(path)
         self._identity = json.loads(json.dumps(jsonable(identity)))
         self._header = dict(header)
-        self._partial: IO[bytes] | None = None
+        self._partial: io.RawIOBase | None = None
         self._lock = _Lock(self.path / LOCK)
         self.frames_done = 0
         self.state: dict[str, Any] = {}
@@ -116,7 +117,8 @@ class RunFolder:
         # O_NOFOLLOW: a link planted under this name must not lead the rows elsewhere
         flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | getattr(os, "O_NOFOLLOW", 0)
         with _as_output_error(self.path / PARTIAL):
-            self._partial = os.fdopen(os.open(self.path / PARTIAL, flags, 0o666), "ab")
+            descriptor = os.open(self.path / PARTIAL, flags, 0o666)
+            self._partial = os.fdopen(descriptor, "ab", buffering=0)
 
     def _load(self) -> None:
         """Rows and state of an earlier run of the same identity."""
@@ -185,8 +187,8 @@ class RunFolder:
         if self._partial is None:
             raise OutputError(f"{self.path}: the run is closed.")
         with _as_output_error(self.path / PARTIAL):
-            self._partial.write(line)
-            self._partial.flush()
+            while line:  # a nearly full disk takes a part and refuses the rest
+                line = line[self._partial.write(line) :]
         self.frames_done += 1
 
     def write_state(self, state: str, **more: Any) -> None:

@@ -1,0 +1,311 @@
+from __future__ import annotations
+
+import tracemalloc
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+
+import hybridvo
+from hybridvo.errors import InputError
+from hybridvo.flow import FlowField, dis_flow
+from hybridvo.geometry import ego_flow, invert, rotation_angle, se3_exp
+from hybridvo.hybrid import METHODS, check_method, estimate, warm_up
+from hybridvo.odometry import Odometry
+from hybridvo.types import Camera, Frame, FramePair, Reason, State
+
+HEIGHT, WIDTH = 48, 64
+CAMERA = Camera(60, 60, 31.5, 23.5, HEIGHT, WIDTH)
+MOTION = se3_exp(np.array([0.03, -0.02, 0.08, 0.004, -0.006, 0.003]))
+
+
+def depth(seed: int = 0) -> np.ndarray:
+    u, v = np.arange(WIDTH), np.arange(HEIGHT)[:, None]
+    return (4 + np.sin(u / 6 + seed) + np.cos(v / 5 - seed)).astype(np.float32)
+
+
+def frame(index: int, **changes: object) -> Frame:
+    rgb = np.full((HEIGHT, WIDTH, 3), index % 256, np.uint8)
+    values = {"rgb": rgb, "depth": depth(index), "camera": CAMERA} | changes
+    return Frame(**values, timestamp=0.1 * index, index=index)
+
+
+def exact_flow(motion: np.ndarray = MOTION):
+    """Provider of the exact flow of a static scene under one motion a frame."""
+
+    def provide(prev: Frame, curr: Frame) -> FlowField:
+        T = np.linalg.matrix_power(motion, curr.index - prev.index)
+        flow = ego_flow(depth(prev.index), T, prev.camera, curr.camera).astype(np.float32)
+        return FlowField(flow, source="exact", is_true=True)
+
+    return provide
+
+
+def tracker(**options: object) -> Odometry:
+    return Odometry(**{"flow": exact_flow(), **options})
+
+
+def test_first_frame_is_the_identity() -> None:
+    step = tracker().track(frame(3))
+    assert step.ok and step.status.state is State.OK
+    np.testing.assert_array_equal(step.T_world_cam, np.eye(4))
+    np.testing.assert_array_equal(step.T_curr_prev, np.eye(4))
+    assert (step.index, step.timestamp) == (3, pytest.approx(0.3))
+
+
+def test_poses_chain_camera_to_world() -> None:
+    vo = tracker()
+    steps = [vo.track(frame(i)) for i in range(4)]
+    for k, step in enumerate(steps):
+        expected = invert(np.linalg.matrix_power(MOTION, k))
+        # float32 flow of ten pixels carries 1e-6 px of rounding: nanometres, and far below 1e-5
+        assert np.abs(step.T_world_cam - expected).max() < 1e-5 * max(k, 1)
+        assert step.covariance.shape == (6, 6) and np.isfinite(step.covariance).all()
+    np.testing.assert_allclose(steps[1].T_prev_curr @ steps[1].T_curr_prev, np.eye(4), atol=1e-12)
+
+
+def test_set_pose_before_and_during_the_walk() -> None:
+    start = se3_exp(np.array([1.0, 2.0, 3.0, 0.1, 0.2, 0.3]))
+    vo = tracker()
+    vo.set_pose(start)
+    np.testing.assert_allclose(vo.track(frame(0)).T_world_cam, start, atol=1e-15)
+    step = vo.track(frame(1))
+    np.testing.assert_allclose(step.T_world_cam, start @ invert(MOTION), atol=1e-5)
+    vo.set_pose(np.eye(4))
+    np.testing.assert_allclose(vo.track(frame(2)).T_world_cam, invert(MOTION), atol=1e-5)
+
+
+@pytest.mark.parametrize("T", [np.zeros((4, 4)), np.full((4, 4), np.nan), np.eye(3)])
+def test_set_pose_refuses_what_is_no_pose(T: np.ndarray) -> None:
+    with pytest.raises(InputError, match="set_pose"):
+        tracker().set_pose(T)
+
+
+def test_reset_forgets() -> None:
+    vo = tracker()
+    first = [vo.track(frame(i)).T_world_cam for i in range(3)]
+    vo.reset()
+    again = [vo.track(frame(i)).T_world_cam for i in range(3)]
+    np.testing.assert_array_equal(first, again)
+
+
+def test_swapped_frames_give_the_inverse_motion() -> None:
+    """A plane seen twice: exact flow both ways, so both estimates are exact."""
+    camera, plane = CAMERA, np.full((HEIGHT, WIDTH), 5.0, np.float32)
+    forth = FramePair(
+        Frame(None, plane, camera),
+        Frame(None, None, camera),
+        ego_flow(plane, MOTION, camera, camera).astype(np.float32),
+    )
+    # depth of the same plane from the second camera: n X = d moves with the motion
+    normal = MOTION[:3, :3] @ np.array([0.0, 0.0, 1.0])
+    distance = 5.0 + normal @ MOTION[:3, 3]
+    u, v = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
+    rays = np.stack([(u - 31.5) / 60, (v - 23.5) / 60, np.ones_like(u)], axis=-1)
+    depth_curr = (distance / (rays @ normal)).astype(np.float32)
+    back = FramePair(
+        Frame(None, depth_curr, camera),
+        Frame(None, None, camera),
+        ego_flow(depth_curr, invert(MOTION), camera, camera).astype(np.float32),
+    )
+    product = estimate(forth).T_curr_prev @ estimate(back).T_curr_prev
+    assert rotation_angle(product[:3, :3]) < 2e-6  # a plane is the weakest scene: float32 rounding
+    assert np.linalg.norm(product[:3, 3]) < 2e-5
+
+
+@pytest.mark.parametrize("policy", ["hold", "constant_velocity"])
+def test_failed_motion_follows_the_policy(policy: str) -> None:
+    vo = tracker(policy=policy)
+    vo.track(frame(0))
+    good = vo.track(frame(1))
+    vo.track(frame(2, depth=None))
+    bad = vo.track(frame(3))
+    assert bad.status.state is State.FAILED and bad.status.reason is Reason.NO_VALID_DEPTH
+    expected = np.eye(4) if policy == "hold" else good.T_curr_prev
+    np.testing.assert_allclose(bad.T_curr_prev, expected, atol=1e-4)
+    # at least a metre and 0.3 rad: no pose graph can take it for a measurement
+    assert (np.diag(bad.covariance) >= [1.0] * 3 + [0.09] * 3).all()
+    after = vo.track(frame(4))
+    assert after.ok and np.isfinite(after.T_world_cam).all()
+
+
+def test_a_frame_that_cannot_be_read_is_spanned() -> None:
+    vo = tracker()
+    vo.track(frame(0))
+    vo.track(frame(1))
+    lost = vo.skip(2, 0.2, "gone")
+    assert lost.status.reason is Reason.MISSING_FRAME and lost.status.message == "gone"
+    np.testing.assert_array_equal(lost.T_curr_prev, np.eye(4))
+    step = vo.track(frame(3))
+    assert step.ok
+    # from frame 1 to 3: both motions, nothing is lost
+    np.testing.assert_allclose(step.T_curr_prev, MOTION @ MOTION, atol=1e-5)
+    np.testing.assert_allclose(
+        step.T_world_cam, invert(np.linalg.matrix_power(MOTION, 3)), atol=3e-5
+    )
+
+
+def test_frames_lost_under_constant_velocity_move_on_and_come_back() -> None:
+    vo = tracker(policy="constant_velocity")
+    vo.track(frame(0))
+    vo.track(frame(1))
+    for k in (2, 3):
+        step = vo.skip(k, 0.1 * k)
+        expected = invert(np.linalg.matrix_power(MOTION, k))
+        np.testing.assert_allclose(step.T_world_cam, expected, atol=1e-4)
+    expected = invert(np.linalg.matrix_power(MOTION, 4))
+    np.testing.assert_allclose(vo.track(frame(4)).T_world_cam, expected, atol=1e-4)
+
+
+def test_a_first_frame_that_cannot_be_read() -> None:
+    vo = tracker()
+    assert not vo.skip(0, 0.0).ok
+    assert vo.track(frame(1)).ok
+    np.testing.assert_allclose(vo.track(frame(2)).T_world_cam, invert(MOTION), atol=1e-5)
+
+
+def test_a_frame_without_image_is_spanned_where_flow_needs_images() -> None:
+    def with_images(prev: Frame, curr: Frame) -> FlowField:
+        if prev.rgb is None or curr.rgb is None:
+            return FlowField(None)
+        return exact_flow()(prev, curr)
+
+    vo = tracker(flow=with_images)
+    vo.track(frame(0))
+    blind = vo.track(frame(1, rgb=None))
+    assert blind.status.reason is Reason.NO_FLOW
+    expected = invert(np.linalg.matrix_power(MOTION, 2))
+    np.testing.assert_allclose(vo.track(frame(2)).T_world_cam, expected, atol=1e-5)
+
+
+def test_an_abrupt_change_of_motion_does_not_trap() -> None:
+    """The last motion is a start among others: the opposite motion is found as exactly."""
+    turn = se3_exp(np.array([-0.1, 0.05, -0.1, -0.02, 0.05, -0.04]))
+
+    def provide(prev: Frame, curr: Frame) -> FlowField:
+        T = turn if curr.index == 4 else MOTION
+        return FlowField(ego_flow(prev.depth, T, CAMERA, CAMERA).astype(np.float32))
+
+    vo = tracker(flow=provide)
+    steps = [vo.track(frame(i)) for i in range(6)]
+    np.testing.assert_allclose(steps[4].T_curr_prev, turn, atol=1e-5)
+    np.testing.assert_allclose(steps[5].T_curr_prev, MOTION, atol=1e-5)
+
+
+def test_flow_can_be_handed_in() -> None:
+    def never(prev: Frame, curr: Frame) -> FlowField:
+        raise AssertionError("the provider must not be asked")
+
+    vo = tracker(flow=never)
+    vo.track(frame(0))
+    flow = ego_flow(depth(0), MOTION, CAMERA, CAMERA)
+    np.testing.assert_allclose(vo.track(frame(1), flow).T_curr_prev, MOTION, atol=1e-5)
+    with pytest.raises(InputError, match="pixels on the previous grid"):
+        vo.track(frame(2), flow[:10])
+
+
+def test_a_driver_may_reuse_its_buffers() -> None:
+    shared_depth = depth(0)
+    vo = tracker()
+    vo.track(frame(0, depth=shared_depth))
+    shared_depth[:] = np.nan
+    assert vo.track(frame(1)).ok
+
+
+def test_a_frame_of_another_size_is_refused_and_changes_nothing() -> None:
+    vo = tracker()
+    vo.track(frame(0))
+    small = Frame(None, np.ones((24, 32), np.float32), Camera(30, 30, 15.5, 11.5, 24, 32))
+    with pytest.raises(InputError, match=r"\(48, 64\).*got \(24, 32\)"):
+        vo.track(small)
+    assert vo.track(frame(1)).ok
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"network": object()}, "networks are not supported yet"),
+        ({"policy": "guess"}, "hold or constant_velocity, got 'guess'"),
+        ({"flow": 3}, "expected a callable"),
+        ({"method": "refin"}, "did you mean 'refine'"),
+        ({"method": "hybrid"}, "needs network weights.*--method refine"),
+    ],
+)
+def test_wrong_options(options: dict[str, object], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        Odometry(**options)
+
+
+def test_track_wants_a_frame() -> None:
+    with pytest.raises(InputError, match="expected a Frame, got ndarray"):
+        tracker().track(np.zeros((4, 4)))
+
+
+def test_from_pretrained_says_what_to_do() -> None:
+    with pytest.raises(InputError, match=r"no network weights yet; use hybridvo.Odometry\(\)"):
+        hybridvo.Odometry.from_pretrained()
+
+
+@pytest.mark.parametrize("bad", [np.nan, 0.0, -1.0, np.inf])
+def test_bad_depth_never_gives_a_pose_that_is_not_finite(bad: float) -> None:
+    vo = tracker()
+    vo.track(frame(0))
+    vo.track(frame(1, depth=np.full((HEIGHT, WIDTH), bad, np.float32)))
+    step = vo.track(frame(2))
+    assert not step.ok and step.status.reason is Reason.NO_VALID_DEPTH
+    assert np.isfinite(step.T_world_cam).all() and np.isfinite(step.covariance).all()
+
+
+def test_memory_is_constant_over_200_frames() -> None:
+    vo = tracker()
+    for i in range(20):
+        vo.track(frame(i))
+    tracemalloc.start()
+    try:
+        for i in range(20, 40):
+            vo.track(frame(i))
+        before = tracemalloc.get_traced_memory()[0]
+        for i in range(40, 220):
+            vo.track(frame(i))
+        grown = tracemalloc.get_traced_memory()[0] - before
+    finally:
+        tracemalloc.stop()
+    # one frame is 21 kB: keeping even one in ten would be 380 kB
+    assert grown < 60_000
+
+
+def test_two_trackers_in_two_threads_give_the_bytes_of_one_after_the_other() -> None:
+    rng = np.random.default_rng(1)
+    pictures = [rng.integers(0, 255, (120, 160, 3), dtype=np.uint8) for _ in range(2)]
+    camera = Camera(120, 120, 79.5, 59.5, 120, 160)
+
+    def walk(seed: int) -> bytes:
+        vo = Odometry(flow=dis_flow("fast"), prepare=False)
+        poses = []
+        for i in range(8):
+            rgb = np.roll(pictures[seed], i, axis=1)
+            plane = np.full((120, 160), 3.0 + seed, np.float32)
+            poses.append(vo.track(Frame(rgb, plane, camera, 0.1 * i, i)).T_world_cam)
+        return np.stack(poses).tobytes()
+
+    warm_up()
+    serial = [walk(0), walk(1)]
+    with ThreadPoolExecutor(2) as pool:
+        for _ in range(3):
+            assert list(pool.map(walk, (0, 1))) == serial
+
+
+def test_every_method_runs_or_says_why_not() -> None:
+    flow = ego_flow(depth(), MOTION, CAMERA, CAMERA).astype(np.float32)
+    pair = FramePair(frame(0), frame(1), flow)
+    ran = []
+    for method in METHODS:
+        try:
+            check_method(method)
+        except InputError as error:
+            assert "needs network weights" in str(error) or "pip install" in str(error)
+            continue
+        result = estimate(pair, method=method)
+        assert np.isfinite(result.T_curr_prev).all() and result.method == method
+        ran.append(method)
+    assert {"refine", "pnp-ransac", "identity"} <= set(ran)
