@@ -38,6 +38,8 @@ MAX_DAMPING = 1e3
 FLOW_NOISE_FLOOR = 2e-3
 """Smallest flow noise assumed, px, as in the numba solver."""
 DEPTH_NOISE_CAP = 0.5
+SMALL_STEP = 0.1
+"""Steps that move the picture by less, in standard deviations, need no descent."""
 SECOND_DEPTH_FLOOR = 2e-3
 """Smallest noise of log D_curr assumed: what bilinear sampling of a smooth surface is good to."""
 
@@ -204,8 +206,8 @@ def gauss_newton(
 ) -> Solution:
     """Damped Gauss-Newton; a step is taken where the cost under the old covariance does not rise.
 
-    With the covariance held, the normal equations are those of a descent, and the fixed point is
-    the root of the estimating equation; the cost under the moving covariance has another minimum.
+    The root of the estimating equation is sought, not the least cost: with the covariance held the
+    two nearly agree, and steps below ``SMALL_STEP`` are taken whatever the cost says.
     """
     dtype = pixels.depth.dtype
     batch = T.shape[0]
@@ -220,9 +222,10 @@ def gauss_newton(
         candidate = left_update(delta, T)
         terms = residual_terms(pixels, candidate.to(dtype))
         new_cost = total_cost(pixels, terms, white, kernel, cutoff)
-        better = solved & ~done & (new_cost <= cost * slack + 1e-12)
-        worse = ~done & ~better
         moved = _moved(delta, g, weight)
+        descends = (new_cost <= cost * slack + 1e-12) | (moved < SMALL_STEP)
+        better = solved & ~done & descends
+        worse = ~done & ~better
         system = normal_equations(
             pixels, candidate.to(dtype), noise, kernel, cutoff, terms=terms
         )  # fmt: skip
@@ -261,7 +264,7 @@ def tighten(
     T, noise, iterations = start.T, start.noise, start.iterations
     eps = torch.finfo(dtype).eps
     last = torch.full(T.shape[:1], torch.inf, dtype=torch.float64, device=T.device)
-    done = ~start.converged
+    done = torch.zeros_like(start.converged)
     for _ in range(rounds):
         A = estimating_hessian(pixels, T.to(dtype), noise, kernel, cutoff)
         for _ in range(steps):
@@ -269,7 +272,7 @@ def tighten(
             delta, solved = solve_small(A, system.g)
             norm = torch.einsum("bi,bij,bj->b", delta, system.H.double(), delta).clamp(min=0)
             moved = (norm / system.weight_sum.double().clamp(min=1e-12)).sqrt()
-            shrinks = solved & (moved < 0.5 * last) & ~done
+            shrinks = solved & (moved < 0.5 * last) & (moved < 1) & ~done
             T = torch.where(shrinks[:, None, None], left_update(delta, T), T)
             last = torch.where(shrinks, moved, last)
             iterations = iterations + shrinks.long()
@@ -280,4 +283,4 @@ def tighten(
         if bool(done.all()):
             break
     tight = last < max(1e-8, 1e4 * eps)
-    return replace(start, T=T, converged=start.converged & tight, iterations=iterations)
+    return replace(start, T=T, converged=tight, iterations=iterations)

@@ -202,7 +202,7 @@ def _checked_pair(
         weights = torch.as_tensor(weights, device=flow.device)
         if weights.ndim == 2 and batch == 1:
             weights = weights[None]
-    for name, value, shape in (
+    checked: tuple[tuple[str, Any, tuple[int, ...]], ...] = (
         ("flow", flow, (*image, 2)),
         ("depth_prev", depth, image),
         ("K_prev", pair.K_prev, (batch, 3, 3)),
@@ -212,7 +212,8 @@ def _checked_pair(
         ("depth_variance", pair.depth_variance, image),
         ("weights", weights, image),
         ("valid", pair.valid, image),
-    ):
+    )
+    for name, value, shape in checked:
         if value is None and name not in ("K_prev", "K_curr"):
             values[name] = None
             continue

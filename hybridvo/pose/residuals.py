@@ -7,11 +7,13 @@ Per pixel, with X' = T X, a = X'/Z', b = Y'/Z', i = 1/Z' (the definition of
 - Jacobian of the prediction with respect to the left perturbation (translation, rotation):
   diag(fx, fy) [[i, 0, -a i, -a b, 1 + a^2, -b], [0, i, -b i, -(1 + b^2), a b, a]];
 - u = q = d pi(X') / d log Z = (fx i (a tz - tx), fy i (b tz - ty));
-- covariance Sigma = diag(sf^2 v_f, sf^2 v_f) + sd^2 v_d u u^T.
+- covariance Sigma = diag(sf^2 v_f, sf^2 v_f) + sd^2 v_d u u^T;
+- a, b, i and u of the Jacobian and of Sigma (not of r) are taken at log Z + e, the posterior mean
+  of the true log depth, e = sd^2 v_d u^T Sigma^-1 r (errors in variables: see the kernels).
 
 With the second depth a third row joins, r_z = log D_curr(x + F) - log Z'. A left perturbation
 moves Z' by dZ' = rho_z + phi_x Y' - phi_y X', so its Jacobian is [0, 0, i, b, -a, 0]; the first
-depth acts through Z' = Z (R K^-1 x)_z + tz, so d log Z' / d log Z = (Z' - tz) / Z' = 1 - tz i =: h.
+depth acts through Z' = Z (R K^-1 x)_z + tz, so d log Z' / d log Z = (Z' - tz) / Z' = 1 - tz i = h.
 The noise of the first depth is common to all three rows: u = (q, h), and
 Sigma = diag(sf^2 v_f, sf^2 v_f, sz^2) + sd^2 v_d u u^T. What the flow noise does to the place where
 D_curr is sampled is left out.
@@ -24,7 +26,7 @@ has a zero in D and loses that row alone.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import reduce
 
 import pypose as pp
@@ -56,19 +58,22 @@ CUTOFFS = {"geman-mcclure": 3.0, "huber": 1.345, "cauchy": 2.385, "l2": 1.0}
 """Default cutoff c in standard deviations: 3 as in the numba solver; the 95 % efficient ones for
 Huber and Cauchy (P. J. Huber, Robust Statistics; one-dimensional Gaussian noise)."""
 
+MAX_SHIFT = 0.3
+"""Largest correction of log depth that an outlier may cause, as in the numba kernels."""
 LOST_DISTANCE2 = 1e4
 """Squared Mahalanobis distance at which a pixel behind the camera is charged."""
 
 
 @dataclass(frozen=True, eq=False)
 class Terms:
-    """What the pose says of every pixel, each (B, N): see the formulas of this module."""
+    """What the pose says of every pixel, each (B, N), and its t; see this module's formulas."""
 
     a: torch.Tensor
     b: torch.Tensor
     i: torch.Tensor
     r: tuple[torch.Tensor, ...]
     u: tuple[torch.Tensor, ...]
+    t: tuple[torch.Tensor, ...]
     front: torch.Tensor
 
 
@@ -81,7 +86,8 @@ class NormalEquations:
     """Weighted normal equations at a pose; H delta = g is the Gauss-Newton step Exp(delta) T.
 
     Args:
-        H: (B, 6, 6) sum of w J^T Sigma^-1 J. g: (B, 6) sum of w J^T Sigma^-1 r.
+        H: (B, 6, 6) float64, sum of w J^T Sigma^-1 J.
+        g: (B, 6) float64, sum of w J^T Sigma^-1 r.
         cost: (B,) robust cost, pixels behind the camera at the full one.
         weights: (B, N) robust weights without the external ones, 0 where unusable.
         weight_sum: (B,) sum of robust times external weights.
@@ -189,24 +195,26 @@ def residual_terms(pixels: Pixels, T: torch.Tensor, xi: torch.Tensor | None = No
     a, b = X * i, Y * i
     fx, fy, cx, cy = pixels.K[:, :, None].unbind(dim=1)
     r = [pixels.target_u - (fx * a + cx), pixels.target_v - (fy * b + cy)]
-    u = [fx * i * (a * t[2] - t[0]), fy * i * (b * t[2] - t[1])]
     if pixels.log_depth_curr is not None:
         r.append(pixels.log_depth_curr + i.log())
-        u.append(1 - t[2] * i)
-    return Terms(a, b, i, tuple(r), tuple(u), front)
+    u = _sensitivity(a, b, i, tuple(t), fx, fy, len(r))
+    return Terms(a, b, i, tuple(r), u, tuple(t), front)
 
 
 def jacobian(terms: Terms, K: torch.Tensor) -> tuple[torch.Tensor, ...]:
-    """Rows d prediction / d delta, each (B, 6, N): u, v and, with the second depth, log Z'."""
+    """Rows d prediction / d delta, each (B, 6, N): u, v and, with the second depth, log Z'.
+
+    Terms of (B, C, L) give rows of (B, C, 6, L).
+    """
     a, b, i = terms.a, terms.b, terms.i
-    fx, fy = K[:, 0, None, None], K[:, 1, None, None]
+    fx, fy = (K[:, k].reshape(-1, *[1] * a.ndim) for k in (0, 1))
     zero, ab = torch.zeros_like(a), a * b
     rows = [
-        fx * torch.stack([i, zero, -a * i, -ab, 1 + a * a, -b], dim=1),
-        fy * torch.stack([zero, i, -b * i, -1 - b * b, ab, a], dim=1),
+        fx * torch.stack([i, zero, -a * i, -ab, 1 + a * a, -b], dim=-2),
+        fy * torch.stack([zero, i, -b * i, -1 - b * b, ab, a], dim=-2),
     ]
     if len(terms.r) == 3:
-        rows.append(torch.stack([zero, zero, i, b, -a, zero], dim=1))
+        rows.append(torch.stack([zero, zero, i, b, -a, zero], dim=-2))
     return tuple(rows)
 
 
@@ -237,9 +245,39 @@ def _whitened(
 ) -> tuple[list[torch.Tensor], torch.Tensor]:
     """(Sigma^-1 r, squared Mahalanobis distance)."""
     D, kappa, Du = white
-    along = kappa * _sum(v * e for v, e in zip(Du, r, strict=True))
-    n = [d * e - along * v for d, e, v in zip(D, r, Du, strict=True)]
-    return n, _sum(m * e for m, e in zip(n, r, strict=True)).clamp(min=0)
+    along = kappa * _sum(v * x for v, x in zip(Du, r, strict=True))
+    n = [d * x - along * v for d, x, v in zip(D, r, Du, strict=True)]
+    return n, _sum(m * x for m, x in zip(n, r, strict=True)).clamp(min=0)
+
+
+def relinearised(pixels: Pixels, terms: Terms, noise: torch.Tensor) -> Terms:
+    """The terms at the depths that the residuals make most likely; the residuals stay.
+
+    With h = 1 - tz i = d log Z' / d log Z: a + e q_u / fx, b + e q_v / fy, i (1 - h e).
+    """
+    _, kappa, Du = whitening(pixels, terms, noise)
+    e = kappa * _sum(v * x for v, x in zip(Du, terms.r, strict=True))
+    e = e.clamp(-MAX_SHIFT, MAX_SHIFT)
+    fx, fy = pixels.K[:, 0, None], pixels.K[:, 1, None]
+    a = terms.a + terms.u[0] * e / fx
+    b = terms.b + terms.u[1] * e / fy
+    i = terms.i * (1 - (1 - terms.t[2] * terms.i) * e)
+    u = _sensitivity(a, b, i, terms.t, fx, fy, len(terms.r))
+    return replace(terms, a=a, b=b, i=i, u=u)
+
+
+def _sensitivity(
+    a: torch.Tensor,
+    b: torch.Tensor,
+    i: torch.Tensor,
+    t: tuple[torch.Tensor, ...],
+    fx: torch.Tensor,
+    fy: torch.Tensor,
+    rows: int,
+) -> tuple[torch.Tensor, ...]:
+    """Sensitivity u = d prediction / d log Z."""
+    u = (fx * i * (a * t[2] - t[0]), fy * i * (b * t[2] - t[1]))
+    return (*u, 1 - t[2] * i) if rows == 3 else u
 
 
 def robust_weight(distance2: torch.Tensor, kernel: str, cutoff: float) -> torch.Tensor:
@@ -250,7 +288,7 @@ def robust_weight(distance2: torch.Tensor, kernel: str, cutoff: float) -> torch.
     if kernel == "cauchy":
         return c2 / (c2 + distance2)
     if kernel == "huber":
-        return cutoff / distance2.clamp(min=c2).sqrt()
+        return torch.where(distance2 <= c2, 1.0, cutoff / distance2.clamp(min=c2).sqrt())
     if kernel == "l2":
         return torch.ones_like(distance2)
     raise InputError(f"kernel: expected one of {', '.join(KERNELS)}, got {kernel!r}.")
@@ -278,13 +316,25 @@ def _full_cost(pixels: Pixels, kernel: str, cutoff: float) -> torch.Tensor:
 
 
 def total_cost(
-    pixels: Pixels, terms: Terms, white: Whitening, kernel: str, cutoff: float
+    pixels: Pixels,
+    terms: Terms,
+    white: Whitening,
+    kernel: str,
+    cutoff: float,
 ) -> torch.Tensor:
     """(B,) robust cost of residuals under a given whitening (not necessarily of their own pose)."""
     _, distance2 = _whitened(terms.r, white)
     rho = robust_cost(distance2, kernel, cutoff)
     full = _full_cost(pixels, kernel, cutoff)
     return (pixels.weight * torch.where(terms.front, rho, full)).sum(dim=1)
+
+
+def _run_length(count: int) -> int:
+    """Length of the runs whose sums stay in the pixels' type; sums of runs are in float64.
+
+    The largest divisor up to 1024: a float32 sum over a whole picture loses the step's fifth digit.
+    """
+    return next((k for k in range(min(count, 1024), 31, -1) if count % k == 0), count)
 
 
 def normal_equations(
@@ -311,6 +361,7 @@ def normal_equations(
     """
     cutoff = CUTOFFS[kernel] if cutoff is None else cutoff
     terms = residual_terms(pixels, T) if terms is None else terms
+    terms = relinearised(pixels, terms, noise)
     white = whitening(pixels, terms, noise)
     D, kappa, Du = white
     n, distance2 = _whitened(terms.r, white)
@@ -319,19 +370,26 @@ def normal_equations(
         usable, robust_weight(distance2, kernel, cutoff), torch.zeros_like(distance2)
     )
     w = pixels.weight * weights
-    J = jacobian(terms, pixels.K)
-    along = _sum(row * v[:, None] for row, v in zip(J, Du, strict=True))
-    G = torch.cat([*J, along], dim=2)
-    omega = torch.cat([*(w * d for d in D), -w * kappa], dim=1)
-    H = (G * omega[:, None]) @ G.transpose(1, 2)
-    e = torch.cat([w * m for m in n], dim=1)
-    g = (G[:, :, : e.shape[1]] @ e[..., None])[..., 0]
+    shape = (w.shape[0], -1, _run_length(w.shape[1]))
+
+    def fold(values: Iterable[torch.Tensor]) -> tuple[torch.Tensor, ...]:
+        return tuple(value.reshape(shape) for value in values)
+
+    a, b, i = fold((terms.a, terms.b, terms.i))
+    J = jacobian(replace(terms, a=a, b=b, i=i), pixels.K)
+    along = _sum(row * v[:, :, None] for row, v in zip(J, fold(Du), strict=True))
+    G = torch.cat([*J, along], dim=3)
+    omega = torch.cat(fold([*(w * d for d in D), -w * kappa]), dim=2)
+    H = ((G * omega[:, :, None]) @ G.transpose(2, 3)).double().sum(dim=1)
+    right = torch.cat(fold(w * m for m in n), dim=2)
+    g = (G[..., : right.shape[2]] @ right[..., None])[..., 0].double().sum(dim=1)
     rho = torch.where(
         terms.front, robust_cost(distance2, kernel, cutoff), _full_cost(pixels, kernel, cutoff)
     )
     scores = None
     if with_scores:
-        scores = _sum(row * (w * m)[:, None] for row, m in zip(J, n, strict=True))
+        scores = _sum(row * m[:, :, None] for row, m in zip(J, fold(w * m for m in n), strict=True))
+        scores = scores.transpose(1, 2).flatten(2)
     return NormalEquations(
         H=0.5 * (H + H.transpose(1, 2)),
         g=g,
@@ -358,6 +416,7 @@ def score_sum(
     with the pose. ``xi`` as in :func:`residual_terms`.
     """
     terms = residual_terms(pixels, T, xi)
+    terms = relinearised(pixels, terms, noise)
     n, distance2 = _whitened(terms.r, whitening(pixels, terms, noise))
     usable = terms.front & (pixels.weight > 0)
     w = torch.where(usable, pixels.weight, torch.zeros_like(pixels.weight))
