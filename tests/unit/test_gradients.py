@@ -46,8 +46,7 @@ def noisy_pair(
     flow = flow + 0.3 * torch.randn(flow.shape, generator=g, dtype=F64)
     gross = torch.rand(depth.shape, generator=g, dtype=F64) < 0.1
     flow = flow + gross[..., None] * 2.0
-    moved = (T[:, None, None, 2, :3] @ torch.ones(3, dtype=F64)) * 0 + depth
-    depth_curr = moved * (1 + 0.01 * torch.randn(depth.shape, generator=g, dtype=F64))
+    depth_curr = depth * (1 + 0.01 * torch.randn(depth.shape, generator=g, dtype=F64))
     weights = 0.5 + torch.rand(depth.shape, generator=g, dtype=F64)
     return PairBatch(flow, depth, K_prev, K_curr, depth_curr=depth_curr), weights
 
@@ -72,8 +71,8 @@ def inputs_of(pair: PairBatch, weights: torch.Tensor) -> tuple[torch.Tensor, ...
 
 def places(slot: int, shape: tuple[int, ...], rng: np.random.Generator) -> list[tuple[int, ...]]:
     if slot in (2, 3):
-        return [(b, i, j) for b in (0, 1) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2))]
-    return [tuple(int(rng.integers(n)) for n in shape) for _ in range(5)]
+        return [(b, i, j) for b, i, j in ((0, 0, 0), (0, 1, 2), (1, 1, 1), (1, 0, 2))]
+    return [tuple(int(rng.integers(n)) for n in shape) for _ in range(3)]
 
 
 def slope(
@@ -112,9 +111,9 @@ def test_against_differences_of_the_whole_solve(kernel: str, second: bool) -> No
         for place in places(slot, tuple(gradient.shape), rng):
             expected = slope(loss, inputs, slot, place)
             # curvature times 1e-10 and a pose exact to 1e-13 over a step of 1e-5
-            assert float(gradient[place]) == pytest.approx(expected, rel=1e-5, abs=2e-7), (
-                SLOTS[slot]
-            )
+            assert float(gradient[place]) == pytest.approx(expected, rel=1e-5, abs=2e-7), SLOTS[
+                slot
+            ]
 
 
 def test_gradcheck() -> None:
@@ -162,11 +161,12 @@ def test_gauss_newton_hessian_in_its_place_would_be_wrong() -> None:
     tangent = tangent_gradient(C, T.detach())
     g = score_sum(pixels, T.detach(), noise, "geman-mcclure", CUTOFFS["geman-mcclure"])
     H = normal_equations(pixels.detach(), T.detach(), noise).H
-    (crude,) = torch.autograd.grad((solve_small(H, tangent)[0] * g).sum(), flow)
+    (crude,) = torch.autograd.grad(
+        (solve_small(H, tangent)[0] * g).sum(), flow, retain_graph=True
+    )  # fmt: skip
     for k in range(2):
         assert (crude[k] - exact[k]).norm() > 0.1 * exact[k].norm()
     A = estimating_hessian(pixels, T.detach(), noise, "geman-mcclure", 3.0)
-    g = score_sum(pixels, T.detach(), noise, "geman-mcclure", 3.0)
     (full,) = torch.autograd.grad(
         (solve_small(A.transpose(1, 2), tangent)[0] * g).sum(), flow
     )  # fmt: skip
@@ -246,8 +246,8 @@ def test_differentiable_once_and_only_on_request() -> None:
     flow = pair.flow.clone().requires_grad_()
     pair = replace(pair, flow=flow)
     T = refine_batch(pair, weights=weights, noise=NOISE).T_curr_prev
-    (gradient,) = torch.autograd.grad(T.sum(), flow, create_graph=True)
-    with pytest.raises(RuntimeError, match="once_differentiable"):
+    (gradient,) = torch.autograd.grad(T.square().sum(), flow, create_graph=True)
+    with pytest.raises(RuntimeError, match="differentiate"):
         gradient.sum().backward()
     assert not refine_batch(pair, differentiable=False).T_curr_prev.requires_grad
     with torch.no_grad():
