@@ -36,7 +36,18 @@ from hybridvo.run_results import draw, score, summarise, true_trajectory, write_
 from hybridvo.trajectory import Trajectory, write_kitti, write_tum
 from hybridvo.types import Frame, Step
 
-__all__ = ["EXIT_DONE", "EXIT_FAILED_FRAMES", "EXIT_INTERRUPTED", "RunResult", "run", "run_name"]
+__all__ = [
+    "EXIT_DONE",
+    "EXIT_FAILED_FRAMES",
+    "EXIT_INTERRUPTED",
+    "RunResult",
+    "check_device",
+    "flow_provider",
+    "input_hash",
+    "run",
+    "run_name",
+    "versions",
+]
 
 EXIT_DONE, EXIT_FAILED_FRAMES, EXIT_INTERRUPTED = 0, 3, 130
 
@@ -93,14 +104,14 @@ def run(
         LockedError: another run holds the folder. OutputError: a result cannot be written.
     """
     check_method(options.method)
-    _check_device(options.device)
+    check_device(options.device)
     sequence = open_sequence(path, dataset, **({"strict": True} if options.strict else {}))
     frames = range(options.start, min(options.stop or len(sequence), len(sequence)), options.stride)
     if not frames:
         raise InputError(
             f"{sequence.name}: no frames from {options.start} on: there are {len(sequence)}."
         )
-    provider = _provider(sequence, options)
+    provider = flow_provider(sequence, options)
     out = Path("runs") / run_name(sequence) if out is None else Path(out)
     identity = {
         "input_hash": input_hash(sequence),
@@ -309,7 +320,12 @@ def _tolerant(provider: FlowProvider, strict: bool) -> FlowProvider:
     return provide
 
 
-def _provider(sequence: Sequence, options: RunOptions) -> _Recorder:
+def flow_provider(sequence: Sequence, options: RunOptions) -> _Recorder:
+    """Provider of the flow that ``options`` ask for; damaged files give no flow unless strict.
+
+    Raises:
+        InputError: flow files asked for where there are none, or with a stride above 1.
+    """
     if options.flow == "file":
         if not sequence.has_flow:
             raise InputError(f"{sequence.name}: there are no flow files; pass --flow dis.")
@@ -325,7 +341,12 @@ def _provider(sequence: Sequence, options: RunOptions) -> _Recorder:
     return _Recorder(dis)
 
 
-def _check_device(device: str) -> None:
+def check_device(device: str) -> None:
+    """Refuse a device that is not there.
+
+    Raises:
+        InputError: ``cuda`` on a machine, or with a build of torch, that has none.
+    """
     if device == "cuda":
         import torch
 

@@ -97,7 +97,7 @@ def draw(
     plot_trajectories({summary["method"]: trajectory}, path, truth=truth, title=title)
 
 
-def true_trajectory(sequence: Sequence, frames: range) -> Trajectory | None:
+def true_trajectory(sequence: Sequence, frames: Iterable[int]) -> Trajectory | None:
     """True poses of the frames of the run that have one."""
     if sequence.poses is None:
         return None
