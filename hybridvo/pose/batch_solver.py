@@ -37,7 +37,8 @@ DAMPING = 1e-6
 MAX_DAMPING = 1e3
 FLOW_NOISE_FLOOR = 2e-3
 """Smallest flow noise assumed, px, as in the numba solver."""
-DEPTH_NOISE_CAP = 0.5
+DEPTH_NOISE_CAP = 0.08
+_SQRT_HALF = 0.5**0.5
 SMALL_STEP = 0.1
 """Steps that move the picture by less, in standard deviations, need no descent."""
 SECOND_DEPTH_FLOOR = 2e-3
@@ -168,16 +169,22 @@ def estimate_noise(
 
 
 def with_second_depth(sparse: Pixels, T: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
-    """(B, 3): the noise of log D_curr from the spread of r_z that sd h does not explain."""
+    """(B, 3): the noise of log D_curr from the spread of r_z that sd h does not explain.
+
+    sd may explain half of the variance at most: the two depths come from one sensor, and the flow
+    of a slow camera says next to nothing of sd.
+    """
     if sparse.has_depth_curr is None:
         return noise
     terms = residual_terms(sparse, T.to(sparse.depth.dtype))
     near = terms.r[0].square() + terms.r[1].square() <= (8 * noise[:, :1]).clamp(min=4.0).square()
     used = (sparse.weight > 0) & (sparse.has_depth_curr > 0) & terms.front & near
     spread = 1.4826 * masked_median(terms.r[2].abs(), used, 0.02)
-    common = noise[:, 1] * masked_median(terms.u[2].abs(), used, 1.0)
-    rest = (spread.square() - common.square()).clamp(min=SECOND_DEPTH_FLOOR**2).sqrt()
-    return torch.cat([noise, rest[:, None]], dim=1)
+    share = _SQRT_HALF * spread
+    h = masked_median(terms.u[2].abs(), used, 1.0).clamp(min=1e-3)
+    sd = torch.minimum(noise[:, 1], share / h)
+    sz = (spread.square() - (sd * h).square()).clamp(min=SECOND_DEPTH_FLOOR**2).sqrt()
+    return torch.stack([noise[:, 0], sd, sz], dim=1)
 
 
 @dataclass(frozen=True, eq=False)

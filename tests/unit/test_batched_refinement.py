@@ -218,9 +218,9 @@ def test_second_depth_helps_the_translation() -> None:
     assert errors[1] < 0.7 * errors[0]
     estimated = refine_batch(pair, use_second_depth=True)
     assert estimated.converged.all()
-    # r_z shows the sum of both depth noises, 0.005 sqrt(2), to about 1 / sqrt(n) and the split badly
+    # r_z shows both depth noises, the second less 4/9 by bilinear sampling; the split is vague
     both = estimated.noise[:, 1:].square().sum(dim=1).sqrt()
-    assert both.numpy() == pytest.approx(0.005 * math.sqrt(2), rel=0.2)
+    assert both.numpy() == pytest.approx(0.005 * math.sqrt(1 + 4 / 9), rel=0.1)
 
 
 def test_outside_autocast_and_half_input() -> None:

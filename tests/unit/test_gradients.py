@@ -278,6 +278,9 @@ def test_pypose_tangent_convention() -> None:
     """Translation first, left: Exp(d) T; the gradient of a pose is padded with a zero."""
     d = torch.tensor([0.1, -0.2, 0.3, 0.02, 0.01, -0.03], dtype=F64)
     assert (pp.se3(d).Exp().matrix() - torch.as_tensor(se3_exp(d.numpy()))).abs().max() < 1e-14
+    for size in (0.0, 1e-6, 1e-4, 1.0, 30.0):
+        T = left_update(size * d[None], torch.eye(4, dtype=F64)[None])
+        assert (T[0] - pp.se3(size * d).Exp().matrix()).abs().max() < 1e-13
     T = pp.SE3(torch.tensor([0.5, 0.1, 2.0, 0, 0, 0, 1.0], dtype=F64))
     point = torch.tensor([1.0, 2.0, 3.0], dtype=F64)
     pose = T.clone().requires_grad_()
