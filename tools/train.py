@@ -137,8 +137,16 @@ def _train(arguments: argparse.Namespace, argv: list[str]) -> int:
             why = trainer.run(math.inf if limit is None else 60 * limit)
         _say(trainer.rank, f"ended by {why} at update {trainer.step}, {trainer.samples} samples")
     if arguments.export is not None and trainer.rank == 0:
-        _export(trainer, arguments, command)
+        _export(trainer, arguments, _record(out, {"command": command, "commit": _commit()}))
     return 0
+
+
+def _record(out: Path, default: dict[str, Any]) -> dict[str, Any]:
+    """What the run wrote of itself when it trained: its command and commit, not the export's."""
+    try:
+        return default | json.loads((out / "options.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return default
 
 
 @contextlib.contextmanager
@@ -159,7 +167,7 @@ def _clean_stop(trainer: Any) -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def _export(trainer: Any, arguments: argparse.Namespace, command: str) -> None:
+def _export(trainer: Any, arguments: argparse.Namespace, record: dict[str, Any]) -> None:
     """Weights of the run with a model card that says where they come from and what they can do."""
     import torch
 
@@ -176,8 +184,8 @@ def _export(trainer: Any, arguments: argparse.Namespace, command: str) -> None:
         "training_hours": round(trainer.elapsed_s / 3600, 2),
         "seed": options.seed,
         "options": dataclasses.asdict(options),
-        "command": command,
-        "commit": _commit(),
+        "command": record["command"],
+        "commit": record["commit"],
         "torch": torch.__version__,
         "translation_scale": (
             "s of the translation is the log scale of a Laplace error in metres"
