@@ -11,7 +11,10 @@ Per pixel, with X' = T X, a = X'/Z', b = Y'/Z', i = 1/Z' (conventions of :mod:`h
   diag(fx, fy) B, B = [[i, 0, -a i, -a b, 1 + a^2, -b], [0, i, -b i, -(1 + b^2), a b, a]];
 - q = d pi(X') / d log Z = (fx i (a tz - tx), fy i (b tz - ty));
 - covariance sf^2 v_f I + sd^2 v_d q q^T (flow noise and propagated depth noise);
-- robust weight of Geman-McClure, (c^2 / (c^2 + d^2))^2, of the squared Mahalanobis distance d^2.
+- robust weight of Geman-McClure, (c^2 / (c^2 + d^2))^2, of the squared Mahalanobis distance d^2;
+- B and q are taken at log Z + e, e = sd^2 v_d q^T Sigma^-1 r, the posterior mean of the true log
+  depth. At the measured depth its error correlates with the residual's, and the translation comes
+  out wrong by a share of about sd^2 (errors in variables): many standard deviations on a full grid.
 """
 
 from __future__ import annotations
@@ -37,6 +40,8 @@ HAS_FLOW_VARIANCE, HAS_DEPTH_VARIANCE, HAS_WEIGHTS, HAS_VALID = 1, 2, 4, 8
 
 MIN_DEPTH = np.float32(1e-6)
 MAX_VALUE = np.float32(1e9)
+MAX_SHIFT = np.float32(0.3)
+"""Largest correction of log depth that an outlier may cause."""
 ONE = np.float32(1.0)
 ZERO = np.float32(0.0)
 
@@ -142,7 +147,7 @@ def gather_grid(stride, data, camera, flags, scale, out):
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
 def project_block(buf, o, n, R, t, K, noise, work, acc):
-    """First stage: residuals, robust weights and weighted 2x2 information of ``n`` pixels from ``o``.
+    """First stage, pixels ``o .. o + n - 1``: residuals, robust weights, weighted information.
 
     ``K`` = (fx, fy, cx, cy) of the current frame; ``noise`` = (1/sf^2, sd^2, c^2); all float32.
     ``work`` rows: a, b, i, m00, m01, m11 (information in units of B), n0, n1 (gradient), robust
@@ -157,7 +162,7 @@ def project_block(buf, o, n, R, t, K, noise, work, acc):
     isf2, sd2, c2 = noise[0], noise[1], noise[2]
     b_x, b_y, b_z, b_u = buf[XN][o:], buf[YN][o:], buf[Z][o:], buf[MU][o:]
     b_v, b_f, b_d, b_w = buf[MV][o:], buf[PF][o:], buf[PD][o:], buf[W][o:]
-    A, B, I, M0, M1, M2 = work[0], work[1], work[2], work[3], work[4], work[5]
+    A, B, IZ, M0, M1, M2 = work[0], work[1], work[2], work[3], work[4], work[5]
     N0, N1, S = work[6], work[7], work[8]
     cost = wsum = count = ZERO
     for k in range(n):
@@ -178,6 +183,14 @@ def project_block(buf, o, n, R, t, K, noise, work, acc):
         qv = fy * i * (b * tz - ty)
         ip = isf2 * b_f[k]
         g = sd2 * b_d[k] * ip
+        # the depth that the residual makes most likely (see the module's docstring)
+        shift = g * (qu * ru + qv * rv) / (ONE + g * (qu * qu + qv * qv))
+        shift = min(max(shift, -MAX_SHIFT), MAX_SHIFT)
+        a += qu * shift / fx
+        b += qv * shift / fy
+        i *= ONE - (ONE - tz * i) * shift
+        qu = fx * i * (a * tz - tx)
+        qv = fy * i * (b * tz - ty)
         kap = g / (ONE + g * (qu * qu + qv * qv))
         dot = kap * (qu * ru + qv * rv)
         n0 = ip * (ru - dot * qu)
@@ -190,7 +203,7 @@ def project_block(buf, o, n, R, t, K, noise, work, acc):
         wf = w * ip
         A[k] = a
         B[k] = b
-        I[k] = i
+        IZ[k] = i
         M0[k] = wf * (ONE - kap * qu * qu) * fx * fx
         M1[k] = -wf * kap * qu * qv * fx * fy
         M2[k] = wf * (ONE - kap * qv * qv) * fy * fy
@@ -208,7 +221,7 @@ def project_block(buf, o, n, R, t, K, noise, work, acc):
 def sum_translation(n, work, acc):
     """Second stage: sums of the rows of H and g that belong to the translation."""
     keep_apart()
-    A, B, I, M0, M1, M2 = work[0], work[1], work[2], work[3], work[4], work[5]
+    A, B, IZ, M0, M1, M2 = work[0], work[1], work[2], work[3], work[4], work[5]
     N0, N1 = work[6], work[7]
     h00 = h01 = h02 = h03 = h04 = h05 = ZERO
     h11 = h12 = h13 = h14 = h15 = ZERO
@@ -217,7 +230,7 @@ def sum_translation(n, work, acc):
     for k in range(n):
         a = A[k]
         b = B[k]
-        i = I[k]
+        i = IZ[k]
         ab = a * b
         aa = ONE + a * a
         bb = ONE + b * b
@@ -343,17 +356,18 @@ def sum_rows(data, camera, flags, scale, R, t, K, noise, v0, v1, out):
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
 def sum_curvature(n, external, work, c2, acc):
-    """Add the curvature of the robust weights, ``sum -2 (dw / dd^2) s s^T``, to ``acc`` (21,).
+    """Add the curvature of the robust weights, ``sum -2 (dw / dd^2) s s^T``, to ``acc[:21]``.
 
     s = J^T Sigma^-1 r. Subtracted from the Gauss-Newton Hessian it gives the derivative of the
-    estimating equation, the "bread" of the sandwich covariance.
+    estimating equation, the "bread" of the sandwich covariance. ``acc[21:42]`` gets the "meat"
+    under independent errors, ``sum w^2 s s^T``.
     """
-    A, B, I, N0, N1, S = work[0], work[1], work[2], work[6], work[7], work[8]
+    A, B, IZ, N0, N1, S = work[0], work[1], work[2], work[6], work[7], work[8]
     row = np.empty(6, np.float64)
     for k in range(n):
         if S[k] < np.float32(1e-12):
             continue
-        a, b, i, x, y = A[k], B[k], I[k], N0[k], N1[k]
+        a, b, i, x, y = A[k], B[k], IZ[k], N0[k], N1[k]
         row[0] = x * i
         row[1] = y * i
         row[2] = -(a * x + b * y) * i
@@ -366,6 +380,7 @@ def sum_curvature(n, external, work, c2, acc):
         for p in range(6):
             for r in range(p, 6):
                 acc[q] += factor * row[p] * row[r]
+                acc[21 + q] += row[p] * row[r]
                 q += 1
 
 
@@ -373,12 +388,12 @@ def sum_curvature(n, external, work, c2, acc):
 def add_scores(n, work, columns):
     """Add w s = w J^T Sigma^-1 r of ``n`` pixels to ``columns`` (6, W), pixel by pixel."""
     keep_apart()
-    A, B, I, N0, N1 = work[0], work[1], work[2], work[6], work[7]
+    A, B, IZ, N0, N1 = work[0], work[1], work[2], work[6], work[7]
     c0, c1, c2, c3, c4, c5 = columns[0], columns[1], columns[2], columns[3], columns[4], columns[5]
     for k in range(n):
         a = A[k]
         b = B[k]
-        i = I[k]
+        i = IZ[k]
         x = N0[k]
         y = N1[k]
         ab = a * b

@@ -10,61 +10,22 @@ pixel's covariance.
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from hybridvo.errors import InputError
 from hybridvo.geometry import pose_matrix
 from hybridvo.pose import kernels, search, solver
-from hybridvo.pose.covariance import sandwich_covariance
+from hybridvo.pose.full_fit import FullFit, fit_full_grid
 from hybridvo.pose.judgement import Judge, cues, default_judge
+from hybridvo.pose.options import RefinementOptions
 from hybridvo.pose.picture import Picture
 from hybridvo.types import FramePair, Hypothesis, PairBatch, Reason, RelativePose, Status
 
 __all__ = ["RefinementOptions", "refine"]
 
 SUPPORT_CUTOFF = 3.0
-
-
-@dataclass(frozen=True)
-class RefinementOptions:
-    """Options of :func:`refine`.
-
-    Args:
-        cutoff: c of the Geman-McClure kernel, in standard deviations. 3 keeps 93 % of the efficiency
-            under Gaussian noise; the influence of a pixel falls from 1.7 standard deviations on.
-        search_pixels: pixels of the grid on which starts are made and scored.
-        coarse_pixels: pixels of the grid on which motions are fitted before the full one.
-        full_steps: Gauss-Newton steps on the full grid (0: the coarse result stands).
-        decisive_share: share of the usable pixels above which the first motion stands alone.
-        least_share: smallest share of a further motion.
-        hypotheses: largest number of motions.
-        minimum_pixels: fewer usable pixels are a failure.
-        tile: side of the tiles, px, within which errors may be correlated (sandwich covariance).
-    """
-
-    cutoff: float = 3.0
-    search_pixels: int = 1800
-    coarse_pixels: int = 7500
-    full_steps: int = 2
-    decisive_share: float = 0.85
-    least_share: float = 0.06
-    hypotheses: int = 5
-    minimum_pixels: int = 24
-    tile: int = 32
-
-    def __post_init__(self) -> None:
-        for name in ("cutoff", "search_pixels", "coarse_pixels", "minimum_pixels", "tile"):
-            if not getattr(self, name) > 0:
-                raise InputError(
-                    f"RefinementOptions.{name}: expected a positive number, "
-                    f"got {getattr(self, name)!r}."
-                )
-        if not 1 <= self.hypotheses <= 16:
-            raise InputError(
-                f"RefinementOptions.hypotheses: expected 1 to 16, got {self.hypotheses}."
-            )
 
 
 def refine(
@@ -185,9 +146,17 @@ def _refine(
     order = sorted(range(found), key=lambda k: -hypotheses[k].score)
     hypotheses = [hypotheses[k] for k in order]
     best = order[0]
-    return _finish(
-        pair, picture, coarse, n, poses[best], facts[best], hypotheses, options, depth_scale, box
+    fit = fit_full_grid(
+        pair,
+        picture,
+        coarse,
+        (h, w, stride),
+        poses[best],
+        (facts[best, search.FLOW_NOISE], facts[best, search.DEPTH_NOISE]),
+        depth_scale,
+        options,
     )
+    return _result(pair, picture, fit, int(facts[best, search.ITERATIONS]), hypotheses, box)
 
 
 def _too_few(pair: FramePair, count: int, minimum: int) -> RelativePose:
@@ -251,90 +220,47 @@ def _hypotheses(
     ]
 
 
-def _finish(
+def _result(
     pair: FramePair,
     picture: Picture,
-    coarse: np.ndarray,
-    n: int,
-    pose: np.ndarray,
-    facts: np.ndarray,
+    fit: FullFit,
+    iterations: int,
     hypotheses: list[Hypothesis],
-    options: RefinementOptions,
-    depth_scale: float,
     box: tuple[int, int, int, int],
 ) -> RelativePose:
-    """Fit the chosen motion on the full grid; covariance, status and weights."""
-    work = solver.new_work()
-    sf, sd = facts[search.FLOW_NOISE], facts[search.DEPTH_NOISE]
-    sf, sd, share, more, _ = solver.polish(
-        coarse,
-        n,
-        picture.K,
-        sf,
-        sd,
-        2.5 * sf,
-        max(2.5 * sd, 0.02),
-        options.cutoff,
-        1,
-        4,
-        pose,
-        work,
-    )
-    iterations = int(facts[search.ITERATIONS] + more)
-    noise = np.empty(3, np.float32)
-    solver.set_noise(sf, sd, options.cutoff, noise)
-    delta = np.zeros(6)
-    for _ in range(options.full_steps):
-        total = picture.normal_equations(pose, noise, options.tile)
-        if not solver.solve6(total, solver.DAMPING, delta):
-            break
-        iterations += 1
-        solver.left_update(delta, pose.copy(), pose)
-        # mean motion of the picture that the step makes, in standard deviations of the flow
-        if delta @ total[21:27] < 1e-6 * max(total[28], 1e-12):
-            break
-    total, scores, weights = picture.last_pass(pose, noise, options.tile)
-    R, t = pose[:, :3].astype(np.float32), pose[:, 3].astype(np.float32)
-    curvature = np.zeros(21)
-    acc = np.zeros(kernels.SUMS)
-    for o in range(0, n, kernels.BLOCK):
-        m = min(kernels.BLOCK, n - o)
-        kernels.project_block(coarse, o, m, R, t, picture.K, noise, work, acc)
-        kernels.sum_curvature(m, coarse[kernels.W, o : o + m], work, float(noise[2]), curvature)
-    curvature *= total[29] / max(acc[29], 1e-12)
-    covariance, eigenvalues, definite = sandwich_covariance(total, curvature, scores, depth_scale)
-    if box != (0, *pair.prev.camera.shape[:1], 0, *pair.prev.camera.shape[1:]):
-        whole = np.zeros(pair.prev.camera.shape, np.float32)
-        whole[box[0] : box[1], box[2] : box[3]] = weights
-        weights = whole
-    T = pose_matrix(pose)
-    common = {
+    """Status, and everything in the units and on the grid of the caller."""
+    height, width = pair.prev.camera.shape
+    weights = fit.weights
+    if box != (0, height, 0, width):
+        weights = np.zeros((height, width), np.float32)
+        weights[box[0] : box[1], box[2] : box[3]] = fit.weights
+    T = pose_matrix(fit.pose) if np.isfinite(fit.pose).all() else np.eye(4)
+    common: dict[str, Any] = {
         "method": "refine",
-        "inlier_ratio": float(min(1.0, share)),
-        "iterations": iterations,
-        "cost": float(total[27] / max(total[29], 1e-12)),
-        "residual_scale_px": float(sf * np.sqrt(picture.scale[0])),
-        "depth_noise": float(sd),
+        "inlier_ratio": float(min(1.0, fit.share)),
+        "iterations": iterations + fit.iterations,
+        "cost": fit.cost,
+        "residual_scale_px": float(fit.flow_noise * np.sqrt(picture.scale[0])),
+        "depth_noise": float(fit.depth_noise * np.sqrt(picture.scale[1])),
         "weights": weights,
-        "information_eigenvalues": eigenvalues,
+        "information_eigenvalues": fit.eigenvalues,
         "hypotheses": tuple(hypotheses),
     }
-    if not definite or not np.isfinite(T).all():
+    if not fit.definite or not np.isfinite(fit.pose).all():
         return RelativePose.failed(
             Reason.DEGENERATE_GEOMETRY,
             "the pixels leave a direction of the motion undetermined",
             **common,
         )
-    if total[28] * share < 6 or share < 0.02:
+    if fit.weight < 6 or fit.share < 0.02:
         return RelativePose.failed(
-            Reason.LOW_INLIERS, f"{100 * share:.1f} % of the pixels follow one motion", **common
+            Reason.LOW_INLIERS, f"{100 * fit.share:.1f} % of the pixels follow one motion", **common
         )
-    status = _status(share, hypotheses)
-    spread = np.sqrt(max(np.linalg.eigvalsh(covariance[:3, :3])[-1], 0.0))
+    spread = np.sqrt(max(np.linalg.eigvalsh(fit.covariance[:3, :3])[-1], 0.0))
     return RelativePose(
         T_curr_prev=T,
-        covariance=covariance,
-        status=status,
+        covariance=fit.covariance,
+        status=_status(fit.share, hypotheses),
         translation_direction_valid=bool(np.linalg.norm(T[:3, 3]) > 3 * spread),
         **common,
     )

@@ -13,10 +13,11 @@ import math
 import numpy as np
 from numba import njit
 
-from hybridvo.pose.kernels import BUFFER_ROWS, MAX_VALUE, MU, MV, XN, YN, W, Z
+from hybridvo.pose.kernels import BUFFER_ROWS, FASTMATH, MAX_VALUE, MU, MV, XN, YN, W, Z
 from hybridvo.pose.solver import (
     DEPTH_NOISE_CAP,
     FLOW_NOISE_CAP,
+    NOISE_PIXELS,
     gauss_newton,
     graduate,
     new_work,
@@ -50,9 +51,9 @@ def next_random(state):
     return np.float64((x * np.uint64(2685821657736338717)) >> np.uint64(11)) / 9007199254740992.0
 
 
-@njit(fastmath={"reassoc", "contract", "arcp", "nsz"}, error_model="numpy", cache=True, nogil=True)
+@njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
 def agreement(samples, n, R, t, K):
-    """Two-scale score of a pose: weighted mean of 1 / (1 + (r / 0.15)^2) and 1 / (1 + (r / 0.9)^2)^2.
+    """Two-scale score of a pose: mean of 1 / (1 + (r / 0.15)^2) and 1 / (1 + (r / 0.9)^2)^2.
 
     The fine scale lets an exact motion win over a vague one, the coarse one keeps noisy flow in
     play; a wider scale yet makes compromises between two motions win (measured).
@@ -256,7 +257,19 @@ def search_round(
     steps += graduate(coarse, n, K, 0.7, 0.5, 0.4, 3, pose, work)
     candidate[:, :] = pose
     sf, sd, share, more, converged = polish(
-        coarse, n, K, 0.5, 0.01, FLOW_NOISE_CAP, DEPTH_NOISE_CAP, cutoff, 2, 4, candidate, work
+        coarse,
+        n,
+        K,
+        0.5,
+        0.01,
+        FLOW_NOISE_CAP,
+        DEPTH_NOISE_CAP,
+        cutoff,
+        2,
+        4,
+        NOISE_PIXELS,
+        candidate,
+        work,
     )
     if score_pose(coarse, n, candidate, K) > 0.95 * score_pose(coarse, n, pose, K):
         pose[:, :] = candidate

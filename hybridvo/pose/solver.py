@@ -35,8 +35,9 @@ DEPTH_NOISE_CAP = 0.08
 """Largest noise (px, log depth) that a motion may claim in the search; beyond it the fit would be a
 compromise between motions. The final fit may claim 2.5 times what the search found."""
 DAMPING = 1e-6
+USUAL_DEPTH_NOISE = 0.01
 NOISE_PIXELS = 1000
-"""Pixels that the noise estimate looks at: good to 2 % of sigma."""
+"""Pixels that the noise estimate of the search looks at: flow noise to 2 %."""
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
@@ -223,7 +224,8 @@ def estimate_noise(samples, n, pose, K, sf, sd, sf_cap, sd_cap, rounds, limit):
     Expectation-maximisation of a mixture of N(0, sf^2 v_f I + sd^2 v_d q q^T) and a uniform density
     over a disc; the two variances by Fisher scoring of the components along and across q. Only the
     shape of the residuals is used, never a given noise level. ``limit`` bounds the number of pixels
-    looked at, ``sf_cap`` and ``sd_cap`` the noise. Returns (sf, sd, share of the weight that follows the pose).
+    looked at, ``sf_cap`` and ``sd_cap`` the noise. Returns (sf, sd, share of the weight that follows
+    the pose).
     """
     step = max(1, n // limit)
     m = 0
@@ -263,6 +265,7 @@ def estimate_noise(samples, n, pose, K, sf, sd, sf_cap, sd_cap, rounds, limit):
     for k in range(m):
         inside += weight[k]
     share = 0.7
+    spread = 0.0
     for _ in range(rounds):
         a11 = a12 = a22 = b1 = b2 = hits = 0.0
         for k in range(m):
@@ -296,9 +299,14 @@ def estimate_noise(samples, n, pose, K, sf, sd, sf_cap, sd_cap, rounds, limit):
         else:
             vf = max(0.0, b1 - a12 * vd) / a11
         floor = FLOW_NOISE_FLOOR * FLOW_NOISE_FLOOR
+        # standard error of vd: Fisher's information of a variance is half of these sums
+        spread = math.sqrt(2.0 / max(a22 - a12 * a12 / a11, 1e-30))
         vf = min(max(vf, floor), sf_cap * sf_cap)
         vd = min(vd, sd_cap * sd_cap)
         vd = max(vd, 1e-10)  # stays estimable in the next round
+    if vd < 2.0 * spread:
+        # too little parallax to tell: no more than a usual sensor has
+        vd = min(vd, USUAL_DEPTH_NOISE * USUAL_DEPTH_NOISE)
     return math.sqrt(vf), math.sqrt(vd), share * inside / total
 
 
@@ -319,7 +327,7 @@ def graduate(samples, n, K, start_px, end_px, ratio, steps, pose, work):
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
-def polish(samples, n, K, sf, sd, sf_cap, sd_cap, cutoff, rounds, steps, pose, work):
+def polish(samples, n, K, sf, sd, sf_cap, sd_cap, cutoff, rounds, steps, limit, pose, work):
     """Alternate noise estimate and Gauss-Newton with the full covariance, in place.
 
     Returns (sf, sd, share, iterations, converged).
@@ -330,7 +338,7 @@ def polish(samples, n, K, sf, sd, sf_cap, sd_cap, cutoff, rounds, steps, pose, w
     converged = False
     share = 0.0
     for _ in range(rounds):
-        sf, sd, share = estimate_noise(samples, n, pose, K, sf, sd, sf_cap, sd_cap, 6, NOISE_PIXELS)
+        sf, sd, share = estimate_noise(samples, n, pose, K, sf, sd, sf_cap, sd_cap, 6, limit)
         set_noise(sf, sd, cutoff, noise)
         done, _, converged = gauss_newton(
             samples, n, total, K, noise, steps, 1e-3 * sf + 1e-5, pose, work

@@ -1,0 +1,207 @@
+"""The last stage of the refinement: one motion, fitted on every pixel, with its covariance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hybridvo.pose import kernels, second_depth, solver
+from hybridvo.pose.covariance import sandwich_covariance, symmetric
+from hybridvo.pose.options import RefinementOptions
+from hybridvo.pose.picture import Picture
+from hybridvo.types import FramePair
+
+SECOND_DEPTH_GAIN = 0.5
+"""The second depth is used where it adds this share of the flow's information in some direction."""
+
+
+@dataclass(frozen=True, eq=False)
+class FullFit:
+    """Outcome of :func:`fit_full_grid`.
+
+    Args:
+        pose: (3, 4) T_curr_prev. covariance: (6, 6). eigenvalues: (6,) of the information, m scaled
+            by the typical depth. definite: whether every direction is determined.
+        weights: (H, W) robust weights. weight: their sum. share: of the pixels that follow.
+        cost: per usable pixel. flow_noise: px. depth_noise: of log depth, both relative to the
+            variances handed in. uses_second_depth: whether the third residual took part.
+    """
+
+    pose: np.ndarray
+    covariance: np.ndarray
+    eigenvalues: np.ndarray
+    definite: bool
+    weights: np.ndarray
+    weight: float
+    share: float
+    cost: float
+    flow_noise: float
+    depth_noise: float
+    iterations: int
+    uses_second_depth: bool
+
+
+@dataclass(frozen=True, eq=False)
+class _DepthTerm:
+    """Pixels and noise of the third residual."""
+
+    samples: np.ndarray
+    log_depth: np.ndarray
+    count: int
+    width: int
+    stride: int
+    sigma: float
+
+    def sums(
+        self, picture: Picture, pose: np.ndarray, noise: np.ndarray, tile: int
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(sums (30,), tile scores (rows, columns, 6), meat (21,))."""
+        rows, columns = -(-picture.shape[0] // tile), -(-picture.shape[1] // tile)
+        acc, scores, meat = np.zeros(kernels.SUMS), np.zeros((rows * columns, 6)), np.zeros(21)
+        second_depth.sum_depth(
+            self.samples, self.count, self.log_depth, pose, picture.K, noise, self.sigma,
+            self.stride, tile, columns, self.width, solver.new_work(), acc, scores, meat,
+        )  # fmt: skip
+        return acc, scores.reshape(rows, columns, 6), meat
+
+
+def tile_size(shape: tuple[int, int], tiles: int) -> int:
+    """Side, px, of the tiles that cut a picture into about ``tiles``; 8 to 64."""
+    return int(np.clip(round(np.sqrt(shape[0] * shape[1] / tiles)), 8, 64))
+
+
+def fit_full_grid(
+    pair: FramePair,
+    picture: Picture,
+    coarse: np.ndarray,
+    grid: tuple[int, int, int],
+    pose: np.ndarray,
+    noise_start: tuple[float, float],
+    depth_scale: float,
+    options: RefinementOptions,
+) -> FullFit:
+    """Fit one motion on the full grid, from its fit on the coarse one.
+
+    Args:
+        pair: the input.
+        picture: its arrays.
+        coarse: gathered pixels of the coarse grid.
+        grid: (rows, columns, stride) of that grid.
+        pose: (3, 4) start.
+        noise_start: (sf, sd) found with it.
+        depth_scale: 1 / typical depth.
+        options: of the refinement.
+    """
+    rows, columns, _ = grid
+    n = rows * columns
+    work = solver.new_work()
+    pose = pose.copy()
+    tile = tile_size(picture.shape, options.tiles)
+    sf, sd = noise_start
+    caps = 2.5 * sf, max(2.5 * sd, 0.02)
+    sf, sd, share, iterations, _ = solver.polish(
+        coarse, n, picture.K, sf, sd, *caps, options.cutoff, 1, 4, n, pose, work
+    )
+    noise = np.empty(3, np.float32)
+    solver.set_noise(sf, sd, options.cutoff, noise)
+    term = None
+    if options.second_depth != "off" and pair.curr.depth is not None:
+        sd, term = _depth_term(pair, picture, coarse, grid, pose, sf, sd, noise, tile, options)
+        solver.set_noise(sf, sd, options.cutoff, noise)
+    delta = np.zeros(6)
+    for _ in range(options.full_steps + (1 if term else 0)):
+        total = picture.normal_equations(pose, noise, tile)
+        if term:
+            total[:27] += term.sums(picture, pose, noise, tile)[0][:27]
+        if not solver.solve6(total, solver.DAMPING, delta):
+            break
+        iterations += 1
+        solver.left_update(delta, pose.copy(), pose)
+        # mean motion of the picture that the step makes, in standard deviations of the flow
+        if delta @ total[21:27] < 1e-6 * max(total[28], 1e-12):
+            break
+    total, scores, weights = picture.last_pass(pose, noise, tile)
+    curvature, used = np.zeros(42), np.zeros(kernels.SUMS)
+    R, t = pose[:, :3].astype(np.float32), pose[:, 3].astype(np.float32)
+    for o in range(0, n, kernels.BLOCK):
+        m = min(kernels.BLOCK, n - o)
+        kernels.project_block(coarse, o, m, R, t, picture.K, noise, work, used)
+        kernels.sum_curvature(m, coarse[kernels.W, o : o + m], work, float(noise[2]), curvature)
+    curvature *= total[29] / max(used[29], 1e-12)
+    if term:
+        depth_sums, depth_scores, depth_meat = term.sums(picture, pose, noise, tile)
+        total[:27] += depth_sums[:27]
+        scores += depth_scores
+        curvature[21:] += depth_meat
+    covariance, eigenvalues, definite = sandwich_covariance(
+        total, curvature[:21], curvature[21:], scores, depth_scale
+    )
+    # whether depth errs about its log, its value or its inverse is not known: the translation's
+    # length is uncertain by half the variance of log depth
+    if definite:
+        covariance[:3, :3] += (0.5 * sd**2) ** 2 * np.outer(pose[:, 3], pose[:, 3])
+    return FullFit(
+        pose=pose,
+        covariance=covariance,
+        eigenvalues=eigenvalues,
+        definite=definite,
+        weights=weights,
+        weight=float(total[28]),
+        share=float(share),
+        cost=float(total[27] / max(total[29], 1e-12)),
+        flow_noise=float(sf),
+        depth_noise=float(sd),
+        iterations=int(iterations),
+        uses_second_depth=term is not None,
+    )
+
+
+def _depth_term(
+    pair: FramePair,
+    picture: Picture,
+    coarse: np.ndarray,
+    grid: tuple[int, int, int],
+    pose: np.ndarray,
+    sf: float,
+    sd: float,
+    noise: np.ndarray,
+    tile: int,
+    options: RefinementOptions,
+) -> tuple[float, _DepthTerm | None]:
+    """(depth noise, third residual or None): it bounds the one and may add the other."""
+    rows, columns, stride = grid
+    n = rows * columns
+    u0, v0 = picture.origin
+    depth = np.ascontiguousarray(pair.curr.depth)
+    log_depth = np.empty(n, np.float32)
+    second_depth.look_up(coarse, n, depth, u0, v0, log_depth)
+    robust = np.empty(n, np.float32)
+    work = solver.new_work()
+    solver.robust_weights(coarse, n, pose, picture.K, noise, work, robust)
+    sigma, raw = second_depth.depth_scale(coarse, n, log_depth, robust, pose, picture.K, noise)
+    if raw <= 0:
+        return sd, None
+    # var(rz) = sz^2 + h^2 sd^2: with two depths of one sensor sd is about raw / sqrt(2)
+    sd = min(sd, raw)
+    solver.set_noise(sf, sd, options.cutoff, noise)
+    coarse_term = _DepthTerm(coarse, log_depth, n, columns, stride, max(sigma, 1e-4))
+    flow = np.zeros(kernels.SUMS)
+    solver.evaluate(coarse, n, pose, picture.K, noise, work, flow)
+    H_flow = symmetric(flow[:21])
+    # on the full fit the flow has every pixel, the depth every second one of both axes
+    fine = max(1, min(2, stride))
+    H_depth = symmetric(coarse_term.sums(picture, pose, noise, tile)[0][:21]) / fine**2
+    if options.second_depth == "auto":
+        try:
+            gain = np.linalg.eigvals(np.linalg.solve(H_flow, H_depth)).real.max()
+        except np.linalg.LinAlgError:
+            gain = np.inf
+        if not gain > SECOND_DEPTH_GAIN:
+            return sd, None
+    if fine == stride:
+        return sd, coarse_term
+    samples, h, w = picture.strided(fine)
+    log_depth = np.empty(h * w, np.float32)
+    second_depth.look_up(samples, h * w, depth, u0, v0, log_depth)
+    return sd, _DepthTerm(samples, log_depth, h * w, w, fine, max(sigma, 1e-4))
