@@ -10,6 +10,7 @@ $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check torch==2.13.0
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[dev,baselines]"
+	$(BIN)/hybridvo doctor  # compiles the kernels once; later runs load them from the cache
 	touch $(STAMP)
 
 demo: $(STAMP)

@@ -12,8 +12,8 @@ class RefinementOptions:
     """Options of :func:`refine`.
 
     Args:
-        cutoff: c of the Geman-McClure kernel, in standard deviations. The influence of a pixel falls
-            from c / sqrt(3), 1.7 standard deviations, on.
+        cutoff: c of the Geman-McClure kernel, in standard deviations. The influence of a pixel
+            falls from c / sqrt(3), 1.7 standard deviations, on.
         search_pixels: pixels of the grid on which starts are made and scored.
         coarse_pixels: pixels of the grid on which motions are fitted before the full one.
         full_steps: Gauss-Newton steps on the full grid (0: the coarse result stands).
@@ -21,10 +21,10 @@ class RefinementOptions:
         least_share: smallest share of a further motion.
         hypotheses: largest number of motions.
         minimum_pixels: fewer usable pixels are a failure.
-        second_depth: use the current frame's depth as a third residual: ``on``, ``off``, or ``auto``,
-            where it adds more than half of what the flow knows in some direction (planes, far).
-        tiles: about how many tiles the picture is cut into for the sandwich covariance; errors may be
-            correlated within a tile (of 8 to 64 px).
+        second_depth: use the current frame's depth as a third residual: ``on``, ``off``, or
+            ``auto``, where it adds more than half of what the flow knows in some direction.
+        tiles: about how many tiles the picture is cut into for the sandwich covariance; errors
+            may be correlated within a tile (of 8 to 64 px).
     """
 
     cutoff: float = 3.0

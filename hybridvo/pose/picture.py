@@ -16,7 +16,7 @@ PARALLEL_PIXELS = 100_000
 
 
 class Picture:
-    """The arrays of a pair as the kernels take them; may be cropped to where the usable ones are."""
+    """The arrays of a pair as the kernels take them; may be cropped to the usable ones."""
 
     def __init__(self, pair: FramePair, weights: np.ndarray | None) -> None:
         prev, curr = pair.prev, pair.curr

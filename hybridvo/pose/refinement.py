@@ -10,7 +10,7 @@ pixel's covariance.
 from __future__ import annotations
 
 import time
-from typing import Any
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
@@ -23,9 +23,29 @@ from hybridvo.pose.options import RefinementOptions
 from hybridvo.pose.picture import Picture
 from hybridvo.types import FramePair, Hypothesis, PairBatch, Reason, RelativePose, Status
 
+if TYPE_CHECKING:
+    from hybridvo.pose.batched import BatchedPose
+
 __all__ = ["RefinementOptions", "refine"]
 
 SUPPORT_CUTOFF = 3.0
+
+
+@overload
+def refine(
+    pair: FramePair,
+    T_init: np.ndarray | None = None,
+    weights: np.ndarray | None = None,
+    *,
+    T_last: np.ndarray | None = None,
+    options: RefinementOptions | None = None,
+    judge: Judge = default_judge,
+    seed: int = 0,
+) -> RelativePose: ...
+
+
+@overload
+def refine(pair: PairBatch, T_init: Any = None, weights: Any = None) -> BatchedPose: ...
 
 
 def refine(
@@ -37,7 +57,7 @@ def refine(
     options: RefinementOptions | None = None,
     judge: Judge = default_judge,
     seed: int = 0,
-) -> RelativePose:
+) -> RelativePose | BatchedPose:
     """Camera motion of a pair by robust dense reprojection, without any network.
 
     Args:
@@ -51,7 +71,8 @@ def refine(
         seed: of the minimal samples; the same seed gives the same bytes.
 
     Returns:
-        The motion with covariance, status, per-pixel weights and every motion found. Bad data give
+        The motion with covariance, status, per-pixel weights and every motion found (for a
+        :class:`PairBatch` a :class:`hybridvo.pose.batched.BatchedPose`). Bad data give
         a failed status, never an exception and never a value that is not finite.
 
     Raises:
@@ -115,7 +136,7 @@ def _refine(
     n = h * w
     small, sh, sw, _ = picture.samples(options.search_pixels)
     coarse_weight = coarse[kernels.W].copy()
-    depth_scale = search.translation_scale(coarse, n, picture.K)
+    depth_scale = search.translation_scale(coarse, n)
     poses = np.zeros((options.hypotheses, 3, 4))
     facts = np.zeros((options.hypotheses, search.FACTS))
     found = search.find_motions(
@@ -199,11 +220,11 @@ def _hypotheses(
     depth = coarse[kernels.Z, :n].reshape(h, w)
     found = []
     for pose, fact in zip(poses, facts, strict=True):
-        support = np.empty(n, np.float32)
+        weights = np.empty(n, np.float32)
         sf, sd = fact[search.FLOW_NOISE], fact[search.DEPTH_NOISE]
         solver.set_noise(max(sf, 0.05), sd, SUPPORT_CUTOFF, noise)
-        solver.robust_weights(coarse, n, pose, picture.K, noise, work, support)
-        support = support.reshape(h, w)
+        solver.robust_weights(coarse, n, pose, picture.K, noise, work, weights)
+        support = weights.reshape(h, w)
         T = pose_matrix(pose)
         source = int(fact[search.SOURCE])
         if source == search.SOURCE_WINDOW:

@@ -355,15 +355,15 @@ def find_motions(
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
-def translation_scale(samples, n, K):
-    """Focal length over the median depth: turns metres of translation into radians of picture."""
+def translation_scale(samples, n):
+    """Root mean square of the inverse depth: turns metres of translation into radians of picture.
+
+    Not the median depth: where most of the picture is sky, the ground still tells the translation.
+    """
+    total = 0.0
     m = 0
-    step = max(1, n // 1000)
-    values = np.empty(n // step + 1)
-    for k in range(0, n, step):
+    for k in range(n):
         if samples[W, k] > 0:
-            values[m] = samples[Z, k]
+            total += 1.0 / (np.float64(samples[Z, k]) * np.float64(samples[Z, k]))
             m += 1
-    if m == 0:
-        return 1.0
-    return 1.0 / max(1e-9, np.median(values[:m])) if math.isfinite(K[0]) else 1.0
+    return max(1e-9, math.sqrt(total / m)) if m > 0 else 1.0

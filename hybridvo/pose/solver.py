@@ -224,8 +224,8 @@ def estimate_noise(samples, n, pose, K, sf, sd, sf_cap, sd_cap, rounds, limit):
     Expectation-maximisation of a mixture of N(0, sf^2 v_f I + sd^2 v_d q q^T) and a uniform density
     over a disc; the two variances by Fisher scoring of the components along and across q. Only the
     shape of the residuals is used, never a given noise level. ``limit`` bounds the number of pixels
-    looked at, ``sf_cap`` and ``sd_cap`` the noise. Returns (sf, sd, share of the weight that follows
-    the pose).
+    looked at, ``sf_cap`` and ``sd_cap`` the noise. Returns (sf, sd, share of the weight that
+    follows the pose).
     """
     step = max(1, n // limit)
     m = 0
