@@ -27,6 +27,7 @@ _HOME = {
     "open_sequence": "hybridvo.data.sequence",
     "iter_pairs": "hybridvo.data.sequence",
     "refine": "hybridvo.pose.refinement",
+    "select": "hybridvo.pose.selection",
 }
 
 __all__ = ["__version__", *_HOME]
