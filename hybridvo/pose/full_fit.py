@@ -12,6 +12,8 @@ from hybridvo.pose.options import RefinementOptions
 from hybridvo.pose.picture import Picture
 from hybridvo.types import FramePair
 
+CONVERGED = 1e-3
+"""Squared length of the last step, in standard deviations."""
 SECOND_DEPTH_GAIN = 0.5
 """The second depth is used where it adds this share of the flow's information in some direction."""
 
@@ -100,7 +102,7 @@ def fit_full_grid(
     tile = tile_size(picture.shape, options.tiles)
     sf, sd = noise_start
     caps = 2.5 * sf, max(2.5 * sd, 0.02)
-    sf, sd, share, iterations, _ = solver.polish(
+    sf, sd, share, iterations, _, spread = solver.polish(
         coarse, n, picture.K, sf, sd, *caps, options.cutoff, 1, 4, n, pose, work
     )
     noise = np.empty(3, np.float32)
@@ -109,26 +111,21 @@ def fit_full_grid(
     if options.second_depth != "off" and pair.curr.depth is not None:
         sd, term = _depth_term(pair, picture, coarse, grid, pose, sf, sd, noise, tile, options)
         solver.set_noise(sf, sd, options.cutoff, noise)
-    delta = np.zeros(6)
+    per_pixel = _curvature(picture, coarse, n, pose, noise)
     for _ in range(options.full_steps + (1 if term else 0)):
         total = picture.normal_equations(pose, noise, tile)
         if term:
             total[:27] += term.sums(picture, pose, noise, tile)[0][:27]
-        if not solver.solve6(total, solver.DAMPING, delta):
+        delta = _newton_step(total, per_pixel[:21] * total[29])
+        if delta is None:
             break
         iterations += 1
         solver.left_update(delta, pose.copy(), pose)
-        # mean motion of the picture that the step makes, in standard deviations of the flow
-        if delta @ total[21:27] < 1e-6 * max(total[28], 1e-12):
+        # squared length of the step in its own standard deviations
+        if delta @ total[21:27] < CONVERGED:
             break
     total, scores, weights = picture.last_pass(pose, noise, tile)
-    curvature, used = np.zeros(42), np.zeros(kernels.SUMS)
-    R, t = pose[:, :3].astype(np.float32), pose[:, 3].astype(np.float32)
-    for o in range(0, n, kernels.BLOCK):
-        m = min(kernels.BLOCK, n - o)
-        kernels.project_block(coarse, o, m, R, t, picture.K, noise, work, used)
-        kernels.sum_curvature(m, coarse[kernels.W, o : o + m], work, float(noise[2]), curvature)
-    curvature *= total[29] / max(used[29], 1e-12)
+    curvature = _curvature(picture, coarse, n, pose, noise) * total[29]
     if term:
         depth_sums, depth_scores, depth_meat = term.sums(picture, pose, noise, tile)
         total[:27] += depth_sums[:27]
@@ -137,6 +134,12 @@ def fit_full_grid(
     covariance, eigenvalues, definite = sandwich_covariance(
         total, curvature[:21], curvature[21:], scores, depth_scale
     )
+    if definite:
+        # what the uncertainty of sd^2 does to the answer, through the errors-in-variables correction
+        slope = _slope_in_depth_variance(picture, coarse, n, pose, sf, sd, options) * total[29]
+        newton = symmetric(total[:21] - curvature[:21])
+        shift = np.linalg.lstsq(newton, slope, rcond=1e-12)[0] * spread
+        covariance += np.outer(shift, shift)
     # whether depth errs about its log, its value or its inverse is not known: the translation's
     # length is uncertain by half the variance of log depth
     if definite:
@@ -155,6 +158,60 @@ def fit_full_grid(
         iterations=int(iterations),
         uses_second_depth=term is not None,
     )
+
+
+def _curvature(
+    picture: Picture, coarse: np.ndarray, n: int, pose: np.ndarray, noise: np.ndarray
+) -> np.ndarray:
+    """(42,) curvature of the robust weights and independent meat, per unit of external weight.
+
+    From the coarse grid: both are averages over many pixels and enter the result at second order.
+    """
+    R, t = pose[:, :3].astype(np.float32), pose[:, 3].astype(np.float32)
+    work = solver.new_work()
+    out, used = np.zeros(42), np.zeros(kernels.SUMS)
+    for o in range(0, n, kernels.BLOCK):
+        m = min(kernels.BLOCK, n - o)
+        kernels.project_block(coarse, o, m, R, t, picture.K, noise, work, used)
+        kernels.sum_curvature(m, coarse[kernels.W, o : o + m], work, float(noise[2]), out)
+    return out / max(used[29], 1e-12)
+
+
+def _slope_in_depth_variance(
+    picture: Picture,
+    coarse: np.ndarray,
+    n: int,
+    pose: np.ndarray,
+    sf: float,
+    sd: float,
+    options: RefinementOptions,
+) -> np.ndarray:
+    """(6,) derivative of the estimating equation in sd^2, per unit of external weight."""
+    sums = np.zeros((2, kernels.SUMS))
+    noise = np.empty(3, np.float32)
+    work = solver.new_work()
+    variances = 0.9 * sd**2, 1.1 * sd**2 + 1e-8
+    for row, variance in zip(sums, variances, strict=True):
+        solver.set_noise(sf, np.sqrt(variance), options.cutoff, noise)
+        solver.evaluate(coarse, n, pose, picture.K, noise, work, row)
+    difference = sums[1, 21:27] - sums[0, 21:27]
+    return difference / (variances[1] - variances[0]) / max(sums[0, 29], 1e-12)
+
+
+def _newton_step(total: np.ndarray, curvature: np.ndarray) -> np.ndarray | None:
+    """Step of the estimating equation; Gauss-Newton's where the curvature makes it indefinite.
+
+    Gauss-Newton alone takes back only two thirds of an error per step under a redescending kernel,
+    and the coarse fit is several of the full fit's standard deviations away.
+    """
+    step = np.zeros(6)
+    newton = total.copy()
+    newton[:21] -= curvature
+    if solver.solve6(newton, solver.DAMPING, step):
+        H = symmetric(total[:21])
+        if step @ H @ step < 4.0 * (step @ total[21:27]):
+            return step
+    return step if solver.solve6(total, solver.DAMPING, step) else None
 
 
 def _depth_term(

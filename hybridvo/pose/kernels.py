@@ -70,7 +70,7 @@ def gather_row(v, data, camera, flags, scale, buf):
     of the previous frame. ``scale`` = (typical flow variance, typical depth variance). Unusable
     pixels get weight 0 and harmless values.
     """
-    keep_apart()
+    keep_apart()  # type: ignore[call-arg]
     depth, flow, flow_variance, depth_variance, weights, valid = data
     ifx, ify, cx, cy = camera[0], camera[1], camera[2], camera[3]
     vf = np.float32(v)
@@ -153,7 +153,7 @@ def project_block(buf, o, n, R, t, K, noise, work, acc):
     ``work`` rows: a, b, i, m00, m01, m11 (information in units of B), n0, n1 (gradient), robust
     weight without the external one (0 where unusable).
     """
-    keep_apart()
+    keep_apart()  # type: ignore[call-arg]
     fx, fy, cx, cy = K[0], K[1], K[2], K[3]
     r00, r01, r02 = R[0, 0], R[0, 1], R[0, 2]
     r10, r11, r12 = R[1, 0], R[1, 1], R[1, 2]
@@ -220,7 +220,7 @@ def project_block(buf, o, n, R, t, K, noise, work, acc):
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
 def sum_translation(n, work, acc):
     """Second stage: sums of the rows of H and g that belong to the translation."""
-    keep_apart()
+    keep_apart()  # type: ignore[call-arg]
     A, B, IZ, M0, M1, M2 = work[0], work[1], work[2], work[3], work[4], work[5]
     N0, N1 = work[6], work[7]
     h00 = h01 = h02 = h03 = h04 = h05 = ZERO
@@ -288,7 +288,7 @@ def sum_translation(n, work, acc):
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
 def sum_rotation(n, work, acc):
     """Third stage: sums of the rows of H and g that belong to the rotation."""
-    keep_apart()
+    keep_apart()  # type: ignore[call-arg]
     A, B, M0, M1, M2 = work[0], work[1], work[3], work[4], work[5]
     N0, N1 = work[6], work[7]
     h33 = h34 = h35 = h44 = h45 = h55 = ZERO
@@ -387,7 +387,7 @@ def sum_curvature(n, external, work, c2, acc):
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
 def add_scores(n, work, columns):
     """Add w s = w J^T Sigma^-1 r of ``n`` pixels to ``columns`` (6, W), pixel by pixel."""
-    keep_apart()
+    keep_apart()  # type: ignore[call-arg]
     A, B, IZ, N0, N1 = work[0], work[1], work[2], work[6], work[7]
     c0, c1, c2, c3, c4, c5 = columns[0], columns[1], columns[2], columns[3], columns[4], columns[5]
     for k in range(n):

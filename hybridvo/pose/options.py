@@ -16,7 +16,7 @@ class RefinementOptions:
             falls from c / sqrt(3), 1.7 standard deviations, on.
         search_pixels: pixels of the grid on which starts are made and scored.
         coarse_pixels: pixels of the grid on which motions are fitted before the full one.
-        full_steps: Gauss-Newton steps on the full grid (0: the coarse result stands).
+        full_steps: most Newton steps on the full grid (0: the coarse result stands).
         decisive_share: share of the usable pixels above which the first motion stands alone.
         least_share: smallest share of a further motion.
         hypotheses: largest number of motions.
@@ -30,7 +30,7 @@ class RefinementOptions:
     cutoff: float = 3.0
     search_pixels: int = 1800
     coarse_pixels: int = 7500
-    full_steps: int = 2
+    full_steps: int = 4
     decisive_share: float = 0.85
     least_share: float = 0.06
     hypotheses: int = 5

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import threading
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -43,7 +44,7 @@ class Picture:
         if masks:
             valid = np.ascontiguousarray(masks[0] if len(masks) == 1 else masks[0] & masks[1])
             flags |= kernels.HAS_VALID
-        self.data = (depth, flow, flow_variance, depth_variance, external, valid)
+        self.data: tuple[Any, ...] = (depth, flow, flow_variance, depth_variance, external, valid)
         self.flags, self.scale = flags, scale
         self.set_cameras(prev.camera, curr.camera, 0, 0)
 
@@ -110,9 +111,13 @@ class Picture:
         bands = -(-height // tile)
         sums = np.zeros((bands, kernels.SUMS))
 
+        arguments: tuple[Any, ...] = (self.data, self.camera, self.flags, self.scale)
+
         def work(band: int) -> None:
             v0, v1 = band * tile, min(height, (band + 1) * tile)
-            kernels.sum_rows(*self._arguments(), R, t, self.K, noise, v0, v1, sums[band])
+            kernels.sum_rows(  # type: ignore[call-arg]
+                *arguments, R, t, self.K, noise, v0, v1, sums[band]
+            )
 
         self._run(work, bands)
         return sums.sum(axis=0)
@@ -128,16 +133,15 @@ class Picture:
         scores = np.zeros((bands, -(-width // tile), 6))
         weights = np.empty((height, width), np.float32)
 
+        arguments: tuple[Any, ...] = (self.data, self.camera, self.flags, self.scale)
+
         def work(band: int) -> None:
-            kernels.score_rows(
-                *self._arguments(), R, t, self.K, noise, band, tile, weights, scores, sums[band]
+            kernels.score_rows(  # type: ignore[call-arg]
+                *arguments, R, t, self.K, noise, band, tile, weights, scores, sums[band]
             )
 
         self._run(work, bands)
         return sums.sum(axis=0), scores, weights
-
-    def _arguments(self) -> tuple:
-        return self.data, self.camera, self.flags, self.scale
 
     def _run(self, work: Callable[[int], None], count: int) -> None:
         """Do ``work(0) .. work(count - 1)`` on two threads where the picture is large.
@@ -164,7 +168,11 @@ class Picture:
 
 
 def typical(variance: np.ndarray) -> float:
-    """Median of the positive finite values on a sparse grid; 1 where there are none."""
+    """Variance of the good pixels: the 20 % quantile of the positive finite values; 1 if none.
+
+    The noise that a motion may claim is bounded in units of it, and the good pixels tell the
+    motions apart.
+    """
     sparse = variance[::7, ::7]
     good = sparse[(sparse > 0) & (sparse < kernels.MAX_VALUE)]
-    return float(np.median(good)) if good.size else 1.0
+    return float(np.quantile(good, 0.2)) if good.size else 1.0

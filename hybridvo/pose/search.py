@@ -256,7 +256,7 @@ def search_round(
         return False
     steps += graduate(coarse, n, K, 0.7, 0.5, 0.4, 3, pose, work)
     candidate[:, :] = pose
-    sf, sd, share, more, converged = polish(
+    sf, sd, share, more, converged, _ = polish(
         coarse,
         n,
         K,

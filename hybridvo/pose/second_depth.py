@@ -17,6 +17,7 @@ from numba import njit
 from hybridvo.pose.kernels import (
     BLOCK,
     FASTMATH,
+    MAX_SHIFT,
     MU,
     MV,
     PD,
@@ -74,13 +75,20 @@ def conditional(samples, k, log_depth, R, t, K, noise, row):
     rv = samples[MV, k] - (K[1] * b + K[3])
     qu = K[0] * i * (a * t[2] - t[0])
     qv = K[1] * i * (b * t[2] - t[1])
-    vd = noise[1] * samples[PD, k]
-    g = vd * noise[0] * samples[PF, k]
+    g = noise[1] * samples[PD, k] * noise[0] * samples[PF, k]
+    raw = log_depth[k] - math.log(Zc)
+    # Jacobian and q at the depth that the flow makes most likely, as in the kernels
+    shift = g * (qu * ru + qv * rv) / (1.0 + g * (qu * qu + qv * qv))
+    shift = min(max(shift, -MAX_SHIFT), MAX_SHIFT)
+    a += qu * shift / K[0]
+    b += qv * shift / K[1]
+    i *= 1.0 - (1.0 - t[2] * i) * shift
+    qu = K[0] * i * (a * t[2] - t[0])
+    qv = K[1] * i * (b * t[2] - t[1])
     shrink = 1.0 / (1.0 + g * (qu * qu + qv * qv))
     h = 1.0 - t[2] * i
     ku = h * g * shrink * qu
     kv = h * g * shrink * qv
-    raw = log_depth[k] - math.log(Zc)
     fx, fy = K[0], K[1]
     row[0] = -ku * fx * i
     row[1] = -kv * fy * i

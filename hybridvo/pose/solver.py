@@ -225,7 +225,7 @@ def estimate_noise(samples, n, pose, K, sf, sd, sf_cap, sd_cap, rounds, limit):
     over a disc; the two variances by Fisher scoring of the components along and across q. Only the
     shape of the residuals is used, never a given noise level. ``limit`` bounds the number of pixels
     looked at, ``sf_cap`` and ``sd_cap`` the noise. Returns (sf, sd, share of the weight that
-    follows the pose).
+    follows the pose, standard error of sd^2).
     """
     step = max(1, n // limit)
     m = 0
@@ -257,7 +257,7 @@ def estimate_noise(samples, n, pose, K, sf, sd, sf_cap, sd_cap, rounds, limit):
         weight[m] = w
         m += 1
     if m < 8 or total <= 0:
-        return sf, sd, 0.0
+        return sf, sd, 0.0, sd * sd
     area = math.pi * radius * radius
     vf = sf * sf
     vd = sd * sd
@@ -306,8 +306,10 @@ def estimate_noise(samples, n, pose, K, sf, sd, sf_cap, sd_cap, rounds, limit):
         vd = max(vd, 1e-10)  # stays estimable in the next round
     if vd < 2.0 * spread:
         # too little parallax to tell: no more than a usual sensor has
-        vd = min(vd, USUAL_DEPTH_NOISE * USUAL_DEPTH_NOISE)
-    return math.sqrt(vf), math.sqrt(vd), share * inside / total
+        usual = USUAL_DEPTH_NOISE * USUAL_DEPTH_NOISE
+        vd = min(vd, usual)
+        spread = max(min(spread, usual), vd)
+    return math.sqrt(vf), math.sqrt(vd), share * inside / total, spread
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
@@ -330,21 +332,24 @@ def graduate(samples, n, K, start_px, end_px, ratio, steps, pose, work):
 def polish(samples, n, K, sf, sd, sf_cap, sd_cap, cutoff, rounds, steps, limit, pose, work):
     """Alternate noise estimate and Gauss-Newton with the full covariance, in place.
 
-    Returns (sf, sd, share, iterations, converged).
+    Returns (sf, sd, share, iterations, converged, standard error of sd^2).
     """
     noise = np.empty(3, np.float32)
     total = np.float64(np.sum(samples[W, :n]))
     iterations = 0
     converged = False
     share = 0.0
+    spread = 0.0
     for _ in range(rounds):
-        sf, sd, share = estimate_noise(samples, n, pose, K, sf, sd, sf_cap, sd_cap, 6, limit)
+        sf, sd, share, spread = estimate_noise(
+            samples, n, pose, K, sf, sd, sf_cap, sd_cap, 6, limit
+        )
         set_noise(sf, sd, cutoff, noise)
         done, _, converged = gauss_newton(
             samples, n, total, K, noise, steps, 1e-3 * sf + 1e-5, pose, work
         )
         iterations += done
-    return sf, sd, share, iterations, converged
+    return sf, sd, share, iterations, converged, spread
 
 
 @njit(error_model="numpy", cache=True, nogil=True)

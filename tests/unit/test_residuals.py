@@ -317,7 +317,7 @@ def test_noise_estimate_equals_the_numba_one() -> None:
         ]
     )  # fmt: skip
     pose = np.ascontiguousarray(T[0, :3].numpy())
-    sf, sd, _ = solver.estimate_noise(
+    sf, sd, *_ = solver.estimate_noise(
         buffer, 900, pose, pixels.K[0].numpy(), 0.7, 0.01, 100.0, 0.08, 6, 1000
     )
     got = estimate_noise(pixels, T, torch.tensor([[0.7, 0.01]]))[0]
