@@ -71,11 +71,11 @@ class Pixels:
 
 
 def _typical(variance: torch.Tensor) -> torch.Tensor:
-    """(B, 1, 1) median of the positive finite values on a sparse grid; 1 where there are none."""
+    """(B, 1, 1) 20 % quantile of the positive finite values on a sparse grid; 1 if there are none."""
     sparse = variance.detach()[:, ::7, ::7].flatten(1)
     good = (sparse > 0) & (sparse < MAX_VALUE)
     values = torch.where(good, sparse, torch.full_like(sparse, torch.nan))
-    return torch.nan_to_num(torch.nanquantile(values, 0.5, dim=1), nan=1.0)[:, None, None]
+    return torch.nan_to_num(torch.nanquantile(values, 0.2, dim=1), nan=1.0)[:, None, None]
 
 
 def sample_depth(

@@ -235,6 +235,7 @@ def estimate_noise(samples, n, pose, K, sf, sd, sf_cap, sd_cap, rounds, limit):
     alpha = np.empty(size)
     beta = np.empty(size)
     weight = np.empty(size)
+    outlier = np.empty(size)
     total = 0.0
     radius = max(4.0, 8.0 * sf)
     for k in range(0, n, step):
@@ -243,8 +244,10 @@ def estimate_noise(samples, n, pose, K, sf, sd, sf_cap, sd_cap, rounds, limit):
             continue
         total += w
         ru, rv, qu, qv, front = residual(samples, k, pose, K)
-        if not front or ru * ru + rv * rv > radius * radius:
+        spreading = max(1.0, 1.0 / samples[PF, k])
+        if not front or ru * ru + rv * rv > radius * radius * spreading:
             continue
+        outlier[m] = 1.0 / (math.pi * radius * radius * spreading)
         q = math.sqrt(qu * qu + qv * qv)
         if q > 1e-12:
             e1[m] = (ru * qu + rv * qv) / q
@@ -258,7 +261,6 @@ def estimate_noise(samples, n, pose, K, sf, sd, sf_cap, sd_cap, rounds, limit):
         m += 1
     if m < 8 or total <= 0:
         return sf, sd, 0.0, sd * sd
-    area = math.pi * radius * radius
     vf = sf * sf
     vd = sd * sd
     inside = 0.0
@@ -277,7 +279,7 @@ def estimate_noise(samples, n, pose, K, sf, sd, sf_cap, sd_cap, rounds, limit):
             if d2 > 60.0:
                 continue
             p = share * math.exp(-0.5 * d2) / (2.0 * math.pi * math.sqrt(var1 * var2))
-            p = weight[k] * p / (p + (1.0 - share) / area)
+            p = weight[k] * p / (p + (1.0 - share) * outlier[k])
             hits += p
             i1 = p / (var1 * var1)
             i2 = p / (var2 * var2)

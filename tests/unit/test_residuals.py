@@ -12,6 +12,7 @@ from hybridvo.errors import InputError
 from hybridvo.geometry import ego_flow, pixel_grid, se3_exp
 from hybridvo.pose import kernels, solver
 from hybridvo.pose.batch_solver import estimate_noise, gauss_newton_step
+from hybridvo.pose.picture import typical
 from hybridvo.pose.pixels import gather_pixels, sample_depth, sparse_subset
 from hybridvo.pose.residuals import (
     CUTOFFS,
@@ -246,8 +247,7 @@ def numba_step(pair: PairBatch, weights: torch.Tensor | None, T: np.ndarray, noi
             data.append(dummy)
             continue
         data.append(value[0].float().numpy())
-        sparse = data[-1][::7, ::7]
-        scale[index] = np.median(sparse[(sparse > 0) & (sparse < kernels.MAX_VALUE)])
+        scale[index] = typical(data[-1])
         flags |= flag
     data.append(dummy if weights is None else weights[0].float().numpy())
     flags |= 0 if weights is None else kernels.HAS_WEIGHTS
