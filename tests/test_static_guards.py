@@ -228,10 +228,10 @@ def test_no_file_names_a_folder_of_a_machine_or_a_registry():
 
 
 def test_no_file_is_large():
-    # weights live beside the package's code; everything else is text and small pictures
+    # apart from weights all is text and small pictures; results keep every pair (1 MB)
     large = {
         path.relative_to(ROOT).as_posix(): path.stat().st_size
         for path in tracked()
-        if path.is_file() and path.suffix != ".safetensors" and path.stat().st_size > 1_000_000
+        if path.is_file() and path.suffix != ".safetensors" and path.stat().st_size > 4_000_000
     }
     assert not large

@@ -12,8 +12,9 @@ from hybridvo.pose.options import RefinementOptions
 from hybridvo.pose.picture import Picture
 from hybridvo.types import FramePair
 
-CONVERGED = 1e-3
-"""Squared length of the last step, in standard deviations."""
+LONG_STEP = 1500.0
+"""Squared length, in standard deviations, of a step that the next one may not end: Newton's steps
+shrink quadratically, and the last pass makes one more."""
 SECOND_DEPTH_GAIN = 0.5
 """The second depth is used where it adds this share of the flow's information in some direction."""
 
@@ -112,30 +113,27 @@ def fit_full_grid(
         sd, term = _depth_term(pair, picture, coarse, grid, pose, sf, sd, noise, tile, options)
         solver.set_noise(sf, sd, options.cutoff, noise)
     per_pixel = _curvature(picture, coarse, n, pose, noise)
-    for _ in range(options.full_steps + (1 if term else 0)):
+    for _ in range(options.full_steps):
         total = picture.normal_equations(pose, noise, tile)
         if term:
             total[:27] += term.sums(picture, pose, noise, tile)[0][:27]
-        delta = _newton_step(total, per_pixel[:21] * total[29])
-        if delta is None:
-            break
+        length = _newton_step(total, per_pixel[:21] * total[29], pose)
         iterations += 1
-        solver.left_update(delta, pose.copy(), pose)
-        # squared length of the step in its own standard deviations
-        if delta @ total[21:27] < CONVERGED:
+        if not length > LONG_STEP:
             break
     total, scores, weights = picture.last_pass(pose, noise, tile)
-    curvature = _curvature(picture, coarse, n, pose, noise) * total[29]
+    curvature = per_pixel * total[29]
     if term:
         depth_sums, depth_scores, depth_meat = term.sums(picture, pose, noise, tile)
         total[:27] += depth_sums[:27]
         scores += depth_scores
         curvature[21:] += depth_meat
+    _newton_step(total, curvature[:21], pose)
     covariance, eigenvalues, definite = sandwich_covariance(
         total, curvature[:21], curvature[21:], scores, depth_scale
     )
     if definite:
-        # what the uncertainty of sd^2 does to the answer, through the errors-in-variables correction
+        # what the uncertainty of sd^2 does to the answer, through the correction of the depth
         slope = _slope_in_depth_variance(picture, coarse, n, pose, sf, sd, options) * total[29]
         newton = symmetric(total[:21] - curvature[:21])
         shift = np.linalg.lstsq(newton, slope, rcond=1e-12)[0] * spread
@@ -198,20 +196,23 @@ def _slope_in_depth_variance(
     return difference / (variances[1] - variances[0]) / max(sums[0, 29], 1e-12)
 
 
-def _newton_step(total: np.ndarray, curvature: np.ndarray) -> np.ndarray | None:
-    """Step of the estimating equation; Gauss-Newton's where the curvature makes it indefinite.
+def _newton_step(total: np.ndarray, curvature: np.ndarray, pose: np.ndarray) -> float:
+    """Step of the estimating equation, in place; its squared length in standard deviations.
 
-    Gauss-Newton alone takes back only two thirds of an error per step under a redescending kernel,
-    and the coarse fit is several of the full fit's standard deviations away.
+    Gauss-Newton's where the curvature makes it indefinite. Gauss-Newton alone takes back only two
+    thirds of an error per step under a redescending kernel, and the coarse fit is several of the
+    full fit's standard deviations away.
     """
     step = np.zeros(6)
     newton = total.copy()
     newton[:21] -= curvature
-    if solver.solve6(newton, solver.DAMPING, step):
-        H = symmetric(total[:21])
-        if step @ H @ step < 4.0 * (step @ total[21:27]):
-            return step
-    return step if solver.solve6(total, solver.DAMPING, step) else None
+    if not solver.solve6(newton, solver.DAMPING, step) or step @ symmetric(
+        total[:21]
+    ) @ step > 4.0 * (step @ total[21:27]):
+        if not solver.solve6(total, solver.DAMPING, step):
+            return 0.0
+    solver.left_update(step, pose.copy(), pose)
+    return float(step @ total[21:27])
 
 
 def _depth_term(

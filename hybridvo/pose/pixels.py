@@ -71,7 +71,7 @@ class Pixels:
 
 
 def _typical(variance: torch.Tensor) -> torch.Tensor:
-    """(B, 1, 1) 20 % quantile of the positive finite values on a sparse grid; 1 if there are none."""
+    """(B, 1, 1) 20 % quantile of the positive finite values on a sparse grid; 1 if none."""
     sparse = variance.detach()[:, ::7, ::7].flatten(1)
     good = (sparse > 0) & (sparse < MAX_VALUE)
     values = torch.where(good, sparse, torch.full_like(sparse, torch.nan))

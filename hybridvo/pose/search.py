@@ -13,7 +13,7 @@ import math
 import numpy as np
 from numba import njit
 
-from hybridvo.pose.kernels import BUFFER_ROWS, FASTMATH, MAX_VALUE, MU, MV, XN, YN, W, Z
+from hybridvo.pose.kernels import BUFFER_ROWS, FASTMATH, MAX_VALUE, MU, MV, PD, PF, XN, YN, W, Z
 from hybridvo.pose.solver import (
     DEPTH_NOISE_CAP,
     FLOW_NOISE_CAP,
@@ -22,6 +22,7 @@ from hybridvo.pose.solver import (
     graduate,
     new_work,
     polish,
+    residual,
     residual_scale,
     robust_weights,
     set_noise,
@@ -30,9 +31,9 @@ from hybridvo.pose.solver import (
 WINDOW_ROWS, WINDOW_COLUMNS = 3, 4
 MINIMAL_SAMPLES = 256
 REFINED = 4
-CLEAR_FLOW = 1.1
-CLEAR_DEPTH = 0.075
-"""Noise (px, log depth) above which even a motion that holds the picture is not beyond doubt."""
+COHERENT = 0.35
+"""Coherence of the residuals above which a motion that holds the picture is not beyond doubt; depth
+noise that is half correlated in space stays below 0.25."""
 
 SHARE, FLOW_NOISE, DEPTH_NOISE, SOURCE, ITERATIONS, CONVERGED, SCORE = range(7)
 FACTS = 7
@@ -220,8 +221,8 @@ def search_round(
         )
     if wide:
         buffer = np.empty((BUFFER_ROWS, ns + 1), np.float32)
-        height = max(3, (2 * sh) // (WINDOW_ROWS + 1))
-        width = max(3, (2 * sw) // (WINDOW_COLUMNS + 1))
+        height = min(sh, max(3, (2 * sh) // (WINDOW_ROWS + 1)))
+        width = min(sw, max(3, (2 * sw) // (WINDOW_COLUMNS + 1)))
         for i in range(WINDOW_ROWS):
             for j in range(WINDOW_COLUMNS):
                 r0 = i * (sh - height) // (WINDOW_ROWS - 1)
@@ -294,9 +295,67 @@ def set_aside(samples, n, pose, K, sf, sd, cutoff, work, scratch):
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
+def residual_coherence(samples, h, w, pose, K, sf, sd):
+    """How alike neighbouring residuals are: 0 for independent noise, 1 for equal residuals.
+
+    Of whitened residuals in 8 x 8 blocks, from the variance of the block means. A compromise
+    between two motions leaves residuals that agree with their neighbours.
+    """
+    between = pixels = blocks = 0.0
+    for r0 in range(0, h - 7, 8):
+        for c0 in range(0, w - 7, 8):
+            m = s0 = s1 = squares = 0.0
+            for r in range(r0, r0 + 8):
+                for c in range(c0, c0 + 8):
+                    k = r * w + c
+                    if not samples[W, k] > 0:
+                        continue
+                    ru, rv, qu, qv, front = residual(samples, k, pose, K)
+                    if not front:
+                        continue
+                    ip = samples[PF, k] / (sf * sf)
+                    g = sd * sd * samples[PD, k] * ip
+                    q2 = qu * qu + qv * qv
+                    root = math.sqrt(1.0 + g * q2)
+                    beta = g / (root * (1.0 + root))
+                    dot = beta * (qu * ru + qv * rv)
+                    e0 = (ru - dot * qu) * math.sqrt(ip)
+                    e1 = (rv - dot * qv) * math.sqrt(ip)
+                    if e0 * e0 + e1 * e1 > 16.0:
+                        continue
+                    m += 1.0
+                    s0 += e0
+                    s1 += e1
+                    squares += e0 * e0 + e1 * e1
+            if m >= 16:
+                # pairs of different pixels: sum of products over the number of pairs
+                between += (s0 * s0 + s1 * s1 - squares) / (m - 1.0)
+                pixels += squares
+                blocks += 1.0
+    if blocks < 4 or pixels <= 0:
+        return 1.0
+    return between / pixels
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
 def find_motions(
-    small, sh, sw, coarse, n, K, starts, cutoff, decisive, least, most, similar, seed, poses, facts
-):
+    small,
+    sh,
+    sw,
+    coarse,
+    h,
+    w,
+    K,
+    starts,
+    cutoff,
+    decisive,
+    least,
+    most,
+    similar,
+    seed,
+    poses,
+    facts,
+):  # fmt: skip
     """All strong motions, in the order of their strength; returns their number.
 
     ``decisive``: share of the usable pixels above which the first motion stands alone. ``least``:
@@ -304,6 +363,7 @@ def find_motions(
     and ``facts`` (most, FACTS) receive them. The weights in row W of ``small`` and ``coarse`` are
     used up.
     """
+    n = h * w
     work = new_work()
     state = np.empty(1, np.uint64)
     state[0] = np.uint64(seed) * np.uint64(2) + np.uint64(88172645463325253)
@@ -331,11 +391,12 @@ def find_motions(
         if not ok:
             break
         fact[SHARE] *= left / all_weight
-        clear = (
-            fact[SHARE] >= decisive
-            and fact[FLOW_NOISE] < CLEAR_FLOW
-            and fact[DEPTH_NOISE] < CLEAR_DEPTH
-        )
+        clear = fact[SHARE] >= decisive and found == 0
+        if clear and not first_wide:
+            coherence = residual_coherence(
+                coarse, h, w, pose, K, fact[FLOW_NOISE], fact[DEPTH_NOISE]
+            )
+            clear = coherence < COHERENT
         if found == 0 and not first_wide and not clear:
             # the handed-in starts did not settle it: let every start compete for the first place
             first_wide = True

@@ -105,11 +105,11 @@ def depth_scale(samples, n, log_depth, robust, pose, K, noise):
     R = pose[:, :3].astype(np.float32)
     t = pose[:, 3].astype(np.float32)
     row = np.empty(6)
-    size = n // max(1, n // 3000) + 1
+    size = n // max(1, n // 1000) + 1
     one = np.empty(size)
     two = np.empty(size)
     m = 0
-    for k in range(0, n, max(1, n // 3000)):
+    for k in range(0, n, max(1, n // 1000)):
         if not (robust[k] > 0.3 and abs(log_depth[k]) < 1e6):
             continue
         e, raw, front = conditional(samples, k, log_depth, R, t, K, noise, row)

@@ -344,7 +344,7 @@ def polish(samples, n, K, sf, sd, sf_cap, sd_cap, cutoff, rounds, steps, limit, 
     spread = 0.0
     for _ in range(rounds):
         sf, sd, share, spread = estimate_noise(
-            samples, n, pose, K, sf, sd, sf_cap, sd_cap, 6, limit
+            samples, n, pose, K, sf, sd, sf_cap, sd_cap, 5, limit
         )
         set_noise(sf, sd, cutoff, noise)
         done, _, converged = gauss_newton(
