@@ -17,10 +17,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hybridvo.errors import InputError
-from hybridvo.geometry import make_transform
+from hybridvo.geometry import ego_flow, make_transform, se3_exp
 from hybridvo.types import Camera, Frame, FramePair
 
-__all__ = ["CELLS", "DEGENERATE_CELLS", "MAIN_CELLS", "Cell", "make_pair"]
+__all__ = ["CELLS", "DEGENERATE_CELLS", "MAIN_CELLS", "Cell", "make_model_pair", "make_pair"]
 
 
 @dataclass(frozen=True)
@@ -163,6 +163,60 @@ def make_pair(
         "flow_true": flow_true,
     }
     return pair, truth
+
+
+def make_model_pair(
+    seed: int,
+    height: int = 160,
+    width: int = 320,
+    flow_noise_px: float = 0.5,
+    depth_noise: float = 0.02,
+) -> tuple[FramePair, dict[str, Any]]:
+    """A static pair whose noise is exactly what the refinement assumes, and its truth.
+
+    Smooth depth of 3-13 m with one step; Gaussian flow noise and log-normal depth noise, both
+    independent per pixel; no outliers, no second depth. Under this noise the normalised error of a
+    right covariance is chi-square with six degrees of freedom.
+
+    Args:
+        seed: development uses 0-999, published figures 1000 and up.
+        height: image height in pixels.
+        width: image width in pixels; the focal lengths scale with it (350 and 340 px at 320).
+        flow_noise_px: standard deviation of each flow component.
+        depth_noise: standard deviation of log depth.
+
+    Returns:
+        The pair (float32), and ``T_curr_prev`` (4, 4), ``depth_true`` (H, W) float64 metres and
+        ``flow_true`` (H, W, 2) float64 px.
+
+    Raises:
+        InputError: negative seed or noise, or an image below 16 pixels.
+    """
+    if seed < 0 or min(height, width) < 16 or not (flow_noise_px >= 0 and depth_noise >= 0):
+        raise InputError(
+            f"make_model_pair: expected seed >= 0, at least 16x16 pixels and noise >= 0, got seed "
+            f"{seed}, {height}x{width}, flow noise {flow_noise_px} and depth noise {depth_noise}."
+        )
+    rng = np.random.default_rng([zlib.crc32(b"model"), int(seed)])
+    camera = Camera(
+        350 / 320 * width, 340 / 320 * width, (width - 2) / 2, (height + 4) / 2, height, width
+    )
+    u, v = np.arange(width) * 320 / width, np.arange(height)[:, None] * 320 / width
+    depth = 6 + 3 * np.sin(u / 40 + rng.uniform(0, 6)) * np.cos(v / 30 + rng.uniform(0, 6))
+    depth = depth + 4.0 * (u > rng.uniform(80, 240))
+    limit = np.array([0.3] * 3 + [0.03] * 3)
+    T = se3_exp(rng.uniform(-limit, limit))
+    flow_true = ego_flow(depth, T, camera, camera)
+    flow = flow_true + flow_noise_px * rng.standard_normal(flow_true.shape)
+    measured = depth * np.exp(depth_noise * rng.standard_normal(depth.shape))
+    pair = FramePair(
+        prev=Frame(None, measured.astype(np.float32), camera, timestamp=0.0, index=0),
+        curr=Frame(None, None, camera, timestamp=0.1, index=1),
+        flow=flow.astype(np.float32),
+        flow_source="synthetic",
+        depth_source="synthetic",
+    )
+    return pair, {"T_curr_prev": T, "depth_true": depth, "flow_true": flow_true}
 
 
 def _direction(rng: np.random.Generator) -> np.ndarray:

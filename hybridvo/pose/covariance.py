@@ -61,6 +61,8 @@ def sandwich_covariance(
         covariance = 0.5 * (clustered + max(1.0, inflation) * independent)
     else:
         covariance = independent * (1 + FEW_TILES / max(tiles, 1))
+    # exact data leave no residuals to learn from: a hundredth of the model's own covariance stays
+    covariance = covariance + 0.01 * np.linalg.inv(H)
     covariance = 0.5 * (covariance + covariance.T) * outer
     if not np.isfinite(covariance).all():
         return NOTHING.copy(), eigenvalues, False

@@ -15,6 +15,10 @@ from hybridvo.types import FramePair
 LONG_STEP = 1500.0
 """Squared length, in standard deviations, of a step that the next one may not end: Newton's steps
 shrink quadratically, and the last pass makes one more."""
+NOISE_PIXELS = 4000
+"""Pixels that the final noise estimate looks at."""
+WELL_CONDITIONED = 0.005
+"""Ratio of the extreme eigenvalues of the flow's information above which it needs no help."""
 SECOND_DEPTH_GAIN = 0.5
 """The second depth is used where it adds this share of the flow's information in some direction."""
 
@@ -104,13 +108,15 @@ def fit_full_grid(
     sf, sd = noise_start
     caps = 2.5 * sf, max(2.5 * sd, 0.02)
     sf, sd, share, iterations, _, spread = solver.polish(
-        coarse, n, picture.K, sf, sd, *caps, options.cutoff, 1, 4, n, pose, work
+        coarse, n, picture.K, sf, sd, *caps, options.cutoff, 1, 4, NOISE_PIXELS, pose, work
     )
     noise = np.empty(3, np.float32)
     solver.set_noise(sf, sd, options.cutoff, noise)
     term = None
     if options.second_depth != "off" and pair.curr.depth is not None:
-        sd, term = _depth_term(pair, picture, coarse, grid, pose, sf, sd, noise, tile, options)
+        sd, term = _depth_term(
+            pair, picture, coarse, grid, pose, sf, sd, noise, tile, depth_scale, options
+        )
         solver.set_noise(sf, sd, options.cutoff, noise)
     per_pixel = _curvature(picture, coarse, n, pose, noise)
     for _ in range(options.full_steps):
@@ -225,6 +231,7 @@ def _depth_term(
     sd: float,
     noise: np.ndarray,
     tile: int,
+    inverse_depth: float,
     options: RefinementOptions,
 ) -> tuple[float, _DepthTerm | None]:
     """(depth noise, third residual or None): it bounds the one and may add the other."""
@@ -243,10 +250,15 @@ def _depth_term(
     # var(rz) = sz^2 + h^2 sd^2: with two depths of one sensor sd is about raw / sqrt(2)
     sd = min(sd, raw)
     solver.set_noise(sf, sd, options.cutoff, noise)
-    coarse_term = _DepthTerm(coarse, log_depth, n, columns, stride, max(sigma, 1e-4))
     flow = np.zeros(kernels.SUMS)
     solver.evaluate(coarse, n, pose, picture.K, noise, work, flow)
     H_flow = symmetric(flow[:21])
+    if options.second_depth == "auto":
+        scaling = np.array([1 / inverse_depth] * 3 + [1.0] * 3)
+        eigenvalues = np.linalg.eigvalsh(H_flow * np.outer(scaling, scaling))
+        if eigenvalues[0] > WELL_CONDITIONED * eigenvalues[-1]:
+            return sd, None
+    coarse_term = _DepthTerm(coarse, log_depth, n, columns, stride, max(sigma, 1e-4))
     # on the full fit the flow has every pixel, the depth every second one of both axes
     fine = max(1, min(2, stride))
     H_depth = symmetric(coarse_term.sums(picture, pose, noise, tile)[0][:21]) / fine**2

@@ -18,7 +18,7 @@ from hybridvo.errors import InputError
 from hybridvo.geometry import pose_matrix
 from hybridvo.pose import kernels, search, solver
 from hybridvo.pose.full_fit import FullFit, fit_full_grid
-from hybridvo.pose.judgement import Judge, cues, default_judge
+from hybridvo.pose.judgement import CueGrid, Judge, default_judge
 from hybridvo.pose.options import RefinementOptions
 from hybridvo.pose.picture import Picture
 from hybridvo.types import FramePair, Hypothesis, PairBatch, Reason, RelativePose, Status
@@ -218,7 +218,7 @@ def _hypotheses(
     work = solver.new_work()
     noise = np.empty(3, np.float32)
     usable = (coarse[kernels.W, :n] > 0).reshape(h, w)
-    depth = coarse[kernels.Z, :n].reshape(h, w)
+    grid = CueGrid(usable, coarse[kernels.Z, :n].reshape(h, w))
     found = []
     for pose, fact in zip(poses, facts, strict=True):
         weights = np.empty(n, np.float32)
@@ -234,7 +234,7 @@ def _hypotheses(
             name = "minimal"
         else:
             name = "identity" if source == 0 else "handed-in"
-        found.append((T, support, name, cues(support, usable, depth, T, T_last, sf)))
+        found.append((T, support, name, grid.cues(support, T, T_last, sf)))
     scores = np.asarray(judge([f[3] for f in found]), dtype=np.float64)
     return [
         Hypothesis(T, support, stride, cue["share"], float(score), name, cue)

@@ -18,8 +18,8 @@ from hybridvo.pose.solver import (
     DEPTH_NOISE_CAP,
     FLOW_NOISE_CAP,
     NOISE_PIXELS,
-    gauss_newton,
     graduate,
+    left_update,
     new_work,
     polish,
     residual,
@@ -29,7 +29,8 @@ from hybridvo.pose.solver import (
 )
 
 WINDOW_ROWS, WINDOW_COLUMNS = 3, 4
-MINIMAL_SAMPLES = 256
+MINIMAL_SAMPLES = 384
+MINIMAL_STEPS = 3
 REFINED = 4
 COHERENT = 0.35
 """Coherence of the residuals above which a motion that holds the picture is not beyond doubt; depth
@@ -90,21 +91,64 @@ def score_pose(samples, n, pose, K):
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
-def fit_minimal(samples, pick, K, tiny, pose, work):
-    """Three pixels, six equations: a few Gauss-Newton steps from the identity, in place."""
-    noise = np.empty(3, np.float32)
-    set_noise(1.0, 0.0, 1e4, noise)
-    for k in range(3):
-        tiny[:, k] = samples[:, pick[k]]
-        tiny[W, k] = 1.0
+def solve_square(A, x):
+    """Solve the 6x6 system A y = x in place by elimination with pivoting; False if singular."""
+    for i in range(6):
+        best = i
+        for r in range(i + 1, 6):
+            if abs(A[r, i]) > abs(A[best, i]):
+                best = r
+        if not abs(A[best, i]) > 1e-9:
+            return False
+        if best != i:
+            for c in range(i, 6):
+                A[i, c], A[best, c] = A[best, c], A[i, c]
+            x[i], x[best] = x[best], x[i]
+        for r in range(i + 1, 6):
+            factor = A[r, i] / A[i, i]
+            for c in range(i + 1, 6):
+                A[r, c] -= factor * A[i, c]
+            x[r] -= factor * x[i]
+    for i in range(5, -1, -1):
+        for c in range(i + 1, 6):
+            x[i] -= A[i, c] * x[c]
+        x[i] /= A[i, i]
+        if not abs(x[i]) < 1e4:
+            return False
+    return True
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def fit_minimal(samples, pick, K, A, x, other, pose):
+    """Three pixels, six equations: Newton steps from the identity, in place; False if it fails."""
     pose[:, :] = 0.0
     for i in range(3):
         pose[i, i] = 1.0
-    gauss_newton(tiny, 3, 3.0, K, noise, 4, 1e-2, pose, work)
-    for i in range(3):
-        for j in range(4):
-            if not abs(pose[i, j]) < 1e4:
+    for _ in range(MINIMAL_STEPS):
+        for m in range(3):
+            k = pick[m]
+            px, py, pz = samples[XN, k], samples[YN, k], samples[Z, k]
+            X = pz * (pose[0, 0] * px + pose[0, 1] * py + pose[0, 2]) + pose[0, 3]
+            Y = pz * (pose[1, 0] * px + pose[1, 1] * py + pose[1, 2]) + pose[1, 3]
+            Zc = pz * (pose[2, 0] * px + pose[2, 1] * py + pose[2, 2]) + pose[2, 3]
+            if not Zc > 1e-6:
                 return False
+            i = 1.0 / Zc
+            a = X * i
+            b = Y * i
+            # rows in units of the picture's radians, translation in units of the depth
+            u = 2 * m
+            v = u + 1
+            A[u, 0], A[u, 1], A[u, 2] = i, 0.0, -a * i
+            A[u, 3], A[u, 4], A[u, 5] = -a * b, 1.0 + a * a, -b
+            A[v, 0], A[v, 1], A[v, 2] = 0.0, i, -b * i
+            A[v, 3], A[v, 4], A[v, 5] = -(1.0 + b * b), a * b, a
+            x[u] = (samples[MU, k] - K[2]) / K[0] - a
+            x[v] = (samples[MV, k] - K[3]) / K[1] - b
+        if not solve_square(A, x):
+            return False
+        other[:, :] = pose
+        left_update(x, other, pose)
     return True
 
 
@@ -199,13 +243,14 @@ def keep_best(pose, score, source, poses, scores, sources, similar):
 
 @njit(error_model="numpy", cache=True, nogil=True)
 def search_round(
-    small, sh, sw, coarse, n, K, starts, wide, cutoff, similar, state, pose, facts, work
-):
+    small, sh, sw, coarse, n, K, starts, wide, minimal, cutoff, similar, state, pose, facts,
+    work,
+):  # fmt: skip
     """One motion among the pixels that are left (their weights in row W of both sample sets).
 
     ``small`` (sh x sw) serves starts and scores, ``coarse`` (n pixels) the refinement. ``starts``
-    (S, 3, 4) are handed in; with ``wide`` windows and minimal samples compete. Sets ``pose`` and
-    ``facts``; returns whether anything was found.
+    (S, 3, 4) are handed in; with ``wide`` windows and ``minimal`` minimal samples compete. Sets
+    ``pose`` and ``facts``; returns whether anything was found.
     """
     ns = sh * sw
     poses = np.zeros((REFINED, 3, 4))
@@ -233,12 +278,14 @@ def search_round(
                 ):  # fmt: skip
                     score = score_pose(small, ns, candidate, K)
                     keep_best(candidate, score, SOURCE_WINDOW, poses, scores, sources, similar)
-        tiny = np.empty((BUFFER_ROWS, 3), np.float32)
+        A = np.empty((6, 6))
+        x = np.empty(6)
+        other = np.empty((3, 4))
         pick = np.zeros(3, np.int64)
-        for s in range(MINIMAL_SAMPLES):
+        for s in range(minimal):
             if not draw_three(small, ns, sh, sw, s % 3 != 0, state, pick):
                 break
-            if fit_minimal(small, pick, K, tiny, candidate, work):
+            if fit_minimal(small, pick, K, A, x, other, candidate):
                 score = score_pose(small, ns, candidate, K)
                 keep_best(candidate, score, SOURCE_MINIMAL, poses, scores, sources, similar)
     best = -1.0
@@ -386,7 +433,9 @@ def find_motions(
         fact = facts[found]
         ok = search_round(
             small, sh, sw, coarse, n, K, starts if found == 0 else none,
-            found > 0 or first_wide, cutoff, similar, state, pose, fact, work,
+            found > 0 or first_wide,
+            MINIMAL_SAMPLES if found == 0 else MINIMAL_SAMPLES // 2,
+            cutoff, similar, state, pose, fact, work,
         )  # fmt: skip
         if not ok:
             break
