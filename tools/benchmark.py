@@ -1,9 +1,11 @@
-"""Pose solvers beside each other on the synthetic cells: same pairs, same process, same clock.
+r"""Pose solvers beside each other on the synthetic cells: same pairs, same process, same clock.
 
-    python tools/benchmark.py --out runs/benchmark --seed0 1000
+    python tools/benchmark.py --out runs/benchmark --seed0 1000 \
+        --heavy 4 --nees 1000 --kernel --batch
 
 What is timed is the whole call from a ``FramePair`` on, preparation included. Writes
-``benchmark.json`` (everything, every pair) and ``benchmark.md`` (the tables).
+``benchmark.json`` (everything, every pair), ``benchmark.md`` (the tables, with the goals first) and
+``benchmark.png``.
 """
 
 from __future__ import annotations
@@ -13,22 +15,17 @@ import importlib.util
 import json
 import os
 import platform
-import resource
 import sys
 import time
-import tracemalloc
 from collections.abc import Callable
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from benchmark_report import MID_CELL, markdown
+from benchmark_scores import is_failure, quartiles, score
 
-CHI2_6_3SIGMA = 20.062
-"""Quantile 0.9973 of chi-square with six degrees of freedom: the 3 sigma ellipsoid."""
-
-MID_CELL = "moving30"
-FAILURE_PX = 1.0
 PACKAGES = ("numpy", "scipy", "opencv-python-headless", "torch", "numba", "poselib", "open3d")
 
 
@@ -40,6 +37,14 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--seed0", type=int, default=0, help="first seed; 0-999 development, 1000+ published"
     )
+    parser.add_argument(
+        "--heavy", type=int, default=0, metavar="N", help="heavy sequences: N seeds of each kind"
+    )
+    parser.add_argument(
+        "--nees", type=int, default=0, metavar="N", help="normalised error over N pairs"
+    )
+    parser.add_argument("--kernel", action="store_true", help="one iteration, and the first call")
+    parser.add_argument("--batch", action="store_true", help="throughput of refine_batch")
     parser.add_argument("--out", type=Path, default=Path("runs/benchmark"))
     parser.add_argument("--overwrite", action="store_true", help="replace results in --out")
     return parser
@@ -48,6 +53,7 @@ def build_parser() -> argparse.ArgumentParser:
 def main(argv: list[str] | None = None) -> int:
     args = build_parser().parse_args(argv)
     from hybridvo.data.benchmark_pairs import CELLS, MAIN_CELLS
+    from hybridvo.evaluation.plots import plot_benchmark
 
     methods, absent = available_methods()
     groups = {"all": list(CELLS), "main": list(MAIN_CELLS)}
@@ -58,10 +64,12 @@ def main(argv: list[str] | None = None) -> int:
             if name not in known:
                 reason = absent.get(name, f"known: {', '.join(known)}")
                 return _bad_usage(f"unknown or missing {what} {name!r}: {reason}.")
-    if args.pairs < 1 or args.seed0 < 0:
-        return _bad_usage(
-            f"expected --pairs >= 1 and --seed0 >= 0, got {args.pairs} and {args.seed0}."
-        )
+    for option, value, least in (("--pairs", args.pairs, 1), ("--seed0", args.seed0, 0),
+                                 ("--heavy", args.heavy, 0), ("--nees", args.nees, 0)):  # fmt: skip
+        if value < least:
+            return _bad_usage(f"expected {option} >= {least}, got {value}.")
+    if "refine" in absent and (args.heavy or args.nees or args.kernel or args.batch):
+        return _bad_usage(f"--heavy, --nees, --kernel and --batch: {absent['refine']}.")
     target = args.out / "benchmark.json"
     if target.exists() and not args.overwrite:
         return _bad_usage(f"{target} exists; pass --overwrite to replace it.")
@@ -73,31 +81,74 @@ def main(argv: list[str] | None = None) -> int:
     except OSError as error:
         print(f"benchmark.py: {args.out} cannot be written: {error}", file=sys.stderr)
         return 5
-    records = []
-    for cell in cells:
-        records += run_cell(cell, {name: methods[name] for name in chosen}, args.pairs, args.seed0)
-        print(f"{cell}: {args.pairs} pairs, {len(chosen)} methods", file=sys.stderr)
-    summary = summarise(records, cells, chosen)
-    result = {
-        "command": ["benchmark.py", *(sys.argv[1:] if argv is None else argv)],
-        "seeds": [args.seed0, args.seed0 + args.pairs - 1],
-        "machine": machine(),
-        "versions": versions(),
-        "missing": absent,
-        "summary": summary,
-        "ratios": ratios(summary, cells, chosen),
-        "memory": peak_memory({name: methods[name] for name in chosen}, args.seed0),
-        "pairs": records,
-    }
+    result = measure(args, {name: methods[name] for name in chosen}, cells)
+    result["command"] = ["benchmark.py", *(sys.argv[1:] if argv is None else argv)]
+    result["missing"] = absent
+    picture = args.out / "benchmark.png"
     try:
         _write(target, json.dumps(result, indent=1, allow_nan=False) + "\n")
         _write(args.out / "benchmark.md", markdown(result, cells, chosen))
+        plot_benchmark(result["summary"], picture, time_cell=MID_CELL)
     except OSError as error:
         print(f"benchmark.py: {args.out} cannot be written: {error}", file=sys.stderr)
         return 5
-    print(target)
-    print(args.out / "benchmark.md")
+    for path in (target, args.out / "benchmark.md", picture):
+        print(path)
     return 0
+
+
+def measure(
+    args: argparse.Namespace, methods: dict[str, Callable[..., Any]], cells: list[str]
+) -> dict[str, Any]:
+    """Everything that was asked for, each part under its own key; None for what was not."""
+    from benchmark_consistency import correlated_nees, run_nees
+    from benchmark_costs import peak_memory, run_batch, run_kernel
+    from benchmark_goals import goals
+    from benchmark_heavy import run_heavy
+
+    started = time.perf_counter()
+
+    def progress(line: str) -> None:
+        print(f"[{time.perf_counter() - started:4.0f} s] {line}", file=sys.stderr, flush=True)
+
+    # first of all: it has the machine to itself before anything else has started threads
+    kernel = run_kernel(MID_CELL, args.seed0) if args.kernel else None
+    if kernel is not None:
+        progress(f"kernel: {kernel['shipped']['median_ms']:.2f} ms an iteration")
+    records = []
+    for cell in cells:
+        records += run_cell(cell, methods, args.pairs, args.seed0)
+        progress(f"{cell}: {args.pairs} pairs, {len(methods)} methods")
+    chosen = list(methods)
+    summary = summarise(records, cells, chosen)
+    memory = peak_memory(methods, MID_CELL, args.seed0)
+    progress("memory")
+    heavy = run_heavy(args.heavy, args.seed0, progress) if args.heavy else None
+    nees = {
+        "model": run_nees(args.nees, args.seed0) if args.nees else None,
+        "correlated noise": correlated_nees(summary),
+    }
+    if args.nees:
+        progress(f"nees: {args.nees} pairs")
+    # last: torch keeps its threads once it has started them
+    batch = run_batch(MID_CELL, args.seed0) if args.batch else None
+    if batch is not None:
+        progress("batch")
+    result = {
+        "seeds": [args.seed0, args.seed0 + args.pairs - 1],
+        "machine": machine(),
+        "versions": versions(),
+        "summary": summary,
+        "ratios": ratios(summary, cells, chosen),
+        "memory": memory,
+        "heavy": heavy,
+        "kernel": kernel,
+        "batch": batch,
+        "nees": nees,
+        "seconds": time.perf_counter() - started,
+        "pairs": records,
+    }
+    return {"goals": goals(result) if "refine" in methods else []} | result
 
 
 def available_methods() -> tuple[dict[str, Callable[..., Any]], dict[str, str]]:
@@ -146,54 +197,6 @@ def run_cell(
     return records
 
 
-def score(result: Any, pair: Any, truth: dict[str, Any]) -> dict[str, Any]:
-    """Errors of one answer against the truth; a failed one is the identity that it carries."""
-    from hybridvo.geometry import invert, rotation_angle, se3_log
-
-    T, T_true = result.T_curr_prev, truth["T_curr_prev"]
-    error = T @ invert(T_true)
-    delta = se3_log(error)
-    try:
-        nees = float(delta @ np.linalg.solve(result.covariance, delta))
-    except np.linalg.LinAlgError:
-        nees = float("inf")
-    hit = [epe(h.T_curr_prev, pair, truth) < FAILURE_PX for h in result.hypotheses]
-    return {
-        "status": str(result.status),
-        "estimated": bool(result.ok),
-        "epe_px": epe(T, pair, truth),
-        "rotation_error_deg": float(np.rad2deg(rotation_angle(error[:3, :3]))),
-        "translation_error_m": float(np.linalg.norm(T[:3, 3] - T_true[:3, 3])),
-        "nees": nees if np.isfinite(nees) else None,
-        "contained": bool(nees < CHI2_6_3SIGMA),
-        "inlier_ratio": float(result.inlier_ratio),
-        "hypotheses": len(hit),
-        "hypothesis_hit": any(hit) if hit else None,
-    }
-
-
-def epe(T: np.ndarray, pair: Any, truth: dict[str, Any]) -> float:
-    """Mean L2 end-point error (px, native size) of the ego flow of ``T`` over the true depth.
-
-    Every second pixel each way: the field is smooth within a surface. A point that a wrong motion
-    puts behind the camera counts as an error of one image width.
-    """
-    prev, curr = pair.prev.camera, pair.curr.camera
-    depth = truth["depth_true"][::2, ::2].astype(np.float64)
-    x = (np.arange(0, prev.width, 2) - prev.cx) / prev.fx * depth
-    y = (np.arange(0, prev.height, 2)[:, None] - prev.cy) / prev.fy * depth
-
-    def seen(M: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        X, Y, Z = (row[0] * x + row[1] * y + row[2] * depth + row[3] for row in M[:3])
-        Z = np.where(Z > 1e-6, Z, np.nan)
-        return curr.fx * X / Z, curr.fy * Y / Z, Z
-
-    u, v, _ = seen(T)
-    u_true, v_true, z_true = seen(truth["T_curr_prev"])
-    error = np.hypot(u - u_true, v - v_true)[np.isfinite(z_true)]
-    return float(np.minimum(np.nan_to_num(error, nan=curr.width), curr.width).mean())
-
-
 def summarise(
     records: list[dict[str, Any]], cells: list[str], methods: list[str]
 ) -> dict[str, dict[str, dict[str, Any]]]:
@@ -207,11 +210,11 @@ def summarise(
             hits = [r["hypothesis_hit"] for r in rows if r["hypothesis_hit"] is not None]
             summary[cell][method] = {
                 "pairs": len(rows),
-                "epe_px": _quartiles([r["epe_px"] for r in rows]),
-                "rotation_error_deg": _quartiles([r["rotation_error_deg"] for r in rows]),
-                "translation_error_m": _quartiles([r["translation_error_m"] for r in rows]),
-                "ms": _quartiles([r["ms"] for r in rows]),
-                "failures": sum(_is_failure(r) for r in rows),
+                "epe_px": quartiles([r["epe_px"] for r in rows]),
+                "rotation_error_deg": quartiles([r["rotation_error_deg"] for r in rows]),
+                "translation_error_m": quartiles([r["translation_error_m"] for r in rows]),
+                "ms": quartiles([r["ms"] for r in rows]),
+                "failures": sum(is_failure(r) for r in rows),
                 "not_estimated": sum(not r["estimated"] for r in rows),
                 "contained": sum(r["contained"] for r in rows),
                 "nees_mean": float(np.mean(nees)) if nees else None,
@@ -244,29 +247,6 @@ def ratios(
     return table
 
 
-def peak_memory(methods: dict[str, Callable[..., Any]], seed0: int) -> dict[str, Any]:
-    """Extra memory of one call on the mid cell: what Python's allocators saw at most, MiB.
-
-    Memory that a C++ library takes from the system is not seen; the process's high-water mark is
-    given beside it.
-    """
-    from hybridvo.data.benchmark_pairs import make_pair
-
-    pair, _ = make_pair(MID_CELL, seed0)
-    peaks: dict[str, Any] = {}
-    for name, method in methods.items():
-        tracemalloc.start()
-        try:
-            method(pair)
-            peaks[name] = tracemalloc.get_traced_memory()[1] / 2**20
-        finally:
-            tracemalloc.stop()
-    return {
-        "traced_peak_mib": peaks,
-        "process_peak_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10,
-    }
-
-
 def machine() -> dict[str, Any]:
     """Processor, cores and load: times of a shared machine are to be read as ratios."""
     model = platform.processor() or platform.machine()
@@ -297,90 +277,6 @@ def versions() -> dict[str, str | None]:
         except PackageNotFoundError:
             found[package] = None
     return found
-
-
-def markdown(result: dict[str, Any], cells: list[str], methods: list[str]) -> str:
-    """The tables for people; every number comes from the JSON."""
-    summary = result["summary"]
-    first, last = result["seeds"]
-    lines = [
-        "# Pose solvers on the synthetic cells",
-        "",
-        f"{last - first + 1} pairs a cell, seeds {first}-{last}; {result['machine']['processor']}, "
-        f"{result['machine']['cores']} cores, load {result['machine']['load_average']}. "
-        "Medians; times are whole calls from the FramePair on.",
-        "",
-        "## Error of the ego flow over true depth, px [failures: above 1 px, or no answer]",
-        "",
-        *_table(cells, methods, lambda c, m: _error_cell(summary[c][m])),
-        "",
-        "## Time, ms (quartiles)",
-        "",
-        *_table(cells, methods, lambda c, m: _spread(summary[c][m]["ms"], 2)),
-        "",
-        "## Error inside the 3 sigma ellipsoid of the covariance, per cent (mean NEES, ideal 6)",
-        "",
-        *_table(cells, methods, lambda c, m: _containment_cell(summary[c][m])),
-        "",
-    ]
-    if any(summary[c][m]["hypothesis_hits"] is not None for c in cells for m in methods):
-        with_any = [m for m in methods if summary[cells[0]][m]["hypothesis_hits"] is not None]
-        lines += ["## Pairs whose true motion is among the hypotheses", ""]
-        lines += _table(
-            cells,
-            with_any,
-            lambda c, m: f"{summary[c][m]['hypothesis_hits']}/{summary[c][m]['pairs']}",
-        )
-        lines.append("")
-    if result["ratios"]["refine_over"]:
-        lines += [
-            "## `refine` over each method",
-            "",
-            f"Error: geometric mean of the medians over {', '.join(result['ratios']['cells'])}. "
-            f"Time: medians in {MID_CELL}.",
-            "",
-            "| against | error | time |",
-            "|---|---|---|",
-        ]
-        for method, row in result["ratios"]["refine_over"].items():
-            ratio = "" if row["time"] is None else f"{row['time']:.3f}"
-            lines.append(f"| {method} | {row['error']:.3f} | {ratio} |")
-        lines.append("")
-    lines += ["## Extra memory of one call, MiB (Python's allocators)", ""]
-    lines += [f"- {m}: {v:.1f}" for m, v in result["memory"]["traced_peak_mib"].items()]
-    lines += ["", "## Versions", ""]
-    lines += [f"- {name}: {value}" for name, value in result["versions"].items() if value]
-    lines += [f"- not run: {name}: {reason}" for name, reason in result["missing"].items()]
-    return "\n".join(lines) + "\n"
-
-
-def _is_failure(record: dict[str, Any]) -> bool:
-    """Wrong by more than a pixel, or no answer at all."""
-    return record["epe_px"] > FAILURE_PX or not record["estimated"]
-
-
-def _table(cells: list[str], methods: list[str], entry: Callable[[str, str], str]) -> list[str]:
-    rows = ["| method | " + " | ".join(cells) + " |", "|---|" + "---|" * len(cells)]
-    return rows + [f"| {m} | " + " | ".join(entry(c, m) for c in cells) + " |" for m in methods]
-
-
-def _error_cell(row: dict[str, Any]) -> str:
-    failures = f" [{row['failures']}]" if row["failures"] else ""
-    return f"{_spread(row['epe_px'], 3)}{failures}"
-
-
-def _containment_cell(row: dict[str, Any]) -> str:
-    nees = "" if row["nees_mean"] is None else f" ({row['nees_mean']:.3g})"
-    return f"{100 * row['contained'] / row['pairs']:.0f}{nees}"
-
-
-def _spread(row: dict[str, float], digits: int) -> str:
-    return f"{row['median']:.{digits}f} ({row['q25']:.{digits}f}-{row['q75']:.{digits}f})"
-
-
-def _quartiles(values: list[float]) -> dict[str, float]:
-    q25, median, q75 = np.percentile(values, [25, 50, 75])
-    return {"median": float(median), "q25": float(q25), "q75": float(q75), "max": max(values)}
 
 
 def _geometric(values: list[float]) -> float | None:
