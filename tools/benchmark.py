@@ -23,8 +23,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from benchmark_report import MID_CELL, markdown
-from benchmark_scores import is_failure, quartiles, score
 
 PACKAGES = ("numpy", "scipy", "opencv-python-headless", "torch", "numba", "poselib", "open3d")
 
@@ -52,6 +50,8 @@ def build_parser() -> argparse.ArgumentParser:
 
 def main(argv: list[str] | None = None) -> int:
     args = build_parser().parse_args(argv)
+    from benchmark_report import MID_CELL, markdown
+
     from hybridvo.data.benchmark_pairs import CELLS, MAIN_CELLS
     from hybridvo.evaluation.plots import plot_benchmark
 
@@ -105,6 +105,7 @@ def measure(
     from benchmark_costs import peak_memory, run_batch, run_kernel
     from benchmark_goals import goals
     from benchmark_heavy import run_heavy
+    from benchmark_report import MID_CELL
 
     started = time.perf_counter()
 
@@ -179,6 +180,8 @@ def run_cell(
     cell: str, methods: dict[str, Callable[..., Any]], pairs: int, seed0: int
 ) -> list[dict[str, Any]]:
     """One record per pair and method; methods take turns on each pair, in rotating order."""
+    from benchmark_scores import score
+
     from hybridvo.data.benchmark_pairs import make_pair
 
     warm_up, _ = make_pair(cell, seed0 + pairs)
@@ -201,6 +204,8 @@ def summarise(
     records: list[dict[str, Any]], cells: list[str], methods: list[str]
 ) -> dict[str, dict[str, dict[str, Any]]]:
     """summary[cell][method]: quartiles of error and time, failures, containment, hypotheses."""
+    from benchmark_scores import is_failure, quartiles
+
     summary: dict[str, dict[str, dict[str, Any]]] = {}
     for cell in cells:
         summary[cell] = {}
@@ -228,6 +233,8 @@ def ratios(
     summary: dict[str, dict[str, dict[str, Any]]], cells: list[str], methods: list[str]
 ) -> dict[str, Any]:
     """``refine`` over each other method: error (geometric mean over the main cells) and time."""
+    from benchmark_report import MID_CELL
+
     from hybridvo.data.benchmark_pairs import MAIN_CELLS
 
     shared = [cell for cell in cells if cell in MAIN_CELLS]
