@@ -20,6 +20,7 @@ __all__ = ["METHODS", "demo"]
 METHODS = {
     "refine": "hybridvo (refine)",
     "pnp-ransac": "OpenCV PnP-RANSAC",
+    "pnp-ransac-tuned": "OpenCV PnP-RANSAC, tuned",
     "identity": "identity (no motion)",
 }
 """Methods of the demo and what its table calls them."""

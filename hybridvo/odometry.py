@@ -45,6 +45,8 @@ class Anchor:
     T_last: np.ndarray | None
     gap: int = 0
 
+FIRST_COVARIANCE = 1e-12 * np.eye(6)
+
 
 class Odometry:
     """Chains the motions of consecutive frames; keeps one previous frame and nothing else.
@@ -209,7 +211,8 @@ class Odometry:
     def _start(self, frame: Frame, anchor: Anchor) -> Step:
         T = anchor.T_world_last
         self._anchor = Anchor(_own(frame), T, T, None)
-        first = RelativePose(covariance=np.zeros((6, 6)), method=self.method)
+        # no motion precedes the first frame; a covariance that a pose graph can still invert
+        first = RelativePose(covariance=FIRST_COVARIANCE.copy(), method=self.method)
         return Step(frame.index, frame.timestamp, T.copy(), first)
 
     def _pair(self, prev: Frame, curr: Frame, flow: Any) -> FramePair:

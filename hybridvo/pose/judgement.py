@@ -1,8 +1,8 @@
 """Which of the strong motions is the world? A question of prior, not of consensus.
 
 One rigid object on 60 % of the picture out-votes the world, so the share alone decides wrongly.
-:class:`CueGrid` measures what tells the world from an object; :func:`default_judge` weighs it. A judge
-is any callable ``(cues of each motion) -> scores``; a learned one comes in at the same place.
+:class:`CueGrid` measures what tells the world from an object; :func:`default_judge` weighs it. A
+judge is any callable ``(cues of each motion) -> scores``; a learned one comes in at the same place.
 """
 
 from __future__ import annotations

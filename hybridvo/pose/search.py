@@ -32,6 +32,8 @@ WINDOW_ROWS, WINDOW_COLUMNS = 3, 4
 MINIMAL_SAMPLES = 384
 MINIMAL_STEPS = 3
 REFINED = 4
+NEAR_START = 1.5
+"""First scale, px, of the robust kernel about a pose that was handed in."""
 COHERENT = 0.35
 """Coherence of the residuals above which a motion that holds the picture is not beyond doubt; depth
 noise that is half correlated in space stays below 0.25."""
@@ -258,12 +260,16 @@ def search_round(
     sources = np.zeros(REFINED)
     candidate = np.empty((3, 4))
     for s in range(starts.shape[0]):
-        candidate[:, :] = starts[s]
-        scale = min(64.0, max(1.0, 1.5 * residual_scale(small, ns, candidate, K)))
-        graduate(small, ns, K, scale, 0.7, 0.4, 2, candidate, work)
-        keep_best(
-            candidate, score_pose(small, ns, candidate, K), s, poses, scores, sources, similar
-        )
+        # from afar; and, for what the caller hands in, from nearby: where most of the picture moves
+        # a wide kernel would leave even the right motion
+        for near in range(2 if s > 0 else 1):
+            candidate[:, :] = starts[s]
+            scale = NEAR_START
+            if near == 0:
+                scale = min(64.0, max(1.0, 1.5 * residual_scale(small, ns, candidate, K)))
+            graduate(small, ns, K, scale, 0.7, 0.4, 2, candidate, work)
+            score = score_pose(small, ns, candidate, K)
+            keep_best(candidate, score, s, poses, scores, sources, similar)
     if wide:
         buffer = np.empty((BUFFER_ROWS, ns + 1), np.float32)
         height = min(sh, max(3, (2 * sh) // (WINDOW_ROWS + 1)))

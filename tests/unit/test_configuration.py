@@ -26,9 +26,9 @@ def test_the_shipped_file_equals_the_defaults_and_names_every_key() -> None:
 
 def test_order_of_precedence(tmp_path: Path) -> None:
     path = write(tmp_path, "seed: 1\nstart: 2\nrefinement:\n  cutoff: 4\n")
-    options = load_options(path, ["start=3", "refinement.tile=16"], {"stride": 2, "stop": None})
+    options = load_options(path, ["start=3", "refinement.tiles=16"], {"stride": 2, "stop": None})
     assert (options.seed, options.start, options.stride, options.stop) == (1, 3, 2, None)
-    assert (options.refinement.cutoff, options.refinement.tile) == (4.0, 16)
+    assert (options.refinement.cutoff, options.refinement.tiles) == (4.0, 16)
     assert load_options(path, ["start=3"], {"start": 4}).start == 4
 
 
