@@ -21,6 +21,8 @@ BORDER = 0.06
 
 SMOOTH_JUMP = 0.01
 """Change of motion, rad of the picture, at which the smoothness cue has fallen to a half."""
+SMALL = 0.2
+"""Share of the picture up to which a motion's size says nothing against it."""
 DOMINANT = 0.8
 """Share of the picture above which a motion is the world whatever its cues."""
 
@@ -107,7 +109,7 @@ def default_judge(motions: Sequence[dict[str, float]]) -> np.ndarray:
     for k, cue in enumerate(motions):
         scores[k] = (
             1.2 * cue["border"]
-            - 1.5 * cue["share"]
+            - 1.5 * max(cue["share"] - SMALL, 0.0)
             + 0.7 * cue["spread"]
             + 0.15 * cue["log_depth"]
             - 0.2 * np.log(max(cue["flow_noise"], 0.05) / sharpest)
