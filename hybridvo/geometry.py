@@ -152,7 +152,7 @@ def rotation_angle(R: np.ndarray) -> np.ndarray:
 
 
 def euler_deg_to_matrix(angles_deg: np.ndarray) -> np.ndarray:
-    """(..., 3, 3) R = Rx(x) Ry(y) Rz(z) from (..., 3) angles in degrees (the paper's convention)."""
+    """(..., 3, 3) R = Rx(x) Ry(y) Rz(z) from (..., 3) angles in degrees, as in the paper."""
     angles = np.asarray(angles_deg, dtype=np.float64)
     flat = Rotation.from_euler("XYZ", angles.reshape(-1, 3), degrees=True).as_matrix()
     return flat.reshape(*angles.shape[:-1], 3, 3)

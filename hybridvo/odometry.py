@@ -45,6 +45,7 @@ class Anchor:
     T_last: np.ndarray | None
     gap: int = 0
 
+
 FIRST_COVARIANCE = 1e-12 * np.eye(6)
 
 

@@ -221,7 +221,7 @@ class FramePair:
         flow: (H, W, 2) float pixels, previous to current, on the previous grid; NaN is invalid.
             None where no flow could be had: the pair then ends as ``failed(no_flow)``.
         flow_variance: (H, W) float px^2 per component, relative or absolute, or None.
-        flow_valid: (H, W) bool, False at pixels whose flow is known to be wrong (occluded), or None.
+        flow_valid: (H, W) bool, False where the flow is known to be wrong (occluded), or None.
         flow_source: ``file``, ``dis``, or the name of a callable.
         flow_is_true: whether the flow is ground truth (an oracle).
         depth_source: ``sensor``, ``true`` (synthetic, an oracle), ``stereo``.

@@ -12,7 +12,7 @@ from hybridvo.pose.options import RefinementOptions
 from hybridvo.pose.picture import Picture
 from hybridvo.types import FramePair
 
-LONG_STEP = 1500.0
+LONG_STEP = 1e4
 """Squared length, in standard deviations, of a step that the next one may not end: Newton's steps
 shrink quadratically, and the last pass makes one more."""
 NOISE_PIXELS = 4000
@@ -125,7 +125,8 @@ def fit_full_grid(
             total[:27] += term.sums(picture, pose, noise, tile)[0][:27]
         length = _newton_step(total, per_pixel[:21] * total[29], pose)
         iterations += 1
-        if not length > LONG_STEP:
+        # with the second depth the weak directions have moved far from where the flow put them
+        if not length > (LONG_STEP if term is None else 1.0):
             break
     total, scores, weights = picture.last_pass(pose, noise, tile)
     curvature = per_pixel * total[29]

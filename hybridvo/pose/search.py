@@ -440,7 +440,7 @@ def find_motions(
         ok = search_round(
             small, sh, sw, coarse, n, K, starts if found == 0 else none,
             found > 0 or first_wide,
-            MINIMAL_SAMPLES if found == 0 else MINIMAL_SAMPLES // 2,
+            MINIMAL_SAMPLES if found == 0 else MINIMAL_SAMPLES // 3,
             cutoff, similar, state, pose, fact, work,
         )  # fmt: skip
         if not ok:
