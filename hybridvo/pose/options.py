@@ -32,7 +32,7 @@ class RefinementOptions:
     coarse_pixels: int = 7500
     full_steps: int = 4
     decisive_share: float = 0.85
-    least_share: float = 0.1
+    least_share: float = 0.08
     hypotheses: int = 5
     minimum_pixels: int = 24
     second_depth: str = "auto"
