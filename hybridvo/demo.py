@@ -1,4 +1,4 @@
-"""``hybridvo demo``: a rendered scene in which objects move, and three methods on it."""
+"""``hybridvo demo``: a rendered scene in which objects move, and the methods on it."""
 
 from __future__ import annotations
 

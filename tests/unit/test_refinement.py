@@ -341,10 +341,13 @@ def check_sane(result):
         assert result.status.message
 
 
-@pytest.mark.parametrize("fill", [0.0, -3.0, np.nan, np.inf, -np.inf, 1e-30, 1e30])
-@pytest.mark.parametrize("where", ["depth", "flow"])
+@pytest.mark.parametrize(
+    ("where", "fill"),
+    [("depth", value) for value in (0.0, -3.0, np.nan, np.inf, -np.inf, 1e-30, 1e30)]
+    + [("flow", value) for value in (np.nan, np.inf, -np.inf, 1e30)],
+)
 @pytest.mark.parametrize("fraction", [0.1, 0.5, 0.99, 1.0])
-def test_invalid_values_are_masked(fill, where, fraction):
+def test_invalid_values_are_masked(where, fill, fraction):
     pair, T = noisy(0)
     rng = np.random.default_rng(5)
     hit = rng.random(CAMERA.shape) < fraction
@@ -352,8 +355,6 @@ def test_invalid_values_are_masked(fill, where, fraction):
     if where == "depth":
         depth[hit] = fill
     else:
-        if fill in (0.0, -3.0, 1e-30):
-            pytest.skip("a finite flow, not an invalid value")
         flow[hit] = fill
     result = refine(FramePair(Frame(None, depth, CAMERA), pair.curr, flow))
     check_sane(result)
