@@ -15,6 +15,7 @@ from hybridvo.data.file_sequence import (
     to_seconds,
 )
 from hybridvo.data.image_io import read_npy, read_png16, read_rgb, read_text
+from hybridvo.data.sensor_noise import stereo_variance
 from hybridvo.errors import FormatError, InputError
 from hybridvo.geometry import invert
 from hybridvo.types import Camera
@@ -173,9 +174,7 @@ class KittiSequence(FileSequence):
     def _depth_variance(self, depth: np.ndarray) -> np.ndarray | None:
         if not self._stereo:
             return None
-        # d log Z = -d disparity / disparity, disparity = f b / Z
-        relative = DISPARITY_SIGMA_PX * depth / (self._focal * self._baseline)
-        return (relative**2).astype(np.float32)
+        return stereo_variance(depth, self._focal, self._baseline, DISPARITY_SIGMA_PX)
 
 
 def _sequence_folder(path: Path) -> Path | None:
