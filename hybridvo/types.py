@@ -336,7 +336,7 @@ class Hypothesis:
         stride: pixels of the full image per step of the support grid.
         share: fraction of the valid pixels that follow this motion.
         score: value by which the world was chosen among the hypotheses; larger is better.
-        source: which start led here (``identity``, ``last``, ``seed``, ``sampled``).
+        source: which start led here (``identity``, ``handed-in``, ``window``, ``minimal``).
         cues: named cues that went into the score.
     """
 

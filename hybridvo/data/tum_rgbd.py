@@ -16,7 +16,7 @@ from hybridvo.data.file_sequence import (
     to_seconds,
 )
 from hybridvo.data.image_io import read_png16
-from hybridvo.data.undistortion import Undistorter
+from hybridvo.data.undistortion import Undistorter, rectify
 from hybridvo.errors import InputError
 from hybridvo.types import Camera
 
@@ -192,11 +192,7 @@ class TumSequence(FileSequence):
     def _rectify(
         self, rgb: np.ndarray | None, depth: np.ndarray | None
     ) -> tuple[np.ndarray | None, np.ndarray | None, np.ndarray | None]:
-        lens = self._undistorter
-        if lens is None:
-            return rgb, depth, None
-        rgb = None if rgb is None else lens.rgb(rgb)
-        return rgb, None if depth is None else lens.depth(depth), lens.mask
+        return rectify(self._undistorter, rgb, depth)
 
 
 def _read_lists(

@@ -7,7 +7,7 @@ import numpy as np
 
 from hybridvo.types import Camera
 
-__all__ = ["Undistorter"]
+__all__ = ["Undistorter", "rectify"]
 
 
 class Undistorter:
@@ -35,3 +35,13 @@ class Undistorter:
     def depth(self, depth: np.ndarray) -> np.ndarray:
         """(H, W) float32 depth, nearest value (no mixing across edges); 0 (invalid) outside."""
         return cv2.remap(depth, self._u, self._v, cv2.INTER_NEAREST)
+
+
+def rectify(
+    lens: Undistorter | None, rgb: np.ndarray | None, depth: np.ndarray | None
+) -> tuple[np.ndarray | None, np.ndarray | None, np.ndarray | None]:
+    """(image, depth, mask) without distortion; as they are, and no mask, where there is no lens."""
+    if lens is None:
+        return rgb, depth, None
+    rgb = None if rgb is None else lens.rgb(rgb)
+    return rgb, None if depth is None else lens.depth(depth), lens.mask

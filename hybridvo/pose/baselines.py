@@ -13,6 +13,7 @@ import importlib
 import importlib.util
 import time
 from collections.abc import Callable
+from typing import Any
 
 import cv2
 import numpy as np
@@ -47,6 +48,7 @@ Estimator = Callable[..., RelativePose]
 POSELIB_REMEDY = "PoseLib is not installed; pip install 'hybridvo[baselines]'"
 
 _IDENTITY_COVARIANCE = np.diag([1.0] * 3 + [0.1] * 3)
+_TUNED: dict[str, Any] = {"iterationsCount": 1000, "reprojectionError": 2.0, "confidence": 0.999}
 _NO_DISTORTION = np.zeros(4)
 _FOUND_NOTHING = (cv2.error, ValueError, RuntimeError, ArithmeticError)
 """What the libraries raise on data that determine no pose."""
@@ -86,9 +88,7 @@ def pnp_ransac_tuned(pair: FramePair, *, seed: int = 0, points: int = POINTS) ->
             data.uv,
             camera.K,
             _NO_DISTORTION,
-            iterationsCount=1000,
-            reprojectionError=2.0,
-            confidence=0.999,
+            **_TUNED,
         )
         if found and inliers is not None and len(inliers) >= MIN_POINTS:
             keep = inliers[:, 0]
@@ -112,9 +112,7 @@ def usac_magsac(pair: FramePair, *, seed: int = 0, points: int = POINTS) -> Rela
             data.uv,
             camera.K,
             _NO_DISTORTION,
-            iterationsCount=1000,
-            reprojectionError=2.0,
-            confidence=0.999,
+            **_TUNED,
             flags=cv2.USAC_MAGSAC,
         )
         return _opencv_pose(found, rvec, tvec)

@@ -145,9 +145,8 @@ def fit_full_grid(
         newton = symmetric(total[:21] - curvature[:21])
         shift = np.linalg.lstsq(newton, slope, rcond=1e-12)[0] * spread
         covariance += np.outer(shift, shift)
-    # whether depth errs about its log, its value or its inverse is not known: the translation's
-    # length is uncertain by half the variance of log depth
-    if definite:
+        # whether depth errs about its log, its value or its inverse is not known: the translation's
+        # length is uncertain by half the variance of log depth
         covariance[:3, :3] += (0.5 * sd**2) ** 2 * np.outer(pose[:, 3], pose[:, 3])
     return FullFit(
         pose=pose,

@@ -163,7 +163,7 @@ def _refine(
             Reason.DEGENERATE_GEOMETRY, "the pixels do not determine any motion", "refine"
         )
     hypotheses = _hypotheses(
-        picture, coarse, h, w, stride, poses[:found], facts[:found], T_last, judge, len(starts)
+        picture, coarse, h, w, stride, poses[:found], facts[:found], T_last, judge
     )
     order = sorted(range(found), key=lambda k: -hypotheses[k].score)
     hypotheses = [hypotheses[k] for k in order]
@@ -211,7 +211,6 @@ def _hypotheses(
     facts: np.ndarray,
     T_last: np.ndarray | None,
     judge: Judge,
-    starts: int,
 ) -> list[Hypothesis]:
     """Support, cues and scores of the motions found, in the order found."""
     n = h * w

@@ -2,7 +2,7 @@
 
 Starts come from three sources: poses that the caller hands in (identity, the last motion, a
 network's seed), robust dense fits of overlapping windows, and minimal three-pixel samples. They are
-scored at several residual scales at once, the best few are refined, and the pixels that follow the
+scored at two residual scales at once, the best few are refined, and the pixels that follow the
 winner are set aside before the next round. Everything is deterministic for a seed.
 """
 
@@ -38,8 +38,8 @@ COHERENT = 0.35
 """Coherence of the residuals above which a motion that holds the picture is not beyond doubt; depth
 noise that is half correlated in space stays below 0.25."""
 
-SHARE, FLOW_NOISE, DEPTH_NOISE, SOURCE, ITERATIONS, CONVERGED, SCORE = range(7)
-FACTS = 7
+SHARE, FLOW_NOISE, DEPTH_NOISE, SOURCE, ITERATIONS = range(5)
+FACTS = 5
 """Columns of the table of facts of the hypotheses."""
 SOURCE_WINDOW, SOURCE_MINIMAL = 100, 101
 
@@ -310,7 +310,7 @@ def search_round(
         return False
     steps += graduate(coarse, n, K, 0.7, 0.5, 0.4, 3, pose, work)
     candidate[:, :] = pose
-    sf, sd, share, more, converged, _ = polish(
+    sf, sd, share, more, _, _ = polish(
         coarse,
         n,
         K,
@@ -327,13 +327,10 @@ def search_round(
     )
     if score_pose(coarse, n, candidate, K) > 0.95 * score_pose(coarse, n, pose, K):
         pose[:, :] = candidate
-    best = score_pose(coarse, n, pose, K)
     facts[SHARE] = share
     facts[FLOW_NOISE] = sf
     facts[DEPTH_NOISE] = sd
     facts[ITERATIONS] = steps + more
-    facts[CONVERGED] = 1.0 if converged else 0.0
-    facts[SCORE] = best
     return True
 
 
@@ -465,8 +462,6 @@ def find_motions(
         set_aside(
             small, sh * sw, pose, K, fact[FLOW_NOISE], fact[DEPTH_NOISE], cutoff, work, scratch
         )
-    if found == 0:
-        return 0
     return found
 
 
