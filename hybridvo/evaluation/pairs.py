@@ -21,6 +21,7 @@ __all__ = [
     "dynamic_fraction",
     "mean_pair_errors",
     "pair_errors",
+    "pair_facts",
 ]
 
 PAPER_SIZE = (128, 256)
@@ -266,3 +267,61 @@ def dynamic_fraction(
             moving += int(np.count_nonzero(valid & (difference > threshold_px)))
             count += int(np.count_nonzero(valid))
     return moving / count if count else None
+
+
+def pair_facts(
+    T_true: np.ndarray | None,
+    depth_prev: np.ndarray | None,
+    camera_prev: Camera,
+    camera_curr: Camera,
+    flow_true: np.ndarray | None = None,
+) -> dict[str, float | None]:
+    """What may explain an error: how much moves, how far, before what. None where unknown.
+
+    Args:
+        T_true: (4, 4) true ``T_curr_prev``, metres, or None.
+        depth_prev: (H, W) depth of the previous frame, metres, or None.
+        camera_prev: previous camera, (H, W).
+        camera_curr: current camera, (H, W).
+        flow_true: (H, W, 2) true flow of everything, px, NaN where unknown; None where there is
+            none, or where it holds the motion of the camera alone.
+
+    Returns:
+        ``dynamic_fraction`` (:func:`dynamic_fraction`); ``flow_magnitude_px``: median length of the
+        true ego flow over every second row and column; ``rotation_deg`` and ``translation_m`` of
+        the true motion; ``depth_spread``: 90th over 10th percentile of the valid depth, one for a
+        plane parallel to the image.
+
+    Raises:
+        InputError: a pose that is not finite, shapes that do not match.
+    """
+    facts: dict[str, float | None] = dict.fromkeys(
+        ("dynamic_fraction", "flow_magnitude_px", "rotation_deg", "translation_m", "depth_spread")
+    )
+    if T_true is not None:
+        T_true = _check_pose(T_true, "T_true")
+        facts["rotation_deg"] = float(np.degrees(rotation_angle(T_true[:3, :3])))
+        facts["translation_m"] = float(np.linalg.norm(T_true[:3, 3]))
+    if depth_prev is None:
+        return facts
+    depth = _check_depth(depth_prev, camera_prev, camera_curr)
+    if T_true is not None and flow_true is not None:
+        facts["dynamic_fraction"] = dynamic_fraction(
+            flow_true, depth, T_true, camera_prev, camera_curr
+        )
+    # a percentile over a quarter of the pixels is known to far less than the width of a bin
+    depth = depth[::2, ::2].astype(np.float64)
+    valid = np.isfinite(depth) & (depth > 0)
+    if not valid.any():
+        return facts
+    low, high = np.quantile(depth[valid], [0.1, 0.9])
+    facts["depth_spread"] = float(high / low)
+    if T_true is not None:
+        v, u = np.nonzero(valid)
+        A_b = _projection_rows(T_true, camera_prev, camera_curr)
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            x, y, s = _moved_pixels(*A_b, 2.0 * u, 2.0 * v, 1.0 / depth[valid])
+            length = np.hypot(x - 2.0 * u, y - 2.0 * v)[s > 0]
+        if length.size:
+            facts["flow_magnitude_px"] = float(np.median(length))
+    return facts
