@@ -17,7 +17,14 @@ import torch
 from hybridvo.errors import InputError
 from hybridvo.types import FramePair, PairBatch
 
-__all__ = ["FLOW_SCALE_PX", "NETWORK_SIZE", "NetworkInputs", "assemble_aligned", "assemble_inputs"]
+__all__ = [
+    "FLOW_SCALE_PX",
+    "NETWORK_SIZE",
+    "NetworkInputs",
+    "assemble_aligned",
+    "assemble_inputs",
+    "subsampled_intrinsics",
+]
 
 FLOW_SCALE_PX = 200.0
 """Flow is divided by this before it enters a network."""
@@ -70,10 +77,35 @@ class NetworkInputs:
         """Part of the batch."""
         return NetworkInputs(*(getattr(self, f.name)[index] for f in fields(self)))
 
+    def subsample(self, stride: int) -> NetworkInputs:
+        """Every ``stride``-th pixel of every ``stride``-th row, flow in their pixels."""
+        if stride == 1:
+            return self
+        first = stride // 2
+        pick = (..., slice(first, None, stride), slice(first, None, stride))
+        return NetworkInputs(
+            self.flow[pick] / stride,
+            self.inverse_depth[pick],
+            self.rays[pick],
+            self.valid[pick],
+            self.depth_prev[pick],
+            self.depth_curr[pick],
+            subsampled_intrinsics(self.K_prev, stride),
+            subsampled_intrinsics(self.K_curr, stride),
+        )
+
     def to(self, *args: object, **kwargs: object) -> NetworkInputs:
         """Copy on another device, or of another floating-point type; the mask stays boolean."""
         moved = {f.name: getattr(self, f.name).to(*args, **kwargs) for f in fields(self)}
         return NetworkInputs(**{**moved, "valid": moved["valid"].bool()})
+
+
+def subsampled_intrinsics(K: torch.Tensor, stride: int) -> torch.Tensor:
+    """(B, 3, 3) intrinsics of the pixels n // 2, n // 2 + n, .. of each axis, n = ``stride``."""
+    out = K.clone()
+    out[:, :2, :2] = K[:, :2, :2] / stride
+    out[:, :2, 2] = (K[:, :2, 2] - stride // 2) / stride
+    return out
 
 
 def assemble_inputs(

@@ -15,7 +15,7 @@ have a coarser grid than the flow, where each cell answers for its pixels.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import torch
@@ -25,6 +25,7 @@ from kornia.geometry.depth import depth_to_3d_v2
 from kornia.geometry.linalg import transform_points
 
 from hybridvo.errors import InputError
+from hybridvo.network.inputs import subsampled_intrinsics
 from hybridvo.types import PixelwisePrediction
 
 __all__ = ["LossOptions", "LossTargets", "NetworkOutput", "reconstruct", "total_loss"]
@@ -147,6 +148,25 @@ class LossTargets:
     K_prev: torch.Tensor
     K_curr: torch.Tensor
     valid: torch.Tensor | None = None
+
+    def subsample(self, stride: int) -> LossTargets:
+        """The picture of every ``stride``-th pixel of every ``stride``-th row, in its own pixels.
+
+        A cheap form of L^F and L^D: they fix six numbers a pair, which need not all of its pixels.
+        """
+        if stride == 1:
+            return self
+        first = stride // 2
+        pick = (..., slice(first, None, stride), slice(first, None, stride))
+        return replace(
+            self,
+            ego_flow=self.ego_flow[pick] / stride,
+            depth_prev=self.depth_prev[pick],
+            depth_curr=self.depth_curr[pick],
+            K_prev=subsampled_intrinsics(self.K_prev, stride),
+            K_curr=subsampled_intrinsics(self.K_curr, stride),
+            valid=None if self.valid is None else self.valid[pick],
+        )
 
     def to(self, *args: object, **kwargs: object) -> LossTargets:
         """Copy on another device, or of another floating-point type; the mask stays boolean."""
@@ -417,7 +437,10 @@ def _check(
     log_scale = torch.cat([scales[0], scales[1]], dim=1)
     cells = log_scale.shape[2:]
     side = -(-height // cells[0])
-    if (-(-height // side), -(-width // side)) != tuple(cells):
+    per_pixel = (options.flow and options.flow_uncertainty) or (
+        options.depth and options.depth_uncertainty
+    )
+    if per_pixel and (-(-height // side), -(-width // side)) != tuple(cells):
         raise InputError(
             f"total_loss: a prediction of {tuple(cells)} does not divide the targets' size "
             f"{(height, width)} evenly; expected the network's input size or half of it."

@@ -7,15 +7,12 @@ them.
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
 from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import nn
 
-from hybridvo.errors import InputError
 from hybridvo.network.inputs import NetworkInputs
 from hybridvo.network.layers import (
     Encoder,
@@ -25,79 +22,15 @@ from hybridvo.network.layers import (
     match_size,
     scaled,
 )
+from hybridvo.network.options import KINDS, NetworkOptions
+from hybridvo.network.scale_free import remove_scale
 from hybridvo.network.vonet import OUTPUT_SCALE, VONet
 from hybridvo.types import PixelwisePrediction
 
 __all__ = ["INVALID_LOG_SCALE", "KINDS", "PWVO", "NetworkOptions", "build_network"]
 
-KINDS = ("pwvo", "vonet", "vonet-attention")
-
 INVALID_LOG_SCALE = 3.0
 """Least log scale where flow or depth is missing: U = 20 degrees or 20 m, "nothing was seen"."""
-
-PATCH = 32
-"""Side of the paper's selection patches in pixels of the network's input."""
-
-
-@dataclass(frozen=True)
-class NetworkOptions:
-    """What decides the shapes of a network's weights.
-
-    Args:
-        kind: ``pwvo`` (also PWVO naive and the pixel-wise network: same shapes, other losses),
-            ``vonet`` or ``vonet-attention``.
-        width: factor on all channel counts, in (0, 4]; 0.5 has about a quarter of the parameters.
-        decoders: 1 = one decoder shared by both heads (published code), 2 = one for the pose and
-            one for the uncertainty (the paper's text).
-        head_stride: 1 = predictions at the resolution of the input, 2 = at half of it, without the
-            decoder's last stage: the same pose at about half the time on a CPU.
-        uncertainty: whether the pixel-wise network has an uncertainty head.
-        flow_gain: factor in (0, 1000] on the normalised flow (px / 200) inside the network. 1 as
-            published; with 10 a flow of a few pixels enters with the size of the other inputs,
-            which short trainings need.
-
-    Raises:
-        InputError: a value outside of what is listed.
-    """
-
-    kind: str = "pwvo"
-    width: float = 1.0
-    decoders: int = 1
-    head_stride: int = 1
-    uncertainty: bool = True
-    flow_gain: float = 1.0
-
-    def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise InputError(
-                f"NetworkOptions.kind: {self.kind!r} unknown; known: {', '.join(KINDS)}. "
-                f"'pwvo-naive' and 'pixelwise' are kind='pwvo' with other losses and selection."
-            )
-        for name, most in (("width", 4), ("flow_gain", 1000)):
-            value = getattr(self, name)
-            number = isinstance(value, int | float) and not isinstance(value, bool)
-            if not number or not math.isfinite(value) or not 0 < value <= most:
-                raise InputError(
-                    f"NetworkOptions.{name}: expected a number in (0, {most}], got {value!r}."
-                )
-        for name in ("decoders", "head_stride"):
-            value = getattr(self, name)
-            if isinstance(value, bool) or value not in (1, 2):
-                raise InputError(f"NetworkOptions.{name}: expected 1 or 2, got {value!r}.")
-        if not isinstance(self.uncertainty, bool):
-            raise InputError(
-                f"NetworkOptions.uncertainty: expected a bool, got {self.uncertainty!r}."
-            )
-        if self.decoders == 2 and not self.uncertainty:
-            raise InputError(
-                "NetworkOptions: decoders=2 gives the uncertainty its own decoder, but "
-                "uncertainty=False. Set decoders=1."
-            )
-
-    @property
-    def patch(self) -> int:
-        """Side of the paper's 32-pixel selection patches, in cells of the prediction's grid."""
-        return PATCH // self.head_stride
 
 
 class _UpStage(nn.Module):
@@ -172,7 +105,7 @@ class PWVO(nn.Module):
         super().__init__()
         options = NetworkOptions() if options is None else options
         width, stride = options.width, options.head_stride
-        self.head_stride = stride
+        self.options = options
         self.branches = InputBranches(options.flow_gain)
         self.encoder = Encoder(InputBranches.out_channels, width)
         self.decoder = Decoder(self.encoder.channels, width, stride)
@@ -185,7 +118,9 @@ class PWVO(nn.Module):
         heads = [h for h in (self.head_motion, self.head_uncertainty) if h is not None]
         initialize(self, uniform=tuple(heads))
 
-    def forward(self, inputs: NetworkInputs) -> PixelwisePrediction:
+    def forward(
+        self, inputs: NetworkInputs, T_start: torch.Tensor | None = None
+    ) -> PixelwisePrediction:
         """Pose and log scale at every pixel.
 
         Where flow or depth is missing (``inputs.valid`` is False) the log scale is at least
@@ -193,24 +128,39 @@ class PWVO(nn.Module):
 
         Args:
             inputs: of size (h, w); multiples of 32 waste no border, any size works.
+            T_start: (B, 4, 4) a first motion, for scale-free networks: they look at what it leaves
+                unexplained, see :func:`hybridvo.network.passes.predict`.
 
         Returns:
-            Maps of (ceil(h / head_stride), ceil(w / head_stride)), float32 (float64 for a float64
-            network), also under autocast. Finite for any input.
+            Maps of (ceil(h / n), ceil(w / n)), n = input_stride * head_stride; float32 (float64 for
+            a float64 network), also under autocast. Finite for any input.
         """
+        options = self.options
+        scale = None
+        inputs = inputs.subsample(options.input_stride)
+        if options.scale_free:
+            inputs, scale = remove_scale(inputs, T_start)
         x = self.branches(inputs)
         features = self.encoder(x)
         dtype = next(self.parameters()).dtype
         shared = self.decoder(x, features)
-        motion = OUTPUT_SCALE * self.head_motion(shared).to(dtype)
+        motion = self.head_motion(shared).to(dtype)
+        if scale is None:
+            motion = OUTPUT_SCALE * motion
+        else:
+            factor, start = (x.to(dtype)[:, :, None, None] for x in (scale.factor, scale.start))
+            # The sum of two small motions: of second order, and the next pass sees what it misses.
+            motion = start + factor * motion
         if self.head_uncertainty is None:
             return PixelwisePrediction(motion[:, :3], motion[:, 3:])
         if self.decoder_uncertainty is not None:
             shared = self.decoder_uncertainty(x, features)
         log_scale = self.head_uncertainty(shared).to(dtype)
+        if scale is not None:
+            log_scale = log_scale + factor.log()
         seen = inputs.valid[:, None].to(dtype)
-        if self.head_stride > 1:
-            seen = F.max_pool2d(seen, self.head_stride, ceil_mode=True)
+        if options.head_stride > 1:
+            seen = F.max_pool2d(seen, options.head_stride, ceil_mode=True)
         log_scale = torch.where(seen > 0, log_scale, log_scale.clamp(min=INVALID_LOG_SCALE))
         return PixelwisePrediction(motion[:, :3], motion[:, 3:], log_scale[:, :3], log_scale[:, 3:])
 
@@ -233,10 +183,5 @@ def build_network(options: NetworkOptions | None = None) -> nn.Module:
         4.3
     """
     options = NetworkOptions() if options is None else options
-    network: Any = (
-        PWVO(options)
-        if options.kind == "pwvo"
-        else VONet(options.width, options.kind == "vonet-attention", options.flow_gain)
-    )
-    network.options = options
+    network: Any = PWVO(options) if options.kind == "pwvo" else VONet(options)
     return network

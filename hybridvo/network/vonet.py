@@ -8,6 +8,8 @@ from torch import nn
 
 from hybridvo.network.inputs import NetworkInputs
 from hybridvo.network.layers import Encoder, InputBranches, SelfAttention, initialize
+from hybridvo.network.options import NetworkOptions
+from hybridvo.network.scale_free import remove_scale
 
 __all__ = ["OUTPUT_SCALE", "VONet"]
 
@@ -34,36 +36,51 @@ class VONet(nn.Module):
     heads, so that one set of weights serves every size.
 
     Args:
-        width: factor on all channel counts of the encoder.
-        attention: self-attention on the embedding (the paper's "VONet + self-att.").
-        flow_gain: factor on the normalised flow.
+        options: kind ``vonet`` or ``vonet-attention`` (the paper's "VONet + self-att.").
     """
 
-    def __init__(self, width: float = 1.0, attention: bool = False, flow_gain: float = 1.0) -> None:
+    def __init__(self, options: NetworkOptions | None = None) -> None:
         super().__init__()
-        self.branches = InputBranches(flow_gain)
-        self.encoder = Encoder(InputBranches.out_channels, width, inner_activation=False)
+        options = NetworkOptions(kind="vonet") if options is None else options
+        self.options = options
+        self.branches = InputBranches(options.flow_gain)
+        self.encoder = Encoder(InputBranches.out_channels, options.width, inner_activation=False)
         channels = self.encoder.channels[-1]
-        self.attention = SelfAttention(channels) if attention else nn.Identity()
+        self.attention = (
+            SelfAttention(channels) if options.kind == "vonet-attention" else nn.Identity()
+        )
         features = channels * FEATURE_GRID[0] * FEATURE_GRID[1]
         self.head_rotation = _PoseHead(features)
         self.head_translation = _PoseHead(features)
         initialize(self, uniform=(self.head_rotation, self.head_translation))
 
-    def forward(self, inputs: NetworkInputs) -> tuple[torch.Tensor, torch.Tensor]:
+    def forward(
+        self, inputs: NetworkInputs, T_start: torch.Tensor | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         """Pose of each pair.
 
         Args:
             inputs: of size (h, w), each at least 1.
+            T_start: (B, 4, 4) a first motion, for scale-free networks.
 
         Returns:
             (B, 3) Euler angles X-Y-Z in degrees (R = Rx Ry Rz) and (B, 3) translation in metres, of
             T_curr_prev, both float32 (float64 for a float64 network). Finite for any input.
         """
+        scale = None
+        inputs = inputs.subsample(self.options.input_stride)
+        if self.options.scale_free:
+            inputs, scale = remove_scale(inputs, T_start)
         embedding = self.attention(self.encoder(self.branches(inputs))[-1])
         if embedding.shape[2:] != FEATURE_GRID:
             embedding = F.adaptive_avg_pool2d(embedding, FEATURE_GRID)
         features = embedding.flatten(1)
         rotation, translation = self.head_rotation(features), self.head_translation(features)
         dtype = next(self.parameters()).dtype
-        return OUTPUT_SCALE * rotation.to(dtype), OUTPUT_SCALE * translation.to(dtype)
+        if scale is None:
+            return OUTPUT_SCALE * rotation.to(dtype), OUTPUT_SCALE * translation.to(dtype)
+        factor, start = scale.factor.to(dtype), scale.start.to(dtype)
+        return (
+            start[:, :3] + factor[:, :3] * rotation.to(dtype),
+            start[:, 3:] + factor[:, 3:] * translation.to(dtype),
+        )

@@ -23,10 +23,10 @@ from torch.nn.parallel import DistributedDataParallel
 
 from hybridvo.errors import CheckpointError, DegenerateError
 from hybridvo.network.losses import NetworkOutput, total_loss
+from hybridvo.network.passes import first_motions
 from hybridvo.network.pwvo import build_network
-from hybridvo.pose.selection import select, selected_transform
 from hybridvo.training.checkpoint import load_checkpoint, save_checkpoint
-from hybridvo.training.held_out import evaluate_network
+from hybridvo.training.held_out import evaluate_network, output_motion
 from hybridvo.training.options import TrainingOptions
 from hybridvo.training.stream import Mixture, SampleStream, TrainingBatch
 from hybridvo.types import PixelwisePrediction
@@ -46,18 +46,12 @@ def training_loss(
     output: NetworkOutput, batch: TrainingBatch, options: TrainingOptions
 ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
     """Loss of a network's output and its parts, see :func:`hybridvo.network.losses.total_loss`."""
-    T = None
-    if options.loss.reconstructs:
-        if isinstance(output, PixelwisePrediction):
-            method = "mean" if output.log_scale_rotation is None else options.selection
-            T = selected_transform(*select(output, method))
-        else:
-            T = selected_transform(*output)
+    T = output_motion(output, options.selection) if options.loss.reconstructs else None
     laplace = options.translation_loss == "laplace" and isinstance(output, PixelwisePrediction)
     loss_options = options.loss
     if laplace:
         loss_options = dataclasses.replace(loss_options, translation_weight=0.0)
-    loss, parts = total_loss(output, batch.targets, loss_options, T)
+    loss, parts = total_loss(output, batch.targets.subsample(options.loss_stride), loss_options, T)
     if laplace and options.loss.pose and isinstance(output, PixelwisePrediction):
         error = (output.translation - batch.targets.translation[:, :, None, None]).abs()
         s = output.log_scale_translation
@@ -144,6 +138,7 @@ class Trainer:
             self._groups(),
             lr=options.optimizer.learning_rate,
             betas=options.optimizer.betas,
+            fused=True,
         )
         self.step = self.samples = self.skipped = self.skipped_in_a_row = 0
         self.elapsed_s = 0.0
@@ -190,7 +185,7 @@ class Trainer:
         self.optimizer.zero_grad(set_to_none=True)
         half = options.precision == "bfloat16"
         with torch.autocast(self.device.type, torch.bfloat16, enabled=half):
-            output = self.model(batch.inputs)
+            output = self.model(batch.inputs, self._starts(batch))
         loss, parts = training_loss(output, batch, options)
         loss.backward()
         norm = nn.utils.clip_grad_norm_(self.network.parameters(), options.optimizer.clip_norm)
@@ -212,6 +207,26 @@ class Trainer:
         self.samples += len(batch.inputs) * self.world
         figures = {"loss": float(loss.detach()), "grad_norm": float(norm), "lr": rate}
         return figures | {name: float(part) for name, part in parts.items()}
+
+    def _starts(self, batch: TrainingBatch) -> torch.Tensor | None:
+        """(B, 4, 4) first motions: none for one half of the batch, the network's own for the rest.
+
+        The later passes of a network learn from the errors that the earlier ones really make.
+        """
+        passes = self.options.network.passes
+        first = len(batch.inputs) // 2
+        if passes == 1 or first == 0:
+            return None
+        T = torch.eye(4, device=self.device).repeat(len(batch.inputs), 1, 1)
+        made = first_motions(
+            self.network,
+            batch.inputs[first:],
+            lambda output: output_motion(output, self.options.selection),
+            1 + self.step % (passes - 1),
+        )
+        assert made is not None
+        T[first:] = made
+        return T
 
     def _average(self) -> None:
         if self.ema is None:

@@ -104,6 +104,8 @@ class TrainingOptions:
             pixels than on static ones of the same pair. 0 = none, as in the paper, whose s need
             not tell the two apart once every pixel knows the answer of its neighbours.
         selection: method of ``hybridvo.pose.selection.select`` that L^F and L^D look through.
+        loss_stride: L^F and L^D, without uncertainty, look at every n-th pixel of every n-th row,
+            in pixels of that smaller picture. 1 as published.
         data: preset files, beside the file that names them.
         data_weights: share of each.
         seed: of the weights and the samples.
@@ -127,6 +129,7 @@ class TrainingOptions:
     translation_loss: str = "direction"
     moving_weight: float = 0.0
     selection: str = "softmax"
+    loss_stride: int = 1
     data: tuple[str, ...] = ("data_paper.yaml",)
     data_weights: tuple[float, ...] = (1.0,)
     seed: int = 0
@@ -152,7 +155,12 @@ class TrainingOptions:
                 f"TrainingOptions.translation_loss: expected direction or laplace, got "
                 f"{self.translation_loss!r}."
             )
-        for name in ("steps", "batch_size", "log_every", "evaluate_count"):
+        if self.loss_stride > 1 and (self.loss.flow_uncertainty or self.loss.depth_uncertainty):
+            raise InputError(
+                "TrainingOptions.loss_stride: above 1 needs loss.flow_uncertainty and "
+                "loss.depth_uncertainty off; weighed by s, every pixel counts."
+            )
+        for name in ("steps", "batch_size", "log_every", "evaluate_count", "loss_stride"):
             if getattr(self, name) < 1:
                 raise InputError(f"TrainingOptions.{name}: expected at least 1.")
         if not 0 <= self.ema_decay < 1:

@@ -39,7 +39,7 @@ def test_parameter_totals():
 @pytest.mark.parametrize("attention", [False, True])
 def test_any_size(size, attention):
     torch.manual_seed(0)
-    network = VONet(0.125, attention).eval()
+    network = VONet(NetworkOptions(kind="vonet-attention" if attention else "vonet", width=0.125)).eval()
     inputs = make_inputs(2, *size)
     with torch.inference_mode():
         together = network(inputs)
@@ -52,7 +52,7 @@ def test_any_size(size, attention):
 
 def test_pooling_is_the_identity_at_the_papers_size():
     torch.manual_seed(0)
-    network = VONet(0.125).eval()
+    network = VONet(NetworkOptions(kind="vonet", width=0.125)).eval()
     inputs = make_inputs(1, 128, 256)
     with torch.inference_mode():
         embedding = network.encoder(network.branches(inputs))[-1]
@@ -82,7 +82,7 @@ def test_attention_starts_as_the_identity_and_matches_a_loop():
 
 def test_gradients_are_finite_and_autocast_returns_float32():
     torch.manual_seed(0)
-    network = VONet(0.125, attention=True)
+    network = VONet(NetworkOptions(kind="vonet-attention", width=0.125))
     inputs = make_inputs(1, 64, 96)
     with torch.autocast("cpu", torch.bfloat16):
         rotation, translation = network(inputs)

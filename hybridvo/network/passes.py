@@ -1,0 +1,42 @@
+"""A network's answer in several passes, each on what the one before left unexplained."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import nn
+
+from hybridvo.network.inputs import NetworkInputs
+from hybridvo.network.losses import NetworkOutput
+
+__all__ = ["first_motions", "predict"]
+
+Chooser = Callable[[NetworkOutput], torch.Tensor]
+"""From a network's output to its motion T_curr_prev (B, 4, 4): ``hybridvo.pose.selection``."""
+
+
+def predict(
+    network: nn.Module, inputs: NetworkInputs, choose: Chooser, passes: int | None = None
+) -> NetworkOutput:
+    """Output of the last of several passes.
+
+    Args:
+        network: of ``build_network``.
+        inputs: of size (h, w).
+        choose: how one motion comes out of an output; the next pass starts there.
+        passes: their number; by default the one that the network's options name.
+    """
+    passes = int(network.options.passes) if passes is None else passes
+    return network(inputs, first_motions(network, inputs, choose, passes - 1))
+
+
+def first_motions(
+    network: nn.Module, inputs: NetworkInputs, choose: Chooser, passes: int
+) -> torch.Tensor | None:
+    """(B, 4, 4) motions after a number of passes, without gradient; None for no pass at all."""
+    T = None
+    with torch.no_grad():
+        for _ in range(passes):
+            T = choose(network(inputs, T))
+    return T
