@@ -54,15 +54,25 @@ def interruptible() -> Iterator[Interruption]:
 
 
 class Progress:
-    """Frames done, on stderr: a bar on a terminal, plain lines elsewhere.
+    """Frames done, on stderr, with the time left: a bar on a terminal, plain lines elsewhere.
 
     Args:
-        total: frames. label: what is run. quiet: show nothing. stream: default stderr.
+        total: frames. label: what is run. quiet: show nothing. stream: default stderr. unit: what
+            is counted. before: how many an earlier session has done, which tell nothing of the
+            speed of this one.
     """
 
     def __init__(
-        self, total: int, label: str, *, quiet: bool = False, stream: IO[str] | None = None
+        self,
+        total: int,
+        label: str,
+        *,
+        quiet: bool = False,
+        stream: IO[str] | None = None,
+        unit: str = "frames",
+        before: int = 0,
     ) -> None:
+        self._unit, self._before = unit, before
         self._stream = stream if stream is not None else sys.stderr
         self._total, self._label, self._quiet = total, label, quiet
         self._done = 0
@@ -89,7 +99,9 @@ class Progress:
                 TimeRemainingColumn(),
                 console=Console(file=self._stream),
             )
-            self._task = self._bar.add_task(self._label, total=self._total, rate="")
+            self._task = self._bar.add_task(
+                self._label, total=self._total, completed=self._before, rate=""
+            )
             self._bar.start()
         return self
 
@@ -98,17 +110,22 @@ class Progress:
             self._bar.stop()
 
     def update(self, done: int, failed: int) -> None:
-        """``done`` frames of this session are finished, ``failed`` of all have failed."""
+        """``done`` frames are finished, ``failed`` of them have failed."""
         self._done, self._failed = done, failed
         now = time.monotonic()
-        rate = f"{done / max(now - self._started, 1e-9):.1f} pairs/s"
+        speed = (done - self._before) / max(now - self._started, 1e-9)
+        rate = f"{speed:.1f} pairs/s"
         if failed:
             rate += f", {failed} failed"
         if self._bar is not None:
             self._bar.update(self._task, completed=done, rate=rate)
         elif not self._quiet and (now - self._last >= PLAIN_INTERVAL_S or done == self._total):
             self._last = now
-            self._write(f"{self._label}: {done}/{self._total} frames, {rate}")
+            left = ""
+            if speed > 0 and done < self._total:
+                minutes, seconds = divmod(round((self._total - done) / speed), 60)
+                left = f", {minutes}:{seconds:02d} min left"
+            self._write(f"{self._label}: {done}/{self._total} {self._unit}, {rate}{left}")
 
     def say(self, text: str) -> None:
         """A line for the user, above the bar."""

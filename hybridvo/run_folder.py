@@ -13,7 +13,7 @@ import json
 import os
 import secrets
 import socket
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -47,6 +47,7 @@ class RunFolder:
             estimator); a mapping that JSON can hold.
         header: what else ``run.json`` says (command, versions, machine).
         mode: ``new`` refuses a folder with results, ``overwrite`` removes them, ``resume`` goes on.
+        results: names of the files that a finished run leaves.
 
     ``frames_done`` counts the kept rows, ``last`` is the latest of an earlier run; the rows stay on
     disk, so that memory does not grow with the sequence.
@@ -63,8 +64,10 @@ class RunFolder:
         identity: Mapping[str, Any],
         header: Mapping[str, Any],
         mode: Mode = "new",
+        results: Iterable[str] = RESULTS,
     ) -> None:
         self.path = Path(path)
+        self._results = tuple(results)
         self._identity = json.loads(json.dumps(jsonable(identity)))
         self._header = dict(header)
         self._partial: io.RawIOBase | None = None
@@ -98,7 +101,7 @@ class RunFolder:
 
     def _prepare(self, mode: Mode) -> None:
         self._done = False
-        present = [n for n in (STATE, PARTIAL, *RESULTS) if os.path.lexists(self.path / n)]
+        present = [n for n in (STATE, PARTIAL, *self._results) if os.path.lexists(self.path / n)]
         if mode == "new" and present:
             raise InputError(
                 f"{self.path}: holds results of a run already ({', '.join(present[:3])}"

@@ -43,6 +43,11 @@ IMPORTS: dict[str, set[str]] = {
         *("__init__", "errors", "types", "geometry", "data", "flow", "hybrid", "odometry"),
         *("trajectory", "evaluation", "configuration", "console", "run_folder", "run_results"),
     },
+    # what tools/compare_methods.py runs, on this machine and on others
+    "comparison": {
+        *("__init__", "errors", "types", "geometry", "data", "flow", "hybrid", "trajectory"),
+        *("evaluation", "configuration", "console", "run_folder", "run_results", "run"),
+    },
     # what stands at the door
     "demo": {"errors", "data", "evaluation", "configuration", "run"},
     "doctor": {"__init__", "errors", "hybrid"},

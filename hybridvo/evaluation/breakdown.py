@@ -51,7 +51,16 @@ import numpy as np
 
 from hybridvo.errors import InputError
 
-__all__ = ["FACTORS", "FAILURE_PX", "Factor", "PairTable", "breakdown", "wilson", "worst_pairs"]
+__all__ = [
+    "FACTORS",
+    "FAILURE_PX",
+    "Factor",
+    "PairTable",
+    "breakdown",
+    "failure_rate",
+    "wilson",
+    "worst_pairs",
+]
 
 FAILURE_PX = 1.0
 """Error of the ego flow at native size above which an estimate has failed, px."""
@@ -113,6 +122,7 @@ _NO_FACTOR = {
     "depth_spread": "needs a valid depth",
 }
 _ERRORS = ("epe_l2_px", "rot_err_deg", "trans_err")
+_COLUMNS = (*("failed", *_ERRORS, "r_err_deg", "t_err", "epe", "ms", "flow_ms"), *FACTORS)
 
 
 def wilson(
@@ -154,7 +164,7 @@ def wilson(
 class PairTable:
     """Errors and facts of all pairs, method by method, as columns of numbers.
 
-    Takes some two hundred bytes for a pair and a method: a million of them fit into memory.
+    Takes some 250 bytes for a pair and a method: a million of them fit into memory.
     """
 
     def __init__(self) -> None:
@@ -164,11 +174,10 @@ class PairTable:
     def add(self, row: Mapping[str, Any]) -> None:
         """Take a row of ``pairs.csv``."""
         group = str(row["method"]), str(row["flow_source"])
-        names = ("failed", *_ERRORS, *FACTORS)
-        columns = self._columns.setdefault(group, {name: array("d") for name in names})
+        columns = self._columns.setdefault(group, {name: array("d") for name in _COLUMNS})
         self._keys.setdefault(group, []).append((str(row["sequence"]), int(row["index"])))
         columns["failed"].append(float(str(row["status"]).startswith("failed")))
-        for name in names[1:]:
+        for name in _COLUMNS[1:]:
             value = row.get(name)
             columns[name].append(math.nan if value is None else float(value))
 
@@ -177,9 +186,22 @@ class PairTable:
         """(method, flow source) in the order in which they were first seen."""
         return list(self._columns)
 
-    def columns(self, group: tuple[str, str]) -> dict[str, np.ndarray]:
-        """(N,) arrays of a group: ``failed`` (0 or 1), the errors and the facts, NaN if unknown."""
-        return {name: np.asarray(values) for name, values in self._columns[group].items()}
+    def count(self, group: tuple[str, str]) -> int:
+        """Pairs of a group so far; 0 for an unknown one."""
+        return len(self._keys.get(group, ()))
+
+    def columns(self, group: tuple[str, str], start: int = 0) -> dict[str, np.ndarray]:
+        """Columns of a group: arrays (N,), NaN where unknown; empty for an unknown group.
+
+        Args:
+            group: (method, flow source).
+            start: pairs at the beginning that are left out.
+
+        Returns:
+            ``failed`` (0 or 1), the errors, the times and the facts, by name.
+        """
+        columns = self._columns.get(group) or {name: array("d") for name in _COLUMNS}
+        return {name: np.array(values[start:]) for name, values in columns.items()}
 
     def keys(self, group: tuple[str, str]) -> list[tuple[str, int]]:
         """(sequence, index) of each pair of a group."""
