@@ -17,12 +17,14 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
-from hybridvo.evaluation.report_data import Path3D, Series
+from hybridvo.evaluation.report_data import Path3D, Series, shown_box
 
 __all__ = [
     "PALETTE",
     "difference_svg",
+    "duration_svg",
     "error_svg",
     "factor_svg",
     "failure_svg",
@@ -134,12 +136,10 @@ def top_view_svg(paths: Sequence[Path3D], title: str, name: str) -> str:
             axes.plot(x, z, linewidth=1.4, gid=_gid(path.series), **_style(path.series))
     start = paths[0].positions[0]
     axes.plot(start[0], start[2], "o", color=_INK, markersize=5, zorder=5)
-    # a camera that stands still has a millimetre to stand on
-    centre = np.mean([p.positions.mean(axis=0)[[0, 2]] for p in paths], axis=0)
-    axes.update_datalim([centre - 5e-4, centre + 5e-4])
-    axes.margins(0.07)
+    low, high = shown_box(paths)
+    axes.set_xlim(low[0], high[0])
+    axes.set_ylim(low[2], high[2])
     axes.set_aspect("equal", adjustable="datalim")
-    axes.autoscale_view()
     return _svg(figure, title, name)
 
 
@@ -171,6 +171,8 @@ def error_svg(
     if limit is not None:
         axes.axhline(limit, color=_MUTED, linewidth=0.9, linestyle=":")
     axes.margins(x=0.02)
+    if labels[0] == "frame":
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     return _svg(figure, title, name)
 
 
@@ -249,8 +251,8 @@ def factor_svg(
     upper.axhline(1.0, color=_MUTED, linewidth=0.9, linestyle=":")
     lower.set_ylim(-0.03, 1.03)
     lower.set_yticks([0, 0.5, 1], ["0 %", "50 %", "100 %"])
-    names = [f"{_bin_name(*bounds[b][:2], share)}\n({bounds[b][2]})" for b in bins]
-    lower.set_xticks(range(len(bins)), names, fontsize=8)
+    ticks = [f"{_bin_name(*bounds[b][:2], share)}\n({bounds[b][2]})" for b in bins]
+    lower.set_xticks(range(len(bins)), ticks, fontsize=8)
     unit = f" [{factor['unit']}]" if factor["unit"] else ""
     _label(upper, "", "EPE [px]")
     _label(lower, f"{factor['label']}{unit}, (pairs)", "failures")
@@ -272,6 +274,7 @@ def failure_svg(
 ) -> str:
     """Failure rate of each series with its Wilson interval; ``rates`` as in the breakdown."""
     known = [r for r in rates if r["failure_rate"] is not None and _key(r) in series]
+    known.sort(key=lambda rate: (series[_key(rate)].m, series[_key(rate)].f))
     figure, (axes,) = _figure(1.0 + 0.24 * len(known))
     groups = [series[_key(r)] for r in known]
     for k, rate in enumerate(known):
@@ -325,7 +328,7 @@ def difference_svg(
         _points(axes, one, [middle], [k], [low], [high], across=True)
     axes.axvline(1.0, color=_MUTED, linewidth=0.9, linestyle=":")
     _names_axis(axes, [row[0] for row in rows], len({row[0].f for row in rows}))
-    _label(axes, f"error over that of {reference} on the same pairs (geometric mean)", "")
+    _label(axes, f"EPE over that of {reference}, geometric mean", "")
     return _svg(figure, title, name)
 
 
@@ -342,10 +345,20 @@ def timing_svg(lines: Sequence[Mapping[str, Any]], title: str, name: str) -> str
         _points(axes, row["series"], [row["ms_median"]], y, low, high)
         ends = [row["ms_q25"]], [row["ms_q75"]]
         _points(axes, row["series"], [row["ms_median"]], y, *ends, across=True)
-        axes.annotate(
-            row["method"], (row["ms_median"], y[0]), xytext=(5, 4), textcoords="offset points",
-            fontsize=8, color=_colour(row["series"]), gid=_gid(row["series"]),
-        )  # fmt: skip
     axes.axhline(1.0, color=_MUTED, linewidth=0.9, linestyle=":")
     _label(axes, "time per pair [ms]", "EPE [px]")
+    return _svg(figure, title, name)
+
+
+def duration_svg(lines: Sequence[Mapping[str, Any]], title: str, name: str) -> str:
+    """Time per pair of each series, medians with quartiles, logarithmic; ``lines``: headline."""
+    known = [row for row in lines if row["ms_median"] is not None]
+    figure, (axes,) = _figure(1.0 + 0.24 * max(len(known), 1))
+    axes.set_xscale("log")
+    for k, row in enumerate(known):
+        ends = [row["ms_median"]], [k], [row["ms_q25"]], [row["ms_q75"]]
+        _points(axes, row["series"], *ends, across=True)
+    groups = [row["series"] for row in known]
+    _names_axis(axes, groups, len({s.f for s in groups}))
+    _label(axes, "time per pair [ms]", "")
     return _svg(figure, title, name)

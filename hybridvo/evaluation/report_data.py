@@ -18,10 +18,11 @@ import numpy as np
 
 from hybridvo.errors import FormatError, HybridVOError, InputError
 from hybridvo.evaluation.metrics import AbsoluteError, ate
+from hybridvo.evaluation.results import Alignment
 from hybridvo.geometry import invert
 from hybridvo.trajectory import Trajectory, read_trajectory
 
-__all__ = ["Comparison", "Path3D", "Series", "read_comparison"]
+__all__ = ["Comparison", "Path3D", "Series", "read_comparison", "shown_box"]
 
 PAIR_NUMBERS = ("index", "epe_l2_px", "rot_err_deg", "trans_err", "ms")
 
@@ -243,11 +244,30 @@ def _paths_of(
 
 def align(est: Trajectory, truth: Trajectory) -> tuple[Trajectory, AbsoluteError | None]:
     """Estimate in the truth's world, rigidly, or by its first pose where a path is degenerate."""
-    for kind in ("se3", "origin"):
-        error = ate(est, truth, kind)  # type: ignore[arg-type]
+    kinds: tuple[Alignment, ...] = ("se3", "origin")
+    for kind in kinds:
+        error = ate(est, truth, kind)
         if error.T_gt_est is not None:
             return est.transformed(error.T_gt_est, error.scale or 1.0), error
     return est.transformed(truth.T_world_cam[0] @ invert(est.T_world_cam[0])), None
+
+
+def shown_box(paths: Iterable[Path3D]) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper corner, (3,) metres each, of what is worth showing of some paths.
+
+    All of them, but no more than twice the truth's extent beyond the truth: a method that runs away
+    must not press the others into a dot. At least a millimetre, for a camera that stands still.
+    """
+    paths = list(paths)
+    everything = np.concatenate([path.positions for path in paths])
+    low, high = everything.min(axis=0), everything.max(axis=0)
+    truth = next((path.positions for path in paths if path.series is None), None)
+    if truth is not None:
+        reach = max(2.0 * float(np.ptp(truth, axis=0).max()), 0.01)
+        low = np.maximum(low, truth.min(axis=0) - reach)
+        high = np.minimum(high, truth.max(axis=0) + reach)
+    margin = 0.06 * max(float((high - low).max()), 1e-3)
+    return low - margin, high + margin
 
 
 def _quartiles(values: np.ndarray) -> tuple[float | None, float | None, float | None]:

@@ -208,13 +208,16 @@ def _breakdown(comparison: Comparison) -> dict[str, Any] | None:
     }
 
 
-def _timing(comparison: Comparison) -> Any:
-    from hybridvo.evaluation.plots_comparison import timing_svg
+def _timing(comparison: Comparison) -> list[tuple[str, Any]]:
+    from hybridvo.evaluation.plots_comparison import duration_svg, timing_svg
 
-    names = ("ms_median", "epe_l2_px_median")
-    if not any(all(line[n] is not None for n in names) for line in comparison.headline):
-        return None
-    return _markup(timing_svg(comparison.headline, "error over time per pair", "tm"))
+    lines = [line for line in comparison.headline if line["ms_median"] is not None]
+    if not lines:
+        return []
+    plots = [("Time per pair", duration_svg(lines, "time per pair", "td"))]
+    if any(line["epe_l2_px_median"] is not None for line in lines):
+        plots.append(("Error against time", timing_svg(lines, "error against time", "tm")))
+    return [(caption, _markup(svg)) for caption, svg in plots]
 
 
 def _picture(path: Path) -> str:

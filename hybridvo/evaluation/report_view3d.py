@@ -13,7 +13,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hybridvo.evaluation.report_data import Path3D
+from hybridvo.evaluation.report_data import Path3D, shown_box
 
 __all__ = ["AZIMUTH", "ELEVATION", "project", "view_svg"]
 
@@ -59,25 +59,21 @@ def _text(point: np.ndarray, scale: float, text: str) -> str:
 
 
 def view_svg(paths: Sequence[Path3D], title: str) -> str:
-    """Paths over a grid on the lowest level, all within the picture however it is turned.
+    """Paths over a grid on their lowest level, within the picture as it stands at first.
 
     Args:
         paths: at least one; in the first camera, metres.
         title: for readers that do not see.
     """
-    everything = np.concatenate([path.positions for path in paths])
-    low, high = everything.min(axis=0), everything.max(axis=0)
-    extent = max(float((high - low).max()), 1e-3)
-    step = _nice(extent / (_LINES - 1))
-    first = np.floor(low / step)
-    count = np.maximum(np.ceil(high / step) - first, 1).astype(int)
-    x, z = (step * (first[i] + np.arange(count[i] + 1)) for i in (0, 2))
+    low, high = shown_box(paths)
+    step = _nice(float((high - low)[[0, 2]].max()) / (_LINES - 1))
+    x, z = (step * np.arange(np.floor(low[i] / step), np.ceil(high[i] / step) + 1) for i in (0, 2))
     ground = float(high[1])
-    centre = np.array([x.mean(), (low[1] + ground) / 2, z.mean()])
-    corner = np.array([np.ptp(x), high[1] - low[1], np.ptp(z)]) / 2
-    scale = 0.46 * min(WIDTH, HEIGHT) / max(float(np.linalg.norm(corner)), 1e-9)
-    # the view is wider than high, and so are most paths
-    scale *= 1.15
+    centre = (low + high) / 2
+    half = (high - low) / 2
+    across = max(float(np.hypot(half[0], half[2])), 1e-9)
+    upright = math.cos(ELEVATION) * half[1] + math.sin(ELEVATION) * across
+    scale = min(0.48 * WIDTH / across, 0.48 * HEIGHT / upright)
 
     def grid(a: tuple[float, float], b: tuple[float, float]) -> str:
         ends = np.array([[a[0], ground, a[1]], [b[0], ground, b[1]]]) - centre
