@@ -369,6 +369,8 @@ class RelativePose:
         information_eigenvalues: (6,) ascending, of the information matrix scaled to pixels.
         hypotheses: every strong motion found, the chosen one first.
         method: name of the estimator. ms: time spent, milliseconds.
+        terms: what carried the motion: ``flow``, ``depth`` (of the current frame), ``images``.
+        polish: :class:`hybridvo.pose.photometric.PolishReport` where images were asked, or None.
     """
 
     T_curr_prev: np.ndarray = field(default_factory=_identity)
@@ -386,6 +388,8 @@ class RelativePose:
     hypotheses: tuple[Hypothesis, ...] = ()
     method: str = ""
     ms: float = 0.0
+    terms: tuple[str, ...] = ()
+    polish: Any = None
 
     @property
     def ok(self) -> bool:
