@@ -23,7 +23,8 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument(
         "--sequence",
-        action="append",
+        action="extend",
+        nargs="+",
         required=True,
         metavar="DIR",
         help="sequence, or a folder of sequences (MPI Sintel as it was unpacked); repeatable",

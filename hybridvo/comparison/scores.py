@@ -188,9 +188,12 @@ def total_row(
         known = [row[key] for row in rows if row[key] is not None]
         scores[key] = float(np.mean(known)) if known else None
         if len(known) < len(rows):
-            without = [row for row in rows if row[key] is None]
+            without: dict[str, list[str]] = {}
+            for row in rows:
+                if row[key] is None:
+                    without.setdefault(row["reasons"][key], []).append(row["sequence"])
             reasons[key] = f"mean over {len(known)} of {len(rows)} sequences; without " + "; ".join(
-                f"{row['sequence']} ({row['reasons'][key]})" for row in without
+                f"{', '.join(names)} ({reason})" for reason, names in without.items()
             )
     return {
         "sequence": "all",

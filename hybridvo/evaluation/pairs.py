@@ -129,18 +129,20 @@ def _paper_epe(
     valid = np.isfinite(depth) & (depth > 0)
     if not valid.any():
         return None
-    v, u = np.mgrid[0:height, 0:width].astype(np.float64)
-    rays = np.linalg.inv(small[0]) @ np.stack([u, v, np.ones_like(u)]).reshape(3, -1)
-    points = rays * np.where(valid, depth, 1.0).reshape(-1)
+    depth = np.where(valid, depth, 1.0)
+    u, v = np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64)[:, None]
+    K_inv = np.linalg.inv(small[0])
     flows = []
     for T in (T_est, T_true):
-        moved = small[1] @ (T[:3, :3] @ points + T[:3, 3:])
+        A, b = small[1] @ T[:3, :3] @ K_inv, small[1] @ T[:3, 3]
+        x, y, z = (depth * (a[0] * u + (a[1] * v + a[2])) + c for a, c in zip(A, b, strict=True))
         # |z| as in the published code ("to avoid reflection"): never undefined
-        pixel = moved[:2] / (np.abs(moved[2]) + _PAPER_MIN_DEPTH)
-        flows.append(pixel - np.stack([u, v]).reshape(2, -1))
-    flow_est, flow_true = flows
-    counted = valid.reshape(-1) & (np.hypot(*flow_true) < PAPER_MAX_FLOW_PX)
-    return float(np.where(counted, np.abs(flow_est - flow_true), 0.0).mean())
+        z = np.abs(z) + _PAPER_MIN_DEPTH
+        flows.append((x / z - u, y / z - v))
+    (du_est, dv_est), (du_true, dv_true) = flows
+    counted = valid & (np.hypot(du_true, dv_true) < PAPER_MAX_FLOW_PX)
+    errors = np.abs(du_est - du_true) + np.abs(dv_est - dv_true)
+    return float(errors.sum(where=counted)) / (2 * height * width)
 
 
 def pair_errors(
