@@ -1,22 +1,40 @@
 """The join of the learned and the classical half: a pair in, its camera motion out.
 
-The only place where network and pose meet. Until the network's weights are part of the package the
-estimate is the classical refinement or a named baseline.
+The only place where network and pose meet. The classical half finds every strong motion of the
+picture and fits it exactly; the learned judge says which of them is the world and where the world
+is, and the motion is fitted there.
 """
 
 from __future__ import annotations
 
 import difflib
+import functools
 import time
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from hybridvo.errors import InputError
 from hybridvo.geometry import ego_flow, se3_exp
+from hybridvo.pose.judgement import default_judge
 from hybridvo.pose.refinement import RefinementOptions, refine
+from hybridvo.pose.second_look import Motions, Opinion, Verdict
 from hybridvo.types import Camera, Frame, FramePair, RelativePose
 
-__all__ = ["DEFAULT_METHOD", "METHODS", "check_method", "estimate", "warm_up"]
+if TYPE_CHECKING:
+    from hybridvo.network.judge import JudgeInputs, JudgeNetwork
+    from hybridvo.pose.coarse import Grid
+
+__all__ = [
+    "DEFAULT_METHOD",
+    "METHODS",
+    "LearnedJudge",
+    "check_method",
+    "estimate",
+    "shipped_judge",
+    "warm_up",
+]
 
 DEFAULT_METHOD = "refine"
 
@@ -29,9 +47,8 @@ _BASELINES = (
     "open3d-rgbd",
     "identity",
 )
+_JUDGED = ("hybrid", "hybrid-flow")
 _WITH_NETWORK = (
-    "hybrid",
-    "hybrid-flow",
     "pwvo",
     "pwvo-naive",
     "pixelwise",
@@ -39,7 +56,7 @@ _WITH_NETWORK = (
     "vonet-attention",
 )
 
-METHODS = (*_WITH_NETWORK[:2], "refine", *_WITH_NETWORK[2:], *_BASELINES)
+METHODS = (*_JUDGED, "refine", *_WITH_NETWORK, *_BASELINES)
 """Every method name, in the order of the results' tables."""
 
 
@@ -54,7 +71,13 @@ def check_method(method: str) -> None:
         near = difflib.get_close_matches(str(method), METHODS, n=1, cutoff=0.4)
         hint = f" (did you mean '{near[0]}'?)" if near else ""
         raise InputError(f"method: '{method}' is unknown{hint}; known: {', '.join(METHODS)}.")
-    if method in _WITH_NETWORK:
+    if method in _JUDGED:
+        from hybridvo.network.weights import pretrained_names
+
+        missing_weights = "judge" not in pretrained_names()
+    else:
+        missing_weights = method in _WITH_NETWORK
+    if missing_weights:
         raise InputError(
             f"method '{method}' needs network weights, which this version does not ship yet; "
             f"use --method refine (the classical refinement)."
@@ -100,10 +123,109 @@ def estimate(
     """
     if method == "refine":
         return refine(pair, T_last=T_last, options=options, seed=seed)
+    if method in _JUDGED:
+        judge = shipped_judge()
+        found = refine(pair, T_last=T_last, options=options, judge=judge, seed=seed)
+        return found.replace(method=method)
     check_method(method)
     from hybridvo.pose.baselines import baselines
 
     return baselines()[method](pair, seed=seed)
+
+
+class LearnedJudge:
+    """A judge network as :func:`hybridvo.pose.refinement.refine` takes it.
+
+    Keeps nothing between pairs: one judge may serve several threads.
+
+    Args:
+        network: of :func:`hybridvo.network.weights.load_weights`.
+    """
+
+    def __init__(self, network: JudgeNetwork) -> None:
+        import torch
+
+        self._network = network.eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+
+    def first_look(
+        self, grid: Grid, motions: Motions, T_last: np.ndarray | None, masks: int
+    ) -> Opinion:
+        """Scores of the motions of the search, and masks for the best, see ``PictureJudge``."""
+        import torch
+
+        with torch.inference_mode():
+            inputs = _judge_inputs(grid, motions, T_last)
+            features = self._network.encode(inputs)
+            best = features.score.argsort(descending=True, stable=True)[:masks]
+            mask = torch.sigmoid(self._network.decode(features, best)).numpy()
+        return Opinion(features.score.double().numpy(), best.numpy(), mask, (inputs, features))
+
+    def second_look(self, first: Opinion, refits: Motions, parents: np.ndarray) -> Verdict:
+        """Scores of all candidates and the probability that the best of them is right."""
+        import torch
+
+        inputs, features = first.memory
+        score, hidden = features.score, features.hidden
+        with torch.inference_mode():
+            if len(refits.poses):
+                again = replace(inputs, **_candidates(refits, parents))
+                second = self._network.encode(again, (inputs, features))
+                score = torch.cat([score, second.score])
+                hidden = torch.cat([hidden, second.hidden])
+            owner = torch.zeros(len(score), dtype=torch.int64)
+            trust = torch.sigmoid(self._network.confidence(score, hidden, owner, 1))
+        return Verdict(score.double().numpy(), float(trust))
+
+
+def _judge_inputs(grid: Grid, motions: Motions, T_last: np.ndarray | None) -> JudgeInputs:
+    """A batch of one picture."""
+    import torch
+
+    from hybridvo.network.judge import JudgeInputs
+
+    def batch(x: Any) -> torch.Tensor:
+        return torch.as_tensor(np.ascontiguousarray(x))[None]
+
+    last = np.eye(4) if T_last is None else np.asarray(T_last)
+    return JudgeInputs(
+        ray=batch(grid.ray),
+        depth=batch(grid.depth),
+        target=batch(grid.target),
+        flow_variance=batch(grid.flow_variance),
+        depth_variance=batch(grid.depth_variance),
+        usable=batch(grid.usable),
+        log_depth_curr=batch(grid.log_depth_curr),
+        K=batch(grid.K),
+        image_width=torch.tensor([float(grid.width)]),
+        T_last=batch(last[:3].astype(np.float32)),
+        has_last=torch.tensor([T_last is not None]),
+        **_candidates(motions, np.arange(len(motions.poses))),
+    )
+
+
+def _candidates(motions: Motions, parents: np.ndarray) -> dict[str, Any]:
+    import torch
+
+    return {
+        "owner": torch.zeros(len(motions.poses), dtype=torch.int64),
+        "parent": torch.as_tensor(parents, dtype=torch.int64),
+        "pose": torch.as_tensor(motions.poses, dtype=torch.float32),
+        "flow_noise": torch.as_tensor(motions.flow_noise, dtype=torch.float32),
+        "depth_noise": torch.as_tensor(motions.depth_noise, dtype=torch.float32),
+    }
+
+
+@functools.cache
+def shipped_judge() -> LearnedJudge:
+    """The judge whose weights are part of the package; read once in a process.
+
+    Raises:
+        CheckpointError: its weights are missing or damaged.
+    """
+    from hybridvo.network.weights import load_weights, pretrained
+
+    network, _ = load_weights(pretrained("judge"))
+    return LearnedJudge(network)  # type: ignore[arg-type]
 
 
 def warm_up(method: str = DEFAULT_METHOD) -> float:
@@ -131,6 +253,7 @@ def warm_up(method: str = DEFAULT_METHOD) -> float:
         valid = np.ones((height, width), np.bool_)
         variance = np.full((height, width), 0.01, np.float32)
         frame = Frame(None, depth, camera)
-        refine(FramePair(frame, frame, flow, variance, valid))
-        refine(FramePair(frame, frame, flow))
+        judge = shipped_judge() if method in _JUDGED else default_judge
+        refine(FramePair(frame, frame, flow, variance, valid), judge=judge)
+        refine(FramePair(frame, frame, flow), judge=judge)
     return time.perf_counter() - started

@@ -32,7 +32,7 @@ IMPORTS: dict[str, set[str]] = {
     "hybrid": CLASSICAL | {"network"},
     "odometry": CLASSICAL | {"flow", "hybrid", "trajectory"},
     "evaluation": NOUNS | {"geometry", "trajectory"},
-    "training": CLASSICAL | {"data", "network", "hybrid"},
+    "training": CLASSICAL | {"data", "flow", "network", "hybrid"},
     # one run of `hybridvo run`: what it writes, how it is set, and the loop around the tracker
     "console": {"errors"},
     "run_folder": {"errors", "evaluation"},

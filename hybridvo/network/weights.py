@@ -22,6 +22,7 @@ from safetensors.torch import save
 from torch import nn
 
 from hybridvo.errors import CheckpointError, InputError, OutputError
+from hybridvo.network.judge import JudgeNetwork, JudgeOptions
 from hybridvo.network.pwvo import NetworkOptions, build_network
 
 __all__ = ["FORMAT", "load_weights", "pretrained", "pretrained_names", "save_weights"]
@@ -32,6 +33,8 @@ FORMAT = "hybridvo-network-1"
 SHIPPED = Path(__file__).parent / "shipped"
 
 SAVED_TYPES = {"float16": torch.float16, "bfloat16": torch.bfloat16, "float32": torch.float32}
+AnyOptions = NetworkOptions | JudgeOptions
+
 STORED_TYPES = {"F16": 2, "BF16": 2, "F32": 4}
 """safetensors type -> bytes per number."""
 
@@ -42,7 +45,7 @@ LISTED = 6
 def save_weights(
     path: str | Path,
     network: nn.Module,
-    options: NetworkOptions,
+    options: AnyOptions,
     card: Mapping[str, Any],
     dtype: str = "float32",
 ) -> Path:
@@ -50,7 +53,7 @@ def save_weights(
 
     Args:
         path: of the file, by custom ``*.safetensors``; its folder must exist.
-        network: built by ``build_network(options)``.
+        network: built by ``build_network(options)``, or a :class:`JudgeNetwork`.
         options: of the network; stored in the header.
         card: model card, JSON values only: preset, samples seen, seed, command, commit, figures.
         dtype: ``float32``, or ``float16`` or ``bfloat16`` for half the size.
@@ -96,7 +99,7 @@ def load_weights(path: str | Path) -> tuple[nn.Module, dict[str, Any]]:
         path: of a file that :func:`save_weights` wrote.
 
     Returns:
-        The network, whose ``options`` attribute is its :class:`NetworkOptions`, and the model card.
+        The network, whose ``options`` attribute says what it is, and the model card.
 
     Raises:
         CheckpointError: missing, truncated, no safetensors file (a pickle, text), of another
@@ -166,18 +169,19 @@ def _known() -> str:
     return f"Shipped weights: {', '.join(names)}." if names else "No weights are shipped."
 
 
-def _skeleton(options: NetworkOptions) -> nn.Module:
+def _skeleton(options: AnyOptions) -> nn.Module:
     """Network without memory for its weights."""
     with torch.device("meta"):
-        network = build_network(options)
-    return network
+        if isinstance(options, JudgeOptions):
+            return JudgeNetwork(options)
+        return build_network(options)
 
 
-def _expected(options: NetworkOptions) -> dict[str, tuple[int, ...]]:
+def _expected(options: AnyOptions) -> dict[str, tuple[int, ...]]:
     return {name: tuple(v.shape) for name, v in _skeleton(options).state_dict().items()}
 
 
-def _read_header(path: Path, metadata: Mapping[str, str]) -> tuple[NetworkOptions, dict[str, Any]]:
+def _read_header(path: Path, metadata: Mapping[str, str]) -> tuple[AnyOptions, dict[str, Any]]:
     """Options and card of a header, or an error that says what is foreign about it."""
     if metadata.get("format") != FORMAT:
         raise CheckpointError(
@@ -192,7 +196,8 @@ def _read_header(path: Path, metadata: Mapping[str, str]) -> tuple[NetworkOption
             raise CheckpointError(f"{path}: the header's {key!r} is not JSON.") from None
         if not isinstance(parsed[key], dict):
             raise CheckpointError(f"{path}: expected the header's {key!r} to be a JSON object.")
-    names = {field.name for field in fields(NetworkOptions)}
+    kind = JudgeOptions if parsed["options"].get("kind") == "judge" else NetworkOptions
+    names = {field.name for field in fields(kind)}
     unknown = set(parsed["options"]) - names
     if unknown:
         raise CheckpointError(
@@ -201,7 +206,7 @@ def _read_header(path: Path, metadata: Mapping[str, str]) -> tuple[NetworkOption
         )
     # An option that is younger than the file has its default, which is what the file was made with.
     try:
-        return NetworkOptions(**parsed["options"]), parsed["card"]
+        return kind(**parsed["options"]), parsed["card"]
     except (InputError, TypeError) as error:
         raise CheckpointError(f"{path}: {error}") from None
 

@@ -10,6 +10,7 @@ pixel's covariance.
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
@@ -17,10 +18,11 @@ import numpy as np
 from hybridvo.errors import InputError
 from hybridvo.geometry import pose_matrix
 from hybridvo.pose import kernels, search, solver
+from hybridvo.pose.coarse import SOURCE_MASK, CoarseSearch, search_motions
 from hybridvo.pose.full_fit import FullFit, fit_full_grid
 from hybridvo.pose.judgement import CueGrid, Judge, default_judge
 from hybridvo.pose.options import RefinementOptions
-from hybridvo.pose.picture import Picture
+from hybridvo.pose.second_look import Decision, PictureJudge, decide
 from hybridvo.types import FramePair, Hypothesis, PairBatch, Reason, RelativePose, Status
 
 if TYPE_CHECKING:
@@ -29,6 +31,16 @@ if TYPE_CHECKING:
 __all__ = ["RefinementOptions", "refine"]
 
 SUPPORT_CUTOFF = 3.0
+TRUSTED = 0.5
+"""Probability of being right below which an answer is degraded."""
+
+SOURCES = {
+    0: "identity",
+    search.SOURCE_WINDOW: "window",
+    search.SOURCE_MINIMAL: "minimal",
+    SOURCE_MASK: "second-look",
+}
+"""Names of the starts; the others were handed in."""
 
 
 @overload
@@ -39,7 +51,7 @@ def refine(
     *,
     T_last: np.ndarray | None = None,
     options: RefinementOptions | None = None,
-    judge: Judge = default_judge,
+    judge: Judge | PictureJudge = default_judge,
     seed: int = 0,
 ) -> RelativePose: ...
 
@@ -55,7 +67,7 @@ def refine(
     *,
     T_last: np.ndarray | None = None,
     options: RefinementOptions | None = None,
-    judge: Judge = default_judge,
+    judge: Judge | PictureJudge = default_judge,
     seed: int = 0,
 ) -> RelativePose | BatchedPose:
     """Camera motion of a pair by robust dense reprojection, without any network.
@@ -67,7 +79,8 @@ def refine(
         weights: (H, W) factors on the information of each pixel; 0 and NaN switch a pixel off.
         T_last: (4, 4) the last camera motion: one more start, and a cue for the judge.
         options: see :class:`RefinementOptions`.
-        judge: chooses the world among the motions found; larger score wins.
+        judge: chooses the world among the motions found, by their cues (larger score wins) or, a
+            :class:`hybridvo.pose.second_look.PictureJudge`, by looking at each pixel.
         seed: of the minimal samples; the same seed gives the same bytes.
 
     Returns:
@@ -115,142 +128,92 @@ def _refine(
     weights: np.ndarray | None,
     T_last: np.ndarray | None,
     options: RefinementOptions,
-    judge: Judge,
+    judge: Judge | PictureJudge,
     seed: int,
 ) -> RelativePose:
     if pair.flow is None:
         return RelativePose.failed(Reason.NO_FLOW, "no optical flow for this pair", "refine")
     if pair.prev.depth is None:
         return RelativePose.failed(Reason.NO_VALID_DEPTH, "no depth for this frame", "refine")
-    picture = Picture(pair, weights)
-    coarse, h, w, stride = picture.samples(options.coarse_pixels)
-    usable = np.count_nonzero(coarse[kernels.W, : h * w] > 0)
-    box = (0, picture.shape[0], 0, picture.shape[1])
-    if usable < 0.1 * h * w or usable < 400:
-        # few usable pixels: look at all of them, and at a finer grid where they are
-        count, box = picture.usable_box()
-        if count < options.minimum_pixels:
-            return _too_few(pair, count, options.minimum_pixels)
-        picture.crop(pair.prev.camera, pair.curr.camera, box)
-        coarse, h, w, stride = picture.samples(options.coarse_pixels)
-    n = h * w
-    small, sh, sw, _ = picture.samples(options.search_pixels)
-    coarse_weight = coarse[kernels.W].copy()
-    depth_scale = search.translation_scale(coarse, n)
-    poses = np.zeros((options.hypotheses, 3, 4))
-    facts = np.zeros((options.hypotheses, search.FACTS))
-    found = search.find_motions(
-        small,
-        sh,
-        sw,
-        coarse,
-        h,
-        w,
-        picture.K,
-        starts,
-        options.cutoff,
-        options.decisive_share,
-        options.least_share,
-        options.hypotheses,
-        depth_scale,
-        seed,
-        poses,
-        facts,
-    )
-    coarse[kernels.W] = coarse_weight
-    if found == 0:
-        return RelativePose.failed(
-            Reason.DEGENERATE_GEOMETRY, "the pixels do not determine any motion", "refine"
-        )
-    hypotheses = _hypotheses(
-        picture, coarse, h, w, stride, poses[:found], facts[:found], T_last, judge
-    )
-    order = sorted(range(found), key=lambda k: -hypotheses[k].score)
-    hypotheses = [hypotheses[k] for k in order]
-    best = order[0]
+    found = search_motions(pair, starts, weights, options, seed)
+    if isinstance(found, RelativePose):
+        return found
+    poses, facts = found.poses, found.facts
+    by_cues = default_judge if isinstance(judge, PictureJudge) else judge
+    hypotheses = _hypotheses(found, poses, facts, T_last, by_cues)
+    scores = np.array([h.score for h in hypotheses])
+    best = int(np.argmax(scores))
+    decision, picture, samples = None, found.picture, found.samples
+    if isinstance(judge, PictureJudge) and not found.clear:
+        decision = decide(judge, found, found.grid(pair), scores, T_last, options)
+        poses, facts, best = decision.poses, decision.facts, decision.best
+        hypotheses += _hypotheses(found, poses[len(scores) :], facts[len(scores) :], T_last)
+        scores = decision.score
+        hypotheses = [replace(h, score=float(s)) for h, s in zip(hypotheses, scores, strict=True)]
+        if decision.mask is not None:
+            picture, samples = found.masked(pair, weights, decision.mask)
     fit = fit_full_grid(
         pair,
         picture,
-        coarse,
-        (h, w, stride),
+        samples,
+        found.shape,
         poses[best],
         (facts[best, search.FLOW_NOISE], facts[best, search.DEPTH_NOISE]),
-        depth_scale,
+        found.depth_scale,
         options,
     )
-    return _result(pair, picture, fit, int(facts[best, search.ITERATIONS]), hypotheses, box)
-
-
-def _too_few(pair: FramePair, count: int, minimum: int) -> RelativePose:
-    """The failure that names what is missing."""
-    depth, flow = pair.prev.depth, pair.flow
-    assert depth is not None and flow is not None
-    with np.errstate(invalid="ignore"):
-        depths = int(np.count_nonzero((depth > kernels.MIN_DEPTH) & (depth < kernels.MAX_VALUE)))
-        flows = int(np.count_nonzero((np.abs(flow) < kernels.MAX_VALUE).all(axis=2)))
-    if depths < minimum:
-        return RelativePose.failed(
-            Reason.NO_VALID_DEPTH, f"{depths} pixels with valid depth, {minimum} needed", "refine"
-        )
-    if flows < minimum:
-        return RelativePose.failed(
-            Reason.NO_FLOW, f"{flows} pixels with valid flow, {minimum} needed", "refine"
-        )
-    return RelativePose.failed(
-        Reason.LOW_INLIERS, f"{count} usable pixels, {minimum} needed", "refine"
-    )
+    if decision is not None and decision.mask is not None:
+        # the share of all pixels, not of those that the mask left
+        fit = replace(fit, share=fit.share * decision.kept)
+    order = [best, *(int(k) for k in np.argsort(-scores, kind="stable") if k != best)]
+    hypotheses = [hypotheses[k] for k in order]
+    return _result(pair, found, fit, int(facts[best, search.ITERATIONS]), hypotheses, decision)
 
 
 def _hypotheses(
-    picture: Picture,
-    coarse: np.ndarray,
-    h: int,
-    w: int,
-    stride: int,
+    found: CoarseSearch,
     poses: np.ndarray,
     facts: np.ndarray,
     T_last: np.ndarray | None,
-    judge: Judge,
+    judge: Judge | None = None,
 ) -> list[Hypothesis]:
-    """Support, cues and scores of the motions found, in the order found."""
-    n = h * w
+    """Support, cues and scores (0 without a judge) of motions, in their order."""
+    h, w, stride = found.shape
+    n = found.count
     work = solver.new_work()
     noise = np.empty(3, np.float32)
-    usable = (coarse[kernels.W, :n] > 0).reshape(h, w)
-    grid = CueGrid(usable, coarse[kernels.Z, :n].reshape(h, w))
-    found = []
+    usable = (found.samples[kernels.W, :n] > 0).reshape(h, w)
+    grid = CueGrid(usable, found.samples[kernels.Z, :n].reshape(h, w))
+    motions = []
     for pose, fact in zip(poses, facts, strict=True):
         weights = np.empty(n, np.float32)
         sf, sd = fact[search.FLOW_NOISE], fact[search.DEPTH_NOISE]
         solver.set_noise(max(sf, 0.05), sd, SUPPORT_CUTOFF, noise)
-        solver.robust_weights(coarse, n, pose, picture.K, noise, work, weights)
+        solver.robust_weights(found.samples, n, pose, found.picture.K, noise, work, weights)
         support = weights.reshape(h, w)
         T = pose_matrix(pose)
-        source = int(fact[search.SOURCE])
-        if source == search.SOURCE_WINDOW:
-            name = "window"
-        elif source == search.SOURCE_MINIMAL:
-            name = "minimal"
-        else:
-            name = "identity" if source == 0 else "handed-in"
-        found.append((T, support, name, grid.cues(support, T, T_last, sf)))
-    scores = np.asarray(judge([f[3] for f in found]), dtype=np.float64)
+        name = SOURCES.get(int(fact[search.SOURCE]), "handed-in")
+        motions.append((T, support, name, grid.cues(support, T, T_last, sf)))
+    scores = np.zeros(len(motions))
+    if judge is not None:
+        scores = np.asarray(judge([m[3] for m in motions]), dtype=np.float64)
     return [
         Hypothesis(T, support, stride, cue["share"], float(score), name, cue)
-        for (T, support, name, cue), score in zip(found, scores, strict=True)
+        for (T, support, name, cue), score in zip(motions, scores, strict=True)
     ]
 
 
 def _result(
     pair: FramePair,
-    picture: Picture,
+    found: CoarseSearch,
     fit: FullFit,
     iterations: int,
     hypotheses: list[Hypothesis],
-    box: tuple[int, int, int, int],
+    decision: Decision | None,
 ) -> RelativePose:
     """Status, and everything in the units and on the grid of the caller."""
     height, width = pair.prev.camera.shape
+    box, scale = found.box, found.picture.scale
     weights = fit.weights
     if box != (0, height, 0, width):
         weights = np.zeros((height, width), np.float32)
@@ -261,8 +224,8 @@ def _result(
         "inlier_ratio": float(min(1.0, fit.share)),
         "iterations": iterations + fit.iterations,
         "cost": fit.cost,
-        "residual_scale_px": float(fit.flow_noise * np.sqrt(picture.scale[0])),
-        "depth_noise": float(fit.depth_noise * np.sqrt(picture.scale[1])),
+        "residual_scale_px": float(fit.flow_noise * np.sqrt(scale[0])),
+        "depth_noise": float(fit.depth_noise * np.sqrt(scale[1])),
         "weights": weights,
         "information_eigenvalues": fit.eigenvalues,
         "hypotheses": tuple(hypotheses),
@@ -281,15 +244,22 @@ def _result(
     return RelativePose(
         T_curr_prev=T,
         covariance=fit.covariance,
-        status=_status(fit.share, hypotheses),
+        status=_status(fit.share, hypotheses, decision),
         translation_direction_valid=bool(np.linalg.norm(T[:3, 3]) > 3 * spread),
         **common,
     )
 
 
-def _status(share: float, hypotheses: list[Hypothesis]) -> Status:
+def _status(share: float, hypotheses: list[Hypothesis], decision: Decision | None) -> Status:
     """Ok, or degraded with the reason."""
-    if len(hypotheses) > 1:
+    if decision is not None:
+        if decision.trust < TRUSTED:
+            return Status.degraded(
+                Reason.AMBIGUOUS_MOTION,
+                f"which motion is the world is uncertain (probability of being right "
+                f"{100 * decision.trust:.0f} %)",
+            )
+    elif len(hypotheses) > 1:
         first, second = hypotheses[0], hypotheses[1]
         if first.score - second.score < 0.15 and second.share > 0.5 * first.share:
             return Status.degraded(

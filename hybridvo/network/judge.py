@@ -1,0 +1,434 @@
+"""The judge: which of the motions found is the world, and where is it.
+
+A small convolutional network looks at every candidate motion of a pair through what it leaves
+unexplained: the residuals of flow and second depth, measured against the noise that the candidate
+itself found, and the support it takes away from its rivals; beside them the picture's flow, depth
+and rays, each over the pair's own scale. It answers with a score, and with a second-look mask: the
+probability of each pixel to be static world. Judging few exact motions is a far easier question
+than segmenting motion from raw flow.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import nn
+
+from hybridvo.errors import InputError
+from hybridvo.network.layers import scaled
+
+__all__ = ["JudgeFeatures", "JudgeInputs", "JudgeNetwork", "JudgeOptions", "JudgeOutput"]
+
+CHANNELS = (24, 40, 64, 96)
+CANDIDATE_CHANNELS = 8
+SHARED_CHANNELS = 9
+SCALARS = 6
+HIDDEN = 96
+PIXEL_CHANNELS = 8
+MIRRORED_CANDIDATE = (0,)
+MIRRORED_SHARED = (0, 4)
+"""Channels that change their sign in a mirror."""
+
+REFERENCE_WIDTH = 1024.0
+"""px, width at which absolute residuals and noises are compared between pictures."""
+LEAST_FLOW_NOISE = 0.01
+SUPPORT_CUTOFF_SQUARED = 9.0
+DEPTH_FLOOR = 0.003
+"""Spread of log depth that even exact depths have between neighbouring pixels."""
+SMOOTH_JUMP = 0.01
+"""Change of motion, rad of the picture, at which the smoothness has fallen to a half."""
+
+
+@dataclass(frozen=True)
+class JudgeOptions:
+    """What decides the shapes of the judge's weights.
+
+    Args:
+        kind: ``judge``.
+        width: factor on all channel counts, in (0, 4].
+
+    Raises:
+        InputError: another kind or width.
+    """
+
+    kind: str = "judge"
+    width: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.kind != "judge":
+            raise InputError(f"JudgeOptions.kind: expected 'judge', got {self.kind!r}.")
+        if isinstance(self.width, bool) or not 0 < self.width <= 4:
+            raise InputError(f"JudgeOptions.width: expected 0 to 4, got {self.width!r}.")
+
+
+@dataclass(frozen=True, eq=False)
+class JudgeInputs:
+    """B pictures on their coarse grid (h, w) and N candidate motions of theirs.
+
+    Args:
+        ray: (B, 2, h, w) K^-1 x without the one.
+        depth: (B, h, w) metres.
+        target: (B, 2, h, w) px, x + flow.
+        flow_variance, depth_variance: (B, h, w) relative to the typical one.
+        usable: (B, h, w) bool.
+        log_depth_curr: (B, h, w) log metres of the second depth at the target; NaN where unknown.
+        K: (B, 4) fx, fy, cx, cy of the current camera, px.
+        image_width: (B,) px, of the whole picture.
+        T_last: (B, 3, 4) last motion of the camera. has_last: (B,) bool, whether it is known.
+        owner: (N,) int64, picture of each candidate.
+        parent: (N,) int64, for refits: the motion of the search it came from; for those: itself.
+        pose: (N, 3, 4) T_curr_prev.
+        flow_noise: (N,) px. depth_noise: (N,) of log depth, both found with the candidate.
+    """
+
+    ray: torch.Tensor
+    depth: torch.Tensor
+    target: torch.Tensor
+    flow_variance: torch.Tensor
+    depth_variance: torch.Tensor
+    usable: torch.Tensor
+    log_depth_curr: torch.Tensor
+    K: torch.Tensor
+    image_width: torch.Tensor
+    T_last: torch.Tensor
+    has_last: torch.Tensor
+    owner: torch.Tensor
+    parent: torch.Tensor
+    pose: torch.Tensor
+    flow_noise: torch.Tensor
+    depth_noise: torch.Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class JudgeOutput:
+    """Answers about N candidates.
+
+    Args:
+        score: (N,) larger is more likely the world; softmax over a picture's candidates.
+        mask: (N, h, w) logit of the probability that a pixel is static world.
+        hidden: (N, D) what :meth:`JudgeNetwork.confidence` looks at.
+        support: (N, h, w) robust weight in [0, 1] of each pixel under each candidate.
+    """
+
+    score: torch.Tensor
+    mask: torch.Tensor
+    hidden: torch.Tensor
+    support: torch.Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class JudgeFeatures:
+    """Scores of N candidates, and what their masks are made of.
+
+    Args:
+        score: (N,). hidden: (N, D). support: (N, h, w).
+        common: (B, C, h', w') the first layer's view of what the candidates of a picture share.
+        levels: input channels and features of :meth:`JudgeNetwork.encode`, finest first.
+    """
+
+    score: torch.Tensor
+    hidden: torch.Tensor
+    support: torch.Tensor
+    common: torch.Tensor
+    levels: tuple[torch.Tensor, ...]
+
+
+def _squash(x: torch.Tensor) -> torch.Tensor:
+    """sign(x) log(1 + |x|)."""
+    return torch.copysign(torch.log1p(x.abs()), x)
+
+
+def candidate_channels(
+    inputs: JudgeInputs, first: tuple[JudgeInputs, torch.Tensor] | None
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """(channels (N, 8, h, w), scalars (N, 6), support (N, h, w)) of every candidate.
+
+    ``first``: inputs and support of the motions of the search, where these are refits of them.
+    """
+    own = inputs.owner
+    x, y = inputs.ray[own, 0], inputs.ray[own, 1]
+    z, usable = inputs.depth[own], inputs.usable[own]
+    fx, fy, cx, cy = (c[:, None, None] for c in inputs.K[own].unbind(1))
+    P = inputs.pose[:, :, :, None, None]
+    a, b, c = (z * (P[:, i, 0] * x + P[:, i, 1] * y + P[:, i, 2]) + P[:, i, 3] for i in range(3))
+    front = c > 1e-6
+    i = 1.0 / torch.where(front, c, torch.ones_like(c))
+    a, b = a * i, b * i
+    ru = inputs.target[own, 0] - (fx * a + cx)
+    rv = inputs.target[own, 1] - (fy * b + cy)
+    qu = fx * i * (a * P[:, 2, 3] - P[:, 0, 3])
+    qv = fy * i * (b * P[:, 2, 3] - P[:, 1, 3])
+    # whitened by the symmetric root of sf^2 v_f I + sd^2 v_d q q^T
+    sf = inputs.flow_noise.clamp(min=LEAST_FLOW_NOISE)[:, None, None]
+    sd = inputs.depth_noise[:, None, None]
+    vd = sd * sd * inputs.depth_variance[own]
+    ip = 1.0 / (sf * sf * inputs.flow_variance[own])
+    g = vd * ip
+    root = torch.sqrt(1.0 + g * (qu * qu + qv * qv))
+    shrink = g / (root * (1.0 + root)) * (qu * ru + qv * rv)
+    scale = torch.sqrt(ip)
+    eu, ev = (ru - shrink * qu) * scale, (rv - shrink * qv) * scale
+    ok = usable & front
+    eu, ev = (torch.where(ok, e, torch.full_like(e, 1e3)).clamp(-1e3, 1e3) for e in (eu, ev))
+    d2 = eu * eu + ev * ev
+    support = torch.square(SUPPORT_CUTOFF_SQUARED / (SUPPORT_CUTOFF_SQUARED + d2)) * usable
+    wide = REFERENCE_WIDTH / inputs.image_width[own]
+    size = torch.sqrt(ru * ru + rv * rv) * wide[:, None, None]
+    size = torch.where(ok, size, torch.zeros_like(size))
+    second = inputs.log_depth_curr[own]
+    known = ok & torch.isfinite(second)
+    rz = torch.where(known, second, torch.zeros_like(z)) - torch.log(
+        torch.where(known, c, torch.ones_like(c))
+    )
+    ez = rz / torch.sqrt(2.0 * vd + DEPTH_FLOOR**2)
+    channels = torch.stack(
+        [
+            0.5 * _squash(eu),
+            0.5 * _squash(ev),
+            0.3 * torch.log1p(size),
+            0.5 * _squash(ez),
+            known.to(z.dtype),
+            0.3 * _squash(50.0 * rz),
+            support,
+            _rivals(inputs, support if first is None else first[1], (first or (inputs,))[0].owner),
+        ],
+        dim=1,
+    )
+    channels = channels * usable[:, None]
+    return channels, _scalars(inputs, support, wide, first is not None), support
+
+
+def _rivals(inputs: JudgeInputs, support: torch.Tensor, owner: torch.Tensor) -> torch.Tensor:
+    """(N, h, w): the largest support among the picture's other motions of the search."""
+    out = support.new_zeros((len(inputs.owner), *support.shape[1:]))
+    index = torch.arange(len(support), device=support.device)
+    for k in range(len(out)):
+        rival = (owner == inputs.owner[k]) & (index != inputs.parent[k])
+        if rival.any():
+            out[k] = support[rival].amax(0)
+    return out
+
+
+def _scalars(
+    inputs: JudgeInputs, support: torch.Tensor, wide: torch.Tensor, refits: bool
+) -> torch.Tensor:
+    """(N, 6): share, noises, whether it is a refit, nearness to the last motion and if known."""
+    own = inputs.owner
+    count = inputs.usable[own].sum((1, 2)).clamp(min=1)
+    share = support.sum((1, 2)) / count
+    step = torch.sum(torch.square(inputs.pose - inputs.T_last[own]).flatten(1)[:, _ROTATION], 1)
+    inverse = torch.where(inputs.usable, 1.0 / inputs.depth.clamp(min=1e-6), 0.0)
+    inverse = inverse.sum((1, 2)) / inputs.usable.sum((1, 2)).clamp(min=1)
+    shift = (inputs.pose - inputs.T_last[own])[:, :, 3].norm(dim=1) * inverse[own]
+    # the Frobenius norm of a difference of rotations is sqrt(2) times the angle
+    jump = torch.sqrt(step / 2.0) + shift
+    known = inputs.has_last[own].to(share.dtype)
+    smooth = known / (1.0 + (jump / SMOOTH_JUMP) ** 2)
+    return torch.stack(
+        [
+            share,
+            0.3 * torch.log(inputs.flow_noise.clamp(min=LEAST_FLOW_NOISE) * wide),
+            0.2 * torch.log(inputs.depth_noise.clamp(min=1e-4) / 1e-2),
+            torch.full_like(share, float(refits)),
+            smooth,
+            known,
+        ],
+        dim=1,
+    )
+
+
+_ROTATION = [0, 1, 2, 4, 5, 6, 8, 9, 10]
+
+
+def shared_channels(inputs: JudgeInputs) -> torch.Tensor:
+    """(B, 9, h, w): flow, inverse depth, validity, rays, border, variances of every picture."""
+    usable = inputs.usable
+    K = inputs.K[:, :, None, None]
+    # on the unit plane of the current camera: what is left is motion, whatever the lens
+    u = (inputs.target[:, 0] - K[:, 2]) / K[:, 0] - inputs.ray[:, 0]
+    v = (inputs.target[:, 1] - K[:, 3]) / K[:, 1] - inputs.ray[:, 1]
+    size = torch.sqrt(u * u + v * v)
+    typical = _median(size, usable).clamp(min=1e-5)
+    inverse = torch.where(usable, 1.0 / inputs.depth.clamp(min=1e-6), 0.0)
+    near = inverse / _median(inverse, usable).clamp(min=1e-9)
+    h, w = usable.shape[1:]
+    rows = torch.arange(h, device=u.device, dtype=u.dtype)
+    columns = torch.arange(w, device=u.device, dtype=u.dtype)
+    to_border = torch.minimum(
+        torch.minimum(rows, h - 1 - rows)[:, None], torch.minimum(columns, w - 1 - columns)[None]
+    )
+    border = torch.exp(-to_border / (0.06 * min(h, w))).expand(usable.shape)
+    channels = torch.stack(
+        [
+            _squash(u / typical),
+            _squash(v / typical),
+            torch.log1p(near),
+            usable.to(u.dtype),
+            inputs.ray[:, 0],
+            inputs.ray[:, 1],
+            border,
+            0.3 * torch.log(inputs.flow_variance.clamp(1e-3, 1e3)),
+            (0.2 * torch.log(size.clamp(min=1e-6) / 1e-2)),
+        ],
+        dim=1,
+    )
+    keep = usable[:, None].expand_as(channels).clone()
+    keep[:, 4:7] = True
+    return torch.where(keep, channels, torch.zeros_like(channels))
+
+
+def _median(x: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
+    """(B, 1, 1) median of the masked pixels of a quarter of the picture."""
+    x, mask = x[:, ::2, ::2].flatten(1), mask[:, ::2, ::2].flatten(1)
+    order = torch.where(mask, x, torch.full_like(x, torch.inf)).sort(1).values
+    middle = (mask.sum(1, keepdim=True) // 2).clamp(max=x.shape[1] - 1)
+    value = order.gather(1, middle)
+    return torch.where(torch.isfinite(value), value, torch.ones_like(value))[..., None]
+
+
+class _Block(nn.Module):
+    """Two 3x3 convolutions beside a shortcut; starts as the identity."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(channels, channels, 3, padding=1)
+        self.conv2 = nn.Conv2d(channels, channels, 3, padding=1)
+        nn.init.zeros_(self.conv2.weight)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """(N, C, h, w) -> the same."""
+        return F.relu_(x + self.conv2(F.relu_(self.conv1(x))))
+
+
+class JudgeNetwork(nn.Module):
+    """Scores and second-look masks of candidate motions.
+
+    Args:
+        options: width.
+    """
+
+    def __init__(self, options: JudgeOptions | None = None) -> None:
+        super().__init__()
+        self.options = options or JudgeOptions()
+        c1, c2, c3, c4 = (scaled(c, self.options.width) for c in CHANNELS)
+        hidden = scaled(HIDDEN, self.options.width)
+        self.candidate = nn.Conv2d(CANDIDATE_CHANNELS, c1, 3, 2, 1)
+        self.shared = nn.Conv2d(SHARED_CHANNELS, c1, 3, 2, 1)
+        self.down2, self.block2 = nn.Conv2d(c1, c2, 3, 2, 1), _Block(c2)
+        self.down3, self.block3 = nn.Conv2d(c2, c3, 3, 2, 1), _Block(c3)
+        self.down4, self.block4 = nn.Conv2d(c3, c4, 3, 2, 1), _Block(c4)
+        self.scalars = nn.Linear(SCALARS, c4)
+        self.summary = nn.Linear(2 * c4 + c3 + SCALARS, hidden)
+        self.inner = nn.Linear(hidden, hidden)
+        self.score = nn.Linear(hidden, 1)
+        self.doubt = nn.Linear(2 * hidden + 2, hidden)
+        self.trust = nn.Linear(hidden, 1)
+        self.up3 = nn.Conv2d(c4, c3, 1)
+        self.merge3 = nn.Conv2d(c3, c2, 3, padding=1)
+        self.merge2 = nn.Conv2d(c2, c1, 3, padding=1)
+        self.merge1 = nn.Conv2d(c1, 16, 3, padding=1)
+        self.context = nn.Conv2d(16, PIXEL_CHANNELS, 1)
+        self.pixel = nn.Conv2d(CANDIDATE_CHANNELS, PIXEL_CHANNELS, 1)
+        self.mask = nn.Conv2d(PIXEL_CHANNELS, 1, 1)
+        nn.init.zeros_(self.score.weight)
+        nn.init.zeros_(self.trust.weight)
+
+    def forward(
+        self,
+        inputs: JudgeInputs,
+        first: tuple[JudgeInputs, JudgeOutput] | None = None,
+        mirror: torch.Tensor | None = None,
+    ) -> JudgeOutput:
+        """Answers about every candidate.
+
+        Args:
+            inputs: pictures and candidates.
+            first: for refits, the motions of the search and the answers about them.
+            mirror: (B,) bool, pictures to look at in a mirror (training); the masks come back
+                unmirrored.
+        """
+        features = self.encode(inputs, first, mirror)
+        mask = self.decode(features)
+        if mirror is not None:
+            mask = torch.where(mirror[inputs.owner][:, None, None], mask.flip(2), mask)
+        return JudgeOutput(features.score, mask, features.hidden, features.support)
+
+    def encode(
+        self,
+        inputs: JudgeInputs,
+        first: tuple[JudgeInputs, JudgeOutput | JudgeFeatures] | None = None,
+        mirror: torch.Tensor | None = None,
+    ) -> JudgeFeatures:
+        """Scores without masks; arguments as those of :meth:`forward`."""
+        rivals = None if first is None else (first[0], first[1].support)
+        channels, scalars, support = candidate_channels(inputs, rivals)
+        if mirror is not None:
+            channels = _mirrored(channels, mirror[inputs.owner], MIRRORED_CANDIDATE)
+        channels = _padded(channels)
+        if first is not None and isinstance(first[1], JudgeFeatures):
+            common = first[1].common
+        else:
+            shared = shared_channels(inputs)
+            if mirror is not None:
+                shared = _mirrored(shared, mirror, MIRRORED_SHARED)
+            common = self.shared(_padded(shared))
+        x1 = F.relu_(self.candidate(channels) + common[inputs.owner])
+        x2 = self.block2(F.relu_(self.down2(x1)))
+        x3 = self.block3(F.relu_(self.down3(x2)))
+        x4 = self.down4(x3) + self.scalars(scalars)[:, :, None, None]
+        x4 = self.block4(F.relu_(x4))
+        pooled = [x4.mean((2, 3)), x4.amax((2, 3)), x3.mean((2, 3)), scalars]
+        hidden = F.relu(self.summary(torch.cat(pooled, 1)))
+        hidden = F.relu(self.inner(hidden))
+        score = self.score(hidden)[:, 0]
+        return JudgeFeatures(score, hidden, support, common, (channels, x1, x2, x3, x4))
+
+    def decode(self, features: JudgeFeatures, pick: torch.Tensor | None = None) -> torch.Tensor:
+        """(N, h, w) logits of the second-look masks, of all candidates or of ``pick`` (R,)."""
+        levels = features.levels
+        if pick is not None:
+            levels = tuple(x[pick] for x in levels)
+        channels, x1, x2, x3, x4 = levels
+        y = F.interpolate(self.up3(x4), scale_factor=2.0)
+        y = F.interpolate(self.merge3(F.relu_(y + x3)), scale_factor=2.0)
+        y = F.interpolate(self.merge2(F.relu_(y + x2)), scale_factor=2.0)
+        y = F.relu_(self.merge1(F.relu_(y + x1)))
+        y = F.interpolate(self.context(y), scale_factor=2.0, mode="bilinear", align_corners=False)
+        h, w = features.support.shape[1:]
+        return self.mask(F.relu_(y + self.pixel(channels)))[:, 0, :h, :w]
+
+    def confidence(
+        self, score: torch.Tensor, hidden: torch.Tensor, owner: torch.Tensor, pictures: int
+    ) -> torch.Tensor:
+        """(B,) logit of the probability that the best candidate of a picture is right.
+
+        Args:
+            score: (N,) of all of its candidates, refits included.
+            hidden: (N, D).
+            owner: (N,) picture of each.
+            pictures: B.
+        """
+        out = []
+        for b in range(pictures):
+            mine = owner == b
+            share = torch.softmax(score[mine], 0)
+            best = hidden[mine]
+            mean = (share[:, None] * best).sum(0)
+            extra = torch.stack([share.max(), torch.logsumexp(score[mine], 0).clamp(-20, 20) / 10])
+            out.append(torch.cat([mean, best[share.argmax()], extra]))
+        return self.trust(F.relu(self.doubt(torch.stack(out))))[:, 0]
+
+
+def _padded(x: torch.Tensor) -> torch.Tensor:
+    """Zeros below and on the right, up to a multiple of what the network divides by."""
+    pad = (0, -x.shape[3] % 16, 0, -x.shape[2] % 16)
+    return F.pad(x, pad).contiguous(memory_format=torch.channels_last)
+
+
+def _mirrored(x: torch.Tensor, mirror: torch.Tensor, signed: tuple[int, ...]) -> torch.Tensor:
+    """Pictures (N, C, h, w) with those of ``mirror`` (N,) seen in a mirror."""
+    turned = x.flip(3)
+    turned[:, list(signed)] *= -1
+    return torch.where(mirror[:, None, None, None], turned, x)

@@ -1,0 +1,174 @@
+"""The second look: a judge of pictures says which motion is the world and where the world is, the
+best few motions are fitted again inside its masks, and it judges old and new ones together.
+
+The judge is handed in (:class:`PictureJudge`); this room knows no network.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+
+from hybridvo.pose import kernels, search
+from hybridvo.pose.coarse import CoarseSearch, Grid, fit_in_mask
+from hybridvo.pose.options import RefinementOptions
+
+__all__ = ["Decision", "Motions", "Opinion", "PictureJudge", "Verdict", "decide", "mask_weights"]
+
+REFITS = 2
+"""Motions that are fitted again inside their masks."""
+REFIT_MARGIN = 0.0
+"""By how much the score of a refit must exceed that of the best motion of the search."""
+LEAST_TRUST = 0.1
+"""Probability of being right below which the classical choice stands."""
+LEAST_MASK = 0.02
+"""Share of the usable pixels that a mask must keep for a fit inside it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Motions:
+    """Candidate motions of one pair.
+
+    Args:
+        poses: (N, 3, 4) T_curr_prev. flow_noise: (N,) px. depth_noise: (N,) of log depth.
+    """
+
+    poses: np.ndarray
+    flow_noise: np.ndarray
+    depth_noise: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Opinion:
+    """What the judge says about the motions of the search.
+
+    Args:
+        score: (N,) larger is more likely the world.
+        best: (R,) int64, the motions with the largest scores.
+        mask: (R, h, w) for each of them the probability of every pixel to be static world.
+        memory: whatever the judge wants back for the second look.
+    """
+
+    score: np.ndarray
+    best: np.ndarray
+    mask: np.ndarray
+    memory: Any = None
+
+
+@dataclass(frozen=True, eq=False)
+class Verdict:
+    """What it says after the second look.
+
+    Args:
+        score: (N + R,) of the motions of the search and of the refits, comparable.
+        trust: probability that the motion with the largest score is right.
+    """
+
+    score: np.ndarray
+    trust: float
+
+
+@runtime_checkable
+class PictureJudge(Protocol):
+    """Judges the motions of a pair by what they leave unexplained, pixel by pixel."""
+
+    def first_look(
+        self, grid: Grid, motions: Motions, T_last: np.ndarray | None, masks: int
+    ) -> Opinion:
+        """Scores of the motions of the search, and masks for the best of them.
+
+        Args:
+            grid: the pixels.
+            motions: N of the search.
+            T_last: (4, 4) the last motion, or None.
+            masks: how many masks are wanted; R is the smaller of it and N.
+        """
+
+    def second_look(self, first: Opinion, refits: Motions, parents: np.ndarray) -> Verdict:
+        """Scores of all; ``parents`` (R,): the motion whose mask each refit was fitted in."""
+
+
+@dataclass(frozen=True, eq=False)
+class Decision:
+    """Candidates, and which of them is the world.
+
+    Args:
+        poses: (N + R, 3, 4). facts: (N + R, :data:`hybridvo.pose.search.FACTS`).
+        score: (N + R,).
+        best: index of the world.
+        mask: (h, w) weights that it was fitted with, or None for a motion of the search.
+        kept: share of the usable pixels' weight that the mask leaves.
+        trust: probability that it is right. abstained: the classical choice stands.
+    """
+
+    poses: np.ndarray
+    facts: np.ndarray
+    score: np.ndarray
+    best: int
+    mask: np.ndarray | None
+    kept: float
+    trust: float
+    abstained: bool
+
+
+def mask_weights(probability: np.ndarray) -> np.ndarray:
+    """Weights of a fit from probabilities to be static: 0 below 0.2, 1 above 0.8."""
+    return np.clip((probability - 0.2) / 0.6, 0.0, 1.0).astype(np.float32)
+
+
+def decide(
+    judge: PictureJudge,
+    found: CoarseSearch,
+    grid: Grid,
+    classical: np.ndarray,
+    T_last: np.ndarray | None,
+    options: RefinementOptions,
+) -> Decision:
+    """Judge, fit the best again inside their masks, judge again.
+
+    Args:
+        judge: of pictures.
+        found: motions of the search.
+        grid: its pixels.
+        classical: (N,) scores of the hand-made judge, for when the judge trusts nothing.
+        T_last: (4, 4) the last motion of the camera, or None.
+        options: of the refinement.
+    """
+    motions = _motions(found.poses, found.facts)
+    first = judge.first_look(grid, motions, T_last, REFITS)
+    usable = found.samples[kernels.W, : found.count]
+    total = float(usable.sum())
+    poses, facts, parents, masks = [], [], [], []
+    for k, probability in zip(first.best, first.mask, strict=True):
+        weights = mask_weights(probability)
+        if float(usable @ weights.reshape(-1)) < LEAST_MASK * total:
+            continue
+        pose, fact = fit_in_mask(
+            found.samples, weights, found.picture.K, found.poses[k], options.cutoff
+        )
+        if np.isfinite(pose).all() and fact[search.SHARE] > 0:
+            poses.append(pose)
+            facts.append(fact)
+            parents.append(int(k))
+            masks.append(weights)
+    count = len(found.poses)
+    every_pose = np.concatenate([found.poses, np.reshape(poses, (-1, 3, 4))])
+    every_fact = np.concatenate([found.facts, np.reshape(facts, (-1, search.FACTS))])
+    refits = _motions(every_pose[count:], every_fact[count:])
+    verdict = judge.second_look(first, refits, np.array(parents, np.int64))
+    score = np.where(np.isfinite(verdict.score), verdict.score, -np.inf)
+    score[count:] -= REFIT_MARGIN
+    best = int(np.argmax(score))
+    abstained = not verdict.trust >= LEAST_TRUST
+    if abstained:
+        best = int(np.argmax(classical))
+    mask = masks[best - count] if best >= count else None
+    kept = 1.0 if mask is None else float(usable @ mask.reshape(-1)) / total
+    trust = float(verdict.trust) if np.isfinite(verdict.trust) else 0.0
+    return Decision(every_pose, every_fact, score, best, mask, kept, trust, abstained)
+
+
+def _motions(poses: np.ndarray, facts: np.ndarray) -> Motions:
+    return Motions(poses, facts[:, search.FLOW_NOISE], facts[:, search.DEPTH_NOISE])

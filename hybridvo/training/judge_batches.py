@@ -1,0 +1,175 @@
+"""Pictures of shards as batches of the judge, and fits inside the masks that it draws."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from hybridvo.network.judge import JudgeInputs, JudgeOutput
+from hybridvo.pose import kernels, search
+from hybridvo.pose.coarse import fit_in_mask
+from hybridvo.pose.options import RefinementOptions
+from hybridvo.pose.second_look import mask_weights
+
+__all__ = ["PictureBatch", "ego_flow_error", "read_batches", "refits_of"]
+
+
+@dataclass(frozen=True, eq=False)
+class PictureBatch:
+    """B pictures of one grid shape, their motions as N candidates, and the truth.
+
+    Args:
+        inputs: what the judge sees.
+        samples: (B, 8, n) float32 pixel buffers of the solver.
+        depth_true: (B, h, w) metres, 0 where unknown. label: (B, h, w) of ``judge_data``.
+        T: (B, 3, 4) true T_curr_prev.
+        source: (B,) 0 wide, 1 rendered with true (or noisy) flow, 2 rendered with DIS flow.
+    """
+
+    inputs: JudgeInputs
+    samples: np.ndarray
+    depth_true: torch.Tensor
+    label: torch.Tensor
+    T: torch.Tensor
+    source: np.ndarray
+
+
+def _collate(p: dict[str, np.ndarray]) -> PictureBatch:
+    """Stacked arrays of pictures -> batch."""
+    size, _, h, w = p["exact"].shape
+    coarse = p["coarse"].astype(np.float32)
+    samples = np.empty((size, kernels.BUFFER_ROWS, h * w), np.float32)
+    order = [kernels.XN, kernels.YN, kernels.Z, kernels.MU, kernels.MV]
+    samples[:, order] = p["exact"].reshape(size, 5, -1)
+    samples[:, [kernels.PF, kernels.PD, kernels.W]] = coarse.reshape(size, 3, -1)
+    owner = np.repeat(np.arange(size), p["count"])
+    picks = [(b, k) for b in range(size) for k in range(p["count"][b])]
+    pose = np.stack([p["poses"][i] for i in picks])
+    facts = np.stack([p["facts"][i] for i in picks])
+
+    def tensor(x: Any, kind: torch.dtype = torch.float32) -> torch.Tensor:
+        return torch.as_tensor(np.ascontiguousarray(x)).to(kind)
+
+    exact = tensor(p["exact"])
+    inputs = JudgeInputs(
+        ray=exact[:, 0:2],
+        depth=exact[:, 2],
+        target=exact[:, 3:5],
+        flow_variance=1.0 / tensor(coarse[:, 0]).clamp(min=1e-6),
+        depth_variance=tensor(coarse[:, 1]),
+        usable=tensor(coarse[:, 2] > 0, torch.bool),
+        log_depth_curr=tensor(p["log_depth"]),
+        K=tensor(p["K"]),
+        image_width=tensor(p["width"]),
+        T_last=tensor(p["T_last"]),
+        has_last=tensor(p["has_last"], torch.bool),
+        owner=tensor(owner, torch.int64),
+        parent=torch.arange(len(owner)),
+        pose=tensor(pose),
+        flow_noise=tensor(facts[:, search.FLOW_NOISE]),
+        depth_noise=tensor(facts[:, search.DEPTH_NOISE]),
+    )
+    return PictureBatch(
+        inputs,
+        samples,
+        tensor(p["depth_true"]),
+        tensor(p["label"], torch.int64),
+        tensor(p["T"]),
+        np.asarray(p["source"]),
+    )
+
+
+def read_batches(
+    files: list[Path], batch_size: int, rng: np.random.Generator | None
+) -> Iterator[PictureBatch]:
+    """Batches of the pictures of some shards, mixed if ``rng`` is given."""
+    by_shape: dict[str, list[Path]] = {}
+    for file in files:
+        by_shape.setdefault(file.stem.split("_")[-1], []).append(file)
+    jobs = []
+    pictures: dict[str, dict[str, np.ndarray]] = {}
+    for shape, members in by_shape.items():
+        loaded = [dict(np.load(member)) for member in members]
+        pictures[shape] = {key: np.concatenate([x[key] for x in loaded]) for key in loaded[0]}
+        order = np.arange(len(pictures[shape]["count"]))
+        if rng is not None:
+            rng.shuffle(order)
+        jobs += [(shape, order[k : k + batch_size]) for k in range(0, len(order), batch_size)]
+    if rng is not None:
+        rng.shuffle(jobs)
+    for shape, index in jobs:
+        yield _collate({key: value[index] for key, value in pictures[shape].items()})
+
+
+def ego_flow_error(pose: torch.Tensor, owner: torch.Tensor, batch: PictureBatch) -> torch.Tensor:
+    """(N,) mean distance of the ego flows of pose and truth, px at a width of 1024."""
+    pick = (slice(None), slice(None, None, 2), slice(None, None, 2))
+    z = batch.depth_true[pick]
+    ray = batch.inputs.ray[:, :, ::2, ::2]
+    K = batch.inputs.K
+
+    def project(P: torch.Tensor, of: torch.Tensor) -> torch.Tensor:
+        P = P[:, :, :, None, None]
+        x, y, depth = ray[of, 0], ray[of, 1], z[of]
+        X, Y, Z = (
+            depth * (P[:, i, 0] * x + P[:, i, 1] * y + P[:, i, 2]) + P[:, i, 3] for i in range(3)
+        )
+        Z = Z.clamp(min=1e-3)
+        fx, fy = K[of, 0, None, None], K[of, 1, None, None]
+        return torch.stack([fx * X / Z, fy * Y / Z], 1)
+
+    truth = project(batch.T, torch.arange(len(batch.T)))
+    distance = (project(pose, owner) - truth[owner]).norm(dim=1)
+    known = (z > 0)[owner]
+    total = torch.where(known, distance.clamp(max=1e3), 0.0).sum((1, 2))
+    error = total / known.sum((1, 2)).clamp(min=1)
+    return error * 1024.0 / batch.inputs.image_width[owner]
+
+
+def refits_of(
+    batch: PictureBatch, out: JudgeOutput, count: int, extra: torch.Generator | None = None
+) -> JudgeInputs | None:
+    """The best motions of every picture, fitted inside their masks, as candidates of their own.
+
+    Args:
+        batch: pictures.
+        out: answers about their motions.
+        count: fits of a picture.
+        extra: draws one of them anew at times (training), so that more than the best is seen.
+    """
+    inputs = batch.inputs
+    cutoff = RefinementOptions().cutoff
+    probability = torch.sigmoid(out.mask).numpy()
+    poses, found, parents = [], [], []
+    for b in range(len(batch.T)):
+        mine = torch.nonzero(inputs.owner == b)[:, 0]
+        order = mine[out.score[mine].argsort(descending=True)].tolist()
+        if extra is not None and len(order) > count and torch.rand((), generator=extra) < 0.3:
+            swap = int(torch.randint(count, len(order), (), generator=extra))
+            order[count - 1], order[swap] = order[swap], order[count - 1]
+        for k in order[:count]:
+            start = inputs.pose[k].numpy().astype(np.float64)
+            pose, fact = fit_in_mask(
+                batch.samples[b], mask_weights(probability[k]), inputs.K[b].numpy(), start, cutoff
+            )
+            if np.isfinite(pose).all():
+                poses.append(pose)
+                found.append(fact)
+                parents.append(k)
+    if not poses:
+        return None
+    facts = torch.as_tensor(np.stack(found), dtype=torch.float32)
+    parent = torch.tensor(parents)
+    return replace(
+        inputs,
+        owner=inputs.owner[parent],
+        parent=parent,
+        pose=torch.as_tensor(np.stack(poses), dtype=torch.float32),
+        flow_noise=facts[:, search.FLOW_NOISE],
+        depth_noise=facts[:, search.DEPTH_NOISE],
+    )
