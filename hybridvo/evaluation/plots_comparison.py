@@ -46,6 +46,7 @@ MARKERS = "osD^vPX<>phd*8HH"
 _STYLES = ("-", (0, (4, 2)), (0, (1, 1.5)), (0, (6, 1.5, 1, 1.5)))
 _INK, _MUTED, _GRID, _BAND = "#0a0c01", "#0a0c02", "#0a0c03", "#0a0c04"
 _NAMES = {_INK: "ink", _MUTED: "muted", _GRID: "grid", _BAND: "band"}
+_ASPECT = 1.55
 MAX_POINTS = 300
 """Points of a line: more cannot be told apart at the size of the plots."""
 FLOOR_PX = 1e-5
@@ -137,9 +138,12 @@ def top_view_svg(paths: Sequence[Path3D], title: str, name: str) -> str:
     start = paths[0].positions[0]
     axes.plot(start[0], start[2], "o", color=_INK, markersize=5, zorder=5)
     low, high = shown_box(paths)
-    axes.set_xlim(low[0], high[0])
-    axes.set_ylim(low[2], high[2])
-    axes.set_aspect("equal", adjustable="datalim")
+    middle, size = (low + high) / 2, high - low
+    # the shape of the picture, so that equal scales leave no empty border
+    half = max(size[0] / _ASPECT, size[2]) / 2
+    axes.set_xlim(middle[0] - _ASPECT * half, middle[0] + _ASPECT * half)
+    axes.set_ylim(middle[2] - half, middle[2] + half)
+    axes.set_aspect("equal", adjustable="box")
     return _svg(figure, title, name)
 
 

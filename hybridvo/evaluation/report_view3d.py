@@ -15,13 +15,13 @@ import numpy as np
 
 from hybridvo.evaluation.report_data import Path3D, shown_box
 
-__all__ = ["AZIMUTH", "ELEVATION", "project", "view_svg"]
+__all__ = ["ELEVATION", "project", "view_svg"]
 
-AZIMUTH, ELEVATION = -0.6, 0.55
-"""Where the viewer stands at first, radians: turned about the vertical, raised over the ground."""
+ELEVATION = 0.55
+"""How far the viewer stands over the ground at first, radians."""
 WIDTH, HEIGHT = 374.0, 259.0
 MAX_POINTS = 200
-_LINES = 6
+_LINES = 9
 
 
 def project(points: np.ndarray, azimuth: float, elevation: float) -> np.ndarray:
@@ -44,17 +44,23 @@ def _nice(value: float) -> float:
     return next(f * power for f in (1, 2, 5, 10) if f * power >= value * (1 - 1e-9))
 
 
-def _polyline(points: np.ndarray, scale: float, attributes: str) -> str:
-    scaled = np.atleast_2d(points) * scale
-    flat = project(scaled, AZIMUTH, ELEVATION)
+def _fitting_scale(points: np.ndarray, azimuth: float) -> float:
+    """Units of the picture per metre with which points about its middle fill it."""
+    reach = np.maximum(np.abs(project(points, azimuth, ELEVATION)).max(axis=0), 1e-9)
+    return float(min(0.44 * WIDTH / reach[0], 0.44 * HEIGHT / reach[1]))
+
+
+def _polyline(points: np.ndarray, azimuth: float, attributes: str) -> str:
+    """Line through points that are in units of the picture already."""
+    flat = project(points, azimuth, ELEVATION)
     shown = " ".join(f"{u:.1f},{v:.1f}" for u, v in flat)
-    kept = " ".join(f"{value:.1f}" for value in scaled.ravel())
+    kept = " ".join(f"{value:.1f}" for value in points.ravel())
     return f'<polyline {attributes} data-p="{kept}" points="{shown}"/>'
 
 
-def _text(point: np.ndarray, scale: float, text: str) -> str:
-    scaled = point[None] * scale
-    (u, v), kept = project(scaled, AZIMUTH, ELEVATION)[0], " ".join(f"{x:.1f}" for x in scaled[0])
+def _text(point: np.ndarray, azimuth: float, text: str) -> str:
+    (u, v) = project(point[None], azimuth, ELEVATION)[0]
+    kept = " ".join(f"{x:.1f}" for x in point)
     return f'<text data-p="{kept}" x="{u:.1f}" y="{v:.1f}">{html.escape(text)}</text>'
 
 
@@ -70,14 +76,16 @@ def view_svg(paths: Sequence[Path3D], title: str) -> str:
     x, z = (step * np.arange(np.floor(low[i] / step), np.ceil(high[i] / step) + 1) for i in (0, 2))
     ground = float(high[1])
     centre = (low + high) / 2
-    half = (high - low) / 2
-    across = max(float(np.hypot(half[0], half[2])), 1e-9)
-    upright = math.cos(ELEVATION) * half[1] + math.sin(ELEVATION) * across
-    scale = min(0.48 * WIDTH / across, 0.48 * HEIGHT / upright)
+    inside = np.concatenate([np.clip(path.positions, low, high) for path in paths]) - centre
+    # seen from where the paths are spread out most
+    azimuth, scale = max(
+        ((turn, _fitting_scale(inside, turn)) for turn in np.linspace(-math.pi, math.pi, 17)[:-1]),
+        key=lambda pair: pair[1],
+    )
 
     def grid(a: tuple[float, float], b: tuple[float, float]) -> str:
         ends = np.array([[a[0], ground, a[1]], [b[0], ground, b[1]]]) - centre
-        return _polyline(ends, scale, 'class="g"')
+        return _polyline(ends * scale, azimuth, 'class="g"')
 
     parts = [grid((value, z[0]), (value, z[-1])) for value in x]
     parts += [grid((x[0], value), (x[-1], value)) for value in z]
@@ -85,15 +93,17 @@ def view_svg(paths: Sequence[Path3D], title: str) -> str:
         positions = path.positions
         keep = np.unique(np.linspace(0, len(positions) - 1, MAX_POINTS).round().astype(int))
         which = "truth" if path.series is None else f"m{path.series.m} f{path.series.f}"
-        parts.append(_polyline(positions[keep] - centre, scale, f'class="{which}"'))
-    start = paths[0].positions[:1] - centre
-    parts.append(_polyline(np.repeat(start, 2, axis=0), scale, 'class="start"'))
-    parts.append(_text(np.array([x[-1], ground, z[0]]) - centre, scale, "x"))
-    parts.append(_text(np.array([x[0], ground, z[-1]]) - centre, scale, "z"))
+        parts.append(_polyline((positions[keep] - centre) * scale, azimuth, f'class="{which}"'))
+    start = (paths[0].positions[:1] - centre) * scale
+    parts.append(_polyline(np.repeat(start, 2, axis=0), azimuth, 'class="start"'))
+    for axis, name in enumerate(("x", "y down", "z")):
+        end = start[0] + 30.0 * np.eye(3)[axis]
+        parts.append(_polyline(np.stack([start[0], end]), azimuth, 'class="axis"'))
+        parts.append(_text(end + 6.0 * np.eye(3)[axis], azimuth, name))
     note = f'<text class="note" x="{-WIDTH / 2 + 6}" y="{HEIGHT / 2 - 8}">grid {step:g} m</text>'
     box = f"{-WIDTH / 2} {-HEIGHT / 2} {WIDTH} {HEIGHT}"
     label = html.escape(title, quote=True)
     return (
         f'<svg viewBox="{box}" role="img" aria-label="{label}" class="plot view3d" '
-        f'data-az="{AZIMUTH}" data-el="{ELEVATION}" tabindex="0">{"".join(parts)}{note}</svg>'
+        f'data-az="{azimuth:.4f}" data-el="{ELEVATION}" tabindex="0">{"".join(parts)}{note}</svg>'
     )

@@ -1,0 +1,135 @@
+"""One picture of the maps of a pair: flow in colours with their wheel, scalars with their bars."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from hybridvo.errors import InputError
+from hybridvo.evaluation.maps import colour_wheel, flow_colours
+
+__all__ = ["FlowPanel", "ImagePanel", "ScalarPanel", "maps_png"]
+
+COLUMNS = 2
+_PANEL_WIDTH = 5.4  # inches
+
+
+@dataclass(frozen=True, eq=False)
+class ImagePanel:
+    """A picture: (H, W, 3) uint8."""
+
+    title: str
+    image: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class FlowPanel:
+    """A flow (H, W, 2) px; ``longest`` is the length at the rim of the wheel, px."""
+
+    title: str
+    flow: np.ndarray
+    longest: float
+
+
+@dataclass(frozen=True, eq=False)
+class ScalarPanel:
+    """A map (h, w).
+
+    Args:
+        title: above it.
+        values: NaN is grey.
+        unit: beside the bar.
+        high: value at the upper end of the bar; default: the 99th percentile.
+        outline: (H, W) bool, whose border is drawn, or None.
+        logarithmic: whether the bar is.
+    """
+
+    title: str
+    values: np.ndarray
+    unit: str = ""
+    high: float | None = None
+    outline: np.ndarray | None = None
+    logarithmic: bool = False
+
+
+Panel = ImagePanel | FlowPanel | ScalarPanel
+
+
+def maps_png(panels: Sequence[Panel], heading: str, aspect: float) -> bytes:
+    """PNG of the panels, two in a row.
+
+    Args:
+        panels: at least one.
+        heading: above all.
+        aspect: width over height of the pair's images.
+
+    Raises:
+        InputError: no panel.
+    """
+    if not panels:
+        raise InputError("maps_png: expected at least one panel, got none.")
+    rows = -(-len(panels) // COLUMNS)
+    height = rows * (_PANEL_WIDTH / aspect * 0.92 + 0.42) + 0.45
+    figure = Figure(figsize=(COLUMNS * _PANEL_WIDTH, height), dpi=100, layout="constrained")
+    FigureCanvasAgg(figure)
+    grid = figure.add_gridspec(rows, COLUMNS)
+    for k, panel in enumerate(panels):
+        axes = figure.add_subplot(grid[k // COLUMNS, k % COLUMNS])
+        axes.set_title(panel.title, fontsize=10, loc="left")
+        axes.set_xticks([])
+        axes.set_yticks([])
+        if isinstance(panel, ImagePanel):
+            axes.imshow(panel.image)
+        elif isinstance(panel, FlowPanel):
+            axes.imshow(flow_colours(panel.flow, panel.longest), interpolation="nearest")
+            _legend(axes, panel.longest)
+        else:
+            _scalar(figure, axes, panel)
+    figure.suptitle(heading, fontsize=11, x=0.01, ha="left")
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png", metadata={"Software": None})
+    return stream.getvalue()
+
+
+def _legend(axes: Any, longest: float) -> None:
+    """The colour wheel in the upper right corner, with the length at its rim."""
+    inset = axes.inset_axes((0.86, 0.62, 0.13, 0.36))
+    inset.imshow(colour_wheel())
+    inset.set_axis_off()
+    label = f"{longest:.3g} px"
+    box = {"facecolor": "white", "alpha": 0.8, "edgecolor": "none", "pad": 1.0}
+    axes.text(
+        0.925, 0.6, label, transform=axes.transAxes, fontsize=8, ha="center", va="top", bbox=box
+    )
+
+
+def _scalar(figure: Figure, axes: Any, panel: ScalarPanel) -> None:
+    from matplotlib import colormaps
+    from matplotlib.colors import LogNorm, Normalize
+
+    values = np.asarray(panel.values, dtype=float)
+    known = values[np.isfinite(values)]
+    top = panel.high
+    if top is None:
+        top = float(np.percentile(known, 99)) if known.size else 1.0
+    if panel.logarithmic:
+        low = float(np.percentile(known[known > 0], 1)) if (known > 0).any() else 1e-3
+        norm: Normalize = LogNorm(low, max(top, low * 1.001))
+    else:
+        norm = Normalize(0.0, max(top, 1e-12))
+    colours = colormaps["magma"].with_extremes(bad="#9a9a9a")
+    drawn = axes.imshow(values, cmap=colours, norm=norm, interpolation="nearest")
+    if panel.outline is not None and panel.outline.any() and not panel.outline.all():
+        height, width = values.shape
+        rows, cols = panel.outline.shape
+        x = (np.arange(cols) + 0.5) * width / cols - 0.5
+        y = (np.arange(rows) + 0.5) * height / rows - 0.5
+        axes.contour(x, y, panel.outline, levels=[0.5], colors="#4fd1ff", linewidths=0.8)
+    bar = figure.colorbar(drawn, ax=axes, fraction=0.04, pad=0.02, label=panel.unit)
+    bar.ax.tick_params(labelsize=8)
