@@ -88,7 +88,13 @@ def _add_run(commands: Any) -> None:
         default=None,
         help="a broken frame ends the run with exit code 2",
     )
-    run.add_argument("--rrd", action="store_true", help="write a Rerun recording")
+    run.add_argument(
+        "--rrd",
+        nargs="?",
+        const="",
+        metavar="FILE",
+        help="write a Rerun recording (extra 'viz'; default: recording.rrd in the output folder)",
+    )
     run.set_defaults(call=_run)
 
 
@@ -203,10 +209,6 @@ def _print(text: str) -> None:
 
 
 def _run(args: argparse.Namespace, command: list[str]) -> int:
-    from hybridvo.errors import InputError
-
-    if args.rrd:
-        raise InputError("--rrd: Rerun recordings are not part of this version yet.")
     from hybridvo.configuration import load_options
     from hybridvo.evaluation.report import to_json
     from hybridvo.run import run
@@ -225,6 +227,7 @@ def _run(args: argparse.Namespace, command: list[str]) -> int:
         mode=mode,
         command=command,
         quiet=args.quiet,
+        rrd=args.rrd,
     )
     _print(to_json(result.summary) if args.json else summary_text(result.summary))
     if not args.quiet:

@@ -6,6 +6,7 @@ said in every output.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
 import logging
@@ -31,6 +32,7 @@ from hybridvo.flow import FlowField, FlowProvider, dis_flow, fallback, file_flow
 from hybridvo.geometry import invert
 from hybridvo.hybrid import check_method
 from hybridvo.odometry import Anchor, Odometry
+from hybridvo.recording import Recording, check_recording
 from hybridvo.run_folder import RESULTS, Mode, RunFolder
 from hybridvo.run_results import draw, score, summarise, true_trajectory, write_steps
 from hybridvo.trajectory import Trajectory, write_kitti, write_tum
@@ -50,6 +52,9 @@ __all__ = [
 ]
 
 EXIT_DONE, EXIT_FAILED_FRAMES, EXIT_INTERRUPTED = 0, 3, 130
+
+RECORDING = "recording.rrd"
+"""Name of a Rerun recording within the output folder."""
 
 SAMPLED_BYTES = 4096
 """Bytes at either end of an input file that go into the input hash, beside its size."""
@@ -87,6 +92,7 @@ def run(
     mode: Mode = "new",
     command: Iterable[str] = (),
     quiet: bool = False,
+    rrd: str | os.PathLike[str] | None = None,
 ) -> RunResult:
     """Estimate, chain, write and score a sequence.
 
@@ -98,6 +104,7 @@ def run(
         mode: ``new``, ``resume`` or ``overwrite``.
         command: for ``run.json``.
         quiet: no progress.
+        rrd: file of a Rerun recording; empty for ``recording.rrd`` in the output folder.
 
     Raises:
         InputError: input or options that cannot be used, or a broken frame with ``strict``.
@@ -105,6 +112,8 @@ def run(
     """
     check_method(options.method)
     check_device(options.device)
+    if rrd is not None:
+        check_recording(rrd or RECORDING)
     sequence = open_sequence(path, dataset, **({"strict": True} if options.strict else {}))
     frames = range(options.start, min(options.stop or len(sequence), len(sequence)), options.stride)
     if not frames:
@@ -133,10 +142,22 @@ def run(
             "notices": list(sequence.notices),
         },
     }
-    with RunFolder(out, identity, header, mode) as folder:
+    with RunFolder(out, identity, header, mode, (*RESULTS, RECORDING)) as folder:
         if folder.finished:
             return _finished_before(folder, sequence)
-        return _run(sequence, frames, provider, options, folder, quiet)
+        with contextlib.ExitStack() as stack:
+            tape = None
+            if rrd is not None:
+                tape = Recording(
+                    rrd or out / RECORDING,
+                    sequence.name,
+                    str(identity["input_hash"]),
+                    len(frames),
+                    first=folder.frames_done,
+                    truth=None if sequence.poses is None else sequence.poses[frames],
+                )
+                stack.enter_context(tape)
+            return _run(sequence, frames, provider, options, folder, quiet, tape)
 
 
 def _run(
@@ -146,6 +167,7 @@ def _run(
     options: RunOptions,
     folder: RunFolder,
     quiet: bool,
+    tape: Recording | None,
 ) -> RunResult:
     label = f"{sequence.name} [{options.method}]"
     with interruptible() as interruption, Progress(len(frames), label, quiet=quiet) as progress:
@@ -166,7 +188,7 @@ def _run(
         for index in frames[done:]:
             if interruption:
                 break
-            row = _track(vo, sequence, index, provider, options.strict, progress)
+            row = _track(vo, sequence, index, provider, options.strict, progress, tape)
             failed += row["status"] == "failed"
             folder.append(row | {"failed_so_far": failed})
             progress.update(folder.frames_done, failed)
@@ -183,6 +205,7 @@ def _track(
     provider: _Recorder,
     strict: bool,
     progress: Progress,
+    tape: Recording | None,
 ) -> dict[str, Any]:
     """Row of one frame."""
     stamp = float(sequence.timestamps[index])
@@ -199,6 +222,8 @@ def _track(
         started = time.perf_counter()
         step = vo.track(frame)
         ms = 1e3 * (time.perf_counter() - started)
+        if tape is not None:
+            tape.add(frame, step, None if provider.field is None else provider.field.flow)
     field = provider.field
     motion = step.motion
     row: dict[str, Any] = {

@@ -36,12 +36,14 @@ IMPORTS: dict[str, set[str]] = {
     # one run of `hybridvo run`: what it writes, how it is set, and the loop around the tracker
     "console": {"errors"},
     "run_folder": {"errors", "evaluation"},
+    "recording": NOUNS | {"evaluation"},
     "run_results": NOUNS | {"geometry", "data", "trajectory", "evaluation"},
     "run_report": {"errors", "evaluation"},
     "configuration": CLASSICAL | {"data", "flow", "hybrid", "odometry"},
     "run": {
         *("__init__", "errors", "types", "geometry", "data", "flow", "hybrid", "odometry"),
         *("trajectory", "evaluation", "configuration", "console", "run_folder", "run_results"),
+        "recording",
     },
     # what tools/compare_methods.py runs, on this machine and on others
     "comparison": {
@@ -58,7 +60,7 @@ IMPORTS: dict[str, set[str]] = {
 ONLY_IN = {
     "evo": {"evaluation/metrics.py", "trajectory.py"},
     "evo.core.metrics": {"evaluation/metrics.py"},
-    "matplotlib": {"evaluation/plots.py"},
+    "matplotlib": {f"evaluation/plots{part}.py" for part in ("", "_comparison", "_maps")},
 }
 """Module -> the files that may import it."""
 

@@ -96,7 +96,7 @@ def test_wrong_usage_is_exit_code_2(
         (["--dataset", "sintell"], "did you mean 'sintel'"),
         (["--config", "none.yaml"], "none.yaml: no such file"),
         (["--set", "refinement.cutof=1"], "did you mean 'cutoff'"),
-        (["--rrd"], "not part of this version"),
+        (["--rrd", "recording.txt"], "a name that ends in .rrd"),
     ],
 )
 def test_bad_options_are_one_line(
