@@ -18,7 +18,7 @@ from hybridvo.evaluation.breakdown import FACTORS, PairTable
 from hybridvo.run_results import true_trajectory
 from hybridvo.trajectory import Trajectory, atomic_write, write_tum
 
-__all__ = ["PAIR_COLUMNS", "ROW_COLUMNS", "Collected", "Segments", "collect"]
+__all__ = ["PAIR_COLUMNS", "ROW_COLUMNS", "Collected", "Segments", "collect", "file_stem"]
 
 PAIR_COLUMNS = (
     *("sequence", "index", "method", "flow_source", "status"),
@@ -72,6 +72,11 @@ class Segments:
             for place in self._places[job]:
                 file.seek(place)
                 yield json.loads(file.readline())
+
+
+def file_stem(number: int, name: str) -> str:
+    """Beginning of the names of a sequence's files: unique, and plain on every file system."""
+    return f"{number:03d}_" + "".join(c if c.isalnum() or c in "-_." else "_" for c in name)
 
 
 @dataclass(frozen=True)
@@ -150,7 +155,7 @@ def _one(
                 paths[flow, method].add(pair["index"], pair["next"], T)
     truth = true_trajectory(sequence, frames)
     torn = job.same_camera_only and any("intrinsics" in row["reason"] for row in left_out)
-    stem = f"{number:03d}_" + "".join(c if c.isalnum() or c in "-_." else "_" for c in job.name)
+    stem = file_stem(number, job.name)
 
     def keep(trajectory: Trajectory, method: str | None, flow: str | None) -> None:
         path = f"trajectories/{stem}_{method or 'truth'}{f'_{flow}' if flow else ''}.tum"

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -123,6 +124,7 @@ def compare(
         "versions": versions(),
         "machine": {"platform": platform.platform(), "cpus": os.cpu_count()},
         "options": settings,
+        "started": _now(),
     }
     with (
         interruptible() as interruption,
@@ -280,6 +282,10 @@ def _outcome(future: Future[Any]) -> dict[str, Any]:
     return segment
 
 
+def _now() -> str:
+    return datetime.now(UTC).isoformat(timespec="seconds")
+
+
 def _count_failed(segment: Mapping[str, Any]) -> int:
     return sum(
         result["status"].startswith("failed")
@@ -305,6 +311,7 @@ def _write(
     )
     result: dict[str, Any] = {
         **header,
+        "finished": _now(),
         "missing": plan.missing,
         "rows": found.rows,
         "totals": found.totals,

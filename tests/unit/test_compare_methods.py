@@ -10,6 +10,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -126,6 +127,12 @@ def test_results_hold_what_the_interface_promises(
         assert row["epe_l2_px"] == pytest.approx(np.mean([float(p["epe_l2_px"]) for p in mine]))
     for entry in result["trajectories"]:
         assert len((out / entry["path"]).read_text().splitlines()) == 4
+    worst = result["worst_pairs"]
+    assert len(worst) == 18 and [w["rank"] for w in worst[:3]] == [1, 2, 3]
+    for w in worst:  # three panels of 256 px with a caption
+        picture = cv2.imread(str(out / w["picture"]))
+        assert picture is not None and picture.shape == (128 + 18, 3 * 256, 3)
+        assert w["status"] and w["picture_reason"] is None
     assert "<html" in (out / "report.html").read_text()
     assert "refine" in (out / "report.md").read_text()
     assert tool.main(arguments) == 2
