@@ -36,7 +36,7 @@ print(json.dumps({"import_s": imported - begin, "warm_up_s": first, "again_s": s
 
 
 def run_kernel(cell: str, seed: int) -> dict[str, Any]:
-    """One pass of ``Picture.normal_equations`` over 436x1024 pixels beside the memory's speed."""
+    """One pass of ``Picture.full_pass`` over 436x1024 pixels beside the memory's speed."""
     from hybridvo.data.benchmark_pairs import make_pair
     from hybridvo.pose import picture as module
     from hybridvo.pose import solver
@@ -52,7 +52,7 @@ def run_kernel(cell: str, seed: int) -> dict[str, Any]:
     solver.set_noise(0.5, 0.02, options.cutoff, noise)
 
     def iteration() -> None:
-        picture.normal_equations(pose, noise, tile)
+        picture.full_pass(pose, noise, tile)
 
     flow = pair.flow
     assert flow is not None and pair.prev.depth is not None

@@ -27,8 +27,11 @@ def predict(
         choose: how one motion comes out of an output; the next pass starts there.
         passes: their number; by default the one that the network's options name.
     """
-    passes = int(network.options.passes) if passes is None else passes
-    return network(inputs, first_motions(network, inputs, choose, passes - 1))
+    if passes is None:
+        options = getattr(network, "options", None)
+        passes = 1 if options is None else int(options.passes)
+    T = first_motions(network, inputs, choose, passes - 1)
+    return network(inputs) if T is None else network(inputs, T)
 
 
 def first_motions(
@@ -38,5 +41,5 @@ def first_motions(
     T = None
     with torch.no_grad():
         for _ in range(passes):
-            T = choose(network(inputs, T))
+            T = choose(network(inputs) if T is None else network(inputs, T))
     return T

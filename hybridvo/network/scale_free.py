@@ -27,6 +27,12 @@ QUANTILE = 0.4
 """Of the lengths of the flow: below one half, so that movers on half of the picture do not set the
 scale of what is left of the world."""
 
+NEAR_QUANTILE = 0.9
+"""Of the inverse depth: near things tell the translation, and set its scale."""
+
+FARTHEST = 50.0
+"""Metres; where all is farther, flow tells no translation, and a camera still moves by metres."""
+
 LIMIT = 10.0
 """Magnitude that squashed values approach; values of the order of one stay as they are."""
 
@@ -68,10 +74,11 @@ def remove_scale(
 
     Returns:
         Inputs whose ``flow`` is what the flow leaves unexplained, over the focal length and over
-        its own typical length m, ``inverse_depth[:, 0]`` the inverse depth over its median,
-        ``inverse_depth[:, 1]`` what the second depth leaves unexplained, in log depth over m (0
-        where either depth is missing), all squashed at 10; and the scales: m as an angle, and m
-        times the median depth. Pixels without depth count as infinitely far. Finite for any input.
+        its own typical length m, ``inverse_depth[:, 0]`` the inverse depth over that of the near
+        things, ``inverse_depth[:, 1]`` what the second depth leaves unexplained, in log depth over
+        m (0 where either depth is missing), all squashed at 10; and the scales: m as an angle, and
+        m times the depth of the near things. Pixels without depth count as infinitely far. Finite
+        for any input.
     """
     focal = torch.stack([inputs.K_prev[:, 0, 0], inputs.K_prev[:, 1, 1]], dim=1)[:, :, None, None]
     inverse = torch.nan_to_num(inputs.inverse_depth, 0.0, 0.0, 0.0)
@@ -92,8 +99,8 @@ def remove_scale(
     angle = flow / focal
     length = (angle.square().sum(dim=1) + 1e-20).sqrt()
     motion = _quantile(length, inputs.valid, QUANTILE, 1.0).clamp(SMALLEST_MOTION, 1.0)
-    nearness = _quantile(inverse[:, 0], inputs.valid & (inverse[:, 0] > 0), 0.5, 1.0)
-    nearness = nearness.clamp(1e-6, 1e3)
+    nearness = _quantile(inverse[:, 0], inputs.valid & (inverse[:, 0] > 0), NEAR_QUANTILE, 1.0)
+    nearness = nearness.clamp(FARTHEST**-1, 1e3)
     m = motion[:, None, None, None]
     depth = torch.cat(
         [_squash(inverse[:, :1] / nearness[:, None, None, None]), _squash(change / m)], dim=1

@@ -10,12 +10,16 @@ NOTHING = np.diag([1e4] * 3 + [10.0] * 3)
 FEW_TILES = 24
 """With fewer tiles the correlation between errors cannot be estimated; it is then assumed."""
 
+UPPER = np.triu_indices(6)
+"""Rows and columns of the 21 upper-triangle values of a symmetric matrix."""
+ORDER = np.zeros((6, 6), np.intp)
+"""Place of each entry of the matrix among them."""
+ORDER[UPPER] = ORDER.T[UPPER] = np.arange(21)
+
 
 def symmetric(upper: np.ndarray) -> np.ndarray:
     """(6, 6) from its 21 upper-triangle values, row by row."""
-    out = np.zeros((6, 6))
-    out[np.triu_indices(6)] = upper
-    return out + np.triu(out, 1).T
+    return upper[ORDER]
 
 
 def sandwich_covariance(

@@ -7,14 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from hybridvo.pose import kernels, second_depth, solver
-from hybridvo.pose.covariance import sandwich_covariance, symmetric
+from hybridvo.pose.covariance import ORDER, UPPER, sandwich_covariance, symmetric
 from hybridvo.pose.options import RefinementOptions
 from hybridvo.pose.picture import Picture
 from hybridvo.types import FramePair
 
-LONG_STEP = 1e4
-"""Squared length, in standard deviations, of a step that the next one may not end: Newton's steps
-shrink quadratically, and the last pass makes one more."""
+LONG_STEP = 1e3
+"""Squared length, in standard deviations, of a step that may not be the last. The coarse fit is
+about sqrt(6 x 60) of the full fit's standard deviations away (60 times fewer pixels), and the step
+is wrong by some 2 % of its length, the statistical error of the curvature."""
 NOISE_PIXELS = 4000
 """Pixels that the final noise estimate looks at."""
 WELL_CONDITIONED = 0.005
@@ -62,15 +63,15 @@ class _DepthTerm:
 
     def sums(
         self, picture: Picture, pose: np.ndarray, noise: np.ndarray, tile: int
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(sums (30,), tile scores (rows, columns, 6), meat (21,))."""
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """(sums of each tile (rows, columns, 27), meat (21,))."""
         rows, columns = -(-picture.shape[0] // tile), -(-picture.shape[1] // tile)
-        acc, scores, meat = np.zeros(kernels.SUMS), np.zeros((rows * columns, 6)), np.zeros(21)
+        sums, meat = np.zeros((rows * columns, kernels.COST)), np.zeros(21)
         second_depth.sum_depth(
             self.samples, self.count, self.log_depth, pose, picture.K, noise, self.sigma,
-            self.stride, tile, columns, self.width, solver.new_work(), acc, scores, meat,
+            self.stride, tile, columns, self.width, solver.new_work(), sums, meat,
         )  # fmt: skip
-        return acc, scores.reshape(rows, columns, 6), meat
+        return sums.reshape(rows, columns, kernels.COST), meat
 
 
 def tile_size(shape: tuple[int, int], tiles: int) -> int:
@@ -119,25 +120,22 @@ def fit_full_grid(
         )
         solver.set_noise(sf, sd, options.cutoff, noise)
     per_pixel = _curvature(picture, coarse, n, pose, noise)
-    for _ in range(options.full_steps):
-        total = picture.normal_equations(pose, noise, tile)
+    # with the second depth the weak directions are far from where the flow put them
+    long = LONG_STEP if term is None else 1.0
+    for step in range(options.full_steps + 1):
+        tiles, rest, weights = picture.full_pass(pose, noise, tile)
+        curvature = per_pixel * rest[2]
         if term:
-            total[:27] += term.sums(picture, pose, noise, tile)[0][:27]
-        length = _newton_step(total, per_pixel[:21] * total[29], pose)
-        iterations += 1
-        # with the second depth the weak directions have moved far from where the flow put them
-        if not length > (LONG_STEP if term is None else 1.0):
+            depth_tiles, depth_meat = term.sums(picture, pose, noise, tile)
+            tiles += depth_tiles
+            curvature[21:] += depth_meat
+        total = np.concatenate([tiles.sum(axis=(0, 1)), rest])
+        length = _newton_step(total, curvature[:21], pose)
+        iterations += step > 0
+        if not length > long:
             break
-    total, scores, weights = picture.last_pass(pose, noise, tile)
-    curvature = per_pixel * total[29]
-    if term:
-        depth_sums, depth_scores, depth_meat = term.sums(picture, pose, noise, tile)
-        total[:27] += depth_sums[:27]
-        scores += depth_scores
-        curvature[21:] += depth_meat
-    _newton_step(total, curvature[:21], pose)
     covariance, eigenvalues, definite = sandwich_covariance(
-        total, curvature[:21], curvature[21:], scores, depth_scale
+        total, curvature[:21], curvature[21:], _centred_scores(tiles, total), depth_scale
     )
     if definite:
         # what the uncertainty of sd^2 does to the answer, through the correction of the depth
@@ -164,6 +162,15 @@ def fit_full_grid(
     )
 
 
+def _centred_scores(tiles: np.ndarray, total: np.ndarray) -> np.ndarray:
+    """(rows, columns, 6) scores of the tiles where all of them together are zero, to first order.
+
+    They were summed before the last step, which is long for a full grid.
+    """
+    step = np.linalg.lstsq(symmetric(total[:21]), total[21:27], rcond=1e-12)[0]
+    return tiles[..., 21:27] - tiles[..., :21][..., ORDER] @ step
+
+
 def _curvature(
     picture: Picture, coarse: np.ndarray, n: int, pose: np.ndarray, noise: np.ndarray
 ) -> np.ndarray:
@@ -173,11 +180,10 @@ def _curvature(
     """
     R, t = pose[:, :3].astype(np.float32), pose[:, 3].astype(np.float32)
     work = solver.new_work()
-    out, used = np.zeros(42), np.zeros(kernels.SUMS)
-    for o in range(0, n, kernels.BLOCK):
-        m = min(kernels.BLOCK, n - o)
-        kernels.project_block(coarse, o, m, R, t, picture.K, noise, work, used)
-        kernels.sum_curvature(m, coarse[kernels.W, o : o + m], work, float(noise[2]), out)
+    rows, factors, used = np.empty((6, n), np.float32), np.empty(n, np.float32), np.zeros(30)
+    kernels.score_pixels(coarse, n, R, t, picture.K, noise, work, rows, factors, used)
+    curvature, meat = (rows * factors) @ rows.T, rows @ rows.T
+    out = np.concatenate([m[UPPER] for m in (curvature, meat)]).astype(np.float64)
     return out / max(used[29], 1e-12)
 
 
@@ -240,7 +246,8 @@ def _depth_term(
     u0, v0 = picture.origin
     depth = np.ascontiguousarray(pair.curr.depth)
     log_depth = np.empty(n, np.float32)
-    second_depth.look_up(coarse, n, depth, u0, v0, log_depth)
+    # looked up at random places of a whole picture: first no more than the scale needs
+    second_depth.look_up(coarse, n, second_depth.sparse_step(n), depth, u0, v0, log_depth)
     robust = np.empty(n, np.float32)
     work = solver.new_work()
     solver.robust_weights(coarse, n, pose, picture.K, noise, work, robust)
@@ -258,10 +265,13 @@ def _depth_term(
         eigenvalues = np.linalg.eigvalsh(H_flow * np.outer(scaling, scaling))
         if eigenvalues[0] > WELL_CONDITIONED * eigenvalues[-1]:
             return sd, None
+    second_depth.look_up(coarse, n, 1, depth, u0, v0, log_depth)
     coarse_term = _DepthTerm(coarse, log_depth, n, columns, stride, max(sigma, 1e-4))
     # on the full fit the flow has every pixel, the depth every second one of both axes
     fine = max(1, min(2, stride))
-    H_depth = symmetric(coarse_term.sums(picture, pose, noise, tile)[0][:21]) / fine**2
+    H_depth = (
+        symmetric(coarse_term.sums(picture, pose, noise, tile)[0].sum(axis=(0, 1))[:21]) / fine**2
+    )
     if options.second_depth == "auto":
         try:
             gain = np.linalg.eigvals(np.linalg.solve(H_flow, H_depth)).real.max()
@@ -273,5 +283,5 @@ def _depth_term(
         return sd, coarse_term
     samples, h, w = picture.strided(fine)
     log_depth = np.empty(h * w, np.float32)
-    second_depth.look_up(samples, h * w, depth, u0, v0, log_depth)
+    second_depth.look_up(samples, h * w, 1, depth, u0, v0, log_depth)
     return sd, _DepthTerm(samples, log_depth, h * w, w, fine, max(sigma, 1e-4))

@@ -35,6 +35,8 @@ BLOCK = 512
 SUMS = 30
 """Length of an accumulator: 21 upper-triangle sums of the Hessian, 6 of the gradient, cost, sum of
 robust weights, sum of external weights."""
+COST = 27
+"""Place of the cost in it."""
 
 HAS_FLOW_VARIANCE, HAS_DEPTH_VARIANCE, HAS_WEIGHTS, HAS_VALID = 1, 2, 4, 8
 
@@ -62,8 +64,8 @@ def keep_apart(typing_context):
 
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
-def gather_row(v, data, camera, flags, scale, buf):
-    """Fill ``buf`` with the whole row ``v`` of the picture.
+def gather_row(v, u0, u1, data, camera, flags, scale, buf):
+    """Fill ``buf`` with columns ``u0 .. u1 - 1`` of row ``v`` of the picture.
 
     ``data`` = (depth, flow, flow_variance, depth_variance, weights, valid), each (H, W) but the
     flow, (H, W, 2); absent ones are dummies, as ``flags`` says. ``camera`` = (1/fx, 1/fy, cx, cy)
@@ -75,16 +77,16 @@ def gather_row(v, data, camera, flags, scale, buf):
     ifx, ify, cx, cy = camera[0], camera[1], camera[2], camera[3]
     vf = np.float32(v)
     yn = (vf - cy) * ify
-    zrow = depth[v]
-    frow = flow[v]
-    n = zrow.shape[0]
+    zrow = depth[v, u0:u1]
+    frow = flow[v, u0:u1]
+    n = u1 - u0
     b_x, b_y, b_z, b_u, b_v = buf[XN], buf[YN], buf[Z], buf[MU], buf[MV]
     b_f, b_d, b_w = buf[PF], buf[PD], buf[W]
     for k in range(n):
-        b_x[k] = (np.float32(k) - cx) * ifx
+        b_x[k] = (np.float32(u0 + k) - cx) * ifx
         b_y[k] = yn
     for k in range(n):
-        b_u[k] = frow[k, 0] + np.float32(k)
+        b_u[k] = frow[k, 0] + np.float32(u0 + k)
         b_v[k] = frow[k, 1] + vf
     for k in range(n):
         z = zrow[k]
@@ -96,7 +98,7 @@ def gather_row(v, data, camera, flags, scale, buf):
         b_v[k] = mv if good else ZERO
         b_w[k] = ONE if good else ZERO
     if flags & HAS_FLOW_VARIANCE:
-        row = flow_variance[v]
+        row = flow_variance[v, u0:u1]
         for k in range(n):
             p = row[k]
             good = (p > ZERO) & (p < MAX_VALUE)
@@ -106,7 +108,7 @@ def gather_row(v, data, camera, flags, scale, buf):
         for k in range(n):
             b_f[k] = ONE
     if flags & HAS_DEPTH_VARIANCE:
-        row = depth_variance[v]
+        row = depth_variance[v, u0:u1]
         for k in range(n):
             p = row[k]
             good = (p >= ZERO) & (p < MAX_VALUE)
@@ -116,12 +118,12 @@ def gather_row(v, data, camera, flags, scale, buf):
         for k in range(n):
             b_d[k] = ONE
     if flags & HAS_WEIGHTS:
-        row = weights[v]
+        row = weights[v, u0:u1]
         for k in range(n):
             p = row[k]
             b_w[k] = b_w[k] * (p if (p > ZERO) & (p < MAX_VALUE) else ZERO)
     if flags & HAS_VALID:
-        vrow = valid[v]
+        vrow = valid[v, u0:u1]
         for k in range(n):
             b_w[k] = b_w[k] if vrow[k] else ZERO
 
@@ -138,7 +140,7 @@ def gather_grid(stride, data, camera, flags, scale, out):
     w = (width - first + stride - 1) // stride
     buf = np.empty((BUFFER_ROWS, width), np.float32)
     for r in range(h):
-        gather_row(first + r * stride, data, camera, flags, scale, buf)
+        gather_row(first + r * stride, 0, width, data, camera, flags, scale, buf)
         for q in range(BUFFER_ROWS):
             for k in range(w):
                 out[q, r * w + k] = buf[q, first + k * stride]
@@ -218,11 +220,14 @@ def project_block(buf, o, n, R, t, K, noise, work, acc):
 
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
-def sum_translation(n, work, acc):
-    """Second stage: sums of the rows of H and g that belong to the translation."""
+def sum_translation(o, n, work, acc):
+    """Second stage, pixels ``o .. o + n - 1`` of the block: the rows of H and g that belong to the
+    translation.
+    """
     keep_apart()  # type: ignore[call-arg]
-    A, B, IZ, M0, M1, M2 = work[0], work[1], work[2], work[3], work[4], work[5]
-    N0, N1 = work[6], work[7]
+    A, B, IZ = work[0][o:], work[1][o:], work[2][o:]
+    M0, M1, M2 = work[3][o:], work[4][o:], work[5][o:]
+    N0, N1 = work[6][o:], work[7][o:]
     h00 = h01 = h02 = h03 = h04 = h05 = ZERO
     h11 = h12 = h13 = h14 = h15 = ZERO
     h22 = h23 = h24 = h25 = ZERO
@@ -286,11 +291,12 @@ def sum_translation(n, work, acc):
 
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
-def sum_rotation(n, work, acc):
-    """Third stage: sums of the rows of H and g that belong to the rotation."""
+def sum_rotation(o, n, work, acc):
+    """Third stage: the rows of H and g that belong to the rotation."""
     keep_apart()  # type: ignore[call-arg]
-    A, B, M0, M1, M2 = work[0], work[1], work[3], work[4], work[5]
-    N0, N1 = work[6], work[7]
+    A, B = work[0][o:], work[1][o:]
+    M0, M1, M2 = work[3][o:], work[4][o:], work[5][o:]
+    N0, N1 = work[6][o:], work[7][o:]
     h33 = h34 = h35 = h44 = h45 = h55 = ZERO
     g3 = g4 = g5 = ZERO
     for k in range(n):
@@ -337,93 +343,72 @@ def sum_samples(samples, n, R, t, K, noise, work, acc):
     for o in range(0, n, BLOCK):
         m = min(BLOCK, n - o)
         project_block(samples, o, m, R, t, K, noise, work, acc)
-        sum_translation(m, work, acc)
-        sum_rotation(m, work, acc)
-
-
-@njit(error_model="numpy", cache=True, nogil=True)
-def sum_rows(data, camera, flags, scale, R, t, K, noise, v0, v1, out):
-    """Normal equations of the full-grid rows ``v0 .. v1 - 1``, added to ``out`` (30,)."""
-    width = data[0].shape[1]
-    buf = np.empty((BUFFER_ROWS, width), np.float32)
-    work = np.empty((WORK_ROWS, width), np.float32)
-    for v in range(v0, v1):
-        gather_row(v, data, camera, flags, scale, buf)
-        project_block(buf, 0, width, R, t, K, noise, work, out)
-        sum_translation(width, work, out)
-        sum_rotation(width, work, out)
+        sum_translation(0, m, work, acc)
+        sum_rotation(0, m, work, acc)
 
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
-def sum_curvature(n, external, work, c2, acc):
-    """Add the curvature of the robust weights, ``sum -2 (dw / dd^2) s s^T``, to ``acc[:21]``.
+def score_block(o, n, c2, external, work, rows, factors):
+    """Write w s = w J^T Sigma^-1 r of each pixel to ``rows`` (6, N), and to ``factors`` (N,) what
+    makes its outer product the curvature of the robust weights, ``-2 (dw / dd^2) s s^T``.
 
-    s = J^T Sigma^-1 r. Subtracted from the Gauss-Newton Hessian it gives the derivative of the
-    estimating equation, the "bread" of the sandwich covariance. ``acc[21:42]`` gets the "meat"
-    under independent errors, ``sum w^2 s s^T``.
+    Subtracted from the Gauss-Newton Hessian the curvature gives the derivative of the estimating
+    equation, the "bread" of the sandwich covariance; the plain outer products are its "meat" under
+    independent errors.
     """
-    A, B, IZ, N0, N1, S = work[0], work[1], work[2], work[6], work[7], work[8]
-    row = np.empty(6, np.float64)
-    for k in range(n):
-        if S[k] < np.float32(1e-12):
-            continue
-        a, b, i, x, y = A[k], B[k], IZ[k], N0[k], N1[k]
-        row[0] = x * i
-        row[1] = y * i
-        row[2] = -(a * x + b * y) * i
-        row[3] = -(a * b * x + (ONE + b * b) * y)
-        row[4] = (ONE + a * a) * x + a * b * y
-        row[5] = a * y - b * x
-        # row = w s with w = x_w S, S = (c2 / (c2 + d2))^2; wanted 4 w / (c2 + d2) s s^T
-        factor = 4.0 / (c2 * external[k] * np.sqrt(S[k]))
-        q = 0
-        for p in range(6):
-            for r in range(p, 6):
-                acc[q] += factor * row[p] * row[r]
-                acc[21 + q] += row[p] * row[r]
-                q += 1
-
-
-@njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
-def add_scores(n, work, columns):
-    """Add w s = w J^T Sigma^-1 r of ``n`` pixels to ``columns`` (6, W), pixel by pixel."""
     keep_apart()  # type: ignore[call-arg]
-    A, B, IZ, N0, N1 = work[0], work[1], work[2], work[6], work[7]
-    c0, c1, c2, c3, c4, c5 = columns[0], columns[1], columns[2], columns[3], columns[4], columns[5]
+    A, B, IZ, N0, N1, S = work[0], work[1], work[2], work[6], work[7], work[8]
+    r0, r1, r2, r3, r4, r5 = (
+        rows[0][o:], rows[1][o:], rows[2][o:], rows[3][o:], rows[4][o:], rows[5][o:]
+    )  # fmt: skip
+    f, e = factors[o:], external[o:]
     for k in range(n):
         a = A[k]
         b = B[k]
         i = IZ[k]
         x = N0[k]
         y = N1[k]
-        ab = a * b
-        c0[k] += x * i
-        c1[k] += y * i
-        c2[k] -= (a * x + b * y) * i
-        c3[k] -= ab * x + (ONE + b * b) * y
-        c4[k] += (ONE + a * a) * x + ab * y
-        c5[k] += a * y - b * x
+        c = a * x + b * y
+        r0[k] = x * i
+        r1[k] = y * i
+        r2[k] = -c * i
+        r3[k] = -(b * c + y)
+        r4[k] = a * c + x
+        r5[k] = a * y - b * x
+        # row = w s with w = x_w S, S = (c2 / (c2 + d2))^2; wanted 4 w / (c2 + d2) s s^T
+        good = S[k] > np.float32(1e-12)
+        f[k] = np.float32(4.0) / (c2 * e[k] * np.sqrt(S[k])) if good else ZERO
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
-def score_rows(data, camera, flags, scale, R, t, K, noise, band, tile, weights, scores, out):
-    """The last pass over the rows of one band of tiles.
+def score_pixels(samples, n, R, t, K, noise, work, rows, factors, acc):
+    """:func:`score_block` of gathered pixels; cost and weights are added to ``acc`` (30,)."""
+    for o in range(0, n, BLOCK):
+        m = min(BLOCK, n - o)
+        project_block(samples, o, m, R, t, K, noise, work, acc)
+        score_block(o, m, noise[2], samples[W], work, rows, factors)
 
-    Adds the normal equations to ``out`` (30,), writes the robust weights (without the external
-    ones) to ``weights`` (H, W) and the sum of w J^T Sigma^-1 r of each tile to ``scores`` (rows of
-    tiles, columns of tiles, 6), from which the sandwich covariance is made.
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def sum_tiles(data, camera, flags, scale, R, t, K, noise, band, tile, weights, sums, out):
+    """One pass over the rows of one band of tiles of the full grid.
+
+    Adds the normal equations of each tile to ``sums`` (rows of tiles, columns of tiles, 27), cost
+    and weights to ``out`` (30,), and writes the robust weights (without the external ones) to
+    ``weights`` (H, W).
     """
     H, width = data[0].shape
-    buf = np.empty((BUFFER_ROWS, width), np.float32)
-    work = np.empty((WORK_ROWS, width), np.float32)
-    columns = np.zeros((6, width), np.float32)
+    # whole tiles that stay in the L1 cache, in rows that do not fall into the same of its sets
+    part = max(1, BLOCK // tile) * tile
+    buf = np.empty((BUFFER_ROWS, part + 16), np.float32)
+    work = np.empty((WORK_ROWS, part + 16), np.float32)
     for v in range(band * tile, min(H, (band + 1) * tile)):
-        gather_row(v, data, camera, flags, scale, buf)
-        project_block(buf, 0, width, R, t, K, noise, work, out)
-        sum_translation(width, work, out)
-        sum_rotation(width, work, out)
-        add_scores(width, work, columns)
-        weights[v] = work[8]
-    for k in range(width):
-        for q in range(6):
-            scores[band, k // tile, q] += columns[q, k]
+        for u0 in range(0, width, part):
+            n = min(part, width - u0)
+            gather_row(v, u0, u0 + n, data, camera, flags, scale, buf)
+            project_block(buf, 0, n, R, t, K, noise, work, out)
+            for o in range(0, n, tile):
+                m = min(tile, n - o)
+                sum_translation(o, m, work, sums[band, (u0 + o) // tile])
+                sum_rotation(o, m, work, sums[band, (u0 + o) // tile])
+            weights[v, u0 : u0 + n] = work[8, :n]

@@ -104,44 +104,31 @@ class Picture:
         columns = np.flatnonzero(usable.any(axis=0))
         return count, (rows[0], rows[-1] + 1, columns[0], columns[-1] + 1)
 
-    def normal_equations(self, pose: np.ndarray, noise: np.ndarray, tile: int) -> np.ndarray:
-        """(30,) sums over every pixel at a (3, 4) pose."""
-        R, t = pose[:, :3].astype(np.float32), pose[:, 3].astype(np.float32)
-        height = self.shape[0]
-        bands = -(-height // tile)
-        sums = np.zeros((bands, kernels.SUMS))
-
-        arguments: tuple[Any, ...] = (self.data, self.camera, self.flags, self.scale)
-
-        def work(band: int) -> None:
-            v0, v1 = band * tile, min(height, (band + 1) * tile)
-            kernels.sum_rows(  # type: ignore[call-arg]
-                *arguments, R, t, self.K, noise, v0, v1, sums[band]
-            )
-
-        self._run(work, bands)
-        return sums.sum(axis=0)
-
-    def last_pass(
+    def full_pass(
         self, pose: np.ndarray, noise: np.ndarray, tile: int
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(sums (30,), scores of the tiles (rows, columns, 6), robust weights (H, W))."""
+        """Normal equations over every pixel at a (3, 4) pose.
+
+        Returns:
+            Sums of each tile (rows, columns, 27), cost and the two sums of weights (3,), robust
+            weights (H, W).
+        """
         R, t = pose[:, :3].astype(np.float32), pose[:, 3].astype(np.float32)
         height, width = self.shape
         bands = -(-height // tile)
-        sums = np.zeros((bands, kernels.SUMS))
-        scores = np.zeros((bands, -(-width // tile), 6))
+        sums = np.zeros((bands, -(-width // tile), kernels.COST))
+        totals = np.zeros((bands, kernels.SUMS))
         weights = np.empty((height, width), np.float32)
 
         arguments: tuple[Any, ...] = (self.data, self.camera, self.flags, self.scale)
 
         def work(band: int) -> None:
-            kernels.score_rows(  # type: ignore[call-arg]
-                *arguments, R, t, self.K, noise, band, tile, weights, scores, sums[band]
+            kernels.sum_tiles(  # type: ignore[call-arg]
+                *arguments, R, t, self.K, noise, band, tile, weights, sums, totals[band]
             )
 
         self._run(work, bands)
-        return sums.sum(axis=0), scores, weights
+        return sums, totals[:, kernels.COST :].sum(axis=0), weights
 
     def _run(self, work: Callable[[int], None], count: int) -> None:
         """Do ``work(0) .. work(count - 1)`` on two threads where the picture is large.

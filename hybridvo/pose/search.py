@@ -38,6 +38,10 @@ COHERENT = 0.35
 """Coherence of the residuals above which a motion that holds the picture is not beyond doubt; depth
 noise that is half correlated in space stays below 0.25."""
 
+SETTLED = 0.5
+"""Share of the picture above which a motion without coherent residuals is taken as it is: no other
+can hold as much, and further ones are looked for in what it leaves."""
+
 SHARE, FLOW_NOISE, DEPTH_NOISE, SOURCE, ITERATIONS = range(5)
 FACTS = 5
 """Columns of the table of facts of the hypotheses."""
@@ -444,15 +448,17 @@ def find_motions(
             break
         fact[SHARE] *= left / all_weight
         clear = fact[SHARE] >= decisive and found == 0
-        if clear and not first_wide:
-            coherence = residual_coherence(
-                coarse, h, w, pose, K, fact[FLOW_NOISE], fact[DEPTH_NOISE]
-            )
-            clear = coherence < COHERENT
-        if found == 0 and not first_wide and not clear:
-            # the handed-in starts did not settle it: let every start compete for the first place
-            first_wide = True
-            continue
+        if found == 0 and not first_wide:
+            settled = fact[SHARE] >= SETTLED
+            if settled:
+                coherence = residual_coherence(
+                    coarse, h, w, pose, K, fact[FLOW_NOISE], fact[DEPTH_NOISE]
+                )
+                settled = coherence < COHERENT
+            if not settled:
+                # the handed-in starts found no motion for sure: every start competes for the first
+                first_wide = True
+                continue
         if found > 0 and fact[SHARE] < least:
             break
         found += 1

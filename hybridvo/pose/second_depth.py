@@ -35,10 +35,12 @@ AGREEMENT = 0.05
 
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
-def look_up(samples, n, depth, u0, v0, out):
-    """Log of the current depth at each pixel's flow target; NaN outside, at edges and at holes."""
+def look_up(samples, n, step, depth, u0, v0, out):
+    """Log of the current depth at the flow target of every ``step``-th pixel; NaN outside, at edges
+    and at holes.
+    """
     H, width = depth.shape
-    for k in range(n):
+    for k in range(0, n, step):
         out[k] = np.nan
         if not samples[W, k] > 0:
             continue
@@ -100,16 +102,23 @@ def conditional(samples, k, log_depth, R, t, K, noise, row):
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
+def sparse_step(n):
+    """Distance of the about 1000 pixels that :func:`depth_scale` looks at."""
+    return max(1, n // 1000)
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
 def depth_scale(samples, n, log_depth, robust, pose, K, noise):
     """Robust standard deviations of (conditional residual, raw residual); 0 if too few pixels."""
     R = pose[:, :3].astype(np.float32)
     t = pose[:, 3].astype(np.float32)
     row = np.empty(6)
-    size = n // max(1, n // 1000) + 1
+    step = sparse_step(n)
+    size = n // step + 1
     one = np.empty(size)
     two = np.empty(size)
     m = 0
-    for k in range(0, n, max(1, n // 1000)):
+    for k in range(0, n, step):
         if not (robust[k] > 0.3 and abs(log_depth[k]) < 1e6):
             continue
         e, raw, front = conditional(samples, k, log_depth, R, t, K, noise, row)
@@ -125,13 +134,13 @@ def depth_scale(samples, n, log_depth, robust, pose, K, noise):
 
 @njit(error_model="numpy", cache=True, nogil=True)
 def sum_depth(
-    samples, n, log_depth, pose, K, noise, sz, step, tile, columns, width, work, acc, scores, meat
+    samples, n, log_depth, pose, K, noise, sz, step, tile, columns, width, work, sums, meat
 ):
-    """Add the third residual's normal equations to ``acc`` (30,).
+    """Add the third residual's normal equations to the tiles' ``sums`` (tiles, 27).
 
-    ``sz``: standard deviation of the conditional residual. ``scores`` (tiles, 6) gets its share of
-    the tile scores, by the place of pixel k on the grid of ``width`` pixels, ``step`` apart, with
-    ``columns`` tiles in a row; ``meat`` (21,) the sum of w^2 s s^T.
+    ``sz``: standard deviation of the conditional residual. The tile follows from the place of pixel
+    k on the grid of ``width`` pixels, ``step`` apart, with ``columns`` tiles in a row; ``meat``
+    (21,) gets the sum of w^2 s s^T.
     """
     R = pose[:, :3].astype(np.float32)
     t = pose[:, 3].astype(np.float32)
@@ -156,8 +165,7 @@ def sum_depth(
             q = 0
             for p in range(6):
                 for r in range(p, 6):
-                    acc[q] += w * row[p] * row[r]
+                    sums[at, q] += w * row[p] * row[r]
                     meat[q] += (w * e) * (w * e) * row[p] * row[r]
                     q += 1
-                acc[21 + p] += w * e * row[p]
-                scores[at, p] += w * e * row[p]
+                sums[at, 21 + p] += w * e * row[p]

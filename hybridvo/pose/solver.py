@@ -370,4 +370,5 @@ def robust_weights(samples, n, pose, K, noise, work, out):
 @njit(error_model="numpy", cache=True, nogil=True)
 def new_work():
     """Scratch memory of one solver."""
-    return np.empty((WORK_ROWS, BLOCK), np.float32)
+    # rows a little longer than a block do not fall into the same sets of the cache
+    return np.empty((WORK_ROWS, BLOCK + 16), np.float32)

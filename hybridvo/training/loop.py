@@ -185,7 +185,8 @@ class Trainer:
         self.optimizer.zero_grad(set_to_none=True)
         half = options.precision == "bfloat16"
         with torch.autocast(self.device.type, torch.bfloat16, enabled=half):
-            output = self.model(batch.inputs, self._starts(batch))
+            starts = self._starts(batch)
+            output = self.model(batch.inputs, *(() if starts is None else (starts,)))
         loss, parts = training_loss(output, batch, options)
         loss.backward()
         norm = nn.utils.clip_grad_norm_(self.network.parameters(), options.optimizer.clip_norm)

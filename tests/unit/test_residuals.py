@@ -259,10 +259,18 @@ def numba_step(pair: PairBatch, weights: torch.Tensor | None, T: np.ndarray, noi
     current = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]], np.float32)
     three = np.empty(3, np.float32)
     solver.set_noise(*noise, 3.0, three)
-    out = np.zeros(kernels.SUMS)
     R, t = T[:3, :3].astype(np.float32), T[:3, 3].astype(np.float32)
-    height = pair.depth_prev.shape[1]
-    kernels.sum_rows(tuple(data), camera, flags, scale, R, t, current, three, 0, height, out)
+    height, width = pair.depth_prev.shape[1:]
+    tile = 24
+    tiles = np.zeros((-(-height // tile), -(-width // tile), 27))
+    out = np.zeros(kernels.SUMS)
+    weight_map = np.empty((height, width), np.float32)
+    for band in range(len(tiles)):
+        kernels.sum_tiles(
+            tuple(data), camera, flags, scale, R, t, current, three, band, tile, weight_map,
+            tiles, out,
+        )  # fmt: skip
+    out[:27] = tiles.sum(axis=(0, 1))
     delta = np.zeros(6)
     assert solver.solve6(out, 0.0, delta)
     return delta, out
