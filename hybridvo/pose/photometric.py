@@ -40,6 +40,12 @@ COARSE_SPREAD = 0.3
 """Coarser blurs are used where the flow leaves more than this many finest blurs undecided."""
 TOLERANCE = 0.02
 """Of a step, in standard deviations of the joint estimate."""
+SETTLING = 2
+"""Steps after which noise and share are estimated again: before, they are those of a worse motion."""
+COST_NOISE = 1.0
+"""A rise of the joint cost below this means nothing. Noise favours places between the pixels, where
+reading averages more of it: the root of the estimating equation, which has no such bias, lies
+beside the minimum of the cost."""
 GAINS = (0.2, 5.0)
 """Limits of the gain between two pictures."""
 
@@ -309,10 +315,11 @@ class Problem:
         state = self.settle(state, 2 if state.noise == 0 else 1)
         photometric = self.weigh(state.noise)
         damping = 0.0
-        for step in range(steps):
-            delta = self._step(state, damping)
-            if delta is None:
-                return state
+        accepted = 0
+        delta, left = self._step(state, damping)
+        for _ in range(steps):
+            if left < TOLERANCE**2 and accepted > SETTLING:
+                break
             other = replace(
                 state,
                 T=se3_exp(delta[:6]) @ state.T,
@@ -320,18 +327,21 @@ class Problem:
                 offset=float(state.offset + delta[7]),
             )
             found = self.project(level, other)
-            if self.cost(found, other.T) <= self.cost(photometric, state.T) * (1 + 1e-9):
-                length = float(delta[:6] @ self._joint(other.T) @ delta[:6])
+            following, still_left = self._step(other, 0.0)
+            falls = self.cost(found, other.T) <= self.cost(photometric, state.T)
+            if falls or still_left < 0.5 * left:
                 state, photometric, damping = other, found, 0.1 * damping
-                if step == 0:  # the noise was that of a worse motion
+                delta, left = following, still_left
+                if accepted < SETTLING:  # the noise was that of a worse motion
                     state = replace(state, noise=self.noise_scale())
                     photometric = self.weigh(state.noise)
                     self.set_share()
-                elif length < TOLERANCE**2:
-                    break
+                    delta, left = self._step(state, damping)
+                accepted += 1
             else:
                 damping = max(10 * damping, 1e-2)
                 self.project(level, state)
+                delta, left = self._step(state, damping)
         return state
 
     def settle(self, state: State, rounds: int, fixed: bool = False) -> State:
@@ -349,11 +359,11 @@ class Problem:
             state = replace(state, gain=gain, offset=state.offset + float(step[1]))
         return state
 
-    def _joint(self, T: np.ndarray) -> np.ndarray:
-        return self.trust * self.share * self.marginal()[0] + self.prior(T)[1]
+    def _step(self, state: State, damping: float) -> tuple[np.ndarray, float]:
+        """Gauss-Newton step of motion, gain and offset, and its squared length in deviations.
 
-    def _step(self, state: State, damping: float) -> np.ndarray | None:
-        """(8,) Gauss-Newton step of motion, gain and offset, or None where there is none."""
+        A step that cannot be had, or is absurd, is zero.
+        """
         c = kernels.COLUMNS
         weight = self.trust * self.share
         _, information, gradient = self.prior(state.T)
@@ -366,8 +376,10 @@ class Problem:
         try:
             delta = np.linalg.solve(H / np.outer(scale, scale), g / scale) / scale
         except np.linalg.LinAlgError:
-            return None
-        return delta if np.isfinite(delta).all() and np.abs(delta[:6]).max() < 1.0 else None
+            return np.zeros(c), 0.0
+        if not (np.isfinite(delta).all() and np.abs(delta[:6]).max() < 1.0):
+            return np.zeros(c), 0.0
+        return delta, float(delta @ g)
 
 
 def _guarded(
@@ -436,7 +448,7 @@ def _guarded(
     joint = problem.cost(photometric, state.T)
     problem.project(level, replace(state, T=pose.T_curr_prev))
     problem.settle(state, 1, fixed=True)
-    if not joint < problem.cost(problem.weigh(state.noise), pose.T_curr_prev):
+    if not joint < problem.cost(problem.weigh(state.noise), pose.T_curr_prev) + COST_NOISE:
         return _unchanged(
             pose, "higher_cost", "the images do not lower the cost of the motion", report
         )
