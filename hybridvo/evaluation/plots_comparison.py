@@ -17,7 +17,7 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter
 
 from hybridvo.evaluation.report_data import Path3D, Series, shown_box
 
@@ -46,6 +46,7 @@ MARKERS = "osD^vPX<>phd*8HH"
 _STYLES = ("-", (0, (4, 2)), (0, (1, 1.5)), (0, (6, 1.5, 1, 1.5)))
 _INK, _MUTED, _GRID, _BAND = "#0a0c01", "#0a0c02", "#0a0c03", "#0a0c04"
 _NAMES = {_INK: "ink", _MUTED: "muted", _GRID: "grid", _BAND: "band"}
+_WIDTH = 5.4
 _ASPECT = 1.55
 MAX_POINTS = 300
 """Points of a line: more cannot be told apart at the size of the plots."""
@@ -66,11 +67,18 @@ def _gid(series: Series) -> str:
     return f"series-{series.m}-{series.f}"
 
 
-def _figure(height: float = 3.3, rows: int = 1, **grid: Any) -> tuple[Figure, list[Any]]:
-    figure = Figure(figsize=(5.4, height), dpi=72, layout="constrained")
+def _figure(
+    height: float = 3.3, rows: int = 1, *, left: float = 0.62, bottom: float = 0.48, **grid: Any
+) -> tuple[Figure, list[Any]]:
+    """Figure of a height with margins in inches; plots below each other."""
+    # fixed margins: the layout engine draws everything twice to find them
+    figure = Figure(figsize=(_WIDTH, height), dpi=72)
     FigureCanvasAgg(figure)
     figure.patch.set_visible(False)
     axes = np.atleast_1d(figure.subplots(rows, 1, **grid))
+    figure.subplots_adjust(
+        left / _WIDTH, bottom / height, 1 - 0.12 / _WIDTH, 1 - 0.1 / height, hspace=0.06
+    )
     for one in axes:
         one.patch.set_visible(False)
         one.tick_params(labelsize=8.5, colors=_INK, which="both")
@@ -80,6 +88,14 @@ def _figure(height: float = 3.3, rows: int = 1, **grid: Any) -> tuple[Figure, li
             spine.set_color(_MUTED)
             spine.set_visible(side in ("left", "bottom"))
     return figure, list(axes)
+
+
+def _logarithmic(axes: Any, which: str) -> None:
+    """Make the ``x`` or ``y`` axis logarithmic, its powers written out."""
+    getattr(axes, f"set_{which}scale")("log")
+    axis = getattr(axes, f"{which}axis")
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
 
 
 def _label(axes: Any, x: str, y: str) -> None:
@@ -166,7 +182,7 @@ def error_svg(
     """
     figure, (axes,) = _figure(3.3)
     _label(axes, *labels)
-    axes.set_yscale("log")
+    _logarithmic(axes, "y")
     for series, x, y in lines:
         x, y = _thin(x, np.maximum(y, FLOOR_PX))
         marker = {"marker": MARKERS[series.m % len(MARKERS)], "markersize": 3}
@@ -225,13 +241,13 @@ def factor_svg(
         title: for readers that do not see.
         name: prefix of ids.
     """
-    figure, (upper, lower) = _figure(4.6, 2, sharex=True, height_ratios=(3, 2))
+    figure, (upper, lower) = _figure(4.6, 2, bottom=0.66, sharex=True, height_ratios=(3, 2))
     bins = sorted({int(cell["bin"]) for cell in cells})
     share = factor["name"] == "dynamic_fraction"
     bounds = {int(c["bin"]): (c["low"], c["high"], c["pairs"]) for c in cells}
     groups = list(dict.fromkeys((c["method"], c["flow_source"]) for c in cells))
     step = 0.8 / max(len(groups), 1)
-    upper.set_yscale("log")
+    _logarithmic(upper, "y")
     for k, group in enumerate(groups):
         if group not in series:
             continue
@@ -263,11 +279,16 @@ def factor_svg(
     return _svg(figure, title, name)
 
 
-def _names_axis(axes: Any, groups: Sequence[Series], flows: int) -> None:
-    names = [s.label if flows > 1 else s.method for s in groups]
+def _named_figure(groups: Sequence[Series]) -> tuple[Figure, Any]:
+    """Figure with a line for each series, its name on the left."""
+    flows = len({one.f for one in groups})
+    names = [one.label if flows > 1 else one.method for one in groups]
+    longest = max((len(name) for name in names), default=0)
+    figure, (axes,) = _figure(0.75 + 0.24 * max(len(names), 1), left=0.2 + 0.072 * longest)
     axes.set_yticks(range(len(names)), names, fontsize=8.5)
     axes.set_ylim(len(names) - 0.5, -0.5)
     axes.grid(visible=False, axis="y")
+    return figure, axes
 
 
 def failure_svg(
@@ -279,12 +300,11 @@ def failure_svg(
     """Failure rate of each series with its Wilson interval; ``rates`` as in the breakdown."""
     known = [r for r in rates if r["failure_rate"] is not None and _key(r) in series]
     known.sort(key=lambda rate: (series[_key(rate)].m, series[_key(rate)].f))
-    figure, (axes,) = _figure(1.0 + 0.24 * len(known))
     groups = [series[_key(r)] for r in known]
+    figure, axes = _named_figure(groups)
     for k, rate in enumerate(known):
         ends = [100 * rate[f"failure_rate{end}"] for end in ("", "_low", "_high")]
         _points(axes, groups[k], [ends[0]], [k], [ends[1]], [ends[2]], across=True, clip_on=False)
-    _names_axis(axes, groups, len({s.f for s in groups}))
     axes.set_xlim(-2, 102)
     _label(axes, "failure rate [%], 95 % interval", "")
     return _svg(figure, title, name)
@@ -326,12 +346,11 @@ def difference_svg(
         if key in series:
             rows.append((series[key], *(ends[0] if end is None else end for end in ends)))
     rows.sort(key=lambda row: (row[0].m, row[0].f))
-    figure, (axes,) = _figure(1.0 + 0.24 * max(len(rows), 1))
-    axes.set_xscale("log")
+    figure, axes = _named_figure([row[0] for row in rows])
+    _logarithmic(axes, "x")
     for k, (one, middle, low, high) in enumerate(rows):
         _points(axes, one, [middle], [k], [low], [high], across=True)
     axes.axvline(1.0, color=_MUTED, linewidth=0.9, linestyle=":")
-    _names_axis(axes, [row[0] for row in rows], len({row[0].f for row in rows}))
     _label(axes, f"EPE over that of {reference}, geometric mean", "")
     return _svg(figure, title, name)
 
@@ -340,8 +359,8 @@ def timing_svg(lines: Sequence[Mapping[str, Any]], title: str, name: str) -> str
     """Error over time per pair: medians with quartiles, both logarithmic; ``lines``: headline."""
     known = [r for r in lines if r["ms_median"] is not None and r["epe_l2_px_median"] is not None]
     figure, (axes,) = _figure(3.4)
-    axes.set_xscale("log")
-    axes.set_yscale("log")
+    _logarithmic(axes, "x")
+    _logarithmic(axes, "y")
     for row in known:
         y, low, high = (
             [max(row[f"epe_l2_px_{end}"], FLOOR_PX)] for end in ("median", "q25", "q75")
@@ -357,12 +376,10 @@ def timing_svg(lines: Sequence[Mapping[str, Any]], title: str, name: str) -> str
 def duration_svg(lines: Sequence[Mapping[str, Any]], title: str, name: str) -> str:
     """Time per pair of each series, medians with quartiles, logarithmic; ``lines``: headline."""
     known = [row for row in lines if row["ms_median"] is not None]
-    figure, (axes,) = _figure(1.0 + 0.24 * max(len(known), 1))
-    axes.set_xscale("log")
+    figure, axes = _named_figure([row["series"] for row in known])
+    _logarithmic(axes, "x")
     for k, row in enumerate(known):
         ends = [row["ms_median"]], [k], [row["ms_q25"]], [row["ms_q75"]]
         _points(axes, row["series"], *ends, across=True)
-    groups = [row["series"] for row in known]
-    _names_axis(axes, groups, len({s.f for s in groups}))
     _label(axes, "time per pair [ms]", "")
     return _svg(figure, title, name)

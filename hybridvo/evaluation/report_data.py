@@ -22,7 +22,7 @@ from hybridvo.evaluation.results import Alignment
 from hybridvo.geometry import invert
 from hybridvo.trajectory import Trajectory, read_trajectory
 
-__all__ = ["Comparison", "Path3D", "Series", "read_comparison", "shown_box"]
+__all__ = ["Comparison", "Path3D", "Series", "inside", "read_comparison", "shown_box"]
 
 PAIR_NUMBERS = ("index", "epe_l2_px", "rot_err_deg", "trans_err", "ms")
 
@@ -199,7 +199,7 @@ def _read_pairs(path: Path) -> dict[tuple[str, str, str], dict[str, np.ndarray]]
     }
 
 
-def _inside(folder: Path, name: Any, what: str) -> Path:
+def inside(folder: Path, name: Any, what: str) -> Path:
     """A file of the folder; a report reads nothing outside of it."""
     path = (folder / str(name)).resolve()
     if not path.is_relative_to(folder.resolve()):
@@ -222,7 +222,7 @@ def _paths_of(
     folder: Path, entries: list[Mapping[str, Any]], series: Mapping[tuple[str, str], Series]
 ) -> Iterable[Path3D]:
     def read(entry: Mapping[str, Any]) -> Trajectory:
-        return read_trajectory(_inside(folder, entry["path"], "trajectory"), "tum")
+        return read_trajectory(inside(folder, entry["path"], "trajectory"), "tum")
 
     truths = [entry for entry in entries if entry.get("method") is None]
     truth = read(truths[0]) if truths else None
@@ -322,7 +322,7 @@ def _read_figures(folder: Path) -> Iterable[dict[str, Any]]:
     for path in sorted((folder / "figures").glob("*.json")):
         try:
             figure = _read_json(path)
-            figure["file"] = _inside(folder, figure["picture"], "figure")
+            figure["file"] = inside(folder, figure["picture"], "figure")
         except KeyError:
             raise FormatError(f"{path}: expected the key 'picture'.") from None
         except HybridVOError:

@@ -32,7 +32,7 @@ import numpy as np
 from hybridvo.errors import FormatError
 from hybridvo.evaluation.breakdown import FAILURE_PX
 from hybridvo.evaluation.report import MISSING
-from hybridvo.evaluation.report_data import Comparison, read_comparison
+from hybridvo.evaluation.report_data import Comparison, inside, read_comparison
 from hybridvo.evaluation.report_tables import (
     headline_table,
     number,
@@ -235,11 +235,10 @@ def _gallery(comparison: Comparison) -> list[dict[str, Any]]:
         key = str(pair["method"]), str(pair["flow_source"] or "none")
         if key not in comparison.series:
             continue
-        path = None if pair.get("picture") is None else comparison.folder / str(pair["picture"])
-        shown = path is not None and path.is_file()
-        groups.setdefault(key, []).append(
-            {**pair, "src": _picture(path) if shown and path is not None else None}
-        )
+        name = pair.get("picture")
+        path = None if name is None else inside(comparison.folder, name, "picture")
+        source = None if path is None else _picture(path)
+        groups.setdefault(key, []).append({**pair, "src": source})
     return [{"series": comparison.series[key], "pairs": pairs} for key, pairs in groups.items()]
 
 
