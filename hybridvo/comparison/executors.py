@@ -9,6 +9,7 @@ import contextlib
 import multiprocessing
 import os
 import signal
+import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from dataclasses import dataclass
@@ -44,11 +45,20 @@ class _Here(Executor):
 def _start_worker(threads: int) -> None:
     """Prepare a worker process: its share of the cores; the keyboard speaks to the parent alone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # a parent that was killed closes nothing: its workers would wait for work for ever
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     import cv2
     import numba
 
     cv2.setNumThreads(threads)
     numba.set_num_threads(min(threads, numba.get_num_threads()))
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 @contextlib.contextmanager
