@@ -261,9 +261,9 @@ def look_through(
             for (what, unit), values in zip(pairs, prediction_errors(output, *true), strict=True):
                 panels.append(ScalarPanel(f"{name}: error of the {what}", values, unit))
     for what, saliency in saliencies(network, inputs, T_start, steps).items():
-        panels.append(
-            ScalarPanel(f"{name}: saliency of the {what}", saliency.magnitude, "", None, moving)
-        )
+        relative = saliency.magnitude / max(float(np.percentile(saliency.magnitude, 99)), 1e-30)
+        title = f"{name}: saliency of the {what}"
+        panels.append(ScalarPanel(title, relative, "relative", 1.0, moving))
         numbers |= {
             f"{name}: saliency of the {what} on moving pixels": share_on(
                 saliency.magnitude, moving

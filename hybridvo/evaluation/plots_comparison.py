@@ -68,7 +68,7 @@ def _gid(series: Series) -> str:
 
 
 def _figure(
-    height: float = 3.3, rows: int = 1, *, left: float = 0.62, bottom: float = 0.48, **grid: Any
+    height: float = 3.3, rows: int = 1, *, left: float = 0.75, bottom: float = 0.48, **grid: Any
 ) -> tuple[Figure, list[Any]]:
     """Figure of a height with margins in inches; plots below each other."""
     # fixed margins: the layout engine draws everything twice to find them
@@ -94,8 +94,17 @@ def _logarithmic(axes: Any, which: str) -> None:
     """Make the ``x`` or ``y`` axis logarithmic, its powers written out."""
     getattr(axes, f"set_{which}scale")("log")
     axis = getattr(axes, f"{which}axis")
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: _power(value)))
     axis.set_minor_formatter(NullFormatter())
+
+
+def _power(value: float) -> str:
+    """Power of ten as short as it can be read."""
+    return (
+        f"{value:g}"
+        if 1e-3 <= abs(value) < 1e4
+        else re.sub(r"e([+-])0*", r"e\1", f"{value:.0e}").replace("e+", "e")
+    )
 
 
 def _label(axes: Any, x: str, y: str) -> None:
@@ -123,9 +132,9 @@ def _svg(figure: Figure, title: str, name: str) -> str:
     text = re.sub(r' id="([^"]+)"', lambda m: f' id="{name}-{m[1]}"' if m[1] in used else "", text)
     text = re.sub(r'(url\(#|href="#)', rf"\g<1>{name}-", text)
     text = text.replace("xlink:href", "href")
-    # line breaks and leading zeros are a fifth of the file
+    # line breaks and far digits of coordinates are a third of the file; text keeps its digits
     text = re.sub(r"\s*\n\s*", " ", text).replace("> <", "><")
-    text = re.sub(r"(\d\.\d\d)\d+", r"\1", text)
+    text = re.sub(r"<[^>]*>", lambda m: re.sub(r"(\d\.\d\d)\d+", r"\1", m[0]), text)
     size = re.search(r'viewBox="([^"]+)"', text)
     box = size[1] if size else "0 0 1 1"
     body = text[text.index(">") + 1 :]

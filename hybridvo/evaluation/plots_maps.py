@@ -90,7 +90,7 @@ def maps_png(panels: Sequence[Panel], heading: str, aspect: float) -> bytes:
             axes.imshow(flow_colours(panel.flow, panel.longest), interpolation="nearest")
             _legend(axes, panel.longest)
         else:
-            _scalar(figure, axes, panel)
+            _scalar(figure, axes, panel, aspect)
     figure.suptitle(heading, fontsize=11, x=0.01, ha="left")
     stream = io.BytesIO()
     figure.savefig(stream, format="png", metadata={"Software": None})
@@ -109,7 +109,7 @@ def _legend(axes: Any, longest: float) -> None:
     )
 
 
-def _scalar(figure: Figure, axes: Any, panel: ScalarPanel) -> None:
+def _scalar(figure: Figure, axes: Any, panel: ScalarPanel, aspect: float) -> None:
     from matplotlib import colormaps
     from matplotlib.colors import LogNorm, Normalize
 
@@ -124,12 +124,12 @@ def _scalar(figure: Figure, axes: Any, panel: ScalarPanel) -> None:
     else:
         norm = Normalize(0.0, max(top, 1e-12))
     colours = colormaps["magma"].with_extremes(bad="#9a9a9a")
-    drawn = axes.imshow(values, cmap=colours, norm=norm, interpolation="nearest")
+    # networks see another shape of picture; shown in that of the images
+    shape = {"extent": (0.0, aspect, 1.0, 0.0), "interpolation": "nearest"}
+    drawn = axes.imshow(values, cmap=colours, norm=norm, **shape)
     if panel.outline is not None and panel.outline.any() and not panel.outline.all():
-        height, width = values.shape
         rows, cols = panel.outline.shape
-        x = (np.arange(cols) + 0.5) * width / cols - 0.5
-        y = (np.arange(rows) + 0.5) * height / rows - 0.5
+        x, y = (np.arange(cols) + 0.5) * aspect / cols, (np.arange(rows) + 0.5) / rows
         axes.contour(x, y, panel.outline, levels=[0.5], colors="#4fd1ff", linewidths=0.8)
     bar = figure.colorbar(drawn, ax=axes, fraction=0.04, pad=0.02, label=panel.unit)
     bar.ax.tick_params(labelsize=8)

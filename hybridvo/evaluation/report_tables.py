@@ -153,10 +153,8 @@ def _build(
 _HEADLINE = (
     Column("method", "method", text=True),
     Column("flow_source", "flow", text=True),
-    Column("pairs", "pairs"),
-    Column("failed", "failed"),
-    Column("failure_rate", "failures above 1 px [%]", 100.0, better=-1),
     Column("epe_l2_px_median", "EPE [px]", better=-1),
+    Column("failure_rate", "failures above 1 px [%]", 100.0, better=-1),
     Column("rot_err_deg_median", "rotation [deg]", better=-1),
     Column("trans_err_median", "translation [cm]", 100.0, better=-1),
     Column("ate_rmse", "ATE [cm]", 100.0, better=-1),
@@ -164,6 +162,8 @@ _HEADLINE = (
     Column("rpe_rot_rmse_deg", "RPE [deg]", better=-1),
     Column("ms_median", "time [ms]", better=-1),
     Column("flow_ms_median", "+ flow [ms]"),
+    Column("pairs", "pairs"),
+    Column("failed", "failed"),
 )
 
 
