@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hybridvo.errors import InputError
+from hybridvo.errors import CheckpointError, InputError
 from hybridvo.geometry import ego_flow, se3_exp
 from hybridvo.pose.judgement import default_judge
 from hybridvo.pose.refinement import RefinementOptions, refine
-from hybridvo.pose.second_look import Motions, Opinion, Verdict
+from hybridvo.pose.second_look import Motions, Opinion, PictureJudge, Verdict
 from hybridvo.types import Camera, Frame, FramePair, RelativePose
 
 if TYPE_CHECKING:
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "DEFAULT_METHOD",
+    "JUDGED",
     "METHODS",
     "LearnedJudge",
     "check_method",
@@ -47,7 +48,8 @@ _BASELINES = (
     "open3d-rgbd",
     "identity",
 )
-_JUDGED = ("hybrid", "hybrid-flow")
+JUDGED = ("hybrid", "hybrid-flow")
+"""Methods that ask a learned judge which motion is the world."""
 _WITH_NETWORK = (
     "pwvo",
     "pwvo-naive",
@@ -56,7 +58,7 @@ _WITH_NETWORK = (
     "vonet-attention",
 )
 
-METHODS = (*_JUDGED, "refine", *_WITH_NETWORK, *_BASELINES)
+METHODS = (*JUDGED, "refine", *_WITH_NETWORK, *_BASELINES)
 """Every method name, in the order of the results' tables."""
 
 
@@ -71,7 +73,7 @@ def check_method(method: str) -> None:
         near = difflib.get_close_matches(str(method), METHODS, n=1, cutoff=0.4)
         hint = f" (did you mean '{near[0]}'?)" if near else ""
         raise InputError(f"method: '{method}' is unknown{hint}; known: {', '.join(METHODS)}.")
-    if method in _JUDGED:
+    if method in JUDGED:
         from hybridvo.network.weights import pretrained_names
 
         missing_weights = "judge" not in pretrained_names()
@@ -96,6 +98,7 @@ def estimate(
     T_last: np.ndarray | None = None,
     method: str = DEFAULT_METHOD,
     options: RefinementOptions | None = None,
+    judge: PictureJudge | None = None,
     seed: int = 0,
 ) -> RelativePose:
     """Camera motion of one pair.
@@ -106,6 +109,7 @@ def estimate(
             the methods that can use one.
         method: one of :data:`METHODS` that can run here.
         options: of the refinement.
+        judge: for the methods that ask one; by default the one whose weights are shipped.
         seed: of everything that is drawn at random; the same seed gives the same bytes.
 
     Returns:
@@ -123,8 +127,8 @@ def estimate(
     """
     if method == "refine":
         return refine(pair, T_last=T_last, options=options, seed=seed)
-    if method in _JUDGED:
-        judge = shipped_judge()
+    if method in JUDGED:
+        judge = judge or shipped_judge()
         found = refine(pair, T_last=T_last, options=options, judge=judge, seed=seed)
         return found.replace(method=method)
     check_method(method)
@@ -216,16 +220,23 @@ def _candidates(motions: Motions, parents: np.ndarray) -> dict[str, Any]:
 
 
 @functools.cache
-def shipped_judge() -> LearnedJudge:
-    """The judge whose weights are part of the package; read once in a process.
+def shipped_judge(name: str = "judge") -> LearnedJudge:
+    """A judge whose weights are part of the package; read once in a process.
+
+    Args:
+        name: of the weights.
 
     Raises:
-        CheckpointError: its weights are missing or damaged.
+        CheckpointError: no such weights, weights of another network, or damaged ones.
     """
+    from hybridvo.network.judge import JudgeNetwork
     from hybridvo.network.weights import load_weights, pretrained
 
-    network, _ = load_weights(pretrained("judge"))
-    return LearnedJudge(network)  # type: ignore[arg-type]
+    path = pretrained(name)
+    network, _ = load_weights(path)
+    if not isinstance(network, JudgeNetwork):
+        raise CheckpointError(f"{path}: expected the weights of a judge, got another network's.")
+    return LearnedJudge(network)
 
 
 def warm_up(method: str = DEFAULT_METHOD) -> float:
@@ -253,7 +264,7 @@ def warm_up(method: str = DEFAULT_METHOD) -> float:
         valid = np.ones((height, width), np.bool_)
         variance = np.full((height, width), 0.01, np.float32)
         frame = Frame(None, depth, camera)
-        judge = shipped_judge() if method in _JUDGED else default_judge
+        judge = shipped_judge() if method in JUDGED else default_judge
         refine(FramePair(frame, frame, flow, variance, valid), judge=judge)
         refine(FramePair(frame, frame, flow), judge=judge)
     return time.perf_counter() - started

@@ -11,7 +11,15 @@ import numpy as np
 from hybridvo.errors import InputError
 from hybridvo.flow import FlowField, FlowProvider, check_field, dis_flow
 from hybridvo.geometry import invert
-from hybridvo.hybrid import DEFAULT_METHOD, check_method, estimate, warm_up
+from hybridvo.hybrid import (
+    DEFAULT_METHOD,
+    JUDGED,
+    LearnedJudge,
+    check_method,
+    estimate,
+    shipped_judge,
+    warm_up,
+)
 from hybridvo.pose.refinement import RefinementOptions
 from hybridvo.trajectory import chain
 from hybridvo.types import Frame, FramePair, Reason, RelativePose, Step
@@ -55,11 +63,16 @@ class Odometry:
     Two trackers share no state and may run in two threads; one tracker belongs to one thread.
 
     Args:
-        network: None; networks come with their weights in a later version.
+        network: ``default`` for the shipped weights, None for the classical refinement alone, or a
+            :class:`hybridvo.hybrid.LearnedJudge` of one's own.
         flow: provider ``(prev, curr) -> FlowField or (H, W, 2) array``; default: OpenCV DIS with a
             forward-backward check. Functions of two images go through
             :func:`hybridvo.flow.as_provider`.
-        method: see :data:`hybridvo.hybrid.METHODS`.
+        method: see :data:`hybridvo.hybrid.METHODS`; by default ``hybrid``, or ``refine`` without a
+            network.
+        history: let the last motion take part: as one start among others, and as a cue for which
+            motion is the world. It cannot hold the tracker: every start competes by how well the
+            pixels follow it.
         policy: pose of a frame whose motion failed: ``hold`` (no motion) or ``constant_velocity``
             (the last motion again). The status stays failed and the covariance is large.
         options: of the refinement.
@@ -67,7 +80,7 @@ class Odometry:
         prepare: compile now rather than at the first pair (see :func:`hybridvo.hybrid.warm_up`).
 
     Raises:
-        InputError: an unknown method or policy, or a network.
+        InputError: an unknown method or policy, or a network that is none or that the method lacks.
 
     Example:
         >>> import numpy as np
@@ -81,17 +94,27 @@ class Odometry:
 
     def __init__(
         self,
-        network: Any = None,
+        network: LearnedJudge | str | None = "default",
         *,
         flow: FlowProvider | Callable[[Frame, Frame], Any] | None = None,
-        method: str = DEFAULT_METHOD,
+        method: str | None = None,
         policy: Policy = "hold",
         options: RefinementOptions | None = None,
         seed: int = 0,
+        history: bool = True,
         prepare: bool = True,
     ) -> None:
-        if network is not None:
-            raise InputError("Odometry.network: expected None; networks are not supported yet.")
+        if network is not None and network != "default" and not isinstance(network, LearnedJudge):
+            raise InputError(
+                f"Odometry.network: expected 'default', None or a LearnedJudge, got {network!r}."
+            )
+        if method is None:
+            method = "refine" if network is None else DEFAULT_METHOD
+        if network is None and method in JUDGED:
+            raise InputError(
+                f"Odometry: method {method!r} needs a network; leave network='default', or use "
+                f"method='refine'."
+            )
         if policy not in POLICIES:
             raise InputError(f"Odometry.policy: expected {' or '.join(POLICIES)}, got {policy!r}.")
         if flow is not None and not callable(flow):
@@ -103,6 +126,10 @@ class Odometry:
         self.policy = policy
         self.options = options or RefinementOptions()
         self.seed = seed
+        self.history = bool(history)
+        self._judge = None
+        if method in JUDGED:
+            self._judge = network if isinstance(network, LearnedJudge) else shipped_judge()
         self._flow = flow or dis_flow()
         self.reset()
         if prepare:
@@ -110,15 +137,16 @@ class Odometry:
 
     @classmethod
     def from_pretrained(cls, name: str = "default", **options: Any) -> Odometry:
-        """Tracker with the shipped network weights.
+        """Tracker with shipped network weights.
+
+        Args:
+            name: ``default``, or one of :func:`hybridvo.network.weights.pretrained_names`.
+            options: of the tracker.
 
         Raises:
-            InputError: always, in this version: no weights are shipped yet.
+            CheckpointError: no such weights (the message lists those known), or damaged ones.
         """
-        raise InputError(
-            f"Odometry.from_pretrained({name!r}): this version ships no network weights yet; "
-            f"use hybridvo.Odometry(), the classical refinement."
-        )
+        return cls("default" if name == "default" else shipped_judge(name), **options)
 
     @property
     def anchor(self) -> Anchor:
@@ -172,9 +200,10 @@ class Odometry:
         pair = self._pair(prev, frame, flow)
         motion = estimate(
             pair,
-            T_last=anchor.T_last if anchor.gap == 0 else None,
+            T_last=anchor.T_last if anchor.gap == 0 and self.history else None,
             method=self.method,
             options=self.options,
+            judge=self._judge,
             seed=self.seed,
         )
         if motion.ok:

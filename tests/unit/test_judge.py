@@ -1,0 +1,264 @@
+"""The judge: what it sees, that pairs stay apart, the second look, training data and training."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from hybridvo.data.benchmark_pairs import Cell, make_pair
+from hybridvo.errors import CheckpointError, InputError
+from hybridvo.geometry import ego_flow
+from hybridvo.hybrid import LearnedJudge, _judge_inputs
+from hybridvo.network.judge import JudgeInputs, JudgeNetwork, JudgeOptions
+from hybridvo.network.weights import load_weights, save_weights
+from hybridvo.pose import second_look
+from hybridvo.pose.coarse import CoarseSearch, search_motions, whole_mask
+from hybridvo.pose.options import RefinementOptions
+from hybridvo.pose.refinement import refine
+from hybridvo.pose.second_look import Motions, Opinion, Verdict
+from hybridvo.training import judge_data
+from hybridvo.training.judge_batches import PictureBatch, ego_flow_error, read_batches
+from hybridvo.training.judge_loop import JudgeTrainer, JudgeTrainingOptions
+from hybridvo.types import Reason, State
+
+CELL = Cell(moving=0.6, objects=1, flow_noise_px=0.3, depth_noise=0.01)
+SIZE = {"height": 96, "width": 224}
+
+
+@pytest.fixture(scope="module")
+def network() -> JudgeNetwork:
+    torch.manual_seed(3)
+    made = JudgeNetwork()
+    # the last layers start at zero; a judge that says something is wanted here
+    for layer in (made.score, made.trust):
+        torch.nn.init.normal_(layer.weight, std=0.3)
+    return made.eval()
+
+
+def search(seed: int, **cell: object) -> tuple[CoarseSearch, object, dict]:
+    pair, truth = make_pair(replace(CELL, **cell), seed, **SIZE)
+    found = search_motions(pair, np.eye(4)[None, :3], None, RefinementOptions(), 0)
+    assert isinstance(found, CoarseSearch) and len(found.poses) > 1
+    return found, pair, truth
+
+
+def inputs_of(seed: int) -> JudgeInputs:
+    found, pair, _ = search(seed)
+    return _judge_inputs(found.grid(pair), second_look._motions(found.poses, found.facts), None)
+
+
+def together(parts: list[JudgeInputs]) -> JudgeInputs:
+    values = {f.name: torch.cat([getattr(p, f.name) for p in parts]) for f in fields(JudgeInputs)}
+    counts = [len(p.owner) for p in parts]
+    values["owner"] = torch.repeat_interleave(torch.arange(len(parts)), torch.tensor(counts))
+    values["parent"] = torch.arange(sum(counts))
+    return JudgeInputs(**values)
+
+
+def test_support_is_that_of_the_solver(network: JudgeNetwork) -> None:
+    # the same robust weight, from torch formulas of their own and from the solver's kernel
+    found, pair, _ = search(1)
+    answer = refine(pair)
+    judged = network.encode(inputs_of(1)).support.detach().numpy()
+    for hypothesis in answer.hypotheses:
+        errors = [np.abs(s - hypothesis.support).max() for s in judged]
+        # float32 residuals of 0.3 px noise: a hundredth of a standard deviation
+        assert min(errors) < 0.02
+    assert found.count == judged[0].size
+
+
+def test_pictures_do_not_see_each_other(network: JudgeNetwork) -> None:
+    parts = [inputs_of(seed) for seed in (1, 2)]
+    broken = replace(parts[1], depth=torch.full_like(parts[1].depth, torch.nan))
+    with torch.no_grad():
+        alone = network(parts[0])
+        for other in (parts[1], broken):
+            both = network(together([parts[0], other]))
+            n = len(parts[0].owner)
+            # another batch size may sum in another order
+            torch.testing.assert_close(both.score[:n], alone.score, atol=1e-4, rtol=1e-4)
+            torch.testing.assert_close(both.mask[:n], alone.mask, atol=1e-3, rtol=1e-3)
+
+
+def test_holes_and_unknown_depths_give_finite_answers(network: JudgeNetwork) -> None:
+    inputs = inputs_of(1)
+    usable = inputs.usable.clone()
+    usable[:, :20] = False
+    nothing = torch.zeros_like(usable)
+    unknown = torch.full_like(inputs.log_depth_curr, torch.nan)
+    with torch.no_grad():
+        for mask in (usable, nothing):
+            out = network(replace(inputs, usable=mask, log_depth_curr=unknown))
+            assert torch.isfinite(out.score).all() and torch.isfinite(out.mask).all()
+            assert (out.support[~mask.expand_as(out.support)] == 0).all()
+
+
+def test_the_second_look_shares_what_the_first_has_seen(network: JudgeNetwork) -> None:
+    # a refit equal to its parent is seen as the parent, but for the flag that it is a refit
+    inputs = inputs_of(1)
+    with torch.no_grad():
+        first = network.encode(inputs)
+        again = network.encode(inputs, (inputs, first))
+        anew = network.encode(inputs, (inputs, network(inputs)))
+    torch.testing.assert_close(first.levels[0], again.levels[0])
+    torch.testing.assert_close(again.score, anew.score)
+    assert (first.score - again.score).abs().max() > 1e-6
+
+
+def test_weights_round_trip(network: JudgeNetwork, tmp_path: Path) -> None:
+    path = save_weights(tmp_path / "j.safetensors", network, network.options, {}, "float16")
+    read, _ = load_weights(path)
+    assert isinstance(read, JudgeNetwork) and read.options == JudgeOptions()
+    with pytest.raises(InputError):
+        save_weights(path, network, JudgeOptions(width=0.5), {})
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(CheckpointError):
+        load_weights(path)
+    for bad in ({"kind": "pwvo"}, {"width": 0.0}, {"width": True}):
+        with pytest.raises(InputError):
+            JudgeOptions(**bad)
+
+
+class Oracle:
+    """A judge that knows where the world is, for testing what is done with its answers."""
+
+    def __init__(self, static: np.ndarray, prefer: str, trust: float = 0.9) -> None:
+        self.static, self.prefer, self.trust = static, prefer, trust
+
+    def first_look(self, grid, motions: Motions, T_last, masks: int) -> Opinion:
+        best = np.arange(min(masks, len(motions.poses)))
+        count = len(motions.poses)
+        return Opinion(np.zeros(count), best, np.stack([self.static] * len(best)), count)
+
+    def second_look(self, first: Opinion, refits: Motions, parents: np.ndarray) -> Verdict:
+        old, new = np.zeros(first.memory), np.zeros(len(refits.poses))
+        (new if self.prefer == "refit" else old)[-1] = 5.0
+        return Verdict(np.concatenate([old, new]), self.trust)
+
+
+def gap(T: np.ndarray, pair, truth) -> float:
+    camera = pair.prev.camera
+    flows = [ego_flow(truth["depth_true"], P, camera, camera) for P in (T, truth["T_curr_prev"])]
+    return float(np.linalg.norm(flows[0] - flows[1], axis=2).mean())
+
+
+def test_the_world_is_fitted_where_the_mask_says() -> None:
+    found, pair, truth = search(4)
+    stride = found.shape[2]
+    static = ~truth["moving"][stride // 2 :: stride, stride // 2 :: stride]
+    answer = refine(pair, judge=Oracle(static.astype(np.float32), "refit"))
+    told = refine(pair, weights=(~truth["moving"]).astype(np.float32))
+    assert answer.hypotheses[0].source == "second-look" and answer.status.state is State.OK
+    # the mask is drawn on every stride-th pixel: its edges differ, the motion hardly
+    assert gap(answer.T_curr_prev, pair, truth) < gap(told.T_curr_prev, pair, truth) + 0.02
+    # 60 % of the pixels move: the share is that of the whole picture
+    assert 0.2 < answer.inlier_ratio < 0.5
+    assert len(answer.hypotheses) > len(refine(pair).hypotheses)
+
+
+def test_an_uncertain_judge_does_not_hurt() -> None:
+    found, pair, _ = search(4)
+    static = np.full(found.shape[:2], 0.5, np.float32)
+    answer, plain = refine(pair, judge=Oracle(static, "refit", 0.01)), refine(pair)
+    np.testing.assert_array_equal(answer.T_curr_prev, plain.T_curr_prev)
+    assert answer.status.state is State.DEGRADED
+    assert answer.status.reason is Reason.AMBIGUOUS_MOTION
+    # an empty mask cannot be fitted in: the motions of the search remain
+    answer = refine(pair, judge=Oracle(0 * static, "search"))
+    assert all(h.source != "second-look" for h in answer.hypotheses) and answer.ok
+
+
+def test_a_clear_motion_is_not_put_before_the_judge() -> None:
+    pair, _ = make_pair(Cell(moving=0.0), 1, **SIZE)
+    answer = refine(pair, judge=Oracle(np.zeros((1, 1), np.float32), "refit", 0.0))
+    np.testing.assert_array_equal(answer.T_curr_prev, refine(pair).T_curr_prev)
+    assert answer.status.state is State.OK
+
+
+def test_masks_grow_to_the_picture() -> None:
+    mask = np.zeros((5, 7), np.float32)
+    mask[:, 4:] = 1
+    whole = whole_mask(mask, (31, 45), (0, 31, 0, 45), 6)
+    assert whole.shape == (31, 45) and not whole[:, :21].any()
+    # the first column of ones is the pixel that the grid took, 4 * 6 + 3
+    assert whole[15, 27] == pytest.approx(1.0, abs=0.1) and whole[30, 44] == 1
+    inner = whole_mask(np.ones((2, 2), np.float32), (20, 20), (4, 12, 6, 14), 4)
+    assert inner.sum() == 64 and inner[4:12, 6:14].all()
+
+
+def test_same_bytes_from_several_threads(network: JudgeNetwork) -> None:
+    _, pair, _ = search(5)
+    judge = LearnedJudge(network)
+    expected = refine(pair, judge=judge).T_curr_prev.tobytes()
+    with ThreadPoolExecutor(4) as pool:
+        got = list(pool.map(lambda _: refine(pair, judge=judge).T_curr_prev.tobytes(), range(8)))
+    assert set(got) == {expected}
+
+
+def test_pictures_are_the_pairs_they_came_from() -> None:
+    first, again = judge_data.draw_pictures(3), judge_data.draw_pictures(3)
+    assert len(first) == len(again)
+    for one, two in zip(first, again, strict=True):
+        for key in one:
+            np.testing.assert_array_equal(one[key], two[key])
+
+
+@pytest.fixture(scope="module")
+def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("pictures")
+    count, judge_data.PER_SHARD = judge_data.PER_SHARD, 12
+    try:
+        assert judge_data.write_shard(folder, 0) > 4
+    finally:
+        judge_data.PER_SHARD = count
+    return folder
+
+
+def batches(folder: Path) -> list[PictureBatch]:
+    return list(read_batches(sorted(folder.glob("*.npz")), 4, None))
+
+
+def test_the_truth_of_a_picture_explains_its_static_pixels(shards: Path) -> None:
+    for batch in batches(shards):
+        owner = torch.arange(len(batch.T))
+        assert ego_flow_error(batch.T, owner, batch).max() < 1e-3
+        # where the flow is true, static pixels follow the true motion
+        for b in np.flatnonzero(batch.source == 1):
+            inputs = batch.inputs
+            x, y = inputs.ray[b]
+            z = batch.depth_true[b]
+            P, K = batch.T[b], inputs.K[b]
+            X, Y, Z = (z * (P[i, 0] * x + P[i, 1] * y + P[i, 2]) + P[i, 3] for i in range(3))
+            u = K[0] * X / Z + K[2] - inputs.target[b, 0]
+            v = K[1] * Y / Z + K[3] - inputs.target[b, 1]
+            distance = torch.sqrt(u * u + v * v) * 1024 / inputs.image_width[b]
+            usable = inputs.usable[b] & (z > 0)
+            static = usable & (batch.label[b] == judge_data.STATIC)
+            moving = usable & (batch.label[b] == judge_data.MOVING)
+            if moving.sum() > 50 and static.sum() > 50:
+                assert distance[static].median() < distance[moving].median()
+
+
+def test_training_learns_and_goes_on(shards: Path, tmp_path: Path) -> None:
+    options = JudgeTrainingOptions(JudgeOptions(width=0.5), batch_size=4, second_look_from=0.0)
+    trainer = JudgeTrainer(options, shards, tmp_path)
+    batch = max(batches(shards), key=lambda b: len(b.T))
+    losses = [trainer.update(batch, 0.5) for _ in range(14)]
+    assert {"choice", "mask", "second", "trust"} <= set(losses[0])
+    # the same pictures again and again: the masks are learned
+    assert losses[-1]["mask"] < 0.9 * losses[0]["mask"]
+    trainer.save()
+    other = JudgeTrainer(options, shards, tmp_path)
+    assert other.resume()
+    expected, got = trainer.update(batch, 0.5), other.update(batch, 0.5)
+    assert expected == got
+    with pytest.raises(InputError):
+        JudgeTrainer(options, tmp_path / "nothing", tmp_path).run(1.0)
+    for bad in ({"batch_size": 0}, {"ema_decay": 1.0}, {"learning_rate": 0.0}):
+        with pytest.raises(InputError):
+            JudgeTrainingOptions(**bad)
