@@ -87,6 +87,12 @@ def test_every_number_is_in_its_json(name):
         protocol = PROTOCOLS[name.removeprefix("sintel_")]
         known += [value for line in protocol.published for value in line.values.values()]
         known += [14.0, 13.0, 2025.0, 2.0, 1.0, 6.0, 992.0]  # tables and years in the sources
+    if name == "ablation":
+        content = json.loads(path.read_text(encoding="utf-8"))
+        known += [run["seconds"] / 60 for run in content["runs"]]  # shown in minutes
+        published = tool("ablation_report.py").published()
+        known += [value for line in published.values() for value in line.values()]
+        known += [0.0]  # seeds of rows that are not trained
     assert len(NUMBER.findall(" ".join(shown))) > 10
     assert not unknown(shown, np.array(known))
 
@@ -152,12 +158,21 @@ def test_a_measured_table_is_filled(made, tmp_path):
 
 def test_the_ablation_stands_there_once_it_is_measured(made, tmp_path):
     assert "Ablation" not in made.page(tmp_path)
-    rows = [{"change": "all", "epe": 0.5123456, "failed": 2}, {"change": "no U", "epe": None}]
-    content = {"command": ["tools/ablation.py", "--out", "x"], "rows": rows}
+    report = tool("ablation_report.py")
+    zero = {"zero_epe": 3.25, "zero_r_err_deg": 0.5, "zero_t_err": 0.25}
+    scores = {"epe": 0.8765, "r_err_deg": 0.125, "t_err": 0.0625} | zero
+    run = {"row": "pwvo", "seed": 0, "scores": {"data_paper": scores, "data_wide": scores}}
+    run |= {"updates": 7, "skipped": 0, "seconds": 90.0, "samples_per_s": 20.0}
+    content = report.summary([run], None, 1) | {
+        **{"command": ["tools/ablation.py", "--out", "x"], "commit": "abc", "samples": 100},
+        **{"base": "configs/ablation.yaml", "device": "cpu", "threads": 1},
+        "held_out": {"count": 10, "seed": 4000},
+    }
     (tmp_path / "ablation.json").write_text(json.dumps(content))
     text = made.page(tmp_path)
-    assert "| all | 0.512 | 2 |" in text
-    assert "| no U | - | - |" in text
+    assert "\n## Ablation" in text and "\n### Table 1: main\n" in text
+    row = next(line for line in text.splitlines() if line.startswith("| PWVO | 1 |"))
+    assert "| 0.876 | 0.125 | 0.062 |" in row or "| 0.877 | 0.125 | 0.062 |" in row
 
 
 def test_bad_files_are_named(made, tmp_path, capsys):

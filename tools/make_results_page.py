@@ -59,10 +59,10 @@ def main(argv: list[str] | None = None) -> int:
     return 0
 
 
-def tables() -> ModuleType:
-    """The tool beside this one that makes the README's tables: a table is written once."""
-    path = Path(__file__).with_name("make_readme_tables.py")
-    spec = importlib.util.spec_from_file_location("make_readme_tables", path)
+def sibling(name: str) -> ModuleType:
+    """A tool beside this one: a table is written once."""
+    path = Path(__file__).with_name(f"{name}.py")
+    spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
         raise ValueError(f"{path}: cannot be read as a module.")
     module = importlib.util.module_from_spec(spec)
@@ -124,7 +124,7 @@ def _part(path: Path, part: Part, content: Mapping[str, Any]) -> list[str]:
 
 
 def benchmark(content: Mapping[str, Any]) -> list[str]:
-    made = tables()
+    made = sibling("make_readme_tables")
     lines = [
         "## Synthetic pairs",
         "",
@@ -166,7 +166,7 @@ def rendered(content: Mapping[str, Any]) -> list[str]:
         "Scenes of `tools/generate_dataset.py`. In the heavy ones objects cover more than half of "
         "the picture.",
         "",
-        *tables().rendered_table(content),
+        *sibling("make_readme_tables").rendered_table(content),
         "",
     ]
 
@@ -178,35 +178,23 @@ def real_samples(content: Mapping[str, Any]) -> list[str]:
         "Medians over the pairs; *end* is the error of the chained motions at the last frame. "
         "`file (true)` is ground-truth flow.",
         "",
-        *tables().real_samples_table(content),
+        *sibling("make_readme_tables").real_samples_table(content),
         "",
     ]
 
 
 def ablation(content: Mapping[str, Any]) -> list[str]:
-    """Any rows of names and numbers: a column per key, in the order of the first row."""
-    made = tables()
-    rows = content["rows"]
-    keys = [k for k, v in rows[0].items() if v is None or isinstance(v, str | int | float)]
-    cells = [[_cell(row.get(key), made) for key in keys] for row in rows]
-    command = content["command"]
-    text = command if isinstance(command, str) else " ".join(command)
-    return ["## Ablation", "", *made.table(keys, cells), "", f"`{text}`", ""]
-
-
-def _cell(value: Any, made: ModuleType) -> str:
-    if isinstance(value, str):
-        return value
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    return str(value) if isinstance(value, int) else made.number(value)
+    """The page of `tools/ablation.py`, its headings a level lower."""
+    text = sibling("ablation_report").markdown(content)
+    lines = [f"#{line}" if line.startswith("#") else line for line in text.rstrip().splitlines()]
+    return [*lines, ""]
 
 
 def sintel(name: str, content: Mapping[str, Any] | None) -> list[str]:
     """Table of one protocol, empty where nothing was measured yet."""
     from hybridvo.evaluation.protocols import PROTOCOLS as KNOWN
 
-    number = tables().number
+    number = sibling("make_readme_tables").number
     protocol = KNOWN[name]
     measured = None if content is None else content["protocol"]
     labels = [f"{m.label}, {m.unit}" for m in protocol.metrics]
