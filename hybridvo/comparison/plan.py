@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 from collections.abc import Sequence
 from pathlib import Path
 
+import hybridvo
 from hybridvo.data.sequence import READERS
 from hybridvo.data.sintel import SintelSequence
 from hybridvo.errors import InputError
 from hybridvo.hybrid import METHODS, check_method
 
-__all__ = ["chosen_methods", "expand", "unique_names"]
+__all__ = ["chosen_methods", "expand", "unique_names", "weights_of"]
 
 _SINTEL_FOLDERS = ("camdata_left", "depth", "final", "clean", "flow")
 
@@ -37,6 +39,22 @@ def chosen_methods(names: Sequence[str]) -> tuple[tuple[str, ...], dict[str, str
         else:
             runnable.append(name)
     return tuple(runnable), missing
+
+
+def weights_of(methods: Sequence[str], shipped: Path | None = None) -> dict[str, str]:
+    """Name and SHA-256 of the shipped weights that methods use: part of what a result depends on.
+
+    Args:
+        methods: in the comparison; those without a network use none.
+        shipped: folder of the weights; default: the package's own.
+    """
+    folder = Path(hybridvo.__file__).parent / "network" / "shipped" if shipped is None else shipped
+    used = set(methods) | ({"judge"} if {"hybrid", "hybrid-flow"} & set(methods) else set())
+    return {
+        path.stem: hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(folder.glob("*.safetensors"))
+        if path.stem in used
+    }
 
 
 def expand(path: str | os.PathLike[str], dataset: str | None = None) -> list[Path]:

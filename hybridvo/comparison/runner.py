@@ -15,7 +15,7 @@ from typing import Any
 import hybridvo
 from hybridvo.comparison.executors import Workers, open_workers
 from hybridvo.comparison.job import Job, run_segment
-from hybridvo.comparison.plan import chosen_methods, expand, unique_names
+from hybridvo.comparison.plan import chosen_methods, expand, unique_names, weights_of
 from hybridvo.comparison.results import ROW_COLUMNS, Segments, collect
 from hybridvo.configuration import RunOptions
 from hybridvo.console import Interruption, Progress, interruptible
@@ -111,12 +111,14 @@ def compare(
         )
     plan = _plan(options)
     settings = asdict(options)
+    weights = weights_of(plan.methods)
     identity = {
         "sequences": [[job.name, job.input_hash] for job in plan.jobs],
         "methods": list(plan.methods),
         "options": {
             key: settings[key] for key in ("flow", "start", "stop", "stride", "seed", "protocol")
         },
+        "weights": weights,
         "hybridvo": hybridvo.__version__,
     }
     header = {
@@ -124,6 +126,7 @@ def compare(
         "versions": versions(),
         "machine": {"platform": platform.platform(), "cpus": os.cpu_count()},
         "options": settings,
+        "weights": weights,
         "started": _now(),
     }
     with (

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import csv
+import hashlib
 import importlib.util
 import json
 import shutil
@@ -17,7 +18,7 @@ import pytest
 from hybridvo.comparison import job as job_module
 from hybridvo.comparison import runner
 from hybridvo.comparison.job import READS_NO_FLOW, Job, run_segment
-from hybridvo.comparison.plan import expand, unique_names
+from hybridvo.comparison.plan import expand, unique_names, weights_of
 from hybridvo.comparison.results import PAIR_COLUMNS
 from hybridvo.comparison.runner import ComparisonOptions, WorkerError, compare
 from hybridvo.data.sequence import open_sequence
@@ -439,3 +440,12 @@ def test_equal_names_are_told_apart() -> None:
     assert names == ["office/Easy/P000", "house/Easy/P000", "P001"]
     with pytest.raises(InputError, match="given twice"):
         unique_names([Path("a"), Path("a")], ["a", "a"])
+
+
+def test_weights_are_part_of_what_a_result_depends_on(tmp_path: Path) -> None:
+    for name in ("judge", "pwvo", "vonet"):
+        (tmp_path / f"{name}.safetensors").write_bytes(name.encode())
+    assert weights_of(["refine", "identity"], tmp_path) == {}
+    found = weights_of(["hybrid", "pwvo", "refine"], tmp_path)
+    assert list(found) == ["judge", "pwvo"]
+    assert found["pwvo"] == hashlib.sha256(b"pwvo").hexdigest()
