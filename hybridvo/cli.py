@@ -63,6 +63,9 @@ def _add_run(commands: Any) -> None:
     run.add_argument(
         "--flow", metavar="WHAT", help="auto (default), file or dis; auto: files, else DIS"
     )
+    run.add_argument(
+        "--polish", metavar="WHAT", help="auto (default: with --method hybrid), on or off"
+    )
     run.add_argument("--start", type=int, metavar="N", help="first frame (default 0)")
     run.add_argument("--stop", type=int, metavar="N", help="the one after the last frame")
     run.add_argument("--stride", type=int, metavar="N", help="step between frames (default 1)")
@@ -214,7 +217,10 @@ def _run(args: argparse.Namespace, command: list[str]) -> int:
     from hybridvo.run import run
     from hybridvo.run_report import summary_text
 
-    named = ("method", "flow", "start", "stop", "stride", "device", "max_failed", "strict")
+    named = (
+        *("method", "flow", "polish", "start", "stop", "stride", "device"),
+        *("max_failed", "strict"),
+    )
     options = load_options(
         args.config, args.assignments, {name: getattr(args, name) for name in named}
     )

@@ -16,8 +16,9 @@ import yaml
 from hybridvo.data.presets import build_options, read_yaml
 from hybridvo.errors import InputError
 from hybridvo.flow import DIS_PRESETS
-from hybridvo.hybrid import DEFAULT_METHOD
+from hybridvo.hybrid import DEFAULT_METHOD, check_polish
 from hybridvo.odometry import POLICIES
+from hybridvo.pose.photometric import PhotometricOptions
 from hybridvo.pose.refinement import RefinementOptions
 
 __all__ = ["DisOptions", "RunOptions", "load_options"]
@@ -49,6 +50,7 @@ class RunOptions:
     Args:
         method: see :data:`hybridvo.hybrid.METHODS`.
         flow: ``file``, ``dis``, or ``auto``: files where the sequence has them, else DIS.
+        polish: sharpen the flow's motion by the pictures: ``auto``, ``on`` or ``off``.
         policy: pose after a failed motion: ``hold`` or ``constant_velocity``.
         start: first frame. stop: the one after the last, None for all. stride: step.
         device: ``auto``, ``cpu`` or ``cuda``.
@@ -56,11 +58,12 @@ class RunOptions:
         max_failed: share of the frames that may fail before the exit code is 3.
         strict: a broken frame ends the run (exit code 2).
         alignment: of the absolute trajectory error.
-        dis: of the DIS flow. refinement: of the refinement.
+        dis: of the DIS flow. refinement: of the refinement. photometric: of the polish.
     """
 
     method: str = DEFAULT_METHOD
     flow: str = "auto"
+    polish: str = "auto"
     policy: str = "hold"
     start: int = 0
     stop: int | None = None
@@ -72,9 +75,11 @@ class RunOptions:
     alignment: str = "se3"
     dis: DisOptions = field(default_factory=DisOptions)
     refinement: RefinementOptions = field(default_factory=RefinementOptions)
+    photometric: PhotometricOptions = field(default_factory=PhotometricOptions)
 
     def __post_init__(self) -> None:
         _one_of("flow", self.flow, FLOWS)
+        check_polish(self.polish)
         _one_of("policy", self.policy, POLICIES)
         _one_of("device", self.device, DEVICES)
         _one_of("alignment", self.alignment, ("se3", "sim3", "origin", "none"))

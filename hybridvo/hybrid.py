@@ -18,6 +18,7 @@ import numpy as np
 from hybridvo.errors import CheckpointError, InputError
 from hybridvo.geometry import ego_flow, se3_exp
 from hybridvo.pose.judgement import default_judge
+from hybridvo.pose.photometric import PhotometricOptions, polish_photometric
 from hybridvo.pose.refinement import RefinementOptions, refine
 from hybridvo.pose.second_look import Motions, Opinion, PictureJudge, Verdict
 from hybridvo.types import Camera, Frame, FramePair, RelativePose
@@ -30,6 +31,7 @@ __all__ = [
     "DEFAULT_METHOD",
     "JUDGED",
     "METHODS",
+    "POLISH",
     "LearnedJudge",
     "check_method",
     "estimate",
@@ -60,6 +62,21 @@ _WITH_NETWORK = (
 
 METHODS = (*JUDGED, "refine", *_WITH_NETWORK, *_BASELINES)
 """Every method name, in the order of the results' tables."""
+
+
+POLISH = ("auto", "on", "off")
+"""Whether the pictures sharpen the flow's motion: ``auto`` where the method is ``hybrid``, ``on``
+with every refinement, ``off`` never."""
+
+
+def check_polish(polish: str) -> None:
+    """Refuse a word that is not in :data:`POLISH`.
+
+    Raises:
+        InputError: an unknown word.
+    """
+    if polish not in POLISH:
+        raise InputError(f"polish: expected {', '.join(POLISH)}, got {polish!r}.")
 
 
 def check_method(method: str) -> None:
@@ -99,6 +116,9 @@ def estimate(
     method: str = DEFAULT_METHOD,
     options: RefinementOptions | None = None,
     judge: PictureJudge | None = None,
+    polish: str = "auto",
+    photometric: PhotometricOptions | None = None,
+    trust: float = 1.0,
     seed: int = 0,
 ) -> RelativePose:
     """Camera motion of one pair.
@@ -110,6 +130,10 @@ def estimate(
         method: one of :data:`METHODS` that can run here.
         options: of the refinement.
         judge: for the methods that ask one; by default the one whose weights are shipped.
+        polish: one of :data:`POLISH`, see :func:`hybridvo.pose.photometric.polish_photometric`.
+        photometric: options of the polish.
+        trust: in the pictures, 0 to 1, see
+            :class:`hybridvo.pose.photometric_monitor.PhotometricMonitor`.
         seed: of everything that is drawn at random; the same seed gives the same bytes.
 
     Returns:
@@ -117,7 +141,7 @@ def estimate(
         exception and never a value that is not finite.
 
     Raises:
-        InputError: an unknown method, or one that cannot run here.
+        InputError: an unknown method, or one that cannot run here; another word for ``polish``.
 
     Example:
         >>> import numpy as np
@@ -125,11 +149,12 @@ def estimate(
         >>> estimate(FramePair(frame, frame, None)).status.reason.value
         'no_flow'
     """
-    if method == "refine":
-        return refine(pair, T_last=T_last, options=options, seed=seed)
-    if method in JUDGED:
-        judge = judge or shipped_judge()
-        found = refine(pair, T_last=T_last, options=options, judge=judge, seed=seed)
+    check_polish(polish)
+    if method == "refine" or method in JUDGED:
+        chosen: Any = (judge or shipped_judge()) if method in JUDGED else default_judge
+        found = refine(pair, T_last=T_last, options=options, judge=chosen, seed=seed)
+        if polish == "on" or (polish == "auto" and method == "hybrid"):
+            found = polish_photometric(pair, found, photometric, trust=trust)
         return found.replace(method=method)
     check_method(method)
     from hybridvo.pose.baselines import baselines
@@ -239,7 +264,7 @@ def shipped_judge(name: str = "judge") -> LearnedJudge:
     return LearnedJudge(network)
 
 
-def warm_up(method: str = DEFAULT_METHOD) -> float:
+def warm_up(method: str = DEFAULT_METHOD, polish: str = "auto") -> float:
     """Pay for the compilation (or the reading of its cache) before the first real frame.
 
     Runs the refinement once on a made pair of each size class. Costs half a minute on the very
@@ -266,5 +291,10 @@ def warm_up(method: str = DEFAULT_METHOD) -> float:
         frame = Frame(None, depth, camera)
         judge = shipped_judge() if method in JUDGED else default_judge
         refine(FramePair(frame, frame, flow, variance, valid), judge=judge)
-        refine(FramePair(frame, frame, flow), judge=judge)
+        pair = FramePair(frame, frame, flow)
+        found = refine(pair, judge=judge)
+        if polish == "on" or method == "hybrid":
+            rgb = (40 * (2 + np.sin(u / 3.0) + np.cos(v / 2.0)))[..., None].repeat(3, 2)
+            seen = replace(frame, rgb=rgb.astype(np.uint8))
+            polish_photometric(replace(pair, prev=seen, curr=seen), found)
     return time.perf_counter() - started

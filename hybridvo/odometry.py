@@ -16,10 +16,13 @@ from hybridvo.hybrid import (
     JUDGED,
     LearnedJudge,
     check_method,
+    check_polish,
     estimate,
     shipped_judge,
     warm_up,
 )
+from hybridvo.pose.photometric import PhotometricOptions
+from hybridvo.pose.photometric_monitor import PhotometricMonitor
 from hybridvo.pose.refinement import RefinementOptions
 from hybridvo.trajectory import chain
 from hybridvo.types import Frame, FramePair, Reason, RelativePose, Step
@@ -45,6 +48,7 @@ class Anchor:
             that could not be read.
         T_last: (4, 4) last motion found between neighbours, or None.
         gap: frames that could not be read since ``frame``.
+        images: state of the tracker's :class:`PhotometricMonitor`, or None.
     """
 
     frame: Frame | None
@@ -52,6 +56,7 @@ class Anchor:
     T_world_last: np.ndarray
     T_last: np.ndarray | None
     gap: int = 0
+    images: dict[str, Any] | None = None
 
 
 FIRST_COVARIANCE = 1e-12 * np.eye(6)
@@ -75,7 +80,10 @@ class Odometry:
             pixels follow it.
         policy: pose of a frame whose motion failed: ``hold`` (no motion) or ``constant_velocity``
             (the last motion again). The status stays failed and the covariance is large.
+        polish: sharpen the flow's motion by the pictures: ``auto`` (where the method is
+            ``hybrid``), ``on`` or ``off``.
         options: of the refinement.
+        photometric: options of the polish.
         seed: of everything drawn at random.
         prepare: compile now rather than at the first pair (see :func:`hybridvo.hybrid.warm_up`).
 
@@ -99,7 +107,9 @@ class Odometry:
         flow: FlowProvider | Callable[[Frame, Frame], Any] | None = None,
         method: str | None = None,
         policy: Policy = "hold",
+        polish: str = "auto",
         options: RefinementOptions | None = None,
+        photometric: PhotometricOptions | None = None,
         seed: int = 0,
         history: bool = True,
         prepare: bool = True,
@@ -122,7 +132,11 @@ class Odometry:
                 f"Odometry.flow: expected a callable (prev, curr), got {type(flow).__name__}."
             )
         check_method(method)
+        check_polish(polish)
         self.method = method
+        self.polish = polish
+        self.photometric = photometric or PhotometricOptions()
+        self.images = PhotometricMonitor()
         self.policy = policy
         self.options = options or RefinementOptions()
         self.seed = seed
@@ -133,7 +147,7 @@ class Odometry:
         self._flow = flow or dis_flow()
         self.reset()
         if prepare:
-            warm_up(method)
+            warm_up(method, polish)
 
     @classmethod
     def from_pretrained(cls, name: str = "default", **options: Any) -> Odometry:
@@ -156,6 +170,7 @@ class Odometry:
     def reset(self) -> None:
         """Forget everything: the next frame is the first one, at the identity."""
         self._anchor = Anchor(None, np.eye(4), np.eye(4), None)
+        self.images.restore(None)
 
     def set_pose(self, T_world_cam: np.ndarray) -> None:
         """Say where the camera is now (or where it starts), as after a loop closure.
@@ -175,6 +190,7 @@ class Odometry:
     def resume(self, anchor: Anchor) -> None:
         """Go on where another tracker stopped; the steps that follow have the same bytes."""
         self._anchor = anchor
+        self.images.restore(anchor.images)
 
     def track(self, frame: Frame, flow: FlowField | np.ndarray | None = None) -> Step:
         """Pose of the next frame.
@@ -204,8 +220,14 @@ class Odometry:
             method=self.method,
             options=self.options,
             judge=self._judge,
+            polish=self.polish,
+            photometric=self.photometric,
+            trust=self.images.trust,
             seed=self.seed,
         )
+        self.images.update(pair, motion)
+        if motion.polish is not None:
+            anchor = replace(anchor, images=self.images.state())
         if motion.ok:
             T_world_cam = chain(anchor.T_world_cam, motion.T_curr_prev)
             T_last = motion.T_curr_prev if anchor.gap == 0 else None
@@ -217,7 +239,9 @@ class Odometry:
         if blind:
             self._anchor = replace(anchor, T_world_last=T_world_cam, gap=anchor.gap + 1)
         else:
-            self._anchor = Anchor(_own(frame), T_world_cam, T_world_cam, T_last)
+            self._anchor = Anchor(
+                _own(frame), T_world_cam, T_world_cam, T_last, images=anchor.images
+            )
         return Step(frame.index, frame.timestamp, T_world_cam.copy(), motion)
 
     def skip(self, index: int, timestamp: float, message: str = "") -> Step:

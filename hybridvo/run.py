@@ -176,6 +176,8 @@ def _run(
         vo = Odometry(
             flow=provider,
             method=options.method,
+            polish=options.polish,
+            photometric=options.photometric,
             policy=options.policy,  # type: ignore[arg-type]
             options=options.refinement,
             seed=options.seed,
@@ -241,11 +243,20 @@ def _track(
         "ms": round(ms, 3),
         "prev_index": None if before.frame is None else before.frame.index,
         "flow_source": None if field is None else field.source,
+        "terms": "+".join(motion.terms),
+        "polish": _polish_word(motion.polish),
         "flow_is_true": field is not None and field.flow is not None and field.is_true,
         "errors": _errors(sequence, before.frame, step),
         "anchor": _dump_anchor(vo.anchor),
     }
     return row
+
+
+def _polish_word(report: Any) -> str:
+    """What became of the polish: empty where it was not asked for, ``taken``, or why not."""
+    if report is None:
+        return ""
+    return report.reason or "taken"
 
 
 def _errors(sequence: Sequence, prev: Frame | None, step: Step) -> dict[str, Any] | None:
@@ -428,6 +439,7 @@ def _dump_anchor(anchor: Anchor) -> dict[str, Any]:
         "T_world_last": anchor.T_world_last.ravel(),
         "T_last": None if anchor.T_last is None else anchor.T_last.ravel(),
         "gap": anchor.gap,
+        "images": anchor.images,
     }
 
 
@@ -441,4 +453,5 @@ def _load_anchor(stored: Mapping[str, Any], sequence: Sequence) -> Anchor:
         matrix("T_world_last"),
         None if stored["T_last"] is None else matrix("T_last"),
         int(stored["gap"]),
+        stored["images"],
     )

@@ -102,12 +102,12 @@ def _polish(
     state = State(pose.T_curr_prev, 1.0, 0.0)
     # where the flow is sure to a fraction of the finest blur, that one is enough
     coarse = problem.spread_px() > COARSE_SPREAD * options.blur_px[-1]
-    for blur, steps in zip(options.blur_px[:-1], options.iterations[:-1], strict=True):
+    for blur in options.blur_px[:-1]:
         if not coarse:
             break
         level = blurred(images, blur)
-        state = problem.solve(level, state, steps)
-    state = problem.solve(first, state, options.iterations[-1])
+        state = problem.solve(level, state, options.iterations)
+    state = problem.solve(first, state, options.iterations)
     return _guarded(pose, problem, first, state, options)
 
 

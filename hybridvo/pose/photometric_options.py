@@ -18,7 +18,7 @@ class PhotometricOptions:
     Args:
         blur_px: standard deviations of the Gaussian blur, coarse to fine. The finest also decides
             how much of the interpolation error is left.
-        iterations: most Gauss-Newton steps on each of them.
+        iterations: most Gauss-Newton steps under each of them.
         pixels: about how many pixels are used, the strongest gradients of evenly spread cells.
         least_weight: robust weight in the refinement below which a pixel is not used.
         cutoff: c of the Geman-McClure kernel, in standard deviations.
@@ -36,7 +36,7 @@ class PhotometricOptions:
     """
 
     blur_px: tuple[float, ...] = (2.0, 1.0)
-    iterations: tuple[int, ...] = (3, 5)
+    iterations: int = 5
     pixels: int = 16000
     least_weight: float = 0.25
     cutoff: float = 3.0
@@ -50,19 +50,20 @@ class PhotometricOptions:
     least_seen: float = 0.3
 
     def __post_init__(self) -> None:
-        if not self.blur_px or len(self.blur_px) != len(self.iterations):
+        if not self.blur_px or not all(0 < value < 100 for value in self.blur_px):
             raise InputError(
-                f"PhotometricOptions: expected as many blur_px as iterations, at least one, got "
-                f"{self.blur_px!r} and {self.iterations!r}."
+                f"PhotometricOptions.blur_px: expected positive numbers below 100, coarse to fine, "
+                f"got {self.blur_px!r}."
             )
-        for name in ("blur_px", "iterations"):
-            if not all(0 < value < 100 for value in getattr(self, name)):
-                raise InputError(
-                    f"PhotometricOptions.{name}: expected positive numbers below 100, "
-                    f"got {getattr(self, name)!r}."
-                )
         for name in (
-            *("pixels", "least_weight", "cutoff", "flow_inflation", "image_inflation"),
+            *(
+                "iterations",
+                "pixels",
+                "least_weight",
+                "cutoff",
+                "flow_inflation",
+                "image_inflation",
+            ),
             *("freedom", "largest_shift", "least_pixels"),
         ):
             if not getattr(self, name) > 0:

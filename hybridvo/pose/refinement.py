@@ -221,6 +221,7 @@ def _result(
     T = pose_matrix(fit.pose) if np.isfinite(fit.pose).all() else np.eye(4)
     common: dict[str, Any] = {
         "method": "refine",
+        "terms": ("flow", "depth") if fit.uses_second_depth else ("flow",),
         "inlier_ratio": float(min(1.0, fit.share)),
         "iterations": iterations + fit.iterations,
         "cost": fit.cost,
