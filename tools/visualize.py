@@ -32,7 +32,7 @@ def build_parser() -> argparse.ArgumentParser:
         "--dataset", metavar="KIND", help="kind of the sequence (default: detected)"
     )
     parser.add_argument("--flow", choices=("auto", "file", "dis"), default="auto")
-    parser.add_argument("--method", default="refine", metavar="NAME", help="default: refine")
+    parser.add_argument("--method", metavar="NAME", help="default: that of hybridvo run")
     parser.add_argument(
         "--weights",
         type=Path,
@@ -75,11 +75,12 @@ def visualize(args: argparse.Namespace, command: list[str]) -> list[Path]:
     from hybridvo.errors import InputError, OutputError
     from hybridvo.evaluation.plots_maps import maps_png
     from hybridvo.evaluation.report import write_json
-    from hybridvo.hybrid import estimate
+    from hybridvo.hybrid import DEFAULT_METHOD, estimate
     from hybridvo.trajectory import atomic_write
 
     if args.steps < 1:
         raise InputError(f"--steps: expected at least 1, got {args.steps}.")
+    args.method = args.method or DEFAULT_METHOD
     picture = target(args)
     pair, sequence, T_true, flow_true = read_pair(args)
     motion = estimate(pair, method=args.method, seed=args.seed)
@@ -212,18 +213,19 @@ def parts(
 
 
 def networks(files: list[Path]) -> list[tuple[str, Any]]:
-    """(name, network) of the given files, or of all shipped ones."""
-    from hybridvo.errors import CheckpointError
+    """(name, network) of the given files, or of all shipped ones that predict a motion."""
+    from hybridvo.errors import InputError
+    from hybridvo.network.options import KINDS
     from hybridvo.network.weights import load_weights, pretrained, pretrained_names
 
-    if files:
-        return [(path.stem, load_weights(path)[0]) for path in files]
     found = []
-    for name in pretrained_names():
-        try:
-            found.append((name, load_weights(pretrained(name))[0]))
-        except CheckpointError:  # shipped, but no network that sees pictures
-            continue
+    for path in files or [pretrained(name) for name in pretrained_names()]:
+        network = load_weights(path)[0]
+        kind = network.options.kind
+        if kind in KINDS:
+            found.append((path.stem, network))
+        elif files:
+            raise InputError(f"--weights {path}: expected {', '.join(KINDS)}, got a {kind}.")
     return found
 
 

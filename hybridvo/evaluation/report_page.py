@@ -264,6 +264,6 @@ def _provenance(result: Mapping[str, Any]) -> list[tuple[str, str]]:
     rows = [(label, flat(result[key])) for key, label in known if result.get(key)]
     depth = sorted({str(row["depth_source"]) for row in result["rows"] if row.get("depth_source")})
     rows.append(("depth", ", ".join(depth) or "unknown"))
-    if not result.get("weights"):
+    if result.get("weights") == {}:  # where the key is absent, nobody noted them
         rows.append(("weights", "no method used a network"))
     return rows

@@ -310,6 +310,15 @@ def test_bad_options(tool, folder: Path, tmp_path: Path, options, message, capsy
     assert not out.exists()
 
 
+def test_networks_that_predict_no_motion_are_refused(tool, tmp_path: Path) -> None:
+    from hybridvo.network.judge import JudgeNetwork, JudgeOptions
+
+    options = JudgeOptions()
+    path = save_weights(tmp_path / "judge.safetensors", JudgeNetwork(options), options, {})
+    with pytest.raises(InputError, match="got a judge"):
+        tool.networks([path])
+
+
 def test_bad_targets(tool, folder: Path, tmp_path: Path, capsys) -> None:
     start = ["--sequence", str(folder / "training" / "clean" / "tiny"), "--pair", "0"]
     assert tool.main([*start, "--out", str(tmp_path / "a.jpg")]) == 2
