@@ -106,7 +106,7 @@ def _dask(address: str) -> Iterator[Workers]:
     except (OSError, ValueError) as error:
         raise InputError(
             f"--scheduler {address}: no Dask scheduler answers ({error}). Start one with "
-            f"'dask scheduler' and workers with 'dask worker {address}'."
+            f"'dask scheduler' and workers with 'dask worker --nthreads 1 {address}'."
         ) from None
     with client:
         try:
@@ -114,6 +114,6 @@ def _dask(address: str) -> Iterator[Workers]:
         except TimeoutError:
             raise InputError(
                 f"--scheduler {address}: it has no worker after {CONNECT_SECONDS:.0f} s. Start "
-                f"some with 'dask worker {address}'."
+                f"some with 'dask worker --nthreads 1 {address}'."
             ) from None
         yield Workers(client.get_executor(pure=False), lambda: max(1, len(client.nthreads())))

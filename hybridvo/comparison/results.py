@@ -40,6 +40,9 @@ ROW_COLUMNS = (
 class Segments:
     """Kept segments, found by their job without holding them.
 
+    ``done`` and ``T_last`` say by job how far it came and what its next segment starts from,
+    ``failed`` counts the failed estimates.
+
     Args:
         path: file with a JSON mapping a line: ``job`` and what ``run_segment`` returned.
     """
@@ -49,6 +52,7 @@ class Segments:
         self._places: dict[int, list[int]] = {}
         self.done: dict[int, int] = {}
         self.T_last: dict[int, dict[str, list[float]]] = {}
+        self.failed = 0
         if not path.exists():
             return
         with path.open("rb") as file:
@@ -63,6 +67,11 @@ class Segments:
         self._places.setdefault(job, []).append(place)
         self.done[job] = int(segment["done"])
         self.T_last[job] = dict(segment["T_last"])
+        self.failed += sum(
+            result["status"].startswith("failed")
+            for pair in segment["pairs"]
+            for result in pair["results"]
+        )
 
     def of(self, job: int) -> Iterator[dict[str, Any]]:
         """Segments of one job, in order."""

@@ -127,6 +127,7 @@ def compare(
         "machine": {"platform": platform.platform(), "cpus": os.cpu_count()},
         "options": settings,
         "weights": weights,
+        "timing": _timing(options),
         "started": _now(),
     }
     with (
@@ -222,7 +223,10 @@ def _flows(sequence: Sequence, options: ComparisonOptions) -> tuple[str, ...]:
         flow_provider(sequence, RunOptions(flow=options.flow, stride=options.stride))
         return (options.flow,)
     files = ("file",) if sequence.has_flow and options.stride == 1 else ()
-    images = sequence.frame(options.start).rgb is not None if files else True
+    try:
+        images = not files or sequence.frame(options.start).rgb is not None
+    except (InputError, OSError):  # a broken frame tells nothing of the others
+        images = True
     return (*files, "dis") if images else files
 
 
@@ -239,7 +243,6 @@ def _work(
     # the longest first, so that none is left alone at the end
     waiting.sort(key=lambda n: segments.done.get(n, 0) - jobs[n].pairs)
     running: dict[Future[Any], int] = {}
-    failed = 0
     if segments.done:
         progress.say(f"resumed after {sum(segments.done.values())} pairs")
     while waiting or running:
@@ -258,11 +261,10 @@ def _work(
             place = folder.path.joinpath(PARTIAL).stat().st_size
             folder.append({"job": n, **segment})
             segments.took({"job": n, **segment}, place)
-            failed += _count_failed(segment)
             for row in segment["left_out"]:
                 if "intrinsics" not in row["reason"]:
                     progress.say(f"left out: {jobs[n].name}: frame {row['index']}: {row['reason']}")
-            progress.update(sum(segments.done.values()), failed)
+            progress.update(sum(segments.done.values()), segments.failed)
             if segments.done[n] < jobs[n].pairs and not interruption:
                 waiting.insert(0, n)  # goes on where its sequence is open
 
@@ -289,12 +291,13 @@ def _now() -> str:
     return datetime.now(UTC).isoformat(timespec="seconds")
 
 
-def _count_failed(segment: Mapping[str, Any]) -> int:
-    return sum(
-        result["status"].startswith("failed")
-        for pair in segment["pairs"]
-        for result in pair["results"]
-    )
+def _timing(options: ComparisonOptions) -> str:
+    """What the times of the results mean."""
+    if options.scheduler is not None:
+        return "one estimate at a time on each worker of a cluster: times are those of its machines"
+    if options.jobs > 1:
+        return f"up to {options.jobs} estimates at the same time: times are upper bounds"
+    return "one estimate at a time"
 
 
 def _write(

@@ -378,6 +378,11 @@ def test_broken_frames_are_left_out_and_told(
     assert by_method["pnp-ransac"]["failed"] == 1  # the pair without a flow file
     assert by_method["identity"]["failed"] == 0
     assert by_method["identity"]["pairs_scored"] == 3
+    (base / "depth" / "longer" / "frame_0001.dpt").write_bytes(b"PIEH")  # the very first
+    compare(options(base / "clean" / "longer"), tmp_path / "more", quiet=True)
+    result = json.loads((tmp_path / "more" / "results.json").read_text())
+    assert {row["flow_source"] for row in result["rows"]} == {"file (true)", "dis"}
+    assert result["sequences"][0]["pairs"] == 2 and result["timing"] == "one estimate at a time"
 
 
 def test_one_pair_no_truth_and_a_still_camera_give_nulls_with_reasons(
