@@ -29,6 +29,8 @@ JPEG_QUALITY = 70
 SIGMAS = 3.0
 """Size of the ellipsoids, in standard deviations."""
 FLUSH_SECONDS = 30.0
+SINCE_1970 = 1e8
+"""Stamps above this are dates: three years of recording would be the alternative."""
 
 _logger = logging.getLogger(__name__)
 
@@ -134,7 +136,9 @@ class Recording:
     def _add(self, frame: Frame, step: Step, flow: np.ndarray | None) -> None:
         rr, stream = self._rr, self._stream
         stream.set_time("frame", sequence=step.index)
-        stream.set_time("time", duration=step.timestamp)
+        # stamps of sensors count from 1970, those of rendered sequences from their start
+        clock = "timestamp" if step.timestamp > SINCE_1970 else "duration"
+        stream.set_time("time", **{clock: step.timestamp})
         T = step.T_world_cam
         self._positions.append(T[:3, 3].astype(np.float32))
         stream.log("world/camera", rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]))

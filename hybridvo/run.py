@@ -157,7 +157,10 @@ def run(
                     truth=None if sequence.poses is None else sequence.poses[frames],
                 )
                 stack.enter_context(tape)
-            return _run(sequence, frames, provider, options, folder, quiet, tape)
+            result = _run(sequence, frames, provider, options, folder, quiet, tape)
+        if tape is not None and not tape.failed:
+            result.summary["recording"] = os.fspath(tape.path)
+        return result
 
 
 def _run(

@@ -64,6 +64,8 @@ def summary_text(summary: Mapping[str, Any]) -> str:
             rows.append((label, f"{values}, {_number(metrics.get(mean), factor)} mean {unit}"))
         rows.append(("end-point error", f"{_number(metrics.get('epe_l2_px'))} px mean"))
     rows.append(("results", str(summary["out"])))
+    if "recording" in summary:
+        rows.append(("recording", f"{summary['recording']} (open it with: rerun FILE)"))
     return _lines(rows)
 
 

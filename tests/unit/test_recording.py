@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 import logging
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -73,7 +74,9 @@ def test_a_run_leaves_a_recording(sequence: str, tmp_path: Path, capsys) -> None
     assert not (plain / "recording.rrd").exists()
     named = tmp_path / "named.rrd"
     options = ["--sequence", sequence, "--out", str(out), "--overwrite", "--rrd", str(named), "-q"]
+    capsys.readouterr()
     assert main(["run", *options]) == 0
+    assert str(named) in capsys.readouterr().out
     assert named.stat().st_size > 5_000
     assert not (out / "recording.rrd").exists()  # of the run that was replaced
 
@@ -98,6 +101,22 @@ def test_what_is_recorded_can_be_read_back(sequence: str, tmp_path: Path) -> Non
     assert len(found["flow"]) == 4 and len(found["weights"]) == 4
     (blob,) = found["flow"][0]["EncodedImage:blob"]
     assert cv2.imdecode(np.array(blob, np.uint8), cv2.IMREAD_COLOR).shape == (64, 128, 3)
+
+
+@pytest.mark.parametrize(("start", "clock"), [(0.0, "duration"), (1.3e9, "timestamp")])
+def test_stamps_of_sensors_are_dates(tmp_path: Path, start: float, clock: str) -> None:
+    from rerun.chunk import RrdReader
+
+    frame, step = step_of(3)
+    with Recording(tmp_path / "a.rrd", "x", "id", 1) as recording:
+        recording.add(frame, replace(step, timestamp=start + 0.25), None)
+    assert not recording.failed
+    types = {
+        str(chunk.to_record_batch().schema.field("time").type)
+        for chunk in RrdReader(recording.path).stream()
+        if "time" in chunk.timeline_names
+    }
+    assert types == {f"{clock}[ns]"}
 
 
 def test_long_runs_take_few_pictures(tmp_path: Path) -> None:
