@@ -137,7 +137,8 @@ def compare(
         if folder.finished:
             return [out / name for name in WRITTEN]
         total = sum(job.pairs for job in plan.jobs)
-        label = f"{len(plan.jobs)} sequences, {len(plan.methods)} methods"
+        count = len(plan.jobs)
+        label = f"{count} sequence{'s' * (count > 1)}, {len(plan.methods)} methods"
         segments = Segments(out / PARTIAL)
         before = sum(segments.done.values())
         with Progress(total, label, quiet=quiet, unit="pairs", before=before) as progress:
