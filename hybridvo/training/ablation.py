@@ -24,7 +24,7 @@ from hybridvo.network.options import NetworkOptions
 from hybridvo.training.held_out import evaluate_network
 from hybridvo.training.loop import Trainer
 from hybridvo.training.options import TrainingOptions
-from hybridvo.training.stream import Mixture, Preset
+from hybridvo.training.stream import Mixture, Preset, TrainingBatch
 
 __all__ = [
     "DECIDING",
@@ -202,6 +202,17 @@ class KeptSamples:
         return self._kept[key]
 
 
+class _Interruptible(Trainer):
+    """Asks after every update whether to go on."""
+
+    should_stop: Callable[[], bool]
+
+    def update(self, batch: TrainingBatch, progress: float) -> dict[str, float]:
+        figures = super().update(batch, progress)
+        self.stop_requested = self.should_stop()
+        return figures
+
+
 def train_row(
     options: TrainingOptions,
     mixture: Mixture,
@@ -223,7 +234,7 @@ def train_row(
         workers: processes that draw samples.
         kept: draws from ``mixture``, and remembers; needs ``workers`` = 0 to be of use.
         report: called with every entry of the log.
-        should_stop: asked with every entry of the log; True ends the run with a checkpoint.
+        should_stop: asked after every update; True ends the run with a checkpoint.
 
     Returns:
         The trainer; the row is finished if ``trainer.step == options.steps``.
@@ -240,10 +251,10 @@ def train_row(
     )
     folder.mkdir(parents=True, exist_ok=True)
     stated, checkpoint = folder / "options.json", folder / "checkpoint.pt"
-    if checkpoint.exists() and stated.exists():
+    if checkpoint.exists():
         try:
             before = json.loads(stated.read_text(encoding="utf-8"))
-        except ValueError:
+        except (OSError, ValueError):
             before = None
         if before != record:
             raise InputError(
@@ -252,20 +263,14 @@ def train_row(
             )
     else:
         stated.write_text(json.dumps(record, indent=2), encoding="utf-8")
-        checkpoint.unlink(missing_ok=True)
-
-    def reported(entry: dict[str, Any]) -> None:
-        if report is not None:
-            report(entry)
-        if should_stop is not None and should_stop():
-            trainer.stop_requested = True
-
+    asked = should_stop or (lambda: False)
     # The trainer only draws from it: evaluations on the way are off.
     source = mixture if kept is None else cast(Mixture, kept)
-    trainer = Trainer(options, source, folder, device, workers, report=reported)
+    trainer = _Interruptible(options, source, folder, device, workers, report)
+    trainer.should_stop = asked
     if checkpoint.exists():
         trainer.resume(checkpoint)
-    if trainer.step < options.steps and not (should_stop is not None and should_stop()):
+    if trainer.step < options.steps and not asked():
         trainer.run()
     return trainer
 
