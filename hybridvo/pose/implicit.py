@@ -52,7 +52,7 @@ def _rows(g: torch.Tensor, xi: torch.Tensor) -> torch.Tensor:
 
 
 def solve_small(A: torch.Tensor, b: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Solve (B, 6, 6) systems in float64, each for itself.
+    """Solve (B, 6, 6) systems in float64, each for itself; other sizes as well.
 
     Args:
         A: (B, 6, 6), possibly singular or not finite.
@@ -62,7 +62,7 @@ def solve_small(A: torch.Tensor, b: torch.Tensor) -> tuple[torch.Tensor, torch.T
         (B, 6) float64 solutions and (B,) bool; where False the solution is zero.
     """
     A, b = A.double(), b.double()
-    unit = torch.eye(6, dtype=A.dtype, device=A.device).expand_as(A)
+    unit = torch.eye(A.shape[1], dtype=A.dtype, device=A.device).expand_as(A)
     scale = A.diagonal(dim1=1, dim2=2).abs().sqrt()
     good = torch.isfinite(A).flatten(1).all(dim=1) & torch.isfinite(b).all(dim=1)
     good = good & (scale > 1e-15).all(dim=1)

@@ -26,6 +26,8 @@ from hybridvo.types import FramePair, RelativePose
 __all__ = ["PhotometricOptions", "PolishReport", "polish_photometric"]
 
 PER_CELL = 4
+SAID = ("no_texture", "no_match", "out_of_view", "outside_flow", "higher_cost", "not_finite")
+"""Reasons that the status of the motion mentions."""
 COARSE_SPREAD = 0.3
 """Coarser blurs are used where the flow leaves more than this many finest blurs undecided."""
 COST_NOISE = 1.0
@@ -54,7 +56,7 @@ def polish_photometric(
     Returns:
         The motion with its covariance, ``terms`` and ``polish`` (a :class:`PolishReport`). Where
         images are missing or of no use, or the guard refuses, the motion is that of ``pose`` and
-        the report says why. Never a value that is not finite.
+        the report and the status' message say why. Never a value that is not finite.
 
     Raises:
         InputError: weights of another shape than the picture, or trust outside [0, 1].
@@ -70,6 +72,8 @@ def _unchanged(
     pose: RelativePose, reason: str, message: str, report: PolishReport | None = None
 ) -> RelativePose:
     report = replace(report or PolishReport(False), taken=False, reason=reason, message=message)
+    if reason in SAID and pose.ok and not pose.status.message:
+        pose = pose.replace(status=replace(pose.status, message=f"images not used: {message}"))
     return pose.replace(polish=report)
 
 

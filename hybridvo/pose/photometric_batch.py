@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import pypose as pp
 import torch
 import torch.nn.functional as F
 
@@ -25,7 +24,7 @@ __all__ = ["PhotometricBatch", "PhotometricPixels", "photometric_terms", "polish
 MARGIN = 3
 NOISE_FLOOR = 0.1
 LEAST_AREA = 1e-3
-STEPS = 12
+STEPS = 40
 TOLERANCE = 1e-6
 """Squared length, in deviations, of the last step: gradients need the root itself."""
 
@@ -312,9 +311,9 @@ def polish_photometric_batch(
             H, g, *_ = equations(T, light, noise, T_flow)
             if step < 2:  # light before motion
                 delta = torch.zeros_like(g)
-                delta[:, 6:], good = solve_two(H[:, 6:, 6:], g[:, 6:])
+                delta[:, 6:], good = solve_small(H[:, 6:, 6:], g[:, 6:])
             else:
-                delta, good = solve_eight(H, g)
+                delta, good = solve_small(H, g)
             delta = torch.where(good[:, None], delta, torch.zeros_like(delta))
             T = left_update(delta[:, :6].to(T.dtype), T)
             light = light + delta[:, 6:].to(light.dtype)
@@ -323,7 +322,7 @@ def polish_photometric_batch(
         H, g, *_ = equations(T, light, noise, T_flow)
         xi = _log(T, T_flow)
         sigma2 = torch.einsum("bi,bij,bj->b", xi, prior, xi)
-        left = (g * solve_eight(H, g)[0]).sum(dim=1)
+        left = (g * solve_small(H, g)[0]).sum(dim=1)
         taken = torch.isfinite(T).flatten(1).all(1) & (sigma2 < options.largest_shift**2)
         taken = taken & (left < 1e-2)
         usable = (pixels.weight > 0).sum(dim=1) >= options.least_pixels
@@ -333,12 +332,12 @@ def polish_photometric_batch(
     if torch.is_grad_enabled() and any(value.requires_grad for value in inputs):
         A = _full_derivative(equations, T, light, noise, T_flow.detach())
         _, g, *_ = equations(T, light, noise, T_flow)
-        step, solved = solve_eight(A, g)
+        step, solved = solve_small(A, g)
         move = torch.where((taken & solved)[:, None], step[:, :6], torch.zeros_like(step[:, :6]))
         # the value stays that of the solver
         move = (move - move.detach()).to(T.dtype)
         T = torch.where(taken[:, None, None], left_update(move, T), T_flow)
-    light_block = solve_cross(H)
+    light_block = _motion_information(H)
     return PhotometricBatch(T, light_block, light[:, 0], light[:, 1], noise, taken)
 
 
@@ -352,22 +351,28 @@ def _full_derivative(equations, T, light, noise, T0) -> torch.Tensor:  # type: i
 
 
 def _log(T: torch.Tensor, T0: torch.Tensor) -> torch.Tensor:
-    """(B, 6) float64 left tangent from T0 to T."""
+    """(B, 6) float64 left tangent from T0 to T, for angles below a right one.
+
+    Written out: the gradient that pypose gives to ``Log`` lives in the tangent space, and would be
+    taken for that of the matrix.
+    """
     relative = T.double() @ torch.linalg.inv(T0.double())
-    return pp.mat2SE3(relative, check=False).Log().tensor()
+    R, t = relative[:, :3, :3], relative[:, :3, 3]
+    axis = 0.5 * torch.stack(
+        [R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], dim=1
+    )
+    sine2 = axis.square().sum(dim=1, keepdim=True)
+    small = sine2 < 1e-8
+    sine = torch.where(small, torch.full_like(sine2, 0.1), sine2).sqrt()
+    theta = sine.asin()
+    phi = axis * torch.where(small, 1 + sine2 / 6, theta / sine)
+    theta2 = phi.square().sum(dim=1, keepdim=True)
+    c = torch.where(small, 1 / 12 + theta2 / 720, theta**-2 - 0.5 / (theta * (0.5 * theta).tan()))
+    turned = torch.linalg.cross(phi, t)
+    return torch.cat([t - 0.5 * turned + c * torch.linalg.cross(phi, turned), phi], dim=1)
 
 
-def solve_two(H: torch.Tensor, g: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Solve (B, 2, 2) systems of gain and offset."""
-    return solve_small(H, g)
-
-
-def solve_eight(H: torch.Tensor, g: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Solve (B, 8, 8) systems, each for itself."""
-    return solve_small(H, g)
-
-
-def solve_cross(H: torch.Tensor) -> torch.Tensor:
+def _motion_information(H: torch.Tensor) -> torch.Tensor:
     """(B, 6, 6) information of the motion with gain and offset free."""
     light = torch.linalg.pinv(H[:, 6:, 6:], hermitian=True)
     return H[:, :6, :6] - H[:, :6, 6:] @ light @ H[:, 6:, :6]

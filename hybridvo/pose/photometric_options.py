@@ -43,7 +43,7 @@ class PhotometricOptions:
     flow_inflation: float = 8.0
     image_inflation: float = 4.0
     freedom: float = 6.0
-    largest_shift: float = 7.0
+    largest_shift: float = 9.0
     least_gain: float = 0.1
     least_correlation: float = 0.5
     least_pixels: int = 200
