@@ -207,7 +207,7 @@ def parts(
             "translation error, m": errors["trans_err"],
         }
     if motion.weights is not None:
-        title = f"weights of the motion (outline: moves by {whose})"
+        title = "weights of the motion (outline: what moves by itself)"
         panels.append(ScalarPanel(title, motion.weights, "", 1.0, moving))
     return panels, numbers, moving
 
