@@ -61,7 +61,10 @@ def sandwich_covariance(
     covariance = independent
     if tiles >= FEW_TILES:
         clustered = inverse @ (flat.T @ flat) @ inverse * (tiles / (tiles - 6))
-        inflation = np.trace(np.linalg.solve(independent, clustered)) / 6
+        try:
+            inflation = np.trace(np.linalg.solve(independent, clustered)) / 6
+        except np.linalg.LinAlgError:
+            inflation = 1.0  # residuals of zero: no doubt that could be compared
         covariance = 0.5 * (clustered + max(1.0, inflation) * independent)
     else:
         covariance = independent * (1 + FEW_TILES / max(tiles, 1))

@@ -167,7 +167,9 @@ def _centred_scores(tiles: np.ndarray, total: np.ndarray) -> np.ndarray:
 
     They were summed before the last step, which is long for a full grid.
     """
-    step = np.linalg.lstsq(symmetric(total[:21]), total[21:27], rcond=1e-12)[0]
+    step = np.zeros(6)
+    if not solver.solve6(total, solver.DAMPING, step):
+        return tiles[..., 21:27]
     return tiles[..., 21:27] - tiles[..., :21][..., ORDER] @ step
 
 
@@ -180,10 +182,10 @@ def _curvature(
     """
     R, t = pose[:, :3].astype(np.float32), pose[:, 3].astype(np.float32)
     work = solver.new_work()
-    rows, factors, used = np.empty((6, n), np.float32), np.empty(n, np.float32), np.zeros(30)
+    rows, factors, used = np.empty((6, n), np.float32), np.empty(n), np.zeros(kernels.SUMS)
     kernels.score_pixels(coarse, n, R, t, picture.K, noise, work, rows, factors, used)
-    curvature, meat = (rows * factors) @ rows.T, rows @ rows.T
-    out = np.concatenate([m[UPPER] for m in (curvature, meat)]).astype(np.float64)
+    wide = rows.astype(np.float64)  # squares of large external weights overflow in float32
+    out = np.concatenate([m[UPPER] for m in ((wide * factors) @ wide.T, wide @ wide.T)])
     return out / max(used[29], 1e-12)
 
 

@@ -42,6 +42,10 @@ HAS_FLOW_VARIANCE, HAS_DEPTH_VARIANCE, HAS_WEIGHTS, HAS_VALID = 1, 2, 4, 8
 
 MIN_DEPTH = np.float32(1e-6)
 MAX_VALUE = np.float32(1e9)
+MAX_TRUST = np.float32(1e6)
+MAX_DOUBT = np.float32(1e9)
+"""Largest inverse flow variance and depth variance of a pixel, relative to the typical ones: what
+is handed in may be anything, and squares of it must stay finite."""
 MAX_SHIFT = np.float32(0.3)
 """Largest correction of log depth that an outlier may cause."""
 ONE = np.float32(1.0)
@@ -102,7 +106,7 @@ def gather_row(v, u0, u1, data, camera, flags, scale, buf):
         for k in range(n):
             p = row[k]
             good = (p > ZERO) & (p < MAX_VALUE)
-            b_f[k] = scale[0] / (p if good else ONE)
+            b_f[k] = min(scale[0] / (p if good else ONE), MAX_TRUST)
             b_w[k] = b_w[k] if good else ZERO
     else:
         for k in range(n):
@@ -112,7 +116,7 @@ def gather_row(v, u0, u1, data, camera, flags, scale, buf):
         for k in range(n):
             p = row[k]
             good = (p >= ZERO) & (p < MAX_VALUE)
-            b_d[k] = (p if good else ONE) / scale[1]
+            b_d[k] = min((p if good else ONE) / scale[1], MAX_DOUBT)
             b_w[k] = b_w[k] if good else ZERO
     else:
         for k in range(n):
@@ -148,12 +152,12 @@ def gather_grid(stride, data, camera, flags, scale, out):
 
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
-def project_block(buf, o, n, R, t, K, noise, work, acc):
+def project_block(buf, o, n, R, t, K, noise, work, robust, acc):
     """First stage, pixels ``o .. o + n - 1``: residuals, robust weights, weighted information.
 
     ``K`` = (fx, fy, cx, cy) of the current frame; ``noise`` = (1/sf^2, sd^2, c^2); all float32.
-    ``work`` rows: a, b, i, m00, m01, m11 (information in units of B), n0, n1 (gradient), robust
-    weight without the external one (0 where unusable).
+    ``work`` rows: a, b, i, m00, m01, m11 (information in units of B), n0, n1 (gradient).
+    ``robust`` (N,): robust weight without the external one, 0 where unusable.
     """
     keep_apart()  # type: ignore[call-arg]
     fx, fy, cx, cy = K[0], K[1], K[2], K[3]
@@ -165,7 +169,7 @@ def project_block(buf, o, n, R, t, K, noise, work, acc):
     b_x, b_y, b_z, b_u = buf[XN][o:], buf[YN][o:], buf[Z][o:], buf[MU][o:]
     b_v, b_f, b_d, b_w = buf[MV][o:], buf[PF][o:], buf[PD][o:], buf[W][o:]
     A, B, IZ, M0, M1, M2 = work[0], work[1], work[2], work[3], work[4], work[5]
-    N0, N1, S = work[6], work[7], work[8]
+    N0, N1 = work[6], work[7]
     cost = wsum = count = ZERO
     for k in range(n):
         xn = b_x[k]
@@ -200,7 +204,7 @@ def project_block(buf, o, n, R, t, K, noise, work, acc):
         d2 = ru * n0 + rv * n1
         s = c2 / (c2 + d2)
         s2 = s * s if wx > ZERO else ZERO
-        S[k] = s2
+        robust[k] = s2
         w = wx * s2
         wf = w * ip
         A[k] = a
@@ -342,7 +346,7 @@ def sum_samples(samples, n, R, t, K, noise, work, acc):
     acc[:] = 0.0
     for o in range(0, n, BLOCK):
         m = min(BLOCK, n - o)
-        project_block(samples, o, m, R, t, K, noise, work, acc)
+        project_block(samples, o, m, R, t, K, noise, work, work[8], acc)
         sum_translation(0, m, work, acc)
         sum_rotation(0, m, work, acc)
 
@@ -363,11 +367,12 @@ def score_block(o, n, c2, external, work, rows, factors):
     )  # fmt: skip
     f, e = factors[o:], external[o:]
     for k in range(n):
-        a = A[k]
-        b = B[k]
-        i = IZ[k]
-        x = N0[k]
-        y = N1[k]
+        good = S[k] > np.float32(1e-12)  # elsewhere anything may stand, not a number either
+        a = A[k] if good else ZERO
+        b = B[k] if good else ZERO
+        i = IZ[k] if good else ZERO
+        x = N0[k] if good else ZERO
+        y = N1[k] if good else ZERO
         c = a * x + b * y
         r0[k] = x * i
         r1[k] = y * i
@@ -376,8 +381,7 @@ def score_block(o, n, c2, external, work, rows, factors):
         r4[k] = a * c + x
         r5[k] = a * y - b * x
         # row = w s with w = x_w S, S = (c2 / (c2 + d2))^2; wanted 4 w / (c2 + d2) s s^T
-        good = S[k] > np.float32(1e-12)
-        f[k] = np.float32(4.0) / (c2 * e[k] * np.sqrt(S[k])) if good else ZERO
+        f[k] = 4.0 / (np.float64(c2) * e[k] * np.sqrt(S[k])) if good else 0.0  # e as small as 1e-38
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
@@ -385,7 +389,7 @@ def score_pixels(samples, n, R, t, K, noise, work, rows, factors, acc):
     """:func:`score_block` of gathered pixels; cost and weights are added to ``acc`` (30,)."""
     for o in range(0, n, BLOCK):
         m = min(BLOCK, n - o)
-        project_block(samples, o, m, R, t, K, noise, work, acc)
+        project_block(samples, o, m, R, t, K, noise, work, work[8], acc)
         score_block(o, m, noise[2], samples[W], work, rows, factors)
 
 
@@ -406,9 +410,8 @@ def sum_tiles(data, camera, flags, scale, R, t, K, noise, band, tile, weights, s
         for u0 in range(0, width, part):
             n = min(part, width - u0)
             gather_row(v, u0, u0 + n, data, camera, flags, scale, buf)
-            project_block(buf, 0, n, R, t, K, noise, work, out)
+            project_block(buf, 0, n, R, t, K, noise, work, weights[v, u0:], out)
             for o in range(0, n, tile):
                 m = min(tile, n - o)
                 sum_translation(o, m, work, sums[band, (u0 + o) // tile])
                 sum_rotation(o, m, work, sums[band, (u0 + o) // tile])
-            weights[v, u0 : u0 + n] = work[8, :n]

@@ -147,11 +147,13 @@ def gather_pixels(
         good = (pair.flow_variance > 0) & (pair.flow_variance < MAX_VALUE)
         typical = _typical(pair.flow_variance)
         flow_variance = torch.where(good, pair.flow_variance, typical) / typical
+        flow_variance = flow_variance.clamp(min=1 / float(kernels.MAX_TRUST))
         usable = usable & good
     if pair.depth_variance is not None:
         good = (pair.depth_variance >= 0) & (pair.depth_variance < MAX_VALUE)
         typical = _typical(pair.depth_variance)
         depth_variance = torch.where(good, pair.depth_variance, typical) / typical
+        depth_variance = depth_variance.clamp(max=float(kernels.MAX_DOUBT))
         usable = usable & good
     weight = one
     if weights is not None:

@@ -149,7 +149,7 @@ def sum_depth(
     row = np.empty(6)
     for o in range(0, n, BLOCK):
         m = min(BLOCK, n - o)
-        project_block(samples, o, m, R, t, K, noise, work, dummy)
+        project_block(samples, o, m, R, t, K, noise, work, work[8], dummy)
         for j in range(m):
             k = o + j
             if not abs(log_depth[k]) < 1e6:

@@ -14,16 +14,21 @@ from numba import njit
 
 from hybridvo.pose.kernels import (
     BLOCK,
+    FASTMATH,
+    MIN_DEPTH,
     MU,
     MV,
+    ONE,
     PD,
     PF,
     SUMS,
     WORK_ROWS,
     XN,
     YN,
+    ZERO,
     W,
     Z,
+    keep_apart,
     project_block,
     sum_samples,
 )
@@ -217,6 +222,108 @@ def residual(samples, k, pose, K):
     return ru, rv, qu, qv, True
 
 
+@njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
+def gather_noise(samples, n, step, R, t, K, radius, terms):
+    """What the noise estimate needs of every ``step``-th pixel, as rows of ``terms`` (6, N).
+
+    Squared residual along q and across it, variance of the flow and of the depth (through q) in
+    units of sf^2 and sd^2, external weight (0 farther away than ``radius``), density of outliers.
+    Returns (number of pixels, their external weight, that of the pixels within the radius).
+    """
+    keep_apart()  # type: ignore[call-arg]
+    fx, fy, cx, cy = K[0], K[1], K[2], K[3]
+    r00, r01, r02 = R[0, 0], R[0, 1], R[0, 2]
+    r10, r11, r12 = R[1, 0], R[1, 1], R[1, 2]
+    r20, r21, r22 = R[2, 0], R[2, 1], R[2, 2]
+    tx, ty, tz = t[0], t[1], t[2]
+    b_x, b_y, b_z, b_u = samples[XN], samples[YN], samples[Z], samples[MU]
+    b_v, b_f, b_d, b_w = samples[MV], samples[PF], samples[PD], samples[W]
+    along, across, alpha = terms[0], terms[1], terms[2]
+    beta, weight, outlier = terms[3], terms[4], terms[5]
+    m = (n + step - 1) // step
+    disc = np.float32(1.0 / math.pi) / (radius * radius)
+    total = inside = ZERO
+    for j in range(m):
+        k = j * step
+        z = b_z[k]
+        Zc = z * (r20 * b_x[k] + r21 * b_y[k] + r22) + tz
+        front = Zc > MIN_DEPTH
+        i = ONE / (Zc if front else ONE)
+        a = (z * (r00 * b_x[k] + r01 * b_y[k] + r02) + tx) * i
+        b = (z * (r10 * b_x[k] + r11 * b_y[k] + r12) + ty) * i
+        ru = b_u[k] - (fx * a + cx)
+        rv = b_v[k] - (fy * b + cy)
+        qu = fx * i * (a * tz - tx)
+        qv = fy * i * (b * tz - ty)
+        q2 = qu * qu + qv * qv
+        pure = q2 < np.float32(1e-20)  # no parallax: any axis will do
+        qu = ONE if pure else qu
+        inverse = ONE / (ONE if pure else q2)
+        dot = ru * qu + rv * qv
+        cross = rv * qu - ru * qv
+        spread = ONE / b_f[k]
+        wide = max(spread, ONE)
+        w = b_w[k]
+        total += w
+        near = front & (ru * ru + rv * rv <= radius * radius * wide) & (q2 < np.float32(1e12))
+        w = w if near else ZERO
+        inside += w
+        along[j] = dot * dot * inverse if near else ZERO
+        across[j] = cross * cross * inverse if near else ZERO
+        alpha[j] = spread
+        beta[j] = min(b_d[k] * q2, np.float32(1e8)) if near else ZERO
+        weight[j] = w
+        outlier[j] = disc / wide
+    return m, total, inside
+
+
+@njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
+def sum_noise(terms, m, vf, vd, share, sums):
+    """One round of expectation-maximisation: set ``sums`` to the weight of the followers, the three
+    entries of the information of (sf^2, sd^2) and the two of its right-hand side.
+    """
+    keep_apart()  # type: ignore[call-arg]
+    along, across, alpha = terms[0], terms[1], terms[2]
+    beta, weight, outlier = terms[3], terms[4], terms[5]
+    density = share * np.float32(0.5 / math.pi)
+    rest = ONE - share
+    hits = a11 = a12 = a22 = b1 = b2 = ZERO
+    for k in range(m):
+        al = alpha[k]
+        be = beta[k]
+        x1 = along[k]
+        x2 = across[k]
+        i2 = ONE / (vf * al)
+        i1 = ONE / (vf * al + vd * be)
+        d2 = x1 * i1 + x2 * i2
+        # exp(-d2 / 2) = exp(-y)^16 by a series that is good to 1e-3 at the limit: no call to a
+        # library function, so that the loop is vectorised
+        y = min(d2, np.float32(60.0)) * np.float32(1 / 32)
+        e = y * np.float32(1 / 5040) + np.float32(1 / 720)
+        e = e * y + np.float32(1 / 120)
+        e = e * y + np.float32(1 / 24)
+        e = e * y + np.float32(1 / 6)
+        e = e * y + np.float32(0.5)
+        e = (e * y + ONE) * y + ONE
+        e = e * e
+        e = e * e
+        e = e * e
+        e = e * e
+        p = density * np.sqrt(i1 * i2)
+        p = weight[k] * p / (p + rest * outlier[k] * e)
+        p = p if d2 < np.float32(60.0) else ZERO
+        j1 = p * i1 * i1
+        j2 = p * i2 * i2
+        hits += p
+        a11 += al * al * (j1 + j2)
+        a12 += al * be * j1
+        a22 += be * be * j1
+        b1 += al * (x1 * j1 + x2 * j2)
+        b2 += be * x1 * j1
+    sums[0], sums[1], sums[2] = hits, a11, a12
+    sums[3], sums[4], sums[5] = a22, b1, b2
+
+
 @njit(error_model="numpy", cache=True, nogil=True)
 def estimate_noise(samples, n, pose, K, sf, sd, sf_cap, sd_cap, rounds, limit):
     """Flow noise (px) and depth noise (of log Z) of the pixels that follow ``pose``.
@@ -228,68 +335,23 @@ def estimate_noise(samples, n, pose, K, sf, sd, sf_cap, sd_cap, rounds, limit):
     follows the pose, standard error of sd^2).
     """
     step = max(1, n // limit)
-    m = 0
-    size = n // step + 1
-    e1 = np.empty(size)
-    e2 = np.empty(size)
-    alpha = np.empty(size)
-    beta = np.empty(size)
-    weight = np.empty(size)
-    outlier = np.empty(size)
-    total = 0.0
-    radius = max(4.0, 8.0 * sf)
-    for k in range(0, n, step):
-        w = samples[W, k]
-        if not w > 0:
-            continue
-        total += w
-        ru, rv, qu, qv, front = residual(samples, k, pose, K)
-        spreading = max(1.0, 1.0 / samples[PF, k])
-        if not front or ru * ru + rv * rv > radius * radius * spreading:
-            continue
-        outlier[m] = 1.0 / (math.pi * radius * radius * spreading)
-        q = math.sqrt(qu * qu + qv * qv)
-        if q > 1e-12:
-            e1[m] = (ru * qu + rv * qv) / q
-            e2[m] = (rv * qu - ru * qv) / q
-        else:
-            e1[m] = ru
-            e2[m] = rv
-        alpha[m] = 1.0 / samples[PF, k]
-        beta[m] = samples[PD, k] * q * q
-        weight[m] = w
-        m += 1
-    if m < 8 or total <= 0:
+    terms = np.empty((6, ((n // step + 16) // 16 | 1) * 16), np.float32)
+    R = pose[:, :3].astype(np.float32)
+    t = pose[:, 3].astype(np.float32)
+    radius = np.float32(max(4.0, 8.0 * sf))
+    m, total, inside = gather_noise(samples, n, step, R, t, K, radius, terms)
+    if m < 8 or not inside > 0:
         return sf, sd, 0.0, sd * sd
     vf = sf * sf
     vd = sd * sd
-    inside = 0.0
-    for k in range(m):
-        inside += weight[k]
     share = 0.7
     spread = 0.0
+    sums = np.empty(6)
     for _ in range(rounds):
-        a11 = a12 = a22 = b1 = b2 = hits = 0.0
-        for k in range(m):
-            var2 = vf * alpha[k]
-            var1 = var2 + vd * beta[k]
-            x1 = e1[k] * e1[k]
-            x2 = e2[k] * e2[k]
-            d2 = x1 / var1 + x2 / var2
-            if d2 > 60.0:
-                continue
-            p = share * math.exp(-0.5 * d2) / (2.0 * math.pi * math.sqrt(var1 * var2))
-            p = weight[k] * p / (p + (1.0 - share) * outlier[k])
-            hits += p
-            i1 = p / (var1 * var1)
-            i2 = p / (var2 * var2)
-            a11 += alpha[k] * alpha[k] * (i1 + i2)
-            a12 += alpha[k] * beta[k] * i1
-            a22 += beta[k] * beta[k] * i1
-            b1 += alpha[k] * (x1 * i1 + x2 * i2)
-            b2 += beta[k] * x1 * i1
-        share = min(0.999, max(0.01, hits / inside))
-        if a11 <= 0:
+        sum_noise(terms, m, np.float32(vf), np.float32(vd), np.float32(share), sums)
+        a11, a12, a22, b1, b2 = sums[1], sums[2], sums[3], sums[4], sums[5]
+        share = min(0.999, max(0.01, sums[0] / inside))
+        if not (0 < a11 < np.inf and a22 < np.inf and abs(b1) < np.inf and abs(b2) < np.inf):
             break
         determinant = a11 * a22 - a12 * a12
         if determinant > 1e-9 * a11 * a22 and determinant > 0:
@@ -362,9 +424,7 @@ def robust_weights(samples, n, pose, K, noise, work, out):
     acc = np.zeros(SUMS)
     for o in range(0, n, BLOCK):
         m = min(BLOCK, n - o)
-        project_block(samples, o, m, R, t, K, noise, work, acc)
-        for k in range(m):
-            out[o + k] = work[8, k]
+        project_block(samples, o, m, R, t, K, noise, work, out[o:], acc)
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
