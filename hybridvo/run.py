@@ -200,7 +200,8 @@ def _run(
         if interruption:
             progress.say(f"interrupted: {folder.frames_done} frames are kept; go on with --resume")
             return _write(sequence, frames, options, folder, interrupted=True)
-        return _write(sequence, frames, options, folder, interrupted=False)
+        said = [vo.images.message] if vo.images.message else []
+        return _write(sequence, frames, options, folder, interrupted=False, warnings=said)
 
 
 def _track(
@@ -275,7 +276,13 @@ def _errors(sequence: Sequence, prev: Frame | None, step: Step) -> dict[str, Any
 
 
 def _write(
-    sequence: Sequence, frames: range, options: RunOptions, folder: RunFolder, *, interrupted: bool
+    sequence: Sequence,
+    frames: range,
+    options: RunOptions,
+    folder: RunFolder,
+    *,
+    interrupted: bool,
+    warnings: Iterable[str] = (),
 ) -> RunResult:
     """Results of the rows kept so far; all of them and the scores where the run is complete."""
     rows = list(folder.rows())
@@ -295,6 +302,7 @@ def _write(
     if interrupted:
         folder.write_state("interrupted", summary=summary)
         return RunResult(EXIT_INTERRUPTED, summary | {"state": "interrupted"}, trajectory, truth)
+    summary["warnings"] += warnings
     if len(rows) == 1:
         summary["warnings"].append("one frame: one pose at the identity, there is no motion to see")
     if truth is not None:

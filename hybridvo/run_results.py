@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -47,6 +48,7 @@ def summarise(
         "degraded": sum(row["status"] == "degraded" for row in rows),
         "missing_frames": [row["index"] for row in rows if row["reason"] == "missing_frame"],
         "flow_source": _names(row["flow_source"] for row in rows),
+        "polish": dict(Counter(row["polish"] for row in rows if row["polish"])),
         "depth_source": sequence.depth_source,
         "oracle": _oracles(rows, sequence),
         "ms_per_pair_median": float(np.median(tracked)) if tracked else None,

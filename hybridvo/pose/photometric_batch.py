@@ -8,6 +8,7 @@ gradient is that of the estimating equation at its root (implicit function theor
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -332,8 +333,8 @@ def polish_photometric_batch(
     if torch.is_grad_enabled() and any(value.requires_grad for value in inputs):
         A = _full_derivative(equations, T, light, noise, T_flow.detach())
         _, g, *_ = equations(T, light, noise, T_flow)
-        step, solved = solve_small(A, g)
-        move = torch.where((taken & solved)[:, None], step[:, :6], torch.zeros_like(step[:, :6]))
+        root, solved = solve_small(A, g)
+        move = root[:, :6] * (taken & solved)[:, None]
         # the value stays that of the solver
         move = (move - move.detach()).to(T.dtype)
         T = torch.where(taken[:, None, None], left_update(move, T), T_flow)
@@ -341,7 +342,13 @@ def polish_photometric_batch(
     return PhotometricBatch(T, light_block, light[:, 0], light[:, 1], noise, taken)
 
 
-def _full_derivative(equations, T, light, noise, T0) -> torch.Tensor:  # type: ignore[no-untyped-def]
+def _full_derivative(
+    equations: Callable[..., tuple[torch.Tensor, ...]],
+    T: torch.Tensor,
+    light: torch.Tensor,
+    noise: torch.Tensor,
+    T0: torch.Tensor,
+) -> torch.Tensor:
     """-dg / d(motion, light) at the root, (B, 8, 8)."""
     with torch.enable_grad():
         x = torch.zeros(T.shape[0], 8, dtype=T.dtype, device=T.device, requires_grad=True)
