@@ -59,7 +59,7 @@ def _add_run(commands: Any) -> None:
     run.add_argument("--sequence", required=True, metavar="DIR", help="folder of the sequence")
     run.add_argument("--dataset", metavar="KIND", help="kind of the sequence (default: detected)")
     run.add_argument("--out", metavar="DIR", help="output folder (default: runs/NAME)")
-    run.add_argument("--method", metavar="NAME", help="estimator (default: refine)")
+    run.add_argument("--method", metavar="NAME", help="estimator (default: hybrid)")
     run.add_argument(
         "--flow", metavar="WHAT", help="auto (default), file or dis; auto: files, else DIS"
     )

@@ -10,7 +10,7 @@ from __future__ import annotations
 import difflib
 import functools
 import time
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,11 +20,13 @@ from hybridvo.geometry import ego_flow, se3_exp
 from hybridvo.pose.judgement import default_judge
 from hybridvo.pose.photometric import PhotometricOptions, polish_photometric
 from hybridvo.pose.refinement import RefinementOptions, refine
-from hybridvo.pose.second_look import Motions, Opinion, PictureJudge, Verdict
+from hybridvo.pose.second_look import Motions, Opinion, PictureJudge
 from hybridvo.types import Camera, Frame, FramePair, RelativePose
 
 if TYPE_CHECKING:
-    from hybridvo.network.judge import JudgeInputs, JudgeNetwork
+    import torch
+
+    from hybridvo.network.judge import JudgeFeatures, JudgeInputs, JudgeNetwork
     from hybridvo.pose.coarse import Grid
 
 __all__ = [
@@ -39,7 +41,7 @@ __all__ = [
     "warm_up",
 ]
 
-DEFAULT_METHOD = "refine"
+DEFAULT_METHOD = "hybrid"
 
 _BASELINES = (
     "pnp-ransac",
@@ -162,6 +164,10 @@ def estimate(
     return baselines()[method](pair, seed=seed)
 
 
+OUT_OF_THE_RACE = 3.0
+"""How far a score may stay behind the best for a second look: at a twentieth of its probability."""
+
+
 class LearnedJudge:
     """A judge network as :func:`hybridvo.pose.refinement.refine` takes it.
 
@@ -186,24 +192,41 @@ class LearnedJudge:
             inputs = _judge_inputs(grid, motions, T_last)
             features = self._network.encode(inputs)
             best = features.score.argsort(descending=True, stable=True)[:masks]
+            best = best[features.score[best] > features.score.max() - OUT_OF_THE_RACE]
             mask = torch.sigmoid(self._network.decode(features, best)).numpy()
-        return Opinion(features.score.double().numpy(), best.numpy(), mask, (inputs, features))
+        memory = _Memory(inputs, features, features.score, features.hidden)
+        return Opinion(features.score.double().numpy(), best.numpy(), mask, memory=memory)
 
-    def second_look(self, first: Opinion, refits: Motions, parents: np.ndarray) -> Verdict:
+    def look_again(self, before: Opinion, refits: Motions, parents: np.ndarray) -> Opinion:
         """Scores of all candidates and the probability that the best of them is right."""
         import torch
 
-        inputs, features = first.memory
-        score, hidden = features.score, features.hidden
+        memory: _Memory = before.memory
+        score, hidden = memory.score, memory.hidden
+        best, mask = torch.zeros(0, dtype=torch.int64), np.zeros((0, *before.mask.shape[1:]))
         with torch.inference_mode():
             if len(refits.poses):
-                again = replace(inputs, **_candidates(refits, parents))
-                second = self._network.encode(again, (inputs, features))
-                score = torch.cat([score, second.score])
-                hidden = torch.cat([hidden, second.hidden])
+                again = replace(memory.inputs, **_candidates(refits, parents))
+                new = self._network.encode(again, (memory.inputs, memory.features))
+                known = len(score)
+                score, hidden = torch.cat([score, new.score]), torch.cat([hidden, new.hidden])
+                if int(score.argmax()) >= known:
+                    best = score.argmax()[None]
+                    mask = torch.sigmoid(self._network.decode(new, best - known)).numpy()
             owner = torch.zeros(len(score), dtype=torch.int64)
             trust = torch.sigmoid(self._network.confidence(score, hidden, owner, 1))
-        return Verdict(score.double().numpy(), float(trust))
+        memory = replace(memory, score=score, hidden=hidden)
+        return Opinion(score.double().numpy(), best.numpy(), mask, float(trust), memory)
+
+
+@dataclass(frozen=True, eq=False)
+class _Memory:
+    """What a judge keeps from look to look: the search's motions as seen, all answers so far."""
+
+    inputs: JudgeInputs
+    features: JudgeFeatures
+    score: torch.Tensor
+    hidden: torch.Tensor
 
 
 def _judge_inputs(grid: Grid, motions: Motions, T_last: np.ndarray | None) -> JudgeInputs:

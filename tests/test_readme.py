@@ -153,10 +153,13 @@ def test_python_names_exist():
                 value = getattr(value, part)
 
 
-def test_from_pretrained_says_that_there_are_no_weights():
-    # the README says so: to be rewritten with the first weights
-    with pytest.raises(InputError, match="no network weights"):
-        hybridvo.Odometry.from_pretrained()
+def test_from_pretrained_gives_a_tracker_that_asks_the_judge():
+    # the README says so, and that the weights are of one megabyte
+    from hybridvo.network.weights import pretrained
+
+    assert hybridvo.Odometry.from_pretrained(prepare=False).method == "hybrid"
+    assert hybridvo.Odometry(network=None, prepare=False).method == "refine"
+    assert 0.5e6 < pretrained("judge").stat().st_size < 1.5e6
 
 
 def test_kinds_of_data_and_scenes_are_all_named(tmp_path):

@@ -21,6 +21,10 @@ LEAST_USABLE = 0.1
 LEAST_USABLE_PIXELS = 400
 SOURCE_MASK = 102
 """Source of a motion that was fitted inside a mask, see :mod:`hybridvo.pose.search`."""
+CLEAR_COHERENCE = 0.5
+"""Coherence of the residuals above which even a motion that most of the picture follows may be a
+compromise: 0.02 for independent noise, 0.25 to 0.4 for DIS flow of static scenes, above 0.6 where a
+large mover bends the flow (development seeds)."""
 FIT_PIXELS = 4000
 """Pixels that the noise estimate of :func:`fit_in_mask` looks at."""
 
@@ -197,6 +201,10 @@ def search_motions(
             Reason.DEGENERATE_GEOMETRY, "the pixels do not determine any motion", "refine"
         )
     clear = found == 1 and bool(facts[0, search.SHARE] >= options.decisive_share)
+    if clear:
+        noise = facts[0, search.FLOW_NOISE], facts[0, search.DEPTH_NOISE]
+        coherence = search.residual_coherence(coarse, h, w, poses[0], picture.K, *noise)
+        clear = bool(coherence < CLEAR_COHERENCE)
     shape = (h, w, stride)
     return CoarseSearch(
         picture, coarse, shape, box, depth_scale, poses[:found], facts[:found], clear

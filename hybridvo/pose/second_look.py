@@ -17,10 +17,13 @@ from hybridvo.pose.coarse import CoarseSearch, Grid, fit_in_mask
 from hybridvo.pose.covariance import symmetric
 from hybridvo.pose.options import RefinementOptions
 
-__all__ = ["Decision", "Motions", "Opinion", "PictureJudge", "Verdict", "decide", "mask_weights"]
+__all__ = ["Decision", "Motions", "Opinion", "PictureJudge", "decide", "mask_weights"]
 
 REFITS = 2
 """Motions that are fitted again inside their masks."""
+LOOKS = 3
+"""Most rounds of fitting and judging. Only a fit that differs from every motion of the search goes
+into another round, inside the mask that is drawn about it."""
 SAME_MOTION = 8.0
 """Squared difference, in standard deviations of the fit inside a mask, up to which a motion of the
 search is taken for the same one (80 % quantile of chi-square with 6 degrees of freedom). Then the
@@ -50,32 +53,21 @@ class Motions:
 
 @dataclass(frozen=True, eq=False)
 class Opinion:
-    """What the judge says about the motions of the search.
+    """What the judge says after a look.
 
     Args:
-        score: (N,) larger is more likely the world.
-        best: (R,) int64, the motions with the largest scores.
+        score: (N,) of all candidates so far; larger is more likely the world.
+        best: (R,) int64, the candidates in whose masks it is worth to fit.
         mask: (R, h, w) for each of them the probability of every pixel to be static world.
-        memory: whatever the judge wants back for the second look.
+        trust: probability that the candidate with the largest score is right.
+        memory: whatever the judge wants back for the next look.
     """
 
     score: np.ndarray
     best: np.ndarray
     mask: np.ndarray
+    trust: float = 0.0
     memory: Any = None
-
-
-@dataclass(frozen=True, eq=False)
-class Verdict:
-    """What it says after the second look.
-
-    Args:
-        score: (N + R,) of the motions of the search and of the refits, comparable.
-        trust: probability that the motion with the largest score is right.
-    """
-
-    score: np.ndarray
-    trust: float
 
 
 @runtime_checkable
@@ -85,7 +77,7 @@ class PictureJudge(Protocol):
     def first_look(
         self, grid: Grid, motions: Motions, T_last: np.ndarray | None, masks: int
     ) -> Opinion:
-        """Scores of the motions of the search, and masks for the best of them.
+        """Opinion of the motions of the search, with masks for the best of them.
 
         Args:
             grid: the pixels.
@@ -94,8 +86,14 @@ class PictureJudge(Protocol):
             masks: how many masks are wanted; R is the smaller of it and N.
         """
 
-    def second_look(self, first: Opinion, refits: Motions, parents: np.ndarray) -> Verdict:
-        """Scores of all; ``parents`` (R,): the motion whose mask each refit was fitted in."""
+    def look_again(self, before: Opinion, refits: Motions, parents: np.ndarray) -> Opinion:
+        """Opinion of all candidates, with the mask of the best one where it is a new one.
+
+        Args:
+            before: the opinion before.
+            refits: R fits inside masks of that opinion; they follow its candidates.
+            parents: (R,) int64, the motion of the search that each goes back to.
+        """
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,54 +142,58 @@ def decide(
         T_last: (4, 4) the last motion of the camera, or None.
         options: of the refinement.
     """
-    motions = _motions(found.poses, found.facts)
-    first = judge.first_look(grid, motions, T_last, REFITS)
     usable = found.samples[kernels.W, : found.count]
     total = float(usable.sum())
-    poses, facts, parents, masks = [], [], [], []
-    for k, probability in zip(first.best, first.mask, strict=True):
-        weights = mask_weights(probability)
-        if float(usable @ weights.reshape(-1)) < LEAST_MASK * total:
-            continue
-        pose, fact = fit_in_mask(
-            found.samples, weights, found.picture.K, found.poses[k], options.cutoff
-        )
-        if np.isfinite(pose).all() and fact[search.SHARE] > 0:
-            poses.append(pose)
-            facts.append(fact)
-            parents.append(int(k))
-            masks.append(weights)
     count = len(found.poses)
-    every_pose = np.concatenate([found.poses, np.reshape(poses, (-1, 3, 4))])
-    every_fact = np.concatenate([found.facts, np.reshape(facts, (-1, search.FACTS))])
-    refits = _motions(every_pose[count:], every_fact[count:])
-    verdict = judge.second_look(first, refits, np.array(parents, np.int64))
-    score = np.where(np.isfinite(verdict.score), verdict.score, -np.inf)
-    best = int(np.argmax(score))
-    abstained = not verdict.trust >= LEAST_TRUST
+    poses, facts = list(found.poses), list(found.facts)
+    parents = list(range(count))
+    masks: list[np.ndarray | None] = [None] * count
+    opinion = judge.first_look(grid, _motions(found.poses, found.facts), T_last, REFITS)
+    best, same = 0, None
+    for _ in range(LOOKS):
+        known = len(poses)
+        for k, probability in zip(opinion.best, opinion.mask, strict=True):
+            weights = mask_weights(probability)
+            if float(usable @ weights.reshape(-1)) < LEAST_MASK * total:
+                continue
+            pose, fact = fit_in_mask(
+                found.samples, weights, found.picture.K, poses[k], options.cutoff
+            )
+            if np.isfinite(pose).all() and fact[search.SHARE] > 0:
+                poses.append(pose)
+                facts.append(fact)
+                parents.append(parents[k])
+                masks.append(weights)
+        refits = _motions(np.reshape(poses[known:], (-1, 3, 4)), np.array(facts[known:]))
+        opinion = judge.look_again(opinion, refits, np.array(parents[known:], np.int64))
+        best = int(np.argmax(np.nan_to_num(opinion.score, nan=-np.inf)))
+        mask = masks[best]
+        same = None if mask is None else _same(found, mask, poses[best], facts[best], options)
+        if best < known or same is not None:
+            break
+    score = np.nan_to_num(opinion.score, nan=-np.inf)
+    trust = float(np.nan_to_num(opinion.trust))
+    abstained = trust < LEAST_TRUST
     if abstained:
         best = int(np.argmax(classical))
-    mask = masks[best - count] if best >= count else None
-    if mask is not None:
-        gaps = _gaps(found, mask, every_pose[best], every_fact[best], options)
-        if gaps.min() < SAME_MOTION:
-            best, mask = int(np.argmin(gaps)), None
+    elif same is not None:
+        best = same
+    mask = masks[best]
     kept = 1.0 if mask is None else float(usable @ mask.reshape(-1)) / total
-    trust = float(verdict.trust) if np.isfinite(verdict.trust) else 0.0
-    return Decision(every_pose, every_fact, score, best, mask, kept, trust, abstained)
+    return Decision(np.stack(poses), np.stack(facts), score, best, mask, kept, trust, abstained)
 
 
-def _gaps(
+def _same(
     found: CoarseSearch,
     mask: np.ndarray,
     pose: np.ndarray,
     fact: np.ndarray,
     options: RefinementOptions,
-) -> np.ndarray:
-    """(N,) squared differences of the search's motions from a fit inside a mask.
+) -> int | None:
+    """Index of the motion of the search that a fit inside a mask differs from by chance only.
 
-    In its own standard deviations. A fit on all pixels that differs by more than chance has been
-    bent by pixels outside of the mask (Hausman's test of an efficient estimate by a robust one).
+    A fit on all pixels that differs by more has been bent by pixels outside of the mask (Hausman's
+    test of an efficient estimate by a robust one).
     """
     n = found.count
     samples = found.samples.copy()
@@ -204,8 +206,10 @@ def _gaps(
     information = symmetric(sums[:21])
     T = pose_matrix(pose)
     steps = np.array([se3_log(T @ invert(pose_matrix(P))) for P in found.poses])
-    return np.einsum("ni,ij,nj->n", steps, information, steps)
+    gaps = np.einsum("ni,ij,nj->n", steps, information, steps)
+    return int(np.argmin(gaps)) if gaps.min() < SAME_MOTION else None
 
 
 def _motions(poses: np.ndarray, facts: np.ndarray) -> Motions:
+    facts = np.reshape(facts, (-1, search.FACTS))
     return Motions(poses, facts[:, search.FLOW_NOISE], facts[:, search.DEPTH_NOISE])

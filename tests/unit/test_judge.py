@@ -20,7 +20,7 @@ from hybridvo.pose import second_look
 from hybridvo.pose.coarse import CoarseSearch, search_motions, whole_mask
 from hybridvo.pose.options import RefinementOptions
 from hybridvo.pose.refinement import refine
-from hybridvo.pose.second_look import Motions, Opinion, Verdict
+from hybridvo.pose.second_look import Motions, Opinion
 from hybridvo.training import judge_data
 from hybridvo.training.judge_batches import PictureBatch, ego_flow_error, read_batches
 from hybridvo.training.judge_loop import JudgeTrainer, JudgeTrainingOptions
@@ -132,13 +132,14 @@ class Oracle:
 
     def first_look(self, grid, motions: Motions, T_last, masks: int) -> Opinion:
         best = np.arange(min(masks, len(motions.poses)))
-        count = len(motions.poses)
-        return Opinion(np.zeros(count), best, np.stack([self.static] * len(best)), count)
+        return Opinion(np.zeros(len(motions.poses)), best, np.stack([self.static] * len(best)))
 
-    def second_look(self, first: Opinion, refits: Motions, parents: np.ndarray) -> Verdict:
-        old, new = np.zeros(first.memory), np.zeros(len(refits.poses))
-        (new if self.prefer == "refit" else old)[-1] = 5.0
-        return Verdict(np.concatenate([old, new]), self.trust)
+    def look_again(self, before: Opinion, refits: Motions, parents: np.ndarray) -> Opinion:
+        old, new = before.score.copy(), np.zeros(len(refits.poses))
+        (new if self.prefer == "refit" and len(new) else old)[-1] = old.max() + 5.0
+        score = np.concatenate([old, new])
+        best = np.array([score.argmax()])
+        return Opinion(score, best, self.static[None], self.trust)
 
 
 def gap(T: np.ndarray, pair, truth) -> float:

@@ -2,15 +2,17 @@ from __future__ import annotations
 
 import tracemalloc
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import hybridvo
-from hybridvo.errors import InputError
+from hybridvo.data.synthetic import make_scene
+from hybridvo.errors import CheckpointError, InputError
 from hybridvo.flow import FlowField, dis_flow
 from hybridvo.geometry import ego_flow, invert, rotation_angle, se3_exp
-from hybridvo.hybrid import METHODS, check_method, estimate, warm_up
+from hybridvo.hybrid import DEFAULT_METHOD, METHODS, check_method, estimate, warm_up
 from hybridvo.odometry import Odometry
 from hybridvo.types import Camera, Frame, FramePair, Reason, State
 
@@ -224,11 +226,12 @@ def test_a_frame_of_another_size_is_refused_and_changes_nothing() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"network": object()}, "networks are not supported yet"),
+        ({"network": object()}, "expected .default., None or a LearnedJudge"),
         ({"policy": "guess"}, "hold or constant_velocity, got 'guess'"),
         ({"flow": 3}, "expected a callable"),
         ({"method": "refin"}, "did you mean 'refine'"),
-        ({"method": "hybrid"}, "needs network weights.*--method refine"),
+        ({"method": "pwvo"}, "needs network weights.*--method refine"),
+        ({"method": "hybrid", "network": None}, "needs a network"),
     ],
 )
 def test_wrong_options(options: dict[str, object], message: str) -> None:
@@ -241,9 +244,10 @@ def test_track_wants_a_frame() -> None:
         tracker().track(np.zeros((4, 4)))
 
 
-def test_from_pretrained_says_what_to_do() -> None:
-    with pytest.raises(InputError, match=r"no network weights yet; use hybridvo.Odometry\(\)"):
-        hybridvo.Odometry.from_pretrained()
+def test_from_pretrained_knows_its_weights() -> None:
+    assert hybridvo.Odometry.from_pretrained(prepare=False).method == DEFAULT_METHOD
+    with pytest.raises(CheckpointError, match="judge"):
+        hybridvo.Odometry.from_pretrained("jugde")
 
 
 @pytest.mark.parametrize("bad", [np.nan, 0.0, -1.0, np.inf])
@@ -309,4 +313,32 @@ def test_every_method_runs_or_says_why_not() -> None:
         result = estimate(pair, method=method)
         assert np.isfinite(result.T_curr_prev).all() and result.method == method
         ran.append(method)
-    assert {"refine", "pnp-ransac", "identity"} <= set(ran)
+    assert {"hybrid", "refine", "pnp-ransac", "identity"} <= set(ran)
+
+
+@pytest.mark.parametrize("kind", ["light", "heavy_rigid"])
+def test_history_cannot_hold_the_tracker(kind: str) -> None:
+    # forwards, then back again at once: every motion after the turn is the inverse of its like
+    scene = make_scene(kind, 7, height=160, width=320, frames=5)
+    there = [scene.render(i) for i in range(5)]
+    path = [0, 1, 2, 3, 4, 3, 2, 1]
+    errors = {}
+    for history in (True, False):
+        vo = Odometry(history=history, flow=dis_flow())
+        for step, at in enumerate(path):
+            seen = there[at]
+            depth_m = np.where(np.isfinite(seen.depth), seen.depth, 0).astype(np.float32)
+            result = vo.track(Frame(seen.rgb, depth_m, scene.camera(at), 0.1 * step, step))
+            if step == 3 and history:
+                # and a last motion that is quite another one
+                wrong = se3_exp(np.array([0.3, 0.2, -0.4, 0.05, -0.08, 0.02]))
+                vo.resume(replace(vo.anchor, T_last=wrong))
+            before = path[max(step - 1, 0)]
+            true = invert(scene.T_world_cam[at]) @ scene.T_world_cam[before]
+            camera = scene.camera(before)
+            z = there[before].depth
+            flows = [ego_flow(z, T, camera, camera) for T in (result.T_curr_prev, true)]
+            errors[step, history] = np.nanmean(np.linalg.norm(flows[0] - flows[1], axis=2))
+    # recovered within two frames of the change; half a pixel is what DIS flow of this size allows
+    assert max(errors[step, True] for step in (5, 6, 7)) < 0.5
+    assert max(errors[step, False] for step in (5, 6, 7)) < 0.5
