@@ -118,7 +118,7 @@ def gather_pixels(index, n, grey, depth, weights, depth_variance, typical, camer
         out[GREY, k] = grey[v, u]
         out[GX, k] = HALF * (grey[v, u + 1] - grey[v, u - 1])
         out[GY, k] = HALF * (grey[v + 1, u] - grey[v - 1, u])
-        out[W, k] = weights[v, u]
+        out[W, k] = min(weights[v, u], ONE)
         out[PD, k] = ONE
         if has_variance:
             p = depth_variance[v, u]
