@@ -120,6 +120,9 @@ def _export(arguments: argparse.Namespace) -> int:
         "licence": "the package's own",
     }
     save_weights(arguments.export, network, trainer.options.network, card, dtype="float16")
+    # the same card for people, beside the weights
+    text = json.dumps(card, indent=1, sort_keys=True) + "\n"
+    arguments.export.with_suffix(".json").write_text(text, encoding="utf-8")
     print(json.dumps(card["held_out"], indent=1))
     print(f"{arguments.export}: {arguments.export.stat().st_size / 1e6:.1f} MB")
     return 0

@@ -31,8 +31,9 @@ if TYPE_CHECKING:
 __all__ = ["RefinementOptions", "refine"]
 
 SUPPORT_CUTOFF = 3.0
-TRUSTED = 0.5
-"""Probability of being right below which an answer is degraded."""
+TRUSTED = 0.7
+"""Probability of being right below which an answer is degraded: on development seeds of the heavy
+scenes 11 of 13 wrong answers under DIS flow, and 6 of 147 right ones."""
 
 SOURCES = {
     0: "identity",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields, replace
 from pathlib import Path
@@ -13,9 +14,9 @@ import torch
 from hybridvo.data.benchmark_pairs import Cell, make_pair
 from hybridvo.errors import CheckpointError, InputError
 from hybridvo.geometry import ego_flow
-from hybridvo.hybrid import LearnedJudge, _judge_inputs
+from hybridvo.hybrid import LearnedJudge, _judge_inputs, estimate
 from hybridvo.network.judge import JudgeInputs, JudgeNetwork, JudgeOptions
-from hybridvo.network.weights import load_weights, save_weights
+from hybridvo.network.weights import load_weights, pretrained, save_weights
 from hybridvo.pose import second_look
 from hybridvo.pose.coarse import CoarseSearch, search_motions, whole_mask
 from hybridvo.pose.options import RefinementOptions
@@ -263,3 +264,23 @@ def test_training_learns_and_goes_on(shards: Path, tmp_path: Path) -> None:
     for bad in ({"batch_size": 0}, {"ema_decay": 1.0}, {"learning_rate": 0.0}):
         with pytest.raises(InputError):
             JudgeTrainingOptions(**bad)
+
+
+def test_the_shipped_judge_chooses_better_than_the_cues() -> None:
+    # one object on 60 % of the picture, development seeds in which the cues fail twice
+    found: dict[str, list[float]] = {"refine": [], "hybrid-flow": []}
+    for seed in range(504, 512):
+        pair, truth = make_pair("one60", seed)
+        for method, gaps in found.items():
+            gaps.append(gap(estimate(pair, method=method).T_curr_prev, pair, truth))
+    wrong = {method: sum(g > 1 for g in gaps) for method, gaps in found.items()}
+    assert wrong["refine"] >= 1 and wrong["hybrid-flow"] < wrong["refine"]
+    assert np.median(found["hybrid-flow"]) <= 1.05 * np.median(found["refine"])
+
+
+def test_the_card_beside_the_weights_is_theirs() -> None:
+    path = pretrained("judge")
+    network, card = load_weights(path)
+    assert json.loads(path.with_suffix(".json").read_text()) == card
+    assert {"command", "commit", "pictures", "held_out", "options"} <= set(card)
+    assert sum(p.numel() for p in network.parameters()) < 1_000_000
