@@ -17,6 +17,7 @@ import numpy as np
 
 from hybridvo.errors import CheckpointError, InputError
 from hybridvo.geometry import ego_flow, se3_exp
+from hybridvo.learned import LEARNED, estimate_learned, shipped_network
 from hybridvo.pose.judgement import default_judge
 from hybridvo.pose.photometric import PhotometricOptions, polish_photometric
 from hybridvo.pose.refinement import RefinementOptions, refine
@@ -54,15 +55,7 @@ _BASELINES = (
 )
 JUDGED = ("hybrid", "hybrid-flow")
 """Methods that ask a learned judge which motion is the world."""
-_WITH_NETWORK = (
-    "pwvo",
-    "pwvo-naive",
-    "pixelwise",
-    "vonet",
-    "vonet-attention",
-)
-
-METHODS = (*JUDGED, "refine", *_WITH_NETWORK, *_BASELINES)
+METHODS = (*JUDGED, "refine", *LEARNED, *_BASELINES)
 """Every method name, in the order of the results' tables."""
 
 
@@ -92,17 +85,15 @@ def check_method(method: str) -> None:
         near = difflib.get_close_matches(str(method), METHODS, n=1, cutoff=0.4)
         hint = f" (did you mean '{near[0]}'?)" if near else ""
         raise InputError(f"method: '{method}' is unknown{hint}; known: {', '.join(METHODS)}.")
-    if method in JUDGED:
+    needed = "judge" if method in JUDGED else method
+    if method in JUDGED or method in LEARNED:
         from hybridvo.network.weights import pretrained_names
 
-        missing_weights = "judge" not in pretrained_names()
-    else:
-        missing_weights = method in _WITH_NETWORK
-    if missing_weights:
-        raise InputError(
-            f"method '{method}' needs network weights, which this version does not ship yet; "
-            f"use --method refine (the classical refinement)."
-        )
+        if needed not in pretrained_names():
+            raise InputError(
+                f"method '{method}' needs network weights, which this version does not ship yet; "
+                f"use --method refine (the classical refinement)."
+            )
     if method in _BASELINES:
         from hybridvo.pose.baselines import missing
 
@@ -159,6 +150,8 @@ def estimate(
             found = polish_photometric(pair, found, photometric, trust=trust)
         return found.replace(method=method)
     check_method(method)
+    if method in LEARNED:
+        return estimate_learned(pair, method)
     from hybridvo.pose.baselines import baselines
 
     return baselines()[method](pair, seed=seed)
@@ -299,6 +292,8 @@ def warm_up(method: str = DEFAULT_METHOD, polish: str = "auto") -> float:
     started = time.perf_counter()
     if method in _BASELINES:
         return 0.0
+    if method in LEARNED:
+        shipped_network(method)
     # the second size takes the parallel kernels
     for height, width in ((48, 64), (320, 400)):
         camera = Camera(width, width, (width - 1) / 2, (height - 1) / 2, height, width)

@@ -104,14 +104,14 @@ def _score(
     from hybridvo.evaluation.pairs import pair_errors
     from hybridvo.network.inputs import assemble_inputs
     from hybridvo.network.passes import predict
-    from hybridvo.training.held_out import output_motion
+    from hybridvo.pose.selection import chosen_motion
 
     inputs = assemble_inputs(pairs)
     truth = [true_motion(sequence, pair.prev.index, pair.curr.index) for pair in pairs]
     for name, (network, selection) in networks.items():
 
         def choose(output: Any, selection: str = selection) -> Any:
-            return output_motion(output, selection)
+            return chosen_motion(output, selection)
 
         with torch.inference_mode():
             given = inputs.to(next(network.parameters()).device)

@@ -25,7 +25,13 @@ import torch.nn.functional as F
 from hybridvo.errors import InputError
 from hybridvo.types import PixelwisePrediction
 
-__all__ = ["SELECTION_METHODS", "select", "selected_transform"]
+__all__ = [
+    "SELECTION_METHODS",
+    "chosen_motion",
+    "chosen_pose",
+    "select",
+    "selected_transform",
+]
 
 SELECTION_METHODS = ("softmax", "min_variance", "median", "mean", "paper")
 
@@ -127,6 +133,27 @@ def selected_transform(rotation_deg: torch.Tensor, translation: torch.Tensor) ->
         (zero, zero, zero, one),
     )
     return torch.stack([torch.stack(torch.broadcast_tensors(*row), dim=1) for row in rows], dim=1)
+
+
+def chosen_pose(
+    output: PixelwisePrediction | tuple[torch.Tensor, torch.Tensor], method: str = "softmax"
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """(rotation_deg (B, 3), translation (B, 3)) of any network's output.
+
+    Args:
+        output: maps, or the pose itself (VONet).
+        method: of :func:`select`; maps without uncertainty are averaged whatever it says.
+    """
+    if not isinstance(output, PixelwisePrediction):
+        return output
+    return select(output, "mean" if output.log_scale_rotation is None else method)
+
+
+def chosen_motion(
+    output: PixelwisePrediction | tuple[torch.Tensor, torch.Tensor], method: str = "softmax"
+) -> torch.Tensor:
+    """(B, 4, 4) T_curr_prev of any network's output, see :func:`chosen_pose`."""
+    return selected_transform(*chosen_pose(output, method))
 
 
 def _check(prediction: PixelwisePrediction, needs_scale: bool) -> None:

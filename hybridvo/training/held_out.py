@@ -17,11 +17,11 @@ from scipy.stats import rankdata
 from hybridvo.errors import InputError
 from hybridvo.network.losses import NetworkOutput, reconstruct
 from hybridvo.network.passes import predict
-from hybridvo.pose.selection import select, selected_transform
+from hybridvo.pose.selection import chosen_motion, chosen_pose, selected_transform
 from hybridvo.training.stream import Preset, TrainingBatch, collate, sample_generator
 from hybridvo.types import PixelwisePrediction
 
-__all__ = ["PUBLISHED_SEED", "area_under_curve", "evaluate_network", "output_motion"]
+__all__ = ["PUBLISHED_SEED", "area_under_curve", "evaluate_network"]
 
 PUBLISHED_SEED = 1000
 """First seed of published figures; smaller ones are for development."""
@@ -99,7 +99,7 @@ def evaluate_network(
                 torch.inference_mode(),
                 torch.autocast(device.type, torch.bfloat16, enabled=precision == "bfloat16"),
             ):
-                output = predict(network, batch.inputs, partial(output_motion, method=selection))
+                output = predict(network, batch.inputs, partial(chosen_motion, method=selection))
             with torch.inference_mode():
                 errors.append(_errors(output, batch, selection))
                 if (
@@ -131,24 +131,10 @@ def evaluate_network(
     return result
 
 
-def output_pose(output: NetworkOutput, method: str) -> tuple[torch.Tensor, torch.Tensor]:
-    """(rotation_deg (B, 3), translation (B, 3)) of any network's output; the mean of its pixels
-    where a pixel-wise network has no uncertainty.
-    """
-    if not isinstance(output, PixelwisePrediction):
-        return output
-    return select(output, "mean" if output.log_scale_rotation is None else method)
-
-
-def output_motion(output: NetworkOutput, method: str) -> torch.Tensor:
-    """(B, 4, 4) T_curr_prev of any network's output, see :func:`output_pose`."""
-    return selected_transform(*output_pose(output, method))
-
-
 def _errors(output: NetworkOutput, batch: TrainingBatch, selection: str) -> np.ndarray:
     """(B, 6) R_err, T_err and EPE of the network and of the zero-motion predictor."""
     truth = batch.targets
-    rotation, translation = output_pose(output, selection)
+    rotation, translation = chosen_pose(output, selection)
     T = selected_transform(rotation, translation)
     flow, _, defined = reconstruct(truth.depth_prev, T, truth.K_prev, truth.K_curr)
     near = truth.ego_flow.norm(dim=1) < EPE_LIMIT_PX

@@ -25,8 +25,9 @@ from hybridvo.errors import CheckpointError, DegenerateError
 from hybridvo.network.losses import NetworkOutput, total_loss
 from hybridvo.network.passes import first_motions
 from hybridvo.network.pwvo import build_network
+from hybridvo.pose.selection import chosen_motion
 from hybridvo.training.checkpoint import load_checkpoint, save_checkpoint
-from hybridvo.training.held_out import evaluate_network, output_motion
+from hybridvo.training.held_out import evaluate_network
 from hybridvo.training.options import TrainingOptions
 from hybridvo.training.stream import Mixture, SampleStream, TrainingBatch
 from hybridvo.types import PixelwisePrediction
@@ -46,7 +47,7 @@ def training_loss(
     output: NetworkOutput, batch: TrainingBatch, options: TrainingOptions
 ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
     """Loss of a network's output and its parts, see :func:`hybridvo.network.losses.total_loss`."""
-    T = output_motion(output, options.selection) if options.loss.reconstructs else None
+    T = chosen_motion(output, options.selection) if options.loss.reconstructs else None
     laplace = options.translation_loss == "laplace" and isinstance(output, PixelwisePrediction)
     loss_options = options.loss
     if laplace:
@@ -222,7 +223,7 @@ class Trainer:
         made = first_motions(
             self.network,
             batch.inputs[first:],
-            lambda output: output_motion(output, self.options.selection),
+            lambda output: chosen_motion(output, self.options.selection),
             1 + self.step % (passes - 1),
         )
         assert made is not None

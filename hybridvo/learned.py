@@ -1,0 +1,130 @@
+"""The paper's networks as estimators: a pair in, the selected motion out, with its covariance."""
+
+from __future__ import annotations
+
+import functools
+import time
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from hybridvo.errors import CheckpointError
+from hybridvo.types import FramePair, Reason, RelativePose, Status
+
+if TYPE_CHECKING:
+    import torch
+
+__all__ = ["LEARNED", "estimate_learned", "shipped_network"]
+
+LEARNED = {
+    "pwvo": "softmax",
+    "pwvo-naive": "mean",
+    "pixelwise": "mean",
+    "vonet": "",
+    "vonet-attention": "",
+}
+"""Methods that are a network alone, and how one motion is selected from its pixels."""
+
+LEAST_PIXELS = 64
+"""Pixels of the network's input with flow and depth below which it is not asked."""
+LEAST_SCALE = 1e-4
+"""Least Laplace scale believed, degrees and metres: half-precision weights know no better."""
+UNCERTAIN_DEG = 2.0
+"""Rotation scale above which the answer is degraded: larger than most motions between frames."""
+UNKNOWN_DEG, UNKNOWN_M = 1.0, 0.3
+"""Scales stated for networks that give none: the largest usual motions, so that nobody trusts."""
+
+
+@functools.cache
+def shipped_network(name: str) -> torch.nn.Module:
+    """A network of the package in the form that is fastest on this machine; read once a process.
+
+    Args:
+        name: of the weights, which is that of the method.
+
+    Raises:
+        CheckpointError: no such weights, weights of another kind of network, or damaged ones.
+    """
+    import torch
+
+    from hybridvo.network.weights import load_weights, pretrained
+
+    path = pretrained(name)
+    network, _ = load_weights(path)
+    if not hasattr(getattr(network, "options", None), "passes"):
+        raise CheckpointError(f"{path}: expected the weights of {name}, got another network's.")
+    return network.eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+
+
+def estimate_learned(
+    pair: FramePair, method: str, network: torch.nn.Module | None = None
+) -> RelativePose:
+    """Camera motion of one pair by a network and the paper's selection, without any refinement.
+
+    Args:
+        pair: two frames and the flow between them.
+        method: one of :data:`LEARNED`.
+        network: of ``build_network`` or ``load_weights``; the one that is shipped by default.
+
+    Returns:
+        ``T_curr_prev``. Its covariance is diagonal: of a Laplace variable with the scales that the
+        selected pixels state (2 U^2). Bad data give a failed status.
+
+    Raises:
+        CheckpointError: weights that are not shipped.
+    """
+    import torch
+
+    from hybridvo.network.inputs import assemble_inputs
+    from hybridvo.network.passes import predict
+    from hybridvo.pose.selection import chosen_motion, chosen_pose, select
+    from hybridvo.types import PixelwisePrediction
+
+    started = time.perf_counter()
+    if pair.flow is None:
+        return RelativePose.failed(Reason.NO_FLOW, "no optical flow for this pair", method)
+    if pair.prev.depth is None:
+        return RelativePose.failed(Reason.NO_VALID_DEPTH, "no depth for this frame", method)
+    network = shipped_network(method) if network is None else network
+    how = LEARNED[method]
+    with torch.inference_mode():
+        inputs = assemble_inputs(pair)
+        seen = int(inputs.valid.sum())
+        if seen < LEAST_PIXELS:
+            return RelativePose.failed(
+                Reason.NO_VALID_DEPTH,
+                f"{seen} pixels of the network's input have flow and depth, {LEAST_PIXELS} needed",
+                method,
+            )
+        output = predict(network, inputs, lambda x: chosen_motion(x, how))
+        rotation, translation = (x.double() for x in chosen_pose(output, how))
+        T = chosen_motion((rotation, translation), how)[0].numpy()
+        scales = torch.tensor([[UNKNOWN_M] * 3 + [UNKNOWN_DEG] * 3], dtype=torch.float64)
+        log_r = log_t = None
+        if isinstance(output, PixelwisePrediction):
+            log_r, log_t = output.log_scale_rotation, output.log_scale_translation
+        if log_r is not None and log_t is not None:
+            # The scales go the way of the values: same pixels, same weights.
+            stated = PixelwisePrediction(log_r.exp(), log_t.exp(), log_r, log_t)
+            scale_r, scale_t = select(stated, how)
+            scales = torch.cat([scale_t, scale_r], dim=1).double()
+    U = np.maximum(scales[0].numpy(), LEAST_SCALE)
+    ms = 1e3 * (time.perf_counter() - started)
+    common: dict[str, Any] = {"method": method, "ms": ms, "terms": ("flow", "depth")}
+    if not (np.isfinite(T).all() and np.isfinite(U).all()):
+        return RelativePose.failed(
+            Reason.DEGENERATE_GEOMETRY, "the network's answer is not finite", **common
+        )
+    status = Status()
+    if U[3:].max() > UNCERTAIN_DEG:
+        status = Status.degraded(
+            Reason.LOW_INLIERS, f"the network is uncertain by {U[3:].max():.1f} degrees"
+        )
+    sigma = np.sqrt(2.0) * np.concatenate([U[:3], np.deg2rad(U[3:])])
+    return RelativePose(
+        T_curr_prev=T,
+        covariance=np.diag(sigma**2),
+        status=status,
+        translation_direction_valid=bool(np.linalg.norm(T[:3, 3]) > 3 * sigma[:3].max()),
+        **common,
+    )

@@ -1,0 +1,234 @@
+"""Networks without units: scales, first motions, several passes; networks as estimators."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hybridvo.errors import CheckpointError, InputError
+from hybridvo.geometry import ego_flow, pose_matrix, se3_exp
+from hybridvo.learned import estimate_learned, shipped_network
+from hybridvo.network.inputs import (
+    NetworkInputs,
+    assemble_aligned,
+    assemble_inputs,
+    subsampled_intrinsics,
+)
+from hybridvo.network.losses import LossOptions, LossTargets, total_loss
+from hybridvo.network.passes import first_motions, predict
+from hybridvo.network.pwvo import NetworkOptions, build_network
+from hybridvo.network.scale_free import euler_deg, remove_scale
+from hybridvo.pose.selection import chosen_motion, selected_transform
+from hybridvo.types import Camera, Frame, FramePair, Reason, State
+
+CAMERA = Camera(60.0, 62.0, 31.5, 15.5, 32, 64)
+MOTION = se3_exp(np.array([0.05, -0.03, 0.08, 0.004, -0.006, 0.01]))
+
+
+def scene(scale: float = 1.0) -> np.ndarray:
+    v, u = np.mgrid[:32, :64]
+    return (scale * (4 + np.sin(u / 9.0) + 0.5 * np.cos(v / 5.0))).astype(np.float32)
+
+
+def inputs_of(
+    flow: np.ndarray, depth: np.ndarray, depth_curr: np.ndarray | None = None
+) -> NetworkInputs:
+    K = torch.tensor(CAMERA.K, dtype=torch.float32)[None]
+    depth_curr = depth if depth_curr is None else depth_curr
+    return assemble_aligned(
+        *(torch.tensor(x, dtype=torch.float32)[None] for x in (flow, depth, depth_curr)), K
+    )
+
+
+def static_inputs(T: np.ndarray = MOTION, scale: float = 1.0) -> NetworkInputs:
+    depth = scene(scale)
+    T = T.copy()
+    T[:3, 3] *= scale
+    v, u = np.mgrid[:32, :64]
+    rays = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones((32, 64))])
+    moved = np.einsum("ij,jhw->ihw", T[:3, :3], rays * depth) + T[:3, 3, None, None]
+    return inputs_of(ego_flow(depth, T, CAMERA, CAMERA), depth, moved[2])
+
+
+def tiny(**options) -> torch.nn.Module:
+    torch.manual_seed(0)
+    return build_network(NetworkOptions(width=0.1, scale_free=True, **options)).eval()
+
+
+def test_euler_angles_are_those_of_the_selected_transform():
+    angles = torch.tensor([[3.0, -20.0, 40.0], [0.0, 0.0, 0.0]])
+    T = selected_transform(angles, torch.zeros(2, 3))
+    # float32 of angles up to 40 degrees: 40 * 6e-8, through one arc sine
+    torch.testing.assert_close(euler_deg(T[:, :3, :3]), angles, atol=2e-5, rtol=0)
+
+
+def test_scales_by_hand():
+    # 3 px of flow everywhere at 60 px focal length: 0.05 rad; depth 2 m everywhere
+    flow = np.zeros((32, 64, 2))
+    flow[..., 0] = 3.0
+    inputs, scale = remove_scale(inputs_of(flow, np.full((32, 64), 2.0)))
+    expected = [np.rad2deg(0.05)] * 3 + [0.1] * 3
+    np.testing.assert_allclose(scale.factor[0], expected, rtol=1e-5)
+    # flow over itself is 1, squashed at 10: 1 / 1.1
+    np.testing.assert_allclose(inputs.flow[0, 0], 1 / 1.1, rtol=1e-5)
+    np.testing.assert_allclose(inputs.inverse_depth[0, 0], 1 / 1.1, rtol=1e-5)
+    assert float(inputs.inverse_depth[0, 1].abs().max()) == 0
+    assert float(scale.start.abs().max()) == 0
+
+
+def test_change_of_depth_is_counted_in_units_of_the_motion():
+    flow = np.zeros((32, 64, 2))
+    flow[..., 0] = 3.0
+    inputs, _ = remove_scale(inputs_of(flow, np.full((32, 64), 2.0), np.full((32, 64), 2.2)))
+    change = np.log(1.1) / 0.05
+    np.testing.assert_allclose(inputs.inverse_depth[0, 1], change / (1 + change / 10), rtol=1e-4)
+
+
+@settings(max_examples=15, deadline=None)
+@given(factor=st.floats(0.1, 10.0))
+def test_a_scene_twice_as_large_moves_by_twice_as_many_metres(factor):
+    # depths stay below the 50 m beyond which the scale of the translation is held
+    network = tiny()
+    with torch.inference_mode():
+        one, other = network(static_inputs()), network(static_inputs(scale=factor))
+    torch.testing.assert_close(one.rotation, other.rotation, atol=1e-3, rtol=1e-3)
+    torch.testing.assert_close(factor * one.translation, other.translation, atol=1e-3, rtol=2e-3)
+    torch.testing.assert_close(
+        one.log_scale_translation + np.log(factor), other.log_scale_translation, atol=2e-3, rtol=0
+    )
+
+
+def test_the_true_motion_leaves_nothing_unexplained():
+    inputs = static_inputs()
+    T = torch.tensor(MOTION, dtype=torch.float32)[None]
+    left, scale = remove_scale(inputs, T)
+    # what is left is rounding: far below the smallest scale, 5e-5 rad
+    assert float(scale.factor[0, 0]) == pytest.approx(np.rad2deg(5e-5))
+    assert float(left.flow.abs().max()) < 0.1
+    assert float(left.inverse_depth[0, 1].abs().max()) < 0.1
+    np.testing.assert_allclose(scale.start[0, 3:], MOTION[:3, 3], rtol=1e-6)
+
+
+def test_no_motion_as_a_start_changes_nothing():
+    inputs = static_inputs()
+    plain, _ = remove_scale(inputs)
+    started, _ = remove_scale(inputs, torch.eye(4)[None])
+    torch.testing.assert_close(plain.flow, started.flow, atol=1e-4, rtol=0)
+    torch.testing.assert_close(plain.inverse_depth, started.inverse_depth, atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 0.0, 1e38])
+def test_bad_values_give_finite_predictions(value):
+    flow, depth = np.full((32, 64, 2), value), np.full((32, 64), value)
+    network = tiny(passes=2)
+    behind = torch.eye(4)[None].clone()
+    behind[0, 2, 3] = -1e6
+    with torch.inference_mode():
+        for T in (None, torch.eye(4)[None], behind):
+            for inputs in (inputs_of(flow, depth), static_inputs()):
+                output = network(inputs, T)
+                assert torch.isfinite(output.rotation).all()
+                assert torch.isfinite(output.log_scale_translation).all()
+
+
+def test_passes_are_the_network_on_what_is_left():
+    network, inputs = tiny(passes=3), static_inputs()
+    with torch.inference_mode():
+        one = network(inputs)
+        two = network(inputs, chosen_motion(one))
+        three = network(inputs, chosen_motion(two))
+        torch.testing.assert_close(predict(network, inputs, chosen_motion).rotation, three.rotation)
+        torch.testing.assert_close(
+            predict(network, inputs, chosen_motion, passes=1).rotation, one.rotation
+        )
+    assert first_motions(network, inputs, chosen_motion, 0) is None
+
+
+def test_options_at_the_door():
+    with pytest.raises(InputError, match="passes above 1 need scale_free"):
+        NetworkOptions(passes=2)
+    with pytest.raises(InputError, match=r"NetworkOptions\.passes"):
+        NetworkOptions(passes=9, scale_free=True)
+    with pytest.raises(InputError, match="input_stride"):
+        NetworkOptions(input_stride=3)
+    assert NetworkOptions(input_stride=2, head_stride=2).patch == 8
+
+
+def test_subsampled_intrinsics_by_hand():
+    # pixels 1, 3, 5, ..: the principal point 31.5 lies 15.25 of them from the first
+    K = subsampled_intrinsics(torch.tensor(CAMERA.K)[None], 2)[0]
+    np.testing.assert_allclose(K, [[30.0, 0, 15.25], [0, 31.0, 7.25], [0, 0, 1]])
+    small = static_inputs().subsample(2)
+    rows, columns = torch.meshgrid(torch.arange(16.0), torch.arange(32.0), indexing="ij")
+    x = (columns - small.K_prev[0, 0, 2]) / small.K_prev[0, 0, 0]
+    y = (rows - small.K_prev[0, 1, 2]) / small.K_prev[0, 1, 1]
+    torch.testing.assert_close(small.rays[0], torch.stack([x, y]), atol=1e-6, rtol=0)
+
+
+def test_the_truth_has_no_flow_loss_on_fewer_pixels():
+    inputs = static_inputs()
+    T = torch.tensor(MOTION, dtype=torch.float32)[None]
+    targets = LossTargets(
+        rotation_deg=euler_deg(T[:, :3, :3]),
+        translation=T[:, :3, 3],
+        ego_flow=inputs.flow_px,
+        depth_prev=inputs.depth_prev,
+        depth_curr=inputs.depth_curr,
+        K_prev=inputs.K_prev,
+        K_curr=inputs.K_curr,
+    ).subsample(4)
+    assert targets.depth_prev.shape == (1, 8, 16)
+    options = LossOptions(
+        pose=False, pose_uncertainty=False, flow_uncertainty=False, depth_uncertainty=False
+    )
+    output = (targets.rotation_deg, targets.translation)
+    _, parts = total_loss(output, targets, options, T)
+    # float32 coordinates of 64 px: 4e-6 px
+    assert float(parts["flow"]) < 1e-4
+    assert float(parts["depth"]) < 1e-5
+    off = T.clone()
+    off[0, 0, 3] += 0.1
+    assert float(total_loss(output, targets, options, off)[1]["flow"]) > 0.1
+
+
+def pair(flow: np.ndarray | None, depth: np.ndarray | None) -> FramePair:
+    return FramePair(Frame(None, depth, CAMERA), Frame(None, depth, CAMERA), flow)
+
+
+@pytest.mark.parametrize("method", ["pwvo", "vonet"])
+def test_a_network_is_an_estimator(method):
+    kind = "pwvo" if method == "pwvo" else "vonet"
+    network = tiny(kind=kind, passes=2)
+    depth = scene()
+    flow = ego_flow(depth, MOTION, CAMERA, CAMERA).astype(np.float32)
+    result = estimate_learned(pair(flow, depth), method, network)
+    assert result.ok and result.method == method
+    assert np.linalg.eigvalsh(result.covariance)[0] > 0
+    R = result.T_curr_prev[:3, :3]
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+    with torch.inference_mode():
+        inputs = assemble_inputs(pair(flow, depth))
+        expected = chosen_motion(predict(network, inputs, chosen_motion))[0]
+    np.testing.assert_allclose(result.T_curr_prev, pose_matrix(expected[:3].numpy()), atol=1e-5)
+
+
+def test_missing_data_is_a_status():
+    network, depth = tiny(), scene()
+    flow = np.zeros((32, 64, 2), np.float32)
+    cases = {
+        Reason.NO_FLOW: pair(None, depth),
+        Reason.NO_VALID_DEPTH: pair(flow, None),
+    }
+    for reason, broken in cases.items():
+        result = estimate_learned(broken, "pwvo", network)
+        assert result.status.state is State.FAILED and result.status.reason is reason
+    empty = estimate_learned(pair(flow, np.full_like(depth, np.nan)), "pwvo", network)
+    assert empty.status.reason is Reason.NO_VALID_DEPTH
+
+
+def test_unknown_weights_are_named():
+    with pytest.raises(CheckpointError, match="unknown"):
+        shipped_network("no-such-network")
