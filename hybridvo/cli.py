@@ -133,6 +133,9 @@ def _add_evaluate(commands: Any) -> None:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
+    # One pair is too little work for several threads of torch, which wait for each other on a busy
+    # machine. Here, before torch is imported, and not in the library: threads are its user's.
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
     try:
         args = build_parser().parse_args(argv)
     except SystemExit as end:  # argparse: 0 after --help and --version, 2 for wrong usage

@@ -18,6 +18,7 @@ from hybridvo.run import EXIT_INTERRUPTED, RunResult, run
 __all__ = ["METHODS", "demo"]
 
 METHODS = {
+    "hybrid": "hybridvo (hybrid)",
     "refine": "hybridvo (refine)",
     "pnp-ransac": "OpenCV PnP-RANSAC",
     "pnp-ransac-tuned": "OpenCV PnP-RANSAC, tuned",
@@ -98,7 +99,7 @@ def demo(
     plot_trajectories(
         {METHODS[method]: result.trajectory for method, result in results.items()},
         picture,
-        truth=results["refine"].truth,
+        truth=results["hybrid"].truth,
         title=f"Rendered scene, {100 * moving:.0f} % of the pixels moving; flow: OpenCV DIS",
     )
     content: dict[str, Any] = {

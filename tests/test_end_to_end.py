@@ -329,11 +329,12 @@ def test_a_killed_run_and_a_signalled_run_lose_nothing(dataset: Path, tmp_path: 
         assert content(out) == content(whole)
 
 
-def test_demo_compares_four_methods(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_demo_compares_five_methods(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "demo"
     assert main(["demo", "--out", str(out), "--frames", "4", "-q", "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
-    ours, ransac, tuned, identity = report["rows"]
+    hybrid, ours, ransac, tuned, identity = report["rows"]
+    assert hybrid["ate_cm"] < ours["ate_cm"] and hybrid["epe_px"] < ours["epe_px"]
     assert ours["ate_cm"] < tuned["ate_cm"] and ours["epe_px"] < tuned["epe_px"]
     assert ours["ate_cm"] < ransac["ate_cm"] and ours["rotation_deg"] < identity["rotation_deg"]
     assert ours["epe_px"] < ransac["epe_px"] < identity["epe_px"]

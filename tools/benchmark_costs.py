@@ -184,6 +184,48 @@ def run_batch(
     }
 
 
+def run_network(name: str = "pwvo", sizes: tuple[int, ...] = BATCHES) -> dict[str, Any]:
+    """Milliseconds a pair of a shipped network at 128x256, all its passes, on the CPU."""
+    from functools import partial
+
+    import torch
+
+    from hybridvo.data.benchmark_pairs import make_pair
+    from hybridvo.learned import LEARNED, shipped_network
+    from hybridvo.network.inputs import assemble_inputs
+    from hybridvo.network.passes import predict
+    from hybridvo.pose.selection import chosen_motion
+
+    network = shipped_network(name)
+    choose = partial(chosen_motion, method=LEARNED[name])
+    pairs = [make_pair("moving30", seed, 128, 256)[0] for seed in range(max(sizes))]
+    rows = []
+    for size in sizes:
+        inputs = assemble_inputs(pairs[:size])
+        for precision, dtype in (("float32", torch.float32), ("bfloat16", torch.bfloat16)):
+            with (
+                torch.inference_mode(),
+                torch.autocast("cpu", dtype, enabled=precision == "bfloat16"),
+            ):
+                times = _timed(lambda inputs=inputs: predict(network, inputs, choose), 10)
+            rows.append(
+                {
+                    "batch": size,
+                    "precision": precision,
+                    "ms_per_pair": times["median_ms"] / size,
+                    "best_ms_per_pair": times["min_ms"] / size,
+                }
+            )
+    return {
+        "network": name,
+        "options": {k: getattr(network.options, k) for k in ("width", "input_stride", "passes")},
+        "shape": list(BATCH_SHAPE),
+        "device": "cpu",
+        "torch_threads": torch.get_num_threads(),
+        "rows": rows,
+    }
+
+
 def peak_memory(methods: dict[str, Callable[..., Any]], cell: str, seed: int) -> dict[str, Any]:
     """Extra memory of one call on a 436x1024 pair, MiB.
 

@@ -17,9 +17,14 @@ HEIGHT, WIDTH = 218, 512
 ORACLE = "refine-oracle-static-mask"
 """``refine`` told by the ground truth which pixels are static: what a perfect mask would give."""
 
+WITH_HYPOTHESES = ("refine", "hybrid-flow")
+
 
 def run_heavy(
-    sequences: int, seed0: int, progress: Callable[[str], None] = lambda line: None
+    sequences: int,
+    seed0: int,
+    progress: Callable[[str], None] = lambda line: None,
+    hybrid: bool = False,
 ) -> dict[str, Any]:
     """Every method on true and on DIS flow of the four heavy kinds, depth true.
 
@@ -27,11 +32,12 @@ def run_heavy(
         sequences: seeds of each kind, from ``seed0`` on.
         seed0: first seed.
         progress: called with a line after each kind.
+        hybrid: whether ``hybrid-flow`` takes part.
 
     Returns:
         ``summary[kind or total][flow][method]``, the conditions, and one record per answer.
     """
-    methods = heavy_methods()
+    methods = heavy_methods(hybrid)
     records = []
     for kind in KINDS:
         started = time.perf_counter()
@@ -61,8 +67,9 @@ def run_heavy(
     }
 
 
-def heavy_methods() -> dict[str, Callable[[Any, dict[str, Any]], Any]]:
+def heavy_methods(hybrid: bool = False) -> dict[str, Callable[[Any, dict[str, Any]], Any]]:
     """Methods of this part: called with a pair and, for the oracle alone, its truth."""
+    from hybridvo.hybrid import estimate
     from hybridvo.pose import baselines
     from hybridvo.pose.refinement import refine
 
@@ -71,6 +78,8 @@ def heavy_methods() -> dict[str, Callable[[Any, dict[str, Any]], Any]]:
         "refine": lambda pair, truth: refine(pair),
         ORACLE: lambda pair, truth: refine(pair, weights=truth["static"]),
     }
+    if hybrid:
+        methods["hybrid-flow"] = lambda pair, truth: estimate(pair, method="hybrid-flow")
     for name in ("pnp-ransac-tuned", "poselib"):
         if name in known:
             methods[name] = lambda pair, truth, estimator=known[name]: estimator(pair)
@@ -120,7 +129,7 @@ def judge_answer(result: Any, pair: Any, truth: dict[str, Any]) -> dict[str, Any
     error = epe(result.T_curr_prev, pair, truth)
     found = [epe(h.T_curr_prev, pair, truth) < FAILURE_PX for h in result.hypotheses]
     chosen = hit = None
-    if str(result.method) == "refine":
+    if str(result.method) in WITH_HYPOTHESES:
         answered = bool(result.ok) and error < FAILURE_PX
         chosen = answered or (bool(found) and found[0])
         hit = chosen or any(found)
@@ -155,7 +164,7 @@ def summarise_heavy(
                     "ms": quartiles([r["ms"] for r in rows]),
                     "failures": proportion(sum(is_failure(r) for r in rows), len(rows)),
                 }
-                if method == "refine":
+                if method in WITH_HYPOTHESES:
                     for key in ("hit", "chosen"):
                         entry[key] = proportion(sum(bool(r[key]) for r in rows), len(rows))
                 summary[kind][flow][method] = entry

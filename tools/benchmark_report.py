@@ -27,6 +27,8 @@ def markdown(result: dict[str, Any], cells: list[str], methods: list[str]) -> st
             lines += section(result[key])
     if result.get("batch"):
         lines += _batch(result["batch"])
+    if result.get("network"):
+        lines += _network(result["network"])
     lines += _memory(result["memory"])
     lines += ["## Versions", ""]
     lines += [f"- {name}: {value}" for name, value in result["versions"].items() if value]
@@ -205,6 +207,25 @@ def _batch(batch: dict[str, Any]) -> list[str]:
         lines.append(
             f"| {row['batch']} | {row['pairs_per_s']:.3g} | {row['best_pairs_per_s']:.3g} "
             f"| {row['epe_px_median']:.3f} | {row['failures']} |"
+        )
+    return [*lines, ""]
+
+
+def _network(network: dict[str, Any]) -> list[str]:
+    height, width = network["shape"]
+    options = network["options"]
+    lines = [
+        f"## Inference: {network['network']}, {width}x{height}, width {options['width']}, "
+        f"{options['passes']} passes, {network['device']}, "
+        f"{network['torch_threads']} torch threads",
+        "",
+        "| pairs a batch | precision | ms a pair (median) | best |",
+        "|---|---|---|---|",
+    ]
+    for row in network["rows"]:
+        lines.append(
+            f"| {row['batch']} | {row['precision']} | {row['ms_per_pair']:.3g} "
+            f"| {row['best_ms_per_pair']:.3g} |"
         )
     return [*lines, ""]
 

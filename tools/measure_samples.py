@@ -22,7 +22,7 @@ SEQUENCES = (
     "tum/redwood_livingroom_5",
     "tum/rgbd_dataset_freiburg1_xyz_first10",
 )
-METHODS = ("refine", "pnp-ransac-tuned", "pnp-ransac", "identity")
+METHODS = ("hybrid", "refine", "pnp-ransac-tuned", "pnp-ransac", "identity")
 ROUNDED = 7
 """Significant digits that are kept: float32 inputs carry no more."""
 

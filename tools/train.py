@@ -205,6 +205,8 @@ def _export(trainer: Any, arguments: argparse.Namespace, record: dict[str, Any])
         for name, preset in zip(options.data, trainer.mixture.presets, strict=True)
     }
     save_weights(path, network, options.network, card, "float16")
+    text = json.dumps(card, indent=1, sort_keys=True) + "\n"
+    path.with_suffix(".json").write_text(text, encoding="utf-8")
     sys.stdout.write(json.dumps({"file": str(path), "held_out": card["held_out"]}, indent=2) + "\n")
 
 
