@@ -83,7 +83,7 @@ def test_wrong_usage_is_exit_code_2(
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--method", "pwvo"], "needs network weights, which this version does not ship yet"),
+        (["--method", "pixelwise"], "needs network weights, which this version does not ship yet"),
         (["--method", "vonet"], "--method refine"),
         (["--method", "refin"], "did you mean 'refine'"),
         (["--flow", "raft"], "flow: expected auto, file, dis, got 'raft'"),

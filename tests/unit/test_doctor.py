@@ -12,8 +12,8 @@ def test_everything_is_here() -> None:
     report = doctor()
     assert report["usable"] and report["missing"] == {}
     assert report["warm_up_s"] > 0 and report["numba_cache"]["files"] >= 0
-    assert report["methods"]["refine"] == "" and "weights" in report["methods"]["pwvo"]
-    assert report["methods"]["hybrid"] == ""
+    assert report["methods"]["refine"] == "" and "weights" in report["methods"]["vonet"]
+    assert report["methods"]["hybrid"] == report["methods"]["pwvo"] == ""
     assert report["threads"]["numba"] >= 1 and "cpu" in report["devices"]
     text = doctor_text(report)
     assert "numpy" in text and text.endswith("ready\n")

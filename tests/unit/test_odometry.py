@@ -230,7 +230,7 @@ def test_a_frame_of_another_size_is_refused_and_changes_nothing() -> None:
         ({"policy": "guess"}, "hold or constant_velocity, got 'guess'"),
         ({"flow": 3}, "expected a callable"),
         ({"method": "refin"}, "did you mean 'refine'"),
-        ({"method": "pwvo"}, "needs network weights.*--method refine"),
+        ({"method": "pixelwise"}, "needs network weights.*--method refine"),
         ({"method": "hybrid", "network": None}, "needs a network"),
     ],
 )

@@ -39,7 +39,9 @@ def test_parameter_totals():
 @pytest.mark.parametrize("attention", [False, True])
 def test_any_size(size, attention):
     torch.manual_seed(0)
-    network = VONet(NetworkOptions(kind="vonet-attention" if attention else "vonet", width=0.125)).eval()
+    network = VONet(
+        NetworkOptions(kind="vonet-attention" if attention else "vonet", width=0.125)
+    ).eval()
     inputs = make_inputs(2, *size)
     with torch.inference_mode():
         together = network(inputs)
