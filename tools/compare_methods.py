@@ -6,13 +6,15 @@
 Every method sees the same pairs, with the flow of the files and OpenCV's DIS flow side by side.
 What is timed is the estimate from a ``FramePair`` on; the time of the flow stands beside it. Writes
 ``results.json``, ``results.csv``, ``pairs.csv``, ``report.md`` and ``report.html``, and beside them
-``trajectories/`` (TUM files) and ``worst/`` (pictures of the worst pairs). The work is kept as it
+``trajectories/`` (TUM files), ``worst/`` (pictures of the worst pairs) and ``figures/`` (maps of
+some of them). The work is kept as it
 is done: after an interruption ``--resume`` goes on.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from pathlib import Path
 
@@ -49,6 +51,13 @@ def build_parser() -> argparse.ArgumentParser:
         help="MPI Sintel as others score it: PWVO's 992 pairs, all 1041, or fourteen trajectories",
     )
     parser.add_argument("--worst", type=int, default=3, help="worst pairs shown for each method")
+    parser.add_argument(
+        "--maps",
+        type=int,
+        default=1,
+        metavar="N",
+        help="worst pairs of the first method whose maps the report shows; a few seconds each",
+    )
     parser.add_argument(
         "--jobs", type=int, default=1, metavar="N", help="sequences at a time, a process each"
     )
@@ -106,9 +115,37 @@ def main(argv: list[str] | None = None) -> int:
         return 130
     if written is None:
         return 130
-    for path in written:
+    written += draw_maps(args.out, args.maps, args.quiet)
+    for path in dict.fromkeys(written):
         print(path)
     return 0
+
+
+def draw_maps(out: Path, count: int, quiet: bool) -> list[Path]:
+    """Maps of the worst pairs of the first method, added to the report; a failure is one line."""
+    import visualize
+
+    from hybridvo.errors import HybridVOError
+
+    results = json.loads((out / "results.json").read_text(encoding="utf-8"))
+    paths = {row["name"]: row["path"] for row in results["sequences"]}
+    kinds = {row["name"]: row["kind"] for row in results["sequences"]}
+    worst = results["worst_pairs"] or []
+    pairs = [row for row in worst if row["method"] == worst[0]["method"]][:count]
+    written: list[Path] = []
+    for row in pairs:
+        name = row["sequence"]
+        command = ["--sequence", paths[name], "--dataset", kinds[name]]
+        command += ["--pair", str(row["index"]), "--method", row["method"], "--into", str(out)]
+        command += ["--flow", "dis" if row["flow_source"] == "dis" else "file", "--overwrite"]
+        if not quiet:
+            print(f"maps of {name}, pair {row['index']}", file=sys.stderr)
+        try:
+            arguments = visualize.build_parser().parse_args(command)
+            written += visualize.visualize(arguments, ["tools/visualize.py", *command])
+        except HybridVOError as error:
+            print(f"compare_methods.py: no maps of {name}: {error}", file=sys.stderr)
+    return written
 
 
 if __name__ == "__main__":

@@ -65,6 +65,34 @@ def sequence(tree: Path) -> str:
     return str(tree / "training" / "clean" / "tiny")
 
 
+@pytest.fixture(autouse=True)
+def no_maps(tool: ModuleType, monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[Path]]:
+    """Maps take seconds; one test draws them, with what this returns."""
+    draw = tool.draw_maps
+    monkeypatch.setattr(tool, "draw_maps", lambda *args: [])
+    return draw
+
+
+def test_maps_of_the_worst_pair_join_the_report(
+    tool: ModuleType,
+    no_maps: Callable[..., list[Path]],
+    sequence: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "tools"))
+    monkeypatch.setattr("visualize.networks", lambda paths: [])
+    out = tmp_path / "out"
+    options = ["--methods", FAST, "--flow", "file", "--stop", "3", "-q"]
+    assert tool.main(["--sequence", sequence, "--out", str(out), *options]) == 0
+    written = no_maps(out, 1, True)
+    worst = json.loads((out / "results.json").read_text())["worst_pairs"][0]
+    picture = out / "figures" / f"tiny_{worst['index']:06d}.png"
+    assert picture in written and picture.read_bytes()[:4] == b"\x89PNG"
+    assert f"tiny, pair {worst['index']}" in (out / "report.html").read_text(encoding="utf-8")
+    assert no_maps(out, 0, True) == []
+
+
 @pytest.fixture
 def no_report(monkeypatch: pytest.MonkeyPatch) -> None:
     """The pages have tests of their own."""
