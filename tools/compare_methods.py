@@ -7,8 +7,7 @@ Every method sees the same pairs, with the flow of the files and OpenCV's DIS fl
 What is timed is the estimate from a ``FramePair`` on; the time of the flow stands beside it. Writes
 ``results.json``, ``results.csv``, ``pairs.csv``, ``report.md`` and ``report.html``, and beside them
 ``trajectories/`` (TUM files), ``worst/`` (pictures of the worst pairs) and ``figures/`` (maps of
-some of them). The work is kept as it
-is done: after an interruption ``--resume`` goes on.
+some of them). The work is kept as it is done: after an interruption ``--resume`` goes on.
 """
 
 from __future__ import annotations
