@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from hybridvo.data.benchmark_pairs import Cell, make_pair
+from hybridvo.data.presets import build_options, read_yaml
 from hybridvo.errors import CheckpointError, InputError
 from hybridvo.geometry import ego_flow
 from hybridvo.hybrid import LearnedJudge, _judge_inputs, estimate
@@ -284,3 +285,10 @@ def test_the_card_beside_the_weights_is_theirs() -> None:
     assert json.loads(path.with_suffix(".json").read_text()) == card
     assert {"command", "commit", "pictures", "held_out", "options"} <= set(card)
     assert sum(p.numel() for p in network.parameters()) < 1_000_000
+
+
+def test_the_shipped_configuration_loads_and_is_the_shipped_network() -> None:
+    path = Path(__file__).parents[2] / "configs" / "train_judge.yaml"
+    options = build_options(JudgeTrainingOptions, read_yaml(path), str(path))
+    network, _ = load_weights(pretrained("judge"))
+    assert options.network == network.options
