@@ -15,8 +15,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import shlex
-import subprocess
 import sys
 import time
 from collections.abc import Sequence
@@ -78,6 +76,7 @@ def _run(args: argparse.Namespace, command: list[str]) -> int:
     from hybridvo.training.ablation import KeptSamples, plan, row_options
     from hybridvo.training.held_out import PUBLISHED_SEED
     from hybridvo.training.options import load_training_options
+    from hybridvo.training.provenance import source_commit
 
     lower = {"samples": 1, "count": 1, "threads": 1, "workers": 0, "keep_gb": 0}
     for name, least in lower.items():
@@ -107,7 +106,7 @@ def _run(args: argparse.Namespace, command: list[str]) -> int:
         "base": base_file.name,
         "samples": args.samples,
         "held_out": {"seed": seed, "count": args.count, "presets": list(presets)},
-        "commit": _commit(),
+        "commit": source_commit(),
         "torch": torch.__version__,
         "device": torch.cuda.get_device_name() if device == "cuda" else "cpu",
         "threads": torch.get_num_threads(),
@@ -228,21 +227,6 @@ def _write(
         file.write(markdown(result))
     plot(result, paths[2])
     return paths
-
-
-def _commit() -> str | None:
-    try:
-        done = subprocess.run(
-            shlex.split("git describe --always --dirty --abbrev=40 --exclude *"),
-            cwd=Path(__file__).resolve().parent,
-            capture_output=True,
-            text=True,
-            timeout=10,
-            check=True,
-        )
-    except (OSError, subprocess.SubprocessError):
-        return None
-    return done.stdout.strip() or None
 
 
 if __name__ == "__main__":

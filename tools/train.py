@@ -15,7 +15,6 @@ import math
 import os
 import shlex
 import signal
-import subprocess
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -84,6 +83,7 @@ def _train(arguments: argparse.Namespace, argv: list[str]) -> int:
     from hybridvo.errors import InputError, OutputError
     from hybridvo.training.loop import Trainer
     from hybridvo.training.options import load_training_options
+    from hybridvo.training.provenance import source_commit
 
     for name in ("threads", "time_limit"):
         value = getattr(arguments, name)
@@ -128,7 +128,7 @@ def _train(arguments: argparse.Namespace, argv: list[str]) -> int:
                 "command": command,
                 "options": dataclasses.asdict(options),
                 "data": [dataclasses.asdict(cast(Any, preset)) for preset in mixture.presets],
-                "commit": _commit(),
+                "commit": source_commit(),
                 "torch": torch.__version__,
             }
             (out / "options.json").write_text(json.dumps(record, indent=2), encoding="utf-8")
@@ -137,7 +137,7 @@ def _train(arguments: argparse.Namespace, argv: list[str]) -> int:
             why = trainer.run(math.inf if limit is None else 60 * limit)
         _say(trainer.rank, f"ended by {why} at update {trainer.step}, {trainer.samples} samples")
     if arguments.export is not None and trainer.rank == 0:
-        _export(trainer, arguments, _record(out, {"command": command, "commit": _commit()}))
+        _export(trainer, arguments, _record(out, {"command": command, "commit": source_commit()}))
     return 0
 
 
@@ -227,23 +227,6 @@ def _report(entry: dict[str, Any]) -> None:
 def _say(rank: int, text: str) -> None:
     if rank == 0:
         sys.stderr.write(text + "\n")
-
-
-def _commit() -> str | None:
-    """Commit of the working tree, with a mark if it was changed; None outside of a repository."""
-    here = Path(__file__).resolve().parent
-    try:
-        done = subprocess.run(
-            ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude", "*"],
-            cwd=here,
-            capture_output=True,
-            text=True,
-            timeout=10,
-            check=True,
-        )
-    except (OSError, subprocess.SubprocessError):
-        return None
-    return done.stdout.strip() or None
 
 
 if __name__ == "__main__":

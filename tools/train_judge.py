@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import json
 import shlex
-import subprocess
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -98,6 +97,7 @@ def _export(arguments: argparse.Namespace) -> int:
     from hybridvo.errors import InputError
     from hybridvo.network.weights import save_weights
     from hybridvo.training.judge_evaluation import evaluate_judge
+    from hybridvo.training.provenance import source_commit
 
     trainer = _trainer(arguments, arguments.held_out)
     if not trainer.resume():
@@ -114,7 +114,7 @@ def _export(arguments: argparse.Namespace) -> int:
         "updates": trainer.step,
         "pictures": trainer.pictures,
         "minutes": round(trainer.elapsed, 1),
-        "commit": _commit(),
+        "commit": source_commit(),
         "command": "python tools/train_judge.py train " + shlex.join(_portable(trainer)),
         "held_out": evaluate_judge(network, files),
         "licence": "the package's own",
@@ -131,16 +131,6 @@ def _export(arguments: argparse.Namespace) -> int:
 def _portable(trainer) -> list[str]:
     minutes = f"{trainer.elapsed:.0f}"
     return ["--data", "DIR", "--out", "runs/judge", "--time-limit", minutes]
-
-
-def _commit() -> str:
-    try:
-        done = subprocess.run(
-            ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, cwd=ROOT
-        )
-    except OSError:
-        return ""
-    return done.stdout.strip()
 
 
 if __name__ == "__main__":
