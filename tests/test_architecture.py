@@ -51,6 +51,11 @@ IMPORTS: dict[str, set[str]] = {
         *("__init__", "errors", "types", "geometry", "data", "flow", "hybrid", "trajectory"),
         *("evaluation", "configuration", "console", "run_folder", "run_results", "run"),
     },
+    # figures of one pair: tools/visualize.py, and the report of a comparison
+    "visualization": {
+        *("errors", "types", "geometry", "data", "network", "pose", "hybrid", "trajectory"),
+        *("evaluation", "configuration", "run"),
+    },
     # what stands at the door
     "demo": {"errors", "data", "evaluation", "configuration", "run"},
     "doctor": {"__init__", "errors", "hybrid"},

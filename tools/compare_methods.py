@@ -122,9 +122,8 @@ def main(argv: list[str] | None = None) -> int:
 
 def draw_maps(out: Path, count: int, quiet: bool) -> list[Path]:
     """Maps of the worst pairs of the first method, added to the report; a failure is one line."""
-    import visualize
-
     from hybridvo.errors import HybridVOError
+    from hybridvo.visualization import PictureOptions, visualize
 
     results = json.loads((out / "results.json").read_text(encoding="utf-8"))
     paths = {row["name"]: row["path"] for row in results["sequences"]}
@@ -134,14 +133,23 @@ def draw_maps(out: Path, count: int, quiet: bool) -> list[Path]:
     written: list[Path] = []
     for row in pairs:
         name = row["sequence"]
-        command = ["--sequence", paths[name], "--dataset", kinds[name]]
+        flow = "dis" if row["flow_source"] == "dis" else "file"
+        options = PictureOptions(
+            sequence=paths[name],
+            pair=row["index"],
+            dataset=kinds[name],
+            flow=flow,
+            method=row["method"],
+            into=out,
+            overwrite=True,
+        )
+        command = ["tools/visualize.py", "--sequence", paths[name], "--dataset", kinds[name]]
         command += ["--pair", str(row["index"]), "--method", row["method"], "--into", str(out)]
-        command += ["--flow", "dis" if row["flow_source"] == "dis" else "file", "--overwrite"]
+        command += ["--flow", flow, "--overwrite"]
         if not quiet:
             print(f"maps of {name}, pair {row['index']}", file=sys.stderr)
         try:
-            arguments = visualize.build_parser().parse_args(command)
-            written += visualize.visualize(arguments, ["tools/visualize.py", *command])
+            written += visualize(options, command)
         except HybridVOError as error:
             print(f"compare_methods.py: no maps of {name}: {error}", file=sys.stderr)
     return written

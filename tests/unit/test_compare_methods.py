@@ -80,8 +80,7 @@ def test_maps_of_the_worst_pair_join_the_report(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "tools"))
-    monkeypatch.setattr("visualize.networks", lambda paths: [])
+    monkeypatch.setattr("hybridvo.visualization.networks", lambda paths: [])
     out = tmp_path / "out"
     options = ["--methods", FAST, "--flow", "file", "--stop", "3", "-q"]
     assert tool.main(["--sequence", sequence, "--out", str(out), *options]) == 0

@@ -31,6 +31,7 @@ from hybridvo.network.inputs import assemble_inputs
 from hybridvo.network.pwvo import NetworkOptions, build_network
 from hybridvo.network.weights import save_weights
 from hybridvo.types import FramePair, PixelwisePrediction
+from hybridvo.visualization import networks, saliencies, start_of
 
 
 @pytest.fixture(scope="module")
@@ -201,12 +202,12 @@ OPTIONS = (
 @pytest.mark.parametrize(
     "options", OPTIONS, ids=["pwvo", "pixelwise", "vonet", "attention", "scale-free"]
 )
-def test_the_saliency_is_complete(tool: ModuleType, known, options: NetworkOptions) -> None:
+def test_the_saliency_is_complete(known, options: NetworkOptions) -> None:
     pair, _ = known
     torch.manual_seed(0)
     network = build_network(options).eval()
     inputs = assemble_inputs(pair, (64, 128))
-    found = tool.saliencies(network, inputs, tool.start_of(network, inputs), steps=16)
+    found = saliencies(network, inputs, start_of(network, inputs), steps=16)
     assert list(found) == ["rotation", "translation"]
     for saliency in found.values():
         assert saliency.magnitude.shape == (64, 128)
@@ -316,7 +317,7 @@ def test_networks_that_predict_no_motion_are_refused(tool, tmp_path: Path) -> No
     options = JudgeOptions()
     path = save_weights(tmp_path / "judge.safetensors", JudgeNetwork(options), options, {})
     with pytest.raises(InputError, match="got a judge"):
-        tool.networks([path])
+        networks([path])
 
 
 def test_bad_targets(tool, folder: Path, tmp_path: Path, capsys) -> None:
