@@ -6,7 +6,7 @@ refinement and, for each network, uncertainty, error and saliency maps (paper, f
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -172,7 +172,9 @@ def parts(
 
     factored = factor_flow(pair, motion.T_curr_prev)
     truth_known = T_true is not None and flow_true is not None
-    real = factor_flow(replace(pair, flow=flow_true), T_true) if truth_known else factored
+    real = factored
+    if T_true is not None and flow_true is not None:
+        real = factor_flow(replace(pair, flow=flow_true), T_true)
     moving = moving_pixels(real.objects)
     whose = "true flow and motion" if truth_known else "this flow and the estimate"
     # one scale for all three: the parts are to be seen beside the whole
@@ -210,7 +212,7 @@ def networks(files: Sequence[Path]) -> list[tuple[str, Any]]:
 
     found = []
     for path in files or [pretrained(name) for name in pretrained_names()]:
-        network = load_weights(path)[0]
+        network: Any = load_weights(path)[0]
         kind = network.options.kind
         if kind in KINDS:
             found.append((path.stem, network))
@@ -317,14 +319,19 @@ def saliencies(
             direction = (motion / motion.norm().clamp(min=1e-12)).detach()
             (weights,) = torch.autograd.grad((direction * motion).sum(), maps[what])
 
-            def answer(*tensors: Any, what: str = what, weights: Any = weights) -> Any:
-                return (weights * getattr(run(*tensors), what)).sum()
+            answer = weighted_map(run, what, weights)
         else:
             motion = output[k]
-            direction = motion / motion.norm().clamp(min=1e-12)
-
-            def answer(*tensors: Any, k: int = k, direction: Any = direction) -> Any:
-                return (direction * run(*tensors)[k]).sum()
-
+            answer = along(run, k, motion / motion.norm().clamp(min=1e-12))
         found[what] = integrated_gradients(answer, given, steps=steps)
     return found
+
+
+def weighted_map(run: Callable[..., Any], name: str, weights: Any) -> Callable[..., Any]:
+    """Sum of a pixel-wise map under fixed weights, as a function of the inputs."""
+    return lambda *tensors: (weights * getattr(run(*tensors), name)).sum()
+
+
+def along(run: Callable[..., Any], part: int, direction: Any) -> Callable[..., Any]:
+    """Length of one part of a motion along a fixed direction, as a function of the inputs."""
+    return lambda *tensors: (direction * run(*tensors)[part]).sum()
