@@ -8,13 +8,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hybridvo.errors import CheckpointError
+from hybridvo.errors import CheckpointError, InputError
 from hybridvo.types import FramePair, Reason, RelativePose, Status
 
 if TYPE_CHECKING:
     import torch
 
-__all__ = ["LEARNED", "estimate_learned", "shipped_network"]
+    from hybridvo.network.inputs import NetworkInputs
+    from hybridvo.network.losses import NetworkOutput
+    from hybridvo.network.passes import Chooser
+
+__all__ = ["LEARNED", "estimate_learned", "fitted_motion", "next_start", "shipped_network"]
 
 LEARNED = {
     "pwvo": "softmax",
@@ -54,6 +58,61 @@ def shipped_network(name: str) -> torch.nn.Module:
     if not hasattr(getattr(network, "options", None), "passes"):
         raise CheckpointError(f"{path}: expected the weights of {name}, got another network's.")
     return network.eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+
+
+def next_start(network: torch.nn.Module, selection: str = "softmax") -> Chooser:
+    """What the next pass of a network starts from, as its options name it.
+
+    Args:
+        network: of ``build_network`` or ``load_weights``.
+        selection: how one pose is selected from the pixels.
+    """
+    from hybridvo.pose.selection import chosen_motion
+
+    options = getattr(network, "options", None)
+    if options is not None and options.pass_start == "fit":
+        return lambda output, inputs: fitted_motion(output, inputs, selection)
+    return lambda output, inputs: chosen_motion(output, selection)
+
+
+def fitted_motion(
+    output: NetworkOutput, inputs: NetworkInputs, selection: str = "softmax"
+) -> torch.Tensor:
+    """(B, 4, 4) motion that the pixels agree on which a prediction trusts.
+
+    The selected pose is the start, the log scales of the rotation are the weights, and carry the
+    gradient; see :func:`hybridvo.pose.weighted_fit.weighted_fit`.
+
+    Args:
+        output: a :class:`~hybridvo.types.PixelwisePrediction` with log scales.
+        inputs: that it was made from.
+        selection: of the start.
+    """
+    import torch.nn.functional as F
+
+    from hybridvo.pose.selection import chosen_motion
+    from hybridvo.pose.weighted_fit import pixel_weights, weighted_fit
+    from hybridvo.types import PixelwisePrediction
+
+    if not isinstance(output, PixelwisePrediction) or output.log_scale_rotation is None:
+        raise InputError("fitted_motion: expected a prediction with uncertainty.")
+    log_scale = output.log_scale_rotation
+    inputs = inputs.subsample(max(1, round(inputs.size[0] / log_scale.shape[2])))
+    if tuple(log_scale.shape[2:]) != inputs.size:
+        log_scale = F.interpolate(log_scale, inputs.size, mode="nearest")
+    flow = inputs.flow_px
+    f_prev, f_curr = (
+        K.diagonal(dim1=1, dim2=2)[:, :2, None, None] for K in (inputs.K_prev, inputs.K_curr)
+    )
+    c_prev, c_curr = (K[:, :2, 2, None, None] for K in (inputs.K_prev, inputs.K_curr))
+    target = (inputs.rays * f_prev + c_prev + flow - c_curr) / f_curr
+    return weighted_fit(
+        inputs.rays.flatten(2),
+        inputs.inverse_depth[:, 0].flatten(1),
+        target.flatten(2),
+        pixel_weights(log_scale, inputs.valid).flatten(1),
+        chosen_motion(output, selection),
+    )
 
 
 def estimate_learned(
@@ -96,7 +155,7 @@ def estimate_learned(
                 f"{seen} pixels of the network's input have flow and depth, {LEAST_PIXELS} needed",
                 method,
             )
-        output = predict(network, inputs, lambda x: chosen_motion(x, how))
+        output = predict(network, inputs, next_start(network, how))
         rotation, translation = (x.double() for x in chosen_pose(output, how))
         T = chosen_motion((rotation, translation), how)[0].numpy()
         scales = torch.tensor([[UNKNOWN_M] * 3 + [UNKNOWN_DEG] * 3], dtype=torch.float64)

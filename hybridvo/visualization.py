@@ -279,11 +279,12 @@ def chosen(output: Any) -> tuple[Any, Any]:
 
 def start_of(network: Any, inputs: Any) -> Any:
     """Motion that a network of several passes starts its last one from; None for one pass."""
+    from hybridvo.learned import next_start
     from hybridvo.network.passes import first_motions
-    from hybridvo.pose.selection import selected_transform
 
     passes = int(network.options.passes)
-    return first_motions(network, inputs, lambda out: selected_transform(*chosen(out)), passes - 1)
+    how = "softmax" if getattr(network.options, "uncertainty", False) else "mean"
+    return first_motions(network, inputs, next_start(network, how), passes - 1)
 
 
 def saliencies(

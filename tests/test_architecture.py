@@ -33,7 +33,7 @@ IMPORTS: dict[str, set[str]] = {
     "hybrid": CLASSICAL | {"network", "learned"},
     "odometry": CLASSICAL | {"flow", "hybrid", "trajectory"},
     "evaluation": NOUNS | {"geometry", "trajectory"},
-    "training": CLASSICAL | {"data", "flow", "network", "hybrid"},
+    "training": CLASSICAL | {"data", "flow", "network", "learned", "hybrid"},
     # one run of `hybridvo run`: what it writes, how it is set, and the loop around the tracker
     "console": {"errors"},
     "run_folder": {"errors", "evaluation"},
@@ -53,8 +53,8 @@ IMPORTS: dict[str, set[str]] = {
     },
     # figures of one pair: tools/visualize.py, and the report of a comparison
     "visualization": {
-        *("errors", "types", "geometry", "data", "network", "pose", "hybrid", "trajectory"),
-        *("evaluation", "configuration", "run"),
+        *("errors", "types", "geometry", "data", "network", "pose", "learned", "hybrid"),
+        *("trajectory", "evaluation", "configuration", "run"),
     },
     # what stands at the door
     "demo": {"errors", "data", "evaluation", "configuration", "run"},

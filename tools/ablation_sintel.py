@@ -102,6 +102,7 @@ def _score(
 
     from hybridvo.comparison.job import true_motion
     from hybridvo.evaluation.pairs import pair_errors
+    from hybridvo.learned import next_start
     from hybridvo.network.inputs import assemble_inputs
     from hybridvo.network.passes import predict
     from hybridvo.pose.selection import chosen_motion
@@ -109,13 +110,10 @@ def _score(
     inputs = assemble_inputs(pairs)
     truth = [true_motion(sequence, pair.prev.index, pair.curr.index) for pair in pairs]
     for name, (network, selection) in networks.items():
-
-        def choose(output: Any, selection: str = selection) -> Any:
-            return chosen_motion(output, selection)
-
         with torch.inference_mode():
             given = inputs.to(next(network.parameters()).device)
-            motions = choose(predict(network, given, choose)).double().cpu().numpy()
+            output = predict(network, given, next_start(network, selection))
+            motions = chosen_motion(output, selection).double().cpu().numpy()
         for pair, T_true, T in zip(pairs, truth, motions, strict=True):
             if T_true is None:
                 continue

@@ -186,18 +186,15 @@ def run_batch(
 
 def run_network(name: str = "pwvo", sizes: tuple[int, ...] = BATCHES) -> dict[str, Any]:
     """Milliseconds a pair of a shipped network at 128x256, all its passes, on the CPU."""
-    from functools import partial
-
     import torch
 
     from hybridvo.data.benchmark_pairs import make_pair
-    from hybridvo.learned import LEARNED, shipped_network
+    from hybridvo.learned import LEARNED, next_start, shipped_network
     from hybridvo.network.inputs import assemble_inputs
     from hybridvo.network.passes import predict
-    from hybridvo.pose.selection import chosen_motion
 
     network = shipped_network(name)
-    choose = partial(chosen_motion, method=LEARNED[name])
+    choose = next_start(network, LEARNED[name])
     pairs = [make_pair("moving30", seed, 128, 256)[0] for seed in range(max(sizes))]
     rows = []
     for size in sizes:

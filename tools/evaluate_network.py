@@ -84,8 +84,8 @@ def reliability(network: Any, seed: int, count: int) -> dict[str, Any]:
     import torch.nn.functional as F
 
     from hybridvo.data.wide import WideOptions
+    from hybridvo.learned import next_start
     from hybridvo.network.passes import predict
-    from hybridvo.pose.selection import chosen_motion
     from hybridvo.training.held_out import area_under_curve
     from hybridvo.training.stream import collate, sample_generator
 
@@ -96,7 +96,7 @@ def reliability(network: Any, seed: int, count: int) -> dict[str, Any]:
     for index in range(count):
         batch = collate([preset.sample(sample_generator(seed, index))])
         with torch.inference_mode():
-            output = predict(network, batch.inputs, chosen_motion)
+            output = predict(network, batch.inputs, next_start(network))
         valid = batch.inputs.valid[0, ::PIXEL_STRIDE, ::PIXEL_STRIDE].numpy()
         moving.append(batch.moving[0, ::PIXEL_STRIDE, ::PIXEL_STRIDE].numpy()[valid])
         for name, value, scale, target in (

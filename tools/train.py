@@ -51,6 +51,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     add("--threads", type=int, help="threads of torch; by default torch's own choice")
     add("--workers", type=int, default=0, help="processes that draw samples (0: this one)")
     add("--device", default="auto", help="auto, cpu or cuda")
+    add("--init", type=Path, metavar="FILE", help="start from these weights, of the same shapes")
     add("--overwrite", action="store_true", help="start anew although --out has a checkpoint")
     add("--export", type=Path, metavar="FILE", help="write weights for users when done (float16)")
     add("--export-count", type=int, default=1000, help="held-out pairs of each preset in the card")
@@ -119,6 +120,9 @@ def _train(arguments: argparse.Namespace, argv: list[str]) -> int:
     if checkpoint.exists() and not arguments.overwrite:
         trainer.resume(checkpoint)
         _say(trainer.rank, f"resumed {checkpoint} at update {trainer.step}")
+    elif arguments.init is not None:
+        trainer.start_from(arguments.init)
+        _say(trainer.rank, f"started from the weights of {arguments.init}")
     elif arguments.no_train:
         raise InputError(f"{checkpoint}: --no-train needs the checkpoint of a run.")
     command = "python tools/train.py " + shlex.join(argv)

@@ -10,6 +10,7 @@ from hybridvo.errors import InputError
 __all__ = ["KINDS", "NetworkOptions"]
 
 KINDS = ("pwvo", "vonet", "vonet-attention")
+PASS_STARTS = ("selection", "fit")
 
 PATCH = 32
 """Side of the paper's selection patches in pixels of the network's input."""
@@ -35,6 +36,12 @@ class NetworkOptions:
             :mod:`hybridvo.network.scale_free`. Off as published.
         passes: how often a scale-free network is used, each time on what the motion found before
             leaves unexplained.
+        pass_start: what a later pass starts from: ``selection`` = the pose that the selection
+            makes of the pass before, ``fit`` = the motion that its trusted pixels agree on, see
+            :func:`hybridvo.pose.weighted_fit.weighted_fit`.
+        later_quantile: quantile of the lengths of the unexplained flow that scales the inputs of a
+            later pass, in (0, 0.5]; 0.4 in the first one. After a good start what is left of the
+            world is short and the flow of movers long, whatever their share.
         input_stride: 1, 2 or 4; the network reads every n-th pixel of its inputs.
 
     Raises:
@@ -50,6 +57,8 @@ class NetworkOptions:
     scale_free: bool = False
     passes: int = 1
     input_stride: int = 1
+    pass_start: str = "selection"
+    later_quantile: float = 0.4
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
@@ -79,6 +88,20 @@ class NetworkOptions:
             value = getattr(self, name)
             if not isinstance(value, bool):
                 raise InputError(f"NetworkOptions.{name}: expected a bool, got {value!r}.")
+        if self.pass_start not in PASS_STARTS:
+            raise InputError(
+                f"NetworkOptions.pass_start: expected {' or '.join(PASS_STARTS)}, got "
+                f"{self.pass_start!r}."
+            )
+        quantile = self.later_quantile
+        if not isinstance(quantile, int | float) or not 0 < quantile <= 0.5:
+            raise InputError(
+                f"NetworkOptions.later_quantile: expected a number in (0, 0.5], got {quantile!r}."
+            )
+        if self.pass_start == "fit" and (self.kind != "pwvo" or not self.uncertainty):
+            raise InputError(
+                "NetworkOptions: pass_start='fit' needs the uncertainty of kind='pwvo'."
+            )
         if self.passes > 1 and not self.scale_free:
             raise InputError("NetworkOptions: passes above 1 need scale_free=True.")
         if self.decoders == 2 and not self.uncertainty:

@@ -10,10 +10,11 @@ from torch import nn
 from hybridvo.network.inputs import NetworkInputs
 from hybridvo.network.losses import NetworkOutput
 
-__all__ = ["first_motions", "predict"]
+__all__ = ["Chooser", "first_motions", "predict"]
 
-Chooser = Callable[[NetworkOutput], torch.Tensor]
-"""From a network's output to its motion T_curr_prev (B, 4, 4): ``hybridvo.pose.selection``."""
+Chooser = Callable[[NetworkOutput, NetworkInputs], torch.Tensor]
+"""From a network's output and what it read to the motion T_curr_prev (B, 4, 4) that the next pass
+starts from: :func:`hybridvo.learned.next_start`."""
 
 
 def predict(
@@ -24,7 +25,7 @@ def predict(
     Args:
         network: of ``build_network``.
         inputs: of size (h, w).
-        choose: how one motion comes out of an output; the next pass starts there.
+        choose: how one motion comes out of a pass; the next one starts there.
         passes: their number; by default the one that the network's options name.
     """
     if passes is None:
@@ -41,5 +42,5 @@ def first_motions(
     T = None
     with torch.no_grad():
         for _ in range(passes):
-            T = choose(network(inputs) if T is None else network(inputs, T))
+            T = choose(network(inputs) if T is None else network(inputs, T), inputs)
     return T

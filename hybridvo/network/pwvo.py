@@ -139,7 +139,7 @@ class PWVO(nn.Module):
         scale = None
         inputs = inputs.subsample(options.input_stride)
         if options.scale_free:
-            inputs, scale = remove_scale(inputs, T_start)
+            inputs, scale = remove_scale(inputs, T_start, options.later_quantile)
         x = self.branches(inputs)
         features = self.encoder(x)
         dtype = next(self.parameters()).dtype

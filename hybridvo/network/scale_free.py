@@ -64,13 +64,15 @@ def euler_deg(R: torch.Tensor) -> torch.Tensor:
 
 
 def remove_scale(
-    inputs: NetworkInputs, T_start: torch.Tensor | None = None
+    inputs: NetworkInputs, T_start: torch.Tensor | None = None, later_quantile: float = QUANTILE
 ) -> tuple[NetworkInputs, MotionScale]:
     """Take a first motion out of a batch's inputs and divide them by the scales of each pair.
 
     Args:
         inputs: of size (h, w).
         T_start: (B, 4, 4) T_curr_prev of the first motion; none by default.
+        later_quantile: of the lengths of the flow that sets the scale of the pairs whose first
+            motion is not the identity.
 
     Returns:
         Inputs whose ``flow`` is what the flow leaves unexplained, over the focal length and over
@@ -87,9 +89,11 @@ def remove_scale(
     safe = torch.where(both, inverse, torch.ones_like(inverse))
     start = torch.zeros(len(inputs), 6, dtype=flow.dtype, device=flow.device)
     change = safe[:, :1].log() - safe[:, 1:].log()
+    quantile = torch.full((len(inputs), 1), QUANTILE, dtype=flow.dtype, device=flow.device)
     if T_start is not None:
         T_start = T_start.to(flow.dtype)
         start = torch.cat([euler_deg(T_start[:, :3, :3]), T_start[:, :3, 3]], dim=1)
+        quantile = torch.where((start != 0).any(dim=1, keepdim=True), later_quantile, quantile)
         ego, log_ratio = _ego_motion(inputs, inverse[:, 0], T_start)
         # No flow was measured where it is exactly zero in both components and the pixel is invalid.
         seen = inputs.valid[:, None] | (flow != 0).any(dim=1, keepdim=True)
@@ -98,8 +102,13 @@ def remove_scale(
     change = torch.where(both, change, torch.zeros_like(change))
     angle = flow / focal
     length = (angle.square().sum(dim=1) + 1e-20).sqrt()
-    motion = _quantile(length, inputs.valid, QUANTILE, 1.0).clamp(SMALLEST_MOTION, 1.0)
-    nearness = _quantile(inverse[:, 0], inputs.valid & (inverse[:, 0] > 0), NEAR_QUANTILE, 1.0)
+    motion = _quantile(length, inputs.valid, quantile, 1.0).clamp(SMALLEST_MOTION, 1.0)
+    nearness = _quantile(
+        inverse[:, 0],
+        inputs.valid & (inverse[:, 0] > 0),
+        torch.full_like(quantile, NEAR_QUANTILE),
+        1.0,
+    )
     nearness = nearness.clamp(FARTHEST**-1, 1e3)
     m = motion[:, None, None, None]
     depth = torch.cat(
@@ -138,8 +147,18 @@ def _squash(x: torch.Tensor) -> torch.Tensor:
     return x / (1 + x.abs() / LIMIT)
 
 
-def _quantile(x: torch.Tensor, mask: torch.Tensor, q: float, fallback: float) -> torch.Tensor:
-    """(B,) quantile of a (B, h, w) map over a mask; ``fallback`` where the mask is empty."""
+def _quantile(
+    x: torch.Tensor, mask: torch.Tensor, q: torch.Tensor, fallback: float
+) -> torch.Tensor:
+    """(B,) quantile (B, 1) of a (B, h, w) map over a mask; ``fallback`` where that is empty."""
     pick = (..., slice(None, None, 2), slice(None, None, 2))  # enough for a scale
     kept = torch.where(mask, x, torch.full_like(x, torch.nan))[pick].flatten(1)
-    return torch.nan_to_num(kept.nanquantile(q, dim=1), fallback, fallback, fallback)
+    # NaN sort to the end; linear between neighbours as in numpy
+    ordered = kept.sort(dim=1).values
+    count = (~kept.isnan()).sum(dim=1, keepdim=True)
+    place = q * (count - 1).clamp(min=0)
+    low = place.floor().long()
+    high = torch.minimum(low + 1, (count - 1).clamp(min=0))
+    a, b = ordered.gather(1, low), ordered.gather(1, high)
+    value = (a + (place - low) * (b - a))[:, 0]
+    return torch.nan_to_num(value, fallback, fallback, fallback)

@@ -70,7 +70,7 @@ class VONet(nn.Module):
         scale = None
         inputs = inputs.subsample(self.options.input_stride)
         if self.options.scale_free:
-            inputs, scale = remove_scale(inputs, T_start)
+            inputs, scale = remove_scale(inputs, T_start, self.options.later_quantile)
         embedding = self.attention(self.encoder(self.branches(inputs))[-1])
         if embedding.shape[2:] != FEATURE_GRID:
             embedding = F.adaptive_avg_pool2d(embedding, FEATURE_GRID)

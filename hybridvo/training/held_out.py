@@ -6,7 +6,6 @@ either.
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,9 +14,10 @@ import torch.nn.functional as F
 from scipy.stats import rankdata
 
 from hybridvo.errors import InputError
+from hybridvo.learned import next_start
 from hybridvo.network.losses import NetworkOutput, reconstruct
 from hybridvo.network.passes import predict
-from hybridvo.pose.selection import chosen_motion, chosen_pose, selected_transform
+from hybridvo.pose.selection import chosen_pose, selected_transform
 from hybridvo.training.stream import Preset, TrainingBatch, collate, sample_generator
 from hybridvo.types import PixelwisePrediction
 
@@ -99,7 +99,7 @@ def evaluate_network(
                 torch.inference_mode(),
                 torch.autocast(device.type, torch.bfloat16, enabled=precision == "bfloat16"),
             ):
-                output = predict(network, batch.inputs, partial(chosen_motion, method=selection))
+                output = predict(network, batch.inputs, next_start(network, selection))
             with torch.inference_mode():
                 errors.append(_errors(output, batch, selection))
                 if (

@@ -22,9 +22,11 @@ from torch import nn
 from torch.nn.parallel import DistributedDataParallel
 
 from hybridvo.errors import CheckpointError, DegenerateError
-from hybridvo.network.losses import NetworkOutput, total_loss
+from hybridvo.learned import fitted_motion, next_start
+from hybridvo.network.losses import NetworkOutput, reconstruct, total_loss
 from hybridvo.network.passes import first_motions
 from hybridvo.network.pwvo import build_network
+from hybridvo.network.weights import load_weights
 from hybridvo.pose.selection import chosen_motion
 from hybridvo.training.checkpoint import load_checkpoint, save_checkpoint
 from hybridvo.training.held_out import evaluate_network
@@ -36,6 +38,9 @@ __all__ = ["Trainer", "training_loss"]
 
 MAX_SKIPPED_IN_A_ROW = 50
 """Updates with a loss or gradient that is not finite, after which a run gives up."""
+
+FIT_FLOOR_PX = 0.05
+"""Pixels of the inputs."""
 
 SEPARATION_SLOPE = 4.0
 """Logits per unit of s."""
@@ -63,11 +68,32 @@ def training_loss(
             term = 0.5 * (error * (-s.clamp(min=-11.5)).exp() + s.clamp(min=-11.5)).mean()
         loss = loss + options.loss.translation_weight * term
         parts = {**parts, "translation": term.detach()}
+    if options.fit_weight and isinstance(output, PixelwisePrediction):
+        term = _fit_loss(output, batch, options)
+        loss = loss + options.fit_weight * term
+        parts = {**parts, "fit": term.detach()}
     if options.moving_weight and isinstance(output, PixelwisePrediction):
         term = _separation(output, batch.moving)
         loss = loss + options.moving_weight * term
         parts = {**parts, "moving": term.detach()}
     return loss, parts
+
+
+def _fit_loss(
+    output: PixelwisePrediction, batch: TrainingBatch, options: TrainingOptions
+) -> torch.Tensor:
+    """Log of the error of the ego flow that the fit to the trusted pixels gives, mean over pairs.
+
+    The gradient goes through the fit into s. The logarithm lets pairs that are far off and pairs
+    that are nearly right learn alike; below ``FIT_FLOOR_PX`` the noise of the inputs decides.
+    """
+    T = fitted_motion(output, batch.inputs, options.selection)
+    truth = batch.targets.subsample(options.loss_stride)
+    flow, _, defined = reconstruct(truth.depth_prev, T, truth.K_prev, truth.K_curr)
+    defined = defined & torch.isfinite(truth.ego_flow).all(dim=1)
+    error = torch.where(defined[:, None], flow - truth.ego_flow, 0.0).abs().sum(1).clamp(max=100.0)
+    error = options.loss_stride * error.flatten(1).sum(1) / defined.flatten(1).sum(1).clamp(min=1)
+    return torch.log1p(error / FIT_FLOOR_PX).mean()
 
 
 def _separation(output: PixelwisePrediction, moving: torch.Tensor) -> torch.Tensor:
@@ -223,7 +249,7 @@ class Trainer:
         made = first_motions(
             self.network,
             batch.inputs[first:],
-            lambda output: chosen_motion(output, self.options.selection),
+            next_start(self.network, self.options.selection),
             1 + self.step % (passes - 1),
         )
         assert made is not None
@@ -364,6 +390,20 @@ class Trainer:
         """Write ``checkpoint.pt``."""
         if self.folder is not None and self.rank == 0:
             save_checkpoint(self.folder / "checkpoint.pt", self.state())
+
+    def start_from(self, path: str | Path) -> None:
+        """Take the weights of another network of the same shapes; everything else starts anew.
+
+        Raises:
+            CheckpointError: a damaged file, or weights of other shapes.
+        """
+        network, _ = load_weights(path)
+        try:
+            self.network.load_state_dict(network.state_dict())
+            if self.ema is not None:
+                self.ema.load_state_dict(network.state_dict())
+        except RuntimeError as error:
+            raise CheckpointError(f"{path}: does not fit this network: {error}") from error
 
     def resume(self, path: str | Path) -> None:
         """Go on where a checkpoint ended.

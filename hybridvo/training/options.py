@@ -103,6 +103,9 @@ class TrainingOptions:
         moving_weight: weight of a term that the paper does not have: s should be larger on moving
             pixels than on static ones of the same pair. 0 = none, as in the paper, whose s need
             not tell the two apart once every pixel knows the answer of its neighbours.
+        fit_weight: weight of the error of the motion that the trusted pixels agree on, with the
+            gradient through the fit into s (:func:`hybridvo.learned.fitted_motion`); 0 = none, as
+            in the paper.
         selection: method of ``hybridvo.pose.selection.select`` that L^F and L^D look through.
         loss_stride: L^F and L^D, without uncertainty, look at every n-th pixel of every n-th row,
             in pixels of that smaller picture. 1 as published.
@@ -128,6 +131,7 @@ class TrainingOptions:
     loss: LossOptions = field(default_factory=LossOptions)
     translation_loss: str = "direction"
     moving_weight: float = 0.0
+    fit_weight: float = 0.0
     selection: str = "softmax"
     loss_stride: int = 1
     data: tuple[str, ...] = ("data_paper.yaml",)
@@ -169,8 +173,11 @@ class TrainingOptions:
             raise InputError(
                 "TrainingOptions: expected checkpoint_minutes > 0 and evaluate_every >= 0."
             )
-        if not self.moving_weight >= 0:
-            raise InputError("TrainingOptions.moving_weight: expected a number >= 0.")
+        for name in ("moving_weight", "fit_weight"):
+            if not getattr(self, name) >= 0:
+                raise InputError(f"TrainingOptions.{name}: expected a number >= 0.")
+        if self.fit_weight and not (self.network.kind == "pwvo" and self.network.uncertainty):
+            raise InputError("TrainingOptions.fit_weight: needs a pwvo network with uncertainty.")
         if len(self.data) != len(self.data_weights):
             raise InputError("TrainingOptions: expected one of data_weights for each of data.")
 
