@@ -10,7 +10,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+
+from hybridvo.compilation import njit
 
 __all__ = ["BOX", "CYLINDER", "ELLIPSOID", "cast", "motion", "screen_bounds", "shade"]
 

@@ -9,7 +9,7 @@ import numpy as np
 from hybridvo.pose import kernels, second_depth, solver
 from hybridvo.pose.covariance import ORDER, UPPER, sandwich_covariance, symmetric
 from hybridvo.pose.options import RefinementOptions
-from hybridvo.pose.picture import Picture
+from hybridvo.pose.picture import Picture, as_given
 from hybridvo.types import FramePair
 
 LONG_STEP = 1e3
@@ -246,7 +246,7 @@ def _depth_term(
     rows, columns, stride = grid
     n = rows * columns
     u0, v0 = picture.origin
-    depth = np.ascontiguousarray(pair.curr.depth)
+    depth = as_given(pair.curr.depth)
     log_depth = np.empty(n, np.float32)
     # looked up at random places of a whole picture: first no more than the scale needs
     second_depth.look_up(coarse, n, second_depth.sparse_step(n), depth, u0, v0, log_depth)

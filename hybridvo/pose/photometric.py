@@ -21,6 +21,7 @@ from hybridvo.pose import photometric_kernels as kernels
 from hybridvo.pose.photometric_images import MID_GREY, Level, blurred, grey_image, match_blur
 from hybridvo.pose.photometric_options import PhotometricOptions, PolishReport
 from hybridvo.pose.photometric_problem import Problem, State, inverse, small_log
+from hybridvo.pose.picture import as_given
 from hybridvo.types import FramePair, RelativePose
 
 __all__ = ["PhotometricOptions", "PolishReport", "polish_photometric"]
@@ -28,6 +29,8 @@ __all__ = ["PhotometricOptions", "PolishReport", "polish_photometric"]
 PER_CELL = 4
 SAID = ("no_texture", "no_match", "out_of_view", "outside_flow", "higher_cost", "not_finite")
 """Reasons that the status of the motion mentions."""
+HALF = 0.5
+"""Agreement of the parts of the picture below which the status mentions it."""
 COARSE_SPREAD = 0.3
 """Coarser blurs are used where the flow leaves more than this many finest blurs undecided."""
 COST_NOISE = 1.0
@@ -124,7 +127,7 @@ def _select(
     cells = (height // cell + 1) * (width // cell + 1)
     index = np.empty((cells * PER_CELL, 2), np.int32)
     n = kernels.select_pixels(
-        grey, np.ascontiguousarray(depth), np.ascontiguousarray(weights, dtype=np.float32),
+        grey, as_given(depth), as_given(weights, np.float32),
         np.float32(options.least_weight), cell, PER_CELL, index,
     )  # fmt: skip
     return index[:n]
@@ -161,6 +164,8 @@ def _guarded(
         noise_grey=state.noise,
         correlation=correlation,
         pixels=int(np.count_nonzero(used)),
+        agreement=problem.agreement,
+        uneven_light=problem.uneven_light,
         depth_shift_px=depth_shift,
         depth_shift_information=depth_information,
     )
@@ -207,13 +212,31 @@ def _guarded(
     U, _, Vt = np.linalg.svd(T[:3, :3])
     T[:3, :3] = U @ Vt
     spread = np.sqrt(max(np.linalg.eigvalsh(covariance[:3, :3])[-1], 0.0))
+    status = pose.status
+    said = _remarks(report)
+    if said and not status.message:
+        status = replace(status, message=f"images: {said}")
     return pose.replace(
         T_curr_prev=T,
         covariance=covariance,
+        status=status,
         translation_direction_valid=bool(np.linalg.norm(T[:3, 3]) > 3 * spread),
         terms=(*pose.terms, "images"),
         polish=report,
     )
+
+
+def _remarks(report: PolishReport) -> str:
+    """What was wrong with images that were used all the same."""
+    parts = []
+    if report.uneven_light:
+        parts.append("the light changed differently over the picture, evened out")
+    if report.agreement < HALF:
+        parts.append(
+            "parts of the picture disagree about the motion (rolling shutter, lens, depth?), "
+            "weighed down"
+        )
+    return "; ".join(parts)
 
 
 def _depth_shift(problem: Problem) -> tuple[np.ndarray, np.ndarray]:

@@ -21,8 +21,8 @@ i = 1/Z'):
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from hybridvo.compilation import njit
 from hybridvo.pose.kernels import FASTMATH, MAX_VALUE, MIN_DEPTH, ONE, ZERO, keep_apart
 
 XN, YN, Z, GREY, GX, GY, PD, W, SU, SV = range(10)

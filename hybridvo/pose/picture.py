@@ -23,26 +23,26 @@ class Picture:
         prev, curr = pair.prev, pair.curr
         assert pair.flow is not None and prev.depth is not None
         flags = 0
-        dummy = np.ones((1, 1), np.float32)
-        depth = np.ascontiguousarray(prev.depth)
-        flow = np.ascontiguousarray(pair.flow)
+        dummy = as_given(np.ones((1, 1), np.float32))
+        depth = as_given(prev.depth)
+        flow = as_given(pair.flow)
         flow_variance = depth_variance = external = dummy
         scale = np.ones(2, np.float32)
         if pair.flow_variance is not None:
-            flow_variance = np.ascontiguousarray(pair.flow_variance)
+            flow_variance = as_given(pair.flow_variance)
             flags |= kernels.HAS_FLOW_VARIANCE
             scale[0] = typical(flow_variance)
         if prev.depth_variance is not None:
-            depth_variance = np.ascontiguousarray(prev.depth_variance)
+            depth_variance = as_given(prev.depth_variance)
             flags |= kernels.HAS_DEPTH_VARIANCE
             scale[1] = typical(depth_variance)
         if weights is not None:
-            external = np.ascontiguousarray(weights, dtype=np.float32)
+            external = as_given(weights, np.float32)
             flags |= kernels.HAS_WEIGHTS
-        valid = np.ones((1, 1), np.bool_)
+        valid = as_given(np.ones((1, 1), np.bool_))
         masks = [m for m in (prev.mask, pair.flow_valid) if m is not None]
         if masks:
-            valid = np.ascontiguousarray(masks[0] if len(masks) == 1 else masks[0] & masks[1])
+            valid = as_given(masks[0] if len(masks) == 1 else masks[0] & masks[1])
             flags |= kernels.HAS_VALID
         self.data: tuple[Any, ...] = (depth, flow, flow_variance, depth_variance, external, valid)
         self.flags, self.scale = flags, scale
@@ -58,7 +58,7 @@ class Picture:
         """Restrict to rows v0..v1-1 and columns u0..u1-1."""
         v0, v1, u0, u1 = box
         self.data = tuple(
-            np.ascontiguousarray(a[v0:v1, u0:u1]) if a.shape[:2] != (1, 1) else a for a in self.data
+            as_given(a[v0:v1, u0:u1]) if a.shape[:2] != (1, 1) else a for a in self.data
         )
         self.set_cameras(prev, curr, u0, v0)
 
@@ -152,6 +152,17 @@ class Picture:
         helper.start()
         take()
         helper.join()
+
+
+def as_given(array: np.ndarray, dtype: Any = None) -> np.ndarray:
+    """Contiguous view that cannot be written to, whatever the array allows.
+
+    Numba compiles a kernel anew for an array that is read-only (a frame out of a buffer, of a file
+    that was mapped) or not aligned: seconds, in the middle of a walk. So all look the same to it.
+    """
+    view = np.require(array, dtype, ["C", "A"]).view()
+    view.flags.writeable = False
+    return view
 
 
 def typical(variance: np.ndarray) -> float:

@@ -11,8 +11,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from hybridvo.compilation import njit
 from hybridvo.pose.kernels import BUFFER_ROWS, FASTMATH, MAX_VALUE, MU, MV, PD, PF, XN, YN, W, Z
 from hybridvo.pose.solver import (
     DEPTH_NOISE_CAP,

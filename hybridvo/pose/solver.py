@@ -10,8 +10,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from hybridvo.compilation import njit
 from hybridvo.pose.kernels import (
     BLOCK,
     FASTMATH,

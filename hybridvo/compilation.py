@@ -1,0 +1,125 @@
+"""Numba's cache on disk: there where it can be, no reason to fail where it cannot, same numbers.
+
+A kernel that is compiled calls those that were compiled before it in the same process; one that is
+read from the cache brings its own copies of them along. Both are right, but they sum in another
+order: motions differ in the eighth digit. So what is not in the cache yet is compiled by a process
+of its own (:func:`compile_once`), and every run reads the same code.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import logging
+import os
+import platform
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numba
+
+__all__ = ["compile_once", "njit"]
+
+LONGEST_S = 1200.0
+"""Patience with the compiling process, seconds: twenty times what it takes."""
+
+_logger = logging.getLogger(__name__)
+
+
+def njit(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """``numba.njit`` to which a cache is a help and never a condition.
+
+    Without a folder that can be written the function is compiled in every process; a full disk or
+    a damaged cache file cost a compilation as well, and no exception.
+
+    Args:
+        **options: of ``numba.njit``; with ``cache=True``, or it makes no difference.
+    """
+
+    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
+        try:
+            compiled = numba.njit(**options)(function)
+        except RuntimeError:  # numba: no locator available
+            return numba.njit(**options | {"cache": False})(function)
+        cache = getattr(compiled, "_cache", None)
+        for name in ("save_overload", "load_overload"):
+            if hasattr(cache, name):
+                setattr(cache, name, _forgiving(getattr(cache, name)))
+        return compiled
+
+    return decorate
+
+
+def _forgiving(act: Callable[..., Any]) -> Callable[..., Any]:
+    """``act``, or None where it fails: numba lets every error of its cache through."""
+
+    def attempt(*arguments: Any) -> Any:
+        try:
+            return act(*arguments)
+        except Exception as error:  # a full disk, a truncated pickle, a foreign file
+            _logger.debug("numba's cache: %s: %s", type(error).__name__, error)
+            return None
+
+    return attempt
+
+
+def compile_once(code: str, kernel: Any, sources: Path, name: str) -> bool:
+    """Have the kernels compiled into the cache by another process, the first time that they are
+    needed on this machine; nothing where there is no cache.
+
+    Args:
+        code: Python that compiles them.
+        kernel: one of them, which knows where the cache is.
+        sources: folder of the files that define them: the first time after a change counts.
+        name: of the set of kernels, a plain word.
+
+    Returns:
+        Whether they are in the cache now.
+    """
+    folder = getattr(getattr(kernel, "stats", None), "cache_path", None)
+    if not folder or not sys.executable or getattr(sys, "frozen", False):
+        return False
+    mark = Path(folder) / f"{name}-{_fingerprint(sources)}.compiled"
+    if mark.exists():
+        return True
+    _logger.warning("compiling the kernels, once on this machine: up to a minute ...")
+    package = os.fspath(Path(__file__).resolve().parents[1])
+    paths = [package, *filter(None, [os.environ.get("PYTHONPATH")])]
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", code],
+            env=os.environ | {"PYTHONPATH": os.pathsep.join(paths)},
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            timeout=LONGEST_S,
+            check=False,
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return False
+    if done.returncode != 0:
+        return False
+    with contextlib.suppress(OSError):
+        for older in Path(folder).glob(f"{name}-*.compiled"):
+            older.unlink(missing_ok=True)
+        mark.touch()
+    return True
+
+
+def _fingerprint(sources: Path) -> str:
+    """Of what numba's cache depends on: the code, the compiler and the processor."""
+    import llvmlite
+    from llvmlite import binding
+
+    digest = hashlib.sha256()
+    for word in (
+        *(platform.python_version(), numba.__version__, llvmlite.__version__),
+        *(binding.get_host_cpu_name(), binding.get_host_cpu_features().flatten()),
+    ):
+        digest.update(f"{word}\0".encode())
+    for path in sorted(sources.glob("*.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
