@@ -68,10 +68,11 @@ def weighted_fit(
             median of the residuals.
 
     Returns:
-        (B, 4, 4) T_curr_prev. Its gradient with respect to the weights is that of the last
-        Gauss-Newton step, at the solution, which is the implicit gradient with the kernel's factors
-        held fixed. Where the fit is not finite, or explains the weighted median pixel no better
-        than the start, ``T_start`` without gradient.
+        (B, 4, 4) T_curr_prev. Its gradient with respect to the weights is that of a Gauss-Newton
+        step at the solution in which every pixel beyond the kernel's scale pulls alike, as under an
+        L1 norm. The exact implicit gradient vanishes for pixels far away: a fit that has settled on
+        a mover would never learn of the world. Where the fit is not finite, or explains the
+        weighted median pixel no better than the start, the value is that of ``T_start``.
 
     Raises:
         InputError: shapes that do not fit.
@@ -108,10 +109,9 @@ def weighted_fit(
             good = torch.isfinite(T).all(dim=2).all(dim=1) & (last <= first)
             T = torch.where(good[:, None, None], T, start)
         if weights.requires_grad:
-            step, _ = _step(ray, inverse, target, weights, T, unit)
+            step, _ = _step(ray, inverse, target, weights, T, unit, far=True)
             # value of the solution, gradient of the step
-            step = torch.where(good[:, None], step - step.detach(), torch.zeros_like(step))
-            T = left_update(step, T)
+            T = left_update(step - step.detach(), T)
     return T.to(T_start.dtype)
 
 
@@ -122,8 +122,13 @@ def _step(
     weights: torch.Tensor,
     T: torch.Tensor,
     unit: torch.Tensor,
+    far: bool = False,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """((B, 6) Gauss-Newton step (translation, rotation), (B,) scale of the residuals)."""
+    """((B, 6) Gauss-Newton step (translation, rotation), (B,) scale of the residuals).
+
+    ``far``: pixels far away pull with constant strength, and the gradient is that of the right
+    hand side alone.
+    """
     moved = torch.einsum("bij,bjn->bin", T[:, :3, :2], ray) + T[:, :3, 2:3]
     moved = moved + T[:, :3, 3:] * inverse[:, None]
     front = moved[:, 2] > NEAREST
@@ -145,11 +150,12 @@ def _step(
         middle = (reached < 0.5 * reached[:, -1:]).sum(dim=1, keepdim=True)
         scale2 = some.gather(1, middle.clamp(max=some.shape[1] - 1))
         kernel2 = (CUTOFF**2 * scale2).clamp(min=LEAST_SCALE**2)
-        factor = torch.where(front, (kernel2 / (kernel2 + length2)).square(), zero)
+        factor = kernel2 / (kernel2 + length2)
+        factor = torch.where(front, factor.sqrt() if far else factor.square(), zero)
     g = weights * factor
     g = g / g.detach().sum(dim=1, keepdim=True).clamp(min=1e-30)
     rows, weighted = J.flatten(2), (J * g[:, None, None]).flatten(2)
-    A = weighted @ rows.transpose(1, 2)
+    A = (weighted.detach() if far else weighted) @ rows.transpose(1, 2)
     b = (weighted @ residual.flatten(1)[:, :, None])[:, :, 0]
     diagonal = torch.diag_embed(DAMPING * A.diagonal(dim1=1, dim2=2).detach() + 1e-12)
     step = torch.linalg.solve_ex((A + diagonal).double(), b.double())[0].to(b.dtype)

@@ -42,8 +42,10 @@ MAX_SKIPPED_IN_A_ROW = 50
 FIT_FLOOR_PX = 0.05
 """Pixels of the inputs."""
 
-SEPARATION_SLOPE = 4.0
+SEPARATION_SLOPE = 2.0
 """Logits per unit of s."""
+SEPARATION_PIXELS = 700
+"""Of each kind in a batch."""
 
 STOPPED_BY = ("steps", "time", "signal")
 
@@ -73,7 +75,7 @@ def training_loss(
         loss = loss + options.fit_weight * term
         parts = {**parts, "fit": term.detach()}
     if options.moving_weight and isinstance(output, PixelwisePrediction):
-        term = _separation(output, batch.moving)
+        term = _separation(output, batch)
         loss = loss + options.moving_weight * term
         parts = {**parts, "moving": term.detach()}
     return loss, parts
@@ -96,31 +98,25 @@ def _fit_loss(
     return torch.log1p(error / FIT_FLOOR_PX).mean()
 
 
-def _separation(output: PixelwisePrediction, moving: torch.Tensor) -> torch.Tensor:
-    """Cross-entropy of "s is above the middle between the two kinds of pixels" with the truth.
+def _separation(output: PixelwisePrediction, batch: TrainingBatch) -> torch.Tensor:
+    """How often s of the rotation is larger on a static pixel than on a moving one, smoothed.
 
-    Both kinds weigh the same; pairs with one kind only do not count. It saturates once U differs
-    by a factor of three or so, and leaves the rest of s to the other terms.
+    The logistic bound of one minus the area under the ROC curve, over pixels of the whole batch:
+    s has to tell movers apart across pairs as well. Pairs of pixels that are apart by a factor of
+    three in U count little; the rest of s is left to the other terms.
     """
-    rotation, translation = output.log_scale_rotation, output.log_scale_translation
-    if rotation is None or translation is None:
+    s = output.log_scale_rotation
+    if s is None:
         return output.rotation.new_zeros(())
-    share = F.interpolate(moving[:, None].to(rotation.dtype), rotation.shape[2:], mode="area")
-    masks = [(share > 0.5).flatten(1).to(share.dtype), (share < 0.5).flatten(1).to(share.dtype)]
-    counts = [mask.sum(1, keepdim=True) for mask in masks]
-    both = (counts[0] > 0) & (counts[1] > 0)
-    term = output.rotation.new_zeros(())
-    for s in (rotation, translation):
-        score = s.mean(1).flatten(1)
-        means = [
-            (score * m).sum(1, True) / n.clamp(min=1) for m, n in zip(masks, counts, strict=True)
-        ]
-        middle = (0.5 * (means[0] + means[1])).detach()
-        for sign, mask, count in zip((1, -1), masks, counts, strict=True):
-            surprise = F.softplus(-sign * SEPARATION_SLOPE * (score - middle))
-            each = (surprise * mask).sum(1, True) / count.clamp(min=1)
-            term = term + 0.25 * torch.where(both, each, 0.0).mean()
-    return term
+    cells = s.shape[2:]
+    moving = F.interpolate(batch.moving[:, None].to(s.dtype), cells, mode="area")[:, 0]
+    valid = F.interpolate(batch.inputs.valid[:, None].to(s.dtype), cells, mode="area")[:, 0] > 0.5
+    score = s.mean(1)
+    kinds = [score[valid & (moving > 0.5)], score[valid & (moving < 0.5)]]
+    if not all(len(kind) for kind in kinds):
+        return s.new_zeros(())
+    above, below = (kind[:: -(-len(kind) // SEPARATION_PIXELS)] for kind in kinds)
+    return F.softplus(SEPARATION_SLOPE * (below[None] - above[:, None])).mean()
 
 
 class Trainer:

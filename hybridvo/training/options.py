@@ -100,8 +100,8 @@ class TrainingOptions:
         loss: terms and switches.
         translation_loss: ``direction`` (the paper's: direction and length) or ``laplace``
             (L1 of each component in metres with its own s: exp(s) is then in metres).
-        moving_weight: weight of a term that the paper does not have: s should be larger on moving
-            pixels than on static ones of the same pair. 0 = none, as in the paper, whose s need
+        moving_weight: weight of a term that the paper does not have: s of the rotation should be
+            larger on moving pixels than on static ones. 0 = none, as in the paper, whose s need
             not tell the two apart once every pixel knows the answer of its neighbours.
         fit_weight: weight of the error of the motion that the trusted pixels agree on, with the
             gradient through the fit into s (:func:`hybridvo.learned.fitted_motion`); 0 = none, as

@@ -7,6 +7,7 @@ import socket
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -486,14 +487,18 @@ def test_two_processes_have_the_gradient_of_one(tmp_path):
 
 
 def test_separation_by_hand():
-    # Left half moves; s is 1 there and 0 elsewhere: half a unit from the middle, softplus(-2).
+    # Left half of the first pair moves; s of the rotation is 1 there and 0 elsewhere.
     moving = torch.zeros(2, 4, 4, dtype=torch.bool)
     moving[0, :, :2] = True
     s = moving[:, None, :, :].expand(-1, 3, -1, -1).float()
-    output = PixelwisePrediction(s, s, s, s)
-    # The second pair has one kind only and does not count: half of the mean.
-    expected = 0.5 * np.log1p(np.exp(-2.0))
-    assert float(loop._separation(output, moving)) == pytest.approx(expected, rel=1e-5)
-    upside_down = PixelwisePrediction(s, s, -s, -s)
-    expected = 0.5 * np.log1p(np.exp(2.0))
-    assert float(loop._separation(upside_down, moving)) == pytest.approx(expected, rel=1e-5)
+    batch = SimpleNamespace(moving=moving, inputs=SimpleNamespace(valid=torch.ones_like(moving)))
+    zero = torch.zeros_like(s)
+    # one unit of s apart, slope 2: log(1 + exp(-2)); the other way round log(1 + exp(2))
+    expected = np.log1p(np.exp(-2.0))
+    right = PixelwisePrediction(s, s, s, zero)
+    assert float(loop._separation(right, batch)) == pytest.approx(expected, rel=1e-5)
+    wrong = PixelwisePrediction(s, s, -s, zero)
+    assert float(loop._separation(wrong, batch)) == pytest.approx(2.0 + expected, rel=1e-5)
+    # a batch with one kind of pixels only tells nothing
+    still = SimpleNamespace(moving=torch.zeros_like(moving), inputs=batch.inputs)
+    assert float(loop._separation(right, still)) == 0.0
