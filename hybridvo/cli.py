@@ -11,6 +11,7 @@ import argparse
 import contextlib
 import logging
 import os
+import stat
 import sys
 import tempfile
 import traceback
@@ -136,6 +137,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     # One pair is too little work for several threads of torch, which wait for each other on a busy
     # machine. Here, before torch is imported, and not in the library: threads are its user's.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
+    _open_standard_streams()
     try:
         args = build_parser().parse_args(argv)
     except SystemExit as end:  # argparse: 0 after --help and --version, 2 for wrong usage
@@ -143,10 +145,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     command = ["hybridvo", *(sys.argv[1:] if argv is None else argv)]
     try:
         return _guarded(args.call, args, command)
-    except BrokenPipeError:
-        # the reader of stdout has gone (`| head`); Python would complain again at exit
-        with contextlib.suppress(OSError, ValueError):
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except BrokenPipeError:  # the reader of stdout has gone (`| head`)
+        _drop_stdout()
         return 0
 
 
@@ -194,24 +194,57 @@ def _complain(message: str) -> None:
         print(f"hybridvo: {message}", file=sys.stderr)
 
 
+def _open_standard_streams() -> None:
+    """Give a closed stdin, stdout or stderr its place back, as a stream to nowhere.
+
+    Else the next file that is opened gets the number, and what a library writes to stderr (libpng's
+    warnings) lands among the results.
+    """
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        try:
+            os.fstat(number)
+        except OSError:
+            if os.open(os.devnull, os.O_RDWR) != number:  # the lowest free number
+                return
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "r" if number == 0 else "w", encoding="utf-8"))
+
+
+def _drop_stdout() -> None:
+    """Forget what stdout still holds: Python would complain again at exit."""
+    with contextlib.suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
 def _prepare_caches() -> None:
     """Give numba and matplotlib a place to write where neither home nor package is writable."""
-    home = Path.home()
     package = Path(__file__).resolve().parent
-    if os.access(home, os.W_OK):
-        return
-    scratch = (
-        Path(tempfile.gettempdir()) / f"hybridvo-{os.getuid() if hasattr(os, 'getuid') else 0}"
-    )
+    with contextlib.suppress(OSError, RuntimeError):  # no home at all
+        if os.access(Path.home(), os.W_OK):
+            return
+    user = os.getuid() if hasattr(os, "getuid") else 0
     with contextlib.suppress(OSError):
+        scratch = Path(tempfile.gettempdir()) / f"hybridvo-{user}"
         scratch.mkdir(mode=0o700, exist_ok=True)
+        found = scratch.lstat()
+        # numba's cache runs what it holds: not out of a folder that somebody else has prepared
+        if not stat.S_ISDIR(found.st_mode) or found.st_mode & 0o022 or found.st_uid != user:
+            return
         os.environ.setdefault("MPLCONFIGDIR", str(scratch))
         if not os.access(package, os.W_OK):
             os.environ.setdefault("NUMBA_CACHE_DIR", str(scratch))
 
 
 def _print(text: str) -> None:
-    print(text, end="" if text.endswith("\n") else "\n", flush=True)
+    from hybridvo.errors import OutputError
+
+    try:
+        print(text, end="" if text.endswith("\n") else "\n", flush=True)
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        _drop_stdout()
+        raise OutputError(f"stdout: cannot be written: {error.strerror or error}.") from error
 
 
 def _run(args: argparse.Namespace, command: list[str]) -> int:

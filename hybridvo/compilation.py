@@ -28,6 +28,9 @@ LONGEST_S = 1200.0
 
 _logger = logging.getLogger(__name__)
 
+_cached: list[Any] = []
+"""The functions that have a cache: they know where it is."""
+
 
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """``numba.njit`` to which a cache is a help and never a condition.
@@ -44,6 +47,7 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
             compiled = numba.njit(**options)(function)
         except RuntimeError:  # numba: no locator available
             return numba.njit(**options | {"cache": False})(function)
+        _cached.append(compiled)
         cache = getattr(compiled, "_cache", None)
         for name in ("save_overload", "load_overload"):
             if hasattr(cache, name):
@@ -66,23 +70,23 @@ def _forgiving(act: Callable[..., Any]) -> Callable[..., Any]:
     return attempt
 
 
-def compile_once(code: str, kernel: Any, sources: Path, name: str) -> bool:
-    """Have the kernels compiled into the cache by another process, the first time that they are
-    needed on this machine; nothing where there is no cache.
+def compile_once(code: str, sources: Path, name: str) -> bool:
+    """Have the kernels of a folder compiled into the cache by another process.
+
+    The first time that they are needed on this machine; nothing where there is no cache.
 
     Args:
         code: Python that compiles them.
-        kernel: one of them, which knows where the cache is.
-        sources: folder of the files that define them: the first time after a change counts.
-        name: of the set of kernels, a plain word.
+        sources: folder of the files that define them; a change there makes it the first time again.
+        name: of this set of kernels, a plain word.
 
     Returns:
         Whether they are in the cache now.
     """
-    folder = getattr(getattr(kernel, "stats", None), "cache_path", None)
-    if not folder or not sys.executable or getattr(sys, "frozen", False):
+    folder = _cache_folder(sources)
+    if folder is None or not sys.executable or getattr(sys, "frozen", False):
         return False
-    mark = Path(folder) / f"{name}-{_fingerprint(sources)}.compiled"
+    mark = folder / f"{name}-{_fingerprint(sources)}.compiled"
     if mark.exists():
         return True
     _logger.warning("compiling the kernels, once on this machine: up to a minute ...")
@@ -103,10 +107,19 @@ def compile_once(code: str, kernel: Any, sources: Path, name: str) -> bool:
     if done.returncode != 0:
         return False
     with contextlib.suppress(OSError):
-        for older in Path(folder).glob(f"{name}-*.compiled"):
+        for older in folder.glob(f"{name}-*.compiled"):
             older.unlink(missing_ok=True)
         mark.touch()
     return True
+
+
+def _cache_folder(sources: Path) -> Path | None:
+    """Where the functions that are defined in a folder are cached."""
+    for kernel in _cached:
+        place = getattr(getattr(kernel, "stats", None), "cache_path", None)
+        if place and Path(kernel.py_func.__code__.co_filename).parent == sources:
+            return Path(place)
+    return None
 
 
 def _fingerprint(sources: Path) -> str:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import difflib
 import functools
+import hashlib
 import time
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -278,6 +279,17 @@ def shipped_judge(name: str = "judge") -> LearnedJudge:
     if not isinstance(network, JudgeNetwork):
         raise CheckpointError(f"{path}: expected the weights of a judge, got another network's.")
     return LearnedJudge(network)
+
+
+def weights_hash(method: str) -> str | None:
+    """SHA-256 over the shipped weights that a method uses; None for a method without a network."""
+    from hybridvo.network.weights import pretrained
+
+    names = ("judge", "pwvo") if method in JUDGED else (method,) if method in LEARNED else ()
+    digest = hashlib.sha256()
+    for name in names:
+        digest.update(pretrained(name).read_bytes())
+    return digest.hexdigest() if names else None
 
 
 def warm_up(method: str = DEFAULT_METHOD, polish: str = "auto") -> float:

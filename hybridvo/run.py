@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 import hybridvo
+from hybridvo.compilation import compile_once
 from hybridvo.configuration import RunOptions
 from hybridvo.console import Progress, interruptible
 from hybridvo.data.sequence import Sequence, open_sequence
@@ -30,10 +31,10 @@ from hybridvo.evaluation.metrics import pair_errors
 from hybridvo.evaluation.report import write_json
 from hybridvo.flow import FlowField, FlowProvider, dis_flow, fallback, file_flow
 from hybridvo.geometry import invert
-from hybridvo.hybrid import check_method
+from hybridvo.hybrid import JUDGED, check_method, weights_hash
 from hybridvo.odometry import Anchor, Odometry
 from hybridvo.recording import Recording, check_recording
-from hybridvo.run_folder import RESULTS, Mode, RunFolder
+from hybridvo.run_folder import PARTIAL, RESULTS, Mode, RunFolder
 from hybridvo.run_results import draw, score, summarise, true_trajectory, write_steps
 from hybridvo.trajectory import Trajectory, write_kitti, write_tum
 from hybridvo.types import Frame, Step
@@ -121,10 +122,12 @@ def run(
             f"{sequence.name}: no frames from {options.start} on: there are {len(sequence)}."
         )
     provider = flow_provider(sequence, options)
+    _compile(options.method)
     out = Path("runs") / run_name(sequence) if out is None else Path(out)
     identity = {
         "input_hash": input_hash(sequence),
         "options": _deciding(options),
+        "weights": weights_hash(options.method),
         "hybridvo": hybridvo.__version__,
     }
     header = {
@@ -186,9 +189,9 @@ def _run(
             seed=options.seed,
         )
         done = folder.frames_done
-        failed = int(folder.last["failed_so_far"]) if folder.last else 0
+        failed = 0
         if folder.last is not None:
-            vo.resume(_load_anchor(folder.last["anchor"], sequence))
+            failed = _resume(vo, folder, sequence, frames)
             progress.say(f"resumed after {done} of {len(frames)} frames")
         for index in frames[done:]:
             if interruption:
@@ -202,6 +205,21 @@ def _run(
             return _write(sequence, frames, options, folder, interrupted=True)
         said = [vo.images.message] if vo.images.message else []
         return _write(sequence, frames, options, folder, interrupted=False, warnings=said)
+
+
+def _resume(vo: Odometry, folder: RunFolder, sequence: Sequence, frames: range) -> int:
+    """Put the tracker where the last kept row left it; returns the failures up to there."""
+    assert folder.last is not None
+    try:
+        if folder.last["index"] != frames[folder.frames_done - 1]:
+            raise ValueError("another frame's")
+        vo.resume(_load_anchor(folder.last["anchor"], sequence))
+        return int(folder.last["failed_so_far"])
+    except (KeyError, TypeError, ValueError, IndexError, OSError) as error:
+        raise InputError(
+            f"{folder.path / PARTIAL}: row {folder.frames_done} cannot be used "
+            f"({type(error).__name__}: {error}). Remove its last lines, or pass --overwrite."
+        ) from error
 
 
 def _track(
@@ -386,6 +404,14 @@ def flow_provider(sequence: Sequence, options: RunOptions) -> _Recorder:
     if options.flow == "auto" and sequence.has_flow and options.stride == 1:
         return _Recorder(fallback(_tolerant(file_flow(sequence), options.strict), dis))
     return _Recorder(dis)
+
+
+def _compile(method: str) -> None:
+    """Compile in another process, so that a first run has the numbers of the later ones."""
+    if method == "refine" or method in JUDGED:
+        words = " ".join(f"warm_up({name!r}, 'on');" for name in dict.fromkeys(("refine", method)))
+        code = f"from hybridvo.hybrid import warm_up; {words}"
+        compile_once(code, Path(__file__).resolve().parent / "pose", method)
 
 
 def check_device(device: str) -> None:

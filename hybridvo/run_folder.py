@@ -11,6 +11,7 @@ import contextlib
 import io
 import json
 import os
+import re
 import secrets
 import socket
 from collections.abc import Iterable, Iterator, Mapping
@@ -114,8 +115,11 @@ class RunFolder:
             with _as_output_error(self.path):
                 for name in present:
                     self._remove(name)
-        if self._done:
-            return
+        with _as_output_error(self.path):
+            self._sweep()
+            if self._done:
+                self._remove(PARTIAL)
+                return
         self.write_state("running")
         # O_NOFOLLOW: a link planted under this name must not lead the rows elsewhere
         flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | getattr(os, "O_NOFOLLOW", 0)
@@ -149,11 +153,13 @@ class RunFolder:
         if self._done:
             return
         path = self.path / PARTIAL
-        if not path.exists():
+        if not os.path.lexists(path):
             return
         with _as_output_error(path):
             good = 0
-            with path.open("rb") as file:
+            # not through a link: what is cut off below must be this run's own
+            descriptor = os.open(path, os.O_RDWR | getattr(os, "O_NOFOLLOW", 0))
+            with os.fdopen(descriptor, "r+b") as file:
                 for line in file:
                     try:
                         row = json.loads(line) if line.endswith(b"\n") else None
@@ -164,8 +170,8 @@ class RunFolder:
                     self.frames_done += 1
                     self.last = row
                     good += len(line)
-            if good < path.stat().st_size:
-                os.truncate(path, good)
+                if good < os.fstat(descriptor).st_size:
+                    os.ftruncate(descriptor, good)
 
     def rows(self) -> Iterator[dict[str, Any]]:
         """The kept rows, in order."""
@@ -231,6 +237,15 @@ class RunFolder:
                 self._partial.close()
             self._partial = None
 
+    def _sweep(self) -> None:
+        """Remove what a killed run left half written; nobody else writes here: the lock is ours."""
+        names = "|".join(map(re.escape, (STATE, *self._results)))
+        leftover = re.compile(rf"\.({names})\.\d+-[0-9a-f]{{8}}\.tmp")
+        for path in self.path.iterdir():
+            if leftover.fullmatch(path.name):
+                path.unlink(missing_ok=True)
+        self._lock.sweep()
+
     def _remove(self, name: str) -> None:
         path = self.path / name
         if path.is_dir() and not path.is_symlink():
@@ -248,21 +263,32 @@ class _Lock:
     def acquire(self) -> None:
         mine = {"pid": os.getpid(), "host": socket.gethostname(), "started": _start_of(os.getpid())}
         content = json.dumps(mine | {"token": secrets.token_hex(8)}).encode()
-        for _ in range(3):
-            try:
-                descriptor = os.open(self.path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666)
-            except FileExistsError:
-                self._clear_stale()
-                continue
-            except OSError as error:
-                raise OutputError(
-                    f"{self.path.parent}: cannot be written: {error.strerror or error}."
-                ) from error
-            with _as_output_error(self.path), os.fdopen(descriptor, "wb") as file:
-                file.write(content)
-            self._content = content
-            return
+        # written beside it and then linked: a lock that stands there is never half written
+        ready = self.path.with_name(f".{LOCK}.{secrets.token_hex(4)}")
+        try:
+            with _as_output_error(self.path.parent):
+                _write_new(ready, content)
+            for _ in range(3):
+                try:
+                    with _as_output_error(self.path.parent):
+                        self._place(ready, content)
+                except FileExistsError:
+                    self._clear_stale()
+                    continue
+                self._content = content
+                return
+        finally:
+            with contextlib.suppress(OSError):
+                ready.unlink()
         raise LockedError(f"{self.path}: other runs are taking this folder at the same moment.")
+
+    def _place(self, ready: Path, content: bytes) -> None:
+        try:
+            os.link(ready, self.path)
+        except FileExistsError:
+            raise
+        except OSError:  # a file system without hard links
+            _write_new(self.path, content)
 
     def release(self) -> None:
         if self._content:
@@ -270,6 +296,14 @@ class _Lock:
                 if self.path.read_bytes() == self._content:
                     self.path.unlink()
             self._content = b""
+
+    def sweep(self) -> None:
+        """Remove the unplaced locks of runs that were killed while they took the folder."""
+        for path in self.path.parent.glob(f".{LOCK}.*"):
+            with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
+                holder = json.loads(path.read_bytes())
+                if holder["host"] == socket.gethostname() and not _holds(holder):
+                    path.unlink()
 
     def _clear_stale(self) -> None:
         """Remove the lock of a dead process; raise LockedError for a living one."""
@@ -281,7 +315,7 @@ class _Lock:
             raise OutputError(f"{self.path}: cannot be read: {error.strerror or error}.") from error
         try:
             holder = json.loads(content)
-            pid, host, started = int(holder["pid"]), holder["host"], holder.get("started")
+            pid, host = int(holder["pid"]), holder["host"]
         except (ValueError, KeyError, TypeError):
             raise LockedError(
                 f"{self.path}: a lock that cannot be read (a run is just starting, or was cut "
@@ -292,7 +326,7 @@ class _Lock:
                 f"{self.path.parent}: held by process {pid} on {host}. If that run is dead, "
                 f"remove {self.path}."
             )
-        if _alive(pid) and (started is None or started == _start_of(pid)):
+        if _holds(holder):
             raise LockedError(
                 f"{self.path.parent}: held by another run (process {pid}). Wait for it, or choose "
                 f"another --out."
@@ -303,13 +337,33 @@ class _Lock:
             os.rename(self.path, aside)
         except OSError:
             return
-        if aside.read_bytes() != content:  # a new run was faster: give its lock back
-            with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError):
+            if aside.read_bytes() != content:  # a new run was faster: give its lock back
                 os.link(aside, self.path)
-        aside.unlink(missing_ok=True)
+            aside.unlink()
+
+
+def _write_new(path: Path, content: bytes) -> None:
+    """Write a file that must not be there yet, or leave none."""
+    descriptor = os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666)
+    try:
+        with os.fdopen(descriptor, "wb") as file:
+            file.write(content)
+    except BaseException:
+        path.unlink(missing_ok=True)
+        raise
+
+
+def _holds(holder: Mapping[str, Any]) -> bool:
+    """Whether the process that wrote a lock on this machine is still the one that runs."""
+    pid, started = int(holder["pid"]), holder.get("started")
+    return _alive(pid) and (started is None or started == _start_of(pid))
 
 
 def _alive(pid: int) -> bool:
+    """Whether a process runs; a killed one that nobody has waited for does not."""
+    if _stat(pid)[:1] in (["Z"], ["X"]):
+        return False
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
@@ -321,17 +375,23 @@ def _alive(pid: int) -> bool:
 
 def _start_of(pid: int) -> str | None:
     """When a process started, in the kernel's own count: tells a reused pid; None if unknown."""
+    fields = _stat(pid)
+    return fields[19] if len(fields) > 19 else None
+
+
+def _stat(pid: int) -> list[str]:
+    """Fields of the kernel's line on a process from its state on; empty if unknown."""
     try:
-        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[19]
-    except (OSError, IndexError):
-        return None
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
+    except (OSError, IndexError, UnicodeDecodeError):
+        return []
 
 
 @contextlib.contextmanager
 def _as_output_error(path: Path) -> Iterator[None]:
     try:
         yield
-    except OutputError:
+    except (OutputError, FileExistsError):
         raise
     except OSError as error:
         raise OutputError(f"{path}: cannot be written: {error.strerror or error}.") from error

@@ -45,7 +45,7 @@ IMPORTS: dict[str, set[str]] = {
     "run": {
         *("__init__", "errors", "types", "geometry", "data", "flow", "hybrid", "odometry"),
         *("trajectory", "evaluation", "configuration", "console", "run_folder", "run_results"),
-        "recording",
+        *("recording", "compilation"),
     },
     # what tools/compare_methods.py runs, on this machine and on others
     "comparison": {
