@@ -11,10 +11,9 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-import yaml
-
+from hybridvo.data.plain_yaml import plain_yaml
 from hybridvo.data.presets import build_options, read_yaml
-from hybridvo.errors import InputError
+from hybridvo.errors import FormatError, InputError
 from hybridvo.flow import DIS_PRESETS
 from hybridvo.hybrid import DEFAULT_METHOD, check_polish
 from hybridvo.odometry import POLICIES
@@ -130,9 +129,10 @@ def load_options(
         if not sign or not all(parts):
             raise InputError(f"--set: expected key=value, as in refinement.cutoff=3, got {text!r}.")
         try:
-            parsed = yaml.safe_load(value)
-        except yaml.YAMLError:
-            raise InputError(f"--set {key}: {value!r} is no value that YAML can read.") from None
+            parsed = plain_yaml(value, key)
+        except FormatError:
+            message = f"--set {key[:80]}: {value[:80]!r} is no value that YAML can read."
+            raise InputError(message) from None
         node = mapping
         for part in parts[:-1]:
             inner = node.setdefault(part, {})

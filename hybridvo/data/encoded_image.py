@@ -7,6 +7,7 @@ where the damage is. Here the chunks, checksums, sizes and end markers are walke
 from __future__ import annotations
 
 import os
+import stat
 import struct
 import zlib
 from typing import IO
@@ -31,16 +32,36 @@ JPEG_MAGIC = b"\xff\xd8"
 MAX_IMAGE_BYTES = 2**30
 DEFLATE_MAX_RATIO = 1032
 """Deflate cannot expand by more than this factor, so a smaller PNG cannot hold its pixels."""
+JPEG_MAX_PIXELS_PER_BYTE = 2048
+"""Huffman coding spends a bit on each block of 64 luminance pixels: 512 a byte; with a margin for
+subsampled luminance."""
+JPEG_MAX_SCANS = 256
+"""Each scan of a progressive JPEG passes over the whole image; writers make about ten."""
 
 
 def open_file(path: str | os.PathLike[str]) -> IO[bytes]:
-    """The file, open for reading; FormatError for what cannot be a file."""
+    """The file, open for reading; FormatError for what is no file with an end.
+
+    Raises:
+        FormatError: a folder, a pipe or a device (which could block or never end), an impossible
+            name, or a file that may not be read. FileNotFoundError: no such file.
+    """
     try:
-        return open(path, "rb")
-    except IsADirectoryError:
-        raise FormatError(f"{path}: expected a file, got a folder.") from None
+        # without O_NONBLOCK a pipe that nobody writes to would block here
+        flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+        descriptor = os.open(path, flags | getattr(os, "O_CLOEXEC", 0))
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        raise FormatError(f"{path}: cannot be read: {error.strerror or error}.") from None
     except ValueError as error:  # a null byte in the name
         raise FormatError(f"{path!r}: not a file name ({error}).") from None
+    mode = os.fstat(descriptor).st_mode
+    if not stat.S_ISREG(mode):
+        os.close(descriptor)
+        what = "a folder" if stat.S_ISDIR(mode) else "a pipe or device"
+        raise FormatError(f"{path}: expected a file, got {what}.")
+    return os.fdopen(descriptor, "rb")
 
 
 def file_size(file: IO[bytes]) -> int:
@@ -120,7 +141,14 @@ def _jpeg_header(data: bytes, path: object) -> tuple[int, int, int]:
 
 
 def _check_jpeg(data: bytes, path: object) -> None:
-    _, _, start = _jpeg_header(data, path)
+    height, width, start = _jpeg_header(data, path)
+    if height * width > JPEG_MAX_PIXELS_PER_BYTE * len(data):
+        raise FormatError(
+            f"{path}: truncated JPEG: {width}x{height} pixels cannot fit into {len(data)} bytes. "
+            f"Copy or download the file again."
+        )
+    if data.count(b"\xff\xda", start) > JPEG_MAX_SCANS:
+        raise FormatError(f"{path}: damaged JPEG: more than {JPEG_MAX_SCANS} scans.")
     scan = data.find(b"\xff\xda", start)
     if scan < 0 or data.rfind(b"\xff\xd9") < scan:
         raise FormatError(
@@ -139,7 +167,7 @@ def decode(path: str | os.PathLike[str], flags: int) -> np.ndarray:
         size = file_size(file)
         if size > MAX_IMAGE_BYTES:
             raise FormatError(f"{path}: {size} bytes, above the limit of {MAX_IMAGE_BYTES}.")
-        data = file.read()
+        data = file.read(size)
     if data[:8] == PNG_MAGIC:
         _check_png(data, path)
     elif data[:2] == JPEG_MAGIC:

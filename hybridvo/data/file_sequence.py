@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import re
+from collections.abc import Iterator
 from collections.abc import Sequence as Many
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from hybridvo.types import Camera, Frame
 __all__ = [
     "FileSequence",
     "associate",
+    "check_pose",
     "depth_unit_notice",
     "gap_notice",
     "natural_key",
@@ -32,6 +34,10 @@ __all__ = [
 NANOSECONDS_ABOVE = 1e14
 ASSOCIATION_TOLERANCE = 0.02
 """Largest difference in seconds between stamps that belong together (the TUM tools' value)."""
+MOST_CANDIDATES = 64
+"""Partners within the tolerance that a stamp may have on average: truth at 3 kHz has fewer."""
+LARGEST_POSITION = 1e12
+"""Metres; no position is larger, and squares of it are finite."""
 PLAUSIBLE_DEPTH = (0.1, 200.0)
 SKY_DEPTH = 1000.0
 
@@ -266,7 +272,8 @@ class FileSequence:
 def natural_key(path: Path | str) -> list[str | int]:
     """Sort key under which ``frame_9`` comes before ``frame_10``."""
     name = path.name if isinstance(path, Path) else path
-    return [int(s) if s.isdecimal() else s for s in re.split(r"([0-9]+)", name)]
+    parts = re.split(r"([0-9]+)", name)  # text, digits, text, ...
+    return [int(part) if k % 2 else part for k, part in enumerate(parts)]
 
 
 def sorted_files(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
@@ -335,7 +342,7 @@ def read_rows(path: Path, columns: str, *, text_columns: int = 0) -> list[tuple]
     """
     names = columns.split()
     rows: list[tuple] = []
-    for number, line in enumerate(read_text(path).splitlines(), start=1):
+    for number, line in enumerate(_lines(read_text(path)), start=1):
         line = line.replace(",", " ").strip() if not text_columns else line.strip()
         if not line or line.startswith("#"):
             continue
@@ -355,9 +362,23 @@ def read_rows(path: Path, columns: str, *, text_columns: int = 0) -> list[tuple]
     return rows
 
 
+def _lines(text: str) -> Iterator[str]:
+    """Lines one at a time: a list of all would take thirty times the file's size."""
+    start = 0
+    while start <= len(text):
+        end = text.find("\n", start)
+        end = len(text) if end < 0 else end
+        yield text[start:end]
+        start = end + 1
+
+
 def to_seconds(stamps: Many[float] | np.ndarray, name: str) -> tuple[np.ndarray, list[str]]:
-    """Stamps in seconds; values above 1e14 are nanoseconds and are converted with a notice."""
-    values = np.asarray(stamps, dtype=np.float64)
+    """Stamps in seconds; values above 1e14 are nanoseconds and are converted with a notice.
+
+    What is not finite becomes NaN.
+    """
+    values = np.array(stamps, dtype=np.float64)
+    values[~np.isfinite(values)] = np.nan
     if (values > NANOSECONDS_ABOVE).any():
         return values / 1e9, [f"{name}: stamps are nanoseconds (above 1e14); converted to seconds."]
     return values, []
@@ -367,12 +388,16 @@ def poses_from_rows(rows: np.ndarray, source: str) -> np.ndarray:
     """(N, 4, 4) transforms from (N, 7) rows ``tx ty tz qx qy qz qw``; NaN rows stay NaN.
 
     Raises:
-        FormatError: a quaternion whose norm is not 1 to within 1 %.
+        FormatError: a quaternion whose norm is not 1 to within 1 %, or a position beyond 1e12 m.
     """
     rows = np.asarray(rows, dtype=np.float64).reshape(-1, 7)
     poses = np.full((len(rows), 4, 4), np.nan)
     finite = np.isfinite(rows).all(axis=1)
-    norms = np.linalg.norm(rows[:, 3:], axis=1)
+    far = finite & (np.abs(rows[:, :3]) > LARGEST_POSITION).any(axis=1)
+    if far.any():
+        i = int(np.flatnonzero(far)[0])
+        raise FormatError(f"{source}: pose {i}: expected metres, got {rows[i, :3]}.")
+    norms = np.linalg.norm(rows[:, 3:].clip(-2, 2), axis=1)
     wrong = finite & ~(np.abs(norms - 1) < 0.01)
     if wrong.any():
         i = int(np.flatnonzero(wrong)[0])
@@ -387,30 +412,53 @@ def poses_from_rows(rows: np.ndarray, source: str) -> np.ndarray:
     return poses
 
 
+def check_pose(T: np.ndarray, where: str) -> None:
+    """Refuse a (4, 4) T_world_cam of a file whose rotation is none to 1 %, or that lies too far.
+
+    Raises:
+        FormatError: such a pose.
+    """
+    R = T[:3, :3]
+    if np.abs(R).max() > 2 or np.abs(R @ R.T - np.eye(3)).max() > 1e-2 or np.linalg.det(R) < 0:
+        raise FormatError(f"{where}: expected a rotation, got {R.tolist()}.")
+    if np.abs(T[:3, 3]).max() > LARGEST_POSITION:
+        raise FormatError(f"{where}: expected a position in metres, got {T[:3, 3].tolist()}.")
+
+
 def associate(
     first: np.ndarray, second: np.ndarray, tolerance: float = ASSOCIATION_TOLERANCE
 ) -> list[tuple[int, int]]:
     """Pairs (i, j) of stamps in seconds that belong together, one to one, sorted by i.
 
     Greedy by the smallest difference, which must be below ``tolerance``, as the TUM tools do it.
-    Neither list needs to be sorted.
+    Neither list needs to be sorted; stamps that are not finite have no partner.
+
+    Raises:
+        InputError: stamps so close together, or so often repeated, that nearly all fit all.
     """
-    order = np.argsort(second, kind="stable")
-    ordered = np.asarray(second)[order]
-    low = np.searchsorted(ordered, np.asarray(first) - tolerance, side="left")
-    high = np.searchsorted(ordered, np.asarray(first) + tolerance, side="right")
-    candidates = [
-        (abs(float(first[i] - ordered[k])), i, int(order[k]))
-        for i in range(len(first))
-        for k in range(low[i], high[i])
-        if abs(first[i] - ordered[k]) < tolerance
-    ]
+    first, second = np.asarray(first, np.float64), np.asarray(second, np.float64)
+    rows, columns = np.flatnonzero(np.isfinite(first)), np.flatnonzero(np.isfinite(second))
+    columns = columns[np.argsort(second[columns], kind="stable")]
+    low = np.searchsorted(second[columns], first[rows] - tolerance, side="left")
+    high = np.searchsorted(second[columns], first[rows] + tolerance, side="right")
+    count = np.maximum(high - low, 0)
+    if count.sum() > MOST_CANDIDATES * (len(first) + len(second)):
+        raise InputError(
+            f"{count.sum()} pairs of stamps lie within {tolerance} s of each other, for "
+            f"{len(first)} and {len(second)} stamps: expected few. Are the stamps seconds, and is "
+            f"each there once?"
+        )
+    i = np.repeat(rows, count)
+    j = columns[np.arange(len(i)) + np.repeat(low - np.cumsum(count) + count, count)]
+    difference = np.abs(first[i] - second[j])
+    near = np.flatnonzero(difference < tolerance)
+    near = near[np.lexsort((j[near], i[near], difference[near]))]
     pairs: dict[int, int] = {}
     taken: set[int] = set()
-    for _, i, j in sorted(candidates):
-        if i not in pairs and j not in taken:
-            pairs[i] = j
-            taken.add(j)
+    for row, column in zip(i[near].tolist(), j[near].tolist(), strict=True):
+        if row not in pairs and column not in taken:
+            pairs[row] = column
+            taken.add(column)
     return sorted(pairs.items())
 
 

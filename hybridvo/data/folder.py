@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from hybridvo.data.file_sequence import (
     FileSequence,
@@ -25,13 +24,13 @@ from hybridvo.data.image_io import (
     read_png16,
     read_text,
 )
+from hybridvo.data.plain_yaml import MAX_YAML_BYTES, plain_yaml
 from hybridvo.data.undistortion import Undistorter, rectify
 from hybridvo.errors import FormatError, InputError
 from hybridvo.types import Camera
 
 __all__ = ["FolderSequence"]
 
-MAX_YAML_BYTES = 2**20
 REQUIRED = ("fx", "fy", "cx", "cy", "width", "height")
 OPTIONAL = ("distortion", "depth_scale", "fps")
 DEFAULT_FPS = 30.0
@@ -157,12 +156,8 @@ class FolderSequence(FileSequence):
 
 
 def _read_settings(path: Path) -> dict[str, Any]:
-    """Checked content of camera.yaml. Values are never printed: an alias bomb would unfold."""
-    try:
-        content = yaml.safe_load(read_text(path, limit=MAX_YAML_BYTES))
-    except (yaml.YAMLError, RecursionError, ValueError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise FormatError(f"{path}: not a plain YAML file ({reason}).") from None
+    """Checked content of camera.yaml."""
+    content = plain_yaml(read_text(path, limit=MAX_YAML_BYTES), str(path))
     if not isinstance(content, dict):
         raise FormatError(f"{path}: expected 'key: value' lines, got a {type(content).__name__}.")
     known = REQUIRED + OPTIONAL

@@ -9,6 +9,7 @@ import numpy as np
 
 from hybridvo.data.file_sequence import (
     FileSequence,
+    check_pose,
     gap_notice,
     numbered_files,
     read_rows,
@@ -27,6 +28,10 @@ FRAMES_PER_SECOND = 10.0
 DEPTH_FOLDERS = ("depth", "depth_2", "depth_0")
 LEFT_AND_RIGHT = (("image_2", "image_3"), ("image_0", "image_1"))
 IMAGE_PATTERN = r"(\d+)\.(?:png|jpg)"
+LARGEST = 1e12
+"""No entry of a projection matrix is larger."""
+LEAST_STEREO_WIDTH = 32
+"""Images narrower than this are not matched: OpenCV's matcher fails, or crashes, below 17 px."""
 DISPARITY_SIGMA_PX = 0.5
 """Assumed standard deviation of a block-matched disparity, px: sets the relative depth noise."""
 
@@ -149,6 +154,8 @@ class KittiSequence(FileSequence):
             raise InputError(
                 f"{path}: the right image has shape {right.shape}, the left one {left.shape}."
             )
+        if left.shape[1] < LEAST_STEREO_WIDTH:
+            return np.zeros(left.shape[:2], np.float32)
         # 128 px at KITTI's size: everything beyond 3 m. Narrow images cannot be searched as far.
         disparities = min(128, max(16, left.shape[1] // 2 // 16 * 16))
         block = 5
@@ -208,8 +215,12 @@ def _projection(matrices: dict[str, np.ndarray], number: str, root: Path) -> np.
     for name in (f"P{number}", f"P_rect_0{number}"):
         if name in matrices:
             P = matrices[name]
-            if P[0, 0] <= 0:
-                raise FormatError(f"{root / 'calib.txt'}: {name}: focal length {P[0, 0]}.")
+            upper = P[1, 0] == 0 and np.allclose(P[2, :3], (0, 0, 1)) and np.abs(P).max() < LARGEST
+            if not (upper and P[0, 0] > 0 and P[1, 1] > 0):
+                raise FormatError(
+                    f"{root / 'calib.txt'}: {name}: expected fx 0 cx tx, 0 fy cy ty, 0 0 1 tz with "
+                    f"positive fx and fy, got {P.tolist()}."
+                )
             return P
     raise FormatError(
         f"{root / 'calib.txt'}: expected a line 'P{number}: ...', found {sorted(matrices)}."
@@ -247,6 +258,7 @@ def _read_poses(
     for i, n in enumerate(numbers):
         if n < len(rows) and np.isfinite(rows[n]).all():
             T_world_cam0 = np.vstack([np.reshape(rows[n], (3, 4)), (0.0, 0.0, 0.0, 1.0)])
+            check_pose(T_world_cam0, f"{path}: pose {n}")
             poses[i] = T_world_cam0 @ invert(T_cam_cam0)
     missing = int(np.isnan(poses[:, 0, 0]).sum())
     if missing:

@@ -2,20 +2,21 @@
 
 A preset file names its kind (``preset: paper``) and repeats every option with its unit and reason.
 Nothing is guessed: an unknown key, a missing file or a value of another type is an error that names
-the file, the key and the nearest known name. Only ``yaml.safe_load`` is used.
+the file, the key and the nearest known name. What of YAML is read: :mod:`hybridvo.data.plain_yaml`.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import difflib
+import math
 import types
 import typing
 from pathlib import Path
 from typing import Any, TypeVar
 
-import yaml
-
+from hybridvo.data.image_io import read_text
+from hybridvo.data.plain_yaml import MAX_YAML_BYTES, plain_yaml
 from hybridvo.data.wide import WideOptions
 from hybridvo.data.workflow import PaperOptions
 from hybridvo.errors import FormatError, InputError
@@ -28,8 +29,8 @@ PRESETS: dict[str, type[PaperOptions] | type[WideOptions]] = {
 }
 """Kinds of training data by the name that a preset file gives under ``preset``."""
 
-MAX_YAML_BYTES = 1 << 20
-"""Largest preset file that is read; a preset is a few kilobytes."""
+LARGEST = 1e300
+"""No whole number is larger: beyond it there is no float."""
 
 OptionsT = TypeVar("OptionsT")
 
@@ -38,18 +39,12 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
     """Mapping stored in a YAML file.
 
     Raises:
-        InputError: no such file. FormatError: not YAML, not a mapping, or larger than a megabyte.
+        InputError: no such file. FormatError: not plain YAML, not a mapping, or above 64 KiB.
     """
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path}: no such file; presets of the project are in configs/.")
-    if path.stat().st_size > MAX_YAML_BYTES:
-        raise FormatError(f"{path}: a preset above {MAX_YAML_BYTES} bytes is not plausible.")
-    try:
-        mapping = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        reason = " ".join(str(error).split())
-        raise FormatError(f"{path}: not a YAML file ({reason}).") from error
+    mapping = plain_yaml(read_text(path, limit=MAX_YAML_BYTES), str(path))
     if not isinstance(mapping, dict):
         raise FormatError(f"{path}: expected a mapping of keys, got {type(mapping).__name__}.")
     return mapping
@@ -63,8 +58,9 @@ def load_preset(path: str | Path) -> PaperOptions | WideOptions:
     """
     mapping = read_yaml(path)
     kind = mapping.pop("preset", None)
-    if kind not in PRESETS:
-        raise InputError(f"{path}: 'preset' must be one of {', '.join(PRESETS)}, got {kind!r}.")
+    if not isinstance(kind, str) or kind not in PRESETS:
+        known = ", ".join(PRESETS)
+        raise InputError(f"{path}: 'preset' must be one of {known}, got {_shown(kind)}.")
     return build_options(PRESETS[kind], mapping, str(path))
 
 
@@ -83,15 +79,17 @@ def build_options(cls: type[OptionsT], mapping: Any, where: str) -> OptionsT:
     if isinstance(mapping, cls):
         return mapping
     if not isinstance(mapping, dict):
-        raise InputError(f"{where}: expected a mapping of keys, got {mapping!r}.")
+        raise InputError(f"{where}: expected a mapping of keys, got {_shown(mapping)}.")
     names = [field.name for field in dataclasses.fields(typing.cast(Any, cls))]
     hints = typing.get_type_hints(cls)
     values = {}
     for key, value in mapping.items():
         if key not in names:
-            near = difflib.get_close_matches(str(key), names, n=1, cutoff=0.0)
+            word = str(key)[:80]
+            near = difflib.get_close_matches(word, names, n=1, cutoff=0.0)
             hint = f" (did you mean '{near[0]}'?)" if near else ""
-            raise InputError(f"{where}: unknown key '{key}'{hint}. Known keys: {', '.join(names)}.")
+            known = ", ".join(names)
+            raise InputError(f"{where}: unknown key '{word}'{hint}. Known keys: {known}.")
         values[key] = _convert(hints[key], value, f"{where}: '{key}'")
     try:
         return cls(**values)
@@ -113,13 +111,15 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
         return build_options(typing.cast(Any, hint), value, where)
     if origin is tuple:
         if not isinstance(value, list | tuple):
-            raise InputError(f"{where}: expected a list, got {value!r}.")
+            raise InputError(f"{where}: expected a list, got {_shown(value)}.")
         if len(arguments) == 2 and arguments[1] is Ellipsis:
             kinds = (arguments[0],) * len(value)
         else:
             kinds = arguments
         if len(kinds) != len(value):
-            raise InputError(f"{where}: expected {len(kinds)} values, got {len(value)}: {value!r}.")
+            raise InputError(
+                f"{where}: expected {len(kinds)} values, got {len(value)}: {_shown(value)}."
+            )
         return tuple(
             _convert(kind, item, f"{where}[{i}]")
             for i, (kind, item) in enumerate(zip(kinds, value, strict=True))
@@ -127,6 +127,8 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
     if hint is Any:
         return value
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    # neither NaN nor a whole number beyond every float; infinity may be meant
+    is_number = is_number and (abs(value) <= LARGEST or abs(value) == math.inf)
     if hint is float and is_number:
         return float(value)
     if hint is int and is_number and float(value).is_integer():
@@ -134,4 +136,11 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
     if hint in (bool, str) and isinstance(value, hint):
         return value
     name = getattr(hint, "__name__", str(hint))
-    raise InputError(f"{where}: expected {name}, got {value!r}.")
+    raise InputError(f"{where}: expected {name}, got {_shown(value)}.")
+
+
+def _shown(value: Any) -> str:
+    """A value as a message may hold it."""
+    huge = isinstance(value, int) and value.bit_length() > 1000  # repr refuses above 4300 digits
+    text = "a number of more than 300 digits" if huge else repr(value)
+    return text if len(text) <= 80 else text[:77] + "..."

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hybridvo.data.file_sequence import FileSequence, gap_notice, numbered_files
+from hybridvo.data.file_sequence import FileSequence, check_pose, gap_notice, numbered_files
 from hybridvo.data.image_io import read_png16, read_text
 from hybridvo.errors import FormatError, InputError
 from hybridvo.types import Camera
@@ -116,11 +116,9 @@ def _read_pose(path: Path) -> np.ndarray:
     T = values.reshape(4, 4)
     if not np.isfinite(T).all():
         return np.full((4, 4), np.nan)
-    R = T[:3, :3]
-    if np.abs(R).max() > 2 or np.abs(R @ R.T - np.eye(3)).max() > 1e-2 or np.linalg.det(R) < 0:
-        raise FormatError(f"{path}: expected a rotation, got {R.tolist()}.")
+    check_pose(T, str(path))
     # The files carry seven digits: bring the rotation back onto the manifold.
-    U, _, Vt = np.linalg.svd(R)
+    U, _, Vt = np.linalg.svd(T[:3, :3])
     T = T.copy()
     T[:3, :3] = U @ Vt
     T[3] = (0.0, 0.0, 0.0, 1.0)

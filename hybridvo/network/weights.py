@@ -128,8 +128,8 @@ def load_weights(path: str | Path) -> tuple[nn.Module, dict[str, Any]]:
             state = {name: file.get_tensor(name).float() for name in found}
     except SafetensorError as error:
         raise CheckpointError(
-            f"{path}: not a whole safetensors file ({error}). Pickled checkpoints (.pt, .pth) are "
-            f"refused on purpose; if this was a weights file, copy or download it again."
+            f"{path}: not a whole safetensors file ({str(error)[:200]}). Pickled checkpoints (.pt, "
+            f".pth) are refused on purpose; if this was a weights file, copy or download it again."
         ) from None
     except OSError as error:
         raise CheckpointError(f"{path}: cannot be read: {error.strerror or error}.") from None
@@ -186,7 +186,7 @@ def _read_header(path: Path, metadata: Mapping[str, str]) -> tuple[AnyOptions, d
     if metadata.get("format") != FORMAT:
         raise CheckpointError(
             f"{path}: a safetensors file, but not hybridvo's: expected format {FORMAT!r} in its "
-            f"header, got {metadata.get('format')!r}."
+            f"header, got {str(metadata.get('format'))[:80]!r}."
         )
     parsed = {}
     for key in ("options", "card"):
@@ -201,14 +201,14 @@ def _read_header(path: Path, metadata: Mapping[str, str]) -> tuple[AnyOptions, d
     unknown = set(parsed["options"]) - names
     if unknown:
         raise CheckpointError(
-            f"{path}: unknown network options {sorted(unknown)}; known: {sorted(names)}. Was it "
-            f"written by a later version of hybridvo?"
+            f"{path}: unknown network options {str(sorted(unknown))[:200]}; known: "
+            f"{sorted(names)}. Was it written by a later version of hybridvo?"
         )
     # An option that is younger than the file has its default, which is what the file was made with.
     try:
         return kind(**parsed["options"]), parsed["card"]
     except (InputError, TypeError) as error:
-        raise CheckpointError(f"{path}: {error}") from None
+        raise CheckpointError(f"{path}: {str(error)[:300]}") from None
 
 
 def _mismatches(
@@ -226,7 +226,7 @@ def _mismatches(
 
 
 def _join(problems: list[str]) -> str:
-    text = "; ".join(problems[:LISTED])
+    text = "; ".join(problem[:200] for problem in problems[:LISTED])
     return text + (f"; and {len(problems) - LISTED} more" if len(problems) > LISTED else "")
 
 

@@ -335,8 +335,8 @@ def test_preset_files_name_every_option(path):
         ("preset: paper\nmove_probability: 2", "move_probability"),
         ("preset: chairs", "one of paper, wide, got 'chairs'"),
         ("- a\n- b", "expected a mapping"),
-        ("a: [", "not a YAML file"),
-        ("preset: !!python/object/apply:os.getcwd []", "not a YAML file"),
+        ("a: [", "not a plain YAML file"),
+        ("preset: !!python/object/apply:os.getcwd []", "not a plain YAML file"),
     ],
 )
 def test_malformed_presets_are_refused(tmp_path, text, message):
@@ -352,5 +352,5 @@ def test_preset_files_that_are_none(tmp_path):
         presets.load_preset(tmp_path / "absent.yaml")
     path = tmp_path / "binary.yaml"
     path.write_bytes(b"\xff\xfe\x00\x80")
-    with pytest.raises(FormatError, match="not a YAML file"):
+    with pytest.raises(FormatError, match="not a plain YAML file"):
         presets.load_preset(path)
