@@ -18,11 +18,11 @@ import numpy as np
 
 from hybridvo.errors import CheckpointError, InputError
 from hybridvo.geometry import ego_flow, se3_exp
-from hybridvo.learned import LEARNED, estimate_learned, shipped_network
+from hybridvo.learned import LEARNED, estimate_learned, propose_motion, shipped_network
 from hybridvo.pose.judgement import default_judge
 from hybridvo.pose.photometric import PhotometricOptions, polish_photometric
 from hybridvo.pose.refinement import RefinementOptions, refine
-from hybridvo.pose.second_look import Motions, Opinion, PictureJudge
+from hybridvo.pose.second_look import Motions, Opinion, PictureJudge, Proposal
 from hybridvo.types import Camera, Frame, FramePair, RelativePose
 
 if TYPE_CHECKING:
@@ -169,11 +169,13 @@ class LearnedJudge:
 
     Args:
         network: of :func:`hybridvo.network.weights.load_weights`.
+        pixelwise: a PWVO, whose motion takes part where the judge trusts no other; or None.
     """
 
-    def __init__(self, network: JudgeNetwork) -> None:
+    def __init__(self, network: JudgeNetwork, pixelwise: torch.nn.Module | None = None) -> None:
         import torch
 
+        self._pixelwise = pixelwise
         self._network = network.eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def first_look(
@@ -211,6 +213,10 @@ class LearnedJudge:
             trust = torch.sigmoid(self._network.confidence(score, hidden, owner, 1))
         memory = replace(memory, score=score, hidden=hidden)
         return Opinion(score.double().numpy(), best.numpy(), mask, float(trust), memory)
+
+    def propose(self, pair: FramePair) -> Proposal | None:
+        """PWVO's motion and where it sees the static world."""
+        return None if self._pixelwise is None else propose_motion(self._pixelwise, pair)
 
 
 @dataclass(frozen=True, eq=False)
@@ -278,7 +284,7 @@ def shipped_judge(name: str = "judge") -> LearnedJudge:
     network, _ = load_weights(path)
     if not isinstance(network, JudgeNetwork):
         raise CheckpointError(f"{path}: expected the weights of a judge, got another network's.")
-    return LearnedJudge(network)
+    return LearnedJudge(network, shipped_network("pwvo"))
 
 
 def weights_hash(method: str) -> str | None:

@@ -17,8 +17,17 @@ if TYPE_CHECKING:
     from hybridvo.network.inputs import NetworkInputs
     from hybridvo.network.losses import NetworkOutput
     from hybridvo.network.passes import Chooser
+    from hybridvo.pose.second_look import Proposal
 
-__all__ = ["LEARNED", "estimate_learned", "fitted_motion", "next_start", "shipped_network"]
+__all__ = [
+    "LEARNED",
+    "estimate_learned",
+    "fitted_motion",
+    "next_start",
+    "propose_motion",
+    "shipped_network",
+    "static_probability",
+]
 
 LEARNED = {
     "pwvo": "softmax",
@@ -29,6 +38,9 @@ LEARNED = {
 }
 """Methods that are a network alone, and how one motion is selected from its pixels."""
 
+STATIC_AT, STATIC_SLOPE = 0.6, 6.0
+"""Where the probability to be static is one half, in units of s above the trusted pixels', and the
+slope of its logit."""
 LEAST_PIXELS = 64
 """Pixels of the network's input with flow and depth below which it is not asked."""
 LEAST_SCALE = 1e-4
@@ -113,6 +125,56 @@ def fitted_motion(
         pixel_weights(log_scale, inputs.valid).flatten(1),
         chosen_motion(output, selection),
     )
+
+
+def static_probability(log_scale: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
+    """Probability of every pixel to be static world, from the log scales of a network.
+
+    Args:
+        log_scale: (B, 3, h, w) of the rotation.
+        valid: (B, h, w) bool; 0 where False.
+
+    Returns:
+        (B, h, w). What counts is how far s lies above that of the pixels with weight in the fit;
+        the map from there is logistic, fitted to held-out ``wide`` pairs (development seeds).
+    """
+    from hybridvo.pose.weighted_fit import pixel_weights
+
+    s = log_scale.mean(dim=1)
+    trusted = (pixel_weights(log_scale, valid) * s).flatten(1).sum(dim=1)[:, None, None]
+    return ((STATIC_AT - (s - trusted)) * STATIC_SLOPE).sigmoid() * valid
+
+
+def propose_motion(network: torch.nn.Module, pair: FramePair) -> Proposal | None:
+    """A pixel-wise network's motion and static world, for a judge that trusts no other.
+
+    Args:
+        network: a PWVO with uncertainty.
+        pair: two frames, the flow between them and the depth of the first.
+
+    Returns:
+        The motion that the trusted pixels agree on, after the last pass; None where too little is
+        valid, or the answer is not finite.
+    """
+    import torch
+
+    from hybridvo.network.inputs import assemble_inputs
+    from hybridvo.network.passes import predict
+    from hybridvo.pose.second_look import Proposal
+
+    with torch.inference_mode():
+        inputs = assemble_inputs(pair)
+        if int(inputs.valid.sum()) < LEAST_PIXELS:
+            return None
+        output = predict(network, inputs, next_start(network))
+        log_scale = getattr(output, "log_scale_rotation", None)
+        if log_scale is None:
+            return None
+        T = fitted_motion(output, inputs)[0].double().numpy()
+        # the upper left pixel of each cell stands for it, as for the network itself
+        stride = max(1, round(inputs.size[0] / log_scale.shape[2]))
+        static = static_probability(log_scale, inputs.subsample(stride).valid)[0].numpy()
+    return Proposal(T, static) if np.isfinite(T).all() and np.isfinite(static).all() else None
 
 
 def estimate_learned(

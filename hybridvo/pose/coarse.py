@@ -11,7 +11,7 @@ import numpy as np
 
 from hybridvo.pose import kernels, search, second_depth, solver
 from hybridvo.pose.options import RefinementOptions
-from hybridvo.pose.picture import Picture
+from hybridvo.pose.picture import Picture, as_given
 from hybridvo.types import FramePair, Reason, RelativePose
 
 __all__ = ["CoarseSearch", "Grid", "fit_in_mask", "search_motions"]
@@ -66,6 +66,7 @@ class CoarseSearch:
         picture: arrays of the pair, cropped to ``box``.
         samples: pixel buffer of the grid, see :mod:`hybridvo.pose.kernels`.
         shape: (rows, columns, stride) of the grid.
+        whole: (height, width) of the picture, px.
         box: (v0, v1, u0, u1) of the picture that the grid covers.
         depth_scale: 1 / typical depth.
         poses: (M, 3, 4) T_curr_prev. facts: (M, :data:`hybridvo.pose.search.FACTS`).
@@ -75,6 +76,7 @@ class CoarseSearch:
     picture: Picture
     samples: np.ndarray
     shape: tuple[int, int, int]
+    whole: tuple[int, int]
     box: tuple[int, int, int, int]
     depth_scale: float
     poses: np.ndarray
@@ -101,6 +103,17 @@ class CoarseSearch:
         samples[kernels.W, : self.count] *= mask.reshape(-1)
         return picture, samples
 
+    def on_grid(self, whole: np.ndarray) -> np.ndarray:
+        """(h, w) float32: a map over the whole picture, of any resolution, seen on the grid."""
+        h, w, stride = self.shape
+        height, width = self.whole
+        first = stride // 2 + 0.5
+        v = (self.box[0] + first + np.arange(h) * stride) * (whole.shape[0] / height) - 0.5
+        u = (self.box[2] + first + np.arange(w) * stride) * (whole.shape[1] / width) - 0.5
+        u, v = np.meshgrid(u.astype(np.float32), v.astype(np.float32))
+        map_of = np.ascontiguousarray(whole, np.float32)
+        return cv2.remap(map_of, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
     def grid(self, pair: FramePair) -> Grid:
         """The pixels as pictures."""
         h, w, stride = self.shape
@@ -112,7 +125,7 @@ class CoarseSearch:
         log_depth = np.full(n, np.nan, np.float32)
         u0, v0 = self.picture.origin
         if pair.curr.depth is not None:
-            depth = np.ascontiguousarray(pair.curr.depth)
+            depth = as_given(pair.curr.depth)
             second_depth.look_up(self.samples, n, 1, depth, u0, v0, log_depth)
         return Grid(
             ray=map_of(kernels.XN, kernels.YN),
@@ -207,7 +220,15 @@ def search_motions(
         clear = bool(coherence < CLEAR_COHERENCE)
     shape = (h, w, stride)
     return CoarseSearch(
-        picture, coarse, shape, box, depth_scale, poses[:found], facts[:found], clear
+        picture,
+        coarse,
+        shape,
+        pair.prev.camera.shape,
+        box,
+        depth_scale,
+        poses[:found],
+        facts[:found],
+        clear,
     )
 
 

@@ -146,7 +146,7 @@ def _refine(
     best = int(np.argmax(scores))
     decision, picture, samples = None, found.picture, found.samples
     if isinstance(judge, PictureJudge) and not found.clear:
-        decision = decide(judge, found, found.grid(pair), scores, T_last, options)
+        decision = decide(judge, found, pair, scores, T_last, options)
         poses, facts, best = decision.poses, decision.facts, decision.best
         hypotheses += _hypotheses(found, poses[len(scores) :], facts[len(scores) :], T_last)
         scores = decision.score

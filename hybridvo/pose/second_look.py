@@ -1,5 +1,6 @@
 """The second look: a judge of pictures says which motion is the world and where the world is, the
-best few motions are fitted again inside its masks, and it judges old and new ones together.
+best few motions are fitted again inside its masks, and it judges old and new ones together. Where
+it trusts none it may propose one of its own, which then takes part like every other.
 
 The judge is handed in (:class:`PictureJudge`); this room knows no network.
 """
@@ -16,8 +17,9 @@ from hybridvo.pose import kernels, search, solver
 from hybridvo.pose.coarse import CoarseSearch, Grid, fit_in_mask
 from hybridvo.pose.covariance import symmetric
 from hybridvo.pose.options import RefinementOptions
+from hybridvo.types import FramePair
 
-__all__ = ["Decision", "Motions", "Opinion", "PictureJudge", "decide", "mask_weights"]
+__all__ = ["Decision", "Motions", "Opinion", "PictureJudge", "Proposal", "decide", "mask_weights"]
 
 REFITS = 2
 """Motions that are fitted again inside their masks."""
@@ -32,6 +34,8 @@ with independent noise the difference stays below 5 and all pixels are better by
 movers have bent the fit it is tens to thousands and the mask is better by half."""
 LEAST_TRUST = 0.5
 """Probability of being right below which the classical choice stands: there the two err alike."""
+CONSULT = 0.9
+"""Probability of being right below which the judge is asked for a proposal."""
 LEAST_FLOW_NOISE = 0.02
 """px: what even true flow may differ by (rounding, edges of pixels)."""
 LEAST_MASK = 0.02
@@ -70,6 +74,20 @@ class Opinion:
     memory: Any = None
 
 
+@dataclass(frozen=True, eq=False)
+class Proposal:
+    """A motion that was seen, not searched.
+
+    Args:
+        T_curr_prev: (4, 4).
+        static: (h, w) probability of every pixel to be static world, over the whole picture at any
+            resolution.
+    """
+
+    T_curr_prev: np.ndarray
+    static: np.ndarray
+
+
 @runtime_checkable
 class PictureJudge(Protocol):
     """Judges the motions of a pair by what they leave unexplained, pixel by pixel."""
@@ -94,6 +112,9 @@ class PictureJudge(Protocol):
             refits: R fits inside masks of that opinion; they follow its candidates.
             parents: (R,) int64, the motion of the search that each goes back to.
         """
+
+    def propose(self, pair: FramePair) -> Proposal | None:
+        """A motion of the judge's own, or None; asked only where it trusts no candidate."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +148,7 @@ def mask_weights(probability: np.ndarray) -> np.ndarray:
 def decide(
     judge: PictureJudge,
     found: CoarseSearch,
-    grid: Grid,
+    pair: FramePair,
     classical: np.ndarray,
     T_last: np.ndarray | None,
     options: RefinementOptions,
@@ -137,50 +158,103 @@ def decide(
     Args:
         judge: of pictures.
         found: motions of the search.
-        grid: its pixels.
+        pair: that they were found in.
         classical: (N,) scores of the hand-made judge, for when the judge trusts nothing.
         T_last: (4, 4) the last motion of the camera, or None.
         options: of the refinement.
     """
-    usable = found.samples[kernels.W, : found.count]
-    total = float(usable.sum())
-    count = len(found.poses)
-    poses, facts = list(found.poses), list(found.facts)
-    parents = list(range(count))
-    masks: list[np.ndarray | None] = [None] * count
-    opinion = judge.first_look(grid, _motions(found.poses, found.facts), T_last, REFITS)
-    best, same = 0, None
+    race = _Race(judge, found, options)
+    opinion = judge.first_look(found.grid(pair), _motions(found.poses, found.facts), T_last, REFITS)
     for _ in range(LOOKS):
-        known = len(poses)
-        for k, probability in zip(opinion.best, opinion.mask, strict=True):
-            weights = mask_weights(probability)
-            if float(usable @ weights.reshape(-1)) < LEAST_MASK * total:
-                continue
-            pose, fact = fit_in_mask(
-                found.samples, weights, found.picture.K, poses[k], options.cutoff
-            )
-            if np.isfinite(pose).all() and fact[search.SHARE] > 0:
-                poses.append(pose)
-                facts.append(fact)
-                parents.append(parents[k])
-                masks.append(weights)
-        refits = _motions(np.reshape(poses[known:], (-1, 3, 4)), np.array(facts[known:]))
-        opinion = judge.look_again(opinion, refits, np.array(parents[known:], np.int64))
-        best = int(np.argmax(np.nan_to_num(opinion.score, nan=-np.inf)))
-        mask = masks[best]
-        same = None if mask is None else _same(found, mask, poses[best], facts[best], options)
-        if best < known or same is not None:
+        opinion = race.run(opinion, _in_masks(race, opinion))
+        if race.best < race.known or race.same is not None:
             break
-    score = np.nan_to_num(opinion.score, nan=-np.inf)
-    trust = float(np.nan_to_num(opinion.trust))
-    abstained = trust < LEAST_TRUST
+    proposal = judge.propose(pair) if race.trust < CONSULT else None
+    if proposal is not None:
+        opinion = race.run(opinion, [_entry(race, proposal)])
+        if race.best >= race.known and race.same is None:
+            opinion = race.run(opinion, _in_masks(race, opinion))
+    best, abstained = race.best, race.trust < LEAST_TRUST
     if abstained:
         best = int(np.argmax(classical))
-    elif same is not None:
-        best = same
-    mask = masks[best]
-    kept = 1.0 if mask is None else float(usable @ mask.reshape(-1)) / total
-    return Decision(np.stack(poses), np.stack(facts), score, best, mask, kept, trust, abstained)
+    elif race.same is not None:
+        best = race.same
+    mask = race.masks[best]
+    kept = 1.0 if mask is None else race.kept(mask)
+    score = np.nan_to_num(opinion.score, nan=-np.inf)
+    return Decision(
+        np.stack(race.poses), np.stack(race.facts), score, best, mask, kept, race.trust, abstained
+    )
+
+
+_Entry = tuple[np.ndarray, np.ndarray, int]
+"""Start (3, 4), weights (h, w) and motion of the search of a fit to come."""
+
+
+class _Race:
+    """Candidates so far, and which of them is ahead."""
+
+    def __init__(
+        self, judge: PictureJudge, found: CoarseSearch, options: RefinementOptions
+    ) -> None:
+        self.judge, self.found, self.options = judge, found, options
+        self.poses, self.facts = list(found.poses), list(found.facts)
+        self.parents = list(range(len(self.poses)))
+        self.masks: list[np.ndarray | None] = [None] * len(self.poses)
+        self.known = self.best = 0
+        self.same: int | None = None
+        self.trust = 0.0
+        self._usable = found.samples[kernels.W, : found.count]
+
+    def kept(self, weights: np.ndarray) -> float:
+        """Share of the usable pixels' weight that a mask leaves."""
+        return float(self._usable @ weights.reshape(-1)) / float(self._usable.sum())
+
+    def run(self, opinion: Opinion, entries: list[_Entry]) -> Opinion:
+        """Fit the entries, let the judge look at all candidates, see who is ahead."""
+        self.known = len(self.poses)
+        for start, weights, parent in entries:
+            if self.kept(weights) < LEAST_MASK:
+                continue
+            pose, fact = fit_in_mask(
+                self.found.samples, weights, self.found.picture.K, start, self.options.cutoff
+            )
+            if np.isfinite(pose).all() and fact[search.SHARE] > 0:
+                self.poses.append(pose)
+                self.facts.append(fact)
+                self.parents.append(parent)
+                self.masks.append(weights)
+        refits = _motions(
+            np.reshape(self.poses[self.known :], (-1, 3, 4)), np.array(self.facts[self.known :])
+        )
+        parents = np.array(self.parents[self.known :], np.int64)
+        opinion = self.judge.look_again(opinion, refits, parents)
+        self.best = int(np.argmax(np.nan_to_num(opinion.score, nan=-np.inf)))
+        self.trust = float(np.nan_to_num(opinion.trust))
+        mask = self.masks[self.best]
+        self.same = None
+        if mask is not None:
+            fit = self.poses[self.best], self.facts[self.best]
+            self.same = _same(self.found, mask, *fit, self.options)
+        return opinion
+
+
+def _in_masks(race: _Race, opinion: Opinion) -> list[_Entry]:
+    """The best candidates of an opinion, each with its mask."""
+    return [
+        (race.poses[k], mask_weights(probability), race.parents[k])
+        for k, probability in zip(opinion.best, opinion.mask, strict=True)
+    ]
+
+
+def _entry(race: _Race, proposal: Proposal) -> _Entry:
+    """A proposal on the grid of the search; it goes back to the motion that is nearest to it."""
+    start = np.ascontiguousarray(proposal.T_curr_prev[:3], dtype=np.float64)
+    weights = mask_weights(race.found.on_grid(proposal.static))
+    T, unit = pose_matrix(start), race.found.depth_scale
+    steps = np.array([se3_log(T @ invert(pose_matrix(P))) for P in race.found.poses])
+    length = (steps * np.array([unit] * 3 + [1.0] * 3)) ** 2
+    return start, weights, int(np.argmin(length.sum(axis=1)))
 
 
 def _same(

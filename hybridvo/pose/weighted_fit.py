@@ -25,6 +25,8 @@ LEAST_SCALE = 1e-4
 """Least scale of the kernel in units of the focal length: 0.1 px at a focal length of 1000."""
 MEDIAN_STRIDE = 3
 """Every third pixel is enough for a median; three divides no usual width: all columns count."""
+LEAST_WEIGHT = 1e-12
+"""Sum of all weights after the kernel below which there is nothing to fit."""
 DAMPING = 1e-6
 """Share of the diagonal of the normal equations, so that a flat direction stays solvable."""
 NEAREST = 1e-2
@@ -153,7 +155,10 @@ def _step(
         factor = kernel2 / (kernel2 + length2)
         factor = torch.where(front, factor.sqrt() if far else factor.square(), zero)
     g = weights * factor
-    g = g / g.detach().sum(dim=1, keepdim=True).clamp(min=1e-30)
+    total = g.detach().sum(dim=1, keepdim=True)
+    enough = (total > LEAST_WEIGHT) & torch.isfinite(total)
+    # without weight there is no step and no gradient
+    g = torch.where(enough, g / torch.where(enough, total, torch.ones_like(total)), zero)
     rows, weighted = J.flatten(2), (J * g[:, None, None]).flatten(2)
     A = (weighted.detach() if far else weighted) @ rows.transpose(1, 2)
     b = (weighted @ residual.flatten(1)[:, :, None])[:, :, 0]

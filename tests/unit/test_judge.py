@@ -22,11 +22,11 @@ from hybridvo.pose import second_look
 from hybridvo.pose.coarse import CoarseSearch, search_motions, whole_mask
 from hybridvo.pose.options import RefinementOptions
 from hybridvo.pose.refinement import refine
-from hybridvo.pose.second_look import Motions, Opinion
+from hybridvo.pose.second_look import Motions, Opinion, Proposal
 from hybridvo.training import judge_data
 from hybridvo.training.judge_batches import PictureBatch, ego_flow_error, read_batches
 from hybridvo.training.judge_loop import JudgeTrainer, JudgeTrainingOptions
-from hybridvo.types import Reason, State
+from hybridvo.types import FramePair, Reason, State
 
 CELL = Cell(moving=0.6, objects=1, flow_noise_px=0.3, depth_noise=0.01)
 SIZE = {"height": 96, "width": 224}
@@ -129,8 +129,15 @@ def test_weights_round_trip(network: JudgeNetwork, tmp_path: Path) -> None:
 class Oracle:
     """A judge that knows where the world is, for testing what is done with its answers."""
 
-    def __init__(self, static: np.ndarray, prefer: str, trust: float = 0.9) -> None:
+    def __init__(
+        self,
+        static: np.ndarray,
+        prefer: str,
+        trust: float = 0.9,
+        proposal: Proposal | None = None,
+    ) -> None:
         self.static, self.prefer, self.trust = static, prefer, trust
+        self.proposal, self.asked = proposal, 0
 
     def first_look(self, grid, motions: Motions, T_last, masks: int) -> Opinion:
         best = np.arange(min(masks, len(motions.poses)))
@@ -142,6 +149,13 @@ class Oracle:
         score = np.concatenate([old, new])
         best = np.array([score.argmax()])
         return Opinion(score, best, self.static[None], self.trust)
+
+
+    def propose(self, pair: FramePair) -> Proposal | None:
+        self.asked += 1
+        # convinced once it has said something itself
+        self.trust = self.trust if self.proposal is None else 0.95
+        return self.proposal
 
 
 def gap(T: np.ndarray, pair, truth) -> float:
@@ -174,6 +188,38 @@ def test_an_uncertain_judge_does_not_hurt() -> None:
     # an empty mask cannot be fitted in: the motions of the search remain
     answer = refine(pair, judge=Oracle(0 * static, "search"))
     assert all(h.source != "second-look" for h in answer.hypotheses) and answer.ok
+
+
+def test_a_judge_without_trust_proposes_a_motion_of_its_own() -> None:
+    found, pair, truth = search(4)
+    nowhere = np.zeros(found.shape[:2], np.float32)  # the judge's masks are of no use
+    static = (~truth["moving"]).astype(np.float32)
+    told = refine(pair, weights=static)
+    judge = Oracle(nowhere, "refit", 0.3, Proposal(truth["T_curr_prev"], static[::2, ::2]))
+    answer = refine(pair, judge=judge)
+    assert judge.asked == 1 and answer.status.state is State.OK
+    assert gap(answer.T_curr_prev, pair, truth) < gap(told.T_curr_prev, pair, truth) + 0.02
+    # one that trusts what was found is not asked; one without an idea leaves the classical answer
+    sure = Oracle(nowhere, "search", 0.95, judge.proposal)
+    refine(pair, judge=sure)
+    silent = Oracle(nowhere, "search", 0.3)
+    answer = refine(pair, judge=silent)
+    assert sure.asked == 0 and silent.asked == 1
+    np.testing.assert_array_equal(answer.T_curr_prev, refine(pair).T_curr_prev)
+
+
+def test_maps_of_any_resolution_are_seen_on_the_grid() -> None:
+    found, pair, _ = search(4)
+    height, width = pair.prev.camera.shape
+    stride = found.shape[2]
+    u, v = np.meshgrid(np.arange(width), np.arange(height))
+    ramp = (0.3 * u + 0.7 * v).astype(np.float32)
+    exact = ramp[stride // 2 :: stride, stride // 2 :: stride]
+    np.testing.assert_allclose(found.on_grid(ramp), exact, atol=1e-3)
+    # a cell of half the resolution stands for four pixels, whose mean it is
+    half = ramp.reshape(height // 2, 2, width // 2, 2).mean((1, 3))
+    inner = found.on_grid(half)[1:-1, 1:-1]
+    np.testing.assert_allclose(inner, exact[1:-1, 1:-1], atol=0.1)
 
 
 def test_a_clear_motion_is_not_put_before_the_judge() -> None:

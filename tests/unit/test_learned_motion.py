@@ -1,0 +1,96 @@
+"""What the hybrid takes from a pixel-wise network: its fitted motion and its static world."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from hybridvo.data.benchmark_pairs import Cell, make_pair
+from hybridvo.errors import InputError
+from hybridvo.geometry import rotation_angle
+from hybridvo.learned import fitted_motion, next_start, propose_motion, static_probability
+from hybridvo.network.inputs import assemble_inputs
+from hybridvo.network.passes import first_motions
+from hybridvo.network.pwvo import NetworkOptions, build_network
+from hybridvo.types import PixelwisePrediction
+
+STRIDE = 4
+
+
+@pytest.fixture(scope="module")
+def moving_pair():
+    return make_pair(Cell(moving=0.65, objects=1, flow_noise_px=0.1), 3, 128, 256)
+
+
+def told(pair, truth, doubt: float) -> tuple[PixelwisePrediction, object]:
+    """A prediction of no motion at all that knows where the world is."""
+    inputs = assemble_inputs(pair)
+    small = inputs.subsample(STRIDE)
+    moving = torch.from_numpy(truth["moving"])[STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE]
+    s = torch.where(moving, doubt, 0.0)[None, None].repeat(1, 3, 1, 1).float()
+    assert tuple(s.shape[2:]) == small.size
+    return PixelwisePrediction(torch.zeros_like(s), torch.zeros_like(s), s - 3, s - 3), inputs
+
+
+def test_the_world_is_fitted_where_the_doubt_is_small(moving_pair) -> None:
+    pair, truth = moving_pair
+    R = truth["T_curr_prev"][:3, :3]
+    size = np.degrees(rotation_angle(R))
+    errors = {}
+    for doubt in (0.0, 2.0):
+        output, inputs = told(pair, truth, doubt)
+        T = fitted_motion(output, inputs)[0].double().numpy()
+        errors[doubt] = np.degrees(rotation_angle(T[:3, :3] @ R.T))
+    # 60 % of the picture move by themselves: without doubt they win
+    assert errors[2.0] < 0.1 * size < errors[0.0]
+    with pytest.raises(InputError, match="uncertainty"):
+        fitted_motion((torch.zeros(1, 3), torch.zeros(1, 3)), inputs)
+
+
+def test_static_probability_by_its_definition(moving_pair) -> None:
+    output, inputs = told(*moving_pair, 2.0)
+    valid = inputs.subsample(STRIDE).valid
+    p = static_probability(output.log_scale_rotation, valid)
+    moving = output.log_scale_rotation[:, 0] > -2
+    assert p[~valid].abs().sum() == 0
+    assert p[valid & ~moving].min() > 0.9 and p[valid & moving].max() < 0.1
+    # adding a constant to s says nothing about where the world is
+    shifted = static_probability(output.log_scale_rotation + 1.5, valid)
+    torch.testing.assert_close(p, shifted, atol=1e-5, rtol=0)
+
+
+def test_passes_start_as_the_options_say(moving_pair) -> None:
+    pair, _ = moving_pair
+    inputs = assemble_inputs(pair)
+    common = {"width": 0.25, "scale_free": True, "passes": 2, "head_stride": 2, "input_stride": 2}
+    torch.manual_seed(0)
+    for start in ("selection", "fit"):
+        network = build_network(NetworkOptions(**common, pass_start=start)).eval()
+        with torch.no_grad():
+            T = first_motions(network, inputs, next_start(network), 1)
+            expected = fitted_motion(network(inputs), inputs)
+        assert torch.equal(T, expected) == (start == "fit")
+    for bad in ({"pass_start": "truth"}, {"later_quantile": 0.7}, {"kind": "vonet"}):
+        with pytest.raises(InputError):
+            NetworkOptions(**{**common, "pass_start": "fit", **bad})
+
+
+def test_proposals_are_finite_or_none(moving_pair) -> None:
+    pair, _ = moving_pair
+    torch.manual_seed(0)
+    options = NetworkOptions(
+        width=0.25, scale_free=True, passes=2, head_stride=2, input_stride=2, pass_start="fit"
+    )
+    network = build_network(options).eval()
+    proposal = propose_motion(network, pair)
+    assert proposal is not None and proposal.static.shape == (32, 64)
+    assert np.isfinite(proposal.T_curr_prev).all()
+    assert (proposal.static >= 0).all() and (proposal.static <= 1).all()
+    with torch.no_grad():
+        network.head_uncertainty[2].bias.fill_(torch.nan)
+    damaged = propose_motion(network, pair)
+    assert damaged is None or np.isfinite(damaged.static).all()
+    empty, _ = make_pair(Cell(), 3, 128, 256)
+    empty.flow[:] = np.nan
+    assert propose_motion(network, empty) is None
