@@ -15,7 +15,7 @@ import os
 import platform
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +47,8 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
             compiled = numba.njit(**options)(function)
         except RuntimeError:  # numba: no locator available
             return numba.njit(**options | {"cache": False})(function)
-        _cached.append(compiled)
+        if hasattr(compiled, "stats"):  # not where numba is switched off
+            _cached.append(compiled)
         cache = getattr(compiled, "_cache", None)
         for name in ("save_overload", "load_overload"):
             if hasattr(cache, name):
@@ -77,16 +78,17 @@ def compile_once(code: str, sources: Path, name: str) -> bool:
 
     Args:
         code: Python that compiles them.
-        sources: folder of the files that define them; a change there makes it the first time again.
+        sources: folder of the files that define them; a change of one makes it the first time.
         name: of this set of kernels, a plain word.
 
     Returns:
         Whether they are in the cache now.
     """
-    folder = _cache_folder(sources)
-    if folder is None or not sys.executable or getattr(sys, "frozen", False):
+    kernels = [k for k in _cached if _file(k).parent == sources and k.stats.cache_path]
+    if not kernels or not sys.executable or getattr(sys, "frozen", False):
         return False
-    mark = folder / f"{name}-{_fingerprint(sources)}.compiled"
+    folder = Path(kernels[0].stats.cache_path)
+    mark = folder / f"{name}-{_fingerprint({_file(k) for k in kernels})}.compiled"
     if mark.exists():
         return True
     _logger.warning("compiling the kernels, once on this machine: up to a minute ...")
@@ -113,16 +115,12 @@ def compile_once(code: str, sources: Path, name: str) -> bool:
     return True
 
 
-def _cache_folder(sources: Path) -> Path | None:
-    """Where the functions that are defined in a folder are cached."""
-    for kernel in _cached:
-        place = getattr(getattr(kernel, "stats", None), "cache_path", None)
-        if place and Path(kernel.py_func.__code__.co_filename).parent == sources:
-            return Path(place)
-    return None
+def _file(kernel: Any) -> Path:
+    """Where a function is defined."""
+    return Path(kernel.py_func.__code__.co_filename)
 
 
-def _fingerprint(sources: Path) -> str:
+def _fingerprint(sources: Iterable[Path]) -> str:
     """Of what numba's cache depends on: the code, the compiler and the processor."""
     import llvmlite
     from llvmlite import binding
@@ -133,6 +131,6 @@ def _fingerprint(sources: Path) -> str:
         *(binding.get_host_cpu_name(), binding.get_host_cpu_features().flatten()),
     ):
         digest.update(f"{word}\0".encode())
-    for path in sorted(sources.glob("*.py")):
+    for path in sorted(sources):
         digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
