@@ -19,6 +19,7 @@ import numpy as np
 from hybridvo.errors import InputError
 from hybridvo.pose import photometric_kernels as kernels
 from hybridvo.pose.photometric_images import MID_GREY, Level, blurred, grey_image, match_blur
+from hybridvo.pose.photometric_light import local_correlation
 from hybridvo.pose.photometric_options import PhotometricOptions, PolishReport
 from hybridvo.pose.photometric_problem import Problem, State, inverse, small_log
 from hybridvo.pose.picture import as_given
@@ -146,7 +147,13 @@ def _guarded(
     used = problem.w > 0
     weight = problem.buffer[kernels.W][used]
     grey = problem.buffer[kernels.GREY][used]
-    correlation = _correlation(grey, problem.r[used] + state.gain * grey + state.offset, weight)
+    seen = problem.r[used] + state.gain * grey + state.offset
+    if problem.uneven_light:
+        index, shape = problem.index[used], problem.pair.prev.camera.shape
+        given = level.prev[index[:, 0], index[:, 1]]  # without the fields
+        correlation = local_correlation(index, shape, given, seen, weight)
+    else:
+        correlation = _correlation(grey, seen, weight)
     H = problem.marginal()[0]
     images = problem.trust * problem.share * H
     shift = small_log(state.T @ problem.T_flow_inverse)

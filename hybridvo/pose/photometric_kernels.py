@@ -305,23 +305,30 @@ def normal_equations(J, r, w, n, columns, H, g):
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
-def tile_scores(index, n, J, r, w, tile, columns, light, scores, meat):
-    """Sum of J w r of the pose per tile (``scores``), and of its outer products (``meat``).
+def tile_scores(index, n, J, r, w, tile, columns, light, scores, curvature, meat):
+    """Sums of J w r of the pose per tile, their ``curvature`` (J w J^T), and outer products.
 
-    ``light`` (6, 2) takes the part of each pose column that gain and offset explain out of it.
+    ``light`` (6, 2) takes the part of each pose column that gain and offset explain out of it;
+    ``meat`` (6, 6) gets the outer products of all pixels.
     """
     row = np.empty(POSE_COLUMNS)
     for k in range(n):
-        if not w[k] > ZERO:
+        weight = w[k]
+        if not weight > ZERO:
             continue
-        s = w[k] * r[k]
         cell = (index[k, 0] // tile) * columns + index[k, 1] // tile
         for p in range(POSE_COLUMNS):
-            row[p] = s * (J[p, k] - light[p, 0] * J[6, k] - light[p, 1] * J[7, k])
-            scores[cell, p] += row[p]
+            row[p] = J[p, k] - light[p, 0] * J[6, k] - light[p, 1] * J[7, k]
+        s = weight * r[k]
+        ss = s * s
         for p in range(POSE_COLUMNS):
+            scores[cell, p] += s * row[p]
             for q in range(p + 1):
-                meat[p, q] += row[p] * row[q]
+                product = row[p] * row[q]
+                curvature[cell, p, q] += weight * product
+                meat[p, q] += ss * product
     for p in range(POSE_COLUMNS):
         for q in range(p + 1, POSE_COLUMNS):
             meat[p, q] = meat[q, p]
+            for cell in range(curvature.shape[0]):
+                curvature[cell, p, q] = curvature[cell, q, p]

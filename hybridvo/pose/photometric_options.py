@@ -91,6 +91,9 @@ class PolishReport:
         noise_grey: standard deviation of the residual, grey levels.
         correlation: of the two pictures over the pixels used.
         pixels: how many were used.
+        agreement: factor in (0, 1] on the information of the images by which the parts of the
+            picture, held against each other, lowered it.
+        uneven_light: whether gain and offset had to vary over the picture.
         depth_shift_px: (2,) shift (right, down) of the depth map against the picture that would
             explain the residuals best, px.
         depth_shift_information: (2, 2) of it.
@@ -108,5 +111,7 @@ class PolishReport:
     noise_grey: float = 0.0
     correlation: float = 0.0
     pixels: int = 0
+    agreement: float = 1.0
+    uneven_light: bool = False
     depth_shift_px: np.ndarray = field(default_factory=lambda: np.zeros(2))
     depth_shift_information: np.ndarray = field(default_factory=lambda: np.zeros((2, 2)))

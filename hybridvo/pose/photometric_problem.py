@@ -24,7 +24,7 @@ TILES = 110
 PARTS = ((2, 2), (4, 1))
 """Rows and columns of parts of the picture that are held against each other: a lens errs by
 quadrant, a rolling shutter by row."""
-EVEN = 0.6
+EVEN = 0.7
 """Dispersion of the parts' scores, as shares of the model's, below which they agree: rendered pairs
 have 0.25 in the median, 0.55 at the 90th percentile; with a rolling shutter 1.0 and 2.0."""
 NOISE_PIXELS = 2000
@@ -151,17 +151,21 @@ class Problem:
         height, width = self.pair.prev.camera.shape
         tile = tile_size((height, width), TILES)
         columns, rows = -(-width // tile), -(-height // tile)
-        scores = np.zeros((rows * columns, kernels.POSE_COLUMNS))
-        meat = np.zeros((kernels.POSE_COLUMNS,) * 2)
+        c = kernels.POSE_COLUMNS
+        scores, curvature = np.zeros((rows * columns, c)), np.zeros((rows * columns, c, c))
+        meat = np.zeros((c, c))
         H, light = self.marginal()
         kernels.tile_scores(
-            self.index, self.n, self.J, self.r, self.w, tile, columns, light, scores, meat
-        )
+            self.index, self.n, self.J, self.r, self.w, tile, columns, light, scores, curvature,
+            meat,
+        )  # fmt: skip
         model = inverse(H)
         independent = inverse(meat)
         if model is None or independent is None:
             self.share = 0.0
             return
+        # as at the optimum of the images alone, to first order: the flow pulls away from it
+        scores -= curvature @ (model @ scores.sum(axis=0))
         clusters = max(1.0, np.trace(independent @ scores.T @ scores) / 6)
         dispersion = np.trace(model @ meat) / 6
         self.share = 1.0 / (max(1.0, clusters * dispersion) * self.options.image_inflation)
@@ -285,10 +289,9 @@ def _dispersion(scores: np.ndarray, model: np.ndarray) -> float:
         )
         sums = np.zeros((*shape, scores.shape[2]))
         np.add.at(sums, np.ix_(rows, columns), scores)
-        sums = sums.reshape(-1, scores.shape[2])
-        k = len(sums)
-        sums -= sums.mean(axis=0)  # at the joint optimum the flow takes a part of the sum
-        found.append(np.einsum("bp,pq,bq->", sums, model, sums) / 6 * k / (k - 1))
+        parts = sums.reshape(-1, scores.shape[2])
+        k = len(parts)
+        found.append(np.einsum("bp,pq,bq->", parts, model, parts) / 6 * k / (k - 1))
     return float(np.mean(found))
 
 
