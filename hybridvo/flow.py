@@ -266,7 +266,8 @@ def check_field(result: Any, prev: Frame, source: str, is_true: bool = False) ->
             f"previous grid, got {array.dtype} {array.shape}."
             + (" Transpose (2, H, W) first." if array.shape == (2, *expected[:2]) else "")
         )
-    flow = array.astype(np.float32)
+    with np.errstate(over="ignore"):  # beyond float32 is inf: no flow
+        flow = array.astype(np.float32)
     finite = np.asarray(np.isfinite(flow).all(axis=2))
     if finite.all():
         return FlowField(flow, source=source, is_true=is_true)

@@ -36,25 +36,33 @@ __all__ = [
 
 MAX_PIXELS = 2**28
 """Largest image, in pixels, that a frame or a file header may declare."""
+FOCAL_RANGE = (1e-3, 1e9)
+"""Focal lengths in pixels whose inverses and squares single precision can hold."""
 
 
 def _as_float_image(value: Any, name: str, channels: int | None) -> np.ndarray:
     """Numpy view (or native-endian float32 copy) of an (H, W[, channels]) image of real numbers."""
     array = np.asarray(value)
     expected = "(H, W)" if channels is None else f"(H, W, {channels})"
-    ndim = 2 if channels is None else 3
     if array.ndim == 3 and channels is None and array.shape[2] == 1:
         array = array[:, :, 0]
-    if array.ndim != ndim or (channels is not None and array.shape[2] != channels):
+    if array.ndim < 2 or array.shape[2:] != (() if channels is None else (channels,)):
         raise InputError(f"{name}: expected shape {expected}, got {array.shape}.")
     if array.dtype.kind != "f":
         raise InputError(
             f"{name}: expected a floating-point array, got dtype {array.dtype}. "
             f"Convert to metres (depth) or pixels (flow) as float32 first."
         )
-    if array.dtype != np.float32:
-        array = array.astype(np.float32)
-    return array
+    with np.errstate(over="ignore"):  # beyond float32 is inf, which is invalid
+        return array.astype(np.float32, copy=False)
+
+
+def _number(value: Any) -> float:
+    """A value as float; NaN where it is no number."""
+    try:
+        return float(value)
+    except (TypeError, ValueError, OverflowError):
+        return float("nan")
 
 
 @dataclass(frozen=True)
@@ -67,8 +75,8 @@ class Camera:
         height, width: image size in pixels.
 
     Raises:
-        InputError: a value that is not finite, a focal length that is not positive, an image size
-            that is not positive, or a principal point farther than one image size outside.
+        InputError: a value that is not finite, a focal length outside ``FOCAL_RANGE``, an image
+            size that is not positive, or a principal point farther than one image size outside.
     """
 
     fx: float
@@ -81,27 +89,25 @@ class Camera:
     def __post_init__(self) -> None:
         for name in ("fx", "fy", "cx", "cy"):
             value = getattr(self, name)
-            try:
-                value = float(value)
-            except (TypeError, ValueError):
-                raise InputError(f"Camera.{name}: expected a number, got {value!r}.") from None
-            if not np.isfinite(value):
-                raise InputError(f"Camera.{name}: expected a finite number, got {value}.")
-            object.__setattr__(self, name, value)
+            number = _number(value)
+            if not np.isfinite(number):
+                raise InputError(f"Camera.{name}: expected a finite number, got {value!r}.")
+            object.__setattr__(self, name, number)
         for name in ("height", "width"):
             value = getattr(self, name)
-            if isinstance(value, bool) or int(value) != value or value <= 0:
+            number = _number(value)
+            if isinstance(value, bool) or not 0 < number < np.inf or number % 1:
                 raise InputError(f"Camera.{name}: expected a positive integer, got {value!r}.")
-            object.__setattr__(self, name, int(value))
+            object.__setattr__(self, name, int(number))
         if self.height * self.width > MAX_PIXELS:
             raise InputError(
                 f"Camera: {self.width}x{self.height} pixels is above the limit of {MAX_PIXELS}."
             )
         for name in ("fx", "fy"):
-            if getattr(self, name) <= 0:
+            if not FOCAL_RANGE[0] <= getattr(self, name) <= FOCAL_RANGE[1]:
                 raise InputError(
-                    f"Camera.{name}: expected a positive focal length in pixels, "
-                    f"got {getattr(self, name)}."
+                    f"Camera.{name}: expected a positive focal length in pixels ({FOCAL_RANGE[0]:g}"
+                    f" to {FOCAL_RANGE[1]:g}), got {getattr(self, name)}."
                 )
         for name, size in (("cx", self.width), ("cy", self.height)):
             value = getattr(self, name)
@@ -155,7 +161,7 @@ class Frame:
         mask: (H, W) bool, True where pixels may be used, or None.
 
     Raises:
-        InputError: shapes that do not match the camera, or dtypes that cannot be meant.
+        InputError: shapes that do not match the camera, wrong dtypes, a stamp that is not finite.
     """
 
     rgb: np.ndarray | None
@@ -182,14 +188,11 @@ class Frame:
                 )
             self._check_size("rgb", rgb)
             object.__setattr__(self, "rgb", rgb)
-        if self.depth is not None:
-            depth = _as_float_image(self.depth, "Frame.depth", None)
-            self._check_size("depth", depth)
-            object.__setattr__(self, "depth", depth)
-        if self.depth_variance is not None:
-            variance = _as_float_image(self.depth_variance, "Frame.depth_variance", None)
-            self._check_size("depth_variance", variance)
-            object.__setattr__(self, "depth_variance", variance)
+        for name in ("depth", "depth_variance"):
+            if getattr(self, name) is not None:
+                array = _as_float_image(getattr(self, name), f"Frame.{name}", None)
+                self._check_size(name, array)
+                object.__setattr__(self, name, array)
         if self.mask is not None:
             mask = np.asarray(self.mask)
             if mask.dtype != np.bool_ or mask.ndim != 2:
@@ -198,7 +201,10 @@ class Frame:
                 )
             self._check_size("mask", mask)
             object.__setattr__(self, "mask", mask)
-        object.__setattr__(self, "timestamp", float(self.timestamp))
+        stamp = _number(self.timestamp)
+        if not np.isfinite(stamp):
+            raise InputError(f"Frame.timestamp: expected finite seconds, got {self.timestamp!r}.")
+        object.__setattr__(self, "timestamp", stamp)
 
     def _check_size(self, name: str, array: np.ndarray) -> None:
         if array.shape[:2] != self.camera.shape:
@@ -251,12 +257,10 @@ class FramePair:
                 f"{self.curr.camera.shape} (height, width). All frames must have one size; resize "
                 f"with hybridvo.data.resize.resize_frame."
             )
-        if self.flow is not None:
-            flow = _as_float_image(self.flow, "FramePair.flow", 2)
-            self._check("flow", flow, shape)
-        if self.flow_variance is not None:
-            variance = _as_float_image(self.flow_variance, "FramePair.flow_variance", None)
-            self._check("flow_variance", variance, shape)
+        for name, channels in (("flow", 2), ("flow_variance", None)):
+            if getattr(self, name) is not None:
+                array = _as_float_image(getattr(self, name), f"FramePair.{name}", channels)
+                self._check(name, array, shape)
         if self.flow_valid is not None:
             valid = np.asarray(self.flow_valid)
             if valid.dtype != np.bool_:
@@ -321,10 +325,6 @@ class Status:
         return self.state.value + (f"({self.reason.value})" if self.reason.value else "")
 
 
-def _identity() -> np.ndarray:
-    return np.eye(4)
-
-
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
     """One strong motion found in the picture.
@@ -373,7 +373,7 @@ class RelativePose:
         polish: :class:`hybridvo.pose.photometric.PolishReport` where images were asked, or None.
     """
 
-    T_curr_prev: np.ndarray = field(default_factory=_identity)
+    T_curr_prev: np.ndarray = field(default_factory=lambda: np.eye(4))
     covariance: np.ndarray = field(default_factory=lambda: np.eye(6))
     status: Status = field(default_factory=Status)
     inlier_ratio: float = 0.0

@@ -194,6 +194,8 @@ def initialize(network: nn.Module, uniform: tuple[nn.Module, ...] = ()) -> None:
     heads = {id(m) for head in uniform for m in head.modules()}
     for module in network.modules():
         if isinstance(module, nn.Conv2d | nn.ConvTranspose2d | nn.Linear):
+            if module.weight.is_meta:  # no memory to fill, and torch would load its compiler for it
+                continue
             if id(module) in heads:
                 nn.init.xavier_uniform_(module.weight)
             else:
