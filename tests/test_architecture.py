@@ -67,7 +67,9 @@ IMPORTS: dict[str, set[str]] = {
 ONLY_IN = {
     "evo": {"evaluation/metrics.py", "trajectory.py"},
     "evo.core.metrics": {"evaluation/metrics.py"},
-    "matplotlib": {f"evaluation/plots{part}.py" for part in ("", "_comparison", "_maps")},
+    "matplotlib": {
+        f"evaluation/plots{part}.py" for part in ("", "_calibration", "_comparison", "_maps")
+    },
 }
 """Module -> the files that may import it."""
 
