@@ -12,8 +12,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numba import njit
 
+from hybridvo.compilation import njit
 from hybridvo.pose.photometric_kernels import GREY, GX, GY, ONE, ZERO
 
 if TYPE_CHECKING:
@@ -58,9 +58,7 @@ def even_light(problem: Problem, state: State, least: float = 0.0) -> bool:
     field, _ = _fit(problem, steps, 1)
     if not np.isfinite(field).all():
         return False
-    apply_field(
-        problem.index, problem.n, field, state.gain, *steps, problem.buffer, problem.r
-    )  # fmt: skip
+    _apply(problem, field.astype(np.float32).reshape(ROWS, COLUMNS, 2), np.float32(state.gain))
     return True
 
 
@@ -98,6 +96,26 @@ def _fit(problem: Problem, steps: tuple[float, float], every: int) -> tuple[np.n
     H[1::2, 1::2] += SMOOTH * weight * LAPLACE
     H[np.diag_indices(2 * NODES)] += ANCHOR * np.tile([power, weight], NODES) + 1e-12
     return np.linalg.solve(H, g), g
+
+
+def _apply(problem: Problem, field: np.ndarray, gain: np.float32) -> None:
+    """Grey values and gradients as under the fields (ROWS, COLUMNS, 2), residuals that follow.
+
+    ``gain`` is the pair's own, by which the grey values are multiplied afterwards.
+    """
+    height, width = problem.pair.prev.camera.shape
+    v = problem.index[:, 0] * np.float32((ROWS - 1) / height)
+    u = problem.index[:, 1] * np.float32((COLUMNS - 1) / width)
+    row, column = v.astype(np.intp), u.astype(np.intp)
+    fv, fu = (v - row)[:, None], (u - column)[:, None]
+    above = field[row, column] * (1 - fu) + field[row, column + 1] * fu
+    below = field[row + 1, column] * (1 - fu) + field[row + 1, column + 1] * fu
+    more, shift = (above * (1 - fv) + below * fv).T
+    buffer = problem.buffer
+    problem.r -= more * buffer[GREY] + shift
+    factor = ONE + more / gain
+    buffer[GREY] = factor * buffer[GREY] + shift / gain
+    buffer[[GX, GY]] *= factor
 
 
 def _laplace() -> np.ndarray:
@@ -143,26 +161,3 @@ def field_equations(index, n, every, grey, r, w, step_v, step_u, H, g):
                 H[p, q + 1] += t * a
                 H[p + 1, q] += t * a
                 H[p + 1, q + 1] += t
-
-
-@njit(error_model="numpy", cache=True, nogil=True)
-def apply_field(index, n, field, gain, step_v, step_u, buf, r):
-    """Grey values and gradients as under the fields, residuals that follow.
-
-    ``gain`` is the pair's own, by which the grey values are multiplied afterwards.
-    """
-    below = 2 * COLUMNS
-    for k in range(n):
-        v, u = index[k, 0] * step_v, index[k, 1] * step_u
-        row, column = int(v), int(u)
-        fv, fu = v - row, u - column
-        p = 2 * (row * COLUMNS + column)
-        a, b, c, d = (1 - fv) * (1 - fu), (1 - fv) * fu, fv * (1 - fu), fv * fu
-        more = a * field[p] + b * field[p + 2] + c * field[p + below] + d * field[p + below + 2]
-        p += 1
-        shift = a * field[p] + b * field[p + 2] + c * field[p + below] + d * field[p + below + 2]
-        factor = np.float32(ONE + more / gain)
-        r[k] -= np.float32(more * buf[GREY, k] + shift)
-        buf[GREY, k] = factor * buf[GREY, k] + np.float32(shift / gain)
-        buf[GX, k] *= factor
-        buf[GY, k] *= factor
