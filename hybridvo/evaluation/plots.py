@@ -215,7 +215,7 @@ def plot_benchmark(
         x = np.arange(len(cells)) + (k - (len(methods) - 1) / 2) * spacing
         handles.append(
             left.errorbar(
-                x, middle, [middle - low, high - middle], color=colours[k % len(colours)],
+                x, middle, np.stack([middle - low, high - middle]), color=colours[k % len(colours)],
                 marker=_MARKERS[k % len(_MARKERS)], markersize=4.5, linestyle="none",
                 elinewidth=1.0, clip_on=False,
             )
