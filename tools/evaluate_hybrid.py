@@ -74,6 +74,7 @@ def measure(args: argparse.Namespace) -> dict[str, Any]:
     from hybridvo.comparison.hybrid_summary import summarise
     from hybridvo.errors import InputError
     from hybridvo.evaluation.report import write_csv
+    from hybridvo.pose.refinement import RECALIBRATION
     from hybridvo.training.provenance import source_commit
 
     def progress(line: str) -> None:
@@ -128,7 +129,8 @@ def measure(args: argparse.Namespace) -> dict[str, Any]:
         },
         "missing": absent,
         "cpu_s": time.process_time() - started,
-        **summarise(records, paths),
+        "map": RECALIBRATION,
+        **summarise(records, paths, RECALIBRATION),
     }
 
 
@@ -138,14 +140,17 @@ def _write(args: argparse.Namespace, result: dict[str, Any]) -> None:
 
     write_json(args.out, result)
     print(args.out)
-    groups = {k: v["right"] for k, v in result["reliability"].items() if k != "sequences"}
+    groups = {k: v["stated"] for k, v in result["reliability"].items() if k != "sequences"}
     if groups:
         picture = args.out.with_suffix(".png")
-        plot_calibration(groups, picture, title="hybrid-flow: is the judge's probability right?")
+        plot_calibration(groups, picture, title="hybrid-flow: is the stated probability right?")
         print(picture)
     for goal in result["goals"]:
         value = "not measured" if goal["value"] is None else f"{goal['value']:.3g}"
         print(f"{goal['what']}: {value} (goal {goal['goal']:.3g}, met: {goal['met']})")
+    if result["recalibration"]:
+        print(f"map shipped: {result['map']}")
+        print(f"map fitted to these answers: {result['recalibration']['fit']['coefficients']}")
 
 
 def _fill_page(args: argparse.Namespace) -> int:

@@ -11,8 +11,13 @@ __all__ = ["START", "STOP", "fill", "section"]
 
 START, STOP = "<!-- from {name}.json -->", "<!-- end -->"
 NOT_MEASURED = "-"
-SHOWN = (0.5, 0.6, 0.7, 0.8, 0.9)
+SHOWN = (0.5, 0.7, 0.8, 0.85, 0.9)
 """Thresholds of the page, among those of the JSON."""
+EVENTS = {
+    "stated": "of the status, no failure",
+    "judge": "the judge's own, no failure",
+    "judge_right": "the judge's own, error <= 1 px at width 1024",
+}
 
 
 def fill(page: str, name: str, result: Mapping[str, Any]) -> str:
@@ -100,9 +105,8 @@ def section(result: Mapping[str, Any], name: str) -> str:
         *_reliability(result["reliability"]),
         "### What another threshold would flag",
         "",
-        "Share of the failures / of the right answers below it. *Recalibrated*: a logistic map of "
-        "the stated probability, the flow's noise and the motion's share of the picture, fitted to "
-        "the other kinds of scenes.",
+        "Share of the failures / of the right answers below it: of the probability that the status "
+        "states, of the judge's own, and of a map fitted to the other kinds of scenes.",
         "",
         *_thresholds(result),
     ]
@@ -195,19 +199,20 @@ def _reliability(groups: Mapping[str, Any]) -> list[str]:
     rows = []
     for name, events in groups.items():
         for event, row in events.items():
-            what = "error <= 1 px at width 1024" if event == "right" else "no failure"
+            what = EVENTS[event]
             rows.append((name, what, str(row["answers"]), *(number(row[key]) for key in (
                 "stated", "right", "brier", "brier_base_rate", "ece"))))  # fmt: skip
-    head = ("answers of", "event", "judged", "stated", "observed", "Brier",
+    head = ("answers of", "probability", "judged", "stated", "observed", "Brier",
             "Brier of the base rate", "ECE")  # fmt: skip
     return table(head, rows)
 
 
 def _thresholds(result: Mapping[str, Any]) -> list[str]:
     rows = []
-    new = result["recalibration"]["leave_one_kind_out"]
+    new = result["recalibration"].get("leave_one_kind_out", {})
     for name, found in result["thresholds"].items():
-        for kind, lines in (("stated", found), ("recalibrated", new[name]["thresholds"])):
+        tables = (*found.items(), ("fitted to the other kinds", new[name]["thresholds"]))
+        for kind, lines in tables:
             shown = [row for row in lines if row["threshold"] in SHOWN]
             pairs = [(row["failures_flagged"], row["right_degraded"]) for row in shown]
             rows.append((name, kind, *(f"{brief(a)} / {brief(b)}" for a, b in pairs)))

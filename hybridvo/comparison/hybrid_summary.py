@@ -20,7 +20,7 @@ from hybridvo.hybrid import JUDGED
 
 __all__ = ["THRESHOLDS", "goals", "summarise"]
 
-THRESHOLDS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
+THRESHOLDS = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.85, 0.9, 0.95)
 """Probabilities below which an answer could be degraded."""
 RATIOS = {"pnp-ransac-tuned": 0.1, "poselib": 1 / 3}
 """Method -> goal for the hybrid's ATE over its own."""
@@ -31,27 +31,54 @@ NEES_RANGE = (3.0, 12.0)
 Record = Mapping[str, Any]
 
 
-def summarise(records: Sequence[Record], paths: Sequence[Record]) -> dict[str, Any]:
+def summarise(
+    records: Sequence[Record],
+    paths: Sequence[Record],
+    coefficients: Mapping[str, float] | None = None,
+) -> dict[str, Any]:
     """Everything but the conditions.
 
     Args:
         records: one per answer, of sequences (flow ``true``, ``true+noise``, ``dis``) and of cells
             (flow ``cell``).
         paths: one per sequence, flow and method.
+        coefficients: of the map that the status applies to the judge's probability, see
+            :func:`hybridvo.evaluation.calibration.recalibrate`; None for none.
 
     Returns:
         ``sequences`` (``paths`` as they are), ``ate``, ``failures``, ``nees``, ``flags``,
         ``reliability``, ``thresholds``, ``recalibration`` and ``goals``.
     """
+    groups = _groups(records)
+    own = {name: [r["probability"] for r in group] for name, group in groups.items()}
+    stated = own
+    if coefficients is not None:
+        stated = {
+            name: recalibrated(own[name], _evidence(group), coefficients).tolist()
+            for name, group in groups.items()
+        }
     result = {
         "sequences": [dict(row) for row in paths],
         "ate": _ate(paths),
         "failures": _by(records, _failures, kinds=True),
         "nees": _by(records, _nees, cells=True),
         "flags": _by(records, flag_cost, cells=True),
-        "reliability": _reliability(records),
-        "thresholds": _thresholds(records),
-        "recalibration": _recalibration(records),
+        "reliability": {
+            name: {
+                "stated": reliability(stated[name], _good(group)),
+                "judge": reliability(own[name], _good(group)),
+                "judge_right": reliability(own[name], [r["right"] for r in group]),
+            }
+            for name, group in groups.items()
+        },
+        "thresholds": {
+            name: {
+                "stated": _flagged(stated[name], _good(group)),
+                "judge": _flagged(own[name], _good(group)),
+            }
+            for name, group in groups.items()
+        },
+        "recalibration": _recalibration(groups),
     }
     return result | {"goals": goals(result)}
 
@@ -153,30 +180,8 @@ def _groups(records: Sequence[Record]) -> dict[str, list[Record]]:
     return {name: group for name, group in groups.items() if group}
 
 
-def _reliability(records: Sequence[Record]) -> dict[str, Any]:
-    """Of the stated probability: for the judge's own pixel, and for a failure as counted here."""
-    return {
-        name: {
-            "right": reliability(_stated(group), [r["right"] for r in group]),
-            "no_failure": reliability(_stated(group), _good(group)),
-        }
-        for name, group in _groups(records).items()
-    }
-
-
-def _stated(group: Sequence[Record]) -> list[float]:
-    return [r["probability"] for r in group]
-
-
 def _good(group: Sequence[Record]) -> list[bool]:
     return [not r["failure"] for r in group]
-
-
-def _thresholds(records: Sequence[Record]) -> dict[str, Any]:
-    """What every threshold on the probability would flag."""
-    return {
-        name: _flagged(_stated(group), _good(group)) for name, group in _groups(records).items()
-    }
 
 
 def _flagged(stated: Iterable[float], good: Iterable[bool]) -> list[dict[str, Any]]:
@@ -192,37 +197,41 @@ def _flagged(stated: Iterable[float], good: Iterable[bool]) -> list[dict[str, An
     ]
 
 
-def _recalibration(records: Sequence[Record]) -> dict[str, Any]:
-    """The probability with the flow's noise and the motion's share as evidence.
-
-    Fitted on these very answers; ``thresholds`` and ``reliability`` are of fits that did not see
-    the answer's kind (leave one kind out).
-    """
-    group = [r for rows in _groups(records).values() for r in rows]
-    group = list({id(r): r for r in group}.values())
-    if not group:
-        return {}
-    stated, good = np.array(_stated(group)), np.array(_good(group))
-    evidence = {
-        "log_noise_px": np.log(np.maximum([r["noise_px"] for r in group], LEAST_NOISE_PX)),
+def _evidence(group: Sequence[Record]) -> dict[str, np.ndarray]:
+    """What the judge's probability leaves out."""
+    noise = np.array([r["noise_px"] for r in group])
+    return {
+        "log_noise_px": np.log(np.maximum(noise, LEAST_NOISE_PX)),
         "share": np.array([r["share"] for r in group]),
     }
-    kinds = np.array([r["kind"] for r in group])
-    left_out = np.empty(len(group))
+
+
+def _recalibration(groups: Mapping[str, list[Record]]) -> dict[str, Any]:
+    """The map fitted anew: ``fit``, on these very answers, for development alone.
+
+    ``leave_one_kind_out``: thresholds and reliability of fits that did not see the answer's kind.
+    """
+    records = list({id(r): r for rows in groups.values() for r in rows}.values())
+    if not records:
+        return {}
+    own = np.array([r["probability"] for r in records])
+    good, evidence = np.array(_good(records)), _evidence(records)
+    kinds = np.array([r["kind"] for r in records])
+    left_out = np.empty(len(records))
     for kind in np.unique(kinds):
         seen, mine = kinds != kind, kinds == kind
-        fit = recalibrate(stated[seen], good[seen], {k: v[seen] for k, v in evidence.items()})
+        fit = recalibrate(own[seen], good[seen], {k: v[seen] for k, v in evidence.items()})
         held_out = {k: v[mine] for k, v in evidence.items()}
-        left_out[mine] = recalibrated(stated[mine], held_out, fit["coefficients"])
-    value = {id(r): float(p) for r, p in zip(group, left_out, strict=True)}
+        left_out[mine] = recalibrated(own[mine], held_out, fit["coefficients"])
+    value = {id(r): float(p) for r, p in zip(records, left_out, strict=True)}
     table = {}
-    for name, rows in _groups(records).items():
+    for name, rows in groups.items():
         new = [value[id(r)] for r in rows]
         table[name] = {
             "thresholds": _flagged(new, _good(rows)),
             "reliability": reliability(new, _good(rows)),
         }
-    return {"fit": recalibrate(stated, good, evidence), "leave_one_kind_out": table}
+    return {"fit": recalibrate(own, good, evidence), "leave_one_kind_out": table}
 
 
 def goals(result: Mapping[str, Any]) -> list[dict[str, Any]]:

@@ -18,6 +18,7 @@ from hybridvo.evaluation.calibration import (
 )
 from hybridvo.evaluation.plots_calibration import plot_calibration
 from hybridvo.geometry import se3_exp
+from hybridvo.pose.refinement import RECALIBRATION, probability_right
 
 
 def test_three_sigma_is_scipys():
@@ -110,6 +111,20 @@ def test_temperature_and_evidence_are_found_again():
     assert found["loss_after"] < found["loss_before"]
     # stated logits are cut at 1e-4, where one in a thousand of these lies
     assert np.abs(recalibrated(stated, {"e": e}, coefficients) - truth).mean() < 0.01
+
+
+def test_the_status_states_the_recalibrated_probability():
+    noise, share = np.array([0.001, 0.4, 1.3]), np.array([0.9, 0.3, 0.5])
+    trust = np.array([0.99999, 0.5, 0.7])
+    evidence = {"log_noise_px": np.log(np.maximum(noise, 0.02)), "share": share}
+    np.testing.assert_allclose(
+        [probability_right(*row) for row in zip(trust, noise, share, strict=True)],
+        recalibrated(trust, evidence, RECALIBRATION),
+        rtol=1e-12,
+    )
+    # surer of itself: surer; the same word where more noise was to be expected: surer
+    assert probability_right(0.9, 0.5, 0.4) > probability_right(0.8, 0.5, 0.4)
+    assert probability_right(0.8, 1.0, 0.4) > probability_right(0.8, 0.1, 0.4)
 
 
 def test_few_or_separable_answers_keep_a_finite_map():
