@@ -180,13 +180,28 @@ def _guarded(
         if isinstance(error, OutputError):
             return EXIT_OUTPUT
         return EXIT_LOCKED if isinstance(error, LockedError) else EXIT_INPUT
-    except Exception:
+    except Exception as error:
+        if lack := _lack_of_memory(error):
+            if args.verbose:
+                traceback.print_exc()
+            _complain(lack)
+            return EXIT_INPUT
         traceback.print_exc()
         _complain("this is a bug in hybridvo; please report it with the lines above.")
         return EXIT_BUG
     finally:
         logger.removeHandler(handler)
         logger.setLevel(before)
+
+
+def _lack_of_memory(error: Exception) -> str:
+    """What to say where memory is exhausted, else nothing. torch's error is known by its name."""
+    if isinstance(error, MemoryError):
+        why = f" ({error})" if str(error) else ""
+        return f"out of memory{why}; smaller pictures, or fewer at a time, need less."
+    if type(error).__name__ == "OutOfMemoryError":
+        return "the CUDA device is out of memory; use --device cpu, or smaller pictures."
+    return ""
 
 
 def _complain(message: str) -> None:

@@ -1,0 +1,178 @@
+"""Rows of the fault matrix that no other file has: F24, F29, F40 and F41 at the command line."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from hybridvo.cli import main
+from hybridvo.data.synthetic import make_scene, write_sintel
+
+FRAMES = 3
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Root of a data set in Sintel's layout with one sequence of three frames."""
+    root = tmp_path_factory.mktemp("sintel")
+    write_sintel(make_scene("static", 3, height=96, width=160, frames=FRAMES), root, "static")
+    return root
+
+
+def walk(root: Path) -> Path:
+    return root / "training" / "clean" / "static"
+
+
+def run(sequence: Path, out: Path, *options: object) -> int:
+    arguments = ["run", "--sequence", sequence, "--out", out, "-q", "--method", "refine", *options]
+    return main([str(part) for part in arguments])
+
+
+class Sentinel:
+    """Its pickle, where anybody loads it, leaves a file behind."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self):
+        return os.mkdir, (os.fspath(self.path),)
+
+
+def test_f24_a_pickle_in_place_of_any_input_runs_nothing(
+    dataset, tmp_path, capsys, record_property
+):
+    import pickle
+
+    ran = tmp_path / "ran"
+    content = pickle.dumps(Sentinel(ran))
+    pickle.loads(content)  # the trap works
+    ran.rmdir()
+    places = sorted(path for path in dataset.rglob("*") if path.is_file())
+    record_property("tries", len(places) + 3)
+    tested = set()
+    for number, place in enumerate(places):
+        root = tmp_path / f"copy{number}"
+        shutil.copytree(dataset, root)
+        (root / place.relative_to(dataset)).write_bytes(content)
+        code = run(walk(root), tmp_path / f"out{number}", "--flow", "auto", "--max-failed", "1")
+        # a damaged flow is replaced by DIS, a damaged frame is spanned, a camera is needed
+        assert code in (0, 2)
+        assert "Traceback" not in capsys.readouterr().err
+        tested.add(place.suffix)
+        shutil.rmtree(root)
+    assert {".png", ".flo", ".dpt", ".cam"} <= tested
+    trap = tmp_path / "trap"
+    trap.write_bytes(content)
+    for arguments in (
+        ["run", "--sequence", walk(dataset), "--out", tmp_path / "o", "--config", trap],
+        ["evaluate", trap, trap],
+        ["run", "--sequence", trap, "--out", tmp_path / "o"],
+    ):
+        assert main([str(part) for part in arguments]) == 2
+        error = capsys.readouterr().err
+        assert error.count("\n") == 1
+        assert "Traceback" not in error
+    assert not ran.exists()
+
+
+@pytest.mark.parametrize("home", ["nowhere", "a_file", "read_only", None])
+def test_f29_home_does_not_matter(dataset, tmp_path, home):
+    place = tmp_path / "home"
+    if home == "a_file":
+        place.write_text("")
+    if home == "read_only":
+        place.mkdir(mode=0o555)
+    dropped = ("HOME", "MPLCONFIGDIR", "XDG_CONFIG_HOME", "XDG_CACHE_HOME", "NUMBA_CACHE_DIR")
+    environment = {k: v for k, v in os.environ.items() if k not in dropped}
+    environment |= {"TMPDIR": str(tmp_path), "OMP_NUM_THREADS": "1"}
+    if home is not None:
+        environment["HOME"] = str(place)
+    command = [sys.executable, "-m", "hybridvo.cli", "run", "--sequence", walk(dataset)]
+    command += ["--out", tmp_path / "out", "--method", "identity", "--flow", "dis", "-q"]
+    done = subprocess.run(
+        [str(part) for part in command], env=environment, capture_output=True, text=True
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert (tmp_path / "out" / "trajectory.png").stat().st_size > 1000
+    if home == "read_only":
+        assert not any(place.iterdir()) or os.getuid() == 0  # root writes where it likes
+
+
+@pytest.mark.parametrize("kind", ["a_file_above", "a_file", "no_name"])
+def test_f29_output_is_refused_before_anything_is_computed(
+    dataset, tmp_path, capsys, monkeypatch, kind
+):
+    def computed(*_: object, **__: object) -> None:
+        raise AssertionError("an estimate was made")
+
+    monkeypatch.setattr("hybridvo.odometry.estimate", computed)
+    (tmp_path / "file").write_text("kept")
+    out = {
+        "a_file_above": tmp_path / "file" / "out",
+        "a_file": tmp_path / "file",
+        "no_name": Path("/dev/null/out"),
+    }[kind]
+    assert run(walk(dataset), out) == 5
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert str(out) in error
+    assert (tmp_path / "file").read_text() == "kept"
+
+
+class OutOfMemoryError(RuntimeError):
+    """Of the name that torch gives its own."""
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        MemoryError(),
+        MemoryError("Unable to allocate 16.0 GiB for an array with shape (65536, 65536)"),
+        OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB\nand more lines"),
+    ],
+    ids=["python", "numpy", "cuda"],
+)
+def test_f40_out_of_memory_is_one_line_with_a_remedy(dataset, tmp_path, capsys, monkeypatch, error):
+    def exhausted(*_: object, **__: object) -> None:
+        raise error
+
+    monkeypatch.setattr("hybridvo.odometry.estimate", exhausted)
+    out = tmp_path / "out"
+    assert run(walk(dataset), out) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert "memory" in said
+    assert ("--device cpu" if "CUDA" in str(error) else "smaller") in said
+    assert not (out / "run.lock").exists()
+
+
+def test_f40_torch_has_an_error_of_that_name():
+    import torch
+
+    assert torch.cuda.OutOfMemoryError.__name__ == OutOfMemoryError.__name__
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["with space", "Größe-日本", "🎥", "-q", "a" * 200, "/".join(["deep" * 10] * 20), "new\nline"],
+    ids=["space", "letters", "emoji", "like_an_option", "long", "deep", "newline"],
+)
+def test_f41_long_and_odd_output_names(dataset, tmp_path, capsys, name):
+    out = tmp_path / name
+    assert run(walk(dataset), out, "--flow", "dis") == 0
+    assert len((out / "trajectory.tum").read_text().splitlines()) >= FRAMES
+    assert (out / "trajectory.png").is_file()
+
+
+def test_f41_names_that_no_file_system_takes(dataset, tmp_path, capsys):
+    for name in ("a" * 300, "/".join(["b" * 200] * 30), "nul\0byte"):
+        code = run(walk(dataset), tmp_path / name)
+        error = capsys.readouterr().err
+        assert code in (2, 5)
+        assert error.startswith("hybridvo: ")
+        assert "Traceback" not in error

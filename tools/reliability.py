@@ -1,0 +1,355 @@
+r"""The table of docs/reliability.md, from what the tests and the campaigns did.
+
+    python tools/reliability.py --run             # run the tests that tests/faults.yaml names
+    python tools/reliability.py --junit FILE      # or take a pytest run's XML (xunit1)
+    python tools/reliability.py                   # only make the page again
+    python tools/reliability.py --check           # exit code 1 if the page is not up to date
+
+A test that is named and does not exist, or was not run, is an error. Counted are test cases, the
+examples of hypothesis, and what a test says about itself by ``record_property("tries", n)``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import base64
+import json
+import os
+import re
+import subprocess
+import sys
+import tempfile
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+ROOT = Path(__file__).resolve().parents[1]
+FAULTS = ROOT / "tests" / "faults.yaml"
+RESULTS = ROOT / "docs" / "results"
+PAGE = ROOT / "docs" / "reliability.md"
+COUNT = 44
+"""Rows of the matrix."""
+PACKAGES = ("hybridvo", "numpy", "scipy", "torch", "opencv-python-headless", "numba")
+EXAMPLES = re.compile(r"(\d+) passing(?: examples)?, (\d+) failing")
+
+
+def build_parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="reliability.py", description=(__doc__ or "").splitlines()[0]
+    )
+    what = parser.add_mutually_exclusive_group()
+    what.add_argument("--run", action="store_true", help="run the named tests first")
+    what.add_argument("--junit", type=Path, help="XML of a pytest run with junit_family=xunit1")
+    what.add_argument("--check", action="store_true", help="write nothing, only compare")
+    parser.add_argument("--faults", type=Path, default=FAULTS)
+    parser.add_argument("--results", type=Path, default=RESULTS, help="folder of the JSON files")
+    parser.add_argument("--page", type=Path, default=PAGE)
+    return parser
+
+
+def main(argv: list[str] | None = None) -> int:
+    args = build_parser().parse_args(argv)
+    target = args.results / "reliability.json"
+    try:
+        matrix = read_faults(args.faults)
+        if args.run or args.junit:
+            with tempfile.TemporaryDirectory() as scratch:
+                path = args.junit or run_tests(matrix, Path(scratch) / "tests.xml")
+                command = ["reliability.py", *(sys.argv[1:] if argv is None else argv)]
+                found = {"command": command, **collect(path, matrix)}
+            write(target, json.dumps(found, indent=1) + "\n")
+        content = json.loads(target.read_text(encoding="utf-8"))
+        campaigns = read_campaigns(args.results)
+        made = page(matrix, content, campaigns)
+    except (OSError, ValueError, KeyError, ElementTree.ParseError) as error:
+        print(f"reliability.py: {error}", file=sys.stderr)
+        return 2
+    if args.check:
+        before = args.page.read_text(encoding="utf-8") if args.page.is_file() else ""
+        if made != before:
+            print(f"{args.page}: differs from {args.results}", file=sys.stderr)
+        return int(made != before)
+    write(args.page, made)
+    print(args.page)
+    failing = [name for name, row in content["tests"].items() if row["failed"]]
+    for name in failing:
+        print(f"FAILED {name}", file=sys.stderr)
+    return int(bool(failing))
+
+
+def write(path: Path, text: str) -> None:
+    partial = path.with_name(path.name + ".tmp")
+    partial.write_text(text, encoding="utf-8")
+    os.replace(partial, path)
+
+
+# What is asked for
+
+
+def read_faults(path: Path) -> dict[str, Any]:
+    """The matrix; ValueError unless it has all rows and every named test exists."""
+    matrix = yaml.safe_load(path.read_text(encoding="utf-8"))
+    expected = [f"F{n}" for n in range(1, COUNT + 1)]
+    if list(matrix["faults"]) != expected:
+        raise ValueError(f"{path}: expected the rows F1 to F{COUNT} in order.")
+    known: dict[str, set[str]] = {}
+    for name in named_tests(matrix):
+        file, _, function = name.partition("::")
+        if file not in known:
+            known[file] = functions(ROOT / file)
+        if function not in known[file]:
+            raise ValueError(f"{path}: {name}: there is no such test.")
+    return matrix
+
+
+def named_tests(matrix: Mapping[str, Any]) -> list[str]:
+    """Every test that the matrix names, once, in order."""
+    rows = [*matrix["faults"].values(), *matrix["totals"]]
+    return list(dict.fromkeys(name for row in rows for name in row["tests"]))
+
+
+def functions(path: Path) -> set[str]:
+    if not path.is_file():
+        raise ValueError(f"{path.name}: there is no such file of tests.")
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    return {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}
+
+
+# What was done
+
+
+def run_tests(matrix: Mapping[str, Any], xml: Path) -> Path:
+    """One process: pytest-xdist leaves out the statistics of hypothesis."""
+    command = [sys.executable, "-m", "pytest", "-q", f"--junitxml={xml}", *named_tests(matrix)]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(command, cwd=ROOT, env=environment, check=False)
+    if done.returncode not in (0, 1):  # 1: some failed, which the page will say
+        raise ValueError(f"pytest ended with exit code {done.returncode}.")
+    return xml
+
+
+def collect(path: Path, matrix: Mapping[str, Any]) -> dict[str, Any]:
+    """Cases, tries, failures and skips of each named test; ValueError for one that was not run."""
+    suites = list(ElementTree.parse(path).getroot().iter("testsuite"))
+    wanted = dict.fromkeys(named_tests(matrix))
+    rows: dict[str, dict[str, Any]] = {}
+    examples = statistics(suites)
+    total = {"cases": 0, "failed": 0, "skipped": 0}
+    for case in (case for suite in suites for case in suite.iter("testcase")):
+        bad = case.find("failure") is not None or case.find("error") is not None
+        skip = case.find("skipped")
+        total["cases"] += 1
+        total["failed"] += bad
+        total["skipped"] += skip is not None
+        name = f"{case.get('file')}::{str(case.get('name')).partition('[')[0]}"
+        if name not in wanted:
+            continue
+        empty = {"cases": 0, "tries": 0, "failed": 0, "skipped": 0, "reasons": []}
+        row = rows.setdefault(name, empty)
+        row["cases"] += 1
+        row["failed"] += bad
+        if skip is not None:
+            row["skipped"] += 1
+            reason = str(skip.get("message"))
+            row["reasons"] = sorted({*row["reasons"], reason})
+            continue
+        own = [p.get("value") for p in case.iter("property") if p.get("name") == "tries"]
+        said = examples.get(f"{case.get('file')}::{case.get('name')}", 0)
+        row["tries"] += int(own[0] or 0) if own else max(1, said)
+    if missing := [name for name in wanted if name not in rows]:
+        raise ValueError(f"{path}: not run: {', '.join(missing)}.")
+    return {
+        "commit": commit(),
+        "python": sys.version.split()[0],
+        "versions": {name: version(name) for name in PACKAGES},
+        "total": total,
+        "tests": {name: rows[name] for name in wanted},
+    }
+
+
+def statistics(suites: list[ElementTree.Element]) -> dict[str, int]:
+    """Examples that hypothesis tried, by test; it leaves its figures beside the cases."""
+    found = {}
+    for entry in (entry for suite in suites for entry in suite.iter("property")):
+        name = str(entry.get("name"))
+        if name.startswith("hypothesis-statistics-"):
+            text = base64.b64decode(str(entry.get("value"))).decode()
+            tried = sum(int(a) + int(b) for a, b in EXAMPLES.findall(text))
+            found[name.removeprefix("hypothesis-statistics-")] = tried
+    return found
+
+
+def commit() -> str:
+    done = subprocess.run(
+        ["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, capture_output=True, text=True
+    )
+    return done.stdout.strip() or "unknown"
+
+
+def read_campaigns(results: Path) -> dict[str, Any]:
+    """Content of the JSON files of the campaigns that are there."""
+    found = {}
+    for name in ("stress", "fuzz", "degenerate"):
+        path = results / f"{name}.json"
+        if path.is_file():
+            found[name] = json.loads(path.read_text(encoding="utf-8"))
+    return found
+
+
+def lookup(campaigns: Mapping[str, Any], dotted: str) -> Any:
+    """Value at ``file.campaign.key``, or None."""
+    value: Any = campaigns
+    for part in dotted.split("."):
+        value = value.get(part) if isinstance(value, Mapping) else None
+    return value
+
+
+# The page
+
+
+def page(
+    matrix: Mapping[str, Any], content: Mapping[str, Any], campaigns: Mapping[str, Any]
+) -> str:
+    """The whole page.
+
+    Raises:
+        ValueError: a test is named whose outcome is not known.
+    """
+    tests = content["tests"]
+    if missing := [name for name in named_tests(matrix) if name not in tests]:
+        raise ValueError(f"reliability.json: no outcome of {', '.join(missing)}; run --run again.")
+    versions = ", ".join(f"{name} {value}" for name, value in content["versions"].items())
+    lines = [
+        "# Reliability",
+        "",
+        "Made by `python tools/reliability.py` from `tests/faults.yaml` and "
+        "`docs/results/reliability.json`, which holds the outcome of the tests that the former "
+        "names. Tries are test cases, examples that hypothesis drew, and repetitions inside of a "
+        "test where it counts them; most loops inside of a test are not counted. Campaigns are "
+        "longer runs of `tools/stress.py`, `tests/fuzz/fuzz.py` and `tools/measure_degenerate.py`.",
+        "",
+        f"Commit {content['commit']}, Python {content['python']}; {versions}.",
+        "",
+        "## Totals",
+        "",
+        "| what must not happen | tests, tries | happened | campaigns |",
+        "|---|---:|---:|---|",
+    ]
+    for row in matrix["totals"]:
+        count = sums(row["tests"], tests)
+        lines.append(
+            f"| {row['what']} | {count['tests']}, {count['tries']} | {count['failed']} | "
+            f"{total_of_campaigns(row, campaigns)} |"
+        )
+    lines += [*degenerate(campaigns.get("degenerate")), "", "## Faults", ""]
+    lines += ["| | fault | how it is made | tries | result |", "|---|---|---|---:|---|"]
+    for name, row in matrix["faults"].items():
+        count = sums(row["tests"], tests)
+        tried = str(count["tries"])
+        for dotted in row.get("campaigns", ()):
+            value = lookup(campaigns, dotted)
+            label = dotted.split(".", 1)[1].replace(".", " ").replace("_", " ")
+            tried += f"; {label}: {'not measured' if value is None else value}"
+        lines.append(
+            f"| {name} | {row['what']} | {row['made']} | {tried} | {outcome(count, row, tests)} |"
+        )
+    lines += ["", *campaign_part(campaigns), "## Tests of each fault", ""]
+    for name, row in matrix["faults"].items():
+        short = [f"`{t.removeprefix('tests/').removeprefix('unit/')}`" for t in row["tests"]]
+        lines.append(f"- **{name}** " + ", ".join(short))
+    return "\n".join(lines) + "\n"
+
+
+def sums(names: list[str], tests: Mapping[str, Any]) -> dict[str, int]:
+    keys = ("cases", "tries", "failed", "skipped")
+    return {key: sum(tests[name][key] for name in names) for key in keys} | {"tests": len(names)}
+
+
+def outcome(count: Mapping[str, int], row: Mapping[str, Any], tests: Mapping[str, Any]) -> str:
+    if count["failed"]:
+        names = [name.partition("::")[2] for name in row["tests"] if tests[name]["failed"]]
+        return f"**{count['failed']} of {count['cases']} FAIL**: {', '.join(names)}"
+    if not count["skipped"]:
+        return "as it should"
+    reasons = sorted({reason for name in row["tests"] for reason in tests[name]["reasons"]})
+    return f"as it should; {count['skipped']} skipped: {'; '.join(reasons)}"
+
+
+def total_of_campaigns(row: Mapping[str, Any], campaigns: Mapping[str, Any]) -> str:
+    """What the campaigns counted under the same heading."""
+    parts = []
+    for key in row.get("counted", ()):
+        for name, figures in campaigns.get("stress", {}).items():
+            if isinstance(figures, Mapping) and isinstance(figures.get(key), int):
+                runs = figures.get("runs", figures.get(name, figures.get("frames")))
+                parts.append(f"{name.replace('_', ' ')}: {int(figures[key])} of {runs}")
+    for dotted in row.get("campaigns", ()):
+        value = lookup(campaigns, dotted)
+        if value is not None:
+            parts.append(f"{dotted}: {value}")
+    return ", ".join(parts) or "-"
+
+
+def degenerate(found: Mapping[str, Any] | None) -> list[str]:
+    """Answers on degenerate data that are wrong and confident."""
+    lines = ["", "### Confident wrong poses on degenerate data", ""]
+    if found is None:
+        return [*lines, "Not measured: `python tools/measure_degenerate.py`."]
+    first, last = found["seeds"]
+    lines += [
+        f"Status ok and an error above three standard deviations; seeds {first} to {last}, "
+        f"{found['size'][1]}x{found['size'][0]}. `{' '.join(found['command'])}`",
+        "",
+        "| kind | data | method | pairs | ok | wrong and ok | not finite |",
+        "|---|---|---|---:|---:|---:|---:|",
+    ]
+    for row in found["rows"]:
+        data = "noise" if row["noise"] else "exact"
+        lines.append(
+            f"| {row['kind'].replace('_', ' ')} | {data} | `{row['method']}` | {row['pairs']} | "
+            f"{row['ok']} | {row['wrong']} | {row['not_finite']} |"
+        )
+    for data, methods in found["total"].items():
+        for method, count in methods.items():
+            lines.append(
+                f"| **all** | {data} | `{method}` | {count['pairs']} | {count['ok']} | "
+                f"**{count['wrong']}** ({100 * count['wrong'] / max(count['pairs'], 1):.1f} %) | "
+                f"{count['not_finite']} |"
+            )
+    return lines
+
+
+def campaign_part(campaigns: Mapping[str, Any]) -> list[str]:
+    """Plain figures of each campaign, as its tool wrote them."""
+    lines = ["## Campaigns", ""]
+    for file in ("stress", "fuzz"):
+        content = campaigns.get(file)
+        if content is None:
+            lines += [f"`docs/results/{file}.json` is not there: not measured.", ""]
+            continue
+        for name, figures in content.items():
+            if name in ("machine", "versions", "command", "commit") or not isinstance(
+                figures, dict
+            ):
+                continue
+            plain = [
+                f"{key.replace('_', ' ')} {_short(value)}"
+                for key, value in figures.items()
+                if isinstance(value, int | float | bool) and key != "seconds"
+            ]
+            lines.append(f"- **{file}: {name.replace('_', ' ')}**: {', '.join(plain)}")
+        lines.append("")
+    return lines
+
+
+def _short(value: float) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
