@@ -117,7 +117,7 @@ def compile_once(code: str, sources: Path, name: str) -> bool:
 
 def _file(kernel: Any) -> Path:
     """Where a function is defined."""
-    return Path(kernel.py_func.__code__.co_filename)
+    return Path(kernel.py_func.__code__.co_filename).resolve()
 
 
 def _fingerprint(sources: Iterable[Path]) -> str:
