@@ -30,6 +30,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--size", default="218x512", help="HEIGHTxWIDTH, px")
     parser.add_argument("--noisy-stride", type=int, default=4, help="also with noise; 0: never")
     parser.add_argument("--cell-pairs", type=int, default=20, help="pairs of each cell; 0: none")
+    parser.add_argument("--jobs", type=int, default=1, help="processes")
     parser.add_argument("--out", type=Path, default=Path("docs/results/hybrid_sequences.json"))
     parser.add_argument("--answers", type=Path, help="CSV with one row per answer")
     parser.add_argument("--page", type=Path, help="page whose marked part is made from --out")
@@ -71,6 +72,7 @@ def _bad_usage(message: str) -> int:
 def measure(args: argparse.Namespace) -> dict[str, Any]:
     """Everything that the JSON holds but the command."""
     from hybridvo.comparison import hybrid_sequences as sequences
+    from hybridvo.comparison.executors import open_workers
     from hybridvo.comparison.hybrid_summary import summarise
     from hybridvo.errors import InputError
     from hybridvo.evaluation.report import write_csv
@@ -100,11 +102,19 @@ def measure(args: argparse.Namespace) -> dict[str, Any]:
     if args.cell_pairs:
         records += sequences.run_cells(args.cell_pairs, args.seed0)
         progress(f"cells: {time.process_time() - started:.0f} s of processor time")
-    for kind in options.kinds:
-        for seed in options.seeds:
-            found, rows = sequences.run_sequence(kind, seed, options, progress)
-            records += found
-            paths += rows
+    cpu_s = time.process_time() - started
+    with open_workers(args.jobs) as workers:
+        running = [
+            (kind, seed, workers.executor.submit(sequences.run_sequence, kind, seed, options))
+            for kind in options.kinds
+            for seed in options.seeds
+        ]
+        for kind, seed, future in running:
+            found = future.result()
+            records += found.records
+            paths += found.paths
+            cpu_s += found.cpu_s
+            progress(f"{kind} {seed}: {found.cpu_s:.0f} s of processor time")
     if args.answers:
         write_csv(args.answers, records)
     return {
@@ -128,7 +138,7 @@ def measure(args: argparse.Namespace) -> dict[str, Any]:
             "picture": f"results/{args.out.with_suffix('.png').name}",
         },
         "missing": absent,
-        "cpu_s": time.process_time() - started,
+        "cpu_s": cpu_s,
         "map": RECALIBRATION,
         **summarise(records, paths, RECALIBRATION),
     }

@@ -8,7 +8,7 @@ depth and the true mask are oracles.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -33,6 +33,7 @@ __all__ = [
     "FLOWS",
     "HEAVY_KINDS",
     "ORACLE",
+    "Measured",
     "RecordedJudge",
     "SequenceOptions",
     "methods_here",
@@ -157,23 +158,29 @@ def _trackers(methods: Sequence[str], judge: RecordedJudge) -> dict[str, Odometr
     }
 
 
-def run_sequence(
-    kind: str,
-    seed: int,
-    options: SequenceOptions,
-    progress: Callable[[str], None] = lambda line: None,
-) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+@dataclass(frozen=True)
+class Measured:
+    """What came of one sequence.
+
+    Args:
+        records: one per flow, method and pair.
+        paths: one per flow and method, with ``ate_m`` (RMSE after rigid alignment), ``path_m``
+            (true length) and their ratio ``ate_share``.
+        cpu_s: processor time.
+    """
+
+    records: list[dict[str, Any]]
+    paths: list[dict[str, Any]]
+    cpu_s: float
+
+
+def run_sequence(kind: str, seed: int, options: SequenceOptions) -> Measured:
     """Every method on the true and on the DIS flow of one sequence.
 
     Args:
         kind: family of :data:`hybridvo.data.synthetic.SCENE_KINDS`.
         seed: of the sequence.
         options: of the rendering; its kinds and seeds are not looked at.
-        progress: called with a line when it is done.
-
-    Returns:
-        One record per flow, method and pair; one record per flow and method with ``ate_m`` (RMSE
-        after rigid alignment), ``path_m`` (true length) and their ratio ``ate_share``.
 
     Raises:
         InputError: an unknown kind, or a method that cannot run here.
@@ -223,8 +230,7 @@ def run_sequence(
         facts | {"flow": flow, "method": name} | _trajectory_error(path, sequence)
         for (flow, name), path in paths.items()
     ]
-    progress(f"{kind} {seed}: {time.process_time() - started:.0f} s of processor time")
-    return records, rows
+    return Measured(records, rows, time.process_time() - started)
 
 
 def _pairs(
