@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
 import resource
 import struct
 import sys
@@ -20,6 +21,7 @@ import zipfile
 import zlib
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -95,7 +97,7 @@ GREY16 = np.full((6, 8), 1500, np.uint16)
 RGB = np.full((6, 8, 3), 90, np.uint8)
 
 
-def whole(folder: Path, kind: str, **options: object) -> None:
+def whole(folder: Path, kind: str, **options: Any) -> None:
     """Open a sequence and read every frame and flow of it."""
 
     def read() -> None:
@@ -265,8 +267,9 @@ def weights(data: bytes, folder: Path) -> None:
 
 
 def weights_header(data: bytes, folder: Path) -> None:
-    """The JSON header of a safetensors file, with the right length in front and data behind it."""
-    weights(struct.pack("<Q", len(data)) + data + bytes(4096), folder)
+    """The JSON header of a safetensors file, with the right lengths in front and behind it."""
+    ends = [int(end) for end in re.findall(rb",\s*(\d{1,5})\s*\]", data)]
+    weights(struct.pack("<Q", len(data)) + data + bytes(max(ends, default=0)), folder)
 
 
 def weights_options(data: bytes, folder: Path) -> None:
