@@ -54,7 +54,7 @@ def test_corpus_breaks_no_promise(path, tmp_path):
         ("flo", b"", None),
         ("raises", b"", ValueError),
         ("warns", b"", RuntimeWarning),
-        ("grows", b"", targets.TooExpensive),
+        ("lingers", b"", targets.TooExpensive),
     ],
 )
 def test_the_targets_would_notice(name, data, error, tmp_path, monkeypatch):
@@ -64,17 +64,28 @@ def test_the_targets_would_notice(name, data, error, tmp_path, monkeypatch):
     def warns(data, folder):
         np.float32(3e38) * np.float32(1e5)
 
-    def grows(data, folder):
-        np.ones(40 * 2**20)  # 320 MiB, touched
+    def lingers(data, folder):
+        while time.process_time() - started < 0.05:
+            pass
 
+    started = time.process_time()
+    if name == "lingers":
+        monkeypatch.setattr(targets, "SLACK_S", 0.01)
     monkeypatch.setitem(targets.TARGETS, "raises", raises)
     monkeypatch.setitem(targets.TARGETS, "warns", warns)
-    monkeypatch.setitem(targets.TARGETS, "grows", grows)
+    monkeypatch.setitem(targets.TARGETS, "lingers", lingers)
     if error is None:
         targets.run(name, data, tmp_path)
     else:
         with pytest.raises(error):
             targets.run(name, data, tmp_path)
+
+
+def test_memory_beyond_the_bound_is_noticed(monkeypatch):
+    # the peak of this process may lie far above what it holds now: a bound that any peak breaks
+    monkeypatch.setattr(targets, "SLACK_BYTES", -1)
+    with pytest.raises(targets.TooExpensive, match="MiB for 0 bytes"), targets.bounded(0):
+        pass
 
 
 def cpu(call) -> float:
