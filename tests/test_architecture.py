@@ -32,7 +32,8 @@ IMPORTS: dict[str, set[str]] = {
     "trajectory": NOUNS | {"geometry"},
     "learned": CLASSICAL | {"network"},
     "hybrid": CLASSICAL | {"network", "learned"},
-    "odometry": CLASSICAL | {"flow", "hybrid", "trajectory"},
+    "tracking": CLASSICAL,
+    "odometry": CLASSICAL | {"flow", "hybrid", "tracking", "trajectory"},
     "evaluation": NOUNS | {"geometry", "trajectory"},
     "training": CLASSICAL | {"data", "flow", "network", "learned", "hybrid"},
     # one run of `hybridvo run`: what it writes, how it is set, and the loop around the tracker
@@ -41,11 +42,11 @@ IMPORTS: dict[str, set[str]] = {
     "recording": NOUNS | {"evaluation"},
     "run_results": NOUNS | {"geometry", "data", "trajectory", "evaluation"},
     "run_report": {"errors", "evaluation"},
-    "configuration": CLASSICAL | {"data", "flow", "hybrid", "odometry"},
+    "configuration": CLASSICAL | {"data", "flow", "hybrid", "odometry", "tracking"},
     "run": {
         *("__init__", "errors", "types", "geometry", "data", "flow", "hybrid", "odometry"),
         *("trajectory", "evaluation", "configuration", "console", "run_folder", "run_results"),
-        *("recording", "compilation"),
+        *("recording", "compilation", "tracking"),
     },
     # what tools/compare_methods.py runs, on this machine and on others
     "comparison": {
@@ -60,6 +61,7 @@ IMPORTS: dict[str, set[str]] = {
     # what stands at the door
     "demo": {"errors", "data", "evaluation", "configuration", "run"},
     "doctor": {"__init__", "errors", "hybrid"},
+    "diagnosis": CLASSICAL | {"flow"},
     "__init__": set(),
 }
 """Room -> rooms it may import. ``cli`` and the tools may import everything."""

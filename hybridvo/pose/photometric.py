@@ -99,7 +99,7 @@ def _polish(
         return _unchanged(pose, "no_estimate", "the estimate has no usable covariance")
     images = match_blur(Level(grey_image(prev.rgb), grey_image(curr.rgb)))
     first = blurred(images, options.blur_px[-1])
-    index = _select(first.prev, prev.depth, pose.weights, options)
+    index = choose_pixels(first.prev, prev.depth, pose.weights, options)
     if len(index) < options.least_pixels:
         return _unchanged(
             pose,
@@ -119,10 +119,10 @@ def _polish(
     return _guarded(pose, problem, first, state, options)
 
 
-def _select(
+def choose_pixels(
     grey: np.ndarray, depth: np.ndarray, weights: np.ndarray, options: PhotometricOptions
 ) -> np.ndarray:
-    """(N, 2) int32 rows and columns of the pixels to use."""
+    """(N, 2) int32 rows and columns of the pixels to use: strong gradients, evenly spread."""
     height, width = grey.shape
     cell = max(2, round(np.sqrt(height * width * PER_CELL / options.pixels)))
     cells = (height // cell + 1) * (width // cell + 1)
