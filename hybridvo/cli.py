@@ -38,8 +38,15 @@ def build_parser() -> argparse.ArgumentParser:
     _add_demo(commands)
     _add_evaluate(commands)
     doctor = commands.add_parser(
-        "doctor", help="versions, devices, threads, and what is missing", parents=[_common()]
+        "doctor", help="what is missing here, or wrong with a sequence", parents=[_common()]
     )
+    doctor.add_argument(
+        "--sequence", metavar="DIR", help="look for systematic faults of this sequence instead"
+    )
+    doctor.add_argument(
+        "--dataset", metavar="KIND", help="kind of the sequence (default: detected)"
+    )
+    doctor.add_argument("--pairs", type=int, default=40, metavar="N", help="pairs (default 40)")
     doctor.set_defaults(call=_doctor)
     return parser
 
@@ -66,6 +73,12 @@ def _add_run(commands: Any) -> None:
     )
     run.add_argument(
         "--polish", metavar="WHAT", help="auto (default: with --method hybrid), on or off"
+    )
+    run.add_argument(
+        "--window",
+        type=int,
+        metavar="N",
+        help="key frames that frames are registered to, 1: none (default: 3 with --polish, else 1)",
     )
     run.add_argument("--start", type=int, metavar="N", help="first frame (default 0)")
     run.add_argument("--stop", type=int, metavar="N", help="the one after the last frame")
@@ -269,7 +282,7 @@ def _run(args: argparse.Namespace, command: list[str]) -> int:
     from hybridvo.run_report import summary_text
 
     named = (
-        *("method", "flow", "polish", "start", "stop", "stride", "device"),
+        *("method", "flow", "polish", "window", "start", "stop", "stride", "device"),
         *("max_failed", "strict"),
     )
     options = load_options(
@@ -333,6 +346,13 @@ def _doctor(args: argparse.Namespace, command: list[str]) -> int:
     from hybridvo.doctor import doctor, doctor_text
     from hybridvo.evaluation.report import to_json
 
+    if args.sequence:
+        from hybridvo.data.sequence import open_sequence
+        from hybridvo.diagnosis import diagnose, diagnosis_text
+
+        found = diagnose(open_sequence(args.sequence, args.dataset), pairs=args.pairs)
+        _print(to_json(found) if args.json else diagnosis_text(found))
+        return 0
     report = doctor()
     _print(to_json(report) if args.json else doctor_text(report))
     return 0 if report["usable"] else EXIT_INPUT
