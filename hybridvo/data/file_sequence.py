@@ -164,7 +164,7 @@ class FileSequence:
         """Every existing file that the sequence reads, sorted: what an input hash covers."""
         lists = (self.sources, self.rgb_files, self.depth_files, self.flow_files[:-1])
         found = {path for paths in lists for path in paths if path is not None}
-        return sorted(path for path in found if path.exists())
+        return sorted(path for path in found if path.is_file())  # no pipe: hashing it would block
 
     def _read_depth(self, path: Path, index: int, rgb: np.ndarray | None) -> np.ndarray:
         raise NotImplementedError
