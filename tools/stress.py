@@ -39,6 +39,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="stress.py", description=__doc__.splitlines()[0])
     parser.add_argument("--campaigns", default="all", help=f"of {', '.join(COUNTS)}; or 'all'")
     parser.add_argument("--scale", type=float, default=1.0, help="factor on every count")
+    parser.add_argument("--counts", default="", help="as in kills=20,long_run=1000; over --scale")
     parser.add_argument("--seed", type=int, default=0, help="of the random moments")
     parser.add_argument("--no-cold", action="store_true", help="determinism: warm cache only")
     parser.add_argument("--out", type=Path, default=Path("runs/stress.json"), metavar="FILE")
@@ -54,6 +55,10 @@ def main(argv: list[str] | None = None) -> int:
     names = list(COUNTS) if args.campaigns == "all" else args.campaigns.split(",")
     if unknown := [name for name in names if name not in COUNTS]:
         return complain(f"--campaigns: unknown: {', '.join(unknown)}; known: {', '.join(COUNTS)}.")
+    try:
+        args.counts = {k: int(v) for k, v in (x.split("=") for x in args.counts.split(",") if x)}
+    except ValueError:
+        return complain(f"--counts: expected NAME=NUMBER,..., got {args.counts!r}.")
     if not args.scale > 0:
         return complain(f"--scale: expected a positive factor, got {args.scale}.")
     if args.out.exists() and not (args.overwrite or args.update):
@@ -85,7 +90,7 @@ def campaigns(where: Path, names: list[str], args: argparse.Namespace) -> Any:
 
     lab = None
     for name in names:
-        count = max(1, round(COUNTS[name] * args.scale))
+        count = args.counts.get(name, max(1, round(COUNTS[name] * args.scale)))
         started = time.perf_counter()
         if name in ("long_run", "long_recording"):
             figures = dying.long_run(
@@ -102,7 +107,7 @@ def campaigns(where: Path, names: list[str], args: argparse.Namespace) -> Any:
             name,
             figures
             | {
-                "command": f"python tools/stress.py --campaigns {name} --scale {args.scale:g}",
+                "command": f"python tools/stress.py --campaigns {name} --counts {name}={count}",
                 "commit": source_commit(),
                 "seconds": round(time.perf_counter() - started, 1),
             },

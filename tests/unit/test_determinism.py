@@ -1,0 +1,176 @@
+"""Same input, same answer; compiled code that is the same wherever it comes from (F42)."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import numba
+import numpy as np
+import pytest
+
+from hybridvo import compilation
+from hybridvo.cli import main
+from hybridvo.geometry import ego_flow, se3_exp
+from hybridvo.hybrid import warm_up
+from hybridvo.odometry import Odometry
+from hybridvo.pose import kernels, photometric_kernels, search, second_depth, solver
+from hybridvo.types import Camera, Frame
+
+TOOLS = Path(__file__).parents[2] / "tools"
+ROOT = TOOLS.parent
+
+
+@pytest.fixture(autouse=True)
+def tools_on_the_path(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(TOOLS)
+
+
+def test_a_fresh_process_with_two_threads_leaves_the_same_bytes(tmp_path: Path) -> None:
+    """Learned judge, DIS and polish, in this process twice and in another with other threads."""
+    from stress_parts import command, content, write_walk
+
+    walk = write_walk(tmp_path / "walk", 5, height=64, width=96, pictures=True)
+    for name in ("first", "second"):
+        assert main([*command(walk, tmp_path / name, "--flow", "dis", "-q")]) == 0
+    code = "import sys; from hybridvo.cli import main; sys.exit(main(sys.argv[1:]))"
+    arguments = command(walk, tmp_path / "other", "--flow", "dis", "-q")
+    two = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "2")
+    done = subprocess.run(
+        [sys.executable, "-c", code, *arguments],
+        env=os.environ | two,
+        cwd=ROOT,
+        capture_output=True,
+    )
+    assert done.returncode == 0, done.stderr
+    first = content(tmp_path / "first")
+    assert len(first["steps.csv"]) == 5 and "trajectory.tum" in first
+    assert content(tmp_path / "second") == first
+    # oneDNN and OpenBLAS share out whole rows and channels: no sum is split between threads here
+    assert content(tmp_path / "other") == first
+
+
+def signatures() -> dict[str, int]:
+    """How many versions of every kernel have been compiled in this process."""
+    modules = (kernels, photometric_kernels, search, second_depth, solver)
+    return {
+        f"{module.__name__}.{name}": len(value.signatures)
+        for module in modules
+        for name, value in vars(module).items()
+        if hasattr(value, "signatures")
+    }
+
+
+def read_only(array: np.ndarray) -> np.ndarray:
+    """As out of ``np.frombuffer``: a message, a mapped file."""
+    return np.frombuffer(array.tobytes(), array.dtype).reshape(array.shape)
+
+
+def unaligned(array: np.ndarray) -> np.ndarray:
+    """As out of a packed message: the first number at an odd address."""
+    data = b"x" + array.tobytes()
+    return np.frombuffer(data, array.dtype, offset=1).reshape(array.shape)
+
+
+@pytest.mark.parametrize("made", [read_only, unaligned, np.asfortranarray, lambda a: a[::-1][::-1]])
+def test_no_frame_makes_a_kernel_compile_anew(made) -> None:
+    """Seconds in the middle of a walk, by a flag that the driver of a camera happens to set."""
+    warm_up("refine", "on")
+    camera = Camera(40, 40, 23.5, 15.5, 32, 48)
+    v, u = np.mgrid[:32, :48] / 48
+    depth = (2 + 0.5 * np.sin(9 * u) + 0.3 * np.cos(11 * v)).astype(np.float32)
+    flow = ego_flow(depth, se3_exp(np.full(6, 0.01)), camera, camera).astype(np.float32)
+    rgb = (120 + 60 * np.sin(40 * u) + 60 * np.cos(33 * v)).astype(np.uint8)[..., None].repeat(3, 2)
+    before = signatures()
+    vo = Odometry(method="refine", polish="on", prepare=False)
+    poses = []
+    for i in range(3):
+        frame = Frame(made(rgb), made(depth), camera, 0.1 * i, i, made(np.full_like(depth, 1e-4)))
+        poses.append(vo.track(frame, flow=made(flow) if i else None).T_world_cam)
+    assert signatures() == before
+    assert np.abs(poses[2] - np.eye(4)).max() > 0.01  # it did track
+
+
+def twice(x):
+    return 2 * x
+
+
+def test_without_a_folder_for_the_cache_the_code_is_compiled_all_the_same(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A package that root installed, and a user without a home: importing must not fail."""
+    from numba.core import caching
+
+    implementation = getattr(caching, "CacheImpl", None) or caching._CacheImpl  # before 0.62
+    monkeypatch.setattr(implementation, "_locator_classes", [])
+    with pytest.raises(RuntimeError, match="no locator available"):
+        numba.njit(cache=True)(twice)
+    assert compilation.njit(cache=True)(twice)(21) == 42
+
+
+def cached_anew(folder: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(folder))
+    return compilation.njit(cache=True)(twice)
+
+
+def test_a_full_disk_or_a_damaged_cache_costs_a_compilation(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from numba.core import caching
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(caching.IndexDataCacheFile, "_save_data", full)
+        assert cached_anew(tmp_path, patch)(21) == 42
+    assert cached_anew(tmp_path, monkeypatch)(21) == 42
+    assert sum(cached_anew(tmp_path, monkeypatch).stats.cache_hits.values()) == 0  # not yet called
+    whole = cached_anew(tmp_path, monkeypatch)
+    assert whole(21) == 42 and sum(whole.stats.cache_hits.values()) == 1
+    for suffix in ("nbc", "nbi"):
+        (file,) = tmp_path.rglob(f"*.{suffix}")
+        content = file.read_bytes()
+        for damage in (b"", content[: len(content) // 2], b"not a cache"):
+            file.write_bytes(damage)
+            assert cached_anew(tmp_path, monkeypatch)(21) == 42
+
+
+@pytest.fixture
+def kernel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Folder of a program with one kernel; its cache is ``tmp_path / 'cache'``."""
+    source = tmp_path / "program" / "kernel.py"
+    source.parent.mkdir()
+    source.write_text("...")
+    (tmp_path / "cache").mkdir()
+    code = SimpleNamespace(co_filename=str(source))
+    made = SimpleNamespace(
+        py_func=SimpleNamespace(__code__=code),
+        stats=SimpleNamespace(cache_path=str(tmp_path / "cache")),
+    )
+    monkeypatch.setattr(compilation, "_cached", [made])
+    return source.parent
+
+
+def test_kernels_are_compiled_apart_once(kernel: Path, tmp_path: Path) -> None:
+    code = f"open({str(tmp_path / 'log')!r}, 'a').write('x')"
+    log = tmp_path / "log"
+    assert compilation.compile_once(code, kernel, "k") and log.read_text() == "x"
+    assert compilation.compile_once(code, kernel, "k") and log.read_text() == "x"
+    (kernel / "kernel.py").write_text("changed")
+    assert compilation.compile_once(code, kernel, "k") and log.read_text() == "xx"
+    assert len(list((tmp_path / "cache").iterdir())) == 1
+    # what cannot be compiled is tried again, and complains in the process that needs it
+    assert not compilation.compile_once("raise SystemExit(3)", kernel, "other")
+    assert not compilation.compile_once(code, kernel.parent, "elsewhere")
+
+
+def test_kernels_are_not_compiled_apart_by_a_frozen_program(
+    kernel: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """There ``sys.executable`` is the program itself: it would start itself again and again."""
+    monkeypatch.setattr(sys, "frozen", True, raising=False)
+    assert not compilation.compile_once("raise SystemExit(0)", kernel, "k")
