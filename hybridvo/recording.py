@@ -121,6 +121,8 @@ class Recording:
 
         self._rr = rerun
         self.path.parent.mkdir(parents=True, exist_ok=True)
+        if self.path.is_symlink():  # replaced, never followed, like all results
+            self.path.unlink()
         # save() itself reports a bad path only later, in a thread
         self.path.open("wb").close()
         self._stream = rerun.RecordingStream(f"hybridvo {name}", recording_id=identity)

@@ -308,3 +308,14 @@ def test_caches_are_not_kept_where_others_can_write(
     scratch.symlink_to(tmp_path)
     _prepare_caches()
     assert "NUMBA_CACHE_DIR" not in os.environ
+
+
+def test_a_recording_never_follows_a_link(tmp_path: Path) -> None:
+    pytest.importorskip("rerun", reason="Rerun is not installed (extra viz)")
+    from hybridvo.recording import Recording
+
+    (tmp_path / "a.rrd").symlink_to(tmp_path / "elsewhere.rrd")
+    with Recording(tmp_path / "a.rrd", "x", "id", 1) as recording:
+        pass
+    assert not recording.failed and (tmp_path / "a.rrd").stat().st_size > 0
+    assert [path.name for path in tmp_path.iterdir()] == ["a.rrd"]
