@@ -19,6 +19,7 @@ from hybridvo.hybrid import DEFAULT_METHOD, check_polish
 from hybridvo.odometry import POLICIES
 from hybridvo.pose.photometric import PhotometricOptions
 from hybridvo.pose.refinement import RefinementOptions
+from hybridvo.tracking.window import WindowOptions, check_window
 
 __all__ = ["DisOptions", "RunOptions", "load_options"]
 
@@ -50,6 +51,9 @@ class RunOptions:
         method: see :data:`hybridvo.hybrid.METHODS`.
         flow: ``file``, ``dis``, or ``auto``: files where the sequence has them, else DIS.
         polish: sharpen the flow's motion by the pictures: ``auto``, ``on`` or ``off``.
+        window: most key frames that frames are registered to, 1 for none; None for the default of
+            :class:`hybridvo.odometry.Odometry`.
+        history: the predicted motion is one start among others, and a cue.
         policy: pose after a failed motion: ``hold`` or ``constant_velocity``.
         start: first frame. stop: the one after the last, None for all. stride: step.
         device: ``auto``, ``cpu`` or ``cuda``.
@@ -58,11 +62,14 @@ class RunOptions:
         strict: a broken frame ends the run (exit code 2).
         alignment: of the absolute trajectory error.
         dis: of the DIS flow. refinement: of the refinement. photometric: of the polish.
+        key_frames: of the window.
     """
 
     method: str = DEFAULT_METHOD
     flow: str = "auto"
     polish: str = "auto"
+    window: int | None = None
+    history: bool = True
     policy: str = "hold"
     start: int = 0
     stop: int | None = None
@@ -75,10 +82,12 @@ class RunOptions:
     dis: DisOptions = field(default_factory=DisOptions)
     refinement: RefinementOptions = field(default_factory=RefinementOptions)
     photometric: PhotometricOptions = field(default_factory=PhotometricOptions)
+    key_frames: WindowOptions = field(default_factory=WindowOptions)
 
     def __post_init__(self) -> None:
         _one_of("flow", self.flow, FLOWS)
         check_polish(self.polish)
+        check_window(self.window)
         _one_of("policy", self.policy, POLICIES)
         _one_of("device", self.device, DEVICES)
         _one_of("alignment", self.alignment, ("se3", "sim3", "origin", "none"))

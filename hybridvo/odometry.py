@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
 
 from hybridvo.errors import InputError
 from hybridvo.flow import FlowField, FlowProvider, check_field, dis_flow
-from hybridvo.geometry import invert
+from hybridvo.geometry import invert, se3_exp, se3_log
 from hybridvo.hybrid import (
     DEFAULT_METHOD,
     JUDGED,
@@ -21,11 +21,16 @@ from hybridvo.hybrid import (
     shipped_judge,
     warm_up,
 )
-from hybridvo.pose.photometric import PhotometricOptions
+from hybridvo.pose.photometric import PhotometricOptions, polish_photometric
 from hybridvo.pose.photometric_monitor import PhotometricMonitor
 from hybridvo.pose.refinement import RefinementOptions
+from hybridvo.tracking.anchor import Anchor
+from hybridvo.tracking.key_frame import KeyFrame
+from hybridvo.tracking.motion_history import Prediction
+from hybridvo.tracking.pose_graph import Edge
+from hybridvo.tracking.window import Located, Window, WindowOptions, check_window, locate
 from hybridvo.trajectory import chain
-from hybridvo.types import Frame, FramePair, Reason, RelativePose, Step
+from hybridvo.types import Frame, FramePair, Reason, RelativePose, State, Status, Step
 
 __all__ = ["Anchor", "Odometry", "Policy"]
 
@@ -34,36 +39,25 @@ POLICIES = ("hold", "constant_velocity")
 
 FAILED_STD_M = 1.0
 FAILED_STD_RAD = 0.3
-"""Smallest standard deviations that a failed motion claims."""
-
-
-@dataclass(frozen=True, eq=False)
-class Anchor:
-    """What a tracker needs to go on where another one stopped.
-
-    Args:
-        frame: the last frame that could be read; None before the first one.
-        T_world_cam: (4, 4) its pose.
-        T_world_last: (4, 4) pose last handed out: another one than ``T_world_cam`` after frames
-            that could not be read.
-        T_last: (4, 4) last motion found between neighbours, or None.
-        gap: frames that could not be read since ``frame``.
-        images: state of the tracker's :class:`PhotometricMonitor`, or None.
-    """
-
-    frame: Frame | None
-    T_world_cam: np.ndarray
-    T_world_last: np.ndarray
-    T_last: np.ndarray | None
-    gap: int = 0
-    images: dict[str, Any] | None = None
+"""Smallest standard deviations that a failed motion claims where nothing is predicted."""
+WINDOWED = (*JUDGED, "refine")
+"""Methods whose weights and covariance a window can build on."""
+DEFAULT_WINDOW = 3
+"""Key frames kept where the pictures sharpen the motion."""
+START_INFLATION = 1000.0
+"""On the covariance of the motion that a registration starts from: the pictures decide."""
+REGISTRATION_STEPS = 10
+"""Most steps under each blur: a start that was wrong by pixels needs more than a pair's."""
 
 
 FIRST_COVARIANCE = 1e-12 * np.eye(6)
 
 
 class Odometry:
-    """Chains the motions of consecutive frames; keeps one previous frame and nothing else.
+    """Chains the motions of consecutive frames, held together by a window of key frames.
+
+    A step's pose is the best one at its time; no pose is revised later, and the motions of the
+    steps chain to their poses. Memory is that of the last frame and of the key frames.
 
     Two trackers share no state and may run in two threads; one tracker belongs to one thread.
 
@@ -75,20 +69,26 @@ class Odometry:
             :func:`hybridvo.flow.as_provider`.
         method: see :data:`hybridvo.hybrid.METHODS`; by default ``hybrid``, or ``refine`` without a
             network.
-        history: let the last motion take part: as one start among others, and as a cue for which
-            motion is the world. It cannot hold the tracker: every start competes by how well the
-            pixels follow it.
+        history: let the predicted motion take part (:meth:`predict`): as one start among others,
+            and as a cue for which motion is the world. It cannot hold the tracker: every start
+            competes by how well the pixels follow it.
         policy: pose of a frame whose motion failed: ``hold`` (no motion) or ``constant_velocity``
-            (the last motion again). The status stays failed and the covariance is large.
+            (the predicted motion, with its covariance). The status stays failed.
         polish: sharpen the flow's motion by the pictures: ``auto`` (where the method is
             ``hybrid``), ``on`` or ``off``.
+        window: most key frames that new frames are registered to, 1 for none, see
+            :mod:`hybridvo.tracking.window`. By default 3 where the pictures sharpen the motion, so
+            that a registration needs no flow of its own, else 1. A larger number without pictures
+            asks the flow for every registration.
+        window_options: of the window.
         options: of the refinement.
         photometric: options of the polish.
         seed: of everything drawn at random.
         prepare: compile now rather than at the first pair (see :func:`hybridvo.hybrid.warm_up`).
 
     Raises:
-        InputError: an unknown method or policy, or a network that is none or that the method lacks.
+        InputError: an unknown method or policy, a network that is none or that the method lacks, or
+            a window that the method cannot use.
 
     Example:
         >>> import numpy as np
@@ -108,8 +108,10 @@ class Odometry:
         method: str | None = None,
         policy: Policy = "hold",
         polish: str = "auto",
+        window: int | None = None,
         options: RefinementOptions | None = None,
         photometric: PhotometricOptions | None = None,
+        window_options: WindowOptions | None = None,
         seed: int = 0,
         history: bool = True,
         prepare: bool = True,
@@ -133,9 +135,25 @@ class Odometry:
             )
         check_method(method)
         check_polish(polish)
+        check_window(window)
+        polished = polish == "on" or (polish == "auto" and method == "hybrid")
+        if method not in WINDOWED:
+            if window is not None and window > 1:
+                raise InputError(
+                    f"Odometry.window: method {method!r} has no window of key frames; pass "
+                    f"window=1, or one of the methods {', '.join(WINDOWED)}."
+                )
+            polished = False
+        self.window = window or (DEFAULT_WINDOW if polished else 1)
+        self.window_options = window_options or WindowOptions()
+        self._polished = polished
         self.method = method
         self.polish = polish
         self.photometric = photometric or PhotometricOptions()
+        # beside a window the prior of a registration is no flow of which errors are known
+        self._registering = replace(
+            self.photometric, flow_inflation=1.0, iterations=REGISTRATION_STEPS
+        )
         self.images = PhotometricMonitor()
         self.policy = policy
         self.options = options or RefinementOptions()
@@ -169,7 +187,7 @@ class Odometry:
 
     def reset(self) -> None:
         """Forget everything: the next frame is the first one, at the identity."""
-        self._anchor = Anchor(None, np.eye(4), np.eye(4), None)
+        self._anchor = Anchor(None, np.eye(4), np.eye(4))
         self.images.restore(None)
 
     def set_pose(self, T_world_cam: np.ndarray) -> None:
@@ -185,12 +203,35 @@ class Odometry:
         anchor = self._anchor
         # the frame that the next pair starts from keeps its place relative to the last pose
         T_anchor = T @ invert(anchor.T_world_last) @ anchor.T_world_cam if anchor.gap else T
-        self._anchor = replace(anchor, T_world_cam=T_anchor, T_world_last=T)
+        window = anchor.window
+        if window is not None:
+            window = window.moved(T_anchor @ invert(anchor.T_world_cam))
+        self._anchor = replace(anchor, T_world_cam=T_anchor, T_world_last=T, window=window)
 
     def resume(self, anchor: Anchor) -> None:
         """Go on where another tracker stopped; the steps that follow have the same bytes."""
         self._anchor = anchor
         self.images.restore(anchor.images)
+
+    @property
+    def edges(self) -> tuple[Edge, ...]:
+        """Motions between key frames and the last frame, each with its covariance and status.
+
+        For a pose graph of one's own; empty without a window.
+        """
+        window = self._anchor.window
+        return () if window is None else window.found
+
+    def predict(self, frames: int = 1) -> Prediction | None:
+        """The motion from the last frame to the next, before it is seen; None before the first one.
+
+        Args:
+            frames: how far ahead.
+
+        Returns:
+            Constant velocity, with a covariance from how the last motions changed.
+        """
+        return self._anchor.history.predict(frames)
 
     def track(self, frame: Frame, flow: FlowField | np.ndarray | None = None) -> Step:
         """Pose of the next frame.
@@ -214,35 +255,125 @@ class Odometry:
             return self._start(frame, anchor)
         prev = anchor.frame
         pair = self._pair(prev, frame, flow)
-        motion = estimate(
-            pair,
-            T_last=anchor.T_last if anchor.gap == 0 and self.history else None,
-            method=self.method,
-            options=self.options,
-            judge=self._judge,
-            polish=self.polish,
-            photometric=self.photometric,
-            trust=self.images.trust,
-            seed=self.seed,
-        )
+        ahead = anchor.history.predict(anchor.gap + 1) if self.history else None
+        motion = self._estimate(pair, None if ahead is None else ahead.T_curr_prev)
         self.images.update(pair, motion)
         if motion.polish is not None:
             anchor = replace(anchor, images=self.images.state())
+        found = motion
         if motion.ok:
             T_world_cam = chain(anchor.T_world_cam, motion.T_curr_prev)
-            T_last = motion.T_curr_prev if anchor.gap == 0 else None
         else:
             T_world_cam, motion = self._instead(anchor, motion)
-            T_last = anchor.T_last
         # without an image nothing can be matched from here: the next pair spans this frame
-        blind = frame.rgb is None and pair.flow is None
-        if blind:
+        if frame.rgb is None and pair.flow is None:
             self._anchor = replace(anchor, T_world_last=T_world_cam, gap=anchor.gap + 1)
-        else:
-            self._anchor = Anchor(
-                _own(frame), T_world_cam, T_world_cam, T_last, images=anchor.images
-            )
+            return Step(frame.index, frame.timestamp, T_world_cam.copy(), motion)
+        own = _own(frame)
+        window = anchor.window
+        if window is not None:
+            located = self._locate(window, motion, prev, own)
+            window = located.window
+            if located.used:
+                T_world_cam = located.T_world_cam
+                motion = motion.replace(
+                    T_curr_prev=invert(T_world_cam) @ anchor.T_world_cam,
+                    covariance=located.covariance,
+                    status=located.status,
+                    terms=(*motion.terms, "window"),
+                )
+        history = anchor.history
+        if found.ok:
+            # a motion that the key frames contradict is no velocity; theirs is, where it is of
+            # this pair alone
+            T = motion.T_curr_prev if not anchor.lost else found.T_curr_prev
+            alone = not anchor.gap and not anchor.lost
+            if anchor.gap:
+                T = se3_exp(se3_log(T) / (anchor.gap + 1))
+            history = history.observed(T, neighbours=alone)
+        self._anchor = Anchor(
+            own,
+            T_world_cam,
+            T_world_cam,
+            history,
+            lost=0 if motion.ok else anchor.lost + 1,
+            images=anchor.images,
+            window=window,
+        )
         return Step(frame.index, frame.timestamp, T_world_cam.copy(), motion)
+
+    def _estimate(self, pair: FramePair, T_last: np.ndarray | None, **more: Any) -> RelativePose:
+        options: dict[str, Any] = {
+            "method": self.method,
+            "options": self.options,
+            "judge": self._judge,
+            "polish": self.polish,
+            "photometric": self.photometric,
+            "trust": self.images.trust,
+            "seed": self.seed,
+        }
+        return estimate(pair, T_last=T_last, **(options | more))
+
+    def _locate(self, window: Window, motion: RelativePose, prev: Frame, curr: Frame) -> Located:
+        return locate(
+            window,
+            motion,
+            prev,
+            curr,
+            self._by_pictures if self._polished else self._by_flow,
+            self._search,
+            self.window,
+            self.window_options,
+        )
+
+    def _by_pictures(
+        self,
+        key: KeyFrame,
+        curr: Frame,
+        T_start: np.ndarray,
+        covariance: np.ndarray,
+        weights: np.ndarray,
+    ) -> RelativePose:
+        """Motion from a key frame by the pictures alone, from a start that is close."""
+        start = RelativePose(
+            T_curr_prev=T_start,
+            covariance=START_INFLATION * covariance,
+            weights=weights,
+            depth_noise=key.depth_noise,
+            method=self.method,
+        )
+        pair = FramePair(key.frame, curr, None)
+        found = polish_photometric(pair, start, self._registering, trust=self.images.trust)
+        if found.polish.taken:
+            return found
+        status = Status.failed(Reason.SOLVER_DIVERGED, found.polish.message)
+        return found.replace(status=status)
+
+    def _by_flow(
+        self,
+        key: KeyFrame,
+        curr: Frame,
+        T_start: np.ndarray | None,
+        covariance: np.ndarray,
+        weights: np.ndarray,
+    ) -> RelativePose:
+        """Motion from a key frame as between neighbours, beside a start."""
+        found = self._estimate(self._pair(key.frame, curr, None), T_start)
+        if found.status.state is State.DEGRADED:
+            # key frames hold the walk together: what is doubtful between neighbours is not used
+            return found.replace(status=Status.failed(found.status.reason, found.status.message))
+        return found
+
+    def _search(
+        self,
+        key: KeyFrame,
+        curr: Frame,
+        T_start: np.ndarray,
+        covariance: np.ndarray,
+        weights: np.ndarray,
+    ) -> RelativePose:
+        """The same where nothing is known of the motion."""
+        return self._by_flow(key, curr, None, covariance, weights)
 
     def skip(self, index: int, timestamp: float, message: str = "") -> Step:
         """A frame that could not be read: a failed step; the next pair spans it.
@@ -264,7 +395,11 @@ class Odometry:
 
     def _start(self, frame: Frame, anchor: Anchor) -> Step:
         T = anchor.T_world_last
-        self._anchor = Anchor(_own(frame), T, T, None)
+        own = _own(frame)
+        window = None
+        if self.window > 1 and frame.depth is not None:
+            window = Window.start(own, T)
+        self._anchor = Anchor(own, T, T, window=window)
         # no motion precedes the first frame; a covariance that a pose graph can still invert
         first = RelativePose(covariance=FIRST_COVARIANCE.copy(), method=self.method)
         return Step(frame.index, frame.timestamp, T.copy(), first)
@@ -286,14 +421,15 @@ class Odometry:
         """(pose, motion) by policy, where a motion was not found."""
         covariance = np.diag([FAILED_STD_M**2] * 3 + [FAILED_STD_RAD**2] * 3)
         covariance = np.maximum(covariance, np.diag(np.diag(failed.covariance)))
-        if self.policy == "hold" or anchor.T_last is None:
-            T_world_cam = anchor.T_world_last
+        T_world_cam, T_curr_prev = anchor.T_world_last, np.eye(4)
+        ahead = anchor.history.predict(anchor.gap + 1)
+        if self.policy == "hold" or ahead is None:
+            if anchor.gap:
+                T_curr_prev = invert(T_world_cam) @ anchor.T_world_cam
         else:
-            T_world_cam = chain(anchor.T_world_last, anchor.T_last)
-        if anchor.gap or self.policy != "hold":
-            T_curr_prev = invert(T_world_cam) @ anchor.T_world_cam
-        else:
-            T_curr_prev = np.eye(4)
+            # the velocity wanders on with every motion that fails
+            T_curr_prev, covariance = ahead.T_curr_prev, (anchor.lost + 1) * ahead.covariance
+            T_world_cam = chain(anchor.T_world_cam, T_curr_prev)
         return T_world_cam, failed.replace(T_curr_prev=T_curr_prev, covariance=covariance)
 
 

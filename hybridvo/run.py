@@ -14,7 +14,7 @@ import os
 import platform
 import re
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -32,10 +32,11 @@ from hybridvo.evaluation.report import write_json
 from hybridvo.flow import FlowField, FlowProvider, dis_flow, fallback, file_flow
 from hybridvo.geometry import invert
 from hybridvo.hybrid import JUDGED, check_method, weights_hash
-from hybridvo.odometry import Anchor, Odometry
+from hybridvo.odometry import Odometry
 from hybridvo.recording import Recording, check_recording
 from hybridvo.run_folder import PARTIAL, RESULTS, Mode, RunFolder
 from hybridvo.run_results import draw, score, summarise, true_trajectory, write_steps
+from hybridvo.tracking.anchor import dump_anchor, load_anchor
 from hybridvo.trajectory import Trajectory, write_kitti, write_tum
 from hybridvo.types import Frame, Step
 
@@ -183,6 +184,9 @@ def _run(
             flow=provider,
             method=options.method,
             polish=options.polish,
+            window=options.window,
+            window_options=options.key_frames,
+            history=options.history,
             photometric=options.photometric,
             policy=options.policy,  # type: ignore[arg-type]
             options=options.refinement,
@@ -213,7 +217,11 @@ def _resume(vo: Odometry, folder: RunFolder, sequence: Sequence, frames: range) 
     try:
         if folder.last["index"] != frames[folder.frames_done - 1]:
             raise ValueError("another frame's")
-        vo.resume(_load_anchor(folder.last["anchor"], sequence))
+        # key frames are written where they change: those of the latest such row hold
+        keys = None
+        for row in folder.rows():
+            keys = row["anchor"]["keys"] or keys
+        vo.resume(load_anchor(folder.last["anchor"], keys, sequence.frame))
         return int(folder.last["failed_so_far"])
     except (KeyError, TypeError, ValueError, IndexError, OSError) as error:
         raise InputError(
@@ -269,7 +277,8 @@ def _track(
         "polish": _polish_word(motion.polish),
         "flow_is_true": field is not None and field.flow is not None and field.is_true,
         "errors": _errors(sequence, before.frame, step),
-        "anchor": _dump_anchor(vo.anchor),
+        "window": "+".join(str(e.prev) for e in vo.edges if e.ok and e.kind != "chain"),
+        "anchor": dump_anchor(vo.anchor, before),
     }
     return row
 
@@ -366,8 +375,10 @@ class _Recorder:
         self.field: FlowField | None = None
 
     def __call__(self, prev: Frame, curr: Frame) -> FlowField:
-        self.field = self._provider(prev, curr)
-        return self.field
+        field = self._provider(prev, curr)
+        if self.field is None:  # a window may ask for more, from its key frames
+            self.field = field
+        return field
 
 
 def _tolerant(provider: FlowProvider, strict: bool) -> FlowProvider:
@@ -467,28 +478,3 @@ def versions() -> dict[str, str]:
         except PackageNotFoundError:
             continue
     return found
-
-
-def _dump_anchor(anchor: Anchor) -> dict[str, Any]:
-    return {
-        "index": None if anchor.frame is None else anchor.frame.index,
-        "T_world_cam": anchor.T_world_cam.ravel(),
-        "T_world_last": anchor.T_world_last.ravel(),
-        "T_last": None if anchor.T_last is None else anchor.T_last.ravel(),
-        "gap": anchor.gap,
-        "images": anchor.images,
-    }
-
-
-def _load_anchor(stored: Mapping[str, Any], sequence: Sequence) -> Anchor:
-    def matrix(name: str) -> np.ndarray:
-        return np.array(stored[name], dtype=np.float64).reshape(4, 4)
-
-    return Anchor(
-        None if stored["index"] is None else sequence.frame(stored["index"]),
-        matrix("T_world_cam"),
-        matrix("T_world_last"),
-        None if stored["T_last"] is None else matrix("T_last"),
-        int(stored["gap"]),
-        stored["images"],
-    )

@@ -20,7 +20,7 @@ __all__ = ["STEP_COLUMNS", "draw", "score", "summarise", "true_trajectory", "wri
 STEP_COLUMNS = (
     *("index", "timestamp", "status", "reason", "tx", "ty", "tz", "rx", "ry", "rz"),
     *("inlier_ratio", "iterations", "cost", "ms", "prev_index", "flow_source"),
-    *("terms", "polish", "message"),
+    *("terms", "polish", "window", "message"),
 )
 
 Row = Mapping[str, Any]

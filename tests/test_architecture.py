@@ -61,7 +61,8 @@ IMPORTS: dict[str, set[str]] = {
     # what stands at the door
     "demo": {"errors", "data", "evaluation", "configuration", "run"},
     "doctor": {"__init__", "errors", "hybrid"},
-    "diagnosis": CLASSICAL | {"flow"},
+    "diagnosis_findings": CLASSICAL,
+    "diagnosis": CLASSICAL | {"flow", "diagnosis_findings"},
     "__init__": set(),
 }
 """Room -> rooms it may import. ``cli`` and the tools may import everything."""

@@ -21,7 +21,7 @@ def test_the_shipped_file_equals_the_defaults_and_names_every_key() -> None:
     assert load_options(str(CONFIG)) == RunOptions()
     keys = yaml.safe_load(CONFIG.read_text())
     assert set(keys) == {f.name for f in dataclasses.fields(RunOptions)} - {
-        *("refinement", "photometric"),
+        *("refinement", "photometric", "key_frames"),
     }
     assert set(keys["dis"]) == {f.name for f in dataclasses.fields(DisOptions)}
 

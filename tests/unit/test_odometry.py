@@ -117,7 +117,7 @@ def test_swapped_frames_give_the_inverse_motion() -> None:
 
 @pytest.mark.parametrize("policy", ["hold", "constant_velocity"])
 def test_failed_motion_follows_the_policy(policy: str) -> None:
-    vo = tracker(policy=policy)
+    vo = tracker(policy=policy, window=1)  # a window would find the way from frame 1
     vo.track(frame(0))
     good = vo.track(frame(1))
     vo.track(frame(2, depth=None))
@@ -232,11 +232,72 @@ def test_a_frame_of_another_size_is_refused_and_changes_nothing() -> None:
         ({"method": "refin"}, "did you mean 'refine'"),
         ({"method": "pixelwise"}, "needs network weights.*--method refine"),
         ({"method": "hybrid", "network": None}, "needs a network"),
+        ({"window": 0}, "1 for none, got 0"),
+        ({"window": 2.5}, "1 for none, got 2.5"),
+        ({"window": 4, "method": "identity"}, "'identity' has no window"),
     ],
 )
 def test_wrong_options(options: dict[str, object], message: str) -> None:
     with pytest.raises(InputError, match=message):
         Odometry(**options)
+
+
+def test_a_frame_without_depth_is_bridged_from_a_key_frame() -> None:
+    vo = tracker()
+    for i in range(3):
+        vo.track(frame(i))
+    lost = vo.track(frame(3, depth=None))
+    assert lost.ok  # its own depth is not needed
+    bridged = vo.track(frame(4))
+    assert bridged.status.state is State.DEGRADED and "key frame" in bridged.status.message
+    assert bridged.status.reason is Reason.NO_VALID_DEPTH and "window" in bridged.motion.terms
+    expected = invert(np.linalg.matrix_power(MOTION, 4))
+    np.testing.assert_allclose(bridged.T_world_cam, expected, atol=1e-4)
+    # steps chain to poses
+    np.testing.assert_allclose(
+        lost.T_world_cam @ bridged.T_prev_curr, bridged.T_world_cam, atol=1e-12
+    )
+
+
+def test_set_pose_moves_the_key_frames_as_well() -> None:
+    start = se3_exp(np.array([1.0, 2.0, 3.0, 0.1, 0.2, 0.3]))
+    vo = tracker()
+    for i in range(4):
+        vo.track(frame(i))
+    vo.set_pose(start)
+    vo.track(frame(4, depth=None))
+    bridged = vo.track(frame(5))
+    assert "window" in bridged.motion.terms
+    expected = start @ invert(np.linalg.matrix_power(MOTION, 2))
+    np.testing.assert_allclose(bridged.T_world_cam, expected, atol=1e-4)
+
+
+def test_prediction_is_the_last_motion_with_a_covariance() -> None:
+    vo = tracker(window=1)
+    assert vo.predict() is None
+    for i in range(8):
+        vo.track(frame(i))
+    ahead = vo.predict()
+    assert ahead is not None
+    np.testing.assert_allclose(ahead.T_curr_prev, MOTION, atol=1e-5)
+    # a motion that never changed: the floor of a millimetre and a milliradian
+    np.testing.assert_allclose(np.sqrt(np.diag(ahead.covariance)), 1e-3, rtol=0.05)
+    two = vo.predict(2)
+    assert two is not None
+    np.testing.assert_allclose(two.T_curr_prev, MOTION @ MOTION, atol=1e-5)
+    np.testing.assert_allclose(two.covariance, 5 * ahead.covariance)
+
+
+def test_a_failed_motion_under_constant_velocity_has_the_covariance_of_the_history() -> None:
+    vo = tracker(policy="constant_velocity", window=1)
+    for i in range(8):
+        vo.track(frame(i))
+    ahead = vo.predict()
+    vo.track(frame(8, depth=None))
+    first, second = vo.track(frame(9, depth=None)), vo.track(frame(10))
+    assert ahead is not None and not first.ok and not second.ok
+    np.testing.assert_allclose(first.covariance, ahead.covariance, rtol=0.2, atol=1e-12)
+    np.testing.assert_allclose(second.covariance, 2 * first.covariance, rtol=1e-6, atol=1e-12)
 
 
 def test_track_wants_a_frame() -> None:
@@ -252,7 +313,7 @@ def test_from_pretrained_knows_its_weights() -> None:
 
 @pytest.mark.parametrize("bad", [np.nan, 0.0, -1.0, np.inf])
 def test_bad_depth_never_gives_a_pose_that_is_not_finite(bad: float) -> None:
-    vo = tracker()
+    vo = tracker(window=1)
     vo.track(frame(0))
     vo.track(frame(1, depth=np.full((HEIGHT, WIDTH), bad, np.float32)))
     step = vo.track(frame(2))
@@ -332,7 +393,8 @@ def test_history_cannot_hold_the_tracker(kind: str) -> None:
             if step == 3 and history:
                 # and a last motion that is quite another one
                 wrong = se3_exp(np.array([0.3, 0.2, -0.4, 0.05, -0.08, 0.02]))
-                vo.resume(replace(vo.anchor, T_last=wrong))
+                trapped = replace(vo.anchor.history, T_last=wrong)
+                vo.resume(replace(vo.anchor, history=trapped))
             before = path[max(step - 1, 0)]
             true = invert(scene.T_world_cam[at]) @ scene.T_world_cam[before]
             camera = scene.camera(before)
