@@ -42,9 +42,12 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
         InputError: no such file. FormatError: not plain YAML, not a mapping, or above 64 KiB.
     """
     path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; presets of the project are in configs/.")
-    mapping = plain_yaml(read_text(path, limit=MAX_YAML_BYTES), str(path))
+    try:
+        text = read_text(path, limit=MAX_YAML_BYTES)
+    except FileNotFoundError:
+        message = f"{path}: no such file; presets of the project are in configs/."
+        raise InputError(message) from None
+    mapping = plain_yaml(text, str(path))
     if not isinstance(mapping, dict):
         raise FormatError(f"{path}: expected a mapping of keys, got {type(mapping).__name__}.")
     return mapping

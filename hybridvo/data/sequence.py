@@ -90,15 +90,26 @@ def open_sequence(
         **options: keyword arguments of the reader, such as ``strict=True``.
 
     Raises:
-        InputError: no such folder, an unknown data set or option, a layout that no reader knows
-            (with what was looked for), or a sequence without frames.
+        InputError: no such folder, one that cannot be read, an unknown data set or option, a layout
+            that no reader knows (with what was looked for), or a sequence without frames.
         FormatError: a list or calibration file that is damaged.
     """
-    folder = Path(path)
     if dataset is not None and dataset not in DATASETS:
         close = difflib.get_close_matches(dataset, DATASETS, n=1)
         hint = f" (did you mean '{close[0]}'?)" if close else ""
         raise InputError(f"dataset: '{dataset}' is unknown{hint}; known: {', '.join(DATASETS)}.")
+    folder = Path(path)
+    try:
+        return _open(folder, dataset, options)
+    except FileNotFoundError as error:
+        raise InputError(f"{folder}: {error.filename or error} is missing.") from None
+    except OSError as error:  # a name that is too long, a folder that may not be read
+        reason = error.strerror or str(error)
+        raise InputError(f"{str(folder)[:200]}: cannot be read: {reason}.") from None
+
+
+def _open(folder: Path, dataset: str | None, options: dict[str, Any]) -> Sequence:
+    """The sequence of a folder by the named reader, or by the first that knows it."""
     if dataset is not None:
         reader = next(r for r in READERS if r.kind == dataset)
     else:
@@ -116,10 +127,7 @@ def open_sequence(
     # Sintel may be opened through an image folder that was never downloaded.
     if not folder.is_dir() and reader is not SintelSequence:
         raise InputError(_nothing_found(folder))
-    try:
-        return reader(folder, **options)
-    except FileNotFoundError as error:
-        raise InputError(f"{folder}: {reader.kind}: {error.filename} is missing.") from None
+    return reader(folder, **options)
 
 
 def _nothing_found(folder: Path) -> str:

@@ -107,7 +107,7 @@ def load_weights(path: str | Path) -> tuple[nn.Module, dict[str, Any]]:
             does not match.
     """
     path = Path(path)
-    if not path.is_file():
+    if not os.path.isfile(path):  # where Path.is_file() raises: a name that is too long
         raise CheckpointError(f"{path}: no such weights file. {_known()}")
     try:
         with safe_open(path, framework="pt") as file:

@@ -90,7 +90,7 @@ def load_checkpoint(path: str | Path) -> dict[str, Any]:
             are not finite; names the file.
     """
     path = Path(path)
-    if not path.is_file():
+    if not os.path.isfile(path):  # where Path.is_file() raises: a name that is too long
         raise CheckpointError(f"{path}: no such checkpoint.")
     try:
         _check_archive(path)

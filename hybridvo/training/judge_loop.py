@@ -18,7 +18,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from hybridvo.errors import InputError
+from hybridvo.errors import CheckpointError, InputError
 from hybridvo.network.judge import JudgeInputs, JudgeNetwork, JudgeOptions, JudgeOutput
 from hybridvo.training.checkpoint import load_checkpoint, save_checkpoint
 from hybridvo.training.judge_batches import (
@@ -258,17 +258,24 @@ class JudgeTrainer:
         )
 
     def resume(self) -> bool:
-        """Go on from ``checkpoint.pt`` if there is one."""
+        """Go on from ``checkpoint.pt`` if there is one.
+
+        Raises:
+            CheckpointError: a damaged file, or one of another training.
+        """
         path = self.out / "checkpoint.pt"
         if not path.exists():
             return False
         state = load_checkpoint(path)
-        self.network.load_state_dict(state["network"])
-        self.optimizer.load_state_dict(state["optimizer"])
-        self.average = state["ema"]
-        progress = state["progress"]
-        self.step, self.pictures = progress["step"], progress["pictures"]
-        self.elapsed = progress["minutes"]
-        self.draw.set_state(state["rng"]["draw"])
-        self.rng.bit_generator.state = json.loads(state["rng"]["order"])
+        try:
+            self.network.load_state_dict(state["network"])
+            self.optimizer.load_state_dict(state["optimizer"])
+            self.average = state["ema"]
+            progress = state["progress"]
+            self.step, self.pictures = progress["step"], progress["pictures"]
+            self.elapsed = progress["minutes"]
+            self.draw.set_state(state["rng"]["draw"])
+            self.rng.bit_generator.state = json.loads(state["rng"]["order"])
+        except (RuntimeError, ValueError, TypeError, LookupError) as error:
+            raise CheckpointError(f"{path}: not of this training of a judge: {error}") from error
         return True

@@ -30,6 +30,7 @@ from hybridvo.data.plain_yaml import plain_yaml
 from hybridvo.data.presets import load_preset
 from hybridvo.data.sequence import open_sequence
 from hybridvo.errors import CheckpointError, FormatError, InputError
+from hybridvo.network.weights import load_weights
 from hybridvo.training.checkpoint import FORMAT, load_checkpoint, save_checkpoint
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "fuzz"))
@@ -225,6 +226,15 @@ def test_pipes_and_devices_do_not_block(tmp_path):
         image_io.read_rgb(tmp_path / "file" / "x.png")
 
 
+@pytest.mark.parametrize("name", ["x" * 300, "file/x", "a\0b"])
+def test_names_that_no_file_can_have(name, tmp_path):
+    (tmp_path / "file").touch()
+    path = f"{tmp_path}/{name}"
+    for read in (load_options, load_preset, load_weights, load_checkpoint, open_sequence):
+        with pytest.raises(InputError):
+            read(path)
+
+
 # --- images ---------------------------------------------------------------------------------------
 def jpeg(**options: int) -> bytes:
     flags = [item for pair in options.items() for item in (getattr(cv2, pair[0]), pair[1])]
@@ -390,3 +400,13 @@ def test_a_list_that_holds_itself(tmp_path):
     loop.append(loop)
     path = save_checkpoint(tmp_path / "x.pt", {**state(), "options": {"loop": loop}})
     assert load_checkpoint(path)["progress"] == {"step": 1}
+
+
+def test_judge_training_refuses_the_checkpoint_of_another_training(tmp_path):
+    from hybridvo.training.judge_loop import JudgeTrainer
+
+    save_checkpoint(tmp_path / "checkpoint.pt", state())
+    trainer = object.__new__(JudgeTrainer)  # resume() needs no pictures
+    trainer.out, trainer.network = tmp_path, torch.nn.Linear(2, 1)  # type: ignore[assignment]
+    with pytest.raises(CheckpointError, match=r"checkpoint\.pt: not of this training"):
+        trainer.resume()

@@ -10,8 +10,9 @@ import sequences as write
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from hybridvo.data.sequence import open_sequence
+from hybridvo.data.sequence import iter_pairs, open_sequence
 from hybridvo.errors import FormatError, InputError
+from hybridvo.flow import FlowField
 from hybridvo.types import Camera
 
 TINY = {k: w for k, w in write.WRITERS.items() if k not in ("tum", "7scenes")}
@@ -205,6 +206,19 @@ def test_depth_units_notice(tmp_path):
         open_sequence(written.path)
 
 
+@pytest.mark.parametrize(
+    ("scale", "hint"),
+    [("256000", "multiply by 1000"), ("25600", "multiply by 100"), ("51.2", None), ("1280", None)],
+)
+def test_depth_units_that_can_and_cannot_be_told(scale, hint, tmp_path):
+    # Five times too far or near is a plausible room, and no picture knows its own scale: with depth
+    # and translation both five times as large every flow is the same. Nothing can be said then.
+    written = write.write_folder(tmp_path)
+    edit(written.path / "camera.yaml", "depth_scale: 256", f"depth_scale: {scale}")
+    notices = [n for n in open_sequence(written.path).notices if "median depth" in n]
+    assert [hint in n for n in notices] == ([True] if hint else [])
+
+
 # F23: dtypes
 def test_eight_bit_depth_is_refused(tmp_path):
     written = write.write_kitti(tmp_path)
@@ -255,6 +269,46 @@ def test_spaces_and_bytes_in_names(tmp_path):  # F41
     path.write_bytes(path.read_bytes().replace(b"rgb/1.png", b"rgb/my \xff.png"))
     frame = open_sequence(written.path).frame(1)
     np.testing.assert_array_equal(frame.rgb, written.rgb[1])
+
+
+def test_very_long_paths(tmp_path):  # F41
+    deep = tmp_path
+    for _ in range(5):
+        deep = deep / ("d" * 200)
+    deep.mkdir(parents=True)
+    written = write.write_folder(deep)
+    np.testing.assert_array_equal(open_sequence(written.path).frame(2).rgb, written.rgb[2])
+    with pytest.raises(InputError, match="cannot be read: File name too long"):
+        open_sequence(tmp_path / ("x" * 300))
+    with pytest.raises(InputError, match="no such folder"):
+        open_sequence(f"{tmp_path}/a\0b")
+
+
+@pytest.mark.parametrize("kind", ["folder", "kitti", "tartanair-v1"])
+def test_frames_deleted_while_their_pairs_are_read(kind, tmp_path):  # F17, F41
+    written = TINY[kind](tmp_path)
+    sequence = open_sequence(written.path)
+    problems: list[tuple[int, Exception]] = []
+    zero = lambda prev, curr: FlowField(np.zeros((*prev.camera.shape, 2), np.float32))  # noqa: E731
+    pairs = iter_pairs(sequence, zero, on_error=lambda i, e: problems.append((i, e)))
+    for files in (sequence.rgb_files, sequence.depth_files):
+        files[1].unlink()
+    assert list(pairs) == []  # of three frames the middle one is gone
+    assert [i for i, _ in problems] == [1]
+    assert isinstance(problems[0][1], FileNotFoundError) and "frame 1" in str(problems[0][1])
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes here")
+@pytest.mark.parametrize("kind", ["sintel", "kitti", "tartanair-v1"])
+def test_a_pipe_among_the_frames_does_not_block(kind, tmp_path):
+    written = TINY[kind](tmp_path)
+    path = open_sequence(written.path).rgb_files[1]
+    path.unlink()
+    os.mkfifo(path)
+    sequence = open_sequence(written.path)
+    assert path not in sequence.files()  # they are opened for the input hash
+    with pytest.raises(FormatError, match="expected a file, got a pipe"):
+        sequence.frame(1)
 
 
 # F27: YAML
