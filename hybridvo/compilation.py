@@ -96,7 +96,8 @@ def compile_once(code: str, sources: Path, name: str) -> bool:
     paths = [package, *filter(None, [os.environ.get("PYTHONPATH")])]
     try:
         done = subprocess.run(
-            [sys.executable, "-c", code],
+            # -P: not the modules that lie in the current folder, which may be a data set's
+            [sys.executable, "-P", "-c", code],
             env=os.environ | {"PYTHONPATH": os.pathsep.join(paths)},
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,

@@ -6,6 +6,7 @@ Each guard is shown a bad line first: a guard that cannot fail guards nothing.
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
@@ -24,6 +25,17 @@ CALLS = {
     *("torch.hub.load", "torch.jit.load", "pandas.read_pickle", "np.fromfile", "numpy.fromfile"),
     *("warnings.simplefilter", "warnings.filterwarnings", "logging.basicConfig"),
 }
+NETWORK = {
+    *("socket", "socketserver", "ssl", "http", "urllib", "urllib3", "requests", "aiohttp", "httpx"),
+    *("ftplib", "imaplib", "poplib", "smtplib", "telnetlib", "xmlrpc", "asyncio", "webbrowser"),
+}
+REACHES_OUT = {
+    "hybridvo/run_folder.py": {"socket"},  # the name of this machine, for the lock
+    "hybridvo/compilation.py": {"subprocess"},  # this Python, on this package
+    "hybridvo/comparison/executors.py": {"multiprocessing"},  # --jobs
+    "hybridvo/training/provenance.py": {"subprocess"},  # git rev-parse, on this package
+}
+"""File of the library -> the only modules by which it may reach beyond its process."""
 PRINTERS = {"cli.py", "console.py", "demo.py", "doctor.py"}
 """The command line. The progress line prints to the stream that it was given."""
 
@@ -86,6 +98,26 @@ def dangers(source: str) -> Iterator[str]:
             yield f"{where}: allow_pickle"
         if keyword(node, "shell") not in (None, False):
             yield f"{where}: shell"
+
+
+def reaches(source: str) -> set[str]:
+    """Modules for networks and for other programs that a source imports."""
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            found |= {alias.name.split(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            found.add((node.module or "").split(".")[0])
+    return found & (NETWORK | {"subprocess", "pty", "multiprocessing"})
+
+
+def children_of_this_folder(source: str) -> Iterator[str]:
+    """Pythons that are started with ``-c`` and would import what lies in the current folder."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.List) and node.elts and dotted(node.elts[0]) == "sys.executable":
+            options = {part.value for part in node.elts if isinstance(part, ast.Constant)}
+            if "-c" in options and not options & {"-P", "-I"}:
+                yield f"line {node.lineno}"
 
 
 def prints(source: str) -> Iterator[str]:
@@ -159,6 +191,28 @@ def test_the_guard_lets_it_pass(good):
 @pytest.mark.parametrize("path", programs(), ids=lambda p: p.relative_to(ROOT).as_posix())
 def test_nothing_runs_what_an_input_says(path):
     assert not list(dangers(path.read_text(encoding="utf-8")))
+
+
+def test_the_library_reaches_for_no_network_and_no_program():
+    assert reaches("from urllib.request import urlopen") == {"urllib"}
+    assert reaches("def f():\n    import http.client, subprocess") == {"http", "subprocess"}
+    found = {
+        path.relative_to(ROOT).as_posix(): modules
+        for path in library()
+        if (modules := reaches(path.read_text(encoding="utf-8")))
+    }
+    assert {name: found[name] - REACHES_OUT.get(name, set()) for name in found} == {
+        name: set() for name in found
+    }
+    lock = (ROOT / "hybridvo" / "run_folder.py").read_text(encoding="utf-8")
+    assert set(re.findall(r"\bsocket\.(\w+)", lock)) == {"gethostname"}
+
+
+def test_no_child_imports_what_lies_in_the_current_folder():
+    assert list(children_of_this_folder("[sys.executable, '-c', code]"))
+    assert not list(children_of_this_folder("[sys.executable, '-P', '-c', code]"))
+    for path in library():
+        assert not list(children_of_this_folder(path.read_text(encoding="utf-8"))), path
 
 
 def test_no_print_in_the_library():
