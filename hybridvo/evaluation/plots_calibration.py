@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,8 @@ __all__ = ["plot_calibration"]
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 _MARKERS = ("o", "s", "D", "^", "v", "P")
 FEW = 5
-"""Answers below which a bin's point is hollow: its interval covers most of the axis."""
+"""Answers below which a bin's point is hollow, without its interval, which covers the axis."""
+_SIZES = (lambda n: n >= FEW, lambda n: 0 < n < FEW)
 
 
 def plot_calibration(
@@ -46,21 +47,18 @@ def plot_calibration(
     width = 0.8 / len(groups)
     for k, (name, found) in enumerate(groups.items()):
         colour = _COLOURS[k % len(_COLOURS)]
-        bins = [b for b in found["bins"] if b["answers"]]
-        x = [b["stated"] for b in bins]
-        y = [b["observed"]["share"] for b in bins]
+        marker = _MARKERS[k % len(_MARKERS)]
+        many, few = ([b for b in found["bins"] if test(b["answers"])] for test in _SIZES)
+        x, y = _points(many)
         spread = [
-            [b["observed"]["share"] - b["observed"]["low"] for b in bins],
-            [b["observed"]["high"] - b["observed"]["share"] for b in bins],
+            [b["observed"]["share"] - b["observed"]["low"] for b in many],
+            [b["observed"]["high"] - b["observed"]["share"] for b in many],
         ]
         upper.errorbar(x, y, spread, color=colour, linestyle="none", elinewidth=0.9, alpha=0.6)
         label = f"{name}: {found['answers']} answers, Brier {found['brier']:.3f}"
         label += f", ECE {found['ece']:.3f}"
-        upper.plot(x, y, color=colour, linewidth=1.2, label=label)
-        for b, at, share in zip(bins, x, y, strict=True):
-            face = "white" if b["answers"] < FEW else colour
-            marker = _MARKERS[k % len(_MARKERS)]
-            upper.plot(at, share, marker, color=colour, markerfacecolor=face, markersize=6)
+        upper.plot(x, y, marker=marker, color=colour, linewidth=1.2, label=label, markersize=6)
+        upper.plot(*_points(few), marker, color=colour, markerfacecolor="white", markersize=5)
         steps = found["bins"]
         lower.bar(
             [0.5 * (b["low"] + b["high"]) + (k + 0.5 - len(groups) / 2) * width / len(steps)
@@ -69,7 +67,7 @@ def plot_calibration(
         )  # fmt: skip
     upper.set_ylabel("share that is right (95 % interval)", fontsize=9)
     upper.set_ylim(-0.02, 1.02)
-    upper.legend(frameon=False, fontsize=8, loc="lower right")
+    figure.legend(frameon=False, fontsize=8, loc="outside lower center", ncols=2)
     lower.set_yscale("symlog", linthresh=10)
     lower.set_ylim(bottom=0)
     lower.set_ylabel("answers", fontsize=9)
@@ -85,3 +83,8 @@ def plot_calibration(
         upper.set_title(title, fontsize=10, loc="left")
     with atomic_write(path, "wb") as file:
         figure.savefig(file, format="png", metadata={"Software": None})
+
+
+def _points(bins: Sequence[Mapping[str, Any]]) -> tuple[list[float], list[float]]:
+    """Stated and observed of some bins."""
+    return [b["stated"] for b in bins], [b["observed"]["share"] for b in bins]
