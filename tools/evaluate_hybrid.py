@@ -31,6 +31,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--noisy-stride", type=int, default=4, help="also with noise; 0: never")
     parser.add_argument("--cell-pairs", type=int, default=20, help="pairs of each cell; 0: none")
     parser.add_argument("--jobs", type=int, default=1, help="processes")
+    parser.add_argument("--parts", type=Path, help="folder of finished sequences, to go on from")
     parser.add_argument("--out", type=Path, default=Path("docs/results/hybrid_sequences.json"))
     parser.add_argument("--answers", type=Path, help="CSV with one row per answer")
     parser.add_argument("--page", type=Path, help="page whose marked part is made from --out")
@@ -105,16 +106,20 @@ def measure(args: argparse.Namespace) -> dict[str, Any]:
     cpu_s = time.process_time() - started
     with open_workers(args.jobs) as workers:
         running = [
-            (kind, seed, workers.executor.submit(sequences.run_sequence, kind, seed, options))
+            (
+                kind,
+                seed,
+                workers.executor.submit(_sequence, kind, seed, options, args.parts, commit),
+            )
             for kind in options.kinds
             for seed in options.seeds
         ]
         for kind, seed, future in running:
             found = future.result()
-            records += found.records
-            paths += found.paths
-            cpu_s += found.cpu_s
-            progress(f"{kind} {seed}: {found.cpu_s:.0f} s of processor time")
+            records += found["records"]
+            paths += found["paths"]
+            cpu_s += found["cpu_s"]
+            progress(f"{kind} {seed}: {found['cpu_s']:.0f} s of processor time")
     if args.answers:
         write_csv(args.answers, records)
     return {
@@ -142,6 +147,30 @@ def measure(args: argparse.Namespace) -> dict[str, Any]:
         "map": RECALIBRATION,
         **summarise(records, paths, RECALIBRATION),
     }
+
+
+def _sequence(
+    kind: str, seed: int, options: Any, parts: Path | None, commit: str | None
+) -> dict[str, Any]:
+    """One sequence; read from ``parts`` where the same sources measured the same before."""
+    import json
+    from dataclasses import asdict
+
+    from hybridvo.comparison.hybrid_sequences import run_sequence
+    from hybridvo.evaluation.report import write_json
+
+    conditions = asdict(options) | {"kinds": [kind], "seeds": [seed], "commit": commit}
+    conditions["methods"] = list(options.methods)
+    path = None if parts is None else parts / f"{kind}_{seed}.json"
+    if path is not None and path.is_file():
+        kept = json.loads(path.read_text(encoding="utf-8"))
+        if kept["conditions"] == conditions and commit and "dirty" not in commit:
+            return kept
+    found = asdict(run_sequence(kind, seed, options)) | {"conditions": conditions}
+    if path is not None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_json(path, found)
+    return found
 
 
 def _write(args: argparse.Namespace, result: dict[str, Any]) -> None:
