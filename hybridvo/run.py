@@ -35,7 +35,7 @@ from hybridvo.hybrid import JUDGED, check_method, weights_hash
 from hybridvo.odometry import Odometry
 from hybridvo.recording import Recording, check_recording
 from hybridvo.run_folder import PARTIAL, RESULTS, Mode, RunFolder
-from hybridvo.run_results import draw, score, summarise, true_trajectory, write_steps
+from hybridvo.run_results import compact, draw, score, summarise, true_trajectory, write_steps
 from hybridvo.tracking.anchor import dump_anchor, load_anchor
 from hybridvo.trajectory import Trajectory, write_kitti, write_tum
 from hybridvo.types import Frame, Step
@@ -312,7 +312,7 @@ def _write(
     warnings: Iterable[str] = (),
 ) -> RunResult:
     """Results of the rows kept so far; all of them and the scores where the run is complete."""
-    rows = list(folder.rows())
+    rows = [compact(row) for row in folder.rows()]
     if not rows:  # interrupted before the first frame
         folder.write_state("interrupted")
         empty = Trajectory(np.zeros(1), np.eye(4)[None], has_timestamps=False)

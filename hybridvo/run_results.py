@@ -15,7 +15,15 @@ from hybridvo.evaluation.report import write_csv
 from hybridvo.geometry import pose_matrix, se3_log
 from hybridvo.trajectory import Trajectory, atomic_write
 
-__all__ = ["STEP_COLUMNS", "draw", "score", "summarise", "true_trajectory", "write_steps"]
+__all__ = [
+    "STEP_COLUMNS",
+    "compact",
+    "draw",
+    "score",
+    "summarise",
+    "true_trajectory",
+    "write_steps",
+]
 
 STEP_COLUMNS = (
     *("index", "timestamp", "status", "reason", "tx", "ty", "tz", "rx", "ry", "rz"),
@@ -23,7 +31,18 @@ STEP_COLUMNS = (
     *("terms", "polish", "window", "message"),
 )
 
+ARRAYS = ("T_curr_prev", "T_world_cam", "covariance")
+
 Row = Mapping[str, Any]
+
+
+def compact(row: Row) -> dict[str, Any]:
+    """A kept row in a third of the memory: numbers as arrays, without the tracker's state."""
+    return {
+        key: np.array(value) if key in ARRAYS else value
+        for key, value in row.items()
+        if key != "anchor"
+    }
 
 
 def summarise(

@@ -189,7 +189,9 @@ def run(walk: Path, out: Path, *options: str) -> int:
     return main([*arguments, "--flow", "file", "-q", *options])
 
 
-def stopped(walk: Path, out: Path, rows: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def stopped(
+    walk: Path, out: Path, rows: int, monkeypatch: pytest.MonkeyPatch, *options: str
+) -> None:
     """A run whose process died after some frames."""
 
     class Died(BaseException):
@@ -205,7 +207,23 @@ def stopped(walk: Path, out: Path, rows: int, monkeypatch: pytest.MonkeyPatch) -
     with monkeypatch.context() as patch:
         patch.setattr(RunFolder, "append", die)
         with pytest.raises(Died):
-            run(walk, out)
+            run(walk, out, *options)
+
+
+def test_a_hybrid_run_with_its_window_resumes_to_the_same_bytes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Key frames, history of the motion and trust in the pictures live beyond one pair."""
+    from stress_parts import content, write_walk
+
+    walk = write_walk(tmp_path / "walk", 9, height=64, width=96, pictures=True)
+    options = ("--method", "hybrid", "--flow", "dis")
+    assert run(walk, tmp_path / "whole", *options) == 0
+    out = tmp_path / "out"
+    stopped(walk, out, 3, monkeypatch, *options)
+    stopped(walk, out, 6, monkeypatch, *options, "--resume")
+    assert run(walk, out, *options, "--resume") == 0
+    assert content(out) == content(tmp_path / "whole")
 
 
 @pytest.mark.parametrize(
