@@ -76,10 +76,12 @@ class View:
         x, y = b.fx * moved[..., 0] / depth + b.cx, b.fy * moved[..., 1] / depth + b.cy
         with np.errstate(invalid="ignore"):
             seen = (x > -0.5) & (x < width - 0.5) & (y > -0.5) & (y < height - 0.5) & valid
+        i = np.clip(np.where(seen, np.rint(y), 0).astype(np.intp), 0, height - 1)
+        j = np.clip(np.where(seen, np.rint(x), 0).astype(np.intp), 0, width - 1)
+        if curr.mask is not None:
+            seen &= curr.mask[i, j]
         if curr.depth is not None:
-            i = np.where(seen, np.rint(y), 0).astype(np.intp)
-            j = np.where(seen, np.rint(x), 0).astype(np.intp)
-            there = curr.depth[np.clip(i, 0, height - 1), np.clip(j, 0, width - 1)]
+            there = curr.depth[i, j]
             known = np.isfinite(there) & (there > 0) & seen
             ratio = np.where(known, there, 1.0) / np.where(known, depth, 1.0)
             seen &= np.abs(ratio - 1.0) < HIDDEN

@@ -300,6 +300,23 @@ def test_a_failed_motion_under_constant_velocity_has_the_covariance_of_the_histo
     np.testing.assert_allclose(second.covariance, 2 * first.covariance, rtol=1e-6, atol=1e-12)
 
 
+def test_masks_and_depth_variances_of_ones_own_are_used() -> None:
+    # the left half of every picture is a body that follows another motion, and masked
+    mask = np.ones((HEIGHT, WIDTH), np.bool_)
+    mask[:, : 2 * WIDTH // 3] = False
+    variance = np.full((HEIGHT, WIDTH), 1e-4, np.float32)
+    other = se3_exp(np.array([-0.2, 0.1, -0.1, 0.02, 0.03, -0.02]))
+
+    def provide(prev: Frame, curr: Frame) -> FlowField:
+        flow = exact_flow()(prev, curr).flow
+        body = ego_flow(depth(prev.index), other, CAMERA, CAMERA).astype(np.float32)
+        return FlowField(np.where(mask[..., None], flow, body))
+
+    vo = tracker(flow=provide)
+    steps = [vo.track(frame(i, mask=mask, depth_variance=variance)) for i in range(3)]
+    np.testing.assert_allclose(steps[2].T_curr_prev, MOTION, atol=1e-4)
+
+
 def test_track_wants_a_frame() -> None:
     with pytest.raises(InputError, match="expected a Frame, got ndarray"):
         tracker().track(np.zeros((4, 4)))

@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from hybridvo.errors import InputError
 from hybridvo.evaluation.report import jsonable
 from hybridvo.geometry import invert, se3_exp, se3_log
 from hybridvo.tracking.anchor import Anchor, dump_anchor, load_anchor
+from hybridvo.tracking.key_frame import View
 from hybridvo.tracking.motion_history import MotionHistory
 from hybridvo.tracking.pose_graph import (
     FREEDOM,
@@ -193,7 +195,7 @@ def test_key_frames_are_taken_where_the_camera_has_moved_on() -> None:
     moving = walk(40, biased)
     taken = [key.frame.index for key in moving[-1].window.keys]
     # 0.6 px a frame, the limit is 8 % of 64 px
-    assert all(5 <= b - a <= 10 for a, b in zip(taken[:-1], taken[1:], strict=True))
+    assert all(5 <= b - a <= 10 for a, b in pairwise(taken))
 
 
 def test_one_wrong_stride_does_not_overrule_the_chain() -> None:
@@ -250,6 +252,23 @@ def test_a_failed_motion_that_no_key_frame_knows_either_stays_failed() -> None:
     assert located[-1].covariance[0, 0] < 1e-4
 
 
+def test_a_view_leaves_out_what_is_masked_hidden_or_outside() -> None:
+    mask = np.ones((HEIGHT, WIDTH), np.bool_)
+    mask[:, :32] = False
+    near = DEPTH.copy()
+    near[:24] = 3.0  # something stands in front of the upper half
+    key = KeyFrame(frame(0), np.eye(4))
+    assert View(key, np.eye(4), frame(1)).overlap == 1.0
+    assert View(key, np.eye(4), replace(frame(1), mask=mask)).overlap == pytest.approx(0.5)
+    assert View(key, np.eye(4), replace(frame(1), depth=near)).overlap == pytest.approx(0.5)
+    aside = se3_exp(np.array([2.0, 0, 0, 0, 0, 0]))  # 30 px to the right of 64
+    view = View(key, aside, frame(1))
+    assert view.overlap == pytest.approx(34 / 64, abs=0.07)  # a cell is 4 px wide
+    assert view.motion == pytest.approx(30 / 64)
+    weights = view.weights((HEIGHT, WIDTH))
+    assert weights.shape == (HEIGHT, WIDTH) and weights[:, :32].all() and not weights[:, 40:].any()
+
+
 def test_steps_say_how_sure_they_are() -> None:
     rng = np.random.default_rng(5)
     root = np.sqrt(OPTIONS.inflation) * np.sqrt(SURE)
@@ -263,7 +282,7 @@ def test_steps_say_how_sure_they_are() -> None:
         register=lambda key, curr, *_: noisy(power(STEP, curr.index - key.frame.index)),
     )
     squared = []
-    for a, b in zip(located[:-1], located[1:], strict=True):
+    for a, b in pairwise(located):
         step = invert(b.T_world_cam) @ a.T_world_cam
         squared.append(chi2(step @ invert(STEP), b.covariance))
     # 6 where all is independent; poses read from one key frame, and merged ones, do better
