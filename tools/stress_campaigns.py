@@ -31,7 +31,10 @@ from stress_parts import (
     write_walk,
 )
 
-FRAMES = 60
+FRAMES = 36
+DELETED = 6
+"""Frames that vanish from a walk."""
+
 Figures = dict[str, Any]
 
 
@@ -240,7 +243,7 @@ def deleted_input(lab: Lab, count: int, seed: int = 0) -> Figures:
             shutil.rmtree(copy)
         else:
             kind = ("depth", "flow")[i % 3]
-            for k in rng.choice(np.arange(30, FRAMES - 1), 10, replace=False):
+            for k in rng.choice(np.arange(FRAMES // 2, FRAMES - 1), DELETED, replace=False):
                 (copy / kind / f"{k:06d}.npy").unlink()
         end = fork.end()
         figures["runs"] += 1
@@ -248,7 +251,7 @@ def deleted_input(lab: Lab, count: int, seed: int = 0) -> Figures:
         with np.load(out / "steps.npz") as steps:
             figures["rows_missing"] += FRAMES - len(steps["T_curr_prev"])
             figures["not_finite"] += sum(not np.isfinite(steps[name]).all() for name in steps)
-        figures["lost_frames_said"] += state(out)["summary"]["failed"] >= 10
+        figures["lost_frames_said"] += state(out)["summary"]["failed"] >= DELETED
         # what was run on is not there any more: going on would mix two inputs
         figures["resumed"] += Fork(command(copy, out, *REFINE, "--resume")).end().code == 0
         shutil.rmtree(copy, ignore_errors=True)
