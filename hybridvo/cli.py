@@ -248,7 +248,7 @@ def _prepare_caches() -> None:
     """Give numba and matplotlib a place to write where neither home nor package is writable."""
     package = Path(__file__).resolve().parent
     with contextlib.suppress(OSError, RuntimeError):  # no home at all
-        if os.access(Path.home(), os.W_OK):
+        if Path.home().is_dir() and os.access(Path.home(), os.W_OK):
             return
     user = os.getuid() if hasattr(os, "getuid") else 0
     with contextlib.suppress(OSError):

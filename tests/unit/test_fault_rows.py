@@ -171,9 +171,8 @@ def test_f41_long_and_odd_output_names(dataset, tmp_path, capsys, name):
 
 
 def test_f41_names_that_no_file_system_takes(dataset, tmp_path, capsys):
-    for name in ("a" * 300, "/".join(["b" * 200] * 30), "nul\0byte"):
-        code = run(walk(dataset), tmp_path / name)
+    for name in ("a" * 300, "/".join(["b" * 200] * 30)):
+        assert run(walk(dataset), tmp_path / name) == 5
         error = capsys.readouterr().err
-        assert code in (2, 5)
         assert error.startswith("hybridvo: ")
         assert "Traceback" not in error
