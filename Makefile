@@ -44,8 +44,7 @@ $(BIN)/pip-audit: $(STAMP)
 
 # The table of docs/reliability.md, from the outcome of every test
 reliability: $(STAMP)
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --junitxml=runs/tests.xml
-	$(BIN)/python tools/reliability.py --junit runs/tests.xml
+	$(BIN)/python tools/reliability.py --run
 
 format: $(STAMP)
 	$(BIN)/ruff check --fix .

@@ -1,11 +1,13 @@
 r"""The table of docs/reliability.md, from what the tests and the campaigns did.
 
     python tools/reliability.py --run             # run the tests that tests/faults.yaml names
-    python tools/reliability.py --junit FILE      # or take a pytest run's XML (xunit1)
+    python tools/reliability.py --missing         # or those of them that have no outcome yet
+    python tools/reliability.py --junit FILE ...  # or take pytest's XML (-o junit_family=xunit1)
     python tools/reliability.py                   # only make the page again
     python tools/reliability.py --check           # exit code 1 if the page is not up to date
 
-A test that is named and does not exist, or was not run, is an error. Counted are test cases, the
+A test that is named and does not exist is an error; one that was not run is said to be so, and the
+exit code is 1, as it is where a test fails. Counted are test cases, the
 examples of hypothesis, and what a test says about itself by ``record_property("tries", n)``.
 """
 
@@ -44,7 +46,8 @@ def build_parser() -> argparse.ArgumentParser:
     )
     what = parser.add_mutually_exclusive_group()
     what.add_argument("--run", action="store_true", help="run the named tests first")
-    what.add_argument("--junit", type=Path, help="XML of a pytest run with junit_family=xunit1")
+    what.add_argument("--missing", action="store_true", help="run those without an outcome first")
+    what.add_argument("--junit", type=Path, nargs="+", help="XML of pytest runs")
     what.add_argument("--check", action="store_true", help="write nothing, only compare")
     parser.add_argument("--faults", type=Path, default=FAULTS)
     parser.add_argument("--results", type=Path, default=RESULTS, help="folder of the JSON files")
@@ -57,11 +60,17 @@ def main(argv: list[str] | None = None) -> int:
     target = args.results / "reliability.json"
     try:
         matrix = read_faults(args.faults)
-        if args.run or args.junit:
+        names = named_tests(matrix)
+        known = json.loads(target.read_text(encoding="utf-8"))["tests"] if target.exists() else {}
+        if args.run or args.missing or args.junit:
+            known = {} if args.run else {name: known[name] for name in names if name in known}
             with tempfile.TemporaryDirectory() as scratch:
-                path = args.junit or run_tests(matrix, Path(scratch) / "tests.xml")
-                command = ["reliability.py", *(sys.argv[1:] if argv is None else argv)]
-                found = {"command": command, **collect(path, matrix)}
+                xml = Path(scratch) / "tests.xml"
+                left = [name for name in names if name not in known]
+                paths = args.junit or ([run_tests(left, xml)] if left else [])
+                rows = known | collect(paths, names)
+            found = {"command": ["python", "tools/reliability.py", "--run"], **surroundings()}
+            found["tests"] = {name: rows[name] for name in names if name in rows}
             write(target, json.dumps(found, indent=1) + "\n")
         content = json.loads(target.read_text(encoding="utf-8"))
         campaigns = read_campaigns(args.results)
@@ -77,9 +86,11 @@ def main(argv: list[str] | None = None) -> int:
     write(args.page, made)
     print(args.page)
     failing = [name for name, row in content["tests"].items() if row["failed"]]
-    for name in failing:
-        print(f"FAILED {name}", file=sys.stderr)
-    return int(bool(failing))
+    absent = [name for name in names if name not in content["tests"]]
+    for label, group in (("FAILED", failing), ("not run", absent)):
+        for name in group:
+            print(f"{label} {name}", file=sys.stderr)
+    return int(bool(failing or absent))
 
 
 def write(path: Path, text: str) -> None:
@@ -123,9 +134,10 @@ def functions(path: Path) -> set[str]:
 # What was done
 
 
-def run_tests(matrix: Mapping[str, Any], xml: Path) -> Path:
+def run_tests(names: list[str], xml: Path) -> Path:
     """One process: pytest-xdist leaves out the statistics of hypothesis."""
-    command = [sys.executable, "-m", "pytest", "-q", f"--junitxml={xml}", *named_tests(matrix)]
+    command = [sys.executable, "-m", "pytest", "-q", "-o", "junit_family=xunit1"]
+    command += [f"--junitxml={xml}", *names]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     done = subprocess.run(command, cwd=ROOT, env=environment, check=False)
     if done.returncode not in (0, 1):  # 1: some failed, which the page will say
@@ -133,42 +145,35 @@ def run_tests(matrix: Mapping[str, Any], xml: Path) -> Path:
     return xml
 
 
-def collect(path: Path, matrix: Mapping[str, Any]) -> dict[str, Any]:
-    """Cases, tries, failures and skips of each named test; ValueError for one that was not run."""
-    suites = list(ElementTree.parse(path).getroot().iter("testsuite"))
-    wanted = dict.fromkeys(named_tests(matrix))
+def collect(paths: list[Path], names: list[str]) -> dict[str, dict[str, Any]]:
+    """Cases, tries, failures and skips of each named test that was run."""
+    suites = [s for path in paths for s in ElementTree.parse(path).getroot().iter("testsuite")]
     rows: dict[str, dict[str, Any]] = {}
     examples = statistics(suites)
-    total = {"cases": 0, "failed": 0, "skipped": 0}
+    now = commit()
     for case in (case for suite in suites for case in suite.iter("testcase")):
-        bad = case.find("failure") is not None or case.find("error") is not None
-        skip = case.find("skipped")
-        total["cases"] += 1
-        total["failed"] += bad
-        total["skipped"] += skip is not None
         name = f"{case.get('file')}::{str(case.get('name')).partition('[')[0]}"
-        if name not in wanted:
+        if name not in names:
             continue
-        empty = {"cases": 0, "tries": 0, "failed": 0, "skipped": 0, "reasons": []}
+        empty = {"commit": now, "cases": 0, "tries": 0, "failed": 0, "skipped": 0, "reasons": []}
         row = rows.setdefault(name, empty)
         row["cases"] += 1
-        row["failed"] += bad
+        row["failed"] += case.find("failure") is not None or case.find("error") is not None
+        skip = case.find("skipped")
         if skip is not None:
             row["skipped"] += 1
-            reason = str(skip.get("message"))
-            row["reasons"] = sorted({*row["reasons"], reason})
+            row["reasons"] = sorted({*row["reasons"], str(skip.get("message"))})
             continue
         own = [p.get("value") for p in case.iter("property") if p.get("name") == "tries"]
         said = examples.get(f"{case.get('file')}::{case.get('name')}", 0)
         row["tries"] += int(own[0] or 0) if own else max(1, said)
-    if missing := [name for name in wanted if name not in rows]:
-        raise ValueError(f"{path}: not run: {', '.join(missing)}.")
+    return rows
+
+
+def surroundings() -> dict[str, Any]:
     return {
-        "commit": commit(),
         "python": sys.version.split()[0],
         "versions": {name: version(name) for name in PACKAGES},
-        "total": total,
-        "tests": {name: rows[name] for name in wanted},
     }
 
 
@@ -215,14 +220,11 @@ def lookup(campaigns: Mapping[str, Any], dotted: str) -> Any:
 def page(
     matrix: Mapping[str, Any], content: Mapping[str, Any], campaigns: Mapping[str, Any]
 ) -> str:
-    """The whole page.
-
-    Raises:
-        ValueError: a test is named whose outcome is not known.
-    """
-    tests = content["tests"]
-    if missing := [name for name in named_tests(matrix) if name not in tests]:
-        raise ValueError(f"reliability.json: no outcome of {', '.join(missing)}; run --run again.")
+    """The whole page; tests without an outcome count as not run."""
+    empty = {"cases": 0, "tries": 0, "failed": 0, "skipped": 0, "absent": 1, "reasons": []}
+    tests = {name: content["tests"].get(name, empty) for name in named_tests(matrix)}
+    absent = sum(row.get("absent", 0) for row in tests.values())
+    commits = sorted({row["commit"] for row in tests.values() if "commit" in row})
     versions = ", ".join(f"{name} {value}" for name, value in content["versions"].items())
     lines = [
         "# Reliability",
@@ -233,7 +235,9 @@ def page(
         "test where it counts them; most loops inside of a test are not counted. Campaigns are "
         "longer runs of `tools/stress.py`, `tests/fuzz/fuzz.py` and `tools/measure_degenerate.py`.",
         "",
-        f"Commit {content['commit']}, Python {content['python']}; {versions}.",
+        f"{len(tests)} tests, {sum(row['cases'] for row in tests.values())} cases"
+        + (f", **{absent} of the tests not run**" if absent else "")
+        + f"; commit {', '.join(commits)}, Python {content['python']}; {versions}.",
         "",
         "## Totals",
         "",
@@ -266,14 +270,17 @@ def page(
 
 
 def sums(names: list[str], tests: Mapping[str, Any]) -> dict[str, int]:
-    keys = ("cases", "tries", "failed", "skipped")
-    return {key: sum(tests[name][key] for name in names) for key in keys} | {"tests": len(names)}
+    keys = ("cases", "tries", "failed", "skipped", "absent")
+    found = {key: sum(tests[name].get(key, 0) for name in names) for key in keys}
+    return found | {"tests": len(names)}
 
 
 def outcome(count: Mapping[str, int], row: Mapping[str, Any], tests: Mapping[str, Any]) -> str:
     if count["failed"]:
         names = [name.partition("::")[2] for name in row["tests"] if tests[name]["failed"]]
         return f"**{count['failed']} of {count['cases']} FAIL**: {', '.join(names)}"
+    if count["absent"]:
+        return f"{count['absent']} of {count['tests']} tests not run"
     if not count["skipped"]:
         return "as it should"
     reasons = sorted({reason for name in row["tests"] for reason in tests[name]["reasons"]})
