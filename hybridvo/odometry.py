@@ -271,7 +271,9 @@ class Odometry:
             return Step(frame.index, frame.timestamp, T_world_cam.copy(), motion)
         own = _own(frame)
         window = anchor.window
-        if window is not None:
+        if window is None:
+            window = self._first_key(own, T_world_cam)
+        else:
             located = self._locate(window, motion, prev, own)
             window = located.window
             if located.used:
@@ -396,13 +398,16 @@ class Odometry:
     def _start(self, frame: Frame, anchor: Anchor) -> Step:
         T = anchor.T_world_last
         own = _own(frame)
-        window = None
-        if self.window > 1 and frame.depth is not None:
-            window = Window.start(own, T)
-        self._anchor = Anchor(own, T, T, window=window)
+        self._anchor = Anchor(own, T, T, window=self._first_key(own, T))
         # no motion precedes the first frame; a covariance that a pose graph can still invert
         first = RelativePose(covariance=FIRST_COVARIANCE.copy(), method=self.method)
         return Step(frame.index, frame.timestamp, T.copy(), first)
+
+    def _first_key(self, frame: Frame, T_world_cam: np.ndarray) -> Window | None:
+        """A window that begins with a frame, where one is kept and the frame has depth."""
+        if self.window == 1 or frame.depth is None:
+            return None
+        return Window.start(frame, T_world_cam)
 
     def _pair(self, prev: Frame, curr: Frame, flow: Any) -> FramePair:
         if curr.camera.shape != prev.camera.shape:

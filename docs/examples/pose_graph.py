@@ -136,7 +136,7 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--sequence", metavar="DIR", help="a sequence that ends where it began")
     parser.add_argument("--frames", type=int, default=12, help="at most so many (default 12)")
-    parser.add_argument("--size", default="109x256", help="of the rendered pictures")
+    parser.add_argument("--size", default="144x320", help="of the rendered pictures")
     args = parser.parse_args(argv)
     truth: list[np.ndarray] = []
     if args.sequence:

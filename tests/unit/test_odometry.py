@@ -259,6 +259,15 @@ def test_a_frame_without_depth_is_bridged_from_a_key_frame() -> None:
     )
 
 
+def test_the_window_waits_for_a_frame_with_depth() -> None:
+    vo = tracker()
+    vo.track(frame(0, depth=None))
+    assert vo.anchor.window is None and vo.edges == ()
+    vo.track(frame(1))
+    assert vo.anchor.window is not None and vo.anchor.window.keys[0].frame.index == 1
+    assert vo.track(frame(2)).ok and [e.prev for e in vo.edges] == [1]
+
+
 def test_set_pose_moves_the_key_frames_as_well() -> None:
     start = se3_exp(np.array([1.0, 2.0, 3.0, 0.1, 0.2, 0.3]))
     vo = tracker()
