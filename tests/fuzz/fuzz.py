@@ -36,13 +36,11 @@ def place(error: BaseException) -> str:
     return f"{type(error).__name__}-{inside[-1] if inside else 'outside'}"
 
 
-def fuzz(name: str, run: Callable[..., None], out: Path, seconds: int) -> None:
+def fuzz(name: str, run: Callable[..., None], out: Path, folder: Path, seconds: int) -> None:
     """Fuzz one target in this process; never returns."""
     import atheris
 
     findings = out / "findings"
-    base = "/dev/shm" if Path("/dev/shm").is_dir() else None
-    folder = Path(tempfile.mkdtemp(dir=base)) / "x"
 
     def once(data: bytes) -> None:
         shutil.rmtree(folder, ignore_errors=True)
@@ -90,14 +88,17 @@ def main(argv: list[str] | None = None) -> int:
         for folder in ("new", "findings"):
             (out / folder).mkdir(parents=True, exist_ok=True)
         before = time.monotonic()
+        # the child never returns to remove it
+        scratch = tempfile.mkdtemp(dir="/dev/shm" if Path("/dev/shm").is_dir() else None)
         process = os.fork()
         if process == 0:
             log = os.open(out / "log.txt", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
             os.dup2(log, 1)
             os.dup2(log, 2)
-            fuzz(name, targets.run, out, args.seconds)
+            fuzz(name, targets.run, out, Path(scratch) / "x", args.seconds)
             os._exit(0)
         _, status, usage = os.wait4(process, 0)
+        shutil.rmtree(scratch, ignore_errors=True)
         text = (out / "log.txt").read_text(errors="replace")
         counts = re.findall(r"^#(\d+)\s.*?ft: (\d+)", text, re.MULTILINE) or [("0", "0")]
         done = re.findall(r"stat::number_of_executed_units: (\d+)", text)
