@@ -28,6 +28,7 @@ def sandwich_covariance(
     meat: np.ndarray,
     scores: np.ndarray,
     depth_scale: float,
+    rounding: float = 0.0,
 ) -> tuple[np.ndarray, np.ndarray, bool]:
     """Covariance of the left perturbation, eigenvalues of the information, whether it is definite.
 
@@ -43,6 +44,7 @@ def sandwich_covariance(
         meat: (21,) under independent errors.
         scores: (rows, columns, 6) scores summed over tiles.
         depth_scale: 1 / m, turns metres of translation into radians of the picture.
+        rounding: what the rounding of exact data adds, in units of the model's own covariance.
     """
     scaling = np.array([1 / depth_scale] * 3 + [1.0] * 3)
     outer = np.outer(scaling, scaling)
@@ -69,7 +71,7 @@ def sandwich_covariance(
     else:
         covariance = independent * (1 + FEW_TILES / max(tiles, 1))
     # exact data leave no residuals to learn from: a hundredth of the model's own covariance stays
-    covariance = covariance + 0.01 * np.linalg.inv(H)
+    covariance = covariance + (0.01 + rounding) * np.linalg.inv(H)
     covariance = 0.5 * (covariance + covariance.T) * outer
     if not np.isfinite(covariance).all():
         return NOTHING.copy(), eigenvalues, False

@@ -22,6 +22,8 @@ WELL_CONDITIONED = 0.005
 """Ratio of the extreme eigenvalues of the flow's information above which it needs no help."""
 SECOND_DEPTH_GAIN = 0.5
 """The second depth is used where it adds this share of the flow's information in some direction."""
+FLOW_ROUNDING = 2e-5
+"""Pixels: single precision at a coordinate of 300."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,8 +136,11 @@ def fit_full_grid(
         iterations += step > 0
         if not length > long:
             break
+    # the same for neighbours, so that an average over n pixels is no better than one of them
+    parallax = picture.K[0] * np.linalg.norm(pose[:, 3]) * depth_scale
+    rounding = total[29] * FLOW_ROUNDING**2 / (sf**2 + (parallax * sd) ** 2)
     covariance, eigenvalues, definite = sandwich_covariance(
-        total, curvature[:21], curvature[21:], _centred_scores(tiles, total), depth_scale
+        total, curvature[:21], curvature[21:], _centred_scores(tiles, total), depth_scale, rounding
     )
     if definite:
         # what the uncertainty of sd^2 does to the answer, through the correction of the depth

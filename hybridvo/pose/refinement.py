@@ -31,6 +31,10 @@ if TYPE_CHECKING:
 
 __all__ = ["RefinementOptions", "refine"]
 
+WEAK_RATIO = 2e-5
+"""Ratio of the information's extreme eigenvalues below which errors that neighbours share, and that
+the covariance of one small patch cannot know of, decide a direction: degraded. A frontal plane over
+a field of view of 20 degrees has 1e-4, a patch of 20 px at fx = 1120 has 1e-5."""
 SUPPORT_CUTOFF = 3.0
 RECALIBRATION = {"logit": 1.88, "log_noise_px": 0.94, "share": -9.4, "constant": 6.27}
 """Logistic map to the probability that the answer errs by less than a pixel: of the judge's own
@@ -257,16 +261,17 @@ def _result(
     return RelativePose(
         T_curr_prev=T,
         covariance=fit.covariance,
-        status=_status(fit.share, hypotheses, decision, noise_px),
+        status=_status(fit, hypotheses, decision, noise_px),
         translation_direction_valid=bool(np.linalg.norm(T[:3, 3]) > 3 * spread),
         **common,
     )
 
 
 def _status(
-    share: float, hypotheses: list[Hypothesis], decision: Decision | None, noise_px: float
+    fit: FullFit, hypotheses: list[Hypothesis], decision: Decision | None, noise_px: float
 ) -> Status:
     """Ok, or degraded with the reason."""
+    share = fit.share
     if decision is not None:
         probability = probability_right(decision.trust, noise_px, share)
         if probability < TRUSTED:
@@ -283,6 +288,10 @@ def _status(
                 f"two motions could be the world ({100 * first.share:.0f} % and "
                 f"{100 * second.share:.0f} % of the pixels)",
             )
+    if fit.eigenvalues[0] < WEAK_RATIO * fit.eigenvalues[-1]:
+        return Status.degraded(
+            Reason.DEGENERATE_GEOMETRY, "a direction of the motion is barely determined"
+        )
     if share < 0.2:
         return Status.degraded(
             Reason.LOW_INLIERS, f"only {100 * share:.0f} % of the pixels follow the motion"
