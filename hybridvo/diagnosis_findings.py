@@ -40,7 +40,8 @@ LEAST_FOCAL = 0.01
 MOST_FOCAL_SE = 0.01
 LEAST_STEP = 0.15
 """Change of the logarithm of the gain that is called a step of the exposure."""
-LEAST_SCALE = 0.1
+LEAST_SCALE = 0.2
+"""Wrong units err by more; truth of a few millimetres' noise by half of that over short motions."""
 SHUTTER, CENTRE, FOCAL = "rolling shutter", "principal point", "focal length"
 SCALES = (1000.0, 5000.0, 5.0, 256.0, 100.0, 10.0)
 """Factors between units that depth files are written in; with their inverses."""
