@@ -53,7 +53,7 @@ def main(argv: list[str] | None = None) -> int:
             return _bad_usage("expected --seed0 >= 0, --seeds >= 1 and --cell-pairs >= 0.")
         args.out.parent.mkdir(parents=True, exist_ok=True)
         result = measure(args)
-        command = shlex.join(sys.argv[1:] if argv is None else argv)
+        command = shlex.join(_command(sys.argv[1:] if argv is None else argv))
         result = {"command": f"python tools/evaluate_hybrid.py {command}".rstrip()} | result
         _write(args, result)
         return _fill_page(args) if args.page else 0
@@ -63,6 +63,19 @@ def main(argv: list[str] | None = None) -> int:
     except OSError as error:
         print(f"evaluate_hybrid.py: {error}", file=sys.stderr)
         return 5
+
+
+def _command(argv: list[str]) -> list[str]:
+    """The arguments that the numbers depend on: no folders of this machine."""
+    kept, skip = [], False
+    for word in argv:
+        skip, said = False, skip
+        if said or word.startswith(("--parts=", "--answers=")):
+            continue
+        skip = word in ("--parts", "--answers")
+        if not skip:
+            kept.append(word)
+    return kept
 
 
 def _bad_usage(message: str) -> int:

@@ -172,9 +172,9 @@ def _nees(nees: Mapping[str, Any]) -> list[str]:
     rows = []
     for flow, kinds in nees.items():
         for kind, methods in kinds.items():
-            if "hybrid-flow" not in methods and flow != "cell":
-                continue
             for method, row in methods.items():
+                if kind != "total" and method != "hybrid-flow":
+                    continue
                 good = row["without_failures"]
                 where = flow if kind == "total" else f"{flow}: {kind}"
                 rows.append((where, f"`{method}`", str(good["pairs"]), number(good["mean"]),
@@ -187,6 +187,9 @@ def _flags(flags: Mapping[str, Any]) -> list[str]:
     for flow, kinds in flags.items():
         for kind, methods in kinds.items():
             for method, row in methods.items():
+                quiet = not (row["failures"]["count"] or row["degraded"]["count"])
+                if kind != "total" and (quiet or method != "hybrid-flow"):
+                    continue
                 where = flow if kind == "total" else f"{flow}: {kind}"
                 cells = (row["failures"], row["flagged"], row["caught"], row["degraded"])
                 rows.append((where, f"`{method}`", *map(percent, cells)))
