@@ -79,7 +79,9 @@ def write_walk(
             np.save(root / "flow" / f"{i:06d}.npy", flow.astype(np.float32))
         if pictures:
             grey = 128 + 50 * np.sin(40 * u + k / 3) + 50 * np.cos(33 * v)
-            cv2.imwrite(str(root / "rgb" / f"{i:06d}.png"), grey[..., None].repeat(3, 2))
+            cv2.imwrite(
+                str(root / "rgb" / f"{i:06d}.png"), grey.astype(np.uint8)[..., None].repeat(3, 2)
+            )
     write_tum(Trajectory(np.arange(frames) / 30, np.stack(poses)), root / "poses.txt")
     return root
 
