@@ -20,6 +20,7 @@ from hybridvo.errors import InputError
 from hybridvo.geometry import pose_matrix
 from hybridvo.pose import kernels, search, solver
 from hybridvo.pose.coarse import SOURCE_MASK, CoarseSearch, search_motions
+from hybridvo.pose.correspondences import DOUBTFUL_INLIER_RATIO
 from hybridvo.pose.full_fit import FullFit, fit_full_grid
 from hybridvo.pose.judgement import CueGrid, Judge, default_judge
 from hybridvo.pose.options import RefinementOptions
@@ -292,7 +293,7 @@ def _status(
         return Status.degraded(
             Reason.DEGENERATE_GEOMETRY, "a direction of the motion is barely determined"
         )
-    if share < 0.2:
+    if share < DOUBTFUL_INLIER_RATIO:
         return Status.degraded(
             Reason.LOW_INLIERS, f"only {100 * share:.0f} % of the pixels follow the motion"
         )
