@@ -1,4 +1,5 @@
-"""Rows of the fault matrix that no other file has: F24, F29, F40 and F41 at the command line."""
+"""Rows of the fault matrix that no other file has: F24, F29, F40, F41 at the command line, and what
+F8 to F12 promise of exact data."""
 
 from __future__ import annotations
 
@@ -8,12 +9,18 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from hybridvo.cli import main
 from hybridvo.data.synthetic import make_scene, write_sintel
+from hybridvo.geometry import invert, se3_log
+from hybridvo.hybrid import estimate
+from hybridvo.types import Reason, State
 
+ROOT = Path(__file__).resolve().parents[2]
 FRAMES = 3
+CHI2_6_3SIGMA = 20.062
 
 
 @pytest.fixture(scope="module")
@@ -176,3 +183,39 @@ def test_f41_names_that_no_file_system_takes(dataset, tmp_path, capsys):
         error = capsys.readouterr().err
         assert error.startswith("hybridvo: ")
         assert "Traceback" not in error
+
+
+@pytest.mark.parametrize("method", ["refine", "hybrid"])
+@pytest.mark.parametrize(
+    "kind",
+    [
+        *("zero_motion", "pure_rotation", "tiny_1cm", "plane", "far"),
+        *("line", "patch", "every_pixel_its_own", "five_motions"),
+    ],
+)
+def test_f8_to_f12_exact_data_are_never_wrong_and_confident(
+    monkeypatch, kind, method, record_property
+):
+    """Without noise the only error is rounding, and where nothing holds together none is ok."""
+    monkeypatch.syspath_prepend(str(ROOT / "tools"))
+    import measure_degenerate
+
+    seeds = range(2)
+    record_property("tries", len(seeds))
+    for seed in seeds:
+        pair, T_true = measure_degenerate.make(kind, seed, noise=False)
+        found = estimate(pair, method=method, seed=seed)
+        error = se3_log(found.T_curr_prev @ invert(T_true))
+        inside = error @ np.linalg.solve(found.covariance, error) < CHI2_6_3SIGMA
+        assert inside or found.status.state is not State.OK
+        assert np.isfinite(found.T_curr_prev).all()
+
+
+def test_f12_a_small_patch_in_noise_is_no_plain_ok(monkeypatch):
+    # errors that all of its pixels share decide: the covariance alone cannot know
+    monkeypatch.syspath_prepend(str(ROOT / "tools"))
+    import measure_degenerate
+
+    for seed in range(4):
+        pair, _ = measure_degenerate.make("patch", seed, noise=True)
+        assert estimate(pair, method="refine").status.reason is Reason.DEGENERATE_GEOMETRY
