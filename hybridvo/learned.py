@@ -38,9 +38,10 @@ LEARNED = {
 }
 """Methods that are a network alone, and how one motion is selected from its pixels."""
 
-STATIC_AT, STATIC_SLOPE = 0.6, 6.0
+STATIC_AT, STATIC_SLOPE = 1.64, 1.63
 """Where the probability to be static is one half, in units of s above the trusted pixels', and the
-slope of its logit."""
+slope of its logit: logistic regression over 200 development pairs (wide and crowd), both kinds of
+pixels weighing alike; stated and observed shares then differ by at most 0.08."""
 LEAST_PIXELS = 64
 """Pixels of the network's input with flow and depth below which it is not asked."""
 LEAST_SCALE = 1e-4
