@@ -49,7 +49,7 @@ def test_the_world_is_fitted_where_the_doubt_is_small(moving_pair) -> None:
 
 
 def test_static_probability_by_its_definition(moving_pair) -> None:
-    output, inputs = told(*moving_pair, 2.0)
+    output, inputs = told(*moving_pair, 4.0)
     valid = inputs.subsample(STRIDE).valid
     p = static_probability(output.log_scale_rotation, valid)
     moving = output.log_scale_rotation[:, 0] > -2
