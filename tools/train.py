@@ -54,6 +54,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     add("--init", type=Path, metavar="FILE", help="start from these weights, of the same shapes")
     add("--overwrite", action="store_true", help="start anew although --out has a checkpoint")
     add("--export", type=Path, metavar="FILE", help="write weights for users when done (float16)")
+    add("--calibrate", type=int, default=0, metavar="N", help="shift s by N development pairs")
     add("--export-count", type=int, default=1000, help="held-out pairs of each preset in the card")
     add("--no-train", action="store_true", help="only --export from the checkpoint in --out")
     return parser.parse_args(argv)
@@ -176,7 +177,7 @@ def _export(trainer: Any, arguments: argparse.Namespace, record: dict[str, Any])
     import torch
 
     from hybridvo.network.weights import load_weights, save_weights
-    from hybridvo.training.held_out import PUBLISHED_SEED, evaluate_network
+    from hybridvo.training.held_out import PUBLISHED_SEED, calibrate_scales, evaluate_network
 
     options = trainer.options
     card: dict[str, Any] = {
@@ -200,6 +201,11 @@ def _export(trainer: Any, arguments: argparse.Namespace, record: dict[str, Any])
     path: Path = arguments.export
     path.parent.mkdir(parents=True, exist_ok=True)
     save_weights(path, trainer.exported, options.network, card, "float16")
+    if arguments.calibrate:
+        preset = trainer.mixture.presets[_widest(options)]
+        shifts = calibrate_scales(trainer.exported, preset, arguments.calibrate)
+        card["calibration"] = {"pairs": arguments.calibrate, "seed": 0, "added_to_s": shifts}
+        save_weights(path, trainer.exported, options.network, card, "float16")
     # The figures are those of the stored, rounded weights, as a user gets them.
     network, _ = load_weights(path)
     card["held_out"] = {
@@ -212,6 +218,12 @@ def _export(trainer: Any, arguments: argparse.Namespace, record: dict[str, Any])
     text = json.dumps(card, indent=1, sort_keys=True) + "\n"
     path.with_suffix(".json").write_text(text, encoding="utf-8")
     sys.stdout.write(json.dumps({"file": str(path), "held_out": card["held_out"]}, indent=2) + "\n")
+
+
+def _widest(options: Any) -> int:
+    """Index of the preset whose pixels the scales shall be right for."""
+    names = [Path(name).stem for name in options.data]
+    return names.index("data_wide") if "data_wide" in names else 0
 
 
 def _report(entry: dict[str, Any]) -> None:

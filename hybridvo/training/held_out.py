@@ -21,7 +21,7 @@ from hybridvo.pose.selection import chosen_pose, selected_transform
 from hybridvo.training.stream import Preset, TrainingBatch, collate, sample_generator
 from hybridvo.types import PixelwisePrediction
 
-__all__ = ["PUBLISHED_SEED", "area_under_curve", "evaluate_network"]
+__all__ = ["PUBLISHED_SEED", "area_under_curve", "calibrate_scales", "evaluate_network"]
 
 PUBLISHED_SEED = 1000
 """First seed of published figures; smaller ones are for development."""
@@ -129,6 +129,36 @@ def evaluate_network(
     known = [value for value in halves if value is not None]
     result["auroc"] = max(known) if known else None
     return result
+
+
+def calibrate_scales(
+    network: torch.nn.Module, preset: Preset, count: int, seed: int = 0
+) -> dict[str, float]:
+    """Add to s of each half what makes the mean of |error| / exp(s) one; the errors stay.
+
+    Args:
+        network: a PWVO with uncertainty; its last bias is changed.
+        preset: whose pairs count.
+        count: of development pairs.
+        seed: of them.
+
+    Returns:
+        ``rotation`` and ``translation``, what was added.
+
+    Raises:
+        InputError: a network without uncertainty.
+    """
+    head = getattr(network, "head_uncertainty", None)
+    if head is None:
+        raise InputError("calibrate_scales: expected a pixel-wise network with uncertainty.")
+    found = evaluate_network(network, preset, seed, count)
+    shifts = {}
+    bias = head[-1].bias
+    for half, part in (("rotation", slice(0, 3)), ("translation", slice(3, 6))):
+        shifts[half] = float(np.log(found[f"laplace_ratio_{half}"]))
+        with torch.no_grad():
+            bias[part] += shifts[half]
+    return shifts
 
 
 def _errors(output: NetworkOutput, batch: TrainingBatch, selection: str) -> np.ndarray:

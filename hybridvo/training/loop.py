@@ -409,7 +409,8 @@ class Trainer:
         """
         state = load_checkpoint(path)
         theirs = state["options"]["network"]
-        ours = dataclasses.asdict(self.options.network)
+        # how often the weights are used is no part of them
+        ours = dataclasses.asdict(self.options.network) | {"passes": theirs.get("passes")}
         if theirs != ours:
             raise CheckpointError(f"{path}: is of network {theirs}, this run asks for {ours}.")
         if (state["ema"] is None) != (self.ema is None):
