@@ -16,7 +16,7 @@ import numpy as np
 
 from hybridvo import Odometry
 from hybridvo.data.benchmark_pairs import CELLS, make_pair
-from hybridvo.data.synthetic import SyntheticSequence, make_scene
+from hybridvo.data.synthetic import SCENE_KINDS, SyntheticSequence, make_scene
 from hybridvo.errors import InputError
 from hybridvo.evaluation.calibration import normalised_error
 from hybridvo.evaluation.metrics import ate
@@ -84,6 +84,11 @@ class SequenceOptions:
                 f"SequenceOptions: expected at least 3 frames (for an ATE), one kind, one seed and "
                 f"one method, got {self.frames} frames, {self.kinds}, {self.seeds}, {self.methods}."
             )
+        for kind in self.kinds:
+            if kind not in SCENE_KINDS:
+                raise InputError(
+                    f"SequenceOptions.kinds: expected some of {', '.join(SCENE_KINDS)}, got {kind}."
+                )
         if self.noisy_stride < 0:
             raise InputError(f"SequenceOptions.noisy_stride: expected >= 0: {self.noisy_stride}.")
 

@@ -94,7 +94,7 @@ def test_cells_are_measured_as_named():
 
 
 def test_options_that_cannot_be_meant():
-    for wrong in ({"frames": 2}, {"kinds": ()}, {"noisy_stride": -1}):
+    for wrong in ({"frames": 2}, {"kinds": ()}, {"kinds": ("no_such",)}, {"noisy_stride": -1}):
         with pytest.raises(InputError, match="expected"):
             SequenceOptions(**wrong)
 
