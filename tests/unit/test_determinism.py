@@ -29,8 +29,9 @@ def tools_on_the_path(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(TOOLS)
 
 
-def test_a_fresh_process_with_two_threads_leaves_the_same_bytes(tmp_path: Path) -> None:
+def test_the_same_bytes_again_and_nearly_those_with_two_threads(tmp_path: Path) -> None:
     """Learned judge, DIS and polish, in this process twice and in another with other threads."""
+    from stress_doors import difference
     from stress_parts import command, content, write_walk
 
     walk = write_walk(tmp_path / "walk", 5, height=64, width=96, pictures=True)
@@ -49,8 +50,10 @@ def test_a_fresh_process_with_two_threads_leaves_the_same_bytes(tmp_path: Path) 
     first = content(tmp_path / "first")
     assert len(first["steps.csv"]) == 5 and "trajectory.tum" in first
     assert content(tmp_path / "second") == first
-    # oneDNN and OpenBLAS share out whole rows and channels: no sum is split between threads here
-    assert content(tmp_path / "other") == first
+    # The judge's convolutions share out their sums by the number of threads: float32 masks differ in
+    # the last bits, motions by 2e-7 m and 2e-4 of their standard deviation (docs/results/stress.json)
+    apart = difference(tmp_path / "first", tmp_path / "other")
+    assert apart["translation_m"] < 1e-5 and apart["rotation"] < 1e-5 and apart["sigmas"] < 0.02
 
 
 def signatures() -> dict[str, int]:
