@@ -50,8 +50,8 @@ def test_the_same_bytes_again_and_nearly_those_with_two_threads(tmp_path: Path) 
     first = content(tmp_path / "first")
     assert len(first["steps.csv"]) == 5 and "trajectory.tum" in first
     assert content(tmp_path / "second") == first
-    # The judge's convolutions share out their sums by the number of threads: float32 masks differ in
-    # the last bits, motions by 2e-7 m and 2e-4 of their standard deviation (docs/results/stress.json)
+    # the judge's convolutions share out their sums by the number of threads: the last bits of its
+    # float32 masks differ, motions by 2e-7 m and 2e-4 standard deviations (measured)
     apart = difference(tmp_path / "first", tmp_path / "other")
     assert apart["translation_m"] < 1e-5 and apart["rotation"] < 1e-5 and apart["sigmas"] < 0.02
 
