@@ -7,7 +7,7 @@ STAMP := $(VENV)/.installed
 MIN_STAMP := $(MIN_VENV)/.installed
 PIP_INSTALL := pip install --quiet --disable-pip-version-check
 
-.PHONY: demo test test-min check format reliability clean
+.PHONY: demo test test-min check fuzz format reliability clean
 
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -45,6 +45,10 @@ $(BIN)/pip-audit: $(STAMP)
 # The table of docs/reliability.md, from the outcome of every test
 reliability: $(STAMP)
 	$(BIN)/python tools/reliability.py --run
+
+fuzz: $(STAMP)  # 20 s for each reader; findings in runs/fuzz
+	$(BIN)/$(PIP_INSTALL) -c constraints.txt -e ".[fuzz]"
+	$(BIN)/python tests/fuzz/fuzz.py --out runs/fuzz
 
 format: $(STAMP)
 	$(BIN)/ruff check --fix .

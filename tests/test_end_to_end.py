@@ -273,7 +273,8 @@ def test_too_many_failures_are_exit_code_3(
     sequence = root / "training" / "clean" / SCENE
     assert run(sequence, tmp_path / "out", "--flow", "dis") == 3
     table = rows(tmp_path / "out")
-    assert [row["reason"] for row in table[:4]] == ["", "no_valid_depth", "no_valid_depth", ""]
+    assert [row["status"] == "failed" for row in table[:4]] == [False, True, True, False]
+    assert [row["reason"] for row in table[1:3]] == ["no_valid_depth"] * 2
     assert load(tmp_path / "out", "run.json")["state"] == "done"
     assert run(sequence, tmp_path / "more", "--flow", "dis", "--max-failed", "0.5") == 0
 

@@ -251,6 +251,7 @@ def _depth_term(
     rows, columns, stride = grid
     n = rows * columns
     u0, v0 = picture.origin
+    assert pair.curr.depth is not None  # asked by the caller
     depth = as_given(pair.curr.depth)
     log_depth = np.empty(n, np.float32)
     # looked up at random places of a whole picture: first no more than the scale needs

@@ -123,7 +123,7 @@ class Picture:
         arguments: tuple[Any, ...] = (self.data, self.camera, self.flags, self.scale)
 
         def work(band: int) -> None:
-            kernels.sum_tiles(  # type: ignore[call-arg]
+            kernels.sum_tiles(
                 *arguments, R, t, self.K, noise, band, tile, weights, sums, totals[band]
             )
 

@@ -150,7 +150,6 @@ class Oracle:
         best = np.array([score.argmax()])
         return Opinion(score, best, self.static[None], self.trust)
 
-
     def propose(self, pair: FramePair) -> Proposal | None:
         self.asked += 1
         # convinced once it has said something itself
