@@ -175,6 +175,14 @@ class Fork:
                 return
             time.sleep(0.001)
 
+    def leave(self, seconds: float) -> None:
+        """Let it run so long, or to its end."""
+        until = time.monotonic() + seconds
+        while time.monotonic() < until:
+            if os.waitid(os.P_PID, self.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT):
+                return
+            time.sleep(0.002)
+
     def signal(self, number: int) -> None:
         """Send a signal, if the fork still runs."""
         with contextlib.suppress(ProcessLookupError):
