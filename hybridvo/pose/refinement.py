@@ -9,7 +9,6 @@ pixel's covariance.
 
 from __future__ import annotations
 
-import math
 import time
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, overload
@@ -20,6 +19,7 @@ from hybridvo.errors import InputError
 from hybridvo.geometry import pose_matrix
 from hybridvo.pose import kernels, search, solver
 from hybridvo.pose.coarse import SOURCE_MASK, CoarseSearch, search_motions
+from hybridvo.pose.confidence import REFERENCE_WIDTH, probability_right
 from hybridvo.pose.correspondences import DOUBTFUL_INLIER_RATIO
 from hybridvo.pose.full_fit import FullFit, fit_full_grid
 from hybridvo.pose.judgement import CueGrid, Judge, default_judge
@@ -37,14 +37,6 @@ WEAK_RATIO = 2e-5
 the covariance of one small patch cannot know of, decide a direction: degraded. A frontal plane over
 a field of view of 20 degrees has 1e-4, a patch of 20 px at fx = 1120 has 1e-5."""
 SUPPORT_CUTOFF = 3.0
-RECALIBRATION = {"logit": 1.88, "log_noise_px": 0.94, "share": -9.4, "constant": 6.27}
-"""Logistic map to the probability that the answer errs by less than a pixel: of the judge's own
-logit, the log of the flow's noise (px at a width of 1024, at least :data:`LEAST_NOISE_PX`) and the
-share of the picture that follows the motion. The judge says too little of itself where every pixel
-has independent noise, and too much where the flow itself is bent. Fitted on development seeds of
-heavy and light scenes and of cells; ``tools/evaluate_hybrid.py`` fits it again to other weights."""
-LEAST_NOISE_PX = 0.02
-REFERENCE_WIDTH = 1024
 TRUSTED = 0.85
 """Probability of being right below which an answer is degraded: on development seeds 52 of the 63
 wrong answers that were judged and 53 of 783 right ones (by the judge's own word below 0.7: 50 and
@@ -298,21 +290,3 @@ def _status(
             Reason.LOW_INLIERS, f"only {100 * share:.0f} % of the pixels follow the motion"
         )
     return Status()
-
-
-def probability_right(trust: float, noise_px: float, share: float) -> float:
-    """Probability that an answer errs by less than a pixel, by :data:`RECALIBRATION`.
-
-    Args:
-        trust: probability that the judge states.
-        noise_px: standard deviation of the flow about the motion, px at a width of 1024.
-        share: of the usable pixels that follow the motion.
-    """
-    p = min(max(trust, 1e-4), 1 - 1e-4)
-    terms = {
-        "logit": math.log(p / (1 - p)),
-        "log_noise_px": math.log(max(noise_px, LEAST_NOISE_PX)),
-        "share": share,
-        "constant": 1.0,
-    }
-    return 1 / (1 + math.exp(-sum(RECALIBRATION[name] * terms[name] for name in terms)))

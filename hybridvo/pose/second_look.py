@@ -15,6 +15,7 @@ import numpy as np
 from hybridvo.geometry import invert, pose_matrix, se3_log
 from hybridvo.pose import kernels, search, solver
 from hybridvo.pose.coarse import CoarseSearch, Grid, fit_in_mask
+from hybridvo.pose.confidence import REFERENCE_WIDTH, probability_right
 from hybridvo.pose.covariance import symmetric
 from hybridvo.pose.options import RefinementOptions
 from hybridvo.types import FramePair
@@ -34,8 +35,9 @@ with independent noise the difference stays below 5 and all pixels are better by
 movers have bent the fit it is tens to thousands and the mask is better by half."""
 LEAST_TRUST = 0.5
 """Probability of being right below which the classical choice stands: there the two err alike."""
-CONSULT = 0.9
-"""Probability of being right below which the judge is asked for a proposal."""
+CONSULT = 0.85
+"""Probability of being right, by :mod:`hybridvo.pose.confidence`, below which the judge is asked
+for a proposal: where the answer would be degraded."""
 PROPOSED = (0.77, 0.91)
 """Probabilities to be static between which the weights of a proposal grow from 0 to 1. Stricter
 than for the judge's masks: on 120 development pairs with DIS flow 12 answers were wrong so, and 15
@@ -174,7 +176,7 @@ def decide(
         opinion = race.run(opinion, _in_masks(race, opinion))
         if race.best < race.known or race.same is not None:
             break
-    proposal = judge.propose(pair) if race.trust < CONSULT else None
+    proposal = judge.propose(pair) if race.probability(pair) < CONSULT else None
     if proposal is not None:
         opinion = race.run(opinion, [_entry(race, proposal)])
         if race.best >= race.known and race.same is None:
@@ -215,6 +217,14 @@ class _Race:
     def kept(self, weights: np.ndarray) -> float:
         """Share of the usable pixels' weight that a mask leaves."""
         return float(self._usable @ weights.reshape(-1)) / float(self._usable.sum())
+
+    def probability(self, pair: FramePair) -> float:
+        """That the candidate ahead is right."""
+        mask, fact = self.masks[self.best], self.facts[self.best]
+        kept = 1.0 if mask is None else self.kept(mask)
+        noise = float(fact[search.FLOW_NOISE] * np.sqrt(self.found.picture.scale[0]))
+        noise_px = noise * REFERENCE_WIDTH / pair.prev.camera.width
+        return probability_right(self.trust, noise_px, float(fact[search.SHARE]) * kept)
 
     def run(self, opinion: Opinion, entries: list[_Entry]) -> Opinion:
         """Fit the entries, let the judge look at all candidates, see who is ahead."""
