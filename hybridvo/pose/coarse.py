@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from hybridvo.pose import kernels, search, second_depth, solver
+from hybridvo.pose.confidence import REFERENCE_WIDTH
 from hybridvo.pose.options import RefinementOptions
 from hybridvo.pose.picture import Picture, as_given
 from hybridvo.types import FramePair, Reason, RelativePose
@@ -25,6 +26,9 @@ CLEAR_COHERENCE = 0.5
 """Coherence of the residuals above which even a motion that most of the picture follows may be a
 compromise: 0.02 for independent noise, 0.25 to 0.4 for DIS flow of static scenes, above 0.6 where a
 large mover bends the flow (development seeds)."""
+CLEAR_BEND_PX = 0.15
+"""Coherent part of the residuals, px at a width of 1024, above which it may be one as well: noise
+hides slow movers, and they bend the motion."""
 FIT_PIXELS = 4000
 """Pixels that the noise estimate of :func:`fit_in_mask` looks at."""
 
@@ -217,7 +221,9 @@ def search_motions(
     if clear:
         noise = facts[0, search.FLOW_NOISE], facts[0, search.DEPTH_NOISE]
         coherence = search.residual_coherence(coarse, h, w, poses[0], picture.K, *noise)
-        clear = bool(coherence < CLEAR_COHERENCE)
+        bend_px = np.sqrt(coherence * picture.scale[0]) * noise[0]
+        bend_px *= REFERENCE_WIDTH / pair.prev.camera.width
+        clear = bool(coherence < CLEAR_COHERENCE and bend_px < CLEAR_BEND_PX)
     shape = (h, w, stride)
     return CoarseSearch(
         picture,
