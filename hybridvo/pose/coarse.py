@@ -26,6 +26,8 @@ CLEAR_COHERENCE = 0.5
 """Coherence of the residuals above which even a motion that most of the picture follows may be a
 compromise: 0.02 for independent noise, 0.25 to 0.4 for DIS flow of static scenes, above 0.6 where a
 large mover bends the flow (development seeds)."""
+CHANCE_COHERENCE = 0.05
+"""Coherence that independent noise reaches by chance."""
 CLEAR_BEND_PX = 0.15
 """Coherent part of the residuals, px at a width of 1024, above which it may be one as well: noise
 hides slow movers, and they bend the motion."""
@@ -221,7 +223,8 @@ def search_motions(
     if clear:
         noise = facts[0, search.FLOW_NOISE], facts[0, search.DEPTH_NOISE]
         coherence = search.residual_coherence(coarse, h, w, poses[0], picture.K, *noise)
-        bend_px = np.sqrt(coherence * picture.scale[0]) * noise[0]
+        excess = max(coherence - CHANCE_COHERENCE, 0.0)
+        bend_px = np.sqrt(excess * picture.scale[0]) * noise[0]
         bend_px *= REFERENCE_WIDTH / pair.prev.camera.width
         clear = bool(coherence < CLEAR_COHERENCE and bend_px < CLEAR_BEND_PX)
     shape = (h, w, stride)

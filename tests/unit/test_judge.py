@@ -13,6 +13,7 @@ import torch
 
 from hybridvo.data.benchmark_pairs import Cell, make_pair
 from hybridvo.data.presets import build_options, read_yaml
+from hybridvo.data.synthetic import SyntheticSequence, make_scene
 from hybridvo.errors import CheckpointError, InputError
 from hybridvo.geometry import ego_flow
 from hybridvo.hybrid import LearnedJudge, _judge_inputs, estimate
@@ -194,14 +195,14 @@ def test_a_judge_without_trust_proposes_a_motion_of_its_own() -> None:
     nowhere = np.zeros(found.shape[:2], np.float32)  # the judge's masks are of no use
     static = (~truth["moving"]).astype(np.float32)
     told = refine(pair, weights=static)
-    judge = Oracle(nowhere, "refit", 0.3, Proposal(truth["T_curr_prev"], static[::2, ::2]))
+    judge = Oracle(nowhere, "refit", 0.01, Proposal(truth["T_curr_prev"], static[::2, ::2]))
     answer = refine(pair, judge=judge)
     assert judge.asked == 1 and answer.status.state is State.OK
     assert gap(answer.T_curr_prev, pair, truth) < gap(told.T_curr_prev, pair, truth) + 0.02
     # one that trusts what was found is not asked; one without an idea leaves the classical answer
     sure = Oracle(nowhere, "search", 0.95, judge.proposal)
     refine(pair, judge=sure)
-    silent = Oracle(nowhere, "search", 0.3)
+    silent = Oracle(nowhere, "search", 0.01)
     answer = refine(pair, judge=silent)
     assert sure.asked == 0 and silent.asked == 1
     np.testing.assert_array_equal(answer.T_curr_prev, refine(pair).T_curr_prev)
@@ -337,3 +338,24 @@ def test_the_shipped_configuration_loads_and_is_the_shipped_network() -> None:
     options = build_options(JudgeTrainingOptions, read_yaml(path), str(path))
     network, _ = load_weights(pretrained("judge"))
     assert options.network == network.options
+
+
+def test_slow_movers_under_noise_are_not_clear() -> None:
+    # measured: with 0.5 px of noise at a width of 256, movers on most of the picture bent the one
+    # motion that was found by 3 to 5 px, and nobody asked the judge
+    scene = make_scene("heavy_ten", 941, height=109, width=256, frames=20)
+    sequence = SyntheticSequence(scene)
+    rng = np.random.default_rng(0)
+    asked = 0
+    for index in (0, 9, 18):
+        prev, curr = sequence.frame(index), sequence.frame(index + 1)
+        flow = sequence.flow(index)[0]
+        flow = flow + rng.normal(0, 0.5, flow.shape).astype(np.float32)
+        found = search_motions(
+            FramePair(prev, curr, flow), np.eye(4)[None, :3], None, RefinementOptions(), 0
+        )
+        asked += not found.clear
+    assert asked == 3
+    # noise alone is no reason to doubt: the same noise where nothing moves
+    pair, _ = make_pair(Cell(moving=0.0, flow_noise_px=0.5), 1, **SIZE)
+    assert search_motions(pair, np.eye(4)[None, :3], None, RefinementOptions(), 0).clear
