@@ -192,7 +192,9 @@ def test_memory_of_a_known_allocation():
     memory = peak_memory({"eight": method}, "moving30", 0)
     # 8 MiB and the few objects around them
     assert memory["traced_peak_mib"]["eight"] == pytest.approx(8, abs=0.1)
-    grown = resident_growth(lambda: method(None))
+    # the least of a few: other threads of the process allocate as well
+    tries = [resident_growth(lambda: method(None)) for _ in range(5)]
+    grown = None if None in tries else min(tries)
     if grown is None:
         pytest.skip("this system cannot reset the high-water mark of the resident set")
     # the kernel counts resident pages with a slack of some dozen pages per processor
