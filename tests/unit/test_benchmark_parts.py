@@ -187,18 +187,16 @@ def test_memory_of_a_known_allocation():
     from benchmark_costs import peak_memory, resident_growth
 
     def method(pair):
-        return np.ones(8 * 2**20, np.uint8).sum()
+        return np.ones(64 * 2**20, np.uint8).sum()
 
-    memory = peak_memory({"eight": method}, "moving30", 0)
-    # 8 MiB and the few objects around them
-    assert memory["traced_peak_mib"]["eight"] == pytest.approx(8, abs=0.1)
-    # the least of a few: other threads of the process allocate as well
-    tries = [resident_growth(lambda: method(None)) for _ in range(5)]
-    grown = None if None in tries else min(tries)
+    memory = peak_memory({"much": method}, "moving30", 0)
+    # 64 MiB and the few objects around them
+    assert memory["traced_peak_mib"]["much"] == pytest.approx(64, abs=0.1)
+    grown = resident_growth(lambda: method(None))
     if grown is None:
         pytest.skip("this system cannot reset the high-water mark of the resident set")
-    # the kernel counts resident pages with a slack of some dozen pages per processor
-    assert grown == pytest.approx(8, abs=1.5)
+    # the kernel counts resident pages in batches per thread and processor: up to 2 MiB were seen
+    assert grown == pytest.approx(64, abs=6)
 
 
 # --- goals and pages ----------------------------------------------------------------------------
