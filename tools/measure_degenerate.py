@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-HEIGHT, WIDTH = 218, 512
+HEIGHT, WIDTH = 436, 1024
 METHODS = ("refine", "hybrid")
 KINDS = ("line", "patch", "every_pixel_its_own", "five_motions")
 FIVE = 5
