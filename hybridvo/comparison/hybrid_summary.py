@@ -25,6 +25,7 @@ THRESHOLDS = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.85, 0.9, 0.95)
 RATIOS = {"pnp-ransac-tuned": 0.1, "poselib": 1 / 3}
 """Method -> goal for the hybrid's ATE over its own."""
 LEAST_NOISE_PX = 0.02
+MAX_SHARE = 0.45
 NEES_RANGE = (3.0, 12.0)
 """A factor of two about the expectation of 6."""
 
@@ -202,7 +203,7 @@ def _evidence(group: Sequence[Record]) -> dict[str, np.ndarray]:
     noise = np.array([r["noise_px"] for r in group])
     return {
         "log_noise_px": np.log(np.maximum(noise, LEAST_NOISE_PX)),
-        "share": np.array([r["share"] for r in group]),
+        "share": np.minimum([r["share"] for r in group], MAX_SHARE),
     }
 
 

@@ -13,6 +13,9 @@ share of the picture that follows the motion. The judge says too little of itsel
 has independent noise, and too much where the flow itself is bent. Fitted on development seeds of
 heavy and light scenes and of cells; ``tools/evaluate_hybrid.py`` fits it again to other weights."""
 LEAST_NOISE_PX = 0.02
+MAX_SHARE = 0.45
+"""A larger share counts as this. The map was fitted where most of the picture moves, and there a
+large share is a mover's; that most of a usual picture follows one motion is no reason for doubt."""
 REFERENCE_WIDTH = 1024
 
 
@@ -28,7 +31,7 @@ def probability_right(trust: float, noise_px: float, share: float) -> float:
     terms = {
         "logit": math.log(p / (1 - p)),
         "log_noise_px": math.log(max(noise_px, LEAST_NOISE_PX)),
-        "share": share,
+        "share": min(share, MAX_SHARE),
         "constant": 1.0,
     }
     return 1 / (1 + math.exp(-sum(RECALIBRATION[name] * terms[name] for name in terms)))

@@ -116,7 +116,7 @@ def test_temperature_and_evidence_are_found_again():
 def test_the_status_states_the_recalibrated_probability():
     noise, share = np.array([0.001, 0.4, 1.3]), np.array([0.9, 0.3, 0.5])
     trust = np.array([0.99999, 0.5, 0.7])
-    evidence = {"log_noise_px": np.log(np.maximum(noise, 0.02)), "share": share}
+    evidence = {"log_noise_px": np.log(np.maximum(noise, 0.02)), "share": np.minimum(share, 0.45)}
     np.testing.assert_allclose(
         [probability_right(*row) for row in zip(trust, noise, share, strict=True)],
         recalibrated(trust, evidence, RECALIBRATION),
@@ -124,6 +124,8 @@ def test_the_status_states_the_recalibrated_probability():
     )
     # surer of itself: surer; the same word where more noise was to be expected: surer
     assert probability_right(0.9, 0.5, 0.4) > probability_right(0.8, 0.5, 0.4)
+    # where most pixels agree, more of them are no reason for doubt
+    assert probability_right(0.8, 0.5, 0.9) == probability_right(0.8, 0.5, 0.5)
     assert probability_right(0.8, 1.0, 0.4) > probability_right(0.8, 0.1, 0.4)
 
 
