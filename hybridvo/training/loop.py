@@ -408,7 +408,9 @@ class Trainer:
             CheckpointError: a damaged file, or one of another network.
         """
         state = load_checkpoint(path)
-        theirs = state["options"]["network"]
+        theirs = state.get("options", {}).get("network")
+        if not isinstance(theirs, dict) or "ema" not in state:
+            raise CheckpointError(f"{path}: is no checkpoint of tools/train.py's networks.")
         # how often the weights are used is no part of them
         ours = dataclasses.asdict(self.options.network) | {"passes": theirs.get("passes")}
         if theirs != ours:

@@ -502,3 +502,12 @@ def test_separation_by_hand():
     # a batch with one kind of pixels only tells nothing
     still = SimpleNamespace(moving=torch.zeros_like(moving), inputs=batch.inputs)
     assert float(loop._separation(right, still)) == 0.0
+
+
+def test_a_checkpoint_of_another_training_is_refused(tmp_path, monkeypatch):
+    asked = options.TrainingOptions(network=NetworkOptions(width=0.25), ema_decay=0.0)
+    trainer = loop.Trainer(asked, stream.Mixture((PaperOptions(),), (1.0,)))
+    for state in ({}, {"options": {"judge": {}}}, {"options": {"network": 3}}):
+        monkeypatch.setattr(loop, "load_checkpoint", lambda path, state=state: state)
+        with pytest.raises(CheckpointError, match="no checkpoint"):
+            trainer.resume(tmp_path / "other.pt")
