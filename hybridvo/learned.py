@@ -110,7 +110,7 @@ def fitted_motion(
     if not isinstance(output, PixelwisePrediction) or output.log_scale_rotation is None:
         raise InputError("fitted_motion: expected a prediction with uncertainty.")
     log_scale = output.log_scale_rotation
-    inputs = inputs.subsample(max(1, round(inputs.size[0] / log_scale.shape[2])))
+    inputs = _on_grid_of(log_scale, inputs)
     if tuple(log_scale.shape[2:]) != inputs.size:
         log_scale = F.interpolate(log_scale, inputs.size, mode="nearest")
     flow = inputs.flow_px
@@ -128,6 +128,11 @@ def fitted_motion(
     )
 
 
+def _on_grid_of(prediction: torch.Tensor, inputs: NetworkInputs) -> NetworkInputs:
+    """Every n-th pixel of the inputs, one for each cell (.., h, w) of a prediction."""
+    return inputs.subsample(max(1, round(inputs.size[0] / prediction.shape[-2])))
+
+
 def static_probability(log_scale: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
     """Probability of every pixel to be static world, from the log scales of a network.
 
@@ -137,7 +142,7 @@ def static_probability(log_scale: torch.Tensor, valid: torch.Tensor) -> torch.Te
 
     Returns:
         (B, h, w). What counts is how far s lies above that of the pixels with weight in the fit;
-        the map from there is logistic, fitted to held-out ``wide`` pairs (development seeds).
+        the map from there is logistic, see :data:`STATIC_AT`.
     """
     from hybridvo.pose.weighted_fit import pixel_weights
 
@@ -172,9 +177,8 @@ def propose_motion(network: torch.nn.Module, pair: FramePair) -> Proposal | None
         if log_scale is None:
             return None
         T = fitted_motion(output, inputs)[0].double().numpy()
-        # the upper left pixel of each cell stands for it, as for the network itself
-        stride = max(1, round(inputs.size[0] / log_scale.shape[2]))
-        static = static_probability(log_scale, inputs.subsample(stride).valid)[0].numpy()
+        valid = _on_grid_of(log_scale, inputs).valid
+        static = static_probability(log_scale, valid)[0].numpy()
     return Proposal(T, static) if np.isfinite(T).all() and np.isfinite(static).all() else None
 
 

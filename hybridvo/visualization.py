@@ -267,24 +267,13 @@ def look_through(
     return panels, numbers
 
 
-def chosen(output: Any) -> tuple[Any, Any]:
-    """(B, 3) Euler angles and (B, 3) translation of any network's output."""
-    from hybridvo.pose.selection import select
-    from hybridvo.types import PixelwisePrediction
-
-    if isinstance(output, PixelwisePrediction):
-        return select(output, "mean" if output.log_scale_rotation is None else "softmax")
-    return output
-
-
 def start_of(network: Any, inputs: Any) -> Any:
     """Motion that a network of several passes starts its last one from; None for one pass."""
     from hybridvo.learned import next_start
     from hybridvo.network.passes import first_motions
 
     passes = int(network.options.passes)
-    how = "softmax" if getattr(network.options, "uncertainty", False) else "mean"
-    return first_motions(network, inputs, next_start(network, how), passes - 1)
+    return first_motions(network, inputs, next_start(network), passes - 1)
 
 
 def saliencies(
@@ -301,6 +290,7 @@ def saliencies(
     import torch
 
     from hybridvo.evaluation.maps import integrated_gradients
+    from hybridvo.pose.selection import chosen_pose
     from hybridvo.types import PixelwisePrediction
 
     names = ("flow",) if network.options.scale_free else ("flow", "inverse_depth")
@@ -316,7 +306,7 @@ def saliencies(
         if isinstance(output, PixelwisePrediction):
             maps = {name: getattr(output, name) for name in ("rotation", "translation")}
             maps = {name: value.clone().requires_grad_() for name, value in maps.items()}
-            motion = chosen(replace(output, **maps))[k]
+            motion = chosen_pose(replace(output, **maps))[k]
             direction = (motion / motion.norm().clamp(min=1e-12)).detach()
             (weights,) = torch.autograd.grad((direction * motion).sum(), maps[what])
 

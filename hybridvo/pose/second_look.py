@@ -35,6 +35,9 @@ with independent noise the difference stays below 5 and all pixels are better by
 movers have bent the fit it is tens to thousands and the mask is better by half."""
 LEAST_TRUST = 0.5
 """Probability of being right below which the classical choice stands: there the two err alike."""
+LEAST_TRUST_PROPOSED = 0.25
+"""The same with a proposal in the race: between the two the judge's best was wrong in 6 and the
+classical choice in 13 of 13 development answers; a judge that trusts nothing at all stays out."""
 CONSULT = 0.85
 """Probability of being right, by :mod:`hybridvo.pose.confidence`, below which the judge is asked
 for a proposal: where the answer would be degraded."""
@@ -42,9 +45,6 @@ PROPOSED = (0.77, 0.91)
 """Probabilities to be static between which the weights of a proposal grow from 0 to 1. Stricter
 than for the judge's masks: on 120 development pairs with DIS flow 12 answers were wrong so, and 15
 with the ramp of the masks."""
-LEAST_TRUST_PROPOSED = 0.25
-"""The same with a proposal in the race: between the two the judge's best was wrong in 6 and the
-classical choice in 13 of 13 development answers; a judge that trusts nothing at all stays out."""
 LEAST_FLOW_NOISE = 0.02
 """px: what even true flow may differ by (rounding, edges of pixels)."""
 LEAST_MASK = 0.02
