@@ -17,15 +17,17 @@ from typing import Any, TypeVar
 
 from hybridvo.data.image_io import read_text
 from hybridvo.data.plain_yaml import MAX_YAML_BYTES, plain_yaml
+from hybridvo.data.rendered_pictures import RenderedOptions
 from hybridvo.data.wide import WideOptions
 from hybridvo.data.workflow import PaperOptions
 from hybridvo.errors import FormatError, InputError
 
 __all__ = ["PRESETS", "build_options", "load_preset", "read_yaml"]
 
-PRESETS: dict[str, type[PaperOptions] | type[WideOptions]] = {
+PRESETS: dict[str, type[PaperOptions] | type[WideOptions] | type[RenderedOptions]] = {
     "paper": PaperOptions,
     "wide": WideOptions,
+    "rendered": RenderedOptions,
 }
 """Kinds of training data by the name that a preset file gives under ``preset``."""
 
@@ -53,7 +55,7 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
     return mapping
 
 
-def load_preset(path: str | Path) -> PaperOptions | WideOptions:
+def load_preset(path: str | Path) -> PaperOptions | WideOptions | RenderedOptions:
     """Options of a data preset file, ``configs/data_paper.yaml`` for one.
 
     Raises:

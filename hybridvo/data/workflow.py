@@ -211,6 +211,8 @@ class Sample:
         rotation_deg, translation: (3,) float32, the same motion as Euler angles X-Y-Z in degrees
             (R = Rx Ry Rz) and metres.
         moving: (H, W) bool, pixels whose true flow differs from the ego flow.
+        rays: (H, W, 2) float32, first two components of K^-1 x of the points that were measured,
+            where they are not the pixels' centres; or None.
     """
 
     flow: np.ndarray
@@ -224,6 +226,7 @@ class Sample:
     rotation_deg: np.ndarray
     translation: np.ndarray
     moving: np.ndarray
+    rays: np.ndarray | None = None
 
 
 def rigid_flow(

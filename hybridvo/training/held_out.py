@@ -13,6 +13,7 @@ import torch
 import torch.nn.functional as F
 from scipy.stats import rankdata
 
+from hybridvo.data.rendered_pictures import RenderedOptions
 from hybridvo.errors import InputError
 from hybridvo.learned import next_start
 from hybridvo.network.losses import NetworkOutput, reconstruct
@@ -84,6 +85,8 @@ def evaluate_network(
         raise InputError(
             f"evaluate_network: expected count and batch_size >= 1, got {count} and {batch_size}."
         )
+    if isinstance(preset, RenderedOptions):
+        preset = preset.for_evaluation()
     device = next(network.parameters()).device
     errors: list[np.ndarray] = []
     doubts: list[np.ndarray] = []

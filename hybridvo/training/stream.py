@@ -115,6 +115,9 @@ def collate(samples: Sequence[Sample]) -> TrainingBatch:
 
     K = stack("K")
     inputs = assemble_aligned(stack("flow"), stack("depth_prev"), stack("depth_curr"), K)
+    for b, sample in enumerate(samples):
+        if sample.rays is not None:
+            inputs.rays[b] = torch.from_numpy(sample.rays).permute(2, 0, 1)
     targets = LossTargets(
         rotation_deg=stack("rotation_deg"),
         translation=stack("translation"),
