@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 import logging
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +14,7 @@ import pytest
 from hybridvo.cli import main
 from hybridvo.data.synthetic import make_scene, write_sintel
 from hybridvo.errors import InputError
-from hybridvo.recording import MAX_PICTURES, Recording, check_recording
+from hybridvo.recording import CHUNK_ROWS, MAX_PICTURES, Recording, check_recording
 from hybridvo.trajectory import read_trajectory
 from hybridvo.types import Camera, Frame, RelativePose, Step
 
@@ -117,6 +118,24 @@ def test_stamps_of_sensors_are_dates(tmp_path: Path, start: float, clock: str) -
         if "time" in chunk.timeline_names
     }
     assert types == {f"{clock}[ns]"}
+
+
+def test_chunks_end_by_frames_and_not_by_time(tmp_path: Path) -> None:
+    """Rerun keeps some kB of each until the end: five a second of every kind filled the memory."""
+    rerun_chunk = pytest.importorskip("rerun.chunk", reason="an older Rerun reads nothing back")
+
+    frames = CHUNK_ROWS + 50
+    with Recording(tmp_path / "slow.rrd", "x", "id", frames) as recording:
+        for index in range(frames):
+            recording.add(*step_of(index), None)
+            time.sleep(0.004)  # a second in all
+    chunks = [
+        chunk
+        for chunk in rerun_chunk.RrdReader(recording.path).stream()
+        if chunk.entity_path.lstrip("/") == "status/inlier_ratio"
+    ]
+    assert sum(len(chunk.to_record_batch()) for chunk in chunks) == frames
+    assert len(chunks) == 2
 
 
 def test_long_runs_take_few_pictures(tmp_path: Path) -> None:
