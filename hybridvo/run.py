@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import hashlib
 import logging
 import os
 import platform
@@ -25,6 +24,7 @@ import hybridvo
 from hybridvo.compilation import compile_once
 from hybridvo.configuration import RunOptions
 from hybridvo.console import Progress, interruptible
+from hybridvo.data.fingerprint import input_hash, input_times
 from hybridvo.data.sequence import Sequence, open_sequence
 from hybridvo.errors import InputError
 from hybridvo.evaluation.metrics import pair_errors
@@ -47,7 +47,6 @@ __all__ = [
     "RunResult",
     "check_device",
     "flow_provider",
-    "input_hash",
     "run",
     "run_name",
     "versions",
@@ -57,9 +56,6 @@ EXIT_DONE, EXIT_FAILED_FRAMES, EXIT_INTERRUPTED = 0, 3, 130
 
 RECORDING = "recording.rrd"
 """Name of a Rerun recording within the output folder."""
-
-SAMPLED_BYTES = 4096
-"""Bytes at either end of an input file that go into the input hash, beside its size."""
 
 _logger = logging.getLogger(__name__)
 
@@ -127,6 +123,7 @@ def run(
     out = Path("runs") / run_name(sequence) if out is None else Path(out)
     identity = {
         "input_hash": input_hash(sequence),
+        "input_times": input_times(sequence),
         "options": _deciding(options),
         "weights": weights_hash(options.method),
         "hybridvo": hybridvo.__version__,
@@ -447,24 +444,6 @@ def _deciding(options: RunOptions) -> dict[str, Any]:
     for name in ("max_failed", "strict", "device"):
         del values[name]
     return values
-
-
-def input_hash(sequence: Sequence) -> str:
-    """SHA-256 over names, sizes and both ends of every input file: milliseconds, not minutes."""
-    digest = hashlib.sha256()
-    for path in sequence.files():
-        try:
-            with path.open("rb") as file:
-                size = os.fstat(file.fileno()).st_size
-                content = file.read(SAMPLED_BYTES)
-                if size > SAMPLED_BYTES:
-                    file.seek(max(SAMPLED_BYTES, size - SAMPLED_BYTES))
-                    content += file.read(SAMPLED_BYTES)
-        except OSError:
-            size, content = -1, b""
-        digest.update(f"{path.name}\0{size}\0".encode(errors="surrogateescape"))
-        digest.update(content)
-    return digest.hexdigest()
 
 
 def versions() -> dict[str, str]:

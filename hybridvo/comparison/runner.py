@@ -19,12 +19,13 @@ from hybridvo.comparison.plan import chosen_methods, expand, unique_names, weigh
 from hybridvo.comparison.results import ROW_COLUMNS, Segments, collect
 from hybridvo.configuration import RunOptions
 from hybridvo.console import Interruption, Progress, interruptible
+from hybridvo.data.fingerprint import input_hash
 from hybridvo.data.sequence import Sequence, open_sequence
 from hybridvo.errors import HybridVOError, InputError
 from hybridvo.evaluation.breakdown import breakdown, worst_pairs
 from hybridvo.evaluation.protocols import Protocol, check_protocol, protocol_summary
 from hybridvo.evaluation.report import write_csv, write_json
-from hybridvo.run import check_device, flow_provider, input_hash, versions
+from hybridvo.run import check_device, flow_provider, versions
 from hybridvo.run_folder import PARTIAL, Mode, RunFolder
 
 __all__ = ["WRITTEN", "ComparisonOptions", "WorkerError", "compare"]
