@@ -7,6 +7,7 @@ all the flow is None, which the estimators answer with ``failed(no_flow)``.
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -47,6 +48,13 @@ pixels that disagree by 0.015, 0.035, 0.075, 0.15, 0.25, 0.4, 0.6, 0.9, 1.2 px t
 MAX_ERROR_PX = 1.5
 MAX_RELATIVE_ERROR = 0.05
 """A forward-backward error above both limits says that the pixel is occluded or mismatched."""
+TEXTURE_SIDE = 120
+"""Shorter side in pixels at which texture is looked for: a sensor's noise is averaged out there."""
+TEXTURE_LEVELS = 1.0
+"""Change in grey levels per pixel of that size that is texture."""
+TEXTURE_SHARE = 0.002
+"""Smallest share of the picture with texture across its weakest direction. Real and rendered pictures
+have 0.4 to 0.8, at a tenth of their brightness 0.006 to 0.28; a covered lens and stripes none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +96,9 @@ class _FlowFiles(Protocol):
 def dis_flow(preset: str = "medium", forward_backward: bool = True) -> FlowProvider:
     """Provider of OpenCV's DIS flow on grey images (Kroeger et al., ECCV 2016).
 
-    The provider owns its DIS object: use one provider per thread.
+    A provider may serve several trackers and threads, and can be pickled. Where a picture has no
+    texture (a covered lens, a dropped frame, stripes along which anything may slide) there is no
+    flow: DIS itself would answer zero there, and both directions agree on it.
 
     Args:
         preset: ``ultrafast``, ``fast`` or ``medium``.
@@ -107,9 +117,18 @@ class _Dis:
     """See :func:`dis_flow`."""
 
     def __init__(self, preset: str, forward_backward: bool) -> None:
-        # OpenCV's stubs do not know that calc takes None for "no initial flow"
-        self._dis: Any = cv2.DISOpticalFlow.create(DIS_PRESETS[preset])
+        self._preset = preset
         self._forward_backward = bool(forward_backward)
+        # a DIS object that two threads use at once ends the process
+        self._threads = threading.local()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _Dis, (self._preset, self._forward_backward)
+
+    def _calc(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        if not hasattr(self._threads, "dis"):
+            self._threads.dis = cv2.DISOpticalFlow.create(DIS_PRESETS[self._preset])
+        return np.asarray(self._threads.dis.calc(first, second, None))
 
     def __call__(self, prev: Frame, curr: Frame) -> FlowField:
         """Flow from ``prev`` to ``curr``; None where an image is missing or too small for DIS."""
@@ -117,15 +136,29 @@ class _Dis:
             return FlowField(None, source="dis")
         first = cv2.cvtColor(prev.rgb, cv2.COLOR_RGB2GRAY)
         second = cv2.cvtColor(curr.rgb, cv2.COLOR_RGB2GRAY)
+        if not (_textured(first) and _textured(second)):
+            return FlowField(None, source="dis")
         try:
-            forward = self._dis.calc(first, second, None)
-            backward = self._dis.calc(second, first, None) if self._forward_backward else None
+            forward = self._calc(first, second)
+            backward = self._calc(second, first) if self._forward_backward else None
         except cv2.error:  # smaller than DIS's patches
             return FlowField(None, source="dis")
         if backward is None:
             return FlowField(forward, None, _lands_inside(forward), "dis")
         variance, valid = forward_backward_check(forward, backward)
         return FlowField(forward, variance, valid, "dis")
+
+
+def _textured(gray: np.ndarray) -> bool:
+    """Whether some of a picture changes along every direction, above the noise of a dark sensor."""
+    if min(gray.shape) < 2:
+        return False
+    factor = max(1, min(gray.shape) // TEXTURE_SIDE)
+    small = cv2.resize(gray, None, fx=1 / factor, fy=1 / factor, interpolation=cv2.INTER_AREA)
+    small = cv2.blur(small.astype(np.float32), (3, 3))
+    gradient = np.stack(np.gradient(small), axis=-1).reshape(-1, 2)
+    weaker = np.linalg.eigh(gradient.T @ gradient)[1][:, 0]
+    return bool(np.mean(np.abs(gradient @ weaker) > TEXTURE_LEVELS) > TEXTURE_SHARE)
 
 
 def forward_backward_check(
