@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import io
 import logging
 import os
 import stat
@@ -20,10 +21,13 @@ from pathlib import Path
 from typing import Any
 
 from hybridvo import __version__
+from hybridvo.console import printable
 
 __all__ = ["build_parser", "main"]
 
 EXIT_BUG, EXIT_INPUT, EXIT_LOCKED, EXIT_OUTPUT, EXIT_INTERRUPTED = 1, 2, 4, 5, 130
+CV2_NO_MEMORY = -4
+"""``cv::Error::StsNoMem``."""
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -41,7 +45,11 @@ def build_parser() -> argparse.ArgumentParser:
         "doctor", help="what is missing here, or wrong with a sequence", parents=[_common()]
     )
     doctor.add_argument(
-        "--sequence", metavar="DIR", help="look for systematic faults of this sequence instead"
+        "--sequence",
+        type=_path,
+        action=_Once,
+        metavar="DIR",
+        help="look for systematic faults of this sequence instead",
     )
     doctor.add_argument(
         "--dataset", metavar="KIND", help="kind of the sequence (default: detected)"
@@ -60,13 +68,43 @@ def _common() -> argparse.ArgumentParser:
     return common
 
 
+def _path(text: str) -> str:
+    """A path that was given: an empty one, of a variable that is not set, is no folder at all."""
+    if not text:
+        raise argparse.ArgumentTypeError("expected a path, got an empty word")
+    return text
+
+
+class _Once(argparse.Action):
+    """An option that may be given once: of two sequences the first would silently be left out."""
+
+    def __call__(self, parser: Any, namespace: Any, values: Any, option: Any = None) -> None:
+        if getattr(namespace, f"_{self.dest}_given", False):
+            parser.error(f"argument {option}: given twice; one run takes one")
+        setattr(namespace, f"_{self.dest}_given", True)
+        setattr(namespace, self.dest, values)
+
+
 def _add_run(commands: Any) -> None:
     run = commands.add_parser(
         "run", help="estimate the camera motion of a sequence", parents=[_common()]
     )
-    run.add_argument("--sequence", required=True, metavar="DIR", help="folder of the sequence")
+    run.add_argument(
+        "--sequence",
+        required=True,
+        type=_path,
+        action=_Once,
+        metavar="DIR",
+        help="folder of the sequence",
+    )
     run.add_argument("--dataset", metavar="KIND", help="kind of the sequence (default: detected)")
-    run.add_argument("--out", metavar="DIR", help="output folder (default: runs/NAME)")
+    run.add_argument(
+        "--out",
+        type=_path,
+        action=_Once,
+        metavar="DIR",
+        help="output folder (default: runs/NAME)",
+    )
     run.add_argument("--method", metavar="NAME", help="estimator (default: hybrid)")
     run.add_argument(
         "--flow", metavar="WHAT", help="auto (default), file or dis; auto: files, else DIS"
@@ -84,7 +122,7 @@ def _add_run(commands: Any) -> None:
     run.add_argument("--stop", type=int, metavar="N", help="the one after the last frame")
     run.add_argument("--stride", type=int, metavar="N", help="step between frames (default 1)")
     run.add_argument("--device", metavar="NAME", help="auto (default), cpu or cuda")
-    run.add_argument("--config", metavar="FILE", help="YAML file of options")
+    run.add_argument("--config", type=_path, metavar="FILE", help="YAML file of options")
     run.add_argument(
         "--set",
         action="append",
@@ -119,7 +157,9 @@ def _add_demo(commands: Any) -> None:
     demo = commands.add_parser(
         "demo", help="render a scene with moving objects and run on it", parents=[_common()]
     )
-    demo.add_argument("--out", default="runs/demo", metavar="DIR", help="default: runs/demo")
+    demo.add_argument(
+        "--out", type=_path, default="runs/demo", metavar="DIR", help="default: runs/demo"
+    )
     demo.add_argument("--overwrite", action="store_true", help="replace the results in --out")
     demo.add_argument("--frames", type=int, default=20, metavar="N", help="default: 20")
     demo.add_argument("--seed", type=int, default=0, metavar="N", help="of the scene")
@@ -173,7 +213,7 @@ def _guarded(
 
     _prepare_caches()
     handler = logging.StreamHandler()
-    handler.setFormatter(logging.Formatter("%(message)s"))
+    handler.setFormatter(_PlainText("%(message)s"))
     logger = logging.getLogger("hybridvo")
     level = logging.DEBUG if args.verbose else logging.ERROR if args.quiet else logging.WARNING
     before = logger.level
@@ -208,26 +248,45 @@ def _guarded(
 
 
 def _lack_of_memory(error: Exception) -> str:
-    """What to say where memory is exhausted, else nothing. torch's error is known by its name."""
-    if isinstance(error, MemoryError):
-        why = f" ({error})" if str(error) else ""
+    """What to say where memory is exhausted, else nothing; libraries' errors by name and words."""
+    words = str(error)
+    if (
+        isinstance(error, MemoryError)
+        or (type(error).__name__ == "error" and getattr(error, "code", 0) == CV2_NO_MEMORY)
+        or (isinstance(error, RuntimeError) and "not enough memory" in words)
+        or (isinstance(error, RuntimeError) and "can't allocate memory" in words)
+    ):
+        why = f" ({words.splitlines()[0].strip()})" if words.strip() else ""
         return f"out of memory{why}; smaller pictures, or fewer at a time, need less."
     if type(error).__name__ == "OutOfMemoryError":
         return "the CUDA device is out of memory; use --device cpu, or smaller pictures."
     return ""
 
 
+class _PlainText(logging.Formatter):
+    """Log lines without what a terminal would obey."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """The message as :func:`hybridvo.console.printable` shows it."""
+        return printable(super().format(record))
+
+
 def _complain(message: str) -> None:
     with contextlib.suppress(OSError, ValueError):
-        print(f"hybridvo: {message}", file=sys.stderr)
+        print(f"hybridvo: {printable(message)}", file=sys.stderr)
 
 
 def _open_standard_streams() -> None:
     """Give a closed stdin, stdout or stderr its place back, as a stream to nowhere.
 
     Else the next file that is opened gets the number, and what a library writes to stderr (libpng's
-    warnings) lands among the results.
+    warnings) lands among the results. What the terminal's alphabet lacks is written as an escape:
+    a name must not end a run whose results are there.
     """
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            with contextlib.suppress(OSError, ValueError):
+                stream.reconfigure(errors="backslashreplace")
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         try:
             os.fstat(number)
@@ -267,7 +326,7 @@ def _print(text: str) -> None:
     from hybridvo.errors import OutputError
 
     try:
-        print(text, end="" if text.endswith("\n") else "\n", flush=True)
+        print(printable(text), end="" if text.endswith("\n") else "\n", flush=True)
     except BrokenPipeError:
         raise
     except OSError as error:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import os
+import re
 import signal
 import sys
 import threading
@@ -11,14 +13,23 @@ from collections.abc import Iterator
 from types import FrameType
 from typing import IO, Any
 
-__all__ = ["Interruption", "Progress", "interruptible"]
+__all__ = [
+    "Interruption",
+    "Progress",
+    "interruptible",
+    "leave_closed_terminals",
+    "open_terminals",
+    "printable",
+    "stop_signals",
+]
 
+_CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
 PLAIN_INTERVAL_S = 5.0
 """Seconds between progress lines where stderr is no terminal."""
 
 
 class Interruption:
-    """Whether the user, or the system, has asked to stop; true after SIGINT or SIGTERM."""
+    """Whether the user, or the system, has asked to stop; true after one of the signals."""
 
     def __init__(self) -> None:
         self.signal: int | None = None
@@ -27,23 +38,35 @@ class Interruption:
         return self.signal is not None
 
 
+def stop_signals() -> list[int]:
+    """SIGINT, SIGTERM, and a closed terminal's SIGHUP unless it is ignored, as with ``nohup``."""
+    hangup = getattr(signal, "SIGHUP", None)  # not on Windows
+    heard = [] if hangup is None or signal.getsignal(hangup) is signal.SIG_IGN else [hangup]
+    return [signal.SIGINT, signal.SIGTERM, *heard]
+
+
 @contextlib.contextmanager
 def interruptible() -> Iterator[Interruption]:
-    """Turns the first SIGINT or SIGTERM into a flag; a second one aborts (KeyboardInterrupt).
+    """Turns the first of the signals into a flag; a second one aborts (KeyboardInterrupt).
 
-    Outside the main thread, where Python delivers no signals, the flag just stays unset.
+    A closed terminal may send its SIGHUP twice, from the shell and from the kernel, so that one
+    never aborts. Outside the main thread, where Python delivers no signals, the flag just stays
+    unset.
     """
     interruption = Interruption()
+    hangup = getattr(signal, "SIGHUP", None)
 
     def handle(number: int, frame: FrameType | None) -> None:
-        if interruption:
+        leave_closed_terminals(terminals)
+        if interruption and number != hangup:
             raise KeyboardInterrupt
         interruption.signal = number
 
     if threading.current_thread() is not threading.main_thread():
         yield interruption
         return
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    terminals = open_terminals()
+    before = {number: signal.getsignal(number) for number in stop_signals()}
     for number in before:
         signal.signal(number, handle)
     try:
@@ -51,6 +74,33 @@ def interruptible() -> Iterator[Interruption]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler if handler is not None else signal.SIG_DFL)
+
+
+def open_terminals() -> list[int]:
+    """Which of stdin, stdout and stderr are a terminal."""
+    return [number for number in (0, 1, 2) if os.isatty(number)]
+
+
+def leave_closed_terminals(terminals: list[int]) -> None:
+    """Give the streams whose terminal is gone another end: what is still said must not fail.
+
+    Args:
+        terminals: of :func:`open_terminals`, from before.
+    """
+    with contextlib.suppress(OSError):
+        for number in terminals:
+            if not os.isatty(number):
+                null = os.open(os.devnull, os.O_RDWR)
+                os.dup2(null, number)
+                os.close(null)
+
+
+def printable(text: str) -> str:
+    """Text without what a terminal would obey: names of files and folders can hold anything.
+
+    Line ends and tabs stay; other control characters are shown by their number.
+    """
+    return _CONTROL.sub(lambda found: f"\\x{ord(found[0]):02x}", text)
 
 
 class Progress:
@@ -92,7 +142,7 @@ class Progress:
             from rich.progress import Progress as Bar
 
             self._bar = Bar(
-                TextColumn("{task.description}"),
+                TextColumn("{task.description}", markup=False),  # a folder may be named [x]
                 BarColumn(),
                 MofNCompleteColumn(),
                 TextColumn("{task.fields[rate]}"),
@@ -100,7 +150,7 @@ class Progress:
                 console=Console(file=self._stream),
             )
             self._task = self._bar.add_task(
-                self._label, total=self._total, completed=self._before, rate=""
+                printable(self._label), total=self._total, completed=self._before, rate=""
             )
             self._bar.start()
         return self
@@ -132,11 +182,11 @@ class Progress:
         if self._quiet:
             return
         if self._bar is not None:
-            self._bar.console.print(text, markup=False, highlight=False)
+            self._bar.console.print(printable(text), markup=False, highlight=False)
         else:
             self._write(text)
 
     def _write(self, text: str) -> None:
         # a reader of stderr that has gone away must not end the run
         with contextlib.suppress(OSError, ValueError):
-            print(text, file=self._stream, flush=True)
+            print(printable(text), file=self._stream, flush=True)

@@ -13,6 +13,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from hybridvo.depth_steps import depth_ratio
 from hybridvo.diagnosis_findings import Evidence, findings
 from hybridvo.errors import FormatError, InputError
 from hybridvo.flow import FlowProvider, dis_flow
@@ -97,7 +98,13 @@ def diagnosis_text(report: Mapping[str, Any]) -> str:
     for finding in report["findings"]:
         lines.append(f"{signs[finding['state']]} {finding['name']}: {finding['message']}")
     lines += [f"unreadable: {message}" for message in report["unreadable"][:5]]
-    lines.append("nothing differs" if report["ok"] else "something differs: see above")
+    if not report["ok"]:
+        lines.append("something differs: see above")
+    elif all(finding["state"] == "not_observable" for finding in report["findings"]):
+        lines.append("nothing could be compared: see above")
+    else:
+        unread = ", in what could be read" if report["unreadable"] else ""
+        lines.append(f"nothing differs{unread}")
     return "\n".join(lines) + "\n"
 
 
@@ -137,6 +144,10 @@ def _look_at(
     found = flow(prev, curr)
     pair = FramePair(prev, curr, found.flow, found.variance, found.valid, found.source)
     motion = polish_photometric(pair, refine(pair))
+    if motion.ok:
+        ratio = depth_ratio(prev, curr, found.flow, motion.T_curr_prev)
+        if ratio is not None:
+            evidence.depth_ratios.append((index, ratio))
     report = motion.polish
     assert isinstance(report, PolishReport)
     evidence.reasons.append(report.reason)

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from hybridvo.depth_steps import is_step
 from hybridvo.pose.registration import LAGS, LARGEST_PX, OffsetCost
 from hybridvo.pose.self_calibration import PARAMETERS
 from hybridvo.types import Camera
@@ -57,8 +58,9 @@ class Evidence:
         looked_at: pairs. unreadable: messages. reasons: of the polish, empty where it was taken.
         offsets: costs of shifts of the depth map. lags: (2, L) costs of its delays. motion_px: of
             the pixels that delays were looked at on. equations: of the intrinsics. gains: (index,
-            gain). scales: length of a motion over the true one. depths: median, metres. cameras:
-            of the previous frames.
+            gain). scales: length of a motion over the true one. depths: median, metres.
+            depth_ratios: (index, ratio) of the depth of the next frame to what this one predicts.
+            cameras: of the previous frames.
     """
 
     looked_at: int = 0
@@ -71,6 +73,7 @@ class Evidence:
     gains: list[tuple[int, float]] = field(default_factory=list)
     scales: list[float] = field(default_factory=list)
     depths: list[float] = field(default_factory=list)
+    depth_ratios: list[tuple[int, float]] = field(default_factory=list)
     cameras: list[Camera] = field(default_factory=list)
 
 
@@ -87,7 +90,8 @@ def findings(evidence: Evidence) -> list[dict[str, Any]]:
     return [
         *registration,
         *(_open(name, why) if apart else look(evidence) for name, look in later),
-        *(_depth_units(evidence), _exposure(evidence), _agreement(evidence)),
+        *(_depth_units(evidence), _depth_steps(evidence)),
+        *(_exposure(evidence), _agreement(evidence)),
     ]
 
 
@@ -311,9 +315,26 @@ def _depth_units(evidence: Evidence) -> dict[str, Any]:
         wrong = [q for s in SCALES for q in (s, 1 / s) if 0.3 < median / q < 30]
         hint = f": depth {_unit_hint(wrong[0])}" if wrong else ""
         return _finding(name, "differs", f"{text}, not in metres?{hint}", median, None, "m")
+    # all depths and all translations times s project to the same pixels: no pair can tell
     return _finding(
         name, "not_observable", f"{text}; not observable without true poses", median, None, "m"
     )
+
+
+def _depth_steps(evidence: Evidence) -> dict[str, Any]:
+    name = "depth from frame to frame"
+    if not evidence.depth_ratios:
+        return _open(name, "no pair has a motion and depth in both frames")
+    steps = [pair for pair in evidence.depth_ratios if is_step(pair[1])]
+    index, ratio = max(evidence.depth_ratios, key=lambda pair: abs(math.log(max(pair[1], 1e-30))))
+    text = (
+        f"depth changes its scale in {len(steps)} of {len(evidence.depth_ratios)} pairs, most from "
+        f"frame {index} to the next (times {ratio:.3g})"
+    )
+    if not steps:
+        return _finding(name, "agrees", text, ratio, None, "ratio")
+    text += ": files of several units, or a scale of its own in every frame"
+    return _finding(name, "differs", text, ratio, None, "ratio")
 
 
 def _unit_hint(ratio: float) -> str:

@@ -18,12 +18,18 @@ import numpy as np
 
 from hybridvo.errors import CheckpointError, InputError
 from hybridvo.geometry import ego_flow, se3_exp
-from hybridvo.learned import LEARNED, estimate_learned, propose_motion, shipped_network
+from hybridvo.learned import (
+    LEARNED,
+    LEAST_PIXELS,
+    estimate_learned,
+    propose_motion,
+    shipped_network,
+)
 from hybridvo.pose.judgement import default_judge
 from hybridvo.pose.photometric import PhotometricOptions, polish_photometric
 from hybridvo.pose.refinement import RefinementOptions, refine
 from hybridvo.pose.second_look import Motions, Opinion, PictureJudge, Proposal
-from hybridvo.types import Camera, Frame, FramePair, RelativePose
+from hybridvo.types import Camera, Frame, FramePair, Reason, RelativePose
 
 if TYPE_CHECKING:
     import torch
@@ -152,10 +158,30 @@ def estimate(
         return found.replace(method=method)
     check_method(method)
     if method in LEARNED:
-        return estimate_learned(pair, method)
+        return _too_little(pair, method) or estimate_learned(pair, method)
     from hybridvo.pose.baselines import baselines
 
     return baselines()[method](pair, seed=seed)
+
+
+FARTHEST_M = 1e7
+"""Depth that still says something: beyond, a picture's flow tells no network any translation."""
+
+
+def _too_little(pair: FramePair, method: str) -> RelativePose | None:
+    """A failure where the pair itself, and not only its enlargement, is too small for a network."""
+    depth, flow = pair.prev.depth, pair.flow
+    if depth is None or flow is None:
+        return None
+    usable = (depth > 0) & (depth < FARTHEST_M) & np.isfinite(flow).all(axis=2)
+    for mask in (pair.prev.mask, pair.flow_valid):
+        if mask is not None:
+            usable &= mask
+    seen = int(np.count_nonzero(usable))
+    if seen >= LEAST_PIXELS:
+        return None
+    what = f"{seen} pixels have flow and depth below {FARTHEST_M:g} m, {LEAST_PIXELS} needed"
+    return RelativePose.failed(Reason.NO_VALID_DEPTH, what, method)
 
 
 OUT_OF_THE_RACE = 3.0

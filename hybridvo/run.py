@@ -26,6 +26,7 @@ from hybridvo.configuration import RunOptions
 from hybridvo.console import Progress, interruptible
 from hybridvo.data.fingerprint import input_hash, input_times
 from hybridvo.data.sequence import Sequence, open_sequence
+from hybridvo.depth_steps import depth_ratio
 from hybridvo.errors import InputError
 from hybridvo.evaluation.metrics import pair_errors
 from hybridvo.evaluation.report import write_json
@@ -121,6 +122,7 @@ def run(
     provider = flow_provider(sequence, options)
     _compile(options.method)
     out = Path("runs") / run_name(sequence) if out is None else Path(out)
+    _check_outside(out, sequence)
     identity = {
         "input_hash": input_hash(sequence),
         "input_times": input_times(sequence),
@@ -162,6 +164,17 @@ def run(
         if tape is not None and not tape.failed:
             result.summary["recording"] = os.fspath(tape.path)
         return result
+
+
+def _check_outside(out: Path, sequence: Sequence) -> None:
+    """Refuse to write among the pictures of the sequence: the next run would read what is drawn."""
+    pictures = (".png", ".jpg", ".jpeg")
+    folders = {path.parent for path in sequence.files() if path.suffix.lower() in pictures}
+    if out.resolve() in {folder.resolve() for folder in folders}:
+        raise InputError(
+            f"{out}: holds pictures of the sequence, and results among them would be taken for "
+            f"input. Choose another --out."
+        )
 
 
 def _run(
@@ -212,11 +225,12 @@ def _resume(vo: Odometry, folder: RunFolder, sequence: Sequence, frames: range) 
     """Put the tracker where the last kept row left it; returns the failures up to there."""
     assert folder.last is not None
     try:
-        if folder.last["index"] != frames[folder.frames_done - 1]:
-            raise ValueError("another frame's")
         # key frames are written where they change: those of the latest such row hold
         keys = None
-        for row in folder.rows():
+        for number, row in enumerate(folder.rows()):
+            index = frames[number]
+            if row["index"] != index or row["timestamp"] != sequence.timestamps[index]:
+                raise ValueError(f"row {number + 1} is another frame's")
             keys = row["anchor"]["keys"] or keys
         vo.resume(load_anchor(folder.last["anchor"], keys, sequence.frame))
         return int(folder.last["failed_so_far"])
@@ -240,6 +254,7 @@ def _track(
     stamp = float(sequence.timestamps[index])
     before = vo.anchor
     provider.field = None
+    ratio: float | None = None
     try:
         frame = sequence.frame(index)
     except (InputError, OSError) as error:
@@ -251,8 +266,11 @@ def _track(
         started = time.perf_counter()
         step = vo.track(frame)
         ms = 1e3 * (time.perf_counter() - started)
+        flow = None if provider.field is None else provider.field.flow
+        if before.frame is not None and step.ok:
+            ratio = depth_ratio(before.frame, frame, flow, step.T_curr_prev)
         if tape is not None:
-            tape.add(frame, step, None if provider.field is None else provider.field.flow)
+            tape.add(frame, step, flow)
     field = provider.field
     motion = step.motion
     row: dict[str, Any] = {
@@ -274,6 +292,7 @@ def _track(
         "polish": _polish_word(motion.polish),
         "flow_is_true": field is not None and field.flow is not None and field.is_true,
         "errors": _errors(sequence, before.frame, step),
+        "depth_ratio": ratio,
         "window": "+".join(str(e.prev) for e in vo.edges if e.ok and e.kind != "chain"),
         "anchor": dump_anchor(vo.anchor, before),
     }
@@ -337,8 +356,8 @@ def _write(
     too_many = summary["failed_share"] > options.max_failed
     if too_many:
         summary["warnings"].append(
-            f"{summary['failed']} of {len(rows) - 1} motions failed, more than --max-failed "
-            f"{options.max_failed:g} allows"
+            f"{min(summary['failed'], len(rows) - 1)} of {len(rows) - 1} motions failed, more than "
+            f"--max-failed {options.max_failed:g} allows"
         )
     folder.finish(summary={k: v for k, v in summary.items() if k != "metrics"})
     summary["files"] = [

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from hybridvo.data.sequence import Sequence
+from hybridvo.depth_steps import depth_step_warning
 from hybridvo.evaluation.metrics import evaluate_trajectories, mean_pair_errors
 from hybridvo.evaluation.report import write_csv
 from hybridvo.geometry import pose_matrix, se3_log
@@ -63,7 +64,7 @@ def summarise(
         "method": method,
         "frames": len(rows),
         "failed": failed,
-        "failed_share": failed / max(pairs, 1),
+        "failed_share": min(failed / max(pairs, 1), 1.0),  # the first frame may fail beside them
         "degraded": sum(row["status"] == "degraded" for row in rows),
         "missing_frames": [row["index"] for row in rows if row["reason"] == "missing_frame"],
         "flow_source": _names(row["flow_source"] for row in rows),
@@ -71,7 +72,7 @@ def summarise(
         "depth_source": sequence.depth_source,
         "oracle": _oracles(rows, sequence),
         "ms_per_pair_median": float(np.median(tracked)) if tracked else None,
-        "warnings": [],
+        "warnings": [text for text in [depth_step_warning(rows)] if text],
     }
 
 

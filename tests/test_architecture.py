@@ -40,13 +40,14 @@ IMPORTS: dict[str, set[str]] = {
     "console": {"errors"},
     "run_folder": {"errors", "evaluation"},
     "recording": NOUNS | {"evaluation"},
-    "run_results": NOUNS | {"geometry", "data", "trajectory", "evaluation"},
+    "depth_steps": NOUNS,
+    "run_results": NOUNS | {"geometry", "data", "trajectory", "evaluation", "depth_steps"},
     "run_report": {"errors", "evaluation"},
     "configuration": CLASSICAL | {"data", "flow", "hybrid", "odometry", "tracking"},
     "run": {
         *("__init__", "errors", "types", "geometry", "data", "flow", "hybrid", "odometry"),
         *("trajectory", "evaluation", "configuration", "console", "run_folder", "run_results"),
-        *("recording", "compilation", "tracking"),
+        *("recording", "compilation", "tracking", "depth_steps"),
     },
     # what tools/compare_methods.py runs, on this machine and on others
     "comparison": {
@@ -61,8 +62,8 @@ IMPORTS: dict[str, set[str]] = {
     # what stands at the door
     "demo": {"errors", "data", "evaluation", "configuration", "run"},
     "doctor": {"__init__", "errors", "hybrid"},
-    "diagnosis_findings": CLASSICAL,
-    "diagnosis": CLASSICAL | {"flow", "diagnosis_findings"},
+    "diagnosis_findings": CLASSICAL | {"depth_steps"},
+    "diagnosis": CLASSICAL | {"flow", "diagnosis_findings", "depth_steps"},
     "__init__": set(),
 }
 """Room -> rooms it may import. ``cli`` and the tools may import everything."""

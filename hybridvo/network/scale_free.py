@@ -36,6 +36,10 @@ FARTHEST = 50.0
 LIMIT = 10.0
 """Magnitude that squashed values approach; values of the order of one stay as they are."""
 
+LOCKED, LARGEST_SINE = 1e-12, 1 - 1e-6
+"""Squared cosine of the middle angle below which it counts as a quarter turn, and the largest sine
+whose angle has a slope that is worth following."""
+
 NEAREST = 1e-2
 """Metres; a moved point nearer than this, or behind the camera, has no residual."""
 
@@ -54,11 +58,18 @@ class MotionScale:
 
 
 def euler_deg(R: torch.Tensor) -> torch.Tensor:
-    """(B, 3) Euler angles X-Y-Z in degrees of rotations (B, 3, 3) = Rx Ry Rz."""
+    """(B, 3) Euler angles X-Y-Z in degrees of rotations (B, 3, 3) = Rx Ry Rz; finite gradient."""
+    # a quarter turn about y leaves only the sum or difference of the others: rz = 0 there, and no
+    # 0 / 0 in the gradient
+    locked = R[:, 0, 0] ** 2 + R[:, 0, 1] ** 2 < LOCKED
+    one, zero = torch.ones_like(R[:, 0, 0]), torch.zeros_like(R[:, 0, 0])
     angles = (
-        torch.atan2(-R[:, 1, 2], R[:, 2, 2]),
-        torch.asin(R[:, 0, 2].clamp(-1, 1)),
-        torch.atan2(-R[:, 0, 1], R[:, 0, 0]),
+        torch.atan2(
+            torch.where(locked, R[:, 2, 1], -R[:, 1, 2]),
+            torch.where(locked, R[:, 1, 1], R[:, 2, 2]),
+        ),
+        torch.asin(R[:, 0, 2].clamp(-LARGEST_SINE, LARGEST_SINE)),
+        torch.atan2(torch.where(locked, zero, -R[:, 0, 1]), torch.where(locked, one, R[:, 0, 0])),
     )
     return torch.rad2deg(torch.stack(angles, dim=1))
 

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -279,9 +280,27 @@ def test_progress_on_a_terminal_is_a_bar() -> None:
     assert "pairs/s, 1 failed" in stream.getvalue() and "a line" in stream.getvalue()
 
 
-def test_second_signal_aborts_and_handlers_return() -> None:
-    import signal
+@pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="no SIGHUP on this system")
+def test_a_closed_terminal_asks_to_stop_unless_it_is_ignored() -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    try:
+        with interruptible() as interruption:
+            for _ in range(2):  # the shell's and the kernel's
+                os.kill(os.getpid(), signal.SIGHUP)
+                time.sleep(0)
+                assert interruption.signal == signal.SIGHUP
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_DFL
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)  # nohup
+        with interruptible() as interruption:
+            os.kill(os.getpid(), signal.SIGHUP)
+            time.sleep(0)
+            assert not interruption
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
+
+def test_second_signal_aborts_and_handlers_return() -> None:
     before = signal.getsignal(signal.SIGTERM)
     with interruptible() as interruption:
         assert not interruption

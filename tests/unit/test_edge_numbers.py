@@ -307,3 +307,27 @@ def test_lists_in_nanoseconds_of_1970_and_2100(epoch_ns, tmp_path):
     np.testing.assert_allclose(sequence.timestamps, expected, rtol=0, atol=2e-6)
     assert np.isfinite(sequence.poses).all()
     assert any("nanoseconds" in notice for notice in sequence.notices)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 40), (7, 9)])
+def test_a_network_does_not_answer_for_a_handful_of_pixels(size) -> None:
+    """Enlarged to the network's input, one pixel is 32 768 that agree with each other."""
+    height, width = size
+    K = Camera(40, 40, (width - 1) / 2, (height - 1) / 2, height, width)
+    found = estimate(
+        pair(np.full(size, 2.0, np.float32), np.zeros((*size, 2), np.float32), K), method="pwvo"
+    )
+    assert str(found.status) == "failed(no_valid_depth)" and "64 needed" in found.status.message
+    check_finite(found)
+
+
+@pytest.mark.parametrize("value", [1e8, 1e30, 3e38])
+def test_depth_out_of_this_world_is_none(value: float) -> None:
+    depth, flow, K, _ = scene()
+    found = estimate(pair(np.full_like(depth, value), flow, K), method="pwvo")
+    assert str(found.status) == "failed(no_valid_depth)", found.status
+    check_finite(found)
+    # a part of it, as the sky in some data sets, costs nothing
+    depth[: HEIGHT // 3] = value
+    found = estimate(pair(depth, flow, K), method="pwvo")
+    assert found.ok and np.isfinite(found.T_curr_prev).all()

@@ -1,0 +1,129 @@
+"""Depth of another scale on the way (F22), and why a scale from the start cannot be seen."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hybridvo.cli import main
+from hybridvo.depth_steps import depth_ratio, depth_step_warning, is_step
+from hybridvo.geometry import ego_flow, se3_exp
+from hybridvo.pose.refinement import refine
+from hybridvo.types import Camera, Frame, FramePair
+
+TOOLS = Path(__file__).parents[2] / "tools"
+K = Camera(90, 95, 63.5, 47.5, 96, 128)
+T = se3_exp(np.array([0.02, -0.03, 0.4, 0.01, -0.02, 0.03]))
+
+
+def plane(camera: Camera, T_cam_world: np.ndarray) -> np.ndarray:
+    """Depth of the plane z = 4 + 0.3 x of the world, exact at every pixel."""
+    normal, distance = T_cam_world[:3, :3] @ np.array([-0.3, 0.0, 1.0]), 4.0
+    v, u = np.mgrid[: camera.height, : camera.width].astype(float)
+    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], -1)
+    return (distance + normal @ T_cam_world[:3, 3]) / (rays @ normal)
+
+
+@pytest.fixture
+def pair() -> tuple[Frame, Frame, np.ndarray]:
+    prev, curr = plane(K, np.eye(4)), plane(K, T)
+    return Frame(None, prev, K), Frame(None, curr, K, index=1), ego_flow(prev, T, K, K)
+
+
+def test_exact_depth_has_the_ratio_one(pair) -> None:
+    prev, curr, flow = pair
+    # half a pixel to the nearest of a slope of 0.2 % a pixel; the median of both signs
+    assert depth_ratio(prev, curr, flow, T) == pytest.approx(1.0, abs=5e-4)
+    # T moves the points away by 0.4 m, and they are 4 m away
+    assert depth_ratio(prev, curr, flow, np.eye(4)) == pytest.approx(1.1, abs=0.03)
+
+
+@pytest.mark.parametrize("scale", [5.0, 1.3, 0.2, 1e-3])
+def test_another_scale_is_its_ratio_in_spite_of_holes(pair, scale: float) -> None:
+    prev, curr, flow = pair
+    depth = scale * curr.depth
+    depth[::3], flow[:20] = np.nan, np.nan
+    flow[-20:] = 1e30
+    mask = np.ones(K.shape, bool)
+    mask[:, :30] = False
+    depth[:, :30] = 77.0
+    found = depth_ratio(prev, replace(curr, depth=depth, mask=mask), flow, T)
+    assert found == pytest.approx(scale, rel=2e-3) and is_step(found)
+
+
+def test_nothing_to_compare_is_no_ratio(pair) -> None:
+    prev, curr, flow = pair
+    nothing = np.full(K.shape, np.nan)
+    for a, b, f in (
+        (replace(prev, depth=None), curr, flow),
+        (prev, replace(curr, depth=None), flow),
+        (prev, replace(curr, depth=nothing), flow),
+        (replace(prev, depth=nothing), curr, flow),
+        (prev, curr, None),
+        (prev, curr, flow + 1000),
+        (replace(prev, mask=np.zeros(K.shape, bool)), curr, flow),
+    ):
+        assert depth_ratio(a, b, f, T) is None
+    behind = np.diag([1.0, 1.0, -1.0, 1.0])
+    assert depth_ratio(prev, curr, flow, behind) is None
+    assert not is_step(None) and not is_step(1.2) and not is_step(1 / 1.2)
+
+
+def test_a_scale_from_the_start_leaves_no_trace(pair) -> None:
+    """All depths times s: the motion's length times s, its covariance with it, and nothing else."""
+    prev, curr, flow = pair
+    flow = (flow + np.random.default_rng(0).normal(0, 0.2, flow.shape)).astype(np.float32)
+    found = []
+    for s in (1, 4):  # a power of two: the same bits with another exponent
+        a, b = (replace(f, depth=s * f.depth) for f in (prev, curr))
+        motion = refine(FramePair(a, b, flow))
+        assert motion.ok
+        found.append((motion, depth_ratio(a, b, flow, motion.T_curr_prev)))
+    (one, ratio), (four, again) = found
+    assert again == pytest.approx(ratio, rel=1e-6) == pytest.approx(1.0, abs=0.01)
+    np.testing.assert_allclose(four.T_curr_prev[:3, :3], one.T_curr_prev[:3, :3], atol=1e-6)
+    np.testing.assert_allclose(four.T_curr_prev[:3, 3] / 4, one.T_curr_prev[:3, 3], atol=2e-5)
+    assert four.inlier_ratio == pytest.approx(one.inlier_ratio, abs=1e-3)
+    assert four.residual_scale_px == pytest.approx(one.residual_scale_px, rel=1e-3)
+    np.testing.assert_allclose(
+        np.sqrt(np.diag(four.covariance)[:3]) / 4, np.sqrt(np.diag(one.covariance)[:3]), rtol=0.01
+    )
+
+
+def test_a_run_says_where_the_scale_changes(tmp_path: Path, monkeypatch, capsys) -> None:
+    monkeypatch.syspath_prepend(TOOLS)
+    from stress_parts import REFINE, command, write_walk
+
+    root = tmp_path / "walk"
+    write_walk(root, 6, height=64, width=96)
+    # a world in which depth is measured again and again: the plane along the walk
+    camera = Camera(96, 96, 47.5, 31.5, 64, 96)
+    step = se3_exp(np.array([0.02, 0.01, 0.05, 0.002, 0.003, 0.001]))
+    T_cam_world = np.eye(4)
+    for i in range(6):
+        depth = plane(camera, T_cam_world)
+        flow = ego_flow(depth, step, camera, camera) + np.random.default_rng(i).normal(
+            0, 0.1, (64, 96, 2)
+        )
+        np.save(root / "depth" / f"{i:06d}.npy", ((3 if i >= 4 else 1) * depth).astype(np.float32))
+        if i < 5:
+            np.save(root / "flow" / f"{i:06d}.npy", flow.astype(np.float32))
+        T_cam_world = step @ T_cam_world
+    (root / "poses.txt").unlink()
+    arguments = command(root, tmp_path / "out", *REFINE[:-1])
+    assert main(arguments) == 0
+    said = capsys.readouterr().err
+    assert "the depth of frame 4 is 3 times what frame 3 and the motion between them say:" in said
+
+
+def test_the_warning_counts() -> None:
+    rows = [
+        {"index": k, "prev_index": k - 1, "depth_ratio": ratio}
+        for k, ratio in enumerate([None, 1.0, 5.0, 0.2, 1.1])
+    ]
+    assert "frame 2 is 5 times what frame 1" in depth_step_warning(rows)
+    assert ", and 1 more: " in depth_step_warning(rows)
+    assert depth_step_warning(rows[:2]) == ""
