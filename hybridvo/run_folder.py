@@ -47,7 +47,8 @@ class RunFolder:
         identity: what must be equal for a run to be resumed (options, input hash, versions of the
             estimator); a mapping that JSON can hold.
         header: what else ``run.json`` says (command, versions, machine).
-        mode: ``new`` refuses a folder with results, ``overwrite`` removes them, ``resume`` goes on.
+        mode: ``new`` refuses a folder with results, ``overwrite`` removes those of a run (and no
+            others), ``resume`` goes on.
         results: names of the files that a finished run leaves.
 
     ``frames_done`` counts the kept rows, ``last`` is the latest of an earlier run; the rows stay on
@@ -55,7 +56,8 @@ class RunFolder:
 
     Raises:
         LockedError: another run holds the folder.
-        InputError: results are there and ``mode`` is ``new``; or ``resume`` of another run.
+        InputError: results are there and ``mode`` is ``new``; ``resume`` of another run; or
+            ``overwrite`` of files that no run has written.
         OutputError: the folder cannot be written.
     """
 
@@ -111,29 +113,53 @@ class RunFolder:
             )
         if mode == "resume" and present:
             self._load()
-        else:
+        elif present:
+            self._check_replaceable(present)
             with _as_output_error(self.path):
-                for name in present:
-                    self._remove(name)
+                self._remove(PARTIAL)
         with _as_output_error(self.path):
             self._sweep()
             if self._done:
                 self._remove(PARTIAL)
                 return
+        # before the old results go: without it nothing would say that what is left is a run's
         self.write_state("running")
+        if mode == "overwrite":
+            with _as_output_error(self.path):
+                for name in self._results:
+                    self._remove(name)
         # O_NOFOLLOW: a link planted under this name must not lead the rows elsewhere
         flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | getattr(os, "O_NOFOLLOW", 0)
         with _as_output_error(self.path / PARTIAL):
             descriptor = os.open(self.path / PARTIAL, flags, 0o666)
             self._partial = os.fdopen(descriptor, "ab", buffering=0)
 
+    def _check_replaceable(self, present: list[str]) -> None:
+        """Refuse to replace what no run has written: a user's own file of such a name.
+
+        A ``run.json`` that is damaged counts as a run's.
+        """
+        for name in present:
+            if (self.path / name).is_dir() and not (self.path / name).is_symlink():
+                raise InputError(
+                    f"{self.path / name}: is a folder, a run writes a file of that name. Remove it."
+                )
+        state = self.read_json(STATE)
+        ours = state is None or (isinstance(state, dict) and "identity" in state)
+        if not ({STATE, PARTIAL} & set(present) and ours):
+            raise InputError(
+                f"{self.path}: holds {', '.join(present[:3])}{', ...' if len(present) > 3 else ''},"
+                f" and no {STATE} that says a run wrote it: not replaced. Move it away, or choose "
+                f"another --out."
+            )
+
     def _load(self) -> None:
         """Rows and state of an earlier run of the same identity."""
         try:
             state = json.loads((self.path / STATE).read_text(encoding="utf-8"))
-            identity, self._done = state["identity"], state["state"] == "done"
+            identity, self._done = dict(state["identity"]), state["state"] == "done"
             self.state = state
-        except (OSError, ValueError, KeyError, TypeError):
+        except (OSError, ValueError, KeyError, TypeError, RecursionError):
             raise InputError(
                 f"{self.path / STATE}: cannot be read, so the run cannot be resumed. "
                 f"Pass --overwrite to start anew."
@@ -145,10 +171,11 @@ class RunFolder:
         )
         if different:
             key = different[0]
+            what, then, now = _difference(key, identity.get(key), self._identity.get(key))
             raise InputError(
                 f"{self.path}: cannot be resumed: {', '.join(different)} differ from the run that "
-                f"was started there ({key}: {_short(identity.get(key))} then, "
-                f"{_short(self._identity.get(key))} now). Pass --overwrite to start anew."
+                f"was started there ({what}: {_short(then)} then, {_short(now)} now). "
+                f"Pass --overwrite to start anew."
             )
         if self._done:
             return
@@ -163,7 +190,7 @@ class RunFolder:
                 for line in file:
                     try:
                         row = json.loads(line) if line.endswith(b"\n") else None
-                    except ValueError:
+                    except (ValueError, RecursionError):
                         row = None
                     if not isinstance(row, dict):
                         break  # torn by the end of the process: what follows is computed again
@@ -183,7 +210,7 @@ class RunFolder:
         """Content of a JSON file of the folder; None where it is absent or damaged."""
         try:
             return json.loads((self.path / name).read_text(encoding="utf-8"))
-        except (OSError, ValueError):
+        except (OSError, ValueError, RecursionError):
             return None
 
     def append(self, row: Mapping[str, Any]) -> None:
@@ -248,8 +275,6 @@ class RunFolder:
 
     def _remove(self, name: str) -> None:
         path = self.path / name
-        if path.is_dir() and not path.is_symlink():
-            raise InputError(f"{path}: is a folder, a run writes a file of that name. Remove it.")
         path.unlink(missing_ok=True)
 
 
@@ -395,6 +420,14 @@ def _as_output_error(path: Path) -> Iterator[None]:
         raise
     except OSError as error:
         raise OutputError(f"{path}: cannot be written: {error.strerror or error}.") from error
+
+
+def _difference(key: str, then: Any, now: Any) -> tuple[str, Any, Any]:
+    """Dotted name and both values of the first thing in which two settings differ."""
+    while isinstance(then, Mapping) and isinstance(now, Mapping):
+        inner = min(k for k in {*then, *now} if then.get(k) != now.get(k))
+        key, then, now = f"{key}.{inner}", then.get(inner), now.get(inner)
+    return key, then, now
 
 
 def _short(value: Any) -> str:

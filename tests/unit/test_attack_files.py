@@ -1,0 +1,375 @@
+"""What an attack on the command line, the readers and the output folders found, one test each.
+
+The list of what was tried is in docs/attack.md.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import struct
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hybridvo.cli import _open_standard_streams, main
+from hybridvo.configuration import load_options
+from hybridvo.console import Progress, printable
+from hybridvo.data.plain_yaml import plain_yaml
+from hybridvo.data.sequence import open_sequence
+from hybridvo.diagnosis import diagnose, diagnosis_text
+from hybridvo.errors import FormatError, InputError
+from hybridvo.evaluation.report import to_json, write_json
+from hybridvo.run_folder import PARTIAL, STATE, RunFolder
+from tests.sequences import image, png, write_folder, write_kitti, write_sintel, write_tum
+
+
+def start(path: Path, mode: Any = "new", **options: Any) -> RunFolder:
+    return RunFolder(path, {"input_hash": "abc", "options": options}, {"command": ["test"]}, mode)
+
+
+# output folders
+
+
+@pytest.mark.parametrize("name", ["trajectory.png", "metrics.json", "trajectory.tum"])
+def test_overwrite_leaves_a_file_that_no_run_has_written(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_text("mine")
+    with pytest.raises(InputError, match=r"no run\.json that says a run wrote it: not replaced"):
+        start(tmp_path, "overwrite")
+    assert (tmp_path / name).read_text() == "mine"
+    assert sorted(path.name for path in tmp_path.iterdir()) == [name]
+
+
+def test_overwrite_leaves_the_run_json_of_another_program(tmp_path: Path) -> None:
+    (tmp_path / STATE).write_text('{"jogging": "5 km"}')
+    with pytest.raises(InputError, match="not replaced"):
+        start(tmp_path, "overwrite")
+    assert "jogging" in (tmp_path / STATE).read_text()
+
+
+def test_overwrite_replaces_a_run_whose_state_is_damaged(tmp_path: Path) -> None:
+    start(tmp_path).close()
+    (tmp_path / STATE).write_text('{"identity": {')
+    (tmp_path / "metrics.json").write_text("{}")
+    with start(tmp_path, "overwrite") as folder:
+        assert folder.frames_done == 0
+        assert not (tmp_path / "metrics.json").exists()
+
+
+def test_overwrite_that_is_killed_can_be_tried_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with start(tmp_path) as folder:
+        folder.append({"index": 0})
+        (tmp_path / "steps.csv").write_text("old")
+        folder.finish()
+    with monkeypatch.context() as patch:
+        patch.setattr(RunFolder, "_remove", _die_at("steps.csv", RunFolder._remove))
+        with pytest.raises(KeyboardInterrupt):
+            start(tmp_path, "overwrite", seed=1)
+    assert json.loads((tmp_path / STATE).read_text())["state"] == "running"
+    with start(tmp_path, "overwrite", seed=1) as folder:
+        assert folder.frames_done == 0
+        assert not (tmp_path / "steps.csv").exists()
+
+
+def _die_at(name: str, remove: Any) -> Any:
+    def dying(self: RunFolder, which: str) -> None:
+        if which == name:
+            raise KeyboardInterrupt
+        remove(self, which)
+
+    return dying
+
+
+def test_a_folder_named_like_a_result_stops_an_overwrite_before_it_removes_anything(
+    tmp_path: Path,
+) -> None:
+    start(tmp_path).close()
+    (tmp_path / "trajectory.tum").mkdir()
+    before = (tmp_path / STATE).read_bytes(), (tmp_path / PARTIAL).exists()
+    with pytest.raises(InputError, match="is a folder"):
+        start(tmp_path, "overwrite")
+    assert ((tmp_path / STATE).read_bytes(), (tmp_path / PARTIAL).exists()) == before
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "[" * 100_000,
+        '{"identity": null, "state": "done"}',
+        '{"identity": 5, "state": "done"}',
+        '{"identity": [1], "state": "done"}',
+        "5",
+    ],
+    ids=["deep", "null", "number", "list", "no mapping"],
+)
+def test_resume_with_a_state_edited_by_hand_is_refused(tmp_path: Path, content: str) -> None:
+    start(tmp_path).close()
+    (tmp_path / STATE).write_text(content)
+    with pytest.raises(InputError, match="cannot be read, so the run cannot be resumed"):
+        start(tmp_path, "resume")
+
+
+def test_resume_with_deeply_nested_rows_computes_them_again(tmp_path: Path) -> None:
+    with start(tmp_path) as folder:
+        folder.append({"index": 0})
+    with (tmp_path / PARTIAL).open("ab") as file:
+        file.write(b"[" * 100_000 + b"\n")
+    with start(tmp_path, "resume") as folder:
+        assert folder.frames_done == 1
+
+
+def test_refused_resume_names_the_option_that_differs(tmp_path: Path) -> None:
+    start(tmp_path, method="refine", dis={"preset": "fast"}, seed=0).close()
+    with pytest.raises(InputError, match=r"options\.dis\.preset: \"fast\" then, \"medium\" now"):
+        start(tmp_path, "resume", method="refine", dis={"preset": "medium"}, seed=1)
+
+
+@pytest.fixture
+def made(tmp_path: Path) -> Iterator[Path]:
+    """A tiny sequence of kind 'folder'."""
+    yield write_folder(tmp_path).path
+
+
+def cli(*words: str) -> int:
+    return main([*words, "-q"])
+
+
+def test_results_are_not_written_among_the_pictures(
+    made: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = sorted(made.rglob("*"))
+    words = ("run", "--sequence", str(made), "--method", "identity", "--out")
+    assert cli(*words, str(made / "rgb")) == 2
+    assert "would be taken for input" in capsys.readouterr().err
+    assert sorted(made.rglob("*")) == before
+
+
+def test_resume_with_a_row_of_another_time_is_refused(
+    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    words = ("run", "--sequence", str(made), "--method", "identity", "--out", str(out))
+    assert cli(*words) == 0
+    # back to the state of a run that was cut off, its row changed by hand
+    state = json.loads((out / STATE).read_text())
+    (out / STATE).write_text(json.dumps(state | {"state": "running"}))
+    row = {"index": 0, "timestamp": 0.7, "anchor": {"keys": None}, "failed_so_far": 0}
+    (out / PARTIAL).write_text(json.dumps(row) + "\n")
+    assert cli(*words, "--resume") == 2
+    assert "row 1 is another frame's" in capsys.readouterr().err
+
+
+def test_no_more_motions_fail_than_there_are(
+    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for path in (made / "rgb").iterdir():
+        path.write_bytes(path.read_bytes()[:-20])
+    out = tmp_path / "out"
+    words = ("run", "--sequence", str(made), "--method", "identity", "--out", str(out))
+    assert main(words) == 3
+    count = len(list((made / "rgb").iterdir()))
+    assert f"{count - 1} of {count - 1} motions failed" in capsys.readouterr().err
+    assert json.loads((out / STATE).read_text())["summary"]["failed_share"] == 1.0
+
+
+# the command line
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("run", "--sequence", ""),
+        ("run", "--sequence", "a", "--out", ""),
+        ("run", "--sequence", "a", "--config", ""),
+        ("doctor", "--sequence", ""),
+        ("demo", "--out", ""),
+    ],
+)
+def test_an_empty_path_is_not_the_working_folder(
+    words: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(words) == 2
+    assert "expected a path, got an empty word" in capsys.readouterr().err
+
+
+def test_the_first_of_two_sequences_is_not_left_out(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", "--sequence", "a", "--sequence", "b"]) == 2
+    assert "--sequence: given twice" in capsys.readouterr().err
+
+
+def test_names_cannot_talk_to_the_terminal(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert printable("a\x1b[31m\x9b2J\rb\tc\n") == "a\\x1b[31m\\x9b2J\\x0db\tc\n"
+    assert main(["run", "--sequence", str(tmp_path / "\x1b[2Jx")]) == 2
+    assert "\x1b" not in capsys.readouterr().err
+    stream = io.StringIO()
+    with Progress(1, "x\x1b]0;y\x07", stream=stream) as progress:
+        progress.say("note: \x1b[2J")
+        progress.update(1, 0)
+    assert "\x1b" not in stream.getvalue() and "\\x1b]0;y\\x07: 1/1" in stream.getvalue()
+
+
+def test_names_are_no_markup_of_the_progress_bar() -> None:
+    class Terminal(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    stream = Terminal()
+    with Progress(1, "[red]x[/nope]", stream=stream) as progress:
+        progress.update(1, 0)
+    assert "[red]x[/nope]" in stream.getvalue()
+
+
+def test_an_alphabet_without_the_name_does_not_end_a_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    bytes_out = io.BytesIO()
+    stream = io.TextIOWrapper(bytes_out, encoding="ascii")
+    monkeypatch.setattr(sys, "stdout", stream)
+    _open_standard_streams()
+    print("séq", file=stream, flush=True)
+    assert bytes_out.getvalue() == b"s\\xe9q\n"
+
+
+def test_a_path_that_is_no_utf8_can_be_reported(tmp_path: Path) -> None:
+    name = os.fsdecode(b"a\xff\xe9")
+    write_json(tmp_path / "x.json", {"path": name, "other": "séq 😀"})
+    read = json.loads((tmp_path / "x.json").read_text(encoding="utf-8"))
+    assert read == {"path": name, "other": "séq 😀"}
+    assert "séq 😀" in to_json("séq 😀")
+
+
+# settings
+
+
+@pytest.mark.parametrize("seed", [-1, 2**31, 10**30])
+def test_a_seed_that_no_generator_takes_is_refused(seed: int) -> None:
+    with pytest.raises(InputError, match="seed: expected 0 to 2147483647"):
+        load_options(assignments=[f"seed={seed}"])
+
+
+def test_a_repeated_key_is_refused(tmp_path: Path) -> None:
+    for text in ("seed: 1\nmethod: refine\nseed: 2", "dis: {preset: fast, preset: medium}"):
+        with pytest.raises(FormatError, match=r"the key '(seed|preset)' is there twice"):
+            plain_yaml(text, "x.yaml")
+    assert plain_yaml("a: {x: 1}\nb: {x: 1}", "x.yaml") == {"a": {"x": 1}, "b": {"x": 1}}
+
+
+@pytest.mark.parametrize(
+    ("word", "value"), [("1e-3", 1e-3), ("1.0e9", 1e9), ("-2.E+5", -2e5), (".5e1", 5.0)]
+)
+def test_a_power_of_ten_is_a_number(word: str, value: float) -> None:
+    assert plain_yaml(f"x: {word}", "x.yaml") == {"x": value}
+    assert plain_yaml("x: '1e-3'", "x.yaml") == {"x": "1e-3"}
+    assert plain_yaml("x: 1e-3x", "x.yaml") == {"x": "1e-3x"}
+
+
+# readers
+
+
+def test_two_files_of_one_frame_are_refused(made: Path) -> None:
+    first = min((made / "rgb").iterdir())
+    other = first.with_suffix(".jpg" if first.suffix == ".png" else ".png")
+    other.write_bytes(first.read_bytes())
+    with pytest.raises(InputError, match="two files of one frame"):
+        open_sequence(made)
+
+
+def own(root: Path, images: tuple[int, ...], depths: tuple[int, ...]) -> Path:
+    """A sequence of kind 'folder' with these numbers and no time stamps."""
+    (root / "depth").mkdir(parents=True)
+    (root / "camera.yaml").write_text(
+        "fx: 20\nfy: 20\ncx: 15.5\ncy: 11.5\nwidth: 32\nheight: 24\ndepth_scale: 1000\n"
+    )
+    for i in images:
+        png(root / "rgb" / f"{i:04d}.png", image(i, 24, 32))
+    for i in depths:
+        png(root / "depth" / f"{i:04d}.png", np.full((24, 32), 2000, np.uint16))
+    return root
+
+
+def test_a_missing_image_is_said(tmp_path: Path) -> None:
+    notices = "\n".join(open_sequence(own(tmp_path, (0, 1, 3, 4), (0, 1, 2, 3, 4))).notices)
+    assert "1 depth files without an image are left out: 0002.png" in notices
+    assert "numbers of the images jump, the time stamps do not" in notices
+
+
+def test_numbers_that_go_on_evenly_are_not_remarked_on(tmp_path: Path) -> None:
+    for name, numbers in (("one", (7, 8, 9)), ("ten", (0, 10, 20))):
+        notices = "\n".join(open_sequence(own(tmp_path / name, numbers, numbers)).notices)
+        assert "jump" not in notices and "left out" not in notices
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_frame_rate_of_almost_zero_is_refused_without_a_warning(tmp_path: Path) -> None:
+    root = own(tmp_path, (0, 1), (0, 1))
+    with (root / "camera.yaml").open("a") as file:
+        file.write("fps: 1.0e-320\n")
+    with pytest.raises(InputError, match="not finite"):
+        open_sequence(root)
+
+
+def test_kitti_with_stored_depth_needs_no_right_camera(tmp_path: Path) -> None:
+    root = write_kitti(tmp_path).path
+    calib = root / "calib.txt"
+    lines = [line for line in calib.read_text().splitlines() if not line.startswith("P3")]
+    assert len(lines) < len(calib.read_text().splitlines())
+    calib.write_text("\n".join(lines) + "\n")
+    assert open_sequence(root).frame(0).depth is not None
+
+
+def test_stamps_in_a_message_are_plain_numbers(tmp_path: Path) -> None:
+    root = write_tum(tmp_path).path
+    lines = (root / "rgb.txt").read_text().splitlines()
+    (root / "rgb.txt").write_text("\n".join(reversed(lines)) + "\n")
+    with pytest.raises(InputError, match=r"entry 0 has \d+\.\d+, entry 1 has \d+\.\d+\."):
+        open_sequence(root)
+
+
+def test_a_camera_of_no_use_costs_its_frame_and_not_the_run(tmp_path: Path) -> None:
+    root = write_sintel(tmp_path).path
+    cam = sorted((tmp_path / "training" / "camdata_left").rglob("*.cam"))[1]
+    data = bytearray(cam.read_bytes())
+    data[4:12] = struct.pack("<d", 1e300)  # fx
+    cam.write_bytes(data)
+    words = ("run", "--sequence", str(root), "--method", "identity", "--max-failed", "1")
+    assert cli(*words, "--out", str(tmp_path / "out")) == 0
+    steps = (tmp_path / "out" / "steps.csv").read_text().splitlines()
+    assert [line.split(",")[3] for line in steps[1:]] == ["", "missing_frame", ""]
+
+
+def test_stamps_that_go_back_are_named(tmp_path: Path) -> None:
+    root = write_kitti(tmp_path).path
+    (root / "times.txt").write_text("5\n4\n3\n")
+    with pytest.raises(InputError, match=r"frame 0 has 5\.0, frame 1 has 4\.0\."):
+        open_sequence(root)
+
+
+def test_a_list_of_files_that_are_not_there_names_one(tmp_path: Path) -> None:
+    root = write_tum(tmp_path).path
+    listed = (root / "rgb.txt").read_text()
+    (root / "rgb.txt").write_text(listed.replace("rgb/", "rgb\\"))  # as Windows writes it
+    notices = "\n".join(open_sequence(root).notices)
+    assert "there are no image files, such as" in notices and "rgb\\" in notices
+
+
+# doctor
+
+
+def test_doctor_does_not_praise_what_it_could_not_read(tmp_path: Path) -> None:
+    root = own(tmp_path, (0, 1, 2), (0, 1, 2))
+    for path in (root / "rgb").iterdir():
+        if path.name != "0000.png":
+            path.write_bytes(b"x")
+    report = diagnose(open_sequence(root))
+    text = diagnosis_text(report)
+    assert len(report["unreadable"]) == 2
+    assert "nothing could be compared: see above" in text and "nothing differs" not in text
+    half = report | {"findings": [{"name": "a", "state": "agrees", "message": "b"}], "ok": True}
+    assert "nothing differs, in what could be read" in diagnosis_text(half)
