@@ -25,6 +25,8 @@ __all__ = ["DisOptions", "RunOptions", "load_options"]
 
 FLOWS = ("auto", "file", "dis")
 DEVICES = ("auto", "cpu", "cuda")
+LARGEST_SEED = 2**31 - 1
+"""Every generator that is seeded takes as much."""
 
 
 @dataclass(frozen=True)
@@ -97,8 +99,8 @@ class RunOptions:
             )
         if self.stop is not None and self.stop <= self.start:
             raise InputError(f"expected stop > start, got {self.stop} and {self.start}.")
-        if self.seed < 0:
-            raise InputError(f"seed: expected a number >= 0, got {self.seed}.")
+        if not 0 <= self.seed <= LARGEST_SEED:
+            raise InputError(f"seed: expected 0 to {LARGEST_SEED}, got {self.seed}.")
         if not 0 <= self.max_failed <= 1:
             raise InputError(f"max_failed: expected a share in [0, 1], got {self.max_failed}.")
 

@@ -24,9 +24,20 @@ MAX_SCALAR, MAX_DEPTH = 1000, 20
 
 
 class _PlainLoader(yaml.SafeLoader):
-    """SafeLoader without aliases, tags, merge keys, dates and numbers of base 60."""
+    """SafeLoader without aliases, tags, merge keys, dates, numbers of base 60 and repeated keys."""
 
     depth = 0
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
+        """One mapping; of a key that stands there twice PyYAML would keep the last."""
+        seen = set()
+        for key, _ in node.value:
+            name = getattr(key, "value", None)
+            if isinstance(name, str) and name in seen:
+                line = key.start_mark.line + 1
+                raise yaml.YAMLError(f"line {line}: the key {name[:40]!r} is there twice")
+            seen.add(name if isinstance(name, str) else None)
+        return super().construct_mapping(node, deep)
 
     def compose_node(self, parent: Any, index: Any) -> Any:
         """One value, after a look at what it is."""
@@ -56,9 +67,12 @@ _PlainLoader.yaml_implicit_resolvers = {
     first: [(tag, pattern) for tag, pattern in resolvers if tag not in _LEFT_OUT]
     for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
 }
-for _first in "-+0123456789":
+# YAML 1.1 reads 1e-3 and 1.0e9 as words; everybody who writes them means the numbers.
+_POWER_OF_TEN = re.compile(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)[eE][-+]?[0-9]+$")
+for _first in "-+.0123456789":
     _PlainLoader.yaml_implicit_resolvers[_first] = [
         ("tag:yaml.org,2002:str", _BASE_60),
+        ("tag:yaml.org,2002:float", _POWER_OF_TEN),
         *_PlainLoader.yaml_implicit_resolvers.get(_first, []),
     ]
 

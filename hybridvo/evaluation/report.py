@@ -12,6 +12,7 @@ import io
 import json
 import math
 import os
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -57,7 +58,9 @@ def jsonable(value: Any) -> Any:
 
 def to_json(data: Any) -> str:
     """JSON text, keys sorted, two spaces, a final newline; floats read back to the same value."""
-    return json.dumps(jsonable(data), sort_keys=True, indent=2, ensure_ascii=False) + "\n"
+    text = json.dumps(jsonable(data), sort_keys=True, indent=2, ensure_ascii=False) + "\n"
+    # a path that is no UTF-8 holds lone surrogates, which no file can: as escapes they read back
+    return re.sub("[\ud800-\udfff]", lambda found: f"\\u{ord(found[0]):04x}", text)
 
 
 def write_json(path: str | os.PathLike[str], data: Any) -> None:
