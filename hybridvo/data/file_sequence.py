@@ -214,9 +214,10 @@ class FileSequence:
         if (steps <= 0).any():
             i = int(np.flatnonzero(steps <= 0)[0])
             raise InputError(
-                f"{self.root}: timestamps must increase: frame {i} has {self.timestamps[i]!r}, "
-                f"frame {i + 1} has {self.timestamps[i + 1]!r}. Sort the list and remove "
-                f"duplicates; hybridvo does not guess which order was meant."
+                f"{self.root}: timestamps must increase: frame {i} has "
+                f"{float(self.timestamps[i])!r}, frame {i + 1} has "
+                f"{float(self.timestamps[i + 1])!r}. Sort the list and remove duplicates; hybridvo "
+                f"does not guess which order was meant."
             )
 
     def _check_sizes(self) -> tuple[int, int]:
@@ -249,7 +250,9 @@ class FileSequence:
         for what, paths in (("image", self.rgb_files), ("depth", self.depth_files)):
             missing = [i for i, path in enumerate(paths) if path is None or not path.exists()]
             if len(missing) == len(paths):
-                notices.append(f"{self.name}: there are no {what} files.")
+                named = next((path for path in paths if path is not None), None)
+                like = f", such as {named}" if named else ""
+                notices.append(f"{self.name}: there are no {what} files{like}.")
             elif missing:
                 shown = ", ".join(map(str, missing[:8])) + (", ..." if len(missing) > 8 else "")
                 notices.append(f"{self.name}: {len(missing)} frames without {what}: {shown}.")

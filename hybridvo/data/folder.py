@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import itertools
 from pathlib import Path
 from typing import Any
 
@@ -86,6 +87,9 @@ class FolderSequence(FileSequence):
         frames = rgb or depth
         notices = [f"{root.name}: frames in natural order, {frames[0].name} to {frames[-1].name}."]
         flow_files = sorted_files(root / "flow", (".flo", ".npy", ".png"))
+        for files in (rgb, depth, flow_files):
+            _refuse_twins(files)
+        notices += _stray_notice(root.name, frames, depth)
         lens = settings.get("distortion", ())
         if flow_files and any(lens):
             raise InputError(
@@ -197,6 +201,45 @@ def _distortion(value: Any, path: Path) -> tuple[float, ...]:
     return tuple(float(v) for v in value)
 
 
+def _refuse_twins(files: list[Path]) -> None:
+    """Refuse two files of one frame: as frames of their own they would be read one after another.
+
+    Raises:
+        InputError: files whose names differ in the ending alone.
+    """
+    seen: dict[str, Path] = {}
+    for path in files:
+        other = seen.setdefault(path.stem, path)
+        if other is not path:
+            raise InputError(
+                f"{path.parent}: {other.name} and {path.name} are two files of one frame. Keep the "
+                f"files of one kind."
+            )
+
+
+def _stray_notice(name: str, frames: list[Path], depth: list[Path]) -> list[str]:
+    """Notice of depth files without an image."""
+    stems = {path.stem for path in frames}
+    stray = [path.name for path in depth if path.stem not in stems]
+    if not stray or len(stray) == len(depth):  # the two folders have names of their own
+        return []
+    shown = ", ".join(stray[:4]) + (", ..." if len(stray) > 4 else "")
+    return [f"{name}: {len(stray)} depth files without an image are left out: {shown}."]
+
+
+def _jump_notice(name: str, frames: list[Path]) -> list[str]:
+    """Notice of images whose numbers do not go on evenly, though their stamps will."""
+    if not all(path.stem.isascii() and path.stem.isdigit() for path in frames):
+        return []
+    steps = {int(b.stem) - int(a.stem) for a, b in itertools.pairwise(frames)}
+    if len(steps) < 2:
+        return []
+    return [
+        f"{name}: the numbers of the images jump, the time stamps do not: {len(frames)} images, "
+        f"{frames[0].name} to {frames[-1].name}. Give the stamps in timestamps.txt."
+    ]
+
+
 def _match_files(frames: list[Path], files: list[Path], folder: Path) -> list[Path | None]:
     """One file or None per frame: by equal stems, else by order where the counts agree."""
     if not files:
@@ -244,7 +287,9 @@ def _read_times_and_poses(
         stamps, converted = to_seconds(named, "file names")
         notices += converted
     else:
-        stamps = np.arange(count) / (fps or DEFAULT_FPS)
+        with np.errstate(over="ignore"):  # of an fps of almost zero: refused as stamps
+            stamps = np.arange(count) / (fps or DEFAULT_FPS)
+        notices += _jump_notice(root.name, frames)
         if fps is None:
             notices.append(f"{root.name}: no time stamps; {DEFAULT_FPS:g} frames a second assumed.")
     if truth is None:

@@ -93,14 +93,16 @@ class KittiSequence(FileSequence):
         self.depth_source = "stereo" if self._stereo else "file"
         depth_files = right if self._stereo else stored
         projections = _read_calibration(root / "calib.txt")
-        P_left, P_right = (_projection(projections, n[-1], root) for n in (left_name, right_name))
-        self._focal = P_left[0, 0]
-        self._baseline = (P_left[0, 3] - P_right[0, 3]) / P_left[0, 0]
-        if self._stereo and not self._baseline > 0:
-            raise FormatError(
-                f"{root / 'calib.txt'}: expected a positive baseline between P{left_name[-1]} and "
-                f"P{right_name[-1]}, got {self._baseline} m."
-            )
+        P_left = _projection(projections, left_name[-1], root)
+        self._focal, self._baseline = P_left[0, 0], 0.0
+        if self._stereo:
+            P_right = _projection(projections, right_name[-1], root)
+            self._baseline = float((P_left[0, 3] - P_right[0, 3]) / P_left[0, 0])
+            if not self._baseline > 0:
+                raise FormatError(
+                    f"{root / 'calib.txt'}: expected a positive baseline between P{left_name[-1]} "
+                    f"and P{right_name[-1]}, got {self._baseline} m."
+                )
         notices = gap_notice(root.name, numbers)
         stamps = _read_times(root / "times.txt", numbers, notices)
         truth = _truth_file(root)

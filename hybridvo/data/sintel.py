@@ -123,11 +123,7 @@ class SintelSequence(FileSequence):
         Raises:
             FileNotFoundError: no ``.cam`` file for this frame. FormatError: a damaged one.
         """
-        K, _ = self._read_cam(self._check_index(index))
-        try:
-            return Camera.from_matrix(K, self.height, self.width)
-        except InputError as error:
-            raise FormatError(f"{self._cameras[index]}: {error}") from None
+        return self._read_camera(self._check_index(index))[0]
 
     def occlusion(self, index: int) -> np.ndarray:
         """(H, W) bool, True where a pixel of frame ``index`` cannot be seen in the next one.
@@ -146,11 +142,20 @@ class SintelSequence(FileSequence):
             raise FileNotFoundError(f"{self.name}: frame {index} has no .cam file.")
         return read_cam(path, strict=self.strict)
 
+    def _read_camera(self, index: int) -> tuple[Camera, np.ndarray]:
+        """Camera and T_cam_world of a frame."""
+        K, T_cam_world = self._read_cam(index)
+        try:
+            return Camera.from_matrix(K, self.height, self.width), T_cam_world
+        except InputError as error:
+            raise FormatError(f"{self._cameras[index]}: {error}") from None
+
     def _read_poses(self) -> np.ndarray:
+        """Poses of the frames that have a camera: the others are not scored."""
         poses = np.full((len(self), 4, 4), np.nan)
         for index in range(len(self)):
             try:
-                poses[index] = invert(self._read_cam(index)[1])
+                poses[index] = invert(self._read_camera(index)[1])
             except (FormatError, FileNotFoundError) as error:
                 self._notices.append(f"no camera for frame {index}: {error}")
         return poses

@@ -212,8 +212,8 @@ def _read_lists(
     if (np.diff(stamps) <= 0).any():
         i = int(np.flatnonzero(np.diff(stamps) <= 0)[0])
         raise InputError(
-            f"{root / 'rgb.txt'}: timestamps must increase: entry {i} has {stamps[i]!r}, entry "
-            f"{i + 1} has {stamps[i + 1]!r}. Sort the list and remove duplicates."
+            f"{root / 'rgb.txt'}: timestamps must increase: entry {i} has {float(stamps[i])!r}, "
+            f"entry {i + 1} has {float(stamps[i + 1])!r}. Sort the list and remove duplicates."
         )
     pairs = dict(associate(stamps, depth_stamps, tolerance))
     kept = list(range(len(stamps))) if keep_unmatched else sorted(pairs)
