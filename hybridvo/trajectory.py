@@ -41,6 +41,9 @@ Axes = Literal["auto", "camera", "ned"]
 NANOSECONDS_ABOVE = 1e14
 """Stamps above this value cannot be seconds (three million years) and are taken as nanoseconds."""
 
+LARGEST_FILE = 2**28
+"""Bytes of the largest trajectory file that is read: two million poses."""
+
 _COLUMNS: dict[str, tuple[int, str]] = {
     "tum": (8, "timestamp tx ty tz qx qy qz qw"),
     "kitti": (12, "r11 r12 r13 tx r21 r22 r23 ty r31 r32 r33 tz"),
@@ -309,7 +312,11 @@ def write_kitti(trajectory: Trajectory, path: str | os.PathLike[str]) -> None:
 def _read_rows(path: Path, format: Format) -> tuple[str, np.ndarray, list[int]]:
     """Format, (N, columns) finite numbers and the line number of each row."""
     try:
-        text = path.read_bytes().decode("utf-8-sig")
+        with path.open("rb") as file:  # not all of it: a device never ends
+            data = file.read(LARGEST_FILE + 1)
+        if len(data) > LARGEST_FILE:
+            raise FormatError(f"{path}: more than {LARGEST_FILE} bytes are no trajectory.")
+        text = data.decode("utf-8-sig")
     except UnicodeDecodeError:
         raise FormatError(f"{path}: expected a text file of poses, got binary data.") from None
     except FileNotFoundError:

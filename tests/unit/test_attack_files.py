@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import hybridvo.trajectory
 from hybridvo.cli import _open_standard_streams, main
 from hybridvo.configuration import load_options
 from hybridvo.console import Progress, printable
@@ -357,6 +358,18 @@ def test_a_list_of_files_that_are_not_there_names_one(tmp_path: Path) -> None:
     (root / "rgb.txt").write_text(listed.replace("rgb/", "rgb\\"))  # as Windows writes it
     notices = "\n".join(open_sequence(root).notices)
     assert "there are no image files, such as" in notices and "rgb\\" in notices
+
+
+# evaluate
+
+
+@pytest.mark.skipif(not Path("/dev/zero").exists(), reason="needs a file that never ends")
+def test_evaluate_does_not_read_without_end(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(hybridvo.trajectory, "LARGEST_FILE", 10_000)
+    assert main(["evaluate", "/dev/zero", "/dev/zero"]) == 2
+    assert "/dev/zero: more than 10000 bytes are no trajectory" in capsys.readouterr().err
 
 
 # doctor
