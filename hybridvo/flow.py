@@ -15,6 +15,7 @@ from typing import Any, Protocol
 import cv2
 import numpy as np
 
+from hybridvo.checks import to_numpy
 from hybridvo.errors import InputError
 from hybridvo.types import Frame
 
@@ -53,8 +54,8 @@ TEXTURE_SIDE = 120
 TEXTURE_LEVELS = 1.0
 """Change in grey levels per pixel of that size that is texture."""
 TEXTURE_SHARE = 0.002
-"""Smallest share of the picture with texture across its weakest direction. Real and rendered pictures
-have 0.4 to 0.8, at a tenth of their brightness 0.006 to 0.28; a covered lens and stripes none."""
+"""Smallest share of the picture with texture across its weakest direction. Real and rendered
+pictures have 0.4 to 0.8, at a tenth of their brightness 0.006 to 0.28; a covered lens has none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -291,7 +292,7 @@ def check_field(result: Any, prev: Frame, source: str, is_true: bool = False) ->
         result = result.flow
     if result is None:
         return FlowField(None, source=source, is_true=is_true)
-    array = np.asarray(result)
+    array = to_numpy(result, f"flow ({source})")
     expected = (*prev.camera.shape, 2)
     if array.shape != expected or array.dtype.kind not in "fiu":
         raise InputError(

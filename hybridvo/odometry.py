@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from hybridvo.checks import as_number, as_rigid, as_seed
 from hybridvo.errors import InputError
 from hybridvo.flow import FlowField, FlowProvider, check_field, dis_flow
 from hybridvo.geometry import invert, se3_exp, se3_log
@@ -50,6 +51,8 @@ REGISTRATION_STEPS = 10
 """Most steps under each blur: a start that was wrong by pixels needs more than a pair's."""
 
 
+FARTHEST = 10**6
+"""Frames ahead that may be asked for: matrix powers beyond are noise."""
 FIRST_COVARIANCE = 1e-12 * np.eye(6)
 
 
@@ -87,8 +90,8 @@ class Odometry:
         prepare: compile now rather than at the first pair (see :func:`hybridvo.hybrid.warm_up`).
 
     Raises:
-        InputError: an unknown method or policy, a network that is none or that the method lacks, or
-            a window that the method cannot use.
+        InputError: an unknown method or policy, a network that is none or that the method lacks, a
+            window that the method cannot use, options of another kind, or no seed.
 
     Example:
         >>> import numpy as np
@@ -133,6 +136,14 @@ class Odometry:
             raise InputError(
                 f"Odometry.flow: expected a callable (prev, curr), got {type(flow).__name__}."
             )
+        for name, value, kind in (
+            ("options", options, RefinementOptions),
+            ("photometric", photometric, PhotometricOptions),
+            ("window_options", window_options, WindowOptions),
+        ):
+            if value is not None and not isinstance(value, kind):
+                got = type(value).__name__
+                raise InputError(f"Odometry.{name}: expected {kind.__name__}, got {got}.")
         check_method(method)
         check_polish(polish)
         check_window(window)
@@ -157,7 +168,7 @@ class Odometry:
         self.images = PhotometricMonitor()
         self.policy = policy
         self.options = options or RefinementOptions()
-        self.seed = seed
+        self.seed = as_seed(seed, "Odometry.seed")
         self.history = bool(history)
         self._judge = None
         if method in JUDGED:
@@ -199,7 +210,7 @@ class Odometry:
         Raises:
             InputError: no finite rigid transform.
         """
-        T = _rigid(T_world_cam, "Odometry.set_pose")
+        T = as_rigid(T_world_cam, "Odometry.set_pose")
         anchor = self._anchor
         # the frame that the next pair starts from keeps its place relative to the last pose
         T_anchor = T @ invert(anchor.T_world_last) @ anchor.T_world_cam if anchor.gap else T
@@ -209,7 +220,13 @@ class Odometry:
         self._anchor = replace(anchor, T_world_cam=T_anchor, T_world_last=T, window=window)
 
     def resume(self, anchor: Anchor) -> None:
-        """Go on where another tracker stopped; the steps that follow have the same bytes."""
+        """Go on where another tracker stopped; the steps that follow have the same bytes.
+
+        Raises:
+            InputError: no anchor.
+        """
+        if not isinstance(anchor, Anchor):
+            raise InputError(f"Odometry.resume: expected an Anchor, got {type(anchor).__name__}.")
         self._anchor = anchor
         self.images.restore(anchor.images)
 
@@ -230,7 +247,15 @@ class Odometry:
 
         Returns:
             Constant velocity, with a covariance from how the last motions changed.
+
+        Raises:
+            InputError: no number of frames from 1 to 10^6.
         """
+        if as_number(frames) % 1 or not 1 <= frames <= FARTHEST:
+            raise InputError(
+                f"Odometry.predict: expected a number of frames from 1 to {FARTHEST}, "
+                f"got {frames!r}."
+            )
         return self._anchor.history.predict(frames)
 
     def track(self, frame: Frame, flow: FlowField | np.ndarray | None = None) -> Step:
@@ -384,7 +409,15 @@ class Odometry:
             index: of the frame.
             timestamp: seconds.
             message: why.
+
+        Raises:
+            InputError: a stamp that is not finite, or an index that is no whole number.
         """
+        if as_number(index) % 1 or not np.isfinite(as_number(timestamp)):
+            raise InputError(
+                f"Odometry.skip: expected an index and finite seconds, got {index!r}, "
+                f"{timestamp!r}."
+            )
         anchor = self._anchor
         failed = RelativePose.failed(
             Reason.MISSING_FRAME, message or "the frame cannot be read", self.method
@@ -451,14 +484,3 @@ def _own(frame: Frame) -> Frame:
         depth_variance=copy(frame.depth_variance),
         mask=copy(frame.mask),
     )
-
-
-def _rigid(T: Any, where: str) -> np.ndarray:
-    """(4, 4) float64 copy of a rigid transform, or InputError."""
-    T = np.array(T, dtype=np.float64)
-    if T.shape != (4, 4) or not np.isfinite(T).all():
-        raise InputError(f"{where}: expected a finite (4, 4) transform, got shape {T.shape}.")
-    R = T[:3, :3]
-    if np.abs(R.T @ R - np.eye(3)).max() > 1e-6 or np.linalg.det(R) < 0:
-        raise InputError(f"{where}: expected a rotation in the upper left, got {R.tolist()}.")
-    return T

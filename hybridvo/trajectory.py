@@ -13,6 +13,7 @@ import logging
 import math
 import os
 import secrets
+import stat
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -114,7 +115,8 @@ def _check_timestamps(timestamps: Any) -> np.ndarray:
         index = int(np.argmax(steps <= 0)) + 1
         raise InputError(
             f"Trajectory.timestamps[{index}]: expected strictly increasing stamps, got "
-            f"{stamps[index]!r} after {stamps[index - 1]!r}. Sort the poses and drop duplicates."
+            f"{float(stamps[index])} after {float(stamps[index - 1])}. Sort the poses and drop "
+            f"duplicates."
         )
     return stamps
 
@@ -234,11 +236,34 @@ class Trajectory:
         Args:
             T_new_world: (4, 4) rigid transform from the (scaled) old world into the new one.
             scale: factor on the positions; rotations do not change.
+
+        Raises:
+            InputError: ``T_new_world`` is no rigid transform, or ``scale`` is not finite.
         """
         T = self.T_world_cam.copy()
         T[:, :3, 3] *= scale
-        T = T_new_world @ T
+        T = _check_transforms(np.asarray(T_new_world)[None], "T_new_world", tolerance=1e-6)[0] @ T
         return Trajectory(self.timestamps, T, self.has_timestamps, self.notices)
+
+
+def check_trajectory(value: Any, where: str) -> None:
+    """Refuse what is no trajectory.
+
+    Raises:
+        InputError: says what it is.
+    """
+    if not isinstance(value, Trajectory):
+        raise InputError(f"{where}: expected a Trajectory, got {type(value).__name__}.")
+
+
+def _as_path(path: Any) -> Path:
+    try:
+        text = os.fsdecode(path)
+    except TypeError:
+        raise InputError(f"path: expected a path, got {type(path).__name__}.") from None
+    if "\0" in text:
+        raise InputError(f"path: {text!r} holds a null character.")
+    return Path(text)
 
 
 @contextlib.contextmanager
@@ -249,9 +274,17 @@ def atomic_write(path: str | os.PathLike[str], mode: Literal["w", "wb"] = "w") -
     A symbolic link at ``path`` is replaced, never followed. Text is UTF-8 with Unix line ends.
 
     Raises:
-        OutputError: the file cannot be created, written or renamed; ``path`` is then unchanged.
+        OutputError: the file cannot be created, written or renamed, or ``path`` is a device, a pipe
+            or a socket, which a rename would put an end to; ``path`` is then unchanged.
+        InputError: ``path`` is no path.
     """
-    path = Path(path)
+    path = _as_path(path)
+    try:
+        kind = path.lstat().st_mode
+    except OSError:  # nothing there, or the folder says why below
+        kind = stat.S_IFREG
+    if not (stat.S_ISREG(kind) or stat.S_ISLNK(kind) or stat.S_ISDIR(kind)):
+        raise OutputError(f"{path}: expected a file or a new name, got a device or a pipe.")
     # not tempfile.mkstemp: its files are private (0600), results should follow the umask
     temporary = path.with_name(f".{path.name[:100]}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
     flags = os.O_CREAT | os.O_EXCL | os.O_WRONLY
@@ -280,11 +313,13 @@ def write_tum(trajectory: Trajectory, path: str | os.PathLike[str]) -> None:
 
     Raises:
         OutputError: the file cannot be written; an older file at ``path`` is then unchanged.
+        InputError: no trajectory, or no path.
     """
     # evo is GPL-3.0 and only needed here: imported when used
     from evo.core.trajectory import PoseTrajectory3D
     from evo.tools.file_interface import write_tum_trajectory_file
 
+    check_trajectory(trajectory, "write_tum")
     xyzw = Rotation.from_matrix(trajectory.T_world_cam[:, :3, :3]).as_quat(canonical=True)
     text = io.StringIO()
     write_tum_trajectory_file(
@@ -299,10 +334,12 @@ def write_kitti(trajectory: Trajectory, path: str | os.PathLike[str]) -> None:
 
     Raises:
         OutputError: the file cannot be written; an older file at ``path`` is then unchanged.
+        InputError: no trajectory, or no path.
     """
     from evo.core.trajectory import PosePath3D
     from evo.tools.file_interface import write_kitti_poses_file
 
+    check_trajectory(trajectory, "write_kitti")
     text = io.StringIO()
     write_kitti_poses_file(text, PosePath3D(poses_se3=list(trajectory.T_world_cam)))
     with atomic_write(path) as file:
@@ -390,9 +427,9 @@ def _to_seconds(path: Path, stamps: np.ndarray, lines: list[int]) -> tuple[np.nd
         index = int(np.argmax(steps <= 0)) + 1
         kind = "repeats the one" if steps[index - 1] == 0 else "lies before that"
         raise FormatError(
-            f"{path}:{lines[index]}: timestamp {stamps[index]!r} {kind} of line "
-            f"{lines[index - 1]} ({stamps[index - 1]!r}). Stamps must increase: sort the file and "
-            f"drop duplicates."
+            f"{path}:{lines[index]}: timestamp {float(stamps[index])!r} {kind} of line "
+            f"{lines[index - 1]} ({float(stamps[index - 1])!r}). Stamps must increase: sort the "
+            f"file and drop duplicates."
         )
     return stamps, notices
 
@@ -425,7 +462,7 @@ def read_trajectory(
         raise InputError(f"format: expected auto, {', '.join(_COLUMNS)}, got {format!r}.")
     if axes not in ("auto", "camera", "ned"):
         raise InputError(f"axes: expected auto, camera or ned, got {axes!r}.")
-    path = Path(path)
+    path = _as_path(path)
     name, rows, lines = _read_rows(path, format)
     stamps = np.arange(len(rows), dtype=np.float64)
     notices: list[str] = []

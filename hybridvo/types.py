@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from hybridvo.checks import as_float_image, as_number, to_numpy
 from hybridvo.errors import InputError
 
 if TYPE_CHECKING:
@@ -38,31 +39,6 @@ MAX_PIXELS = 2**28
 """Largest image, in pixels, that a frame or a file header may declare."""
 FOCAL_RANGE = (1e-3, 1e9)
 """Focal lengths in pixels whose inverses and squares single precision can hold."""
-
-
-def _as_float_image(value: Any, name: str, channels: int | None) -> np.ndarray:
-    """Numpy view (or native-endian float32 copy) of an (H, W[, channels]) image of real numbers."""
-    array = np.asarray(value)
-    expected = "(H, W)" if channels is None else f"(H, W, {channels})"
-    if array.ndim == 3 and channels is None and array.shape[2] == 1:
-        array = array[:, :, 0]
-    if array.ndim < 2 or array.shape[2:] != (() if channels is None else (channels,)):
-        raise InputError(f"{name}: expected shape {expected}, got {array.shape}.")
-    if array.dtype.kind != "f":
-        raise InputError(
-            f"{name}: expected a floating-point array, got dtype {array.dtype}. "
-            f"Convert to metres (depth) or pixels (flow) as float32 first."
-        )
-    with np.errstate(over="ignore"):  # beyond float32 is inf, which is invalid
-        return array.astype(np.float32, copy=False)
-
-
-def _number(value: Any) -> float:
-    """A value as float; NaN where it is no number."""
-    try:
-        return float(value)
-    except (TypeError, ValueError, OverflowError):
-        return float("nan")
 
 
 @dataclass(frozen=True)
@@ -89,13 +65,13 @@ class Camera:
     def __post_init__(self) -> None:
         for name in ("fx", "fy", "cx", "cy"):
             value = getattr(self, name)
-            number = _number(value)
+            number = as_number(value)
             if not np.isfinite(number):
                 raise InputError(f"Camera.{name}: expected a finite number, got {value!r}.")
             object.__setattr__(self, name, number)
         for name in ("height", "width"):
             value = getattr(self, name)
-            number = _number(value)
+            number = as_number(value)
             if isinstance(value, bool) or not 0 < number < np.inf or number % 1:
                 raise InputError(f"Camera.{name}: expected a positive integer, got {value!r}.")
             object.__setattr__(self, name, int(number))
@@ -124,9 +100,10 @@ class Camera:
         Raises:
             InputError: not 3x3, not finite, skewed, or with a last row other than (0, 0, 1).
         """
-        K = np.asarray(K, dtype=np.float64)
-        if K.shape != (3, 3) or not np.isfinite(K).all():
+        K = to_numpy(K, "Camera")
+        if K.shape != (3, 3) or K.dtype.kind not in "fiu" or not np.isfinite(K).all():
             raise InputError(f"Camera: expected a finite 3x3 intrinsic matrix, got {K.tolist()}.")
+        K = K.astype(np.float64)
         tolerance = 1e-6 * max(abs(K[0, 0]), abs(K[1, 1]), 1.0)
         if not np.allclose(K[2], (0, 0, 1)) or abs(K[0, 1]) > tolerance or abs(K[1, 0]) > tolerance:
             raise InputError(
@@ -161,7 +138,8 @@ class Frame:
         mask: (H, W) bool, True where pixels may be used, or None.
 
     Raises:
-        InputError: shapes that do not match the camera, wrong dtypes, a stamp that is not finite.
+        InputError: shapes that do not match the camera, wrong dtypes, a stamp that is not finite,
+            an index that is no whole number.
     """
 
     rgb: np.ndarray | None
@@ -176,7 +154,7 @@ class Frame:
         if not isinstance(self.camera, Camera):
             raise InputError(f"Frame.camera: expected a Camera, got {type(self.camera).__name__}.")
         if self.rgb is not None:
-            rgb = np.asarray(self.rgb)
+            rgb = to_numpy(self.rgb, "Frame.rgb")
             if rgb.dtype != np.uint8:
                 raise InputError(f"Frame.rgb: expected uint8 values 0..255, got dtype {rgb.dtype}.")
             if rgb.ndim == 2 or (rgb.ndim == 3 and rgb.shape[2] == 1):
@@ -190,21 +168,24 @@ class Frame:
             object.__setattr__(self, "rgb", rgb)
         for name in ("depth", "depth_variance"):
             if getattr(self, name) is not None:
-                array = _as_float_image(getattr(self, name), f"Frame.{name}", None)
+                array = as_float_image(getattr(self, name), f"Frame.{name}", None)
                 self._check_size(name, array)
                 object.__setattr__(self, name, array)
         if self.mask is not None:
-            mask = np.asarray(self.mask)
+            mask = to_numpy(self.mask, "Frame.mask")
             if mask.dtype != np.bool_ or mask.ndim != 2:
                 raise InputError(
                     f"Frame.mask: expected a boolean (H, W) array, got {mask.dtype} {mask.shape}."
                 )
             self._check_size("mask", mask)
             object.__setattr__(self, "mask", mask)
-        stamp = _number(self.timestamp)
+        stamp = as_number(self.timestamp)
         if not np.isfinite(stamp):
             raise InputError(f"Frame.timestamp: expected finite seconds, got {self.timestamp!r}.")
         object.__setattr__(self, "timestamp", stamp)
+        if as_number(self.index) % 1:
+            raise InputError(f"Frame.index: expected a whole number, got {self.index!r}.")
+        object.__setattr__(self, "index", int(self.index))
 
     def _check_size(self, name: str, array: np.ndarray) -> None:
         if array.shape[:2] != self.camera.shape:
@@ -259,10 +240,10 @@ class FramePair:
             )
         for name, channels in (("flow", 2), ("flow_variance", None)):
             if getattr(self, name) is not None:
-                array = _as_float_image(getattr(self, name), f"FramePair.{name}", channels)
+                array = as_float_image(getattr(self, name), f"FramePair.{name}", channels)
                 self._check(name, array, shape)
         if self.flow_valid is not None:
-            valid = np.asarray(self.flow_valid)
+            valid = to_numpy(self.flow_valid, "FramePair.flow_valid")
             if valid.dtype != np.bool_:
                 raise InputError(f"FramePair.flow_valid: expected bool, got dtype {valid.dtype}.")
             self._check("flow_valid", valid, shape)

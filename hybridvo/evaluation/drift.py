@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from numbers import Real
 from typing import Any, Literal
 
 import numpy as np
@@ -110,7 +111,8 @@ def kitti_drift(
         )
     if not len(lengths) or not all(np.isfinite(length) and length > 0 for length in lengths):
         raise InputError(f"kitti_drift: expected positive lengths in metres, got {lengths!r}.")
-    if isinstance(start_step, bool) or int(start_step) != start_step or start_step < 1:
+    whole = isinstance(start_step, Real) and not isinstance(start_step, bool)
+    if not whole or start_step % 1 or start_step < 1:
         raise InputError(f"kitti_drift: expected start_step >= 1, got {start_step!r}.")
     if averaging not in ("lengths", "segments"):
         raise InputError(f"averaging: expected lengths or segments, got {averaging!r}.")

@@ -8,7 +8,9 @@ here too.
 
 from __future__ import annotations
 
+import inspect
 import os
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -25,7 +27,7 @@ from hybridvo.evaluation.results import (
     Scale,
 )
 from hybridvo.geometry import xyzw_to_wxyz
-from hybridvo.trajectory import Axes, Format, Trajectory, read_trajectory
+from hybridvo.trajectory import Axes, Format, Trajectory, check_trajectory, read_trajectory
 
 __all__ = [
     "AbsoluteError",
@@ -74,9 +76,11 @@ def associate(est: Trajectory, gt: Trajectory, *, max_diff: float | None = None)
             with its neighbour's partner.
 
     Raises:
-        InputError: ``max_diff`` is negative or not finite.
+        InputError: no trajectories, or ``max_diff`` is negative or not finite.
     """
-    if max_diff is not None and not (np.isfinite(max_diff) and max_diff >= 0):
+    check_trajectory(est, "est")
+    check_trajectory(gt, "gt")
+    if max_diff is not None and not (isinstance(max_diff, Real) and 0 <= max_diff < np.inf):
         raise InputError(f"max_diff: expected seconds >= 0, got {max_diff!r}.")
     total = min(len(est), len(gt))
     if not (est.has_timestamps and gt.has_timestamps):
@@ -310,7 +314,7 @@ def rpe(
         InputError: an unknown option, or ``delta`` below 1.
     """
     _check_options(alignment, scale)
-    if isinstance(delta, bool) or int(delta) != delta or delta < 1:
+    if isinstance(delta, bool) or not isinstance(delta, Real) or delta % 1 or delta < 1:
         raise InputError(f"delta: expected a number of frames >= 1, got {delta!r}.")
     match = association or associate(est, gt, max_diff=max_diff)
     reason, factor = match.reason, 1.0
@@ -472,9 +476,12 @@ def evaluate_files(
         InputError: a file that is missing or malformed (the message names file and line), or an
             unknown option.
     """
+    unknown = set(options) - set(inspect.signature(evaluate_trajectories).parameters)
+    if unknown:
+        raise InputError(f"evaluate_files: unknown option {', '.join(sorted(unknown))}.")
     est = read_trajectory(est_path, format_est, axes=axes_est)
     gt = read_trajectory(gt_path, format_gt, axes=axes_gt)
     report = evaluate_trajectories(est, gt, **options)
-    report["estimate"], report["truth"] = os.fspath(est_path), os.fspath(gt_path)
+    report["estimate"], report["truth"] = os.fsdecode(est_path), os.fsdecode(gt_path)
     report["notices"] = [*est.notices, *gt.notices]
     return report

@@ -26,7 +26,7 @@ class Anchor:
 
     Args:
         frame: the last frame that could be read; None before the first one.
-        T_world_cam: (4, 4) its pose.
+        T_world_cam: (4, 4) its pose; read-only.
         T_world_last: (4, 4) pose last handed out: another one than ``T_world_cam`` after frames
             that could not be read.
         history: the motions found so far.
@@ -44,6 +44,12 @@ class Anchor:
     lost: int = 0
     images: dict[str, Any] | None = None
     window: Window | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("T_world_cam", "T_world_last"):
+            own = np.array(getattr(self, name))
+            own.flags.writeable = False
+            object.__setattr__(self, name, own)
 
 
 def dump_anchor(anchor: Anchor, before: Anchor | None = None) -> dict[str, Any]:

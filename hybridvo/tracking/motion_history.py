@@ -59,6 +59,8 @@ class MotionHistory:
             neighbours: whether it follows the last one directly: both are motions over one frame
                 and nothing lies between them.
         """
+        # a step hands its motion out as well: its array may change
+        T_curr_prev = np.array(T_curr_prev)
         if self.T_last is None or not neighbours:
             return MotionHistory(T_curr_prev, self.spread, self.weight, self.changes)
         change = se3_log(T_curr_prev @ invert(self.T_last))
@@ -81,7 +83,7 @@ class MotionHistory:
             return None
         n = int(frames)
         grown = n * (n + 1) * (2 * n + 1) / 6
-        T = np.linalg.matrix_power(self.T_last, n)
+        T = np.array(np.linalg.matrix_power(self.T_last, n))
         if self.spread is None or self.changes < LEAST_CHANGES:
             one = np.diag([UNKNOWN_M**2] * 3 + [UNKNOWN_RAD**2] * 3)
         else:

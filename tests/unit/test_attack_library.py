@@ -4,9 +4,9 @@ What was tried is in ``docs/attack.md``.
 """
 
 import copy
+import os
 import pickle
 import threading
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ from hybridvo.flow import dis_flow
 from hybridvo.geometry import ego_flow, se3_exp
 from hybridvo.odometry import Odometry
 from hybridvo.trajectory import Trajectory, write_tum
-from hybridvo.types import Camera, Frame, FramePair, Reason, State
+from hybridvo.types import Camera, Frame, FramePair, Reason
 
 H, W = 72, 96
 CAMERA = Camera(80.0, 80.0, 47.5, 35.5, H, W)
@@ -88,3 +88,146 @@ def test_a_tracker_can_be_copied_and_sent_to_a_process(duplicate):
     other = duplicate(vo)
     frame = _frame(_picture(1), 1)
     assert np.array_equal(vo.track(frame).T_world_cam, other.track(frame).T_world_cam)
+
+
+def _walk(vo, indices, spoil=()):
+    """Steps over given flow; ``spoil`` are the arrays of each step that the caller overwrites."""
+    steps = []
+    for index in indices:
+        flow = _flow(1.0 + 0.1 * index) if index else None
+        step = vo.track(_frame(_picture(), index), flow)
+        steps.append((step.T_world_cam.copy(), step.covariance.copy()))
+        for name in spoil:
+            getattr(step, name)[...] = 0.0
+    return steps
+
+
+@pytest.mark.parametrize("name", ["T_world_cam", "T_curr_prev", "covariance"])
+def test_the_arrays_of_a_step_belong_to_the_caller(name):
+    """The last motion was kept by reference: a unit conversion in place ended the tracker."""
+    clean = _walk(Odometry(network=None, prepare=False), range(5))
+    spoiled = _walk(Odometry(network=None, prepare=False), range(5), spoil=[name])
+    for (T, covariance), (T_spoiled, covariance_spoiled) in zip(clean, spoiled, strict=True):
+        assert np.array_equal(T, T_spoiled) and np.array_equal(covariance, covariance_spoiled)
+
+
+def test_prediction_and_anchor_are_no_door_into_the_tracker():
+    vo, other = (Odometry(network=None, prepare=False) for _ in range(2))
+    _walk(vo, range(3))
+    _walk(other, range(3))
+    vo.predict().T_curr_prev[...] = 0.0
+    with pytest.raises(ValueError, match="read-only"):
+        vo.anchor.T_world_cam[...] = 0.0
+    assert np.array_equal(_walk(vo, [3])[0][0], _walk(other, [3])[0][0])
+
+
+WRONG_OPTIONS = [
+    {"seed": "x"},
+    {"seed": None},
+    {"seed": -1},
+    {"seed": 1.5},
+    {"seed": True},
+    {"seed": 2**70},
+    {"options": {"cutoff": 3}},
+    {"photometric": "x"},
+    {"window_options": {}},
+]
+
+
+@pytest.mark.parametrize("option", WRONG_OPTIONS, ids=str)
+def test_options_of_another_kind_are_refused_at_the_door(option):
+    with pytest.raises(InputError, match=f"Odometry.{next(iter(option))}"):
+        Odometry(network=None, prepare=False, **option)
+
+
+@pytest.mark.parametrize("frames", [0, -1, 1.5, "x", None, 10**400, float("nan")], ids=str)
+def test_predict_refuses_what_is_no_number_of_frames(frames):
+    with pytest.raises(InputError, match="predict"):
+        Odometry(network=None, prepare=False).predict(frames)
+
+
+BAD_LAST_ROW = np.vstack([np.eye(4)[:3], [0, 0, 1, 1]])
+
+
+@pytest.mark.parametrize("T", ["x", None, BAD_LAST_ROW, np.eye(4) * 1j, np.zeros((4, 4))], ids=str)
+def test_set_pose_refuses_what_is_no_pose(T):
+    with pytest.raises(InputError, match="set_pose"):
+        Odometry(network=None, prepare=False).set_pose(T)
+
+
+def test_resume_and_skip_refuse_what_a_trajectory_could_not_hold():
+    vo = Odometry(network=None, prepare=False)
+    for anchor in (None, "x", {}):
+        with pytest.raises(InputError, match="resume"):
+            vo.resume(anchor)
+    for index, stamp in ((1, float("nan")), ("a", 0.0), (1, "b"), (None, 0.0)):
+        with pytest.raises(InputError, match="skip"):
+            vo.skip(index, stamp)
+
+
+def test_masked_pixels_are_invalid():
+    """The mask of a masked array was dropped: its fill values took part as depth and flow."""
+    depth, flow = _depth(), _flow()
+    hidden = np.zeros((H, W), bool)
+    hidden[:20] = True
+    depth[hidden], flow[hidden] = 9.0, 99.0
+    frame = Frame(None, np.ma.masked_array(depth, hidden), CAMERA)
+    pair = FramePair(frame, frame, np.ma.masked_array(flow, np.stack([hidden] * 2, -1)))
+    assert np.array_equal(np.isnan(pair.prev.depth), hidden)
+    assert np.array_equal(np.isnan(pair.flow).any(-1), hidden)
+
+
+def test_what_is_no_array_is_refused_in_words():
+    torch = pytest.importorskip("torch")
+    frame = _frame()
+    for flow in (torch.zeros(H, W, 2, requires_grad=True), torch.zeros(H, W, 2, device="meta")):
+        with pytest.raises(InputError, match=r"FramePair\.flow"):
+            FramePair(frame, frame, flow)
+    with pytest.raises(InputError, match=r"Frame\.depth"):
+        Frame(None, [[1.0], [1.0, 2.0]], CAMERA)
+    with pytest.raises(InputError, match="3x3"):
+        Camera.from_matrix("K", H, W)
+    vo = Odometry(network=None, prepare=False, flow=lambda prev, curr: (_flow(), None))
+    vo.track(frame)
+    with pytest.raises(InputError, match="flow"):
+        vo.track(frame)
+
+
+@pytest.mark.parametrize("index", ["a", 1.5, None, float("nan")], ids=str)
+def test_an_index_is_a_whole_number(index):
+    with pytest.raises(InputError, match=r"Frame\.index"):
+        Frame(None, _depth(), CAMERA, index=index)
+
+
+def test_a_result_never_replaces_a_device_or_a_pipe(tmp_path):
+    """As root, a trajectory written to /dev/full took the device's place."""
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    path = Trajectory([0.0], [np.eye(4)])
+    with pytest.raises(OutputError, match="pipe"):
+        write_tum(path, pipe)
+    assert pipe.is_fifo() and [p.name for p in tmp_path.iterdir()] == ["pipe"]
+    for nowhere in (None, 3, "a\0b"):
+        with pytest.raises(InputError, match="path"):
+            write_tum(path, nowhere)
+    with pytest.raises(InputError, match="Trajectory"):
+        write_tum([np.eye(4)], tmp_path / "list.txt")
+    with pytest.raises(InputError, match="T_new_world"):
+        path.transformed(None)
+
+
+def test_errors_of_what_is_no_trajectory_are_refused(tmp_path):
+    from hybridvo.evaluation.metrics import evaluate_files, evaluate_trajectories
+
+    path = Trajectory([0.0, 1.0], [np.eye(4)] * 2)
+    for wrong in (None, path.T_world_cam, "x.txt"):
+        with pytest.raises(InputError, match="Trajectory"):
+            evaluate_trajectories(wrong, path)
+        with pytest.raises(InputError, match="Trajectory"):
+            evaluate_trajectories(path, wrong)
+    for option in ({"max_diff": "x"}, {"delta": "x"}, {"delta": float("nan")}, {"start_step": "x"}):
+        with pytest.raises(InputError, match=next(iter(option))):
+            evaluate_trajectories(path, path, **option)
+    write_tum(path, tmp_path / "a.tum")
+    with pytest.raises(InputError, match="foo"):
+        evaluate_files(tmp_path / "a.tum", tmp_path / "a.tum", foo=1)
