@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 
+from hybridvo.pose.covariance import CLUSTERED, FEW_TILES, SIZES, SMALLEST_REST, long_range
 from hybridvo.pose.pixels import Pixels
 from hybridvo.pose.residuals import NormalEquations
 
@@ -21,10 +22,10 @@ def sandwich_covariance(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Sandwich covariance (B, 6, 6), and whether the information is definite (B,).
 
-    As in the numpy refinement. Bread: the Gauss-Newton Hessian less the curvature of the robust
-    weights. Meat: outer products of the scores summed over tiles, so that errors correlated within
-    a tile count as such, with the small-sample factor of a cluster-robust covariance. In float64
-    but for the scores.
+    As in the numpy refinement (:mod:`hybridvo.pose.covariance`): the Gauss-Newton Hessian less the
+    curvature of the robust weights about the outer products of scores summed over overlapping
+    blocks of tiles. What independent errors would give is summed over every pixel here, and stands
+    for the information of the tiles as well. In float64 but for the scores.
     """
     dtype = pixels.depth.dtype
     scores = system.scores
@@ -44,26 +45,59 @@ def sandwich_covariance(
     bread = H - curvature
     sound = torch.linalg.eigvalsh(bread)[:, 0] > 0.2 * torch.linalg.eigvalsh(H)[:, 0]
     bread = torch.where(sound[:, None, None], bread, H)
-    batch, width = scores.shape[0], scores.shape[2] // height
-    image = scores.reshape(batch, 6, height, width)
-    pad = (0, -width % tile, 0, -height % tile)
-    image = torch.nn.functional.pad(image, pad)
-    rows, columns = image.shape[2] // tile, image.shape[3] // tile
-    tiles = image.reshape(batch, 6, rows, tile, columns, tile).sum(dim=(3, 5)).flatten(2).double()
-    tiles = tiles * scaling[:, :, None]
-    clusters = (tiles.abs().amax(dim=1) > 0).sum(dim=1).double()
-    factor = clusters / (clusters - 6).clamp(min=1)
+    tiles, alone = _tiles(scores, height, tile)
+    tiles = tiles * scaling[:, :, None, None]
+    alone = alone * outer.flatten(1)[:, :, None, None]
+    occupied = (alone[:, 0] > 0).flatten(1).sum(dim=1).clamp(min=1).double()
+    independent = alone.sum(dim=(2, 3)).reshape(-1, 6, 6)
+    whole, singular = torch.linalg.inv_ex(independent)
+    whole = torch.where((singular == 0)[:, None, None], whole, torch.zeros_like(whole))
+    meats, inflation = [], []
+    for width, step in SIZES.tolist():
+        share = (step / width) ** 2
+        score, information = (_blocks(value, width, step) for value in (tiles, alone))
+        X = whole[:, None] @ information.transpose(1, 2).reshape(len(H), -1, 6, 6)
+        lost = share * (X * X.transpose(2, 3)).sum(dim=(1, 2, 3)) / 6
+        meat = share * score @ score.transpose(1, 2)
+        meats.append(meat / (1 - lost).clamp(min=SMALLEST_REST)[:, None, None])
+        inflation.append((whole * meats[-1]).sum(dim=(1, 2)) / 6)
+    growth = inflation[2] / inflation[0].clamp(min=1e-30)
+    reach = H.new_tensor(
+        [long_range(g, int(n)) for g, n in zip(growth.tolist(), occupied.tolist(), strict=True)]
+    )[:, None, None]
+    scaled = inflation[1].clamp(min=1)[:, None, None] * independent
+    clustered = CLUSTERED * meats[1] + (1 - CLUSTERED) * scaled
+    extra = (FEW_TILES / occupied - 1).clamp(min=0)[:, None, None]
     inverse = torch.linalg.inv(bread)
-    sandwich = inverse @ (tiles @ tiles.transpose(1, 2)) @ inverse
-    sandwich = (
-        sandwich * torch.where(clusters >= 12, factor, torch.zeros_like(factor))[:, None, None]
-    )
-    model = torch.linalg.inv(H)
-    cautious = (24 / clusters.clamp(min=1)).clamp(min=1)[:, None, None] * (model + sandwich)
-    covariance = torch.where((clusters >= 24)[:, None, None], sandwich, cautious) * outer
+    covariance = inverse @ (reach * clustered + extra * independent) @ inverse
+    # exact data leave no residuals to learn from
+    covariance = (covariance + 0.01 * torch.linalg.inv(H)) * outer
     covariance = 0.5 * (covariance + covariance.transpose(1, 2))
     definite = definite & torch.isfinite(covariance).flatten(1).all(dim=1)
     return torch.where(definite[:, None, None], covariance, unit).to(dtype), definite
+
+
+def _tiles(scores: torch.Tensor, height: int, tile: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Scores of (B, 6, N) pixels summed over tiles (B, 6, rows, columns), and the sums of their
+    outer products (B, 36, rows, columns), in float64.
+    """
+    image = scores.reshape(len(scores), 6, height, -1)
+    image = torch.nn.functional.pad(image, (0, -image.shape[3] % tile, 0, -height % tile))
+    rows, columns = image.shape[2] // tile, image.shape[3] // tile
+    image = image.reshape(-1, 6, rows, tile, columns, tile).permute(0, 2, 4, 1, 3, 5).flatten(4)
+    alone = (image @ image.transpose(3, 4)).double().flatten(3)
+    return image.sum(dim=4).double().permute(0, 3, 1, 2), alone.permute(0, 3, 1, 2)
+
+
+def _blocks(values: torch.Tensor, width: int, step: int) -> torch.Tensor:
+    """(B, C, blocks) sums over blocks of tiles, those that reach over the border included."""
+    pads = []
+    for size in (values.shape[3], values.shape[2]):
+        count = -(-(size + width - step) // step)
+        pads += [width - step, (count - 1) * step + width - (width - step) - size]
+    padded = torch.nn.functional.pad(values, pads)
+    sums = padded.unfold(2, width, step).unfold(3, width, step)
+    return sums.sum(dim=(4, 5)).flatten(2)
 
 
 def _curvature(

@@ -18,10 +18,21 @@ about sqrt(6 x 60) of the full fit's standard deviations away (60 times fewer pi
 is wrong by some 2 % of its length, the statistical error of the curvature."""
 NOISE_PIXELS = 4000
 """Pixels that the final noise estimate looks at."""
+FEW_SAMPLES = 1500
+"""With fewer usable pixels on the coarse grid (a line across the picture leaves 50) noise and
+curvature are averaged over the usable pixels of a finer one."""
 WELL_CONDITIONED = 0.005
 """Ratio of the extreme eigenvalues of the flow's information above which it needs no help."""
 SECOND_DEPTH_GAIN = 0.5
 """The second depth is used where it adds this share of the flow's information in some direction."""
+FEW_TILES = 24
+"""Tiles of the whole picture in which usable pixels lie, below which a covariance cannot be
+trusted: depth errs alike over some 50 px, so that a line across the picture holds ten to twenty
+independent readings for six unknowns (3 of 59 development lines were beyond 3 sigma, one by 7)."""
+DEPTHS_PER_PAIR = 1.32
+"""The two depths of a pair differ by this many times the noise of one: sqrt(2), less what the
+interpolation of the second one averages away (4/9 remains of independent noise)."""
+MIN_DEPTH_VARIANCE = 1e-10
 FLOW_ROUNDING = 2e-5
 """Pixels: single precision at a coordinate of 300."""
 
@@ -50,6 +61,12 @@ class FullFit:
     depth_noise: float
     iterations: int
     uses_second_depth: bool
+    tiles: int
+
+    @property
+    def is_narrow(self) -> bool:
+        """Whether the pixels are too close together to tell how far their errors agree."""
+        return self.tiles < FEW_TILES
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,25 +120,24 @@ def fit_full_grid(
         depth_scale: 1 / typical depth.
         options: of the refinement.
     """
-    rows, columns, _ = grid
-    n = rows * columns
     work = solver.new_work()
     pose = pose.copy()
     tile = tile_size(picture.shape, options.tiles)
     sf, sd = noise_start
     caps = 2.5 * sf, max(2.5 * sd, 0.02)
+    samples, n = _enough_samples(picture, coarse, grid)
     sf, sd, share, iterations, _, spread = solver.polish(
-        coarse, n, picture.K, sf, sd, *caps, options.cutoff, 1, 4, NOISE_PIXELS, pose, work
+        samples, n, picture.K, sf, sd, *caps, options.cutoff, 1, 4, NOISE_PIXELS, pose, work
     )
     noise = np.empty(3, np.float32)
     solver.set_noise(sf, sd, options.cutoff, noise)
     term = None
     if options.second_depth != "off" and pair.curr.depth is not None:
-        sd, term = _depth_term(
-            pair, picture, coarse, grid, pose, sf, sd, noise, tile, depth_scale, options
+        sd, spread, term = _depth_term(
+            pair, picture, coarse, grid, pose, (sf, sd, spread), noise, tile, depth_scale, options
         )
         solver.set_noise(sf, sd, options.cutoff, noise)
-    per_pixel = _curvature(picture, coarse, n, pose, noise)
+    per_pixel = _curvature(picture, samples, n, pose, noise)
     # with the second depth the weak directions are far from where the flow put them
     long = LONG_STEP if term is None else 1.0
     for step in range(options.full_steps + 1):
@@ -140,11 +156,17 @@ def fit_full_grid(
     parallax = picture.K[0] * np.linalg.norm(pose[:, 3]) * depth_scale
     rounding = total[29] * FLOW_ROUNDING**2 / (sf**2 + (parallax * sd) ** 2)
     covariance, eigenvalues, definite = sandwich_covariance(
-        total, curvature[:21], curvature[21:], _centred_scores(tiles, total), depth_scale, rounding
+        total,
+        curvature[:21],
+        curvature[21:],
+        _centred_scores(tiles, total),
+        tiles[..., :21],
+        depth_scale,
+        rounding,
     )
     if definite:
         # what the uncertainty of sd^2 does to the answer, through the correction of the depth
-        slope = _slope_in_depth_variance(picture, coarse, n, pose, sf, sd, options) * total[29]
+        slope = _slope_in_depth_variance(picture, samples, n, pose, sf, sd, options) * total[29]
         newton = symmetric(total[:21] - curvature[:21])
         shift = np.linalg.lstsq(newton, slope, rcond=1e-12)[0] * spread
         covariance += np.outer(shift, shift)
@@ -164,7 +186,42 @@ def fit_full_grid(
         depth_noise=float(sd),
         iterations=int(iterations),
         uses_second_depth=term is not None,
+        tiles=_tiles_used(picture, samples, n, pair.prev.camera.shape, options.tiles),
     )
+
+
+def _tiles_used(
+    picture: Picture, samples: np.ndarray, n: int, shape: tuple[int, int], tiles: int
+) -> int:
+    """Tiles of a picture of ``shape`` that hold one of the usable samples.
+
+    :data:`FEW_TILES` where the picture itself has few.
+    """
+    tile = tile_size(shape, tiles)
+    columns = -(-shape[1] // tile)
+    if shape[0] * shape[1] < 2 * FEW_TILES * tile**2:
+        return FEW_TILES
+    ifx, ify, cx, cy = picture.camera
+    x, y = samples[kernels.XN : kernels.YN + 1, :n][:, samples[kernels.W, :n] > 0]
+    # the rays are of pixel centres: half a pixel keeps the rounding off the border of the tile
+    u = ((x / ifx + (cx + picture.origin[0] + 0.5)) / tile).astype(np.intp)
+    v = ((y / ify + (cy + picture.origin[1] + 0.5)) / tile).astype(np.intp)
+    return int(np.count_nonzero(np.bincount(v * columns + u)))
+
+
+def _enough_samples(
+    picture: Picture, coarse: np.ndarray, grid: tuple[int, int, int]
+) -> tuple[np.ndarray, int]:
+    """The coarse grid and its size or, where few of its pixels are usable, those of a finer one."""
+    rows, columns, stride = grid
+    n = rows * columns
+    usable = np.count_nonzero(coarse[kernels.W, :n] > 0)
+    fine = int(stride * np.sqrt(usable / FEW_SAMPLES))
+    if usable >= FEW_SAMPLES or stride == 1 or fine >= stride:
+        return coarse, n
+    samples, h, w = picture.strided(max(1, fine))
+    samples = np.ascontiguousarray(samples[:, : h * w][:, samples[kernels.W, : h * w] > 0])
+    return samples, samples.shape[1]
 
 
 def _centred_scores(tiles: np.ndarray, total: np.ndarray) -> np.ndarray:
@@ -240,14 +297,18 @@ def _depth_term(
     coarse: np.ndarray,
     grid: tuple[int, int, int],
     pose: np.ndarray,
-    sf: float,
-    sd: float,
+    found: tuple[float, float, float],
     noise: np.ndarray,
     tile: int,
     inverse_depth: float,
     options: RefinementOptions,
-) -> tuple[float, _DepthTerm | None]:
-    """(depth noise, third residual or None): it bounds the one and may add the other."""
+) -> tuple[float, float, _DepthTerm | None]:
+    """(depth noise, standard error of its square, third residual or None).
+
+    ``found`` = (sf, sd, standard error of sd^2) of the flow. The second depth bounds the noise of
+    the first, tells it where the flow cannot, and may add a residual.
+    """
+    sf, sd, spread = found
     rows, columns, stride = grid
     n = rows * columns
     u0, v0 = picture.origin
@@ -261,8 +322,12 @@ def _depth_term(
     solver.robust_weights(coarse, n, pose, picture.K, noise, work, robust)
     sigma, raw = second_depth.depth_scale(coarse, n, log_depth, robust, pose, picture.K, noise)
     if raw <= 0:
-        return sd, None
+        return sd, spread, None
     # var(rz) = sz^2 + h^2 sd^2: with two depths of one sensor sd is about raw / sqrt(2)
+    if sd**2 < 2 * spread:
+        # too little parallax for the flow to tell; errors that both depths share do not show here
+        sd = min(raw / DEPTHS_PER_PAIR, solver.DEPTH_NOISE_CAP)
+        spread = max(sd**2, MIN_DEPTH_VARIANCE)
     sd = min(sd, raw)
     solver.set_noise(sf, sd, options.cutoff, noise)
     flow = np.zeros(kernels.SUMS)
@@ -272,7 +337,7 @@ def _depth_term(
         scaling = np.array([1 / inverse_depth] * 3 + [1.0] * 3)
         eigenvalues = np.linalg.eigvalsh(H_flow * np.outer(scaling, scaling))
         if eigenvalues[0] > WELL_CONDITIONED * eigenvalues[-1]:
-            return sd, None
+            return sd, spread, None
     second_depth.look_up(coarse, n, 1, depth, u0, v0, log_depth)
     coarse_term = _DepthTerm(coarse, log_depth, n, columns, stride, max(sigma, 1e-4))
     # on the full fit the flow has every pixel, the depth every second one of both axes
@@ -286,10 +351,10 @@ def _depth_term(
         except np.linalg.LinAlgError:
             gain = np.inf
         if not gain > SECOND_DEPTH_GAIN:
-            return sd, None
+            return sd, spread, None
     if fine == stride:
-        return sd, coarse_term
+        return sd, spread, coarse_term
     samples, h, w = picture.strided(fine)
     log_depth = np.empty(h * w, np.float32)
     second_depth.look_up(samples, h * w, 1, depth, u0, v0, log_depth)
-    return sd, _DepthTerm(samples, log_depth, h * w, w, fine, max(sigma, 1e-4))
+    return sd, spread, _DepthTerm(samples, log_depth, h * w, w, fine, max(sigma, 1e-4))

@@ -285,6 +285,11 @@ def _status(
         return Status.degraded(
             Reason.DEGENERATE_GEOMETRY, "a direction of the motion is barely determined"
         )
+    if fit.is_narrow:
+        return Status.degraded(
+            Reason.DEGENERATE_GEOMETRY,
+            "the pixels cover too little of the picture to tell how far their errors agree",
+        )
     if share < DOUBTFUL_INLIER_RATIO:
         return Status.degraded(
             Reason.LOW_INLIERS, f"only {100 * share:.0f} % of the pixels follow the motion"

@@ -41,6 +41,11 @@ DEPTH_NOISE_CAP = 0.08
 compromise between motions. The final fit may claim 2.5 times what the search found."""
 DAMPING = 1e-6
 USUAL_DEPTH_NOISE = 0.01
+DOUBTFUL_DEPTH_NOISE = 0.03
+"""Noise of log depth where the flow cannot tell it: what is assumed, and what the standard error of
+its square goes up to (stereo and learned depth; by 0.01 instead the errors of far and of slowly
+moving scenes came out at twice their standard deviation: the slope of the flow in inverse depth is
+shortened by the share of the noise in its variance)."""
 NOISE_PIXELS = 1000
 """Pixels that the noise estimate of the search looks at: flow noise to 2 %."""
 
@@ -370,9 +375,8 @@ def estimate_noise(samples, n, pose, K, sf, sd, sf_cap, sd_cap, rounds, limit):
         vd = max(vd, 1e-10)  # stays estimable in the next round
     if vd < 2.0 * spread:
         # too little parallax to tell: no more than a usual sensor has
-        usual = USUAL_DEPTH_NOISE * USUAL_DEPTH_NOISE
-        vd = min(vd, usual)
-        spread = max(min(spread, usual), vd)
+        vd = min(vd, USUAL_DEPTH_NOISE * USUAL_DEPTH_NOISE)
+        spread = max(min(spread, DOUBTFUL_DEPTH_NOISE * DOUBTFUL_DEPTH_NOISE), vd)
     return math.sqrt(vf), math.sqrt(vd), share * inside / total, spread
 
 
