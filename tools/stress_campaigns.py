@@ -107,9 +107,9 @@ def kills(lab: Lab, count: int, seed: int = 0) -> Figures:
 
 
 def signals(lab: Lab, count: int, seed: int = 0) -> Figures:
-    """SIGINT and SIGTERM at random frames: exit 130, all finished frames kept, resume identical.
+    """SIGTERM, SIGINT, SIGHUP at random frames: exit 130, finished frames kept, resume identical.
 
-    Every third time a second signal follows at once.
+    Every fourth time a second signal follows at once.
     """
     rng = np.random.default_rng(seed)
     names = ("signals", "exit_130", "aborted_by_second", "frames_lost", "locks_left", "identical")
@@ -119,8 +119,8 @@ def signals(lab: Lab, count: int, seed: int = 0) -> Figures:
         fork = Fork(lab.arguments(out), slow=0.003)
         fork.wait_for(int(rng.integers(1, FRAMES - 10)))
         asked = time.monotonic()
-        fork.signal(signal.SIGINT if i % 2 else signal.SIGTERM)
-        if i % 3 == 0:
+        fork.signal((signal.SIGTERM, signal.SIGINT, signal.SIGHUP)[i % 3])
+        if i % 4 == 0:
             fork.signal(signal.SIGINT)
         end = fork.end()
         figures["signals"] += 1

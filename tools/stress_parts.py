@@ -208,6 +208,7 @@ def _be_a_run(
     code = 99
     try:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)  # also under nohup
         null = os.open(os.devnull, os.O_RDWR)
         os.dup2(null, 1)
         os.dup2(stderr, 2)

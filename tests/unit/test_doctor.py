@@ -156,6 +156,18 @@ def test_units_and_exposure_are_named(recorded: Recorded) -> None:
     assert "divide it by 1000" in state_of(diagnose(millimetres), "depth units")["message"]
 
 
+def test_a_scale_that_changes_on_the_way_is_named(recorded: Recorded) -> None:
+    """Five times as deep from frame 6 on: no pair before or after can know, that one does."""
+    blind = replace(recorded, poses=None)
+    report = changed(blind, lambda k, f: replace(f, depth=(5 if k >= 6 else 1) * f.depth), 10)
+    found = state_of(report, "depth from frame to frame")
+    assert found["state"] == "differs" and "frame 5 to the next (times 5)" in found["message"]
+    assert "1 of 9 pairs" in found["message"]
+    whole = changed(blind, lambda k, f: replace(f, depth=5 * f.depth), 4)
+    assert state_of(whole, "depth from frame to frame")["state"] == "agrees"
+    assert state_of(whole, "depth units")["state"] == "not_observable"
+
+
 def test_what_cannot_be_seen_is_left_open(recorded: Recorded) -> None:
     blind = replace(recorded, frames=[replace(f, rgb=None) for f in recorded.frames[:4]])
     report = diagnose(blind)

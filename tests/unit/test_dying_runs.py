@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -32,7 +35,7 @@ def figures(tmp_path_factory: pytest.TempPathFactory) -> dict:
     out = tmp_path_factory.mktemp("stress") / "stress.json"
     names = "kills,signals,full_disk,two_runs,deleted_input,denied"
     command = [sys.executable, str(TOOLS / "stress.py"), "--campaigns", names]
-    counts = ["--counts", "kills=20,signals=2,full_disk=2,two_runs=2,deleted_input=3,denied=1"]
+    counts = ["--counts", "kills=20,signals=3,full_disk=2,two_runs=2,deleted_input=3,denied=1"]
     done = subprocess.run([*command, *counts, "--out", str(out)], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-3000:]
     return json.loads(out.read_text())
@@ -47,7 +50,7 @@ def test_killed_runs_lose_no_frame_and_end_with_the_same_bytes(figures: dict) ->
 
 def test_signals_end_a_run_in_order(figures: dict) -> None:
     signals = figures["signals"]
-    assert signals["signals"] == signals["exit_130"] == signals["identical"] == 2, signals
+    assert signals["signals"] == signals["exit_130"] == signals["identical"] == 3, signals
     assert signals["frames_lost"] == signals["locks_left"] == signals["tracebacks"] == 0, signals
 
 
@@ -77,6 +80,35 @@ def test_what_may_not_be_written(figures: dict) -> None:
     home = denied["read_only_home"]
     assert home == {"exit_code": 0, "identical": True, "files_elsewhere": []}
     assert denied["no_home_at_all"] == {"exit_code": 0, "identical": True}
+
+
+def test_a_closed_terminal_keeps_what_is_finished(tmp_path: Path) -> None:
+    """Not the signal alone: the terminal is gone, and nothing can be written to it any more."""
+    pty = pytest.importorskip("pty")
+    from stress_parts import REFINE, ROOT, command, rows_kept, state, write_walk
+
+    frames = 4000  # 10 s and more: it cannot be through when the terminal closes
+    walk, out = write_walk(tmp_path / "walk", frames, distinct=8), tmp_path / "out"
+    pid, terminal = pty.fork()
+    if pid == 0:
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)  # also under nohup
+        os.environ |= {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+        arguments = command(walk, out, *REFINE[:-1])  # not quiet: with its bar
+        os.execv(sys.executable, [sys.executable, "-m", "hybridvo.cli", *arguments])
+    os.set_blocking(terminal, False)
+    until = time.monotonic() + 120
+    while not (out / PARTIAL).exists() or rows_kept(out) < 5:
+        assert time.monotonic() < until
+        with contextlib.suppress(BlockingIOError, OSError):
+            os.read(terminal, 65536)
+        time.sleep(0.01)
+    os.close(terminal)
+    _, status = os.waitpid(pid, 0)
+    assert os.waitstatus_to_exitcode(status) == 130
+    assert state(out)["state"] == "interrupted"
+    assert 5 <= rows_kept(out) == state(out)["frames_done"] < frames
+    assert not (out / LOCK).exists()
+    assert len((out / "trajectory.tum").read_text().splitlines()) >= rows_kept(out)
 
 
 IDENTITY = {"input_hash": "abc"}

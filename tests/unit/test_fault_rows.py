@@ -159,6 +159,61 @@ def test_f40_out_of_memory_is_one_line_with_a_remedy(dataset, tmp_path, capsys, 
     assert not (out / "run.lock").exists()
 
 
+def _out_of_memory() -> list[Exception]:
+    """As Python, numpy, torch on a CPU and OpenCV say it; the last two from the libraries."""
+    import cv2
+    import torch
+
+    found: list[Exception] = [MemoryError("Unable to allocate 4.00 EiB for an array")]
+    try:
+        torch.empty(2**61, dtype=torch.uint8)
+    except RuntimeError as error:
+        found.append(error)
+    lack = cv2.error("OpenCV(5.0.0) alloc.cpp:73: error: (-4:Insufficient memory) Failed")
+    lack.code = -4
+    return [*found, lack]
+
+
+@pytest.mark.parametrize(
+    "place",
+    [
+        "hybridvo.run.open_sequence",
+        "hybridvo.data.sintel.read_dpt",
+        "hybridvo.odometry.check_field",
+        "hybridvo.odometry._own",
+        "hybridvo.run.write_tum",
+        "hybridvo.run_results.write_csv",
+        "hybridvo.run_results.np.savez",
+        "hybridvo.run.score",
+        "hybridvo.evaluation.plots.plot_trajectories",
+    ],
+)
+def test_f40_memory_may_end_anywhere(dataset, tmp_path, capsys, monkeypatch, place):
+    """One line, no lock, nothing half written; with memory again the results of any other run."""
+    whole = tmp_path / "whole"
+    assert run(walk(dataset), whole, "--flow", "dis") == 0
+    expected = {p.name: p.read_bytes() for p in whole.iterdir() if p.suffix in (".tum", ".npz")}
+    assert len(expected) == 2
+    errors = _out_of_memory()
+    assert len(errors) == 3
+    for number, error in enumerate(errors):
+        out = tmp_path / f"out{number}"
+
+        def exhausted(*_: object, error: Exception = error, **__: object) -> None:
+            raise error
+
+        with monkeypatch.context() as patch:
+            patch.setattr(place, exhausted)
+            assert run(walk(dataset), out, "--flow", "dis") == 2
+        said = capsys.readouterr().err
+        assert said.count("\n") == 1 and "memory" in said and "smaller" in said
+        left = {p.name: p.read_bytes() for p in out.iterdir()} if out.exists() else {}
+        assert "run.lock" not in left and not any(name.endswith(".tmp") for name in left)
+        assert all(left[name] == expected[name] for name in left.keys() & expected.keys())
+        assert run(walk(dataset), out, "--flow", "dis", "--resume") == 0
+        assert all((out / name).read_bytes() == expected[name] for name in expected)
+
+
 def test_f40_torch_has_an_error_of_that_name():
     import torch
 
