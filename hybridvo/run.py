@@ -36,7 +36,15 @@ from hybridvo.hybrid import JUDGED, check_method, weights_hash
 from hybridvo.odometry import Odometry
 from hybridvo.recording import Recording, check_recording
 from hybridvo.run_folder import PARTIAL, RESULTS, Mode, RunFolder
-from hybridvo.run_results import compact, draw, score, summarise, true_trajectory, write_steps
+from hybridvo.run_results import (
+    compact,
+    draw,
+    is_repeated,
+    score,
+    summarise,
+    true_trajectory,
+    write_steps,
+)
 from hybridvo.tracking.anchor import dump_anchor, load_anchor
 from hybridvo.trajectory import Trajectory, write_kitti, write_tum
 from hybridvo.types import Frame, Step
@@ -255,6 +263,7 @@ def _track(
     before = vo.anchor
     provider.field = None
     ratio: float | None = None
+    repeated = False
     try:
         frame = sequence.frame(index)
     except (InputError, OSError) as error:
@@ -267,6 +276,7 @@ def _track(
         step = vo.track(frame)
         ms = 1e3 * (time.perf_counter() - started)
         flow = None if provider.field is None else provider.field.flow
+        repeated = is_repeated(before.frame, frame)
         if before.frame is not None and step.ok:
             ratio = depth_ratio(before.frame, frame, flow, step.T_curr_prev)
         if tape is not None:
@@ -293,6 +303,7 @@ def _track(
         "flow_is_true": field is not None and field.flow is not None and field.is_true,
         "errors": _errors(sequence, before.frame, step),
         "depth_ratio": ratio,
+        "repeated": repeated,
         "window": "+".join(str(e.prev) for e in vo.edges if e.ok and e.kind != "chain"),
         "anchor": dump_anchor(vo.anchor, before),
     }

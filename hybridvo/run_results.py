@@ -15,11 +15,13 @@ from hybridvo.evaluation.metrics import evaluate_trajectories, mean_pair_errors
 from hybridvo.evaluation.report import write_csv
 from hybridvo.geometry import pose_matrix, se3_log
 from hybridvo.trajectory import Trajectory, atomic_write
+from hybridvo.types import Frame
 
 __all__ = [
     "STEP_COLUMNS",
     "compact",
     "draw",
+    "is_repeated",
     "score",
     "summarise",
     "true_trajectory",
@@ -72,8 +74,32 @@ def summarise(
         "depth_source": sequence.depth_source,
         "oracle": _oracles(rows, sequence),
         "ms_per_pair_median": float(np.median(tracked)) if tracked else None,
-        "warnings": [text for text in [depth_step_warning(rows)] if text],
+        "warnings": [text for text in (depth_step_warning(rows), _repeat_warning(rows)) if text],
     }
+
+
+def is_repeated(prev: Frame | None, curr: Frame) -> bool:
+    """Whether a frame has the very picture of the one before, but another depth map.
+
+    A camera that stands still gives no two equal pictures, and a rendered one equal depth as well:
+    a driver has handed out an old picture.
+    """
+    if prev is None or prev.rgb is None or curr.rgb is None:
+        return False
+    if prev.depth is None or curr.depth is None or not np.array_equal(prev.rgb, curr.rgb):
+        return False
+    return not np.array_equal(prev.depth, curr.depth, equal_nan=True)
+
+
+def _repeat_warning(rows: Iterable[Row]) -> str:
+    repeated = [row for row in rows if row["repeated"]]
+    if not repeated:
+        return ""
+    first, more = repeated[0], f", and {len(repeated) - 1} more" if len(repeated) > 1 else ""
+    return (
+        f"frame {first['index']} has the very picture of frame {first['prev_index']}, and another "
+        f"depth map{more}: pictures that are handed out twice stand still where the camera moves"
+    )
 
 
 def score(

@@ -25,8 +25,10 @@ from hybridvo.data.plain_yaml import plain_yaml
 from hybridvo.data.sequence import open_sequence
 from hybridvo.diagnosis import diagnose, diagnosis_text
 from hybridvo.errors import FormatError, InputError
-from hybridvo.evaluation.report import to_json, write_json
+from hybridvo.evaluation.plots import plot_trajectories
+from hybridvo.evaluation.report import to_json, write_csv, write_json
 from hybridvo.run_folder import PARTIAL, STATE, RunFolder
+from hybridvo.trajectory import Trajectory
 from tests.sequences import image, png, write_folder, write_kitti, write_sintel, write_tum
 
 
@@ -180,6 +182,21 @@ def test_no_more_motions_fail_than_there_are(
     assert json.loads((out / STATE).read_text())["summary"]["failed_share"] == 1.0
 
 
+def test_a_picture_that_is_handed_out_twice_is_warned_of(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = own(tmp_path / "s", (0, 1, 2, 3), (0, 1, 2, 3))
+    for a, b in (("0000", "0001"), ("0002", "0003")):
+        (root / "rgb" / f"{b}.png").write_bytes((root / "rgb" / f"{a}.png").read_bytes())
+    # frames 2 and 3 share their depth as well: a rendered camera that stands
+    png(root / "depth" / "0001.png", np.full((24, 32), 2010, np.uint16))
+    words = ("run", "--sequence", str(root), "--method", "identity", "--max-failed", "1")
+    assert main([*words, "--out", str(tmp_path / "out")]) == 0
+    said = capsys.readouterr().err
+    assert "frame 1 has the very picture of frame 0, and another depth map: pictures" in said
+    assert json.loads((tmp_path / "out" / STATE).read_text())["summary"]["warnings"] != []
+
+
 # the command line
 
 
@@ -244,6 +261,15 @@ def test_a_path_that_is_no_utf8_can_be_reported(tmp_path: Path) -> None:
     read = json.loads((tmp_path / "x.json").read_text(encoding="utf-8"))
     assert read == {"path": name, "other": "séq 😀"}
     assert "séq 😀" in to_json("séq 😀")
+    write_csv(tmp_path / "x.csv", [{"message": f"{name}: séq"}])
+    assert (tmp_path / "x.csv").read_text("utf-8") == "message\na\\udcff\\udce9: séq\n"
+
+
+@pytest.mark.parametrize("name", ["$\\frac{$x", "序列\x1b", os.fsdecode(b"a\xff\xe9$")])
+def test_any_name_can_stand_over_the_picture(tmp_path: Path, name: str) -> None:
+    path = Trajectory(np.arange(3.0), np.tile(np.eye(4), (3, 1, 1)))
+    plot_trajectories({"identity": path}, tmp_path / "x.png", title=name)
+    assert (tmp_path / "x.png").read_bytes()[:4] == b"\x89PNG"
 
 
 # settings
@@ -305,6 +331,14 @@ def test_numbers_that_go_on_evenly_are_not_remarked_on(tmp_path: Path) -> None:
     for name, numbers in (("one", (7, 8, 9)), ("ten", (0, 10, 20))):
         notices = "\n".join(open_sequence(own(tmp_path / name, numbers, numbers)).notices)
         assert "jump" not in notices and "left out" not in notices
+
+
+def test_intrinsics_of_another_image_size_are_remarked_on(tmp_path: Path) -> None:
+    root = own(tmp_path, (0, 1), (0, 1))
+    assert not any("principal point" in notice for notice in open_sequence(root).notices)
+    settings = (root / "camera.yaml").read_text()
+    (root / "camera.yaml").write_text(settings.replace("cx: 15.5", "cx: 31.5"))
+    assert any("those of another image size?" in notice for notice in open_sequence(root).notices)
 
 
 @pytest.mark.filterwarnings("error")
