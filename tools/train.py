@@ -92,6 +92,11 @@ def _train(arguments: argparse.Namespace, argv: list[str]) -> int:
         value = getattr(arguments, name)
         if value is not None and not value > 0:
             raise InputError(f"--{name.replace('_', '-')}: expected a value above 0, got {value}.")
+    if arguments.export_count < 1 or arguments.calibrate < 0:  # else said hours later
+        raise InputError(
+            f"expected --export-count >= 1 and --calibrate >= 0, got {arguments.export_count} and "
+            f"{arguments.calibrate}."
+        )
     if arguments.workers < 0:
         raise InputError(f"--workers: expected 0 or more, got {arguments.workers}.")
     if arguments.device not in ("auto", "cpu", "cuda"):

@@ -115,6 +115,7 @@ class FolderSequence(FileSequence):
                 f"{root}: images are {self.width}x{self.height}, camera.yaml says "
                 f"{self._camera.width}x{self._camera.height}. Intrinsics belong to one image size."
             )
+        self._notices += _centre_notice(root.name, self._camera)
         self._undistorter = Undistorter(self._camera, lens) if any(lens) else None
         self._notice_depth_units()
 
@@ -190,6 +191,17 @@ def _read_settings(path: Path) -> dict[str, Any]:
         if key in ("width", "height") and int(value) != value:
             raise FormatError(f"{path}: {key}: expected a whole number of pixels, got {value}.")
     return content
+
+
+def _centre_notice(name: str, camera: Camera) -> list[str]:
+    """Notice of a principal point far from the middle of the picture."""
+    x, y = (camera.cx + 0.5) / camera.width, (camera.cy + 0.5) / camera.height
+    if abs(x - 0.5) < 0.25 and abs(y - 0.5) < 0.25:
+        return []
+    return [
+        f"{name}: the principal point {camera.cx:g} {camera.cy:g} is far from the middle of "
+        f"{camera.width}x{camera.height} pixels: are fx, fy, cx, cy those of another image size?"
+    ]
 
 
 def _distortion(value: Any, path: Path) -> tuple[float, ...]:

@@ -6,6 +6,7 @@ Uses the object interface with the Agg canvas: no window, no pyplot, no global s
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -51,7 +52,7 @@ def _label(name: str, error: AbsoluteError | None) -> str:
 
 
 def _style(axes: Any, title: str, x: str, y: str) -> None:
-    axes.set_title(title, fontsize=10, loc="left")
+    axes.set_title(title, fontsize=10, loc="left", parse_math=False)
     axes.set_xlabel(x, fontsize=9)
     axes.set_ylabel(y, fontsize=9)
     axes.tick_params(labelsize=8)
@@ -158,7 +159,9 @@ def plot_trajectories(
         fontsize=9,
     )
     if title:
-        figure.suptitle(title, fontsize=11)
+        # a folder's name: bytes that are no UTF-8 cannot be drawn, dollars in it are no formula
+        title = title.encode("utf-8", "replace").decode("utf-8")
+        figure.suptitle(title, fontsize=11, parse_math=False)
     _save(figure, path)
 
 
@@ -279,5 +282,6 @@ def _save(figure: Figure, path: Path) -> None:
     """Whole file or none; no date and no version in it: the same input gives the same bytes."""
     metadata = {".png": {"Software": None}, ".pdf": {"CreationDate": None}, ".svg": {"Date": None}}
     kind = path.suffix.lower()
-    with atomic_write(path, "wb") as file:
+    with atomic_write(path, "wb") as file, warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph", UserWarning)  # a name in letters without font
         figure.savefig(file, format=kind[1:], metadata=metadata[kind])

@@ -103,8 +103,8 @@ def write_csv(
         cells = (jsonable(row.get(name)) for name in names)
         # repr, not str(): the same for a float, and explicit that every digit is meant
         writer.writerow([repr(c) if isinstance(c, float) else c for c in cells])
-    with atomic_write(path) as file:
-        file.write(text.getvalue())
+    with atomic_write(path, "wb") as file:  # a message may name a path that is no UTF-8
+        file.write(text.getvalue().encode("utf-8", "backslashreplace"))
 
 
 def _cell(value: Any, spec: str) -> str:
