@@ -29,7 +29,7 @@ from hybridvo.tracking.anchor import Anchor
 from hybridvo.tracking.key_frame import KeyFrame
 from hybridvo.tracking.motion_history import Prediction
 from hybridvo.tracking.pose_graph import Edge
-from hybridvo.tracking.window import Located, Window, WindowOptions, check_window, locate
+from hybridvo.tracking.window import Located, Window, WindowOptions, check_window, corrected, locate
 from hybridvo.trajectory import chain
 from hybridvo.types import Frame, FramePair, Reason, RelativePose, State, Status, Step
 
@@ -295,7 +295,7 @@ class Odometry:
             self._anchor = replace(anchor, T_world_last=T_world_cam, gap=anchor.gap + 1)
             return Step(frame.index, frame.timestamp, T_world_cam.copy(), motion)
         own = _own(frame)
-        window = anchor.window
+        window, jumped = anchor.window, False
         if window is None:
             window = self._first_key(own, T_world_cam)
         else:
@@ -303,17 +303,13 @@ class Odometry:
             window = located.window
             if located.used:
                 T_world_cam = located.T_world_cam
-                motion = motion.replace(
-                    T_curr_prev=invert(T_world_cam) @ anchor.T_world_cam,
-                    covariance=located.covariance,
-                    status=located.status,
-                    terms=(*motion.terms, "window"),
-                )
+                motion = corrected(motion, located, invert(T_world_cam) @ anchor.T_world_cam)
+                jumped = motion.covariance is not located.covariance
         history = anchor.history
         if found.ok:
             # a motion that the key frames contradict is no velocity; theirs is, where it is of
             # this pair alone
-            T = motion.T_curr_prev if not anchor.lost else found.T_curr_prev
+            T = found.T_curr_prev if anchor.lost or jumped else motion.T_curr_prev
             alone = not anchor.gap and not anchor.lost
             if anchor.gap:
                 T = se3_exp(se3_log(T) / (anchor.gap + 1))

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from hybridvo.errors import InputError
-from hybridvo.geometry import invert
+from hybridvo.geometry import invert, se3_log
 from hybridvo.tracking.key_frame import KeyFrame, View, spread_px, static_cells
 from hybridvo.tracking.pose_graph import (
     CHI2_LIMIT,
@@ -28,13 +28,25 @@ from hybridvo.tracking.pose_graph import (
 )
 from hybridvo.types import Frame, Reason, RelativePose, State, Status
 
-__all__ = ["KeyFrame", "Located", "Register", "Window", "WindowOptions", "check_window", "locate"]
+__all__ = [
+    "KeyFrame",
+    "Located",
+    "Register",
+    "Window",
+    "WindowOptions",
+    "check_window",
+    "corrected",
+    "locate",
+]
 
 Register = Callable[["KeyFrame", Frame, np.ndarray, np.ndarray, np.ndarray], RelativePose]
 """(key frame, frame, predicted T_frame_key, its covariance, (H, W) weights) -> motion."""
 
 AS_SURE = 1.5
 """Standard deviations, of the chain's, up to which others may overrule it."""
+CORRECTION_LIMIT = 100.0
+"""Chi-square of ten standard deviations, beyond which a step's motion is no measurement: up to 36
+where the walk holds, 450 and more after a frame of another place (rendered sequences)."""
 NO_MOTION = 1e-12 * np.eye(6)
 
 
@@ -334,6 +346,34 @@ def _joint(edges: list[Edge], key: int) -> np.ndarray:
         return edges[0].covariance
     covariance = np.linalg.inv(information)
     return 0.5 * (covariance + covariance.T)
+
+
+def corrected(motion: RelativePose, located: Located, T_curr_prev: np.ndarray) -> RelativePose:
+    """The motion of a step whose pose comes from the key frames.
+
+    Where it holds a correction of the pose before, which the motion between the two frames
+    contradicts, it is no measurement of that motion: its covariance takes the correction in, and
+    its status says so.
+
+    Args:
+        motion: of the pair.
+        located: the frame's place.
+        T_curr_prev: (4, 4) from the pose before to that place.
+    """
+    covariance, status = located.covariance, located.status
+    between = T_curr_prev @ invert(motion.T_curr_prev)
+    if motion.ok and chi2(between, covariance + motion.covariance) > CORRECTION_LIMIT:
+        jump = se3_log(between)
+        covariance = covariance + np.outer(jump, jump)
+        if status.state is State.OK:
+            status = Status.degraded(
+                Reason.AMBIGUOUS_MOTION,
+                f"corrects the poses before by {np.linalg.norm(jump[:3]):.3g} m, by key frames",
+            )
+    terms = (*motion.terms, "window")
+    return motion.replace(
+        T_curr_prev=T_curr_prev, covariance=covariance, status=status, terms=terms
+    )
 
 
 def _promote(

@@ -13,10 +13,11 @@ import pytest
 
 from hybridvo.errors import InputError, OutputError
 from hybridvo.flow import dis_flow
-from hybridvo.geometry import ego_flow, se3_exp
+from hybridvo.geometry import ego_flow, invert, se3_exp, se3_log
 from hybridvo.odometry import Odometry
+from hybridvo.tracking.window import Located, Window, corrected
 from hybridvo.trajectory import Trajectory, write_tum
-from hybridvo.types import Camera, Frame, FramePair, Reason
+from hybridvo.types import Camera, Frame, FramePair, Reason, RelativePose, State, Status
 
 H, W = 72, 96
 CAMERA = Camera(80.0, 80.0, 47.5, 35.5, H, W)
@@ -231,3 +232,28 @@ def test_errors_of_what_is_no_trajectory_are_refused(tmp_path):
     write_tum(path, tmp_path / "a.tum")
     with pytest.raises(InputError, match="foo"):
         evaluate_files(tmp_path / "a.tum", tmp_path / "a.tum", foo=1)
+
+
+def _located(T, covariance):
+    return Located(Window(), T, covariance, Status(), used=True)
+
+
+def test_a_step_that_corrects_older_poses_is_no_sure_measurement():
+    """After a frame of another place the key frames pulled the pose back: ok, 2962 sigma off."""
+    pair = RelativePose(T_curr_prev=se3_exp(np.full(6, 0.01)), covariance=1e-8 * np.eye(6))
+    jump = np.array([0.6, 0.0, 0.1, 0.0, 0.02, 0.0])
+    T = se3_exp(jump) @ pair.T_curr_prev
+    step = corrected(pair, _located(T, pair.covariance), T)
+    assert step.status.state is State.DEGRADED and "0.608 m" in step.status.message
+    error = se3_log(step.T_curr_prev @ invert(pair.T_curr_prev))
+    # one outer product: the correction is one standard deviation of what is claimed
+    assert error @ np.linalg.solve(step.covariance, error) <= 1.0
+    assert np.array_equal(step.T_curr_prev, T)
+
+
+def test_a_correction_of_drift_stays_a_measurement():
+    pair = RelativePose(T_curr_prev=se3_exp(np.full(6, 0.01)), covariance=1e-8 * np.eye(6))
+    T = se3_exp(np.full(6, 2e-4)) @ pair.T_curr_prev  # chi-square 12
+    step = corrected(pair, _located(T, pair.covariance), T)
+    assert step.status.state is State.OK
+    assert np.array_equal(step.covariance, pair.covariance)
