@@ -12,11 +12,14 @@ import functools
 import hashlib
 import time
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from hybridvo.compilation import compile_once
 from hybridvo.errors import CheckpointError, InputError
+from hybridvo.flow_check import contradiction
 from hybridvo.geometry import ego_flow, se3_exp
 from hybridvo.learned import (
     LEARNED,
@@ -44,6 +47,7 @@ __all__ = [
     "POLISH",
     "LearnedJudge",
     "check_method",
+    "compile_kernels",
     "estimate",
     "shipped_judge",
     "warm_up",
@@ -150,10 +154,14 @@ def estimate(
         'no_flow'
     """
     check_polish(polish)
+    polished = polish == "on" or (polish == "auto" and method == "hybrid")
     if method == "refine" or method in JUDGED:
+        wrong = contradiction(pair) if polished else None
+        if wrong is not None:
+            return RelativePose.failed(Reason.NO_FLOW, wrong, method)
         chosen: Any = (judge or shipped_judge()) if method in JUDGED else default_judge
         found = refine(pair, T_last=T_last, options=options, judge=chosen, seed=seed)
-        if polish == "on" or (polish == "auto" and method == "hybrid"):
+        if polished:
             found = polish_photometric(pair, found, photometric, trust=trust)
         return found.replace(method=method)
     check_method(method)
@@ -328,7 +336,8 @@ def warm_up(method: str = DEFAULT_METHOD, polish: str = "auto") -> float:
     """Pay for the compilation (or the reading of its cache) before the first real frame.
 
     Runs the refinement once on a made pair of each size class. Costs half a minute on the very
-    first call after an installation, half a second after that, and nothing in the same process.
+    first call after an installation, when another process compiles (:func:`compile_kernels`), half
+    a second after that, and nothing in the same process.
 
     Returns:
         Seconds spent.
@@ -338,6 +347,32 @@ def warm_up(method: str = DEFAULT_METHOD, polish: str = "auto") -> float:
         return 0.0
     if method in LEARNED:
         shipped_network(method)
+    compile_kernels(method)
+    _run_kernels(method, polish)
+    return time.perf_counter() - started
+
+
+def compile_kernels(method: str = DEFAULT_METHOD) -> bool:
+    """Have the kernels compiled by another process, so that this one reads what later ones read.
+
+    Code that is compiled in a process differs from the same code out of the cache in the last bits
+    of its sums (:mod:`hybridvo.compilation`): without this, a first run's motions differ by some
+    1e-7 m from those of every later one.
+
+    Args:
+        method: whose kernels; those of ``refine`` are compiled with every one.
+
+    Returns:
+        Whether they are in the cache now; where they cannot be, this process compiles for itself.
+    """
+    name = method if method in JUDGED else "refine"
+    calls = " ".join(f"_run_kernels({n!r}, 'on');" for n in dict.fromkeys(("refine", name)))
+    code = f"from hybridvo.hybrid import _run_kernels; {calls}"
+    return compile_once(code, Path(__file__).resolve().parent / "pose", name)
+
+
+def _run_kernels(method: str, polish: str) -> None:
+    """Call every kernel once, with every type of its arguments."""
     # the second size takes the parallel kernels
     for height, width in ((48, 64), (320, 400)):
         camera = Camera(width, width, (width - 1) / 2, (height - 1) / 2, height, width)
@@ -359,4 +394,3 @@ def warm_up(method: str = DEFAULT_METHOD, polish: str = "auto") -> float:
             rgb = (40 * (2 + np.sin(u / 3.0) + np.cos(v / 2.0)))[..., None].repeat(3, 2)
             seen = replace(frame, rgb=rgb.astype(np.uint8))
             polish_photometric(replace(pair, prev=seen, curr=seen), found)
-    return time.perf_counter() - started

@@ -21,7 +21,6 @@ from typing import Any
 import numpy as np
 
 import hybridvo
-from hybridvo.compilation import compile_once
 from hybridvo.configuration import RunOptions
 from hybridvo.console import Progress, interruptible
 from hybridvo.data.fingerprint import input_hash, input_times
@@ -32,7 +31,7 @@ from hybridvo.evaluation.metrics import pair_errors
 from hybridvo.evaluation.report import write_json
 from hybridvo.flow import FlowField, FlowProvider, dis_flow, fallback, file_flow
 from hybridvo.geometry import invert
-from hybridvo.hybrid import JUDGED, check_method, weights_hash
+from hybridvo.hybrid import JUDGED, check_method, compile_kernels, weights_hash
 from hybridvo.odometry import Odometry
 from hybridvo.recording import Recording, check_recording
 from hybridvo.run_folder import PARTIAL, RESULTS, Mode, RunFolder
@@ -128,7 +127,8 @@ def run(
             f"{sequence.name}: no frames from {options.start} on: there are {len(sequence)}."
         )
     provider = flow_provider(sequence, options)
-    _compile(options.method)
+    if options.method == "refine" or options.method in JUDGED:
+        compile_kernels(options.method)  # before the folder is taken: it may last
     out = Path("runs") / run_name(sequence) if out is None else Path(out)
     _check_outside(out, sequence)
     identity = {
@@ -442,14 +442,6 @@ def flow_provider(sequence: Sequence, options: RunOptions) -> _Recorder:
     if options.flow == "auto" and sequence.has_flow and options.stride == 1:
         return _Recorder(fallback(_tolerant(file_flow(sequence), options.strict), dis))
     return _Recorder(dis)
-
-
-def _compile(method: str) -> None:
-    """Compile in another process, so that a first run has the numbers of the later ones."""
-    if method == "refine" or method in JUDGED:
-        words = " ".join(f"warm_up({name!r}, 'on');" for name in dict.fromkeys(("refine", method)))
-        code = f"from hybridvo.hybrid import warm_up; {words}"
-        compile_once(code, Path(__file__).resolve().parent / "pose", method)
 
 
 def check_device(device: str) -> None:

@@ -32,7 +32,7 @@ IMPORTS: dict[str, set[str]] = {
     "pose": NOUNS | {"geometry", "compilation"},
     "trajectory": NOUNS | {"geometry"},
     "learned": CLASSICAL | {"network"},
-    "hybrid": CLASSICAL | {"network", "learned"},
+    "hybrid": CLASSICAL | {"network", "learned", "compilation"},
     "tracking": CLASSICAL,
     "odometry": CLASSICAL | {"flow", "hybrid", "tracking", "trajectory"},
     "evaluation": NOUNS | {"geometry", "trajectory"},

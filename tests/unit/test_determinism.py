@@ -12,7 +12,7 @@ import numba
 import numpy as np
 import pytest
 
-from hybridvo import compilation
+from hybridvo import compilation, hybrid
 from hybridvo.cli import main
 from hybridvo.geometry import ego_flow, se3_exp
 from hybridvo.hybrid import warm_up
@@ -177,3 +177,22 @@ def test_kernels_are_not_compiled_apart_by_a_frozen_program(
     """There ``sys.executable`` is the program itself: it would start itself again and again."""
     monkeypatch.setattr(sys, "frozen", True, raising=False)
     assert not compilation.compile_once("raise SystemExit(0)", kernel, "k")
+
+
+def test_a_library_user_reads_the_code_that_later_processes_read(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The tracker asks for it as ``hybridvo run`` does; the compiling process asks nobody."""
+    asked = []
+    monkeypatch.setattr(hybrid, "compile_once", lambda *args: asked.append(args) or True)
+    Odometry(method="refine")
+    Odometry(method="refine", prepare=False)
+    Odometry(method="hybrid")
+    assert [(sources.name, name) for _, sources, name in asked] == [
+        ("pose", "refine"),
+        ("pose", "hybrid"),
+    ]
+    assert warm_up("identity") == 0.0 and len(asked) == 2
+    for code, _, _ in asked:
+        exec(compile(code, "child", "exec"), {})
+    assert len(asked) == 2
