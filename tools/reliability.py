@@ -344,14 +344,22 @@ def campaign_part(campaigns: Mapping[str, Any]) -> list[str]:
                 figures, dict
             ):
                 continue
-            plain = [
-                f"{key.replace('_', ' ')} {_short(value)}"
-                for key, value in figures.items()
-                if isinstance(value, int | float | bool) and key != "seconds"
-            ]
-            lines.append(f"- **{file}: {name.replace('_', ' ')}**: {', '.join(plain)}")
+            plain = ", ".join(_plain(figures))
+            lines.append(f"- **{file}: {name.replace('_', ' ')}**: {plain}")
         lines.append("")
     return lines
+
+
+def _plain(figures: Mapping[str, Any], above: str = "") -> list[str]:
+    """Numbers by their names, those of nested figures after the name of what holds them."""
+    found = []
+    for key, value in figures.items():
+        name = f"{above}{key.replace('_', ' ')}"
+        if isinstance(value, Mapping):
+            found += _plain(value, f"{name}: ")
+        elif isinstance(value, int | float | bool) and key != "seconds":
+            found.append(f"{name} {_short(value)}")
+    return found
 
 
 def _short(value: float) -> str:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import json
 import os
 import re
 import shutil
@@ -67,6 +68,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("targets", nargs="*", help="names, default all")
     parser.add_argument("--seconds", type=int, default=20, help="of each target")
     parser.add_argument("--out", default="runs/fuzz", help="folder for findings and new inputs")
+    parser.add_argument("--report", type=Path, help="JSON file of the figures, as they come")
     args = parser.parse_args(argv)
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # forked processes must not share threads
     try:
@@ -82,6 +84,7 @@ def main(argv: list[str] | None = None) -> int:
 
         importlib.import_module("hybridvo.training.options")
     total, found = 0, 0
+    report: dict[str, object] = {"command": ["fuzz.py", *(sys.argv[1:] if argv is None else argv)]}
     print(f"{'target':18} {'executions':>10} {'features':>8} {'cpu s':>6}  findings", flush=True)
     for name in args.targets or targets.TARGETS:
         out = Path(args.out).absolute() / name
@@ -111,6 +114,15 @@ def main(argv: list[str] | None = None) -> int:
         spent = usage.ru_utime + usage.ru_stime
         row = f"{name:18} {executions:10d} {counts[-1][1]:>8} {spent:6.1f}  {', '.join(places)}"
         print(row, flush=True)
+        report[name] = {
+            "executions": executions,
+            "features": int(counts[-1][1]),
+            "cpu_s": round(spent, 1),
+            "findings": len(places),
+        }
+        report["all"] = {"executions": total, "findings": found}
+        if args.report is not None:
+            args.report.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
     print(f"{total} executions, {found} findings")
     return 1 if found else 0
 
