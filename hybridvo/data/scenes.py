@@ -41,6 +41,8 @@ SCENE_KINDS = tuple(_BANDS)
 
 _LAG = 6
 _MIN_DEPTH = 1.2
+MOST_FRAMES = 100_000
+"""Of a scene: an hour at 30 frames a second. Its cameras are drawn at once, in memory."""
 _ATTEMPTS = 200
 
 
@@ -216,7 +218,7 @@ def compose_world(
         seed: not negative; the same seed gives the same world.
         height: pixels.
         width: pixels.
-        frames: at least 2.
+        frames: at least 2, at most :data:`MOST_FRAMES`.
         moving: median share of the pixels on movers; None for the family's own (light 0.3,
             heavy 0.6, pair random).
         zoom: amplitude of a slow change of focal length, relative.
@@ -230,6 +232,8 @@ def compose_world(
                                ("width", width, 8)):  # fmt: skip
         if isinstance(value, bool) or int(value) != value or value < least:
             raise InputError(f"{name}: expected an integer of at least {least}, got {value!r}.")
+    if frames > MOST_FRAMES:
+        raise InputError(f"frames: expected at most {MOST_FRAMES}, got {frames}.")
     if not 0.0 <= zoom <= 0.3:
         raise InputError(f"zoom: expected 0 to 0.3, got {zoom}.")
     low, high = _BANDS[kind]

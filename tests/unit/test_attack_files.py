@@ -406,6 +406,16 @@ def test_evaluate_does_not_read_without_end(
     assert "/dev/zero: more than 10000 bytes are no trajectory" in capsys.readouterr().err
 
 
+# scenes
+
+
+def test_a_scene_of_a_billion_frames_is_refused_before_it_fills_the_memory(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["demo", "--out", str(tmp_path / "demo"), "--frames", "1000000000"]) == 2
+    assert "frames: expected at most 100000" in capsys.readouterr().err
+
+
 # doctor
 
 
