@@ -7,16 +7,19 @@ is, and the motion is fitted there.
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import functools
 import hashlib
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from hybridvo.checks import as_number, as_rigid, as_seed
 from hybridvo.compilation import compile_once
 from hybridvo.errors import CheckpointError, InputError
 from hybridvo.flow_check import contradiction
@@ -145,7 +148,8 @@ def estimate(
         exception and never a value that is not finite.
 
     Raises:
-        InputError: an unknown method, or one that cannot run here; another word for ``polish``.
+        InputError: an unknown method, or one that cannot run here; another word for ``polish``;
+            an argument of another kind.
 
     Example:
         >>> import numpy as np
@@ -153,6 +157,20 @@ def estimate(
         >>> estimate(FramePair(frame, frame, None)).status.reason.value
         'no_flow'
     """
+    if not isinstance(pair, FramePair):
+        raise InputError(f"estimate: expected a FramePair, got {type(pair).__name__}.")
+    seed = as_seed(seed, "estimate.seed")
+    if T_last is not None:
+        T_last = as_rigid(T_last, "estimate.T_last")
+    if not 0 <= as_number(trust) <= 1:
+        raise InputError(f"estimate: expected trust in [0, 1], got {trust!r}.")
+    for name, value, kind in (
+        ("options", options, RefinementOptions),
+        ("photometric", photometric, PhotometricOptions),
+    ):
+        if value is not None and not isinstance(value, kind):
+            got = type(value).__name__
+            raise InputError(f"estimate.{name}: expected {kind.__name__}, got {got}.")
     check_polish(polish)
     polished = polish == "on" or (polish == "auto" and method == "hybrid")
     if method == "refine" or method in JUDGED:
@@ -166,7 +184,8 @@ def estimate(
         return found.replace(method=method)
     check_method(method)
     if method in LEARNED:
-        return _too_little(pair, method) or estimate_learned(pair, method)
+        with _plain_torch():
+            return _too_little(pair, method) or estimate_learned(pair, method)
     from hybridvo.pose.baselines import baselines
 
     return baselines()[method](pair, seed=seed)
@@ -218,7 +237,7 @@ class LearnedJudge:
         """Scores of the motions of the search, and masks for the best, see ``PictureJudge``."""
         import torch
 
-        with torch.inference_mode():
+        with _plain_torch():
             inputs = _judge_inputs(grid, motions, T_last)
             features = self._network.encode(inputs)
             best = features.score.argsort(descending=True, stable=True)[:masks]
@@ -233,8 +252,9 @@ class LearnedJudge:
 
         memory: _Memory = before.memory
         score, hidden = memory.score, memory.hidden
-        best, mask = torch.zeros(0, dtype=torch.int64), np.zeros((0, *before.mask.shape[1:]))
-        with torch.inference_mode():
+        mask = np.zeros((0, *before.mask.shape[1:]))
+        with _plain_torch():
+            best = torch.zeros(0, dtype=torch.int64)
             if len(refits.poses):
                 again = replace(memory.inputs, **_candidates(refits, parents))
                 new = self._network.encode(again, (memory.inputs, memory.features))
@@ -250,7 +270,24 @@ class LearnedJudge:
 
     def propose(self, pair: FramePair) -> Proposal | None:
         """PWVO's motion and where it sees the static world."""
-        return None if self._pixelwise is None else propose_motion(self._pixelwise, pair)
+        if self._pixelwise is None:
+            return None
+        with _plain_torch():
+            return propose_motion(self._pixelwise, pair)
+
+
+@contextlib.contextmanager
+def _plain_torch() -> Iterator[None]:
+    """Inference in float32 on the CPU, whatever the caller set for networks of its own."""
+    import torch
+
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(torch.inference_mode())
+        if torch.is_autocast_enabled("cpu"):
+            stack.enter_context(torch.autocast("cpu", enabled=False))
+        if torch.get_default_device().type != "cpu":
+            stack.enter_context(torch.device("cpu"))
+        yield
 
 
 @dataclass(frozen=True, eq=False)
@@ -282,7 +319,7 @@ def _judge_inputs(grid: Grid, motions: Motions, T_last: np.ndarray | None) -> Ju
         usable=batch(grid.usable),
         log_depth_curr=batch(grid.log_depth_curr),
         K=batch(grid.K),
-        image_width=torch.tensor([float(grid.width)]),
+        image_width=torch.tensor([float(grid.width)], dtype=torch.float32),
         T_last=batch(last[:3].astype(np.float32)),
         has_last=torch.tensor([T_last is not None]),
         **_candidates(motions, np.arange(len(motions.poses))),
