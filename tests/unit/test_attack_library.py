@@ -7,13 +7,17 @@ import copy
 import os
 import pickle
 import threading
+from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
 from hybridvo.errors import InputError, OutputError
 from hybridvo.flow import dis_flow
+from hybridvo.flow_check import contradiction
 from hybridvo.geometry import ego_flow, invert, se3_exp, se3_log
+from hybridvo.hybrid import estimate
 from hybridvo.odometry import Odometry
 from hybridvo.tracking.window import Located, Window, corrected
 from hybridvo.trajectory import Trajectory, write_tum
@@ -257,3 +261,93 @@ def test_a_correction_of_drift_stays_a_measurement():
     step = corrected(pair, _located(T, pair.covariance), T)
     assert step.status.state is State.OK
     assert np.array_equal(step.covariance, pair.covariance)
+
+
+SIZE = (120, 160)
+SEEN = Camera(130.0, 130.0, 79.5, 59.5, *SIZE)
+
+
+def _moving_pair(flow_of=lambda flow: flow, **more):
+    """A picture shifted by (6, 3) px beside its true flow, or a wrong one made of it."""
+    rng = np.random.default_rng(3)
+    wide = cv2.GaussianBlur(rng.uniform(0, 255, (140, 180, 3)), (0, 0), 3)
+    wide = ((wide - wide.min()) / np.ptp(wide) * 255).astype(np.uint8)
+    prev, curr = wide[10:130, 10:170], wide[7:127, 4:164]
+    depth = np.full(SIZE, 3.0, np.float32)
+    flow = np.broadcast_to(np.float32([6.0, 3.0]), (*SIZE, 2))
+    frames = (Frame(np.ascontiguousarray(rgb), depth, SEEN) for rgb in (prev, curr))
+    return FramePair(*frames, np.array(flow_of(flow), np.float32), **more)
+
+
+WRONG_FLOWS = {
+    "negated": lambda flow: -flow,
+    "zero": lambda flow: 0 * flow,
+    "twice": lambda flow: 2.2 * flow,
+    "normalised": lambda flow: flow / [160, 120],
+    "(v, -u)": lambda flow: flow[..., ::-1] * [1, -1],
+}
+
+
+@pytest.mark.parametrize("kind", WRONG_FLOWS)
+def test_a_flow_that_the_pictures_contradict_is_refused(kind):
+    """A wrong sign, unit or order gave ok and a wrong motion at thousands of sigma."""
+    message = contradiction(_moving_pair(WRONG_FLOWS[kind]))
+    assert message is not None and "sign" in message
+    found = estimate(_moving_pair(WRONG_FLOWS[kind]))
+    assert found.status.state is State.FAILED and found.status.reason is Reason.NO_FLOW
+    # what was asked not to look at the pictures does not
+    assert contradiction(_moving_pair(WRONG_FLOWS[kind], flow_source="dis")) is None
+
+
+def test_a_right_flow_is_not_doubted():
+    rng = np.random.default_rng(0)
+    noisy = lambda flow: flow + rng.normal(0, 3, flow.shape)  # noqa: E731
+    holes = lambda flow: np.where(rng.random((*SIZE, 1)) < 0.4, np.nan, flow)  # noqa: E731
+    wrong = lambda flow: np.where(rng.random((*SIZE, 1)) < 0.3, 40.0, flow)  # noqa: E731
+    for kind in (lambda flow: flow, noisy, holes, wrong):
+        assert contradiction(_moving_pair(kind)) is None
+
+
+def test_pictures_that_tell_nothing_contradict_nothing():
+    pair = _moving_pair(WRONG_FLOWS["negated"])
+    black = np.zeros_like(pair.prev.rgb)
+    other = np.random.default_rng(9).integers(0, 255, black.shape, dtype=np.uint8)
+    for rgb in (black, other, pair.prev.rgb, None):
+        assert contradiction(replace(pair, curr=replace(pair.curr, rgb=rgb))) is None
+    tiny = Frame(np.zeros((3, 4, 3), np.uint8), None, Camera(4, 4, 1.5, 1.0, 3, 4))
+    assert contradiction(FramePair(tiny, tiny, np.zeros((3, 4, 2), np.float32))) is None
+
+
+WRONG_ARGUMENTS = [
+    {"seed": "x"},
+    {"seed": 2**70},
+    {"T_last": np.zeros((4, 4))},
+    {"T_last": np.stack([np.eye(4)] * 3)},
+    {"T_last": "x"},
+    {"options": {}},
+    {"photometric": {}},
+    {"trust": "x"},
+    {"trust": float("nan")},
+]
+
+
+@pytest.mark.parametrize("argument", WRONG_ARGUMENTS, ids=str)
+def test_estimate_refuses_arguments_of_another_kind(argument):
+    with pytest.raises(InputError, match=next(iter(argument))):
+        estimate(FramePair(_frame(), _frame(), _flow()), method="refine", **argument)
+    with pytest.raises(InputError, match="FramePair"):
+        estimate((_frame(), _frame(), _flow()))
+
+
+def test_the_callers_torch_settings_do_not_reach_the_judge():
+    """A default dtype of float64, or autocast, ended the hybrid in a traceback."""
+    torch = pytest.importorskip("torch")
+    pair = FramePair(_frame(), _frame(), _flow())
+    expected = estimate(pair).T_curr_prev
+    torch.set_default_dtype(torch.float64)
+    try:
+        assert np.array_equal(estimate(pair).T_curr_prev, expected)
+    finally:
+        torch.set_default_dtype(torch.float32)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert np.array_equal(estimate(pair).T_curr_prev, expected)
