@@ -350,13 +350,13 @@ def campaign_part(campaigns: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-def _plain(figures: Mapping[str, Any], above: str = "") -> list[str]:
-    """Numbers by their names, those of nested figures after the name of what holds them."""
+def _plain(figures: Mapping[str, Any]) -> list[str]:
+    """Numbers by their names, those of nested figures in brackets."""
     found = []
     for key, value in figures.items():
-        name = f"{above}{key.replace('_', ' ')}"
+        name = key.replace("_", " ")
         if isinstance(value, Mapping):
-            found += _plain(value, f"{name}: ")
+            found.append(f"{name} ({', '.join(_plain(value))})")
         elif isinstance(value, int | float | bool) and key != "seconds":
             found.append(f"{name} {_short(value)}")
     return found
