@@ -82,12 +82,12 @@ def contradiction(pair: FramePair) -> str | None:
     seen &= lands & lands_own
     if np.count_nonzero(seen) < LEAST_PIXELS:
         return None
-    given, best, still = (float(np.median(x[seen])) for x in (given, best, still))
-    if given < NO_BETTER * still or still < MUST_MOVE * best + 1:
+    left, least, most = (float(np.median(x[seen])) for x in (given, best, still))
+    if left < NO_BETTER * most or most < MUST_MOVE * least + 1:
         return None
     return (
         f"the flow ({pair.flow_source}) carries the previous picture onto the current one hardly "
-        f"better than standing still ({given:.1f} and {still:.1f} grey levels, {best:.1f} by a "
+        f"better than standing still ({left:.1f} and {most:.1f} grey levels, {least:.1f} by a "
         f"flow of the pictures). Expected pixels, (u, v), from the previous frame to the current "
         f"one: check its sign, its direction, its unit and whose pair it is."
     )
