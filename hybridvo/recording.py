@@ -44,12 +44,24 @@ SINCE_1970 = 1e8
 _logger = logging.getLogger(__name__)
 
 
-def check_recording(path: str | os.PathLike[str]) -> None:
+def check_recording(path: str | os.PathLike[str], *, replace: bool = True) -> None:
     """Refuse what cannot become a recording, before a run is started.
 
+    Args:
+        path: file to write.
+        replace: a file of that name may be replaced, or gone on with.
+
     Raises:
-        InputError: Rerun is not installed, or the name does not end in ``.rrd``.
+        InputError: Rerun is not installed, the name does not end in ``.rrd`` or is that of a
+            folder, or it is there already and ``replace`` is False.
     """
+    if Path(path).is_dir():
+        raise InputError(f"--rrd {os.fspath(path)}: is a folder, expected the name of a file.")
+    if not replace and os.path.lexists(path):
+        raise InputError(
+            f"--rrd {os.fspath(path)}: is there already. Pass --overwrite to replace it, or "
+            f"another name."
+        )
     if Path(path).suffix != ".rrd":
         raise InputError(f"--rrd {os.fspath(path)}: expected a name that ends in .rrd.")
     if find_spec("rerun") is None:

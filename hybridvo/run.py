@@ -119,7 +119,8 @@ def run(
     check_method(options.method)
     check_device(options.device)
     if rrd is not None:
-        check_recording(rrd or RECORDING)
+        # one in the output folder is the folder's affair
+        check_recording(rrd or RECORDING, replace=mode != "new" or not rrd)
     sequence = open_sequence(path, dataset, **({"strict": True} if options.strict else {}))
     frames = range(options.start, min(options.stop or len(sequence), len(sequence)), options.stride)
     if not frames:

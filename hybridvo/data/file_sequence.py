@@ -288,13 +288,22 @@ def sorted_files(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
 
 
 def numbered_files(folder: Path | None, pattern: str) -> dict[int, Path]:
-    """Files whose whole name matches a regular expression, by the number in its first group."""
+    """Files whose whole name matches a regular expression, by the number in its first group.
+
+    Raises:
+        InputError: two files of one number.
+    """
     if folder is None or not folder.is_dir():
         return {}
-    matches = ((re.fullmatch(pattern, path.name), path) for path in folder.iterdir())
-    return {
-        int(match[1]): path for match, path in sorted(matches, key=lambda m: m[1].name) if match
-    }
+    found: dict[int, Path] = {}
+    for path in sorted(folder.iterdir()):
+        if match := re.fullmatch(pattern, path.name):
+            other = found.setdefault(int(match[1]), path)
+            if other is not path:
+                raise InputError(
+                    f"{folder}: {other.name} and {path.name} are two files of one frame. Keep one."
+                )
+    return found
 
 
 def gap_notice(name: str, numbers: Many[int]) -> list[str]:

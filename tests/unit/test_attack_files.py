@@ -27,6 +27,7 @@ from hybridvo.diagnosis import diagnose, diagnosis_text
 from hybridvo.errors import FormatError, InputError
 from hybridvo.evaluation.plots import plot_trajectories
 from hybridvo.evaluation.report import to_json, write_csv, write_json
+from hybridvo.recording import check_recording
 from hybridvo.run_folder import PARTIAL, STATE, RunFolder
 from hybridvo.trajectory import Trajectory
 from tests.sequences import image, png, write_folder, write_kitti, write_sintel, write_tum
@@ -197,6 +198,30 @@ def test_a_picture_that_is_handed_out_twice_is_warned_of(
     assert json.loads((tmp_path / "out" / STATE).read_text())["summary"]["warnings"] != []
 
 
+def test_a_recording_replaces_no_file_without_overwrite(tmp_path: Path) -> None:
+    pytest.importorskip("rerun")
+    mine, folder = tmp_path / "mine.rrd", tmp_path / "folder.rrd"
+    mine.write_text("mine")
+    folder.mkdir()
+    with pytest.raises(InputError, match="is there already"):
+        check_recording(mine, replace=False)
+    with pytest.raises(InputError, match="is a folder"):
+        check_recording(folder)
+    check_recording(mine)
+
+
+@pytest.mark.parametrize(("flag", "code"), [((), 2), (("--overwrite",), 0)])
+def test_a_run_asks_before_it_replaces_a_recording(
+    made: Path, tmp_path: Path, flag: tuple[str, ...], code: int
+) -> None:
+    pytest.importorskip("rerun")
+    mine = tmp_path / "mine.rrd"
+    mine.write_text("mine")
+    words = ("run", "--sequence", str(made), "--method", "identity", "--rrd", str(mine), *flag)
+    assert cli(*words, "--out", str(tmp_path / "out")) == code
+    assert (mine.read_bytes() == b"mine") == (code == 2)
+
+
 # the command line
 
 
@@ -306,6 +331,13 @@ def test_two_files_of_one_frame_are_refused(made: Path) -> None:
     other.write_bytes(first.read_bytes())
     with pytest.raises(InputError, match="two files of one frame"):
         open_sequence(made)
+
+
+def test_two_files_of_one_number_are_refused(tmp_path: Path) -> None:
+    root = write_sintel(tmp_path).path
+    (root / "frame_2.png").write_bytes((root / "frame_0002.png").read_bytes())
+    with pytest.raises(InputError, match=r"frame_0002\.png and frame_2\.png are two files"):
+        open_sequence(root)
 
 
 def own(root: Path, images: tuple[int, ...], depths: tuple[int, ...]) -> Path:
