@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from hybridvo.checks import to_numpy
 from hybridvo.errors import InputError
 from hybridvo.types import Camera
 
@@ -188,9 +189,15 @@ def to_gtsam_covariance(covariance: np.ndarray) -> np.ndarray:
     Ours is of ``Exp(d) T_curr_prev``, d = (translation, rotation). Its inverse is
     ``T_prev_curr Exp(-d)``: the same covariance, now of a right perturbation, which is GTSAM's
     side. Only the order changes, to (rotation, translation).
+
+    Raises:
+        InputError: another shape than (6, 6).
     """
+    covariance = to_numpy(covariance, "to_gtsam_covariance")
+    if covariance.shape != (6, 6):
+        raise InputError(f"to_gtsam_covariance: expected shape (6, 6), got {covariance.shape}.")
     order = [3, 4, 5, 0, 1, 2]
-    return np.asarray(covariance)[np.ix_(order, order)]
+    return covariance[np.ix_(order, order)]
 
 
 def pose_matrix(pose: np.ndarray) -> np.ndarray:

@@ -16,7 +16,7 @@ import pytest
 from hybridvo.errors import InputError, OutputError
 from hybridvo.flow import dis_flow
 from hybridvo.flow_check import contradiction
-from hybridvo.geometry import ego_flow, invert, se3_exp, se3_log
+from hybridvo.geometry import ego_flow, invert, se3_exp, se3_log, to_gtsam_covariance
 from hybridvo.hybrid import estimate
 from hybridvo.odometry import Odometry
 from hybridvo.tracking.window import Located, Window, corrected
@@ -351,3 +351,9 @@ def test_the_callers_torch_settings_do_not_reach_the_judge():
         torch.set_default_dtype(torch.float32)
     with torch.autocast("cpu", dtype=torch.bfloat16):
         assert np.array_equal(estimate(pair).T_curr_prev, expected)
+
+
+@pytest.mark.parametrize("wrong", [None, np.eye(4), "x"], ids=str)
+def test_a_covariance_for_gtsam_has_six_rows(wrong):
+    with pytest.raises(InputError, match="to_gtsam_covariance"):
+        to_gtsam_covariance(wrong)
