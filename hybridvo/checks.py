@@ -11,7 +11,8 @@ from hybridvo.errors import InputError
 
 __all__ = ["as_float_image", "as_number", "as_rigid", "as_seed", "to_numpy"]
 
-LARGEST_SEED = 2**63 - 1
+LARGEST_SEED = 2**31 - 1
+"""Every generator that is seeded takes as much."""
 
 
 def to_numpy(value: Any, name: str) -> np.ndarray:
@@ -61,11 +62,11 @@ def as_seed(seed: Any, where: str) -> int:
     """A seed that every generator takes.
 
     Raises:
-        InputError: no whole number from 0 to 2^63 - 1.
+        InputError: no whole number from 0 to 2^31 - 1.
     """
     whole = isinstance(seed, Integral) and not isinstance(seed, bool)
     if not whole or not 0 <= seed <= LARGEST_SEED:
-        raise InputError(f"{where}: expected a whole number from 0 to 2^63 - 1, got {seed!r}.")
+        raise InputError(f"{where}: expected a whole number from 0 to 2^31 - 1, got {seed!r}.")
     return int(seed)
 
 

@@ -163,7 +163,8 @@ def compare(
 def _plan(options: ComparisonOptions) -> _Plan:
     """Open every sequence once, before the first hour is spent."""
     check_device(options.device)
-    RunOptions(flow=options.flow, start=options.start, stop=options.stop, stride=options.stride)
+    wanted = {name: getattr(options, name) for name in ("flow", "start", "stop", "stride", "seed")}
+    RunOptions(**wanted)
     methods, missing = chosen_methods(options.methods)
     paths = [path for given in options.sequences for path in expand(given, options.dataset)]
     opened = [open_sequence(path, options.dataset) for path in paths]

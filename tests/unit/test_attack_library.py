@@ -357,3 +357,13 @@ def test_the_callers_torch_settings_do_not_reach_the_judge():
 def test_a_covariance_for_gtsam_has_six_rows(wrong):
     with pytest.raises(InputError, match="to_gtsam_covariance"):
         to_gtsam_covariance(wrong)
+
+
+@pytest.mark.parametrize("seed", [-1, 2**70])
+def test_a_comparison_refuses_a_seed_before_it_makes_a_folder(tmp_path, seed):
+    from hybridvo.comparison.runner import ComparisonOptions, compare
+
+    options = ComparisonOptions(("nowhere",), methods=("identity",), seed=seed)
+    with pytest.raises(InputError, match="seed"):
+        compare(options, tmp_path / "out", quiet=True)
+    assert not (tmp_path / "out").exists()
