@@ -51,7 +51,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     add("--threads", type=int, help="threads of torch; by default torch's own choice")
     add("--workers", type=int, default=0, help="processes that draw samples (0: this one)")
     add("--device", default="auto", help="auto, cpu or cuda")
-    add("--init", type=Path, metavar="FILE", help="start from these weights, of the same shapes")
+    add("--init", type=Path, metavar="FILE", help="start from these weights: a file, or pwvo")
     add("--overwrite", action="store_true", help="start anew although --out has a checkpoint")
     add("--export", type=Path, metavar="FILE", help="write weights for users when done (float16)")
     add("--calibrate", type=int, default=0, metavar="N", help="shift s by N development pairs")
@@ -131,7 +131,7 @@ def _train(arguments: argparse.Namespace, argv: list[str]) -> int:
         trainer.resume(checkpoint)
         _say(trainer.rank, f"resumed {checkpoint} at update {trainer.step}")
     elif arguments.init is not None:
-        trainer.start_from(arguments.init)
+        trainer.start_from(_weights(arguments.init))
         _say(trainer.rank, f"started from the weights of {arguments.init}")
     elif arguments.no_train:
         raise InputError(f"{checkpoint}: --no-train needs the checkpoint of a run.")
@@ -231,6 +231,13 @@ def _export(trainer: Any, arguments: argparse.Namespace, record: dict[str, Any])
     text = json.dumps(card, indent=1, sort_keys=True) + "\n"
     path.with_suffix(".json").write_text(text, encoding="utf-8")
     sys.stdout.write(json.dumps({"file": str(path), "held_out": card["held_out"]}, indent=2) + "\n")
+
+
+def _weights(named: Path) -> Path:
+    """The file of weights that --init names: a path, or the name of shipped ones."""
+    from hybridvo.network.weights import pretrained, pretrained_names
+
+    return pretrained(str(named)) if str(named) in pretrained_names() else named
 
 
 def _widest(options: Any) -> int:

@@ -58,10 +58,25 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     return parser.parse_args(argv)
 
 
+def _make_folder(path: Path) -> None:
+    from hybridvo.errors import OutputError
+
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{path}: cannot make the folder: {error.strerror or error}.") from error
+
+
 def _make(arguments: argparse.Namespace) -> int:
+    from hybridvo.errors import InputError
     from hybridvo.training.judge_data import PER_SHARD, write_shard
 
-    arguments.data.mkdir(parents=True, exist_ok=True)
+    if arguments.first_seed < 0 or arguments.seeds < 1:
+        raise InputError(
+            f"expected --first-seed >= 0 and --seeds >= 1, got {arguments.first_seed} and "
+            f"{arguments.seeds}."
+        )
+    _make_folder(arguments.data)
     last = arguments.first_seed + arguments.seeds
     for seed in range(arguments.first_seed, last, PER_SHARD):
         count = write_shard(arguments.data, seed)
@@ -76,7 +91,7 @@ def _trainer(arguments: argparse.Namespace, data: Path):
     options = build_options(
         JudgeTrainingOptions, read_yaml(arguments.config), str(arguments.config)
     )
-    arguments.out.mkdir(parents=True, exist_ok=True)
+    _make_folder(arguments.out)
     return JudgeTrainer(options, data, arguments.out)
 
 

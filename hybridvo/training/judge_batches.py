@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from hybridvo.errors import FormatError
 from hybridvo.network.judge import JudgeInputs, JudgeOutput
 from hybridvo.pose import kernels, search
 from hybridvo.pose.coarse import fit_in_mask
@@ -84,6 +86,22 @@ def _collate(p: dict[str, np.ndarray]) -> PictureBatch:
     )
 
 
+def _read_shard(path: Path) -> dict[str, np.ndarray]:
+    """Arrays of a shard.
+
+    Raises:
+        FormatError: a file that is none.
+    """
+    try:
+        with np.load(path) as file:
+            arrays = dict(file)
+    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
+        raise FormatError(f"{path}: not a shard of pictures ({error}).") from None
+    if "count" not in arrays:
+        raise FormatError(f"{path}: not a shard of pictures (no array 'count').")
+    return arrays
+
+
 def read_batches(
     files: list[Path], batch_size: int, rng: np.random.Generator | None
 ) -> Iterator[PictureBatch]:
@@ -94,7 +112,7 @@ def read_batches(
     jobs = []
     pictures: dict[str, dict[str, np.ndarray]] = {}
     for shape, members in by_shape.items():
-        loaded = [dict(np.load(member)) for member in members]
+        loaded = [_read_shard(member) for member in members]
         pictures[shape] = {key: np.concatenate([x[key] for x in loaded]) for key in loaded[0]}
         order = np.arange(len(pictures[shape]["count"]))
         if rng is not None:
