@@ -78,26 +78,28 @@ def main(argv: list[str] | None = None) -> int:
     except SystemExit as end:
         return int(end.code or 0)
     from hybridvo.comparison.runner import ComparisonOptions, WorkerError, compare
-    from hybridvo.errors import HybridVOError, LockedError, OutputError
+    from hybridvo.errors import HybridVOError, InputError, LockedError, OutputError
 
     given = sys.argv[1:] if argv is None else argv
-    options = ComparisonOptions(
-        sequences=tuple(args.sequence),
-        dataset=args.dataset,
-        methods=tuple(name.strip() for name in args.methods.split(",") if name.strip()),
-        flow=args.flow,
-        start=args.start,
-        stop=args.stop,
-        stride=args.stride,
-        seed=args.seed,
-        protocol=args.protocol,
-        device=args.device,
-        jobs=args.jobs,
-        scheduler=args.scheduler,
-        worst=args.worst,
-    )
     mode = "overwrite" if args.overwrite else "resume" if args.resume else "new"
     try:
+        if args.maps < 0:
+            raise InputError(f"--maps: expected at least 0, got {args.maps}.")
+        options = ComparisonOptions(
+            sequences=tuple(args.sequence),
+            dataset=args.dataset,
+            methods=tuple(name.strip() for name in args.methods.split(",") if name.strip()),
+            flow=args.flow,
+            start=args.start,
+            stop=args.stop,
+            stride=args.stride,
+            seed=args.seed,
+            protocol=args.protocol,
+            device=args.device,
+            jobs=args.jobs,
+            scheduler=args.scheduler,
+            worst=args.worst,
+        )
         written = compare(
             options,
             args.out,

@@ -49,6 +49,9 @@ class ComparisonOptions:
         seed: of everything drawn at random. protocol: of Sintel, or None. device: see RunOptions.
         jobs, scheduler: see :func:`hybridvo.comparison.executors.open_workers`.
         worst: pairs shown for each method and flow.
+
+    Raises:
+        InputError: ``jobs`` below 1 or ``worst`` below 0.
     """
 
     sequences: tuple[str, ...]
@@ -64,6 +67,11 @@ class ComparisonOptions:
     jobs: int = 1
     scheduler: str | None = None
     worst: int = 3
+
+    def __post_init__(self) -> None:
+        for name, least in (("jobs", 1), ("worst", 0)):
+            if getattr(self, name) < least:
+                raise InputError(f"--{name}: expected at least {least}, got {getattr(self, name)}.")
 
 
 @dataclass

@@ -367,3 +367,12 @@ def test_a_comparison_refuses_a_seed_before_it_makes_a_folder(tmp_path, seed):
     with pytest.raises(InputError, match="seed"):
         compare(options, tmp_path / "out", quiet=True)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("option", [{"jobs": 0}, {"worst": -1}], ids=str)
+def test_a_comparison_refuses_counts_that_cannot_be_meant(option):
+    """``--worst -1`` meant all but one, ``--jobs 0`` left a folder behind."""
+    from hybridvo.comparison.runner import ComparisonOptions
+
+    with pytest.raises(InputError, match=f"--{next(iter(option))}"):
+        ComparisonOptions(("nowhere",), **option)
