@@ -277,7 +277,7 @@ def _track(
         step = vo.track(frame)
         ms = 1e3 * (time.perf_counter() - started)
         flow = None if provider.field is None else provider.field.flow
-        repeated = is_repeated(before.frame, frame)
+        repeated = step.ok and is_repeated(before.frame, frame)
         if before.frame is not None and step.ok:
             ratio = depth_ratio(before.frame, frame, flow, step.T_curr_prev)
         if tape is not None:
