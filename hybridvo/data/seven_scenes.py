@@ -81,7 +81,8 @@ class SevenScenesSequence(FileSequence):
         if camera is None and (self.height, self.width) != (480, 640):
             raise InputError(
                 f"{root}: images are {self.width}x{self.height}, 7-Scenes ships 640x480. "
-                f"Pass camera=Camera(fx, fy, cx, cy, {self.height}, {self.width})."
+                f"Pass camera=Camera(fx, fy, cx, cy, {self.height}, {self.width}); on the command "
+                f"line, describe it as a folder with camera.yaml."
             )
         self._camera = camera or Camera(585.0, 585.0, 320.0, 240.0, 480, 640)
         self._notice_depth_units()

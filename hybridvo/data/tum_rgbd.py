@@ -170,7 +170,7 @@ class TumSequence(FileSequence):
             self._notices.append(
                 f"{self.name}: camera {known.fx} {known.fy} {known.cx} {known.cy} (fx fy cx cy) "
                 f"is assumed: the folder name says neither fr1, fr2, fr3 nor Bonn. "
-                f"Pass camera=... if it is another one."
+                f"Pass camera=... if it is another one (command line: a folder with camera.yaml)."
             )
         if "bonn" in name and self.poses is not None:
             self._notices.append(
@@ -181,7 +181,8 @@ class TumSequence(FileSequence):
         if (self.height, self.width) != (480, 640):
             raise InputError(
                 f"{self.root}: images are {self.width}x{self.height}, the known calibration is for "
-                f"640x480. Pass camera=Camera(fx, fy, cx, cy, {self.height}, {self.width})."
+                f"640x480. Pass camera=Camera(fx, fy, cx, cy, {self.height}, {self.width}); "
+                f"on the command line, describe it as a folder with camera.yaml."
             )
         lens = known.distortion if distortion is None else tuple(distortion)
         return calibrated, lens
