@@ -30,7 +30,8 @@ COUNTS = {
     "streams": 1,
     "determinism": 1,
     "long_run": 20000,
-    "long_recording": 5000,
+    "long_recording": 10000,
+    "long_default": 20000,
 }
 """Campaign -> how often, or over how many frames, at scale 1."""
 
@@ -92,10 +93,9 @@ def campaigns(where: Path, names: list[str], args: argparse.Namespace) -> Any:
     for name in names:
         count = args.counts.get(name, max(1, round(COUNTS[name] * args.scale)))
         started = time.perf_counter()
-        if name in ("long_run", "long_recording"):
-            figures = dying.long_run(
-                where / name, max(count, 200), args.seed, rrd=name == "long_recording"
-            )
+        if name.startswith("long_"):
+            kind = name.removeprefix("long_")
+            figures = dying.long_run(where / name, max(count, 200), args.seed, kind)
         else:
             lab = lab or dying.Lab(where)
             act: Callable[..., dict[str, Any]] = getattr(

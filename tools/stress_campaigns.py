@@ -28,6 +28,7 @@ from stress_parts import (
     hybridvo,
     rows_kept,
     state,
+    write_rendered_walk,
     write_walk,
 )
 
@@ -260,13 +261,20 @@ def deleted_input(lab: Lab, count: int, seed: int = 0) -> Figures:
     return figures
 
 
-def long_run(where: Path, frames: int, seed: int = 0, rrd: bool = False) -> Figures:
-    """Memory and open files of one run over many frames, sampled from outside."""
+def long_run(where: Path, frames: int, seed: int = 0, kind: str = "run") -> Figures:
+    """Memory and open files of one run over many frames, sampled from outside.
+
+    ``run``: the classical method on flow from files; ``recording``: the same with ``--rrd``;
+    ``default``: all that ``hybridvo run`` does where nothing is said (judge, DIS, polish, window).
+    """
     import psutil
 
-    walk = write_walk(where / "walk", frames, pictures=rrd)
     out = where / "out"
-    arguments = command(walk, out, *REFINE, *(["--rrd"] if rrd else []))
+    if kind == "default":
+        arguments = command(write_rendered_walk(where / "walk", frames), out, "-q")
+    else:
+        walk = write_walk(where / "walk", frames, pictures=kind == "recording")
+        arguments = command(walk, out, *REFINE, *(["--rrd"] if kind == "recording" else []))
     environment = os.environ | ONE_THREAD | {"PYTHONPATH": str(Path(__file__).parents[1])}
     child = subprocess.Popen(
         [sys.executable, "-m", "hybridvo.cli", *arguments],

@@ -86,6 +86,43 @@ def write_walk(
     return root
 
 
+def write_rendered_walk(
+    root: Path, frames: int, *, height: int = 96, width: int = 128, distinct: int = 30
+) -> Path:
+    """The same with rendered pictures and depth, and no flow: the camera goes to and fro.
+
+    Beyond ``distinct`` frames the files are links to the first ones, in the order of the way back
+    and forth, so that neighbours always are neighbours.
+    """
+    import cv2
+
+    from hybridvo.data.synthetic import make_scene
+    from hybridvo.trajectory import Trajectory, write_tum
+
+    distinct = min(distinct, frames)
+    scene = make_scene("light", 404, height=height, width=width, frames=distinct)
+    for kind in ("rgb", "depth"):
+        (root / kind).mkdir(parents=True, exist_ok=True)
+    camera = scene.camera(0)
+    lines = [f"{name}: {getattr(camera, name)}\n" for name in ("fx", "fy", "cx", "cy")]
+    (root / "camera.yaml").write_text(f"{''.join(lines)}width: {width}\nheight: {height}\n")
+    poses = []
+    for i in range(frames):
+        k = distinct - 1 - abs(i % max(2 * distinct - 2, 1) - (distinct - 1))
+        poses.append(scene.T_world_cam[k])
+        picture, depth = (root / "rgb" / f"{i:06d}.png", root / "depth" / f"{i:06d}.npy")
+        if i < distinct:
+            found = scene.render(i)
+            cv2.imwrite(str(picture), np.ascontiguousarray(found.rgb[..., ::-1]))
+            np.save(depth, found.depth)
+            continue
+        os.link(root / "rgb" / f"{k:06d}.png", picture)
+        os.link(root / "depth" / f"{k:06d}.npy", depth)
+    T = np.linalg.inv(poses[0]) @ np.stack(poses)
+    write_tum(Trajectory(np.arange(frames) / 30, T), root / "poses.txt")
+    return root
+
+
 def content(out: Path) -> dict[str, Any]:
     """Results of a run but for the times in them; names of all its files."""
     names = sorted(path.name for path in out.iterdir()) if out.is_dir() else []
