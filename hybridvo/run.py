@@ -176,12 +176,12 @@ def run(
 
 
 def _check_outside(out: Path, sequence: Sequence) -> None:
-    """Refuse to write among the pictures of the sequence: the next run would read what is drawn."""
-    pictures = (".png", ".jpg", ".jpeg")
-    folders = {path.parent for path in sequence.files() if path.suffix.lower() in pictures}
+    """Refuse to write among the frames of the sequence: the next run would read what is drawn."""
+    frames = (".png", ".jpg", ".jpeg", ".npy", ".dpt", ".flo")
+    folders = {path.parent for path in sequence.files() if path.suffix.lower() in frames}
     if out.resolve() in {folder.resolve() for folder in folders}:
         raise InputError(
-            f"{out}: holds pictures of the sequence, and results among them would be taken for "
+            f"{out}: holds frames of the sequence, and results among them would be taken for "
             f"input. Choose another --out."
         )
 

@@ -150,12 +150,13 @@ def cli(*words: str) -> int:
     return main([*words, "-q"])
 
 
-def test_results_are_not_written_among_the_pictures(
-    made: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("folder", ["rgb", "depth", "flow"])
+def test_results_are_not_written_among_the_frames(
+    made: Path, folder: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = sorted(made.rglob("*"))
     words = ("run", "--sequence", str(made), "--method", "identity", "--out")
-    assert cli(*words, str(made / "rgb")) == 2
+    assert cli(*words, str(made / folder)) == 2
     assert "would be taken for input" in capsys.readouterr().err
     assert sorted(made.rglob("*")) == before
 
