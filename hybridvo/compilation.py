@@ -9,6 +9,7 @@ of its own (:func:`compile_once`), and every run reads the same code.
 from __future__ import annotations
 
 import contextlib
+import functools
 import hashlib
 import logging
 import os
@@ -50,12 +51,25 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
         if hasattr(compiled, "stats"):  # not where numba is switched off
             _cached.append(compiled)
         cache = getattr(compiled, "_cache", None)
+        if hasattr(getattr(cache, "_cache_file", None), "_source_stamp"):
+            cache._cache_file._source_stamp = _stamp(_file(compiled).parent)
         for name in ("save_overload", "load_overload"):
             if hasattr(cache, name):
                 setattr(cache, name, _forgiving(getattr(cache, name)))
         return compiled
 
     return decorate
+
+
+@functools.cache
+def _stamp(folder: Path) -> tuple[Any, ...]:
+    """What numba's cache has to belong to: every source beside the function's own.
+
+    Numba looks at the file of the function alone, though its code holds that of the functions that
+    it calls: after a change of theirs it would go on with the old ones, or fail between the two.
+    """
+    files = sorted(folder.glob("*.py"))
+    return tuple((f.name, s.st_mtime_ns, s.st_size) for f in files for s in [f.stat()])
 
 
 def _forgiving(act: Callable[..., Any]) -> Callable[..., Any]:

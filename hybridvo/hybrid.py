@@ -7,15 +7,13 @@ is, and the motion is fitted there.
 
 from __future__ import annotations
 
-import contextlib
 import difflib
 import functools
 import hashlib
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -28,27 +26,21 @@ from hybridvo.learned import (
     LEARNED,
     LEAST_PIXELS,
     estimate_learned,
-    propose_motion,
+    plain_torch,
     shipped_network,
 )
+from hybridvo.learned_judge import LearnedJudge
 from hybridvo.pose.judgement import default_judge
 from hybridvo.pose.photometric import PhotometricOptions, polish_photometric
 from hybridvo.pose.refinement import RefinementOptions, refine
-from hybridvo.pose.second_look import Motions, Opinion, PictureJudge, Proposal
+from hybridvo.pose.second_look import PictureJudge
 from hybridvo.types import Camera, Frame, FramePair, Reason, RelativePose
-
-if TYPE_CHECKING:
-    import torch
-
-    from hybridvo.network.judge import JudgeFeatures, JudgeInputs, JudgeNetwork
-    from hybridvo.pose.coarse import Grid
 
 __all__ = [
     "DEFAULT_METHOD",
     "JUDGED",
     "METHODS",
     "POLISH",
-    "LearnedJudge",
     "check_method",
     "compile_kernels",
     "estimate",
@@ -120,6 +112,7 @@ def estimate(
     pair: FramePair,
     *,
     T_last: np.ndarray | None = None,
+    T_last_covariance: np.ndarray | None = None,
     method: str = DEFAULT_METHOD,
     options: RefinementOptions | None = None,
     judge: PictureJudge | None = None,
@@ -134,6 +127,8 @@ def estimate(
         pair: two frames and the flow between them.
         T_last: (4, 4) motion of the pair before: a start among others and a cue for the judge, for
             the methods that can use one.
+        T_last_covariance: (6, 6) of ``Exp(delta) T_last``, translation first, m^2 and rad^2, where
+            ``T_last`` is a prediction that knows its own worth.
         method: one of :data:`METHODS` that can run here.
         options: of the refinement.
         judge: for the methods that ask one; by default the one whose weights are shipped.
@@ -178,13 +173,20 @@ def estimate(
         if wrong is not None:
             return RelativePose.failed(Reason.NO_FLOW, wrong, method)
         chosen: Any = (judge or shipped_judge()) if method in JUDGED else default_judge
-        found = refine(pair, T_last=T_last, options=options, judge=chosen, seed=seed)
+        found = refine(
+            pair,
+            T_last=T_last,
+            T_last_covariance=T_last_covariance,
+            options=options,
+            judge=chosen,
+            seed=seed,
+        )
         if polished:
             found = polish_photometric(pair, found, photometric, trust=trust)
         return found.replace(method=method)
     check_method(method)
     if method in LEARNED:
-        with _plain_torch():
+        with plain_torch():
             return _too_little(pair, method) or estimate_learned(pair, method)
     from hybridvo.pose.baselines import baselines
 
@@ -209,133 +211,6 @@ def _too_little(pair: FramePair, method: str) -> RelativePose | None:
         return None
     what = f"{seen} pixels have flow and depth below {FARTHEST_M:g} m, {LEAST_PIXELS} needed"
     return RelativePose.failed(Reason.NO_VALID_DEPTH, what, method)
-
-
-OUT_OF_THE_RACE = 3.0
-"""How far a score may stay behind the best for a second look: at a twentieth of its probability."""
-
-
-class LearnedJudge:
-    """A judge network as :func:`hybridvo.pose.refinement.refine` takes it.
-
-    Keeps nothing between pairs: one judge may serve several threads.
-
-    Args:
-        network: of :func:`hybridvo.network.weights.load_weights`.
-        pixelwise: a PWVO, whose motion takes part where the judge trusts no other; or None.
-    """
-
-    def __init__(self, network: JudgeNetwork, pixelwise: torch.nn.Module | None = None) -> None:
-        import torch
-
-        self._pixelwise = pixelwise
-        self._network = network.eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-
-    def first_look(
-        self, grid: Grid, motions: Motions, T_last: np.ndarray | None, masks: int
-    ) -> Opinion:
-        """Scores of the motions of the search, and masks for the best, see ``PictureJudge``."""
-        import torch
-
-        with _plain_torch():
-            inputs = _judge_inputs(grid, motions, T_last)
-            features = self._network.encode(inputs)
-            best = features.score.argsort(descending=True, stable=True)[:masks]
-            best = best[features.score[best] > features.score.max() - OUT_OF_THE_RACE]
-            mask = torch.sigmoid(self._network.decode(features, best)).numpy()
-        memory = _Memory(inputs, features, features.score, features.hidden)
-        return Opinion(features.score.double().numpy(), best.numpy(), mask, memory=memory)
-
-    def look_again(self, before: Opinion, refits: Motions, parents: np.ndarray) -> Opinion:
-        """Scores of all candidates and the probability that the best of them is right."""
-        import torch
-
-        memory: _Memory = before.memory
-        score, hidden = memory.score, memory.hidden
-        mask = np.zeros((0, *before.mask.shape[1:]))
-        with _plain_torch():
-            best = torch.zeros(0, dtype=torch.int64)
-            if len(refits.poses):
-                again = replace(memory.inputs, **_candidates(refits, parents))
-                new = self._network.encode(again, (memory.inputs, memory.features))
-                known = len(score)
-                score, hidden = torch.cat([score, new.score]), torch.cat([hidden, new.hidden])
-                if int(score.argmax()) >= known:
-                    best = score.argmax()[None]
-                    mask = torch.sigmoid(self._network.decode(new, best - known)).numpy()
-            owner = torch.zeros(len(score), dtype=torch.int64)
-            trust = torch.sigmoid(self._network.confidence(score, hidden, owner, 1))
-        memory = replace(memory, score=score, hidden=hidden)
-        return Opinion(score.double().numpy(), best.numpy(), mask, float(trust), memory)
-
-    def propose(self, pair: FramePair) -> Proposal | None:
-        """PWVO's motion and where it sees the static world."""
-        if self._pixelwise is None:
-            return None
-        with _plain_torch():
-            return propose_motion(self._pixelwise, pair)
-
-
-@contextlib.contextmanager
-def _plain_torch() -> Iterator[None]:
-    """Inference in float32 on the CPU, whatever the caller set for networks of its own."""
-    import torch
-
-    with contextlib.ExitStack() as stack:
-        stack.enter_context(torch.inference_mode())
-        if torch.is_autocast_enabled("cpu"):
-            stack.enter_context(torch.autocast("cpu", enabled=False))
-        if torch.get_default_device().type != "cpu":
-            stack.enter_context(torch.device("cpu"))
-        yield
-
-
-@dataclass(frozen=True, eq=False)
-class _Memory:
-    """What a judge keeps from look to look: the search's motions as seen, all answers so far."""
-
-    inputs: JudgeInputs
-    features: JudgeFeatures
-    score: torch.Tensor
-    hidden: torch.Tensor
-
-
-def _judge_inputs(grid: Grid, motions: Motions, T_last: np.ndarray | None) -> JudgeInputs:
-    """A batch of one picture."""
-    import torch
-
-    from hybridvo.network.judge import JudgeInputs
-
-    def batch(x: Any) -> torch.Tensor:
-        return torch.as_tensor(np.ascontiguousarray(x))[None]
-
-    last = np.eye(4) if T_last is None else np.asarray(T_last)
-    return JudgeInputs(
-        ray=batch(grid.ray),
-        depth=batch(grid.depth),
-        target=batch(grid.target),
-        flow_variance=batch(grid.flow_variance),
-        depth_variance=batch(grid.depth_variance),
-        usable=batch(grid.usable),
-        log_depth_curr=batch(grid.log_depth_curr),
-        K=batch(grid.K),
-        image_width=torch.tensor([float(grid.width)], dtype=torch.float32),
-        T_last=batch(last[:3].astype(np.float32)),
-        has_last=torch.tensor([T_last is not None]),
-        **_candidates(motions, np.arange(len(motions.poses))),
-    )
-
-
-def _candidates(motions: Motions, parents: np.ndarray) -> dict[str, Any]:
-    import torch
-
-    return {
-        "owner": torch.zeros(len(motions.poses), dtype=torch.int64),
-        "parent": torch.as_tensor(parents, dtype=torch.int64),
-        "pose": torch.as_tensor(motions.poses, dtype=torch.float32),
-        "flow_noise": torch.as_tensor(motions.flow_noise, dtype=torch.float32),
-        "depth_noise": torch.as_tensor(motions.depth_noise, dtype=torch.float32),
-    }
 
 
 @functools.cache

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import time
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -24,6 +26,7 @@ __all__ = [
     "estimate_learned",
     "fitted_motion",
     "next_start",
+    "plain_torch",
     "propose_motion",
     "shipped_network",
     "static_probability",
@@ -50,6 +53,20 @@ UNCERTAIN_DEG = 2.0
 """Rotation scale above which the answer is degraded: larger than most motions between frames."""
 UNKNOWN_DEG, UNKNOWN_M = 1.0, 0.3
 """Scales stated for networks that give none: the largest usual motions, so that nobody trusts."""
+
+
+@contextlib.contextmanager
+def plain_torch() -> Iterator[None]:
+    """Inference in float32 on the CPU, whatever the caller set for networks of its own."""
+    import torch
+
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(torch.inference_mode())
+        if torch.is_autocast_enabled("cpu"):
+            stack.enter_context(torch.autocast("cpu", enabled=False))
+        if torch.get_default_device().type != "cpu":
+            stack.enter_context(torch.device("cpu"))
+        yield
 
 
 @functools.cache

@@ -281,7 +281,7 @@ class Odometry:
         prev = anchor.frame
         pair = self._pair(prev, frame, flow)
         ahead = anchor.history.predict(anchor.gap + 1) if self.history else None
-        motion = self._estimate(pair, None if ahead is None else ahead.T_curr_prev)
+        motion = self._estimate(pair, ahead)
         self.images.update(pair, motion)
         if motion.polish is not None:
             anchor = replace(anchor, images=self.images.state())
@@ -325,7 +325,7 @@ class Odometry:
         )
         return Step(frame.index, frame.timestamp, T_world_cam.copy(), motion)
 
-    def _estimate(self, pair: FramePair, T_last: np.ndarray | None, **more: Any) -> RelativePose:
+    def _estimate(self, pair: FramePair, expected: Prediction | None) -> RelativePose:
         options: dict[str, Any] = {
             "method": self.method,
             "options": self.options,
@@ -335,7 +335,10 @@ class Odometry:
             "trust": self.images.trust,
             "seed": self.seed,
         }
-        return estimate(pair, T_last=T_last, **(options | more))
+        if expected is not None:
+            options["T_last"] = expected.T_curr_prev
+            options["T_last_covariance"] = expected.covariance if expected.informed else None
+        return estimate(pair, **options)
 
     def _locate(self, window: Window, motion: RelativePose, prev: Frame, curr: Frame) -> Located:
         return locate(
@@ -381,7 +384,8 @@ class Odometry:
         weights: np.ndarray,
     ) -> RelativePose:
         """Motion from a key frame as between neighbours, beside a start."""
-        found = self._estimate(self._pair(key.frame, curr, None), T_start)
+        expected = None if T_start is None else Prediction(T_start, covariance, informed=False)
+        found = self._estimate(self._pair(key.frame, curr, None), expected)
         if found.status.state is State.DEGRADED:
             # key frames hold the walk together: what is doubtful between neighbours is not used
             return found.replace(status=Status.failed(found.status.reason, found.status.message))

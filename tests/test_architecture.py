@@ -33,7 +33,8 @@ IMPORTS: dict[str, set[str]] = {
     "trajectory": NOUNS | {"geometry"},
     "learned": CLASSICAL | {"network"},
     "flow_check": NOUNS,
-    "hybrid": CLASSICAL | {"network", "learned", "compilation", "flow_check"},
+    "learned_judge": CLASSICAL | {"network", "learned"},
+    "hybrid": CLASSICAL | {"network", "learned", "learned_judge", "compilation", "flow_check"},
     "tracking": CLASSICAL,
     "odometry": CLASSICAL | {"flow", "hybrid", "tracking", "trajectory"},
     "evaluation": NOUNS | {"geometry", "trajectory"},
@@ -55,6 +56,7 @@ IMPORTS: dict[str, set[str]] = {
     "comparison": {
         *("__init__", "errors", "types", "geometry", "data", "flow", "hybrid", "trajectory"),
         *("evaluation", "configuration", "console", "run_folder", "run_results", "run"),
+        "learned_judge",
     },
     # figures of one pair: tools/visualize.py, and the report of a comparison
     "visualization": {

@@ -79,7 +79,7 @@ def systems(
     judge: str, pwvo: str, before: Path | None
 ) -> dict[str, Callable[[Any, dict[str, Any]], Any]]:
     """The rows: called with a pair and, for the oracle alone, its truth."""
-    from hybridvo.hybrid import LearnedJudge
+    from hybridvo.learned_judge import LearnedJudge
     from hybridvo.network.weights import load_weights, pretrained
     from hybridvo.pose.refinement import refine
 

@@ -2,6 +2,7 @@
 
 ``python tools/train_judge.py make --data DIR --first-seed 1000000 --seeds 4096`` makes pictures and
 may run several times at once, and beside a training (held-out seeds are those below 1000);
+``... propose --data DIR`` asks the shipped PWVO about them (of the held-out ones as well);
 ``... train --data DIR --out runs/judge --time-limit 50`` trains, or goes on with what stands in
 ``--out``; ``... export --out runs/judge --held-out DIR --export FILE`` writes weights that users
 load, with figures on held-out pictures in their model card.
@@ -28,7 +29,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     from hybridvo.errors import HybridVOError, OutputError
 
     try:
-        return {"make": _make, "train": _train, "export": _export}[arguments.command](arguments)
+        commands = {"make": _make, "propose": _propose, "train": _train, "export": _export}
+        return commands[arguments.command](arguments)
     except OutputError as error:
         sys.stderr.write(f"train_judge: {error}\n")
         return 5
@@ -45,10 +47,14 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     make.add_argument("--data", type=Path, required=True, help="folder of the shards")
     make.add_argument("--first-seed", type=int, required=True, help="below 1000: held out")
     make.add_argument("--seeds", type=int, required=True, help="about as many pictures")
+    propose = commands.add_parser("propose", help="ask a PWVO about the pictures")
+    propose.add_argument("--data", type=Path, required=True, help="folder of the shards")
+    propose.add_argument("--network", type=Path, help="weights; the shipped ones by default")
     train = commands.add_parser("train", help="train on them")
     train.add_argument("--data", type=Path, required=True, help="folder of the shards")
     train.add_argument("--time-limit", type=float, metavar="MIN", required=True, help="minutes")
     train.add_argument("--threads", type=int, help="threads of torch; by default torch's own")
+    train.add_argument("--init", type=Path, metavar="FILE", help="start from these weights")
     export = commands.add_parser("export", help="write weights for users")
     export.add_argument("--held-out", type=Path, required=True, help="shards of held-out pictures")
     export.add_argument("--export", type=Path, required=True, metavar="FILE", help="*.safetensors")
@@ -84,6 +90,17 @@ def _make(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def _propose(arguments: argparse.Namespace) -> int:
+    from hybridvo.learned import shipped_network
+    from hybridvo.network.weights import load_weights
+    from hybridvo.training.judge_proposals import write_proposals
+
+    path = arguments.network
+    network = shipped_network("pwvo") if path is None else load_weights(path)[0]
+    print(f"{write_proposals(arguments.data, network)} pictures")
+    return 0
+
+
 def _trainer(arguments: argparse.Namespace, data: Path):
     from hybridvo.data.presets import build_options, read_yaml
     from hybridvo.training.judge_loop import JudgeTrainer, JudgeTrainingOptions
@@ -103,6 +120,8 @@ def _train(arguments: argparse.Namespace) -> int:
     trainer = _trainer(arguments, arguments.data)
     if trainer.resume():
         print(f"going on after {trainer.elapsed:.1f} min, {trainer.pictures} pictures")
+    elif arguments.init is not None:
+        trainer.start_from(arguments.init)
     trainer.run(arguments.time_limit)
     print(f"{arguments.out / 'checkpoint.pt'}: {trainer.pictures} pictures seen")
     return 0
@@ -132,6 +151,7 @@ def _export(arguments: argparse.Namespace) -> int:
         "commit": source_commit(),
         "command": "python tools/train_judge.py train " + shlex.join(_portable(trainer)),
         "held_out": evaluate_judge(network, files),
+        "held_out_with_proposals": evaluate_judge(network, files, asked=True),
         "licence": "the package's own",
     }
     save_weights(arguments.export, network, trainer.options.network, card, dtype="float16")

@@ -23,7 +23,8 @@ from hybridvo.evaluation.metrics import ate
 from hybridvo.evaluation.pairs import dynamic_fraction, pair_errors
 from hybridvo.flow import FlowField, dis_flow
 from hybridvo.geometry import invert
-from hybridvo.hybrid import JUDGED, LearnedJudge, check_method, estimate, shipped_judge
+from hybridvo.hybrid import JUDGED, check_method, estimate, shipped_judge
+from hybridvo.learned_judge import LearnedJudge
 from hybridvo.trajectory import Trajectory
 from hybridvo.types import FramePair, RelativePose
 

@@ -1,13 +1,14 @@
 """Training pairs from the judge's pictures: rendered scenes with true, noisy and DIS flow.
 
-``tools/train_judge.py make`` writes the pictures (shards of npz files); here they become samples of
-the pixel-wise networks. What DIS makes of a crowd of movers cannot be imitated by a noise model, and
-rendering a pair costs a hundred times what a training step on it does.
+``tools/train_judge.py make`` writes the pictures (shards of npz files); here they become samples
+of the pixel-wise networks. What DIS makes of a crowd of movers cannot be imitated by a noise model,
+and rendering a pair costs a hundred times what a training step on it does.
 """
 
 from __future__ import annotations
 
 import functools
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from hybridvo.data.workflow import Sample, rigid_flow
 from hybridvo.errors import FormatError, InputError
 from hybridvo.geometry import matrix_to_euler_deg
 
-__all__ = ["RenderedOptions"]
+__all__ = ["RenderedOptions", "picture_sample"]
 
 MOVING = 0
 """Label of a moving pixel in a shard."""
@@ -72,7 +73,7 @@ class RenderedOptions:
         number = int(np.searchsorted(sizes, choice, side="right"))
         index = choice - int(sizes[number - 1] if number else 0)
         mirrored = rng.random(2) < 0.5
-        return _resized(
+        return picture_sample(
             {name: array[index] for name, array in groups[number].items()},
             (self.height, self.width),
             (bool(mirrored[0]), bool(mirrored[1])),
@@ -103,8 +104,8 @@ def _pictures(folder: str) -> list[dict[str, np.ndarray]]:
     ]
 
 
-def _resized(
-    p: dict[str, np.ndarray], size: tuple[int, int], mirrored: tuple[bool, bool]
+def picture_sample(
+    p: Mapping[str, np.ndarray], size: tuple[int, int], mirrored: tuple[bool, bool] = (False, False)
 ) -> Sample:
     """The nearest of a picture's measured pixels for each of the sample's, seen in mirrors.
 

@@ -19,12 +19,19 @@ from torch import nn
 from hybridvo.errors import InputError
 from hybridvo.network.layers import scaled
 
-__all__ = ["JudgeFeatures", "JudgeInputs", "JudgeNetwork", "JudgeOptions", "JudgeOutput"]
+__all__ = [
+    "JudgeFeatures",
+    "JudgeInputs",
+    "JudgeNetwork",
+    "JudgeOptions",
+    "JudgeOutput",
+    "expected_information",
+]
 
 CHANNELS = (24, 40, 64, 96)
 CANDIDATE_CHANNELS = 8
-SHARED_CHANNELS = 9
-SCALARS = 6
+SHARED_CHANNELS = 11
+SCALARS = 8
 HIDDEN = 96
 PIXEL_CHANNELS = 8
 MIRRORED_CANDIDATE = (0,)
@@ -37,8 +44,10 @@ LEAST_FLOW_NOISE = 0.01
 SUPPORT_CUTOFF_SQUARED = 9.0
 DEPTH_FLOOR = 0.003
 """Spread of log depth that even exact depths have between neighbouring pixels."""
-SMOOTH_JUMP = 0.01
-"""Change of motion, rad of the picture, at which the smoothness has fallen to a half."""
+USUAL_CHANGE = 0.01
+"""rad of the picture by which a motion usually differs from the one before."""
+MOST_LOGIT = 6.0
+"""Largest logit of another network's static probability that is believed."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +85,12 @@ class JudgeInputs:
         log_depth_curr: (B, h, w) log metres of the second depth at the target; NaN where unknown.
         K: (B, 4) fx, fy, cx, cy of the current camera, px.
         image_width: (B,) px, of the whole picture.
-        T_last: (B, 3, 4) last motion of the camera. has_last: (B,) bool, whether it is known.
+        static: (B, h, w) logit of the probability to be static world that another network states.
+        has_static: (B,) bool, whether it was asked.
+        T_last: (B, 3, 4) motion that is expected from those before.
+        last_information: (B, 6, 6) inverse of the covariance of ``Exp(delta) T_last``, translation
+            first.
+        has_last: (B,) bool, whether it is known.
         owner: (N,) int64, picture of each candidate.
         parent: (N,) int64, for refits: the motion of the search it came from; for those: itself.
         pose: (N, 3, 4) T_curr_prev.
@@ -90,9 +104,12 @@ class JudgeInputs:
     depth_variance: torch.Tensor
     usable: torch.Tensor
     log_depth_curr: torch.Tensor
+    static: torch.Tensor
+    has_static: torch.Tensor
     K: torch.Tensor
     image_width: torch.Tensor
     T_last: torch.Tensor
+    last_information: torch.Tensor
     has_last: torch.Tensor
     owner: torch.Tensor
     parent: torch.Tensor
@@ -143,7 +160,7 @@ def _squash(x: torch.Tensor) -> torch.Tensor:
 def candidate_channels(
     inputs: JudgeInputs, first: tuple[JudgeInputs, torch.Tensor] | None
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """(channels (N, 8, h, w), scalars (N, 6), support (N, h, w)) of every candidate.
+    """(channels (N, 8, h, w), scalars (N, 8), support (N, h, w)) of every candidate.
 
     ``first``: inputs and support of the motions of the search, where these are refits of them.
     """
@@ -214,36 +231,65 @@ def _rivals(inputs: JudgeInputs, support: torch.Tensor, owner: torch.Tensor) -> 
 def _scalars(
     inputs: JudgeInputs, support: torch.Tensor, wide: torch.Tensor, refits: bool
 ) -> torch.Tensor:
-    """(N, 6): share, noises, whether it is a refit, nearness to the last motion and if known."""
+    """(N, 8): share, noises, whether it is a refit, what was expected, what another network saw."""
     own = inputs.owner
     count = inputs.usable[own].sum((1, 2)).clamp(min=1)
     share = support.sum((1, 2)) / count
-    step = torch.sum(torch.square(inputs.pose - inputs.T_last[own]).flatten(1)[:, _ROTATION], 1)
-    inverse = torch.where(inputs.usable, 1.0 / inputs.depth.clamp(min=1e-6), 0.0)
-    inverse = inverse.sum((1, 2)) / inputs.usable.sum((1, 2)).clamp(min=1)
-    shift = (inputs.pose - inputs.T_last[own])[:, :, 3].norm(dim=1) * inverse[own]
-    # the Frobenius norm of a difference of rotations is sqrt(2) times the angle
-    jump = torch.sqrt(step / 2.0) + shift
     known = inputs.has_last[own].to(share.dtype)
-    smooth = known / (1.0 + (jump / SMOOTH_JUMP) ** 2)
+    step = _small_step(inputs.pose, inputs.T_last[own])
+    # bounded on its near side and logarithmic on the far one: a prior that cannot trap
+    away = torch.einsum("ni,nij,nj->n", step, inputs.last_information[own], step).clamp(0, 1e6) / 6
+    seen = torch.sigmoid(inputs.static) * inputs.usable
+    agreed = (support * seen[own]).sum((1, 2)) / seen.sum((1, 2)).clamp(min=1e-3)[own]
     return torch.stack(
         [
             share,
             0.3 * torch.log(inputs.flow_noise.clamp(min=LEAST_FLOW_NOISE) * wide),
             0.2 * torch.log(inputs.depth_noise.clamp(min=1e-4) / 1e-2),
             torch.full_like(share, float(refits)),
-            smooth,
+            known / (1.0 + away),
             known,
+            0.2 * known * torch.log1p(away),
+            agreed * inputs.has_static[own],
         ],
         dim=1,
     )
 
 
-_ROTATION = [0, 1, 2, 4, 5, 6, 8, 9, 10]
+def expected_information(
+    depth: torch.Tensor, usable: torch.Tensor, covariance: torch.Tensor | None
+) -> torch.Tensor:
+    """(B, 6, 6) inverse covariances of the motions expected.
+
+    Args:
+        depth: (B, h, w) metres.
+        usable: (B, h, w) bool.
+        covariance: (B, 6, 6), translation first; None where nobody knows: then
+            :data:`USUAL_CHANGE` of the picture, and of the typical depth.
+    """
+    inverse = torch.where(usable, 1.0 / depth.clamp(min=1e-6), 0.0).sum((1, 2))
+    inverse = (inverse / usable.sum((1, 2)).clamp(min=1)).clamp(min=1e-6)
+    usual = torch.stack([inverse] * 3 + [torch.ones_like(inverse)] * 3, dim=1) / USUAL_CHANGE
+    usual = torch.diag_embed(usual * usual)
+    if covariance is None:
+        return usual
+    information, failed = torch.linalg.inv_ex(covariance.double())
+    sound = (failed == 0) & torch.isfinite(information).all((1, 2))
+    return torch.where(sound[:, None, None], information.to(usual.dtype), usual)
+
+
+def _small_step(pose: torch.Tensor, start: torch.Tensor) -> torch.Tensor:
+    """(N, 6) delta with pose = Exp(delta) start, translation first, to first order."""
+    R = pose[:, :, :3] @ start[:, :, :3].transpose(1, 2)
+    shift = pose[:, :, 3] - torch.einsum("nij,nj->ni", R, start[:, :, 3])
+    turn = torch.stack(
+        [R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], dim=1
+    )
+    return torch.cat([shift, turn / 2], dim=1)
 
 
 def shared_channels(inputs: JudgeInputs) -> torch.Tensor:
-    """(B, 9, h, w): flow, inverse depth, validity, rays, border, variances of every picture."""
+    """(B, 11, h, w): flow, inverse depth, validity, rays, border, variances, static world."""
     usable = inputs.usable
     K = inputs.K[:, :, None, None]
     # on the unit plane of the current camera: what is left is motion, whatever the lens
@@ -260,6 +306,7 @@ def shared_channels(inputs: JudgeInputs) -> torch.Tensor:
         torch.minimum(rows, h - 1 - rows)[:, None], torch.minimum(columns, w - 1 - columns)[None]
     )
     border = torch.exp(-to_border / (0.06 * min(h, w))).expand(usable.shape)
+    asked = inputs.has_static[:, None, None].to(u.dtype)
     channels = torch.stack(
         [
             _squash(u / typical),
@@ -271,6 +318,8 @@ def shared_channels(inputs: JudgeInputs) -> torch.Tensor:
             border,
             0.3 * torch.log(inputs.flow_variance.clamp(1e-3, 1e3)),
             (0.2 * torch.log(size.clamp(min=1e-6) / 1e-2)),
+            inputs.static.clamp(-MOST_LOGIT, MOST_LOGIT) * asked / 3,
+            asked.expand(usable.shape),
         ],
         dim=1,
     )

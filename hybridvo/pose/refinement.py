@@ -24,7 +24,7 @@ from hybridvo.pose.correspondences import DOUBTFUL_INLIER_RATIO
 from hybridvo.pose.full_fit import FullFit, fit_full_grid
 from hybridvo.pose.judgement import CueGrid, Judge, default_judge
 from hybridvo.pose.options import RefinementOptions
-from hybridvo.pose.second_look import Decision, PictureJudge, decide
+from hybridvo.pose.second_look import Decision, Expected, PictureJudge, decide
 from hybridvo.types import FramePair, Hypothesis, PairBatch, Reason, RelativePose, Status
 
 if TYPE_CHECKING:
@@ -58,6 +58,7 @@ def refine(
     weights: np.ndarray | None = None,
     *,
     T_last: np.ndarray | None = None,
+    T_last_covariance: np.ndarray | None = None,
     options: RefinementOptions | None = None,
     judge: Judge | PictureJudge = default_judge,
     seed: int = 0,
@@ -74,6 +75,7 @@ def refine(
     weights: np.ndarray | None = None,
     *,
     T_last: np.ndarray | None = None,
+    T_last_covariance: np.ndarray | None = None,
     options: RefinementOptions | None = None,
     judge: Judge | PictureJudge = default_judge,
     seed: int = 0,
@@ -85,7 +87,10 @@ def refine(
             differentiable path, see :func:`hybridvo.pose.batched.refine_batch`.
         T_init: (4, 4) or (S, 4, 4) T_curr_prev, starts beside the identity (a network's seeds).
         weights: (H, W) factors on the information of each pixel; 0 and NaN switch a pixel off.
-        T_last: (4, 4) the last camera motion: one more start, and a cue for the judge.
+        T_last: (4, 4) the last camera motion, or the one expected: one more start, and a cue for
+            the judge.
+        T_last_covariance: (6, 6) of ``Exp(delta) T_last``, translation first, m^2 and rad^2: how
+            far the motion may be from it; a judge of pixels weighs it.
         options: see :class:`RefinementOptions`.
         judge: chooses the world among the motions found, by their cues (larger score wins) or, a
             :class:`hybridvo.pose.second_look.PictureJudge`, by looking at each pixel.
@@ -110,7 +115,13 @@ def refine(
         raise InputError(
             f"refine: expected weights of shape {pair.prev.camera.shape}, got {np.shape(weights)}."
         )
-    result = _refine(pair, starts, weights, T_last, options, judge, seed)
+    expected = None if T_last is None else Expected(np.asarray(T_last, float), T_last_covariance)
+    if T_last_covariance is not None and np.shape(T_last_covariance) != (6, 6):
+        raise InputError(
+            f"refine: expected T_last_covariance of shape (6, 6), got "
+            f"{np.shape(T_last_covariance)}."
+        )
+    result = _refine(pair, starts, weights, expected, options, judge, seed)
     return result.replace(ms=1e3 * (time.perf_counter() - started))
 
 
@@ -134,7 +145,7 @@ def _refine(
     pair: FramePair,
     starts: np.ndarray,
     weights: np.ndarray | None,
-    T_last: np.ndarray | None,
+    expected: Expected | None,
     options: RefinementOptions,
     judge: Judge | PictureJudge,
     seed: int,
@@ -148,12 +159,13 @@ def _refine(
         return found
     poses, facts = found.poses, found.facts
     by_cues = default_judge if isinstance(judge, PictureJudge) else judge
+    T_last = None if expected is None else expected.T_curr_prev
     hypotheses = _hypotheses(found, poses, facts, T_last, by_cues)
     scores = np.array([h.score for h in hypotheses])
     best = int(np.argmax(scores))
     decision, picture, samples = None, found.picture, found.samples
     if isinstance(judge, PictureJudge) and not found.clear:
-        decision = decide(judge, found, pair, scores, T_last, options)
+        decision = decide(judge, found, pair, scores, expected, options)
         poses, facts, best = decision.poses, decision.facts, decision.best
         hypotheses += _hypotheses(found, poses[len(scores) :], facts[len(scores) :], T_last)
         scores = decision.score

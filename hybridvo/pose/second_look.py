@@ -20,13 +20,26 @@ from hybridvo.pose.covariance import symmetric
 from hybridvo.pose.options import RefinementOptions
 from hybridvo.types import FramePair
 
-__all__ = ["Decision", "Motions", "Opinion", "PictureJudge", "Proposal", "decide", "mask_weights"]
+__all__ = [
+    "PROPOSED",
+    "Decision",
+    "Expected",
+    "Motions",
+    "Opinion",
+    "PictureJudge",
+    "Proposal",
+    "decide",
+    "mask_weights",
+    "nearest_motion",
+]
 
 REFITS = 2
 """Motions that are fitted again inside their masks."""
 LOOKS = 3
 """Most rounds of fitting and judging. Only a fit that differs from every motion of the search goes
 into another round, inside the mask that is drawn about it."""
+LOOKS_MORE = 2
+"""The same after a proposal has joined."""
 SAME_MOTION = 8.0
 """Squared difference, in standard deviations of the fit inside a mask, up to which a motion of the
 search is taken for the same one (80 % quantile of chi-square with 6 degrees of freedom). Then the
@@ -62,6 +75,20 @@ class Motions:
     poses: np.ndarray
     flow_noise: np.ndarray
     depth_noise: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Expected:
+    """The motion that those before let expect: a weak prior.
+
+    Args:
+        T_curr_prev: (4, 4).
+        covariance: (6, 6) of ``Exp(delta) T_curr_prev``, translation first, m^2 and rad^2; None
+            where nobody knows how well it holds.
+    """
+
+    T_curr_prev: np.ndarray
+    covariance: np.ndarray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,14 +129,14 @@ class PictureJudge(Protocol):
     """Judges the motions of a pair by what they leave unexplained, pixel by pixel."""
 
     def first_look(
-        self, grid: Grid, motions: Motions, T_last: np.ndarray | None, masks: int
+        self, grid: Grid, motions: Motions, expected: Expected | None, masks: int
     ) -> Opinion:
         """Opinion of the motions of the search, with masks for the best of them.
 
         Args:
             grid: the pixels.
             motions: N of the search.
-            T_last: (4, 4) the last motion, or None.
+            expected: what the motions before say, or None.
             masks: how many masks are wanted; R is the smaller of it and N.
         """
 
@@ -124,6 +151,19 @@ class PictureJudge(Protocol):
 
     def propose(self, pair: FramePair) -> Proposal | None:
         """A motion of the judge's own, or None; asked only where it trusts no candidate."""
+
+    def look_with(
+        self, before: Opinion, static: np.ndarray, refits: Motions, parents: np.ndarray, masks: int
+    ) -> Opinion:
+        """Opinion of all candidates anew, in the light of where a proposal sees the static world.
+
+        Args:
+            before: the opinion before.
+            static: (h, w) probability of every pixel of the grid to be static world.
+            refits: R fits more; they follow the candidates so far.
+            parents: (R,) int64, the motion of the search that each goes back to.
+            masks: how many masks are wanted, of the best of all candidates.
+        """
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,7 +200,7 @@ def decide(
     found: CoarseSearch,
     pair: FramePair,
     classical: np.ndarray,
-    T_last: np.ndarray | None,
+    expected: Expected | None,
     options: RefinementOptions,
 ) -> Decision:
     """Judge, fit the best again inside their masks, judge again.
@@ -170,20 +210,24 @@ def decide(
         found: motions of the search.
         pair: that they were found in.
         classical: (N,) scores of the hand-made judge, for when the judge trusts nothing.
-        T_last: (4, 4) the last motion of the camera, or None.
+        expected: what the motions before say of this one, or None.
         options: of the refinement.
     """
     race = _Race(judge, found, options)
-    opinion = judge.first_look(found.grid(pair), _motions(found.poses, found.facts), T_last, REFITS)
+    motions = _motions(found.poses, found.facts)
+    opinion = judge.first_look(found.grid(pair), motions, expected, REFITS)
     for _ in range(LOOKS):
         opinion = race.run(opinion, _in_masks(race, opinion))
         if race.best < race.known or race.same is not None:
             break
     proposal = judge.propose(pair) if race.probability(pair) < CONSULT else None
     if proposal is not None:
-        opinion = race.run(opinion, [_entry(race, proposal)])
-        if race.best >= race.known and race.same is None:
+        static = race.found.on_grid(proposal.static)
+        opinion = race.run(opinion, [_entry(race, proposal.T_curr_prev, static)], static)
+        for _ in range(LOOKS_MORE):
             opinion = race.run(opinion, _in_masks(race, opinion))
+            if race.best < race.known or race.same is not None:
+                break
     least = LEAST_TRUST if proposal is None else LEAST_TRUST_PROPOSED
     best, abstained = race.best, race.trust < least
     if abstained:
@@ -229,8 +273,13 @@ class _Race:
         noise_px = noise * REFERENCE_WIDTH / pair.prev.camera.width
         return probability_right(self.trust, noise_px, float(fact[search.SHARE]) * kept)
 
-    def run(self, opinion: Opinion, entries: list[_Entry]) -> Opinion:
-        """Fit the entries, let the judge look at all candidates, see who is ahead."""
+    def run(
+        self, opinion: Opinion, entries: list[_Entry], static: np.ndarray | None = None
+    ) -> Opinion:
+        """Fit the entries, let the judge look at all candidates, see who is ahead.
+
+        ``static``: where a proposal sees the world; then the judge sees all of them anew.
+        """
         self.known = len(self.poses)
         for start, weights, parent in entries:
             if self.kept(weights) < LEAST_MASK:
@@ -247,7 +296,10 @@ class _Race:
             np.reshape(self.poses[self.known :], (-1, 3, 4)), np.array(self.facts[self.known :])
         )
         parents = np.array(self.parents[self.known :], np.int64)
-        opinion = self.judge.look_again(opinion, refits, parents)
+        if static is None:
+            opinion = self.judge.look_again(opinion, refits, parents)
+        else:
+            opinion = self.judge.look_with(opinion, static, refits, parents, REFITS)
         self.best = int(np.argmax(np.nan_to_num(opinion.score, nan=-np.inf)))
         self.trust = float(np.nan_to_num(opinion.trust))
         mask = self.masks[self.best]
@@ -266,14 +318,20 @@ def _in_masks(race: _Race, opinion: Opinion) -> list[_Entry]:
     ]
 
 
-def _entry(race: _Race, proposal: Proposal) -> _Entry:
-    """A proposal on the grid of the search; it goes back to the motion that is nearest to it."""
-    start = np.ascontiguousarray(proposal.T_curr_prev[:3], dtype=np.float64)
-    weights = mask_weights(race.found.on_grid(proposal.static), PROPOSED)
-    T, unit = pose_matrix(start), race.found.depth_scale
-    steps = np.array([se3_log(T @ invert(pose_matrix(P))) for P in race.found.poses])
-    length = (steps * np.array([unit] * 3 + [1.0] * 3)) ** 2
-    return start, weights, int(np.argmin(length.sum(axis=1)))
+def _entry(race: _Race, T_curr_prev: np.ndarray, static: np.ndarray) -> _Entry:
+    """A proposal as a fit to come; it goes back to the motion of the search nearest to it."""
+    start = np.ascontiguousarray(T_curr_prev[:3], dtype=np.float64)
+    found = race.found
+    parent = nearest_motion(found.poses, start, found.depth_scale)
+    return start, mask_weights(static, PROPOSED), parent
+
+
+def nearest_motion(poses: np.ndarray, pose: np.ndarray, depth_scale: float) -> int:
+    """Index of the motion (N, 3, 4) nearest to another (3, 4); metres count 1 / depth radians."""
+    T = pose_matrix(pose)
+    steps = np.array([se3_log(T @ invert(pose_matrix(P))) for P in poses])
+    length = (steps * np.array([depth_scale] * 3 + [1.0] * 3)) ** 2
+    return int(np.argmin(length.sum(axis=1)))
 
 
 def _same(

@@ -29,10 +29,12 @@ class Prediction:
     Args:
         T_curr_prev: (4, 4).
         covariance: (6, 6) of ``Exp(delta) T_curr_prev``, translation first; m^2, rad^2.
+        informed: whether enough changes were seen for the covariance to mean anything.
     """
 
     T_curr_prev: np.ndarray
     covariance: np.ndarray
+    informed: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +86,8 @@ class MotionHistory:
         n = int(frames)
         grown = n * (n + 1) * (2 * n + 1) / 6
         T = np.array(np.linalg.matrix_power(self.T_last, n))
-        if self.spread is None or self.changes < LEAST_CHANGES:
+        informed = self.spread is not None and self.changes >= LEAST_CHANGES
+        if self.spread is None or not informed:
             one = np.diag([UNKNOWN_M**2] * 3 + [UNKNOWN_RAD**2] * 3)
         else:
             # ten changes are few for 21 numbers: half of it is even in all directions
@@ -92,4 +95,4 @@ class MotionHistory:
             even = np.repeat([np.trace(mean[:3, :3]) / 3, np.trace(mean[3:, 3:]) / 3], 3)
             one = INFLATION * 0.5 * (mean + np.diag(even))
             one += np.diag([FLOOR_M**2] * 3 + [FLOOR_RAD**2] * 3)
-        return Prediction(T, grown * one)
+        return Prediction(T, grown * one, informed)

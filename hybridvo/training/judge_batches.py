@@ -11,12 +11,15 @@ from typing import Any
 import numpy as np
 import torch
 
+from hybridvo.data.degradation import log_uniform
 from hybridvo.errors import FormatError
-from hybridvo.network.judge import JudgeInputs, JudgeOutput
+from hybridvo.geometry import pose_matrix, se3_exp
+from hybridvo.network.judge import JudgeInputs, JudgeOutput, expected_information
 from hybridvo.pose import kernels, search
 from hybridvo.pose.coarse import fit_in_mask
 from hybridvo.pose.options import RefinementOptions
-from hybridvo.pose.second_look import mask_weights
+from hybridvo.pose.second_look import PROPOSED, mask_weights, nearest_motion
+from hybridvo.training.judge_proposals import read_proposals
 
 __all__ = ["PictureBatch", "ego_flow_error", "read_batches", "refits_of"]
 
@@ -31,6 +34,8 @@ class PictureBatch:
         depth_true: (B, h, w) metres, 0 where unknown. label: (B, h, w) of ``judge_data``.
         T: (B, 3, 4) true T_curr_prev.
         source: (B,) 0 wide, 1 rendered with true (or noisy) flow, 2 rendered with DIS flow.
+        static: (B, h, w) probability to be static world that a pixel-wise network states.
+        proposal: (B, 3, 4) its motion. proposed: (B,) bool, whether it was asked.
     """
 
     inputs: JudgeInputs
@@ -39,6 +44,41 @@ class PictureBatch:
     label: torch.Tensor
     T: torch.Tensor
     source: np.ndarray
+    static: torch.Tensor
+    proposal: np.ndarray
+    proposed: torch.Tensor
+
+    def shown(self, asked: torch.Tensor) -> PictureBatch:
+        """The same with the static world of the other network shown for ``asked`` (B,) bool."""
+        asked = asked & self.proposed
+        logit = torch.logit(self.static, eps=1e-4)
+        return replace(self, inputs=replace(self.inputs, static=logit, has_static=asked))
+
+    def expecting(self, rng: np.random.Generator) -> PictureBatch:
+        """The same with motions expected by histories of all kinds: none, good, wrong, too sure."""
+        count = len(self.T)
+        truth = self.T.numpy().astype(np.float64)
+        last = np.tile(np.eye(4), (count, 1, 1))
+        information = self.inputs.last_information.clone()
+        known = rng.random(count) < 0.6
+        for b in np.flatnonzero(known):
+            length = max(float(np.linalg.norm(truth[b, :, 3])), 1e-3)
+            spread = np.repeat([log_uniform(rng, (0.02, 0.6)) * length, 0.0], 3)
+            spread[3:] = log_uniform(rng, (3e-4, 1e-2))
+            spread *= np.exp(0.5 * rng.standard_normal(6))
+            stated = spread * log_uniform(rng, (0.5, 2.0))
+            if rng.random() < 0.12:  # the camera was pushed: the history knows nothing of it
+                spread = np.array([2 * length] * 3 + [0.04] * 3)
+            last[b] = se3_exp(spread * rng.standard_normal(6)) @ pose_matrix(truth[b])
+            if rng.random() < 0.6:
+                information[b] = torch.diag(torch.as_tensor(1.0 / stated**2).float())
+        inputs = replace(
+            self.inputs,
+            T_last=torch.as_tensor(last[:, :3], dtype=torch.float32),
+            last_information=information,
+            has_last=torch.as_tensor(known),
+        )
+        return replace(self, inputs=inputs)
 
 
 def _collate(p: dict[str, np.ndarray]) -> PictureBatch:
@@ -58,17 +98,21 @@ def _collate(p: dict[str, np.ndarray]) -> PictureBatch:
         return torch.as_tensor(np.ascontiguousarray(x)).to(kind)
 
     exact = tensor(p["exact"])
+    usable = tensor(coarse[:, 2] > 0, torch.bool)
     inputs = JudgeInputs(
         ray=exact[:, 0:2],
         depth=exact[:, 2],
         target=exact[:, 3:5],
         flow_variance=1.0 / tensor(coarse[:, 0]).clamp(min=1e-6),
         depth_variance=tensor(coarse[:, 1]),
-        usable=tensor(coarse[:, 2] > 0, torch.bool),
+        usable=usable,
         log_depth_curr=tensor(p["log_depth"]),
+        static=torch.zeros(size, h, w),
+        has_static=torch.zeros(size, dtype=torch.bool),
         K=tensor(p["K"]),
         image_width=tensor(p["width"]),
         T_last=tensor(p["T_last"]),
+        last_information=expected_information(exact[:, 2], usable, None),
         has_last=tensor(p["has_last"], torch.bool),
         owner=tensor(owner, torch.int64),
         parent=torch.arange(len(owner)),
@@ -83,6 +127,9 @@ def _collate(p: dict[str, np.ndarray]) -> PictureBatch:
         tensor(p["label"], torch.int64),
         tensor(p["T"]),
         np.asarray(p["source"]),
+        tensor(p["static"]),
+        p["proposal"].astype(np.float64),
+        tensor(p["proposed"], torch.bool),
     )
 
 
@@ -112,7 +159,7 @@ def read_batches(
     jobs = []
     pictures: dict[str, dict[str, np.ndarray]] = {}
     for shape, members in by_shape.items():
-        loaded = [_read_shard(member) for member in members]
+        loaded = [_read_shard(member) | read_proposals(member) for member in members]
         pictures[shape] = {key: np.concatenate([x[key] for x in loaded]) for key in loaded[0]}
         order = np.arange(len(pictures[shape]["count"]))
         if rng is not None:
@@ -159,6 +206,8 @@ def refits_of(
         out: answers about their motions.
         count: fits of a picture.
         extra: draws one of them anew at times (training), so that more than the best is seen.
+
+    Where the judge is shown another network's static world, that network's motion takes part.
     """
     inputs = batch.inputs
     cutoff = RefinementOptions().cutoff
@@ -170,11 +219,20 @@ def refits_of(
         if extra is not None and len(order) > count and torch.rand((), generator=extra) < 0.3:
             swap = int(torch.randint(count, len(order), (), generator=extra))
             order[count - 1], order[swap] = order[swap], order[count - 1]
-        for k in order[:count]:
-            start = inputs.pose[k].numpy().astype(np.float64)
-            pose, fact = fit_in_mask(
-                batch.samples[b], mask_weights(probability[k]), inputs.K[b].numpy(), start, cutoff
-            )
+        entries = [
+            (inputs.pose[k].numpy().astype(np.float64), mask_weights(probability[k]), k)
+            for k in order[:count]
+        ]
+        if inputs.has_static[b]:
+            weights = mask_weights(batch.static[b].numpy(), PROPOSED)
+            z = inputs.depth[b][inputs.usable[b]]
+            start = batch.proposal[b]
+            near = nearest_motion(inputs.pose[mine].numpy(), start, 1.0 / float(z.median()))
+            entries.append((start, weights, int(mine[near])))
+        for start, weights, k in entries:
+            if weights.max() <= 0:
+                continue
+            pose, fact = fit_in_mask(batch.samples[b], weights, inputs.K[b].numpy(), start, cutoff)
             if np.isfinite(pose).all():
                 poses.append(pose)
                 found.append(fact)

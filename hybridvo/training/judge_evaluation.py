@@ -20,9 +20,20 @@ __all__ = ["evaluate_judge"]
 
 @torch.no_grad()
 def evaluate_judge(
-    network: JudgeNetwork, files: list[Path], refits: int = 2, batch_size: int = 8
+    network: JudgeNetwork,
+    files: list[Path],
+    refits: int = 2,
+    batch_size: int = 8,
+    asked: bool = False,
 ) -> dict[str, dict[str, Any]]:
     """Shares of wrong answers on pictures of shards, by source.
+
+    Args:
+        network: the judge.
+        files: shards.
+        refits: motions of a picture that are fitted again.
+        batch_size: pictures at once.
+        asked: whether the pixel-wise network takes part.
 
     Returns:
         For each source: ``pictures``, and the share of pictures whose motion is further than a
@@ -33,6 +44,7 @@ def evaluate_judge(
     """
     rows: dict[int, list[list[float]]] = {0: [], 1: [], 2: []}
     for batch in read_batches(files, batch_size, None):
+        batch = batch.shown(torch.full((len(batch.T),), asked))
         inputs = batch.inputs
         out = network(inputs)
         more = refits_of(batch, out, refits)

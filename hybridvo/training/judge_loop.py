@@ -17,6 +17,8 @@ from typing import Any
 import numpy as np
 import torch
 import torch.nn.functional as F
+from safetensors import SafetensorError
+from safetensors.torch import load_file
 
 from hybridvo.errors import CheckpointError, InputError
 from hybridvo.network.judge import JudgeInputs, JudgeNetwork, JudgeOptions, JudgeOutput
@@ -52,6 +54,8 @@ class JudgeTrainingOptions:
         refits: candidates of a picture that are fitted inside their masks.
         mask_weight: of the loss of the masks beside that of the choice.
         trust_weight: of the loss of the probability that the choice is right.
+        asked_share: share of the pictures in which the pixel-wise network's static world is shown
+            and its motion takes part, as where the judge alone is in doubt.
         files: shards from which the pictures of a round are mixed.
         bfloat16: run the network's convolutions in bfloat16 while training.
 
@@ -71,6 +75,7 @@ class JudgeTrainingOptions:
     refits: int = 2
     mask_weight: float = 1.0
     trust_weight: float = 0.5
+    asked_share: float = 0.5
     files: int = 48
     bfloat16: bool = True
 
@@ -158,7 +163,10 @@ class JudgeTrainer:
         cosine = 0.5 * (1 + math.cos(math.pi * min(progress, 1.0)))
         for group in self.optimizer.param_groups:
             group["lr"] = o.learning_rate * rise * (o.final_share + (1 - o.final_share) * cosine)
-        network, inputs, count = self.network, batch.inputs, len(batch.T)
+        network, count = self.network, len(batch.T)
+        asked = torch.rand(count, generator=self.draw) < o.asked_share
+        batch = batch.expecting(self.rng).shown(asked)
+        inputs = batch.inputs
         mirror = torch.rand(count, generator=self.draw) < 0.5
         with torch.autocast("cpu", torch.bfloat16, enabled=o.bfloat16):
             out = _float(network(inputs, mirror=mirror))
@@ -239,6 +247,37 @@ class JudgeTrainer:
         network = JudgeNetwork(self.options.network)
         network.load_state_dict(self.average)
         return network.eval()
+
+    def start_from(self, path: str | Path) -> None:
+        """Take the weights of another judge; everything else starts anew.
+
+        One that was shown less than this one is taken as well: what it did not see counts nothing
+        at first.
+
+        Raises:
+            CheckpointError: a damaged file, or weights of other shapes.
+        """
+        try:
+            stored = load_file(path)
+        except (OSError, SafetensorError) as error:
+            raise CheckpointError(f"{path}: not a file of weights: {error}") from error
+        state = self.network.state_dict()
+        if set(stored) != set(state):
+            raise CheckpointError(f"{path}: not the weights of a judge.")
+        for name, new in state.items():
+            old = stored[name].float()
+            narrow = old.ndim > 1 and old.shape[0] == new.shape[0] and old.shape[1] < new.shape[1]
+            if old.shape != new.shape and not (narrow and old.shape[2:] == new.shape[2:]):
+                raise CheckpointError(
+                    f"{path}: {name} has shape {tuple(old.shape)}, expected {tuple(new.shape)}."
+                )
+            if narrow:
+                state[name] = torch.zeros_like(new)
+                state[name][:, : old.shape[1]] = old
+            else:
+                state[name] = old
+        self.network.load_state_dict(state)
+        self.average = {k: v.clone() for k, v in self.network.state_dict().items()}
 
     def save(self) -> None:
         """Write ``checkpoint.pt``."""

@@ -196,3 +196,31 @@ def test_a_library_user_reads_the_code_that_later_processes_read(
     for code, _, _ in asked:
         exec(compile(code, "child", "exec"), {})
     assert len(asked) == 2
+
+
+def test_a_kernel_follows_the_changes_of_the_ones_it_calls(tmp_path: Path) -> None:
+    # numba alone answers 2 and 2: its cache looks at the file of the caller only
+    head = "from hybridvo.compilation import njit\n"
+    (tmp_path / "caller.py").write_text(
+        f"{head}from callee import f\n@njit(cache=True)\ndef g():\n    return f()\n"
+    )
+    command = [
+        *(sys.executable, "-c"),
+        "from caller import g; print(g(), sum(g.stats.cache_hits.values()))",
+    ]
+    answers = []
+    for value in (2, 30):
+        (tmp_path / "callee.py").write_text(
+            f"{head}@njit(cache=True)\ndef f():\n    return {value}\n"
+        )
+        for _ in range(2):  # compiled, then read
+            done = subprocess.run(
+                command,
+                cwd=tmp_path,
+                capture_output=True,
+                text=True,
+                check=True,
+                env=os.environ | {"PYTHONPATH": os.fspath(ROOT)},
+            )
+            answers.append(done.stdout.split())
+    assert answers == [["2", "0"], ["2", "1"], ["30", "0"], ["30", "1"]]

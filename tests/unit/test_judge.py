@@ -10,13 +10,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import save_file
 
 from hybridvo.data.benchmark_pairs import Cell, make_pair
 from hybridvo.data.presets import build_options, read_yaml
 from hybridvo.data.synthetic import SyntheticSequence, make_scene
 from hybridvo.errors import CheckpointError, InputError
-from hybridvo.geometry import ego_flow
-from hybridvo.hybrid import LearnedJudge, _judge_inputs, estimate
+from hybridvo.geometry import ego_flow, se3_exp
+from hybridvo.hybrid import estimate
+from hybridvo.learned_judge import LearnedJudge, judge_inputs
+from hybridvo.network import judge as judge_network
 from hybridvo.network.judge import JudgeInputs, JudgeNetwork, JudgeOptions
 from hybridvo.network.weights import load_weights, pretrained, save_weights
 from hybridvo.pose import second_look
@@ -52,7 +55,7 @@ def search(seed: int, **cell: object) -> tuple[CoarseSearch, object, dict]:
 
 def inputs_of(seed: int) -> JudgeInputs:
     found, pair, _ = search(seed)
-    return _judge_inputs(found.grid(pair), second_look._motions(found.poses, found.facts), None)
+    return judge_inputs(found.grid(pair), second_look._motions(found.poses, found.facts), None)
 
 
 def together(parts: list[JudgeInputs]) -> JudgeInputs:
@@ -140,7 +143,7 @@ class Oracle:
         self.static, self.prefer, self.trust = static, prefer, trust
         self.proposal, self.asked = proposal, 0
 
-    def first_look(self, grid, motions: Motions, T_last, masks: int) -> Opinion:
+    def first_look(self, grid, motions: Motions, expected, masks: int) -> Opinion:
         best = np.arange(min(masks, len(motions.poses)))
         return Opinion(np.zeros(len(motions.poses)), best, np.stack([self.static] * len(best)))
 
@@ -150,6 +153,9 @@ class Oracle:
         score = np.concatenate([old, new])
         best = np.array([score.argmax()])
         return Opinion(score, best, self.static[None], self.trust)
+
+    def look_with(self, before, static, refits, parents, masks) -> Opinion:
+        return self.look_again(before, refits, parents)
 
     def propose(self, pair: FramePair) -> Proposal | None:
         self.asked += 1
@@ -359,3 +365,97 @@ def test_slow_movers_under_noise_are_not_clear() -> None:
     # noise alone is no reason to doubt: the same noise where nothing moves
     pair, _ = make_pair(Cell(moving=0.0, flow_noise_px=0.5), 1, **SIZE)
     assert search_motions(pair, np.eye(4)[None, :3], None, RefinementOptions(), 0).clear
+
+
+def test_what_was_expected_is_weighed_by_its_covariance() -> None:
+    inputs = inputs_of(1)
+    sigma = torch.tensor([0.1, 0.2, 0.4, 0.01, 0.02, 0.04])
+    delta = np.array([0.1, 0.0, 0.4, 0.0, 0.02, 0.0])  # one standard deviation on three axes
+    pose = torch.as_tensor(se3_exp(delta)[None, :3], dtype=torch.float32)
+    told = replace(
+        inputs,
+        T_last=torch.eye(4)[None, :3],
+        has_last=torch.tensor([True]),
+        last_information=torch.diag(1 / sigma**2)[None],
+        pose=pose.expand(len(inputs.owner), 3, 4),
+    )
+    _, scalars, _ = judge_network.candidate_channels(told, None)
+    # three of six: 1 / (1 + 3 / 6), to the first order in 0.02 rad
+    torch.testing.assert_close(scalars[0, 4], torch.tensor(2 / 3), atol=5e-3, rtol=0)
+    assert scalars[0, 5] == 1
+    far = replace(told, last_information=1e12 * told.last_information)
+    _, scalars, _ = judge_network.candidate_channels(far, None)
+    # a prior that is sure of itself says a bounded amount
+    assert torch.isfinite(scalars).all() and scalars.abs().max() < 5
+    _, unknown, _ = judge_network.candidate_channels(inputs, None)
+    assert (unknown[:, 4:] == 0).all()
+
+
+def test_a_covariance_that_is_none_counts_as_unknown() -> None:
+    inputs = inputs_of(1)
+    usual = judge_network.expected_information(inputs.depth, inputs.usable, None)
+    for broken in (torch.zeros(1, 6, 6), torch.full((1, 6, 6), torch.nan)):
+        told = judge_network.expected_information(inputs.depth, inputs.usable, broken)
+        torch.testing.assert_close(told, usual)
+    exact = judge_network.expected_information(
+        inputs.depth, inputs.usable, torch.diag(torch.tensor([4.0] * 3 + [0.25] * 3))[None]
+    )
+    torch.testing.assert_close(exact[0].diagonal(), torch.tensor([0.25] * 3 + [4.0] * 3))
+    # 0.01 rad, and as much of the typical depth: its reciprocal is the mean of the reciprocals
+    near = (1 / inputs.depth[inputs.usable]).mean()
+    torch.testing.assert_close(usual[0, 0, 0].sqrt(), near / 0.01)
+    torch.testing.assert_close(usual[0, 5, 5].sqrt(), torch.tensor(100.0))
+    _, pair, truth = search(1)
+    with pytest.raises(InputError, match="T_last_covariance"):
+        refine(pair, T_last=truth["T_curr_prev"], T_last_covariance=np.eye(3))
+
+
+def test_all_candidates_are_seen_anew_with_a_static_world(network: JudgeNetwork) -> None:
+    found, pair, truth = search(1)
+    motions = second_look._motions(found.poses, found.facts)
+    judge = LearnedJudge(network)
+    first = judge.first_look(found.grid(pair), motions, None, 2)
+    again = judge.look_again(first, motions, np.arange(len(motions.poses)))
+    stride = found.shape[2]
+    static = ~truth["moving"][stride // 2 :: stride, stride // 2 :: stride]
+    empty = second_look._motions(np.zeros((0, 3, 4)), np.zeros((0, found.facts.shape[1])))
+    seen = judge.look_with(again, static.astype(np.float32), empty, np.zeros(0, np.int64), 2)
+    count = 2 * len(motions.poses)
+    assert seen.score.shape == again.score.shape == (count,)
+    assert np.abs(seen.score - again.score).max() > 1e-6
+    assert len(seen.mask) == len(seen.best) and set(seen.best) <= set(range(count))
+    assert np.isfinite(seen.mask).all() and 0 <= seen.trust <= 1
+    # with refits and without, in one call or two: the same candidates, the same scores
+    more = judge.look_with(first, static.astype(np.float32), motions, np.arange(count // 2), 2)
+    np.testing.assert_allclose(more.score, seen.score, atol=1e-4)
+    after = judge.look_again(seen, motions, np.arange(count // 2))
+    np.testing.assert_allclose(after.score[:count], seen.score)
+    np.testing.assert_allclose(after.score[count:], seen.score[count // 2 :], atol=1e-4)
+
+
+def test_a_judge_that_was_shown_less_can_be_taught_more(
+    network: JudgeNetwork, shards: Path, tmp_path: Path
+) -> None:
+    wide = {"shared.weight": 9, "scalars.weight": 6, "summary.weight": -2}
+    state = {
+        k: (v[:, : wide[k]] if k in wide else v).contiguous()
+        for k, v in network.state_dict().items()
+    }
+    save_file(state, tmp_path / "old.safetensors")
+    trainer = JudgeTrainer(JudgeTrainingOptions(), shards, tmp_path)
+    trainer.start_from(tmp_path / "old.safetensors")
+    inputs = inputs_of(1)
+    shown = replace(inputs, has_static=torch.tensor([True]), static=torch.ones_like(inputs.static))
+    with torch.no_grad():
+        # what it was never shown counts nothing yet, and what it was counts as before
+        got, other = trainer.network.eval()(inputs), trainer.network(shown)
+        expected = network(inputs)
+    torch.testing.assert_close(got.score, other.score)
+    torch.testing.assert_close(got.score, expected.score, atol=1e-4, rtol=1e-4)
+    state["score.weight"] = state["score.weight"][:, :-1].contiguous()
+    state.pop("score.bias")
+    save_file(state, tmp_path / "other.safetensors")
+    with pytest.raises(CheckpointError, match="not the weights of a judge"):
+        trainer.start_from(tmp_path / "other.safetensors")
+    with pytest.raises(CheckpointError, match="not a file of weights"):
+        trainer.start_from(tmp_path / "nothing.safetensors")
