@@ -115,6 +115,8 @@ def _trainer(arguments: argparse.Namespace, data: Path):
 def _train(arguments: argparse.Namespace) -> int:
     import torch
 
+    from hybridvo.training.provenance import source_commit
+
     if arguments.threads:
         torch.set_num_threads(arguments.threads)
     trainer = _trainer(arguments, arguments.data)
@@ -122,6 +124,9 @@ def _train(arguments: argparse.Namespace) -> int:
         print(f"going on after {trainer.elapsed:.1f} min, {trainer.pictures} pictures")
     elif arguments.init is not None:
         trainer.start_from(arguments.init)
+    record = {"command": "python tools/train_judge.py " + shlex.join(sys.argv[1:])}
+    record["commit"] = source_commit()
+    (arguments.out / "run.json").write_text(json.dumps(record, indent=1), encoding="utf-8")
     trainer.run(arguments.time_limit)
     print(f"{arguments.out / 'checkpoint.pt'}: {trainer.pictures} pictures seen")
     return 0
@@ -131,7 +136,6 @@ def _export(arguments: argparse.Namespace) -> int:
     from hybridvo.errors import InputError
     from hybridvo.network.weights import save_weights
     from hybridvo.training.judge_evaluation import evaluate_judge
-    from hybridvo.training.provenance import source_commit
 
     trainer = _trainer(arguments, arguments.held_out)
     if not trainer.resume():
@@ -148,8 +152,7 @@ def _export(arguments: argparse.Namespace) -> int:
         "updates": trainer.step,
         "pictures": trainer.pictures,
         "minutes": round(trainer.elapsed, 1),
-        "commit": source_commit(),
-        "command": "python tools/train_judge.py train " + shlex.join(_portable(trainer)),
+        **_record(arguments.out),
         "held_out": evaluate_judge(network, files),
         "held_out_with_proposals": evaluate_judge(network, files, asked=True),
         "licence": "the package's own",
@@ -163,9 +166,15 @@ def _export(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _portable(trainer) -> list[str]:
-    minutes = f"{trainer.elapsed:.0f}"
-    return ["--data", "DIR", "--out", "runs/judge", "--time-limit", minutes]
+def _record(out: Path) -> dict[str, str]:
+    """Command and commit of the training that stands in a folder."""
+    from hybridvo.errors import InputError
+
+    try:
+        stored = json.loads((out / "run.json").read_text(encoding="utf-8"))
+        return {key: str(stored[key]) for key in ("command", "commit")}
+    except (OSError, ValueError, LookupError) as error:
+        raise InputError(f"{out / 'run.json'}: not the record of a training: {error}.") from error
 
 
 if __name__ == "__main__":

@@ -48,10 +48,10 @@ with independent noise the difference stays below 5 and all pixels are better by
 movers have bent the fit it is tens to thousands and the mask is better by half."""
 LEAST_TRUST = 0.5
 """Probability of being right below which the classical choice stands: there the two err alike."""
-LEAST_TRUST_PROPOSED = 0.25
+LEAST_TRUST_PROPOSED = 0.15
 """The same with a proposal in the race: between the two the judge's best was wrong in 6 and the
 classical choice in 13 of 13 development answers; a judge that trusts nothing at all stays out."""
-CONSULT = 0.85
+CONSULT = 0.95
 """Probability of being right, by :mod:`hybridvo.pose.confidence`, below which the judge is asked
 for a proposal: where the answer would be degraded."""
 PROPOSED = (0.77, 0.91)
