@@ -171,7 +171,7 @@ def test_the_demo_starts_no_program_and_unpickles_nothing(watched):
     others = [words for words in seen["programs"] if words[:3] != own]
     assert {Path(words[0]).name for words in others} <= {"uname", "fc-list"}
     for words in seen["programs"]:
-        assert words[:3] != own or words[3].startswith("from hybridvo.hybrid import warm_up;")
+        assert words[:3] != own or words[3].startswith("from hybridvo.hybrid import _run_kernels;")
     assert seen["unpickled"] == []
 
 
