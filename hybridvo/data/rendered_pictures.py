@@ -1,8 +1,8 @@
 """Training pairs from the judge's pictures: rendered scenes with true, noisy and DIS flow.
 
 ``tools/train_judge.py make`` writes the pictures (shards of npz files); here they become samples of
-the pixel-wise networks. What DIS makes of a crowd of movers cannot be imitated by a noise model, and
-rendering a pair costs a hundred times what a training step on it does.
+the pixel-wise networks. What DIS makes of a crowd of movers cannot be imitated by a noise model,
+and rendering a pair costs a hundred times what a training step on it does.
 """
 
 from __future__ import annotations
