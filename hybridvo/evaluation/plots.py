@@ -282,6 +282,7 @@ def _save(figure: Figure, path: Path) -> None:
     """Whole file or none; no date and no version in it: the same input gives the same bytes."""
     metadata = {".png": {"Software": None}, ".pdf": {"CreationDate": None}, ".svg": {"Date": None}}
     kind = path.suffix.lower()
-    with atomic_write(path, "wb") as file, warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "Glyph", UserWarning)  # a name in letters without font
+    # a name in letters that the font lacks is drawn as boxes, without a word on stderr for each
+    quiet = warnings.catch_warnings(action="ignore", category=UserWarning)
+    with atomic_write(path, "wb") as file, quiet:
         figure.savefig(file, format=kind[1:], metadata=metadata[kind])

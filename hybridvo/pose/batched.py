@@ -54,7 +54,7 @@ class BatchOptions:
         largest_px, smallest_px: largest start and the end of the graduated scale, px.
         levels: Gauss-Newton steps between them.
         minimum_pixels: fewer usable pixels are a failure.
-        tile: side of the tiles, px, within which errors may be correlated (sandwich covariance).
+        tile: side of the tiles, px; errors may be correlated over two (sandwich covariance).
     """
 
     cutoff: float | None = None

@@ -23,8 +23,8 @@ class RefinementOptions:
         minimum_pixels: fewer usable pixels are a failure.
         second_depth: use the current frame's depth as a third residual: ``on``, ``off``, or
             ``auto``, where it adds more than half of what the flow knows in some direction.
-        tiles: about how many tiles the picture is cut into for the sandwich covariance; errors
-            may be correlated within a tile (of 8 to 64 px).
+        tiles: about how many tiles (of 8 to 64 px) the picture is cut into for the sandwich
+            covariance; errors may be correlated over two of them, and beyond where it shows.
     """
 
     cutoff: float = 3.0

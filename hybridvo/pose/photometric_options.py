@@ -23,8 +23,9 @@ class PhotometricOptions:
         least_weight: robust weight in the refinement below which a pixel is not used.
         cutoff: c of the Geman-McClure kernel, in standard deviations.
         flow_inflation: factor on the flow's covariance. The errors of estimated flow are alike over
-            distances far beyond the tiles of its sandwich covariance: with DIS the squared error,
-            in units of that covariance, has a median of about 50 where 6 is expected.
+            distances far beyond the blocks of its sandwich covariance: with DIS the squared error,
+            in units of that covariance, has a median of 8 to 10 where 5.4 is expected, and a long
+            tail. With less than this the polish errs more on development sequences.
         image_inflation: the same for the images, beyond their own tiles (interpolation, shading).
         freedom: degrees of freedom of the Student prior around the flow's motion: how well its
             covariance is known.
