@@ -51,8 +51,9 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
         if hasattr(compiled, "stats"):  # not where numba is switched off
             _cached.append(compiled)
         cache = getattr(compiled, "_cache", None)
-        if hasattr(getattr(cache, "_cache_file", None), "_source_stamp"):
-            cache._cache_file._source_stamp = _stamp(_file(compiled).parent)
+        index = getattr(cache, "_cache_file", None)
+        if hasattr(index, "_source_stamp"):
+            index._source_stamp = _stamp(_file(compiled).parent)
         for name in ("save_overload", "load_overload"):
             if hasattr(cache, name):
                 setattr(cache, name, _forgiving(getattr(cache, name)))
