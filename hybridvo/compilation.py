@@ -51,7 +51,7 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
         if hasattr(compiled, "stats"):  # not where numba is switched off
             _cached.append(compiled)
         cache = getattr(compiled, "_cache", None)
-        index = getattr(cache, "_cache_file", None)
+        index: Any = getattr(cache, "_cache_file", None)
         if hasattr(index, "_source_stamp"):
             index._source_stamp = _stamp(_file(compiled).parent)
         for name in ("save_overload", "load_overload"):
