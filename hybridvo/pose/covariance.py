@@ -31,7 +31,7 @@ though errors of depth leave some of them alone."""
 LONG_GROWTH = (1.7, 2.2)
 """Growth of the variance of sums over blocks four tiles wide (kept overlapping) against one tile's,
 in units of independent errors, between which the errors come to count as reaching beyond the
-blocks. Median and 95 % quantile over 60 development pairs or more: 1.0 and 1.5 of independent noise,
+blocks. Median and 95 % quantile over development pairs: 1.0 and 1.5 of independent noise,
 1.0 to 1.3 and 1.8 to 2.7 of the cells (24 px in tiles of 64 px), 2.2 to 3.1 the median with DIS
 flow. So every tenth to twentieth pair of noisy cells is doubted more than it should."""
 ABSORBED = 2.0
