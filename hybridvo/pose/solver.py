@@ -42,9 +42,9 @@ compromise between motions. The final fit may claim 2.5 times what the search fo
 DAMPING = 1e-6
 USUAL_DEPTH_NOISE = 0.01
 DOUBTFUL_DEPTH_NOISE = 0.03
-"""Noise of log depth where the flow cannot tell it: what is assumed, and what the standard error of
-its square goes up to (stereo and learned depth; by 0.01 instead the errors of far and of slowly
-moving scenes came out at twice their standard deviation: the slope of the flow in inverse depth is
+"""Noise of log depth up to whose square the standard error of the square goes where the flow cannot
+tell it (stereo and learned depth; with 0.01 instead the errors of far scenes came
+out at 1.7 times their standard deviation: the slope of the flow in inverse depth is
 shortened by the share of the noise in its variance)."""
 NOISE_PIXELS = 1000
 """Pixels that the noise estimate of the search looks at: flow noise to 2 %."""
