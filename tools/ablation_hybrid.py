@@ -1,10 +1,11 @@
 """What each learned part of the hybrid gives, on rendered sequences in which most of it moves.
 
-    python tools/ablation_hybrid.py --seed0 7000 --sequences 6 --out runs/ablation_hybrid
+    python tools/ablation_hybrid.py --seed0 8000 --sequences 6 --out runs/ablation_hybrid
 
 Rows, each with one part more than the one before: the classical refinement with its hand-made cues;
-the judge's first look; its second look; PWVO trained by the paper's losses; PWVO whose doubt was
-trained through the fit. Beside them the fit in the true mask, an oracle. Writes JSON and Markdown.
+the judge's first look; its second look; PWVO as it was after each stage of its training (the
+paper's losses, the doubt through the fit), where the weights of those stages are handed in; PWVO as
+shipped. Beside them the fit in the true mask, an oracle. Writes JSON and Markdown.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ def build_parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add("--sequences", type=int, default=6, help="of each kind of scene")
     add("--seed0", type=int, default=0, help="first seed; 0-999 are for development")
-    add("--pwvo-before", type=Path, metavar="FILE", help="PWVO trained by the paper's losses only")
+    add("--pwvo-paper", type=Path, metavar="FILE", help="PWVO trained by the paper's losses only")
+    add("--pwvo-fit", type=Path, metavar="FILE", help="PWVO trained through the fit as well")
     add("--judge", default="judge", help="name of shipped weights, or a file")
     add("--pwvo", default="pwvo", help="name of shipped weights, or a file")
     add("--flow", choices=("true", "dis", "both"), default="both")
@@ -52,7 +54,8 @@ def main(argv: list[str] | None = None) -> int:
         print("ablation_hybrid.py: expected --sequences >= 1 and --seed0 >= 0.", file=sys.stderr)
         return 2
     try:
-        rows = systems(args.judge, args.pwvo, args.pwvo_before)
+        stages = {"the paper's losses": args.pwvo_paper, "through the fit": args.pwvo_fit}
+        rows = systems(args.judge, args.pwvo, stages)
         records = measure(rows, args.seed0, args.sequences, args.flow)
         result = {
             "command": "python tools/ablation_hybrid.py "
@@ -76,7 +79,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def systems(
-    judge: str, pwvo: str, before: Path | None
+    judge: str, pwvo: str, stages: dict[str, Path | None]
 ) -> dict[str, Callable[[Any, dict[str, Any]], Any]]:
     """The rows: called with a pair and, for the oracle alone, its truth."""
     from hybridvo.learned_judge import LearnedJudge
@@ -86,8 +89,8 @@ def systems(
     class FirstLook(LearnedJudge):
         """Scores alone: no mask, no second fit."""
 
-        def first_look(self, grid: Any, motions: Any, T_last: Any, masks: int) -> Any:
-            return super().first_look(grid, motions, T_last, 0)
+        def first_look(self, grid: Any, motions: Any, expected: Any, masks: int) -> Any:
+            return super().first_look(grid, motions, expected, 0)
 
     def read(name: str | Path) -> Any:
         path = Path(name) if Path(name).is_file() else pretrained(str(name))
@@ -98,9 +101,10 @@ def systems(
         "+ judge, one look": FirstLook(network),
         "+ second look": LearnedJudge(network),
     }
-    if before is not None:
-        judges["+ PWVO, the paper's losses"] = LearnedJudge(network, read(before))
-    judges["+ PWVO, trained through the fit"] = LearnedJudge(network, read(pwvo))
+    for stage, path in stages.items():
+        if path is not None:
+            judges[f"+ PWVO, {stage}"] = LearnedJudge(network, read(path))
+    judges["+ PWVO as shipped"] = LearnedJudge(network, read(pwvo))
     rows: dict[str, Callable[[Any, dict[str, Any]], Any]] = {
         "refinement, hand-made cues": lambda pair, truth: refine(pair)
     }
