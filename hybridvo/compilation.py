@@ -64,12 +64,12 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
 
 @functools.cache
 def _stamp(folder: Path) -> tuple[Any, ...]:
-    """What numba's cache has to belong to: every source beside the function's own.
+    """What numba's cache has to belong to: every file with kernels beside the function's own.
 
     Numba looks at the file of the function alone, though its code holds that of the functions that
     it calls: after a change of theirs it would go on with the old ones, or fail between the two.
     """
-    files = sorted(folder.glob("*.py"))
+    files = [f for f in sorted(folder.glob("*.py")) if b"njit" in f.read_bytes()]
     return tuple((f.name, s.st_mtime_ns, s.st_size) for f in files for s in [f.stat()])
 
 

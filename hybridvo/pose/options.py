@@ -40,9 +40,9 @@ class RefinementOptions:
 
     def __post_init__(self) -> None:
         for name in ("cutoff", "search_pixels", "coarse_pixels", "minimum_pixels", "tiles"):
-            if not getattr(self, name) > 0:
+            if not 0 < getattr(self, name) < float("inf"):
                 raise InputError(
-                    f"RefinementOptions.{name}: expected a positive number, "
+                    f"RefinementOptions.{name}: expected a positive, finite number, "
                     f"got {getattr(self, name)!r}."
                 )
         if self.second_depth not in ("auto", "on", "off"):

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
+from hybridvo.checks import as_rigid, as_seed, to_numpy
 from hybridvo.errors import InputError
 from hybridvo.geometry import pose_matrix
 from hybridvo.pose import kernels, search, solver
@@ -101,43 +102,51 @@ def refine(
         a failed status, never an exception and never a value that is not finite.
 
     Raises:
-        InputError: a start or weights of the wrong shape, or starts that are not finite.
+        InputError: an argument of another kind or shape, a start that is no rigid transform, a
+            seed that no generator takes.
     """
     if isinstance(pair, PairBatch):
         from hybridvo.pose.batched import refine_batch
 
         return refine_batch(pair, T_init=T_init, weights=weights)
     started = time.perf_counter()
+    if not isinstance(pair, FramePair):
+        raise InputError(f"refine: expected a FramePair or a PairBatch, got {type(pair).__name__}.")
+    if not (callable(judge) or isinstance(judge, PictureJudge)):
+        raise InputError(f"refine.judge: expected a callable or a PictureJudge, got {judge!r}.")
+    seed = as_seed(seed, "refine.seed")
     options = options or RefinementOptions()
+    T_last = None if T_last is None else as_rigid(T_last, "refine.T_last")
     starts = _starts(T_init, T_last)
     if weights is not None and np.shape(weights) != pair.prev.camera.shape:
         raise InputError(
             f"refine: expected weights of shape {pair.prev.camera.shape}, got {np.shape(weights)}."
         )
-    expected = None if T_last is None else Expected(np.asarray(T_last, float), T_last_covariance)
-    if T_last_covariance is not None and np.shape(T_last_covariance) != (6, 6):
-        raise InputError(
-            f"refine: expected T_last_covariance of shape (6, 6), got "
-            f"{np.shape(T_last_covariance)}."
-        )
+    if T_last_covariance is not None:
+        T_last_covariance = to_numpy(T_last_covariance, "refine.T_last_covariance")
+        if T_last_covariance.shape != (6, 6) or T_last_covariance.dtype.kind not in "fiu":
+            raise InputError(
+                f"refine.T_last_covariance: expected numbers of shape (6, 6), got "
+                f"{T_last_covariance.dtype} of shape {T_last_covariance.shape}."
+            )
+    expected = None if T_last is None else Expected(T_last, T_last_covariance)
     result = _refine(pair, starts, weights, expected, options, judge, seed)
     return result.replace(ms=1e3 * (time.perf_counter() - started))
 
 
 def _starts(T_init: np.ndarray | None, T_last: np.ndarray | None) -> np.ndarray:
     """(S, 3, 4) starts: identity, the last motion, the handed-in ones."""
-    poses = [np.eye(4)[None]]
-    for name, value in (("T_last", T_last), ("T_init", T_init)):
-        if value is None:
-            continue
-        value = np.asarray(value, dtype=np.float64)
-        if value.shape[-2:] != (4, 4) or value.ndim not in (2, 3) or not np.isfinite(value).all():
+    poses = [np.eye(4)]
+    if T_last is not None:
+        poses.append(T_last)
+    if T_init is not None:
+        stack = to_numpy(T_init, "refine.T_init")
+        if stack.ndim not in (2, 3) or stack.shape[-2:] != (4, 4):
             raise InputError(
-                f"refine: expected {name} as finite (4, 4) or (S, 4, 4) transforms, "
-                f"got shape {value.shape}."
+                f"refine.T_init: expected (4, 4) or (S, 4, 4) transforms, got shape {stack.shape}."
             )
-        poses.append(value.reshape(-1, 4, 4))
-    return np.ascontiguousarray(np.concatenate(poses)[:, :3, :])
+        poses += [as_rigid(T, "refine.T_init") for T in stack.reshape(-1, 4, 4)]
+    return np.ascontiguousarray(np.stack(poses)[:, :3, :])
 
 
 def _refine(

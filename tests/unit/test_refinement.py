@@ -480,8 +480,24 @@ def test_bad_arguments_are_refused_at_the_door():
         refine(pair, T_init=np.full((4, 4), np.nan))
     with pytest.raises(InputError, match="T_last"):
         refine(pair, T_last=np.eye(3))
-    with pytest.raises(InputError, match="cutoff"):
-        RefinementOptions(cutoff=0)
+    with pytest.raises(InputError, match="T_last"):
+        refine(pair, T_last=np.zeros((4, 4)))
+    with pytest.raises(InputError, match="T_last"):
+        refine(pair, T_last=np.stack([np.eye(4)] * 2))
+    with pytest.raises(InputError, match="T_init"):
+        refine(pair, T_init=np.stack([np.eye(4), 2 * np.eye(4)]))
+    with pytest.raises(InputError, match="T_last_covariance"):
+        refine(pair, T_last=np.eye(4), T_last_covariance=np.full((6, 6), "much"))
+    for seed in (None, "1", 1.0, True, -1, 10**30):
+        with pytest.raises(InputError, match="seed"):
+            refine(pair, seed=seed)
+    with pytest.raises(InputError, match="FramePair"):
+        refine((pair.prev, pair.curr))
+    with pytest.raises(InputError, match="judge"):
+        refine(pair, judge="hybrid")
+    for cutoff in (0, np.inf, np.nan):
+        with pytest.raises(InputError, match="cutoff"):
+            RefinementOptions(cutoff=cutoff)
     with pytest.raises(InputError, match="second_depth"):
         RefinementOptions(second_depth="maybe")
 
