@@ -251,9 +251,13 @@ def weigh_pixels(buf, n, noise, J, r, w):
     is2, sd2, c2 = noise[0], noise[1], noise[2]
     weights, relative, gradient = buf[W], buf[PD], J[GQ]
     total = 0.0
+    # no sum in a loop that stores: whether that one runs in vectors, and so the order of the sum,
+    # depends on where its arrays happen to lie in memory
+    costs = np.empty(BLOCK, np.float32)
     for o in range(0, n, BLOCK):
-        cost = ZERO
-        for k in range(o, min(o + BLOCK, n)):
+        m = min(BLOCK, n - o)
+        for j in range(m):
+            k = o + j
             gq = gradient[k]
             e = r[k]
             information = is2 / (ONE + is2 * sd2 * relative[k] * gq * gq)
@@ -262,7 +266,10 @@ def weigh_pixels(buf, n, noise, J, r, w):
             d2 = d2 if seen else ZERO
             robust = c2 / (c2 + d2)
             w[k] = weights[k] * robust * robust * information if seen else ZERO
-            cost += HALF * weights[k] * (robust * d2 if seen else c2)
+            costs[j] = HALF * weights[k] * (robust * d2 if seen else c2)
+        cost = ZERO
+        for j in range(m):
+            cost += costs[j]
         total += cost
     return total
 
