@@ -97,7 +97,8 @@ class LearnedJudge:
             if pool is not None:
                 pool = replace(pool, static=inputs.static, has_static=inputs.has_static)
                 seen.append(self._network.encode(pool, (inputs, features)))
-                score, hidden = (torch.cat([getattr(f, n) for f in seen]) for n in _SAID)
+                score = torch.cat([f.score for f in seen])
+                hidden = torch.cat([f.hidden for f in seen])
             best = _worth_a_look(score, masks)
             mask = torch.stack([self._mask(seen, int(k)) for k in best]).numpy()
             trust = self._trust(score, hidden)
@@ -124,9 +125,6 @@ class LearnedJudge:
             return None
         with plain_torch():
             return propose_motion(self._pixelwise, pair)
-
-
-_SAID = ("score", "hidden")
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,3 +22,17 @@ def shared_data() -> Path:
 @pytest.fixture
 def rng() -> np.random.Generator:
     return np.random.default_rng(7)
+
+
+@pytest.fixture(scope="module")
+def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A few of the judge's training pictures, as `tools/train_judge.py make` writes them."""
+    from hybridvo.training import judge_data
+
+    folder = tmp_path_factory.mktemp("pictures")
+    count, judge_data.PER_SHARD = judge_data.PER_SHARD, 12
+    try:
+        assert judge_data.write_shard(folder, 0) > 4
+    finally:
+        judge_data.PER_SHARD = count
+    return folder

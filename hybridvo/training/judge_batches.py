@@ -144,9 +144,10 @@ def _read_shard(path: Path) -> dict[str, np.ndarray]:
             arrays = dict(file)
     except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
         raise FormatError(f"{path}: not a shard of pictures ({error}).") from None
-    if "count" not in arrays:
-        raise FormatError(f"{path}: not a shard of pictures (no array 'count').")
-    return arrays
+    for name in ("count", "label"):
+        if name not in arrays:
+            raise FormatError(f"{path}: not a shard of pictures (no array '{name}').")
+    return arrays | read_proposals(path, arrays["label"].shape)
 
 
 def read_batches(
@@ -159,7 +160,7 @@ def read_batches(
     jobs = []
     pictures: dict[str, dict[str, np.ndarray]] = {}
     for shape, members in by_shape.items():
-        loaded = [_read_shard(member) | read_proposals(member) for member in members]
+        loaded = [_read_shard(member) for member in members]
         pictures[shape] = {key: np.concatenate([x[key] for x in loaded]) for key in loaded[0]}
         order = np.arange(len(pictures[shape]["count"]))
         if rng is not None:

@@ -61,16 +61,19 @@ def write_proposals(folder: str | os.PathLike[str], network: torch.nn.Module) ->
     return total
 
 
-def read_proposals(path: Path) -> dict[str, np.ndarray]:
-    """``proposal``, ``static`` and ``proposed`` of the pictures of a shard; False if not asked."""
+def read_proposals(path: Path, shape: tuple[int, int, int]) -> dict[str, np.ndarray]:
+    """``proposal``, ``static`` and ``proposed`` of the pictures of a shard; False if not asked.
+
+    Args:
+        path: of the shard.
+        shape: (pictures, rows, columns) of what it holds.
+    """
     beside = path.parent / FOLDER / path.name
-    with np.load(path) as file:
-        count, h, w = file["label"].shape
     if not beside.exists():
         return {
-            "proposal": np.tile(np.eye(4)[:3], (count, 1, 1)),
-            "static": np.full((count, h, w), 0.5, np.float16),
-            "proposed": np.zeros(count, bool),
+            "proposal": np.tile(np.eye(4)[:3], (shape[0], 1, 1)),
+            "static": np.full(shape, 0.5, np.float16),
+            "proposed": np.zeros(shape[0], bool),
         }
     with np.load(beside) as file:
         said = dict(file)

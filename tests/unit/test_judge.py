@@ -263,17 +263,6 @@ def test_pictures_are_the_pairs_they_came_from() -> None:
             np.testing.assert_array_equal(one[key], two[key])
 
 
-@pytest.fixture(scope="module")
-def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("pictures")
-    count, judge_data.PER_SHARD = judge_data.PER_SHARD, 12
-    try:
-        assert judge_data.write_shard(folder, 0) > 4
-    finally:
-        judge_data.PER_SHARD = count
-    return folder
-
-
 def batches(folder: Path) -> list[PictureBatch]:
     return list(read_batches(sorted(folder.glob("*.npz")), 4, None))
 

@@ -15,22 +15,10 @@ from hybridvo.errors import FormatError, InputError
 from hybridvo.learned import shipped_network
 from hybridvo.network.judge import JudgeNetwork, JudgeOptions
 from hybridvo.pose.weighted_fit import weighted_fit
-from hybridvo.training import judge_data
 from hybridvo.training.held_out import evaluate_network
 from hybridvo.training.judge_batches import PictureBatch, read_batches, refits_of
 from hybridvo.training.judge_proposals import write_proposals
 from hybridvo.training.stream import collate, sample_generator
-
-
-@pytest.fixture(scope="module")
-def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("pictures")
-    count, judge_data.PER_SHARD = judge_data.PER_SHARD, 12
-    try:
-        assert judge_data.write_shard(folder, 0) > 4
-    finally:
-        judge_data.PER_SHARD = count
-    return folder
 
 
 def pictures(shards: Path, source: int) -> list[dict[str, np.ndarray]]:
