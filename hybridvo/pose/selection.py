@@ -19,6 +19,8 @@ s = log U, U the Laplace scale that the network predicts:
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 import torch.nn.functional as F
 
@@ -69,8 +71,9 @@ def select(
         (B, 3) Euler angles X-Y-Z in degrees and (B, 3) translation in metres, of T_curr_prev.
 
     Raises:
-        InputError: unknown method, patch below 1, maps of the wrong shape, or a prediction without
-            uncertainty for a method that needs it.
+        InputError: unknown method, patch below 1, what is no prediction, maps that are no dense
+            floating-point tensors, of the wrong shape or on several devices, or a prediction
+            without uncertainty for a method that needs it.
 
     Example:
         >>> import torch
@@ -80,15 +83,18 @@ def select(
         >>> select(prediction)[0].tolist()
         [[2.0, 2.0, 2.0]]
     """
-    if method not in SELECTION_METHODS:
+    if not isinstance(method, str) or method not in SELECTION_METHODS:
         raise InputError(
             f"select: method {method!r} unknown; known: {', '.join(SELECTION_METHODS)}."
         )
+    if not isinstance(joint, bool):
+        raise InputError(f"select: expected joint to be True or False, got {joint!r}.")
     _check(prediction, needs_scale=method != "mean")
-    height = prediction.rotation.shape[2]
+    height, width = prediction.rotation.shape[2:]
     patch = -(-height // PATCH_ROWS) if patch is None else patch
     if isinstance(patch, bool) or not isinstance(patch, int) or patch < 1:
         raise InputError(f"select: expected a patch side of at least 1 cell, got {patch!r}.")
+    patch = min(patch, max(height, width))  # a larger one is the whole map, and padding
     pairs = (
         (prediction.rotation, prediction.log_scale_rotation),
         (prediction.translation, prediction.log_scale_translation),
@@ -157,7 +163,13 @@ def chosen_motion(
 
 
 def _check(prediction: PixelwisePrediction, needs_scale: bool) -> None:
-    shape = tuple(prediction.rotation.shape)
+    """Refuse what is no prediction, and maps that do not belong to each other."""
+    if not isinstance(prediction, PixelwisePrediction):
+        raise InputError(
+            f"select: expected a PixelwisePrediction, got {type(prediction).__name__}."
+        )
+    rotation = _checked_map("rotation", prediction.rotation)
+    shape = tuple(rotation.shape)
     if len(shape) != 4 or shape[1] != 3 or 0 in shape[2:]:
         raise InputError(f"select: expected rotation maps of shape (B, 3, h, w), got {shape}.")
     maps = {
@@ -166,14 +178,41 @@ def _check(prediction: PixelwisePrediction, needs_scale: bool) -> None:
         "log_scale_translation": prediction.log_scale_translation,
     }
     for name, value in maps.items():
-        if value is None:
+        if value is None and name != "translation":
             if needs_scale:
                 raise InputError(
                     f"select: the prediction has no {name}; a network without uncertainty can "
                     f"only be averaged: method='mean'."
                 )
-        elif tuple(value.shape) != shape:
+            continue
+        value = _checked_map(name, value)
+        if tuple(value.shape) != shape:
             raise InputError(f"select: expected {name} of {shape}, got {tuple(value.shape)}.")
+        if value.device != rotation.device:
+            raise InputError(
+                f"select: expected {name} on {rotation.device} as the rotation, got "
+                f"{value.device}. Move it with .to()."
+            )
+
+
+def _checked_map(name: str, value: Any) -> torch.Tensor:
+    """``value`` if it is a dense tensor of real numbers, which all that follows computes with."""
+    if not isinstance(value, torch.Tensor):
+        raise InputError(
+            f"select: expected {name} as a torch tensor, got {type(value).__name__}. "
+            f"torch.as_tensor converts arrays and lists."
+        )
+    if not value.is_floating_point():
+        raise InputError(
+            f"select: expected {name} of a floating-point type, got {value.dtype}. "
+            f"Convert it with .float()."
+        )
+    if value.layout is not torch.strided or value.is_nested:
+        raise InputError(
+            f"select: expected {name} as a dense tensor, got layout {value.layout}. "
+            f"Convert it with .to_dense()."
+        )
+    return value
 
 
 def _mean(value: torch.Tensor) -> torch.Tensor:
