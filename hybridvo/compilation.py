@@ -20,9 +20,34 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
-import numba
+from hybridvo.errors import InputError
 
-__all__ = ["compile_once", "njit"]
+MOST_THREADS = 4096
+"""More than a machine has cores; a million end the process where numba starts them."""
+
+
+def check_threads() -> None:
+    """Refuse a ``NUMBA_NUM_THREADS`` that numba answers with a traceback, or with a crash.
+
+    Raises:
+        InputError: no whole number from 1 to ``MOST_THREADS``.
+    """
+    setting = os.environ.get("NUMBA_NUM_THREADS")
+    try:
+        usable = setting is None or 1 <= int(setting) <= MOST_THREADS
+    except ValueError:
+        usable = False
+    if not usable:
+        raise InputError(
+            f"NUMBA_NUM_THREADS (environment): expected a whole number from 1 to {MOST_THREADS}, "
+            f"got {setting!r}. Unset it: numba then takes as many threads as there are cores."
+        )
+
+
+check_threads()  # before numba reads it
+import numba  # noqa: E402
+
+__all__ = ["check_threads", "compile_once", "njit"]
 
 LONGEST_S = 1200.0
 """Patience with the compiling process, seconds: twenty times what it takes."""

@@ -24,7 +24,7 @@ IMPORTS: dict[str, set[str]] = {
     "errors": set(),
     "checks": {"errors"},
     "types": {"checks", "errors"},
-    "compilation": set(),
+    "compilation": {"errors"},
     "geometry": NOUNS,
     "data": NOUNS | {"geometry", "compilation"},
     "flow": NOUNS | {"geometry"},
@@ -65,7 +65,7 @@ IMPORTS: dict[str, set[str]] = {
     },
     # what stands at the door
     "demo": {"errors", "data", "evaluation", "configuration", "run"},
-    "doctor": {"__init__", "errors", "hybrid"},
+    "doctor": {"__init__", "compilation", "errors", "hybrid"},
     "diagnosis_findings": CLASSICAL | {"depth_steps"},
     "diagnosis": CLASSICAL | {"flow", "diagnosis_findings", "depth_steps"},
     "__init__": set(),
