@@ -8,6 +8,7 @@ import numpy as np
 
 from hybridvo.pose import kernels, second_depth, solver
 from hybridvo.pose.covariance import ORDER, UPPER, sandwich_covariance, symmetric
+from hybridvo.pose.depth_agreement import DepthAgreement, depth_agreement
 from hybridvo.pose.options import RefinementOptions
 from hybridvo.pose.picture import Picture, as_given
 from hybridvo.types import FramePair
@@ -47,6 +48,7 @@ class FullFit:
         weights: (H, W) robust weights. weight: their sum. share: of the pixels that follow.
         cost: per usable pixel. flow_noise: px. depth_noise: of log depth, both relative to the
             variances handed in. uses_second_depth: whether the third residual took part.
+        depths: how the second depth agrees with the first, moved; None where it cannot be told.
     """
 
     pose: np.ndarray
@@ -62,6 +64,7 @@ class FullFit:
     iterations: int
     uses_second_depth: bool
     tiles: int
+    depths: DepthAgreement | None = None
 
     @property
     def is_narrow(self) -> bool:
@@ -173,6 +176,11 @@ def fit_full_grid(
         # whether depth errs about its log, its value or its inverse is not known: the translation's
         # length is uncertain by half the variance of log depth
         covariance[:3, :3] += (0.5 * sd**2) ** 2 * np.outer(pose[:, 3], pose[:, 3])
+    depths = None
+    if options.second_depth != "off" and pair.curr.depth is not None:
+        robust = np.empty(n, np.float32)
+        solver.robust_weights(samples, n, pose, picture.K, noise, work, robust)
+        depths = depth_agreement(pair.curr, samples[:, :n], robust, pose, picture.origin)
     return FullFit(
         pose=pose,
         covariance=covariance,
@@ -187,6 +195,7 @@ def fit_full_grid(
         iterations=int(iterations),
         uses_second_depth=term is not None,
         tiles=_tiles_used(picture, samples, n, pair.prev.camera.shape, options.tiles),
+        depths=depths,
     )
 
 

@@ -269,6 +269,8 @@ def _result(
         return RelativePose.failed(
             Reason.LOW_INLIERS, f"{100 * fit.share:.1f} % of the pixels follow one motion", **common
         )
+    if fit.depths is not None and fit.depths.is_none:
+        return RelativePose.failed(Reason.NO_VALID_DEPTH, fit.depths.doubt, **common)
     noise_px = common["residual_scale_px"] * REFERENCE_WIDTH / width
     spread = np.sqrt(max(np.linalg.eigvalsh(fit.covariance[:3, :3])[-1], 0.0))
     return RelativePose(
@@ -285,6 +287,8 @@ def _status(
 ) -> Status:
     """Ok, or degraded with the reason."""
     share = fit.share
+    if fit.depths is not None and fit.depths.doubt:
+        return Status.degraded(Reason.NO_VALID_DEPTH, fit.depths.doubt)
     if decision is not None:
         probability = probability_right(decision.trust, noise_px, share)
         if probability < TRUSTED:
