@@ -20,6 +20,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, cast
 
+RECORD = "options.json"
+"""Says what the training in a folder is."""
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the tool; returns its exit code (2: bad input, 5: output that cannot be written)."""
@@ -52,7 +55,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     add("--workers", type=int, default=0, help="processes that draw samples (0: this one)")
     add("--device", default="auto", help="auto, cpu or cuda")
     add("--init", type=Path, metavar="FILE", help="start from these weights: a file, or pwvo")
-    add("--overwrite", action="store_true", help="start anew although --out has a checkpoint")
+    add("--overwrite", action="store_true", help="start anew where --out has a training")
     add("--export", type=Path, metavar="FILE", help="write weights for users when done (float16)")
     add("--calibrate", type=int, default=0, metavar="N", help="shift s by N development pairs")
     add("--export-count", type=int, default=1000, help="held-out pairs of each preset in the card")
@@ -82,11 +85,14 @@ def _train(arguments: argparse.Namespace, argv: list[str]) -> int:
     import cv2
     import torch
 
-    from hybridvo.errors import InputError, OutputError
+    from hybridvo.errors import InputError
+    from hybridvo.evaluation.report import write_json
     from hybridvo.run import check_device
     from hybridvo.training.loop import Trainer
     from hybridvo.training.options import load_training_options
+    from hybridvo.training.outputs import check_export, check_folder, make_folder
     from hybridvo.training.provenance import source_commit
+    from hybridvo.training.stream import check_batch_fits
 
     for name in ("threads", "time_limit"):
         value = getattr(arguments, name)
@@ -117,17 +123,19 @@ def _train(arguments: argparse.Namespace, argv: list[str]) -> int:
             options.optimizer, learning_rate=arguments.learning_rate
         )
     options = dataclasses.replace(options, **changes)
+    check_batch_fits(mixture, options.batch_size)
     out: Path = arguments.out
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{out}: cannot make the folder: {error.strerror or error}.") from error
+    if not arguments.no_train:
+        check_folder(out, RECORD, ("command", "options"))
+    if arguments.export is not None:
+        check_export(arguments.export, out, RECORD)
+    make_folder(out)
     device = arguments.device
     if device == "auto":
         device = "cuda" if torch.cuda.is_available() else "cpu"
     trainer = Trainer(options, mixture, out, device, arguments.workers, report=_report)
     checkpoint = out / "checkpoint.pt"
-    if checkpoint.exists() and not arguments.overwrite:
+    if checkpoint.exists() and (arguments.no_train or not arguments.overwrite):
         trainer.resume(checkpoint)
         _say(trainer.rank, f"resumed {checkpoint} at update {trainer.step}")
     elif arguments.init is not None:
@@ -145,7 +153,7 @@ def _train(arguments: argparse.Namespace, argv: list[str]) -> int:
                 "commit": source_commit(),
                 "torch": torch.__version__,
             }
-            (out / "options.json").write_text(json.dumps(record, indent=2), encoding="utf-8")
+            write_json(out / RECORD, record)
         with _clean_stop(trainer):
             limit = arguments.time_limit
             why = trainer.run(math.inf if limit is None else 60 * limit)
@@ -158,7 +166,7 @@ def _train(arguments: argparse.Namespace, argv: list[str]) -> int:
 def _record(out: Path, default: dict[str, Any]) -> dict[str, Any]:
     """What the run wrote of itself when it trained: its command and commit, not the export's."""
     try:
-        return default | json.loads((out / "options.json").read_text(encoding="utf-8"))
+        return default | json.loads((out / RECORD).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return default
 
@@ -191,6 +199,7 @@ def _export(trainer: Any, arguments: argparse.Namespace, record: dict[str, Any])
 
     from hybridvo.network.weights import load_weights, save_weights
     from hybridvo.training.held_out import PUBLISHED_SEED, calibrate_scales, evaluate_network
+    from hybridvo.trajectory import atomic_write
 
     options = trainer.options
     card: dict[str, Any] = {
@@ -212,7 +221,6 @@ def _export(trainer: Any, arguments: argparse.Namespace, record: dict[str, Any])
         ),
     }
     path: Path = arguments.export
-    path.parent.mkdir(parents=True, exist_ok=True)
     save_weights(path, trainer.exported, options.network, card, "float16")
     if arguments.calibrate:
         preset = trainer.mixture.presets[_widest(options)]
@@ -228,8 +236,8 @@ def _export(trainer: Any, arguments: argparse.Namespace, record: dict[str, Any])
         for name, preset in zip(options.data, trainer.mixture.presets, strict=True)
     }
     save_weights(path, network, options.network, card, "float16")
-    text = json.dumps(card, indent=1, sort_keys=True) + "\n"
-    path.with_suffix(".json").write_text(text, encoding="utf-8")
+    with atomic_write(path.with_suffix(".json")) as file:
+        file.write(json.dumps(card, indent=1, sort_keys=True) + "\n")
     sys.stdout.write(json.dumps({"file": str(path), "held_out": card["held_out"]}, indent=2) + "\n")
 
 

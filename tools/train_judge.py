@@ -22,6 +22,9 @@ ROOT = Path(__file__).resolve().parents[1]
 if str(ROOT) not in sys.path:
     sys.path.insert(0, str(ROOT))
 
+RECORD, RECORDED = "run.json", ("command", "commit")
+"""Says what the training in a folder is, and what it says."""
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the tool; returns its exit code (2: bad input, 5: output that cannot be written)."""
@@ -67,25 +70,17 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     return parser.parse_args(argv)
 
 
-def _make_folder(path: Path) -> None:
-    from hybridvo.errors import OutputError
-
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{path}: cannot make the folder: {error.strerror or error}.") from error
-
-
 def _make(arguments: argparse.Namespace) -> int:
     from hybridvo.errors import InputError
     from hybridvo.training.judge_data import PER_SHARD, write_shard
+    from hybridvo.training.outputs import make_folder
 
     if arguments.first_seed < 0 or arguments.seeds < 1:
         raise InputError(
             f"expected --first-seed >= 0 and --seeds >= 1, got {arguments.first_seed} and "
             f"{arguments.seeds}."
         )
-    _make_folder(arguments.data)
+    make_folder(arguments.data)
     last = arguments.first_seed + arguments.seeds
     for seed in range(arguments.first_seed, last, PER_SHARD):
         count = write_shard(arguments.data, seed)
@@ -107,21 +102,25 @@ def _propose(arguments: argparse.Namespace) -> int:
 def _trainer(arguments: argparse.Namespace, data: Path):
     from hybridvo.data.presets import build_options, read_yaml
     from hybridvo.training.judge_loop import JudgeTrainer, JudgeTrainingOptions
+    from hybridvo.training.outputs import make_folder
 
     options = build_options(
         JudgeTrainingOptions, read_yaml(arguments.config), str(arguments.config)
     )
-    _make_folder(arguments.out)
+    make_folder(arguments.out)
     return JudgeTrainer(options, data, arguments.out)
 
 
 def _train(arguments: argparse.Namespace) -> int:
     import torch
 
+    from hybridvo.evaluation.report import write_json
+    from hybridvo.training.outputs import check_folder
     from hybridvo.training.provenance import source_commit
 
     if arguments.threads:
         torch.set_num_threads(arguments.threads)
+    check_folder(arguments.out, RECORD, RECORDED)
     trainer = _trainer(arguments, arguments.data)
     if trainer.resume():
         print(f"going on after {trainer.elapsed:.1f} min, {trainer.pictures} pictures")
@@ -129,7 +128,7 @@ def _train(arguments: argparse.Namespace) -> int:
         trainer.start_from(arguments.init)
     record = {"command": "python tools/train_judge.py " + shlex.join(sys.argv[1:])}
     record["commit"] = source_commit()
-    (arguments.out / "run.json").write_text(json.dumps(record, indent=1), encoding="utf-8")
+    write_json(arguments.out / RECORD, record)
     trainer.run(arguments.time_limit)
     print(f"{arguments.out / 'checkpoint.pt'}: {trainer.pictures} pictures seen")
     return 0
@@ -139,7 +138,10 @@ def _export(arguments: argparse.Namespace) -> int:
     from hybridvo.errors import InputError
     from hybridvo.network.weights import save_weights
     from hybridvo.training.judge_evaluation import evaluate_judge
+    from hybridvo.training.outputs import check_export
+    from hybridvo.trajectory import atomic_write
 
+    check_export(arguments.export, arguments.out, RECORD)
     trainer = _trainer(arguments, arguments.held_out)
     if not trainer.resume():
         raise InputError(f"{arguments.out}: no checkpoint; train first.")
@@ -162,8 +164,8 @@ def _export(arguments: argparse.Namespace) -> int:
     }
     save_weights(arguments.export, network, trainer.options.network, card, dtype="float16")
     # the same card for people, beside the weights
-    text = json.dumps(card, indent=1, sort_keys=True) + "\n"
-    arguments.export.with_suffix(".json").write_text(text, encoding="utf-8")
+    with atomic_write(arguments.export.with_suffix(".json")) as file:
+        file.write(json.dumps(card, indent=1, sort_keys=True) + "\n")
     print(json.dumps(card["held_out"], indent=1))
     print(f"{arguments.export}: {arguments.export.stat().st_size / 1e6:.1f} MB")
     return 0
@@ -174,10 +176,10 @@ def _record(out: Path) -> dict[str, str]:
     from hybridvo.errors import InputError
 
     try:
-        stored = json.loads((out / "run.json").read_text(encoding="utf-8"))
-        return {key: str(stored[key]) for key in ("command", "commit")}
+        stored = json.loads((out / RECORD).read_text(encoding="utf-8"))
+        return {key: str(stored[key]) for key in RECORDED}
     except (OSError, ValueError, LookupError) as error:
-        raise InputError(f"{out / 'run.json'}: not the record of a training: {error}.") from error
+        raise InputError(f"{out / RECORD}: not the record of a training: {error}.") from error
 
 
 if __name__ == "__main__":

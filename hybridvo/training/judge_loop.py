@@ -300,12 +300,19 @@ class JudgeTrainer:
         """Go on from ``checkpoint.pt`` if there is one.
 
         Raises:
-            CheckpointError: a damaged file, or one of another training.
+            CheckpointError: a damaged file, or one of another training or seed.
         """
         path = self.out / "checkpoint.pt"
         if not path.exists():
             return False
         state = load_checkpoint(path)
+        seed = state["options"].get("seed", self.options.seed)
+        if seed != self.options.seed:
+            raise CheckpointError(
+                f"{path}: was trained with seed {seed}, this run asks for seed "
+                f"{self.options.seed}. Set seed: {seed} in the configuration, or choose another "
+                f"--out."
+            )
         try:
             self.network.load_state_dict(state["network"])
             self.optimizer.load_state_dict(state["optimizer"])

@@ -405,7 +405,7 @@ class Trainer:
         """Go on where a checkpoint ended.
 
         Raises:
-            CheckpointError: a damaged file, or one of another network.
+            CheckpointError: a damaged file, or one of another network or seed.
         """
         state = load_checkpoint(path)
         theirs = state.get("options", {}).get("network")
@@ -415,6 +415,13 @@ class Trainer:
         ours = dataclasses.asdict(self.options.network) | {"passes": theirs.get("passes")}
         if theirs != ours:
             raise CheckpointError(f"{path}: is of network {theirs}, this run asks for {ours}.")
+        seed = state["options"].get("seed", self.options.seed)
+        if seed != self.options.seed:
+            raise CheckpointError(
+                f"{path}: was trained with seed {seed}, this run asks for seed "
+                f"{self.options.seed}: other samples from here on. Go on with --seed {seed}, or "
+                f"start anew with --overwrite or in another folder."
+            )
         if (state["ema"] is None) != (self.ema is None):
             raise CheckpointError(
                 f"{path}: ema_decay must be above 0 in both or in neither of the runs."

@@ -7,8 +7,10 @@ seed, has seen a held-out pair.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
@@ -20,10 +22,21 @@ from hybridvo.errors import InputError
 from hybridvo.network.inputs import NetworkInputs, assemble_aligned
 from hybridvo.network.losses import LossTargets
 
-__all__ = ["Mixture", "SampleStream", "TrainingBatch", "collate", "sample_generator"]
+__all__ = [
+    "Mixture",
+    "SampleStream",
+    "TrainingBatch",
+    "check_batch_fits",
+    "collate",
+    "sample_generator",
+]
 
 TRAINING_KEYS = 1 << 32
 """Added to the seed of training samples; held-out seeds lie below."""
+
+
+SMALL_BATCH = 200
+"""Samples of a batch that need no look at the memory: twice the paper's."""
 
 
 class Preset(Protocol):
@@ -99,6 +112,46 @@ class TrainingBatch:
         return TrainingBatch(
             self.inputs.to(device), self.targets.to(device), self.moving.to(device)
         )
+
+
+def check_batch_fits(mixture: Mixture, batch_size: int) -> None:
+    """Refuse a batch whose samples alone do not fit into the memory, before they are drawn.
+
+    A lower bound: the samples and the tensors that they are stacked into. What the network makes of
+    them depends on the device and comes on top.
+
+    Raises:
+        InputError: too many samples.
+    """
+    have = available_bytes()
+    if have is None or batch_size <= SMALL_BATCH:
+        return
+    samples = (preset.sample(sample_generator(0, 0)) for preset in mixture.presets)
+    largest = max(
+        sum(value.nbytes for value in vars(sample).values() if value is not None)
+        for sample in samples
+    )
+    need = 2 * largest * batch_size
+    if need > have:
+        raise InputError(
+            f"batch_size: {batch_size} samples of {largest / 1e6:.1f} MB need {need / 1e9:.3g} GB "
+            f"as arrays and as tensors, {have / 1e9:.3g} GB of memory are free. Expected at most "
+            f"{have // (2 * largest)}; batches of 8 to 100 are usual."
+        )
+
+
+def available_bytes() -> int | None:
+    """Memory that is free for programs, or all there is where that is not told; None if unknown."""
+    try:
+        for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
+            if line.startswith("MemAvailable:"):
+                return 1024 * int(line.split()[1])
+    except (OSError, ValueError, IndexError):  # not on macOS and Windows
+        pass
+    try:
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, OSError, ValueError):
+        return None
 
 
 def collate(samples: Sequence[Sample]) -> TrainingBatch:

@@ -5,16 +5,26 @@ What was tried, and what is left, is in docs/attack.md.
 
 from __future__ import annotations
 
+import json
 import os
+import runpy
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
+import psutil
 import pytest
 import torch
 
-from hybridvo.errors import InputError
+from hybridvo.data.workflow import PaperOptions
+from hybridvo.errors import CheckpointError, InputError
+from hybridvo.network.judge import JudgeOptions
+from hybridvo.network.weights import pretrained
 from hybridvo.pose.selection import SELECTION_METHODS, select
+from hybridvo.training import stream
+from hybridvo.training.judge_loop import JudgeTrainer, JudgeTrainingOptions
+from hybridvo.training.outputs import check_export
 from hybridvo.types import PixelwisePrediction
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -141,3 +151,180 @@ def test_numbas_threads_are_refused_in_words(threads: str) -> None:
     assert any(line.startswith("note") and told in line for line in doors)
     assert ready == "NOT ready: see above"
     assert not (ROOT / "nowhere").exists()
+
+
+# training
+
+
+def configuration(folder: Path, **changes: object) -> Path:
+    (folder / "data_paper.yaml").write_text("preset: paper\nheight: 32\nwidth: 64\n")
+    options = {
+        "network": {"width": 0.1, "head_stride": 2},
+        "data": ["data_paper.yaml"],
+        "data_weights": [1.0],
+        "steps": 1,
+        "batch_size": 2,
+        "log_every": 1,
+    }
+    path = folder / "train.yaml"
+    path.write_text(json.dumps(options | changes))
+    return path
+
+
+class Training:
+    """``tools/train.py`` on a tiny network, and what it says."""
+
+    def __init__(self, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        self.tool = runpy.run_path(str(ROOT / "tools" / "train.py"))["main"]
+        self.config, self.out, self.capsys = configuration(folder), folder / "run", capsys
+
+    def __call__(self, *words: object) -> tuple[int, str]:
+        common = ["--config", self.config, "--out", self.out, "--export-count", "1"]
+        code = self.tool([str(word) for word in [*common, *words]])
+        return code, self.capsys.readouterr().err
+
+
+@pytest.fixture
+def train(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Iterator[Training]:
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # on a busy machine two wait for each other, for seconds
+    yield Training(tmp_path, capsys)
+    torch.set_num_threads(threads)
+
+
+def test_a_batch_larger_than_the_memory_is_refused(train: Training) -> None:
+    """It was drawn, sample by sample, until the memory ended."""
+    code, said = train("--batch-size", 10**9)
+    assert code == 2
+    assert "batch_size: 1000000000 samples of" in said and "of memory are free" in said
+    assert not train.out.exists()
+
+
+def test_a_batch_that_fits_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two copies of 128 x 256 pixels of nine floats and a flag: 2.4 MB a sample at most."""
+    mixture = stream.Mixture((PaperOptions(),), (1.0,))
+    monkeypatch.setattr(stream, "available_bytes", lambda: 10**9)
+    stream.check_batch_fits(mixture, 10**9 // 2_430_000)
+    with pytest.raises(InputError, match=r"need 2.\d\d GB .* 1 GB of memory are free"):
+        stream.check_batch_fits(mixture, 1000)
+    monkeypatch.setattr(stream, "available_bytes", lambda: None)  # who does not know lets it be
+    stream.check_batch_fits(mixture, 10**12)
+
+
+def test_the_free_memory_is_known_here() -> None:
+    have = stream.available_bytes()
+    assert have is not None
+    assert 10**7 < have <= psutil.virtual_memory().total
+
+
+@pytest.mark.parametrize("name", ["checkpoint.pt", "options.json", "log.jsonl"])
+@pytest.mark.parametrize("words", [(), ("--overwrite",)])
+def test_a_training_replaces_nobody_elses_file(
+    train: Training, name: str, words: tuple[str, ...]
+) -> None:
+    train.out.mkdir()
+    (train.out / name).write_text('{"jogging": "5 km"}')
+    code, said = train(*words)
+    assert code == 2
+    assert f"holds {name}, and no options.json that says a training wrote it" in said
+    assert [path.name for path in train.out.iterdir()] == [name]
+    assert (train.out / name).read_text() == '{"jogging": "5 km"}'
+
+
+def test_a_training_replaces_its_own_files(train: Training) -> None:
+    assert train()[0] == 0
+    first = (train.out / "checkpoint.pt").read_bytes()
+    assert train("--seed", 3, "--overwrite")[0] == 0
+    assert (train.out / "checkpoint.pt").read_bytes() != first
+    # one that was killed before its first checkpoint, or while it wrote its record
+    (train.out / "checkpoint.pt").unlink()
+    (train.out / "options.json").write_text('{"command": ')
+    assert train()[0] == 0
+    # a checkpoint alone, as the library leaves it
+    (train.out / "options.json").unlink()
+    assert train("--overwrite")[0] == 0
+    assert json.loads((train.out / "options.json").read_text())["options"]["steps"] == 1
+
+
+@pytest.mark.parametrize("name", ["thesis.safetensors", "thesis.json"])
+def test_an_export_replaces_nobody_elses_file(train: Training, tmp_path: Path, name: str) -> None:
+    """Said before the training, and neither does --overwrite, which is there to start anew."""
+    (tmp_path / name).write_text('{"chapter": 1}')
+    for words in ((), ("--overwrite",), ("--no-train",)):
+        code, said = train("--export", tmp_path / "thesis.safetensors", *words)
+        assert code == 2
+        assert f"{name} is there already, and no training wrote it: not replaced" in said
+    assert (tmp_path / name).read_text() == '{"chapter": 1}'
+    assert not train.out.exists()
+
+
+def test_an_export_replaces_an_export(train: Training, tmp_path: Path) -> None:
+    """The command that was started again goes on and exports again, as docs/training.md says."""
+    weights = tmp_path / "new" / "w.safetensors"
+    assert train("--export", weights)[0] == 0
+    first = weights.read_bytes()
+    assert train("--export", weights, "--steps", "2")[0] == 0
+    assert weights.read_bytes() != first
+    assert train("--export", weights, "--no-train", "--overwrite")[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("run/checkpoint.pt", "is a file of the training itself"),
+        ("run/options.safetensors", "options.json is a file of the training itself"),
+        ("run/../run/log.jsonl", "is a file of the training itself"),
+        ("w.json", "that of its model card"),
+        ("", "got a folder"),
+        ("train.yaml/w.safetensors", "expected a folder or a new name, got a file"),
+    ],
+)
+def test_an_export_needs_a_name_of_its_own(
+    train: Training, tmp_path: Path, name: str, message: str
+) -> None:
+    code, said = train("--export", tmp_path / name)
+    assert code == (5 if "new name" in message else 2)
+    assert message in said
+    assert not train.out.exists() or not list(train.out.iterdir())
+
+
+def test_a_resumed_training_keeps_its_seed(train: Training) -> None:
+    assert train("--seed", 5)[0] == 0
+    before = (train.out / "checkpoint.pt").read_bytes()
+    for words in ((), ("--seed", 6), ("--no-train", "--export", train.out / "w.safetensors")):
+        code, said = train(*words)
+        assert code == 2
+        asked = words[1] if "--seed" in words else 0
+        assert f"was trained with seed 5, this run asks for seed {asked}" in said
+    assert (train.out / "checkpoint.pt").read_bytes() == before
+    assert train("--seed", 5, "--steps", 2)[0] == 0
+
+
+def test_a_judge_replaces_nobody_elses_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    tool = runpy.run_path(str(ROOT / "tools" / "train_judge.py"))["main"]
+    out, data = tmp_path / "run", tmp_path / "data"
+    out.mkdir()
+    data.mkdir()
+    # a folder of `hybridvo run`, whose state the record of the training would have replaced
+    (out / "run.json").write_text('{"identity": {}, "state": "done"}')
+    common = ["--out", str(out)]
+    assert tool(["train", "--data", str(data), *common, "--time-limit", "1"]) == 2
+    assert "no run.json that says a training wrote it" in capsys.readouterr().err
+    assert (out / "run.json").read_text() == '{"identity": {}, "state": "done"}'
+    (tmp_path / "mine.safetensors").write_text("mine")
+    words = ["export", *common, "--held-out", str(data), "--export"]
+    assert tool([*words, str(tmp_path / "mine.safetensors")]) == 2
+    assert "no training wrote it: not replaced" in capsys.readouterr().err
+    # the weights and the card in the package are those of a training
+    check_export(pretrained("judge"), out, "run.json")
+    check_export(pretrained("pwvo"), out, "options.json")
+
+
+def test_a_resumed_judge_keeps_its_seed(tmp_path: Path) -> None:
+    network = JudgeOptions(width=0.25)
+    JudgeTrainer(JudgeTrainingOptions(network, seed=4), tmp_path, tmp_path).save()
+    with pytest.raises(CheckpointError, match="was trained with seed 4, this run asks for seed 0"):
+        JudgeTrainer(JudgeTrainingOptions(network), tmp_path, tmp_path).resume()
+    assert JudgeTrainer(JudgeTrainingOptions(network, seed=4), tmp_path, tmp_path).resume()
