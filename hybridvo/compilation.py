@@ -52,6 +52,9 @@ __all__ = ["check_threads", "compile_once", "njit"]
 LONGEST_S = 1200.0
 """Patience with the compiling process, seconds: twenty times what it takes."""
 
+COMPILING = "HYBRIDVO_COMPILING"
+"""In the environment of the process that compiles: it must not ask for another one."""
+
 _logger = logging.getLogger(__name__)
 
 _cached: list[Any] = []
@@ -94,8 +97,14 @@ def _stamp(folder: Path) -> tuple[Any, ...]:
     Numba looks at the file of the function alone, though its code holds that of the functions that
     it calls: after a change of theirs it would go on with the old ones, or fail between the two.
     """
-    files = [f for f in sorted(folder.glob("*.py")) if b"njit" in f.read_bytes()]
-    return tuple((f.name, s.st_mtime_ns, s.st_size) for f in files for s in [f.stat()])
+    return tuple(
+        (f.name, s.st_mtime_ns, s.st_size) for f in sorted(_files(folder)) for s in [f.stat()]
+    )
+
+
+def _files(folder: Path) -> set[Path]:
+    """The files with kernels, whether they are imported yet or not."""
+    return {f for f in folder.glob("*.py") if b"njit" in f.read_bytes()}
 
 
 def _forgiving(act: Callable[..., Any]) -> Callable[..., Any]:
@@ -127,8 +136,10 @@ def compile_once(code: str, sources: Path, name: str) -> bool:
     kernels = [k for k in _cached if _file(k).parent == sources and k.stats.cache_path]
     if not kernels or not sys.executable or getattr(sys, "frozen", False):
         return False
+    if os.environ.get(COMPILING):  # this is that process
+        return False
     folder = Path(kernels[0].stats.cache_path)
-    mark = folder / f"{name}-{_fingerprint({_file(k) for k in kernels})}.compiled"
+    mark = folder / f"{name}-{_fingerprint({_file(k) for k in kernels} | _files(sources))}.compiled"
     if mark.exists():
         return True
     _logger.warning("compiling the kernels, once on this machine: up to a minute ...")
@@ -138,7 +149,7 @@ def compile_once(code: str, sources: Path, name: str) -> bool:
         done = subprocess.run(
             # -P: not the modules that lie in the current folder, which may be a data set's
             [sys.executable, "-P", "-c", code],
-            env=os.environ | {"PYTHONPATH": os.pathsep.join(paths)},
+            env=os.environ | {"PYTHONPATH": os.pathsep.join(paths), COMPILING: "1"},
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,

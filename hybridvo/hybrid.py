@@ -11,7 +11,6 @@ import difflib
 import functools
 import hashlib
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,6 @@ from hybridvo.checks import as_number, as_rigid, as_seed
 from hybridvo.compilation import compile_once
 from hybridvo.errors import CheckpointError, InputError
 from hybridvo.flow_check import contradiction
-from hybridvo.geometry import ego_flow, se3_exp
 from hybridvo.learned import (
     LEARNED,
     LEAST_PIXELS,
@@ -32,9 +30,10 @@ from hybridvo.learned import (
 from hybridvo.learned_judge import LearnedJudge
 from hybridvo.pose.judgement import default_judge
 from hybridvo.pose.photometric import PhotometricOptions, polish_photometric
+from hybridvo.pose.readiness import compile_refinement, run_kernels
 from hybridvo.pose.refinement import RefinementOptions, refine
 from hybridvo.pose.second_look import PictureJudge
-from hybridvo.types import Camera, Frame, FramePair, Reason, RelativePose
+from hybridvo.types import FramePair, Reason, RelativePose
 
 __all__ = [
     "DEFAULT_METHOD",
@@ -172,6 +171,7 @@ def estimate(
         wrong = contradiction(pair) if polished else None
         if wrong is not None:
             return RelativePose.failed(Reason.NO_FLOW, wrong, method)
+        _compiled(method)
         chosen: Any = (judge or shipped_judge()) if method in JUDGED else default_judge
         found = refine(
             pair,
@@ -260,7 +260,8 @@ def warm_up(method: str = DEFAULT_METHOD, polish: str = "auto") -> float:
     if method in LEARNED:
         shipped_network(method)
     compile_kernels(method)
-    _run_kernels(method, polish)
+    judge = shipped_judge() if method in JUDGED else default_judge
+    run_kernels(judge, polish=polish == "on" or method == "hybrid")
     return time.perf_counter() - started
 
 
@@ -272,37 +273,20 @@ def compile_kernels(method: str = DEFAULT_METHOD) -> bool:
     1e-7 m from those of every later one.
 
     Args:
-        method: whose kernels; those of ``refine`` are compiled with every one.
+        method: whose kernels; those of ``refine`` are compiled with every one, and before.
 
     Returns:
         Whether they are in the cache now; where they cannot be, this process compiles for itself.
     """
-    name = method if method in JUDGED else "refine"
-    calls = " ".join(f"_run_kernels({n!r}, 'on');" for n in dict.fromkeys(("refine", name)))
-    code = f"from hybridvo.hybrid import _run_kernels; {calls}"
-    return compile_once(code, Path(__file__).resolve().parent / "pose", name)
+    done = compile_refinement()
+    if method in JUDGED:
+        code = (
+            "from hybridvo.hybrid import shipped_judge; from hybridvo.pose.readiness import "
+            "run_kernels; run_kernels(shipped_judge())"
+        )
+        done = compile_once(code, Path(__file__).resolve().parent / "pose", "judged") and done
+    return done
 
 
-def _run_kernels(method: str, polish: str) -> None:
-    """Call every kernel once, with every type of its arguments."""
-    # the second size takes the parallel kernels
-    for height, width in ((48, 64), (320, 400)):
-        camera = Camera(width, width, (width - 1) / 2, (height - 1) / 2, height, width)
-        u = np.arange(width)
-        v = np.arange(height)[:, None]
-        depth = (4.0 + np.sin(u / 7.0) + np.cos(v / 5.0)).astype(np.float32)
-        motion = se3_exp(np.array([0.02, -0.01, 0.05, 0.002, 0.004, -0.003]))
-        flow = ego_flow(depth, motion, camera, camera).astype(np.float32)
-        # a mask, a variance and a second motion: every branch is compiled
-        flow[: height // 3, : width // 3] += 3.0
-        valid = np.ones((height, width), np.bool_)
-        variance = np.full((height, width), 0.01, np.float32)
-        frame = Frame(None, depth, camera)
-        judge = shipped_judge() if method in JUDGED else default_judge
-        refine(FramePair(frame, frame, flow, variance, valid), judge=judge)
-        pair = FramePair(frame, frame, flow)
-        found = refine(pair, judge=judge)
-        if polish == "on" or method == "hybrid":
-            rgb = (40 * (2 + np.sin(u / 3.0) + np.cos(v / 2.0)))[..., None].repeat(3, 2)
-            seen = replace(frame, rgb=rgb.astype(np.uint8))
-            polish_photometric(replace(pair, prev=seen, curr=seen), found)
+_compiled = functools.cache(compile_kernels)
+"""Once in a process, for who did not warm up."""

@@ -25,6 +25,7 @@ from hybridvo.pose.correspondences import DOUBTFUL_INLIER_RATIO
 from hybridvo.pose.full_fit import FullFit, fit_full_grid
 from hybridvo.pose.judgement import CueGrid, Judge, default_judge
 from hybridvo.pose.options import RefinementOptions
+from hybridvo.pose.readiness import compile_refinement
 from hybridvo.pose.second_look import Decision, Expected, PictureJudge, decide
 from hybridvo.types import FramePair, Hypothesis, PairBatch, Reason, RelativePose, Status
 
@@ -162,6 +163,7 @@ def _refine(
         return RelativePose.failed(Reason.NO_FLOW, "no optical flow for this pair", "refine")
     if pair.prev.depth is None:
         return RelativePose.failed(Reason.NO_VALID_DEPTH, "no depth for this frame", "refine")
+    compile_refinement()
     found = search_motions(pair, starts, weights, options, seed)
     if isinstance(found, RelativePose):
         return found

@@ -15,10 +15,18 @@ import pytest
 from hybridvo import compilation, hybrid
 from hybridvo.cli import main
 from hybridvo.geometry import ego_flow, se3_exp
-from hybridvo.hybrid import warm_up
+from hybridvo.hybrid import compile_kernels, estimate, warm_up
 from hybridvo.odometry import Odometry
-from hybridvo.pose import kernels, photometric_kernels, search, second_depth, solver
-from hybridvo.types import Camera, Frame
+from hybridvo.pose import (
+    kernels,
+    photometric_kernels,
+    readiness,
+    search,
+    second_depth,
+    solver,
+)
+from hybridvo.pose.refinement import refine
+from hybridvo.types import Camera, Frame, FramePair
 
 TOOLS = Path(__file__).parents[2] / "tools"
 ROOT = TOOLS.parent
@@ -182,20 +190,84 @@ def test_kernels_are_not_compiled_apart_by_a_frozen_program(
 def test_a_library_user_reads_the_code_that_later_processes_read(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The tracker asks for it as ``hybridvo run`` does; the compiling process asks nobody."""
+    """A tracker asks for it as ``hybridvo run`` does, and so does the first pair of who did not
+    warm up; a process asks once.
+    """
     asked = []
-    monkeypatch.setattr(hybrid, "compile_once", lambda *args: asked.append(args) or True)
-    Odometry(method="refine")
+    for module in (hybrid, readiness):
+        monkeypatch.setattr(module, "compile_once", lambda *args: asked.append(args) or True)
+    for once in (readiness.compile_refinement, hybrid._compiled):
+        once.cache_clear()
+
+    def sets() -> list[tuple[str, str]]:
+        done = [(sources.name, name) for _, sources, name in asked]
+        asked.clear()
+        return done
+
+    frame = Frame(None, np.ones((24, 32)), Camera(30, 30, 15.5, 11.5, 24, 32))
+    pair = FramePair(frame, frame, np.zeros((24, 32, 2)))
     Odometry(method="refine", prepare=False)
-    Odometry(method="hybrid")
-    assert [(sources.name, name) for _, sources, name in asked] == [
-        ("pose", "refine"),
-        ("pose", "hybrid"),
-    ]
-    assert warm_up("identity") == 0.0 and len(asked) == 2
+    assert warm_up("identity") == 0.0 and sets() == []
+    refine(pair)
+    assert sets() == [("pose", "refine")]
+    estimate(pair, method="refine")
+    Odometry(method="refine")
+    assert sets() == []
+    estimate(pair, method="hybrid")
+    assert sets() == [("pose", "judged")]
+    estimate(pair, method="hybrid")
+    assert sets() == []
+
+
+def test_the_compiling_process_asks_for_no_other(
+    kernel: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = tmp_path / "log"
+    code = (
+        "import os; from hybridvo.compilation import COMPILING; "
+        f"open({str(log)!r}, 'w').write(os.environ[COMPILING])"
+    )
+    assert compilation.compile_once(code, kernel, "k") and log.read_text() == "1"
+    monkeypatch.setenv(compilation.COMPILING, "1")
+    assert not compilation.compile_once("raise SystemExit(0)", kernel, "other")
+
+
+def test_what_the_compiling_processes_run_is_valid(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+    for module in (hybrid, readiness):
+        monkeypatch.setattr(module, "compile_once", lambda *args: asked.append(args) or True)
+    readiness.compile_refinement.cache_clear()
+    assert compile_kernels("hybrid")
+    ran = []
+    monkeypatch.setattr(readiness, "run_kernels", lambda *judge: ran.append(judge))
     for code, _, _ in asked:
         exec(compile(code, "child", "exec"), {})
-    assert len(asked) == 2
+    assert [len(judge) for judge in ran] == [0, 1]
+
+
+def test_the_first_motion_in_a_new_process_is_that_of_every_later_one(tmp_path: Path) -> None:
+    """With a cold cache and no warm-up: the bytes of a process that finds the cache warm."""
+    code = (
+        "import numpy as np; from hybridvo.pose.refinement import refine; "
+        "from hybridvo.types import Camera, Frame, FramePair; "
+        "rng = np.random.default_rng(0); "
+        "f = Frame(None, rng.uniform(2, 5, (120, 160)), Camera(90, 90, 79.5, 59.5, 120, 160)); "
+        "flow = np.full((120, 160, 2), 1.5) + rng.normal(0, 0.3, (120, 160, 2)); "
+        "found = refine(FramePair(f, f, flow)); "
+        "print(found.T_curr_prev.tobytes().hex(), found.covariance.tobytes().hex())"
+    )
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": os.fspath(ROOT)}
+    answers = [
+        subprocess.run(
+            [sys.executable, "-c", code],
+            capture_output=True,
+            text=True,
+            check=True,
+            env=environment,
+        ).stdout
+        for _ in range(2)
+    ]
+    assert answers[0] == answers[1] and answers[0].strip()
 
 
 def test_a_kernel_follows_the_changes_of_the_ones_it_calls(tmp_path: Path) -> None:
