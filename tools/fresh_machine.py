@@ -25,7 +25,8 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 OLDEST = (3, 11)
-KEEP = ("PATH", "LANG", "LC_ALL", "TMPDIR", "SSL_CERT_FILE", "REQUESTS_CA_BUNDLE")
+KEEP = ("PATH", "LANG", "LC_ALL", "TMPDIR", "SSL_CERT_FILE", "REQUESTS_CA_BUNDLE",
+        "HYBRIDVO_DATA")  # fmt: skip
 """Of the environment; beside these, what pip needs to find its packages on this machine."""
 TOLERANCE = 0.2
 """Relative, or 0.005 in the unit of the column: OpenCV picks its DIS kernels by processor."""
@@ -135,10 +136,14 @@ def visit(folder: Path, program: str, tests: str | None) -> dict[str, Any]:
     home.mkdir()
     problems: list[str] = []
     seconds: dict[str, float] = {}
+    tests_said = ""
     subprocess.run(["git", "clone", "--quiet", str(ROOT), str(clone)], check=True)
     readme = (clone / "README.md").read_text(encoding="utf-8")
     environment = {k: v for k, v in os.environ.items() if k in KEEP or k.startswith("PIP_")}
     environment |= {"HOME": str(home), "PYTHON": program}
+    data = ROOT.parent / "shared" / "data"
+    if data.is_dir():  # the tests look for it beside the clone
+        environment.setdefault("HYBRIDVO_DATA", str(data))
     configured = Path.home() / ".config" / "pip"
     if configured.is_dir() and "PIP_CONFIG_FILE" not in environment:
         environment["PIP_CONFIG_FILE"] = str(configured / "pip.conf")
@@ -148,8 +153,10 @@ def visit(folder: Path, program: str, tests: str | None) -> dict[str, Any]:
         done = subprocess.run(command, cwd=clone, env=environment, capture_output=True, text=True)
         seconds[name] = round(time.perf_counter() - started, 1)
         if done.returncode != 0:
-            tail = (done.stdout + done.stderr).strip()[-600:]
-            problems.append(f"{name}: exit code {done.returncode}: {tail}")
+            text = (done.stdout + done.stderr).strip()
+            failed = [line for line in text.splitlines() if line.startswith(("FAILED", "E  "))]
+            said = "\n".join([*failed[:40], text[-300:]])
+            problems.append(f"{name}: exit code {done.returncode}: {said}")
         return done
 
     shown = re.findall(r"^```sh\n(.*?)^```$", readme, re.DOTALL | re.MULTILINE)[0].splitlines()
@@ -165,9 +172,10 @@ def visit(folder: Path, program: str, tests: str | None) -> dict[str, Any]:
         if block.returncode == 0 and not re.search(r"^[1-9]\d* blocks$", block.stdout, re.M):
             problems.append("the README has no Python block")
         if tests is None:
-            run("make test", ["make", "test"])
+            tests_said = run("make test", ["make", "test"]).stdout
         elif tests:
-            run("tests", [f"{binary}/python", "-m", "pytest", *tests.split()])
+            tests_said = run("tests", [f"{binary}/python", "-m", "pytest", *tests.split()]).stdout
+    closing = re.findall(r"^=+ (.* in [\d.]+s.*) =+$", tests_said, re.MULTILINE)
     left = sorted(path.name for path in home.iterdir())
     changed = subprocess.run(
         ["git", "status", "--short"], cwd=clone, capture_output=True, text=True, check=True
@@ -177,6 +185,7 @@ def visit(folder: Path, program: str, tests: str | None) -> dict[str, Any]:
     return {
         "commit": commit(clone),
         "seconds": seconds,
+        "tests": closing[-1] if closing else None,
         "in_home_afterwards": left,
         "printed": printed,
         "problems": problems,
