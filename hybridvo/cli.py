@@ -398,6 +398,9 @@ def _evaluate(args: argparse.Namespace, command: list[str]) -> int:
         max_diff=args.max_diff,
     )
     _print(to_json(report) if args.json else evaluation_text(report))
+    if report["ate_rmse_unaligned"] is None:  # not one figure: the files do not belong together
+        _complain(f"nothing could be compared: {report['reasons']['ate_rmse_unaligned']}.")
+        return EXIT_INPUT
     return 0
 
 

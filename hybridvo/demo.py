@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from hybridvo.checks import make_folder
 from hybridvo.configuration import RunOptions
 from hybridvo.data.synthetic import make_scene, write_sintel
 from hybridvo.errors import InputError, OutputError
@@ -142,8 +143,10 @@ def _prepare(out: Path, overwrite: bool) -> None:
             if not overwrite:
                 raise InputError(f"{out}: holds a demo already. Pass --overwrite to replace it.")
             shutil.rmtree(out / "data", ignore_errors=True)
-        out.mkdir(parents=True, exist_ok=True)
+        make_folder(out)
         (out / MARK).write_text("{}\n", encoding="utf-8")
+    except OutputError:
+        raise
     except OSError as error:
         raise OutputError(f"{out}: cannot be written: {error.strerror or error}.") from error
 

@@ -17,6 +17,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from hybridvo.checks import make_folder
 from hybridvo.errors import InputError
 from hybridvo.evaluation.maps import flow_colours, longest_flow
 from hybridvo.types import Frame, Step
@@ -141,7 +142,7 @@ class Recording:
         import rerun
 
         self._rr = rerun
-        self.path.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(self.path.parent)
         if self.path.is_symlink():  # replaced, never followed, like all results
             self.path.unlink()
         # save() itself reports a bad path only later, in a thread

@@ -18,6 +18,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
+from hybridvo.checks import make_folder
 from hybridvo.errors import InputError, LockedError, OutputError
 from hybridvo.evaluation.report import jsonable, write_json
 
@@ -78,12 +79,7 @@ class RunFolder:
         self.frames_done = 0
         self.state: dict[str, Any] = {}
         self.last: dict[str, Any] | None = None
-        try:
-            self.path.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise OutputError(
-                f"{self.path}: cannot be created: {error.strerror or error}."
-            ) from error
+        make_folder(self.path)
         self._lock.acquire()
         try:
             self._prepare(mode)

@@ -22,6 +22,7 @@ from typing import IO, Any, Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from hybridvo.checks import NANOSECONDS_ABOVE, stamp_unit
 from hybridvo.errors import FormatError, InputError, OutputError
 from hybridvo.geometry import invert, ned_to_camera, xyzw_to_wxyz
 
@@ -38,9 +39,6 @@ __all__ = [
 
 Format = Literal["auto", "tum", "kitti", "tartanair"]
 Axes = Literal["auto", "camera", "ned"]
-
-NANOSECONDS_ABOVE = 1e14
-"""Stamps above this value cannot be seconds (three million years) and are taken as nanoseconds."""
 
 LARGEST_FILE = 2**28
 """Bytes of the largest trajectory file that is read: two million poses."""
@@ -414,14 +412,15 @@ def _quaternions_to_matrices(path: Path, xyzw: np.ndarray, lines: list[int]) -> 
 def _to_seconds(path: Path, stamps: np.ndarray, lines: list[int]) -> tuple[np.ndarray, list[str]]:
     """Stamps in seconds, strictly increasing, and what was changed."""
     notices = []
-    nanoseconds = np.abs(stamps) > NANOSECONDS_ABOVE
-    if nanoseconds.all():
-        stamps = stamps / 1e9
-        notices.append(f"{path}: timestamps are nanoseconds; converted to seconds.")
-        _logger.warning(notices[-1])
-    elif nanoseconds.any():
-        line = lines[int(np.argmax(nanoseconds != nanoseconds[0]))]
+    far = np.abs(stamps) > NANOSECONDS_ABOVE
+    factor, unit = stamp_unit(stamps)
+    if far.any() and not far.all():
+        line = lines[int(np.argmax(far != far[0]))]
         raise FormatError(f"{path}:{line}: timestamps mix seconds and nanoseconds.")
+    if factor != 1:
+        stamps = stamps / factor
+        notices.append(f"{path}: timestamps are {unit}; converted to seconds.")
+        _logger.warning(notices[-1])
     steps = np.diff(stamps)
     if (steps <= 0).any():
         index = int(np.argmax(steps <= 0)) + 1
@@ -450,7 +449,8 @@ def read_trajectory(
             y right, z down; converted to camera axes). ``auto`` is NED for TartanAir's format.
 
     Returns:
-        The trajectory in camera axes. Stamps above 1e14 are nanoseconds and are converted, which
+        The trajectory in camera axes. Stamps above 1e14 are nanoseconds, or milliseconds or
+        microseconds where :func:`hybridvo.checks.stamp_unit` can tell, and are converted, which
         ``notices`` records and the log says. KITTI and TartanAir files get frame numbers as stamps.
 
     Raises:

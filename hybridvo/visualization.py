@@ -62,7 +62,8 @@ def visualize(options: PictureOptions, command: list[str]) -> list[Path]:
         InputError: unknown sequence, pair, weights, or a target that exists or is no PNG.
         OutputError: the target cannot be written.
     """
-    from hybridvo.errors import InputError, OutputError
+    from hybridvo.checks import make_folder
+    from hybridvo.errors import InputError
     from hybridvo.evaluation.plots_maps import maps_png
     from hybridvo.evaluation.report import write_json
     from hybridvo.hybrid import DEFAULT_METHOD, estimate
@@ -85,10 +86,7 @@ def visualize(options: PictureOptions, command: list[str]) -> list[Path]:
     )
     height, width = pair.prev.camera.shape
     content = maps_png(panels, heading, width / height)
-    try:
-        picture.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{picture.parent}: cannot be written: {error.strerror}.") from error
+    make_folder(picture.parent)
     with atomic_write(picture, "wb") as file:
         file.write(content)
     record = {

@@ -41,7 +41,7 @@ IMPORTS: dict[str, set[str]] = {
     "training": CLASSICAL | {"data", "flow", "network", "learned", "hybrid"},
     # one run of `hybridvo run`: what it writes, how it is set, and the loop around the tracker
     "console": {"errors"},
-    "run_folder": {"errors", "evaluation"},
+    "run_folder": {"checks", "errors", "evaluation"},
     "recording": NOUNS | {"evaluation"},
     "depth_steps": NOUNS,
     "run_results": NOUNS | {"geometry", "data", "trajectory", "evaluation", "depth_steps"},
@@ -60,11 +60,11 @@ IMPORTS: dict[str, set[str]] = {
     },
     # figures of one pair: tools/visualize.py, and the report of a comparison
     "visualization": {
-        *("errors", "types", "geometry", "data", "network", "pose", "learned", "hybrid"),
-        *("trajectory", "evaluation", "configuration", "run"),
+        *("checks", "errors", "types", "geometry", "data", "network", "pose", "learned"),
+        *("hybrid", "trajectory", "evaluation", "configuration", "run"),
     },
     # what stands at the door
-    "demo": {"errors", "data", "evaluation", "configuration", "run"},
+    "demo": {"checks", "errors", "data", "evaluation", "configuration", "run"},
     "doctor": {"__init__", "compilation", "errors", "hybrid"},
     "diagnosis_findings": CLASSICAL | {"depth_steps"},
     "diagnosis": CLASSICAL | {"flow", "diagnosis_findings", "depth_steps"},

@@ -85,12 +85,13 @@ def _train(arguments: argparse.Namespace, argv: list[str]) -> int:
     import cv2
     import torch
 
+    from hybridvo.checks import make_folder
     from hybridvo.errors import InputError
     from hybridvo.evaluation.report import write_json
     from hybridvo.run import check_device
     from hybridvo.training.loop import Trainer
     from hybridvo.training.options import load_training_options
-    from hybridvo.training.outputs import check_export, check_folder, make_folder
+    from hybridvo.training.outputs import check_export, check_folder
     from hybridvo.training.provenance import source_commit
     from hybridvo.training.stream import check_batch_fits
 

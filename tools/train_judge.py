@@ -71,9 +71,9 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
 
 
 def _make(arguments: argparse.Namespace) -> int:
+    from hybridvo.checks import make_folder
     from hybridvo.errors import InputError
     from hybridvo.training.judge_data import PER_SHARD, write_shard
-    from hybridvo.training.outputs import make_folder
 
     if arguments.first_seed < 0 or arguments.seeds < 1:
         raise InputError(
@@ -100,9 +100,9 @@ def _propose(arguments: argparse.Namespace) -> int:
 
 
 def _trainer(arguments: argparse.Namespace, data: Path):
+    from hybridvo.checks import make_folder
     from hybridvo.data.presets import build_options, read_yaml
     from hybridvo.training.judge_loop import JudgeTrainer, JudgeTrainingOptions
-    from hybridvo.training.outputs import make_folder
 
     options = build_options(
         JudgeTrainingOptions, read_yaml(arguments.config), str(arguments.config)

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from hybridvo.checks import stamp_unit
 from hybridvo.data.image_io import image_size, read_rgb, read_text
 from hybridvo.errors import FormatError, InputError
 from hybridvo.types import Camera, Frame
@@ -31,7 +32,6 @@ __all__ = [
     "to_seconds",
 ]
 
-NANOSECONDS_ABOVE = 1e14
 ASSOCIATION_TOLERANCE = 0.02
 """Largest difference in seconds between stamps that belong together (the TUM tools' value)."""
 MOST_CANDIDATES = 64
@@ -385,15 +385,16 @@ def _lines(text: str) -> Iterator[str]:
 
 
 def to_seconds(stamps: Many[float] | np.ndarray, name: str) -> tuple[np.ndarray, list[str]]:
-    """Stamps in seconds; values above 1e14 are nanoseconds and are converted with a notice.
+    """Stamps in seconds; other units (``stamp_unit``) are converted with a notice.
 
     What is not finite becomes NaN.
     """
     values = np.array(stamps, dtype=np.float64)
     values[~np.isfinite(values)] = np.nan
-    if (values > NANOSECONDS_ABOVE).any():
-        return values / 1e9, [f"{name}: stamps are nanoseconds (above 1e14); converted to seconds."]
-    return values, []
+    factor, unit = stamp_unit(values)
+    if factor == 1:
+        return values, []
+    return values / factor, [f"{name}: stamps are {unit}; converted to seconds."]
 
 
 def poses_from_rows(rows: np.ndarray, source: str) -> np.ndarray:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from hybridvo.checks import stamp_unit
 from hybridvo.data.file_sequence import (
     FileSequence,
     associate,
@@ -316,10 +317,10 @@ def _read_times_and_poses(
 
 
 def _stamps_in_names(frames: list[Path]) -> list[float] | None:
-    """Stamps where every file name is a number in seconds or nanoseconds; counters are none."""
+    """Stamps where every file name is a number of seconds or parts of one; counters are none."""
     try:
         values = [float(path.stem) for path in frames]
     except ValueError:
         return None
-    stamps = all("." in path.stem for path in frames) or min(values) > 1e14
+    stamps = all("." in path.stem for path in frames) or stamp_unit(np.array(values))[0] != 1
     return values if stamps and np.isfinite(values).all() else None

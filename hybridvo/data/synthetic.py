@@ -12,6 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from hybridvo.checks import make_folder
 from hybridvo.data.image_io import write_cam, write_dpt, write_flo
 from hybridvo.data.raycasting import cast, motion, screen_bounds, shade
 from hybridvo.data.scenes import SCENE_KINDS, compose_world
@@ -282,11 +283,8 @@ def write_sintel(scene: Scene, root: str | os.PathLike[str], name: str) -> None:
         part: base / part / name
         for part in ("clean", "flow", "depth", "camdata_left", "occlusions", "invalid", "moving")
     }
-    try:
-        for folder in folders.values():
-            folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{base}: cannot create the folders of {name!r}: {error}.") from error
+    for folder in folders.values():
+        make_folder(folder)
     for index in range(scene.frames):
         stem = f"frame_{index + 1:04d}"
         rendered = scene.render(index)

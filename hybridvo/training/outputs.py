@@ -8,28 +8,14 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from hybridvo.errors import CheckpointError, InputError, OutputError
+from hybridvo.checks import make_folder
+from hybridvo.errors import CheckpointError, InputError
 from hybridvo.network.weights import load_weights
 from hybridvo.training.checkpoint import load_checkpoint
 
-__all__ = ["check_export", "check_folder", "make_folder"]
+__all__ = ["check_export", "check_folder"]
 
 CHECKPOINT, LOG = "checkpoint.pt", "log.jsonl"
-
-
-def make_folder(path: Path) -> None:
-    """Make a folder and those above it.
-
-    Raises:
-        OutputError: it cannot be made, or a file has its name.
-    """
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except FileExistsError:
-        what = "a link to nowhere" if path.is_symlink() else "a file"
-        raise OutputError(f"{path}: expected a folder or a new name, got {what}.") from None
-    except OSError as error:
-        raise OutputError(f"{path}: cannot make the folder: {error.strerror or error}.") from error
 
 
 def check_folder(out: Path, record: str, wrote_it: Iterable[str]) -> None:

@@ -462,7 +462,7 @@ def test_a_scene_of_a_billion_frames_is_refused_before_it_fills_the_memory(
     [
         (("make", "--first-seed", "-5", "--seeds", "1"), 2, "expected --first-seed >= 0"),
         (("make", "--first-seed", "5", "--seeds", "0"), 2, "--seeds >= 1, got 5 and 0"),
-        (("make", "--first-seed", "5", "--seeds", "1"), 5, "cannot make the folder"),
+        (("make", "--first-seed", "5", "--seeds", "1"), 5, "cannot be created"),
     ],
 )
 def test_train_judge_answers_in_words(

@@ -7,25 +7,36 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import runpy
 import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import psutil
 import pytest
 import torch
 
+from hybridvo.checks import stamp_unit
+from hybridvo.cli import main
+from hybridvo.data.file_sequence import to_seconds
+from hybridvo.data.sequence import open_sequence
 from hybridvo.data.workflow import PaperOptions
-from hybridvo.errors import CheckpointError, InputError
+from hybridvo.errors import CheckpointError, InputError, OutputError
+from hybridvo.evaluation import metrics
+from hybridvo.geometry import se3_exp
 from hybridvo.network.judge import JudgeOptions
 from hybridvo.network.weights import pretrained
 from hybridvo.pose.selection import SELECTION_METHODS, select
+from hybridvo.run_folder import RunFolder
 from hybridvo.training import stream
 from hybridvo.training.judge_loop import JudgeTrainer, JudgeTrainingOptions
 from hybridvo.training.outputs import check_export
+from hybridvo.trajectory import Trajectory, read_trajectory, write_tum
 from hybridvo.types import PixelwisePrediction
+from tests.sequences import write_folder
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -276,7 +287,7 @@ def test_an_export_replaces_an_export(train: Training, tmp_path: Path) -> None:
         ("run/../run/log.jsonl", "is a file of the training itself"),
         ("w.json", "that of its model card"),
         ("", "got a folder"),
-        ("train.yaml/w.safetensors", "expected a folder or a new name, got a file"),
+        ("train.yaml/w.safetensors", "is a file, expected a folder or a new name"),
     ],
 )
 def test_an_export_needs_a_name_of_its_own(
@@ -328,3 +339,146 @@ def test_a_resumed_judge_keeps_its_seed(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match="was trained with seed 4, this run asks for seed 0"):
         JudgeTrainer(JudgeTrainingOptions(network), tmp_path, tmp_path).resume()
     assert JudgeTrainer(JudgeTrainingOptions(network, seed=4), tmp_path, tmp_path).resume()
+
+
+# evaluate
+
+
+def walk(stamps: np.ndarray, seed: int = 0, noise: float = 0.0) -> Trajectory:
+    """A path that bends in all directions, one pose a stamp."""
+    rng = np.random.default_rng(seed)
+    t = np.linspace(0.0, 20.0, len(stamps))
+    tangents = np.stack([np.sin(0.3 * t), t, np.cos(0.7 * t), *(0.5 * np.sin([t, 2 * t, 3 * t]))])
+    steps = noise * rng.standard_normal((len(stamps), 6))
+    T = [se3_exp(a) @ se3_exp(b) for a, b in zip(tangents.T, steps, strict=True)]
+    return Trajectory(stamps, np.stack(T))
+
+
+def test_evaluate_says_that_nothing_could_be_matched(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Not one figure is none of the things that exit code 0 promises."""
+    stamps = np.arange(20) / 10
+    write_tum(walk(stamps), tmp_path / "a")
+    write_tum(walk(stamps + 5000), tmp_path / "b")
+    assert main(["evaluate", str(tmp_path / "a"), str(tmp_path / "b"), "--json"]) == 2
+    said = capsys.readouterr()
+    assert json.loads(said.out)["matched"] == 0
+    assert said.err.count("\n") == 1
+    assert "nothing could be compared: only 0 of 20 poses match within 0.02 s" in said.err
+    # a camera on a straight line leaves the alignment open; other figures stand
+    straight = np.tile(np.eye(4), (20, 1, 1))
+    straight[:, 0, 3] = stamps
+    write_tum(Trajectory(stamps, straight), tmp_path / "c")
+    assert main(["evaluate", str(tmp_path / "c"), str(tmp_path / "c"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["ate_rmse"] is None
+
+
+@pytest.mark.parametrize("delta", [1, 7])
+@pytest.mark.parametrize("noise", [1e-9, 1e-3, 1.0])
+def test_angles_of_all_pairs_at_once_are_evos(delta: int, noise: float) -> None:
+    from evo.core.metrics import RPE, PoseRelation, Unit
+
+    stamps = np.arange(60) / 10
+    est, gt = walk(stamps, 1, noise), walk(stamps)
+    match = metrics.associate(est, gt)
+    metric = RPE(PoseRelation.rotation_angle_deg, delta, Unit.frames, all_pairs=True)
+    paths = [metrics._to_evo(t, i) for t, i in ((gt, match.gt_indices), (est, match.est_indices))]
+    metric.process_data(tuple(paths))
+    errors = np.asarray(metric.error)
+    found = metrics.rpe(est, gt, delta)
+    # the same formula on the same numbers: rounding of sums, and of angles near 1e-14 deg
+    assert found.pairs == len(errors) == 60 - delta
+    for value, expected in (
+        (found.rot_rmse_deg, np.sqrt(np.mean(errors**2))),
+        (found.rot_mean_deg, errors.mean()),
+        (found.rot_median_deg, np.median(errors)),
+    ):
+        assert value == pytest.approx(expected, rel=1e-12, abs=1e-13)
+
+
+# output folders and stamps
+
+
+@pytest.mark.parametrize("below", ["", "deeper/still"])
+def test_an_output_folder_that_is_a_link_to_nowhere(tmp_path: Path, below: str) -> None:
+    """'File exists' was all that was said."""
+    (tmp_path / "link").symlink_to(tmp_path / "gone")
+    with pytest.raises(OutputError) as caught:
+        RunFolder(tmp_path / "link" / below, {}, {})
+    assert f"{tmp_path / 'link'} is a symbolic link to {tmp_path / 'gone'}" in str(caught.value)
+    assert "which leads nowhere. Make that folder, or remove the link." in str(caught.value)
+    assert not (tmp_path / "gone").exists()
+    (tmp_path / "gone").mkdir()  # as the message says
+    RunFolder(tmp_path / "link" / below, {}, {}).close()
+    assert (tmp_path / "gone" / below / "run.json").is_file()
+
+
+def test_every_door_names_the_link(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    link = tmp_path / "link"
+    link.symlink_to("gone")
+    (tmp_path / "file").write_text("mine")
+    tool = runpy.run_path(str(ROOT / "tools" / "train.py"))["main"]
+    for call in (
+        lambda out: main(["demo", "--frames", "3", "--out", out]),
+        lambda out: tool(["--config", str(configuration(tmp_path)), "--out", out]),
+    ):
+        assert call(str(link)) == 5
+        assert f"{link} is a symbolic link to gone, which leads nowhere" in capsys.readouterr().err
+        assert call(str(tmp_path / "file" / "out")) == 5
+        assert "file is a file, expected a folder or a new name" in capsys.readouterr().err
+
+
+EPOCH = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
+
+
+@pytest.mark.parametrize("start", [1_000_000_001.0, 1_763_000_000.0, 4_102_444_800.0])
+@pytest.mark.parametrize("unit", EPOCH)
+def test_the_unit_of_todays_stamps_is_told(
+    tmp_path: Path, unit: str, start: float, caplog: pytest.LogCaptureFixture
+) -> None:
+    seconds = start + np.arange(9) / 25
+    stamps = np.round(seconds * EPOCH[unit])
+    assert stamp_unit(stamps) == (EPOCH[unit], unit)
+    (tmp_path / "t").write_text("".join(f"{int(s)} 0 0 0 0 0 0 1\n" for s in stamps))
+    read = read_trajectory(tmp_path / "t")
+    assert unit in read.notices[0]
+    np.testing.assert_allclose(read.timestamps, seconds, rtol=0, atol=1e-6)
+    listed, notices = to_seconds(stamps, "rgb.txt")
+    assert unit in notices[0]
+    np.testing.assert_allclose(listed, seconds, rtol=0, atol=1e-6)
+    assert stamp_unit(np.append(stamps, np.nan)) == (EPOCH[unit], unit)
+
+
+@pytest.mark.parametrize(
+    ("stamps", "unit"),
+    [
+        (1.7e15 + 4e7 * np.arange(9), "nanoseconds"),  # 20 days after the start, 25 pictures a s
+        (1.7e15 + 2e6 * np.arange(9), "nanoseconds"),  # either: 500 a second, or one in 2 s
+        (np.array([1.7e15]), "nanoseconds"),  # one alone tells nothing
+        (2e14 + 4e4 * np.arange(9), "nanoseconds"),  # microseconds of 1976 are no clock's
+        (1.7e12 + 4e7 * np.arange(9), "seconds"),  # nanoseconds half an hour after the start
+        (1.7e12 + 4e4 * np.arange(9), "seconds"),  # microseconds after 20 days
+        (1.7e9 + np.arange(9) / 25, "seconds"),
+        (1.7e9 + 86400.0 * np.arange(9), "seconds"),
+        (np.arange(9.0), "seconds"),
+        (np.array([np.nan, np.inf]), "seconds"),
+        (np.zeros(0), "seconds"),
+    ],
+)
+def test_a_unit_that_cannot_be_told_stays(stamps: np.ndarray, unit: str) -> None:
+    assert stamp_unit(stamps)[1] == unit
+
+
+def test_pictures_named_by_microseconds_have_stamps(tmp_path: Path) -> None:
+    written = write_folder(tmp_path)
+    camera = written.path / "camera.yaml"
+    camera.write_text(re.sub("fps:.*", "", camera.read_text()))
+    (written.path / "poses.txt").unlink()
+    for i, path in enumerate(sorted((written.path / "rgb").iterdir())):
+        depth = next((written.path / "depth").glob(f"{path.stem}.*"))
+        for old in (path, depth):
+            old.rename(old.with_stem(str(1_763_000_000_000_000 + 40_000 * i)))
+    sequence = open_sequence(written.path)
+    expected = 1_763_000_000 + 0.04 * np.arange(len(sequence))
+    np.testing.assert_allclose(sequence.timestamps, expected, rtol=0, atol=1e-6)
