@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import math
 import re
@@ -330,7 +331,8 @@ def resolve_inside(root: Path, name: str, allow_outside: bool, source: str) -> P
         path = root / name
         resolved = path.resolve()
         inside = resolved.is_relative_to(root.resolve())
-        path.exists()  # raises for a name that the system cannot hold
+        with contextlib.suppress(FileNotFoundError, NotADirectoryError):
+            path.stat()  # raises for a loop of links, and for a name that the system cannot hold
     except (OSError, RuntimeError, ValueError) as error:
         raise InputError(f"{source}: {name!r} is not a usable file name ({error}).") from None
     if not inside and not allow_outside:
