@@ -342,8 +342,9 @@ class RelativePose:
         inlier_ratio: share of the valid pixels that follow the motion.
         iterations: Gauss-Newton steps spent (or RANSAC iterations).
         cost: final robust cost per valid pixel, dimensionless.
-        residual_scale_px: estimated standard deviation of the flow noise, px.
-        depth_noise: estimated standard deviation of the log depth noise.
+        residual_scale_px: estimated standard deviation of the flow noise, px, where variances were
+            handed in at a pixel of the typical one.
+        depth_noise: of the log depth, likewise.
         weights: (h, w) float32 robust weight of each pixel on the grid of ``weights_stride``.
         translation_direction_valid: whether the translation is longer than three of its own
             standard deviations; its direction means nothing otherwise.

@@ -6,7 +6,7 @@ import math
 
 __all__ = ["RECALIBRATION", "REFERENCE_WIDTH", "probability_right"]
 
-RECALIBRATION = {"logit": 1.29, "log_noise_px": 0.48, "share": -0.74, "constant": 2.31}
+RECALIBRATION = {"logit": 1.11, "log_noise_px": 0.43, "share": 0.58, "constant": 1.67}
 """Logistic map to the probability that the answer errs by less than a pixel: of the judge's own
 logit, the log of the flow's noise (px at a width of 1024, at least :data:`LEAST_NOISE_PX`) and the
 share of the picture that follows the motion. The judge says too little of itself where every pixel

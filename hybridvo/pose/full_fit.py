@@ -46,8 +46,8 @@ class FullFit:
         pose: (3, 4) T_curr_prev. covariance: (6, 6). eigenvalues: (6,) of the information, m scaled
             by the typical depth. definite: whether every direction is determined.
         weights: (H, W) robust weights. weight: their sum. share: of the pixels that follow.
-        cost: per usable pixel. flow_noise: px. depth_noise: of log depth, both relative to the
-            variances handed in. uses_second_depth: whether the third residual took part.
+        cost: per usable pixel. flow_noise: px. depth_noise: of log depth, both at a pixel of the
+            typical variance handed in. uses_second_depth: whether the third residual took part.
         depths: how the second depth agrees with the first, moved; None where it cannot be told.
     """
 

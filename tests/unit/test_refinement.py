@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -155,6 +156,19 @@ def test_noise_scales_are_estimated():
     # standard errors over 12 pairs, measured: 0.001 px and 0.001
     assert flow_noise == pytest.approx(0.5, abs=0.01)
     assert depth_noise == pytest.approx(0.02, abs=0.004)
+
+
+@pytest.mark.parametrize("unit", [1e-4, 1.0, 25.0])
+def test_noise_scales_are_those_of_a_typical_pixel_whatever_the_unit_of_the_variances(unit):
+    found = []
+    for seed in range(6):
+        pair, _ = noisy(seed)
+        variance = np.full(pair.prev.depth.shape, unit)
+        prev = replace(pair.prev, depth_variance=variance)
+        found.append(refine(replace(pair, prev=prev, flow_variance=variance)))
+    # as without variances, with the standard errors of 6 pairs
+    assert np.mean([r.residual_scale_px for r in found]) == pytest.approx(0.5, abs=0.015)
+    assert np.mean([r.depth_noise for r in found]) == pytest.approx(0.02, abs=0.006)
 
 
 @pytest.mark.parametrize(
