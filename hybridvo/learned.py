@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hybridvo.errors import CheckpointError, InputError
+from hybridvo.quiet_import import quiet_import
 from hybridvo.types import FramePair, Reason, RelativePose, Status
 
 if TYPE_CHECKING:
@@ -120,6 +121,7 @@ def fitted_motion(
     """
     import torch.nn.functional as F
 
+    quiet_import("pypose")  # which the fit loads
     from hybridvo.pose.selection import chosen_motion
     from hybridvo.pose.weighted_fit import pixel_weights, weighted_fit
     from hybridvo.types import PixelwisePrediction
@@ -161,6 +163,7 @@ def static_probability(log_scale: torch.Tensor, valid: torch.Tensor) -> torch.Te
         (B, h, w). What counts is how far s lies above that of the pixels with weight in the fit;
         the map from there is logistic, see :data:`STATIC_AT`.
     """
+    quiet_import("pypose")  # which the fit loads
     from hybridvo.pose.weighted_fit import pixel_weights
 
     s = log_scale.mean(dim=1)
@@ -179,13 +182,11 @@ def propose_motion(network: torch.nn.Module, pair: FramePair) -> Proposal | None
         The motion that the trusted pixels agree on, after the last pass; None where too little is
         valid, or the answer is not finite.
     """
-    import torch
-
     from hybridvo.network.inputs import assemble_inputs
     from hybridvo.network.passes import predict
     from hybridvo.pose.second_look import Proposal
 
-    with torch.inference_mode():
+    with plain_torch():
         inputs = assemble_inputs(pair)
         if int(inputs.valid.sum()) < LEAST_PIXELS:
             return None
@@ -230,7 +231,7 @@ def estimate_learned(
         return RelativePose.failed(Reason.NO_VALID_DEPTH, "no depth for this frame", method)
     network = shipped_network(method) if network is None else network
     how = LEARNED[method]
-    with torch.inference_mode():
+    with plain_torch():
         inputs = assemble_inputs(pair)
         seen = int(inputs.valid.sum())
         if seen < LEAST_PIXELS:

@@ -69,7 +69,7 @@ class Odometry:
             :class:`hybridvo.hybrid.LearnedJudge` of one's own.
         flow: provider ``(prev, curr) -> FlowField or (H, W, 2) array``; default: OpenCV DIS with a
             forward-backward check. Functions of two images go through
-            :func:`hybridvo.flow.as_provider`.
+            :func:`hybridvo.flow.as_provider`. After :meth:`skip` the two are no neighbours.
         method: see :data:`hybridvo.hybrid.METHODS`; by default ``hybrid``, or ``refine`` without a
             network.
         history: let the predicted motion take part (:meth:`predict`): as one start among others,
@@ -264,7 +264,9 @@ class Odometry:
         Args:
             frame: the next frame. Its arrays are copied: a driver may reuse its buffers.
             flow: (H, W, 2) px from the previous frame to this one, or a FlowField, where it is
-                known already; by default the tracker's own provider is asked.
+                known already; by default the tracker's own provider is asked. The previous frame
+                is ``anchor.frame``: after :meth:`skip` the last one that was tracked. A flow from
+                the skipped one is of another pair, which its numbers do not tell: leave it away.
 
         Returns:
             The step. The first frame has the identity as motion, status ok.
@@ -403,7 +405,7 @@ class Odometry:
         return self._by_flow(key, curr, None, covariance, weights)
 
     def skip(self, index: int, timestamp: float, message: str = "") -> Step:
-        """A frame that could not be read: a failed step; the next pair spans it.
+        """A frame that could not be read: a failed step; the next pair, and its flow, span it.
 
         Args:
             index: of the frame.

@@ -387,16 +387,12 @@ def _lines(text: str) -> Iterator[str]:
 
 
 def to_seconds(stamps: Many[float] | np.ndarray, name: str) -> tuple[np.ndarray, list[str]]:
-    """Stamps in seconds; other units (``stamp_unit``) are converted with a notice.
-
-    What is not finite becomes NaN.
-    """
+    """Stamps in seconds, other units converted with a notice; what is not finite becomes NaN."""
     values = np.array(stamps, dtype=np.float64)
     values[~np.isfinite(values)] = np.nan
     factor, unit = stamp_unit(values)
-    if factor == 1:
-        return values, []
-    return values / factor, [f"{name}: stamps are {unit}; converted to seconds."]
+    told = [f"{name}: stamps are {unit}; converted to seconds."]
+    return values / factor, told if factor != 1 else []
 
 
 def poses_from_rows(rows: np.ndarray, source: str) -> np.ndarray:

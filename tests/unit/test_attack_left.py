@@ -11,7 +11,9 @@ import re
 import runpy
 import subprocess
 import sys
+import warnings
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -26,16 +28,18 @@ from hybridvo.data.sequence import open_sequence
 from hybridvo.data.workflow import PaperOptions
 from hybridvo.errors import CheckpointError, InputError, OutputError
 from hybridvo.evaluation import metrics
-from hybridvo.geometry import se3_exp
+from hybridvo.geometry import ego_flow, invert, se3_exp
 from hybridvo.network.judge import JudgeOptions
 from hybridvo.network.weights import pretrained
+from hybridvo.odometry import Odometry
 from hybridvo.pose.selection import SELECTION_METHODS, select
+from hybridvo.quiet_import import quiet_import
 from hybridvo.run_folder import RunFolder
 from hybridvo.training import stream
 from hybridvo.training.judge_loop import JudgeTrainer, JudgeTrainingOptions
 from hybridvo.training.outputs import check_export
 from hybridvo.trajectory import Trajectory, read_trajectory, write_tum
-from hybridvo.types import PixelwisePrediction
+from hybridvo.types import Camera, Frame, PixelwisePrediction
 from tests.sequences import write_folder
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -482,3 +486,97 @@ def test_pictures_named_by_microseconds_have_stamps(tmp_path: Path) -> None:
     sequence = open_sequence(written.path)
     expected = 1_763_000_000 + 0.04 * np.arange(len(sequence))
     np.testing.assert_allclose(sequence.timestamps, expected, rtol=0, atol=1e-6)
+
+
+# torch's settings, and what others warn of
+
+ASK_THE_NETWORK = """
+import sys, warnings
+import numpy as np, torch
+torch.set_default_device(sys.argv[1])
+import hybridvo as hvo
+from hybridvo.geometry import ego_flow, se3_exp
+from hybridvo.learned import estimate_learned, propose_motion, shipped_network
+camera = hvo.Camera(80.0, 80.0, 47.5, 35.5, 72, 96)
+v, u = np.mgrid[:72, :96]
+depth = (3 + np.sin(u / 9) + np.cos(v / 7)).astype(np.float32)
+T = se3_exp(np.array([0.02, -0.01, 0.03, 0.004, -0.006, 0.002]))
+flow = ego_flow(depth, T, camera, camera).astype(np.float32)
+pair = hvo.FramePair(hvo.Frame(None, depth, camera), hvo.Frame(None, depth, camera), flow)
+before = list(warnings.filters)
+network = shipped_network("pwvo")
+for found in (propose_motion(network, pair), estimate_learned(pair, "pwvo"), hvo.estimate(pair)):
+    print(repr(found.T_curr_prev.tolist()))
+assert "pypose" in sys.modules
+new = [f for f in warnings.filters if f not in before]
+assert all(f in warnings.filters for f in before)
+assert all(f[2].__module__.startswith("sympy") for f in new), new  # which torch loads
+assert torch.get_default_device().type == sys.argv[1]
+"""
+
+
+def test_another_default_device_and_warnings_as_errors_change_nothing() -> None:
+    """Torch: no data in a meta tensor; pypose: torch.jit.script is deprecated."""
+    plain = in_a_fresh_process(ASK_THE_NETWORK.replace("sys.argv[1]", '"cpu"'), "-W", "default")
+    strict = in_a_fresh_process(ASK_THE_NETWORK.replace("sys.argv[1]", '"meta"'), "-W", "error")
+    assert plain.returncode == strict.returncode == 0, plain.stderr + strict.stderr
+    assert strict.stderr == "" and "jit" not in plain.stderr
+    assert strict.stdout == plain.stdout and plain.stdout.count("\n") == 3
+
+
+def test_a_quiet_import_shields_only_its_own_warnings(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From many threads at once; what is no deprecation is heard as before."""
+    names = [f"warns_of_{kind}" for kind in ("DeprecationWarning", "FutureWarning")]
+    for name in (*names, "warns_of_UserWarning"):
+        kind = name.removeprefix("warns_of_")
+        (tmp_path / f"{name}.py").write_text(
+            f"import time, warnings\nwarnings.warn('old', {kind})\ntime.sleep(0.05)\nready = 1\n"
+        )
+    monkeypatch.syspath_prepend(tmp_path)
+    before = list(warnings.filters)
+    with ThreadPoolExecutor(8) as pool:
+        modules = list(pool.map(quiet_import, 8 * names))
+    assert all(module.ready for module in modules)
+    assert warnings.filters == before
+    with pytest.warns(UserWarning, match="old"):
+        quiet_import("warns_of_UserWarning")
+    with pytest.raises(ImportError):
+        quiet_import("nowhere_to_be_found")
+    with pytest.warns(DeprecationWarning):
+        warnings.warn("new", DeprecationWarning, stacklevel=1)
+    for name in (*names, "warns_of_UserWarning"):
+        sys.modules.pop(name)
+
+
+# the tracker
+
+
+def test_after_a_skipped_frame_a_flow_leads_from_the_last_tracked_one() -> None:
+    """Which frame a flow must lead from is what the anchor and the provider's arguments say."""
+    camera = Camera(40.0, 40.0, 15.5, 11.5, 24, 32)
+    v, u = np.mgrid[:24, :32]
+    depth = (3 + np.sin(u / 5) + np.cos(v / 4)).astype(np.float32)
+    frames = [Frame(None, depth, camera, timestamp=0.1 * i, index=i) for i in range(4)]
+    T = se3_exp(np.array([0.02, -0.01, 0.03, 0.004, -0.006, 0.002]))
+    across = ego_flow(depth, T, camera, camera).astype(np.float32)
+    asked = []
+
+    def provider(prev: Frame, curr: Frame) -> np.ndarray:
+        asked.append((prev.index, curr.index))
+        return across
+
+    for given in (None, across):
+        vo = Odometry(None, flow=provider, prepare=False)
+        vo.track(frames[0])
+        vo.skip(1, 0.1)
+        assert vo.anchor.frame is not None and vo.anchor.frame.index == 0 and vo.anchor.gap == 1
+        step = vo.track(frames[2], given)
+        # the motion of the pair 0 -> 2: float32 of the flow, over pixels of 3 m / 40 px
+        np.testing.assert_allclose(step.T_world_cam, invert(T), atol=1e-5)
+        assert vo.anchor.frame.index == 2 and vo.anchor.gap == 0
+    assert asked == [(0, 2)]
+    told = " ".join((Odometry.track.__doc__ or "").split())
+    assert "after :meth:`skip` the last one that was tracked" in told
+    assert "``anchor.frame``" in told
