@@ -10,7 +10,6 @@ for all; errors of the refinement alone and after the polish; processor time of 
 from __future__ import annotations
 
 import argparse
-import shlex
 import sys
 import time
 from collections.abc import Iterator
@@ -18,54 +17,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from measured_pairs import REAL, pairs_parser, write_rows
 
 KINDS = ("static", "light", "heavy_rigid", "heavy_two", "pair")
-REAL = (
-    "tartanair_v2/P000",
-    "tum/redwood_livingroom_5",
-    "tum/rgbd_dataset_freiburg1_xyz_first10",
-)
 VARIANTS = ("ultrafast", "fast", "medium", "medium-forward", "medium-twice", "fast-twice")
 
 
-def build_parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="measure_flow.py", description=(__doc__ or "").splitlines()[0]
-    )
-    parser.add_argument("--data", type=Path, default=Path("../shared/data"), metavar="DIR")
-    parser.add_argument("--out", type=Path, required=True, metavar="FILE")
-    parser.add_argument("--seed", type=int, default=100, help="first seed of the scenes")
-    parser.add_argument("--scenes", type=int, default=2, help="scenes of each kind")
-    parser.add_argument("--overwrite", action="store_true", help="replace --out")
-    return parser
-
-
 def main(argv: list[str] | None = None) -> int:
-    args = build_parser().parse_args(argv)
-    from hybridvo.errors import HybridVOError
-    from hybridvo.evaluation.report import write_json
-    from hybridvo.hybrid import warm_up
-    from hybridvo.run import versions
+    return write_rows(pairs_parser("measure_flow.py", __doc__, 2), argv, measure_all, table)
 
-    given = sys.argv[1:] if argv is None else argv
-    if args.out.exists() and not args.overwrite:
-        print(f"measure_flow.py: {args.out} exists; pass --overwrite.", file=sys.stderr)
-        return 2
-    try:
-        warm_up("refine", "on")
-        groups = {"rendered": rendered(args)} | {
-            name: real(args.data / name) for name in REAL if (args.data / name).exists()
-        }
-        rows = [row for name, pairs in groups.items() for row in measure(name, pairs)]
-        args.out.parent.mkdir(parents=True, exist_ok=True)
-        command = "python tools/measure_flow.py " + shlex.join(given)
-        write_json(args.out, {"command": command, "versions": versions(), "rows": rows})
-    except HybridVOError as error:
-        print(f"measure_flow.py: {error}", file=sys.stderr)
-        return 2
-    print(table(rows))
-    print(args.out)
-    return 0
+
+def measure_all(args: argparse.Namespace) -> list[dict[str, Any]]:
+    groups = {"rendered": rendered(args)} | {
+        name: real(args.data / name) for name in REAL if (args.data / name).exists()
+    }
+    return [row for name, pairs in groups.items() for row in measure(name, pairs)]
 
 
 def rendered(args: argparse.Namespace) -> Iterator[tuple[Any, Any, np.ndarray]]:

@@ -10,68 +10,29 @@ flow, rotation, translation, end-point drift of the real sequences, reasons, mil
 from __future__ import annotations
 
 import argparse
-import shlex
 import sys
 import time
 from collections import Counter
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+from measured_pairs import REAL, pairs_parser, write_rows
 
 KINDS = ("static", "light", "heavy_rigid", "heavy_deforming", "heavy_two", "heavy_ten", "pair")
-REAL = (
-    "tartanair_v2/P000",
-    "tum/redwood_livingroom_5",
-    "tum/rgbd_dataset_freiburg1_xyz_first10",
-)
 PAIRS = (0, 4, 8, 12, 16)
 """Pairs of a rendered sequence that are measured."""
 
 
-def build_parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="measure_polish.py", description=(__doc__ or "").splitlines()[0]
-    )
-    parser.add_argument("--data", type=Path, default=Path("../shared/data"), metavar="DIR")
-    parser.add_argument("--out", type=Path, required=True, metavar="FILE")
-    parser.add_argument("--seed", type=int, default=100, help="first seed of the scenes")
-    parser.add_argument("--scenes", type=int, default=4, help="scenes of each kind")
-    parser.add_argument("--degraded", action="store_true", help="spoilt pictures instead")
-    parser.add_argument("--overwrite", action="store_true", help="replace --out")
-    return parser
-
-
 def main(argv: list[str] | None = None) -> int:
-    args = build_parser().parse_args(argv)
-    from hybridvo.errors import HybridVOError
-    from hybridvo.evaluation.report import write_json
-    from hybridvo.hybrid import warm_up
-    from hybridvo.run import versions
+    parser = pairs_parser("measure_polish.py", __doc__, 4)
+    parser.add_argument("--degraded", action="store_true", help="spoilt pictures instead")
+    return write_rows(parser, argv, measure_all)
 
-    given = sys.argv[1:] if argv is None else argv
-    if args.out.exists() and not args.overwrite:
-        print(f"measure_polish.py: {args.out} exists; pass --overwrite.", file=sys.stderr)
-        return 2
-    try:
-        warm_up("refine", "on")
-        source = spoilt(args) if args.degraded else groups(args)
-        rows = [measure(name, pairs) for name, pairs in source]
-        args.out.parent.mkdir(parents=True, exist_ok=True)
-        write_json(
-            args.out,
-            {
-                "command": "python tools/measure_polish.py " + shlex.join(given),
-                "versions": versions(),
-                "rows": rows,
-            },
-        )
-    except HybridVOError as error:
-        print(f"measure_polish.py: {error}", file=sys.stderr)
-        return 2
-    print(args.out)
-    return 0
+
+def measure_all(args: argparse.Namespace) -> list[dict[str, Any]]:
+    source = spoilt(args) if args.degraded else groups(args)
+    return [measure(name, pairs) for name, pairs in source]
 
 
 def groups(args: argparse.Namespace) -> Iterator[tuple[str, Iterator[tuple[Any, np.ndarray]]]]:
