@@ -18,10 +18,10 @@ from hybridvo.data.workflow import Sample, rigid_flow
 from hybridvo.errors import FormatError, InputError
 from hybridvo.geometry import matrix_to_euler_deg
 
-__all__ = ["RenderedOptions", "picture_sample"]
+__all__ = ["MOVING", "STATIC", "UNKNOWN", "RenderedOptions", "picture_sample"]
 
-MOVING = 0
-"""Label of a moving pixel in a shard."""
+MOVING, STATIC, UNKNOWN = 0, 1, 255
+"""Labels of the pixels in a shard."""
 FIRST_RENDERED = 1
 """Sources from this number on are rendered; 0 is the ``wide`` preset, which is drawn afresh."""
 NAMES = ("exact", "coarse", "log_depth", "depth_true", "label", "T", "K", "stride", "source")

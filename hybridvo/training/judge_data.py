@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from hybridvo.data.degradation import DegradationOptions, degrade_depth, log_uniform
+from hybridvo.data.rendered_pictures import MOVING, STATIC, UNKNOWN
 from hybridvo.data.wide import WideOptions, wide_sample
 from hybridvo.flow import dis_flow
 from hybridvo.geometry import invert, se3_exp
@@ -32,7 +33,6 @@ MOST = 5
 """Motions of a picture."""
 SIZES = ((160, 320), (160, 320), (128, 256), (192, 256), (120, 400), (218, 512))
 """(height, width) of the pictures."""
-MOVING, STATIC, UNKNOWN = 0, 1, 255
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,6 +20,7 @@ import torch.nn.functional as F
 from safetensors import SafetensorError
 from safetensors.torch import load_file
 
+from hybridvo.data.rendered_pictures import MOVING, STATIC
 from hybridvo.errors import CheckpointError, InputError
 from hybridvo.network.judge import JudgeInputs, JudgeNetwork, JudgeOptions, JudgeOutput
 from hybridvo.training.checkpoint import load_checkpoint, save_checkpoint
@@ -29,7 +30,6 @@ from hybridvo.training.judge_batches import (
     read_batches,
     refits_of,
 )
-from hybridvo.training.judge_data import MOVING, STATIC
 
 __all__ = ["JudgeTrainer", "JudgeTrainingOptions"]
 
