@@ -403,10 +403,11 @@ def test_a_list_that_holds_itself(tmp_path):
 
 
 def test_judge_training_refuses_the_checkpoint_of_another_training(tmp_path):
-    from hybridvo.training.judge_loop import JudgeTrainer
+    from hybridvo.training.judge_loop import JudgeTrainer, JudgeTrainingOptions
 
     save_checkpoint(tmp_path / "checkpoint.pt", state())
     trainer = object.__new__(JudgeTrainer)  # resume() needs no pictures
-    trainer.out, trainer.network = tmp_path, torch.nn.Linear(2, 1)  # type: ignore[assignment]
+    trainer.out, trainer.options = tmp_path, JudgeTrainingOptions()
+    trainer.network = torch.nn.Linear(2, 1)  # type: ignore[assignment]
     with pytest.raises(CheckpointError, match=r"checkpoint\.pt: not of this training"):
         trainer.resume()
