@@ -114,12 +114,15 @@ def test_select_takes_maps_of_several_real_types() -> None:
 # surroundings
 
 
-def in_a_fresh_process(code: str, *flags: str, **environment: str) -> subprocess.CompletedProcess:
+def in_a_fresh_process(
+    code: str, *words: object, flags: tuple[str, ...] = (), **environment: str
+) -> subprocess.CompletedProcess:
     return subprocess.run(
-        [sys.executable, *flags, "-c", code],
+        [sys.executable, *flags, "-c", code, *map(str, words)],
         capture_output=True,
         text=True,
         check=False,
+        timeout=120,
         cwd=ROOT,
         env=os.environ | {"OMP_NUM_THREADS": "1"} | environment,
     )
@@ -128,13 +131,13 @@ def in_a_fresh_process(code: str, *flags: str, **environment: str) -> subprocess
 ASK_EVERY_DOOR = """
 import contextlib, io, runpy, sys
 from hybridvo.cli import main
-folder = sys.argv[1] if len(sys.argv) > 1 else "nowhere"
+folder = sys.argv[1]
 tool = lambda name: runpy.run_path(f"tools/{name}.py")["main"]
 for door, words in (
     (main, ["run", "--sequence", folder]),
-    (main, ["demo", "--out", folder]),
-    (tool("train"), ["--config", "configs/train_pwvo.yaml", "--out", folder]),
-    (tool("generate_dataset"), ["--out", folder]),
+    (main, ["demo", "--out", folder, "--frames", "3"]),
+    (tool("train"), ["--config", "configs/train_pwvo.yaml", "--out", folder, "--steps", "1"]),
+    (tool("generate_dataset"), ["--out", folder, "--frames", "3"]),
     (tool("train_judge"), ["make", "--data", folder, "--first-seed", "0", "--seeds", "1"]),
 ):
     with contextlib.redirect_stderr(io.StringIO()) as said:
@@ -151,9 +154,9 @@ main(["doctor"])
 
 
 @pytest.mark.parametrize("threads", ["0", "many", "1000000"])
-def test_numbas_threads_are_refused_in_words(threads: str) -> None:
+def test_numbas_threads_are_refused_in_words(tmp_path: Path, threads: str) -> None:
     """Numba: a ValueError, a warning that holds a traceback, the end of the process."""
-    done = in_a_fresh_process(ASK_EVERY_DOOR, NUMBA_NUM_THREADS=threads)
+    done = in_a_fresh_process(ASK_EVERY_DOOR, tmp_path / "out", NUMBA_NUM_THREADS=threads)
     assert done.returncode == 0, done.stderr
     assert "Traceback" not in done.stdout + done.stderr
     *doors, ready = done.stdout.strip().splitlines()
@@ -165,7 +168,7 @@ def test_numbas_threads_are_refused_in_words(threads: str) -> None:
     assert all(told in line and "Unset it" in line for line in answers)
     assert any(line.startswith("note") and told in line for line in doors)
     assert ready == "NOT ready: see above"
-    assert not (ROOT / "nowhere").exists()
+    assert not (tmp_path / "out").exists()
 
 
 # training
@@ -517,8 +520,8 @@ assert torch.get_default_device().type == sys.argv[1]
 
 def test_another_default_device_and_warnings_as_errors_change_nothing() -> None:
     """Torch: no data in a meta tensor; pypose: torch.jit.script is deprecated."""
-    plain = in_a_fresh_process(ASK_THE_NETWORK.replace("sys.argv[1]", '"cpu"'), "-W", "default")
-    strict = in_a_fresh_process(ASK_THE_NETWORK.replace("sys.argv[1]", '"meta"'), "-W", "error")
+    plain = in_a_fresh_process(ASK_THE_NETWORK, "cpu", flags=("-W", "default"))
+    strict = in_a_fresh_process(ASK_THE_NETWORK, "meta", flags=("-W", "error"))
     assert plain.returncode == strict.returncode == 0, plain.stderr + strict.stderr
     assert strict.stderr == "" and "jit" not in plain.stderr
     assert strict.stdout == plain.stdout and plain.stdout.count("\n") == 3
