@@ -131,7 +131,7 @@ def run(
     if options.method == "refine" or options.method in JUDGED:
         compile_kernels(options.method)  # before the folder is taken: it may last
     out = Path("runs") / run_name(sequence) if out is None else Path(out)
-    _check_outside(out, sequence)
+    check_outside(out, sequence)
     identity = {
         "input_hash": input_hash(sequence),
         "input_times": input_times(sequence),
@@ -175,7 +175,7 @@ def run(
         return result
 
 
-def _check_outside(out: Path, sequence: Sequence) -> None:
+def check_outside(out: Path, sequence: Sequence) -> None:
     """Refuse to write among the frames of the sequence: the next run would read what is drawn."""
     frames = (".png", ".jpg", ".jpeg", ".npy", ".dpt", ".flo")
     folders = {path.parent for path in sequence.files() if path.suffix.lower() in frames}

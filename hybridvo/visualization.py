@@ -33,6 +33,7 @@ class PictureOptions:
         out: picture to write, .png.
         into: folder of a comparison, whose report gets the picture.
         overwrite: replace what is there.
+        name: what the sequence is called; None: as its folder.
     """
 
     sequence: str
@@ -46,6 +47,7 @@ class PictureOptions:
     out: Path | None = None
     into: Path | None = None
     overwrite: bool = False
+    name: str | None = None
 
 
 def visualize(options: PictureOptions, command: list[str]) -> list[Path]:
@@ -81,16 +83,15 @@ def visualize(options: PictureOptions, command: list[str]) -> list[Path]:
         panels += more
         numbers |= values
     source = f"{pair.flow_source} (true)" if pair.flow_is_true else pair.flow_source
-    heading = (
-        f"{sequence.name}, pair {options.pair}; flow: {source}; motion: {method}, {motion.status}"
-    )
+    called = options.name or sequence.name
+    heading = f"{called}, pair {options.pair}; flow: {source}; motion: {method}, {motion.status}"
     height, width = pair.prev.camera.shape
     content = maps_png(panels, heading, width / height)
     make_folder(picture.parent)
     with atomic_write(picture, "wb") as file:
         file.write(content)
     record = {
-        "title": f"{sequence.name}, pair {options.pair}",
+        "title": f"{called}, pair {options.pair}",
         "caption": f"Flow: {source}; motion: {method}, {motion.status}.",
         "command": command,
         "numbers": [
@@ -111,6 +112,7 @@ def visualize(options: PictureOptions, command: list[str]) -> list[Path]:
 def target(options: PictureOptions) -> Path:
     """Picture to write."""
     from hybridvo.errors import InputError
+    from hybridvo.evaluation.report_data import plain_stem
 
     if options.into is not None:
         if not (options.into / "results.json").is_file():
@@ -118,7 +120,7 @@ def target(options: PictureOptions) -> Path:
                 f"--into {options.into}: holds no results.json; expected the output folder of "
                 f"tools/compare_methods.py."
             )
-        name = "".join(c if c.isalnum() or c in "-_." else "_" for c in Path(options.sequence).name)
+        name = plain_stem(options.name or Path(options.sequence).name)
         path = options.into / "figures" / f"{name}_{options.pair:06d}.png"
     elif options.out is not None:
         path = options.out

@@ -56,7 +56,7 @@ IMPORTS: dict[str, set[str]] = {
     # what tools/compare_methods.py runs, on this machine and on others
     "comparison": {
         *("__init__", "errors", "types", "geometry", "data", "flow", "hybrid", "trajectory"),
-        *("evaluation", "configuration", "console", "run_folder", "run_results", "run"),
+        *("evaluation", "configuration", "console", "run_folder", "run_results", "run", "checks"),
         "learned_judge",
     },
     # figures of one pair: tools/visualize.py, and the report of a comparison

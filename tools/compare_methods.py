@@ -30,7 +30,7 @@ def build_parser() -> argparse.ArgumentParser:
         metavar="DIR",
         help="sequence, or a folder of sequences (MPI Sintel as it was unpacked); repeatable",
     )
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR")
+    parser.add_argument("--out", required=True, metavar="DIR")
     parser.add_argument("--methods", default="all", help="comma-separated; default: all that run")
     parser.add_argument(
         "--flow",
@@ -78,11 +78,15 @@ def main(argv: list[str] | None = None) -> int:
     except SystemExit as end:
         return int(end.code or 0)
     from hybridvo.comparison.runner import ComparisonOptions, WorkerError, compare
+    from hybridvo.console import printable
     from hybridvo.errors import HybridVOError, InputError, LockedError, OutputError
 
     given = sys.argv[1:] if argv is None else argv
     mode = "overwrite" if args.overwrite else "resume" if args.resume else "new"
     try:
+        for option, values in (("--sequence", args.sequence), ("--out", [args.out])):
+            if "" in values:  # a variable that is not set, not the working folder
+                raise InputError(f"{option}: expected a folder, got an empty path.")
         if args.maps < 0:
             raise InputError(f"--maps: expected at least 0, got {args.maps}.")
         options = ComparisonOptions(
@@ -102,13 +106,13 @@ def main(argv: list[str] | None = None) -> int:
         )
         written = compare(
             options,
-            args.out,
+            Path(args.out),
             mode=mode,
             command=["tools/compare_methods.py", *given],
             quiet=args.quiet,
         )
     except HybridVOError as error:
-        print(f"compare_methods.py: {error}", file=sys.stderr)
+        print(printable(f"compare_methods.py: {error}"), file=sys.stderr)
         codes = ((OutputError, 5), (LockedError, 4), (WorkerError, 1))
         return next((code for kind, code in codes if isinstance(error, kind)), 2)
     except KeyboardInterrupt:
@@ -116,21 +120,28 @@ def main(argv: list[str] | None = None) -> int:
         return 130
     if written is None:
         return 130
-    written += draw_maps(args.out, args.maps, args.quiet)
+    written += draw_maps(Path(args.out), args.maps, args.quiet)
     for path in dict.fromkeys(written):
-        print(path)
+        print(printable(str(path)))
     return 0
 
 
 def draw_maps(out: Path, count: int, quiet: bool) -> list[Path]:
     """Maps of the worst pairs of the first method, added to the report; a failure is one line."""
+    from hybridvo.console import printable
     from hybridvo.errors import HybridVOError
     from hybridvo.visualization import PictureOptions, visualize
 
-    results = json.loads((out / "results.json").read_text(encoding="utf-8"))
-    paths = {row["name"]: row["path"] for row in results["sequences"]}
-    kinds = {row["name"]: row["kind"] for row in results["sequences"]}
-    worst = results["worst_pairs"] or []
+    if not count:
+        return []
+    try:
+        results = json.loads((out / "results.json").read_text(encoding="utf-8"))
+        paths = {row["name"]: row["path"] for row in results["sequences"]}
+        kinds = {row["name"]: row["kind"] for row in results["sequences"]}
+        worst = results["worst_pairs"] or []
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        print(f"compare_methods.py: no maps: results.json: {error!r}", file=sys.stderr)
+        return []
     pairs = [row for row in worst if row["method"] == worst[0]["method"]][:count]
     written: list[Path] = []
     for row in pairs:
@@ -144,6 +155,7 @@ def draw_maps(out: Path, count: int, quiet: bool) -> list[Path]:
             method=row["method"],
             into=out,
             overwrite=True,
+            name=name,
         )
         command = ["tools/visualize.py", "--sequence", paths[name], "--dataset", kinds[name]]
         command += ["--pair", str(row["index"]), "--method", row["method"], "--into", str(out)]
@@ -153,7 +165,8 @@ def draw_maps(out: Path, count: int, quiet: bool) -> list[Path]:
         try:
             written += visualize(options, command)
         except HybridVOError as error:
-            print(f"compare_methods.py: no maps of {name}: {error}", file=sys.stderr)
+            told = f"compare_methods.py: no maps of {name}: {error}"
+            print(printable(told), file=sys.stderr)
     return written
 
 

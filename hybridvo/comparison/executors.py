@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import multiprocessing
 import os
+import re
 import signal
 import threading
 from collections.abc import Callable, Iterator
@@ -20,6 +21,7 @@ from hybridvo.errors import InputError
 __all__ = ["Workers", "open_workers"]
 
 CONNECT_SECONDS = 30.0
+_ADDRESS = re.compile(r"(?:(?:tcp|tls)://)?(?:\[[0-9a-fA-F:.%]+\]|[\w.-]+):([0-9]{1,5})", re.ASCII)
 
 
 @dataclass(frozen=True)
@@ -94,7 +96,17 @@ def open_workers(jobs: int = 1, scheduler: str | None = None) -> Iterator[Worker
             pool.shutdown(wait=True, cancel_futures=True)
 
 
+def _check_address(address: str) -> None:
+    # Dask takes other words for addresses too, and then waits a minute in a thread of its own
+    found = _ADDRESS.fullmatch(address)
+    if found is None or not 1 <= int(found[1]) <= 65535:
+        raise InputError(
+            f"--scheduler: expected an address such as tcp://host:8786, got {address!r}."
+        )
+
+
 def _dask(address: str) -> Iterator[Workers]:
+    _check_address(address)
     try:
         from distributed import Client
     except ImportError:
@@ -103,7 +115,7 @@ def _dask(address: str) -> Iterator[Workers]:
         ) from None
     try:
         client = Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, TypeError, RuntimeError) as error:
         raise InputError(
             f"--scheduler {address}: no Dask scheduler answers ({error}). Start one with "
             f"'dask scheduler' and workers with 'dask worker --nthreads 1 {address}'."

@@ -9,12 +9,14 @@ from typing import Any
 import cv2
 import numpy as np
 
+from hybridvo.checks import make_folder
 from hybridvo.comparison.job import Job, flow_label, true_motion
 from hybridvo.comparison.results import Segments, file_stem
 from hybridvo.configuration import RunOptions
 from hybridvo.data.sequence import Sequence as FrameSequence
 from hybridvo.errors import InputError
 from hybridvo.evaluation.maps import error_map, flow_colours, longest_flow
+from hybridvo.evaluation.report_data import one_line
 from hybridvo.flow import FlowField
 from hybridvo.run import flow_provider
 from hybridvo.trajectory import atomic_write
@@ -55,7 +57,7 @@ def picture_worst(
     for entry in found:
         wanted.setdefault((entry["sequence"], entry["index"]), []).append(entry)
     if found:
-        (out / "worst").mkdir(exist_ok=True)
+        make_folder(out / "worst")
     for number, (job, sequence) in enumerate(zip(jobs, sequences, strict=True)):
         if not any(name == job.name for name, _ in wanted):
             continue
@@ -93,7 +95,7 @@ def _picture_pair(
         result = results[entry["method"], flow]
         entry |= {
             "status": result["status"],
-            "message": " ".join(str(result["message"]).split()),
+            "message": one_line(result["message"]),
             "picture": None,
             "picture_reason": reason,
         }

@@ -13,7 +13,7 @@ from hybridvo.data.sintel import SintelSequence
 from hybridvo.errors import InputError
 from hybridvo.hybrid import METHODS, check_method
 
-__all__ = ["chosen_methods", "expand", "unique_names", "weights_of"]
+__all__ = ["chosen_methods", "expand", "shown_name", "unique_names", "weights_of"]
 
 _SINTEL_FOLDERS = ("camdata_left", "depth", "final", "clean", "flow")
 
@@ -101,13 +101,25 @@ def _sintel_scenes(folder: Path) -> list[Path]:
     return [scenes[name] for name in sorted(scenes)]
 
 
+def shown_name(name: str) -> str:
+    """A name for results: one line, of characters that UTF-8 has and a reader sees.
+
+    What is none becomes an escape. A name that a spreadsheet would take for a formula gets ``./``
+    before it, in every file, so that all of them can still be joined by it.
+    """
+    shown = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in name)
+    return f"./{shown}" if shown.startswith(("=", "+", "-", "@")) else shown
+
+
 def unique_names(paths: Sequence[Path], names: Sequence[str]) -> list[str]:
     """Names of sequences, with parts of their paths before those that would be told twice.
+
+    They are fit to be shown: see :func:`shown_name`.
 
     Raises:
         InputError: one folder given twice.
     """
-    result = list(names)
+    result = [shown_name(name) for name in names]
     absolute = [path.absolute() for path in paths]
     if len(set(absolute)) < len(absolute):
         twice = next(p for p in paths if absolute.count(p.absolute()) > 1)
@@ -119,5 +131,5 @@ def unique_names(paths: Sequence[Path], names: Sequence[str]) -> list[str]:
         for i, name in enumerate(result):
             if name in double:
                 parts = absolute[i].parent.parts[-depth:]
-                result[i] = "/".join((*parts, names[i]))
+                result[i] = shown_name("/".join((*parts, names[i])))
     return result

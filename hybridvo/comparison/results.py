@@ -11,10 +11,14 @@ from typing import IO, Any
 
 import numpy as np
 
+from hybridvo.checks import make_folder
 from hybridvo.comparison.job import Job, flow_label
+from hybridvo.comparison.kept import check_segment
 from hybridvo.comparison.scores import ChainedPath, sequence_row, total_row
 from hybridvo.data.sequence import Sequence as FrameSequence
+from hybridvo.errors import FormatError
 from hybridvo.evaluation.breakdown import FACTORS, PairTable
+from hybridvo.evaluation.report_data import one_line, plain_stem
 from hybridvo.run_results import true_trajectory
 from hybridvo.trajectory import Trajectory, atomic_write, write_tum
 
@@ -45,9 +49,13 @@ class Segments:
 
     Args:
         path: file with a JSON mapping a line: ``job`` and what ``run_segment`` returned.
+        jobs: of the comparison, which every line must fit.
+
+    Raises:
+        FormatError: a line that this comparison has not written.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, jobs: Sequence[Job]) -> None:
         self._path = path
         self._places: dict[int, list[int]] = {}
         self.done: dict[int, int] = {}
@@ -57,8 +65,16 @@ class Segments:
             return
         with path.open("rb") as file:
             place = 0
-            for line in file:
-                self.took(json.loads(line), place)
+            for number, line in enumerate(file, start=1):
+                segment = json.loads(line)
+                try:
+                    check_segment(segment, jobs, self.done)
+                except (ValueError, OverflowError) as error:
+                    raise FormatError(
+                        f"{path}:{number}: not as this comparison wrote it: {error}. Pass "
+                        f"--overwrite to start anew."
+                    ) from None
+                self.took(segment, place)
                 place += len(line)
 
     def took(self, segment: Mapping[str, Any], place: int) -> None:
@@ -85,7 +101,7 @@ class Segments:
 
 def file_stem(number: int, name: str) -> str:
     """Beginning of the names of a sequence's files: unique, and plain on every file system."""
-    return f"{number:03d}_" + "".join(c if c.isalnum() or c in "-_." else "_" for c in name)
+    return f"{number:03d}_{plain_stem(name)}"
 
 
 @dataclass(frozen=True)
@@ -114,7 +130,7 @@ def collect(
         OutputError: a file cannot be written.
     """
     found = Collected([], [], [], [], PairTable())
-    (out / "trajectories").mkdir(exist_ok=True)
+    make_folder(out / "trajectories")
     with atomic_write(out / "pairs.csv") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(PAIR_COLUMNS)
@@ -156,7 +172,7 @@ def _one(
                 flow, method = result["flow"], result["method"]
                 row = shared | result | {"sequence": job.name, "flow_source": labels[flow]}
                 row["flow_ms"] = pair["flow_ms"][flow]
-                row["message"] = " ".join(str(result["message"]).split())
+                row["message"] = one_line(result["message"])
                 table.add(row)
                 cells = (row.get(name) for name in PAIR_COLUMNS)
                 writer.writerow([repr(c) if isinstance(c, float) else c for c in cells])
@@ -197,6 +213,6 @@ def _one(
             "left_out": left_out,
             "depth_source": sequence.depth_source,
             "flow_sources": list(labels.values()),
-            "notices": list(sequence.notices),
+            "notices": [n.removeprefix(f"{sequence.name}: ") for n in sequence.notices],
         }
     )

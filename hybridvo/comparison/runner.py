@@ -17,21 +17,25 @@ from hybridvo.comparison.executors import Workers, open_workers
 from hybridvo.comparison.job import Job, run_segment
 from hybridvo.comparison.plan import chosen_methods, expand, unique_names, weights_of
 from hybridvo.comparison.results import ROW_COLUMNS, Segments, collect
+from hybridvo.comparison.scores import scale_notice
 from hybridvo.configuration import RunOptions
 from hybridvo.console import Interruption, Progress, interruptible
 from hybridvo.data.fingerprint import input_hash
 from hybridvo.data.sequence import Sequence, open_sequence
-from hybridvo.errors import HybridVOError, InputError
+from hybridvo.errors import HybridVOError, InputError, OutputError
 from hybridvo.evaluation.breakdown import breakdown, worst_pairs
 from hybridvo.evaluation.protocols import Protocol, check_protocol, protocol_summary
 from hybridvo.evaluation.report import write_csv, write_json
-from hybridvo.run import check_device, flow_provider, versions
+from hybridvo.evaluation.report_data import one_line
+from hybridvo.run import check_device, check_outside, flow_provider, versions
 from hybridvo.run_folder import PARTIAL, Mode, RunFolder
 
 __all__ = ["WRITTEN", "ComparisonOptions", "WorkerError", "compare"]
 
 WRITTEN = ("results.json", "results.csv", "pairs.csv", "report.md", "report.html")
-"""What a finished comparison leaves, beside run.json, trajectories/ and worst/."""
+"""What a finished comparison leaves, beside run.json and :data:`FOLDERS`."""
+FOLDERS = {"trajectories": "*.tum", "worst": "*.jpg", "figures": "*_[0-9]*"}
+"""Folders inside of the output folder, and what a comparison writes there."""
 
 
 class WorkerError(HybridVOError, RuntimeError):
@@ -85,6 +89,11 @@ class _Plan:
     protocol: Protocol | None
     left_aside: list[str] = field(default_factory=list)
 
+    @property
+    def each(self) -> Iterable[tuple[Job, Sequence]]:
+        """Jobs beside their sequences."""
+        return zip(self.jobs, self.sequences, strict=True)
+
 
 def compare(
     options: ComparisonOptions,
@@ -111,14 +120,19 @@ def compare(
         LockedError: another run holds the folder. OutputError: a result cannot be written.
         WorkerError: a worker died.
     """
+    from hybridvo.evaluation.report_page import write_report
+
     out = Path(out)
-    present = [name for name in WRITTEN if (out / name).exists()]
+    present = [name for name in WRITTEN if os.path.lexists(out / name)]
     if present and mode == "new":
         raise InputError(
             f"{out}: holds {', '.join(present)}; pass --overwrite to replace them, or another "
             f"--out."
         )
+    _check_folders(out, mode)
     plan = _plan(options)
+    for sequence in plan.sequences:
+        check_outside(out, sequence)
     settings = asdict(options)
     weights = weights_of(plan.methods)
     identity = {
@@ -141,31 +155,93 @@ def compare(
     }
     with (
         interruptible() as interruption,
+        # before the folder is taken: an address that is wrong leaves nothing behind
+        open_workers(_jobs(options, plan), options.scheduler) as workers,
         RunFolder(out, identity, header, mode, WRITTEN) as folder,
     ):
         if folder.finished:
+            absent = [name for name in WRITTEN if not (out / name).is_file()]
+            if absent and not any(name.endswith((".json", ".csv")) for name in absent):
+                write_report(out)  # made of the others
+            elif absent:
+                raise InputError(
+                    f"{out}: this comparison is done, but {', '.join(absent)} is missing. Pass "
+                    f"--overwrite to start anew."
+                )
             return [out / name for name in WRITTEN]
+        if mode == "overwrite":
+            _clear_folders(out)
         total = sum(job.pairs for job in plan.jobs)
         count = len(plan.jobs)
         label = f"{count} sequence{'s' * (count > 1)}, {len(plan.methods)} methods"
-        segments = Segments(out / PARTIAL)
+        segments = Segments(out / PARTIAL, plan.jobs)
         before = sum(segments.done.values())
         with Progress(total, label, quiet=quiet, unit="pairs", before=before) as progress:
             for name, reason in plan.missing.items():
                 progress.say(f"not run: {name}: {reason}")
-            for line in plan.left_aside:
+            notices = [
+                f"{job.name}: {one_line(notice.removeprefix(f'{sequence.name}: '))}"
+                for job, sequence in plan.each
+                for notice in sequence.notices
+            ]
+            for line in (*plan.left_aside, *notices):
                 progress.say(f"note: {line}")
-            with open_workers(options.jobs, options.scheduler) as workers:
-                _work(plan.jobs, segments, folder, workers, interruption, progress)
+            _work(plan.jobs, segments, folder, workers, interruption, progress)
             if interruption:
                 done = sum(segments.done.values())
                 progress.say(f"interrupted: {done} of {total} pairs are kept; go on with --resume")
                 folder.write_state("interrupted")
                 return None
             progress.say("all pairs are done: scores and report")
-            _write(out, plan, options, header, segments)
+            for line in _write(out, plan, options, header, segments):
+                progress.say(f"warning: {line}")
         folder.finish()
     return [out / name for name in WRITTEN]
+
+
+def _jobs(options: ComparisonOptions, plan: _Plan) -> int:
+    """Processes that have something to do."""
+    return options.jobs if options.scheduler is not None else min(options.jobs, len(plan.jobs))
+
+
+def _check_folders(out: Path, mode: Mode) -> None:
+    """Refuse folders inside of ``out`` that lead elsewhere, or that hold what others wrote.
+
+    Raises:
+        InputError: a link or a file under the name of a folder, or files in one for a new run.
+    """
+    for name in FOLDERS:
+        path = out / name
+        if os.path.islink(path) or (os.path.exists(path) and not os.path.isdir(path)):
+            what = "a link" if os.path.islink(path) else "a file"
+            raise InputError(f"{path}: {what}, where results go. Move it, or choose another --out.")
+        if mode == "new" and os.path.isdir(path) and any(path.iterdir()):
+            raise InputError(
+                f"{path}: holds files already. Move them away, or choose another --out."
+            )
+
+
+def _clear_folders(out: Path) -> None:
+    """Remove what an earlier comparison left: a report shows every figure that it finds."""
+    for name, pattern in FOLDERS.items():
+        for path in (out / name).glob(pattern):
+            if path.is_file() or path.is_symlink():
+                try:
+                    path.unlink()
+                except OSError as error:
+                    why = error.strerror or error
+                    raise OutputError(f"{path}: cannot be removed: {why}.") from error
+
+
+def _refuse_twins(paths: list[Path], opened: list[Sequence]) -> None:
+    """Refuse a sequence that is given twice under two names: it would count double."""
+    seen: dict[Path, Path] = {}
+    for path, sequence in zip(paths, opened, strict=True):
+        suffixes = (".png", ".jpg", ".jpeg", ".npy", ".dpt")
+        first = next((f for f in sequence.files() if f.suffix.lower() in suffixes), path)
+        other = seen.setdefault(first.resolve(), path)
+        if other is not path:
+            raise InputError(f"--sequence {path}: the same frames as {other}; give them once.")
 
 
 def _plan(options: ComparisonOptions) -> _Plan:
@@ -198,6 +274,7 @@ def _plan(options: ComparisonOptions) -> _Plan:
                 f"{', '.join(protocol.sequences)}."
             )
     names = unique_names(paths, [s.name for s in opened])
+    _refuse_twins(paths, opened)
     jobs = []
     for path, sequence, name in zip(paths, opened, names, strict=True):
         stop = len(sequence) if options.stop is None else min(options.stop, len(sequence))
@@ -269,7 +346,7 @@ def _work(
         for future in finished:
             n = running.pop(future)
             segment = _outcome(future)
-            place = folder.path.joinpath(PARTIAL).stat().st_size
+            place = _size(folder.path / PARTIAL)
             folder.append({"job": n, **segment})
             segments.took({"job": n, **segment}, place)
             for row in segment["left_out"]:
@@ -280,6 +357,13 @@ def _work(
                 waiting.insert(0, n)  # goes on where its sequence is open
 
 
+def _size(path: Path) -> int:
+    try:
+        return path.stat().st_size
+    except OSError as error:  # the user, or another program, has removed the folder
+        raise OutputError(f"{path}: is gone: {error.strerror or error}.") from error
+
+
 def _outcome(future: Future[Any]) -> dict[str, Any]:
     try:
         segment: dict[str, Any] = future.result()
@@ -287,6 +371,11 @@ def _outcome(future: Future[Any]) -> dict[str, Any]:
         raise WorkerError(
             f"a worker died ({error or type(error).__name__}), perhaps for want of memory. What "
             f"was finished is kept: go on with --resume and fewer --jobs."
+        ) from error
+    except InputError as error:  # it was there when the comparison began
+        raise InputError(
+            f"{error} What was finished is kept: once the sequences are as they were, go on with "
+            f"--resume."
         ) from error
     except Exception as error:
         if type(error).__name__ == "KilledWorker":  # of Dask, which may be absent
@@ -296,6 +385,16 @@ def _outcome(future: Future[Any]) -> dict[str, Any]:
             ) from error
         raise
     return segment
+
+
+def _changes(job: Job) -> list[str]:
+    """Notice of input that is no longer what it was when the comparison began."""
+    try:
+        same = input_hash(open_sequence(job.path, job.dataset)) == job.input_hash
+    except (InputError, OSError):
+        same = False
+    told = "its files changed while the comparison ran; these figures may mix both. Run it again."
+    return [] if same else [told]
 
 
 def _now() -> str:
@@ -317,12 +416,18 @@ def _write(
     options: ComparisonOptions,
     header: Mapping[str, Any],
     segments: Segments,
-) -> None:
-    """Every file of the comparison, from the kept segments."""
+) -> list[str]:
+    """Every file of the comparison, from the kept segments; what the user must know of them."""
     from hybridvo.comparison.pictures import picture_worst
     from hybridvo.evaluation.report_page import write_report
 
     found = collect(out, plan.jobs, plan.sequences, segments)
+    warnings = []
+    for job, entry in zip(plan.jobs, found.sequences, strict=True):
+        mine = [row for row in found.rows if row["sequence"] == job.name]
+        told = [*_changes(job), *scale_notice(mine)]
+        entry["notices"] += told
+        warnings += [f"{job.name}: {line}" for line in told]
     worst = picture_worst(
         out, worst_pairs(found.table, options.worst), plan.jobs, plan.sequences, segments
     )
@@ -343,3 +448,4 @@ def _write(
     write_json(out / "results.json", result)
     write_csv(out / "results.csv", found.rows, ROW_COLUMNS)
     write_report(out)
+    return warnings

@@ -25,6 +25,7 @@ __all__ = [
     "PATH_KEYS",
     "ChainedPath",
     "pair_scores",
+    "scale_notice",
     "sequence_row",
     "total_row",
     "trajectory_scores",
@@ -36,6 +37,8 @@ PATH_KEYS = (
     *("ate_rmse_sim3", "rpe_trans_rmse_sim3", "rpe_rot_rmse_deg_sim3"),
 )
 """Errors of a whole trajectory; those without a suffix are after a rigid alignment."""
+_SCALE = 3.0
+"""Factor beyond which a truth and all estimates disagree about the unit."""
 NO_TRUTH = "the sequence has no truth for these frames"
 NO_PAIRS = "no pair was estimated"
 LEFT_OUT = "the protocol leaves out pairs, which tears the trajectory"
@@ -59,6 +62,26 @@ class ChainedPath:
             return None
         indices = list(self.T_world_cam)
         return Trajectory(timestamps[indices], np.stack(list(self.T_world_cam.values())))
+
+
+def scale_notice(rows: Iterable[Mapping[str, Any]]) -> list[str]:
+    """Notice of a truth whose unit is not that of the depth, from the rows of one sequence.
+
+    Every method measures in the unit of the depth: where all of them are wrong by about the same
+    large factor, the truth is. Two of them at least, and not the one that stands still.
+    """
+    scales = [
+        float(row["scale_sim3"])
+        for row in rows
+        if row.get("scale_sim3") and row["method"] != "identity" and row["failed"] < row["pairs"]
+    ]
+    if len(scales) < 2 or not (min(scales) > _SCALE or 0 < max(scales) < 1 / _SCALE):
+        return []
+    low, high = (f"{value:.3g}" for value in (min(scales), max(scales)))
+    return [
+        f"the true path is {low} to {high} times as long as every estimate: the unit of the truth "
+        f"or of the depth is wrong, and so are the errors in metres and pixels."
+    ]
 
 
 def pair_scores(columns: Mapping[str, np.ndarray], method: str) -> dict[str, Any]:

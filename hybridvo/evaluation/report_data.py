@@ -199,6 +199,18 @@ def _read_pairs(path: Path) -> dict[tuple[str, str, str], dict[str, np.ndarray]]
     }
 
 
+def one_line(text: Any) -> str:
+    """A message as one line of characters that UTF-8 has and a reader sees."""
+    line = " ".join(str(text).split())
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)
+
+
+def plain_stem(name: str, longest: int = 100) -> str:
+    """Part of a file's name that every file system takes: no separators, ``longest`` bytes."""
+    plain = "".join(c if c.isalnum() or c in "-_." else "_" for c in name)
+    return plain.encode("utf-8", "replace")[:longest].decode("utf-8", "ignore")
+
+
 def inside(folder: Path, name: Any, what: str) -> Path:
     """A file of the folder; a report reads nothing outside of it."""
     path = (folder / str(name)).resolve()

@@ -32,10 +32,11 @@ import numpy as np
 from hybridvo.errors import FormatError
 from hybridvo.evaluation.breakdown import FAILURE_PX
 from hybridvo.evaluation.report import MISSING
-from hybridvo.evaluation.report_data import Comparison, inside, read_comparison
+from hybridvo.evaluation.report_data import Comparison, inside, one_line, read_comparison
 from hybridvo.evaluation.report_tables import (
     headline_table,
     number,
+    plain_markdown,
     protocol_table,
     published_table,
     sequence_table,
@@ -80,11 +81,14 @@ def write_report(folder: str | os.PathLike[str]) -> list[Path]:
         lstrip_blocks=True,
     )
     environment.filters["number"] = number
+    environment.filters["plain"] = plain_markdown
     written = []
     for name in ("report.html", "report.md"):
         text = environment.get_template(f"{name}.jinja").render(content)
-        with atomic_write(folder / name) as file:
-            file.write(text.rstrip() + "\n")
+        # a path or a message may hold what is no UTF-8
+        content_bytes = (text.rstrip() + "\n").encode("utf-8", "backslashreplace")
+        with atomic_write(folder / name, "wb") as file:
+            file.write(content_bytes)
         written.append(folder / name)
     return written
 
@@ -116,12 +120,31 @@ def _content(comparison: Comparison) -> dict[str, Any]:
         "provenance": _provenance(result),
         "command": _command(result.get("command")),
         "missing": result.get("missing") or {},
+        "remarks": _remarks(result.get("sequences") or ()),
         "MISSING": MISSING,
     }
 
 
 def _command(command: Any) -> str:
-    return command if isinstance(command, str) else shlex.join(str(x) for x in command or ())
+    if isinstance(command, str):
+        return command
+    return one_line(shlex.join(str(x) for x in command or ()))
+
+
+def _remarks(sequences: Iterable[Mapping[str, Any]]) -> list[str]:
+    """What readers noticed, and the pairs that are not in the figures: sequence by sequence."""
+    found = []
+    for sequence in sequences:
+        name = sequence["name"]
+        found += [f"{name}: {notice}" for notice in sequence.get("notices") or ()]
+        left_out = sequence.get("left_out") or []
+        absent = max(0, sequence["frames"] - 1) - sequence["pairs"]
+        if left_out and absent > 0:
+            first = f"first, frame {left_out[0]['index']}: {left_out[0]['reason']}"
+            found.append(f"{name}: {absent} of {sequence['frames'] - 1} pairs left out; {first}")
+        elif sequence["pairs"] == 0:
+            found.append(f"{name}: no pair of frames: {sequence['frames']} frame in the range")
+    return [one_line(line) for line in found]
 
 
 def _markup(svg: str) -> Any:
@@ -250,7 +273,7 @@ def _provenance(result: Mapping[str, Any]) -> list[tuple[str, str]]:
             return ", ".join(f"{k} {flat(v)}" for k, v in value.items())
         if isinstance(value, (list, tuple)):
             return ", ".join(flat(item) for item in value)
-        return MISSING if value is None else str(value)
+        return MISSING if value is None else one_line(value)
 
     known: Iterable[tuple[str, str]] = (
         ("versions", "versions"),

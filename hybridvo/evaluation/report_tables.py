@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from hybridvo.evaluation.report import MISSING
-from hybridvo.evaluation.report_data import Comparison, Series
+from hybridvo.evaluation.report_data import Comparison, Series, one_line
 
 __all__ = [
     "Cell",
@@ -16,10 +17,26 @@ __all__ = [
     "Table",
     "headline_table",
     "number",
+    "plain_markdown",
     "protocol_table",
     "published_table",
     "sequence_table",
 ]
+
+
+_MARKDOWN = str.maketrans({c: f"\\{c}" for c in "\\`*|<&$"})
+
+
+def plain_markdown(text: str) -> str:
+    r"""Text that Markdown shows as it stands: no tag, image, link, cell or code out of a name.
+
+    Example:
+        >>> print(plain_markdown("![a](b) <img> [px]"))
+        ![a\](b) \<img> [px]
+    """
+    escaped = one_line(text).translate(_MARKDOWN)
+    # a bracket does something only before one of these; units in brackets stay readable
+    return re.sub(r"\](?=[(\[:])", r"\\]", escaped)
 
 
 def number(value: float | None, digits: int = 3) -> str:
@@ -78,18 +95,18 @@ class Table:
         """As a Markdown table."""
 
         def line(items: Iterable[str]) -> str:
-            cleaned = (item.replace("|", "\\|").replace("\n", " ") for item in items)
-            return "| " + " | ".join(cleaned) + " |"
+            return "| " + " | ".join(items) + " |"
 
         rule = "|" + "|".join("---" if column.text else "---:" for column in self.columns) + "|"
         rows = (
             line(
-                (f"**{c.text}**" if c.best else c.text) + (f" {c.small}" if c.small else "")
+                (f"**{c.text}**" if c.best else plain_markdown(c.text))
+                + (f" {c.small}" if c.small else "")
                 for c in cells
             )
             for _, cells in self.rows
         )
-        return "\n".join([line(c.label for c in self.columns), rule, *rows]) + "\n"
+        return "\n".join([line(plain_markdown(c.label) for c in self.columns), rule, *rows]) + "\n"
 
     @property
     def reasons(self) -> tuple[str, ...]:
@@ -103,8 +120,9 @@ def _classes(series: Series | None) -> str:
 
 
 def _idle(column: Column, row: Mapping[str, Any]) -> bool:
-    """Whether a row's time says nothing: doing nothing is the fastest."""
-    return column.key.startswith("ms_") and row.get("method") == "identity"
+    """Whether a row's time says nothing: doing nothing, or giving up, is the fastest."""
+    gave_up = bool(row.get("pairs")) and row.get("failed") == row.get("pairs")
+    return column.key.startswith("ms_") and (row.get("method") == "identity" or gave_up)
 
 
 def _build(
