@@ -46,8 +46,10 @@ def check_threads() -> None:
 
 check_threads()  # before numba reads it
 import numba  # noqa: E402
+from numba import types  # noqa: E402
+from numba.extending import intrinsic  # noqa: E402
 
-__all__ = ["check_threads", "compile_once", "njit"]
+__all__ = ["check_threads", "compile_once", "intrinsic", "njit", "types"]
 
 LONGEST_S = 1200.0
 """Patience with the compiling process, seconds: twenty times what it takes."""

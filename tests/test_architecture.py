@@ -30,7 +30,7 @@ IMPORTS: dict[str, set[str]] = {
     "data": NOUNS | {"geometry", "compilation"},
     "flow": NOUNS | {"geometry"},
     "network": NOUNS | {"geometry"},
-    "pose": NOUNS | {"geometry", "compilation"},
+    "pose": NOUNS | {"geometry", "compilation", "quiet_import"},
     "trajectory": NOUNS | {"geometry"},
     "learned": CLASSICAL | {"network", "quiet_import"},
     "flow_check": NOUNS,

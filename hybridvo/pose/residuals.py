@@ -29,13 +29,15 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import reduce
 
-import pypose as pp
 import torch
 from kornia.geometry.camera import project_points
 from kornia.geometry.depth import depth_to_3d_v2
 
 from hybridvo.errors import InputError
 from hybridvo.pose.pixels import MAX_VALUE, MIN_DEPTH, Pixels
+from hybridvo.quiet_import import quiet_import
+
+pp = quiet_import("pypose")
 
 __all__ = [
     "CUTOFFS",

@@ -171,6 +171,13 @@ def test_numbas_threads_are_refused_in_words(tmp_path: Path, threads: str) -> No
     assert not (tmp_path / "out").exists()
 
 
+def test_the_first_name_that_is_asked_for_may_be_refine() -> None:
+    code = "import hybridvo as hvo\ntry: hvo.refine\nexcept hvo.HybridVOError as e: print(e)"
+    done = in_a_fresh_process(code, NUMBA_NUM_THREADS="0")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("NUMBA_NUM_THREADS (environment): expected")
+
+
 # training
 
 
@@ -525,6 +532,20 @@ def test_another_default_device_and_warnings_as_errors_change_nothing() -> None:
     assert plain.returncode == strict.returncode == 0, plain.stderr + strict.stderr
     assert strict.stderr == "" and "jit" not in plain.stderr
     assert strict.stdout == plain.stdout and plain.stdout.count("\n") == 3
+
+
+def test_a_batch_is_the_first_thing_that_is_refined_under_warnings_as_errors() -> None:
+    """No network and no tracker before it, which would have loaded pypose already."""
+    code = """
+import torch, hybridvo as hvo
+K = torch.tensor([[[80.0, 0, 47.5], [0, 80, 35.5], [0, 0, 1]]])
+depth = 3 + torch.linspace(0, 2, 72 * 96).reshape(1, 72, 96).sin()
+found = hvo.refine(hvo.PairBatch(torch.zeros(1, 72, 96, 2), depth, K, K))
+print((found.T_curr_prev - torch.eye(4)).abs().max().item())
+"""
+    done = in_a_fresh_process(code, flags=("-W", "error"))
+    assert done.returncode == 0 and done.stderr == "", done.stderr
+    assert float(done.stdout) < 1e-6
 
 
 def test_a_quiet_import_shields_only_its_own_warnings(
