@@ -57,7 +57,7 @@ IMPORTS: dict[str, set[str]] = {
     "comparison": {
         *("__init__", "errors", "types", "geometry", "data", "flow", "hybrid", "trajectory"),
         *("evaluation", "configuration", "console", "run_folder", "run_results", "run", "checks"),
-        "learned_judge",
+        *("learned_judge", "pose"),
     },
     # figures of one pair: tools/visualize.py, and the report of a comparison
     "visualization": {

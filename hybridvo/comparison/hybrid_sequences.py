@@ -25,6 +25,7 @@ from hybridvo.flow import FlowField, dis_flow
 from hybridvo.geometry import invert
 from hybridvo.hybrid import JUDGED, check_method, estimate, shipped_judge
 from hybridvo.learned_judge import LearnedJudge
+from hybridvo.pose.confidence import REFERENCE_WIDTH
 from hybridvo.trajectory import Trajectory
 from hybridvo.types import FramePair, RelativePose
 
@@ -47,8 +48,6 @@ HEAVY_KINDS = ("heavy_rigid", "heavy_deforming", "heavy_two", "heavy_ten")
 FLOWS = ("true", "true+noise", "dis")
 FAILURE_PX = 1.0
 """Mean error of the ego flow, px of the picture, from which a motion is wrong."""
-JUDGED_WIDTH = 1024
-"""The judge's own "right" is an error of at most one pixel of a picture as wide as this."""
 ORACLE = "refine-oracle-static-mask"
 """``refine`` told by the truth which pixels are static: what a perfect mask would give."""
 METHODS = ("hybrid-flow", "hybrid", "refine", "poselib", "pnp-ransac-tuned", ORACLE)
@@ -147,9 +146,9 @@ def _answer(
         "failure": bool(error > FAILURE_PX or not motion.ok),
         "nees": normalised_error(motion.T_curr_prev, motion.covariance, T_true),
         "probability": probability,
-        "noise_px": motion.residual_scale_px * JUDGED_WIDTH / pair.prev.camera.width,
+        "noise_px": motion.residual_scale_px * REFERENCE_WIDTH / pair.prev.camera.width,
         "share": motion.inlier_ratio,
-        "right": bool(motion.ok and error * JUDGED_WIDTH / pair.prev.camera.width <= 1.0),
+        "right": bool(motion.ok and error * REFERENCE_WIDTH / pair.prev.camera.width <= 1.0),
         "ms": motion.ms,
     }
 

@@ -17,6 +17,7 @@ from hybridvo.evaluation.calibration import (
     reliability,
 )
 from hybridvo.hybrid import JUDGED
+from hybridvo.pose.confidence import LEAST_NOISE_PX, MAX_SHARE
 
 __all__ = ["THRESHOLDS", "goals", "summarise"]
 
@@ -24,8 +25,6 @@ THRESHOLDS = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.85, 0.9, 0.95)
 """Probabilities below which an answer could be degraded."""
 RATIOS = {"pnp-ransac-tuned": 0.1, "poselib": 1 / 3}
 """Method -> goal for the hybrid's ATE over its own."""
-LEAST_NOISE_PX = 0.02
-MAX_SHARE = 0.45
 NEES_RANGE = (3.0, 12.0)
 """A factor of two about the expectation of 6."""
 

@@ -4,7 +4,13 @@ from __future__ import annotations
 
 import math
 
-__all__ = ["RECALIBRATION", "REFERENCE_WIDTH", "probability_right"]
+__all__ = [
+    "LEAST_NOISE_PX",
+    "MAX_SHARE",
+    "RECALIBRATION",
+    "REFERENCE_WIDTH",
+    "probability_right",
+]
 
 RECALIBRATION = {"logit": 1.11, "log_noise_px": 0.43, "share": 0.58, "constant": 1.67}
 """Logistic map to the probability that the answer errs by less than a pixel: of the judge's own
@@ -17,6 +23,7 @@ MAX_SHARE = 0.45
 """A larger share counts as this. The map was fitted where most of the picture moves, and there a
 large share is a mover's; that most of a usual picture follows one motion is no reason for doubt."""
 REFERENCE_WIDTH = 1024
+"""px; the judge's "right" is an error of at most one pixel of a picture as wide as this."""
 
 
 def probability_right(trust: float, noise_px: float, share: float) -> float:
