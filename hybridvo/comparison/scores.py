@@ -39,6 +39,8 @@ PATH_KEYS = (
 """Errors of a whole trajectory; those without a suffix are after a rigid alignment."""
 _SCALE = 3.0
 """Factor beyond which a truth and all estimates disagree about the unit."""
+_AGREE = 1.5
+"""Factor within which the estimates must agree about that."""
 NO_TRUTH = "the sequence has no truth for these frames"
 NO_PAIRS = "no pair was estimated"
 LEFT_OUT = "the protocol leaves out pairs, which tears the trajectory"
@@ -68,14 +70,17 @@ def scale_notice(rows: Iterable[Mapping[str, Any]]) -> list[str]:
     """Notice of a truth whose unit is not that of the depth, from the rows of one sequence.
 
     Every method measures in the unit of the depth: where all of them are wrong by about the same
-    large factor, the truth is. Two of them at least, and not the one that stands still.
+    large factor, the truth is. Two of them at least, and not the one that stands still; noise does
+    not agree on a factor.
     """
     scales = [
         float(row["scale_sim3"])
         for row in rows
         if row.get("scale_sim3") and row["method"] != "identity" and row["failed"] < row["pairs"]
     ]
-    if len(scales) < 2 or not (min(scales) > _SCALE or 0 < max(scales) < 1 / _SCALE):
+    if len(scales) < 2 or min(scales) <= 0 or max(scales) > _AGREE * min(scales):
+        return []
+    if 1 / _SCALE <= max(scales) and min(scales) <= _SCALE:
         return []
     low, high = (f"{value:.3g}" for value in (min(scales), max(scales)))
     return [

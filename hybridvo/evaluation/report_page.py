@@ -136,7 +136,11 @@ def _remarks(sequences: Iterable[Mapping[str, Any]]) -> list[str]:
     found = []
     for sequence in sequences:
         name = sequence["name"]
-        found += [f"{name}: {notice}" for notice in sequence.get("notices") or ()]
+        found += [
+            f"{name}: {notice}"
+            for notice in sequence.get("notices") or ()
+            if "natural order" not in notice  # true of most data sets, and no surprise
+        ]
         left_out = sequence.get("left_out") or []
         absent = max(0, sequence["frames"] - 1) - sequence["pairs"]
         if left_out and absent > 0:

@@ -435,6 +435,8 @@ def test_a_range_of_one_frame_says_that_it_has_no_pair(
         ([10.0, 0.1], False),
         ([2.0, 1.9], False),
         ([10.0], False),
+        ([0.01, 0.2], False),  # noise agrees on nothing
+        ([0.0, 0.0], False),
         ([], False),
         ([None, 10.0], False),
     ],
