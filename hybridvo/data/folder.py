@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import itertools
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -104,7 +105,7 @@ class FolderSequence(FileSequence):
             root.name,
             rgb=rgb or [None] * len(depth),
             depth=_match_files(frames, depth, root / "depth"),
-            flow=_match_flow(frames, flow_files, root / "flow"),
+            flow=_match_flow(frames, flow_files, root / "flow", notices),
             timestamps=stamps,
             poses=poses,
             sources=[root / "camera.yaml", *sources],
@@ -269,10 +270,35 @@ def _match_files(frames: list[Path], files: list[Path], folder: Path) -> list[Pa
     )
 
 
-def _match_flow(frames: list[Path], files: list[Path], folder: Path) -> list[Path | None]:
+def _match_flow(
+    frames: list[Path], files: list[Path], folder: Path, notices: list[str]
+) -> list[Path | None]:
+    """As :func:`_match_files`; a flow that led to a frame which is missing now is left out."""
     if len(files) == len(frames) - 1 and not {p.stem for p in files} & {p.stem for p in frames}:
         return [*files, None]
-    return _match_files(frames, files, folder)
+    matched = _match_files(frames, files, folder)
+    if not files or not all(p.stem.isascii() and p.stem.isdigit() for p in (*frames, *files)):
+        return matched
+    if not {int(p.stem) for p in files} & {int(p.stem) for p in frames}:
+        return matched  # names of their own, matched by order
+    numbers = [int(path.stem) for path in frames]
+    without_image = np.array(sorted({int(path.stem) for path in files} - {*numbers}), float)
+    steps = Counter(b - a for a, b in itertools.pairwise(numbers))
+    usual = steps.most_common(1)[0][0] if steps else 1
+    lost = {
+        k: None
+        for k, (a, b) in enumerate(itertools.pairwise(numbers))
+        if matched[k] is not None
+        and (b - a != usual or np.diff(np.searchsorted(without_image, (a, b)))[0])
+    }
+    if lost:
+        first = [frames[k].name for k in itertools.islice(lost, 4)]
+        names = ", ".join(first) + (", ..." if len(lost) > 4 else "")
+        notices.append(
+            f"{folder.parent.name}: images are missing after {names}: the flow files of these lead "
+            f"to the missing ones and are not used."
+        )
+    return [None if k in lost else path for k, path in enumerate(matched)]
 
 
 def _read_times_and_poses(

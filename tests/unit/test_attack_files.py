@@ -22,6 +22,7 @@ import hybridvo.trajectory
 from hybridvo.cli import _open_standard_streams, main
 from hybridvo.configuration import load_options
 from hybridvo.console import Progress, printable
+from hybridvo.data.image_io import write_flo
 from hybridvo.data.plain_yaml import plain_yaml
 from hybridvo.data.sequence import open_sequence
 from hybridvo.diagnosis import diagnose, diagnosis_text
@@ -363,6 +364,36 @@ def test_a_missing_image_is_said(tmp_path: Path) -> None:
     notices = "\n".join(open_sequence(own(tmp_path, (0, 1, 3, 4), (0, 1, 2, 3, 4))).notices)
     assert "1 depth files without an image are left out: 0002.png" in notices
     assert "numbers of the images jump, the time stamps do not" in notices
+
+
+@pytest.mark.parametrize(
+    ("images", "flows", "kept"),
+    [
+        ((0, 1, 2, 3), (0, 1, 2), (0, 1, 2)),
+        ((0, 2, 3, 4), (0, 1, 2, 3), (2, 3)),  # one image deleted
+        ((0, 2, 3, 4), (0, 2, 3), (2, 3)),  # and its flow with it
+        ((0, 10, 20, 30), (0, 10, 20), (0, 10, 20)),  # flow over ten frames
+        ((0, 2, 4, 6), (0, 1, 2, 3, 4, 5), ()),  # every second image of a sequence with its flow
+        ((0, 1, 5, 6), (0, 1, 5), (0, 5)),
+    ],
+)
+def test_flow_that_led_to_a_missing_image_is_not_used(
+    tmp_path: Path, images: tuple[int, ...], flows: tuple[int, ...], kept: tuple[int, ...]
+) -> None:
+    root = own(tmp_path, images, images)
+    (root / "flow").mkdir()
+    for number in flows:
+        write_flo(root / "flow" / f"{number:04d}.flo", np.full((24, 32, 2), number, np.float32))
+    sequence = open_sequence(root)
+    for index, number in enumerate(images[:-1]):
+        if number in kept:
+            assert sequence.flow(index)[0].max() == number
+        else:
+            with pytest.raises(FileNotFoundError, match="no flow file from frame"):
+                sequence.flow(index)
+    assert sequence.has_flow == bool(kept)
+    said = any("are not used" in notice for notice in sequence.notices)
+    assert said == (len(kept) < len(set(flows) & set(images)))
 
 
 def test_numbers_that_go_on_evenly_are_not_remarked_on(tmp_path: Path) -> None:
