@@ -98,6 +98,24 @@ def _logarithmic(axes: Any, which: str) -> None:
     axis.set_minor_formatter(NullFormatter())
 
 
+def _widen(axes: Any) -> None:
+    """Room about one single value on a logarithmic axis, of which rounding may leave none.
+
+    After all points are drawn: it fixes the limits of that axis.
+    """
+    for which in ("x", "y"):
+        low, high = getattr(axes.dataLim, f"interval{which}")
+        if getattr(axes, f"get_{which}scale")() == "log" and 0 < low <= high < 1.001 * low:
+            getattr(axes, f"set_{which}lim")(low / 2, high * 2)
+
+
+def _mark(axes: Any, which: str, at: float) -> None:
+    """A line across at a value of the ``x`` or ``y`` axis; after all points are drawn."""
+    _widen(axes)  # the line asks where the axes end
+    line = axes.axvline if which == "x" else axes.axhline
+    line(at, color=_MUTED, linewidth=0.9, linestyle=":")
+
+
 def _power(value: float) -> str:
     """Power of ten as short as it can be read."""
     return (
@@ -114,6 +132,8 @@ def _label(axes: Any, x: str, y: str) -> None:
 
 def _svg(figure: Figure, title: str, name: str) -> str:
     """The figure as one element whose ids begin with ``name``."""
+    for axes in figure.axes:
+        _widen(axes)
     stream = io.StringIO()
     # text as text: small, searchable, in the font of the page; equal input gives equal bytes
     with rc_context({"svg.fonttype": "none", "svg.hashsalt": "hybridvo"}):
@@ -198,7 +218,7 @@ def error_svg(
         single = marker if len(x) < 30 else {}
         axes.plot(x, y, linewidth=1.1, gid=_gid(series), **single, **_style(series))
     if limit is not None:
-        axes.axhline(limit, color=_MUTED, linewidth=0.9, linestyle=":")
+        _mark(axes, "y", limit)
     axes.margins(x=0.02)
     if labels[0] == "frame":
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
@@ -277,7 +297,7 @@ def factor_svg(
     for axes in (upper, lower):
         axes.grid(visible=False, axis="x")
         axes.set_xlim(-0.5, len(bins) - 0.5)
-    upper.axhline(1.0, color=_MUTED, linewidth=0.9, linestyle=":")
+    _mark(upper, "y", 1.0)
     lower.set_ylim(-0.03, 1.03)
     lower.set_yticks([0, 0.5, 1], ["0 %", "50 %", "100 %"])
     ticks = [f"{_bin_name(*bounds[b][:2], share)}\n({bounds[b][2]})" for b in bins]
@@ -359,7 +379,7 @@ def difference_svg(
     _logarithmic(axes, "x")
     for k, (one, middle, low, high) in enumerate(rows):
         _points(axes, one, [middle], [k], [low], [high], across=True)
-    axes.axvline(1.0, color=_MUTED, linewidth=0.9, linestyle=":")
+    _mark(axes, "x", 1.0)
     _label(axes, f"EPE over that of {reference}, geometric mean", "")
     return _svg(figure, title, name)
 
@@ -377,7 +397,7 @@ def timing_svg(lines: Sequence[Mapping[str, Any]], title: str, name: str) -> str
         _points(axes, row["series"], [row["ms_median"]], y, low, high)
         ends = [row["ms_q25"]], [row["ms_q75"]]
         _points(axes, row["series"], [row["ms_median"]], y, *ends, across=True)
-    axes.axhline(1.0, color=_MUTED, linewidth=0.9, linestyle=":")
+    _mark(axes, "y", 1.0)
     _label(axes, "time per pair [ms]", "EPE [px]")
     return _svg(figure, title, name)
 

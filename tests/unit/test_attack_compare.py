@@ -403,8 +403,6 @@ def test_input_that_vanishes_on_the_way_keeps_what_was_done(
 # figures that need a remark
 
 
-# plots of a single pair: an axis of one time may warn, with the clock
-@pytest.mark.filterwarnings("ignore:divide by zero:RuntimeWarning")
 def test_notices_and_pairs_left_out_stand_before_the_figures(
     compare: Callable[..., tuple[int, str]], mine: Path, tmp_path: Path
 ) -> None:

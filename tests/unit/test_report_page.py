@@ -16,6 +16,7 @@ import pytest
 
 from hybridvo.errors import FormatError, InputError
 from hybridvo.evaluation.breakdown import FACTORS, PairTable, breakdown, worst_pairs
+from hybridvo.evaluation.plots_comparison import Series, duration_svg, timing_svg
 from hybridvo.evaluation.protocols import PROTOCOLS, protocol_summary
 from hybridvo.evaluation.report_data import Path3D, shown_box
 from hybridvo.evaluation.report_page import write_report
@@ -435,3 +436,18 @@ def test_the_page_in_a_browser(folder: Path, tmp_path: Path, width: int) -> None
     assert np.abs(turned - written).max() > 5.0
     assert found["before"] > 10 and found["hidden"] == 0 and found["pressed"] == "false"
     assert found["themes"][0] != found["themes"][1]
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("ms", [168.1676930936777, 0.022931544755345156, 1.0, 47.332029160100475])
+@pytest.mark.parametrize("count", [1, 2])
+def test_one_time_alone_has_room_on_its_axis(ms: float, count: int) -> None:
+    """Of a logarithmic axis about one value matplotlib's rounding leaves nothing, at times."""
+    lines = [
+        {"series": Series(f"m{k}", "dis", k, 0)}
+        | dict.fromkeys(("ms_median", "ms_q25", "ms_q75"), ms)
+        | dict.fromkeys(("epe_l2_px_median", "epe_l2_px_q25", "epe_l2_px_q75"), 1.0)
+        for k in range(count)
+    ]
+    assert "<svg" in duration_svg(lines, "title", "one")
+    assert "<svg" in timing_svg(lines, "title", "two")
