@@ -471,7 +471,7 @@ def test_write_sintel_refuses_bad_places(tmp_path, scenes):
         with pytest.raises(InputError, match="plain folder name"):
             write_sintel(scenes["pair"], tmp_path, name)
     (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError, match="cannot create"):
+    with pytest.raises(OutputError, match="cannot be created"):
         write_sintel(scenes["pair"], tmp_path / "file", "demo")
 
 
