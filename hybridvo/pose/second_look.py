@@ -51,7 +51,7 @@ LEAST_TRUST = 0.5
 LEAST_TRUST_PROPOSED = 0.15
 """The same with a proposal in the race. Between this and 0.5 the judge's best was right in 11 and
 the classical choice in 7 of 15 development answers; one that trusts nothing at all stays out."""
-CONSULT = 0.95
+CONSULT = 0.94
 """Probability of being right, by :mod:`hybridvo.pose.confidence`, below which the judge is asked
 for a proposal. Higher than where an answer is degraded: of 440 development answers with DIS flow it
 mends two that were wrong."""
