@@ -136,7 +136,8 @@ def stamp_unit(stamps: np.ndarray) -> tuple[float, str]:
         stamps: (N,) numbers in the order of the frames; those that are not finite say nothing.
     """
     known = np.abs(stamps[np.isfinite(stamps)])
-    step = np.median(np.abs(np.diff(known))) if len(known) > 1 else np.inf
+    with np.errstate(over="ignore"):  # between numbers that are no times anyway
+        step = np.median(np.abs(np.diff(known))) if len(known) > 1 else np.inf
     for factor, name in ((1e3, "milliseconds"), (1e6, "microseconds")):
         first, last = factor * EPOCH_S[0], factor * EPOCH_S[1]
         if step < factor and first <= known.min() and known.max() <= last:
