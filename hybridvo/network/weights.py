@@ -110,7 +110,8 @@ def load_weights(path: str | Path) -> tuple[nn.Module, dict[str, Any]]:
     if not os.path.isfile(path):  # where Path.is_file() raises: a name that is too long
         raise CheckpointError(f"{path}: no such weights file. {_known()}")
     try:
-        with safe_open(path, framework="pt") as file:
+        # older safetensors makes its tensors on torch's default device
+        with torch.device("cpu"), safe_open(path, framework="pt") as file:
             options, card = _read_header(path, file.metadata() or {})
             slices = {name: file.get_slice(name) for name in file.keys()}
             found = {name: tuple(s.get_shape()) for name, s in slices.items()}
