@@ -292,9 +292,15 @@ def total_of_campaigns(row: Mapping[str, Any], campaigns: Mapping[str, Any]) -> 
     parts = []
     for key in row.get("counted", ()):
         for name, figures in campaigns.get("stress", {}).items():
-            if isinstance(figures, Mapping) and isinstance(figures.get(key), int):
-                runs = figures.get("runs", figures.get(name, figures.get("frames")))
+            if not isinstance(figures, Mapping):
+                continue
+            tried = [figures.get(what) for what in ("runs", "rounds", name, "frames")]
+            runs = next((count for count in tried if count is not None), "?")
+            if isinstance(figures.get(key), int):
                 parts.append(f"{name.replace('_', ' ')}: {int(figures[key])} of {runs}")
+            elif key == "not_finite" and isinstance(figures.get("finite"), bool):
+                said = "none" if figures["finite"] else "some"
+                parts.append(f"{name.replace('_', ' ')}: {said} of {runs} frames")
     for dotted in row.get("campaigns", ()):
         value = lookup(campaigns, dotted)
         if value is not None:
