@@ -22,6 +22,7 @@ from hybridvo.data.sequence import open_sequence
 from hybridvo.demo import demo
 from hybridvo.errors import InputError
 from hybridvo.hybrid import METHODS
+from tests.scripts import load_script
 
 ROOT = Path(__file__).resolve().parents[1]
 TEXT = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -50,12 +51,7 @@ def commands() -> list[str]:
 
 
 def tool(path: str) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(Path(path).stem, ROOT / path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return load_script(path)
 
 
 def sensor(count: int = 3):

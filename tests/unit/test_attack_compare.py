@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import csv
 import html.parser
-import importlib.util
 import json
 import os
 import shutil
@@ -28,6 +27,7 @@ from hybridvo.comparison.scores import scale_notice
 from hybridvo.errors import InputError, OutputError
 from hybridvo.evaluation.report_tables import Column, _build, plain_markdown
 from hybridvo.run_folder import PARTIAL, STATE
+from tests.scripts import load_script
 from tests.sequences import write_folder
 
 NASTY = [
@@ -50,12 +50,7 @@ NASTY = [
 
 @pytest.fixture(scope="module")
 def tool() -> ModuleType:
-    path = Path(__file__).parents[2] / "tools" / "compare_methods.py"
-    spec = importlib.util.spec_from_file_location("compare_methods", path)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return load_script("tools/compare_methods.py")
 
 
 @pytest.fixture

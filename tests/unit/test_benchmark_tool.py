@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import importlib.util
 import json
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import pytest
 from hybridvo.data.benchmark_pairs import make_pair
 from hybridvo.geometry import ego_flow, se3_exp
 from hybridvo.types import Hypothesis, Reason, RelativePose
+from tests.scripts import load_script
 
 TOOLS = Path(__file__).parents[2] / "tools"
 
@@ -22,10 +22,7 @@ def tools_on_the_path(monkeypatch):
 
 @pytest.fixture
 def tool(tools_on_the_path):
-    spec = importlib.util.spec_from_file_location("benchmark_tool", TOOLS / "benchmark.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return load_script("tools/benchmark.py")
 
 
 def test_writes_json_and_tables_and_never_overwrites(tool, tmp_path, capsys):

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import csv
 import hashlib
-import importlib.util
 import json
 import shutil
 from collections.abc import Callable
@@ -26,6 +25,7 @@ from hybridvo.data.synthetic import make_scene, write_sintel
 from hybridvo.errors import InputError, LockedError
 from hybridvo.hybrid import METHODS
 from hybridvo.types import RelativePose
+from tests.scripts import load_script
 
 ROWS = (  # design/interface.md
     *("sequence", "method", "flow_source", "depth_source", "pairs", "failed", "r_err_deg", "t_err"),
@@ -43,12 +43,7 @@ FAST = "pnp-ransac,identity"
 
 @pytest.fixture(scope="module")
 def tool() -> ModuleType:
-    path = Path(__file__).parents[2] / "tools" / "compare_methods.py"
-    spec = importlib.util.spec_from_file_location("compare_methods", path)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return load_script("tools/compare_methods.py")
 
 
 @pytest.fixture(scope="module")

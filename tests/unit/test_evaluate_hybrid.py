@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 from pathlib import Path
 from types import ModuleType
@@ -23,18 +22,14 @@ from hybridvo.comparison.hybrid_summary import summarise
 from hybridvo.data.benchmark_pairs import make_pair
 from hybridvo.errors import FormatError, InputError
 from hybridvo.hybrid import estimate, shipped_judge
+from tests.scripts import load_script
 
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = {"frames": 4, "height": 64, "width": 128, "noisy_stride": 2}
 
 
 def tool() -> ModuleType:
-    path = ROOT / "tools" / "evaluate_hybrid.py"
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return load_script("tools/evaluate_hybrid.py")
 
 
 @pytest.fixture(scope="module")

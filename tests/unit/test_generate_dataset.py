@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import importlib.util
 import json
 from pathlib import Path
 
@@ -9,6 +8,7 @@ import pytest
 
 from hybridvo.data.image_io import read_flo
 from hybridvo.data.synthetic import make_scene
+from tests.scripts import load_script
 
 TOOL = Path(__file__).resolve().parents[2] / "tools" / "generate_dataset.py"
 SMALL = ["--height", "32", "--width", "64", "--frames", "3"]
@@ -16,10 +16,7 @@ SMALL = ["--height", "32", "--width", "64", "--frames", "3"]
 
 @pytest.fixture(scope="module")
 def tool():
-    spec = importlib.util.spec_from_file_location("generate_dataset", TOOL)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return load_script("tools/generate_dataset.py")
 
 
 def test_writes_every_scene_and_seed(tool, tmp_path, capsys):

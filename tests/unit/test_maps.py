@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import importlib.util
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -32,16 +31,12 @@ from hybridvo.network.pwvo import NetworkOptions, build_network
 from hybridvo.network.weights import save_weights
 from hybridvo.types import FramePair, PixelwisePrediction
 from hybridvo.visualization import networks, saliencies, start_of
+from tests.scripts import load_script
 
 
 @pytest.fixture(scope="module")
 def tool() -> ModuleType:
-    path = Path(__file__).parents[2] / "tools" / "visualize.py"
-    spec = importlib.util.spec_from_file_location("visualize", path)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return load_script("tools/visualize.py")
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,6 @@ A camera moves before a plane by the same step everywhere. In ambush_4 and shama
 from __future__ import annotations
 
 import csv
-import importlib.util
 import json
 import struct
 from pathlib import Path
@@ -20,6 +19,7 @@ import pytest
 from hybridvo.errors import InputError
 from hybridvo.evaluation.protocols import PROTOCOLS, check_protocol, same_intrinsics
 from hybridvo.types import Camera
+from tests.scripts import load_script
 
 TAG = struct.pack("<f", 202021.25)
 HEIGHT, WIDTH = 32, 64
@@ -115,12 +115,7 @@ def short_sintel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def tool() -> ModuleType:
-    path = Path(__file__).parents[2] / "tools" / "compare_methods.py"
-    spec = importlib.util.spec_from_file_location("compare_methods", path)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return load_script("tools/compare_methods.py")
 
 
 @pytest.fixture(autouse=True)

@@ -4,7 +4,6 @@ its folder, no optional library; and that the lists of versions are what they sa
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import os
 import re
@@ -21,6 +20,7 @@ from packaging.requirements import Requirement
 from packaging.version import Version
 
 from hybridvo.data.synthetic import make_scene, write_sintel
+from tests.scripts import load_script
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -285,12 +285,7 @@ def test_lower_bounds_are_the_versions_that_test_min_installs():
 
 
 def audit() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("audit", ROOT / "tools" / "audit.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return load_script("tools/audit.py")
 
 
 SKIPPED = {"name": "numpy", "skip_reason": "Dependency not found"}
