@@ -24,7 +24,6 @@ from hybridvo.learned import (
     LEARNED,
     LEAST_PIXELS,
     estimate_learned,
-    plain_torch,
     shipped_network,
 )
 from hybridvo.learned_judge import LearnedJudge
@@ -171,7 +170,7 @@ def estimate(
         wrong = contradiction(pair) if polished else None
         if wrong is not None:
             return RelativePose.failed(Reason.NO_FLOW, wrong, method)
-        _compiled(method)
+        compile_kernels(method)
         chosen: Any = (judge or shipped_judge()) if method in JUDGED else default_judge
         found = refine(
             pair,
@@ -186,8 +185,7 @@ def estimate(
         return found.replace(method=method)
     check_method(method)
     if method in LEARNED:
-        with plain_torch():
-            return _too_little(pair, method) or estimate_learned(pair, method)
+        return _too_little(pair, method) or estimate_learned(pair, method)
     from hybridvo.pose.baselines import baselines
 
     return baselines()[method](pair, seed=seed)
@@ -265,8 +263,10 @@ def warm_up(method: str = DEFAULT_METHOD, polish: str = "auto") -> float:
     return time.perf_counter() - started
 
 
+@functools.cache
 def compile_kernels(method: str = DEFAULT_METHOD) -> bool:
-    """Have the kernels compiled by another process, so that this one reads what later ones read.
+    """Have the kernels compiled by another process, so that this one reads what later ones read;
+    asked once in a process.
 
     Code that is compiled in a process differs from the same code out of the cache in the last bits
     of its sums (:mod:`hybridvo.compilation`): without this, a first run's motions differ by some
@@ -286,7 +286,3 @@ def compile_kernels(method: str = DEFAULT_METHOD) -> bool:
         )
         done = compile_once(code, Path(__file__).resolve().parent / "pose", "judged") and done
     return done
-
-
-_compiled = functools.cache(compile_kernels)
-"""Once in a process, for who did not warm up."""

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hybridvo.errors import CheckpointError, InputError
-from hybridvo.quiet_import import quiet_import
 from hybridvo.types import FramePair, Reason, RelativePose, Status
 
 if TYPE_CHECKING:
@@ -121,7 +120,6 @@ def fitted_motion(
     """
     import torch.nn.functional as F
 
-    quiet_import("pypose")  # which the fit loads
     from hybridvo.pose.selection import chosen_motion
     from hybridvo.pose.weighted_fit import pixel_weights, weighted_fit
     from hybridvo.types import PixelwisePrediction
@@ -163,7 +161,6 @@ def static_probability(log_scale: torch.Tensor, valid: torch.Tensor) -> torch.Te
         (B, h, w). What counts is how far s lies above that of the pixels with weight in the fit;
         the map from there is logistic, see :data:`STATIC_AT`.
     """
-    quiet_import("pypose")  # which the fit loads
     from hybridvo.pose.weighted_fit import pixel_weights
 
     s = log_scale.mean(dim=1)

@@ -123,8 +123,7 @@ class LearnedJudge:
         """PWVO's motion and where it sees the static world."""
         if self._pixelwise is None:
             return None
-        with plain_torch():
-            return propose_motion(self._pixelwise, pair)
+        return propose_motion(self._pixelwise, pair)
 
 
 @dataclass(frozen=True, eq=False)

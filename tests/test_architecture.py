@@ -32,7 +32,7 @@ IMPORTS: dict[str, set[str]] = {
     "network": NOUNS | {"geometry"},
     "pose": NOUNS | {"geometry", "compilation", "quiet_import"},
     "trajectory": NOUNS | {"geometry"},
-    "learned": CLASSICAL | {"network", "quiet_import"},
+    "learned": CLASSICAL | {"network"},
     "flow_check": NOUNS,
     "learned_judge": CLASSICAL | {"network", "learned"},
     "hybrid": CLASSICAL | {"network", "learned", "learned_judge", "compilation", "flow_check"},

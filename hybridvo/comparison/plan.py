@@ -11,6 +11,7 @@ import hybridvo
 from hybridvo.data.sequence import READERS
 from hybridvo.data.sintel import SintelSequence
 from hybridvo.errors import InputError
+from hybridvo.evaluation.report_data import visible
 from hybridvo.hybrid import METHODS, check_method
 
 __all__ = ["chosen_methods", "expand", "shown_name", "unique_names", "weights_of"]
@@ -104,10 +105,10 @@ def _sintel_scenes(folder: Path) -> list[Path]:
 def shown_name(name: str) -> str:
     """A name for results: one line, of characters that UTF-8 has and a reader sees.
 
-    What is none becomes an escape. A name that a spreadsheet would take for a formula gets ``./``
-    before it, in every file, so that all of them can still be joined by it.
+    One that a spreadsheet would take for a formula gets ``./`` before it, in every file, so that
+    all of them can still be joined by it.
     """
-    shown = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in name)
+    shown = visible(name)
     return f"./{shown}" if shown.startswith(("=", "+", "-", "@")) else shown
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import itertools
+from bisect import bisect
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -282,23 +283,24 @@ def _match_flow(
     if not {int(p.stem) for p in files} & {int(p.stem) for p in frames}:
         return matched  # names of their own, matched by order
     numbers = [int(path.stem) for path in frames]
-    without_image = np.array(sorted({int(path.stem) for path in files} - {*numbers}), float)
+    without_image = sorted({int(path.stem) for path in files} - {*numbers})
     steps = Counter(b - a for a, b in itertools.pairwise(numbers))
     usual = steps.most_common(1)[0][0] if steps else 1
-    lost = {
-        k: None
+    lost = [
+        k
         for k, (a, b) in enumerate(itertools.pairwise(numbers))
         if matched[k] is not None
-        and (b - a != usual or np.diff(np.searchsorted(without_image, (a, b)))[0])
-    }
+        and (b - a != usual or bisect(without_image, a) != bisect(without_image, b))
+    ]
     if lost:
-        first = [frames[k].name for k in itertools.islice(lost, 4)]
-        names = ", ".join(first) + (", ..." if len(lost) > 4 else "")
+        names = ", ".join(frames[k].name for k in lost[:4]) + (", ..." if len(lost) > 4 else "")
         notices.append(
             f"{folder.parent.name}: images are missing after {names}: the flow files of these lead "
             f"to the missing ones and are not used."
         )
-    return [None if k in lost else path for k, path in enumerate(matched)]
+    for k in lost:
+        matched[k] = None
+    return matched
 
 
 def _read_times_and_poses(

@@ -199,10 +199,14 @@ def _read_pairs(path: Path) -> dict[tuple[str, str, str], dict[str, np.ndarray]]
     }
 
 
+def visible(text: str) -> str:
+    """Text of characters that UTF-8 has and a reader sees; what is none becomes an escape."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
 def one_line(text: Any) -> str:
-    """A message as one line of characters that UTF-8 has and a reader sees."""
-    line = " ".join(str(text).split())
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)
+    """A message as one line of :func:`visible` characters."""
+    return visible(" ".join(str(text).split()))
 
 
 def plain_stem(name: str, longest: int = 100) -> str:

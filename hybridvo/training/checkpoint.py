@@ -19,7 +19,7 @@ import torch
 
 from hybridvo.errors import CheckpointError, OutputError
 
-__all__ = ["FORMAT", "load_checkpoint", "save_checkpoint"]
+__all__ = ["FORMAT", "check_seed", "load_checkpoint", "save_checkpoint"]
 
 FORMAT = "hybridvo-training-1"
 """Value of the ``format`` key."""
@@ -122,6 +122,26 @@ def load_checkpoint(path: str | Path) -> dict[str, Any]:
     if broken:
         raise CheckpointError(f"{path}: weights that are not finite in {', '.join(broken[:6])}.")
     return state
+
+
+def check_seed(path: str | Path, state: dict[str, Any], asked: int, remedy: str) -> None:
+    """Refuse to go on with a training under another seed.
+
+    Args:
+        path: of the checkpoint.
+        state: its content.
+        asked: seed of this run.
+        remedy: end of the message, in which ``{seed}`` is that of the checkpoint.
+
+    Raises:
+        CheckpointError: the seeds differ.
+    """
+    seed = state["options"].get("seed", asked)
+    if seed != asked:
+        raise CheckpointError(
+            f"{path}: was trained with seed {seed}, this run asks for seed {asked}"
+            + remedy.format(seed=seed)
+        )
 
 
 def _damaged(path: Path, reason: str) -> CheckpointError:

@@ -23,7 +23,7 @@ from safetensors.torch import load_file
 from hybridvo.data.rendered_pictures import MOVING, STATIC
 from hybridvo.errors import CheckpointError, InputError
 from hybridvo.network.judge import JudgeInputs, JudgeNetwork, JudgeOptions, JudgeOutput
-from hybridvo.training.checkpoint import load_checkpoint, save_checkpoint
+from hybridvo.training.checkpoint import check_seed, load_checkpoint, save_checkpoint
 from hybridvo.training.judge_batches import (
     PictureBatch,
     ego_flow_error,
@@ -306,13 +306,8 @@ class JudgeTrainer:
         if not path.exists():
             return False
         state = load_checkpoint(path)
-        seed = state["options"].get("seed", self.options.seed)
-        if seed != self.options.seed:
-            raise CheckpointError(
-                f"{path}: was trained with seed {seed}, this run asks for seed "
-                f"{self.options.seed}. Set seed: {seed} in the configuration, or choose another "
-                f"--out."
-            )
+        remedy = ". Set seed: {seed} in the configuration, or choose another --out."
+        check_seed(path, state, self.options.seed, remedy)
         try:
             self.network.load_state_dict(state["network"])
             self.optimizer.load_state_dict(state["optimizer"])

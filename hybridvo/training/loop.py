@@ -28,7 +28,7 @@ from hybridvo.network.passes import first_motions
 from hybridvo.network.pwvo import build_network
 from hybridvo.network.weights import load_weights
 from hybridvo.pose.selection import chosen_motion
-from hybridvo.training.checkpoint import load_checkpoint, save_checkpoint
+from hybridvo.training.checkpoint import check_seed, load_checkpoint, save_checkpoint
 from hybridvo.training.held_out import evaluate_network
 from hybridvo.training.options import TrainingOptions
 from hybridvo.training.stream import Mixture, SampleStream, TrainingBatch
@@ -415,13 +415,11 @@ class Trainer:
         ours = dataclasses.asdict(self.options.network) | {"passes": theirs.get("passes")}
         if theirs != ours:
             raise CheckpointError(f"{path}: is of network {theirs}, this run asks for {ours}.")
-        seed = state["options"].get("seed", self.options.seed)
-        if seed != self.options.seed:
-            raise CheckpointError(
-                f"{path}: was trained with seed {seed}, this run asks for seed "
-                f"{self.options.seed}: other samples from here on. Go on with --seed {seed}, or "
-                f"start anew with --overwrite or in another folder."
-            )
+        remedy = (
+            ": other samples from here on. Go on with --seed {seed}, or start anew with "
+            "--overwrite or in another folder."
+        )
+        check_seed(path, state, self.options.seed, remedy)
         if (state["ema"] is None) != (self.ema is None):
             raise CheckpointError(
                 f"{path}: ema_decay must be above 0 in both or in neither of the runs."

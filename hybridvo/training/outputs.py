@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +42,7 @@ def check_folder(out: Path, record: str, wrote_it: Iterable[str]) -> None:
         content = _read_json(out / record)
         ours = content is None or (isinstance(content, dict) and set(wrote_it) <= set(content))
     else:
-        ours = CHECKPOINT in present and _is_checkpoint(out / CHECKPOINT)
+        ours = CHECKPOINT in present and _is_read_by(load_checkpoint, out / CHECKPOINT)
     if not ours:
         raise InputError(
             f"{out}: holds {', '.join(present)}, and no {record} that says a training wrote it: "
@@ -100,20 +100,16 @@ def _read_json(path: Path) -> Any:
         return None
 
 
-def _is_checkpoint(path: Path) -> bool:
+def _is_read_by(load: Callable[[Path], Any], path: Path) -> bool:
     try:
-        load_checkpoint(path)
+        load(path)
     except CheckpointError:
         return False
     return True
 
 
 def _is_weights(path: Path) -> bool:
-    try:
-        load_weights(path)
-    except CheckpointError:
-        return False
-    return True
+    return _is_read_by(load_weights, path)
 
 
 def _is_card(path: Path) -> bool:

@@ -196,7 +196,7 @@ def test_a_library_user_reads_the_code_that_later_processes_read(
     asked = []
     for module in (hybrid, readiness):
         monkeypatch.setattr(module, "compile_once", lambda *args: asked.append(args) or True)
-    for once in (readiness.compile_refinement, hybrid._compiled):
+    for once in (readiness.compile_refinement, compile_kernels):
         once.cache_clear()
 
     def sets() -> list[tuple[str, str]]:
@@ -237,6 +237,7 @@ def test_what_the_compiling_processes_run_is_valid(monkeypatch: pytest.MonkeyPat
     for module in (hybrid, readiness):
         monkeypatch.setattr(module, "compile_once", lambda *args: asked.append(args) or True)
     readiness.compile_refinement.cache_clear()
+    compile_kernels.cache_clear()
     assert compile_kernels("hybrid")
     ran = []
     monkeypatch.setattr(readiness, "run_kernels", lambda *judge: ran.append(judge))
