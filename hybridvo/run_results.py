@@ -13,8 +13,9 @@ from hybridvo.data.sequence import Sequence
 from hybridvo.depth_steps import depth_step_warning
 from hybridvo.evaluation.metrics import evaluate_trajectories, mean_pair_errors
 from hybridvo.evaluation.report import write_csv
+from hybridvo.files import atomic_write
 from hybridvo.geometry import pose_matrix, se3_log
-from hybridvo.trajectory import Trajectory, atomic_write
+from hybridvo.trajectory import Trajectory
 from hybridvo.types import Frame
 
 __all__ = [

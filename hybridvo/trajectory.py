@@ -7,30 +7,27 @@ name the file and the line.
 
 from __future__ import annotations
 
-import contextlib
 import io
 import logging
 import math
 import os
-import secrets
-import stat
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hybridvo.checks import NANOSECONDS_ABOVE, stamp_unit
-from hybridvo.errors import FormatError, InputError, OutputError
+from hybridvo.errors import FormatError, InputError
+from hybridvo.files import atomic_write
 from hybridvo.geometry import invert, ned_to_camera, xyzw_to_wxyz
 
 __all__ = [
     "Axes",
     "Format",
     "Trajectory",
-    "atomic_write",
     "chain",
     "read_trajectory",
     "write_kitti",
@@ -262,48 +259,6 @@ def _as_path(path: Any) -> Path:
     if "\0" in text:
         raise InputError(f"path: {text!r} holds a null character.")
     return Path(text)
-
-
-@contextlib.contextmanager
-def atomic_write(path: str | os.PathLike[str], mode: Literal["w", "wb"] = "w") -> Iterator[IO[Any]]:
-    """File handle whose content appears under ``path`` completely or not at all.
-
-    Writes into a new file in the same folder, flushes it to the disk and renames it over ``path``.
-    A symbolic link at ``path`` is replaced, never followed. Text is UTF-8 with Unix line ends.
-
-    Raises:
-        OutputError: the file cannot be created, written or renamed, or ``path`` is a device, a pipe
-            or a socket, which a rename would put an end to; ``path`` is then unchanged.
-        InputError: ``path`` is no path.
-    """
-    path = _as_path(path)
-    try:
-        kind = path.lstat().st_mode
-    except OSError:  # nothing there, or the folder says why below
-        kind = stat.S_IFREG
-    if not (stat.S_ISREG(kind) or stat.S_ISLNK(kind) or stat.S_ISDIR(kind)):
-        raise OutputError(f"{path}: expected a file or a new name, got a device or a pipe.")
-    # not tempfile.mkstemp: its files are private (0600), results should follow the umask
-    temporary = path.with_name(f".{path.name[:100]}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
-    flags = os.O_CREAT | os.O_EXCL | os.O_WRONLY
-    try:
-        descriptor = os.open(temporary, flags | getattr(os, "O_BINARY", 0), 0o666)
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written: {error.strerror or error}.") from error
-    text = {} if mode == "wb" else {"encoding": "utf-8", "newline": "\n"}
-    try:
-        try:
-            with os.fdopen(descriptor, mode, **text) as file:  # type: ignore[call-overload]
-                yield file
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(temporary, path)
-        except OSError as error:
-            raise OutputError(f"{path}: cannot be written: {error.strerror or error}.") from error
-    except BaseException:
-        with contextlib.suppress(OSError):
-            os.unlink(temporary)
-        raise
 
 
 def write_tum(trajectory: Trajectory, path: str | os.PathLike[str]) -> None:

@@ -68,8 +68,8 @@ def visualize(options: PictureOptions, command: list[str]) -> list[Path]:
     from hybridvo.errors import InputError
     from hybridvo.evaluation.plots_maps import maps_png
     from hybridvo.evaluation.report import write_json
+    from hybridvo.files import atomic_write
     from hybridvo.hybrid import DEFAULT_METHOD, estimate
-    from hybridvo.trajectory import atomic_write
 
     if options.steps < 1:
         raise InputError(f"--steps: expected at least 1, got {options.steps}.")

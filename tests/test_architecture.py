@@ -22,6 +22,7 @@ CLASSICAL = NOUNS | {"geometry", "pose"}
 IMPORTS: dict[str, set[str]] = {
     # the house itself: data walks from left to right
     "errors": set(),
+    "files": {"errors"},
     "checks": {"errors"},
     "types": {"checks", "errors"},
     "compilation": {"errors"},
@@ -31,7 +32,7 @@ IMPORTS: dict[str, set[str]] = {
     "flow": NOUNS | {"geometry"},
     "network": NOUNS | {"geometry"},
     "pose": NOUNS | {"geometry", "compilation", "quiet_import"},
-    "trajectory": NOUNS | {"geometry"},
+    "trajectory": NOUNS | {"geometry", "files"},
     "learned": CLASSICAL | {"network"},
     "flow_check": NOUNS,
     "learned_judge": CLASSICAL | {"network", "learned"},

@@ -163,8 +163,8 @@ def _one(
     interruption: Any,
 ) -> dict[str, Any] | None:
     """Train and score one row; None if the training was interrupted."""
+    from hybridvo.files import atomic_write
     from hybridvo.training.ablation import score_row, train_row
-    from hybridvo.trajectory import atomic_write
 
     results = folder / "result.json"
     if args.overwrite:
@@ -217,7 +217,7 @@ def _write(
     """The three files, from what there is so far."""
     from ablation_report import markdown, plot, summary
 
-    from hybridvo.trajectory import atomic_write
+    from hybridvo.files import atomic_write
 
     result = {**about, **summary(runs, sintel, args.seeds)}
     paths = [args.out / f"ablation.{kind}" for kind in ("json", "md", "png")]

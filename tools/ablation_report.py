@@ -309,7 +309,7 @@ def plot(result: Mapping[str, Any], path: Path) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    from hybridvo.trajectory import atomic_write
+    from hybridvo.files import atomic_write
 
     rows = result["rows"][::-1]
     figure = Figure(figsize=(9.5, 0.9 + 0.36 * len(rows)), dpi=130, layout="constrained")

@@ -209,7 +209,7 @@ def _fill_page(args: argparse.Namespace) -> int:
     import json
 
     from hybridvo.comparison.hybrid_page import fill
-    from hybridvo.trajectory import atomic_write
+    from hybridvo.files import atomic_write
 
     if args.page is None:
         return _bad_usage("--page-only needs --page.")

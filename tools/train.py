@@ -198,9 +198,9 @@ def _export(trainer: Any, arguments: argparse.Namespace, record: dict[str, Any])
     """Weights of the run with a model card that says where they come from and what they can do."""
     import torch
 
+    from hybridvo.files import atomic_write
     from hybridvo.network.weights import load_weights, save_weights
     from hybridvo.training.held_out import PUBLISHED_SEED, calibrate_scales, evaluate_network
-    from hybridvo.trajectory import atomic_write
 
     options = trainer.options
     card: dict[str, Any] = {

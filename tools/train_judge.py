@@ -136,10 +136,10 @@ def _train(arguments: argparse.Namespace) -> int:
 
 def _export(arguments: argparse.Namespace) -> int:
     from hybridvo.errors import InputError
+    from hybridvo.files import atomic_write
     from hybridvo.network.weights import save_weights
     from hybridvo.training.judge_evaluation import evaluate_judge
     from hybridvo.training.outputs import check_export
-    from hybridvo.trajectory import atomic_write
 
     check_export(arguments.export, arguments.out, RECORD)
     trainer = _trainer(arguments, arguments.held_out)

@@ -17,9 +17,9 @@ from hybridvo.data.sequence import Sequence as FrameSequence
 from hybridvo.errors import InputError
 from hybridvo.evaluation.maps import error_map, flow_colours, longest_flow
 from hybridvo.evaluation.report_data import one_line
+from hybridvo.files import atomic_write
 from hybridvo.flow import FlowField
 from hybridvo.run import flow_provider
-from hybridvo.trajectory import atomic_write
 from hybridvo.types import Frame
 
 __all__ = ["picture_worst"]

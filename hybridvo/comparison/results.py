@@ -19,8 +19,9 @@ from hybridvo.data.sequence import Sequence as FrameSequence
 from hybridvo.errors import FormatError
 from hybridvo.evaluation.breakdown import FACTORS, PairTable
 from hybridvo.evaluation.report_data import one_line, plain_stem
+from hybridvo.files import atomic_write
 from hybridvo.run_results import true_trajectory
-from hybridvo.trajectory import Trajectory, atomic_write, write_tum
+from hybridvo.trajectory import Trajectory, write_tum
 
 __all__ = ["PAIR_COLUMNS", "ROW_COLUMNS", "Collected", "Segments", "collect", "file_stem"]
 

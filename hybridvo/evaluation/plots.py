@@ -17,8 +17,9 @@ from matplotlib.figure import Figure
 
 from hybridvo.errors import InputError
 from hybridvo.evaluation.metrics import AbsoluteError, Alignment, ate
+from hybridvo.files import atomic_write
 from hybridvo.geometry import invert
-from hybridvo.trajectory import Trajectory, atomic_write
+from hybridvo.trajectory import Trajectory
 
 __all__ = ["plot_benchmark", "plot_trajectories"]
 

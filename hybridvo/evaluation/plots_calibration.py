@@ -11,7 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from hybridvo.errors import InputError
-from hybridvo.trajectory import atomic_write
+from hybridvo.files import atomic_write
 
 __all__ = ["plot_calibration"]
 

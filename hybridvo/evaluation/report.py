@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from hybridvo.errors import InputError
-from hybridvo.trajectory import atomic_write
+from hybridvo.files import atomic_write
 
 __all__ = ["jsonable", "table_markdown", "table_text", "to_json", "write_csv", "write_json"]
 

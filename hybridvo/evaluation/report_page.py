@@ -41,7 +41,7 @@ from hybridvo.evaluation.report_tables import (
     published_table,
     sequence_table,
 )
-from hybridvo.trajectory import atomic_write
+from hybridvo.files import atomic_write
 
 __all__ = ["write_report"]
 

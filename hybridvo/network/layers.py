@@ -72,16 +72,19 @@ class ResidualBlock(nn.Module):
         self.conv1 = nn.Conv2d(in_channels, out_channels, 3, stride, 1)
         self.conv2 = nn.Conv2d(out_channels, out_channels, 3, 1, 1)
         self.inner_activation = inner_activation
+        self.stride = stride
         self.shortcut: nn.Module = nn.Identity()
         if stride != 1 or in_channels != out_channels or project:
-            self.shortcut = nn.Conv2d(in_channels, out_channels, 1, stride)
+            self.shortcut = nn.Conv2d(in_channels, out_channels, 1)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """(B, in_channels, h, w) -> (B, out_channels, ceil(h / stride), ceil(w / stride))."""
         y = self.conv2(F.elu(self.conv1(x), inplace=True))
         if self.inner_activation:
             y = F.elu(y, inplace=True)
-        return F.elu(y + self.shortcut(x), inplace=True)
+        # not a 1x1 convolution of stride 2: oneDNN's gradient of it writes past its memory where
+        # there are few channels in channels-last order
+        return F.elu(y + self.shortcut(x[..., :: self.stride, :: self.stride]), inplace=True)
 
 
 class InputBranches(nn.Module):

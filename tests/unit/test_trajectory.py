@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hybridvo.errors import FormatError, InputError, OutputError
+from hybridvo.files import atomic_write
 from hybridvo.geometry import make_transform, ned_to_camera, se3_exp
 from hybridvo.trajectory import (
     Trajectory,
-    atomic_write,
     read_trajectory,
     write_kitti,
     write_tum,
