@@ -1,1 +1,1 @@
-"""The refinement: one residual, a numba path for one pair and a torch path for batches."""
+"""Refinement of a camera motion on flow, depth and images, with its covariance."""
