@@ -27,7 +27,7 @@ _HOME = {
     "open_sequence": "hybridvo.data.sequence",
     "iter_pairs": "hybridvo.data.sequence",
     "refine": "hybridvo.refinement.refine",
-    "select": "hybridvo.pose.selection",
+    "select": "hybridvo.network.selection",
 }
 
 __all__ = ["__version__", *_HOME]

@@ -46,7 +46,7 @@ def pixel_grid(height: int, width: int, like: torch.Tensor) -> torch.Tensor:
 
 
 def se3(T: Any) -> pp.LieTensor:
-    """Pypose SE3 (..., 7) of (..., 4, 4) matrices, whose rotation is replaced by the nearest one."""
+    """Pypose SE3 (..., 7) of (..., 4, 4) matrices, with the rotations nearest to theirs."""
     U, _, Vh = torch.linalg.svd(T[..., :3, :3])
     flip = torch.linalg.det(U @ Vh)[..., None, None]
     T = T.clone()
@@ -81,7 +81,8 @@ def reproject(
     Args:
         depth: (B, H, W) metres.
         T: T_curr_prev, (B, 4, 4) or pypose SE3 (B, 7).
-        K_prev, K_curr: (B, 3, 3) intrinsics.
+        K_prev: (B, 3, 3) intrinsics of the previous camera.
+        K_curr: (B, 3, 3) of the current one.
 
     Returns:
         (B, H, W, 2) px on the current image and (B, H, W) bool, False where the depth is invalid

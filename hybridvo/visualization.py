@@ -290,7 +290,7 @@ def saliencies(
     import torch
 
     from hybridvo.evaluation.maps import integrated_gradients
-    from hybridvo.pose.selection import chosen_pose
+    from hybridvo.network.selection import chosen_pose
     from hybridvo.types import PixelwisePrediction
 
     names = ("flow",) if network.options.scale_free else ("flow", "inverse_depth")

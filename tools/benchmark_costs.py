@@ -133,7 +133,7 @@ def run_batch(
     from benchmark_scores import FAILURE_PX, epe
 
     from hybridvo.data.benchmark_pairs import make_pair
-    from hybridvo.pose.batched import refine_batch
+    from hybridvo.refinement.torch_backend import refine_batch
     from hybridvo.types import PairBatch
 
     made = [make_pair(cell, seed0 + k, *shape) for k in range(max(sizes))]

@@ -9,10 +9,12 @@ import numpy as np
 import torch
 
 from hybridvo.errors import InputError
-from hybridvo.refinement.torch_factors import MAX_VALUE
-from hybridvo.torch_geometry import MAX_DEPTH, MIN_DEPTH, pp
+from hybridvo.refinement.torch_pixels import MAX_VALUE
+from hybridvo.torch_geometry import MAX_DEPTH, MIN_DEPTH, pp, se3
 from hybridvo.types import PairBatch, Reason, RelativePose, Status
 
+DEPTH_CURR_FLOOR = 2e-3
+"""Smallest noise of log D_curr assumed: what bilinear sampling of a smooth surface is good to."""
 DOUBTFUL_INLIER_RATIO = 0.2
 """Share of the weight below which a motion is degraded."""
 DOUBTFUL_PROBABILITY = 0.8
@@ -163,6 +165,52 @@ def checked_batch(
         values[name] = value if name == "valid" else value.to(dtype)
     weights = values.pop("weights")
     return PairBatch(**values), weights
+
+
+def initial_poses(T_init: Any, like: torch.Tensor, alone: bool) -> pp.LieTensor:
+    """(B, S, 7) pypose SE3; ``alone``: without the identity beside what is handed in."""
+    batch = len(like)
+    unit = torch.eye(4, dtype=torch.float64, device=like.device)
+    identity = unit.expand(batch, 1, 4, 4)
+    if T_init is None:
+        return se3(identity)
+    if isinstance(T_init, pp.LieTensor):
+        T_init = T_init.matrix()
+    T = torch.as_tensor(T_init, device=like.device).detach().double()
+    if T.shape == (4, 4) and batch == 1:
+        T = T[None]
+    if T.ndim == 3:
+        T = T[:, None]
+    if T.ndim != 4 or T.shape[0] != batch or T.shape[2:] != (4, 4):
+        raise InputError(
+            f"refine_batch: expected T_init of shape ({batch}, 4, 4) or ({batch}, S, 4, 4), "
+            f"got {tuple(T.shape)}."
+        )
+    good = torch.isfinite(T).flatten(2).all(dim=2) & (T.abs().flatten(2).amax(dim=2) < 1e9)
+    T = torch.where(good[:, :, None, None], T, unit)
+    return se3(T if alone else torch.cat([identity, T], dim=1))
+
+
+def given_noise(noise: Any, like: torch.Tensor, use_depth_curr: bool) -> torch.Tensor | None:
+    """(B, 2) or (B, 3) noise as handed in."""
+    if noise is None:
+        return None
+    if isinstance(noise, (tuple, list)):
+        columns = [torch.as_tensor(x, dtype=like.dtype, device=like.device) for x in noise]
+        value = torch.stack([x.expand(len(like)) for x in columns], dim=1)
+    else:
+        value = torch.as_tensor(noise, device=like.device).to(like.dtype)
+    if value.ndim != 2 or len(value) != len(like) or value.shape[1] not in (2, 3):
+        raise InputError(
+            f"refine_batch: expected noise as (sf, sd), (sf, sd, sz) or a tensor of shape "
+            f"({len(like)}, 2) or ({len(like)}, 3), got {tuple(value.shape)}."
+        )
+    known = value.detach()
+    if not bool(torch.isfinite(known).all() & (known >= 0).all() & (known[:, 0] > 0).all()):
+        raise InputError("refine_batch: expected finite noise, sf positive, sd not negative.")
+    if use_depth_curr and value.shape[1] == 2:
+        value = torch.cat([value, value[:, 1:].clamp(min=DEPTH_CURR_FLOOR)], dim=1)
+    return value if use_depth_curr else value[:, :2]
 
 
 def status_of(

@@ -32,7 +32,7 @@ from hybridvo.refinement.readiness import compile_refinement
 from hybridvo.types import FramePair, Hypothesis, PairBatch, Reason, RelativePose, Status
 
 if TYPE_CHECKING:
-    from hybridvo.pose.batched import BatchedPose
+    from hybridvo.refinement.batch import BatchedPose, BatchOptions
 
 __all__ = ["RefinementOptions", "refine"]
 
@@ -69,7 +69,13 @@ def refine(
 
 
 @overload
-def refine(pair: PairBatch, T_init: Any = None, weights: Any = None) -> BatchedPose: ...
+def refine(
+    pair: PairBatch,
+    T_init: Any = None,
+    weights: Any = None,
+    *,
+    options: BatchOptions | None = None,
+) -> BatchedPose: ...
 
 
 def refine(
@@ -79,7 +85,7 @@ def refine(
     *,
     T_last: np.ndarray | None = None,
     T_last_covariance: np.ndarray | None = None,
-    options: RefinementOptions | None = None,
+    options: RefinementOptions | BatchOptions | None = None,
     judge: Judge | PictureJudge = default_judge,
     seed: int = 0,
 ) -> RelativePose | BatchedPose:
@@ -87,21 +93,22 @@ def refine(
 
     Args:
         pair: a :class:`FramePair` (numpy), or a :class:`PairBatch` (torch) for the batched,
-            differentiable path, see :func:`hybridvo.pose.batched.refine_batch`.
+            differentiable path, see :func:`hybridvo.refinement.torch_backend.refine_batch`.
         T_init: (4, 4) or (S, 4, 4) T_curr_prev, starts beside the identity (a network's seeds).
         weights: (H, W) factors on the information of each pixel; 0 and NaN switch a pixel off.
         T_last: (4, 4) the last camera motion, or the one expected: one more start, and a cue for
             the judge.
         T_last_covariance: (6, 6) of ``Exp(delta) T_last``, translation first, m^2 and rad^2: how
             far the motion may be from it; a judge of pixels weighs it.
-        options: see :class:`RefinementOptions`.
+        options: :class:`RefinementOptions`, or for a batch
+            :class:`hybridvo.refinement.batch.BatchOptions`.
         judge: chooses the world among the motions found, by their cues (larger score wins) or, a
             :class:`hybridvo.hypotheses.selector.PictureJudge`, by looking at each pixel.
         seed: of the minimal samples; the same seed gives the same bytes.
 
     Returns:
         The motion with covariance, status, per-pixel weights and every motion found (for a
-        :class:`PairBatch` a :class:`hybridvo.pose.batched.BatchedPose`). Bad data give
+        :class:`PairBatch` a :class:`hybridvo.refinement.batch.BatchedPose`). Bad data give
         a failed status, never an exception and never a value that is not finite.
 
     Raises:
@@ -109,9 +116,20 @@ def refine(
             seed that no generator takes.
     """
     if isinstance(pair, PairBatch):
-        from hybridvo.pose.batched import refine_batch
+        from hybridvo.refinement.torch_backend import refine_batch
 
-        return refine_batch(pair, T_init=T_init, weights=weights)
+        for name, value, default in (
+            ("T_last", T_last, None),
+            ("T_last_covariance", T_last_covariance, None),
+            ("judge", judge, default_judge),
+            ("seed", seed, 0),
+        ):
+            if value is not default:
+                raise InputError(
+                    f"refine.{name}: expected nothing for a PairBatch, got {value!r}. It takes "
+                    f"T_init, weights and options."
+                )
+        return refine_batch(pair, T_init, weights, options=options)
     started = time.perf_counter()
     if not isinstance(pair, FramePair):
         raise InputError(f"refine: expected a FramePair or a PairBatch, got {type(pair).__name__}.")
@@ -119,6 +137,8 @@ def refine(
         raise InputError(f"refine.judge: expected a callable or a PictureJudge, got {judge!r}.")
     seed = as_seed(seed, "refine.seed")
     options = options or RefinementOptions()
+    if not isinstance(options, RefinementOptions):
+        raise InputError(f"refine.options: expected RefinementOptions, got {options!r}.")
     T_last = None if T_last is None else as_rigid(T_last, "refine.T_last")
     starts = _starts(T_init, T_last)
     if weights is not None and np.shape(weights) != pair.prev.camera.shape:

@@ -20,22 +20,27 @@ import numpy as np
 import torch
 
 from hybridvo.errors import InputError
-from hybridvo.pose import solver as numba_solver
-from hybridvo.pose.covariance import NOTHING, UPPER, sandwich_covariance
-from hybridvo.refinement.batch import BatchedPose, BatchOptions, checked_batch, status_of
+from hybridvo.refinement import solver as numba_solver
+from hybridvo.refinement.batch import (
+    DEPTH_CURR_FLOOR,
+    BatchedPose,
+    BatchOptions,
+    checked_batch,
+    given_noise,
+    initial_poses,
+    status_of,
+)
+from hybridvo.refinement.covariance import NOTHING, UPPER, sandwich_covariance
 from hybridvo.refinement.torch_factors import (
     KERNELS,
     Linearization,
-    Pixels,
     RobustNoise,
-    from_tiles,
-    gather_pixels,
     linearize,
     residuals,
     score_sum,
-    tile_grid,
 )
-from hybridvo.torch_geometry import left_update, pp, se3
+from hybridvo.refinement.torch_pixels import Pixels, from_tiles, gather_pixels, tile_grid
+from hybridvo.torch_geometry import left_update, pp
 from hybridvo.types import PairBatch
 
 MIN_DAMPING = 1e-6
@@ -45,8 +50,6 @@ GNC_RATIO = 0.7
 INITIAL_NOISE = (0.7, 0.01)
 """px and of log depth, where the noise estimate begins."""
 DEPTH_NOISE_CAP = 0.08
-DEPTH_CURR_FLOOR = 2e-3
-"""Smallest noise of log D_curr assumed: what bilinear sampling of a smooth surface is good to."""
 INLIER_DISTANCE2 = 9.0
 ROUNDED_STEP = 0.05
 """Steps below, in standard deviations of the noise, that no longer shrink are rounding."""
@@ -93,13 +96,18 @@ def refine_batch(
         InputError: shapes, types or options that cannot be used.
     """
     options = options or BatchOptions()
+    if not isinstance(batch, PairBatch) or not isinstance(options, BatchOptions):
+        raise InputError(
+            f"refine_batch: expected a PairBatch and BatchOptions, got {type(batch).__name__} and "
+            f"{options!r}."
+        )
     if kernel not in KERNELS:
         raise InputError(f"refine_batch: unknown kernel {kernel!r}; known: {', '.join(KERNELS)}.")
     if gradient not in ("implicit", "none"):
         raise InputError(f"refine_batch: expected gradient implicit or none, got {gradient!r}.")
     batch, weights = checked_batch(batch, weights, options.use_depth_curr)
-    starts = _starts(T_init, batch.flow, alone=weights is not None)
-    given = _given_noise(noise, batch.flow, options.use_depth_curr)
+    starts = initial_poses(T_init, batch.flow, alone=weights is not None)
+    given = given_noise(noise, batch.flow, options.use_depth_curr)
     tensors = (*vars(batch).values(), weights, given)
     wanted = gradient == "implicit" and torch.is_grad_enabled()
     wanted = wanted and any(x is not None and x.requires_grad for x in tensors)
@@ -160,52 +168,6 @@ def solve_small(
     x = x / scale
     good = good & (info == 0) & (x.abs() < 1e6).all(dim=1)
     return torch.where(good[:, None], x, torch.zeros_like(x)), good
-
-
-def _starts(T_init: Any, like: torch.Tensor, alone: bool) -> pp.LieTensor:
-    """(B, S, 7) pypose SE3; ``alone``: without the identity beside what is handed in."""
-    batch = len(like)
-    unit = torch.eye(4, dtype=torch.float64, device=like.device)
-    identity = unit.expand(batch, 1, 4, 4)
-    if T_init is None:
-        return se3(identity)
-    if isinstance(T_init, pp.LieTensor):
-        T_init = T_init.matrix()
-    T = torch.as_tensor(T_init, device=like.device).detach().double()
-    if T.shape == (4, 4) and batch == 1:
-        T = T[None]
-    if T.ndim == 3:
-        T = T[:, None]
-    if T.ndim != 4 or T.shape[0] != batch or T.shape[2:] != (4, 4):
-        raise InputError(
-            f"refine_batch: expected T_init of shape ({batch}, 4, 4) or ({batch}, S, 4, 4), "
-            f"got {tuple(T.shape)}."
-        )
-    good = torch.isfinite(T).flatten(2).all(dim=2) & (T.abs().flatten(2).amax(dim=2) < 1e9)
-    T = torch.where(good[:, :, None, None], T, unit)
-    return se3(T if alone else torch.cat([identity, T], dim=1))
-
-
-def _given_noise(noise: Any, like: torch.Tensor, use_depth_curr: bool) -> torch.Tensor | None:
-    """(B, 2) or (B, 3) noise as handed in."""
-    if noise is None:
-        return None
-    if isinstance(noise, (tuple, list)):
-        columns = [torch.as_tensor(x, dtype=like.dtype, device=like.device) for x in noise]
-        value = torch.stack([x.expand(len(like)) for x in columns], dim=1)
-    else:
-        value = torch.as_tensor(noise, device=like.device).to(like.dtype)
-    if value.ndim != 2 or len(value) != len(like) or value.shape[1] not in (2, 3):
-        raise InputError(
-            f"refine_batch: expected noise as (sf, sd), (sf, sd, sz) or a tensor of shape "
-            f"({len(like)}, 2) or ({len(like)}, 3), got {tuple(value.shape)}."
-        )
-    known = value.detach()
-    if not bool(torch.isfinite(known).all() & (known >= 0).all() & (known[:, 0] > 0).all()):
-        raise InputError("refine_batch: expected finite noise, sf positive, sd not negative.")
-    if use_depth_curr and value.shape[1] == 2:
-        value = torch.cat([value, value[:, 1:].clamp(min=DEPTH_CURR_FLOOR)], dim=1)
-    return value if use_depth_curr else value[:, :2]
 
 
 class _Solver:
@@ -429,7 +391,7 @@ class _Solver:
             step = torch.where(done[:, None], torch.zeros_like(step), step)
             moved = (_energy(step, H) / now.weight_sum.double().clamp(min=1e-12)).sqrt()
             T, iterations = left_update(step, T), iterations + (~done).long()
-            rounded = (moved > 0.5 * best) & (moved < ROUNDED_STEP)
+            rounded = (moved > 0.5 * best) & (moved < ROUNDED_STEP) & (k > 3 or not tight)
             converged = converged | (~done & solved & ((moved < enough) | rounded))
             best = torch.where(done, best, torch.minimum(best, moved))
             done = converged | ~solved

@@ -11,9 +11,7 @@ import re
 import runpy
 import subprocess
 import sys
-import warnings
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -30,10 +28,9 @@ from hybridvo.errors import CheckpointError, InputError, OutputError
 from hybridvo.evaluation import metrics
 from hybridvo.geometry import ego_flow, invert, se3_exp
 from hybridvo.network.judge import JudgeOptions
+from hybridvo.network.selection import SELECTION_METHODS, select
 from hybridvo.network.weights import pretrained
 from hybridvo.odometry import Odometry
-from hybridvo.pose.selection import SELECTION_METHODS, select
-from hybridvo.quiet_import import quiet_import
 from hybridvo.run_folder import RunFolder
 from hybridvo.training import stream
 from hybridvo.training.judge_loop import JudgeTrainer, JudgeTrainingOptions
@@ -546,35 +543,6 @@ print((found.T_curr_prev - torch.eye(4)).abs().max().item())
     done = in_a_fresh_process(code, flags=("-W", "error"))
     assert done.returncode == 0 and done.stderr == "", done.stderr
     assert float(done.stdout) < 1e-6
-
-
-def test_a_quiet_import_shields_only_its_own_warnings(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """From many threads at once; what is no deprecation is heard as before."""
-    names = [f"warns_of_{kind}" for kind in ("DeprecationWarning", "FutureWarning")]
-    for name in (*names, "warns_of_UserWarning"):
-        kind = name.removeprefix("warns_of_")
-        (tmp_path / f"{name}.py").write_text(
-            f"import time, warnings\nwarnings.warn('old', {kind})\ntime.sleep(0.05)\nready = 1\n"
-        )
-    monkeypatch.syspath_prepend(tmp_path)
-    before = list(warnings.filters)
-    with ThreadPoolExecutor(8) as pool:
-        modules = list(pool.map(quiet_import, 8 * names))
-    assert all(module.ready for module in modules)
-    assert warnings.filters == before
-    with pytest.warns(UserWarning, match="old"):
-        quiet_import("warns_of_UserWarning")
-    with pytest.raises(ImportError):
-        quiet_import("nowhere_to_be_found")
-    with pytest.warns(DeprecationWarning):
-        warnings.warn("new", DeprecationWarning, stacklevel=1)
-    for name in (*names, "warns_of_UserWarning"):
-        sys.modules.pop(name)
-
-
-# the tracker
 
 
 def test_after_a_skipped_frame_a_flow_leads_from_the_last_tracked_one() -> None:
