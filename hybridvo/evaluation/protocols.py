@@ -64,7 +64,9 @@ def protocols() -> dict[str, Protocol]:
 def same_intrinsics(first: Camera, second: Camera) -> bool:
     """Whether two cameras are one: the pairs that the paper keeps."""
     pairs = ((getattr(c, n) for c in (first, second)) for n in ("fx", "fy", "cx", "cy"))
-    return first.shape == second.shape and all(abs(a - b) <= SAME_FOCAL * first.fx for a, b in pairs)
+    return first.shape == second.shape and all(
+        abs(a - b) <= SAME_FOCAL * first.fx for a, b in pairs
+    )
 
 
 def check_protocol(name: str, sequences: Sequence[Any]) -> Protocol:

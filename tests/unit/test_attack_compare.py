@@ -17,15 +17,15 @@ from types import ModuleType
 from typing import Any
 
 import pytest
-
 from hybridvo.comparison import runner
 from hybridvo.comparison.executors import open_workers
 from hybridvo.comparison.job import run_segment
 from hybridvo.comparison.plan import shown_name, unique_names
 from hybridvo.comparison.results import file_stem
 from hybridvo.comparison.scores import scale_notice
-from hybridvo.errors import InputError, OutputError
 from hybridvo.evaluation.report_tables import Column, _build, plain_markdown
+
+from hybridvo.errors import InputError, OutputError
 from hybridvo.run_folder import PARTIAL, STATE
 from tests.scripts import load_script
 from tests.sequences import write_folder

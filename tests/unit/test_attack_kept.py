@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-
 from hybridvo.comparison.job import Job, run_segment
 from hybridvo.comparison.results import Segments
+
 from hybridvo.errors import FormatError
 from hybridvo.run_folder import PARTIAL
 from tests.sequences import write_folder

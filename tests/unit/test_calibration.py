@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-
-from hybridvo.errors import InputError
 from hybridvo.evaluation.calibration import (
     CHI2_6_3SIGMA,
     flag_cost,
@@ -17,6 +15,8 @@ from hybridvo.evaluation.calibration import (
     reliability,
 )
 from hybridvo.evaluation.plots_calibration import plot_calibration
+
+from hybridvo.errors import InputError
 from hybridvo.geometry import se3_exp
 from hybridvo.hypotheses.confidence import RECALIBRATION, probability_right
 

@@ -13,13 +13,13 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-
 from hybridvo.comparison import job as job_module
 from hybridvo.comparison import runner
 from hybridvo.comparison.job import READS_NO_FLOW, Job, run_segment
 from hybridvo.comparison.plan import expand, unique_names, weights_of
 from hybridvo.comparison.results import PAIR_COLUMNS
 from hybridvo.comparison.runner import ComparisonOptions, WorkerError, compare
+
 from hybridvo.data.sequence import open_sequence
 from hybridvo.data.synthetic import make_scene, write_sintel
 from hybridvo.errors import InputError, LockedError

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-
 from hybridvo.comparison.executors import open_workers
 from hybridvo.comparison.runner import ComparisonOptions, compare
+
 from hybridvo.data.synthetic import make_scene, write_sintel
 from hybridvo.errors import InputError
 

@@ -8,7 +8,6 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-
 from hybridvo.comparison.hybrid_page import START, STOP, fill
 from hybridvo.comparison.hybrid_sequences import (
     ORACLE,
@@ -19,6 +18,7 @@ from hybridvo.comparison.hybrid_sequences import (
     run_sequence,
 )
 from hybridvo.comparison.hybrid_summary import summarise
+
 from hybridvo.data.benchmark_pairs import make_pair
 from hybridvo.errors import FormatError, InputError
 from hybridvo.pipeline import estimate, shipped_judge

@@ -9,6 +9,9 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from hybridvo.evaluation.pairs import dynamic_fraction, pair_errors
+from hybridvo.evaluation.plots_maps import FlowPanel, ImagePanel, ScalarPanel, maps_png
+from hybridvo.visualization import networks, saliencies, start_of
 
 from hybridvo.data.synthetic import SyntheticSequence, make_scene, write_sintel
 from hybridvo.errors import InputError
@@ -23,14 +26,11 @@ from hybridvo.evaluation.maps import (
     share_on,
     uncertainty_maps,
 )
-from hybridvo.evaluation.pairs import dynamic_fraction, pair_errors
-from hybridvo.evaluation.plots_maps import FlowPanel, ImagePanel, ScalarPanel, maps_png
 from hybridvo.geometry import invert, se3_exp
 from hybridvo.network.inputs import assemble_inputs
 from hybridvo.network.pwvo import NetworkOptions, build_network
 from hybridvo.network.weights import save_weights
 from hybridvo.types import FramePair, PixelwisePrediction
-from hybridvo.visualization import networks, saliencies, start_of
 from tests.scripts import load_script
 
 

@@ -5,12 +5,12 @@ import time
 
 import numpy as np
 import pytest
+from hybridvo.evaluation.drift import KITTI_LENGTHS, SHORT_LENGTHS, kitti_drift
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from hybridvo.errors import FormatError, InputError
-from hybridvo.evaluation.drift import KITTI_LENGTHS, SHORT_LENGTHS, kitti_drift
 from hybridvo.evaluation.metrics import (
     associate,
     ate,

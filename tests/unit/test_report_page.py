@@ -13,15 +13,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-
-from hybridvo.errors import FormatError, InputError
-from hybridvo.evaluation.breakdown import FACTORS, PairTable, breakdown, worst_pairs
 from hybridvo.evaluation.plots_comparison import Series, duration_svg, timing_svg
-from hybridvo.evaluation.protocols import PROTOCOLS, protocol_summary
 from hybridvo.evaluation.report_data import Path3D, shown_box
 from hybridvo.evaluation.report_page import write_report
 from hybridvo.evaluation.report_tables import number
 from hybridvo.evaluation.report_view3d import project, view_svg
+
+from hybridvo.errors import FormatError, InputError
+from hybridvo.evaluation.breakdown import FACTORS, PairTable, breakdown, worst_pairs
+from hybridvo.evaluation.protocols import PROTOCOLS, protocol_summary
 from hybridvo.geometry import se3_exp
 from hybridvo.trajectory import Trajectory, write_tum
 
