@@ -28,7 +28,8 @@ IMPORTS: dict[str, set[str]] = {
     "compilation": {"errors"},
     "quiet_import": set(),
     "geometry": NOUNS,
-    "data": NOUNS | {"geometry", "compilation"},
+    "data": NOUNS | {"geometry", "synthetic", "training"},
+    "synthetic": NOUNS | {"geometry", "compilation", "data", "files"},
     "flow": NOUNS | {"geometry"},
     "network": NOUNS | {"geometry"},
     "pose": NOUNS | {"geometry", "compilation", "quiet_import"},
@@ -40,7 +41,7 @@ IMPORTS: dict[str, set[str]] = {
     "tracking": CLASSICAL,
     "odometry": CLASSICAL | {"flow", "hybrid", "tracking", "trajectory"},
     "evaluation": NOUNS | {"geometry", "trajectory"},
-    "training": CLASSICAL | {"data", "flow", "network", "learned", "hybrid"},
+    "training": CLASSICAL | {"data", "synthetic", "flow", "network", "learned", "hybrid"},
     # one run of `hybridvo run`: what it writes, how it is set, and the loop around the tracker
     "console": {"errors"},
     "run_folder": {"checks", "errors", "evaluation"},
@@ -58,7 +59,7 @@ IMPORTS: dict[str, set[str]] = {
     "comparison": {
         *("__init__", "errors", "types", "geometry", "data", "flow", "hybrid", "trajectory"),
         *("evaluation", "configuration", "console", "run_folder", "run_results", "run", "checks"),
-        *("learned_judge", "pose"),
+        *("learned_judge", "pose", "synthetic"),
     },
     # figures of one pair: tools/visualize.py, and the report of a comparison
     "visualization": {
@@ -66,7 +67,7 @@ IMPORTS: dict[str, set[str]] = {
         *("hybrid", "trajectory", "evaluation", "configuration", "run"),
     },
     # what stands at the door
-    "demo": {"checks", "errors", "data", "evaluation", "configuration", "run"},
+    "demo": {"checks", "errors", "synthetic", "data", "evaluation", "configuration", "run"},
     "doctor": {"__init__", "compilation", "errors", "hybrid"},
     "diagnosis_findings": CLASSICAL | {"depth_steps"},
     "diagnosis": CLASSICAL | {"flow", "diagnosis_findings", "depth_steps"},

@@ -96,7 +96,7 @@ def write_rendered_walk(
     """
     import cv2
 
-    from hybridvo.data.synthetic import make_scene
+    from hybridvo.synthetic.render import make_scene
     from hybridvo.trajectory import Trajectory, write_tum
 
     distinct = min(distinct, frames)

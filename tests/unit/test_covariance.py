@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 
-from hybridvo.data.benchmark_pairs import make_pair
 from hybridvo.pose import batch_covariance, full_fit, kernels, solver
 from hybridvo.pose.covariance import (
     LONG_GROWTH,
@@ -24,6 +23,7 @@ from hybridvo.pose.covariance import (
 )
 from hybridvo.pose.picture import Picture
 from hybridvo.pose.refinement import refine
+from hybridvo.synthetic.scenarios import make_pair
 from hybridvo.types import FramePair, Reason, State
 
 TOOLS = str(Path(__file__).parents[2] / "tools")

@@ -19,7 +19,7 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.version import Version
 
-from hybridvo.data.synthetic import make_scene, write_sintel
+from hybridvo.synthetic.render import make_scene, write_sintel
 from tests.scripts import load_script
 
 ROOT = Path(__file__).resolve().parents[2]
