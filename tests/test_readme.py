@@ -20,7 +20,7 @@ from hybridvo.cli import build_parser
 from hybridvo.data.sequence import open_sequence
 from hybridvo.demo import demo
 from hybridvo.errors import InputError
-from hybridvo.hybrid import METHODS
+from hybridvo.pipeline import METHODS
 from hybridvo.synthetic.scenes import SCENE_KINDS
 from tests.scripts import load_script
 

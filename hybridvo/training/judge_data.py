@@ -17,9 +17,9 @@ import numpy as np
 
 from hybridvo.flow import dis_flow
 from hybridvo.geometry import invert, se3_exp
-from hybridvo.pose import kernels
-from hybridvo.pose.coarse import CoarseSearch, search_motions
-from hybridvo.pose.options import RefinementOptions
+from hybridvo.hypotheses.generate import CoarseSearch, search_motions
+from hybridvo.refinement import kernels
+from hybridvo.refinement.options import RefinementOptions
 from hybridvo.synthetic.diverse import WideOptions, wide_sample
 from hybridvo.synthetic.sensors import DegradationOptions, degrade_depth, log_uniform
 from hybridvo.synthetic.training_scenes import judge_scene

@@ -20,7 +20,7 @@ from hybridvo.comparison.hybrid_sequences import (
 )
 from hybridvo.comparison.hybrid_summary import summarise
 from hybridvo.errors import FormatError, InputError
-from hybridvo.hybrid import estimate, shipped_judge
+from hybridvo.pipeline import estimate, shipped_judge
 from hybridvo.synthetic.scenarios import make_pair
 from tests.scripts import load_script
 
