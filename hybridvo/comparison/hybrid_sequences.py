@@ -24,8 +24,9 @@ from hybridvo.geometry import invert
 from hybridvo.hypotheses.confidence import REFERENCE_WIDTH
 from hybridvo.learned_judge import LearnedJudge
 from hybridvo.pipeline import JUDGED, check_method, estimate, shipped_judge
-from hybridvo.synthetic.render import SCENE_KINDS, SyntheticSequence, make_scene
+from hybridvo.synthetic.render import SyntheticSequence, make_scene
 from hybridvo.synthetic.scenarios import SCENARIOS, make_pair
+from hybridvo.synthetic.scenes import SCENE_KINDS
 from hybridvo.trajectory import Trajectory
 from hybridvo.types import FramePair, RelativePose
 
