@@ -4,7 +4,6 @@ import cv2
 import numpy as np
 import pytest
 
-from hybridvo.data.synthetic import SyntheticSequence, make_scene
 from hybridvo.errors import FormatError, InputError
 from hybridvo.flow import (
     BASE_STD_PX,
@@ -18,6 +17,7 @@ from hybridvo.flow import (
     file_flow,
     forward_backward_check,
 )
+from hybridvo.synthetic.render import SyntheticSequence, make_scene
 from hybridvo.types import Camera, Frame
 
 HEIGHT, WIDTH = 96, 128
