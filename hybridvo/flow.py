@@ -114,6 +114,16 @@ def dis_flow(preset: str = "medium", forward_backward: bool = True) -> FlowProvi
     return _Dis(preset, forward_backward)
 
 
+def crashes_dis(image: np.ndarray) -> bool:
+    """Whether OpenCV's DIS would end the process: a short, wide (H, W) image.
+
+    Below 32 rows it chooses its coarsest level by the width alone, where fewer rows than a patch
+    may be left.
+    """
+    height, width = image.shape[:2]
+    return height < 32 and width > 2 * height
+
+
 class _Dis:
     """See :func:`dis_flow`."""
 
@@ -137,7 +147,7 @@ class _Dis:
             return FlowField(None, source="dis")
         first = cv2.cvtColor(prev.rgb, cv2.COLOR_RGB2GRAY)
         second = cv2.cvtColor(curr.rgb, cv2.COLOR_RGB2GRAY)
-        if not (_textured(first) and _textured(second)):
+        if crashes_dis(first) or not (_textured(first) and _textured(second)):
             return FlowField(None, source="dis")
         try:
             forward = self._calc(first, second)

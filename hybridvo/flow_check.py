@@ -10,6 +10,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from hybridvo.flow import crashes_dis
 from hybridvo.types import FramePair
 
 __all__ = ["contradiction"]
@@ -50,6 +51,8 @@ def contradiction(pair: FramePair) -> str | None:
         )
         for x in (rgb_prev, rgb_curr)
     )
+    if crashes_dis(first):
+        return None
     try:
         dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
         own = np.asarray(dis.calc(first, second, None))  # type: ignore[call-overload]
