@@ -15,7 +15,7 @@ import pytest
 
 from hybridvo.errors import InputError, OutputError
 from hybridvo.flow import dis_flow
-from hybridvo.flow_check import contradiction
+from hybridvo.flow import contradiction
 from hybridvo.geometry import ego_flow, invert, se3_exp, se3_log, to_gtsam_covariance
 from hybridvo.hybrid import estimate
 from hybridvo.odometry import Odometry
