@@ -37,7 +37,8 @@ from hybridvo.geometry import (
     xyzw_to_wxyz,
 )
 from hybridvo.network.inputs import assemble_inputs
-from hybridvo.pose import residuals, solver
+from hybridvo.pose import residuals
+from hybridvo.refinement import solver
 from hybridvo.trajectory import Trajectory, read_trajectory, write_tum
 from hybridvo.types import Camera, Frame, FramePair, PairBatch, RelativePose, Step
 

@@ -21,7 +21,7 @@ from hybridvo.data.scenes import SCENE_KINDS
 from hybridvo.data.sequence import open_sequence
 from hybridvo.demo import demo
 from hybridvo.errors import InputError
-from hybridvo.hybrid import METHODS
+from hybridvo.pipeline import METHODS
 from tests.scripts import load_script
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -167,17 +167,17 @@ def available_methods() -> tuple[dict[str, Callable[..., Any]], dict[str, str]]:
     """Methods that can run here by name (ours first), and reason and remedy for the others."""
     from functools import partial
 
-    from hybridvo.pose import baselines
+    from hybridvo.baselines import pnp as baselines
 
     methods: dict[str, Callable[..., Any]] = {}
     absent = baselines.missing()
-    if importlib.util.find_spec("hybridvo.pose.refinement") is None:
-        absent["refine"] = "hybridvo.pose.refinement is not part of this version"
+    if importlib.util.find_spec("hybridvo.refinement.refine") is None:
+        absent["refine"] = "hybridvo.refinement.refine is not part of this version"
     else:
-        from hybridvo.pose.refinement import refine
+        from hybridvo.refinement.refine import refine
 
         methods["refine"] = refine
-        from hybridvo.hybrid import estimate
+        from hybridvo.pipeline import estimate
 
         methods[HYBRID] = partial(estimate, method=HYBRID)
     for name, estimator in baselines.baselines().items():

@@ -17,7 +17,7 @@ def run_nees(pairs: int, seed0: int) -> dict[str, Any]:
     deviation sqrt(12), 99.73 % below the 3 sigma ellipsoid.
     """
     from hybridvo.data.benchmark_pairs import make_model_pair
-    from hybridvo.pose.refinement import refine
+    from hybridvo.refinement.refine import refine
 
     values = []
     unanswered = 0

@@ -27,7 +27,7 @@ BEYOND_CACHE = 256 * 2**20
 FRESH_PROCESS = """
 import json, time
 begin = time.perf_counter()
-from hybridvo.hybrid import warm_up
+from hybridvo.pipeline import warm_up
 imported = time.perf_counter()
 first = warm_up()
 second = warm_up()
@@ -38,10 +38,10 @@ print(json.dumps({"import_s": imported - begin, "warm_up_s": first, "again_s": s
 def run_kernel(cell: str, seed: int) -> dict[str, Any]:
     """One pass of ``Picture.full_pass`` over 436x1024 pixels beside the memory's speed."""
     from hybridvo.data.benchmark_pairs import make_pair
-    from hybridvo.pose import picture as module
-    from hybridvo.pose import solver
-    from hybridvo.pose.full_fit import tile_size
-    from hybridvo.pose.options import RefinementOptions
+    from hybridvo.refinement import pixels as module
+    from hybridvo.refinement import solver
+    from hybridvo.refinement.full_fit import tile_size
+    from hybridvo.refinement.options import RefinementOptions
 
     pair, truth = make_pair(cell, seed)
     options = RefinementOptions()

@@ -125,11 +125,11 @@ def reliability(network: Any, seed: int, count: int) -> dict[str, Any]:
 
 def one_mover(network: Any, seed: int, count: int) -> dict[str, Any]:
     """Rotation errors where one object covers half of the picture or more, beside the motion."""
+    from hybridvo.baselines.pnp import baselines
     from hybridvo.data.wide import WideOptions
     from hybridvo.geometry import rotation_angle
     from hybridvo.learned import estimate_learned
-    from hybridvo.pose.baselines import baselines
-    from hybridvo.pose.refinement import refine
+    from hybridvo.refinement.refine import refine
     from hybridvo.training.stream import sample_generator
     from hybridvo.types import Camera, Frame, FramePair
 

@@ -55,7 +55,7 @@ def build_parser() -> argparse.ArgumentParser:
 def main(argv: list[str] | None = None) -> int:
     args = build_parser().parse_args(argv)
     from hybridvo.errors import InputError
-    from hybridvo.hybrid import check_method
+    from hybridvo.pipeline import check_method
 
     methods = args.methods.split(",")
     try:
@@ -126,7 +126,7 @@ def measure_kind(
     """One row per method, and the pairs that are wrong and confident."""
     from benchmark_scores import CHI2_6_3SIGMA, normalised_error
 
-    from hybridvo.hybrid import estimate
+    from hybridvo.pipeline import estimate
 
     wrong = []
     counts = {m: dict.fromkeys(COUNTS, 0) for m in methods}

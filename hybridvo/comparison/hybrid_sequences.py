@@ -23,9 +23,9 @@ from hybridvo.evaluation.metrics import ate
 from hybridvo.evaluation.pairs import dynamic_fraction, pair_errors
 from hybridvo.flow import FlowField, dis_flow
 from hybridvo.geometry import invert
-from hybridvo.hybrid import JUDGED, check_method, estimate, shipped_judge
+from hybridvo.hypotheses.confidence import REFERENCE_WIDTH
 from hybridvo.learned_judge import LearnedJudge
-from hybridvo.pose.confidence import REFERENCE_WIDTH
+from hybridvo.pipeline import JUDGED, check_method, estimate, shipped_judge
 from hybridvo.trajectory import Trajectory
 from hybridvo.types import FramePair, RelativePose
 
@@ -105,7 +105,7 @@ class RecordedJudge(LearnedJudge):
         self.probability: float | None = None
 
     def look_again(self, *args: Any, **options: Any) -> Any:
-        """See :class:`hybridvo.hybrid.LearnedJudge`."""
+        """See :class:`hybridvo.pipeline.LearnedJudge`."""
         opinion = super().look_again(*args, **options)
         self.probability = opinion.trust
         return opinion

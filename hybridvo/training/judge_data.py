@@ -20,9 +20,9 @@ from hybridvo.data.rendered_pictures import MOVING, STATIC, UNKNOWN
 from hybridvo.data.wide import WideOptions, wide_sample
 from hybridvo.flow import dis_flow
 from hybridvo.geometry import invert, se3_exp
-from hybridvo.pose import kernels
-from hybridvo.pose.coarse import CoarseSearch, search_motions
-from hybridvo.pose.options import RefinementOptions
+from hybridvo.hypotheses.generate import CoarseSearch, search_motions
+from hybridvo.refinement import kernels
+from hybridvo.refinement.options import RefinementOptions
 from hybridvo.training.judge_scenes import judge_scene
 from hybridvo.types import Camera, Frame, FramePair, RelativePose
 

@@ -24,7 +24,7 @@ from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
 GUIDED = ["hybridvo", "yaml"]
-UNGUIDED = ("torch", "safetensors.torch", "scipy.spatial.transform", "hybridvo.hybrid")
+UNGUIDED = ("torch", "safetensors.torch", "scipy.spatial.transform", "hybridvo.pipeline")
 UNGUIDED += ("hybridvo.network.judge", "hybridvo.network.pwvo")
 """Imported before the hook is set: large, and no reader."""
 MAX_BYTES = 4096

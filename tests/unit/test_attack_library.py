@@ -17,8 +17,8 @@ from hybridvo.errors import InputError, OutputError
 from hybridvo.flow import dis_flow
 from hybridvo.flow import contradiction
 from hybridvo.geometry import ego_flow, invert, se3_exp, se3_log, to_gtsam_covariance
-from hybridvo.hybrid import estimate
 from hybridvo.odometry import Odometry
+from hybridvo.pipeline import estimate
 from hybridvo.tracking.window import Located, Window, corrected
 from hybridvo.trajectory import Trajectory, write_tum
 from hybridvo.types import Camera, Frame, FramePair, Reason, RelativePose, State, Status

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from hybridvo.baselines import pnp as module
+from hybridvo.baselines.correspondences import Correspondences, check_pose
+from hybridvo.baselines.pnp import baselines, missing
 from hybridvo.data.benchmark_pairs import Cell, make_pair
 from hybridvo.errors import InputError
 from hybridvo.geometry import ego_flow, invert, make_transform, rotation_angle, se3_exp, se3_log
-from hybridvo.pose import baselines as module
-from hybridvo.pose.baselines import baselines, missing
-from hybridvo.pose.correspondences import Correspondences, check_pose
 from hybridvo.types import Camera, Frame, FramePair, Reason, RelativePose, State
 
 POINT_SOLVERS = ["pnp-ransac", "pnp-ransac-tuned", "usac-magsac", "poselib"]

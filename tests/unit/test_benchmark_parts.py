@@ -155,7 +155,7 @@ def test_heavy_summary_counts_kinds_and_total():
 def test_kernel_part_restores_the_threads_and_relates_to_the_memory(monkeypatch):
     import benchmark_costs
 
-    from hybridvo.pose import picture
+    from hybridvo.refinement import pixels as picture
 
     monkeypatch.setattr(benchmark_costs, "ITERATIONS", 3)
     monkeypatch.setattr(benchmark_costs, "BEYOND_CACHE", 2**22)

@@ -11,7 +11,7 @@ import pytest
 from hybridvo.cli import main
 from hybridvo.depth_steps import depth_ratio, depth_step_warning, is_step
 from hybridvo.geometry import ego_flow, se3_exp
-from hybridvo.pose.refinement import refine
+from hybridvo.refinement.refine import refine
 from hybridvo.types import Camera, Frame, FramePair
 
 TOOLS = Path(__file__).parents[2] / "tools"

@@ -12,20 +12,16 @@ import numba
 import numpy as np
 import pytest
 
-from hybridvo import compilation, hybrid
+from hybridvo import compilation
+from hybridvo import pipeline as hybrid
 from hybridvo.cli import main
 from hybridvo.geometry import ego_flow, se3_exp
-from hybridvo.hybrid import compile_kernels, estimate, warm_up
+from hybridvo.hypotheses import search
 from hybridvo.odometry import Odometry
-from hybridvo.pose import (
-    kernels,
-    photometric_kernels,
-    readiness,
-    search,
-    second_depth,
-    solver,
-)
-from hybridvo.pose.refinement import refine
+from hybridvo.pipeline import compile_kernels, estimate, warm_up
+from hybridvo.refinement import depth as second_depth
+from hybridvo.refinement import kernels, photometric_kernels, readiness, solver
+from hybridvo.refinement.refine import refine
 from hybridvo.types import Camera, Frame, FramePair
 
 TOOLS = Path(__file__).parents[2] / "tools"
@@ -209,12 +205,12 @@ def test_a_library_user_reads_the_code_that_later_processes_read(
     Odometry(method="refine", prepare=False)
     assert warm_up("identity") == 0.0 and sets() == []
     refine(pair)
-    assert sets() == [("pose", "refine")]
+    assert sets() == [("refinement", "refine")]
     estimate(pair, method="refine")
     Odometry(method="refine")
     assert sets() == []
     estimate(pair, method="hybrid")
-    assert sets() == [("pose", "judged")]
+    assert sets() == [("refinement", "judged")]
     estimate(pair, method="hybrid")
     assert sets() == []
 
@@ -249,7 +245,7 @@ def test_what_the_compiling_processes_run_is_valid(monkeypatch: pytest.MonkeyPat
 def test_the_first_motion_in_a_new_process_is_that_of_every_later_one(tmp_path: Path) -> None:
     """With a cold cache and no warm-up: the bytes of a process that finds the cache warm."""
     code = (
-        "import numpy as np; from hybridvo.pose.refinement import refine; "
+        "import numpy as np; from hybridvo.refinement.refine import refine; "
         "from hybridvo.types import Camera, Frame, FramePair; "
         "rng = np.random.default_rng(0); "
         "f = Frame(None, rng.uniform(2, 5, (120, 160)), Camera(90, 90, 79.5, 59.5, 120, 160)); "

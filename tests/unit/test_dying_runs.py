@@ -299,7 +299,7 @@ def test_resume_with_other_weights_is_refused(
 
 
 def test_weights_have_a_hash_where_there_are_any() -> None:
-    from hybridvo.hybrid import weights_hash
+    from hybridvo.pipeline import weights_hash
 
     assert weights_hash("refine") is None and weights_hash("identity") is None
     judged, alone = weights_hash("hybrid"), weights_hash("pwvo")

@@ -14,9 +14,9 @@ from hybridvo.data.sequence import open_sequence
 from hybridvo.errors import InputError
 from hybridvo.flow import check_field
 from hybridvo.geometry import ego_flow, invert, se3_exp, se3_log
-from hybridvo.hybrid import estimate
 from hybridvo.odometry import Odometry
-from hybridvo.pose.refinement import refine
+from hybridvo.pipeline import estimate
+from hybridvo.refinement.refine import refine
 from hybridvo.trajectory import Trajectory, read_trajectory, write_tum
 from hybridvo.types import Camera, Frame, FramePair, RelativePose
 

@@ -15,7 +15,7 @@ import pytest
 from hybridvo.cli import main
 from hybridvo.data.synthetic import make_scene, write_sintel
 from hybridvo.geometry import invert, se3_log
-from hybridvo.hybrid import estimate
+from hybridvo.pipeline import estimate
 from hybridvo.types import Reason, State
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -17,16 +17,16 @@ from hybridvo.data.presets import build_options, read_yaml
 from hybridvo.data.synthetic import SyntheticSequence, make_scene
 from hybridvo.errors import CheckpointError, InputError
 from hybridvo.geometry import ego_flow, se3_exp
-from hybridvo.hybrid import estimate
+from hybridvo.hypotheses import selector as second_look
+from hybridvo.hypotheses.generate import CoarseSearch, search_motions, whole_mask
+from hybridvo.hypotheses.selector import Motions, Opinion, Proposal
 from hybridvo.learned_judge import LearnedJudge, judge_inputs
 from hybridvo.network import judge as judge_network
 from hybridvo.network.judge import JudgeInputs, JudgeNetwork, JudgeOptions
 from hybridvo.network.weights import load_weights, pretrained, save_weights
-from hybridvo.pose import second_look
-from hybridvo.pose.coarse import CoarseSearch, search_motions, whole_mask
-from hybridvo.pose.options import RefinementOptions
-from hybridvo.pose.refinement import refine
-from hybridvo.pose.second_look import Motions, Opinion, Proposal
+from hybridvo.pipeline import estimate
+from hybridvo.refinement.options import RefinementOptions
+from hybridvo.refinement.refine import refine
 from hybridvo.training import judge_data
 from hybridvo.training.judge_batches import PictureBatch, ego_flow_error, read_batches
 from hybridvo.training.judge_loop import JudgeTrainer, JudgeTrainingOptions

@@ -176,7 +176,7 @@ def test_the_demo_starts_no_program_and_unpickles_nothing(watched, tmp_path):
     others = [words for words in started if words[:3] != own]
     assert {Path(words[0]).name for words in others} <= {"uname", "lscpu", "fc-list"}
     for words in started:
-        assert words[:3] != own or "hybridvo.pose.readiness import run_kernels" in words[3]
+        assert words[:3] != own or "hybridvo.refinement.readiness import run_kernels" in words[3]
     assert seen["unpickled"] == []
 
 

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from hybridvo.errors import InputError
-from hybridvo.pose.photometric_options import PolishReport
-from hybridvo.pose.registration import LARGEST_PX, OffsetCost, depth_offset_cost
+from hybridvo.refinement.photometric_options import PolishReport
+from hybridvo.refinement.registration import LARGEST_PX, OffsetCost, depth_offset_cost
 from hybridvo.types import FramePair, RelativePose
 
 __all__ = ["PhotometricMonitor"]

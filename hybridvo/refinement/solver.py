@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from hybridvo.compilation import njit
-from hybridvo.pose.kernels import (
+from hybridvo.refinement.kernels import (
     BLOCK,
     FASTMATH,
     MIN_DEPTH,

@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hybridvo.compilation import njit
-from hybridvo.pose.photometric_kernels import GREY, GX, GY, ONE, ZERO
+from hybridvo.refinement.photometric_kernels import GREY, GX, GY, ONE, ZERO
 
 if TYPE_CHECKING:
-    from hybridvo.pose.photometric_problem import Problem, State
+    from hybridvo.refinement.photometric_problem import Problem, State
 
 __all__ = ["EXPLAINED", "even_light", "local_correlation"]
 

@@ -18,9 +18,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from hybridvo.errors import InputError
-from hybridvo.geometry import make_transform
-from hybridvo.pose.correspondences import (
+from hybridvo.baselines.correspondences import (
     MIN_POINTS,
     POINTS,
     Correspondences,
@@ -28,7 +26,9 @@ from hybridvo.pose.correspondences import (
     check_pose,
     sample_correspondences,
 )
-from hybridvo.pose.rgbd_alignment import REMEDIES, open3d_rgbd, opencv_rgbd
+from hybridvo.baselines.rgbd import REMEDIES, open3d_rgbd, opencv_rgbd
+from hybridvo.errors import InputError
+from hybridvo.geometry import make_transform
 from hybridvo.types import Camera, FramePair, RelativePose, Status
 
 __all__ = [

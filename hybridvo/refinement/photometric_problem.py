@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hybridvo.geometry import invert, se3_exp
-from hybridvo.pose import photometric_kernels as kernels
-from hybridvo.pose.full_fit import tile_size
-from hybridvo.pose.photometric_images import Level
-from hybridvo.pose.photometric_light import EXPLAINED, even_light
-from hybridvo.pose.photometric_options import PhotometricOptions
-from hybridvo.pose.picture import as_given, typical
+from hybridvo.refinement import photometric_kernels as kernels
+from hybridvo.refinement.full_fit import tile_size
+from hybridvo.refinement.illumination import EXPLAINED, even_light
+from hybridvo.refinement.photometric_images import Level
+from hybridvo.refinement.photometric_options import PhotometricOptions
+from hybridvo.refinement.pixels import as_given, typical
 from hybridvo.types import FramePair, RelativePose
 
 __all__ = ["Problem", "State", "inverse", "small_log"]

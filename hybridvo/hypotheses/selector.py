@@ -13,11 +13,12 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from hybridvo.geometry import invert, pose_matrix, se3_log
-from hybridvo.pose import kernels, search, solver
-from hybridvo.pose.coarse import CoarseSearch, Grid, fit_in_mask
-from hybridvo.pose.confidence import REFERENCE_WIDTH, probability_right
-from hybridvo.pose.covariance import symmetric
-from hybridvo.pose.options import RefinementOptions
+from hybridvo.hypotheses import search
+from hybridvo.hypotheses.confidence import REFERENCE_WIDTH, probability_right
+from hybridvo.hypotheses.generate import CoarseSearch, Grid, fit_in_mask
+from hybridvo.refinement import kernels, solver
+from hybridvo.refinement.covariance import symmetric
+from hybridvo.refinement.options import RefinementOptions
 from hybridvo.types import FramePair
 
 __all__ = [
@@ -52,7 +53,8 @@ LEAST_TRUST_PROPOSED = 0.15
 """The same with a proposal in the race. Between this and 0.5 the judge's best was right in 11 and
 the classical choice in 7 of 15 development answers; one that trusts nothing at all stays out."""
 CONSULT = 0.94, 0.975
-"""Probability of being right, by :mod:`hybridvo.pose.confidence`, below which the judge is asked
+"""Probability of being right, by :mod:`hybridvo.hypotheses.confidence`, below which the judge is
+asked
 for a proposal: of a flow alone, and of one that states its own variance, as estimated flow does.
 Higher than where an answer is degraded, the more where the flow is bent: of 120 development pairs
 with DIS flow 7 are wrong with 0.94 (16 asked), 5 with 0.975 (29 asked); of 96 pairs of cells with
@@ -178,7 +180,7 @@ class Decision:
     """Candidates, and which of them is the world.
 
     Args:
-        poses: (N + R, 3, 4). facts: (N + R, :data:`hybridvo.pose.search.FACTS`).
+        poses: (N + R, 3, 4). facts: (N + R, :data:`hybridvo.hypotheses.search.FACTS`).
         score: (N + R,).
         best: index of the world.
         mask: (h, w) weights that it was fitted with, or None for a motion of the search.

@@ -1,7 +1,8 @@
 """The refinement: metric camera motion with covariance from flow, depth and intrinsics.
 
-Finds every strong motion on a coarse grid (:mod:`hybridvo.pose.search`), lets a judge say which one
-is the world (:mod:`hybridvo.pose.judgement`), and fits that one on the full grid with noise scales
+Finds every strong motion on a coarse grid (:mod:`hybridvo.hypotheses.search`), lets a judge say
+which one
+is the world (:mod:`hybridvo.hypotheses.cues`), and fits that one on the full grid with noise scales
 estimated from the data. It minimises the ego-flow reprojection error (paper, equations 6 and 8)
 under a Geman-McClure kernel of the Mahalanobis distance, with the depth noise propagated into each
 pixel's covariance.
@@ -15,18 +16,19 @@ from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
+from hybridvo.baselines.correspondences import DOUBTFUL_INLIER_RATIO
 from hybridvo.checks import as_rigid, as_seed, to_numpy
 from hybridvo.errors import InputError
 from hybridvo.geometry import pose_matrix
-from hybridvo.pose import kernels, search, solver
-from hybridvo.pose.coarse import SOURCE_MASK, CoarseSearch, search_motions
-from hybridvo.pose.confidence import REFERENCE_WIDTH, probability_right
-from hybridvo.pose.correspondences import DOUBTFUL_INLIER_RATIO
-from hybridvo.pose.full_fit import FullFit, fit_full_grid
-from hybridvo.pose.judgement import CueGrid, Judge, default_judge
-from hybridvo.pose.options import RefinementOptions
-from hybridvo.pose.readiness import compile_refinement
-from hybridvo.pose.second_look import Decision, Expected, PictureJudge, decide
+from hybridvo.hypotheses import search
+from hybridvo.hypotheses.confidence import REFERENCE_WIDTH, probability_right
+from hybridvo.hypotheses.cues import CueGrid, Judge, default_judge
+from hybridvo.hypotheses.generate import SOURCE_MASK, CoarseSearch, search_motions
+from hybridvo.hypotheses.selector import Decision, Expected, PictureJudge, decide
+from hybridvo.refinement import kernels, solver
+from hybridvo.refinement.full_fit import FullFit, fit_full_grid
+from hybridvo.refinement.options import RefinementOptions
+from hybridvo.refinement.readiness import compile_refinement
 from hybridvo.types import FramePair, Hypothesis, PairBatch, Reason, RelativePose, Status
 
 if TYPE_CHECKING:
@@ -94,7 +96,7 @@ def refine(
             far the motion may be from it; a judge of pixels weighs it.
         options: see :class:`RefinementOptions`.
         judge: chooses the world among the motions found, by their cues (larger score wins) or, a
-            :class:`hybridvo.pose.second_look.PictureJudge`, by looking at each pixel.
+            :class:`hybridvo.hypotheses.selector.PictureJudge`, by looking at each pixel.
         seed: of the minimal samples; the same seed gives the same bytes.
 
     Returns:

@@ -1,6 +1,7 @@
 """The photometric polish of a batch of pairs in torch: CPU or GPU, differentiable.
 
-The twin of :mod:`hybridvo.pose.photometric_kernels` and :mod:`hybridvo.pose.photometric_problem`;
+The twin of :mod:`hybridvo.refinement.photometric_kernels` and
+:mod:`hybridvo.refinement.photometric_problem`;
 a test holds residuals, Jacobians and normal equations equal. Samples never see each other. The
 gradient is that of the estimating equation at its root (implicit function theorem, see
 :mod:`hybridvo.pose.implicit`): one more Newton step is taken with its matrix held.
@@ -16,9 +17,9 @@ import torch.nn.functional as F
 
 from hybridvo.errors import InputError
 from hybridvo.pose.implicit import solve_small
-from hybridvo.pose.photometric_options import PhotometricOptions
 from hybridvo.pose.pixels import MAX_VALUE, MIN_DEPTH
 from hybridvo.pose.residuals import left_update
+from hybridvo.refinement.photometric_options import PhotometricOptions
 
 __all__ = ["PhotometricBatch", "PhotometricPixels", "photometric_terms", "polish_photometric_batch"]
 

@@ -13,7 +13,7 @@ __all__ = ["PhotometricOptions", "PolishReport"]
 
 @dataclass(frozen=True)
 class PhotometricOptions:
-    """Options of :func:`hybridvo.pose.photometric.polish_photometric`.
+    """Options of :func:`hybridvo.refinement.photometric.polish_photometric`.
 
     Args:
         blur_px: standard deviations of the Gaussian blur, coarse to fine. The finest also decides

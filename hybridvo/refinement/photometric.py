@@ -5,7 +5,8 @@ weighted static pixel, ``I_curr(pi(T X)) - gain I_prev - offset``, joins as info
 (and the second depth's) covariance becomes a prior of Student's form around the motion of the
 refinement, and the 6x6 normal equations of both add up, each with its estimated noise. A guard
 keeps the motion of the flow where the pictures do not lower the joint cost, do not match, or lead
-outside of what the flow allows. Definition of the term: :mod:`hybridvo.pose.photometric_kernels`.
+outside of what the flow allows. Definition of the term:
+:mod:`hybridvo.refinement.photometric_kernels`.
 """
 
 from __future__ import annotations
@@ -17,12 +18,12 @@ from typing import Any
 import numpy as np
 
 from hybridvo.errors import InputError
-from hybridvo.pose import photometric_kernels as kernels
-from hybridvo.pose.photometric_images import MID_GREY, Level, blurred, grey_image, match_blur
-from hybridvo.pose.photometric_light import local_correlation
-from hybridvo.pose.photometric_options import PhotometricOptions, PolishReport
-from hybridvo.pose.photometric_problem import Problem, State, inverse, small_log
-from hybridvo.pose.picture import as_given
+from hybridvo.refinement import photometric_kernels as kernels
+from hybridvo.refinement.illumination import local_correlation
+from hybridvo.refinement.photometric_images import MID_GREY, Level, blurred, grey_image, match_blur
+from hybridvo.refinement.photometric_options import PhotometricOptions, PolishReport
+from hybridvo.refinement.photometric_problem import Problem, State, inverse, small_log
+from hybridvo.refinement.pixels import as_given
 from hybridvo.types import FramePair, RelativePose
 
 __all__ = ["PhotometricOptions", "PolishReport", "polish_photometric"]
@@ -51,11 +52,11 @@ def polish_photometric(
 
     Args:
         pair: the two frames; both with images.
-        pose: what :func:`hybridvo.pose.refinement.refine` found for them, with its weights and
+        pose: what :func:`hybridvo.refinement.refine.refine` found for them, with its weights and
             covariance.
         options: see :class:`PhotometricOptions`.
         trust: factor in [0, 1] on the information of the pictures, see
-            :class:`hybridvo.pose.photometric_monitor.PhotometricMonitor`.
+            :class:`hybridvo.refinement.photometric_monitor.PhotometricMonitor`.
 
     Returns:
         The motion with its covariance, ``terms`` and ``polish`` (a :class:`PolishReport`). Where

@@ -10,8 +10,8 @@ import numpy as np
 
 from hybridvo.compilation import compile_once
 from hybridvo.geometry import ego_flow, se3_exp
-from hybridvo.pose.judgement import Judge, default_judge
-from hybridvo.pose.second_look import PictureJudge
+from hybridvo.hypotheses.cues import Judge, default_judge
+from hybridvo.hypotheses.selector import PictureJudge
 from hybridvo.types import Camera, Frame, FramePair
 
 __all__ = ["compile_refinement", "run_kernels"]
@@ -27,7 +27,7 @@ def compile_refinement() -> bool:
     Returns:
         Whether they are in the cache now, see :func:`hybridvo.compilation.compile_once`.
     """
-    code = "from hybridvo.pose.readiness import run_kernels; run_kernels()"
+    code = "from hybridvo.refinement.readiness import run_kernels; run_kernels()"
     return compile_once(code, Path(__file__).resolve().parent, "refine")
 
 
@@ -38,8 +38,8 @@ def run_kernels(judge: Judge | PictureJudge = default_judge, polish: bool = True
         judge: of the refinement.
         polish: whether those of the photometric polish as well.
     """
-    from hybridvo.pose.photometric import polish_photometric
-    from hybridvo.pose.refinement import refine
+    from hybridvo.refinement.photometric import polish_photometric
+    from hybridvo.refinement.refine import refine
 
     for height, width in SIZES:
         camera = Camera(width, width, (width - 1) / 2, (height - 1) / 2, height, width)

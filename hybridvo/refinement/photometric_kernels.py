@@ -1,6 +1,7 @@
 """Numba kernels of the photometric term: which pixels, and their residuals and Jacobians.
 
-The same definition as :mod:`hybridvo.pose.photometric_batch` (torch); a test holds both equal.
+The same definition as :mod:`hybridvo.refinement.photometric_batch` (torch); a test holds both
+equal.
 
 Per pixel x of the previous picture with grey value A, at a pose T (X' = T X, a = X'/Z', b = Y'/Z',
 i = 1/Z'):
@@ -12,8 +13,8 @@ i = 1/Z'):
   of constant depth (inverse compositional, Baker and Matthews, IJCV 2004): the noise of a central
   difference at x is independent of the noise of A at x, so noise alone moves nothing;
 - Jacobian of r: G^T diag(fx, fy) B_x with respect to the left perturbation (B_x as in
-  :mod:`hybridvo.pose.kernels`), -A for the gain, -1 for the offset, and G^T q grad(log Z) for a
-  shift of the depth map, q = d pi(X') / d log Z;
+  :mod:`hybridvo.refinement.kernels`), -A for the gain, -1 for the offset, and G^T q grad(log Z)
+  for a shift of the depth map, q = d pi(X') / d log Z;
 - variance s^2 + sd^2 v_d (G^T q)^2, s the noise of the residual in grey levels;
 - robust weight of Geman-McClure, (c^2 / (c^2 + d^2))^2 with d^2 = r^2 / variance.
 """
@@ -23,7 +24,7 @@ from __future__ import annotations
 import numpy as np
 
 from hybridvo.compilation import njit
-from hybridvo.pose.kernels import FASTMATH, MAX_VALUE, MIN_DEPTH, ONE, ZERO, keep_apart
+from hybridvo.refinement.kernels import FASTMATH, MAX_VALUE, MIN_DEPTH, ONE, ZERO, keep_apart
 
 XN, YN, Z, GREY, GX, GY, PD, W, SU, SV = range(10)
 """Rows of a pixel buffer: ray x, ray y, depth, grey value, its gradient, relative depth variance,

@@ -11,12 +11,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from hybridvo.pose import photometric_kernels as kernels
-from hybridvo.pose.photometric import choose_pixels
-from hybridvo.pose.photometric_images import Level, blurred, grey_image, match_blur
-from hybridvo.pose.photometric_light import EXPLAINED, even_light
-from hybridvo.pose.photometric_options import PhotometricOptions
-from hybridvo.pose.photometric_problem import NOISE_FLOOR, Problem, State
+from hybridvo.refinement import photometric_kernels as kernels
+from hybridvo.refinement.illumination import EXPLAINED, even_light
+from hybridvo.refinement.photometric import choose_pixels
+from hybridvo.refinement.photometric_images import Level, blurred, grey_image, match_blur
+from hybridvo.refinement.photometric_options import PhotometricOptions
+from hybridvo.refinement.photometric_problem import NOISE_FLOOR, Problem, State
 from hybridvo.types import Camera, FramePair, RelativePose
 
 __all__ = ["PARAMETERS", "calibration_equations"]

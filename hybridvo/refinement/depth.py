@@ -2,7 +2,8 @@
 
 rz = log D_curr(x + F) - log Z'. Given the flow residual r it is Gaussian with mean k^T r,
 k = h sd^2 Sigma^-1 q, where h = dlogZ'/dlogZ = 1 - tz/Z' and Sigma, q are those of
-:mod:`hybridvo.pose.kernels`: both residuals share the error of the previous depth. So the full 3x3
+:mod:`hybridvo.refinement.kernels`: both residuals share the error of the previous depth. So the
+full 3x3
 covariance enters as one more scalar residual, rz - k^T r, with the Jacobian row Jz - k^T J, Jz =
 (0, 0, i, b, -a, 0), that adds to the same normal equations. Its variance is estimated.
 """
@@ -14,7 +15,7 @@ import math
 import numpy as np
 
 from hybridvo.compilation import njit
-from hybridvo.pose.kernels import (
+from hybridvo.refinement.kernels import (
     BLOCK,
     FASTMATH,
     MAX_SHIFT,

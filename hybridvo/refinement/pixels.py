@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from hybridvo.pose import kernels
+from hybridvo.refinement import kernels
 from hybridvo.types import Camera, FramePair
 
 PARALLEL_PIXELS = 100_000

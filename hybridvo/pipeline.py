@@ -20,6 +20,8 @@ from hybridvo.checks import as_number, as_rigid, as_seed
 from hybridvo.compilation import compile_once
 from hybridvo.errors import CheckpointError, InputError
 from hybridvo.flow import contradiction
+from hybridvo.hypotheses.cues import default_judge
+from hybridvo.hypotheses.selector import PictureJudge
 from hybridvo.learned import (
     LEARNED,
     LEAST_PIXELS,
@@ -27,11 +29,9 @@ from hybridvo.learned import (
     shipped_network,
 )
 from hybridvo.learned_judge import LearnedJudge
-from hybridvo.pose.judgement import default_judge
-from hybridvo.pose.photometric import PhotometricOptions, polish_photometric
-from hybridvo.pose.readiness import compile_refinement, run_kernels
-from hybridvo.pose.refinement import RefinementOptions, refine
-from hybridvo.pose.second_look import PictureJudge
+from hybridvo.refinement.photometric import PhotometricOptions, polish_photometric
+from hybridvo.refinement.readiness import compile_refinement, run_kernels
+from hybridvo.refinement.refine import RefinementOptions, refine
 from hybridvo.types import FramePair, Reason, RelativePose
 
 __all__ = [
@@ -99,7 +99,7 @@ def check_method(method: str) -> None:
                 f"use --method refine (the classical refinement)."
             )
     if method in _BASELINES:
-        from hybridvo.pose.baselines import missing
+        from hybridvo.baselines.pnp import missing
 
         absent = missing()
         if method in absent:
@@ -130,10 +130,11 @@ def estimate(
         method: one of :data:`METHODS` that can run here.
         options: of the refinement.
         judge: for the methods that ask one; by default the one whose weights are shipped.
-        polish: one of :data:`POLISH`, see :func:`hybridvo.pose.photometric.polish_photometric`.
+        polish: one of :data:`POLISH`, see
+            :func:`hybridvo.refinement.photometric.polish_photometric`.
         photometric: options of the polish.
         trust: in the pictures, 0 to 1, see
-            :class:`hybridvo.pose.photometric_monitor.PhotometricMonitor`.
+            :class:`hybridvo.refinement.photometric_monitor.PhotometricMonitor`.
         seed: of everything that is drawn at random; the same seed gives the same bytes.
 
     Returns:
@@ -186,7 +187,7 @@ def estimate(
     check_method(method)
     if method in LEARNED:
         return _too_little(pair, method) or estimate_learned(pair, method)
-    from hybridvo.pose.baselines import baselines
+    from hybridvo.baselines.pnp import baselines
 
     return baselines()[method](pair, seed=seed)
 
@@ -281,8 +282,8 @@ def compile_kernels(method: str = DEFAULT_METHOD) -> bool:
     done = compile_refinement()
     if method in JUDGED:
         code = (
-            "from hybridvo.hybrid import shipped_judge; from hybridvo.pose.readiness import "
-            "run_kernels; run_kernels(shipped_judge())"
+            "from hybridvo.pipeline import shipped_judge; "
+            "from hybridvo.refinement.readiness import run_kernels; run_kernels(shipped_judge())"
         )
-        done = compile_once(code, Path(__file__).resolve().parent / "pose", "judged") and done
+        done = compile_once(code, Path(__file__).resolve().parent / "refinement", "judged") and done
     return done

@@ -13,9 +13,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from hybridvo.errors import InputError
-from hybridvo.geometry import make_transform
-from hybridvo.pose.correspondences import (
+from hybridvo.baselines.correspondences import (
     DEPTH_RANGE_M,
     POINTS,
     Correspondences,
@@ -25,6 +23,8 @@ from hybridvo.pose.correspondences import (
     is_rigid,
     sample_correspondences,
 )
+from hybridvo.errors import InputError
+from hybridvo.geometry import make_transform
 from hybridvo.types import Camera, FramePair, Reason, RelativePose, Status
 
 __all__ = ["open3d_rgbd", "opencv_rgbd"]

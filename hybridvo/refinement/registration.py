@@ -15,10 +15,10 @@ import numpy as np
 
 from hybridvo.errors import InputError
 from hybridvo.geometry import ego_flow
-from hybridvo.pose import photometric_kernels as kernels
-from hybridvo.pose.photometric_images import Level, blurred, grey_image, match_blur
-from hybridvo.pose.photometric_options import PhotometricOptions
-from hybridvo.pose.photometric_problem import Problem, State
+from hybridvo.refinement import photometric_kernels as kernels
+from hybridvo.refinement.photometric_images import Level, blurred, grey_image, match_blur
+from hybridvo.refinement.photometric_options import PhotometricOptions
+from hybridvo.refinement.photometric_problem import Problem, State
 from hybridvo.types import FramePair, RelativePose
 
 __all__ = ["LAGS", "LARGEST_PX", "OffsetCost", "depth_costs", "depth_offset_cost"]

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hybridvo.pose import kernels
+from hybridvo.refinement import kernels
 from hybridvo.types import Frame
 
 __all__ = ["DepthAgreement", "depth_agreement"]
@@ -75,7 +75,8 @@ def depth_agreement(
 
     Args:
         curr: the current frame.
-        samples: (rows, n) gathered pixels of the previous one, see :mod:`hybridvo.pose.kernels`.
+        samples: (rows, n) gathered pixels of the previous one, see
+            :mod:`hybridvo.refinement.kernels`.
         robust: (n,) robust weights about the motion.
         pose: (3, 4) T_curr_prev.
         origin: (u, v) of the current picture's coordinates in ``samples``.

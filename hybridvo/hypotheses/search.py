@@ -13,8 +13,20 @@ import math
 import numpy as np
 
 from hybridvo.compilation import njit
-from hybridvo.pose.kernels import BUFFER_ROWS, FASTMATH, MAX_VALUE, MU, MV, PD, PF, XN, YN, W, Z
-from hybridvo.pose.solver import (
+from hybridvo.refinement.kernels import (
+    BUFFER_ROWS,
+    FASTMATH,
+    MAX_VALUE,
+    MU,
+    MV,
+    PD,
+    PF,
+    XN,
+    YN,
+    W,
+    Z,
+)
+from hybridvo.refinement.solver import (
     DEPTH_NOISE_CAP,
     FLOW_NOISE_CAP,
     NOISE_PIXELS,

@@ -6,11 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hybridvo.pose import kernels, second_depth, solver
-from hybridvo.pose.covariance import ORDER, UPPER, sandwich_covariance, symmetric
-from hybridvo.pose.depth_agreement import DepthAgreement, depth_agreement
-from hybridvo.pose.options import RefinementOptions
-from hybridvo.pose.picture import Picture, as_given
+from hybridvo.refinement import depth as second_depth
+from hybridvo.refinement import kernels, solver
+from hybridvo.refinement.covariance import ORDER, UPPER, sandwich_covariance, symmetric
+from hybridvo.refinement.depth_agreement import DepthAgreement, depth_agreement
+from hybridvo.refinement.options import RefinementOptions
+from hybridvo.refinement.pixels import Picture, as_given
 from hybridvo.types import FramePair
 
 LONG_STEP = 1e3

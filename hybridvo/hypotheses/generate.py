@@ -9,10 +9,12 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from hybridvo.pose import kernels, search, second_depth, solver
-from hybridvo.pose.confidence import REFERENCE_WIDTH
-from hybridvo.pose.options import RefinementOptions
-from hybridvo.pose.picture import Picture, as_given
+from hybridvo.hypotheses import search
+from hybridvo.hypotheses.confidence import REFERENCE_WIDTH
+from hybridvo.refinement import depth as second_depth
+from hybridvo.refinement import kernels, solver
+from hybridvo.refinement.options import RefinementOptions
+from hybridvo.refinement.pixels import Picture, as_given
 from hybridvo.types import FramePair, Reason, RelativePose
 
 __all__ = ["CoarseSearch", "Grid", "fit_in_mask", "search_motions"]
@@ -21,7 +23,7 @@ LEAST_USABLE = 0.1
 """Share of usable grid pixels below which the grid is drawn anew, finer, where they are."""
 LEAST_USABLE_PIXELS = 400
 SOURCE_MASK = 102
-"""Source of a motion that was fitted inside a mask, see :mod:`hybridvo.pose.search`."""
+"""Source of a motion that was fitted inside a mask, see :mod:`hybridvo.hypotheses.search`."""
 CLEAR_COHERENCE = 0.5
 """Coherence of the residuals above which even a motion that most of the picture follows may be a
 compromise: 0.02 for independent noise, 0.25 to 0.4 for DIS flow of static scenes, above 0.6 where a
@@ -70,12 +72,12 @@ class CoarseSearch:
 
     Args:
         picture: arrays of the pair, cropped to ``box``.
-        samples: pixel buffer of the grid, see :mod:`hybridvo.pose.kernels`.
+        samples: pixel buffer of the grid, see :mod:`hybridvo.refinement.kernels`.
         shape: (rows, columns, stride) of the grid.
         whole: (height, width) of the picture, px.
         box: (v0, v1, u0, u1) of the picture that the grid covers.
         depth_scale: 1 / typical depth.
-        poses: (M, 3, 4) T_curr_prev. facts: (M, :data:`hybridvo.pose.search.FACTS`).
+        poses: (M, 3, 4) T_curr_prev. facts: (M, :data:`hybridvo.hypotheses.search.FACTS`).
         clear: the first motion holds the picture beyond doubt; no other was looked for.
     """
 
