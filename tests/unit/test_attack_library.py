@@ -14,8 +14,7 @@ import numpy as np
 import pytest
 
 from hybridvo.errors import InputError, OutputError
-from hybridvo.flow import dis_flow
-from hybridvo.flow import contradiction
+from hybridvo.flow import contradiction, dis_flow
 from hybridvo.geometry import ego_flow, invert, se3_exp, se3_log, to_gtsam_covariance
 from hybridvo.odometry import Odometry
 from hybridvo.pipeline import estimate
