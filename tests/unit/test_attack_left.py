@@ -456,7 +456,7 @@ def test_the_unit_of_todays_stamps_is_told(
     assert stamp_unit(stamps) == (EPOCH[unit], unit)
     (tmp_path / "t").write_text("".join(f"{int(s)} 0 0 0 0 0 0 1\n" for s in stamps))
     read = read_trajectory(tmp_path / "t")
-    assert unit in read.notices[0]
+    assert unit in read.warnings[0]
     np.testing.assert_allclose(read.timestamps, seconds, rtol=0, atol=1e-6)
     listed, notices = to_seconds(stamps, "rgb.txt")
     assert unit in notices[0]
