@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 import pytest
 
-from hybridvo.data.synthetic import SyntheticSequence, make_scene
 from hybridvo.errors import FormatError, InputError
 from hybridvo.flow import (
     BASE_STD_PX,
@@ -21,6 +20,7 @@ from hybridvo.flow import (
     file_flow,
     forward_backward_check,
 )
+from hybridvo.synthetic.render import SyntheticSequence, make_scene
 from hybridvo.types import Camera, Frame, FramePair
 
 HEIGHT, WIDTH = 96, 128

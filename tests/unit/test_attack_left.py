@@ -25,7 +25,6 @@ from hybridvo.checks import stamp_unit
 from hybridvo.cli import main
 from hybridvo.data.file_sequence import to_seconds
 from hybridvo.data.sequence import open_sequence
-from hybridvo.data.workflow import PaperOptions
 from hybridvo.errors import CheckpointError, InputError, OutputError
 from hybridvo.evaluation import metrics
 from hybridvo.geometry import ego_flow, invert, se3_exp
@@ -35,6 +34,7 @@ from hybridvo.odometry import Odometry
 from hybridvo.pose.selection import SELECTION_METHODS, select
 from hybridvo.quiet_import import quiet_import
 from hybridvo.run_folder import RunFolder
+from hybridvo.synthetic.paper import PaperOptions
 from hybridvo.training import stream
 from hybridvo.training.judge_loop import JudgeTrainer, JudgeTrainingOptions
 from hybridvo.training.outputs import check_export

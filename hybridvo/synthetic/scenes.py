@@ -1,7 +1,7 @@
 """Scene families: a furnished room, a camera path and movers that keep a wanted share of the view.
 
 Every family is drawn from one seed; movers are sized, and draws rejected, until the share of
-moving pixels is inside the family's band in every frame. :mod:`hybridvo.data.synthetic` renders
+moving pixels is inside the family's band in every frame. :mod:`hybridvo.synthetic.render` renders
 the result.
 """
 
@@ -10,7 +10,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hybridvo.data.bodies import (
+from hybridvo.errors import InputError
+from hybridvo.synthetic.bodies import (
     Mover,
     Parts,
     affine,
@@ -20,12 +21,9 @@ from hybridvo.data.bodies import (
     draw_look,
     mover_path,
 )
-from hybridvo.data.raycasting import BOX, CYLINDER, ELLIPSOID
-from hybridvo.data.world import Solid, World, dynamic_share, moving_share
-from hybridvo.errors import InputError
+from hybridvo.synthetic.raycast import BOX, CYLINDER, ELLIPSOID
+from hybridvo.synthetic.world import Solid, World, dynamic_share, moving_share
 from hybridvo.types import Camera
-
-__all__ = ["SCENE_KINDS", "compose_world"]
 
 _BANDS = {
     "static": (0.0, 0.0),

@@ -15,8 +15,6 @@ import numpy as np
 
 from hybridvo.errors import InputError
 
-__all__ = ["DegradationOptions", "degrade_depth", "degrade_flow", "log_uniform", "smooth_field"]
-
 Range = tuple[float, float]
 
 

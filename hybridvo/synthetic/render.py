@@ -14,21 +14,12 @@ import numpy as np
 
 from hybridvo.checks import make_folder
 from hybridvo.data.image_io import write_cam, write_dpt, write_flo
-from hybridvo.data.raycasting import cast, motion, screen_bounds, shade
-from hybridvo.data.scenes import SCENE_KINDS, compose_world
-from hybridvo.data.world import World, invert_affine
 from hybridvo.errors import InputError, OutputError
 from hybridvo.geometry import invert
+from hybridvo.synthetic.raycast import cast, motion, screen_bounds, shade
+from hybridvo.synthetic.scenes import compose_world
+from hybridvo.synthetic.world import World, invert_affine
 from hybridvo.types import Camera, Frame
-
-__all__ = [
-    "SCENE_KINDS",
-    "RenderedFrame",
-    "Scene",
-    "SyntheticSequence",
-    "make_scene",
-    "write_sintel",
-]
 
 
 @dataclass(frozen=True, eq=False)

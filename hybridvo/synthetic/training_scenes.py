@@ -3,7 +3,7 @@
 Streets, halls, hills, walls and tables with static things at all depths, some of them close enough
 to fill the picture; vehicles, walkers, chains, hinged panels, swarms, breathing and twisting
 bodies, alone or together, free or followed by the camera. The scenes of
-:mod:`hybridvo.data.scenes` are kept aside for measuring: no builder of theirs is used here.
+:mod:`hybridvo.synthetic.scenes` are kept aside for measuring: no builder of theirs is used here.
 """
 
 from __future__ import annotations
@@ -15,13 +15,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from hybridvo.data.raycasting import BOX, CYLINDER, ELLIPSOID
-from hybridvo.data.synthetic import Scene
-from hybridvo.data.world import Solid, World, moving_share
 from hybridvo.geometry import make_transform
+from hybridvo.synthetic.raycast import BOX, CYLINDER, ELLIPSOID
+from hybridvo.synthetic.render import Scene
+from hybridvo.synthetic.world import Solid, World, moving_share
 from hybridvo.types import Camera
-
-__all__ = ["judge_scene"]
 
 SHAPES = (BOX, ELLIPSOID, CYLINDER)
 

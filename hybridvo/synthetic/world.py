@@ -7,12 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hybridvo.data.raycasting import cast, motion, screen_bounds
 from hybridvo.errors import InputError
 from hybridvo.geometry import invert
+from hybridvo.synthetic.raycast import cast, motion, screen_bounds
 from hybridvo.types import Camera
-
-__all__ = ["Solid", "World", "dynamic_share", "invert_affine", "moving_share"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,7 +18,7 @@ class Solid:
     """One textured unit shape under an affine map.
 
     Args:
-        shape: BOX, ELLIPSOID or CYLINDER of :mod:`hybridvo.data.raycasting`.
+        shape: BOX, ELLIPSOID or CYLINDER of :mod:`hybridvo.synthetic.raycast`.
         A_world_body: (3, 4), or (N, 3, 4) for one that moves or deforms; metres. The columns are
             the half axes and the centre.
         object_id: 0 for static solids; solids of one mover share a positive number.

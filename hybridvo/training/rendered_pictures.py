@@ -14,9 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
-from hybridvo.data.workflow import Sample, rigid_flow
 from hybridvo.errors import FormatError, InputError
 from hybridvo.geometry import matrix_to_euler_deg
+from hybridvo.synthetic.paper import Sample, rigid_flow
 
 __all__ = ["MOVING", "STATIC", "UNKNOWN", "RenderedOptions", "picture_sample"]
 

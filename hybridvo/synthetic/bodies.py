@@ -8,11 +8,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hybridvo.data.raycasting import BOX, CYLINDER, ELLIPSOID
-from hybridvo.data.world import Solid
 from hybridvo.geometry import make_transform
-
-__all__ = ["Mover", "affine", "camera_path", "cloud", "cluster", "draw_look", "mover_path"]
+from hybridvo.synthetic.raycast import BOX, CYLINDER, ELLIPSOID
+from hybridvo.synthetic.world import Solid
 
 Parts = list[tuple[int, np.ndarray]]
 """Unit shapes with their (3, 4) or (N, 3, 4) maps into the object frame, metres."""

@@ -13,8 +13,6 @@ import numpy as np
 
 from hybridvo.errors import InputError
 
-__all__ = ["Silhouette", "outline", "random_silhouette", "silhouette_mask"]
-
 KINDS = ("superellipse", "polygon", "star", "bar")
 
 _SUBPIXEL_BITS = 4

@@ -16,7 +16,11 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from hybridvo.data.degradation import (
+from hybridvo.errors import InputError
+from hybridvo.geometry import euler_deg_to_matrix, make_transform
+from hybridvo.synthetic.layered import SKY_INVERSE_DEPTH, LayeredScene
+from hybridvo.synthetic.paper import Sample, rigid_flow
+from hybridvo.synthetic.sensors import (
     DegradationOptions,
     Range,
     degrade_depth,
@@ -25,13 +29,7 @@ from hybridvo.data.degradation import (
     sample_at,
     smooth_field,
 )
-from hybridvo.data.layered_scene import SKY_INVERSE_DEPTH, LayeredScene
-from hybridvo.data.silhouettes import Silhouette, outline, random_silhouette
-from hybridvo.data.workflow import Sample, rigid_flow
-from hybridvo.errors import InputError
-from hybridvo.geometry import euler_deg_to_matrix, make_transform
-
-__all__ = ["WideOptions", "wide_sample"]
+from hybridvo.synthetic.silhouettes import Silhouette, outline, random_silhouette
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,6 @@ import numpy as np
 
 from hybridvo.compilation import njit
 
-__all__ = ["BOX", "CYLINDER", "ELLIPSOID", "cast", "motion", "screen_bounds", "shade"]
-
 BOX = 0
 """Cube [-1, 1]^3; seen from inside it is a room."""
 ELLIPSOID = 1

@@ -20,11 +20,9 @@ from hybridvo.errors import InputError
 from hybridvo.geometry import ego_flow, make_transform, se3_exp
 from hybridvo.types import Camera, Frame, FramePair
 
-__all__ = ["CELLS", "DEGENERATE_CELLS", "MAIN_CELLS", "Cell", "make_model_pair", "make_pair"]
-
 
 @dataclass(frozen=True)
-class Cell:
+class Scenario:
     """One row of conditions.
 
     Args:
@@ -50,42 +48,42 @@ class Cell:
     scene: str = "structured"
 
 
-MAIN_CELLS: dict[str, Cell] = {
-    "moving00": Cell(moving=0.0),
-    "moving30": Cell(moving=0.3),
-    "moving50": Cell(moving=0.5),
-    "moving70": Cell(moving=0.7),
-    "exact_depth": Cell(depth_noise=0.0),
-    "noisy": Cell(flow_noise_px=1.0, depth_noise=0.05),
-    "low_noise": Cell(flow_noise_px=0.1, depth_noise=0.005),
-    "outliers20": Cell(outliers=0.2),
+MAIN_SCENARIOS: dict[str, Scenario] = {
+    "moving00": Scenario(moving=0.0),
+    "moving30": Scenario(moving=0.3),
+    "moving50": Scenario(moving=0.5),
+    "moving70": Scenario(moving=0.7),
+    "exact_depth": Scenario(depth_noise=0.0),
+    "noisy": Scenario(flow_noise_px=1.0, depth_noise=0.05),
+    "low_noise": Scenario(flow_noise_px=0.1, depth_noise=0.005),
+    "outliers20": Scenario(outliers=0.2),
 }
 """The eight main and noise cells over which methods are compared."""
 
-DEGENERATE_CELLS: dict[str, Cell] = {
-    "zero_motion": Cell(moving=0.0, rotation_deg=0.0, translation_m=0.0),
-    "pure_rotation": Cell(moving=0.0, translation_m=0.0),
-    "tiny_1cm": Cell(moving=0.0, translation_m=0.01, min_translation_m=0.01),
-    "plane": Cell(moving=0.0, scene="plane"),
-    "far": Cell(moving=0.0, scene="far"),
+DEGENERATE_SCENARIOS: dict[str, Scenario] = {
+    "zero_motion": Scenario(moving=0.0, rotation_deg=0.0, translation_m=0.0),
+    "pure_rotation": Scenario(moving=0.0, translation_m=0.0),
+    "tiny_1cm": Scenario(moving=0.0, translation_m=0.01, min_translation_m=0.01),
+    "plane": Scenario(moving=0.0, scene="plane"),
+    "far": Scenario(moving=0.0, scene="far"),
 }
 """Motions and scenes in which some direction of the motion is weak."""
 
-CELLS: dict[str, Cell] = {
-    **MAIN_CELLS,
-    **DEGENERATE_CELLS,
-    "one60": Cell(moving=0.6, objects=1),
+SCENARIOS: dict[str, Scenario] = {
+    **MAIN_SCENARIOS,
+    **DEGENERATE_SCENARIOS,
+    "one60": Scenario(moving=0.6, objects=1),
 }
 """Every cell by name."""
 
 
 def make_pair(
-    cell: str | Cell, seed: int, height: int = 436, width: int = 1024
+    cell: str | Scenario, seed: int, height: int = 436, width: int = 1024
 ) -> tuple[FramePair, dict[str, Any]]:
     """A pair of the cell and its truth.
 
     Args:
-        cell: name of a row of :data:`CELLS`, or conditions of one's own.
+        cell: name of a row of :data:`SCENARIOS`, or conditions of one's own.
         seed: development uses 0-999, published figures 1000 and up.
         height: image height in pixels.
         width: image width in pixels; the focal length scales with it (1120 px at 1024).
@@ -102,9 +100,9 @@ def make_pair(
     """
     name = "custom"
     if isinstance(cell, str):
-        if cell not in CELLS:
-            raise InputError(f"make_pair: unknown cell {cell!r}; known: {', '.join(CELLS)}.")
-        name, cell = cell, CELLS[cell]
+        if cell not in SCENARIOS:
+            raise InputError(f"make_pair: unknown cell {cell!r}; known: {', '.join(SCENARIOS)}.")
+        name, cell = cell, SCENARIOS[cell]
     if seed < 0 or min(height, width) < 16:
         raise InputError(
             f"make_pair: expected seed >= 0 and at least 16x16 pixels, "
@@ -224,7 +222,7 @@ def _direction(rng: np.random.Generator) -> np.ndarray:
     return axis / np.linalg.norm(axis)
 
 
-def _motion(rng: np.random.Generator, cell: Cell) -> np.ndarray:
+def _motion(rng: np.random.Generator, cell: Scenario) -> np.ndarray:
     angle = np.deg2rad(rng.uniform(0, cell.rotation_deg))
     length = rng.uniform(cell.min_translation_m, cell.translation_m)
     R = Rotation.from_rotvec(angle * _direction(rng)).as_matrix()
@@ -257,7 +255,7 @@ def _smooth(rng: np.random.Generator, height: int, width: int, size: int) -> np.
     return field * np.float32(1.27)  # cubic interpolation keeps 0.62 of the variance
 
 
-def _scene(rng: np.random.Generator, cell: Cell, height: int, width: int) -> np.ndarray:
+def _scene(rng: np.random.Generator, cell: Scenario, height: int, width: int) -> np.ndarray:
     """(H, W) float32 depth: layers of slanted planes with smooth bumps, 1-30 m."""
     x = np.linspace(-0.5, 0.5, width, dtype=np.float32)
     y = np.linspace(-0.5, 0.5, height, dtype=np.float32)[:, None]
@@ -287,7 +285,7 @@ def _scene(rng: np.random.Generator, cell: Cell, height: int, width: int) -> np.
     return np.clip(bumps / plane, 1.0, 30.0)
 
 
-def _objects(rng: np.random.Generator, cell: Cell, depth: np.ndarray) -> np.ndarray:
+def _objects(rng: np.random.Generator, cell: Scenario, depth: np.ndarray) -> np.ndarray:
     """(H, W) uint8 object label, 0 = static; writes the objects' own surfaces into ``depth``.
 
     The objects grow from their centres until together they cover the wanted share.
@@ -317,7 +315,7 @@ def _objects(rng: np.random.Generator, cell: Cell, depth: np.ndarray) -> np.ndar
     return label
 
 
-def _grow(rng: np.random.Generator, cell: Cell, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+def _grow(rng: np.random.Generator, cell: Scenario, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """uint8 labels on the grid of ``x`` (columns) and ``y`` (rows): ellipses at random centres."""
     aspect = float(x[-1] - x[0])
     distance = []
@@ -331,7 +329,7 @@ def _grow(rng: np.random.Generator, cell: Cell, x: np.ndarray, y: np.ndarray) ->
     return np.where(nearest < limit, stacked.argmin(axis=0) + 1, 0).astype(np.uint8)
 
 
-def _with_noise(rng: np.random.Generator, cell: Cell, depth: np.ndarray) -> np.ndarray:
+def _with_noise(rng: np.random.Generator, cell: Scenario, depth: np.ndarray) -> np.ndarray:
     if cell.depth_noise == 0:
         return np.ascontiguousarray(depth, dtype=np.float32)
     height, width = depth.shape

@@ -15,11 +15,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from hybridvo.data.silhouettes import silhouette_mask
 from hybridvo.errors import InputError
 from hybridvo.geometry import euler_deg_to_matrix, make_transform
-
-__all__ = ["MotionSamplers", "PaperOptions", "Sample", "TailSampler", "paper_sample", "rigid_flow"]
+from hybridvo.synthetic.silhouettes import silhouette_mask
 
 MAX_REJECTIONS = 10_000
 

@@ -11,13 +11,12 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from hybridvo.data.degradation import log_uniform, smooth_field
 from hybridvo.geometry import euler_deg_to_matrix
+from hybridvo.synthetic.sensors import log_uniform, smooth_field
 
 if TYPE_CHECKING:
-    from hybridvo.data.wide import WideOptions
+    from hybridvo.synthetic.diverse import WideOptions
 
-__all__ = ["SKY_INVERSE_DEPTH", "LayeredScene"]
 
 SKY_INVERSE_DEPTH = 1.0 / 2000.0
 """Surfaces farther than two kilometres are sky."""
