@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -12,13 +14,14 @@ from hybridvo.flow import (
     FlowField,
     as_provider,
     check_field,
+    contradiction,
     dis_flow,
     fallback,
     file_flow,
     forward_backward_check,
 )
 from hybridvo.synthetic.render import SyntheticSequence, make_scene
-from hybridvo.types import Camera, Frame
+from hybridvo.types import Camera, Frame, FramePair
 
 HEIGHT, WIDTH = 96, 128
 CAMERA = Camera(100, 100, 63.5, 47.5, HEIGHT, WIDTH)
@@ -204,3 +207,51 @@ def test_none_means_no_flow_and_fields_pass() -> None:
 def test_something_that_cannot_be_called() -> None:
     with pytest.raises(InputError, match="expected a callable, got ndarray"):
         as_provider(np.zeros(3))
+
+
+# -- a given flow against its images ------------------------------------------------------------
+
+
+def shifted_pair(texture: np.ndarray, change=lambda flow: flow, **more) -> FramePair:
+    """Images shifted by (-4, 0) px beside their true flow, or a wrong one made of it."""
+    prev, curr = frame(texture[:, 4:-4]), frame(np.ascontiguousarray(texture[:, 8:]), 1)
+    flow = np.broadcast_to(np.float32([-4.0, 0.0]), (HEIGHT, WIDTH, 2))
+    return FramePair(prev, curr, np.array(change(flow), np.float32), **more)
+
+
+WRONG = {
+    "negated": lambda flow: -flow,
+    "zero": lambda flow: 0 * flow,
+    "normalised": lambda flow: flow / [WIDTH, HEIGHT],
+    "(v, u)": lambda flow: flow[..., ::-1],
+}
+
+
+@pytest.mark.parametrize("kind", WRONG)
+def test_a_flow_that_the_images_contradict(kind: str, texture: np.ndarray) -> None:
+    message = contradiction(shifted_pair(texture, WRONG[kind]))
+    assert message is not None and "sign" in message and "unit" in message
+    # a flow that was computed from the images cannot be another pair's
+    assert contradiction(shifted_pair(texture, WRONG[kind], flow_source="dis")) is None
+
+
+def test_a_right_flow_passes_with_noise_holes_and_outliers(texture: np.ndarray) -> None:
+    rng = np.random.default_rng(0)
+    hidden = rng.random((HEIGHT, WIDTH, 1))
+    for change in (
+        lambda flow: flow,
+        lambda flow: flow + rng.normal(0, 1, flow.shape),
+        lambda flow: np.where(hidden < 0.4, np.nan, flow),
+        lambda flow: np.where(hidden < 0.3, 40.0, flow),
+    ):
+        assert contradiction(shifted_pair(texture, change)) is None
+
+
+def test_images_without_texture_contradict_nothing(texture: np.ndarray) -> None:
+    pair = shifted_pair(texture, WRONG["negated"])
+    black = np.zeros_like(pair.prev.rgb)
+    other = np.random.default_rng(9).integers(0, 255, black.shape, dtype=np.uint8)
+    for rgb in (black, other, pair.prev.rgb, None):
+        assert contradiction(replace(pair, curr=replace(pair.curr, rgb=rgb))) is None
+    tiny = Frame(np.zeros((3, 4, 3), np.uint8), None, Camera(4, 4, 1.5, 1.0, 3, 4))
+    assert contradiction(FramePair(tiny, tiny, np.zeros((3, 4, 2), np.float32))) is None
