@@ -19,7 +19,7 @@ import numpy as np
 from hybridvo.checks import as_number, as_rigid, as_seed
 from hybridvo.compilation import compile_once
 from hybridvo.errors import CheckpointError, InputError
-from hybridvo.flow_check import contradiction
+from hybridvo.flow import contradiction
 from hybridvo.hypotheses.cues import default_judge
 from hybridvo.hypotheses.selector import PictureJudge
 from hybridvo.learned import (

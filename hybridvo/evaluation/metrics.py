@@ -483,5 +483,5 @@ def evaluate_files(
     gt = read_trajectory(gt_path, format_gt, axes=axes_gt)
     report = evaluate(est, gt, **options)
     report["estimate"], report["gt"] = os.fsdecode(est_path), os.fsdecode(gt_path)
-    report["warnings"] = [*est.notices, *gt.notices]
+    report["warnings"] = [*est.warnings, *gt.warnings]
     return report

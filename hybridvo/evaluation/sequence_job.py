@@ -214,6 +214,8 @@ def _part(
     left_out: list[dict[str, Any]],
 ) -> dict[str, Any]:
     """What one job leaves, JSON-ready."""
+    order = [(method, flows[flow].label) for flow in job.flows for method in job.methods]
+    pairs.sort(key=lambda row: (row["index"], order.index((row["method"], row["flow_source"]))))
     table = pair_table(pairs)
     indices = list(next(iter(poses.values())))
     gt = _true_trajectory(sequence, indices)
