@@ -64,7 +64,7 @@ def diagnose(
         InputError: fewer than two frames, or ``pairs`` below 1.
 
     Example:
-        >>> from hybridvo.data.synthetic import SyntheticSequence, make_scene
+        >>> from hybridvo.synthetic.render import SyntheticSequence, make_scene
         >>> scene = make_scene("static", 0, height=48, width=64, frames=2)
         >>> diagnose(SyntheticSequence(scene))["findings"][0]["state"]
         'not_observable'

@@ -21,7 +21,7 @@ import numpy as np
 from hybridvo.baselines import pnp
 from hybridvo.checks import as_rigid, as_seed
 from hybridvo.errors import CheckpointError, InputError
-from hybridvo.flow_check import contradiction
+from hybridvo.flow import contradiction
 from hybridvo.geometry import ego_flow, se3_exp
 from hybridvo.hypotheses.generate import HypothesisSet, generate
 from hybridvo.hypotheses.selector import CueSelector, MaskSelector, Scorer, Selection, Selector

@@ -36,8 +36,8 @@ def measure_all(args: argparse.Namespace) -> list[dict[str, Any]]:
 
 def rendered(args: argparse.Namespace) -> Iterator[tuple[Any, Any, np.ndarray]]:
     """(previous frame, current frame, true motion) of rendered scenes."""
-    from hybridvo.data.synthetic import SyntheticSequence, make_scene
     from hybridvo.geometry import invert
+    from hybridvo.synthetic.render import SyntheticSequence, make_scene
 
     for kind in KINDS:
         for seed in range(args.seed, args.seed + args.scenes * (3 if kind == "pair" else 1)):

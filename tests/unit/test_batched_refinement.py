@@ -8,7 +8,7 @@ import pypose as pp
 import pytest
 import torch
 
-import hybridvo.data.benchmark_pairs as benchmark_pairs
+import hybridvo.synthetic.scenarios as benchmark_pairs
 from hybridvo.errors import InputError
 from hybridvo.geometry import pixel_grid, rotation_angle, se3_exp
 from hybridvo.pose.batched import BatchedPose, BatchOptions, refine_batch

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 
-from hybridvo.data.synthetic import SyntheticSequence, make_scene
 from hybridvo.errors import InputError
 from hybridvo.flow import dis_flow
 from hybridvo.geometry import ego_flow, invert, se3_exp, se3_log
@@ -24,6 +23,7 @@ from hybridvo.refinement.photometric_monitor import CHECK_EVERY, PhotometricMoni
 from hybridvo.refinement.photometric_problem import Problem, State, small_log
 from hybridvo.refinement.refine import refine
 from hybridvo.refinement.registration import OffsetCost, depth_offset_cost
+from hybridvo.synthetic.render import SyntheticSequence, make_scene
 from hybridvo.types import FramePair, RelativePose
 
 MEASURED = range(300, 306)
