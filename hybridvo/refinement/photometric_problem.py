@@ -18,7 +18,7 @@ from hybridvo.types import FramePair, RelativePose
 CUTOFF = 3.0
 """c of the Geman-McClure kernel, in standard deviations."""
 FREEDOM = 6.0
-"""Degrees of freedom of the Student prior around the flow's motion, whose covariance is estimated."""
+"""Degrees of freedom of the Student prior around the flow, whose covariance is an estimate."""
 NOISE_FLOOR = 0.1
 """Grey levels: rounding to 8 bits leaves 0.08 after the finest blur."""
 TILES = 110
