@@ -23,10 +23,10 @@ _HOME = {
     "HybridVOError": "hybridvo.errors",
     "Odometry": "hybridvo.odometry",
     "Trajectory": "hybridvo.trajectory",
-    "estimate": "hybridvo.hybrid",
+    "estimate": "hybridvo.pipeline",
     "open_sequence": "hybridvo.data.sequence",
     "iter_pairs": "hybridvo.data.sequence",
-    "refine": "hybridvo.pose.refinement",
+    "refine": "hybridvo.refinement.refine",
     "select": "hybridvo.pose.selection",
 }
 

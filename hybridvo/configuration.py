@@ -15,10 +15,10 @@ from hybridvo.data.plain_yaml import plain_yaml
 from hybridvo.data.presets import build_options, read_yaml
 from hybridvo.errors import FormatError, InputError
 from hybridvo.flow import DIS_PRESETS
-from hybridvo.hybrid import DEFAULT_METHOD, check_polish
 from hybridvo.odometry import POLICIES
-from hybridvo.pose.photometric import PhotometricOptions
-from hybridvo.pose.refinement import RefinementOptions
+from hybridvo.pipeline import DEFAULT_METHOD, check_polish
+from hybridvo.refinement.photometric import PhotometricOptions
+from hybridvo.refinement.refine import RefinementOptions
 from hybridvo.tracking.window import WindowOptions, check_window
 
 __all__ = ["DisOptions", "RunOptions", "load_options"]
@@ -50,7 +50,7 @@ class RunOptions:
     """Options of ``hybridvo run``; the command line's own options win over a file's.
 
     Args:
-        method: see :data:`hybridvo.hybrid.METHODS`.
+        method: see :data:`hybridvo.pipeline.METHODS`.
         flow: ``file``, ``dis``, or ``auto``: files where the sequence has them, else DIS.
         polish: sharpen the flow's motion by the pictures: ``auto``, ``on`` or ``off``.
         window: most key frames that frames are registered to, 1 for none; None for the default of

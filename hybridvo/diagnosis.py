@@ -18,10 +18,10 @@ from hybridvo.diagnosis_findings import Evidence, findings
 from hybridvo.errors import FormatError, InputError
 from hybridvo.flow import FlowProvider, dis_flow
 from hybridvo.geometry import invert
-from hybridvo.pose.photometric import PolishReport, polish_photometric
-from hybridvo.pose.refinement import refine
-from hybridvo.pose.registration import depth_costs
-from hybridvo.pose.self_calibration import calibration_equations
+from hybridvo.refinement.photometric import PolishReport, polish_photometric
+from hybridvo.refinement.refine import refine
+from hybridvo.refinement.registration import depth_costs
+from hybridvo.refinement.self_calibration import calibration_equations
 from hybridvo.types import Frame, FramePair, RelativePose
 
 __all__ = ["diagnose", "diagnosis_text"]
@@ -64,7 +64,7 @@ def diagnose(
         InputError: fewer than two frames, or ``pairs`` below 1.
 
     Example:
-        >>> from hybridvo.data.synthetic import SyntheticSequence, make_scene
+        >>> from hybridvo.synthetic.render import SyntheticSequence, make_scene
         >>> scene = make_scene("static", 0, height=48, width=64, frames=2)
         >>> diagnose(SyntheticSequence(scene))["findings"][0]["state"]
         'not_observable'

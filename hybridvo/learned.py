@@ -16,10 +16,10 @@ from hybridvo.types import FramePair, Reason, RelativePose, Status
 if TYPE_CHECKING:
     import torch
 
+    from hybridvo.hypotheses.selector import Proposal
     from hybridvo.network.inputs import NetworkInputs
     from hybridvo.network.losses import NetworkOutput
     from hybridvo.network.passes import Chooser
-    from hybridvo.pose.second_look import Proposal
 
 __all__ = [
     "LEARNED",
@@ -179,9 +179,9 @@ def propose_motion(network: torch.nn.Module, pair: FramePair) -> Proposal | None
         The motion that the trusted pixels agree on, after the last pass; None where too little is
         valid, or the answer is not finite.
     """
+    from hybridvo.hypotheses.selector import Proposal
     from hybridvo.network.inputs import assemble_inputs
     from hybridvo.network.passes import predict
-    from hybridvo.pose.second_look import Proposal
 
     with plain_torch():
         inputs = assemble_inputs(pair)

@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from hybridvo.hypotheses.selector import Expected, Motions, Opinion, Proposal
 from hybridvo.learned import plain_torch, propose_motion
-from hybridvo.pose.second_look import Expected, Motions, Opinion, Proposal
 from hybridvo.types import FramePair
 
 if TYPE_CHECKING:
     import torch
 
+    from hybridvo.hypotheses.generate import Grid
     from hybridvo.network.judge import JudgeFeatures, JudgeInputs, JudgeNetwork
-    from hybridvo.pose.coarse import Grid
 
 __all__ = ["LearnedJudge", "judge_inputs"]
 
@@ -24,7 +24,7 @@ OUT_OF_THE_RACE = 3.0
 
 
 class LearnedJudge:
-    """A judge network as :func:`hybridvo.pose.refinement.refine` takes it.
+    """A judge network as :func:`hybridvo.refinement.refine.refine` takes it.
 
     Keeps nothing between pairs: one judge may serve several threads.
 

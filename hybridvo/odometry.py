@@ -12,7 +12,7 @@ from hybridvo.checks import as_number, as_rigid, as_seed
 from hybridvo.errors import InputError
 from hybridvo.flow import FlowField, FlowProvider, check_field, dis_flow
 from hybridvo.geometry import invert, se3_exp, se3_log
-from hybridvo.hybrid import (
+from hybridvo.pipeline import (
     DEFAULT_METHOD,
     JUDGED,
     LearnedJudge,
@@ -22,9 +22,9 @@ from hybridvo.hybrid import (
     shipped_judge,
     warm_up,
 )
-from hybridvo.pose.photometric import PhotometricOptions, polish_photometric
-from hybridvo.pose.photometric_monitor import PhotometricMonitor
-from hybridvo.pose.refinement import RefinementOptions
+from hybridvo.refinement.photometric import PhotometricOptions, polish_photometric
+from hybridvo.refinement.photometric_monitor import PhotometricMonitor
+from hybridvo.refinement.refine import RefinementOptions
 from hybridvo.tracking.anchor import Anchor
 from hybridvo.tracking.key_frame import KeyFrame
 from hybridvo.tracking.motion_history import Prediction
@@ -66,12 +66,12 @@ class Odometry:
 
     Args:
         network: ``default`` for the shipped weights, None for the classical refinement alone, or a
-            :class:`hybridvo.hybrid.LearnedJudge` of one's own.
+            :class:`hybridvo.pipeline.LearnedJudge` of one's own.
         flow: provider ``(prev, curr) -> FlowField or (H, W, 2) array``; default: OpenCV DIS with a
             forward-backward check. Functions of two images go through
             :func:`hybridvo.flow.as_provider`. After :meth:`skip` the two are no neighbours.
-        method: see :data:`hybridvo.hybrid.METHODS`; by default ``hybrid``, or ``refine`` without a
-            network.
+        method: see :data:`hybridvo.pipeline.METHODS`; by default ``hybrid``, or ``refine`` without
+            a network.
         history: let the predicted motion take part (:meth:`predict`): as one start among others,
             and as a cue for which motion is the world. It cannot hold the tracker: every start
             competes by how well the pixels follow it.
@@ -87,7 +87,7 @@ class Odometry:
         options: of the refinement.
         photometric: options of the polish.
         seed: of everything drawn at random.
-        prepare: compile now rather than at the first pair (see :func:`hybridvo.hybrid.warm_up`).
+        prepare: compile now rather than at the first pair (see :func:`hybridvo.pipeline.warm_up`).
 
     Raises:
         InputError: an unknown method or policy, a network that is none or that the method lacks, a

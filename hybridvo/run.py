@@ -31,8 +31,8 @@ from hybridvo.evaluation.metrics import pair_errors
 from hybridvo.evaluation.report import write_json
 from hybridvo.flow import FlowField, FlowProvider, dis_flow, fallback, file_flow
 from hybridvo.geometry import invert
-from hybridvo.hybrid import JUDGED, check_method, compile_kernels, weights_hash
 from hybridvo.odometry import Odometry
+from hybridvo.pipeline import JUDGED, check_method, compile_kernels, weights_hash
 from hybridvo.recording import Recording, check_recording
 from hybridvo.run_folder import PARTIAL, RESULTS, Mode, RunFolder
 from hybridvo.run_results import (

@@ -352,7 +352,8 @@ class RelativePose:
         hypotheses: every strong motion found, the chosen one first.
         method: name of the estimator. ms: time spent, milliseconds.
         terms: what carried the motion: ``flow``, ``depth`` (of the current frame), ``images``.
-        polish: :class:`hybridvo.pose.photometric.PolishReport` where images were asked, or None.
+        polish: :class:`hybridvo.refinement.photometric.PolishReport` where images were asked,
+            or None.
     """
 
     T_curr_prev: np.ndarray = field(default_factory=lambda: np.eye(4))

@@ -69,7 +69,7 @@ def visualize(options: PictureOptions, command: list[str]) -> list[Path]:
     from hybridvo.evaluation.plots_maps import maps_png
     from hybridvo.evaluation.report import write_json
     from hybridvo.files import atomic_write
-    from hybridvo.hybrid import DEFAULT_METHOD, estimate
+    from hybridvo.pipeline import DEFAULT_METHOD, estimate
 
     if options.steps < 1:
         raise InputError(f"--steps: expected at least 1, got {options.steps}.")

@@ -18,7 +18,8 @@ MAX_LINES = 500
 """A file is one noun; the aim is 400 lines."""
 
 NOUNS = {"checks", "errors", "types"}
-CLASSICAL = NOUNS | {"geometry", "pose"}
+ESTIMATORS = {"pose", "refinement", "hypotheses", "baselines"}
+CLASSICAL = NOUNS | {"geometry"} | ESTIMATORS
 IMPORTS: dict[str, set[str]] = {
     # the house itself: data walks from left to right
     "errors": set(),
@@ -31,16 +32,16 @@ IMPORTS: dict[str, set[str]] = {
     "data": NOUNS | {"geometry", "compilation"},
     "flow": NOUNS | {"geometry"},
     "network": NOUNS | {"geometry"},
-    "pose": NOUNS | {"geometry", "compilation", "quiet_import"},
+    **{room: CLASSICAL | {"compilation", "quiet_import"} for room in sorted(ESTIMATORS)},
     "trajectory": NOUNS | {"geometry", "files"},
     "learned": CLASSICAL | {"network"},
     "flow_check": NOUNS,
     "learned_judge": CLASSICAL | {"network", "learned"},
-    "hybrid": CLASSICAL | {"network", "learned", "learned_judge", "compilation", "flow_check"},
+    "pipeline": CLASSICAL | {"network", "learned", "learned_judge", "compilation", "flow_check"},
     "tracking": CLASSICAL,
-    "odometry": CLASSICAL | {"flow", "hybrid", "tracking", "trajectory"},
+    "odometry": CLASSICAL | {"flow", "pipeline", "tracking", "trajectory"},
     "evaluation": NOUNS | {"geometry", "trajectory"},
-    "training": CLASSICAL | {"data", "flow", "network", "learned", "hybrid"},
+    "training": CLASSICAL | {"data", "flow", "network", "learned", "pipeline"},
     # one run of `hybridvo run`: what it writes, how it is set, and the loop around the tracker
     "console": {"errors"},
     "run_folder": {"checks", "errors", "evaluation"},
@@ -48,26 +49,26 @@ IMPORTS: dict[str, set[str]] = {
     "depth_steps": NOUNS,
     "run_results": NOUNS | {"geometry", "data", "trajectory", "evaluation", "depth_steps"},
     "run_report": {"errors", "evaluation"},
-    "configuration": CLASSICAL | {"data", "flow", "hybrid", "odometry", "tracking"},
+    "configuration": CLASSICAL | {"data", "flow", "pipeline", "odometry", "tracking"},
     "run": {
-        *("__init__", "errors", "types", "geometry", "data", "flow", "hybrid", "odometry"),
+        *("__init__", "errors", "types", "geometry", "data", "flow", "pipeline", "odometry"),
         *("trajectory", "evaluation", "configuration", "console", "run_folder", "run_results"),
         *("recording", "compilation", "tracking", "depth_steps"),
     },
     # what tools/compare_methods.py runs, on this machine and on others
     "comparison": {
-        *("__init__", "errors", "types", "geometry", "data", "flow", "hybrid", "trajectory"),
+        *("__init__", "errors", "types", "geometry", "data", "flow", "pipeline", "trajectory"),
         *("evaluation", "configuration", "console", "run_folder", "run_results", "run", "checks"),
-        *("learned_judge", "pose"),
+        *("learned_judge", *ESTIMATORS),
     },
     # figures of one pair: tools/visualize.py, and the report of a comparison
     "visualization": {
-        *("checks", "errors", "types", "geometry", "data", "network", "pose", "learned"),
-        *("hybrid", "trajectory", "evaluation", "configuration", "run"),
+        *("checks", "errors", "types", "geometry", "data", "network", *ESTIMATORS, "learned"),
+        *("pipeline", "trajectory", "evaluation", "configuration", "run"),
     },
     # what stands at the door
     "demo": {"checks", "errors", "data", "evaluation", "configuration", "run"},
-    "doctor": {"__init__", "compilation", "errors", "hybrid"},
+    "doctor": {"__init__", "compilation", "errors", "pipeline"},
     "diagnosis_findings": CLASSICAL | {"depth_steps"},
     "diagnosis": CLASSICAL | {"flow", "diagnosis_findings", "depth_steps"},
     "__init__": set(),

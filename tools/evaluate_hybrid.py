@@ -90,7 +90,7 @@ def measure(args: argparse.Namespace) -> dict[str, Any]:
     from hybridvo.comparison.hybrid_summary import summarise
     from hybridvo.errors import InputError
     from hybridvo.evaluation.report import write_csv
-    from hybridvo.pose.confidence import RECALIBRATION
+    from hybridvo.hypotheses.confidence import RECALIBRATION
     from hybridvo.training.provenance import source_commit
 
     def progress(line: str) -> None:

@@ -90,7 +90,7 @@ def measure_on(
     from hybridvo.data.sequence import iter_pairs
     from hybridvo.evaluation.metrics import pair_errors
     from hybridvo.geometry import invert, rotation_angle
-    from hybridvo.hybrid import estimate, warm_up
+    from hybridvo.pipeline import estimate, warm_up
 
     warm_up()
     pairs: dict[str, list[dict[str, Any]]] = {method: [] for method in METHODS}

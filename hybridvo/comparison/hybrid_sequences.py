@@ -15,17 +15,18 @@ from typing import Any
 import numpy as np
 
 from hybridvo import Odometry
-from hybridvo.data.benchmark_pairs import CELLS, make_pair
-from hybridvo.data.synthetic import SCENE_KINDS, SyntheticSequence, make_scene
 from hybridvo.errors import InputError
 from hybridvo.evaluation.calibration import normalised_error
 from hybridvo.evaluation.metrics import ate
 from hybridvo.evaluation.pairs import dynamic_fraction, pair_errors
 from hybridvo.flow import FlowField, dis_flow
 from hybridvo.geometry import invert
-from hybridvo.hybrid import JUDGED, check_method, estimate, shipped_judge
+from hybridvo.hypotheses.confidence import REFERENCE_WIDTH
 from hybridvo.learned_judge import LearnedJudge
-from hybridvo.pose.confidence import REFERENCE_WIDTH
+from hybridvo.pipeline import JUDGED, check_method, estimate, shipped_judge
+from hybridvo.synthetic.render import SyntheticSequence, make_scene
+from hybridvo.synthetic.scenarios import SCENARIOS, make_pair
+from hybridvo.synthetic.scenes import SCENE_KINDS
 from hybridvo.trajectory import Trajectory
 from hybridvo.types import FramePair, RelativePose
 
@@ -44,7 +45,7 @@ __all__ = [
 ]
 
 HEAVY_KINDS = ("heavy_rigid", "heavy_deforming", "heavy_two", "heavy_ten")
-"""Families of :mod:`hybridvo.data.scenes`; the judge is trained on other builders."""
+"""Families of :mod:`hybridvo.synthetic.scenes`; the judge is trained on other builders."""
 FLOWS = ("true", "true+noise", "dis")
 FAILURE_PX = 1.0
 """Mean error of the ego flow, px of the picture, from which a motion is wrong."""
@@ -105,7 +106,7 @@ class RecordedJudge(LearnedJudge):
         self.probability: float | None = None
 
     def look_again(self, *args: Any, **options: Any) -> Any:
-        """See :class:`hybridvo.hybrid.LearnedJudge`."""
+        """See :class:`hybridvo.pipeline.LearnedJudge`."""
         opinion = super().look_again(*args, **options)
         self.probability = opinion.trust
         return opinion
@@ -183,7 +184,7 @@ def run_sequence(kind: str, seed: int, options: SequenceOptions) -> Measured:
     """Every method on the true and on the DIS flow of one sequence.
 
     Args:
-        kind: family of :data:`hybridvo.data.synthetic.SCENE_KINDS`.
+        kind: family of :data:`hybridvo.synthetic.render.SCENE_KINDS`.
         seed: of the sequence.
         options: of the rendering; its kinds and seeds are not looked at.
 
@@ -291,7 +292,7 @@ def _trajectory_error(path: list[np.ndarray], sequence: SyntheticSequence) -> di
 def run_cells(
     pairs: int,
     seed0: int,
-    cells: tuple[str, ...] = tuple(CELLS),
+    cells: tuple[str, ...] = tuple(SCENARIOS),
     size: tuple[int, int] = (436, 1024),
 ) -> list[dict[str, Any]]:
     """The hybrid and the refinement on the solver's cells: known noise, no pictures.
@@ -299,7 +300,7 @@ def run_cells(
     Args:
         pairs: of each cell.
         seed0: first seed.
-        cells: of :data:`hybridvo.data.benchmark_pairs.CELLS`.
+        cells: of :data:`hybridvo.synthetic.scenarios.SCENARIOS`.
         size: height and width, px.
 
     Raises:

@@ -16,8 +16,8 @@ from hybridvo.evaluation.calibration import (
     recalibrated,
     reliability,
 )
-from hybridvo.hybrid import JUDGED
-from hybridvo.pose.confidence import LEAST_NOISE_PX, MAX_SHARE
+from hybridvo.hypotheses.confidence import LEAST_NOISE_PX, MAX_SHARE
+from hybridvo.pipeline import JUDGED
 
 __all__ = ["THRESHOLDS", "goals", "summarise"]
 

@@ -24,7 +24,7 @@ from hybridvo.evaluation.pairs import pair_errors, pair_facts
 from hybridvo.evaluation.protocols import same_intrinsics
 from hybridvo.flow import FlowField, FlowProvider
 from hybridvo.geometry import invert
-from hybridvo.hybrid import check_method, estimate, warm_up
+from hybridvo.pipeline import check_method, estimate, warm_up
 from hybridvo.run import flow_provider
 from hybridvo.types import Frame, FramePair
 

@@ -12,7 +12,7 @@ from hybridvo.data.sequence import READERS
 from hybridvo.data.sintel import SintelSequence
 from hybridvo.errors import InputError
 from hybridvo.evaluation.report_data import visible
-from hybridvo.hybrid import METHODS, check_method
+from hybridvo.pipeline import METHODS, check_method
 
 __all__ = ["chosen_methods", "expand", "shown_name", "unique_names", "weights_of"]
 

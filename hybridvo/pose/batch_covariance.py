@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import torch
 
-from hybridvo.pose.covariance import CLUSTERED, FEW_TILES, SIZES, SMALLEST_REST, long_range
 from hybridvo.pose.pixels import Pixels
 from hybridvo.pose.residuals import NormalEquations
+from hybridvo.refinement.covariance import CLUSTERED, FEW_TILES, SIZES, SMALLEST_REST, long_range
 
 __all__ = ["sandwich_covariance"]
 
@@ -22,7 +22,8 @@ def sandwich_covariance(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Sandwich covariance (B, 6, 6), and whether the information is definite (B,).
 
-    As in the numpy refinement (:mod:`hybridvo.pose.covariance`): the Gauss-Newton Hessian less the
+    As in the numpy refinement (:mod:`hybridvo.refinement.covariance`): the Gauss-Newton Hessian
+    less the
     curvature of the robust weights about the outer products of scores summed over overlapping
     blocks of tiles. What independent errors would give is summed over every pixel here, and stands
     for the information of the tiles as well. In float64 but for the scores.

@@ -118,7 +118,8 @@ def estimate_noise(
     """(B, 2) flow noise in px and noise of log depth of the pixels that follow (B, 4, 4) poses.
 
     Expectation-maximisation of a mixture of N(0, sf^2 v_f I + sd^2 v_d q q^T) and a uniform density
-    over a disc, as in :func:`hybridvo.pose.solver.estimate_noise`, in float64. ``noise`` (B, 2) is
+    over a disc, as in :func:`hybridvo.refinement.solver.estimate_noise`, in float64. ``noise`` (B,
+    2) is
     where it starts, and what it returns for samples with fewer than eight pixels near the pose.
     """
     terms = residual_terms(sparse, T.to(sparse.depth.dtype))

@@ -1,6 +1,6 @@
 """The refinement of a batch of pairs in torch: CPU or GPU, float32 or float64, differentiable.
 
-The torch twin of :mod:`hybridvo.pose.refinement` with the residual of
+The torch twin of :mod:`hybridvo.refinement.refine` with the residual of
 :mod:`hybridvo.pose.residuals`. Every start is refined side by side on a sparse set of pixels under
 a kernel whose scale is graduated; the start of least cost at one common scale is fitted on the
 whole grid. Samples never see each other: damping, acceptance, convergence and failure are per

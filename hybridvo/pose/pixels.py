@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from kornia.geometry.depth import unproject_meshgrid
 
-from hybridvo.pose import kernels
+from hybridvo.refinement import kernels
 from hybridvo.types import PairBatch
 
 __all__ = ["Pixels", "gather_pixels", "sample_depth", "sparse_subset"]

@@ -1,7 +1,7 @@
 """Ego-flow reprojection residuals of a batch of pairs in torch: the twin of the numba kernels.
 
 Per pixel, with X' = T X, a = X'/Z', b = Y'/Z', i = 1/Z' (the definition of
-:mod:`hybridvo.pose.kernels`; a test holds the Gauss-Newton steps of both equal):
+:mod:`hybridvo.refinement.kernels`; a test holds the Gauss-Newton steps of both equal):
 
 - residual r = (x + F) - pi(X') in px, predicted by the pose (paper, equations 6 and 8);
 - Jacobian of the prediction with respect to the left perturbation (translation, rotation):

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from hybridvo.geometry import invert, pose_matrix, se3_exp, se3_log
-from hybridvo.pose.photometric_problem import small_log
+from hybridvo.refinement.photometric_problem import small_log
 from hybridvo.types import Status
 
 __all__ = ["CHI2_LIMIT", "Edge", "Solution", "adjoint", "chi2", "compose_covariance", "solve_graph"]

@@ -11,14 +11,15 @@ from typing import Any
 import numpy as np
 import torch
 
-from hybridvo.data.degradation import log_uniform
 from hybridvo.errors import FormatError
 from hybridvo.geometry import pose_matrix, se3_exp
+from hybridvo.hypotheses import search
+from hybridvo.hypotheses.generate import fit_in_mask
+from hybridvo.hypotheses.selector import PROPOSED, mask_weights, nearest_motion
 from hybridvo.network.judge import JudgeInputs, JudgeOutput, expected_information
-from hybridvo.pose import kernels, search
-from hybridvo.pose.coarse import fit_in_mask
-from hybridvo.pose.options import RefinementOptions
-from hybridvo.pose.second_look import PROPOSED, mask_weights, nearest_motion
+from hybridvo.refinement import kernels
+from hybridvo.refinement.options import RefinementOptions
+from hybridvo.synthetic.sensors import log_uniform
 from hybridvo.training.judge_proposals import read_proposals
 
 __all__ = ["PictureBatch", "ego_flow_error", "read_batches", "refits_of"]

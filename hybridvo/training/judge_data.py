@@ -15,15 +15,15 @@ from typing import Any
 
 import numpy as np
 
-from hybridvo.data.degradation import DegradationOptions, degrade_depth, log_uniform
-from hybridvo.data.rendered_pictures import MOVING, STATIC, UNKNOWN
-from hybridvo.data.wide import WideOptions, wide_sample
 from hybridvo.flow import dis_flow
 from hybridvo.geometry import invert, se3_exp
-from hybridvo.pose import kernels
-from hybridvo.pose.coarse import CoarseSearch, search_motions
-from hybridvo.pose.options import RefinementOptions
-from hybridvo.training.judge_scenes import judge_scene
+from hybridvo.hypotheses.generate import CoarseSearch, search_motions
+from hybridvo.refinement import kernels
+from hybridvo.refinement.options import RefinementOptions
+from hybridvo.synthetic.diverse import WideOptions, wide_sample
+from hybridvo.synthetic.sensors import DegradationOptions, degrade_depth, log_uniform
+from hybridvo.synthetic.training_scenes import judge_scene
+from hybridvo.training.rendered_pictures import MOVING, STATIC, UNKNOWN
 from hybridvo.types import Camera, Frame, FramePair, RelativePose
 
 __all__ = ["PER_SHARD", "draw_pictures", "write_shard"]

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from hybridvo.data.rendered_pictures import MOVING, STATIC
+from hybridvo.hypotheses.generate import fit_in_mask
 from hybridvo.network.judge import JudgeNetwork
-from hybridvo.pose.coarse import fit_in_mask
-from hybridvo.pose.options import RefinementOptions
+from hybridvo.refinement.options import RefinementOptions
 from hybridvo.training.judge_batches import ego_flow_error, read_batches, refits_of
 from hybridvo.training.judge_loop import RIGHT_PX
+from hybridvo.training.rendered_pictures import MOVING, STATIC
 
 __all__ = ["evaluate_judge"]
 

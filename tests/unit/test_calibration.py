@@ -18,7 +18,7 @@ from hybridvo.evaluation.calibration import (
 )
 from hybridvo.evaluation.plots_calibration import plot_calibration
 from hybridvo.geometry import se3_exp
-from hybridvo.pose.confidence import RECALIBRATION, probability_right
+from hybridvo.hypotheses.confidence import RECALIBRATION, probability_right
 
 
 def test_three_sigma_is_scipys():

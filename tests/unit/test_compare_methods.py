@@ -21,9 +21,9 @@ from hybridvo.comparison.plan import expand, unique_names, weights_of
 from hybridvo.comparison.results import PAIR_COLUMNS
 from hybridvo.comparison.runner import ComparisonOptions, WorkerError, compare
 from hybridvo.data.sequence import open_sequence
-from hybridvo.data.synthetic import make_scene, write_sintel
 from hybridvo.errors import InputError, LockedError
-from hybridvo.hybrid import METHODS
+from hybridvo.pipeline import METHODS
+from hybridvo.synthetic.render import make_scene, write_sintel
 from hybridvo.types import RelativePose
 from tests.scripts import load_script
 
@@ -366,7 +366,7 @@ def test_a_method_that_fails_is_counted_and_takes_part(
 def test_methods_without_flow_are_run_once_a_pair(sequence: str) -> None:
     """And may be: flow or none, their result is the same."""
     from hybridvo.data.sequence import iter_pairs
-    from hybridvo.hybrid import check_method, estimate
+    from hybridvo.pipeline import check_method, estimate
 
     pair = next(iter_pairs(open_sequence(sequence)))
     assert set(METHODS) >= READS_NO_FLOW

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import torch
 
-from hybridvo.data.benchmark_pairs import make_pair
-from hybridvo.pose import batch_covariance, full_fit, kernels, solver
-from hybridvo.pose.covariance import (
+from hybridvo.pose import batch_covariance
+from hybridvo.refinement import full_fit, kernels, solver
+from hybridvo.refinement.covariance import (
     LONG_GROWTH,
     ORDER,
     SIZES,
@@ -22,8 +22,9 @@ from hybridvo.pose.covariance import (
     long_range,
     sandwich_covariance,
 )
-from hybridvo.pose.picture import Picture
-from hybridvo.pose.refinement import refine
+from hybridvo.refinement.pixels import Picture
+from hybridvo.refinement.refine import refine
+from hybridvo.synthetic.scenarios import make_pair
 from hybridvo.types import FramePair, Reason, State
 
 TOOLS = str(Path(__file__).parents[2] / "tools")

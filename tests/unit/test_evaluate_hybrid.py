@@ -19,9 +19,9 @@ from hybridvo.comparison.hybrid_sequences import (
     run_sequence,
 )
 from hybridvo.comparison.hybrid_summary import summarise
-from hybridvo.data.benchmark_pairs import make_pair
 from hybridvo.errors import FormatError, InputError
-from hybridvo.hybrid import estimate, shipped_judge
+from hybridvo.pipeline import estimate, shipped_judge
+from hybridvo.synthetic.scenarios import make_pair
 from tests.scripts import load_script
 
 ROOT = Path(__file__).resolve().parents[2]

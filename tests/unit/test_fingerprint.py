@@ -12,8 +12,7 @@ import pytest
 from hybridvo.cli import main
 from hybridvo.data import fingerprint
 from hybridvo.data.fingerprint import PART_BYTES, PARTS, input_hash, input_times
-
-TOOLS = Path(__file__).parents[2] / "tools"
+from tests.walks import REFINE, command, write_walk
 
 
 def files_of(folder: Path) -> SimpleNamespace:
@@ -95,9 +94,6 @@ def test_files_that_cannot_be_read_are_a_content_too(folder: Path) -> None:
 def test_a_resume_sees_a_change_in_the_middle_of_a_frame(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, large: bool
 ) -> None:
-    monkeypatch.syspath_prepend(TOOLS)
-    from stress_parts import REFINE, command, write_walk
-
     if large:
         monkeypatch.setattr(fingerprint, "WHOLE_BYTES", 1000)
         monkeypatch.setattr(fingerprint, "PARTS", 2)

@@ -10,20 +10,20 @@ import numpy as np
 import pytest
 import torch
 
-from hybridvo.data.synthetic import SyntheticSequence, make_scene
 from hybridvo.errors import InputError
 from hybridvo.flow import dis_flow
 from hybridvo.geometry import ego_flow, invert, se3_exp, se3_log
-from hybridvo.hybrid import estimate
 from hybridvo.odometry import Odometry
-from hybridvo.pose import photometric_batch as batch
-from hybridvo.pose import photometric_kernels as kernels
-from hybridvo.pose.photometric import PhotometricOptions, polish_photometric
-from hybridvo.pose.photometric_images import Level, blurred, grey_image, match_blur
-from hybridvo.pose.photometric_monitor import CHECK_EVERY, PhotometricMonitor
-from hybridvo.pose.photometric_problem import Problem, State, small_log
-from hybridvo.pose.refinement import refine
-from hybridvo.pose.registration import OffsetCost, depth_offset_cost
+from hybridvo.pipeline import estimate
+from hybridvo.refinement import photometric_batch as batch
+from hybridvo.refinement import photometric_kernels as kernels
+from hybridvo.refinement.photometric import PhotometricOptions, polish_photometric
+from hybridvo.refinement.photometric_images import Level, blurred, grey_image, match_blur
+from hybridvo.refinement.photometric_monitor import CHECK_EVERY, PhotometricMonitor
+from hybridvo.refinement.photometric_problem import Problem, State, small_log
+from hybridvo.refinement.refine import refine
+from hybridvo.refinement.registration import OffsetCost, depth_offset_cost
+from hybridvo.synthetic.render import SyntheticSequence, make_scene
 from hybridvo.types import FramePair, RelativePose
 
 MEASURED = range(300, 306)

@@ -10,9 +10,7 @@ import torch
 
 from hybridvo.errors import InputError
 from hybridvo.geometry import ego_flow, pixel_grid, se3_exp
-from hybridvo.pose import kernels, solver
 from hybridvo.pose.batch_solver import estimate_noise, gauss_newton_step
-from hybridvo.pose.picture import typical
 from hybridvo.pose.pixels import gather_pixels, sample_depth, sparse_subset
 from hybridvo.pose.residuals import (
     CUTOFFS,
@@ -28,6 +26,8 @@ from hybridvo.pose.residuals import (
     robust_weight,
     score_sum,
 )
+from hybridvo.refinement import kernels, solver
+from hybridvo.refinement.pixels import typical
 from hybridvo.types import Camera, PairBatch
 
 F64 = torch.float64
