@@ -122,6 +122,7 @@ def read_pair(path: Path, flow: str) -> tuple[Any, np.ndarray, np.ndarray, np.nd
 def heavy(kind: str) -> Cases:
     """Development scenes in which most of the image moves: true and DIS flow, true depth."""
     from hybridvo.data.synthetic import SyntheticSequence, make_scene
+
     from hybridvo.flow import dis_flow
 
     height, width = SIZE

@@ -128,9 +128,8 @@ def timed(work: Callable[[], Any]) -> tuple[Any, float]:
 
 def able(methods: Iterable[str]) -> tuple[list[str], dict[str, str]]:
     """The methods that can run here, and the reason for each other one."""
-    from hybridvo.pipeline import check_method
-
     from hybridvo.errors import InputError
+    from hybridvo.pipeline import check_method
 
     found, missing = [], {}
     for method in methods:
