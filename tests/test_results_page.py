@@ -12,7 +12,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from hybridvo.evaluation.protocols import PROTOCOLS, protocol_summary
+from hybridvo.evaluation.protocols import protocol_summary, protocols
 from tests.scripts import load_script
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -41,7 +41,7 @@ from hybridvo.evaluation.sequence_job import (
 )
 from hybridvo.evaluation.sources import expand, methods_to_run
 from hybridvo.files import write_csv, write_json
-from hybridvo.pipeline import weights_hash
+from hybridvo.pipeline import Models, weights_hash
 from hybridvo.trajectory import Trajectory, write_tum
 
 WRITTEN = ("results.json", "results.csv", "pairs.csv", "report.md", "report.html")
@@ -81,7 +81,7 @@ def compare(
 
     out, report = Path(out), progress or (lambda message, done, total: None)
     started = _now()
-    methods, missing = methods_to_run(options.methods)
+    methods, missing = methods_to_run(options.methods, Models(options.device, options.weights))
     jobs, protocol = _plan(options, methods)
     with _folder(out, mode):
         total = sum(max(0, job.frames - 1) for job in jobs)
@@ -104,7 +104,7 @@ def compare(
             "versions": _versions(),
             "machine": {"platform": platform.platform(), "cpus": os.cpu_count()},
             "options": asdict(options),
-            "weights": {name: hash for name in methods if (hash := weights_hash(name))},
+            "weights": _weights(methods, options),
             "timing": _timing(options),
             "started": started,
             "finished": _now(),
@@ -207,6 +207,12 @@ def _flows(sequence: Sequence, options: ComparisonOptions) -> tuple[str, ...]:
     return (*(("dis",) if images or not usable else ()), *(("file",) if usable else ()))
 
 
+def _weights(methods: Iterable[str], options: ComparisonOptions) -> dict[str, str | None]:
+    """Method -> SHA-256 over all weights that it uses; None without a network."""
+    models = Models(options.device, options.weights)
+    return {name: weights_hash(name, models) for name in methods}
+
+
 def _fingerprint(sequence: Sequence, methods: Iterable[str], options: ComparisonOptions) -> str:
     """What decides the rows of a sequence: a resumed comparison takes no others."""
     files = []
@@ -216,12 +222,8 @@ def _fingerprint(sequence: Sequence, methods: Iterable[str], options: Comparison
             files.append((path.name, stat.st_size, stat.st_mtime_ns))
     deciding = ("flow", "start", "stop", "stride", "seed", "protocol", "device")
     chosen = {name: getattr(options, name) for name in deciding}
-    own = {
-        name: hashlib.sha256(Path(f).read_bytes()).hexdigest()
-        for name, f in options.weights.items()
-    }
-    weights = {name: weights_hash(name) for name in methods}
-    content = json.dumps([files, chosen, own, weights, hybridvo.__version__], sort_keys=True)
+    weights = _weights(methods, options)
+    content = json.dumps([files, chosen, weights, hybridvo.__version__], sort_keys=True)
     return hashlib.sha256(content.encode()).hexdigest()
 
 

@@ -19,6 +19,7 @@ from hybridvo.evaluation.scores import scale_warning, sequence_row
 from hybridvo.evaluation.sources import SharedFlow, true_flow
 from hybridvo.geometry import invert, pose_matrix
 from hybridvo.odometry import Odometry
+from hybridvo.pipeline import Models
 from hybridvo.trajectory import Trajectory
 from hybridvo.types import Frame
 
@@ -42,7 +43,7 @@ class ComparisonOptions:
         start, stop, stride: range of frames.
         seed: of everything drawn at random.
         protocol: ``paper`` or ``trajectory14`` (MPI Sintel as others score it), or None.
-        weights: method -> file of its network; the pretrained one where absent.
+        weights: name of a network -> its file; the pretrained one where absent.
         device: ``auto``, ``cpu`` or ``cuda``.
         jobs: sequences at a time, a process each. scheduler: address of a Dask cluster
             (``tcp://host:8786``) that works instead.
@@ -99,13 +100,9 @@ def run_sequence(job: Job, progress: Callable[[int], None] | None = None) -> dic
     options = job.options
     sequence = open_sequence(job.path, options.dataset)
     flows = {name: SharedFlow(name, sequence) for name in job.flows}
+    models = Models(options.device, options.weights)
     trackers = {
-        (flow, method): Odometry(
-            options.weights.get(method, "default"),
-            flow=flows[flow],
-            method=method,
-            seed=options.seed,
-        )
+        (flow, method): Odometry(models, flow=flows[flow], method=method, seed=options.seed)
         for flow in job.flows
         for method in job.methods
     }

@@ -13,7 +13,7 @@ import numpy as np
 from hybridvo.data.sequence import Sequence, open_sequence
 from hybridvo.errors import HybridVOError, InputError
 from hybridvo.flow import FlowField, dis_flow, file_flow
-from hybridvo.pipeline import METHODS, check_method
+from hybridvo.pipeline import METHODS, Models, check_method
 from hybridvo.types import Frame
 
 SINTEL_FOLDERS = ("camdata_left", "depth", "flow", "clean", "final")
@@ -24,7 +24,9 @@ CAMERA_FLOW_KINDS = ("tartanair",)
 _logger = logging.getLogger(__name__)
 
 
-def methods_to_run(names: Several[str]) -> tuple[tuple[str, ...], dict[str, str]]:
+def methods_to_run(
+    names: Several[str], models: Models | None = None
+) -> tuple[tuple[str, ...], dict[str, str]]:
     """Methods to run, and of those that ``all`` leaves out the reason with its remedy.
 
     Raises:
@@ -34,12 +36,12 @@ def methods_to_run(names: Several[str]) -> tuple[tuple[str, ...], dict[str, str]
         if not names:
             raise InputError(f"--methods: expected names, got none; known: {', '.join(METHODS)}.")
         for name in names:
-            check_method(name)
+            check_method(name, models)
         return tuple(dict.fromkeys(names)), {}
     runnable, missing = [], {}
     for name in METHODS:
         try:
-            check_method(name)
+            check_method(name, models)
             runnable.append(name)
         except InputError as error:
             missing[name] = str(error)
