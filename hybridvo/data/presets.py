@@ -17,10 +17,10 @@ from typing import Any, TypeVar
 
 from hybridvo.data.image_io import read_text
 from hybridvo.data.plain_yaml import MAX_YAML_BYTES, plain_yaml
-from hybridvo.data.rendered_pictures import RenderedOptions
-from hybridvo.data.wide import WideOptions
-from hybridvo.data.workflow import PaperOptions
 from hybridvo.errors import FormatError, InputError
+from hybridvo.synthetic.diverse import WideOptions
+from hybridvo.synthetic.paper import PaperOptions
+from hybridvo.training.rendered_pictures import RenderedOptions
 
 __all__ = ["PRESETS", "build_options", "load_preset", "read_yaml"]
 

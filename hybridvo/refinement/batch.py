@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from hybridvo.errors import InputError
+from hybridvo.options import RefineOptions
 from hybridvo.refinement.torch_pixels import MAX_VALUE
 from hybridvo.torch_geometry import MAX_DEPTH, MIN_DEPTH, pp, se3
 from hybridvo.types import PairBatch, Reason, RelativePose, Status
@@ -49,6 +50,16 @@ class BatchOptions:
     min_inlier_ratio: float = 0.02
     tiles: int = 110
     use_depth_curr: bool = False
+
+    @classmethod
+    def of(cls, options: RefineOptions, kernel: str) -> BatchOptions:
+        """Those that belong to the options of the refinement of one pair."""
+        return cls(
+            cutoff=options.cutoff if kernel == "geman-mcclure" else None,
+            min_pixels=options.min_pixels,
+            tiles=options.tiles,
+            use_depth_curr=options.current_depth == "on",
+        )
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -106,6 +117,7 @@ class BatchedPose:
         noise = self.noise[index].tolist()
         common: dict[str, Any] = {
             "method": method,
+            "probability": float(self.probability[index]),
             "inlier_ratio": min(1.0, float(self.inlier_ratio[index])),
             "iterations": int(self.iterations[index]),
             "cost": float(self.cost[index]),

@@ -20,6 +20,7 @@ import numpy as np
 import torch
 
 from hybridvo.errors import InputError
+from hybridvo.options import RefineOptions
 from hybridvo.refinement import solver as numba_solver
 from hybridvo.refinement.batch import (
     DEPTH_CURR_FLOOR,
@@ -65,7 +66,7 @@ def refine_batch(
     noise: Any = None,
     kernel: str = "geman-mcclure",
     gradient: str = "implicit",
-    options: BatchOptions | None = None,
+    options: BatchOptions | RefineOptions | None = None,
 ) -> BatchedPose:
     """Camera motion of every pair of a batch by robust dense reprojection.
 
@@ -85,7 +86,7 @@ def refine_batch(
         gradient: ``implicit`` attaches the gradient to flow, depth, intrinsics, variances, weights
             and noise where one of them requires it, ``none`` does not. T_init has none: the
             estimate does not depend on it.
-        options: see :class:`BatchOptions`.
+        options: of the batch, or those of the refinement of one pair.
 
     Returns:
         Poses with covariance and a status per sample. Bad data give a failed status for that very
@@ -95,11 +96,13 @@ def refine_batch(
     Raises:
         InputError: shapes, types or options that cannot be used.
     """
+    if isinstance(options, RefineOptions):
+        options = BatchOptions.of(options, kernel)
     options = options or BatchOptions()
     if not isinstance(batch, PairBatch) or not isinstance(options, BatchOptions):
         raise InputError(
-            f"refine_batch: expected a PairBatch and BatchOptions, got {type(batch).__name__} and "
-            f"{options!r}."
+            f"refine_batch: expected a PairBatch and BatchOptions or RefineOptions, got "
+            f"{type(batch).__name__} and {options!r}."
         )
     if kernel not in KERNELS:
         raise InputError(f"refine_batch: unknown kernel {kernel!r}; known: {', '.join(KERNELS)}.")

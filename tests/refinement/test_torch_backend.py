@@ -10,12 +10,12 @@ import pytest
 import torch
 from batches import F64, noisy_batch
 
-from hybridvo.data import benchmark_pairs
 from hybridvo.errors import InputError
 from hybridvo.geometry import rotation_angle, se3_exp
+from hybridvo.pipeline import refine
 from hybridvo.refinement.batch import BatchedPose, BatchOptions
-from hybridvo.refinement.refine import refine
 from hybridvo.refinement.torch_backend import refine_batch
+from hybridvo.synthetic.scenarios import make_pair
 from hybridvo.torch_geometry import pixel_grid, pp, reproject, se3
 from hybridvo.types import PairBatch, Reason, State
 
@@ -245,7 +245,7 @@ def test_input_errors() -> None:
 
 
 def test_agrees_with_the_numpy_refinement() -> None:
-    pair, truth = benchmark_pairs.make_pair("moving30", 3, 218, 512)
+    pair, truth = make_pair("moving30", 3, 218, 512)
     batch = PairBatch(
         *(
             torch.as_tensor(value, dtype=torch.float32)[None]
