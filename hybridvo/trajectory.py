@@ -19,10 +19,10 @@ from typing import Any, Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hybridvo.checks import NANOSECONDS_ABOVE, stamp_unit
 from hybridvo.errors import FormatError, InputError
 from hybridvo.files import atomic_write
 from hybridvo.geometry import invert, ned_to_camera, xyzw_to_wxyz
+from hybridvo.units import MAX_SECONDS, stamp_unit
 
 __all__ = [
     "Axes",
@@ -367,7 +367,7 @@ def _quaternions_to_matrices(path: Path, xyzw: np.ndarray, lines: list[int]) -> 
 def _to_seconds(path: Path, stamps: np.ndarray, lines: list[int]) -> tuple[np.ndarray, list[str]]:
     """Stamps in seconds, strictly increasing, and what was changed."""
     notices = []
-    far = np.abs(stamps) > NANOSECONDS_ABOVE
+    far = np.abs(stamps) > MAX_SECONDS
     factor, unit = stamp_unit(stamps)
     if far.any() and not far.all():
         line = lines[int(np.argmax(far != far[0]))]
@@ -405,7 +405,7 @@ def read_trajectory(
 
     Returns:
         The trajectory in camera axes. Stamps above 1e14 are nanoseconds, or milliseconds or
-        microseconds where :func:`hybridvo.checks.stamp_unit` can tell, and are converted, which
+        microseconds where :func:`hybridvo.units.stamp_unit` can tell, and are converted, which
         ``notices`` records and the log says. KITTI and TartanAir files get frame numbers as stamps.
 
     Raises:

@@ -214,6 +214,6 @@ def _one(
             "left_out": left_out,
             "depth_source": sequence.depth_source,
             "flow_sources": list(labels.values()),
-            "notices": [n.removeprefix(f"{sequence.name}: ") for n in sequence.notices],
+            "notices": [n.removeprefix(f"{sequence.name}: ") for n in sequence.warnings],
         }
     )

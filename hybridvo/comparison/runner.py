@@ -20,13 +20,13 @@ from hybridvo.comparison.results import ROW_COLUMNS, Segments, collect
 from hybridvo.comparison.scores import scale_notice
 from hybridvo.configuration import RunOptions
 from hybridvo.console import Interruption, Progress, interruptible
-from hybridvo.data.fingerprint import input_hash
 from hybridvo.data.sequence import Sequence, open_sequence
 from hybridvo.errors import HybridVOError, InputError, OutputError
 from hybridvo.evaluation.breakdown import breakdown, worst_pairs
 from hybridvo.evaluation.protocols import Protocol, check_protocol, protocol_summary
 from hybridvo.evaluation.report import write_csv, write_json
 from hybridvo.evaluation.report_data import one_line
+from hybridvo.files import fingerprint
 from hybridvo.run import check_device, check_outside, flow_provider, versions
 from hybridvo.run_folder import PARTIAL, Mode, RunFolder
 
@@ -182,7 +182,7 @@ def compare(
             notices = [
                 f"{job.name}: {one_line(notice.removeprefix(f'{sequence.name}: '))}"
                 for job, sequence in plan.each
-                for notice in sequence.notices
+                for notice in sequence.warnings
             ]
             for line in (*plan.left_aside, *notices):
                 progress.say(f"note: {line}")
@@ -288,7 +288,7 @@ def _plan(options: ComparisonOptions) -> _Plan:
                 str(path),
                 options.dataset,
                 name,
-                input_hash(sequence),
+                fingerprint(sequence.files()),
                 _flows(sequence, options),
                 methods,
                 frames,
@@ -390,7 +390,7 @@ def _outcome(future: Future[Any]) -> dict[str, Any]:
 def _changes(job: Job) -> list[str]:
     """Notice of input that is no longer what it was when the comparison began."""
     try:
-        same = input_hash(open_sequence(job.path, job.dataset)) == job.input_hash
+        same = fingerprint(open_sequence(job.path, job.dataset).files()) == job.input_hash
     except (InputError, OSError):
         same = False
     told = "its files changed while the comparison ran; these figures may mix both. Run it again."

@@ -17,13 +17,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hybridvo.data.plain_yaml import plain_yaml
 
 import hybridvo.trajectory
 from hybridvo.cli import _open_standard_streams, main
 from hybridvo.configuration import load_options
 from hybridvo.console import Progress, printable
 from hybridvo.data.image_io import write_flo
-from hybridvo.data.plain_yaml import plain_yaml
 from hybridvo.data.sequence import open_sequence
 from hybridvo.diagnosis import diagnose, diagnosis_text
 from hybridvo.errors import FormatError, InputError

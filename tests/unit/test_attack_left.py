@@ -20,10 +20,10 @@ import numpy as np
 import psutil
 import pytest
 import torch
+from hybridvo.data.file_sequence import to_seconds
 
 from hybridvo.checks import stamp_unit
 from hybridvo.cli import main
-from hybridvo.data.file_sequence import to_seconds
 from hybridvo.data.sequence import open_sequence
 from hybridvo.data.workflow import PaperOptions
 from hybridvo.errors import CheckpointError, InputError, OutputError

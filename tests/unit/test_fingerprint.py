@@ -8,10 +8,10 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from hybridvo.data.fingerprint import PART_BYTES, PARTS, input_hash, input_times
 
 from hybridvo.cli import main
 from hybridvo.data import fingerprint
-from hybridvo.data.fingerprint import PART_BYTES, PARTS, input_hash, input_times
 from tests.walks import REFINE, command, write_walk
 
 
