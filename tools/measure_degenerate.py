@@ -95,7 +95,7 @@ def measure(seeds: range, methods: list[str], jobs: int = 1) -> dict[str, Any]:
     from benchmark_scores import proportion
 
     from hybridvo.comparison.executors import open_workers
-    from hybridvo.data.benchmark_pairs import DEGENERATE_CELLS
+    from hybridvo.synthetic.scenarios import DEGENERATE_SCENARIOS
 
     rows, wrong = [], []
     total: dict[str, dict[str, dict[str, Any]]] = {}
@@ -103,7 +103,7 @@ def measure(seeds: range, methods: list[str], jobs: int = 1) -> dict[str, Any]:
         running = [
             workers.executor.submit(measure_kind, kind, noise, seeds, methods)
             for noise in (True, False)
-            for kind in (*DEGENERATE_CELLS, *KINDS)
+            for kind in (*DEGENERATE_SCENARIOS, *KINDS)
         ]
         for future in running:
             some_rows, some_wrong = future.result()
@@ -163,11 +163,11 @@ def worst_component(found: Any, T_true: np.ndarray) -> float:
 
 def make(kind: str, seed: int, noise: bool) -> tuple[Any, np.ndarray]:
     """A pair and its true ``T_curr_prev``; for what has no world, that of a camera at rest."""
-    from hybridvo.data.benchmark_pairs import CELLS, Cell, make_pair
+    from hybridvo.synthetic.scenarios import SCENARIOS, Scenario, make_pair
     from hybridvo.types import Frame, FramePair
 
     still = kind in KINDS
-    cell = Cell(moving=0.0) if still else CELLS[kind]
+    cell = Scenario(moving=0.0) if still else SCENARIOS[kind]
     if not noise:
         cell = replace(cell, flow_noise_px=0.0, depth_noise=0.0, outliers=0.0)
     own_stream = np.random.SeedSequence([zlib.crc32(kind.encode()), seed])

@@ -36,8 +36,8 @@ def measure_all(args: argparse.Namespace) -> list[dict[str, Any]]:
 
 def rendered(args: argparse.Namespace) -> Iterator[tuple[Any, Any, np.ndarray]]:
     """(previous frame, current frame, true motion) of rendered scenes."""
-    from hybridvo.data.synthetic import SyntheticSequence, make_scene
     from hybridvo.geometry import invert
+    from hybridvo.synthetic.render import SyntheticSequence, make_scene
 
     for kind in KINDS:
         for seed in range(args.seed, args.seed + args.scenes * (3 if kind == "pair" else 1)):
@@ -63,8 +63,8 @@ def measure(name: str, pairs: Iterator[tuple[Any, Any, np.ndarray]]) -> list[dic
     """One row a variant."""
     from hybridvo.evaluation.metrics import pair_errors
     from hybridvo.flow import dis_flow
+    from hybridvo.pipeline import refine
     from hybridvo.refinement.photometric import polish_photometric
-    from hybridvo.refinement.refine import refine
     from hybridvo.types import FramePair
 
     errors: dict[str, list[list[float]]] = {variant: [] for variant in VARIANTS}

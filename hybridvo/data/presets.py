@@ -16,11 +16,11 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from hybridvo.data.image_io import read_text
-from hybridvo.data.rendered_pictures import RenderedOptions
-from hybridvo.data.wide import WideOptions
-from hybridvo.data.workflow import PaperOptions
 from hybridvo.errors import FormatError, InputError
 from hybridvo.files import parse_yaml
+from hybridvo.synthetic.diverse import WideOptions
+from hybridvo.synthetic.paper import PaperOptions
+from hybridvo.training.rendered_pictures import RenderedOptions
 
 __all__ = ["PRESETS", "build_options", "load_preset", "read_yaml"]
 

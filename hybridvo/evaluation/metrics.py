@@ -27,7 +27,7 @@ from hybridvo.evaluation.results import (
     Scale,
 )
 from hybridvo.geometry import xyzw_to_wxyz
-from hybridvo.trajectory import Axes, Format, Trajectory, check_trajectory, read_trajectory
+from hybridvo.trajectory import Axes, Format, Trajectory, read_trajectory
 
 __all__ = [
     "AbsoluteError",
@@ -78,8 +78,6 @@ def associate(est: Trajectory, gt: Trajectory, *, max_diff: float | None = None)
     Raises:
         InputError: no trajectories, or ``max_diff`` is negative or not finite.
     """
-    check_trajectory(est, "est")
-    check_trajectory(gt, "gt")
     if max_diff is not None and not (isinstance(max_diff, Real) and 0 <= max_diff < np.inf):
         raise InputError(f"max_diff: expected seconds >= 0, got {max_diff!r}.")
     total = min(len(est), len(gt))
@@ -483,5 +481,5 @@ def evaluate_files(
     gt = read_trajectory(gt_path, format_gt, axes=axes_gt)
     report = evaluate_trajectories(est, gt, **options)
     report["estimate"], report["truth"] = os.fsdecode(est_path), os.fsdecode(gt_path)
-    report["notices"] = [*est.notices, *gt.notices]
+    report["notices"] = [*est.warnings, *gt.warnings]
     return report

@@ -13,12 +13,12 @@ import torch
 import torch.nn.functional as F
 from scipy.stats import rankdata
 
-from hybridvo.data.rendered_pictures import RenderedOptions
 from hybridvo.errors import InputError
 from hybridvo.learned import next_start
 from hybridvo.network.losses import NetworkOutput, reconstruct
 from hybridvo.network.passes import predict
 from hybridvo.pose.selection import chosen_pose, selected_transform
+from hybridvo.training.rendered_pictures import RenderedOptions
 from hybridvo.training.stream import Preset, TrainingBatch, collate, sample_generator
 from hybridvo.types import PixelwisePrediction
 

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import sequences as write
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from hybridvo.data.sequence import iter_pairs, open_sequence
 from hybridvo.errors import FormatError, InputError
+from tests import sequences as write
 
 RELAXED = settings(
     max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]

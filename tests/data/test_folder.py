@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import sequences as write
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -18,6 +17,7 @@ from hybridvo.data.sequence import open_sequence
 from hybridvo.errors import FormatError, InputError
 from hybridvo.types import Camera
 from hybridvo.units import depth_advice, depth_factor, stamp_unit, typical_depth
+from tests import sequences as write
 
 CAMERA = "fx: 20\nfy: 20\ncx: 15.5\ncy: 11.5\nwidth: 32\nheight: 24\ndepth_scale: 1000\n"
 SIZE = (24, 32)

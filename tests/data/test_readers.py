@@ -6,7 +6,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import sequences as write
 
 from hybridvo.data.sequence import DATASETS, Sequence, iter_pairs, open_sequence
 from hybridvo.data.tum import BONN_MARKER, BONN_ROS
@@ -14,6 +13,7 @@ from hybridvo.errors import FormatError, InputError
 from hybridvo.files import fingerprint
 from hybridvo.geometry import ego_flow, invert
 from hybridvo.types import Camera
+from tests import sequences as write
 
 DEPTH_SOURCE = {"sintel": "true", "tartanair": "true", "tum": "sensor", "7scenes": "sensor"}
 SECONDS = {"sintel": 1 / 24, "tartanair": 1 / 10, "tum": 1 / 30, "7scenes": 1 / 30, "folder": 1 / 4}

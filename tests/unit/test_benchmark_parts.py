@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 import pytest
 
-from hybridvo.data.benchmark_pairs import make_model_pair
 from hybridvo.errors import InputError, OutputError
 from hybridvo.evaluation.plots import plot_benchmark
 from hybridvo.geometry import ego_flow, se3_exp
+from hybridvo.synthetic.scenarios import make_model_pair
 from hybridvo.types import Hypothesis, RelativePose
 
 

@@ -21,9 +21,9 @@ from hybridvo.comparison.plan import expand, unique_names, weights_of
 from hybridvo.comparison.results import PAIR_COLUMNS
 from hybridvo.comparison.runner import ComparisonOptions, WorkerError, compare
 from hybridvo.data.sequence import open_sequence
-from hybridvo.data.synthetic import make_scene, write_sintel
 from hybridvo.errors import InputError, LockedError
 from hybridvo.pipeline import METHODS
+from hybridvo.synthetic.render import make_scene, write_sintel
 from hybridvo.types import RelativePose
 from tests.scripts import load_script
 

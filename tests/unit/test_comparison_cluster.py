@@ -10,8 +10,8 @@ import pytest
 
 from hybridvo.comparison.executors import open_workers
 from hybridvo.comparison.runner import ComparisonOptions, compare
-from hybridvo.data.synthetic import make_scene, write_sintel
 from hybridvo.errors import InputError
+from hybridvo.synthetic.render import make_scene, write_sintel
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from hybridvo.data.benchmark_pairs import make_pair
+from hybridvo.pipeline import refine
 from hybridvo.pose import batch_covariance
 from hybridvo.refinement import full_fit, kernels, solver
 from hybridvo.refinement.covariance import (
@@ -24,7 +24,7 @@ from hybridvo.refinement.covariance import (
     sandwich_covariance,
 )
 from hybridvo.refinement.pixels import Picture
-from hybridvo.refinement.refine import refine
+from hybridvo.synthetic.scenarios import make_pair
 from hybridvo.types import FramePair, Reason, State
 
 TOOLS = str(Path(__file__).parents[2] / "tools")

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 
-from hybridvo.data.synthetic import SyntheticSequence, make_scene, write_sintel
 from hybridvo.errors import InputError
 from hybridvo.evaluation.maps import (
     colour_wheel,
@@ -29,6 +28,7 @@ from hybridvo.geometry import invert, se3_exp
 from hybridvo.network.inputs import assemble_inputs
 from hybridvo.network.pwvo import NetworkOptions, build_network
 from hybridvo.network.weights import save_weights
+from hybridvo.synthetic.render import SyntheticSequence, make_scene, write_sintel
 from hybridvo.types import FramePair, PixelwisePrediction
 from hybridvo.visualization import networks, saliencies, start_of
 from tests.scripts import load_script

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 import hybridvo
-from hybridvo.data.synthetic import make_scene
 from hybridvo.errors import CheckpointError, InputError
 from hybridvo.flow import FlowField, dis_flow
 from hybridvo.geometry import ego_flow, invert, rotation_angle, se3_exp
 from hybridvo.odometry import Odometry
 from hybridvo.pipeline import DEFAULT_METHOD, METHODS, check_method, estimate, warm_up
+from hybridvo.synthetic.render import make_scene
 from hybridvo.types import Camera, Frame, FramePair, Reason, State
 
 HEIGHT, WIDTH = 48, 64
