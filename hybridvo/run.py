@@ -26,7 +26,7 @@ from hybridvo.console import Progress, interruptible
 from hybridvo.data.sequence import Sequence, open_sequence
 from hybridvo.depth_steps import depth_ratio
 from hybridvo.errors import InputError
-from hybridvo.evaluation.metrics import pair_errors
+from hybridvo.evaluation.pair_errors import pair_errors
 from hybridvo.evaluation.report import write_json
 from hybridvo.files import fingerprint
 from hybridvo.flow import FlowField, FlowProvider, dis_flow, fallback, file_flow

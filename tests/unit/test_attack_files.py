@@ -31,7 +31,7 @@ from hybridvo.recording import check_recording
 from hybridvo.run_folder import PARTIAL, STATE, RunFolder
 from hybridvo.training.judge_batches import read_batches
 from hybridvo.trajectory import Trajectory
-from tests.sequences import png, write_folder
+from tests.sequences import image, png, write_folder
 
 ROOT = Path(__file__).resolve().parents[2]
 
