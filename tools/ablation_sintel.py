@@ -105,7 +105,7 @@ def _score(
     from hybridvo.learned import next_start
     from hybridvo.network.inputs import assemble_inputs
     from hybridvo.network.passes import predict
-    from hybridvo.network.selection import chosen_motion
+    from hybridvo.network.selection import select_motion
 
     inputs = assemble_inputs(pairs)
     truth = [true_motion(sequence, pair.prev.index, pair.curr.index) for pair in pairs]
@@ -113,7 +113,7 @@ def _score(
         with torch.inference_mode():
             given = inputs.to(next(network.parameters()).device)
             output = predict(network, given, next_start(network, selection))
-            motions = chosen_motion(output, selection).double().cpu().numpy()
+            motions = select_motion(output, selection).double().cpu().numpy()
         for pair, T_true, T in zip(pairs, truth, motions, strict=True):
             if T_true is None:
                 continue

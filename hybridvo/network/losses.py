@@ -234,8 +234,8 @@ def total_loss(
         options: which terms; the paper's PWVO by default. Outputs without uncertainty (VONet,
             pixel-wise) need the three ``*_uncertainty`` switches off.
         T_curr_prev: (B, 4, 4) the selected motion, as ``hybridvo.network.selection`` gives it:
-            ``selected_transform(*select(prediction))``, for a VONet
-            ``selected_transform(*output)``. Needed by L^F and L^D only.
+            ``euler_transform(*select_pose(prediction))``, for a VONet
+            ``euler_transform(*output)``. Needed by L^F and L^D only.
 
     Returns:
         Scalar loss, and its unweighted terms without gradient under ``rotation``, ``translation``,
@@ -245,8 +245,8 @@ def total_loss(
         InputError: the selected motion or the uncertainty is missing, or shapes do not fit.
 
     Example:
-        rotation_deg, translation = select(prediction)
-        T = selected_transform(rotation_deg, translation)
+        rotation_deg, translation = select_pose(prediction)
+        T = euler_transform(rotation_deg, translation)
         loss, parts = total_loss(prediction, targets, LossOptions(), T)
     """
     options = LossOptions() if options is None else options
@@ -406,7 +406,7 @@ def _check(
         if T_curr_prev is None:
             raise InputError(
                 "total_loss: L^F and L^D need T_curr_prev, the selected motion: pass "
-                "selected_transform(*select(prediction)), or switch flow and depth off."
+                "euler_transform(*select_pose(prediction)), or switch flow and depth off."
             )
         if tuple(T_curr_prev.shape) != (batch, 4, 4):
             raise InputError(

@@ -17,7 +17,8 @@ from hybridvo.errors import InputError
 from hybridvo.learned import next_start
 from hybridvo.network.losses import NetworkOutput, reconstruct
 from hybridvo.network.passes import predict
-from hybridvo.network.selection import chosen_pose, selected_transform
+from hybridvo.network.selection import select_pose
+from hybridvo.torch_geometry import euler_transform
 from hybridvo.training.rendered_pictures import RenderedOptions
 from hybridvo.training.stream import Preset, TrainingBatch, collate, sample_generator
 from hybridvo.types import PixelwisePrediction
@@ -167,8 +168,8 @@ def calibrate_scales(
 def _errors(output: NetworkOutput, batch: TrainingBatch, selection: str) -> np.ndarray:
     """(B, 6) R_err, T_err and EPE of the network and of the zero-motion predictor."""
     truth = batch.targets
-    rotation, translation = chosen_pose(output, selection)
-    T = selected_transform(rotation, translation)
+    rotation, translation = select_pose(output, selection)
+    T = euler_transform(rotation, translation)
     flow, _, defined = reconstruct(truth.depth_prev, T, truth.K_prev, truth.K_curr)
     near = truth.ego_flow.norm(dim=1) < EPE_LIMIT_PX
     # Sky has no depth to reproject; a point behind the camera has no flow: neither counts.

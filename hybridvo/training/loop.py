@@ -26,7 +26,7 @@ from hybridvo.learned import fitted_motion, next_start
 from hybridvo.network.losses import NetworkOutput, reconstruct, total_loss
 from hybridvo.network.passes import first_motions
 from hybridvo.network.pwvo import build_network
-from hybridvo.network.selection import chosen_motion
+from hybridvo.network.selection import select_motion
 from hybridvo.network.weights import load_weights
 from hybridvo.training.checkpoint import check_seed, load_checkpoint, save_checkpoint
 from hybridvo.training.held_out import evaluate_network
@@ -54,7 +54,7 @@ def training_loss(
     output: NetworkOutput, batch: TrainingBatch, options: TrainingOptions
 ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
     """Loss of a network's output and its parts, see :func:`hybridvo.network.losses.total_loss`."""
-    T = chosen_motion(output, options.selection) if options.loss.reconstructs else None
+    T = select_motion(output, options.selection) if options.loss.reconstructs else None
     laplace = options.translation_loss == "laplace" and isinstance(output, PixelwisePrediction)
     loss_options = options.loss
     if laplace:

@@ -10,7 +10,8 @@ import torch
 from hybridvo.errors import InputError
 from hybridvo.geometry import ego_flow, euler_deg_to_matrix, make_transform
 from hybridvo.network.losses import LossOptions, LossTargets, reconstruct, total_loss
-from hybridvo.network.selection import select, selected_transform
+from hybridvo.network.selection import select_pose
+from hybridvo.torch_geometry import euler_transform
 from hybridvo.types import Camera, PixelwisePrediction
 
 PLAIN = {"pose_uncertainty": False, "flow_uncertainty": False, "depth_uncertainty": False}
@@ -281,7 +282,7 @@ def test_gradcheck_through_selection(options):
 
     def loss(*values):
         prediction = PixelwisePrediction(*values)
-        T = selected_transform(*select(prediction, patch=2))
+        T = euler_transform(*select_pose(prediction, patch=2))
         return total_loss(prediction, targets, options, T)[0]
 
     torch.autograd.gradcheck(loss, maps)
@@ -296,7 +297,7 @@ def test_gradcheck_of_a_vonet():
 
     def loss(rotation, translation):
         output = (rotation, translation)
-        return total_loss(output, targets, LossOptions(**PLAIN), selected_transform(*output))[0]
+        return total_loss(output, targets, LossOptions(**PLAIN), euler_transform(*output))[0]
 
     torch.autograd.gradcheck(loss, pose)
 
@@ -315,7 +316,7 @@ def test_gradients_are_finite_at_identity_and_zero_error(options, translation, d
         for v in vars(predict((0, 0, 0), translation, (0, 0, 0), (0, 0, 0))).values()
     ]
     prediction = PixelwisePrediction(*maps)
-    T = selected_transform(*select(prediction))
+    T = euler_transform(*select_pose(prediction))
     loss, _ = total_loss(prediction, targets, options, T)
     loss.backward()
     assert torch.isfinite(loss)
