@@ -17,7 +17,7 @@ import pytest
 import torch
 
 import hybridvo
-from hybridvo.data.resize import resize_camera, resize_flow, resize_pair
+from hybridvo.data.resize import resize_camera, resize_pair
 from hybridvo.data.sequence import iter_pairs, open_sequence
 from hybridvo.geometry import (
     backproject,
@@ -149,7 +149,8 @@ def test_resizing_scales_flow_and_cameras_together():
     )
     np.testing.assert_allclose(expected[7, 9], [2.5, 0], atol=1e-12)
     np.testing.assert_allclose(small.flow, expected, atol=1e-6)  # float32
-    np.testing.assert_allclose(resize_flow(flow, 160, 50)[0][0, 0], [2.5, 0])
+    tall = resize_pair(FramePair(frame, frame, flow), 160, 50)
+    np.testing.assert_allclose(tall.flow[0, 0], [2.5, 0])
 
 
 def test_network_inputs_scale_intrinsics_the_same_way():
