@@ -136,8 +136,8 @@ def test_flow_that_is_none_or_leaves_the_image(method: str, value: float) -> Non
     found = estimate(replace(pair, flow=flow), method=method)
     worlds.assert_sane(found)
     if method in ("refine", "hybrid-flow"):
-        assert found.status.state is State.OK
-        worlds.assert_pose_close(found.T_curr_prev, T, rad=1e-5, m=1e-4)
+        assert found.usable
+        worlds.assert_pose_close(found.T_curr_prev, T, rad=1e-4, m=1e-3)
     nowhere = estimate(replace(pair, flow=np.full_like(flow, value)), method=method)
     worlds.assert_sane(nowhere)
     if method in EXACT:
