@@ -240,6 +240,7 @@ def test_the_tool_draws_a_pair(tool, folder: Path, tmp_path: Path, capsys) -> No
     sequence = str(folder / "training" / "clean" / "tiny")
     out = tmp_path / "new" / "pair.png"
     arguments = ["--sequence", sequence, "--pair", "1", "--flow", "dis", "--steps", "4"]
+    arguments += ["--method", "refine"]
     for kind in ("pwvo", "vonet"):
         arguments += ["--weights", str(folder / f"{kind}.safetensors")]
     assert tool.main([*arguments, "--out", str(out)]) == 0
