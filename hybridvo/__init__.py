@@ -15,6 +15,8 @@ _HOME = {
     "Camera": "hybridvo.types",
     "Frame": "hybridvo.types",
     "FramePair": "hybridvo.types",
+    "MotionPrior": "hybridvo.types",
+    "Options": "hybridvo.options",
     "PairBatch": "hybridvo.types",
     "PixelwisePrediction": "hybridvo.types",
     "RelativePose": "hybridvo.types",
@@ -23,11 +25,11 @@ _HOME = {
     "HybridVOError": "hybridvo.errors",
     "Odometry": "hybridvo.odometry",
     "Trajectory": "hybridvo.trajectory",
-    "estimate": "hybridvo.hybrid",
+    "estimate": "hybridvo.pipeline",
     "open_sequence": "hybridvo.data.sequence",
     "iter_pairs": "hybridvo.data.sequence",
-    "refine": "hybridvo.pose.refinement",
-    "select": "hybridvo.pose.selection",
+    "refine": "hybridvo.pipeline",
+    "select": "hybridvo.network.selection",
 }
 
 __all__ = ["__version__", *_HOME]

@@ -10,11 +10,11 @@ from typing import Any
 
 from hybridvo.checks import make_folder
 from hybridvo.configuration import RunOptions
-from hybridvo.data.synthetic import make_scene, write_sintel
 from hybridvo.errors import InputError, OutputError
 from hybridvo.evaluation.plots import plot_trajectories
 from hybridvo.evaluation.report import table_text, to_json, write_json
 from hybridvo.run import EXIT_INTERRUPTED, RunResult, run
+from hybridvo.synthetic.render import make_scene, write_sintel
 
 __all__ = ["METHODS", "demo"]
 

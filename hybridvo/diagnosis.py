@@ -18,10 +18,10 @@ from hybridvo.diagnosis_findings import Evidence, findings
 from hybridvo.errors import FormatError, InputError
 from hybridvo.flow import FlowProvider, dis_flow
 from hybridvo.geometry import invert
-from hybridvo.pose.photometric import PolishReport, polish_photometric
-from hybridvo.pose.refinement import refine
-from hybridvo.pose.registration import depth_costs
-from hybridvo.pose.self_calibration import calibration_equations
+from hybridvo.pipeline import refine
+from hybridvo.refinement.photometric import PhotometricReport, refine_photometric
+from hybridvo.refinement.registration import depth_costs
+from hybridvo.refinement.self_calibration import calibration_equations
 from hybridvo.types import Frame, FramePair, RelativePose
 
 __all__ = ["diagnose", "diagnosis_text"]
@@ -64,7 +64,7 @@ def diagnose(
         InputError: fewer than two frames, or ``pairs`` below 1.
 
     Example:
-        >>> from hybridvo.data.synthetic import SyntheticSequence, make_scene
+        >>> from hybridvo.synthetic.render import SyntheticSequence, make_scene
         >>> scene = make_scene("static", 0, height=48, width=64, frames=2)
         >>> diagnose(SyntheticSequence(scene))["findings"][0]["state"]
         'not_observable'
@@ -143,13 +143,13 @@ def _look_at(
         return
     found = flow(prev, curr)
     pair = FramePair(prev, curr, found.flow, found.variance, found.valid, found.source)
-    motion = polish_photometric(pair, refine(pair))
-    if motion.ok:
+    motion = refine_photometric(pair, refine(pair))
+    if motion.usable:
         ratio = depth_ratio(prev, curr, found.flow, motion.T_curr_prev)
         if ratio is not None:
             evidence.depth_ratios.append((index, ratio))
-    report = motion.polish
-    assert isinstance(report, PolishReport)
+    report = motion.photometric
+    assert isinstance(report, PhotometricReport)
     evidence.reasons.append(report.reason)
     if report.pixels:
         evidence.gains.append((index, report.gain))
@@ -172,7 +172,7 @@ def _compare_scale(
     evidence: Evidence, sequence: _Sequence, index: int, motion: RelativePose
 ) -> None:
     """Length of the motion over that of the true poses, where both have one."""
-    if sequence.poses is None or not motion.ok or not motion.translation_direction_valid:
+    if sequence.poses is None or not motion.usable or not motion.translation_direction_valid:
         return
     true = invert(sequence.poses[index + 1]) @ sequence.poses[index]
     length = float(np.linalg.norm(true[:3, 3]))

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from hybridvo.depth_steps import is_step
-from hybridvo.pose.registration import LAGS, LARGEST_PX, OffsetCost
-from hybridvo.pose.self_calibration import PARAMETERS
+from hybridvo.refinement.registration import LAGS, LARGEST_PX, OffsetCost
+from hybridvo.refinement.self_calibration import PARAMETERS
 from hybridvo.types import Camera
 
 __all__ = ["Evidence", "findings"]

@@ -141,10 +141,12 @@ def _look_at_threads(report: dict[str, Any]) -> None:
 
 
 def _look_at_numba_cache(report: dict[str, Any]) -> None:
-    from hybridvo.hybrid import warm_up
+    from hybridvo.pipeline import warm_up
 
     named = os.environ.get("NUMBA_CACHE_DIR")
-    folder = Path(named) if named else Path(__file__).resolve().parent / "pose" / "__pycache__"
+    folder = (
+        Path(named) if named else Path(__file__).resolve().parent / "refinement" / "__pycache__"
+    )
     before = len(list(folder.rglob("*.nbi")))
     started = time.perf_counter()
     warm_up()
@@ -160,7 +162,7 @@ def _look_at_numba_cache(report: dict[str, Any]) -> None:
 
 def _look_at_methods(report: dict[str, Any]) -> None:
     from hybridvo.errors import InputError
-    from hybridvo.hybrid import METHODS, check_method
+    from hybridvo.pipeline import METHODS, check_method
 
     for method in METHODS:
         try:

@@ -5,10 +5,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import settings
+
+from tests.walks import write_walk
 
 SHARED_DATA = Path(
     os.environ.get("HYBRIDVO_DATA", Path(__file__).resolve().parents[2] / "shared" / "data")
 )
+
+# no deadline: a busy machine is no failure. HYPOTHESIS_PROFILE=dev draws other examples each time
+settings.register_profile("ci", deadline=None, derandomize=True)
+settings.register_profile("dev", deadline=None)
+settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci"))
 
 
 @pytest.fixture
@@ -22,6 +30,19 @@ def shared_data() -> Path:
 @pytest.fixture
 def rng() -> np.random.Generator:
     return np.random.default_rng(7)
+
+
+@pytest.fixture(scope="session")
+def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A sequence of six frames of 32x48 with flow files and true poses; read it, change nothing."""
+    return write_walk(tmp_path_factory.mktemp("session") / "walk", 6)
+
+
+@pytest.fixture(scope="session")
+def image_walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A sequence of five frames of 64x96 with images; read it, change nothing."""
+    root = tmp_path_factory.mktemp("session") / "image_walk"
+    return write_walk(root, 5, height=64, width=96, pictures=True)
 
 
 @pytest.fixture(scope="module")

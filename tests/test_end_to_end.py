@@ -16,9 +16,9 @@ import pytest
 
 from hybridvo.cli import main
 from hybridvo.data.image_io import read_flo
-from hybridvo.data.synthetic import make_scene, write_sintel
 from hybridvo.evaluation.report import to_json
 from hybridvo.run_folder import PARTIAL
+from hybridvo.synthetic.render import make_scene, write_sintel
 from hybridvo.trajectory import read_trajectory
 
 FRAMES = 6

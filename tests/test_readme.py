@@ -17,11 +17,11 @@ import pytest
 
 import hybridvo
 from hybridvo.cli import build_parser
-from hybridvo.data.scenes import SCENE_KINDS
 from hybridvo.data.sequence import open_sequence
 from hybridvo.demo import demo
 from hybridvo.errors import InputError
-from hybridvo.hybrid import METHODS
+from hybridvo.pipeline import METHODS
+from hybridvo.synthetic.scenes import SCENE_KINDS
 from tests.scripts import load_script
 
 ROOT = Path(__file__).resolve().parents[1]

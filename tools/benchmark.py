@@ -57,16 +57,16 @@ def main(argv: list[str] | None = None) -> int:
     args = build_parser().parse_args(argv)
     from benchmark_report import MID_CELL, markdown
 
-    from hybridvo.data.benchmark_pairs import CELLS, MAIN_CELLS
     from hybridvo.evaluation.plots import plot_benchmark
+    from hybridvo.synthetic.scenarios import MAIN_SCENARIOS, SCENARIOS
 
     methods, absent = available_methods()
-    groups = {"all": list(CELLS), "main": list(MAIN_CELLS)}
+    groups = {"all": list(SCENARIOS), "main": list(MAIN_SCENARIOS)}
     cells = groups.get(args.cells) or args.cells.split(",")
     chosen = args.methods.split(",")
     if args.methods == "all":
         chosen = [name for name in methods if name != HYBRID]
-    for what, given, known in (("cell", cells, CELLS), ("method", chosen, methods)):
+    for what, given, known in (("cell", cells, SCENARIOS), ("method", chosen, methods)):
         for name in given:
             if name not in known:
                 reason = absent.get(name, f"known: {', '.join(known)}")
@@ -167,17 +167,17 @@ def available_methods() -> tuple[dict[str, Callable[..., Any]], dict[str, str]]:
     """Methods that can run here by name (ours first), and reason and remedy for the others."""
     from functools import partial
 
-    from hybridvo.pose import baselines
+    from hybridvo.baselines import pnp as baselines
 
     methods: dict[str, Callable[..., Any]] = {}
     absent = baselines.missing()
-    if importlib.util.find_spec("hybridvo.pose.refinement") is None:
-        absent["refine"] = "hybridvo.pose.refinement is not part of this version"
+    if importlib.util.find_spec("hybridvo.refinement.refine") is None:
+        absent["refine"] = "hybridvo.refinement.refine is not part of this version"
     else:
-        from hybridvo.pose.refinement import refine
+        from hybridvo.pipeline import refine
 
         methods["refine"] = refine
-        from hybridvo.hybrid import estimate
+        from hybridvo.pipeline import estimate
 
         methods[HYBRID] = partial(estimate, method=HYBRID)
     for name, estimator in baselines.baselines().items():
@@ -196,7 +196,7 @@ def run_cell(
     """One record per pair and method; methods take turns on each pair, in rotating order."""
     from benchmark_scores import score
 
-    from hybridvo.data.benchmark_pairs import make_pair
+    from hybridvo.synthetic.scenarios import make_pair
 
     warm_up, _ = make_pair(cell, seed0 + pairs)
     for method in methods.values():
@@ -249,9 +249,9 @@ def ratios(
     """``refine`` over each other method: error (geometric mean over the main cells) and time."""
     from benchmark_report import MID_CELL
 
-    from hybridvo.data.benchmark_pairs import MAIN_CELLS
+    from hybridvo.synthetic.scenarios import MAIN_SCENARIOS
 
-    shared = [cell for cell in cells if cell in MAIN_CELLS]
+    shared = [cell for cell in cells if cell in MAIN_SCENARIOS]
     means = {m: _geometric([summary[c][m]["epe_px"]["median"] for c in shared]) for m in methods}
     table: dict[str, Any] = {"cells": shared, "geometric_mean_epe_px": means, "refine_over": {}}
     ours = means.get("refine")

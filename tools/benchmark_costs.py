@@ -27,7 +27,7 @@ BEYOND_CACHE = 256 * 2**20
 FRESH_PROCESS = """
 import json, time
 begin = time.perf_counter()
-from hybridvo.hybrid import warm_up
+from hybridvo.pipeline import warm_up
 imported = time.perf_counter()
 first = warm_up()
 second = warm_up()
@@ -37,11 +37,12 @@ print(json.dumps({"import_s": imported - begin, "warm_up_s": first, "again_s": s
 
 def run_kernel(cell: str, seed: int) -> dict[str, Any]:
     """One pass of ``Picture.full_pass`` over 436x1024 pixels beside the memory's speed."""
-    from hybridvo.data.benchmark_pairs import make_pair
-    from hybridvo.pose import picture as module
-    from hybridvo.pose import solver
-    from hybridvo.pose.full_fit import tile_size
-    from hybridvo.pose.options import RefinementOptions
+    from hybridvo.refinement.options import RefinementOptions
+
+    from hybridvo.refinement import pixels as module
+    from hybridvo.refinement import solver
+    from hybridvo.refinement.full_fit import tile_size
+    from hybridvo.synthetic.scenarios import make_pair
 
     pair, truth = make_pair(cell, seed)
     options = RefinementOptions()
@@ -132,8 +133,8 @@ def run_batch(
     import torch
     from benchmark_scores import FAILURE_PX, epe
 
-    from hybridvo.data.benchmark_pairs import make_pair
-    from hybridvo.pose.batched import refine_batch
+    from hybridvo.refinement.torch_backend import refine_batch
+    from hybridvo.synthetic.scenarios import make_pair
     from hybridvo.types import PairBatch
 
     made = [make_pair(cell, seed0 + k, *shape) for k in range(max(sizes))]
@@ -188,10 +189,10 @@ def run_network(name: str = "pwvo", sizes: tuple[int, ...] = BATCHES) -> dict[st
     """Milliseconds a pair of a shipped network at 128x256, all its passes, on the CPU."""
     import torch
 
-    from hybridvo.data.benchmark_pairs import make_pair
     from hybridvo.learned import LEARNED, next_start, shipped_network
     from hybridvo.network.inputs import assemble_inputs
     from hybridvo.network.passes import predict
+    from hybridvo.synthetic.scenarios import make_pair
 
     network = shipped_network(name)
     choose = next_start(network, LEARNED[name])
@@ -230,7 +231,7 @@ def peak_memory(methods: dict[str, Callable[..., Any]], cell: str, seed: int) ->
     takes from the system is not seen. ``resident_peak_mib``: growth of the process's resident
     high-water mark, None where the system cannot reset it.
     """
-    from hybridvo.data.benchmark_pairs import make_pair
+    from hybridvo.synthetic.scenarios import make_pair
 
     pair, _ = make_pair(cell, seed)
     traced: dict[str, float] = {}

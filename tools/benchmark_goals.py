@@ -67,11 +67,11 @@ def _row(
 
 def _cell_goals(result: dict[str, Any]) -> list[dict[str, Any]]:
     """No failure, the true motion in ``one60``, containment in the degenerate cells."""
-    from hybridvo.data.benchmark_pairs import DEGENERATE_CELLS, MAIN_CELLS
+    from hybridvo.synthetic.scenarios import DEGENERATE_SCENARIOS, MAIN_SCENARIOS
 
     ours = {c: rows["refine"] for c, rows in result["summary"].items() if "refine" in rows}
-    main = [ours[c] for c in MAIN_CELLS if c in ours]
-    weak = [ours[c] for c in DEGENERATE_CELLS if c in ours]
+    main = [ours[c] for c in MAIN_SCENARIOS if c in ours]
+    weak = [ours[c] for c in DEGENERATE_SCENARIOS if c in ours]
     one = ours.get("one60")
 
     def coverage(group: list[dict[str, Any]], of: int) -> str:
@@ -83,11 +83,11 @@ def _cell_goals(result: dict[str, Any]) -> list[dict[str, Any]]:
     hits = None if one is None else 100 * (one["hypothesis_hits"] or 0) / one["pairs"]
     return [
         _row("failures, main and noise cells", "pairs", 0, failures,
-             note=coverage(main, len(MAIN_CELLS))),
+             note=coverage(main, len(MAIN_SCENARIOS))),
         _row("one60: true motion among the hypotheses", "%", 100, hits, at_least=True,
              note=coverage([one] if one else [], 1)),
         _row("degenerate cells: error within 3 sigma", "%", 99, contained, at_least=True,
-             note=coverage(weak, len(DEGENERATE_CELLS))),
+             note=coverage(weak, len(DEGENERATE_SCENARIOS))),
     ]  # fmt: skip
 
 
@@ -113,7 +113,7 @@ def _heavy_goals(heavy: dict[str, Any] | None) -> list[dict[str, Any]]:
 
 
 def _cost_goals(result: dict[str, Any]) -> list[dict[str, Any]]:
-    from hybridvo.data.benchmark_pairs import MAIN_CELLS
+    from hybridvo.synthetic.scenarios import MAIN_SCENARIOS
 
     kernel = result.get("kernel")
     rows = [
@@ -127,7 +127,7 @@ def _cost_goals(result: dict[str, Any]) -> list[dict[str, Any]]:
             else None,
         )
     ]
-    ours = [r for r in result["pairs"] if r["method"] == "refine" and r["cell"] in MAIN_CELLS]
+    ours = [r for r in result["pairs"] if r["method"] == "refine" and r["cell"] in MAIN_SCENARIOS]
     for name, goal, decisive in (
         ("refine, first hypothesis decisive", 4.0, True),
         ("refine, several hypotheses", 12.0, False),

@@ -69,9 +69,8 @@ def run_heavy(
 
 def heavy_methods(hybrid: bool = False) -> dict[str, Callable[[Any, dict[str, Any]], Any]]:
     """Methods of this part: called with a pair and, for the oracle alone, its truth."""
-    from hybridvo.hybrid import estimate
-    from hybridvo.pose import baselines
-    from hybridvo.pose.refinement import refine
+    from hybridvo.baselines import pnp as baselines
+    from hybridvo.pipeline import estimate, refine
 
     known = baselines.baselines()
     methods: dict[str, Callable[[Any, dict[str, Any]], Any]] = {
@@ -88,9 +87,9 @@ def heavy_methods(hybrid: bool = False) -> dict[str, Callable[[Any, dict[str, An
 
 def heavy_pairs(kind: str, seed: int) -> Iterator[tuple[int, str, Any, dict[str, Any]]]:
     """(index, flow, pair, truth) of a sequence: pairs spread over it, each with both flows."""
-    from hybridvo.data.synthetic import SyntheticSequence, make_scene
     from hybridvo.flow import dis_flow
     from hybridvo.geometry import invert
+    from hybridvo.synthetic.render import SyntheticSequence, make_scene
     from hybridvo.types import FramePair
 
     sequence = SyntheticSequence(

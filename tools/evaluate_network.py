@@ -83,9 +83,9 @@ def reliability(network: Any, seed: int, count: int) -> dict[str, Any]:
     import torch
     import torch.nn.functional as F
 
-    from hybridvo.data.wide import WideOptions
     from hybridvo.learned import next_start
     from hybridvo.network.passes import predict
+    from hybridvo.synthetic.diverse import WideOptions
     from hybridvo.training.held_out import area_under_curve
     from hybridvo.training.stream import collate, sample_generator
 
@@ -125,11 +125,11 @@ def reliability(network: Any, seed: int, count: int) -> dict[str, Any]:
 
 def one_mover(network: Any, seed: int, count: int) -> dict[str, Any]:
     """Rotation errors where one object covers half of the picture or more, beside the motion."""
-    from hybridvo.data.wide import WideOptions
+    from hybridvo.baselines.pnp import baselines
     from hybridvo.geometry import rotation_angle
     from hybridvo.learned import estimate_learned
-    from hybridvo.pose.baselines import baselines
-    from hybridvo.pose.refinement import refine
+    from hybridvo.pipeline import refine
+    from hybridvo.synthetic.diverse import WideOptions
     from hybridvo.training.stream import sample_generator
     from hybridvo.types import Camera, Frame, FramePair
 

@@ -53,7 +53,7 @@ def main(argv: list[str] | None = None) -> int:
 
 def generate(options: argparse.Namespace):
     """Yields one summary per sequence, after writing it."""
-    from hybridvo.data.synthetic import make_scene, write_sintel
+    from hybridvo.synthetic.render import make_scene, write_sintel
 
     settings = {
         key: getattr(options, key)

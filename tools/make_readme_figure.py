@@ -55,11 +55,11 @@ def main(argv: list[str] | None = None) -> int:
 
 def track(kind: str, seed: int, shown: int) -> dict[str, Any]:
     """Both methods over the scene, and the inputs and weights of one pair."""
-    from hybridvo.data.synthetic import SyntheticSequence, make_scene
     from hybridvo.errors import InputError
     from hybridvo.flow import dis_flow
     from hybridvo.geometry import invert
     from hybridvo.odometry import Odometry
+    from hybridvo.synthetic.render import SyntheticSequence, make_scene
 
     scene = make_scene(kind, seed, height=218, width=512)
     sequence = SyntheticSequence(scene)

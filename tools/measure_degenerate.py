@@ -18,10 +18,12 @@ from __future__ import annotations
 
 import argparse
 import json
+import multiprocessing
 import os
 import sys
 import zlib
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -55,7 +57,7 @@ def build_parser() -> argparse.ArgumentParser:
 def main(argv: list[str] | None = None) -> int:
     args = build_parser().parse_args(argv)
     from hybridvo.errors import InputError
-    from hybridvo.hybrid import check_method
+    from hybridvo.pipeline import check_method
 
     methods = args.methods.split(",")
     try:
@@ -94,16 +96,15 @@ def measure(seeds: range, methods: list[str], jobs: int = 1) -> dict[str, Any]:
     """
     from benchmark_scores import proportion
 
-    from hybridvo.comparison.executors import open_workers
-    from hybridvo.data.benchmark_pairs import DEGENERATE_CELLS
+    from hybridvo.synthetic.scenarios import DEGENERATE_SCENARIOS
 
     rows, wrong = [], []
     total: dict[str, dict[str, dict[str, Any]]] = {}
-    with open_workers(jobs) as workers:
+    with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as executor:
         running = [
-            workers.executor.submit(measure_kind, kind, noise, seeds, methods)
+            executor.submit(measure_kind, kind, noise, seeds, methods)
             for noise in (True, False)
-            for kind in (*DEGENERATE_CELLS, *KINDS)
+            for kind in (*DEGENERATE_SCENARIOS, *KINDS)
         ]
         for future in running:
             some_rows, some_wrong = future.result()
@@ -126,7 +127,7 @@ def measure_kind(
     """One row per method, and the pairs that are wrong and confident."""
     from benchmark_scores import CHI2_6_3SIGMA, normalised_error
 
-    from hybridvo.hybrid import estimate
+    from hybridvo.pipeline import estimate
 
     wrong = []
     counts = {m: dict.fromkeys(COUNTS, 0) for m in methods}
@@ -163,11 +164,11 @@ def worst_component(found: Any, T_true: np.ndarray) -> float:
 
 def make(kind: str, seed: int, noise: bool) -> tuple[Any, np.ndarray]:
     """A pair and its true ``T_curr_prev``; for what has no world, that of a camera at rest."""
-    from hybridvo.data.benchmark_pairs import CELLS, Cell, make_pair
+    from hybridvo.synthetic.scenarios import SCENARIOS, Scenario, make_pair
     from hybridvo.types import Frame, FramePair
 
     still = kind in KINDS
-    cell = Cell(moving=0.0) if still else CELLS[kind]
+    cell = Scenario(moving=0.0) if still else SCENARIOS[kind]
     if not noise:
         cell = replace(cell, flow_noise_px=0.0, depth_noise=0.0, outliers=0.0)
     own_stream = np.random.SeedSequence([zlib.crc32(kind.encode()), seed])

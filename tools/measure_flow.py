@@ -36,8 +36,8 @@ def measure_all(args: argparse.Namespace) -> list[dict[str, Any]]:
 
 def rendered(args: argparse.Namespace) -> Iterator[tuple[Any, Any, np.ndarray]]:
     """(previous frame, current frame, true motion) of rendered scenes."""
-    from hybridvo.data.synthetic import SyntheticSequence, make_scene
     from hybridvo.geometry import invert
+    from hybridvo.synthetic.render import SyntheticSequence, make_scene
 
     for kind in KINDS:
         for seed in range(args.seed, args.seed + args.scenes * (3 if kind == "pair" else 1)):
@@ -61,10 +61,10 @@ def real(path: Path) -> Iterator[tuple[Any, Any, np.ndarray]]:
 
 def measure(name: str, pairs: Iterator[tuple[Any, Any, np.ndarray]]) -> list[dict[str, Any]]:
     """One row a variant."""
-    from hybridvo.evaluation.metrics import pair_errors
+    from hybridvo.evaluation.pair_errors import pair_errors
     from hybridvo.flow import dis_flow
-    from hybridvo.pose.photometric import polish_photometric
-    from hybridvo.pose.refinement import refine
+    from hybridvo.pipeline import refine
+    from hybridvo.refinement.photometric import polish_photometric
     from hybridvo.types import FramePair
 
     errors: dict[str, list[list[float]]] = {variant: [] for variant in VARIANTS}

@@ -38,7 +38,7 @@ def measure_all(args: argparse.Namespace) -> list[dict[str, Any]]:
 def groups(args: argparse.Namespace) -> Iterator[tuple[str, Iterator[tuple[Any, np.ndarray]]]]:
     """(name, its pairs with their true motions)."""
     from hybridvo.data.sequence import open_sequence
-    from hybridvo.data.synthetic import SyntheticSequence, make_scene
+    from hybridvo.synthetic.render import SyntheticSequence, make_scene
 
     def rendered(kind: str) -> Iterator[tuple[Any, np.ndarray]]:
         for seed in range(args.seed, args.seed + args.scenes * (5 if kind == "pair" else 1)):
@@ -57,8 +57,8 @@ def spoilt(args: argparse.Namespace) -> Iterator[tuple[str, Iterator[tuple[Any, 
     """(name of what was done to the pictures, pairs with the flow of those pictures)."""
     from dataclasses import replace
 
-    from hybridvo.data.synthetic import SyntheticSequence, make_scene
     from hybridvo.geometry import invert
+    from hybridvo.synthetic.render import SyntheticSequence, make_scene
 
     frames = []
     for kind in ("static", "light", "pair"):
@@ -179,9 +179,9 @@ def pairs_of(sequence: Any, indices: Any) -> Iterator[tuple[Any, np.ndarray]]:
 
 def measure(name: str, pairs: Iterator[tuple[Any, np.ndarray]]) -> dict[str, Any]:
     """Errors before and after."""
-    from hybridvo.evaluation.metrics import pair_errors
-    from hybridvo.pose.photometric import polish_photometric
-    from hybridvo.pose.refinement import refine
+    from hybridvo.evaluation.pair_errors import pair_errors
+    from hybridvo.pipeline import refine
+    from hybridvo.refinement.photometric import polish_photometric
 
     errors: dict[str, list[list[float]]] = {"refine": [], "polished": []}
     end = {key: np.eye(4) for key in ("refine", "polished", "truth")}

@@ -37,7 +37,7 @@ def write_rows(
     args = parser.parse_args(given)
     from hybridvo.errors import HybridVOError
     from hybridvo.evaluation.report import write_json
-    from hybridvo.hybrid import warm_up
+    from hybridvo.pipeline import warm_up
     from hybridvo.run import versions
 
     if args.out.exists() and not args.overwrite:

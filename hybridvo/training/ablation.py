@@ -18,9 +18,9 @@ from typing import Any, cast
 import numpy as np
 import torch
 
-from hybridvo.data.workflow import Sample
 from hybridvo.errors import InputError
 from hybridvo.network.options import NetworkOptions
+from hybridvo.synthetic.paper import Sample
 from hybridvo.training.held_out import evaluate_network
 from hybridvo.training.loop import Trainer
 from hybridvo.training.options import TrainingOptions

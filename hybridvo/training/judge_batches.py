@@ -11,14 +11,15 @@ from typing import Any
 import numpy as np
 import torch
 
-from hybridvo.data.degradation import log_uniform
 from hybridvo.errors import FormatError
 from hybridvo.geometry import pose_matrix, se3_exp
+from hybridvo.hypotheses import search
+from hybridvo.hypotheses.generate import fit_in_mask
+from hybridvo.hypotheses.selector import mask_weights, nearest_motion
 from hybridvo.network.judge import JudgeInputs, JudgeOutput, expected_information
-from hybridvo.pose import kernels, search
-from hybridvo.pose.coarse import fit_in_mask
-from hybridvo.pose.options import RefinementOptions
-from hybridvo.pose.second_look import PROPOSED, mask_weights, nearest_motion
+from hybridvo.options import RefineOptions
+from hybridvo.refinement import kernels
+from hybridvo.synthetic.sensors import log_uniform
 from hybridvo.training.judge_proposals import read_proposals
 
 __all__ = ["PictureBatch", "ego_flow_error", "read_batches", "refits_of"]
@@ -211,7 +212,7 @@ def refits_of(
     Where the judge is shown another network's static world, that network's motion takes part.
     """
     inputs = batch.inputs
-    cutoff = RefinementOptions().cutoff
+    cutoff = RefineOptions().cutoff
     probability = torch.sigmoid(out.mask).numpy()
     poses, found, parents = [], [], []
     for b in range(len(batch.T)):
@@ -225,7 +226,7 @@ def refits_of(
             for k in order[:count]
         ]
         if inputs.has_static[b]:
-            weights = mask_weights(batch.static[b].numpy(), PROPOSED)
+            weights = mask_weights(batch.static[b].numpy())
             z = inputs.depth[b][inputs.usable[b]]
             start = batch.proposal[b]
             near = nearest_motion(inputs.pose[mine].numpy(), start, 1.0 / float(z.median()))

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from hybridvo.data.rendered_pictures import MOVING, STATIC
+from hybridvo.hypotheses.generate import fit_in_mask
 from hybridvo.network.judge import JudgeNetwork
-from hybridvo.pose.coarse import fit_in_mask
-from hybridvo.pose.options import RefinementOptions
+from hybridvo.options import RefineOptions
 from hybridvo.training.judge_batches import ego_flow_error, read_batches, refits_of
 from hybridvo.training.judge_loop import RIGHT_PX
+from hybridvo.training.rendered_pictures import MOVING, STATIC
 
 __all__ = ["evaluate_judge"]
 
@@ -60,7 +60,7 @@ def evaluate_judge(
         )
         trust = torch.sigmoid(network.confidence(score, hidden, owner, len(batch.T)))
         old = len(inputs.owner)
-        cutoff = RefinementOptions().cutoff
+        cutoff = RefineOptions().cutoff
         for b in range(len(batch.T)):
             mine = torch.nonzero(owner == b)[:, 0]
             first = mine[mine < old]

@@ -20,7 +20,6 @@ import torch.nn.functional as F
 from safetensors import SafetensorError
 from safetensors.torch import load_file
 
-from hybridvo.data.rendered_pictures import MOVING, STATIC
 from hybridvo.errors import CheckpointError, InputError
 from hybridvo.network.judge import JudgeInputs, JudgeNetwork, JudgeOptions, JudgeOutput
 from hybridvo.training.checkpoint import check_seed, load_checkpoint, save_checkpoint
@@ -30,6 +29,7 @@ from hybridvo.training.judge_batches import (
     read_batches,
     refits_of,
 )
+from hybridvo.training.rendered_pictures import MOVING, STATIC
 
 __all__ = ["JudgeTrainer", "JudgeTrainingOptions"]
 

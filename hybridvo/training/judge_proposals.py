@@ -14,10 +14,10 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from hybridvo.data.rendered_pictures import picture_sample
 from hybridvo.learned import fitted_motion, next_start, static_probability
 from hybridvo.network.inputs import NETWORK_SIZE
 from hybridvo.network.passes import predict
+from hybridvo.training.rendered_pictures import picture_sample
 from hybridvo.training.stream import collate
 from hybridvo.types import PixelwisePrediction
 

@@ -17,10 +17,10 @@ import numpy as np
 import torch
 from torch.utils.data import IterableDataset, get_worker_info
 
-from hybridvo.data.workflow import Sample
 from hybridvo.errors import InputError
 from hybridvo.network.inputs import NetworkInputs, assemble_aligned
 from hybridvo.network.losses import LossTargets
+from hybridvo.synthetic.paper import Sample
 
 __all__ = [
     "Mixture",

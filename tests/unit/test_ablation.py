@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 import torch
 
-from hybridvo.data.synthetic import make_scene, write_sintel
-from hybridvo.data.workflow import PaperOptions
 from hybridvo.errors import InputError
 from hybridvo.geometry import invert, matrix_to_euler_deg
 from hybridvo.network.losses import LossOptions, LossTargets, reconstruct, total_loss
 from hybridvo.network.options import NetworkOptions
+from hybridvo.synthetic.paper import PaperOptions
+from hybridvo.synthetic.render import make_scene, write_sintel
 from hybridvo.training import ablation
 from hybridvo.training.options import TrainingOptions, load_training_options
 from hybridvo.training.stream import Mixture, sample_generator

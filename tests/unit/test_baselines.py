@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hybridvo.data.benchmark_pairs import Cell, make_pair
+from hybridvo.baselines import pnp as module
+from hybridvo.baselines.correspondences import Correspondences, check_pose
+from hybridvo.baselines.pnp import baselines, missing
 from hybridvo.errors import InputError
 from hybridvo.geometry import ego_flow, invert, make_transform, rotation_angle, se3_exp, se3_log
-from hybridvo.pose import baselines as module
-from hybridvo.pose.baselines import baselines, missing
-from hybridvo.pose.correspondences import Correspondences, check_pose
+from hybridvo.synthetic.scenarios import Scenario, make_pair
 from hybridvo.types import Camera, Frame, FramePair, Reason, RelativePose, State
 
 POINT_SOLVERS = ["pnp-ransac", "pnp-ransac-tuned", "usac-magsac", "poselib"]
@@ -98,7 +98,7 @@ def test_exact_static_pair(solver, seed):
 
 
 def test_noisy_pair_with_moving_objects(solver):
-    pair, truth = make_pair(Cell(moving=0.2), 1, height=218, width=512)
+    pair, truth = make_pair(Scenario(moving=0.2), 1, height=218, width=512)
     # the peers' medians are 0.05-0.2 px at f = 1120: 0.2 mrad; ten times that is a gross error
     result = solver(pair)
     _assert_sane(result)
@@ -379,7 +379,7 @@ def test_the_number_of_points_is_an_argument():
 
 
 def test_same_seed_same_bytes_whatever_the_global_generators(solver):
-    pair, _ = make_pair(Cell(moving=0.3), 2, height=218, width=512)
+    pair, _ = make_pair(Scenario(moving=0.3), 2, height=218, width=512)
     results = []
     for state in (0, 1):
         cv2.setRNGSeed(state)
@@ -391,7 +391,7 @@ def test_same_seed_same_bytes_whatever_the_global_generators(solver):
 
 
 def test_f42_two_threads_give_what_one_gives(solver):
-    pairs = [make_pair(Cell(moving=0.3), s, height=109, width=256)[0] for s in range(4)]
+    pairs = [make_pair(Scenario(moving=0.3), s, height=109, width=256)[0] for s in range(4)]
     serial = [solver(p).T_curr_prev.tobytes() for p in pairs]
     with ThreadPoolExecutor(2) as pool:
         threaded = [r.T_curr_prev.tobytes() for r in pool.map(solver, pairs)]

@@ -5,15 +5,21 @@ import numpy as np
 import pytest
 from scipy.ndimage import label
 
-from hybridvo.data.benchmark_pairs import CELLS, DEGENERATE_CELLS, MAIN_CELLS, Cell, make_pair
 from hybridvo.errors import InputError
 from hybridvo.geometry import ego_flow, rotation_angle
+from hybridvo.synthetic.scenarios import (
+    DEGENERATE_SCENARIOS,
+    MAIN_SCENARIOS,
+    SCENARIOS,
+    Scenario,
+    make_pair,
+)
 
-CLEAN = Cell(moving=0.3, flow_noise_px=0.0, depth_noise=0.0, outliers=0.0)
+CLEAN = Scenario(moving=0.3, flow_noise_px=0.0, depth_noise=0.0, outliers=0.0)
 
 
 def test_the_eight_main_and_noise_cells_are_the_peers():
-    assert list(MAIN_CELLS) == [
+    assert list(MAIN_SCENARIOS) == [
         "moving00",
         "moving30",
         "moving50",
@@ -23,12 +29,12 @@ def test_the_eight_main_and_noise_cells_are_the_peers():
         "low_noise",
         "outliers20",
     ]
-    assert set(CELLS) == {*MAIN_CELLS, *DEGENERATE_CELLS, "one60"}
+    assert set(SCENARIOS) == {*MAIN_SCENARIOS, *DEGENERATE_SCENARIOS, "one60"}
 
 
-@pytest.mark.parametrize("cell", CELLS)
+@pytest.mark.parametrize("cell", SCENARIOS)
 def test_pair_keeps_the_conditions_of_its_cell(cell):
-    conditions = CELLS[cell]
+    conditions = SCENARIOS[cell]
     pair, truth = make_pair(cell, 3)
     assert pair.prev.camera.shape == (436, 1024)
     assert pair.prev.camera.fx == pytest.approx(1120)
@@ -78,7 +84,7 @@ def test_one60_is_one_object_on_most_of_the_picture():
 
 
 def test_current_depth_is_the_moved_surface():
-    pair, truth = make_pair(Cell(0.0, 0, 0.0, 0.0, 0.0, scene="plane"), 5)
+    pair, truth = make_pair(Scenario(0.0, 0, 0.0, 0.0, 0.0, scene="plane"), 5)
     T, camera = truth["T_curr_prev"], pair.curr.camera
     # the plane n.X = 1 from three corners, moved by T: z = 1 / (n' . K^-1 (u, v, 1)) analytically
     rays = np.array([[u, v, 1.0] for u, v in ((0, 0), (1023, 0), (0, 435))])

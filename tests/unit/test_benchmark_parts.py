@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 import pytest
 
-from hybridvo.data.benchmark_pairs import make_model_pair
 from hybridvo.errors import InputError, OutputError
 from hybridvo.evaluation.plots import plot_benchmark
 from hybridvo.geometry import ego_flow, se3_exp
+from hybridvo.synthetic.scenarios import make_model_pair
 from hybridvo.types import Hypothesis, RelativePose
 
 
@@ -155,7 +155,7 @@ def test_heavy_summary_counts_kinds_and_total():
 def test_kernel_part_restores_the_threads_and_relates_to_the_memory(monkeypatch):
     import benchmark_costs
 
-    from hybridvo.pose import picture
+    from hybridvo.refinement import pixels as picture
 
     monkeypatch.setattr(benchmark_costs, "ITERATIONS", 3)
     monkeypatch.setattr(benchmark_costs, "BEYOND_CACHE", 2**22)

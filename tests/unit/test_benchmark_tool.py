@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hybridvo.data.benchmark_pairs import make_pair
 from hybridvo.geometry import ego_flow, se3_exp
+from hybridvo.synthetic.scenarios import make_pair
 from hybridvo.types import Hypothesis, Reason, RelativePose
 from tests.scripts import load_script
 

@@ -15,8 +15,8 @@ import pytest
 from hybridvo import __version__
 from hybridvo.cli import main
 from hybridvo.console import Progress, interruptible
-from hybridvo.data.synthetic import make_scene, write_sintel
 from hybridvo.run_folder import LOCK
+from hybridvo.synthetic.render import make_scene, write_sintel
 
 HYBRIDVO = [sys.executable, "-m", "hybridvo.cli"]
 

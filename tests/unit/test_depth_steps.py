@@ -11,10 +11,10 @@ import pytest
 from hybridvo.cli import main
 from hybridvo.depth_steps import depth_ratio, depth_step_warning, is_step
 from hybridvo.geometry import ego_flow, se3_exp
-from hybridvo.pose.refinement import refine
+from hybridvo.pipeline import refine
 from hybridvo.types import Camera, Frame, FramePair
+from tests.walks import REFINE, command, write_walk
 
-TOOLS = Path(__file__).parents[2] / "tools"
 K = Camera(90, 95, 63.5, 47.5, 96, 128)
 T = se3_exp(np.array([0.02, -0.03, 0.4, 0.01, -0.02, 0.03]))
 
@@ -93,10 +93,7 @@ def test_a_scale_from_the_start_leaves_no_trace(pair) -> None:
     )
 
 
-def test_a_run_says_where_the_scale_changes(tmp_path: Path, monkeypatch, capsys) -> None:
-    monkeypatch.syspath_prepend(TOOLS)
-    from stress_parts import REFINE, command, write_walk
-
+def test_a_run_says_where_the_scale_changes(tmp_path: Path, capsys) -> None:
     root = tmp_path / "walk"
     write_walk(root, 6, height=64, width=96)
     # a world in which depth is measured again and again: the plane along the walk

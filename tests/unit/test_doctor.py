@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from hybridvo.cli import main
-from hybridvo.data.synthetic import SyntheticSequence, make_scene, write_sintel
 from hybridvo.diagnosis import diagnose, diagnosis_text
 from hybridvo.doctor import doctor, doctor_text
 from hybridvo.errors import FormatError, InputError
 from hybridvo.evaluation.report import to_json
+from hybridvo.synthetic.render import SyntheticSequence, make_scene, write_sintel
 from hybridvo.types import Frame
 
 

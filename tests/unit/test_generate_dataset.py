@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hybridvo.data.image_io import read_flo
-from hybridvo.data.synthetic import make_scene
+from hybridvo.synthetic.render import make_scene
 from tests.scripts import load_script
 
 TOOL = Path(__file__).resolve().parents[2] / "tools" / "generate_dataset.py"

@@ -10,29 +10,28 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from hybridvo.learned_judge import LearnedJudge, judge_inputs
+from hybridvo.refinement.options import RefinementOptions
 from safetensors.torch import save_file
 
-from hybridvo.data.benchmark_pairs import Cell, make_pair
 from hybridvo.data.presets import build_options, read_yaml
-from hybridvo.data.synthetic import SyntheticSequence, make_scene
 from hybridvo.errors import CheckpointError, InputError
 from hybridvo.geometry import ego_flow, se3_exp
-from hybridvo.hybrid import estimate
-from hybridvo.learned_judge import LearnedJudge, judge_inputs
+from hybridvo.hypotheses import selector as second_look
+from hybridvo.hypotheses.generate import CoarseSearch, search_motions, whole_mask
+from hybridvo.hypotheses.selector import Motions, Opinion, Proposal
 from hybridvo.network import judge as judge_network
 from hybridvo.network.judge import JudgeInputs, JudgeNetwork, JudgeOptions
 from hybridvo.network.weights import load_weights, pretrained, save_weights
-from hybridvo.pose import second_look
-from hybridvo.pose.coarse import CoarseSearch, search_motions, whole_mask
-from hybridvo.pose.options import RefinementOptions
-from hybridvo.pose.refinement import refine
-from hybridvo.pose.second_look import Motions, Opinion, Proposal
+from hybridvo.pipeline import estimate, refine
+from hybridvo.synthetic.render import SyntheticSequence, make_scene
+from hybridvo.synthetic.scenarios import Scenario, make_pair
 from hybridvo.training import judge_data
 from hybridvo.training.judge_batches import PictureBatch, ego_flow_error, read_batches
 from hybridvo.training.judge_loop import JudgeTrainer, JudgeTrainingOptions
 from hybridvo.types import FramePair, Reason, State
 
-CELL = Cell(moving=0.6, objects=1, flow_noise_px=0.3, depth_noise=0.01)
+CELL = Scenario(moving=0.6, objects=1, flow_noise_px=0.3, depth_noise=0.01)
 SIZE = {"height": 96, "width": 224}
 
 
@@ -229,7 +228,7 @@ def test_maps_of_any_resolution_are_seen_on_the_grid() -> None:
 
 
 def test_a_clear_motion_is_not_put_before_the_judge() -> None:
-    pair, _ = make_pair(Cell(moving=0.0), 1, **SIZE)
+    pair, _ = make_pair(Scenario(moving=0.0), 1, **SIZE)
     answer = refine(pair, judge=Oracle(np.zeros((1, 1), np.float32), "refit", 0.0))
     np.testing.assert_array_equal(answer.T_curr_prev, refine(pair).T_curr_prev)
     assert answer.status.state is State.OK
@@ -352,7 +351,7 @@ def test_slow_movers_under_noise_are_not_clear() -> None:
         asked += not found.clear
     assert asked == 3
     # noise alone is no reason to doubt: the same noise where nothing moves
-    pair, _ = make_pair(Cell(moving=0.0, flow_noise_px=0.5), 1, **SIZE)
+    pair, _ = make_pair(Scenario(moving=0.0, flow_noise_px=0.5), 1, **SIZE)
     assert search_motions(pair, np.eye(4)[None, :3], None, RefinementOptions(), 0).clear
 
 

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from hybridvo.data.benchmark_pairs import Cell, make_pair
 from hybridvo.errors import InputError
 from hybridvo.geometry import rotation_angle
 from hybridvo.learned import fitted_motion, next_start, propose_motion, static_probability
 from hybridvo.network.inputs import assemble_inputs
 from hybridvo.network.passes import first_motions
 from hybridvo.network.pwvo import NetworkOptions, build_network
+from hybridvo.synthetic.scenarios import Scenario, make_pair
 from hybridvo.types import PixelwisePrediction
 
 STRIDE = 4
@@ -20,7 +20,7 @@ STRIDE = 4
 
 @pytest.fixture(scope="module")
 def moving_pair():
-    return make_pair(Cell(moving=0.65, objects=1, flow_noise_px=0.1), 3, 128, 256)
+    return make_pair(Scenario(moving=0.65, objects=1, flow_noise_px=0.1), 3, 128, 256)
 
 
 def told(pair, truth, doubt: float) -> tuple[PixelwisePrediction, object]:
@@ -91,6 +91,6 @@ def test_proposals_are_finite_or_none(moving_pair) -> None:
         network.head_uncertainty[2].bias.fill_(torch.nan)
     damaged = propose_motion(network, pair)
     assert damaged is None or np.isfinite(damaged.static).all()
-    empty, _ = make_pair(Cell(), 3, 128, 256)
+    empty, _ = make_pair(Scenario(), 3, 128, 256)
     empty.flow[:] = np.nan
     assert propose_motion(network, empty) is None

@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 import pytest
 
-from hybridvo.data.synthetic import SyntheticSequence, make_scene
 from hybridvo.flow import dis_flow
 from hybridvo.geometry import ego_flow, invert
-from hybridvo.pose.photometric import polish_photometric
-from hybridvo.pose.photometric_light import COLUMNS, ROWS, local_correlation
-from hybridvo.pose.refinement import refine
+from hybridvo.pipeline import refine
+from hybridvo.refinement.illumination import COLUMNS, ROWS, local_correlation
+from hybridvo.refinement.photometric import polish_photometric
+from hybridvo.synthetic.render import SyntheticSequence, make_scene
 from hybridvo.types import Frame, FramePair
 
 HEIGHT, WIDTH = 160, 256

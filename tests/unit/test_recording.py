@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from hybridvo.cli import main
-from hybridvo.data.synthetic import make_scene, write_sintel
 from hybridvo.errors import InputError
 from hybridvo.recording import CHUNK_ROWS, MAX_PICTURES, Recording, check_recording
+from hybridvo.synthetic.render import make_scene, write_sintel
 from hybridvo.trajectory import read_trajectory
 from hybridvo.types import Camera, Frame, RelativePose, Step
 

@@ -8,15 +8,15 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from hybridvo.refinement.options import RefinementOptions
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hybridvo.data.benchmark_pairs import make_pair
 from hybridvo.errors import InputError
 from hybridvo.geometry import ego_flow, invert, make_transform, rotation_angle, se3_exp, se3_log
-from hybridvo.pose import picture as picture_module
-from hybridvo.pose.options import RefinementOptions
-from hybridvo.pose.refinement import refine
+from hybridvo.pipeline import refine
+from hybridvo.refinement import pixels as picture_module
+from hybridvo.synthetic.scenarios import make_pair
 from hybridvo.types import Camera, Frame, FramePair, Reason, State
 
 CAMERA = Camera(350.0, 340.0, 159.0, 82.0, 160, 320)

@@ -9,15 +9,15 @@ import pytest
 import torch
 
 from hybridvo.data.presets import load_preset
-from hybridvo.data.rendered_pictures import NAMES, RenderedOptions, picture_sample
-from hybridvo.data.workflow import Sample, rigid_flow
 from hybridvo.errors import FormatError, InputError
 from hybridvo.learned import shipped_network
 from hybridvo.network.judge import JudgeNetwork, JudgeOptions
-from hybridvo.pose.weighted_fit import weighted_fit
+from hybridvo.network.weighted_fit import weighted_fit
+from hybridvo.synthetic.paper import Sample, rigid_flow
 from hybridvo.training.held_out import evaluate_network
 from hybridvo.training.judge_batches import PictureBatch, read_batches, refits_of
 from hybridvo.training.judge_proposals import write_proposals
+from hybridvo.training.rendered_pictures import NAMES, RenderedOptions, picture_sample
 from hybridvo.training.stream import collate, sample_generator
 
 

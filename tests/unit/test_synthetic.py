@@ -9,13 +9,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hybridvo.data.image_io import read_cam, read_dpt, read_flo, read_mask_png, read_rgb
-from hybridvo.data.raycasting import BOX, CYLINDER, ELLIPSOID
-from hybridvo.data.scenes import SCENE_KINDS
 from hybridvo.data.sequence import Sequence
-from hybridvo.data.synthetic import Scene, SyntheticSequence, make_scene, write_sintel
-from hybridvo.data.world import Solid, World, dynamic_share, moving_share
 from hybridvo.errors import InputError, OutputError
 from hybridvo.geometry import ego_flow, invert, make_transform, pixel_grid, rotation_angle
+from hybridvo.synthetic.raycast import BOX, CYLINDER, ELLIPSOID
+from hybridvo.synthetic.render import Scene, SyntheticSequence, make_scene, write_sintel
+from hybridvo.synthetic.scenes import SCENE_KINDS
+from hybridvo.synthetic.world import Solid, World, dynamic_share, moving_share
 from hybridvo.types import Camera
 
 HEAVY = [kind for kind in SCENE_KINDS if kind.startswith("heavy")]

@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 import torch
 
-from hybridvo.data.wide import WideOptions
-from hybridvo.data.workflow import PaperOptions
 from hybridvo.errors import CheckpointError, DegenerateError, InputError
 from hybridvo.network.losses import LossOptions
 from hybridvo.network.pwvo import NetworkOptions
 from hybridvo.network.weights import load_weights
+from hybridvo.synthetic.diverse import WideOptions
+from hybridvo.synthetic.paper import PaperOptions
 from hybridvo.training import checkpoint, held_out, loop, options, stream
 from hybridvo.types import PixelwisePrediction
 
@@ -431,7 +431,7 @@ WORKER = """
 import sys
 import torch
 import torch.distributed as dist
-from hybridvo.data.workflow import PaperOptions
+from hybridvo.synthetic.paper import PaperOptions
 from hybridvo.network.pwvo import NetworkOptions
 from hybridvo.training import loop, options, stream
 torch.set_num_threads(1)

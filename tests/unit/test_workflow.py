@@ -9,8 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hybridvo import geometry
-from hybridvo.data import degradation, presets, silhouettes, wide, workflow
+from hybridvo.data import presets
 from hybridvo.errors import FormatError, InputError
+from hybridvo.synthetic import diverse as wide
+from hybridvo.synthetic import paper as workflow
+from hybridvo.synthetic import sensors as degradation
+from hybridvo.synthetic import silhouettes
 from hybridvo.types import Camera
 
 CONFIGS = Path(__file__).parents[2] / "configs"

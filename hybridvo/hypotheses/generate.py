@@ -1,0 +1,180 @@
+"""Every strong motion of a pair, on a grid of a few thousand pixels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hybridvo.hypotheses import search
+from hybridvo.options import Options
+from hybridvo.refinement import kernels
+from hybridvo.refinement.depth import look_up
+from hybridvo.refinement.full_fit import fit_coarse, translation_scale
+from hybridvo.refinement.pixels import CoarseGrid, as_contiguous, coarse_grid
+from hybridvo.types import FramePair, Reason, RelativePose
+
+REFERENCE_WIDTH = 1024
+"""px; residuals of images of different size are compared at this width."""
+SOURCE_REFIT = 102
+"""Source of a motion that was fitted inside a mask, see :mod:`hybridvo.hypotheses.search`."""
+CLEAR_COHERENCE = 0.5
+"""Spatial correlation of the residuals above which even a motion that most of the image follows may
+be a compromise: 0.02 for independent noise, 0.25 to 0.4 for DIS flow of static scenes, above 0.6
+where a large moving object bends the flow (development seeds)."""
+CHANCE_COHERENCE = 0.05
+"""Correlation that independent noise reaches by chance."""
+CLEAR_BEND_PX = 0.15
+"""Coherent part of the residuals, px at a width of 1024, above which it may be one as well: noise
+hides slowly moving objects, and they bend the motion."""
+
+
+@dataclass(frozen=True, eq=False)
+class GridMaps:
+    """Inputs of a scorer: what is known about each pixel of the coarse grid.
+
+    Args:
+        ray: (2, h, w) float32, K^-1 x without the one.
+        depth: (h, w) float32 metres, previous frame.
+        target: (2, h, w) float32 px, x + flow in the current image.
+        flow_variance, depth_variance: (h, w) float32 relative to the typical one.
+        usable: (h, w) bool, flow and depth are there.
+        log_depth_curr: (h, w) float32, log metres of the current frame at the target; NaN where
+            unknown or at an edge.
+        K: (4,) fx, fy, cx, cy of the current camera.
+        width: px, of the whole image.
+        stride: px between the grid's pixels.
+    """
+
+    ray: np.ndarray
+    depth: np.ndarray
+    target: np.ndarray
+    flow_variance: np.ndarray
+    depth_variance: np.ndarray
+    usable: np.ndarray
+    log_depth_curr: np.ndarray
+    K: np.ndarray
+    width: int
+    stride: int
+
+
+@dataclass(frozen=True, eq=False)
+class HypothesisSet:
+    """The motions found, in the order found, and the pixels they were found on.
+
+    Args:
+        pair: the input.
+        grid: its coarse grid.
+        depth_scale: 1 / typical depth.
+        poses: (M, 3, 4) T_curr_prev. facts: (M, :data:`hybridvo.hypotheses.search.FACTS`).
+        is_ambiguous: False where the first motion explains the image beyond doubt; no other was
+            looked for then.
+    """
+
+    pair: FramePair
+    grid: CoarseGrid
+    depth_scale: float
+    poses: np.ndarray
+    facts: np.ndarray
+    is_ambiguous: bool
+
+    def maps(self) -> GridMaps:
+        """The pixels of the grid as images."""
+        grid, pair = self.grid, self.pair
+        h, w, stride = grid.shape
+        n = grid.count
+
+        def map_of(*rows: int) -> np.ndarray:
+            return grid.samples[list(rows), :n].reshape(len(rows), h, w)
+
+        log_depth = np.full(n, np.nan, np.float32)
+        if pair.curr.depth is not None:
+            u0, v0 = grid.pixels.origin
+            look_up(grid.samples, n, 1, as_contiguous(pair.curr.depth), u0, v0, log_depth)
+        return GridMaps(
+            ray=map_of(kernels.XN, kernels.YN),
+            depth=map_of(kernels.Z)[0],
+            target=map_of(kernels.MU, kernels.MV),
+            flow_variance=1.0 / np.maximum(map_of(kernels.PF)[0], np.float32(1e-6)),
+            depth_variance=map_of(kernels.PD)[0],
+            usable=map_of(kernels.W)[0] > 0,
+            log_depth_curr=log_depth.reshape(h, w),
+            K=grid.pixels.K,
+            width=pair.prev.camera.width,
+            stride=stride,
+        )
+
+
+def generate(
+    pair: FramePair,
+    starts: np.ndarray,
+    options: Options,
+    seed: int = 0,
+    weights: np.ndarray | None = None,
+) -> HypothesisSet | RelativePose:
+    """Every strong motion of a pair, or the failure that says why there is none.
+
+    Args:
+        pair: two frames and their flow.
+        starts: (S, 4, 4) T_curr_prev to start from, beside those that the search makes.
+        options: ``search`` and ``refine`` are read.
+        seed: of the minimal samples.
+        weights: (H, W) factors on the information of each pixel, or None.
+    """
+    grid = coarse_grid(pair, weights, options.refine)
+    if isinstance(grid, RelativePose):
+        return grid
+    h, w, _ = grid.shape
+    small, sh, sw, _ = grid.pixels.samples(options.search.grid_pixels)
+    depth_scale = translation_scale(grid.samples, grid.count)
+    K, limits = grid.pixels.K, options.search
+    poses = np.zeros((limits.max_hypotheses, 3, 4))
+    facts = np.zeros((limits.max_hypotheses, search.FACTS))
+    before = grid.samples[kernels.W].copy()  # the search uses the weights up
+    found = search.find_motions(
+        small, sh, sw, grid.samples, h, w, K, np.ascontiguousarray(starts[:, :3]),
+        options.refine.cutoff, limits.unambiguous_ratio, limits.min_inlier_ratio,
+        limits.max_hypotheses, depth_scale, seed, poses, facts,
+    )  # fmt: skip
+    grid.samples[kernels.W] = before
+    if found == 0:
+        return RelativePose.failed(
+            Reason.DEGENERATE_GEOMETRY, "the pixels do not determine any motion", "refine"
+        )
+    clear = found == 1 and bool(facts[0, search.SHARE] >= limits.unambiguous_ratio)
+    clear = clear and _is_rigid(grid, poses[0], facts[0], pair.prev.camera.width)
+    return HypothesisSet(pair, grid, depth_scale, poses[:found], facts[:found], not clear)
+
+
+def _is_rigid(grid: CoarseGrid, pose: np.ndarray, fact: np.ndarray, width: int) -> bool:
+    """Whether the residuals of a motion look like noise, not like a bent compromise of two."""
+    h, w, _ = grid.shape
+    noise = fact[search.FLOW_NOISE], fact[search.DEPTH_NOISE]
+    coherence = search.residual_coherence(grid.samples, h, w, pose, grid.pixels.K, *noise)
+    excess = max(coherence - CHANCE_COHERENCE, 0.0)
+    bend_px = np.sqrt(excess * grid.pixels.scale[0]) * noise[0] * REFERENCE_WIDTH / width
+    return bool(coherence < CLEAR_COHERENCE and bend_px < CLEAR_BEND_PX)
+
+
+def fit_in_mask(
+    samples: np.ndarray, mask: np.ndarray, K: np.ndarray, pose: np.ndarray, cutoff: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """One motion, fitted on the coarse grid inside a mask.
+
+    Args:
+        samples: pixel buffer of the grid; left as it is.
+        mask: (h, w) factors in [0, 1] on the weights of its first h * w pixels.
+        K: (4,) float32 fx, fy, cx, cy of the current camera.
+        pose: (3, 4) start; left as it is.
+        cutoff: of the robust kernel, see :class:`hybridvo.options.RefineOptions`.
+
+    Returns:
+        The pose (3, 4) and its facts, the inlier ratio being that of the masked weight.
+    """
+    masked = samples.copy()
+    masked[kernels.W, : mask.size] *= mask.reshape(-1)
+    pose, sf, sd, share, iterations = fit_coarse(masked, mask.size, K, pose, cutoff)
+    facts = np.zeros(search.FACTS)
+    facts[search.SHARE], facts[search.FLOW_NOISE], facts[search.DEPTH_NOISE] = share, sf, sd
+    facts[search.ITERATIONS], facts[search.SOURCE] = iterations, SOURCE_REFIT
+    return pose, facts

@@ -1,0 +1,296 @@
+"""Which of the motions found is the camera's, and which pixels are static.
+
+Two selectors: :class:`CueSelector` by hand-made cues, and :class:`MaskSelector` by a scorer, which
+is handed in (a network; this package knows none): the motions are scored, the best are fitted again
+inside the static masks that the scorer draws about them, and all are scored once more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+
+from hybridvo.calibration import CUE_GAP
+from hybridvo.geometry import invert, pose_matrix, se3_log
+from hybridvo.hypotheses import search
+from hybridvo.hypotheses.cues import cue_scores
+from hybridvo.hypotheses.generate import SOURCE_REFIT, GridMaps, HypothesisSet, fit_in_mask
+from hybridvo.options import Options
+from hybridvo.refinement import solver
+from hybridvo.types import Hypothesis, MotionPrediction, MotionPrior
+
+SUPPORT_CUTOFF = 3.0
+"""Cutoff of the robust kernel by which the inliers of a motion are told, standard deviations."""
+MIN_NOISE_PX = 0.05
+"""The same, least noise of the flow."""
+MASK_RAMP = (0.4, 0.9)
+"""Probabilities of being static between which the weights of a fit grow from 0 to 1."""
+MIN_COVERAGE = 0.02
+"""Share of the usable pixels' weight that a mask must leave for a fit inside it."""
+SOURCES = {
+    search.SOURCE_WINDOW: "window",
+    search.SOURCE_MINIMAL: "minimal",
+    SOURCE_REFIT: "refit",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """Motions to be scored: those of the search, then those fitted inside masks.
+
+    Args:
+        poses: (N, 3, 4) T_curr_prev. facts: (N, :data:`hybridvo.hypotheses.search.FACTS`).
+        parents: (N,) int64, for a refit the motion of the search that it goes back to, else itself.
+        searched: how many are of the search.
+    """
+
+    poses: np.ndarray
+    facts: np.ndarray
+    parents: np.ndarray
+    searched: int
+
+
+@dataclass(frozen=True, eq=False)
+class Scores:
+    """A scorer's answer.
+
+    Args:
+        score: (N,) of the candidates; larger is more likely the camera's motion.
+        best: (R,) int64, the candidates worth a fit inside their mask.
+        masks: (R, h, w) for each of them the probability of every pixel of being static.
+        confidence: probability, 0 to 1, that the candidate with the largest score is right.
+    """
+
+    score: np.ndarray
+    best: np.ndarray
+    masks: np.ndarray
+    confidence: float
+
+
+class Scorer(Protocol):
+    """Scores the motions of a pair by what they leave unexplained, pixel by pixel."""
+
+    def score(
+        self,
+        maps: GridMaps,
+        candidates: Candidates,
+        prior: MotionPrior | None,
+        static: np.ndarray | None,
+        masks: int,
+    ) -> Scores:
+        """Scores of all candidates, and masks for the best of them.
+
+        Args:
+            maps: the pixels.
+            candidates: the motions.
+            prior: what is known of the motion, or None.
+            static: (h, w) probability of being static that a network predicts, or None.
+            masks: how many masks are wanted at most.
+        """
+
+
+@dataclass(frozen=True, eq=False)
+class Selection:
+    """The motion selected.
+
+    Args:
+        T_curr_prev: (4, 4).
+        noise: (flow px, log depth) standard deviations found with it.
+        mask: (h, w) weights on the coarse grid that it was fitted with, or None for all.
+        coverage: share of the usable pixels' weight that the mask leaves.
+        confidence: the selector's own probability, 0 to 1, that it is right.
+        probability: the same, calibrated.
+        hypotheses: all candidates, the one selected first.
+        iterations: Gauss-Newton steps spent on it.
+    """
+
+    T_curr_prev: np.ndarray
+    noise: tuple[float, float]
+    mask: np.ndarray | None
+    coverage: float
+    confidence: float
+    probability: float
+    hypotheses: tuple[Hypothesis, ...]
+    iterations: int
+
+
+class Selector(Protocol):
+    """Chooses the camera's motion."""
+
+    def select(
+        self,
+        found: HypothesisSet,
+        prior: MotionPrior | None = None,
+        prediction: MotionPrediction | None = None,
+    ) -> Selection:
+        """The motion selected.
+
+        Args:
+            found: the motions of the search.
+            prior: what is known of the motion, or None.
+            prediction: of a network: one candidate more, and where it sees the static scene.
+        """
+
+
+class CueSelector:
+    """By hand-made cues, see :mod:`hybridvo.hypotheses.cues`."""
+
+    def select(
+        self,
+        found: HypothesisSet,
+        prior: MotionPrior | None = None,
+        prediction: MotionPrediction | None = None,
+    ) -> Selection:
+        """See :class:`Selector`; a prediction is not looked at."""
+        candidates = _searched(found)
+        scores = cue_scores(found, hypotheses(found, candidates), prior)
+        ordered = np.sort(scores)[::-1]
+        probability = 1.0
+        if found.is_ambiguous and len(scores) > 1:
+            slope, offset = CUE_GAP
+            probability = float(1 / (1 + np.exp(-slope * (ordered[0] - ordered[1]) - offset)))
+        return _selection(found, candidates, scores, [None] * len(scores), probability)
+
+
+class MaskSelector:
+    """By a scorer and its masks: score, fit again inside masks, score again.
+
+    Args:
+        scorer: of the candidates.
+        options: ``select`` and ``refine`` are read.
+    """
+
+    def __init__(self, scorer: Scorer, options: Options | None = None) -> None:
+        self.scorer, self.options = scorer, options or Options()
+
+    def select(
+        self,
+        found: HypothesisSet,
+        prior: MotionPrior | None = None,
+        prediction: MotionPrediction | None = None,
+    ) -> Selection:
+        """See :class:`Selector`."""
+        candidates = _searched(found)
+        if not found.is_ambiguous:
+            return _selection(found, candidates, np.zeros(1), [None], 1.0)
+        maps, limits = found.maps(), self.options.select
+        masks: list[np.ndarray | None] = [None] * candidates.searched
+        static = None
+        if prediction is not None:
+            static = found.grid.resample(prediction.static_probability)
+            candidates = self._refit(
+                found, candidates, masks, [(prediction.T_curr_prev[:3], mask_weights(static), None)]
+            )
+        scores = self.scorer.score(maps, candidates, prior, static, limits.refits)
+        entries = [
+            (candidates.poses[k], mask_weights(mask), int(candidates.parents[k]))
+            for k, mask in zip(scores.best, scores.masks, strict=True)
+        ]
+        candidates = self._refit(found, candidates, masks, entries)
+        if len(candidates.poses) > len(scores.score):
+            scores = self.scorer.score(maps, candidates, prior, static, 0)
+        return _selection(found, candidates, scores.score, masks, scores.confidence)
+
+    def _refit(
+        self,
+        found: HypothesisSet,
+        candidates: Candidates,
+        masks: list[np.ndarray | None],
+        entries: Sequence[tuple[np.ndarray, np.ndarray, int | None]],
+    ) -> Candidates:
+        """The candidates with one fit more for each (start, weights, parent); extends ``masks``."""
+        poses, facts, parents = (
+            [*x] for x in (candidates.poses, candidates.facts, candidates.parents)
+        )
+        cutoff = self.options.refine.cutoff
+        for start, weights, parent in entries:
+            if _coverage(found, weights) < MIN_COVERAGE:
+                continue
+            pose, fact = fit_in_mask(
+                found.grid.samples, weights, found.grid.pixels.K, start, cutoff
+            )
+            if np.isfinite(pose).all() and fact[search.SHARE] > 0:
+                if parent is None:
+                    parent = nearest_motion(found.poses, start, found.depth_scale)
+                poses.append(pose)
+                facts.append(fact)
+                parents.append(parent)
+                masks.append(weights)
+        return replace(
+            candidates,
+            poses=np.stack(poses),
+            facts=np.stack(facts),
+            parents=np.array(parents, np.int64),
+        )
+
+
+def mask_weights(probability: np.ndarray, ramp: tuple[float, float] = MASK_RAMP) -> np.ndarray:
+    """Weights of a fit from probabilities of being static: 0 below the ramp, 1 above it."""
+    low, high = ramp
+    return np.clip((probability - low) / (high - low), 0.0, 1.0).astype(np.float32)
+
+
+def nearest_motion(poses: np.ndarray, pose: np.ndarray, depth_scale: float) -> int:
+    """Index of the motion (N, 3, 4) nearest to another (3, 4); metres count 1 / depth radians."""
+    T = pose_matrix(pose)
+    steps = np.array([se3_log(T @ invert(pose_matrix(P))) for P in poses])
+    length = (steps * np.array([depth_scale] * 3 + [1.0] * 3)) ** 2
+    return int(np.argmin(length.sum(axis=1)))
+
+
+def hypotheses(found: HypothesisSet, candidates: Candidates) -> list[Hypothesis]:
+    """The candidates with their inliers, in their order."""
+    grid = found.grid
+    h, w, stride = grid.shape
+    work, noise = solver.new_work(), np.empty(3, np.float32)
+    total = max(float(grid.weight.sum()), 1e-9)
+    made = []
+    for pose, fact in zip(candidates.poses, candidates.facts, strict=True):
+        inliers = np.empty(grid.count, np.float32)
+        flow_noise, depth_noise = float(fact[search.FLOW_NOISE]), float(fact[search.DEPTH_NOISE])
+        solver.set_noise(max(flow_noise, MIN_NOISE_PX), depth_noise, SUPPORT_CUTOFF, noise)
+        solver.robust_weights(grid.samples, grid.count, pose, grid.pixels.K, noise, work, inliers)
+        name = SOURCES.get(int(fact[search.SOURCE]), "start")
+        share = float(np.where(grid.weight > 0, inliers, 0) @ grid.weight) / total
+        T, shape = pose_matrix(pose), inliers.reshape(h, w)
+        made.append(Hypothesis(T, name, share, flow_noise, depth_noise, shape, stride))
+    return made
+
+
+def _searched(found: HypothesisSet) -> Candidates:
+    return Candidates(found.poses, found.facts, np.arange(len(found.poses)), len(found.poses))
+
+
+def _coverage(found: HypothesisSet, weights: np.ndarray) -> float:
+    """Share of the usable pixels' weight that a mask leaves."""
+    return float(found.grid.weight @ weights.reshape(-1)) / max(
+        float(found.grid.weight.sum()), 1e-9
+    )
+
+
+def _selection(
+    found: HypothesisSet,
+    candidates: Candidates,
+    scores: np.ndarray,
+    masks: Sequence[np.ndarray | None],
+    confidence: float,
+) -> Selection:
+    """The candidate with the largest score."""
+    scores = np.nan_to_num(scores, nan=-np.inf)
+    order = np.argsort(-scores, kind="stable")
+    best = int(order[0])
+    motions = hypotheses(found, candidates)
+    fact, mask = candidates.facts[best], masks[best]
+    return Selection(
+        T_curr_prev=pose_matrix(candidates.poses[best]),
+        noise=(float(fact[search.FLOW_NOISE]), float(fact[search.DEPTH_NOISE])),
+        mask=mask,
+        coverage=1.0 if mask is None else _coverage(found, mask),
+        confidence=float(np.nan_to_num(confidence)),
+        probability=float(np.nan_to_num(confidence)),
+        hypotheses=tuple(replace(motions[k], score=float(scores[k])) for k in order),
+        iterations=int(fact[search.ITERATIONS]),
+    )

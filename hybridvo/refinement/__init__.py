@@ -1,0 +1,1 @@
+"""Refinement of a camera motion on flow, depth and images, with its covariance."""

@@ -1,0 +1,172 @@
+"""The depth of the current frame as a third residual per pixel (numba).
+
+rz = log D_curr(x + F) - log Z'. Given the flow residual r it is Gaussian with mean k^T r,
+k = h sd^2 Sigma^-1 q, where h = dlogZ'/dlogZ = 1 - tz/Z' and Sigma, q are those of
+:mod:`hybridvo.refinement.kernels`: both residuals share the error of the previous depth. So the
+full 3x3
+covariance enters as one more scalar residual, rz - k^T r, with the Jacobian row Jz - k^T J, Jz =
+(0, 0, i, b, -a, 0), that adds to the same normal equations. Its variance is estimated.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from hybridvo.compilation import njit
+from hybridvo.refinement.kernels import (
+    BLOCK,
+    FASTMATH,
+    MAX_SHIFT,
+    MU,
+    MV,
+    PD,
+    PF,
+    SUMS,
+    XN,
+    YN,
+    W,
+    Z,
+    project_block,
+)
+
+AGREEMENT = 0.05
+"""Largest relative difference between the four neighbours that are interpolated."""
+
+
+@njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
+def look_up(samples, n, step, depth, u0, v0, out):
+    """Log of the current depth at the flow target of every ``step``-th pixel; NaN outside, at edges
+    and at holes.
+    """
+    H, width = depth.shape
+    for k in range(0, n, step):
+        out[k] = np.nan
+        if not samples[W, k] > 0:
+            continue
+        u = samples[MU, k] + u0
+        v = samples[MV, k] + v0
+        if not (u >= 0 and v >= 0 and u < width - 1 and v < H - 1):
+            continue
+        i = int(u)
+        j = int(v)
+        a, b, c, d = depth[j, i], depth[j, i + 1], depth[j + 1, i], depth[j + 1, i + 1]
+        low = min(min(a, b), min(c, d))
+        high = max(max(a, b), max(c, d))
+        if low > 1e-6 and high < 1e9 and high < low * (1.0 + AGREEMENT):
+            fu = u - i
+            fv = v - j
+            top = a + fu * (b - a)
+            bottom = c + fu * (d - c)
+            out[k] = math.log(top + fv * (bottom - top))
+
+
+@njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
+def conditional(samples, k, log_depth, R, t, K, noise, row):
+    """(conditional residual, raw residual, in front) of pixel ``k``; its Jacobian in ``row``."""
+    x, y, z = samples[XN, k], samples[YN, k], samples[Z, k]
+    X = z * (R[0, 0] * x + R[0, 1] * y + R[0, 2]) + t[0]
+    Y = z * (R[1, 0] * x + R[1, 1] * y + R[1, 2]) + t[1]
+    Zc = z * (R[2, 0] * x + R[2, 1] * y + R[2, 2]) + t[2]
+    if not Zc > 1e-6:
+        return 0.0, 0.0, False
+    i = 1.0 / Zc
+    a = X * i
+    b = Y * i
+    ru = samples[MU, k] - (K[0] * a + K[2])
+    rv = samples[MV, k] - (K[1] * b + K[3])
+    qu = K[0] * i * (a * t[2] - t[0])
+    qv = K[1] * i * (b * t[2] - t[1])
+    g = noise[1] * samples[PD, k] * noise[0] * samples[PF, k]
+    raw = log_depth[k] - math.log(Zc)
+    # Jacobian and q at the depth that the flow makes most likely, as in the kernels
+    shift = g * (qu * ru + qv * rv) / (1.0 + g * (qu * qu + qv * qv))
+    shift = min(max(shift, -MAX_SHIFT), MAX_SHIFT)
+    a += qu * shift / K[0]
+    b += qv * shift / K[1]
+    i *= 1.0 - (1.0 - t[2] * i) * shift
+    qu = K[0] * i * (a * t[2] - t[0])
+    qv = K[1] * i * (b * t[2] - t[1])
+    shrink = 1.0 / (1.0 + g * (qu * qu + qv * qv))
+    h = 1.0 - t[2] * i
+    ku = h * g * shrink * qu
+    kv = h * g * shrink * qv
+    fx, fy = K[0], K[1]
+    row[0] = -ku * fx * i
+    row[1] = -kv * fy * i
+    row[2] = i + (ku * fx * a + kv * fy * b) * i
+    row[3] = b + ku * fx * a * b + kv * fy * (1.0 + b * b)
+    row[4] = -a - ku * fx * (1.0 + a * a) - kv * fy * a * b
+    row[5] = ku * fx * b - kv * fy * a
+    return raw - ku * ru - kv * rv, raw, True
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def sparse_step(n):
+    """Distance of the about 1000 pixels that :func:`depth_scale` looks at."""
+    return max(1, n // 1000)
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def depth_scale(samples, n, log_depth, robust, pose, K, noise):
+    """Robust standard deviations of (conditional residual, raw residual); 0 if too few pixels."""
+    R = pose[:, :3].astype(np.float32)
+    t = pose[:, 3].astype(np.float32)
+    row = np.empty(6)
+    step = sparse_step(n)
+    size = n // step + 1
+    one = np.empty(size)
+    two = np.empty(size)
+    m = 0
+    for k in range(0, n, step):
+        if not (robust[k] > 0.3 and abs(log_depth[k]) < 1e6):
+            continue
+        e, raw, front = conditional(samples, k, log_depth, R, t, K, noise, row)
+        if not front:
+            continue
+        one[m] = abs(e)
+        two[m] = abs(raw)
+        m += 1
+    if m < 50:
+        return 0.0, 0.0
+    return 1.4826 * np.median(one[:m]), 1.4826 * np.median(two[:m])
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def sum_depth(
+    samples, n, log_depth, pose, K, noise, sz, step, tile, columns, width, work, sums, meat
+):
+    """Add the third residual's normal equations to the tiles' ``sums`` (tiles, 27).
+
+    ``sz``: standard deviation of the conditional residual. The tile follows from the place of pixel
+    k on the grid of ``width`` pixels, ``step`` apart, with ``columns`` tiles in a row; ``meat``
+    (21,) gets the sum of w^2 s s^T.
+    """
+    R = pose[:, :3].astype(np.float32)
+    t = pose[:, 3].astype(np.float32)
+    c2 = np.float64(noise[2])
+    dummy = np.zeros(SUMS)
+    row = np.empty(6)
+    for o in range(0, n, BLOCK):
+        m = min(BLOCK, n - o)
+        project_block(samples, o, m, R, t, K, noise, work, work[8], dummy)
+        for j in range(m):
+            k = o + j
+            if not abs(log_depth[k]) < 1e6:
+                continue
+            e, _, front = conditional(samples, k, log_depth, R, t, K, noise, row)
+            if not front:
+                continue
+            v = sz * sz
+            d2 = e * e / v
+            s = c2 / (c2 + d2)
+            w = samples[W, k] * work[8, j] * s * s / v
+            at = (k // width * step // tile) * columns + k % width * step // tile
+            q = 0
+            for p in range(6):
+                for r in range(p, 6):
+                    sums[at, q] += w * row[p] * row[r]
+                    meat[q] += (w * e) * (w * e) * row[p] * row[r]
+                    q += 1
+                sums[at, 21 + p] += w * e * row[p]

@@ -1,0 +1,417 @@
+"""Numba kernels of the refinement: one pass over the pixels gives the 6x6 normal equations.
+
+The same definition as :mod:`hybridvo.refinement.torch_factors`; a test holds both equal. Pixels are
+gathered into short structure-of-arrays buffers that stay in the L1 cache, and branch-free loops sum
+over them in float32 per block, float64 in total. Nothing here changes thread settings.
+
+Per pixel, with X' = T X, a = X'/Z', b = Y'/Z', i = 1/Z' (conventions of :mod:`hybridvo.types`):
+
+- residual r = (x + F) - pi(X');
+- Jacobian of pi(X') with respect to the left perturbation (translation, rotation):
+  diag(fx, fy) B, B = [[i, 0, -a i, -a b, 1 + a^2, -b], [0, i, -b i, -(1 + b^2), a b, a]];
+- q = d pi(X') / d log Z = (fx i (a tz - tx), fy i (b tz - ty));
+- covariance sf^2 v_f I + sd^2 v_d q q^T (flow noise and propagated depth noise);
+- robust weight of Geman-McClure, (c^2 / (c^2 + d^2))^2, of the squared Mahalanobis distance d^2;
+- B and q are taken at log Z + e, e = sd^2 v_d q^T Sigma^-1 r, the posterior mean of the true log
+  depth. At the measured depth its error correlates with the residual's, and the translation comes
+  out wrong by a share of about sd^2 (errors in variables): many standard deviations on a full grid.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hybridvo.compilation import intrinsic, njit, types
+
+FASTMATH = {"reassoc", "contract", "arcp", "nsz"}  # not nnan/ninf: invalid values are tested for
+
+XN, YN, Z, MU, MV, PF, PD, W = range(8)
+"""Rows of a pixel buffer: ray x, ray y, depth, flow target u, v, inverse relative flow variance,
+relative depth variance, external weight (0 where the pixel cannot be used)."""
+BUFFER_ROWS = 8
+WORK_ROWS = 9
+BLOCK = 512
+
+SUMS = 30
+"""Length of an accumulator: 21 upper-triangle sums of the Hessian, 6 of the gradient, cost, sum of
+robust weights, sum of external weights."""
+COST = 27
+"""Place of the cost in it."""
+
+HAS_FLOW_VARIANCE, HAS_DEPTH_VARIANCE, HAS_WEIGHTS, HAS_VALID = 1, 2, 4, 8
+
+MIN_DEPTH = np.float32(1e-6)
+MAX_VALUE = np.float32(1e9)
+MAX_TRUST = np.float32(1e6)
+MAX_DOUBT = np.float32(1e9)
+"""Largest inverse flow variance and depth variance of a pixel, relative to the typical ones: what
+is handed in may be anything, and squares of it must stay finite."""
+MAX_SHIFT = np.float32(0.3)
+"""Largest correction of log depth that an outlier may cause."""
+ONE = np.float32(1.0)
+ZERO = np.float32(0.0)
+
+
+@intrinsic
+def keep_apart(typing_context):
+    """Forbid LLVM to inline the calling function.
+
+    Inlined into a loop over rows its reductions are no longer recognised and the vector code is
+    lost (measured: 27 ns a pixel instead of 4).
+    """
+
+    def codegen(context, builder, signature, args):
+        builder.function.attributes.add("noinline")
+        return context.get_dummy_value()
+
+    return types.none(), codegen
+
+
+@njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
+def gather_row(v, u0, u1, data, camera, flags, scale, buf):
+    """Fill ``buf`` with columns ``u0 .. u1 - 1`` of row ``v`` of the picture.
+
+    ``data`` = (depth, flow, flow_variance, depth_variance, weights, valid), each (H, W) but the
+    flow, (H, W, 2); absent ones are dummies, as ``flags`` says. ``camera`` = (1/fx, 1/fy, cx, cy)
+    of the previous frame. ``scale`` = (typical flow variance, typical depth variance). Unusable
+    pixels get weight 0 and harmless values.
+    """
+    keep_apart()  # type: ignore[call-arg]
+    depth, flow, flow_variance, depth_variance, weights, valid = data
+    ifx, ify, cx, cy = camera[0], camera[1], camera[2], camera[3]
+    vf = np.float32(v)
+    yn = (vf - cy) * ify
+    zrow = depth[v, u0:u1]
+    frow = flow[v, u0:u1]
+    n = u1 - u0
+    b_x, b_y, b_z, b_u, b_v = buf[XN], buf[YN], buf[Z], buf[MU], buf[MV]
+    b_f, b_d, b_w = buf[PF], buf[PD], buf[W]
+    for k in range(n):
+        b_x[k] = (np.float32(u0 + k) - cx) * ifx
+        b_y[k] = yn
+    for k in range(n):
+        b_u[k] = frow[k, 0] + np.float32(u0 + k)
+        b_v[k] = frow[k, 1] + vf
+    for k in range(n):
+        z = zrow[k]
+        mu = b_u[k]
+        mv = b_v[k]
+        good = (z > MIN_DEPTH) & (z < MAX_VALUE) & (abs(mu) < MAX_VALUE) & (abs(mv) < MAX_VALUE)
+        b_z[k] = z if good else ONE
+        b_u[k] = mu if good else ZERO
+        b_v[k] = mv if good else ZERO
+        b_w[k] = ONE if good else ZERO
+    if flags & HAS_FLOW_VARIANCE:
+        row = flow_variance[v, u0:u1]
+        for k in range(n):
+            p = row[k]
+            good = (p > ZERO) & (p < MAX_VALUE)
+            b_f[k] = min(scale[0] / (p if good else ONE), MAX_TRUST)
+            b_w[k] = b_w[k] if good else ZERO
+    else:
+        for k in range(n):
+            b_f[k] = ONE
+    if flags & HAS_DEPTH_VARIANCE:
+        row = depth_variance[v, u0:u1]
+        for k in range(n):
+            p = row[k]
+            good = (p >= ZERO) & (p < MAX_VALUE)
+            b_d[k] = min((p if good else ONE) / scale[1], MAX_DOUBT)
+            b_w[k] = b_w[k] if good else ZERO
+    else:
+        for k in range(n):
+            b_d[k] = ONE
+    if flags & HAS_WEIGHTS:
+        row = weights[v, u0:u1]
+        for k in range(n):
+            p = row[k]
+            b_w[k] = b_w[k] * (p if (p > ZERO) & (p < MAX_VALUE) else ZERO)
+    if flags & HAS_VALID:
+        vrow = valid[v, u0:u1]
+        for k in range(n):
+            b_w[k] = b_w[k] if vrow[k] else ZERO
+
+
+@njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
+def gather_grid(stride, data, camera, flags, scale, out):
+    """Gather every ``stride``-th pixel of both axes into ``out`` (BUFFER_ROWS, h w).
+
+    The grid starts half a stride in, so that its centre is that of the picture. Returns (h, w).
+    """
+    H, width = data[0].shape
+    first = stride // 2
+    h = (H - first + stride - 1) // stride
+    w = (width - first + stride - 1) // stride
+    buf = np.empty((BUFFER_ROWS, width), np.float32)
+    for r in range(h):
+        gather_row(first + r * stride, 0, width, data, camera, flags, scale, buf)
+        for q in range(BUFFER_ROWS):
+            for k in range(w):
+                out[q, r * w + k] = buf[q, first + k * stride]
+    return h, w
+
+
+@njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
+def project_block(buf, o, n, R, t, K, noise, work, robust, acc):
+    """First stage, pixels ``o .. o + n - 1``: residuals, robust weights, weighted information.
+
+    ``K`` = (fx, fy, cx, cy) of the current frame; ``noise`` = (1/sf^2, sd^2, c^2); all float32.
+    ``work`` rows: a, b, i, m00, m01, m11 (information in units of B), n0, n1 (gradient).
+    ``robust`` (N,): robust weight without the external one, 0 where unusable.
+    """
+    keep_apart()  # type: ignore[call-arg]
+    fx, fy, cx, cy = K[0], K[1], K[2], K[3]
+    r00, r01, r02 = R[0, 0], R[0, 1], R[0, 2]
+    r10, r11, r12 = R[1, 0], R[1, 1], R[1, 2]
+    r20, r21, r22 = R[2, 0], R[2, 1], R[2, 2]
+    tx, ty, tz = t[0], t[1], t[2]
+    isf2, sd2, c2 = noise[0], noise[1], noise[2]
+    b_x, b_y, b_z, b_u = buf[XN][o:], buf[YN][o:], buf[Z][o:], buf[MU][o:]
+    b_v, b_f, b_d, b_w = buf[MV][o:], buf[PF][o:], buf[PD][o:], buf[W][o:]
+    A, B, IZ, M0, M1, M2 = work[0], work[1], work[2], work[3], work[4], work[5]
+    N0, N1 = work[6], work[7]
+    cost = wsum = count = ZERO
+    for k in range(n):
+        xn = b_x[k]
+        yn = b_y[k]
+        z = b_z[k]
+        X = z * (r00 * xn + r01 * yn + r02) + tx
+        Y = z * (r10 * xn + r11 * yn + r12) + ty
+        Zc = z * (r20 * xn + r21 * yn + r22) + tz
+        front = Zc > MIN_DEPTH
+        i = ONE / (Zc if front else ONE)
+        wx = b_w[k] if front else ZERO
+        a = X * i
+        b = Y * i
+        ru = b_u[k] - (fx * a + cx)
+        rv = b_v[k] - (fy * b + cy)
+        qu = fx * i * (a * tz - tx)
+        qv = fy * i * (b * tz - ty)
+        ip = isf2 * b_f[k]
+        g = sd2 * b_d[k] * ip
+        # the depth that the residual makes most likely (see the module's docstring)
+        shift = g * (qu * ru + qv * rv) / (ONE + g * (qu * qu + qv * qv))
+        shift = min(max(shift, -MAX_SHIFT), MAX_SHIFT)
+        a += qu * shift / fx
+        b += qv * shift / fy
+        i *= ONE - (ONE - tz * i) * shift
+        qu = fx * i * (a * tz - tx)
+        qv = fy * i * (b * tz - ty)
+        kap = g / (ONE + g * (qu * qu + qv * qv))
+        dot = kap * (qu * ru + qv * rv)
+        n0 = ip * (ru - dot * qu)
+        n1 = ip * (rv - dot * qv)
+        d2 = ru * n0 + rv * n1
+        s = c2 / (c2 + d2)
+        s2 = s * s if wx > ZERO else ZERO
+        robust[k] = s2
+        w = wx * s2
+        wf = w * ip
+        A[k] = a
+        B[k] = b
+        IZ[k] = i
+        M0[k] = wf * (ONE - kap * qu * qu) * fx * fx
+        M1[k] = -wf * kap * qu * qv * fx * fy
+        M2[k] = wf * (ONE - kap * qv * qv) * fy * fy
+        N0[k] = w * fx * n0
+        N1[k] = w * fy * n1
+        cost += wx * s * d2
+        wsum += w
+        count += wx
+    acc[27] += np.float32(0.5) * cost
+    acc[28] += wsum
+    acc[29] += count
+
+
+@njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
+def sum_translation(o, n, work, acc):
+    """Second stage, pixels ``o .. o + n - 1`` of the block: the rows of H and g that belong to the
+    translation.
+    """
+    keep_apart()  # type: ignore[call-arg]
+    A, B, IZ = work[0][o:], work[1][o:], work[2][o:]
+    M0, M1, M2 = work[3][o:], work[4][o:], work[5][o:]
+    N0, N1 = work[6][o:], work[7][o:]
+    h00 = h01 = h02 = h03 = h04 = h05 = ZERO
+    h11 = h12 = h13 = h14 = h15 = ZERO
+    h22 = h23 = h24 = h25 = ZERO
+    g0 = g1 = g2 = ZERO
+    for k in range(n):
+        a = A[k]
+        b = B[k]
+        i = IZ[k]
+        ab = a * b
+        aa = ONE + a * a
+        bb = ONE + b * b
+        k0 = M0[k] * i
+        k1 = M1[k] * i
+        k2 = M2[k] * i
+        c02 = -(k0 * a + k1 * b)
+        c12 = -(k1 * a + k2 * b)
+        c03 = -(k0 * ab + k1 * bb)
+        c13 = -(k1 * ab + k2 * bb)
+        c04 = k0 * aa + k1 * ab
+        c14 = k1 * aa + k2 * ab
+        c05 = k1 * a - k0 * b
+        c15 = k2 * a - k1 * b
+        h00 += k0 * i
+        h01 += k1 * i
+        h11 += k2 * i
+        h02 += c02 * i
+        h12 += c12 * i
+        h03 += c03
+        h04 += c04
+        h05 += c05
+        h13 += c13
+        h14 += c14
+        h15 += c15
+        h22 -= (a * c02 + b * c12) * i
+        h23 -= a * c03 + b * c13
+        h24 -= a * c04 + b * c14
+        h25 -= a * c05 + b * c15
+        x = N0[k] * i
+        y = N1[k] * i
+        g0 += x
+        g1 += y
+        g2 -= a * x + b * y
+    acc[0] += h00
+    acc[1] += h01
+    acc[2] += h02
+    acc[3] += h03
+    acc[4] += h04
+    acc[5] += h05
+    acc[6] += h11
+    acc[7] += h12
+    acc[8] += h13
+    acc[9] += h14
+    acc[10] += h15
+    acc[11] += h22
+    acc[12] += h23
+    acc[13] += h24
+    acc[14] += h25
+    acc[21] += g0
+    acc[22] += g1
+    acc[23] += g2
+
+
+@njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
+def sum_rotation(o, n, work, acc):
+    """Third stage: the rows of H and g that belong to the rotation."""
+    keep_apart()  # type: ignore[call-arg]
+    A, B = work[0][o:], work[1][o:]
+    M0, M1, M2 = work[3][o:], work[4][o:], work[5][o:]
+    N0, N1 = work[6][o:], work[7][o:]
+    h33 = h34 = h35 = h44 = h45 = h55 = ZERO
+    g3 = g4 = g5 = ZERO
+    for k in range(n):
+        a = A[k]
+        b = B[k]
+        m0 = M0[k]
+        m1 = M1[k]
+        m2 = M2[k]
+        x = N0[k]
+        y = N1[k]
+        ab = a * b
+        aa = ONE + a * a
+        bb = ONE + b * b
+        c03 = m0 * ab + m1 * bb
+        c13 = m1 * ab + m2 * bb
+        c04 = m0 * aa + m1 * ab
+        c14 = m1 * aa + m2 * ab
+        c05 = m1 * a - m0 * b
+        c15 = m2 * a - m1 * b
+        h33 += ab * c03 + bb * c13
+        h34 -= ab * c04 + bb * c14
+        h35 -= ab * c05 + bb * c15
+        h44 += aa * c04 + ab * c14
+        h45 += aa * c05 + ab * c15
+        h55 += a * c15 - b * c05
+        g3 -= ab * x + bb * y
+        g4 += aa * x + ab * y
+        g5 += a * y - b * x
+    acc[15] += h33
+    acc[16] += h34
+    acc[17] += h35
+    acc[18] += h44
+    acc[19] += h45
+    acc[20] += h55
+    acc[24] += g3
+    acc[25] += g4
+    acc[26] += g5
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def sum_samples(samples, n, R, t, K, noise, work, acc):
+    """Normal equations of gathered pixels, set in ``acc`` (30,) float64."""
+    acc[:] = 0.0
+    for o in range(0, n, BLOCK):
+        m = min(BLOCK, n - o)
+        project_block(samples, o, m, R, t, K, noise, work, work[8], acc)
+        sum_translation(0, m, work, acc)
+        sum_rotation(0, m, work, acc)
+
+
+@njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
+def score_block(o, n, c2, external, work, rows, factors):
+    """Write w s = w J^T Sigma^-1 r of each pixel to ``rows`` (6, N), and to ``factors`` (N,) what
+    makes its outer product the curvature of the robust weights, ``-2 (dw / dd^2) s s^T``.
+
+    Subtracted from the Gauss-Newton Hessian the curvature gives the derivative of the estimating
+    equation, the "bread" of the sandwich covariance; the plain outer products are its "meat" under
+    independent errors.
+    """
+    keep_apart()  # type: ignore[call-arg]
+    A, B, IZ, N0, N1, S = work[0], work[1], work[2], work[6], work[7], work[8]
+    r0, r1, r2, r3, r4, r5 = (
+        rows[0][o:], rows[1][o:], rows[2][o:], rows[3][o:], rows[4][o:], rows[5][o:]
+    )  # fmt: skip
+    f, e = factors[o:], external[o:]
+    for k in range(n):
+        good = S[k] > np.float32(1e-12)  # elsewhere anything may stand, not a number either
+        a = A[k] if good else ZERO
+        b = B[k] if good else ZERO
+        i = IZ[k] if good else ZERO
+        x = N0[k] if good else ZERO
+        y = N1[k] if good else ZERO
+        c = a * x + b * y
+        r0[k] = x * i
+        r1[k] = y * i
+        r2[k] = -c * i
+        r3[k] = -(b * c + y)
+        r4[k] = a * c + x
+        r5[k] = a * y - b * x
+        # row = w s with w = x_w S, S = (c2 / (c2 + d2))^2; wanted 4 w / (c2 + d2) s s^T
+        f[k] = 4.0 / (np.float64(c2) * e[k] * np.sqrt(S[k])) if good else 0.0  # e as small as 1e-38
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def score_pixels(samples, n, R, t, K, noise, work, rows, factors, acc):
+    """:func:`score_block` of gathered pixels; cost and weights are added to ``acc`` (30,)."""
+    for o in range(0, n, BLOCK):
+        m = min(BLOCK, n - o)
+        project_block(samples, o, m, R, t, K, noise, work, work[8], acc)
+        score_block(o, m, noise[2], samples[W], work, rows, factors)
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def sum_tiles(data, camera, flags, scale, R, t, K, noise, band, tile, weights, sums, out):
+    """One pass over the rows of one band of tiles of the full grid.
+
+    Adds the normal equations of each tile to ``sums`` (rows of tiles, columns of tiles, 27), cost
+    and weights to ``out`` (30,), and writes the robust weights (without the external ones) to
+    ``weights`` (H, W).
+    """
+    H, width = data[0].shape
+    # whole tiles that stay in the L1 cache, in rows that do not fall into the same of its sets
+    part = max(1, BLOCK // tile) * tile
+    buf = np.empty((BUFFER_ROWS, part + 16), np.float32)
+    work = np.empty((WORK_ROWS, part + 16), np.float32)
+    for v in range(band * tile, min(H, (band + 1) * tile)):
+        for u0 in range(0, width, part):
+            n = min(part, width - u0)
+            gather_row(v, u0, u0 + n, data, camera, flags, scale, buf)
+            project_block(buf, 0, n, R, t, K, noise, work, weights[v, u0:], out)
+            for o in range(0, n, tile):
+                m = min(tile, n - o)
+                sum_translation(o, m, work, sums[band, (u0 + o) // tile])
+                sum_rotation(o, m, work, sums[band, (u0 + o) // tile])

@@ -1,0 +1,339 @@
+"""Numba kernels of the photometric term: which pixels, and their residuals and Jacobians.
+
+Per pixel x of the previous picture with grey value A, at a pose T (X' = T X, a = X'/Z', b = Y'/Z',
+i = 1/Z'):
+
+- residual r = B(pi(X')) - gain A - offset, B read by cubic convolution (Catmull-Rom): bilinear
+  reading blurs by an amount that depends on the place between the pixels, which pulls the motion
+  towards places of equal blur (measured: twice the error on clean pictures);
+- image gradient G of B at pi(X') from the gradient of A at x, carried over by the warp of a patch
+  of constant depth (inverse compositional, Baker and Matthews, IJCV 2004): the noise of a central
+  difference at x is independent of the noise of A at x, so noise alone moves nothing;
+- Jacobian of r: G^T diag(fx, fy) B_x with respect to the left perturbation (B_x as in
+  :mod:`hybridvo.refinement.kernels`), -A for the gain, -1 for the offset, and G^T q grad(log Z)
+  for a shift of the depth map, q = d pi(X') / d log Z;
+- variance s^2 + sd^2 v_d (G^T q)^2, s the noise of the residual in grey levels;
+- robust weight of Geman-McClure, (c^2 / (c^2 + d^2))^2 with d^2 = r^2 / variance.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hybridvo.compilation import njit
+from hybridvo.refinement.kernels import FASTMATH, MAX_VALUE, MIN_DEPTH, ONE, ZERO, keep_apart
+
+XN, YN, Z, GREY, GX, GY, PD, W, SU, SV = range(10)
+"""Rows of a pixel buffer: ray x, ray y, depth, grey value, its gradient, relative depth variance,
+weight, gradient of log depth (per px)."""
+BUFFER_ROWS = 10
+POSE_COLUMNS = 6
+COLUMNS = 8
+"""Columns of the solve: translation, rotation, gain, offset."""
+ALL_COLUMNS = 10
+"""And the shift of the depth map, px, along u and v."""
+GQ = 10
+"""Row of the Jacobian that holds G^T q, for the variance."""
+JACOBIAN_ROWS = 11
+MARGIN = 3
+"""Pixels this close to the border are not read: gradients and cubic reading need neighbours."""
+HALF = np.float32(0.5)
+BLOCK = 512
+LEAST_AREA = np.float32(1e-3)
+"""A patch whose area shrinks below this share is seen edge-on."""
+STEEP = np.float32(0.2)
+"""A change of log depth over two pixels above this is an edge, where the shift means nothing."""
+
+
+@njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
+def strength_row(v, grey, depth, weights, least, out):
+    """Squared gradient of the usable pixels of row ``v``, 0 for the others."""
+    keep_apart()  # type: ignore[call-arg]
+    before, here, after = grey[v - 1], grey[v], grey[v + 1]
+    zrow, wrow = depth[v], weights[v]
+    for u in range(MARGIN, here.shape[0] - MARGIN):
+        gx = here[u + 1] - here[u - 1]
+        gy = after[u] - before[u]
+        strength = gx * gx + gy * gy
+        z = zrow[u]
+        usable = (wrow[u] >= least) & (z > MIN_DEPTH) & (z < MAX_VALUE) & (strength < MAX_VALUE)
+        out[u] = strength if usable else ZERO
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def select_pixels(grey, depth, weights, least, cell, per_cell, index):
+    """The ``per_cell`` usable pixels of strongest gradient in every cell of ``cell`` px.
+
+    ``index`` (N, 2) int32 gets (v, u); returns how many. Usable: weight of at least ``least``,
+    valid depth, off the border.
+    """
+    H, width = grey.shape
+    cells = (width - 2 * MARGIN + cell - 1) // cell
+    best = np.empty((cells, per_cell), np.float32)
+    place = np.empty((cells, per_cell, 2), np.int32)
+    row = np.empty(width, np.float32)
+    last = per_cell - 1
+    n = 0
+    for v0 in range(MARGIN, H - MARGIN, cell):
+        best[:] = ZERO
+        for v in range(v0, min(v0 + cell, H - MARGIN)):
+            strength_row(v, grey, depth, weights, least, row)
+            for c in range(cells):
+                u0 = MARGIN + c * cell
+                for u in range(u0, min(u0 + cell, width - MARGIN)):
+                    strength = row[u]
+                    if not strength > best[c, last]:
+                        continue
+                    k = last
+                    while k > 0 and best[c, k - 1] < strength:
+                        best[c, k] = best[c, k - 1]
+                        place[c, k] = place[c, k - 1]
+                        k -= 1
+                    best[c, k] = strength
+                    place[c, k, 0] = v
+                    place[c, k, 1] = u
+        for c in range(cells):
+            for k in range(per_cell):
+                if best[c, k] > ZERO and n < index.shape[0]:
+                    index[n] = place[c, k]
+                    n += 1
+    return n
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def gather_pixels(index, n, grey, depth, weights, depth_variance, typical, camera, out):
+    """Fill ``out`` (BUFFER_ROWS, N) for the chosen pixels; ``camera`` = (1/fx, 1/fy, cx, cy).
+
+    ``depth_variance`` is (1, 1) where there is none, ``typical`` its unit.
+    """
+    has_variance = depth_variance.shape[0] > 1
+    for k in range(n):
+        v, u = index[k, 0], index[k, 1]
+        z = depth[v, u]
+        out[XN, k] = (np.float32(u) - camera[2]) * camera[0]
+        out[YN, k] = (np.float32(v) - camera[3]) * camera[1]
+        out[Z, k] = z
+        out[GREY, k] = grey[v, u]
+        out[GX, k] = HALF * (grey[v, u + 1] - grey[v, u - 1])
+        out[GY, k] = HALF * (grey[v + 1, u] - grey[v - 1, u])
+        out[W, k] = min(weights[v, u], ONE)
+        out[PD, k] = ONE
+        if has_variance:
+            p = depth_variance[v, u]
+            good = (p >= ZERO) & (p < MAX_VALUE)
+            out[PD, k] = p / typical if good else ONE
+            if not good:
+                out[W, k] = ZERO
+        out[SU, k] = log_slope(depth[v, u - 1], z, depth[v, u + 1])
+        out[SV, k] = log_slope(depth[v - 1, u], z, depth[v + 1, u])
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def log_slope(before, here, after):
+    """Slope of log depth per px; 0 at edges and invalid neighbours."""
+    if not (before > MIN_DEPTH and before < MAX_VALUE and after > MIN_DEPTH and after < MAX_VALUE):
+        return ZERO
+    slope = HALF * (after - before) / here
+    return slope if abs(slope) < HALF * STEEP else ZERO
+
+
+@njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
+def read_cubic(image, u, v):
+    """Value of ``image`` at (u, v) by cubic convolution with a = -1/2 (Keys 1981)."""
+    iu = int(u)
+    iv = int(v)
+    f = u - np.float32(iu)
+    g = v - np.float32(iv)
+    ff = f * f
+    fff = ff * f
+    x0 = HALF * (-fff + ff + ff - f)
+    x1 = HALF * (fff + fff + fff - (ff + ff + ff + ff + ff)) + ONE
+    x2 = HALF * (-(fff + fff + fff) + (ff + ff + ff + ff) + f)
+    x3 = HALF * (fff - ff)
+    gg = g * g
+    ggg = gg * g
+    y0 = HALF * (-ggg + gg + gg - g)
+    y1 = HALF * (ggg + ggg + ggg - (gg + gg + gg + gg + gg)) + ONE
+    y2 = HALF * (-(ggg + ggg + ggg) + (gg + gg + gg + gg) + g)
+    y3 = HALF * (ggg - gg)
+    a, b, c, d = image[iv - 1], image[iv], image[iv + 1], image[iv + 2]
+    j = iu - 1
+    return (
+        y0 * (x0 * a[j] + x1 * a[j + 1] + x2 * a[j + 2] + x3 * a[j + 3])
+        + y1 * (x0 * b[j] + x1 * b[j + 1] + x2 * b[j + 2] + x3 * b[j + 3])
+        + y2 * (x0 * c[j] + x1 * c[j + 1] + x2 * c[j + 2] + x3 * c[j + 3])
+        + y3 * (x0 * d[j] + x1 * d[j + 1] + x2 * d[j + 2] + x3 * d[j + 3])
+    )
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def project_pixels(buf, n, image, R, t, K, scale, light, J, r):
+    """Residuals and Jacobians of ``n`` pixels; returns the weight that is seen.
+
+    ``K`` = (fx, fy, cx, cy) of the current frame, ``scale`` = (1/fx, 1/fy) of the previous one,
+    ``light`` = (gain, offset), all float32. ``J`` (JACOBIAN_ROWS, N); ``r`` (N,), NaN where the
+    point is not seen.
+    """
+    H, width = image.shape
+    fx, fy, cx, cy = K[0], K[1], K[2], K[3]
+    sx, sy = fx * scale[0], fx * scale[1]
+    tx_, ty_ = fy * scale[0], fy * scale[1]
+    r00, r01, r02 = R[0, 0], R[0, 1], R[0, 2]
+    r10, r11, r12 = R[1, 0], R[1, 1], R[1, 2]
+    r20, r21, r22 = R[2, 0], R[2, 1], R[2, 2]
+    tx, ty, tz = t[0], t[1], t[2]
+    gain, offset = light[0], light[1]
+    low = np.float32(MARGIN - 1)
+    high_u = np.float32(width - MARGIN)
+    high_v = np.float32(H - MARGIN)
+    inside = 0.0
+    for k in range(n):
+        xn = buf[XN, k]
+        yn = buf[YN, k]
+        z = buf[Z, k]
+        weight = buf[W, k]
+        X = z * (r00 * xn + r01 * yn + r02) + tx
+        Y = z * (r10 * xn + r11 * yn + r12) + ty
+        Zc = z * (r20 * xn + r21 * yn + r22) + tz
+        i = ONE / (Zc if Zc > MIN_DEPTH else ONE)
+        a = X * i
+        b = Y * i
+        u = fx * a + cx
+        v = fy * b + cy
+        # d pi / d x for constant depth; the gradient of A is its transpose times that of B
+        s = z * i
+        w00 = s * sx * (r00 - a * r20)
+        w01 = s * sy * (r01 - a * r21)
+        w10 = s * tx_ * (r10 - b * r20)
+        w11 = s * ty_ * (r11 - b * r21)
+        determinant = w00 * w11 - w01 * w10
+        seen = (Zc > MIN_DEPTH) & (u > low) & (u < high_u) & (v > low) & (v < high_v)
+        if not (seen and determinant > LEAST_AREA):
+            for p in range(JACOBIAN_ROWS):
+                J[p, k] = ZERO
+            r[k] = np.nan
+            continue
+        grey = buf[GREY, k]
+        e = read_cubic(image, u, v) - gain * grey - offset
+        f = gain / determinant
+        gx = f * (w11 * buf[GX, k] - w10 * buf[GY, k])
+        gy = f * (w00 * buf[GY, k] - w01 * buf[GX, k])
+        qu = fx * i * (a * tz - tx)
+        qv = fy * i * (b * tz - ty)
+        gq = gx * qu + gy * qv
+        gx *= fx
+        gy *= fy
+        J[0, k] = gx * i
+        J[1, k] = gy * i
+        J[2, k] = -(gx * a + gy * b) * i
+        J[3, k] = -(gx * a * b + gy * (ONE + b * b))
+        J[4, k] = gx * (ONE + a * a) + gy * a * b
+        J[5, k] = gy * a - gx * b
+        J[6, k] = -grey
+        J[7, k] = -ONE
+        J[8, k] = gq * buf[SU, k]
+        J[9, k] = gq * buf[SV, k]
+        J[GQ, k] = gq
+        r[k] = e
+        inside += weight
+    return inside
+
+
+@njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
+def weigh_pixels(buf, n, noise, J, r, w):
+    """Robust weight x weight / variance in ``w`` (N,), 0 where not seen; returns the robust cost.
+
+    ``noise`` = (1/s^2, sd^2, c^2) float32. Unseen points count at the full cost.
+    """
+    keep_apart()  # type: ignore[call-arg]
+    is2, sd2, c2 = noise[0], noise[1], noise[2]
+    weights, relative, gradient = buf[W], buf[PD], J[GQ]
+    total = 0.0
+    # no sum in a loop that stores: whether that one runs in vectors, and so the order of the sum,
+    # depends on where its arrays happen to lie in memory
+    costs = np.empty(BLOCK, np.float32)
+    for o in range(0, n, BLOCK):
+        m = min(BLOCK, n - o)
+        for j in range(m):
+            k = o + j
+            gq = gradient[k]
+            e = r[k]
+            information = is2 / (ONE + is2 * sd2 * relative[k] * gq * gq)
+            d2 = e * e * information
+            seen = d2 < MAX_VALUE  # false for NaN
+            d2 = d2 if seen else ZERO
+            robust = c2 / (c2 + d2)
+            w[k] = weights[k] * robust * robust * information if seen else ZERO
+            costs[j] = HALF * weights[k] * (robust * d2 if seen else c2)
+        cost = ZERO
+        for j in range(m):
+            cost += costs[j]
+        total += cost
+    return total
+
+
+@njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
+def relight(buf, n, gain, offset, r):
+    """Residuals after a change of gain and offset by these."""
+    grey = buf[GREY]
+    for k in range(n):
+        r[k] -= gain * grey[k] + offset
+
+
+@njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
+def normal_equations(J, r, w, n, columns, H, g):
+    """``H`` = J w J^T and ``g`` = -J w r over ``n`` pixels and the first ``columns`` rows."""
+    weighted = np.empty(BLOCK, np.float32)
+    H[:, :] = 0.0
+    g[:] = 0.0
+    for o in range(0, n, BLOCK):
+        m = min(BLOCK, n - o)
+        residual = r[o : o + m]
+        weight = w[o : o + m]
+        for p in range(columns):
+            row = J[p, o : o + m]
+            s = ZERO
+            for k in range(m):
+                value = weight[k] * row[k]
+                weighted[k] = value
+                s += value * (residual[k] if weight[k] > ZERO else ZERO)
+            g[p] -= s
+            for q in range(p, columns):
+                other = J[q, o : o + m]
+                s = ZERO
+                for k in range(m):
+                    s += weighted[k] * other[k]
+                H[p, q] += s
+    for p in range(columns):
+        for q in range(p):
+            H[p, q] = H[q, p]
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def tile_scores(index, n, J, r, w, tile, columns, light, scores, curvature, meat):
+    """Sums of J w r of the pose per tile, their ``curvature`` (J w J^T), and outer products.
+
+    ``light`` (6, 2) takes the part of each pose column that gain and offset explain out of it;
+    ``meat`` (6, 6) gets the outer products of all pixels.
+    """
+    row = np.empty(POSE_COLUMNS)
+    for k in range(n):
+        weight = w[k]
+        if not weight > ZERO:
+            continue
+        cell = (index[k, 0] // tile) * columns + index[k, 1] // tile
+        for p in range(POSE_COLUMNS):
+            row[p] = J[p, k] - light[p, 0] * J[6, k] - light[p, 1] * J[7, k]
+        s = weight * r[k]
+        ss = s * s
+        for p in range(POSE_COLUMNS):
+            scores[cell, p] += s * row[p]
+            for q in range(p + 1):
+                product = row[p] * row[q]
+                curvature[cell, p, q] += weight * product
+                meat[p, q] += ss * product
+    for p in range(POSE_COLUMNS):
+        for q in range(p + 1, POSE_COLUMNS):
+            meat[p, q] = meat[q, p]
+            for cell in range(curvature.shape[0]):
+                curvature[cell, p, q] = curvature[cell, q, p]

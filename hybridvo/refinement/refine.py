@@ -1,0 +1,181 @@
+"""Refinement on flow and depth: from a start to a metric motion with covariance and status.
+
+Minimises the ego-flow reprojection error (paper, equations 6 and 8) under a Geman-McClure kernel of
+the Mahalanobis distance. Each pixel's covariance is that of its flow and of its depth, propagated;
+both noise scales are estimated from the pair.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from hybridvo.geometry import invert, pose_matrix, se3_log
+from hybridvo.options import RefineOptions
+from hybridvo.refinement.full_fit import MIN_TILES, FullFit, fit_coarse, fit_full_grid
+from hybridvo.refinement.pixels import CoarseGrid, coarse_grid
+from hybridvo.types import FramePair, Hypothesis, Reason, RelativePose, Status
+
+WEAK_RATIO = 2e-5
+"""Ratio of the information's extreme eigenvalues below which errors that neighbours share, and that
+the covariance of one small patch cannot know of, decide a direction: degraded. A frontal plane over
+a field of view of 20 degrees has 1e-4, a patch of 20 px at fx = 1120 has 1e-5."""
+MIN_INLIER_RATIO = 0.02
+"""Share of the pixels that must follow the motion, else it is none."""
+LOW_INLIER_RATIO = 0.25
+"""Share of the pixels below which the motion is degraded."""
+
+
+@dataclass(frozen=True, eq=False)
+class Context:
+    """What the selection knows of the motion to be refined.
+
+    Args:
+        noise: (flow px, log depth) standard deviations found with it, or None.
+        coverage: share of the usable pixels' weight that the static mask leaves.
+        probability: that it is the camera's motion.
+        min_probability: below which the motion is degraded.
+        hypotheses: every motion found, the selected one first.
+        iterations: Gauss-Newton steps spent so far.
+    """
+
+    noise: tuple[float, float] | None = None
+    coverage: float = 1.0
+    probability: float = 1.0
+    min_probability: float = 0.0
+    hypotheses: tuple[Hypothesis, ...] = ()
+    iterations: int = 0
+
+
+def refine_pair(
+    pair: FramePair,
+    T_init: np.ndarray,
+    grid: CoarseGrid | None = None,
+    weights: np.ndarray | None = None,
+    options: RefineOptions | None = None,
+    context: Context | None = None,
+) -> RelativePose:
+    """The motion of a pair near a start.
+
+    Args:
+        pair: two frames and their flow.
+        T_init: (4, 4) the only start.
+        grid: coarse grid of the pair, with the weights; None: it is made.
+        weights: (H, W) factors on the information of each pixel, for the grid that is made.
+        options: of the refinement.
+        context: what the selection knows.
+    """
+    options, context = options or RefineOptions(), context or Context()
+    if grid is None:
+        made = coarse_grid(pair, weights, options)
+        if isinstance(made, RelativePose):
+            return made
+        grid = made
+    pose = np.ascontiguousarray(T_init[:3], dtype=np.float64)
+    iterations, noise = context.iterations, context.noise
+    if noise is None:
+        pose, sf, sd, _, iterations = fit_coarse(
+            grid.samples, grid.count, grid.pixels.K, pose, options.cutoff
+        )
+        noise = sf, sd
+    fit = fit_full_grid(pair, grid, pose, noise, options)
+    share = min(1.0, fit.share * context.coverage)
+    weights = np.zeros(grid.size, np.float32)
+    v0, v1, u0, u1 = grid.box
+    weights[v0:v1, u0:u1] = fit.weights
+    common: dict[str, Any] = {
+        "method": "refine",
+        "terms": ("flow", "depth") if fit.uses_current_depth else ("flow",),
+        "inlier_ratio": share,
+        "iterations": iterations + fit.iterations,
+        "cost": fit.cost,
+        "residual_scale_px": fit.flow_noise,
+        "depth_noise": fit.depth_noise,
+        "weights": weights,
+        "information_eigenvalues": fit.eigenvalues,
+        "hypotheses": context.hypotheses,
+    }
+    failure = _failure(fit, share)
+    if failure is not None:
+        return RelativePose.failed(*failure, **common)
+    T = pose_matrix(fit.pose)
+    status = _status(fit, share, context)
+    covariance = fit.covariance
+    if not status.ok:
+        covariance = widened(covariance, T, fit, context)
+    spread = np.sqrt(max(np.linalg.eigvalsh(covariance[:3, :3])[-1], 0.0))
+    return RelativePose(
+        T_curr_prev=T,
+        covariance=covariance,
+        status=status,
+        translation_direction_valid=bool(np.linalg.norm(T[:3, 3]) > 3 * spread),
+        probability=context.probability,
+        **common,
+    )
+
+
+def _failure(fit: FullFit, share: float) -> tuple[Reason, str] | None:
+    """Why there is no motion, or None."""
+    if not fit.definite or not np.isfinite(fit.pose).all():
+        return (
+            Reason.DEGENERATE_GEOMETRY,
+            "the pixels leave a direction of the motion undetermined",
+        )
+    if fit.weight < 6 or share < MIN_INLIER_RATIO:
+        return Reason.LOW_INLIERS, f"{100 * share:.1f} % of the pixels follow one motion"
+    if fit.depths is not None and fit.depths.is_none:
+        return Reason.NO_VALID_DEPTH, fit.depths.doubt
+    return None
+
+
+def _status(fit: FullFit, share: float, context: Context) -> Status:
+    """Ok, or degraded with the first reason that holds."""
+    if fit.depths is not None and fit.depths.doubt:
+        return Status.degraded(Reason.NO_VALID_DEPTH, fit.depths.doubt)
+    if context.probability < context.min_probability:
+        return Status.degraded(
+            Reason.AMBIGUOUS_MOTION,
+            f"another of the motions found could be the camera's (probability of this one "
+            f"{100 * context.probability:.0f} %)",
+        )
+    if fit.eigenvalues[0] < WEAK_RATIO * fit.eigenvalues[-1]:
+        return Status.degraded(
+            Reason.DEGENERATE_GEOMETRY, "a direction of the motion is barely determined"
+        )
+    if fit.tiles < MIN_TILES:
+        return Status.degraded(
+            Reason.DEGENERATE_GEOMETRY,
+            "the pixels cover too little of the image to tell how far their errors agree",
+        )
+    if share < LOW_INLIER_RATIO:
+        return Status.degraded(
+            Reason.LOW_INLIERS, f"only {100 * share:.0f} % of the pixels follow the motion"
+        )
+    return Status()
+
+
+def widened(
+    covariance: np.ndarray, T_curr_prev: np.ndarray, fit: FullFit, context: Context
+) -> np.ndarray:
+    """(6, 6) covariance of a degraded motion that covers what is in doubt about it.
+
+    - Another motion may be the camera's: the second moment of the mixture. With probability p it is
+      this one; else one of the others found, or none, that is as far away as they or as standing
+      still. Nothing is known of the direction, so it counts alike in all.
+    - The two depths differ: the length of the translation is wrong by as much.
+    - Few tiles hold pixels: errors that agree within them are averaged over as many readings only.
+    """
+    covariance = covariance * max(1.0, MIN_TILES / max(fit.tiles, 1))
+    if context.probability < context.min_probability:
+        others = [h.T_curr_prev for h in context.hypotheses[1:]] + [np.eye(4)]
+        steps = np.array([se3_log(T_curr_prev @ invert(T)) for T in others])
+        sizes = [np.max(np.sum(steps[:, part] ** 2, axis=1)) for part in (slice(0, 3), slice(3, 6))]
+        covariance = covariance + (1 - context.probability) * np.diag(np.repeat(sizes, 3))
+    if fit.depths is not None and fit.depths.doubt:
+        t = T_curr_prev[:3, 3]
+        length = np.log(fit.depths.ratio) ** 2 + fit.depths.spread**2
+        covariance = covariance.copy()
+        covariance[:3, :3] += length * np.outer(t, t)
+    return covariance

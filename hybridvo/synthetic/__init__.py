@@ -1,0 +1,1 @@
+"""Synthetic pairs and scenes with exact ground truth."""

@@ -1,0 +1,389 @@
+"""Training pairs with what the real world adds to the paper's five steps.
+
+Rooms, streets and slanted planes with relief instead of one constant plane; static occluders at all
+depths; movers that are articulated or bend, one of which may cover most of the picture; motions
+**composed** (T_cam T_object) instead of added; sky; hidden points; cameras of any lens and crop;
+cameras that follow an actor; inputs as a flow estimator and a depth sensor deliver them.
+
+Everything is computed in inverse depth on normalised rays, so that sky is exact (0) and single
+precision suffices.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+
+from hybridvo.errors import InputError
+from hybridvo.geometry import euler_deg_to_matrix, make_transform
+from hybridvo.synthetic.layered import SKY_INVERSE_DEPTH, LayeredScene
+from hybridvo.synthetic.paper import Sample, rigid_flow
+from hybridvo.synthetic.sensors import (
+    DegradationOptions,
+    Range,
+    degrade_depth,
+    degrade_flow,
+    log_uniform,
+    sample_at,
+    smooth_field,
+)
+from hybridvo.synthetic.silhouettes import Silhouette, outline, random_silhouette
+
+
+@dataclass(frozen=True)
+class WideOptions:
+    """Options of the wide preset; ranges of two numbers are drawn log-uniformly unless said.
+
+    Args:
+        height: rows of the sample. width: columns.
+        field_of_view_deg: horizontal field of view.
+        aspect: fy / fx; pictures are stretched to the sample's shape.
+        centre_shift: largest shift of the principal point as a share of the size (crops).
+        scene_depth: metres, size of the scene.
+        room_probability: share of scenes closed on all sides; outdoor_probability: ground with
+            walls and sky; the rest are single slanted surfaces.
+        relief: largest spread of log depth of a surface's smooth relief.
+        sky_far_probability: share of skies that come as a huge depth instead of an invalid one.
+        static_layers: least and largest number of static occluders (uniform).
+        movers: least and largest number of small movers (uniform).
+        mover_radius: radius of a small mover as a share of the width.
+        still_probability: share of samples in which nothing moves but the camera.
+        large_mover_probability: share of samples with one large mover.
+        large_coverage: share of the picture that it covers (uniform).
+        articulated_probability: share of movers with limbs that turn about joints.
+        nonrigid_probability: share of movers that bend.
+        bend: spread of the bending as a share of depth.
+        follow_probability: share of samples whose camera follows the main mover.
+        follow_residual: factor on the mover's motion that is left in the picture.
+        camera_rotation_deg: median, spread of the logarithm, and largest camera rotation.
+        camera_translation: the same for the camera translation as a share of the near depth.
+        camera_translation_limit: metres, largest camera translation.
+        forward_probability: share of camera translations that are mainly along the axis.
+        object_rotation_deg: median, spread of the logarithm, and largest object rotation.
+        object_translation: the same for the object translation as a share of its depth.
+        limb_rotation_deg: the same for the rotation of a limb about its joint.
+        moving_threshold_px: a pixel moves if its true flow is that far from the ego flow.
+        flow_limit: scenes whose flow exceeds this share of the width in over a hundredth of the
+            picture are drawn again: no flow estimator follows such motion.
+        degradation: what measuring does to flow and depth.
+
+    Raises:
+        InputError: sizes, ranges or probabilities that cannot be meant.
+    """
+
+    height: int = 128
+    width: int = 256
+    field_of_view_deg: Range = (35.0, 105.0)
+    aspect: Range = (0.45, 1.8)
+    centre_shift: float = 0.1
+    scene_depth: Range = (1.0, 60.0)
+    room_probability: float = 0.4
+    outdoor_probability: float = 0.35
+    relief: float = 0.25
+    sky_far_probability: float = 0.5
+    static_layers: tuple[int, int] = (0, 7)
+    movers: tuple[int, int] = (0, 3)
+    mover_radius: Range = (0.04, 0.25)
+    still_probability: float = 0.08
+    large_mover_probability: float = 0.5
+    large_coverage: Range = (0.4, 0.87)
+    articulated_probability: float = 0.35
+    nonrigid_probability: float = 0.3
+    bend: Range = (0.002, 0.03)
+    follow_probability: float = 0.35
+    follow_residual: Range = (0.02, 0.6)
+    camera_rotation_deg: tuple[float, float, float] = (0.5, 1.1, 12.0)
+    camera_translation: tuple[float, float, float] = (0.02, 1.1, 0.3)
+    camera_translation_limit: float = 3.0
+    forward_probability: float = 0.3
+    object_rotation_deg: tuple[float, float, float] = (1.5, 1.0, 15.0)
+    object_translation: tuple[float, float, float] = (0.03, 0.9, 0.25)
+    limb_rotation_deg: tuple[float, float, float] = (4.0, 0.7, 25.0)
+    moving_threshold_px: float = 0.5
+    flow_limit: float = 0.35
+    degradation: DegradationOptions = field(default_factory=DegradationOptions)
+
+    def __post_init__(self) -> None:
+        if min(self.height, self.width) < 16:
+            raise InputError("WideOptions: expected height and width of at least 16 pixels.")
+        for name, value in vars(self).items():
+            if name.endswith("_probability") and not 0 <= value <= 1:
+                raise InputError(f"WideOptions.{name}: expected 0..1, got {value}.")
+            if isinstance(value, tuple) and len(value) == 2:
+                least = 0 if name in ("static_layers", "movers") else 1e-9
+                if not least <= value[0] <= value[1]:
+                    raise InputError(f"WideOptions.{name}: expected low <= high, got {value}.")
+        if not self.field_of_view_deg[1] < 175 or not self.large_coverage[1] < 1:
+            raise InputError("WideOptions: expected a field of view < 175 deg and a coverage < 1.")
+        if self.room_probability + self.outdoor_probability > 1:
+            raise InputError("WideOptions: room and outdoor probabilities add up to more than 1.")
+
+    def sample(self, rng: np.random.Generator) -> Sample:
+        """One pair: :func:`wide_sample`."""
+        return wide_sample(rng, self)
+
+
+def _magnitude(rng: np.random.Generator, law: tuple[float, float, float]) -> float:
+    median, spread, largest = law
+    return min(median * float(np.exp(spread * rng.standard_normal())), largest)
+
+
+def _direction(rng: np.random.Generator) -> np.ndarray:
+    v = rng.standard_normal(3)
+    return v / np.linalg.norm(v)
+
+
+def _random_turn(rng: np.random.Generator, law: tuple[float, float, float]) -> np.ndarray:
+    """(3, 3) rotation of a drawn size about a drawn axis (small angles: Euler angles serve)."""
+    return euler_deg_to_matrix(_magnitude(rng, law) * _direction(rng))
+
+
+def _about(R: np.ndarray, t: np.ndarray, centre: np.ndarray) -> np.ndarray:
+    """(4, 4) rotation about a point, then translation."""
+    return make_transform(R, centre - R @ centre + t)
+
+
+def _camera(scene: LayeredScene, follow: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Euler angles in degrees and translation in metres of the camera's T_curr_prev."""
+    o, rng = scene.options, scene.rng
+    angles = _magnitude(rng, o.camera_rotation_deg) * _direction(rng)
+    seen = scene.rho[::2, ::2]
+    seen = seen[seen > 0]
+    nearest = float(seen.max()) if seen.size else 1.0 / scene.scale
+    near = 1.0 / (float(np.quantile(seen, 0.8)) if seen.size else 1.0 / scene.scale)
+    direction = _direction(rng)
+    if rng.random() < o.forward_probability:
+        direction = direction * 0.2 + np.array([0.0, 0.0, rng.choice([-1.0, -1.0, -1.0, 1.0])])
+        direction /= np.linalg.norm(direction)
+    size = _magnitude(rng, o.camera_translation) * near * (1.5 if follow else 1.0)
+    size = min(size, o.camera_translation_limit, 0.4 / nearest)
+    return angles, size * direction
+
+
+def _add_mover(
+    scene: LayeredScene,
+    shape: Silhouette,
+    mask: np.ndarray,
+    radius: float,
+    T_cam: np.ndarray,
+    follow: float,
+) -> None:
+    """Lay a mover over the scene and give it, its limbs and its bending a motion.
+
+    Args:
+        scene: to add to.
+        shape: its outline.
+        mask: (H, W) uint8, where it is painted.
+        radius: its size in pixels.
+        T_cam: (4, 4) T_curr_prev of the camera.
+        follow: factor on the motion that is left in the picture, or 0 for a free mover.
+    """
+    o, rng = scene.options, scene.rng
+    added = scene.add(mask, in_front=True)
+    if added is None:
+        return
+    number, centre = added
+    depth = float(centre[2])
+    R = _random_turn(rng, o.object_rotation_deg)
+    t = _magnitude(rng, o.object_translation) * depth * _direction(rng) * np.array([1.0, 0.6, 0.8])
+    if follow:
+        own = _about(euler_deg_to_matrix(follow * 3.0 * _direction(rng)), follow * t, centre)
+        total = own
+    else:
+        total = T_cam @ _about(R, t, centre)
+    scene.motions[number] = total
+    if rng.random() < o.nonrigid_probability:
+        amplitude = np.float32(log_uniform(rng, o.bend) * depth)
+        cells = int(rng.integers(3, 8))
+        scene.bends[number] = amplitude * smooth_field(rng, o.height, o.width, cells, 3)
+    if rng.random() < o.articulated_probability:
+        points = shape.parts[0][0]
+        ray = centre / depth
+        middle = np.array([ray[0] * scene.fx + scene.cx, ray[1] * scene.fy + scene.cy])
+        for _ in range(int(rng.integers(1, 6))):
+            limb_radius = radius * rng.uniform(0.3, 0.8)
+            limb = outline(rng, "bar" if rng.random() < 0.6 else "superellipse")
+            joint = middle + radius * points[int(rng.integers(len(points)))] * 0.8
+            reach = limb_radius * limb[int(rng.integers(len(limb)))]
+            limb_mask = scene.new_mask()
+            place = (float(joint[0] + reach[0]), float(joint[1] + reach[1]))
+            Silhouette(((limb, True),)).draw(limb_mask, place, limb_radius)
+            part = scene.add(limb_mask, True, 1.02 / depth)
+            if part is None:
+                continue
+            joint_ray = np.array(
+                [(joint[0] - scene.cx) / scene.fx, (joint[1] - scene.cy) / scene.fy, 1.0]
+            )
+            turn = _about(_random_turn(rng, o.limb_rotation_deg), np.zeros(3), joint_ray * depth)
+            scene.motions[part[0]] = total @ turn
+
+
+def _populate(scene: LayeredScene) -> tuple[np.ndarray, np.ndarray]:
+    """Occluders and movers; returns the camera's Euler angles and translation."""
+    o, rng = scene.options, scene.rng
+    still = rng.random() < o.still_probability
+    large = not still and rng.random() < o.large_mover_probability
+    follow = 0.0
+    if not still and rng.random() < o.follow_probability:
+        follow = log_uniform(rng, o.follow_residual)
+
+    def random_place() -> tuple[float, float]:
+        return rng.uniform(0, o.width), rng.uniform(0, o.height)
+
+    def occluders(count: int) -> None:
+        for _ in range(count):
+            mask = scene.new_mask()
+            radius = o.width * log_uniform(rng, o.mover_radius)
+            random_silhouette(rng).draw(mask, random_place(), radius, log_uniform(rng, (0.4, 2.5)))
+            scene.add(mask, in_front=False)
+
+    occluders(int(rng.integers(o.static_layers[0], o.static_layers[1] + 1)))
+    angles, translation = _camera(scene, follow > 0)
+    T_cam = make_transform(euler_deg_to_matrix(angles), translation)
+    if large:
+        centre = rng.uniform(-0.1, 1.1) * o.width, rng.uniform(0.1, 1.1) * o.height
+        share = rng.uniform(*o.large_coverage)
+        shape = random_silhouette(rng, hole_probability=0.15)
+        mask, radius = shape.draw_coverage(
+            o.height, o.width, centre, share, log_uniform(rng, (0.5, 1.6))
+        )
+        _add_mover(scene, shape, mask, radius, T_cam, follow)
+    if not still:
+        count = int(rng.integers(o.movers[0], o.movers[1] + 1))
+        for index in range(count if large else max(count, 1)):
+            shape, mask = random_silhouette(rng), scene.new_mask()
+            radius = o.width * log_uniform(rng, o.mover_radius)
+            shape.draw(mask, random_place(), radius, log_uniform(rng, (0.4, 2.0)))
+            main = index == 0 and not large
+            _add_mover(scene, shape, mask, radius, T_cam, follow if main else 0.0)
+    if rng.random() < 0.4:
+        occluders(int(rng.integers(1, 3)))
+    return angles, translation
+
+
+def wide_sample(rng: np.random.Generator, options: WideOptions | None = None) -> Sample:
+    """One pair of the wide preset.
+
+    Args:
+        rng: source of randomness; the sample depends on nothing else.
+        options: defaults to the preset ``configs/data_wide.yaml``.
+    """
+    o = options or WideOptions()
+    while True:
+        scene = LayeredScene(rng, o)
+        angles, translation = _populate(scene)
+        T_cam = make_transform(euler_deg_to_matrix(angles), translation)
+        ego_flow, ego_ratio, flow, ratio = _flows(scene, T_cam)
+        if _plausible(flow, ratio, o) and _plausible(ego_flow, ego_ratio, o):
+            break
+    rho = scene.rho
+    depth = np.where(rho > 0, 1.0 / np.maximum(rho, SKY_INVERSE_DEPTH / 10), 0.0)
+    depth = depth.astype(np.float32)
+    own = np.square(flow - ego_flow)
+    moving = own[..., 0] + own[..., 1] > o.moving_threshold_px**2
+    hidden, depth_curr = _visibility(flow, rho / ratio, rho > 0)
+
+    measured, depth_prev = flow, depth
+    if rng.random() < o.sky_far_probability and not rho.all():
+        far = np.float32(rng.uniform(1e3, 1e4))
+        depth_prev = np.where(rho > 0, depth, far)
+        depth_curr = np.where((rho > 0) | hidden | (depth_curr > 0), depth_curr, far)
+    if rng.random() >= o.degradation.exact_flow_probability:
+        measured = degrade_flow(rng, flow, hidden, o.degradation)
+        depth_curr = sample_at(depth_curr, measured - flow)
+    if rng.random() >= o.degradation.exact_depth_probability:
+        depth_prev, depth_curr = degrade_depth(rng, [depth_prev, depth_curr], o.degradation)
+    return Sample(
+        flow=measured,
+        ego_flow=ego_flow,
+        depth_prev=depth_prev,
+        depth_curr=depth_curr,
+        depth_true=depth,
+        depth_target=np.maximum(depth * ego_ratio, 0.0),
+        K=np.array([[scene.fx, 0, scene.cx], [0, scene.fy, scene.cy], [0, 0, 1]], np.float32),
+        T_curr_prev=T_cam.astype(np.float32),
+        rotation_deg=angles.astype(np.float32),
+        translation=translation.astype(np.float32),
+        moving=moving,
+    )
+
+
+def _flows(
+    scene: LayeredScene, T_cam: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Ego flow (H, W, 2) and its depth ratio (H, W), total flow and its depth ratio."""
+    t_cam = T_cam[:3, 3].astype(np.float32)
+    focal = (scene.fx, scene.fy)
+    u, v, ego_ratio = rigid_flow(scene.x, scene.y, scene.rho, T_cam[:3, :3], t_cam, focal)
+    ego_flow = np.stack([u, v], axis=-1)
+    flow, ratio = ego_flow.copy(), ego_ratio.copy()
+    for number, T in enumerate(scene.motions):
+        if T is not None:
+            _move(scene, number, T, flow, ratio, focal)
+    return ego_flow, ego_ratio, flow, ratio
+
+
+def _plausible(flow: np.ndarray, ratio: np.ndarray, o: WideOptions) -> bool:
+    """Nothing is swept through the image plane, and a flow estimator could follow the motion."""
+    if not ratio.min() > 0.15:
+        return False
+    # Component by component: numpy reduces an axis of two values very slowly.
+    limit = o.flow_limit * o.width
+    large = (np.abs(flow[..., 0]) > limit) | (np.abs(flow[..., 1]) > limit)
+    return np.count_nonzero(large) <= 0.01 * large.size
+
+
+def _move(
+    scene: LayeredScene,
+    number: int,
+    T: np.ndarray,
+    flow: np.ndarray,
+    ratio: np.ndarray,
+    focal: tuple[float, float],
+) -> None:
+    """Flow and depth ratio of one mover, written into its pixels."""
+    mask = (scene.owner == number).astype(np.uint8)
+    left, top, width, height = cv2.boundingRect(mask)
+    if not width * height:
+        return
+    box = np.s_[top : top + height, left : left + width]
+    inside = mask[box] > 0
+    t = T[:3, 3].astype(np.float32)
+    bend = scene.bends[number]
+    if bend is not None:
+        t = np.moveaxis(t + bend[box], -1, 0)
+    u, v, change = rigid_flow(scene.x[box[1]], scene.y[box[0]], scene.rho[box], T[:3, :3], t, focal)
+    flow[box][inside] = np.stack([u, v], axis=-1)[inside]
+    ratio[box][inside] = change[inside]
+
+
+def _visibility(
+    flow: np.ndarray, rho_curr: np.ndarray, solid: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Who is hidden in the next frame, and the depth that is seen at x + flow.
+
+    Args:
+        flow: (H, W, 2) px, true.
+        rho_curr: (H, W) inverse depth of each moved point.
+        solid: (H, W) bool, not sky.
+
+    Returns:
+        (H, W) bool, hidden behind something nearer or outside of the picture, and (H, W) float32
+        metres of t+1 on the grid of t; 0 outside and for sky.
+    """
+    height, width = rho_curr.shape
+    u = np.rint(flow[..., 0] + np.arange(width, dtype=np.float32)).astype(np.int32)
+    v = np.rint(flow[..., 1] + np.arange(height, dtype=np.float32)[:, None]).astype(np.int32)
+    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    index = np.where(inside, v * width + u, 0)
+    front = np.zeros(height * width, np.float32)
+    np.maximum.at(front, index[inside], rho_curr[inside])
+    seen = front[index]
+    # A tenth: neighbours on a slanted surface share a pixel of the next frame.
+    covered = inside & (seen > np.float32(1.1) * rho_curr)
+    inverse = np.where(covered, seen, rho_curr)
+    known = inside & (solid | covered)
+    depth = np.where(known, 1.0 / np.maximum(inverse, np.float32(1e-5)), 0.0)
+    return covered | ~inside, depth.astype(np.float32)

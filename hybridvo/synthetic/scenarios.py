@@ -1,0 +1,360 @@
+"""Synthetic pairs of the solver benchmark: exact geometry, known noise, moving objects, no images.
+
+These are the cells on which the published solvers were measured: 436x1024 pixels, fx 1120, depth
+1-30 m with structure, rotation 0-3 degrees, translation 0-0.3 m, a share of the pixels on
+independently moving rigid objects, noise on flow and depth. A pair depends on (cell, seed) alone.
+The images that a method would see are not rendered: ``Frame.rgb`` is None.
+"""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from hybridvo.errors import InputError
+from hybridvo.geometry import ego_flow, make_transform, se3_exp
+from hybridvo.types import Camera, Frame, FramePair
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """One row of conditions.
+
+    Args:
+        moving: share of the pixels on independently moving objects.
+        objects: number of these objects.
+        flow_noise_px: standard deviation of each flow component, independent per pixel.
+        depth_noise: standard deviation of log depth; half of its variance is correlated in space.
+        outliers: share of the pixels whose flow is replaced by a gross error of up to 60 px.
+        rotation_deg: largest rotation angle. translation_m: largest length of the translation.
+        min_translation_m: smallest length.
+        scene: ``structured``, ``plane`` (one oblique plane) or ``far`` (structured, 60 times nearer
+            to infinity: 60-200 m).
+    """
+
+    moving: float = 0.3
+    objects: int = 5
+    flow_noise_px: float = 0.5
+    depth_noise: float = 0.02
+    outliers: float = 0.05
+    rotation_deg: float = 3.0
+    translation_m: float = 0.3
+    min_translation_m: float = 0.0
+    scene: str = "structured"
+
+
+MAIN_SCENARIOS: dict[str, Scenario] = {
+    "moving00": Scenario(moving=0.0),
+    "moving30": Scenario(moving=0.3),
+    "moving50": Scenario(moving=0.5),
+    "moving70": Scenario(moving=0.7),
+    "exact_depth": Scenario(depth_noise=0.0),
+    "noisy": Scenario(flow_noise_px=1.0, depth_noise=0.05),
+    "low_noise": Scenario(flow_noise_px=0.1, depth_noise=0.005),
+    "outliers20": Scenario(outliers=0.2),
+}
+"""The eight main and noise cells over which methods are compared."""
+
+DEGENERATE_SCENARIOS: dict[str, Scenario] = {
+    "zero_motion": Scenario(moving=0.0, rotation_deg=0.0, translation_m=0.0),
+    "pure_rotation": Scenario(moving=0.0, translation_m=0.0),
+    "tiny_1cm": Scenario(moving=0.0, translation_m=0.01, min_translation_m=0.01),
+    "plane": Scenario(moving=0.0, scene="plane"),
+    "far": Scenario(moving=0.0, scene="far"),
+}
+"""Motions and scenes in which some direction of the motion is weak."""
+
+SCENARIOS: dict[str, Scenario] = {
+    **MAIN_SCENARIOS,
+    **DEGENERATE_SCENARIOS,
+    "one60": Scenario(moving=0.6, objects=1),
+}
+"""Every cell by name."""
+
+
+def make_pair(
+    cell: str | Scenario, seed: int, height: int = 436, width: int = 1024
+) -> tuple[FramePair, dict[str, Any]]:
+    """A pair of the cell and its truth.
+
+    Args:
+        cell: name of a row of :data:`SCENARIOS`, or conditions of one's own.
+        seed: development uses 0-999, published figures 1000 and up.
+        height: image height in pixels.
+        width: image width in pixels; the focal length scales with it (1120 px at 1024).
+
+    Returns:
+        The pair (float32 contiguous arrays; the current depth is NaN where the previous frame saw
+        nothing) and the truth: ``T_curr_prev`` (4, 4), ``depth_true`` (H, W) float32 metres on the
+        previous grid, ``moving`` (H, W) bool, ``object``
+        (H, W) uint8 label (0 is the world), ``outlier`` (H, W) bool, ``flow_true`` (H, W, 2)
+        float32 of the surface, objects included.
+
+    Raises:
+        InputError: unknown cell, negative seed, or an image below 16 pixels.
+    """
+    name = "custom"
+    if isinstance(cell, str):
+        if cell not in SCENARIOS:
+            raise InputError(f"make_pair: unknown cell {cell!r}; known: {', '.join(SCENARIOS)}.")
+        name, cell = cell, SCENARIOS[cell]
+    if seed < 0 or min(height, width) < 16:
+        raise InputError(
+            f"make_pair: expected seed >= 0 and at least 16x16 pixels, "
+            f"got seed {seed} and {height}x{width}."
+        )
+    rng = np.random.default_rng([zlib.crc32(name.encode()), int(seed)])
+    focal = 1120.0 * width / 1024
+    camera = Camera(focal, focal, (width - 1) / 2, (height - 1) / 2, height, width)
+    T = _motion(rng, cell)
+    depth = _scene(rng, cell, height, width)
+    label = _objects(rng, cell, depth)
+    u = (np.arange(width) - camera.cx) / focal
+    v = (np.arange(height)[:, None] - camera.cy) / focal
+
+    moved = _apply(T, u, v, depth)
+    for k in range(1, cell.objects + 1 if cell.moving > 0 else 1):
+        rows, columns = np.nonzero(label == k)
+        if len(rows) == 0:
+            continue
+        x, y, z = u[columns], v[rows, 0], depth[rows, columns].astype(np.float64)
+        centre = np.array([np.mean(x * z), np.mean(y * z), np.mean(z)])
+        own = T @ _object_motion(rng, centre, float(np.mean(z)), focal)
+        for plane, values in zip(moved, _apply(own, x, y, z), strict=True):
+            plane[rows, columns] = values
+    x, y, z = moved
+    target_x = focal * x / z + camera.cx
+    target_y = focal * y / z + camera.cy
+    flow_true = np.empty((height, width, 2), dtype=np.float32)
+    flow_true[..., 0] = target_x - np.arange(width)
+    flow_true[..., 1] = target_y - np.arange(height)[:, None]
+
+    flow = flow_true
+    if cell.flow_noise_px > 0:
+        noise = rng.standard_normal(flow.shape, dtype=np.float32)
+        flow = flow + np.float32(cell.flow_noise_px) * noise
+    outlier = np.zeros((height, width), dtype=bool)
+    if cell.outliers > 0:
+        outlier = rng.random((height, width), dtype=np.float32) < cell.outliers
+        gross = rng.uniform(-60, 60, (int(outlier.sum()), 2)).astype(np.float32)
+        flow = flow.copy() if flow is flow_true else flow
+        flow[outlier] += gross
+    depth_curr = _splat(target_x, target_y, z)
+    pair = FramePair(
+        prev=Frame(None, _with_noise(rng, cell, depth), camera, timestamp=0.0, index=0),
+        curr=Frame(None, _with_noise(rng, cell, depth_curr), camera, timestamp=0.1, index=1),
+        flow=np.ascontiguousarray(flow),
+        flow_source="synthetic",
+        depth_source="synthetic",
+    )
+    truth = {
+        "T_curr_prev": T,
+        "depth_true": depth,
+        "moving": label > 0,
+        "object": label,
+        "outlier": outlier,
+        "flow_true": flow_true,
+    }
+    return pair, truth
+
+
+def make_model_pair(
+    seed: int,
+    height: int = 160,
+    width: int = 320,
+    flow_noise_px: float = 0.5,
+    depth_noise: float = 0.02,
+) -> tuple[FramePair, dict[str, Any]]:
+    """A static pair whose noise is exactly what the refinement assumes, and its truth.
+
+    Smooth depth of 3-13 m with one step; Gaussian flow noise and log-normal depth noise, both
+    independent per pixel; no outliers, no second depth. Under this noise the normalised error of a
+    right covariance is chi-square with six degrees of freedom.
+
+    Args:
+        seed: development uses 0-999, published figures 1000 and up.
+        height: image height in pixels.
+        width: image width in pixels; the focal lengths scale with it (350 and 340 px at 320).
+        flow_noise_px: standard deviation of each flow component.
+        depth_noise: standard deviation of log depth.
+
+    Returns:
+        The pair (float32), and ``T_curr_prev`` (4, 4), ``depth_true`` (H, W) float64 metres and
+        ``flow_true`` (H, W, 2) float64 px.
+
+    Raises:
+        InputError: negative seed or noise, or an image below 16 pixels.
+    """
+    if seed < 0 or min(height, width) < 16 or not (flow_noise_px >= 0 and depth_noise >= 0):
+        raise InputError(
+            f"make_model_pair: expected seed >= 0, at least 16x16 pixels and noise >= 0, got seed "
+            f"{seed}, {height}x{width}, flow noise {flow_noise_px} and depth noise {depth_noise}."
+        )
+    rng = np.random.default_rng([zlib.crc32(b"model"), int(seed)])
+    camera = Camera(
+        350 / 320 * width, 340 / 320 * width, (width - 2) / 2, (height + 4) / 2, height, width
+    )
+    u, v = np.arange(width) * 320 / width, np.arange(height)[:, None] * 320 / width
+    depth = 6 + 3 * np.sin(u / 40 + rng.uniform(0, 6)) * np.cos(v / 30 + rng.uniform(0, 6))
+    depth = depth + 4.0 * (u > rng.uniform(80, 240))
+    limit = np.array([0.3] * 3 + [0.03] * 3)
+    T = se3_exp(rng.uniform(-limit, limit))
+    flow_true = ego_flow(depth, T, camera, camera)
+    flow = flow_true + flow_noise_px * rng.standard_normal(flow_true.shape)
+    measured = depth * np.exp(depth_noise * rng.standard_normal(depth.shape))
+    pair = FramePair(
+        prev=Frame(None, measured.astype(np.float32), camera, timestamp=0.0, index=0),
+        curr=Frame(None, None, camera, timestamp=0.1, index=1),
+        flow=flow.astype(np.float32),
+        flow_source="synthetic",
+        depth_source="synthetic",
+    )
+    return pair, {"T_curr_prev": T, "depth_true": depth, "flow_true": flow_true}
+
+
+def _direction(rng: np.random.Generator) -> np.ndarray:
+    axis = rng.standard_normal(3)
+    return axis / np.linalg.norm(axis)
+
+
+def _motion(rng: np.random.Generator, cell: Scenario) -> np.ndarray:
+    angle = np.deg2rad(rng.uniform(0, cell.rotation_deg))
+    length = rng.uniform(cell.min_translation_m, cell.translation_m)
+    R = Rotation.from_rotvec(angle * _direction(rng)).as_matrix()
+    return make_transform(R, length * _direction(rng))
+
+
+def _object_motion(
+    rng: np.random.Generator, centre: np.ndarray, depth: float, focal: float
+) -> np.ndarray:
+    """Rigid motion about the object's centre: 8-70 px sideways, some depth, up to 5 degrees."""
+    heading = rng.uniform(0, 2 * np.pi)
+    metres = rng.uniform(8, 70) * focal / 1120 * depth / focal
+    t = metres * np.array([np.cos(heading), np.sin(heading), rng.uniform(-0.5, 0.5)])
+    R = Rotation.from_rotvec(np.deg2rad(rng.uniform(0, 5)) * _direction(rng)).as_matrix()
+    return make_transform(R, centre - R @ centre + t)
+
+
+def _apply(T: np.ndarray, u: Any, v: Any, z: np.ndarray) -> list[np.ndarray]:
+    """Coordinates of ``T (u z, v z, z)``, three float64 planes."""
+    z = z.astype(np.float64)
+    return [z * (row[0] * u + row[1] * v + row[2]) + row[3] for row in T[:3]]
+
+
+def _smooth(rng: np.random.Generator, height: int, width: int, size: int) -> np.ndarray:
+    """(H, W) float32 smooth noise of about unit variance with a correlation length of ``size``."""
+    rows, columns = height // size + 3, width // size + 3
+    coarse = rng.standard_normal((rows, columns), dtype=np.float32)
+    scale = cv2.resize(coarse, (columns * size, rows * size), interpolation=cv2.INTER_CUBIC)
+    field = scale[size : size + height, size : size + width]
+    return field * np.float32(1.27)  # cubic interpolation keeps 0.62 of the variance
+
+
+def _scene(rng: np.random.Generator, cell: Scenario, height: int, width: int) -> np.ndarray:
+    """(H, W) float32 depth: layers of slanted planes with smooth bumps, 1-30 m."""
+    x = np.linspace(-0.5, 0.5, width, dtype=np.float32)
+    y = np.linspace(-0.5, 0.5, height, dtype=np.float32)[:, None]
+    if cell.scene == "plane":
+        slope = rng.uniform(-0.5, 0.5, 2)
+        return np.float32(rng.uniform(3, 12)) / (
+            1 + np.float32(slope[0]) * x + slope[1] * y
+        ).astype(np.float32)
+    layers = 12
+    centre = rng.uniform(-0.5, 0.5, (layers, 2)).astype(np.float32)
+    log_depth = rng.uniform(np.log(1.5), np.log(28.0), layers)
+    inverse = np.exp(-log_depth).astype(np.float32)
+    slope = rng.uniform(-0.8, 0.8, (layers, 2)).astype(np.float32)
+    step = 4
+    coarse_x, coarse_y = x[::step], y[::step]
+    distance = np.stack([(coarse_x - c[0]) ** 2 + (coarse_y - c[1]) ** 2 for c in centre])
+    owner = np.argmin(distance, axis=0).astype(np.uint8)
+    owner = cv2.resize(owner, (width, height), interpolation=cv2.INTER_NEAREST)
+    plane = inverse[owner] * (
+        1
+        + slope[:, 0][owner] * (x - centre[:, 0][owner])
+        + slope[:, 1][owner] * (y - centre[:, 1][owner])
+    )
+    bumps = np.exp(np.float32(0.06) * _smooth(rng, height, width, 48))
+    if cell.scene == "far":
+        return np.clip(7 * bumps / plane, 60.0, 200.0)
+    return np.clip(bumps / plane, 1.0, 30.0)
+
+
+def _objects(rng: np.random.Generator, cell: Scenario, depth: np.ndarray) -> np.ndarray:
+    """(H, W) uint8 object label, 0 = static; writes the objects' own surfaces into ``depth``.
+
+    The objects grow from their centres until together they cover the wanted share.
+    """
+    height, width = depth.shape
+    if cell.moving <= 0:
+        return np.zeros((height, width), dtype=np.uint8)
+    step = 2
+    aspect = width / height
+    x = np.linspace(-0.5, 0.5, width, dtype=np.float32)[::step] * aspect
+    y = np.linspace(-0.5, 0.5, height, dtype=np.float32)[::step, None]
+    # one object must not rival the world, or the pair has no right answer; ``one60`` is about that
+    largest = np.inf if cell.objects == 1 else 0.8 * (1 - cell.moving)
+    for _ in range(50):
+        coarse = _grow(rng, cell, x, y)
+        if np.bincount(coarse.ravel())[1:].max(initial=0) <= largest * coarse.size:
+            break
+    label = np.repeat(np.repeat(coarse, step, axis=0), step, axis=1)[:height, :width]
+    label = np.ascontiguousarray(label)
+    for k in range(1, cell.objects + 1):
+        rows, columns = np.nonzero(label == k)
+        z = np.float32(np.exp(rng.uniform(np.log(2.0), np.log(12.0))))
+        slope = rng.uniform(-0.5, 0.5, 2).astype(np.float32)
+        depth[rows, columns] = z / (
+            1 + slope[0] * (columns / width - 0.5) + slope[1] * (rows / height - 0.5)
+        )
+    return label
+
+
+def _grow(rng: np.random.Generator, cell: Scenario, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """uint8 labels on the grid of ``x`` (columns) and ``y`` (rows): ellipses at random centres."""
+    aspect = float(x[-1] - x[0])
+    distance = []
+    for _ in range(cell.objects):
+        cx, cy = rng.uniform(-0.42, 0.42) * aspect, rng.uniform(-0.35, 0.35)
+        stretch = np.exp(rng.uniform(-0.4, 0.4))
+        distance.append(((x - cx) * stretch) ** 2 + ((y - cy) / stretch) ** 2)
+    stacked = np.stack(distance).astype(np.float32)
+    nearest = stacked.min(axis=0)
+    limit = np.quantile(nearest, cell.moving)
+    return np.where(nearest < limit, stacked.argmin(axis=0) + 1, 0).astype(np.uint8)
+
+
+def _with_noise(rng: np.random.Generator, cell: Scenario, depth: np.ndarray) -> np.ndarray:
+    if cell.depth_noise == 0:
+        return np.ascontiguousarray(depth, dtype=np.float32)
+    height, width = depth.shape
+    noise = rng.standard_normal(depth.shape, dtype=np.float32)
+    noise += _smooth(rng, height, width, 24)
+    noise *= np.float32(cell.depth_noise * np.sqrt(0.5))
+    return np.ascontiguousarray(depth * np.exp(noise), dtype=np.float32)
+
+
+def _splat(target_x: np.ndarray, target_y: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """(H, W) float32 depth on the current grid: nearest surface that lands on each pixel.
+
+    The half pixel between landing point and pixel centre is made good with the local slope.
+    """
+    height, width = z.shape
+    column, row = np.rint(target_x), np.rint(target_y)
+    value = z.copy()
+    for axis, offset in ((1, column - target_x), (0, row - target_y)):
+        slope = np.gradient(z, axis=axis)
+        # a depth edge is no slope
+        slope[np.abs(slope) > 0.02 * z] = 0.0
+        value += slope * offset
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height) & (z > 0)
+    index = (row[inside] * width + column[inside]).astype(np.intp)
+    depth = np.full(height * width, np.inf, dtype=np.float32)
+    np.minimum.at(depth, index, value[inside].astype(np.float32))
+    depth[np.isinf(depth)] = np.nan
+    return depth.reshape(height, width)

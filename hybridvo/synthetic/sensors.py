@@ -1,0 +1,207 @@
+"""What measuring does to flow and depth: errors with the structure of a real estimator and sensor.
+
+Flow: the errors that OpenCV's DIS makes at these sizes. Its patches average across motion
+boundaries (motion bleeds over silhouettes), fail block by block where there is no texture, lag
+behind large motions, and have no answer where the point is hidden or leaves the picture. Depth:
+noise that grows with distance, a smooth bias, edges in the wrong place and holes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from hybridvo.errors import InputError
+
+Range = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class DegradationOptions:
+    """How strongly inputs are damaged; a range is drawn log-uniformly once per sample.
+
+    Args:
+        exact_flow_probability: share of samples whose flow is the true one.
+        exact_depth_probability: share of samples whose depths are the true ones.
+        flow_white_px: spread of the noise of each pixel.
+        flow_smooth_px: spread of an error field that is smooth over an eighth of the picture.
+        flow_lag: largest share by which the flow falls behind the true motion, locally.
+        bleed_px: distance over which motion bleeds across a boundary.
+        block_share: share of the blocks whose flow is off.
+        block_px: spread of the offset of such a block.
+        textureless_probability: share of samples with an area where the flow is only a blurred
+            guess from around it.
+        hidden_px: spread of the additional error where a point is hidden or leaves the picture.
+        depth_relative: spread of depth noise over depth.
+        depth_quadratic: spread of the noise of a disparity sensor, 1 / metres: std = a z^2.
+        depth_bias: spread of a smooth relative error of depth.
+        depth_bleed_px: distance by which depth edges are displaced.
+        hole_share: largest share of the picture that is lost in blobs.
+        edge_hole_probability: share of samples that lose the depth along silhouettes.
+        range_limit_probability: share of samples whose sensor sees nothing beyond a distance.
+
+    Raises:
+        InputError: a range in the wrong order or a probability outside [0, 1].
+    """
+
+    exact_flow_probability: float = 0.35
+    exact_depth_probability: float = 0.4
+    flow_white_px: Range = (0.005, 0.15)
+    flow_smooth_px: Range = (0.01, 0.4)
+    flow_lag: float = 0.08
+    bleed_px: Range = (0.5, 5.0)
+    block_share: Range = (0.002, 0.08)
+    block_px: Range = (0.3, 8.0)
+    textureless_probability: float = 0.3
+    hidden_px: Range = (0.2, 4.0)
+    depth_relative: Range = (0.001, 0.03)
+    depth_quadratic: Range = (0.0003, 0.006)
+    depth_bias: Range = (0.001, 0.04)
+    depth_bleed_px: Range = (0.3, 2.5)
+    hole_share: float = 0.3
+    edge_hole_probability: float = 0.3
+    range_limit_probability: float = 0.25
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if isinstance(value, tuple):
+                if not 0 < value[0] <= value[1]:
+                    raise InputError(
+                        f"DegradationOptions.{name}: expected 0 < low <= high, got {value}."
+                    )
+            elif not 0 <= value <= 1:
+                raise InputError(f"DegradationOptions.{name}: expected 0..1, got {value}.")
+
+
+def log_uniform(rng: np.random.Generator, limits: Range) -> float:
+    """One draw, uniform in the logarithm between two positive limits."""
+    return float(np.exp(rng.uniform(np.log(limits[0]), np.log(limits[1]))))
+
+
+def smooth_field(
+    rng: np.random.Generator, height: int, width: int, cells: int, channels: int = 1
+) -> np.ndarray:
+    """(H, W[, C]) float32 Gaussian field of about unit spread with ``cells`` knots per height."""
+    rows = max(cells, 2)
+    columns = max(round(cells * width / max(height, 1)), 2)
+    coarse = rng.standard_normal((rows, columns, channels), dtype=np.float32)
+    field = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
+    return field.reshape(height, width, channels) if channels > 1 else field.reshape(height, width)
+
+
+def _look_up(
+    image: np.ndarray, offset: np.ndarray, border: int = cv2.BORDER_REPLICATE
+) -> np.ndarray:
+    """Image at x + offset, nearest pixel."""
+    height, width = image.shape[:2]
+    u = offset[..., 0] + np.arange(width, dtype=np.float32)
+    v = offset[..., 1] + np.arange(height, dtype=np.float32)[:, None]
+    return cv2.remap(image, u, v, cv2.INTER_NEAREST, borderMode=border, borderValue=0.0)
+
+
+def degrade_flow(
+    rng: np.random.Generator, flow: np.ndarray, hidden: np.ndarray, options: DegradationOptions
+) -> np.ndarray:
+    """Flow as DIS would have measured it.
+
+    Args:
+        rng: source of randomness.
+        flow: (H, W, 2) float32 px, true.
+        hidden: (H, W) bool, points that are covered in the next frame or leave it.
+        options: strengths.
+
+    Returns:
+        (H, W, 2) float32 px.
+    """
+    height, width = flow.shape[:2]
+    o = options
+    bleed = log_uniform(rng, o.bleed_px)
+    wander = smooth_field(rng, height, width, 16, 2) * np.float32(bleed / 2)
+    out = _look_up(flow, wander)
+    side = 2 * int(rng.integers(0, 1 + max(1, round(bleed)))) + 1
+    if side > 1:
+        out = (
+            cv2.medianBlur(out, min(side, 5)) if rng.random() < 0.5 else cv2.blur(out, (side,) * 2)
+        )
+    lag = np.float32(1.0) - np.float32(o.flow_lag * rng.random() ** 2) * np.abs(
+        smooth_field(rng, height, width, 6)
+    )
+    out *= lag[..., None]
+    if rng.random() < o.textureless_probability:
+        field = smooth_field(rng, height, width, int(rng.integers(3, 8)))
+        area = field > np.float32(rng.uniform(0.5, 1.6))
+        spread = 2 * int(rng.integers(4, 17)) + 1
+        guess = cv2.blur(out, (spread, spread)) * np.float32(rng.uniform(0.3, 1.0))
+        np.copyto(out, guess, where=area[..., None])
+    block = int(rng.integers(3, 9))
+    rows, columns = -(-height // block), -(-width // block)
+    bad = rng.random((rows, columns), dtype=np.float32) < log_uniform(rng, o.block_share)
+    if bad.any():
+        offsets = np.zeros((rows, columns, 2), np.float32)
+        offsets[bad] = log_uniform(rng, o.block_px) * rng.standard_normal((int(bad.sum()), 2))
+        out += np.repeat(np.repeat(offsets, block, 0), block, 1)[:height, :width]
+    if hidden.any():
+        around = cv2.blur(out, (9, 9))
+        error = smooth_field(rng, height, width, 24, 2) * np.float32(log_uniform(rng, o.hidden_px))
+        np.copyto(out, around + error, where=hidden[..., None])
+    smooth = smooth_field(rng, height, width, int(rng.integers(4, 17)), 2)
+    out += smooth * np.float32(log_uniform(rng, o.flow_smooth_px))
+    white = rng.standard_normal(flow.shape, dtype=np.float32)
+    out += white * np.float32(log_uniform(rng, o.flow_white_px))
+    return out
+
+
+def sample_at(depth: np.ndarray, offset: np.ndarray) -> np.ndarray:
+    """(H, W) depth looked up at x + offset, nearest pixel; 0 outside."""
+    return _look_up(depth, offset, cv2.BORDER_CONSTANT)
+
+
+def degrade_depth(
+    rng: np.random.Generator, depths: list[np.ndarray], options: DegradationOptions
+) -> list[np.ndarray]:
+    """Depths of one sensor: the same strengths for both frames, noise of their own.
+
+    Args:
+        rng: source of randomness.
+        depths: (H, W) float32 metres each, 0 is invalid.
+        options: strengths.
+
+    Returns:
+        Damaged copies; 0 is invalid.
+    """
+    o = options
+    quadratic = rng.random() < 0.5
+    strength = log_uniform(rng, o.depth_quadratic if quadratic else o.depth_relative)
+    bias = log_uniform(rng, o.depth_bias)
+    bleed = log_uniform(rng, o.depth_bleed_px) if rng.random() < 0.6 else 0.0
+    hole_share = o.hole_share * rng.random() ** 2 if rng.random() < 0.5 else 0.0
+    edges = rng.random() < o.edge_hole_probability
+    limit = np.inf
+    if rng.random() < o.range_limit_probability:
+        valid = depths[0][depths[0] > 0]
+        if valid.size:
+            limit = float(np.quantile(valid[::7], rng.uniform(0.5, 0.98)))
+    height, width = depths[0].shape
+    # Most of a sensor's bias stays from one frame to the next; its change is what misleads.
+    common = smooth_field(rng, height, width, 4)
+    out = []
+    for depth in depths:
+        wander = smooth_field(rng, height, width, 24, 2) * np.float32(bleed / 2)
+        noisy = _look_up(depth, wander) if bleed else depth.copy()
+        error = bias * (0.9 * common + 0.3 * smooth_field(rng, height, width, 4))
+        white = rng.standard_normal(depth.shape, dtype=np.float32) * np.float32(strength)
+        error += np.clip(white * noisy, -0.5, 0.5) if quadratic else white
+        noisy *= np.clip(1.0 + error, 0.3, 3.0)
+        lost = noisy > limit
+        if hole_share:
+            field = smooth_field(rng, height, width, int(rng.integers(4, 20)))
+            lost |= field > np.quantile(field[::3, ::3], 1.0 - hole_share)
+        if edges:
+            kernel = np.ones((3, 3), np.uint8)
+            jump = cv2.dilate(depth, kernel) - cv2.erode(depth, kernel)
+            lost |= jump > 0.15 * depth
+        noisy[lost] = 0.0
+        out.append(noisy)
+    return out
