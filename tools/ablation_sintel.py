@@ -105,7 +105,7 @@ def _score(
     from hybridvo.learned import next_start
     from hybridvo.network.inputs import assemble_inputs
     from hybridvo.network.passes import predict
-    from hybridvo.pose.selection import chosen_motion
+    from hybridvo.network.selection import chosen_motion
 
     inputs = assemble_inputs(pairs)
     truth = [true_motion(sequence, pair.prev.index, pair.curr.index) for pair in pairs]
