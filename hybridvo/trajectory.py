@@ -1,15 +1,14 @@
 """Camera trajectories: chained from relative poses, read from and written to text files.
 
 A trajectory holds ``T_world_cam`` (camera to world, as TUM, KITTI and evo store it) in camera axes
-(x right, y down, z forward). Files are written by evo; they are read here, because an error has to
-name the file and the line.
+(x right, y down, z forward). evo writes the files. They are read here: evo names neither the line
+of a mistake nor accepts tabs and Windows line ends.
 """
 
 from __future__ import annotations
 
 import io
 import logging
-import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,26 +18,12 @@ from typing import Any, Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hybridvo.checks import NANOSECONDS_ABOVE, stamp_unit
 from hybridvo.errors import FormatError, InputError
 from hybridvo.files import atomic_write
 from hybridvo.geometry import invert, ned_to_camera, xyzw_to_wxyz
 
-__all__ = [
-    "Axes",
-    "Format",
-    "Trajectory",
-    "chain",
-    "read_trajectory",
-    "write_kitti",
-    "write_tum",
-]
-
 Format = Literal["auto", "tum", "kitti", "tartanair"]
 Axes = Literal["auto", "camera", "ned"]
-
-LARGEST_FILE = 2**28
-"""Bytes of the largest trajectory file that is read: two million poses."""
 
 _COLUMNS: dict[str, tuple[int, str]] = {
     "tum": (8, "timestamp tx ty tz qx qy qz qw"),
@@ -50,7 +35,32 @@ _FILE_ROTATION_TOLERANCE = 1e-2
 _QUATERNION_NORM_TOLERANCE = 0.1
 _ROTATION_TOLERANCE = 1e-6
 
+NANOSECONDS_ABOVE = 1e14
+"""Stamps above this cannot be seconds (three million years) and are taken as nanoseconds."""
+EPOCH_S = (1e9, 4.2e9)
+"""Seconds since 1970 from 2001 to 2103: where the stamps of today's clocks lie."""
+
 _logger = logging.getLogger(__name__)
+
+
+def stamp_unit(stamps: np.ndarray) -> tuple[float, str]:
+    """How many of the unit of some stamps make a second, and the unit's name.
+
+    Milliseconds and microseconds need two signs: every stamp is one of today's clocks (2001 to
+    2103), and neighbours are typically less than a second apart. Else stamps above 1e14 are
+    nanoseconds.
+
+    Args:
+        stamps: (N,) numbers in the order of the frames; those that are not finite are ignored.
+    """
+    known = np.abs(stamps[np.isfinite(stamps)])
+    with np.errstate(over="ignore"):
+        step = np.median(np.abs(np.diff(known))) if len(known) > 1 else np.inf
+    for factor, name in ((1e3, "milliseconds"), (1e6, "microseconds")):
+        first, last = factor * EPOCH_S[0], factor * EPOCH_S[1]
+        if step < factor and first <= known.min() and known.max() <= last:
+            return factor, name
+    return (1e9, "nanoseconds") if (known > NANOSECONDS_ABOVE).any() else (1.0, "seconds")
 
 
 def _orthonormality_error(R: np.ndarray) -> np.ndarray:
@@ -59,14 +69,6 @@ def _orthonormality_error(R: np.ndarray) -> np.ndarray:
         error = np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)).max(axis=(-1, -2))
         error = np.where(np.linalg.det(R) > 0, error, error + 2.0)
     return np.nan_to_num(error, nan=np.inf)
-
-
-def _nearest_rotation(R: np.ndarray) -> np.ndarray:
-    """(..., 3, 3) rotations nearest to R in the Frobenius norm."""
-    U, _, Vt = np.linalg.svd(R)
-    # det(U Vt) = -1 would be a reflection; callers have excluded it, rounding has not
-    U[..., :, 2] *= np.sign(np.linalg.det(U @ Vt))[..., None]
-    return U @ Vt
 
 
 def _check_transforms(T: Any, name: str, tolerance: float = _ROTATION_TOLERANCE) -> np.ndarray:
@@ -96,22 +98,23 @@ def _check_transforms(T: Any, name: str, tolerance: float = _ROTATION_TOLERANCE)
 
 def _check_timestamps(timestamps: Any) -> np.ndarray:
     """(N,) float64 copy of strictly increasing, finite stamps in seconds, or InputError."""
+    name = "Trajectory.timestamps"
     try:
         stamps = np.array(timestamps, dtype=np.float64)
     except (TypeError, ValueError):
-        raise InputError("Trajectory.timestamps: expected numbers in seconds.") from None
+        raise InputError(f"{name}: expected numbers in seconds.") from None
     if stamps.ndim != 1:
-        raise InputError(f"Trajectory.timestamps: expected shape (N,), got {stamps.shape}.")
+        raise InputError(f"{name}: expected shape (N,), got {stamps.shape}.")
     if not np.isfinite(stamps).all():
-        index = int(np.argmin(np.isfinite(stamps)))
-        raise InputError(f"Trajectory.timestamps[{index}]: expected a finite number.")
-    steps = np.diff(stamps)
-    if (steps <= 0).any():
-        index = int(np.argmax(steps <= 0)) + 1
         raise InputError(
-            f"Trajectory.timestamps[{index}]: expected strictly increasing stamps, got "
-            f"{float(stamps[index])} after {float(stamps[index - 1])}. Sort the poses and drop "
-            f"duplicates."
+            f"{name}[{int(np.argmin(np.isfinite(stamps)))}]: expected a finite number."
+        )
+    late = np.flatnonzero(np.diff(stamps) <= 0)
+    if len(late):
+        before, after = stamps[late[0] : late[0] + 2].tolist()
+        raise InputError(
+            f"{name}[{late[0] + 1}]: expected strictly increasing stamps, got {after} after "
+            f"{before}. Sort the poses and drop duplicates."
         )
     return stamps
 
@@ -119,8 +122,8 @@ def _check_timestamps(timestamps: Any) -> np.ndarray:
 def chain(T_world_prev: np.ndarray, T_curr_prev: np.ndarray) -> np.ndarray:
     """Next camera pose: ``T_world_curr = T_world_prev @ inv(T_curr_prev)``.
 
-    The rotation is brought back to orthonormality by one Newton step of the polar decomposition,
-    which squares the error, so that rounding does not accumulate over long sequences.
+    One Newton step of the polar decomposition keeps the rotation orthonormal, so that rounding does
+    not accumulate over long sequences.
 
     Args:
         T_world_prev: (4, 4) previous camera to world, orthonormal to 1e-6.
@@ -143,7 +146,7 @@ class Trajectory:
         timestamps: (N,) seconds, strictly increasing; frame numbers where a file has no stamps.
         T_world_cam: (N, 4, 4) camera to world, metres, N >= 1; stored as read-only float64.
         has_timestamps: False where ``timestamps`` are frame numbers.
-        notices: what a reader changed, in sentences for people.
+        warnings: what a reader changed, in sentences.
 
     Raises:
         InputError: no pose, shapes that do not match, values that are not finite, rotations that
@@ -153,7 +156,7 @@ class Trajectory:
     timestamps: np.ndarray
     T_world_cam: np.ndarray
     has_timestamps: bool = True
-    notices: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         stamps = _check_timestamps(self.timestamps)
@@ -171,6 +174,9 @@ class Trajectory:
 
     def __len__(self) -> int:
         return len(self.timestamps)
+
+    def __repr__(self) -> str:
+        return f"Trajectory({len(self)} poses, {self.length:.3g} m)"
 
     @property
     def positions(self) -> np.ndarray:
@@ -213,8 +219,8 @@ class Trajectory:
             )
         first = np.eye(4) if T_world_first is None else np.asarray(T_world_first)
         first = _check_transforms(first[None], "T_world_first", tolerance=1e-3)
-        first[:, :3, :3] = _nearest_rotation(first[:, :3, :3])
-        relative[:, :3, :3] = _nearest_rotation(relative[:, :3, :3])
+        for T in (first, relative):
+            T[:, :3, :3] = Rotation.from_matrix(T[:, :3, :3]).as_matrix()
         T_world_cam = np.empty((len(relative) + 1, 4, 4))
         T_world_cam[0] = first[0]
         for i, T in enumerate(relative):
@@ -238,27 +244,16 @@ class Trajectory:
         T = self.T_world_cam.copy()
         T[:, :3, 3] *= scale
         T = _check_transforms(np.asarray(T_new_world)[None], "T_new_world", tolerance=1e-6)[0] @ T
-        return Trajectory(self.timestamps, T, self.has_timestamps, self.notices)
+        return Trajectory(self.timestamps, T, self.has_timestamps, self.warnings)
 
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the trajectory: KITTI's form where the name ends in ``.kitti``, else TUM's.
 
-def check_trajectory(value: Any, where: str) -> None:
-    """Refuse what is no trajectory.
-
-    Raises:
-        InputError: says what it is.
-    """
-    if not isinstance(value, Trajectory):
-        raise InputError(f"{where}: expected a Trajectory, got {type(value).__name__}.")
-
-
-def _as_path(path: Any) -> Path:
-    try:
-        text = os.fsdecode(path)
-    except TypeError:
-        raise InputError(f"path: expected a path, got {type(path).__name__}.") from None
-    if "\0" in text:
-        raise InputError(f"path: {text!r} holds a null character.")
-    return Path(text)
+        Raises:
+            OutputError: the file cannot be written; an older file at ``path`` is then unchanged.
+        """
+        write = write_kitti if Path(path).suffix == ".kitti" else write_tum
+        write(self, path)
 
 
 def write_tum(trajectory: Trajectory, path: str | os.PathLike[str]) -> None:
@@ -266,13 +261,11 @@ def write_tum(trajectory: Trajectory, path: str | os.PathLike[str]) -> None:
 
     Raises:
         OutputError: the file cannot be written; an older file at ``path`` is then unchanged.
-        InputError: no trajectory, or no path.
     """
-    # evo is GPL-3.0 and only needed here: imported when used
+    # imported when used: evo takes a second
     from evo.core.trajectory import PoseTrajectory3D
     from evo.tools.file_interface import write_tum_trajectory_file
 
-    check_trajectory(trajectory, "write_tum")
     xyzw = Rotation.from_matrix(trajectory.T_world_cam[:, :3, :3]).as_quat(canonical=True)
     text = io.StringIO()
     write_tum_trajectory_file(
@@ -287,60 +280,52 @@ def write_kitti(trajectory: Trajectory, path: str | os.PathLike[str]) -> None:
 
     Raises:
         OutputError: the file cannot be written; an older file at ``path`` is then unchanged.
-        InputError: no trajectory, or no path.
     """
     from evo.core.trajectory import PosePath3D
     from evo.tools.file_interface import write_kitti_poses_file
 
-    check_trajectory(trajectory, "write_kitti")
     text = io.StringIO()
     write_kitti_poses_file(text, PosePath3D(poses_se3=list(trajectory.T_world_cam)))
     with atomic_write(path) as file:
         file.write(text.getvalue())
 
 
-def _read_rows(path: Path, format: Format) -> tuple[str, np.ndarray, list[int]]:
-    """Format, (N, columns) finite numbers and the line number of each row."""
+def _read_text(path: Path) -> str:
     try:
-        with path.open("rb") as file:  # not all of it: a device never ends
-            data = file.read(LARGEST_FILE + 1)
-        if len(data) > LARGEST_FILE:
-            raise FormatError(f"{path}: more than {LARGEST_FILE} bytes are no trajectory.")
-        text = data.decode("utf-8-sig")
+        return path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError:
         raise FormatError(f"{path}: expected a text file of poses, got binary data.") from None
     except FileNotFoundError:
         raise InputError(f"{path}: no such trajectory file.") from None
-    except OSError as error:
-        reason = error.strerror or error
-        raise InputError(f"{path}: trajectory file cannot be read: {reason}.") from None
-    name: str = format
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: trajectory file cannot be read: {error}.") from None
+
+
+def _read_rows(path: Path, format: str) -> tuple[str, np.ndarray, list[int]]:
+    """Format, (N, columns) finite numbers and the line number of each row."""
+    by_count = {count: known for known, (count, _) in _COLUMNS.items()}
     rows: list[list[float]] = []
     lines: list[int] = []
-    for number, line in enumerate(text.split("\n"), start=1):
+    for number, line in enumerate(_read_text(path).split("\n"), start=1):
         fields = line.split("#", 1)[0].split()
         if not fields:
             continue
-        if name == "auto":
-            by_count = {count: known for known, (count, _) in _COLUMNS.items()}
+        if format == "auto":
             if len(fields) not in by_count:
                 raise FormatError(
                     f"{path}:{number}: expected 8 numbers (TUM), 12 (KITTI) or 7 (TartanAir) "
                     f"separated by spaces, got {len(fields)}."
                 )
-            name = by_count[len(fields)]
-        count, names = _COLUMNS[name]
+            format = by_count[len(fields)]
+        count, names = _COLUMNS[format]
+        expected = f"{path}:{number}: expected {count} numbers '{names}'"
         if len(fields) != count:
-            raise FormatError(
-                f"{path}:{number}: expected {count} numbers '{names}', got {len(fields)}."
-            )
+            raise FormatError(f"{expected}, got {len(fields)}.")
         try:
             row = [float(field) for field in fields]
         except ValueError:
-            raise FormatError(
-                f"{path}:{number}: expected {count} numbers '{names}', got {line.strip()[:80]!r}."
-            ) from None
-        if not all(map(math.isfinite, row)):
+            raise FormatError(f"{expected}, got {line.strip()[:80]!r}.") from None
+        if not np.isfinite(row).all():
             raise FormatError(
                 f"{path}:{number}: expected finite numbers '{names}', got NaN or inf. Remove the "
                 f"line: a pose that is not known must not be in the file."
@@ -349,11 +334,12 @@ def _read_rows(path: Path, format: Format) -> tuple[str, np.ndarray, list[int]]:
         lines.append(number)
     if not rows:
         raise FormatError(f"{path}: expected at least one pose, got none.")
-    return name, np.array(rows), lines
+    return format, np.array(rows), lines
 
 
 def _quaternions_to_matrices(path: Path, xyzw: np.ndarray, lines: list[int]) -> np.ndarray:
-    norms = np.hypot(np.hypot(xyzw[:, 0], xyzw[:, 1]), np.hypot(xyzw[:, 2], xyzw[:, 3]))
+    with np.errstate(over="ignore"):
+        norms = np.linalg.norm(xyzw, axis=1)
     bad = np.abs(norms - 1.0) > _QUATERNION_NORM_TOLERANCE
     if bad.any():
         index = int(np.argmax(bad))
@@ -366,16 +352,16 @@ def _quaternions_to_matrices(path: Path, xyzw: np.ndarray, lines: list[int]) -> 
 
 def _to_seconds(path: Path, stamps: np.ndarray, lines: list[int]) -> tuple[np.ndarray, list[str]]:
     """Stamps in seconds, strictly increasing, and what was changed."""
-    notices = []
+    warnings = []
     far = np.abs(stamps) > NANOSECONDS_ABOVE
-    factor, unit = stamp_unit(stamps)
     if far.any() and not far.all():
         line = lines[int(np.argmax(far != far[0]))]
         raise FormatError(f"{path}:{line}: timestamps mix seconds and nanoseconds.")
+    factor, unit = stamp_unit(stamps)
     if factor != 1:
         stamps = stamps / factor
-        notices.append(f"{path}: timestamps are {unit}; converted to seconds.")
-        _logger.warning(notices[-1])
+        warnings.append(f"{path}: timestamps are {unit}; converted to seconds.")
+        _logger.warning(warnings[-1])
     steps = np.diff(stamps)
     if (steps <= 0).any():
         index = int(np.argmax(steps <= 0)) + 1
@@ -385,7 +371,7 @@ def _to_seconds(path: Path, stamps: np.ndarray, lines: list[int]) -> tuple[np.nd
             f"{lines[index - 1]} ({float(stamps[index - 1])!r}). Stamps must increase: sort the "
             f"file and drop duplicates."
         )
-    return stamps, notices
+    return stamps, warnings
 
 
 def read_trajectory(
@@ -399,14 +385,14 @@ def read_trajectory(
         path: text file, one pose a line.
         format: ``tum`` (8 columns: timestamp tx ty tz qx qy qz qw), ``kitti`` (12 columns, first
             three rows of the matrix), ``tartanair`` (7 columns: tx ty tz qx qy qz qw), or ``auto``:
-            told from the number of columns.
+            by the number of columns.
         axes: axes of the file: ``camera`` (x right, y down, z forward) or ``ned`` (x forward,
             y right, z down; converted to camera axes). ``auto`` is NED for TartanAir's format.
 
     Returns:
-        The trajectory in camera axes. Stamps above 1e14 are nanoseconds, or milliseconds or
-        microseconds where :func:`hybridvo.checks.stamp_unit` can tell, and are converted, which
-        ``notices`` records and the log says. KITTI and TartanAir files get frame numbers as stamps.
+        The trajectory in camera axes. Stamps in other units than seconds (:func:`stamp_unit`) are
+        converted, which ``warnings`` and the log say. KITTI and TartanAir files get frame numbers
+        as stamps.
 
     Raises:
         InputError: no such file, an unknown option.
@@ -417,10 +403,10 @@ def read_trajectory(
         raise InputError(f"format: expected auto, {', '.join(_COLUMNS)}, got {format!r}.")
     if axes not in ("auto", "camera", "ned"):
         raise InputError(f"axes: expected auto, camera or ned, got {axes!r}.")
-    path = _as_path(path)
+    path = Path(path)
     name, rows, lines = _read_rows(path, format)
     stamps = np.arange(len(rows), dtype=np.float64)
-    notices: list[str] = []
+    warnings: list[str] = []
     T = np.tile(np.eye(4), (len(rows), 1, 1))
     if name == "kitti":
         T[:, :3] = rows.reshape(-1, 3, 4)
@@ -431,12 +417,12 @@ def read_trajectory(
                 f"9-11, got a matrix that is not orthonormal to {_FILE_ROTATION_TOLERANCE:g}."
             )
         if _orthonormality_error(T[:, :3, :3]).max() > 1e-9:
-            T[:, :3, :3] = _nearest_rotation(T[:, :3, :3])
+            T[:, :3, :3] = Rotation.from_matrix(T[:, :3, :3]).as_matrix()
     else:
         if name == "tum":
-            stamps, notices = _to_seconds(path, rows[:, 0], lines)
+            stamps, warnings = _to_seconds(path, rows[:, 0], lines)
         T[:, :3, :3] = _quaternions_to_matrices(path, rows[:, -4:], lines)
         T[:, :3, 3] = rows[:, -7:-4]
     if axes == "ned" or (axes == "auto" and name == "tartanair"):
         T = ned_to_camera(T)
-    return Trajectory(stamps, T, has_timestamps=name == "tum", notices=tuple(notices))
+    return Trajectory(stamps, T, has_timestamps=name == "tum", warnings=tuple(warnings))

@@ -5,10 +5,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import settings
+
+from tests.walks import write_walk
 
 SHARED_DATA = Path(
     os.environ.get("HYBRIDVO_DATA", Path(__file__).resolve().parents[2] / "shared" / "data")
 )
+
+# no deadline: a busy machine is no failure. HYPOTHESIS_PROFILE=dev draws other examples each time
+settings.register_profile("ci", deadline=None, derandomize=True)
+settings.register_profile("dev", deadline=None)
+settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci"))
 
 
 @pytest.fixture
@@ -24,15 +32,14 @@ def rng() -> np.random.Generator:
     return np.random.default_rng(7)
 
 
-@pytest.fixture(scope="module")
-def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A few of the judge's training pictures, as `tools/train_judge.py make` writes them."""
-    from hybridvo.training import judge_data
+@pytest.fixture(scope="session")
+def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A sequence of six frames of 32x48 with flow files and true poses; read it, change nothing."""
+    return write_walk(tmp_path_factory.mktemp("session") / "walk", 6)
 
-    folder = tmp_path_factory.mktemp("pictures")
-    count, judge_data.PER_SHARD = judge_data.PER_SHARD, 12
-    try:
-        assert judge_data.write_shard(folder, 0) > 4
-    finally:
-        judge_data.PER_SHARD = count
-    return folder
+
+@pytest.fixture(scope="session")
+def image_walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A sequence of five frames of 64x96 with images; read it, change nothing."""
+    root = tmp_path_factory.mktemp("session") / "image_walk"
+    return write_walk(root, 5, height=64, width=96, pictures=True)

@@ -386,7 +386,7 @@ def test_stamps_above_1e14_are_nanoseconds_with_a_notice(tmp_path, caplog):
     assert trajectory.timestamps.tolist() == [1700000000.5, 1700000001.0]
     assert trajectory.timestamps.dtype == np.float64
     assert "nanoseconds" in caplog.text
-    assert "nanoseconds" in trajectory.notices[0]
+    assert "nanoseconds" in trajectory.warnings[0]
 
 
 def test_units_are_suffixes_of_one_spelling():

@@ -17,9 +17,9 @@ import numpy as np
 
 from hybridvo.flow import dis_flow
 from hybridvo.geometry import invert, se3_exp
-from hybridvo.hypotheses.generate import CoarseSearch, search_motions
+from hybridvo.hypotheses.generate import HypothesisSet, generate
+from hybridvo.options import Options
 from hybridvo.refinement import kernels
-from hybridvo.refinement.options import RefinementOptions
 from hybridvo.synthetic.diverse import DiverseOptions, diverse_sample
 from hybridvo.synthetic.sensors import SensorOptions, degrade_depth, log_uniform
 from hybridvo.synthetic.training_scenes import training_scene
@@ -27,7 +27,7 @@ from hybridvo.training.rendered import MOVING, STATIC, UNKNOWN
 from hybridvo.types import Camera, Frame, FramePair, RelativePose
 
 PER_SHARD = 64
-MOST = 5
+MAX_MOTIONS = 5
 """Motions of a sample."""
 SIZES = ((160, 320), (160, 320), (128, 256), (192, 256), (120, 400), (218, 512))
 """(height, width) of the samples."""
@@ -60,13 +60,11 @@ def draw_samples(seed: int) -> list[dict[str, Any]]:
         starts = [np.eye(4)]
         if T_last is not None and rng.random() < 0.7:
             starts.append(T_last)
-        found = search_motions(
-            pair, np.stack(starts)[:, :3], None, RefinementOptions(), int(rng.integers(1 << 30))
-        )
+        found = generate(pair, np.stack(starts), Options(), int(rng.integers(1 << 30)))
         full = (0, *pair.prev.camera.shape)
-        if isinstance(found, RelativePose) or found.clear:
+        if isinstance(found, RelativePose) or not found.is_ambiguous:
             continue
-        if (found.box[0], found.box[1], found.box[3]) != full:
+        if (found.grid.box[0], found.grid.box[1], found.grid.box[3]) != full:
             continue
         samples.append(_record(pair, found, truth, T_last, log_depth_curr, source))
     return samples
@@ -162,7 +160,7 @@ def _moving(
 
 def _record(
     pair: FramePair,
-    found: CoarseSearch,
+    found: HypothesisSet,
     truth: _Truth,
     T_last: np.ndarray | None,
     log_depth_curr: np.ndarray | None,
@@ -171,15 +169,15 @@ def _record(
     """Everything about a sample, as small arrays."""
     h, w, stride = found.shape
     pick = np.s_[stride // 2 :: stride, stride // 2 :: stride]
-    log_depth = found.grid(pair).log_depth_curr
+    log_depth = found.maps().log_depth_curr
     if log_depth_curr is not None:
         log_depth = log_depth_curr[pick]
     label = np.where(truth.moving, MOVING, STATIC)
     label = np.where(truth.known, label, UNKNOWN)[pick]
-    n = found.count
-    rows = found.samples[:, :n]
-    poses = np.zeros((MOST, 3, 4))
-    facts = np.zeros((MOST, found.facts.shape[1]))
+    n = found.grid.count
+    rows = found.grid.samples[:, :n]
+    poses = np.zeros((MAX_MOTIONS, 3, 4))
+    facts = np.zeros((MAX_MOTIONS, found.facts.shape[1]))
     poses[: len(found.poses)], facts[: len(found.poses)] = found.poses, found.facts
     exact = [kernels.XN, kernels.YN, kernels.Z, kernels.MU, kernels.MV]
     return {
@@ -194,22 +192,22 @@ def _record(
         "T": truth.T_curr_prev[:3],
         "T_last": (np.eye(4) if T_last is None else T_last)[:3],
         "has_last": T_last is not None,
-        "K": found.picture.K,
+        "K": found.grid.pixels.K,
         "width": pair.prev.camera.width,
         "stride": stride,
         "source": ("diverse", "true", "dis").index(source),
     }
 
 
-def write_shard(path: str | os.PathLike[str], first_seed: int) -> int:
-    """Write samples from ``first_seed`` on until a shard of each shape is full or seeds end.
+def write_shard(path: str | os.PathLike[str], first_seed: int, seeds: int = PER_SHARD) -> int:
+    """Write the samples of some seeds, in one file for each grid shape.
 
     Returns:
-        Number of samples written, in one file per grid shape.
+        Number of samples written.
     """
     folder = Path(path)
     by_shape: dict[tuple[int, int], list[dict[str, Any]]] = {}
-    for seed in range(first_seed, first_seed + PER_SHARD):
+    for seed in range(first_seed, first_seed + seeds):
         for sample in draw_samples(seed):
             by_shape.setdefault(sample["label"].shape, []).append(sample)
     for (h, w), samples in by_shape.items():

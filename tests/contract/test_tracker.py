@@ -1,0 +1,186 @@
+"""What a program with a loop relies on: its arrays are its own, copies go on, bad flow is seen."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+import threading
+from collections.abc import Callable
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+import hybridvo as hvo
+from hybridvo.flow import dis_flow
+from hybridvo.geometry import invert
+from hybridvo.types import Reason, State
+from tests import worlds
+
+PAIR, T_TRUE = worlds.world()
+
+
+def frames(count: int) -> list[hvo.Frame]:
+    """The same frame again and again: with ``PAIR.flow`` the motion is that of the pair."""
+    return [replace(PAIR.prev, timestamp=0.1 * i, index=i) for i in range(count)]
+
+
+def walk(vo: hvo.Odometry, count: int, spoil: tuple[str, ...] = ()) -> list[np.ndarray]:
+    """Poses over given flow; ``spoil`` names the arrays of each step that the caller overwrites."""
+    poses = []
+    for frame in frames(count):
+        step = vo.track(frame, PAIR.flow if frame.index else None)
+        poses.append(step.T_world_cam.copy())
+        for name in spoil:
+            getattr(step, name)[...] = 0.0
+    return poses
+
+
+@pytest.mark.parametrize("name", ["T_world_cam", "T_curr_prev", "covariance"])
+def test_the_arrays_of_a_step_belong_to_the_caller(name: str) -> None:
+    clean = walk(hvo.Odometry(network=None), 4)
+    spoiled = walk(hvo.Odometry(network=None), 4, spoil=(name,))
+    np.testing.assert_allclose(spoiled, clean, rtol=0, atol=1e-9)
+    assert np.linalg.norm(clean[3][:3, 3]) > 0.1
+
+
+@pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda vo: pickle.loads(pickle.dumps(vo))])
+def test_a_tracker_can_be_copied_and_sent_to_a_process(duplicate: Callable) -> None:
+    vo = hvo.Odometry(network=None)
+    first, second = frames(2)
+    vo.track(first)
+    other = duplicate(vo)
+    one, two = (tracker.track(second, PAIR.flow) for tracker in (vo, other))
+    np.testing.assert_allclose(one.T_world_cam, two.T_world_cam, rtol=0, atol=1e-9)
+
+
+def test_after_a_skipped_frame_a_flow_leads_from_the_last_tracked_one() -> None:
+    asked = []
+
+    def provider(prev: hvo.Frame, curr: hvo.Frame) -> np.ndarray:
+        asked.append((prev.index, curr.index))
+        return PAIR.flow
+
+    for given in (None, PAIR.flow):
+        vo = hvo.Odometry(network=None, flow=provider)
+        first, _, third = frames(3)
+        vo.track(first)
+        vo.skip(1, 0.1)
+        step = vo.track(third, given)
+        np.testing.assert_allclose(step.T_world_cam, invert(T_TRUE), rtol=0, atol=1e-5)
+    assert asked == [(0, 2)]
+
+
+def test_a_covered_lens_is_no_standstill() -> None:
+    vo = hvo.Odometry(network=None)
+    vo.track(PAIR.prev)
+    black = np.zeros_like(PAIR.prev.rgb)
+    for index in (1, 2):
+        step = vo.track(replace(PAIR.prev, rgb=black, index=index, timestamp=0.1 * index))
+        assert step.status.reason is Reason.NO_FLOW
+
+
+@pytest.mark.parametrize("kind", ["black", "noise", "stripes"])
+def test_an_image_without_texture_has_no_flow(kind: str) -> None:
+    """DIS answers zero there in both directions: a sure standstill of a moving camera."""
+    rgb = PAIR.prev.rgb
+    blind = {
+        "black": np.zeros_like(rgb),
+        "noise": (20 + np.random.default_rng(1).integers(-1, 2, rgb.shape)).astype(np.uint8),
+        "stripes": np.repeat(rgb[:, :1], rgb.shape[1], axis=1),
+    }[kind]
+    seen, covered = PAIR.prev, replace(PAIR.prev, rgb=blind)
+    dis = dis_flow()
+    assert dis(seen, seen).flow is not None
+    for prev, curr in ((seen, covered), (covered, seen), (covered, covered)):
+        assert dis(prev, curr).flow is None
+
+
+def test_one_flow_provider_serves_several_threads() -> None:
+    dis = dis_flow()
+    expected = dis(PAIR.prev, PAIR.curr).flow
+    results: list[np.ndarray] = []
+
+    def work() -> None:
+        results.extend(dis(PAIR.prev, PAIR.curr).flow for _ in range(10))
+
+    threads = [threading.Thread(target=work) for _ in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(results) == 30
+    assert all(np.abs(flow - expected).max() < 1e-6 for flow in results)
+
+
+# --- a flow that the images contradict ------------------------------------------------------------
+
+SIZE = (120, 160)
+SHIFT = (6.0, 3.0)
+WRONG_FLOWS = {
+    "negated": lambda flow: -flow,
+    "zero": lambda flow: 0 * flow,
+    "twice": lambda flow: 2.2 * flow,
+    "normalised": lambda flow: flow / [160, 120],
+    "(v, -u)": lambda flow: flow[..., ::-1] * [1, -1],
+}
+
+
+def shifted(change: Callable = lambda flow: flow, **more: object) -> hvo.FramePair:
+    """An image shifted by (6, 3) px beside its true flow, or a wrong one made of it."""
+    wide = cv2.GaussianBlur(np.random.default_rng(3).uniform(0, 255, (140, 180, 3)), (0, 0), 3)
+    wide = ((wide - wide.min()) / np.ptp(wide) * 255).astype(np.uint8)
+    depth = np.full(SIZE, 3.0, np.float32)
+    flow = change(np.broadcast_to(np.float32(SHIFT), (*SIZE, 2)))
+    K = hvo.Camera(130.0, 130.0, 79.5, 59.5, *SIZE)
+    prev, curr = (
+        hvo.Frame(np.ascontiguousarray(rgb), depth, K)
+        for rgb in (wide[10:130, 10:170], wide[7:127, 4:164])
+    )
+    return hvo.FramePair(prev, curr, np.asarray(flow, np.float32), **more)
+
+
+def is_contradicted(pair: hvo.FramePair) -> bool:
+    found = hvo.estimate(pair)
+    worlds.assert_sane(found)
+    return found.status.state is State.FAILED and found.status.reason is Reason.NO_FLOW
+
+
+@pytest.mark.parametrize("kind", WRONG_FLOWS)
+def test_a_flow_of_another_sign_unit_or_order_is_refused(kind: str) -> None:
+    assert is_contradicted(shifted(WRONG_FLOWS[kind]))
+    assert not is_contradicted(shifted(WRONG_FLOWS[kind], flow_source="dis"))
+
+
+@pytest.mark.parametrize("kind", ["right", "noisy", "with holes", "partly wrong"])
+def test_a_right_flow_is_not_refused(kind: str) -> None:
+    rng = np.random.default_rng(0)
+    change = {
+        "right": lambda flow: flow,
+        "noisy": lambda flow: flow + rng.normal(0, 3, flow.shape),
+        "with holes": lambda flow: np.where(rng.random((*SIZE, 1)) < 0.4, np.nan, flow),
+        "partly wrong": lambda flow: np.where(rng.random((*SIZE, 1)) < 0.3, 40.0, flow),
+    }[kind]
+    assert not is_contradicted(shifted(change))
+
+
+def test_images_that_tell_nothing_contradict_nothing() -> None:
+    pair = shifted(WRONG_FLOWS["negated"])
+    black = np.zeros_like(pair.prev.rgb)
+    other = np.random.default_rng(9).integers(0, 255, black.shape, dtype=np.uint8)
+    for rgb in (black, other, pair.prev.rgb, None):
+        assert not is_contradicted(replace(pair, curr=replace(pair.curr, rgb=rgb)))
+
+
+def test_the_callers_torch_settings_change_nothing() -> None:
+    expected = hvo.estimate(PAIR, method="pwvo").T_curr_prev
+    torch.set_default_dtype(torch.float64)
+    try:
+        found = [hvo.estimate(PAIR, method="pwvo").T_curr_prev]
+    finally:
+        torch.set_default_dtype(torch.float32)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        found.append(hvo.estimate(PAIR, method="pwvo").T_curr_prev)
+    np.testing.assert_allclose(found, [expected] * 2, rtol=0, atol=1e-6)

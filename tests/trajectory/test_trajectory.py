@@ -1,0 +1,353 @@
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hybridvo.errors import FormatError, InputError, OutputError
+from hybridvo.files import atomic_write
+from hybridvo.geometry import euler_deg_to_matrix, make_transform, ned_to_camera, se3_exp
+from hybridvo.trajectory import Trajectory, chain, read_trajectory, write_kitti, write_tum
+
+IDENTITY_TUM = "0 0 0 0 0 0 1"
+
+
+def random_trajectory(rng: np.random.Generator, frames: int = 20) -> Trajectory:
+    relative = [se3_exp(0.1 * rng.standard_normal(6)) for _ in range(frames - 1)]
+    return Trajectory.from_relative(relative, 1.3e9 + np.arange(frames) / 30)
+
+
+def write(path: Path, *lines: str) -> Path:
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+# -- the class --------------------------------------------------------------------------------
+
+
+def test_rotation_stays_orthonormal_over_1e5_steps(rng):
+    relative = np.array([se3_exp(0.1 * rng.standard_normal(6)) for _ in range(1000)])
+    trajectory = Trajectory.from_relative(np.tile(relative, (100, 1, 1)), np.arange(100_001.0))
+    R = trajectory.T_world_cam[:, :3, :3]
+    assert np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max() < 1e-12
+
+
+def test_rotations_rounded_to_float32_are_made_orthonormal(rng):
+    relative = [se3_exp(0.1 * rng.standard_normal(6)).astype(np.float32) for _ in range(500)]
+    R = Trajectory.from_relative(relative, np.arange(501.0)).T_world_cam[:, :3, :3]
+    assert np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max() < 1e-12
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), frames=st.integers(1, 12), size=st.sampled_from([1e-7, 1.0]))
+def test_relative_is_the_inverse_of_from_relative(seed, frames, size):
+    rng = np.random.default_rng(seed)
+    relative = np.array([se3_exp(size * rng.standard_normal(6)) for _ in range(frames - 1)])
+    first = se3_exp(rng.standard_normal(6))
+    trajectory = Trajectory.from_relative(relative.reshape(-1, 4, 4), np.arange(frames), first)
+    assert len(trajectory) == frames
+    np.testing.assert_allclose(trajectory.T_world_cam[0], first, atol=1e-14)
+    # a few roundings of numbers up to about 20
+    np.testing.assert_allclose(trajectory.relative(), relative.reshape(-1, 4, 4), atol=1e-13)
+
+
+def test_arrays_are_copied_and_read_only():
+    T = np.eye(4)[None].copy()
+    trajectory = Trajectory([0.0], T)
+    T[0, 0, 3] = 5.0
+    assert trajectory.positions[0, 0] == 0.0
+    with pytest.raises(ValueError, match="read-only"):
+        trajectory.T_world_cam[0, 0, 3] = 1.0
+
+
+@pytest.mark.parametrize(
+    ("stamps", "match"),
+    [
+        ([0.0, 2.0, 1.0], r"timestamps\[2\]: expected strictly increasing"),
+        ([0.0, 1.0, 1.0], r"timestamps\[2\]: expected strictly increasing"),
+        ([0.0, np.nan, 2.0], r"timestamps\[1\]: expected a finite"),
+        ([0.0, 1.0], "2 timestamps for 3 poses"),
+        ([[0.0, 1.0, 2.0]], r"expected shape \(N,\)"),
+        (["a", "b", "c"], "expected numbers"),
+    ],
+)
+def test_bad_timestamps(stamps, match):
+    with pytest.raises(InputError, match=match):
+        Trajectory(stamps, np.tile(np.eye(4), (3, 1, 1)))
+
+
+def test_bad_poses():
+    T = np.tile(np.eye(4), (3, 1, 1))
+    T[1, 0, 3] = np.nan
+    with pytest.raises(InputError, match=r"T_world_cam\[1\]: expected finite"):
+        Trajectory(np.arange(3), T)
+    reflection = np.diag([1.0, 1.0, -1.0, 1.0])
+    with pytest.raises(InputError, match=r"T_world_cam\[0\]: expected a rigid transform"):
+        Trajectory([0.0], reflection[None])
+    with pytest.raises(InputError, match=r"expected shape \(N, 4, 4\), got \(2, 3, 4\)"):
+        Trajectory([0.0, 1.0], np.zeros((2, 3, 4)))
+    with pytest.raises(InputError, match="at least one pose"):
+        Trajectory([], np.zeros((0, 4, 4)))
+    with pytest.raises(InputError, match="expected 2 timestamps for 1 relative poses, got 3"):
+        Trajectory.from_relative([np.eye(4)], [0.0, 1.0, 2.0])
+
+
+# -- writing ------------------------------------------------------------------------------------
+
+
+def test_tum_and_kitti_round_trip_and_evo_reads_them(tmp_path, rng):
+    from evo.tools.file_interface import read_kitti_poses_file, read_tum_trajectory_file
+
+    trajectory = random_trajectory(rng)
+    tum, kitti = tmp_path / "t.tum", tmp_path / "t.kitti"
+    write_tum(trajectory, tum)
+    write_kitti(trajectory, kitti)
+    again = read_trajectory(tum)
+    np.testing.assert_array_equal(again.timestamps, trajectory.timestamps)
+    # quaternion and back: a few ulp of 1
+    np.testing.assert_allclose(again.T_world_cam, trajectory.T_world_cam, atol=5e-15)
+    np.testing.assert_array_equal(read_trajectory(kitti).T_world_cam, trajectory.T_world_cam)
+    evo = read_tum_trajectory_file(str(tum))
+    np.testing.assert_allclose(evo.poses_se3, trajectory.T_world_cam, atol=5e-15)
+    np.testing.assert_array_equal(
+        read_kitti_poses_file(str(kitti)).poses_se3, trajectory.T_world_cam
+    )
+    assert sorted(os.listdir(tmp_path)) == ["t.kitti", "t.tum"]
+
+
+def test_identity_row_reads_zeros_and_one(tmp_path):
+    write_tum(Trajectory([2.5], np.eye(4)[None]), tmp_path / "t")
+    row = (tmp_path / "t").read_text().split()
+    assert [float(value) for value in row] == [2.5, 0, 0, 0, 0, 0, 0, 1]
+
+
+def test_a_failed_write_leaves_the_old_file_and_no_litter(tmp_path):
+    target = write(tmp_path / "t.tum", "old")
+    with pytest.raises(RuntimeError), atomic_write(target) as file:
+        file.write("new")
+        raise RuntimeError
+    assert target.read_text() == "old\n"
+    assert os.listdir(tmp_path) == ["t.tum"]
+
+
+def test_output_error_names_the_file(tmp_path):
+    blocker = write(tmp_path / "file", "x")
+    with pytest.raises(OutputError, match=r"t\.tum: cannot be written"):
+        write_tum(Trajectory([0.0], np.eye(4)[None]), blocker / "t.tum")
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(OutputError, match="folder: cannot be written"):
+        write_kitti(Trajectory([0.0], np.eye(4)[None]), tmp_path / "folder")
+    assert sorted(os.listdir(tmp_path)) == ["file", "folder"]
+
+
+def test_a_symbolic_link_is_replaced_not_followed(tmp_path):
+    sentinel = write(tmp_path / "sentinel", "mine")
+    link = tmp_path / "t.tum"
+    link.symlink_to(sentinel)
+    write_tum(Trajectory([0.0], np.eye(4)[None]), link)
+    assert sentinel.read_text() == "mine\n"
+    assert not link.is_symlink()
+
+
+def test_new_files_follow_the_umask(tmp_path):
+    with atomic_write(tmp_path / "a") as file:
+        file.write("x")
+    (tmp_path / "b").write_text("x")
+    assert (tmp_path / "a").stat().st_mode == (tmp_path / "b").stat().st_mode
+
+
+# -- reading ------------------------------------------------------------------------------------
+
+
+def test_comments_crlf_tabs_bom_and_blank_lines(tmp_path):
+    path = tmp_path / "t.txt"
+    path.write_bytes(
+        b"\xef\xbb\xbf# timestamp tx ty tz qx qy qz qw\r\n\r\n"
+        b"1.5 1 2 3 0 0 0 1 \r\n  2.5\t4 5 6  0 0 1 0 # turned\r\n"
+    )
+    trajectory = read_trajectory(path)
+    np.testing.assert_array_equal(trajectory.timestamps, [1.5, 2.5])
+    np.testing.assert_array_equal(trajectory.positions, [[1, 2, 3], [4, 5, 6]])
+    np.testing.assert_allclose(trajectory.T_world_cam[1, :3, :3], np.diag([-1, -1, 1]), atol=1e-15)
+
+
+def test_message_names_file_line_and_columns(tmp_path):
+    lines = [f"{i} {IDENTITY_TUM}" for i in range(56)]
+    path = write(tmp_path / "trajectory.txt", *lines, f"56 {IDENTITY_TUM[2:]}")
+    with pytest.raises(FormatError) as error:
+        read_trajectory(path)
+    assert str(error.value).endswith(
+        "trajectory.txt:57: expected 8 numbers 'timestamp tx ty tz qx qy qz qw', got 7."
+    )
+
+
+@pytest.mark.parametrize(
+    ("lines", "match"),
+    [
+        (["1 2 3"], r":1: expected 8 numbers \(TUM\), 12 \(KITTI\) or 7 \(TartanAir\).*got 3"),
+        ([f"0 {IDENTITY_TUM}", f"1 {IDENTITY_TUM[:-1]}x"], r":2: expected 8 numbers .*got '1 0"),
+        (["# head", "0 nan 0 0 0 0 0 1"], r":2: expected finite numbers"),
+        (["0 0 0 0 0 0 0 inf"], r":1: expected finite numbers"),
+        (["0 0 0 0 0 0 0 0"], r":1: expected a unit quaternion.*all zeros"),
+        (["0 0 0 0 0 0 3 4"], r":1: expected a unit quaternion.*norm 5"),
+        ([f"1 {IDENTITY_TUM}", f"0 {IDENTITY_TUM}"], r":2: timestamp .*lies before that of line 1"),
+        (
+            [f"1 {IDENTITY_TUM}", "", f"1 {IDENTITY_TUM}"],
+            r":3: timestamp .*repeats the one of line",
+        ),
+        ([f"1 {IDENTITY_TUM}", f"2e15 {IDENTITY_TUM}"], r":2: timestamps mix seconds and nano"),
+        (["1 0 0 0 0 1 0 0 0 0 2 0"], r":1: expected a rotation"),
+        (["1 0 0 0 0 1 0 0 0 0 -1 0"], r":1: expected a rotation"),
+        (["1e200 1e200 0 0 1e200 -1e200 0 0 0 0 1 0"], r":1: expected a rotation"),
+        (["0 0 0 0 1e200 0 0 0"], r":1: expected a unit quaternion"),
+        (["# nothing"], "expected at least one pose"),
+        ([], "expected at least one pose"),
+    ],
+)
+def test_malformed_files(tmp_path, lines, match):
+    with pytest.raises(FormatError, match=match):
+        read_trajectory(write(tmp_path / "t.txt", *lines))
+
+
+def test_missing_binary_and_folder(tmp_path):
+    with pytest.raises(InputError, match=r"none\.txt: no such trajectory file"):
+        read_trajectory(tmp_path / "none.txt")
+    with pytest.raises(InputError, match="cannot be read"):
+        read_trajectory(tmp_path)
+    (tmp_path / "b").write_bytes(bytes(range(256)))
+    with pytest.raises(FormatError, match="binary"):
+        read_trajectory(tmp_path / "b")
+    good = write(tmp_path / "t", f"0 {IDENTITY_TUM}")
+    with pytest.raises(InputError, match="format: expected auto"):
+        read_trajectory(good, "csv")  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="axes: expected auto"):
+        read_trajectory(good, axes="enu")  # type: ignore[arg-type]
+    with pytest.raises(FormatError, match=":1: expected 12 numbers"):
+        read_trajectory(good, "kitti")
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.binary(max_size=200) | st.text("0123456789.-e #\n\r\tnaif", max_size=200).map(str.encode))
+def test_arbitrary_bytes_give_a_trajectory_or_a_format_error(tmp_path_factory, data):
+    path = tmp_path_factory.getbasetemp() / "fuzz.txt"
+    path.write_bytes(data)
+    try:
+        trajectory = read_trajectory(path)
+    except FormatError:
+        return
+    assert np.isfinite(trajectory.T_world_cam).all()
+
+
+def test_nanoseconds_become_seconds_with_a_notice(tmp_path, caplog):
+    path = write(
+        tmp_path / "t",
+        f"1305031102175304000 {IDENTITY_TUM}",
+        f"1305031102211214000 {IDENTITY_TUM}",
+    )
+    with caplog.at_level("WARNING", logger="hybridvo"):
+        trajectory = read_trajectory(path)
+    # float64 keeps 128 ns at this size
+    np.testing.assert_allclose(
+        trajectory.timestamps, [1305031102.175304, 1305031102.211214], rtol=0, atol=3e-7
+    )
+    assert "nanoseconds" in trajectory.warnings[0]
+    assert "nanoseconds" in caplog.text
+
+
+def test_slightly_rounded_matrices_become_rotations(tmp_path, rng):
+    T = se3_exp(rng.standard_normal(6))
+    path = write(tmp_path / "t", " ".join(f"{value:.4f}" for value in T[:3].ravel()))
+    R = read_trajectory(path).T_world_cam[0, :3, :3]
+    np.testing.assert_allclose(R.T @ R, np.eye(3), atol=1e-14)
+    np.testing.assert_allclose(R, T[:3, :3], atol=2e-4)  # four decimals were written
+
+
+def test_tartanair_columns_are_ned_unless_said_otherwise(tmp_path):
+    # 1 m north (forward), 2 m east (right), 3 m down; turned 90 deg about the down axis
+    path = write(tmp_path / "pose_left.txt", "1 2 3 0 0 0.7071067811865476 0.7071067811865476")
+    trajectory = read_trajectory(path)
+    assert not trajectory.has_timestamps
+    np.testing.assert_array_equal(trajectory.timestamps, [0.0])
+    np.testing.assert_allclose(trajectory.positions, [[2, 3, 1]])
+    # looking along world z, then turned right: the camera's forward axis is world x
+    np.testing.assert_allclose(trajectory.T_world_cam[0, :3, 2], [1, 0, 0], atol=1e-15)
+    as_camera = read_trajectory(path, axes="camera")
+    np.testing.assert_allclose(as_camera.positions, [[1, 2, 3]])
+    np.testing.assert_allclose(ned_to_camera(as_camera.T_world_cam), trajectory.T_world_cam)
+
+
+def test_transformed_scales_positions_then_moves():
+    T = make_transform(np.eye(3), np.array([1.0, 0, 0]))[None]
+    moved = Trajectory([0.0], T).transformed(make_transform(np.eye(3), np.array([0, 5.0, 0])), 2.0)
+    np.testing.assert_allclose(moved.positions, [[2, 5, 0]])
+
+
+def test_save_chooses_the_form_by_the_name(tmp_path, rng):
+    trajectory = random_trajectory(rng, 3)
+    for name, columns in (("t.tum", 8), ("t.txt", 8), ("t.kitti", 12)):
+        trajectory.save(tmp_path / name)
+        lines = (tmp_path / name).read_text().splitlines()
+        assert {len(line.split()) for line in lines} == {columns}
+
+
+@pytest.mark.parametrize(
+    ("stamps", "unit", "first"),
+    [
+        ([1305031102175, 1305031102211], "milliseconds", 1305031102.175),
+        ([1305031102175304, 1305031102211214], "microseconds", 1305031102.175304),
+        ([1305031102.175, 1305031102.211], "", 1305031102.175),
+        ([1e14], "", 1e14),
+        ([2e14], "nanoseconds", 2e5),
+    ],
+)
+def test_units_of_stamps(tmp_path, stamps, unit, first):
+    path = write(tmp_path / "t", *(f"{stamp!r} {IDENTITY_TUM}" for stamp in stamps))
+    trajectory = read_trajectory(path)
+    assert trajectory.timestamps[0] == pytest.approx(first, rel=1e-15)
+    assert (unit in trajectory.warnings[0]) if unit else not trajectory.warnings
+
+
+# -- conventions, with numbers worked by hand ---------------------------------------------------
+
+
+def test_forward_motion_moves_the_camera_along_world_z():
+    # the camera goes 1 m forward: points come 1 m nearer, so T_curr_prev has t = (0, 0, -1)
+    forward = make_transform(np.eye(3), np.array([0.0, 0.0, -1.0]))
+    trajectory = Trajectory.from_relative([forward, forward], [0.0, 0.1, 0.2])
+    np.testing.assert_allclose(trajectory.positions, [[0, 0, 0], [0, 0, 1], [0, 0, 2]])
+
+
+def test_turn_right_then_forward():
+    # turning right by 90 deg about y (down): what was ahead (0, 0, 1) is now at the left (-1, 0, 0)
+    turn = make_transform(euler_deg_to_matrix(np.array([0.0, -90.0, 0.0])), np.zeros(3))
+    np.testing.assert_allclose(turn[:3, :3] @ [0, 0, 1], [-1, 0, 0], atol=1e-15)
+    forward = make_transform(np.eye(3), np.array([0.0, 0.0, -1.0]))
+    trajectory = Trajectory.from_relative([turn, forward], [0.0, 1.0, 2.0])
+    # after the turn, forward is to the right of the world: +x
+    np.testing.assert_allclose(trajectory.positions[2], [1, 0, 0], atol=1e-15)
+
+
+def test_chain_is_t_world_prev_times_inverse_of_t_curr_prev():
+    T_world_prev = make_transform(np.eye(3), np.array([10.0, 0.0, 0.0]))
+    T_curr_prev = make_transform(np.eye(3), np.array([-1.0, 2.0, 0.0]))
+    np.testing.assert_allclose(chain(T_world_prev, T_curr_prev)[:3, 3], [11, -2, 0])
+
+
+def test_world_is_the_first_camera_unless_given():
+    assert (Trajectory.from_relative([], [0.0]).T_world_cam[0] == np.eye(4)).all()
+    first = make_transform(np.eye(3), np.array([1.0, 2.0, 3.0]))
+    given = Trajectory.from_relative([np.eye(4)], [0.0, 1.0], first)
+    np.testing.assert_allclose(given.positions, [[1, 2, 3], [1, 2, 3]])
+
+
+def test_tum_files_hold_camera_to_world_and_quaternions_xyzw(tmp_path):
+    # 90 deg about z: q = (0, 0, sin 45, cos 45) in xyzw
+    T = make_transform(np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]]), np.array([1.0, 2.0, 3.0]))
+    write_tum(Trajectory([4.0], T[None]), tmp_path / "t")
+    row = [float(value) for value in (tmp_path / "t").read_text().split()]
+    np.testing.assert_allclose(row, [4, 1, 2, 3, 0, 0, 0.5**0.5, 0.5**0.5], atol=1e-15)
+    np.testing.assert_allclose(read_trajectory(tmp_path / "t").T_world_cam[0], T, atol=1e-15)
