@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from hybridvo.data.image_io import read_text
-from hybridvo.data.plain_yaml import MAX_YAML_BYTES, plain_yaml
 from hybridvo.errors import FormatError, InputError
+from hybridvo.files import parse_yaml
 
 LARGEST = 1e300
 """No whole number is larger: beyond it there is no float."""
@@ -28,11 +28,11 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
     """
     path = Path(path)
     try:
-        text = read_text(path, limit=MAX_YAML_BYTES)
+        text = read_text(path, limit=2**16)
     except FileNotFoundError:
         message = f"{path}: no such file; presets of the project are in configs/."
         raise InputError(message) from None
-    mapping = plain_yaml(text, str(path))
+    mapping = parse_yaml(text, str(path))
     if not isinstance(mapping, dict):
         raise FormatError(f"{path}: expected a mapping of keys, got {type(mapping).__name__}.")
     return mapping

@@ -250,7 +250,7 @@ def saliencies(network: Any, inputs: Any, T_start: Any, steps: int) -> dict[str,
     """
     import torch
 
-    from hybridvo.pose.selection import chosen_pose
+    from hybridvo.network.selection import chosen_pose
 
     names = ("flow",) if network.options.scale_free else ("flow", "inverse_depth")
     given = tuple(getattr(inputs, name) for name in names)

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
-import yaml
 from pydantic import TypeAdapter, ValidationError
 
 from hybridvo.errors import FormatError, InputError
+from hybridvo.files import parse_yaml
 from hybridvo.synthetic.diverse import DiverseOptions
 from hybridvo.synthetic.layered import Sample
 from hybridvo.synthetic.paper import PaperOptions
@@ -37,11 +37,11 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
         InputError: no such file. FormatError: not YAML, or not a mapping.
     """
     try:
-        mapping = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+        mapping = parse_yaml(Path(path).read_text(encoding="utf-8"), str(path))
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; those of the project are in configs/.") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise FormatError(f"{path}: not plain YAML: {' '.join(str(error).split())}.") from None
+    except UnicodeDecodeError as error:
+        raise FormatError(f"{path}: not UTF-8: {error}.") from None
     if not isinstance(mapping, dict):
         raise FormatError(f"{path}: expected a mapping of keys, got {type(mapping).__name__}.")
     if "extends" in mapping:

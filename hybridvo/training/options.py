@@ -12,7 +12,7 @@ from hybridvo.errors import InputError
 from hybridvo.network.judge import JudgeOptions
 from hybridvo.network.losses import LossOptions
 from hybridvo.network.options import NetworkOptions
-from hybridvo.pose.selection import SELECTION_METHODS as SELECTIONS
+from hybridvo.network.selection import SELECTION_METHODS as SELECTIONS
 from hybridvo.synthetic.dataset import StoredSamples
 from hybridvo.synthetic.presets import (
     PRESETS,

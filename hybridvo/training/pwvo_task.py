@@ -14,7 +14,7 @@ from hybridvo.learned import fitted_motion, next_start
 from hybridvo.network.losses import NetworkOutput, reconstruct, total_loss
 from hybridvo.network.passes import first_motions
 from hybridvo.network.pwvo import build_network
-from hybridvo.pose.selection import chosen_motion
+from hybridvo.network.selection import chosen_motion
 from hybridvo.training.options import PwvoOptions, described
 from hybridvo.training.stream import Mixture, SampleStream, TrainingBatch
 from hybridvo.training.validation import evaluate_network

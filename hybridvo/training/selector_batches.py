@@ -30,7 +30,7 @@ class SelectorBatch:
     Args:
         inputs: what the selector sees.
         samples: (B, 8, n) float32 pixel buffers of the solver.
-        depth_true: (B, h, w) metres, 0 where unknown. label: (B, h, w) of ``judge_data``.
+        depth_true: (B, h, w) metres, 0 where unknown. label: (B, h, w) of ``rendered``.
         T: (B, 3, 4) true T_curr_prev.
         source: (B,) 0 layered, 1 rendered with true (or noisy) flow, 2 rendered with DIS flow.
         static: (B, h, w) probability to be static world that a pixel-wise network states.

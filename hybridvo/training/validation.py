@@ -17,7 +17,7 @@ from hybridvo.errors import InputError
 from hybridvo.learned import next_start
 from hybridvo.network.losses import NetworkOutput, reconstruct
 from hybridvo.network.passes import predict
-from hybridvo.pose.selection import chosen_pose, select, selected_transform
+from hybridvo.network.selection import chosen_pose, select, selected_transform
 from hybridvo.synthetic.presets import Preset
 from hybridvo.training.stream import TrainingBatch, collate, sample_generator
 from hybridvo.types import PixelwisePrediction

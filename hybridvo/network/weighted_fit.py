@@ -10,7 +10,7 @@ from __future__ import annotations
 import torch
 
 from hybridvo.errors import InputError
-from hybridvo.pose.residuals import left_update
+from hybridvo.torch_geometry import left_update, pp, se3
 
 __all__ = ["pixel_weights", "weighted_fit"]
 
@@ -96,7 +96,7 @@ def weighted_fit(
             torch.nan_to_num(x.to(number), 0.0, 0.0, 0.0)
             for x in (ray, inverse_depth, target, weights)
         )
-        start = T_start.detach().to(number)
+        start = se3(T_start.detach().to(number))
         fixed = weights.detach()
         # Metres of the nearest tenth as the unit of length: rotations and translations alike.
         unit = inverse.quantile(0.9, dim=1).clamp(min=1e-3)
@@ -108,13 +108,13 @@ def weighted_fit(
                 step, _ = _step(ray, inverse, target, fixed, T, unit)
             T = left_update(step, T)
             _, last = _step(ray, inverse, target, fixed, T, unit)
-            good = torch.isfinite(T).all(dim=2).all(dim=1) & (last <= first)
-            T = torch.where(good[:, None, None], T, start)
+            good = torch.isfinite(T.tensor()).all(dim=1) & (last <= first)
+            T = pp.SE3(torch.where(good[:, None], T.tensor(), start.tensor()))
         if weights.requires_grad:
             step, _ = _step(ray, inverse, target, weights, T, unit, far=True)
             # value of the solution, gradient of the step
             T = left_update(step - step.detach(), T)
-    return T.to(T_start.dtype)
+    return T.matrix().to(T_start.dtype)
 
 
 def _step(
@@ -122,7 +122,7 @@ def _step(
     inverse: torch.Tensor,
     target: torch.Tensor,
     weights: torch.Tensor,
-    T: torch.Tensor,
+    T: pp.LieTensor,
     unit: torch.Tensor,
     far: bool = False,
 ) -> tuple[torch.Tensor, torch.Tensor]:
@@ -131,8 +131,9 @@ def _step(
     ``far``: pixels far away pull with constant strength, and the gradient is that of the right
     hand side alone.
     """
-    moved = torch.einsum("bij,bjn->bin", T[:, :3, :2], ray) + T[:, :3, 2:3]
-    moved = moved + T[:, :3, 3:] * inverse[:, None]
+    M = T.matrix()
+    moved = torch.einsum("bij,bjn->bin", M[:, :3, :2], ray) + M[:, :3, 2:3]
+    moved = moved + M[:, :3, 3:] * inverse[:, None]
     front = moved[:, 2] > NEAREST
     z = torch.where(front, moved[:, 2], torch.ones_like(inverse))
     x, y = moved[:, 0] / z, moved[:, 1] / z

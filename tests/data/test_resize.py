@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hybridvo.data.resize import resize_camera, resize_flow, resize_frame, resize_pair
+from hybridvo.data.resize import resize_camera, resize_frame, resize_pair
 from hybridvo.errors import InputError
 from hybridvo.geometry import ego_flow, project, se3_exp
 from hybridvo.types import Camera, Frame, FramePair
@@ -39,12 +39,9 @@ def test_points_move_with_the_pixel_grid(height, width):
 def test_depth_is_never_mixed(rng):
     depth = np.where(rng.random((48, 64)) < 0.5, 1.0, 9.0).astype(np.float32)
     depth[0] = np.nan
+    camera = Camera(32, 32, 31.5, 23.5, 48, 64)
     frame = Frame(
-        np.zeros((48, 64, 3), np.uint8),
-        depth,
-        Camera(32, 32, 31.5, 23.5, 48, 64),
-        mask=depth > 2,
-        depth_variance=depth,
+        np.zeros((48, 64, 3), np.uint8), depth, camera, mask=depth > 2, depth_variance=depth
     )
     for size in ((24, 32), (13, 17), (96, 128)):
         small = resize_frame(frame, *size)
@@ -56,29 +53,8 @@ def test_depth_is_never_mixed(rng):
     np.testing.assert_array_equal(third.depth, depth[1::3])
 
 
-def test_flow_vectors_are_scaled():
-    flow = np.full((4, 6, 2), (3.0, 8.0), np.float32)
-    valid = np.ones((4, 6), bool)
-    valid[0, :3] = False
-    flow[0, :3] = 1e6
-    small, kept = resize_flow(flow, 2, 2, valid)
-    assert small[1, 1].tolist() == [1.0, 4.0]
-    assert kept.shape == (2, 2)
-    mean, enough = resize_flow(flow, 2, 2, valid, average=True)
-    np.testing.assert_allclose(mean, np.full((2, 2, 2), (1.0, 4.0)), rtol=1e-6)
-    assert enough.all()
-    valid[:2, :3] = False
-    mean, enough = resize_flow(flow, 2, 2, valid, average=True)
-    assert np.isnan(mean[0, 0]).all() and enough.tolist() == [[False, True], [True, True]]
-    with pytest.raises(InputError, match="flow"):
-        resize_flow(np.zeros((4, 6, 2), np.int32), 2, 2)
-    with pytest.raises(InputError, match="valid"):
-        resize_flow(flow, 2, 2, valid[:2])
-
-
-@pytest.mark.parametrize("average", [False, True])
 @pytest.mark.parametrize("factor", [2, 3])
-def test_resized_pair_is_still_rigid(factor, average):
+def test_resized_pair_is_still_rigid(factor):
     """Ego flow of the resized depth and camera meets the resized flow of the full size."""
     height, width = 480, 636  # divisible by 2 and by 3
     big = Camera(320.0, 320.0, 317.5, 239.5, height, width)
@@ -87,16 +63,17 @@ def test_resized_pair_is_still_rigid(factor, average):
     T = se3_exp(np.array([0.05, -0.02, 0.1, 0.01, -0.02, 0.03]))
     flow = ego_flow(depth, T, big, big).astype(np.float32)
     frame = Frame(None, depth, big)
-    variance = np.full((height, width), 9.0, np.float32)
-    pair = FramePair(frame, frame, flow, flow_variance=variance)
-    small = resize_pair(pair, height // factor, width // factor, average=average)
+    valid = depth > 3.5
+    pair = FramePair(frame, frame, flow, np.full((height, width), 9.0, np.float32), valid)
+    small = resize_pair(pair, height // factor, width // factor)
     camera = small.prev.camera
     rigid = ego_flow(small.prev.depth, T, camera, camera)
     error = np.linalg.norm(rigid - small.flow, axis=2)
     # Nearest with an even factor samples half a source pixel beside the new centre, so it is off by
     # at most half the change of the flow from pixel to pixel. An odd factor samples the centre
-    # itself: only float32 remains. The mean of a block is centred; depth is the nearest one.
+    # itself: only float32 remains.
     gradient = max(np.abs(np.diff(flow, axis=k)).max() for k in (0, 1))
-    bound = 0.5 * gradient * np.sqrt(2) if factor == 2 else 2e-4
-    assert error.max() < bound + 2e-3 * average
+    assert error.max() < (0.5 * gradient * np.sqrt(2) if factor == 2 else 2e-4)
+    assert small.flow.dtype == np.float32
     assert small.flow_variance[0, 0] == pytest.approx(9.0 / factor**2)
+    np.testing.assert_array_equal(small.flow_valid, small.prev.depth > 3.5)
