@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 PIP_INSTALL := pip install --quiet --disable-pip-version-check
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 
-.PHONY: demo test test-slow check format docs clean
+.PHONY: demo test test-slow golden check format docs clean
 
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -23,6 +23,9 @@ test: $(STAMP)
 
 test-slow: $(STAMP)
 	$(PYTEST) -n 2 -m "slow or not slow"
+
+golden: $(STAMP)  # what moved against the frozen figures; its inputs are made once, in runs/golden
+	$(BIN)/python tools/golden.py --against docs/golden.json
 
 check: $(STAMP)
 	$(BIN)/ruff check .

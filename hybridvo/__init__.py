@@ -15,6 +15,8 @@ _HOME = {
     "Camera": "hybridvo.types",
     "Frame": "hybridvo.types",
     "FramePair": "hybridvo.types",
+    "MotionPrior": "hybridvo.types",
+    "Options": "hybridvo.options",
     "PairBatch": "hybridvo.types",
     "PixelwisePrediction": "hybridvo.types",
     "RelativePose": "hybridvo.types",
@@ -26,7 +28,7 @@ _HOME = {
     "estimate": "hybridvo.pipeline",
     "open_sequence": "hybridvo.data.sequence",
     "iter_pairs": "hybridvo.data.sequence",
-    "refine": "hybridvo.refinement.refine",
+    "refine": "hybridvo.pipeline",
     "select": "hybridvo.pose.selection",
 }
 

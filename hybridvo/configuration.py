@@ -7,6 +7,7 @@ An unknown key is an error that names the nearest known one.
 from __future__ import annotations
 
 import copy
+import dataclasses
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -15,11 +16,8 @@ from hybridvo.data.plain_yaml import plain_yaml
 from hybridvo.data.presets import build_options, read_yaml
 from hybridvo.errors import FormatError, InputError
 from hybridvo.flow import DIS_PRESETS
-from hybridvo.odometry import POLICIES
-from hybridvo.pipeline import DEFAULT_METHOD, check_polish
-from hybridvo.refinement.photometric import PhotometricOptions
-from hybridvo.refinement.refine import RefinementOptions
-from hybridvo.tracking.window import WindowOptions, check_window
+from hybridvo.options import Options, PhotometricOptions, RefineOptions, TrackOptions
+from hybridvo.pipeline import DEFAULT_METHOD
 
 __all__ = ["DisOptions", "RunOptions", "load_options"]
 
@@ -82,15 +80,14 @@ class RunOptions:
     strict: bool = False
     alignment: str = "se3"
     dis: DisOptions = field(default_factory=DisOptions)
-    refinement: RefinementOptions = field(default_factory=RefinementOptions)
+    refinement: RefineOptions = field(default_factory=RefineOptions)
     photometric: PhotometricOptions = field(default_factory=PhotometricOptions)
-    key_frames: WindowOptions = field(default_factory=WindowOptions)
+    key_frames: TrackOptions = field(default_factory=TrackOptions)
 
     def __post_init__(self) -> None:
         _one_of("flow", self.flow, FLOWS)
-        check_polish(self.polish)
-        check_window(self.window)
-        _one_of("policy", self.policy, POLICIES)
+        _one_of("polish", self.polish, ("auto", "on", "off"))
+        _one_of("policy", self.policy, ("hold", "constant_velocity"))
         _one_of("device", self.device, DEVICES)
         _one_of("alignment", self.alignment, ("se3", "sim3", "origin", "none"))
         if self.start < 0 or self.stride < 1:
@@ -103,6 +100,20 @@ class RunOptions:
             raise InputError(f"seed: expected 0 to {LARGEST_SEED}, got {self.seed}.")
         if not 0 <= self.max_failed <= 1:
             raise InputError(f"max_failed: expected a share in [0, 1], got {self.max_failed}.")
+
+
+def option_tree(flat: RunOptions) -> Options:
+    """The tree of :mod:`hybridvo.options` with these values."""
+    return Options(
+        refine=flat.refinement,
+        photometric=dataclasses.replace(flat.photometric, mode=flat.polish),
+        track=dataclasses.replace(
+            flat.key_frames,
+            window=flat.window,
+            motion_prior=flat.history,
+            on_failure=flat.policy,  # type: ignore[arg-type]
+        ),
+    )
 
 
 def _one_of(name: str, value: str, known: tuple[str, ...]) -> None:

@@ -18,8 +18,8 @@ from hybridvo.diagnosis_findings import Evidence, findings
 from hybridvo.errors import FormatError, InputError
 from hybridvo.flow import FlowProvider, dis_flow
 from hybridvo.geometry import invert
-from hybridvo.refinement.photometric import PolishReport, polish_photometric
-from hybridvo.refinement.refine import refine
+from hybridvo.pipeline import refine
+from hybridvo.refinement.photometric import PhotometricReport, refine_photometric
 from hybridvo.refinement.registration import depth_costs
 from hybridvo.refinement.self_calibration import calibration_equations
 from hybridvo.types import Frame, FramePair, RelativePose
@@ -143,13 +143,13 @@ def _look_at(
         return
     found = flow(prev, curr)
     pair = FramePair(prev, curr, found.flow, found.variance, found.valid, found.source)
-    motion = polish_photometric(pair, refine(pair))
-    if motion.ok:
+    motion = refine_photometric(pair, refine(pair))
+    if motion.usable:
         ratio = depth_ratio(prev, curr, found.flow, motion.T_curr_prev)
         if ratio is not None:
             evidence.depth_ratios.append((index, ratio))
-    report = motion.polish
-    assert isinstance(report, PolishReport)
+    report = motion.photometric
+    assert isinstance(report, PhotometricReport)
     evidence.reasons.append(report.reason)
     if report.pixels:
         evidence.gains.append((index, report.gain))
@@ -172,7 +172,7 @@ def _compare_scale(
     evidence: Evidence, sequence: _Sequence, index: int, motion: RelativePose
 ) -> None:
     """Length of the motion over that of the true poses, where both have one."""
-    if sequence.poses is None or not motion.ok or not motion.translation_direction_valid:
+    if sequence.poses is None or not motion.usable or not motion.translation_direction_valid:
         return
     true = invert(sequence.poses[index + 1]) @ sequence.poses[index]
     length = float(np.linalg.norm(true[:3, 3]))

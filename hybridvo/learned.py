@@ -11,12 +11,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hybridvo.errors import CheckpointError, InputError
-from hybridvo.types import FramePair, Reason, RelativePose, Status
+from hybridvo.types import FramePair, MotionPrediction, Reason, RelativePose, Status
 
 if TYPE_CHECKING:
     import torch
 
-    from hybridvo.hypotheses.selector import Proposal
     from hybridvo.network.inputs import NetworkInputs
     from hybridvo.network.losses import NetworkOutput
     from hybridvo.network.passes import Chooser
@@ -168,8 +167,8 @@ def static_probability(log_scale: torch.Tensor, valid: torch.Tensor) -> torch.Te
     return ((STATIC_AT - (s - trusted)) * STATIC_SLOPE).sigmoid() * valid
 
 
-def propose_motion(network: torch.nn.Module, pair: FramePair) -> Proposal | None:
-    """A pixel-wise network's motion and static world, for a judge that trusts no other.
+def propose_motion(network: torch.nn.Module, pair: FramePair) -> MotionPrediction | None:
+    """A pixel-wise network's motion and static world, for an ambiguous pair.
 
     Args:
         network: a PWVO with uncertainty.
@@ -179,7 +178,6 @@ def propose_motion(network: torch.nn.Module, pair: FramePair) -> Proposal | None
         The motion that the trusted pixels agree on, after the last pass; None where too little is
         valid, or the answer is not finite.
     """
-    from hybridvo.hypotheses.selector import Proposal
     from hybridvo.network.inputs import assemble_inputs
     from hybridvo.network.passes import predict
 
@@ -194,7 +192,9 @@ def propose_motion(network: torch.nn.Module, pair: FramePair) -> Proposal | None
         T = fitted_motion(output, inputs)[0].double().numpy()
         valid = _on_grid_of(log_scale, inputs).valid
         static = static_probability(log_scale, valid)[0].numpy()
-    return Proposal(T, static) if np.isfinite(T).all() and np.isfinite(static).all() else None
+    return (
+        MotionPrediction(T, static) if np.isfinite(T).all() and np.isfinite(static).all() else None
+    )
 
 
 def estimate_learned(

@@ -1,8 +1,8 @@
-"""The join of the learned and the classical half: a pair in, its camera motion out.
+"""A pair in, its camera motion out: every method, and the stages it is made of.
 
-The only place where network and pose meet. The classical half finds every strong motion of the
-picture and fits it exactly; the learned judge says which of them is the world and where the world
-is, and the motion is fitted there.
+Read this file first. The stages: *predict* (a network), *search* (every strong motion of the pair),
+*select* (which one is the camera's, and where the scene is static), *refine* (on flow and depth),
+*refine photometrically* (on the images).
 """
 
 from __future__ import annotations
@@ -11,44 +11,235 @@ import difflib
 import functools
 import hashlib
 import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
-from hybridvo.checks import as_number, as_rigid, as_seed
-from hybridvo.compilation import compile_once
+from hybridvo.baselines import pnp
+from hybridvo.checks import as_rigid, as_seed
 from hybridvo.errors import CheckpointError, InputError
 from hybridvo.flow import contradiction
-from hybridvo.hypotheses.cues import default_judge
-from hybridvo.hypotheses.selector import PictureJudge
-from hybridvo.learned import (
-    LEARNED,
-    LEAST_PIXELS,
-    estimate_learned,
-    shipped_network,
+from hybridvo.geometry import ego_flow, se3_exp
+from hybridvo.hypotheses.generate import HypothesisSet, generate
+from hybridvo.hypotheses.selector import CueSelector, MaskSelector, Scorer, Selection, Selector
+from hybridvo.options import Options
+from hybridvo.refinement import refine as stage
+from hybridvo.refinement.photometric import refine_photometric
+from hybridvo.types import (
+    Camera,
+    Frame,
+    FramePair,
+    MotionPrediction,
+    MotionPrior,
+    PairBatch,
+    Reason,
+    RelativePose,
 )
-from hybridvo.learned_judge import LearnedJudge
-from hybridvo.refinement.photometric import PhotometricOptions, polish_photometric
-from hybridvo.refinement.readiness import compile_refinement, run_kernels
-from hybridvo.refinement.refine import RefinementOptions, refine
-from hybridvo.types import FramePair, Reason, RelativePose
 
-__all__ = [
-    "DEFAULT_METHOD",
-    "JUDGED",
-    "METHODS",
-    "POLISH",
-    "check_method",
-    "compile_kernels",
-    "estimate",
-    "shipped_judge",
-    "warm_up",
-]
+if TYPE_CHECKING:
+    import torch
+
+    from hybridvo.pose.batched import BatchedPose
 
 DEFAULT_METHOD = "hybrid"
+MAX_METRES = 100.0
+"""Median depth above which depth is suspected to be in millimetres."""
+WARM_UP_SIZES = ((48, 64), (320, 400))
+"""Height and width of the pairs of :func:`warm_up`; the second takes the parallel kernels."""
 
-_BASELINES = (
+
+class Models:
+    """Networks by name, read on first use.
+
+    Args:
+        device: ``cpu``, ``cuda``, or ``auto`` for cuda where there is one.
+        weights: files to be read instead of the pretrained weights of a name.
+
+    Raises:
+        InputError: a device that is not there.
+    """
+
+    def __init__(
+        self, device: str = "cpu", weights: Mapping[str, str | Path] | None = None
+    ) -> None:
+        self.device = torch_device(device)
+        self.weights = {name: Path(file) for name, file in (weights or {}).items()}
+        self._networks: dict[str, Any] = {}
+
+    def path(self, name: str) -> Path:
+        """File of the weights of a network.
+
+        Raises:
+            CheckpointError: there are none (the message lists those known).
+        """
+        from hybridvo.network.weights import pretrained
+
+        return self.weights.get(name) or pretrained(name)
+
+    def network(self, name: str) -> torch.nn.Module:
+        """A network, in the form that is fastest on its device.
+
+        Raises:
+            CheckpointError: no such weights, or damaged ones.
+        """
+        import torch
+
+        from hybridvo.network.weights import load_weights
+
+        if name not in self._networks:
+            network = load_weights(self.path(name))[0].eval().to(self.device)
+            self._networks[name] = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        return self._networks[name]
+
+    def scorer(self) -> Scorer:
+        """The selector network.
+
+        Raises:
+            CheckpointError: no such weights, weights of another network, or damaged ones.
+        """
+        from hybridvo.network.judge import JudgeNetwork
+        from hybridvo.network.scorer import NetworkScorer
+
+        network = self.network("judge")
+        if not isinstance(network, JudgeNetwork):
+            raise CheckpointError(
+                f"{self.path('judge')}: expected the weights of a selector, got another network's."
+            )
+        return NetworkScorer(network, self.device)
+
+
+@functools.cache
+def default_models(device: str = "cpu") -> Models:
+    """The pretrained networks, shared by all estimates of a process."""
+    return Models(device)
+
+
+def torch_device(device: str) -> str:
+    """``cpu`` or ``cuda`` for a device asked for.
+
+    Raises:
+        InputError: ``cuda`` on a machine, or with a build of torch, that has none.
+    """
+    if device == "cpu":
+        return device
+    import torch
+
+    if torch.cuda.is_available():
+        return "cuda"
+    if device == "cuda":
+        raise InputError(
+            "device cuda: this machine, or this build of torch, has no CUDA device; use cpu."
+        )
+    return "cpu"
+
+
+@dataclass(frozen=True, eq=False)
+class Context:
+    """What the methods need beside the pair.
+
+    Args:
+        options: the option tree.
+        prior: what is known of the motion before the pair is seen, or None.
+        seed: of everything drawn at random.
+        weights: (H, W) factors on the information of each pixel, for the search, or None.
+        models: the networks.
+        check_flow: ask the images whether the flow can be theirs.
+    """
+
+    options: Options = field(default_factory=Options)
+    prior: MotionPrior | None = None
+    seed: int = 0
+    weights: np.ndarray | None = None
+    models: Models = field(default_factory=default_models)
+    check_flow: bool = True
+
+    def search(self, pair: FramePair) -> HypothesisSet | RelativePose:
+        """Every strong motion of a pair, from the identity and the prior; or the failure."""
+        starts = [np.eye(4)] + ([] if self.prior is None else [self.prior.T_curr_prev])
+        return generate(pair, np.stack(starts), self.options, self.seed, self.weights)
+
+    def selector(self) -> Selector:
+        """The learned selector."""
+        return MaskSelector(self.models.scorer(), self.options)
+
+    def predict(self, pair: FramePair) -> MotionPrediction | None:
+        """PWVO's motion and static probability; None where it has too little to see."""
+        from hybridvo.learned import propose_motion
+
+        return propose_motion(self.models.network("pwvo"), pair)
+
+
+def refine_selection(
+    pair: FramePair, found: HypothesisSet, chosen: Selection, ctx: Context
+) -> RelativePose:
+    """The motion selected, refined inside its static mask, with covariance and status."""
+    grid = found.grid
+    if chosen.mask is not None:
+        grid = grid.within(pair, ctx.weights, chosen.mask)
+    context = stage.Context(
+        noise=chosen.noise,
+        coverage=chosen.coverage,
+        probability=chosen.probability,
+        min_probability=ctx.options.select.min_confidence,
+        hypotheses=chosen.hypotheses,
+        iterations=chosen.iterations,
+    )
+    return stage.refine_pair(
+        pair, chosen.T_curr_prev, grid, options=ctx.options.refine, context=context
+    )
+
+
+def classical(pair: FramePair, ctx: Context) -> RelativePose:
+    """Search, select by hand-made cues, refine."""
+    found = ctx.search(pair)
+    if isinstance(found, RelativePose):
+        return found
+    return refine_selection(pair, found, CueSelector().select(found, ctx.prior), ctx)
+
+
+def hybrid_flow(pair: FramePair, ctx: Context) -> RelativePose:
+    """Search, select by the network, ask PWVO where that is in doubt, refine."""
+    found = ctx.search(pair)
+    if isinstance(found, RelativePose):
+        return found
+    selector = ctx.selector()
+    chosen = selector.select(found, ctx.prior)
+    if found.is_ambiguous and chosen.confidence < ctx.options.select.consult_below:
+        prediction = ctx.predict(pair)
+        if prediction is not None:
+            chosen = selector.select(found, ctx.prior, prediction)
+    return refine_selection(pair, found, chosen, ctx)
+
+
+def hybrid(pair: FramePair, ctx: Context) -> RelativePose:
+    """The same, and then refined photometrically where the images allow it."""
+    wrong = contradiction(pair) if ctx.check_flow else None
+    if wrong is not None:
+        return RelativePose.failed(Reason.NO_FLOW, wrong)
+    return hybrid_flow(pair, ctx)
+
+
+def learned(name: str) -> Callable[[FramePair, Context], RelativePose]:
+    """A network alone, by the paper's selection."""
+
+    def run(pair: FramePair, ctx: Context) -> RelativePose:
+        from hybridvo.learned import estimate_learned
+
+        return estimate_learned(pair, name, ctx.models.network(name))
+
+    return run
+
+
+def baseline(name: str) -> Callable[[FramePair, Context], RelativePose]:
+    """An estimator of another library."""
+    return lambda pair, ctx: pnp.baselines()[name](pair, seed=ctx.seed)
+
+
+LEARNED = ("pwvo", "pwvo-naive", "pixelwise", "vonet", "vonet-attention")
+BASELINES = (
     "pnp-ransac",
     "pnp-ransac-tuned",
     "usac-magsac",
@@ -57,28 +248,26 @@ _BASELINES = (
     "open3d-rgbd",
     "identity",
 )
-JUDGED = ("hybrid", "hybrid-flow")
-"""Methods that ask a learned judge which motion is the world."""
-METHODS = (*JUDGED, "refine", *LEARNED, *_BASELINES)
-"""Every method name, in the order of the results' tables."""
+METHODS: dict[str, Callable[[FramePair, Context], RelativePose]] = {
+    "hybrid": hybrid,
+    "hybrid-flow": hybrid_flow,
+    "refine": classical,
+    **{name: learned(name) for name in LEARNED},
+    **{name: baseline(name) for name in BASELINES},
+}
+"""Every method, in the order of the results' tables."""
+SELECTING = ("hybrid", "hybrid-flow")
+"""Methods that ask the selector network."""
 
 
-POLISH = ("auto", "on", "off")
-"""Whether the pictures sharpen the flow's motion: ``auto`` where the method is ``hybrid``, ``on``
-with every refinement, ``off`` never."""
+def networks_of(method: str) -> tuple[str, ...]:
+    """Names of the weights that a method uses."""
+    if method in SELECTING:
+        return ("judge", "pwvo")
+    return (method,) if method in LEARNED else ()
 
 
-def check_polish(polish: str) -> None:
-    """Refuse a word that is not in :data:`POLISH`.
-
-    Raises:
-        InputError: an unknown word.
-    """
-    if polish not in POLISH:
-        raise InputError(f"polish: expected {', '.join(POLISH)}, got {polish!r}.")
-
-
-def check_method(method: str) -> None:
+def check_method(method: str, models: Models | None = None) -> None:
     """Refuse a method that cannot run here.
 
     Raises:
@@ -89,201 +278,235 @@ def check_method(method: str) -> None:
         near = difflib.get_close_matches(str(method), METHODS, n=1, cutoff=0.4)
         hint = f" (did you mean '{near[0]}'?)" if near else ""
         raise InputError(f"method: '{method}' is unknown{hint}; known: {', '.join(METHODS)}.")
-    needed = "judge" if method in JUDGED else method
-    if method in JUDGED or method in LEARNED:
-        from hybridvo.network.weights import pretrained_names
-
-        if needed not in pretrained_names():
+    for name in networks_of(method):
+        try:
+            (models or default_models()).path(name)
+        except CheckpointError:
             raise InputError(
-                f"method '{method}' needs network weights, which this version does not ship yet; "
-                f"use --method refine (the classical refinement)."
-            )
-    if method in _BASELINES:
-        from hybridvo.baselines.pnp import missing
+                f"method '{method}' needs the weights '{name}', which this version does not have; "
+                f"use --method refine (the classical refinement), or --weights {name}=FILE."
+            ) from None
+    if method in BASELINES and method in (absent := pnp.missing()):
+        raise InputError(f"method '{method}' cannot run here: {absent[method]}.")
 
-        absent = missing()
-        if method in absent:
-            raise InputError(f"method '{method}' cannot run here: {absent[method]}.")
+
+@overload
+def estimate(pair: FramePair, /, **options: Any) -> RelativePose: ...
+
+
+@overload
+def estimate(prev: Frame, curr: Frame, /, **options: Any) -> RelativePose: ...
 
 
 def estimate(
-    pair: FramePair,
+    pair: FramePair | Frame,
+    curr: Frame | None = None,
     *,
-    T_last: np.ndarray | None = None,
-    T_last_covariance: np.ndarray | None = None,
     method: str = DEFAULT_METHOD,
-    options: RefinementOptions | None = None,
-    judge: PictureJudge | None = None,
-    polish: str = "auto",
-    photometric: PhotometricOptions | None = None,
-    trust: float = 1.0,
+    prior: MotionPrior | None = None,
+    options: Options | None = None,
+    models: Models | None = None,
     seed: int = 0,
 ) -> RelativePose:
     """Camera motion of one pair.
 
     Args:
-        pair: two frames and the flow between them.
-        T_last: (4, 4) motion of the pair before: a start among others and a cue for the judge, for
-            the methods that can use one.
-        T_last_covariance: (6, 6) of ``Exp(delta) T_last``, translation first, m^2 and rad^2, where
-            ``T_last`` is a prediction that knows its own worth.
+        pair: two frames and the flow between them; or the previous frame.
+        curr: then the current frame; the flow is OpenCV's DIS.
         method: one of :data:`METHODS` that can run here.
-        options: of the refinement.
-        judge: for the methods that ask one; by default the one whose weights are shipped.
-        polish: one of :data:`POLISH`, see
-            :func:`hybridvo.refinement.photometric.polish_photometric`.
-        photometric: options of the polish.
-        trust: in the pictures, 0 to 1, see
-            :class:`hybridvo.refinement.photometric_monitor.PhotometricMonitor`.
-        seed: of everything that is drawn at random; the same seed gives the same bytes.
+        prior: what is known of the motion: one more start, and a cue for the selection.
+        options: the option tree; ``search``, ``select``, ``refine``, ``photometric``, and
+            ``run.device`` and ``flow`` are read.
+        models: networks of one's own; by default the pretrained ones.
+        seed: of everything that is drawn at random.
 
     Returns:
         ``T_curr_prev`` with covariance and status. Bad data give a failed status, never an
         exception and never a value that is not finite.
 
     Raises:
-        InputError: an unknown method, or one that cannot run here; another word for ``polish``;
-            an argument of another kind.
+        InputError: an unknown method, or one that cannot run here; an argument of another kind.
 
     Example:
         >>> import numpy as np
+        >>> from hybridvo.types import Camera, Frame, FramePair
         >>> frame = Frame(None, np.ones((24, 32)), Camera(30, 30, 15.5, 11.5, 24, 32))
         >>> estimate(FramePair(frame, frame, None)).status.reason.value
         'no_flow'
     """
+    options = options or Options()
+    _check_kind("options", options, Options)
+    if curr is not None or isinstance(pair, Frame):
+        pair = _pair_of(pair, curr, options)
     if not isinstance(pair, FramePair):
-        raise InputError(f"estimate: expected a FramePair, got {type(pair).__name__}.")
-    seed = as_seed(seed, "estimate.seed")
-    if T_last is not None:
-        T_last = as_rigid(T_last, "estimate.T_last")
-    if not 0 <= as_number(trust) <= 1:
-        raise InputError(f"estimate: expected trust in [0, 1], got {trust!r}.")
-    for name, value, kind in (
-        ("options", options, RefinementOptions),
-        ("photometric", photometric, PhotometricOptions),
-    ):
-        if value is not None and not isinstance(value, kind):
-            got = type(value).__name__
-            raise InputError(f"estimate.{name}: expected {kind.__name__}, got {got}.")
-    check_polish(polish)
-    polished = polish == "on" or (polish == "auto" and method == "hybrid")
-    if method == "refine" or method in JUDGED:
-        wrong = contradiction(pair) if polished else None
-        if wrong is not None:
-            return RelativePose.failed(Reason.NO_FLOW, wrong, method)
-        compile_kernels(method)
-        chosen: Any = (judge or shipped_judge()) if method in JUDGED else default_judge
-        found = refine(
-            pair,
-            T_last=T_last,
-            T_last_covariance=T_last_covariance,
-            options=options,
-            judge=chosen,
-            seed=seed,
+        raise InputError(
+            f"estimate: expected a FramePair or two Frames, got {type(pair).__name__}."
         )
-        if polished:
-            found = polish_photometric(pair, found, photometric, trust=trust)
-        return found.replace(method=method)
-    check_method(method)
-    if method in LEARNED:
-        return _too_little(pair, method) or estimate_learned(pair, method)
-    from hybridvo.baselines.pnp import baselines
-
-    return baselines()[method](pair, seed=seed)
+    if prior is not None:
+        _check_kind("prior", prior, MotionPrior)
+    seed = as_seed(seed, "estimate.seed")
+    models = models or default_models(options.run.device if networks_of(method) else "cpu")
+    return run_method(pair, method, Context(options, prior, seed, None, models))
 
 
-FARTHEST_M = 1e7
-"""Depth that still says something: beyond, a picture's flow tells no network any translation."""
+def run_method(pair: FramePair, method: str, ctx: Context) -> RelativePose:
+    """:func:`estimate` for arguments that were checked."""
+    check_method(method, ctx.models)
+    started = time.perf_counter()
+    found = METHODS[method](pair, ctx)
+    mode = ctx.options.photometric.mode
+    if (mode == "on" and method in (*SELECTING, "refine")) or (
+        mode == "auto" and method == "hybrid"
+    ):
+        found = refine_photometric(pair, found, ctx.options.photometric)
+    if found.status.ok and not found.status.message and (doubt := _depth_doubt(pair)):
+        found = found.replace(status=replace(found.status, message=doubt))
+    return found.replace(method=method, ms=1e3 * (time.perf_counter() - started))
 
 
-def _too_little(pair: FramePair, method: str) -> RelativePose | None:
-    """A failure where the pair itself, and not only its enlargement, is too small for a network."""
-    depth, flow = pair.prev.depth, pair.flow
-    if depth is None or flow is None:
-        return None
-    usable = (depth > 0) & (depth < FARTHEST_M) & np.isfinite(flow).all(axis=2)
-    for mask in (pair.prev.mask, pair.flow_valid):
-        if mask is not None:
-            usable &= mask
-    seen = int(np.count_nonzero(usable))
-    if seen >= LEAST_PIXELS:
-        return None
-    what = f"{seen} pixels have flow and depth below {FARTHEST_M:g} m, {LEAST_PIXELS} needed"
-    return RelativePose.failed(Reason.NO_VALID_DEPTH, what, method)
+def refines_images(method: str, options: Options) -> bool:
+    """Whether a method ends with the photometric refinement."""
+    if options.photometric.mode == "auto":
+        return method == "hybrid"
+    return options.photometric.mode == "on" and method in (*SELECTING, "refine")
 
 
-@functools.cache
-def shipped_judge(name: str = "judge") -> LearnedJudge:
-    """A judge whose weights are part of the package; read once in a process.
+def _check_kind(name: str, value: Any, kind: type) -> None:
+    if not isinstance(value, kind):
+        got = type(value).__name__
+        raise InputError(f"estimate.{name}: expected {kind.__name__}, got {got}.")
+
+
+def _pair_of(prev: Any, curr: Any, options: Options) -> FramePair:
+    """A pair of two frames with DIS flow between them."""
+    from hybridvo.flow import dis_flow
+
+    for name, frame in (("first", prev), ("second", curr)):
+        if not isinstance(frame, Frame):
+            got = type(frame).__name__
+            raise InputError(f"estimate: expected a Frame as the {name} of two, got {got}.")
+    flow = dis_flow(options.flow.dis_preset, options.flow.forward_backward)(prev, curr)
+    return FramePair(prev, curr, flow.flow, flow.variance, flow.valid, flow.source, flow.is_true)
+
+
+def _depth_doubt(pair: FramePair) -> str:
+    """A sentence where depth looks as if it were in millimetres; empty where it does not."""
+    if pair.prev.depth is None:
+        return ""
+    depth = pair.prev.depth[::8, ::8]
+    depth = depth[np.isfinite(depth) & (depth > 0)]
+    if depth.size == 0 or np.median(depth) <= MAX_METRES:
+        return ""
+    return (
+        f"the median depth is {np.median(depth):.0f} m, and the motion as much too large if that "
+        f"is millimetres: Frame.depth expects metres"
+    )
+
+
+@overload
+def refine(
+    pair: FramePair,
+    T_init: np.ndarray | None = None,
+    weights: np.ndarray | None = None,
+    *,
+    options: Options | None = None,
+    seed: int = 0,
+) -> RelativePose: ...
+
+
+@overload
+def refine(
+    pair: PairBatch,
+    T_init: Any = None,
+    weights: Any = None,
+    *,
+    options: Options | None = None,
+    seed: int = 0,
+) -> BatchedPose: ...
+
+
+def refine(
+    pair: FramePair | PairBatch,
+    T_init: Any = None,
+    weights: Any = None,
+    *,
+    options: Options | None = None,
+    seed: int = 0,
+) -> RelativePose | BatchedPose:
+    """Camera motion by robust dense reprojection, without any network.
 
     Args:
-        name: of the weights.
+        pair: a :class:`FramePair` (numpy), or a :class:`PairBatch` (torch) for the batched,
+            differentiable path, see :func:`hybridvo.pose.batched.refine_batch`: that one does not
+            search, and follows the largest motion where nothing is handed in.
+        T_init: (4, 4) T_curr_prev, the only start; None: every strong motion is searched, and
+            hand-made cues say which is the camera's.
+        weights: (H, W) factors on the information of each pixel; 0 and NaN switch a pixel off.
+        options: ``search`` and ``refine`` are read.
+        seed: of the search.
+
+    Returns:
+        The motion with covariance and status (for a :class:`PairBatch` a ``BatchedPose``). Bad data
+        give a failed status, never an exception and never a value that is not finite.
 
     Raises:
-        CheckpointError: no such weights, weights of another network, or damaged ones.
+        InputError: an argument of another kind or shape, or a start that is no rigid transform.
     """
-    from hybridvo.network.judge import JudgeNetwork
-    from hybridvo.network.weights import load_weights, pretrained
+    options = options or Options()
+    _check_kind("options", options, Options)
+    if isinstance(pair, PairBatch):
+        from hybridvo.pose.batched import refine_batch
 
-    path = pretrained(name)
-    network, _ = load_weights(path)
-    if not isinstance(network, JudgeNetwork):
-        raise CheckpointError(f"{path}: expected the weights of a judge, got another network's.")
-    return LearnedJudge(network, shipped_network("pwvo"))
+        return refine_batch(pair, T_init=T_init, weights=weights)
+    if not isinstance(pair, FramePair):
+        raise InputError(f"refine: expected a FramePair or a PairBatch, got {type(pair).__name__}.")
+    seed = as_seed(seed, "refine.seed")
+    if weights is not None and np.shape(weights) != pair.prev.camera.shape:
+        raise InputError(
+            f"refine: expected weights of shape {pair.prev.camera.shape}, got {np.shape(weights)}."
+        )
+    started = time.perf_counter()
+    if T_init is None:
+        motion = classical(pair, Context(options, None, seed, weights))
+    else:
+        T = as_rigid(T_init, "refine.T_init")
+        motion = stage.refine_pair(pair, T, weights=weights, options=options.refine)
+    return motion.replace(ms=1e3 * (time.perf_counter() - started))
 
 
-def weights_hash(method: str) -> str | None:
-    """SHA-256 over the shipped weights that a method uses; None for a method without a network."""
-    from hybridvo.network.weights import pretrained
-
-    names = ("judge", "pwvo") if method in JUDGED else (method,) if method in LEARNED else ()
+def weights_hash(method: str, models: Models | None = None) -> str | None:
+    """SHA-256 over the weights that a method uses; None for a method without a network."""
     digest = hashlib.sha256()
-    for name in names:
-        digest.update(pretrained(name).read_bytes())
-    return digest.hexdigest() if names else None
+    for name in networks_of(method):
+        digest.update((models or default_models()).path(name).read_bytes())
+    return digest.hexdigest() if networks_of(method) else None
 
 
-def warm_up(method: str = DEFAULT_METHOD, polish: str = "auto") -> float:
-    """Pay for the compilation (or the reading of its cache) before the first real frame.
-
-    Runs the refinement once on a made pair of each size class. Costs half a minute on the very
-    first call after an installation, when another process compiles (:func:`compile_kernels`), half
-    a second after that, and nothing in the same process.
+def warm_up(method: str = DEFAULT_METHOD, models: Models | None = None) -> float:
+    """Compile the kernels (or read them from numba's cache) and the networks before a first pair.
 
     Returns:
-        Seconds spent.
+        Seconds spent: a minute on the first call after an installation, a second after that.
     """
     started = time.perf_counter()
-    if method in _BASELINES:
+    if method in BASELINES:
         return 0.0
-    if method in LEARNED:
-        shipped_network(method)
-    compile_kernels(method)
-    judge = shipped_judge() if method in JUDGED else default_judge
-    run_kernels(judge, polish=polish == "on" or method == "hybrid")
+    for height, width in WARM_UP_SIZES:
+        camera = Camera(width, width, (width - 1) / 2, (height - 1) / 2, height, width)
+        u, v = np.arange(width), np.arange(height)[:, None]
+        depth = (4.0 + np.sin(u / 7.0) + np.cos(v / 5.0)).astype(np.float32)
+        motion = se3_exp(np.array([0.02, -0.01, 0.05, 0.002, 0.004, -0.003]))
+        flow = ego_flow(depth, motion, camera, camera).astype(np.float32)
+        # a mask, a variance and a second motion: every branch is compiled
+        flow[: height // 3, : width // 3] += 3.0
+        rgb = (40 * (2 + np.sin(u / 3.0) + np.cos(v / 2.0)))[..., None].repeat(3, 2)
+        frame = Frame(rgb.astype(np.uint8), depth, camera)
+        valid = np.ones((height, width), np.bool_)
+        variance = np.full((height, width), 0.01, np.float32)
+        context = Context(models=models or default_models(), check_flow=False)
+        for pair in (
+            FramePair(frame, frame, flow, variance, valid),
+            FramePair(frame, frame, flow),
+        ):
+            run_method(pair, method, context)
     return time.perf_counter() - started
-
-
-@functools.cache
-def compile_kernels(method: str = DEFAULT_METHOD) -> bool:
-    """Have the kernels compiled by another process, so that this one reads what later ones read;
-    asked once in a process.
-
-    Code that is compiled in a process differs from the same code out of the cache in the last bits
-    of its sums (:mod:`hybridvo.compilation`): without this, a first run's motions differ by some
-    1e-7 m from those of every later one.
-
-    Args:
-        method: whose kernels; those of ``refine`` are compiled with every one, and before.
-
-    Returns:
-        Whether they are in the cache now; where they cannot be, this process compiles for itself.
-    """
-    done = compile_refinement()
-    if method in JUDGED:
-        code = (
-            "from hybridvo.pipeline import shipped_judge; "
-            "from hybridvo.refinement.readiness import run_kernels; run_kernels(shipped_judge())"
-        )
-        done = compile_once(code, Path(__file__).resolve().parent / "refinement", "judged") and done
-    return done

@@ -185,7 +185,7 @@ class Recording:
         log("status/ms", rr.Scalars(motion.ms))
         if str(step.status) != "ok":
             text = f"frame {step.index}: {step.status} {step.status.message}"
-            log("status/messages", rr.TextLog(text, level="ERROR" if not step.ok else "WARN"))
+            log("status/messages", rr.TextLog(text, level="ERROR" if not step.usable else "WARN"))
         # the covariance of the motion, in the camera where it lies
         values, axes = np.linalg.eigh(motion.covariance[:3, :3])
         if np.linalg.det(axes) < 0:

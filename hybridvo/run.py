@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 import hybridvo
-from hybridvo.configuration import RunOptions
+from hybridvo.configuration import RunOptions, option_tree
 from hybridvo.console import Progress, interruptible
 from hybridvo.data.fingerprint import input_hash, input_times
 from hybridvo.data.sequence import Sequence, open_sequence
@@ -32,7 +32,7 @@ from hybridvo.evaluation.report import write_json
 from hybridvo.flow import FlowField, FlowProvider, dis_flow, fallback, file_flow
 from hybridvo.geometry import invert
 from hybridvo.odometry import Odometry
-from hybridvo.pipeline import JUDGED, check_method, compile_kernels, weights_hash
+from hybridvo.pipeline import check_method, weights_hash
 from hybridvo.recording import Recording, check_recording
 from hybridvo.run_folder import PARTIAL, RESULTS, Mode, RunFolder
 from hybridvo.run_results import (
@@ -44,7 +44,6 @@ from hybridvo.run_results import (
     true_trajectory,
     write_steps,
 )
-from hybridvo.tracking.anchor import dump_anchor, load_anchor
 from hybridvo.trajectory import Trajectory, write_kitti, write_tum
 from hybridvo.types import Frame, Step
 
@@ -128,8 +127,6 @@ def run(
             f"{sequence.name}: no frames from {options.start} on: there are {len(sequence)}."
         )
     provider = flow_provider(sequence, options)
-    if options.method == "refine" or options.method in JUDGED:
-        compile_kernels(options.method)  # before the folder is taken: it may last
     out = Path("runs") / run_name(sequence) if out is None else Path(out)
     check_outside(out, sequence)
     identity = {
@@ -202,13 +199,7 @@ def _run(
         vo = Odometry(
             flow=provider,
             method=options.method,
-            polish=options.polish,
-            window=options.window,
-            window_options=options.key_frames,
-            history=options.history,
-            photometric=options.photometric,
-            policy=options.policy,  # type: ignore[arg-type]
-            options=options.refinement,
+            options=option_tree(options),
             seed=options.seed,
         )
         done = folder.frames_done
@@ -226,22 +217,19 @@ def _run(
         if interruption:
             progress.say(f"interrupted: {folder.frames_done} frames are kept; go on with --resume")
             return _write(sequence, frames, options, folder, interrupted=True)
-        said = [vo.images.message] if vo.images.message else []
-        return _write(sequence, frames, options, folder, interrupted=False, warnings=said)
+        return _write(sequence, frames, options, folder, interrupted=False)
 
 
 def _resume(vo: Odometry, folder: RunFolder, sequence: Sequence, frames: range) -> int:
     """Put the tracker where the last kept row left it; returns the failures up to there."""
     assert folder.last is not None
     try:
-        # key frames are written where they change: those of the latest such row hold
-        keys = None
         for number, row in enumerate(folder.rows()):
             index = frames[number]
             if row["index"] != index or row["timestamp"] != sequence.timestamps[index]:
                 raise ValueError(f"row {number + 1} is another frame's")
-            keys = row["anchor"]["keys"] or keys
-        vo.resume(load_anchor(folder.last["anchor"], keys, sequence.frame))
+        for number in range(folder.frames_done):
+            vo.track(sequence.frame(frames[number]))
         return int(folder.last["failed_so_far"])
     except (KeyError, TypeError, ValueError, IndexError, OSError) as error:
         raise InputError(
@@ -261,7 +249,7 @@ def _track(
 ) -> dict[str, Any]:
     """Row of one frame."""
     stamp = float(sequence.timestamps[index])
-    before = vo.anchor
+    before = vo.state
     provider.field = None
     ratio: float | None = None
     repeated = False
@@ -277,8 +265,8 @@ def _track(
         step = vo.track(frame)
         ms = 1e3 * (time.perf_counter() - started)
         flow = None if provider.field is None else provider.field.flow
-        repeated = step.ok and is_repeated(before.frame, frame)
-        if before.frame is not None and step.ok:
+        repeated = step.usable and is_repeated(before.frame, frame)
+        if before.frame is not None and step.usable:
             ratio = depth_ratio(before.frame, frame, flow, step.T_curr_prev)
         if tape is not None:
             tape.add(frame, step, flow)
@@ -300,13 +288,12 @@ def _track(
         "prev_index": None if before.frame is None else before.frame.index,
         "flow_source": None if field is None else field.source,
         "terms": "+".join(motion.terms),
-        "polish": _polish_word(motion.polish),
+        "polish": _polish_word(motion.photometric),
         "flow_is_true": field is not None and field.flow is not None and field.is_true,
         "errors": _errors(sequence, before.frame, step),
         "depth_ratio": ratio,
         "repeated": repeated,
         "window": "+".join(str(e.prev) for e in vo.edges if e.ok and e.kind != "chain"),
-        "anchor": dump_anchor(vo.anchor, before),
     }
     return row
 

@@ -1,4 +1,4 @@
-"""The nouns: camera, frame, pair, prediction, relative pose, status and step.
+"""The types: camera, frame, pair, prior, prediction, hypothesis, relative pose, status and step.
 
 Conventions (pinned in ``tests/test_conventions.py``): ``T_target_source`` maps homogeneous points
 of ``source`` into ``target``; camera axes x right, y down, z forward; pixel (0, 0) is the centre of
@@ -15,25 +15,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hybridvo.checks import as_float_image, as_number, to_numpy
+from hybridvo.checks import as_float_image, as_number, as_rigid, to_numpy
 from hybridvo.errors import InputError
 
 if TYPE_CHECKING:
     import torch
 
-__all__ = [
-    "Camera",
-    "Frame",
-    "FramePair",
-    "Hypothesis",
-    "PairBatch",
-    "PixelwisePrediction",
-    "Reason",
-    "RelativePose",
-    "State",
-    "Status",
-    "Step",
-]
+    from hybridvo.refinement.photometric_options import PhotometricReport
 
 MAX_PIXELS = 2**28
 """Largest image, in pixels, that a frame or a file header may declare."""
@@ -133,7 +121,7 @@ class Frame:
             None where the sensor delivered none: the pair then ends as ``failed(no_valid_depth)``.
         camera: pinhole intrinsics of this very image size.
         timestamp: seconds. Values above 1e14 are nanoseconds and are converted by the readers.
-        index: position in its sequence.
+        index: position in its sequence; None: the tracker counts.
         depth_variance: (H, W) float, variance of log depth (relative variance), or None.
         mask: (H, W) bool, True where pixels may be used, or None.
 
@@ -146,7 +134,7 @@ class Frame:
     depth: np.ndarray | None
     camera: Camera
     timestamp: float = 0.0
-    index: int = 0
+    index: int | None = None
     depth_variance: np.ndarray | None = None
     mask: np.ndarray | None = None
 
@@ -183,9 +171,10 @@ class Frame:
         if not np.isfinite(stamp):
             raise InputError(f"Frame.timestamp: expected finite seconds, got {self.timestamp!r}.")
         object.__setattr__(self, "timestamp", stamp)
-        if as_number(self.index) % 1:
-            raise InputError(f"Frame.index: expected a whole number, got {self.index!r}.")
-        object.__setattr__(self, "index", int(self.index))
+        if self.index is not None:
+            if as_number(self.index) % 1:
+                raise InputError(f"Frame.index: expected a whole number, got {self.index!r}.")
+            object.__setattr__(self, "index", int(self.index))
 
     def _check_size(self, name: str, array: np.ndarray) -> None:
         if array.shape[:2] != self.camera.shape:
@@ -281,7 +270,7 @@ class Reason(enum.Enum):
 
 @dataclass(frozen=True)
 class Status:
-    """State, reason and a sentence for people."""
+    """State, reason and a sentence that explains it."""
 
     state: State = State.OK
     reason: Reason = Reason.NONE
@@ -289,7 +278,12 @@ class Status:
 
     @property
     def ok(self) -> bool:
-        """True unless the estimate failed; a degraded estimate may be used with its covariance."""
+        """Whether the state is OK: neither degraded nor failed."""
+        return self.state is State.OK
+
+    @property
+    def usable(self) -> bool:
+        """Whether there is an estimate: not failed. A degraded one has a wider covariance."""
         return self.state is not State.FAILED
 
     @classmethod
@@ -307,27 +301,90 @@ class Status:
 
 
 @dataclass(frozen=True, eq=False)
-class Hypothesis:
-    """One strong motion found in the picture.
+class MotionPrior:
+    """What is known of a motion before the pair is seen: one start among others, and a cue.
 
     Args:
-        T_curr_prev: (4, 4).
-        support: (h, w) float32 in [0, 1], robust weight of each pixel under this motion, on the
-            grid of ``stride``.
-        stride: pixels of the full image per step of the support grid.
-        share: fraction of the valid pixels that follow this motion.
-        score: value by which the world was chosen among the hypotheses; larger is better.
-        source: which start led here (``identity``, ``handed-in``, ``window``, ``minimal``).
-        cues: named cues that went into the score.
+        T_curr_prev: (4, 4) rigid transform, metres.
+        covariance: (6, 6) positive definite, of ``Exp(delta) T_curr_prev``, delta = (translation,
+            rotation) in the current camera; m^2, m rad, rad^2.
+
+    Raises:
+        InputError: no rigid transform, or no positive definite covariance.
     """
 
     T_curr_prev: np.ndarray
-    support: np.ndarray
+    covariance: np.ndarray
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "T_curr_prev", as_rigid(self.T_curr_prev, "MotionPrior"))
+        covariance = to_numpy(self.covariance, "MotionPrior.covariance")
+        if covariance.shape != (6, 6) or covariance.dtype.kind not in "fiu":
+            raise InputError(
+                f"MotionPrior.covariance: expected numbers of shape (6, 6), got "
+                f"{covariance.dtype} of shape {covariance.shape}. A prior needs one: how far may "
+                f"the motion be from it?"
+            )
+        covariance = covariance.astype(np.float64)
+        if not (np.isfinite(covariance).all() and np.allclose(covariance, covariance.T)):
+            raise InputError("MotionPrior.covariance: expected a finite, symmetric matrix.")
+        if not np.linalg.eigvalsh(covariance)[0] > 0:
+            raise InputError(
+                "MotionPrior.covariance: expected a positive definite matrix, got one with the "
+                f"smallest eigenvalue {np.linalg.eigvalsh(covariance)[0]:.3g}."
+            )
+        object.__setattr__(self, "covariance", covariance)
+
+    def __repr__(self) -> str:
+        sigma = np.sqrt(np.diag(self.covariance))
+        return f"MotionPrior({_motion(self.T_curr_prev)}, sigma {_sizes(sigma[:3], sigma[3:])})"
+
+
+@dataclass(frozen=True, eq=False)
+class MotionPrediction:
+    """A network's prediction for one pair.
+
+    Args:
+        T_curr_prev: (4, 4) metres.
+        static_probability: (h, w) of every pixel of being static, 0 to 1, over the whole image at
+            any resolution.
+        covariance: (6, 6) of ``Exp(delta) T_curr_prev``, or None.
+    """
+
+    T_curr_prev: np.ndarray
+    static_probability: np.ndarray
+    covariance: np.ndarray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """One strong motion found in the image.
+
+    Args:
+        T_curr_prev: (4, 4).
+        source: which start led here (``identity``, ``prior``, ``window``, ``minimal``, ``refit``).
+        inlier_ratio: share of the valid pixels that follow this motion.
+        flow_noise_px: standard deviation of the flow about it, px. depth_noise: of log depth.
+        inliers: (h, w) float32 in [0, 1], robust weight of each pixel under this motion, on the
+            grid of ``stride``.
+        stride: px of the full image per step of that grid.
+        score: by which the camera's motion was chosen; larger is better.
+    """
+
+    T_curr_prev: np.ndarray
+    source: str
+    inlier_ratio: float
+    flow_noise_px: float
+    depth_noise: float
+    inliers: np.ndarray
     stride: int
-    share: float
-    score: float
-    source: str = ""
-    cues: dict[str, float] = field(default_factory=dict)
+    score: float = 0.0
+
+    def __repr__(self) -> str:
+        return (
+            f"Hypothesis({self.source}, {_motion(self.T_curr_prev)}, "
+            f"inliers {100 * self.inlier_ratio:.0f} %, score {self.score:.3g})"
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -349,11 +406,13 @@ class RelativePose:
         translation_direction_valid: whether the translation is longer than three of its own
             standard deviations; its direction means nothing otherwise.
         information_eigenvalues: (6,) ascending, of the information matrix scaled to pixels.
+        probability: that this is the camera's motion and not an object's, 0 to 1; 0 if failed.
         hypotheses: every strong motion found, the chosen one first.
         method: name of the estimator. ms: time spent, milliseconds.
-        terms: what carried the motion: ``flow``, ``depth`` (of the current frame), ``images``.
-        polish: :class:`hybridvo.refinement.photometric.PolishReport` where images were asked,
-            or None.
+        terms: what carried the motion: ``flow``, ``depth`` (of the current frame), ``images``,
+            ``window`` (key frames).
+        photometric: :class:`hybridvo.refinement.photometric.PhotometricReport` where the images
+            took part or were refused, or None.
     """
 
     T_curr_prev: np.ndarray = field(default_factory=lambda: np.eye(4))
@@ -368,16 +427,22 @@ class RelativePose:
     weights_stride: int = 1
     translation_direction_valid: bool = False
     information_eigenvalues: np.ndarray = field(default_factory=lambda: np.zeros(6))
+    probability: float = 1.0
     hypotheses: tuple[Hypothesis, ...] = ()
     method: str = ""
     ms: float = 0.0
     terms: tuple[str, ...] = ()
-    polish: Any = None
+    photometric: PhotometricReport | None = None
 
     @property
     def ok(self) -> bool:
-        """True unless the estimate failed."""
+        """Whether the status is OK: neither degraded nor failed."""
         return self.status.ok
+
+    @property
+    def usable(self) -> bool:
+        """Whether this is a measurement: not failed. The covariance of a degraded one is wider."""
+        return self.status.usable
 
     @property
     def T_prev_curr(self) -> np.ndarray:
@@ -395,12 +460,21 @@ class RelativePose:
             covariance=np.diag([1e4] * 3 + [10.0] * 3),
             status=Status.failed(reason, message),
             method=method,
+            probability=0.0,
             **extra,
         )
 
     def replace(self, **changes: Any) -> RelativePose:
         """Copy with some fields changed."""
         return replace(self, **changes)
+
+    def __repr__(self) -> str:
+        sigma = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+        return (
+            f"RelativePose({self.method or 'motion'}: {self.status}, {_motion(self.T_curr_prev)}, "
+            f"sigma {_sizes(sigma[:3], sigma[3:])}, inliers {100 * self.inlier_ratio:.0f} %, "
+            f"probability {self.probability:.2f})"
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -420,8 +494,18 @@ class Step:
 
     @property
     def ok(self) -> bool:
-        """True unless the motion of this step failed."""
+        """Whether the motion is neither degraded nor failed."""
         return self.motion.ok
+
+    @property
+    def usable(self) -> bool:
+        """Whether the motion did not fail."""
+        return self.motion.usable
+
+    @property
+    def probability(self) -> float:
+        """That the motion is the camera's, 0 to 1."""
+        return self.motion.probability
 
     @property
     def status(self) -> Status:
@@ -443,10 +527,17 @@ class Step:
         """(6, 6) covariance of the motion."""
         return self.motion.covariance
 
+    def __repr__(self) -> str:
+        x, y, z = self.T_world_cam[:3, 3]
+        return (
+            f"Step({self.index}, t {self.timestamp:.3f} s, at [{x:.3f} {y:.3f} {z:.3f}] m, "
+            f"{self.motion!r})"
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class PixelwisePrediction:
-    """What a pixel-wise network says of a batch of pairs (paper, section 3.2).
+    """Raw output of a pixel-wise network for a batch of pairs (paper, section 3.2).
 
     Args:
         rotation: (B, 3, h, w) Euler angles X-Y-Z in degrees (R = Rx Ry Rz), of T_curr_prev.
@@ -481,3 +572,15 @@ class PairBatch:
     flow_variance: torch.Tensor | None = None
     depth_variance: torch.Tensor | None = None
     valid: torch.Tensor | None = None
+
+
+def _sizes(metres: np.ndarray, radians: np.ndarray) -> str:
+    return f"{np.linalg.norm(metres):.3g} m {np.rad2deg(np.linalg.norm(radians)):.3g} deg"
+
+
+def _motion(T: np.ndarray) -> str:
+    """Translation and angle of a (4, 4) transform, for a line of print."""
+    x, y, z = T[:3, 3]
+    sine = np.array([T[2, 1] - T[1, 2], T[0, 2] - T[2, 0], T[1, 0] - T[0, 1]])
+    angle = np.arctan2(np.linalg.norm(sine), np.trace(T[:3, :3]) - 1)
+    return f"t [{x:.4f} {y:.4f} {z:.4f}] m, {np.rad2deg(angle):.3f} deg"

@@ -83,8 +83,9 @@ def systems(
 ) -> dict[str, Callable[[Any, dict[str, Any]], Any]]:
     """The rows: called with a pair and, for the oracle alone, its truth."""
     from hybridvo.learned_judge import LearnedJudge
+
     from hybridvo.network.weights import load_weights, pretrained
-    from hybridvo.refinement.refine import refine
+    from hybridvo.pipeline import refine
 
     class FirstLook(LearnedJudge):
         """Scores alone: no mask, no second fit."""

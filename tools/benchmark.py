@@ -174,7 +174,7 @@ def available_methods() -> tuple[dict[str, Callable[..., Any]], dict[str, str]]:
     if importlib.util.find_spec("hybridvo.refinement.refine") is None:
         absent["refine"] = "hybridvo.refinement.refine is not part of this version"
     else:
-        from hybridvo.refinement.refine import refine
+        from hybridvo.pipeline import refine
 
         methods["refine"] = refine
         from hybridvo.pipeline import estimate

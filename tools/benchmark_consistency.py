@@ -16,7 +16,7 @@ def run_nees(pairs: int, seed0: int) -> dict[str, Any]:
     With a right covariance it is chi-square with six degrees of freedom: mean 6, standard
     deviation sqrt(12), 99.73 % below the 3 sigma ellipsoid.
     """
-    from hybridvo.refinement.refine import refine
+    from hybridvo.pipeline import refine
     from hybridvo.synthetic.scenarios import make_model_pair
 
     values = []

@@ -37,10 +37,11 @@ print(json.dumps({"import_s": imported - begin, "warm_up_s": first, "again_s": s
 
 def run_kernel(cell: str, seed: int) -> dict[str, Any]:
     """One pass of ``Picture.full_pass`` over 436x1024 pixels beside the memory's speed."""
+    from hybridvo.refinement.options import RefinementOptions
+
     from hybridvo.refinement import pixels as module
     from hybridvo.refinement import solver
     from hybridvo.refinement.full_fit import tile_size
-    from hybridvo.refinement.options import RefinementOptions
     from hybridvo.synthetic.scenarios import make_pair
 
     pair, truth = make_pair(cell, seed)

@@ -70,8 +70,7 @@ def run_heavy(
 def heavy_methods(hybrid: bool = False) -> dict[str, Callable[[Any, dict[str, Any]], Any]]:
     """Methods of this part: called with a pair and, for the oracle alone, its truth."""
     from hybridvo.baselines import pnp as baselines
-    from hybridvo.pipeline import estimate
-    from hybridvo.refinement.refine import refine
+    from hybridvo.pipeline import estimate, refine
 
     known = baselines.baselines()
     methods: dict[str, Callable[[Any, dict[str, Any]], Any]] = {

@@ -128,7 +128,7 @@ def one_mover(network: Any, seed: int, count: int) -> dict[str, Any]:
     from hybridvo.baselines.pnp import baselines
     from hybridvo.geometry import rotation_angle
     from hybridvo.learned import estimate_learned
-    from hybridvo.refinement.refine import refine
+    from hybridvo.pipeline import refine
     from hybridvo.synthetic.diverse import WideOptions
     from hybridvo.training.stream import sample_generator
     from hybridvo.types import Camera, Frame, FramePair

@@ -63,8 +63,8 @@ def measure(name: str, pairs: Iterator[tuple[Any, Any, np.ndarray]]) -> list[dic
     """One row a variant."""
     from hybridvo.evaluation.metrics import pair_errors
     from hybridvo.flow import dis_flow
+    from hybridvo.pipeline import refine
     from hybridvo.refinement.photometric import polish_photometric
-    from hybridvo.refinement.refine import refine
     from hybridvo.types import FramePair
 
     errors: dict[str, list[list[float]]] = {variant: [] for variant in VARIANTS}

@@ -180,8 +180,8 @@ def pairs_of(sequence: Any, indices: Any) -> Iterator[tuple[Any, np.ndarray]]:
 def measure(name: str, pairs: Iterator[tuple[Any, np.ndarray]]) -> dict[str, Any]:
     """Errors before and after."""
     from hybridvo.evaluation.metrics import pair_errors
+    from hybridvo.pipeline import refine
     from hybridvo.refinement.photometric import polish_photometric
-    from hybridvo.refinement.refine import refine
 
     errors: dict[str, list[list[float]]] = {"refine": [], "polished": []}
     end = {key: np.eye(4) for key in ("refine", "polished", "truth")}

@@ -264,13 +264,12 @@ def _result(
 ) -> dict[str, Any]:
     """One estimate, its time and its errors."""
     size = (method, pair.prev.camera.shape)
-    last = np.array(T_last[key]).reshape(4, 4) if key in T_last else None
     try:
         if size not in _called_before:  # a library's own first call is not timed
             _called_before.add(size)
-            estimate(pair, T_last=last, method=method, seed=job.seed)
+            estimate(pair, method=method, seed=job.seed)
         started = time.perf_counter()
-        motion = estimate(pair, T_last=last, method=method, seed=job.seed)
+        motion = estimate(pair, method=method, seed=job.seed)
         ms = 1e3 * (time.perf_counter() - started)
     except InputError:
         raise
@@ -279,7 +278,7 @@ def _result(
         message = f"{type(error).__name__}: {error}"
     else:
         T, status, message = motion.T_curr_prev, str(motion.status), motion.status.message
-        if motion.ok:
+        if motion.usable:
             T_last[key] = T.ravel().tolist()
     errors: dict[str, float | None] = {}
     if T_true is not None:

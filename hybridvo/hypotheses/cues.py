@@ -1,120 +1,80 @@
-"""Which of the strong motions is the world? A question of prior, not of consensus.
+"""Cues that tell the motion of the static scene from that of an object, without any network.
 
-One rigid object on 60 % of the picture out-votes the world, so the share alone decides wrongly.
-:class:`CueGrid` measures what tells the world from an object; :func:`default_judge` weighs it. A
-judge is any callable ``(cues of each motion) -> scores``; a learned one comes in at the same place.
+One rigid object on 60 % of the image holds more pixels than the static scene, so the inlier ratio
+alone decides wrongly.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
-from hybridvo.geometry import rotation_angle
-
-Judge = Callable[[Sequence[dict[str, float]]], np.ndarray]
+from hybridvo.geometry import invert, se3_log
+from hybridvo.hypotheses.generate import HypothesisSet
+from hybridvo.refinement import kernels
+from hybridvo.types import Hypothesis, MotionPrior
 
 BORDER = 0.06
-"""Width of the border band, as a share of the picture's shorter side (at least one cell)."""
-
-
-SMOOTH_JUMP = 0.01
-"""Change of motion, rad of the picture, at which the smoothness cue has fallen to a half."""
+"""Width of the border band, as a share of the image's shorter side (at least one cell)."""
 SMALL = 0.2
-"""Share of the picture up to which a motion's size says nothing against it."""
+"""Inlier ratio up to which a motion's size says nothing against it."""
 DOMINANT = 0.8
-"""Share of the picture above which a motion is the world whatever its cues."""
+"""Inlier ratio above which a motion is the camera's whatever its cues."""
+MIN_NOISE_PX = 0.05
+"""Noise of the flow below which motions are equally sharp."""
 
 
-class CueGrid:
-    """What the cues of every motion of a picture share, on the (h, w) grid of the search.
+def cue_scores(
+    found: HypothesisSet, motions: Sequence[Hypothesis], prior: MotionPrior | None = None
+) -> np.ndarray:
+    """Score of each motion, larger is more likely the camera's.
 
-    Args:
-        usable: (h, w) bool, pixels with depth and flow.
-        depth: (h, w) metres.
-    """
-
-    def __init__(self, usable: np.ndarray, depth: np.ndarray) -> None:
-        h, w = usable.shape
-        self.usable = usable.ravel()
-        self.count = max(float(np.count_nonzero(usable)), 1.0)
-        self.log_depth = np.log(np.where(usable, depth, 1.0)).ravel()
-        self.mean_log_depth = float(self.log_depth.sum()) / self.count
-        band = max(1, round(BORDER * min(h, w)))
-        frame = np.ones((h, w), np.bool_)
-        frame[band : h - band, band : w - band] = False
-        self.border = np.flatnonzero(usable & frame)
-        rows = np.minimum(np.arange(h) * 4 // h, 3)
-        columns = np.minimum(np.arange(w) * 4 // w, 3)
-        self.cell = (rows[:, None] * 4 + columns[None, :]).ravel()
-        self.available = np.bincount(self.cell, usable.ravel(), minlength=16)
-
-    def cues(
-        self,
-        support: np.ndarray,
-        T_curr_prev: np.ndarray,
-        T_last: np.ndarray | None,
-        flow_noise: float,
-    ) -> dict[str, float]:
-        """Cues of one motion.
-
-        Args:
-            support: (h, w) robust weight in [0, 1] of each pixel under this motion.
-            T_curr_prev: (4, 4) the motion.
-            T_last: (4, 4) the last motion of the camera, or None.
-            flow_noise: px, standard deviation of the flow about this motion.
-
-        Returns:
-            ``share`` of the usable pixels; ``border``, share of those in the border band;
-            ``log_depth``, mean log depth of the support relative to that of all usable pixels;
-            ``spread``, how evenly the support covers a 4 x 4 grid (1 = every cell);
-            ``smoothness``, 1 for the same motion as the last one, towards 0 for a jump (0 where
-            none is known); ``flow_noise``.
-        """
-        weight = np.where(self.usable, support.ravel(), 0.0)
-        total = float(weight.sum())
-        mass = max(total, 1e-9)
-        log_depth = float(weight @ self.log_depth) / mass
-        filled = np.bincount(self.cell, weight, minlength=16)
-        covered = filled[self.available > 0] / self.available[self.available > 0]
-        smoothness = 0.0
-        if T_last is not None:
-            step = T_curr_prev @ np.linalg.inv(T_last)
-            shift = float(np.linalg.norm(step[:3, 3])) / float(np.exp(log_depth))
-            jump = float(rotation_angle(step[:3, :3])) + shift
-            smoothness = 1.0 / (1.0 + (jump / SMOOTH_JUMP) ** 2)
-        return {
-            "share": total / self.count,
-            "border": float(weight[self.border].sum()) / max(len(self.border), 1),
-            "log_depth": log_depth - self.mean_log_depth,
-            "spread": float(np.minimum(covered / 0.25, 1.0).mean()) if covered.size else 0.0,
-            "smoothness": smoothness,
-            "flow_noise": float(flow_noise),
-        }
-
-
-def default_judge(motions: Sequence[dict[str, float]]) -> np.ndarray:
-    """Score of each motion: who holds more of the border than of the picture is the world.
-
-    Movers are compact and mostly inside the picture, so their share exceeds their hold of the
-    border and they leave cells of the picture empty; the world is behind, reaches the border
+    Objects are compact and mostly inside the image: their share of the image exceeds their share of
+    its border, and they leave parts of it empty. The static scene is behind, reaches the border
     everywhere and is as sharply rigid as the flow allows (a compromise between two motions is not).
-    A motion that holds four fifths of the picture is the world whatever its cues. The weights were
-    chosen on development seeds of the synthetic world and of the benchmark's ``one60`` cell;
-    figures on other seeds are in the results.
+    The weights were chosen on development seeds of the synthetic scenes and of the scenario
+    ``one60``.
     """
-    sharpest = min(max(cue["flow_noise"], 0.05) for cue in motions)
+    h, w, _ = found.grid.shape
+    usable = found.grid.weight > 0
+    count = max(float(np.count_nonzero(usable)), 1.0)
+    depth = found.grid.samples[kernels.Z, : found.grid.count]
+    log_depth = np.log(np.where(usable, depth, 1.0))
+    mean_log_depth = float(log_depth.sum()) / count
+    band = max(1, round(BORDER * min(h, w)))
+    frame = np.ones((h, w), np.bool_)
+    frame[band : h - band, band : w - band] = False
+    border = np.flatnonzero(usable & frame.ravel())
+    cell = np.minimum(np.arange(h) * 4 // h, 3)[:, None] * 4 + np.minimum(np.arange(w) * 4 // w, 3)
+    cell = cell.ravel()
+    available = np.bincount(cell, usable, minlength=16)
+    sharpest = min(max(m.flow_noise_px, MIN_NOISE_PX) for m in motions)
     scores = np.empty(len(motions))
-    for k, cue in enumerate(motions):
+    for k, motion in enumerate(motions):
+        weight = np.where(usable, motion.inliers.ravel(), 0.0)
+        total = float(weight.sum())
+        share = total / count
+        filled = np.bincount(cell, weight, minlength=16)[available > 0] / available[available > 0]
+        spread = float(np.minimum(filled / 0.25, 1.0).mean()) if filled.size else 0.0
+        behind = float(weight @ log_depth) / max(total, 1e-9) - mean_log_depth
+        on_border = float(weight[border].sum()) / max(len(border), 1)
         scores[k] = (
-            1.2 * cue["border"]
-            - 1.5 * max(cue["share"] - SMALL, 0.0)
-            + 0.7 * cue["spread"]
-            + 0.15 * cue["log_depth"]
-            - 0.2 * np.log(max(cue["flow_noise"], 0.05) / sharpest)
-            + 0.3 * cue["smoothness"]
+            1.2 * on_border
+            - 1.5 * max(share - SMALL, 0.0)
+            + 0.7 * spread
+            + 0.15 * behind
+            - 0.2 * np.log(max(motion.flow_noise_px, MIN_NOISE_PX) / sharpest)
+            + 0.3 * agreement(motion.T_curr_prev, prior)
         )
-        if cue["share"] > DOMINANT:
+        if share > DOMINANT:
             scores[k] += 2.0
     return scores
+
+
+def agreement(T_curr_prev: np.ndarray, prior: MotionPrior | None) -> float:
+    """1 where a motion is the expected one, towards 0 by its distance in standard deviations."""
+    if prior is None:
+        return 0.0
+    delta = se3_log(T_curr_prev @ invert(prior.T_curr_prev))
+    return 1.0 / (1.0 + float(delta @ np.linalg.solve(prior.covariance, delta)) / len(delta))

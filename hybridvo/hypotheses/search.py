@@ -490,18 +490,3 @@ def find_motions(
             small, sh * sw, pose, K, fact[FLOW_NOISE], fact[DEPTH_NOISE], cutoff, work, scratch
         )
     return found
-
-
-@njit(error_model="numpy", cache=True, nogil=True)
-def translation_scale(samples, n):
-    """Root mean square of the inverse depth: turns metres of translation into radians of picture.
-
-    Not the median depth: where most of the picture is sky, the ground still tells the translation.
-    """
-    total = 0.0
-    m = 0
-    for k in range(n):
-        if samples[W, k] > 0:
-            total += 1.0 / (np.float64(samples[Z, k]) * np.float64(samples[Z, k]))
-            m += 1
-    return max(1e-9, math.sqrt(total / m)) if m > 0 else 1.0

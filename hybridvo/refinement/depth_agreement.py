@@ -14,8 +14,6 @@ import numpy as np
 from hybridvo.refinement import kernels
 from hybridvo.types import Frame
 
-__all__ = ["DepthAgreement", "depth_agreement"]
-
 PIXELS = 4000
 LEAST_PIXELS = 100
 """Pixels that are asked, and the fewest that can tell."""

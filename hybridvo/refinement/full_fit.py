@@ -6,30 +6,29 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hybridvo.refinement import depth as second_depth
+from hybridvo.options import RefineOptions
+from hybridvo.refinement import depth as current_depth
 from hybridvo.refinement import kernels, solver
 from hybridvo.refinement.covariance import ORDER, UPPER, sandwich_covariance, symmetric
 from hybridvo.refinement.depth_agreement import DepthAgreement, depth_agreement
-from hybridvo.refinement.options import RefinementOptions
-from hybridvo.refinement.pixels import Picture, as_given
+from hybridvo.refinement.pixels import CoarseGrid, PixelGrid, as_contiguous
 from hybridvo.types import FramePair
 
-LONG_STEP = 1e3
-"""Squared length, in standard deviations, of a step that may not be the last. The coarse fit is
-about sqrt(6 x 60) of the full fit's standard deviations away (60 times fewer pixels), and the step
-is wrong by some 2 % of its length, the statistical error of the curvature."""
+DEPTH_STEPS = 5
+"""Most Newton steps on the full grid with the current depth; without it one is enough: 1, 2 and 4
+steps more give the very same answers on the scenarios."""
 NOISE_PIXELS = 4000
 """Pixels that the final noise estimate looks at."""
-FEW_SAMPLES = 1500
-"""With fewer usable pixels on the coarse grid (a line across the picture leaves 50) noise and
+MIN_SAMPLES = 1500
+"""With fewer usable pixels on the coarse grid (a line across the image leaves 50) noise and
 curvature are averaged over the usable pixels of a finer one."""
 WELL_CONDITIONED = 0.005
 """Ratio of the extreme eigenvalues of the flow's information above which it needs no help."""
-SECOND_DEPTH_GAIN = 0.5
-"""The second depth is used where it adds this share of the flow's information in some direction."""
-FEW_TILES = 24
-"""Tiles of the whole picture in which usable pixels lie, below which a covariance cannot be
-trusted: depth errs alike over some 50 px, so that a line across the picture holds ten to twenty
+CURRENT_DEPTH_GAIN = 0.5
+"""The current depth is used where it adds this share of the flow's information somewhere."""
+MIN_TILES = 24
+"""Tiles of the whole image in which usable pixels lie, below which a covariance cannot be
+trusted: depth errs alike over some 50 px, so that a line across the image holds ten to twenty
 independent readings for six unknowns (3 of 59 development lines were beyond 3 sigma, one by 7)."""
 DEPTHS_PER_PAIR = 1.32
 """The two depths of a pair differ by this many times the noise of one: sqrt(2), less what the
@@ -48,8 +47,8 @@ class FullFit:
             by the typical depth. definite: whether every direction is determined.
         weights: (H, W) robust weights. weight: their sum. share: of the pixels that follow.
         cost: per usable pixel. flow_noise: px. depth_noise: of log depth, both at a pixel of the
-            typical variance handed in. uses_second_depth: whether the third residual took part.
-        depths: how the second depth agrees with the first, moved; None where it cannot be told.
+            typical variance handed in. uses_current_depth: whether the third residual took part.
+        depths: how the current depth agrees with the first, moved; None where it cannot be told.
     """
 
     pose: np.ndarray
@@ -63,14 +62,9 @@ class FullFit:
     flow_noise: float
     depth_noise: float
     iterations: int
-    uses_second_depth: bool
+    uses_current_depth: bool
     tiles: int
     depths: DepthAgreement | None = None
-
-    @property
-    def is_narrow(self) -> bool:
-        """Whether the pixels are too close together to tell how far their errors agree."""
-        return self.tiles < FEW_TILES
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,103 +79,116 @@ class _DepthTerm:
     sigma: float
 
     def sums(
-        self, picture: Picture, pose: np.ndarray, noise: np.ndarray, tile: int
+        self, image: PixelGrid, pose: np.ndarray, noise: np.ndarray, tile: int
     ) -> tuple[np.ndarray, np.ndarray]:
         """(sums of each tile (rows, columns, 27), meat (21,))."""
-        rows, columns = -(-picture.shape[0] // tile), -(-picture.shape[1] // tile)
+        rows, columns = -(-image.shape[0] // tile), -(-image.shape[1] // tile)
         sums, meat = np.zeros((rows * columns, kernels.COST)), np.zeros(21)
-        second_depth.sum_depth(
-            self.samples, self.count, self.log_depth, pose, picture.K, noise, self.sigma,
+        current_depth.sum_depth(
+            self.samples, self.count, self.log_depth, pose, image.K, noise, self.sigma,
             self.stride, tile, columns, self.width, solver.new_work(), sums, meat,
         )  # fmt: skip
         return sums.reshape(rows, columns, kernels.COST), meat
 
 
+def translation_scale(samples: np.ndarray, n: int) -> float:
+    """1 / typical depth, per metre: root mean square over the usable pixels."""
+    usable = samples[kernels.W, :n] > 0
+    inverse = 1.0 / samples[kernels.Z, :n][usable].astype(np.float64)
+    return max(1e-9, float(np.sqrt(np.mean(inverse**2)))) if len(inverse) else 1.0
+
+
 def tile_size(shape: tuple[int, int], tiles: int) -> int:
-    """Side, px, of the tiles that cut a picture into about ``tiles``; 8 to 64."""
+    """Side, px, of the tiles that cut a image into about ``tiles``; 8 to 64."""
     return int(np.clip(round(np.sqrt(shape[0] * shape[1] / tiles)), 8, 64))
+
+
+def fit_coarse(
+    samples: np.ndarray, n: int, K: np.ndarray, pose: np.ndarray, cutoff: float
+) -> tuple[np.ndarray, float, float, float, int]:
+    """One motion on gathered pixels, by graduated non-convexity from a start.
+
+    Args:
+        samples: pixel buffer; its first ``n`` pixels count.
+        n: pixels.
+        K: (4,) float32 fx, fy, cx, cy of the current camera.
+        pose: (3, 4) start; left as it is.
+        cutoff: of the robust kernel.
+
+    Returns:
+        Pose (3, 4), flow noise px, depth noise, inlier ratio of the weight, iterations.
+    """
+    work = solver.new_work()
+    pose = np.array(pose, np.float64, order="C")
+    scale = min(64.0, max(1.0, 1.5 * solver.residual_scale(samples, n, pose, K)))
+    steps = solver.graduate(samples, n, K, scale, 0.4, 0.5, 3, pose, work)
+    sf, sd, share, more, _, _ = solver.polish(
+        samples, n, K, 0.5, 0.01, solver.FLOW_NOISE_CAP, solver.DEPTH_NOISE_CAP, cutoff, 2, 4,
+        NOISE_PIXELS, pose, work,
+    )  # fmt: skip
+    return pose, sf, sd, share, steps + more
 
 
 def fit_full_grid(
     pair: FramePair,
-    picture: Picture,
-    coarse: np.ndarray,
-    grid: tuple[int, int, int],
+    grid: CoarseGrid,
     pose: np.ndarray,
     noise_start: tuple[float, float],
-    depth_scale: float,
-    options: RefinementOptions,
+    options: RefineOptions,
 ) -> FullFit:
     """Fit one motion on the full grid, from its fit on the coarse one.
 
     Args:
         pair: the input.
-        picture: its arrays.
-        coarse: gathered pixels of the coarse grid.
-        grid: (rows, columns, stride) of that grid.
+        grid: its coarse grid.
         pose: (3, 4) start.
         noise_start: (sf, sd) found with it.
-        depth_scale: 1 / typical depth.
         options: of the refinement.
     """
-    work = solver.new_work()
+    image, work = grid.pixels, solver.new_work()
     pose = pose.copy()
-    tile = tile_size(picture.shape, options.tiles)
+    tile = tile_size(image.shape, options.tiles)
+    depth_scale = translation_scale(grid.samples, grid.count)
     sf, sd = noise_start
     caps = 2.5 * sf, max(2.5 * sd, 0.02)
-    samples, n = _enough_samples(picture, coarse, grid)
+    samples, n = _enough_samples(grid)
     sf, sd, share, iterations, _, spread = solver.polish(
-        samples, n, picture.K, sf, sd, *caps, options.cutoff, 1, 4, NOISE_PIXELS, pose, work
+        samples, n, image.K, sf, sd, *caps, options.cutoff, 1, 4, NOISE_PIXELS, pose, work
     )
     noise = np.empty(3, np.float32)
     solver.set_noise(sf, sd, options.cutoff, noise)
     term = None
-    if options.second_depth != "off" and pair.curr.depth is not None:
+    if options.current_depth != "off" and pair.curr.depth is not None:
         sd, spread, term = _depth_term(
-            pair, picture, coarse, grid, pose, (sf, sd, spread), noise, tile, depth_scale, options
+            pair, grid, pose, (sf, sd, spread), noise, tile, depth_scale, options
         )
         solver.set_noise(sf, sd, options.cutoff, noise)
-    per_pixel = _curvature(picture, samples, n, pose, noise)
-    # with the second depth the weak directions are far from where the flow put them
-    long = LONG_STEP if term is None else 1.0
-    for step in range(options.full_steps + 1):
-        tiles, rest, weights = picture.full_pass(pose, noise, tile)
+    per_pixel = _curvature(image, samples, n, pose, noise)
+    # with the current depth the weak directions are far from where the flow put them
+    for step in range(1 if term is None else DEPTH_STEPS):
+        tiles, rest, weights = image.full_pass(pose, noise, tile)
         curvature = per_pixel * rest[2]
         if term:
-            depth_tiles, depth_meat = term.sums(picture, pose, noise, tile)
+            depth_tiles, depth_meat = term.sums(image, pose, noise, tile)
             tiles += depth_tiles
             curvature[21:] += depth_meat
         total = np.concatenate([tiles.sum(axis=(0, 1)), rest])
         length = _newton_step(total, curvature[:21], pose)
         iterations += step > 0
-        if not length > long:
+        if not length > 1.0:
             break
-    # the same for neighbours, so that an average over n pixels is no better than one of them
-    parallax = picture.K[0] * np.linalg.norm(pose[:, 3]) * depth_scale
-    rounding = total[29] * FLOW_ROUNDING**2 / (sf**2 + (parallax * sd) ** 2)
-    covariance, eigenvalues, definite = sandwich_covariance(
-        total,
-        curvature[:21],
-        curvature[21:],
-        _centred_scores(tiles, total),
-        tiles[..., :21],
-        depth_scale,
-        rounding,
+    covariance, eigenvalues, definite = _covariance(
+        image, tiles, total, curvature, pose, (sf, sd), depth_scale
     )
     if definite:
-        # what the uncertainty of sd^2 does to the answer, through the correction of the depth
-        slope = _slope_in_depth_variance(picture, samples, n, pose, sf, sd, options) * total[29]
-        newton = symmetric(total[:21] - curvature[:21])
-        shift = np.linalg.lstsq(newton, slope, rcond=1e-12)[0] * spread
-        covariance += np.outer(shift, shift)
-        # whether depth errs about its log, its value or its inverse is not known: the translation's
-        # length is uncertain by half the variance of log depth
-        covariance[:3, :3] += (0.5 * sd**2) ** 2 * np.outer(pose[:, 3], pose[:, 3])
+        covariance += _depth_uncertainty(
+            image, samples, n, pose, (sf, sd, spread), total, curvature, options
+        )
     depths = None
-    if options.second_depth != "off" and pair.curr.depth is not None:
+    if options.current_depth != "off" and pair.curr.depth is not None:
         robust = np.empty(n, np.float32)
-        solver.robust_weights(samples, n, pose, picture.K, noise, work, robust)
-        depths = depth_agreement(pair.curr, samples[:, :n], robust, pose, picture.origin)
+        solver.robust_weights(samples, n, pose, image.K, noise, work, robust)
+        depths = depth_agreement(pair.curr, samples[:, :n], robust, pose, image.origin)
     return FullFit(
         pose=pose,
         covariance=covariance,
@@ -194,42 +201,86 @@ def fit_full_grid(
         flow_noise=float(sf),
         depth_noise=float(sd),
         iterations=int(iterations),
-        uses_second_depth=term is not None,
-        tiles=_tiles_used(picture, samples, n, pair.prev.camera.shape, options.tiles),
+        uses_current_depth=term is not None,
+        tiles=_tiles_used(image, samples, n, pair.prev.camera.shape, options.tiles),
         depths=depths,
     )
 
 
-def _tiles_used(
-    picture: Picture, samples: np.ndarray, n: int, shape: tuple[int, int], tiles: int
-) -> int:
-    """Tiles of a picture of ``shape`` that hold one of the usable samples.
+def _covariance(
+    image: PixelGrid,
+    tiles: np.ndarray,
+    total: np.ndarray,
+    curvature: np.ndarray,
+    pose: np.ndarray,
+    noise: tuple[float, float],
+    depth_scale: float,
+) -> tuple[np.ndarray, np.ndarray, bool]:
+    """(covariance, eigenvalues, whether every direction is determined) of the last pass."""
+    # rounding is the same for neighbours, so that an average over n pixels is no better than one
+    parallax = image.K[0] * np.linalg.norm(pose[:, 3]) * depth_scale
+    rounding = total[29] * FLOW_ROUNDING**2 / (noise[0] ** 2 + (parallax * noise[1]) ** 2)
+    return sandwich_covariance(
+        total,
+        curvature[:21],
+        curvature[21:],
+        _centred_scores(tiles, total),
+        tiles[..., :21],
+        depth_scale,
+        rounding,
+    )
 
-    :data:`FEW_TILES` where the picture itself has few.
+
+def _depth_uncertainty(
+    image: PixelGrid,
+    samples: np.ndarray,
+    n: int,
+    pose: np.ndarray,
+    noise: tuple[float, float, float],
+    total: np.ndarray,
+    curvature: np.ndarray,
+    options: RefineOptions,
+) -> np.ndarray:
+    """(6, 6) what not knowing the depth's noise adds; ``noise`` = (sf, sd, error of sd^2)."""
+    sf, sd, spread = noise
+    # what the uncertainty of sd^2 does to the answer, through the correction of the depth
+    slope = _slope_in_depth_variance(image, samples, n, pose, sf, sd, options) * total[29]
+    newton = symmetric(total[:21] - curvature[:21])
+    shift = np.linalg.lstsq(newton, slope, rcond=1e-12)[0] * spread
+    covariance = np.outer(shift, shift)
+    # whether depth errs about its log, its value or its inverse is not known: the translation's
+    # length is uncertain by half the variance of log depth
+    covariance[:3, :3] += (0.5 * sd**2) ** 2 * np.outer(pose[:, 3], pose[:, 3])
+    return covariance
+
+
+def _tiles_used(
+    image: PixelGrid, samples: np.ndarray, n: int, shape: tuple[int, int], tiles: int
+) -> int:
+    """Tiles of a image of ``shape`` that hold one of the usable samples.
+
+    :data:`MIN_TILES` where the image itself has few.
     """
     tile = tile_size(shape, tiles)
     columns = -(-shape[1] // tile)
-    if shape[0] * shape[1] < 2 * FEW_TILES * tile**2:
-        return FEW_TILES
-    ifx, ify, cx, cy = picture.camera
+    if shape[0] * shape[1] < 2 * MIN_TILES * tile**2:
+        return MIN_TILES
+    ifx, ify, cx, cy = image.camera
     x, y = samples[kernels.XN : kernels.YN + 1, :n][:, samples[kernels.W, :n] > 0]
     # the rays are of pixel centres: half a pixel keeps the rounding off the border of the tile
-    u = ((x / ifx + (cx + picture.origin[0] + 0.5)) / tile).astype(np.intp)
-    v = ((y / ify + (cy + picture.origin[1] + 0.5)) / tile).astype(np.intp)
+    u = ((x / ifx + (cx + image.origin[0] + 0.5)) / tile).astype(np.intp)
+    v = ((y / ify + (cy + image.origin[1] + 0.5)) / tile).astype(np.intp)
     return int(np.count_nonzero(np.bincount(v * columns + u)))
 
 
-def _enough_samples(
-    picture: Picture, coarse: np.ndarray, grid: tuple[int, int, int]
-) -> tuple[np.ndarray, int]:
+def _enough_samples(grid: CoarseGrid) -> tuple[np.ndarray, int]:
     """The coarse grid and its size or, where few of its pixels are usable, those of a finer one."""
-    rows, columns, stride = grid
-    n = rows * columns
-    usable = np.count_nonzero(coarse[kernels.W, :n] > 0)
-    fine = int(stride * np.sqrt(usable / FEW_SAMPLES))
-    if usable >= FEW_SAMPLES or stride == 1 or fine >= stride:
+    coarse, n, stride = grid.samples, grid.count, grid.shape[2]
+    usable = np.count_nonzero(grid.weight > 0)
+    fine = int(stride * np.sqrt(usable / MIN_SAMPLES))
+    if usable >= MIN_SAMPLES or stride == 1 or fine >= stride:
         return coarse, n
-    samples, h, w = picture.strided(max(1, fine))
+    samples, h, w = grid.pixels.strided(max(1, fine))
     samples = np.ascontiguousarray(samples[:, : h * w][:, samples[kernels.W, : h * w] > 0])
     return samples, samples.shape[1]
 
@@ -246,7 +297,7 @@ def _centred_scores(tiles: np.ndarray, total: np.ndarray) -> np.ndarray:
 
 
 def _curvature(
-    picture: Picture, coarse: np.ndarray, n: int, pose: np.ndarray, noise: np.ndarray
+    image: PixelGrid, coarse: np.ndarray, n: int, pose: np.ndarray, noise: np.ndarray
 ) -> np.ndarray:
     """(42,) curvature of the robust weights and independent meat, per unit of external weight.
 
@@ -255,20 +306,20 @@ def _curvature(
     R, t = pose[:, :3].astype(np.float32), pose[:, 3].astype(np.float32)
     work = solver.new_work()
     rows, factors, used = np.empty((6, n), np.float32), np.empty(n), np.zeros(kernels.SUMS)
-    kernels.score_pixels(coarse, n, R, t, picture.K, noise, work, rows, factors, used)
+    kernels.score_pixels(coarse, n, R, t, image.K, noise, work, rows, factors, used)
     wide = rows.astype(np.float64)  # squares of large external weights overflow in float32
     out = np.concatenate([m[UPPER] for m in ((wide * factors) @ wide.T, wide @ wide.T)])
     return out / max(used[29], 1e-12)
 
 
 def _slope_in_depth_variance(
-    picture: Picture,
+    image: PixelGrid,
     coarse: np.ndarray,
     n: int,
     pose: np.ndarray,
     sf: float,
     sd: float,
-    options: RefinementOptions,
+    options: RefineOptions,
 ) -> np.ndarray:
     """(6,) derivative of the estimating equation in sd^2, per unit of external weight."""
     sums = np.zeros((2, kernels.SUMS))
@@ -277,7 +328,7 @@ def _slope_in_depth_variance(
     variances = 0.9 * sd**2, 1.1 * sd**2 + 1e-8
     for row, variance in zip(sums, variances, strict=True):
         solver.set_noise(sf, np.sqrt(variance), options.cutoff, noise)
-        solver.evaluate(coarse, n, pose, picture.K, noise, work, row)
+        solver.evaluate(coarse, n, pose, image.K, noise, work, row)
     difference = sums[1, 21:27] - sums[0, 21:27]
     return difference / (variances[1] - variances[0]) / max(sums[0, 29], 1e-12)
 
@@ -303,34 +354,32 @@ def _newton_step(total: np.ndarray, curvature: np.ndarray, pose: np.ndarray) -> 
 
 def _depth_term(
     pair: FramePair,
-    picture: Picture,
-    coarse: np.ndarray,
-    grid: tuple[int, int, int],
+    grid: CoarseGrid,
     pose: np.ndarray,
     found: tuple[float, float, float],
     noise: np.ndarray,
     tile: int,
     inverse_depth: float,
-    options: RefinementOptions,
+    options: RefineOptions,
 ) -> tuple[float, float, _DepthTerm | None]:
     """(depth noise, standard error of its square, third residual or None).
 
-    ``found`` = (sf, sd, standard error of sd^2) of the flow. The second depth bounds the noise of
+    ``found`` = (sf, sd, standard error of sd^2) of the flow. The current depth bounds the noise of
     the first, tells it where the flow cannot, and may add a residual.
     """
     sf, sd, spread = found
-    rows, columns, stride = grid
-    n = rows * columns
-    u0, v0 = picture.origin
+    image, coarse, n = grid.pixels, grid.samples, grid.count
+    _, columns, stride = grid.shape
+    u0, v0 = image.origin
     assert pair.curr.depth is not None  # asked by the caller
-    depth = as_given(pair.curr.depth)
+    depth = as_contiguous(pair.curr.depth)
     log_depth = np.empty(n, np.float32)
-    # looked up at random places of a whole picture: first no more than the scale needs
-    second_depth.look_up(coarse, n, second_depth.sparse_step(n), depth, u0, v0, log_depth)
+    # looked up at random places of a whole image: first no more than the scale needs
+    current_depth.look_up(coarse, n, current_depth.sparse_step(n), depth, u0, v0, log_depth)
     robust = np.empty(n, np.float32)
     work = solver.new_work()
-    solver.robust_weights(coarse, n, pose, picture.K, noise, work, robust)
-    sigma, raw = second_depth.depth_scale(coarse, n, log_depth, robust, pose, picture.K, noise)
+    solver.robust_weights(coarse, n, pose, image.K, noise, work, robust)
+    sigma, raw = current_depth.depth_scale(coarse, n, log_depth, robust, pose, image.K, noise)
     if raw <= 0:
         return sd, spread, None
     # var(rz) = sz^2 + h^2 sd^2: with two depths of one sensor sd is about raw / sqrt(2)
@@ -341,30 +390,30 @@ def _depth_term(
     sd = min(sd, raw)
     solver.set_noise(sf, sd, options.cutoff, noise)
     flow = np.zeros(kernels.SUMS)
-    solver.evaluate(coarse, n, pose, picture.K, noise, work, flow)
+    solver.evaluate(coarse, n, pose, image.K, noise, work, flow)
     H_flow = symmetric(flow[:21])
-    if options.second_depth == "auto":
+    if options.current_depth == "auto":
         scaling = np.array([1 / inverse_depth] * 3 + [1.0] * 3)
         eigenvalues = np.linalg.eigvalsh(H_flow * np.outer(scaling, scaling))
         if eigenvalues[0] > WELL_CONDITIONED * eigenvalues[-1]:
             return sd, spread, None
-    second_depth.look_up(coarse, n, 1, depth, u0, v0, log_depth)
+    current_depth.look_up(coarse, n, 1, depth, u0, v0, log_depth)
     coarse_term = _DepthTerm(coarse, log_depth, n, columns, stride, max(sigma, 1e-4))
     # on the full fit the flow has every pixel, the depth every second one of both axes
     fine = max(1, min(2, stride))
     H_depth = (
-        symmetric(coarse_term.sums(picture, pose, noise, tile)[0].sum(axis=(0, 1))[:21]) / fine**2
+        symmetric(coarse_term.sums(image, pose, noise, tile)[0].sum(axis=(0, 1))[:21]) / fine**2
     )
-    if options.second_depth == "auto":
+    if options.current_depth == "auto":
         try:
             gain = np.linalg.eigvals(np.linalg.solve(H_flow, H_depth)).real.max()
         except np.linalg.LinAlgError:
             gain = np.inf
-        if not gain > SECOND_DEPTH_GAIN:
+        if not gain > CURRENT_DEPTH_GAIN:
             return sd, spread, None
     if fine == stride:
         return sd, spread, coarse_term
-    samples, h, w = picture.strided(fine)
+    samples, h, w = image.strided(fine)
     log_depth = np.empty(h * w, np.float32)
-    second_depth.look_up(samples, h * w, 1, depth, u0, v0, log_depth)
+    current_depth.look_up(samples, h * w, 1, depth, u0, v0, log_depth)
     return sd, spread, _DepthTerm(samples, log_depth, h * w, w, fine, max(sigma, 1e-4))

@@ -19,8 +19,6 @@ from hybridvo.refinement.photometric_kernels import GREY, GX, GY, ONE, ZERO
 if TYPE_CHECKING:
     from hybridvo.refinement.photometric_problem import Problem, State
 
-__all__ = ["EXPLAINED", "even_light", "local_correlation"]
-
 ROWS, COLUMNS = 5, 7
 """Nodes of the fields."""
 NODES = ROWS * COLUMNS

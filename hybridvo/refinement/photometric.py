@@ -18,17 +18,25 @@ from typing import Any
 import numpy as np
 
 from hybridvo.errors import InputError
+from hybridvo.options import PhotometricOptions
 from hybridvo.refinement import photometric_kernels as kernels
 from hybridvo.refinement.illumination import local_correlation
 from hybridvo.refinement.photometric_images import MID_GREY, Level, blurred, grey_image, match_blur
-from hybridvo.refinement.photometric_options import PhotometricOptions, PolishReport
+from hybridvo.refinement.photometric_options import PhotometricReport
 from hybridvo.refinement.photometric_problem import Problem, State, inverse, small_log
-from hybridvo.refinement.pixels import as_given
+from hybridvo.refinement.pixels import as_contiguous
 from hybridvo.types import FramePair, RelativePose
 
-__all__ = ["PhotometricOptions", "PolishReport", "polish_photometric"]
-
 PER_CELL = 4
+MIN_WEIGHT = 0.25
+"""Robust weight in the refinement on the flow below which a pixel is not used."""
+MIN_PIXELS = 200
+MIN_SEEN = 0.3
+"""Share of the weight that must fall inside the current image."""
+MIN_GAIN = 0.1
+"""Share of the flow's information that the images must add in some direction."""
+MAX_SHIFT = 9.0
+"""Longest shift from the flow's motion, in its inflated standard deviations."""
 SAID = ("no_texture", "no_match", "out_of_view", "outside_flow", "higher_cost", "not_finite")
 """Reasons that the status of the motion mentions."""
 HALF = 0.5
@@ -41,12 +49,10 @@ reading averages more of it: the root of the estimating equation, which has no s
 beside the minimum of the cost."""
 
 
-def polish_photometric(
+def refine_photometric(
     pair: FramePair,
     pose: RelativePose,
     options: PhotometricOptions | None = None,
-    *,
-    trust: float = 1.0,
 ) -> RelativePose:
     """The motion of a pair, sharpened by its two pictures.
 
@@ -55,59 +61,55 @@ def polish_photometric(
         pose: what :func:`hybridvo.refinement.refine.refine` found for them, with its weights and
             covariance.
         options: see :class:`PhotometricOptions`.
-        trust: factor in [0, 1] on the information of the pictures, see
-            :class:`hybridvo.refinement.photometric_monitor.PhotometricMonitor`.
 
     Returns:
-        The motion with its covariance, ``terms`` and ``polish`` (a :class:`PolishReport`). Where
-        images are missing or of no use, or the guard refuses, the motion is that of ``pose`` and
-        the report and the status' message say why. Never a value that is not finite.
+        The motion with its covariance, ``terms`` and report (``photometric``). Where images are
+        missing or of no use, or the acceptance test refuses them, the motion is that of ``pose``,
+        and the report and the status' message say why. Never a value that is not finite.
 
     Raises:
-        InputError: weights of another shape than the picture, or trust outside [0, 1].
+        InputError: weights of another shape than the picture.
     """
-    if not 0.0 <= trust <= 1.0:
-        raise InputError(f"polish_photometric: expected trust in [0, 1], got {trust!r}.")
     started = time.perf_counter()
-    motion = _polish(pair, pose, options or PhotometricOptions(), trust)
+    motion = _polish(pair, pose, options or PhotometricOptions())
     return motion.replace(ms=pose.ms + 1e3 * (time.perf_counter() - started))
 
 
 def _unchanged(
-    pose: RelativePose, reason: str, message: str, report: PolishReport | None = None
+    pose: RelativePose, reason: str, message: str, report: PhotometricReport | None = None
 ) -> RelativePose:
-    report = replace(report or PolishReport(False), taken=False, reason=reason, message=message)
-    if reason in SAID and pose.ok and not pose.status.message:
+    report = replace(
+        report or PhotometricReport(False), taken=False, reason=reason, message=message
+    )
+    if reason in SAID and pose.usable and not pose.status.message:
         pose = pose.replace(status=replace(pose.status, message=f"images not used: {message}"))
-    return pose.replace(polish=report)
+    return pose.replace(photometric=report)
 
 
-def _polish(
-    pair: FramePair, pose: RelativePose, options: PhotometricOptions, trust: float
-) -> RelativePose:
+def _polish(pair: FramePair, pose: RelativePose, options: PhotometricOptions) -> RelativePose:
     prev, curr = pair.prev, pair.curr
     if prev.rgb is None or curr.rgb is None:
         return _unchanged(pose, "no_images", "an image of the pair is missing")
-    if not pose.ok or pose.weights is None or pose.weights_stride != 1 or prev.depth is None:
+    if not pose.usable or pose.weights is None or pose.weights_stride != 1 or prev.depth is None:
         return _unchanged(pose, "no_estimate", "there is no weighted estimate to start from")
     if pose.weights.shape != prev.camera.shape:
         raise InputError(
-            f"polish_photometric: expected weights of shape {prev.camera.shape}, "
+            f"refine_photometric: expected weights of shape {prev.camera.shape}, "
             f"got {pose.weights.shape}."
         )
-    flow_information = inverse(pose.covariance * options.flow_inflation)
+    flow_information = inverse(pose.covariance * options.prior_inflation)
     if flow_information is None:
         return _unchanged(pose, "no_estimate", "the estimate has no usable covariance")
     images = match_blur(Level(grey_image(prev.rgb), grey_image(curr.rgb)))
     first = blurred(images, options.blur_px[-1])
     index = choose_pixels(first.prev, prev.depth, pose.weights, options)
-    if len(index) < options.least_pixels:
+    if len(index) < MIN_PIXELS:
         return _unchanged(
             pose,
             "no_texture",
-            f"{len(index)} static pixels with texture and depth, {options.least_pixels} needed",
+            f"{len(index)} static pixels with texture and depth, {MIN_PIXELS} needed",
         )
-    problem = Problem(pair, pose, index, flow_information, options, trust)
+    problem = Problem(pair, pose, index, flow_information, options)
     state = State(pose.T_curr_prev, 1.0, 0.0)
     # where the flow is sure to a fraction of the finest blur, that one is enough
     coarse = problem.spread_px() > COARSE_SPREAD * options.blur_px[-1]
@@ -129,8 +131,8 @@ def choose_pixels(
     cells = (height // cell + 1) * (width // cell + 1)
     index = np.empty((cells * PER_CELL, 2), np.int32)
     n = kernels.select_pixels(
-        grey, as_given(depth), as_given(weights, np.float32),
-        np.float32(options.least_weight), cell, PER_CELL, index,
+        grey, as_contiguous(depth), as_contiguous(weights, np.float32),
+        np.float32(MIN_WEIGHT), cell, PER_CELL, index,
     )  # fmt: skip
     return index[:n]
 
@@ -156,12 +158,12 @@ def _guarded(
     else:
         correlation = _correlation(grey, seen, weight)
     H = problem.marginal()[0]
-    images = problem.trust * problem.share * H
+    images = problem.share * H
     shift = small_log(state.T @ problem.T_flow_inverse)
     flow = problem.flow_information
     sigma = float(np.sqrt(max(shift @ flow @ shift, 0.0)))
     depth_shift, depth_information = _depth_shift(problem)
-    report = PolishReport(
+    report = PhotometricReport(
         True,
         shift=shift,
         shift_sigma=sigma,
@@ -180,14 +182,14 @@ def _guarded(
     numbers: tuple[Any, ...] = (state.T, images, photometric, state.gain, state.offset)
     if not all(np.isfinite(value).all() for value in numbers):
         return _unchanged(pose, "not_finite", "the images gave no finite motion")
-    if problem.seen < options.least_seen:
+    if problem.seen < MIN_SEEN:
         return _unchanged(
             pose,
             "out_of_view",
             f"{100 * problem.seen:.0f} % of the pixels are seen by both cameras",
             report,
         )
-    if not correlation >= options.least_correlation:
+    if not correlation >= options.min_correlation:
         return _unchanged(
             pose,
             "no_match",
@@ -195,11 +197,11 @@ def _guarded(
             report,
         )
     gain = float(np.linalg.eigvals(np.linalg.solve(flow, images)).real.max())
-    if gain < options.least_gain:
+    if gain < MIN_GAIN:
         return _unchanged(
             pose, "no_gain", "the images add little to what the flow already knows", report
         )
-    if sigma > options.largest_shift:
+    if sigma > MAX_SHIFT:
         return _unchanged(
             pose,
             "outside_flow",
@@ -230,11 +232,11 @@ def _guarded(
         status=status,
         translation_direction_valid=bool(np.linalg.norm(T[:3, 3]) > 3 * spread),
         terms=(*pose.terms, "images"),
-        polish=report,
+        photometric=report,
     )
 
 
-def _remarks(report: PolishReport) -> str:
+def _remarks(report: PhotometricReport) -> str:
     """What was wrong with images that were used all the same."""
     parts = []
     if report.uneven_light:

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-__all__ = ["MID_GREY", "Level", "blurred", "grey_image", "match_blur"]
-
 MID_GREY = 128.0
 """Taken off every grey value, so that gain and offset are nearly independent."""
 STRIPS = 4

@@ -7,16 +7,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hybridvo.geometry import invert, se3_exp
+from hybridvo.options import PhotometricOptions
 from hybridvo.refinement import photometric_kernels as kernels
 from hybridvo.refinement.full_fit import tile_size
 from hybridvo.refinement.illumination import EXPLAINED, even_light
 from hybridvo.refinement.photometric_images import Level
-from hybridvo.refinement.photometric_options import PhotometricOptions
-from hybridvo.refinement.pixels import as_given, typical
+from hybridvo.refinement.pixels import as_contiguous, typical
 from hybridvo.types import FramePair, RelativePose
 
-__all__ = ["Problem", "State", "inverse", "small_log"]
-
+CUTOFF = 3.0
+"""c of the Geman-McClure kernel, in standard deviations."""
+FREEDOM = 6.0
+"""Degrees of freedom of the Student prior around the flow, whose covariance is an estimate."""
 NOISE_FLOOR = 0.1
 """Grey levels: rounding to 8 bits leaves 0.08 after the finest blur."""
 TILES = 110
@@ -57,12 +59,11 @@ class Problem:
         index: np.ndarray,
         flow_information: np.ndarray,
         options: PhotometricOptions,
-        trust: float,
     ) -> None:
         prev, curr = pair.prev.camera, pair.curr.camera
         n = len(index)
         self.pair, self.pose, self.index, self.n = pair, pose, index, n
-        self.flow_information, self.options, self.trust = flow_information, options, trust
+        self.flow_information, self.options = flow_information, options
         self.T_flow_inverse = invert(pose.T_curr_prev)
         self.camera = np.array([1 / prev.fx, 1 / prev.fy, prev.cx, prev.cy], np.float32)
         self.K = np.array([curr.fx, curr.fy, curr.cx, curr.cy], np.float32)
@@ -87,9 +88,9 @@ class Problem:
         else:
             unit = typical(variance)
         kernels.gather_pixels(
-            self.index, self.n, level.prev, as_given(depth),
-            as_given(self.pose.weights, np.float32),
-            as_given(variance), np.float32(unit), self.camera, self.buffer,
+            self.index, self.n, level.prev, as_contiguous(depth),
+            as_contiguous(self.pose.weights, np.float32),
+            as_contiguous(variance), np.float32(unit), self.camera, self.buffer,
         )  # fmt: skip
         self.total = float(self.buffer[kernels.W].sum())
 
@@ -107,7 +108,7 @@ class Problem:
                 self.K[1] * np.array([zero, i, -y * i, -(1 + y * y), x * y, x]),
             ]
         )
-        covariance = self.pose.covariance * self.options.flow_inflation
+        covariance = self.pose.covariance * self.options.prior_inflation
         return float(np.sqrt(np.einsum("cpn,pq,cqn->", rows, covariance, rows) / len(x)))
 
     def project(self, level: Level, state: State) -> float:
@@ -123,7 +124,7 @@ class Problem:
     def weigh(self, noise: float, columns: int = kernels.COLUMNS) -> float:
         """Weights, H and g of the last projection under a noise; returns the photometric cost."""
         # depth_noise belongs to the typical depth variance, the unit of the buffer's
-        values = (1 / max(noise, NOISE_FLOOR) ** 2, self.depth_noise**2, self.options.cutoff**2)
+        values = (1 / max(noise, NOISE_FLOOR) ** 2, self.depth_noise**2, CUTOFF**2)
         variances = np.array(values, np.float32)
         cost = kernels.weigh_pixels(self.buffer, self.n, variances, self.J, self.r, self.w)
         kernels.normal_equations(self.J, self.r, self.w, self.n, columns, self.H, self.g)
@@ -184,14 +185,14 @@ class Problem:
         """(cost, information (6, 6), its gradient (6,)) of Student's prior around the flow."""
         xi = small_log(T @ self.T_flow_inverse)
         d2 = float(xi @ self.flow_information @ xi)
-        freedom = self.options.freedom
+        freedom = FREEDOM
         weight = (freedom + 6) / (freedom + d2)
         information = weight * self.flow_information
         return 0.5 * (freedom + 6) * float(np.log1p(d2 / freedom)), information, -information @ xi
 
     def cost(self, photometric: float, T: np.ndarray) -> float:
         """Joint cost of images and flow."""
-        return self.trust * self.share * photometric + self.prior(T)[0]
+        return self.share * photometric + self.prior(T)[0]
 
     def solve(self, level: Level, state: State, steps: int) -> State:
         """Damped Gauss-Newton on one blur; a step is taken only where the joint cost falls.
@@ -260,7 +261,7 @@ class Problem:
         A step that cannot be had, or is absurd, is zero.
         """
         c = kernels.COLUMNS
-        weight = self.trust * self.share
+        weight = self.share
         _, information, gradient = self.prior(state.T)
         H, g = weight * self.H[:c, :c], weight * self.g[:c]
         H[:6, :6] += information

@@ -1,48 +1,54 @@
-"""The arrays of a pair as the kernels take them, and the passes over the full grid."""
+"""The arrays of a pair as the kernels take them: on a coarse grid, or all pixels in parallel."""
 
 from __future__ import annotations
 
 import itertools
 import threading
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 
+from hybridvo.options import RefineOptions
 from hybridvo.refinement import kernels
-from hybridvo.types import Camera, FramePair
+from hybridvo.types import Camera, FramePair, Reason, RelativePose
 
+MIN_USABLE = 0.1
+"""Share of usable grid pixels below which the grid is drawn anew, finer, where they are."""
+MIN_USABLE_PIXELS = 400
 PARALLEL_PIXELS = 100_000
 """Below this many pixels one thread is as fast, and steadier under load."""
 
 
-class Picture:
-    """The arrays of a pair as the kernels take them; may be cropped to the usable ones."""
+class PixelGrid:
+    """The arrays of a pair as the kernels take them; may be cropped to the usable pixels."""
 
     def __init__(self, pair: FramePair, weights: np.ndarray | None) -> None:
         prev, curr = pair.prev, pair.curr
         assert pair.flow is not None and prev.depth is not None
         flags = 0
-        dummy = as_given(np.ones((1, 1), np.float32))
-        depth = as_given(prev.depth)
-        flow = as_given(pair.flow)
+        dummy = as_contiguous(np.ones((1, 1), np.float32))
+        depth = as_contiguous(prev.depth)
+        flow = as_contiguous(pair.flow)
         flow_variance = depth_variance = external = dummy
         scale = np.ones(2, np.float32)
         if pair.flow_variance is not None:
-            flow_variance = as_given(pair.flow_variance)
+            flow_variance = as_contiguous(pair.flow_variance)
             flags |= kernels.HAS_FLOW_VARIANCE
             scale[0] = typical(flow_variance)
         if prev.depth_variance is not None:
-            depth_variance = as_given(prev.depth_variance)
+            depth_variance = as_contiguous(prev.depth_variance)
             flags |= kernels.HAS_DEPTH_VARIANCE
             scale[1] = typical(depth_variance)
         if weights is not None:
-            external = as_given(weights, np.float32)
+            external = as_contiguous(weights, np.float32)
             flags |= kernels.HAS_WEIGHTS
-        valid = as_given(np.ones((1, 1), np.bool_))
+        valid = as_contiguous(np.ones((1, 1), np.bool_))
         masks = [m for m in (prev.mask, pair.flow_valid) if m is not None]
         if masks:
-            valid = as_given(masks[0] if len(masks) == 1 else masks[0] & masks[1])
+            valid = as_contiguous(masks[0] if len(masks) == 1 else masks[0] & masks[1])
             flags |= kernels.HAS_VALID
         self.data: tuple[Any, ...] = (depth, flow, flow_variance, depth_variance, external, valid)
         self.flags, self.scale = flags, scale
@@ -58,7 +64,7 @@ class Picture:
         """Restrict to rows v0..v1-1 and columns u0..u1-1."""
         v0, v1, u0, u1 = box
         self.data = tuple(
-            as_given(a[v0:v1, u0:u1]) if a.shape[:2] != (1, 1) else a for a in self.data
+            as_contiguous(a[v0:v1, u0:u1]) if a.shape[:2] != (1, 1) else a for a in self.data
         )
         self.set_cameras(prev, curr, u0, v0)
 
@@ -131,7 +137,7 @@ class Picture:
         return sums, totals[:, kernels.COST :].sum(axis=0), weights
 
     def _run(self, work: Callable[[int], None], count: int) -> None:
-        """Do ``work(0) .. work(count - 1)`` on two threads where the picture is large.
+        """Do ``work(0) .. work(count - 1)`` on two threads where the image is large.
 
         Plain threads over kernels that release the GIL: each band has its own sum, so the result
         does not depend on who did what, several trackers may run at once, and on a busy machine
@@ -154,7 +160,116 @@ class Picture:
         helper.join()
 
 
-def as_given(array: np.ndarray, dtype: Any = None) -> np.ndarray:
+@dataclass(frozen=True, eq=False)
+class CoarseGrid:
+    """Every n-th pixel of both axes, over the part of an image where pixels are usable.
+
+    Args:
+        pixels: arrays of the pair, cropped to ``box``.
+        samples: (rows, n) buffer of the gathered pixels, see :mod:`hybridvo.refinement.kernels`.
+        shape: (h, w, stride).
+        size: (height, width) of the image, px.
+        box: (v0, v1, u0, u1) that the grid covers.
+    """
+
+    pixels: PixelGrid
+    samples: np.ndarray
+    shape: tuple[int, int, int]
+    size: tuple[int, int]
+    box: tuple[int, int, int, int]
+
+    @property
+    def count(self) -> int:
+        """Pixels of the grid."""
+        return self.shape[0] * self.shape[1]
+
+    @property
+    def weight(self) -> np.ndarray:
+        """(n,) external weight of each pixel; 0 where it cannot be used."""
+        return self.samples[kernels.W, : self.count]
+
+    def masked(self, mask: np.ndarray) -> np.ndarray:
+        """A copy of the samples, their weights times a mask (h, w)."""
+        samples = self.samples.copy()
+        samples[kernels.W, : self.count] *= mask.reshape(-1)
+        return samples
+
+    def within(self, pair: FramePair, weights: np.ndarray | None, mask: np.ndarray) -> CoarseGrid:
+        """The same grid with weights (H, W) times a mask (h, w) of it, on the full grid as well."""
+        factors = self.upsample(mask)
+        if weights is not None:
+            factors = factors * np.asarray(weights, np.float32)
+        pixels = PixelGrid(pair, factors)
+        if self.box != (0, self.size[0], 0, self.size[1]):
+            pixels.crop(pair.prev.camera, pair.curr.camera, self.box)
+        return CoarseGrid(pixels, self.masked(mask), self.shape, self.size, self.box)
+
+    def resample(self, image: np.ndarray) -> np.ndarray:
+        """(h, w) float32: a map over the whole image, of any resolution, at the grid's pixels."""
+        h, w, stride = self.shape
+        height, width = self.size
+        first = stride // 2 + 0.5
+        v = (self.box[0] + first + np.arange(h) * stride) * (image.shape[0] / height) - 0.5
+        u = (self.box[2] + first + np.arange(w) * stride) * (image.shape[1] / width) - 0.5
+        u, v = np.meshgrid(u.astype(np.float32), v.astype(np.float32))
+        source = np.ascontiguousarray(image, np.float32)
+        return cv2.remap(source, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+    def upsample(self, mask: np.ndarray) -> np.ndarray:
+        """(H, W) float32 over the whole image from a mask (h, w); 0 outside of the box."""
+        h, w, stride = self.shape
+        v0, v1, u0, u1 = self.box
+        mask = np.ascontiguousarray(mask, np.float32)
+        fine = cv2.resize(mask, (w * stride, h * stride), interpolation=cv2.INTER_LINEAR)
+        missing = (0, max(0, v1 - v0 - h * stride)), (0, max(0, u1 - u0 - w * stride))
+        whole = np.zeros(self.size, np.float32)
+        whole[v0:v1, u0:u1] = np.pad(fine, missing, mode="edge")[: v1 - v0, : u1 - u0]
+        return whole
+
+
+def coarse_grid(
+    pair: FramePair, weights: np.ndarray | None, options: RefineOptions
+) -> CoarseGrid | RelativePose:
+    """The pixels of a pair on a coarse grid, or the failure that says what is missing.
+
+    Args:
+        pair: two frames and their flow.
+        weights: (H, W) factors on the information of each pixel, or None.
+        options: of the refinement.
+    """
+    if pair.flow is None:
+        return RelativePose.failed(Reason.NO_FLOW, "no optical flow for this pair", "refine")
+    if pair.prev.depth is None:
+        return RelativePose.failed(Reason.NO_VALID_DEPTH, "no depth for this frame", "refine")
+    pixels = PixelGrid(pair, weights)
+    samples, h, w, stride = pixels.samples(options.coarse_pixels)
+    usable = np.count_nonzero(samples[kernels.W, : h * w] > 0)
+    size = pixels.shape
+    box = (0, size[0], 0, size[1])
+    if usable < MIN_USABLE * h * w or usable < MIN_USABLE_PIXELS:
+        count, box = pixels.usable_box()
+        if count < options.min_pixels:
+            return _too_few(pair, count, options.min_pixels)
+        pixels.crop(pair.prev.camera, pair.curr.camera, box)
+        samples, h, w, stride = pixels.samples(options.coarse_pixels)
+    return CoarseGrid(pixels, samples, (h, w, stride), size, box)
+
+
+def _too_few(pair: FramePair, count: int, minimum: int) -> RelativePose:
+    """The failure that names what is missing."""
+    depth, flow = pair.prev.depth, pair.flow
+    with np.errstate(invalid="ignore"):
+        depths = int(np.count_nonzero((depth > kernels.MIN_DEPTH) & (depth < kernels.MAX_VALUE)))
+        flows = int(np.count_nonzero((np.abs(flow) < kernels.MAX_VALUE).all(axis=2)))
+    reason, what = Reason.LOW_INLIERS, f"{count} usable pixels"
+    if depths < minimum:
+        reason, what = Reason.NO_VALID_DEPTH, f"{depths} pixels with valid depth"
+    elif flows < minimum:
+        reason, what = Reason.NO_FLOW, f"{flows} pixels with valid flow"
+    return RelativePose.failed(reason, f"{what}, {minimum} needed", "refine")
+
+
+def as_contiguous(array: np.ndarray, dtype: Any = None) -> np.ndarray:
     """Contiguous view that cannot be written to, whatever the array allows.
 
     Numba compiles a kernel anew for an array that is read-only (a frame out of a buffer, of a file

@@ -15,13 +15,11 @@ import numpy as np
 
 from hybridvo.errors import InputError
 from hybridvo.geometry import ego_flow
+from hybridvo.options import PhotometricOptions
 from hybridvo.refinement import photometric_kernels as kernels
 from hybridvo.refinement.photometric_images import Level, blurred, grey_image, match_blur
-from hybridvo.refinement.photometric_options import PhotometricOptions
 from hybridvo.refinement.photometric_problem import Problem, State
 from hybridvo.types import FramePair, RelativePose
-
-__all__ = ["LAGS", "LARGEST_PX", "OffsetCost", "depth_costs", "depth_offset_cost"]
 
 LARGEST_PX = 4
 """Largest shift looked at, px."""
@@ -193,7 +191,7 @@ def _edges(pair: FramePair, pose: RelativePose, options: PhotometricOptions) -> 
     prev, curr = pair.prev, pair.curr
     if prev.rgb is None or curr.rgb is None or prev.depth is None:
         return None
-    if not pose.ok or pose.weights is None or pose.weights_stride != 1:
+    if not pose.usable or pose.weights is None or pose.weights_stride != 1:
         return None
     if pose.weights.shape != prev.camera.shape:
         raise InputError(
@@ -205,7 +203,7 @@ def _edges(pair: FramePair, pose: RelativePose, options: PhotometricOptions) -> 
     index = _edge_pixels(level.prev, depth, pose.weights)
     if len(index) < LEAST_PIXELS:
         return None
-    problem = Problem(pair, pose, index, np.eye(6), options, 1.0)
+    problem = Problem(pair, pose, index, np.eye(6), options)
     problem.gather(level)
     problem.buffer[kernels.W] = 1.0
     state = State(pose.T_curr_prev, 1.0, 0.0)

@@ -11,11 +11,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from hybridvo.options import PhotometricOptions
 from hybridvo.refinement import photometric_kernels as kernels
 from hybridvo.refinement.illumination import EXPLAINED, even_light
 from hybridvo.refinement.photometric import choose_pixels
 from hybridvo.refinement.photometric_images import Level, blurred, grey_image, match_blur
-from hybridvo.refinement.photometric_options import PhotometricOptions
 from hybridvo.refinement.photometric_problem import NOISE_FLOOR, Problem, State
 from hybridvo.types import Camera, FramePair, RelativePose
 
@@ -44,14 +44,14 @@ def calibration_equations(
     prev, curr = pair.prev, pair.curr
     if prev.rgb is None or curr.rgb is None or prev.depth is None:
         return None
-    if not pose.ok or pose.weights is None or pose.weights.shape != prev.camera.shape:
+    if not pose.usable or pose.weights is None or pose.weights.shape != prev.camera.shape:
         return None
     images = match_blur(Level(grey_image(prev.rgb), grey_image(curr.rgb)))
     level = blurred(images, options.blur_px[-1])
     index = choose_pixels(level.prev, prev.depth, pose.weights, options)
     if len(index) < options.least_pixels:
         return None
-    problem = Problem(pair, pose, index, np.eye(6), options, 1.0)
+    problem = Problem(pair, pose, index, np.eye(6), options)
     problem.gather(level)
     state = State(pose.T_curr_prev, 1.0, 0.0)
     problem.project(level, state)

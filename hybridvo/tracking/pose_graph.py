@@ -11,8 +11,6 @@ from hybridvo.geometry import invert, pose_matrix, se3_exp, se3_log
 from hybridvo.refinement.photometric_problem import small_log
 from hybridvo.types import Status
 
-__all__ = ["CHI2_LIMIT", "Edge", "Solution", "adjoint", "chi2", "compose_covariance", "solve_graph"]
-
 CHI2_LIMIT = 22.5
 """Squared Mahalanobis distance that 0.1 % of right motions exceed (chi-square, 6 degrees)."""
 FREEDOM = 4.0
@@ -48,7 +46,7 @@ class Edge:
     @property
     def ok(self) -> bool:
         """Whether it took part."""
-        return self.status.ok and self.weight > 0
+        return self.status.usable and self.weight > 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +95,7 @@ def solve_graph(
         free: frames that may move; the others are held.
     """
     Y = {name: invert(T) for name, T in T_world_cam.items()}
-    used = [e for e in edges if e.status.ok]
+    used = [e for e in edges if e.status.usable]
     information = [np.linalg.inv(e.covariance) for e in used]
     maps = [adjoint(e.T) for e in used]
     column = {name: 6 * k for k, name in enumerate(free)}
@@ -142,7 +140,7 @@ def solve_graph(
     distances = iter(squared)
     rated = []
     for e in edges:
-        d2 = float(next(distances)) if e.status.ok else np.inf
+        d2 = float(next(distances)) if e.status.usable else np.inf
         weight = (FREEDOM + 6) / (FREEDOM + d2) if d2 < CHI2_LIMIT else 0.0
         rated.append(replace(e, weight=weight))
     poses = {name: pose_matrix(invert(T)[:3]) for name, T in Y.items()}

@@ -15,9 +15,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from hybridvo.errors import InputError
 from hybridvo.geometry import invert, se3_log
-from hybridvo.tracking.key_frame import KeyFrame, View, spread_px, static_cells
+from hybridvo.options import TrackOptions
+from hybridvo.tracking.keyframes import KeyFrame, View, spread_px, static_cells
 from hybridvo.tracking.pose_graph import (
     CHI2_LIMIT,
     Edge,
@@ -27,17 +27,6 @@ from hybridvo.tracking.pose_graph import (
     solve_graph,
 )
 from hybridvo.types import Frame, Reason, RelativePose, State, Status
-
-__all__ = [
-    "KeyFrame",
-    "Located",
-    "Register",
-    "Window",
-    "WindowOptions",
-    "check_window",
-    "corrected",
-    "locate",
-]
 
 Register = Callable[["KeyFrame", Frame, np.ndarray, np.ndarray, np.ndarray], RelativePose]
 """(key frame, frame, predicted T_frame_key, its covariance, (H, W) weights) -> motion."""
@@ -50,43 +39,9 @@ where the walk holds, 450 and more after a frame of another place (rendered sequ
 NO_MOTION = 1e-12 * np.eye(6)
 
 
-@dataclass(frozen=True)
-class WindowOptions:
-    """Options of the window of key frames.
-
-    Args:
-        overlap: share of a key frame's static pixels that must still be seen; below it the frame
-            becomes a key frame.
-        motion: median shift of these pixels, as a share of the picture's width, above which the
-            frame becomes a key frame: texture looks different then.
-        least_overlap: share below which no motion is sought between two key frames.
-        inflation: factor on every covariance: errors of estimated flow, of depth and of texture
-            seen from afar are alike from frame to frame.
-        largest_spread_px: uncertainty of the predicted motion in the picture above which it is no
-            start for a registration; the flow is asked then.
-    """
-
-    overlap: float = 0.85
-    motion: float = 0.08
-    least_overlap: float = 0.5
-    inflation: float = 4.0
-    largest_spread_px: float = 8.0
-
-    def __post_init__(self) -> None:
-        for name in ("overlap", "least_overlap"):
-            if not 0 < getattr(self, name) < 1:
-                raise InputError(
-                    f"WindowOptions.{name}: expected a share within (0, 1), "
-                    f"got {getattr(self, name)!r}."
-                )
-        for name in ("motion", "inflation", "largest_spread_px"):
-            if not getattr(self, name) > 0:
-                raise InputError(
-                    f"WindowOptions.{name}: expected a positive number, "
-                    f"got {getattr(self, name)!r}."
-                )
-
-
+MAX_SPREAD_PX = 8.0
+"""Uncertainty of the predicted motion in the image above which it is no start for a registration;
+the flow is asked then."""
 STRIDES = (1, 2, 4)
 """Key frames back to which a new key frame is registered."""
 
@@ -139,20 +94,6 @@ class Located:
     used: bool
 
 
-def check_window(window: int | None) -> None:
-    """Refuse a length that cannot be meant.
-
-    Raises:
-        InputError: not None and no whole number of at least 1.
-    """
-    if window is not None and (
-        isinstance(window, bool) or not isinstance(window, int) or window < 1
-    ):
-        raise InputError(
-            f"window: expected a whole number of key frames, 1 for none, got {window!r}."
-        )
-
-
 def locate(
     window: Window,
     motion: RelativePose,
@@ -161,7 +102,7 @@ def locate(
     register: Register,
     search: Register,
     size: int,
-    options: WindowOptions,
+    options: TrackOptions,
 ) -> Located:
     """Place a frame among the key frames.
 
@@ -174,11 +115,11 @@ def locate(
         register: motion from a key frame, started from a predicted one.
         search: the same without belief in the prediction.
         size: most key frames.
-        options: see :class:`WindowOptions`.
+        options: see :class:`TrackOptions`.
     """
     window = _told(window, motion, prev)
     before = window.covariance
-    inflated = motion.covariance * (options.inflation if motion.ok else 1.0)
+    inflated = motion.covariance * (options.inflation if motion.usable else 1.0)
     key = window.keys[-1]
     chain = Edge(
         key.frame.index,
@@ -191,7 +132,7 @@ def locate(
     edges, asked = [chain], 1
     view = View(key, chain.T, curr)
     at_key = prev.index == key.frame.index
-    if not at_key or not motion.ok:
+    if not at_key or not motion.usable:
         direct, view = _register(key, curr, chain, view, register, search, options)
         edges.append(direct)
     T, edges = _vote(window, edges)
@@ -204,13 +145,13 @@ def locate(
             break
         T, edges = _vote(window, [*edges, older])
     used = any(e.ok and e.kind != "chain" for e in edges)
-    lost = not motion.ok and not used
+    lost = not motion.usable and not used
     if edges[0].weight == 0 and used:
         view = View(key, _relative(T, key.T_world_cam), curr)
-    moved_on = view.overlap < options.overlap or view.motion > options.motion
+    moved_on = view.overlap < options.keyframe_overlap or view.motion > options.keyframe_motion
     # where the next motion works again but no key frame is found, a new walk begins
-    far = spread_px(key, chain.covariance) > options.largest_spread_px
-    broken = motion.ok and not at_key and not used and far
+    far = spread_px(key, chain.covariance) > MAX_SPREAD_PX
+    broken = motion.usable and not at_key and not used and far
     usable = curr.rgb is not None and curr.depth is not None
     covariance = _joint(edges, key.frame.index)
     T_key = _relative(T, key.T_world_cam) if used else chain.T
@@ -227,7 +168,7 @@ def locate(
 def _told(window: Window, motion: RelativePose, prev: Frame) -> Window:
     """The window once the newest key frame's static pixels are known."""
     key = window.keys[-1]
-    if key.static is not None or key.frame.index != prev.index or not motion.ok:
+    if key.static is not None or key.frame.index != prev.index or not motion.usable:
         return window
     static = static_cells(prev, motion)
     key = replace(key, static=static, depth_noise=motion.depth_noise)
@@ -235,7 +176,7 @@ def _told(window: Window, motion: RelativePose, prev: Frame) -> Window:
 
 
 def _edge(
-    key: KeyFrame, curr: Frame, found: RelativePose, kind: str, options: WindowOptions
+    key: KeyFrame, curr: Frame, found: RelativePose, kind: str, options: TrackOptions
 ) -> Edge:
     covariance = options.inflation * found.covariance
     return Edge(key.frame.index, curr.index, found.T_curr_prev, covariance, found.status, kind)
@@ -253,17 +194,17 @@ def _register(
     view: View,
     register: Register,
     search: Register,
-    options: WindowOptions,
+    options: TrackOptions,
 ) -> tuple[Edge, View]:
     """The edge from a key frame, and what is seen of it."""
     shape = key.frame.camera.shape
-    sure = spread_px(key, start.covariance) < options.largest_spread_px
-    if sure and view.overlap < options.least_overlap:
+    sure = spread_px(key, start.covariance) < MAX_SPREAD_PX
+    if sure and view.overlap < options.min_overlap:
         return _failed(key, curr, start.T, "too little of the key frame is seen"), view
     ask = register if sure else search
     found = ask(key, curr, start.T, start.covariance, view.weights(shape))
     edge = _edge(key, curr, found, "stride" if sure else "search", options)
-    return edge, view if sure or not found.ok else View(key, found.T_curr_prev, curr)
+    return edge, view if sure or not found.usable else View(key, found.T_curr_prev, curr)
 
 
 def _older(
@@ -273,7 +214,7 @@ def _older(
     T_world_cam: np.ndarray,
     covariance: np.ndarray,
     register: Register,
-    options: WindowOptions,
+    options: TrackOptions,
 ) -> Edge | None:
     """The edge from the key frame ``stride`` key frames back, where there is one in sight."""
     if len(window.keys) < stride or window.keys[-stride].static is None:
@@ -281,7 +222,7 @@ def _older(
     key = window.keys[-stride]
     T = _relative(T_world_cam, key.T_world_cam)
     view = View(key, T, curr)
-    if view.overlap < options.least_overlap:
+    if view.overlap < options.min_overlap:
         return None
     found = register(key, curr, T, covariance, view.weights(key.frame.camera.shape))
     return _edge(key, curr, found, "stride", options)
@@ -294,7 +235,7 @@ def _relative(T_world_curr: np.ndarray, T_world_key: np.ndarray) -> np.ndarray:
 
 def _contradicted(edges: list[Edge]) -> bool:
     """Whether a motion was found, and lost the vote."""
-    return any(e.status.ok and e.weight == 0 for e in edges)
+    return any(e.status.usable and e.weight == 0 for e in edges)
 
 
 def _vote(window: Window, edges: list[Edge]) -> tuple[np.ndarray, list[Edge]]:
@@ -305,7 +246,7 @@ def _vote(window: Window, edges: list[Edge]) -> tuple[np.ndarray, list[Edge]]:
     or texture change with the distance all of them are, and say so by their covariance.
     """
     held = {key.frame.index: key.T_world_cam for key in window.keys}
-    ok = [k for k, e in enumerate(edges) if e.status.ok]
+    ok = [k for k, e in enumerate(edges) if e.status.usable]
     poses = {k: held[edges[k].prev] @ invert(edges[k].T) for k in ok}
     if not ok:
         T = held[edges[0].prev] @ invert(edges[0].T)
@@ -362,7 +303,7 @@ def corrected(motion: RelativePose, located: Located, T_curr_prev: np.ndarray) -
     """
     covariance, status = located.covariance, located.status
     between = T_curr_prev @ invert(motion.T_curr_prev)
-    if motion.ok and chi2(between, covariance + motion.covariance) > CORRECTION_LIMIT:
+    if motion.usable and chi2(between, covariance + motion.covariance) > CORRECTION_LIMIT:
         jump = se3_log(between)
         covariance = covariance + np.outer(jump, jump)
         if status.state is State.OK:
@@ -383,7 +324,7 @@ def _promote(
     edges: list[Edge],
     register: Register,
     size: int,
-    options: WindowOptions,
+    options: TrackOptions,
 ) -> tuple[np.ndarray, Window]:
     """(pose, window) with the frame as the newest key frame, and the graph solved."""
     known = {e.prev for e in edges if e.kind != "chain"}
@@ -399,7 +340,7 @@ def _promote(
     keys = [replace(k, T_world_cam=answer.T_world_cam[k.frame.index]) for k in window.keys]
     keys = [*keys, KeyFrame(curr, answer.T_world_cam[curr.index])][-size:]
     kept = {key.frame.index for key in keys}
-    links = tuple(e for e in answer.edges if e.status.ok and e.prev in kept and e.curr in kept)
+    links = tuple(e for e in answer.edges if e.status.usable and e.prev in kept and e.curr in kept)
     found = tuple(e for e in answer.edges if e.curr == curr.index)
     after = Window(tuple(keys), links, found=found)
     return answer.T_world_cam[curr.index], after
@@ -408,7 +349,7 @@ def _promote(
 def _status(motion: RelativePose, edges: list[Edge]) -> Status:
     """Of the motion from the previous frame, once longer strides have spoken."""
     confirmed = [e for e in edges if e.ok and e.kind != "chain"]
-    if not motion.ok and confirmed:
+    if not motion.usable and confirmed:
         return Status.degraded(
             motion.status.reason,
             f"{motion.status.message}; taken over key frame {confirmed[0].prev}",

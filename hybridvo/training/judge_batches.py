@@ -15,10 +15,10 @@ from hybridvo.errors import FormatError
 from hybridvo.geometry import pose_matrix, se3_exp
 from hybridvo.hypotheses import search
 from hybridvo.hypotheses.generate import fit_in_mask
-from hybridvo.hypotheses.selector import PROPOSED, mask_weights, nearest_motion
+from hybridvo.hypotheses.selector import mask_weights, nearest_motion
 from hybridvo.network.judge import JudgeInputs, JudgeOutput, expected_information
+from hybridvo.options import RefineOptions
 from hybridvo.refinement import kernels
-from hybridvo.refinement.options import RefinementOptions
 from hybridvo.synthetic.sensors import log_uniform
 from hybridvo.training.judge_proposals import read_proposals
 
@@ -212,7 +212,7 @@ def refits_of(
     Where the judge is shown another network's static world, that network's motion takes part.
     """
     inputs = batch.inputs
-    cutoff = RefinementOptions().cutoff
+    cutoff = RefineOptions().cutoff
     probability = torch.sigmoid(out.mask).numpy()
     poses, found, parents = [], [], []
     for b in range(len(batch.T)):
@@ -226,7 +226,7 @@ def refits_of(
             for k in order[:count]
         ]
         if inputs.has_static[b]:
-            weights = mask_weights(batch.static[b].numpy(), PROPOSED)
+            weights = mask_weights(batch.static[b].numpy())
             z = inputs.depth[b][inputs.usable[b]]
             start = batch.proposal[b]
             near = nearest_motion(inputs.pose[mine].numpy(), start, 1.0 / float(z.median()))

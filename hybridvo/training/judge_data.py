@@ -17,9 +17,9 @@ import numpy as np
 
 from hybridvo.flow import dis_flow
 from hybridvo.geometry import invert, se3_exp
-from hybridvo.hypotheses.generate import CoarseSearch, search_motions
+from hybridvo.hypotheses.generate import HypothesisSet, generate
+from hybridvo.options import Options
 from hybridvo.refinement import kernels
-from hybridvo.refinement.options import RefinementOptions
 from hybridvo.synthetic.diverse import WideOptions, wide_sample
 from hybridvo.synthetic.sensors import DegradationOptions, degrade_depth, log_uniform
 from hybridvo.synthetic.training_scenes import judge_scene
@@ -62,13 +62,11 @@ def draw_pictures(seed: int) -> list[dict[str, Any]]:
         starts = [np.eye(4)]
         if T_last is not None and rng.random() < 0.7:
             starts.append(T_last)
-        found = search_motions(
-            pair, np.stack(starts)[:, :3], None, RefinementOptions(), int(rng.integers(1 << 30))
-        )
+        found = generate(pair, np.stack(starts), Options(), int(rng.integers(1 << 30)))
         full = (0, *pair.prev.camera.shape)
-        if isinstance(found, RelativePose) or found.clear:
+        if isinstance(found, RelativePose) or not found.is_ambiguous:
             continue
-        if (found.box[0], found.box[1], found.box[3]) != full:
+        if (found.grid.box[0], found.grid.box[1], found.grid.box[3]) != full:
             continue
         pictures.append(_record(pair, found, truth, T_last, log_depth_curr, source))
     return pictures
@@ -164,22 +162,22 @@ def _moving(
 
 def _record(
     pair: FramePair,
-    found: CoarseSearch,
+    found: HypothesisSet,
     truth: _Truth,
     T_last: np.ndarray | None,
     log_depth_curr: np.ndarray | None,
     source: str,
 ) -> dict[str, Any]:
     """Everything about a picture, as small arrays."""
-    h, w, stride = found.shape
+    h, w, stride = found.grid.shape
     pick = np.s_[stride // 2 :: stride, stride // 2 :: stride]
-    log_depth = found.grid(pair).log_depth_curr
+    log_depth = found.maps().log_depth_curr
     if log_depth_curr is not None:
         log_depth = log_depth_curr[pick]
     label = np.where(truth.moving, MOVING, STATIC)
     label = np.where(truth.known, label, UNKNOWN)[pick]
-    n = found.count
-    rows = found.samples[:, :n]
+    n = found.grid.count
+    rows = found.grid.samples[:, :n]
     poses = np.zeros((MOST, 3, 4))
     facts = np.zeros((MOST, found.facts.shape[1]))
     poses[: len(found.poses)], facts[: len(found.poses)] = found.poses, found.facts
@@ -196,7 +194,7 @@ def _record(
         "T": truth.T_curr_prev[:3],
         "T_last": (np.eye(4) if T_last is None else T_last)[:3],
         "has_last": T_last is not None,
-        "K": found.picture.K,
+        "K": found.grid.pixels.K,
         "width": pair.prev.camera.width,
         "stride": stride,
         "source": ("wide", "true", "dis").index(source),

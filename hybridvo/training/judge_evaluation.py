@@ -10,7 +10,7 @@ import torch
 
 from hybridvo.hypotheses.generate import fit_in_mask
 from hybridvo.network.judge import JudgeNetwork
-from hybridvo.refinement.options import RefinementOptions
+from hybridvo.options import RefineOptions
 from hybridvo.training.judge_batches import ego_flow_error, read_batches, refits_of
 from hybridvo.training.judge_loop import RIGHT_PX
 from hybridvo.training.rendered_pictures import MOVING, STATIC
@@ -60,7 +60,7 @@ def evaluate_judge(
         )
         trust = torch.sigmoid(network.confidence(score, hidden, owner, len(batch.T)))
         old = len(inputs.owner)
-        cutoff = RefinementOptions().cutoff
+        cutoff = RefineOptions().cutoff
         for b in range(len(batch.T)):
             mine = torch.nonzero(owner == b)[:, 0]
             first = mine[mine < old]

@@ -11,9 +11,9 @@ import torch
 import hybridvo.synthetic.scenarios as benchmark_pairs
 from hybridvo.errors import InputError
 from hybridvo.geometry import pixel_grid, rotation_angle, se3_exp
+from hybridvo.pipeline import refine
 from hybridvo.pose.batched import BatchedPose, BatchOptions, refine_batch
 from hybridvo.pose.residuals import reproject
-from hybridvo.refinement.refine import refine
 from hybridvo.types import PairBatch, Reason, State
 
 F64 = torch.float64

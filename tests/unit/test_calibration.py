@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hybridvo.hypotheses.confidence import RECALIBRATION, probability_right
 
 from hybridvo.errors import InputError
 from hybridvo.evaluation.calibration import (
@@ -18,7 +19,6 @@ from hybridvo.evaluation.calibration import (
 )
 from hybridvo.evaluation.plots_calibration import plot_calibration
 from hybridvo.geometry import se3_exp
-from hybridvo.hypotheses.confidence import RECALIBRATION, probability_right
 
 
 def test_three_sigma_is_scipys():

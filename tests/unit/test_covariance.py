@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+from hybridvo.pipeline import refine
 from hybridvo.pose import batch_covariance
 from hybridvo.refinement import full_fit, kernels, solver
 from hybridvo.refinement.covariance import (
@@ -23,7 +24,6 @@ from hybridvo.refinement.covariance import (
     sandwich_covariance,
 )
 from hybridvo.refinement.pixels import Picture
-from hybridvo.refinement.refine import refine
 from hybridvo.synthetic.scenarios import make_pair
 from hybridvo.types import FramePair, Reason, State
 

@@ -6,15 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hybridvo.refinement.options import RefinementOptions
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hybridvo.geometry import ego_flow, se3_exp
-from hybridvo.pipeline import estimate
+from hybridvo.pipeline import estimate, refine
 from hybridvo.refinement import kernels
 from hybridvo.refinement.depth_agreement import depth_agreement
-from hybridvo.refinement.options import RefinementOptions
-from hybridvo.refinement.refine import refine
 from hybridvo.types import Camera, Frame, FramePair, Reason
 
 K = Camera(140, 140, 127.5, 95.5, 192, 256)

@@ -11,7 +11,7 @@ import pytest
 from hybridvo.cli import main
 from hybridvo.depth_steps import depth_ratio, depth_step_warning, is_step
 from hybridvo.geometry import ego_flow, se3_exp
-from hybridvo.refinement.refine import refine
+from hybridvo.pipeline import refine
 from hybridvo.types import Camera, Frame, FramePair
 from tests.walks import REFINE, command, write_walk
 

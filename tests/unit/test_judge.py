@@ -10,6 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from hybridvo.learned_judge import LearnedJudge, judge_inputs
+from hybridvo.refinement.options import RefinementOptions
 from safetensors.torch import save_file
 
 from hybridvo.data.presets import build_options, read_yaml
@@ -18,13 +20,10 @@ from hybridvo.geometry import ego_flow, se3_exp
 from hybridvo.hypotheses import selector as second_look
 from hybridvo.hypotheses.generate import CoarseSearch, search_motions, whole_mask
 from hybridvo.hypotheses.selector import Motions, Opinion, Proposal
-from hybridvo.learned_judge import LearnedJudge, judge_inputs
 from hybridvo.network import judge as judge_network
 from hybridvo.network.judge import JudgeInputs, JudgeNetwork, JudgeOptions
 from hybridvo.network.weights import load_weights, pretrained, save_weights
-from hybridvo.pipeline import estimate
-from hybridvo.refinement.options import RefinementOptions
-from hybridvo.refinement.refine import refine
+from hybridvo.pipeline import estimate, refine
 from hybridvo.synthetic.render import SyntheticSequence, make_scene
 from hybridvo.synthetic.scenarios import Scenario, make_pair
 from hybridvo.training import judge_data

@@ -9,19 +9,18 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from hybridvo.refinement.photometric_monitor import CHECK_EVERY, PhotometricMonitor
 
 from hybridvo.errors import InputError
 from hybridvo.flow import dis_flow
 from hybridvo.geometry import ego_flow, invert, se3_exp, se3_log
 from hybridvo.odometry import Odometry
-from hybridvo.pipeline import estimate
+from hybridvo.pipeline import estimate, refine
 from hybridvo.refinement import photometric_batch as batch
 from hybridvo.refinement import photometric_kernels as kernels
 from hybridvo.refinement.photometric import PhotometricOptions, polish_photometric
 from hybridvo.refinement.photometric_images import Level, blurred, grey_image, match_blur
-from hybridvo.refinement.photometric_monitor import CHECK_EVERY, PhotometricMonitor
 from hybridvo.refinement.photometric_problem import Problem, State, small_log
-from hybridvo.refinement.refine import refine
 from hybridvo.refinement.registration import OffsetCost, depth_offset_cost
 from hybridvo.synthetic.render import SyntheticSequence, make_scene
 from hybridvo.types import FramePair, RelativePose

@@ -10,9 +10,9 @@ import pytest
 
 from hybridvo.flow import dis_flow
 from hybridvo.geometry import ego_flow, invert
+from hybridvo.pipeline import refine
 from hybridvo.refinement.illumination import COLUMNS, ROWS, local_correlation
 from hybridvo.refinement.photometric import polish_photometric
-from hybridvo.refinement.refine import refine
 from hybridvo.synthetic.render import SyntheticSequence, make_scene
 from hybridvo.types import Frame, FramePair
 

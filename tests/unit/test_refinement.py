@@ -8,14 +8,14 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from hybridvo.refinement.options import RefinementOptions
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hybridvo.errors import InputError
 from hybridvo.geometry import ego_flow, invert, make_transform, rotation_angle, se3_exp, se3_log
+from hybridvo.pipeline import refine
 from hybridvo.refinement import pixels as picture_module
-from hybridvo.refinement.options import RefinementOptions
-from hybridvo.refinement.refine import refine
 from hybridvo.synthetic.scenarios import make_pair
 from hybridvo.types import Camera, Frame, FramePair, Reason, State
 

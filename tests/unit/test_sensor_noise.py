@@ -6,7 +6,7 @@ import pytest
 from hybridvo.data.sensor_noise import ratio_variance, stereo_variance, structured_light_variance
 from hybridvo.errors import InputError
 from hybridvo.geometry import ego_flow, se3_exp
-from hybridvo.refinement.refine import refine
+from hybridvo.pipeline import refine
 from hybridvo.types import Camera, Frame, FramePair
 
 DEPTH = np.array([[2.0, 4.0]], np.float32)

@@ -7,14 +7,14 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from hybridvo.tracking.anchor import Anchor, dump_anchor, load_anchor
+from hybridvo.tracking.key_frame import View
+from hybridvo.tracking.motion_history import MotionHistory
 from scipy.optimize import least_squares
 
 from hybridvo.errors import InputError
 from hybridvo.evaluation.report import jsonable
 from hybridvo.geometry import invert, se3_exp, se3_log
-from hybridvo.tracking.anchor import Anchor, dump_anchor, load_anchor
-from hybridvo.tracking.key_frame import View
-from hybridvo.tracking.motion_history import MotionHistory
 from hybridvo.tracking.pose_graph import (
     FREEDOM,
     Edge,

@@ -8,8 +8,6 @@ import numpy as np
 
 from hybridvo.types import Frame, RelativePose
 
-__all__ = ["KeyFrame", "View", "spread_px", "static_cells"]
-
 GRID_COLUMNS = 128
 """Cells in a row of the coarse grid on which static pixels and overlap are known."""
 HIDDEN = 0.03

@@ -1,4 +1,4 @@
-"""What the motions so far say of the next one: constant velocity, with how well that has held."""
+"""Constant velocity, with a covariance from how well that has held so far."""
 
 from __future__ import annotations
 
@@ -6,13 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hybridvo.geometry import invert, se3_log
-
-__all__ = ["MotionHistory", "Prediction"]
+from hybridvo.geometry import invert, pose_matrix, se3_log
+from hybridvo.types import MotionPrior
 
 MEMORY = 10
 """Motions after which a change counts 1 / e of a new one."""
-LEAST_CHANGES = 3
+MIN_CHANGES = 3
 """Changes between motions to be seen before their spread means anything."""
 INFLATION = 2.0
 """Factor on the mean square of the last changes, which tell little of the next, larger one."""
@@ -23,22 +22,7 @@ UNKNOWN_M, UNKNOWN_RAD = 1.0, 0.3
 
 
 @dataclass(frozen=True, eq=False)
-class Prediction:
-    """The next motion, before its frame is looked at.
-
-    Args:
-        T_curr_prev: (4, 4).
-        covariance: (6, 6) of ``Exp(delta) T_curr_prev``, translation first; m^2, rad^2.
-        informed: whether enough changes were seen for the covariance to mean anything.
-    """
-
-    T_curr_prev: np.ndarray
-    covariance: np.ndarray
-    informed: bool = True
-
-
-@dataclass(frozen=True, eq=False)
-class MotionHistory:
+class MotionModel:
     """The last motion and the spread of the changes from motion to motion; constant size.
 
     Args:
@@ -53,8 +37,8 @@ class MotionHistory:
     weight: float = 0.0
     changes: int = 0
 
-    def observed(self, T_curr_prev: np.ndarray, neighbours: bool = True) -> MotionHistory:
-        """The history after one more motion.
+    def observed(self, T_curr_prev: np.ndarray, neighbours: bool = True) -> MotionModel:
+        """The model after one more motion.
 
         Args:
             T_curr_prev: (4, 4).
@@ -64,18 +48,18 @@ class MotionHistory:
         # a step hands its motion out as well: its array may change
         T_curr_prev = np.array(T_curr_prev)
         if self.T_last is None or not neighbours:
-            return MotionHistory(T_curr_prev, self.spread, self.weight, self.changes)
+            return MotionModel(T_curr_prev, self.spread, self.weight, self.changes)
         change = se3_log(T_curr_prev @ invert(self.T_last))
         keep = 1.0 - 1.0 / MEMORY
         before = np.zeros((6, 6)) if self.spread is None else self.spread
-        return MotionHistory(
+        return MotionModel(
             T_curr_prev,
             keep * before + np.outer(change, change),
             keep * self.weight + 1.0,
             self.changes + 1,
         )
 
-    def predict(self, frames: int = 1) -> Prediction | None:
+    def predict(self, frames: int = 1) -> MotionPrior | None:
         """The motion to the frame ``frames`` ahead; None before the first motion.
 
         The velocity is taken to wander by as much as it did: over n frames the variance is that of
@@ -85,9 +69,8 @@ class MotionHistory:
             return None
         n = int(frames)
         grown = n * (n + 1) * (2 * n + 1) / 6
-        T = np.array(np.linalg.matrix_power(self.T_last, n))
-        informed = self.spread is not None and self.changes >= LEAST_CHANGES
-        if self.spread is None or not informed:
+        T = pose_matrix(np.linalg.matrix_power(self.T_last, n)[:3])
+        if self.spread is None or self.changes < MIN_CHANGES:
             one = np.diag([UNKNOWN_M**2] * 3 + [UNKNOWN_RAD**2] * 3)
         else:
             # ten changes are few for 21 numbers: half of it is even in all directions
@@ -95,4 +78,4 @@ class MotionHistory:
             even = np.repeat([np.trace(mean[:3, :3]) / 3, np.trace(mean[3:, 3:]) / 3], 3)
             one = INFLATION * 0.5 * (mean + np.diag(even))
             one += np.diag([FLOOR_M**2] * 3 + [FLOOR_RAD**2] * 3)
-        return Prediction(T, grown * one, informed)
+        return MotionPrior(T, grown * one)

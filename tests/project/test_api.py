@@ -1,0 +1,53 @@
+"""The public names: what ``import hybridvo as hvo`` offers, and what each says of itself."""
+
+from __future__ import annotations
+
+import inspect
+
+import pytest
+
+import hybridvo
+
+NAMES = {
+    *("Camera", "Frame", "FramePair", "PairBatch", "PixelwisePrediction", "RelativePose"),
+    *("Status", "Step", "HybridVOError", "Odometry", "Trajectory"),
+    *("estimate", "select", "refine", "open_sequence", "iter_pairs"),
+}
+
+
+def test_the_public_names() -> None:
+    assert {name for name in hybridvo.__all__ if name != "__version__"} == NAMES
+    assert set(dir(hybridvo)) >= NAMES
+
+
+def test_an_unknown_name_is_an_attribute_error() -> None:
+    with pytest.raises(AttributeError, match="'hybridvo' has no attribute 'Odometer'"):
+        _ = hybridvo.Odometer
+
+
+@pytest.mark.parametrize("name", sorted(NAMES))
+def test_every_public_name_has_a_docstring(name: str) -> None:
+    value = getattr(hybridvo, name)
+    assert inspect.getdoc(value)
+    for member, function in vars(value).items() if inspect.isclass(value) else ():
+        if inspect.isfunction(function) and not member.startswith("_"):
+            assert inspect.getdoc(function), f"{name}.{member}"
+
+
+@pytest.mark.parametrize(
+    ("name", "positional", "keywords"),
+    [
+        ("estimate", 1, {"method", "seed"}),
+        ("refine", 1, {"options", "seed"}),
+        ("Odometry", 1, {"flow", "method", "seed"}),
+        ("open_sequence", 1, set()),
+        ("iter_pairs", 1, set()),
+    ],
+)
+def test_arguments_that_programs_pass_by_name(
+    name: str, positional: int, keywords: set[str]
+) -> None:
+    parameters = inspect.signature(getattr(hybridvo, name)).parameters.values()
+    kinds = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.VAR_POSITIONAL)
+    assert sum(p.kind in kinds for p in parameters) >= positional
+    assert keywords <= {p.name for p in parameters}

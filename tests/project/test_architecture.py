@@ -1,0 +1,242 @@
+"""The house: who imports whom, how large things are, what an import does."""
+
+from __future__ import annotations
+
+import ast
+import graphlib
+import json
+import subprocess
+import sys
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+from tests.project import source_tree as source
+
+NOUNS = {"errors", "types", "geometry"}
+CORE = NOUNS | {"torch_geometry", "refinement", "hypotheses", "calibration"}
+IMPORTS: dict[str, set[str]] = {
+    # data walk from left to right
+    "errors": set(),
+    "types": {"errors"},
+    "geometry": {"errors", "types"},
+    "torch_geometry": {"errors", "types"},
+    "files": {"errors"},
+    "calibration": set(),
+    "flow": NOUNS | {"files"},
+    "trajectory": NOUNS | {"files"},
+    "data": NOUNS | {"files"},
+    "refinement": NOUNS | {"torch_geometry", "calibration"},
+    "hypotheses": NOUNS | {"refinement", "calibration"},
+    "network": CORE,
+    "baselines": NOUNS,
+    "options": CORE | {"network", "tracking", "flow", "data"},
+    "pipeline": CORE | {"network", "baselines", "flow", "options"},
+    "tracking": CORE,
+    "odometry": CORE | {"pipeline", "tracking", "flow", "trajectory", "options"},
+    "synthetic": NOUNS | {"files", "trajectory", "data"},
+    "evaluation": CORE
+    | {"trajectory", "data", "pipeline", "flow", "files", "options", "odometry", "network"},
+    "training": CORE | {"files", "data", "synthetic", "network", "flow", "pipeline", "trajectory"},
+    "__init__": set(),
+}
+"""Room -> rooms it may import. ``commands``, ``cli`` and the tools may import everything."""
+
+ONLY_IN = {
+    "evo": {"trajectory.py", "evaluation/metrics.py"},
+    "matplotlib": {"evaluation/plots.py", "evaluation/maps.py"},
+    "plotly": {"evaluation/"},
+    "pandas": {"evaluation/"},
+    "rerun": {"commands/recording.py"},
+    "rich": {"commands/"},
+    "yaml": {"commands/", "data/", "synthetic/", "options.py", "training/"},
+    "open3d": {"baselines/"},
+    "poselib": {"baselines/"},
+    "safetensors": {"network/weights.py"},
+    "pydantic": {"options.py"},
+}
+"""Library -> the only files, or folders, that may import it."""
+
+MAX_FILE_LINES = 500
+MAX_FUNCTION_LINES = 80
+MAX_FOLDER_FILES = 15
+MAX_CONSTANTS = 300
+"""Module-level names in capitals that hold numbers, outside ``calibration.py``. It only falls."""
+
+
+def test_rooms_import_only_what_stands_before_them() -> None:
+    wrong = [
+        f"{path} imports {other}"
+        for path, others in source.own_imports().items()
+        if source.room(path) not in ("cli", "commands")
+        for other in others
+        if source.room(other) != source.room(path)
+        and source.room(other) not in IMPORTS.get(source.room(path), set())
+    ]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_the_table_names_the_rooms_that_there_are() -> None:
+    rooms = {source.room(path) for path in source.files()}
+    assert set(IMPORTS) | {"cli", "commands"} == rooms
+
+
+def test_no_file_imports_itself_by_way_of_others() -> None:
+    try:
+        graphlib.TopologicalSorter(source.own_imports()).prepare()
+    except graphlib.CycleError as error:
+        pytest.fail(" -> ".join(error.args[1]))
+
+
+def test_nothing_imports_the_commands_the_tools_or_the_tests() -> None:
+    for path, tree in source.files().items():
+        names = {name.split(".")[0] for name in source.imported(tree)}
+        assert not names & {"tools", "tests"}, path
+        if source.room(path) not in ("cli", "commands"):
+            below = {source.room(other) for other in source.own_imports()[path]}
+            assert not below & {"cli", "commands"}, path
+
+
+@pytest.mark.parametrize("library", ONLY_IN)
+def test_one_place_for_each_of_these_libraries(library: str) -> None:
+    users = {
+        path
+        for path, tree in source.files().items()
+        if any(name.split(".")[0] == library for name in source.imported(tree))
+    }
+    wrong = {path for path in users if not path.startswith(tuple(ONLY_IN[library]))}
+    assert not wrong
+
+
+def test_the_parts_of_evo_that_act_on_import_are_never_used() -> None:
+    # evo.tools.settings writes into the home folder, evo.tools.plot sets a matplotlib backend
+    for path, tree in source.files().items():
+        for name in source.imported(tree):
+            assert not name.startswith(("evo.tools.settings", "evo.tools.plot", "evo.main")), path
+
+
+def test_the_reader_of_imports_sees_those_in_functions_and_not_those_of_types() -> None:
+    tree = ast.parse(
+        "def f():\n    import evo.core\nif TYPE_CHECKING:\n    from hybridvo import cli\n"
+    )
+    assert source.imported(tree) == {"evo.core"}
+
+
+# --- sizes ----------------------------------------------------------------------------------------
+
+
+def lines(path: Path) -> int:
+    return len(path.read_text(encoding="utf-8").splitlines())
+
+
+def python_files(folder: str) -> list[Path]:
+    return sorted((source.ROOT / folder).rglob("*.py"))
+
+
+@pytest.mark.parametrize(
+    ("folder", "budget"), [("hybridvo", 24_000), ("tests", 15_000), ("tools", 3_000)]
+)
+def test_budget_of_lines(folder: str, budget: int) -> None:
+    assert sum(lines(path) for path in python_files(folder)) <= budget
+
+
+def test_files_are_short() -> None:
+    paths = [*python_files("hybridvo"), *python_files("tools")]
+    assert not {path.name: count for path in paths if (count := lines(path)) > MAX_FILE_LINES}
+
+
+def test_functions_are_short() -> None:
+    long = {name: count for name, count in source.functions().items() if count > MAX_FUNCTION_LINES}
+    assert not long
+
+
+def test_folders_can_be_read_at_a_glance() -> None:
+    count = Counter(path.rpartition("/")[0] for path in source.files())
+    count = Counter({folder: number for folder, number in count.items() if folder})
+    assert not {folder: n - 1 for folder, n in count.items() if n - 1 > MAX_FOLDER_FILES}
+
+
+def test_few_numbers_are_fixed_in_code() -> None:
+    found = source.numeric_constants()
+    found.pop("calibration.py", None)
+    assert sum(found.values()) <= MAX_CONSTANTS
+
+
+# --- what an import does --------------------------------------------------------------------------
+
+
+def fresh(code: str) -> dict:
+    """What a fresh interpreter, to which warnings are errors, prints as JSON."""
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", code],
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=source.ROOT,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    return json.loads(done.stdout)
+
+
+def test_import_loads_nothing_and_changes_nothing() -> None:
+    code = """
+import json, logging, os, sys, threading
+before = dict(os.environ), os.listdir()
+import hybridvo
+hybridvo.__version__
+heavy = ("torch", "evo", "matplotlib", "kornia", "pypose", "numba", "cv2", "scipy", "numpy")
+print(json.dumps({
+    "heavy": [name for name in heavy if name in sys.modules],
+    "unchanged": before == (dict(os.environ), os.listdir()),
+    "handlers": len(logging.getLogger().handlers) + len(logging.getLogger("hybridvo").handlers),
+    "threads": threading.active_count(),
+}))
+"""
+    assert fresh(code) == {"heavy": [], "unchanged": True, "handlers": 0, "threads": 1}
+
+
+def test_help_loads_no_heavy_library() -> None:
+    code = """
+import contextlib, io, json, sys
+from hybridvo.cli import main
+out = io.StringIO()
+with contextlib.redirect_stdout(out):
+    try:
+        main(["--help"])
+    except SystemExit as end:
+        assert not end.code
+assert "run" in out.getvalue() and "doctor" in out.getvalue()
+heavy = ("torch", "evo", "matplotlib", "kornia", "pypose", "numba", "cv2", "scipy")
+print(json.dumps([name for name in heavy if name in sys.modules]))
+"""
+    assert fresh(code) == []
+
+
+@pytest.mark.slow
+def test_importing_every_module_changes_no_setting() -> None:
+    """Thread counts, environment, log handlers and modes stay as the libraries leave them."""
+    code = """
+import importlib, json, logging, os, pkgutil, warnings
+warnings.filterwarnings("ignore", message=".*torch.jit.script.*")
+import cv2, evo, kornia, matplotlib, numba, numpy, pypose, scipy, torch
+def state():
+    return [
+        torch.get_num_threads(), torch.get_num_interop_threads(), cv2.getNumThreads(),
+        numba.get_num_threads(), torch.get_default_dtype() == torch.float32,
+        torch.is_grad_enabled(), matplotlib.get_backend(), numpy.geterr(), sorted(os.environ),
+        len(logging.getLogger().handlers), len(logging.getLogger("hybridvo").handlers),
+        len(os.listdir()),
+    ]
+numba.get_num_threads()  # starts numba's threads, which changes what torch says
+before = state()
+import hybridvo
+names = [m.name for m in pkgutil.walk_packages(hybridvo.__path__, "hybridvo.")]
+modules = [importlib.import_module(name) for name in names]
+after = state()
+print(json.dumps([len(names), [i for i, (a, b) in enumerate(zip(before, after)) if a != b]]))
+"""
+    count, changed = fresh(code)
+    assert count > 40
+    assert changed == []

@@ -1,0 +1,130 @@
+"""Fresh processes in poor surroundings: no network, no home, no optional libraries."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.walks import command
+
+ROOT = Path(__file__).resolve().parents[2]
+MAIN = "import sys; from hybridvo.cli import main; sys.exit(main(sys.argv[1:]))"
+HIDDEN = """
+import sys
+class Hide:
+    def __init__(self, finder):
+        self.finder = finder
+    def __getattr__(self, name):
+        return getattr(self.finder, name)
+    def find_spec(self, name, *where):
+        hidden = name.partition(".")[0] in sys.argv[1].split(",")
+        return None if hidden else self.finder.find_spec(name, *where)
+sys.meta_path[:] = [Hide(finder) for finder in sys.meta_path]
+from hybridvo.cli import main
+sys.exit(main(sys.argv[2:]))
+"""
+"""The libraries in the first argument are as if they had never been installed."""
+WATCHED = """
+import sys
+def watch(event, given):
+    if event.startswith("socket.") and event not in ("socket.gethostname", "socket.__new__"):
+        raise SystemExit(f"network: {event} {given[1:]}")
+sys.addaudithook(watch)
+from hybridvo.cli import main
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def child(code: str, *arguments: object, **environment: str | None):
+    env = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": os.fspath(ROOT)}
+    for name, value in environment.items():
+        if value is None:
+            env.pop(name, None)
+        else:
+            env[name] = value
+    return subprocess.run(
+        [sys.executable, "-c", code, *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        check=False,
+        env=env,
+    )
+
+
+@pytest.mark.slow
+def test_the_demo_needs_no_network(tmp_path: Path) -> None:
+    done = child(WATCHED, "demo", "--out", tmp_path / "out", "--frames", 3, "-q")
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "out" / "trajectory.png").is_file()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("home", ["nowhere", "a_file", None])
+def test_home_does_not_matter(walk: Path, tmp_path: Path, home: str | None) -> None:
+    place = tmp_path / "home"
+    if home == "a_file":
+        place.write_text("")
+    dropped = dict.fromkeys(
+        ("MPLCONFIGDIR", "XDG_CONFIG_HOME", "XDG_CACHE_HOME", "NUMBA_CACHE_DIR")
+    )
+    arguments = command(walk, tmp_path / "out", "--method", "identity", "--flow", "file", "-q")
+    done = child(MAIN, *arguments, **dropped, HOME=str(place) if home else None)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert (tmp_path / "out" / "trajectory.png").stat().st_size > 1000
+
+
+@pytest.mark.slow
+def test_the_core_needs_no_optional_library(walk: Path, tmp_path: Path) -> None:
+    optional = "rerun,poselib,open3d,distributed,dask,torchvision,gtsam"
+    for out, hidden in (("with", "nothing"), ("without", optional)):
+        arguments = command(walk, tmp_path / out, "--method", "refine", "--flow", "file", "-q")
+        done = child(HIDDEN, hidden, *arguments)
+        assert (done.returncode, done.stderr) == (0, "")
+    poses = [np.loadtxt(tmp_path / out / "trajectory.tum") for out in ("with", "without")]
+    np.testing.assert_allclose(poses[0], poses[1], rtol=0, atol=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("hidden", "options", "remedy"),
+    [
+        ("rerun", ["--rrd"], "pip install 'hybridvo[viz]'"),
+        ("poselib", ["--method", "poselib"], "pip install 'hybridvo[baselines]'"),
+        ("open3d", ["--method", "open3d-rgbd"], "pip install open3d"),
+    ],
+)
+def test_an_absent_library_is_one_line_with_its_command(
+    walk: Path, tmp_path: Path, hidden: str, options: list[str], remedy: str
+) -> None:
+    done = child(HIDDEN, hidden, *command(walk, tmp_path / "out", "-q", *options))
+    assert done.returncode == 2 and done.stdout == ""
+    assert done.stderr.count("\n") == 1 and remedy in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("threads", ["0", "many"])
+def test_numbas_threads_are_refused_in_words(walk: Path, tmp_path: Path, threads: str) -> None:
+    done = child(MAIN, *command(walk, tmp_path / "out", "-q"), NUMBA_NUM_THREADS=threads)
+    assert done.returncode == 2
+    assert "NUMBA_NUM_THREADS" in done.stderr and "Traceback" not in done.stderr
+
+
+def test_a_batch_is_refined_where_warnings_are_errors() -> None:
+    code = """
+import sys, warnings
+warnings.simplefilter("error")
+import torch, hybridvo as hvo
+K = torch.tensor([[[80.0, 0, 47.5], [0, 80, 35.5], [0, 0, 1]]])
+depth = 3 + torch.linspace(0, 2, 72 * 96).reshape(1, 72, 96).sin()
+found = hvo.refine(hvo.PairBatch(torch.zeros(1, 72, 96, 2), depth, K, K))
+print((found.T_curr_prev - torch.eye(4)).abs().max().item())
+"""
+    done = child(code)
+    assert done.returncode == 0 and done.stderr == "", done.stderr
+    assert float(done.stdout) < 1e-6
