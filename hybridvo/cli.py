@@ -245,7 +245,7 @@ def _open(args: argparse.Namespace) -> Any:
 
 def _run(args: argparse.Namespace, command: list[str]) -> int:
     from hybridvo.commands.configuration import load_options
-    from hybridvo.commands.inputs import network_file
+    from hybridvo.commands.inputs import make_models
     from hybridvo.commands.results import summary_text
     from hybridvo.commands.run import Mode, run
 
@@ -259,7 +259,7 @@ def _run(args: argparse.Namespace, command: list[str]) -> int:
         _open(args),
         args.out,
         options,
-        network=network_file(args.weights, options.run.method),
+        models=make_models(args.weights, options.run.method, options.run.device),
         mode=mode,
         command=command,
         quiet=args.quiet,

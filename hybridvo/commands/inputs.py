@@ -20,6 +20,7 @@ from hybridvo.data.sequence import Sequence
 from hybridvo.errors import InputError
 from hybridvo.flow import FlowField, FlowProvider, dis_flow, fallback, file_flow
 from hybridvo.options import Options
+from hybridvo.pipeline import Models, networks_of
 from hybridvo.types import Frame
 
 DARK_LEVEL = 20.0
@@ -84,25 +85,26 @@ def flow_provider(sequence: Sequence, options: Options) -> FlowProvider:
     return dis
 
 
-def network_file(weights: Iterable[str], method: str) -> str | None:
-    """File of ``NAME=FILE``, or None where nothing was given.
+def make_models(weights: Iterable[str], method: str, device: str) -> Models:
+    """Networks of a run: the pretrained ones, or the files of ``NAME=FILE``.
 
     Raises:
-        InputError: another form, several files, no such file, or a name that the method does not
-            use.
+        InputError: another form, no such file, a name that the method does not use, or a device
+            that is not there.
     """
-    given = list(weights)
-    if not given:
-        return None
-    name, sign, path = given[0].partition("=")
-    needed = "selector" if method.startswith("hybrid") else method
-    if len(given) > 1 or not sign or name != needed:
-        raise InputError(
-            f"--weights: expected one {needed}=FILE for --method {method}, got {' '.join(given)}."
-        )
-    if not Path(path).is_file():
-        raise InputError(f"--weights {name}: {path}: no such file.")
-    return path
+    files = {}
+    for text in weights:
+        name, sign, path = text.partition("=")
+        known = networks_of(method)
+        if not sign or name not in known:
+            raise InputError(
+                f"--weights: expected NAME=FILE with {' or '.join(known) or 'no name'} for "
+                f"--method {method}, got {text!r}."
+            )
+        if not Path(path).is_file():
+            raise InputError(f"--weights {name}: {path}: no such file.")
+        files[name] = path
+    return Models(device, files)
 
 
 def run_name(sequence: Sequence) -> str:

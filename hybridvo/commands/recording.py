@@ -13,7 +13,6 @@ from typing import Any
 import cv2
 import numpy as np
 
-from hybridvo.commands.tracker import probability
 from hybridvo.errors import InputError, OutputError
 from hybridvo.evaluation.maps import flow_colours, longest_flow
 from hybridvo.types import Frame, State, Step
@@ -116,7 +115,7 @@ class Recording:
         log("covariance/translation_std_mm", rr.Scalars(1e3 * std[:3]))
         log("covariance/rotation_std_mdeg", rr.Scalars(1e3 * np.degrees(std[3:])))
         log("status/inlier_ratio", rr.Scalars(motion.inlier_ratio))
-        log("status/probability", rr.Scalars(probability(step)))
+        log("status/probability", rr.Scalars(motion.probability))
         state = step.status.state
         if state is not State.OK:
             text = f"frame {step.index}: {step.status} {step.status.message}"

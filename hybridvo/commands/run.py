@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 import hybridvo
-from hybridvo.commands import results, tracker
+from hybridvo.commands import results
 from hybridvo.commands.inputs import (
     TimedFlow,
     check_outside,
@@ -35,14 +35,14 @@ from hybridvo.data.sequence import Sequence
 from hybridvo.depth_steps import depth_ratio
 from hybridvo.errors import InputError
 from hybridvo.evaluation.metrics import pair_errors
-from hybridvo.files import fingerprint, sha256, write_json
-from hybridvo.flow import contradiction
+from hybridvo.files import fingerprint, write_json
 from hybridvo.geometry import invert
 from hybridvo.odometry import Odometry
 from hybridvo.options import Options
-from hybridvo.pipeline import check_method, weights_hash
+from hybridvo.pipeline import Models, check_method, weights_hash
+from hybridvo.tracking.state import TrackerState
 from hybridvo.trajectory import Trajectory, read_trajectory
-from hybridvo.types import Frame, FramePair, Step
+from hybridvo.types import Frame, State, Step
 
 EXIT_DONE, EXIT_FAILED_FRAMES, EXIT_INTERRUPTED = 0, 3, 130
 
@@ -74,7 +74,7 @@ def run(
     out: str | os.PathLike[str] | None,
     options: Options,
     *,
-    network: str | None = None,
+    models: Models | None = None,
     mode: Mode = "new",
     command: Iterable[str] = (),
     quiet: bool = False,
@@ -86,7 +86,7 @@ def run(
         sequence: an open one, see :func:`hybridvo.data.sequence.open_sequence`.
         out: output folder, default ``runs/NAME``.
         options: see :class:`hybridvo.options.Options`.
-        network: file of weights instead of the pretrained ones.
+        models: networks instead of the pretrained ones.
         mode: ``new``, ``resume`` or ``overwrite``.
         command: for ``run.json``.
         quiet: no progress.
@@ -96,7 +96,9 @@ def run(
         InputError: input or options that cannot be used, or a broken frame with ``strict``.
         LockedError: another run holds the folder. OutputError: a result cannot be written.
     """
-    check_method(options.run.method)
+    method = options.run.method
+    models = models or Models(options.run.device)
+    check_method(method, models)
     if rrd is not None:
         check_recording(rrd or RECORDING)
     stop = min(options.run.stop or len(sequence), len(sequence))
@@ -109,11 +111,12 @@ def run(
     flow = TimedFlow(flow_provider(sequence, options), options.run.strict)
     out = Path("runs") / run_name(sequence) if out is None else Path(out)
     check_outside(out, sequence)
-    vo = tracker.make_tracker(options, flow, network)
+    vo = Odometry(models, flow=flow, method=method, options=options, seed=options.run.seed)
+    vo.warm_up()  # before the folder is taken: it may last
     identity = {
         "input_hash": fingerprint(sequence.files()),
         "options": deciding(options),
-        "weights": sha256(network) if network else weights_hash(options.run.method),
+        "weights": weights_hash(method, models),
         "hybridvo": hybridvo.__version__,
     }
     header = run_header(sequence, frames, options, command) | {"input_hash": identity["input_hash"]}
@@ -153,7 +156,7 @@ class _Job:
 
     def run(self, quiet: bool) -> RunResult:
         label = f"{self.sequence.name} [{self.options.run.method}]"
-        done, warnings = self.folder.frames_done, []
+        done = self.folder.frames_done
         with (
             interruptible() as interrupted,
             Progress(len(self.frames), label, quiet=quiet, done=done) as progress,
@@ -161,30 +164,29 @@ class _Job:
             for warning in self.sequence.notices:
                 progress.say(f"warning: {warning}")
             if self.folder.tracker is not None:
-                tracker.resume(self.vo, self.folder.tracker, self.sequence)
+                self.vo.resume(TrackerState.from_arrays(self.folder.tracker))
                 progress.say(f"resumed after {done} of {len(self.frames)} frames")
             failed = sum(row["status"] == "failed" for row in self.folder.rows())
             for index in self.frames[done:]:
                 if interrupted.is_set():
                     break
-                row, warning = self._track(index, progress)
-                warnings += [warning] if warning else []
+                row = self._track(index, progress)
                 failed += row["status"] == "failed"
                 self.folder.append(row)
                 progress.update(self.folder.frames_done, failed)
                 if self.folder.frames_done % SAVE_EVERY == 0:
-                    self.folder.save_tracker(tracker.state_arrays(self.vo))
+                    self.folder.save_tracker(self.vo.state.to_arrays())
             if interrupted.is_set():
-                self.folder.save_tracker(tracker.state_arrays(self.vo))
+                self.folder.save_tracker(self.vo.state.to_arrays())
                 kept = self.folder.frames_done
                 progress.say(f"interrupted: {kept} frames are kept; go on with --resume")
-            return self._write(interrupted.is_set(), warnings)
+            return self._write(interrupted.is_set())
 
-    def _track(self, index: int, progress: Progress) -> tuple[dict[str, Any], str]:
-        """Row of one frame, and a warning or an empty text."""
+    def _track(self, index: int, progress: Progress) -> dict[str, Any]:
+        """Row of one frame; says so on the screen where its motion is not ok."""
         stamp = float(self.sequence.timestamps[index])
-        prev = self.vo.anchor.frame
-        frame, warning, ms = None, "", 0.0
+        prev = self.vo.state.frame
+        frame, ms = None, 0.0
         self.flow.reset()
         try:
             frame = self.sequence.frame(index)
@@ -197,26 +199,12 @@ class _Job:
             step = self.vo.track(frame)
             ms = 1e3 * (time.perf_counter() - started)
         row = self._row(step, prev, frame, ms)
-        if prev is not None and frame is not None:
-            warning = self._first_flow(prev, frame)
-            if self.recording is not None:
-                self.recording.add(frame, step, self.flow.field and self.flow.field.flow)
-        elif frame is not None and self.recording is not None:
-            self.recording.add(frame, step, None)
+        if frame is not None and self.recording is not None:
+            self.recording.add(frame, step, self.flow.field and self.flow.field.flow)
         if row["status"] != "ok":
             text = f"frame {index}: {row['status']} ({row['reason']}), probability "
             progress.say(f"{text}{row['probability']:.2f}: {row['message']}")
-        if warning:
-            progress.say(f"warning: {warning}")
-        return row, warning
-
-    def _first_flow(self, prev: Frame, frame: Frame) -> str:
-        """Why a given flow contradicts the images of the first pair; else an empty text."""
-        field = self.flow.field
-        if prev.index != self.frames[0] or field is None or field.flow is None:
-            return ""
-        pair = FramePair(prev, frame, field.flow, field.variance, field.valid, field.source)
-        return contradiction(pair) or ""
+        return row
 
     def _row(
         self, step: Step, prev: Frame | None, frame: Frame | None, ms: float
@@ -224,10 +212,10 @@ class _Job:
         motion, field = step.motion, self.flow.field
         flow = None if field is None else field.flow
         message = step.status.message
-        if frame is not None and step.status.state.value != "ok" and is_dark(frame.rgb):
+        if frame is not None and not step.ok and is_dark(frame.rgb):
             message = f"the image is dark; {message}"
         ratio, repeated = None, False
-        if prev is not None and frame is not None and step.status.state.value != "failed":
+        if prev is not None and frame is not None and step.status.state is not State.FAILED:
             ratio = depth_ratio(prev, frame, flow, step.T_curr_prev)
             repeated = is_repeated(prev, frame)
         return {
@@ -235,7 +223,7 @@ class _Job:
             "timestamp": step.timestamp,
             "status": step.status.state.value,
             "reason": step.status.reason.value,
-            "probability": tracker.probability(step),
+            "probability": float(motion.probability),
             "message": message,
             "T_curr_prev": motion.T_curr_prev.ravel().tolist(),
             "T_world_cam": step.T_world_cam.ravel().tolist(),
@@ -266,7 +254,7 @@ class _Job:
         camera = self.sequence.camera(step.index)
         return pair_errors(step.T_curr_prev, T_true, prev.depth, prev.camera, camera)
 
-    def _write(self, interrupted: bool, warnings: list[str]) -> RunResult:
+    def _write(self, interrupted: bool) -> RunResult:
         """Results of the rows kept so far; all of them and the scores where the run is complete."""
         folder, path = self.folder, self.folder.path
         rows = list(folder.rows())
@@ -280,7 +268,7 @@ class _Job:
         trajectory.save(path / "trajectory.kitti")
         results.write_steps(path, rows)
         summary = results.summarise(rows, self.sequence, self.options.run.method)
-        summary |= {"out": os.fspath(path), "warnings": warnings + summary["warnings"]}
+        summary["out"] = os.fspath(path)
         if interrupted:
             folder.write_state("interrupted", summary=summary)
             return RunResult(EXIT_INTERRUPTED, summary | {"state": "interrupted"}, trajectory, gt)
