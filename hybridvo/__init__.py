@@ -27,9 +27,11 @@ _HOME = {
     "open_sequence": "hybridvo.data.sequence",
     "iter_pairs": "hybridvo.data.sequence",
     "refine": "hybridvo.pipeline",
-    "select": "hybridvo.pose.selection",
+    "select": "hybridvo.network.selection",
     "dis_flow": "hybridvo.flow",
+    "evaluate": "hybridvo.evaluation.metrics",
     "to_gtsam_covariance": "hybridvo.geometry",
+    "to_ros_covariance": "hybridvo.geometry",
 }
 
 __all__ = ["__version__", *_HOME]

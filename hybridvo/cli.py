@@ -52,7 +52,8 @@ def build_parser() -> argparse.ArgumentParser:
         return command
 
     _add_run(add("run", _run, "estimate the camera motion of a sequence", _input()))
-    _add_show(add("show", _show, "draw the maps of one pair of a sequence", _input()))
+    _add_compare(add("compare", _compare, "run methods side by side and write a report"))
+    _add_show(add("show", _show, "draw the maps of one pair of a sequence", _where()))
     _add_evaluate(add("evaluate", _evaluate, "errors of a trajectory file against ground truth"))
     doctor = add(
         "doctor", _doctor, "what is missing here, or wrong with a sequence", _input(required=False)
@@ -77,8 +78,8 @@ def _common() -> argparse.ArgumentParser:
     return common
 
 
-def _input(required: bool = True) -> argparse.ArgumentParser:
-    """Which sequence, and what its folder does not say."""
+def _where(required: bool = True) -> argparse.ArgumentParser:
+    """Which sequence."""
     given = argparse.ArgumentParser(add_help=False)
     where = given.add_mutually_exclusive_group(required=required)
     where.add_argument("path", nargs="?", metavar="DIR", help="folder of the sequence")
@@ -86,6 +87,12 @@ def _input(required: bool = True) -> argparse.ArgumentParser:
     given.add_argument(
         "--dataset", metavar="KIND", help=f"one of {', '.join(KINDS)} (default: detected)"
     )
+    return given
+
+
+def _input(required: bool = True) -> argparse.ArgumentParser:
+    """Which sequence, and what its folder does not say."""
+    given = _where(required)
     given.add_argument(
         "--camera", metavar="FILE|fx,fy,cx,cy", help="camera.yaml, ROS camera_info, or numbers"
     )
@@ -154,12 +161,46 @@ class _KeysInHelp(argparse.Action):
         setattr(namespace, self.dest, [*getattr(namespace, self.dest), values])
 
 
+def _add_compare(compare: argparse.ArgumentParser) -> None:
+    add = compare.add_argument
+    add(
+        "--sequence",
+        action="extend",
+        nargs="+",
+        required=True,
+        metavar="DIR",
+        help="sequence, or a folder of sequences (MPI Sintel as it was unpacked); repeatable",
+    )
+    add("--out", required=True, metavar="DIR")
+    add("--methods", default="all", help="comma-separated; default: all that run here")
+    flow = "auto: the sequence's flow files and DIS, side by side"
+    add("--flow", choices=("auto", "file", "dis"), default="auto", help=flow)
+    add("--dataset", help="kind of the sequences (default: detected)")
+    add("--start", type=int, default=0)
+    add("--stop", type=int)
+    add("--stride", type=int, default=1)
+    add("--seed", type=int, default=0)
+    add("--device", choices=("auto", "cpu", "cuda"), default="auto")
+    own = "network weights instead of the pretrained ones; repeatable"
+    add("--weights", action="append", default=[], metavar="NAME=FILE", help=own)
+    paper = "MPI Sintel as others score it: PWVO's 992 pairs, or fourteen trajectories"
+    add("--protocol", choices=("paper", "trajectory14"), help=paper)
+    add("--worst", type=int, default=3, help="worst pairs shown for each method")
+    add("--jobs", type=int, default=1, metavar="N", help="sequences at a time, a process each")
+    cluster = "of a Dask cluster (tcp://host:8786) that works instead; extra 'cluster'"
+    add("--scheduler", metavar="ADDRESS", help=cluster)
+    exists = compare.add_mutually_exclusive_group()
+    exists.add_argument("--resume", action="store_true", help="keep the finished sequences")
+    exists.add_argument("--overwrite", action="store_true", help="replace results in --out")
+
+
 def _add_show(show: argparse.ArgumentParser) -> None:
     show.add_argument("--pair", type=int, default=0, metavar="N", help="first frame (default 0)")
     show.add_argument("--out", default="pair.png", metavar="FILE", help="default: pair.png")
     show.add_argument("--method", metavar="NAME", help="estimator (default: hybrid)")
     show.add_argument("--flow", choices=("auto", "file", "dis"), default="auto")
     show.add_argument("--weights", action="append", default=[], metavar="FILE", help="a network")
+    show.add_argument("--steps", type=int, default=32, help="of the integrated gradients")
     show.add_argument("--overwrite", action="store_true", help="replace the image")
 
 
@@ -275,7 +316,15 @@ def _run(args: argparse.Namespace, command: list[str]) -> int:
 def _show(args: argparse.Namespace, command: list[str]) -> int:
     from hybridvo.commands.show import show
 
-    written = show(_open(args), args)
+    written = show(args)
+    _print(args, {"files": written}, "\n".join(written))
+    return 0
+
+
+def _compare(args: argparse.Namespace, command: list[str]) -> int:
+    from hybridvo.commands.compare import compare_command
+
+    written = [str(path) for path in compare_command(args, command)]
     _print(args, {"files": written}, "\n".join(written))
     return 0
 

@@ -70,7 +70,7 @@ def _run(args: argparse.Namespace, command: list[str]) -> int:
     import cv2
     import torch
 
-    from hybridvo.console import interruptible
+    from hybridvo.commands.progress import interruptible
     from hybridvo.data.presets import load_preset
     from hybridvo.errors import InputError
     from hybridvo.training.ablation import KeptSamples, plan, row_options

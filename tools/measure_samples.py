@@ -42,7 +42,7 @@ def main(argv: list[str] | None = None) -> int:
     args = build_parser().parse_args(argv)
     from hybridvo.errors import HybridVOError, OutputError
     from hybridvo.evaluation.report import write_json
-    from hybridvo.run import versions
+    from hybridvo.commands.inputs import versions
 
     given = sys.argv[1:] if argv is None else argv
     try:
@@ -88,7 +88,7 @@ def measure_on(
 ) -> list[dict[str, Any]]:
     """Errors of all methods on the same pairs."""
     from hybridvo.data.sequence import iter_pairs
-    from hybridvo.evaluation.metrics import pair_errors
+    from hybridvo.evaluation.pair_errors import pair_errors
     from hybridvo.geometry import invert, rotation_angle
     from hybridvo.pipeline import estimate, warm_up
 

@@ -38,7 +38,7 @@ def write_rows(
     from hybridvo.errors import HybridVOError
     from hybridvo.evaluation.report import write_json
     from hybridvo.pipeline import warm_up
-    from hybridvo.run import versions
+    from hybridvo.commands.inputs import versions
 
     if args.out.exists() and not args.overwrite:
         print(f"{parser.prog}: {args.out} exists; pass --overwrite.", file=sys.stderr)

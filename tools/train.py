@@ -88,7 +88,7 @@ def _train(arguments: argparse.Namespace, argv: list[str]) -> int:
     from hybridvo.checks import make_folder
     from hybridvo.errors import InputError
     from hybridvo.evaluation.report import write_json
-    from hybridvo.run import check_device
+    from hybridvo.pipeline import torch_device
     from hybridvo.training.loop import Trainer
     from hybridvo.training.options import load_training_options
     from hybridvo.training.outputs import check_export, check_folder
@@ -108,7 +108,7 @@ def _train(arguments: argparse.Namespace, argv: list[str]) -> int:
         raise InputError(f"--workers: expected 0 or more, got {arguments.workers}.")
     if arguments.device not in ("auto", "cpu", "cuda"):
         raise InputError(f"--device: expected auto, cpu or cuda, got {arguments.device!r}.")
-    check_device(arguments.device)
+    torch_device(arguments.device)
     if arguments.threads is not None:
         torch.set_num_threads(arguments.threads)
     # Samples are small: threads inside OpenCV cost more than they give.
@@ -175,16 +175,11 @@ def _record(out: Path, default: dict[str, Any]) -> dict[str, Any]:
 @contextlib.contextmanager
 def _clean_stop(trainer: Any) -> Iterator[None]:
     """The signals that ask to stop end the run after the update at hand, with a checkpoint."""
-    from hybridvo.console import leave_closed_terminals, open_terminals, stop_signals
-
-    terminals = open_terminals()
-
     def request(number: int, frame: object) -> None:
-        leave_closed_terminals(terminals)
         trainer.stop_requested = True
 
     try:
-        before = {s: signal.signal(s, request) for s in stop_signals()}
+        before = {s: signal.signal(s, request) for s in (signal.SIGINT, signal.SIGTERM)}
     except ValueError:  # not the main thread: whoever started it must stop it
         before = {}
     try:

@@ -156,7 +156,7 @@ def run_header(
             "path": os.fspath(sequence.root),
             "frames": len(frames),
             "depth_source": sequence.depth_source,
-            "warnings": list(sequence.notices),
+            "warnings": list(sequence.warnings),
         },
     }
 

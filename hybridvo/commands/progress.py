@@ -80,8 +80,11 @@ class Progress:
     def __exit__(self, *_: object) -> None:
         self._bar.stop()
 
-    def update(self, done: int, failed: int = 0) -> None:
+    def update(self, done: int, failed: int = 0, total: int | None = None) -> None:
         """``done`` units are finished, ``failed`` of them have failed."""
+        if total is not None:
+            self._total = total
+            self._bar.update(self._task, total=total)
         now = time.monotonic()
         speed = (done - self._before) / max(now - self._started, 1e-9)
         rate = f"{speed:.1f} {self._unit}/s" + (f", {failed} failed" if failed else "")

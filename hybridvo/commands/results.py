@@ -10,7 +10,8 @@ import numpy as np
 
 from hybridvo.data.sequence import Sequence
 from hybridvo.depth_steps import is_step
-from hybridvo.evaluation.metrics import evaluate_trajectories, mean_pair_errors
+from hybridvo.evaluation.metrics import evaluate
+from hybridvo.evaluation.pair_errors import mean_pair_errors
 from hybridvo.files import atomic_write, write_csv
 from hybridvo.geometry import pose_matrix, se3_log
 from hybridvo.trajectory import Trajectory
@@ -95,7 +96,7 @@ def score(
     rows: list[dict[str, Any]], trajectory: Trajectory, gt: Trajectory, summary: Row, alignment: str
 ) -> dict[str, Any]:
     """Content of ``metrics.json``: errors against the ground truth, and what went in."""
-    report = evaluate_trajectories(trajectory, gt, alignment=alignment)  # type: ignore[arg-type]
+    report = evaluate(trajectory, gt, alignment=alignment)  # type: ignore[arg-type]
     pairs = mean_pair_errors(row["errors"] for row in rows if row["errors"] is not None)
     reasons = report.pop("reasons") | pairs.pop("reasons")
     named = ("method", "failed", "degraded", "flow_source", "depth_source", "oracle", "sequence")

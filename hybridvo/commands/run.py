@@ -34,7 +34,7 @@ from hybridvo.commands.run_folder import RESULTS, Mode, RunFolder
 from hybridvo.data.sequence import Sequence
 from hybridvo.depth_steps import depth_ratio
 from hybridvo.errors import InputError
-from hybridvo.evaluation.metrics import pair_errors
+from hybridvo.evaluation.pair_errors import pair_errors
 from hybridvo.files import fingerprint, write_json
 from hybridvo.geometry import invert
 from hybridvo.odometry import Odometry
@@ -161,7 +161,7 @@ class _Job:
             interruptible() as interrupted,
             Progress(len(self.frames), label, quiet=quiet, done=done) as progress,
         ):
-            for warning in self.sequence.notices:
+            for warning in self.sequence.warnings:
                 progress.say(f"warning: {warning}")
             if self.folder.tracker is not None:
                 self.vo.resume(TrackerState.from_arrays(self.folder.tracker))

@@ -1,25 +1,24 @@
-"""``hybridvo show``: the maps of one pair of a sequence in one picture."""
+"""``hybridvo show``: the maps of one pair of a sequence in one image."""
 
 from __future__ import annotations
 
 import argparse
 import os
-from pathlib import Path
-from typing import Any
 
-from hybridvo.visualization import PictureOptions, visualize
+from hybridvo.evaluation.drawing import draw
 
 
-def show(sequence: Any, args: argparse.Namespace) -> list[str]:
+def show(args: argparse.Namespace) -> list[str]:
     """Draw flow factors, uncertainty and saliency of a pair; paths of what was written."""
-    options = PictureOptions(
-        sequence=os.fspath(sequence.root),
-        pair=args.pair,
+    written = draw(
+        args.path or args.sequence,
+        args.pair,
+        args.out,
         dataset=args.dataset,
         flow=args.flow,
         method=args.method,
-        weights=tuple(Path(name) for name in args.weights),
-        out=Path(args.out),
+        weights=args.weights,
+        steps=args.steps,
         overwrite=args.overwrite,
     )
-    return [os.fspath(path) for path in visualize(options, ["hybridvo", "show"])]
+    return [os.fspath(path) for path in written]
