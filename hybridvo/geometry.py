@@ -9,7 +9,6 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hybridvo.checks import to_numpy
 from hybridvo.errors import InputError
 from hybridvo.types import Camera
 

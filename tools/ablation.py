@@ -172,7 +172,7 @@ def _one(
             (folder / name).unlink(missing_ok=True)
     mixture, kept = source
     trainer = train_row(
-        options, mixture, folder, device, args.workers, kept, report, lambda: bool(interruption)
+        options, mixture, folder, device, args.workers, kept, report, interruption.is_set
     )
     if trainer.step < options.steps:
         return None

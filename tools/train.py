@@ -175,6 +175,7 @@ def _record(out: Path, default: dict[str, Any]) -> dict[str, Any]:
 @contextlib.contextmanager
 def _clean_stop(trainer: Any) -> Iterator[None]:
     """The signals that ask to stop end the run after the update at hand, with a checkpoint."""
+
     def request(number: int, frame: object) -> None:
         trainer.stop_requested = True
 
