@@ -114,7 +114,8 @@ def select_pose(
 
     Differentiable in the predictions and, through the weights, in the log scales (``median`` in
     the predictions only); the choice of the pixel has no gradient. Values that are not finite are
-    never chosen while their patch has another, and a patch without any has no weight; a pair without any gives zero motion.
+    never chosen while their patch has another, and a patch without any has no weight; a pair
+    without any gives zero motion.
 
     Args:
         output: maps of (B, 3, h, w), or the pose itself (VONet).
