@@ -130,9 +130,6 @@ def _look_at_devices(report: dict[str, Any]) -> None:
 
 
 def _look_at_threads(report: dict[str, Any]) -> None:
-    from hybridvo.compilation import check_threads
-
-    check_threads()  # in words, where numba answers with a traceback
     import cv2
     import numba
 

@@ -32,9 +32,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     from hybridvo.errors import HybridVOError, OutputError
 
     try:
-        from hybridvo.compilation import check_threads
-
-        check_threads()  # before a module imports numba, which would answer with a traceback
         commands = {"make": _make, "propose": _propose, "train": _train, "export": _export}
         return commands[arguments.command](arguments)
     except OutputError as error:

@@ -20,8 +20,10 @@ Per pixel, with X' = T X, a = X'/Z', b = Y'/Z', i = 1/Z' (conventions of :mod:`h
 from __future__ import annotations
 
 import numpy as np
+from numba import types
+from numba.extending import intrinsic
 
-from hybridvo.compilation import intrinsic, njit, types
+from hybridvo.compilation import njit
 
 FASTMATH = {"reassoc", "contract", "arcp", "nsz"}  # not nnan/ninf: invalid values are tested for
 
