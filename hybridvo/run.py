@@ -27,7 +27,7 @@ from hybridvo.data.fingerprint import input_hash, input_times
 from hybridvo.data.sequence import Sequence, open_sequence
 from hybridvo.depth_steps import depth_ratio
 from hybridvo.errors import InputError
-from hybridvo.evaluation.metrics import pair_errors
+from hybridvo.evaluation.pair_errors import pair_errors
 from hybridvo.evaluation.report import write_json
 from hybridvo.flow import FlowField, FlowProvider, dis_flow, fallback, file_flow
 from hybridvo.geometry import invert

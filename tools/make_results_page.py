@@ -21,7 +21,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "docs" / "results"
 PAGE = ROOT / "docs" / "results.md"
-PROTOCOLS = ("paper", "all", "trajectory14")
+PROTOCOLS = ("paper", "trajectory14")
 NETWORKS = ("hybrid", "hybrid-flow", "pwvo", "pwvo-naive", "pixelwise", "vonet", "vonet-attention")
 CLASSICAL = ("refine", "pnp-ransac", "pnp-ransac-tuned", "usac-magsac", "poselib", "identity")
 
@@ -192,13 +192,13 @@ def ablation(content: Mapping[str, Any]) -> list[str]:
 
 def sintel(name: str, content: Mapping[str, Any] | None) -> list[str]:
     """Table of one protocol, empty where nothing was measured yet."""
-    from hybridvo.evaluation.protocols import PROTOCOLS as KNOWN
+    from hybridvo.evaluation.protocols import protocols
 
     number = sibling("make_readme_tables").number
-    protocol = KNOWN[name]
+    protocol = protocols()[name]
     measured = None if content is None else content["protocol"]
-    labels = [f"{m.label}, {m.unit}" for m in protocol.metrics]
-    keys = [m.key for m in protocol.metrics]
+    labels = [f"{m['label']}, {m['unit']}" for m in protocol.metrics]
+    keys = [m["key"] for m in protocol.metrics]
     title = protocol.title[0].upper() + protocol.title[1:]
     lines = [
         f"### {title}",
@@ -229,13 +229,15 @@ def sintel(name: str, content: Mapping[str, Any] | None) -> list[str]:
         ]
     lines += [_line(["measured here", "flow", "pairs", *labels])]
     lines += ["|---|---|" + "---:|" * (1 + len(keys)), *map(_line, rows), ""]
-    given = [m for m in protocol.metrics if any(m.key in p.values for p in protocol.published)]
-    lines += [_line(["published", *(f"{m.label}, {m.unit}" for m in given), "source", "note"])]
+    given = [m for m in protocol.metrics if any(m["key"] in p for p in protocol.published)]
+    lines += [
+        _line(["published", *(f"{m['label']}, {m['unit']}" for m in given), "source", "note"])
+    ]
     lines += ["|---|" + "---:|" * len(given) + "---|---|"]
     for published in protocol.published:
-        values = [number(published.values.get(m.key)) for m in given]
-        note = "; ".join(filter(None, (published.inputs, published.note)))
-        lines.append(_line([published.name, *values, published.source, note]))
+        values = [number(published.get(m["key"])) for m in given]
+        note = "; ".join(filter(None, (published["inputs"], published["note"])))
+        lines.append(_line([published["name"], *values, published["source"], note]))
     return [*lines, ""]
 
 

@@ -18,10 +18,12 @@ from __future__ import annotations
 
 import argparse
 import json
+import multiprocessing
 import os
 import sys
 import zlib
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -94,14 +96,13 @@ def measure(seeds: range, methods: list[str], jobs: int = 1) -> dict[str, Any]:
     """
     from benchmark_scores import proportion
 
-    from hybridvo.comparison.executors import open_workers
     from hybridvo.synthetic.scenarios import DEGENERATE_SCENARIOS
 
     rows, wrong = [], []
     total: dict[str, dict[str, dict[str, Any]]] = {}
-    with open_workers(jobs) as workers:
+    with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as executor:
         running = [
-            workers.executor.submit(measure_kind, kind, noise, seeds, methods)
+            executor.submit(measure_kind, kind, noise, seeds, methods)
             for noise in (True, False)
             for kind in (*DEGENERATE_SCENARIOS, *KINDS)
         ]

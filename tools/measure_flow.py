@@ -61,7 +61,7 @@ def real(path: Path) -> Iterator[tuple[Any, Any, np.ndarray]]:
 
 def measure(name: str, pairs: Iterator[tuple[Any, Any, np.ndarray]]) -> list[dict[str, Any]]:
     """One row a variant."""
-    from hybridvo.evaluation.metrics import pair_errors
+    from hybridvo.evaluation.pair_errors import pair_errors
     from hybridvo.flow import dis_flow
     from hybridvo.pipeline import refine
     from hybridvo.refinement.photometric import polish_photometric

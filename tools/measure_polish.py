@@ -179,7 +179,7 @@ def pairs_of(sequence: Any, indices: Any) -> Iterator[tuple[Any, np.ndarray]]:
 
 def measure(name: str, pairs: Iterator[tuple[Any, np.ndarray]]) -> dict[str, Any]:
     """Errors before and after."""
-    from hybridvo.evaluation.metrics import pair_errors
+    from hybridvo.evaluation.pair_errors import pair_errors
     from hybridvo.pipeline import refine
     from hybridvo.refinement.photometric import polish_photometric
 

@@ -88,7 +88,7 @@ def measure_on(
 ) -> list[dict[str, Any]]:
     """Errors of all methods on the same pairs."""
     from hybridvo.data.sequence import iter_pairs
-    from hybridvo.evaluation.metrics import pair_errors
+    from hybridvo.evaluation.pair_errors import pair_errors
     from hybridvo.geometry import invert, rotation_angle
     from hybridvo.pipeline import estimate, warm_up
 

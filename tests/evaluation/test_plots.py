@@ -1,8 +1,5 @@
 from __future__ import annotations
 
-import csv
-import json
-import math
 import os
 import subprocess
 import sys
@@ -11,30 +8,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from hybridvo.errors import InputError, OutputError
 from hybridvo.evaluation.plots import plot_trajectories
-from hybridvo.evaluation.report import (
-    jsonable,
-    table_markdown,
-    table_text,
-    to_json,
-    write_csv,
-    write_json,
-)
 from hybridvo.geometry import se3_exp
 from hybridvo.trajectory import Trajectory
-from hybridvo.types import State
 
 
 def random_trajectory(rng: np.random.Generator, frames: int = 30) -> Trajectory:
     relative = [se3_exp(0.1 * rng.standard_normal(6)) for _ in range(frames - 1)]
     return Trajectory.from_relative(relative, 1e9 + np.arange(frames) / 30)
-
-
-# -- pictures -------------------------------------------------------------------------------------
 
 
 def coloured(path: Path, rgb: tuple[int, int, int]) -> int:
@@ -109,88 +92,3 @@ def test_works_without_a_home_and_without_pyplot(tmp_path):
         capture_output=True,
     )
     assert target.stat().st_size > 1000
-
-
-# -- JSON -----------------------------------------------------------------------------------------
-
-
-def test_json_has_null_for_what_is_no_number_and_sorted_keys():
-    data = {
-        "b": math.nan,
-        "a": np.float64("inf"),
-        "c": np.array([1.0, np.nan]),
-        "d": (1, -math.inf),
-    }
-    assert json.loads(to_json(data)) == {"a": None, "b": None, "c": [1.0, None], "d": [1, None]}
-    assert to_json({"b": 1, "a": 2}) == '{\n  "a": 2,\n  "b": 1\n}\n'
-
-
-@settings(max_examples=200, deadline=None)
-@given(st.floats(allow_nan=False, allow_infinity=False))
-def test_numbers_round_trip(value):
-    assert json.loads(to_json({"v": value, "n": np.float64(value)})) == {"v": value, "n": value}
-
-
-def test_types():
-    data = {
-        "path": Path("a/b"), "state": State.OK, "bool": np.bool_(True), "int": np.int64(3),
-        "single": np.float32(0.1), "set": {"y", "x"}, 5: "key", "none": None, "array": np.eye(2),
-    }  # fmt: skip
-    assert jsonable(data) == {
-        "path": str(Path("a/b")), "state": "ok", "bool": True, "int": 3,
-        "single": float(np.float32(0.1)), "set": ["x", "y"], "5": "key", "none": None,
-        "array": [[1.0, 0.0], [0.0, 1.0]],
-    }  # fmt: skip
-    with pytest.raises(InputError, match="a object cannot be written"):
-        to_json({"x": object()})
-
-
-def test_write_json_is_atomic(tmp_path):
-    path = tmp_path / "r.json"
-    write_json(path, {"a": 1})
-    with pytest.raises(InputError):
-        write_json(path, {"a": object()})
-    assert json.loads(path.read_text()) == {"a": 1}
-    assert os.listdir(tmp_path) == ["r.json"]
-
-
-# -- tables ---------------------------------------------------------------------------------------
-
-ROWS = [
-    {"method": "hybrid", "epe": 0.12345678, "pairs": 10, "note": None},
-    {"method": "a|b", "epe": math.nan, "pairs": 9},
-]
-
-
-def test_csv_round_trips_numbers(tmp_path):
-    rows = [*ROWS, {"method": 'quoted, "x"', "epe": 0.1 + 0.2, "pairs": 0}]
-    write_csv(tmp_path / "r.csv", rows, ["method", "epe", "pairs"])
-    with open(tmp_path / "r.csv", newline="") as file:
-        back = list(csv.DictReader(file))
-    assert [row["method"] for row in back] == ["hybrid", "a|b", 'quoted, "x"']
-    assert float(back[0]["epe"]) == 0.12345678
-    assert back[1]["epe"] == ""
-    assert float(back[2]["epe"]) == 0.1 + 0.2
-    assert b"\r" not in (tmp_path / "r.csv").read_bytes()
-    write_csv(tmp_path / "e.csv", [], ["a", "b"])
-    assert (tmp_path / "e.csv").read_text() == "a,b\n"
-
-
-def test_markdown():
-    text = table_markdown(ROWS, headers={"epe": "EPE [px]"}, formats={"epe": ".2f"})
-    assert text.splitlines() == [
-        "| method | EPE [px] | pairs | note |",
-        "|---|---:|---:|---|",
-        "| hybrid | 0.12 | 10 | - |",
-        "| a\\|b | - | 9 | - |",
-    ]
-
-
-def test_text():
-    assert table_text(ROWS, ["method", "epe", "pairs"]).splitlines() == [
-        "method     epe  pairs",
-        "------  ------  -----",
-        "hybrid  0.1235     10",
-        "a|b          -      9",
-    ]
-    assert table_text([], ["a"]) == "a\n-\n"

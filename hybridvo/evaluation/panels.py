@@ -8,21 +8,17 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 from hybridvo.errors import InputError
 from hybridvo.evaluation.maps import colour_wheel, flow_colours
 
-__all__ = ["FlowPanel", "ImagePanel", "ScalarPanel", "maps_png"]
-
 COLUMNS = 2
-_PANEL_WIDTH = 5.4  # inches
+PANEL_WIDTH_INCHES = 5.4
 
 
 @dataclass(frozen=True, eq=False)
 class ImagePanel:
-    """A picture: (H, W, 3) uint8."""
+    """An image: (H, W, 3) uint8."""
 
     title: str
     image: np.ndarray
@@ -44,10 +40,9 @@ class ScalarPanel:
     Args:
         title: above it.
         values: NaN is grey.
-        unit: beside the bar.
+        unit: beside the bar; panels of one unit share its ends.
         high: value at the upper end of the bar; default: the 99th percentile.
         outline: (H, W) bool, whose border is drawn, or None.
-        logarithmic: whether the bar is.
     """
 
     title: str
@@ -55,7 +50,6 @@ class ScalarPanel:
     unit: str = ""
     high: float | None = None
     outline: np.ndarray | None = None
-    logarithmic: bool = False
 
 
 Panel = ImagePanel | FlowPanel | ScalarPanel
@@ -72,16 +66,21 @@ def maps_png(panels: Sequence[Panel], heading: str, aspect: float) -> bytes:
     Raises:
         InputError: no panel.
     """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
     if not panels:
         raise InputError("maps_png: expected at least one panel, got none.")
     rows = -(-len(panels) // COLUMNS)
-    height = rows * (_PANEL_WIDTH / aspect * 0.92 + 0.42) + 0.45
-    figure = Figure(figsize=(COLUMNS * _PANEL_WIDTH, height), dpi=100, layout="constrained")
+    height = rows * (PANEL_WIDTH_INCHES / aspect * 0.92 + 0.42) + 0.45
+    # the figure's own canvas: nothing is registered with pyplot, so threads do not meet
+    figure = Figure(figsize=(COLUMNS * PANEL_WIDTH_INCHES, height), dpi=100, layout="constrained")
     FigureCanvasAgg(figure)
     grid = figure.add_gridspec(rows, COLUMNS)
+    tops = _shared_tops(panels)
     for k, panel in enumerate(panels):
         axes = figure.add_subplot(grid[k // COLUMNS, k % COLUMNS])
-        axes.set_title(panel.title, fontsize=10, loc="left")
+        axes.set_title(panel.title, fontsize=10, loc="left", parse_math=False)
         axes.set_xticks([])
         axes.set_yticks([])
         if isinstance(panel, ImagePanel):
@@ -90,11 +89,24 @@ def maps_png(panels: Sequence[Panel], heading: str, aspect: float) -> bytes:
             axes.imshow(flow_colours(panel.flow, panel.longest), interpolation="nearest")
             _legend(axes, panel.longest)
         else:
-            _scalar(figure, axes, panel, aspect)
-    figure.suptitle(heading, fontsize=11, x=0.01, ha="left")
+            _scalar(figure, axes, panel, tops[panel.unit], aspect)
+    figure.suptitle(heading, fontsize=11, x=0.01, ha="left", parse_math=False)
     stream = io.BytesIO()
     figure.savefig(stream, format="png", metadata={"Software": None})
     return stream.getvalue()
+
+
+def _shared_tops(panels: Sequence[Panel]) -> dict[str, float]:
+    """Unit -> upper end of the bars: what stands side by side has one scale."""
+    tops: dict[str, float] = {}
+    for panel in panels:
+        if isinstance(panel, ScalarPanel):
+            known = panel.values[np.isfinite(panel.values)]
+            top = panel.high
+            if top is None:
+                top = float(np.percentile(known, 99)) if known.size else 1e-12
+            tops[panel.unit] = max(tops.get(panel.unit, 1e-12), top)
+    return tops
 
 
 def _legend(axes: Any, longest: float) -> None:
@@ -102,31 +114,18 @@ def _legend(axes: Any, longest: float) -> None:
     inset = axes.inset_axes((0.86, 0.62, 0.13, 0.36))
     inset.imshow(colour_wheel())
     inset.set_axis_off()
-    label = f"{longest:.3g} px"
     box = {"facecolor": "white", "alpha": 0.8, "edgecolor": "none", "pad": 1.0}
-    axes.text(
-        0.925, 0.6, label, transform=axes.transAxes, fontsize=8, ha="center", va="top", bbox=box
-    )
+    place = {"transform": axes.transAxes, "ha": "center", "va": "top"}
+    axes.text(0.925, 0.6, f"{longest:.3g} px", fontsize=8, bbox=box, **place)
 
 
-def _scalar(figure: Figure, axes: Any, panel: ScalarPanel, aspect: float) -> None:
+def _scalar(figure: Any, axes: Any, panel: ScalarPanel, top: float, aspect: float) -> None:
     from matplotlib import colormaps
-    from matplotlib.colors import LogNorm, Normalize
 
-    values = np.asarray(panel.values, dtype=float)
-    known = values[np.isfinite(values)]
-    top = panel.high
-    if top is None:
-        top = float(np.percentile(known, 99)) if known.size else 1.0
-    if panel.logarithmic:
-        low = float(np.percentile(known[known > 0], 1)) if (known > 0).any() else 1e-3
-        norm: Normalize = LogNorm(low, max(top, low * 1.001))
-    else:
-        norm = Normalize(0.0, max(top, 1e-12))
     colours = colormaps["magma"].with_extremes(bad="#9a9a9a")
-    # networks see another shape of picture; shown in that of the images
+    # networks see another shape of image; shown in that of the sequence
     shape = {"extent": (0.0, aspect, 1.0, 0.0), "interpolation": "nearest"}
-    drawn = axes.imshow(values, cmap=colours, norm=norm, **shape)
+    drawn = axes.imshow(panel.values, cmap=colours, vmin=0.0, vmax=top, **shape)
     if panel.outline is not None and panel.outline.any() and not panel.outline.all():
         rows, cols = panel.outline.shape
         x, y = (np.arange(cols) + 0.5) * aspect / cols, (np.arange(rows) + 0.5) / rows
