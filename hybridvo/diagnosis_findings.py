@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from hybridvo.depth_steps import is_step
-from hybridvo.refinement.registration import LAGS, LARGEST_PX, OffsetCost
+from hybridvo.refinement.registration import LAGS, OffsetCost
+from hybridvo.refinement.registration import MAX_PX as LARGEST_PX
 from hybridvo.refinement.self_calibration import PARAMETERS
 from hybridvo.types import Camera
 

@@ -1,6 +1,6 @@
-"""Whether depth and picture show the same thing at the same pixel: the offset between the two.
+"""Whether depth and image show the same thing at the same pixel: the offset between the two.
 
-At the edges of near things a depth map that is shifted against its picture gives pixels the depth
+At the edges of near things a depth map that is shifted against its image gives pixels the depth
 of what lies beside them, and under the camera's motion they land in the wrong place. For every
 shift of a small grid the photometric cost of the pixels near depth edges is measured, with the
 motion held; the costs of many pairs add up, and the least one says how the depth map is shifted.
@@ -21,19 +21,19 @@ from hybridvo.refinement.photometric_images import Level, blurred, grey_image, m
 from hybridvo.refinement.photometric_problem import Problem, State
 from hybridvo.types import FramePair, RelativePose
 
-LARGEST_PX = 4
+MAX_PX = 4
 """Largest shift looked at, px."""
 LAGS = np.arange(-8, 9) / 4.0
-"""Delays of the depth map, and of the last row of a picture after the first, looked at, frames."""
-MOST_LAG_PX = 24
+"""Delays of the depth map, and of the last row of an image after the first, looked at, frames."""
+MAX_LAG_PX = 24
 """Longest motion of the depth map under a delay that is looked at, px."""
 EDGE = 0.05
 """Change of log depth within reach that makes an edge."""
-LEAST_STATIC = 0.5
+MIN_STATIC = 0.5
 """Mean weight in the neighbourhood of a pixel that may be used."""
 NEIGHBOURHOOD = 15
 PIXELS = 3000
-LEAST_PIXELS = 100
+MIN_PIXELS = 100
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +42,7 @@ class OffsetCost:
 
     Args:
         cost: (2 n + 1, 2 n + 1) summed robust costs, rows down, columns right, n =
-            :data:`LARGEST_PX`; pixels count at most as much as an outlier.
+            :data:`MAX_PX`; pixels count at most as much as an outlier.
         pixels: how many took part, older pairs counting less. 0: nothing is known.
     """
 
@@ -56,16 +56,16 @@ class OffsetCost:
     @classmethod
     def nothing(cls) -> OffsetCost:
         """Of no pair."""
-        return cls(np.zeros((2 * LARGEST_PX + 1,) * 2), 0)
+        return cls(np.zeros((2 * MAX_PX + 1,) * 2), 0)
 
     @property
     def offset_px(self) -> np.ndarray:
-        """(2,) right, down: where a thing is in the depth map less where it is in the picture."""
+        """(2,) right, down: where a thing is in the depth map less where it is in the image."""
         row, column = np.unravel_index(np.argmin(self.cost), self.cost.shape)
         return np.array(
             [
-                column + _vertex(self.cost[row], int(column)) - LARGEST_PX,
-                row + _vertex(self.cost[:, column], int(row)) - LARGEST_PX,
+                column + _vertex(self.cost[row], int(column)) - MAX_PX,
+                row + _vertex(self.cost[:, column], int(row)) - MAX_PX,
             ]
         )
 
@@ -74,7 +74,7 @@ class OffsetCost:
         """How much the cost per pixel falls from no shift to the best one."""
         if not self.pixels:
             return 0.0
-        return float(self.cost[LARGEST_PX, LARGEST_PX] - self.cost.min()) / self.pixels
+        return float(self.cost[MAX_PX, MAX_PX] - self.cost.min()) / self.pixels
 
 
 def _vertex(values: np.ndarray, k: int) -> float:
@@ -89,15 +89,15 @@ def _vertex(values: np.ndarray, k: int) -> float:
 def depth_offset_cost(
     pair: FramePair, pose: RelativePose, options: PhotometricOptions | None = None
 ) -> OffsetCost:
-    """Cost of shifts of the previous depth map against its picture.
+    """Cost of shifts of the previous depth map against its image.
 
     Args:
         pair: both frames with images, the previous one with depth.
         pose: the motion found, with its weights.
-        options: of the polish: blur, cutoff.
+        options: of the photometric refinement: blur, cutoff.
 
     Raises:
-        InputError: weights of another shape than the picture.
+        InputError: weights of another shape than the image.
     """
     found = _edges(pair, pose, options or PhotometricOptions())
     return OffsetCost.nothing() if found is None else found.offset_cost()
@@ -106,16 +106,16 @@ def depth_offset_cost(
 def depth_costs(
     pair: FramePair, pose: RelativePose, options: PhotometricOptions | None = None
 ) -> tuple[OffsetCost, np.ndarray, float]:
-    """Costs of shifts and of delays of the previous depth map against its picture.
+    """Costs of shifts and of delays of the previous depth map against its image.
 
     A depth map that is late shows things where they were: it is displaced along the flow. Under a
     delay of L frames the depth of a pixel with flow f stands at x - L f in the map. A rolling
-    shutter, of the picture and not of the depth, is a delay that grows from row to row.
+    shutter, of the image and not of the depth, is a delay that grows from row to row.
 
     Args:
         pair: as for :func:`depth_offset_cost`.
         pose: the motion found, with its weights.
-        options: of the polish.
+        options: of the photometric refinement.
 
     Returns:
         The cost of shifts; (2, L) the cost per pixel of each delay of :data:`LAGS`, less that of
@@ -123,7 +123,7 @@ def depth_costs(
         the motion of the pixels that it was looked at on, px (0: nothing is known).
 
     Raises:
-        InputError: weights of another shape than the picture.
+        InputError: weights of another shape than the image.
     """
     found = _edges(pair, pose, options or PhotometricOptions())
     if found is None:
@@ -155,11 +155,11 @@ class _Edges:
 
     def offset_cost(self) -> OffsetCost:
         """See :func:`depth_offset_cost`."""
-        side = 2 * LARGEST_PX + 1
+        side = 2 * MAX_PX + 1
         cost = np.empty((side, side))
         for row in range(side):
             for column in range(side):
-                shift = np.array([row - LARGEST_PX, column - LARGEST_PX], np.int32)
+                shift = np.array([row - MAX_PX, column - MAX_PX], np.int32)
                 cost[row, column] = self.cost(shift)
         good = np.isfinite(cost).all()
         return OffsetCost(cost, self.problem.n) if good else OffsetCost.nothing()
@@ -171,7 +171,7 @@ class _Edges:
         # of the pixels around: at an edge the pixel's own depth may be another thing's
         flow = cv2.blur(np.nan_to_num(flow).astype(np.float32), (NEIGHBOURHOOD,) * 2)
         motion = flow[index[:, 0], index[:, 1], ::-1]
-        longest = MOST_LAG_PX / np.abs(LAGS).max()
+        longest = MAX_LAG_PX / np.abs(LAGS).max()
         motion = motion * np.minimum(1.0, longest / np.maximum(np.abs(motion).max(), 1e-9))
         rows = (index[:, :1] + 0.5) / self.depth.shape[0] - 0.5
         cost = np.array(
@@ -201,7 +201,7 @@ def _edges(pair: FramePair, pose: RelativePose, options: PhotometricOptions) -> 
     level = blurred(match_blur(Level(grey_image(prev.rgb), grey_image(curr.rgb))), 1.0)
     depth = np.ascontiguousarray(prev.depth)
     index = _edge_pixels(level.prev, depth, pose.weights)
-    if len(index) < LEAST_PIXELS:
+    if len(index) < MIN_PIXELS:
         return None
     problem = Problem(pair, pose, index, np.eye(6), options)
     problem.gather(level)
@@ -215,12 +215,12 @@ def _edge_pixels(grey: np.ndarray, depth: np.ndarray, weights: np.ndarray) -> np
     """(N, 2) int32 rows and columns of textured pixels near depth edges of the static world."""
     valid = np.isfinite(depth) & (depth > kernels.MIN_DEPTH) & (depth < kernels.MAX_VALUE)
     log = np.log(np.where(valid, depth, 1.0), dtype=np.float32)
-    reach = np.ones((2 * LARGEST_PX + 1,) * 2, np.uint8)
+    reach = np.ones((2 * MAX_PX + 1,) * 2, np.uint8)
     edges = cv2.dilate(log, reach) - cv2.erode(log, reach) > EDGE
     edges &= cv2.erode(valid.astype(np.uint8), reach) > 0
     static = cv2.blur(np.ascontiguousarray(weights, dtype=np.float32), (NEIGHBOURHOOD,) * 2)
-    usable = edges & (static > LEAST_STATIC)
-    border = LARGEST_PX + kernels.MARGIN
+    usable = edges & (static > MIN_STATIC)
+    border = MAX_PX + kernels.MARGIN
     usable[:border] = usable[-border:] = False
     usable[:, :border] = usable[:, -border:] = False
     rows, columns = np.nonzero(usable)

@@ -1,7 +1,7 @@
 """What one pair says of its own intrinsics: principal point and focal length, motion free.
 
 The motion that fits best hides most of a wrong intrinsic. What it cannot hide is left in the
-residuals of the pictures, with a sign that is the same in every pair: small in one, plain in the
+residuals of the images, with a sign that is the same in every pair: small in one, plain in the
 sum over a sequence.
 """
 
@@ -35,7 +35,7 @@ def calibration_equations(
     Args:
         pair: both frames with images, the previous one with depth.
         pose: the motion found, with its weights.
-        options: of the polish.
+        options: of the photometric refinement.
 
     Returns:
         H (P, P) and g (P,) for :data:`PARAMETERS`; None where the pair says nothing.
@@ -116,7 +116,7 @@ def _changed(camera: Camera, name: str, amount: float) -> Camera:
 def _place(
     problem: Problem, T: np.ndarray, prev: Camera, curr: Camera
 ) -> tuple[np.ndarray, np.ndarray]:
-    """((2, N) px in the current picture, (N,) depth there) of the pixels."""
+    """((2, N) px in the current image, (N,) depth there) of the pixels."""
     v, u = problem.index.T.astype(np.float64)
     z = problem.buffer[kernels.Z].astype(np.float64)
     points = np.stack([(u - prev.cx) / prev.fx * z, (v - prev.cy) / prev.fy * z, z])
