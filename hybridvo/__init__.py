@@ -18,18 +18,20 @@ _HOME = {
     "MotionPrior": "hybridvo.types",
     "Options": "hybridvo.options",
     "PairBatch": "hybridvo.types",
-    "PixelwisePrediction": "hybridvo.types",
     "RelativePose": "hybridvo.types",
     "Status": "hybridvo.types",
     "Step": "hybridvo.types",
-    "HybridVOError": "hybridvo.errors",
     "Odometry": "hybridvo.odometry",
     "Trajectory": "hybridvo.trajectory",
     "estimate": "hybridvo.pipeline",
     "open_sequence": "hybridvo.data.sequence",
     "iter_pairs": "hybridvo.data.sequence",
     "refine": "hybridvo.pipeline",
-    "select": "hybridvo.pose.selection",
+    "select": "hybridvo.network.selection",
+    "dis_flow": "hybridvo.flow",
+    "evaluate": "hybridvo.evaluation.metrics",
+    "to_gtsam_covariance": "hybridvo.geometry",
+    "to_ros_covariance": "hybridvo.geometry",
 }
 
 __all__ = ["__version__", *_HOME]

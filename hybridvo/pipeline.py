@@ -7,11 +7,12 @@ Read this file first. The stages: *predict* (a network), *search* (every strong 
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import functools
 import hashlib
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
@@ -42,7 +43,7 @@ from hybridvo.types import (
 if TYPE_CHECKING:
     import torch
 
-    from hybridvo.pose.batched import BatchedPose
+    from hybridvo.refinement.batch import BatchedPose
 
 DEFAULT_METHOD = "hybrid"
 MAX_METRES = 100.0
@@ -115,6 +116,23 @@ class Models:
 def default_models(device: str = "cpu") -> Models:
     """The pretrained networks, shared by all estimates of a process."""
     return Models(device)
+
+
+@contextlib.contextmanager
+def one_thread() -> Iterator[None]:
+    """Run torch's CPU kernels on one thread, and as before afterwards.
+
+    A pair at 128x256 is too little work for several threads, which wait for each other: on a busy
+    machine that takes ten times as long.
+    """
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def torch_device(device: str) -> str:
@@ -334,7 +352,7 @@ def estimate(
         >>> estimate(FramePair(frame, frame, None)).status.reason.value
         'no_flow'
     """
-    options = options or Options()
+    options = Options() if options is None else options
     _check_kind("options", options, Options)
     if curr is not None or isinstance(pair, Frame):
         pair = _pair_of(pair, curr, options)
@@ -353,7 +371,8 @@ def run_method(pair: FramePair, method: str, ctx: Context) -> RelativePose:
     """:func:`estimate` for arguments that were checked."""
     check_method(method, ctx.models)
     started = time.perf_counter()
-    found = METHODS[method](pair, ctx)
+    with one_thread() if networks_of(method) else contextlib.nullcontext():
+        found = METHODS[method](pair, ctx)
     mode = ctx.options.photometric.mode
     if (mode == "on" and method in (*SELECTING, "refine")) or (
         mode == "auto" and method == "hybrid"
@@ -395,7 +414,7 @@ def _depth_doubt(pair: FramePair) -> str:
     if pair.prev.depth is None:
         return ""
     depth = pair.prev.depth[::8, ::8]
-    depth = depth[np.isfinite(depth) & (depth > 0)]
+    depth = depth[np.isfinite(depth) & (depth > 0)].astype(np.float64)
     if depth.size == 0 or np.median(depth) <= MAX_METRES:
         return ""
     return (
@@ -438,8 +457,8 @@ def refine(
 
     Args:
         pair: a :class:`FramePair` (numpy), or a :class:`PairBatch` (torch) for the batched,
-            differentiable path, see :func:`hybridvo.pose.batched.refine_batch`: that one does not
-            search, and follows the largest motion where nothing is handed in.
+            differentiable path, see :func:`hybridvo.refinement.torch_backend.refine_batch`: that
+            one draws nothing at random, and follows the largest motion where nothing is handed in.
         T_init: (4, 4) T_curr_prev, the only start; None: every strong motion is searched, and
             hand-made cues say which is the camera's.
         weights: (H, W) factors on the information of each pixel; 0 and NaN switch a pixel off.
@@ -453,12 +472,12 @@ def refine(
     Raises:
         InputError: an argument of another kind or shape, or a start that is no rigid transform.
     """
-    options = options or Options()
+    options = Options() if options is None else options
     _check_kind("options", options, Options)
     if isinstance(pair, PairBatch):
-        from hybridvo.pose.batched import refine_batch
+        from hybridvo.refinement.torch_backend import refine_batch
 
-        return refine_batch(pair, T_init=T_init, weights=weights)
+        return refine_batch(pair, T_init, weights, options=options.refine)
     if not isinstance(pair, FramePair):
         raise InputError(f"refine: expected a FramePair or a PairBatch, got {type(pair).__name__}.")
     seed = as_seed(seed, "refine.seed")

@@ -17,8 +17,8 @@ import pytest
 
 import hybridvo
 from hybridvo.cli import build_parser
+from hybridvo.commands.demo import demo
 from hybridvo.data.sequence import open_sequence
-from hybridvo.demo import demo
 from hybridvo.errors import InputError
 from hybridvo.pipeline import METHODS
 from hybridvo.synthetic.scenes import SCENE_KINDS

@@ -133,7 +133,7 @@ def run_batch(
     import torch
     from benchmark_scores import FAILURE_PX, epe
 
-    from hybridvo.pose.batched import refine_batch
+    from hybridvo.refinement.torch_backend import refine_batch
     from hybridvo.synthetic.scenarios import make_pair
     from hybridvo.types import PairBatch
 

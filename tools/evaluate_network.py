@@ -85,11 +85,11 @@ def reliability(network: Any, seed: int, count: int) -> dict[str, Any]:
 
     from hybridvo.learned import next_start
     from hybridvo.network.passes import predict
-    from hybridvo.synthetic.diverse import WideOptions
-    from hybridvo.training.held_out import area_under_curve
+    from hybridvo.synthetic.diverse import DiverseOptions
     from hybridvo.training.stream import collate, sample_generator
+    from hybridvo.training.validation import area_under_curve
 
-    preset = WideOptions()
+    preset = DiverseOptions()
     ratios: dict[str, list[np.ndarray]] = {"rotation": [], "translation": []}
     doubts: dict[str, list[np.ndarray]] = {"rotation": [], "translation": []}
     moving = []
@@ -129,12 +129,12 @@ def one_mover(network: Any, seed: int, count: int) -> dict[str, Any]:
     from hybridvo.geometry import rotation_angle
     from hybridvo.learned import estimate_learned
     from hybridvo.pipeline import refine
-    from hybridvo.synthetic.diverse import WideOptions
+    from hybridvo.synthetic.diverse import DiverseOptions
     from hybridvo.training.stream import sample_generator
     from hybridvo.types import Camera, Frame, FramePair
 
     preset = dataclasses.replace(
-        WideOptions(), large_mover_probability=1.0, large_coverage=COVERAGE, movers=(0, 0),
+        DiverseOptions(), large_mover_probability=1.0, large_coverage=COVERAGE, movers=(0, 0),
         still_probability=0.0,
     )  # fmt: skip
     methods: dict[str, Callable[[FramePair], Any]] = {

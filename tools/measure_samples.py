@@ -40,9 +40,9 @@ def build_parser() -> argparse.ArgumentParser:
 
 def main(argv: list[str] | None = None) -> int:
     args = build_parser().parse_args(argv)
+    from hybridvo.commands.inputs import versions
     from hybridvo.errors import HybridVOError, OutputError
     from hybridvo.evaluation.report import write_json
-    from hybridvo.run import versions
 
     given = sys.argv[1:] if argv is None else argv
     try:

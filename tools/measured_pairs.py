@@ -35,10 +35,10 @@ def write_rows(
     """Read the command line, measure, write the rows with their command; the exit code."""
     given = sys.argv[1:] if argv is None else argv
     args = parser.parse_args(given)
+    from hybridvo.commands.inputs import versions
     from hybridvo.errors import HybridVOError
     from hybridvo.evaluation.report import write_json
     from hybridvo.pipeline import warm_up
-    from hybridvo.run import versions
 
     if args.out.exists() and not args.overwrite:
         print(f"{parser.prog}: {args.out} exists; pass --overwrite.", file=sys.stderr)

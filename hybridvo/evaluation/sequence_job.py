@@ -242,7 +242,7 @@ def _part(
         "left_out": left_out,
         "depth_source": sequence.depth_source,
         "flow_sources": [flow.label for flow in flows.values()],
-        "warnings": [*sequence.notices, *scale_warning(rows)],
+        "warnings": [*sequence.warnings, *scale_warning(rows)],
     }
     known = [] if gt is None else gt.timestamps.tolist()
     stamps = {"estimate": sequence.timestamps[indices].tolist(), "ground_truth": known}

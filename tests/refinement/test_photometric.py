@@ -17,7 +17,6 @@ from hybridvo.refinement import photometric_kernels as kernels
 from hybridvo.refinement.photometric import refine_photometric
 from hybridvo.refinement.photometric_images import Level, blurred, grey_image, match_blur
 from hybridvo.refinement.photometric_problem import Problem, State, small_log
-from hybridvo.refinement.registration import OffsetCost, depth_offset_cost
 from hybridvo.synthetic.render import SyntheticSequence, make_scene
 from hybridvo.types import FramePair, RelativePose
 
@@ -259,29 +258,3 @@ def test_noise_and_holes_leave_finite_motions(noise, light):
     assert np.isfinite(done.T_curr_prev).all()
     assert np.linalg.eigvalsh(done.covariance)[0] > 0
     assert error_px(pair, done.T_curr_prev, T) <= 1.05 * error_px(pair, motion.T_curr_prev, T)
-
-
-def shifted(pair: FramePair, right: int, down: int) -> FramePair:
-    depth = np.full_like(pair.prev.depth, np.nan)
-    height, width = depth.shape
-    depth[max(down, 0) : height + min(down, 0), max(right, 0) : width + min(right, 0)] = (
-        pair.prev.depth[
-            max(-down, 0) : height - max(down, 0), max(-right, 0) : width - max(right, 0)
-        ]
-    )
-    return replace(pair, prev=replace(pair.prev, depth=depth))
-
-
-def test_a_shifted_depth_map_is_told_from_a_registered_one():
-    sums = {0: OffsetCost.nothing(), 3: OffsetCost.nothing()}
-    for seed in (301, 303, 305):
-        pair, _, _ = made_pair("light", seed, height=218, width=512)
-        for right in sums:
-            moved = shifted(pair, right, 0)
-            sums[right] += depth_offset_cost(moved, refine_photometric(moved, refine(moved)))
-    assert sums[0].gain < 0.02
-    assert sums[3].gain > 0.02
-    offset = sums[3].offset_px
-    # occlusion hides a part: measured 0.6 to 1 of the shift
-    assert 1.5 < offset[0] < 4.0
-    assert abs(offset[1]) < 1.0

@@ -1,0 +1,258 @@
+"""Samples of shards as batches of the selector, and fits inside the masks that it draws."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from hybridvo.errors import FormatError
+from hybridvo.geometry import pose_matrix, se3_exp
+from hybridvo.hypotheses import search
+from hybridvo.hypotheses.generate import fit_in_mask
+from hybridvo.hypotheses.selector import mask_weights, nearest_motion
+from hybridvo.network.judge import JudgeInputs, JudgeOutput, expected_information
+from hybridvo.options import RefineOptions
+from hybridvo.refinement import kernels
+from hybridvo.synthetic.sensors import log_uniform
+from hybridvo.training.selector_proposals import read_proposals
+
+
+@dataclass(frozen=True, eq=False)
+class SelectorBatch:
+    """B samples of one grid shape, their motions as N candidates, and ground truth.
+
+    Args:
+        inputs: what the selector sees.
+        samples: (B, 8, n) float32 pixel buffers of the solver.
+        depth_true: (B, h, w) metres, 0 where unknown. label: (B, h, w) of ``rendered``.
+        T: (B, 3, 4) true T_curr_prev.
+        source: (B,) 0 layered, 1 rendered with true (or noisy) flow, 2 rendered with DIS flow.
+        static: (B, h, w) probability to be static world that a pixel-wise network states.
+        proposal: (B, 3, 4) its motion. proposed: (B,) bool, whether it was asked.
+    """
+
+    inputs: JudgeInputs
+    samples: np.ndarray
+    depth_true: torch.Tensor
+    label: torch.Tensor
+    T: torch.Tensor
+    source: np.ndarray
+    static: torch.Tensor
+    proposal: np.ndarray
+    proposed: torch.Tensor
+
+    def __len__(self) -> int:
+        return len(self.T)
+
+    def to(self, device: torch.device) -> SelectorBatch:
+        """The same: the solver that fits inside masks runs on the CPU."""
+        return self
+
+    def shown(self, asked: torch.Tensor) -> SelectorBatch:
+        """The same with the static world of the other network shown for ``asked`` (B,) bool."""
+        asked = asked & self.proposed
+        logit = torch.logit(self.static, eps=1e-4)
+        return replace(self, inputs=replace(self.inputs, static=logit, has_static=asked))
+
+    def expecting(self, rng: np.random.Generator) -> SelectorBatch:
+        """The same with motions expected by histories of all kinds: none, good, wrong, too sure."""
+        count = len(self.T)
+        truth = self.T.numpy().astype(np.float64)
+        last = np.tile(np.eye(4), (count, 1, 1))
+        information = self.inputs.last_information.clone()
+        known = rng.random(count) < 0.6
+        for b in np.flatnonzero(known):
+            length = max(float(np.linalg.norm(truth[b, :, 3])), 1e-3)
+            spread = np.repeat([log_uniform(rng, (0.02, 0.6)) * length, 0.0], 3)
+            spread[3:] = log_uniform(rng, (3e-4, 1e-2))
+            spread *= np.exp(0.5 * rng.standard_normal(6))
+            stated = spread * log_uniform(rng, (0.5, 2.0))
+            if rng.random() < 0.12:  # the camera was pushed: the history knows nothing of it
+                spread = np.array([2 * length] * 3 + [0.04] * 3)
+            last[b] = se3_exp(spread * rng.standard_normal(6)) @ pose_matrix(truth[b])
+            if rng.random() < 0.6:
+                information[b] = torch.diag(torch.as_tensor(1.0 / stated**2).float())
+        inputs = replace(
+            self.inputs,
+            T_last=torch.as_tensor(last[:, :3], dtype=torch.float32),
+            last_information=information,
+            has_last=torch.as_tensor(known),
+        )
+        return replace(self, inputs=inputs)
+
+
+def _collate(p: dict[str, np.ndarray]) -> SelectorBatch:
+    """Stacked arrays of samples -> batch."""
+    size, _, h, w = p["exact"].shape
+    coarse = p["coarse"].astype(np.float32)
+    samples = np.empty((size, kernels.BUFFER_ROWS, h * w), np.float32)
+    order = [kernels.XN, kernels.YN, kernels.Z, kernels.MU, kernels.MV]
+    samples[:, order] = p["exact"].reshape(size, 5, -1)
+    samples[:, [kernels.PF, kernels.PD, kernels.W]] = coarse.reshape(size, 3, -1)
+    owner = np.repeat(np.arange(size), p["count"])
+    picks = [(b, k) for b in range(size) for k in range(p["count"][b])]
+    pose = np.stack([p["poses"][i] for i in picks])
+    facts = np.stack([p["facts"][i] for i in picks])
+
+    def tensor(x: Any, kind: torch.dtype = torch.float32) -> torch.Tensor:
+        return torch.as_tensor(np.ascontiguousarray(x)).to(kind)
+
+    exact = tensor(p["exact"])
+    usable = tensor(coarse[:, 2] > 0, torch.bool)
+    inputs = JudgeInputs(
+        ray=exact[:, 0:2],
+        depth=exact[:, 2],
+        target=exact[:, 3:5],
+        flow_variance=1.0 / tensor(coarse[:, 0]).clamp(min=1e-6),
+        depth_variance=tensor(coarse[:, 1]),
+        usable=usable,
+        log_depth_curr=tensor(p["log_depth"]),
+        static=torch.zeros(size, h, w),
+        has_static=torch.zeros(size, dtype=torch.bool),
+        K=tensor(p["K"]),
+        image_width=tensor(p["width"]),
+        T_last=tensor(p["T_last"]),
+        last_information=expected_information(exact[:, 2], usable, None),
+        has_last=tensor(p["has_last"], torch.bool),
+        owner=tensor(owner, torch.int64),
+        parent=torch.arange(len(owner)),
+        pose=tensor(pose),
+        flow_noise=tensor(facts[:, search.FLOW_NOISE]),
+        depth_noise=tensor(facts[:, search.DEPTH_NOISE]),
+    )
+    return SelectorBatch(
+        inputs,
+        samples,
+        tensor(p["depth_true"]),
+        tensor(p["label"], torch.int64),
+        tensor(p["T"]),
+        np.asarray(p["source"]),
+        tensor(p["static"]),
+        p["proposal"].astype(np.float64),
+        tensor(p["proposed"], torch.bool),
+    )
+
+
+def _read_shard(path: Path) -> dict[str, np.ndarray]:
+    """Arrays of a shard.
+
+    Raises:
+        FormatError: a file that is none.
+    """
+    try:
+        with np.load(path) as file:
+            arrays = dict(file)
+    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
+        raise FormatError(f"{path}: not a shard of samples ({error}).") from None
+    for name in ("count", "label"):
+        if name not in arrays:
+            raise FormatError(f"{path}: not a shard of samples (no array '{name}').")
+    return arrays | read_proposals(path, arrays["label"].shape)
+
+
+def read_batches(
+    files: list[Path], batch_size: int, rng: np.random.Generator | None
+) -> Iterator[SelectorBatch]:
+    """Batches of the samples of some shards, mixed if ``rng`` is given."""
+    by_shape: dict[str, list[Path]] = {}
+    for file in files:
+        by_shape.setdefault(file.stem.split("_")[-1], []).append(file)
+    jobs = []
+    samples: dict[str, dict[str, np.ndarray]] = {}
+    for shape, members in by_shape.items():
+        loaded = [_read_shard(member) for member in members]
+        samples[shape] = {key: np.concatenate([x[key] for x in loaded]) for key in loaded[0]}
+        order = np.arange(len(samples[shape]["count"]))
+        if rng is not None:
+            rng.shuffle(order)
+        jobs += [(shape, order[k : k + batch_size]) for k in range(0, len(order), batch_size)]
+    if rng is not None:
+        rng.shuffle(jobs)
+    for shape, index in jobs:
+        yield _collate({key: value[index] for key, value in samples[shape].items()})
+
+
+def ego_flow_error(pose: torch.Tensor, owner: torch.Tensor, batch: SelectorBatch) -> torch.Tensor:
+    """(N,) mean distance of the ego flows of pose and truth, px at a width of 1024."""
+    pick = (slice(None), slice(None, None, 2), slice(None, None, 2))
+    z = batch.depth_true[pick]
+    ray = batch.inputs.ray[:, :, ::2, ::2]
+    K = batch.inputs.K
+
+    def project(P: torch.Tensor, of: torch.Tensor) -> torch.Tensor:
+        P = P[:, :, :, None, None]
+        x, y, depth = ray[of, 0], ray[of, 1], z[of]
+        X, Y, Z = (
+            depth * (P[:, i, 0] * x + P[:, i, 1] * y + P[:, i, 2]) + P[:, i, 3] for i in range(3)
+        )
+        Z = Z.clamp(min=1e-3)
+        fx, fy = K[of, 0, None, None], K[of, 1, None, None]
+        return torch.stack([fx * X / Z, fy * Y / Z], 1)
+
+    truth = project(batch.T, torch.arange(len(batch.T)))
+    distance = (project(pose, owner) - truth[owner]).norm(dim=1)
+    known = (z > 0)[owner]
+    total = torch.where(known, distance.clamp(max=1e3), 0.0).sum((1, 2))
+    error = total / known.sum((1, 2)).clamp(min=1)
+    return error * 1024.0 / batch.inputs.image_width[owner]
+
+
+def refits_of(
+    batch: SelectorBatch, out: JudgeOutput, count: int, extra: torch.Generator | None = None
+) -> JudgeInputs | None:
+    """The best motions of every sample, fitted inside their masks, as candidates of their own.
+
+    Args:
+        batch: samples.
+        out: answers about their motions.
+        count: fits of a sample.
+        extra: draws one of them anew at times (training), so that more than the best is seen.
+
+    Where the selector is shown another network's static world, that network's motion takes part.
+    """
+    inputs = batch.inputs
+    cutoff = RefineOptions().cutoff
+    probability = torch.sigmoid(out.mask).numpy()
+    poses, found, parents = [], [], []
+    for b in range(len(batch.T)):
+        mine = torch.nonzero(inputs.owner == b)[:, 0]
+        order = mine[out.score[mine].argsort(descending=True)].tolist()
+        if extra is not None and len(order) > count and torch.rand((), generator=extra) < 0.3:
+            swap = int(torch.randint(count, len(order), (), generator=extra))
+            order[count - 1], order[swap] = order[swap], order[count - 1]
+        entries = [
+            (inputs.pose[k].numpy().astype(np.float64), mask_weights(probability[k]), k)
+            for k in order[:count]
+        ]
+        if inputs.has_static[b]:
+            weights = mask_weights(batch.static[b].numpy())
+            z = inputs.depth[b][inputs.usable[b]]
+            start = batch.proposal[b]
+            near = nearest_motion(inputs.pose[mine].numpy(), start, 1.0 / float(z.median()))
+            entries.append((start, weights, int(mine[near])))
+        for start, weights, k in entries:
+            if weights.max() <= 0:
+                continue
+            pose, fact = fit_in_mask(batch.samples[b], weights, inputs.K[b].numpy(), start, cutoff)
+            if np.isfinite(pose).all():
+                poses.append(pose)
+                found.append(fact)
+                parents.append(k)
+    if not poses:
+        return None
+    facts = torch.as_tensor(np.stack(found), dtype=torch.float32)
+    parent = torch.tensor(parents)
+    return replace(
+        inputs,
+        owner=inputs.owner[parent],
+        parent=parent,
+        pose=torch.as_tensor(np.stack(poses), dtype=torch.float32),
+        flow_noise=facts[:, search.FLOW_NOISE],
+        depth_noise=facts[:, search.DEPTH_NOISE],
+    )
