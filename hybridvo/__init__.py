@@ -29,7 +29,7 @@ _HOME = {
     "open_sequence": "hybridvo.data.sequence",
     "iter_pairs": "hybridvo.data.sequence",
     "refine": "hybridvo.pipeline",
-    "select": "hybridvo.pose.selection",
+    "select": "hybridvo.network.selection",
 }
 
 __all__ = ["__version__", *_HOME]

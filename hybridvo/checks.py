@@ -17,17 +17,11 @@ __all__ = [
     "as_rigid",
     "as_seed",
     "make_folder",
-    "stamp_unit",
     "to_numpy",
 ]
 
 LARGEST_SEED = 2**31 - 1
 """Every generator that is seeded takes as much."""
-
-NANOSECONDS_ABOVE = 1e14
-"""Stamps above this value cannot be seconds (three million years) and are taken as nanoseconds."""
-EPOCH_S = (1e9, 4.2e9)
-"""Seconds since 1970 from 2001 to 2103: where the stamps of today's clocks lie."""
 
 
 def to_numpy(value: Any, name: str) -> np.ndarray:
@@ -122,24 +116,3 @@ def make_folder(path: Path) -> None:
             elif os.path.exists(part) and not os.path.isdir(part):
                 why = f"{part} is a file, expected a folder or a new name"
         raise OutputError(f"{path}: cannot be created: {why}.") from error
-
-
-def stamp_unit(stamps: np.ndarray) -> tuple[float, str]:
-    """How many of the unit of some stamps make a second, and its name.
-
-    Milliseconds and microseconds are told by two things together: every stamp is one of today's
-    clocks (2001 to 2103), and neighbours are typically less than a second apart, which in the finer
-    units of a clock that counts from another moment (nanoseconds since the machine was started)
-    would be more than 1000 pictures a second. Else stamps above 1e14 are nanoseconds.
-
-    Args:
-        stamps: (N,) numbers in the order of the frames; those that are not finite say nothing.
-    """
-    known = np.abs(stamps[np.isfinite(stamps)])
-    with np.errstate(over="ignore"):  # between numbers that are no times anyway
-        step = np.median(np.abs(np.diff(known))) if len(known) > 1 else np.inf
-    for factor, name in ((1e3, "milliseconds"), (1e6, "microseconds")):
-        first, last = factor * EPOCH_S[0], factor * EPOCH_S[1]
-        if step < factor and first <= known.min() and known.max() <= last:
-            return factor, name
-    return (1e9, "nanoseconds") if (known > NANOSECONDS_ABOVE).any() else (1.0, "seconds")

@@ -12,9 +12,9 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from hybridvo.data.plain_yaml import plain_yaml
 from hybridvo.data.presets import build_options, read_yaml
 from hybridvo.errors import FormatError, InputError
+from hybridvo.files import parse_yaml
 from hybridvo.flow import DIS_PRESETS
 from hybridvo.options import Options, PhotometricOptions, RefineOptions, TrackOptions
 from hybridvo.pipeline import DEFAULT_METHOD
@@ -151,7 +151,7 @@ def load_options(
         if not sign or not all(parts):
             raise InputError(f"--set: expected key=value, as in refinement.cutoff=3, got {text!r}.")
         try:
-            parsed = plain_yaml(value, key)
+            parsed = parse_yaml(value, key)
         except FormatError:
             message = f"--set {key[:80]}: {value[:80]!r} is no value that YAML can read."
             raise InputError(message) from None

@@ -1,4 +1,4 @@
-"""Writing result files: completely or not at all, and always in the same form."""
+"""Files: results written completely or not at all, YAML read, input told from other input."""
 
 from __future__ import annotations
 
@@ -7,14 +7,15 @@ import csv
 import hashlib
 import json
 import os
+import re
 import secrets
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any, Literal
 
-from hybridvo.errors import OutputError
+import yaml
 
-__all__ = ["atomic_write", "sha256", "write_csv", "write_json"]
+from hybridvo.errors import FormatError, OutputError
 
 
 @contextlib.contextmanager
@@ -78,3 +79,46 @@ def sha256(*paths: str | os.PathLike[str]) -> str:
     for path in paths:
         digest.update(Path(path).read_bytes())
     return digest.hexdigest()
+
+
+def fingerprint(paths: Iterable[str | os.PathLike[str]]) -> str:
+    """Hash of the names, sizes and times of files: tells whether input has changed since.
+
+    Returns:
+        Hexadecimal SHA-256; a file that cannot be looked at counts by its name alone.
+    """
+    digest = hashlib.sha256()
+    for path in map(Path, paths):
+        size, time = -1, -1
+        with contextlib.suppress(OSError):
+            status = path.stat()
+            size, time = status.st_size, status.st_mtime_ns
+        digest.update(f"{path.name}\0{size}\0{time}\0".encode(errors="surrogateescape"))
+    return digest.hexdigest()
+
+
+class _Loader(yaml.SafeLoader):
+    """YAML 1.1 reads 1e-3 as a word; everybody who writes it means the number."""
+
+
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)[eE][-+]?[0-9]+$"),
+    list("-+.0123456789"),
+)
+
+
+def parse_yaml(text: str, where: str) -> Any:
+    """Content of a YAML document by the safe loader.
+
+    Raises:
+        FormatError: not YAML; names ``where`` and the line.
+    """
+    try:
+        return yaml.load(text, Loader=_Loader)  # noqa: S506  (a SafeLoader)
+    # ValueError: dates and numbers that are none; RecursionError: thousands of brackets
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        mark = getattr(error, "problem_mark", None)
+        line = f":{mark.line + 1}" if mark is not None else ""
+        reason = getattr(error, "problem", None) or str(error)[:200] or type(error).__name__
+        raise FormatError(f"{where}{line}: not a YAML file ({reason}).") from None

@@ -1,7 +1,7 @@
 """Camera geometry and rotations: each fact once.
 
 Numpy functions work on single images in float64; the differentiable torch twins of the projection
-live in :mod:`hybridvo.pose.residuals`, on kornia and pypose.
+live in :mod:`hybridvo.refinement.torch_factors`, on kornia and pypose.
 """
 
 from __future__ import annotations

@@ -96,7 +96,7 @@ def next_start(network: torch.nn.Module, selection: str = "softmax") -> Chooser:
         network: of ``build_network`` or ``load_weights``.
         selection: how one pose is selected from the pixels.
     """
-    from hybridvo.pose.selection import chosen_motion
+    from hybridvo.network.selection import chosen_motion
 
     options = getattr(network, "options", None)
     if options is not None and options.pass_start == "fit":
@@ -110,7 +110,7 @@ def fitted_motion(
     """(B, 4, 4) motion that the pixels agree on which a prediction trusts.
 
     The selected pose is the start, the log scales of the rotation are the weights, and carry the
-    gradient; see :func:`hybridvo.pose.weighted_fit.weighted_fit`.
+    gradient; see :func:`hybridvo.network.weighted_fit.weighted_fit`.
 
     Args:
         output: a :class:`~hybridvo.types.PixelwisePrediction` with log scales.
@@ -119,8 +119,8 @@ def fitted_motion(
     """
     import torch.nn.functional as F
 
-    from hybridvo.pose.selection import chosen_motion
-    from hybridvo.pose.weighted_fit import pixel_weights, weighted_fit
+    from hybridvo.network.selection import chosen_motion
+    from hybridvo.network.weighted_fit import pixel_weights, weighted_fit
     from hybridvo.types import PixelwisePrediction
 
     if not isinstance(output, PixelwisePrediction) or output.log_scale_rotation is None:
@@ -160,7 +160,7 @@ def static_probability(log_scale: torch.Tensor, valid: torch.Tensor) -> torch.Te
         (B, h, w). What counts is how far s lies above that of the pixels with weight in the fit;
         the map from there is logistic, see :data:`STATIC_AT`.
     """
-    from hybridvo.pose.weighted_fit import pixel_weights
+    from hybridvo.network.weighted_fit import pixel_weights
 
     s = log_scale.mean(dim=1)
     trusted = (pixel_weights(log_scale, valid) * s).flatten(1).sum(dim=1)[:, None, None]
@@ -218,7 +218,7 @@ def estimate_learned(
 
     from hybridvo.network.inputs import assemble_inputs
     from hybridvo.network.passes import predict
-    from hybridvo.pose.selection import chosen_motion, chosen_pose, select
+    from hybridvo.network.selection import chosen_motion, chosen_pose, select
     from hybridvo.types import PixelwisePrediction
 
     started = time.perf_counter()

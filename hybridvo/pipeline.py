@@ -42,7 +42,7 @@ from hybridvo.types import (
 if TYPE_CHECKING:
     import torch
 
-    from hybridvo.pose.batched import BatchedPose
+    from hybridvo.refinement.batch import BatchedPose
 
 DEFAULT_METHOD = "hybrid"
 MAX_METRES = 100.0
@@ -437,8 +437,8 @@ def refine(
 
     Args:
         pair: a :class:`FramePair` (numpy), or a :class:`PairBatch` (torch) for the batched,
-            differentiable path, see :func:`hybridvo.pose.batched.refine_batch`: that one does not
-            search, and follows the largest motion where nothing is handed in.
+            differentiable path, see :func:`hybridvo.refinement.torch_backend.refine_batch`: that
+            one draws nothing at random, and follows the largest motion where nothing is handed in.
         T_init: (4, 4) T_curr_prev, the only start; None: every strong motion is searched, and
             hand-made cues say which is the camera's.
         weights: (H, W) factors on the information of each pixel; 0 and NaN switch a pixel off.
@@ -455,9 +455,9 @@ def refine(
     options = options or Options()
     _check_kind("options", options, Options)
     if isinstance(pair, PairBatch):
-        from hybridvo.pose.batched import refine_batch
+        from hybridvo.refinement.torch_backend import refine_batch
 
-        return refine_batch(pair, T_init=T_init, weights=weights)
+        return refine_batch(pair, T_init, weights, options=options.refine)
     if not isinstance(pair, FramePair):
         raise InputError(f"refine: expected a FramePair or a PairBatch, got {type(pair).__name__}.")
     seed = as_seed(seed, "refine.seed")

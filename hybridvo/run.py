@@ -23,12 +23,12 @@ import numpy as np
 import hybridvo
 from hybridvo.configuration import RunOptions, option_tree
 from hybridvo.console import Progress, interruptible
-from hybridvo.data.fingerprint import input_hash, input_times
 from hybridvo.data.sequence import Sequence, open_sequence
 from hybridvo.depth_steps import depth_ratio
 from hybridvo.errors import InputError
-from hybridvo.evaluation.metrics import pair_errors
+from hybridvo.evaluation.pair_errors import pair_errors
 from hybridvo.evaluation.report import write_json
+from hybridvo.files import fingerprint
 from hybridvo.flow import FlowField, FlowProvider, dis_flow, fallback, file_flow
 from hybridvo.geometry import invert
 from hybridvo.odometry import Odometry
@@ -130,8 +130,7 @@ def run(
     out = Path("runs") / run_name(sequence) if out is None else Path(out)
     check_outside(out, sequence)
     identity = {
-        "input_hash": input_hash(sequence),
-        "input_times": input_times(sequence),
+        "input_hash": fingerprint(sequence.files()),
         "options": _deciding(options),
         "weights": weights_hash(options.method),
         "hybridvo": hybridvo.__version__,
@@ -148,7 +147,7 @@ def run(
             "path": os.fspath(path),
             "frames": len(frames),
             "depth_source": sequence.depth_source,
-            "notices": list(sequence.notices),
+            "notices": list(sequence.warnings),
         },
     }
     with RunFolder(out, identity, header, mode, (*RESULTS, RECORDING)) as folder:
@@ -194,7 +193,7 @@ def _run(
 ) -> RunResult:
     label = f"{sequence.name} [{options.method}]"
     with interruptible() as interruption, Progress(len(frames), label, quiet=quiet) as progress:
-        for notice in sequence.notices:
+        for notice in sequence.warnings:
             progress.say(f"note: {notice}")
         vo = Odometry(
             flow=provider,

@@ -11,7 +11,8 @@ import numpy as np
 
 from hybridvo.data.sequence import Sequence
 from hybridvo.depth_steps import depth_step_warning
-from hybridvo.evaluation.metrics import evaluate_trajectories, mean_pair_errors
+from hybridvo.evaluation.metrics import evaluate
+from hybridvo.evaluation.pair_errors import mean_pair_errors
 from hybridvo.evaluation.report import write_csv
 from hybridvo.files import atomic_write
 from hybridvo.geometry import pose_matrix, se3_log
@@ -111,7 +112,7 @@ def score(
     summary: Mapping[str, Any],
 ) -> dict[str, Any]:
     """Content of ``metrics.json``; no times, so that equal runs give equal bytes."""
-    report = evaluate_trajectories(trajectory, truth, alignment=alignment)  # type: ignore[arg-type]
+    report = evaluate(trajectory, truth, alignment=alignment)  # type: ignore[arg-type]
     per_pair = mean_pair_errors(row["errors"] for row in rows if row["errors"] is not None)
     reasons = report.pop("reasons") | per_pair.pop("reasons")
     named = ("method", "failed", "degraded", "flow_source", "depth_source", "oracle", "sequence")

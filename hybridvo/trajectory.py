@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 from hybridvo.errors import FormatError, InputError
 from hybridvo.files import atomic_write
 from hybridvo.geometry import invert, ned_to_camera, xyzw_to_wxyz
+from hybridvo.units import MAX_SECONDS, stamp_unit
 
 Format = Literal["auto", "tum", "kitti", "tartanair"]
 Axes = Literal["auto", "camera", "ned"]
@@ -35,32 +36,7 @@ _FILE_ROTATION_TOLERANCE = 1e-2
 _QUATERNION_NORM_TOLERANCE = 0.1
 _ROTATION_TOLERANCE = 1e-6
 
-NANOSECONDS_ABOVE = 1e14
-"""Stamps above this cannot be seconds (three million years) and are taken as nanoseconds."""
-EPOCH_S = (1e9, 4.2e9)
-"""Seconds since 1970 from 2001 to 2103: where the stamps of today's clocks lie."""
-
 _logger = logging.getLogger(__name__)
-
-
-def stamp_unit(stamps: np.ndarray) -> tuple[float, str]:
-    """How many of the unit of some stamps make a second, and the unit's name.
-
-    Milliseconds and microseconds need two signs: every stamp is one of today's clocks (2001 to
-    2103), and neighbours are typically less than a second apart. Else stamps above 1e14 are
-    nanoseconds.
-
-    Args:
-        stamps: (N,) numbers in the order of the frames; those that are not finite are ignored.
-    """
-    known = np.abs(stamps[np.isfinite(stamps)])
-    with np.errstate(over="ignore"):
-        step = np.median(np.abs(np.diff(known))) if len(known) > 1 else np.inf
-    for factor, name in ((1e3, "milliseconds"), (1e6, "microseconds")):
-        first, last = factor * EPOCH_S[0], factor * EPOCH_S[1]
-        if step < factor and first <= known.min() and known.max() <= last:
-            return factor, name
-    return (1e9, "nanoseconds") if (known > NANOSECONDS_ABOVE).any() else (1.0, "seconds")
 
 
 def _orthonormality_error(R: np.ndarray) -> np.ndarray:
@@ -353,7 +329,7 @@ def _quaternions_to_matrices(path: Path, xyzw: np.ndarray, lines: list[int]) -> 
 def _to_seconds(path: Path, stamps: np.ndarray, lines: list[int]) -> tuple[np.ndarray, list[str]]:
     """Stamps in seconds, strictly increasing, and what was changed."""
     warnings = []
-    far = np.abs(stamps) > NANOSECONDS_ABOVE
+    far = np.abs(stamps) > MAX_SECONDS
     if far.any() and not far.all():
         line = lines[int(np.argmax(far != far[0]))]
         raise FormatError(f"{path}:{line}: timestamps mix seconds and nanoseconds.")
@@ -390,9 +366,9 @@ def read_trajectory(
             y right, z down; converted to camera axes). ``auto`` is NED for TartanAir's format.
 
     Returns:
-        The trajectory in camera axes. Stamps in other units than seconds (:func:`stamp_unit`) are
-        converted, which ``warnings`` and the log say. KITTI and TartanAir files get frame numbers
-        as stamps.
+        The trajectory in camera axes. Stamps in other units than seconds are converted
+        (:mod:`hybridvo.units`), which ``warnings`` and the log say. KITTI and TartanAir files get
+        frame numbers as stamps.
 
     Raises:
         InputError: no such file, an unknown option.

@@ -17,7 +17,8 @@ import pytest
 import torch
 
 import hybridvo
-from hybridvo.data.resize import resize_camera, resize_flow, resize_pair
+from hybridvo import torch_geometry
+from hybridvo.data.resize import resize_camera, resize_pair
 from hybridvo.data.sequence import iter_pairs, open_sequence
 from hybridvo.geometry import (
     backproject,
@@ -37,7 +38,6 @@ from hybridvo.geometry import (
     xyzw_to_wxyz,
 )
 from hybridvo.network.inputs import assemble_inputs
-from hybridvo.pose import residuals
 from hybridvo.refinement import solver
 from hybridvo.trajectory import Trajectory, read_trajectory, write_tum
 from hybridvo.types import Camera, Frame, FramePair, PairBatch, RelativePose, Step
@@ -149,7 +149,8 @@ def test_resizing_scales_flow_and_cameras_together():
     )
     np.testing.assert_allclose(expected[7, 9], [2.5, 0], atol=1e-12)
     np.testing.assert_allclose(small.flow, expected, atol=1e-6)  # float32
-    np.testing.assert_allclose(resize_flow(flow, 160, 50)[0][0, 0], [2.5, 0])
+    tall = resize_pair(FramePair(frame, frame, flow), 160, 50)
+    np.testing.assert_allclose(tall.flow[0, 0], [2.5, 0])
 
 
 def test_network_inputs_scale_intrinsics_the_same_way():
@@ -420,7 +421,8 @@ def update(twin: str, delta: np.ndarray, T: np.ndarray) -> np.ndarray:
         out = np.eye(4)
         solver.left_update(delta, np.ascontiguousarray(T[:3]), out[:3])
         return out
-    return residuals.left_update(torch.tensor(delta)[None], torch.tensor(T)[None])[0].numpy()
+    pose = torch_geometry.se3(torch.tensor(T)[None])
+    return torch_geometry.left_update(torch.tensor(delta)[None], pose)[0].matrix().numpy()
 
 
 def test_se3_exp_is_pyposes():

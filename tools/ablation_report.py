@@ -75,10 +75,10 @@ CLAIM = ("pwvo", "naive", "vonet")
 
 def published() -> dict[str, dict[str, float]]:
     """Row -> the paper's EPE (px at 128x256), R_err (degrees) and T_err (m), on MPI Sintel."""
-    from hybridvo.evaluation.protocols import PROTOCOLS
+    from hybridvo.evaluation.protocols import protocols
 
-    lines = {line.name: dict(line.values) for line in PROTOCOLS["paper"].published}
-    figures = {row: lines[name] for row, name in IN_PROTOCOL.items()}
+    lines = {line["name"]: line for line in protocols()["paper"].published}
+    figures = {row: {key: lines[name][key] for key in METRICS} for row, name in IN_PROTOCOL.items()}
     return figures | {
         row: dict(zip(METRICS, values, strict=True)) for row, values in WITHOUT_FLOW.items()
     }

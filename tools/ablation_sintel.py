@@ -18,13 +18,13 @@ def open_sintel(folder: Path) -> list[Path]:
     Raises:
         InputError: none is there, or one that is not of the training set.
     """
-    from hybridvo.comparison.plan import expand
     from hybridvo.data.sequence import open_sequence
     from hybridvo.evaluation.protocols import check_protocol
+    from hybridvo.evaluation.sources import expand
 
     paths = expand(folder, "sintel")
     opened = [open_sequence(path, "sintel") for path in paths]
-    check_protocol("paper", [(sequence.name, sequence.kind) for sequence in opened])
+    check_protocol("paper", opened)
     return paths
 
 
@@ -45,8 +45,8 @@ def score_sintel(
         of the 992 pairs of the paper.
     """
     from hybridvo.data.sequence import iter_pairs, open_sequence
-    from hybridvo.evaluation.pairs import mean_pair_errors
-    from hybridvo.evaluation.protocols import PROTOCOLS, same_intrinsics
+    from hybridvo.evaluation.pair_errors import mean_pair_errors
+    from hybridvo.evaluation.protocols import protocols, same_intrinsics
 
     names = [f"{run['row']}-seed{run['seed']}" for run in runs]
     networks = {name: _network(out / name, device) for name in names}
@@ -66,7 +66,7 @@ def score_sintel(
                 waiting = []
         if waiting:
             _score(networks, waiting, sequence, errors)
-    protocol = PROTOCOLS["paper"]
+    protocol = protocols()["paper"]
     pairs = len(next(iter(errors.values())))
     missing = len(set(protocol.sequences) - set(found))
     note = ""
@@ -100,12 +100,12 @@ def _score(
 ) -> None:
     import torch
 
-    from hybridvo.comparison.job import true_motion
-    from hybridvo.evaluation.pairs import pair_errors
+    from hybridvo.evaluation.pair_errors import pair_errors
+    from hybridvo.evaluation.sequence_job import true_motion
     from hybridvo.learned import next_start
     from hybridvo.network.inputs import assemble_inputs
     from hybridvo.network.passes import predict
-    from hybridvo.pose.selection import chosen_motion
+    from hybridvo.network.selection import chosen_motion
 
     inputs = assemble_inputs(pairs)
     truth = [true_motion(sequence, pair.prev.index, pair.curr.index) for pair in pairs]

@@ -1,28 +1,25 @@
-"""Methods beside each other on sequences: same pairs, same flow, same clock, scored against truth.
+"""Methods beside each other on sequences: same frames, same flow, same clock, scored against truth.
 
     python tools/compare_methods.py --sequence DIR [--sequence DIR ...] --out runs/comparison
     python tools/compare_methods.py --sequence MPI-Sintel --protocol paper --out runs/sintel
 
-Every method sees the same pairs, with the flow of the files and OpenCV's DIS flow side by side.
-What is timed is the estimate from a ``FramePair`` on; the time of the flow stands beside it. Writes
-``results.json``, ``results.csv``, ``pairs.csv``, ``report.md`` and ``report.html``, and beside them
-``trajectories/`` (TUM files), ``worst/`` (pictures of the worst pairs) and ``figures/`` (maps of
-some of them). The work is kept as it is done: after an interruption ``--resume`` goes on.
+Every method gives what ``hybridvo run --method NAME`` gives. Writes ``results.json``,
+``results.csv``, ``pairs.csv``, ``report.md`` and ``report.html``, and beside them ``trajectories/``
+(TUM files) and ``worst/`` (images of the worst pairs). Finished sequences are kept: after an
+interruption ``--resume`` goes on.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import sys
-from pathlib import Path
 
 
 def build_parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="compare_methods.py", description=(__doc__ or "").splitlines()[0]
-    )
-    parser.add_argument(
+    text = (__doc__ or "").splitlines()[0]
+    parser = argparse.ArgumentParser(prog="compare_methods.py", description=text)
+    add = parser.add_argument
+    add(
         "--sequence",
         action="extend",
         nargs="+",
@@ -30,144 +27,69 @@ def build_parser() -> argparse.ArgumentParser:
         metavar="DIR",
         help="sequence, or a folder of sequences (MPI Sintel as it was unpacked); repeatable",
     )
-    parser.add_argument("--out", required=True, metavar="DIR")
-    parser.add_argument("--methods", default="all", help="comma-separated; default: all that run")
-    parser.add_argument(
-        "--flow",
-        choices=("auto", "file", "dis"),
-        default="auto",
-        help="auto: the sequence's flow files and DIS, side by side",
-    )
-    parser.add_argument("--dataset", help="kind of the sequences (default: detected)")
-    parser.add_argument("--start", type=int, default=0)
-    parser.add_argument("--stop", type=int)
-    parser.add_argument("--stride", type=int, default=1)
-    parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument(
-        "--protocol",
-        choices=("paper", "all", "trajectory14"),
-        help="MPI Sintel as others score it: PWVO's 992 pairs, all 1041, or fourteen trajectories",
-    )
-    parser.add_argument("--worst", type=int, default=3, help="worst pairs shown for each method")
-    parser.add_argument(
-        "--maps",
-        type=int,
-        default=1,
-        metavar="N",
-        help="worst pairs of the first method whose maps the report shows; a few seconds each",
-    )
-    parser.add_argument(
-        "--jobs", type=int, default=1, metavar="N", help="sequences at a time, a process each"
-    )
-    parser.add_argument(
-        "--scheduler",
-        metavar="ADDRESS",
-        help="of a Dask cluster (tcp://host:8786) that works instead; extra 'cluster'",
-    )
+    add("--out", required=True, metavar="DIR")
+    add("--methods", default="all", help="comma-separated; default: all that run here")
+    flow = "auto: the sequence's flow files and DIS, side by side"
+    add("--flow", choices=("auto", "file", "dis"), default="auto", help=flow)
+    add("--dataset", help="kind of the sequences (default: detected)")
+    add("--start", type=int, default=0)
+    add("--stop", type=int)
+    add("--stride", type=int, default=1)
+    add("--seed", type=int, default=0)
+    add("--device", choices=("auto", "cpu", "cuda"), default="auto")
+    own = "file of a network (judge, pwvo, ...) instead of the pretrained one; repeatable"
+    add("--weights", action="append", default=[], metavar="NAME=FILE", help=own)
+    paper = "MPI Sintel as others score it: PWVO's 992 pairs, or fourteen trajectories"
+    add("--protocol", choices=("paper", "trajectory14"), help=paper)
+    add("--worst", type=int, default=3, help="worst pairs shown for each method")
+    add("--jobs", type=int, default=1, metavar="N", help="sequences at a time, a process each")
+    cluster = "of a Dask cluster (tcp://host:8786) that works instead; extra 'cluster'"
+    add("--scheduler", metavar="ADDRESS", help=cluster)
     group = parser.add_mutually_exclusive_group()
-    group.add_argument("--resume", action="store_true", help="go on with an interrupted comparison")
+    group.add_argument("--resume", action="store_true", help="keep the sequences that are finished")
     group.add_argument("--overwrite", action="store_true", help="replace results in --out")
-    parser.add_argument("-q", "--quiet", action="store_true", help="no progress")
+    add("-q", "--quiet", action="store_true", help="no progress")
     return parser
 
 
 def main(argv: list[str] | None = None) -> int:
     try:
-        args = build_parser().parse_args(argv)
+        args = vars(build_parser().parse_args(argv))
     except SystemExit as end:
         return int(end.code or 0)
-    from hybridvo.comparison.runner import ComparisonOptions, WorkerError, compare
-    from hybridvo.console import printable
     from hybridvo.errors import HybridVOError, InputError, LockedError, OutputError
+    from hybridvo.evaluation.comparison import ComparisonOptions, compare
 
-    given = sys.argv[1:] if argv is None else argv
-    mode = "overwrite" if args.overwrite else "resume" if args.resume else "new"
+    mode = "overwrite" if args.pop("overwrite") else "resume" if args["resume"] else "new"
+    del args["resume"]
+    quiet, out = args.pop("quiet"), args.pop("out")
     try:
-        for option, values in (("--sequence", args.sequence), ("--out", [args.out])):
-            if "" in values:  # a variable that is not set, not the working folder
-                raise InputError(f"{option}: expected a folder, got an empty path.")
-        if args.maps < 0:
-            raise InputError(f"--maps: expected at least 0, got {args.maps}.")
+        pairs = [text.partition("=") for text in args.pop("weights")]
         options = ComparisonOptions(
-            sequences=tuple(args.sequence),
-            dataset=args.dataset,
-            methods=tuple(name.strip() for name in args.methods.split(",") if name.strip()),
-            flow=args.flow,
-            start=args.start,
-            stop=args.stop,
-            stride=args.stride,
-            seed=args.seed,
-            protocol=args.protocol,
-            device=args.device,
-            jobs=args.jobs,
-            scheduler=args.scheduler,
-            worst=args.worst,
+            sequences=tuple(args.pop("sequence")),
+            methods=tuple(n.strip() for n in args.pop("methods").split(",") if n.strip()),
+            weights={name: file for name, _, file in pairs},
+            **args,
         )
+        command = ["tools/compare_methods.py", *(sys.argv[1:] if argv is None else argv)]
         written = compare(
-            options,
-            Path(args.out),
-            mode=mode,
-            command=["tools/compare_methods.py", *given],
-            quiet=args.quiet,
+            options, out, mode=mode, command=command, progress=None if quiet else show
         )
     except HybridVOError as error:
-        print(printable(f"compare_methods.py: {error}"), file=sys.stderr)
-        codes = ((OutputError, 5), (LockedError, 4), (WorkerError, 1))
-        return next((code for kind, code in codes if isinstance(error, kind)), 2)
+        print(f"compare_methods.py: {error}", file=sys.stderr)
+        codes = ((InputError, 2), (LockedError, 4), (OutputError, 5))
+        return next((code for kind, code in codes if isinstance(error, kind)), 1)
     except KeyboardInterrupt:
-        print("compare_methods.py: interrupted.", file=sys.stderr)
+        print("compare_methods.py: interrupted; go on with --resume.", file=sys.stderr)
         return 130
-    if written is None:
-        return 130
-    written += draw_maps(Path(args.out), args.maps, args.quiet)
-    for path in dict.fromkeys(written):
-        print(printable(str(path)))
+    print(*written, sep="\n")
     return 0
 
 
-def draw_maps(out: Path, count: int, quiet: bool) -> list[Path]:
-    """Maps of the worst pairs of the first method, added to the report; a failure is one line."""
-    from hybridvo.console import printable
-    from hybridvo.errors import HybridVOError
-    from hybridvo.visualization import PictureOptions, visualize
-
-    if not count:
-        return []
-    try:
-        results = json.loads((out / "results.json").read_text(encoding="utf-8"))
-        paths = {row["name"]: row["path"] for row in results["sequences"]}
-        kinds = {row["name"]: row["kind"] for row in results["sequences"]}
-        worst = results["worst_pairs"] or []
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        print(f"compare_methods.py: no maps: results.json: {error!r}", file=sys.stderr)
-        return []
-    pairs = [row for row in worst if row["method"] == worst[0]["method"]][:count]
-    written: list[Path] = []
-    for row in pairs:
-        name = row["sequence"]
-        flow = "dis" if row["flow_source"] == "dis" else "file"
-        options = PictureOptions(
-            sequence=paths[name],
-            pair=row["index"],
-            dataset=kinds[name],
-            flow=flow,
-            method=row["method"],
-            into=out,
-            overwrite=True,
-            name=name,
-        )
-        command = ["tools/visualize.py", "--sequence", paths[name], "--dataset", kinds[name]]
-        command += ["--pair", str(row["index"]), "--method", row["method"], "--into", str(out)]
-        command += ["--flow", flow, "--overwrite"]
-        if not quiet:
-            print(f"maps of {name}, pair {row['index']}", file=sys.stderr)
-        try:
-            written += visualize(options, command)
-        except HybridVOError as error:
-            told = f"compare_methods.py: no maps of {name}: {error}"
-            print(printable(told), file=sys.stderr)
-    return written
+def show(message: str, done: int, total: int) -> None:
+    end = "\r" if sys.stderr.isatty() and not message else "\n"
+    if message or sys.stderr.isatty():
+        print(f"[{done}/{total} pairs] {message}", end=end, file=sys.stderr, flush=True)
 
 
 if __name__ == "__main__":

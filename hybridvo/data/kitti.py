@@ -7,36 +7,27 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from hybridvo.data.file_sequence import (
-    FileSequence,
-    check_pose,
-    gap_notice,
-    numbered_files,
-    read_rows,
-    to_seconds,
-)
-from hybridvo.data.image_io import read_npy, read_png16, read_rgb, read_text
-from hybridvo.data.sensor_noise import stereo_variance
+from hybridvo.data.base import Given, Listing, Sequence
+from hybridvo.data.camera_file import Calibration
+from hybridvo.data.image_io import read_rgb, read_text
+from hybridvo.data.lists import gap_warning, numbered_files, read_rows, rigid, to_seconds
 from hybridvo.errors import FormatError, InputError
 from hybridvo.geometry import invert
 from hybridvo.types import Camera
 
-__all__ = ["KittiSequence"]
-
-DEPTH_PER_METRE = 256.0
 FRAMES_PER_SECOND = 10.0
 DEPTH_FOLDERS = ("depth", "depth_2", "depth_0")
 LEFT_AND_RIGHT = (("image_2", "image_3"), ("image_0", "image_1"))
 IMAGE_PATTERN = r"(\d+)\.(?:png|jpg)"
-LARGEST = 1e12
+MAX_ENTRY = 1e12
 """No entry of a projection matrix is larger."""
-LEAST_STEREO_WIDTH = 32
+MIN_STEREO_WIDTH = 32
 """Images narrower than this are not matched: OpenCV's matcher fails, or crashes, below 17 px."""
 DISPARITY_SIGMA_PX = 0.5
 """Assumed standard deviation of a block-matched disparity, px: sets the relative depth noise."""
 
 
-class KittiSequence(FileSequence):
+class KittiSequence(Sequence):
     """One sequence such as ``sequences/00``: image_2 (or image_0), calib.txt, times.txt.
 
     Depth comes from a folder ``depth`` (16-bit PNG with 256 units per metre, or ``.npy`` in
@@ -45,30 +36,20 @@ class KittiSequence(FileSequence):
 
     Args:
         path: sequence folder, or its image_2 or image_0.
-        depth: ``auto``, ``file`` or ``stereo``.
-        strict: trailing bytes in a file are errors.
-        allow_outside: accepted for symmetry; no list file names paths here.
+        given: what the user says about camera, unit and masks.
 
     Raises:
         InputError: no frames, no calibration, no source of depth. FormatError: damaged text files.
     """
 
     kind = "kitti"
+    depth_scale = 256.0
     looks_for = "kitti: calib.txt and image_2 or image_0"
 
-    def __init__(
-        self,
-        path: Path,
-        *,
-        depth: str = "auto",
-        strict: bool = False,
-        allow_outside: bool = False,
-    ) -> None:
-        root = _sequence_folder(Path(path).absolute())
+    def __init__(self, path: Path, given: Given) -> None:
+        root = _sequence_folder(path.absolute())
         if root is None:
             raise InputError(f"{path}: expected a folder with {self.looks_for.split(': ')[1]}.")
-        if depth not in ("auto", "file", "stereo"):
-            raise InputError(f"depth: expected auto, file or stereo, got {depth!r}.")
         left_name, right_name = next(
             ((a, b) for a, b in LEFT_AND_RIGHT if numbered_files(root / a, IMAGE_PATTERN)),
             LEFT_AND_RIGHT[0],
@@ -77,113 +58,98 @@ class KittiSequence(FileSequence):
         if not left:
             raise InputError(f"{root}: no frames matched NUMBER.png in image_2 or image_0.")
         numbers = sorted(left)
-        right = numbered_files(root / right_name, IMAGE_PATTERN)
-        stored = next(
-            (d for f in DEPTH_FOLDERS if (d := numbered_files(root / f, r"(\d+)\.(?:png|npy)"))), {}
-        )
-        if (depth == "file" and not stored) or (depth == "stereo" and not right):
-            what = "a depth folder" if depth == "file" else right_name
-            raise InputError(f"{root}: depth='{depth}' needs {what}, which holds no numbered file.")
-        if not stored and not right:
+        stored = (numbered_files(root / f, r"(\d+)\.(?:png|npy)") for f in DEPTH_FOLDERS)
+        depth = next((files for files in stored if files), {})
+        self._is_stereo = not depth
+        self.depth_source = "stereo" if self._is_stereo else "file"
+        if self._is_stereo:
+            depth = numbered_files(root / right_name, IMAGE_PATTERN)
+        if not depth:
             raise InputError(
                 f"{root}: no source of depth: expected a folder depth (16-bit PNG, 256 per metre, "
                 f"or .npy in metres) or the right images {right_name}."
             )
-        self._stereo = depth == "stereo" or not stored
-        self.depth_source = "stereo" if self._stereo else "file"
-        depth_files = right if self._stereo else stored
-        projections = _read_calibration(root / "calib.txt")
-        P_left = _projection(projections, left_name[-1], root)
-        self._focal, self._baseline = P_left[0, 0], 0.0
-        if self._stereo:
-            P_right = _projection(projections, right_name[-1], root)
-            self._baseline = float((P_left[0, 3] - P_right[0, 3]) / P_left[0, 0])
+        calibration = root / "calib.txt"
+        P = _read_projections(calibration)
+        self._P_left = _projection(P, left_name[-1], calibration)
+        self._P_name = f"P{left_name[-1]}"
+        self._baseline = 0.0
+        if self._is_stereo:
+            P_right = _projection(P, right_name[-1], calibration)
+            self._baseline = float((self._P_left[0, 3] - P_right[0, 3]) / self._P_left[0, 0])
             if not self._baseline > 0:
                 raise FormatError(
-                    f"{root / 'calib.txt'}: expected a positive baseline between P{left_name[-1]} "
-                    f"and P{right_name[-1]}, got {self._baseline} m."
+                    f"{calibration}: expected a positive baseline between {self._P_name} and "
+                    f"P{right_name[-1]}, got {self._baseline} m."
                 )
-        notices = gap_notice(root.name, numbers)
-        stamps = _read_times(root / "times.txt", numbers, notices)
-        truth = _truth_file(root)
-        sources = [root / "calib.txt", root / "times.txt"]
-        poses = None
-        if truth is not None:
-            poses = _read_poses(truth, numbers, P_left, notices)
-            sources.append(truth)
-        super().__init__(
-            root,
-            root.name,
+        stamps, told = _read_times(root / "times.txt", numbers)
+        listing = Listing(
             rgb=[left[n] for n in numbers],
-            depth=[depth_files.get(n) for n in numbers],
+            depth=[depth.get(n) for n in numbers],
             timestamps=stamps,
-            poses=poses,
-            sources=sources,
-            notices=notices,
-            strict=strict,
+            sources=[calibration, root / "times.txt"],
+            warnings=gap_warning(root.name, numbers) + told,
         )
-        try:
-            self._camera = Camera.from_matrix(P_left[:, :3], self.height, self.width)
-        except InputError as error:
-            raise FormatError(f"{root / 'calib.txt'}: P{left_name[-1]}: {error}") from None
-        if not self._stereo:
-            self._notice_depth_units()
+        if (truth := _truth_file(root)) is not None:
+            listing.sources.append(truth)
+            listing.poses, told = _read_poses(truth, numbers, self._P_left)
+            listing.warnings += told
+        super().__init__(root, root.name, listing, given)
 
     @staticmethod
     def matches(path: Path) -> bool:
         """Whether the folder looks like a KITTI odometry sequence."""
         return _sequence_folder(path.absolute()) is not None
 
-    def camera(self, index: int) -> Camera:
+    def _calibration(self) -> Calibration:
         """The rectified left camera."""
-        self._check_index(index)
-        return self._camera
+        try:
+            camera = Camera.from_matrix(self._P_left[:, :3], self.height, self.width)
+        except InputError as error:
+            raise FormatError(f"{self.root / 'calib.txt'}: {self._P_name}: {error}") from None
+        return Calibration(camera)
 
     def _read_depth(self, path: Path, index: int, rgb: np.ndarray | None) -> np.ndarray:
-        if self._stereo:
-            left = rgb if rgb is not None else read_rgb(self.rgb_files[index] or path)
-            return self._match(left, read_rgb(path), path)
-        if path.suffix == ".npy":
-            depth = read_npy(path, strict=self.strict)
-            if depth.dtype != np.float32:
-                raise FormatError(f"{path}: expected depth as floating point, got {depth.dtype}.")
-            return depth
-        return read_png16(path).astype(np.float32) / np.float32(DEPTH_PER_METRE)
-
-    def _match(self, left: np.ndarray, right: np.ndarray, path: Path) -> np.ndarray:
-        """(H, W) float32 depth from a rectified pair; 0 where no match was found."""
-        if left.shape != right.shape:
-            raise InputError(
-                f"{path}: the right image has shape {right.shape}, the left one {left.shape}."
-            )
-        if left.shape[1] < LEAST_STEREO_WIDTH:
-            return np.zeros(left.shape[:2], np.float32)
-        # 128 px at KITTI's size: everything beyond 3 m. Narrow images cannot be searched as far.
-        disparities = min(128, max(16, left.shape[1] // 2 // 16 * 16))
-        block = 5
-        matcher = cv2.StereoSGBM.create(
-            minDisparity=0,
-            numDisparities=disparities,
-            blockSize=block,
-            P1=8 * block * block,
-            P2=32 * block * block,
-            disp12MaxDiff=1,
-            uniquenessRatio=10,
-            speckleWindowSize=100,
-            speckleRange=2,
-            mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
-        )
-        gray = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (left, right)]
-        disparity = matcher.compute(gray[0], gray[1]).astype(np.float32) / 16
+        if not self._is_stereo:
+            return super()._read_depth(path, index, rgb)
+        left = rgb if rgb is not None else read_rgb(self.rgb_files[index] or path)
+        right = read_rgb(path)
+        self._check_shape(right, path, "a right image")
+        disparity = _match(left, right)
         depth = np.zeros_like(disparity)
         found = disparity > 0
-        depth[found] = self._focal * self._baseline / disparity[found]
+        depth[found] = self._P_left[0, 0] * self._baseline / disparity[found]
         return depth
 
     def _depth_variance(self, depth: np.ndarray) -> np.ndarray | None:
-        if not self._stereo:
+        """Variance of log depth of a stereo pair: (sigma_d z / (f b))^2."""
+        if not self._is_stereo:
             return None
-        return stereo_variance(depth, self._focal, self._baseline, DISPARITY_SIGMA_PX)
+        reach = float(self._P_left[0, 0] * self._baseline)
+        return np.square(DISPARITY_SIGMA_PX * depth / reach).astype(np.float32)
+
+
+def _match(left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """(H, W) float32 disparity in pixels of a rectified pair; 0 or less where nothing matches."""
+    if left.shape[1] < MIN_STEREO_WIDTH:
+        return np.zeros(left.shape[:2], np.float32)
+    # 128 px at KITTI's size: everything beyond 3 m. Narrow images cannot be searched as far.
+    disparities = min(128, max(16, left.shape[1] // 2 // 16 * 16))
+    block = 5
+    matcher = cv2.StereoSGBM.create(
+        minDisparity=0,
+        numDisparities=disparities,
+        blockSize=block,
+        P1=8 * block * block,
+        P2=32 * block * block,
+        disp12MaxDiff=1,
+        uniquenessRatio=10,
+        speckleWindowSize=100,
+        speckleRange=2,
+        mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
+    )
+    gray = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (left, right)]
+    return matcher.compute(gray[0], gray[1]).astype(np.float32) / 16  # steps of 1/16 px
 
 
 def _sequence_folder(path: Path) -> Path | None:
@@ -196,11 +162,11 @@ def _sequence_folder(path: Path) -> Path | None:
     return None
 
 
-def _read_calibration(path: Path) -> dict[str, np.ndarray]:
-    """Name -> (3, 4) matrix."""
+def _read_projections(path: Path) -> dict[str, tuple[int, np.ndarray]]:
+    """Name -> line in the file and (3, 4) matrix."""
     matrices = {}
-    for number, line in enumerate(read_text(path, limit=2**20).splitlines(), start=1):
-        name, colon, rest = line.partition(":")
+    for line, text in enumerate(read_text(path, limit=2**20).split("\n"), start=1):
+        name, colon, rest = text.partition(":")
         if not colon or not name.strip().startswith(("P", "Tr")):
             continue
         try:
@@ -208,39 +174,36 @@ def _read_calibration(path: Path) -> dict[str, np.ndarray]:
         except ValueError:
             values = np.zeros(0)
         if values.size != 12 or not np.isfinite(values).all():
-            raise FormatError(f"{path}:{number}: expected 12 finite numbers after {name!r}.")
-        matrices[name.strip()] = values.reshape(3, 4)
+            raise FormatError(f"{path}:{line}: expected 12 finite numbers after {name!r}.")
+        matrices[name.strip()] = line, values.reshape(3, 4)
     return matrices
 
 
-def _projection(matrices: dict[str, np.ndarray], number: str, root: Path) -> np.ndarray:
-    for name in (f"P{number}", f"P_rect_0{number}"):
-        if name in matrices:
-            P = matrices[name]
-            upper = P[1, 0] == 0 and np.allclose(P[2, :3], (0, 0, 1)) and np.abs(P).max() < LARGEST
-            if not (upper and P[0, 0] > 0 and P[1, 1] > 0):
-                raise FormatError(
-                    f"{root / 'calib.txt'}: {name}: expected fx 0 cx tx, 0 fy cy ty, 0 0 1 tz with "
-                    f"positive fx and fy, got {P.tolist()}."
-                )
-            return P
-    raise FormatError(
-        f"{root / 'calib.txt'}: expected a line 'P{number}: ...', found {sorted(matrices)}."
-    )
+def _projection(matrices: dict[str, tuple[int, np.ndarray]], number: str, path: Path) -> np.ndarray:
+    name = next((n for n in (f"P{number}", f"P_rect_0{number}") if n in matrices), None)
+    if name is None:
+        raise FormatError(f"{path}: expected a line 'P{number}: ...', found {sorted(matrices)}.")
+    line, P = matrices[name]
+    upper = P[1, 0] == 0 and np.allclose(P[2, :3], (0, 0, 1)) and np.abs(P).max() < MAX_ENTRY
+    if not (upper and P[0, 0] > 0 and P[1, 1] > 0):
+        raise FormatError(
+            f"{path}:{line}: {name}: expected fx 0 cx tx, 0 fy cy ty, 0 0 1 tz with positive fx "
+            f"and fy, got {P.tolist()}."
+        )
+    return P
 
 
-def _read_times(path: Path, numbers: list[int], notices: list[str]) -> np.ndarray:
+def _read_times(path: Path, numbers: list[int]) -> tuple[np.ndarray, list[str]]:
     """Line i belongs to image number i."""
     if not path.exists():
-        notices.append(f"{path}: not there; stamps count {FRAMES_PER_SECOND:g} frames a second.")
-        return (np.array(numbers) - numbers[0]) / FRAMES_PER_SECOND
-    times, converted = to_seconds([row[0] for row in read_rows(path, "seconds")], path.name)
-    notices += converted
+        told = f"{path}: not there; stamps count {FRAMES_PER_SECOND:g} frames a second."
+        return (np.array(numbers) - numbers[0]) / FRAMES_PER_SECOND, [told]
+    times, told = to_seconds([row.numbers[0] for row in read_rows(path, "seconds")], path.name)
     if numbers[-1] >= len(times):
         raise FormatError(
             f"{path}: expected a line for image {numbers[-1]}, got {len(times)} lines."
         )
-    return times[numbers]
+    return times[numbers], told
 
 
 def _truth_file(root: Path) -> Path | None:
@@ -249,20 +212,16 @@ def _truth_file(root: Path) -> Path | None:
     return next((p for p in (*beside, root.parent.parent / "poses" / name) if p.is_file()), None)
 
 
-def _read_poses(
-    path: Path, numbers: list[int], P_left: np.ndarray, notices: list[str]
-) -> np.ndarray:
+def _read_poses(path: Path, numbers: list[int], P_left: np.ndarray) -> tuple[np.ndarray, list[str]]:
     """(N, 4, 4) T_world_cam of the left camera that is read; the file holds those of camera 0."""
     rows = read_rows(path, "r11 r12 r13 tx r21 r22 r23 ty r31 r32 r33 tz")
     poses = np.full((len(numbers), 4, 4), np.nan)
     T_cam_cam0 = np.eye(4)
     T_cam_cam0[:3, 3] = np.linalg.solve(P_left[:, :3], P_left[:, 3])
     for i, n in enumerate(numbers):
-        if n < len(rows) and np.isfinite(rows[n]).all():
-            T_world_cam0 = np.vstack([np.reshape(rows[n], (3, 4)), (0.0, 0.0, 0.0, 1.0)])
-            check_pose(T_world_cam0, f"{path}: pose {n}")
-            poses[i] = T_world_cam0 @ invert(T_cam_cam0)
+        if n < len(rows) and np.isfinite(rows[n].numbers).all():
+            M = np.reshape(rows[n].numbers, (3, 4))
+            poses[i] = rigid(M[:, :3], M[:, 3], f"{path}:{rows[n].line}") @ invert(T_cam_cam0)
     missing = int(np.isnan(poses[:, 0, 0]).sum())
-    if missing:
-        notices.append(f"{path}: {len(rows)} poses; {missing} of {len(numbers)} have no truth.")
-    return poses
+    told = f"{path}: {len(rows)} poses; {missing} of {len(numbers)} have no truth."
+    return poses, [told] if missing else []

@@ -2,7 +2,7 @@
 
 A preset file names its kind (``preset: paper``) and repeats every option with its unit and reason.
 Nothing is guessed: an unknown key, a missing file or a value of another type is an error that names
-the file, the key and the nearest known name. What of YAML is read: :mod:`hybridvo.data.plain_yaml`.
+the file, the key and the nearest known name.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from hybridvo.data.image_io import read_text
-from hybridvo.data.plain_yaml import MAX_YAML_BYTES, plain_yaml
 from hybridvo.errors import FormatError, InputError
+from hybridvo.files import parse_yaml
 from hybridvo.synthetic.diverse import WideOptions
 from hybridvo.synthetic.paper import PaperOptions
 from hybridvo.training.rendered_pictures import RenderedOptions
@@ -45,11 +45,11 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
     """
     path = Path(path)
     try:
-        text = read_text(path, limit=MAX_YAML_BYTES)
+        text = read_text(path, limit=2**16)
     except FileNotFoundError:
         message = f"{path}: no such file; presets of the project are in configs/."
         raise InputError(message) from None
-    mapping = plain_yaml(text, str(path))
+    mapping = parse_yaml(text, str(path))
     if not isinstance(mapping, dict):
         raise FormatError(f"{path}: expected a mapping of keys, got {type(mapping).__name__}.")
     return mapping

@@ -6,22 +6,27 @@ from pathlib import Path
 
 import numpy as np
 
-from hybridvo.data.file_sequence import FileSequence, gap_notice, numbered_files
-from hybridvo.data.image_io import read_cam, read_dpt, read_flo, read_mask_png
+from hybridvo.data.base import Given, Listing, Sequence
+from hybridvo.data.camera_file import Calibration
+from hybridvo.data.image_io import read_cam, read_flow, read_mask_png
+from hybridvo.data.lists import flow_of_next, gap_warning, numbered_files
 from hybridvo.errors import FormatError, InputError
 from hybridvo.geometry import invert
 from hybridvo.types import Camera
 
-__all__ = ["SintelSequence"]
-
 FRAMES_PER_SECOND = 24.0
 IMAGE_PASSES = ("final", "clean", "albedo")
-FOLDERS = (*IMAGE_PASSES, "flow", "depth", "camdata_left", "occlusions", "invalid")
-UNKNOWN_FLOW = 1e9
-"""Middlebury's mark: flow beyond this is unknown."""
+SUFFIXES = {
+    "flow": "flo",
+    "depth": "dpt",
+    "camdata_left": "cam",
+    "occlusions": "png",
+    "invalid": "png",
+}
+FOLDERS = (*IMAGE_PASSES, *SUFFIXES)
 
 
-class SintelSequence(FileSequence):
+class SintelSequence(Sequence):
     """One Sintel scene, such as ``training/clean/alley_1``.
 
     ``flow`` marks pixels of the ``invalid`` masks. Occluded pixels keep their true flow: ask
@@ -30,10 +35,9 @@ class SintelSequence(FileSequence):
     Args:
         path: ``.../training/FOLDER/NAME`` with FOLDER one of clean, final, albedo, flow, depth,
             camdata_left, occlusions, invalid; the siblings are found from there, also where the
-            zip files were unpacked into neighbouring folders.
-        images: which render pass to read; the one in ``path`` by default, else final, else clean.
-        strict: trailing bytes in a file are errors.
-        allow_outside: accepted for symmetry; no list file names paths here.
+            zip files were unpacked into neighbouring folders. Images are those of ``path``, else
+            of the final pass, else of the clean one.
+        given: what the user says about camera, unit and masks.
 
     Raises:
         InputError: no frames, or no camera data.
@@ -44,68 +48,42 @@ class SintelSequence(FileSequence):
     flow_is_true = True
     looks_for = "sintel: .../{clean,final,flow,depth,camdata_left}/NAME with frame_0001.*"
 
-    def __init__(
-        self,
-        path: Path,
-        *,
-        images: str | None = None,
-        strict: bool = False,
-        allow_outside: bool = False,
-    ) -> None:
-        path = Path(path).absolute()
+    def __init__(self, path: Path, given: Given) -> None:
+        path = path.absolute()
         name, base = path.name, path.parent.parent
-        if images is not None and images not in IMAGE_PASSES:
-            raise InputError(f"images: expected one of {IMAGE_PASSES}, got {images!r}.")
-        found = {folder: _find(base, folder, name) for folder in FOLDERS}
-        given = path.parent.name if path.parent.name in IMAGE_PASSES else None
-        passes = [images] if images else [given] if given else list(IMAGE_PASSES)
-        chosen = next((found[p] for p in passes if p and found[p]), None)
-        if images is not None and chosen is None:
-            raise InputError(f"{base}: there is no folder {images}/{name}.")
-        numbered = {
-            folder: numbered_files(found[folder], rf"frame_(\d+)\.{suffix}")
-            for folder, suffix in (
-                ("flow", "flo"),
-                ("depth", "dpt"),
-                ("camdata_left", "cam"),
-                ("occlusions", "png"),
-                ("invalid", "png"),
-            )
+        given_pass = path.parent.name if path.parent.name in IMAGE_PASSES else None
+        passes = (given_pass,) if given_pass else IMAGE_PASSES
+        images = next((found for p in passes if (found := _find(base, p, name))), None)
+        files = {
+            folder: numbered_files(_find(base, folder, name), rf"frame_(\d+)\.{suffix}")
+            for folder, suffix in SUFFIXES.items()
         }
-        rgb = numbered_files(chosen, r"frame_(\d+)\.(?:png|jpg|jpeg)")
-        numbers = sorted(set(rgb) | set(numbered["depth"]))
+        rgb = numbered_files(images, r"frame_(\d+)\.(?:png|jpg|jpeg)")
+        numbers = sorted(set(rgb) | set(files["depth"]))
         if not numbers:
             raise InputError(
-                f"{path}: no frames matched frame_*.png or frame_*.dpt in {chosen or base} "
-                f"and {found['depth'] or base / 'depth' / name}."
+                f"{path}: no frames matched frame_*.png or frame_*.dpt in {images or base} and "
+                f"{base / 'depth' / name}."
             )
-        if not numbered["camdata_left"]:
+        if not files["camdata_left"]:
             raise InputError(
                 f"{base}: no frames matched frame_*.cam in camdata_left/{name}. The camera data "
                 f"comes with Sintel's depth download; it exists for the training scenes only."
             )
-        self._cameras = [numbered["camdata_left"].get(n) for n in numbers]
-        self._occlusions = [numbered["occlusions"].get(n) for n in numbers]
-        self._invalid = [numbered["invalid"].get(n) for n in numbers]
-        # frame_0003.flo leads to frame 4: across a gap it is not the flow of this pair
-        flow = [
-            numbered["flow"].get(n) if following == n + 1 else None
-            for n, following in zip(numbers, [*numbers[1:], None], strict=True)
-        ]
-        masks = [p for p in self._invalid + self._occlusions if p is not None]
-        super().__init__(
-            _root(path, base),
-            name,
+        self._cameras = [files["camdata_left"].get(n) for n in numbers]
+        self._occlusions = [files["occlusions"].get(n) for n in numbers]
+        self._invalid = [files["invalid"].get(n) for n in numbers]
+        sources = (*self._cameras, *self._invalid, *self._occlusions)
+        listing = Listing(
             rgb=[rgb.get(n) for n in numbers],
-            depth=[numbered["depth"].get(n) for n in numbers],
-            flow=flow,
+            depth=[files["depth"].get(n) for n in numbers],
+            flow=flow_of_next(files["flow"], numbers),
             timestamps=(np.array(numbers) - numbers[0]) / FRAMES_PER_SECOND,
-            sources=[p for p in self._cameras if p is not None] + masks,
-            notices=gap_notice(name, numbers),
-            strict=strict,
+            sources=[p for p in sources if p is not None],
+            warnings=gap_warning(name, numbers),
         )
+        super().__init__(path if path.is_dir() else base, name, listing, given)
         self.poses = self._read_poses()
-        self._notice_depth_units()
 
     @staticmethod
     def matches(path: Path) -> bool:
@@ -123,7 +101,8 @@ class SintelSequence(FileSequence):
         Raises:
             FileNotFoundError: no ``.cam`` file for this frame. FormatError: a damaged one.
         """
-        return self._read_camera(self._check_index(index))[0]
+        index = self._check_index(index)
+        return self._camera or self._read_camera(index)[0]
 
     def occlusion(self, index: int) -> np.ndarray:
         """(H, W) bool, True where a pixel of frame ``index`` cannot be seen in the next one.
@@ -136,19 +115,19 @@ class SintelSequence(FileSequence):
             raise FileNotFoundError(f"{self.name}: frame {index} has no occlusion mask.")
         return read_mask_png(path)
 
-    def _read_cam(self, index: int) -> tuple[np.ndarray, np.ndarray]:
-        path = self._cameras[index]
-        if path is None:
-            raise FileNotFoundError(f"{self.name}: frame {index} has no .cam file.")
-        return read_cam(path, strict=self.strict)
+    def _calibration(self) -> Calibration | None:
+        return None
 
     def _read_camera(self, index: int) -> tuple[Camera, np.ndarray]:
         """Camera and T_cam_world of a frame."""
-        K, T_cam_world = self._read_cam(index)
+        path = self._cameras[index]
+        if path is None:
+            raise FileNotFoundError(f"{self.name}: frame {index} has no .cam file.")
+        K, T_cam_world = read_cam(path)
         try:
             return Camera.from_matrix(K, self.height, self.width), T_cam_world
         except InputError as error:
-            raise FormatError(f"{self._cameras[index]}: {error}") from None
+            raise FormatError(f"{path}: {error}") from None
 
     def _read_poses(self) -> np.ndarray:
         """Poses of the frames that have a camera: the others are not scored."""
@@ -157,23 +136,18 @@ class SintelSequence(FileSequence):
             try:
                 poses[index] = invert(self._read_camera(index)[1])
             except (FormatError, FileNotFoundError) as error:
-                self._notices.append(f"no camera for frame {index}: {error}")
+                self._warnings.append(f"no camera for frame {index}: {error}")
         return poses
 
-    def _read_depth(self, path: Path, index: int, rgb: np.ndarray | None) -> np.ndarray:
-        return read_dpt(path, strict=self.strict)
-
     def _read_flow(self, path: Path, index: int) -> tuple[np.ndarray, np.ndarray | None]:
-        flow = read_flo(path, strict=self.strict)
-        self._check_shape(flow, path, "flow")
-        with np.errstate(invalid="ignore"):
-            known = (np.abs(flow) < UNKNOWN_FLOW).all(axis=2)
+        flow, valid = read_flow(path)
         mask = self._invalid[index]
         if mask is None or not mask.exists():
-            return flow, None if known.all() else known
+            return flow, valid
         invalid = read_mask_png(mask)
+        self._check_shape(flow, path, "flow")
         self._check_shape(invalid, mask, "a mask")
-        return flow, known & ~invalid
+        return flow, ~invalid if valid is None else valid & ~invalid
 
 
 def _find(base: Path, folder: str, name: str) -> Path | None:
@@ -185,7 +159,3 @@ def _find(base: Path, folder: str, name: str) -> Path | None:
     if base.name != "training":
         return None
     return next(iter(sorted(base.parent.parent.glob(f"*/training/{folder}/{name}"))), None)
-
-
-def _root(path: Path, base: Path) -> Path:
-    return path if path.is_dir() else base

@@ -1,8 +1,7 @@
-"""What one pair looks like to an estimate: flow in parts, errors, uncertainty, weights, saliency.
+"""Maps of one pair: flow in parts, errors, uncertainty, saliency; arrays in, arrays out.
 
-Arrays in, arrays out; :mod:`hybridvo.evaluation.plots_maps` draws them. The flow of the input is
-the ego flow (what the camera's motion causes on a still scene) plus the object flow (what is left):
-``F = F_ego + F_object``.
+The input flow is the ego flow (what the camera's motion causes on a static scene) plus the object
+flow (what is left): ``F = F_ego + F_object``.
 """
 
 from __future__ import annotations
@@ -15,29 +14,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hybridvo.errors import InputError
+from hybridvo.evaluation.pair_errors import MOVING_PX
 from hybridvo.geometry import ego_flow
 from hybridvo.types import Camera, FramePair, PixelwisePrediction
 
 if TYPE_CHECKING:
     import torch
-
-__all__ = [
-    "FactoredFlow",
-    "Saliency",
-    "colour_wheel",
-    "error_map",
-    "factor_flow",
-    "flow_colours",
-    "integrated_gradients",
-    "longest_flow",
-    "moving_pixels",
-    "prediction_errors",
-    "share_on",
-    "uncertainty_maps",
-]
-
-MOVING_PX = 1.0
-"""A pixel whose flow differs by more than this from the ego flow moves by itself."""
 
 # Baker et al., "A Database and Evaluation Methodology for Optical Flow" (IJCV 2011): hues between
 # six corners of the colour circle, as many steps as the eye tells apart in each part
@@ -75,7 +57,7 @@ def flow_colours(flow: np.ndarray, longest: float | None = None) -> np.ndarray:
         (H, W, 3) uint8 RGB; white is no motion, red to the right, yellow-green downwards.
 
     Raises:
-        InputError: another shape, or a length that is not positive.
+        InputError: another shape.
     """
     flow = np.asarray(flow)
     if flow.ndim != 3 or flow.shape[2] != 2:
@@ -86,8 +68,6 @@ def flow_colours(flow: np.ndarray, longest: float | None = None) -> np.ndarray:
     length = np.hypot(u, v)
     if longest is None:
         longest = longest_flow(flow)
-    elif not (math.isfinite(longest) and longest > 0):
-        raise InputError(f"flow_colours: expected a positive length, got {longest}.")
     radius = length / longest
     angle = np.arctan2(-v, -u) / np.pi  # -1 to 1
     place = (angle + 1) / 2 * (len(_WHEEL) - 1)
@@ -119,22 +99,8 @@ def colour_wheel(size: int = 65) -> np.ndarray:
     return np.dstack([rgb, alpha])
 
 
-@dataclass(frozen=True, eq=False)
-class FactoredFlow:
-    """Flow of a pair in its two parts, all (H, W, 2) px, NaN where a part is not known.
-
-    Args:
-        total: the flow that the estimate was given. ego: what a camera motion causes.
-        objects: total minus ego.
-    """
-
-    total: np.ndarray
-    ego: np.ndarray
-    objects: np.ndarray
-
-
-def factor_flow(pair: FramePair, T_curr_prev: np.ndarray) -> FactoredFlow:
-    """Take the flow that a camera motion causes out of a pair's flow.
+def object_flow(pair: FramePair, T_curr_prev: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(ego flow, object flow) of a pair, (H, W, 2) px each, NaN where a part is not known.
 
     Args:
         pair: with flow and previous depth.
@@ -145,16 +111,15 @@ def factor_flow(pair: FramePair, T_curr_prev: np.ndarray) -> FactoredFlow:
     """
     if pair.flow is None or pair.prev.depth is None:
         missing = "flow" if pair.flow is None else "previous depth"
-        raise InputError(f"factor_flow: the pair has no {missing}.")
-    total = np.where(np.isfinite(pair.flow).all(axis=2, keepdims=True), pair.flow, np.nan)
+        raise InputError(f"object_flow: the pair has no {missing}.")
     ego = ego_flow(pair.prev.depth, T_curr_prev, pair.prev.camera, pair.curr.camera)
-    return FactoredFlow(*(x.astype(np.float32) for x in (total, ego, total - ego)))
+    return ego, pair.flow - ego
 
 
-def moving_pixels(objects: np.ndarray, threshold_px: float = MOVING_PX) -> np.ndarray:
-    """(H, W) bool: pixels of an object flow (H, W, 2) that are longer than a threshold."""
+def moving_pixels(objects: np.ndarray) -> np.ndarray:
+    """(H, W) bool: pixels whose object flow (H, W, 2) is longer than a pixel."""
     with np.errstate(invalid="ignore"):
-        return np.hypot(objects[..., 0], objects[..., 1]) > threshold_px
+        return np.hypot(objects[..., 0], objects[..., 1]) > MOVING_PX
 
 
 def error_map(
@@ -219,7 +184,7 @@ class Saliency:
     Args:
         magnitude: (h, w) sum over the channels of the absolute attributions.
         total: sum of all attributions, with their signs.
-        change: answer for the input minus answer for the baseline. Equal to ``total`` up to the
+        change: answer for the input minus answer for zeros. Equal to ``total`` up to the
             error of the integral (completeness).
     """
 
@@ -236,33 +201,21 @@ class Saliency:
 def integrated_gradients(
     answer: Callable[..., torch.Tensor],
     inputs: tuple[torch.Tensor, ...],
-    baselines: tuple[torch.Tensor, ...] | None = None,
     steps: int = 32,
 ) -> Saliency:
     """Integrated gradients of a scalar answer (Sundararajan, Taly and Yan, ICML 2017).
 
-    The integral from the baseline to the input goes over Gauss-Legendre nodes: for smooth networks
+    The integral from zero to the input goes over Gauss-Legendre nodes: for smooth networks
     32 of them leave less than a percent of the change unexplained.
 
     Args:
         answer: takes tensors like ``inputs``, returns one number, differentiable.
         inputs: tensors of (1, C, h, w), all of one (h, w).
-        baselines: where the path starts; zeros by default.
         steps: nodes of the integral, at least 1; each costs one forward and one backward pass.
-
-    Raises:
-        InputError: no inputs, shapes that do not fit each other, or fewer than one step.
     """
     import torch
 
-    if not inputs or len({tuple(x.shape[-2:]) for x in inputs}) != 1:
-        shapes = [tuple(x.shape) for x in inputs]
-        raise InputError(f"integrated_gradients: expected tensors of one (h, w), got {shapes}.")
-    if steps < 1:
-        raise InputError(f"integrated_gradients: expected at least 1 step, got {steps}.")
-    starts = tuple(torch.zeros_like(x) for x in inputs) if baselines is None else baselines
-    if [x.shape for x in starts] != [x.shape for x in inputs]:
-        raise InputError("integrated_gradients: expected baselines of the shapes of the inputs.")
+    starts = tuple(torch.zeros_like(x) for x in inputs)
     nodes, weights = np.polynomial.legendre.leggauss(steps)
     sums = [torch.zeros_like(x) for x in inputs]
     for node, weight in zip((nodes + 1) / 2, weights / 2, strict=True):

@@ -1,49 +1,25 @@
-"""Trajectory errors against truth: absolute and relative pose error through evo, and KITTI drift.
+"""Trajectory errors against ground truth: ATE and RPE through evo, KITTI drift, NEES.
 
-The only file that imports evo's metrics. evo aligns in place and raises on degenerate paths: every
-call works on copies, and a value that cannot be computed is None with a reason. Per-pair errors
-(the paper's R_err, T_err and EPE) live in :mod:`hybridvo.evaluation.pairs` and are offered
-here too.
+evo aligns in place and raises on degenerate paths: every call works on copies, and a value that
+cannot be computed is None with a reason.
 """
 
 from __future__ import annotations
 
-import inspect
 import os
-from numbers import Real
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hybridvo.errors import InputError
-from hybridvo.evaluation.drift import KITTI_LENGTHS, SHORT_LENGTHS, KittiDrift, kitti_drift
-from hybridvo.evaluation.pairs import dynamic_fraction, mean_pair_errors, pair_errors
-from hybridvo.evaluation.results import (
-    AbsoluteError,
-    Alignment,
-    Association,
-    RelativeError,
-    Scale,
-)
-from hybridvo.geometry import xyzw_to_wxyz
-from hybridvo.trajectory import Axes, Format, Trajectory, read_trajectory
+from hybridvo.geometry import invert, rotation_angle, se3_log
+from hybridvo.trajectory import Trajectory, read_trajectory
 
-__all__ = [
-    "AbsoluteError",
-    "Association",
-    "KittiDrift",
-    "RelativeError",
-    "associate",
-    "ate",
-    "dynamic_fraction",
-    "evaluate_files",
-    "evaluate_trajectories",
-    "kitti_drift",
-    "mean_pair_errors",
-    "pair_errors",
-    "rpe",
-]
+Alignment = Literal["se3", "sim3", "origin", "none"]
+DeltaUnit = Literal["frames", "s"]
 
 MAX_TIME_DIFFERENCE = 0.02
 """Largest difference in seconds between the stamps of matched poses (TUM RGB-D's tools)."""
@@ -51,165 +27,149 @@ MIN_MATCHED_SHARE = 0.5
 """Smallest share of the shorter trajectory that has to find a partner."""
 MIN_POSES = 3
 """Fewest poses that determine a rigid alignment."""
+MIN_WIDTH = 1e-12
+"""Product of the relative widths of both paths below which they are straight: above rounding
+(1e-16), below one millimetre aside on a hundred metres (1e-10)."""
+KITTI_LENGTHS = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
+"""Sub-path lengths of the KITTI odometry benchmark, metres."""
+SHORT_LENGTHS = (5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0)
+"""Sub-path lengths for indoor sequences, metres (TartanAir's evaluator)."""
+NOT_FINITE = "the error is not a finite number: positions are too large"
 
-# Product of the relative widths of both paths below which they count as straight: far above
-# rounding (1e-16), far below one millimetre aside on a hundred metres (1e-10).
-_STRAIGHT = 1e-12
+
+@dataclass(frozen=True, eq=False)
+class Association:
+    """Poses of two trajectories that belong together.
+
+    Args:
+        est_indices, gt_indices: (M,) indices into the estimate and the ground truth.
+        total: poses of the shorter trajectory.
+        by: ``time`` or, where a file has no timestamps, ``index``.
+        max_diff: largest time difference allowed, seconds; None by index.
+        reason: why no error can be computed from these matches, or the empty string.
+    """
+
+    est_indices: np.ndarray
+    gt_indices: np.ndarray
+    total: int
+    by: str
+    max_diff: float | None = None
+    reason: str = ""
 
 
-def _evo_version() -> str:
-    import evo
+@dataclass(frozen=True, eq=False)
+class TrajectoryError:
+    """Absolute or relative errors of matched poses; empty arrays with a ``reason`` if none.
 
-    return str(evo.__version__).lstrip("v")
+    Args:
+        translation: (M,) metres. rotation_deg: (M,) degrees, of relative errors only.
+        scale: factor that the alignment put on the estimate, or None.
+        T_gt_est: (4, 4) alignment: an estimated position p becomes ``T_gt_est @ (scale p)``.
+        timestamps: (M,) of the ground truth, seconds.
+        alignment, reason: how it was aligned, and why there are no errors.
+    """
+
+    translation: np.ndarray
+    rotation_deg: np.ndarray
+    scale: float | None
+    T_gt_est: np.ndarray | None
+    timestamps: np.ndarray
+    alignment: Alignment
+    reason: str = ""
+
+    @property
+    def rmse(self) -> float | None:
+        """Root mean square of the translation errors, metres; None with a ``reason``."""
+        return _statistics(self.translation).get("rmse")
 
 
 def associate(est: Trajectory, gt: Trajectory, *, max_diff: float | None = None) -> Association:
-    """Match the poses of two trajectories one to one: by nearest stamp, through evo.
+    """Match the poses of two trajectories one to one: by nearest timestamp, through evo.
 
-    Where one of them has no stamps, poses are matched by index, which needs equal lengths.
+    Where one of them has no timestamps, poses are matched by index, which needs equal lengths.
 
     Args:
         est: estimated trajectory.
-        gt: true trajectory.
-        max_diff: largest difference of matched stamps, seconds. Default: 0.02, or half the median
-            spacing of the sparser trajectory if that is smaller, so that no pose can be matched
-            with its neighbour's partner.
-
-    Raises:
-        InputError: no trajectories, or ``max_diff`` is negative or not finite.
+        gt: ground truth.
+        max_diff: largest difference of matched timestamps, seconds. Default: 0.02, or half the
+            median spacing of the sparser trajectory if that is smaller.
     """
-    if max_diff is not None and not (isinstance(max_diff, Real) and 0 <= max_diff < np.inf):
-        raise InputError(f"max_diff: expected seconds >= 0, got {max_diff!r}.")
-    total = min(len(est), len(gt))
-    if not (est.has_timestamps and gt.has_timestamps):
-        if len(est) != len(gt):
-            empty = np.zeros(0, dtype=int)
-            reason = (
-                f"poses without timestamps can only be matched one by one, but the estimate has "
-                f"{len(est)} and the truth {len(gt)}"
-            )
-            return Association(empty, empty, total, "index", None, reason)
-        indices = np.arange(total)
-        return Association(indices, indices, total, "index")
-    if max_diff is None:
-        spacings = [np.median(np.diff(t.timestamps)) for t in (est, gt) if len(t) > 1]
-        max_diff = float(min([MAX_TIME_DIFFERENCE] + ([max(spacings) / 2] if spacings else [])))
-
     from evo.core.sync import matching_time_indices
 
+    total = min(len(est), len(gt))
+    if not (est.has_timestamps and gt.has_timestamps):
+        reason = ""
+        if len(est) != len(gt):
+            reason = (
+                f"poses without timestamps can only be matched one by one, but the estimate has "
+                f"{len(est)} and the ground truth {len(gt)}"
+            )
+        indices = np.arange(0 if reason else total)
+        return Association(indices, indices, total, "index", None, reason)
+    if max_diff is None:
+        spacings = [float(np.median(np.diff(t.timestamps))) for t in (est, gt) if len(t) > 1]
+        max_diff = min([MAX_TIME_DIFFERENCE] + ([max(spacings) / 2] if spacings else []))
     short, long = (est, gt) if len(est) <= len(gt) else (gt, est)
     found = matching_time_indices(short.timestamps, long.timestamps, max_diff)
-    short_indices, long_indices = (np.array(indices, dtype=int) for indices in found)
+    i, j = (np.array(indices, dtype=int) for indices in found)
     # evo may give one pose of the longer trajectory to two of the shorter: the nearer one keeps it
-    difference = np.abs(short.timestamps[short_indices] - long.timestamps[long_indices])
-    order = np.lexsort((difference, long_indices))
-    _, keep = np.unique(long_indices[order], return_index=True)
-    chosen = np.sort(order[keep])
-    short_indices, long_indices = short_indices[chosen], long_indices[chosen]
+    order = np.lexsort((np.abs(short.timestamps[i] - long.timestamps[j]), j))
+    chosen = np.sort(order[np.unique(j[order], return_index=True)[1]])
+    i, j = i[chosen], j[chosen]
     reason = ""
-    if len(chosen) < MIN_MATCHED_SHARE * total or not len(chosen):
+    if len(i) < MIN_MATCHED_SHARE * total or not len(i):
         reason = (
-            f"only {len(chosen)} of {total} poses match within {max_diff:.4g} s (estimate "
-            f"{est.timestamps[0]:.6f} to {est.timestamps[-1]:.6f} s, truth "
+            f"only {len(i)} of {total} poses match within {max_diff:.4g} s (estimate "
+            f"{est.timestamps[0]:.6f} to {est.timestamps[-1]:.6f} s, ground truth "
             f"{gt.timestamps[0]:.6f} to {gt.timestamps[-1]:.6f} s)"
         )
-    indices_est, indices_gt = (
-        (short_indices, long_indices) if short is est else (long_indices, short_indices)
-    )
-    return Association(indices_est, indices_gt, total, "time", max_diff, reason)
+    return Association(*((i, j) if short is est else (j, i)), total, "time", max_diff, reason)
 
 
 def _to_evo(trajectory: Trajectory, indices: np.ndarray) -> Any:
     from evo.core.trajectory import PosePath3D
 
-    T = trajectory.T_world_cam[indices]
-    xyzw = Rotation.from_matrix(T[:, :3, :3]).as_quat()
-    return PosePath3D(
-        positions_xyz=T[:, :3, 3].copy(),
-        orientations_quat_wxyz=xyzw_to_wxyz(xyzw),
-        poses_se3=[pose.copy() for pose in T],
-    )
+    return PosePath3D(poses_se3=[T.copy() for T in trajectory.T_world_cam[indices]])
 
 
-def _degeneracy(est: np.ndarray, gt: np.ndarray) -> str:
-    """Why (M, 3) positions do not determine an alignment, or the empty string."""
-    if len(est) < MIN_POSES:
-        return f"not enough poses: {len(est)} matched, an alignment needs {MIN_POSES}"
-    x, y = est - est.mean(axis=0), gt - gt.mean(axis=0)
-    size_x, size_y = np.linalg.norm(x), np.linalg.norm(y)
-    if not np.isfinite([size_x, size_y]).all():
-        return "positions too large: the error is not a finite number"
-    for name, positions, size in (("estimate", est, size_x), ("truth", gt, size_y)):
-        if size <= 1e-12 * max(float(np.abs(positions).max()), 1e-300):
+def _degeneracy(x: np.ndarray, y: np.ndarray) -> str:
+    """Why (M, 3) positions of estimate and truth determine no alignment, or the empty string."""
+    if len(x) < MIN_POSES:
+        return f"not enough poses: {len(x)} matched, an alignment needs {MIN_POSES}"
+    centred = []
+    for name, positions in (("estimate", x), ("ground truth", y)):
+        moved = positions - positions.mean(axis=0)
+        size = float(np.linalg.norm(moved))
+        if not np.isfinite(size):
+            return NOT_FINITE
+        if size <= 1e-12 * float(np.abs(positions).max()):
             return f"static camera: the positions of the {name} do not move"
-    widths = np.linalg.svd((y / size_y).T @ (x / size_x), compute_uv=False)
-    if widths[1] <= _STRAIGHT:
-        return (
-            "degenerate covariance rank: the camera moves on a straight line, which leaves the "
-            "rotation about it open"
-        )
+        centred.append(moved / size)
+    if np.linalg.svd(centred[1].T @ centred[0], compute_uv=False)[1] <= MIN_WIDTH:
+        return "straight line: the camera path leaves the rotation about it open"
     return ""
 
 
-def _align(est: Any, gt: Any, alignment: Alignment, scale: Scale) -> tuple[np.ndarray, float, str]:
+def _align(est: Any, gt: Any, alignment: Alignment) -> tuple[np.ndarray, float, str]:
     """Align the evo path ``est`` to ``gt`` in place: (T_gt_est, scale, reason why it failed)."""
     from evo import EvoException
-    from evo.core.geometry import umeyama_alignment
-    from evo.core.lie_algebra import se3
 
     if alignment == "none":
         return np.eye(4), 1.0, ""
     if alignment == "origin":
         return np.asarray(est.align_origin(gt)), 1.0, ""
-    x, y = est.positions_xyz, gt.positions_xyz
-    reason = _degeneracy(x, y)
+    reason = _degeneracy(est.positions_xyz, gt.positions_xyz)
     if reason:
         return np.eye(4), 1.0, reason
     try:
-        R, t, s = umeyama_alignment(x.T, y.T, with_scale=alignment == "sim3")
+        R, t, scale = est.align(gt, correct_scale=alignment == "sim3")
     except (EvoException, np.linalg.LinAlgError) as error:
         return np.eye(4), 1.0, f"evo: {error}"
-    if alignment == "sim3" and scale == "norms":
-        # |y|^2 / <y, R x>: the inverse of the factor that brings the truth onto the estimate;
-        # larger than Umeyama's <y, R x> / |x|^2
-        centred = y - y.mean(axis=0)
-        dots = float((centred * (x @ R.T)).sum())
-        s = float((centred**2).sum()) / dots if dots > 0 else 0.0
-        t = y.mean(axis=0) - s * (R @ x.mean(axis=0))
-    if s <= 0:
+    if scale <= 0:
         return np.eye(4), 1.0, "the paths are not correlated: no positive scale fits"
-    est.scale(s)
-    est.transform(se3(R, t))
-    return se3(R, t), float(s), ""
-
-
-def _check_options(alignment: str, scale: str) -> None:
-    if alignment not in ("se3", "sim3", "origin", "none"):
-        raise InputError(f"alignment: expected se3, sim3, origin or none, got {alignment!r}.")
-    if scale not in ("umeyama", "norms"):
-        raise InputError(f"scale: expected umeyama or norms, got {scale!r}.")
-
-
-def _statistics(errors: np.ndarray) -> dict[str, float] | None:
-    """rmse, mean, median and max of the errors, or None where one of them is not finite."""
-    values = {
-        "rmse": float(np.sqrt(np.mean(errors**2))),
-        "mean": float(np.mean(errors)),
-        "median": float(np.median(errors)),
-        "max": float(np.max(errors)),
-    }
-    return values if np.isfinite(list(values.values())).all() else None
-
-
-_NOT_FINITE = "positions too large: the error is not a finite number"
-
-
-def _ape(est: Any, gt: Any) -> np.ndarray:
-    from evo.core.metrics import APE, PoseRelation
-
-    metric = APE(PoseRelation.translation_part)
-    metric.process_data((gt, est))
-    return np.asarray(metric.error, dtype=np.float64)
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R, t
+    return T, float(scale), ""
 
 
 @np.errstate(over="ignore", invalid="ignore")
@@ -218,229 +178,275 @@ def ate(
     gt: Trajectory,
     alignment: Alignment = "se3",
     *,
-    scale: Scale = "umeyama",
-    max_diff: float | None = None,
     association: Association | None = None,
-) -> AbsoluteError:
-    """Absolute trajectory error through evo.
+) -> TrajectoryError:
+    """Absolute trajectory error: distances of matched positions after the alignment.
 
     Args:
         est: estimated trajectory.
-        gt: true trajectory.
-        alignment: ``se3`` (rigid, least squares over all positions: the rule for metric methods),
-            ``sim3`` (with scale), ``origin`` (first matched poses made equal), ``none``.
-        scale: with ``sim3``: ``umeyama``, or ``norms`` (squared norm of the truth over its dot
-            product with the estimate, as TartanAir's evaluator scales).
-        max_diff: see :func:`associate`.
-        association: matches found before, to save the search.
-
-    Returns:
-        The error; None with a reason where it cannot be computed. Never raises on what the
-        trajectories hold.
-
-    Raises:
-        InputError: an unknown option.
+        gt: ground truth.
+        alignment: ``se3`` (rigid, least squares: the rule for metric methods), ``sim3`` (with
+            scale), ``origin`` (first matched poses made equal) or ``none``.
+        association: matches found before.
     """
-    _check_options(alignment, scale)
-    match = association or associate(est, gt, max_diff=max_diff)
-    names = ("rmse", "mean", "median", "max")
-    reasons: dict[str, str] = {}
-    statistics: dict[str, float] | None = None
-    unaligned: float | None = None
-    T_gt_est = errors = stamps = factor = None
-    if match.reason:
-        reasons = dict.fromkeys((*names, "rmse_unaligned", "scale"), match.reason)
-    else:
-        est_path, gt_path = _to_evo(est, match.est_indices), _to_evo(gt, match.gt_indices)
-        raw = _statistics(_ape(est_path, gt_path))
-        if raw:
-            unaligned = raw["rmse"]
-        else:
-            reasons["rmse_unaligned"] = _NOT_FINITE
-        T, s, reason = _align(est_path, gt_path, alignment, scale)
-        if not reason:
-            found = _ape(est_path, gt_path)
-            statistics = _statistics(found)
-            reason = "" if statistics else _NOT_FINITE
-        if reason:
-            reasons.update(dict.fromkeys((*names, "scale"), reason))
-        else:
-            T_gt_est, factor, errors, stamps = T, s, found, gt.timestamps[match.gt_indices]
-    return AbsoluteError(
-        **{name: statistics[name] if statistics else None for name in names},
-        rmse_unaligned=unaligned,
-        alignment=alignment,
-        scale=factor,
-        scale_kind=scale,
-        matched=match.matched,
-        total=match.total,
-        evo_version=_evo_version(),
-        reasons=reasons,
-        T_gt_est=T_gt_est,
-        errors=errors,
-        timestamps=stamps,
-    )
+    from evo.core.metrics import APE, PoseRelation
+
+    match = association or associate(est, gt)
+    nothing = np.zeros(0)
+    reason = match.reason
+    if not reason:
+        paths = _to_evo(est, match.est_indices), _to_evo(gt, match.gt_indices)
+        T, scale, reason = _align(*paths, alignment)
+    if not reason:
+        metric = APE(PoseRelation.translation_part)
+        metric.process_data((paths[1], paths[0]))
+        errors = np.asarray(metric.error)
+        if np.isfinite(errors**2).all():
+            stamps = gt.timestamps[match.gt_indices]
+            return TrajectoryError(errors, nothing, scale, T, stamps, alignment)
+        reason = NOT_FINITE
+    return TrajectoryError(nothing, nothing, None, None, nothing, alignment, reason)
 
 
 @np.errstate(over="ignore", invalid="ignore")
 def rpe(
     est: Trajectory,
     gt: Trajectory,
-    delta: int = 1,
+    delta: float = 1,
+    delta_unit: DeltaUnit = "frames",
     alignment: Alignment = "se3",
     *,
-    scale: Scale = "umeyama",
-    max_diff: float | None = None,
     association: Association | None = None,
-) -> RelativeError:
-    """Relative pose error over ``delta`` matched frames through evo, all (overlapping) pairs.
+) -> TrajectoryError:
+    """Relative pose error over all (overlapping) pairs that are ``delta`` apart.
 
     Args:
         est: estimated trajectory.
-        gt: true trajectory.
-        delta: frames between the two poses of a pair.
+        gt: ground truth.
+        delta: distance of the two poses of a pair.
+        delta_unit: ``frames``, or ``s``: the partner is the pose nearest to that time, at most
+            half a frame away.
         alignment: only ``sim3`` changes the values: its scale is applied to the estimate.
-        scale: see :func:`ate`.
-        max_diff: see :func:`associate`.
-        association: matches found before, to save the search.
-
-    Returns:
-        The error; None with a reason where it cannot be computed. Two poses are enough unless a
-        scale is wanted.
-
-    Raises:
-        InputError: an unknown option, or ``delta`` below 1.
+        association: matches found before.
     """
-    _check_options(alignment, scale)
-    if isinstance(delta, bool) or not isinstance(delta, Real) or delta % 1 or delta < 1:
-        raise InputError(f"delta: expected a number of frames >= 1, got {delta!r}.")
-    match = association or associate(est, gt, max_diff=max_diff)
-    reason, factor = match.reason, 1.0
-    if not reason and match.matched <= delta:
-        reason = f"not enough poses: {match.matched} matched, a pair spans {delta + 1}"
-    trans = rot = None
-    if not reason:
-        est_path, gt_path = _to_evo(est, match.est_indices), _to_evo(gt, match.gt_indices)
-        if alignment == "sim3":
-            _, factor, reason = _align(est_path, gt_path, alignment, scale)
-    if not reason:
-        from evo.core.metrics import RPE, PoseRelation, Unit
+    from evo.core.metrics import RPE
 
-        metric = RPE(PoseRelation.translation_part, int(delta), Unit.frames, all_pairs=True)
-        metric.process_data((gt_path, est_path))
-        trans = _statistics(np.asarray(metric.error, dtype=np.float64))
-        # evo's formula for the angles, for all pairs at once: one by one they took most of the time
-        turns = Rotation.from_matrix(np.array(metric.E)[:, :3, :3]).as_rotvec()
-        rot = _statistics(np.rad2deg(np.linalg.norm(turns, axis=1)))
-    values: dict[str, float | None] = {}
-    reasons: dict[str, str] = {}
-    for prefix, suffix, statistics in (("trans", "", trans), ("rot", "_deg", rot)):
-        for name in ("rmse", "mean", "median"):
-            key = f"{prefix}_{name}{suffix}"
-            values[key] = statistics[name] if statistics else None
-            if statistics is None:
-                reasons[key] = reason or _NOT_FINITE
-    return RelativeError(
-        **values,
-        delta=int(delta),
-        pairs=0 if reason else match.matched - int(delta),
-        alignment=alignment,
-        scale=None if reason else factor,
-        matched=match.matched,
-        total=match.total,
-        evo_version=_evo_version(),
-        reasons=reasons,
-    )
+    match = association or associate(est, gt)
+    nothing = np.zeros(0)
+    reason, scale = match.reason, 1.0
+    if not reason and delta_unit == "s" and match.by != "time":
+        reason = "a distance in seconds needs timestamps in both trajectories"
+    if not reason:
+        stamps = gt.timestamps[match.gt_indices]
+        first, last = _pairs(stamps, delta, delta_unit)
+        if not len(first):
+            reason = f"not enough poses: of {len(stamps)} no two are {delta:g} {delta_unit} apart"
+    if not reason:
+        paths = _to_evo(est, match.est_indices), _to_evo(gt, match.gt_indices)
+        if alignment == "sim3":
+            _, scale, reason = _align(*paths, "sim3")
+    if not reason:
+        P, Q = (path.poses_se3 for path in paths)
+        pairs = zip(first, last, strict=True)
+        E = np.array([RPE.rpe_base(Q[i], Q[j], P[i], P[j]) for i, j in pairs])
+        translation = np.linalg.norm(E[:, :3, 3], axis=1)
+        if np.isfinite(translation**2).all():
+            angles = np.degrees(Rotation.from_matrix(E[:, :3, :3]).magnitude())
+            return TrajectoryError(translation, angles, scale, None, stamps[first], alignment)
+        reason = NOT_FINITE
+    return TrajectoryError(nothing, nothing, None, None, nothing, alignment, reason)
+
+
+def _pairs(stamps: np.ndarray, delta: float, unit: DeltaUnit) -> tuple[np.ndarray, np.ndarray]:
+    """Indices of the first and last pose of each pair."""
+    first = np.arange(len(stamps))
+    if unit == "frames":
+        last = first + int(delta)
+    else:
+        goal = stamps + delta
+        last = np.searchsorted(stamps, goal)
+        before = np.clip(last - 1, 0, len(stamps) - 1)
+        after = np.clip(last, 0, len(stamps) - 1)
+        nearer = np.abs(stamps[before] - goal) < np.abs(stamps[after] - goal)
+        last = np.where(nearer, before, after)
+        half = np.median(np.diff(stamps)) / 2 if len(stamps) > 1 else 0.0
+        # half a frame, and rounding of the stamps
+        last[np.abs(stamps[last] - goal) > 1.01 * half] = len(stamps)
+    inside = (last < len(stamps)) & (last > first)
+    return first[inside], last[inside]
 
 
 @np.errstate(over="ignore", invalid="ignore")
-def evaluate_trajectories(
-    est: Trajectory,
+def kitti_drift(
+    T_world_cam_est: np.ndarray,
+    T_world_cam_gt: np.ndarray,
+    *,
+    lengths: Sequence[float] = KITTI_LENGTHS,
+) -> dict[str, Any]:
+    """Drift as KITTI's odometry benchmark defines it (Geiger et al., CVPR 2012).
+
+    From every frame and for every length L, the sub-path ends at the first frame whose distance
+    along the true path exceeds L; translation and angle of its relative error are divided by L and
+    averaged within each length, then over the lengths (as TartanAir's evaluator). Nothing is
+    aligned or scaled.
+
+    Args:
+        T_world_cam_est: (N, 4, 4) estimated camera to world, metres.
+        T_world_cam_gt: (N, 4, 4) true camera to world of the same frames, metres.
+        lengths: of the sub-paths, metres.
+
+    Returns:
+        ``translation`` (fraction) and ``rotation_deg_per_m``, None with ``reasons`` where the path
+        is shorter than every length; ``segments``, ``path_length_m``.
+    """
+    est, gt = np.asarray(T_world_cam_est), np.asarray(T_world_cam_gt)
+    steps = np.linalg.norm(np.diff(gt[:, :3, 3], axis=0), axis=1)
+    distance = np.concatenate([[0.0], np.cumsum(steps)])
+    means, segments = [], 0
+    for length in lengths:
+        last = np.searchsorted(distance, distance + length, side="right")
+        (first,) = np.nonzero(last < len(gt))
+        if len(first):
+            last = last[first]
+            error = invert(invert(est[first]) @ est[last]) @ (invert(gt[first]) @ gt[last])
+            translation = np.linalg.norm(error[:, :3, 3], axis=1).mean() / length
+            rotation = np.degrees(rotation_angle(error[:, :3, :3])).mean() / length
+            means.append((translation, rotation))
+            segments += len(first)
+    values = [float(x) for x in np.mean(means, axis=0)] if means else [np.nan, np.nan]
+    report: dict[str, Any] = {
+        "segments": segments,
+        "path_length_m": float(distance[-1]) if np.isfinite(distance[-1]) else None,
+        "reasons": {},
+    }
+    for name, value in zip(("translation", "rotation_deg_per_m"), values, strict=True):
+        report[name] = value if np.isfinite(value) else None
+        if report[name] is None:
+            short = f"the true path of {distance[-1]:.4g} m is shorter than {min(lengths):g} m"
+            report["reasons"][name] = NOT_FINITE if means else short
+    return report
+
+
+def nees(T_est: np.ndarray, T_gt: np.ndarray, covariance: np.ndarray) -> float:
+    """Normalised estimation error squared of one motion: 6 on average where sigma is right.
+
+    Args:
+        T_est: (4, 4) estimated T_curr_prev.
+        T_gt: (4, 4) true T_curr_prev.
+        covariance: (6, 6) of ``Exp(delta) T_est``, translation first, m^2 and rad^2.
+    """
+    error = se3_log(T_gt @ invert(T_est))
+    # whitened by the standard deviations: metres and radians may differ by many powers of ten
+    std = np.sqrt(np.diag(covariance))
+    return float(error / std @ np.linalg.solve(covariance / np.outer(std, std), error / std))
+
+
+def _statistics(errors: np.ndarray) -> dict[str, float]:
+    """rmse, mean, median and max; empty for no errors."""
+    if not len(errors):
+        return {}
+    values = (np.sqrt(np.mean(errors**2)), errors.mean(), np.median(errors), errors.max())
+    return dict(zip(("rmse", "mean", "median", "max"), map(float, values), strict=True))
+
+
+def _check(alignment: str, delta: float, delta_unit: str, max_diff: float | None) -> None:
+    if alignment not in ("se3", "sim3", "origin", "none"):
+        raise InputError(f"alignment: expected se3, sim3, origin or none, got {alignment!r}.")
+    if delta_unit not in ("frames", "s"):
+        raise InputError(f"delta_unit: expected frames or s, got {delta_unit!r}.")
+    whole = delta_unit == "s" or float(delta).is_integer()
+    if not (0 < delta < np.inf and whole):
+        raise InputError(f"delta: expected a positive number of {delta_unit}, got {delta!r}.")
+    if max_diff is not None and not 0 <= max_diff < np.inf:
+        raise InputError(f"max_diff: expected seconds >= 0, got {max_diff!r}.")
+
+
+def evaluate(
+    estimate: Trajectory,
     gt: Trajectory,
     *,
     alignment: Alignment = "se3",
-    scale: Scale = "umeyama",
-    delta: int = 1,
+    delta: float = 1,
+    delta_unit: DeltaUnit = "frames",
     max_diff: float | None = None,
-    start_step: int = 1,
 ) -> dict[str, Any]:
     """Every trajectory error of one estimate, JSON-ready.
 
     Args:
-        est: estimated trajectory.
-        gt: true trajectory.
+        estimate: estimated trajectory.
+        gt: ground truth.
         alignment: of ``ate_rmse`` and its companions; ``se3`` for metric methods.
-        scale: see :func:`ate`.
-        delta: frames of the relative error.
+        delta: of the relative error.
+        delta_unit: ``frames`` or ``s``.
         max_diff: see :func:`associate`.
-        start_step: frames between the starts of the KITTI drift.
 
     Returns:
-        ``ate_rmse``, ``ate_mean``, ``ate_median``, ``ate_max`` (m, ``alignment``),
-        ``ate_rmse_unaligned``, ``ate_rmse_origin``, ``ate_rmse_sim3`` with ``scale_sim3`` and
-        ``ate_rmse_norms`` with ``scale_norms``; ``rpe_trans_rmse`` (m) and ``rpe_rot_rmse_deg``;
-        ``kitti_drift`` (100 to 800 m) and ``kitti_drift_short`` (5 to 40 m); ``alignment``,
-        ``scale``, ``matched``, ``total``, ``evo_version``; ``reasons`` for every None.
+        ``ate_rmse``, ``ate_mean``, ``ate_median``, ``ate_max`` (m, after ``alignment``),
+        ``ate_rmse_unaligned``, ``ate_rmse_origin``, ``ate_rmse_sim3`` with ``scale_sim3``;
+        ``rpe_trans_rmse`` (m), ``rpe_rot_rmse_deg`` and their mean and median, with the suffix
+        ``_sim3`` after a similarity; ``kitti_drift`` (100 to 800 m) and ``kitti_drift_short``
+        (5 to 40 m); ``matched``, ``total``; ``reasons`` for every None.
 
     Raises:
-        InputError: an unknown option.
+        InputError: no trajectory, or an unknown option.
     """
-    match = associate(est, gt, max_diff=max_diff)
-    main = ate(est, gt, alignment, scale=scale, association=match)
-    others = {
-        "origin": ate(est, gt, "origin", association=match),
-        "sim3": ate(est, gt, "sim3", association=match),
-        "norms": ate(est, gt, "sim3", scale="norms", association=match),
-    }
-    relative = rpe(est, gt, delta, alignment, scale=scale, association=match)
+    import evo
+
+    for name, value in (("estimate", estimate), ("gt", gt)):
+        if not isinstance(value, Trajectory):
+            raise InputError(
+                f"evaluate.{name}: expected a Trajectory, got {type(value).__name__}. Files are "
+                f"read by hybridvo.trajectory.read_trajectory."
+            )
+    _check(alignment, delta, delta_unit, max_diff)
+    match = associate(estimate, gt, max_diff=max_diff)
     report: dict[str, Any] = {
         "alignment": alignment,
-        "scale": main.scale,
-        "scale_kind": scale,
-        "delta_frames": int(delta),
-        "matched": match.matched,
+        "delta": float(delta),
+        "delta_unit": delta_unit,
+        "matched": len(match.est_indices),
         "total": match.total,
         "matched_by": match.by,
         "max_time_difference_s": match.max_diff,
-        "poses_estimate": len(est),
-        "poses_truth": len(gt),
-        "evo_version": main.evo_version,
+        "poses_estimate": len(estimate),
+        "poses_gt": len(gt),
+        "evo_version": str(evo.__version__).lstrip("v"),
     }
     reasons: dict[str, str] = {}
-    for key, trajectory in (("length_estimate_m", est), ("length_truth_m", gt)):
-        report[key] = trajectory.length if np.isfinite(trajectory.length) else None
-        if report[key] is None:
-            reasons[key] = _NOT_FINITE
 
-    def put(key: str, result: AbsoluteError | RelativeError, name: str) -> None:
-        report[key] = getattr(result, name)
-        if name in result.reasons:
-            reasons[key] = result.reasons[name]
+    def put(key: str, value: float | None, reason: str) -> None:
+        report[key] = value
+        if value is None:
+            reasons[key] = reason
 
-    for name in ("rmse", "mean", "median", "max", "rmse_unaligned"):
-        put(f"ate_{name}", main, name)
-    for label, result in others.items():
-        put(f"ate_rmse_{label}", result, "rmse")
-        if label != "origin":
-            put(f"scale_{label}", result, "scale")
-    for name in ("trans_rmse", "trans_mean", "trans_median"):
-        put(f"rpe_{name}", relative, name)
-    for name in ("rot_rmse_deg", "rot_mean_deg", "rot_median_deg"):
-        put(f"rpe_{name}", relative, name)
-    if "scale" in main.reasons:
-        reasons["scale"] = main.reasons["scale"]
+    main = ate(estimate, gt, alignment, association=match)
+    for name in ("rmse", "mean", "median", "max"):
+        put(f"ate_{name}", _statistics(main.translation).get(name), main.reason)
+    put("scale", main.scale, main.reason)
+    other: Alignment
+    for other, suffix in (("none", "unaligned"), ("origin", "origin"), ("sim3", "sim3")):
+        error = ate(estimate, gt, other, association=match)
+        put(f"ate_rmse_{suffix}", error.rmse, error.reason)
+    put("scale_sim3", error.scale, error.reason)
+    for other, suffix in ((alignment, ""), ("sim3", "_sim3")):
+        relative = rpe(estimate, gt, delta, delta_unit, other, association=match)
+        for values, name, unit in (
+            (relative.translation, "trans", ""),
+            (relative.rotation_deg, "rot", "_deg"),
+        ):
+            for kind in ("rmse",) if suffix else ("rmse", "mean", "median"):
+                put(
+                    f"rpe_{name}_{kind}{unit}{suffix}",
+                    _statistics(values).get(kind),
+                    relative.reason,
+                )
+    poses = estimate.T_world_cam[match.est_indices], gt.T_world_cam[match.gt_indices]
     for key, lengths in (("kitti_drift", KITTI_LENGTHS), ("kitti_drift_short", SHORT_LENGTHS)):
-        report[key] = None
-        if match.reason:
-            reasons[key] = match.reason
-        else:
-            drift = kitti_drift(
-                est.T_world_cam[match.est_indices],
-                gt.T_world_cam[match.gt_indices],
-                lengths=lengths,
-                start_step=start_step,
-            )
-            report[key] = drift.to_dict()
+        put(key, None if match.reason else kitti_drift(*poses, lengths=lengths), match.reason)
+    for key, path in (("length_estimate_m", estimate), ("length_gt_m", gt)):
+        with np.errstate(over="ignore", invalid="ignore"):
+            length = path.length
+        put(key, length if np.isfinite(length) else None, NOT_FINITE)
     report["reasons"] = reasons
     return report
 
@@ -449,37 +455,33 @@ def evaluate_files(
     est_path: str | os.PathLike[str],
     gt_path: str | os.PathLike[str],
     *,
-    format_est: Format = "auto",
-    format_gt: Format = "auto",
-    axes_est: Axes = "auto",
-    axes_gt: Axes = "auto",
+    format_est: Any = "auto",
+    format_gt: Any = "auto",
+    axes_est: Any = "auto",
+    axes_gt: Any = "auto",
     **options: Any,
 ) -> dict[str, Any]:
-    """Every trajectory error between two files: what ``hybridvo evaluate EST GT`` prints.
+    """Errors between two trajectory files: what ``hybridvo evaluate EST GT`` prints.
 
     Args:
         est_path: estimated trajectory.
-        gt_path: true trajectory.
+        gt_path: ground truth.
         format_est: see :func:`hybridvo.trajectory.read_trajectory`.
-        format_gt: the same for the truth.
+        format_gt: the same for the ground truth.
         axes_est: see :func:`hybridvo.trajectory.read_trajectory`.
-        axes_gt: the same for the truth.
-        **options: of :func:`evaluate_trajectories`.
+        axes_gt: the same for the ground truth.
+        **options: of :func:`evaluate`.
 
     Returns:
-        The report of :func:`evaluate_trajectories` with ``estimate``, ``truth`` (paths) and
-        ``notices`` (what the readers changed).
+        The report of :func:`evaluate` with ``estimate``, ``gt`` (paths) and ``warnings`` (what the
+        readers changed).
 
     Raises:
-        InputError: a file that is missing or malformed (the message names file and line), or an
-            unknown option.
+        InputError: a file that is missing or malformed, or an unknown option.
     """
-    unknown = set(options) - set(inspect.signature(evaluate_trajectories).parameters)
-    if unknown:
-        raise InputError(f"evaluate_files: unknown option {', '.join(sorted(unknown))}.")
     est = read_trajectory(est_path, format_est, axes=axes_est)
     gt = read_trajectory(gt_path, format_gt, axes=axes_gt)
-    report = evaluate_trajectories(est, gt, **options)
-    report["estimate"], report["truth"] = os.fsdecode(est_path), os.fsdecode(gt_path)
-    report["notices"] = [*est.warnings, *gt.warnings]
+    report = evaluate(est, gt, **options)
+    report["estimate"], report["gt"] = os.fsdecode(est_path), os.fsdecode(gt_path)
+    report["warnings"] = [*est.warnings, *gt.warnings]
     return report

@@ -1,4 +1,4 @@
-"""Pictures of trajectories and of benchmarks: the only file that imports matplotlib.
+"""Images of trajectories, by matplotlib.
 
 Uses the object interface with the Agg canvas: no window, no pyplot, no global state.
 """
@@ -16,12 +16,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from hybridvo.errors import InputError
-from hybridvo.evaluation.metrics import AbsoluteError, Alignment, ate
+from hybridvo.evaluation.metrics import Alignment, TrajectoryError, ate
 from hybridvo.files import atomic_write
 from hybridvo.geometry import invert
 from hybridvo.trajectory import Trajectory
-
-__all__ = ["plot_benchmark", "plot_trajectories"]
 
 # Okabe and Ito's palette without yellow: told apart by colour-blind readers, in print too
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
@@ -34,7 +32,7 @@ _FORMATS = (".png", ".pdf", ".svg")
 
 def _fit(
     est: Trajectory, truth: Trajectory, alignment: Alignment
-) -> tuple[Trajectory, AbsoluteError | None]:
+) -> tuple[Trajectory, TrajectoryError | None]:
     """Estimate in the truth's world, by the best alignment that the paths determine."""
     for kind in dict.fromkeys((alignment, "origin")):
         error = ate(est, truth, kind)
@@ -45,7 +43,7 @@ def _fit(
     return est.transformed(T_gt_est), None
 
 
-def _label(name: str, error: AbsoluteError | None) -> str:
+def _label(name: str, error: TrajectoryError | None) -> str:
     if error is None or error.rmse is None:
         return f"{name} (no error: poses do not match)"
     unit, factor = ("m", 1.0) if error.rmse >= 1.0 else ("cm", 100.0)
@@ -100,11 +98,11 @@ def plot_trajectories(
     path = Path(path)
     _check_format(path)
     drawn: list[tuple[str, np.ndarray, dict[str, Any]]] = []
-    errors: list[tuple[AbsoluteError, dict[str, Any]]] = []
+    errors: list[tuple[TrajectoryError, dict[str, Any]]] = []
     if truth is not None:
         T_first_world = invert(truth.T_world_cam[0])
         style: dict[str, Any] = {"color": _TRUTH_COLOUR, "linewidth": 2.6, "alpha": 0.55}
-        drawn.append(("truth", truth.transformed(T_first_world).positions, style))
+        drawn.append(("ground truth", truth.transformed(T_first_world).positions, style))
     for index, (name, trajectory) in enumerate(trajectories.items()):
         style = {
             "color": _COLOURS[index % len(_COLOURS)],
@@ -142,12 +140,12 @@ def plot_trajectories(
     if errors:
         axes = figure.add_subplot(grid[1, :])
         timed = truth is not None and truth.has_timestamps
-        largest = max(float(np.max(error.errors)) for error, _ in errors)  # type: ignore[arg-type]
+        largest = max(float(np.max(error.translation)) for error, _ in errors)  # type: ignore[arg-type]
         unit, factor = ("m", 1.0) if largest >= 1.0 else ("cm", 100.0)
         _style(axes, "Position error", "time [s]" if timed else "frame", f"error [{unit}]")
         start_time = truth.timestamps[0] if truth is not None and timed else 0.0
         for error, style in errors:
-            axes.plot(error.timestamps - start_time, error.errors * factor, **style)  # type: ignore[operator]
+            axes.plot(error.timestamps - start_time, error.translation * factor, **style)  # type: ignore[operator]
         axes.set_ylim(bottom=0.0)
         axes.margins(x=0.01)
     handles = [figure.axes[0].lines[i] for i in range(len(drawn))]

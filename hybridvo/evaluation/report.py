@@ -1,185 +1,378 @@
-"""Numbers to files and tables: JSON, CSV, Markdown and text for terminals.
+"""The report of a comparison: ``report.html`` (one file, interactive) and ``report.md``.
 
-Numbers are written in full (Python's shortest form that reads back to the same float), tables for
-people are rounded. What cannot be computed is ``null`` in JSON, empty in CSV and a dash in tables.
+Read from ``results.json``, ``pairs.csv`` and ``trajectories/`` of the output folder. Estimated flow
+stands before true flow (an oracle) everywhere.
 """
 
 from __future__ import annotations
 
-import csv
-import enum
-import io
+import base64
 import json
 import math
 import os
-import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+import pandas as pd
 
-from hybridvo.errors import InputError
+from hybridvo.errors import FormatError, InputError
+from hybridvo.evaluation.charts import (
+    error_distribution,
+    factor_charts,
+    failure_chart,
+    path_charts,
+    time_chart,
+)
+from hybridvo.evaluation.tables import jsonable as jsonable  # until its readers have moved
+from hybridvo.evaluation.tables import table_text as table_text
+from hybridvo.evaluation.tables import to_json as to_json
+from hybridvo.evaluation.tables import write_csv as write_csv
+from hybridvo.evaluation.tables import write_json as write_json
 from hybridvo.files import atomic_write
-
-__all__ = ["jsonable", "table_markdown", "table_text", "to_json", "write_csv", "write_json"]
 
 MISSING = "-"
 """What a table shows where there is no number."""
+OURS = ("hybrid", "hybrid-flow", "refine", "pwvo-refine", "pwvo")
+"""Methods of this package; the others are peers, or the paper's networks."""
+LEVEL = 1.02
+"""Ratio of two errors below which neither has won."""
+EMBEDDED_BYTES = 2_000_000
+"""Images that the page holds, so that it stays below 8 MB with plotly's 5 MB."""
+
+Column = tuple[str, str, float]
+RESULT_COLUMNS: tuple[Column, ...] = (
+    ("epe_l2_px_median", "EPE, median [px]", 1.0),
+    ("epe_l2_px", "EPE, mean [px]", 1.0),
+    ("failures", "failures (> 1 px)", 1.0),
+    ("failure_rate", "failures [%]", 100.0),
+    ("rot_err_deg_median", "rotation [deg]", 1.0),
+    ("trans_err_median", "translation [cm]", 100.0),
+    ("ate_rmse", "ATE [cm]", 100.0),
+    ("rpe_trans_rmse", "RPE [cm]", 100.0),
+    ("rpe_rot_rmse_deg", "RPE [deg]", 1.0),
+    ("ms_per_pair_median", "time [ms]", 1.0),
+    ("flow_ms_median", "+ flow [ms]", 1.0),
+    ("pairs", "pairs", 1.0),
+    ("failed", "given up", 1.0),
+)
+SEQUENCE_COLUMNS: tuple[Column, ...] = (
+    *RESULT_COLUMNS,
+    ("rot_err_deg_mean", "rotation, mean [deg]", 1.0),
+    ("trans_err_mean", "translation, mean [cm]", 100.0),
+    ("epe", "paper's EPE [px]", 1.0),
+    ("r_err_deg", "paper's R_err [deg]", 1.0),
+    ("t_err", "paper's T_err [cm]", 100.0),
+    ("dynamic_fraction", "moving [%]", 100.0),
+)
+MORE_IS_NO_MERIT = ("pairs", "flow_ms_median", "dynamic_fraction")
+"""Columns without a best value."""
 
 
-def jsonable(value: Any) -> Any:
-    """Plain JSON value: NaN and inf become None, arrays lists, paths and enums their text.
-
-    Raises:
-        InputError: a value that JSON has no form for; the message names its type.
-    """
-    if value is None or isinstance(value, (bool, str)):
-        return value
-    if isinstance(value, enum.Enum):
-        return jsonable(value.value)
-    if isinstance(value, (np.bool_, np.integer, np.floating)):
-        return jsonable(value.item())
-    if isinstance(value, int):
-        return value
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, np.ndarray):
-        return jsonable(value.tolist())
-    if isinstance(value, Mapping):
-        return {str(jsonable(key)): jsonable(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple, set, frozenset)):
-        items = sorted(value, key=str) if isinstance(value, (set, frozenset)) else value
-        return [jsonable(item) for item in items]
-    if isinstance(value, os.PathLike):
-        return os.fspath(value)
-    raise InputError(f"report: a {type(value).__name__} cannot be written as JSON.")
-
-
-def to_json(data: Any) -> str:
-    """JSON text, keys sorted, two spaces, a final newline; floats read back to the same value."""
-    text = json.dumps(jsonable(data), sort_keys=True, indent=2, ensure_ascii=False) + "\n"
-    # a path that is no UTF-8 holds lone surrogates, which no file can: as escapes they read back
-    return re.sub("[\ud800-\udfff]", lambda found: f"\\u{ord(found[0]):04x}", text)
-
-
-def write_json(path: str | os.PathLike[str], data: Any) -> None:
-    """Write :func:`to_json` of ``data``, completely or not at all.
-
-    Raises:
-        InputError: a value that JSON has no form for. OutputError: the file cannot be written.
-    """
-    text = to_json(data)
-    with atomic_write(path) as file:
-        file.write(text)
-
-
-def _columns(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None) -> list[str]:
-    """Given columns, or all keys in the order in which they first appear."""
-    return list(columns) if columns is not None else list(dict.fromkeys(k for r in rows for k in r))
-
-
-def write_csv(
-    path: str | os.PathLike[str],
-    rows: Iterable[Mapping[str, Any]],
-    columns: Sequence[str] | None = None,
-) -> None:
-    """Write rows as CSV with a header line, numbers in full, completely or not at all.
+def write_report(folder: str | os.PathLike[str]) -> list[Path]:
+    """Write ``report.html`` and ``report.md`` of a comparison.
 
     Args:
-        path: file to write.
-        rows: mappings from column to value; None, NaN and inf become empty cells.
-        columns: order of the columns; default: as they first appear. Other keys are left out.
+        folder: output of :func:`hybridvo.evaluation.comparison.compare`.
 
     Raises:
-        OutputError: the file cannot be written.
+        InputError: no ``results.json`` or ``pairs.csv``. FormatError: they are not a comparison's.
+        OutputError: a file cannot be written.
     """
-    rows = list(rows)
-    names = _columns(rows, columns)
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(names)
-    for row in rows:
-        cells = (jsonable(row.get(name)) for name in names)
-        # repr, not str(): the same for a float, and explicit that every digit is meant
-        writer.writerow([repr(c) if isinstance(c, float) else c for c in cells])
-    with atomic_write(path, "wb") as file:  # a message may name a path that is no UTF-8
-        file.write(text.getvalue().encode("utf-8", "backslashreplace"))
+    import jinja2
+    from plotly.offline import get_plotlyjs
 
-
-def _cell(value: Any, spec: str) -> str:
-    value = jsonable(value)
-    if value is None:
-        return MISSING
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, float):
-        return format(value, spec)
-    return str(value)
-
-
-def _table(
-    rows: Iterable[Mapping[str, Any]],
-    columns: Sequence[str] | None,
-    headers: Mapping[str, str] | None,
-    formats: Mapping[str, str] | None,
-) -> tuple[list[str], list[list[str]], list[bool]]:
-    """Header, cells, and which columns hold numbers (and stand to the right)."""
-    rows = list(rows)
-    names = _columns(rows, columns)
-    specs = formats or {}
-    cells = [[_cell(row.get(name), specs.get(name, ".4g")) for name in names] for row in rows]
-    numeric = [
-        any(isinstance(row.get(name), (int, float, np.number)) for row in rows)
-        and not any(isinstance(row.get(name), (str, Path)) for row in rows)
-        for name in names
+    folder = Path(folder)
+    result, pairs = read_comparison(folder)
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+    )
+    methods = list(dict.fromkeys(row["method"] for row in result["totals"]))
+    sections = [
+        ("How the errors are distributed", error_distribution(pairs, methods)),
+        ("How often an estimate fails", failure_chart(result["breakdown"], methods)),
+        ("What makes it fail", factor_charts(result["breakdown"], methods)),
+        ("Error against time", time_chart(result["totals"], methods)),
     ]
-    return [(headers or {}).get(name, name) for name in names], cells, numeric
+    html = environment.get_template("report.html").render(
+        headline=headline(result),
+        result=result,
+        pairs=len(pairs.drop_duplicates(["sequence", "index"])),
+        methods=methods,
+        tables=[(flow, html_table(rows, RESULT_COLUMNS)) for flow, rows in by_flow(result)],
+        worst=_gallery(folder, result),
+        sections=[
+            (name, [_json(chart) for chart in charts]) for name, charts in sections if charts
+        ],
+        sequences=[
+            (name, [_json(chart) for chart in path_charts(folder, result, pairs, name, methods)])
+            for name in dict.fromkeys(row["sequence"] for row in result["rows"])
+        ],
+        protocol=_protocol_tables(result),
+        numbers=html_table(
+            [row for _, rows in by_flow(result, "rows") for row in rows],
+            SEQUENCE_COLUMNS,
+            ("sequence", "method", "flow_source"),
+        ),
+        provenance=_provenance(result),
+        plotly=get_plotlyjs(),
+    )
+    written = {"report.html": html, "report.md": _markdown(result)}
+    for name, text in written.items():
+        with atomic_write(folder / name) as file:
+            file.write(text)
+    return [folder / name for name in written]
 
 
-def table_markdown(
-    rows: Iterable[Mapping[str, Any]],
-    columns: Sequence[str] | None = None,
-    *,
-    headers: Mapping[str, str] | None = None,
-    formats: Mapping[str, str] | None = None,
-) -> str:
-    """Markdown table, numbers to the right; a missing value is a dash.
+def read_comparison(folder: Path) -> tuple[dict[str, Any], pd.DataFrame]:
+    """``results.json`` and ``pairs.csv`` of a folder."""
+    try:
+        result = json.loads((folder / "results.json").read_text(encoding="utf-8"))
+        pairs = pd.read_csv(folder / "pairs.csv")
+        return result | {"rows": [*result["rows"]], "totals": [*result["totals"]]}, pairs
+    except FileNotFoundError as error:
+        raise InputError(
+            f"{error.filename}: no such file; expected the output folder of a comparison."
+        ) from None
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise FormatError(
+            f"{folder}: results.json or pairs.csv is not what a comparison writes: {error!r}."
+        ) from None
 
-    Args:
-        rows: mappings from column to value.
-        columns: order of the columns; default: as they first appear.
-        headers: text above a column, by its name.
-        formats: format of a column's floats, by its name; default ``.4g``.
+
+def is_oracle(flow: str) -> bool:
+    """Whether a source of flow is ground truth."""
+    return "(true)" in flow
+
+
+def by_flow(result: Mapping[str, Any], key: str = "totals") -> list[tuple[str, list[Any]]]:
+    """Rows by source of flow, estimated ones first."""
+    flows = sorted(dict.fromkeys(row["flow_source"] for row in result[key]), key=is_oracle)
+    return [(flow, [r for r in result[key] if r["flow_source"] == flow]) for flow in flows]
+
+
+def ranking(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """Scored rows of one source of flow: fewest failures first, then the smallest median error."""
+    scored = [r for r in rows if r["epe_l2_px_median"] is not None and r["method"] != "identity"]
+    return sorted(scored, key=lambda row: (row["failure_rate"], row["epe_l2_px_median"]))
+
+
+def headline(result: Mapping[str, Any]) -> str:
+    """One sentence: who won, by how much, under which flow; and where the winner is worst."""
+    flow, rows = by_flow(result)[0]
+    order = ranking(rows)
+    if not order:
+        return "Nothing is scored: no pair has ground truth and depth."
+    first = order[0]
+    oracle = ", an oracle" if is_oracle(flow) else ""
+    text = f"With {flow} flow{oracle}, {first['method']} has the smallest errors: {_score(first)}"
+    for label, others in (
+        ("next is", order[1:2]),
+        ("the best of others is", [r for r in order[2:] if r["method"] not in OURS][:1]),
+    ):
+        for row in others:
+            text += f"; {label} {row['method']} with {_score(row)}{_times(row, first)}"
+    worst = [
+        entry
+        for entry in result["worst_pairs"]
+        if (entry["method"], entry["flow_source"]) == (first["method"], flow)
+    ]
+    if worst and worst[0]["epe_l2_px"] is not None:
+        place = f"{worst[0]['sequence']}, pair {worst[0]['index']}"
+        text += f". Its worst pair is {place}: {number(worst[0]['epe_l2_px'])} px"
+    return text + "."
+
+
+def _score(row: Mapping[str, Any]) -> str:
+    return (
+        f"{number(row['epe_l2_px_median'])} px median error of the ego flow, {row['failures']} "
+        f"failures (above 1 px or given up) in {row['pairs']} pairs"
+    )
+
+
+def _times(row: Mapping[str, Any], first: Mapping[str, Any]) -> str:
+    if not first["epe_l2_px_median"]:
+        return ""
+    ratio = row["epe_l2_px_median"] / first["epe_l2_px_median"]
+    return " (level)" if 1 / LEVEL < ratio < LEVEL else f" ({number(ratio, 2)} times)"
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """Significant digits without an exponent where it is readable; a dash for None.
+
+    Example:
+        >>> number(1234.5), number(0.012345), number(0.0), number(None)
+        ('1234', '0.0123', '0', '-')
     """
-    head, cells, numeric = _table(rows, columns, headers, formats)
-
-    def line(items: Iterable[str]) -> str:
-        return (
-            "| " + " | ".join(item.replace("|", "\\|").replace("\n", " ") for item in items) + " |"
-        )
-
-    rule = "|" + "|".join("---:" if right else "---" for right in numeric) + "|"
-    return "\n".join([line(head), rule, *(line(row) for row in cells)]) + "\n"
+    if value is None or not math.isfinite(value):
+        return MISSING
+    if value == 0 or abs(value) >= 10**digits:
+        return f"{value:.0f}"
+    return f"{value:.{digits}g}"
 
 
-def table_text(
-    rows: Iterable[Mapping[str, Any]],
-    columns: Sequence[str] | None = None,
-    *,
-    headers: Mapping[str, str] | None = None,
-    formats: Mapping[str, str] | None = None,
-) -> str:
-    """Table of plain text with aligned columns, for terminals; arguments of table_markdown."""
-    head, cells, numeric = _table(rows, columns, headers, formats)
-    widths = [max(map(len, column)) for column in zip(head, *cells, strict=True)]
+# -- tables ---------------------------------------------------------------------------------------
 
+
+def _cells(
+    rows: Sequence[Mapping[str, Any]], columns: Sequence[Column]
+) -> list[list[tuple[str, str, bool]]]:
+    """(text, reason why it is missing, whether it is the best of its column and flow)."""
+    best: dict[tuple[str, str], float] = {}
+    for row in rows:
+        for key, _, _ in columns:
+            value = row.get(key)
+            place = key, row.get("sequence", "") + row["flow_source"]
+            if value is not None and _counts(row, key):
+                best[place] = min(best.get(place, math.inf), value)
+    lines = []
+    for row in rows:
+        line = []
+        for key, _, factor in columns:
+            value = row.get(key)
+            text = MISSING if value is None else number(factor * value)
+            wins = (
+                len(rows) > 1
+                and value is not None
+                and _counts(row, key)
+                and value == best[key, row.get("sequence", "") + row["flow_source"]]
+            )
+            line.append((text, str(row.get("reasons", {}).get(key, "")), wins))
+        lines.append(line)
+    return lines
+
+
+def _counts(row: Mapping[str, Any], key: str) -> bool:
+    """Whether a value is a merit: not the time of doing nothing, nor what is no error at all."""
+    idle = "ms" in key and row["method"] == "identity"
+    return not (idle or key in MORE_IS_NO_MERIT)
+
+
+def html_table(
+    rows: Sequence[Mapping[str, Any]],
+    columns: Sequence[Column],
+    named: Sequence[str] = ("method",),
+) -> dict[str, Any]:
+    """Header, lines of (names, cells) and the reasons of missing values, for the template."""
+    cells = _cells(rows, columns)
+    lines = [([str(row[n]) for n in named], line) for row, line in zip(rows, cells, strict=True)]
+    reasons = dict.fromkeys(
+        f"{row['method']}: {label}: {row['reasons'][key]}"
+        for row in rows
+        for key, label, _ in columns
+        if row.get(key) is None and key in row.get("reasons", {})
+    )
+    labels = [label for _, label, _ in columns]
+    return {"named": list(named), "columns": labels, "lines": lines, "reasons": list(reasons)}
+
+
+def _protocol_tables(result: Mapping[str, Any]) -> list[tuple[str, dict[str, Any]]]:
+    """Measured here, and what others published."""
+    protocol = result.get("protocol")
+    if not protocol:
+        return []
+    columns = [(m["key"], f"{m['label']} [{m['unit']}]", 1.0) for m in protocol["metrics"]]
+    mine = [*protocol["table"]]
+    measured = html_table(mine, [*columns, ("pairs", "pairs", 1.0)], ("method", "flow_source"))
+    others = [{**line, "method": line["name"], "flow_source": ""} for line in protocol["published"]]
+    published = html_table(others, columns, ("name", "inputs", "source", "note"))
+    published["lines"] = [
+        (names, [(text, reason, False) for text, reason, _ in line])
+        for names, line in published["lines"]
+    ]
+    return [("Measured here", measured), ("Published by others", published)]
+
+
+def _markdown_table(table: Mapping[str, Any]) -> str:
     def line(items: Sequence[str]) -> str:
-        padded = [
-            item.rjust(width) if right else item.ljust(width)
-            for item, width, right in zip(items, widths, numeric, strict=True)
-        ]
-        return "  ".join(padded).rstrip()
+        return "| " + " | ".join(item.replace("|", "\\|") for item in items) + " |\n"
 
-    rule = "  ".join("-" * width for width in widths)
-    return "\n".join([line(head), rule, *(line(row) for row in cells)]) + "\n"
+    text = line([*table["named"], *table["columns"]])
+    text += "|" + "---|" * len(table["named"]) + "---:|" * len(table["columns"]) + "\n"
+    for names, cells in table["lines"]:
+        text += line([*names, *(f"**{t}**" if best else t for t, _, best in cells)])
+    return text
+
+
+def _markdown(result: Mapping[str, Any]) -> str:
+    """``report.md``: headline, tables, worst pairs, what is missing."""
+    parts = ["# Comparison of methods\n", headline(result) + "\n"]
+    for flow, rows in by_flow(result):
+        oracle = " (an oracle: ground truth)" if is_oracle(flow) else ""
+        parts += [f"## {flow} flow{oracle}\n", _markdown_table(html_table(rows, RESULT_COLUMNS))]
+    parts.append("## Worst pairs\n")
+    for entry in sorted(result["worst_pairs"], key=lambda e: is_oracle(e["flow_source"])):
+        error = number(entry["epe_l2_px"])
+        place = f"{entry['sequence']}, pair {entry['index']}"
+        parts.append(
+            f"- {entry['method']}, {entry['flow_source']}: {place}: {error} px, {entry['status']}"
+        )
+    parts.append("")
+    for name, table in _protocol_tables(result):
+        title = result["protocol"]["title"]
+        note = result["protocol"]["note"]
+        parts += [f"## {name}: {title}\n", f"{note}\n" if note else "", _markdown_table(table)]
+    notes = [f"- not run: {name}: {reason}" for name, reason in result["missing"].items()]
+    for sequence in result["sequences"]:
+        notes += [f"- {sequence['name']}: {warning}" for warning in sequence["warnings"]]
+    if notes:
+        parts += ["## Notes\n", *notes, ""]
+    parts += ["## Command\n", "```", " ".join(result["command"]), "```"]
+    return "\n".join(parts) + "\n"
+
+
+# -- page -----------------------------------------------------------------------------------------
+
+
+def _gallery(folder: Path, result: Mapping[str, Any]) -> list[tuple[str, list[dict[str, Any]]]]:
+    """Worst pairs by method, estimated flow first and the best method first, with images."""
+    budget = EMBEDDED_BYTES
+    groups = []
+    for flow, rows in by_flow(result):
+        order = [row["method"] for row in ranking(rows)]
+        methods = [*order, *(r["method"] for r in rows if r["method"] not in order)]
+        for method in methods:
+            entries = []
+            for entry in result["worst_pairs"]:
+                if (entry["method"], entry["flow_source"]) != (method, flow):
+                    continue
+                source = None
+                path = entry["picture"] and folder / entry["picture"]
+                if path and path.is_file() and path.stat().st_size <= budget:
+                    data = path.read_bytes()
+                    budget -= len(data)
+                    source = "data:image/jpeg;base64," + base64.b64encode(data).decode()
+                error = number(entry["epe_l2_px"])
+                entries.append({**entry, "source": source, "error": error})
+            if entries:
+                groups.append((f"{method}, {flow} flow", entries))
+    return groups
+
+
+def _provenance(result: Mapping[str, Any]) -> list[tuple[str, str]]:
+    def flat(value: Any) -> str:
+        if isinstance(value, Mapping):
+            return ", ".join(f"{key} {flat(item)}" for key, item in value.items())
+        if isinstance(value, (list, tuple)):
+            return ", ".join(map(flat, value))
+        return str(value)
+
+    names = (
+        "command",
+        "versions",
+        "machine",
+        "weights",
+        "options",
+        "timing",
+        "started",
+        "finished",
+    )
+    return [(name, flat(result[name])) for name in names if result.get(name)]
+
+
+def _json(chart: Any) -> str:
+    """JSON that may stand inside of a script element."""
+    return json.dumps(chart, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")

@@ -233,7 +233,7 @@ def total_loss(
         targets: the truth.
         options: which terms; the paper's PWVO by default. Outputs without uncertainty (VONet,
             pixel-wise) need the three ``*_uncertainty`` switches off.
-        T_curr_prev: (B, 4, 4) the selected motion, as ``hybridvo.pose.selection`` gives it:
+        T_curr_prev: (B, 4, 4) the selected motion, as ``hybridvo.network.selection`` gives it:
             ``selected_transform(*select(prediction))``, for a VONet
             ``selected_transform(*output)``. Needed by L^F and L^D only.
 

@@ -38,7 +38,7 @@ class NetworkOptions:
             leaves unexplained.
         pass_start: what a later pass starts from: ``selection`` = the pose that the selection
             makes of the pass before, ``fit`` = the motion that its trusted pixels agree on, see
-            :func:`hybridvo.pose.weighted_fit.weighted_fit`.
+            :func:`hybridvo.network.weighted_fit.weighted_fit`.
         later_quantile: quantile of the lengths of the unexplained flow that scales the inputs of a
             later pass, in (0, 0.5]; 0.4 in the first one. After a good start what is left of the
             world is short and the flow of movers long, whatever their share.

@@ -1,6 +1,6 @@
 """Numba kernels of the refinement: one pass over the pixels gives the 6x6 normal equations.
 
-The same definition as :mod:`hybridvo.pose.residuals` (torch); a test holds both equal. Pixels are
+The same definition as :mod:`hybridvo.refinement.torch_factors`; a test holds both equal. Pixels are
 gathered into short structure-of-arrays buffers that stay in the L1 cache, and branch-free loops sum
 over them in float32 per block, float64 in total. Nothing here changes thread settings.
 

@@ -1,8 +1,5 @@
 """Numba kernels of the photometric term: which pixels, and their residuals and Jacobians.
 
-The same definition as :mod:`hybridvo.refinement.photometric_batch` (torch); a test holds both
-equal.
-
 Per pixel x of the previous picture with grey value A, at a pose T (X' = T X, a = X'/Z', b = Y'/Z',
 i = 1/Z'):
 

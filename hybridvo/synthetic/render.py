@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from hybridvo.checks import make_folder
+from hybridvo.data.base import Sequence
 from hybridvo.data.image_io import write_cam, write_dpt, write_flo
 from hybridvo.errors import InputError, OutputError
 from hybridvo.geometry import invert
@@ -185,7 +186,7 @@ def make_scene(
 
 
 @dataclass(frozen=True, eq=False)
-class SyntheticSequence:
+class SyntheticSequence(Sequence):
     """A scene as a sequence, rendered on the fly.
 
     Args:
@@ -217,7 +218,7 @@ class SyntheticSequence:
         return self.scene.T_world_cam
 
     @property
-    def notices(self) -> tuple[str, ...]:
+    def warnings(self) -> tuple[str, ...]:
         """Nothing was mended."""
         return ()
 

@@ -17,7 +17,7 @@ from hybridvo.errors import InputError
 from hybridvo.learned import next_start
 from hybridvo.network.losses import NetworkOutput, reconstruct
 from hybridvo.network.passes import predict
-from hybridvo.pose.selection import chosen_pose, selected_transform
+from hybridvo.network.selection import chosen_pose, selected_transform
 from hybridvo.training.rendered_pictures import RenderedOptions
 from hybridvo.training.stream import Preset, TrainingBatch, collate, sample_generator
 from hybridvo.types import PixelwisePrediction
@@ -66,7 +66,7 @@ def evaluate_network(
         preset: what to draw.
         seed: below 1000 for development, from 1000 for published figures.
         count: number of pairs, samples 0 to count - 1 of the seed.
-        selection: method of ``hybridvo.pose.selection.select``; VONets have none.
+        selection: method of ``hybridvo.network.selection.select``; VONets have none.
         batch_size: pairs at once.
         precision: ``float32`` or ``bfloat16`` (autocast).
 

@@ -26,8 +26,8 @@ from hybridvo.learned import fitted_motion, next_start
 from hybridvo.network.losses import NetworkOutput, reconstruct, total_loss
 from hybridvo.network.passes import first_motions
 from hybridvo.network.pwvo import build_network
+from hybridvo.network.selection import chosen_motion
 from hybridvo.network.weights import load_weights
-from hybridvo.pose.selection import chosen_motion
 from hybridvo.training.checkpoint import check_seed, load_checkpoint, save_checkpoint
 from hybridvo.training.held_out import evaluate_network
 from hybridvo.training.options import TrainingOptions

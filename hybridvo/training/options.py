@@ -106,7 +106,7 @@ class TrainingOptions:
         fit_weight: weight of the error of the motion that the trusted pixels agree on, with the
             gradient through the fit into s (:func:`hybridvo.learned.fitted_motion`); 0 = none, as
             in the paper.
-        selection: method of ``hybridvo.pose.selection.select`` that L^F and L^D look through.
+        selection: method of ``hybridvo.network.selection.select`` that L^F and L^D look through.
         loss_stride: L^F and L^D, without uncertainty, look at every n-th pixel of every n-th row,
             in pixels of that smaller picture. 1 as published.
         data: preset files, beside the file that names them.

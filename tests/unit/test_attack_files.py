@@ -9,7 +9,6 @@ import io
 import json
 import os
 import runpy
-import struct
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -22,8 +21,6 @@ import hybridvo.trajectory
 from hybridvo.cli import _open_standard_streams, main
 from hybridvo.configuration import load_options
 from hybridvo.console import Progress, printable
-from hybridvo.data.image_io import write_flo
-from hybridvo.data.plain_yaml import plain_yaml
 from hybridvo.data.sequence import open_sequence
 from hybridvo.diagnosis import diagnose, diagnosis_text
 from hybridvo.errors import FormatError, InputError
@@ -34,7 +31,7 @@ from hybridvo.recording import check_recording
 from hybridvo.run_folder import PARTIAL, STATE, RunFolder
 from hybridvo.training.judge_batches import read_batches
 from hybridvo.trajectory import Trajectory
-from tests.sequences import image, png, write_folder, write_kitti, write_sintel, write_tum
+from tests.sequences import image, png, write_folder
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -313,40 +310,6 @@ def test_a_seed_that_no_generator_takes_is_refused(seed: int) -> None:
         load_options(assignments=[f"seed={seed}"])
 
 
-def test_a_repeated_key_is_refused(tmp_path: Path) -> None:
-    for text in ("seed: 1\nmethod: refine\nseed: 2", "dis: {preset: fast, preset: medium}"):
-        with pytest.raises(FormatError, match=r"the key '(seed|preset)' is there twice"):
-            plain_yaml(text, "x.yaml")
-    assert plain_yaml("a: {x: 1}\nb: {x: 1}", "x.yaml") == {"a": {"x": 1}, "b": {"x": 1}}
-
-
-@pytest.mark.parametrize(
-    ("word", "value"), [("1e-3", 1e-3), ("1.0e9", 1e9), ("-2.E+5", -2e5), (".5e1", 5.0)]
-)
-def test_a_power_of_ten_is_a_number(word: str, value: float) -> None:
-    assert plain_yaml(f"x: {word}", "x.yaml") == {"x": value}
-    assert plain_yaml("x: '1e-3'", "x.yaml") == {"x": "1e-3"}
-    assert plain_yaml("x: 1e-3x", "x.yaml") == {"x": "1e-3x"}
-
-
-# readers
-
-
-def test_two_files_of_one_frame_are_refused(made: Path) -> None:
-    first = min((made / "rgb").iterdir())
-    other = first.with_suffix(".jpg" if first.suffix == ".png" else ".png")
-    other.write_bytes(first.read_bytes())
-    with pytest.raises(InputError, match="two files of one frame"):
-        open_sequence(made)
-
-
-def test_two_files_of_one_number_are_refused(tmp_path: Path) -> None:
-    root = write_sintel(tmp_path).path
-    (root / "frame_2.png").write_bytes((root / "frame_0002.png").read_bytes())
-    with pytest.raises(InputError, match=r"frame_0002\.png and frame_2\.png are two files"):
-        open_sequence(root)
-
-
 def own(root: Path, images: tuple[int, ...], depths: tuple[int, ...]) -> Path:
     """A sequence of kind 'folder' with these numbers and no time stamps."""
     (root / "depth").mkdir(parents=True)
@@ -358,109 +321,6 @@ def own(root: Path, images: tuple[int, ...], depths: tuple[int, ...]) -> Path:
     for i in depths:
         png(root / "depth" / f"{i:04d}.png", np.full((24, 32), 2000, np.uint16))
     return root
-
-
-def test_a_missing_image_is_said(tmp_path: Path) -> None:
-    notices = "\n".join(open_sequence(own(tmp_path, (0, 1, 3, 4), (0, 1, 2, 3, 4))).notices)
-    assert "1 depth files without an image are left out: 0002.png" in notices
-    assert "numbers of the images jump, the time stamps do not" in notices
-
-
-@pytest.mark.parametrize(
-    ("images", "flows", "kept"),
-    [
-        ((0, 1, 2, 3), (0, 1, 2), (0, 1, 2)),
-        ((0, 2, 3, 4), (0, 1, 2, 3), (2, 3)),  # one image deleted
-        ((0, 2, 3, 4), (0, 2, 3), (2, 3)),  # and its flow with it
-        ((0, 10, 20, 30), (0, 10, 20), (0, 10, 20)),  # flow over ten frames
-        ((0, 2, 4, 6), (0, 1, 2, 3, 4, 5), ()),  # every second image of a sequence with its flow
-        ((0, 1, 5, 6), (0, 1, 5), (0, 5)),
-    ],
-)
-def test_flow_that_led_to_a_missing_image_is_not_used(
-    tmp_path: Path, images: tuple[int, ...], flows: tuple[int, ...], kept: tuple[int, ...]
-) -> None:
-    root = own(tmp_path, images, images)
-    (root / "flow").mkdir()
-    for number in flows:
-        write_flo(root / "flow" / f"{number:04d}.flo", np.full((24, 32, 2), number, np.float32))
-    sequence = open_sequence(root)
-    for index, number in enumerate(images[:-1]):
-        if number in kept:
-            assert sequence.flow(index)[0].max() == number
-        else:
-            with pytest.raises(FileNotFoundError, match="no flow file from frame"):
-                sequence.flow(index)
-    assert sequence.has_flow == bool(kept)
-    said = any("are not used" in notice for notice in sequence.notices)
-    assert said == (len(kept) < len(set(flows) & set(images)))
-
-
-def test_numbers_that_go_on_evenly_are_not_remarked_on(tmp_path: Path) -> None:
-    for name, numbers in (("one", (7, 8, 9)), ("ten", (0, 10, 20))):
-        notices = "\n".join(open_sequence(own(tmp_path / name, numbers, numbers)).notices)
-        assert "jump" not in notices and "left out" not in notices
-
-
-def test_intrinsics_of_another_image_size_are_remarked_on(tmp_path: Path) -> None:
-    root = own(tmp_path, (0, 1), (0, 1))
-    assert not any("principal point" in notice for notice in open_sequence(root).notices)
-    settings = (root / "camera.yaml").read_text()
-    (root / "camera.yaml").write_text(settings.replace("cx: 15.5", "cx: 31.5"))
-    assert any("those of another image size?" in notice for notice in open_sequence(root).notices)
-
-
-@pytest.mark.filterwarnings("error")
-def test_a_frame_rate_of_almost_zero_is_refused_without_a_warning(tmp_path: Path) -> None:
-    root = own(tmp_path, (0, 1), (0, 1))
-    with (root / "camera.yaml").open("a") as file:
-        file.write("fps: 1.0e-320\n")
-    with pytest.raises(InputError, match="not finite"):
-        open_sequence(root)
-
-
-def test_kitti_with_stored_depth_needs_no_right_camera(tmp_path: Path) -> None:
-    root = write_kitti(tmp_path).path
-    calib = root / "calib.txt"
-    lines = [line for line in calib.read_text().splitlines() if not line.startswith("P3")]
-    assert len(lines) < len(calib.read_text().splitlines())
-    calib.write_text("\n".join(lines) + "\n")
-    assert open_sequence(root).frame(0).depth is not None
-
-
-def test_stamps_in_a_message_are_plain_numbers(tmp_path: Path) -> None:
-    root = write_tum(tmp_path).path
-    lines = (root / "rgb.txt").read_text().splitlines()
-    (root / "rgb.txt").write_text("\n".join(reversed(lines)) + "\n")
-    with pytest.raises(InputError, match=r"entry 0 has \d+\.\d+, entry 1 has \d+\.\d+\."):
-        open_sequence(root)
-
-
-def test_a_camera_of_no_use_costs_its_frame_and_not_the_run(tmp_path: Path) -> None:
-    root = write_sintel(tmp_path).path
-    cam = sorted((tmp_path / "training" / "camdata_left").rglob("*.cam"))[1]
-    data = bytearray(cam.read_bytes())
-    data[4:12] = struct.pack("<d", 1e300)  # fx
-    cam.write_bytes(data)
-    words = ("run", "--sequence", str(root), "--method", "identity", "--max-failed", "1")
-    assert cli(*words, "--out", str(tmp_path / "out")) == 0
-    steps = (tmp_path / "out" / "steps.csv").read_text().splitlines()
-    assert [line.split(",")[3] for line in steps[1:]] == ["", "missing_frame", ""]
-
-
-def test_stamps_that_go_back_are_named(tmp_path: Path) -> None:
-    root = write_kitti(tmp_path).path
-    (root / "times.txt").write_text("5\n4\n3\n")
-    with pytest.raises(InputError, match=r"frame 0 has 5\.0, frame 1 has 4\.0\."):
-        open_sequence(root)
-
-
-def test_a_list_of_files_that_are_not_there_names_one(tmp_path: Path) -> None:
-    root = write_tum(tmp_path).path
-    listed = (root / "rgb.txt").read_text()
-    (root / "rgb.txt").write_text(listed.replace("rgb/", "rgb\\"))  # as Windows writes it
-    notices = "\n".join(open_sequence(root).notices)
-    assert "there are no image files, such as" in notices and "rgb\\" in notices
 
 
 # evaluate

@@ -10,7 +10,7 @@ import torch
 from hybridvo.errors import InputError
 from hybridvo.geometry import ego_flow, euler_deg_to_matrix, make_transform
 from hybridvo.network.losses import LossOptions, LossTargets, reconstruct, total_loss
-from hybridvo.pose.selection import select, selected_transform
+from hybridvo.network.selection import select, selected_transform
 from hybridvo.types import Camera, PixelwisePrediction
 
 PLAIN = {"pose_uncertainty": False, "flow_uncertainty": False, "depth_uncertainty": False}

@@ -8,7 +8,6 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-import torch
 from hybridvo.refinement.photometric_monitor import CHECK_EVERY, PhotometricMonitor
 
 from hybridvo.errors import InputError
@@ -16,7 +15,6 @@ from hybridvo.flow import dis_flow
 from hybridvo.geometry import ego_flow, invert, se3_exp, se3_log
 from hybridvo.odometry import Odometry
 from hybridvo.pipeline import estimate, refine
-from hybridvo.refinement import photometric_batch as batch
 from hybridvo.refinement import photometric_kernels as kernels
 from hybridvo.refinement.photometric import PhotometricOptions, polish_photometric
 from hybridvo.refinement.photometric_images import Level, blurred, grey_image, match_blur
@@ -77,11 +75,6 @@ def test_cubic_reading_is_exact_on_parabolas():
         expected = 3 + 0.5 * x - 0.25 * y + 0.1 * x * y + 0.2 * x * x - 0.3 * y * y
         read = kernels.read_cubic(image, np.float32(x), np.float32(y))
         assert read == pytest.approx(expected, abs=2e-5)  # float32
-        twin = batch.read_cubic(
-            torch.tensor(image)[None].double(), torch.tensor([[x]]).double(),
-            torch.tensor([[y]]).double(),
-        )  # fmt: skip
-        assert float(twin) == pytest.approx(expected, abs=1e-5)
 
 
 def test_jacobian_is_that_of_the_residual(light):
@@ -102,45 +95,6 @@ def test_jacobian_is_that_of_the_residual(light):
         slope = (sides[0] - sides[1]) / 2e-4
         # the curvature of cubic reading jumps at the pixels, and float32: 2 % of the largest slope
         assert np.nanmax(np.abs(slope - J[column])) < 0.02 * np.abs(J[column]).max()
-
-
-def test_numba_and_torch_are_one_definition(light):
-    pair, motion, T_true = light
-    problem, level = as_problem(pair, motion)
-    state = State(se3_exp(np.full(6, 1e-3)) @ T_true, 0.9, 3.0, 2.0)
-    problem.depth_noise = 0.01
-    cost = problem.project(level, state)
-    buffer = [torch.tensor(row)[None].double() for row in problem.buffer]
-    pixels = batch.PhotometricPixels(
-        buffer[kernels.XN], buffer[kernels.YN], buffer[kernels.Z], buffer[kernels.GREY],
-        buffer[kernels.GX], buffer[kernels.GY], buffer[kernels.W],
-    )  # fmt: skip
-    one = torch.ones(1, dtype=torch.float64)
-    r, J, gq, seen = batch.photometric_terms(
-        pixels, torch.tensor(level.curr)[None].double(), torch.tensor(state.T)[None],
-        torch.tensor(pair.prev.camera.K)[None], torch.tensor(pair.curr.camera.K)[None],
-        0.9 * one, 3.0 * one,
-    )  # fmt: skip
-    w, twin_cost = batch.photometric_weights(
-        r, gq, seen, pixels.weight, 2.0 * one, 0.01 * one, problem.options.cutoff
-    )
-    inside = np.isfinite(problem.r)
-    assert inside.sum() > 200
-    np.testing.assert_array_equal(inside, seen[0].numpy())
-    # float32 coordinates are good to 3e-5 px, grey values change by up to 50 a pixel
-    np.testing.assert_allclose(problem.r[inside], r[0].numpy()[inside], atol=5e-3)
-    for p in range(kernels.COLUMNS):
-        largest = np.abs(problem.J[p]).max()
-        np.testing.assert_allclose(problem.J[p], J[0, p].numpy(), atol=1e-4 * largest)
-    np.testing.assert_allclose(problem.w, w[0].numpy(), atol=2e-3 * problem.w.max())
-    assert cost == pytest.approx(float(twin_cost), rel=1e-3)
-    H = ((J * w[:, None]) @ J.transpose(1, 2))[0].numpy()
-    scale = np.sqrt(np.diag(H))
-    c = kernels.COLUMNS
-    difference = (problem.H[:c, :c] - H) / np.outer(scale, scale)
-    assert np.abs(difference).max() < 1e-3
-    g = -((J * w[:, None]) @ r[..., None])[0, :, 0].numpy()
-    assert np.abs((problem.g[:c] - g) / scale).max() < 1e-2 * np.sqrt(cost)
 
 
 def test_small_log_is_the_logarithm():
@@ -405,99 +359,3 @@ def test_the_monitor_says_what_disagrees_and_lowers_trust(light):
     assert "exposure changed" in monitor.message
     assert monitor.trust < 0.2
     assert json.loads(json.dumps(monitor.state())) == monitor.state()
-
-
-# torch
-
-
-def torch_inputs(pairs, dtype=torch.float64):
-    motions = [refine(pair) for pair in pairs]
-
-    def stack(values):
-        return torch.stack([torch.tensor(np.asarray(v), dtype=dtype) for v in values])
-
-    levels = [blurred(Level(grey_image(p.prev.rgb), grey_image(p.curr.rgb)), 1.0) for p in pairs]
-    return {
-        "grey_prev": stack([level.prev for level in levels]),
-        "grey_curr": stack([level.curr for level in levels]),
-        "depth": stack([p.prev.depth for p in pairs]),
-        "K_prev": stack([p.prev.camera.K for p in pairs]),
-        "K_curr": stack([p.curr.camera.K for p in pairs]),
-        "T_flow": stack([m.T_curr_prev for m in motions]),
-        "covariance": stack([m.covariance for m in motions]),
-        "weights": stack([m.weights for m in motions]),
-    }
-
-
-@pytest.fixture(scope="module")
-def torch_batch():
-    made = [made_pair("pair", seed, height=96, width=160) for seed in (301, 304)]
-    return [m[0] for m in made], [m[1] for m in made], torch_inputs([m[0] for m in made])
-
-
-def test_batch_is_polished_like_single_pairs(torch_batch):
-    pairs, truths, inputs = torch_batch
-    options = PhotometricOptions(blur_px=(1.0,))
-    out = batch.polish_photometric_batch(**inputs, options=options)
-    assert out.taken.all()
-    for k, (pair, T) in enumerate(zip(pairs, truths, strict=True)):
-        before = error_px(pair, inputs["T_flow"][k].numpy(), T)
-        after = error_px(pair, out.T_curr_prev[k].numpy(), T)
-        assert after < 0.5 * before
-
-
-def test_batch_samples_do_not_see_each_other(torch_batch):
-    _, _, inputs = torch_batch
-    both = batch.polish_photometric_batch(**inputs)
-    alone = batch.polish_photometric_batch(**{k: v[:1] for k, v in inputs.items()})
-    # steps until all have converged: the last ones are below the tolerance
-    np.testing.assert_allclose(both.T_curr_prev[0], alone.T_curr_prev[0], atol=1e-6)
-    poisoned = {k: v.clone() for k, v in inputs.items()}
-    poisoned["grey_curr"][1] = torch.nan
-    out = batch.polish_photometric_batch(**poisoned)
-    np.testing.assert_allclose(out.T_curr_prev[0], alone.T_curr_prev[0], atol=1e-6)
-    assert not out.taken[1]
-    assert torch.equal(out.T_curr_prev[1], inputs["T_flow"][1])
-
-
-@pytest.mark.parametrize("name", ["depth", "grey_curr", "K_curr"])
-def test_batch_gradient_is_that_of_the_solution(name, torch_batch, monkeypatch):
-    # the noise scale is held by the derivative: so it is by the differences. Every pixel is used
-    # (cells of two by two), so that the choice does not change. The root is found to its last digit
-    monkeypatch.setattr(batch, "_noise_scale", lambda r, used: torch.full_like(r[:, 0], 0.6))
-    monkeypatch.setattr(batch, "TOLERANCE", 1e-18)
-    monkeypatch.setattr(batch, "STEPS", 60)
-    _, _, inputs = torch_batch
-    inputs = {k: v[1:, ...].clone() for k, v in inputs.items()}
-    for key in ("grey_prev", "grey_curr", "depth", "weights"):
-        inputs[key] = inputs[key][:, 20:68, 40:104].contiguous()
-    for key in ("K_prev", "K_curr"):
-        inputs[key][:, 0, 2] -= 40
-        inputs[key][:, 1, 2] -= 20
-    options = PhotometricOptions(pixels=10**6)
-    generator = torch.Generator().manual_seed(0)
-    direction = torch.randn(inputs[name].shape, generator=generator, dtype=torch.float64)
-    if name == "K_curr":
-        direction = torch.zeros_like(direction)
-        direction[:, 0, 2] = 1.0
-
-    def run(amount, grad=False):
-        amount = torch.tensor(amount, dtype=torch.float64, requires_grad=grad)
-        moved = inputs | {name: inputs[name] + amount * direction}
-        out = batch.polish_photometric_batch(**moved, options=options)
-        assert out.taken.all()
-        return amount, out.T_curr_prev[0, :3, 3].sum()
-
-    amount, value = run(0.0, grad=True)
-    (slope,) = torch.autograd.grad(value, amount)
-    h = 1e-4
-    numeric = (run(h)[1] - run(-h)[1]) / (2 * h)
-    assert torch.isfinite(slope)
-    # the curvature of cubic reading jumps where a point crosses a pixel: 1 %
-    assert float(slope) == pytest.approx(float(numeric), rel=0.01)
-
-
-def test_batch_refuses_shapes(torch_batch):
-    _, _, inputs = torch_batch
-    with pytest.raises(InputError, match="K_curr"):
-        batch.polish_photometric_batch(**(inputs | {"K_curr": inputs["K_curr"][:1]}))

@@ -12,7 +12,7 @@ from hybridvo.data.presets import load_preset
 from hybridvo.errors import FormatError, InputError
 from hybridvo.learned import shipped_network
 from hybridvo.network.judge import JudgeNetwork, JudgeOptions
-from hybridvo.pose.weighted_fit import weighted_fit
+from hybridvo.network.weighted_fit import weighted_fit
 from hybridvo.synthetic.paper import Sample, rigid_flow
 from hybridvo.training.held_out import evaluate_network
 from hybridvo.training.judge_batches import PictureBatch, read_batches, refits_of

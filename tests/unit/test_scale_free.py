@@ -21,7 +21,7 @@ from hybridvo.network.losses import LossOptions, LossTargets, total_loss
 from hybridvo.network.passes import first_motions, predict
 from hybridvo.network.pwvo import NetworkOptions, build_network
 from hybridvo.network.scale_free import euler_deg, remove_scale
-from hybridvo.pose.selection import chosen_motion, selected_transform
+from hybridvo.network.selection import chosen_motion, selected_transform
 from hybridvo.types import Camera, Frame, FramePair, Reason, State
 
 CAMERA = Camera(60.0, 62.0, 31.5, 15.5, 32, 64)

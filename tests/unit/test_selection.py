@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from hybridvo.errors import InputError
 from hybridvo.geometry import euler_deg_to_matrix
-from hybridvo.pose.selection import SELECTION_METHODS, select, selected_transform
+from hybridvo.network.selection import SELECTION_METHODS, select, selected_transform
 from hybridvo.types import PixelwisePrediction
 
 

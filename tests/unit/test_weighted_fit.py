@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from hybridvo.errors import InputError
 from hybridvo.geometry import rotation_angle, se3_exp
-from hybridvo.pose.weighted_fit import pixel_weights, weighted_fit
+from hybridvo.network.weighted_fit import pixel_weights, weighted_fit
 
 COUNT = 600
 

@@ -1,1 +1,0 @@
-"""Methods beside each other: what ``tools/compare_methods.py`` runs, here and on other machines."""

@@ -1,0 +1,326 @@
+"""The base class of all readers: lists of files in, checked frames out."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from hybridvo.data.camera_file import Calibration, Lens, parse_camera, units_per_metre
+from hybridvo.data.image_io import image_size, read_depth, read_flow, read_mask_png, read_rgb
+from hybridvo.data.lists import check_increasing, shown, sorted_files
+from hybridvo.errors import FormatError, InputError
+from hybridvo.types import Camera, Frame
+from hybridvo.units import depth_advice, typical_depth
+
+
+@dataclass(frozen=True)
+class Given:
+    """What a user says about a sequence beyond its folder.
+
+    Args:
+        camera: instead of the data set's, see :func:`hybridvo.data.camera_file.parse_camera`.
+        depth_scale: stored units per metre.
+        mask: folder of masks, 0 where pixels must not be used.
+    """
+
+    camera: str | os.PathLike[str] | Camera | Calibration | None = None
+    depth_scale: float | None = None
+    mask: str | os.PathLike[str] | None = None
+
+
+@dataclass
+class Listing:
+    """What a reader has found on disk; lists hold an entry for each frame, None where none is.
+
+    Args:
+        rgb, depth: image and depth files. flow: from each frame to the next.
+        timestamps: (N,) seconds. poses: (N, 4, 4) T_world_cam, NaN rows unknown, or None.
+        sources: further files that were read (lists, calibration, ground truth).
+        warnings: what the user should know.
+    """
+
+    rgb: list[Path | None]
+    depth: list[Path | None]
+    timestamps: np.ndarray
+    flow: list[Path | None] = field(default_factory=list)
+    poses: np.ndarray | None = None
+    sources: list[Path] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+
+
+class Sequence:
+    """Frames in time order, read when asked for: ``len``, ``sequence[i]``, ``for frame in``.
+
+    A reader fills in a :class:`Listing` and says which camera belongs to it; where its files need
+    more than their ending says, it overrides ``_read_depth`` and ``_read_flow``.
+
+    Attributes:
+        kind: sintel, tartanair, tum, 7scenes, kitti or folder.
+        name: what reports call it. root: its folder.
+        timestamps: (N,) float64 seconds, strictly increasing.
+        poses: (N, 4, 4) T_world_cam in camera axes, NaN rows where a frame has no truth, or None.
+        depth_source: ``true`` (synthetic, an oracle), ``sensor``, ``stereo`` or ``file``.
+        flow_is_true: whether its flow files are ground truth (an oracle).
+
+    Raises:
+        InputError: no frames, stamps that do not increase, depth of another size than colour.
+        FormatError: no image can be read at all.
+    """
+
+    kind = "sequence"
+    looks_for = ""
+    depth_source = "sensor"
+    flow_is_true = False
+    depth_scale: float | None = None
+    """Stored units per metre of the data set's depth; None: metres."""
+    poses: np.ndarray | None = None
+    timestamps: np.ndarray
+    name: str
+    root: Path
+
+    def __init__(self, root: Path, name: str, listing: Listing, given: Given) -> None:
+        self.root, self.name = root, name
+        self.rgb_files, self.depth_files = listing.rgb, listing.depth
+        count = len(listing.rgb)
+        self.flow_files = (listing.flow + [None] * count)[:count]
+        self.timestamps = np.asarray(listing.timestamps, dtype=np.float64)
+        self.poses, self._sources = listing.poses, listing.sources
+        self._warnings = listing.warnings
+        if count == 0:
+            raise InputError(f"{root}: no frames.")
+        check_increasing(self.timestamps, str(root))
+        self.height, self.width = self._find_size()
+        shape = (self.height, self.width)
+        if given.camera is not None:
+            calibration: Calibration | None = parse_camera(given.camera, shape)
+        else:
+            calibration = self._calibration()
+        self._camera = calibration.camera if calibration else None
+        self._lens = None
+        scale, told = units_per_metre(given.depth_scale, self.name)
+        if calibration is not None:
+            self._warnings += calibration.warnings
+            if any(calibration.distortion):
+                self._lens = Lens(calibration.camera, calibration.distortion)
+            scale = scale or calibration.depth_scale
+        self._given_scale = scale
+        self._warnings += told
+        self.mask_files = self._find_masks(given.mask)
+        self._warnings += self._missing()
+        self._check_depth_unit()
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What the user should know: converted stamps, gaps, missing files, doubtful units."""
+        return tuple(self._warnings)
+
+    def add_warning(self, sentence: str) -> None:
+        """Tell the user something more."""
+        self._warnings.append(sentence)
+
+    @property
+    def has_flow(self) -> bool:
+        """Whether there is at least one flow file."""
+        return any(path is not None for path in self.flow_files)
+
+    def __len__(self) -> int:
+        return len(self.timestamps)
+
+    def __repr__(self) -> str:
+        return f"<{self.kind} sequence {self.name!r}: {len(self)} frames>"
+
+    def __getitem__(self, index: int) -> Frame:
+        return self.frame(index + len(self) if index < 0 else index)
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Frames that can be read; one that cannot be is left out with a Python warning."""
+        for index in range(len(self)):
+            try:
+                frame = self.frame(index)
+            except (InputError, OSError) as error:
+                warnings.warn(f"frame {index} is left out: {error}", stacklevel=2)
+                continue
+            yield frame
+
+    def camera(self, index: int) -> Camera:
+        """Pinhole camera of frame ``index``."""
+        self._check_index(index)
+        if self._camera is None:
+            raise InputError(f"{self.name}: no camera is known for frame {index}.")
+        return self._camera
+
+    def frame(self, index: int) -> Frame:
+        """Frame ``index``; ``rgb`` or ``depth`` is None where its file is missing.
+
+        Raises:
+            IndexError: no such index. FileNotFoundError: neither image nor depth is there.
+            FormatError: a file cannot be decoded or has another size.
+        """
+        index = self._check_index(index)
+        camera = self.camera(index)
+        rgb_path, depth_path = self.rgb_files[index], self.depth_files[index]
+        rgb = depth = mask = None
+        if rgb_path is not None and rgb_path.exists():
+            rgb = read_rgb(rgb_path)
+            self._check_shape(rgb, rgb_path, "an image")
+        if depth_path is not None and depth_path.exists():
+            depth = self._read_depth(depth_path, index, rgb)
+            self._check_shape(depth, depth_path, "depth")
+        if rgb is None and depth is None:
+            raise FileNotFoundError(
+                f"{self.name}: frame {index}: neither image nor depth is there "
+                f"({rgb_path or 'no image path'}, {depth_path or 'no depth path'})."
+            )
+        if (path := self.mask_files[index]) is not None:
+            mask = read_mask_png(path)
+            self._check_shape(mask, path, "a mask")
+        if self._lens is not None:
+            rgb = None if rgb is None else self._lens.smooth(rgb)
+            depth = None if depth is None else self._lens.nearest(depth)
+            mask = self._lens.mask & (mask is None or self._lens.nearest(mask.view(np.uint8)) > 0)
+        variance = None if depth is None else self._depth_variance(depth)
+        return Frame(rgb, depth, camera, float(self.timestamps[index]), index, variance, mask)
+
+    def flow(self, index: int) -> tuple[np.ndarray, np.ndarray | None]:
+        """Flow from frame ``index`` to the next: (H, W, 2) float32 px, and (H, W) bool or None.
+
+        Raises:
+            IndexError: no such pair. FileNotFoundError: no flow file for it.
+            FormatError: the file cannot be decoded or has another size.
+        """
+        index = self._check_index(index)
+        if index == len(self) - 1:
+            raise IndexError(f"{self.name}: frame {index} is the last, no flow starts there.")
+        path = self.flow_files[index]
+        if path is None:
+            raise FileNotFoundError(
+                f"{self.name}: there is no flow file from frame {index} to {index + 1}."
+            )
+        flow, valid = self._read_flow(path, index)
+        self._check_shape(flow, path, "flow")
+        return flow, valid
+
+    def files(self) -> list[Path]:
+        """Every existing file that the sequence reads, sorted: what a fingerprint covers."""
+        frames = (self.rgb_files, self.depth_files, self.flow_files[:-1], self.mask_files)
+        found = {path for paths in (self._sources, *frames) for path in paths if path is not None}
+        return sorted(path for path in found if path.is_file())
+
+    def _calibration(self) -> Calibration | None:
+        """Camera of all frames; None where each frame has its own (``camera`` is overridden)."""
+        raise NotImplementedError
+
+    def _read_depth(self, path: Path, index: int, rgb: np.ndarray | None) -> np.ndarray:
+        """(H, W) float32 metres; 0, negative and not finite are invalid."""
+        return self._metres(read_depth(path))
+
+    def _metres(self, stored: np.ndarray) -> np.ndarray:
+        """Stored depth in metres. Unless a scale is given, only integers are in the set's unit."""
+        usual = self.depth_scale if stored.dtype.kind == "u" else None
+        return stored.astype(np.float32) / np.float32(self._given_scale or usual or 1.0)
+
+    def _read_flow(self, path: Path, index: int) -> tuple[np.ndarray, np.ndarray | None]:
+        return read_flow(path)
+
+    def _depth_variance(self, depth: np.ndarray) -> np.ndarray | None:
+        """Variance of log depth, where the source allows to state one."""
+        return None
+
+    def _check_shape(self, array: np.ndarray, path: Path, what: str) -> None:
+        if array.shape[:2] != (self.height, self.width):
+            raise FormatError(
+                f"{path}: expected {what} of {self.width}x{self.height} pixels as the first frame "
+                f"has, got {array.shape[1]}x{array.shape[0]}."
+            )
+
+    def _check_index(self, index: int) -> int:
+        if not 0 <= int(index) < len(self):
+            raise IndexError(f"{self.name}: expected a frame 0 to {len(self) - 1}, got {index}.")
+        return int(index)
+
+    def _find_size(self) -> tuple[int, int]:
+        """(height, width) of the first image that can be read, which its depth must have too."""
+        rgb, problem = _first_size(self.rgb_files)
+        depth, no_depth = _first_size(self.depth_files)
+        if rgb is None and depth is None:
+            raise FormatError(
+                f"{self.root}: no frames: none can be read. First problem: {problem or no_depth}"
+            )
+        if rgb is not None and depth is not None and rgb != depth:
+            raise InputError(
+                f"{self.root}: depth images are {depth[1]}x{depth[0]}, colour images {rgb[1]}x"
+                f"{rgb[0]} pixels (width x height): depth must be registered to colour, so that "
+                f"both have one size and camera (RealSense: rs.align(rs.stream.color); ROS: "
+                f"depth_registered or aligned_depth_to_color). Resizing does not register it."
+            )
+        return rgb or depth  # type: ignore[return-value]
+
+    def _find_masks(self, folder: str | os.PathLike[str] | None) -> list[Path | None]:
+        """Mask of each frame: by equal names, else by order where the counts agree."""
+        none: list[Path | None] = [None] * len(self)
+        if folder is None:
+            return none
+        masks = sorted_files(Path(folder), (".png", ".jpg", ".jpeg"))
+        frames = [rgb or depth for rgb, depth in zip(self.rgb_files, self.depth_files, strict=True)]
+        by_stem = {path.stem: path for path in masks}
+        found = [by_stem.get(path.stem) if path else None for path in frames]
+        if not any(found) and len(masks) == len(frames):
+            found = [*masks]
+        if not any(found):
+            raise InputError(
+                f"{folder}: {len(masks)} masks (PNG or JPEG, 0 where pixels must not be used) for "
+                f"{len(frames)} frames, and no name agrees. Name them like the images."
+            )
+        return found
+
+    def _missing(self) -> list[str]:
+        found = []
+        listed = [("image", self.rgb_files), ("depth", self.depth_files)]
+        if any(self.mask_files):
+            listed.append(("mask", self.mask_files))
+        for what, paths in listed:
+            missing = [i for i, path in enumerate(paths) if path is None or not path.exists()]
+            if len(missing) == len(paths):
+                like = next((f", such as {path}" for path in paths if path is not None), "")
+                found.append(f"{self.name}: there are no {what} files{like}.")
+            elif missing:
+                found.append(
+                    f"{self.name}: {len(missing)} frames without {what}: {shown(missing)}."
+                )
+        return found
+
+    def _check_depth_unit(self) -> None:
+        """Look at the first depth map that can be read, and say so if its unit is doubtful."""
+        for index, path in enumerate(self.depth_files):
+            if path is None or not path.exists() or self.depth_source == "stereo":
+                continue
+            try:
+                median = typical_depth(self._read_depth(path, index, None))
+            except (InputError, OSError):
+                continue
+            if median is None:
+                self._warnings.append(f"{path}: the first depth map has no valid value.")
+            elif advice := depth_advice(median, self.depth_scale):
+                self._warnings.append(
+                    f"{path}: the median depth is {median:.4g} m, which cannot be metres. "
+                    f"Probable remedy: {advice} (by --depth-scale, or depth_scale in camera.yaml)."
+                )
+            return
+
+
+def _first_size(paths: list[Path | None]) -> tuple[tuple[int, int] | None, Exception | None]:
+    """(height, width) of the first readable file, and the first problem met on the way."""
+    problem: Exception | None = None
+    for path in paths:
+        if path is None:
+            continue
+        try:
+            return image_size(path), problem
+        except (FormatError, OSError) as error:
+            problem = problem or error
+    return None, problem

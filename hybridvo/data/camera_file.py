@@ -1,0 +1,303 @@
+"""Cameras that users describe: ``camera.yaml``, ROS ``camera_info``, RealSense, ``fx,fy,cx,cy``."""
+
+from __future__ import annotations
+
+import difflib
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from hybridvo.data.image_io import image_size, read_text
+from hybridvo.data.lists import sorted_files
+from hybridvo.errors import FormatError, InputError
+from hybridvo.files import atomic_write, parse_yaml
+from hybridvo.types import Camera
+
+CAMERA_FILE = "camera.yaml"
+REQUIRED = ("fx", "fy", "cx", "cy", "width", "height")
+KNOWN = (*REQUIRED, "distortion", "depth_scale", "fps")
+MAX_FILE_BYTES = 2**16
+"""Largest camera file; they are a few kilobytes."""
+MAX_NUMBER = 1e12
+"""No setting is larger; NaN, infinity and integers beyond any float are not smaller."""
+BROWN_COUNTS = (4, 5, 8)
+"""Lengths of k1 k2 p1 p2 [k3 [k4 k5 k6]], OpenCV's order."""
+
+TEMPLATE = """\
+# The camera of the images in rgb/, in pixels; (0, 0) is the centre of the top-left pixel.
+# ROS (ros2 topic echo /camera/color/camera_info): K = [fx 0 cx 0 fy cy 0 0 1]; RealSense: ppx = cx.
+fx:
+fy:
+cx:
+cy:
+width: {width}
+height: {height}
+# Units per metre of the depth images: 1000 for millimetres (RealSense, Kinect, ZED), 5000 for TUM.
+# Leave it out where depth/ holds .npy or .dpt in metres.
+depth_scale: 1000
+# Lens distortion k1, k2, p1, p2, k3 (OpenCV's order); leave it out for rectified images.
+# distortion: [0, 0, 0, 0, 0]
+# Images a second, where neither file names nor timestamps.txt give time stamps.
+# fps: 30
+#
+# rgb/    PNG or JPEG. depth/  16-bit PNG, .npy or .dpt, registered to the colour image, same size.
+#         Files go together by equal names, else by stamps (names such as 1305031102.1753.png, or
+#         timestamps.txt and depth_timestamps.txt, a stamp a line), else by order.
+# mask/   optional: 0 where pixels must not be used.  flow/  optional: .flo, .npy or KITTI's PNG.
+# poses.txt  optional ground truth: timestamp tx ty tz qx qy qz qw, camera to world.
+"""
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """A camera and what is known beside it.
+
+    Args:
+        camera: pinhole intrinsics, in pixels.
+        distortion: Brown coefficients k1 k2 p1 p2 [k3 [k4 k5 k6]]; empty for rectified images.
+        depth_scale: stored units per metre of depth, or None.
+        fps: frames a second, or None.
+        warnings: what the user should know.
+    """
+
+    camera: Camera
+    distortion: tuple[float, ...] = ()
+    depth_scale: float | None = None
+    fps: float | None = None
+    warnings: tuple[str, ...] = ()
+
+
+class Lens:
+    """Remaps images of a distorted camera to a pinhole camera with the same intrinsics.
+
+    Args:
+        camera: intrinsics of the distorted and of the resulting image.
+        distortion: Brown coefficients, as OpenCV orders them.
+    """
+
+    def __init__(self, camera: Camera, distortion: tuple[float, ...]) -> None:
+        size = (camera.width, camera.height)
+        self._u, self._v = cv2.initUndistortRectifyMap(
+            camera.K, np.array(distortion), np.eye(3), camera.K, size, cv2.CV_32FC1
+        )
+        inside = (self._u >= 0) & (self._u <= camera.width - 1)
+        self.mask: np.ndarray = inside & (self._v >= 0) & (self._v <= camera.height - 1)
+        """(H, W) bool, False where the pinhole image sees beyond the distorted one."""
+
+    def smooth(self, image: np.ndarray) -> np.ndarray:
+        """(H, W, 3) uint8 image, bilinear; black outside."""
+        return cv2.remap(image, self._u, self._v, cv2.INTER_LINEAR)
+
+    def nearest(self, array: np.ndarray) -> np.ndarray:
+        """(H, W) depth or mask, nearest value (no mixing across edges); 0 outside."""
+        return cv2.remap(array, self._u, self._v, cv2.INTER_NEAREST)
+
+
+def parse_camera(
+    camera: str | os.PathLike[str] | Camera | Calibration, shape: tuple[int, int]
+) -> Calibration:
+    """Calibration that a user gives for images of a size.
+
+    Args:
+        camera: ``fx,fy,cx,cy`` in pixels, the name of a camera file (see :func:`read_camera_file`),
+            or a camera.
+        shape: (height, width) of the images.
+
+    Raises:
+        InputError: neither numbers nor a file, or intrinsics of another image size.
+        FormatError: a damaged file.
+    """
+    if isinstance(camera, Camera):
+        found, where = Calibration(camera), "camera"
+    elif isinstance(camera, Calibration):
+        found, where = camera, "camera"
+    elif (numbers := _four_numbers(camera)) is not None:
+        try:
+            return Calibration(Camera(*numbers, height=shape[0], width=shape[1]))
+        except InputError as error:
+            raise InputError(f"camera '{camera}': {error}") from None
+    else:
+        where = os.fspath(camera)
+        try:
+            found = read_camera_file(Path(camera))
+        except FileNotFoundError:
+            raise InputError(
+                f"camera: expected a file or 'fx,fy,cx,cy' in pixels, got {where[:200]!r}, which "
+                f"is neither four numbers nor a file."
+            ) from None
+    if found.camera.shape != tuple(shape):
+        raise InputError(
+            f"{where}: the camera is for {found.camera.width}x{found.camera.height}, the images "
+            f"are {shape[1]}x{shape[0]} pixels (width x height). Intrinsics belong to one size."
+        )
+    return found
+
+
+def read_camera_file(path: Path) -> Calibration:
+    """Calibration of a YAML or JSON file.
+
+    Three vocabularies are read: ours (fx, fy, cx, cy, width, height, and optionally ``distortion:
+    [k1, k2, p1, p2, k3]``, ``depth_scale`` in units per metre, ``fps``), ROS's ``camera_info``
+    (calibration file or message), RealSense's intrinsics (ppx, ppy, coeffs).
+
+    Raises:
+        FormatError: not YAML, a key that is missing or unknown, a value that cannot be.
+        FileNotFoundError: no such file.
+    """
+    content = parse_yaml(read_text(path, limit=MAX_FILE_BYTES), str(path))
+    if not isinstance(content, dict):
+        raise FormatError(f"{path}: expected 'key: value' lines, got a {type(content).__name__}.")
+    content, warnings = _in_our_words(content, path)
+    missing = [key for key in REQUIRED if content.get(key) is None]
+    if missing:
+        raise FormatError(
+            f"{path}: missing: {', '.join(missing)}. Expected fx, fy, cx, cy, width, height in "
+            f"pixels."
+        )
+    numbers = {
+        key: _number(content[key], f"{path}: {key}")
+        for key in KNOWN
+        if key != "distortion" and content.get(key) is not None
+    }
+    try:
+        camera = Camera(**{key: numbers[key] for key in REQUIRED})  # type: ignore[arg-type]
+    except InputError as error:
+        raise FormatError(f"{path}: {error}") from None
+    for key in ("depth_scale", "fps"):
+        if key in numbers and numbers[key] <= 0:
+            raise FormatError(f"{path}: {key}: expected a number above 0, got {numbers[key]}.")
+    scale, told = units_per_metre(numbers.get("depth_scale"), str(path))
+    distortion = _distortion(content.get("distortion"), path)
+    warnings += told + _doubts(camera, path)
+    return Calibration(camera, distortion, scale, numbers.get("fps"), tuple(warnings))
+
+
+def units_per_metre(scale: float | None, where: str) -> tuple[float | None, list[str]]:
+    """Stored units per metre, and a warning where the inverse was given.
+
+    A value below 1 is RealSense's number of the same name, metres per unit: no depth is stored in
+    units longer than a metre.
+
+    Raises:
+        InputError: not a finite number above 0.
+    """
+    if scale is None:
+        return None, []
+    if not (np.isfinite(scale) and scale > 0):
+        raise InputError(f"{where}: depth_scale: expected units per metre above 0, got {scale}.")
+    if scale >= 1:
+        return float(scale), []
+    units = float(f"{1 / scale:.6g}")  # 0.001 as single precision prints it is 1000
+    return units, [
+        f"{where}: depth_scale {scale:g} is taken as metres per unit (as RealSense gives it): "
+        f"{units:g} units per metre."
+    ]
+
+
+def write_camera_template(directory: str | os.PathLike[str]) -> Path:
+    """Write a ``camera.yaml`` to fill in; the image size is filled in where rgb/ has an image.
+
+    Raises:
+        InputError: there is one already. OutputError: it cannot be written.
+    """
+    folder = Path(directory)
+    path = folder / CAMERA_FILE
+    if path.exists():
+        raise InputError(f"{path}: exists already; remove it first, or edit it.")
+    images = sorted_files(folder / "rgb", (".png", ".jpg", ".jpeg"))
+    height, width = image_size(images[0]) if images else ("", "")
+    folder.mkdir(parents=True, exist_ok=True)
+    with atomic_write(path) as file:
+        file.write(TEMPLATE.format(width=width, height=height))
+    return path
+
+
+def _four_numbers(camera: str | os.PathLike[str]) -> list[float] | None:
+    parts = os.fspath(camera).split(",")
+    try:
+        return [float(part) for part in parts] if len(parts) == 4 else None
+    except ValueError:
+        return None
+
+
+def _in_our_words(content: dict[Any, Any], path: Path) -> tuple[dict[str, Any], list[str]]:
+    """The content with our keys: those of ROS and RealSense renamed, unknown ones refused."""
+    extra = {key: content[key] for key in ("depth_scale", "fps") if key in content}
+    lens: Any = None
+    if K := next((content[key] for key in ("camera_matrix", "K", "k") if key in content), None):
+        K = _data(K)
+        if not isinstance(K, list) or len(K) != 9:
+            raise FormatError(f"{path}: camera matrix: expected 9 numbers, row by row.")
+        lens = next((content[k] for k in ("distortion_coefficients", "D", "d") if k in content), [])
+        size = {key: content.get(f"image_{key}", content.get(key)) for key in ("width", "height")}
+        renamed = {"fx": K[0], "cx": K[2], "fy": K[4], "cy": K[5], **size}
+        model = content.get("distortion_model", "")
+    elif "ppx" in content or "ppy" in content:  # RealSense
+        lens, model = content.get("coeffs", []), content.get("model", "")
+        renamed = {key: content.get(key) for key in ("fx", "fy", "width", "height")}
+        renamed |= {"cx": content.get("ppx"), "cy": content.get("ppy")}
+    else:
+        for key in content:
+            if key not in KNOWN:
+                close = difflib.get_close_matches(str(key)[:40], KNOWN, n=1)
+                hint = f" (did you mean '{close[0]}'?)" if close else ""
+                raise FormatError(
+                    f"{path}: unknown key '{str(key)[:40]}'{hint}; known: {', '.join(KNOWN)}."
+                )
+        return content, []
+    lens = _data(lens) or []
+    if not any(_distortion(lens, path)):
+        return renamed | extra, []
+    if any(word in str(model).lower() for word in ("fish", "equidist", "kannala", "ftheta")):
+        raise FormatError(
+            f"{path}: distortion model '{str(model)[:40]}': expected Brown's (plumb_bob, "
+            f"rational_polynomial). Rectify the images first."
+        )
+    told = f"{path}: lens distortion is taken out; use a camera file without it if the images are "
+    return renamed | extra | {"distortion": lens}, [told + "rectified already."]
+
+
+def _data(value: Any) -> Any:
+    """The numbers of a matrix that ROS writes as {rows, cols, data}."""
+    return value.get("data") if isinstance(value, dict) else value
+
+
+def _number(value: Any, where: str) -> float:
+    """A finite number of a file."""
+    try:
+        number = float("nan") if isinstance(value, bool) else float(value)
+    except (TypeError, ValueError, OverflowError):
+        number = float("nan")
+    if not abs(number) < MAX_NUMBER:
+        shown = f"{value!r}"[:40] if isinstance(value, str | int | float) else type(value).__name__
+        raise FormatError(f"{where}: expected a finite number, got {shown}.")
+    return number
+
+
+def _distortion(value: Any, path: Path) -> tuple[float, ...]:
+    if value is None or value == []:
+        return ()
+    if not isinstance(value, list) or len(value) not in BROWN_COUNTS:
+        raise FormatError(
+            f"{path}: distortion: expected a list of 4, 5 or 8 numbers [k1, k2, p1, p2, k3, ...]."
+        )
+    return tuple(_number(item, f"{path}: distortion") for item in value)
+
+
+def _doubts(camera: Camera, path: Path) -> list[str]:
+    """Warning of intrinsics that are rarely right."""
+    x, y = (camera.cx + 0.5) / camera.width, (camera.cy + 0.5) / camera.height
+    found = []
+    if abs(x - 0.5) > 0.25 or abs(y - 0.5) > 0.25:
+        found.append(
+            f"{path}: the principal point {camera.cx:g} {camera.cy:g} is far from the middle of "
+            f"{camera.width}x{camera.height} pixels: are fx, fy, cx, cy those of another image "
+            f"size?"
+        )
+    if not 0.8 < camera.fx / camera.fy < 1.25:
+        found.append(f"{path}: fx {camera.fx:g} and fy {camera.fy:g} differ: are pixels square?")
+    return found

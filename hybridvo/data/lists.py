@@ -1,0 +1,260 @@
+"""Lists on disk: numbered files, stamps, poses, and what belongs together by time."""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Sequence as Many
+from pathlib import Path, PurePath
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from hybridvo.data.image_io import read_text
+from hybridvo.errors import FormatError, InputError
+from hybridvo.geometry import pose_matrix
+from hybridvo.units import stamp_unit
+
+MAX_STAMP_DIFFERENCE_S = 0.02
+"""Largest difference in seconds between stamps that belong together (the TUM tools' value)."""
+MAX_CANDIDATES = 64
+"""Partners within the tolerance that a stamp may have on average: truth at 3 kHz has fewer."""
+MAX_POSITION_M = 1e12
+"""No position is larger, and squares of it are finite."""
+TIMED_POSE = "timestamp tx ty tz qx qy qz qw"
+
+
+class Row(NamedTuple):
+    """One line of a list: its number in the file, its numbers, then its words."""
+
+    line: int
+    numbers: tuple[float, ...]
+    words: tuple[str, ...]
+
+
+def natural_key(path: Path) -> list[str | int]:
+    """Sort key under which ``frame_9`` comes before ``frame_10``."""
+    parts = re.split(r"([0-9]+)", path.name)  # text, digits, text, ...
+    return [int(part) if k % 2 else part for k, part in enumerate(parts)]
+
+
+def sorted_files(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
+    """Files of a folder with one of the suffixes, in natural order; empty if there is no folder.
+
+    Raises:
+        InputError: files whose names differ in the ending alone: frames would be read twice.
+    """
+    if not folder.is_dir():
+        return []
+    found = [p for p in folder.iterdir() if p.suffix.lower() in suffixes and p.is_file()]
+    files = sorted((p for p in found if not p.name.startswith(".")), key=natural_key)
+    seen: dict[str, Path] = {}
+    for path in files:
+        other = seen.setdefault(path.stem, path)
+        if other is not path:
+            raise InputError(
+                f"{folder}: {other.name} and {path.name} are two files of one frame. Keep one."
+            )
+    return files
+
+
+def numbered_files(folder: Path | None, pattern: str) -> dict[int, Path]:
+    """Files whose whole name matches a regular expression, by the number in its first group.
+
+    Raises:
+        InputError: two files of one number.
+    """
+    if folder is None or not folder.is_dir():
+        return {}
+    found: dict[int, Path] = {}
+    for path in sorted(folder.iterdir()):
+        if match := re.fullmatch(pattern, path.name):
+            other = found.setdefault(int(match[1]), path)
+            if other is not path:
+                raise InputError(
+                    f"{folder}: {other.name} and {path.name} are two files of one frame. Keep one."
+                )
+    return found
+
+
+def gap_warning(name: str, numbers: Many[int]) -> list[str]:
+    """Warning of frame numbers that are missing between the first and the last."""
+    spans = [
+        f"{a + 1}" if b - a == 2 else f"{a + 1} to {b - 1}"
+        for a, b in itertools.pairwise(numbers)
+        if b - a > 1
+    ]
+    if not spans:
+        return []
+    return [f"{name}: frame numbers {shown(spans)} are missing; the time stamps keep the gap."]
+
+
+def flow_of_next(flow: dict[int, Path], numbers: Many[int]) -> list[Path | None]:
+    """Flow file of each frame that leads to the following frame: across a gap there is none."""
+    following = [*numbers[1:], None]
+    return [flow.get(n) if m == n + 1 else None for n, m in zip(numbers, following, strict=True)]
+
+
+def shown(names: Many[object], most: int = 8) -> str:
+    """The first names of a list, for a message."""
+    return ", ".join(map(str, names[:most])) + (", ..." if len(names) > most else "")
+
+
+def listed_path(root: Path, name: str, where: str) -> Path:
+    """Path of a file that a list names, below the sequence's own folder.
+
+    Raises:
+        FormatError: an absolute name, one with ``..``, or no file name.
+    """
+    if PurePath(name).is_absolute() or ".." in PurePath(name).parts or "\0" in name:
+        raise FormatError(f"{where}: expected a file below {root}, got {name[:200]!r}.")
+    return root / name
+
+
+def read_rows(path: Path, columns: str, *, words: int = 0) -> list[Row]:
+    """Rows of a list file: numbers, then ``words`` columns of text; ``#`` starts a comment line.
+
+    Args:
+        path: file to read.
+        columns: names of the columns, for the error message; their number is what a row must have.
+        words: how many of the last columns are text (the last may contain spaces).
+
+    Raises:
+        FormatError: a row of another length or a number that cannot be read, with its line number.
+    """
+    count = len(columns.split())
+    rows = []
+    for line, text in enumerate(read_text(path).split("\n"), start=1):
+        text = text.strip() if words else text.replace(",", " ").strip()
+        if not text or text.startswith("#"):
+            continue
+        parts = text.split(maxsplit=count - 1) if words else text.split()
+        try:
+            numbers = tuple(map(float, parts[: count - words]))
+        except ValueError:
+            numbers = ()
+        if len(parts) != count or len(numbers) != count - words:
+            raise FormatError(f"{path}:{line}: expected '{columns}', got {text[:80]!r}.")
+        rows.append(Row(line, numbers, tuple(parts[count - words :])))
+    return rows
+
+
+def to_seconds(stamps: Many[float] | np.ndarray, name: str) -> tuple[np.ndarray, list[str]]:
+    """Stamps in seconds, other units converted with a warning; what is not finite becomes NaN."""
+    values = np.array(stamps, dtype=np.float64)
+    values[~np.isfinite(values)] = np.nan
+    factor, unit = stamp_unit(values)
+    told = [f"{name}: stamps are {unit}; converted to seconds."]
+    return values / factor, told if factor != 1 else []
+
+
+def check_increasing(stamps: np.ndarray, where: str) -> None:
+    """Refuse stamps that are not finite, go back or stand still.
+
+    Raises:
+        InputError: with the frames and their stamps.
+    """
+    if not np.isfinite(stamps).all():
+        bad = int(np.flatnonzero(~np.isfinite(stamps))[0])
+        raise InputError(f"{where}: expected a finite timestamp, frame {bad} has {stamps[bad]}.")
+    back = np.flatnonzero(np.diff(stamps) <= 0)
+    if back.size:
+        i = int(back[0])
+        raise InputError(
+            f"{where}: timestamps must increase: frame {i} has {float(stamps[i])!r}, frame {i + 1} "
+            f"has {float(stamps[i + 1])!r}. Sort the list and remove duplicates."
+        )
+
+
+def rigid(R: np.ndarray, t: np.ndarray, where: str) -> np.ndarray:
+    """(4, 4) pose of a file: rotation brought onto the manifold, position in metres.
+
+    Raises:
+        FormatError: a matrix that is no rotation to 1 %, or a position beyond 1e12 m.
+    """
+    if np.abs(R).max() > 2 or np.abs(R @ R.T - np.eye(3)).max() > 1e-2 or np.linalg.det(R) < 0:
+        raise FormatError(f"{where}: expected a rotation, got {R.tolist()}.")
+    if np.abs(t).max() > MAX_POSITION_M:
+        raise FormatError(f"{where}: expected a position in metres, got {t.tolist()}.")
+    return pose_matrix(np.column_stack([R, t]))
+
+
+def read_poses(path: Path, columns: str = TIMED_POSE) -> tuple[np.ndarray, np.ndarray]:
+    """Stamps (N,), as in the file, and poses (N, 4, 4) of a list ``[timestamp] tx .. qw``.
+
+    Poses that are not finite are NaN; without a column of stamps these are NaN too.
+
+    Raises:
+        FormatError: a damaged row, a quaternion whose norm is not 1 to within 1 %, or a position
+            beyond 1e12 m, with its line number.
+    """
+    rows = read_rows(path, columns)
+    values = np.array([row.numbers[-7:] for row in rows], dtype=np.float64).reshape(-1, 7)
+    finite = np.isfinite(values).all(axis=1)
+    norms = np.linalg.norm(values[:, 3:].clip(-2, 2), axis=1)
+    good = (np.abs(norms - 1) < 0.01) & (np.abs(values[:, :3]) <= MAX_POSITION_M).all(axis=1)
+    if (finite & ~good).any():
+        i = int(np.flatnonzero(finite & ~good)[0])
+        raise FormatError(
+            f"{path}:{rows[i].line}: expected a position in metres and a unit quaternion qx qy qz "
+            f"qw, got {values[i].tolist()}."
+        )
+    poses = np.full((len(rows), 4, 4), np.nan)
+    if finite.any():
+        poses[finite] = np.eye(4)
+        poses[finite, :3, :3] = Rotation.from_quat(values[finite, 3:]).as_matrix()
+        poses[finite, :3, 3] = values[finite, :3]
+    stamps = [row.numbers[0] if len(row.numbers) == 8 else np.nan for row in rows]
+    return np.array(stamps), poses
+
+
+def poses_at(
+    stamps: np.ndarray, pose_stamps: np.ndarray, poses: np.ndarray, name: str
+) -> tuple[np.ndarray, list[str]]:
+    """(N, 4, 4) pose of the nearest stamp in seconds, NaN where none is near, and warnings."""
+    matched = np.full((len(stamps), 4, 4), np.nan)
+    for i, j in associate(stamps, pose_stamps):
+        matched[i] = poses[j]
+    missing = int(np.isnan(matched[:, 0, 0]).sum())
+    if not missing:
+        return matched, []
+    limit = MAX_STAMP_DIFFERENCE_S
+    return matched, [f"{name}: {missing} of {len(stamps)} frames have no pose within {limit} s."]
+
+
+def associate(
+    first: np.ndarray, second: np.ndarray, tolerance: float = MAX_STAMP_DIFFERENCE_S
+) -> list[tuple[int, int]]:
+    """Pairs (i, j) of stamps in seconds that belong together, one to one, sorted by i.
+
+    Greedy by the smallest difference, which must be below ``tolerance``, as the TUM tools do it.
+    Neither list needs to be sorted; stamps that are not finite have no partner.
+
+    Raises:
+        InputError: stamps so close together, or so often repeated, that nearly all fit all.
+    """
+    first, second = np.asarray(first, np.float64), np.asarray(second, np.float64)
+    rows, columns = np.flatnonzero(np.isfinite(first)), np.flatnonzero(np.isfinite(second))
+    columns = columns[np.argsort(second[columns], kind="stable")]
+    low = np.searchsorted(second[columns], first[rows] - tolerance, side="left")
+    high = np.searchsorted(second[columns], first[rows] + tolerance, side="right")
+    count = np.maximum(high - low, 0)
+    if count.sum() > MAX_CANDIDATES * (len(first) + len(second)):
+        raise InputError(
+            f"{count.sum()} pairs of stamps lie within {tolerance} s of each other, for "
+            f"{len(first)} and {len(second)} stamps: expected few. Are the stamps seconds, and is "
+            f"each there once?"
+        )
+    i = np.repeat(rows, count)
+    j = columns[np.arange(len(i)) + np.repeat(low - np.cumsum(count) + count, count)]
+    difference = np.abs(first[i] - second[j])
+    near = np.flatnonzero(difference < tolerance)
+    near = near[np.lexsort((j[near], i[near], difference[near]))]
+    pairs: dict[int, int] = {}
+    taken: set[int] = set()
+    for row, column in zip(i[near].tolist(), j[near].tolist(), strict=True):
+        if row not in pairs and column not in taken:
+            pairs[row] = column
+            taken.add(column)
+    return sorted(pairs.items())

@@ -1,0 +1,362 @@
+"""Images of pairs: the paper's figures of one pair, and the worst pairs of a comparison."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from hybridvo.data.sequence import Sequence, iter_pairs, open_sequence
+from hybridvo.errors import InputError
+from hybridvo.evaluation.maps import (
+    Saliency,
+    error_map,
+    flow_colours,
+    integrated_gradients,
+    longest_flow,
+    moving_pixels,
+    object_flow,
+    prediction_errors,
+    share_on,
+    uncertainty_maps,
+)
+from hybridvo.evaluation.pair_errors import pair_errors
+from hybridvo.evaluation.panels import FlowPanel, ImagePanel, Panel, ScalarPanel, maps_png
+from hybridvo.evaluation.sequence_job import true_motion
+from hybridvo.evaluation.sources import SharedFlow
+from hybridvo.files import atomic_write, write_json
+from hybridvo.geometry import matrix_to_euler_deg
+from hybridvo.types import Frame, FramePair, PixelwisePrediction
+
+THUMBNAIL_WIDTH = 256
+"""Width of each of the three panels of a worst pair, px: a report holds a hundred of them."""
+JPEG_QUALITY = 80
+CAPTION_PX = 18
+ERROR_RANGE_PX = (0.01, 10.0)
+"""Ends of the colours of every error map of the worst pairs, px, logarithmic."""
+SALIENCY_BLOCK = 4
+"""Pixels whose saliency is summed for display: networks read one of some pixels only."""
+
+
+def draw(
+    sequence: str | Path,
+    pair: int,
+    out: str | Path,
+    *,
+    dataset: str | None = None,
+    flow: str = "auto",
+    method: str | None = None,
+    weights: Iterable[str | Path] = (),
+    steps: int = 32,
+    overwrite: bool = False,
+) -> list[Path]:
+    """Draw the maps of one pair: flow and its parts, error, weights, and what networks look at.
+
+    Args:
+        sequence: folder of the sequence.
+        pair: its first frame.
+        out: image to write, .png; the numbers stand beside it as .json.
+        dataset: kind of the sequence; None detects it.
+        flow: ``auto`` (files where there are some), ``file`` or ``dis``.
+        method: estimate that is looked at; None: the default of ``hybridvo run``.
+        weights: networks to look through; empty: the pretrained ones.
+        steps: of the integrated gradients.
+        overwrite: replace what is there.
+
+    Returns:
+        The files written.
+
+    Raises:
+        InputError: unknown sequence, pair or weights, or an image that exists or is no PNG.
+        OutputError: the image cannot be written.
+    """
+    from hybridvo.pipeline import DEFAULT_METHOD, estimate
+
+    out = Path(out)
+    if out.suffix.lower() != ".png":
+        raise InputError(f"{out}: expected a name that ends in .png.")
+    if out.exists() and not overwrite:
+        raise InputError(f"{out}: exists; pass --overwrite.")
+    if steps < 1:
+        raise InputError(f"steps: expected at least 1, got {steps}.")
+    opened = open_sequence(sequence, dataset)
+    given = read_pair(opened, pair, flow)
+    flow_gt = None
+    if opened.has_flow and opened.flow_is_true:
+        flow_gt = given.flow if given.flow_is_true else opened.flow(pair)[0]
+    T_gt = true_motion(opened, pair, pair + 1)
+    method = method or DEFAULT_METHOD
+    motion = estimate(given, method=method)
+    panels, numbers, moving = pair_panels(given, motion, T_gt, flow_gt)
+    for name, network in networks(weights):
+        more, values = network_panels(name, network, given, T_gt, moving, steps)
+        panels += more
+        numbers |= values
+    source = f"{given.flow_source} (true)" if given.flow_is_true else given.flow_source
+    heading = f"{opened.name}, pair {pair}; flow: {source}; motion: {method}, {motion.status}"
+    height, width = given.prev.camera.shape
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_write(out, "wb") as file:
+        file.write(maps_png(panels, heading, width / height))
+    record = {"title": heading, "image": out.name, "values": numbers}
+    write_json(out.with_suffix(".json"), record)
+    return [out, out.with_suffix(".json")]
+
+
+def read_pair(sequence: Sequence, index: int, flow: str = "auto") -> FramePair:
+    """Pair of a sequence that has flow and depth.
+
+    Raises:
+        InputError: no such pair, or one without flow or depth.
+    """
+    if not 0 <= index < len(sequence) - 1:
+        raise InputError(
+            f"--pair: {sequence.name} has pairs 0 to {len(sequence) - 2}, got {index}."
+        )
+    if flow == "auto":
+        flow = "file" if sequence.has_flow else "dis"
+    provider = SharedFlow(flow, sequence)
+    pair = next(iter(iter_pairs(sequence, provider, start=index, stop=index + 2)))
+    if pair.flow is None or pair.prev.depth is None:
+        missing = "flow" if pair.flow is None else "depth"
+        raise InputError(f"{sequence.name}, pair {index}: there is no {missing} to look at.")
+    return pair
+
+
+def pair_panels(
+    pair: FramePair, motion: Any, T_gt: np.ndarray | None, flow_gt: np.ndarray | None
+) -> tuple[list[Panel], dict[str, float | None], np.ndarray]:
+    """Panels and numbers that need no network, and (H, W) which pixels move by themselves."""
+    ego, objects = object_flow(pair, motion.T_curr_prev)
+    known = T_gt is not None and flow_gt is not None
+    real = object_flow(replace(pair, flow=flow_gt), T_gt)[1] if known else objects
+    moving = moving_pixels(real)
+    whose = "true flow and motion" if known else "this flow and the estimate"
+    # one scale for all three: the parts are to be seen beside the whole
+    longest = longest_flow(pair.flow)
+    panels: list[Panel] = []
+    if pair.prev.rgb is not None:
+        panels.append(ImagePanel("previous image", pair.prev.rgb))
+    panels += [
+        FlowPanel("input flow F", pair.flow, longest),
+        FlowPanel("ego flow of the estimate", ego, longest),
+        FlowPanel("object flow, F minus ego flow", objects, longest),
+    ]
+    numbers: dict[str, float | None] = {f"moving share, {whose}": float(moving.mean())}
+    if T_gt is not None:
+        prev, curr, depth = pair.prev.camera, pair.curr.camera, pair.prev.depth
+        error = error_map(motion.T_curr_prev, T_gt, depth, prev, curr)
+        panels.append(ScalarPanel("error of the ego flow", error, "px"))
+        errors = pair_errors(motion.T_curr_prev, T_gt, depth, prev, curr)
+        numbers |= {
+            "EPE, px": errors["epe_l2_px"],
+            "rotation error, deg": errors["rot_err_deg"],
+            "translation error, m": errors["trans_err"],
+        }
+    if motion.weights is not None:
+        title = "weights of the motion (outline: what moves by itself)"
+        panels.append(ScalarPanel(title, motion.weights, "weight", 1.0, moving))
+    return panels, numbers, moving
+
+
+def networks(files: Iterable[str | Path] = ()) -> list[tuple[str, Any]]:
+    """(name, network) of the given files, or of all pretrained ones that predict a motion."""
+    from hybridvo.network.options import KINDS
+    from hybridvo.network.weights import load_weights, pretrained, pretrained_names
+
+    found = []
+    paths = [Path(file) for file in files]
+    for path in paths or [pretrained(name) for name in pretrained_names()]:
+        network: Any = load_weights(path)[0]
+        kind = network.options.kind
+        if kind in KINDS:
+            found.append((path.stem, network))
+        elif paths:
+            raise InputError(f"--weights {path}: expected {', '.join(KINDS)}, got a {kind}.")
+    return found
+
+
+def network_panels(
+    name: str,
+    network: Any,
+    pair: FramePair,
+    T_gt: np.ndarray | None,
+    moving: np.ndarray,
+    steps: int,
+) -> tuple[list[Panel], dict[str, float | None]]:
+    """Panels and numbers of one network: uncertainty, errors, saliency of its last pass."""
+    import torch
+
+    from hybridvo.network.inputs import assemble_inputs
+
+    inputs = assemble_inputs(pair)
+    T_start = start_of(network, inputs)
+    with torch.no_grad():
+        output = network(inputs, T_start)
+    panels: list[Panel] = []
+    numbers: dict[str, float | None] = {}
+    if isinstance(output, PixelwisePrediction):
+        units = [("rotation", "deg"), ("translation", "m")]
+        if output.log_scale_rotation is not None:
+            for (what, unit), values in zip(units, uncertainty_maps(output), strict=True):
+                title = f"{name}: uncertainty of the {what}"
+                panels.append(ScalarPanel(title, values, f"{unit} (1 sigma)", None, moving))
+        if T_gt is not None:
+            true = matrix_to_euler_deg(T_gt[:3, :3]), T_gt[:3, 3]
+            for (what, unit), values in zip(units, prediction_errors(output, *true), strict=True):
+                panels.append(ScalarPanel(f"{name}: error of the {what}", values, unit))
+    for what, saliency in saliencies(network, inputs, T_start, steps).items():
+        shown = _block_sums(saliency.magnitude)
+        relative = shown / max(float(np.percentile(shown, 99)), 1e-30)
+        title = f"{name}: saliency of the {what} (last pass)"
+        panels.append(ScalarPanel(title, relative, "relative", 1.0, moving))
+        numbers |= {
+            f"{name}: saliency of the {what} on moving pixels": share_on(
+                saliency.magnitude, moving
+            ),
+            f"{name}: part of the {what} that the saliency misses": saliency.completeness_error,
+        }
+    return panels, numbers
+
+
+def _block_sums(values: np.ndarray) -> np.ndarray:
+    """Sums over square blocks of a map (h, w); a rest at the border is left out."""
+    n = SALIENCY_BLOCK
+    h, w = values.shape[0] // n, values.shape[1] // n
+    return values[: n * h, : n * w].reshape(h, n, w, n).sum(axis=(1, 3))
+
+
+def start_of(network: Any, inputs: Any) -> Any:
+    """Motion that a network of several passes starts its last one from; None for one pass."""
+    from hybridvo.learned import next_start
+    from hybridvo.network.passes import first_motions
+
+    passes = int(network.options.passes)
+    return first_motions(network, inputs, next_start(network), passes - 1)
+
+
+def saliencies(network: Any, inputs: Any, T_start: Any, steps: int) -> dict[str, Saliency]:
+    """Integrated gradients of rotation and translation over flow and inverse depth.
+
+    The answer is the length of the predicted rotation (or translation) along its own direction. Of
+    a pixel-wise network it is that of the pixels and weights that the selection chose for the real
+    input: with the choice itself inside, the answer would jump along the path. The path starts at
+    zero flow and zero inverse depth; for scale-free networks, which see the logarithm of the
+    depth, at zero flow. What earlier passes found is held fixed.
+    """
+    import torch
+
+    from hybridvo.network.selection import chosen_pose
+
+    names = ("flow",) if network.options.scale_free else ("flow", "inverse_depth")
+    given = tuple(getattr(inputs, name) for name in names)
+
+    def run(*tensors: Any) -> Any:
+        return network(replace(inputs, **dict(zip(names, tensors, strict=True))), T_start)
+
+    with torch.no_grad():
+        output = run(*given)
+    found = {}
+    for k, what in enumerate(("rotation", "translation")):
+        if isinstance(output, PixelwisePrediction):
+            maps = {name: getattr(output, name) for name in ("rotation", "translation")}
+            maps = {name: value.clone().requires_grad_() for name, value in maps.items()}
+            motion = chosen_pose(replace(output, **maps))[k]
+            direction = (motion / motion.norm().clamp(min=1e-12)).detach()
+            (weights,) = torch.autograd.grad((direction * motion).sum(), maps[what])
+            answer = _weighted_map(run, what, weights)
+        else:
+            motion = output[k]
+            answer = _along(run, k, motion / motion.norm().clamp(min=1e-12))
+        found[what] = integrated_gradients(answer, given, steps=steps)
+    return found
+
+
+def _weighted_map(run: Callable[..., Any], name: str, weights: Any) -> Callable[..., Any]:
+    return lambda *tensors: (weights * getattr(run(*tensors), name)).sum()
+
+
+def _along(run: Callable[..., Any], part: int, direction: Any) -> Callable[..., Any]:
+    return lambda *tensors: (direction * run(*tensors)[part]).sum()
+
+
+# -- worst pairs of a comparison ------------------------------------------------------------------
+
+
+def draw_worst(
+    out: Path,
+    stem: str,
+    sequence: Sequence,
+    entries: Iterable[dict[str, Any]],
+    results: Mapping[tuple[int, str, str], Mapping[str, Any]],
+    flows: Iterable[str],
+) -> None:
+    """Draw worst pairs of one sequence, with the motion that the comparison found.
+
+    Args:
+        out: folder of the comparison.
+        stem: of the names of the images in it.
+        sequence: an open one.
+        entries: get ``picture``, or None and ``picture_reason``.
+        results: (index, method, flow source) -> its row with ``prev``, ``next``, ``T_curr_prev``.
+        flows: ``dis``, ``file``.
+    """
+    providers = {provider.label: provider for provider in (SharedFlow(f, sequence) for f in flows)}
+    for entry in entries:
+        method, label = entry["method"], entry["flow_source"]
+        row = results[entry["index"], method, label]
+        entry |= {"picture": None, "picture_reason": None}
+        try:
+            prev, curr = sequence.frame(row["prev"]), sequence.frame(row["next"])
+        except (InputError, OSError) as error:
+            entry["picture_reason"] = f"the pair cannot be read: {error}"
+            continue
+        flow = providers[label](prev, curr).flow
+        T_est = np.array(row["T_curr_prev"]).reshape(4, 4)
+        image = _three_panels(
+            prev, curr, flow, T_est, true_motion(sequence, prev.index, curr.index)
+        )
+        entry["picture"] = f"{stem}_{entry['index']:06d}_{method}_{label.split()[0]}.jpg"
+        encoded = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+        with atomic_write(out / entry["picture"], "wb") as file:
+            file.write(encoded[1].tobytes())
+
+
+def _three_panels(
+    prev: Frame, curr: Frame, flow: np.ndarray | None, T_est: np.ndarray, T_gt: np.ndarray | None
+) -> np.ndarray:
+    """(H, W, 3) uint8 RGB: previous frame, flow, and distance of the two ego flows."""
+    panels = [(prev.rgb, f"frame {prev.index}" if prev.rgb is not None else "no image")]
+    if flow is None:
+        panels.append((None, "no flow"))
+    else:
+        longest = longest_flow(flow)
+        panels.append((flow_colours(flow, longest), f"flow, to {longest:.3g} px"))
+    if T_gt is None or prev.depth is None:
+        panels.append((None, "error unknown"))
+    else:
+        low, high = ERROR_RANGE_PX
+        with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
+            error = error_map(T_est, T_gt, prev.depth, prev.camera, curr.camera)
+            relative = np.log(error / low) / np.log(high / low)
+        grey = np.clip(255 * np.nan_to_num(relative, nan=0.0), 0, 255).astype(np.uint8)
+        heat = cv2.applyColorMap(grey, cv2.COLORMAP_INFERNO)[..., ::-1].copy()
+        heat[~np.isfinite(error)] = 128
+        panels.append((heat, f"error {low:g} to {high:g} px, log"))
+    return np.concatenate([_panel(*panel, prev.camera.shape) for panel in panels], axis=1)
+
+
+def _panel(image: np.ndarray | None, caption: str, shape: tuple[int, int]) -> np.ndarray:
+    """Image of the common width with a line of text below."""
+    size = THUMBNAIL_WIDTH, max(1, round(THUMBNAIL_WIDTH * shape[0] / shape[1]))
+    small = np.full((size[1], size[0], 3), 128, np.uint8)
+    if image is not None:
+        small[:] = cv2.resize(np.ascontiguousarray(image), size, interpolation=cv2.INTER_AREA)
+    strip = np.full((CAPTION_PX, THUMBNAIL_WIDTH, 3), 255, np.uint8)
+    place, font = (4, CAPTION_PX - 5), cv2.FONT_HERSHEY_SIMPLEX
+    cv2.putText(strip, caption, place, font, 0.4, (0, 0, 0), 1, cv2.LINE_AA)
+    return np.concatenate([small, strip])

@@ -1,0 +1,264 @@
+"""Errors of one relative pose against the true one: the paper's three, and metric ones beside them.
+
+There is one definition of each name in the house. ``epe`` is the paper's: the mean over pixels *and
+components* of the absolute difference of ego flows at 128x256, with invalid pixels set to zero but
+counted. ``epe_l2_px`` is the usual end-point error: the mean L2 distance over valid pixels at
+native size.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+
+from hybridvo.errors import InputError
+from hybridvo.geometry import matrix_to_euler_deg, rotation_angle
+from hybridvo.types import Camera
+
+PAPER_SIZE = (128, 256)
+"""(height, width) at which the paper measures its EPE."""
+PAPER_MAX_FLOW_PX = 400.0
+"""Pixels whose true ego flow is at least this long count with error zero in the paper's EPE."""
+PAPER_MIN_DEPTH_M = 1e-12
+"""Added to |z| before the division, as in the published code."""
+UNKNOWN_FLOW_PX = 1e9
+"""Middlebury's mark of an unknown flow vector."""
+MOVING_PX = 1.0
+"""A pixel whose true flow differs by more than this from the true ego flow moves by itself."""
+NO_DEPTH = "no pixel has a valid depth and a true motion that stays in front of the camera"
+
+
+def _check(T: Any, depth: Any, camera_prev: Camera, camera_curr: Camera) -> None:
+    for name, pose in T.items():
+        if np.shape(pose) != (4, 4) or not np.isfinite(pose).all():
+            raise InputError(f"{name}: expected a finite (4, 4) transform, got {np.shape(pose)}.")
+    if np.shape(depth) != camera_prev.shape or camera_curr.shape != camera_prev.shape:
+        raise InputError(
+            f"depth: expected shape {camera_prev.shape} of both cameras, got {np.shape(depth)} and "
+            f"a current camera of {camera_curr.shape}."
+        )
+
+
+def _moved(
+    T: np.ndarray, K_prev: np.ndarray, K_curr: np.ndarray, inverse_depth: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(x, y) of every pixel (H, W) after the motion, and its moved depth over its depth."""
+    A = K_curr @ T[:3, :3] @ np.linalg.inv(K_prev)
+    b = K_curr @ T[:3, 3]
+    v, u = np.ogrid[: inverse_depth.shape[0], : inverse_depth.shape[1]]
+    x, y, s = (A[k, 0] * u + (A[k, 1] * v + A[k, 2]) + b[k] * inverse_depth for k in range(3))
+    return x / s, y / s, s
+
+
+def _inverse(depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(H, W) inverse depth, and which depths are valid: finite and positive."""
+    inverse_depth = 1.0 / np.asarray(depth, dtype=np.float64)
+    # 0 < 1/d < inf drops zero, negative, infinite and NaN depth at once
+    return inverse_depth, (inverse_depth > 0) & (inverse_depth < np.inf)
+
+
+@np.errstate(divide="ignore", invalid="ignore", over="ignore")
+def _native_epe(
+    T_est: np.ndarray, T_gt: np.ndarray, depth: np.ndarray, prev: Camera, curr: Camera
+) -> float | None:
+    """Mean L2 distance of the two ego flows over valid pixels, px."""
+    inverse_depth, valid = _inverse(depth)
+    x_gt, y_gt, s_gt = _moved(T_gt, prev.K, curr.K, inverse_depth)
+    x_est, y_est, s_est = _moved(T_est, prev.K, curr.K, inverse_depth)
+    valid &= s_gt > 0
+    error = np.sqrt((x_est - x_gt) ** 2 + (y_est - y_gt) ** 2)
+    error[~(s_est > 0) | ~np.isfinite(error)] = np.hypot(*prev.shape)
+    return float(error[valid].mean()) if valid.any() else None
+
+
+@np.errstate(divide="ignore", invalid="ignore", over="ignore")
+def _paper_epe(
+    T_est: np.ndarray, T_gt: np.ndarray, depth: np.ndarray, prev: Camera, curr: Camera
+) -> float | None:
+    """Component mean of |F_ego - F~_ego| at 128x256; None where no pixel has a depth."""
+    height, width = PAPER_SIZE
+    K = []
+    for camera in (prev, curr):
+        sx, sy = width / camera.width, height / camera.height
+        small = np.diag([sx, sy, 1.0]) @ camera.K
+        small[:2, 2] = sx * (camera.cx + 0.5) - 0.5, sy * (camera.cy + 0.5) - 0.5
+        K.append(small)
+    # nearest at pixel centres: centre i of the small grid lies at (i + 0.5) / s - 0.5
+    rows = ((np.arange(height) + 0.5) * prev.height / height).astype(int)
+    columns = ((np.arange(width) + 0.5) * prev.width / width).astype(int)
+    depth = depth[np.ix_(rows, columns)].astype(np.float64)
+    valid = np.isfinite(depth) & (depth > 0)
+    if not valid.any():
+        return None
+    depth = np.where(valid, depth, 1.0)
+    v, u = np.mgrid[:height, :width]
+    points = np.linalg.inv(K[0]) @ np.stack([u, v, np.ones_like(u)]).reshape(3, -1) * depth.ravel()
+    flows = []
+    for T in (T_est, T_gt):
+        x, y, z = K[1] @ (T[:3, :3] @ points + T[:3, 3:])
+        # |z| as in the published code ("to avoid reflection"): never undefined
+        z = np.abs(z) + PAPER_MIN_DEPTH_M
+        flows.append(np.stack([x / z - u.ravel(), y / z - v.ravel()]))
+    counted = valid.ravel() & (np.hypot(*flows[1]) < PAPER_MAX_FLOW_PX)
+    return float(np.abs(flows[0] - flows[1])[:, counted].sum()) / (2 * height * width)
+
+
+def pair_errors(
+    T_est: np.ndarray,
+    T_gt: np.ndarray,
+    depth_prev: np.ndarray,
+    camera_prev: Camera,
+    camera_curr: Camera,
+) -> dict[str, float | None]:
+    """Errors of one estimated ``T_curr_prev``.
+
+    Args:
+        T_est: (4, 4) estimated ``T_curr_prev``, metres.
+        T_gt: (4, 4) true ``T_curr_prev``, metres.
+        depth_prev: (H, W) true depth of the previous frame, metres; not finite or not positive is
+            invalid.
+        camera_prev: previous camera, (H, W).
+        camera_curr: current camera, (H, W).
+
+    Returns:
+        ``r_err_deg``: mean over the axes of the absolute Euler X-Y-Z difference, degrees (wrapped
+        to 180). ``t_err``: mean over the components of the absolute translation difference, m.
+        ``epe``: the paper's, px at 128x256. ``epe_l2_px``: mean L2 distance of the ego flows over
+        valid pixels at native size; a pixel that the estimate puts behind the camera counts with
+        the image diagonal. ``rot_err_deg``: geodesic angle. ``trans_err``: norm of the translation
+        difference, m. ``epe`` and ``epe_l2_px`` are None where no pixel is valid.
+
+    Raises:
+        InputError: poses that are not finite, shapes that do not match.
+    """
+    _check({"T_est": T_est, "T_gt": T_gt}, depth_prev, camera_prev, camera_curr)
+    T_est, T_gt = np.asarray(T_est, dtype=np.float64), np.asarray(T_gt, dtype=np.float64)
+    depth = np.asarray(depth_prev)
+    euler = matrix_to_euler_deg(T_est[:3, :3]) - matrix_to_euler_deg(T_gt[:3, :3])
+    euler = (euler + 180.0) % 360.0 - 180.0
+    translation = T_est[:3, 3] - T_gt[:3, 3]
+    return {
+        "r_err_deg": float(np.abs(euler).mean()),
+        "t_err": float(np.abs(translation).mean()),
+        "epe": _paper_epe(T_est, T_gt, depth, camera_prev, camera_curr),
+        "epe_l2_px": _native_epe(T_est, T_gt, depth, camera_prev, camera_curr),
+        "rot_err_deg": float(np.degrees(rotation_angle(T_est[:3, :3] @ T_gt[:3, :3].T))),
+        "trans_err": float(np.linalg.norm(translation)),
+    }
+
+
+def mean_pair_errors(pairs: Iterable[Mapping[str, float | None]]) -> dict[str, Any]:
+    """Means and medians of :func:`pair_errors` over pairs, under the names of ``results.json``.
+
+    Args:
+        pairs: what :func:`pair_errors` returned for each pair.
+
+    Returns:
+        ``pairs`` (their number), the means ``r_err_deg``, ``t_err``, ``epe``, ``epe_l2_px``,
+        ``rot_err_deg_mean``, ``trans_err_mean``, the medians ``rot_err_deg_median``,
+        ``trans_err_median``, and ``reasons`` for every value that is None or leaves pairs out.
+    """
+    pairs = list(pairs)
+    report: dict[str, Any] = {"pairs": len(pairs)}
+    reasons: dict[str, str] = {}
+    for key in (
+        *("r_err_deg", "t_err", "epe", "epe_l2_px"),
+        *("rot_err_deg_mean", "rot_err_deg_median", "trans_err_mean", "trans_err_median"),
+    ):
+        name = key.removesuffix("_mean").removesuffix("_median")
+        known = [value for pair in pairs if (value := pair.get(name)) is not None]
+        statistic = np.median if key.endswith("_median") else np.mean
+        report[key] = float(statistic(known)) if known else None
+        if not pairs:
+            reasons[key] = "no pair with ground truth"
+        elif len(known) < len(pairs):
+            missing = len(pairs) - len(known)
+            reasons[key] = f"unknown for {missing} of {len(pairs)} pairs: {NO_DEPTH}"
+    report["reasons"] = reasons
+    return report
+
+
+@np.errstate(divide="ignore", invalid="ignore", over="ignore")
+def dynamic_fraction(
+    flow_gt: np.ndarray,
+    depth_prev: np.ndarray,
+    T_gt: np.ndarray,
+    camera_prev: Camera,
+    camera_curr: Camera,
+) -> float | None:
+    """Share of valid pixels whose true flow differs from the true ego flow by more than 1 px.
+
+    Args:
+        flow_gt: (H, W, 2) true total flow, px; NaN or components above 1e9 are unknown.
+        depth_prev: (H, W) true depth, metres.
+        T_gt: (4, 4) true ``T_curr_prev``.
+        camera_prev: previous camera, (H, W).
+        camera_curr: current camera, (H, W).
+
+    Returns:
+        The share in [0, 1]; None where no pixel has flow, depth and a point in front of the camera.
+
+    Raises:
+        InputError: shapes that do not match.
+    """
+    _check({"T_gt": T_gt}, depth_prev, camera_prev, camera_curr)
+    if np.shape(flow_gt) != (*camera_prev.shape, 2):
+        raise InputError(f"flow_gt: expected {(*camera_prev.shape, 2)}, got {np.shape(flow_gt)}.")
+    inverse_depth, valid = _inverse(depth_prev)
+    x, y, s = _moved(T_gt, camera_prev.K, camera_curr.K, inverse_depth)
+    du, dv = np.moveaxis(np.asarray(flow_gt, dtype=np.float64), 2, 0)
+    valid &= (np.abs(du) < UNKNOWN_FLOW_PX) & (np.abs(dv) < UNKNOWN_FLOW_PX) & (s > 0)
+    v, u = np.ogrid[: camera_prev.height, : camera_prev.width]
+    moving = np.hypot(x - u - du, y - v - dv)[valid] > MOVING_PX
+    return float(moving.mean()) if len(moving) else None
+
+
+def pair_facts(
+    T_gt: np.ndarray | None,
+    depth_prev: np.ndarray | None,
+    camera_prev: Camera,
+    camera_curr: Camera,
+    flow_gt: np.ndarray | None = None,
+) -> dict[str, float | None]:
+    """What may explain an error: how much moves, how far, before what. None where unknown.
+
+    Args:
+        T_gt: (4, 4) true ``T_curr_prev``, metres, or None.
+        depth_prev: (H, W) depth of the previous frame, metres, or None.
+        camera_prev: previous camera, (H, W).
+        camera_curr: current camera, (H, W).
+        flow_gt: (H, W, 2) true flow of everything, px, NaN where unknown; None where there is
+            none, or where it holds the motion of the camera alone.
+
+    Returns:
+        ``dynamic_fraction`` (:func:`dynamic_fraction`); ``flow_magnitude_px``: median length of the
+        true ego flow; ``rotation_deg`` and ``translation_m`` of the true motion;
+        ``depth_spread``: 90th over 10th percentile of the valid depth.
+
+    Raises:
+        InputError: a pose that is not finite, shapes that do not match.
+    """
+    names = ("dynamic_fraction", "flow_magnitude_px", "rotation_deg", "translation_m")
+    facts: dict[str, float | None] = dict.fromkeys((*names, "depth_spread"))
+    if T_gt is not None:
+        facts["rotation_deg"] = float(np.degrees(rotation_angle(T_gt[:3, :3])))
+        facts["translation_m"] = float(np.linalg.norm(T_gt[:3, 3]))
+    if depth_prev is None:
+        return facts
+    if T_gt is not None and flow_gt is not None:
+        facts["dynamic_fraction"] = dynamic_fraction(
+            flow_gt, depth_prev, T_gt, camera_prev, camera_curr
+        )
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        inverse_depth, valid = _inverse(depth_prev)
+        if valid.any():
+            low, high = np.quantile(inverse_depth[valid], [0.1, 0.9])
+            facts["depth_spread"] = float(high / low)
+        if T_gt is not None:
+            x, y, s = _moved(T_gt, camera_prev.K, camera_curr.K, inverse_depth)
+            v, u = np.ogrid[: camera_prev.height, : camera_prev.width]
+            length = np.hypot(x - u, y - v)[valid & (s > 0)]
+            facts["flow_magnitude_px"] = float(np.median(length)) if length.size else None
+    return facts

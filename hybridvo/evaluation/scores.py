@@ -1,0 +1,186 @@
+"""Lines of ``results.json``: one method on one sequence, and one method on all of them.
+
+Fields beyond those of the interface: ``pairs_scored`` and ``pairs_scored_epe`` (pairs over which
+means and medians are taken), ``epe_l2_px_median``, ``failures``, ``failure_rate`` with its Wilson
+interval, errors after a similarity (``_sim3``), ``ms_per_pair_p95``, ``flow_ms_median``,
+``ms_with_flow_median`` and ``reasons``: why a value is None, by its name. A failed estimate counts
+with the motion it carries, which is none, in every mean and median.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from scipy.stats import binomtest
+
+from hybridvo.evaluation.metrics import evaluate
+from hybridvo.evaluation.pair_errors import mean_pair_errors
+from hybridvo.trajectory import Trajectory
+
+FAILURE_PX = 1.0
+"""Error of the ego flow at native size above which an estimate has failed, px."""
+CONFIDENCE = 0.95
+READS_NO_FLOW = ("opencv-rgbd", "open3d-rgbd", "identity")
+"""Methods whose result is the same whatever the flow."""
+PATH_KEYS = (
+    *("ate_rmse", "rpe_trans_rmse", "rpe_rot_rmse_deg"),
+    *("ate_rmse_sim3", "rpe_trans_rmse_sim3", "rpe_rot_rmse_deg_sim3"),
+)
+"""Errors of a whole trajectory; those without a suffix are after a rigid alignment."""
+PAIR_ERRORS = ("r_err_deg", "t_err", "epe", "epe_l2_px", "rot_err_deg", "trans_err")
+ROW_COLUMNS = (
+    *("sequence", "method", "flow_source", "depth_source", "pairs", "failed", "r_err_deg", "t_err"),
+    *("epe", "epe_l2_px", "rot_err_deg_mean", "rot_err_deg_median", "trans_err_mean"),
+    *("trans_err_median", "ate_rmse", "rpe_trans_rmse", "rpe_rot_rmse_deg", "alignment"),
+    *("ms_per_pair_median", "dynamic_fraction"),
+    *("pairs_scored", "pairs_scored_epe", "epe_l2_px_median", "failures", "failure_rate"),
+    *("failure_rate_low", "failure_rate_high", "ate_rmse_sim3", "scale_sim3"),
+    *("rpe_trans_rmse_sim3", "rpe_rot_rmse_deg_sim3", "ms_per_pair_p95", "flow_ms_median"),
+    "ms_with_flow_median",
+)
+"""Columns of ``results.csv``."""
+NO_PAIRS = "no pair was estimated"
+NO_TRUTH = "the sequence has no ground truth for these frames"
+NO_MOVING = "needs true flow of the whole scene (moving objects included) and ground truth"
+SCALE_FACTOR = 3.0
+"""Factor beyond which ground truth and all estimates disagree about the unit."""
+SCALE_SPREAD = 1.5
+"""Factor within which the estimates must agree about that."""
+
+
+def failure_rate(pairs: pd.DataFrame) -> dict[str, Any]:
+    """``pairs``, ``failures``, ``failure_rate`` and its Wilson interval over a table of pairs.
+
+    A failure is a failed estimate or an error of the ego flow above one pixel. Pairs whose error is
+    unknown and whose estimate did not fail are left out.
+    """
+    failed, epe = is_failed(pairs), pairs["epe_l2_px"]
+    known = failed | epe.notna()
+    total, failures = int(known.sum()), int((failed | (epe > FAILURE_PX)).sum())
+    names = ("failures", "failure_rate", "failure_rate_low", "failure_rate_high")
+    if not total:
+        return {"pairs": 0, **dict.fromkeys(names)}
+    interval = binomtest(failures, total).proportion_ci(CONFIDENCE, method="wilson")
+    values = (failures, failures / total, float(interval.low), float(interval.high))
+    return {"pairs": total, **dict(zip(names, values, strict=True))}
+
+
+def is_failed(pairs: pd.DataFrame) -> pd.Series:
+    """Which estimates failed."""
+    return pairs["status"].str.startswith("failed")
+
+
+def _statistic(values: pd.Series, q: float = 0.5) -> float | None:
+    return float(values.quantile(q)) if values.notna().any() else None
+
+
+def pair_scores(pairs: pd.DataFrame) -> dict[str, Any]:
+    """Everything that is a mean, median or count over the pairs of one method and flow."""
+    scored = pairs[pairs["rot_err_deg"].notna()]
+    errors = scored[list(PAIR_ERRORS)].astype(object).where(scored[list(PAIR_ERRORS)].notna(), None)
+    scores = mean_pair_errors(errors.to_dict("records"))
+    reasons = scores["reasons"]
+    if pairs.empty:
+        reasons |= dict.fromkeys(reasons, NO_PAIRS)
+    rates = failure_rate(pairs)
+    rates.pop("pairs")
+    flow_ms = pairs["flow_ms"].where(~pairs["method"].isin(READS_NO_FLOW), 0.0)
+    moving = pairs["dynamic_fraction"]
+    scores |= rates | {
+        "pairs": len(pairs),
+        "failed": int(is_failed(pairs).sum()),
+        "pairs_scored": len(scored),
+        "pairs_scored_epe": int(pairs["epe_l2_px"].notna().sum()),
+        "epe_l2_px_median": _statistic(pairs["epe_l2_px"]),
+        "ms_per_pair_median": _statistic(pairs["ms"]),
+        "ms_per_pair_p95": _statistic(pairs["ms"], 0.95),
+        "flow_ms_median": _statistic(flow_ms),
+        "ms_with_flow_median": _statistic(pairs["ms"] + flow_ms),
+        "dynamic_fraction": float(moving.mean()) if moving.notna().any() else None,
+    }
+    for name, value in scores.items():
+        if value is None and name not in reasons:
+            missing = NO_PAIRS if "ms" in name else reasons.get("epe_l2_px", NO_PAIRS)
+            reasons[name] = NO_MOVING if name == "dynamic_fraction" else missing
+    return scores
+
+
+def trajectory_scores(est: Trajectory | None, gt: Trajectory | None) -> dict[str, Any]:
+    """Errors of a trajectory: :data:`PATH_KEYS`, ``scale_sim3``, ``kitti_drift``, ``reasons``."""
+    names = (*PATH_KEYS, "scale_sim3", "kitti_drift")
+    scores: dict[str, Any] = {"alignment": "se3", **dict.fromkeys(names)}
+    if est is None or gt is None:
+        return scores | {"reasons": dict.fromkeys(names, NO_PAIRS if est is None else NO_TRUTH)}
+    report = evaluate(est, gt)
+    scores |= {name: report[name] for name in names}
+    reasons = {name: report["reasons"][name] for name in names if name in report["reasons"]}
+    drift = scores["kitti_drift"]
+    if drift is not None and drift["translation"] is None:
+        scores["kitti_drift"] = None
+        reasons["kitti_drift"] = drift["reasons"]["translation"]
+    return scores | {"reasons": reasons}
+
+
+def sequence_row(
+    pairs: pd.DataFrame,
+    est: Trajectory | None,
+    gt: Trajectory | None,
+    named: Mapping[str, Any],
+) -> dict[str, Any]:
+    """Line of one method on one sequence; ``named`` says which."""
+    scores, path = pair_scores(pairs), trajectory_scores(est, gt)
+    return {**named, **scores, **path, "reasons": {**scores["reasons"], **path["reasons"]}}
+
+
+def total_row(pairs: pd.DataFrame, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Line of one method over all sequences: pairs pooled, trajectory errors as plain means.
+
+    Args:
+        pairs: all pairs of the method and flow.
+        rows: its lines of the single sequences; a trajectory error that one of them lacks is the
+            mean over the others, and ``reasons`` says which are missing.
+    """
+    scores = pair_scores(pairs)
+    reasons = scores["reasons"]
+    for key in PATH_KEYS:
+        known = [row[key] for row in rows if row[key] is not None]
+        scores[key] = float(np.mean(known)) if known else None
+        missing = [row for row in rows if row[key] is None]
+        if missing:
+            without = "; ".join(f"{row['sequence']}: {row['reasons'][key]}" for row in missing)
+            reasons[key] = f"mean over {len(known)} of {len(rows)} sequences; without {without}"
+    first = rows[0]
+    return {
+        "sequence": "all",
+        "sequences": len(rows),
+        "method": first["method"],
+        "flow_source": first["flow_source"],
+        "depth_source": ", ".join(dict.fromkeys(row["depth_source"] for row in rows)),
+        "alignment": "se3",
+        **scores,
+    }
+
+
+def scale_warning(rows: Iterable[Mapping[str, Any]]) -> list[str]:
+    """Warning of a ground truth whose unit is not that of the depth, from rows of one sequence.
+
+    Every method measures in the unit of the depth: where all of them are wrong by about the same
+    large factor, the ground truth is.
+    """
+    scales = [
+        float(row["scale_sim3"])
+        for row in rows
+        if row.get("scale_sim3") and row["method"] != "identity" and row["failed"] < row["pairs"]
+    ]
+    if len(scales) < 2 or min(scales) <= 0 or max(scales) > SCALE_SPREAD * min(scales):
+        return []
+    if 1 / SCALE_FACTOR <= max(scales) and min(scales) <= SCALE_FACTOR:
+        return []
+    return [
+        f"the true path is {min(scales):.3g} to {max(scales):.3g} times as long as every estimate: "
+        f"the unit of the ground truth or of the depth is wrong, and so are the errors in metres "
+        f"and pixels"
+    ]

@@ -1,1 +1,0 @@
-"""Frame pairs to relative poses: residuals, refinement, hypotheses and baselines."""

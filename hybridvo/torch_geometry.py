@@ -1,0 +1,157 @@
+"""Camera geometry and rigid motions in torch: one definition each, on kornia and pypose.
+
+The torch side of :mod:`hybridvo.geometry`, for the refinement, the networks and their training;
+same conventions: ``T_curr_prev`` takes points of the previous camera into the current one, pixel
+centres lie at whole coordinates, tangents are (translation, rotation) and act from the left.
+"""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import torch
+
+with warnings.catch_warnings():
+    # both packages warn of their own use of torch.jit while they are loaded
+    warnings.simplefilter("ignore", DeprecationWarning)
+    warnings.simplefilter("ignore", FutureWarning)
+    import pypose as pp
+    from kornia.geometry.camera import project_points
+    from kornia.geometry.depth import unproject_meshgrid
+
+from hybridvo.errors import InputError
+
+MIN_DEPTH = 1e-6
+MAX_DEPTH = 1e9
+"""Metres between which a depth counts as measured, as in the numba kernels."""
+MIN_COS2, MAX_SIN = 1e-12, 1 - 1e-6
+"""Squared cosine of the middle Euler angle below which it counts as a quarter turn, and the largest
+sine whose angle has a slope that is worth following."""
+
+
+def rays(height: int, width: int, K: torch.Tensor) -> torch.Tensor:
+    """(B, H, W, 3) K^-1 (u, v, 1) of every pixel, for (B, 3, 3) intrinsics."""
+    return unproject_meshgrid(height, width, K, device=K.device, dtype=K.dtype)
+
+
+def pixel_grid(height: int, width: int, like: torch.Tensor) -> torch.Tensor:
+    """(H, W, 2) coordinates (u, v) of the pixel centres, of the type and device of ``like``."""
+    v, u = torch.meshgrid(
+        torch.arange(height, dtype=like.dtype, device=like.device),
+        torch.arange(width, dtype=like.dtype, device=like.device),
+        indexing="ij",
+    )
+    return torch.stack([u, v], dim=-1)
+
+
+def se3(T: Any) -> pp.LieTensor:
+    """Pypose SE3 (..., 7) of (..., 4, 4) matrices, with the rotations nearest to theirs."""
+    U, _, Vh = torch.linalg.svd(T[..., :3, :3])
+    flip = torch.linalg.det(U @ Vh)[..., None, None]
+    T = T.clone()
+    T[..., :3, :3] = torch.cat([U[..., :2], U[..., 2:] * flip], dim=-1) @ Vh
+    return pp.mat2SE3(T, check=False)
+
+
+def left_update(delta: torch.Tensor, T: pp.LieTensor) -> pp.LieTensor:
+    """Exp(delta) T for (B, 6) tangents (translation, rotation) and pypose SE3 (B, 7)."""
+    return pp.se3(delta).Exp() @ T
+
+
+def move(T: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
+    """(B, 3, N) points under (B, 4, 4) transforms.
+
+    A matrix product: pypose's ``Act`` goes through quaternions and takes 20 times as long on the
+    pixels of an image.
+    """
+    return torch.baddbmm(T[:, :3, 3:], T[:, :3, :3], points)
+
+
+def project(points: torch.Tensor, K: torch.Tensor) -> torch.Tensor:
+    """(B, 2, N) px of (B, 3, N) points in front of cameras (B, 3, 3)."""
+    return project_points(points.transpose(1, 2), K[:, None]).transpose(1, 2)
+
+
+def reproject(
+    depth: torch.Tensor, T: torch.Tensor, K_prev: torch.Tensor, K_curr: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Where the pixels of the previous frame are seen by the current one: x + ego flow.
+
+    Args:
+        depth: (B, H, W) metres.
+        T: T_curr_prev, (B, 4, 4) or pypose SE3 (B, 7).
+        K_prev: (B, 3, 3) intrinsics of the previous camera.
+        K_curr: (B, 3, 3) of the current one.
+
+    Returns:
+        (B, H, W, 2) px on the current image and (B, H, W) bool, False where the depth is invalid
+        or the point is not in front of the camera; these pixels hold finite values without meaning.
+
+    Raises:
+        InputError: shapes that do not fit together.
+    """
+    if isinstance(T, pp.LieTensor):
+        T = T.matrix()
+    batch = len(depth)
+    for name, value, shape in (
+        ("depth", depth, (batch, *depth.shape[-2:])),
+        ("T", T, (batch, 4, 4)),
+        ("K_prev", K_prev, (batch, 3, 3)),
+        ("K_curr", K_curr, (batch, 3, 3)),
+    ):
+        if tuple(value.shape) != shape:
+            got = tuple(value.shape)
+            raise InputError(f"reproject: expected {name} of shape {shape}, got {got}.")
+    valid = (depth > MIN_DEPTH) & (depth < MAX_DEPTH)
+    safe = torch.where(valid, depth, torch.ones_like(depth))
+    points = rays(*depth.shape[1:], K_prev) * safe[..., None]
+    moved = move(T, points.flatten(1, 2).transpose(1, 2))
+    front = moved[:, 2:] > MIN_DEPTH
+    pixels = project(torch.where(front, moved, torch.ones_like(moved)), K_curr)
+    return (
+        pixels.transpose(1, 2).reshape(*depth.shape, 2),
+        valid & front.reshape(depth.shape),
+    )
+
+
+def euler_transform(rotation_deg: torch.Tensor, translation: torch.Tensor) -> torch.Tensor:
+    """Rigid transform of Euler angles and a translation, differentiable everywhere.
+
+    Args:
+        rotation_deg: (B, 3) Euler angles X-Y-Z in degrees, R = Rx Ry Rz.
+        translation: (B, 3) metres.
+
+    Returns:
+        (B, 4, 4), of the wider of the two types.
+    """
+    # Written out, not multiplied: a matrix product would run in bfloat16 under autocast.
+    (cx, cy, cz), (sx, sy, sz) = (
+        f(torch.deg2rad(rotation_deg)).unbind(1) for f in (torch.cos, torch.sin)
+    )
+    tx, ty, tz = translation.unbind(1)
+    zero, one = torch.zeros_like(tx), torch.ones_like(tx)
+    rows = (
+        (cy * cz, -cy * sz, sy, tx),
+        (cx * sz + sx * sy * cz, cx * cz - sx * sy * sz, -sx * cy, ty),
+        (sx * sz - cx * sy * cz, sx * cz + cx * sy * sz, cx * cy, tz),
+        (zero, zero, zero, one),
+    )
+    return torch.stack([torch.stack(torch.broadcast_tensors(*row), dim=1) for row in rows], dim=1)
+
+
+def euler_deg(R: torch.Tensor) -> torch.Tensor:
+    """(B, 3) Euler angles X-Y-Z in degrees of rotations (B, 3, 3) = Rx Ry Rz; finite gradient."""
+    # a quarter turn about y leaves only the sum or difference of the others: rz = 0 there, and no
+    # 0 / 0 in the gradient
+    locked = R[:, 0, 0] ** 2 + R[:, 0, 1] ** 2 < MIN_COS2
+    one, zero = torch.ones_like(R[:, 0, 0]), torch.zeros_like(R[:, 0, 0])
+    angles = (
+        torch.atan2(
+            torch.where(locked, R[:, 2, 1], -R[:, 1, 2]),
+            torch.where(locked, R[:, 1, 1], R[:, 2, 2]),
+        ),
+        torch.asin(R[:, 0, 2].clamp(-MAX_SIN, MAX_SIN)),
+        torch.atan2(torch.where(locked, zero, -R[:, 0, 1]), torch.where(locked, one, R[:, 0, 0])),
+    )
+    return torch.rad2deg(torch.stack(angles, dim=1))

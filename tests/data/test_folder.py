@@ -1,0 +1,450 @@
+"""A user's own folder: what belongs together, stamps, units, masks and camera files."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hybridvo.data.camera_file import parse_camera, read_camera_file, write_camera_template
+from hybridvo.data.image_io import write_flo
+from hybridvo.data.lists import associate, natural_key, to_seconds
+from hybridvo.data.sequence import open_sequence
+from hybridvo.errors import FormatError, InputError
+from hybridvo.types import Camera
+from hybridvo.units import depth_advice, depth_factor, stamp_unit, typical_depth
+from tests import sequences as write
+
+CAMERA = "fx: 20\nfy: 20\ncx: 15.5\ncy: 11.5\nwidth: 32\nheight: 24\ndepth_scale: 1000\n"
+SIZE = (24, 32)
+
+
+def own(root: Path, images: list, depths: list | None = None, units: int = 2000) -> Path:
+    """A sequence of kind 'folder' with files of these names, depth 2 m."""
+    write.text(root / "camera.yaml", CAMERA)
+    for name in images:
+        write.png(root / "rgb" / f"{name}.png", write.image(0, *SIZE))
+    for name in images if depths is None else depths:
+        write.png(root / "depth" / f"{name}.png", np.full(SIZE, units, np.uint16))
+    return root
+
+
+def told(path: Path, **options) -> str:
+    return "\n".join(open_sequence(path, **options).warnings)
+
+
+# what belongs together
+
+
+def test_colour_and_depth_go_together_by_stamps_in_their_names(tmp_path):
+    colour = [f"{100 + i / 10:.3f}" for i in range(5)]
+    depth = [f"{100.004 + i / 10:.3f}" for i in (0, 1, 3, 4)]  # 4 ms later, one missing
+    sequence = open_sequence(own(tmp_path, colour, depth))
+    np.testing.assert_allclose(sequence.timestamps, [100, 100.1, 100.3, 100.4])
+    assert [path.stem for path in sequence.depth_files] == depth
+    assert "1 of 5 colour images have no depth" in "\n".join(sequence.warnings)
+
+
+def test_colour_and_depth_go_together_by_lists_of_stamps(tmp_path):
+    root = own(tmp_path, ["a1", "a2", "a3"], ["b1", "b2", "b3", "b4"])
+    with pytest.raises(InputError, match=r"4 files for 3 images.*depth_timestamps\.txt"):
+        open_sequence(root)
+    (root / "timestamps.txt").write_text("# colour\n1.0\n1.5\n2.0\n")
+    (root / "depth_timestamps.txt").write_text("1.001\n1.25\n1.499\n2.012\n")
+    sequence = open_sequence(root)
+    assert [path.stem for path in sequence.depth_files] == ["b1", "b3", "b4"]
+    assert sequence.timestamps.tolist() == [1.0, 1.5, 2.0]
+    (root / "depth_timestamps.txt").write_text("51\n52\n53\n54\n")
+    with pytest.raises(InputError, match="same clock"):
+        open_sequence(root)
+    (root / "timestamps.txt").write_text("1\n2\n")
+    with pytest.raises(InputError, match=r"timestamps\.txt: 2 stamps for 3 files"):
+        open_sequence(root)
+
+
+def test_equal_counts_without_names_or_stamps_go_by_order(tmp_path):
+    sequence = open_sequence(own(tmp_path, ["c9", "c10"], ["d1", "d2"]))
+    assert [path.stem for path in sequence.rgb_files] == ["c9", "c10"]
+    assert [path.stem for path in sequence.depth_files] == ["d1", "d2"]
+    assert "natural order, c9.png to c10.png" in "\n".join(sequence.warnings)
+
+
+def test_missing_and_stray_files_are_told(tmp_path):
+    text = told(own(tmp_path / "a", ["0000", "0001", "0003"], ["0000", "0001", "0002", "0003"]))
+    assert "1 depth files without an image are left out: 0002.png" in text
+    assert "numbers of the images jump, the time stamps do not" in text
+    assert "timestamps.txt" in text
+    for name, numbers in (("one", ["7", "8", "9"]), ("ten", ["00", "10", "20"])):
+        text = told(own(tmp_path / name, numbers))
+        assert "jump" not in text and "left out" not in text
+    frame = open_sequence(own(tmp_path / "b", ["0", "1"], ["0"]))[1]
+    assert frame.depth is None and frame.rgb is not None
+
+
+def test_two_files_of_one_frame_are_refused(tmp_path):
+    root = own(tmp_path / "a", ["0", "1"])
+    (root / "rgb" / "0.jpg").write_bytes(b"")
+    with pytest.raises(InputError, match="two files of one frame"):
+        open_sequence(root)
+    sintel = write.write_sintel(tmp_path).path
+    (sintel / "frame_2.png").write_bytes((sintel / "frame_0002.png").read_bytes())
+    with pytest.raises(InputError, match=r"frame_0002\.png and frame_2\.png are two files"):
+        open_sequence(sintel)
+
+
+@pytest.mark.parametrize(
+    ("images", "flows", "kept"),
+    [
+        ((0, 1, 2, 3), (0, 1, 2), (0, 1, 2)),
+        ((0, 2, 3, 4), (0, 1, 2, 3), (2, 3)),  # one image deleted
+        ((0, 2, 3, 4), (0, 2, 3), (2, 3)),  # and its flow with it
+        ((0, 10, 20, 30), (0, 10, 20), (0, 10, 20)),  # flow over ten frames
+        ((0, 2, 4, 6), (0, 1, 2, 3, 4, 5), ()),  # every second image of a sequence with its flow
+        ((0, 1, 5, 6), (0, 1, 5), (0, 5)),
+    ],
+)
+def test_flow_that_led_to_a_missing_image_is_not_used(tmp_path, images, flows, kept):
+    root = own(tmp_path, [f"{i:04d}" for i in images])
+    (root / "flow").mkdir()
+    for number in flows:
+        write_flo(root / "flow" / f"{number:04d}.flo", np.full((*SIZE, 2), number, np.float32))
+    sequence = open_sequence(root)
+    for index, number in enumerate(images[:-1]):
+        if number in kept:
+            assert sequence.flow(index)[0].max() == number
+        else:
+            with pytest.raises(FileNotFoundError, match="no flow file from frame"):
+                sequence.flow(index)
+    assert sequence.has_flow == bool(kept)
+    is_told = any("are not used" in warning for warning in sequence.warnings)
+    assert is_told == (len(kept) < len(set(flows) & set(images)))
+
+
+def test_images_without_depth_say_that_depth_is_needed(tmp_path):
+    write.png(tmp_path / "a" / "0.png", write.image(0, *SIZE))
+    write.png(tmp_path / "b" / "rgb" / "0.png", write.image(0, *SIZE))
+    for name in "ab":
+        with pytest.raises(InputError, match="needs metric depth"):
+            open_sequence(tmp_path / name)
+    with pytest.raises(InputError, match="needs metric depth"):
+        open_sequence(own(tmp_path / "c", ["0"], []))
+
+
+def test_depth_of_another_size_must_be_registered(tmp_path):
+    root = own(tmp_path, ["0", "1"])
+    for path in (root / "depth").iterdir():
+        write.png(path, np.full((30, 40), 2000, np.uint16))
+    with pytest.raises(InputError, match=r"40x30.*32x24.*registered to colour"):
+        open_sequence(root)
+
+
+def test_masks(tmp_path):
+    root = own(tmp_path / "data", ["0", "1"])
+    mask = np.zeros(SIZE, np.uint8)
+    mask[3:] = 255
+    for folder in (root / "mask", tmp_path / "masks"):
+        write.png(folder / "1.png", mask)
+    for sequence in (open_sequence(root), open_sequence(root, mask=tmp_path / "masks")):
+        assert sequence[0].mask is None
+        np.testing.assert_array_equal(sequence[1].mask, mask > 0)
+        assert any("1 frames without mask: 0" in warning for warning in sequence.warnings)
+        assert any(path.parent.name.startswith("mask") for path in sequence.files())
+    (root / "camera.yaml").write_text(CAMERA + "distortion: [-0.01, 0, 0, 0, 0]\n")
+    assert not open_sequence(root)[1].mask[:2].any() and open_sequence(root)[1].mask[4:].any()
+    with pytest.raises(InputError, match="0 masks"):
+        open_sequence(root, mask=tmp_path / "nowhere")
+
+
+# stamps
+
+
+@given(
+    st.lists(st.integers(0, 400), min_size=1, max_size=25, unique=True),
+    st.lists(st.integers(0, 400), min_size=1, max_size=25, unique=True),
+)
+def test_association_is_greedy_one_to_one(a, b):
+    first, second = np.array(a) / 1000, np.array(b) / 1000 + 0.00031
+    # the definition, in its slow form
+    table = sorted(
+        (abs(x - y), i, j)
+        for i, x in enumerate(first)
+        for j, y in enumerate(second)
+        if abs(x - y) < 0.02
+    )
+    used_a, used_b, expected = set(), set(), []
+    for _, i, j in table:
+        if i not in used_a and j not in used_b:
+            used_a.add(i)
+            used_b.add(j)
+            expected.append((i, j))
+    assert associate(first, second, 0.02) == sorted(expected)
+
+
+def test_stamps_that_all_fit_all_are_refused():
+    with pytest.raises(InputError, match="400000000 pairs of stamps"):  # 30 GB of candidates
+        associate(1 + 1e-9 * np.arange(20_000), np.ones(20_000))
+    # truth at 1 kHz beside frames at 30 Hz is no such case
+    frames, truth = np.arange(300) / 30, np.arange(10_000) / 1000
+    pairs = associate(frames, truth)
+    assert [i for i, _ in pairs] == list(range(300))
+    assert np.abs(frames - truth[[j for _, j in pairs]]).max() <= 0.0005 + 1e-9
+
+
+def test_natural_order():
+    names = ["f10", "f9", "f1", "b\N{SUPERSCRIPT TWO}", "\N{ARABIC-INDIC DIGIT THREE}1"]
+    found = [path.name for path in sorted(map(Path, names), key=natural_key)]
+    assert [name for name in found if name.startswith("f")] == ["f1", "f9", "f10"]
+
+
+EPOCH = 1_700_000_000.25
+
+
+@pytest.mark.parametrize(
+    ("factor", "unit"), [(1e3, "milliseconds"), (1e6, "microseconds"), (1e9, "nanoseconds")]
+)
+def test_stamps_of_todays_clocks_become_seconds(factor, unit, tmp_path):
+    seconds = EPOCH + np.arange(4) / 30
+    stamps = np.round(seconds * factor)
+    assert stamp_unit(np.append(stamps, np.nan)) == (factor, unit)
+    listed, warnings = to_seconds(stamps, "rgb.txt")
+    assert unit in warnings[0] and "rgb.txt" in warnings[0]
+    np.testing.assert_allclose(listed, seconds, rtol=0, atol=6e-4)
+    sequence = open_sequence(own(tmp_path, [str(int(stamp)) for stamp in stamps]))
+    np.testing.assert_array_equal(sequence.timestamps, listed)
+    assert unit in "\n".join(sequence.warnings)
+
+
+@pytest.mark.parametrize(
+    "stamps", [[0.0, 0.1], [1.3e9], [1.3e9, 1.3e9 + 5], [0.0, 33.0, 66.0], [np.nan], []]
+)
+def test_a_unit_that_cannot_be_told_stays(stamps):
+    assert stamp_unit(np.array(stamps, dtype=float)) == (1.0, "seconds")
+
+
+@pytest.mark.parametrize("stamps", ["5\n4\n3\n", "5\n5\n6\n", "1\nnan\n2\n"])
+def test_stamps_that_go_back_are_named(tmp_path, stamps):
+    root = write.write_kitti(tmp_path).path
+    (root / "times.txt").write_text(stamps)
+    with pytest.raises(InputError, match=r"frame \d.*has") as caught:
+        open_sequence(root)
+    assert "np.float64" not in str(caught.value)
+
+
+def test_truth_without_a_partner_is_nan(tmp_path):
+    root = own(tmp_path, ["1.0", "1.1", "1.2"])
+    (root / "poses.txt").write_text(write.tum_row(1.001, 0) + write.tum_row(1.199, 2))
+    sequence = open_sequence(root)
+    assert np.isfinite(sequence.poses[[0, 2]]).all() and np.isnan(sequence.poses[1]).all()
+    np.testing.assert_allclose(sequence.poses[2], write.pose(2), atol=1e-12)
+    assert "1 of 3 frames have no pose" in "\n".join(sequence.warnings)
+
+
+# depth units
+
+
+@pytest.mark.parametrize(
+    ("metres", "units", "usual", "advice"),
+    [
+        (0.974, 1000, None, "divide by 1000 (millimetres)"),
+        (3.0, 5000, None, "divide by 5000 (TUM's unit)"),
+        (12.0, 256, 256, "divide by 256 (KITTI's unit)"),
+        (2.0, 5000, 5000, "divide by 5000 (TUM's unit)"),
+        (2.6, 100, None, "divide by 100 (centimetres)"),
+        (2.0, 1 / 1000, None, "multiply by 1000"),
+        (2.0, 1, None, ""),
+        (30.0, 1, None, ""),
+    ],
+)
+def test_probable_depth_unit(metres, units, usual, advice):
+    depth = np.full((4, 4), metres * units)
+    depth[0] = np.nan
+    assert depth_advice(typical_depth(depth), usual) == advice
+    factor = depth_factor(metres * units, usual)
+    assert factor is None if not advice else factor == pytest.approx(1 / units)
+
+
+def test_the_sky_says_nothing_about_the_unit():
+    assert typical_depth(np.array([2.0, 3.0, 4.0, 1e4, 1e4, 1e4, 1e4, np.inf, 0, -1])) == 3.0
+    assert typical_depth(np.zeros((3, 3))) is None
+
+
+def test_doubtful_units_are_told_with_their_remedy(tmp_path):
+    root = own(tmp_path, ["0", "1"])
+    assert "median" not in told(root)
+    (root / "camera.yaml").write_text(CAMERA.replace("1000", "1"))
+    assert "divide by 1000 (millimetres)" in told(root) and "--depth-scale" in told(root)
+    assert open_sequence(root, depth_scale=1000)[0].depth[0, 0] == 2.0
+    (root / "camera.yaml").write_text(CAMERA.replace("1000", "0.001"))  # RealSense's
+    assert open_sequence(root)[0].depth[0, 0] == 2.0 and "1000 units per metre" in told(root)
+    (root / "camera.yaml").write_text(CAMERA.replace("depth_scale: 1000", ""))
+    with pytest.raises(InputError, match="depth_scale"):
+        open_sequence(root)
+    for i in range(2):  # floating point is in metres, unless said otherwise
+        (root / "depth" / f"{i}.png").unlink()
+        np.save(root / "depth" / f"{i}.npy", np.full(SIZE, 2000.0))
+    assert "divide by 1000" in told(root)
+    assert open_sequence(root, depth_scale=1000)[1].depth[0, 0] == 2.0
+    for bad in (0, -1, float("nan")):
+        with pytest.raises(InputError, match="depth_scale"):
+            open_sequence(root, depth_scale=bad)
+
+
+# cameras
+
+ROS = """image_width: 32
+image_height: 24
+camera_name: camera
+camera_matrix:
+  rows: 3
+  cols: 3
+  data: [20.0, 0, 15.5, 0, 21.0, 11.5, 0, 0, 1]
+distortion_model: plumb_bob
+distortion_coefficients: {rows: 1, cols: 5, data: [0.1, -0.2, 0, 0, 0]}
+rectification_matrix: {rows: 3, cols: 3, data: [1, 0, 0, 0, 1, 0, 0, 0, 1]}
+"""
+MESSAGE = "width: 32\nheight: 24\nK: [20.0, 0, 15.5, 0, 21.0, 11.5, 0, 0, 1]\nD: [0, 0, 0, 0, 0]\n"
+REALSENSE = {
+    "width": 32,
+    "height": 24,
+    "ppx": 15.5,
+    "ppy": 11.5,
+    "fx": 20.0,
+    "fy": 21.0,
+    "model": "distortion.inverse_brown_conrady",
+    "coeffs": [0.0] * 5,
+    "depth_scale": 0.0010000000474974513,
+}
+
+
+@pytest.mark.parametrize("text", [ROS, MESSAGE, json.dumps(REALSENSE), MESSAGE.replace("K", "k")])
+def test_camera_files_of_others(text, tmp_path):
+    path = tmp_path / "info.yaml"
+    path.write_text(text)
+    found = read_camera_file(path)
+    assert found.camera == Camera(20, 21, 15.5, 11.5, 24, 32)
+    assert any(found.distortion) == (text is ROS) == bool(found.warnings and not found.depth_scale)
+    if "depth_scale" in text:
+        assert found.depth_scale == 1000
+    for model in ("equidistant", "rational_polynomial"):
+        path.write_text(ROS.replace("plumb_bob", model))
+        if model == "equidistant":
+            with pytest.raises(FormatError, match="Rectify"):
+                read_camera_file(path)
+        else:
+            assert len(read_camera_file(path).distortion) == 5
+
+
+def test_a_camera_may_be_given_to_every_reader(tmp_path):
+    path = tmp_path / "info.yaml"
+    for kind, writer in write.WRITERS.items():
+        sequence = open_sequence(writer(tmp_path / kind).path)
+        height, width = sequence.height, sequence.width
+        words = f"99,98,{width / 2},{height / 2}"
+        expected = Camera(99, 98, width / 2, height / 2, height, width)
+        path.write_text(
+            f"{{fx: 99, fy: 98, cx: {width / 2}, cy: {height / 2}, width: {width}, "
+            f"height: {height}}}"
+        )
+        for given_camera in (words, path, str(path), expected):
+            opened = open_sequence(sequence.root, sequence.kind, camera=given_camera)
+            assert opened.camera(1) == opened[1].camera == expected
+    with pytest.raises(InputError, match="10x6"):
+        parse_camera(path, (480, 640))
+    with pytest.raises(InputError, match="neither four numbers nor a file"):
+        parse_camera("1,2,3", (480, 640))
+    with pytest.raises(InputError, match="focal length"):
+        parse_camera("-1,2,3,4", (480, 640))
+
+
+def test_a_folder_needs_no_camera_file_where_the_camera_is_given(tmp_path):
+    root = own(tmp_path, ["0", "1"])
+    (root / "camera.yaml").unlink()
+    with pytest.raises(InputError, match=r"camera\.yaml.*hybridvo init.*--camera"):
+        open_sequence(root)
+    sequence = open_sequence(root, camera="20,20,15.5,11.5", depth_scale=1000)
+    assert sequence[0].depth[0, 0] == 2.0 and sequence.camera(0).fx == 20
+
+
+def test_template_is_filled_in_and_read(tmp_path):
+    root = own(tmp_path, ["0", "1"])
+    (root / "camera.yaml").unlink()
+    path = write_camera_template(root)
+    assert path == root / "camera.yaml"
+    with pytest.raises(FormatError, match=r"camera\.yaml: missing: fx, fy, cx, cy\."):
+        open_sequence(root)
+    text = path.read_text()
+    for key in ("fx", "fy", "cx", "cy"):
+        text = text.replace(f"\n{key}:", f"\n{key}: 16.5")
+    path.write_text(text)
+    assert open_sequence(root)[0].camera == Camera(16.5, 16.5, 16.5, 16.5, 24, 32)
+    with pytest.raises(InputError, match="exists already"):
+        write_camera_template(root)
+    assert write_camera_template(tmp_path / "new").read_text().count("width:") == 1
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (CAMERA + "distortoin: [0, 0, 0, 0, 0]\n", "did you mean 'distortion'"),
+        (CAMERA + "distortion: [0, x, 0, 0, 0]\n", "distortion: expected a finite number"),
+        (CAMERA + "distortion: [0, 0]\n", "a list of 4, 5 or 8 numbers"),
+        (CAMERA.replace("fx: 20", "fx: twenty"), "fx: expected a finite number, got 'twenty'"),
+        (CAMERA.replace("fx: 20", "fx: .nan"), "fx: expected a finite number"),
+        (CAMERA.replace("fx: 20", "fx: " + "9" * 400), "fx: expected a finite number"),
+        (CAMERA.replace("fx: 20", "fx: -20"), "fx: expected a positive focal length"),
+        (CAMERA.replace("fx: 20\n", ""), "missing: fx"),
+        (CAMERA.replace("1000", "-1"), "depth_scale: expected a number above 0"),
+        ("!!python/object/apply:os.system ['true']\n", r"camera\.yaml:1: not a YAML file"),
+        ("- 1\n- 2\n", "got a list"),
+        ("fx: 1\nfy: [1\n", r"camera\.yaml:3: not a YAML file"),
+        ("", "got a NoneType"),
+        ("[" * 5000, "not a YAML file"),
+        ("#" * (2**20 + 1), "above the limit"),
+        ("K: [1, 2]\n", "expected 9 numbers"),
+    ],
+)
+def test_damaged_camera_files(text, message, tmp_path):
+    root = own(tmp_path, ["0", "1"])
+    (root / "camera.yaml").write_text(text)
+    with pytest.raises(FormatError, match=message) as caught:
+        open_sequence(root)
+    assert "camera.yaml" in str(caught.value) and len(str(caught.value)) < 1000
+
+
+def test_powers_of_ten_are_numbers(tmp_path):
+    root = own(tmp_path, ["0", "1"])
+    (root / "camera.yaml").write_text(CAMERA.replace("fx: 20", "fx: 2e1").replace("1000", "1e3"))
+    assert open_sequence(root).camera(0).fx == 20.0
+
+
+def test_intrinsics_of_another_size_are_told_or_refused(tmp_path):
+    root = own(tmp_path, ["0", "1"])
+    assert told(root).count("principal point") == 0
+    (root / "camera.yaml").write_text(CAMERA.replace("cx: 15.5", "cx: 31.5"))
+    assert "those of another image size?" in told(root)
+    (root / "camera.yaml").write_text(CAMERA.replace("fx: 20", "fx: 30"))
+    assert "pixels square?" in told(root)
+    (root / "camera.yaml").write_text(CAMERA.replace("width: 32", "width: 64"))
+    with pytest.raises(InputError, match=r"32x24.*64x24"):
+        open_sequence(root)
+    (root / "camera.yaml").write_text(CAMERA + "distortion: [0.1, 0, 0, 0]\n")
+    write_flo_at(root)
+    with pytest.raises(InputError, match="Undistort"):
+        open_sequence(root)
+
+
+def write_flo_at(root: Path) -> None:
+    (root / "flow").mkdir()
+    write_flo(root / "flow" / "0.flo", np.zeros((*SIZE, 2), np.float32))
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_frame_rate_of_almost_zero_is_refused(tmp_path):
+    root = own(tmp_path, ["a", "b"])
+    (root / "camera.yaml").write_text(CAMERA + "fps: 1.0e-320\n")
+    with pytest.raises(InputError, match="finite timestamp"):
+        open_sequence(root)

@@ -1,0 +1,275 @@
+"""Image, flow, depth and camera files: exact bytes, exact values, and nothing but FormatError."""
+
+from __future__ import annotations
+
+import io as stdio
+import struct
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from hybridvo.data import image_io as io
+from hybridvo.errors import FormatError, InputError
+
+TAG = b"PIEH"
+RELAXED = settings(
+    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+GRID = np.arange(20 * 24).reshape(20, 24)
+
+
+def tagged(array: np.ndarray) -> bytes:
+    return TAG + struct.pack("<ii", array.shape[1], array.shape[0]) + array.astype("<f4").tobytes()
+
+
+def cam_bytes() -> bytes:
+    K = np.array([[1120, 0, 511.5], [0, 1120, 217.5], [0, 0, 1.0]])
+    Rt = np.hstack([np.eye(3), [[1.0], [2.0], [3.0]]])
+    return TAG + K.astype("<f8").tobytes() + Rt.astype("<f8").tobytes()
+
+
+def npy_bytes(array: np.ndarray, allow_pickle: bool = False) -> bytes:
+    buffer = stdio.BytesIO()
+    np.save(buffer, array, allow_pickle=allow_pickle)
+    return buffer.getvalue()
+
+
+def encoded(extension: str, array: np.ndarray) -> bytes:
+    return cv2.imencode(extension, array)[1].tobytes()
+
+
+RGB = np.dstack([GRID % 251] * 3).astype(np.uint8)
+FLOW = np.arange(12, dtype=np.float32).reshape(2, 3, 2) / 4
+FILES = {
+    "flow.flo": (tagged(FLOW), io.read_flo),
+    "depth.dpt": (tagged(FLOW[..., 0]), io.read_dpt),
+    "camera.cam": (cam_bytes(), io.read_cam),
+    "flow.npy": (npy_bytes(FLOW), lambda p: io.read_npy(p, channels=2)),
+    "image.png": (encoded(".png", RGB), io.read_rgb),
+    "image.jpg": (encoded(".jpg", RGB), io.read_rgb),
+    "depth.png": (encoded(".png", (GRID * 100).astype(np.uint16)), io.read_depth),
+    "kitti.png": (
+        encoded(".png", np.dstack([GRID % 2, GRID, GRID]).astype(np.uint16)),
+        io.read_flow,
+    ),
+    "rgba.png": (
+        encoded(".png", np.ones((4, 5), "<f4").view(np.uint8).reshape(4, 5, 4)),
+        io.read_depth_rgba_png,
+    ),
+}
+"""File name -> whole content and its reader."""
+
+
+def written(folder: Path, name: str, data: bytes) -> Path:
+    (folder / name).write_bytes(data)
+    return folder / name
+
+
+def test_layouts_by_hand(tmp_path):
+    flow = io.read_flo(written(tmp_path, "a.flo", FILES["flow.flo"][0]))
+    assert flow.shape == (2, 3, 2) and flow.dtype == np.float32
+    assert flow[1, 2].tolist() == [10 / 4, 11 / 4]
+    depth = io.read_dpt(written(tmp_path, "a.dpt", tagged(np.arange(6.0).reshape(2, 3))))
+    assert depth.tolist() == [[0, 1, 2], [3, 4, 5]]
+    K, T = io.read_cam(written(tmp_path, "a.cam", cam_bytes()))
+    assert (K[0, 0], K[0, 2], K[1, 2]) == (1120, 511.5, 217.5)
+    assert T[:3, 3].tolist() == [1, 2, 3] and T[3].tolist() == [0, 0, 0, 1]
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (2, 5), (7, 3)])
+def test_write_then_read(shape, tmp_path, rng):
+    flow = rng.normal(size=(*shape, 2)).astype(np.float32)
+    io.write_flo(tmp_path / "a.flo", flow)
+    np.testing.assert_array_equal(io.read_flo(tmp_path / "a.flo"), flow)
+    np.testing.assert_array_equal(cv2.readOpticalFlow(str(tmp_path / "a.flo")), flow)
+    io.write_dpt(tmp_path / "a.dpt", flow[..., 0])
+    np.testing.assert_array_equal(io.read_dpt(tmp_path / "a.dpt"), flow[..., 0])
+    io.write_cam(tmp_path / "a.cam", np.diag([2.0, 3.0, 1.0]), np.eye(4))
+    K, T = io.read_cam(tmp_path / "a.cam")
+    assert K.tolist() == np.diag([2.0, 3.0, 1.0]).tolist() and T.tolist() == np.eye(4).tolist()
+    for write, bad in ((io.write_flo, flow[..., 0]), (io.write_dpt, flow)):
+        with pytest.raises(InputError, match="shape"):
+            write(tmp_path / "w", bad)
+
+
+def test_kitti_flow_layout(tmp_path):
+    bgr = np.zeros((1, 2, 3), np.uint16)  # R = u, G = v, B = valid: OpenCV writes B, G, R
+    bgr[0, 0] = (1, 32768 + 64, 32768 - 32)
+    flow, valid = io.read_flow(written(tmp_path, "a.png", encoded(".png", bgr)))
+    assert flow[0, 0].tolist() == [-0.5, 1.0] and np.isnan(flow[0, 1]).all()
+    assert valid.tolist() == [[True, False]]
+
+
+def test_unknown_flow_of_middlebury_is_not_valid(tmp_path):
+    flow = FLOW.copy()
+    flow[0, 1] = 1.5e9
+    _, valid = io.read_flow(written(tmp_path, "a.flo", tagged(flow)))
+    assert not valid[0, 1] and valid.sum() == 5
+
+
+@pytest.mark.parametrize("name", FILES)
+@RELAXED
+@given(data=st.data())
+def test_cut_files_raise_format_error(name, tmp_path, data):
+    content, reader = FILES[name]
+    # the last bytes of a PNG or JPEG hold no pixels
+    length = data.draw(st.integers(0, len(content) - 1 - 12 * name.endswith((".png", ".jpg"))))
+    with pytest.raises(FormatError, match=name):
+        reader(written(tmp_path, name, content[:length]))
+
+
+@pytest.mark.parametrize("name", FILES)
+@RELAXED
+@given(data=st.data())
+def test_flipped_bytes_raise_nothing_else(name, tmp_path, data):
+    content, reader = FILES[name]
+    broken = bytearray(content)
+    for _ in range(data.draw(st.integers(1, 3))):
+        broken[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
+    path = written(tmp_path, name, bytes(broken))
+    for read in (reader, io.image_size):
+        try:
+            read(path)
+        except FormatError as error:
+            assert name in str(error)
+
+
+@RELAXED
+@given(
+    content=st.binary(max_size=300),
+    magic=st.sampled_from([b"", TAG, b"\x93NUMPY\x01\x00", b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"]),
+)
+def test_arbitrary_bytes_raise_nothing_else(tmp_path, content, magic):
+    for name, (_, reader) in FILES.items():
+        path = written(tmp_path, name, magic + content)
+        for read in (reader, io.image_size):
+            try:
+                read(path)
+            except FormatError as error:
+                assert name in str(error)
+
+
+@pytest.mark.parametrize("name", ["depth.png", "image.png", "rgba.png"])
+def test_a_flipped_png_byte_never_gives_another_image(name, tmp_path):
+    content, reader = FILES[name]
+    right = reader(written(tmp_path, name, content))
+    for position in range(len(content)):
+        broken = bytearray(content)
+        broken[position] ^= 0x10
+        try:
+            found = reader(written(tmp_path, name, bytes(broken)))
+        except FormatError:
+            continue
+        np.testing.assert_array_equal(found, right)
+
+
+def npy_head(height: int, width: int) -> bytes:
+    text = f"{{'descr': '<f4', 'fortran_order': False, 'shape': ({height}, {width}), }}\n"
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text.encode()
+
+
+def png_head(width: int, height: int) -> bytes:
+    chunk = b"IHDR" + struct.pack(">IIBBBBB", width % 2**32, height % 2**32, 16, 0, 0, 0, 0)
+    checksum = struct.pack(">I", zlib.crc32(chunk))
+    return b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + chunk + checksum + b"IDAT IEND"
+
+
+@pytest.mark.parametrize(
+    ("width", "height"),
+    [(0, 2), (2, 0), (-1, 5), (2_000_000_000, 1), (50_000, 50_000), (65_536, 65_536), (2**14,) * 2],
+)
+def test_headers_cost_no_memory(width, height, tmp_path, monkeypatch):
+    # nothing that a header alone declares may be decoded or allocated
+    for owner, name in ((cv2, "imdecode"), (np, "load"), (np, "frombuffer")):
+        monkeypatch.setattr(owner, name, lambda *args, **kwargs: pytest.fail("allocates"))
+    jpeg = FILES["image.jpg"][0]
+    at = jpeg.index(b"\xff\xc0") + 5
+    size = struct.pack(">HH", height % 2**16, width % 2**16)
+    for name, head in {
+        "flow.flo": TAG + struct.pack("<ii", width, height) + bytes(100),
+        "depth.dpt": TAG + struct.pack("<ii", width, height) + bytes(100),
+        "flow.npy": npy_head(height, width) + bytes(100),
+        "depth.png": png_head(width, height),
+        "image.png": png_head(width, height),
+        "image.jpg": jpeg[:at] + size + jpeg[at + 4 :],
+    }.items():
+        if name == "image.jpg" and not (0 <= width < 2**16 and 0 <= height < 2**16):
+            continue  # does not fit into the header
+        with pytest.raises(FormatError, match=name):
+            FILES[name][1](written(tmp_path, name, head))
+
+
+def test_even_a_flat_image_keeps_its_jpeg(tmp_path):
+    # the most pixels per byte that a writer can reach; the limit has to be far above
+    flat = np.full((3000, 4000, 3), 128, np.uint8)
+    content = cv2.imencode(".jpg", flat, [cv2.IMWRITE_JPEG_QUALITY, 1])[1].tobytes()
+    assert io.read_rgb(written(tmp_path, "x.jpg", content)).shape == flat.shape
+    assert flat.shape[0] * flat.shape[1] < 0.5 * io.MAX_PIXELS_PER_BYTE * len(content)
+
+
+@pytest.mark.parametrize("name", ["flow.flo", "depth.dpt", "camera.cam", "flow.npy"])
+def test_bytes_left_over_are_damage(name, tmp_path):
+    content, reader = FILES[name]
+    with pytest.raises(FormatError, match=f"{name}.*1 trailing.*expected {len(content)} bytes"):
+        reader(written(tmp_path, name, content + b"x"))
+
+
+def test_wrong_tags_types_and_shapes(tmp_path):
+    flo = FILES["flow.flo"][0]
+    eight = encoded(".png", (GRID % 200).astype(np.uint8))
+    cases = [
+        (io.read_flo, TAG[::-1] + flo[4:], "big-endian"),
+        (io.read_flo, b"JUNK" + flo[4:], "expected the first bytes"),
+        (io.read_flo, FILES["depth.dpt"][0], "truncated"),  # half the bytes
+        (io.read_dpt, flo, "trailing"),
+        (io.read_depth, eight, "16-bit depth PNG"),
+        (io.read_flow, eight, "3 channels"),
+        (io.read_npy, npy_bytes(np.array([{}], dtype=object), allow_pickle=True), "objects"),
+        (io.read_npy, npy_bytes(np.zeros((2, 4, 5), np.float32)), "shape"),
+        (io.read_npy, npy_bytes(np.zeros((0, 5), np.float32)), "1 to"),
+    ]
+    for reader, content, message in cases:
+        with pytest.raises(FormatError, match=message):
+            reader(written(tmp_path, "x.bin", content))
+
+
+def test_arrays_of_other_types_are_converted(tmp_path):
+    half = np.asfortranarray(np.arange(6, dtype=np.float16).reshape(2, 3))
+    read = io.read_npy(written(tmp_path, "half.npy", npy_bytes(half)))
+    assert read.dtype == np.float32 and read.tolist() == [[0, 1, 2], [3, 4, 5]]
+    big = np.arange(6, dtype=">f8").reshape(2, 3)
+    assert io.read_npy(written(tmp_path, "big.npy", npy_bytes(big))).tolist() == big.tolist()
+    units = np.arange(6, dtype=np.uint16).reshape(2, 3)
+    assert io.read_depth(written(tmp_path, "units.npy", npy_bytes(units))).dtype == np.uint16
+
+
+def test_sizes_names_and_what_is_no_file(tmp_path):
+    folder = tmp_path / "with space \N{CAMERA}"
+    folder.mkdir()
+    expected = {"flow.flo": (2, 3), "depth.dpt": (2, 3), "flow.npy": (2, 3), "rgba.png": (4, 5)}
+    for name, (content, _) in FILES.items():
+        if name != "camera.cam":
+            path = written(folder, name, content)
+            assert io.image_size(path) == expected.get(name, (20, 24))
+    path = written(folder, "\udcff.png", FILES["image.png"][0])  # a name that is not UTF-8
+    assert io.read_rgb(path).shape == (20, 24, 3)
+    with pytest.raises(FileNotFoundError):
+        io.read_flo(folder / "none.flo")
+    for odd in (folder, folder / ("x" * 300), "a\0b"):
+        with pytest.raises(FormatError, match=r"expected a file|cannot be read"):
+            io.read_flo(odd)
+
+
+def test_rgb_order_grey_and_mask(tmp_path):
+    bgr = np.zeros((2, 2, 3), np.uint8)
+    bgr[0, 0] = (1, 2, 3)
+    rgb = io.read_rgb(written(tmp_path, "a.png", encoded(".png", bgr)))
+    assert rgb[0, 0].tolist() == [3, 2, 1]
+    grey = written(tmp_path, "g.png", encoded(".png", bgr[..., 1]))
+    assert io.read_rgb(grey)[0, 0].tolist() == [2, 2, 2]
+    assert io.read_mask_png(grey).tolist() == [[True, False], [False, False]]

@@ -1,0 +1,289 @@
+"""Every reader gives back, bit for bit, what the test wrote in the data set's format."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from hybridvo.data.sequence import DATASETS, Sequence, iter_pairs, open_sequence
+from hybridvo.data.tum import BONN_MARKER, BONN_ROS
+from hybridvo.errors import FormatError, InputError
+from hybridvo.files import fingerprint
+from hybridvo.geometry import ego_flow, invert
+from hybridvo.types import Camera
+from tests import sequences as write
+
+DEPTH_SOURCE = {"sintel": "true", "tartanair": "true", "tum": "sensor", "7scenes": "sensor"}
+SECONDS = {"sintel": 1 / 24, "tartanair": 1 / 10, "tum": 1 / 30, "7scenes": 1 / 30, "folder": 1 / 4}
+
+
+@pytest.mark.parametrize("kind", write.WRITERS)
+def test_reads_back_exactly(kind, tmp_path):
+    written = write.WRITERS[kind](tmp_path)
+    sequence = open_sequence(written.path)
+    assert sequence.kind == kind.split("-")[0]
+    assert sequence.depth_source == DEPTH_SOURCE.get(sequence.kind, "file")
+    assert len(sequence) == write.N
+    step = SECONDS.get(sequence.kind, 1 / 10)
+    np.testing.assert_allclose(np.diff(sequence.timestamps), step, atol=2e-6)
+    # 7-Scenes stores 7 digits; everything else is exact to the last few bits
+    np.testing.assert_allclose(sequence.poses, written.poses, atol=1e-12, rtol=0)
+    for i, frame in enumerate(sequence):
+        np.testing.assert_array_equal(frame.rgb, written.rgb[i])
+        np.testing.assert_array_equal(frame.depth, written.depth[i])
+        camera = frame.camera
+        assert camera == sequence.camera(i)
+        assert (camera.fx, camera.fy, camera.cx, camera.cy) == written.K[i]
+        assert (frame.index, frame.timestamp) == (i, sequence.timestamps[i])
+    assert sequence.has_flow == bool(written.flow)
+    for i, expected in enumerate(written.flow):
+        flow, valid = sequence.flow(i)
+        np.testing.assert_array_equal(flow, expected)
+        assert flow.dtype == np.float32
+        np.testing.assert_array_equal(valid, written.valid[i] if written.valid else None)
+    on_disk = {path for path in tmp_path.rglob("*") if path.is_file()}
+    unread = {p for p in on_disk if "invalid" in str(p) and p.name == "frame_0003.png"}
+    assert set(sequence.files()) >= on_disk - unread
+
+
+@pytest.mark.parametrize("kind", write.WRITERS)
+def test_a_sequence_is_a_list_of_frames(kind, tmp_path):
+    written = write.WRITERS[kind](tmp_path)
+    sequence = open_sequence(written.path, kind.split("-")[0])  # the kind may be named
+    assert isinstance(sequence, Sequence)
+    assert [frame.index for frame in sequence] == [0, 1, 2]
+    assert sequence[1].index == 1 and sequence[-1].index == 2
+    for index in (write.N, -write.N - 1):
+        with pytest.raises(IndexError):
+            sequence[index]
+    with pytest.raises(IndexError):
+        sequence.flow(write.N - 1)
+
+
+def test_fingerprint_tells_changed_input(tmp_path):
+    sequence = open_sequence(write.write_folder(tmp_path).path)
+    before = fingerprint(sequence.files())
+    assert fingerprint(open_sequence(sequence.root).files()) == before
+    path = sequence.root / "poses.txt"
+    path.write_text(path.read_text() + "\n")
+    assert fingerprint(sequence.files()) != before
+
+
+@pytest.mark.parametrize("folder", ["clean", "flow", "depth", "camdata_left", "final"])
+def test_sintel_from_any_sibling(folder, tmp_path):
+    written = write.write_sintel(tmp_path)
+    sequence = open_sequence(tmp_path / "training" / folder / written.path.name)
+    assert len(sequence) == write.N
+    assert sequence.has_flow
+    # final was never downloaded: there are no images then
+    assert (sequence.frame(0).rgb is None) == (folder == "final")
+
+
+def test_sintel_without_images_and_with_zips_apart(tmp_path):
+    write.write_sintel(tmp_path / "MPI-Sintel-depth", images=False)
+    path = tmp_path / "MPI-Sintel-depth" / "training" / "depth" / "alley_9"
+    frame = open_sequence(path).frame(1)
+    assert frame.rgb is None and frame.depth is not None
+    apart = tmp_path / "MPI-Sintel-complete" / "training" / "clean" / "alley_9"
+    for i in range(write.N):
+        write.png(apart / f"frame_{i + 1:04d}.png", write.image(i, 5, 8))
+    np.testing.assert_array_equal(open_sequence(apart).frame(1).rgb, write.image(1, 5, 8))
+
+
+def test_sintel_occlusion(tmp_path):
+    sequence = open_sequence(write.write_sintel(tmp_path).path)
+    assert np.argwhere(sequence.occlusion(1)).tolist() == [[0, 1]]
+    with pytest.raises(FileNotFoundError, match="occlusion"):
+        sequence.occlusion(2)
+
+
+def test_real_tartanair_flow_is_the_rigid_flow(shared_data):
+    sequence = open_sequence(shared_data / "tartanair_v2" / "P000")
+    flow, valid = sequence.flow(0)
+    T_curr_prev = invert(sequence.poses[1]) @ sequence.poses[0]
+    prev = sequence[0]
+    rigid = ego_flow(prev.depth, T_curr_prev, prev.camera, sequence.camera(1))
+    error = np.linalg.norm(rigid - flow, axis=2)[valid]
+    # flow is stored in steps of 1/64 px: at most 0.5/64 * sqrt(2) = 0.01105 px of rounding
+    assert np.median(error) < 0.0065
+    assert error.max() < 0.0112
+
+
+@pytest.mark.parametrize("name", ["rgbd_dataset_freiburg1_xyz_first10", "redwood_livingroom_5"])
+def test_real_tum(name, shared_data):
+    sequence = open_sequence(shared_data / "tum" / name)
+    assert len(sequence) in (5, 10)
+    assert np.isfinite(sequence.poses).all()
+    depth = sequence[0].depth
+    assert 0.5 < np.median(depth[depth > 0]) < 3
+
+
+def test_tum_calibrations_are_those_of_the_folder_name(tmp_path):
+    for name, fx, is_distorted in (
+        ("rgbd_dataset_freiburg1_x", 517.306408, True),
+        ("fr2_desk", 520.908620, True),
+        ("rgbd_bonn_balloon", 542.822841, True),
+        ("unknown", 525.0, False),
+    ):
+        sequence = open_sequence(write.write_tum(tmp_path, name).path)
+        assert sequence.camera(0).fx == fx
+        assert (sequence[0].mask is not None) == is_distorted
+        assert any("--camera" in told for told in sequence.warnings) == (name == "unknown")
+        given = open_sequence(sequence.root, camera="500,501,320,240")
+        assert given.camera(0) == Camera(500, 501, 320, 240, 480, 640) and given[0].mask is None
+
+
+def test_undistorted_depth_is_never_mixed(tmp_path):
+    frame = open_sequence(write.write_tum(tmp_path, "freiburg1").path)[0]
+    stored = np.append(np.round(write.depth_map(0, 480, 640) * 5000) / 5000, 0)
+    np.testing.assert_allclose(np.setdiff1d(frame.depth, stored.astype(np.float32)), [], atol=1e-6)
+    assert frame.mask.mean() > 0.8 and not frame.mask.all()
+
+
+def test_bonn_truth_is_that_of_the_camera(tmp_path):
+    plain = open_sequence(write.write_tum(tmp_path / "a").path).poses
+    sequence = open_sequence(write.write_tum(tmp_path / "b", "rgbd_bonn_crowd").path)
+    # by hand: T_ROS swaps y and z and turns x around; the marker's scale of 1.0593 is taken out
+    swap = np.array([[-1.0, 0, 0], [0, 0, 1], [0, 1, 0]])
+    lever = np.array([0.0113, -0.0098, 0.0111])
+    R_marker = BONN_MARKER[:, :3] / np.cbrt(np.linalg.det(BONN_MARKER[:, :3]))
+    for T, body in zip(sequence.poses, plain, strict=True):
+        np.testing.assert_allclose(T[:3, :3], swap @ body[:3, :3] @ swap @ R_marker, atol=3e-4)
+        expected = swap @ (body[:3, :3] @ swap @ lever + body[:3, 3])
+        np.testing.assert_allclose(T[:3, 3], expected, atol=1e-12)
+        np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
+    assert np.linalg.norm(lever) == pytest.approx(0.0186, abs=1e-4)
+    np.testing.assert_array_equal(BONN_ROS @ BONN_ROS, np.eye(4))
+    assert any("Bonn" in told for told in sequence.warnings)
+
+
+def test_icl_nuim_is_reflected(tmp_path):
+    written = write.write_tum(tmp_path, "living_room_traj0")
+    root = written.path
+    root.joinpath("associations.txt").write_text(
+        "".join(f"{i} depth/{i}.png {i} rgb/{i}.png\n" for i in range(write.N))
+    )
+    root.joinpath("traj0.gt.freiburg").write_text(
+        "".join(f"{i} {i} 2 3 0 0 0 1\n" for i in range(write.N))
+    )
+    for name in ("rgb.txt", "depth.txt", "groundtruth.txt"):
+        (root / name).unlink()
+    sequence = open_sequence(root)
+    assert sequence.camera(0).fy == 480.0
+    np.testing.assert_allclose(np.diff(sequence.timestamps), 1 / 30)
+    np.testing.assert_array_equal(sequence.poses[1, :3, 3], (1, -2, 3))
+    np.testing.assert_array_equal(sequence[2].rgb, written.rgb[2])
+
+
+def test_kitti_depth_from_stereo(tmp_path):
+    written = write.write_kitti(tmp_path, stereo=True)
+    sequence = open_sequence(written.path)
+    assert sequence.depth_source == "stereo"
+    frame = sequence[0]
+    found = frame.depth > 0
+    assert found[:, 40:].mean() > 0.6
+    np.testing.assert_allclose(np.median(frame.depth[found]), 1.25, rtol=0.02)
+    sigma = 0.5 * frame.depth / (20 * 0.5)  # half a pixel of disparity, f b = 10
+    np.testing.assert_allclose(frame.depth_variance, sigma**2, rtol=1e-5)
+
+
+@pytest.mark.parametrize("width", [1, 15, 17, 31])
+def test_stereo_of_narrow_images_finds_no_depth(width, tmp_path):
+    # OpenCV's matcher raises for these, and crashes the process at 15 pixels
+    written = write.write_kitti(tmp_path, stereo=True)
+    for path in sorted(written.path.glob("image_*/*.png")):
+        write.png(path, write.image(0, 40, width))
+    calibration = written.path / "calib.txt"
+    calibration.write_text(calibration.read_text().replace(" 4.5 ", f" {width / 2} "))
+    assert not open_sequence(written.path)[0].depth.any()
+
+
+def test_kitti_with_stored_depth_needs_no_right_camera(tmp_path):
+    root = write.write_kitti(tmp_path).path
+    calib = root / "calib.txt"
+    lines = [line for line in calib.read_text().splitlines() if not line.startswith("P3")]
+    calib.write_text("\n".join(lines) + "\n")
+    assert open_sequence(root)[0].depth is not None
+
+
+def test_failure_says_what_was_looked_for(tmp_path):
+    (tmp_path / "readme.txt").write_text("x")
+    with pytest.raises(InputError) as caught:
+        open_sequence(tmp_path)
+    message = str(caught.value)
+    assert all(f"\n  {name}: " in message for name in DATASETS)
+    assert "readme.txt" in message and str(tmp_path) in message
+    for path, words in (
+        (tmp_path / "missing", "no such folder"),
+        (tmp_path / "readme.txt", "got a file"),
+        (tmp_path / ("x" * 300), "cannot be read"),
+        (f"{tmp_path}/a\0b", "no such folder"),
+    ):
+        with pytest.raises(InputError, match=words):
+            open_sequence(path)
+    for name, hint in (("kiti", "did you mean 'kitti'"), ("euroc", "known: sintel.*hybridvo init")):
+        with pytest.raises(InputError, match=hint):
+            open_sequence(tmp_path, name)
+
+
+@pytest.mark.parametrize("dataset", DATASETS)
+def test_forced_kind_on_a_foreign_folder(dataset, tmp_path):
+    with pytest.raises(InputError):
+        open_sequence(tmp_path, dataset)
+
+
+@pytest.mark.parametrize("kind", ["tum", "folder", "kitti", "tartanair-v1"])
+def test_one_folder_of_a_sequence_stands_for_all_of_it_and_says_so(kind, tmp_path):
+    written = write.WRITERS[kind](tmp_path)
+    inner = open_sequence(written.path).rgb_files[0].parent
+    sequence = open_sequence(inner)
+    assert len(sequence) == write.N and sequence.root == written.path
+    assert any(str(inner) in told for told in sequence.warnings)
+    assert not any(str(inner) in told for told in open_sequence(written.path).warnings)
+
+
+def test_pairs_from_files_read_each_frame_once(tmp_path):
+    sequence = open_sequence(write.write_sintel(tmp_path).path)
+    pairs = list(iter_pairs(sequence))
+    assert [(p.prev.index, p.curr.index) for p in pairs] == [(0, 1), (1, 2)]
+    assert pairs[0].curr is pairs[1].prev
+    assert pairs[0].flow_source == "file" and pairs[0].flow_is_true
+    assert pairs[0].depth_source == "true" and not pairs[0].flow_valid[0, 1]
+    assert len(list(iter_pairs(sequence, start=1))) == 1
+    assert list(iter_pairs(sequence, stop=1)) == []
+
+
+def test_pairs_from_a_callable(tmp_path):
+    sequence = open_sequence(write.write_kitti(tmp_path).path)
+    with pytest.raises(InputError, match="no flow files"):
+        iter_pairs(sequence)
+
+    def flow(prev, curr):
+        field = np.full((*prev.camera.shape, 2), curr.index, np.float32)
+        return SimpleNamespace(flow=field, variance=None, valid=None, source="mine", is_true=False)
+
+    pairs = list(iter_pairs(sequence, flow, stride=2))
+    assert [(p.prev.index, p.curr.index, p.flow_source) for p in pairs] == [(0, 2, "mine")]
+    assert pairs[0].flow[0, 0, 0] == 2
+    with_flow = open_sequence(write.write_folder(tmp_path).path)
+    with pytest.raises(InputError, match="stride of 2"):
+        iter_pairs(with_flow, stride=2)
+    with pytest.raises(InputError, match="stride >= 1"):
+        iter_pairs(with_flow, stride=0)
+
+
+def test_a_broken_frame_ends_neither_pairs_nor_frames(tmp_path):
+    written = write.write_folder(tmp_path)
+    (written.path / "depth" / "f8.png").write_bytes(b"no")
+    (written.path / "flow" / "f9.flo").unlink()
+    sequence = open_sequence(written.path)
+    with pytest.raises(FormatError, match=r"f8\.png"):
+        next(iter_pairs(sequence))
+    seen = []
+    pairs = list(iter_pairs(sequence, on_error=lambda i, e: seen.append((i, type(e)))))
+    assert seen == [(0, FormatError)]
+    assert [(p.prev.index, p.flow) for p in pairs] == [(1, None)]
+    with pytest.warns(UserWarning, match=r"frame 0 is left out.*f8\.png"):
+        assert [frame.index for frame in sequence] == [1, 2]

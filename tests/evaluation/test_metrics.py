@@ -1,0 +1,371 @@
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from hybridvo.errors import FormatError, InputError
+from hybridvo.evaluation.metrics import (
+    associate,
+    ate,
+    evaluate,
+    evaluate_files,
+    kitti_drift,
+    nees,
+    rpe,
+)
+from hybridvo.geometry import invert, make_transform, se3_exp, se3_log
+from hybridvo.trajectory import Trajectory, read_trajectory, write_tum
+
+
+def random_trajectory(rng: np.random.Generator, frames: int = 40) -> Trajectory:
+    relative = [se3_exp(0.2 * rng.standard_normal(6)) for _ in range(frames - 1)]
+    return Trajectory.from_relative(relative, np.arange(frames) * 0.1)
+
+
+def perturbed(trajectory: Trajectory, rng: np.random.Generator, size: float = 0.05) -> Trajectory:
+    T = trajectory.T_world_cam.copy()
+    for pose in T:
+        pose[:] = pose @ se3_exp(size * rng.standard_normal(6))
+    return Trajectory(trajectory.timestamps, T)
+
+
+def from_positions(positions, stamps=None) -> Trajectory:
+    positions = np.asarray(positions, dtype=np.float64)
+    T = np.tile(np.eye(4), (len(positions), 1, 1))
+    T[:, :3, 3] = positions
+    return Trajectory(np.arange(len(T)) * 0.1 if stamps is None else stamps, T)
+
+
+# -- the official figures -------------------------------------------------------------------------
+
+
+@pytest.fixture
+def official(shared_data):
+    folder = shared_data / "trajectories"
+    return folder / "pose_est.txt", folder / "pose_gt.txt"
+
+
+def test_official_evaluator(official):
+    report = evaluate_files(*official)
+    exact = {"rel": 1e-6}
+    assert report["ate_rmse"] == pytest.approx(1.2045074393, **exact)
+    assert report["kitti_drift"]["rotation_deg_per_m"] == pytest.approx(0.0229947185, **exact)
+    assert report["kitti_drift"]["translation"] == pytest.approx(0.0271438892, **exact)
+    short = report["kitti_drift_short"]
+    assert short["rotation_deg_per_m"] == pytest.approx(0.0798719448, **exact)
+    assert short["translation"] == pytest.approx(0.0749175164, **exact)
+    assert report["alignment"] == "se3"
+    assert (report["matched"], report["total"]) == (734, 734)
+    assert report["reasons"] == {}
+    assert json.loads(json.dumps(report, allow_nan=False)) == report
+
+
+def test_errors_do_not_depend_on_the_axes(official):
+    ned = evaluate_files(*official)
+    camera = evaluate_files(*official, axes_est="camera", axes_gt="camera")
+    for key in ("ate_rmse", "ate_rmse_sim3", "rpe_trans_rmse", "rpe_rot_rmse_deg"):
+        assert ned[key] == pytest.approx(camera[key], rel=1e-9)
+
+
+# -- ATE and RPE ----------------------------------------------------------------------------------
+
+
+def umeyama(x, y, with_scale):
+    """Independent least-squares alignment y ~ s R x + t (Umeyama 1991) of (M, 3) points."""
+    mx, my = x.mean(0), y.mean(0)
+    xc, yc = x - mx, y - my
+    U, d, Vt = np.linalg.svd(yc.T @ xc / len(x))
+    S = np.diag([1, 1, np.sign(np.linalg.det(U) * np.linalg.det(Vt))])
+    R = U @ S @ Vt
+    s = np.trace(np.diag(d) @ S) / (xc**2).sum() * len(x) if with_scale else 1.0
+    return s, R, my - s * R @ mx
+
+
+@pytest.mark.parametrize("alignment", ["se3", "sim3"])
+def test_ate_against_independent_umeyama(rng, alignment):
+    truth = random_trajectory(rng)
+    moved = perturbed(truth, rng).transformed(se3_exp(rng.standard_normal(6)), 1.7)
+    before = moved.T_world_cam.copy()
+    result = ate(moved, truth, alignment)
+    s, R, t = umeyama(moved.positions, truth.positions, alignment == "sim3")
+    errors = np.linalg.norm(s * moved.positions @ R.T + t - truth.positions, axis=1)
+    np.testing.assert_allclose(result.translation, errors, rtol=1e-9)
+    assert result.rmse == pytest.approx(np.sqrt((errors**2).mean()), rel=1e-12)
+    assert result.scale == pytest.approx(s)
+    np.testing.assert_allclose(result.T_gt_est, make_transform(R, t), atol=1e-12)
+    np.testing.assert_array_equal(moved.T_world_cam, before)  # evo aligns in place: not ours
+    aligned = moved.transformed(result.T_gt_est, result.scale)
+    np.testing.assert_allclose(
+        np.linalg.norm(aligned.positions - truth.positions, axis=1), errors, rtol=1e-9
+    )
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_errors_do_not_depend_on_the_world(seed):
+    rng = np.random.default_rng(seed)
+    truth = random_trajectory(rng, 10)
+    est = perturbed(truth, rng)
+    moved = est.transformed(se3_exp(rng.standard_normal(6)))
+    for alignment in ("se3", "sim3", "origin"):
+        a, b = ate(est, truth, alignment), ate(moved, truth, alignment)
+        assert a.rmse == pytest.approx(b.rmse, rel=1e-9)
+    errors = [rpe(path, truth).rotation_deg for path in (est, moved)]
+    np.testing.assert_allclose(*errors, rtol=1e-6)
+
+
+def test_ate_by_hand():
+    truth = from_positions([[0, 0, 0], [1, 0, 0], [1, 1, 0]])
+    est = from_positions([[0, 0, 3], [1, 0, 3], [1, 1, 4]])
+    report = evaluate(est, truth, alignment="none")
+    assert report["ate_rmse"] == pytest.approx(np.sqrt((9 + 9 + 16) / 3))
+    assert report["ate_max"] == pytest.approx(4)
+    assert report["ate_rmse_unaligned"] == report["ate_rmse"]
+    assert ate(est, truth, "origin").rmse == pytest.approx(np.sqrt(1 / 3))
+
+
+def test_rpe_by_hand():
+    # the truth goes 1 m a frame; the estimate 1.1 m, and turns by 2 deg a frame about y
+    truth = from_positions([[0, 0, k] for k in range(5)])
+    step = make_transform(Rotation.from_euler("y", 2, degrees=True).as_matrix(), [0, 0, 1.1])
+    T = [np.eye(4)]
+    for _ in range(4):
+        T.append(T[-1] @ step)
+    est = Trajectory(truth.timestamps, np.array(T))
+    report = evaluate(est, truth)
+    assert report["rpe_trans_rmse"] == pytest.approx(0.1)
+    assert report["rpe_rot_rmse_deg"] == pytest.approx(2.0)
+    two = rpe(est, truth, delta=2)
+    np.testing.assert_allclose(two.rotation_deg, [4.0, 4.0, 4.0])
+    # two frames are 0.2 s; what lies further than half a frame from the wanted time is no partner
+    for seconds, pairs in ((0.2, 3), (0.22, 3), (10.0, 0)):
+        found = rpe(est, truth, seconds, "s")
+        np.testing.assert_allclose(found.rotation_deg, [4.0] * pairs)
+    report = evaluate(est, truth, delta=10.0, delta_unit="s")
+    assert report["rpe_trans_rmse"] is None and "10 s" in report["reasons"]["rpe_trans_rmse"]
+
+
+def test_rpe_over_seconds_skips_a_gap():
+    stamps = np.array([0.0, 0.1, 0.2, 0.5, 0.6])
+    truth = from_positions([[0, 0, t] for t in stamps], stamps)
+    est = from_positions([[0, 0, 1.1 * t] for t in stamps], stamps)
+    found = rpe(est, truth, 0.1, "s")  # 0.2 to 0.5 is no tenth of a second
+    np.testing.assert_allclose(found.translation, [0.01] * 3)
+    assert len(rpe(est, truth, 1).translation) == 4
+
+
+def test_rpe_with_scale(rng):
+    truth = random_trajectory(rng)
+    doubled = truth.transformed(np.eye(4), 2.0)
+    assert rpe(doubled, truth).rmse > 0.1
+    scaled = rpe(doubled, truth, alignment="sim3")
+    assert scaled.rmse == pytest.approx(0, abs=1e-12)
+    assert evaluate(doubled, truth)["rpe_trans_rmse_sim3"] == pytest.approx(0, abs=1e-12)
+    assert scaled.scale == pytest.approx(0.5)
+
+
+# -- what cannot be computed ----------------------------------------------------------------------
+
+
+def test_static_camera():
+    still = from_positions(np.ones((10, 3)))
+    moving = from_positions(np.random.default_rng(1).normal(size=(10, 3)))
+    for est, truth in ((still, moving), (moving, still), (still, still)):
+        report = evaluate(est, truth)
+        for key in ("ate_rmse", "scale", "rpe_trans_rmse_sim3"):
+            assert report[key] is None and "static camera" in report["reasons"][key]
+        for key in ("ate_rmse_unaligned", "ate_rmse_origin", "rpe_trans_rmse"):
+            assert report[key] is not None
+    assert evaluate(still, still)["ate_rmse_unaligned"] == 0.0
+
+
+def test_straight_line():
+    line = np.outer(np.arange(20.0), [0.3, 0.1, 2.0])
+    bent = line + np.random.default_rng(2).normal(size=line.shape) * 0.1
+    for est, truth in ((line, bent), (bent, line), (line + 1, line)):
+        result = ate(from_positions(est), from_positions(truth))
+        assert result.rmse is None and "straight line" in result.reason
+    # 2 mm aside on 40 m is enough
+    nearly = line + np.sin(np.arange(20))[:, None] * [0.002, 0, 0]
+    assert ate(from_positions(nearly), from_positions(nearly)).rmse == pytest.approx(0, abs=1e-9)
+
+
+@pytest.mark.parametrize("frames", [1, 2])
+def test_one_and_two_poses(frames):
+    trajectory = from_positions(np.eye(3)[:frames])
+    report = evaluate(trajectory, trajectory)
+    assert report["ate_rmse"] is None
+    assert "not enough poses" in report["reasons"]["ate_rmse"]
+    assert report["ate_rmse_unaligned"] == 0.0
+    assert report["ate_rmse_origin"] == 0.0
+    if frames == 1:
+        assert report["rpe_trans_rmse"] is None
+        assert "not enough poses" in report["reasons"]["rpe_trans_rmse"]
+    else:
+        assert report["rpe_trans_rmse"] == 0.0
+    assert report["kitti_drift"]["translation"] is None
+    assert "shorter than" in report["kitti_drift"]["reasons"]["translation"]
+    json.dumps(report, allow_nan=False)
+
+
+def test_overflow_is_none_with_a_reason():
+    truth = from_positions(np.random.default_rng(3).normal(size=(10, 3)))
+    far = from_positions(truth.positions * 1e200)
+    report = evaluate(far, truth)
+    for key in ("ate_rmse", "ate_rmse_unaligned", "ate_rmse_origin", "rpe_trans_rmse"):
+        assert report[key] is None
+        assert "not a finite number" in report["reasons"][key]
+    json.dumps(report, allow_nan=False)
+
+
+def test_nan_in_a_file_names_the_line(tmp_path):
+    write_tum(from_positions(np.eye(3)), tmp_path / "gt")
+    (tmp_path / "est").write_text("0 0 0 0 0 0 0 1\n1 nan 0 0 0 0 0 1\n")
+    with pytest.raises(FormatError, match="est:2: expected finite numbers"):
+        evaluate_files(tmp_path / "est", tmp_path / "gt")
+
+
+def test_few_matches_give_no_number():
+    positions = np.random.default_rng(4).normal(size=(50, 3))
+    truth = from_positions(positions)
+    # nanoseconds read as seconds elsewhere: one stamp of fifty meets
+    est = from_positions(positions, truth.timestamps * 1000)
+    report = evaluate(est, truth)
+    assert (report["matched"], report["total"]) == (1, 50)
+    for key in ("ate_rmse", "ate_rmse_unaligned", "rpe_rot_rmse_deg", "kitti_drift"):
+        assert report[key] is None
+        assert "only 1 of 50 poses match" in report["reasons"][key]
+    nothing = evaluate(from_positions(positions, truth.timestamps + 1e6), truth)
+    assert nothing["matched"] == 0
+    assert "only 0 of 50" in nothing["reasons"]["ate_rmse"]
+
+
+def test_all_none_values_have_a_reason():
+    still = from_positions(np.ones((10, 3)))
+    report = evaluate(still, still)
+    missing = {key for key, value in report.items() if value is None}
+    assert missing == set(report["reasons"])
+
+
+# -- association ----------------------------------------------------------------------------------
+
+
+def test_association_is_one_to_one_and_nearest():
+    truth = from_positions(np.zeros((5, 3)), [0.0, 0.1, 0.2, 0.3, 0.4])
+    est = from_positions(np.zeros((4, 3)), [0.001, 0.115, 0.12, 0.4])
+    match = associate(est, truth, max_diff=0.02)
+    # 0.115 and 0.12 both want 0.1: the nearer one gets it
+    np.testing.assert_array_equal(match.est_indices, [0, 1, 3])
+    np.testing.assert_array_equal(match.gt_indices, [0, 1, 4])
+    assert (match.total, match.by) == (4, "time")
+    back = associate(truth, est, max_diff=0.02)
+    np.testing.assert_array_equal(back.est_indices, [0, 1, 4])
+
+
+def test_default_time_difference():
+    slow = from_positions(np.zeros((5, 3)), np.arange(5) * 0.1)
+    fast = from_positions(np.zeros((5, 3)), np.arange(5) * 0.01)
+    assert associate(slow, slow).max_diff == 0.02
+    assert associate(fast, fast).max_diff == pytest.approx(0.005)
+
+
+def test_files_without_stamps_match_by_index():
+    stamped = from_positions(np.eye(3))
+    plain = Trajectory(np.arange(3), stamped.T_world_cam, has_timestamps=False)
+    assert associate(plain, stamped).by == "index"
+    assert len(associate(plain, stamped).est_indices) == 3
+    short = Trajectory([0, 1], stamped.T_world_cam[:2], has_timestamps=False)
+    report = evaluate(short, stamped)
+    assert report["ate_rmse"] is None
+    assert "the estimate has 2 and the ground truth 3" in report["reasons"]["ate_rmse"]
+
+
+PATH = from_positions(np.eye(3))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "options", "field"),
+    [
+        ((PATH, PATH), {"alignment": "affine"}, "alignment"),
+        ((PATH, PATH), {"delta": 0}, "delta"),
+        ((PATH, PATH), {"delta": 1.5}, "delta"),
+        ((PATH, PATH), {"delta_unit": "m"}, "delta_unit"),
+        ((PATH, PATH), {"max_diff": -1.0}, "max_diff"),
+        (("est.txt", PATH), {}, "estimate"),
+        ((PATH, np.eye(4)), {}, "gt"),
+    ],
+)
+def test_bad_arguments(arguments, options, field):
+    with pytest.raises(InputError, match=f"{field}: expected .*, got"):
+        evaluate(*arguments, **options)
+
+
+# -- KITTI drift ----------------------------------------------------------------------------------
+
+
+def test_drift_by_hand():
+    # truth: 1 m a frame along z, 0 to 12 m. Estimate: 1.02 m a frame. Length 10 m: the first frame
+    # strictly beyond it is 11 frames on, so starts 0 and 1, error 11 * 0.02 = 0.22 m over 10 m.
+    T_true = from_positions([[0, 0, k] for k in range(13)]).T_world_cam
+    T_est = from_positions([[0, 0, 1.02 * k] for k in range(13)]).T_world_cam
+    drift = kitti_drift(T_est, T_true, lengths=[10])
+    assert drift["segments"] == 2
+    assert drift["translation"] == pytest.approx(0.022)
+    assert drift["rotation_deg_per_m"] == 0.0
+    # lengths 5 (6 frames on, 0.12 / 5) and 10: the mean of the lengths that occur
+    both = kitti_drift(T_est, T_true, lengths=[5, 10, 100])
+    assert both["translation"] == pytest.approx((0.024 + 0.022) / 2)
+
+
+def test_drift_of_rotation_by_hand():
+    T_true = from_positions([[0, 0, k] for k in range(13)]).T_world_cam
+    T_est = T_true.copy()
+    for k in range(13):
+        T_est[k, :3, :3] = Rotation.from_euler("z", 0.5 * k, degrees=True).as_matrix()
+    drift = kitti_drift(T_est, T_true, lengths=[10])
+    assert drift["rotation_deg_per_m"] == pytest.approx(11 * 0.5 / 10)
+    assert drift["translation"] == pytest.approx(0, abs=1e-15)
+
+
+def test_drift_against_a_plain_loop(rng):
+    truth = random_trajectory(rng, 120)
+    est = perturbed(truth, rng)
+    lengths, translations, rotations = (2.0, 7.0), [], []
+    steps = np.linalg.norm(np.diff(truth.positions, axis=0), axis=1)
+    for length in lengths:
+        errors = []
+        for i in range(len(truth)):
+            ends = [j for j in range(i, len(truth)) if steps[i:j].sum() > length]
+            if ends:
+                j = ends[0]
+                D = [np.linalg.inv(t.T_world_cam[i]) @ t.T_world_cam[j] for t in (est, truth)]
+                E = np.linalg.inv(D[0]) @ D[1]
+                angle = np.arccos(np.clip((np.trace(E[:3, :3]) - 1) / 2, -1, 1))
+                errors.append((np.linalg.norm(E[:3, 3]) / length, np.degrees(angle) / length))
+        translations.append(np.mean([e[0] for e in errors]))
+        rotations.append(np.mean([e[1] for e in errors]))
+    drift = kitti_drift(est.T_world_cam, truth.T_world_cam, lengths=lengths)
+    assert drift["translation"] == pytest.approx(np.mean(translations), rel=1e-9)
+    assert drift["rotation_deg_per_m"] == pytest.approx(np.mean(rotations), rel=1e-9)
+
+
+def test_nees_of_drawn_motions_is_six(rng):
+    A = rng.standard_normal((6, 6)) * [1e-2, 1e-3, 1e-2, 1e-4, 1e-5, 1e-4]
+    covariance = A.T @ A + np.diag([1e-6] * 3 + [1e-10] * 3)
+    T = se3_exp(0.3 * rng.standard_normal(6))
+    deltas = rng.multivariate_normal(np.zeros(6), covariance, 2000, check_valid="ignore")
+    values = [nees(T, se3_exp(delta) @ T, covariance) for delta in deltas]
+    assert np.mean(values) == pytest.approx(6.0, abs=0.4)
+    delta = se3_log(se3_exp(deltas[0]) @ T @ invert(T))
+    assert values[0] == pytest.approx(delta @ np.linalg.solve(covariance, delta), rel=1e-6)
+
+
+def test_ate_reads_what_write_tum_wrote(tmp_path, rng):
+    truth = random_trajectory(rng)
+    write_tum(truth, tmp_path / "t")
+    assert ate(read_trajectory(tmp_path / "t"), truth).rmse == pytest.approx(0, abs=1e-12)

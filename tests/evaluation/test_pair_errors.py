@@ -1,0 +1,190 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from hybridvo.errors import InputError
+from hybridvo.evaluation.pair_errors import (
+    dynamic_fraction,
+    mean_pair_errors,
+    pair_errors,
+    pair_facts,
+)
+from hybridvo.geometry import ego_flow, make_transform, se3_exp
+from hybridvo.types import Camera
+
+CAMERA = Camera(200.0, 200.0, 127.5, 63.5, 128, 256)
+"""Camera of the paper's size, principal point in the middle: nothing is resized."""
+
+
+def test_pair_errors_by_hand():
+    # depth 4 m, f = 200: a translation of 0.02 m in x moves every pixel by 200 * 0.02 / 4 = 1 px,
+    # -0.04 m in y by -2 px. Component mean 1.5, L2 sqrt(5).
+    depth = np.full(CAMERA.shape, 4.0, dtype=np.float32)
+    T_est = make_transform(np.eye(3), np.array([0.02, -0.04, 0.0]))
+    errors = pair_errors(T_est, np.eye(4), depth, CAMERA, CAMERA)
+    assert errors["epe"] == pytest.approx(1.5)
+    assert errors["epe_l2_px"] == pytest.approx(np.sqrt(5))
+    assert errors["t_err"] == pytest.approx(0.02)
+    assert errors["trans_err"] == pytest.approx(np.sqrt(0.002))
+    assert errors["r_err_deg"] == 0.0
+    assert errors["rot_err_deg"] == 0.0
+    assert set(errors) == {"r_err_deg", "t_err", "epe", "epe_l2_px", "rot_err_deg", "trans_err"}
+
+
+def test_paper_epe_at_another_native_size():
+    # 512x512 at f = 400: at 128x256 one has fx' = 200, fy' = 100; the same motion gives 1 and -1 px
+    camera = Camera(400.0, 400.0, 255.5, 255.5, 512, 512)
+    depth = np.full(camera.shape, 4.0)
+    T_est = make_transform(np.eye(3), np.array([0.02, -0.04, 0.0]))
+    errors = pair_errors(T_est, np.eye(4), depth, camera, camera)
+    assert errors["epe"] == pytest.approx(1.0)
+    assert errors["epe_l2_px"] == pytest.approx(np.sqrt(4 + 16))
+
+
+def test_paper_epe_scales_the_principal_point_about_pixel_corners():
+    # forward motion with a known focus of expansion: u' = (u - cx') z / z' + cx' at the small size,
+    # cx' = (511 + 0.5) / 4 - 0.5 = 127.375, cy' = (200 + 0.5) / 2 - 0.5 = 99.75
+    camera = Camera(400.0, 400.0, 511.0, 200.0, 256, 1024)
+    T_est = make_transform(np.eye(3), np.array([0.0, 0.0, -1.0]))
+    errors = pair_errors(T_est, np.eye(4), np.full(camera.shape, 5.0), camera, camera)
+    u, v = np.arange(256.0), np.arange(128.0)
+    expected = 0.25 * (np.abs(u - 127.375).mean() + np.abs(v - 99.75).mean()) / 2
+    assert errors["epe"] == pytest.approx(expected)
+
+
+def test_paper_epe_takes_the_nearest_depth_at_pixel_centres():
+    # 384 rows, 3 to 1: centre of small row i is native row 3 i + 1; only those rows hold 4 m
+    camera = Camera(200.0, 200.0, 127.5, 191.5, 384, 256)
+    depth = np.full(camera.shape, 1e-3)
+    depth[1::3] = 4.0
+    T_est = make_transform(np.eye(3), np.array([0.02, 0.0, 0.0]))
+    assert pair_errors(T_est, np.eye(4), depth, camera, camera)["epe"] == pytest.approx(0.5)
+
+
+def test_paper_epe_counts_invalid_and_long_flows_as_zero():
+    depth = np.full(CAMERA.shape, 4.0)
+    T_est = make_transform(np.eye(3), np.array([0.02, 0.0, 0.0]))
+    for bad in (0.0, -1.0, np.nan, np.inf):
+        half = depth.copy()
+        half[:64] = bad
+        errors = pair_errors(T_est, np.eye(4), half, CAMERA, CAMERA)
+        assert errors["epe"] == pytest.approx(0.25)  # (1 + 0) / 2 over all pixels, half of them 0
+        assert errors["epe_l2_px"] == pytest.approx(1.0)  # over the valid ones
+    # 8.1 m aside at 4 m: true ego flow 405 px, zeroed but counted; at 7.9 m: 395 px, kept
+    for aside, expected in ((8.1, 0.0), (7.9, 0.5)):
+        T_true = make_transform(np.eye(3), np.array([aside, 0.0, 0.0]))
+        errors = pair_errors(T_true @ T_est, T_true, depth, CAMERA, CAMERA)
+        assert errors["epe"] == pytest.approx(expected)
+        assert errors["epe_l2_px"] == pytest.approx(1.0)
+
+
+def test_no_valid_depth_is_none_not_nan():
+    depth = np.zeros(CAMERA.shape)
+    errors = pair_errors(np.eye(4), np.eye(4), depth, CAMERA, CAMERA)
+    assert errors["epe"] is None and errors["epe_l2_px"] is None
+    good = pair_errors(np.eye(4), np.eye(4), depth + 1, CAMERA, CAMERA)
+    report = mean_pair_errors([errors, good])
+    assert report["epe"] == 0.0
+    assert "1 of 2 pairs" in report["reasons"]["epe"]
+    empty = mean_pair_errors([])
+    assert empty["pairs"] == 0 and empty["epe"] is None and "epe" in empty["reasons"]
+
+
+def test_native_epe_equals_the_ego_flows_of_geometry(rng):
+    prev = Camera(310.0, 290.0, 200.0, 90.0, 218, 401)
+    curr = Camera(305.0, 295.0, 203.0, 92.0, 218, 401)
+    depth = rng.uniform(1, 30, prev.shape)
+    depth[rng.random(prev.shape) < 0.2] = np.nan
+    depth[0, :4] = [0.0, -2.0, np.inf, 1e-9]
+    T_true, T_est = se3_exp(0.05 * rng.standard_normal(6)), se3_exp(0.05 * rng.standard_normal(6))
+    depth[0, 3] = np.nan
+    flows = [ego_flow(depth, T, prev, curr) for T in (T_est, T_true)]
+    expected = np.nanmean(np.linalg.norm(flows[0] - flows[1], axis=-1))
+    got = pair_errors(T_est, T_true, depth, prev, curr)["epe_l2_px"]
+    assert got == pytest.approx(expected, rel=1e-10)
+
+
+def test_estimate_behind_the_camera_is_finite_and_costs_the_diagonal():
+    T_est = make_transform(np.eye(3), np.array([0.0, 0.0, -9.0]))
+    errors = pair_errors(T_est, np.eye(4), np.full(CAMERA.shape, 4.0), CAMERA, CAMERA)
+    assert errors["epe_l2_px"] == pytest.approx(np.hypot(128, 256))
+    assert np.isfinite(errors["epe"])
+
+
+@settings(max_examples=50, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), size=st.sampled_from([1e-6, 0.05, 1.0]))
+def test_rotation_errors_against_scipy(seed, size):
+    rng = np.random.default_rng(seed)
+    R_est, R_true = (Rotation.from_rotvec(size * rng.uniform(-1, 1, 3)) for _ in range(2))
+    T_est, T_true = (make_transform(R.as_matrix(), np.zeros(3)) for R in (R_est, R_true))
+    errors = pair_errors(T_est, T_true, np.ones((4, 5)), *[Camera(9, 9, 2, 1.5, 4, 5)] * 2)
+    difference = R_est.as_euler("XYZ", degrees=True) - R_true.as_euler("XYZ", degrees=True)
+    difference = np.degrees(
+        np.arctan2(np.sin(np.radians(difference)), np.cos(np.radians(difference)))
+    )
+    assert errors["r_err_deg"] == pytest.approx(np.abs(difference).mean(), rel=1e-6, abs=1e-11)
+    geodesic = np.degrees((R_est * R_true.inv()).magnitude())
+    assert errors["rot_err_deg"] == pytest.approx(geodesic, rel=1e-6, abs=1e-11)
+
+
+def test_pair_errors_refuses_bad_input():
+    depth = np.ones(CAMERA.shape)
+    with pytest.raises(InputError, match="T_est: expected a finite"):
+        pair_errors(np.full((4, 4), np.nan), np.eye(4), depth, CAMERA, CAMERA)
+    with pytest.raises(InputError, match="depth: expected shape"):
+        pair_errors(np.eye(4), np.eye(4), depth[:5], CAMERA, CAMERA)
+
+
+def test_mean_pair_errors_by_hand():
+    pairs = [
+        {
+            "r_err_deg": 1.0,
+            "t_err": 0.1,
+            "epe": 2.0,
+            "epe_l2_px": 3.0,
+            "rot_err_deg": r,
+            "trans_err": t,
+        }
+        for r, t in ((1.0, 0.1), (2.0, 0.2), (9.0, 0.6))
+    ]
+    report = mean_pair_errors(pairs)
+    assert report["pairs"] == 3
+    assert report["rot_err_deg_mean"] == pytest.approx(4.0)
+    assert report["rot_err_deg_median"] == 2.0
+    assert report["trans_err_mean"] == pytest.approx(0.3)
+    assert report["trans_err_median"] == 0.2
+    assert report["epe_l2_px"] == 3.0
+    assert report["reasons"] == {}
+
+
+def test_dynamic_fraction_by_hand():
+    depth = np.full(CAMERA.shape, 4.0)
+    T = make_transform(np.eye(3), np.array([0.02, 0.0, 0.0]))
+    flow = ego_flow(depth, T, CAMERA, CAMERA).astype(np.float32)
+    assert dynamic_fraction(flow, depth, T, CAMERA, CAMERA) == 0.0
+    flow[:32, :, 0] += 0.9  # a quarter moves by less than a pixel
+    flow[32:64, :, 1] += 1.1  # a quarter by more
+    assert dynamic_fraction(flow, depth, T, CAMERA, CAMERA) == 0.25
+    flow[64:96] = np.nan  # unknown pixels do not count
+    depth[96:] = 0.0
+    assert dynamic_fraction(flow, depth, T, CAMERA, CAMERA) == 0.5
+    flow[32:48] = 1.666e9  # Middlebury's unknown
+    assert dynamic_fraction(flow, depth, T, CAMERA, CAMERA) == pytest.approx(1 / 3)
+    assert dynamic_fraction(flow, depth * 0, T, CAMERA, CAMERA) is None
+
+
+def test_facts_of_a_pair_by_hand():
+    depth = np.full(CAMERA.shape, 4.0)
+    depth[:, :64] = 8.0
+    depth[:, 200:] = np.nan
+    T = make_transform(np.eye(3), np.array([0.02, 0.0, 0.0]))
+    facts = pair_facts(T, depth, CAMERA, CAMERA)
+    assert facts["dynamic_fraction"] is None  # no true flow of the scene
+    assert facts["translation_m"] == pytest.approx(0.02) and facts["rotation_deg"] == 0.0
+    assert facts["flow_magnitude_px"] == pytest.approx(1.0)  # at 4 m, two thirds of what is known
+    assert facts["depth_spread"] == pytest.approx(2.0)
+    assert set(pair_facts(None, None, CAMERA, CAMERA).values()) == {None}

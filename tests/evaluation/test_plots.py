@@ -1,0 +1,94 @@
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from hybridvo.errors import InputError, OutputError
+from hybridvo.evaluation.plots import plot_trajectories
+from hybridvo.geometry import se3_exp
+from hybridvo.trajectory import Trajectory
+
+
+def random_trajectory(rng: np.random.Generator, frames: int = 30) -> Trajectory:
+    relative = [se3_exp(0.1 * rng.standard_normal(6)) for _ in range(frames - 1)]
+    return Trajectory.from_relative(relative, 1e9 + np.arange(frames) / 30)
+
+
+def coloured(path: Path, rgb: tuple[int, int, int]) -> int:
+    """Pixels of exactly this colour."""
+    image = cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB)
+    return int((image == rgb).all(axis=-1).sum())
+
+
+def test_picture_shows_every_trajectory(tmp_path, rng):
+    truth = random_trajectory(rng)
+    other = truth.transformed(np.eye(4), 1.2)
+    path = tmp_path / "trajectory.png"
+    plot_trajectories({"hybrid": truth, "identity": other}, path, truth=truth, title="x")
+    image = cv2.imread(str(path))
+    assert image.shape[0] > 600 and image.shape[1] > 1000
+    assert coloured(path, (0x00, 0x72, 0xB2)) > 500
+    assert coloured(path, (0xD5, 0x5E, 0x00)) > 500
+    assert os.listdir(tmp_path) == ["trajectory.png"]
+    first = path.read_bytes()
+    plot_trajectories({"hybrid": truth, "identity": other}, path, truth=truth, title="x")
+    assert path.read_bytes() == first
+
+
+@pytest.mark.parametrize("case", ["static", "straight", "one", "two", "unmatched", "no truth"])
+def test_degenerate_paths_are_drawn(tmp_path, rng, case):
+    frames = {"one": 1, "two": 2}.get(case, 10)
+    T = np.tile(np.eye(4), (frames, 1, 1))
+    if case != "static":
+        T[:, 2, 3] = np.arange(frames)
+    trajectory = Trajectory(np.arange(frames) / 10, T)
+    truth = None if case == "no truth" else trajectory
+    if case == "unmatched":
+        truth = Trajectory(np.arange(frames) / 10 + 1e5, T)
+    plot_trajectories({"a": trajectory}, tmp_path / "p.png", truth=truth)
+    assert cv2.imread(str(tmp_path / "p.png")) is not None
+
+
+def test_many_and_other_formats(tmp_path, rng):
+    truth = random_trajectory(rng)
+    plot_trajectories({f"m{k}": truth for k in range(14)}, tmp_path / "p.svg", truth=truth)
+    assert (tmp_path / "p.svg").read_text().startswith("<?xml")
+
+
+def test_plot_refuses(tmp_path, rng):
+    truth = random_trajectory(rng, 3)
+    with pytest.raises(InputError, match="at least one trajectory"):
+        plot_trajectories({}, tmp_path / "p.png")
+    with pytest.raises(InputError, match="picture name ending in"):
+        plot_trajectories({"a": truth}, tmp_path / "p.txt")
+    with pytest.raises(OutputError, match=r"p\.png: cannot be written"):
+        plot_trajectories({"a": truth}, tmp_path / "no" / "p.png")
+
+
+def test_works_without_a_home_and_without_pyplot(tmp_path):
+    code = (
+        "import sys, numpy as np\n"
+        "from hybridvo.evaluation.plots import plot_trajectories\n"
+        "from hybridvo.trajectory import Trajectory\n"
+        "T = np.tile(np.eye(4), (4, 1, 1)); T[:, 2, 3] = range(4)\n"
+        "plot_trajectories({'a': Trajectory(range(4), T)}, sys.argv[1])\n"
+        "assert 'matplotlib.pyplot' not in sys.modules\n"
+    )
+    drop = ("MPLCONFIGDIR", "XDG_CONFIG_HOME", "XDG_CACHE_HOME", "DISPLAY", "MPLBACKEND")
+    environment = {k: v for k, v in os.environ.items() if k not in drop}
+    environment |= {"HOME": os.devnull, "TMPDIR": str(tmp_path)}
+    target = tmp_path / "p.png"
+    subprocess.run(
+        [sys.executable, "-c", code, str(target)],
+        env=environment,
+        check=True,
+        timeout=120,
+        capture_output=True,
+    )
+    assert target.stat().st_size > 1000

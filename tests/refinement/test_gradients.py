@@ -1,0 +1,212 @@
+"""The implicit gradient of the refined pose: against finite differences of the whole estimate."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+import torch
+from batches import F64, noisy_batch
+
+from hybridvo.geometry import se3_exp
+from hybridvo.refinement.batch import BatchOptions
+from hybridvo.refinement.torch_backend import newton_matrix, refine_batch, solve_small
+from hybridvo.refinement.torch_factors import KERNELS, RobustNoise, linearize, score_sum
+from hybridvo.refinement.torch_pixels import gather_pixels
+from hybridvo.torch_geometry import left_update, pixel_grid, pp, reproject
+from hybridvo.types import PairBatch
+
+NOISE = (0.3, 0.03)
+NAMES = ("flow", "depth_prev", "K_prev", "K_curr", "weights", "depth_curr", "flow_variance")
+Values = dict[str, torch.Tensor]
+
+
+def made(seed: int, size: tuple[int, int] = (7, 9)) -> Values:
+    """Inputs small enough for finite differences, every one of them."""
+    batch, _ = noisy_batch(2, size, seed, outlier_px=2.0)
+    g = torch.Generator().manual_seed(seed + 100)
+    noise = torch.randn(batch.depth_prev.shape, generator=g, dtype=F64)
+    return {
+        **{name: getattr(batch, name) for name in NAMES[:4]},
+        "weights": 0.5 + torch.rand(noise.shape, generator=g, dtype=F64),
+        "depth_curr": 4 + 0.03 * noise,
+        "flow_variance": 0.5 + torch.rand(noise.shape, generator=g, dtype=F64),
+        "noise": torch.tensor([(*NOISE, 0.05)] * 2, dtype=F64),
+    }
+
+
+def solve(values: Values, kernel: str = "geman-mcclure", use_depth_curr: bool = False):
+    """The refined poses, solved to the precision of float64."""
+    values = dict(values)
+    weights = values.pop("weights")
+    noise = values.pop("noise")
+    result = refine_batch(
+        PairBatch(**values),
+        torch.eye(4, dtype=F64).repeat(2, 1, 1),
+        weights if weights.requires_grad else weights.clone().requires_grad_(),
+        noise=noise if use_depth_curr else noise[:, :2],
+        kernel=kernel,
+        options=BatchOptions(use_depth_curr=use_depth_curr),
+    )
+    assert result.converged.all(), result.status
+    return result.T_curr_prev
+
+
+def slope(loss: Callable[[Values], torch.Tensor], values: Values, name: str, at) -> float:
+    sides = []
+    for step in (1e-5, -1e-5):
+        changed = {k: v.detach().clone() for k, v in values.items()}
+        changed[name][at] += step
+        sides.append(loss(changed).item())
+    return (sides[0] - sides[1]) / 2e-5
+
+
+@pytest.mark.parametrize(
+    ("kernel", "use_depth_curr"),
+    [("geman-mcclure", False), ("huber", False), ("cauchy", True)],
+)
+def test_against_differences_of_the_whole_estimate(kernel: str, use_depth_curr: bool) -> None:
+    values = made(seed=1)
+    C = torch.randn(2, 4, 4, dtype=F64, generator=torch.Generator().manual_seed(3))
+
+    def loss(changed: Values) -> torch.Tensor:
+        return (C * solve(changed, kernel, use_depth_curr)).sum()
+
+    leaves = {k: v.clone().requires_grad_() for k, v in values.items()}
+    names = [n for n in (*NAMES, "noise") if use_depth_curr or n != "depth_curr"]
+    gradients = torch.autograd.grad(loss(leaves), [leaves[n] for n in names])
+    for name, gradient in zip(names, gradients, strict=True):
+        assert gradient.abs().max() > 0, name
+        at = {"K_prev": (0, 0, 2), "K_curr": (1, 1, 1), "noise": (1, 0)}.get(name, (1, 4, 6))
+        expected = slope(loss, values, name, at)
+        got = gradient[at].sum()
+        # curvature times 1e-10, and a pose exact to 1e-13 over a step of 1e-5
+        assert float(got) == pytest.approx(expected, rel=1e-5, abs=2e-7), name
+
+
+def test_gradcheck() -> None:
+    values = made(seed=2, size=(5, 6))
+    names = NAMES[:5]
+    leaves = [values[n].clone().requires_grad_() for n in names]
+    assert torch.autograd.gradcheck(
+        lambda *x: solve(values | dict(zip(names, x, strict=True))),
+        leaves, eps=1e-6, atol=1e-6, fast_mode=True,
+    )  # fmt: skip
+
+
+def test_against_an_unrolled_solve() -> None:
+    values = made(seed=4)
+    flow = values["flow"].clone().requires_grad_()
+    implicit = solve(values | {"flow": flow})
+    C = torch.randn(2, 4, 4, dtype=F64, generator=torch.Generator().manual_seed(5))
+    (expected,) = torch.autograd.grad((C * implicit).sum(), flow)
+    batch = PairBatch(**{k: v for k, v in values.items() if k not in ("weights", "noise")})
+    pixels = gather_pixels(replace(batch, flow=flow), values["weights"])
+    how = RobustNoise(values["noise"])
+    T = pp.mat2SE3(implicit.detach(), check=False)
+    for _ in range(40):  # a contraction of about 0.4
+        H, g = linearize(pixels, T, how).total()
+        T = left_update(torch.linalg.solve(H, g), T)
+    assert (T.matrix() - implicit).abs().max() < 1e-11
+    (unrolled,) = torch.autograd.grad((C * T.matrix()).sum(), flow)
+    assert (unrolled - expected).abs().max() < 1e-6 * expected.abs().max()
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_matrix_of_the_newton_step_against_differences(kernel: str) -> None:
+    values = made(seed=6)
+    batch = PairBatch(**{k: v for k, v in values.items() if k not in ("weights", "noise")})
+    pixels = gather_pixels(batch, values["weights"], use_depth_curr=True)
+    how = RobustNoise(values["noise"], kernel, 1.5)
+    T = pp.identity_SE3(2, dtype=F64)
+    A = newton_matrix(pixels, T, how)
+    for k in range(6):
+        step = torch.zeros(2, 6, dtype=F64)
+        step[:, k] = 1e-6
+        ahead, behind = (score_sum(pixels, left_update(s * step, T), how) for s in (1, -1))
+        assert ((behind - ahead) / 2e-6 - A[:, :, k]).abs().max() < 1e-6 * A.abs().max()
+
+
+def test_start_does_not_matter_at_the_optimum() -> None:
+    values = made(seed=7)
+    far = torch.as_tensor(se3_exp([0.1, -0.1, 0.05, 0.02, 0.01, 0.0])).expand(2, 4, 4)
+    found = []
+    for start in (None, far.clone().requires_grad_()):
+        flow = values["flow"].clone().requires_grad_()
+        batch = PairBatch(flow, *(values[n] for n in NAMES[1:4]))
+        T = refine_batch(batch, start, values["weights"], noise=NOISE).T_curr_prev
+        (gradient,) = torch.autograd.grad(T[:, :3].sum(), flow)
+        found.append((T.detach(), gradient))
+    assert (found[0][0] - found[1][0]).abs().max() < 1e-11
+    assert (found[0][1] - found[1][1]).abs().max() < 1e-8
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+@pytest.mark.parametrize("noise", [None, NOISE, (0.3, 0.0)])
+def test_exact_flow_has_a_gradient_in_single_precision_as_well(dtype, noise) -> None:
+    batch, T = noisy_batch(2, seed=3, outliers=0, flow_noise=0, depth_noise=0, dtype=dtype)
+    leaves = [x.clone().requires_grad_() for x in (batch.flow, batch.depth_prev, batch.K_prev)]
+    result = refine_batch(PairBatch(*leaves, batch.K_curr), noise=noise)
+    assert result.converged.all() and (result.T_curr_prev - T).abs().max() < 1e-5
+    gradients = torch.autograd.grad(result.T_curr_prev[:, :3].sum(), leaves)
+    assert all(torch.isfinite(x).all() for x in gradients)
+    assert (gradients[0].abs().amax((1, 2, 3)) > 0).all()
+
+
+def test_a_failed_sample_gives_zero_gradient_and_leaves_the_others() -> None:
+    values = made(seed=9)
+    flow = values["flow"].clone()
+    flow[1] = torch.nan
+    flow.requires_grad_()
+    result = refine_batch(PairBatch(flow, *(values[n] for n in NAMES[1:4])), noise=NOISE)
+    assert result.failed.tolist() == [False, True]
+    (gradient,) = torch.autograd.grad(result.T_curr_prev.square().sum(), flow)
+    assert torch.isfinite(gradient).all() and (gradient[1] == 0).all()
+    assert gradient[0].abs().max() > 0
+
+
+def test_only_on_request() -> None:
+    values = made(seed=10)
+    flow = values["flow"].clone().requires_grad_()
+    batch = PairBatch(flow, *(values[n] for n in NAMES[1:4]))
+    assert refine_batch(batch, noise=NOISE).T_curr_prev.requires_grad
+    assert not refine_batch(batch, gradient="none").T_curr_prev.requires_grad
+    with torch.no_grad():
+        assert not refine_batch(batch).T_curr_prev.requires_grad
+
+
+def test_pypose_tangents_are_ours() -> None:
+    """Translation first, from the left, and the gradient of Exp is that of the matrix."""
+    g = torch.Generator().manual_seed(0)
+    d = torch.randn(3, 6, generator=g, dtype=F64) * torch.tensor([[0.0], [1e-5], [0.7]], dtype=F64)
+    T = pp.se3(torch.randn(3, 6, generator=g, dtype=F64)).Exp()
+    for k in range(3):
+        expected = torch.as_tensor(se3_exp(d[k].numpy())) @ T[k].matrix()
+        assert (left_update(d, T)[k].matrix() - expected).abs().max() < 1e-13
+    assert torch.autograd.gradcheck(lambda x: left_update(x, T).matrix(), d.requires_grad_())
+
+
+def test_a_refined_motion_of_half_a_turn() -> None:
+    """About the axis of the lens: the only half turn whose two images show the same things."""
+    T = pp.se3(torch.tensor([[0.05, -0.02, 0.1, 0.0, 0.0, math.pi]], dtype=F64)).Exp().matrix()
+    K = torch.tensor([[[40.0, 0, 11.5], [0, 40.0, 7.5], [0, 0, 1]]], dtype=F64)
+    grid = pixel_grid(16, 24, K)
+    depth = (3 + 0.05 * grid[..., 0] + torch.sin(grid[..., 1] / 3))[None]
+    g = torch.Generator().manual_seed(0)
+    flow = reproject(depth, T, K, K)[0] - grid
+    flow = (flow + 0.1 * torch.randn(flow.shape, generator=g, dtype=F64)).requires_grad_()
+    found = refine_batch(PairBatch(flow, depth, K, K), T, noise=(0.1, 0.01))
+    assert found.converged.all() and (found.T_curr_prev - T).abs().max() < 0.05
+    (gradient,) = torch.autograd.grad(found.T_curr_prev.sum(), flow)
+    assert torch.isfinite(gradient).all() and 0 < gradient.abs().max() < 1e3
+
+
+def test_small_systems_are_solved_each_for_itself() -> None:
+    good = 2 * torch.eye(6, dtype=F64)
+    A = torch.stack([good, torch.zeros(6, 6, dtype=F64), math.nan * good, -good])
+    step, solved = solve_small(A, torch.ones(4, 6, dtype=F64))
+    assert solved.tolist() == [True, False, False, True]
+    assert step[0].tolist() == pytest.approx([0.5] * 6)
+    assert (step[1:3] == 0).all()

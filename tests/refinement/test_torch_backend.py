@@ -1,0 +1,304 @@
+"""The refinement of batches: accuracy, independence of the samples, bad data, oracles."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from batches import F64, noisy_batch
+
+from hybridvo.errors import InputError
+from hybridvo.geometry import rotation_angle, se3_exp
+from hybridvo.pipeline import refine
+from hybridvo.refinement.batch import BatchedPose, BatchOptions
+from hybridvo.refinement.torch_backend import refine_batch
+from hybridvo.synthetic.scenarios import make_pair
+from hybridvo.torch_geometry import pixel_grid, pp, reproject, se3
+from hybridvo.types import PairBatch, Reason, State
+
+FIELDS = ("SE3", "covariance", "converged", "failed", "cost", "weights", "noise")
+
+
+def scene(batch: int = 3, seed: int = 0, **how) -> tuple[PairBatch, torch.Tensor]:
+    return noisy_batch(batch, (40, 56), seed, **how)
+
+
+def take(pair: PairBatch, index: list[int]) -> PairBatch:
+    return PairBatch(
+        pair.flow[index], pair.depth_prev[index], pair.K_prev[index], pair.K_curr[index]
+    )
+
+
+def assert_same(a: BatchedPose, ia: list[int], b: BatchedPose, ib: list[int]) -> None:
+    for name in FIELDS:
+        assert torch.equal(getattr(a, name)[ia], getattr(b, name)[ib]), name
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+def test_finds_the_motion_within_its_covariance(dtype: torch.dtype) -> None:
+    pair, T = scene(8, dtype=dtype)
+    result = refine_batch(pair)
+    assert result.T_curr_prev.dtype == dtype and result.SE3.shape == (8, 7)
+    assert result.converged.all() and not result.failed.any()
+    assert all(status.state is State.OK for status in result.status)
+    nees = []
+    for k in range(8):
+        delta = (se3(T[k]) @ result.SE3[k].Inv()).Log().tensor()
+        nees.append(float(delta @ torch.linalg.solve(result.covariance[k].double(), delta)))
+    # chi-square with 48 degrees of freedom: 99.99 % below 95; the sandwich of 4 tiles is cautious
+    assert sum(nees) < 95
+    assert result.noise[:, 0].double().numpy() == pytest.approx(0.3, rel=0.1)
+    # q is a pixel or two here, so one pair alone tells little of the depth noise
+    assert float(result.noise[:, 1].median()) == pytest.approx(0.02, abs=0.01)
+    assert (result.inlier_ratio > 0.85).all()
+    assert (result.T_prev_curr @ result.T_curr_prev - torch.eye(4, dtype=dtype)).abs().max() < 1e-6
+
+
+def test_a_nan_pair_leaves_the_others_bit_unchanged() -> None:
+    pair, _ = scene(3)
+    expected = refine_batch(pair)
+    for name in ("flow", "depth_prev", "K_prev", "K_curr"):
+        broken = {
+            key: getattr(pair, key).clone() for key in ("flow", "depth_prev", "K_prev", "K_curr")
+        }
+        broken[name][1] = math.nan
+        result = refine_batch(PairBatch(**broken))
+        assert_same(result, [0, 2], expected, [0, 2])
+        assert result.failed.tolist() == [False, True, False]
+        assert result.status[1].state is State.FAILED
+        assert torch.equal(result.T_curr_prev[1], torch.eye(4, dtype=F64))
+        assert torch.isfinite(result.covariance).all() and torch.isfinite(result.weights).all()
+    reasons = {
+        "flow": Reason.NO_FLOW,
+        "depth_prev": Reason.NO_VALID_DEPTH,
+        "K_prev": Reason.NAN_INPUT,
+    }
+    for name, reason in reasons.items():
+        broken = {
+            key: getattr(pair, key).clone() for key in ("flow", "depth_prev", "K_prev", "K_curr")
+        }
+        broken[name][1] = math.nan
+        assert refine_batch(PairBatch(**broken)).status[1].reason is reason
+
+
+def test_permuting_the_batch_permutes_the_result() -> None:
+    pair, _ = scene(3, seed=1)
+    order = [2, 0, 1]
+    first, second = refine_batch(pair), refine_batch(take(pair, order))
+    assert torch.equal(first.iterations[order], second.iterations)
+    # vector and scalar lanes may round differently
+    assert (first.T_curr_prev[order] - second.T_curr_prev).abs().max() < 1e-10
+    alone = refine_batch(take(pair, [1]))
+    assert (alone.T_curr_prev[0] - first.T_curr_prev[1]).abs().max() < 1e-10
+
+
+def test_weights_and_mask_switch_pixels_off() -> None:
+    pair, _ = scene(1, seed=2)
+    valid = torch.ones(1, 40, 56, dtype=torch.bool)
+    valid[:, :, :20] = False
+    by_mask = refine_batch(replace(pair, valid=valid))
+    weights = valid.double()
+    weights[0, 0, :4] = torch.tensor([math.nan, -1.0, 1e38, math.inf])
+    by_weight = refine_batch(pair, weights=weights)
+    assert torch.equal(by_mask.T_curr_prev, by_weight.T_curr_prev)
+    assert (by_mask.weights[~valid] == 0).all()
+    poisoned = pair.flow.clone()
+    poisoned[:, :, :20] = math.nan
+    by_nan = refine_batch(replace(pair, flow=poisoned))
+    assert torch.equal(by_mask.T_curr_prev, by_nan.T_curr_prev)
+
+
+@pytest.mark.parametrize("count", [0, 3, 6, 23])
+def test_too_few_pixels_fail(count: int) -> None:
+    pair, _ = scene(2)
+    depth = pair.depth_prev.clone()
+    keep = torch.zeros(40 * 56, dtype=torch.bool)
+    keep[torch.arange(count) * 90] = True
+    depth[0, ~keep.reshape(40, 56)] = math.nan
+    result = refine_batch(replace(pair, depth_prev=depth))
+    assert result.failed.tolist() == [True, False]
+    assert result.status[0].reason is Reason.NO_VALID_DEPTH
+    assert torch.equal(result.T_curr_prev[0], torch.eye(4, dtype=F64))
+    assert result.covariance[0].diagonal().tolist() == [1e4] * 3 + [10.0] * 3
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+@pytest.mark.parametrize("depth", [1e-6, 1e6])
+def test_absurd_depths_stay_finite(depth: float, dtype: torch.dtype) -> None:
+    pair, _ = scene(2, dtype=dtype)
+    for value in (torch.full_like(pair.depth_prev, depth), pair.depth_prev * depth):
+        result = refine_batch(replace(pair, depth_prev=value))
+        for name in ("T_curr_prev", "covariance", "cost", "weights", "noise"):
+            assert torch.isfinite(getattr(result, name)).all(), name
+        R = result.T_curr_prev[:, :3, :3]
+        assert (R @ R.transpose(1, 2) - torch.eye(3, dtype=dtype)).abs().max() < 1e-5
+
+
+def test_collinear_pixels_are_degenerate_or_say_so() -> None:
+    pair, _ = scene(1, seed=3)
+    valid = torch.zeros(1, 40, 56, dtype=torch.bool)
+    valid[:, 20] = True
+    flat = PairBatch(
+        pair.flow, torch.full_like(pair.depth_prev, 3.0), pair.K_prev, pair.K_curr, valid=valid
+    )
+    result = refine_batch(flat)
+    assert torch.isfinite(result.T_curr_prev).all()
+    spread = result.covariance[0].diagonal()[:3].amax().sqrt()
+    assert result.failed[0] or spread > 0.01
+
+
+def test_handed_in_start_wins_where_the_identity_is_lost() -> None:
+    pair, T = scene(2, seed=4, outliers=0.3)
+    turned = torch.as_tensor(se3_exp(np.array([0.0, 0.0, 0.0, 0.05, 0.4, -0.3])))
+    far = T @ turned
+    grid = pixel_grid(40, 56, pair.K_prev)
+    K = pair.K_prev.clone()
+    pixels, seen = reproject(pair.depth_prev, far, K, K)
+    noise = 0.2 * torch.randn(pixels.shape, dtype=F64, generator=torch.Generator().manual_seed(1))
+    pair = replace(pair, flow=pixels - grid + noise, valid=seen)
+    starts = torch.stack([torch.full((2, 4, 4), math.nan, dtype=F64), far], dim=1)
+    result = refine_batch(pair, starts)
+    assert result.converged.all()
+    angle = rotation_angle((result.T_curr_prev[:, :3, :3] @ far[:, :3, :3].transpose(1, 2)).numpy())
+    assert angle.max() < 0.01
+    assert (
+        torch.equal(refine_batch(pair, starts[:, 1]).T_curr_prev, result.T_curr_prev)
+        or (refine_batch(pair, starts[:, 1]).T_curr_prev - result.T_curr_prev).abs().max() < 1e-9
+    )
+
+
+@pytest.mark.parametrize("kernel", ["huber", "cauchy", "l2"])
+def test_other_kernels(kernel: str) -> None:
+    pair, T = scene(2, seed=5, outliers=0.0)
+    result = refine_batch(pair, noise=(0.3, 0.02), kernel=kernel)
+    assert result.converged.all()
+    assert (result.T_curr_prev - T).abs().max() < 0.02
+    assert result.noise.tolist() == [[0.3, 0.02]] * 2
+
+
+def test_depth_of_the_current_frame_helps_the_translation() -> None:
+    pair, T = scene(6, seed=6, outliers=0.0)
+    # a fronto-parallel wall: rotation and translation trade off in the flow alone
+    depth = torch.full_like(pair.depth_prev, 5.0)
+    grid = pixel_grid(40, 56, pair.K_prev)
+    shift = torch.eye(4, dtype=F64).repeat(6, 1, 1)
+    shift[:, :3, 3] = T[:, :3, 3]
+    flow = reproject(depth, shift, pair.K_prev, pair.K_curr)[0] - grid
+    g = torch.Generator().manual_seed(7)
+    flow = flow + 0.5 * torch.randn(flow.shape, generator=g, dtype=F64)
+    curr = (depth + shift[:, 2, 3, None, None]) * torch.exp(
+        0.005 * torch.randn(depth.shape, generator=g, dtype=F64)
+    )
+    measured = depth * torch.exp(0.005 * torch.randn(depth.shape, generator=g, dtype=F64))
+    pair = PairBatch(flow, measured, pair.K_prev, pair.K_curr, depth_curr=curr)
+    errors = []
+    for second in (False, True):
+        options = BatchOptions(use_depth_curr=second)
+        result = refine_batch(pair, noise=(0.5, 0.005), options=options)
+        assert result.converged.all()
+        assert result.noise.shape == (6, 2 + second)
+        errors.append((result.T_curr_prev - shift)[:, 2, 3].square().mean().sqrt())
+    assert errors[1] < 0.7 * errors[0]
+    estimated = refine_batch(pair, options=BatchOptions(use_depth_curr=True))
+    assert estimated.converged.all()
+    # r_z shows both depth noises, the second less 4/9 by bilinear sampling; the split is vague
+    both = estimated.noise[:, 1:].square().sum(dim=1).sqrt()
+    assert both.numpy() == pytest.approx(0.005 * math.sqrt(1 + 4 / 9), rel=0.1)
+
+
+def test_outside_autocast_and_half_input() -> None:
+    pair, _ = scene(2, dtype=torch.float32)
+    expected = refine_batch(pair)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        flow = pair.flow.clone().requires_grad_()
+        result = refine_batch(replace(pair, flow=flow))
+        result.T_curr_prev.sum().backward()
+    assert (result.T_curr_prev - expected.T_curr_prev).abs().max() < 1e-4  # tight against loose
+    assert flow.grad is not None and torch.isfinite(flow.grad).all()
+    half = PairBatch(pair.flow.half(), pair.depth_prev.half(), pair.K_prev, pair.K_curr)
+    assert refine_batch(half).T_curr_prev.dtype == torch.float32
+
+
+def test_input_errors() -> None:
+    pair, _ = scene(2)
+    for arguments, message in (
+        ({"pair": replace(pair, flow=pair.flow[..., :1])}, "flow of shape"),
+        ({"pair": replace(pair, K_curr=pair.K_curr[:1])}, "K_curr"),
+        ({"pair": replace(pair, flow=pair.flow.long())}, "floating-point"),
+        ({"pair": replace(pair, valid=pair.depth_prev)}, "bool"),
+        ({"weights": torch.ones(2, 3, 3)}, "weights"),
+        ({"T_init": torch.eye(4)}, "T_init"),
+        ({"kernel": "tukey"}, "known"),
+        ({"noise": (0.0, 0.1)}, "positive"),
+        ({"noise": torch.ones(2, 4)}, "noise"),
+        ({"options": BatchOptions(use_depth_curr=True)}, "depth_curr"),
+        ({"gradient": "unrolled"}, "implicit or none"),
+        ({"options": "nonsense"}, "BatchOptions"),
+    ):
+        with pytest.raises(InputError, match=message):
+            refine_batch(**{"pair": pair, **arguments})
+    with pytest.raises(InputError, match="iterations"):
+        BatchOptions(iterations=0)
+
+
+def test_agrees_with_the_numpy_refinement() -> None:
+    pair, truth = make_pair("moving30", 3, 218, 512)
+    batch = PairBatch(
+        *(
+            torch.as_tensor(value, dtype=torch.float32)[None]
+            for value in (pair.flow, pair.prev.depth, pair.prev.camera.K, pair.curr.camera.K)
+        )
+    )
+    mine, other = refine_batch(batch), refine(pair)
+    T = mine.T_curr_prev[0].double().numpy()
+    for part, tolerance in ((T[:3, 3] - other.T_curr_prev[:3, 3], mine.covariance[0, :3, :3]),):
+        # the same estimator with its own noise estimate: well within the uncertainty of both
+        assert np.linalg.norm(part) < 2 * float(tolerance.diagonal().sum().sqrt())
+    assert np.abs(T - truth["T_curr_prev"]).max() < 5e-3
+    assert refine(batch).T_curr_prev.shape == (1, 4, 4)
+
+
+def test_pypose_levenberg_marquardt_finds_the_same_minimum() -> None:
+    """pypose.optim.LM as oracle, on 200 points without robust weights and without depth noise."""
+    pair, _ = scene(1, seed=8, outliers=0.0)
+    valid = torch.zeros(40 * 56, dtype=torch.bool)
+    valid[torch.randperm(40 * 56, generator=torch.Generator().manual_seed(0))[:200]] = True
+    valid = valid.reshape(1, 40, 56)
+    mine = refine_batch(replace(pair, valid=valid), noise=(0.3, 0.0), kernel="l2")
+    grid = pixel_grid(40, 56, pair.K_prev)[None]
+    K = pair.K_prev[0]
+    uv, z = grid[valid], pair.depth_prev[valid]
+    rays = torch.cat([(uv - K[:2, 2]) / K.diagonal()[:2], torch.ones(200, 1, dtype=F64)], dim=1)
+    points, target = rays * z[:, None], (grid + pair.flow)[valid]
+
+    class Reprojection(torch.nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.pose = pp.Parameter(pp.identity_SE3(dtype=F64))
+
+        def forward(self, _: torch.Tensor) -> torch.Tensor:
+            moved = self.pose.Act(points)
+            return target - (moved[:, :2] / moved[:, 2:] * K.diagonal()[:2] + K[:2, 2])
+
+    model = Reprojection()
+    optimizer = pp.optim.LM(model, vectorize=False)
+    for _ in range(8):
+        optimizer.step(torch.zeros(()))
+    assert (model.pose.matrix() - mine.T_curr_prev[0]).abs().max() < 1e-6
+
+
+@pytest.mark.gpu
+def test_same_on_cuda() -> None:
+    if not torch.cuda.is_available():
+        pytest.skip("no CUDA device")
+    pair, _ = scene(3)
+    moved = PairBatch(*(v.cuda() for v in (pair.flow, pair.depth_prev, pair.K_prev, pair.K_curr)))
+    flow = moved.flow.requires_grad_()
+    result = refine_batch(replace(moved, flow=flow))
+    expected = refine_batch(replace(pair, flow=pair.flow.clone().requires_grad_()))
+    assert (result.T_curr_prev.cpu() - expected.T_curr_prev).abs().max() < 1e-8
+    result.T_curr_prev.sum().backward()
+    assert flow.grad is not None and torch.isfinite(flow.grad).all()

@@ -1,0 +1,282 @@
+"""The residual of the torch refinement: by hand, against autograd, algebra and numba."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from batches import F64, noisy_batch
+
+from hybridvo.errors import InputError
+from hybridvo.geometry import ego_flow, pixel_grid, se3_exp
+from hybridvo.refinement import kernels, solver
+from hybridvo.refinement.pixels import typical
+from hybridvo.refinement.torch_backend import solve_small
+from hybridvo.refinement.torch_factors import (
+    KERNELS,
+    RobustNoise,
+    at_likely_depth,
+    jacobian,
+    linearize,
+    residuals,
+    score_sum,
+)
+from hybridvo.refinement.torch_pixels import from_tiles, gather_pixels, sample_depth, to_tiles
+from hybridvo.torch_geometry import left_update, pp, reproject, se3
+from hybridvo.types import Camera, PairBatch
+
+
+def test_one_pixel_by_hand() -> None:
+    # fx = fy = 100, c = (1, 1); pixel (2, 1) at 2 m; t = (0.1, 0, 0.5): X' = (0.12, 0, 2.5)
+    K = torch.tensor([[[100.0, 0, 1], [0, 100.0, 1], [0, 0, 1]]], dtype=F64)
+    depth = torch.full((1, 3, 3), math.nan, dtype=F64)
+    depth[0, 1, 2] = 2.0
+    flow = torch.zeros(1, 3, 3, 2, dtype=F64)
+    flow[0, 1, 2] = torch.tensor([5.0, 1.0])
+    T = pp.SE3(torch.tensor([[0.1, 0, 0.5, 0, 0, 0, 1]], dtype=F64))
+    pixels = gather_pixels(PairBatch(flow, depth, K, K))
+    assert pixels.weight.sum() == 1
+    terms, at = residuals(pixels, T), 5
+    # a = 0.048, so the pixel lands at 5.8: residual 7 - 5.8; q = 100/2.5 (0.048 0.5 - 0.1)
+    found = [float(x[0, at]) for x in (*terms.r, *terms.u)]
+    assert found == pytest.approx([1.2, 1.0, 40 * (0.024 - 0.1), 0.0], abs=1e-12)
+    rows = jacobian(pixels, terms)
+    expected = 100 * np.array([0.4, 0, -0.048 * 0.4, 0, 1 + 0.048**2, 0])
+    assert rows[0][0, :, at].numpy() == pytest.approx(expected, abs=1e-12)
+    assert rows[1][0, :, at].numpy() == pytest.approx([0, 40, 0, -100, 0, 4.8], abs=1e-12)
+    # Sigma_uu = 0.25 + 0.01 q^2; most likely log depth: e = 0.01 q 1.2 / Sigma_uu beyond log 2
+    q = -40 * 0.076
+    e = 0.01 * q * 1.2 / (0.25 + 0.01 * q * q)
+    how = RobustNoise(torch.tensor([[0.5, 0.1]], dtype=F64), "l2", 1.0)
+    moved = at_likely_depth(pixels, terms, how.noise)
+    assert moved.a[0, at] == pytest.approx(0.048 + q * e / 100, rel=1e-12)
+    assert moved.i[0, at] == pytest.approx(0.4 * (1 - 0.8 * e), rel=1e-12)  # 1 - tz i = 0.8
+    q = float(100 * moved.i[0, at] * (moved.a[0, at] * 0.5 - 0.1))
+    found = linearize(pixels, T, how)
+    variance = 0.25 + 0.01 * q * q
+    assert found.distance2[0, at] == pytest.approx(1.44 / variance + 1 / 0.25, rel=1e-12)
+    assert found.g[0, 0, 1] == pytest.approx(100 * float(moved.i[0, at]) / 0.25, rel=1e-12)
+
+
+def test_reproject_is_the_numpy_ego_flow() -> None:
+    batch, T = noisy_batch(seed=3)
+    pixels, valid = reproject(batch.depth_prev, T, batch.K_prev, batch.K_curr)
+    same, _ = reproject(batch.depth_prev, se3(T), batch.K_prev, batch.K_curr)
+    assert (same - pixels).abs().max() < 1e-9 and valid.all()
+    for k in range(2):
+        cameras = [Camera.from_matrix(K[k].numpy(), 24, 32) for K in (batch.K_prev, batch.K_curr)]
+        flow = ego_flow(batch.depth_prev[k].numpy(), T[k].numpy(), *cameras)
+        assert np.abs(pixels[k].numpy() - pixel_grid(24, 32) - flow).max() < 1e-10
+    with pytest.raises(InputError, match=r"expected T of shape \(2, 4, 4\)"):
+        reproject(batch.depth_prev, T[:1], batch.K_prev, batch.K_curr)
+
+
+def test_reproject_marks_points_behind_and_stays_finite() -> None:
+    batch, _ = noisy_batch()
+    T = torch.eye(4, dtype=F64).repeat(2, 1, 1)
+    T[0, 2, 3] = -100.0
+    depth = batch.depth_prev.clone()
+    depth[1, 0, 0] = math.nan
+    depth.requires_grad_()
+    pixels, valid = reproject(depth, T, batch.K_prev, batch.K_curr)
+    assert not valid[0].any()
+    assert not valid[1, 0, 0] and valid[1].sum() == 24 * 32 - 1
+    (gradient,) = torch.autograd.grad(pixels.sum(), depth)
+    assert torch.isfinite(pixels).all() and torch.isfinite(gradient).all()
+
+
+def test_derivatives_against_autograd() -> None:
+    """The Jacobian in the pose, and the sensitivity to the log depth, of all three rows."""
+    batch, T = noisy_batch(size=(6, 7), seed=5)
+    batch = replace(batch, depth_curr=torch.full((2, 6, 7), 4.0, dtype=F64))
+    pixels = gather_pixels(batch, use_depth_curr=True)
+    pose = se3(T)
+    terms = residuals(pixels, pose)
+    zero = torch.zeros(2, 6, dtype=F64)
+    for k, row in enumerate(jacobian(pixels, terms)):
+        full = torch.autograd.functional.jacobian(
+            lambda d, k=k: -residuals(pixels, left_update(d, pose)).r[k], zero
+        )
+        auto = torch.stack([full[b, :, b] for b in range(2)])
+        assert (row.transpose(1, 2) - auto).abs().max() < 1e-10
+        scale = torch.ones_like(pixels.weight).requires_grad_()
+        r = residuals(replace(pixels, points=pixels.points * scale[:, None]), pose).r[k]
+        (slope,) = torch.autograd.grad(-r.sum(), scale)  # at 1: the derivative in log Z
+        assert (slope - terms.u[k]).abs().max() < 1e-10
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_normal_equations_against_dense_algebra(kernel: str) -> None:
+    batch, T = noisy_batch(size=(5, 6), seed=7)
+    smooth = torch.linspace(3, 3.4, 30, dtype=F64).reshape(5, 6)
+    batch = replace(batch, depth_curr=smooth.repeat(2, 1, 1))
+    weights = torch.rand(2, 5, 6, dtype=F64, generator=torch.Generator().manual_seed(1))
+    c = KERNELS[kernel].cutoff
+    how = RobustNoise(torch.tensor([[0.4, 0.05, 0.02], [0.3, 0.02, 0.05]], dtype=F64), kernel, c)
+    pixels = gather_pixels(batch, weights, use_depth_curr=True)
+    present = pixels.has_depth_curr
+    assert present is not None and 0 < present.sum() < present.numel()
+    found = linearize(pixels, se3(T), how, run=10, scores=True)
+    terms = residuals(pixels, se3(T))
+    moved = at_likely_depth(pixels, terms, how.noise)
+    rows = jacobian(pixels, moved)
+    for b in range(2):
+        H, g, cost = np.zeros((6, 6)), np.zeros(6), 0.0
+        for k in range(30):
+            keep = [0, 1, 2] if present[b, k] else [0, 1]
+            J = np.stack([rows[q][b, :, k].numpy() for q in keep])
+            u = np.array([float(moved.u[q][b, k]) for q in keep])
+            r = np.array([float(terms.r[q][b, k]) for q in keep])
+            sf, sd, sz = how.noise[b].tolist()
+            sigma = np.diag([sf**2, sf**2, sz**2][: len(keep)]) + sd**2 * np.outer(u, u)
+            information = np.linalg.inv(sigma)
+            d2 = torch.tensor(r @ information @ r, dtype=F64)
+            w = float(weights[b].flatten()[k] * KERNELS[kernel].weight(d2, c * c))
+            H += w * J.T @ information @ J
+            g += w * J.T @ information @ r
+            cost += float(weights[b].flatten()[k] * KERNELS[kernel].cost(d2, c * c))
+        total_H, total_g = (x[b].numpy() for x in found.total())
+        assert total_H == pytest.approx(H, rel=1e-9, abs=1e-9 * np.abs(H).max())
+        assert total_g == pytest.approx(g, rel=1e-9, abs=1e-9 * np.abs(g).max())
+        assert float(found.cost[b]) == pytest.approx(cost, rel=1e-10)
+    assert found.H.shape == (2, 3, 6, 6) and found.scores is not None
+    g = found.total()[1]
+    assert (found.scores.sum(dim=2) - g).abs().max() < 1e-9 * g.abs().max()
+    assert (score_sum(pixels, se3(T), how) - g).abs().max() < 1e-9 * g.abs().max()
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_weight_and_curvature_are_slopes_of_the_cost(kernel: str) -> None:
+    d2 = torch.tensor([0.0, 0.3, 1.0, 4.0, 60.0], dtype=F64, requires_grad=True)
+    how, c2 = KERNELS[kernel], 1.7**2
+    (slope,) = torch.autograd.grad(how.cost(d2, c2).sum(), d2)
+    assert (2 * slope - how.weight(d2, c2)).abs().max() < 1e-14
+    if kernel != "l2":
+        (bend,) = torch.autograd.grad(how.weight(d2, c2).sum(), d2)
+        assert (-2 * bend / how.weight(d2, c2) - how.curvature(d2, c2)).abs().max() < 1e-12
+
+
+def numba_step(pair: PairBatch, weights: torch.Tensor | None, T: np.ndarray, noise: tuple):
+    """(step, sums) of the numba kernels for the only sample of a batch."""
+    dummy = np.ones((1, 1), np.float32)
+    flags, scale = 0, np.ones(2, np.float32)
+    data = [pair.depth_prev[0].float().numpy(), pair.flow[0].float().numpy()]
+    for index, (value, flag) in enumerate(
+        (
+            (pair.flow_variance, kernels.HAS_FLOW_VARIANCE),
+            (pair.depth_variance, kernels.HAS_DEPTH_VARIANCE),
+        )
+    ):
+        if value is None:
+            data.append(dummy)
+            continue
+        data.append(value[0].float().numpy())
+        scale[index] = typical(data[-1])
+        flags |= flag
+    data.append(dummy if weights is None else weights[0].float().numpy())
+    flags |= 0 if weights is None else kernels.HAS_WEIGHTS
+    data.append(np.ones((1, 1), np.bool_) if pair.valid is None else pair.valid[0].numpy())
+    flags |= 0 if pair.valid is None else kernels.HAS_VALID
+    K = pair.K_prev[0].numpy()
+    camera = np.array([1 / K[0, 0], 1 / K[1, 1], K[0, 2], K[1, 2]], np.float32)
+    K = pair.K_curr[0].numpy()
+    current = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]], np.float32)
+    three = np.empty(3, np.float32)
+    solver.set_noise(*noise, 3.0, three)
+    R, t = T[:3, :3].astype(np.float32), T[:3, 3].astype(np.float32)
+    height, width = pair.depth_prev.shape[1:]
+    tile = 24
+    tiles = np.zeros((-(-height // tile), -(-width // tile), 27))
+    out = np.zeros(kernels.SUMS)
+    weight_map = np.empty((height, width), np.float32)
+    for band in range(len(tiles)):
+        kernels.sum_tiles(
+            tuple(data), camera, flags, scale, R, t, current, three, band, tile, weight_map,
+            tiles, out,
+        )  # fmt: skip
+    out[:27] = tiles.sum(axis=(0, 1))
+    delta = np.zeros(6)
+    assert solver.solve6(out, 0.0, delta)
+    return delta, out
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+@pytest.mark.parametrize("case", ["plain", "variances", "weights", "mask", "all"])
+def test_step_equals_the_numba_kernels(case: str, dtype: torch.dtype) -> None:
+    pair, T = noisy_batch(1, (60, 80), seed=8, dtype=dtype)
+    g = torch.Generator().manual_seed(2)
+
+    def positive() -> torch.Tensor:
+        return (0.3 + torch.rand(1, 60, 80, generator=g, dtype=F64)).to(dtype)
+
+    weights = None
+    if case in ("variances", "all"):
+        flow_variance, depth_variance = positive(), 1e-3 * positive()
+        flow_variance[0, 3, 4], flow_variance[0, 5, 5] = math.nan, -1.0
+        depth_variance[0, 9, 9], depth_variance[0, 9, 10] = 0.0, math.inf
+        pair = replace(pair, flow_variance=flow_variance, depth_variance=depth_variance)
+    if case in ("weights", "all"):
+        weights = 3 * positive()
+        weights[0, :4] = 0.0
+        weights[0, 10, :3] = torch.tensor([math.nan, -2.0, 1e38], dtype=dtype)
+    if case in ("mask", "all"):
+        pair.depth_prev[0, 20:24, 5] = torch.tensor([math.nan, 0.0, -1.0, math.inf], dtype=dtype)
+        pair.flow[0, 30, 6] = math.nan
+        pair = replace(pair, valid=torch.rand(1, 60, 80, generator=g) > 0.3)
+    start = se3_exp(np.array([0.02, -0.01, 0.015, 2e-3, -1e-3, 3e-3])) @ T[0].numpy()
+    expected, _ = numba_step(pair, weights, start, (0.35, 0.04))
+    pixels = gather_pixels(pair, weights, tile=24)
+    how = RobustNoise(torch.tensor([[0.35, 0.04]], dtype=dtype))
+    found = linearize(pixels, se3(torch.as_tensor(start)[None]), how, run=24 * 24)
+    step, good = solve_small(*found.total())
+    assert good.all() and found.H.shape[1] == 3 * 4
+    # in units of the step along each of translation and rotation
+    for part in (slice(0, 3), slice(3, 6)):
+        length = np.linalg.norm(expected[part])
+        assert np.abs(step[0, part].numpy() - expected[part]).max() < 1e-5 * length
+
+
+def test_sampled_depth_by_hand() -> None:
+    depth = torch.tensor([[[4.0, 4.1, 8.0], [4.05, 4.15, 8.0]]], dtype=F64)
+    u = torch.tensor([0.25, 1.0, 1.5, 2.0, -0.1, math.nan], dtype=F64)
+    v = torch.tensor([0.5, 1.0, 0.5, 1.0, 0.0, 0.0], dtype=F64)
+    at = torch.stack([u, v], dim=1)[None, None]
+    sampled, good = sample_depth(depth, at)
+    assert good[0, 0].tolist() == [True, False, False, False, False, False]
+    assert sampled[0, 0, 0] == pytest.approx(0.75 * 4.025 + 0.25 * 4.125)
+    depth[0, 1, 0] = math.nan
+    assert not sample_depth(depth, at)[1].any()
+    corners = torch.tensor([[4.0, 3.0], [0.0, 0.0]], dtype=F64)[None, None]
+    assert sample_depth(torch.full((1, 4, 5), 3.0, dtype=F64), corners)[1].all()
+
+
+def test_unusable_values_leave_no_trace_in_gradients() -> None:
+    batch, T = noisy_batch(seed=10)
+    for value in (math.nan, math.inf, -math.inf, 0.0, -3.0, 1e300):
+        batch.depth_prev[0, 0, 0] = value
+        batch.flow[0, 1, 1, 0] = math.nan if value == 0.0 else value
+        inputs = [v.clone().requires_grad_() for v in (batch.flow, batch.depth_prev, batch.K_prev)]
+        pixels = gather_pixels(PairBatch(*inputs, batch.K_curr))
+        g = score_sum(pixels, se3(T), RobustNoise(torch.tensor([[0.3, 0.03]] * 2, dtype=F64)))
+        gradients = torch.autograd.grad(g.sum(), inputs)
+        assert all(torch.isfinite(gradient).all() for gradient in gradients)
+        assert gradients[1][0, 0, 0] == 0
+
+
+def test_subset_takes_usable_pixels_once() -> None:
+    batch, _ = noisy_batch(size=(40, 50))
+    valid = torch.zeros(2, 40, 50, dtype=torch.bool)
+    valid[0, 10:30, 10:40] = True
+    valid[1, 5, 5:12] = True
+    few = gather_pixels(replace(batch, valid=valid), tile=16).subset(200)
+    assert (few.weight > 0).sum(dim=1).tolist() == [200, 7]
+    assert len(torch.unique(few.points[0].T, dim=0)) == 200
+
+
+@pytest.mark.parametrize("tile", [3, 8, 64])
+def test_tiles_are_undone(tile: int) -> None:
+    x = torch.arange(2 * 7 * 10.0).reshape(2, 7, 10)
+    assert torch.equal(from_tiles(to_tiles(x, tile), tile, 7, 10), x)
