@@ -384,7 +384,7 @@ def _shrunk(
         slice(factor // 2, factor * width, factor),
     )
     small = flow[middle] / np.float32(factor)
-    seen = np.isfinite(small).all(axis=2)
+    seen = np.asarray(np.isfinite(small).all(axis=2))
     if valid is not None:
         seen &= valid[middle]
     small = np.where(seen[..., None], small, np.float32(0))

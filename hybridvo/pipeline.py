@@ -334,7 +334,7 @@ def estimate(
         >>> estimate(FramePair(frame, frame, None)).status.reason.value
         'no_flow'
     """
-    options = options or Options()
+    options = Options() if options is None else options
     _check_kind("options", options, Options)
     if curr is not None or isinstance(pair, Frame):
         pair = _pair_of(pair, curr, options)
@@ -394,7 +394,7 @@ def _depth_doubt(pair: FramePair) -> str:
     if pair.prev.depth is None:
         return ""
     depth = pair.prev.depth[::8, ::8]
-    depth = depth[np.isfinite(depth) & (depth > 0)]
+    depth = depth[np.isfinite(depth) & (depth > 0)].astype(np.float64)
     if depth.size == 0 or np.median(depth) <= MAX_METRES:
         return ""
     return (
@@ -452,7 +452,7 @@ def refine(
     Raises:
         InputError: an argument of another kind or shape, or a start that is no rigid transform.
     """
-    options = options or Options()
+    options = Options() if options is None else options
     _check_kind("options", options, Options)
     if isinstance(pair, PairBatch):
         from hybridvo.refinement.torch_backend import refine_batch

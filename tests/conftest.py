@@ -43,17 +43,3 @@ def image_walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A sequence of five frames of 64x96 with images; read it, change nothing."""
     root = tmp_path_factory.mktemp("session") / "image_walk"
     return write_walk(root, 5, height=64, width=96, pictures=True)
-
-
-@pytest.fixture(scope="module")
-def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A few of the judge's training pictures, as `tools/train_judge.py make` writes them."""
-    from hybridvo.training import judge_data
-
-    folder = tmp_path_factory.mktemp("pictures")
-    count, judge_data.PER_SHARD = judge_data.PER_SHARD, 12
-    try:
-        assert judge_data.write_shard(folder, 0) > 4
-    finally:
-        judge_data.PER_SHARD = count
-    return folder

@@ -230,8 +230,14 @@ def assert_sane(motion: Any) -> None:
     assert np.isfinite(numbers).all() and 0 <= motion.inlier_ratio <= 1
     if motion.weights is not None:
         assert np.isfinite(motion.weights).all()
-    if motion.status.state is State.FAILED:
+    assert 0 <= motion.probability <= 1
+    assert motion.ok == (motion.status.state is State.OK)
+    assert motion.usable == (motion.status.state is not State.FAILED)
+    assert "\n" not in repr(motion)
+    if not motion.ok:
         assert motion.status.reason.value and motion.status.message
+    if not motion.usable:
+        assert motion.probability == 0
         assert np.array_equal(T, np.eye(4))
 
 

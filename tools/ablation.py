@@ -1,232 +1,276 @@
-"""The paper's three tables, trained anew: every row under one budget, on the same pairs.
+"""The rows of the paper's tables, trained anew under one budget on the same pairs.
 
-    python tools/ablation.py --out runs/ablation --samples 20000 --seeds 3
-    python tools/ablation.py --out runs/ablation --samples 20000 --seeds 3 --sintel MPI-Sintel
-    python tools/ablation.py --base configs/train_paper.yaml --samples 10000000 --out runs/full
+    hybridvo generate --preset paper --size 64x128 --count 100000 --out runs/paper_samples
+    python tools/ablation.py --out runs/ablation --data runs/paper_samples --seeds 3
 
-Started again with the same ``--out`` it goes on where it was: a row that is finished is not trained
-again. ``ablation.json``, ``ablation.md`` and ``ablation.png`` are written after every row, with
-what is there. The published figures are of MPI Sintel with true flow and depth; ours are of
-held-out synthetic pairs, and of Sintel too where ``--sintel`` names a copy.
+A row is a file of configs/ablation. The rows that decide the paper's order have several seeds, the
+others one; every row is scored on held-out pairs at 6, 12, 25, 50 and 100 thousand samples, so that
+a reader sees whether an order is settled. Started again with the same ``--out`` it goes on where it
+was: each row's state is ``OUT/ROW-seedN`` (checkpoint.pt, log.jsonl, result.json, and at the end
+weights.safetensors). ``OUT/ablation.json`` is written after every score, with what is there.
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
-import os
+import signal
 import sys
-import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-HELD_OUT = ("data_paper.yaml", "data_wide.yaml")
-"""Presets of the held-out pairs, beside the base recipe."""
-
-
-def build_parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="ablation.py", description=(__doc__ or "").splitlines()[0]
-    )
-    add = parser.add_argument
-    add("--out", type=Path, required=True, metavar="DIR", help="a folder for each row, and results")
-    add("--base", type=Path, default=None, help="recipe of all rows (configs/ablation.yaml)")
-    add("--samples", type=int, default=20_000, help="training samples of every row")
-    add("--seeds", type=int, default=1, help="seeds of the rows that decide the order")
-    add("--rows", help="comma-separated names (default: all)")
-    add("--count", type=int, default=1000, help="held-out pairs of each preset")
-    add("--dev", action="store_true", help="score on development pairs (seed 0), not on published")
-    add("--sintel", type=Path, metavar="DIR", help="MPI Sintel as unpacked: the paper's protocol")
-    add("--threads", type=int, help="threads of torch; by default torch's own choice")
-    add("--workers", type=int, default=0, help="processes that draw samples (0: this one)")
-    add("--keep-gb", type=float, default=0.0, help="memory for training samples kept between rows")
-    add("--device", choices=("auto", "cpu", "cuda"), default="auto")
-    add("--overwrite", action="store_true", help="train every row anew")
-    add("-q", "--quiet", action="store_true", help="no lines of progress")
-    return parser
+ROWS = Path(__file__).resolve().parents[1] / "configs" / "ablation"
+DECIDING = ("pwvo-paper", "pwvo-naive", "vonet", "pwvo-uncertain")
+"""Rows whose order is the paper's claim: these are trained with several seeds."""
+CLAIMS = (
+    ("pwvo-paper", "pwvo-uncertain"),
+    ("pwvo-paper", "pwvo-naive"),
+    ("pwvo-paper", "vonet"),
+    ("pwvo-uncertain", "pwvo-naive"),
+    ("pwvo-naive", "vonet"),
+    *((row, f"{row}-without-flow") for row in ("vonet", "vonet-attention", "pwvo-naive")),
+)
+"""(better, worse) in EPE as the paper has it."""
+MILESTONES = (6_000, 12_000, 25_000, 50_000, 100_000)
+"""Samples at which a row is scored, and at its end."""
+HELD_OUT = ("data_paper.yaml", "data_diverse.yaml")
+RULES = ("softmax", "min_variance", "median", "mean", "paper", "softmax-joint")
+"""Selection rules that a finished pixel-wise row with uncertainty is scored with."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the tool; returns its exit code (2 bad input, 5 no output, 130 interrupted)."""
-    try:
-        args = build_parser().parse_args(argv)
-    except SystemExit as end:
-        return int(end.code or 0)
+    args = _parse(argv)
     from hybridvo.errors import HybridVOError, OutputError
 
-    command = ["tools/ablation.py", *(sys.argv[1:] if argv is None else argv)]
     try:
-        return _run(args, command)
+        return _run(args)
     except HybridVOError as error:
         print(f"ablation.py: {error}", file=sys.stderr)
         return 5 if isinstance(error, OutputError) else 2
-    except OSError as error:
-        print(f"ablation.py: {error.filename}: {error.strerror or error}", file=sys.stderr)
-        return 5
 
 
-def _run(args: argparse.Namespace, command: list[str]) -> int:
+def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        prog="ablation.py",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = parser.add_argument
+    add("--out", type=Path, required=True, metavar="DIR", help="a folder for each row, and results")
+    add("--configs", type=Path, default=ROWS, metavar="DIR", help="the rows (configs/ablation)")
+    add("--rows", help="comma-separated names (default: all)")
+    add("--seeds", type=int, default=1, help="seeds of the rows that decide the order")
+    add("--samples", type=int, default=100_000, help="training samples of every row")
+    add("--data", type=Path, metavar="DIR", help="stored samples instead of drawn ones")
+    add("--count", type=int, default=500, help="held-out pairs of each preset")
+    add("--threads", type=int, default=1, help="threads of torch")
+    add("--workers", type=int, default=0, help="processes that draw samples (0: this one)")
+    add("--device", choices=("cpu", "cuda"), default="cpu")
+    return parser.parse_args(argv)
+
+
+def plan(names: Sequence[str], seeds: int) -> list[tuple[str, int]]:
+    """(row, seed) in the order of training: deciding rows, the others, further seeds."""
+    first = [name for name in DECIDING if name in names]
+    order = [(name, 0) for name in first]
+    order += [(name, 0) for name in names if name not in first]
+    return order + [(name, seed) for seed in range(1, seeds) for name in first]
+
+
+def _run(args: argparse.Namespace) -> int:
     import cv2
     import torch
 
-    from hybridvo.console import interruptible
-    from hybridvo.data.presets import load_preset
     from hybridvo.errors import InputError
-    from hybridvo.training.ablation import KeptSamples, plan, row_options
-    from hybridvo.training.held_out import PUBLISHED_SEED
-    from hybridvo.training.options import load_training_options
-    from hybridvo.training.provenance import source_commit
 
-    lower = {"samples": 1, "count": 1, "threads": 1, "workers": 0, "keep_gb": 0}
-    for name, least in lower.items():
-        value = getattr(args, name)
-        if value is not None and not value >= least:
-            option = name.replace("_", "-")
-            raise InputError(f"--{option}: expected {least} or more, got {value}.")
-    base_file = args.base or Path(__file__).resolve().parents[1] / "configs" / "ablation.yaml"
-    base, mixture = load_training_options(base_file)
-    presets = {Path(n).stem: KeptSamples(load_preset(base_file.parent / n)) for n in HELD_OUT}
-    todo = plan(args.seeds, None if args.rows is None else args.rows.split(","))
-    if args.sintel is not None:
-        from ablation_sintel import open_sintel
-
-        open_sintel(args.sintel)  # a wrong folder is told before hours of training
-    if args.threads is not None:
-        torch.set_num_threads(args.threads)
+    known = sorted(path.stem for path in args.configs.glob("*.yaml") if path.stem != "base")
+    names = known if args.rows is None else args.rows.split(",")
+    unknown = sorted(set(names) - set(known))
+    if unknown:
+        raise InputError(f"--rows: unknown {', '.join(unknown)}; known: {', '.join(known)}.")
+    for name in ("seeds", "samples", "count", "threads"):
+        if getattr(args, name) < 1:
+            raise InputError(f"--{name}: expected 1 or more, got {getattr(args, name)}.")
+    torch.set_num_threads(args.threads)
     cv2.setNumThreads(0)  # samples are small: threads inside OpenCV cost more than they give
-    device = args.device
-    if device == "auto":
-        device = "cuda" if torch.cuda.is_available() else "cpu"
-    kept = KeptSamples(mixture, int(args.keep_gb * 1e9))
-    seed = 0 if args.dev else PUBLISHED_SEED
-    args.out.mkdir(parents=True, exist_ok=True)
-    about = {
-        "command": command,
-        "base": base_file.name,
-        "samples": args.samples,
-        "held_out": {"seed": seed, "count": args.count, "presets": list(presets)},
-        "commit": source_commit(),
-        "torch": torch.__version__,
-        "device": torch.cuda.get_device_name() if device == "cuda" else "cpu",
-        "threads": torch.get_num_threads(),
-        "cores": os.cpu_count(),
-    }
-    runs: list[dict[str, Any]] = []
-    with interruptible() as interruption:
-        for number, (row, row_seed) in enumerate(todo):
-            options = row_options(base, row, row_seed, args.samples)
-            if number and row_seed != todo[number - 1][1]:
-                kept.forget()
-            say = _Report(args.quiet, f"{number + 1}/{len(todo)} {row.name} seed {row_seed}")
-            folder = args.out / f"{row.name}-seed{row_seed}"
-            source = (mixture, kept)
-            run = _one(args, folder, options, source, presets, seed, device, say, interruption)
-            if run is None:
-                print("ablation.py: interrupted; start again to go on.", file=sys.stderr)
-                return 130
-            runs.append({"row": row.name, "seed": row_seed, **run})
-            _write(args, about, runs, None)
-    sintel = None
-    if args.sintel is not None:
-        from ablation_sintel import score_sintel
-
-        sintel = score_sintel(args.sintel, args.out, runs, device, args.quiet)
-    for path in _write(args, about, runs, sintel):
-        print(path)
+    runs: dict[tuple[str, int], dict[str, Any]] = {}
+    for name, seed in plan(names, args.seeds):
+        if not _train(args, name, seed, runs):
+            print("ablation.py: interrupted; start again to go on.", file=sys.stderr)
+            return 130
     return 0
 
 
-class _Report:
-    """A line on stderr for every tenth entry of the log."""
+def _train(
+    args: argparse.Namespace, name: str, seed: int, runs: dict[tuple[str, int], dict[str, Any]]
+) -> bool:
+    """Train and score one row; False if the training was interrupted."""
+    from hybridvo.files import write_json
+    from hybridvo.network.weights import save_weights
+    from hybridvo.training.trainer import Trainer
 
-    def __init__(self, quiet: bool, label: str) -> None:
-        self.quiet, self.label, self.entries = quiet, label, 0
+    task = _task(args, name, seed)
+    options = task.options
+    folder = args.out / f"{name}-seed{seed}"
+    folder.mkdir(parents=True, exist_ok=True)
+    trainer = Trainer(task, folder, args.device, args.workers, _Progress(f"{name} seed {seed}"))
+    trainer.resume()
 
-    def __call__(self, entry: dict[str, Any]) -> None:
-        self.entries += 1
-        if not self.quiet and self.entries % 10 == 1 and "loss" in entry:
-            rate = f"{entry['samples_per_s']:.1f} samples/s"
-            line = f"{self.label}: {entry['samples']} samples, loss {entry['loss']:.3f}, {rate}"
-            print(line, file=sys.stderr)
+    def stop(number: int, frame: object) -> None:
+        trainer.stop_requested = True
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, stop)
+    result = _read(folder / "result.json") or {"row": name, "seed": seed, "curve": {}}
+    result["parameters"] = sum(p.numel() for p in trainer.network.parameters())
+    for samples in sorted({m for m in MILESTONES if m < args.samples} | {args.samples}):
+        if trainer.run(until=-(-samples // options.batch_size)) == "signal":
+            return False
+        if str(samples) not in result["curve"]:
+            last = samples == args.samples
+            scores = _scores(args, trainer.exported, options, last)
+            result["curve"][str(samples)] = {"seconds": round(trainer.elapsed_s), **scores}
+            write_json(folder / "result.json", result)
+            print(f"{name} seed {seed}, {samples}: {_short(scores)}", file=sys.stderr, flush=True)
+        runs[name, seed] = result
+        write_json(args.out / "ablation.json", _summary(args, runs))
+    card = {"row": name, **trainer.record, "curve": result["curve"]}
+    save_weights(folder / "weights.safetensors", trainer.exported, options.network, card, "float16")
+    return True
 
 
-def _one(
-    args: argparse.Namespace,
-    folder: Path,
-    options: Any,
-    source: tuple[Any, Any],
-    presets: dict[str, Any],
-    seed: int,
-    device: str,
-    report: _Report,
-    interruption: Any,
+def _task(args: argparse.Namespace, name: str, seed: int) -> Any:
+    from hybridvo.synthetic.dataset import StoredSamples
+    from hybridvo.training.options import load_pwvo_options
+    from hybridvo.training.pwvo_task import PwvoTask
+    from hybridvo.training.stream import Mixture
+
+    options, mixture = load_pwvo_options(args.configs / f"{name}.yaml")
+    steps = -(-args.samples // options.batch_size)
+    options = dataclasses.replace(options, seed=seed, steps=steps)
+    if args.data is not None:
+        mixture = Mixture((StoredSamples(str(args.data.resolve())),), (1.0,))
+        options = dataclasses.replace(options, data=("folder",), data_weights=(1.0,))
+    return PwvoTask(options, mixture)
+
+
+def _scores(args: argparse.Namespace, network: Any, options: Any, last: bool) -> dict[str, Any]:
+    """Figures on held-out pairs of each preset; at the end by every rule of the selection."""
+    from hybridvo.synthetic.presets import load_preset
+    from hybridvo.training.validation import PUBLISHED_SEED, evaluate_network
+
+    scores: dict[str, Any] = {}
+    for file in HELD_OUT:
+        preset = load_preset(ROWS.parent / file, size=options.data_size)
+
+        def evaluate(rule: str, preset: Any = preset) -> dict[str, Any]:
+            return evaluate_network(network, preset, PUBLISHED_SEED, args.count, selection=rule)
+
+        scores[Path(file).stem] = evaluate(options.selection)
+        if last and options.loss.needs_uncertainty:
+            rules = {rule: evaluate(rule) for rule in RULES}
+            scores[f"rules_{Path(file).stem}"] = {
+                rule: {key: figures[key] for key in ("epe", "r_err_deg", "t_err")}
+                for rule, figures in rules.items()
+            }
+    return scores
+
+
+def _summary(args: argparse.Namespace, runs: Mapping[tuple[str, int], Any]) -> dict[str, Any]:
+    """What stands in ablation.json: every curve, and the paper's claims by paired differences."""
+    presets = [Path(file).stem for file in HELD_OUT]
+    results = [
+        {**run, "curve": {k: _without_pairs(v) for k, v in run["curve"].items()}}
+        for run in runs.values()
+    ]
+    claims = [
+        {"preset": preset, "samples": samples, **claim}
+        for preset in presets
+        for samples in sorted({int(k) for run in runs.values() for k in run["curve"]})
+        for better, worse in CLAIMS
+        if (claim := _claim(runs, better, worse, preset, str(samples))) is not None
+    ]
+    return {
+        "command": ["tools/ablation.py", *sys.argv[1:]],
+        "samples": args.samples,
+        "held_out": {"count": args.count, "presets": presets},
+        "epe": "component mean, px at the size of the samples",
+        "claims": claims,
+        "runs": results,
+    }
+
+
+def _claim(
+    runs: Mapping[tuple[str, int], Any], better: str, worse: str, preset: str, samples: str
 ) -> dict[str, Any] | None:
-    """Train and score one row; None if the training was interrupted."""
-    from hybridvo.files import atomic_write
-    from hybridvo.training.ablation import score_row, train_row
+    """Difference in EPE of two rows over common seeds, and over the pairs; None if not there."""
+    import numpy as np
 
-    results = folder / "result.json"
-    if args.overwrite:
-        for name in ("checkpoint.pt", "options.json", "log.jsonl", "result.json"):
-            (folder / name).unlink(missing_ok=True)
-    mixture, kept = source
-    trainer = train_row(
-        options, mixture, folder, device, args.workers, kept, report, lambda: bool(interruption)
-    )
-    if trainer.step < options.steps:
+    common = [
+        seed
+        for name, seed in runs
+        if name == better
+        and samples in runs[better, seed]["curve"]
+        and samples in runs.get((worse, seed), {"curve": {}})["curve"]
+    ]
+    if not common:
         return None
-    asked = {"seed": seed, "count": args.count}
-    run = _read(results)
-    if run is None or run.get("asked") != asked or run.get("updates") != trainer.step:
-        started = time.perf_counter()
-        scores = score_row(trainer.exported, presets, seed, args.count, options)
-        run = {
-            "asked": asked,
-            "updates": trainer.step,
-            "samples": trainer.samples,
-            "skipped": trainer.skipped,
-            "seconds": trainer.elapsed_s,
-            "samples_per_s": trainer.samples / max(trainer.elapsed_s, 1e-9),
-            "parameters": sum(p.numel() for p in trainer.network.parameters()),
-            "scores": scores,
-        }
-        with atomic_write(results) as file:
-            json.dump(run, file, indent=1)
-        if not report.quiet:
-            epe = ", ".join(f"{name} {score['epe']:.3f}" for name, score in scores.items())
-            seconds = time.perf_counter() - started
-            print(f"{report.label}: EPE {epe} px (scored in {seconds:.0f} s)", file=sys.stderr)
-    return run
+    differences = np.array(
+        [
+            np.subtract(
+                *(runs[row, s]["curve"][samples][preset]["epe_of_pairs"] for row in (better, worse))
+            )
+            for s in common
+        ]
+    )
+    of_seeds = differences.mean(axis=1)
+    over_pairs = differences.mean(axis=0)
+    return {
+        "better": better,
+        "worse": worse,
+        "difference_px": round(float(of_seeds.mean()), 4),
+        "spread_of_seeds_px": round(float(of_seeds.std(ddof=1)), 4) if len(common) > 1 else None,
+        "error_over_pairs_px": round(float(over_pairs.std() / np.sqrt(over_pairs.size)), 4),
+        "as_claimed": f"{int((of_seeds < 0).sum())} of {len(common)}",
+    }
+
+
+def _without_pairs(scores: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        name: {k: v for k, v in value.items() if k != "epe_of_pairs"}
+        if isinstance(value, dict)
+        else value
+        for name, value in scores.items()
+    }
+
+
+def _short(scores: Mapping[str, Any]) -> str:
+    named = {name: value for name, value in scores.items() if "epe" in value}
+    return ", ".join(f"{name} EPE {value['epe']:.3f} px" for name, value in named.items())
 
 
 def _read(path: Path) -> dict[str, Any] | None:
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        return json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
-    return content if isinstance(content, dict) else None
 
 
-def _write(
-    args: argparse.Namespace,
-    about: dict[str, Any],
-    runs: list[dict[str, Any]],
-    sintel: dict[str, Any] | None,
-) -> list[Path]:
-    """The three files, from what there is so far."""
-    from ablation_report import markdown, plot, summary
+class _Progress:
+    """A line on stderr for every twentieth entry of the log."""
 
-    from hybridvo.files import atomic_write
+    def __init__(self, label: str) -> None:
+        self.label, self.entries = label, 0
 
-    result = {**about, **summary(runs, sintel, args.seeds)}
-    paths = [args.out / f"ablation.{kind}" for kind in ("json", "md", "png")]
-    with atomic_write(paths[0]) as file:
-        file.write(json.dumps(result, indent=1, allow_nan=False) + "\n")
-    with atomic_write(paths[1]) as file:
-        file.write(markdown(result))
-    plot(result, paths[2])
-    return paths
+    def __call__(self, entry: dict[str, Any]) -> None:
+        self.entries += 1
+        if self.entries % 20 == 1 and "loss" in entry:
+            rate = f"{entry['samples_per_s']:.1f} samples/s"
+            line = f"{self.label}: {entry['samples']} samples, loss {entry['loss']:.3f}, {rate}"
+            print(line, file=sys.stderr, flush=True)
 
 
 if __name__ == "__main__":

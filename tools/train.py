@@ -1,8 +1,13 @@
-"""Train a network: ``python tools/train.py --config configs/train_pwvo.yaml --out runs/pwvo``.
+"""Train the networks: PWVO and its baselines, and the selector.
 
-Started again with the same ``--out`` it goes on where it was. Several processes or machines:
-``torchrun --nproc-per-node 8 tools/train.py ...``. Writes ``checkpoint.pt``, ``log.jsonl`` and
-``options.json`` into the folder; ``--export FILE`` writes weights that users load.
+    python tools/train.py pwvo --config configs/train_paper.yaml --out runs/paper
+    python tools/train.py export --out runs/paper --export paper.safetensors
+    python tools/train.py selector-data --data runs/selector_data --first-seed 1000000 --seeds 4096
+    python tools/train.py selector --data runs/selector_data --out runs/selector --time-limit 50
+
+Started again with the same ``--out`` a training goes on where it was. Several processes or
+machines: ``torchrun --nproc-per-node 8 tools/train.py pwvo ...``. Seeds of selector-data below 1000
+are held out; ``--propose`` asks PWVO about all samples of a folder.
 """
 
 from __future__ import annotations
@@ -15,63 +20,79 @@ import math
 import os
 import shlex
 import signal
+import subprocess
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
-RECORD = "options.json"
-"""Says what the training in a folder is."""
+ROOT = Path(__file__).resolve().parents[1]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the tool; returns its exit code (2: bad input, 5: output that cannot be written)."""
-    arguments = _parse(argv)
+    args = _parse(argv)
     from hybridvo.errors import HybridVOError, OutputError
 
+    command = "python tools/train.py " + shlex.join(sys.argv[1:] if argv is None else argv)
     try:
         with _processes():
-            return _train(arguments, list(sys.argv[1:] if argv is None else argv))
-    except OutputError as error:
-        sys.stderr.write(f"train: {error}\n")
-        return 5
+            args.run(args, command)
     except HybridVOError as error:
         sys.stderr.write(f"train: {error}\n")
-        return 2
+        return 5 if isinstance(error, OutputError) else 2
+    return 0
 
 
 def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog="train.py", description="Train a network of hybridvo.")
-    add = parser.add_argument
-    add("--config", type=Path, required=True, help="configs/train_*.yaml")
-    add("--out", type=Path, required=True, help="folder of the run; resumed if it has a checkpoint")
-    add("--time-limit", type=float, metavar="MIN", help="minutes of training; ends cleanly")
-    add("--steps", type=int, help="updates, instead of the configuration's")
-    add("--batch-size", type=int, help="samples an update and process, instead of the file's")
-    add("--learning-rate", type=float, help="peak rate, instead of the configuration's")
-    add("--precision", choices=("float32", "bfloat16"), help="instead of the configuration's")
-    add("--seed", type=int, help="instead of the configuration's")
-    add("--threads", type=int, help="threads of torch; by default torch's own choice")
-    add("--workers", type=int, default=0, help="processes that draw samples (0: this one)")
-    add("--device", default="auto", help="auto, cpu or cuda")
-    add("--init", type=Path, metavar="FILE", help="start from these weights: a file, or pwvo")
-    add("--overwrite", action="store_true", help="start anew where --out has a training")
-    add("--export", type=Path, metavar="FILE", help="write weights for users when done (float16)")
-    add("--calibrate", type=int, default=0, metavar="N", help="shift s by N development pairs")
-    add("--export-count", type=int, default=1000, help="held-out pairs of each preset in the card")
-    add("--no-train", action="store_true", help="only --export from the checkpoint in --out")
+    parser = argparse.ArgumentParser(
+        prog="train.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    commands = parser.add_subparsers(required=True)
+    pwvo = commands.add_parser("pwvo", help="train a network of the paper")
+    selector = commands.add_parser("selector", help="train the selector")
+    for part, run in ((pwvo, _pwvo), (selector, _selector)):
+        add = part.add_argument
+        add("--out", type=Path, required=True, help="folder of the run; goes on where it was")
+        add("--time-limit", type=float, default=math.inf, metavar="MIN", help="minutes in all")
+        add("--threads", type=int, help="threads of torch; by default torch's own choice")
+        add("--overwrite", action="store_true", help="start anew where --out has a training")
+        add("--init", metavar="FILE", help="start from these weights: a file, or a shipped name")
+        part.set_defaults(run=run)
+    pwvo.add_argument("--config", type=Path, required=True, help="configs/train_*.yaml")
+    pwvo.add_argument("--workers", type=int, default=0, help="processes that draw samples")
+    pwvo.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda"))
+    for name, kind in (("steps", int), ("batch-size", int), ("seed", int)):
+        pwvo.add_argument(f"--{name}", type=kind, help="instead of the configuration's")
+    config = ROOT / "configs" / "train_selector.yaml"
+    selector.add_argument("--config", type=Path, default=config)
+    selector.add_argument("--data", type=Path, required=True, help="folder of the shards")
+    selector.add_argument("--export", type=Path, metavar="FILE", help="write weights when done")
+    selector.add_argument("--held-out", type=Path, help="shards of held-out samples, for --export")
+    export = commands.add_parser("export", help="write a network's weights for users (float16)")
+    export.add_argument("--out", type=Path, required=True, help="folder of the run")
+    export.add_argument("--export", type=Path, required=True, metavar="FILE", help="*.safetensors")
+    export.add_argument("--count", type=int, default=1000, help="held-out pairs of each preset")
+    export.add_argument("--calibrate", type=int, default=0, metavar="N", help="shift s by N pairs")
+    export.set_defaults(run=_export)
+    data = commands.add_parser("selector-data", help="draw samples for the selector")
+    data.add_argument("--data", type=Path, required=True, help="folder of the shards")
+    data.add_argument("--first-seed", type=int, default=1_000_000, help="below 1000: held out")
+    data.add_argument("--seeds", type=int, default=0, help="about as many samples")
+    data.add_argument("--propose", metavar="NETWORK", help="ask these weights about the samples")
+    data.set_defaults(run=_selector_data)
     return parser.parse_args(argv)
 
 
 @contextlib.contextmanager
 def _processes() -> Iterator[None]:
     """The process group of torchrun, where it started us."""
+    if "RANK" not in os.environ:
+        yield
+        return
     import torch
     import torch.distributed as dist
 
-    if "RANK" not in os.environ or dist.is_initialized():
-        yield
-        return
     if torch.cuda.is_available():
         torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", "0")))
     dist.init_process_group("nccl" if torch.cuda.is_available() else "gloo")
@@ -81,112 +102,80 @@ def _processes() -> Iterator[None]:
         dist.destroy_process_group()
 
 
-def _train(arguments: argparse.Namespace, argv: list[str]) -> int:
+def _pwvo(args: argparse.Namespace, command: str) -> None:
+    import torch
+
+    from hybridvo.training.options import load_pwvo_options
+    from hybridvo.training.pwvo_task import PwvoTask
+
+    options, mixture = load_pwvo_options(args.config)
+    names = ("steps", "batch_size", "seed")
+    changes = {n: getattr(args, n) for n in names if getattr(args, n) is not None}
+    options = dataclasses.replace(options, **changes)
+    device = args.device
+    if device == "auto":
+        device = "cuda" if torch.cuda.is_available() else "cpu"
+    _train(args, command, PwvoTask(options, mixture), device, args.workers)
+
+
+def _selector(args: argparse.Namespace, command: str) -> None:
+    from hybridvo.errors import InputError
+    from hybridvo.training.export import export_selector
+    from hybridvo.training.options import load_selector_options
+    from hybridvo.training.selector_task import SelectorTask
+
+    if args.export is not None and args.held_out is None:
+        raise InputError("--export: needs --held-out, samples for the figures of the card.")
+    task = SelectorTask(load_selector_options(args.config), args.data)
+    trainer = _train(args, command, task, "cpu", 0)
+    if args.export is not None:
+        card = export_selector(trainer, args.held_out, args.export)
+        print(json.dumps(card["held_out"], indent=1))
+
+
+def _train(args: argparse.Namespace, command: str, task: Any, device: str, workers: int) -> Any:
     import cv2
     import torch
 
-    from hybridvo.checks import make_folder
     from hybridvo.errors import InputError
-    from hybridvo.evaluation.report import write_json
-    from hybridvo.run import check_device
-    from hybridvo.training.loop import Trainer
-    from hybridvo.training.options import load_training_options
-    from hybridvo.training.outputs import check_export, check_folder
-    from hybridvo.training.provenance import source_commit
-    from hybridvo.training.stream import check_batch_fits
+    from hybridvo.files import write_json
+    from hybridvo.network.weights import load_weights, pretrained, pretrained_names
+    from hybridvo.training.export import RUN
+    from hybridvo.training.trainer import CHECKPOINT, LOG, Trainer
 
-    for name in ("threads", "time_limit"):
-        value = getattr(arguments, name)
-        if value is not None and not value > 0:
-            raise InputError(f"--{name.replace('_', '-')}: expected a value above 0, got {value}.")
-    if arguments.export_count < 1 or arguments.calibrate < 0:  # else said hours later
-        raise InputError(
-            f"expected --export-count >= 1 and --calibrate >= 0, got {arguments.export_count} and "
-            f"{arguments.calibrate}."
-        )
-    if arguments.workers < 0:
-        raise InputError(f"--workers: expected 0 or more, got {arguments.workers}.")
-    if arguments.device not in ("auto", "cpu", "cuda"):
-        raise InputError(f"--device: expected auto, cpu or cuda, got {arguments.device!r}.")
-    check_device(arguments.device)
-    if arguments.threads is not None:
-        torch.set_num_threads(arguments.threads)
-    # Samples are small: threads inside OpenCV cost more than they give.
-    cv2.setNumThreads(0)
-    options, mixture = load_training_options(arguments.config)
-    changes: dict[str, Any] = {
-        name: getattr(arguments, name)
-        for name in ("steps", "batch_size", "precision", "seed")
-        if getattr(arguments, name) is not None
-    }
-    if arguments.learning_rate is not None:
-        changes["optimizer"] = dataclasses.replace(
-            options.optimizer, learning_rate=arguments.learning_rate
-        )
-    options = dataclasses.replace(options, **changes)
-    check_batch_fits(mixture, options.batch_size)
-    out: Path = arguments.out
-    if not arguments.no_train:
-        check_folder(out, RECORD, ("command", "options"))
-    if arguments.export is not None:
-        check_export(arguments.export, out, RECORD)
-    make_folder(out)
-    device = arguments.device
-    if device == "auto":
-        device = "cuda" if torch.cuda.is_available() else "cpu"
-    trainer = Trainer(options, mixture, out, device, arguments.workers, report=_report)
-    checkpoint = out / "checkpoint.pt"
-    if checkpoint.exists() and (arguments.no_train or not arguments.overwrite):
-        trainer.resume(checkpoint)
-        _say(trainer.rank, f"resumed {checkpoint} at update {trainer.step}")
-    elif arguments.init is not None:
-        trainer.start_from(_weights(arguments.init))
-        _say(trainer.rank, f"started from the weights of {arguments.init}")
-    elif arguments.no_train:
-        raise InputError(f"{checkpoint}: --no-train needs the checkpoint of a run.")
-    command = "python tools/train.py " + shlex.join(argv)
-    if not arguments.no_train:
+    if args.threads is not None:
+        if args.threads < 1:
+            raise InputError(f"--threads: expected 1 or more, got {args.threads}.")
+        torch.set_num_threads(args.threads)
+    cv2.setNumThreads(0)  # samples are small: threads inside OpenCV cost more than they give
+    args.out.mkdir(parents=True, exist_ok=True)
+    if args.overwrite:
+        for name in (CHECKPOINT, LOG, RUN):
+            (args.out / name).unlink(missing_ok=True)
+    trainer = Trainer(task, args.out, device, workers, report=_report)
+    if trainer.resume():
+        _say(trainer, f"goes on at update {trainer.step}")
+    else:
+        if args.init is not None:
+            path = pretrained(args.init) if args.init in pretrained_names() else args.init
+            trainer.start_from(load_weights(path)[0].state_dict(), str(path))
         if trainer.rank == 0:
-            record = {
-                "command": command,
-                "options": dataclasses.asdict(options),
-                "data": [dataclasses.asdict(cast(Any, preset)) for preset in mixture.presets],
-                "commit": source_commit(),
-                "torch": torch.__version__,
-            }
-            write_json(out / RECORD, record)
-        with _clean_stop(trainer):
-            limit = arguments.time_limit
-            why = trainer.run(math.inf if limit is None else 60 * limit)
-        _say(trainer.rank, f"ended by {why} at update {trainer.step}, {trainer.samples} samples")
-    if arguments.export is not None and trainer.rank == 0:
-        _export(trainer, arguments, _record(out, {"command": command, "commit": source_commit()}))
-    return 0
-
-
-def _record(out: Path, default: dict[str, Any]) -> dict[str, Any]:
-    """What the run wrote of itself when it trained: its command and commit, not the export's."""
-    try:
-        return default | json.loads((out / RECORD).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return default
+            about = {"command": command, "commit": _commit(), "torch": torch.__version__}
+            write_json(args.out / RUN, about)
+    with _clean_stop(trainer):
+        why = trainer.run(60 * args.time_limit)
+    _say(trainer, f"ended by {why} at update {trainer.step}, {trainer.samples} samples")
+    return trainer
 
 
 @contextlib.contextmanager
 def _clean_stop(trainer: Any) -> Iterator[None]:
     """The signals that ask to stop end the run after the update at hand, with a checkpoint."""
-    from hybridvo.console import leave_closed_terminals, open_terminals, stop_signals
-
-    terminals = open_terminals()
 
     def request(number: int, frame: object) -> None:
-        leave_closed_terminals(terminals)
         trainer.stop_requested = True
 
-    try:
-        before = {s: signal.signal(s, request) for s in stop_signals()}
-    except ValueError:  # not the main thread: whoever started it must stop it
-        before = {}
+    before = {s: signal.signal(s, request) for s in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield
     finally:
@@ -194,65 +183,35 @@ def _clean_stop(trainer: Any) -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def _export(trainer: Any, arguments: argparse.Namespace, record: dict[str, Any]) -> None:
-    """Weights of the run with a model card that says where they come from and what they can do."""
-    import torch
+def _export(args: argparse.Namespace, command: str) -> None:
+    from hybridvo.training.export import export_pwvo
 
-    from hybridvo.files import atomic_write
-    from hybridvo.network.weights import load_weights, save_weights
-    from hybridvo.training.held_out import PUBLISHED_SEED, calibrate_scales, evaluate_network
-
-    options = trainer.options
-    card: dict[str, Any] = {
-        "preset": dict(zip(options.data, options.data_weights, strict=True)),
-        "size": [trainer.mixture.presets[0].height, trainer.mixture.presets[0].width],
-        "updates": trainer.step,
-        "samples": trainer.samples,
-        "skipped_updates": trainer.skipped,
-        "training_hours": round(trainer.elapsed_s / 3600, 2),
-        "seed": options.seed,
-        "options": dataclasses.asdict(options),
-        "command": record["command"],
-        "commit": record["commit"],
-        "torch": torch.__version__,
-        "translation_scale": (
-            "s of the translation is the log scale of a Laplace error in metres"
-            if options.translation_loss == "laplace"
-            else "s of the translation is the log scale of the paper's direction-and-length error"
-        ),
-    }
-    path: Path = arguments.export
-    save_weights(path, trainer.exported, options.network, card, "float16")
-    if arguments.calibrate:
-        preset = trainer.mixture.presets[_widest(options)]
-        shifts = calibrate_scales(trainer.exported, preset, arguments.calibrate)
-        card["calibration"] = {"pairs": arguments.calibrate, "seed": 0, "added_to_s": shifts}
-        save_weights(path, trainer.exported, options.network, card, "float16")
-    # The figures are those of the stored, rounded weights, as a user gets them.
-    network, _ = load_weights(path)
-    card["held_out"] = {
-        Path(name).stem: evaluate_network(
-            network, preset, PUBLISHED_SEED, arguments.export_count, selection=options.selection
-        )
-        for name, preset in zip(options.data, trainer.mixture.presets, strict=True)
-    }
-    save_weights(path, network, options.network, card, "float16")
-    with atomic_write(path.with_suffix(".json")) as file:
-        file.write(json.dumps(card, indent=1, sort_keys=True) + "\n")
-    sys.stdout.write(json.dumps({"file": str(path), "held_out": card["held_out"]}, indent=2) + "\n")
+    card = export_pwvo(args.out, args.export, args.count, args.calibrate)
+    print(json.dumps({"file": str(args.export), "held_out": card["held_out"]}, indent=1))
 
 
-def _weights(named: Path) -> Path:
-    """The file of weights that --init names: a path, or the name of shipped ones."""
-    from hybridvo.network.weights import pretrained, pretrained_names
+def _selector_data(args: argparse.Namespace, command: str) -> None:
+    from hybridvo.errors import InputError
+    from hybridvo.network.weights import load_weights, pretrained, pretrained_names
+    from hybridvo.training.selector_data import PER_SHARD, write_shard
+    from hybridvo.training.selector_proposals import write_proposals
 
-    return pretrained(str(named)) if str(named) in pretrained_names() else named
+    if args.first_seed < 0 or args.seeds < 0:
+        raise InputError(f"expected --first-seed and --seeds >= 0, got {args.first_seed}.")
+    args.data.mkdir(parents=True, exist_ok=True)
+    for seed in range(args.first_seed, args.first_seed + args.seeds, PER_SHARD):
+        print(f"seeds from {seed}: {write_shard(args.data, seed)} samples", flush=True)
+    if args.propose is not None:
+        known = args.propose in pretrained_names()
+        path = pretrained(args.propose) if known else args.propose
+        print(f"asked about {write_proposals(args.data, load_weights(path)[0])} samples")
 
 
-def _widest(options: Any) -> int:
-    """Index of the preset whose pixels the scales shall be right for."""
-    names = [Path(name).stem for name in options.data]
-    return names.index("data_wide") if "data_wide" in names else 0
+def _commit() -> str | None:
+    """Commit of the working tree, marked if it was changed; None outside of a repository."""
+    ask = ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude", "*"]
+    done = subprocess.run(ask, cwd=ROOT, capture_output=True, text=True, check=False)
+    return done.stdout.strip() or None
 
 
 def _report(entry: dict[str, Any]) -> None:
@@ -260,17 +219,13 @@ def _report(entry: dict[str, Any]) -> None:
     numbers = ((k, v) for k, v in entry.items() if isinstance(v, int | float))
     line = " ".join(f"{key}={value:.5g}" for key, value in numbers)
     for name, result in entry.get("results", {}).items():
-        line += (
-            f"\n  {name}: R_err {result['r_err_deg']:.3f} deg (zero motion "
-            f"{result['zero_r_err_deg']:.3f}), T_err {result['t_err']:.4f} "
-            f"({result['zero_t_err']:.4f}), EPE {result['epe']:.3f} px ({result['zero_epe']:.3f}), "
-            f"AUROC {result['auroc'] or math.nan:.3f}"
-        )
+        figures = " ".join(f"{k}={v:.4g}" for k, v in result.items() if isinstance(v, float))
+        line += f"\n  {name}: {figures}"
     sys.stderr.write(line + "\n")
 
 
-def _say(rank: int, text: str) -> None:
-    if rank == 0:
+def _say(trainer: Any, text: str) -> None:
+    if trainer.rank == 0:
         sys.stderr.write(text + "\n")
 
 

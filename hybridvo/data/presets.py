@@ -1,9 +1,4 @@
-"""YAML presets: a strict reader from plain mappings to frozen option dataclasses.
-
-A preset file names its kind (``preset: paper``) and repeats every option with its unit and reason.
-Nothing is guessed: an unknown key, a missing file or a value of another type is an error that names
-the file, the key and the nearest known name.
-"""
+"""YAML files: a strict reader from plain mappings to frozen option dataclasses."""
 
 from __future__ import annotations
 
@@ -18,18 +13,6 @@ from typing import Any, TypeVar
 from hybridvo.data.image_io import read_text
 from hybridvo.errors import FormatError, InputError
 from hybridvo.files import parse_yaml
-from hybridvo.synthetic.diverse import WideOptions
-from hybridvo.synthetic.paper import PaperOptions
-from hybridvo.training.rendered_pictures import RenderedOptions
-
-__all__ = ["PRESETS", "build_options", "load_preset", "read_yaml"]
-
-PRESETS: dict[str, type[PaperOptions] | type[WideOptions] | type[RenderedOptions]] = {
-    "paper": PaperOptions,
-    "wide": WideOptions,
-    "rendered": RenderedOptions,
-}
-"""Kinds of training data by the name that a preset file gives under ``preset``."""
 
 LARGEST = 1e300
 """No whole number is larger: beyond it there is no float."""
@@ -53,20 +36,6 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
     if not isinstance(mapping, dict):
         raise FormatError(f"{path}: expected a mapping of keys, got {type(mapping).__name__}.")
     return mapping
-
-
-def load_preset(path: str | Path) -> PaperOptions | WideOptions | RenderedOptions:
-    """Options of a data preset file, ``configs/data_paper.yaml`` for one.
-
-    Raises:
-        InputError: no such file, an unknown kind or key, or a value that cannot be meant.
-    """
-    mapping = read_yaml(path)
-    kind = mapping.pop("preset", None)
-    if not isinstance(kind, str) or kind not in PRESETS:
-        known = ", ".join(PRESETS)
-        raise InputError(f"{path}: 'preset' must be one of {known}, got {_shown(kind)}.")
-    return build_options(PRESETS[kind], mapping, str(path))
 
 
 def build_options(cls: type[OptionsT], mapping: Any, where: str) -> OptionsT:

@@ -4,9 +4,6 @@ Rooms, streets and slanted planes with relief instead of one constant plane; sta
 depths; movers that are articulated or bend, one of which may cover most of the picture; motions
 **composed** (T_cam T_object) instead of added; sky; hidden points; cameras of any lens and crop;
 cameras that follow an actor; inputs as a flow estimator and a depth sensor deliver them.
-
-Everything is computed in inverse depth on normalised rays, so that sky is exact (0) and single
-precision suffices.
 """
 
 from __future__ import annotations
@@ -18,11 +15,10 @@ import numpy as np
 
 from hybridvo.errors import InputError
 from hybridvo.geometry import euler_deg_to_matrix, make_transform
-from hybridvo.synthetic.layered import SKY_INVERSE_DEPTH, LayeredScene
-from hybridvo.synthetic.paper import Sample, rigid_flow
+from hybridvo.synthetic.layered import Layers, Sample, normalized_grid, visibility
 from hybridvo.synthetic.sensors import (
-    DegradationOptions,
     Range,
+    SensorOptions,
     degrade_depth,
     degrade_flow,
     log_uniform,
@@ -31,10 +27,13 @@ from hybridvo.synthetic.sensors import (
 )
 from hybridvo.synthetic.silhouettes import Silhouette, outline, random_silhouette
 
+SKY_INVERSE_DEPTH = 1.0 / 2000.0
+"""Surfaces farther than two kilometres are sky."""
+
 
 @dataclass(frozen=True)
-class WideOptions:
-    """Options of the wide preset; ranges of two numbers are drawn log-uniformly unless said.
+class DiverseOptions:
+    """Options of the diverse preset; ranges of two numbers are drawn log-uniformly unless said.
 
     Args:
         height: rows of the sample. width: columns.
@@ -103,26 +102,133 @@ class WideOptions:
     limb_rotation_deg: tuple[float, float, float] = (4.0, 0.7, 25.0)
     moving_threshold_px: float = 0.5
     flow_limit: float = 0.35
-    degradation: DegradationOptions = field(default_factory=DegradationOptions)
+    degradation: SensorOptions = field(default_factory=SensorOptions)
 
     def __post_init__(self) -> None:
         if min(self.height, self.width) < 16:
-            raise InputError("WideOptions: expected height and width of at least 16 pixels.")
+            raise InputError("DiverseOptions: expected height and width of at least 16 pixels.")
         for name, value in vars(self).items():
             if name.endswith("_probability") and not 0 <= value <= 1:
-                raise InputError(f"WideOptions.{name}: expected 0..1, got {value}.")
+                raise InputError(f"DiverseOptions.{name}: expected 0..1, got {value}.")
             if isinstance(value, tuple) and len(value) == 2:
                 least = 0 if name in ("static_layers", "movers") else 1e-9
                 if not least <= value[0] <= value[1]:
-                    raise InputError(f"WideOptions.{name}: expected low <= high, got {value}.")
+                    raise InputError(f"DiverseOptions.{name}: expected low <= high, got {value}.")
         if not self.field_of_view_deg[1] < 175 or not self.large_coverage[1] < 1:
-            raise InputError("WideOptions: expected a field of view < 175 deg and a coverage < 1.")
+            raise InputError(
+                "DiverseOptions: expected a field of view < 175 deg and a coverage < 1."
+            )
         if self.room_probability + self.outdoor_probability > 1:
-            raise InputError("WideOptions: room and outdoor probabilities add up to more than 1.")
+            raise InputError(
+                "DiverseOptions: room and outdoor probabilities add up to more than 1."
+            )
 
     def sample(self, rng: np.random.Generator) -> Sample:
-        """One pair: :func:`wide_sample`."""
-        return wide_sample(rng, self)
+        """One pair: :func:`diverse_sample`."""
+        return diverse_sample(rng, self)
+
+
+class _Scene(Layers):
+    """A room, a street or a slanted surface, and what is laid over it."""
+
+    def __init__(self, rng: np.random.Generator, options: DiverseOptions) -> None:
+        o, self.rng, self.options = options, rng, options
+        half_angle = np.deg2rad(log_uniform(rng, o.field_of_view_deg)) / 2
+        self.fx = float(o.width / 2 / np.tan(half_angle))
+        self.fy = self.fx * log_uniform(rng, o.aspect)
+        shift = o.centre_shift * rng.uniform(-1, 1, 2)
+        self.cx = (o.width - 1) / 2 + shift[0] * o.width
+        self.cy = (o.height - 1) / 2 + shift[1] * o.height
+        K = np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]])
+        self.scale = log_uniform(rng, o.scene_depth)
+        super().__init__(K, self._background(*normalized_grid(K, o.height, o.width)))
+
+    def _background(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """(H, W) inverse depth of walls, ground or one slanted surface; 0 is sky."""
+        o, rng = self.options, self.rng
+        kind = rng.random()
+        yaw, pitch, roll = rng.uniform(-40, 40), rng.normal(0, 10), rng.normal(0, 4)
+        R = euler_deg_to_matrix(np.array([pitch, yaw, roll]))
+        size = self.scale
+        planes: list[tuple[np.ndarray, float]] = []
+        floor = (np.array([0.0, 1.0, 0.0]), size * rng.uniform(0.25, 0.7))
+        if kind < o.room_probability:
+            planes = [
+                floor,
+                (np.array([0.0, -1.0, 0.0]), size * rng.uniform(0.25, 0.9)),
+                (np.array([1.0, 0.0, 0.0]), size * rng.uniform(0.3, 2.0)),
+                (np.array([-1.0, 0.0, 0.0]), size * rng.uniform(0.3, 2.0)),
+                (np.array([0.0, 0.0, 1.0]), size * rng.uniform(0.7, 3.0)),
+            ]
+        elif kind < o.room_probability + o.outdoor_probability:
+            planes = [floor]
+            for side in (1.0, -1.0):
+                if rng.random() < 0.4:
+                    planes.append((np.array([side, 0.0, 0.0]), size * rng.uniform(0.3, 4.0)))
+            if rng.random() < 0.4:
+                planes.append((np.array([0.0, 0.0, 1.0]), size * rng.uniform(1.0, 20.0)))
+        else:
+            tilt = rng.uniform(-0.9, 0.9, 2)
+            normal = np.array([tilt[0], tilt[1], 1.0])
+            planes = [(normal / np.linalg.norm(normal), size * rng.uniform(0.6, 1.5))]
+            R = np.eye(3)
+        rho = np.zeros((o.height, o.width), np.float32)
+        for normal, distance in planes:
+            n = (R.T @ normal / distance).astype(np.float32)
+            np.maximum(rho, n[0] * x + (n[1] * y + n[2]), out=rho)
+        if kind >= o.room_probability + o.outdoor_probability:
+            # A single surface has no sky: it bends away instead.
+            np.maximum(rho, np.float32(0.05 / size), out=rho)
+        relief = o.relief * rng.random() ** 2
+        rho *= np.exp(relief * smooth_field(rng, o.height, o.width, int(rng.integers(3, 12))))
+        rho[rho < SKY_INVERSE_DEPTH] = 0.0
+        return np.minimum(rho, np.float32(5.0))
+
+    def add(
+        self,
+        mask: np.ndarray,
+        in_front: bool,
+        inverse_depth: float | None = None,
+    ) -> tuple[int, np.ndarray] | None:
+        """Lay a curved, slanted piece of surface over the image.
+
+        Args:
+            mask: (H, W) uint8.
+            in_front: nearer than everything under it; else at any depth, possibly hidden.
+            inverse_depth: 1 / metres, or None to draw it.
+
+        Returns:
+            Its number and the point (3,) in metres at its middle, or None if nothing of it is seen.
+        """
+        rng = self.rng
+        left, top, width, height = cv2.boundingRect(mask)
+        if not width * height:
+            return None
+        box = np.s_[top : top + height, left : left + width]
+        inside = mask[box] > 0
+        under = self.rho[box]
+        if inverse_depth is None:
+            most = max(float(np.quantile(under[::2, ::2], 0.9)), 0.1 / self.scale)
+            factor = rng.uniform(0.05, 1.2) if in_front else rng.uniform(-0.9, 1.4)
+            inverse_depth = min(most * float(np.exp(factor)), 5.0)
+        dx = np.linspace(-1, 1, width, dtype=np.float32)
+        dy = np.linspace(-1, 1, height, dtype=np.float32)[:, None]
+        slope = rng.uniform(-0.15, 0.15, 2).astype(np.float32)
+        bulge = np.float32(rng.uniform(0, 0.2))
+        shape = 1 + slope[0] * dx + slope[1] * dy + bulge * (1 - dx**2 - dy**2)
+        rho = np.float32(inverse_depth) * np.maximum(shape, 0.3)
+        if np.count_nonzero(inside & (rho > under)) < 4:
+            return None
+        number = len(self.motions)
+        shown = self.lay(box, inside, rho)
+        rows, columns = np.nonzero(shown)
+        u, v = left + columns.mean(), top + rows.mean()
+        ray = np.array([(u - self.cx) / self.fx, (v - self.cy) / self.fy, 1.0])
+        return number, ray / inverse_depth
+
+    def new_mask(self) -> np.ndarray:
+        """Empty (H, W) uint8 mask."""
+        return np.zeros((self.options.height, self.options.width), np.uint8)
 
 
 def _magnitude(rng: np.random.Generator, law: tuple[float, float, float]) -> float:
@@ -145,7 +251,7 @@ def _about(R: np.ndarray, t: np.ndarray, centre: np.ndarray) -> np.ndarray:
     return make_transform(R, centre - R @ centre + t)
 
 
-def _camera(scene: LayeredScene, follow: bool) -> tuple[np.ndarray, np.ndarray]:
+def _camera(scene: _Scene, follow: bool) -> tuple[np.ndarray, np.ndarray]:
     """Euler angles in degrees and translation in metres of the camera's T_curr_prev."""
     o, rng = scene.options, scene.rng
     angles = _magnitude(rng, o.camera_rotation_deg) * _direction(rng)
@@ -163,7 +269,7 @@ def _camera(scene: LayeredScene, follow: bool) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _add_mover(
-    scene: LayeredScene,
+    scene: _Scene,
     shape: Silhouette,
     mask: np.ndarray,
     radius: float,
@@ -220,7 +326,7 @@ def _add_mover(
             scene.motions[part[0]] = total @ turn
 
 
-def _populate(scene: LayeredScene) -> tuple[np.ndarray, np.ndarray]:
+def _populate(scene: _Scene) -> tuple[np.ndarray, np.ndarray]:
     """Occluders and movers; returns the camera's Euler angles and translation."""
     o, rng = scene.options, scene.rng
     still = rng.random() < o.still_probability
@@ -263,19 +369,19 @@ def _populate(scene: LayeredScene) -> tuple[np.ndarray, np.ndarray]:
     return angles, translation
 
 
-def wide_sample(rng: np.random.Generator, options: WideOptions | None = None) -> Sample:
-    """One pair of the wide preset.
+def diverse_sample(rng: np.random.Generator, options: DiverseOptions = DiverseOptions()) -> Sample:
+    """One pair of the diverse preset.
 
     Args:
         rng: source of randomness; the sample depends on nothing else.
-        options: defaults to the preset ``configs/data_wide.yaml``.
+        options: defaults to the preset ``configs/data_diverse.yaml``.
     """
-    o = options or WideOptions()
+    o = options
     while True:
-        scene = LayeredScene(rng, o)
+        scene = _Scene(rng, o)
         angles, translation = _populate(scene)
         T_cam = make_transform(euler_deg_to_matrix(angles), translation)
-        ego_flow, ego_ratio, flow, ratio = _flows(scene, T_cam)
+        ego_flow, ego_ratio, flow, ratio = scene.flows(T_cam, added=False)
         if _plausible(flow, ratio, o) and _plausible(ego_flow, ego_ratio, o):
             break
     rho = scene.rho
@@ -283,7 +389,7 @@ def wide_sample(rng: np.random.Generator, options: WideOptions | None = None) ->
     depth = depth.astype(np.float32)
     own = np.square(flow - ego_flow)
     moving = own[..., 0] + own[..., 1] > o.moving_threshold_px**2
-    hidden, depth_curr = _visibility(flow, rho / ratio, rho > 0)
+    hidden, depth_curr = visibility(flow, rho / ratio, rho > 0)
 
     measured, depth_prev = flow, depth
     if rng.random() < o.sky_far_probability and not rho.all():
@@ -302,7 +408,7 @@ def wide_sample(rng: np.random.Generator, options: WideOptions | None = None) ->
         depth_curr=depth_curr,
         depth_true=depth,
         depth_target=np.maximum(depth * ego_ratio, 0.0),
-        K=np.array([[scene.fx, 0, scene.cx], [0, scene.fy, scene.cy], [0, 0, 1]], np.float32),
+        K=scene.K.astype(np.float32),
         T_curr_prev=T_cam.astype(np.float32),
         rotation_deg=angles.astype(np.float32),
         translation=translation.astype(np.float32),
@@ -310,22 +416,7 @@ def wide_sample(rng: np.random.Generator, options: WideOptions | None = None) ->
     )
 
 
-def _flows(
-    scene: LayeredScene, T_cam: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Ego flow (H, W, 2) and its depth ratio (H, W), total flow and its depth ratio."""
-    t_cam = T_cam[:3, 3].astype(np.float32)
-    focal = (scene.fx, scene.fy)
-    u, v, ego_ratio = rigid_flow(scene.x, scene.y, scene.rho, T_cam[:3, :3], t_cam, focal)
-    ego_flow = np.stack([u, v], axis=-1)
-    flow, ratio = ego_flow.copy(), ego_ratio.copy()
-    for number, T in enumerate(scene.motions):
-        if T is not None:
-            _move(scene, number, T, flow, ratio, focal)
-    return ego_flow, ego_ratio, flow, ratio
-
-
-def _plausible(flow: np.ndarray, ratio: np.ndarray, o: WideOptions) -> bool:
+def _plausible(flow: np.ndarray, ratio: np.ndarray, o: DiverseOptions) -> bool:
     """Nothing is swept through the image plane, and a flow estimator could follow the motion."""
     if not ratio.min() > 0.15:
         return False
@@ -333,57 +424,3 @@ def _plausible(flow: np.ndarray, ratio: np.ndarray, o: WideOptions) -> bool:
     limit = o.flow_limit * o.width
     large = (np.abs(flow[..., 0]) > limit) | (np.abs(flow[..., 1]) > limit)
     return np.count_nonzero(large) <= 0.01 * large.size
-
-
-def _move(
-    scene: LayeredScene,
-    number: int,
-    T: np.ndarray,
-    flow: np.ndarray,
-    ratio: np.ndarray,
-    focal: tuple[float, float],
-) -> None:
-    """Flow and depth ratio of one mover, written into its pixels."""
-    mask = (scene.owner == number).astype(np.uint8)
-    left, top, width, height = cv2.boundingRect(mask)
-    if not width * height:
-        return
-    box = np.s_[top : top + height, left : left + width]
-    inside = mask[box] > 0
-    t = T[:3, 3].astype(np.float32)
-    bend = scene.bends[number]
-    if bend is not None:
-        t = np.moveaxis(t + bend[box], -1, 0)
-    u, v, change = rigid_flow(scene.x[box[1]], scene.y[box[0]], scene.rho[box], T[:3, :3], t, focal)
-    flow[box][inside] = np.stack([u, v], axis=-1)[inside]
-    ratio[box][inside] = change[inside]
-
-
-def _visibility(
-    flow: np.ndarray, rho_curr: np.ndarray, solid: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Who is hidden in the next frame, and the depth that is seen at x + flow.
-
-    Args:
-        flow: (H, W, 2) px, true.
-        rho_curr: (H, W) inverse depth of each moved point.
-        solid: (H, W) bool, not sky.
-
-    Returns:
-        (H, W) bool, hidden behind something nearer or outside of the picture, and (H, W) float32
-        metres of t+1 on the grid of t; 0 outside and for sky.
-    """
-    height, width = rho_curr.shape
-    u = np.rint(flow[..., 0] + np.arange(width, dtype=np.float32)).astype(np.int32)
-    v = np.rint(flow[..., 1] + np.arange(height, dtype=np.float32)[:, None]).astype(np.int32)
-    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
-    index = np.where(inside, v * width + u, 0)
-    front = np.zeros(height * width, np.float32)
-    np.maximum.at(front, index[inside], rho_curr[inside])
-    seen = front[index]
-    # A tenth: neighbours on a slanted surface share a pixel of the next frame.
-    covered = inside & (seen > np.float32(1.1) * rho_curr)
-    inverse = np.where(covered, seen, rho_curr)
-    known = inside & (solid | covered)
-    depth = np.where(known, 1.0 / np.maximum(inverse, np.float32(1e-5)), 0.0)
-    return covered | ~inside, depth.astype(np.float32)

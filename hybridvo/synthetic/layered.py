@@ -1,134 +1,200 @@
-"""A scene of surfaces laid over each other, in inverse depth on the rays of one camera.
+"""Surfaces laid over each other in inverse depth: what every generator of training pairs builds on.
 
-The background is a room, a street or a slanted surface; every further layer is a curved piece of
-surface that hides what is behind it. Each layer may have a motion of its own.
+Everything is computed in inverse depth on normalised rays, so that sky is exact (0) and single
+precision suffices.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
-from hybridvo.geometry import euler_deg_to_matrix
-from hybridvo.synthetic.sensors import log_uniform, smooth_field
-
-if TYPE_CHECKING:
-    from hybridvo.synthetic.diverse import WideOptions
+MIN_RATIO = np.float32(1e-6)
+"""Added to |z' / z|: the flow of a point in the image plane stays finite."""
 
 
-SKY_INVERSE_DEPTH = 1.0 / 2000.0
-"""Surfaces farther than two kilometres are sky."""
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """One training pair on the pixel grid of t.
+
+    Args:
+        flow: (H, W, 2) float32 px, total flow as the network is given it.
+        ego_flow: (H, W, 2) float32 px, flow of the camera motion alone, without noise.
+        depth_prev: (H, W) float32 metres as the network is given it; 0 is invalid.
+        depth_curr: (H, W) float32 metres of t+1 **on the grid of t** (what lies at x + flow); 0 is
+            invalid.
+        depth_true: (H, W) float32 metres of t without noise or holes; 0 where there is none (sky).
+        depth_target: (H, W) float32 metres, what L^D compares with; 0 where there is none. It
+            includes the object's own motion in the paper's five steps, not in the diverse preset.
+        K: (3, 3) float32 intrinsics of both frames.
+        T_curr_prev: (4, 4) float32, points of the previous camera into the current one.
+        rotation_deg, translation: (3,) float32, the same motion as Euler angles X-Y-Z in degrees
+            (R = Rx Ry Rz) and metres.
+        moving: (H, W) bool, pixels whose true flow differs from the ego flow.
+        rays: (H, W, 2) float32, first two components of K^-1 x of the points that were measured,
+            where they are not the pixels' centres; or None.
+    """
+
+    flow: np.ndarray
+    ego_flow: np.ndarray
+    depth_prev: np.ndarray
+    depth_curr: np.ndarray
+    depth_true: np.ndarray
+    depth_target: np.ndarray
+    K: np.ndarray
+    T_curr_prev: np.ndarray
+    rotation_deg: np.ndarray
+    translation: np.ndarray
+    moving: np.ndarray
+    rays: np.ndarray | None = None
 
 
-class LayeredScene:
-    """Inverse depth, owner and motion of every pixel while layers are laid over each other."""
+class Layers:
+    """Inverse depth, owner and motion of every pixel while surfaces are laid over each other.
 
-    def __init__(self, rng: np.random.Generator, options: WideOptions) -> None:
-        o, self.rng, self.options = options, rng, options
-        half_angle = np.deg2rad(log_uniform(rng, o.field_of_view_deg)) / 2
-        self.fx = float(o.width / 2 / np.tan(half_angle))
-        self.fy = self.fx * log_uniform(rng, o.aspect)
-        shift = o.centre_shift * rng.uniform(-1, 1, 2)
-        self.cx = (o.width - 1) / 2 + shift[0] * o.width
-        self.cy = (o.height - 1) / 2 + shift[1] * o.height
-        self.x = ((np.arange(o.width) - self.cx) / self.fx).astype(np.float32)
-        self.y = ((np.arange(o.height) - self.cy) / self.fy).astype(np.float32)[:, None]
-        self.scale = log_uniform(rng, o.scene_depth)
-        self.rho = self._background()
-        self.owner = np.full((o.height, o.width), -1, np.int16)
+    Args:
+        K: (3, 3) intrinsics of the sample.
+        rho: (H, W) float32 inverse depth of the background, 0 for sky; is changed in place.
+    """
+
+    def __init__(self, K: np.ndarray, rho: np.ndarray) -> None:
+        height, width = rho.shape
+        self.K, self.rho = K, rho
+        self.x, self.y = normalized_grid(K, height, width)
+        self.owner = np.full((height, width), -1, np.int16)
         self.motions: list[np.ndarray | None] = []
         self.bends: list[np.ndarray | None] = []
 
-    def _background(self) -> np.ndarray:
-        """(H, W) inverse depth of walls, ground or one slanted surface; 0 is sky."""
-        o, rng = self.options, self.rng
-        kind = rng.random()
-        yaw, pitch, roll = rng.uniform(-40, 40), rng.normal(0, 10), rng.normal(0, 4)
-        R = euler_deg_to_matrix(np.array([pitch, yaw, roll]))
-        size = self.scale
-        planes: list[tuple[np.ndarray, float]] = []
-        floor = (np.array([0.0, 1.0, 0.0]), size * rng.uniform(0.25, 0.7))
-        if kind < o.room_probability:
-            planes = [
-                floor,
-                (np.array([0.0, -1.0, 0.0]), size * rng.uniform(0.25, 0.9)),
-                (np.array([1.0, 0.0, 0.0]), size * rng.uniform(0.3, 2.0)),
-                (np.array([-1.0, 0.0, 0.0]), size * rng.uniform(0.3, 2.0)),
-                (np.array([0.0, 0.0, 1.0]), size * rng.uniform(0.7, 3.0)),
-            ]
-        elif kind < o.room_probability + o.outdoor_probability:
-            planes = [floor]
-            for side in (1.0, -1.0):
-                if rng.random() < 0.4:
-                    planes.append((np.array([side, 0.0, 0.0]), size * rng.uniform(0.3, 4.0)))
-            if rng.random() < 0.4:
-                planes.append((np.array([0.0, 0.0, 1.0]), size * rng.uniform(1.0, 20.0)))
-        else:
-            tilt = rng.uniform(-0.9, 0.9, 2)
-            normal = np.array([tilt[0], tilt[1], 1.0])
-            planes = [(normal / np.linalg.norm(normal), size * rng.uniform(0.6, 1.5))]
-            R = np.eye(3)
-        rho = np.zeros((o.height, o.width), np.float32)
-        for normal, distance in planes:
-            n = (R.T @ normal / distance).astype(np.float32)
-            np.maximum(rho, n[0] * self.x + (n[1] * self.y + n[2]), out=rho)
-        if kind >= o.room_probability + o.outdoor_probability:
-            # A single surface has no sky: it bends away instead.
-            np.maximum(rho, np.float32(0.05 / size), out=rho)
-        relief = o.relief * rng.random() ** 2
-        rho *= np.exp(relief * smooth_field(rng, o.height, o.width, int(rng.integers(3, 12))))
-        rho[rho < SKY_INVERSE_DEPTH] = 0.0
-        return np.minimum(rho, np.float32(5.0))
-
-    def add(
-        self,
-        mask: np.ndarray,
-        in_front: bool,
-        inverse_depth: float | None = None,
-    ) -> tuple[int, np.ndarray] | None:
-        """Lay a curved, slanted piece of surface over the picture.
+    def lay(
+        self, box: tuple[slice, slice], inside: np.ndarray, rho: np.ndarray | float
+    ) -> np.ndarray:
+        """Add a surface that does not move yet; its number is that of the layers before it.
 
         Args:
-            mask: (H, W) uint8.
-            in_front: nearer than everything under it; else at any depth, possibly hidden.
-            inverse_depth: 1 / metres, or None to draw it.
+            box: rows and columns of the image that it may touch.
+            inside: (h, w) bool, its outline in the box.
+            rho: inverse depth there.
 
         Returns:
-            Its number and the point (3,) in metres at its middle, or None if nothing of it is seen.
+            (h, w) bool, where it is in front of what was there.
         """
-        rng = self.rng
-        left, top, width, height = cv2.boundingRect(mask)
-        if not width * height:
-            return None
-        box = np.s_[top : top + height, left : left + width]
-        inside = mask[box] > 0
-        under = self.rho[box]
-        if inverse_depth is None:
-            most = max(float(np.quantile(under[::2, ::2], 0.9)), 0.1 / self.scale)
-            factor = rng.uniform(0.05, 1.2) if in_front else rng.uniform(-0.9, 1.4)
-            inverse_depth = min(most * float(np.exp(factor)), 5.0)
-        dx = np.linspace(-1, 1, width, dtype=np.float32)
-        dy = np.linspace(-1, 1, height, dtype=np.float32)[:, None]
-        slope = rng.uniform(-0.15, 0.15, 2).astype(np.float32)
-        bulge = np.float32(rng.uniform(0, 0.2))
-        shape = 1 + slope[0] * dx + slope[1] * dy + bulge * (1 - dx**2 - dy**2)
-        rho = np.float32(inverse_depth) * np.maximum(shape, 0.3)
-        shown = inside & (rho > under)
-        count = int(shown.sum())
-        if count < 4:
-            return None
-        number = len(self.motions)
-        under[shown] = rho[shown]
-        self.owner[box][shown] = number
+        shown = inside & (rho > self.rho[box])
+        self.owner[box][shown] = len(self.motions)
+        self.rho[box][shown] = rho[shown] if isinstance(rho, np.ndarray) else rho
         self.motions.append(None)
         self.bends.append(None)
-        rows, columns = np.nonzero(shown)
-        u, v = left + columns.mean(), top + rows.mean()
-        ray = np.array([(u - self.cx) / self.fx, (v - self.cy) / self.fy, 1.0])
-        return number, ray / inverse_depth
+        return shown
 
-    def new_mask(self) -> np.ndarray:
-        """Empty (H, W) uint8 mask."""
-        return np.zeros((self.options.height, self.options.width), np.uint8)
+    def flows(
+        self, T_curr_prev: np.ndarray, added: bool
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Flow of the camera alone, and with the motions of the layers.
+
+        Args:
+            T_curr_prev: (4, 4) motion of the camera.
+            added: layers' motions are their own, and their flow is added to the camera's (as the
+                paper does); else they contain the camera's and replace it.
+
+        Returns:
+            (H, W, 2) ego flow and (H, W) its ratio of new depth to old, total flow and its ratio.
+        """
+        focal = (float(self.K[0, 0]), float(self.K[1, 1]))
+        T = T_curr_prev
+        t = T[:3, 3].astype(np.float32)
+        u, v, ego_ratio = rigid_flow(self.x, self.y, self.rho, T[:3, :3], t, focal)
+        ego_flow = np.stack([u, v], axis=-1)
+        flow, ratio = ego_flow.copy(), ego_ratio.copy()
+        for number, motion in enumerate(self.motions):
+            mask = (self.owner == number).astype(np.uint8)
+            left, top, width, height = cv2.boundingRect(mask)
+            if motion is None or not width * height:
+                continue
+            box = np.s_[top : top + height, left : left + width]
+            inside = mask[box] > 0
+            t = motion[:3, 3].astype(np.float32)
+            bend = self.bends[number]
+            if bend is not None:
+                t = np.moveaxis(t + bend[box], -1, 0)
+            u, v, change = rigid_flow(
+                self.x[box[1]], self.y[box[0]], self.rho[box], motion[:3, :3], t, focal
+            )
+            own = np.stack([u, v], axis=-1)
+            if added:
+                flow[box][inside] += own[inside]
+                ratio[box][inside] += change[inside] - 1.0
+            else:
+                flow[box][inside] = own[inside]
+                ratio[box][inside] = change[inside]
+        return ego_flow, ego_ratio, flow, ratio
+
+
+def normalized_grid(K: np.ndarray, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
+    """(W,) and (H, 1) float32: first two components of K^-1 x of the pixels."""
+    x = ((np.arange(width) - K[0, 2]) / K[0, 0]).astype(np.float32)
+    y = ((np.arange(height) - K[1, 2]) / K[1, 1]).astype(np.float32)
+    return x, y[:, None]
+
+
+def rigid_flow(
+    x: np.ndarray,
+    y: np.ndarray,
+    inverse_depth: np.ndarray | float,
+    R: np.ndarray,
+    t: tuple[np.ndarray | float, np.ndarray | float, np.ndarray | float] | np.ndarray,
+    focal: tuple[float, float],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Flow of a rigid motion from normalised coordinates and inverse depth (paper, equation 8).
+
+    Written as differences, so that single precision suffices, and in inverse depth, so that a
+    point at infinity (0) is exact.
+
+    Args:
+        x: (W,) normalised horizontal coordinates of the pixels (or any shape that broadcasts).
+        y: (H, 1) normalised vertical coordinates.
+        inverse_depth: (H, W) 1/metres, or one number for a constant depth.
+        R: (3, 3) rotation of the points.
+        t: their translation in metres: three numbers or (H, W) arrays.
+        focal: fx, fy in pixels.
+
+    Returns:
+        u and v flow in pixels and the ratio of the new depth to the old, each (H, W).
+    """
+    R = np.asarray(R, dtype=np.float32)
+    ratio = (R[2, 0] * x + (R[2, 1] * y + R[2, 2])) + t[2] * inverse_depth
+    # The published code takes |z'|: a point behind the camera keeps a bounded flow.
+    scale = 1.0 / (np.abs(ratio) + MIN_RATIO)
+    u = (((R[0, 0] * x + (R[0, 1] * y + R[0, 2])) + t[0] * inverse_depth) * scale - x) * focal[0]
+    v = (((R[1, 0] * x + (R[1, 1] * y + R[1, 2])) + t[1] * inverse_depth) * scale - y) * focal[1]
+    return u, v, ratio
+
+
+def visibility(
+    flow: np.ndarray, rho_curr: np.ndarray, solid: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Who is hidden in the next frame, and the depth that is seen at x + flow.
+
+    Args:
+        flow: (H, W, 2) px, true.
+        rho_curr: (H, W) inverse depth of each moved point.
+        solid: (H, W) bool, not sky.
+
+    Returns:
+        (H, W) bool, hidden behind something nearer or outside of the picture, and (H, W) float32
+        metres of t+1 on the grid of t; 0 outside and for sky.
+    """
+    height, width = rho_curr.shape
+    u = np.rint(flow[..., 0] + np.arange(width, dtype=np.float32)).astype(np.int32)
+    v = np.rint(flow[..., 1] + np.arange(height, dtype=np.float32)[:, None]).astype(np.int32)
+    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    index = np.where(inside, v * width + u, 0)
+    front = np.zeros(height * width, np.float32)
+    np.maximum.at(front, index[inside], rho_curr[inside])
+    seen = front[index]
+    # A tenth: neighbours on a slanted surface share a pixel of the next frame.
+    covered = inside & (seen > np.float32(1.1) * rho_curr)
+    inverse = np.where(covered, seen, rho_curr)
+    known = inside & (solid | covered)
+    depth = np.where(known, 1.0 / np.maximum(inverse, np.float32(1e-5)), 0.0)
+    return covered | ~inside, depth.astype(np.float32)

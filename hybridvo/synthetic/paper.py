@@ -17,6 +17,7 @@ import numpy as np
 
 from hybridvo.errors import InputError
 from hybridvo.geometry import euler_deg_to_matrix, make_transform
+from hybridvo.synthetic.layered import Layers, Sample
 from hybridvo.synthetic.silhouettes import silhouette_mask
 
 MAX_REJECTIONS = 10_000
@@ -191,91 +192,19 @@ class PaperOptions:
         return paper_sample(rng, self)
 
 
-@dataclass(frozen=True, eq=False)
-class Sample:
-    """One training pair on the pixel grid of t.
-
-    Args:
-        flow: (H, W, 2) float32 px, total flow as the network is given it.
-        ego_flow: (H, W, 2) float32 px, flow of the camera motion alone, without noise.
-        depth_prev: (H, W) float32 metres as the network is given it; 0 is invalid.
-        depth_curr: (H, W) float32 metres of t+1 **on the grid of t** (what lies at x + flow); 0 is
-            invalid.
-        depth_true: (H, W) float32 metres of t without noise or holes; 0 where there is none (sky).
-        depth_target: (H, W) float32 metres, what L^D compares with; 0 where there is none. It
-            includes the object's own motion in the paper's five steps, not in ``wide``.
-        K: (3, 3) float32 intrinsics of both frames.
-        T_curr_prev: (4, 4) float32, points of the previous camera into the current one.
-        rotation_deg, translation: (3,) float32, the same motion as Euler angles X-Y-Z in degrees
-            (R = Rx Ry Rz) and metres.
-        moving: (H, W) bool, pixels whose true flow differs from the ego flow.
-        rays: (H, W, 2) float32, first two components of K^-1 x of the points that were measured,
-            where they are not the pixels' centres; or None.
-    """
-
-    flow: np.ndarray
-    ego_flow: np.ndarray
-    depth_prev: np.ndarray
-    depth_curr: np.ndarray
-    depth_true: np.ndarray
-    depth_target: np.ndarray
-    K: np.ndarray
-    T_curr_prev: np.ndarray
-    rotation_deg: np.ndarray
-    translation: np.ndarray
-    moving: np.ndarray
-    rays: np.ndarray | None = None
-
-
-def rigid_flow(
-    x: np.ndarray,
-    y: np.ndarray,
-    inverse_depth: np.ndarray | float,
-    R: np.ndarray,
-    t: tuple[np.ndarray | float, np.ndarray | float, np.ndarray | float] | np.ndarray,
-    focal: tuple[float, float],
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Flow of a rigid motion from normalised coordinates and inverse depth (paper, equation 8).
-
-    Written as differences, so that single precision suffices, and in inverse depth, so that a
-    point at infinity (0) is exact.
-
-    Args:
-        x: (W,) normalised horizontal coordinates of the pixels (or any shape that broadcasts).
-        y: (H, 1) normalised vertical coordinates.
-        inverse_depth: (H, W) 1/metres, or one number for a constant depth.
-        R: (3, 3) rotation of the points.
-        t: their translation in metres: three numbers or (H, W) arrays.
-        focal: fx, fy in pixels.
-
-    Returns:
-        u and v flow in pixels and the ratio of the new depth to the old, each (H, W).
-    """
-    R = np.asarray(R, dtype=np.float32)
-    ratio = (R[2, 0] * x + (R[2, 1] * y + R[2, 2])) + t[2] * inverse_depth
-    # The published code takes |z'|: a point behind the camera keeps a bounded flow.
-    scale = 1.0 / (np.abs(ratio) + np.float32(1e-6))
-    u = (((R[0, 0] * x + (R[0, 1] * y + R[0, 2])) + t[0] * inverse_depth) * scale - x) * focal[0]
-    v = (((R[1, 0] * x + (R[1, 1] * y + R[1, 2])) + t[1] * inverse_depth) * scale - y) * focal[1]
-    return u, v, ratio
-
-
-def paper_sample(rng: np.random.Generator, options: PaperOptions | None = None) -> Sample:
+def paper_sample(rng: np.random.Generator, options: PaperOptions = PaperOptions()) -> Sample:
     """One pair by the paper's five steps.
 
     Args:
         rng: source of randomness; the sample depends on nothing else.
         options: defaults to the published configuration.
     """
-    o = options or PaperOptions()
-    height, width = o.height, o.width
+    o = options
     # Step 1. The published code resizes corner to corner, hence fx != fy at 128x256.
     f = o.focal_low + o.focal.draw(rng) * (o.focal_high - o.focal_low)
-    fx = f * (width - 1) / (o.full_width - 1)
-    fy = f * (height - 1) / (o.full_height - 1)
-    cx, cy = (width - 1) / 2, (height - 1) / 2
-    x = ((np.arange(width) - cx) / fx).astype(np.float32)
-    y = ((np.arange(height) - cy) / fy).astype(np.float32)[:, None]
+    fx = f * (o.width - 1) / (o.full_width - 1)
+    fy = f * (o.height - 1) / (o.full_height - 1)
+    K = np.array([[fx, 0, (o.width - 1) / 2], [0, fy, (o.height - 1) / 2], [0, 0, 1]])
 
     # Step 2.
     if rng.random() < o.background_far_probability:
@@ -288,58 +217,36 @@ def paper_sample(rng: np.random.Generator, options: PaperOptions | None = None) 
         near + o.object_depth.draw(rng) * (background - near) if background > near else background
         for _ in range(o.objects)
     ]
-    owner = np.full((height, width), -1, np.int8)
-    depth = np.full((height, width), background, np.float32)
-    for index, object_depth in enumerate(depths):
-        view, mask = _place(rng, o)
-        front = mask & (depth[view] > object_depth)
-        owner[view][front] = index
-        depth[view][front] = object_depth
+    layers = Layers(K, np.full((o.height, o.width), 1.0 / background, np.float32))
+    for depth in depths:
+        box, mask = _place(rng, o)
+        layers.lay(box, mask, np.float32(1.0 / depth))
 
     # Step 3.
     angles, t = o.motion.draw(rng, min(depths, default=background))
     T = make_transform(euler_deg_to_matrix(angles), t)
+    for number, depth in enumerate(depths):
+        if rng.random() < o.move_probability:
+            own_angles, own_t = o.motion.draw(rng, depth)
+            layers.motions[number] = make_transform(euler_deg_to_matrix(own_angles), own_t)
 
     # Steps 4 and 5.
-    u, v, ratio = rigid_flow(x, y, 1.0 / depth, T[:3, :3], t.astype(np.float32), (fx, fy))
-    ego_flow = np.stack([u, v], axis=-1)
-    flow = ego_flow.copy()
-    dz = depth * (ratio - 1.0)
-    moving = np.zeros((height, width), bool)
-    for index, object_depth in enumerate(depths):
-        if rng.random() >= o.move_probability:
-            continue
-        object_angles, object_t = o.motion.draw(rng, object_depth)
-        mask = owner == index
-        rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-        if not len(rows):
-            continue
-        box = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-        u, v, ratio = rigid_flow(
-            x[box[1]],
-            y[box[0]],
-            1.0 / object_depth,
-            euler_deg_to_matrix(object_angles),
-            object_t.astype(np.float32),
-            (fx, fy),
-        )
-        inside = mask[box]
-        flow[box] += np.stack([u * inside, v * inside], axis=-1)
-        dz[box] += np.float32(object_depth) * (ratio - 1.0) * inside
-        moving |= mask
-    depth_curr = np.maximum(depth + dz, 0.0)
+    ego_flow, _, flow, ratio = layers.flows(T, added=True)
+    moving = [number for number, motion in enumerate(layers.motions) if motion is not None]
+    depth_prev = 1.0 / layers.rho
+    depth_curr = np.maximum(depth_prev * ratio, 0.0)
     return Sample(
         flow=flow,
         ego_flow=ego_flow,
-        depth_prev=depth,
+        depth_prev=depth_prev,
         depth_curr=depth_curr,
-        depth_true=depth,
+        depth_true=depth_prev,
         depth_target=depth_curr,
-        K=np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float32),
+        K=K.astype(np.float32),
         T_curr_prev=T.astype(np.float32),
         rotation_deg=angles.astype(np.float32),
         translation=t.astype(np.float32),
-        moving=moving,
+        moving=np.isin(layers.owner, moving),
     )
 
 

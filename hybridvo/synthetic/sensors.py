@@ -19,7 +19,7 @@ Range = tuple[float, float]
 
 
 @dataclass(frozen=True)
-class DegradationOptions:
+class SensorOptions:
     """How strongly inputs are damaged; a range is drawn log-uniformly once per sample.
 
     Args:
@@ -69,10 +69,10 @@ class DegradationOptions:
             if isinstance(value, tuple):
                 if not 0 < value[0] <= value[1]:
                     raise InputError(
-                        f"DegradationOptions.{name}: expected 0 < low <= high, got {value}."
+                        f"SensorOptions.{name}: expected 0 < low <= high, got {value}."
                     )
             elif not 0 <= value <= 1:
-                raise InputError(f"DegradationOptions.{name}: expected 0..1, got {value}.")
+                raise InputError(f"SensorOptions.{name}: expected 0..1, got {value}.")
 
 
 def log_uniform(rng: np.random.Generator, limits: Range) -> float:
@@ -102,7 +102,7 @@ def _look_up(
 
 
 def degrade_flow(
-    rng: np.random.Generator, flow: np.ndarray, hidden: np.ndarray, options: DegradationOptions
+    rng: np.random.Generator, flow: np.ndarray, hidden: np.ndarray, options: SensorOptions
 ) -> np.ndarray:
     """Flow as DIS would have measured it.
 
@@ -159,7 +159,7 @@ def sample_at(depth: np.ndarray, offset: np.ndarray) -> np.ndarray:
 
 
 def degrade_depth(
-    rng: np.random.Generator, depths: list[np.ndarray], options: DegradationOptions
+    rng: np.random.Generator, depths: list[np.ndarray], options: SensorOptions
 ) -> list[np.ndarray]:
     """Depths of one sensor: the same strengths for both frames, noise of their own.
 

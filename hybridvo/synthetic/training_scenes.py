@@ -1,4 +1,4 @@
-"""Rendered two-frame worlds in which the judge learns what moves; many kinds, not the benchmark's.
+"""Rendered two-frame worlds for the selector's training; many kinds, not the benchmark's.
 
 Streets, halls, hills, walls and tables with static things at all depths, some of them close enough
 to fill the picture; vehicles, walkers, chains, hinged panels, swarms, breathing and twisting
@@ -390,7 +390,7 @@ def _movers(
     return solids
 
 
-def judge_scene(seed: int, height: int, width: int) -> Scene:
+def training_scene(seed: int, height: int, width: int) -> Scene:
     """Scene of two frames.
 
     Args:

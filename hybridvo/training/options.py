@@ -1,27 +1,41 @@
-"""Options of a training run: the frozen dataclasses behind ``configs/train_*.yaml``."""
+"""Options of a training: the frozen dataclasses behind ``configs/train_*.yaml``."""
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any, cast
 
-from hybridvo.data.presets import build_options, load_preset, read_yaml
 from hybridvo.errors import InputError
+from hybridvo.network.judge import JudgeOptions
 from hybridvo.network.losses import LossOptions
-from hybridvo.network.pwvo import NetworkOptions
+from hybridvo.network.options import NetworkOptions
+from hybridvo.network.selection import SELECTION_METHODS as SELECTIONS
+from hybridvo.synthetic.dataset import StoredSamples
+from hybridvo.synthetic.presets import (
+    PRESETS,
+    Preset,
+    build_options,
+    load_preset,
+    read_yaml,
+)
+from hybridvo.training.rendered import RenderedOptions
 from hybridvo.training.stream import Mixture
 
-__all__ = ["OptimizerOptions", "ScheduleOptions", "TrainingOptions", "load_training_options"]
+KINDS = PRESETS | {"rendered": RenderedOptions, "folder": StoredSamples}
+"""Data that a training can name."""
 
 
 @dataclass(frozen=True)
 class OptimizerOptions:
-    """Adam; the defaults are the published ones.
+    """AdamW; the defaults are the published Adam.
 
     Args:
         learning_rate: at its peak.
-        betas: of Adam.
+        betas: moments' decay.
+        weight_decay: decoupled; 0 is Adam.
         clip_norm: largest global norm of the gradient.
         head_rate: factor on the rate of the motion heads' last layer. Its output is scaled by
             0.01; at the common rate a short run spends itself on growing that layer's weights. 100
@@ -33,11 +47,12 @@ class OptimizerOptions:
 
     learning_rate: float = 1e-4
     betas: tuple[float, float] = (0.5, 0.999)
+    weight_decay: float = 0.0
     clip_norm: float = 1.0
     head_rate: float = 1.0
 
     def __post_init__(self) -> None:
-        if not (self.learning_rate > 0 and self.clip_norm > 0 and self.head_rate > 0):
+        if not min(self.learning_rate, self.clip_norm, self.head_rate) > 0:
             raise InputError(
                 "OptimizerOptions: expected learning_rate, clip_norm and head_rate above 0."
             )
@@ -54,7 +69,7 @@ class ScheduleOptions:
         warmup: share of the run over which the rate grows from 0.
         halvings: shares of the run at which ``halving`` halves.
         final_share: share of the peak at which ``cosine`` ends.
-        by: ``steps`` = p counts updates (bit-equal however often the run is cut), ``time`` = p is
+        by: ``steps`` = p counts updates (the same however often the run is cut), ``time`` = p is
             the larger of that and the share of the time limit that is spent.
 
     Raises:
@@ -68,12 +83,8 @@ class ScheduleOptions:
     by: str = "steps"
 
     def __post_init__(self) -> None:
-        if self.kind not in ("halving", "cosine", "constant"):
-            raise InputError(
-                f"ScheduleOptions.kind: expected halving, cosine or constant, got {self.kind!r}."
-            )
-        if self.by not in ("steps", "time"):
-            raise InputError(f"ScheduleOptions.by: expected steps or time, got {self.by!r}.")
+        _one_of("ScheduleOptions.kind", self.kind, ("halving", "cosine", "constant"))
+        _one_of("ScheduleOptions.by", self.by, ("steps", "time"))
         if not all(0 <= p <= 1 for p in (self.warmup, self.final_share, *self.halvings)):
             raise InputError("ScheduleOptions: expected shares of the run in [0, 1].")
 
@@ -92,25 +103,10 @@ class ScheduleOptions:
 
 
 @dataclass(frozen=True)
-class TrainingOptions:
-    """A whole run; the defaults are the paper's.
+class RunOptions:
+    """What every training has; the defaults are the paper's.
 
     Args:
-        network: kind and shapes.
-        loss: terms and switches.
-        translation_loss: ``direction`` (the paper's: direction and length) or ``laplace``
-            (L1 of each component in metres with its own s: exp(s) is then in metres).
-        moving_weight: weight of a term that the paper does not have: s of the rotation should be
-            larger on moving pixels than on static ones. 0 = none, as in the paper, whose s need
-            not tell the two apart once every pixel knows the answer of its neighbours.
-        fit_weight: weight of the error of the motion that the trusted pixels agree on, with the
-            gradient through the fit into s (:func:`hybridvo.learned.fitted_motion`); 0 = none, as
-            in the paper.
-        selection: method of ``hybridvo.network.selection.select`` that L^F and L^D look through.
-        loss_stride: L^F and L^D, without uncertainty, look at every n-th pixel of every n-th row,
-            in pixels of that smaller picture. 1 as published.
-        data: preset files, beside the file that names them.
-        data_weights: share of each.
         seed: of the weights and the samples.
         steps: updates.
         batch_size: samples an update and process.
@@ -127,15 +123,6 @@ class TrainingOptions:
         InputError: values that cannot be meant.
     """
 
-    network: NetworkOptions = field(default_factory=NetworkOptions)
-    loss: LossOptions = field(default_factory=LossOptions)
-    translation_loss: str = "direction"
-    moving_weight: float = 0.0
-    fit_weight: float = 0.0
-    selection: str = "softmax"
-    loss_stride: int = 1
-    data: tuple[str, ...] = ("data_paper.yaml",)
-    data_weights: tuple[float, ...] = (1.0,)
     seed: int = 0
     steps: int = 100_000
     batch_size: int = 100
@@ -150,45 +137,141 @@ class TrainingOptions:
     evaluate_count: int = 200
 
     def __post_init__(self) -> None:
-        if self.precision not in ("float32", "bfloat16"):
+        _one_of(f"{type(self).__name__}.precision", self.precision, ("float32", "bfloat16"))
+        for name in ("steps", "batch_size", "log_every", "evaluate_count"):
+            if getattr(self, name) < 1:
+                raise InputError(f"{type(self).__name__}.{name}: expected at least 1.")
+        if not 0 <= self.ema_decay < 1 or self.checkpoint_minutes <= 0 or self.evaluate_every < 0:
             raise InputError(
-                f"TrainingOptions.precision: expected float32 or bfloat16, got {self.precision!r}."
+                f"{type(self).__name__}: expected 0 <= ema_decay < 1, checkpoint_minutes > 0 and "
+                f"evaluate_every >= 0."
             )
-        if self.translation_loss not in ("direction", "laplace"):
+
+
+@dataclass(frozen=True)
+class PwvoOptions(RunOptions):
+    """A training of PWVO or of a baseline; the defaults are the paper's.
+
+    Args:
+        network: kind and shapes.
+        loss: terms and switches.
+        moving_weight: weight of a term that the paper does not have: s of the rotation should be
+            larger on moving pixels than on static ones. 0 = none, as in the paper.
+        fit_weight: weight of the error of the motion that the trusted pixels agree on, with the
+            gradient through the fit into s; 0 = none, as in the paper.
+        selection: rule by which L^F and L^D see one motion of the pixels, and by which the network
+            is used.
+        loss_stride: L^F and L^D, without uncertainty, look at every n-th pixel of every n-th row,
+            in pixels of that smaller image. 1 as published.
+        data: preset files, beside the file that names them.
+        data_weights: share of each.
+        data_size: (height, width) of the drawn samples instead of the presets' own, or None.
+
+    Raises:
+        InputError: values that cannot be meant.
+    """
+
+    network: NetworkOptions = field(default_factory=NetworkOptions)
+    loss: LossOptions = field(default_factory=LossOptions)
+    moving_weight: float = 0.0
+    fit_weight: float = 0.0
+    selection: str = "softmax"
+    loss_stride: int = 1
+    data: tuple[str, ...] = ("data_paper.yaml",)
+    data_weights: tuple[float, ...] = (1.0,)
+    data_size: tuple[int, int] | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _one_of("PwvoOptions.selection", self.selection, SELECTIONS)
+        weighs_pixels = self.loss.flow_uncertainty or self.loss.depth_uncertainty
+        if self.loss_stride < 1 or (self.loss_stride > 1 and weighs_pixels):
             raise InputError(
-                f"TrainingOptions.translation_loss: expected direction or laplace, got "
-                f"{self.translation_loss!r}."
-            )
-        if self.loss_stride > 1 and (self.loss.flow_uncertainty or self.loss.depth_uncertainty):
-            raise InputError(
-                "TrainingOptions.loss_stride: above 1 needs loss.flow_uncertainty and "
+                "PwvoOptions.loss_stride: expected 1, or more with loss.flow_uncertainty and "
                 "loss.depth_uncertainty off; weighed by s, every pixel counts."
             )
-        for name in ("steps", "batch_size", "log_every", "evaluate_count", "loss_stride"):
-            if getattr(self, name) < 1:
-                raise InputError(f"TrainingOptions.{name}: expected at least 1.")
-        if not 0 <= self.ema_decay < 1:
-            raise InputError("TrainingOptions.ema_decay: expected 0 <= decay < 1.")
-        if self.checkpoint_minutes <= 0 or self.evaluate_every < 0:
-            raise InputError(
-                "TrainingOptions: expected checkpoint_minutes > 0 and evaluate_every >= 0."
-            )
-        for name in ("moving_weight", "fit_weight"):
-            if not getattr(self, name) >= 0:
-                raise InputError(f"TrainingOptions.{name}: expected a number >= 0.")
+        if not (self.moving_weight >= 0 and self.fit_weight >= 0):
+            raise InputError("PwvoOptions: expected moving_weight and fit_weight >= 0.")
         if self.fit_weight and not (self.network.kind == "pwvo" and self.network.uncertainty):
-            raise InputError("TrainingOptions.fit_weight: needs a pwvo network with uncertainty.")
-        if len(self.data) != len(self.data_weights):
-            raise InputError("TrainingOptions: expected one of data_weights for each of data.")
+            raise InputError("PwvoOptions.fit_weight: needs a pwvo network with uncertainty.")
+        if not self.data or len(self.data) != len(self.data_weights):
+            raise InputError("PwvoOptions: expected one of data_weights for each of data.")
 
 
-def load_training_options(path: str | Path) -> tuple[TrainingOptions, Mixture]:
-    """Options of a ``configs/train_*.yaml`` and the mixture of the presets that it names.
+@dataclass(frozen=True)
+class SelectorOptions(RunOptions):
+    """A training of the selector.
+
+    Args:
+        network: shapes.
+        second_look_from: share of the run after which fits inside the masks take part.
+        refits: candidates of a sample that are fitted inside their masks.
+        mask_weight: of the loss of the masks beside that of the choice.
+        trust_weight: of the loss of the probability that the choice is right.
+        asked_share: share of the samples in which the pixel-wise network's static world is shown
+            and its motion takes part, as where the selector alone is in doubt.
+        files: shards from which the samples of a round are mixed.
+
+    Raises:
+        InputError: values that cannot be meant.
+    """
+
+    network: JudgeOptions = field(default_factory=JudgeOptions)
+    second_look_from: float = 0.1
+    refits: int = 2
+    mask_weight: float = 1.0
+    trust_weight: float = 0.5
+    asked_share: float = 0.5
+    files: int = 48
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if min(self.refits, self.files) < 1:
+            raise InputError("SelectorOptions: expected refits and files of at least 1.")
+
+
+def _one_of(name: str, value: str, known: tuple[str, ...]) -> None:
+    if value not in known:
+        raise InputError(f"{name}: expected {' or '.join(known)}, got {value!r}.")
+
+
+def load_pwvo_options(path: str | Path) -> tuple[PwvoOptions, Mixture]:
+    """Options of a ``configs/train_*.yaml`` and the mixture of the data that it names.
 
     Raises:
         InputError: a missing file, an unknown key, or a value that cannot be meant.
     """
     path = Path(path)
-    options = build_options(TrainingOptions, read_yaml(path), str(path))
-    presets = tuple(load_preset(path.parent / name) for name in options.data)
-    return options, Mixture(presets, options.data_weights)
+    options = build_options(PwvoOptions, read_yaml(path), str(path))
+    return options, load_mixture(options, path.parent)
+
+
+def load_mixture(options: PwvoOptions, folder: Path) -> Mixture:
+    """Data of a training, whose files are named from ``folder``; see :func:`load_pwvo_options`."""
+    presets = [load_preset(folder / name, KINDS, options.data_size) for name in options.data]
+    return Mixture(tuple(presets), options.data_weights)
+
+
+def described(preset: Preset) -> dict[str, Any]:
+    """Kind and options of a preset as plain values; :func:`recorded_run` reads them back."""
+    kind = next(name for name, cls in KINDS.items() if type(preset) is cls)
+    return {"preset": kind} | dataclasses.asdict(cast(Any, preset))
+
+
+def recorded_run(record: dict[str, Any], where: str) -> tuple[PwvoOptions, Mixture]:
+    """Options and data of a run from the record in its checkpoint.
+
+    Raises:
+        InputError: not the record of such a run; named by ``where``.
+    """
+    options = build_options(PwvoOptions, record["options"], where)
+    presets = []
+    for mapping in record["data"]:
+        values = {key: value for key, value in mapping.items() if key != "preset"}
+        presets.append(build_options(KINDS[mapping["preset"]], values, where))
+    return options, Mixture(tuple(presets), options.data_weights)
+
+
+def load_selector_options(path: str | Path) -> SelectorOptions:
+    """Options of a ``configs/train_selector.yaml``; raises as :func:`load_pwvo_options`."""
+    return build_options(SelectorOptions, read_yaml(path), str(path))

@@ -32,7 +32,7 @@ def camera(**changed: object) -> hvo.Camera:
 BAD_SIZES = (0, -1, 2.5, np.nan, np.inf, None, True, 10**400, [4])
 BAD_FOCALS = (0, -5.0, np.nan, np.inf, 1e-300, 1e300, None, "wide")
 BAD_STAMPS = (np.nan, -np.inf, None, "now", 10**400)
-BAD_INDICES = ("a", 1.5, None, np.nan)
+BAD_INDICES = ("a", 1.5, np.nan)
 BAD_IMAGES = (
     np.zeros((24, 32, 2), np.uint8),
     np.zeros((3, 24, 32), np.uint8),

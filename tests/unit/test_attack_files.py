@@ -8,7 +8,6 @@ from __future__ import annotations
 import io
 import json
 import os
-import runpy
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -23,13 +22,11 @@ from hybridvo.configuration import load_options
 from hybridvo.console import Progress, printable
 from hybridvo.data.sequence import open_sequence
 from hybridvo.diagnosis import diagnose, diagnosis_text
-from hybridvo.errors import FormatError, InputError
+from hybridvo.errors import InputError
 from hybridvo.evaluation.plots import plot_trajectories
 from hybridvo.evaluation.report import to_json, write_csv, write_json
-from hybridvo.network.weights import pretrained
 from hybridvo.recording import check_recording
 from hybridvo.run_folder import PARTIAL, STATE, RunFolder
-from hybridvo.training.judge_batches import read_batches
 from hybridvo.trajectory import Trajectory
 from tests.sequences import image, png, write_folder
 
@@ -343,67 +340,6 @@ def test_a_scene_of_a_billion_frames_is_refused_before_it_fills_the_memory(
 ) -> None:
     assert main(["demo", "--out", str(tmp_path / "demo"), "--frames", "1000000000"]) == 2
     assert "frames: expected at most 100000" in capsys.readouterr().err
-
-
-# training
-
-
-@pytest.mark.parametrize(
-    ("words", "code", "said"),
-    [
-        (("make", "--first-seed", "-5", "--seeds", "1"), 2, "expected --first-seed >= 0"),
-        (("make", "--first-seed", "5", "--seeds", "0"), 2, "--seeds >= 1, got 5 and 0"),
-        (("make", "--first-seed", "5", "--seeds", "1"), 5, "cannot be created"),
-    ],
-)
-def test_train_judge_answers_in_words(
-    tmp_path: Path,
-    words: tuple[str, ...],
-    code: int,
-    said: str,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    (tmp_path / "file").write_text("mine")
-    tool = runpy.run_path(str(ROOT / "tools" / "train_judge.py"))
-    assert tool["main"]([*words, "--data", str(tmp_path / "file")]) == code
-    assert said in capsys.readouterr().err
-    assert (tmp_path / "file").read_text() == "mine"
-
-
-@pytest.mark.parametrize("content", ["noise", "empty", "other", "objects"])
-def test_a_file_that_is_no_shard_of_pictures_is_refused(tmp_path: Path, content: str) -> None:
-    path = tmp_path / "0_8x8.npz"
-    if content == "noise":
-        path.write_bytes(np.random.default_rng(0).bytes(3000))
-    elif content == "objects":
-        np.savez(path, count=np.array([{}], object))
-    else:
-        np.savez(path, **({} if content == "empty" else {"x": np.zeros(3)}))
-    with pytest.raises(FormatError, match="not a shard of pictures"):
-        next(read_batches([path], 4, None))
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (("--device", "gpu"), "--device: expected auto, cpu or cuda, got 'gpu'"),
-        (("--export-count", "0"), "expected --export-count >= 1"),
-    ],
-)
-def test_train_checks_its_options_before_it_starts(
-    tmp_path: Path, words: tuple[str, ...], said: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    tool = runpy.run_path(str(ROOT / "tools" / "train.py"))
-    config = str(ROOT / "configs" / "train_pwvo.yaml")
-    assert tool["main"](["--config", config, "--out", str(tmp_path / "out"), *words]) == 2
-    assert said in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
-
-
-def test_init_takes_the_name_of_shipped_weights(tmp_path: Path) -> None:
-    named = runpy.run_path(str(ROOT / "tools" / "train.py"))["_weights"]
-    assert named(Path("pwvo")) == pretrained("pwvo")
-    assert named(tmp_path / "mine.safetensors") == tmp_path / "mine.safetensors"
 
 
 # doctor

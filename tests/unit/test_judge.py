@@ -12,9 +12,7 @@ import pytest
 import torch
 from hybridvo.learned_judge import LearnedJudge, judge_inputs
 from hybridvo.refinement.options import RefinementOptions
-from safetensors.torch import save_file
 
-from hybridvo.data.presets import build_options, read_yaml
 from hybridvo.errors import CheckpointError, InputError
 from hybridvo.geometry import ego_flow, se3_exp
 from hybridvo.hypotheses import selector as second_look
@@ -26,9 +24,6 @@ from hybridvo.network.weights import load_weights, pretrained, save_weights
 from hybridvo.pipeline import estimate, refine
 from hybridvo.synthetic.render import SyntheticSequence, make_scene
 from hybridvo.synthetic.scenarios import Scenario, make_pair
-from hybridvo.training import judge_data
-from hybridvo.training.judge_batches import PictureBatch, ego_flow_error, read_batches
-from hybridvo.training.judge_loop import JudgeTrainer, JudgeTrainingOptions
 from hybridvo.types import FramePair, Reason, State
 
 CELL = Scenario(moving=0.6, objects=1, flow_noise_px=0.3, depth_noise=0.01)
@@ -254,59 +249,6 @@ def test_same_bytes_from_several_threads(network: JudgeNetwork) -> None:
     assert set(got) == {expected}
 
 
-def test_pictures_are_the_pairs_they_came_from() -> None:
-    first, again = judge_data.draw_pictures(3), judge_data.draw_pictures(3)
-    assert len(first) == len(again)
-    for one, two in zip(first, again, strict=True):
-        for key in one:
-            np.testing.assert_array_equal(one[key], two[key])
-
-
-def batches(folder: Path) -> list[PictureBatch]:
-    return list(read_batches(sorted(folder.glob("*.npz")), 4, None))
-
-
-def test_the_truth_of_a_picture_explains_its_static_pixels(shards: Path) -> None:
-    for batch in batches(shards):
-        owner = torch.arange(len(batch.T))
-        assert ego_flow_error(batch.T, owner, batch).max() < 1e-3
-        # where the flow is true, static pixels follow the true motion
-        for b in np.flatnonzero(batch.source == 1):
-            inputs = batch.inputs
-            x, y = inputs.ray[b]
-            z = batch.depth_true[b]
-            P, K = batch.T[b], inputs.K[b]
-            X, Y, Z = (z * (P[i, 0] * x + P[i, 1] * y + P[i, 2]) + P[i, 3] for i in range(3))
-            u = K[0] * X / Z + K[2] - inputs.target[b, 0]
-            v = K[1] * Y / Z + K[3] - inputs.target[b, 1]
-            distance = torch.sqrt(u * u + v * v) * 1024 / inputs.image_width[b]
-            usable = inputs.usable[b] & (z > 0)
-            static = usable & (batch.label[b] == judge_data.STATIC)
-            moving = usable & (batch.label[b] == judge_data.MOVING)
-            if moving.sum() > 50 and static.sum() > 50:
-                assert distance[static].median() < distance[moving].median()
-
-
-def test_training_learns_and_goes_on(shards: Path, tmp_path: Path) -> None:
-    options = JudgeTrainingOptions(JudgeOptions(width=0.5), batch_size=4, second_look_from=0.0)
-    trainer = JudgeTrainer(options, shards, tmp_path)
-    batch = max(batches(shards), key=lambda b: len(b.T))
-    losses = [trainer.update(batch, 0.5) for _ in range(40)]
-    assert {"choice", "mask", "second", "trust"} <= set(losses[0])
-    # the same pictures again and again: the masks are learned
-    assert losses[-1]["mask"] < 0.9 * losses[0]["mask"]
-    trainer.save()
-    other = JudgeTrainer(options, shards, tmp_path)
-    assert other.resume()
-    expected, got = trainer.update(batch, 0.5), other.update(batch, 0.5)
-    assert expected == got
-    with pytest.raises(InputError):
-        JudgeTrainer(options, tmp_path / "nothing", tmp_path).run(1.0)
-    for bad in ({"batch_size": 0}, {"ema_decay": 1.0}, {"learning_rate": 0.0}):
-        with pytest.raises(InputError):
-            JudgeTrainingOptions(**bad)
-
-
 def test_the_shipped_judge_chooses_better_than_the_cues() -> None:
     # one object on 60 % of the picture, development seeds in which the cues fail twice
     found: dict[str, list[float]] = {"refine": [], "hybrid-flow": []}
@@ -325,13 +267,6 @@ def test_the_card_beside_the_weights_is_theirs() -> None:
     assert json.loads(path.with_suffix(".json").read_text()) == card
     assert {"command", "commit", "pictures", "held_out", "options"} <= set(card)
     assert sum(p.numel() for p in network.parameters()) < 1_000_000
-
-
-def test_the_shipped_configuration_loads_and_is_the_shipped_network() -> None:
-    path = Path(__file__).parents[2] / "configs" / "train_judge.yaml"
-    options = build_options(JudgeTrainingOptions, read_yaml(path), str(path))
-    network, _ = load_weights(pretrained("judge"))
-    assert options.network == network.options
 
 
 def test_slow_movers_under_noise_are_not_clear() -> None:
@@ -420,31 +355,3 @@ def test_all_candidates_are_seen_anew_with_a_static_world(network: JudgeNetwork)
     after = judge.look_again(seen, motions, np.arange(count // 2))
     np.testing.assert_allclose(after.score[:count], seen.score)
     np.testing.assert_allclose(after.score[count:], seen.score[count // 2 :], atol=1e-4)
-
-
-def test_a_judge_that_was_shown_less_can_be_taught_more(
-    network: JudgeNetwork, shards: Path, tmp_path: Path
-) -> None:
-    wide = {"shared.weight": 9, "scalars.weight": 6, "summary.weight": -2}
-    state = {
-        k: (v[:, : wide[k]] if k in wide else v).contiguous()
-        for k, v in network.state_dict().items()
-    }
-    save_file(state, tmp_path / "old.safetensors")
-    trainer = JudgeTrainer(JudgeTrainingOptions(), shards, tmp_path)
-    trainer.start_from(tmp_path / "old.safetensors")
-    inputs = inputs_of(1)
-    shown = replace(inputs, has_static=torch.tensor([True]), static=torch.ones_like(inputs.static))
-    with torch.no_grad():
-        # what it was never shown counts nothing yet, and what it was counts as before
-        got, other = trainer.network.eval()(inputs), trainer.network(shown)
-        expected = network(inputs)
-    torch.testing.assert_close(got.score, other.score)
-    torch.testing.assert_close(got.score, expected.score, atol=1e-4, rtol=1e-4)
-    state["score.weight"] = state["score.weight"][:, :-1].contiguous()
-    state.pop("score.bias")
-    save_file(state, tmp_path / "other.safetensors")
-    with pytest.raises(CheckpointError, match="not the weights of a judge"):
-        trainer.start_from(tmp_path / "other.safetensors")
-    with pytest.raises(CheckpointError, match="not a file of weights"):
-        trainer.start_from(tmp_path / "nothing.safetensors")

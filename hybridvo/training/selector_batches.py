@@ -1,4 +1,4 @@
-"""Pictures of shards as batches of the judge, and fits inside the masks that it draws."""
+"""Samples of shards as batches of the selector, and fits inside the masks that it draws."""
 
 from __future__ import annotations
 
@@ -20,21 +20,19 @@ from hybridvo.network.judge import JudgeInputs, JudgeOutput, expected_informatio
 from hybridvo.options import RefineOptions
 from hybridvo.refinement import kernels
 from hybridvo.synthetic.sensors import log_uniform
-from hybridvo.training.judge_proposals import read_proposals
-
-__all__ = ["PictureBatch", "ego_flow_error", "read_batches", "refits_of"]
+from hybridvo.training.selector_proposals import read_proposals
 
 
 @dataclass(frozen=True, eq=False)
-class PictureBatch:
-    """B pictures of one grid shape, their motions as N candidates, and the truth.
+class SelectorBatch:
+    """B samples of one grid shape, their motions as N candidates, and ground truth.
 
     Args:
-        inputs: what the judge sees.
+        inputs: what the selector sees.
         samples: (B, 8, n) float32 pixel buffers of the solver.
-        depth_true: (B, h, w) metres, 0 where unknown. label: (B, h, w) of ``judge_data``.
+        depth_true: (B, h, w) metres, 0 where unknown. label: (B, h, w) of ``rendered``.
         T: (B, 3, 4) true T_curr_prev.
-        source: (B,) 0 wide, 1 rendered with true (or noisy) flow, 2 rendered with DIS flow.
+        source: (B,) 0 layered, 1 rendered with true (or noisy) flow, 2 rendered with DIS flow.
         static: (B, h, w) probability to be static world that a pixel-wise network states.
         proposal: (B, 3, 4) its motion. proposed: (B,) bool, whether it was asked.
     """
@@ -49,13 +47,20 @@ class PictureBatch:
     proposal: np.ndarray
     proposed: torch.Tensor
 
-    def shown(self, asked: torch.Tensor) -> PictureBatch:
+    def __len__(self) -> int:
+        return len(self.T)
+
+    def to(self, device: torch.device) -> SelectorBatch:
+        """The same: the solver that fits inside masks runs on the CPU."""
+        return self
+
+    def shown(self, asked: torch.Tensor) -> SelectorBatch:
         """The same with the static world of the other network shown for ``asked`` (B,) bool."""
         asked = asked & self.proposed
         logit = torch.logit(self.static, eps=1e-4)
         return replace(self, inputs=replace(self.inputs, static=logit, has_static=asked))
 
-    def expecting(self, rng: np.random.Generator) -> PictureBatch:
+    def expecting(self, rng: np.random.Generator) -> SelectorBatch:
         """The same with motions expected by histories of all kinds: none, good, wrong, too sure."""
         count = len(self.T)
         truth = self.T.numpy().astype(np.float64)
@@ -82,8 +87,8 @@ class PictureBatch:
         return replace(self, inputs=inputs)
 
 
-def _collate(p: dict[str, np.ndarray]) -> PictureBatch:
-    """Stacked arrays of pictures -> batch."""
+def _collate(p: dict[str, np.ndarray]) -> SelectorBatch:
+    """Stacked arrays of samples -> batch."""
     size, _, h, w = p["exact"].shape
     coarse = p["coarse"].astype(np.float32)
     samples = np.empty((size, kernels.BUFFER_ROWS, h * w), np.float32)
@@ -121,7 +126,7 @@ def _collate(p: dict[str, np.ndarray]) -> PictureBatch:
         flow_noise=tensor(facts[:, search.FLOW_NOISE]),
         depth_noise=tensor(facts[:, search.DEPTH_NOISE]),
     )
-    return PictureBatch(
+    return SelectorBatch(
         inputs,
         samples,
         tensor(p["depth_true"]),
@@ -144,36 +149,36 @@ def _read_shard(path: Path) -> dict[str, np.ndarray]:
         with np.load(path) as file:
             arrays = dict(file)
     except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
-        raise FormatError(f"{path}: not a shard of pictures ({error}).") from None
+        raise FormatError(f"{path}: not a shard of samples ({error}).") from None
     for name in ("count", "label"):
         if name not in arrays:
-            raise FormatError(f"{path}: not a shard of pictures (no array '{name}').")
+            raise FormatError(f"{path}: not a shard of samples (no array '{name}').")
     return arrays | read_proposals(path, arrays["label"].shape)
 
 
 def read_batches(
     files: list[Path], batch_size: int, rng: np.random.Generator | None
-) -> Iterator[PictureBatch]:
-    """Batches of the pictures of some shards, mixed if ``rng`` is given."""
+) -> Iterator[SelectorBatch]:
+    """Batches of the samples of some shards, mixed if ``rng`` is given."""
     by_shape: dict[str, list[Path]] = {}
     for file in files:
         by_shape.setdefault(file.stem.split("_")[-1], []).append(file)
     jobs = []
-    pictures: dict[str, dict[str, np.ndarray]] = {}
+    samples: dict[str, dict[str, np.ndarray]] = {}
     for shape, members in by_shape.items():
         loaded = [_read_shard(member) for member in members]
-        pictures[shape] = {key: np.concatenate([x[key] for x in loaded]) for key in loaded[0]}
-        order = np.arange(len(pictures[shape]["count"]))
+        samples[shape] = {key: np.concatenate([x[key] for x in loaded]) for key in loaded[0]}
+        order = np.arange(len(samples[shape]["count"]))
         if rng is not None:
             rng.shuffle(order)
         jobs += [(shape, order[k : k + batch_size]) for k in range(0, len(order), batch_size)]
     if rng is not None:
         rng.shuffle(jobs)
     for shape, index in jobs:
-        yield _collate({key: value[index] for key, value in pictures[shape].items()})
+        yield _collate({key: value[index] for key, value in samples[shape].items()})
 
 
-def ego_flow_error(pose: torch.Tensor, owner: torch.Tensor, batch: PictureBatch) -> torch.Tensor:
+def ego_flow_error(pose: torch.Tensor, owner: torch.Tensor, batch: SelectorBatch) -> torch.Tensor:
     """(N,) mean distance of the ego flows of pose and truth, px at a width of 1024."""
     pick = (slice(None), slice(None, None, 2), slice(None, None, 2))
     z = batch.depth_true[pick]
@@ -199,17 +204,17 @@ def ego_flow_error(pose: torch.Tensor, owner: torch.Tensor, batch: PictureBatch)
 
 
 def refits_of(
-    batch: PictureBatch, out: JudgeOutput, count: int, extra: torch.Generator | None = None
+    batch: SelectorBatch, out: JudgeOutput, count: int, extra: torch.Generator | None = None
 ) -> JudgeInputs | None:
-    """The best motions of every picture, fitted inside their masks, as candidates of their own.
+    """The best motions of every sample, fitted inside their masks, as candidates of their own.
 
     Args:
-        batch: pictures.
+        batch: samples.
         out: answers about their motions.
-        count: fits of a picture.
+        count: fits of a sample.
         extra: draws one of them anew at times (training), so that more than the best is seen.
 
-    Where the judge is shown another network's static world, that network's motion takes part.
+    Where the selector is shown another network's static world, that network's motion takes part.
     """
     inputs = batch.inputs
     cutoff = RefineOptions().cutoff

@@ -1,7 +1,7 @@
-"""Training pictures of the judge: the motions that the real search finds, and which are right.
+"""Training samples of the selector: the motions that the real search finds, and which are right.
 
-A picture is the coarse grid of a pair, the motions that the search found on it (its failures
-included), and the truth: the motion, the depth and who moves. Pictures come from the ``wide``
+A sample is the coarse grid of a pair, the motions that the search found on it (its failures
+included), and ground truth: the motion, the depth and who moves. Samples come from the ``wide``
 preset with its degraded flow and depth, and from rendered scenes with true, noisy and DIS flow.
 Shards are written atomically, so that a training can read them while others are being made.
 """
@@ -20,19 +20,17 @@ from hybridvo.geometry import invert, se3_exp
 from hybridvo.hypotheses.generate import HypothesisSet, generate
 from hybridvo.options import Options
 from hybridvo.refinement import kernels
-from hybridvo.synthetic.diverse import WideOptions, wide_sample
-from hybridvo.synthetic.sensors import DegradationOptions, degrade_depth, log_uniform
-from hybridvo.synthetic.training_scenes import judge_scene
-from hybridvo.training.rendered_pictures import MOVING, STATIC, UNKNOWN
+from hybridvo.synthetic.diverse import DiverseOptions, diverse_sample
+from hybridvo.synthetic.sensors import SensorOptions, degrade_depth, log_uniform
+from hybridvo.synthetic.training_scenes import training_scene
+from hybridvo.training.rendered import MOVING, STATIC, UNKNOWN
 from hybridvo.types import Camera, Frame, FramePair, RelativePose
 
-__all__ = ["PER_SHARD", "draw_pictures", "write_shard"]
-
 PER_SHARD = 64
-MOST = 5
-"""Motions of a picture."""
+MAX_MOTIONS = 5
+"""Motions of a sample."""
 SIZES = ((160, 320), (160, 320), (128, 256), (192, 256), (120, 400), (218, 512))
-"""(height, width) of the pictures."""
+"""(height, width) of the samples."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,18 +43,18 @@ class _Truth:
     known: np.ndarray
 
 
-def draw_pictures(seed: int) -> list[dict[str, Any]]:
-    """Pictures of one seed: one of the wide preset, or two of a rendered pair.
+def draw_samples(seed: int) -> list[dict[str, Any]]:
+    """Samples of one seed: one of the diverse preset, or two of a rendered pair.
 
-    Pairs that the search settles alone are left out: the judge is never asked about them.
+    Pairs that the search settles alone are left out: the selector is never asked about them.
     """
     rng = np.random.default_rng([0x6A64, seed])
     height, width = SIZES[int(rng.integers(len(SIZES)))]
     if rng.random() < 0.5:
-        pairs = [_wide_pair(rng, min(height, 160), min(width, 320))]
+        pairs = [_diverse_pair(rng, min(height, 160), min(width, 320))]
     else:
         pairs = _rendered_pairs(rng, seed, height, width)
-    pictures = []
+    samples = []
     for pair, truth, log_depth_curr, source in pairs:
         T_last = _last_motion(rng, truth.T_curr_prev)
         starts = [np.eye(4)]
@@ -68,8 +66,8 @@ def draw_pictures(seed: int) -> list[dict[str, Any]]:
             continue
         if (found.grid.box[0], found.grid.box[1], found.grid.box[3]) != full:
             continue
-        pictures.append(_record(pair, found, truth, T_last, log_depth_curr, source))
-    return pictures
+        samples.append(_record(pair, found, truth, T_last, log_depth_curr, source))
+    return samples
 
 
 def _last_motion(rng: np.random.Generator, T: np.ndarray) -> np.ndarray | None:
@@ -97,8 +95,8 @@ def _noisy(rng: np.random.Generator, flow: np.ndarray) -> np.ndarray:
     return flow
 
 
-def _wide_pair(rng: np.random.Generator, height: int, width: int) -> tuple[Any, ...]:
-    sample = wide_sample(rng, WideOptions(height=height, width=width))
+def _diverse_pair(rng: np.random.Generator, height: int, width: int) -> tuple[Any, ...]:
+    sample = diverse_sample(rng, DiverseOptions(height=height, width=width))
     K = sample.K.astype(float)
     camera = Camera(K[0, 0], K[1, 1], K[0, 2], K[1, 2], height, width)
     flow = np.ascontiguousarray(sample.flow)
@@ -116,13 +114,13 @@ def _wide_pair(rng: np.random.Generator, height: int, width: int) -> tuple[Any, 
         sample.moving,
         sample.depth_true > 0,
     )
-    return pair, truth, log_depth.astype(np.float32), "wide"
+    return pair, truth, log_depth.astype(np.float32), "diverse"
 
 
 def _rendered_pairs(
     rng: np.random.Generator, seed: int, height: int, width: int
 ) -> list[tuple[Any, ...]]:
-    scene = judge_scene(seed, height, width)
+    scene = training_scene(seed, height, width)
     frames = [scene.render(k) for k in (0, 1)]
     flow, _, _ = scene.flow(0)
     camera = scene.camera(0)
@@ -132,7 +130,7 @@ def _rendered_pairs(
     moving = _moving(flow, T, camera, depth[0], frames[0].object_id > 0)
     truth = _Truth(T, depth[0], moving, known)
     if rng.random() < 0.5:
-        depth = degrade_depth(rng, depth, DegradationOptions())
+        depth = degrade_depth(rng, depth, SensorOptions())
     second = rng.random() > 0.1
     if rng.random() < 0.3:
         flow = _noisy(rng, flow)
@@ -168,8 +166,8 @@ def _record(
     log_depth_curr: np.ndarray | None,
     source: str,
 ) -> dict[str, Any]:
-    """Everything about a picture, as small arrays."""
-    h, w, stride = found.grid.shape
+    """Everything about a sample, as small arrays."""
+    h, w, stride = found.shape
     pick = np.s_[stride // 2 :: stride, stride // 2 :: stride]
     log_depth = found.maps().log_depth_curr
     if log_depth_curr is not None:
@@ -178,8 +176,8 @@ def _record(
     label = np.where(truth.known, label, UNKNOWN)[pick]
     n = found.grid.count
     rows = found.grid.samples[:, :n]
-    poses = np.zeros((MOST, 3, 4))
-    facts = np.zeros((MOST, found.facts.shape[1]))
+    poses = np.zeros((MAX_MOTIONS, 3, 4))
+    facts = np.zeros((MAX_MOTIONS, found.facts.shape[1]))
     poses[: len(found.poses)], facts[: len(found.poses)] = found.poses, found.facts
     exact = [kernels.XN, kernels.YN, kernels.Z, kernels.MU, kernels.MV]
     return {
@@ -197,23 +195,23 @@ def _record(
         "K": found.grid.pixels.K,
         "width": pair.prev.camera.width,
         "stride": stride,
-        "source": ("wide", "true", "dis").index(source),
+        "source": ("diverse", "true", "dis").index(source),
     }
 
 
-def write_shard(path: str | os.PathLike[str], first_seed: int) -> int:
-    """Write pictures from ``first_seed`` on until a shard of each shape is full or seeds end.
+def write_shard(path: str | os.PathLike[str], first_seed: int, seeds: int = PER_SHARD) -> int:
+    """Write the samples of some seeds, in one file for each grid shape.
 
     Returns:
-        Number of pictures written, in one file per grid shape.
+        Number of samples written.
     """
     folder = Path(path)
     by_shape: dict[tuple[int, int], list[dict[str, Any]]] = {}
-    for seed in range(first_seed, first_seed + PER_SHARD):
-        for picture in draw_pictures(seed):
-            by_shape.setdefault(picture["label"].shape, []).append(picture)
-    for (h, w), pictures in by_shape.items():
-        arrays: dict[str, Any] = {key: np.stack([p[key] for p in pictures]) for key in pictures[0]}
+    for seed in range(first_seed, first_seed + seeds):
+        for sample in draw_samples(seed):
+            by_shape.setdefault(sample["label"].shape, []).append(sample)
+    for (h, w), samples in by_shape.items():
+        arrays: dict[str, Any] = {key: np.stack([p[key] for p in samples]) for key in samples[0]}
         target = folder / f"{first_seed:08d}_{h}x{w}.npz"
         temporary = target.with_suffix(".tmp")
         with open(temporary, "wb") as file:

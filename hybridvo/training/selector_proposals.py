@@ -1,4 +1,4 @@
-"""What a pixel-wise network says of the pictures: a motion, and where the world stands still.
+"""What a pixel-wise network says of the samples: a motion, and where the world stands still.
 
 Kept beside the shards, in their folder ``proposals``, so that they can be made anew when the
 network has learned more.
@@ -17,25 +17,23 @@ import torch.nn.functional as F
 from hybridvo.learned import fitted_motion, next_start, static_probability
 from hybridvo.network.inputs import NETWORK_SIZE
 from hybridvo.network.passes import predict
-from hybridvo.training.rendered_pictures import picture_sample
+from hybridvo.training.rendered import grid_sample
 from hybridvo.training.stream import collate
 from hybridvo.types import PixelwisePrediction
-
-__all__ = ["read_proposals", "write_proposals"]
 
 FOLDER = "proposals"
 AT_ONCE = 16
 
 
 def write_proposals(folder: str | os.PathLike[str], network: torch.nn.Module) -> int:
-    """Ask a network about the pictures of all shards of a folder.
+    """Ask a network about the samples of all shards of a folder.
 
     Args:
         folder: of the shards.
         network: a PWVO with uncertainty.
 
     Returns:
-        Number of pictures.
+        Number of samples.
     """
     folder = Path(folder)
     (folder / FOLDER).mkdir(exist_ok=True)
@@ -62,11 +60,11 @@ def write_proposals(folder: str | os.PathLike[str], network: torch.nn.Module) ->
 
 
 def read_proposals(path: Path, shape: tuple[int, int, int]) -> dict[str, np.ndarray]:
-    """``proposal``, ``static`` and ``proposed`` of the pictures of a shard; False if not asked.
+    """``proposal``, ``static`` and ``proposed`` of the samples of a shard; False if not asked.
 
     Args:
         path: of the shard.
-        shape: (pictures, rows, columns) of what it holds.
+        shape: (samples, rows, columns) of what it holds.
     """
     beside = path.parent / FOLDER / path.name
     if not beside.exists():
@@ -83,8 +81,8 @@ def read_proposals(path: Path, shape: tuple[int, int, int]) -> dict[str, np.ndar
 def _proposals(
     shard: dict[str, np.ndarray], index: range, network: torch.nn.Module
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Motions (n, 3, 4) and static probabilities (n, h, w) of some pictures."""
-    samples = [picture_sample({k: v[i] for k, v in shard.items()}, NETWORK_SIZE) for i in index]
+    """Motions (n, 3, 4) and static probabilities (n, h, w) of some samples."""
+    samples = [grid_sample({k: v[i] for k, v in shard.items()}, NETWORK_SIZE) for i in index]
     with torch.inference_mode():
         inputs = collate(samples).inputs
         output = predict(network, inputs, next_start(network))

@@ -1,6 +1,6 @@
-"""Training pairs from the judge's pictures: rendered scenes with true, noisy and DIS flow.
+"""Training pairs from the selector's samples: rendered scenes with true, noisy and DIS flow.
 
-``tools/train_judge.py make`` writes the pictures (shards of npz files); here they become samples
+``tools/train.py selector-data`` writes the samples (shards of npz files); here they become samples
 of the pixel-wise networks. What DIS makes of a crowd of movers cannot be imitated by a noise model,
 and rendering a pair costs a hundred times what a training step on it does.
 """
@@ -16,20 +16,18 @@ import numpy as np
 
 from hybridvo.errors import FormatError, InputError
 from hybridvo.geometry import matrix_to_euler_deg
-from hybridvo.synthetic.paper import Sample, rigid_flow
-
-__all__ = ["MOVING", "STATIC", "UNKNOWN", "RenderedOptions", "picture_sample"]
+from hybridvo.synthetic.layered import Sample, rigid_flow
 
 MOVING, STATIC, UNKNOWN = 0, 1, 255
 """Labels of the pixels in a shard."""
 FIRST_RENDERED = 1
-"""Sources from this number on are rendered; 0 is the ``wide`` preset, which is drawn afresh."""
+"""Sources from this number on are rendered; 0 is the diverse preset, which is drawn afresh."""
 NAMES = ("exact", "coarse", "log_depth", "depth_true", "label", "T", "K", "stride", "source")
 
 
 @dataclass(frozen=True)
 class RenderedOptions:
-    """Pictures of a folder as samples of one size, mirrored at random.
+    """Samples of a folder as samples of one size, mirrored at random.
 
     Args:
         folder: of the shards, from the current folder.
@@ -52,28 +50,28 @@ class RenderedOptions:
             )
 
     def for_evaluation(self) -> RenderedOptions:
-        """The same of the held-out pictures.
+        """The same of the held-out samples.
 
         Raises:
             InputError: none are named.
         """
         if not self.held_out:
-            raise InputError("RenderedOptions.held_out: no folder of held-out pictures is named.")
+            raise InputError("RenderedOptions.held_out: no folder of held-out samples is named.")
         return replace(self, folder=self.held_out)
 
     def sample(self, rng: np.random.Generator) -> Sample:
-        """One picture as it would be at the sample's size.
+        """One sample as it would be at the sample's size.
 
         Raises:
             InputError: a folder without shards. FormatError: a shard that is not one.
         """
-        groups = _pictures(self.folder)
+        groups = _samples(self.folder)
         sizes = np.cumsum([len(group["source"]) for group in groups])
         choice = int(rng.integers(sizes[-1]))
         number = int(np.searchsorted(sizes, choice, side="right"))
         index = choice - int(sizes[number - 1] if number else 0)
         mirrored = rng.random(2) < 0.5
-        return picture_sample(
+        return grid_sample(
             {name: array[index] for name, array in groups[number].items()},
             (self.height, self.width),
             (bool(mirrored[0]), bool(mirrored[1])),
@@ -81,8 +79,8 @@ class RenderedOptions:
 
 
 @functools.cache
-def _pictures(folder: str) -> list[dict[str, np.ndarray]]:
-    """Rendered pictures of a folder, one stack for every shape of grid."""
+def _samples(folder: str) -> list[dict[str, np.ndarray]]:
+    """Rendered samples of a folder, one stack for every shape of grid."""
     by_shape: dict[tuple[int, ...], list[dict[str, np.ndarray]]] = {}
     for path in sorted(Path(folder).glob("*.npz")):
         try:
@@ -90,13 +88,13 @@ def _pictures(folder: str) -> list[dict[str, np.ndarray]]:
                 keep = file["source"] >= FIRST_RENDERED
                 shard = {name: file[name][keep] for name in NAMES}
         except (OSError, ValueError, KeyError) as error:
-            raise FormatError(f"{path}: not a shard of pictures: {error}.") from error
+            raise FormatError(f"{path}: not a shard of samples: {error}.") from error
         if keep.any():
             by_shape.setdefault(shard["label"].shape[1:], []).append(shard)
     if not by_shape:
         raise InputError(
-            f"{folder or '(no folder)'}: no shards of rendered pictures; make some with "
-            f"tools/train_judge.py make."
+            f"{folder or '(no folder)'}: no shards of rendered samples; make some with "
+            f"tools/train.py selector-data."
         )
     return [
         {name: np.concatenate([shard[name] for shard in shards]) for name in NAMES}
@@ -104,16 +102,16 @@ def _pictures(folder: str) -> list[dict[str, np.ndarray]]:
     ]
 
 
-def picture_sample(
+def grid_sample(
     p: Mapping[str, np.ndarray], size: tuple[int, int], mirrored: tuple[bool, bool] = (False, False)
 ) -> Sample:
-    """The nearest of a picture's measured pixels for each of the sample's, seen in mirrors.
+    """The nearest of a sample's measured pixels for each of the sample's, seen in mirrors.
 
-    The rays are those of the pixels that were taken, so that flow and depth stay exact; the truth
-    belongs to the sample's own pixels.
+    The rays are those of the pixels that were taken, so that flow and depth stay exact; ground
+    truth belongs to the sample's own pixels.
 
     Args:
-        p: arrays of one picture.
+        p: arrays of one sample.
         size: (height, width) of the sample.
         mirrored: left to right, top to bottom.
     """

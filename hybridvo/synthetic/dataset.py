@@ -1,0 +1,202 @@
+"""Drawn samples on disk: reading one costs far less than drawing it.
+
+A folder holds ``samples.json`` (what was drawn) and ``shard_0000/FIELD.npy`` with the fields of
+:class:`~hybridvo.synthetic.layered.Sample` stacked, float32, little-endian. The ego flow is left
+out: it follows from depth, intrinsics and motion; so are fields that repeat another one.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import json
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from hybridvo.errors import FormatError, InputError, OutputError
+from hybridvo.files import write_json
+from hybridvo.synthetic.layered import Sample, normalized_grid, rigid_flow
+from hybridvo.synthetic.presets import Preset
+
+MANIFEST = "samples.json"
+PER_SHARD = 500
+"""Samples of a shard: 270 MB at 128x256."""
+
+REPEATS = {"depth_true": "depth_prev", "depth_target": "depth_curr"}
+"""Field -> the one that it equals in data without noise; stored where it does not."""
+STORED = (
+    *("flow", "depth_prev", "depth_curr", "depth_true", "depth_target", "K", "T_curr_prev"),
+    *("rotation_deg", "translation", "moving"),
+)
+
+
+def sample_rng(seed: int, index: int) -> np.random.Generator:
+    """Generator of sample ``index`` of a stored set; keys apart from those of every stream."""
+    return np.random.Generator(np.random.Philox(key=[(1 << 33) + seed, index]))
+
+
+def write_samples(
+    preset: Preset, count: int, folder: str | Path, seed: int = 0, workers: int = 1
+) -> Iterator[int]:
+    """Draw samples into a folder; shards that are there already are kept.
+
+    Args:
+        preset: what to draw.
+        count: number of samples.
+        folder: is made; may hold an interrupted call of the same arguments.
+        seed: of the samples.
+        workers: processes.
+
+    Yields:
+        Number of samples written so far, after each shard.
+
+    Raises:
+        InputError: a count below 1, or a folder with other samples.
+        OutputError: a file that cannot be written.
+    """
+    if count < 1 or workers < 1 or not 0 <= seed < 1 << 32:
+        raise InputError(
+            f"write_samples: expected count >= 1, workers >= 1 and 0 <= seed < 2^32, got {count}, "
+            f"{workers} and {seed}."
+        )
+    folder = Path(folder)
+    options = dataclasses.asdict(cast(Any, preset))
+    manifest = {
+        "preset": type(preset).__name__,
+        "options": json.loads(json.dumps(options)),
+        "seed": seed,
+        "count": count,
+        "per_shard": PER_SHARD,
+    }
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if (folder / MANIFEST).exists():
+            if _manifest(folder) != manifest:
+                raise InputError(f"{folder}: holds other samples. Choose another folder.")
+        else:
+            write_json(folder / MANIFEST, manifest)
+        shards = range(-(-count // PER_SHARD))
+        jobs = [(preset, seed, count, folder, number) for number in shards]
+        done = 0
+        with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+            for written in pool.map(_write_shard, jobs) if workers > 1 else map(_write_shard, jobs):
+                done += written
+                yield done
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be written: {error.strerror or error}.") from error
+
+
+def _write_shard(job: tuple[Preset, int, int, Path, int]) -> int:
+    """Draw one shard under a hidden name and give it its own at the end."""
+    preset, seed, count, folder, number = job
+    first = number * PER_SHARD
+    indices = range(first, min(first + PER_SHARD, count))
+    target = _shard(folder, number)
+    if target.is_dir():
+        return len(indices)
+    partial = target.with_name(f".{target.name}")
+    partial.mkdir(exist_ok=True)
+    samples = [preset.sample(sample_rng(seed, i)) for i in indices]
+    for name in STORED:
+        array = np.stack([getattr(sample, name) for sample in samples])
+        twin = REPEATS.get(name)
+        if twin and all(np.array_equal(getattr(s, name), getattr(s, twin)) for s in samples):
+            continue
+        np.save(partial / f"{name}.npy", array)
+    partial.rename(target)
+    return len(indices)
+
+
+def _shard(folder: Path, number: int) -> Path:
+    return folder / f"shard_{number:04d}"
+
+
+def _manifest(folder: Path) -> dict[str, Any]:
+    path = folder / MANIFEST
+    try:
+        manifest = json.loads(path.read_text(encoding="utf-8"))
+        if not manifest["count"] > 0 or not manifest["per_shard"] > 0:
+            raise ValueError("no samples")
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; write samples with hybridvo generate.") from None
+    except (ValueError, KeyError, TypeError) as error:
+        raise FormatError(f"{path}: not a description of samples: {error}.") from None
+    return manifest
+
+
+@functools.cache
+def _open_shard(path: Path) -> dict[str, np.ndarray]:
+    """Memory-mapped fields of a shard."""
+    try:
+        names = [name for name in STORED if (path / f"{name}.npy").exists()]
+        return {name: np.load(path / f"{name}.npy", mmap_mode="r") for name in names}
+    except (OSError, ValueError) as error:
+        raise FormatError(f"{path}: not a shard of samples: {error}.") from None
+
+
+def read_sample(folder: str | Path, index: int) -> Sample:
+    """Sample ``index`` of a folder that :func:`write_samples` filled.
+
+    Raises:
+        InputError: no such sample. FormatError: a damaged shard.
+    """
+    folder = Path(folder)
+    manifest = _read_manifest(folder)
+    if not 0 <= index < manifest["count"]:
+        raise InputError(f"{folder}: expected a sample 0 to {manifest['count'] - 1}, got {index}.")
+    number, row = divmod(index, manifest["per_shard"])
+    shard = _open_shard(_shard(folder, number))
+    try:
+        fields = {name: np.array(array[row]) for name, array in shard.items()}
+        for name, twin in REPEATS.items():
+            fields.setdefault(name, fields[twin])
+        return Sample(ego_flow=_ego_flow(fields), **fields)
+    except (KeyError, IndexError, TypeError) as error:
+        raise FormatError(f"{_shard(folder, number)}: damaged shard of samples: {error}.") from None
+
+
+_read_manifest = functools.cache(_manifest)
+
+
+def _ego_flow(fields: dict[str, np.ndarray]) -> np.ndarray:
+    """(H, W, 2) flow of the camera motion alone."""
+    depth, K, T = (fields[name] for name in ("depth_true", "K", "T_curr_prev"))
+    known = depth > 0
+    rho = np.where(known, 1.0 / np.where(known, depth, 1.0), 0.0).astype(np.float32)
+    focal = (float(K[0, 0]), float(K[1, 1]))
+    u, v, _ = rigid_flow(*normalized_grid(K, *depth.shape), rho, T[:3, :3], T[:3, 3], focal)
+    return np.stack([u, v], axis=-1).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class StoredSamples:
+    """Samples of a folder as data of a training: ``preset: folder``.
+
+    Args:
+        folder: that :func:`write_samples` filled, from the current folder.
+        held_out: one of another seed for evaluations; empty: none.
+    """
+
+    folder: str
+    held_out: str = ""
+
+    def sample(self, rng: np.random.Generator) -> Sample:
+        """One of the samples."""
+        count = _read_manifest(Path(self.folder))["count"]
+        return read_sample(self.folder, int(rng.integers(count)))
+
+    def for_evaluation(self) -> StoredSamples:
+        """The same of the held-out folder.
+
+        Raises:
+            InputError: none is named.
+        """
+        if not self.held_out:
+            raise InputError("StoredSamples.held_out: no folder of held-out samples is named.")
+        return StoredSamples(self.held_out)

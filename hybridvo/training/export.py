@@ -1,0 +1,132 @@
+"""Weights of a run for users, with a card that says what the run was trained with."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from hybridvo.errors import CheckpointError, InputError
+from hybridvo.files import write_json
+from hybridvo.network.weights import load_weights, save_weights
+from hybridvo.training.options import recorded_run
+from hybridvo.training.pwvo_task import PwvoTask
+from hybridvo.training.selector_task import SelectorTask, evaluate_selector
+from hybridvo.training.trainer import CHECKPOINT, Trainer
+from hybridvo.training.validation import PUBLISHED_SEED, calibrate_scales, evaluate_network
+
+RUN = "run.json"
+"""Command, commit and versions of a training, beside its checkpoint."""
+
+SCALE_OF = {
+    "laplace": "s of the translation is the log scale of a Laplace error in metres",
+    "direction": "s of the translation is the log scale of the paper's direction-and-length error",
+}
+
+
+def run_card(trainer: Trainer) -> dict[str, Any]:
+    """What every card says of a run: its own record, never the options of the export."""
+    card = {
+        "updates": trainer.step,
+        "samples": trainer.samples,
+        "skipped_updates": trainer.skipped,
+        "training_hours": round(trainer.elapsed_s / 3600, 2),
+        **trainer.record,
+    }
+    try:
+        assert trainer.folder is not None
+        card |= json.loads((trainer.folder / RUN).read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{trainer.folder}: no {RUN} of a training: {error}.") from None
+    return card
+
+
+def open_run(folder: str | Path) -> Trainer:
+    """A PWVO run as its checkpoint describes it.
+
+    Raises:
+        CheckpointError: no checkpoint, or a damaged one.
+    """
+    folder = Path(folder)
+    path = folder / CHECKPOINT
+    if not path.exists():
+        raise CheckpointError(f"{path}: no such checkpoint; train first.")
+    record = torch.load(path, map_location="cpu", weights_only=True)["record"]
+    trainer = Trainer(PwvoTask(*recorded_run(record, str(path))), folder)
+    trainer.resume()
+    return trainer
+
+
+def export_pwvo(
+    folder: str | Path,
+    path: str | Path,
+    count: int = 1000,
+    calibrate: int = 0,
+    say: Callable[[str], None] = print,
+) -> dict[str, Any]:
+    """Write a run's weights as float16 safetensors, and its card beside them as JSON.
+
+    Args:
+        folder: of the run.
+        path: of the weights.
+        count: held-out pairs of each preset for the figures of the card.
+        calibrate: development pairs over which the scales of the translation are calibrated;
+            0: as trained.
+        say: takes lines of progress.
+
+    Returns:
+        The card. Its figures are those of the stored, rounded weights, as a user gets them.
+
+    Raises:
+        CheckpointError, InputError: not the folder of a run.
+    """
+    trainer = open_run(folder)
+    path, task = Path(path), trainer.task
+    options, presets = task.options, task.mixture.presets
+    card = run_card(trainer)
+    card["translation_scale"] = SCALE_OF[options.loss.translation_form]
+    if calibrate:
+        shares = list(options.data_weights)
+        main = presets[shares.index(max(shares))]
+        shift = calibrate_scales(trainer.exported, main, calibrate)
+        card["calibration"] = {"pairs": calibrate, "seed": 0, "added_to_s": shift}
+    save_weights(path, trainer.exported, options.network, card, "float16")
+    network, _ = load_weights(path)
+    card["held_out"] = {}
+    for name, preset in zip(options.data, presets, strict=True):
+        say(f"{Path(name).stem}: {count} held-out pairs")
+        figures = evaluate_network(
+            network, preset, PUBLISHED_SEED, count, selection=options.selection
+        )
+        del figures["epe_of_pairs"]
+        card["held_out"][Path(name).stem] = figures
+    save_weights(path, network, options.network, card, "float16")
+    write_json(path.with_suffix(".json"), card)
+    return card
+
+
+def export_selector(trainer: Trainer, held_out: str | Path, path: str | Path) -> dict[str, Any]:
+    """Write the selector's weights and card; ``held_out`` is a folder of held-out shards.
+
+    Raises:
+        InputError: no held-out shards.
+    """
+    path, task = Path(path), trainer.task
+    assert isinstance(task, SelectorTask)
+    files = sorted(Path(held_out).glob("*.npz"))
+    if not files:
+        raise InputError(f"{held_out}: no shards; make some with seeds below 1000.")
+    network = trainer.exported.eval()
+    card = run_card(trainer) | {
+        "what": "chooses the world among candidate motions, and where the world is",
+        "held_out": evaluate_selector(network, files),
+        "held_out_with_proposals": evaluate_selector(network, files, asked=True),
+    }
+    card["network"] = dataclasses.asdict(task.options.network)
+    save_weights(path, network, task.options.network, card, dtype="float16")
+    write_json(path.with_suffix(".json"), card)
+    return card

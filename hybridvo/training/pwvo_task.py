@@ -1,0 +1,156 @@
+"""Training of the pixel-wise networks and of the VONet baselines."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import nn
+
+from hybridvo.learned import fitted_motion, next_start
+from hybridvo.network.losses import NetworkOutput, reconstruct, total_loss
+from hybridvo.network.passes import first_motions
+from hybridvo.network.pwvo import build_network
+from hybridvo.network.selection import chosen_motion
+from hybridvo.training.options import PwvoOptions, described
+from hybridvo.training.stream import Mixture, SampleStream, TrainingBatch
+from hybridvo.training.validation import evaluate_network
+from hybridvo.types import PixelwisePrediction
+
+FIT_FLOOR_PX = 0.05
+"""Pixels of the inputs: below it the noise of the inputs decides the fit."""
+FIT_LIMIT_PX = 100.0
+"""Most that a pixel of the fit is charged, and what one behind the camera is."""
+SEPARATION_SLOPE = 2.0
+"""Logits per unit of s: pixels apart by a factor of three in U count little."""
+SEPARATION_PIXELS = 700
+"""Of each kind in a batch, for the pairs of pixels that are compared."""
+
+
+class PwvoTask:
+    """One of the paper's networks, its data and its loss; see ``trainer.Task``.
+
+    Args:
+        options: of the run. The weights are drawn from its seed.
+        mixture: what samples are drawn from.
+    """
+
+    def __init__(self, options: PwvoOptions, mixture: Mixture) -> None:
+        self.options, self.mixture = options, mixture
+        torch.manual_seed(options.seed)
+        self.network = build_network(options.network)
+        self.data = [described(preset) for preset in mixture.presets]
+        self.all_parameters_used = options.loss.needs_uncertainty
+
+    def batches(self, samples: int, workers: int, rank: int, world: int) -> Iterator[TrainingBatch]:
+        """Batches of the run's stream from sample number ``samples`` on."""
+        options = self.options
+        stream = SampleStream(self.mixture, options.seed, samples, options.batch_size, rank, world)
+        context = "fork" if workers else None
+        return iter(
+            torch.utils.data.DataLoader(
+                stream, batch_size=None, num_workers=workers, multiprocessing_context=context
+            )
+        )
+
+    def loss(
+        self, model: nn.Module, batch: TrainingBatch, step: int, progress: float
+    ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        """Loss of a batch and its parts."""
+        half = self.options.precision == "bfloat16"
+        with torch.autocast(batch.moving.device.type, torch.bfloat16, enabled=half):
+            starts = self._starts(batch, step)
+            output = model(batch.inputs, *(() if starts is None else (starts,)))
+        return training_loss(output, batch, self.options)
+
+    def _starts(self, batch: TrainingBatch, step: int) -> torch.Tensor | None:
+        """(B, 4, 4) first motions: none for one half of the batch, the network's own for the rest.
+
+        The later passes of a network learn from the errors that the earlier ones really make.
+        """
+        passes = self.options.network.passes
+        first = len(batch) // 2
+        if passes == 1 or first == 0:
+            return None
+        T = torch.eye(4, device=batch.moving.device).repeat(len(batch), 1, 1)
+        choose = next_start(self.network, self.options.selection)
+        made = first_motions(self.network, batch.inputs[first:], choose, 1 + step % (passes - 1))
+        assert made is not None
+        T[first:] = made
+        return T
+
+    def evaluate(self, network: nn.Module) -> dict[str, Any]:
+        """Figures on development pairs of each preset."""
+        options = self.options
+        return {
+            Path(name).stem: evaluate_network(
+                network,
+                preset,
+                0,
+                options.evaluate_count,
+                selection=options.selection,
+                precision=options.precision,
+            )
+            for name, preset in zip(options.data, self.mixture.presets, strict=True)
+        }
+
+
+def training_loss(
+    output: NetworkOutput, batch: TrainingBatch, options: PwvoOptions
+) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+    """Loss of a network's output and its parts, see :func:`hybridvo.network.losses.total_loss`."""
+    T = chosen_motion(output, options.selection) if options.loss.reconstructs else None
+    loss, parts = total_loss(output, batch.targets.subsample(options.loss_stride), options.loss, T)
+    if isinstance(output, PixelwisePrediction):
+        for name, weight, term in (
+            ("fit", options.fit_weight, fit_loss),
+            ("moving", options.moving_weight, separation_loss),
+        ):
+            if weight:
+                value = term(output, batch, options)
+                loss = loss + weight * value
+                parts[name] = value.detach()
+    return loss, parts
+
+
+def fit_loss(
+    output: PixelwisePrediction, batch: TrainingBatch, options: PwvoOptions
+) -> torch.Tensor:
+    """Log of the error of the ego flow that the fit to the trusted pixels gives, mean over pairs.
+
+    The gradient goes through the fit into s. The logarithm lets pairs that are far off and pairs
+    that are nearly right learn alike.
+    """
+    T = fitted_motion(output, batch.inputs, options.selection)
+    gt = batch.targets.subsample(options.loss_stride)
+    flow, _, defined = reconstruct(gt.depth_prev, T, gt.K_prev, gt.K_curr)
+    known = (gt.depth_prev > 0) & torch.isfinite(gt.ego_flow).all(dim=1)
+    error = torch.where(known[:, None], flow - gt.ego_flow, 0.0).abs().sum(1)
+    error = torch.where(defined, error.clamp(max=FIT_LIMIT_PX), known * FIT_LIMIT_PX)
+    mean = options.loss_stride * error.flatten(1).sum(1) / known.flatten(1).sum(1).clamp(min=1)
+    return torch.log1p(mean / FIT_FLOOR_PX).mean()
+
+
+def separation_loss(
+    output: PixelwisePrediction, batch: TrainingBatch, options: PwvoOptions
+) -> torch.Tensor:
+    """How often s of the rotation is larger on a static pixel than on a moving one, smoothed.
+
+    The logistic bound of one minus the area under the ROC curve, over pixels of the whole batch:
+    s has to tell movers apart across pairs as well.
+    """
+    s = output.log_scale_rotation
+    if s is None:
+        return output.rotation.new_zeros(())
+    cells = s.shape[2:]
+    moving = F.interpolate(batch.moving[:, None].to(s.dtype), cells, mode="area")[:, 0]
+    valid = F.interpolate(batch.inputs.valid[:, None].to(s.dtype), cells, mode="area")[:, 0] > 0.5
+    score = s.mean(1)
+    kinds = [score[valid & (moving > 0.5)], score[valid & (moving < 0.5)]]
+    if not all(len(kind) for kind in kinds):
+        return s.new_zeros(())
+    above, below = (kind[:: -(-len(kind) // SEPARATION_PIXELS)] for kind in kinds)
+    return F.softplus(SEPARATION_SLOPE * (below[None] - above[:, None])).mean()

@@ -1,0 +1,213 @@
+"""Training of the selector: choose, refit inside the masks it draws, choose again.
+
+Every update judges the motions of a few samples, fits the best of them inside the network's own
+masks with the solver of the pipeline, and judges the fits beside the old ones: the final choice is
+learned on what it will be asked about.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+
+from hybridvo.errors import InputError
+from hybridvo.network.judge import JudgeInputs, JudgeNetwork, JudgeOutput
+from hybridvo.training.options import SelectorOptions
+from hybridvo.training.rendered import MOVING, STATIC
+from hybridvo.training.selector_batches import (
+    SelectorBatch,
+    ego_flow_error,
+    read_batches,
+    refits_of,
+)
+
+RIGHT_PX = 1.0
+"""px at a width of 1024: mean error of the ego flow up to which a motion is right."""
+RIGHT_SLOPE_PX = 0.15
+"""px: softness of that limit as a target."""
+SOURCES = ("diverse", "rendered", "dis")
+"""Where samples come from: the layered generator, rendered scenes with true flow and with DIS."""
+
+
+def choice_loss(
+    score: torch.Tensor, error: torch.Tensor, owner: torch.Tensor, samples: int
+) -> torch.Tensor:
+    """Cross entropy against a soft target: motions nearly as good as the best share it.
+
+    Samples in which all motions are far off count little: there the choice does not matter.
+    """
+    losses = []
+    for b in range(samples):
+        mine = owner == b
+        wrong = error[mine]
+        best = wrong.min()
+        target = torch.softmax(-(wrong - best) / (0.1 + 0.3 * best), 0)
+        weight = 1.0 / (1.0 + (best / 4.0) ** 2)
+        losses.append(-weight * (target * torch.log_softmax(score[mine], 0)).sum())
+    return torch.stack(losses).mean()
+
+
+def mask_loss(mask: torch.Tensor, inputs: JudgeInputs, label: torch.Tensor) -> torch.Tensor:
+    """Binary cross entropy of the masks over usable pixels of known kind."""
+    label = label[inputs.owner]
+    known = inputs.usable[inputs.owner] & ((label == STATIC) | (label == MOVING))
+    loss = F.binary_cross_entropy_with_logits(
+        mask, (label == STATIC).to(mask.dtype), reduction="none"
+    )
+    return ((loss * known).sum((1, 2)) / known.sum((1, 2)).clamp(min=1)).mean()
+
+
+def trust_loss(
+    logit: torch.Tensor, score: torch.Tensor, error: torch.Tensor, owner: torch.Tensor
+) -> torch.Tensor:
+    """Binary cross entropy of the probability that the chosen motion is right."""
+    target = []
+    for b in range(len(logit)):
+        mine = owner == b
+        chosen = error[mine][score[mine].argmax()]
+        target.append(torch.sigmoid((RIGHT_PX - chosen) / RIGHT_SLOPE_PX))
+    return F.binary_cross_entropy_with_logits(logit, torch.stack(target))
+
+
+def _float(out: JudgeOutput) -> JudgeOutput:
+    """The answers in single precision."""
+    return JudgeOutput(out.score.float(), out.mask.float(), out.hidden.float(), out.support)
+
+
+class SelectorTask:
+    """The selector, shards of samples and the losses; see ``trainer.Task``.
+
+    Args:
+        options: of the run. The weights are drawn from its seed.
+        folder: of the shards; more may appear while training.
+    """
+
+    all_parameters_used = False
+
+    def __init__(self, options: SelectorOptions, folder: Path) -> None:
+        self.options, self.folder, self.data = options, Path(folder), str(folder)
+        torch.manual_seed(options.seed)
+        self.network = JudgeNetwork(options.network)
+
+    def batches(self, samples: int, workers: int, rank: int, world: int) -> Iterator[SelectorBatch]:
+        """Batches of shards that are picked and mixed anew each round."""
+        round_number = 0
+        while True:
+            files = sorted(self.folder.glob("*.npz"))
+            if not files:
+                raise InputError(f"{self.folder}: no shards of samples; make some first.")
+            rng = np.random.default_rng([self.options.seed, samples, rank, round_number])
+            picked = rng.permutation(len(files))[: self.options.files]
+            yield from read_batches([files[k] for k in picked], self.options.batch_size, rng)
+            round_number += 1
+
+    def loss(
+        self, model: torch.nn.Module, batch: SelectorBatch, step: int, progress: float
+    ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        """Losses of the choice, of the masks and of the stated probability."""
+        o, count = self.options, len(batch)
+        draw = torch.Generator().manual_seed((o.seed << 32) + step)
+        asked = torch.rand(count, generator=draw) < o.asked_share
+        batch = batch.expecting(np.random.default_rng([o.seed, step])).shown(asked)
+        inputs = batch.inputs
+        mirror = torch.rand(count, generator=draw) < 0.5
+        half = o.precision == "bfloat16"
+        with torch.autocast("cpu", torch.bfloat16, enabled=half):
+            out = _float(model(inputs, mirror=mirror))
+        error = ego_flow_error(inputs.pose, inputs.owner, batch)
+        losses = {
+            "choice": choice_loss(out.score, error, inputs.owner, count),
+            "mask": o.mask_weight * mask_loss(out.mask, inputs, batch.label),
+        }
+        score, hidden, owner = out.score, out.hidden, inputs.owner
+        more = self._refits(batch, out, draw) if progress >= o.second_look_from else None
+        if more is not None:
+            with torch.autocast("cpu", torch.bfloat16, enabled=half):
+                again = _float(model(more, (inputs, out), mirror))
+            owner = torch.cat([owner, more.owner])
+            score = torch.cat([score, again.score])
+            hidden = torch.cat([hidden, again.hidden])
+            error = torch.cat([error, ego_flow_error(more.pose, more.owner, batch)])
+            losses["second"] = choice_loss(score, error, owner, count)
+            losses["second_mask"] = 0.5 * o.mask_weight * mask_loss(again.mask, more, batch.label)
+        trust = self.network.confidence(score, hidden, owner, count)
+        losses["trust"] = o.trust_weight * trust_loss(trust, score.detach(), error, owner)
+        total = torch.stack(list(losses.values())).sum()
+        return total, {name: value.detach() for name, value in losses.items()}
+
+    def _refits(
+        self, batch: SelectorBatch, out: JudgeOutput, draw: torch.Generator
+    ) -> JudgeInputs | None:
+        """Candidates fitted inside their masks, without gradient."""
+        refits = self.options.refits
+        with torch.no_grad():
+            told = replace(out, score=out.score.detach(), mask=out.mask.detach())
+            # one fit less in half of the updates: cheaper, and the best one is seen most
+            fewer = refits > 1 and bool(torch.rand((), generator=draw) < 0.5)
+            return refits_of(batch, told, refits - fewer, draw)
+
+    def evaluate(self, network: torch.nn.Module) -> dict[str, Any]:
+        """Figures on the held-out shards beside the training's, ``FOLDER_held_out``."""
+        folder = self.folder.with_name(f"{self.folder.name}_held_out")
+        files = sorted(folder.glob("*.npz"))
+        return evaluate_selector(network, files, self.options.refits) if files else {}
+
+
+@torch.no_grad()
+def evaluate_selector(
+    network: torch.nn.Module, files: list[Path], refits: int = 2, asked: bool = False
+) -> dict[str, dict[str, Any]]:
+    """Shares of wrong answers on samples of shards, by source.
+
+    Args:
+        network: the selector.
+        files: shards.
+        refits: motions of a sample that are fitted again.
+        asked: whether the pixel-wise network takes part.
+
+    Returns:
+        For each source: ``samples``, the share of them whose motion is further than a pixel from
+        the ground truth for ``support`` (the first motion found), ``chosen`` (the first choice),
+        ``final`` (after the second look) and ``best`` (the best of them, an oracle), and
+        ``trust_right`` and ``trust_wrong``, the mean probability given to right and wrong answers.
+    """
+    rows: dict[int, list[list[float]]] = {source: [] for source in range(len(SOURCES))}
+    for batch in read_batches(files, 8, None):
+        batch = batch.shown(torch.full((len(batch),), asked))
+        inputs = batch.inputs
+        out = network(inputs)
+        more = refits_of(batch, out, refits)
+        owner, score, hidden = inputs.owner, out.score, out.hidden
+        error = ego_flow_error(inputs.pose, owner, batch)
+        first_look = len(owner)
+        if more is not None:
+            again = network(more, (inputs, out))
+            owner = torch.cat([owner, more.owner])
+            score = torch.cat([score, again.score])
+            hidden = torch.cat([hidden, again.hidden])
+            error = torch.cat([error, ego_flow_error(more.pose, more.owner, batch)])
+        trust = torch.sigmoid(network.confidence(score, hidden, owner, len(batch)))
+        for b in range(len(batch)):
+            mine = torch.nonzero(owner == b)[:, 0]
+            first = mine[mine < first_look]
+            picks = (first[0], first[score[first].argmax()], mine[score[mine].argmax()])
+            wrong = [float(error[k]) for k in picks] + [float(error[mine].min()), float(trust[b])]
+            rows[int(batch.source[b])].append(wrong)
+    return {name: _shares(np.array(rows[i])) for i, name in enumerate(SOURCES) if rows[i]}
+
+
+def _shares(table: np.ndarray) -> dict[str, Any]:
+    wrong = table[:, 2] > RIGHT_PX
+    result: dict[str, Any] = {"samples": len(table)}
+    for i, name in enumerate(("support", "chosen", "final", "best")):
+        result[name] = round(float((table[:, i] > RIGHT_PX).mean()), 4)
+    result["median_final_px"] = round(float(np.median(table[:, 2])), 3)
+    for name, rows in (("trust_right", ~wrong), ("trust_wrong", wrong)):
+        result[name] = round(float(table[rows, 4].mean()), 3) if rows.any() else None
+    return result

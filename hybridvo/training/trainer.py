@@ -1,0 +1,341 @@
+"""One training loop for every task: updates, running average, checkpoints, many processes.
+
+Two runs with the same options take the same updates on the same machine, whether or not they were
+interrupted, as long as the schedule counts updates.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import json
+import math
+import pickle
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, Protocol
+
+import torch
+import torch.distributed as dist
+from torch import nn
+from torch.nn.parallel import DistributedDataParallel
+
+from hybridvo.errors import CheckpointError, DegenerateError, InputError
+from hybridvo.files import atomic_write
+from hybridvo.training.options import RunOptions
+
+MAX_SKIPPED_IN_A_ROW = 50
+"""Updates with a loss or gradient that is not finite, after which a run gives up."""
+
+FREE_TO_CHANGE = ("checkpoint_minutes", "log_every", "evaluate_every", "evaluate_count")
+"""Options in which a resumed run may differ: they do not touch what is learned."""
+
+CHECKPOINT, LOG = "checkpoint.pt", "log.jsonl"
+
+
+class Task(Protocol):
+    """What is trained: a network, its samples and its loss.
+
+    ``data`` describes the samples in plain values: with the options it is the record of a run.
+    ``all_parameters_used`` says whether every parameter takes part in every loss.
+    """
+
+    options: RunOptions
+    network: nn.Module
+    data: Any
+    all_parameters_used: bool
+
+    def batches(self, samples: int, workers: int, rank: int, world: int) -> Iterator[Any]:
+        """Endless batches, after ``samples`` samples that all ranks together have seen."""
+
+    def loss(
+        self, model: nn.Module, batch: Any, step: int, progress: float
+    ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        """Loss of a batch and its parts, without gradient."""
+
+    def evaluate(self, network: nn.Module) -> dict[str, Any]:
+        """Figures of a network on development samples."""
+
+
+class Trainer:
+    """A run: task, optimiser, and their state on disk.
+
+    Args:
+        task: what is trained.
+        folder: of ``checkpoint.pt`` and ``log.jsonl``; must exist. None writes nothing.
+        device: of the network.
+        workers: processes that draw samples; 0 draws them in this one.
+        report: called with every entry of the log, for a progress display.
+
+    Under ``torch.distributed`` (``torchrun``) every process makes its own Trainer; gradients are
+    averaged, and only rank 0 writes.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        folder: Path | None = None,
+        device: torch.device | str = "cpu",
+        workers: int = 0,
+        report: Callable[[dict[str, Any]], None] | None = None,
+    ) -> None:
+        self.task, self.options, self.folder = task, task.options, folder
+        self.device, self.workers, self.report = torch.device(device), workers, report
+        self.world = dist.get_world_size() if dist.is_initialized() else 1
+        self.rank = dist.get_rank() if dist.is_initialized() else 0
+        self.network = task.network.to(self.device)
+        if self.options.channels_last:
+            self.network = self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.model: nn.Module = self.network
+        if self.world > 1:
+            self.model = DistributedDataParallel(
+                self.network, find_unused_parameters=not task.all_parameters_used
+            )
+        average = self.options.ema_decay > 0
+        self.ema = copy.deepcopy(self.network).requires_grad_(False) if average else None
+        self.optimizer = torch.optim.AdamW(
+            _parameter_groups(self.network, self.options.optimizer.head_rate),
+            lr=self.options.optimizer.learning_rate,
+            betas=self.options.optimizer.betas,
+            weight_decay=self.options.optimizer.weight_decay,
+        )
+        self.step = self.samples = self.skipped = self.skipped_in_a_row = 0
+        self.elapsed_s = 0.0
+        self.stop_requested = False
+
+    @property
+    def exported(self) -> nn.Module:
+        """The network that a user should get: the running average where there is one."""
+        return self.network if self.ema is None else self.ema
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """Options and data as plain values: what a resumed run has to agree with."""
+        record = {"options": dataclasses.asdict(self.options), "data": self.task.data}
+        return json.loads(json.dumps(record))
+
+    def update(self, batch: Any, progress: float) -> dict[str, float]:
+        """One step of the optimiser.
+
+        Args:
+            batch: samples of this process.
+            progress: share of the run that is done, for the learning rate.
+
+        Returns:
+            ``loss``, its parts, ``grad_norm`` and ``lr``.
+
+        Raises:
+            DegenerateError: the loss or the gradient was not finite 50 times in a row.
+        """
+        optimizer = self.options.optimizer
+        rate = optimizer.learning_rate * self.options.schedule.factor(progress)
+        for group in self.optimizer.param_groups:
+            group["lr"] = rate * group["rate_factor"]
+        self.optimizer.zero_grad(set_to_none=True)
+        loss, parts = self.task.loss(self.model, batch.to(self.device), self.step, progress)
+        loss.backward()
+        norm = nn.utils.clip_grad_norm_(self.network.parameters(), optimizer.clip_norm)
+        # The averaged gradient is the same on all ranks, and not finite where any loss was not.
+        if math.isfinite(float(norm)):
+            self.optimizer.step()
+            self.skipped_in_a_row = 0
+            self._average()
+        else:
+            self.skipped += 1
+            self.skipped_in_a_row += 1
+            if self.skipped_in_a_row >= MAX_SKIPPED_IN_A_ROW:
+                raise DegenerateError(
+                    f"training: loss or gradient not finite {MAX_SKIPPED_IN_A_ROW} times in a row "
+                    f"at update {self.step}. Lower optimizer.learning_rate or loss weights; the "
+                    f"last checkpoint is sound."
+                )
+        self.step += 1
+        self.samples += len(batch) * self.world
+        figures = {"loss": float(loss.detach()), "grad_norm": float(norm), "lr": rate}
+        return figures | {name: float(part) for name, part in parts.items()}
+
+    def _average(self) -> None:
+        if self.ema is None:
+            return
+        # A young average follows quickly: it must forget the random start.
+        decay = min(self.options.ema_decay, (1 + self.step) / (10 + self.step))
+        with torch.no_grad():
+            for ours, theirs in zip(
+                self.ema.state_dict().values(), self.network.state_dict().values(), strict=True
+            ):
+                ours.lerp_(theirs, 1 - decay)
+
+    def run(self, time_limit_s: float = math.inf, until: int | None = None) -> str:
+        """Train until the options' steps, a time limit or a request to stop.
+
+        Args:
+            time_limit_s: seconds of training, over all interruptions; ends with a checkpoint.
+            until: pause at this update, with the schedule of the whole run.
+
+        Returns:
+            Why it ended: ``steps``, ``time`` or ``signal`` (``stop_requested`` was set).
+        """
+        options = self.options
+        last = options.steps if until is None else min(until, options.steps)
+        batches = self.task.batches(self.samples, self.workers, self.rank, self.world)
+        self.network.train()
+        before, started = self.elapsed_s, time.monotonic()
+        saved = logged = started
+        seen: list[dict[str, float]] = []
+        why = "steps"
+        while self.step < last:
+            progress = self.step / options.steps
+            if options.schedule.by == "time" and math.isfinite(time_limit_s):
+                progress = max(progress, self.elapsed_s / time_limit_s)
+            seen.append(self.update(next(batches), progress))
+            now = time.monotonic()
+            self.elapsed_s = before + now - started
+            if self.step % options.log_every == 0:
+                rate = options.batch_size * self.world * len(seen) / (now - logged)
+                self._log({"event": "train", **_means(seen), "samples_per_s": rate})
+                seen, logged = [], now
+            if options.evaluate_every and self.step % options.evaluate_every == 0:
+                self.evaluate()
+            stop = self._agree(self.stop_requested, self.elapsed_s >= time_limit_s)
+            if stop:
+                why = ("steps", "time", "signal")[stop]
+                break
+            if now - saved > 60 * options.checkpoint_minutes:
+                self.save()
+                saved = now
+        self.save()
+        return why
+
+    def _agree(self, signalled: bool, late: bool) -> int:
+        """2 = a process was told to stop, 1 = time is up on one, 0 = go on; equal on all ranks."""
+        stop = 2 if signalled else int(late)
+        if self.world > 1:
+            flag = torch.tensor(stop, device=self.device)
+            dist.all_reduce(flag, dist.ReduceOp.MAX)
+            stop = int(flag)
+        return stop
+
+    def evaluate(self) -> dict[str, Any]:
+        """Figures of the exported network on development samples, also into the log."""
+        if self.rank != 0:
+            return {}
+        results = self.task.evaluate(self.exported)
+        self._log({"event": "evaluation", "results": results})
+        return results
+
+    def _log(self, entry: dict[str, Any]) -> None:
+        if self.rank != 0:
+            return
+        progress = {key: getattr(self, key) for key in ("step", "samples", "skipped")}
+        entry = progress | {"elapsed_s": round(self.elapsed_s, 1)} | entry
+        if self.folder is not None:
+            with (self.folder / LOG).open("a", encoding="utf-8") as file:
+                file.write(json.dumps(entry) + "\n")
+        if self.report is not None:
+            self.report(entry)
+
+    def save(self) -> None:
+        """Write ``checkpoint.pt``: everything that a later process needs to go on.
+
+        Raises:
+            OutputError: it cannot be written; the checkpoint before stays.
+        """
+        if self.folder is None or self.rank != 0:
+            return
+        progress = ("step", "samples", "skipped", "elapsed_s")
+        state = {
+            "record": self.record,
+            "network": self.network.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "ema": None if self.ema is None else self.ema.state_dict(),
+            "progress": {key: getattr(self, key) for key in progress},
+        }
+        with atomic_write(self.folder / CHECKPOINT, "wb") as file:
+            torch.save(state, file)
+
+    def start_from(self, weights: dict[str, torch.Tensor], name: str) -> None:
+        """Take the weights of another network of the same shapes; everything else starts anew.
+
+        Raises:
+            CheckpointError: weights of other shapes; names them by ``name``.
+        """
+        try:
+            self.network.load_state_dict(weights)
+            if self.ema is not None:
+                self.ema.load_state_dict(weights)
+        except RuntimeError as error:
+            raise CheckpointError(f"{name}: does not fit this network: {error}") from None
+
+    def resume(self) -> bool:
+        """Go on where the folder's checkpoint ended, if there is one.
+
+        Raises:
+            CheckpointError: a damaged file.
+            InputError: a run of other options or other data.
+        """
+        if self.folder is None or not (self.folder / CHECKPOINT).exists():
+            return False
+        path = self.folder / CHECKPOINT
+        try:
+            state = torch.load(path, map_location=self.device, weights_only=True)
+            record = state["record"]
+        except (OSError, RuntimeError, EOFError, KeyError, TypeError, pickle.UnpicklingError) as e:
+            reason = str(e).strip().splitlines()[0] if str(e).strip() else type(e).__name__
+            raise CheckpointError(f"{path}: not a checkpoint of a training: {reason}.") from None
+        changed = difference(record, self.record)
+        if changed:
+            raise InputError(
+                f"{path}: is of a run with other options: {changed}. Choose another folder, or "
+                f"train anew with --overwrite."
+            )
+        try:
+            self.network.load_state_dict(state["network"])
+            self.optimizer.load_state_dict(state["optimizer"])
+            if self.ema is not None:
+                self.ema.load_state_dict(state["ema"])
+            for key, value in state["progress"].items():
+                setattr(self, key, value)
+        except (RuntimeError, ValueError, KeyError, TypeError) as error:
+            raise CheckpointError(f"{path}: does not fit this network: {error}") from None
+        return True
+
+
+def difference(before: Any, now: Any, where: str = "") -> str:
+    """First key in which two records differ, with both values; empty if they agree."""
+    if isinstance(before, dict) and isinstance(now, dict):
+        for key in before | now:
+            if where == "options" and key in FREE_TO_CHANGE:
+                continue
+            name = f"{where}.{key}" if where else key
+            found = difference(before.get(key), now.get(key), name)
+            if found:
+                return found
+        return ""
+    return "" if before == now else f"{where} was {before!r}, now {now!r}"
+
+
+def _parameter_groups(network: nn.Module, head_rate: float) -> list[dict[str, Any]]:
+    """Parameters in two groups: the motion heads' last layers have a rate of their own."""
+    last = []
+    for name in ("head_motion", "head_rotation", "head_translation"):
+        head = getattr(network, name, None)
+        if head is not None:
+            last.append(f"{name}.{len(head) - 1}.")
+    groups: list[dict[str, Any]] = [
+        {"params": [], "rate_factor": 1.0},
+        {"params": [], "rate_factor": head_rate},
+    ]
+    for name, parameter in network.named_parameters():
+        groups[name.startswith(tuple(last))]["params"].append(parameter)
+    return [group for group in groups if group["params"]]
+
+
+def _means(entries: list[dict[str, float]]) -> dict[str, float]:
+    """Mean of each figure over the entries in which all figures are finite."""
+    good = [e for e in entries if all(math.isfinite(value) for value in e.values())]
+    names = dict.fromkeys(name for entry in good for name in entry)
+    return {
+        name: sum(e[name] for e in good if name in e) / sum(name in e for e in good)
+        for name in names
+    }

@@ -1,0 +1,202 @@
+"""Figures of a network on held-out synthetic pairs: the paper's three, and what its doubt is worth.
+
+Seeds 0 to 999 are for development, 1000 and up for published figures; no training run has seen
+either.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from scipy.stats import rankdata, spearmanr
+
+from hybridvo.errors import InputError
+from hybridvo.learned import next_start
+from hybridvo.network.losses import NetworkOutput, reconstruct
+from hybridvo.network.passes import predict
+from hybridvo.network.selection import chosen_pose, select, selected_transform
+from hybridvo.synthetic.presets import Preset
+from hybridvo.training.stream import TrainingBatch, collate, sample_generator
+from hybridvo.types import PixelwisePrediction
+
+PUBLISHED_SEED = 1000
+"""First seed of published figures; smaller ones are for development."""
+
+EPE_LIMIT_PX = 400.0
+"""Pixels with a true ego flow of this length or more count as 0 in EPE, as published."""
+
+PIXEL_STRIDE = 4
+"""Every fourth row and column goes into the figures on uncertainty."""
+
+FIGURES = ("r_err_deg", "t_err", "epe")
+
+
+def area_under_curve(score: np.ndarray, label: np.ndarray) -> float | None:
+    """Area under the ROC curve of a score as a detector of a label; None if one class is absent.
+
+    Args:
+        score: (N,) larger means more likely true; ties count one half.
+        label: (N,) bool.
+    """
+    positive = int(label.sum())
+    negative = label.size - positive
+    if not positive or not negative:
+        return None
+    ranks = rankdata(score)
+    return float((ranks[label].sum() - positive * (positive + 1) / 2) / (positive * negative))
+
+
+def evaluate_network(
+    network: torch.nn.Module,
+    preset: Preset,
+    seed: int,
+    count: int,
+    *,
+    selection: str = "softmax",
+    batch_size: int = 20,
+    precision: str = "float32",
+) -> dict[str, Any]:
+    """Errors of a network's selected pose on ``count`` held-out pairs.
+
+    Args:
+        network: of ``build_network``; stays in the mode that it is in when the call ends.
+        preset: what to draw; held-out data of its own (``for_evaluation``) are used where it has.
+        seed: below 1000 for development, from 1000 for published figures.
+        count: number of pairs, samples 0 to count - 1 of the seed.
+        selection: rule, with ``-joint`` behind it one pixel and weight for each three components;
+            VONets have none.
+        batch_size: pairs at once.
+        precision: ``float32`` or ``bfloat16`` (autocast).
+
+    Returns:
+        ``r_err_deg``, ``t_err`` (metres) and ``epe`` (px at the sample's size), the paper's
+        component means; the same of zero motion under ``zero_*``, medians under ``median_*``, the
+        EPE of each pair under ``epe_of_pairs``. Of the uncertainty, None without:
+        ``auroc_rotation`` and ``auroc_translation`` of the mean log scale as a detector of moving
+        pixels, ``spearman_*`` with the pixel's own error, ``laplace_ratio_*``, the mean of
+        |error| / exp(s), 1 for calibrated scales.
+
+    Raises:
+        InputError: a count that is not positive.
+    """
+    if count < 1 or batch_size < 1:
+        raise InputError(f"evaluate_network: expected count >= 1, got {count}.")
+    preset = preset.for_evaluation() if hasattr(preset, "for_evaluation") else preset
+    device = next(network.parameters()).device
+    choose = next_start(network, selection.removesuffix("-joint"))
+    errors, pixels = [], []
+    was_training = network.training
+    network.eval()
+    try:
+        for first in range(0, count, batch_size):
+            numbers = range(first, min(first + batch_size, count))
+            batch = collate([preset.sample(sample_generator(seed, i)) for i in numbers]).to(device)
+            half = precision == "bfloat16"
+            with torch.inference_mode(), torch.autocast(device.type, torch.bfloat16, enabled=half):
+                output = predict(network, batch.inputs, choose)
+            with torch.inference_mode():
+                errors.append(_errors(output, batch, selection))
+                if getattr(output, "log_scale_rotation", None) is not None:
+                    pixels += _uncertainty(output, batch)
+    finally:
+        network.train(was_training)
+    table = np.concatenate(errors)
+    result: dict[str, Any] = {"seed": seed, "count": count}
+    for i, name in enumerate(FIGURES):
+        result[name] = float(table[:, i].mean())
+        result[f"zero_{name}"] = float(table[:, 3 + i].mean())
+        result[f"median_{name}"] = float(np.median(table[:, i]))
+    result["epe_of_pairs"] = [round(float(x), 5) for x in table[:, 2]]
+    for i, half_name in enumerate(("rotation", "translation")):
+        result |= _uncertainty_figures(pixels, i, half_name)
+    return result
+
+
+def _errors(output: NetworkOutput, batch: TrainingBatch, selection: str) -> np.ndarray:
+    """(B, 6) R_err, T_err and EPE of the network and of zero motion."""
+    gt = batch.targets
+    if selection.endswith("-joint") and isinstance(output, PixelwisePrediction):
+        rotation, translation = select(output, selection.removesuffix("-joint"), joint=True)
+    else:
+        rotation, translation = chosen_pose(output, selection)
+    T = selected_transform(rotation, translation)
+    flow, _, defined = reconstruct(gt.depth_prev, T, gt.K_prev, gt.K_curr)
+    near = gt.ego_flow.norm(dim=1) < EPE_LIMIT_PX
+    # Sky has no depth to reproject; a point behind the camera has no flow: neither counts.
+    counts = defined & near
+    total = (defined | ~near).flatten(1).sum(1).clamp(min=1)
+
+    def epe(difference: torch.Tensor) -> torch.Tensor:
+        error = torch.where(counts[:, None], difference.abs(), 0.0).mean(dim=1)
+        return error.flatten(1).sum(1) / total
+
+    columns = [
+        (rotation - gt.rotation_deg).abs().mean(1),
+        (translation - gt.translation).abs().mean(1),
+        epe(flow - gt.ego_flow),
+        gt.rotation_deg.abs().mean(1),
+        gt.translation.abs().mean(1),
+        epe(gt.ego_flow),
+    ]
+    return torch.stack(columns, dim=1).float().cpu().numpy()
+
+
+def _uncertainty(output: PixelwisePrediction, batch: TrainingBatch) -> list[np.ndarray]:
+    """Per pair (N, 7) of its valid pixels: moving; of both halves mean s, |error|, |error| / U."""
+    gt = batch.targets
+    valid = batch.inputs.valid[:, ::PIXEL_STRIDE, ::PIXEL_STRIDE]
+    maps = [batch.moving[:, None].float()]
+    for value, s, target in (
+        (output.rotation, output.log_scale_rotation, gt.rotation_deg),
+        (output.translation, output.log_scale_translation, gt.translation),
+    ):
+        error = (value - target[:, :, None, None]).abs()
+        half = torch.stack([s.mean(1), error.mean(1), (error * (-s).exp()).mean(1)], dim=1)
+        maps.append(F.interpolate(half.float(), size=batch.moving.shape[1:], mode="nearest"))
+    table = torch.cat(maps, dim=1)[..., ::PIXEL_STRIDE, ::PIXEL_STRIDE].permute(0, 2, 3, 1)
+    return [table[b][valid[b]].cpu().numpy() for b in range(len(batch))]
+
+
+def _uncertainty_figures(pixels: list[np.ndarray], index: int, name: str) -> dict[str, Any]:
+    """Figures of one half; the rank correlation is the mean of that inside each pair."""
+    keys = [f"{figure}_{name}" for figure in ("auroc", "spearman", "laplace_ratio")]
+    if not pixels:
+        return dict.fromkeys(keys)
+    table = np.concatenate(pixels)
+    s, ratio = table[:, 1 + 3 * index], table[:, 3 + 3 * index]
+    columns = (1 + 3 * index, 2 + 3 * index)
+    ranks = [spearmanr(p[:, columns[0]], p[:, columns[1]]).statistic for p in pixels if len(p) > 2]
+    auroc = area_under_curve(s, table[:, 0] > 0.5)
+    return dict(zip(keys, (auroc, float(np.nanmean(ranks)), float(ratio.mean())), strict=True))
+
+
+def calibrate_scales(
+    network: torch.nn.Module, preset: Preset, count: int, seed: int = 0
+) -> dict[str, float]:
+    """Add to s of the translation what makes the mean of |error| / exp(s) one; the errors stay.
+
+    The scales of the rotation are left alone: they are the weights of the fit as well.
+
+    Args:
+        network: a PWVO with uncertainty; its last bias is changed.
+        preset: whose pairs count.
+        count: of development pairs.
+        seed: of them.
+
+    Returns:
+        ``translation``, what was added.
+
+    Raises:
+        InputError: a network without uncertainty.
+    """
+    head = getattr(network, "head_uncertainty", None)
+    if head is None:
+        raise InputError("calibrate_scales: expected a pixel-wise network with uncertainty.")
+    found = evaluate_network(network, preset, seed, count)
+    shift = float(np.log(found["laplace_ratio_translation"]))
+    with torch.no_grad():
+        head[-1].bias[3:] += shift
+    return {"translation": shift}

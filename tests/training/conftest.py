@@ -1,0 +1,26 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from hybridvo.synthetic.diverse import DiverseOptions
+from hybridvo.synthetic.paper import PaperOptions
+from hybridvo.training.stream import Mixture
+
+SIZE = {"height": 32, "width": 64}
+
+
+@pytest.fixture
+def mixture() -> Mixture:
+    return Mixture((PaperOptions(**SIZE), DiverseOptions(**SIZE)), (0.5, 0.5))
+
+
+@pytest.fixture(scope="session")
+def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A few of the selector's training samples."""
+    from hybridvo.training.selector_data import write_shard
+
+    folder = tmp_path_factory.mktemp("shards")
+    assert write_shard(folder, 0, seeds=12) > 4
+    return folder

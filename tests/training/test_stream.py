@@ -1,0 +1,91 @@
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+import torch
+
+from hybridvo.errors import InputError
+from hybridvo.synthetic.dataset import StoredSamples, write_samples
+from hybridvo.synthetic.paper import PaperOptions
+from hybridvo.training.stream import Mixture, SampleStream, collate, sample_generator
+
+
+def flows(loader, count: int) -> list[torch.Tensor]:
+    return [batch.inputs.flow for batch in itertools.islice(loader, count)]
+
+
+def test_workers_change_nothing(mixture):
+    stream = SampleStream(mixture, 1, 8, 2)
+    loader = torch.utils.data.DataLoader(
+        stream, batch_size=None, num_workers=2, multiprocessing_context="fork"
+    )
+    for a, b in zip(flows(stream, 4), flows(loader, 4), strict=True):
+        assert torch.equal(a, b)
+
+
+def test_ranks_share_one_stream_that_resumes_at_an_index(mixture):
+    one = flows(SampleStream(mixture, 1, 0, 4), 2)
+    ranks = [flows(SampleStream(mixture, 1, 0, 2, rank, 2), 2) for rank in (0, 1)]
+    for step in range(2):
+        assert torch.equal(one[step], torch.cat([ranks[0][step], ranks[1][step]]))
+    assert torch.equal(flows(SampleStream(mixture, 1, 4, 4), 1)[0], one[1])
+
+
+def test_no_training_seed_draws_a_held_out_sample():
+    held, train = (
+        {
+            tuple(sample_generator(seed, i, training).integers(0, 2**62, 2))
+            for seed, i in itertools.product(range(3), range(9))
+        }
+        for training in (False, True)
+    )
+    assert len(held) == len(train) == 27 and not held & train
+
+
+def test_mixture_keeps_its_shares():
+    class Mark:
+        def __init__(self, name):
+            self.name = name
+
+        def sample(self, rng):
+            return self.name
+
+    mixed = Mixture((Mark("a"), Mark("b"), Mark("c")), (1.0, 0.0, 3.0))
+    drawn = [mixed.sample(sample_generator(0, i)) for i in range(2000)]
+    # four standard errors of a share of a quarter
+    assert drawn.count("a") / 2000 == pytest.approx(0.25, abs=0.04)
+    assert "b" not in drawn
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: sample_generator(-1, 0),
+        lambda: sample_generator(0, -1),
+        lambda: Mixture((PaperOptions(),), (0.5, 0.5)),
+        lambda: Mixture((PaperOptions(),), (-1.0,)),
+        lambda: Mixture((), ()),
+    ],
+)
+def test_refuses_nonsense(call):
+    with pytest.raises(InputError, match="got"):
+        call()
+
+
+def test_stored_samples_are_one_stream_for_every_training(tmp_path):
+    list(write_samples(PaperOptions(height=32, width=64), 5, tmp_path))
+    data = Mixture((StoredSamples(str(tmp_path)),), (1.0,))
+    first, again = (flows(SampleStream(data, 3, 0, 4), 2) for _ in range(2))
+    assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
+    with pytest.raises(InputError, match="held_out"):
+        data.presets[0].for_evaluation()
+
+
+def test_a_batch_holds_its_samples(mixture):
+    samples = [mixture.sample(sample_generator(0, i)) for i in range(3)]
+    batch = collate(samples)
+    assert len(batch) == 3
+    np.testing.assert_array_equal(batch.targets.rotation_deg[1], samples[1].rotation_deg)
+    np.testing.assert_array_equal(batch.moving[2], samples[2].moving)
