@@ -120,7 +120,7 @@ def run(
     if rrd is not None:
         # one in the output folder is the folder's affair
         check_recording(rrd or RECORDING, replace=mode != "new" or not rrd)
-    sequence = open_sequence(path, dataset, **({"strict": True} if options.strict else {}))
+    sequence = open_sequence(path, dataset)
     frames = range(options.start, min(options.stop or len(sequence), len(sequence)), options.stride)
     if not frames:
         raise InputError(

@@ -83,6 +83,7 @@ def draw(
         raise InputError(f"{out}: exists; pass --overwrite.")
     if steps < 1:
         raise InputError(f"steps: expected at least 1, got {steps}.")
+    found = networks(weights)
     opened = open_sequence(sequence, dataset)
     given = read_pair(opened, pair, flow)
     flow_gt = None
@@ -92,7 +93,7 @@ def draw(
     method = method or DEFAULT_METHOD
     motion = estimate(given, method=method)
     panels, numbers, moving = pair_panels(given, motion, T_gt, flow_gt)
-    for name, network in networks(weights):
+    for name, network in found:
         more, values = network_panels(name, network, given, T_gt, moving, steps)
         panels += more
         numbers |= values
