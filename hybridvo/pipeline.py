@@ -7,11 +7,12 @@ Read this file first. The stages: *predict* (a network), *search* (every strong 
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import functools
 import hashlib
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
@@ -115,6 +116,23 @@ class Models:
 def default_models(device: str = "cpu") -> Models:
     """The pretrained networks, shared by all estimates of a process."""
     return Models(device)
+
+
+@contextlib.contextmanager
+def one_thread() -> Iterator[None]:
+    """Run torch's CPU kernels on one thread, and as before afterwards.
+
+    A pair at 128x256 is too little work for several threads, which wait for each other: on a busy
+    machine that takes ten times as long.
+    """
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def torch_device(device: str) -> str:
@@ -353,7 +371,8 @@ def run_method(pair: FramePair, method: str, ctx: Context) -> RelativePose:
     """:func:`estimate` for arguments that were checked."""
     check_method(method, ctx.models)
     started = time.perf_counter()
-    found = METHODS[method](pair, ctx)
+    with one_thread() if networks_of(method) else contextlib.nullcontext():
+        found = METHODS[method](pair, ctx)
     mode = ctx.options.photometric.mode
     if (mode == "on" and method in (*SELECTING, "refine")) or (
         mode == "auto" and method == "hybrid"
