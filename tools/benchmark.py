@@ -10,7 +10,10 @@ Writes one JSON with a key for each part. Development uses the seeds 0 to 999, p
 from __future__ import annotations
 
 import argparse
+import json
+import subprocess
 import sys
+import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -237,6 +240,16 @@ def real_rows(sequence: Any, provider: Any, methods: dict[str, Estimator]) -> di
     return rows
 
 
+def demo(args: argparse.Namespace) -> dict[str, Any]:
+    """What ``hybridvo demo`` prints."""
+    with tempfile.TemporaryDirectory() as folder:
+        program = str(Path(sys.executable).parent / "hybridvo")
+        command = [program, "demo", "--out", f"{folder}/demo", "--json", "--quiet"]
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+    content = json.loads(done.stdout)
+    return {name: content[name] for name in ("scene", "moving_fraction", "rows")}
+
+
 def estimators(names: tuple[str, ...]) -> tuple[dict[str, Estimator], dict[str, str]]:
     """Those that can run here, by name, and reason and remedy for the others."""
     from hybridvo import estimate
@@ -271,6 +284,7 @@ PARTS: dict[str, Callable[[argparse.Namespace], dict[str, Any]]] = {
     "heavy": heavy,
     "real": real,
     "costs": costs,
+    "demo": demo,
 }
 
 
