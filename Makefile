@@ -38,7 +38,7 @@ format: $(STAMP)
 
 docs: $(STAMP)
 	$(BIN)/$(PIP_INSTALL) -c constraints.txt -e ".[docs]"
-	$(BIN)/mkdocs build --strict
+	$(BIN)/mkdocs build --strict -f configs/mkdocs.yml
 
 clean:
 	rm -rf $(VENV) build dist runs site

@@ -17,12 +17,11 @@ _HOME = {
     "FramePair": "hybridvo.types",
     "MotionPrior": "hybridvo.types",
     "Options": "hybridvo.options",
+    "PWVO": "hybridvo.network.pwvo",
     "PairBatch": "hybridvo.types",
-    "PixelwisePrediction": "hybridvo.types",
     "RelativePose": "hybridvo.types",
     "Status": "hybridvo.types",
     "Step": "hybridvo.types",
-    "HybridVOError": "hybridvo.errors",
     "Odometry": "hybridvo.odometry",
     "Trajectory": "hybridvo.trajectory",
     "estimate": "hybridvo.pipeline",
@@ -30,6 +29,10 @@ _HOME = {
     "iter_pairs": "hybridvo.data.sequence",
     "refine": "hybridvo.pipeline",
     "select": "hybridvo.network.selection",
+    "dis_flow": "hybridvo.flow",
+    "evaluate": "hybridvo.evaluation.metrics",
+    "to_gtsam_covariance": "hybridvo.geometry",
+    "to_ros_covariance": "hybridvo.geometry",
 }
 
 __all__ = ["__version__", *_HOME]

@@ -1,4 +1,4 @@
-"""Exceptions of hybridvo. Bad input raises one of these at the door; a failed estimate never does.
+"""Exceptions of hybridvo. Bad input raises one of these; a failed estimate never does.
 
 Every message says what is wrong, where, what was found, what was expected and how to mend it.
 """
@@ -7,7 +7,9 @@ from __future__ import annotations
 
 
 class HybridVOError(Exception):
-    """Base class of everything that hybridvo raises on purpose."""
+    """Base class of everything that hybridvo raises on purpose; ``exit_code`` of the commands."""
+
+    exit_code = 2
 
 
 class InputError(HybridVOError, ValueError):
@@ -29,6 +31,10 @@ class DegenerateError(HybridVOError, ValueError):
 class OutputError(HybridVOError, OSError):
     """A result that could not be written (exit code 5)."""
 
+    exit_code = 5
+
 
 class LockedError(HybridVOError, RuntimeError):
     """An output folder that another run holds (exit code 4)."""
+
+    exit_code = 4

@@ -9,7 +9,6 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hybridvo.checks import to_numpy
 from hybridvo.errors import InputError
 from hybridvo.types import Camera
 
@@ -184,20 +183,53 @@ def wxyz_to_xyzw(quaternion: np.ndarray) -> np.ndarray:
 
 
 def to_gtsam_covariance(covariance: np.ndarray) -> np.ndarray:
-    """(6, 6) covariance for a GTSAM ``BetweenFactorPose3`` whose measurement is ``T_prev_curr``.
+    """Covariances for a GTSAM ``BetweenFactorPose3`` whose measurement is ``T_prev_curr``.
 
     Ours is of ``Exp(d) T_curr_prev``, d = (translation, rotation). Its inverse is
     ``T_prev_curr Exp(-d)``: the same covariance, now of a right perturbation, which is GTSAM's
     side. Only the order changes, to (rotation, translation).
 
+    Args:
+        covariance: (6, 6) or (N, 6, 6), as ``motion.covariance`` and ``steps.npz`` hold them.
+
     Raises:
-        InputError: another shape than (6, 6).
+        InputError: another shape.
     """
-    covariance = to_numpy(covariance, "to_gtsam_covariance")
-    if covariance.shape != (6, 6):
-        raise InputError(f"to_gtsam_covariance: expected shape (6, 6), got {covariance.shape}.")
+    covariance = _covariances(covariance, "to_gtsam_covariance")
     order = [3, 4, 5, 0, 1, 2]
-    return covariance[np.ix_(order, order)]
+    return covariance[..., order, :][..., order]
+
+
+def to_ros_covariance(covariance: np.ndarray, T_prev_curr: np.ndarray) -> np.ndarray:
+    """Covariances for the ``geometry_msgs/PoseWithCovariance`` of ``T_prev_curr``.
+
+    ROS keeps (x, y, z, rotation about x, y, z) about the axes of the parent frame, which is the
+    previous camera: ``T_prev_curr Exp(-d)`` turned into them by the rotation of ``T_prev_curr``.
+
+    Args:
+        covariance: (6, 6) or (N, 6, 6), as ``motion.covariance`` and ``steps.npz`` hold them.
+        T_prev_curr: (4, 4) or (N, 4, 4), as ``motion.T_prev_curr``.
+
+    Raises:
+        InputError: other shapes.
+    """
+    covariance = _covariances(covariance, "to_ros_covariance")
+    T = np.asarray(T_prev_curr)
+    if T.shape != (*covariance.shape[:-2], 4, 4):
+        raise InputError(
+            f"to_ros_covariance: expected T_prev_curr of shape "
+            f"{(*covariance.shape[:-2], 4, 4)}, got {T.shape}."
+        )
+    A = np.zeros_like(covariance, dtype=np.float64)
+    A[..., :3, :3] = A[..., 3:, 3:] = T[..., :3, :3]
+    return A @ covariance @ np.swapaxes(A, -1, -2)
+
+
+def _covariances(value: np.ndarray, where: str) -> np.ndarray:
+    array = np.asarray(value)
+    if array.ndim not in (2, 3) or array.shape[-2:] != (6, 6):
+        raise InputError(f"{where}: expected shape (6, 6) or (N, 6, 6), got {array.shape}.")
+    return array
 
 
 def pose_matrix(pose: np.ndarray) -> np.ndarray:

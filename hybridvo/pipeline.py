@@ -7,11 +7,12 @@ Read this file first. The stages: *predict* (a network), *search* (every strong 
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import functools
 import hashlib
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
@@ -115,6 +116,23 @@ class Models:
 def default_models(device: str = "cpu") -> Models:
     """The pretrained networks, shared by all estimates of a process."""
     return Models(device)
+
+
+@contextlib.contextmanager
+def one_thread() -> Iterator[None]:
+    """Run torch's CPU kernels on one thread, and as before afterwards.
+
+    A pair at 128x256 is too little work for several threads, which wait for each other: on a busy
+    machine that takes ten times as long.
+    """
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def torch_device(device: str) -> str:
@@ -222,6 +240,24 @@ def hybrid(pair: FramePair, ctx: Context) -> RelativePose:
     return hybrid_flow(pair, ctx)
 
 
+def pwvo_refine(pair: FramePair, ctx: Context) -> RelativePose:
+    """PWVO's selected motion and uncertainty seed and weigh the refinement in torch, on its device.
+
+    The same lines serve batches, with gradients to flow, depth, weights and maps.
+    """
+    from hybridvo.learned import plain_torch
+    from hybridvo.network.selection import select
+    from hybridvo.refinement.torch_backend import refine_batch
+
+    network = ctx.models.network("pwvo")
+    with plain_torch():
+        batch = PairBatch.from_pairs([pair], device=ctx.models.device)
+        seed = select(network(batch))
+        return refine_batch(batch, seed.T_curr_prev, seed.weights, options=ctx.options.refine).one(
+            0
+        )
+
+
 def learned(name: str) -> Callable[[FramePair, Context], RelativePose]:
     """A network alone, by the paper's selection."""
 
@@ -252,6 +288,7 @@ METHODS: dict[str, Callable[[FramePair, Context], RelativePose]] = {
     "hybrid": hybrid,
     "hybrid-flow": hybrid_flow,
     "refine": classical,
+    "pwvo-refine": pwvo_refine,
     **{name: learned(name) for name in LEARNED},
     **{name: baseline(name) for name in BASELINES},
 }
@@ -264,6 +301,8 @@ def networks_of(method: str) -> tuple[str, ...]:
     """Names of the weights that a method uses."""
     if method in SELECTING:
         return ("judge", "pwvo")
+    if method == "pwvo-refine":
+        return ("pwvo",)
     return (method,) if method in LEARNED else ()
 
 
@@ -353,7 +392,8 @@ def run_method(pair: FramePair, method: str, ctx: Context) -> RelativePose:
     """:func:`estimate` for arguments that were checked."""
     check_method(method, ctx.models)
     started = time.perf_counter()
-    found = METHODS[method](pair, ctx)
+    with one_thread() if networks_of(method) else contextlib.nullcontext():
+        found = METHODS[method](pair, ctx)
     mode = ctx.options.photometric.mode
     if (mode == "on" and method in (*SELECTING, "refine")) or (
         mode == "auto" and method == "hybrid"

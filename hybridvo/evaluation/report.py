@@ -33,8 +33,10 @@ from hybridvo.files import atomic_write
 
 MISSING = "-"
 """What a table shows where there is no number."""
-OURS = ("hybrid", "hybrid-flow", "refine", "pwvo-refine", "pwvo")
-"""Methods of this package; the others are peers, or the paper's networks."""
+PEERS = (
+    *("pnp-ransac", "pnp-ransac-tuned", "usac-magsac", "poselib", "opencv-rgbd", "open3d-rgbd"),
+)
+"""Methods of other projects."""
 LEVEL = 1.02
 """Ratio of two errors below which neither has won."""
 EMBEDDED_BYTES = 2_000_000
@@ -168,13 +170,19 @@ def headline(result: Mapping[str, Any]) -> str:
         return "Nothing is scored: no pair has ground truth and depth."
     first = order[0]
     oracle = ", an oracle" if is_oracle(flow) else ""
-    text = f"With {flow} flow{oracle}, {first['method']} has the smallest errors: {_score(first)}"
+    text = (
+        f"With {flow} flow{oracle}, {first['method']} has the smallest errors: median "
+        f"{number(first['epe_l2_px_median'])} px (error of the ego flow), {first['failures']} of "
+        f"{first['pairs']} pairs failed (above 1 px, or given up)"
+    )
     for label, others in (
         ("next is", order[1:2]),
-        ("the best of others is", [r for r in order[2:] if r["method"] not in OURS][:1]),
+        ("the best of other projects is", [r for r in order[2:] if r["method"] in PEERS][:1]),
     ):
         for row in others:
-            text += f"; {label} {row['method']} with {_score(row)}{_times(row, first)}"
+            error = number(row["epe_l2_px_median"])
+            text += f"; {label} {row['method']}: {error} px{_times(row, first)}"
+            text += f", {row['failures']} failed"
     worst = [
         entry
         for entry in result["worst_pairs"]
@@ -184,13 +192,6 @@ def headline(result: Mapping[str, Any]) -> str:
         place = f"{worst[0]['sequence']}, pair {worst[0]['index']}"
         text += f". Its worst pair is {place}: {number(worst[0]['epe_l2_px'])} px"
     return text + "."
-
-
-def _score(row: Mapping[str, Any]) -> str:
-    return (
-        f"{number(row['epe_l2_px_median'])} px median error of the ego flow, {row['failures']} "
-        f"failures (above 1 px or given up) in {row['pairs']} pairs"
-    )
 
 
 def _times(row: Mapping[str, Any], first: Mapping[str, Any]) -> str:

@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from batches import F64, noisy_batch
 
 from hybridvo.geometry import se3_exp
 from hybridvo.refinement.batch import BatchOptions
@@ -17,6 +16,7 @@ from hybridvo.refinement.torch_factors import KERNELS, RobustNoise, linearize, s
 from hybridvo.refinement.torch_pixels import gather_pixels
 from hybridvo.torch_geometry import left_update, pixel_grid, pp, reproject
 from hybridvo.types import PairBatch
+from tests.refinement.batches import F64, noisy_batch
 
 NOISE = (0.3, 0.03)
 NAMES = ("flow", "depth_prev", "K_prev", "K_curr", "weights", "depth_curr", "flow_variance")

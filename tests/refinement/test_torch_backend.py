@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from batches import F64, noisy_batch
 
 from hybridvo.errors import InputError
 from hybridvo.geometry import rotation_angle, se3_exp
@@ -18,6 +17,7 @@ from hybridvo.refinement.torch_backend import refine_batch
 from hybridvo.synthetic.scenarios import make_pair
 from hybridvo.torch_geometry import pixel_grid, pp, reproject, se3
 from hybridvo.types import PairBatch, Reason, State
+from tests.refinement.batches import F64, noisy_batch
 
 FIELDS = ("SE3", "covariance", "converged", "failed", "cost", "weights", "noise")
 

@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from batches import F64, noisy_batch
 
 from hybridvo.errors import InputError
 from hybridvo.geometry import ego_flow, pixel_grid, se3_exp
@@ -27,6 +26,7 @@ from hybridvo.refinement.torch_factors import (
 from hybridvo.refinement.torch_pixels import from_tiles, gather_pixels, sample_depth, to_tiles
 from hybridvo.torch_geometry import left_update, pp, reproject, se3
 from hybridvo.types import Camera, PairBatch
+from tests.refinement.batches import F64, noisy_batch
 
 
 def test_one_pixel_by_hand() -> None:

@@ -1,0 +1,110 @@
+"""Options from a YAML file and from ``--set group.key=value``; the command line wins."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from hybridvo.errors import FormatError, InputError
+from hybridvo.files import parse_yaml
+from hybridvo.options import Options
+
+
+def option_defaults() -> dict[str, Any]:
+    """Every key that ``--set`` knows, such as ``refine.cutoff``, with its default."""
+    return {
+        f"{group}.{name}": value
+        for group, options in dataclasses.asdict(Options()).items()
+        for name, value in options.items()
+    }
+
+
+def load_options(
+    path: str | Path | None = None,
+    assignments: Iterable[str] = (),
+    given: Mapping[str, Any] | None = None,
+) -> Options:
+    """Options from a file, then from ``group.key=value`` texts, then from named values.
+
+    Args:
+        path: YAML file, or None for the defaults.
+        assignments: such as ``refine.cutoff=2.5``; values are YAML.
+        given: such as ``{"run.method": "refine"}``; values that are None are left out.
+
+    Raises:
+        InputError: no such file, an unknown key (the nearest known one is named), a value that is
+            out of bounds. FormatError: the file is no YAML mapping.
+
+    Example:
+        >>> load_options(assignments=["refine.cutoff=2.5"]).refine.cutoff
+        2.5
+    """
+    values = _from_file(Path(path)) if path is not None else {}
+    texts = list(assignments)
+    for text in texts:
+        key, sign, value = text.partition("=")
+        if not sign or not key.strip():
+            raise InputError(
+                f"--set: expected group.key=value, as in refine.cutoff=3, got {text!r}."
+            )
+        values[_known(key.strip(), "--set")] = parse_yaml(value, f"--set {key}")
+    values |= {key: value for key, value in (given or {}).items() if value is not None}
+    groups: dict[str, dict[str, Any]] = {}
+    for key, value in values.items():
+        group, name = key.split(".")
+        groups.setdefault(group, {})[name] = value
+    where = " and ".join(
+        [*([str(path)] if path is not None else []), *(["--set"] if texts else [])]
+    )
+    try:
+        return Options(
+            **{
+                field.name: type(field.default)(**groups.get(field.name, {}))
+                for field in dataclasses.fields(Options)
+            }
+        )
+    except InputError as error:
+        raise InputError(f"{where}: {error}" if where else str(error)) from None
+
+
+def _from_file(path: Path) -> dict[str, Any]:
+    """Content of an options file as ``group.key`` and value."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file.") from None
+    except UnicodeDecodeError:
+        raise FormatError(f"{path}: expected a YAML file, got binary data.") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}.") from None
+    content = parse_yaml(text, str(path))
+    if content is None:
+        return {}
+    if not isinstance(content, dict):
+        raise FormatError(f"{path}: expected 'group:' lines, got a {type(content).__name__}.")
+    values = {}
+    for group, entries in content.items():
+        if not isinstance(entries, dict):
+            groups = ", ".join(field.name for field in dataclasses.fields(Options))
+            raise InputError(
+                f"{path}: '{group}': expected a group ({groups}) with indented keys, "
+                f"got {entries!r}."
+            )
+        for name, value in entries.items():
+            values[_known(f"{group}.{name}", str(path))] = value
+    return values
+
+
+def _known(key: str, where: str) -> str:
+    known = list(option_defaults())
+    if key not in known:
+        last = key.rsplit(".", 1)[-1]
+        near = difflib.get_close_matches(key, known, n=1) or [
+            other for other in known if other.endswith(f".{last}")
+        ]
+        hint = f" (did you mean '{near[0]}'?)" if near else f"; known: {', '.join(known)}"
+        raise InputError(f"{where}: unknown key '{key}'{hint}.")
+    return key

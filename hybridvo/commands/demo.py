@@ -1,0 +1,170 @@
+"""``hybridvo demo``: a rendered scene in which objects move, and the methods on it."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from hybridvo.commands.configuration import load_options
+from hybridvo.commands.run import EXIT_INTERRUPTED, RunResult, run
+from hybridvo.commands.run_folder import make_folder
+from hybridvo.data.sequence import open_sequence
+from hybridvo.errors import InputError, OutputError
+from hybridvo.evaluation.plots import plot_trajectories
+from hybridvo.files import atomic_write, write_json
+from hybridvo.synthetic.render import make_scene, write_sintel
+
+METHODS = {
+    "hybrid": "hybridvo (hybrid)",
+    "refine": "hybridvo (refine)",
+    "pnp-ransac": "OpenCV PnP-RANSAC",
+    "pnp-ransac-tuned": "OpenCV PnP-RANSAC, tuned",
+    "identity": "identity (no motion)",
+}
+"""Methods of the demo and what its table calls them."""
+DRAWN = ("pnp-ransac-tuned", "hybrid")
+MARK = "hybridvo_demo.json"
+"""File by which a folder is known as a demo's own, and may be replaced."""
+SCENE = "light"
+HEIGHT, WIDTH = 218, 512
+
+
+def demo(
+    out: str | os.PathLike[str],
+    *,
+    frames: int = 20,
+    seed: int = 0,
+    overwrite: bool = False,
+    command: Iterable[str] = (),
+    quiet: bool = False,
+) -> dict[str, Any] | None:
+    """Render, run and compare.
+
+    The scene is written in Sintel's layout under ``out/data``; flow comes from OpenCV DIS, never
+    from the true flow that is written beside it. Depth is the renderer's.
+
+    Returns:
+        JSON-ready: the scene, a row for each method, ``image``; None where it was interrupted.
+
+    Raises:
+        InputError: too few frames, or a folder that holds something already.
+        OutputError: a file that cannot be written.
+    """
+    if frames < 2:
+        raise InputError(f"demo: expected at least 2 frames, got {frames}.")
+    out = Path(out)
+    _prepare(out, overwrite)
+    scene = make_scene(SCENE, seed, height=HEIGHT, width=WIDTH, frames=frames)
+    write_sintel(scene, out / "data", SCENE)
+    sequence = open_sequence(out / "data" / "training" / "clean" / SCENE, "sintel")
+    results: dict[str, RunResult] = {}
+    for method in METHODS:
+        options = load_options(
+            given={"run.method": method, "flow.source": "dis", "run.max_failed": 1.0}
+        )
+        results[method] = run(
+            sequence,
+            out / method,
+            options,
+            mode="overwrite" if overwrite else "new",
+            command=command,
+            quiet=quiet,
+        )
+        if results[method].exit_code == EXIT_INTERRUPTED:
+            return None
+    moving = float(np.median([(scene.object_id(i) > 0).mean() for i in range(scene.frames)]))
+    content = {
+        "command": list(command),
+        "scene": {"kind": SCENE, "seed": seed, "frames": frames, "height": HEIGHT, "width": WIDTH},
+        "moving_fraction": moving,
+        "flow_source": "dis",
+        "depth_source": "true",
+        "alignment": "origin",
+        "rows": [_row(method, result.summary) for method, result in results.items()],
+        "image": os.fspath(out / "demo.png"),
+    }
+    title = f"{100 * moving:.0f} % of the pixels (in colour) move by themselves"
+    _draw(out / "demo.png", sequence.frame(0).rgb, scene.object_id(0) > 0, results, title)
+    write_json(out / MARK, content)
+    return content
+
+
+def demo_text(content: dict[str, Any]) -> str:
+    """The table for people, and what to do next."""
+    scene, lines = content["scene"], []
+    lines.append(
+        f"{scene['frames']} rendered frames of {scene['width']}x{scene['height']}, "
+        f"{100 * content['moving_fraction']:.0f} % of the pixels move by themselves; flow: OpenCV "
+        f"DIS on the images; depth: the renderer's (true)."
+    )
+    lines.append("ATE after aligning the first pose, the other errors are means a pair.\n")
+    lines.append(
+        f"{'method':26}{'ATE cm':>10}{'RPE cm':>10}{'rotation deg':>14}{'ego-flow px':>13}"
+        f"{'failed':>8}{'ms/frame':>10}"
+    )
+    for row in content["rows"]:
+        lines.append(
+            f"{row['method']:26}{row['ate_cm']:10.3f}{row['rpe_cm']:10.3f}"
+            f"{row['rotation_deg']:14.4f}{row['epe_px']:13.3f}{row['failed']:8}"
+            f"{row['frame_ms']:10.1f}"
+        )
+    lines += [
+        f"\nimage: {content['image']}",
+        "next:  hybridvo run DIR       your own sequence (hybridvo init DIR writes camera.yaml)",
+        "       hybridvo doctor DIR    what is wrong with it",
+    ]
+    return "\n".join(lines)
+
+
+def _prepare(out: Path, overwrite: bool) -> None:
+    """An empty folder, or one that an earlier demo left and that may be replaced."""
+    try:
+        if out.exists() and any(out.iterdir()):
+            if not (out / MARK).is_file():
+                raise InputError(
+                    f"{out}: is not empty and holds no finished demo. Choose another --out, or "
+                    f"remove the folder."
+                )
+            if not overwrite:
+                raise InputError(f"{out}: holds a demo already. Pass --overwrite to replace it.")
+            shutil.rmtree(out / "data", ignore_errors=True)
+    except OSError as error:
+        raise OutputError(f"{out}: cannot be written: {error.strerror or error}.") from error
+    make_folder(out)
+    write_json(out / MARK, {})
+
+
+def _row(method: str, summary: dict[str, Any]) -> dict[str, Any]:
+    """Line of the table."""
+    metrics = summary["metrics"]
+    return {
+        "method": METHODS[method],
+        "ate_cm": 100.0 * metrics["ate_rmse_origin"],
+        "rpe_cm": 100.0 * metrics["rpe_trans_mean"],
+        "rotation_deg": metrics["rot_err_deg_mean"],
+        "epe_px": metrics["epe_l2_px"],
+        "failed": summary["failed"],
+        "frame_ms": summary["frame_ms_median"],
+    }
+
+
+def _draw(
+    path: Path, rgb: Any, moving: np.ndarray, results: dict[str, RunResult], title: str
+) -> None:
+    """The first frame, its moving pixels in colour, above the paths."""
+    paths = path.with_name("trajectory.png")
+    drawn = {METHODS[m]: t for m in DRAWN if (t := results[m].trajectory) is not None}
+    plot_trajectories(drawn, paths, truth=results["hybrid"].gt, alignment="origin", title=title)
+    below = cv2.imread(os.fspath(paths))
+    grey = cv2.cvtColor(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), cv2.COLOR_GRAY2RGB)
+    bgr = np.ascontiguousarray(np.where(moving[..., None], rgb, grey)[..., ::-1])
+    height = round(bgr.shape[0] * below.shape[1] / bgr.shape[1])
+    above = cv2.resize(bgr, (below.shape[1], height), interpolation=cv2.INTER_CUBIC)
+    with atomic_write(path, "wb") as file:
+        file.write(cv2.imencode(".png", np.vstack([above, below]))[1].tobytes())

@@ -1,0 +1,181 @@
+"""What goes into a run: the flow, the weights, and the facts of the machine and the sequence."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import logging
+import os
+import platform
+import re
+import time
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import hybridvo
+from hybridvo.data.sequence import Sequence
+from hybridvo.errors import InputError
+from hybridvo.flow import FlowField, FlowProvider, dis_flow, fallback, file_flow
+from hybridvo.options import Options
+from hybridvo.pipeline import Models, networks_of
+from hybridvo.types import Frame
+
+DARK_LEVEL = 20.0
+"""Grey levels (of 255) below which nine tenths of a dark image lie; lit rooms and night streets
+have a tenth above 60."""
+
+_logger = logging.getLogger(__name__)
+
+
+class TimedFlow:
+    """A flow provider that keeps the first field of a frame and sums up the time spent.
+
+    A field is None, with a line in the log, where a file is damaged; with ``strict`` it raises.
+    """
+
+    def __init__(self, provider: FlowProvider, strict: bool = False) -> None:
+        self._provider, self._strict = provider, strict
+        self.field: FlowField | None = None
+        self.ms = 0.0
+
+    def reset(self) -> None:
+        """Forget the last frame's."""
+        self.field, self.ms = None, 0.0
+
+    def __call__(self, prev: Frame, curr: Frame) -> FlowField:
+        """Flow from ``prev`` to ``curr``."""
+        started = time.perf_counter()
+        try:
+            field = self._provider(prev, curr)
+        except (InputError, OSError) as error:
+            if self._strict:
+                raise InputError(f"flow of frame {prev.index}: {error}") from error
+            _logger.warning("flow of frame %d: %s", prev.index, error)
+            field = FlowField(None, source="file")
+        self.ms += 1e3 * (time.perf_counter() - started)
+        if self.field is None:  # the window may ask for more, from its key frames
+            self.field = field
+        return field
+
+
+def flow_provider(sequence: Sequence, options: Options) -> FlowProvider:
+    """Provider of the flow that the options ask for.
+
+    Raises:
+        InputError: flow files asked for where there are none, or with a stride above 1.
+    """
+    source, stride = options.flow.source, options.run.stride
+    if source == "file":
+        if not sequence.has_flow:
+            raise InputError(f"{sequence.name}: there are no flow files; pass --flow dis.")
+        if stride > 1:
+            raise InputError(
+                f"{sequence.name}: flow files lead from one frame to the next, not over a stride "
+                f"of {stride}; pass --flow dis."
+            )
+        return file_flow(sequence)
+    dis = dis_flow(options.flow.dis_preset, options.flow.forward_backward)
+    if source == "auto" and sequence.has_flow and stride == 1:
+        # a damaged file is no reason to stop where DIS can stand in
+        strict = options.run.strict
+        return fallback(TimedFlow(file_flow(sequence), strict), dis)
+    return dis
+
+
+def make_models(weights: Iterable[str], method: str, device: str) -> Models:
+    """Networks of a run: the pretrained ones, or the files of ``NAME=FILE``.
+
+    Raises:
+        InputError: another form, no such file, a name that the method does not use, or a device
+            that is not there.
+    """
+    files = {}
+    for text in weights:
+        name, sign, path = text.partition("=")
+        known = networks_of(method)
+        if not sign or name not in known:
+            raise InputError(
+                f"--weights: expected NAME=FILE with {' or '.join(known) or 'no name'} for "
+                f"--method {method}, got {text!r}."
+            )
+        if not Path(path).is_file():
+            raise InputError(f"--weights {name}: {path}: no such file.")
+        files[name] = path
+    return Models(device, files)
+
+
+def run_name(sequence: Sequence) -> str:
+    """Name of a sequence as one plain path part."""
+    return re.sub(r"[^\w.-]+", "_", sequence.name).strip("._") or "sequence"
+
+
+def check_outside(out: Path, sequence: Sequence) -> None:
+    """Refuse to write among the frames of the sequence: the next run would read what is drawn."""
+    images = (".png", ".jpg", ".jpeg", ".npy", ".dpt", ".flo")
+    folders = {path.parent.resolve() for path in sequence.files() if path.suffix.lower() in images}
+    if out.resolve() in folders:
+        raise InputError(
+            f"{out}: holds frames of the sequence, and results among them would be taken for "
+            f"input. Choose another --out."
+        )
+
+
+def is_dark(rgb: np.ndarray | None) -> bool:
+    """Whether an image (H, W, 3) uint8 is too dark to see anything in."""
+    if rgb is None:
+        return False
+    return float(np.percentile(rgb[::4, ::4].max(axis=2), 90)) < DARK_LEVEL
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of the packages that decide numbers; absent ones are left out."""
+    from importlib.metadata import PackageNotFoundError, version
+
+    found = {"python": platform.python_version(), "hybridvo": hybridvo.__version__}
+    for name in ("numpy", "scipy", "opencv-python-headless", "numba", "torch", "evo", "poselib"):
+        with contextlib.suppress(PackageNotFoundError):
+            found[name] = version(name)
+    return found
+
+
+def run_header(
+    sequence: Sequence, frames: range, options: Options, command: Iterable[str]
+) -> dict[str, Any]:
+    """What ``run.json`` says of a run beside its state."""
+    return {
+        "command": list(command),
+        "versions": versions(),
+        "machine": {"platform": platform.platform(), "cpus": os.cpu_count()},
+        "options": dataclasses.asdict(options),
+        "sequence": {
+            "name": sequence.name,
+            "kind": sequence.kind,
+            "path": os.fspath(sequence.root),
+            "frames": len(frames),
+            "depth_source": sequence.depth_source,
+            "warnings": list(sequence.warnings),
+        },
+    }
+
+
+def is_repeated(prev: Frame, curr: Frame) -> bool:
+    """Whether a frame has the very image of the one before, but another depth map.
+
+    A camera at rest gives no two equal images, and a rendered one equal depth as well: a driver has
+    handed out an old image.
+    """
+    if prev.rgb is None or curr.rgb is None or prev.depth is None or curr.depth is None:
+        return False
+    same = np.array_equal(prev.rgb, curr.rgb)
+    return same and not np.array_equal(prev.depth, curr.depth, equal_nan=True)
+
+
+def deciding(options: Options) -> dict[str, Any]:
+    """The options that decide the result: what a resumed run must share."""
+    values = dataclasses.asdict(options)
+    for name in ("max_failed", "strict", "device"):
+        del values["run"][name]
+    return values

@@ -1,0 +1,99 @@
+"""Progress on stderr, and the signals that ask a command to stop."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from types import FrameType
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+from rich.progress import Progress as Bar
+
+PLAIN_INTERVAL_S = 5.0
+"""Seconds between progress lines where stderr is no terminal."""
+
+
+@contextlib.contextmanager
+def interruptible() -> Iterator[threading.Event]:
+    """An event that the first SIGINT or SIGTERM sets; a second one raises KeyboardInterrupt.
+
+    Outside the main thread, where Python delivers no signals, the event stays unset.
+    """
+    event = threading.Event()
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        if event.is_set():
+            raise KeyboardInterrupt
+        event.set()
+
+    if threading.current_thread() is not threading.main_thread():
+        yield event
+        return
+    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield event
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+class Progress:
+    """Work done, on stderr: a bar on a terminal, a line every few seconds elsewhere.
+
+    Args:
+        total: units of work. label: what is run. quiet: show nothing. unit: name of the units.
+        done: units finished before, which do not count for the speed. console: where to write.
+    """
+
+    def __init__(
+        self,
+        total: int,
+        label: str,
+        *,
+        quiet: bool = False,
+        unit: str = "frames",
+        done: int = 0,
+        console: Console | None = None,
+    ) -> None:
+        self._console = console or Console(stderr=True, quiet=quiet, soft_wrap=True)
+        self._bar = Bar(
+            TextColumn("{task.description}", markup=False),  # a folder may be named [x]
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[rate]}", markup=False),
+            TimeRemainingColumn(),
+            console=self._console,
+            disable=not self._console.is_terminal,
+        )
+        self._task = self._bar.add_task(label, total=total, completed=done, rate="")
+        self._label, self._total, self._unit, self._before = label, total, unit, done
+        self._started = self._last = time.monotonic()
+
+    def __enter__(self) -> Progress:
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+    def update(self, done: int, failed: int = 0, total: int | None = None) -> None:
+        """``done`` units are finished, ``failed`` of them have failed."""
+        if total is not None:
+            self._total = total
+            self._bar.update(self._task, total=total)
+        now = time.monotonic()
+        speed = (done - self._before) / max(now - self._started, 1e-9)
+        rate = f"{speed:.1f} {self._unit}/s" + (f", {failed} failed" if failed else "")
+        if self._console.is_terminal:
+            self._bar.update(self._task, completed=done, rate=rate)
+        elif now - self._last >= PLAIN_INTERVAL_S or done == self._total:
+            self._last = now
+            self.say(f"{self._label}: {done}/{self._total} {self._unit}, {rate}")
+
+    def say(self, text: str) -> None:
+        """A line for the user, above the bar."""
+        self._console.print(text, markup=False, highlight=False)

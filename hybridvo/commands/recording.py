@@ -1,0 +1,152 @@
+"""A recording of a run for the Rerun viewer: images, flow, weights, path and covariance.
+
+Images are shrunk, compressed and taken every few frames; poses and numbers are kept for all.
+"""
+
+from __future__ import annotations
+
+import os
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from hybridvo.errors import InputError, OutputError
+from hybridvo.evaluation.maps import flow_colours, longest_flow
+from hybridvo.types import Frame, State, Step
+
+MAX_IMAGES = 300
+"""Images of a kind in a recording: with the sizes below about 15 MB at most."""
+MAX_SIDE = 480
+JPEG_QUALITY = 70
+SIGMAS = 3.0
+"""Size of the ellipsoids, in standard deviations."""
+SINCE_1970 = 1e8
+"""Seconds; larger stamps are dates."""
+
+
+def check_recording(path: str | os.PathLike[str]) -> None:
+    """Refuse what cannot become a recording, before a run is started.
+
+    Raises:
+        InputError: Rerun is not installed, or the name does not end in ``.rrd``.
+    """
+    if Path(path).suffix != ".rrd" or Path(path).is_dir():
+        raise InputError(f"--rrd {os.fspath(path)}: expected the name of a file that ends in .rrd.")
+    if find_spec("rerun") is None:
+        raise InputError("--rrd: Rerun is not installed; pip install 'hybridvo[viz]'.")
+
+
+class Recording:
+    """Writes a recording as the frames come in; use as a context manager.
+
+    Args:
+        path: file to write; where it exists, as after ``--resume``, a part is written beside it
+            that the viewer shows together with it.
+        name: of the sequence.
+        identity: the same for all parts of one run.
+        frames: expected number of frames; decides the stride of the images.
+        first: number of the first frame that will be recorded.
+        poses: (N, 4, 4) ground truth T_world_cam, or None.
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        name: str,
+        identity: str,
+        frames: int,
+        *,
+        first: int = 0,
+        poses: np.ndarray | None = None,
+    ) -> None:
+        import rerun
+
+        self.path = Path(path)
+        if first > 0 and self.path.exists():
+            self.path = self.path.with_stem(f"{self.path.stem}_from_{first:06d}")
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self.path.write_bytes(b"")  # Rerun reports a bad path only later, in a thread
+        except OSError as error:
+            raise OutputError(f"{self.path}: cannot be written: {error.strerror}.") from error
+        self._rr = rerun
+        self._stride = max(1, -(-frames // MAX_IMAGES))
+        self._positions: list[np.ndarray] = []
+        self._stream = rerun.RecordingStream(f"hybridvo {name}", recording_id=identity)
+        self._stream.save(self.path)
+        self._stream.log("world", rerun.ViewCoordinates.RIGHT_HAND_Y_DOWN, static=True)
+        known = [] if poses is None else poses[np.isfinite(poses).all(axis=(1, 2))]
+        if len(known):
+            line = (np.linalg.inv(known[0]) @ known)[:, :3, 3]
+            strip = rerun.LineStrips3D([line], colors=[140, 140, 140])
+            self._stream.log("world/ground_truth", strip, static=True)
+
+    def __enter__(self) -> Recording:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        """Write what is still in memory; the file is complete afterwards."""
+        if len(self._positions) > 1:
+            strip = self._rr.LineStrips3D([np.array(self._positions)], colors=[0, 114, 178])
+            self._stream.log("world/path", strip, static=True)
+        self._stream.flush()
+        self._stream.disconnect()
+
+    def add(self, frame: Frame, step: Step, flow: np.ndarray | None) -> None:
+        """Record a tracked frame; ``flow`` is (H, W, 2) px from the frame before, or None."""
+        rr, log = self._rr, self._stream.log
+        self._stream.set_time("frame", sequence=step.index)
+        # stamps of sensors count from 1970, those of rendered sequences from their start
+        clock = "timestamp" if step.timestamp > SINCE_1970 else "duration"
+        self._stream.set_time("time", **{clock: step.timestamp})
+        T = step.T_world_cam
+        log("world/camera", rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]))
+        self._numbers(step)
+        if len(self._positions) % self._stride == 0:
+            self._images(frame, step, flow)
+        self._positions.append(T[:3, 3].astype(np.float32))
+
+    def _numbers(self, step: Step) -> None:
+        rr, log, motion = self._rr, self._stream.log, step.motion
+        std = np.sqrt(np.maximum(np.diag(motion.covariance), 0.0))
+        log("covariance/translation_std_mm", rr.Scalars(1e3 * std[:3]))
+        log("covariance/rotation_std_mdeg", rr.Scalars(1e3 * np.degrees(std[3:])))
+        log("status/inlier_ratio", rr.Scalars(motion.inlier_ratio))
+        log("status/probability", rr.Scalars(motion.probability))
+        state = step.status.state
+        if state is not State.OK:
+            text = f"frame {step.index}: {step.status} {step.status.message}"
+            level = "WARN" if state is State.DEGRADED else "ERROR"
+            log("status/messages", rr.TextLog(text, level=level))
+        # the covariance of the motion, in the camera where it lies
+        values, axes = np.linalg.eigh(motion.covariance[:3, :3])
+        if np.linalg.det(axes) < 0:
+            axes[:, 0] *= -1
+        sizes = SIGMAS * np.sqrt(np.maximum(values, 0.0))
+        log("world/camera/covariance", rr.Transform3D(mat3x3=axes))
+        log("world/camera/covariance", rr.Ellipsoids3D(half_sizes=[sizes], colors=[213, 94, 0]))
+
+    def _images(self, frame: Frame, step: Step, flow: np.ndarray | None) -> None:
+        rr, log = self._rr, self._stream.log
+        height, width = frame.camera.shape
+        scale = min(1.0, MAX_SIDE / max(height, width))
+        size = max(1, round(width * scale)), max(1, round(height * scale))
+        K = np.diag([size[0] / width, size[1] / height, 1.0]) @ frame.camera.K
+        log("world/camera/image", rr.Pinhole(image_from_camera=K, width=size[0], height=size[1]))
+        if frame.rgb is not None:
+            log("world/camera/image", self._jpeg(frame.rgb, size))
+        if flow is not None:
+            log("flow", self._jpeg(flow_colours(flow, longest_flow(flow)), size))
+        if step.motion.weights is not None:
+            weights = (255 * np.clip(step.motion.weights, 0.0, 1.0)).astype(np.uint8)
+            log("weights", self._jpeg(np.repeat(weights[..., None], 3, axis=2), size))
+
+    def _jpeg(self, rgb: np.ndarray, size: tuple[int, int]) -> Any:
+        enlarged = rgb.shape[1] < size[0]  # weights may stand on a coarser grid
+        method = cv2.INTER_NEAREST if enlarged else cv2.INTER_AREA
+        bgr = cv2.resize(np.ascontiguousarray(rgb[..., ::-1]), size, interpolation=method)
+        _, content = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+        return self._rr.EncodedImage(contents=content.tobytes(), media_type="image/jpeg")

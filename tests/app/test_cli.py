@@ -1,0 +1,167 @@
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import filelock
+import numpy as np
+import pytest
+
+import hybridvo
+from hybridvo import __version__, cli
+from hybridvo.cli import main
+from hybridvo.commands.run_folder import LOCK
+
+
+def write_tum(path: Path, noise: float = 0.0) -> str:
+    rng = np.random.default_rng(0)
+    x = np.cumsum(rng.normal(size=(5, 3)), axis=0) + noise * rng.normal(size=(5, 3))
+    lines = [f"{0.5 * i} {a:.17g} {b:.17g} {c:.17g} 0 0 0 1" for i, (a, b, c) in enumerate(x)]
+    path.write_text("\n".join(lines) + "\n")
+    return str(path)
+
+
+def test_version_and_help(capsys):
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"hybridvo {__version__}\n"
+    assert main(["run", "--help"]) == 0
+    text = capsys.readouterr().out
+    for word in "--camera --depth-scale --mask --weights --config --set pnp-ransac".split():
+        assert word in text
+    assert main(["run", "x", "--set", "help"]) == 0
+    assert "refine.cutoff=" in capsys.readouterr().out
+
+
+def test_help_loads_nothing_heavy():
+    code = "import sys, hybridvo.cli as c; c.main(['run', '--help']); "
+    code += "sys.exit(any(name in sys.modules for name in ('numpy', 'torch', 'cv2', 'numba')))"
+    subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
+
+
+def test_the_help_names_every_method_and_kind():
+    from hybridvo.data.sequence import DATASETS
+    from hybridvo.pipeline import METHODS
+
+    assert set(cli.METHODS) >= set(METHODS) and set(cli.KINDS) == set(DATASETS)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        ([], "required"),
+        (["walk"], "walk"),
+        (["run"], "--sequence"),
+        (["run", "x", "--resume", "--overwrite"], "not allowed with"),
+        (["run", "x", "-q", "-v"], "not allowed with"),
+        (["run", "x", "--start", "a"], "--start"),
+        (["evaluate", "a"], "GT"),
+        (["run", "/nowhere"], "/nowhere"),
+        (["doctor", "/nowhere"], "/nowhere"),
+        (["run", "{sequence}", "--method", "refin"], "refine"),
+        (["run", "{sequence}", "--flow", "raft"], "raft"),
+        (["run", "{sequence}", "--flow", "file", "--stride", "2"], "--flow dis"),
+        (["run", "{sequence}", "--start", "7"], "7"),
+        (["run", "{sequence}", "--start", "-1"], "-1"),
+        (["run", "{sequence}", "--max-failed", "2"], "2"),
+        (["run", "{sequence}", "--device", "tpu"], "tpu"),
+        (["run", "{sequence}", "--dataset", "sintell"], "sintel"),
+        (["run", "{sequence}", "--config", "none.yaml"], "none.yaml"),
+        (["run", "{sequence}", "--set", "refine.cutof=1"], "refine.cutoff"),
+        (["run", "{sequence}", "--rrd", "recording.txt"], ".rrd"),
+        (["run", "{sequence}", "--weights", "pwvo=none.safetensors"], "none.safetensors"),
+        (["run", "{sequence}", "--weights", "mine"], "NAME=FILE"),
+    ],
+)
+def test_wrong_usage_is_exit_code_2_and_no_traceback(
+    arguments, expected, dataset, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    assert main([text.format(sequence=dataset) for text in arguments]) == 2
+    captured = capsys.readouterr()
+    assert expected in captured.err and captured.out == "" and "Traceback" not in captured.err
+    assert not (tmp_path / "runs").exists()
+
+
+def test_verbose_shows_where_an_error_came_from(tmp_path, capsys):
+    assert main(["run", str(tmp_path / "absent"), "-v"]) == 2
+    assert "Traceback" in capsys.readouterr().err
+
+
+def test_exit_codes_1_4_5_and_130(dataset, tmp_path, monkeypatch, capsys):
+    arguments = ["run", str(dataset), "--method", "identity", "-q", "--out"]
+    (tmp_path / "file").write_text("")
+    assert main([*arguments, str(tmp_path / "file" / "out")]) == 5
+    (tmp_path / "held").mkdir()
+    with filelock.FileLock(tmp_path / "held" / LOCK):
+        assert main([*arguments, str(tmp_path / "held")]) == 4
+    for error, code in ((RuntimeError("unforeseen"), 1), (KeyboardInterrupt(), 130)):
+
+        def broken(*_, error=error, **__):
+            raise error
+
+        monkeypatch.setattr("hybridvo.data.sequence.open_sequence", broken)
+        assert main([*arguments, str(tmp_path / "out")]) == code
+    assert "bug in hybridvo" in capsys.readouterr().err
+
+
+def test_data_on_stdout_and_progress_on_stderr(dataset, tmp_path, capsys):
+    arguments = ["run", "--sequence", str(dataset), "--out", str(tmp_path), "--method", "identity"]
+    assert main([*arguments, "--json"]) == 0
+    captured = capsys.readouterr()
+    summary = json.loads(captured.out)
+    assert summary["frames"] == 6 and summary["state"] == "done"
+    assert {Path(name).name for name in summary["files"]} >= {"metrics.json", "run.json"}
+    assert "6/6 frames" in captured.err
+    assert main([*arguments, "--overwrite", "-q"]) == 0
+    assert capsys.readouterr().err == ""
+
+
+def test_default_folder_is_runs_and_the_name(dataset, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["run", str(dataset), "--method", "identity", "-q"]) == 0
+    (folder,) = (tmp_path / "runs").iterdir()
+    assert (folder / "trajectory.tum").is_file()
+
+
+def test_evaluate(tmp_path, capsys):
+    est, gt = write_tum(tmp_path / "est", noise=0.1), write_tum(tmp_path / "gt")
+    assert main(["evaluate", gt, gt, "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["ate_rmse"] == pytest.approx(0, abs=1e-9) and report["matched"] == 5
+    assert main(["evaluate", est, gt, "--alignment", "origin", "--delta-unit", "s"]) == 0
+    text = capsys.readouterr().out
+    assert "5 of 5 poses" in text and "(origin)" in text
+    (tmp_path / "bad").write_text("0 1 2 3 4 5 6\n0 1\n")
+    assert main(["evaluate", str(tmp_path / "bad"), gt]) == 2
+    assert "bad:2" in capsys.readouterr().err
+
+
+def test_init_writes_a_camera_file(tmp_path, capsys):
+    assert main(["init", str(tmp_path / "mine")]) == 0
+    assert (tmp_path / "mine" / "camera.yaml").is_file()
+    assert main(["init", str(tmp_path / "mine")]) == 2
+
+
+def test_show_writes_an_image(dataset, tmp_path, capsys):
+    out = tmp_path / "pair.png"
+    options = ["--method", "refine", "--flow", "dis", "--steps", "1"]
+    assert main(["show", str(dataset), "--pair", "1", "--out", str(out), *options]) == 0
+    assert out.stat().st_size > 1000
+
+
+def test_every_public_name_can_be_loaded():
+    for name in hybridvo.__all__:
+        assert getattr(hybridvo, name) is not None
+
+
+@pytest.mark.slow
+def test_demo(tmp_path, capsys):
+    assert main(["demo", "--out", str(tmp_path), "--frames", "3", "-q", "--json"]) == 0
+    content = json.loads(capsys.readouterr().out)
+    by_name = {row["method"]: row for row in content["rows"]}
+    best = min(by_name.values(), key=lambda row: row["ate_cm"])
+    assert best["method"] == "hybridvo (hybrid)" and content["alignment"] == "origin"
+    assert Path(content["image"]).stat().st_size > 10_000
+    assert main(["demo", "--out", str(tmp_path), "--frames", "3", "-q"]) == 2

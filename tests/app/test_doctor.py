@@ -1,0 +1,113 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hybridvo.cli import main
+from hybridvo.commands.diagnose import diagnose, diagnosis_text
+from hybridvo.commands.doctor import doctor, doctor_text
+from hybridvo.data.image_io import read_flo
+from hybridvo.errors import FormatError, InputError
+from hybridvo.synthetic.render import SyntheticSequence, make_scene
+from hybridvo.types import Frame
+
+
+def test_what_is_installed():
+    report = doctor()
+    assert report["usable"] and report["missing"] == {} and report["warm_up_s"] > 0
+    assert report["devices"]["cpu"] == "works" and report["methods"]["refine"] == ""
+    assert "numpy" in doctor_text(report)
+
+
+@dataclass
+class Recorded:
+    """Frames in memory, with something done to them."""
+
+    frames: list[Frame]
+    poses: np.ndarray | None
+    name: str = "recorded"
+    broken: int = -1
+    has_flow: bool = False
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def frame(self, index: int) -> Frame:
+        if index == self.broken:
+            raise FormatError("frame.png: expected an image")
+        return self.frames[index]
+
+
+@pytest.fixture(scope="module")
+def recorded() -> Recorded:
+    sequence = SyntheticSequence(make_scene("static", 7, height=160, width=256, frames=9))
+    return Recorded([sequence.frame(k) for k in range(9)], sequence.poses)
+
+
+def finding(report: dict[str, Any], name: str) -> dict[str, Any]:
+    return next(found for found in report["findings"] if found["name"] == name)
+
+
+def changed(recorded: Recorded, change: Callable[[int, Frame], Frame], **more: Any) -> Any:
+    frames = [change(k, frame) for k, frame in enumerate(recorded.frames)]
+    return diagnose(replace(recorded, frames=frames, **more))
+
+
+def test_a_clean_sequence_is_not_accused(recorded):
+    report = diagnose(recorded)
+    assert report["ok"], diagnosis_text(report)
+    assert len(report["findings"]) == 5 and report["pairs"] == 8
+    assert finding(report, "depth units")["value"] == pytest.approx(1.0, abs=0.05)
+
+
+def test_depth_that_is_shifted_against_colour_is_found(recorded):
+    report = changed(recorded, lambda k, f: replace(f, rgb=np.roll(f.rgb, 3, axis=1)))
+    found = finding(report, "depth against colour")
+    assert found["state"] == "differs" and not report["ok"]
+    assert -4.0 < found["value"][0] < -1.0 < found["value"][1] < 1.0
+
+
+def test_units_and_exposure(recorded):
+    def dim(k: int, f: Frame) -> Frame:
+        rgb = (0.02 * f.rgb).astype(np.uint8) if k in (3, 4) else f.rgb
+        return replace(f, rgb=rgb, depth=1000 * f.depth)
+
+    report = changed(recorded, dim, poses=None)
+    assert finding(report, "depth units")["state"] == "differs"
+    assert "divide by" in finding(report, "depth units")["message"]
+    exposure = finding(report, "exposure")
+    assert exposure["state"] == "differs" and "dark: 3, 4" in exposure["message"]
+    scaled = changed(recorded, lambda k, f: replace(f, depth=5 * f.depth))
+    assert finding(scaled, "depth units")["state"] == "differs"
+
+
+def test_a_scale_that_changes_on_the_way(recorded):
+    report = changed(recorded, lambda k, f: replace(f, depth=(5 if k >= 6 else 1) * f.depth))
+    found = finding(report, "depth from frame to frame")
+    assert found["state"] == "differs" and "frame 5" in found["message"]
+
+
+def test_what_cannot_be_seen_is_said(recorded):
+    report = changed(recorded, lambda k, f: replace(f, rgb=None), poses=None)
+    assert {found["state"] for found in report["findings"]} == {"cannot_tell"}
+    assert report["ok"] and "5 of 5" in diagnosis_text(report)
+
+
+def test_a_broken_frame_does_not_end_the_diagnosis(recorded):
+    report = diagnose(replace(recorded, broken=2))
+    assert report["unreadable"] and report["pairs"] == 6
+    with pytest.raises(InputError, match="two frames"):
+        diagnose(replace(recorded, frames=recorded.frames[:1]))
+
+
+def test_exit_codes(dataset, own):
+    assert main(["doctor", str(dataset), "--pairs", "2"]) == 0
+    for path in (own.parents[1] / "flow" / "static").iterdir():
+        flow = read_flo(path)
+        header = path.read_bytes()[:12]
+        path.write_bytes(header + (-flow).astype("<f4").tobytes())
+    assert main(["doctor", str(own)]) == 1

@@ -1,0 +1,249 @@
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import filelock
+import numpy as np
+import pytest
+
+from hybridvo.data.sequence import open_sequence
+from hybridvo.errors import InputError, LockedError
+from hybridvo.evaluation.comparison import WRITTEN, ComparisonOptions, compare
+from hybridvo.evaluation.sequence_job import PAIR_COLUMNS
+from hybridvo.evaluation.sources import SharedFlow, expand, methods_to_run
+from hybridvo.odometry import Odometry
+from hybridvo.pipeline import METHODS, Models, weights_hash
+from hybridvo.synthetic.render import make_scene, write_sintel
+from hybridvo.trajectory import read_trajectory
+from hybridvo.types import RelativePose
+from tests.scripts import load_script
+
+ROWS = (  # what other programs rely on
+    *("sequence", "method", "flow_source", "depth_source", "pairs", "failed", "r_err_deg", "t_err"),
+    *("epe", "epe_l2_px", "rot_err_deg_mean", "rot_err_deg_median", "trans_err_mean"),
+    *("trans_err_median", "ate_rmse", "rpe_trans_rmse", "rpe_rot_rmse_deg", "alignment"),
+    *("ms_per_pair_median", "dynamic_fraction"),
+)
+PAIRS = (
+    *("sequence", "index", "method", "flow_source", "status"),
+    *("epe_l2_px", "rot_err_deg", "trans_err", "ms"),
+)
+FAST = ("pnp-ransac", "identity")
+
+
+@pytest.fixture(scope="module")
+def tool() -> ModuleType:
+    return load_script("tools/compare_methods.py")
+
+
+@pytest.fixture(scope="module")
+def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two sequences: ``tiny`` of four frames, ``longer`` of six."""
+    root = tmp_path_factory.mktemp("sintel")
+    write_sintel(make_scene("light", 1, height=64, width=128, frames=4), root, "tiny")
+    write_sintel(make_scene("heavy_two", 2, height=64, width=128, frames=6), root, "longer")
+    return root
+
+
+@pytest.fixture(scope="module")
+def tiny(tree: Path) -> Path:
+    return tree / "training" / "clean" / "tiny"
+
+
+def options(*paths: Path, methods: tuple[str, ...] = FAST, **more: Any) -> ComparisonOptions:
+    return ComparisonOptions(tuple(map(str, paths)), methods=methods, **more)
+
+
+def rows_of(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def outcome(out: Path) -> tuple[Any, Any]:
+    """Rows and pairs, but for what the clock said."""
+    result = json.loads((out / "results.json").read_text())
+    return tuple(
+        [{k: v for k, v in row.items() if k != "ms" and "ms_" not in k and "_ms" not in k}
+         for row in rows]
+        for rows in (result["rows"], rows_of(out / "pairs.csv"))
+    )  # fmt: skip
+
+
+def test_results_hold_what_the_interface_promises(tool, tiny, tmp_path, capsys) -> None:
+    out = tmp_path / "out"
+    methods = "refine,pnp-ransac,identity"
+    arguments = ["--sequence", str(tiny), "--out", str(out), "--methods", methods, "-q"]
+    assert tool.main(arguments) == 0
+    assert capsys.readouterr().out.splitlines() == [str(out / name) for name in WRITTEN]
+    result = json.loads((out / "results.json").read_text())
+    assert set(result) >= {"command", "versions", "machine", "rows"}
+    expected = [(m, f) for f in ("dis", "file (true)") for m in methods.split(",")]
+    assert [(row["method"], row["flow_source"]) for row in result["rows"]] == expected
+    for row in result["rows"]:
+        assert set(ROWS) <= set(row) and row["depth_source"] == "true"
+        assert row["pairs"] == row["pairs_scored"] == 3
+        # what moves is known from the files, whichever flow a method was given
+        assert 0 < row["dynamic_fraction"] < 1
+        for name, value in row.items():
+            assert value is not None or row["reasons"][name]
+    by_flow = {(row["method"], row["flow_source"]): row for row in result["rows"]}
+    for flow in ("file (true)", "dis"):
+        ours, identity = by_flow["refine", flow], by_flow["identity", flow]
+        assert ours["rot_err_deg_median"] < identity["rot_err_deg_median"]
+        assert identity["flow_ms_median"] == 0  # it reads no flow
+    pairs = rows_of(out / "pairs.csv")
+    assert tuple(pairs[0])[: len(PAIRS)] == PAIRS and tuple(pairs[0]) == PAIR_COLUMNS
+    assert len(pairs) == 18 and {pair["index"] for pair in pairs} == {"0", "1", "2"}
+    for row, line in zip(result["rows"], rows_of(out / "results.csv"), strict=True):
+        mine = [
+            float(pair["epe_l2_px"])
+            for pair in pairs
+            if (pair["method"], pair["flow_source"]) == (row["method"], row["flow_source"])
+        ]
+        assert row["epe_l2_px"] == pytest.approx(np.mean(mine))
+        assert float(line["epe_l2_px"]) == row["epe_l2_px"]
+    assert not (out / "parts").exists()
+    assert all((out / entry["path"]).exists() for entry in result["trajectories"])
+    assert all((out / entry["picture"]).exists() for entry in result["worst_pairs"])
+
+
+@pytest.mark.parametrize("method", ["refine", "pnp-ransac-tuned"])
+def test_a_method_gives_what_it_gives_alone(tree: Path, tmp_path: Path, method: str) -> None:
+    """Beside others, and with flow that they share, as a tracker of its own: the same motions."""
+    path = tree / "training" / "clean" / "longer"
+    compare(options(path, methods=("identity", method), flow="dis"), tmp_path / "out")
+    sequence = open_sequence(path)
+    vo = Odometry(method=method)
+    poses = [vo.track(sequence.frame(i)).T_world_cam for i in range(len(sequence))]
+    result = json.loads((tmp_path / "out" / "results.json").read_text())
+    (entry,) = (e for e in result["trajectories"] if e["method"] == method)
+    found = read_trajectory(tmp_path / "out" / entry["path"], "tum")
+    np.testing.assert_allclose(found.T_world_cam, poses, atol=1e-6)
+
+
+def test_resume_keeps_finished_sequences(tree: Path, tmp_path: Path, monkeypatch) -> None:
+    paths = [tree / "training" / "clean" / name for name in ("tiny", "longer")]
+    compare(options(*paths), tmp_path / "whole")
+    # as after an interruption: the first sequence is finished, the second is not
+    read: list[str] = []
+
+    def interrupt(message: str, done: int, total: int) -> None:
+        if done > 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        compare(options(*paths), tmp_path / "cut", progress=interrupt)
+    assert [path.name for path in (tmp_path / "cut" / "parts").iterdir()] == ["000.json"]
+    with pytest.raises(InputError, match="--resume"):
+        compare(options(*paths), tmp_path / "cut")
+    with pytest.raises(InputError, match="--overwrite"):
+        compare(options(*paths, seed=1), tmp_path / "cut", mode="resume")
+    compare(options(*paths), tmp_path / "cut", mode="resume", progress=lambda m, *_: read.append(m))
+    assert any("1 of 2 sequences" in message for message in read)
+    assert outcome(tmp_path / "cut") == outcome(tmp_path / "whole")
+
+
+def test_processes_give_what_one_gives(tree: Path, tmp_path: Path) -> None:
+    compare(options(tree, flow="file"), tmp_path / "one")
+    compare(options(tree, flow="file", jobs=2), tmp_path / "two")
+    assert outcome(tmp_path / "one") == outcome(tmp_path / "two")
+
+
+def test_a_broken_frame_is_a_failed_pair_and_the_next_spans_it(tiny: Path, tmp_path: Path) -> None:
+    root = tmp_path / "training"
+    shutil.copytree(tiny.parents[1], root)
+    sequence = root / "clean" / "tiny"
+    sorted(sequence.glob("*.png"))[1].write_bytes(b"no image")
+    out = tmp_path / "out"
+    compare(options(sequence, methods=("refine", "identity"), flow="dis"), out)
+    rows = [row for row in rows_of(out / "pairs.csv") if row["method"] == "refine"]
+    assert [row["index"] for row in rows] == ["0", "1", "2"]
+    assert rows[0]["status"].startswith("failed") and rows[0]["epe_l2_px"] == ""
+    assert (rows[1]["prev"], rows[1]["next"]) == ("0", "2") and float(rows[1]["epe_l2_px"]) < 1
+    result = json.loads((out / "results.json").read_text())
+    row = result["rows"][0]
+    assert (row["failed"], row["pairs"], row["pairs_scored"]) == (1, 3, 2)
+    assert row["failures"] >= 1
+    assert result["sequences"][0]["left_out"][0]["index"] == 1
+
+
+def test_without_ground_truth_there_are_reasons(walk: Path, tmp_path: Path) -> None:
+    shutil.copytree(walk, tmp_path / "walk")
+    (tmp_path / "walk" / "poses.txt").unlink()
+    compare(options(tmp_path / "walk", flow="file"), tmp_path / "out")
+    result = json.loads((tmp_path / "out" / "results.json").read_text())
+    for row in result["rows"]:
+        for key in ("epe", "epe_l2_px", "ate_rmse", "rot_err_deg_mean", "failure_rate"):
+            assert row[key] is None and row["reasons"][key]
+    text = (tmp_path / "out" / "report.md").read_text()
+    assert "Nothing is scored" in text
+
+
+def test_a_bug_of_a_method_costs_its_pairs(tiny: Path, tmp_path: Path, monkeypatch) -> None:
+    def broken(pair: Any, context: Any) -> RelativePose:
+        raise ZeroDivisionError("a bug")
+
+    monkeypatch.setitem(METHODS, "pnp-ransac", broken)
+    compare(options(tiny, flow="file"), tmp_path / "out")
+    rows = rows_of(tmp_path / "out" / "pairs.csv")
+    status = {row["method"]: (row["status"], row["message"]) for row in rows}
+    assert status["pnp-ransac"] == ("failed(raised)", "ZeroDivisionError: a bug")
+    assert status["identity"][0] == "ok"
+
+
+def test_refused_folders(tiny: Path, tmp_path: Path) -> None:
+    (tmp_path / "held").mkdir()
+    with filelock.FileLock(tmp_path / "held" / ".lock"), pytest.raises(LockedError):
+        compare(options(tiny), tmp_path / "held")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "field"),
+    [
+        (["--methods", "pnp-ransak"], "pnp-ransac"),
+        (["--methods", ","], "--methods"),
+        (["--jobs", "0"], "--jobs"),
+        (["--start", "9"], "frames"),
+        (["--stride", "2", "--flow", "file"], "stride"),
+        (["--protocol", "paper"], "tiny"),
+    ],
+)
+def test_bad_options(tool, tiny, tmp_path, arguments, field, capsys) -> None:
+    given = ["--sequence", str(tiny), "--out", str(tmp_path / "out"), "-q", "--methods", "identity"]
+    assert tool.main([*given, *arguments]) == 2
+    assert field in capsys.readouterr().err
+    assert not (tmp_path / "out" / "results.json").exists()
+
+
+def test_a_folder_stands_for_its_sequences(tree: Path, walk: Path) -> None:
+    found = [tree / "training" / "clean" / name for name in ("longer", "tiny")]
+    for path in (tree, tree / "training", tree / "training" / "clean"):
+        assert expand(path) == found
+    assert expand(found[0]) == [found[0]]
+    assert expand(walk) == [walk] and expand(walk.parent)[-1] == walk
+    assert expand(tree / "nothing") == [tree / "nothing"]
+
+
+def test_flow_is_computed_once_for_all(tiny: Path) -> None:
+    sequence = open_sequence(tiny)
+    flow = SharedFlow("dis", sequence)
+    prev, curr = sequence.frame(0), sequence.frame(1)
+    flow.prepare(prev, curr)
+    assert flow(prev, curr) is flow(prev, curr) and flow.ms > 0
+    assert flow.label == "dis" and SharedFlow("file", sequence).label == "file (true)"
+
+
+def test_weights_of_a_method_are_all_that_it_reads(tmp_path: Path) -> None:
+    names, missing = methods_to_run(("all",))
+    assert {"hybrid", "refine", "identity"} <= set(names) and set(missing) == set(METHODS) - set(
+        names
+    )
+    (tmp_path / "pwvo").write_bytes(b"other weights")
+    other = Models(weights={"pwvo": tmp_path / "pwvo"})
+    assert weights_hash("hybrid", other) != weights_hash("hybrid")
+    assert weights_hash("refine") is None

@@ -1,0 +1,293 @@
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from hybridvo.errors import InputError
+from hybridvo.evaluation.drawing import draw, networks, saliencies, start_of
+from hybridvo.evaluation.maps import (
+    colour_wheel,
+    error_map,
+    flow_colours,
+    integrated_gradients,
+    moving_pixels,
+    object_flow,
+    prediction_errors,
+    share_on,
+    uncertainty_maps,
+)
+from hybridvo.evaluation.pair_errors import dynamic_fraction, pair_errors
+from hybridvo.evaluation.panels import FlowPanel, ImagePanel, ScalarPanel, maps_png
+from hybridvo.geometry import invert, se3_exp
+from hybridvo.network.inputs import assemble_inputs
+from hybridvo.network.pwvo import NetworkOptions, build_network
+from hybridvo.network.weights import save_weights
+from hybridvo.synthetic.render import SyntheticSequence, make_scene, write_sintel
+from hybridvo.types import FramePair, PixelwisePrediction
+from tests.scripts import load_script
+
+
+@pytest.fixture(scope="module")
+def tool() -> ModuleType:
+    return load_script("tools/visualize.py")
+
+
+@pytest.fixture(scope="module")
+def known() -> tuple[FramePair, np.ndarray]:
+    """A rendered pair with movers, its true flow, and its true motion."""
+    sequence = SyntheticSequence(make_scene("light", 1, height=64, width=128, frames=4))
+    prev, curr = sequence.frame(1), sequence.frame(2)
+    T = invert(sequence.poses[2]) @ sequence.poses[1]
+    return FramePair(prev, curr, sequence.flow(1)[0], flow_is_true=True), T
+
+
+# -- flow in colours ------------------------------------------------------------------------------
+
+
+def test_colours_of_directions_by_hand() -> None:
+    # Middlebury's circle: red to the right, yellow downwards, cyan-blue to the left
+    flow = np.array([[[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]]])
+    white, right, down, left, up = (list(map(int, c)) for c in flow_colours(flow, 1.0)[0])
+    assert white == [255, 255, 255]
+    assert right == [255, 0, 0]
+    # a quarter of 54 steps is 13.5; yellow comes after 15: 13.5 / 15 of 255
+    assert down == [255, 230, 0]
+    # half way is step 27, two of eleven from cyan to blue: 255 (1 - 2 / 11)
+    assert left == [0, 209, 255]
+    # three quarters is step 40.5: 4.5 of 13 from blue to magenta
+    assert up == [88, 0, 255]
+
+
+def test_colours_of_lengths() -> None:
+    flow = np.array([[[0.5, 0.0], [1.0, 0.0], [2.0, 0.0], [np.nan, 0.0], [np.inf, 1.0]]])
+    half, full, longer, nan, inf = (list(map(int, c)) for c in flow_colours(flow, 1.0)[0])
+    assert half == [255, 128, 128] and full == [255, 0, 0] and longer == [191, 0, 0]
+    assert nan == inf == [0, 0, 0]
+    assert flow_colours(np.full((3, 4, 2), np.nan)).max() == 0
+    for bad in (np.zeros((3, 4)), np.zeros((3, 4, 3))):
+        with pytest.raises(InputError, match=r"shape \(H, W, 2\)"):
+            flow_colours(bad)
+
+
+def test_the_wheel_is_a_legend() -> None:
+    wheel = colour_wheel(65)
+    assert wheel.shape == (65, 65, 4)
+    assert wheel[0, 0, 3] == 0 and wheel[32, 32, 3] == 255
+    assert list(wheel[32, 32, :3]) == [255, 255, 255]
+    flow = np.array([[[0.6, -0.3]]])
+    place = wheel[32 + round(-0.3 * 32), 32 + round(0.6 * 32), :3].astype(int)
+    assert np.abs(place - flow_colours(flow, 1.0)[0, 0].astype(int)).max() <= 6
+
+
+# -- flow in parts --------------------------------------------------------------------------------
+
+
+def test_the_parts_add_up_and_movers_stand_out(known) -> None:
+    pair, T = known
+    ego, objects = object_flow(pair, T)
+    valid = np.isfinite(pair.flow).all(axis=2) & np.isfinite(ego).all(axis=2)
+    assert valid.mean() > 0.9
+    np.testing.assert_allclose((ego + objects)[valid], pair.flow[valid], atol=1e-4)
+    cameras = pair.prev.camera, pair.curr.camera
+    share = dynamic_fraction(pair.flow, pair.prev.depth, T, *cameras)
+    assert share is not None and 0.02 < share < 0.9
+    assert moving_pixels(objects)[valid].mean() == pytest.approx(share, abs=0.005)
+    still = object_flow(replace(pair, flow=ego.astype(np.float32)), T)[1]
+    assert np.nanmax(np.abs(still)) < 1e-4 and not moving_pixels(still).any()
+
+
+def test_missing_inputs_are_named(known) -> None:
+    pair, T = known
+    with pytest.raises(InputError, match="no flow"):
+        object_flow(replace(pair, flow=None), T)
+    with pytest.raises(InputError, match="no previous depth"):
+        object_flow(replace(pair, prev=replace(pair.prev, depth=None)), T)
+
+
+def test_the_error_map_has_the_mean_of_the_metric(known) -> None:
+    pair, T = known
+    wrong = se3_exp(np.array([0.01, 0.0, -0.02, 0.001, 0.002, 0.0])) @ T
+    arguments = wrong, T, pair.prev.depth, pair.prev.camera, pair.curr.camera
+    error = error_map(*arguments)
+    expected = pair_errors(*arguments)["epe_l2_px"]
+    assert float(np.nanmean(error)) == pytest.approx(expected, rel=1e-6)
+    assert float(np.nanmax(error_map(T, *arguments[1:]))) == 0.0
+
+
+# -- networks -------------------------------------------------------------------------------------
+
+
+def test_uncertainty_and_error_maps_by_hand() -> None:
+    maps = torch.zeros(2, 3, 4, 5)
+    maps[1] += 7.0  # the second pair is not looked at
+    log_rotation = torch.tensor([0.0, 1.0, 2.0])[None, :, None, None].expand(2, 3, 4, 5)
+    prediction = PixelwisePrediction(maps, maps + 2.0, log_rotation, log_rotation - 1.0)
+    rotation, translation = uncertainty_maps(prediction)
+    np.testing.assert_allclose(rotation, np.full((4, 5), np.e), rtol=1e-6)
+    np.testing.assert_allclose(translation, np.ones((4, 5)), rtol=1e-6)
+    errors = prediction_errors(prediction, np.array([1.0, 2.0, 3.0]), np.array([2.0, 2.0, 0.5]))
+    np.testing.assert_allclose(errors[0], np.full((4, 5), 2.0))
+    np.testing.assert_allclose(errors[1], np.full((4, 5), 0.5))
+    with pytest.raises(InputError, match="no uncertainty"):
+        uncertainty_maps(PixelwisePrediction(maps, maps))
+
+
+def test_gradients_of_a_linear_answer_are_its_terms() -> None:
+    generator = torch.Generator().manual_seed(0)
+    x, w = (torch.randn(1, 2, 3, 4, generator=generator) for _ in range(2))
+    y = torch.randn(1, 1, 3, 4, generator=generator)
+    found = integrated_gradients(lambda a, b: (w * a).sum() + 0.0 * b.sum(), (x, y), steps=1)
+    np.testing.assert_allclose(found.magnitude, (w * x)[0].abs().sum(0).numpy(), rtol=1e-5)
+    assert found.total == pytest.approx(float((w * x).sum()), rel=1e-5)
+    assert found.completeness_error < 1e-5
+
+
+def test_the_quadrature_is_exact_for_polynomials() -> None:
+    # n Gauss nodes integrate degree 2 n - 1: the gradient of x^6 with three of them
+    x = torch.full((1, 1, 2, 2), 1.3, dtype=torch.float64)
+    exact = integrated_gradients(lambda a: (a**6).sum(), (x,), steps=3)
+    assert exact.change == pytest.approx(4 * 1.3**6, rel=1e-12)
+    assert exact.completeness_error < 1e-12
+    assert integrated_gradients(lambda a: (a**6).sum(), (x,), steps=2).completeness_error > 1e-3
+
+
+def test_share_on_a_mask_of_another_size() -> None:
+    magnitude = np.array([[1.0, 3.0], [0.0, 4.0]])
+    mask = np.zeros((4, 4), bool)
+    mask[:, 2:] = True
+    assert share_on(magnitude, mask) == pytest.approx(7 / 8)
+    assert share_on(np.zeros((2, 2)), mask) is None
+    assert share_on(np.full((2, 2), np.nan), mask) is None
+
+
+OPTIONS = (
+    NetworkOptions(width=0.25, head_stride=2),
+    NetworkOptions(width=0.25, head_stride=2, uncertainty=False),
+    NetworkOptions(kind="vonet", width=0.25),
+    NetworkOptions(kind="vonet-attention", width=0.25),
+    NetworkOptions(width=0.25, head_stride=2, scale_free=True, passes=2),
+)
+
+
+@pytest.mark.parametrize(
+    "options", OPTIONS, ids=["pwvo", "pixelwise", "vonet", "attention", "scale-free"]
+)
+def test_the_saliency_is_complete(known, options: NetworkOptions) -> None:
+    pair, _ = known
+    torch.manual_seed(0)
+    network = build_network(options).eval()
+    inputs = assemble_inputs(pair, (64, 128))
+    found = saliencies(network, inputs, start_of(network, inputs), 16)
+    assert list(found) == ["rotation", "translation"]
+    for saliency in found.values():
+        assert saliency.magnitude.shape == (64, 128)
+        assert np.isfinite(saliency.magnitude).all() and saliency.magnitude.max() > 0
+        # completeness: the parts add up to the change of the answer. Scale-free networks divide by
+        # a quantile of the flow, whose limits put corners on the path
+        assert saliency.completeness_error < (0.05 if options.scale_free else 0.005)
+        # what is as in the baseline cannot matter
+        read = (
+            inputs.flow if options.scale_free else torch.cat([inputs.flow, inputs.inverse_depth], 1)
+        )
+        unseen = (read[0] == 0).all(0).numpy()
+        assert saliency.magnitude[unseen].sum() == 0
+
+
+# -- the picture and the tool ---------------------------------------------------------------------
+
+
+def test_the_picture_has_all_panels() -> None:
+    rng = np.random.default_rng(0)
+    flow = rng.standard_normal((20, 40, 2))
+    mask = np.zeros((20, 40), bool)
+    mask[5:9, 5:9] = True
+    panels = [
+        ImagePanel("image", np.full((20, 40, 3), 200, np.uint8)),
+        FlowPanel("flow", flow, 2.0),
+        ScalarPanel("weights", rng.uniform(size=(10, 20)), "", 1.0, mask),
+        ScalarPanel("nothing known", np.full((5, 10), np.nan), "px"),
+        ScalarPanel("zeros", np.zeros((5, 10)), "px"),
+    ]
+    content = maps_png(panels, "heading", 2.0)
+    picture = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
+    few = cv2.imdecode(np.frombuffer(maps_png(panels[:2], "h", 2.0), np.uint8), cv2.IMREAD_COLOR)
+    assert picture.shape[1] == few.shape[1] > 1000
+    assert picture.shape[0] > 2.4 * few.shape[0]
+    assert maps_png(panels, "heading", 2.0) == content
+    with pytest.raises(InputError, match="at least one panel"):
+        maps_png([], "h", 2.0)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("sintel")
+    write_sintel(make_scene("light", 1, height=64, width=128, frames=4), root, "tiny")
+    torch.manual_seed(0)
+    for kind in ("pwvo", "vonet"):
+        options = NetworkOptions(kind=kind, width=0.125, head_stride=2)
+        save_weights(root / f"{kind}.safetensors", build_network(options), options, {})
+    return root
+
+
+def test_the_tool_draws_a_pair(tool, folder: Path, tmp_path: Path, capsys) -> None:
+    sequence = str(folder / "training" / "clean" / "tiny")
+    out = tmp_path / "new" / "pair.png"
+    arguments = ["--sequence", sequence, "--pair", "1", "--flow", "dis", "--steps", "4"]
+    arguments += ["--method", "refine"]
+    for kind in ("pwvo", "vonet"):
+        arguments += ["--weights", str(folder / f"{kind}.safetensors")]
+    assert tool.main([*arguments, "--out", str(out)]) == 0
+    assert capsys.readouterr().out.split() == [str(out), str(out.with_suffix(".json"))]
+    # image, three flows, error, weights; four maps and two saliencies of pwvo, two of vonet
+    assert cv2.imread(str(out)).shape[0] > 1500
+    values = json.loads(out.with_suffix(".json").read_text())["values"]
+    for kind in ("pwvo", "vonet"):
+        for what in ("rotation", "translation"):
+            assert 0 < values[f"{kind}: saliency of the {what} on moving pixels"] < 1
+            # four nodes are few, and enough to see that the numbers are those of the picture
+            assert values[f"{kind}: part of the {what} that the saliency misses"] < 0.15
+    assert 0 < values["moving share, true flow and motion"] < 1
+    before = out.read_bytes()
+    assert tool.main([*arguments, "--out", str(out)]) == 2
+    assert "pass --overwrite" in capsys.readouterr().err
+    assert out.read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("options", "field"),
+    [
+        (["--pair", "3"], "got 3"),
+        (["--pair", "-1"], "got -1"),
+        (["--pair", "0", "--weights", "none.safetensors"], "none.safetensors"),
+        (["--pair", "0", "--steps", "0"], "steps"),
+        (["--pair", "0", "--method", "refin"], "refine"),
+    ],
+)
+def test_bad_options(tool, folder: Path, tmp_path: Path, options, field, capsys) -> None:
+    sequence = str(folder / "training" / "clean" / "tiny")
+    out = tmp_path / "out.png"
+    assert tool.main(["--sequence", sequence, "--out", str(out), *options]) == 2
+    assert field in capsys.readouterr().err
+    assert not out.exists()
+
+
+def test_networks_that_predict_no_motion_are_refused(tool, tmp_path: Path) -> None:
+    from hybridvo.network.judge import JudgeNetwork, JudgeOptions
+
+    options = JudgeOptions()
+    path = save_weights(tmp_path / "judge.safetensors", JudgeNetwork(options), options, {})
+    with pytest.raises(InputError, match="got a judge"):
+        networks([path])
+
+
+def test_bad_targets(folder: Path, tmp_path: Path) -> None:
+    sequence = folder / "training" / "clean" / "tiny"
+    with pytest.raises(InputError, match=r"a\.jpg: expected .*png"):
+        draw(sequence, 0, tmp_path / "a.jpg")

@@ -1,0 +1,127 @@
+from __future__ import annotations
+
+import csv
+import json
+import struct
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from hybridvo.errors import InputError
+from hybridvo.evaluation.comparison import ComparisonOptions, compare
+from hybridvo.evaluation.protocols import protocol_summary, protocols, same_intrinsics
+from hybridvo.geometry import ego_flow, make_transform
+from hybridvo.types import Camera
+
+TAG = struct.pack("<f", 202021.25)
+HEIGHT, WIDTH, FRAMES = 32, 64, 5
+ZOOMS = {"ambush_4": (2, 4), "shaman_2": (1, 3)}  # frame numbers between which f grows
+STEP = np.array([0.03, -0.01, 0.02])
+
+
+def camera(name: str, number: int) -> Camera:
+    first, last = ZOOMS.get(name, (0, 0))
+    f = 70.0 * (1 + 0.002 * (min(max(number, first), last) - first))
+    return Camera(f, f, (WIDTH - 1) / 2, (HEIGHT - 1) / 2, HEIGHT, WIDTH)
+
+
+@pytest.fixture(scope="module")
+def sintel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The data set with the first five frames of each sequence; every camera moves by STEP."""
+    training = tmp_path_factory.mktemp("data") / "MPI-Sintel" / "training"
+    texture = np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+    image = cv2.imencode(".png", texture)[1].tobytes()
+    size = struct.pack("<ii", WIDTH, HEIGHT)
+    depth = 4 + np.linspace(0, 4, WIDTH)[None, :].repeat(HEIGHT, axis=0)
+    T, E = make_transform(np.eye(3), STEP), np.eye(4)
+    for name in protocols()["paper"].sequences:
+        E = np.eye(4)
+        for number in range(1, FRAMES + 1):
+            K = camera(name, number)
+            flow = ego_flow(depth, T, K, camera(name, number + 1))
+            content = {
+                f"final/{name}/frame_{number:04d}.png": image,
+                f"depth/{name}/frame_{number:04d}.dpt": TAG + size + depth.astype("<f4").tobytes(),
+                f"camdata_left/{name}/frame_{number:04d}.cam": (
+                    TAG + K.K.astype("<f8").tobytes() + E[:3].astype("<f8").tobytes()
+                ),
+                f"flow/{name}/frame_{number:04d}.flo": TAG + size + flow.astype("<f4").tobytes(),
+            }
+            for path, data in content.items():
+                if number < FRAMES or not path.startswith("flow"):
+                    (training / path).parent.mkdir(parents=True, exist_ok=True)
+                    (training / path).write_bytes(data)
+            E = T @ E
+    return training.parent
+
+
+def compared(sintel: Path, out: Path, name: str) -> dict:
+    options = ComparisonOptions((str(sintel),), ("identity",), flow="file", protocol=name, worst=1)
+    compare(options, out)
+    return json.loads((out / "results.json").read_text())
+
+
+def test_the_complete_sets_have_the_published_numbers_of_pairs() -> None:
+    paper, fourteen = protocols()["paper"], protocols()["trajectory14"]
+    assert (paper.pairs, len(paper.sequences)) == (992, 23)
+    assert sum(paper.sequences.values()) - 23 == 1041  # 49 pairs change their intrinsics
+    assert fourteen.pairs == sum(fourteen.sequences.values()) - 14 == 629
+    totals = [{"method": "pwvo-paper", "reasons": {}, "epe": 0.5}]
+    frames = {name: frames - 1 for name, frames in paper.sequences.items()}
+    frames["ambush_4"] -= 23
+    frames["shaman_2"] -= 26
+    summary = protocol_summary(paper, totals, frames)
+    assert summary["complete"] and not summary["note"]
+    assert summary["table"][0]["published"]["epe"] == 0.626
+    for protocol in protocols().values():
+        keys = {metric["key"] for metric in protocol.metrics}
+        for line in protocol.published:
+            assert line["source"] and keys & set(line)
+
+
+def test_the_paper_leaves_out_pairs_whose_intrinsics_change(sintel: Path, tmp_path: Path) -> None:
+    result = compared(sintel, tmp_path, "paper")
+    left_out = {s["name"]: [row["index"] for row in s["left_out"]] for s in result["sequences"]}
+    assert left_out.pop("ambush_4") == [1, 2] and left_out.pop("shaman_2") == [0, 1]
+    assert not any(left_out.values())
+    protocol = result["protocol"]
+    assert protocol["pairs"] == 23 * 4 - 4 and not protocol["complete"]
+    assert "88 pairs, the complete set has 992" in protocol["note"]
+    (line,) = protocol["table"]
+    # standing still is wrong by the motion itself: the component means of the paper
+    assert line["t_err"] == pytest.approx(np.abs(STEP).mean(), rel=1e-9)
+    assert line["r_err_deg"] == pytest.approx(0, abs=1e-9)
+    with (tmp_path / "pairs.csv").open() as file:
+        epe = [float(row["epe"]) for row in csv.DictReader(file)]
+    assert len(epe) == 88 and line["epe"] == pytest.approx(np.mean(epe))
+
+
+def test_trajectories_are_means_over_fourteen_sequences(sintel: Path, tmp_path: Path) -> None:
+    result = compared(sintel, tmp_path, "trajectory14")
+    names = [sequence["name"] for sequence in result["sequences"]]
+    assert names == sorted(protocols()["trajectory14"].sequences)
+    (line,) = result["protocol"]["table"]
+    assert line["sequences"] == 14 and line["pairs"] == 14 * 4
+    assert line["rpe_trans_rmse"] == pytest.approx(np.linalg.norm(STEP), rel=1e-9)
+    assert line["ate_rmse_sim3"] is None and "static camera" in line["reasons"]["ate_rmse_sim3"]
+
+
+def test_other_ranges_and_sequences_are_refused(sintel: Path, walk: Path, tmp_path: Path) -> None:
+    for path, more, field in (
+        (sintel, {"stop": 3}, "--stop"),
+        (walk, {}, "walk"),
+        (sintel / "training" / "final" / "alley_1", {"protocol": "trajectory14"}, "alley_2"),
+        (sintel, {"protocol": "other"}, "other"),
+    ):
+        options = ComparisonOptions((str(path),), ("identity",), **{"protocol": "paper"} | more)
+        with pytest.raises(InputError, match=field):
+            compare(options, tmp_path / "out")
+
+
+def test_cameras_are_the_same_to_rounding() -> None:
+    K = Camera(1120.0, 1120.0, 511.5, 217.5, 436, 1024)
+    assert same_intrinsics(K, Camera(1120.0 * (1 + 1e-12), 1120.0, 511.5, 217.5, 436, 1024))
+    assert not same_intrinsics(K, Camera(1120.01, 1120.0, 511.5, 217.5, 436, 1024))
+    assert not same_intrinsics(K, Camera(1120.0, 1120.0, 511.5, 217.5, 435, 1024))

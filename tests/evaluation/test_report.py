@@ -1,0 +1,150 @@
+"""The page of a comparison: what stands first, what is left out, that it needs no other file."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from hybridvo.errors import FormatError, InputError
+from hybridvo.evaluation.breakdown import breakdown, worst_pairs
+from hybridvo.evaluation.protocols import protocol_summary, protocols
+from hybridvo.evaluation.report import headline, number, write_report
+from hybridvo.evaluation.scores import sequence_row, total_row
+from hybridvo.evaluation.sequence_job import PAIR_COLUMNS, pair_table
+from hybridvo.files import write_csv, write_json
+from hybridvo.geometry import se3_exp
+from hybridvo.trajectory import Trajectory, write_tum
+
+ERRORS = {"hybrid": 0.01, "refine": 0.1, "pnp-ransac": 3.0}
+FLOWS = ("file (true)", "dis")
+NAME = "<b>walk</b>"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Results of three methods with both flows on one sequence, whose name is hostile."""
+    poses = np.stack([se3_exp(np.array([0.1 * k, 0.02 * k**2, 0, 0, 0, 0])) for k in range(7)])
+    gt = Trajectory(np.arange(7) / 10, poses)
+    (tmp_path / "trajectories").mkdir()
+    (tmp_path / "worst").mkdir()
+    write_tum(gt, tmp_path / "trajectories" / "gt.tum")
+    cv2.imwrite(str(tmp_path / "worst" / "a.jpg"), np.zeros((8, 8, 3), np.uint8))
+    pairs = [
+        {
+            **{"sequence": NAME, "index": i, "prev": i, "next": i + 1, "method": method},
+            **{"flow_source": flow, "status": "ok", "message": "", "ms": 10.0, "flow_ms": 5.0},
+            **{"epe_l2_px": epe * (1 + i) * (1e-3 if "true" in flow else 1), "epe": 0.1},
+            **{"rot_err_deg": 0.1, "trans_err": 0.01, "r_err_deg": 0.1, "t_err": 0.01},
+            **{"dynamic_fraction": 0.1 * i, "rotation_deg": 0.2},  # rotation: one bin
+        }
+        for flow in FLOWS
+        for method, epe in ERRORS.items()
+        for i in range(6)
+    ]
+    pairs[6 * 3]["epe_l2_px"] = 7.5  # hybrid, dis, pair 0: the one real failure of the best
+    table = pair_table(pairs)
+    rows, totals = [], []
+    for (method, flow), group in table.groupby(["method", "flow_source"], sort=False):
+        named = dict(sequence=NAME, method=method, flow_source=flow, depth_source="true")
+        rows.append(sequence_row(group, gt, gt, named))
+        totals.append(total_row(group, rows[-1:]))
+    worst = [{**e, "picture": "worst/a.jpg", "picture_reason": None} for e in worst_pairs(table, 1)]
+    drawn = [(None, None), *((row["method"], row["flow_source"]) for row in rows)]
+    paths = [
+        {"sequence": NAME, "path": "trajectories/gt.tum", "method": m, "flow_source": f}
+        for m, f in drawn
+    ]
+    result: dict[str, Any] = {
+        **{"command": ["compare"], "versions": {}, "machine": {"cpus": 2}, "weights": {}},
+        **{"options": {}, "timing": "one at a time", "started": "", "finished": ""},
+        **{"missing": {"open3d-rgbd": "pip install open3d"}, "rows": rows, "totals": totals},
+        "sequences": [{"name": NAME, "warnings": ["<script>"], "left_out": []}],
+        **{"trajectories": paths, "breakdown": breakdown(table), "worst_pairs": worst},
+        "protocol": protocol_summary(protocols()["paper"], totals, {NAME: 6}),
+    }
+    write_json(tmp_path / "results.json", result)
+    write_csv(tmp_path / "pairs.csv", PAIR_COLUMNS, pairs)
+    return tmp_path
+
+
+def own_part(page: str) -> str:
+    """The page without plotly."""
+    return re.sub(r"<script>.*?</script>", "", page, flags=re.DOTALL)
+
+
+def test_the_page_opens_with_the_winner_and_estimated_flow(folder: Path) -> None:
+    assert [path.name for path in write_report(folder)] == ["report.html", "report.md"]
+    page, text = (folder / "report.html").read_text(), (folder / "report.md").read_text()
+    sentence = headline(json.loads((folder / "results.json").read_text()))
+    # refine has no failure with dis flow, hybrid has one: the sentence says whose pair it is
+    assert sentence.startswith("With dis flow, refine") and "hybrid" in sentence
+    for content in (own_part(page), text):
+        start = content.replace("&lt;", "<").replace("&gt;", ">")
+        assert sentence in start
+        assert start.index("dis flow") < start.index("file (true) flow")
+    body = own_part(page)
+    assert body.index("7.5 px in") > body.index('id="worst"')
+    assert body.index("hybrid, dis flow") < body.index("refine, file (true) flow")
+    assert "open3d-rgbd" in body and "992" in body and "0.626" in body
+
+
+def test_the_page_needs_no_other_file_and_runs_no_name(folder: Path) -> None:
+    write_report(folder)
+    page = (folder / "report.html").read_text()
+    assert len(page) < 8e6
+    body = own_part(page)
+    assert not re.search(r'(src|href)="(?!#|data:)', body)
+    assert "<b>walk" not in body and "&lt;b&gt;walk" in body and "<script></" not in body
+    assert body.count("data:image/jpeg;base64,") == 6
+
+
+def charts(folder: Path) -> list[dict[str, Any]]:
+    write_report(folder)
+    page = (folder / "report.html").read_text()
+    found = re.findall(r'<script type="application/json">(.*?)</script>', page, re.DOTALL)
+    return [json.loads(text) for text in found]
+
+
+def test_charts_have_distinct_colours_one_scale_and_no_single_bins(folder: Path) -> None:
+    found = charts(folder)
+    titles = [chart["layout"]["xaxis"]["title"]["text"] for chart in found]
+    assert any("share of pixels" in title for title in titles)
+    assert not any("true rotation" in title for title in titles)  # one bin tells nothing
+    spread = [c for c in found if "EPE [px]" in c["layout"]["xaxis"]["title"]["text"]]
+    assert len(spread) == 2  # both flows side by side
+    assert spread[0]["layout"]["xaxis"]["range"] == spread[1]["layout"]["xaxis"]["range"]
+    colours = {trace["name"]: trace["line"]["color"] for trace in spread[0]["data"]}
+    assert set(colours) == set(ERRORS) and len(set(colours.values())) == 3
+    curve = {trace["name"]: trace for trace in spread[0]["data"]}["pnp-ransac"]
+    assert curve["y"][-1] == 100 and curve["x"] == sorted(curve["x"])
+    above = next(c for c in found if "from above" in c["layout"]["title"]["text"])
+    gt, *paths = above["data"]
+    assert gt["name"] == "ground truth" and len(paths) == 3
+    np.testing.assert_allclose(paths[0]["x"], gt["x"], atol=1e-4)  # aligned: the same path
+    assert [c["data"][0]["type"] for c in found].count("scatter3d") == 1
+
+
+def test_nothing_scored_and_foreign_folders(folder: Path, tmp_path: Path) -> None:
+    result = json.loads((folder / "results.json").read_text())
+    for row in result["totals"]:
+        row["epe_l2_px_median"] = None
+    assert "Nothing is scored" in headline(result)
+    with pytest.raises(InputError, match=r"results\.json"):
+        write_report(tmp_path / "nothing")
+    (folder / "results.json").write_text("[]")
+    with pytest.raises(FormatError, match="results"):
+        write_report(folder)
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(1234.5, "1234"), (0.012345, "0.0123"), (0.0, "0"), (None, "-"), (float("nan"), "-")],
+)
+def test_numbers_for_people(value: float | None, text: str) -> None:
+    assert number(value) == text

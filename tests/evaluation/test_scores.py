@@ -1,0 +1,126 @@
+"""Scores and breakdown of a table of pairs, by hand."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from hybridvo.evaluation.breakdown import breakdown, worst_pairs
+from hybridvo.evaluation.scores import failure_rate, scale_warning, sequence_row, total_row
+from hybridvo.evaluation.sequence_job import pair_table
+from hybridvo.geometry import se3_exp
+from hybridvo.trajectory import Trajectory
+
+
+def row(index: int, error: float | None, method: str = "a", /, **more: Any) -> dict[str, Any]:
+    base = {"sequence": "walk", "index": index, "method": method, "flow_source": "dis"}
+    return {**base, "status": "ok", "message": "", "epe_l2_px": error, **more}
+
+
+def table(*rows: dict[str, Any]) -> pd.DataFrame:
+    return pair_table(rows)
+
+
+def test_a_failed_estimate_is_a_failure_and_an_unknown_error_is_left_out() -> None:
+    pairs = table(
+        row(0, 0.5),
+        row(1, 1.5),
+        row(2, 0.1, status="failed(no_flow)"),  # small error of a motion that was never found
+        row(3, None, status="failed(no_valid_depth)"),
+        row(4, None),
+        row(5, 1.0),  # one pixel is no failure yet
+    )
+    rate = failure_rate(pairs)
+    assert {k: rate[k] for k in ("pairs", "failures", "failure_rate")} == {
+        "pairs": 5, "failures": 3, "failure_rate": 0.6,
+    }  # fmt: skip
+
+
+def test_the_interval_of_a_rate_by_hand() -> None:
+    # E. B. Wilson's score interval at 0 of 10 and 1 of 10, 95 %
+    for failures, low, high in ((0, 0.0, 0.2775), (1, 0.0179, 0.4042)):
+        rate = failure_rate(table(*(row(i, 9.0 if i < failures else 0.1) for i in range(10))))
+        assert rate["failure_rate_low"] == pytest.approx(low, abs=1e-4)
+        assert rate["failure_rate_high"] == pytest.approx(high, abs=1e-4)
+    assert failure_rate(table(row(0, None)))["failure_rate"] is None
+
+
+def test_a_line_of_results_by_hand() -> None:
+    errors = {"rot_err_deg": 1.0, "trans_err": 0.1, "r_err_deg": 0.5, "t_err": 0.05}
+    pairs = table(
+        row(0, 2.0, **errors, epe=0.3, ms=10.0, flow_ms=5.0, dynamic_fraction=0.5),
+        row(1, 4.0, **errors | {"rot_err_deg": 3.0}, epe=0.5, ms=20.0, flow_ms=5.0),
+        row(2, None, status="failed(no_flow)", ms=30.0, flow_ms=5.0),
+    )
+    poses = np.stack([se3_exp(np.array([0.1 * k, 0.02 * k**2, 0, 0, 0, 0])) for k in range(4)])
+    gt = Trajectory(np.arange(4) / 10, poses)
+    named = {"sequence": "walk", "method": "a", "flow_source": "dis", "depth_source": "true"}
+    line = sequence_row(pairs, gt.transformed(se3_exp(np.full(6, 0.3))), gt, named)
+    expected = {
+        **{"pairs": 3, "pairs_scored": 2, "failed": 1, "failures": 3, "epe_l2_px": 3.0},
+        **{"epe": 0.4, "rot_err_deg_mean": 2.0, "trans_err_median": 0.1, "ms_per_pair_median": 20},
+        **{"ms_with_flow_median": 25.0, "dynamic_fraction": 0.5, "alignment": "se3"},
+    }
+    assert {key: line[key] for key in expected} == pytest.approx(expected)
+    assert line["ate_rmse"] == pytest.approx(0, abs=1e-12)
+    missing = {key for key, value in line.items() if value is None}
+    assert missing == {"kitti_drift"} and line["reasons"]["kitti_drift"]
+    other = sequence_row(pairs, gt, None, named | {"sequence": "b"})
+    assert other["ate_rmse"] is None
+    total = total_row(pd.concat([pairs, pairs]), [line, other])
+    assert total["pairs"] == 6 and total["ate_rmse"] == line["ate_rmse"]
+    assert "1 of 2 sequences" in total["reasons"]["ate_rmse"]
+
+
+def test_methods_without_flow_do_not_wait_for_it() -> None:
+    pairs = table(row(0, 1.0, "identity", rot_err_deg=1.0, ms=1.0, flow_ms=50.0))
+    named = {"sequence": "s", "method": "identity", "flow_source": "dis", "depth_source": "true"}
+    assert sequence_row(pairs, None, None, named)["ms_with_flow_median"] == 1.0
+
+
+@pytest.mark.parametrize(
+    ("scales", "warned"),
+    [((1000.0, 1010.0), True), ((0.2, 0.21), True), ((1.0, 1.1), False), ((5.0, 50.0), False)],
+)
+def test_a_ground_truth_in_another_unit_is_named(scales, warned) -> None:
+    rows = [{"scale_sim3": s, "method": "a", "failed": 0, "pairs": 9} for s in scales]
+    rows.append({"scale_sim3": 1.0, "method": "identity", "failed": 0, "pairs": 9})
+    assert bool(scale_warning(rows)) is warned
+
+
+def test_bins_hold_their_lower_edge_and_the_last_one_both() -> None:
+    values = {0.0: 0.0, 0.02: 0.02, 0.0199: 0.0, 0.99: 0.5, 1.0: 0.5}
+    pairs = table(*(row(i, 0.1 * i, dynamic_fraction=v) for i, v in enumerate(values)))
+    found = breakdown(pairs)
+    cells = [cell for cell in found["cells"] if cell["factor"] == "dynamic_fraction"]
+    counts = {cell["low"]: cell["pairs"] for cell in cells}
+    assert counts == {0.0: 2, 0.02: 1, 0.5: 2}
+    (first,) = (cell for cell in cells if cell["low"] == 0.0)
+    assert first["epe_l2_px_median"] == pytest.approx(0.1) and first["high"] == 0.02
+    known = {factor["name"]: factor["pairs"] for factor in found["factors"]}
+    assert known["dynamic_fraction"] == 5 and known["rotation_deg"] == 0
+    (rate,) = found["failure_rates"]
+    assert (rate["method"], rate["pairs"]) == ("a", 5)
+
+
+def test_the_worst_pairs_by_hand() -> None:
+    pairs = table(
+        row(0, 0.5),
+        row(1, 7.0),
+        row(2, None),  # unknown, not failed: left out
+        row(3, None, status="failed(no_flow)"),
+        row(4, 2.0),
+        row(0, math.nan, "b"),
+    )
+    worst = worst_pairs(pairs, 3)
+    assert [(entry["method"], entry["rank"], entry["index"]) for entry in worst] == [
+        ("a", 1, 1),
+        ("a", 2, 4),
+        ("a", 3, 0),
+    ]
+    assert worst_pairs(pairs, 4)[3]["epe_l2_px"] is None
+    assert worst_pairs(pairs, 0) == []
