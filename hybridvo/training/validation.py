@@ -11,14 +11,15 @@ from typing import Any
 import numpy as np
 import torch
 import torch.nn.functional as F
-from scipy.stats import rankdata, spearmanr
+from scipy.stats import rankdata
 
 from hybridvo.errors import InputError
 from hybridvo.learned import next_start
 from hybridvo.network.losses import NetworkOutput, reconstruct
 from hybridvo.network.passes import predict
-from hybridvo.network.selection import chosen_pose, select, selected_transform
+from hybridvo.network.selection import select_pose
 from hybridvo.synthetic.presets import Preset
+from hybridvo.torch_geometry import euler_transform
 from hybridvo.training.stream import TrainingBatch, collate, sample_generator
 from hybridvo.types import PixelwisePrediction
 
@@ -47,6 +48,14 @@ def area_under_curve(score: np.ndarray, label: np.ndarray) -> float | None:
         return None
     ranks = rankdata(score)
     return float((ranks[label].sum() - positive * (positive + 1) / 2) / (positive * negative))
+
+
+def rank_correlation(a: np.ndarray, b: np.ndarray) -> float | None:
+    """Spearman's correlation of (N,) values; None where one of them is constant."""
+    ranks = [rankdata(x) for x in (a, b)]
+    if min(np.ptp(r) if r.size else 0.0 for r in ranks) == 0:
+        return None
+    return float(np.corrcoef(*ranks)[0, 1])
 
 
 def evaluate_network(
@@ -119,10 +128,10 @@ def _errors(output: NetworkOutput, batch: TrainingBatch, selection: str) -> np.n
     """(B, 6) R_err, T_err and EPE of the network and of zero motion."""
     gt = batch.targets
     if selection.endswith("-joint") and isinstance(output, PixelwisePrediction):
-        rotation, translation = select(output, selection.removesuffix("-joint"), joint=True)
+        rotation, translation = select_pose(output, selection.removesuffix("-joint"), joint=True)
     else:
-        rotation, translation = chosen_pose(output, selection)
-    T = selected_transform(rotation, translation)
+        rotation, translation = select_pose(output, selection)
+    T = euler_transform(rotation, translation)
     flow, _, defined = reconstruct(gt.depth_prev, T, gt.K_prev, gt.K_curr)
     near = gt.ego_flow.norm(dim=1) < EPE_LIMIT_PX
     # Sky has no depth to reproject; a point behind the camera has no flow: neither counts.
@@ -167,10 +176,12 @@ def _uncertainty_figures(pixels: list[np.ndarray], index: int, name: str) -> dic
         return dict.fromkeys(keys)
     table = np.concatenate(pixels)
     s, ratio = table[:, 1 + 3 * index], table[:, 3 + 3 * index]
-    columns = (1 + 3 * index, 2 + 3 * index)
-    ranks = [spearmanr(p[:, columns[0]], p[:, columns[1]]).statistic for p in pixels if len(p) > 2]
+    columns = [1 + 3 * index, 2 + 3 * index]
+    ranks = [rank_correlation(*p[:, columns].T) for p in pixels]
+    known = [r for r in ranks if r is not None]
+    spearman = float(np.mean(known)) if known else None
     auroc = area_under_curve(s, table[:, 0] > 0.5)
-    return dict(zip(keys, (auroc, float(np.nanmean(ranks)), float(ratio.mean())), strict=True))
+    return dict(zip(keys, (auroc, spearman, float(ratio.mean())), strict=True))
 
 
 def calibrate_scales(
