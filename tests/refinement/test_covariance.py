@@ -1,0 +1,216 @@
+"""The sandwich covariance against errors of known correlation."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hybridvo.geometry import invert, se3_log
+from hybridvo.pipeline import refine
+from hybridvo.refinement import kernels, solver
+from hybridvo.refinement.covariance import (
+    LONG_GROWTH,
+    ORDER,
+    SIZES,
+    UPPER,
+    block_sums,
+    long_range,
+    sandwich_covariance,
+)
+from hybridvo.refinement.pixels import PixelGrid
+from hybridvo.refinement.refine import widened
+from hybridvo.synthetic.scenarios import make_pair
+from hybridvo.types import FramePair, Reason, State, Status
+
+FINE, ROWS, COLUMNS = 4, 7, 16
+"""Readings along the side of a tile, and tiles: those of a image of 436x1024."""
+GRID = (ROWS * FINE, COLUMNS * FINE)
+
+
+def flow_jacobian() -> np.ndarray:
+    """(rows, columns, 2, 6) of the flow of a curved surface, in radians of the image."""
+    v, u = np.mgrid[0 : GRID[0], 0 : GRID[1]]
+    a, b = (u - GRID[1] / 2) / GRID[1] * 0.9, (v - GRID[0] / 2) / GRID[1] * 0.9
+    i = 1 + 0.6 * np.sin(u / 7) * np.cos(v / 5)
+    zero = np.zeros_like(a)
+    rows = [
+        [i, zero, -a * i, -a * b, 1 + a * a, -b],
+        [zero, i, -b * i, -1 - b * b, a * b, a],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+J = flow_jacobian()
+H_PIXEL = np.einsum("vuki,vukj->vuij", J, J)
+H = H_PIXEL.sum(axis=(0, 1))
+
+
+def to_tiles(values: np.ndarray) -> np.ndarray:
+    rest = values.shape[2:]
+    return values.reshape(ROWS, FINE, COLUMNS, FINE, *rest).sum(axis=(1, 3))
+
+
+def smooth(rng: np.random.Generator, width: int) -> np.ndarray:
+    """(rows, columns, 2) of unit variance: white noise averaged over ``width`` readings."""
+    pad = width - 1
+    noise = rng.standard_normal((GRID[0] + pad, GRID[1] + pad, 2))
+    for axis in (0, 1):
+        sums = np.cumsum(np.insert(noise, 0, 0.0, axis=axis), axis=axis)
+        size = sums.shape[axis] - width
+        noise = np.take(sums, range(width, width + size), axis) - np.take(sums, range(size), axis)
+    return noise / width
+
+
+def answer(error: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(error of the least-squares motion, covariance that its residuals give)."""
+    motion = np.linalg.solve(H, np.einsum("vuki,vuk->i", J, error))
+    residual = error - J @ motion
+    scores = to_tiles(np.einsum("vuki,vuk->vui", J, residual))
+    information = to_tiles(H_PIXEL)[..., UPPER[0], UPPER[1]]
+    total = np.zeros(kernels.SUMS)
+    total[:21] = H[UPPER]
+    products = np.einsum("vuki,vuk->vui", J, residual).reshape(-1, 6)
+    meat = (products.T @ products)[UPPER]
+    covariance, _, definite = sandwich_covariance(
+        total, np.zeros(21), meat, scores, information, 1.0
+    )
+    assert definite
+    return motion, covariance
+
+
+def consistency(width: int, draws: int = 150) -> tuple[float, float]:
+    """(mean normalised error squared, mean stated over true variance) of errors so correlated."""
+    rng = np.random.default_rng([7, width])
+    found = [answer(smooth(rng, width)) for _ in range(draws)]
+    motions = np.array([motion for motion, _ in found])
+    nees = [m @ np.linalg.solve(C, m) for m, C in found]
+    true = motions.T @ motions / draws
+    stated = np.mean([C for _, C in found], axis=0)
+    return float(np.mean(nees)), float(np.trace(np.linalg.solve(true, stated)) / 6)
+
+
+def test_independent_errors_give_the_models_own_covariance() -> None:
+    nees, ratio = consistency(1)
+    # 150 draws: standard error of the mean of chi-square with 6 degrees of freedom 0.28; the scaled
+    # part never falls below the model's, which costs a few percent
+    assert 4.9 < nees < 7.1
+    # sampling of the true covariance, 6 directions x 150 draws: 5 %
+    assert 0.85 < ratio < 1.25
+
+
+@pytest.mark.parametrize("width", [2, FINE])
+def test_errors_that_neighbours_share_are_inflated_by_the_right_factor(width: int) -> None:
+    nees, ratio = consistency(width)
+    # sums over all readings have width^2 times the variance of independent errors: 4 and 16. Errors
+    # as wide as a tile lose about a fifth of it at the blocks' borders
+    assert 4.2 < nees < 8.5
+    assert 0.7 < ratio < 1.6
+
+
+def test_the_stated_variance_grows_with_the_correlation() -> None:
+    sizes = []
+    for width in (1, 2, 4):
+        rng = np.random.default_rng([3, width])
+        C = np.mean([answer(smooth(rng, width))[1] for _ in range(20)], axis=0)
+        sizes.append(np.trace(H @ C) / 6)
+    assert sizes[0] == pytest.approx(1.0, abs=0.2)  # 20 draws of 112 tiles
+    assert sizes[1] > 2.5 and sizes[2] > 9  # of 4 and 16, less the borders
+
+
+def test_errors_over_the_whole_image_are_continued_beyond_the_blocks() -> None:
+    nees, without = [], []
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        # equal shares of all scales up to half of the image
+        error = np.sum([smooth(rng, width) for width in (1, 2, 4, 8, 16)], axis=0)
+        motion, C = answer(error)
+        nees.append(motion @ np.linalg.solve(C, motion))
+        information = to_tiles(H_PIXEL)[..., UPPER[0], UPPER[1]]
+        scores = to_tiles(np.einsum("vuki,vuk->vui", J, error - J @ motion))
+        meats, lost = np.empty((len(SIZES), 6, 6)), np.empty(len(SIZES))
+        block_sums(scores, information, np.linalg.inv(H), SIZES, ORDER, meats, lost)
+        tiles_only = np.linalg.inv(H) @ meats[0] @ np.linalg.inv(H)
+        without.append(motion @ np.linalg.solve(tiles_only, motion))
+    # expected 6; tiles alone know nothing of what is wider than they are
+    assert np.median(without) > 12
+    assert np.median(nees) < 9
+
+
+def test_reach_by_hand() -> None:
+    assert long_range(LONG_GROWTH[0], 112) == 1.0
+    assert long_range(math.nan, 112) == 1.0
+    # four times in two doublings, twice that exponent for what the fit absorbed: with the area
+    assert long_range(4.0, 64) == pytest.approx(64 / 4)
+    assert long_range(1e6, 64) == pytest.approx(64 / 4)  # no faster than the area
+    assert long_range(4.0, 3) == 1.0  # a block is the whole image already
+    values = [long_range(g, 112) for g in np.linspace(1, 4, 50)]
+    assert np.all(np.diff(values) >= 0)
+
+
+def test_block_sums_by_hand() -> None:
+    s = np.zeros((1, 2, 6))
+    s[0, 0, 0], s[0, 1, 0], s[0, 1, 1] = 2.0, -1.0, 3.0
+    information = np.zeros((1, 2, 21))
+    information[..., np.flatnonzero(UPPER[0] == UPPER[1])] = 0.5  # half of the unit matrix each
+    meats, lost = np.empty((len(SIZES), 6, 6)), np.empty(len(SIZES))
+    assert block_sums(s, information, np.eye(6), SIZES, ORDER, meats, lost) == 2
+    assert meats[0][:2, :2].tolist() == [[5.0, -3.0], [-3.0, 9.0]]
+    # blocks {1}, {1, 2}, {2}, each in two rows, a quarter each: sum (1, 3) of both
+    assert meats[1][:2, :2].tolist() == [[3.0, 0.0], [0.0, 9.0]]
+    # of the unit matrix: (1/4 + 1/4) and (1/4 + 1 + 1/4) / 2
+    assert lost[:2].tolist() == [0.5, 0.75]
+
+
+def line(pair: FramePair) -> FramePair:
+    """The pair with depth on a slanted line three pixels wide."""
+    height, width = pair.prev.camera.shape
+    v, u = np.mgrid[0:height, 0:width]
+    off = np.abs(v - height / 2 - 0.35 * (u - width / 2)) > 1.5
+    depth = np.where(off, np.nan, pair.prev.depth).astype(np.float32)
+    return replace(pair, prev=replace(pair.prev, depth=depth), curr=replace(pair.curr, depth=None))
+
+
+def test_a_narrow_support_is_degraded_and_a_whole_image_is_not() -> None:
+    pair, _ = make_pair("moving00", 3)
+    assert refine(pair).status.state is State.OK
+    result = refine(line(pair))
+    assert result.status.state is State.DEGRADED
+    assert result.status.reason is Reason.DEGENERATE_GEOMETRY
+
+
+def test_depth_noise_that_the_flow_cannot_tell_comes_from_the_second_depth() -> None:
+    # 0.3 m at 100 m: a parallax of 3 px, of which 2 % are lost in 0.5 px of flow noise
+    pair, _ = make_pair("far", 5)
+    result = refine(pair)
+    # the depths differ by 1.2 to 1.41 times the noise, as much of it as interpolation averages
+    assert result.depth_noise == pytest.approx(0.02, rel=0.2)
+
+
+def test_depth_noise_that_nothing_tells_is_doubted() -> None:
+    pair, _ = make_pair("zero_motion", 5)
+    samples, h, w, _ = (image := PixelGrid(pair, None)).samples(7500)
+    pose = np.eye(4)[:3].copy()
+    facts = solver.estimate_noise(samples, h * w, pose, image.K, 0.5, 0.01, 2.0, 0.08, 5, 4000)
+    assert facts[3] == pytest.approx(solver.DOUBTFUL_DEPTH_NOISE**2)
+
+
+def test_a_degraded_motion_covers_its_doubt() -> None:
+    # the depths of both frames differ by a third: the length of the translation is as uncertain
+    pair, _ = make_pair("moving00", 4)
+    wrong = replace(pair, curr=replace(pair.curr, depth=1.4 * pair.curr.depth))
+    result = refine(wrong)
+    assert result.status.reason is Reason.NO_VALID_DEPTH
+    t = result.T_curr_prev[:3, 3]
+    assert np.sqrt(t @ result.covariance[:3, :3] @ t) / (t @ t) > 0.3
+    # another of the motions found could be the camera's: so could be the distance to it
+    pair, _ = make_pair("one60", 1)
+    found = refine(pair)
+    doubt = Status.degraded(Reason.AMBIGUOUS_MOTION, "two motions")
+    wide = widened(found.replace(status=doubt, probability=0.4))
+    for other in found.hypotheses[1:]:
+        delta = se3_log(other.T_curr_prev @ invert(wide.T_curr_prev))
+        assert delta @ np.linalg.solve(wide.covariance, delta) < 10
+    assert widened(found.replace(status=Status())) is not wide

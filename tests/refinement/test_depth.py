@@ -1,0 +1,125 @@
+"""Depths of two frames that do not belong to one world, as a pair can tell."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hybridvo.geometry import ego_flow, se3_exp
+from hybridvo.options import Options, RefineOptions
+from hybridvo.pipeline import estimate, refine
+from hybridvo.refinement import kernels
+from hybridvo.refinement.depth_agreement import depth_agreement
+from hybridvo.types import Camera, Frame, FramePair, Reason
+
+K = Camera(140, 140, 127.5, 95.5, 192, 256)
+T = se3_exp(np.array([0.05, -0.03, 0.1, 0.01, -0.02, 0.015]))
+
+
+def world(T_cam_world: np.ndarray) -> np.ndarray:
+    """Depth of two planes: a wall and a floor, exact at every pixel."""
+    v, u = np.mgrid[: K.height, : K.width].astype(float)
+    rays = np.stack([(u - K.cx) / K.fx, (v - K.cy) / K.fy, np.ones_like(u)], -1)
+    depths = []
+    for normal, distance in (((0.3, 0, 1.0), 4.0), ((0.0, 1.0, 0.2), 1.5)):
+        turned = T_cam_world[:3, :3] @ np.array(normal)
+        along = rays @ turned
+        depth = (distance + turned @ T_cam_world[:3, 3]) / np.where(along > 1e-3, along, np.nan)
+        depths.append(depth)
+    return np.fmin(*depths)
+
+
+def make(noise_px: float = 0.1, seed: int = 0) -> FramePair:
+    prev, curr = Frame(None, world(np.eye(4)), K), Frame(None, world(T), K, index=1)
+    flow = ego_flow(prev.depth, T, K, K)
+    rng = np.random.default_rng(seed)
+    return FramePair(prev, curr, flow + rng.normal(0, noise_px, flow.shape))
+
+
+def with_depths(pair: FramePair, change) -> FramePair:
+    prev, curr = (replace(f, depth=change(f.depth)) for f in (pair.prev, pair.curr))
+    return replace(pair, prev=prev, curr=curr)
+
+
+def test_numbers_by_hand() -> None:
+    # 200 points straight ahead, 4 m away; the camera goes 1 m towards them
+    samples = np.zeros((10, 200), np.float32)
+    samples[kernels.Z], samples[kernels.W] = 4.0, 1.0
+    samples[kernels.MU], samples[kernels.MV] = np.arange(200), 3.0
+    depth = np.full((10, 300), 3.0)
+    depth[3, :50], depth[3, 50:100], depth[3, 100:200] = 3.3, 2.7, 3.0
+    pose = np.eye(4)[:3]
+    pose[2, 3] = -1.0
+    found = depth_agreement(Frame(None, depth, Camera(9, 9, 0, 0, 10, 300)), samples,
+                            np.ones(200, np.float32), pose, (0.0, 0.0))  # fmt: skip
+    assert found is not None
+    # a quarter at log 1.1 = 0.0953, a quarter at log 0.9, a half at 0: the middle one is 0
+    assert found.ratio == pytest.approx(1.0, abs=1e-6)
+    assert 0 <= found.spread <= 0.106 and not found.doubt
+    twice = depth_agreement(Frame(None, 2 * depth, Camera(9, 9, 0, 0, 10, 300)), samples,
+                            np.ones(200, np.float32), pose, (0.0, 0.0))  # fmt: skip
+    assert twice is not None and twice.ratio == pytest.approx(2.0, abs=1e-6)
+    assert "2 times" in twice.doubt and not twice.is_none
+
+
+def test_one_world_is_no_doubt() -> None:
+    found = refine(make())
+    assert found.status.state.value == "ok"
+    # 5 % of noise in every pixel of both is 5 % of spread
+    rng = np.random.default_rng(1)
+    noisy = with_depths(make(), lambda d: d * np.exp(rng.normal(0, 0.05, d.shape)))
+    assert refine(noisy).status.state.value == "ok"
+
+
+@pytest.mark.parametrize("method", ["refine", "hybrid"])
+@pytest.mark.parametrize("low, high", [(0.5, 10.0), (2.0, 4.0)])
+def test_depth_of_noise_is_never_simply_ok(method: str, low: float, high: float) -> None:
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        pair = with_depths(make(seed=seed), lambda d, r=rng: r.uniform(low, high, d.shape))
+        found = estimate(pair, method=method, seed=seed)
+        assert found.status.state.value != "ok"
+        # whatever the motion turns on, the depths of 0.5 to 10 m have nothing in common
+        assert found.status.state.value == "failed" or low == 2.0
+
+
+@pytest.mark.parametrize("scale", [0.5, 0.8, 1.3, 1000.0])
+def test_another_scale_is_degraded_and_the_motion_that_of_the_first(scale: float) -> None:
+    pair = make()
+    pair = replace(pair, curr=replace(pair.curr, depth=scale * pair.curr.depth))
+    found = refine(pair)
+    assert found.status.reason is Reason.NO_VALID_DEPTH
+    assert found.status.state.value == "degraded"
+    assert f"{scale:.3g} times" in found.status.message
+    # the flow and the first depth alone say how far: 0.1 px over 200 x 256 pixels
+    assert np.linalg.norm(found.T_curr_prev[:3, 3] - T[:3, 3]) < 0.003
+
+
+@settings(max_examples=15, deadline=None)
+@given(scale=st.floats(0.9, 1.1), holes=st.floats(0, 0.9), seed=st.integers(0, 99))
+def test_a_tenth_of_scale_and_holes_are_no_doubt(scale: float, holes: float, seed: int) -> None:
+    pair = make()
+    depth = scale * pair.curr.depth
+    depth[np.random.default_rng(seed).uniform(size=depth.shape) < holes] = np.nan
+    found = refine(replace(pair, curr=replace(pair.curr, depth=depth)))
+    assert found.status.state.value == "ok", found.status
+
+
+def test_what_cannot_be_compared_is_no_doubt() -> None:
+    pair = make()
+    wrong = 3.0 * pair.curr.depth
+    for depth, mask in (
+        (np.full(K.shape, np.nan), None),
+        (np.zeros(K.shape), None),
+        (wrong, np.zeros(K.shape, bool)),
+        (np.where(np.arange(K.width) < 1, wrong, np.inf), None),
+    ):
+        curr = replace(pair.curr, depth=depth, mask=mask)
+        assert refine(replace(pair, curr=curr)).status.state.value == "ok"
+    off = Options(refine=RefineOptions(current_depth="off"))
+    unasked = replace(pair, curr=replace(pair.curr, depth=wrong))
+    assert refine(unasked, options=off).status.state.value == "ok"
