@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from hybridvo.evaluation.metrics import ate
+from hybridvo.evaluation.trajectory_errors import ate
 from hybridvo.geometry import invert
 from hybridvo.trajectory import Trajectory, read_trajectory
 

@@ -10,14 +10,12 @@ from scipy.spatial.transform import Rotation
 
 from hybridvo.errors import FormatError, InputError
 from hybridvo.evaluation.metrics import (
-    associate,
-    ate,
     evaluate,
     evaluate_files,
     kitti_drift,
     nees,
-    rpe,
 )
+from hybridvo.evaluation.trajectory_errors import associate, ate, rpe
 from hybridvo.geometry import invert, make_transform, se3_exp, se3_log
 from hybridvo.trajectory import Trajectory, read_trajectory, write_tum
 
