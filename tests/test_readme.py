@@ -17,7 +17,6 @@ import pytest
 
 import hybridvo
 from hybridvo.cli import build_parser
-from hybridvo.commands.demo import demo
 from hybridvo.data.sequence import open_sequence
 from hybridvo.errors import InputError
 from hybridvo.pipeline import METHODS
@@ -260,18 +259,6 @@ def test_results_say_how_they_were_made():
             else [part for name, part in content.items() if name != "machine"]
         )
         assert parts and all(part["command"] for part in parts), path.name
-
-
-def test_the_demo_prints_what_the_readme_shows(tmp_path):
-    printed, code = demo(tmp_path / "demo", frames=2, quiet=True)
-    assert code == 0
-    shown = parts()["demo"]
-    header = next(line for line in printed.splitlines() if line.startswith("method"))
-    assert header.split() in [line.split() for line in shown.splitlines()]
-    star = next(line for line in printed.splitlines() if line.startswith("*"))
-    assert star in shown
-    note = re.sub(r"\d+", "N", printed.splitlines()[0])
-    assert note in re.sub(r"\d+", "N", shown)
 
 
 # Other pages
