@@ -17,6 +17,7 @@ _HOME = {
     "FramePair": "hybridvo.types",
     "MotionPrior": "hybridvo.types",
     "Options": "hybridvo.options",
+    "PWVO": "hybridvo.network.pwvo",
     "PairBatch": "hybridvo.types",
     "RelativePose": "hybridvo.types",
     "Status": "hybridvo.types",

@@ -96,12 +96,12 @@ def next_start(network: torch.nn.Module, selection: str = "softmax") -> Chooser:
         network: of ``build_network`` or ``load_weights``.
         selection: how one pose is selected from the pixels.
     """
-    from hybridvo.network.selection import chosen_motion
+    from hybridvo.network.selection import select_motion
 
     options = getattr(network, "options", None)
     if options is not None and options.pass_start == "fit":
         return lambda output, inputs: fitted_motion(output, inputs, selection)
-    return lambda output, inputs: chosen_motion(output, selection)
+    return lambda output, inputs: select_motion(output, selection)
 
 
 def fitted_motion(
@@ -119,7 +119,7 @@ def fitted_motion(
     """
     import torch.nn.functional as F
 
-    from hybridvo.network.selection import chosen_motion
+    from hybridvo.network.selection import select_motion
     from hybridvo.network.weighted_fit import pixel_weights, weighted_fit
     from hybridvo.types import PixelwisePrediction
 
@@ -140,7 +140,7 @@ def fitted_motion(
         inputs.inverse_depth[:, 0].flatten(1),
         target.flatten(2),
         pixel_weights(log_scale, inputs.valid).flatten(1),
-        chosen_motion(output, selection),
+        select_motion(output, selection),
     )
 
 
@@ -218,7 +218,7 @@ def estimate_learned(
 
     from hybridvo.network.inputs import assemble_inputs
     from hybridvo.network.passes import predict
-    from hybridvo.network.selection import chosen_motion, chosen_pose, select
+    from hybridvo.network.selection import select_motion, select_pose
     from hybridvo.types import PixelwisePrediction
 
     started = time.perf_counter()
@@ -238,8 +238,8 @@ def estimate_learned(
                 method,
             )
         output = predict(network, inputs, next_start(network, how))
-        rotation, translation = (x.double() for x in chosen_pose(output, how))
-        T = chosen_motion((rotation, translation), how)[0].numpy()
+        rotation, translation = (x.double() for x in select_pose(output, how))
+        T = select_motion((rotation, translation), how)[0].numpy()
         scales = torch.tensor([[UNKNOWN_M] * 3 + [UNKNOWN_DEG] * 3], dtype=torch.float64)
         log_r = log_t = None
         if isinstance(output, PixelwisePrediction):
@@ -247,7 +247,7 @@ def estimate_learned(
         if log_r is not None and log_t is not None:
             # The scales go the way of the values: same pixels, same weights.
             stated = PixelwisePrediction(log_r.exp(), log_t.exp(), log_r, log_t)
-            scale_r, scale_t = select(stated, how)
+            scale_r, scale_t = select_pose(stated, how)
             scales = torch.cat([scale_t, scale_r], dim=1).double()
     U = np.maximum(scales[0].numpy(), LEAST_SCALE)
     ms = 1e3 * (time.perf_counter() - started)

@@ -240,6 +240,24 @@ def hybrid(pair: FramePair, ctx: Context) -> RelativePose:
     return hybrid_flow(pair, ctx)
 
 
+def pwvo_refine(pair: FramePair, ctx: Context) -> RelativePose:
+    """PWVO's selected motion and uncertainty seed and weigh the refinement in torch, on its device.
+
+    The same lines serve batches, with gradients to flow, depth, weights and maps.
+    """
+    from hybridvo.learned import plain_torch
+    from hybridvo.network.selection import select
+    from hybridvo.refinement.torch_backend import refine_batch
+
+    network = ctx.models.network("pwvo")
+    with plain_torch():
+        batch = PairBatch.from_pairs([pair], device=ctx.models.device)
+        seed = select(network(batch))
+        return refine_batch(batch, seed.T_curr_prev, seed.weights, options=ctx.options.refine).one(
+            0
+        )
+
+
 def learned(name: str) -> Callable[[FramePair, Context], RelativePose]:
     """A network alone, by the paper's selection."""
 
@@ -270,6 +288,7 @@ METHODS: dict[str, Callable[[FramePair, Context], RelativePose]] = {
     "hybrid": hybrid,
     "hybrid-flow": hybrid_flow,
     "refine": classical,
+    "pwvo-refine": pwvo_refine,
     **{name: learned(name) for name in LEARNED},
     **{name: baseline(name) for name in BASELINES},
 }
@@ -282,6 +301,8 @@ def networks_of(method: str) -> tuple[str, ...]:
     """Names of the weights that a method uses."""
     if method in SELECTING:
         return ("judge", "pwvo")
+    if method == "pwvo-refine":
+        return ("pwvo",)
     return (method,) if method in LEARNED else ()
 
 

@@ -10,6 +10,7 @@ pixels from the previous to the current frame, on the previous grid; tangent vec
 from __future__ import annotations
 
 import enum
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -544,12 +545,14 @@ class PixelwisePrediction:
         translation: (B, 3, h, w) metres, of T_curr_prev.
         log_scale_rotation, log_scale_translation: (B, 3, h, w), s = log of the Laplace scale U, or
             None where the network predicts no uncertainty.
+        image_size: (H, W) of the pairs that the network was given, or None.
     """
 
     rotation: torch.Tensor
     translation: torch.Tensor
     log_scale_rotation: torch.Tensor | None = None
     log_scale_translation: torch.Tensor | None = None
+    image_size: tuple[int, int] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -572,6 +575,61 @@ class PairBatch:
     flow_variance: torch.Tensor | None = None
     depth_variance: torch.Tensor | None = None
     valid: torch.Tensor | None = None
+
+    @classmethod
+    def from_pairs(
+        cls,
+        pairs: Sequence[FramePair],
+        device: torch.device | str | None = None,
+        dtype: torch.dtype | None = None,
+    ) -> PairBatch:
+        """A batch of numpy pairs of one size; what a pair lacks is NaN, that is, invalid.
+
+        Args:
+            pairs: at least one.
+            device: of the tensors; the CPU by default.
+            dtype: their type; float32 by default.
+
+        Raises:
+            InputError: no pair, or pairs of several sizes.
+        """
+        import torch
+
+        sizes = {pair.prev.camera.shape for pair in pairs}
+        if len(sizes) != 1:
+            raise InputError(
+                f"PairBatch.from_pairs: expected pairs of one size, got {sorted(sizes)}."
+            )
+        size = sizes.pop()
+
+        def stack(values: list[Any], lacking: float = np.nan) -> Any:
+            given = [value for value in values if value is not None]
+            if not given:
+                return None
+            absent = np.full(given[0].shape, lacking, np.float32)
+            array = np.stack([absent if value is None else value for value in values])
+            return torch.as_tensor(array, device=device).to(dtype or torch.float32)
+
+        def masked(array: np.ndarray | None, mask: np.ndarray | None) -> np.ndarray | None:
+            hidden = array is None or mask is None
+            return array if hidden else np.where(mask, array, np.float32(np.nan))
+
+        valid = np.ones((len(pairs), *size), np.bool_)
+        for k, pair in enumerate(pairs):
+            for mask in (pair.prev.mask, pair.flow_valid):
+                valid[k] &= True if mask is None else mask
+        no_flow, no_depth = np.full((*size, 2), np.nan), np.full(size, np.nan)
+        return cls(
+            flow=stack([no_flow if p.flow is None else p.flow for p in pairs]),
+            depth_prev=stack([no_depth if p.prev.depth is None else p.prev.depth for p in pairs]),
+            K_prev=stack([p.prev.camera.K for p in pairs]),
+            K_curr=stack([p.curr.camera.K for p in pairs]),
+            depth_curr=stack([masked(p.curr.depth, p.curr.mask) for p in pairs]),
+            # a pair without variances beside one with them has those of a typical pixel
+            flow_variance=stack([p.flow_variance for p in pairs], 1.0),
+            depth_variance=stack([p.prev.depth_variance for p in pairs], 1.0),
+            valid=torch.as_tensor(valid, device=device),
+        )
 
 
 def _sizes(metres: np.ndarray, radians: np.ndarray) -> str:

@@ -276,7 +276,7 @@ def command_line(inputs: Path, method: str) -> dict[str, Any]:
         out = Path(folder) / "run"
         command = [str(Path(sys.executable).parent / "hybridvo"), "run", "--sequence", sequence]
         command += ["--flow", "dis", "--method", method, "--out", out, "--quiet"]
-        done = subprocess.run([str(word) for word in command], check=False)
+        done = subprocess.run(list(map(str, command)), stdout=subprocess.DEVNULL, check=False)
         files = sorted(str(path.relative_to(out)) for path in out.rglob("*") if path.is_file())
         with open(out / "steps.csv", encoding="utf-8", newline="") as file:
             steps = list(csv.DictReader(file))

@@ -46,11 +46,11 @@ Cases = Iterator[tuple[dict[str, Any], np.ndarray, dict[str, Any]]]
 def write_inputs(folder: Path, data: Path) -> None:
     """Every group below ``folder``, and ``index.json`` with the hash of the arrays of each."""
     groups: dict[str, Cases] = {kind: heavy(kind) for kind in HEAVY}
-    from hybridvo.data.benchmark_pairs import DEGENERATE_CELLS, MAIN_CELLS
+    from hybridvo.synthetic.scenarios import DEGENERATE_SCENARIOS, MAIN_SCENARIOS
 
-    groups |= {f"scenario_{name}": scenario(name) for name in MAIN_CELLS}
+    groups |= {f"scenario_{name}": scenario(name) for name in MAIN_SCENARIOS}
     groups |= {
-        f"degenerate_{name}": degenerate(name) for name in (*DEGENERATE_CELLS, *UNDETERMINED)
+        f"degenerate_{name}": degenerate(name) for name in (*DEGENERATE_SCENARIOS, *UNDETERMINED)
     }
     groups["model_noise"] = model_noise()
     for name in REAL:
@@ -121,9 +121,8 @@ def read_pair(path: Path, flow: str) -> tuple[Any, np.ndarray, np.ndarray, np.nd
 
 def heavy(kind: str) -> Cases:
     """Development scenes in which most of the image moves: true and DIS flow, true depth."""
-    from hybridvo.data.synthetic import SyntheticSequence, make_scene
-
     from hybridvo.flow import dis_flow
+    from hybridvo.synthetic.render import SyntheticSequence, make_scene
 
     height, width = SIZE
     for seed in HEAVY_SEEDS:
@@ -175,7 +174,7 @@ def real(data: Path, name: str) -> Cases:
 
 def scenario(name: str) -> Cases:
     """Pairs without images: known noise, moving objects, gross errors of the flow."""
-    from hybridvo.data.benchmark_pairs import make_pair
+    from hybridvo.synthetic.scenarios import make_pair
 
     for seed in range(5):
         pair, truth = make_pair(name, seed)
@@ -184,7 +183,7 @@ def scenario(name: str) -> Cases:
 
 def model_noise() -> Cases:
     """Static pairs whose noise is what the refinement assumes: the covariance must be right."""
-    from hybridvo.data.benchmark_pairs import make_model_pair
+    from hybridvo.synthetic.scenarios import make_model_pair
 
     for seed in range(60):
         pair, truth = make_model_pair(seed)
@@ -194,14 +193,14 @@ def model_noise() -> Cases:
 
 def degenerate(kind: str) -> Cases:
     """Four pairs, two of them without noise, in which the motion is weak or not determined."""
-    from hybridvo.data.benchmark_pairs import CELLS, Cell, make_pair
+    from hybridvo.synthetic.scenarios import SCENARIOS, Scenario, make_pair
 
     for k in range(4):
-        cell = Cell(moving=0.0) if kind in UNDETERMINED else CELLS[kind]
+        conditions = Scenario(moving=0.0) if kind in UNDETERMINED else SCENARIOS[kind]
         if k >= 2:
-            cell = replace(cell, flow_noise_px=0.0, depth_noise=0.0, outliers=0.0)
+            conditions = replace(conditions, flow_noise_px=0.0, depth_noise=0.0, outliers=0.0)
         stream = np.random.SeedSequence([zlib.crc32(kind.encode()), k])
-        pair, truth = make_pair(cell, int(stream.generate_state(1)[0]), *SIZE)
+        pair, truth = make_pair(conditions, int(stream.generate_state(1)[0]), *SIZE)
         T, depth = truth["T_curr_prev"], truth["depth_true"]
         if kind in UNDETERMINED:
             pair = undetermined(kind, pair, truth, np.random.default_rng([k, len(kind)]))
@@ -239,7 +238,7 @@ def undetermined(kind: str, pair: Any, truth: dict[str, Any], rng: np.random.Gen
 
 def walk(folder: Path) -> None:
     """A sequence to track at 640x480 as arrays, and one on disk for the command line."""
-    from hybridvo.data.synthetic import SyntheticSequence, make_scene, write_sintel
+    from hybridvo.synthetic.render import SyntheticSequence, make_scene, write_sintel
 
     height, width = WALK_SIZE
     scene = make_scene("light", 0, height=height, width=width, frames=WALK_FRAMES)

@@ -251,7 +251,7 @@ def saliencies(network: Any, inputs: Any, T_start: Any, steps: int) -> dict[str,
     """
     import torch
 
-    from hybridvo.network.selection import chosen_pose
+    from hybridvo.network.selection import select_pose
 
     names = ("flow",) if network.options.scale_free else ("flow", "inverse_depth")
     given = tuple(getattr(inputs, name) for name in names)
@@ -266,7 +266,7 @@ def saliencies(network: Any, inputs: Any, T_start: Any, steps: int) -> dict[str,
         if isinstance(output, PixelwisePrediction):
             maps = {name: getattr(output, name) for name in ("rotation", "translation")}
             maps = {name: value.clone().requires_grad_() for name, value in maps.items()}
-            motion = chosen_pose(replace(output, **maps))[k]
+            motion = select_pose(replace(output, **maps))[k]
             direction = (motion / motion.norm().clamp(min=1e-12)).detach()
             (weights,) = torch.autograd.grad((direction * motion).sum(), maps[what])
             answer = _weighted_map(run, what, weights)

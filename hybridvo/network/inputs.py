@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
-import numpy as np
 import torch
 
 from hybridvo.errors import InputError
@@ -128,12 +127,12 @@ def assemble_inputs(
     """
     size = _check_size(size)
     if isinstance(pair, FramePair):
-        return _from_batch(_to_batch(pair), size)
+        return _from_batch(PairBatch.from_pairs([pair]), size)
     if isinstance(pair, PairBatch):
         _check_batch(pair)
         return _from_batch(pair, size)
     if isinstance(pair, Sequence) and pair and all(isinstance(p, FramePair) for p in pair):
-        parts = [_from_batch(_to_batch(p), size) for p in pair]
+        parts = [_from_batch(PairBatch.from_pairs([p]), size) for p in pair]
         return NetworkInputs(
             *(torch.cat([getattr(p, f.name) for p in parts]) for f in fields(NetworkInputs))
         )
@@ -174,38 +173,6 @@ def assemble_aligned(
     rows = torch.arange(height, device=flow.device)
     cols = torch.arange(width, device=flow.device)
     return _finish(flow, depth_prev, depth_curr, valid, K_prev, K_curr, K_prev, rows, cols)
-
-
-def _to_batch(pair: FramePair) -> PairBatch:
-    """A batch of one; what is missing is NaN, that is, invalid."""
-    height, width = pair.prev.camera.shape
-
-    def image(array: np.ndarray | None, *shape: int) -> torch.Tensor:
-        if array is None:
-            return torch.full((1, *shape), torch.nan)
-        return _tensor(array)[None]
-
-    valid = pair.prev.mask
-    if pair.flow_valid is not None:
-        valid = pair.flow_valid if valid is None else valid & pair.flow_valid
-    depth_curr = pair.curr.depth
-    if depth_curr is not None and pair.curr.mask is not None:
-        depth_curr = np.where(pair.curr.mask, depth_curr, np.float32(np.nan))
-    return PairBatch(
-        flow=image(pair.flow, height, width, 2),
-        depth_prev=image(pair.prev.depth, height, width),
-        K_prev=torch.tensor(pair.prev.camera.K, dtype=torch.float32)[None],
-        K_curr=torch.tensor(pair.curr.camera.K, dtype=torch.float32)[None],
-        depth_curr=None if depth_curr is None else image(depth_curr, height, width),
-        valid=None if valid is None else _tensor(valid)[None],
-    )
-
-
-def _tensor(array: np.ndarray) -> torch.Tensor:
-    # torch warns about read-only memory (a memory map) and refuses negative strides.
-    if not array.flags.writeable or any(s < 0 for s in array.strides):
-        array = array.copy()
-    return torch.from_numpy(array)
 
 
 def _from_batch(batch: PairBatch, size: tuple[int, int]) -> NetworkInputs:

@@ -7,13 +7,17 @@ them.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import nn
 
-from hybridvo.network.inputs import NetworkInputs
+from hybridvo.errors import CheckpointError
+from hybridvo.network.inputs import NetworkInputs, assemble_inputs
 from hybridvo.network.layers import (
     Encoder,
     InputBranches,
@@ -25,7 +29,7 @@ from hybridvo.network.layers import (
 from hybridvo.network.options import KINDS, NetworkOptions
 from hybridvo.network.scale_free import remove_scale
 from hybridvo.network.vonet import OUTPUT_SCALE, VONet
-from hybridvo.types import PixelwisePrediction
+from hybridvo.types import FramePair, PairBatch, PixelwisePrediction
 
 __all__ = ["INVALID_LOG_SCALE", "KINDS", "PWVO", "NetworkOptions", "build_network"]
 
@@ -118,16 +122,40 @@ class PWVO(nn.Module):
         heads = [h for h in (self.head_motion, self.head_uncertainty) if h is not None]
         initialize(self, uniform=tuple(heads))
 
+    @classmethod
+    def from_pretrained(cls, name_or_path: str | Path = "pwvo") -> PWVO:
+        """A trained network, in evaluation mode on the CPU.
+
+        Args:
+            name_or_path: name of pretrained weights, or a file of one's own training.
+
+        Raises:
+            CheckpointError: no such weights, damaged ones, or another network's.
+        """
+        from hybridvo.network.weights import load_weights, pretrained, pretrained_names
+
+        name = str(name_or_path)
+        path = pretrained(name) if name in pretrained_names() else Path(name_or_path)
+        network, _ = load_weights(path)
+        if not isinstance(network, cls):
+            raise CheckpointError(f"{path}: expected the weights of a PWVO, got another network's.")
+        return network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+
     def forward(
-        self, inputs: NetworkInputs, T_start: torch.Tensor | None = None
+        self,
+        inputs: NetworkInputs | FramePair | PairBatch | Sequence[FramePair],
+        T_start: torch.Tensor | None = None,
     ) -> PixelwisePrediction:
-        """Pose and log scale at every pixel.
+        """Pose and log scale at every pixel: of assembled inputs in one pass, of pairs in all.
+
+        Pairs are brought to the size of the network, to its device and type, and looked at as often
+        as its options say, each time at what the motion found before leaves unexplained.
 
         Where flow or depth is missing (``inputs.valid`` is False) the log scale is at least
         ``INVALID_LOG_SCALE``, in training and in use: no selection prefers such a pixel.
 
         Args:
-            inputs: of size (h, w); multiples of 32 waste no border, any size works.
+            inputs: pairs of any size; or inputs of size (h, w), multiples of 32 waste no border.
             T_start: (B, 4, 4) a first motion, for scale-free networks: they look at what it leaves
                 unexplained, see :func:`hybridvo.network.passes.predict`.
 
@@ -136,6 +164,8 @@ class PWVO(nn.Module):
             a float64 network), also under autocast. Finite for any input.
         """
         options = self.options
+        if not isinstance(inputs, NetworkInputs):
+            return self._predict(inputs)
         scale = None
         inputs = inputs.subsample(options.input_stride)
         if options.scale_free:
@@ -163,6 +193,23 @@ class PWVO(nn.Module):
             seen = F.max_pool2d(seen, options.head_stride, ceil_mode=True)
         log_scale = torch.where(seen > 0, log_scale, log_scale.clamp(min=INVALID_LOG_SCALE))
         return PixelwisePrediction(motion[:, :3], motion[:, 3:], log_scale[:, :3], log_scale[:, 3:])
+
+    def _predict(self, pairs: FramePair | PairBatch | Sequence[FramePair]) -> PixelwisePrediction:
+        """Maps of pairs after all passes."""
+        from hybridvo.learned import next_start
+        from hybridvo.network.passes import predict
+
+        own = next(self.parameters())
+        inputs = assemble_inputs(pairs).to(device=own.device, dtype=own.dtype)
+        output = predict(self, inputs, next_start(self))
+        assert isinstance(output, PixelwisePrediction)
+        return replace(output, image_size=_image_size(pairs))
+
+
+def _image_size(pairs: FramePair | PairBatch | Sequence[FramePair]) -> tuple[int, int]:
+    if isinstance(pairs, PairBatch):
+        return pairs.flow.shape[1], pairs.flow.shape[2]
+    return (pairs if isinstance(pairs, FramePair) else pairs[0]).prev.camera.shape
 
 
 def build_network(options: NetworkOptions | None = None) -> nn.Module:

@@ -10,15 +10,11 @@ from __future__ import annotations
 import torch
 
 from hybridvo.errors import InputError
+from hybridvo.network.selection import SHARPNESS
 from hybridvo.torch_geometry import left_update, pp, se3
 
 __all__ = ["pixel_weights", "weighted_fit"]
 
-SHARPNESS = 4.0
-"""Weights go with exp(-4 s), the fourth power of 1 / U. The variance of independent errors would
-ask for the second; errors of the pixels of a mover are not independent, and a mover on two thirds
-of the picture must not outvote what is left. On development pairs 2 left twice the error, 8 the
-same as 4."""
 CUTOFF = 1.5
 """Scale of the robust kernel in weighted medians of the residual."""
 LEAST_SCALE = 1e-4

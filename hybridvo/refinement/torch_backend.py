@@ -287,7 +287,7 @@ class _Solver:
         rest = replace(pixels, weight=pixels.weight * (own < 0.25))
         identity = pp.identity_SE3(len(T), dtype=T.dtype, device=T.device)
         other = self._shrink_scale(rest, identity, end)
-        theirs = linearize(rest, other, self._isotropic(end)).weights
+        theirs = linearize(rest, other, self._isotropic(3 * end)).weights
         follow = (rest.weight * (theirs > 0.25)).sum(dim=1)
         return torch.nan_to_num(follow / pixels.weight.sum(dim=1).clamp(min=1e-30))
 

@@ -35,8 +35,7 @@ def write_contact_sheet(samples: Sequence[Sample], path: str | Path) -> None:
     """
     rows = [_header(samples[0].flow.shape[1])]
     rows += [_row(sample) for sample in samples]
-    done, data = cv2.imencode(".png", np.concatenate(rows))
-    assert done
+    data = cv2.imencode(".png", np.concatenate(rows))[1]
     with atomic_write(path, "wb") as file:
         file.write(data.tobytes())
 

@@ -14,7 +14,7 @@ from hybridvo.learned import fitted_motion, next_start
 from hybridvo.network.losses import NetworkOutput, reconstruct, total_loss
 from hybridvo.network.passes import first_motions
 from hybridvo.network.pwvo import build_network
-from hybridvo.network.selection import chosen_motion
+from hybridvo.network.selection import select_motion
 from hybridvo.training.options import PwvoOptions, described
 from hybridvo.training.stream import Mixture, SampleStream, TrainingBatch
 from hybridvo.training.validation import evaluate_network
@@ -102,7 +102,7 @@ def training_loss(
     output: NetworkOutput, batch: TrainingBatch, options: PwvoOptions
 ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
     """Loss of a network's output and its parts, see :func:`hybridvo.network.losses.total_loss`."""
-    T = chosen_motion(output, options.selection) if options.loss.reconstructs else None
+    T = select_motion(output, options.selection) if options.loss.reconstructs else None
     loss, parts = total_loss(output, batch.targets.subsample(options.loss_stride), options.loss, T)
     if isinstance(output, PixelwisePrediction):
         for name, weight, term in (

@@ -17,8 +17,9 @@ from hybridvo.errors import InputError
 from hybridvo.learned import next_start
 from hybridvo.network.losses import NetworkOutput, reconstruct
 from hybridvo.network.passes import predict
-from hybridvo.network.selection import chosen_pose, select, selected_transform
+from hybridvo.network.selection import select_pose
 from hybridvo.synthetic.presets import Preset
+from hybridvo.torch_geometry import euler_transform
 from hybridvo.training.stream import TrainingBatch, collate, sample_generator
 from hybridvo.types import PixelwisePrediction
 
@@ -119,10 +120,10 @@ def _errors(output: NetworkOutput, batch: TrainingBatch, selection: str) -> np.n
     """(B, 6) R_err, T_err and EPE of the network and of zero motion."""
     gt = batch.targets
     if selection.endswith("-joint") and isinstance(output, PixelwisePrediction):
-        rotation, translation = select(output, selection.removesuffix("-joint"), joint=True)
+        rotation, translation = select_pose(output, selection.removesuffix("-joint"), joint=True)
     else:
-        rotation, translation = chosen_pose(output, selection)
-    T = selected_transform(rotation, translation)
+        rotation, translation = select_pose(output, selection)
+    T = euler_transform(rotation, translation)
     flow, _, defined = reconstruct(gt.depth_prev, T, gt.K_prev, gt.K_curr)
     near = gt.ego_flow.norm(dim=1) < EPE_LIMIT_PX
     # Sky has no depth to reproject; a point behind the camera has no flow: neither counts.

@@ -21,7 +21,8 @@ from hybridvo.network.losses import LossOptions, LossTargets, total_loss
 from hybridvo.network.passes import first_motions, predict
 from hybridvo.network.pwvo import NetworkOptions, build_network
 from hybridvo.network.scale_free import euler_deg, remove_scale
-from hybridvo.network.selection import chosen_motion, selected_transform
+from hybridvo.network.selection import select_motion
+from hybridvo.torch_geometry import euler_transform
 from hybridvo.types import Camera, Frame, FramePair, Reason, State
 
 CAMERA = Camera(60.0, 62.0, 31.5, 15.5, 32, 64)
@@ -60,7 +61,7 @@ def tiny(**options) -> torch.nn.Module:
 
 def test_euler_angles_are_those_of_the_selected_transform():
     angles = torch.tensor([[3.0, -20.0, 40.0], [0.0, 0.0, 0.0]])
-    T = selected_transform(angles, torch.zeros(2, 3))
+    T = euler_transform(angles, torch.zeros(2, 3))
     # float32 of angles up to 40 degrees: 40 * 6e-8, through one arc sine
     torch.testing.assert_close(euler_deg(T[:, :3, :3]), angles, atol=2e-5, rtol=0)
 
@@ -138,8 +139,8 @@ def test_passes_are_the_network_on_what_is_left():
     network, inputs = tiny(passes=3), static_inputs()
     with torch.inference_mode():
         one = network(inputs)
-        two = network(inputs, chosen_motion(one))
-        three = network(inputs, chosen_motion(two))
+        two = network(inputs, select_motion(one))
+        three = network(inputs, select_motion(two))
         torch.testing.assert_close(
             predict(network, inputs, next_start(network)).rotation, three.rotation
         )
@@ -213,7 +214,7 @@ def test_a_network_is_an_estimator(method):
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
     with torch.inference_mode():
         inputs = assemble_inputs(pair(flow, depth))
-        expected = chosen_motion(predict(network, inputs, next_start(network)))[0]
+        expected = select_motion(predict(network, inputs, next_start(network)))[0]
     np.testing.assert_allclose(result.T_curr_prev, pose_matrix(expected[:3].numpy()), atol=1e-5)
 
 

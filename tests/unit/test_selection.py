@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from hybridvo.errors import InputError
 from hybridvo.geometry import euler_deg_to_matrix
-from hybridvo.network.selection import SELECTION_METHODS, select, selected_transform
+from hybridvo.network.selection import SELECTION_METHODS, select_pose
+from hybridvo.torch_geometry import euler_transform
 from hybridvo.types import PixelwisePrediction
 
 
@@ -58,7 +59,7 @@ def by_loop(value, s, method, patch, joint):
 @pytest.mark.parametrize(("shape", "patch"), [((8, 8), 4), ((7, 9), 4), ((5, 6), 10), ((3, 2), 1)])
 def test_equals_a_loop(method, joint, shape, patch):
     prediction = random_prediction(5, (2, 3, *shape))
-    rotation, translation = select(prediction, method, patch, joint)
+    rotation, translation = select_pose(prediction, method, patch, joint)
     for b in range(2):
         for got, value, s in (
             (rotation, prediction.rotation, prediction.log_scale_rotation),
@@ -86,7 +87,7 @@ def worked_example() -> PixelwisePrediction:
     ],
 )
 def test_worked_by_hand(method, expected):
-    rotation, translation = select(worked_example(), method, patch=2)
+    rotation, translation = select_pose(worked_example(), method, patch=2)
     torch.testing.assert_close(rotation, torch.full((1, 3), expected))
     torch.testing.assert_close(translation, torch.full((1, 3), 10 * expected))
 
@@ -96,16 +97,18 @@ def test_joint_takes_one_pixel_for_three_components():
     s = torch.tensor([[0.0, 1.0], [2.0, 0.5], [2.0, 0.5]])[None, :, None, :]
     value = torch.tensor([[1.0, 2.0]]).expand(3, 2)[None, :, None, :]
     prediction = PixelwisePrediction(value, value, s, s)
-    assert select(prediction, patch=2)[0].tolist() == [[1.0, 2.0, 2.0]]
-    assert select(prediction, patch=2, joint=True)[0].tolist() == [[2.0, 2.0, 2.0]]
+    assert select_pose(prediction, patch=2)[0].tolist() == [[1.0, 2.0, 2.0]]
+    assert select_pose(prediction, patch=2, joint=True)[0].tolist() == [[2.0, 2.0, 2.0]]
 
 
 def test_default_patch_is_the_papers_grid():
     prediction = random_prediction(0, (1, 3, 128, 256), torch.float32)
-    for got, expected in zip(select(prediction), select(prediction, patch=32), strict=True):
+    for got, expected in zip(
+        select_pose(prediction), select_pose(prediction, patch=32), strict=True
+    ):
         assert torch.equal(got, expected)
     half = random_prediction(0, (1, 3, 64, 128), torch.float32)
-    for got, expected in zip(select(half), select(half, patch=16), strict=True):
+    for got, expected in zip(select_pose(half), select_pose(half, patch=16), strict=True):
         assert torch.equal(got, expected)
 
 
@@ -115,9 +118,11 @@ def test_padding_never_wins():
     value, s = torch.full(shape, 3.0), torch.full(shape, 40.0)
     prediction = PixelwisePrediction(value, value, s, s)
     for method in SELECTION_METHODS:
-        torch.testing.assert_close(select(prediction, method, patch=4)[0], torch.full((1, 3), 3.0))
+        torch.testing.assert_close(
+            select_pose(prediction, method, patch=4)[0], torch.full((1, 3), 3.0)
+        )
     extreme = PixelwisePrediction(value, value, torch.full(shape, 3e38), torch.full(shape, 3e38))
-    torch.testing.assert_close(select(extreme, patch=4)[0], torch.full((1, 3), 3.0))
+    torch.testing.assert_close(select_pose(extreme, patch=4)[0], torch.full((1, 3), 3.0))
 
 
 @settings(max_examples=40, deadline=None)
@@ -133,7 +138,7 @@ def test_result_lies_within_the_values_and_is_equivariant(
     seed, height, width, patch, method, joint
 ):
     prediction = random_prediction(seed, (1, 3, height, width))
-    rotation, _ = select(prediction, method, patch, joint)
+    rotation, _ = select_pose(prediction, method, patch, joint)
     flat = prediction.rotation.flatten(2)
     assert (rotation >= flat.min(-1).values - 1e-12).all()
     assert (rotation <= flat.max(-1).values + 1e-12).all()
@@ -143,7 +148,7 @@ def test_result_lies_within_the_values_and_is_equivariant(
         prediction.log_scale_rotation,
         prediction.log_scale_translation,
     )
-    torch.testing.assert_close(select(moved, method, patch, joint)[0], 2 * rotation + 5)
+    torch.testing.assert_close(select_pose(moved, method, patch, joint)[0], 2 * rotation + 5)
     if method in ("softmax", "min_variance", "median"):
         louder = PixelwisePrediction(
             prediction.rotation,
@@ -151,7 +156,7 @@ def test_result_lies_within_the_values_and_is_equivariant(
             prediction.log_scale_rotation + 3,
             prediction.log_scale_translation,
         )
-        torch.testing.assert_close(select(louder, method, patch, joint)[0], rotation)
+        torch.testing.assert_close(select_pose(louder, method, patch, joint)[0], rotation)
 
 
 @pytest.mark.parametrize("method", SELECTION_METHODS)
@@ -163,8 +168,8 @@ def test_damage_is_not_heard(method, joint):
         maps[i][0, :, :4, :4] = broken  # a whole patch, and one pixel of another
         maps[i][0, :, 6, 6] = broken
     prediction = PixelwisePrediction(*maps)
-    rotation, translation = select(prediction, method, 4, joint)
-    reference = select(clean, method, 4, joint)
+    rotation, translation = select_pose(prediction, method, 4, joint)
+    reference = select_pose(clean, method, 4, joint)
     assert torch.isfinite(rotation).all()
     assert torch.isfinite(translation).all()
     torch.testing.assert_close(rotation[1], reference[0][1])
@@ -176,7 +181,7 @@ def test_damage_is_not_heard(method, joint):
 def test_nothing_usable_is_zero_motion_even_for_the_printed_form():
     nan = torch.full((1, 3, 8, 8), torch.nan)
     for method in SELECTION_METHODS:
-        rotation, translation = select(PixelwisePrediction(nan, nan, nan, nan), method, 4)
+        rotation, translation = select_pose(PixelwisePrediction(nan, nan, nan, nan), method, 4)
         assert rotation.tolist() == [[0.0] * 3]
         assert translation.tolist() == [[0.0] * 3]
 
@@ -186,7 +191,7 @@ def test_extreme_scales_stay_finite_in_value_and_gradient():
         value = torch.randn(1, 3, 8, 8, requires_grad=True)
         s = torch.full((1, 3, 8, 8), extreme, requires_grad=True)
         for method in SELECTION_METHODS:
-            rotation, translation = select(PixelwisePrediction(value, value, s, s), method, 4)
+            rotation, translation = select_pose(PixelwisePrediction(value, value, s, s), method, 4)
             assert torch.isfinite(rotation).all()
             (rotation.sum() + translation.sum()).backward()
         assert torch.isfinite(value.grad).all()
@@ -199,7 +204,7 @@ def test_gradcheck(method, joint):
     maps = [v.requires_grad_() for v in vars(random_prediction(3, (1, 3, 3, 4))).values()]
 
     def pose(*values):
-        return torch.cat(select(PixelwisePrediction(*values), method, 2, joint), dim=1)
+        return torch.cat(select_pose(PixelwisePrediction(*values), method, 2, joint), dim=1)
 
     torch.autograd.gradcheck(pose, maps)
     if method in ("softmax", "min_variance", "paper"):
@@ -211,43 +216,43 @@ def test_batch_elements_are_independent():
     prediction = random_prediction(8, (4, 3, 8, 8))
     alone = PixelwisePrediction(*(v[2:3] for v in vars(prediction).values()))
     for method in SELECTION_METHODS:
-        for a, b in zip(select(prediction, method), select(alone, method), strict=True):
+        for a, b in zip(select_pose(prediction, method), select_pose(alone, method), strict=True):
             torch.testing.assert_close(a[2:3], b)
 
 
 def test_transform_matches_scipy_and_is_differentiable():
     angles = torch.tensor([[10.0, -20, 30], [0, 0, 0], [179, 60, -100]], dtype=torch.float64)
     translation = torch.tensor([[1.0, 2, 3], [0, 0, 0], [-1, 5, 2]], dtype=torch.float64)
-    T = selected_transform(angles, translation)
+    T = euler_transform(angles, translation)
     np.testing.assert_allclose(T[:, :3, :3], euler_deg_to_matrix(angles.numpy()), atol=1e-15)
     np.testing.assert_allclose(T[:, :3, 3], translation)
     assert T[:, 3].tolist() == [[0, 0, 0, 1]] * 3
     torch.autograd.gradcheck(
-        selected_transform, (angles.requires_grad_(), translation.requires_grad_())
+        euler_transform, (angles.requires_grad_(), translation.requires_grad_())
     )
 
 
 def test_transform_stays_exact_under_autocast():
     angles = torch.tensor([[0.1, -0.2, 0.3]])
-    plain = selected_transform(angles, angles)
+    plain = euler_transform(angles, angles)
     with torch.autocast("cpu", torch.bfloat16):
-        assert torch.equal(selected_transform(angles, angles), plain)
+        assert torch.equal(euler_transform(angles, angles), plain)
 
 
 def test_bad_arguments_are_refused():
     prediction = random_prediction(0)
     with pytest.raises(InputError, match="known: softmax"):
-        select(prediction, "best")
+        select_pose(prediction, "best")
     for patch in (0, -1, 2.5, True):
         with pytest.raises(InputError, match="patch"):
-            select(prediction, patch=patch)
+            select_pose(prediction, patch=patch)
     bare = PixelwisePrediction(prediction.rotation, prediction.translation)
     with pytest.raises(InputError, match="method='mean'"):
-        select(bare)
-    assert select(bare, "mean")[0].shape == (2, 3)
+        select_pose(bare)
+    assert select_pose(bare, "mean")[0].shape == (2, 3)
     with pytest.raises(InputError, match="translation"):
-        select(PixelwisePrediction(prediction.rotation, prediction.translation[:, :2]), "mean")
+        select_pose(PixelwisePrediction(prediction.rotation, prediction.translation[:, :2]), "mean")
     with pytest.raises(InputError, match=r"\(B, 3, h, w\)"):
-        select(PixelwisePrediction(prediction.rotation[0], prediction.translation[0]), "mean")
+        select_pose(PixelwisePrediction(prediction.rotation[0], prediction.translation[0]), "mean")
     with pytest.raises(InputError, match=r"\(B, 3\)"):
-        selected_transform(torch.zeros(3), torch.zeros(3))
+        euler_transform(torch.zeros(3), torch.zeros(3))

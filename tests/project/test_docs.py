@@ -1,0 +1,122 @@
+"""README and pages are true: commands parse, paths exist, tables are those of the tool."""
+
+from __future__ import annotations
+
+import re
+import shlex
+
+import pytest
+
+import hybridvo
+from hybridvo.cli import build_parser
+from tests.scripts import ROOT, load_script
+
+PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")])
+TOP = ("hybridvo/", "tools/", "tests/", "configs/", "docs/", ".ci/")
+
+
+def spans(text: str) -> list[str]:
+    """What stands in backquotes, outside of code blocks."""
+    prose = re.sub(r"^```.*?^```$", "", text, flags=re.DOTALL | re.MULTILINE)
+    return re.findall(r"`([^`\n]+)`", prose)
+
+
+def commands(text: str) -> list[str]:
+    """Command lines of shell blocks and of the prose."""
+    blocks = re.findall(r"^```sh\n(.*?)^```$", text, re.DOTALL | re.MULTILINE)
+    lines = [line for block in blocks for line in block.splitlines()]
+    lines = [line.split(" #")[0].strip() for line in [*lines, *spans(text)]]
+    lines = [line for line in lines if re.match(r"(make|hybridvo|python) [^<\[]*$", line)]
+    # a command that is named in passing has no arguments
+    return [
+        line
+        for line in lines
+        if re.match(r"make |\w+ \S+ \S", line) and line.split()[2:] != ["--sequence"]
+    ]
+
+
+def written() -> list[tuple[str, str]]:
+    found = [
+        (page.relative_to(ROOT).as_posix(), command)
+        for page in PAGES
+        if page.name != "results.md"  # its commands ran at the commit that is named
+        for command in commands(page.read_text(encoding="utf-8"))
+    ]
+    return sorted(set(found))
+
+
+@pytest.fixture(autouse=True)
+def _tools_import_each_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "tools"))
+
+
+@pytest.mark.parametrize(("page", "command"), written())
+def test_every_command_is_understood(page, command):
+    program, first, *rest = shlex.split(command)
+    if program == "make":
+        makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+        assert re.search(rf"^{first}:", makefile, re.MULTILINE)
+    elif program == "hybridvo":
+        build_parser().parse_args([first, *rest])
+    elif first.endswith(".py"):
+        assert (ROOT / first).is_file()
+        script = load_script(first)
+        if hasattr(script, "build_parser"):  # a thin door parses elsewhere
+            script.build_parser().parse_args(rest)
+
+
+def test_there_are_commands_to_check():
+    assert len(written()) > 10
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_every_path_exists(page):
+    text = page.read_text(encoding="utf-8")
+    for span in spans(text):
+        word = span.split()[0]
+        if word.startswith(TOP) and not set("*<>{}") & set(word) and word.upper() != word:
+            assert (ROOT / word).exists(), word
+    for link in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", text):
+        if "://" not in link:
+            assert (page.parent / link).exists(), link
+
+
+def test_public_names_that_are_written_exist():
+    for page in PAGES:
+        for name in re.findall(r"\bhvo\.([A-Za-z_]+)", page.read_text(encoding="utf-8")):
+            assert hasattr(hybridvo, name), f"{page.name}: hvo.{name}"
+
+
+def test_generated_tables_are_those_of_the_tool():
+    made = load_script("tools/make_docs.py")
+    results = made.read(ROOT / "docs/results")
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert made.fill(readme, results) == readme, "run python tools/make_docs.py"
+    page = (ROOT / "docs/results.md").read_text(encoding="utf-8")
+    assert made.page(results) == page, "run python tools/make_docs.py"
+    assert page.count("\n## ") <= 5
+
+
+def test_results_say_how_they_were_made_and_stay_small():
+    files = list((ROOT / "docs/results").iterdir())
+    assert sum(path.stat().st_size for path in files) < 300_000
+    made = load_script("tools/make_docs.py")
+    for name, content in made.read(ROOT / "docs/results").items():
+        assert content["command"], name
+        assert content["commit"], name
+
+
+def test_the_benchmark_scores_what_is_known():
+    """One scenario, one pair: the refinement is right, and no motion is not."""
+    benchmark = load_script("tools/benchmark.py")
+    from hybridvo.synthetic.scenarios import make_pair
+
+    methods, _ = benchmark.estimators(("refine", "identity"))
+    records: dict[str, list[dict]] = {method: [] for method in methods}
+    pair, truth = make_pair("moving30", 1, 109, 256)
+    benchmark.answer(records, methods, pair, truth["T_curr_prev"], truth["depth_true"])
+    assert records["refine"][0]["error"] < 0.2
+    assert records["identity"][0]["failed"]
+    row = benchmark.summarise(records["refine"] * 3)
+    assert row["pairs"] == 3 and row["failures"]["count"] == 0
+    assert 0.5 < row["failures"]["high"] < 0.6  # Wilson's interval of 0 of 3 at 95 %

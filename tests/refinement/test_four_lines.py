@@ -1,0 +1,140 @@
+"""PWVO's selection seeds and weighs the differentiable refinement: the lines of the README."""
+
+from __future__ import annotations
+
+import kornia
+import numpy as np
+import pypose as pp
+import pytest
+import torch
+
+import hybridvo as hvo
+from hybridvo import torch_geometry
+from hybridvo.synthetic.scenarios import make_pair
+
+SIZE = (120, 160)
+
+
+@pytest.fixture(scope="module")
+def pairs():
+    return [make_pair("moving50", seed, *SIZE) for seed in (510, 511)]
+
+
+def four_lines(pairs, device="cpu", dtype=torch.float32):
+    batch = hvo.PairBatch.from_pairs(pairs, device, dtype)
+    maps = hvo.PWVO.from_pretrained().to(device)(batch)
+    seed = hvo.select(maps)
+    return hvo.refine(batch, seed.T_curr_prev, seed.weights)
+
+
+def check(motion, pairs) -> None:
+    errors = [
+        np.abs(motion.T_curr_prev[k].detach().cpu().numpy() - truth["T_curr_prev"]).max()
+        for k, (_, truth) in enumerate(pairs)
+    ]
+    assert max(errors) < 0.02, errors
+    assert isinstance(motion.SE3, pp.LieTensor) and not motion.failed.any()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_as_they_stand(pairs, dtype) -> None:
+    motion = four_lines([p for p, _ in pairs], dtype=dtype)
+    check(motion, pairs)
+    assert motion.T_curr_prev.dtype == dtype
+    alone = four_lines([pairs[0][0]], dtype=dtype)
+    # the network's kernels may round differently for another number of pairs
+    assert (alone.T_curr_prev[0] - motion.T_curr_prev[0]).abs().max() < 1e-4
+    alone.T_curr_prev.sum().backward()
+
+
+@pytest.mark.gpu
+def test_on_a_gpu(pairs) -> None:
+    check(four_lines([p for p, _ in pairs], "cuda"), pairs)
+
+
+def test_gradients_reach_flow_depth_weights_and_maps(pairs) -> None:
+    batch = hvo.PairBatch.from_pairs([pairs[0][0]], dtype=torch.float64)
+    with torch.no_grad():
+        maps = hvo.PWVO.from_pretrained().double()(batch)
+    C = torch.randn(4, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    values = {
+        "flow": batch.flow,
+        "depth_prev": torch.nan_to_num(batch.depth_prev, 0.0),
+        "log_scale_rotation": maps.log_scale_rotation,
+    }
+
+    def loss(flow, depth_prev, log_scale_rotation):
+        changed = hvo.PairBatch(flow, depth_prev, batch.K_prev, batch.K_curr)
+        seed = hvo.select(
+            hvo.PixelwisePrediction(
+                maps.rotation, maps.translation, log_scale_rotation, maps.log_scale_translation,
+                maps.image_size,
+            )
+        )  # fmt: skip
+        from hybridvo.refinement.torch_backend import refine_batch
+
+        motion = refine_batch(changed, seed.T_curr_prev, seed.weights, noise=(0.3, 0.02))
+        return (C * motion.T_curr_prev[0]).sum()
+
+    leaves = {k: v.clone().requires_grad_() for k, v in values.items()}
+    gradients = torch.autograd.grad(loss(**leaves), list(leaves.values()))
+    generator = torch.Generator().manual_seed(1)
+    for name, gradient in zip(values, gradients, strict=True):
+        d = torch.randn(gradient.shape, dtype=torch.float64, generator=generator)
+        sides = [loss(**(leaves | {name: values[name] + e * d})).item() for e in (1e-5, -1e-5)]
+        slope = (sides[0] - sides[1]) / 2e-5
+        assert float((gradient * d).sum()) == pytest.approx(slope, rel=1e-3), name
+
+
+def test_kornia_and_pypose_carry_the_method(pairs, monkeypatch) -> None:
+    calls = {"project": 0, "Exp": 0}
+    project, exp = torch_geometry.project_points, pp.LieTensor.Exp
+
+    def counted(name, function):
+        def call(*arguments, **named):
+            calls[name] += 1
+            return function(*arguments, **named)
+
+        return call
+
+    assert project is kornia.geometry.camera.project_points
+    monkeypatch.setattr(torch_geometry, "project_points", counted("project", project))
+    monkeypatch.setattr(pp.LieTensor, "Exp", counted("Exp", exp))
+    motion = hvo.estimate(pairs[0][0], method="pwvo-refine")
+    assert motion.usable and motion.method == "pwvo-refine"
+    assert calls["project"] > motion.iterations and calls["Exp"] > motion.iterations
+
+
+def test_the_numba_path_gives_the_same_motion(pairs) -> None:
+    """With the same noise, start and weights, on pairs without a current depth."""
+    from dataclasses import replace
+
+    from hybridvo.refinement.torch_backend import refine_batch
+
+    for pair, truth in pairs:
+        pair = replace(pair, curr=replace(pair.curr, depth=None))
+        start = truth["T_curr_prev"]
+        weights = np.random.default_rng(0).uniform(0.2, 1.0, SIZE).astype(np.float32)
+        ours = hvo.refine(pair, start, weights)
+        noise = (ours.residual_scale_px, ours.depth_noise)
+        batch = hvo.PairBatch.from_pairs([pair])
+        other = refine_batch(batch, torch.as_tensor(start)[None], weights[None], noise=noise)
+        difference = np.abs(other.T_curr_prev[0].numpy() - ours.T_curr_prev).max()
+        # metres; the numba path stops one Newton step after the coarse fit: 9e-6 and 5e-5 here
+        assert difference < 1e-4
+
+
+def test_one_training_step_of_a_narrow_network_in_channels_last() -> None:
+    """At the paper's size, where oneDNN wrote past its memory under strided 1x1 convolutions."""
+    from hybridvo.network.inputs import assemble_inputs
+    from hybridvo.network.pwvo import NetworkOptions, build_network
+
+    torch.manual_seed(0)
+    network = build_network(NetworkOptions(width=0.25)).to(memory_format=torch.channels_last)
+    optimizer = torch.optim.SGD(network.parameters(), 1e-3)
+    inputs = assemble_inputs([make_pair("moving30", k, 128, 256)[0] for k in (0, 1)])
+    before = [p.detach().clone() for p in network.parameters()]
+    network(inputs).rotation.square().mean().backward()
+    optimizer.step()
+    assert all(torch.isfinite(p).all() for p in network.parameters())
+    assert any(not torch.equal(a, b) for a, b in zip(before, network.parameters(), strict=True))

@@ -1,0 +1,253 @@
+"""The default method on whole sequences: paths, failures, and whether its doubt is honest.
+
+    python tools/evaluate.py --out docs/results/sequences.json --overwrite
+
+Each method tracks rendered sequences in which about 60 % of every image moves, from the first frame
+to the last, as a user would; depth is the renderer's, flow is DIS and, as an oracle, the true one.
+Then: how often the stated probability of a motion comes true, and whether the scales that the
+pixel-wise network states are those of its errors.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from golden_inputs import HEAVY, SIZE, scene_flow
+from measuring import able, digits, proportion, provenance, score, summarise, timed
+from scipy.spatial.transform import Rotation
+from scipy.stats import rankdata
+
+METHODS = {
+    "dis": ("hybrid", "hybrid-flow", "refine", "pwvo", "pnp-ransac-tuned", "poselib"),
+    "true": ("hybrid-flow", "refine", "pwvo", "pnp-ransac-tuned", "poselib"),
+}
+"""By flow; images add nothing to a true flow."""
+ASKED = ("hybrid", "hybrid-flow")
+"""Methods that state a probability."""
+BINS = (0.0, 0.2, 0.4, 0.6, 0.8, 0.9, 0.95, 0.99, 1.0)
+LEVELS = (0.25, 0.5, 0.75, 0.9)
+NETWORK_PAIRS = 10
+"""Pairs of each sequence on which the network's scales are compared with its errors."""
+
+
+def build_parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="evaluate.py", description=(__doc__ or "").splitlines()[0]
+    )
+    parser.add_argument("--kinds", default=",".join(HEAVY), help="families of scenes")
+    parser.add_argument("--sequences", type=int, default=1, help="of each family")
+    parser.add_argument("--frames", type=int, default=100, help="of a sequence")
+    parser.add_argument("--seed0", type=int, default=9000, help="0-999 development, else published")
+    parser.add_argument("--out", type=Path, default=Path("runs/sequences.json"), metavar="FILE")
+    parser.add_argument("--overwrite", action="store_true", help="replace --out")
+    return parser
+
+
+def main(argv: list[str] | None = None) -> int:
+    args = build_parser().parse_args(argv)
+    from hybridvo.errors import HybridVOError, OutputError
+    from hybridvo.files import write_json
+
+    problem = ""
+    if args.out.exists() and not args.overwrite:
+        problem = f"{args.out} exists; pass --overwrite to replace it."
+    if args.sequences < 1 or args.frames < 3 or args.seed0 < 0:
+        problem = "expected --sequences >= 1, --frames >= 3 and --seed0 >= 0."
+    if problem:
+        print(f"evaluate.py: {problem}", file=sys.stderr)
+        return 2
+    try:
+        result = provenance("evaluate.py", argv) | measure(args)
+        args.out.parent.mkdir(parents=True, exist_ok=True)
+        write_json(args.out, result)
+    except HybridVOError as error:
+        print(f"evaluate.py: {error}", file=sys.stderr)
+        return 5 if isinstance(error, OutputError) else 2
+    print(args.out)
+    return 0
+
+
+def measure(args: argparse.Namespace) -> dict[str, Any]:
+    """Figures by flow, method and family, the probability's reliability, the network's scales."""
+    paths: dict[str, dict[str, dict[str, list[Any]]]] = {flow: {} for flow in METHODS}
+    records: dict[str, dict[str, list[Any]]] = {flow: {} for flow in METHODS}
+    scales: list[dict[str, Any]] = []
+    methods = {flow: able(names)[0] for flow, names in METHODS.items()}
+    for kind in args.kinds.split(","):
+        for seed in range(args.seed0, args.seed0 + args.sequences):
+            sequence = rendered(kind, seed, args.frames)
+            for (flow, method), (some, path) in track(sequence, methods).items():
+                records[flow].setdefault(method, []).extend(some)
+                paths[flow].setdefault(method, {}).setdefault(kind, []).append(path)
+            scales.append(network_scales(sequence))
+            print(f"{kind}, seed {seed}", file=sys.stderr, flush=True)
+    return {
+        "kinds": args.kinds.split(","),
+        "seeds": [args.seed0, args.seed0 + args.sequences - 1],
+        "frames": args.frames,
+        "size": list(SIZE),
+        "depth": "true (oracle)",
+        "missing": able(METHODS["dis"])[1],
+        "paths": {
+            flow: {method: {kind: mean_path(some) for kind, some in by_kind.items()}
+                   for method, by_kind in by_method.items()}
+            for flow, by_method in paths.items()
+        },
+        "pairs": {
+            flow: {method: summarise(rows) for method, rows in by_method.items()}
+            for flow, by_method in records.items()
+        },
+        "probability": {
+            flow: {m: reliability(by_method[m]) for m in ASKED if m in by_method}
+            for flow, by_method in records.items()
+        },
+        "network": over_sequences(scales),
+    }  # fmt: skip
+
+
+def rendered(kind: str, seed: int, frames: int) -> Any:
+    from hybridvo.synthetic.render import SyntheticSequence, make_scene
+
+    scene = make_scene(kind, seed, height=SIZE[0], width=SIZE[1], frames=frames)
+    return SyntheticSequence(scene, name=kind)
+
+
+def track(
+    sequence: Any, methods: dict[str, list[str]]
+) -> dict[tuple[str, str], tuple[list[dict[str, Any]], dict[str, float]]]:
+    """By flow and method: the score of every step, and the error of the path."""
+    from hybridvo import FramePair, Odometry
+    from hybridvo.flow import dis_flow
+
+    providers = {"dis": dis_flow(), "true": scene_flow(sequence)}
+    trackers = {
+        (flow, method): Odometry(method=method)
+        for flow, names in methods.items()
+        for method in names
+    }
+    records: dict[tuple[str, str], list[Any]] = {key: [] for key in trackers}
+    places: dict[tuple[str, str], list[np.ndarray]] = {key: [] for key in trackers}
+    prev = None
+    for i in range(len(sequence)):
+        frame = sequence.frame(i)
+        fields = {flow: p(prev, frame) for flow, p in providers.items()} if prev is not None else {}
+        for key, tracker in trackers.items():
+            field = fields.get(key[0])
+            step, ms = timed(lambda t=tracker, f=field, frame=frame: t.track(frame, f))
+            places[key].append(step.T_world_cam[:3, 3])
+            if prev is not None:
+                T = np.linalg.inv(sequence.poses[i]) @ sequence.poses[i - 1]
+                row = score(step.motion, T, prev.depth, FramePair(prev, frame, None))
+                records[key].append(row | {"ms": ms, "probability": step.motion.probability})
+        prev = frame
+    truth = (np.linalg.inv(sequence.poses[0]) @ sequence.poses)[:, :3, 3]
+    return {key: (records[key], path_error(np.array(places[key]), truth)) for key in trackers}
+
+
+def path_error(places: np.ndarray, truth: np.ndarray) -> dict[str, float]:
+    """Root mean square and last error of the position, cm, and the length of the path, m.
+
+    Both paths begin at the same pose, nothing is aligned afterwards.
+    """
+    error = np.linalg.norm(places - truth, axis=1)
+    return {
+        "rmse_cm": 100 * float(np.sqrt(np.mean(error**2))),
+        "end_cm": 100 * float(error[-1]),
+        "length_m": float(np.linalg.norm(np.diff(truth, axis=0), axis=1).sum()),
+    }
+
+
+def mean_path(paths: list[dict[str, float]]) -> dict[str, float]:
+    return {name: digits(np.mean([path[name] for path in paths])) for name in paths[0]}
+
+
+def reliability(records: list[dict[str, Any]]) -> dict[str, Any]:
+    """How often a motion of some stated probability is right (within a pixel)."""
+    stated = np.array([record["probability"] for record in records])
+    right = np.array([not record["failed"] for record in records])
+    rows = []
+    for low, high in itertools.pairwise(BINS):
+        inside = (stated >= low) & ((stated < high) | (high == BINS[-1]))
+        if inside.any():
+            share = proportion(int(right[inside].sum()), int(inside.sum()))
+            rows.append({"from": low, "to": high, "stated": digits(stated[inside].mean())} | share)
+    flagged = np.array([not record["status"].startswith("ok") for record in records])
+    return {
+        "bins": rows,
+        "brier": digits(np.mean((stated - right) ** 2)),
+        "failures": int((~right).sum()),
+        "failures_flagged": int((~right & flagged).sum()),
+        "right_flagged": int((right & flagged).sum()),
+    }
+
+
+def network_scales(sequence: Any) -> dict[str, Any]:
+    """Errors of the pixel-wise network in units of its stated Laplace scale U, on the true flow.
+
+    e / U of a calibrated network is an exponential variable of mean 1.
+    """
+    import torch
+
+    from hybridvo import PWVO, FramePair, PairBatch
+
+    network, flow = PWVO.from_pretrained(), scene_flow(sequence)
+    ratios: dict[str, list[np.ndarray]] = {name: [] for name in ("rotation", "translation")}
+    doubt: dict[str, list[np.ndarray]] = {name: [] for name in ratios}
+    moving = []
+    for i in np.linspace(0, len(sequence) - 2, NETWORK_PAIRS).round().astype(int).tolist():
+        frames = sequence.frame(i), sequence.frame(i + 1)
+        pair = FramePair(*frames, flow(*frames).flow, flow_is_true=True, depth_source="true")
+        with torch.inference_mode():
+            maps = network(PairBatch.from_pairs([pair]))
+        T = np.linalg.inv(sequence.poses[i + 1]) @ sequence.poses[i]
+        target = {
+            "rotation": Rotation.from_matrix(T[:3, :3]).as_euler("XYZ", degrees=True),
+            "translation": T[:3, 3],
+        }
+        shape = maps.rotation.shape[2:]
+        rows, columns = (
+            np.linspace(0, n - 1, m).astype(int) for n, m in zip(SIZE, shape, strict=True)
+        )
+        moving.append(sequence.moving(i)[np.ix_(rows, columns)].ravel())
+        for name in ratios:
+            value = getattr(maps, name)[0].double().numpy()
+            log_scale = getattr(maps, f"log_scale_{name}")[0].double().numpy()
+            ratio = np.abs(value - target[name][:, None, None]) / np.exp(log_scale)
+            ratios[name].append(ratio.reshape(3, -1))
+            doubt[name].append(log_scale.mean(axis=0).ravel())
+    return {
+        name: {
+            "ratio": np.concatenate(ratios[name], axis=1),
+            "doubt": np.concatenate(doubt[name]),
+            "moving": np.concatenate(moving),
+        }
+        for name in ratios
+    }  # fmt: skip
+
+
+def over_sequences(scales: list[dict[str, Any]]) -> dict[str, Any]:
+    """Over all sequences: mean of e / U, share of errors below its quantiles, and how well the
+    scale tells moving pixels from static ones (area under the ROC curve).
+    """
+    result = {}
+    for name in ("rotation", "translation"):
+        ratio = np.concatenate([some[name]["ratio"].ravel() for some in scales])
+        doubt = np.concatenate([some[name]["doubt"] for some in scales])
+        moving = np.concatenate([some[name]["moving"] for some in scales])
+        n = int(moving.sum())
+        rank_sum = rankdata(doubt)[moving].sum()
+        result[name] = {
+            "mean_ratio": digits(ratio.mean()),
+            "below": {f"{p:g}": digits(np.mean(ratio < -np.log(1 - p))) for p in LEVELS},
+            "auroc": digits((rank_sum - n * (n + 1) / 2) / (n * (len(moving) - n))),
+        }
+    return result
+
+
+if __name__ == "__main__":
+    sys.exit(main())

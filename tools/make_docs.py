@@ -1,0 +1,331 @@
+"""The tables of the README and of docs/results.md, from docs/results.
+
+    python tools/make_docs.py            # fill README.md, write docs/results.md
+    python tools/make_docs.py --check    # exit code 1 if they are not up to date
+
+In the README, what stands between ``<!-- table:NAME -->`` and ``<!-- end:NAME -->`` is made here.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from measuring import ROOT
+
+PART = re.compile(r"(<!-- table:(\w+) -->\n)(.*?)(<!-- end:\2 -->)", re.DOTALL)
+FAILURES = "[n]: pairs that are wrong by more than a pixel, or without an answer"
+
+Results = dict[str, dict[str, Any]]
+
+
+def build_parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="make_docs.py", description=(__doc__ or "").splitlines()[0]
+    )
+    parser.add_argument("--readme", type=Path, default=ROOT / "README.md")
+    parser.add_argument("--page", type=Path, default=ROOT / "docs" / "results.md")
+    parser.add_argument("--results", type=Path, default=ROOT / "docs" / "results", metavar="DIR")
+    parser.add_argument("--check", action="store_true", help="write nothing, only compare")
+    return parser
+
+
+def main(argv: list[str] | None = None) -> int:
+    args = build_parser().parse_args(argv)
+    results = read(args.results)
+    stale = 0
+    for path, text in (
+        (args.readme, fill(args.readme.read_text(encoding="utf-8"), results)),
+        (args.page, page(results)),
+    ):
+        if path.is_file() and path.read_text(encoding="utf-8") == text:
+            continue
+        stale += 1
+        if args.check:
+            print(f"{path}: differs from {args.results}", file=sys.stderr)
+        else:
+            path.write_text(text, encoding="utf-8")
+            print(path)
+    return int(args.check and stale > 0)
+
+
+def read(folder: Path) -> Results:
+    """Every JSON file of the folder by its stem."""
+    return {
+        path.stem: json.loads(path.read_text(encoding="utf-8"))
+        for path in sorted(folder.glob("*.json"))
+    }
+
+
+def fill(text: str, results: Results) -> str:
+    """The text with every marked part made anew; empty where its figures are missing."""
+
+    def part(match: re.Match[str]) -> str:
+        lines = TABLES[match.group(2)](results)
+        return match.group(1) + ("\n" + "\n".join(lines) + "\n\n" if lines else "") + match.group(4)
+
+    return PART.sub(part, text)
+
+
+def page(results: Results) -> str:
+    """docs/results.md: a title and a table for each kind of measurement."""
+    lines = [
+        "# Results",
+        "",
+        "Made by `python tools/make_docs.py` from the JSON files in `docs/results`. Ground truth "
+        "that a method is given (true flow, true depth, a true mask) is named: an oracle. "
+        f"{FAILURES}. Times are wall times on a shared machine.",
+        "",
+    ]
+    for title, name in PAGE:
+        table_lines = TABLES[name](results)
+        if table_lines:
+            lines += [f"## {title}", "", *table_lines, ""]
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def table(header: list[str], rows: list[list[str]]) -> list[str]:
+    """A Markdown table, names left and numbers right."""
+    ruler = "|---" * 1 + "|---:" * (len(header) - 1) + "|"
+    return [line(header), ruler, *map(line, rows)]
+
+
+def line(cells: list[str]) -> str:
+    return "| " + " | ".join(cells) + " |"
+
+
+def number(value: float | None) -> str:
+    """Three significant digits; a dash where there is none."""
+    if value is None:
+        return "-"
+    return f"{value:.3g}" if value < 1000 else f"{value:.0f}"
+
+
+def error(row: dict[str, Any]) -> str:
+    """Median error in px, with the number of failures."""
+    count = row["failures"]["count"]
+    return number(row["epe_px"]["median"]) + (f" [{count}]" if count else "")
+
+
+def source(content: dict[str, Any]) -> str:
+    """Where figures come from."""
+    machine = content["machine"]
+    return (
+        f"`{content['command']}`, commit `{content['commit']}`; {machine['processor']}, "
+        f"{machine['cores']} cores."
+    )
+
+
+def heavy(results: Results) -> list[str]:
+    """Scenes in which most of the image moves: median error in px, and failures."""
+    content = results.get("benchmark", {})
+    if "heavy" not in content:
+        return []
+    part = content["heavy"]
+    kinds = [kind for kind in part["summary"] if kind != "total"]
+    rows = []
+    for flow in ("dis", "true"):
+        total = part["summary"]["total"][flow]
+        for method, row in total.items():
+            cells = [error(part["summary"][kind][flow][method]) for kind in kinds]
+            share = f"{100 * row['failures']['count'] / row['pairs']:.0f} %"
+            rows.append([f"`{method}`, {flow} flow", *cells, share, number(row["ms"])])
+    height, width = part["size"]
+    return [
+        *table(["method", *kinds, "failures", "ms"], rows),
+        "",
+        f"Median error of the ego flow, px; seeds {part['seeds'][0]} to {part['seeds'][1]} of each "
+        f"kind, {width}x{height}, depth {part['depth']}. True flow is an oracle. {source(content)}",
+    ]
+
+
+def peers(results: Results) -> list[str]:
+    """The README's one table: every method on estimated flow."""
+    content = results.get("benchmark", {})
+    if "heavy" not in content:
+        return []
+    rows = []
+    for method, row in content["heavy"]["summary"]["total"]["dis"].items():
+        if "oracle" in method:
+            continue
+        share = f"{100 * row['failures']['count'] / row['pairs']:.0f} %"
+        rows.append(
+            [f"`{method}`", number(row["epe_px"]["median"]), number(row["translation_cm"]),
+             number(row["rotation_deg"]), share, number(row["ms"])]
+        )  # fmt: skip
+    part = content["heavy"]
+    pairs = part["summary"]["total"]["dis"][next(iter(part["summary"]["total"]["dis"]))]["pairs"]
+    return [
+        *table(["method", "error, px", "cm", "deg", "wrong by more than 1 px", "ms a pair"], rows),
+        "",
+        f"Medians over {pairs} pairs of rendered scenes in which most of the image moves; flow: "
+        f"OpenCV DIS, depth {part['depth']}; flow not in the time. {source(content)}",
+    ]
+
+
+def scenarios(results: Results) -> list[str]:
+    """Pairs with known noise: median error in px of every method in every scenario."""
+    content = results.get("benchmark", {})
+    if "scenarios" not in content:
+        return []
+    part = content["scenarios"]
+    names = list(part["summary"])
+    methods = list(part["summary"][names[0]])
+    rows = [[name, *(error(part["summary"][name][method]) for method in methods)] for name in names]
+    means = [number(part["geometric_mean_px"][method]) for method in methods]
+    rows.append([f"geometric mean of the first {len(part['main'])}", *means])
+    lines = [
+        *table(["scenario", *(f"`{method}`" for method in methods)], rows),
+        "",
+        f"Median error of the ego flow, px; seeds {part['seeds'][0]} to {part['seeds'][1]}. "
+        f"{source(content)}",
+    ]
+    if "model_noise" in content:
+        row = content["model_noise"]["refine"]
+        lines += [
+            "",
+            f"Covariance of `refine` under the noise that it assumes: mean normalised error "
+            f"{row['nees_mean']:.2f} +- {row['nees_standard_error']:.2f} over {row['pairs']} pairs "
+            f"(right: 6), {row['overconfident']} outside of 3 sigma (right: 0.3 %).",
+        ]
+    return lines
+
+
+def real(results: Results) -> list[str]:
+    """Recorded sequences: medians over the pairs, and the error at the end of the chain."""
+    content = results.get("benchmark", {})
+    if "real" not in content:
+        return []
+    rows = []
+    for name, sequence in content["real"]["summary"].items():
+        for flow, by_method in sequence["flows"].items():
+            for k, (method, row) in enumerate(by_method.items()):
+                first = f"{name}, {flow}" if k == 0 else ""
+                keys = ("rotation_deg", "translation_cm")
+                ends = ("end_rotation_deg", "end_translation_cm", "ms")
+                values = [*(number(row[key]) for key in keys), error(row)]
+                values += [number(row[key]) for key in ends]
+                rows.append([first, f"`{method}`", *values])
+    header = ["sequence, flow", "method", "deg", "cm", "px", "end, deg", "end, cm", "ms"]
+    return [*table(header, rows), "", f"Medians over the pairs. {source(content)}"]
+
+
+def sequences(results: Results) -> list[str]:
+    """Paths of whole rendered sequences, and how often the stated probability comes true."""
+    content = results.get("sequences")
+    if content is None:
+        return []
+    kinds = content["kinds"]
+    rows = []
+    for flow, by_method in content["paths"].items():
+        for method, by_kind in by_method.items():
+            cells = [number(by_kind[kind]["rmse_cm"]) for kind in kinds]
+            pairs = content["pairs"][flow][method]
+            count = f"{pairs['failures']['count']} of {pairs['pairs']}"
+            rows.append([f"`{method}`, {flow} flow", *cells, count, number(pairs["nees_median"])])
+    lines = [
+        *table(["method", *kinds, "failed pairs", "median NEES"], rows),
+        "",
+        f"Root mean square error of the position, cm, both paths from the same first pose; "
+        f"{content['frames']} frames a sequence, depth {content['depth']}; the NEES of a right "
+        f"covariance has the median 5.35. {source(content)}",
+    ]
+    stated = content["probability"]["dis"].get("hybrid")
+    if stated:
+        bins = "; ".join(
+            f"{row['from']:g} to {row['to']:g}: {row['count']} of {row['of']}"
+            for row in stated["bins"]
+        )
+        lines += [
+            "",
+            f"Probability that `hybrid` states, DIS flow, and how many of these motions are right "
+            f"within a pixel: {bins}. Flagged: {stated['failures_flagged']} of "
+            f"{stated['failures']} failures, and {stated['right_flagged']} right motions.",
+        ]
+    return lines
+
+
+def costs(results: Results) -> list[str]:
+    """Wall time of a pair and of a whole frame, memory, batches."""
+    content = results.get("benchmark", {})
+    if "costs" not in content:
+        return []
+    part = content["costs"]
+    sizes = list(part["pair_ms"])
+    rows = [
+        [f"`{method}`", *(number(part[key][size][method]) for key in ("pair_ms", "frame_ms")
+         for size in sizes), number(part["memory_mib"][method])]
+        for method in part["pair_ms"][sizes[0]]
+    ]  # fmt: skip
+    header = [f"pair, {size}" for size in sizes] + [f"frame, {size}" for size in sizes]
+    first = part["first_call"]
+    batch = ", ".join(f"{row['pairs']}: {row['pairs_per_s']:g}/s" for row in part["batch"])
+    return [
+        *table(["method", *header, "MiB"], rows),
+        "",
+        "Milliseconds of an estimate with the flow given, and of a tracked frame with its flow "
+        f"(OpenCV DIS). MiB: most that one estimate allocates at {sizes[-1]}. Import and first "
+        f"call: {number(first.get('import_s'))} s and {number(first.get('warm_up_s'))} s. Batched "
+        f"refinement of 256x128 on the CPU, pairs a batch: {batch}. {source(content)}",
+    ]
+
+
+def speed(results: Results) -> list[str]:
+    """Frames a second of a whole tracked frame, its flow included."""
+    content = results.get("benchmark", {})
+    if "costs" not in content:
+        return []
+    rows = [
+        [f"`{method}`", number(1e3 / ms), number(ms)]
+        for method, ms in content["costs"]["frame_ms"]["640x480"].items()
+    ]
+    return [
+        *table(["method", "frames a second", "ms a frame"], rows),
+        "",
+        f"640x480, OpenCV DIS flow included, one process. {source(content)}",
+    ]
+
+
+def demo(results: Results) -> list[str]:
+    """What ``hybridvo demo`` measures."""
+    content = results.get("benchmark", {}).get("demo")
+    if content is None:
+        return []
+    keys = ("ate_cm", "rotation_deg", "epe_px", "ms")
+    rows = [[row["method"], *(number(row[key]) for key in keys)] for row in content["rows"]]
+    scene = content["scene"]
+    return [
+        *table(["method", "ATE, cm", "rotation, deg a pair", "EPE, px", "ms a pair"], rows),
+        "",
+        f"{scene['frames']} rendered frames of {scene['width']}x{scene['height']}, "
+        f"{100 * content['moving_fraction']:.0f} % of the pixels move; flow: OpenCV DIS, in the "
+        "time; depth: the renderer's (an oracle).",
+    ]
+
+
+TABLES: dict[str, Callable[[Results], list[str]]] = {
+    "demo": demo,
+    "speed": speed,
+    "peers": peers,
+    "heavy": heavy,
+    "scenarios": scenarios,
+    "real": real,
+    "sequences": sequences,
+    "costs": costs,
+}
+PAGE = (
+    ("Most of the image moves", "heavy"),
+    ("Known noise", "scenarios"),
+    ("Recorded sequences", "real"),
+    ("Whole sequences", "sequences"),
+    ("Time and memory", "costs"),
+)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
