@@ -103,6 +103,8 @@ class Odometry:
                 f"Odometry.network: expected 'default', the name or file of weights, Models or "
                 f"None, got {got}."
             )
+        if flow is not None and not callable(flow):
+            raise InputError(f"Odometry.flow: expected a callable (prev, curr), got {flow!r}.")
         if method is None:
             method = "refine" if network is None else DEFAULT_METHOD
         if network is None and networks_of(method):

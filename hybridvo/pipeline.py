@@ -399,6 +399,7 @@ def run_method(pair: FramePair, method: str, ctx: Context) -> RelativePose:
         mode == "auto" and method == "hybrid"
     ):
         found = refine_photometric(pair, found, ctx.options.photometric)
+    found = stage.widened(found)
     if found.status.ok and not found.status.message and (doubt := _depth_doubt(pair)):
         found = found.replace(status=replace(found.status, message=doubt))
     return found.replace(method=method, ms=1e3 * (time.perf_counter() - started))

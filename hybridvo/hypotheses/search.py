@@ -1,4 +1,4 @@
-"""Every strong motion in the picture, one after the other (numba).
+"""Every strong motion in the image, one after the other (numba).
 
 Starts come from three sources: poses that the caller hands in (identity, the last motion, a
 network's seed), robust dense fits of overlapping windows, and minimal three-pixel samples. They are
@@ -30,10 +30,10 @@ from hybridvo.refinement.solver import (
     DEPTH_NOISE_CAP,
     FLOW_NOISE_CAP,
     NOISE_PIXELS,
-    graduate,
+    anneal,
     left_update,
     new_work,
-    polish,
+    reestimate,
     residual,
     residual_scale,
     robust_weights,
@@ -47,11 +47,11 @@ REFINED = 4
 NEAR_START = 1.5
 """First scale, px, of the robust kernel about a pose that was handed in."""
 COHERENT = 0.35
-"""Coherence of the residuals above which a motion that holds the picture is not beyond doubt; depth
+"""Coherence of the residuals above which a motion that holds the image is not beyond doubt; depth
 noise that is half correlated in space stays below 0.25."""
 
 SETTLED = 0.5
-"""Share of the picture above which a motion without coherent residuals is taken as it is: no other
+"""Share of the image above which a motion without coherent residuals is taken as it is: no other
 can hold as much, and further ones are looked for in what it leaves."""
 
 ASIDE = 0.8
@@ -163,7 +163,7 @@ def fit_minimal(samples, pick, K, A, x, other, pose):
             i = 1.0 / Zc
             a = X * i
             b = Y * i
-            # rows in units of the picture's radians, translation in units of the depth
+            # rows in units of the image's radians, translation in units of the depth
             u = 2 * m
             v = u + 1
             A[u, 0], A[u, 1], A[u, 2] = i, 0.0, -a * i
@@ -224,7 +224,7 @@ def fit_window(samples, h, w, r0, r1, c0, c1, K, buffer, pose, work):
     for i in range(3):
         pose[i, i] = 1.0
     scale = min(64.0, max(1.0, residual_scale(buffer, m, pose, K)))
-    graduate(buffer, m, K, scale, 0.7, 0.4, 2, pose, work)
+    anneal(buffer, m, K, scale, 0.7, 0.4, 2, pose, work)
     for i in range(3):
         for j in range(4):
             if not abs(pose[i, j]) < MAX_VALUE:
@@ -285,14 +285,14 @@ def search_round(
     sources = np.zeros(REFINED)
     candidate = np.empty((3, 4))
     for s in range(starts.shape[0]):
-        # from afar; and, for what the caller hands in, from nearby: where most of the picture moves
+        # from afar; and, for what the caller hands in, from nearby: where most of the image moves
         # a wide kernel would leave even the right motion
         for near in range(2 if s > 0 else 1):
             candidate[:, :] = starts[s]
             scale = NEAR_START
             if near == 0:
                 scale = min(64.0, max(1.0, 1.5 * residual_scale(small, ns, candidate, K)))
-            graduate(small, ns, K, scale, 0.7, 0.4, 2, candidate, work)
+            anneal(small, ns, K, scale, 0.7, 0.4, 2, candidate, work)
             score = score_pose(small, ns, candidate, K)
             keep_best(candidate, score, s, poses, scores, sources, similar)
     if wide:
@@ -325,7 +325,7 @@ def search_round(
         if scores[s] <= 0:
             break
         candidate[:, :] = poses[s]
-        steps += graduate(small, ns, K, 1.5, 0.7, 0.4, 3, candidate, work)
+        steps += anneal(small, ns, K, 1.5, 0.7, 0.4, 3, candidate, work)
         score = score_pose(coarse, n, candidate, K)
         if score > best:
             best = score
@@ -333,9 +333,9 @@ def search_round(
             facts[SOURCE] = sources[s]
     if best <= 0:
         return False
-    steps += graduate(coarse, n, K, 0.7, 0.5, 0.4, 3, pose, work)
+    steps += anneal(coarse, n, K, 0.7, 0.5, 0.4, 3, pose, work)
     candidate[:, :] = pose
-    sf, sd, share, more, _, _ = polish(
+    sf, sd, share, more, _, _ = reestimate(
         coarse,
         n,
         K,

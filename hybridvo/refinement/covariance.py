@@ -2,11 +2,11 @@
 
 Errors of flow and depth are correlated over tens of pixels, and over whole objects where a flow was
 smoothed. The sandwich of Huber (1967) takes this in through its meat: the scores are summed over
-blocks of the picture before their outer products are taken (cluster-robust: Liang and Zeger, 1986),
+blocks of the image before their outer products are taken (cluster-robust: Liang and Zeger, 1986),
 and the blocks overlap, which is Bartlett's kernel of the heteroskedasticity- and autocorrelation-
 consistent estimate in two dimensions (Newey and West, 1987; Conley, 1999). How the variance grows
 from one size of block to the next tells whether the errors end within the blocks; where they do
-not, the growth is continued to the size of the picture (aggregated variance of processes with long-
+not, the growth is continued to the size of the image (aggregated variance of processes with long-
 range dependence: Beran, Statistics for Long-Memory Processes, 1994).
 """
 
@@ -36,7 +36,7 @@ blocks. Median and 95 % quantile over development pairs: 1.0 and 1.5 of independ
 flow. So every tenth to twentieth pair of noisy cells is doubted more than it should."""
 ABSORBED = 2.0
 """The exponent of the growth is taken so much larger: what errors have in common over the whole
-picture the fit takes into the motion, so that the residuals show less of it than there is. On
+image the fit takes into the motion, so that the residuals show less of it than there is. On
 development sequences with DIS flow (240 pairs) the median squared error in units of the covariance,
 5.3 expected, was 12 with 1.5, 7 to 9 with 2 and 6 to 8 with 2.5."""
 SMALLEST_REST = 0.25
@@ -147,7 +147,7 @@ def sandwich_covariance(
     Bread: the derivative of the estimating equation (Gauss-Newton Hessian less the curvature of the
     robust weights). Meat: :data:`CLUSTERED` from overlapping blocks two tiles wide, the rest from
     independent errors, scaled by how much the blocks exceed them on the average; both corrected for
-    what the fit itself takes out of the residuals, and continued to the size of the picture where
+    what the fit itself takes out of the residuals, and continued to the size of the image where
     the errors reach beyond the blocks.
 
     Args:
@@ -156,7 +156,7 @@ def sandwich_covariance(
         meat: (21,) under independent errors.
         scores: (rows, columns, 6) scores summed over tiles.
         information: (rows, columns, 21) Gauss-Newton Hessian summed over tiles.
-        depth_scale: 1 / m, turns metres of translation into radians of the picture.
+        depth_scale: 1 / m, turns metres of translation into radians of the image.
         rounding: what the rounding of exact data adds, in units of the model's own covariance.
     """
     scaling = np.array([1 / depth_scale] * 3 + [1.0] * 3)

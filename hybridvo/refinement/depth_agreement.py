@@ -15,7 +15,7 @@ from hybridvo.refinement import kernels
 from hybridvo.types import Frame
 
 PIXELS = 4000
-LEAST_PIXELS = 100
+MIN_PIXELS = 100
 """Pixels that are asked, and the fewest that can tell."""
 FOLLOWS = 0.5
 """Robust weight from which a pixel follows the motion."""
@@ -77,7 +77,7 @@ def depth_agreement(
             :mod:`hybridvo.refinement.kernels`.
         robust: (n,) robust weights about the motion.
         pose: (3, 4) T_curr_prev.
-        origin: (u, v) of the current picture's coordinates in ``samples``.
+        origin: (u, v) of the current image's coordinates in ``samples``.
 
     Returns:
         None where too few pixels of both frames have depth.
@@ -98,7 +98,7 @@ def depth_agreement(
     known = (seen > 1e-6) & (seen < 1e9)
     if curr.mask is not None:
         known &= curr.mask[rows, columns]
-    if np.count_nonzero(known) < LEAST_PIXELS:
+    if np.count_nonzero(known) < MIN_PIXELS:
         return None
     log_ratio = np.log(seen[known] / moved[inside][known])
     middle = float(np.median(log_ratio))

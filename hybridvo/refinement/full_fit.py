@@ -99,7 +99,7 @@ def translation_scale(samples: np.ndarray, n: int) -> float:
 
 
 def tile_size(shape: tuple[int, int], tiles: int) -> int:
-    """Side, px, of the tiles that cut a image into about ``tiles``; 8 to 64."""
+    """Side, px, of the tiles that cut an image into about ``tiles``; 8 to 64."""
     return int(np.clip(round(np.sqrt(shape[0] * shape[1] / tiles)), 8, 64))
 
 
@@ -121,8 +121,8 @@ def fit_coarse(
     work = solver.new_work()
     pose = np.array(pose, np.float64, order="C")
     scale = min(64.0, max(1.0, 1.5 * solver.residual_scale(samples, n, pose, K)))
-    steps = solver.graduate(samples, n, K, scale, 0.4, 0.5, 3, pose, work)
-    sf, sd, share, more, _, _ = solver.polish(
+    steps = solver.anneal(samples, n, K, scale, 0.4, 0.5, 3, pose, work)
+    sf, sd, share, more, _, _ = solver.reestimate(
         samples, n, K, 0.5, 0.01, solver.FLOW_NOISE_CAP, solver.DEPTH_NOISE_CAP, cutoff, 2, 4,
         NOISE_PIXELS, pose, work,
     )  # fmt: skip
@@ -152,7 +152,7 @@ def fit_full_grid(
     sf, sd = noise_start
     caps = 2.5 * sf, max(2.5 * sd, 0.02)
     samples, n = _enough_samples(grid)
-    sf, sd, share, iterations, _, spread = solver.polish(
+    sf, sd, share, iterations, _, spread = solver.reestimate(
         samples, n, image.K, sf, sd, *caps, options.cutoff, 1, 4, NOISE_PIXELS, pose, work
     )
     noise = np.empty(3, np.float32)
@@ -257,7 +257,7 @@ def _depth_uncertainty(
 def _tiles_used(
     image: PixelGrid, samples: np.ndarray, n: int, shape: tuple[int, int], tiles: int
 ) -> int:
-    """Tiles of a image of ``shape`` that hold one of the usable samples.
+    """Tiles of an image of ``shape`` that hold one of the usable samples.
 
     :data:`MIN_TILES` where the image itself has few.
     """

@@ -1,9 +1,9 @@
-"""Light that is not the same all over the picture: vignette, lamps, the camera's tone curve.
+"""Light that is not the same all over the image: vignette, lamps, the camera's tone curve.
 
 One gain and one offset a pair cannot follow it, and what they leave pulls at the motion. Where it
-explains much of the residual, gain and offset become smooth fields over the picture, bilinear
+explains much of the residual, gain and offset become smooth fields over the image, bilinear
 between the nodes of a coarse grid, fitted to the residuals and put into the grey values of the
-previous picture. Gradients have no preferred sign within a cell, so that the field leaves the
+previous image. Gradients have no preferred sign within a cell, so that the field leaves the
 motion alone.
 """
 
@@ -65,11 +65,11 @@ def local_correlation(
 ) -> float:
     """Weighted correlation of two sets of grey values about their means in cells half as wide.
 
-    The fields can bring the means of any two pictures together, but not what is within a cell.
+    The fields can bring the means of any two images together, but not what is within a cell.
 
     Args:
         index: (N, 2) rows and columns.
-        shape: of the picture.
+        shape: of the image.
         a: (N,).
         b: (N,).
         weight: (N,).

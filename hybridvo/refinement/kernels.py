@@ -20,8 +20,10 @@ Per pixel, with X' = T X, a = X'/Z', b = Y'/Z', i = 1/Z' (conventions of :mod:`h
 from __future__ import annotations
 
 import numpy as np
+from numba import types
+from numba.extending import intrinsic
 
-from hybridvo.compilation import intrinsic, njit, types
+from hybridvo.compilation import njit
 
 FASTMATH = {"reassoc", "contract", "arcp", "nsz"}  # not nnan/ninf: invalid values are tested for
 
@@ -69,7 +71,7 @@ def keep_apart(typing_context):
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
 def gather_row(v, u0, u1, data, camera, flags, scale, buf):
-    """Fill ``buf`` with columns ``u0 .. u1 - 1`` of row ``v`` of the picture.
+    """Fill ``buf`` with columns ``u0 .. u1 - 1`` of row ``v`` of the image.
 
     ``data`` = (depth, flow, flow_variance, depth_variance, weights, valid), each (H, W) but the
     flow, (H, W, 2); absent ones are dummies, as ``flags`` says. ``camera`` = (1/fx, 1/fy, cx, cy)
@@ -136,7 +138,7 @@ def gather_row(v, u0, u1, data, camera, flags, scale, buf):
 def gather_grid(stride, data, camera, flags, scale, out):
     """Gather every ``stride``-th pixel of both axes into ``out`` (BUFFER_ROWS, h w).
 
-    The grid starts half a stride in, so that its centre is that of the picture. Returns (h, w).
+    The grid starts half a stride in, so that its centre is that of the image. Returns (h, w).
     """
     H, width = data[0].shape
     first = stride // 2

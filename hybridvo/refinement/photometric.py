@@ -1,10 +1,10 @@
-"""Photometric polish: the motion that the flow found, made sharper by the pictures themselves.
+"""Photometric refinement: the motion that the flow found, made sharper by the images themselves.
 
-The flow brings the motion close; the pictures hold far more than the flow. The residual of a
+The flow brings the motion close; the images hold far more than the flow. The residual of a
 weighted static pixel, ``I_curr(pi(T X)) - gain I_prev - offset``, joins as information: the flow's
 (and the second depth's) covariance becomes a prior of Student's form around the motion of the
 refinement, and the 6x6 normal equations of both add up, each with its estimated noise. A guard
-keeps the motion of the flow where the pictures do not lower the joint cost, do not match, or lead
+keeps the motion of the flow where the images do not lower the joint cost, do not match, or lead
 outside of what the flow allows. Definition of the term:
 :mod:`hybridvo.refinement.photometric_kernels`.
 """
@@ -40,7 +40,7 @@ MAX_SHIFT = 9.0
 SAID = ("no_texture", "no_match", "out_of_view", "outside_flow", "higher_cost", "not_finite")
 """Reasons that the status of the motion mentions."""
 HALF = 0.5
-"""Agreement of the parts of the picture below which the status mentions it."""
+"""Agreement of the parts of the image below which the status mentions it."""
 COARSE_SPREAD = 0.3
 """Coarser blurs are used where the flow leaves more than this many finest blurs undecided."""
 COST_NOISE = 1.0
@@ -54,7 +54,7 @@ def refine_photometric(
     pose: RelativePose,
     options: PhotometricOptions | None = None,
 ) -> RelativePose:
-    """The motion of a pair, sharpened by its two pictures.
+    """The motion of a pair, sharpened by its two images.
 
     Args:
         pair: the two frames; both with images.
@@ -68,10 +68,10 @@ def refine_photometric(
         and the report and the status' message say why. Never a value that is not finite.
 
     Raises:
-        InputError: weights of another shape than the picture.
+        InputError: weights of another shape than the image.
     """
     started = time.perf_counter()
-    motion = _polish(pair, pose, options or PhotometricOptions())
+    motion = _refine(pair, pose, options or PhotometricOptions())
     return motion.replace(ms=pose.ms + 1e3 * (time.perf_counter() - started))
 
 
@@ -86,7 +86,7 @@ def _unchanged(
     return pose.replace(photometric=report)
 
 
-def _polish(pair: FramePair, pose: RelativePose, options: PhotometricOptions) -> RelativePose:
+def _refine(pair: FramePair, pose: RelativePose, options: PhotometricOptions) -> RelativePose:
     prev, curr = pair.prev, pair.curr
     if prev.rgb is None or curr.rgb is None:
         return _unchanged(pose, "no_images", "an image of the pair is missing")
@@ -144,7 +144,7 @@ def _guarded(
     state: State,
     options: PhotometricOptions,
 ) -> RelativePose:
-    """The polished motion, or that of the flow where the pictures cannot be believed."""
+    """The refined motion, or that of the flow where the images cannot be believed."""
     problem.set_share()
     photometric = problem.weigh(state.noise, kernels.ALL_COLUMNS)
     used = problem.w > 0
@@ -240,10 +240,10 @@ def _remarks(report: PhotometricReport) -> str:
     """What was wrong with images that were used all the same."""
     parts = []
     if report.uneven_light:
-        parts.append("the light changed differently over the picture, evened out")
+        parts.append("the light changed differently over the image, evened out")
     if report.agreement < HALF:
         parts.append(
-            "parts of the picture disagree about the motion (rolling shutter, lens, depth?), "
+            "parts of the image disagree about the motion (rolling shutter, lens, depth?), "
             "weighed down"
         )
     return "; ".join(parts)

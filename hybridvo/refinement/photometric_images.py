@@ -1,4 +1,4 @@
-"""Grey pictures for the photometric term: conversion, blur, and blur made alike."""
+"""Grey images for the photometric term: conversion, blur, and blur made alike."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ STRIPS = 4
 STRIP_ROWS = 28
 """Sharpness is measured on so many strips of so many rows."""
 UNLIKE = 1.1
-"""Ratio of two sharpnesses from which on a picture is blurred to match the other."""
-MOST_BLUR_PX = 4.0
+"""Ratio of two sharpnesses from which on an image is blurred to match the other."""
+MAX_BLUR_PX = 4.0
 HALVINGS = 5
 
 
 @dataclass(frozen=True, eq=False)
 class Level:
-    """The two grey pictures, (H, W) float32, under one blur."""
+    """The two grey images, (H, W) float32, under one blur."""
 
     prev: np.ndarray
     curr: np.ndarray
@@ -36,13 +36,13 @@ def grey_image(rgb: np.ndarray) -> np.ndarray:
 
 
 def blurred(images: Level, blur_px: float) -> Level:
-    """Both pictures under a Gaussian blur of this standard deviation."""
+    """Both images under a Gaussian blur of this standard deviation."""
     prev, curr = (cv2.GaussianBlur(image, (0, 0), blur_px) for image in (images.prev, images.curr))
     return Level(prev, curr)
 
 
 def match_blur(images: Level) -> Level:
-    """The sharper of two pictures blurred until both are about equally sharp.
+    """The sharper of two images blurred until both are about equally sharp.
 
     Motion blur and focus change from frame to frame; the difference of a sharp and a blurred edge
     is no motion, but it pulls at one.
@@ -54,7 +54,7 @@ def match_blur(images: Level) -> Level:
         return images
     first = sharpness[0] == high
     strip = strips[0] if first else strips[1]
-    least, most = 0.0, MOST_BLUR_PX
+    least, most = 0.0, MAX_BLUR_PX
     for _ in range(HALVINGS):
         middle = 0.5 * (least + most)
         if _sharpness(cv2.GaussianBlur(strip, (0, 0), middle)) > low:
@@ -67,7 +67,7 @@ def match_blur(images: Level) -> Level:
 
 
 def _strips(image: np.ndarray) -> np.ndarray:
-    """Some rows of the picture, at most a strip at each of ``STRIPS`` heights."""
+    """Some rows of the image, at most a strip at each of ``STRIPS`` heights."""
     height = image.shape[0]
     if height <= STRIPS * STRIP_ROWS:
         return image

@@ -1,11 +1,11 @@
 """Numba kernels of the photometric term: which pixels, and their residuals and Jacobians.
 
-Per pixel x of the previous picture with grey value A, at a pose T (X' = T X, a = X'/Z', b = Y'/Z',
+Per pixel x of the previous image with grey value A, at a pose T (X' = T X, a = X'/Z', b = Y'/Z',
 i = 1/Z'):
 
 - residual r = B(pi(X')) - gain A - offset, B read by cubic convolution (Catmull-Rom): bilinear
   reading blurs by an amount that depends on the place between the pixels, which pulls the motion
-  towards places of equal blur (measured: twice the error on clean pictures);
+  towards places of equal blur (measured: twice the error on clean images);
 - image gradient G of B at pi(X') from the gradient of A at x, carried over by the warp of a patch
   of constant depth (inverse compositional, Baker and Matthews, IJCV 2004): the noise of a central
   difference at x is independent of the noise of A at x, so noise alone moves nothing;
@@ -39,7 +39,7 @@ MARGIN = 3
 """Pixels this close to the border are not read: gradients and cubic reading need neighbours."""
 HALF = np.float32(0.5)
 BLOCK = 512
-LEAST_AREA = np.float32(1e-3)
+MIN_AREA = np.float32(1e-3)
 """A patch whose area shrinks below this share is seen edge-on."""
 STEEP = np.float32(0.2)
 """A change of log depth over two pixels above this is an edge, where the shift means nothing."""
@@ -208,7 +208,7 @@ def project_pixels(buf, n, image, R, t, K, scale, light, J, r):
         w11 = s * ty_ * (r11 - b * r21)
         determinant = w00 * w11 - w01 * w10
         seen = (Zc > MIN_DEPTH) & (u > low) & (u < high_u) & (v > low) & (v < high_v)
-        if not (seen and determinant > LEAST_AREA):
+        if not (seen and determinant > MIN_AREA):
             for p in range(JACOBIAN_ROWS):
                 J[p, k] = ZERO
             r[k] = np.nan

@@ -21,14 +21,14 @@ class PhotometricReport:
         shift_sigma: its length in standard deviations of the flow (inflated).
         image_information: (6, 6) of the images alone; flow_information: (6, 6) of the flow alone,
             both as they were added up.
-        gain, offset: of the current picture over the previous one; offset in grey levels.
+        gain, offset: of the current image over the previous one; offset in grey levels.
         noise_grey: standard deviation of the residual, grey levels.
-        correlation: of the two pictures over the pixels used.
+        correlation: of the two images over the pixels used.
         pixels: how many were used.
         agreement: factor in (0, 1] on the information of the images by which the parts of the
-            picture, held against each other, lowered it.
-        uneven_light: whether gain and offset had to vary over the picture.
-        depth_shift_px: (2,) shift (right, down) of the depth map against the picture that would
+            image, held against each other, lowered it.
+        uneven_light: whether gain and offset had to vary over the image.
+        depth_shift_px: (2,) shift (right, down) of the depth map against the image that would
             explain the residuals best, px.
         depth_shift_information: (2, 2) of it.
     """

@@ -24,7 +24,7 @@ NOISE_FLOOR = 0.1
 TILES = 110
 """As in the refinement: errors may be correlated within a tile."""
 PARTS = ((2, 2), (4, 1))
-"""Rows and columns of parts of the picture that are held against each other: a lens errs by
+"""Rows and columns of parts of the image that are held against each other: a lens errs by
 quadrant, a rolling shutter by row."""
 EVEN = 0.7
 """Dispersion of the parts' scores, as shares of the model's, below which they agree: rendered pairs
@@ -36,12 +36,12 @@ TOLERANCE = 0.02
 SETTLING = 2
 """Steps after which noise and share are estimated again: they were those of a worse motion."""
 GAINS = (0.2, 5.0)
-"""Limits of the gain between two pictures."""
+"""Limits of the gain between two images."""
 
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """(4, 4) T_curr_prev, gain and offset of the current picture; noise in grey levels."""
+    """(4, 4) T_curr_prev, gain and offset of the current image; noise in grey levels."""
 
     T: np.ndarray
     gain: float
@@ -297,7 +297,7 @@ def _dispersion(scores: np.ndarray, model: np.ndarray) -> float:
 
 
 def _solve_light(block: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """``block^-1 right`` for gain and offset; 0 of the one that the picture does not show."""
+    """``block^-1 right`` for gain and offset; 0 of the one that the image does not show."""
     a, b, c = block[0, 0], block[0, 1], block[1, 1]
     determinant = a * c - b * b
     if determinant > 1e-9 * a * c > 0:

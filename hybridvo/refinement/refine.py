@@ -102,9 +102,7 @@ def refine_pair(
         return RelativePose.failed(*failure, **common)
     T = pose_matrix(fit.pose)
     status = _status(fit, share, context)
-    covariance = fit.covariance
-    if not status.ok:
-        covariance = widened(covariance, T, fit, context)
+    covariance = _with_doubt(fit, T)
     spread = np.sqrt(max(np.linalg.eigvalsh(covariance[:3, :3])[-1], 0.0))
     return RelativePose(
         T_curr_prev=T,
@@ -156,26 +154,31 @@ def _status(fit: FullFit, share: float, context: Context) -> Status:
     return Status()
 
 
-def widened(
-    covariance: np.ndarray, T_curr_prev: np.ndarray, fit: FullFit, context: Context
-) -> np.ndarray:
-    """(6, 6) covariance of a degraded motion that covers what is in doubt about it.
+def _with_doubt(fit: FullFit, T_curr_prev: np.ndarray) -> np.ndarray:
+    """(6, 6) covariance that covers what the sums of one pair cannot know.
 
-    - Another motion may be the camera's: the second moment of the mixture. With probability p it is
-      this one; else one of the others found, or none, that is as far away as they or as standing
-      still. Nothing is known of the direction, so it counts alike in all.
-    - The two depths differ: the length of the translation is wrong by as much.
-    - Few tiles hold pixels: errors that agree within them are averaged over as many readings only.
+    Where few tiles hold pixels, errors that agree within them are averaged over as many readings
+    only. Where the two depths differ, the length of the translation is wrong by as much.
     """
-    covariance = covariance * max(1.0, MIN_TILES / max(fit.tiles, 1))
-    if context.probability < context.min_probability:
-        others = [h.T_curr_prev for h in context.hypotheses[1:]] + [np.eye(4)]
-        steps = np.array([se3_log(T_curr_prev @ invert(T)) for T in others])
-        sizes = [np.max(np.sum(steps[:, part] ** 2, axis=1)) for part in (slice(0, 3), slice(3, 6))]
-        covariance = covariance + (1 - context.probability) * np.diag(np.repeat(sizes, 3))
+    covariance = fit.covariance * max(1.0, MIN_TILES / max(fit.tiles, 1))
     if fit.depths is not None and fit.depths.doubt:
         t = T_curr_prev[:3, 3]
-        length = np.log(fit.depths.ratio) ** 2 + fit.depths.spread**2
-        covariance = covariance.copy()
-        covariance[:3, :3] += length * np.outer(t, t)
+        share = np.log(fit.depths.ratio) ** 2 + fit.depths.spread**2
+        covariance[:3, :3] += share * np.outer(t, t)
     return covariance
+
+
+def widened(motion: RelativePose) -> RelativePose:
+    """An ambiguous motion with a covariance that covers the other motions it may be.
+
+    The second moment of the mixture: with its probability the camera's motion is this one; else it
+    is another of those found, or none of them, taken to be as far away as they or as standing
+    still. Nothing is known of the direction, so it counts alike in all.
+    """
+    if motion.status.reason is not Reason.AMBIGUOUS_MOTION or not motion.usable:
+        return motion
+    others = [h.T_curr_prev for h in motion.hypotheses[1:]] + [np.eye(4)]
+    steps = np.array([se3_log(motion.T_curr_prev @ invert(T)) for T in others])
+    sizes = [np.max(np.sum(steps[:, part] ** 2, axis=1)) for part in (slice(0, 3), slice(3, 6))]
+    doubt = (1 - motion.probability) * np.diag(np.repeat(sizes, 3))
+    return motion.replace(covariance=motion.covariance + doubt, translation_direction_valid=False)

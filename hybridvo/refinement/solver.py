@@ -34,7 +34,7 @@ from hybridvo.refinement.kernels import (
 )
 
 FLOW_NOISE_FLOOR = 2e-3
-"""Smallest flow noise assumed, px: float32 coordinates of an 8k picture are good to 5e-4 px."""
+"""Smallest flow noise assumed, px: float32 coordinates of an 8k image are good to 5e-4 px."""
 FLOW_NOISE_CAP = 1.2
 DEPTH_NOISE_CAP = 0.08
 """Largest noise (px, log depth) that a motion may claim in the search; beyond it the fit would be a
@@ -151,7 +151,7 @@ def evaluate(samples, n, pose, K, noise, work, acc):
 def gauss_newton(samples, n, total, K, noise, steps, tolerance_px, pose, work):
     """Damped Gauss-Newton in place; a step is taken only where the robust cost does not rise.
 
-    ``total`` is the sum of the external weights. Stops when the step moves the picture by less
+    ``total`` is the sum of the external weights. Stops when the step moves the image by less
     than ``tolerance_px``. Returns (iterations, cost, converged).
     """
     acc = np.zeros(SUMS)
@@ -174,7 +174,7 @@ def gauss_newton(samples, n, total, K, noise, steps, tolerance_px, pose, work):
         new_cost += full * max(0.0, total - other[29])
         done += 1
         if new_cost <= cost * (1.0 + 1e-9) + 1e-12:
-            # predicted mean squared motion of the picture, px^2: delta^T H delta / weight
+            # predicted mean squared motion of the image, px^2: delta^T H delta / weight
             moved = 0.0
             for i in range(6):
                 moved += delta[i] * acc[21 + i]
@@ -381,7 +381,7 @@ def estimate_noise(samples, n, pose, K, sf, sd, sf_cap, sd_cap, rounds, limit):
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
-def graduate(samples, n, K, start_px, end_px, ratio, steps, pose, work):
+def anneal(samples, n, K, start_px, end_px, ratio, steps, pose, work):
     """Graduated Geman-McClure with isotropic noise, from ``start_px`` down to ``end_px``."""
     noise = np.empty(3, np.float32)
     total = np.float64(np.sum(samples[W, :n]))
@@ -397,7 +397,7 @@ def graduate(samples, n, K, start_px, end_px, ratio, steps, pose, work):
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
-def polish(samples, n, K, sf, sd, sf_cap, sd_cap, cutoff, rounds, steps, limit, pose, work):
+def reestimate(samples, n, K, sf, sd, sf_cap, sd_cap, cutoff, rounds, steps, limit, pose, work):
     """Alternate noise estimate and Gauss-Newton with the full covariance, in place.
 
     Returns (sf, sd, share, iterations, converged, standard error of sd^2).

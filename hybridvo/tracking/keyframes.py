@@ -96,7 +96,7 @@ class View:
 
 
 def spread_px(key: KeyFrame, covariance: np.ndarray) -> float:
-    """How far a (6, 6) covariance of a motion lets the picture of a key frame move, px.
+    """How far a (6, 6) covariance of a motion lets the image of a key frame move, px.
 
     Root mean square over both axes, at the median depth.
     """

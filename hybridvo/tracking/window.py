@@ -302,6 +302,9 @@ def corrected(motion: RelativePose, located: Located, T_curr_prev: np.ndarray) -
         T_curr_prev: (4, 4) from the pose before to that place.
     """
     covariance, status = located.covariance, located.status
+    if motion.status.reason is Reason.AMBIGUOUS_MOTION and not status.ok:
+        # a registration that started from this motion confirms it whichever it is
+        covariance = covariance + motion.covariance
     between = T_curr_prev @ invert(motion.T_curr_prev)
     if motion.usable and chi2(between, covariance + motion.covariance) > CORRECTION_LIMIT:
         jump = se3_log(between)

@@ -167,7 +167,7 @@ def _record(
     source: str,
 ) -> dict[str, Any]:
     """Everything about a sample, as small arrays."""
-    h, w, stride = found.shape
+    h, w, stride = found.grid.shape
     pick = np.s_[stride // 2 :: stride, stride // 2 :: stride]
     log_depth = found.maps().log_depth_curr
     if log_depth_curr is not None:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 import torch.nn.functional as F
-from scipy.stats import rankdata, spearmanr
+from scipy.stats import rankdata
 
 from hybridvo.errors import InputError
 from hybridvo.learned import next_start
@@ -48,6 +48,14 @@ def area_under_curve(score: np.ndarray, label: np.ndarray) -> float | None:
         return None
     ranks = rankdata(score)
     return float((ranks[label].sum() - positive * (positive + 1) / 2) / (positive * negative))
+
+
+def rank_correlation(a: np.ndarray, b: np.ndarray) -> float | None:
+    """Spearman's correlation of (N,) values; None where one of them is constant."""
+    ranks = [rankdata(x) for x in (a, b)]
+    if min(np.ptp(r) if r.size else 0.0 for r in ranks) == 0:
+        return None
+    return float(np.corrcoef(*ranks)[0, 1])
 
 
 def evaluate_network(
@@ -168,10 +176,12 @@ def _uncertainty_figures(pixels: list[np.ndarray], index: int, name: str) -> dic
         return dict.fromkeys(keys)
     table = np.concatenate(pixels)
     s, ratio = table[:, 1 + 3 * index], table[:, 3 + 3 * index]
-    columns = (1 + 3 * index, 2 + 3 * index)
-    ranks = [spearmanr(p[:, columns[0]], p[:, columns[1]]).statistic for p in pixels if len(p) > 2]
+    columns = [1 + 3 * index, 2 + 3 * index]
+    ranks = [rank_correlation(*p[:, columns].T) for p in pixels]
+    known = [r for r in ranks if r is not None]
+    spearman = float(np.mean(known)) if known else None
     auroc = area_under_curve(s, table[:, 0] > 0.5)
-    return dict(zip(keys, (auroc, float(np.nanmean(ranks)), float(ratio.mean())), strict=True))
+    return dict(zip(keys, (auroc, spearman, float(ratio.mean())), strict=True))
 
 
 def calibrate_scales(

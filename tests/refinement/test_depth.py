@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hybridvo.refinement.options import RefinementOptions
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hybridvo.geometry import ego_flow, se3_exp
+from hybridvo.options import Options, RefineOptions
 from hybridvo.pipeline import estimate, refine
 from hybridvo.refinement import kernels
 from hybridvo.refinement.depth_agreement import depth_agreement
@@ -120,6 +120,6 @@ def test_what_cannot_be_compared_is_no_doubt() -> None:
     ):
         curr = replace(pair.curr, depth=depth, mask=mask)
         assert refine(replace(pair, curr=curr)).status.state.value == "ok"
-    off = RefinementOptions(second_depth="off")
+    off = Options(refine=RefineOptions(current_depth="off"))
     unasked = replace(pair, curr=replace(pair.curr, depth=wrong))
     assert refine(unasked, options=off).status.state.value == "ok"

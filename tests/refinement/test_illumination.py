@@ -12,7 +12,7 @@ from hybridvo.flow import dis_flow
 from hybridvo.geometry import ego_flow, invert
 from hybridvo.pipeline import refine
 from hybridvo.refinement.illumination import COLUMNS, ROWS, local_correlation
-from hybridvo.refinement.photometric import polish_photometric
+from hybridvo.refinement.photometric import refine_photometric
 from hybridvo.synthetic.render import SyntheticSequence, make_scene
 from hybridvo.types import Frame, FramePair
 
@@ -32,7 +32,7 @@ def polished(prev: Frame, curr: Frame):
     field = dis_flow()(prev, curr)
     pair = FramePair(prev, curr, field.flow, field.variance, field.valid, "dis")
     motion = refine(pair)
-    return motion, polish_photometric(pair, motion)
+    return motion, refine_photometric(pair, motion)
 
 
 def error_px(prev: Frame, T: np.ndarray, T_true: np.ndarray) -> float:
@@ -55,7 +55,7 @@ def lamp(rgb: np.ndarray) -> np.ndarray:
 def test_even_light_is_left_alone(made):
     prev, curr, T, _ = made
     motion, done = polished(prev, curr)
-    assert done.polish.taken and not done.polish.uneven_light
+    assert done.photometric.taken and not done.photometric.uneven_light
     assert done.status.message == motion.status.message
     assert error_px(prev, done.T_curr_prev, T) < 0.3 * error_px(prev, motion.T_curr_prev, T)
 
@@ -68,7 +68,7 @@ def test_uneven_light_is_evened_out_and_said(both, made):
     else:
         curr = replace(curr, rgb=lamp(curr.rgb))
     motion, done = polished(prev, curr)
-    assert done.polish.taken and done.polish.uneven_light
+    assert done.photometric.taken and done.photometric.uneven_light
     assert "light changed" in done.status.message
     # one gain a pair gave 0.9 to 1.0 in the median of rendered pairs, the fields 0.26 to 0.36
     assert error_px(prev, done.T_curr_prev, T) < 0.7 * error_px(prev, motion.T_curr_prev, T)
@@ -80,8 +80,8 @@ def test_the_fields_do_not_make_another_picture_fit(made):
     other = SyntheticSequence(make_scene("static", 405, height=HEIGHT, width=WIDTH, frames=2))
     pair = FramePair(prev, curr, field.flow, field.variance, field.valid, "dis")
     motion = refine(pair)
-    done = polish_photometric(replace(pair, curr=other.frame(0)), motion)
-    assert not done.polish.taken
+    done = refine_photometric(replace(pair, curr=other.frame(0)), motion)
+    assert not done.photometric.taken
     assert "images not used" in done.status.message
     np.testing.assert_array_equal(done.T_curr_prev, motion.T_curr_prev)
 
@@ -96,11 +96,11 @@ def test_rows_taken_one_after_the_other_lower_the_weight(made):
     pair = FramePair(prev, curr, field.flow, field.variance, field.valid, "dis")
     motion = refine(pair)
     rolled = cv2.remap(curr.rgb, place[..., 0], place[..., 1], cv2.INTER_CUBIC)
-    plain = polish_photometric(pair, motion).polish
-    done = polish_photometric(replace(pair, curr=replace(curr, rgb=rolled)), motion)
+    plain = refine_photometric(pair, motion).photometric
+    done = refine_photometric(replace(pair, curr=replace(curr, rgb=rolled)), motion)
     assert plain.agreement > 0.5
-    assert done.polish.agreement < 0.5
-    assert not done.polish.taken or "parts of the picture disagree" in done.status.message
+    assert done.photometric.agreement < 0.5
+    assert not done.photometric.taken or "parts of the image disagree" in done.status.message
 
 
 def test_local_correlation_forgets_what_a_cell_has_in_common():

@@ -1,20 +1,19 @@
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
-from hybridvo.tracking.anchor import Anchor, dump_anchor, load_anchor
-from hybridvo.tracking.key_frame import View
-from hybridvo.tracking.motion_history import MotionHistory
 from scipy.optimize import least_squares
 
 from hybridvo.errors import InputError
-from hybridvo.evaluation.report import jsonable
 from hybridvo.geometry import invert, se3_exp, se3_log
+from hybridvo.options import TrackOptions
+from hybridvo.tracking.keyframes import KeyFrame, View
+from hybridvo.tracking.motion_model import MotionModel
 from hybridvo.tracking.pose_graph import (
     FREEDOM,
     Edge,
@@ -23,7 +22,8 @@ from hybridvo.tracking.pose_graph import (
     compose_covariance,
     solve_graph,
 )
-from hybridvo.tracking.window import KeyFrame, Located, Window, WindowOptions, locate
+from hybridvo.tracking.state import TrackerState
+from hybridvo.tracking.window import Located, Window, locate
 from hybridvo.types import Camera, Frame, Reason, RelativePose, State, Status
 
 HEIGHT, WIDTH = 48, 64
@@ -34,7 +34,7 @@ STEP = se3_exp(np.array([0.04, -0.01, 0.02, 0.001, -0.004, 0.002]))
 SURE = np.diag([1e-3**2] * 3 + [3e-4**2] * 3)
 """Covariance of every motion of these tests before the window inflates it."""
 WRONG = se3_exp(np.array([0.1, 0.05, -0.08, 0.01, 0.02, -0.01]))
-OPTIONS = WindowOptions()
+OPTIONS = TrackOptions()
 
 
 def frame(index: int) -> Frame:
@@ -59,7 +59,7 @@ def walk(
     register: Callable[..., RelativePose] = right,
     search: Callable[..., RelativePose] = nothing,
     size: int = 5,
-    options: WindowOptions = OPTIONS,
+    options: TrackOptions = OPTIONS,
 ) -> list[Located]:
     """Every frame of a walk, ``motion(k)`` being what was found from k - 1 to k."""
     window, out = Window.start(frame(0), np.eye(4)), []
@@ -177,7 +177,7 @@ def test_key_frames_stop_the_drift_of_biased_motions() -> None:
     assert error(with_window[-1], frames - 1) < 0.6 * error(chained[-1], frames - 1)
     assert not any(located.used for located in chained)
     for located in with_window[10:]:
-        assert located.status.ok and located.used
+        assert located.status.usable and located.used
 
 
 def test_memory_is_that_of_the_key_frames() -> None:
@@ -248,7 +248,7 @@ def test_a_failed_motion_that_no_key_frame_knows_either_stays_failed() -> None:
     assert located[14].status.state is State.FAILED and not located[14].used
     assert located[14].covariance[0, 0] >= 1.0
     # a new walk begins beyond it: later motions are as sure as ever
-    assert located[15].status.ok and located[-1].window.keys[-1].frame.index >= 16
+    assert located[15].status.usable and located[-1].window.keys[-1].frame.index >= 16
     assert located[-1].covariance[0, 0] < 1e-4
 
 
@@ -289,51 +289,13 @@ def test_steps_say_how_sure_they_are() -> None:
     assert 1.0 < np.mean(squared) < 9.0
 
 
-def test_state_goes_through_text_without_losing_a_bit() -> None:
-    located = walk(40, biased)
-    window = located[-1].window
-    history = MotionHistory()
-    for _ in range(4):
-        history = history.observed(STEP @ se3_exp(1e-3 * np.arange(6)))
-    keys = [key if key.static is None else replace(key, static=key.static) for key in window.keys]
-    some = np.zeros_like(keys[0].static)
-    some[::2, 1::3] = True
-    window = replace(window, keys=(replace(keys[0], static=some), *keys[1:]))
-    anchor = Anchor(frame(39), STEP, WRONG, history, 2, 1, {"counts": [1, 0]}, window)
-    stored = json.loads(json.dumps(jsonable(dump_anchor(anchor))))
-    back = load_anchor(stored, stored["keys"], frame)
-    again = json.loads(json.dumps(jsonable(dump_anchor(back))))
-    assert again == stored
-    assert back.window is not None and back.window.keys[0].static is not None
-    np.testing.assert_array_equal(back.window.keys[0].static, some)
-    np.testing.assert_array_equal(back.window.T_last_key, window.T_last_key)
-    for a, b in zip(back.window.edges, window.edges, strict=True):
-        assert (a.prev, a.curr, a.kind, a.status) == (b.prev, b.curr, b.kind, b.status)
-        assert a.T.tobytes() == b.T.tobytes() and a.covariance.tobytes() == b.covariance.tobytes()
-    # the same key frames are not written twice
-    assert dump_anchor(anchor, anchor)["keys"] is None
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"overlap": 1.0}, "overlap: expected a share"),
-        ({"least_overlap": 0.0}, "least_overlap: expected a share"),
-        ({"inflation": 0.0}, "inflation: expected a positive number"),
-    ],
-)
-def test_wrong_options(options: dict[str, float], message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        WindowOptions(**options)
-
-
-def test_the_history_knows_how_well_constant_velocity_held() -> None:
+def test_the_model_knows_how_well_constant_velocity_held() -> None:
     rng = np.random.default_rng(2)
     sigma = np.array([0.02, 0.01, 0.03, 0.004, 0.006, 0.002])
     for ahead in (1, 3):
-        motion, history, squared = STEP, MotionHistory(), []
+        motion, model, squared = STEP, MotionModel(), []
         for k in range(400):
-            prediction = history.predict(ahead)
+            prediction = model.predict(ahead)
             motions = [motion]
             for _ in range(ahead):
                 motions.append(se3_exp(sigma * rng.standard_normal(6)) @ motions[-1])
@@ -343,13 +305,33 @@ def test_the_history_knows_how_well_constant_velocity_held() -> None:
                     true = T @ true
                 squared.append(chi2(true @ invert(prediction.T_curr_prev), prediction.covariance))
             motion = motions[1]
-            history = history.observed(motion)
+            model = model.observed(motion)
         # twice the mean square of the last ten changes: a mean of 3 to 6 for six numbers
         assert 1.5 < np.mean(squared) < 7.0
 
 
-def test_the_history_says_little_before_it_has_seen_changes() -> None:
-    history = MotionHistory()
-    assert history.predict() is None
-    prediction = history.observed(STEP).predict()
+def test_the_model_says_little_before_it_has_seen_changes() -> None:
+    model = MotionModel()
+    assert model.predict() is None
+    prediction = model.observed(STEP).predict()
     assert prediction is not None and prediction.covariance[0, 0] == 1.0
+
+
+def test_the_state_goes_through_a_file(tmp_path: Path) -> None:
+    window = walk(40, biased)[-1].window
+    model = MotionModel()
+    for _ in range(4):
+        model = model.observed(STEP @ se3_exp(1e-3 * np.arange(6)))
+    state = TrackerState(frame(39), STEP, WRONG, model, 2, 1, 40, window)
+    np.savez(tmp_path / "state.npz", **state.to_arrays())
+    with np.load(tmp_path / "state.npz", allow_pickle=False) as arrays:
+        back = TrackerState.from_arrays(arrays)
+    again = back.to_arrays()
+    for name, array in state.to_arrays().items():
+        np.testing.assert_array_equal(again[name], array)
+    assert (back.gap, back.failed, back.count) == (2, 1, 40) and back.frame is not None
+    assert [e.status for e in back.window.edges] == [e.status for e in window.edges]
+    first = TrackerState()
+    assert TrackerState.from_arrays(first.to_arrays()).frame is None
+    with pytest.raises(InputError, match="to_arrays"):
+        TrackerState.from_arrays({})

@@ -1,0 +1,73 @@
+"""Samples on disk: what is read is what was drawn; the command and its contact sheet."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import cv2
+import numpy as np
+import pytest
+
+from hybridvo.commands.generate import generate
+from hybridvo.errors import FormatError, InputError
+from hybridvo.synthetic import dataset
+from hybridvo.synthetic.diverse import DiverseOptions
+from hybridvo.synthetic.paper import PaperOptions
+
+SIZE = {"height": 32, "width": 64}
+
+
+@pytest.mark.parametrize("preset", [PaperOptions(**SIZE), DiverseOptions(**SIZE)])
+def test_what_is_read_is_what_was_drawn(tmp_path, preset):
+    assert list(dataset.write_samples(preset, 4, tmp_path, seed=2)) == [4]
+    for index in range(4):
+        read = dataset.read_sample(tmp_path, index)
+        drawn = preset.sample(dataset.sample_rng(2, index))
+        for field in dataclasses.fields(drawn):
+            a, b = getattr(read, field.name), getattr(drawn, field.name)
+            if field.name == "ego_flow":  # computed anew, float32
+                np.testing.assert_allclose(a, b, atol=2e-3, rtol=1e-4)
+            else:
+                np.testing.assert_array_equal(a, b)
+
+
+def test_the_paper_s_depths_are_stored_once(tmp_path):
+    list(dataset.write_samples(PaperOptions(**SIZE), 2, tmp_path))
+    names = {path.stem for path in (tmp_path / "shard_0000").iterdir()}
+    assert "depth_prev" in names and not {"depth_true", "ego_flow"} & names
+
+
+def test_an_interrupted_call_goes_on_and_other_samples_are_refused(tmp_path):
+    preset = PaperOptions(**SIZE)
+    list(dataset.write_samples(preset, 3, tmp_path))
+    written = (tmp_path / "shard_0000" / "flow.npy").stat().st_mtime_ns
+    assert list(dataset.write_samples(preset, 3, tmp_path)) == [3]
+    assert (tmp_path / "shard_0000" / "flow.npy").stat().st_mtime_ns == written
+    for other in ((preset, 3, 1), (PaperOptions(height=64, width=64), 3, 0), (preset, 4, 0)):
+        with pytest.raises(InputError, match="other samples"):
+            list(dataset.write_samples(*other[:2], tmp_path, seed=other[2]))
+
+
+def test_damage_and_nonsense_are_named(tmp_path):
+    with pytest.raises(InputError, match=r"samples\.json"):
+        dataset.read_sample(tmp_path / "none", 0)
+    list(dataset.write_samples(PaperOptions(**SIZE), 2, tmp_path / "a"))
+    with pytest.raises(InputError, match="0 to 1, got 2"):
+        dataset.read_sample(tmp_path / "a", 2)
+    (tmp_path / "a" / "shard_0000" / "flow.npy").write_bytes(b"damaged")
+    with pytest.raises(FormatError, match="shard_0000"):
+        dataset.read_sample(tmp_path / "a", 0)
+    with pytest.raises(InputError, match="count"):
+        list(dataset.write_samples(PaperOptions(**SIZE), 0, tmp_path / "b"))
+
+
+def test_the_command_writes_samples_and_a_contact_sheet(tmp_path):
+    seen = []
+    sheet = generate("paper", 3, tmp_path / "a", size=(32, 64), report=lambda *x: seen.append(x))
+    assert seen == [(3, 3)]
+    image = cv2.imread(str(sheet))
+    # seven tiles of 64 px with their gaps; three rows of 32 px with a line of text each, a header
+    assert image.shape == (18 + 3 * (32 + 18), 7 * (64 + 4), 3)
+    assert dataset.read_sample(tmp_path / "a", 0).flow.shape == (32, 64, 2)
+    with pytest.raises(InputError, match="paper, diverse"):
+        generate("real", 3, tmp_path / "b")

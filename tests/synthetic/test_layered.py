@@ -1,0 +1,291 @@
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hybridvo import geometry
+from hybridvo.errors import InputError
+from hybridvo.synthetic import diverse, layered, paper, sensors, silhouettes
+from hybridvo.types import Camera
+
+
+def generator(index: int, seed: int = 3) -> np.random.Generator:
+    return np.random.Generator(np.random.Philox(key=[seed, index]))
+
+
+def draws(sampler: paper.TailSampler, count: int = 20_000) -> np.ndarray:
+    rng = generator(0)
+    return np.array([sampler.draw(rng) for _ in range(count)])
+
+
+@pytest.mark.parametrize(("axis", "expected"), [(0, 0.397), (1, 0.467), (2, 0.372)])
+def test_rotation_samplers_have_the_published_statistics(axis, expected):
+    values = np.abs(draws(paper.MotionSamplers().rotation_deg[axis]))
+    # Four standard errors of the mean; the reference was drawn too, 200 000 times.
+    assert values.mean() == pytest.approx(expected, abs=4 * values.std() / np.sqrt(values.size))
+    assert np.median(values) == pytest.approx(0.15, abs=0.02)
+    # 5.6 to 6.9 over the three axes; the quantile of 20 000 draws has a standard error of 0.1.
+    assert 5.2 < np.quantile(values, 0.99) < 7.3
+
+
+@pytest.mark.parametrize(("axis", "expected", "median"), [(0, 0.035, 0.021), (1, 0.027, 0.018)])
+def test_translation_samplers_have_the_published_statistics(axis, expected, median):
+    values = np.abs(draws(paper.MotionSamplers().translation[axis]))
+    # The reference is rounded to 0.001.
+    bound = 4 * values.std() / np.sqrt(values.size) + 5e-4
+    assert values.mean() == pytest.approx(expected, abs=bound)
+    assert np.median(values) == pytest.approx(median, abs=0.0015)
+
+
+def test_focal_and_background_have_the_published_statistics():
+    o = paper.PaperOptions()
+    focal = o.focal_low + draws(o.focal) * (o.focal_high - o.focal_low)
+    assert focal.mean() == pytest.approx(906, abs=4 * focal.std() / np.sqrt(focal.size))
+    assert np.median(focal) == pytest.approx(771, abs=10)
+    rng = generator(1)
+    near = o.background_low + draws(o.background_depth) * (o.background_high - o.background_low)
+    far = rng.uniform(o.background_high, o.background_far, near.size)
+    depth = np.where(rng.random(near.size) < o.background_far_probability, far, near)
+    assert np.median(depth) == pytest.approx(44.8, abs=1.0)
+    assert depth.mean() == pytest.approx(199, abs=4 * depth.std() / np.sqrt(depth.size))
+
+
+def test_sampler_stays_within_its_limits_and_tells_when_it_cannot():
+    sampler = paper.TailSampler(0.0, 1.8, 2.5, 0.15, -5.0, 5.0, 0.02)
+    values = np.array([sampler.draw(generator(i), low=-0.01) for i in range(300)])
+    assert values.min() >= -0.01 and values.max() <= 5.0
+    with pytest.raises(InputError, match="fell into"):
+        paper.TailSampler(0.0, 1e-3, 1.0, 0.0, 50.0, 51.0, 1e-3).draw(generator(0))
+
+
+@pytest.mark.parametrize(
+    "change", [{"low": 2.0}, {"core_std": 0.0}, {"tail_probability": 1.5}, {"power": -1.0}]
+)
+def test_sampler_refuses_nonsense(change):
+    good = {"mean": 0.0, "tail_std": 1.0, "power": 2.0, "tail_probability": 0.1}
+    good |= {"low": -1.0, "high": 1.0, "core_std": 0.1}
+    with pytest.raises(InputError, match="TailSampler"):
+        paper.TailSampler(**(good | change))
+
+
+def test_paper_zero_motion_figures():
+    """R_err 0.412 deg, T_err 0.074; EPE 2.4 px, median 0.93, of the background plane."""
+    o = paper.PaperOptions(height=32, width=64)
+    rotation, translation, flow = [], [], []
+    for i in range(600):
+        sample = paper.paper_sample(generator(i, seed=5), o)
+        rotation.append(np.abs(sample.rotation_deg).mean())
+        translation.append(np.abs(sample.translation).mean())
+        # The reference figure is of the plane without the objects in front of it. Flow scales with
+        # the size of the picture: four times that of 32x64.
+        fx, fy = sample.K[0, 0], sample.K[1, 1]
+        x = (np.arange(64) - sample.K[0, 2]) / fx
+        y = ((np.arange(32) - sample.K[1, 2]) / fy)[:, None]
+        T = sample.T_curr_prev
+        rho = 1.0 / float(sample.depth_prev.max())
+        u, v, _ = layered.rigid_flow(x, y, rho, T[:3, :3], T[:3, 3], (fx, fy))
+        flow.append(4 * (np.abs(u).mean() + np.abs(v).mean()) / 2)
+    for values, expected, rounding in (
+        (rotation, 0.412, 0.0005),
+        (translation, 0.074, 0.0005),
+        (flow, 2.4, 0.05),
+    ):
+        bound = 4 * np.std(values) / np.sqrt(len(values)) + rounding
+        assert np.mean(values) == pytest.approx(expected, abs=bound)
+    assert np.median(flow) == pytest.approx(0.93, abs=0.2)
+
+
+def test_paper_sample_obeys_its_equations():
+    o = paper.PaperOptions()
+    moved = 0
+    for i in range(12):
+        s = paper.paper_sample(generator(i), o)
+        camera = Camera.from_matrix(s.K, o.height, o.width)
+        exact = geometry.ego_flow(s.depth_true, s.T_curr_prev.astype(np.float64), camera, camera)
+        ok = np.isfinite(exact).all(axis=-1) & (np.abs(exact).max(axis=-1) < 300)
+        # float32: 1e-6 of a normalised coordinate of 1 at fx up to 800 px.
+        np.testing.assert_allclose(s.ego_flow[ok], exact[ok], atol=5e-3, rtol=1e-4)
+        still = ~s.moving
+        np.testing.assert_array_equal(s.flow[still], s.ego_flow[still])
+        z = (geometry.backproject(s.depth_true, camera) @ s.T_curr_prev[:3, :3].T)[..., 2]
+        np.testing.assert_allclose(
+            s.depth_curr[still], (z + s.T_curr_prev[2, 3])[still], rtol=1e-4, atol=1e-3
+        )
+        R = geometry.euler_deg_to_matrix(s.rotation_deg)
+        np.testing.assert_allclose(s.T_curr_prev[:3, :3], R, atol=1e-6)
+        np.testing.assert_array_equal(s.T_curr_prev[:3, 3], s.translation)
+        moved += s.moving.any()
+    assert moved > 6
+
+
+def test_paper_intrinsics_are_those_of_the_published_resize():
+    o = paper.PaperOptions()
+    K = paper.paper_sample(generator(0), o).K
+    # f 255/1023 and f 127/435 with the principal point in the middle.
+    assert K[1, 1] / K[0, 0] == pytest.approx((127 / 435) / (255 / 1023), rel=1e-6)
+    assert (K[0, 2], K[1, 2]) == (127.5, 63.5)
+
+
+def test_rigid_flow_by_hand():
+    x, y = np.zeros(1, np.float32), np.zeros((1, 1), np.float32)
+    # 0.1 m to the right at 2 m with fx 200: 10 px; 1 m closer: the depth halves.
+    u, v, ratio = layered.rigid_flow(x, y, 0.5, np.eye(3), np.array([0.1, 0, 0]), (200, 100))
+    assert (u[0, 0], v[0, 0], ratio[0, 0]) == pytest.approx((10.0, 0.0, 1.0), rel=1e-5)
+    _, _, ratio = layered.rigid_flow(x, y, 0.5, np.eye(3), np.array([0, 0, -1.0]), (200, 100))
+    assert ratio[0, 0] == pytest.approx(0.5)
+    # A point at infinity does not see a translation.
+    u, _, ratio = layered.rigid_flow(x, y, 0.0, np.eye(3), np.array([5.0, 0, 0]), (200, 100))
+    assert abs(u[0, 0]) < 1e-3 and ratio[0, 0] == 1.0
+
+
+@pytest.mark.parametrize("preset", [paper.PaperOptions(), diverse.DiverseOptions()])
+def test_a_sample_depends_on_its_generator_alone(preset):
+    first, _, again = (preset.sample(generator(i)) for i in (7, 8, 7))
+    for field in dataclasses.fields(first):
+        np.testing.assert_array_equal(getattr(first, field.name), getattr(again, field.name))
+
+
+@pytest.mark.parametrize("size", [(128, 256), (64, 96), (37, 61)])
+@pytest.mark.parametrize("kind", [paper.PaperOptions, diverse.DiverseOptions])
+def test_samples_of_any_size_are_finite_and_complete(kind, size):
+    options = kind(height=size[0], width=size[1])
+    for i in range(8):
+        s = options.sample(generator(i))
+        for name in ("flow", "ego_flow"):
+            assert getattr(s, name).shape == (*size, 2)
+        for name in ("depth_prev", "depth_curr", "depth_true", "depth_target", "moving"):
+            assert getattr(s, name).shape == size
+        for field in dataclasses.fields(s):
+            value = getattr(s, field.name)
+            if field.name == "rays":  # those of the pixels' centres
+                assert value is None
+                continue
+            assert value.dtype == (bool if field.name == "moving" else np.float32), field.name
+            assert np.isfinite(value).all(), field.name
+            if field.name.startswith("depth"):
+                assert (value >= 0).all()
+
+
+def exact_diverse() -> diverse.DiverseOptions:
+    return diverse.DiverseOptions(
+        degradation=sensors.SensorOptions(exact_flow_probability=1.0, exact_depth_probability=1.0)
+    )
+
+
+def test_diverse_ego_flow_and_target_depth_are_those_of_the_camera():
+    o = exact_diverse()
+    for i in range(15):
+        s = diverse.diverse_sample(generator(i), o)
+        camera = Camera.from_matrix(s.K, o.height, o.width)
+        T = s.T_curr_prev.astype(np.float64)
+        exact = geometry.ego_flow(s.depth_true, T, camera, camera)
+        seen = s.depth_true > 0
+        # float32 at up to 400 px of focal length.
+        np.testing.assert_allclose(s.ego_flow[seen], exact[seen], atol=5e-3, rtol=1e-3)
+        z = (geometry.backproject(s.depth_true, camera) @ T[:3, :3].T)[..., 2] + T[2, 3]
+        np.testing.assert_allclose(s.depth_target[seen], z[seen], rtol=1e-3)
+        assert np.array_equal(s.moving, np.linalg.norm(s.flow - s.ego_flow, axis=-1) > 0.5)
+
+
+def test_diverse_has_large_movers_sky_and_still_scenes():
+    o = diverse.DiverseOptions(height=64, width=128)
+    count = 150
+    samples = [diverse.diverse_sample(generator(i, seed=11), o) for i in range(count)]
+    moving = np.array([s.moving.mean() for s in samples])
+    large = ((moving > 0.4) & (moving <= 0.87)).mean()
+    # about 0.37 over thousands of samples; four standard errors of a share are 0.16 here
+    assert 0.21 < large < 0.54
+    assert (moving < 0.01).mean() > 0.03
+    border = np.array([0, -1])
+    touching = [s.moving[border].any() or s.moving[:, border].any() for s in samples]
+    assert np.mean([t for t, m in zip(touching, moving, strict=True) if m > 0.4]) > 0.9
+    sky = np.array([(s.depth_true == 0).mean() for s in samples])
+    assert 0.05 < (sky > 0.02).mean() < 0.5
+    assert max(np.abs(s.ego_flow).max() for s in samples) < 2 * o.width
+
+
+def test_visibility_by_hand():
+    # One row: a near pixel (inverse depth 1) moves right by one and covers its far neighbour;
+    # the last pixel leaves the picture.
+    flow = np.zeros((1, 4, 2), np.float32)
+    flow[0, 0, 0] = 1.0
+    flow[0, 3, 0] = 1.0
+    rho = np.array([[1.0, 0.1, 0.5, 0.5]], np.float32)
+    hidden, depth = layered.visibility(flow, rho, rho > 0)
+    assert hidden.tolist() == [[False, True, False, True]]
+    np.testing.assert_allclose(depth, [[1.0, 1.0, 2.0, 0.0]])
+
+
+def test_degradation_is_of_the_stated_size_and_keeps_what_is_exact():
+    rng = generator(0)
+    flow = np.zeros((64, 128, 2), np.float32)
+    flow[:, 64:, 0] = 10.0
+    o = sensors.SensorOptions(
+        flow_white_px=(0.1, 0.1),
+        flow_smooth_px=(1e-6, 1e-6),
+        flow_lag=0.0,
+        bleed_px=(1e-3, 1e-3),
+        block_share=(1e-9, 1e-9),
+        textureless_probability=0.0,
+    )
+    damaged = sensors.degrade_flow(rng, flow, np.zeros((64, 128), bool), o)
+    inner = np.r_[8:56, 72:120]
+    error = (damaged - flow)[:, inner]
+    # 48 x 96 x 2 normal draws: standard error 0.7 %, and nothing else away from the edges.
+    assert error.std() == pytest.approx(0.1, rel=0.03)
+    depth = np.full((64, 128), 2.0, np.float32)
+    depth[:8] = 0.0
+    for image in sensors.degrade_depth(rng, [depth, depth], sensors.SensorOptions()):
+        assert (image[:5] == 0).all() and np.isfinite(image).all() and (image >= 0).all()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"field_of_view_deg": (90.0, 200.0)},
+        {"movers": (3, 1)},
+        {"room_probability": 0.9, "outdoor_probability": 0.9},
+        {"height": 4},
+        {"large_coverage": (0.5, 1.2)},
+        {"follow_probability": -0.1},
+    ],
+)
+def test_diverse_refuses_nonsense(change):
+    with pytest.raises(InputError, match="DiverseOptions"):
+        diverse.DiverseOptions(**change)
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), kind=st.sampled_from(silhouettes.KINDS))
+def test_outlines_lie_in_the_unit_circle(seed, kind):
+    points = silhouettes.outline(np.random.default_rng(seed), kind)
+    assert np.linalg.norm(points, axis=1).max() == pytest.approx(1.0)
+    assert points.ndim == 2 and points.shape[1] == 2 and len(points) >= 3
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), size=st.integers(8, 180))
+def test_silhouettes_are_cropped_to_their_box(seed, size):
+    mask = silhouettes.silhouette_mask(np.random.default_rng(seed), size)
+    assert mask.dtype == bool and max(mask.shape) <= size
+    assert mask[0].any() and mask[-1].any() and mask[:, 0].any() and mask[:, -1].any()
+
+
+def test_coverage_is_met():
+    square = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    shape = silhouettes.Silhouette(((square, True),))
+    mask, radius = shape.draw_coverage(128, 256, (127.5, 63.5), 0.25)
+    assert mask.mean() == pytest.approx(0.25, abs=0.01)
+    # (2 r)^2 = 0.25 * 128 * 256 gives r = 45.3; a border pixel more or less.
+    assert radius == pytest.approx(45.3, abs=1.5)
+
+
+def test_silhouettes_refuse_nonsense():
+    with pytest.raises(InputError, match="positive size"):
+        silhouettes.silhouette_mask(generator(0), 0)
+    with pytest.raises(InputError, match="superellipse"):
+        silhouettes.outline(generator(0), "heart")

@@ -1,0 +1,128 @@
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from scipy.ndimage import label
+
+from hybridvo.errors import InputError
+from hybridvo.geometry import ego_flow, rotation_angle
+from hybridvo.synthetic.scenarios import (
+    DEGENERATE_SCENARIOS,
+    MAIN_SCENARIOS,
+    SCENARIOS,
+    Scenario,
+    make_pair,
+)
+
+CLEAN = Scenario(moving=0.3, flow_noise_px=0.0, depth_noise=0.0, outliers=0.0)
+
+
+def test_the_eight_main_and_noise_cells_are_the_peers():
+    assert list(MAIN_SCENARIOS) == [
+        "moving00",
+        "moving30",
+        "moving50",
+        "moving70",
+        "exact_depth",
+        "noisy",
+        "low_noise",
+        "outliers20",
+    ]
+    assert set(SCENARIOS) == {*MAIN_SCENARIOS, *DEGENERATE_SCENARIOS, "one60"}
+
+
+@pytest.mark.parametrize("cell", SCENARIOS)
+def test_pair_keeps_the_conditions_of_its_cell(cell):
+    conditions = SCENARIOS[cell]
+    pair, truth = make_pair(cell, 3)
+    assert pair.prev.camera.shape == (436, 1024)
+    assert pair.prev.camera.fx == pytest.approx(1120)
+    for array in (pair.flow, pair.prev.depth, pair.curr.depth):
+        assert array.dtype == np.float32 and array.flags.c_contiguous
+    low, high = (60, 200) if conditions.scene == "far" else (1, 30)
+    assert truth["depth_true"].min() >= low and truth["depth_true"].max() <= high
+    # share of the moving pixels: one 2x2 block is 1e-5 of the picture
+    assert truth["moving"].mean() == pytest.approx(conditions.moving, abs=1e-3)
+    # 446 464 draws: standard deviation of a share is below 8e-4
+    assert truth["outlier"].mean() == pytest.approx(conditions.outliers, abs=4e-3)
+    T = truth["T_curr_prev"]
+    assert np.rad2deg(rotation_angle(T[:3, :3])) <= conditions.rotation_deg + 1e-9
+    assert np.linalg.norm(T[:3, 3]) <= conditions.translation_m + 1e-12
+    clean = ~truth["outlier"]
+    noise = (pair.flow - truth["flow_true"])[clean]
+    # relative standard deviation of a sample deviation is 1 / sqrt(2 n) ~ 8e-4
+    assert noise.std() == pytest.approx(conditions.flow_noise_px, rel=5e-3)
+    log_ratio = np.log(pair.prev.depth / truth["depth_true"])
+    # half of the variance is correlated over 24 px: about 800 independent draws
+    assert log_ratio.std() == pytest.approx(conditions.depth_noise, rel=0.15, abs=1e-9)
+
+
+def test_static_pixels_follow_the_camera_and_moving_ones_do_not():
+    pair, truth = make_pair(CLEAN, 0)
+    flow = ego_flow(truth["depth_true"], truth["T_curr_prev"], pair.prev.camera, pair.curr.camera)
+    error = np.linalg.norm(flow - pair.flow, axis=-1)
+    # float32 flow below 128 px is rounded by at most 4e-6 px a component
+    assert error[~truth["moving"]].max() < 2e-5
+    assert np.median(error[truth["moving"]]) > 8.0
+
+
+def test_no_object_rivals_the_world():
+    """In ``moving70`` 30 % stand still: no rigid object may cover as much."""
+    for seed in range(6):
+        _, truth = make_pair("moving70", seed, height=109, width=256)
+        label_map = truth["object"]
+        shares = np.bincount(label_map.ravel(), minlength=6) / label_map.size
+        assert shares[0] == pytest.approx(0.3, abs=0.02)
+        assert len(shares) == 6 and shares[1:].max() < 0.26
+
+
+def test_one60_is_one_object_on_most_of_the_picture():
+    _, truth = make_pair("one60", 1)
+    assert label(truth["moving"])[1] == 1
+    assert truth["moving"].mean() == pytest.approx(0.6, abs=1e-3)
+
+
+def test_current_depth_is_the_moved_surface():
+    pair, truth = make_pair(Scenario(0.0, 0, 0.0, 0.0, 0.0, scene="plane"), 5)
+    T, camera = truth["T_curr_prev"], pair.curr.camera
+    # the plane n.X = 1 from three corners, moved by T: z = 1 / (n' . K^-1 (u, v, 1)) analytically
+    rays = np.array([[u, v, 1.0] for u, v in ((0, 0), (1023, 0), (0, 435))])
+    points = rays @ np.linalg.inv(camera.K).T
+    points *= np.array([truth["depth_true"][int(v), int(u)] for u, v, _ in rays])[:, None]
+    moved = points @ T[:3, :3].T + T[:3, 3]
+    n = np.linalg.solve(moved, np.ones(3))
+    v, u = np.mgrid[0:436, 0:1024]
+    expected = 1 / (np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(camera.K).T @ n)
+    seen = np.isfinite(pair.curr.depth)
+    assert seen.mean() > 0.6
+    # half a pixel times a slope of 6e-4 a pixel, taken on the previous grid: the frames differ by
+    # up to 3 degrees of roll and a few per cent of scale, 6e-4 / 2 * 0.1
+    np.testing.assert_allclose(pair.curr.depth[seen], expected[seen], rtol=6e-5)
+
+
+def test_pair_depends_on_cell_and_seed_alone():
+    cv2.setRNGSeed(0)
+    first, _ = make_pair("moving30", 7)
+    cv2.setRNGSeed(1)
+    second, _ = make_pair("moving30", 7)
+    other_seed, _ = make_pair("moving30", 8)
+    other_cell, _ = make_pair("moving50", 7)
+    for name in ("prev", "curr"):
+        a, b = getattr(first, name).depth, getattr(second, name).depth
+        assert a.tobytes() == b.tobytes()
+    assert first.flow.tobytes() == second.flow.tobytes()
+    assert first.flow.tobytes() != other_seed.flow.tobytes()
+    assert first.flow.tobytes() != other_cell.flow.tobytes()
+
+
+@pytest.mark.parametrize("arguments", [("moving31", 0), ("moving30", -1), ("moving30", 0, 8, 8)])
+def test_bad_arguments_are_refused(arguments):
+    with pytest.raises(InputError, match="make_pair"):
+        make_pair(*arguments)
+
+
+def test_small_images_keep_the_field_of_view():
+    pair, _ = make_pair("moving30", 0, height=109, width=256)
+    assert pair.prev.camera.fx == pytest.approx(280)
+    assert pair.flow.shape == (109, 256, 2)

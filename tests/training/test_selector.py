@@ -1,0 +1,112 @@
+"""The selector's training: samples that mean what they say, losses that fall, a second look."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from hybridvo.errors import FormatError, InputError
+from hybridvo.network.judge import JudgeOptions
+from hybridvo.network.weights import load_weights, pretrained
+from hybridvo.training import rendered, selector_data
+from hybridvo.training.options import SelectorOptions, load_selector_options
+from hybridvo.training.selector_batches import SelectorBatch, ego_flow_error, read_batches
+from hybridvo.training.selector_task import SelectorTask, evaluate_selector
+from hybridvo.training.stream import sample_generator
+from hybridvo.training.trainer import Trainer
+
+CONFIG = Path(__file__).parents[2] / "configs" / "train_selector.yaml"
+
+
+def batches(folder: Path) -> list[SelectorBatch]:
+    return list(read_batches(sorted(folder.glob("*.npz")), 4, None))
+
+
+def test_samples_are_drawn_again_as_they_were():
+    first, again = selector_data.draw_samples(3), selector_data.draw_samples(3)
+    assert len(first) == len(again)
+    for one, two in zip(first, again, strict=True):
+        for key in one:
+            np.testing.assert_array_equal(one[key], two[key])
+
+
+def test_ground_truth_explains_the_static_pixels(shards):
+    for batch in batches(shards):
+        assert ego_flow_error(batch.T, torch.arange(len(batch)), batch).max() < 1e-3
+        # where the flow is true, static pixels follow the true motion
+        for b in np.flatnonzero(batch.source == 1):
+            inputs = batch.inputs
+            x, y = inputs.ray[b]
+            z = batch.depth_true[b]
+            P, K = batch.T[b], inputs.K[b]
+            X, Y, Z = (z * (P[i, 0] * x + P[i, 1] * y + P[i, 2]) + P[i, 3] for i in range(3))
+            u = K[0] * X / Z + K[2] - inputs.target[b, 0]
+            v = K[1] * Y / Z + K[3] - inputs.target[b, 1]
+            distance = torch.sqrt(u * u + v * v) * 1024 / inputs.image_width[b]
+            usable = inputs.usable[b] & (z > 0)
+            static = usable & (batch.label[b] == rendered.STATIC)
+            moving = usable & (batch.label[b] == rendered.MOVING)
+            if moving.sum() > 50 and static.sum() > 50:
+                assert distance[static].median() < distance[moving].median()
+
+
+def test_training_learns_and_goes_on(shards, tmp_path):
+    options = SelectorOptions(
+        network=JudgeOptions(width=0.5), batch_size=4, ema_decay=0.9, second_look_from=0.0
+    )
+    options = dataclasses.replace(
+        options, optimizer=dataclasses.replace(options.optimizer, learning_rate=1e-3)
+    )
+    trainer = Trainer(SelectorTask(options, shards), tmp_path)
+    batch = max(batches(shards), key=len)
+    losses = [trainer.update(batch, 0.5) for _ in range(15)]
+    assert {"choice", "mask", "second", "trust"} <= set(losses[0])
+    # the same samples again and again: the masks are learned
+    assert losses[-1]["mask"] < 0.9 * losses[0]["mask"]
+    trainer.save()
+    other = Trainer(SelectorTask(options, shards), tmp_path)
+    assert other.resume()
+    expected, got = trainer.update(batch, 0.5), other.update(batch, 0.5)
+    assert got == pytest.approx(expected, rel=1e-5)
+    with pytest.raises(InputError, match="no shards"):
+        next(SelectorTask(options, tmp_path / "nothing").batches(0, 0, 0, 1))
+    figures = evaluate_selector(trainer.exported, sorted(shards.glob("*.npz"))[:1], 1)
+    assert all(row["best"] <= row["final"] for row in figures.values())
+
+
+def test_the_configuration_is_that_of_the_pretrained_network():
+    options = load_selector_options(CONFIG)
+    network, _ = load_weights(pretrained("judge"))
+    assert options.network == network.options
+
+
+@pytest.mark.parametrize("content", ["noise", "empty", "other", "objects"])
+def test_a_file_that_is_no_shard_is_refused(tmp_path, content):
+    path = tmp_path / "0_8x8.npz"
+    if content == "noise":
+        path.write_bytes(np.random.default_rng(0).bytes(3000))
+    elif content == "objects":
+        np.savez(path, count=np.array([{}], object))
+    else:
+        np.savez(path, **({} if content == "empty" else {"x": np.zeros(3)}))
+    with pytest.raises(FormatError, match="0_8x8"):
+        next(read_batches([path], 4, None))
+
+
+def test_rendered_samples_train_the_pixel_wise_networks(shards, tmp_path):
+    options = rendered.RenderedOptions(str(shards), str(shards))
+    sample = options.sample(sample_generator(0, 1))
+    assert sample.flow.shape == (128, 256, 2) and sample.rays is not None
+    assert options.for_evaluation().folder == str(shards)
+    # static pixels with true depth and flow obey the true motion, seen in any mirror
+    ok = np.isfinite(sample.flow).all(-1) & ~sample.moving & (sample.depth_true > 0)
+    error = np.linalg.norm(sample.flow - sample.ego_flow, axis=-1)[ok]
+    assert np.median(error) < 2.0
+    with pytest.raises(InputError, match="no shards"):
+        rendered.RenderedOptions(str(tmp_path)).sample(sample_generator(0, 0))
+    with pytest.raises(InputError, match="held_out"):
+        rendered.RenderedOptions(str(shards)).for_evaluation()

@@ -1,0 +1,116 @@
+"""The doors: trainings that are started again, cards that say what a run was trained with."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from hybridvo.errors import CheckpointError
+from hybridvo.network.weights import load_weights
+from hybridvo.training.export import export_pwvo, open_run
+from hybridvo.training.options import load_pwvo_options, load_selector_options
+from tests.scripts import load_script
+
+ROOT = Path(__file__).parents[2]
+
+
+def write_config(folder: Path, **changes) -> Path:
+    for kind in ("paper", "diverse"):
+        (folder / f"{kind}.yaml").write_text(f"preset: {kind}\nheight: 32\nwidth: 64\n")
+    config = {
+        "network": {"width": 0.1, "head_stride": 2},
+        "data": ["paper.yaml", "diverse.yaml"],
+        "data_weights": [0.5, 0.5],
+        "steps": 2,
+        "batch_size": 4,
+        "log_every": 1,
+    }
+    path = folder / "train.yaml"
+    path.write_text(json.dumps(config | changes))
+    return path
+
+
+@pytest.mark.parametrize(
+    "path",
+    sorted((ROOT / "configs").glob("train_*.yaml")) + sorted((ROOT / "configs/ablation").iterdir()),
+    ids=lambda path: path.name,
+)
+def test_every_training_file_loads(path):
+    if path.name == "train_selector.yaml":
+        load_selector_options(path)
+    elif path.name != "data_rendered.yaml":
+        options, mixture = load_pwvo_options(path)
+        assert len(mixture.presets) == len(options.data)
+
+
+def test_the_rows_are_those_of_the_paper():
+    rows = {}
+    for path in (ROOT / "configs" / "ablation").glob("*.yaml"):
+        rows[path.stem] = load_pwvo_options(path)[0]
+    paper = rows["pwvo-paper"]
+    assert (paper.moving_weight, paper.fit_weight, paper.network.passes) == (0, 0, 1)
+    assert (paper.loss.translation_form, paper.selection) == ("direction", "softmax")
+    for name in ("vonet", "pixelwise"):
+        assert not rows[name].loss.needs_uncertainty
+    naive, uncertain = rows["pwvo-naive"], rows["pwvo-uncertain"]
+    assert naive.loss.pose_uncertainty and not naive.loss.flow_uncertainty
+    assert uncertain.loss.flow_uncertainty and uncertain.loss.depth_uncertainty
+    assert naive.selection == uncertain.selection == "mean"
+    plain = [name for name in rows if name != "base" and "without" not in name]
+    assert all(rows[name].loss.flow for name in plain)
+    assert all(not rows[f"{name}-without-flow"].loss.flow for name in plain)
+
+
+def test_train_resumes_and_the_card_is_of_the_run(tmp_path, capsys):
+    tool = load_script("tools/train.py")
+    config, out, weights = write_config(tmp_path), tmp_path / "run", tmp_path / "w.safetensors"
+    words = ["pwvo", "--config", str(config), "--out", str(out), "--seed", "2"]
+    assert tool.main(words) == 0
+    assert tool.main(words) == 0
+    assert "goes on at update 2" in capsys.readouterr().err
+    other = write_config(tmp_path, selection="mean")
+    assert tool.main(["pwvo", "--config", str(other), "--out", str(out), "--seed", "2"]) == 2
+    assert "options.selection was 'softmax', now 'mean'" in capsys.readouterr().err
+    assert tool.main(["export", "--out", str(out), "--export", str(weights), "--count", "4"]) == 0
+    _, card = load_weights(weights)
+    assert card["options"]["seed"] == 2 and card["options"]["steps"] == card["updates"] == 2
+    assert "--seed 2" in card["command"] and set(card["held_out"]) == {"paper", "diverse"}
+    assert json.loads(weights.with_suffix(".json").read_text()) == card
+    assert open_run(out).task.options.seed == 2
+
+
+def test_an_export_needs_a_run(tmp_path):
+    with pytest.raises(CheckpointError, match="train first"):
+        export_pwvo(tmp_path, tmp_path / "w.safetensors")
+
+
+def test_ablation_scores_milestones_and_goes_on(tmp_path, monkeypatch):
+    tool = load_script("tools/ablation.py")
+    configs, out = tmp_path / "configs", tmp_path / "out"
+    configs.mkdir()
+    plain = {"pose_uncertainty": False, "flow_uncertainty": False, "depth_uncertainty": False}
+    for name, changes in (
+        ("vonet", {"network": {"kind": "vonet", "width": 0.1}, "loss": plain}),
+        ("pwvo-paper", {"network": {"width": 0.1, "head_stride": 2}}),
+    ):
+        data = {"data": ["../paper.yaml"], "data_weights": [1.0], "data_size": [32, 64]}
+        write_config(tmp_path, **data, **changes).rename(configs / f"{name}.yaml")
+    monkeypatch.setattr(tool, "MILESTONES", (4, 8))
+    words = ["--out", str(out), "--configs", str(configs), "--samples", "8", "--count", "4"]
+    assert tool.main([*words, "--seeds", "2"]) == 0
+    result = json.loads((out / "ablation.json").read_text())
+    assert {(run["row"], run["seed"]) for run in result["runs"]} == {
+        (row, seed) for row in ("vonet", "pwvo-paper") for seed in (0, 1)
+    }
+    assert all(set(run["curve"]) == {"4", "8"} for run in result["runs"])
+    claim = next(c for c in result["claims"] if c["samples"] == 8)
+    assert claim["as_claimed"].endswith("of 2") and claim["spread_of_seeds_px"] >= 0
+    rules = result["runs"][0]["curve"]["8"]["rules_data_paper"]
+    assert set(rules) == set(tool.RULES)
+    load_weights(out / "pwvo-paper-seed0" / "weights.safetensors")
+    trained = (out / "vonet-seed0" / "log.jsonl").read_text()
+    assert tool.main([*words, "--seeds", "2"]) == 0
+    assert (out / "vonet-seed0" / "log.jsonl").read_text() == trained
+    assert tool.main([*words, "--rows", "vonnet"]) == 2

@@ -1,0 +1,70 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from hybridvo.errors import InputError
+from hybridvo.network.options import NetworkOptions
+from hybridvo.network.pwvo import build_network
+from hybridvo.synthetic.paper import PaperOptions
+from hybridvo.training import validation
+from hybridvo.training.stream import TrainingBatch, collate, sample_generator
+from hybridvo.types import PixelwisePrediction
+
+PRESET = PaperOptions(height=32, width=64)
+
+
+def test_area_under_curve_by_hand():
+    score = np.array([0.1, 0.4, 0.35, 0.8])
+    label = np.array([False, False, True, True])
+    assert validation.area_under_curve(score, label) == 0.75
+    assert validation.area_under_curve(np.ones(4), label) == 0.5
+    assert validation.area_under_curve(score, np.ones(4, bool)) is None
+
+
+class Oracle(torch.nn.Module):
+    """Answers with a share of the true motion and calls moving pixels uncertain."""
+
+    def __init__(self, truth: TrainingBatch, share: float) -> None:
+        super().__init__()
+        self.dummy = torch.nn.Parameter(torch.zeros(1))
+        self.truth, self.share = truth, share
+
+    def forward(self, inputs):
+        maps = self.truth.moving[:, None].expand(-1, 3, -1, -1).float()
+        rotation, translation = (
+            (self.share * x)[:, :, None, None].expand_as(maps)
+            for x in (self.truth.targets.rotation_deg, self.truth.targets.translation)
+        )
+        return PixelwisePrediction(rotation, translation, maps, maps)
+
+
+@pytest.mark.parametrize("share", [1.0, 0.0])
+@pytest.mark.parametrize("rule", ["softmax", "softmax-joint", "mean"])
+def test_figures_of_an_oracle_and_of_zero_motion(share, rule):
+    samples = [PRESET.sample(sample_generator(3, i)) for i in range(6)]
+    network = Oracle(collate(samples), share)
+    result = validation.evaluate_network(network, PRESET, 3, 6, selection=rule, batch_size=6)
+    assert result["auroc_rotation"] == 1.0
+    for name, exact in (("r_err_deg", 1e-5), ("t_err", 1e-6), ("epe", 1e-2)):
+        expected = 0.0 if share else result[f"zero_{name}"]
+        assert result[name] == pytest.approx(expected, abs=exact)
+    direct = np.mean([np.abs(s.rotation_deg).mean() for s in samples])
+    assert result["zero_r_err_deg"] == pytest.approx(direct, rel=1e-5)
+    near = [np.linalg.norm(s.ego_flow, axis=-1) < validation.EPE_LIMIT_PX for s in samples]
+    flows = [(np.abs(s.ego_flow) * n[..., None]).mean() for s, n in zip(samples, near, strict=True)]
+    assert result["zero_epe"] == pytest.approx(np.mean(flows), rel=1e-4)
+    assert len(result["epe_of_pairs"]) == 6
+
+
+def test_calibrated_scales_state_the_mean_error():
+    torch.manual_seed(0)
+    network = build_network(NetworkOptions(width=0.1, head_stride=2))
+    validation.calibrate_scales(network, PRESET, 8)
+    result = validation.evaluate_network(network, PRESET, 0, 8)
+    assert result["laplace_ratio_translation"] == pytest.approx(1.0, rel=0.02)
+    with pytest.raises(InputError, match="uncertainty"):
+        validation.calibrate_scales(build_network(NetworkOptions("vonet", width=0.1)), PRESET, 2)
+    with pytest.raises(InputError, match="count"):
+        validation.evaluate_network(network, PRESET, 0, 0)
