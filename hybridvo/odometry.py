@@ -117,7 +117,7 @@ class Odometry:
         elif network in ("default", None):
             models = default_models(options.run.device if networks_of(method) else "cpu")
         else:
-            models = Models(options.run.device, {"judge": _weights_file(network)})
+            models = Models(options.run.device, {"selector": _weights_file(network)})
         check_method(method, models)
         by_images = refines_images(method, options)
         if method not in WINDOWED:

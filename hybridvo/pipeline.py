@@ -75,11 +75,14 @@ class Context:
 
     def selector(self) -> Selector:
         """The learned selector."""
-        return MaskSelector(self.models.scorer(), self.options)
+        from hybridvo.network.scorer import NetworkScorer
+
+        scorer = NetworkScorer(self.models.network("selector"), self.models.device)
+        return MaskSelector(scorer, self.options)
 
     def predict(self, pair: FramePair) -> MotionPrediction | None:
         """PWVO's motion and static probability; None where it has too little to see."""
-        from hybridvo.learned import propose_motion
+        from hybridvo.network.prediction import propose_motion
 
         return propose_motion(self.models.network("pwvo"), pair)
 
@@ -139,7 +142,7 @@ def pwvo_refine(pair: FramePair, ctx: Context) -> RelativePose:
 
     The same lines serve batches, with gradients to flow, depth, weights and maps.
     """
-    from hybridvo.learned import plain_torch
+    from hybridvo.network.models import plain_torch
     from hybridvo.network.selection import select
     from hybridvo.refinement.torch_backend import refine_batch
 
@@ -152,13 +155,13 @@ def pwvo_refine(pair: FramePair, ctx: Context) -> RelativePose:
         )
 
 
-def learned(name: str) -> Callable[[FramePair, Context], RelativePose]:
+def network_alone(name: str) -> Callable[[FramePair, Context], RelativePose]:
     """A network alone, by the paper's selection."""
 
     def run(pair: FramePair, ctx: Context) -> RelativePose:
-        from hybridvo.learned import estimate_learned
+        from hybridvo.network.prediction import estimate_by_network
 
-        return estimate_learned(pair, name, ctx.models.network(name))
+        return estimate_by_network(pair, name, ctx.models.network(name))
 
     return run
 
@@ -168,7 +171,7 @@ def baseline(name: str) -> Callable[[FramePair, Context], RelativePose]:
     return lambda pair, ctx: pnp.baselines()[name](pair, seed=ctx.seed)
 
 
-LEARNED = ("pwvo", "pwvo-naive", "pixelwise", "vonet", "vonet-attention")
+NETWORKS = ("pwvo", "pwvo-naive", "pixelwise", "vonet", "vonet-attention")
 BASELINES = (
     "pnp-ransac",
     "pnp-ransac-tuned",
@@ -183,7 +186,7 @@ METHODS: dict[str, Callable[[FramePair, Context], RelativePose]] = {
     "hybrid-flow": hybrid_flow,
     "refine": classical,
     "pwvo-refine": pwvo_refine,
-    **{name: learned(name) for name in LEARNED},
+    **{name: network_alone(name) for name in NETWORKS},
     **{name: baseline(name) for name in BASELINES},
 }
 """Every method, in the order of the results' tables."""
@@ -194,10 +197,10 @@ SELECTING = ("hybrid", "hybrid-flow")
 def networks_of(method: str) -> tuple[str, ...]:
     """Names of the weights that a method uses."""
     if method in SELECTING:
-        return ("judge", "pwvo")
+        return ("selector", "pwvo")
     if method == "pwvo-refine":
         return ("pwvo",)
-    return (method,) if method in LEARNED else ()
+    return (method,) if method in NETWORKS else ()
 
 
 def check_method(method: str, models: Models | None = None) -> None:

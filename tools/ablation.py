@@ -138,7 +138,7 @@ def _train(
         runs[name, seed] = result
         write_json(args.out / "ablation.json", _summary(args, runs))
     card = {"row": name, **trainer.record, "curve": result["curve"]}
-    save_weights(folder / "weights.safetensors", trainer.exported, options.network, card, "float16")
+    save_weights(folder / "weights.safetensors", trainer.exported, card, "float16")
     return True
 
 

@@ -37,7 +37,7 @@ def build_parser() -> argparse.ArgumentParser:
     add("--stride", type=int, default=1)
     add("--seed", type=int, default=0)
     add("--device", choices=("auto", "cpu", "cuda"), default="auto")
-    own = "file of a network (judge, pwvo, ...) instead of the pretrained one; repeatable"
+    own = "file of a network (selector, pwvo, ...) instead of the pretrained one; repeatable"
     add("--weights", action="append", default=[], metavar="NAME=FILE", help=own)
     paper = "MPI Sintel as others score it: PWVO's 992 pairs, or fourteen trajectories"
     add("--protocol", choices=("paper", "trajectory14"), help=paper)

@@ -61,7 +61,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
         add("--time-limit", type=float, default=math.inf, metavar="MIN", help="minutes in all")
         add("--threads", type=int, help="threads of torch; by default torch's own choice")
         add("--overwrite", action="store_true", help="start anew where --out has a training")
-        add("--init", metavar="FILE", help="start from these weights: a file, or a shipped name")
+        add("--init", metavar="FILE", help="start from these weights: a file, or a pretrained name")
         part.set_defaults(run=run)
     pwvo.add_argument("--config", type=Path, required=True, help="configs/train_*.yaml")
     pwvo.add_argument("--workers", type=int, default=0, help="processes that draw samples")
@@ -142,7 +142,8 @@ def _train(args: argparse.Namespace, command: str, task: Any, device: str, worke
 
     from hybridvo.errors import InputError
     from hybridvo.files import write_json
-    from hybridvo.network.weights import load_weights, pretrained, pretrained_names
+    from hybridvo.network.models import load_weights
+    from hybridvo.network.weights import weights_file
     from hybridvo.training.export import RUN
     from hybridvo.training.provenance import source_commit
     from hybridvo.training.trainer import CHECKPOINT, LOG, Trainer
@@ -161,7 +162,7 @@ def _train(args: argparse.Namespace, command: str, task: Any, device: str, worke
         _say(trainer, f"goes on at update {trainer.step}")
     else:
         if args.init is not None:
-            path = pretrained(args.init) if args.init in pretrained_names() else args.init
+            path = weights_file(args.init)
             trainer.start_from(load_weights(path)[0].state_dict(), str(path))
         if trainer.rank == 0:
             about = {"command": command, "commit": source_commit(), "torch": torch.__version__}
@@ -196,7 +197,8 @@ def _export(args: argparse.Namespace, command: str) -> None:
 
 def _selector_data(args: argparse.Namespace, command: str) -> None:
     from hybridvo.errors import InputError
-    from hybridvo.network.weights import load_weights, pretrained, pretrained_names
+    from hybridvo.network.models import load_weights
+    from hybridvo.network.weights import weights_file
     from hybridvo.training.selector_data import PER_SHARD, write_shard
     from hybridvo.training.selector_proposals import write_proposals
 
@@ -206,9 +208,8 @@ def _selector_data(args: argparse.Namespace, command: str) -> None:
     for seed in range(args.first_seed, args.first_seed + args.seeds, PER_SHARD):
         print(f"seeds from {seed}: {write_shard(args.data, seed)} samples", flush=True)
     if args.propose is not None:
-        known = args.propose in pretrained_names()
-        path = pretrained(args.propose) if known else args.propose
-        print(f"asked about {write_proposals(args.data, load_weights(path)[0])} samples")
+        network, _ = load_weights(weights_file(args.propose))
+        print(f"asked about {write_proposals(args.data, network)} samples")
 
 
 def _report(entry: dict[str, Any]) -> None:

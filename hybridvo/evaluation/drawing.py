@@ -166,8 +166,9 @@ def pair_panels(
 
 def networks(files: Iterable[str | Path] = ()) -> list[tuple[str, Any]]:
     """(name, network) of the given files, or of all pretrained ones that predict a motion."""
+    from hybridvo.network.models import load_weights
     from hybridvo.network.options import KINDS
-    from hybridvo.network.weights import load_weights, pretrained, pretrained_names
+    from hybridvo.network.weights import pretrained, pretrained_names
 
     found = []
     paths = [Path(file) for file in files]
@@ -233,11 +234,10 @@ def _block_sums(values: np.ndarray) -> np.ndarray:
 
 def start_of(network: Any, inputs: Any) -> Any:
     """Motion that a network of several passes starts its last one from; None for one pass."""
-    from hybridvo.learned import next_start
-    from hybridvo.network.passes import first_motions
+    from hybridvo.network.normalization import first_motions
 
     passes = int(network.options.passes)
-    return first_motions(network, inputs, next_start(network), passes - 1)
+    return first_motions(network, inputs, "softmax", passes - 1)
 
 
 def saliencies(network: Any, inputs: Any, T_start: Any, steps: int) -> dict[str, Saliency]:

@@ -13,19 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from hybridvo.errors import InputError
 from hybridvo.network.inputs import NetworkInputs
-
-__all__ = [
-    "ENCODER_CHANNELS",
-    "Encoder",
-    "InputBranches",
-    "ResidualBlock",
-    "SelfAttention",
-    "initialize",
-    "match_size",
-    "scaled",
-]
 
 ENCODER_CHANNELS = (64, 128, 128, 256, 256)
 """Output channels of layer1 to layer5 at full width."""
@@ -88,45 +76,27 @@ class ResidualBlock(nn.Module):
 
 
 class InputBranches(nn.Module):
-    """The three inputs side by side: flow as it is, depths and rays through a 1x1 convolution.
-
-    Args:
-        flow_gain: factor on the normalised flow.
-    """
+    """The three inputs side by side: flow as it is, depths and rays through a 1x1 convolution."""
 
     out_channels = 2 + 2 * BRANCH_CHANNELS
 
-    def __init__(self, flow_gain: float = 1.0) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self.flow_gain = flow_gain
         self.depth = nn.Conv2d(2, BRANCH_CHANNELS, 1)
         self.rays = nn.Conv2d(2, BRANCH_CHANNELS, 1)
 
     def forward(self, inputs: NetworkInputs) -> torch.Tensor:
         """Network inputs -> (B, 18, h, w)."""
         flow, depth, rays = (
-            self._clean(x, name)
-            for x, name in (
-                (inputs.flow, "flow"),
-                (inputs.inverse_depth, "inverse_depth"),
-                (inputs.rays, "rays"),
-            )
+            torch.nan_to_num(x, 0.0, 0.0, 0.0).clamp(-INPUT_LIMIT, INPUT_LIMIT)
+            for x in (inputs.flow, inputs.inverse_depth, inputs.rays)
         )
-        branches = [self.flow_gain * flow, F.elu(self.depth(depth)), F.elu(self.rays(rays))]
+        branches = [flow, F.elu(self.depth(depth)), F.elu(self.rays(rays))]
         return torch.cat([x.to(branches[1].dtype) for x in branches], dim=1)
-
-    @staticmethod
-    def _clean(x: torch.Tensor, name: str) -> torch.Tensor:
-        if x.ndim != 4 or x.shape[1] != 2:
-            raise InputError(
-                f"NetworkInputs.{name}: expected shape (B, 2, h, w), got {tuple(x.shape)}. "
-                f"Build the inputs with hybridvo.network.inputs.assemble_inputs."
-            )
-        return torch.nan_to_num(x, nan=0.0, posinf=0.0, neginf=0.0).clamp(-INPUT_LIMIT, INPUT_LIMIT)
 
 
 class Encoder(nn.Module):
-    """Stem of three convolutions and five stages of residual blocks, each halving the picture.
+    """Stem of three convolutions and five stages of residual blocks, each halving the image.
 
     Args:
         in_channels: channels of the assembled inputs.
@@ -137,13 +107,8 @@ class Encoder(nn.Module):
     def __init__(self, in_channels: int, width: float = 1.0, inner_activation: bool = True) -> None:
         super().__init__()
         stem = scaled(STEM_CHANNELS, width)
-        self.stem = nn.ModuleList(
-            [
-                nn.Conv2d(in_channels, stem, 3, 2, 1),
-                nn.Conv2d(stem, stem, 3, 1, 1),
-                nn.Conv2d(stem, stem, 3, 1, 1),
-            ]
-        )
+        strides = ((in_channels, 2), (stem, 1), (stem, 1))
+        self.stem = nn.ModuleList(nn.Conv2d(n, stem, 3, stride, 1) for n, stride in strides)
         self.channels = tuple(scaled(c, width) for c in ENCODER_CHANNELS)
         stages = []
         for count, (before, after) in zip(

@@ -6,14 +6,42 @@ import contextlib
 import functools
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from hybridvo.errors import CheckpointError, InputError
 
-if TYPE_CHECKING:
-    import torch
+KIND_OF = {
+    "selector": "selector",
+    "pwvo": "pwvo",
+    "pwvo-naive": "pwvo",
+    "pixelwise": "pwvo",
+    "vonet": "vonet",
+    "vonet-attention": "vonet-attention",
+}
+"""Name of the weights -> kind of network, as its options state it."""
 
-    from hybridvo.hypotheses.selector import Scorer
+
+def load_weights(path: str | Path) -> tuple[Any, dict[str, Any]]:
+    """Network of a weights file, in evaluation mode and float32 on the CPU.
+
+    Args:
+        path: of a file that :func:`hybridvo.network.weights.save_weights` wrote.
+
+    Returns:
+        The network, whose ``options`` attribute says what it is, and the model card.
+
+    Raises:
+        CheckpointError: missing, truncated, no safetensors file (a pickle, text), of another
+            program or architecture, or with values that are not finite; names the file and what
+            does not match.
+    """
+    from hybridvo.network.pwvo import network_of
+    from hybridvo.network.selector_net import selector_of
+    from hybridvo.network.weights import read_weights
+
+    weights = read_weights(path)
+    is_selector = weights.options.get("kind") == "selector"
+    return (selector_of if is_selector else network_of)(weights), weights.card
 
 
 class Models:
@@ -44,42 +72,44 @@ class Models:
 
         return self.weights.get(name) or pretrained(name)
 
-    def network(self, name: str) -> torch.nn.Module:
+    def network(self, name: str) -> Any:
         """A network, in the form that is fastest on its device.
 
         Raises:
-            CheckpointError: no such weights, or damaged ones.
+            CheckpointError: no such weights, damaged ones, or those of another network.
         """
         import torch
 
-        from hybridvo.network.weights import load_weights
-
         if name not in self._networks:
-            network = load_weights(self.path(name))[0].eval().to(self.device)
-            self._networks[name] = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+            path = self.path(name)
+            network, _ = load_weights(path)
+            if network.options.kind != KIND_OF[name]:
+                raise CheckpointError(
+                    f"{path}: expected the weights of a {name}, got a {network.options.kind}'s."
+                )
+            network = network.to(self.device, memory_format=torch.channels_last)
+            self._networks[name] = network
         return self._networks[name]
-
-    def scorer(self) -> Scorer:
-        """The selector network.
-
-        Raises:
-            CheckpointError: no such weights, weights of another network, or damaged ones.
-        """
-        from hybridvo.network.judge import JudgeNetwork
-        from hybridvo.network.scorer import NetworkScorer
-
-        network = self.network("judge")
-        if not isinstance(network, JudgeNetwork):
-            raise CheckpointError(
-                f"{self.path('judge')}: expected the weights of a selector, got another network's."
-            )
-        return NetworkScorer(network, self.device)
 
 
 @functools.cache
 def default_models(device: str = "cpu") -> Models:
     """The pretrained networks, shared by all estimates of a process."""
     return Models(device)
+
+
+@contextlib.contextmanager
+def plain_torch() -> Iterator[None]:
+    """Inference in float32 on the CPU, whatever the caller set for networks of its own."""
+    import torch
+
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(torch.inference_mode())
+        if torch.is_autocast_enabled("cpu"):
+            stack.enter_context(torch.autocast("cpu", enabled=False))
+        if torch.get_default_device().type != "cpu":
+            stack.enter_context(torch.device("cpu"))
+        yield
 
 
 @contextlib.contextmanager

@@ -16,7 +16,7 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from hybridvo.errors import CheckpointError
+from hybridvo.errors import CheckpointError, InputError
 from hybridvo.network.inputs import NetworkInputs, assemble_inputs
 from hybridvo.network.layers import (
     Encoder,
@@ -26,12 +26,11 @@ from hybridvo.network.layers import (
     match_size,
     scaled,
 )
-from hybridvo.network.options import KINDS, NetworkOptions
-from hybridvo.network.scale_free import remove_scale
+from hybridvo.network.normalization import predict, remove_scale
+from hybridvo.network.options import NetworkOptions
 from hybridvo.network.vonet import OUTPUT_SCALE, VONet
+from hybridvo.network.weights import Weights, read_weights, weights_file
 from hybridvo.types import FramePair, PairBatch, PixelwisePrediction
-
-__all__ = ["INVALID_LOG_SCALE", "KINDS", "PWVO", "NetworkOptions", "build_network"]
 
 INVALID_LOG_SCALE = 3.0
 """Least log scale where flow or depth is missing: U = 20 degrees or 20 m, "nothing was seen"."""
@@ -110,7 +109,7 @@ class PWVO(nn.Module):
         options = NetworkOptions() if options is None else options
         width, stride = options.width, options.head_stride
         self.options = options
-        self.branches = InputBranches(options.flow_gain)
+        self.branches = InputBranches()
         self.encoder = Encoder(InputBranches.out_channels, width)
         self.decoder = Decoder(self.encoder.channels, width, stride)
         self.decoder_uncertainty = (
@@ -132,13 +131,12 @@ class PWVO(nn.Module):
         Raises:
             CheckpointError: no such weights, damaged ones, or another network's.
         """
-        from hybridvo.network.weights import load_weights, pretrained, pretrained_names
-
-        name = str(name_or_path)
-        path = pretrained(name) if name in pretrained_names() else Path(name_or_path)
-        network, _ = load_weights(path)
+        weights = read_weights(weights_file(name_or_path))
+        network = network_of(weights)
         if not isinstance(network, cls):
-            raise CheckpointError(f"{path}: expected the weights of a PWVO, got another network's.")
+            raise CheckpointError(
+                f"{weights.path}: expected the weights of a PWVO, got another network's."
+            )
         return network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def forward(
@@ -157,7 +155,7 @@ class PWVO(nn.Module):
         Args:
             inputs: pairs of any size; or inputs of size (h, w), multiples of 32 waste no border.
             T_start: (B, 4, 4) a first motion, for scale-free networks: they look at what it leaves
-                unexplained, see :func:`hybridvo.network.passes.predict`.
+                unexplained, see :func:`hybridvo.network.normalization.predict`.
 
         Returns:
             Maps of (ceil(h / n), ceil(w / n)), n = input_stride * head_stride; float32 (float64 for
@@ -196,12 +194,9 @@ class PWVO(nn.Module):
 
     def _predict(self, pairs: FramePair | PairBatch | Sequence[FramePair]) -> PixelwisePrediction:
         """Maps of pairs after all passes."""
-        from hybridvo.learned import next_start
-        from hybridvo.network.passes import predict
-
         own = next(self.parameters())
         inputs = assemble_inputs(pairs).to(device=own.device, dtype=own.dtype)
-        output = predict(self, inputs, next_start(self))
+        output = predict(self, inputs)
         assert isinstance(output, PixelwisePrediction)
         return replace(output, image_size=_image_size(pairs))
 
@@ -232,3 +227,16 @@ def build_network(options: NetworkOptions | None = None) -> nn.Module:
     options = NetworkOptions() if options is None else options
     network: Any = PWVO(options) if options.kind == "pwvo" else VONet(options)
     return network
+
+
+def network_of(weights: Weights) -> nn.Module:
+    """The network of a weights file, in evaluation mode.
+
+    Raises:
+        CheckpointError: options that are not a network's, or weights that do not fit them.
+    """
+    try:
+        options = NetworkOptions(**weights.options)
+    except (InputError, TypeError) as error:
+        raise CheckpointError(f"{weights.path}: {error}") from None
+    return weights.into(build_network(options))

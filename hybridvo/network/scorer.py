@@ -10,8 +10,13 @@ import torch
 from hybridvo.hypotheses import search
 from hybridvo.hypotheses.generate import GridMaps
 from hybridvo.hypotheses.selector import Candidates, Scores
-from hybridvo.learned import plain_torch
-from hybridvo.network.judge import JudgeFeatures, JudgeInputs, JudgeNetwork, expected_information
+from hybridvo.network.models import plain_torch
+from hybridvo.network.selector_net import (
+    SelectorFeatures,
+    SelectorInputs,
+    SelectorNetwork,
+    prior_information_of,
+)
 from hybridvo.types import MotionPrior
 
 MAX_LAG = 3.0
@@ -26,7 +31,7 @@ class NetworkScorer:
         device: where it runs.
     """
 
-    def __init__(self, network: JudgeNetwork, device: str = "cpu") -> None:
+    def __init__(self, network: SelectorNetwork, device: str = "cpu") -> None:
         self.device = torch.device(device)
         network = network.eval().to(self.device)
         self.network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -64,7 +69,7 @@ class NetworkScorer:
             float(confidence),
         )
 
-    def _mask(self, seen: list[JudgeFeatures], k: int, searched: int) -> torch.Tensor:
+    def _mask(self, seen: list[SelectorFeatures], k: int, searched: int) -> torch.Tensor:
         """(h, w) probability of being static, as candidate k sees it."""
         refit = k >= searched
         pick = torch.tensor([k - searched if refit else k], device=self.device)
@@ -78,7 +83,7 @@ def selector_inputs(
     prior: MotionPrior | None,
     static: np.ndarray | None,
     device: torch.device,
-) -> JudgeInputs:
+) -> SelectorInputs:
     """A batch of one image and a part of its candidates."""
 
     def batch(x: Any) -> torch.Tensor:
@@ -95,7 +100,7 @@ def selector_inputs(
     def of(x: np.ndarray, dtype: torch.dtype) -> torch.Tensor:
         return torch.as_tensor(x, dtype=dtype, device=device)
 
-    return JudgeInputs(
+    return SelectorInputs(
         ray=batch(maps.ray),
         depth=depth,
         target=batch(maps.target),
@@ -107,9 +112,9 @@ def selector_inputs(
         has_static=torch.tensor([static is not None], device=device),
         K=batch(maps.K),
         image_width=torch.tensor([float(maps.width)], device=device),
-        T_last=batch(expected[:3].astype(np.float32)),
-        last_information=expected_information(depth, usable, covariance),
-        has_last=torch.tensor([prior is not None], device=device),
+        T_prior=batch(expected[:3].astype(np.float32)),
+        prior_information=prior_information_of(depth, usable, covariance),
+        has_prior=torch.tensor([prior is not None], device=device),
         owner=torch.zeros(len(poses), dtype=torch.int64, device=device),
         parent=of(candidates.parents[part], torch.int64),
         pose=of(poses, torch.float32),

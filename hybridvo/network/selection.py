@@ -108,10 +108,10 @@ def select_pose(
     output: NetworkOutput,
     method: str = "softmax",
     patch: int | None = None,
-    joint: bool = False,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """One rotation and one translation per pair from the output of any network.
 
+    Each of the six numbers has its own pixels and weights, as in the published evaluation.
     Differentiable in the predictions and, through the weights, in the log scales (``median`` in
     the predictions only); the choice of the pixel has no gradient. Values that are not finite are
     never chosen while their patch has another, and a patch without any has no weight; a pair
@@ -123,9 +123,6 @@ def select_pose(
             averaged whatever it says.
         patch: side of the square patches in cells of the maps; patches at the right and lower
             border may be smaller. A quarter of the height by default: 32 at 128x256 (the paper).
-        joint: False = each of the six numbers has its own pixels and weights (published
-            evaluation); True = the three of the rotation share theirs, as do the three of the
-            translation: least mean of s, weights from it.
 
     Returns:
         (B, 3) Euler angles X-Y-Z in degrees and (B, 3) translation in metres, of T_curr_prev.
@@ -149,9 +146,7 @@ def select_pose(
         (output.translation, output.log_scale_translation),
     )
     rotation, translation = (
-        _mean(value)
-        if scale is None or method == "mean"
-        else _vote(value, scale, method, patch, joint)
+        _mean(value) if scale is None or method == "mean" else _vote(value, scale, method, patch)
         for value, scale in pairs
     )
     return rotation, translation
@@ -182,17 +177,11 @@ def _mean(value: torch.Tensor) -> torch.Tensor:
     return total / finite.sum(dim=(2, 3)).clamp(min=1)
 
 
-def _vote(
-    value: torch.Tensor, log_scale: torch.Tensor, method: str, patch: int, joint: bool
-) -> torch.Tensor:
+def _vote(value: torch.Tensor, log_scale: torch.Tensor, method: str, patch: int) -> torch.Tensor:
     """(B, 3, h, w) values and log scales -> (B, 3)."""
     usable = torch.isfinite(value) & torch.isfinite(log_scale)
-    if joint:
-        usable = usable.all(dim=1, keepdim=True).expand_as(usable)
     value = torch.where(usable, value, 0.0)
     log_scale = torch.where(usable, log_scale, 0.0).clamp(-MAX_LOG_SCALE, MAX_LOG_SCALE)
-    if joint:
-        log_scale = log_scale.mean(dim=1, keepdim=True).expand_as(log_scale)
     # Padding that completes the last patches is infinitely uncertain and unusable: as every patch
     # holds at least one real pixel, and real ones rank below infinity, padding never wins.
     rank = torch.where(usable, log_scale, torch.finfo(log_scale.dtype).max).detach()

@@ -8,10 +8,8 @@ from torch import nn
 
 from hybridvo.network.inputs import NetworkInputs
 from hybridvo.network.layers import Encoder, InputBranches, SelfAttention, initialize
+from hybridvo.network.normalization import remove_scale
 from hybridvo.network.options import NetworkOptions
-from hybridvo.network.scale_free import remove_scale
-
-__all__ = ["OUTPUT_SCALE", "VONet"]
 
 OUTPUT_SCALE = 0.01
 """Raw head outputs are multiplied by this to give degrees and metres."""
@@ -43,7 +41,7 @@ class VONet(nn.Module):
         super().__init__()
         options = NetworkOptions(kind="vonet") if options is None else options
         self.options = options
-        self.branches = InputBranches(options.flow_gain)
+        self.branches = InputBranches()
         self.encoder = Encoder(InputBranches.out_channels, options.width, inner_activation=False)
         channels = self.encoder.channels[-1]
         self.attention = (

@@ -8,27 +8,70 @@ torch, and differentiable in s: the network learns the doubt that the fit needs.
 from __future__ import annotations
 
 import torch
+import torch.nn.functional as F
 
 from hybridvo.errors import InputError
-from hybridvo.network.selection import SHARPNESS
+from hybridvo.network.inputs import NetworkInputs
+from hybridvo.network.selection import SHARPNESS, NetworkOutput, select_motion
 from hybridvo.torch_geometry import left_update, pp, se3
+from hybridvo.types import PixelwisePrediction
 
-__all__ = ["pixel_weights", "weighted_fit"]
-
+ITERATIONS = 6
 CUTOFF = 1.5
 """Scale of the robust kernel in weighted medians of the residual."""
-LEAST_SCALE = 1e-4
+MIN_SCALE = 1e-4
 """Least scale of the kernel in units of the focal length: 0.1 px at a focal length of 1000."""
 MEDIAN_STRIDE = 3
 """Every third pixel is enough for a median; three divides no usual width: all columns count."""
-LEAST_WEIGHT = 1e-12
+MIN_WEIGHT = 1e-12
 """Sum of all weights after the kernel below which there is nothing to fit."""
 DAMPING = 1e-6
-"""Share of the diagonal of the normal equations, so that a flat direction stays solvable."""
-NEAREST = 1e-2
+"""Part of the diagonal of the normal equations, so that a flat direction stays solvable."""
+MIN_DEPTH_RATIO = 1e-2
 """Depth over depth before below which a moved point counts as behind the camera."""
-LONGEST_STEP = 0.5
+MAX_STEP = 0.5
 """Of one iteration, in radians and in nearest depths: the linear model holds no farther."""
+
+
+def fitted_motion(
+    output: NetworkOutput, inputs: NetworkInputs, selection: str = "softmax"
+) -> torch.Tensor:
+    """(B, 4, 4) motion that the pixels agree on which a prediction trusts.
+
+    The selected pose is the start, the log scales of the rotation are the weights, and carry the
+    gradient.
+
+    Args:
+        output: a :class:`~hybridvo.types.PixelwisePrediction` with log scales.
+        inputs: that it was made from.
+        selection: of the start.
+
+    Raises:
+        InputError: a prediction without uncertainty.
+    """
+    if not isinstance(output, PixelwisePrediction) or output.log_scale_rotation is None:
+        raise InputError("fitted_motion: expected a prediction with uncertainty.")
+    log_scale = output.log_scale_rotation
+    inputs = on_grid_of(log_scale, inputs)
+    if tuple(log_scale.shape[2:]) != inputs.size:
+        log_scale = F.interpolate(log_scale, inputs.size, mode="nearest")
+    f_prev, f_curr = (
+        K.diagonal(dim1=1, dim2=2)[:, :2, None, None] for K in (inputs.K_prev, inputs.K_curr)
+    )
+    c_prev, c_curr = (K[:, :2, 2, None, None] for K in (inputs.K_prev, inputs.K_curr))
+    target = (inputs.rays * f_prev + c_prev + inputs.flow_px - c_curr) / f_curr
+    return weighted_fit(
+        inputs.rays.flatten(2),
+        inputs.inverse_depth[:, 0].flatten(1),
+        target.flatten(2),
+        pixel_weights(log_scale, inputs.valid).flatten(1),
+        select_motion(output, selection),
+    )
+
+
+def on_grid_of(prediction: torch.Tensor, inputs: NetworkInputs) -> NetworkInputs:
+    """Every n-th pixel of the inputs, one for each cell (.., h, w) of a prediction."""
+    return inputs.subsample(max(1, round(inputs.size[0] / prediction.shape[-2])))
 
 
 def pixel_weights(log_scale: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
@@ -52,62 +95,40 @@ def weighted_fit(
     target: torch.Tensor,
     weights: torch.Tensor,
     T_start: torch.Tensor,
-    iterations: int = 6,
 ) -> torch.Tensor:
     """Motion that maps rays onto targets best under given weights, by robust Gauss-Newton.
 
     Args:
         ray: (B, 2, N) x / z and y / z of the previous camera.
-        inverse_depth: (B, N) 1 / metres; 0: infinitely far.
-        target: (B, 2, N) x / z and y / z where the flow says that the points went.
-        weights: (B, N) of the pixels, >= 0; may carry a gradient.
-        T_start: (B, 4, 4) T_curr_prev to start from.
-        iterations: Gauss-Newton steps under a Geman-McClure kernel whose scale follows the weighted
-            median of the residuals.
+        inverse_depth: (B, N) of the previous frame, 1 / metres; 0 counts as infinitely far.
+        target: (B, 2, N) ray plus flow in the current camera, over its focal lengths.
+        weights: (B, N), 0 where flow or depth is missing.
+        T_start: (B, 4, 4) T_curr_prev.
 
     Returns:
-        (B, 4, 4) T_curr_prev. Its gradient with respect to the weights is that of a Gauss-Newton
-        step at the solution in which every pixel beyond the kernel's scale pulls alike, as under an
-        L1 norm. The exact implicit gradient vanishes for pixels far away: a fit that has settled on
-        a mover would never learn of the world. Where the fit is not finite, or explains the
-        weighted median pixel no better than the start, the value is that of ``T_start``.
-
-    Raises:
-        InputError: shapes that do not fit.
+        (B, 4, 4). Its gradient goes into the weights alone, through the pull of the pixels at the
+        solution; pixels far away pull with constant strength there, since a network that has
+        settled on a mover would never learn of the world. Where the fit is not finite, or explains
+        the weighted median pixel no better than the start, the value is that of ``T_start``.
     """
-    batch, count = weights.shape
-    if ray.shape != (batch, 2, count) or target.shape != ray.shape:
-        raise InputError(
-            f"weighted_fit: expected ray and target of {(batch, 2, count)} for weights of "
-            f"{(batch, count)}, got {tuple(ray.shape)} and {tuple(target.shape)}."
-        )
-    if inverse_depth.shape != weights.shape or T_start.shape != (batch, 4, 4):
-        raise InputError(
-            f"weighted_fit: expected inverse_depth of {(batch, count)} and T_start of "
-            f"{(batch, 4, 4)}, got {tuple(inverse_depth.shape)} and {tuple(T_start.shape)}."
-        )
     with torch.autocast(weights.device.type, enabled=False):
         number = torch.float64 if ray.dtype == torch.float64 else torch.float32
         ray, inverse, target, weights = (
             torch.nan_to_num(x.to(number), 0.0, 0.0, 0.0)
             for x in (ray, inverse_depth, target, weights)
         )
-        start = se3(T_start.detach().to(number))
-        fixed = weights.detach()
-        # Metres of the nearest tenth as the unit of length: rotations and translations alike.
-        unit = inverse.quantile(0.9, dim=1).clamp(min=1e-3)
-        T = start
+        # The nearest tenth sets the unit of length, so that rotations and translations are alike.
+        pixels = (ray, inverse, target, inverse.quantile(0.9, dim=1).clamp(min=1e-3)[:, None])
+        T = start = se3(T_start.detach().to(number))
         with torch.no_grad():
-            step, first = _step(ray, inverse, target, fixed, T, unit)
-            for _ in range(iterations - 1):
+            step, first = _step(*pixels, weights, T)
+            for _ in range(ITERATIONS):
                 T = left_update(step, T)
-                step, _ = _step(ray, inverse, target, fixed, T, unit)
-            T = left_update(step, T)
-            _, last = _step(ray, inverse, target, fixed, T, unit)
+                step, last = _step(*pixels, weights, T)
             good = torch.isfinite(T.tensor()).all(dim=1) & (last <= first)
             T = pp.SE3(torch.where(good[:, None], T.tensor(), start.tensor()))
         if weights.requires_grad:
-            step, _ = _step(ray, inverse, target, weights, T, unit, far=True)
+            step, _ = _step(*pixels, weights, T, attached=True)
             # value of the solution, gradient of the step
             T = left_update(step - step.detach(), T)
     return T.matrix().to(T_start.dtype)
@@ -117,50 +138,48 @@ def _step(
     ray: torch.Tensor,
     inverse: torch.Tensor,
     target: torch.Tensor,
+    unit: torch.Tensor,
     weights: torch.Tensor,
     T: pp.LieTensor,
-    unit: torch.Tensor,
-    far: bool = False,
+    attached: bool = False,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """((B, 6) Gauss-Newton step (translation, rotation), (B,) scale of the residuals).
 
-    ``far``: pixels far away pull with constant strength, and the gradient is that of the right
-    hand side alone.
+    ``attached``: the step that carries the gradient: pixels far away pull with constant strength,
+    and the gradient is that of the right-hand side alone.
     """
     M = T.matrix()
-    moved = torch.einsum("bij,bjn->bin", M[:, :3, :2], ray) + M[:, :3, 2:3]
-    moved = moved + M[:, :3, 3:] * inverse[:, None]
-    front = moved[:, 2] > NEAREST
-    z = torch.where(front, moved[:, 2], torch.ones_like(inverse))
+    moved = M[:, :3, :2] @ ray + M[:, :3, 2:3] + M[:, :3, 3:] * inverse[:, None]
+    front = moved[:, 2] > MIN_DEPTH_RATIO
+    z = torch.where(front, moved[:, 2], 1.0)
     x, y = moved[:, 0] / z, moved[:, 1] / z
-    d = inverse / (z * unit[:, None])
-    zero = torch.zeros_like(x)
-    xy = x * y
-    # (B, 6, 2, N): rows of translation and rotation, columns of x and y
-    J = torch.stack(
-        [d, zero, zero, d, -x * d, -y * d, -xy, -1 - y * y, 1 + x * x, xy, -y, x], dim=1
-    ).view(len(x), 6, 2, -1)
+    d, zero = inverse / (z * unit), torch.zeros_like(x)
+    rows_x = [d, zero, -x * d, -x * y, 1 + x * x, -y]
+    rows_y = [zero, d, -y * d, -1 - y * y, x * y, x]
+    J = torch.cat([torch.stack(rows_x, dim=1), torch.stack(rows_y, dim=1)], dim=2)  # (B, 6, 2 N)
     residual = target - torch.stack([x, y], dim=1)
-    with torch.no_grad():
-        length2 = residual.square().sum(dim=1)
-        used = torch.where(front, weights, zero)
-        some, order = length2[:, ::MEDIAN_STRIDE].sort(dim=1)
-        reached = used[:, ::MEDIAN_STRIDE].gather(1, order).cumsum(dim=1)
-        middle = (reached < 0.5 * reached[:, -1:]).sum(dim=1, keepdim=True)
-        scale2 = some.gather(1, middle.clamp(max=some.shape[1] - 1))
-        kernel2 = (CUTOFF**2 * scale2).clamp(min=LEAST_SCALE**2)
-        factor = kernel2 / (kernel2 + length2)
-        factor = torch.where(front, factor.sqrt() if far else factor.square(), zero)
+    length2 = residual.square().sum(dim=1)
+    scale2 = _weighted_median(length2, torch.where(front, weights, zero).detach())
+    kernel2 = (CUTOFF**2 * scale2).clamp(min=MIN_SCALE**2)
+    factor = kernel2 / (kernel2 + length2)
+    factor = torch.where(front, factor.sqrt() if attached else factor.square(), zero)
     g = weights * factor
     total = g.detach().sum(dim=1, keepdim=True)
-    enough = (total > LEAST_WEIGHT) & torch.isfinite(total)
+    enough = (total > MIN_WEIGHT) & torch.isfinite(total)
     # without weight there is no step and no gradient
-    g = torch.where(enough, g / torch.where(enough, total, torch.ones_like(total)), zero)
-    rows, weighted = J.flatten(2), (J * g[:, None, None]).flatten(2)
-    A = (weighted.detach() if far else weighted) @ rows.transpose(1, 2)
-    b = (weighted @ residual.flatten(1)[:, :, None])[:, :, 0]
-    diagonal = torch.diag_embed(DAMPING * A.diagonal(dim1=1, dim2=2).detach() + 1e-12)
-    step = torch.linalg.solve_ex((A + diagonal).double(), b.double())[0].to(b.dtype)
-    step = step * (LONGEST_STEP / step.detach().norm(dim=1, keepdim=True)).clamp(max=1.0)
-    metres = torch.cat([step[:, :3] / unit[:, None], step[:, 3:]], dim=1)
-    return metres, scale2[:, 0].sqrt()
+    g = torch.where(enough, g / torch.where(enough, total, 1.0), zero)
+    weighted = J * g.repeat(1, 2)[:, None]
+    A = weighted.detach() @ J.transpose(1, 2)
+    b = weighted @ residual.flatten(1)[:, :, None]
+    A = A + torch.diag_embed(DAMPING * A.diagonal(dim1=1, dim2=2) + 1e-12)
+    step = torch.linalg.solve_ex(A.double(), b.double())[0][:, :, 0].to(b.dtype)
+    step = step * (MAX_STEP / step.detach().norm(dim=1, keepdim=True)).clamp(max=1.0)
+    return torch.cat([step[:, :3] / unit, step[:, 3:]], dim=1), scale2[:, 0].sqrt()
+
+
+def _weighted_median(x: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
+    """(B, 1) weighted median of every third of (B, N) values."""
+    ordered, order = x[:, ::MEDIAN_STRIDE].sort(dim=1)
+    reached = weights[:, ::MEDIAN_STRIDE].gather(1, order).cumsum(dim=1)
+    middle = (reached < 0.5 * reached[:, -1:]).sum(dim=1, keepdim=True)
+    return ordered.gather(1, middle.clamp(max=ordered.shape[1] - 1))

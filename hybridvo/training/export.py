@@ -12,7 +12,8 @@ import torch
 
 from hybridvo.errors import CheckpointError, InputError
 from hybridvo.files import write_json
-from hybridvo.network.weights import load_weights, save_weights
+from hybridvo.network.models import load_weights
+from hybridvo.network.weights import save_weights
 from hybridvo.training.options import recorded_run
 from hybridvo.training.pwvo_task import PwvoTask
 from hybridvo.training.selector_task import SelectorTask, evaluate_selector
@@ -94,7 +95,7 @@ def export_pwvo(
         main = presets[shares.index(max(shares))]
         shift = calibrate_scales(trainer.exported, main, calibrate)
         card["calibration"] = {"pairs": calibrate, "seed": 0, "added_to_s": shift}
-    save_weights(path, trainer.exported, options.network, card, "float16")
+    save_weights(path, trainer.exported, card, "float16")
     network, _ = load_weights(path)
     card["held_out"] = {}
     for name, preset in zip(options.data, presets, strict=True):
@@ -104,7 +105,7 @@ def export_pwvo(
         )
         del figures["epe_of_pairs"]
         card["held_out"][Path(name).stem] = figures
-    save_weights(path, network, options.network, card, "float16")
+    save_weights(path, network, card, "float16")
     write_json(path.with_suffix(".json"), card)
     return card
 
@@ -127,6 +128,6 @@ def export_selector(trainer: Trainer, held_out: str | Path, path: str | Path) ->
         "held_out_with_proposals": evaluate_selector(network, files, asked=True),
     }
     card["network"] = dataclasses.asdict(task.options.network)
-    save_weights(path, network, task.options.network, card, dtype="float16")
+    save_weights(path, network, card, dtype="float16")
     write_json(path.with_suffix(".json"), card)
     return card

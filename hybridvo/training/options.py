@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any, cast
 
 from hybridvo.errors import InputError
-from hybridvo.network.judge import JudgeOptions
 from hybridvo.network.losses import LossOptions
 from hybridvo.network.options import NetworkOptions
 from hybridvo.network.selection import SELECTION_METHODS as SELECTIONS
+from hybridvo.network.selector_net import SelectorNetworkOptions
 from hybridvo.synthetic.dataset import StoredSamples
 from hybridvo.synthetic.presets import (
     PRESETS,
@@ -216,7 +216,7 @@ class SelectorOptions(RunOptions):
         InputError: values that cannot be meant.
     """
 
-    network: JudgeOptions = field(default_factory=JudgeOptions)
+    network: SelectorNetworkOptions = field(default_factory=SelectorNetworkOptions)
     second_look_from: float = 0.1
     refits: int = 2
     mask_weight: float = 1.0

@@ -10,11 +10,11 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from hybridvo.learned import fitted_motion, next_start
 from hybridvo.network.losses import NetworkOutput, reconstruct, total_loss
-from hybridvo.network.passes import first_motions
+from hybridvo.network.normalization import first_motions
 from hybridvo.network.pwvo import build_network
 from hybridvo.network.selection import select_motion
+from hybridvo.network.weighted_fit import fitted_motion
 from hybridvo.training.options import PwvoOptions, described
 from hybridvo.training.stream import Mixture, SampleStream, TrainingBatch
 from hybridvo.training.validation import evaluate_network
@@ -76,8 +76,9 @@ class PwvoTask:
         if passes == 1 or first == 0:
             return None
         T = torch.eye(4, device=batch.moving.device).repeat(len(batch), 1, 1)
-        choose = next_start(self.network, self.options.selection)
-        made = first_motions(self.network, batch.inputs[first:], choose, 1 + step % (passes - 1))
+        made = first_motions(
+            self.network, batch.inputs[first:], self.options.selection, 1 + step % (passes - 1)
+        )
         assert made is not None
         T[first:] = made
         return T

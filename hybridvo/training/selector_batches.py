@@ -16,7 +16,7 @@ from hybridvo.geometry import pose_matrix, se3_exp
 from hybridvo.hypotheses import search
 from hybridvo.hypotheses.generate import fit_in_mask
 from hybridvo.hypotheses.selector import mask_weights, nearest_motion
-from hybridvo.network.judge import JudgeInputs, JudgeOutput, expected_information
+from hybridvo.network.selector_net import SelectorInputs, SelectorOutput, prior_information_of
 from hybridvo.options import RefineOptions
 from hybridvo.refinement import kernels
 from hybridvo.synthetic.sensors import log_uniform
@@ -37,7 +37,7 @@ class SelectorBatch:
         proposal: (B, 3, 4) its motion. proposed: (B,) bool, whether it was asked.
     """
 
-    inputs: JudgeInputs
+    inputs: SelectorInputs
     samples: np.ndarray
     depth_true: torch.Tensor
     label: torch.Tensor
@@ -65,7 +65,7 @@ class SelectorBatch:
         count = len(self.T)
         truth = self.T.numpy().astype(np.float64)
         last = np.tile(np.eye(4), (count, 1, 1))
-        information = self.inputs.last_information.clone()
+        information = self.inputs.prior_information.clone()
         known = rng.random(count) < 0.6
         for b in np.flatnonzero(known):
             length = max(float(np.linalg.norm(truth[b, :, 3])), 1e-3)
@@ -80,9 +80,9 @@ class SelectorBatch:
                 information[b] = torch.diag(torch.as_tensor(1.0 / stated**2).float())
         inputs = replace(
             self.inputs,
-            T_last=torch.as_tensor(last[:, :3], dtype=torch.float32),
-            last_information=information,
-            has_last=torch.as_tensor(known),
+            T_prior=torch.as_tensor(last[:, :3], dtype=torch.float32),
+            prior_information=information,
+            has_prior=torch.as_tensor(known),
         )
         return replace(self, inputs=inputs)
 
@@ -105,7 +105,7 @@ def _collate(p: dict[str, np.ndarray]) -> SelectorBatch:
 
     exact = tensor(p["exact"])
     usable = tensor(coarse[:, 2] > 0, torch.bool)
-    inputs = JudgeInputs(
+    inputs = SelectorInputs(
         ray=exact[:, 0:2],
         depth=exact[:, 2],
         target=exact[:, 3:5],
@@ -117,9 +117,9 @@ def _collate(p: dict[str, np.ndarray]) -> SelectorBatch:
         has_static=torch.zeros(size, dtype=torch.bool),
         K=tensor(p["K"]),
         image_width=tensor(p["width"]),
-        T_last=tensor(p["T_last"]),
-        last_information=expected_information(exact[:, 2], usable, None),
-        has_last=tensor(p["has_last"], torch.bool),
+        T_prior=tensor(p["T_prior"]),
+        prior_information=prior_information_of(exact[:, 2], usable, None),
+        has_prior=tensor(p["has_prior"], torch.bool),
         owner=tensor(owner, torch.int64),
         parent=torch.arange(len(owner)),
         pose=tensor(pose),
@@ -204,8 +204,8 @@ def ego_flow_error(pose: torch.Tensor, owner: torch.Tensor, batch: SelectorBatch
 
 
 def refits_of(
-    batch: SelectorBatch, out: JudgeOutput, count: int, extra: torch.Generator | None = None
-) -> JudgeInputs | None:
+    batch: SelectorBatch, out: SelectorOutput, count: int, extra: torch.Generator | None = None
+) -> SelectorInputs | None:
     """The best motions of every sample, fitted inside their masks, as candidates of their own.
 
     Args:

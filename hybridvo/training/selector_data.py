@@ -56,17 +56,17 @@ def draw_samples(seed: int) -> list[dict[str, Any]]:
         pairs = _rendered_pairs(rng, seed, height, width)
     samples = []
     for pair, truth, log_depth_curr, source in pairs:
-        T_last = _last_motion(rng, truth.T_curr_prev)
+        T_prior = _last_motion(rng, truth.T_curr_prev)
         starts = [np.eye(4)]
-        if T_last is not None and rng.random() < 0.7:
-            starts.append(T_last)
+        if T_prior is not None and rng.random() < 0.7:
+            starts.append(T_prior)
         found = generate(pair, np.stack(starts), Options(), int(rng.integers(1 << 30)))
         full = (0, *pair.prev.camera.shape)
         if isinstance(found, RelativePose) or not found.is_ambiguous:
             continue
         if (found.grid.box[0], found.grid.box[1], found.grid.box[3]) != full:
             continue
-        samples.append(_record(pair, found, truth, T_last, log_depth_curr, source))
+        samples.append(_record(pair, found, truth, T_prior, log_depth_curr, source))
     return samples
 
 
@@ -162,7 +162,7 @@ def _record(
     pair: FramePair,
     found: HypothesisSet,
     truth: _Truth,
-    T_last: np.ndarray | None,
+    T_prior: np.ndarray | None,
     log_depth_curr: np.ndarray | None,
     source: str,
 ) -> dict[str, Any]:
@@ -190,8 +190,8 @@ def _record(
         "facts": facts,
         "count": len(found.poses),
         "T": truth.T_curr_prev[:3],
-        "T_last": (np.eye(4) if T_last is None else T_last)[:3],
-        "has_last": T_last is not None,
+        "T_prior": (np.eye(4) if T_prior is None else T_prior)[:3],
+        "has_prior": T_prior is not None,
         "K": found.grid.pixels.K,
         "width": pair.prev.camera.width,
         "stride": stride,

@@ -14,9 +14,10 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from hybridvo.learned import fitted_motion, next_start, static_probability
 from hybridvo.network.inputs import NETWORK_SIZE
-from hybridvo.network.passes import predict
+from hybridvo.network.normalization import predict
+from hybridvo.network.prediction import static_probability
+from hybridvo.network.weighted_fit import fitted_motion, on_grid_of
 from hybridvo.training.rendered import grid_sample
 from hybridvo.training.stream import collate
 from hybridvo.types import PixelwisePrediction
@@ -85,10 +86,10 @@ def _proposals(
     samples = [grid_sample({k: v[i] for k, v in shard.items()}, NETWORK_SIZE) for i in index]
     with torch.inference_mode():
         inputs = collate(samples).inputs
-        output = predict(network, inputs, next_start(network))
+        output = predict(network, inputs)
         assert isinstance(output, PixelwisePrediction) and output.log_scale_rotation is not None
         scale = output.log_scale_rotation
-        valid = inputs.subsample(max(1, round(inputs.size[0] / scale.shape[2]))).valid
+        valid = on_grid_of(scale, inputs).valid
         static = static_probability(scale, valid)[:, None]
         size = shard["label"].shape[1:]
         static = F.interpolate(static, size, mode="bilinear", align_corners=False)[:, 0]

@@ -17,7 +17,7 @@ import torch
 import torch.nn.functional as F
 
 from hybridvo.errors import InputError
-from hybridvo.network.judge import JudgeInputs, JudgeNetwork, JudgeOutput
+from hybridvo.network.selector_net import SelectorInputs, SelectorNetwork, SelectorOutput
 from hybridvo.training.options import SelectorOptions
 from hybridvo.training.rendered import MOVING, STATIC
 from hybridvo.training.selector_batches import (
@@ -53,7 +53,7 @@ def choice_loss(
     return torch.stack(losses).mean()
 
 
-def mask_loss(mask: torch.Tensor, inputs: JudgeInputs, label: torch.Tensor) -> torch.Tensor:
+def mask_loss(mask: torch.Tensor, inputs: SelectorInputs, label: torch.Tensor) -> torch.Tensor:
     """Binary cross entropy of the masks over usable pixels of known kind."""
     label = label[inputs.owner]
     known = inputs.usable[inputs.owner] & ((label == STATIC) | (label == MOVING))
@@ -75,9 +75,9 @@ def trust_loss(
     return F.binary_cross_entropy_with_logits(logit, torch.stack(target))
 
 
-def _float(out: JudgeOutput) -> JudgeOutput:
+def _float(out: SelectorOutput) -> SelectorOutput:
     """The answers in single precision."""
-    return JudgeOutput(out.score.float(), out.mask.float(), out.hidden.float(), out.support)
+    return SelectorOutput(out.score.float(), out.mask.float(), out.hidden.float(), out.support)
 
 
 class SelectorTask:
@@ -93,7 +93,7 @@ class SelectorTask:
     def __init__(self, options: SelectorOptions, folder: Path) -> None:
         self.options, self.folder, self.data = options, Path(folder), str(folder)
         torch.manual_seed(options.seed)
-        self.network = JudgeNetwork(options.network)
+        self.network = SelectorNetwork(options.network)
 
     def batches(self, samples: int, workers: int, rank: int, world: int) -> Iterator[SelectorBatch]:
         """Batches of shards that are picked and mixed anew each round."""
@@ -142,8 +142,8 @@ class SelectorTask:
         return total, {name: value.detach() for name, value in losses.items()}
 
     def _refits(
-        self, batch: SelectorBatch, out: JudgeOutput, draw: torch.Generator
-    ) -> JudgeInputs | None:
+        self, batch: SelectorBatch, out: SelectorOutput, draw: torch.Generator
+    ) -> SelectorInputs | None:
         """Candidates fitted inside their masks, without gradient."""
         refits = self.options.refits
         with torch.no_grad():

@@ -14,9 +14,8 @@ import torch.nn.functional as F
 from scipy.stats import rankdata
 
 from hybridvo.errors import InputError
-from hybridvo.learned import next_start
 from hybridvo.network.losses import NetworkOutput, reconstruct
-from hybridvo.network.passes import predict
+from hybridvo.network.normalization import predict
 from hybridvo.network.selection import select_pose
 from hybridvo.synthetic.presets import Preset
 from hybridvo.torch_geometry import euler_transform
@@ -95,7 +94,6 @@ def evaluate_network(
         raise InputError(f"evaluate_network: expected count >= 1, got {count}.")
     preset = preset.for_evaluation() if hasattr(preset, "for_evaluation") else preset
     device = next(network.parameters()).device
-    choose = next_start(network, selection.removesuffix("-joint"))
     errors, pixels = [], []
     was_training = network.training
     network.eval()
@@ -105,7 +103,7 @@ def evaluate_network(
             batch = collate([preset.sample(sample_generator(seed, i)) for i in numbers]).to(device)
             half = precision == "bfloat16"
             with torch.inference_mode(), torch.autocast(device.type, torch.bfloat16, enabled=half):
-                output = predict(network, batch.inputs, choose)
+                output = predict(network, batch.inputs, selection)
             with torch.inference_mode():
                 errors.append(_errors(output, batch, selection))
                 if getattr(output, "log_scale_rotation", None) is not None:
@@ -127,10 +125,7 @@ def evaluate_network(
 def _errors(output: NetworkOutput, batch: TrainingBatch, selection: str) -> np.ndarray:
     """(B, 6) R_err, T_err and EPE of the network and of zero motion."""
     gt = batch.targets
-    if selection.endswith("-joint") and isinstance(output, PixelwisePrediction):
-        rotation, translation = select_pose(output, selection.removesuffix("-joint"), joint=True)
-    else:
-        rotation, translation = select_pose(output, selection)
+    rotation, translation = select_pose(output, selection)
     T = euler_transform(rotation, translation)
     flow, _, defined = reconstruct(gt.depth_prev, T, gt.K_prev, gt.K_curr)
     near = gt.ego_flow.norm(dim=1) < EPE_LIMIT_PX

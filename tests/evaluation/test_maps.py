@@ -232,7 +232,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     torch.manual_seed(0)
     for kind in ("pwvo", "vonet"):
         options = NetworkOptions(kind=kind, width=0.125, head_stride=2)
-        save_weights(root / f"{kind}.safetensors", build_network(options), options, {})
+        save_weights(root / f"{kind}.safetensors", build_network(options), {})
     return root
 
 
@@ -279,11 +279,11 @@ def test_bad_options(tool, folder: Path, tmp_path: Path, options, field, capsys)
 
 
 def test_networks_that_predict_no_motion_are_refused(tool, tmp_path: Path) -> None:
-    from hybridvo.network.judge import JudgeNetwork, JudgeOptions
+    from hybridvo.network.selector_net import SelectorNetwork, SelectorNetworkOptions
 
-    options = JudgeOptions()
-    path = save_weights(tmp_path / "judge.safetensors", JudgeNetwork(options), options, {})
-    with pytest.raises(InputError, match="got a judge"):
+    options = SelectorNetworkOptions()
+    path = save_weights(tmp_path / "selector.safetensors", SelectorNetwork(options), {})
+    with pytest.raises(InputError, match="got a selector"):
         networks([path])
 
 

@@ -35,18 +35,17 @@ IMPORTS: dict[str, set[str]] = {
     "refinement": NOUNS | {"torch_geometry"},
     "baselines": NOUNS,
     "hypotheses": NOUNS | {"refinement"},
-    "network": NOUNS | {"torch_geometry", "refinement", "hypotheses", "learned"},
-    "learned": NOUNS | {"torch_geometry", "refinement", "network"},
-    "pipeline": NOUNS | {"network", "learned", "hypotheses", "refinement", "baselines", "flow"},
+    "network": NOUNS | {"torch_geometry", "refinement", "hypotheses"},
+    "pipeline": NOUNS | {"network", "hypotheses", "refinement", "baselines", "flow"},
     "tracking": NOUNS | {"refinement"},
     "odometry": NOUNS
     | {"pipeline", "tracking", "flow", "trajectory", "refinement", "network", "hypotheses"},
     "synthetic": NOUNS | {"trajectory", "data"},
     "evaluation": NOUNS
-    | {"trajectory", "data", "pipeline", "odometry", "flow", "network", "learned", "refinement"}
+    | {"trajectory", "data", "pipeline", "odometry", "flow", "network", "refinement"}
     | {"__init__"},
     "training": NOUNS
-    | {"torch_geometry", "data", "synthetic", "network", "learned", "hypotheses", "refinement"}
+    | {"torch_geometry", "data", "synthetic", "network", "hypotheses", "refinement"}
     | {"flow", "pipeline", "trajectory"},
     "__init__": set(),
 }

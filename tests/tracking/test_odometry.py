@@ -293,7 +293,7 @@ def test_masks_and_depth_variances_of_ones_own_are_used() -> None:
 
 def test_from_pretrained_knows_its_weights() -> None:
     assert hybridvo.Odometry.from_pretrained().method == DEFAULT_METHOD
-    with pytest.raises(CheckpointError, match="judge"):
+    with pytest.raises(CheckpointError, match="selector"):
         hybridvo.Odometry.from_pretrained("jugde")
 
 

@@ -10,8 +10,9 @@ import pytest
 import torch
 
 from hybridvo.errors import FormatError, InputError
-from hybridvo.network.judge import JudgeOptions
-from hybridvo.network.weights import load_weights, pretrained
+from hybridvo.network.models import load_weights
+from hybridvo.network.selector_net import SelectorNetworkOptions
+from hybridvo.network.weights import pretrained
 from hybridvo.training import rendered, selector_data
 from hybridvo.training.options import SelectorOptions, load_selector_options
 from hybridvo.training.selector_batches import SelectorBatch, ego_flow_error, read_batches
@@ -56,7 +57,7 @@ def test_ground_truth_explains_the_static_pixels(shards):
 
 def test_training_learns_and_goes_on(shards, tmp_path):
     options = SelectorOptions(
-        network=JudgeOptions(width=0.5), batch_size=4, ema_decay=0.9, second_look_from=0.0
+        network=SelectorNetworkOptions(width=0.5), batch_size=4, ema_decay=0.9, second_look_from=0.0
     )
     options = dataclasses.replace(
         options, optimizer=dataclasses.replace(options.optimizer, learning_rate=1e-3)
@@ -80,7 +81,7 @@ def test_training_learns_and_goes_on(shards, tmp_path):
 
 def test_the_configuration_is_that_of_the_pretrained_network():
     options = load_selector_options(CONFIG)
-    network, _ = load_weights(pretrained("judge"))
+    network, _ = load_weights(pretrained("selector"))
     assert options.network == network.options
 
 

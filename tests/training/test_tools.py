@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from hybridvo.errors import CheckpointError
-from hybridvo.network.weights import load_weights
+from hybridvo.network.models import load_weights
 from hybridvo.training.export import export_pwvo, open_run
 from hybridvo.training.options import load_pwvo_options, load_selector_options
 from tests.scripts import load_script

@@ -1,11 +1,11 @@
-"""The judge: which of the motions found is the world, and where is it.
+"""The selector network: which of the motions found is the camera's, and where is the static world.
 
 A small convolutional network looks at every candidate motion of a pair through what it leaves
 unexplained: the residuals of flow and second depth, measured against the noise that the candidate
-itself found, and the support it takes away from its rivals; beside them the picture's flow, depth
-and rays, each over the pair's own scale. It answers with a score, and with a second-look mask: the
-probability of each pixel to be static world. Judging few exact motions is a far easier question
-than segmenting motion from raw flow.
+itself found, and the support it takes away from its rivals; beside them the image's flow, depth
+and rays, each over the pair's own scale. It answers with a score and a mask: the probability of
+each pixel to be static world. Choosing among few exact motions is a far easier question than
+segmenting motion from raw flow.
 """
 
 from __future__ import annotations
@@ -16,17 +16,9 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from hybridvo.errors import InputError
+from hybridvo.errors import CheckpointError, InputError
 from hybridvo.network.layers import scaled
-
-__all__ = [
-    "JudgeFeatures",
-    "JudgeInputs",
-    "JudgeNetwork",
-    "JudgeOptions",
-    "JudgeOutput",
-    "expected_information",
-]
+from hybridvo.network.weights import Weights
 
 CHANNELS = (24, 40, 64, 96)
 CANDIDATE_CHANNELS = 8
@@ -39,42 +31,44 @@ MIRRORED_SHARED = (0, 4)
 """Channels that change their sign in a mirror."""
 
 REFERENCE_WIDTH = 1024.0
-"""px, width at which absolute residuals and noises are compared between pictures."""
-LEAST_FLOW_NOISE = 0.01
+"""px, width at which absolute residuals and noises are compared between images."""
+MIN_FLOW_NOISE = 0.01
 SUPPORT_CUTOFF_SQUARED = 9.0
 DEPTH_FLOOR = 0.003
 """Spread of log depth that even exact depths have between neighbouring pixels."""
 USUAL_CHANGE = 0.01
-"""rad of the picture by which a motion usually differs from the one before."""
-MOST_LOGIT = 6.0
+"""rad of the image by which a motion usually differs from the one before."""
+MAX_LOGIT = 6.0
 """Largest logit of another network's static probability that is believed."""
 
 
 @dataclass(frozen=True)
-class JudgeOptions:
-    """What decides the shapes of the judge's weights.
+class SelectorNetworkOptions:
+    """What decides the shapes of the weights.
 
     Args:
-        kind: ``judge``.
+        kind: ``selector``.
         width: factor on all channel counts, in (0, 4].
 
     Raises:
         InputError: another kind or width.
     """
 
-    kind: str = "judge"
+    kind: str = "selector"
     width: float = 1.0
 
     def __post_init__(self) -> None:
-        if self.kind != "judge":
-            raise InputError(f"JudgeOptions.kind: expected 'judge', got {self.kind!r}.")
+        if self.kind != "selector":
+            raise InputError(
+                f"SelectorNetworkOptions.kind: expected 'selector', got {self.kind!r}."
+            )
         if isinstance(self.width, bool) or not 0 < self.width <= 4:
-            raise InputError(f"JudgeOptions.width: expected 0 to 4, got {self.width!r}.")
+            raise InputError(f"SelectorNetworkOptions.width: expected 0 to 4, got {self.width!r}.")
 
 
 @dataclass(frozen=True, eq=False)
-class JudgeInputs:
-    """B pictures on their coarse grid (h, w) and N candidate motions of theirs.
+class SelectorInputs:
+    """B images on their coarse grid (h, w) and N candidate motions of theirs.
 
     Args:
         ray: (B, 2, h, w) K^-1 x without the one.
@@ -84,14 +78,14 @@ class JudgeInputs:
         usable: (B, h, w) bool.
         log_depth_curr: (B, h, w) log metres of the second depth at the target; NaN where unknown.
         K: (B, 4) fx, fy, cx, cy of the current camera, px.
-        image_width: (B,) px, of the whole picture.
+        image_width: (B,) px, of the whole image.
         static: (B, h, w) logit of the probability to be static world that another network states.
         has_static: (B,) bool, whether it was asked.
-        T_last: (B, 3, 4) motion that is expected from those before.
-        last_information: (B, 6, 6) inverse of the covariance of ``Exp(delta) T_last``, translation
-            first.
-        has_last: (B,) bool, whether it is known.
-        owner: (N,) int64, picture of each candidate.
+        T_prior: (B, 3, 4) motion that is expected from those before.
+        prior_information: (B, 6, 6) inverse of the covariance of ``Exp(delta) T_prior``,
+            translation first.
+        has_prior: (B,) bool, whether it is known.
+        owner: (N,) int64, image of each candidate.
         parent: (N,) int64, for refits: the motion of the search it came from; for those: itself.
         pose: (N, 3, 4) T_curr_prev.
         flow_noise: (N,) px. depth_noise: (N,) of log depth, both found with the candidate.
@@ -108,9 +102,9 @@ class JudgeInputs:
     has_static: torch.Tensor
     K: torch.Tensor
     image_width: torch.Tensor
-    T_last: torch.Tensor
-    last_information: torch.Tensor
-    has_last: torch.Tensor
+    T_prior: torch.Tensor
+    prior_information: torch.Tensor
+    has_prior: torch.Tensor
     owner: torch.Tensor
     parent: torch.Tensor
     pose: torch.Tensor
@@ -119,13 +113,13 @@ class JudgeInputs:
 
 
 @dataclass(frozen=True, eq=False)
-class JudgeOutput:
+class SelectorOutput:
     """Answers about N candidates.
 
     Args:
-        score: (N,) larger is more likely the world; softmax over a picture's candidates.
+        score: (N,) larger is more likely the world; softmax over a image's candidates.
         mask: (N, h, w) logit of the probability that a pixel is static world.
-        hidden: (N, D) what :meth:`JudgeNetwork.confidence` looks at.
+        hidden: (N, D) what :meth:`SelectorNetwork.confidence` looks at.
         support: (N, h, w) robust weight in [0, 1] of each pixel under each candidate.
     """
 
@@ -136,13 +130,13 @@ class JudgeOutput:
 
 
 @dataclass(frozen=True, eq=False)
-class JudgeFeatures:
+class SelectorFeatures:
     """Scores of N candidates, and what their masks are made of.
 
     Args:
         score: (N,). hidden: (N, D). support: (N, h, w).
-        common: (B, C, h', w') the first layer's view of what the candidates of a picture share.
-        levels: input channels and features of :meth:`JudgeNetwork.encode`, finest first.
+        common: (B, C, h', w') the first layer's view of what the candidates of a image share.
+        levels: input channels and features of :meth:`SelectorNetwork.encode`, finest first.
     """
 
     score: torch.Tensor
@@ -158,7 +152,7 @@ def _squash(x: torch.Tensor) -> torch.Tensor:
 
 
 def candidate_channels(
-    inputs: JudgeInputs, first: tuple[JudgeInputs, torch.Tensor] | None
+    inputs: SelectorInputs, first: tuple[SelectorInputs, torch.Tensor] | None
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """(channels (N, 8, h, w), scalars (N, 8), support (N, h, w)) of every candidate.
 
@@ -178,7 +172,7 @@ def candidate_channels(
     qu = fx * i * (a * P[:, 2, 3] - P[:, 0, 3])
     qv = fy * i * (b * P[:, 2, 3] - P[:, 1, 3])
     # whitened by the symmetric root of sf^2 v_f I + sd^2 v_d q q^T
-    sf = inputs.flow_noise.clamp(min=LEAST_FLOW_NOISE)[:, None, None]
+    sf = inputs.flow_noise.clamp(min=MIN_FLOW_NOISE)[:, None, None]
     sd = inputs.depth_noise[:, None, None]
     vd = sd * sd * inputs.depth_variance[own]
     ip = 1.0 / (sf * sf * inputs.flow_variance[own])
@@ -217,8 +211,8 @@ def candidate_channels(
     return channels, _scalars(inputs, support, wide, first is not None), support
 
 
-def _rivals(inputs: JudgeInputs, support: torch.Tensor, owner: torch.Tensor) -> torch.Tensor:
-    """(N, h, w): the largest support among the picture's other motions of the search."""
+def _rivals(inputs: SelectorInputs, support: torch.Tensor, owner: torch.Tensor) -> torch.Tensor:
+    """(N, h, w): the largest support among the image's other motions of the search."""
     out = support.new_zeros((len(inputs.owner), *support.shape[1:]))
     index = torch.arange(len(support), device=support.device)
     for k in range(len(out)):
@@ -229,22 +223,22 @@ def _rivals(inputs: JudgeInputs, support: torch.Tensor, owner: torch.Tensor) -> 
 
 
 def _scalars(
-    inputs: JudgeInputs, support: torch.Tensor, wide: torch.Tensor, refits: bool
+    inputs: SelectorInputs, support: torch.Tensor, wide: torch.Tensor, refits: bool
 ) -> torch.Tensor:
     """(N, 8): share, noises, whether it is a refit, what was expected, what another network saw."""
     own = inputs.owner
     count = inputs.usable[own].sum((1, 2)).clamp(min=1)
     share = support.sum((1, 2)) / count
-    known = inputs.has_last[own].to(share.dtype)
-    step = _small_step(inputs.pose, inputs.T_last[own])
+    known = inputs.has_prior[own].to(share.dtype)
+    step = _small_step(inputs.pose, inputs.T_prior[own])
     # bounded on its near side and logarithmic on the far one: a prior that cannot trap
-    away = torch.einsum("ni,nij,nj->n", step, inputs.last_information[own], step).clamp(0, 1e6) / 6
+    away = torch.einsum("ni,nij,nj->n", step, inputs.prior_information[own], step).clamp(0, 1e6) / 6
     seen = torch.sigmoid(inputs.static) * inputs.usable
     agreed = (support * seen[own]).sum((1, 2)) / seen.sum((1, 2)).clamp(min=1e-3)[own]
     return torch.stack(
         [
             share,
-            0.3 * torch.log(inputs.flow_noise.clamp(min=LEAST_FLOW_NOISE) * wide),
+            0.3 * torch.log(inputs.flow_noise.clamp(min=MIN_FLOW_NOISE) * wide),
             0.2 * torch.log(inputs.depth_noise.clamp(min=1e-4) / 1e-2),
             torch.full_like(share, float(refits)),
             known / (1.0 + away),
@@ -256,7 +250,7 @@ def _scalars(
     )
 
 
-def expected_information(
+def prior_information_of(
     depth: torch.Tensor, usable: torch.Tensor, covariance: torch.Tensor | None
 ) -> torch.Tensor:
     """(B, 6, 6) inverse covariances of the motions expected.
@@ -265,7 +259,7 @@ def expected_information(
         depth: (B, h, w) metres.
         usable: (B, h, w) bool.
         covariance: (B, 6, 6), translation first; None where nobody knows: then
-            :data:`USUAL_CHANGE` of the picture, and of the typical depth.
+            :data:`USUAL_CHANGE` of the image, and of the typical depth.
     """
     inverse = torch.where(usable, 1.0 / depth.clamp(min=1e-6), 0.0).sum((1, 2))
     inverse = (inverse / usable.sum((1, 2)).clamp(min=1)).clamp(min=1e-6)
@@ -288,7 +282,7 @@ def _small_step(pose: torch.Tensor, start: torch.Tensor) -> torch.Tensor:
     return torch.cat([shift, turn / 2], dim=1)
 
 
-def shared_channels(inputs: JudgeInputs) -> torch.Tensor:
+def shared_channels(inputs: SelectorInputs) -> torch.Tensor:
     """(B, 11, h, w): flow, inverse depth, validity, rays, border, variances, static world."""
     usable = inputs.usable
     K = inputs.K[:, :, None, None]
@@ -318,7 +312,7 @@ def shared_channels(inputs: JudgeInputs) -> torch.Tensor:
             border,
             0.3 * torch.log(inputs.flow_variance.clamp(1e-3, 1e3)),
             (0.2 * torch.log(size.clamp(min=1e-6) / 1e-2)),
-            inputs.static.clamp(-MOST_LOGIT, MOST_LOGIT) * asked / 3,
+            inputs.static.clamp(-MAX_LOGIT, MAX_LOGIT) * asked / 3,
             asked.expand(usable.shape),
         ],
         dim=1,
@@ -329,7 +323,7 @@ def shared_channels(inputs: JudgeInputs) -> torch.Tensor:
 
 
 def _median(x: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
-    """(B, 1, 1) median of the masked pixels of a quarter of the picture."""
+    """(B, 1, 1) median of the masked pixels of a quarter of the image."""
     x, mask = x[:, ::2, ::2].flatten(1), mask[:, ::2, ::2].flatten(1)
     order = torch.where(mask, x, torch.full_like(x, torch.inf)).sort(1).values
     middle = (mask.sum(1, keepdim=True) // 2).clamp(max=x.shape[1] - 1)
@@ -351,16 +345,16 @@ class _Block(nn.Module):
         return F.relu_(x + self.conv2(F.relu_(self.conv1(x))))
 
 
-class JudgeNetwork(nn.Module):
-    """Scores and second-look masks of candidate motions.
+class SelectorNetwork(nn.Module):
+    """Scores and static masks of candidate motions.
 
     Args:
         options: width.
     """
 
-    def __init__(self, options: JudgeOptions | None = None) -> None:
+    def __init__(self, options: SelectorNetworkOptions | None = None) -> None:
         super().__init__()
-        self.options = options or JudgeOptions()
+        self.options = options or SelectorNetworkOptions()
         c1, c2, c3, c4 = (scaled(c, self.options.width) for c in CHANNELS)
         hidden = scaled(HIDDEN, self.options.width)
         self.candidate = nn.Conv2d(CANDIDATE_CHANNELS, c1, 3, 2, 1)
@@ -386,37 +380,37 @@ class JudgeNetwork(nn.Module):
 
     def forward(
         self,
-        inputs: JudgeInputs,
-        first: tuple[JudgeInputs, JudgeOutput] | None = None,
+        inputs: SelectorInputs,
+        first: tuple[SelectorInputs, SelectorOutput] | None = None,
         mirror: torch.Tensor | None = None,
-    ) -> JudgeOutput:
+    ) -> SelectorOutput:
         """Answers about every candidate.
 
         Args:
-            inputs: pictures and candidates.
+            inputs: images and candidates.
             first: for refits, the motions of the search and the answers about them.
-            mirror: (B,) bool, pictures to look at in a mirror (training); the masks come back
+            mirror: (B,) bool, images to look at in a mirror (training); the masks come back
                 unmirrored.
         """
         features = self.encode(inputs, first, mirror)
         mask = self.decode(features)
         if mirror is not None:
             mask = torch.where(mirror[inputs.owner][:, None, None], mask.flip(2), mask)
-        return JudgeOutput(features.score, mask, features.hidden, features.support)
+        return SelectorOutput(features.score, mask, features.hidden, features.support)
 
     def encode(
         self,
-        inputs: JudgeInputs,
-        first: tuple[JudgeInputs, JudgeOutput | JudgeFeatures] | None = None,
+        inputs: SelectorInputs,
+        first: tuple[SelectorInputs, SelectorOutput | SelectorFeatures] | None = None,
         mirror: torch.Tensor | None = None,
-    ) -> JudgeFeatures:
+    ) -> SelectorFeatures:
         """Scores without masks; arguments as those of :meth:`forward`."""
         rivals = None if first is None else (first[0], first[1].support)
         channels, scalars, support = candidate_channels(inputs, rivals)
         if mirror is not None:
             channels = _mirrored(channels, mirror[inputs.owner], MIRRORED_CANDIDATE)
         channels = _padded(channels)
-        if first is not None and isinstance(first[1], JudgeFeatures):
+        if first is not None and isinstance(first[1], SelectorFeatures):
             common = first[1].common
         else:
             shared = shared_channels(inputs)
@@ -432,10 +426,10 @@ class JudgeNetwork(nn.Module):
         hidden = F.relu(self.summary(torch.cat(pooled, 1)))
         hidden = F.relu(self.inner(hidden))
         score = self.score(hidden)[:, 0]
-        return JudgeFeatures(score, hidden, support, common, (channels, x1, x2, x3, x4))
+        return SelectorFeatures(score, hidden, support, common, (channels, x1, x2, x3, x4))
 
-    def decode(self, features: JudgeFeatures, pick: torch.Tensor | None = None) -> torch.Tensor:
-        """(N, h, w) logits of the second-look masks, of all candidates or of ``pick`` (R,)."""
+    def decode(self, features: SelectorFeatures, pick: torch.Tensor | None = None) -> torch.Tensor:
+        """(N, h, w) logits of the static masks, of all candidates or of ``pick`` (R,)."""
         levels = features.levels
         if pick is not None:
             levels = tuple(x[pick] for x in levels)
@@ -449,18 +443,18 @@ class JudgeNetwork(nn.Module):
         return self.mask(F.relu_(y + self.pixel(channels)))[:, 0, :h, :w]
 
     def confidence(
-        self, score: torch.Tensor, hidden: torch.Tensor, owner: torch.Tensor, pictures: int
+        self, score: torch.Tensor, hidden: torch.Tensor, owner: torch.Tensor, images: int
     ) -> torch.Tensor:
-        """(B,) logit of the probability that the best candidate of a picture is right.
+        """(B,) logit of the probability that the best candidate of a image is right.
 
         Args:
             score: (N,) of all of its candidates, refits included.
             hidden: (N, D).
-            owner: (N,) picture of each.
-            pictures: B.
+            owner: (N,) image of each.
+            images: B.
         """
         out = []
-        for b in range(pictures):
+        for b in range(images):
             mine = owner == b
             share = torch.softmax(score[mine], 0)
             best = hidden[mine]
@@ -477,7 +471,20 @@ def _padded(x: torch.Tensor) -> torch.Tensor:
 
 
 def _mirrored(x: torch.Tensor, mirror: torch.Tensor, signed: tuple[int, ...]) -> torch.Tensor:
-    """Pictures (N, C, h, w) with those of ``mirror`` (N,) seen in a mirror."""
+    """Images (N, C, h, w) with those of ``mirror`` (N,) seen in a mirror."""
     turned = x.flip(3)
     turned[:, list(signed)] *= -1
     return torch.where(mirror[:, None, None, None], turned, x)
+
+
+def selector_of(weights: Weights) -> nn.Module:
+    """The selector of a weights file, in evaluation mode.
+
+    Raises:
+        CheckpointError: options that are not a selector's, or weights that do not fit them.
+    """
+    try:
+        options = SelectorNetworkOptions(**weights.options)
+    except (InputError, TypeError) as error:
+        raise CheckpointError(f"{weights.path}: {error}") from None
+    return weights.into(SelectorNetwork(options))

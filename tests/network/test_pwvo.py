@@ -229,13 +229,16 @@ def test_channels_last_and_float64_give_the_same():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"kind": "pwvo-naive"}, "known: pwvo, vonet"),
+        ({"kind": "pwvo-naive"}, "pwvo, vonet"),
         ({"width": 0}, "width"),
         ({"width": float("nan")}, "width"),
         ({"width": "wide"}, "width"),
         ({"width": 5}, "width"),
-        ({"flow_gain": 0.0}, "flow_gain"),
-        ({"flow_gain": True}, "flow_gain"),
+        ({"input_stride": 3}, "input_stride"),
+        ({"passes": 2}, "passes"),
+        ({"passes": 9, "scale_free": True}, "passes"),
+        ({"passes": 2, "scale_free": True, "kind": "vonet"}, "passes"),
+        ({"later_quantile": 0.7}, "later_quantile"),
         ({"head_stride": 3}, "head_stride"),
         ({"head_stride": True}, "head_stride"),
         ({"decoders": 0}, "decoders"),
@@ -246,24 +249,3 @@ def test_channels_last_and_float64_give_the_same():
 def test_bad_options_are_refused(changes, message):
     with pytest.raises(InputError, match=message):
         NetworkOptions(**changes)
-
-
-def test_patch_follows_the_head_stride():
-    assert NetworkOptions().patch == 32
-    assert NetworkOptions(head_stride=2).patch == 16
-
-
-@pytest.mark.parametrize("kind", ["pwvo", "vonet"])
-def test_flow_gain_scales_the_flow_alone(kind):
-    inputs = make_inputs(1)
-    plain = make_network(NetworkOptions(kind=kind, width=0.125))
-    louder = make_network(NetworkOptions(kind=kind, width=0.125, flow_gain=10.0))
-    with torch.inference_mode():
-        expected = plain.branches(replace(inputs, flow=10 * inputs.flow))
-        torch.testing.assert_close(louder.branches(inputs), expected)
-
-
-def test_wrong_channels_are_refused():
-    inputs = make_inputs(1)
-    with pytest.raises(InputError, match="flow"):
-        make_network()(replace(inputs, flow=inputs.flow[:, :1]))

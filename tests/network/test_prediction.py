@@ -7,13 +7,15 @@ import pytest
 import torch
 
 from hybridvo.errors import InputError
-from hybridvo.geometry import rotation_angle
-from hybridvo.learned import fitted_motion, next_start, propose_motion, static_probability
+from hybridvo.geometry import ego_flow, rotation_angle, se3_exp
 from hybridvo.network.inputs import assemble_inputs
-from hybridvo.network.passes import first_motions
+from hybridvo.network.normalization import predict
+from hybridvo.network.prediction import estimate_by_network, propose_motion, static_probability
 from hybridvo.network.pwvo import NetworkOptions, build_network
+from hybridvo.network.selection import select_motion
+from hybridvo.network.weighted_fit import fitted_motion
 from hybridvo.synthetic.scenarios import Scenario, make_pair
-from hybridvo.types import PixelwisePrediction
+from hybridvo.types import Camera, Frame, FramePair, PixelwisePrediction, Reason, State
 
 STRIDE = 4
 
@@ -42,7 +44,7 @@ def test_the_world_is_fitted_where_the_doubt_is_small(moving_pair) -> None:
         output, inputs = told(pair, truth, doubt)
         T = fitted_motion(output, inputs)[0].double().numpy()
         errors[doubt] = np.degrees(rotation_angle(T[:3, :3] @ R.T))
-    # 60 % of the picture move by themselves: without doubt they win
+    # 60 % of the image move by themselves: without doubt they win
     assert errors[2.0] < 0.1 * size < errors[0.0]
     with pytest.raises(InputError, match="uncertainty"):
         fitted_motion((torch.zeros(1, 3), torch.zeros(1, 3)), inputs)
@@ -60,28 +62,10 @@ def test_static_probability_by_its_definition(moving_pair) -> None:
     torch.testing.assert_close(p, shifted, atol=1e-5, rtol=0)
 
 
-def test_passes_start_as_the_options_say(moving_pair) -> None:
-    pair, _ = moving_pair
-    inputs = assemble_inputs(pair)
-    common = {"width": 0.25, "scale_free": True, "passes": 2, "head_stride": 2, "input_stride": 2}
-    torch.manual_seed(0)
-    for start in ("selection", "fit"):
-        network = build_network(NetworkOptions(**common, pass_start=start)).eval()
-        with torch.no_grad():
-            T = first_motions(network, inputs, next_start(network), 1)
-            expected = fitted_motion(network(inputs), inputs)
-        assert torch.equal(T, expected) == (start == "fit")
-    for bad in ({"pass_start": "truth"}, {"later_quantile": 0.7}, {"kind": "vonet"}):
-        with pytest.raises(InputError):
-            NetworkOptions(**{**common, "pass_start": "fit", **bad})
-
-
 def test_proposals_are_finite_or_none(moving_pair) -> None:
     pair, _ = moving_pair
     torch.manual_seed(0)
-    options = NetworkOptions(
-        width=0.25, scale_free=True, passes=2, head_stride=2, input_stride=2, pass_start="fit"
-    )
+    options = NetworkOptions(width=0.25, scale_free=True, passes=2, head_stride=2, input_stride=2)
     network = build_network(options).eval()
     proposal = propose_motion(network, pair)
     assert proposal is not None and proposal.static_probability.shape == (32, 64)
@@ -94,3 +78,40 @@ def test_proposals_are_finite_or_none(moving_pair) -> None:
     empty, _ = make_pair(Scenario(), 3, 128, 256)
     empty.flow[:] = np.nan
     assert propose_motion(network, empty) is None
+
+
+CAMERA = Camera(60.0, 62.0, 31.5, 15.5, 32, 64)
+MOTION = se3_exp(np.array([0.05, -0.03, 0.08, 0.004, -0.006, 0.01]))
+DEPTH = np.linspace(2, 6, 64, dtype=np.float32) * np.ones((32, 1), np.float32)
+
+
+def pair_of(flow: np.ndarray | None, depth: np.ndarray | None) -> FramePair:
+    return FramePair(Frame(None, depth, CAMERA), Frame(None, depth, CAMERA), flow)
+
+
+@pytest.mark.parametrize(("method", "passes"), [("pwvo", 2), ("vonet", 1)])
+def test_a_network_is_an_estimator(method, passes):
+    torch.manual_seed(0)
+    options = NetworkOptions(kind=method, width=0.1, scale_free=True, passes=passes)
+    network = build_network(options).eval()
+    pair = pair_of(ego_flow(DEPTH, MOTION, CAMERA, CAMERA).astype(np.float32), DEPTH)
+    result = estimate_by_network(pair, method, network)
+    assert result.ok and result.method == method
+    assert np.linalg.eigvalsh(result.covariance)[0] > 0
+    R = result.T_curr_prev[:3, :3]
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+    with torch.inference_mode():
+        expected = select_motion(predict(network, assemble_inputs(pair)))[0]
+    np.testing.assert_allclose(result.T_curr_prev, expected.numpy(), atol=1e-5)
+
+
+def test_missing_data_is_a_status():
+    network = build_network(NetworkOptions(width=0.1)).eval()
+    flow = np.zeros((32, 64, 2), np.float32)
+    for reason, broken in (
+        (Reason.NO_FLOW, pair_of(None, DEPTH)),
+        (Reason.NO_VALID_DEPTH, pair_of(flow, None)),
+        (Reason.NO_VALID_DEPTH, pair_of(flow, np.full_like(DEPTH, np.nan))),
+    ):
+        result = estimate_by_network(broken, "pwvo", network)
+        assert result.status.state is State.FAILED and result.status.reason is reason

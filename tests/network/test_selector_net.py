@@ -1,23 +1,19 @@
-"""The judge: what it sees, that pairs stay apart, the second look, training data and training."""
+"""The selector network: what it sees, that pairs stay apart, refits."""
 
 from __future__ import annotations
 
-import json
 from dataclasses import fields, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from hybridvo.errors import CheckpointError, InputError
 from hybridvo.geometry import se3_exp
 from hybridvo.hypotheses.generate import HypothesisSet, generate
 from hybridvo.hypotheses.selector import _searched
-from hybridvo.network import judge as judge_network
-from hybridvo.network.judge import JudgeInputs, JudgeNetwork, JudgeOptions
+from hybridvo.network import selector_net
 from hybridvo.network.scorer import selector_inputs
-from hybridvo.network.weights import load_weights, pretrained, save_weights
+from hybridvo.network.selector_net import SelectorInputs, SelectorNetwork
 from hybridvo.options import Options
 from hybridvo.pipeline import refine
 from hybridvo.synthetic.scenarios import Scenario, make_pair
@@ -27,10 +23,10 @@ SIZE = {"height": 96, "width": 224}
 
 
 @pytest.fixture(scope="module")
-def network() -> JudgeNetwork:
+def network() -> SelectorNetwork:
     torch.manual_seed(3)
-    made = JudgeNetwork()
-    # the last layers start at zero; a judge that says something is wanted here
+    made = SelectorNetwork()
+    # the last layers start at zero; a selector that says something is wanted here
     for layer in (made.score, made.trust):
         torch.nn.init.normal_(layer.weight, std=0.3)
     return made.eval()
@@ -43,7 +39,7 @@ def search(seed: int, **cell: object) -> tuple[HypothesisSet, object, dict]:
     return found, pair, truth
 
 
-def inputs_of(seed: int) -> JudgeInputs:
+def inputs_of(seed: int) -> SelectorInputs:
     found, _, _ = search(seed)
     everything = slice(None)
     return selector_inputs(
@@ -51,27 +47,29 @@ def inputs_of(seed: int) -> JudgeInputs:
     )
 
 
-def together(parts: list[JudgeInputs]) -> JudgeInputs:
-    values = {f.name: torch.cat([getattr(p, f.name) for p in parts]) for f in fields(JudgeInputs)}
+def together(parts: list[SelectorInputs]) -> SelectorInputs:
+    values = {
+        f.name: torch.cat([getattr(p, f.name) for p in parts]) for f in fields(SelectorInputs)
+    }
     counts = [len(p.owner) for p in parts]
     values["owner"] = torch.repeat_interleave(torch.arange(len(parts)), torch.tensor(counts))
     values["parent"] = torch.arange(sum(counts))
-    return JudgeInputs(**values)
+    return SelectorInputs(**values)
 
 
-def test_support_is_that_of_the_solver(network: JudgeNetwork) -> None:
+def test_support_is_that_of_the_solver(network: SelectorNetwork) -> None:
     # the same robust weight, from torch formulas of their own and from the solver's kernel
     found, pair, _ = search(1)
     answer = refine(pair)
-    judged = network.encode(inputs_of(1)).support.detach().numpy()
+    seen = network.encode(inputs_of(1)).support.detach().numpy()
     for hypothesis in answer.hypotheses:
-        errors = [np.abs(s - hypothesis.inliers).max() for s in judged]
+        errors = [np.abs(s - hypothesis.inliers).max() for s in seen]
         # float32 residuals of 0.3 px noise: a hundredth of a standard deviation
         assert min(errors) < 0.02
-    assert found.grid.count == judged[0].size
+    assert found.grid.count == seen[0].size
 
 
-def test_pictures_do_not_see_each_other(network: JudgeNetwork) -> None:
+def test_images_do_not_see_each_other(network: SelectorNetwork) -> None:
     parts = [inputs_of(seed) for seed in (1, 2)]
     broken = replace(parts[1], depth=torch.full_like(parts[1].depth, torch.nan))
     with torch.no_grad():
@@ -84,7 +82,7 @@ def test_pictures_do_not_see_each_other(network: JudgeNetwork) -> None:
             torch.testing.assert_close(both.mask[:n], alone.mask, atol=1e-3, rtol=1e-3)
 
 
-def test_holes_and_unknown_depths_give_finite_answers(network: JudgeNetwork) -> None:
+def test_holes_and_unknown_depths_give_finite_answers(network: SelectorNetwork) -> None:
     inputs = inputs_of(1)
     usable = inputs.usable.clone()
     usable[:, :20] = False
@@ -97,7 +95,7 @@ def test_holes_and_unknown_depths_give_finite_answers(network: JudgeNetwork) -> 
             assert (out.support[~mask.expand_as(out.support)] == 0).all()
 
 
-def test_the_second_look_shares_what_the_first_has_seen(network: JudgeNetwork) -> None:
+def test_refits_share_what_the_search_has_seen(network: SelectorNetwork) -> None:
     # a refit equal to its parent is seen as the parent, but for the flag that it is a refit
     inputs = inputs_of(1)
     with torch.no_grad():
@@ -109,28 +107,6 @@ def test_the_second_look_shares_what_the_first_has_seen(network: JudgeNetwork) -
     assert (first.score - again.score).abs().max() > 1e-6
 
 
-def test_weights_round_trip(network: JudgeNetwork, tmp_path: Path) -> None:
-    path = save_weights(tmp_path / "j.safetensors", network, network.options, {}, "float16")
-    read, _ = load_weights(path)
-    assert isinstance(read, JudgeNetwork) and read.options == JudgeOptions()
-    with pytest.raises(InputError):
-        save_weights(path, network, JudgeOptions(width=0.5), {})
-    path.write_bytes(path.read_bytes()[:-100])
-    with pytest.raises(CheckpointError):
-        load_weights(path)
-    for bad in ({"kind": "pwvo"}, {"width": 0.0}, {"width": True}):
-        with pytest.raises(InputError):
-            JudgeOptions(**bad)
-
-
-def test_the_card_beside_the_weights_is_theirs() -> None:
-    path = pretrained("judge")
-    network, card = load_weights(path)
-    assert json.loads(path.with_suffix(".json").read_text()) == card
-    assert {"command", "commit", "pictures", "held_out", "options"} <= set(card)
-    assert sum(p.numel() for p in network.parameters()) < 1_000_000
-
-
 def test_what_was_expected_is_weighed_by_its_covariance() -> None:
     inputs = inputs_of(1)
     sigma = torch.tensor([0.1, 0.2, 0.4, 0.01, 0.02, 0.04])
@@ -138,31 +114,31 @@ def test_what_was_expected_is_weighed_by_its_covariance() -> None:
     pose = torch.as_tensor(se3_exp(delta)[None, :3], dtype=torch.float32)
     told = replace(
         inputs,
-        T_last=torch.eye(4)[None, :3],
-        has_last=torch.tensor([True]),
-        last_information=torch.diag(1 / sigma**2)[None],
+        T_prior=torch.eye(4)[None, :3],
+        has_prior=torch.tensor([True]),
+        prior_information=torch.diag(1 / sigma**2)[None],
         pose=pose.expand(len(inputs.owner), 3, 4),
     )
-    _, scalars, _ = judge_network.candidate_channels(told, None)
+    _, scalars, _ = selector_net.candidate_channels(told, None)
     # three of six: 1 / (1 + 3 / 6). First order leaves half of 0.02 rad x 0.4 m, 0.04 of 0.1 m:
     # 0.08 in the square, 0.006 here
     torch.testing.assert_close(scalars[0, 4], torch.tensor(2 / 3), atol=7e-3, rtol=0)
     assert scalars[0, 5] == 1
-    far = replace(told, last_information=1e12 * told.last_information)
-    _, scalars, _ = judge_network.candidate_channels(far, None)
+    far = replace(told, prior_information=1e12 * told.prior_information)
+    _, scalars, _ = selector_net.candidate_channels(far, None)
     # a prior that is sure of itself says a bounded amount
     assert torch.isfinite(scalars).all() and scalars.abs().max() < 5
-    _, unknown, _ = judge_network.candidate_channels(inputs, None)
+    _, unknown, _ = selector_net.candidate_channels(inputs, None)
     assert (unknown[:, 4:] == 0).all()
 
 
 def test_a_covariance_that_is_none_counts_as_unknown() -> None:
     inputs = inputs_of(1)
-    usual = judge_network.expected_information(inputs.depth, inputs.usable, None)
+    usual = selector_net.prior_information_of(inputs.depth, inputs.usable, None)
     for broken in (torch.zeros(1, 6, 6), torch.full((1, 6, 6), torch.nan)):
-        told = judge_network.expected_information(inputs.depth, inputs.usable, broken)
+        told = selector_net.prior_information_of(inputs.depth, inputs.usable, broken)
         torch.testing.assert_close(told, usual)
-    exact = judge_network.expected_information(
+    exact = selector_net.prior_information_of(
         inputs.depth, inputs.usable, torch.diag(torch.tensor([4.0] * 3 + [0.25] * 3))[None]
     )
     torch.testing.assert_close(exact[0].diagonal(), torch.tensor([0.25] * 3 + [4.0] * 3))

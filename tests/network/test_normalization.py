@@ -1,4 +1,4 @@
-"""Networks without units: scales, first motions, several passes; networks as estimators."""
+"""Networks without units: scales, first motions, several passes."""
 
 from __future__ import annotations
 
@@ -8,22 +8,14 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hybridvo.errors import CheckpointError, InputError
-from hybridvo.geometry import ego_flow, pose_matrix, se3_exp
-from hybridvo.learned import estimate_learned, next_start, shipped_network
-from hybridvo.network.inputs import (
-    NetworkInputs,
-    assemble_aligned,
-    assemble_inputs,
-    subsampled_intrinsics,
-)
+from hybridvo.geometry import ego_flow, se3_exp
+from hybridvo.network.inputs import NetworkInputs, assemble_aligned, subsampled_intrinsics
 from hybridvo.network.losses import LossOptions, LossTargets, total_loss
-from hybridvo.network.passes import first_motions, predict
+from hybridvo.network.normalization import first_motions, predict, remove_scale
 from hybridvo.network.pwvo import NetworkOptions, build_network
-from hybridvo.network.scale_free import euler_deg, remove_scale
-from hybridvo.network.selection import select_motion
-from hybridvo.torch_geometry import euler_transform
-from hybridvo.types import Camera, Frame, FramePair, Reason, State
+from hybridvo.network.weighted_fit import fitted_motion
+from hybridvo.torch_geometry import euler_deg
+from hybridvo.types import Camera
 
 CAMERA = Camera(60.0, 62.0, 31.5, 15.5, 32, 64)
 MOTION = se3_exp(np.array([0.05, -0.03, 0.08, 0.004, -0.006, 0.01]))
@@ -57,13 +49,6 @@ def static_inputs(T: np.ndarray = MOTION, scale: float = 1.0) -> NetworkInputs:
 def tiny(**options) -> torch.nn.Module:
     torch.manual_seed(0)
     return build_network(NetworkOptions(width=0.1, scale_free=True, **options)).eval()
-
-
-def test_euler_angles_are_those_of_the_selected_transform():
-    angles = torch.tensor([[3.0, -20.0, 40.0], [0.0, 0.0, 0.0]])
-    T = euler_transform(angles, torch.zeros(2, 3))
-    # float32 of angles up to 40 degrees: 40 * 6e-8, through one arc sine
-    torch.testing.assert_close(euler_deg(T[:, :3, :3]), angles, atol=2e-5, rtol=0)
 
 
 def test_scales_by_hand():
@@ -139,25 +124,11 @@ def test_passes_are_the_network_on_what_is_left():
     network, inputs = tiny(passes=3), static_inputs()
     with torch.inference_mode():
         one = network(inputs)
-        two = network(inputs, select_motion(one))
-        three = network(inputs, select_motion(two))
-        torch.testing.assert_close(
-            predict(network, inputs, next_start(network)).rotation, three.rotation
-        )
-        torch.testing.assert_close(
-            predict(network, inputs, next_start(network), passes=1).rotation, one.rotation
-        )
-    assert first_motions(network, inputs, next_start(network), 0) is None
-
-
-def test_options_at_the_door():
-    with pytest.raises(InputError, match="passes above 1 need scale_free"):
-        NetworkOptions(passes=2)
-    with pytest.raises(InputError, match=r"NetworkOptions\.passes"):
-        NetworkOptions(passes=9, scale_free=True)
-    with pytest.raises(InputError, match="input_stride"):
-        NetworkOptions(input_stride=3)
-    assert NetworkOptions(input_stride=2, head_stride=2).patch == 8
+        two = network(inputs, fitted_motion(one, inputs))
+        three = network(inputs, fitted_motion(two, inputs))
+        torch.testing.assert_close(predict(network, inputs).rotation, three.rotation)
+        torch.testing.assert_close(predict(network, inputs, passes=1).rotation, one.rotation)
+    assert first_motions(network, inputs, "softmax", 0) is None
 
 
 def test_subsampled_intrinsics_by_hand():
@@ -195,43 +166,3 @@ def test_the_truth_has_no_flow_loss_on_fewer_pixels():
     off = T.clone()
     off[0, 0, 3] += 0.1
     assert float(total_loss(output, targets, options, off)[1]["flow"]) > 0.1
-
-
-def pair(flow: np.ndarray | None, depth: np.ndarray | None) -> FramePair:
-    return FramePair(Frame(None, depth, CAMERA), Frame(None, depth, CAMERA), flow)
-
-
-@pytest.mark.parametrize("method", ["pwvo", "vonet"])
-def test_a_network_is_an_estimator(method):
-    kind = "pwvo" if method == "pwvo" else "vonet"
-    network = tiny(kind=kind, passes=2)
-    depth = scene()
-    flow = ego_flow(depth, MOTION, CAMERA, CAMERA).astype(np.float32)
-    result = estimate_learned(pair(flow, depth), method, network)
-    assert result.ok and result.method == method
-    assert np.linalg.eigvalsh(result.covariance)[0] > 0
-    R = result.T_curr_prev[:3, :3]
-    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
-    with torch.inference_mode():
-        inputs = assemble_inputs(pair(flow, depth))
-        expected = select_motion(predict(network, inputs, next_start(network)))[0]
-    np.testing.assert_allclose(result.T_curr_prev, pose_matrix(expected[:3].numpy()), atol=1e-5)
-
-
-def test_missing_data_is_a_status():
-    network, depth = tiny(), scene()
-    flow = np.zeros((32, 64, 2), np.float32)
-    cases = {
-        Reason.NO_FLOW: pair(None, depth),
-        Reason.NO_VALID_DEPTH: pair(flow, None),
-    }
-    for reason, broken in cases.items():
-        result = estimate_learned(broken, "pwvo", network)
-        assert result.status.state is State.FAILED and result.status.reason is reason
-    empty = estimate_learned(pair(flow, np.full_like(depth, np.nan)), "pwvo", network)
-    assert empty.status.reason is Reason.NO_VALID_DEPTH
-
-
-def test_unknown_weights_are_named():
-    with pytest.raises(CheckpointError, match="unknown"):
-        shipped_network("no-such-network")

@@ -15,12 +15,14 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import torch
+from torch import nn
 
 from hybridvo.network.inputs import NetworkInputs
+from hybridvo.network.selection import NetworkOutput
+from hybridvo.network.weighted_fit import fitted_motion
+from hybridvo.torch_geometry import euler_deg
 
-__all__ = ["MotionScale", "euler_deg", "remove_scale"]
-
-SMALLEST_MOTION = 5e-5
+MIN_MOTION = 5e-5
 """rad; flow smaller than this is not amplified any further: at 2000 px of focal length 0.1 px."""
 
 QUANTILE = 0.4
@@ -30,15 +32,12 @@ scale of what is left of the world."""
 NEAR_QUANTILE = 0.9
 """Of the inverse depth: near things tell the translation, and set its scale."""
 
-FARTHEST = 50.0
-"""Metres; where all is farther, flow tells no translation, and a camera still moves by metres."""
+MIN_NEARNESS = 1 / 50
+"""1 / metres; where all is farther, flow tells no translation, and a camera still moves by metres.
+"""
 
 LIMIT = 10.0
 """Magnitude that squashed values approach; values of the order of one stay as they are."""
-
-LOCKED, LARGEST_SINE = 1e-12, 1 - 1e-6
-"""Squared cosine of the middle angle below which it counts as a quarter turn, and the largest sine
-whose angle has a slope that is worth following."""
 
 NEAREST = 1e-2
 """Metres; a moved point nearer than this, or behind the camera, has no residual."""
@@ -57,21 +56,33 @@ class MotionScale:
     start: torch.Tensor
 
 
-def euler_deg(R: torch.Tensor) -> torch.Tensor:
-    """(B, 3) Euler angles X-Y-Z in degrees of rotations (B, 3, 3) = Rx Ry Rz; finite gradient."""
-    # a quarter turn about y leaves only the sum or difference of the others: rz = 0 there, and no
-    # 0 / 0 in the gradient
-    locked = R[:, 0, 0] ** 2 + R[:, 0, 1] ** 2 < LOCKED
-    one, zero = torch.ones_like(R[:, 0, 0]), torch.zeros_like(R[:, 0, 0])
-    angles = (
-        torch.atan2(
-            torch.where(locked, R[:, 2, 1], -R[:, 1, 2]),
-            torch.where(locked, R[:, 1, 1], R[:, 2, 2]),
-        ),
-        torch.asin(R[:, 0, 2].clamp(-LARGEST_SINE, LARGEST_SINE)),
-        torch.atan2(torch.where(locked, zero, -R[:, 0, 1]), torch.where(locked, one, R[:, 0, 0])),
-    )
-    return torch.rad2deg(torch.stack(angles, dim=1))
+def predict(
+    network: nn.Module,
+    inputs: NetworkInputs,
+    selection: str = "softmax",
+    passes: int | None = None,
+) -> NetworkOutput:
+    """Output of the last of several passes, each on what the one before left unexplained.
+
+    Args:
+        network: of ``build_network``.
+        inputs: of size (h, w).
+        selection: how one pose comes out of the pixels of a pass.
+        passes: their number; by default the one that the network's options name.
+    """
+    count = int(network.options.passes) if passes is None else passes  # type: ignore[union-attr]
+    return network(inputs, first_motions(network, inputs, selection, count - 1))
+
+
+def first_motions(
+    network: nn.Module, inputs: NetworkInputs, selection: str, passes: int
+) -> torch.Tensor | None:
+    """(B, 4, 4) motions after a number of passes, without gradient; None for no pass at all."""
+    T = None
+    with torch.no_grad():
+        for _ in range(passes):
+            T = fitted_motion(network(inputs, T), inputs, selection)
+    return T
 
 
 def remove_scale(
@@ -93,14 +104,12 @@ def remove_scale(
         m times the depth of the near things. Pixels without depth count as infinitely far. Finite
         for any input.
     """
-    focal = torch.stack([inputs.K_prev[:, 0, 0], inputs.K_prev[:, 1, 1]], dim=1)[:, :, None, None]
     inverse = torch.nan_to_num(inputs.inverse_depth, 0.0, 0.0, 0.0)
     flow = torch.nan_to_num(inputs.flow_px, 0.0, 0.0, 0.0)
     both = (inverse > 0).all(dim=1, keepdim=True)
-    safe = torch.where(both, inverse, torch.ones_like(inverse))
-    start = torch.zeros(len(inputs), 6, dtype=flow.dtype, device=flow.device)
-    change = safe[:, :1].log() - safe[:, 1:].log()
-    quantile = torch.full((len(inputs), 1), QUANTILE, dtype=flow.dtype, device=flow.device)
+    change = -torch.where(both, inverse, 1.0).log().diff(dim=1)
+    start = flow.new_zeros(len(inputs), 6)
+    quantile = flow.new_full((len(inputs), 1), QUANTILE)
     if T_start is not None:
         T_start = T_start.to(flow.dtype)
         start = torch.cat([euler_deg(T_start[:, :3, :3]), T_start[:, :3, 3]], dim=1)
@@ -110,21 +119,17 @@ def remove_scale(
         seen = inputs.valid[:, None] | (flow != 0).any(dim=1, keepdim=True)
         flow = torch.where(seen, flow - ego, flow)
         change = change - log_ratio
-    change = torch.where(both, change, torch.zeros_like(change))
-    angle = flow / focal
+    angle = flow / _focal(inputs.K_prev)
     length = (angle.square().sum(dim=1) + 1e-20).sqrt()
-    motion = _quantile(length, inputs.valid, quantile, 1.0).clamp(SMALLEST_MOTION, 1.0)
+    motion = _quantile(length, inputs.valid, quantile).clamp(MIN_MOTION, 1.0)
     nearness = _quantile(
         inverse[:, 0],
         inputs.valid & (inverse[:, 0] > 0),
         torch.full_like(quantile, NEAR_QUANTILE),
-        1.0,
-    )
-    nearness = nearness.clamp(FARTHEST**-1, 1e3)
-    m = motion[:, None, None, None]
-    depth = torch.cat(
-        [_squash(inverse[:, :1] / nearness[:, None, None, None]), _squash(change / m)], dim=1
-    )
+    ).clamp(MIN_NEARNESS, 1e3)
+    m, near = (x[:, None, None, None] for x in (motion, nearness))
+    change = torch.where(both, change / m, 0.0)
+    depth = torch.cat([_squash(inverse[:, :1] / near), _squash(change)], dim=1)
     factor = torch.stack([torch.rad2deg(motion), motion / nearness], dim=1)
     scale = MotionScale(factor.repeat_interleave(3, dim=1), start)
     return replace(inputs, flow=_squash(angle / m), inverse_depth=depth), scale
@@ -136,40 +141,33 @@ def _ego_motion(
     """((B, 2, h, w) px, (B, 1, h, w)) flow and change of log depth that a motion causes; zero where
     the moved point is behind the camera.
     """
-    rays = torch.cat([inputs.rays, torch.ones_like(inputs.rays[:, :1])], dim=1)
     # Over its depth, a point is ray + translation * inverse depth: finite for the farthest.
-    moved = torch.einsum("bij,bjhw->bihw", T[:, :3, :3], rays)
-    moved = moved + T[:, :3, 3, None, None] * inverse[:, None]
-    limit = NEAREST * inverse.clamp(min=1e-3)
-    front = moved[:, 2] > limit
-    z = torch.where(front, moved[:, 2], torch.ones_like(limit))[:, None]
-    K_prev, K_curr = inputs.K_prev, inputs.K_curr
+    rays, inverse = inputs.rays.flatten(2), inverse.flatten(1)[:, None]
+    moved = T[:, :3, :2] @ rays + T[:, :3, 2:3] + T[:, :3, 3:] * inverse
+    moved = moved.unflatten(2, inputs.size)
+    front = moved[:, 2:] > NEAREST * inverse.unflatten(2, inputs.size).clamp(min=1e-3)
+    z = torch.where(front, moved[:, 2:], 1.0)
+    now = _focal(inputs.K_curr) * moved[:, :2] / z + inputs.K_curr[:, :2, 2, None, None]
+    before = _focal(inputs.K_prev) * inputs.rays + inputs.K_prev[:, :2, 2, None, None]
+    return torch.where(front, now - before, 0.0), torch.where(front, z.log(), 0.0)
 
-    def pixels(K: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
-        focal = torch.stack([K[:, 0, 0], K[:, 1, 1]], dim=1)[:, :, None, None]
-        return focal * x + K[:, :2, 2, None, None]
 
-    flow = pixels(K_curr, moved[:, :2] / z) - pixels(K_prev, inputs.rays)
-    flow = torch.where(front[:, None], flow, torch.zeros_like(flow))
-    return flow, torch.where(front[:, None], z.log(), torch.zeros_like(z))
+def _focal(K: torch.Tensor) -> torch.Tensor:
+    return K.diagonal(dim1=1, dim2=2)[:, :2, None, None]
 
 
 def _squash(x: torch.Tensor) -> torch.Tensor:
     return x / (1 + x.abs() / LIMIT)
 
 
-def _quantile(
-    x: torch.Tensor, mask: torch.Tensor, q: torch.Tensor, fallback: float
-) -> torch.Tensor:
-    """(B,) quantile (B, 1) of a (B, h, w) map over a mask; ``fallback`` where that is empty."""
+def _quantile(x: torch.Tensor, mask: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
+    """(B,) quantile (B, 1) of a (B, h, w) map over a mask; 1 where that is empty."""
     pick = (..., slice(None, None, 2), slice(None, None, 2))  # enough for a scale
-    kept = torch.where(mask, x, torch.full_like(x, torch.nan))[pick].flatten(1)
-    # NaN sort to the end; linear between neighbours as in numpy
+    kept = torch.where(mask, x, torch.nan)[pick].flatten(1)
+    # not torch.nanquantile: it takes one quantile for the whole batch; NaN sort to the end
     ordered = kept.sort(dim=1).values
-    count = (~kept.isnan()).sum(dim=1, keepdim=True)
-    place = q * (count - 1).clamp(min=0)
+    last = ((~kept.isnan()).sum(dim=1, keepdim=True) - 1).clamp(min=0)
+    place = q * last
     low = place.floor().long()
-    high = torch.minimum(low + 1, (count - 1).clamp(min=0))
-    a, b = ordered.gather(1, low), ordered.gather(1, high)
-    value = (a + (place - low) * (b - a))[:, 0]
-    return torch.nan_to_num(value, fallback, fallback, fallback)
+    a, b = (ordered.gather(1, k) for k in (low, torch.minimum(low + 1, last)))
+    return torch.nan_to_num(torch.lerp(a, b, place - low)[:, 0], 1.0, 1.0, 1.0)

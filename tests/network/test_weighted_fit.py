@@ -8,7 +8,6 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hybridvo.errors import InputError
 from hybridvo.geometry import rotation_angle, se3_exp
 from hybridvo.network.weighted_fit import pixel_weights, weighted_fit
 
@@ -140,12 +139,3 @@ def test_weights_of_pixels() -> None:
     expected = np.array([[1.0, np.exp(-4.0)], [0.0, 0.0]]) / (1 + np.exp(-4.0))
     np.testing.assert_allclose(weights[0].numpy(), expected, atol=1e-6)
     assert float(pixel_weights(s, torch.zeros_like(valid)).sum()) == 0.0
-
-
-def test_shapes_are_checked_at_the_door() -> None:
-    ray, inverse, target, _ = scene(1, [WORLD], [1.0])
-    weights = torch.ones(1, COUNT, dtype=torch.float64)
-    with pytest.raises(InputError, match=r"ray and target of \(1, 2, 600\)"):
-        weighted_fit(ray[:, :, 1:], inverse, target, weights, EYE)
-    with pytest.raises(InputError, match="T_start"):
-        weighted_fit(ray, inverse, target, weights, EYE[0])

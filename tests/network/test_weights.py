@@ -1,0 +1,187 @@
+"""Weights files: round trip, what is refused, the pretrained ones."""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+import struct
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from hybridvo.errors import CheckpointError, InputError, OutputError
+from hybridvo.network.models import Models, load_weights
+from hybridvo.network.pwvo import NetworkOptions, build_network
+from hybridvo.network.weights import FORMAT, pretrained, pretrained_names, save_weights
+
+OPTIONS = NetworkOptions(width=0.125)
+CARD = {"preset": "paper", "samples": 12, "figures": {"r_err_deg": 0.1}}
+
+
+@pytest.fixture
+def network():
+    torch.manual_seed(0)
+    return build_network(OPTIONS)
+
+
+@pytest.fixture
+def saved(tmp_path, network):
+    return save_weights(tmp_path / "tiny.safetensors", network, CARD)
+
+
+def rewrite(path, change=None, **header):
+    """Write a file again with other tensors or another header."""
+    content = path.read_bytes()
+    size = struct.unpack("<Q", content[:8])[0]
+    header = json.loads(content[8 : 8 + size])["__metadata__"] | header
+    tensors = load_file(path)
+    if change is not None:
+        change(tensors)
+    save_file(tensors, path, {k: v for k, v in header.items() if v is not None})
+
+
+def refuses(path, *parts):
+    with pytest.raises(CheckpointError) as caught:
+        load_weights(path)
+    for part in (path.name, *parts):
+        assert part in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        NetworkOptions(width=0.125, decoders=2, head_stride=2),
+        NetworkOptions(width=0.125, uncertainty=False),
+        NetworkOptions(kind="vonet-attention", width=0.125),
+    ],
+)
+def test_round_trip_is_exact(tmp_path, options):
+    network = build_network(options)
+    loaded, card = load_weights(save_weights(tmp_path / "x.safetensors", network, CARD))
+    assert card == CARD and loaded.options == options and not loaded.training
+    for name, value in network.state_dict().items():
+        assert torch.equal(loaded.state_dict()[name], value)
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [("float16", 2**-11), ("bfloat16", 2**-8)])
+def test_half_storage_comes_back_as_float32(tmp_path, network, dtype, tolerance):
+    small = save_weights(tmp_path / "half.safetensors", network, CARD, dtype=dtype)
+    for name, value in load_weights(small)[0].state_dict().items():
+        assert value.dtype == torch.float32
+        # Rounding to nearest: half a unit in the last place; 2^-24 where float16 is subnormal.
+        torch.testing.assert_close(value, network.state_dict()[name], rtol=tolerance, atol=2**-24)
+
+
+def test_saving_refuses_what_could_not_be_loaded(tmp_path, network):
+    path = tmp_path / "x.safetensors"
+    with pytest.raises(OutputError, match="nowhere"):
+        save_weights(tmp_path / "nowhere" / "x.safetensors", network, CARD)
+    with pytest.raises(InputError, match="int8"):
+        save_weights(path, network, CARD, dtype="int8")
+    for card in ({"x": object()}, {"x": float("nan")}):
+        with pytest.raises(InputError, match="JSON"):
+            save_weights(path, network, card)
+    with torch.no_grad():
+        network.decoder.out.bias[0] = 1e6  # above float16
+    with pytest.raises(InputError, match=r"decoder\.out\.bias"):
+        save_weights(path, network, CARD, dtype="float16")
+    assert not path.exists()
+
+
+def test_missing_truncated_and_foreign_files(tmp_path, saved):
+    refuses(tmp_path / "none.safetensors")
+    content = saved.read_bytes()
+    for broken in (
+        *(content[: int(part * len(content))] for part in (0.0, 1e-4, 0.01, 0.5, 0.999)),
+        content + b"x",
+        b"hello, this is a text file and no weights\n" * 10,
+        struct.pack("<Q", 2**40) + b"{}",
+        bytes(4096),
+    ):
+        saved.write_bytes(broken)
+        refuses(saved)
+    for header in (None, {"format": "pt"}):
+        save_file({"weight": torch.zeros(3)}, saved, header)
+        refuses(saved, FORMAT)
+
+
+class Bomb:
+    def __init__(self, sentinel):
+        self.sentinel = sentinel
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.sentinel),)
+
+
+@pytest.mark.parametrize("write", [torch.save, lambda x, path: path.write_bytes(pickle.dumps(x))])
+def test_pickles_are_refused_and_not_run(tmp_path, write):
+    sentinel, path = tmp_path / "sentinel", tmp_path / "x.pt"
+    write({"w": Bomb(sentinel)}, path)
+    refuses(path)
+    assert not sentinel.exists()
+
+
+def test_tensors_that_are_not_the_networks(saved):
+    def rename(tensors):
+        del tensors["encoder.stem.0.weight"]
+        tensors["surplus"] = torch.zeros(1)
+        tensors["decoder.out.bias"] = torch.zeros(7)
+
+    def spoil(tensors):
+        tensors["encoder.layer3.2.conv1.weight"][0, 0, 0, 0] = torch.nan
+
+    content = saved.read_bytes()
+    rewrite(saved, rename)
+    refuses(saved, "encoder.stem.0.weight", "surplus")
+    saved.write_bytes(content)
+    rewrite(saved, spoil)
+    refuses(saved, "encoder.layer3.2.conv1.weight")
+    saved.write_bytes(content)
+    rewrite(saved, options=json.dumps({"kind": "vonet", "width": 0.125}))
+    refuses(saved, "head_rotation")
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        None,
+        "not json",
+        "[1]",
+        "{}",
+        '{"kind": "pwvo", "width": 1e9}',
+        '{"kind": [], "width": 1}',
+        '{"kind": "pwvo", "width": NaN}',
+        '{"kind": "pwvo", "width": 0.125, "depth": 3}',
+    ],
+)
+def test_damaged_options_and_cards(saved, options):
+    content = saved.read_bytes()
+    rewrite(saved, options=options)
+    refuses(saved)
+    saved.write_bytes(content)
+    rewrite(saved, card=options if options != "{}" else "null")
+    if options is None or not options.startswith("{"):
+        refuses(saved)
+
+
+def test_pretrained_weights_load_and_are_small():
+    assert set(pretrained_names()) == {"pwvo", "selector"}
+    for name in pretrained_names():
+        network, card = load_weights(pretrained(name))
+        assert network.options.kind == name
+        assert {"command", "commit", "held_out"} <= set(card)
+        assert json.loads(pretrained(name).with_suffix(".json").read_text()) == card
+    assert sum(pretrained(name).stat().st_size for name in pretrained_names()) < 12e6
+    for name in ("pwvo-wid", "../pwvo", ""):
+        with pytest.raises(CheckpointError, match="pwvo, selector"):
+            pretrained(name)
+
+
+def test_a_method_refuses_the_weights_of_another_network(saved):
+    assert Models(weights={"pwvo": saved}).network("pwvo").options == OPTIONS
+    with pytest.raises(CheckpointError, match="selector"):
+        Models(weights={"selector": saved}).network("selector")
+    with pytest.raises(CheckpointError, match="vonet"):
+        Models().network("vonet")
