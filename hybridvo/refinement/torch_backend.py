@@ -423,7 +423,7 @@ class _Solver:
                       self.pixels.K[:, 0, 0], T.translation())
         ]  # fmt: skip
         found = [
-            _one_covariance(*(x[k] for x in arrays), shape=self.tiles) for k in range(len(T))
+            _one_covariance(*(x[k] for x in arrays), self.tiles) for k in range(len(T))
         ]  # fmt: skip
         covariance = torch.as_tensor(np.stack([c for c, _ in found]), device=weight.device)
         return covariance, torch.tensor([ok for _, ok in found], device=weight.device)

@@ -208,17 +208,17 @@ class SyntheticSequence(Sequence):
         return Path(self.name)
 
     @property
-    def timestamps(self) -> np.ndarray:
+    def timestamps(self) -> np.ndarray:  # type: ignore[override]
         """(N,) float64 seconds."""
         return np.arange(len(self)) / self.fps
 
     @property
-    def poses(self) -> np.ndarray:
+    def poses(self) -> np.ndarray:  # type: ignore[override]
         """(N, 4, 4) true T_world_cam."""
         return self.scene.T_world_cam
 
     @property
-    def warnings(self) -> tuple[str, ...]:
+    def warnings(self) -> tuple[str, ...]:  # type: ignore[override]
         """Nothing was mended."""
         return ()
 
