@@ -1,4 +1,4 @@
-"""The command line: ``hybridvo run | compare | show | evaluate | doctor | demo | init | ...``.
+"""The command line: ``hybridvo run | compare | show | evaluate | doctor | demo | train | ...``.
 
 Parses, calls, prints. Heavy modules are imported after parsing, so that ``--help`` is instant. Data
 goes to stdout, progress and errors to stderr. Exit codes: 0 done, 1 a bug, 2 bad input or usage (or
@@ -18,15 +18,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from hybridvo import __version__
-
-METHODS = (
-    *("hybrid", "hybrid-flow", "refine", "pwvo-refine"),
-    *("pwvo", "pwvo-paper", "pwvo-uncertain", "pwvo-naive", "pixelwise"),
-    *("vonet", "vonet-attention", "pnp-ransac", "pnp-ransac-tuned", "usac-magsac", "poselib"),
-    *("opencv-rgbd", "open3d-rgbd", "identity"),
-)
-"""For the help alone, which must not load what the methods need."""
-KINDS = ("sintel", "tartanair", "7scenes", "folder", "kitti", "tum")
+from hybridvo.commands import arguments
 
 Call = Callable[[argparse.Namespace, list[str]], int]
 
@@ -45,18 +37,27 @@ def build_parser() -> argparse.ArgumentParser:
             name,
             help=help,
             description=help[0].upper() + help[1:] + ".",
-            parents=[_common(), *parents],
+            parents=[arguments.common(), *parents],
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
         command.set_defaults(call=call)
         return command
 
-    _add_run(add("run", _run, "estimate the camera motion of a sequence", _input()))
-    _add_compare(add("compare", _compare, "run methods side by side and write a report"))
-    _add_show(add("show", _show, "draw the maps of one pair of a sequence", _where()))
-    _add_evaluate(add("evaluate", _evaluate, "errors of a trajectory file against ground truth"))
+    arguments.add_run(
+        add("run", _run, "estimate the camera motion of a sequence", arguments.input())
+    )
+    arguments.add_compare(add("compare", _compare, "run methods side by side and write a report"))
+    arguments.add_show(
+        add("show", _show, "draw the maps of one pair of a sequence", arguments.where())
+    )
+    arguments.add_evaluate(
+        add("evaluate", _evaluate, "errors of a trajectory file against ground truth")
+    )
     doctor = add(
-        "doctor", _doctor, "what is missing here, or wrong with a sequence", _input(required=False)
+        "doctor",
+        _doctor,
+        "what is missing here, or wrong with a sequence",
+        arguments.input(required=False),
     )
     doctor.add_argument("--pairs", type=int, default=40, metavar="N", help="pairs (default 40)")
     demo = add("demo", _demo, "render a scene with moving objects and run on it")
@@ -64,172 +65,32 @@ def build_parser() -> argparse.ArgumentParser:
     demo.add_argument("--overwrite", action="store_true", help="replace the results in --out")
     demo.add_argument("--frames", type=int, default=20, metavar="N", help="default: 20")
     demo.add_argument("--seed", type=int, default=0, metavar="N", help="of the scene")
+    generate = add("generate", _generate, "draw training samples into a folder")
+    generate.add_argument("preset", metavar="PRESET", help="paper, diverse or a YAML file")
+    generate.add_argument("--out", required=True, metavar="DIR", help="folder of the samples")
+    generate.add_argument("--count", type=int, default=1000, metavar="N", help="default: 1000")
+    generate.add_argument("--seed", type=int, default=0, metavar="N")
+    generate.add_argument("--size", type=int, nargs=2, metavar=("H", "W"), help="pixels")
+    generate.add_argument("--workers", type=int, default=1, metavar="N", help="processes")
+    # has a parser of its own, see main
+    commands.add_parser("train", help="train a network (hybridvo train --help)", add_help=False)
     init = add("init", _init, "write a camera.yaml to fill in, for a recording of your own")
     init.add_argument("directory", metavar="DIR", help="folder with rgb/ and depth/")
     return parser
 
 
-def _common() -> argparse.ArgumentParser:
-    common = argparse.ArgumentParser(add_help=False)
-    common.add_argument("--json", action="store_true", help="print the result as JSON on stdout")
-    loudness = common.add_mutually_exclusive_group()
-    loudness.add_argument("-v", "--verbose", action="store_true", help="more, and tracebacks")
-    loudness.add_argument("-q", "--quiet", action="store_true", help="errors only")
-    return common
-
-
-def _where(required: bool = True) -> argparse.ArgumentParser:
-    """Which sequence."""
-    given = argparse.ArgumentParser(add_help=False)
-    where = given.add_mutually_exclusive_group(required=required)
-    where.add_argument("path", nargs="?", metavar="DIR", help="folder of the sequence")
-    where.add_argument("--sequence", metavar="DIR", help="the same, by name")
-    given.add_argument(
-        "--dataset", metavar="KIND", help=f"one of {', '.join(KINDS)} (default: detected)"
-    )
-    return given
-
-
-def _input(required: bool = True) -> argparse.ArgumentParser:
-    """Which sequence, and what its folder does not say."""
-    given = _where(required)
-    given.add_argument(
-        "--camera", metavar="FILE|fx,fy,cx,cy", help="camera.yaml, ROS camera_info, or numbers"
-    )
-    given.add_argument(
-        "--depth-scale", type=float, metavar="N", help="depth units per metre, 1000: millimetres"
-    )
-    given.add_argument("--mask", metavar="DIR", help="images that are 0 where pixels do not count")
-    return given
-
-
-def _add_run(run: argparse.ArgumentParser) -> None:
-    run.add_argument("--out", metavar="DIR", help="output folder (default: runs/NAME)")
-    run.add_argument(
-        "--method", metavar="NAME", help=f"one of {', '.join(METHODS)} (default: hybrid)"
-    )
-    run.add_argument(
-        "--flow", metavar="WHAT", help="auto, file or dis (default: files where there are, or dis)"
-    )
-    run.add_argument("--start", type=int, metavar="N", help="first frame (default 0)")
-    run.add_argument("--stop", type=int, metavar="N", help="the one after the last frame")
-    run.add_argument("--stride", type=int, metavar="N", help="step between frames (default 1)")
-    run.add_argument(
-        "--weights",
-        action="append",
-        default=[],
-        metavar="NAME=FILE",
-        help="network weights instead of the pretrained ones, as in pwvo=mine.safetensors",
-    )
-    run.add_argument("--device", metavar="NAME", help="auto (default), cpu or cuda")
-    run.add_argument("--config", metavar="FILE", help="YAML file of options")
-    run.add_argument(
-        "--set",
-        action=_KeysInHelp,
-        default=[],
-        dest="assignments",
-        metavar="KEY=VALUE",
-        help="one option, as in refine.cutoff=2.5; may be repeated; --set help lists the keys",
-    )
-    exists = run.add_mutually_exclusive_group()
-    exists.add_argument("--resume", action="store_true", help="go on with a run that was cut off")
-    exists.add_argument("--overwrite", action="store_true", help="replace the results in --out")
-    run.add_argument(
-        "--max-failed", type=float, metavar="X", help="fraction of failed motions (default 0.2)"
-    )
-    run.add_argument(
-        "--strict", action="store_true", default=None, help="a broken frame ends the run"
-    )
-    run.add_argument(
-        "--rrd",
-        nargs="?",
-        const="",
-        metavar="FILE",
-        help="write a Rerun recording (extra 'viz'; default: recording.rrd in the output folder)",
-    )
-
-
-class _KeysInHelp(argparse.Action):
-    """Collects assignments; ``--set help`` prints every key with its default."""
-
-    def __call__(self, parser: Any, namespace: Any, values: Any, option: Any = None) -> None:
-        if values == "help":
-            from hybridvo.commands.configuration import option_defaults
-
-            print("\n".join(f"{key}={value}" for key, value in option_defaults().items()))
-            parser.exit()
-        setattr(namespace, self.dest, [*getattr(namespace, self.dest), values])
-
-
-def _add_compare(compare: argparse.ArgumentParser) -> None:
-    add = compare.add_argument
-    add(
-        "--sequence",
-        action="extend",
-        nargs="+",
-        required=True,
-        metavar="DIR",
-        help="sequence, or a folder of sequences (MPI Sintel as it was unpacked); repeatable",
-    )
-    add("--out", required=True, metavar="DIR")
-    add("--methods", default="all", help="comma-separated; default: all that run here")
-    flow = "auto: the sequence's flow files and DIS, side by side"
-    add("--flow", choices=("auto", "file", "dis"), default="auto", help=flow)
-    add("--dataset", help="kind of the sequences (default: detected)")
-    add("--start", type=int, default=0)
-    add("--stop", type=int)
-    add("--stride", type=int, default=1)
-    add("--seed", type=int, default=0)
-    add("--device", choices=("auto", "cpu", "cuda"), default="auto")
-    own = "network weights instead of the pretrained ones; repeatable"
-    add("--weights", action="append", default=[], metavar="NAME=FILE", help=own)
-    paper = "MPI Sintel as others score it: PWVO's 992 pairs, or fourteen trajectories"
-    add("--protocol", choices=("paper", "trajectory14"), help=paper)
-    add("--worst", type=int, default=3, help="worst pairs shown for each method")
-    add("--jobs", type=int, default=1, metavar="N", help="sequences at a time, a process each")
-    cluster = "of a Dask cluster (tcp://host:8786) that works instead; extra 'cluster'"
-    add("--scheduler", metavar="ADDRESS", help=cluster)
-    exists = compare.add_mutually_exclusive_group()
-    exists.add_argument("--resume", action="store_true", help="keep the finished sequences")
-    exists.add_argument("--overwrite", action="store_true", help="replace results in --out")
-
-
-def _add_show(show: argparse.ArgumentParser) -> None:
-    show.add_argument("--pair", type=int, default=0, metavar="N", help="first frame (default 0)")
-    show.add_argument("--out", default="pair.png", metavar="FILE", help="default: pair.png")
-    show.add_argument("--method", metavar="NAME", help="estimator (default: hybrid)")
-    show.add_argument("--flow", choices=("auto", "file", "dis"), default="auto")
-    show.add_argument("--weights", action="append", default=[], metavar="FILE", help="a network")
-    show.add_argument("--steps", type=int, default=32, help="of the integrated gradients")
-    show.add_argument("--overwrite", action="store_true", help="replace the image")
-
-
-def _add_evaluate(evaluate: argparse.ArgumentParser) -> None:
-    evaluate.add_argument("estimate", metavar="EST", help="estimated trajectory")
-    evaluate.add_argument("gt", metavar="GT", help="true trajectory")
-    evaluate.add_argument(
-        "--alignment", choices=("se3", "sim3", "origin", "none"), default="se3", help="of the ATE"
-    )
-    evaluate.add_argument(
-        "--delta", type=float, default=1, metavar="X", help="span of the RPE (default 1)"
-    )
-    evaluate.add_argument(
-        "--delta-unit", choices=("frames", "s"), default="frames", help="unit of --delta"
-    )
-    evaluate.add_argument("--max-diff", type=float, metavar="S", help="seconds between matches")
-    formats = ("auto", "tum", "kitti", "tartanair")
-    for name in ("est", "gt"):
-        evaluate.add_argument(f"--format-{name}", choices=formats, default="auto")
-        evaluate.add_argument(f"--axes-{name}", choices=("auto", "camera", "ned"), default="auto")
-
-
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
+    given = sys.argv[1:] if argv is None else list(argv)
+    if given[:1] == ["train"]:
+        from hybridvo.commands.train import main as train
+
+        return train(given[1:])
     try:
-        args = build_parser().parse_args(argv)
+        args = build_parser().parse_args(given)
     except SystemExit as end:  # argparse: 0 after --help and --version, 2 for wrong usage
         return int(end.code or 0)
-    command = ["hybridvo", *(sys.argv[1:] if argv is None else argv)]
+    command = ["hybridvo", *given]
     try:
         return _guarded(args, command)
     except BrokenPipeError:  # the reader of stdout has gone (`| head`)
@@ -372,6 +233,25 @@ def _demo(args: argparse.Namespace, command: list[str]) -> int:
     if content is None:
         return 130
     _print(args, content, demo_text(content))
+    return 0
+
+
+def _generate(args: argparse.Namespace, command: list[str]) -> int:
+    from hybridvo.commands.generate import generate
+    from hybridvo.commands.progress import Progress
+
+    size = tuple(args.size) if args.size else None
+    with Progress(args.count, "generate", quiet=args.quiet, unit="samples") as progress:
+        sheet = generate(
+            args.preset,
+            args.count,
+            args.out,
+            seed=args.seed,
+            size=size,
+            workers=args.workers,
+            report=lambda done, total: progress.update(done, total=total),
+        )
+    _print(args, {"contact_sheet": str(sheet)}, str(sheet))
     return 0
 
 

@@ -199,7 +199,7 @@ class _Solver:
         if given is not None:
             end = torch.maximum(end, given[:, 0].detach())
         T = self._graduate(starts, end)
-        rival = self._rival_ratio(T, end)
+        own, rival = self._shares(T, end)
         T, noise = self._fit_subset(T, given)
         how = RobustNoise(noise, self.kernel, self.cutoff)
         curvature, meat = self._curvature(T, how)
@@ -214,8 +214,8 @@ class _Solver:
         usable = (weight > 0).sum(dim=1)
         lost = ratio < self.options.min_inlier_ratio
         failed = (usable < self.options.min_pixels) | ~definite | ~finite | lost
-        own = ratio.double().clamp(min=1e-6)
-        probability = torch.where(failed, 0.0, own**2 / (own**2 + rival.double() ** 2))
+        probability = own**2 / (own**2 + rival**2).clamp(min=1e-12)
+        probability = torch.where(failed, torch.zeros_like(own), probability)
         status = [
             status_of(
                 batch,
@@ -280,16 +280,22 @@ class _Solver:
             scale = torch.maximum(scale * GNC_RATIO, end)
         return T
 
-    def _rival_ratio(self, T: pp.LieTensor, end: torch.Tensor) -> torch.Tensor:
-        """(B,) share of the external weight that follows another motion and not this one."""
+    def _shares(self, T: pp.LieTensor, end: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """(B,) shares of the external weight that follow this motion, and another but not this.
+
+        Both within the same few pixels: a compromise between two motions explains neither, however
+        much noise is granted to it afterwards.
+        """
         pixels = self.planar
         own = linearize(pixels, T, self._isotropic(3 * end)).weights
         rest = replace(pixels, weight=pixels.weight * (own < 0.25))
         identity = pp.identity_SE3(len(T), dtype=T.dtype, device=T.device)
         other = self._shrink_scale(rest, identity, end)
         theirs = linearize(rest, other, self._isotropic(3 * end)).weights
-        follow = (rest.weight * (theirs > 0.25)).sum(dim=1)
-        return torch.nan_to_num(follow / pixels.weight.sum(dim=1).clamp(min=1e-30))
+        total = pixels.weight.double().sum(dim=1).clamp(min=1e-30)
+        found = ((pixels.weight, own), (rest.weight, theirs))
+        shares = [(w * (follow > 0.25)).double().sum(dim=1) / total for w, follow in found]
+        return torch.nan_to_num(shares[0]), torch.nan_to_num(shares[1])
 
     def _fit_subset(
         self, T: pp.LieTensor, given: torch.Tensor | None

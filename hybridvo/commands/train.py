@@ -1,0 +1,226 @@
+"""``hybridvo train``: PWVO and its baselines, and the selector.
+
+    hybridvo train pwvo --config configs/train_paper.yaml --out runs/paper
+    hybridvo train export --out runs/paper --export paper.safetensors
+    hybridvo train selector-data --data runs/selector_data --first-seed 1000000 --seeds 4096
+    hybridvo train selector --data runs/selector_data --out runs/selector --time-limit 50
+
+Started again with the same ``--out`` a training goes on where it was. Several processes or
+machines: ``torchrun --nproc-per-node 8 tools/train.py pwvo ...``. Seeds of selector-data below 1000
+are held out; ``--propose`` asks PWVO about all samples of a folder.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import dataclasses
+import json
+import math
+import os
+import shlex
+import signal
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit code (2: bad input, 5: output that cannot be written)."""
+    try:
+        args = _parse(argv)
+    except SystemExit as end:
+        return int(end.code or 0)
+    from hybridvo.errors import HybridVOError
+
+    command = "hybridvo train " + shlex.join(sys.argv[1:] if argv is None else argv)
+    try:
+        with _processes():
+            args.run(args, command)
+    except HybridVOError as error:
+        sys.stderr.write(f"hybridvo: {error}\n")
+        return error.exit_code
+    return 0
+
+
+def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        prog="hybridvo train",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    commands = parser.add_subparsers(required=True)
+    pwvo = commands.add_parser("pwvo", help="train a network of the paper")
+    selector = commands.add_parser("selector", help="train the selector")
+    for part, run in ((pwvo, _pwvo), (selector, _selector)):
+        add = part.add_argument
+        add("--out", type=Path, required=True, help="folder of the run; goes on where it was")
+        add("--time-limit", type=float, default=math.inf, metavar="MIN", help="minutes in all")
+        add("--threads", type=int, help="threads of torch; by default torch's own choice")
+        add("--overwrite", action="store_true", help="start anew where --out has a training")
+        add("--init", metavar="FILE", help="start from these weights: a file, or a shipped name")
+        part.set_defaults(run=run)
+    pwvo.add_argument("--config", type=Path, required=True, help="configs/train_*.yaml")
+    pwvo.add_argument("--workers", type=int, default=0, help="processes that draw samples")
+    pwvo.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda"))
+    for name, kind in (("steps", int), ("batch-size", int), ("seed", int)):
+        pwvo.add_argument(f"--{name}", type=kind, help="instead of the configuration's")
+    selector.add_argument("--config", type=Path, default=Path("configs/train_selector.yaml"))
+    selector.add_argument("--data", type=Path, required=True, help="folder of the shards")
+    selector.add_argument("--export", type=Path, metavar="FILE", help="write weights when done")
+    selector.add_argument("--held-out", type=Path, help="shards of held-out samples, for --export")
+    export = commands.add_parser("export", help="write a network's weights for users (float16)")
+    export.add_argument("--out", type=Path, required=True, help="folder of the run")
+    export.add_argument("--export", type=Path, required=True, metavar="FILE", help="*.safetensors")
+    export.add_argument("--count", type=int, default=1000, help="held-out pairs of each preset")
+    export.add_argument("--calibrate", type=int, default=0, metavar="N", help="shift s by N pairs")
+    export.set_defaults(run=_export)
+    data = commands.add_parser("selector-data", help="draw samples for the selector")
+    data.add_argument("--data", type=Path, required=True, help="folder of the shards")
+    data.add_argument("--first-seed", type=int, default=1_000_000, help="below 1000: held out")
+    data.add_argument("--seeds", type=int, default=0, help="about as many samples")
+    data.add_argument("--propose", metavar="NETWORK", help="ask these weights about the samples")
+    data.set_defaults(run=_selector_data)
+    return parser.parse_args(argv)
+
+
+@contextlib.contextmanager
+def _processes() -> Iterator[None]:
+    """The process group of torchrun, where it started us."""
+    if "RANK" not in os.environ:
+        yield
+        return
+    import torch
+    import torch.distributed as dist
+
+    if torch.cuda.is_available():
+        torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", "0")))
+    dist.init_process_group("nccl" if torch.cuda.is_available() else "gloo")
+    try:
+        yield
+    finally:
+        dist.destroy_process_group()
+
+
+def _pwvo(args: argparse.Namespace, command: str) -> None:
+    import torch
+
+    from hybridvo.training.options import load_pwvo_options
+    from hybridvo.training.pwvo_task import PwvoTask
+
+    options, mixture = load_pwvo_options(args.config)
+    names = ("steps", "batch_size", "seed")
+    changes = {n: getattr(args, n) for n in names if getattr(args, n) is not None}
+    options = dataclasses.replace(options, **changes)
+    device = args.device
+    if device == "auto":
+        device = "cuda" if torch.cuda.is_available() else "cpu"
+    _train(args, command, PwvoTask(options, mixture), device, args.workers)
+
+
+def _selector(args: argparse.Namespace, command: str) -> None:
+    from hybridvo.errors import InputError
+    from hybridvo.training.export import export_selector
+    from hybridvo.training.options import load_selector_options
+    from hybridvo.training.selector_task import SelectorTask
+
+    if args.export is not None and args.held_out is None:
+        raise InputError("--export: needs --held-out, samples for the figures of the card.")
+    task = SelectorTask(load_selector_options(args.config), args.data)
+    trainer = _train(args, command, task, "cpu", 0)
+    if args.export is not None:
+        card = export_selector(trainer, args.held_out, args.export)
+        print(json.dumps(card["held_out"], indent=1))
+
+
+def _train(args: argparse.Namespace, command: str, task: Any, device: str, workers: int) -> Any:
+    import cv2
+    import torch
+
+    from hybridvo.errors import InputError
+    from hybridvo.files import write_json
+    from hybridvo.network.weights import load_weights, pretrained, pretrained_names
+    from hybridvo.training.export import RUN
+    from hybridvo.training.provenance import source_commit
+    from hybridvo.training.trainer import CHECKPOINT, LOG, Trainer
+
+    if args.threads is not None:
+        if args.threads < 1:
+            raise InputError(f"--threads: expected 1 or more, got {args.threads}.")
+        torch.set_num_threads(args.threads)
+    cv2.setNumThreads(0)  # samples are small: threads inside OpenCV cost more than they give
+    args.out.mkdir(parents=True, exist_ok=True)
+    if args.overwrite:
+        for name in (CHECKPOINT, LOG, RUN):
+            (args.out / name).unlink(missing_ok=True)
+    trainer = Trainer(task, args.out, device, workers, report=_report)
+    if trainer.resume():
+        _say(trainer, f"goes on at update {trainer.step}")
+    else:
+        if args.init is not None:
+            path = pretrained(args.init) if args.init in pretrained_names() else args.init
+            trainer.start_from(load_weights(path)[0].state_dict(), str(path))
+        if trainer.rank == 0:
+            about = {"command": command, "commit": source_commit(), "torch": torch.__version__}
+            write_json(args.out / RUN, about)
+    with _clean_stop(trainer):
+        why = trainer.run(60 * args.time_limit)
+    _say(trainer, f"ended by {why} at update {trainer.step}, {trainer.samples} samples")
+    return trainer
+
+
+@contextlib.contextmanager
+def _clean_stop(trainer: Any) -> Iterator[None]:
+    """The signals that ask to stop end the run after the update at hand, with a checkpoint."""
+
+    def request(number: int, frame: object) -> None:
+        trainer.stop_requested = True
+
+    before = {s: signal.signal(s, request) for s in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _export(args: argparse.Namespace, command: str) -> None:
+    from hybridvo.training.export import export_pwvo
+
+    card = export_pwvo(args.out, args.export, args.count, args.calibrate)
+    print(json.dumps({"file": str(args.export), "held_out": card["held_out"]}, indent=1))
+
+
+def _selector_data(args: argparse.Namespace, command: str) -> None:
+    from hybridvo.errors import InputError
+    from hybridvo.network.weights import load_weights, pretrained, pretrained_names
+    from hybridvo.training.selector_data import PER_SHARD, write_shard
+    from hybridvo.training.selector_proposals import write_proposals
+
+    if args.first_seed < 0 or args.seeds < 0:
+        raise InputError(f"expected --first-seed and --seeds >= 0, got {args.first_seed}.")
+    args.data.mkdir(parents=True, exist_ok=True)
+    for seed in range(args.first_seed, args.first_seed + args.seeds, PER_SHARD):
+        print(f"seeds from {seed}: {write_shard(args.data, seed)} samples", flush=True)
+    if args.propose is not None:
+        known = args.propose in pretrained_names()
+        path = pretrained(args.propose) if known else args.propose
+        print(f"asked about {write_proposals(args.data, load_weights(path)[0])} samples")
+
+
+def _report(entry: dict[str, Any]) -> None:
+    """One line a log entry on stderr."""
+    numbers = ((k, v) for k, v in entry.items() if isinstance(v, int | float))
+    line = " ".join(f"{key}={value:.5g}" for key, value in numbers)
+    for name, result in entry.get("results", {}).items():
+        figures = " ".join(f"{k}={v:.4g}" for k, v in result.items() if isinstance(v, float))
+        line += f"\n  {name}: {figures}"
+    sys.stderr.write(line + "\n")
+
+
+def _say(trainer: Any, text: str) -> None:
+    if trainer.rank == 0:
+        sys.stderr.write(text + "\n")
