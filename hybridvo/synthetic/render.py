@@ -203,7 +203,7 @@ class SyntheticSequence(Sequence):
     flow_is_true = True
 
     @property
-    def root(self) -> Path:
+    def root(self) -> Path:  # type: ignore[override]
         """There is no folder; the name stands for it."""
         return Path(self.name)
 
@@ -218,7 +218,7 @@ class SyntheticSequence(Sequence):
         return self.scene.T_world_cam
 
     @property
-    def warnings(self) -> tuple[str, ...]:  # type: ignore[override]
+    def warnings(self) -> tuple[str, ...]:
         """Nothing was mended."""
         return ()
 
