@@ -71,12 +71,7 @@ class Calibration:
 
 
 class Lens:
-    """Remaps images of a distorted camera to a pinhole camera with the same intrinsics.
-
-    Args:
-        camera: intrinsics of the distorted and of the resulting image.
-        distortion: Brown coefficients, as OpenCV orders them.
-    """
+    """Remaps images with Brown distortion to a pinhole camera with the same intrinsics."""
 
     def __init__(self, camera: Camera, distortion: tuple[float, ...]) -> None:
         size = (camera.width, camera.height)
@@ -99,11 +94,7 @@ class Lens:
 def parse_camera(
     camera: str | os.PathLike[str] | Camera | Calibration, shape: tuple[int, int]
 ) -> Calibration:
-    """Calibration that a user gives: ``fx,fy,cx,cy`` in pixels, a camera file, or a camera.
-
-    Args:
-        camera: see above; files as :func:`read_camera_file` reads them.
-        shape: (height, width) of the images, for intrinsics that come without.
+    """Calibration that a user gives: ``fx,fy,cx,cy`` for images of a shape, a file, or a camera.
 
     Raises:
         InputError: neither numbers nor a file. FormatError: a damaged file.
@@ -134,7 +125,7 @@ def read_camera_file(path: Path) -> Calibration:
         FormatError: not YAML, a key that is missing or unknown, a value that cannot be.
         FileNotFoundError: no such file.
     """
-    text = read_text(path, limit=MAX_FILE_BYTES).rstrip().removesuffix("---")  # as ROS prints it
+    text = read_text(path, limit=MAX_FILE_BYTES).removesuffix("---\n")  # as ROS prints it
     content = parse_yaml(text, str(path))
     if not isinstance(content, dict):
         raise FormatError(f"{path}: expected 'key: value' lines, got a {type(content).__name__}.")
@@ -173,9 +164,6 @@ def units_per_metre(scale: float | None, where: str) -> tuple[float | None, list
 
     A value below 1 is RealSense's number of the same name, metres per unit: no depth is stored in
     units longer than a metre.
-
-    Raises:
-        InputError: not a finite number above 0.
     """
     if scale is None:
         return None, []
@@ -191,11 +179,7 @@ def units_per_metre(scale: float | None, where: str) -> tuple[float | None, list
 
 
 def write_camera_template(directory: str | os.PathLike[str]) -> Path:
-    """Write a ``camera.yaml`` to fill in; the image size is filled in where rgb/ has an image.
-
-    Raises:
-        InputError: there is one already. OutputError: it cannot be written.
-    """
+    """Write a ``camera.yaml`` to fill in, with the image size where rgb/ has an image."""
     folder = Path(directory)
     path = folder / CAMERA_FILE
     if path.exists():

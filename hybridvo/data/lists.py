@@ -38,11 +38,7 @@ def natural_key(path: Path) -> list[str | int]:
 
 
 def sorted_files(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
-    """Files of a folder with one of the suffixes, in natural order; empty if there is no folder.
-
-    Raises:
-        InputError: files whose names differ in the ending alone: frames would be read twice.
-    """
+    """Files of a folder with one of the suffixes, in natural order; empty if there is no folder."""
     if not folder.is_dir():
         return []
     found = [p for p in folder.iterdir() if p.suffix.lower() in suffixes and p.is_file()]
@@ -51,11 +47,7 @@ def sorted_files(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
 
 
 def numbered_files(folder: Path | None, pattern: str) -> dict[int, Path]:
-    """Files whose whole name matches a regular expression, by the number in its first group.
-
-    Raises:
-        InputError: two files of one number.
-    """
+    """Files whose whole name matches a regular expression, by the number in its first group."""
     if folder is None or not folder.is_dir():
         return {}
     names = ((path, re.fullmatch(pattern, path.name)) for path in sorted(folder.iterdir()))
@@ -98,23 +90,16 @@ def shown(names: Many[object], most: int = 8) -> str:
 
 
 def listed_path(root: Path, name: str, where: str) -> Path:
-    """Path of a file that a list names, below the sequence's own folder.
-
-    Raises:
-        FormatError: an absolute name, one with ``..``, or no file name.
-    """
+    """Path of a file that a list names: below the sequence's own folder, else FormatError."""
     if PurePath(name).is_absolute() or ".." in PurePath(name).parts or "\0" in name:
         raise FormatError(f"{where}: expected a file below {root}, got {name[:200]!r}.")
     return root / name
 
 
 def read_rows(path: Path, columns: str, *, words: int = 0) -> list[Row]:
-    """Rows of a list file: numbers, then ``words`` columns of text; ``#`` starts a comment line.
+    """Rows of a list file: a number for each of ``columns``, the last ``words`` of them text.
 
-    Args:
-        path: file to read.
-        columns: names of the columns; their number is what a row must have.
-        words: how many of the last columns are text (the last may contain spaces).
+    ``#`` starts a comment line; the last word may contain spaces.
 
     Raises:
         FormatError: a row of another length or a number that cannot be read, with its line.
@@ -146,11 +131,7 @@ def to_seconds(stamps: Many[float] | np.ndarray, name: str) -> tuple[np.ndarray,
 
 
 def check_increasing(stamps: np.ndarray, where: str) -> None:
-    """Refuse stamps that are not finite, go back or stand still.
-
-    Raises:
-        InputError: with the frames and their stamps.
-    """
+    """Refuse stamps that are not finite, go back or stand still: InputError with the frames."""
     if not np.isfinite(stamps).all():
         bad = int(np.flatnonzero(~np.isfinite(stamps))[0])
         raise InputError(f"{where}: expected a finite timestamp, frame {bad} has {stamps[bad]}.")
