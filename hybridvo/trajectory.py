@@ -233,11 +233,7 @@ class Trajectory:
 
 
 def write_tum(trajectory: Trajectory, path: str | os.PathLike[str]) -> None:
-    """Write ``timestamp tx ty tz qx qy qz qw`` lines (camera to world, xyzw) through evo.
-
-    Raises:
-        OutputError: the file cannot be written; an older file at ``path`` is then unchanged.
-    """
+    """Write ``timestamp tx ty tz qx qy qz qw`` lines (camera to world), see ``Trajectory.save``."""
     # imported when used: evo takes a second
     from evo.core.trajectory import PoseTrajectory3D
     from evo.tools.file_interface import write_tum_trajectory_file
@@ -252,11 +248,7 @@ def write_tum(trajectory: Trajectory, path: str | os.PathLike[str]) -> None:
 
 
 def write_kitti(trajectory: Trajectory, path: str | os.PathLike[str]) -> None:
-    """Write the first three rows of each camera-to-world pose, 12 numbers a line, through evo.
-
-    Raises:
-        OutputError: the file cannot be written; an older file at ``path`` is then unchanged.
-    """
+    """Write the first three rows of each camera-to-world pose, see ``Trajectory.save``."""
     from evo.core.trajectory import PosePath3D
     from evo.tools.file_interface import write_kitti_poses_file
 

@@ -20,7 +20,6 @@ import math
 import os
 import shlex
 import signal
-import subprocess
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -145,6 +144,7 @@ def _train(args: argparse.Namespace, command: str, task: Any, device: str, worke
     from hybridvo.files import write_json
     from hybridvo.network.weights import load_weights, pretrained, pretrained_names
     from hybridvo.training.export import RUN
+    from hybridvo.training.provenance import source_commit
     from hybridvo.training.trainer import CHECKPOINT, LOG, Trainer
 
     if args.threads is not None:
@@ -164,7 +164,7 @@ def _train(args: argparse.Namespace, command: str, task: Any, device: str, worke
             path = pretrained(args.init) if args.init in pretrained_names() else args.init
             trainer.start_from(load_weights(path)[0].state_dict(), str(path))
         if trainer.rank == 0:
-            about = {"command": command, "commit": _commit(), "torch": torch.__version__}
+            about = {"command": command, "commit": source_commit(), "torch": torch.__version__}
             write_json(args.out / RUN, about)
     with _clean_stop(trainer):
         why = trainer.run(60 * args.time_limit)
@@ -209,13 +209,6 @@ def _selector_data(args: argparse.Namespace, command: str) -> None:
         known = args.propose in pretrained_names()
         path = pretrained(args.propose) if known else args.propose
         print(f"asked about {write_proposals(args.data, load_weights(path)[0])} samples")
-
-
-def _commit() -> str | None:
-    """Commit of the working tree, marked if it was changed; None outside of a repository."""
-    ask = ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude", "*"]
-    done = subprocess.run(ask, cwd=ROOT, capture_output=True, text=True, check=False)
-    return done.stdout.strip() or None
 
 
 def _report(entry: dict[str, Any]) -> None:

@@ -192,10 +192,11 @@ def write_camera_template(directory: str | os.PathLike[str]) -> Path:
     return path
 
 
-def _four_numbers(camera: str | os.PathLike[str]) -> list[float] | None:
+def _four_numbers(camera: str | os.PathLike[str]) -> tuple[float, float, float, float] | None:
     parts = os.fspath(camera).split(",")
     try:
-        return [float(part) for part in parts] if len(parts) == 4 else None
+        fx, fy, cx, cy = (float(part) for part in parts)
+        return fx, fy, cx, cy
     except ValueError:
         return None
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,6 @@ from hybridvo.trajectory import Trajectory
 # Okabe and Ito's palette without yellow: told apart by colour-blind readers, in print too
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 _STYLES = ("-", "--", "-.", ":")
-_MARKERS = ("o", "s", "D", "^", "v", "P", "X")
 _TRUTH_COLOUR = "#222222"
 _GRID_COLOUR = "#e4e4e4"
 _FORMATS = (".png", ".pdf", ".svg")
@@ -140,12 +139,12 @@ def plot_trajectories(
     if errors:
         axes = figure.add_subplot(grid[1, :])
         timed = truth is not None and truth.has_timestamps
-        largest = max(float(np.max(error.translation)) for error, _ in errors)  # type: ignore[arg-type]
+        largest = max(float(np.max(error.translation)) for error, _ in errors)
         unit, factor = ("m", 1.0) if largest >= 1.0 else ("cm", 100.0)
         _style(axes, "Position error", "time [s]" if timed else "frame", f"error [{unit}]")
         start_time = truth.timestamps[0] if truth is not None and timed else 0.0
         for error, style in errors:
-            axes.plot(error.timestamps - start_time, error.translation * factor, **style)  # type: ignore[operator]
+            axes.plot(error.timestamps - start_time, error.translation * factor, **style)
         axes.set_ylim(bottom=0.0)
         axes.margins(x=0.01)
     handles = [figure.axes[0].lines[i] for i in range(len(drawn))]
@@ -162,114 +161,6 @@ def plot_trajectories(
         title = title.encode("utf-8", "replace").decode("utf-8")
         figure.suptitle(title, fontsize=11, parse_math=False)
     _save(figure, path)
-
-
-def plot_benchmark(
-    summary: Mapping[str, Mapping[str, Mapping[str, Any]]],
-    path: str | os.PathLike[str],
-    *,
-    time_cell: str = "moving30",
-) -> None:
-    """Draw the error of every method in every cell, and the time of one cell.
-
-    Points are medians, bars reach from the lower to the upper quartile, both axes of figures are
-    logarithmic; what is zero stands at the lower edge.
-
-    Args:
-        summary: ``summary[cell][method]`` with ``epe_px`` and ``ms``, each a mapping with
-            ``median``, ``q25`` and ``q75``; every cell has the same methods.
-        path: picture to write: .png, .pdf or .svg.
-        time_cell: the cell whose time is drawn; where absent, the first one.
-
-    Raises:
-        InputError: no cell, no method, cells with different methods, or another kind of file.
-        OutputError: it cannot be written.
-    """
-    methods = list(next(iter(summary.values()), {}))
-    if not methods:
-        raise InputError("plot_benchmark: expected at least one cell with one method, got none.")
-    for cell, rows in summary.items():
-        if set(rows) != set(methods):
-            raise InputError(
-                f"plot_benchmark: cell {cell!r}: expected the methods {', '.join(methods)}, "
-                f"got {', '.join(rows)}."
-            )
-    path = Path(path)
-    _check_format(path)
-    cells = list(summary)
-    timed = time_cell if time_cell in summary else cells[0]
-    figure = Figure(figsize=(4.2 + 0.72 * max(len(cells), 6), 5.0), dpi=130, layout="constrained")
-    FigureCanvasAgg(figure)
-    widths = [0.72 * max(len(cells), 6), 3.0]
-    left, right = figure.subplots(1, 2, width_ratios=widths)
-
-    _style(left, "Error of the ego flow over true depth", "", "EPE [px]")
-    errors = [summary[c][m]["epe_px"] for c in cells for m in methods]
-    floor = _log_axis(left.set_yscale, left.set_ylim, errors)
-    spacing = 0.8 / len(methods)
-    colours = (*_COLOURS, "#777777")
-    handles = []
-    for k, method in enumerate(methods):
-        quartiles = [summary[cell][method]["epe_px"] for cell in cells]
-        low, middle, high = (
-            np.maximum([row[key] for row in quartiles], floor) for key in ("q25", "median", "q75")
-        )
-        x = np.arange(len(cells)) + (k - (len(methods) - 1) / 2) * spacing
-        handles.append(
-            left.errorbar(
-                x, middle, np.stack([middle - low, high - middle]), color=colours[k % len(colours)],
-                marker=_MARKERS[k % len(_MARKERS)], markersize=4.5, linestyle="none",
-                elinewidth=1.0, clip_on=False,
-            )
-        )  # fmt: skip
-    # shading tells the cells apart where many methods stand side by side
-    for k in range(0, len(cells), 2):
-        left.axvspan(k - 0.5, k + 0.5, color="#f5f5f5", zorder=0, linewidth=0)
-    left.axhline(1.0, color=_TRUTH_COLOUR, linewidth=0.8, linestyle=":")
-    left.grid(visible=False, axis="x")
-    left.set_xlim(-0.5, len(cells) - 0.5)
-    left.set_xticks(range(len(cells)), cells, rotation=40, ha="right", fontsize=8)
-
-    _style(right, f"Time, {timed}", "ms per pair", "")
-    times = [summary[timed][method]["ms"] for method in methods]
-    floor = _log_axis(right.set_xscale, right.set_xlim, times)
-    for k, row in enumerate(times):
-        low, middle, high = (max(row[key], floor) for key in ("q25", "median", "q75"))
-        right.errorbar(
-            middle, k, xerr=[[middle - low], [high - middle]], color=colours[k % len(colours)],
-            marker=_MARKERS[k % len(_MARKERS)], markersize=5, elinewidth=1.2, clip_on=False,
-        )  # fmt: skip
-        right.annotate(
-            f"{row['median']:.2g}" if row["median"] < 10 else f"{row['median']:.0f}",
-            (middle, k), xytext=(0, 6), textcoords="offset points", ha="center", fontsize=8,
-        )  # fmt: skip
-    right.set_yticks(range(len(methods)), methods, fontsize=8)
-    right.set_ylim(len(methods) - 0.5, -0.7)  # the first method on top
-    figure.legend(
-        handles,
-        methods,
-        loc="outside lower center",
-        ncols=min(len(methods), 6),
-        frameon=False,
-        fontsize=9,
-    )
-    _save(figure, path)
-
-
-def _log_axis(
-    set_scale: Callable[[str], Any],
-    set_limits: Callable[[float, float], Any],
-    rows: Sequence[Mapping[str, float]],
-) -> float:
-    """Make an axis logarithmic over the quartiles of the rows; returns its lower end."""
-    values = np.array([[row[key] for key in ("q25", "median", "q75")] for row in rows])
-    positive = values[np.isfinite(values) & (values > 0)]
-    top = float(positive.max()) if positive.size else 1.0
-    # an error that is zero but for rounding must not squeeze all the others together
-    bottom = max(float(positive.min()) if positive.size else 0.1, top * 1e-6)
-    set_scale("log")
-    set_limits(bottom / 1.5, top * 1.8)
-    return bottom / 1.5
 
 
 def _check_format(path: Path) -> None:

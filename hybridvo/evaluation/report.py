@@ -24,11 +24,6 @@ from hybridvo.evaluation.charts import (
     path_charts,
     time_chart,
 )
-from hybridvo.evaluation.tables import jsonable as jsonable  # until its readers have moved
-from hybridvo.evaluation.tables import table_text as table_text
-from hybridvo.evaluation.tables import to_json as to_json
-from hybridvo.evaluation.tables import write_csv as write_csv
-from hybridvo.evaluation.tables import write_json as write_json
 from hybridvo.files import atomic_write
 
 MISSING = "-"
