@@ -9,12 +9,10 @@ from __future__ import annotations
 
 import contextlib
 import difflib
-import functools
 import hashlib
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
@@ -25,7 +23,8 @@ from hybridvo.errors import CheckpointError, InputError
 from hybridvo.flow import contradiction
 from hybridvo.geometry import ego_flow, se3_exp
 from hybridvo.hypotheses.generate import HypothesisSet, generate
-from hybridvo.hypotheses.selector import CueSelector, MaskSelector, Scorer, Selection, Selector
+from hybridvo.hypotheses.selector import CueSelector, MaskSelector, Selection, Selector
+from hybridvo.network.models import Models, default_models, one_thread
 from hybridvo.options import Options
 from hybridvo.refinement import refine as stage
 from hybridvo.refinement.photometric import refine_photometric
@@ -39,119 +38,14 @@ from hybridvo.types import (
     Reason,
     RelativePose,
 )
+from hybridvo.units import depth_advice, typical_depth
 
 if TYPE_CHECKING:
-    import torch
-
     from hybridvo.refinement.batch import BatchedPose
 
 DEFAULT_METHOD = "hybrid"
-MAX_METRES = 100.0
-"""Median depth above which depth is suspected to be in millimetres."""
 WARM_UP_SIZES = ((48, 64), (320, 400))
 """Height and width of the pairs of :func:`warm_up`; the second takes the parallel kernels."""
-
-
-class Models:
-    """Networks by name, read on first use.
-
-    Args:
-        device: ``cpu``, ``cuda``, or ``auto`` for cuda where there is one.
-        weights: files to be read instead of the pretrained weights of a name.
-
-    Raises:
-        InputError: a device that is not there.
-    """
-
-    def __init__(
-        self, device: str = "cpu", weights: Mapping[str, str | Path] | None = None
-    ) -> None:
-        self.device = torch_device(device)
-        self.weights = {name: Path(file) for name, file in (weights or {}).items()}
-        self._networks: dict[str, Any] = {}
-
-    def path(self, name: str) -> Path:
-        """File of the weights of a network.
-
-        Raises:
-            CheckpointError: there are none (the message lists those known).
-        """
-        from hybridvo.network.weights import pretrained
-
-        return self.weights.get(name) or pretrained(name)
-
-    def network(self, name: str) -> torch.nn.Module:
-        """A network, in the form that is fastest on its device.
-
-        Raises:
-            CheckpointError: no such weights, or damaged ones.
-        """
-        import torch
-
-        from hybridvo.network.weights import load_weights
-
-        if name not in self._networks:
-            network = load_weights(self.path(name))[0].eval().to(self.device)
-            self._networks[name] = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        return self._networks[name]
-
-    def scorer(self) -> Scorer:
-        """The selector network.
-
-        Raises:
-            CheckpointError: no such weights, weights of another network, or damaged ones.
-        """
-        from hybridvo.network.judge import JudgeNetwork
-        from hybridvo.network.scorer import NetworkScorer
-
-        network = self.network("judge")
-        if not isinstance(network, JudgeNetwork):
-            raise CheckpointError(
-                f"{self.path('judge')}: expected the weights of a selector, got another network's."
-            )
-        return NetworkScorer(network, self.device)
-
-
-@functools.cache
-def default_models(device: str = "cpu") -> Models:
-    """The pretrained networks, shared by all estimates of a process."""
-    return Models(device)
-
-
-@contextlib.contextmanager
-def one_thread() -> Iterator[None]:
-    """Run torch's CPU kernels on one thread, and as before afterwards.
-
-    A pair at 128x256 is too little work for several threads, which wait for each other: on a busy
-    machine that takes ten times as long.
-    """
-    import torch
-
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
-
-
-def torch_device(device: str) -> str:
-    """``cpu`` or ``cuda`` for a device asked for.
-
-    Raises:
-        InputError: ``cuda`` on a machine, or with a build of torch, that has none.
-    """
-    if device == "cpu":
-        return device
-    import torch
-
-    if torch.cuda.is_available():
-        return "cuda"
-    if device == "cuda":
-        raise InputError(
-            "device cuda: this machine, or this build of torch, has no CUDA device; use cpu."
-        )
-    return "cpu"
 
 
 @dataclass(frozen=True, eq=False)
@@ -329,14 +223,6 @@ def check_method(method: str, models: Models | None = None) -> None:
         raise InputError(f"method '{method}' cannot run here: {absent[method]}.")
 
 
-@overload
-def estimate(pair: FramePair, /, **options: Any) -> RelativePose: ...
-
-
-@overload
-def estimate(prev: Frame, curr: Frame, /, **options: Any) -> RelativePose: ...
-
-
 def estimate(
     pair: FramePair | Frame,
     curr: Frame | None = None,
@@ -431,17 +317,12 @@ def _pair_of(prev: Any, curr: Any, options: Options) -> FramePair:
 
 
 def _depth_doubt(pair: FramePair) -> str:
-    """A sentence where depth looks as if it were in millimetres; empty where it does not."""
-    if pair.prev.depth is None:
+    """A sentence where depth is hardly in metres; empty where it can be."""
+    median = None if pair.prev.depth is None else typical_depth(pair.prev.depth[::8, ::8])
+    advice = "" if median is None else depth_advice(median)
+    if not advice:
         return ""
-    depth = pair.prev.depth[::8, ::8]
-    depth = depth[np.isfinite(depth) & (depth > 0)].astype(np.float64)
-    if depth.size == 0 or np.median(depth) <= MAX_METRES:
-        return ""
-    return (
-        f"the median depth is {np.median(depth):.0f} m, and the motion as much too large if that "
-        f"is millimetres: Frame.depth expects metres"
-    )
+    return f"the median depth is {median:.4g}; Frame.depth expects metres: {advice}"
 
 
 @overload
