@@ -16,7 +16,6 @@ from hybridvo.network.selection import SHARPNESS, NetworkOutput, select_motion
 from hybridvo.torch_geometry import left_update, pp, se3
 from hybridvo.types import PixelwisePrediction
 
-ITERATIONS = 6
 CUTOFF = 1.5
 """Scale of the robust kernel in weighted medians of the residual."""
 MIN_SCALE = 1e-4
@@ -95,6 +94,7 @@ def weighted_fit(
     target: torch.Tensor,
     weights: torch.Tensor,
     T_start: torch.Tensor,
+    iterations: int = 6,
 ) -> torch.Tensor:
     """Motion that maps rays onto targets best under given weights, by robust Gauss-Newton.
 
@@ -104,6 +104,7 @@ def weighted_fit(
         target: (B, 2, N) ray plus flow in the current camera, over its focal lengths.
         weights: (B, N), 0 where flow or depth is missing.
         T_start: (B, 4, 4) T_curr_prev.
+        iterations: steps of Gauss-Newton.
 
     Returns:
         (B, 4, 4). Its gradient goes into the weights alone, through the pull of the pixels at the
@@ -122,7 +123,7 @@ def weighted_fit(
         T = start = se3(T_start.detach().to(number))
         with torch.no_grad():
             step, first = _step(*pixels, weights, T)
-            for _ in range(ITERATIONS):
+            for _ in range(iterations):
                 T = left_update(step, T)
                 step, last = _step(*pixels, weights, T)
             good = torch.isfinite(T.tensor()).all(dim=1) & (last <= first)
