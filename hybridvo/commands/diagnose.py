@@ -16,11 +16,11 @@ import numpy as np
 
 from hybridvo.commands.inputs import is_dark
 from hybridvo.data.sequence import Sequence
-from hybridvo.depth_steps import depth_ratio, is_step
 from hybridvo.errors import FormatError, InputError
 from hybridvo.flow import contradiction, dis_flow, file_flow
 from hybridvo.geometry import ego_flow, invert
 from hybridvo.pipeline import estimate
+from hybridvo.refinement.depth_agreement import depth_ratio, is_step
 from hybridvo.types import Frame, FramePair, RelativePose
 from hybridvo.units import depth_advice, typical_depth
 
