@@ -110,7 +110,7 @@ def run(
     with RunFolder(out, identity, header, mode) as folder, contextlib.ExitStack() as stack:
         if folder.finished:
             summary = folder.read_json(STATE)["summary"]
-            summary |= {"state": "done", "metrics": folder.read_json("metrics.json")}
+            summary |= {"state": "done", "metrics": folder.read_json("metrics.json") or None}
             return RunResult(_exit_code(summary, options), summary)
         recording = None
         if rrd is not None:
@@ -118,7 +118,7 @@ def run(
             recording = Recording(
                 rrd or out / RECORDING,
                 sequence.name,
-                identity["input_hash"],
+                str(identity["input_hash"]),
                 len(frames),
                 first=len(folder.rows),
                 poses=poses,
@@ -188,7 +188,9 @@ class _Job:
             ms = 1e3 * (time.perf_counter() - started)
         row = self._row(step, prev, frame, ms)
         if frame is not None and self.recording is not None:
-            self.recording.add(frame, step, self.flow.field and self.flow.field.flow)
+            self.recording.add(
+                frame, step, None if self.flow.field is None else self.flow.field.flow
+            )
         if row["status"] != "ok":
             text = f"frame {index}: {row['status']} ({row['reason']}), probability "
             progress.say(f"{text}{row['probability']:.2f}: {row['message']}")
@@ -199,12 +201,13 @@ class _Job:
     ) -> dict[str, Any]:
         """What is kept of a frame, JSON-ready: the columns of ``steps.csv`` and more."""
         motion, field = step.motion, self.flow.field
+        flow = None if field is None else field.flow
         message = " ".join(step.status.message.split())
         if frame is not None and not step.ok and is_dark(frame.rgb):
             message = f"the image is dark; {message}"
         ratio = None
         if prev is not None and frame is not None and step.status.state is not State.FAILED:
-            ratio = depth_ratio(prev, frame, field and field.flow, step.T_curr_prev)
+            ratio = depth_ratio(prev, frame, flow, step.T_curr_prev)
         values = [*motion.T_curr_prev[:3, 3].tolist(), *se3_log(motion.T_curr_prev)[3:].tolist()]
         return {
             "index": step.index,
@@ -225,7 +228,7 @@ class _Job:
             "T_curr_prev": motion.T_curr_prev.tolist(),
             "T_world_cam": step.T_world_cam.tolist(),
             "covariance": motion.covariance.tolist(),
-            "flow_is_true": field is not None and field.flow is not None and field.is_true,
+            "flow_is_true": flow is not None and field is not None and field.is_true,
             "errors": self._errors(prev, step),
             "depth_ratio": ratio,
         }

@@ -108,7 +108,7 @@ class RunFolder:
             self._load()
             if self.finished:
                 return
-        elif present and "identity" not in (self.read_json(STATE) or {}):
+        elif present and "identity" not in self.read_json(STATE):
             raise InputError(
                 f"{self.path}: holds {', '.join(present[:3])} and no {STATE} of a run: not "
                 f"replaced. Move the files away, or choose another --out."
@@ -122,7 +122,7 @@ class RunFolder:
 
     def _load(self) -> None:
         """Rows and tracker of an earlier run of the same identity."""
-        state = self.read_json(STATE) or {}
+        state = self.read_json(STATE)
         if "identity" not in state:
             raise InputError(
                 f"{self.path / STATE}: cannot be read, so the run cannot be resumed. "
@@ -148,12 +148,13 @@ class RunFolder:
                 f"resumed. Pass --overwrite to start anew."
             ) from None
 
-    def read_json(self, name: str) -> Any:
-        """Content of a JSON file of the folder; None where it is absent or damaged."""
+    def read_json(self, name: str) -> dict[str, Any]:
+        """Content of a JSON file of the folder; empty where it is absent or damaged."""
         try:
-            return json.loads((self.path / name).read_text(encoding="utf-8"))
+            content = json.loads((self.path / name).read_text(encoding="utf-8"))
         except (OSError, ValueError):
-            return None
+            return {}
+        return content if isinstance(content, dict) else {}
 
     def append(self, row: dict[str, Any]) -> None:
         """Keep the row of a finished frame, and write its line of ``steps.csv``.
@@ -177,8 +178,9 @@ class RunFolder:
     def save_checkpoint(self, tracker: Mapping[str, np.ndarray]) -> None:
         """Keep the rows and the tracker's state after them."""
         rows = np.frombuffer(json.dumps(self.rows).encode(), np.uint8)
+        content: dict[str, Any] = {"rows": rows, **tracker}
         with atomic_write(self.path / CHECKPOINT, "wb") as file:
-            np.savez(file, rows=rows, **tracker)
+            np.savez(file, **content)
 
     def write_state(self, state: str, **more: Any) -> None:
         """Write ``run.json``; ``state`` is ``running``, ``interrupted`` or ``done``."""
