@@ -19,7 +19,7 @@ from hybridvo.trajectory import Trajectory
 Row = Mapping[str, Any]
 
 
-def write_motions(folder: Path, rows: list[Row]) -> Trajectory:
+def write_motions(folder: Path, rows: list[dict[str, Any]]) -> Trajectory:
     """Write both trajectories and ``steps.npz`` (motions with their covariances)."""
     stamps = np.array([row["timestamp"] for row in rows])
     trajectory = Trajectory(stamps, np.array([row["T_world_cam"] for row in rows]))
@@ -79,7 +79,7 @@ def summarise(rows: list[dict[str, Any]], sequence: Sequence, method: str) -> di
 
 def write_metrics(
     folder: Path,
-    rows: list[Row],
+    rows: list[dict[str, Any]],
     trajectory: Trajectory,
     gt: Trajectory,
     summary: Row,
