@@ -97,7 +97,13 @@ class Sequence:
         self.warnings += told
         self._camera = self._lens = None
         if calibration is not None:
-            self._camera = self._checked(calibration.camera)
+            self._camera = camera = calibration.camera
+            if camera.shape != (self.height, self.width):
+                raise InputError(
+                    f"{root}: images are {self.width}x{self.height}, the camera is for "
+                    f"{camera.width}x{camera.height} pixels. Intrinsics belong to one image size: "
+                    f"give those of these images (--camera fx,fy,cx,cy or --camera FILE)."
+                )
             self.warnings += calibration.warnings
             if any(calibration.distortion):
                 self._lens = Lens(calibration.camera, calibration.distortion)
@@ -214,16 +220,6 @@ class Sequence:
     def _depth_variance(self, depth: np.ndarray) -> np.ndarray | None:
         """Variance of log depth, where the source allows to state one."""
         return None
-
-    def _checked(self, camera: Camera) -> Camera:
-        """Camera whose size must be that of the images."""
-        if camera.shape != (self.height, self.width):
-            raise InputError(
-                f"{self.root}: images are {self.width}x{self.height}, the camera is for "
-                f"{camera.width}x{camera.height} pixels. Intrinsics belong to one image size: "
-                f"give those of these images (--camera fx,fy,cx,cy or --camera FILE)."
-            )
-        return camera
 
     def _check_shape(self, array: np.ndarray, path: Path, what: str) -> None:
         if array.shape[:2] != (self.height, self.width):
