@@ -167,7 +167,7 @@ def evaluate(
     }
     reasons: dict[str, str] = {}
 
-    def put(key: str, value: float | None, reason: str) -> None:
+    def put(key: str, value: Any, reason: str) -> None:
         report[key] = value
         if value is None:
             reasons[key] = reason

@@ -11,6 +11,7 @@ import torch
 import hybridvo as hvo
 from hybridvo import torch_geometry
 from hybridvo.synthetic.scenarios import make_pair
+from hybridvo.types import PixelwisePrediction
 
 SIZE = (120, 160)
 
@@ -66,7 +67,7 @@ def test_gradients_reach_flow_depth_weights_and_maps(pairs) -> None:
     def loss(flow, depth_prev, log_scale_rotation):
         changed = hvo.PairBatch(flow, depth_prev, batch.K_prev, batch.K_curr)
         seed = hvo.select(
-            hvo.PixelwisePrediction(
+            PixelwisePrediction(
                 maps.rotation, maps.translation, log_scale_rotation, maps.log_scale_translation,
                 maps.image_size,
             )
