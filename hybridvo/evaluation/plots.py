@@ -16,7 +16,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from hybridvo.errors import InputError
-from hybridvo.evaluation.trajectory_errors import Alignment, TrajectoryError, ate
+from hybridvo.evaluation.metrics import Alignment, TrajectoryError, ate
 from hybridvo.files import atomic_write
 from hybridvo.geometry import invert
 from hybridvo.trajectory import Trajectory
@@ -86,7 +86,7 @@ def plot_trajectories(
         trajectories: name to trajectory, at least one.
         path: picture to write: .png, .pdf or .svg.
         truth: true trajectory, or None.
-        alignment: see :func:`hybridvo.evaluation.trajectory_errors.ate`.
+        alignment: see :func:`hybridvo.evaluation.metrics.ate`.
         title: line above the picture.
 
     Raises:

@@ -4,13 +4,13 @@ import csv
 import json
 import shutil
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import filelock
 import numpy as np
 import pytest
 
+from hybridvo.cli import main
 from hybridvo.data.sequence import open_sequence
 from hybridvo.errors import InputError, LockedError
 from hybridvo.evaluation.comparison import WRITTEN, ComparisonOptions, compare
@@ -21,7 +21,6 @@ from hybridvo.pipeline import METHODS, Models, weights_hash
 from hybridvo.synthetic.render import make_scene, write_sintel
 from hybridvo.trajectory import read_trajectory
 from hybridvo.types import RelativePose
-from tests.scripts import load_script
 
 ROWS = (  # what other programs rely on
     *("sequence", "method", "flow_source", "depth_source", "pairs", "failed", "r_err_deg", "t_err"),
@@ -34,11 +33,6 @@ PAIRS = (
     *("epe_l2_px", "rot_err_deg", "trans_err", "ms"),
 )
 FAST = ("pnp-ransac", "identity")
-
-
-@pytest.fixture(scope="module")
-def tool() -> ModuleType:
-    return load_script("tools/compare_methods.py")
 
 
 @pytest.fixture(scope="module")
@@ -74,11 +68,11 @@ def outcome(out: Path) -> tuple[Any, Any]:
     )  # fmt: skip
 
 
-def test_results_hold_what_the_interface_promises(tool, tiny, tmp_path, capsys) -> None:
+def test_results_hold_what_the_interface_promises(tiny, tmp_path, capsys) -> None:
     out = tmp_path / "out"
     methods = "refine,pnp-ransac,identity"
-    arguments = ["--sequence", str(tiny), "--out", str(out), "--methods", methods, "-q"]
-    assert tool.main(arguments) == 0
+    arguments = ["compare", "--sequence", str(tiny), "--out", str(out), "--methods", methods, "-q"]
+    assert main(arguments) == 0
     assert capsys.readouterr().out.splitlines() == [str(out / name) for name in WRITTEN]
     result = json.loads((out / "results.json").read_text())
     assert set(result) >= {"command", "versions", "machine", "rows"}
@@ -213,9 +207,9 @@ def test_refused_folders(tiny: Path, tmp_path: Path) -> None:
         (["--protocol", "paper"], "tiny"),
     ],
 )
-def test_bad_options(tool, tiny, tmp_path, arguments, field, capsys) -> None:
+def test_bad_options(tiny, tmp_path, arguments, field, capsys) -> None:
     given = ["--sequence", str(tiny), "--out", str(tmp_path / "out"), "-q", "--methods", "identity"]
-    assert tool.main([*given, *arguments]) == 2
+    assert main(["compare", *given, *arguments]) == 2
     assert field in capsys.readouterr().err
     assert not (tmp_path / "out" / "results.json").exists()
 
