@@ -194,8 +194,8 @@ def _evaluate(args: argparse.Namespace, command: list[str]) -> int:
     from hybridvo.commands.results import evaluation_text
     from hybridvo.evaluation.metrics import evaluate_files
 
-    names = ("alignment", "delta", "delta_unit", "max_diff")
-    names += ("format_est", "format_gt", "axes_est", "axes_gt")
+    names = ["alignment", "delta", "delta_unit", "max_diff"]
+    names += ["format_est", "format_gt", "axes_est", "axes_gt"]
     report = evaluate_files(args.estimate, args.gt, **{name: getattr(args, name) for name in names})
     _print(args, report, evaluation_text(report))
     if report["ate_rmse_unaligned"] is None:  # not one figure: the files do not belong together

@@ -223,14 +223,6 @@ def check_method(method: str, models: Models | None = None) -> None:
         raise InputError(f"method '{method}' cannot run here: {absent[method]}.")
 
 
-@overload
-def estimate(pair: FramePair, /, **options: Any) -> RelativePose: ...
-
-
-@overload
-def estimate(prev: Frame, curr: Frame, /, **options: Any) -> RelativePose: ...
-
-
 def estimate(
     pair: FramePair | Frame,
     curr: Frame | None = None,

@@ -105,7 +105,7 @@ def reproject(
             raise InputError(f"reproject: expected {name} of shape {shape}, got {got}.")
     valid = (depth > MIN_DEPTH) & (depth < MAX_DEPTH)
     safe = torch.where(valid, depth, torch.ones_like(depth))
-    points = rays(*depth.shape[1:], K_prev) * safe[..., None]
+    points = rays(depth.shape[1], depth.shape[2], K_prev) * safe[..., None]
     moved = move(T, points.flatten(1, 2).transpose(1, 2))
     front = moved[:, 2:] > MIN_DEPTH
     pixels = project(torch.where(front, moved, torch.ones_like(moved)), K_curr)

@@ -135,7 +135,7 @@ class Frame:
     depth: np.ndarray | None
     camera: Camera
     timestamp: float = 0.0
-    index: int | None = None
+    index: int = None  # type: ignore[assignment]  # None: the tracker counts
     depth_variance: np.ndarray | None = None
     mask: np.ndarray | None = None
 
@@ -611,8 +611,9 @@ class PairBatch:
             return torch.as_tensor(array, device=device).to(dtype or torch.float32)
 
         def masked(array: np.ndarray | None, mask: np.ndarray | None) -> np.ndarray | None:
-            hidden = array is None or mask is None
-            return array if hidden else np.where(mask, array, np.float32(np.nan))
+            if array is None or mask is None:
+                return array
+            return np.where(mask, array, np.float32(np.nan))
 
         valid = np.ones((len(pairs), *size), np.bool_)
         for k, pair in enumerate(pairs):

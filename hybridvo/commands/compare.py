@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Literal
 
 from hybridvo.commands.progress import Progress
 from hybridvo.evaluation.comparison import ComparisonOptions, compare
@@ -21,6 +22,7 @@ def compare_command(args: argparse.Namespace, command: list[str]) -> list[Path]:
         weights=dict(text.split("=", 1) for text in args.weights if "=" in text),
         **{name: getattr(args, name) for name in given},
     )
+    mode: Literal["new", "resume", "overwrite"]
     mode = "resume" if args.resume else "overwrite" if args.overwrite else "new"
     with Progress(0, "compare", quiet=args.quiet, unit="pairs") as progress:
 

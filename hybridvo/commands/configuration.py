@@ -62,7 +62,7 @@ def load_options(
     try:
         return Options(
             **{
-                field.name: type(field.default)(**groups.get(field.name, {}))
+                field.name: type(getattr(Options(), field.name))(**groups.get(field.name, {}))
                 for field in dataclasses.fields(Options)
             }
         )

@@ -161,7 +161,7 @@ def _draw(
     paths = path.with_name("trajectory.png")
     drawn = {METHODS[m]: t for m in DRAWN if (t := results[m].trajectory) is not None}
     plot_trajectories(drawn, paths, truth=results["hybrid"].gt, alignment="origin", title=title)
-    below = cv2.imread(os.fspath(paths))
+    below = np.asarray(cv2.imread(os.fspath(paths)))
     grey = cv2.cvtColor(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), cv2.COLOR_GRAY2RGB)
     bgr = np.ascontiguousarray(np.where(moving[..., None], rgb, grey)[..., ::-1])
     height = round(bgr.shape[0] * below.shape[1] / bgr.shape[1])

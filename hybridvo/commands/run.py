@@ -129,7 +129,7 @@ def run(
                 recording = Recording(
                     rrd or out / RECORDING,
                     sequence.name,
-                    identity["input_hash"],
+                    str(identity["input_hash"]),
                     len(frames),
                     first=folder.frames_done,
                     poses=None if sequence.poses is None else sequence.poses[list(frames)],
@@ -200,7 +200,9 @@ class _Job:
             ms = 1e3 * (time.perf_counter() - started)
         row = self._row(step, prev, frame, ms)
         if frame is not None and self.recording is not None:
-            self.recording.add(frame, step, self.flow.field and self.flow.field.flow)
+            self.recording.add(
+                frame, step, None if self.flow.field is None else self.flow.field.flow
+            )
         if row["status"] != "ok":
             text = f"frame {index}: {row['status']} ({row['reason']}), probability "
             progress.say(f"{text}{row['probability']:.2f}: {row['message']}")

@@ -196,7 +196,8 @@ class RunFolder:
     def save_tracker(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Keep the tracker's state after the rows kept so far."""
         with atomic_write(self.path / TRACKER, "wb") as file:
-            np.savez(file, frames_done=np.array(self.frames_done), **arrays)
+            content: dict[str, Any] = {"frames_done": self.frames_done, **arrays}
+            np.savez(file, **content)
 
     def write_state(self, state: str, **more: Any) -> None:
         """Write ``run.json``; ``state`` is ``running``, ``interrupted`` or ``done``."""

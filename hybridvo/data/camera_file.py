@@ -117,7 +117,7 @@ def parse_camera(
         found, where = camera, "camera"
     elif (numbers := _four_numbers(camera)) is not None:
         try:
-            return Calibration(Camera(*numbers, height=shape[0], width=shape[1]))
+            return Calibration(Camera(*numbers, *shape))
         except InputError as error:
             raise InputError(f"camera '{camera}': {error}") from None
     else:
@@ -216,10 +216,11 @@ def write_camera_template(directory: str | os.PathLike[str]) -> Path:
     return path
 
 
-def _four_numbers(camera: str | os.PathLike[str]) -> list[float] | None:
+def _four_numbers(camera: str | os.PathLike[str]) -> tuple[float, float, float, float] | None:
     parts = os.fspath(camera).split(",")
     try:
-        return [float(part) for part in parts] if len(parts) == 4 else None
+        fx, fy, cx, cy = (float(part) for part in parts)
+        return fx, fy, cx, cy
     except ValueError:
         return None
 

@@ -198,12 +198,12 @@ def _read_times(path: Path, numbers: list[int]) -> tuple[np.ndarray, list[str]]:
     if not path.exists():
         told = f"{path}: not there; stamps count {FRAMES_PER_SECOND:g} frames a second."
         return (np.array(numbers) - numbers[0]) / FRAMES_PER_SECOND, [told]
-    times, told = to_seconds([row.numbers[0] for row in read_rows(path, "seconds")], path.name)
+    times, warnings = to_seconds([row.numbers[0] for row in read_rows(path, "seconds")], path.name)
     if numbers[-1] >= len(times):
         raise FormatError(
             f"{path}: expected a line for image {numbers[-1]}, got {len(times)} lines."
         )
-    return times[numbers], told
+    return times[numbers], warnings
 
 
 def _truth_file(root: Path) -> Path | None:

@@ -83,7 +83,7 @@ def open_sequence(
     return sequence
 
 
-def _reader(folder: Path, dataset: str | None) -> type[Sequence]:
+def _reader(folder: Path, dataset: str | None) -> Any:
     """The named reader, or the first that knows the folder."""
     # Sintel may be opened through an image folder that was never downloaded.
     if dataset == SintelSequence.kind or (dataset is None and SintelSequence.matches(folder)):

@@ -216,7 +216,7 @@ def _in_first_camera(path: Trajectory, gt: Trajectory | None) -> np.ndarray:
     if gt is None:
         return path.transformed(invert(path.T_world_cam[0])).positions
     for alignment in ("se3", "origin"):
-        error = ate(path, gt, alignment)  # type: ignore[arg-type]
+        error = ate(path, gt, alignment)
         if error.T_gt_est is not None:
             path = path.transformed(error.T_gt_est)
             break

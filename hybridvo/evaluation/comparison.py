@@ -160,8 +160,8 @@ def _plan(
         protocol = check_protocol(options.protocol, opened)
         inside = [sequence.name in protocol.sequences for sequence in opened]
         if not any(inside):
-            names = ", ".join(protocol.sequences)
-            raise InputError(f"--protocol {protocol.name}: expected some of {names}, got none.")
+            known = ", ".join(protocol.sequences)
+            raise InputError(f"--protocol {protocol.name}: expected some of {known}, got none.")
         paths = [path for path, wanted in zip(paths, inside, strict=True) if wanted]
         opened = [sequence for sequence, wanted in zip(opened, inside, strict=True) if wanted]
     names = [sequence.name for sequence in opened]
@@ -252,11 +252,11 @@ def _work(
     options = jobs[0].options
     if options.scheduler is None and min(options.jobs, len(todo)) <= 1:
         for job in todo:
-            before = done
-            write_json(
-                paths[job.name],
-                run_sequence(job, lambda pairs, before=before: report("", before + pairs, total)),
-            )
+
+            def report_pairs(pairs: int, before: int = done) -> None:
+                report("", before + pairs, total)
+
+            write_json(paths[job.name], run_sequence(job, report_pairs))
             done += max(0, job.frames - 1)
     else:
         with _executor(options) as executor:

@@ -132,24 +132,26 @@ def pair_panels(
     pair: FramePair, motion: Any, T_gt: np.ndarray | None, flow_gt: np.ndarray | None
 ) -> tuple[list[Panel], dict[str, float | None], np.ndarray]:
     """Panels and numbers that need no network, and (H, W) which pixels move by themselves."""
+    flow, depth = np.asarray(pair.flow), np.asarray(pair.prev.depth)
     ego, objects = object_flow(pair, motion.T_curr_prev)
-    known = T_gt is not None and flow_gt is not None
-    real = object_flow(replace(pair, flow=flow_gt), T_gt)[1] if known else objects
+    real, whose = objects, "this flow and the estimate"
+    if T_gt is not None and flow_gt is not None:
+        real = object_flow(replace(pair, flow=flow_gt), T_gt)[1]
+        whose = "true flow and motion"
     moving = moving_pixels(real)
-    whose = "true flow and motion" if known else "this flow and the estimate"
     # one scale for all three: the parts are to be seen beside the whole
-    longest = longest_flow(pair.flow)
+    longest = longest_flow(flow)
     panels: list[Panel] = []
     if pair.prev.rgb is not None:
         panels.append(ImagePanel("previous image", pair.prev.rgb))
     panels += [
-        FlowPanel("input flow F", pair.flow, longest),
+        FlowPanel("input flow F", flow, longest),
         FlowPanel("ego flow of the estimate", ego, longest),
         FlowPanel("object flow, F minus ego flow", objects, longest),
     ]
     numbers: dict[str, float | None] = {f"moving share, {whose}": float(moving.mean())}
     if T_gt is not None:
-        prev, curr, depth = pair.prev.camera, pair.curr.camera, pair.prev.depth
+        prev, curr = pair.prev.camera, pair.curr.camera
         error = error_map(motion.T_curr_prev, T_gt, depth, prev, curr)
         panels.append(ScalarPanel("error of the ego flow", error, "px"))
         errors = pair_errors(motion.T_curr_prev, T_gt, depth, prev, curr)

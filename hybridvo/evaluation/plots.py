@@ -139,12 +139,12 @@ def plot_trajectories(
     if errors:
         axes = figure.add_subplot(grid[1, :])
         timed = truth is not None and truth.has_timestamps
-        largest = max(float(np.max(error.translation)) for error, _ in errors)  # type: ignore[arg-type]
+        largest = max(float(np.max(error.translation)) for error, _ in errors)
         unit, factor = ("m", 1.0) if largest >= 1.0 else ("cm", 100.0)
         _style(axes, "Position error", "time [s]" if timed else "frame", f"error [{unit}]")
         start_time = truth.timestamps[0] if truth is not None and timed else 0.0
         for error, style in errors:
-            axes.plot(error.timestamps - start_time, error.translation * factor, **style)  # type: ignore[operator]
+            axes.plot(error.timestamps - start_time, error.translation * factor, **style)
         axes.set_ylim(bottom=0.0)
         axes.margins(x=0.01)
     handles = [figure.axes[0].lines[i] for i in range(len(drawn))]

@@ -56,7 +56,7 @@ def protocols() -> dict[str, Protocol]:
         names = fields.pop("sequences")
         frames = content["frames"]
         sequences = frames if names == "all" else {key: frames[key] for key in names}
-        lists = {key: tuple(fields.pop(key)) for key in ("metrics", "published")}
+        lists: dict[str, Any] = {key: tuple(fields.pop(key)) for key in ("metrics", "published")}
         found[name] = Protocol(name=name, sequences=sequences, **lists, **fields)
     return found
 

@@ -114,13 +114,14 @@ def run_sequence(job: Job, progress: Callable[[int], None] | None = None) -> dic
     for done, index in enumerate(frames):
         stamp = float(sequence.timestamps[index])
         facts: dict[str, Any] = {}
+        frame: Frame | None
         try:
             frame = sequence.frame(index)
         except (InputError, OSError) as error:
             frame = None
             left_out.append({"index": index, "reason": f"frame cannot be read: {error}"})
         else:
-            if prev is not None:
+            if prev is not None and frame is not None:
                 for flow in flows.values():
                     flow.prepare(prev, frame)
                 facts = _facts(sequence, prev, frame, options.stride)

@@ -235,7 +235,7 @@ def total_loss(
     if options.pose and isinstance(output, PixelwisePrediction):
         s_pose = s if options.pose_uncertainty else None
         parts |= _pose_losses(output, targets, s_pose, options)
-    elif options.pose:
+    elif options.pose and isinstance(output, tuple):
         parts["rotation"] = (output[0] - targets.rotation_deg).abs().mean()
         parts["translation"] = (output[1] - targets.translation).abs().mean()
     if options.reconstructs:
@@ -264,7 +264,11 @@ def total_loss(
 
 def _log_scales(output: NetworkOutput, targets: LossTargets, options: LossOptions) -> torch.Tensor:
     """(B, 6, h, w) log scales of an output that the options weigh by."""
-    if not isinstance(output, PixelwisePrediction) or output.log_scale_rotation is None:
+    if (
+        not isinstance(output, PixelwisePrediction)
+        or output.log_scale_rotation is None
+        or output.log_scale_translation is None
+    ):
         raise InputError(
             "total_loss: the network's output has no uncertainty. Set pose_uncertainty, "
             "flow_uncertainty and depth_uncertainty to False."

@@ -95,7 +95,7 @@ def seed_weights(log_scale: torch.Tensor) -> torch.Tensor:
     Of all log scales those of the rotation tell moving objects best.
     """
     s = torch.nan_to_num(log_scale.mean(dim=1), 50.0, 50.0, -50.0).clamp(-50.0, 50.0)
-    least = s.detach().flatten(1).amin(dim=1)[:, None, None]
+    least = s.flatten(1).amin(dim=1)[:, None, None]
     return torch.exp(-SHARPNESS * (s - least)).clamp(min=MIN_WEIGHT)
 
 

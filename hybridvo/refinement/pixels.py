@@ -257,7 +257,7 @@ def coarse_grid(
 
 def _too_few(pair: FramePair, count: int, minimum: int) -> RelativePose:
     """The failure that names what is missing."""
-    depth, flow = pair.prev.depth, pair.flow
+    depth, flow = np.asarray(pair.prev.depth), np.asarray(pair.flow)
     with np.errstate(invalid="ignore"):
         depths = int(np.count_nonzero((depth > kernels.MIN_DEPTH) & (depth < kernels.MAX_VALUE)))
         flows = int(np.count_nonzero((np.abs(flow) < kernels.MAX_VALUE).all(axis=2)))

@@ -429,13 +429,14 @@ class _Solver:
                       self.pixels.K[:, 0, 0], T.translation())
         ]  # fmt: skip
         found = [
-            _one_covariance(*(x[k] for x in arrays), shape=self.tiles) for k in range(len(T))
+            _one_covariance(self.tiles, *(x[k] for x in arrays)) for k in range(len(T))
         ]  # fmt: skip
         covariance = torch.as_tensor(np.stack([c for c, _ in found]), device=weight.device)
         return covariance, torch.tensor([ok for _, ok in found], device=weight.device)
 
 
 def _one_covariance(
+    shape: tuple[int, int],
     information: np.ndarray,
     scores: np.ndarray,
     curvature: np.ndarray,
@@ -445,7 +446,6 @@ def _one_covariance(
     weight: float,
     focal: float,
     translation: np.ndarray,
-    shape: tuple[int, int],
 ) -> tuple[np.ndarray, bool]:
     """Covariance of one sample from the sums of its tiles, and whether it is definite."""
     if not all(np.isfinite(x).all() for x in (information, scores, curvature, meat, translation)):

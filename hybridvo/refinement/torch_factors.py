@@ -141,7 +141,7 @@ def _dot(a: Rows, b: Rows) -> torch.Tensor:
 def whitening(pixels: Pixels, at: Residuals, noise: torch.Tensor) -> Whitening:
     """Inverse covariance of each pixel, for noise (B, 2) sf px, sd; (B, 3) with sz."""
     flow = 1 / (noise[:, 0, None].square() * pixels.flow_variance)
-    D = (flow, flow)
+    D: tuple[torch.Tensor, ...] = (flow, flow)
     if pixels.has_depth_curr is not None:
         D = (*D, pixels.has_depth_curr / noise[:, 2, None].square())
     Du = tuple(d * u for d, u in zip(D, at.u, strict=True))

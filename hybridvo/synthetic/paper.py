@@ -220,7 +220,7 @@ def paper_sample(rng: np.random.Generator, options: PaperOptions = PaperOptions(
     layers = Layers(K, np.full((o.height, o.width), 1.0 / background, np.float32))
     for depth in depths:
         box, mask = _place(rng, o)
-        layers.lay(box, mask, np.float32(1.0 / depth))
+        layers.lay(box, mask, float(np.float32(1.0 / depth)))
 
     # Step 3.
     angles, t = o.motion.draw(rng, min(depths, default=background))

@@ -203,17 +203,17 @@ class SyntheticSequence(Sequence):
     flow_is_true = True
 
     @property
-    def root(self) -> Path:
+    def root(self) -> Path:  # type: ignore[override]
         """There is no folder; the name stands for it."""
         return Path(self.name)
 
     @property
-    def timestamps(self) -> np.ndarray:
+    def timestamps(self) -> np.ndarray:  # type: ignore[override]
         """(N,) float64 seconds."""
         return np.arange(len(self)) / self.fps
 
     @property
-    def poses(self) -> np.ndarray:
+    def poses(self) -> np.ndarray:  # type: ignore[override]
         """(N, 4, 4) true T_world_cam."""
         return self.scene.T_world_cam
 

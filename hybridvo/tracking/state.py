@@ -114,7 +114,7 @@ class TrackerState:
         )
         window = None
         if "window_T" in arrays:
-            keys = []
+            keys: list[KeyFrame] = []
             while f"key{len(keys)}_T" in arrays:
                 name = f"key{len(keys)}"
                 frame = _read_frame(name, arrays)
@@ -157,7 +157,8 @@ def _frame_arrays(name: str, frame: Frame | None) -> dict[str, Any]:
 def _read_frame(name: str, arrays: Mapping[str, np.ndarray]) -> Frame | None:
     if f"{name}_camera" not in arrays:
         return None
-    camera = Camera(*(float(x) for x in arrays[f"{name}_camera"]))
+    fx, fy, cx, cy, height, width = arrays[f"{name}_camera"].tolist()
+    camera = Camera(fx, fy, cx, cy, int(height), int(width))
     images = {part: arrays.get(f"{name}_{part}") for part in IMAGES}
     timestamp, index = arrays[f"{name}_at"]
     return Frame(camera=camera, timestamp=float(timestamp), index=int(index), **images)

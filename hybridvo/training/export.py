@@ -38,8 +38,7 @@ def run_card(trainer: Trainer) -> dict[str, Any]:
         **trainer.record,
     }
     try:
-        assert trainer.folder is not None
-        card |= json.loads((trainer.folder / RUN).read_text(encoding="utf-8"))
+        card |= json.loads((Path(str(trainer.folder)) / RUN).read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise InputError(f"{trainer.folder}: no {RUN} of a training: {error}.") from None
     return card
@@ -86,6 +85,7 @@ def export_pwvo(
     """
     trainer = open_run(folder)
     path, task = Path(path), trainer.task
+    assert isinstance(task, PwvoTask)
     options, presets = task.options, task.mixture.presets
     card = run_card(trainer)
     card["translation_scale"] = SCALE_OF[options.loss.translation_form]
@@ -116,6 +116,7 @@ def export_selector(trainer: Trainer, held_out: str | Path, path: str | Path) ->
         InputError: no held-out shards.
     """
     path, task = Path(path), trainer.task
+    assert isinstance(task, PwvoTask)
     assert isinstance(task, SelectorTask)
     files = sorted(Path(held_out).glob("*.npz"))
     if not files:

@@ -265,7 +265,7 @@ def recorded_run(record: dict[str, Any], where: str) -> tuple[PwvoOptions, Mixtu
         InputError: not the record of such a run; named by ``where``.
     """
     options = build_options(PwvoOptions, record["options"], where)
-    presets = []
+    presets: list[Any] = []
     for mapping in record["data"]:
         values = {key: value for key, value in mapping.items() if key != "preset"}
         presets.append(build_options(KINDS[mapping["preset"]], values, where))

@@ -161,7 +161,7 @@ class SelectorTask:
 
 @torch.no_grad()
 def evaluate_selector(
-    network: torch.nn.Module, files: list[Path], refits: int = 2, asked: bool = False
+    network: Any, files: list[Path], refits: int = 2, asked: bool = False
 ) -> dict[str, dict[str, Any]]:
     """Shares of wrong answers on samples of shards, by source.
 

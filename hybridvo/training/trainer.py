@@ -41,10 +41,13 @@ class Task(Protocol):
     ``all_parameters_used`` says whether every parameter takes part in every loss.
     """
 
-    options: RunOptions
     network: nn.Module
     data: Any
     all_parameters_used: bool
+
+    @property
+    def options(self) -> RunOptions:
+        """Options of the run."""
 
     def batches(self, samples: int, workers: int, rank: int, world: int) -> Iterator[Any]:
         """Endless batches, after ``samples`` samples that all ranks together have seen."""

@@ -108,7 +108,10 @@ def evaluate_network(
                 output = predict(network, batch.inputs, choose)
             with torch.inference_mode():
                 errors.append(_errors(output, batch, selection))
-                if getattr(output, "log_scale_rotation", None) is not None:
+                if (
+                    isinstance(output, PixelwisePrediction)
+                    and output.log_scale_rotation is not None
+                ):
                     pixels += _uncertainty(output, batch)
     finally:
         network.train(was_training)
@@ -162,6 +165,8 @@ def _uncertainty(output: PixelwisePrediction, batch: TrainingBatch) -> list[np.n
         (output.rotation, output.log_scale_rotation, gt.rotation_deg),
         (output.translation, output.log_scale_translation, gt.translation),
     ):
+        if s is None:
+            continue
         error = (value - target[:, :, None, None]).abs()
         half = torch.stack([s.mean(1), error.mean(1), (error * (-s).exp()).mean(1)], dim=1)
         maps.append(F.interpolate(half.float(), size=batch.moving.shape[1:], mode="nearest"))
