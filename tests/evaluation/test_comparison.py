@@ -6,6 +6,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import cv2
 import filelock
 import numpy as np
 import pytest
@@ -103,7 +104,8 @@ def test_results_hold_what_the_interface_promises(tiny, tmp_path, capsys) -> Non
         assert float(line["epe_l2_px"]) == row["epe_l2_px"]
     assert not (out / "parts").exists()
     assert all((out / entry["path"]).exists() for entry in result["trajectories"])
-    assert all((out / entry["picture"]).exists() for entry in result["worst_pairs"])
+    images = {e["method"]: cv2.imread(str(out / e["picture"])) for e in result["worst_pairs"]}
+    assert images["refine"].shape[1] > images["identity"].shape[1]  # with the pixels' weights
 
 
 @pytest.mark.parametrize("method", ["refine", "pnp-ransac-tuned"])

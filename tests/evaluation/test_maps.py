@@ -24,7 +24,7 @@ from hybridvo.evaluation.maps import (
     uncertainty_maps,
 )
 from hybridvo.evaluation.pair_errors import dynamic_fraction, pair_errors
-from hybridvo.evaluation.panels import FlowPanel, ImagePanel, ScalarPanel, maps_png
+from hybridvo.evaluation.plots import FlowPanel, ImagePanel, ScalarPanel, maps_png
 from hybridvo.geometry import invert, se3_exp
 from hybridvo.network.inputs import assemble_inputs
 from hybridvo.network.pwvo import NetworkOptions, build_network

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from hybridvo.errors import FormatError, InputError
-from hybridvo.evaluation.breakdown import breakdown, worst_pairs
 from hybridvo.evaluation.charts import (
     error_distribution,
     factor_charts,
@@ -21,8 +20,9 @@ from hybridvo.evaluation.charts import (
 )
 from hybridvo.evaluation.protocols import protocol_summary, protocols
 from hybridvo.evaluation.report import headline, number, read_comparison, write_report
-from hybridvo.evaluation.scores import sequence_row, total_row
+from hybridvo.evaluation.scores import breakdown, sequence_row, total_row
 from hybridvo.evaluation.sequence_job import PAIR_COLUMNS, pair_table
+from hybridvo.evaluation.worst import worst_pairs
 from hybridvo.files import write_csv, write_json
 from hybridvo.geometry import se3_exp
 from hybridvo.trajectory import Trajectory, write_tum
