@@ -3,8 +3,9 @@
     python tools/benchmark.py --out docs/results/benchmark.json --overwrite
     python tools/benchmark.py --parts real --data ../shared/data --out runs/real.json
 
-Writes one JSON with a key for each part. Development uses the seeds 0 to 999, published figures
-9000 and up. Flow or depth that is ground truth is named so: an oracle.
+Writes one JSON with a key for each part; with --overwrite the other parts of the file stay.
+Development uses the seeds 0 to 999, published figures 9000 and up. Flow or depth that is ground
+truth is named so: an oracle.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--seed0", type=int, default=9000, help="first seed of what is made")
     parser.add_argument("--data", type=Path, default=Path("../shared/data"), metavar="DIR")
     parser.add_argument("--out", type=Path, default=Path("runs/benchmark.json"), metavar="FILE")
-    parser.add_argument("--overwrite", action="store_true", help="replace --out")
+    parser.add_argument("--overwrite", action="store_true", help="replace its parts in --out")
     return parser
 
 
@@ -67,10 +68,11 @@ def main(argv: list[str] | None = None) -> int:
             return usage(f"--{name.replace('_', '-')}: expected at least {least}.")
     if args.out.exists() and not args.overwrite:
         return usage(f"{args.out} exists; pass --overwrite to replace it.")
-    result = provenance("benchmark.py", argv)
+    # parts that are measured anew replace those of the file; the others stay
+    result = json.loads(args.out.read_text(encoding="utf-8")) if args.out.exists() else {}
     try:
         for part in args.parts.split(","):
-            result[part] = PARTS[part](args)
+            result[part] = provenance("benchmark.py", argv) | PARTS[part](args)
             print(f"{part}: done", file=sys.stderr, flush=True)
         args.out.parent.mkdir(parents=True, exist_ok=True)
         write_json(args.out, result)

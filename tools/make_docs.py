@@ -113,11 +113,12 @@ def error(row: dict[str, Any]) -> str:
 
 
 def source(content: dict[str, Any]) -> str:
-    """Where figures come from."""
+    """Where figures come from; times of a loaded machine are to be read as ratios."""
     machine = content["machine"]
+    load = machine["load"][0] if machine["load"] else 0.0
     return (
         f"`{content['command']}`, commit `{content['commit']}`; {machine['processor']}, "
-        f"{machine['cores']} cores."
+        f"{machine['cores']} cores, load {load:.1f}."
     )
 
 
@@ -140,7 +141,7 @@ def heavy(results: Results) -> list[str]:
         *table(["method", *kinds, "failures", "ms"], rows),
         "",
         f"Median error of the ego flow, px; seeds {part['seeds'][0]} to {part['seeds'][1]} of each "
-        f"kind, {width}x{height}, depth {part['depth']}. True flow is an oracle. {source(content)}",
+        f"kind, {width}x{height}, depth {part['depth']}. True flow is an oracle. {source(part)}",
     ]
 
 
@@ -164,7 +165,7 @@ def peers(results: Results) -> list[str]:
         *table(["method", "error, px", "cm", "deg", "wrong by more than 1 px", "ms a pair"], rows),
         "",
         f"Medians over {pairs} pairs of rendered scenes in which most of the image moves; flow: "
-        f"OpenCV DIS, depth {part['depth']}; flow not in the time. {source(content)}",
+        f"OpenCV DIS, depth {part['depth']}; flow not in the time. {source(part)}",
     ]
 
 
@@ -183,7 +184,7 @@ def scenarios(results: Results) -> list[str]:
         *table(["scenario", *(f"`{method}`" for method in methods)], rows),
         "",
         f"Median error of the ego flow, px; seeds {part['seeds'][0]} to {part['seeds'][1]}. "
-        f"{source(content)}",
+        f"{source(part)}",
     ]
     if "model_noise" in content:
         row = content["model_noise"]["refine"]
@@ -201,8 +202,8 @@ def real(results: Results) -> list[str]:
     content = results.get("benchmark", {})
     if "real" not in content:
         return []
-    rows = []
-    for name, sequence in content["real"]["summary"].items():
+    part, rows = content["real"], []
+    for name, sequence in part["summary"].items():
         for flow, by_method in sequence["flows"].items():
             for k, (method, row) in enumerate(by_method.items()):
                 first = f"{name}, {flow}" if k == 0 else ""
@@ -212,7 +213,7 @@ def real(results: Results) -> list[str]:
                 values += [number(row[key]) for key in ends]
                 rows.append([first, f"`{method}`", *values])
     header = ["sequence, flow", "method", "deg", "cm", "px", "end, deg", "end, cm", "ms"]
-    return [*table(header, rows), "", f"Medians over the pairs. {source(content)}"]
+    return [*table(header, rows), "", f"Medians over the pairs. {source(part)}"]
 
 
 def sequences(results: Results) -> list[str]:
@@ -271,7 +272,7 @@ def costs(results: Results) -> list[str]:
         "Milliseconds of an estimate with the flow given, and of a tracked frame with its flow "
         f"(OpenCV DIS). MiB: most that one estimate allocates at {sizes[-1]}. Import and first "
         f"call: {number(first.get('import_s'))} s and {number(first.get('warm_up_s'))} s. Batched "
-        f"refinement of 256x128 on the CPU, pairs a batch: {batch}. {source(content)}",
+        f"refinement of 256x128 on the CPU, pairs a batch: {batch}. {source(part)}",
     ]
 
 
@@ -280,14 +281,15 @@ def speed(results: Results) -> list[str]:
     content = results.get("benchmark", {})
     if "costs" not in content:
         return []
+    part = content["costs"]
     rows = [
         [f"`{method}`", number(1e3 / ms), number(ms)]
-        for method, ms in content["costs"]["frame_ms"]["640x480"].items()
+        for method, ms in part["frame_ms"]["640x480"].items()
     ]
     return [
         *table(["method", "frames a second", "ms a frame"], rows),
         "",
-        f"640x480, OpenCV DIS flow included, one process. {source(content)}",
+        f"640x480, OpenCV DIS flow included, one process. {source(part)}",
     ]
 
 
@@ -296,15 +298,15 @@ def demo(results: Results) -> list[str]:
     content = results.get("benchmark", {}).get("demo")
     if content is None:
         return []
-    keys = ("ate_cm", "rotation_deg", "epe_px", "ms")
+    keys = ("ate_cm", "rotation_deg", "epe_px")
     rows = [[row["method"], *(number(row[key]) for key in keys)] for row in content["rows"]]
     scene = content["scene"]
     return [
-        *table(["method", "ATE, cm", "rotation, deg a pair", "EPE, px", "ms a pair"], rows),
+        *table(["method", "ATE, cm", "rotation, deg a pair", "EPE, px"], rows),
         "",
         f"{scene['frames']} rendered frames of {scene['width']}x{scene['height']}, "
-        f"{100 * content['moving_fraction']:.0f} % of the pixels move; flow: OpenCV DIS, in the "
-        "time; depth: the renderer's (an oracle).",
+        f"{100 * content['moving_fraction']:.0f} % of the pixels move; flow: OpenCV DIS; "
+        "depth: the renderer's (an oracle).",
     ]
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hybridvo.data.camera_file import Calibration, Lens, parse_camera, units_per_metre
+from hybridvo.data.camera_file import IMAGES, Calibration, Lens, parse_camera, units_per_metre
 from hybridvo.data.image_io import image_size, read_depth, read_flow, read_mask_png, read_rgb
 from hybridvo.data.lists import check_increasing, shown, sorted_files
 from hybridvo.errors import FormatError, InputError
@@ -22,10 +22,7 @@ from hybridvo.units import depth_advice, typical_depth
 class Given:
     """What a user says about a sequence beyond its folder.
 
-    Args:
-        camera: instead of the data set's, see :func:`hybridvo.data.camera_file.parse_camera`.
-        depth_scale: stored units per metre.
-        mask: folder of masks, 0 where pixels must not be used.
+    See :func:`hybridvo.data.sequence.open_sequence`.
     """
 
     camera: str | os.PathLike[str] | Camera | Calibration | None = None
@@ -63,9 +60,10 @@ class Sequence:
         kind: sintel, tartanair, tum, 7scenes, kitti or folder.
         name: what reports call it. root: its folder.
         timestamps: (N,) float64 seconds, strictly increasing.
-        poses: (N, 4, 4) T_world_cam in camera axes, NaN rows where a frame has no truth, or None.
+        poses: (N, 4, 4) T_world_cam in camera axes, NaN rows where unknown, or None.
         depth_source: ``true`` (synthetic, an oracle), ``sensor``, ``stereo`` or ``file``.
         flow_is_true: whether its flow files are ground truth (an oracle).
+        warnings: what the user should know: converted stamps, gaps, missing files, doubtful units.
 
     Raises:
         InputError: no frames, stamps that do not increase, depth of another size than colour.
@@ -78,10 +76,6 @@ class Sequence:
     flow_is_true = False
     depth_scale: float | None = None
     """Stored units per metre of the data set's depth; None: metres."""
-    poses: np.ndarray | None = None
-    timestamps: np.ndarray
-    name: str
-    root: Path
 
     def __init__(self, root: Path, name: str, listing: Listing, given: Given) -> None:
         self.root, self.name = root, name
@@ -90,38 +84,28 @@ class Sequence:
         self.flow_files = (listing.flow + [None] * count)[:count]
         self.timestamps = np.asarray(listing.timestamps, dtype=np.float64)
         self.poses, self._sources = listing.poses, listing.sources
-        self._warnings = listing.warnings
+        self.warnings = listing.warnings
         if count == 0:
             raise InputError(f"{root}: no frames.")
         check_increasing(self.timestamps, str(root))
         self.height, self.width = self._find_size()
-        shape = (self.height, self.width)
-        if given.camera is not None:
-            calibration: Calibration | None = parse_camera(given.camera, shape)
-        else:
+        if given.camera is None:
             calibration = self._calibration()
-        self._camera = calibration.camera if calibration else None
-        self._lens = None
+        else:
+            calibration = parse_camera(given.camera, (self.height, self.width))
         scale, told = units_per_metre(given.depth_scale, self.name)
+        self.warnings += told
+        self._camera = self._lens = None
         if calibration is not None:
-            self._warnings += calibration.warnings
+            self._camera = self._checked(calibration.camera)
+            self.warnings += calibration.warnings
             if any(calibration.distortion):
                 self._lens = Lens(calibration.camera, calibration.distortion)
             scale = scale or calibration.depth_scale
         self._given_scale = scale
-        self._warnings += told
         self.mask_files = self._find_masks(given.mask)
-        self._warnings += self._missing()
-        self._check_depth_unit()
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """What the user should know: converted stamps, gaps, missing files, doubtful units."""
-        return tuple(self._warnings)
-
-    def add_warning(self, sentence: str) -> None:
-        """Tell the user something more."""
-        self._warnings.append(sentence)
+        self._warn_of_missing_files()
+        self._warn_of_depth_unit()
 
     @property
     def has_flow(self) -> bool:
@@ -231,6 +215,16 @@ class Sequence:
         """Variance of log depth, where the source allows to state one."""
         return None
 
+    def _checked(self, camera: Camera) -> Camera:
+        """Camera whose size must be that of the images."""
+        if camera.shape != (self.height, self.width):
+            raise InputError(
+                f"{self.root}: images are {self.width}x{self.height}, the camera is for "
+                f"{camera.width}x{camera.height} pixels. Intrinsics belong to one image size: "
+                f"give those of these images (--camera fx,fy,cx,cy or --camera FILE)."
+            )
+        return camera
+
     def _check_shape(self, array: np.ndarray, path: Path, what: str) -> None:
         if array.shape[:2] != (self.height, self.width):
             raise FormatError(
@@ -262,10 +256,9 @@ class Sequence:
 
     def _find_masks(self, folder: str | os.PathLike[str] | None) -> list[Path | None]:
         """Mask of each frame: by equal names, else by order where the counts agree."""
-        none: list[Path | None] = [None] * len(self)
         if folder is None:
-            return none
-        masks = sorted_files(Path(folder), (".png", ".jpg", ".jpeg"))
+            return [None] * len(self)
+        masks = sorted_files(Path(folder), IMAGES)
         frames = [rgb or depth for rgb, depth in zip(self.rgb_files, self.depth_files, strict=True)]
         by_stem = {path.stem: path for path in masks}
         found = [by_stem.get(path.stem) if path else None for path in frames]
@@ -278,35 +271,33 @@ class Sequence:
             )
         return found
 
-    def _missing(self) -> list[str]:
-        found = []
-        listed = [("image", self.rgb_files), ("depth", self.depth_files)]
-        if any(self.mask_files):
-            listed.append(("mask", self.mask_files))
-        for what, paths in listed:
+    def _warn_of_missing_files(self) -> None:
+        listed = {"image": self.rgb_files, "depth": self.depth_files, "mask": self.mask_files}
+        for what, paths in listed.items():
             missing = [i for i, path in enumerate(paths) if path is None or not path.exists()]
-            if len(missing) == len(paths):
+            if len(missing) == len(paths) and what != "mask":
                 like = next((f", such as {path}" for path in paths if path is not None), "")
-                found.append(f"{self.name}: there are no {what} files{like}.")
-            elif missing:
-                found.append(
+                self.warnings.append(f"{self.name}: there are no {what} files{like}.")
+            elif missing and any(paths):
+                self.warnings.append(
                     f"{self.name}: {len(missing)} frames without {what}: {shown(missing)}."
                 )
-        return found
 
-    def _check_depth_unit(self) -> None:
+    def _warn_of_depth_unit(self) -> None:
         """Look at the first depth map that can be read, and say so if its unit is doubtful."""
+        if self.depth_source == "stereo":
+            return
         for index, path in enumerate(self.depth_files):
-            if path is None or not path.exists() or self.depth_source == "stereo":
-                continue
             try:
+                if path is None:
+                    continue
                 median = typical_depth(self._read_depth(path, index, None))
             except (InputError, OSError):
                 continue
             if median is None:
-                self._warnings.append(f"{path}: the first depth map has no valid value.")
+                self.warnings.append(f"{path}: the first depth map has no valid value.")
             elif advice := depth_advice(median, self.depth_scale):
-                self._warnings.append(
+                self.warnings.append(
                     f"{path}: the median depth is {median:.4g} m, which cannot be metres. "
                     f"Probable remedy: {advice} (by --depth-scale, or depth_scale in camera.yaml)."
                 )

@@ -18,12 +18,11 @@ from hybridvo.files import atomic_write, parse_yaml
 from hybridvo.types import Camera
 
 CAMERA_FILE = "camera.yaml"
+IMAGES = (".png", ".jpg", ".jpeg")
 REQUIRED = ("fx", "fy", "cx", "cy", "width", "height")
 KNOWN = (*REQUIRED, "distortion", "depth_scale", "fps")
 MAX_FILE_BYTES = 2**16
 """Largest camera file; they are a few kilobytes."""
-MAX_NUMBER = 1e12
-"""No setting is larger; NaN, infinity and integers beyond any float are not smaller."""
 BROWN_COUNTS = (4, 5, 8)
 """Lengths of k1 k2 p1 p2 [k3 [k4 k5 k6]], OpenCV's order."""
 
@@ -72,12 +71,7 @@ class Calibration:
 
 
 class Lens:
-    """Remaps images of a distorted camera to a pinhole camera with the same intrinsics.
-
-    Args:
-        camera: intrinsics of the distorted and of the resulting image.
-        distortion: Brown coefficients, as OpenCV orders them.
-    """
+    """Remaps images with Brown distortion to a pinhole camera with the same intrinsics."""
 
     def __init__(self, camera: Camera, distortion: tuple[float, ...]) -> None:
         size = (camera.width, camera.height)
@@ -100,41 +94,24 @@ class Lens:
 def parse_camera(
     camera: str | os.PathLike[str] | Camera | Calibration, shape: tuple[int, int]
 ) -> Calibration:
-    """Calibration that a user gives for images of a size.
-
-    Args:
-        camera: ``fx,fy,cx,cy`` in pixels, the name of a camera file (see :func:`read_camera_file`),
-            or a camera.
-        shape: (height, width) of the images.
+    """Calibration that a user gives: ``fx,fy,cx,cy`` for images of a shape, a file, or a camera.
 
     Raises:
-        InputError: neither numbers nor a file, or intrinsics of another image size.
-        FormatError: a damaged file.
+        InputError: neither numbers nor a file. FormatError: a damaged file.
     """
+    if isinstance(camera, Calibration):
+        return camera
     if isinstance(camera, Camera):
-        found, where = Calibration(camera), "camera"
-    elif isinstance(camera, Calibration):
-        found, where = camera, "camera"
-    elif (numbers := _four_numbers(camera)) is not None:
-        try:
-            return Calibration(Camera(*numbers, *shape))
-        except InputError as error:
-            raise InputError(f"camera '{camera}': {error}") from None
-    else:
-        where = os.fspath(camera)
-        try:
-            found = read_camera_file(Path(camera))
-        except FileNotFoundError:
-            raise InputError(
-                f"camera: expected a file or 'fx,fy,cx,cy' in pixels, got {where[:200]!r}, which "
-                f"is neither four numbers nor a file."
-            ) from None
-    if found.camera.shape != tuple(shape):
+        return Calibration(camera)
+    if (numbers := _four_numbers(camera)) is not None:
+        return Calibration(Camera(*numbers, *shape))
+    try:
+        return read_camera_file(Path(camera))
+    except FileNotFoundError:
         raise InputError(
-            f"{where}: the camera is for {found.camera.width}x{found.camera.height}, the images "
-            f"are {shape[1]}x{shape[0]} pixels (width x height). Intrinsics belong to one size."
-        )
-    return found
+            f"camera: expected a file or 'fx,fy,cx,cy' in pixels, got {os.fspath(camera)[:200]!r}, "
+            f"which is neither four numbers nor a file."
+        ) from None
 
 
 def read_camera_file(path: Path) -> Calibration:
@@ -148,7 +125,8 @@ def read_camera_file(path: Path) -> Calibration:
         FormatError: not YAML, a key that is missing or unknown, a value that cannot be.
         FileNotFoundError: no such file.
     """
-    content = parse_yaml(read_text(path, limit=MAX_FILE_BYTES), str(path))
+    text = read_text(path, limit=MAX_FILE_BYTES).removesuffix("---\n")  # as ROS prints it
+    content = parse_yaml(text, str(path))
     if not isinstance(content, dict):
         raise FormatError(f"{path}: expected 'key: value' lines, got a {type(content).__name__}.")
     content, warnings = _in_our_words(content, path)
@@ -165,15 +143,20 @@ def read_camera_file(path: Path) -> Calibration:
     }
     try:
         camera = Camera(**{key: numbers[key] for key in REQUIRED})  # type: ignore[arg-type]
+        scale, told = units_per_metre(numbers.get("depth_scale"), str(path))
     except InputError as error:
         raise FormatError(f"{path}: {error}") from None
-    for key in ("depth_scale", "fps"):
-        if key in numbers and numbers[key] <= 0:
-            raise FormatError(f"{path}: {key}: expected a number above 0, got {numbers[key]}.")
-    scale, told = units_per_metre(numbers.get("depth_scale"), str(path))
+    fps = numbers.get("fps")
+    if fps is not None and fps <= 0:
+        raise FormatError(f"{path}: fps: expected a number above 0, got {fps}.")
     distortion = _distortion(content.get("distortion"), path)
-    warnings += told + _doubts(camera, path)
-    return Calibration(camera, distortion, scale, numbers.get("fps"), tuple(warnings))
+    x, y = (camera.cx + 0.5) / camera.width, (camera.cy + 0.5) / camera.height
+    if abs(x - 0.5) > 0.25 or abs(y - 0.5) > 0.25:
+        told.append(
+            f"{path}: the principal point {camera.cx:g} {camera.cy:g} is far from the middle of "
+            f"{camera.width}x{camera.height} pixels: are the intrinsics those of another size?"
+        )
+    return Calibration(camera, distortion, scale, fps, tuple(warnings + told))
 
 
 def units_per_metre(scale: float | None, where: str) -> tuple[float | None, list[str]]:
@@ -181,9 +164,6 @@ def units_per_metre(scale: float | None, where: str) -> tuple[float | None, list
 
     A value below 1 is RealSense's number of the same name, metres per unit: no depth is stored in
     units longer than a metre.
-
-    Raises:
-        InputError: not a finite number above 0.
     """
     if scale is None:
         return None, []
@@ -199,16 +179,12 @@ def units_per_metre(scale: float | None, where: str) -> tuple[float | None, list
 
 
 def write_camera_template(directory: str | os.PathLike[str]) -> Path:
-    """Write a ``camera.yaml`` to fill in; the image size is filled in where rgb/ has an image.
-
-    Raises:
-        InputError: there is one already. OutputError: it cannot be written.
-    """
+    """Write a ``camera.yaml`` to fill in, with the image size where rgb/ has an image."""
     folder = Path(directory)
     path = folder / CAMERA_FILE
     if path.exists():
         raise InputError(f"{path}: exists already; remove it first, or edit it.")
-    images = sorted_files(folder / "rgb", (".png", ".jpg", ".jpeg"))
+    images = sorted_files(folder / "rgb", IMAGES)
     height, width = image_size(images[0]) if images else ("", "")
     folder.mkdir(parents=True, exist_ok=True)
     with atomic_write(path) as file:
@@ -227,20 +203,19 @@ def _four_numbers(camera: str | os.PathLike[str]) -> tuple[float, float, float, 
 
 def _in_our_words(content: dict[Any, Any], path: Path) -> tuple[dict[str, Any], list[str]]:
     """The content with our keys: those of ROS and RealSense renamed, unknown ones refused."""
-    extra = {key: content[key] for key in ("depth_scale", "fps") if key in content}
-    lens: Any = None
-    if K := next((content[key] for key in ("camera_matrix", "K", "k") if key in content), None):
-        K = _data(K)
+    matrix = _first_of(content, "camera_matrix", "K", "k")
+    if matrix is not None:  # ROS
+        K = _data(matrix)
         if not isinstance(K, list) or len(K) != 9:
             raise FormatError(f"{path}: camera matrix: expected 9 numbers, row by row.")
-        lens = next((content[k] for k in ("distortion_coefficients", "D", "d") if k in content), [])
-        size = {key: content.get(f"image_{key}", content.get(key)) for key in ("width", "height")}
-        renamed = {"fx": K[0], "cx": K[2], "fy": K[4], "cy": K[5], **size}
-        model = content.get("distortion_model", "")
+        renamed = {"fx": K[0], "cx": K[2], "fy": K[4], "cy": K[5]}
+        for key in ("width", "height"):
+            renamed[key] = _first_of(content, f"image_{key}", key)
+        lens = _data(_first_of(content, "distortion_coefficients", "D", "d"))
     elif "ppx" in content or "ppy" in content:  # RealSense
-        lens, model = content.get("coeffs", []), content.get("model", "")
         renamed = {key: content.get(key) for key in ("fx", "fy", "width", "height")}
         renamed |= {"cx": content.get("ppx"), "cy": content.get("ppy")}
+        lens = content.get("coeffs")
     else:
         for key in content:
             if key not in KNOWN:
@@ -250,16 +225,22 @@ def _in_our_words(content: dict[Any, Any], path: Path) -> tuple[dict[str, Any], 
                     f"{path}: unknown key '{str(key)[:40]}'{hint}; known: {', '.join(KNOWN)}."
                 )
         return content, []
-    lens = _data(lens) or []
+    renamed |= {key: content[key] for key in ("depth_scale", "fps") if key in content}
     if not any(_distortion(lens, path)):
-        return renamed | extra, []
-    if any(word in str(model).lower() for word in ("fish", "equidist", "kannala", "ftheta")):
+        return renamed, []
+    model = str(_first_of(content, "distortion_model", "model"))[:40]
+    if any(word in model.lower() for word in ("fish", "equidist", "kannala", "ftheta")):
         raise FormatError(
-            f"{path}: distortion model '{str(model)[:40]}': expected Brown's (plumb_bob, "
+            f"{path}: distortion model '{model}': expected Brown's (plumb_bob, "
             f"rational_polynomial). Rectify the images first."
         )
     told = f"{path}: lens distortion is taken out; use a camera file without it if the images are "
-    return renamed | extra | {"distortion": lens}, [told + "rectified already."]
+    return renamed | {"distortion": lens}, [told + "rectified already."]
+
+
+def _first_of(content: dict[Any, Any], *keys: str) -> Any:
+    """Value of the first key that is there, else None."""
+    return next((content[key] for key in keys if key in content), None)
 
 
 def _data(value: Any) -> Any:
@@ -273,9 +254,8 @@ def _number(value: Any, where: str) -> float:
         number = float("nan") if isinstance(value, bool) else float(value)
     except (TypeError, ValueError, OverflowError):
         number = float("nan")
-    if not abs(number) < MAX_NUMBER:
-        shown = f"{value!r}"[:40] if isinstance(value, str | int | float) else type(value).__name__
-        raise FormatError(f"{where}: expected a finite number, got {shown}.")
+    if not np.isfinite(number):
+        raise FormatError(f"{where}: expected a finite number, got {str(value)[:40]!r}.")
     return number
 
 
@@ -287,18 +267,3 @@ def _distortion(value: Any, path: Path) -> tuple[float, ...]:
             f"{path}: distortion: expected a list of 4, 5 or 8 numbers [k1, k2, p1, p2, k3, ...]."
         )
     return tuple(_number(item, f"{path}: distortion") for item in value)
-
-
-def _doubts(camera: Camera, path: Path) -> list[str]:
-    """Warning of intrinsics that are rarely right."""
-    x, y = (camera.cx + 0.5) / camera.width, (camera.cy + 0.5) / camera.height
-    found = []
-    if abs(x - 0.5) > 0.25 or abs(y - 0.5) > 0.25:
-        found.append(
-            f"{path}: the principal point {camera.cx:g} {camera.cy:g} is far from the middle of "
-            f"{camera.width}x{camera.height} pixels: are fx, fy, cx, cy those of another image "
-            f"size?"
-        )
-    if not 0.8 < camera.fx / camera.fy < 1.25:
-        found.append(f"{path}: fx {camera.fx:g} and fy {camera.fy:g} differ: are pixels square?")
-    return found

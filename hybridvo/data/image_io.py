@@ -1,21 +1,19 @@
 """Readers and writers of image, depth, flow and camera files.
 
 Every reader compares the size that a header declares with the size of the file before it decodes
-or allocates anything. Every reader raises :class:`FormatError` with the path, what was expected and
-what was found where a file does not fit its format (truncated, damaged, bytes left over, objects to
-unpickle), and ``FileNotFoundError`` where there is none.
+anything. A file that does not fit its format (truncated, damaged, bytes left over, objects to
+unpickle) is a :class:`FormatError` with path, expected and found; none is a ``FileNotFoundError``.
 
-Formats: Middlebury's and Sintel's ``.flo``, Sintel's ``.dpt`` and ``.cam`` (little-endian, tag
+Formats: ``.flo`` of Middlebury and Sintel, Sintel's ``.dpt`` and ``.cam`` (little-endian, tag
 202021.25), ``.npy``, PNG of 8 and 16 bits, JPEG.
 """
 
 from __future__ import annotations
 
-import math
 import os
 import struct
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
 
 import cv2
 import numpy as np
@@ -42,10 +40,7 @@ COPY_AGAIN = "Copy or download the file again."
 
 
 def read_text(path: str | os.PathLike[str], *, limit: int = 2**26) -> str:
-    """Text of a list or calibration file of at most ``limit`` bytes.
-
-    Bytes that are not UTF-8 survive as surrogates, so that file names in a list keep their bytes.
-    """
+    """Text of a list or calibration file; bytes that are not UTF-8 survive as surrogates."""
     return _read_bytes(path, limit).decode("utf-8-sig", errors="surrogateescape")
 
 
@@ -63,10 +58,7 @@ def read_mask_png(path: str | os.PathLike[str]) -> np.ndarray:
 
 
 def read_depth(path: str | os.PathLike[str]) -> np.ndarray:
-    """(H, W) depth as it is stored: float32 (``.dpt``, ``.npy``) or unsigned integers.
-
-    Integers come from a 16-bit PNG with one channel, or from ``.npy``.
-    """
+    """(H, W) depth as stored: float32 (``.dpt``, ``.npy``) or unsigned (16-bit PNG, ``.npy``)."""
     suffix = Path(path).suffix.lower()
     if suffix == ".dpt":
         return read_dpt(path)
@@ -154,90 +146,56 @@ def read_cam(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def read_npy(path: str | os.PathLike[str], *, channels: int | None = None) -> np.ndarray:
-    """Image stored as ``.npy``: (H, W), or (H, W, channels); never unpickles.
-
-    Returns:
-        The array, in native byte order. Floating-point arrays come as float32.
-    """
-    with _open(path) as file:
-        shape, dtype = _npy_header(file, path)
-        if len(shape) != (2 if channels is None else 3) or shape[2:] not in ((), (channels,)):
-            expected = "(H, W)" if channels is None else f"(H, W, {channels})"
-            raise FormatError(f"{path}: expected an array of shape {expected}, got {shape}.")
-        size = file.tell() + math.prod(shape) * dtype.itemsize
-        _check_size(path, size, os.fstat(file.fileno()).st_size, f".npy {dtype} {shape}")
-    array = np.load(path, allow_pickle=False)
-    target = np.dtype(np.float32) if dtype.kind == "f" else dtype.newbyteorder("=")
+    """(H, W) or (H, W, channels) of a ``.npy`` file, floating point as float32; never unpickles."""
+    array = _map_npy(path)
+    if array.ndim != (2 if channels is None else 3) or array.shape[2:] not in ((), (channels,)):
+        expected = "(H, W)" if channels is None else f"(H, W, {channels})"
+        raise FormatError(f"{path}: expected an array of shape {expected}, got {array.shape}.")
+    kind = array.dtype
+    target = np.dtype(np.float32) if kind.kind == "f" else kind.newbyteorder("=")
     with np.errstate(over="ignore", invalid="ignore"):  # float64 beyond float32 becomes inf
-        return np.ascontiguousarray(array, dtype=target)
+        return np.array(array, dtype=target, order="C", subok=False)
 
 
 def image_size(path: str | os.PathLike[str]) -> tuple[int, int]:
     """(height, width) from the header of a PNG, JPEG, ``.npy``, ``.flo`` or ``.dpt`` file."""
     with _open(path) as file:
         data = file.read(MAX_HEADER_BYTES)
-        if data.startswith(NPY_MAGIC):
-            file.seek(0)
-            shape, _ = _npy_header(file, path)
-            return shape[0], shape[1]
+    if data.startswith(NPY_MAGIC):
+        height, width = _map_npy(path).shape[:2]
+        return height, width
     if data.startswith(TAG_BYTES):
         return _tagged_size(data, path, Path(path).suffix)
     return _encoded_size(data, path)
 
 
 def write_flo(path: str | os.PathLike[str], flow: np.ndarray) -> None:
-    """Write (H, W, 2) flow in pixels as ``.flo``.
-
-    Raises:
-        InputError: another shape. OutputError: the file cannot be written.
-    """
-    flow = np.asarray(flow)
-    if flow.ndim != 3 or flow.shape[2] != 2 or flow.size == 0:
-        raise InputError(f"write_flo: expected flow of shape (H, W, 2), got {flow.shape}.")
-    _write_tagged(path, flow)
+    """Write (H, W, 2) flow in pixels as ``.flo``; InputError for another shape."""
+    _write_tagged(path, np.asarray(flow), 2)
 
 
 def write_dpt(path: str | os.PathLike[str], depth: np.ndarray) -> None:
-    """Write (H, W) depth as ``.dpt``.
-
-    Raises:
-        InputError: another shape. OutputError: the file cannot be written.
-    """
-    depth = np.asarray(depth)
-    if depth.ndim != 2 or depth.size == 0:
-        raise InputError(f"write_dpt: expected depth of shape (H, W), got {depth.shape}.")
-    _write_tagged(path, depth)
+    """Write (H, W) depth as ``.dpt``; InputError for another shape."""
+    _write_tagged(path, np.asarray(depth)[..., None], 1)
 
 
 def write_cam(path: str | os.PathLike[str], K: np.ndarray, T_cam_world: np.ndarray) -> None:
-    """Write intrinsics (3, 3) and the extrinsic T_cam_world (4, 4) as ``.cam``.
-
-    Raises:
-        InputError: another shape. OutputError: the file cannot be written.
-    """
-    K, T = np.asarray(K, dtype="<f8"), np.asarray(T_cam_world, dtype="<f8")
-    if K.shape != (3, 3) or T.shape != (4, 4):
-        raise InputError(
-            f"write_cam: expected K (3, 3) and T_cam_world (4, 4), got {K.shape} and {T.shape}."
-        )
+    """Write intrinsics (3, 3) and the extrinsic T_cam_world (4, 4) as ``.cam``."""
     with atomic_write(path, "wb") as file:
-        file.write(TAG_BYTES + K.tobytes() + T[:3].tobytes())
+        file.write(TAG_BYTES + np.asarray(K, "<f8").tobytes())
+        file.write(np.asarray(T_cam_world, "<f8")[:3].tobytes())
 
 
 def _open(path: str | os.PathLike[str]) -> IO[bytes]:
     """The file, open for reading; FormatError for what is no regular file."""
     try:
         if os.path.exists(path) and not os.path.isfile(path):
-            what = "a folder" if os.path.isdir(path) else "a pipe or device"
-            raise FormatError(f"{path}: expected a file, got {what}.")
+            raise FormatError(f"{path}: expected a file, got a folder, pipe or device.")
         return open(path, "rb")
-    except FileNotFoundError:
+    except (FileNotFoundError, FormatError):
         raise
     except (OSError, ValueError) as error:
-        if isinstance(error, FormatError):
-            raise
-        reason = getattr(error, "strerror", None) or error
-        raise FormatError(f"{str(path)[:200]!r}: cannot be read: {reason}.") from None
+        raise FormatError(f"{str(path)[:200]!r}: cannot be read: {error}.") from None
 
 
 def _read_bytes(path: str | os.PathLike[str], limit: int) -> bytes:
@@ -267,10 +225,9 @@ def _check_pixels(path: object, width: int, height: int) -> None:
 
 def _check_tag(path: object, data: bytes, suffix: str) -> None:
     if not data.startswith(TAG_BYTES):
-        big = " The file is big-endian, expected little-endian." * data.startswith(TAG_BYTES[::-1])
         raise FormatError(
-            f"{path}: not a {suffix} file: expected the first bytes {TAG_BYTES!r}, "
-            f"got {data[:4]!r}.{big}"
+            f"{path}: not a little-endian {suffix} file: expected the first bytes {TAG_BYTES!r}, "
+            f"got {data[:4]!r}."
         )
 
 
@@ -292,29 +249,31 @@ def _read_tagged(path: str | os.PathLike[str], suffix: str, channels: int) -> np
     return array.astype(np.float32)
 
 
-def _write_tagged(path: str | os.PathLike[str], array: np.ndarray) -> None:
+def _write_tagged(path: str | os.PathLike[str], array: np.ndarray, channels: int) -> None:
+    if array.ndim != 3 or array.shape[2] != channels or array.size == 0:
+        raise InputError(f"{path}: expected (H, W) and {channels} channels, got {array.shape}.")
     size = struct.pack("<ii", array.shape[1], array.shape[0])
     with atomic_write(path, "wb") as file:
         file.write(TAG_BYTES + size + array.astype("<f4").tobytes())
 
 
-def _npy_header(file: IO[bytes], path: object) -> tuple[tuple[int, ...], np.dtype[Any]]:
-    """Shape and dtype of an image stored as .npy; the file stands at the first value then."""
+def _map_npy(path: str | os.PathLike[str]) -> np.memmap:
+    """Image stored as .npy, mapped: its header is checked, no value is read."""
+    with _open(path):
+        pass
     try:
-        version = np.lib.format.read_magic(file)
-        read = np.lib.format.read_array_header_1_0
-        read = read if version == (1, 0) else np.lib.format.read_array_header_2_0
-        shape, _, dtype = read(file)
+        array = np.load(path, mmap_mode="r", allow_pickle=False)
+        trailing = os.path.getsize(path) - array.offset - array.nbytes
     except Exception as error:  # numpy raises errors of many kinds for a damaged header
         reason = " ".join(str(error).split())[:200]
-        raise FormatError(f"{path}: expected a .npy file of a plain array ({reason}).") from None
-    if dtype.kind not in "fiub" or len(shape) not in (2, 3):
+        raise FormatError(f"{path}: expected a whole .npy file of one array ({reason}).") from None
+    if array.dtype.kind not in "fiub" or array.ndim not in (2, 3) or trailing:
         raise FormatError(
-            f"{path}: expected a .npy image of numbers (H, W) or (H, W, C), got {dtype} {shape}. "
-            f"Arrays of objects are not read."
+            f"{path}: expected a .npy image of numbers (H, W) or (H, W, C), got {array.dtype} "
+            f"{array.shape} and {trailing} trailing bytes."
         )
-    _check_pixels(path, shape[1], shape[0])
-    return shape, dtype
+    _check_pixels(path, array.shape[1], array.shape[0])
+    return array
 
 
 def _encoded_size(data: bytes, path: object) -> tuple[int, int]:

@@ -33,16 +33,10 @@ class KittiSequence(Sequence):
     Depth comes from a folder ``depth`` (16-bit PNG with 256 units per metre, or ``.npy`` in
     metres), else from stereo: OpenCV's semi-global matching with the baseline of ``calib.txt``.
     Poses are those of the colour camera that is read, in KITTI's world (first camera 0).
-
-    Args:
-        path: sequence folder, or its image_2 or image_0.
-        given: what the user says about camera, unit and masks.
-
-    Raises:
-        InputError: no frames, no calibration, no source of depth. FormatError: damaged text files.
     """
 
     kind = "kitti"
+    depth_source = "file"
     depth_scale = 256.0
     looks_for = "kitti: calib.txt and image_2 or image_0"
 
@@ -60,9 +54,8 @@ class KittiSequence(Sequence):
         numbers = sorted(left)
         stored = (numbered_files(root / f, r"(\d+)\.(?:png|npy)") for f in DEPTH_FOLDERS)
         depth = next((files for files in stored if files), {})
-        self._is_stereo = not depth
-        self.depth_source = "stereo" if self._is_stereo else "file"
-        if self._is_stereo:
+        if not depth:
+            self.depth_source = "stereo"
             depth = numbered_files(root / right_name, IMAGE_PATTERN)
         if not depth:
             raise InputError(
@@ -72,15 +65,14 @@ class KittiSequence(Sequence):
         calibration = root / "calib.txt"
         P = _read_projections(calibration)
         self._P_left = _projection(P, left_name[-1], calibration)
-        self._P_name = f"P{left_name[-1]}"
-        self._baseline = 0.0
-        if self._is_stereo:
+        self._disparity_at_1m = 0.0  # px: focal length times baseline
+        if self.depth_source == "stereo":
             P_right = _projection(P, right_name[-1], calibration)
-            self._baseline = float((self._P_left[0, 3] - P_right[0, 3]) / self._P_left[0, 0])
-            if not self._baseline > 0:
+            self._disparity_at_1m = float(self._P_left[0, 3] - P_right[0, 3])
+            if not self._disparity_at_1m > 0:
                 raise FormatError(
-                    f"{calibration}: expected a positive baseline between {self._P_name} and "
-                    f"P{right_name[-1]}, got {self._baseline} m."
+                    f"{calibration}: expected the camera of {right_name} to the right of the one "
+                    f"of {left_name}."
                 )
         stamps, told = _read_times(root / "times.txt", numbers)
         listing = Listing(
@@ -90,9 +82,9 @@ class KittiSequence(Sequence):
             sources=[calibration, root / "times.txt"],
             warnings=gap_warning(root.name, numbers) + told,
         )
-        if (truth := _truth_file(root)) is not None:
-            listing.sources.append(truth)
-            listing.poses, told = _read_poses(truth, numbers, self._P_left)
+        if (pose_file := _pose_file(root)) is not None:
+            listing.sources.append(pose_file)
+            listing.poses, told = _read_poses(pose_file, numbers, self._P_left)
             listing.warnings += told
         super().__init__(root, root.name, listing, given)
 
@@ -106,11 +98,11 @@ class KittiSequence(Sequence):
         try:
             camera = Camera.from_matrix(self._P_left[:, :3], self.height, self.width)
         except InputError as error:
-            raise FormatError(f"{self.root / 'calib.txt'}: {self._P_name}: {error}") from None
+            raise FormatError(f"{self.root / 'calib.txt'}: {error}") from None
         return Calibration(camera)
 
     def _read_depth(self, path: Path, index: int, rgb: np.ndarray | None) -> np.ndarray:
-        if not self._is_stereo:
+        if self.depth_source == "file":
             return super()._read_depth(path, index, rgb)
         left = rgb if rgb is not None else read_rgb(self.rgb_files[index] or path)
         right = read_rgb(path)
@@ -118,15 +110,14 @@ class KittiSequence(Sequence):
         disparity = _match(left, right)
         depth = np.zeros_like(disparity)
         found = disparity > 0
-        depth[found] = self._P_left[0, 0] * self._baseline / disparity[found]
+        depth[found] = self._disparity_at_1m / disparity[found]
         return depth
 
     def _depth_variance(self, depth: np.ndarray) -> np.ndarray | None:
         """Variance of log depth of a stereo pair: (sigma_d z / (f b))^2."""
-        if not self._is_stereo:
+        if self.depth_source == "file":
             return None
-        reach = float(self._P_left[0, 0] * self._baseline)
-        return np.square(DISPARITY_SIGMA_PX * depth / reach).astype(np.float32)
+        return np.square(DISPARITY_SIGMA_PX * depth / self._disparity_at_1m).astype(np.float32)
 
 
 def _match(left: np.ndarray, right: np.ndarray) -> np.ndarray:
@@ -162,35 +153,32 @@ def _sequence_folder(path: Path) -> Path | None:
     return None
 
 
-def _read_projections(path: Path) -> dict[str, tuple[int, np.ndarray]]:
-    """Name -> line in the file and (3, 4) matrix."""
+def _read_projections(path: Path) -> dict[str, np.ndarray]:
+    """Name -> (3, 4) projection of a rectified camera: fx 0 cx tx, 0 fy cy ty, 0 0 1 tz."""
     matrices = {}
     for line, text in enumerate(read_text(path, limit=2**20).split("\n"), start=1):
-        name, colon, rest = text.partition(":")
-        if not colon or not name.strip().startswith(("P", "Tr")):
+        name, _, rest = text.partition(":")
+        if not name.startswith("P"):
             continue
         try:
-            values = np.array([float(word) for word in rest.split()])
+            P = np.array(rest.split(), dtype=np.float64).reshape(3, 4)
         except ValueError:
-            values = np.zeros(0)
-        if values.size != 12 or not np.isfinite(values).all():
-            raise FormatError(f"{path}:{line}: expected 12 finite numbers after {name!r}.")
-        matrices[name.strip()] = line, values.reshape(3, 4)
+            P = np.zeros((3, 4))
+        is_rectified = P[1, 0] == 0 and np.allclose(P[2, :3], (0, 0, 1)) and P[0, 0] * P[1, 1] > 0
+        if not (is_rectified and np.abs(P).max() < MAX_ENTRY):
+            raise FormatError(
+                f"{path}:{line}: expected {name}: fx 0 cx tx 0 fy cy ty 0 0 1 tz, got "
+                f"{rest[:200]!r}."
+            )
+        matrices[name] = P
     return matrices
 
 
-def _projection(matrices: dict[str, tuple[int, np.ndarray]], number: str, path: Path) -> np.ndarray:
+def _projection(matrices: dict[str, np.ndarray], number: str, path: Path) -> np.ndarray:
     name = next((n for n in (f"P{number}", f"P_rect_0{number}") if n in matrices), None)
     if name is None:
         raise FormatError(f"{path}: expected a line 'P{number}: ...', found {sorted(matrices)}.")
-    line, P = matrices[name]
-    upper = P[1, 0] == 0 and np.allclose(P[2, :3], (0, 0, 1)) and np.abs(P).max() < MAX_ENTRY
-    if not (upper and P[0, 0] > 0 and P[1, 1] > 0):
-        raise FormatError(
-            f"{path}:{line}: {name}: expected fx 0 cx tx, 0 fy cy ty, 0 0 1 tz with positive fx "
-            f"and fy, got {P.tolist()}."
-        )
-    return P
+    return matrices[name]
 
 
 def _read_times(path: Path, numbers: list[int]) -> tuple[np.ndarray, list[str]]:
@@ -206,7 +194,7 @@ def _read_times(path: Path, numbers: list[int]) -> tuple[np.ndarray, list[str]]:
     return times[numbers], warnings
 
 
-def _truth_file(root: Path) -> Path | None:
+def _pose_file(root: Path) -> Path | None:
     name = f"{root.name}.txt"
     beside = (root / "poses" / name, root / "poses.txt", root.parent / "poses" / name)
     return next((p for p in (*beside, root.parent.parent / "poses" / name) if p.is_file()), None)
@@ -223,5 +211,5 @@ def _read_poses(path: Path, numbers: list[int], P_left: np.ndarray) -> tuple[np.
             M = np.reshape(rows[n].numbers, (3, 4))
             poses[i] = rigid(M[:, :3], M[:, 3], f"{path}:{rows[n].line}") @ invert(T_cam_cam0)
     missing = int(np.isnan(poses[:, 0, 0]).sum())
-    told = f"{path}: {len(rows)} poses; {missing} of {len(numbers)} have no truth."
+    told = f"{path}: {len(rows)} poses; {missing} of {len(numbers)} have no ground truth."
     return poses, [told] if missing else []

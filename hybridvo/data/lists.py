@@ -18,8 +18,6 @@ from hybridvo.units import stamp_unit
 
 MAX_STAMP_DIFFERENCE_S = 0.02
 """Largest difference in seconds between stamps that belong together (the TUM tools' value)."""
-MAX_CANDIDATES = 64
-"""Partners within the tolerance that a stamp may have on average: truth at 3 kHz has fewer."""
 MAX_POSITION_M = 1e12
 """No position is larger, and squares of it are finite."""
 TIMED_POSE = "timestamp tx ty tz qx qy qz qw"
@@ -40,41 +38,32 @@ def natural_key(path: Path) -> list[str | int]:
 
 
 def sorted_files(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
-    """Files of a folder with one of the suffixes, in natural order; empty if there is no folder.
-
-    Raises:
-        InputError: files whose names differ in the ending alone: frames would be read twice.
-    """
+    """Files of a folder with one of the suffixes, in natural order; empty if there is no folder."""
     if not folder.is_dir():
         return []
     found = [p for p in folder.iterdir() if p.suffix.lower() in suffixes and p.is_file()]
     files = sorted((p for p in found if not p.name.startswith(".")), key=natural_key)
-    seen: dict[str, Path] = {}
-    for path in files:
-        other = seen.setdefault(path.stem, path)
-        if other is not path:
-            raise InputError(
-                f"{folder}: {other.name} and {path.name} are two files of one frame. Keep one."
-            )
-    return files
+    return list(_one_each(files, [path.stem for path in files]).values())
 
 
 def numbered_files(folder: Path | None, pattern: str) -> dict[int, Path]:
-    """Files whose whole name matches a regular expression, by the number in its first group.
-
-    Raises:
-        InputError: two files of one number.
-    """
+    """Files whose whole name matches a regular expression, by the number in its first group."""
     if folder is None or not folder.is_dir():
         return {}
-    found: dict[int, Path] = {}
-    for path in sorted(folder.iterdir()):
-        if match := re.fullmatch(pattern, path.name):
-            other = found.setdefault(int(match[1]), path)
-            if other is not path:
-                raise InputError(
-                    f"{folder}: {other.name} and {path.name} are two files of one frame. Keep one."
-                )
+    names = ((path, re.fullmatch(pattern, path.name)) for path in sorted(folder.iterdir()))
+    found = [(path, int(match[1])) for path, match in names if match]
+    return _one_each([path for path, _ in found], [number for _, number in found])
+
+
+def _one_each(files: Many[Path], keys: Many) -> dict:
+    """Key -> file, where each key may have one file only."""
+    found: dict = {}
+    for path, key in zip(files, keys, strict=True):
+        other = found.setdefault(key, path)
+        if other is not path:
+            raise InputError(
+                f"{path.parent}: {other.name} and {path.name} are two files of one frame. Keep one."
+            )
     return found
 
 
@@ -85,9 +74,8 @@ def gap_warning(name: str, numbers: Many[int]) -> list[str]:
         for a, b in itertools.pairwise(numbers)
         if b - a > 1
     ]
-    if not spans:
-        return []
-    return [f"{name}: frame numbers {shown(spans)} are missing; the time stamps keep the gap."]
+    told = f"{name}: frame numbers {shown(spans)} are missing; the time stamps keep the gap."
+    return [told] if spans else []
 
 
 def flow_of_next(flow: dict[int, Path], numbers: Many[int]) -> list[Path | None]:
@@ -102,26 +90,19 @@ def shown(names: Many[object], most: int = 8) -> str:
 
 
 def listed_path(root: Path, name: str, where: str) -> Path:
-    """Path of a file that a list names, below the sequence's own folder.
-
-    Raises:
-        FormatError: an absolute name, one with ``..``, or no file name.
-    """
+    """Path of a file that a list names: below the sequence's own folder, else FormatError."""
     if PurePath(name).is_absolute() or ".." in PurePath(name).parts or "\0" in name:
         raise FormatError(f"{where}: expected a file below {root}, got {name[:200]!r}.")
     return root / name
 
 
 def read_rows(path: Path, columns: str, *, words: int = 0) -> list[Row]:
-    """Rows of a list file: numbers, then ``words`` columns of text; ``#`` starts a comment line.
+    """Rows of a list file: a number for each of ``columns``, the last ``words`` of them text.
 
-    Args:
-        path: file to read.
-        columns: names of the columns, for the error message; their number is what a row must have.
-        words: how many of the last columns are text (the last may contain spaces).
+    ``#`` starts a comment line; the last word may contain spaces.
 
     Raises:
-        FormatError: a row of another length or a number that cannot be read, with its line number.
+        FormatError: a row of another length or a number that cannot be read, with its line.
     """
     count = len(columns.split())
     rows = []
@@ -150,11 +131,7 @@ def to_seconds(stamps: Many[float] | np.ndarray, name: str) -> tuple[np.ndarray,
 
 
 def check_increasing(stamps: np.ndarray, where: str) -> None:
-    """Refuse stamps that are not finite, go back or stand still.
-
-    Raises:
-        InputError: with the frames and their stamps.
-    """
+    """Refuse stamps that are not finite, go back or stand still: InputError with the frames."""
     if not np.isfinite(stamps).all():
         bad = int(np.flatnonzero(~np.isfinite(stamps))[0])
         raise InputError(f"{where}: expected a finite timestamp, frame {bad} has {stamps[bad]}.")
@@ -183,7 +160,7 @@ def rigid(R: np.ndarray, t: np.ndarray, where: str) -> np.ndarray:
 def read_poses(path: Path, columns: str = TIMED_POSE) -> tuple[np.ndarray, np.ndarray]:
     """Stamps (N,), as in the file, and poses (N, 4, 4) of a list ``[timestamp] tx .. qw``.
 
-    Poses that are not finite are NaN; without a column of stamps these are NaN too.
+    Poses that are not finite are NaN. Without a column of stamps the first numbers stand for them.
 
     Raises:
         FormatError: a damaged row, a quaternion whose norm is not 1 to within 1 %, or a position
@@ -205,8 +182,7 @@ def read_poses(path: Path, columns: str = TIMED_POSE) -> tuple[np.ndarray, np.nd
         poses[finite] = np.eye(4)
         poses[finite, :3, :3] = Rotation.from_quat(values[finite, 3:]).as_matrix()
         poses[finite, :3, 3] = values[finite, :3]
-    stamps = [row.numbers[0] if len(row.numbers) == 8 else np.nan for row in rows]
-    return np.array(stamps), poses
+    return np.array([row.numbers[0] for row in rows]), poses
 
 
 def poses_at(
@@ -217,10 +193,32 @@ def poses_at(
     for i, j in associate(stamps, pose_stamps):
         matched[i] = poses[j]
     missing = int(np.isnan(matched[:, 0, 0]).sum())
-    if not missing:
-        return matched, []
     limit = MAX_STAMP_DIFFERENCE_S
-    return matched, [f"{name}: {missing} of {len(stamps)} frames have no pose within {limit} s."]
+    told = f"{name}: {missing} of {len(stamps)} frames have no pose within {limit} s."
+    return matched, [told] if missing else []
+
+
+def depth_at(
+    stamps: np.ndarray, depth_stamps: np.ndarray, where: Path
+) -> tuple[list[tuple[int, int]], list[str]]:
+    """Pairs (i, j) of colour and depth of one time, and a warning of colour that is left out.
+
+    Raises:
+        InputError: colour stamps that do not increase, or none with depth near.
+    """
+    check_increasing(stamps[np.isfinite(stamps)], str(where))
+    pairs = associate(stamps, depth_stamps)
+    count, limit = len(stamps), MAX_STAMP_DIFFERENCE_S
+    if count and not pairs:
+        raise InputError(
+            f"{where}: no frames: none of {count} colour stamps has a depth stamp within {limit} "
+            f"s. Are both in the same unit and of the same clock?"
+        )
+    told = (
+        f"{where.name}: {count - len(pairs)} of {count} colour images have no depth within {limit} "
+        f"s and are left out."
+    )
+    return pairs, [told] if len(pairs) < count else []
 
 
 def associate(
@@ -230,31 +228,18 @@ def associate(
 
     Greedy by the smallest difference, which must be below ``tolerance``, as the TUM tools do it.
     Neither list needs to be sorted; stamps that are not finite have no partner.
-
-    Raises:
-        InputError: stamps so close together, or so often repeated, that nearly all fit all.
     """
-    first, second = np.asarray(first, np.float64), np.asarray(second, np.float64)
-    rows, columns = np.flatnonzero(np.isfinite(first)), np.flatnonzero(np.isfinite(second))
-    columns = columns[np.argsort(second[columns], kind="stable")]
-    low = np.searchsorted(second[columns], first[rows] - tolerance, side="left")
-    high = np.searchsorted(second[columns], first[rows] + tolerance, side="right")
-    count = np.maximum(high - low, 0)
-    if count.sum() > MAX_CANDIDATES * (len(first) + len(second)):
-        raise InputError(
-            f"{count.sum()} pairs of stamps lie within {tolerance} s of each other, for "
-            f"{len(first)} and {len(second)} stamps: expected few. Are the stamps seconds, and is "
-            f"each there once?"
-        )
-    i = np.repeat(rows, count)
-    j = columns[np.arange(len(i)) + np.repeat(low - np.cumsum(count) + count, count)]
-    difference = np.abs(first[i] - second[j])
-    near = np.flatnonzero(difference < tolerance)
-    near = near[np.lexsort((j[near], i[near], difference[near]))]
+    order = np.argsort(second, kind="stable")
+    low, high = (np.searchsorted(second, first + d, sorter=order) for d in (-tolerance, tolerance))
+    candidates = [
+        (abs(first[i] - second[j]), i, int(j))
+        for i in range(len(first))
+        for j in order[low[i] : high[i]]
+    ]
     pairs: dict[int, int] = {}
     taken: set[int] = set()
-    for row, column in zip(i[near].tolist(), j[near].tolist(), strict=True):
-        if row not in pairs and column not in taken:
-            pairs[row] = column
-            taken.add(column)
+    for difference, i, j in sorted(candidates):
+        if difference < tolerance and i not in pairs and j not in taken:
+            pairs[i] = j
+            taken.add(j)
     return sorted(pairs.items())

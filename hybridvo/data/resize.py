@@ -12,30 +12,18 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from hybridvo.errors import InputError
 from hybridvo.types import Camera, Frame, FramePair
 
 
 def resize_camera(camera: Camera, height: int, width: int) -> Camera:
-    """Camera of the same view with another image size in pixels.
-
-    Raises:
-        InputError: a size that is not positive.
-    """
-    for name, value in (("height", height), ("width", width)):
-        if isinstance(value, bool) or int(value) != value or value <= 0:
-            raise InputError(f"resize: expected a positive {name} in pixels, got {value!r}.")
+    """Camera of the same view with another image size in pixels."""
     sx, sy = width / camera.width, height / camera.height
     cx, cy = sx * (camera.cx + 0.5) - 0.5, sy * (camera.cy + 0.5) - 0.5
     return Camera(camera.fx * sx, camera.fy * sy, cx, cy, height, width)
 
 
 def resize_frame(frame: Frame, height: int, width: int) -> Frame:
-    """Frame of another size: image by area (or bilinear when it grows), the rest by nearest.
-
-    Raises:
-        InputError: a size that is not positive.
-    """
+    """Frame of another size: image by area (or bilinear when it grows), the rest by nearest."""
     camera = resize_camera(frame.camera, height, width)
     rgb = frame.rgb
     if rgb is not None:
@@ -56,9 +44,6 @@ def resize_pair(pair: FramePair, height: int, width: int) -> FramePair:
     """Pair of another size: both frames, both cameras, and the flow with its vectors (px) scaled.
 
     Flow variance (px^2) is scaled with the area of a pixel.
-
-    Raises:
-        InputError: a size that is not positive.
     """
     prev, curr = (resize_frame(frame, height, width) for frame in (pair.prev, pair.curr))
     scale = np.array([width, height]) / (pair.prev.camera.width, pair.prev.camera.height)

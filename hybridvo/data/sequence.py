@@ -56,11 +56,6 @@ def open_sequence(
         InputError: no such folder, one that cannot be read, an unknown data set, a layout that no
             reader knows (with what was looked for), or a sequence without frames.
         FormatError: a list or calibration file that is damaged.
-
-    Example:
-        >>> sequence = open_sequence("recording", camera="525,525,319.5,239.5", depth_scale=1000)
-        >>> for frame in sequence:
-        ...     print(frame.index, frame.timestamp)
     """
     if dataset is not None and dataset not in DATASETS:
         close = difflib.get_close_matches(dataset, DATASETS, n=1)
@@ -78,8 +73,9 @@ def open_sequence(
         reason = error.strerror or str(error)
         raise InputError(f"{str(folder)[:200]}: cannot be read: {reason}.") from None
     if reader is not SintelSequence and sequence.root.resolve() != folder.resolve():
-        told = f"{folder}: one folder of a sequence; all of {sequence.root} is read."
-        sequence.add_warning(told)
+        sequence.warnings.append(
+            f"{folder}: one folder of a sequence; all of {sequence.root} is read."
+        )
     return sequence
 
 
@@ -131,16 +127,14 @@ def iter_pairs(
 
     Args:
         sequence: where the frames come from.
-        flow: None takes the flow files; a callable (prev, curr), such as ``hybridvo.dis_flow()``,
-            gives an object with the attributes flow, variance, valid, source and is_true.
+        flow: None takes the flow files (where one of many is missing, the pair's flow is None); a
+            callable (prev, curr), such as ``hybridvo.dis_flow()``, gives an object with the
+            attributes flow, variance, valid, source and is_true.
         start: first frame.
         stop: the one after the last frame.
         stride: step between frames.
         on_error: called with the index of a frame (or of a pair's previous frame) that cannot be
             read and with the exception; that pair is left out. By default the exception is raised.
-
-    Returns:
-        Iterator of pairs. Where one flow file of many is missing, the pair's flow is None.
 
     Raises:
         InputError: a range without a pair; flow files asked for where there are none, or with a
@@ -168,30 +162,20 @@ def _pairs(
 ) -> Iterator[FramePair]:
     prev: Frame | None = None
     for index in indices:
-        curr = _or_told(on_error, index, lambda i=index: sequence.frame(i))  # type: ignore[misc]
-        if prev is not None and curr is not None:
-            pair = _or_told(
-                on_error,
-                prev.index,
-                lambda prev=prev, curr=curr: _pair(sequence, flow, prev, curr),  # type: ignore[misc]
-            )
-            if pair is not None:
-                yield pair
-                del pair
+        curr = pair = None
+        failing = index
+        try:
+            curr = sequence.frame(index)
+            if prev is not None:
+                failing = prev.index
+                pair = _pair(sequence, flow, prev, curr)
+        except (InputError, OSError) as error:
+            if on_error is None:
+                raise
+            on_error(failing, error)
+        if pair is not None:
+            yield pair
         prev = curr
-
-
-def _or_told(
-    on_error: Callable[[int, Exception], None] | None, index: int, read: Callable[[], Any]
-) -> Any:
-    """What ``read`` gives; None where it fails and the caller wants to be told."""
-    try:
-        return read()
-    except (InputError, OSError) as error:
-        if on_error is None:
-            raise
-        on_error(index, error)
-        return None
 
 
 def _pair(

@@ -24,14 +24,7 @@ class SevenScenesSequence(Sequence):
 
     Depth is in millimetres, 0 and 65535 are invalid. K = 585 585 320 240 is the data set's own
     convention for colour and depth. Stamps count 30 frames a second: the data has none. A frame
-    whose pose file is damaged has no truth.
-
-    Args:
-        path: folder with the frames.
-        given: what the user says about camera, unit and masks.
-
-    Raises:
-        InputError: no frames, or images of another size than 640x480 without a camera.
+    whose pose file is damaged has no ground truth.
     """
 
     kind = "7scenes"
@@ -56,7 +49,7 @@ class SevenScenesSequence(Sequence):
                 if n in pose_files:
                     poses[i] = _read_pose(pose_files[n])
             except FormatError as error:
-                warnings.append(f"no truth for frame {i}: {error}")
+                warnings.append(f"no ground truth for frame {i}: {error}")
         listing = Listing(
             rgb=[rgb.get(n) for n in numbers],
             depth=[depth.get(n) for n in numbers],
@@ -73,11 +66,6 @@ class SevenScenesSequence(Sequence):
         return any(numbered_files(path, pattern) for pattern in (IMAGE_PATTERN, DEPTH_PATTERN))
 
     def _calibration(self) -> Calibration:
-        if (self.height, self.width) != (480, 640):
-            raise InputError(
-                f"{self.root}: images are {self.width}x{self.height}, 7-Scenes ships 640x480. Give "
-                f"the camera (--camera fx,fy,cx,cy)."
-            )
         return Calibration(Camera(585.0, 585.0, 320.0, 240.0, 480, 640))
 
     def _read_depth(self, path: Path, index: int, rgb: np.ndarray | None) -> np.ndarray:
@@ -89,14 +77,10 @@ class SevenScenesSequence(Sequence):
 
 def _read_pose(path: Path) -> np.ndarray:
     """(4, 4) T_world_cam; NaN where tracking was lost (the file then holds inf or nan)."""
-    words = read_text(path, limit=2**16).split()
     try:
-        values = np.array([float(word) for word in words])
-    except ValueError:
-        raise FormatError(f"{path}: expected 16 numbers of a 4x4 matrix, got text.") from None
-    if values.size != 16:
-        raise FormatError(f"{path}: expected 16 numbers of a 4x4 matrix, got {values.size}.")
-    if not np.isfinite(values).all():
+        T = np.array(read_text(path, limit=2**16).split(), dtype=np.float64).reshape(4, 4)
+    except ValueError as error:
+        raise FormatError(f"{path}: expected 16 numbers of a 4x4 matrix ({error}).") from None
+    if not np.isfinite(T).all():
         return np.full((4, 4), np.nan)
-    T = values.reshape(4, 4)
     return rigid(T[:3, :3], T[:3, 3], str(path))

@@ -16,31 +16,17 @@ from hybridvo.types import Camera
 
 FRAMES_PER_SECOND = 24.0
 IMAGE_PASSES = ("final", "clean", "albedo")
-SUFFIXES = {
-    "flow": "flo",
-    "depth": "dpt",
-    "camdata_left": "cam",
-    "occlusions": "png",
-    "invalid": "png",
-}
-FOLDERS = (*IMAGE_PASSES, *SUFFIXES)
+SUFFIXES = {"flow": "flo", "depth": "dpt", "camdata_left": "cam", "invalid": "png"}
+FOLDERS = (*IMAGE_PASSES, *SUFFIXES, "occlusions")
 
 
 class SintelSequence(Sequence):
-    """One Sintel scene, such as ``training/clean/alley_1``.
+    """One Sintel scene, such as ``training/clean/alley_1``, or NAME under a sibling of clean.
 
-    ``flow`` marks pixels of the ``invalid`` masks. Occluded pixels keep their true flow: ask
-    ``occlusion`` for them. Stamps count 24 frames a second from the first frame.
-
-    Args:
-        path: ``.../training/FOLDER/NAME`` with FOLDER one of clean, final, albedo, flow, depth,
-            camdata_left, occlusions, invalid; the siblings are found from there, also where the
-            zip files were unpacked into neighbouring folders. Images are those of ``path``, else
-            of the final pass, else of the clean one.
-        given: what the user says about camera, unit and masks.
-
-    Raises:
-        InputError: no frames, or no camera data.
+    Siblings are found from there, also where the zip files were unpacked into neighbouring folders.
+    Images are those of the path, else of the final pass, else of the clean one. ``flow`` marks the
+    pixels of the ``invalid`` masks; occluded pixels keep their true flow. Stamps count 24 frames a
+    second from the first frame.
     """
 
     kind = "sintel"
@@ -71,9 +57,8 @@ class SintelSequence(Sequence):
                 f"comes with Sintel's depth download; it exists for the training scenes only."
             )
         self._cameras = [files["camdata_left"].get(n) for n in numbers]
-        self._occlusions = [files["occlusions"].get(n) for n in numbers]
         self._invalid = [files["invalid"].get(n) for n in numbers]
-        sources = (*self._cameras, *self._invalid, *self._occlusions)
+        sources = (*self._cameras, *self._invalid)
         listing = Listing(
             rgb=[rgb.get(n) for n in numbers],
             depth=[files["depth"].get(n) for n in numbers],
@@ -96,24 +81,9 @@ class SintelSequence(Sequence):
         return any(numbered_files(folder, pattern) for folder in siblings)
 
     def camera(self, index: int) -> Camera:
-        """Camera of this very frame: Sintel zooms.
-
-        Raises:
-            FileNotFoundError: no ``.cam`` file for this frame. FormatError: a damaged one.
-        """
+        """Camera of this very frame (Sintel zooms); FileNotFoundError where it has none."""
         index = self._check_index(index)
         return self._camera or self._read_camera(index)[0]
-
-    def occlusion(self, index: int) -> np.ndarray:
-        """(H, W) bool, True where a pixel of frame ``index`` cannot be seen in the next one.
-
-        Raises:
-            FileNotFoundError: no occlusion mask for this frame. FormatError: a damaged one.
-        """
-        path = self._occlusions[self._check_index(index)]
-        if path is None:
-            raise FileNotFoundError(f"{self.name}: frame {index} has no occlusion mask.")
-        return read_mask_png(path)
 
     def _calibration(self) -> Calibration | None:
         return None
@@ -136,7 +106,7 @@ class SintelSequence(Sequence):
             try:
                 poses[index] = invert(self._read_camera(index)[1])
             except (FormatError, FileNotFoundError) as error:
-                self._warnings.append(f"no camera for frame {index}: {error}")
+                self.warnings.append(f"no camera for frame {index}: {error}")
         return poses
 
     def _read_flow(self, path: Path, index: int) -> tuple[np.ndarray, np.ndarray | None]:

@@ -32,13 +32,6 @@ class TartanAirSequence(Sequence):
     The flow files hold the flow that the camera alone causes. Depth of the sky is about 1e4 m and
     kept. Poses are turned from north-east-down to camera axes here, once. Stamps count 10 frames a
     second: the data has none.
-
-    Args:
-        path: trajectory folder, or one of its image, depth or flow folders.
-        given: what the user says about camera, unit and masks.
-
-    Raises:
-        InputError: no frames. FormatError: a damaged pose file.
     """
 
     kind = "tartanair"
@@ -86,15 +79,10 @@ class TartanAirSequence(Sequence):
     def _calibration(self) -> Calibration:
         # Field of view 90 degrees over the width: 320 px at 640, c = (size - 1) / 2 because our
         # pixel (0, 0) is a centre where TartanAir publishes the corner convention's 320.
-        height, width, focal = self.height, self.width, self.width / 2
-        camera = Camera(focal, focal, (width - 1) / 2, (height - 1) / 2, height, width)
-        if width == PUBLISHED_WIDTH:
-            return Calibration(camera)
-        told = (
-            f"{self.name}: images are {width} pixels wide, TartanAir ships {PUBLISHED_WIDTH}: the "
-            f"focal length is scaled to {focal} px, which is right if they were resized as a whole."
-        )
-        return Calibration(camera, warnings=(told,))
+        height, width = self.height, self.width
+        camera = Camera(width / 2, width / 2, (width - 1) / 2, (height - 1) / 2, height, width)
+        told = f"{self.name}: images are {width} pixels wide, TartanAir's 640: focal length scaled."
+        return Calibration(camera, warnings=() if width == PUBLISHED_WIDTH else (told,))
 
     def _read_depth(self, path: Path, index: int, rgb: np.ndarray | None) -> np.ndarray:
         if path.suffix == ".png":
@@ -135,15 +123,11 @@ def _read_poses(path: Path, numbers: list[int]) -> tuple[np.ndarray | None, list
     if not path.exists():
         return None, []
     converted = ned_to_camera(read_poses(path, "tx ty tz qx qy qz qw")[1])
-    count = len(converted)
-    known = np.array(numbers) < count
-    if not known.any() and count == len(numbers):
+    known = np.array(numbers) < len(converted)
+    if not known.any() and len(converted) == len(numbers):
         return converted, [f"{path}: frames start at {numbers[0]}; pose lines are taken in order."]
     poses = np.full((len(numbers), 4, 4), np.nan)
     poses[known] = converted[np.array(numbers)[known]]
-    if known.all():
-        return poses, []
-    return poses, [
-        f"{path}: {count} poses, but frame {numbers[-1]} needs line {numbers[-1] + 1}: "
-        f"{int((~known).sum())} frames have no truth."
-    ]
+    lost = int((~known).sum())
+    told = f"{path}: {len(converted)} poses: {lost} frames have no ground truth."
+    return poses, [told] if lost else []

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hybridvo.data.camera_file import parse_camera, read_camera_file, write_camera_template
+from hybridvo.data.camera_file import read_camera_file, write_camera_template
 from hybridvo.data.image_io import write_flo
 from hybridvo.data.lists import associate, natural_key, to_seconds
 from hybridvo.data.sequence import open_sequence
@@ -40,49 +41,68 @@ def told(path: Path, **options) -> str:
 # what belongs together
 
 
-def test_colour_and_depth_go_together_by_stamps_in_their_names(tmp_path):
-    colour = [f"{100 + i / 10:.3f}" for i in range(5)]
-    depth = [f"{100.004 + i / 10:.3f}" for i in (0, 1, 3, 4)]  # 4 ms later, one missing
-    sequence = open_sequence(own(tmp_path, colour, depth))
-    np.testing.assert_allclose(sequence.timestamps, [100, 100.1, 100.3, 100.4])
-    assert [path.stem for path in sequence.depth_files] == depth
-    assert "1 of 5 colour images have no depth" in "\n".join(sequence.warnings)
+NUMBERS = st.lists(st.integers(0, 12), min_size=1, max_size=5, unique=True).map(sorted)
 
 
-def test_colour_and_depth_go_together_by_lists_of_stamps(tmp_path):
-    root = own(tmp_path, ["a1", "a2", "a3"], ["b1", "b2", "b3", "b4"])
-    with pytest.raises(InputError, match=r"4 files for 3 images.*depth_timestamps\.txt"):
-        open_sequence(root)
-    (root / "timestamps.txt").write_text("# colour\n1.0\n1.5\n2.0\n")
-    (root / "depth_timestamps.txt").write_text("1.001\n1.25\n1.499\n2.012\n")
-    sequence = open_sequence(root)
-    assert [path.stem for path in sequence.depth_files] == ["b1", "b3", "b4"]
-    assert sequence.timestamps.tolist() == [1.0, 1.5, 2.0]
-    (root / "depth_timestamps.txt").write_text("51\n52\n53\n54\n")
-    with pytest.raises(InputError, match="same clock"):
-        open_sequence(root)
+@settings(max_examples=60, deadline=None)
+@given(
+    NUMBERS,
+    NUMBERS,
+    st.sampled_from(["names", "stamps", "lists"]),
+    st.sampled_from(["", "fps: 4\n"]),
+)
+def test_colour_and_depth_that_belong_together(images, depths, way, fps):
+    """Against the rule in words: equal names, else stamps within 20 ms, else order."""
+    names, lists = {
+        "names": (("{:.0f}", "{:.0f}"), False),
+        "stamps": (("{:.3f}", "{:.3f}"), False),
+        "lists": (("a{:.0f}", "b{:.0f}"), True),
+    }[way]
+    times = {n: 100 + n / 10 for n in range(13)}
+    values = times if way == "stamps" else {n: n for n in times}
+    lag = 0.004 if way == "stamps" else 0.0
+    colour = [names[0].format(values[n]) for n in images]
+    depth = [names[1].format(values[n] + lag) for n in depths]
+    common = [n for n in images if n in depths]
+    with TemporaryDirectory() as folder:
+        root = own(Path(folder), colour, depth)
+        (root / "camera.yaml").write_text(CAMERA + fps)
+        if lists:
+            write.text(root / "timestamps.txt", "".join(f"{times[n]}\n" for n in images))
+            write.text(
+                root / "depth_timestamps.txt", "".join(f"{times[n] + 0.01}\n" for n in depths)
+            )
+        if not common and (way != "names" or len(images) != len(depths)):
+            with pytest.raises(InputError, match=r"same clock|files for .* images"):
+                open_sequence(root)
+            return
+        sequence = open_sequence(root)
+        warnings = "\n".join(sequence.warnings)
+        if way == "names":
+            expected = [n if n in depths else None for n in images] if common else depths
+            rate = 4 if fps else 30
+            np.testing.assert_allclose(sequence.timestamps, np.arange(len(images)) / rate)
+            stray = len(set(depths) - set(images)) if common else 0
+            assert (f"{stray} depth files without an image are left out" in warnings) == (stray > 0)
+        else:
+            expected = common
+            np.testing.assert_allclose(sequence.timestamps, [times[n] for n in common])
+            lost = len(images) - len(common)
+            assert (f"{lost} of {len(images)} colour images have no depth" in warnings) == bool(
+                lost
+            )
+        found = [None if path is None else path.stem for path in sequence.depth_files]
+        by_number = dict(zip(depths, depth, strict=True))
+        assert found == [by_number.get(n) for n in expected]
+        frame = sequence[0]
+        assert frame.rgb is not None and (frame.depth is None) == (expected[0] is None)
+
+
+def test_stamps_of_another_count_are_refused(tmp_path):
+    root = own(tmp_path, ["c1", "c2", "c3"], ["d1", "d2"])
     (root / "timestamps.txt").write_text("1\n2\n")
     with pytest.raises(InputError, match=r"timestamps\.txt: 2 stamps for 3 files"):
         open_sequence(root)
-
-
-def test_equal_counts_without_names_or_stamps_go_by_order(tmp_path):
-    sequence = open_sequence(own(tmp_path, ["c9", "c10"], ["d1", "d2"]))
-    assert [path.stem for path in sequence.rgb_files] == ["c9", "c10"]
-    assert [path.stem for path in sequence.depth_files] == ["d1", "d2"]
-    assert "natural order, c9.png to c10.png" in "\n".join(sequence.warnings)
-
-
-def test_missing_and_stray_files_are_told(tmp_path):
-    text = told(own(tmp_path / "a", ["0000", "0001", "0003"], ["0000", "0001", "0002", "0003"]))
-    assert "1 depth files without an image are left out: 0002.png" in text
-    assert "numbers of the images jump, the time stamps do not" in text
-    assert "timestamps.txt" in text
-    for name, numbers in (("one", ["7", "8", "9"]), ("ten", ["00", "10", "20"])):
-        text = told(own(tmp_path / name, numbers))
-        assert "jump" not in text and "left out" not in text
-    frame = open_sequence(own(tmp_path / "b", ["0", "1"], ["0"]))[1]
-    assert frame.depth is None and frame.rgb is not None
 
 
 def test_two_files_of_one_frame_are_refused(tmp_path):
@@ -182,16 +202,6 @@ def test_association_is_greedy_one_to_one(a, b):
             used_b.add(j)
             expected.append((i, j))
     assert associate(first, second, 0.02) == sorted(expected)
-
-
-def test_stamps_that_all_fit_all_are_refused():
-    with pytest.raises(InputError, match="400000000 pairs of stamps"):  # 30 GB of candidates
-        associate(1 + 1e-9 * np.arange(20_000), np.ones(20_000))
-    # truth at 1 kHz beside frames at 30 Hz is no such case
-    frames, truth = np.arange(300) / 30, np.arange(10_000) / 1000
-    pairs = associate(frames, truth)
-    assert [i for i, _ in pairs] == list(range(300))
-    assert np.abs(frames - truth[[j for _, j in pairs]]).max() <= 0.0005 + 1e-9
 
 
 def test_natural_order():
@@ -307,6 +317,7 @@ distortion_coefficients: {rows: 1, cols: 5, data: [0.1, -0.2, 0, 0, 0]}
 rectification_matrix: {rows: 3, cols: 3, data: [1, 0, 0, 0, 1, 0, 0, 0, 1]}
 """
 MESSAGE = "width: 32\nheight: 24\nK: [20.0, 0, 15.5, 0, 21.0, 11.5, 0, 0, 1]\nD: [0, 0, 0, 0, 0]\n"
+MESSAGE += "---\n"  # as "ros2 topic echo" ends it
 REALSENSE = {
     "width": 32,
     "height": 24,
@@ -349,15 +360,16 @@ def test_a_camera_may_be_given_to_every_reader(tmp_path):
             f"{{fx: 99, fy: 98, cx: {width / 2}, cy: {height / 2}, width: {width}, "
             f"height: {height}}}"
         )
-        for given_camera in (words, path, str(path), expected):
+        for given_camera in (words, str(path), expected):
             opened = open_sequence(sequence.root, sequence.kind, camera=given_camera)
             assert opened.camera(1) == opened[1].camera == expected
-    with pytest.raises(InputError, match="10x6"):
-        parse_camera(path, (480, 640))
-    with pytest.raises(InputError, match="neither four numbers nor a file"):
-        parse_camera("1,2,3", (480, 640))
-    with pytest.raises(InputError, match="focal length"):
-        parse_camera("-1,2,3,4", (480, 640))
+    for camera, message in (
+        (Camera(9, 9, 4, 3, 6, 8), "8x6"),
+        ("1,2,3", "neither four numbers nor a file"),
+        ("-1,2,3,4", "focal length"),
+    ):
+        with pytest.raises(InputError, match=message):
+            open_sequence(sequence.root, camera=camera)
 
 
 def test_a_folder_needs_no_camera_file_where_the_camera_is_given(tmp_path):
@@ -373,7 +385,6 @@ def test_template_is_filled_in_and_read(tmp_path):
     root = own(tmp_path, ["0", "1"])
     (root / "camera.yaml").unlink()
     path = write_camera_template(root)
-    assert path == root / "camera.yaml"
     with pytest.raises(FormatError, match=r"camera\.yaml: missing: fx, fy, cx, cy\."):
         open_sequence(root)
     text = path.read_text()
@@ -383,7 +394,6 @@ def test_template_is_filled_in_and_read(tmp_path):
     assert open_sequence(root)[0].camera == Camera(16.5, 16.5, 16.5, 16.5, 24, 32)
     with pytest.raises(InputError, match="exists already"):
         write_camera_template(root)
-    assert write_camera_template(tmp_path / "new").read_text().count("width:") == 1
 
 
 @pytest.mark.parametrize(
@@ -394,15 +404,13 @@ def test_template_is_filled_in_and_read(tmp_path):
         (CAMERA + "distortion: [0, 0]\n", "a list of 4, 5 or 8 numbers"),
         (CAMERA.replace("fx: 20", "fx: twenty"), "fx: expected a finite number, got 'twenty'"),
         (CAMERA.replace("fx: 20", "fx: .nan"), "fx: expected a finite number"),
-        (CAMERA.replace("fx: 20", "fx: " + "9" * 400), "fx: expected a finite number"),
         (CAMERA.replace("fx: 20", "fx: -20"), "fx: expected a positive focal length"),
         (CAMERA.replace("fx: 20\n", ""), "missing: fx"),
-        (CAMERA.replace("1000", "-1"), "depth_scale: expected a number above 0"),
+        (CAMERA.replace("1000", "-1"), "depth_scale: expected units per metre above 0"),
         ("!!python/object/apply:os.system ['true']\n", r"camera\.yaml:1: not a YAML file"),
         ("- 1\n- 2\n", "got a list"),
         ("fx: 1\nfy: [1\n", r"camera\.yaml:3: not a YAML file"),
         ("", "got a NoneType"),
-        ("[" * 5000, "not a YAML file"),
         ("#" * (2**20 + 1), "above the limit"),
         ("K: [1, 2]\n", "expected 9 numbers"),
     ],
@@ -415,36 +423,21 @@ def test_damaged_camera_files(text, message, tmp_path):
     assert "camera.yaml" in str(caught.value) and len(str(caught.value)) < 1000
 
 
-def test_powers_of_ten_are_numbers(tmp_path):
-    root = own(tmp_path, ["0", "1"])
-    (root / "camera.yaml").write_text(CAMERA.replace("fx: 20", "fx: 2e1").replace("1000", "1e3"))
-    assert open_sequence(root).camera(0).fx == 20.0
-
-
 def test_intrinsics_of_another_size_are_told_or_refused(tmp_path):
     root = own(tmp_path, ["0", "1"])
-    assert told(root).count("principal point") == 0
+    (root / "camera.yaml").write_text(CAMERA.replace("fx: 20", "fx: 2e1").replace("1000", "1e3"))
+    assert open_sequence(root).camera(0).fx == 20.0 and "principal point" not in told(root)
     (root / "camera.yaml").write_text(CAMERA.replace("cx: 15.5", "cx: 31.5"))
-    assert "those of another image size?" in told(root)
-    (root / "camera.yaml").write_text(CAMERA.replace("fx: 20", "fx: 30"))
-    assert "pixels square?" in told(root)
+    assert "those of another size?" in told(root)
     (root / "camera.yaml").write_text(CAMERA.replace("width: 32", "width: 64"))
     with pytest.raises(InputError, match=r"32x24.*64x24"):
         open_sequence(root)
+
+
+def test_flow_of_distorted_images_is_refused(tmp_path):
+    root = own(tmp_path, ["0", "1"])
     (root / "camera.yaml").write_text(CAMERA + "distortion: [0.1, 0, 0, 0]\n")
-    write_flo_at(root)
-    with pytest.raises(InputError, match="Undistort"):
-        open_sequence(root)
-
-
-def write_flo_at(root: Path) -> None:
     (root / "flow").mkdir()
     write_flo(root / "flow" / "0.flo", np.zeros((*SIZE, 2), np.float32))
-
-
-@pytest.mark.filterwarnings("error")
-def test_a_frame_rate_of_almost_zero_is_refused(tmp_path):
-    root = own(tmp_path, ["a", "b"])
-    (root / "camera.yaml").write_text(CAMERA + "fps: 1.0e-320\n")
-    with pytest.raises(InputError, match="finite timestamp"):
+    with pytest.raises(InputError, match="Undistort"):
         open_sequence(root)

@@ -10,7 +10,8 @@ import torch
 from hybridvo.errors import InputError
 from hybridvo.geometry import ego_flow, euler_deg_to_matrix, make_transform
 from hybridvo.network.losses import LossOptions, LossTargets, reconstruct, total_loss
-from hybridvo.network.selection import select, selected_transform
+from hybridvo.network.selection import select_pose
+from hybridvo.torch_geometry import euler_transform
 from hybridvo.types import Camera, PixelwisePrediction
 
 PLAIN = {"pose_uncertainty": False, "flow_uncertainty": False, "depth_uncertainty": False}
@@ -70,6 +71,10 @@ def predict(rotation, translation, s_rotation, s_translation, **shape) -> Pixelw
     return PixelwisePrediction(
         *(constant_maps(v, **shape) for v in (rotation, translation, s_rotation, s_translation))
     )
+
+
+def maps_of(prediction: PixelwisePrediction) -> list[torch.Tensor]:
+    return [value for value in vars(prediction).values() if isinstance(value, torch.Tensor)]
 
 
 LOG2 = math.log(2.0)
@@ -273,7 +278,7 @@ def test_gradcheck_through_selection(options):
 
     def loss(*values):
         prediction = PixelwisePrediction(*values)
-        T = selected_transform(*select(prediction, patch=2))
+        T = euler_transform(*select_pose(prediction, patch=2))
         return total_loss(prediction, targets, options, T)[0]
 
     torch.autograd.gradcheck(loss, maps)
@@ -288,7 +293,7 @@ def test_gradcheck_of_a_vonet():
 
     def loss(rotation, translation):
         output = (rotation, translation)
-        return total_loss(output, targets, LossOptions(**PLAIN), selected_transform(*output))[0]
+        return total_loss(output, targets, LossOptions(**PLAIN), euler_transform(*output))[0]
 
     torch.autograd.gradcheck(loss, pose)
 
@@ -304,10 +309,10 @@ def test_gradients_are_finite_at_identity_and_zero_error(options, translation, d
     targets = replace(targets, ego_flow=flow, depth_curr=z)
     maps = [
         v.to(dtype).requires_grad_()
-        for v in vars(predict((0, 0, 0), translation, (0, 0, 0), (0, 0, 0))).values()
+        for v in maps_of(predict((0, 0, 0), translation, (0, 0, 0), (0, 0, 0)))
     ]
     prediction = PixelwisePrediction(*maps)
-    T = selected_transform(*select(prediction))
+    T = euler_transform(*select_pose(prediction))
     loss, _ = total_loss(prediction, targets, options, T)
     loss.backward()
     assert torch.isfinite(loss)
@@ -322,7 +327,7 @@ def test_gradients_are_finite_at_identity_and_zero_error(options, translation, d
 def test_extreme_scales_have_finite_gradients_in_the_right_direction(extreme):
     maps = [
         v.float().requires_grad_()
-        for v in vars(predict((1, 1, 1), (1, 0, 0), [extreme] * 3, [extreme] * 3)).values()
+        for v in maps_of(predict((1, 1, 1), (1, 0, 0), [extreme] * 3, [extreme] * 3))
     ]
     loss, _ = total_loss(
         PixelwisePrediction(*maps), make_targets().to(torch.float32), LossOptions(**POSE)
