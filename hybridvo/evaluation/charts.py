@@ -69,8 +69,8 @@ def error_distribution(pairs: pd.DataFrame, methods: Sequence[str]) -> list[Figu
         return []
     share = np.linspace(0, 1, QUANTILES)
     groups = known.groupby(["flow_source", "method"])["epe_l2_px"]
-    curves = groups.quantile(share).clip(lower=FLOOR_PX).reset_index(names=["f", "m", "below"])
-    curves = curves.rename(columns={"f": "flow_source", "m": "method"})
+    curves = groups.quantile(share).clip(lower=FLOOR_PX)
+    curves = curves.rename_axis(["flow_source", "method", "below"]).reset_index()
     curves["below"] *= 100
     figure = px.line(
         curves,
