@@ -1,26 +1,15 @@
-"""What users hand in, as arrays, numbers and folders that can be used, or an error in words."""
+"""What users hand in, as arrays and numbers that can be used, or an error in words."""
 
 from __future__ import annotations
 
-import os
 from numbers import Integral
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from hybridvo.errors import InputError, OutputError
+from hybridvo.errors import InputError
 
-__all__ = [
-    "as_float_image",
-    "as_number",
-    "as_rigid",
-    "as_seed",
-    "make_folder",
-    "to_numpy",
-]
-
-LARGEST_SEED = 2**31 - 1
+MAX_SEED = 2**31 - 1
 """Every generator that is seeded takes as much."""
 
 
@@ -74,7 +63,7 @@ def as_seed(seed: Any, where: str) -> int:
         InputError: no whole number from 0 to 2^31 - 1.
     """
     whole = isinstance(seed, Integral) and not isinstance(seed, bool)
-    if not whole or not 0 <= seed <= LARGEST_SEED:
+    if not whole or not 0 <= seed <= MAX_SEED:
         raise InputError(f"{where}: expected a whole number from 0 to 2^31 - 1, got {seed!r}.")
     return int(seed)
 
@@ -95,24 +84,3 @@ def as_rigid(T: Any, where: str) -> np.ndarray:
     if np.abs(T[3] - (0.0, 0.0, 0.0, 1.0)).max() > 1e-6:
         raise InputError(f"{where}: expected (0, 0, 0, 1) in the last row, got {T[3].tolist()}.")
     return T
-
-
-def make_folder(path: Path) -> None:
-    """Make a folder for results, and those above it.
-
-    Raises:
-        OutputError: it cannot be made; says which part of the path stands in the way.
-    """
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        why = error.strerror or str(error)
-        for part in (path, *path.parents):
-            if os.path.islink(part) and not os.path.exists(part):
-                why = (
-                    f"{part} is a symbolic link to {os.readlink(part)}, which leads nowhere. Make "
-                    f"that folder, or remove the link"
-                )
-            elif os.path.exists(part) and not os.path.isdir(part):
-                why = f"{part} is a file, expected a folder or a new name"
-        raise OutputError(f"{path}: cannot be created: {why}.") from error

@@ -66,7 +66,9 @@ def build_parser() -> argparse.ArgumentParser:
     demo.add_argument("--frames", type=int, default=20, metavar="N", help="default: 20")
     demo.add_argument("--seed", type=int, default=0, metavar="N", help="of the scene")
     generate = add("generate", _generate, "draw training samples into a folder")
-    generate.add_argument("preset", metavar="PRESET", help="paper, diverse or a YAML file")
+    which = generate.add_mutually_exclusive_group(required=True)
+    which.add_argument("path", nargs="?", metavar="PRESET", help="paper, diverse or a YAML file")
+    which.add_argument("--preset", metavar="PRESET", help="the same, by name")
     generate.add_argument("--out", required=True, metavar="DIR", help="folder of the samples")
     generate.add_argument("--count", type=int, default=1000, metavar="N", help="default: 1000")
     generate.add_argument("--seed", type=int, default=0, metavar="N")
@@ -243,7 +245,7 @@ def _generate(args: argparse.Namespace, command: list[str]) -> int:
     size = tuple(args.size) if args.size else None
     with Progress(args.count, "generate", quiet=args.quiet, unit="samples") as progress:
         sheet = generate(
-            args.preset,
+            args.path or args.preset,
             args.count,
             args.out,
             seed=args.seed,

@@ -8,7 +8,6 @@ estimators return ``failed(no_flow)``.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -89,15 +88,6 @@ class FlowProvider(Protocol):
         """Flow from ``prev`` to ``curr``."""
 
 
-class FlowFiles(Protocol):
-    """The part of a sequence that flow files need."""
-
-    flow_is_true: bool
-
-    def flow(self, index: int) -> tuple[np.ndarray, np.ndarray | None]:
-        """Flow from frame ``index`` to the next, and its validity or None."""
-
-
 def dis_flow(preset: str = "medium", forward_backward: bool = True) -> FlowProvider:
     """Provider of OpenCV's DIS flow on grey images (Kroeger et al., ECCV 2016).
 
@@ -118,14 +108,19 @@ def dis_flow(preset: str = "medium", forward_backward: bool = True) -> FlowProvi
     return _Dis(preset, forward_backward)
 
 
-def crashes_dis(image: np.ndarray) -> bool:
-    """Whether OpenCV's DIS would end the process: a short, wide (H, W) image.
+def _calc_dis(dis: Any, first: np.ndarray, second: np.ndarray) -> np.ndarray | None:
+    """(H, W, 2) flow between grey images, or None where they are too small.
 
-    Below 32 rows it chooses its coarsest level by the width alone, where fewer rows than a patch
-    may be left.
+    Below 32 rows DIS chooses its coarsest level by the width alone; where fewer rows than a patch
+    are left it would end the process.
     """
-    height, width = image.shape[:2]
-    return height < 32 and width > 2 * height
+    height, width = first.shape
+    if height < 32 and width > 2 * height:
+        return None
+    try:
+        return np.asarray(dis.calc(first, second, None))
+    except cv2.error:  # smaller than its patches
+        return None
 
 
 class _Dis:
@@ -140,28 +135,24 @@ class _Dis:
     def __reduce__(self) -> tuple[Any, ...]:
         return _Dis, (self._preset, self._forward_backward)
 
-    def _calc(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        if not hasattr(self._threads, "dis"):
-            self._threads.dis = cv2.DISOpticalFlow.create(DIS_PRESETS[self._preset])
-        return np.asarray(self._threads.dis.calc(first, second, None))
-
     def __call__(self, prev: Frame, curr: Frame) -> FlowField:
         """Flow from ``prev`` to ``curr``; None where an image is missing or too small for DIS."""
+        none = FlowField(None, source="dis")
         if prev.rgb is None or curr.rgb is None or prev.rgb.shape != curr.rgb.shape:
-            return FlowField(None, source="dis")
+            return none
         first = cv2.cvtColor(prev.rgb, cv2.COLOR_RGB2GRAY)
         second = cv2.cvtColor(curr.rgb, cv2.COLOR_RGB2GRAY)
-        if crashes_dis(first) or not (_textured(first) and _textured(second)):
-            return FlowField(None, source="dis")
-        try:
-            forward = self._calc(first, second)
-            backward = self._calc(second, first) if self._forward_backward else None
-        except cv2.error:  # smaller than DIS's patches
-            return FlowField(None, source="dis")
-        if backward is None:
+        if not (_textured(first) and _textured(second)):
+            return none
+        if not hasattr(self._threads, "dis"):
+            self._threads.dis = cv2.DISOpticalFlow.create(DIS_PRESETS[self._preset])
+        forward = _calc_dis(self._threads.dis, first, second)
+        if forward is None:
+            return none
+        if not self._forward_backward:
             return FlowField(forward, None, _lands_inside(forward), "dis")
-        variance, valid = forward_backward_check(forward, backward)
-        return FlowField(forward, variance, valid, "dis")
+        backward = _calc_dis(self._threads.dis, second, first)
+        return FlowField(forward, *forward_backward_check(forward, backward), "dis")
 
 
 def _textured(gray: np.ndarray) -> bool:
@@ -191,24 +182,11 @@ def forward_backward_check(
     Returns:
         variance (H, W) float32 px^2 per component, and valid (H, W) bool: False where the error
         exceeds 1.5 px and 5 % of the flow, or where the flow leaves the image or is not finite.
-
-    Raises:
-        InputError: shapes that are not (H, W, 2) or differ.
     """
-    if forward.ndim != 3 or forward.shape[2] != 2 or backward.shape != forward.shape:
-        raise InputError(
-            f"forward_backward_check: expected two flows of one shape (H, W, 2), got "
-            f"{forward.shape} and {backward.shape}."
-        )
     height, width = forward.shape[:2]
-    columns = np.arange(width, dtype=np.float32)
-    rows = np.arange(height, dtype=np.float32)[:, None]
-    finite_forward = np.nan_to_num(forward.astype(np.float32), nan=1e9, posinf=1e9, neginf=-1e9)
-    du, dv = cv2.split(finite_forward)
-    u, v = du + columns, dv + rows
-    back = cv2.remap(
-        backward.astype(np.float32), u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-    )
+    du, dv = cv2.split(np.nan_to_num(forward, nan=1e9, posinf=1e9, neginf=-1e9))
+    u, v = _targets(du, dv)
+    back = cv2.remap(backward, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     squared = (du + back[..., 0]) ** 2 + (dv + back[..., 1]) ** 2
     limit = np.maximum(MAX_ERROR_PX**2, MAX_RELATIVE_ERROR**2 * (du * du + dv * dv))
     valid = (squared <= limit) & (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)
@@ -218,22 +196,29 @@ def forward_backward_check(
     return variance, valid
 
 
+def _targets(du: np.ndarray, dv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Columns and rows, each (H, W) float32, to which a flow leads."""
+    height, width = du.shape
+    columns, rows = np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)
+    return du + columns, dv + rows[:, None]
+
+
 def _lands_inside(flow: np.ndarray) -> np.ndarray:
     """(H, W) bool, True where the flow ends within the image; False for NaN."""
     height, width = flow.shape[:2]
-    u = flow[..., 0] + np.arange(width, dtype=np.float32)
-    v = flow[..., 1] + np.arange(height, dtype=np.float32)[:, None]
+    u, v = _targets(flow[..., 0], flow[..., 1])
     return (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)
 
 
-def file_flow(sequence: FlowFiles) -> FlowProvider:
+def file_flow(sequence: Any) -> FlowProvider:
     """Provider of the flow files of a sequence.
 
     Flow files lead from one frame to the next: for any other two frames, and where the file of a
     pair is missing, the flow is None. A damaged file raises what the reader raises.
 
     Args:
-        sequence: an open sequence, see :func:`hybridvo.data.sequence.open_sequence`.
+        sequence: an open sequence, see :func:`hybridvo.data.sequence.open_sequence`, with
+            ``flow(index)`` (flow and validity or None) and ``flow_is_true``.
     """
 
     def provide(prev: Frame, curr: Frame) -> FlowField:
@@ -258,44 +243,8 @@ def fallback(first: FlowProvider, second: FlowProvider) -> FlowProvider:
     return provide
 
 
-def as_provider(
-    function: Callable[..., Any], *, name: str | None = None, is_true: bool = False
-) -> FlowProvider:
-    """Provider from a user's own function of two images.
-
-    Args:
-        function: ``(rgb_prev, rgb_curr) -> (H, W, 2)`` px on the previous grid; images are
-            (H, W, 3) uint8 in RGB order. NaN, inf and None mean that there is no flow.
-        name: what reports call it; default: the function's own name.
-        is_true: whether its flow is ground truth.
-
-    Raises:
-        InputError: ``function`` cannot be called. The provider raises it for a result of another
-            shape or type.
-
-    Example:
-        >>> import numpy as np
-        >>> from hybridvo.types import Camera
-        >>> still = as_provider(lambda a, b: np.zeros((*a.shape[:2], 2)), name="still")
-        >>> frame = Frame(np.zeros((4, 6, 3), np.uint8), None, Camera(5, 5, 2.5, 1.5, 4, 6))
-        >>> still(frame, frame).flow.shape
-        (4, 6, 2)
-    """
-    if not callable(function):
-        raise InputError(f"flow: expected a callable, got {type(function).__name__}.")
-    label = str(name or getattr(function, "__name__", type(function).__name__))
-
-    def provide(prev: Frame, curr: Frame) -> FlowField:
-        if prev.rgb is None or curr.rgb is None:
-            return FlowField(None, source=label, is_true=is_true)
-        result = function(prev.rgb, curr.rgb)
-        return check_field(result, prev, label, is_true)
-
-    return provide
-
-
 def check_field(result: Any, prev: Frame, source: str, is_true: bool = False) -> FlowField:
-    """FlowField from an array, a FlowField or None, with its shape checked against the frame.
+    """FlowField from what a provider returns: an array, a FlowField or None.
 
     Raises:
         InputError: another shape than the frame's, or values that are not numbers.
@@ -347,12 +296,8 @@ def contradiction(pair: FramePair) -> str | None:
         )
         for x in (rgb_prev, rgb_curr)
     )
-    if crashes_dis(first):
-        return None
-    try:
-        dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
-        own = np.asarray(dis.calc(first, second, None))  # type: ignore[call-overload]
-    except cv2.error:  # smaller than DIS's patches
+    own = _calc_dis(cv2.DISOpticalFlow.create(DIS_PRESETS["fast"]), first, second)
+    if own is None:
         return None
     small, seen = _shrunk(flow, pair.flow_valid, factor, size)
     du, dv = cv2.Sobel(first, cv2.CV_32F, 1, 0) / 8, cv2.Sobel(first, cv2.CV_32F, 0, 1) / 8
@@ -379,10 +324,8 @@ def _shrunk(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Smoothed flow on a coarser grid of (width, height), in its pixels, and where it is known."""
     width, height = size
-    middle = (
-        slice(factor // 2, factor * height, factor),
-        slice(factor // 2, factor * width, factor),
-    )
+    rows = slice(factor // 2, factor * height, factor)
+    middle = rows, slice(factor // 2, factor * width, factor)
     small = flow[middle] / np.float32(factor)
     seen = np.asarray(np.isfinite(small).all(axis=2))
     if valid is not None:
@@ -394,6 +337,5 @@ def _shrunk(
 
 def _warped_difference(first: np.ndarray, second: np.ndarray, flow: np.ndarray) -> np.ndarray:
     """(H, W) absolute grey levels between the first image and the second one warped onto it."""
-    u = flow[..., 0] + np.arange(flow.shape[1], dtype=np.float32)
-    v = flow[..., 1] + np.arange(flow.shape[0], dtype=np.float32)[:, None]
+    u, v = _targets(flow[..., 0], flow[..., 1])
     return np.abs(cv2.remap(second.astype(np.float32), u, v, cv2.INTER_LINEAR) - first)

@@ -63,8 +63,8 @@ class Odometry:
         network: ``default`` for the pretrained weights, None for the classical refinement alone,
             the name or file of other selector weights, or :class:`hybridvo.pipeline.Models`.
         flow: provider ``(prev, curr) -> FlowField or (H, W, 2) array``; default: OpenCV DIS.
-            Functions of two images go through :func:`hybridvo.flow.as_provider`. After :meth:`skip`
-            the two are no neighbours.
+            A network of one's own: ``lambda prev, curr: net(prev.rgb, curr.rgb)``. After
+            :meth:`skip` the two are no neighbours.
         method: one of :data:`hybridvo.pipeline.METHODS`; by default ``hybrid``, or ``refine``
             without a network.
         options: the option tree; all groups but ``run`` are read, and of that ``run.device``.

@@ -91,7 +91,7 @@ class SelectOptions:
 
     consult_below: Share = 0.8
     refits: Annotated[int, Field(ge=0, le=16)] = 2
-    min_confidence: Share = 0.6
+    min_confidence: Share = 0.65
 
 
 @_group

@@ -7,7 +7,6 @@ of a mistake nor accepts tabs and Windows line ends.
 
 from __future__ import annotations
 
-import io
 import logging
 import os
 from collections.abc import Sequence
@@ -18,6 +17,7 @@ from typing import Any, Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from hybridvo.checks import as_number, to_numpy
 from hybridvo.errors import FormatError, InputError
 from hybridvo.files import atomic_write
 from hybridvo.geometry import invert, ned_to_camera, xyzw_to_wxyz
@@ -26,10 +26,10 @@ from hybridvo.units import MAX_SECONDS, stamp_unit
 Format = Literal["auto", "tum", "kitti", "tartanair"]
 Axes = Literal["auto", "camera", "ned"]
 
-_COLUMNS: dict[str, tuple[int, str]] = {
-    "tum": (8, "timestamp tx ty tz qx qy qz qw"),
-    "kitti": (12, "r11 r12 r13 tx r21 r22 r23 ty r31 r32 r33 tz"),
-    "tartanair": (7, "tx ty tz qx qy qz qw"),
+_COLUMNS = {
+    "tum": "timestamp tx ty tz qx qy qz qw".split(),
+    "kitti": "r11 r12 r13 tx r21 r22 r23 ty r31 r32 r33 tz".split(),
+    "tartanair": "tx ty tz qx qy qz qw".split(),
 }
 # Text files carry six digits or so: a rotation may be off by that much, a wrong column is far more.
 _FILE_ROTATION_TOLERANCE = 1e-2
@@ -49,25 +49,18 @@ def _orthonormality_error(R: np.ndarray) -> np.ndarray:
 
 def _check_transforms(T: Any, name: str, tolerance: float = _ROTATION_TOLERANCE) -> np.ndarray:
     """(N, 4, 4) float64 copy of rigid transforms, or InputError naming the first bad one."""
-    try:
-        T = np.array(T, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise InputError(f"{name}: expected an array of shape (N, 4, 4).") from None
-    if T.size == 0:
-        T = T.reshape(0, 4, 4)
+    T = np.array(to_numpy(T, name), dtype=np.float64)
+    T = T.reshape(0, 4, 4) if T.size == 0 else T
     if T.ndim != 3 or T.shape[1:] != (4, 4):
         raise InputError(f"{name}: expected shape (N, 4, 4), got {T.shape}.")
-    finite = np.isfinite(T).all(axis=(1, 2))
-    if not finite.all():
-        raise InputError(f"{name}[{int(np.argmin(finite))}]: expected finite values, got NaN/inf.")
-    bad = (_orthonormality_error(T[:, :3, :3]) > tolerance) | (
-        np.abs(T[:, 3] - (0.0, 0.0, 0.0, 1.0)).max(axis=1) > tolerance
-    )
-    if bad.any():
-        index = int(np.argmax(bad))
+    last_row = np.abs(T[:, 3] - (0.0, 0.0, 0.0, 1.0)).max(axis=1)
+    good = np.isfinite(T).all(axis=(1, 2)) & (last_row <= tolerance)
+    good &= _orthonormality_error(T[:, :3, :3]) <= tolerance
+    if not good.all():
+        index = int(np.argmin(good))
         raise InputError(
-            f"{name}[{index}]: expected a rigid transform (rotation to {tolerance:g}, last row "
-            f"0 0 0 1), got {np.array2string(T[index], precision=6, separator=', ')}."
+            f"{name}[{index}]: expected a finite rigid transform (rotation to {tolerance:g}, last "
+            f"row 0 0 0 1), got {np.array2string(T[index], precision=6, separator=', ')}."
         )
     return T
 
@@ -75,22 +68,19 @@ def _check_transforms(T: Any, name: str, tolerance: float = _ROTATION_TOLERANCE)
 def _check_timestamps(timestamps: Any) -> np.ndarray:
     """(N,) float64 copy of strictly increasing, finite stamps in seconds, or InputError."""
     name = "Trajectory.timestamps"
-    try:
-        stamps = np.array(timestamps, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise InputError(f"{name}: expected numbers in seconds.") from None
-    if stamps.ndim != 1:
-        raise InputError(f"{name}: expected shape (N,), got {stamps.shape}.")
-    if not np.isfinite(stamps).all():
+    stamps = to_numpy(timestamps, name)
+    if stamps.ndim != 1 or (stamps.size and stamps.dtype.kind not in "fiu"):
         raise InputError(
-            f"{name}[{int(np.argmin(np.isfinite(stamps)))}]: expected a finite number."
+            f"{name}: expected seconds of shape (N,), got {stamps.dtype} {stamps.shape}."
         )
-    late = np.flatnonzero(np.diff(stamps) <= 0)
-    if len(late):
-        before, after = stamps[late[0] : late[0] + 2].tolist()
+    stamps = stamps.astype(np.float64)
+    rising = np.diff(stamps, prepend=-np.inf) > 0
+    good = np.isfinite(stamps) & rising
+    if not good.all():
+        index = int(np.argmin(good))
         raise InputError(
-            f"{name}[{late[0] + 1}]: expected strictly increasing stamps, got {after} after "
-            f"{before}. Sort the poses and drop duplicates."
+            f"{name}[{index}]: expected a finite number above the one before, got "
+            f"{stamps[max(index - 1, 0) : index + 1].tolist()}. Sort the poses, drop duplicates."
         )
     return stamps
 
@@ -239,12 +229,9 @@ def write_tum(trajectory: Trajectory, path: str | os.PathLike[str]) -> None:
     from evo.tools.file_interface import write_tum_trajectory_file
 
     xyzw = Rotation.from_matrix(trajectory.T_world_cam[:, :3, :3]).as_quat(canonical=True)
-    text = io.StringIO()
-    write_tum_trajectory_file(
-        text, PoseTrajectory3D(trajectory.positions, xyzw_to_wxyz(xyzw), trajectory.timestamps)
-    )
+    poses = PoseTrajectory3D(trajectory.positions, xyzw_to_wxyz(xyzw), trajectory.timestamps)
     with atomic_write(path) as file:
-        file.write(text.getvalue())
+        write_tum_trajectory_file(file, poses)
 
 
 def write_kitti(trajectory: Trajectory, path: str | os.PathLike[str]) -> None:
@@ -252,94 +239,64 @@ def write_kitti(trajectory: Trajectory, path: str | os.PathLike[str]) -> None:
     from evo.core.trajectory import PosePath3D
     from evo.tools.file_interface import write_kitti_poses_file
 
-    text = io.StringIO()
-    write_kitti_poses_file(text, PosePath3D(poses_se3=list(trajectory.T_world_cam)))
     with atomic_write(path) as file:
-        file.write(text.getvalue())
-
-
-def _read_text(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError:
-        raise FormatError(f"{path}: expected a text file of poses, got binary data.") from None
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such trajectory file.") from None
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: trajectory file cannot be read: {error}.") from None
+        write_kitti_poses_file(file, PosePath3D(poses_se3=list(trajectory.T_world_cam)))
 
 
 def _read_rows(path: Path, format: str) -> tuple[str, np.ndarray, list[int]]:
     """Format, (N, columns) finite numbers and the line number of each row."""
-    by_count = {count: known for known, (count, _) in _COLUMNS.items()}
-    rows: list[list[float]] = []
-    lines: list[int] = []
-    for number, line in enumerate(_read_text(path).split("\n"), start=1):
-        fields = line.split("#", 1)[0].split()
-        if not fields:
-            continue
-        if format == "auto":
-            if len(fields) not in by_count:
-                raise FormatError(
-                    f"{path}:{number}: expected 8 numbers (TUM), 12 (KITTI) or 7 (TartanAir) "
-                    f"separated by spaces, got {len(fields)}."
-                )
-            format = by_count[len(fields)]
-        count, names = _COLUMNS[format]
-        expected = f"{path}:{number}: expected {count} numbers '{names}'"
-        if len(fields) != count:
-            raise FormatError(f"{expected}, got {len(fields)}.")
-        try:
-            row = [float(field) for field in fields]
-        except ValueError:
-            raise FormatError(f"{expected}, got {line.strip()[:80]!r}.") from None
-        if not np.isfinite(row).all():
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError:
+        raise FormatError(f"{path}: expected a text file of poses, got binary data.") from None
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: trajectory file cannot be read: {error}.") from None
+    numbered = enumerate((line.split("#", 1)[0].split() for line in text.split("\n")), start=1)
+    lines = {number: fields for number, fields in numbered if fields}
+    if not lines:
+        raise FormatError(f"{path}: expected at least one pose, got none.")
+    if format == "auto":
+        first, count = next((number, len(fields)) for number, fields in lines.items())
+        format = next((name for name, names in _COLUMNS.items() if len(names) == count), "")
+        if not format:
             raise FormatError(
-                f"{path}:{number}: expected finite numbers '{names}', got NaN or inf. Remove the "
-                f"line: a pose that is not known must not be in the file."
+                f"{path}:{first}: expected 8 numbers (TUM), 12 (KITTI) or 7 (TartanAir) separated "
+                f"by spaces, got {count}."
+            )
+    names = _COLUMNS[format]
+    rows = []
+    for number, fields in lines.items():
+        row = [as_number(field) for field in fields]
+        if len(row) != len(names) or not np.isfinite(row).all():
+            raise FormatError(
+                f"{path}:{number}: expected {len(names)} finite numbers '{' '.join(names)}', got "
+                f"{len(row)}: {' '.join(fields)[:80]!r}. A pose that is not known must not be in "
+                f"the file."
             )
         rows.append(row)
-        lines.append(number)
-    if not rows:
-        raise FormatError(f"{path}: expected at least one pose, got none.")
-    return format, np.array(rows), lines
+    return format, np.array(rows), list(lines)
 
 
-def _quaternions_to_matrices(path: Path, xyzw: np.ndarray, lines: list[int]) -> np.ndarray:
-    with np.errstate(over="ignore"):
-        norms = np.linalg.norm(xyzw, axis=1)
-    bad = np.abs(norms - 1.0) > _QUATERNION_NORM_TOLERANCE
+def _refuse(bad: np.ndarray, path: Path, lines: list[int], rows: np.ndarray, expected: str) -> None:
+    """FormatError that names the first bad row."""
     if bad.any():
-        index = int(np.argmax(bad))
-        got = "all zeros" if norms[index] == 0 else f"norm {norms[index]:.6g}"
-        raise FormatError(
-            f"{path}:{lines[index]}: expected a unit quaternion qx qy qz qw, got {got}."
-        )
-    return Rotation.from_quat(xyzw).as_matrix()
+        k = int(np.argmax(bad))
+        raise FormatError(f"{path}:{lines[k]}: expected {expected}, got {rows[k].tolist()}.")
 
 
 def _to_seconds(path: Path, stamps: np.ndarray, lines: list[int]) -> tuple[np.ndarray, list[str]]:
     """Stamps in seconds, strictly increasing, and what was changed."""
-    warnings = []
     far = np.abs(stamps) > MAX_SECONDS
-    if far.any() and not far.all():
-        line = lines[int(np.argmax(far != far[0]))]
-        raise FormatError(f"{path}:{line}: timestamps mix seconds and nanoseconds.")
+    one_unit = f"timestamps that do not mix units ({stamps[0]} before)"
+    _refuse(far != far[0], path, lines, stamps, one_unit)
+    late = np.diff(stamps, prepend=-np.inf) <= 0
+    _refuse(late, path, lines, stamps, "increasing timestamps: sort the file, drop duplicates")
     factor, unit = stamp_unit(stamps)
-    if factor != 1:
-        stamps = stamps / factor
-        warnings.append(f"{path}: timestamps are {unit}; converted to seconds.")
-        _logger.warning(warnings[-1])
-    steps = np.diff(stamps)
-    if (steps <= 0).any():
-        index = int(np.argmax(steps <= 0)) + 1
-        kind = "repeats the one" if steps[index - 1] == 0 else "lies before that"
-        raise FormatError(
-            f"{path}:{lines[index]}: timestamp {float(stamps[index])!r} {kind} of line "
-            f"{lines[index - 1]} ({float(stamps[index - 1])!r}). Stamps must increase: sort the "
-            f"file and drop duplicates."
-        )
-    return stamps, warnings
+    if factor == 1:
+        return stamps, []
+    warning = f"{path}: timestamps are {unit}; converted to seconds."
+    _logger.warning(warning)
+    return stamps / factor, [warning]
 
 
 def read_trajectory(
@@ -372,25 +329,26 @@ def read_trajectory(
     if axes not in ("auto", "camera", "ned"):
         raise InputError(f"axes: expected auto, camera or ned, got {axes!r}.")
     path = Path(path)
-    name, rows, lines = _read_rows(path, format)
+    format, rows, lines = _read_rows(path, format)
     stamps = np.arange(len(rows), dtype=np.float64)
     warnings: list[str] = []
     T = np.tile(np.eye(4), (len(rows), 1, 1))
-    if name == "kitti":
+    if format == "kitti":
         T[:, :3] = rows.reshape(-1, 3, 4)
-        bad = _orthonormality_error(T[:, :3, :3]) > _FILE_ROTATION_TOLERANCE
-        if bad.any():
-            raise FormatError(
-                f"{path}:{lines[int(np.argmax(bad))]}: expected a rotation in columns 1-3, 5-7 and "
-                f"9-11, got a matrix that is not orthonormal to {_FILE_ROTATION_TOLERANCE:g}."
-            )
-        if _orthonormality_error(T[:, :3, :3]).max() > 1e-9:
+        error = _orthonormality_error(T[:, :3, :3])
+        expected = "a rotation in columns 1-3, 5-7 and 9-11"
+        _refuse(error > _FILE_ROTATION_TOLERANCE, path, lines, rows, expected)
+        if error.max() > 1e-9:
             T[:, :3, :3] = Rotation.from_matrix(T[:, :3, :3]).as_matrix()
     else:
-        if name == "tum":
+        if format == "tum":
             stamps, warnings = _to_seconds(path, rows[:, 0], lines)
-        T[:, :3, :3] = _quaternions_to_matrices(path, rows[:, -4:], lines)
+        xyzw = rows[:, -4:]
+        error = np.abs(np.linalg.norm(xyzw.clip(-2, 2), axis=1) - 1)
+        expected = "a unit quaternion qx qy qz qw"
+        _refuse(error > _QUATERNION_NORM_TOLERANCE, path, lines, xyzw, expected)
+        T[:, :3, :3] = Rotation.from_quat(xyzw).as_matrix()
         T[:, :3, 3] = rows[:, -7:-4]
-    if axes == "ned" or (axes == "auto" and name == "tartanair"):
+    if axes == "ned" or (axes == "auto" and format == "tartanair"):
         T = ned_to_camera(T)
-    return Trajectory(stamps, T, has_timestamps=name == "tum", warnings=tuple(warnings))
+    return Trajectory(stamps, T, has_timestamps=format == "tum", warnings=tuple(warnings))

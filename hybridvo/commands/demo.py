@@ -13,11 +13,10 @@ import numpy as np
 
 from hybridvo.commands.configuration import load_options
 from hybridvo.commands.run import EXIT_INTERRUPTED, RunResult, run
-from hybridvo.commands.run_folder import make_folder
 from hybridvo.data.sequence import open_sequence
 from hybridvo.errors import InputError, OutputError
 from hybridvo.evaluation.plots import plot_trajectories
-from hybridvo.files import atomic_write, write_json
+from hybridvo.files import atomic_write, make_folder, write_json
 from hybridvo.synthetic.render import make_scene, write_sintel
 
 METHODS = {

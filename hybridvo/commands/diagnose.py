@@ -6,8 +6,9 @@ and images against flow. A question that the frames cannot answer is reported as
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,12 +16,13 @@ import cv2
 import numpy as np
 
 from hybridvo.commands.inputs import is_dark
+from hybridvo.data.lists import shown
 from hybridvo.data.sequence import Sequence
-from hybridvo.depth_steps import depth_ratio, is_step
-from hybridvo.errors import FormatError, InputError
+from hybridvo.errors import InputError
 from hybridvo.flow import contradiction, dis_flow, file_flow
 from hybridvo.geometry import ego_flow, invert
 from hybridvo.pipeline import estimate
+from hybridvo.refinement.depth_agreement import depth_ratio, is_step
 from hybridvo.types import Frame, FramePair, RelativePose
 from hybridvo.units import depth_advice, typical_depth
 
@@ -102,18 +104,14 @@ def diagnose(sequence: Sequence, *, pairs: int = PAIRS) -> dict[str, Any]:
         try:
             prev = kept[1] if kept and kept[0] == index else sequence.frame(index)
             curr = sequence.frame(index + 1)
-        except (InputError, FormatError, OSError) as error:
+        except (InputError, OSError) as error:
             evidence.unreadable.append(str(error))
             kept = None
             continue
         kept = index + 1, curr
         _look_at(evidence, sequence, prev, curr)
     found = [
-        _units(evidence),
-        _depth_steps(evidence),
-        _depth_against_colour(evidence),
-        _exposure(evidence),
-        _images_against_flow(evidence),
+        {"name": name, **dataclasses.asdict(answer(evidence))} for name, answer in QUESTIONS.items()
     ]
     return {
         "sequence": sequence.name,
@@ -132,13 +130,10 @@ def diagnosis_text(report: Mapping[str, Any]) -> str:
     lines += [f"{signs[f['state']]}{f['name']}: {f['message']}" for f in report["findings"]]
     lines += [f"unreadable  {message}" for message in report["unreadable"][:5]]
     unanswered = sum(finding["state"] == "cannot_tell" for finding in report["findings"])
-    open_ones = f"{unanswered} of {len(report['findings'])} questions could not be answered"
-    if not report["ok"]:
-        lines.append("something differs: see above")
-    elif unanswered:
-        lines.append(f"nothing found, but {open_ones}")
-    else:
-        lines.append("nothing differs" + (" in what is readable" if report["unreadable"] else ""))
+    end = "nothing differs" if report["ok"] else "something differs: see above"
+    if unanswered:
+        end += f"; {unanswered} of {len(report['findings'])} questions could not be answered"
+    lines.append(end)
     return "\n".join(lines)
 
 
@@ -262,91 +257,82 @@ def _edge_pixels(
 # -- findings -----------------------------------------------------------------------------------
 
 
-def _finding(
-    name: str, state: str, message: str, value: Any = None, error: Any = None, unit: str = ""
-) -> dict[str, Any]:
-    return {
-        "name": name,
-        "state": state,
-        "value": value,
-        "standard_error": error,
-        "unit": unit,
-        "message": message,
-    }
+@dataclass(frozen=True)
+class Finding:
+    """Answer to a question: ``agrees``, ``differs`` or ``cannot_tell``, and why."""
+
+    state: str
+    message: str
+    value: Any = None
+    standard_error: Any = None
+    unit: str = ""
 
 
-def _units(evidence: Evidence) -> dict[str, Any]:
-    name = "depth units"
+def _units(evidence: Evidence) -> Finding:
     if not evidence.depths:
-        return _finding(name, "cannot_tell", "no frame has valid depth")
+        return Finding("cannot_tell", "no frame has valid depth")
     median = float(np.median(evidence.depths))
-    text = f"median depth {median:.3g} m"
-    advice = depth_advice(median)
-    if len(evidence.scales) >= MIN_PAIRS:
-        logs = np.log(np.maximum(evidence.scales, 1e-6))
-        value = float(np.exp(np.median(logs)))
-        deviation = 1.4826 * float(np.median(np.abs(logs - np.median(logs))))
-        error = value * deviation * math.sqrt(math.pi / 2 / len(logs))
-        text += f"; motions are {value:.4g} (+- {error:.2g}) times as long as the poses on file say"
-        if abs(value - 1) > max(MIN_SCALE_ERROR, SIGMAS * error):
-            remedy = advice or (
-                f"divide by {value:.4g}" if value > 1 else f"multiply by {1 / value:.4g}"
-            )
-            return _finding(name, "differs", f"{text}: depth: {remedy}", value, error, "ratio")
-        text += f" (a wrong unit differs by more than {MIN_SCALE_ERROR:.0%})"
-        return _finding(name, "agrees", text, value, error, "ratio")
-    if advice:
-        text += f", which cannot be metres; probable remedy: {advice}"
-        return _finding(name, "differs", text, median, None, "m")
-    # all depths and all translations times s project to the same pixels: no pair can tell
-    text += "; no image knows its scale without true poses"
-    return _finding(name, "cannot_tell", text, median, None, "m")
+    text, advice = f"median depth {median:.3g} m", depth_advice(median)
+    if len(evidence.scales) < MIN_PAIRS:
+        if advice:
+            text += f", which cannot be metres; probable remedy: {advice}"
+            return Finding("differs", text, median, unit="m")
+        # all depths and all translations times s project to the same pixels: no pair can tell
+        text += "; no image knows its scale without true poses"
+        return Finding("cannot_tell", text, median, unit="m")
+    logs = np.log(np.maximum(evidence.scales, 1e-6))
+    value = float(np.exp(np.median(logs)))
+    deviation = 1.4826 * float(np.median(np.abs(logs - np.median(logs))))
+    error = value * deviation * math.sqrt(math.pi / 2 / len(logs))
+    text += f"; motions are {value:.4g} (+- {error:.2g}) times as long as the poses on file say"
+    if abs(value - 1) <= max(MIN_SCALE_ERROR, SIGMAS * error):
+        return Finding("agrees", text, value, error, "ratio")
+    remedy = f"divide by {value:.4g}" if value > 1 else f"multiply by {1 / value:.4g}"
+    return Finding("differs", f"{text}: depth: {advice or remedy}", value, error, "ratio")
 
 
-def _depth_steps(evidence: Evidence) -> dict[str, Any]:
-    name = "depth from frame to frame"
+def _depth_steps(evidence: Evidence) -> Finding:
     ratios = evidence.depth_ratios
     if not ratios:
-        return _finding(name, "cannot_tell", "no pair has a motion and depth in both frames")
-    steps = [pair for pair in ratios if is_step(pair[1])]
+        return Finding("cannot_tell", "no pair has a motion and depth in both frames")
+    steps = sum(is_step(ratio) for _, ratio in ratios)
     index, ratio = max(ratios, key=lambda pair: abs(math.log(max(pair[1], 1e-30))))
     text = (
-        f"depth changes its scale in {len(steps)} of {len(ratios)} pairs, most from frame {index} "
-        f"to the next (times {ratio:.3g})"
+        f"depth changes its scale in {steps} of {len(ratios)} pairs, most from frame {index} to "
+        f"the next (times {ratio:.3g})"
     )
-    if not steps:
-        return _finding(name, "agrees", text, ratio, None, "ratio")
-    text += ": files of several units, or a scale of its own in every frame"
-    return _finding(name, "differs", text, ratio, None, "ratio")
+    if steps:
+        text += ": files of several units, or a scale of its own in every frame"
+    return Finding("differs" if steps else "agrees", text, ratio, unit="ratio")
 
 
-def _depth_against_colour(evidence: Evidence) -> dict[str, Any]:
-    name = "depth against colour"
+def _depth_against_colour(evidence: Evidence) -> Finding:
     costs = np.array(evidence.shift_costs)
     n = len(costs)
     if n < MIN_PAIRS:
         text = f"{n} pairs with depth edges in textured places, {MIN_PAIRS} needed"
-        return _finding(name, "cannot_tell", text)
+        return Finding("cannot_tell", text)
     total = costs.mean(axis=0)
     value = _minimum(total)
     left_out = np.array([_minimum((n * total - cost) / (n - 1)) for cost in costs])
     error = np.sqrt((n - 1) * left_out.var(axis=0))  # jackknife
     size, spread = float(np.linalg.norm(value)), float(np.linalg.norm(error))
     gain = float(total[MAX_SHIFT_PX, MAX_SHIFT_PX] - total.min())
-    where = f"{value[0]:+.1f} px right, {value[1]:+.1f} px down (+- {spread:.1f}) of the image"
-    numbers = value.tolist(), error.tolist(), "px"
-    shifted = size > max(MIN_SHIFT_PX, SIGMAS * spread)
-    if spread > MAX_SHIFT_SE_PX or (shifted and gain <= MIN_SHIFT_GAIN):
-        text = "the images at depth edges do not show whether depth is shifted"
-        return _finding(name, "cannot_tell", text, *numbers)
-    if not shifted:
-        return _finding(name, "agrees", f"the depth map stands {where}", *numbers)
-    bound = "at least " if np.abs(value).max() >= MAX_SHIFT_PX else ""
     text = (
-        f"the depth map stands {bound}{where}: colour and depth look unregistered; register depth "
-        f"to colour, or give the intrinsics of the colour camera"
+        f"the depth map stands {value[0]:+.1f} px right, {value[1]:+.1f} px down "
+        f"(+- {spread:.1f}, searched to {MAX_SHIFT_PX}) of the image"
     )
-    return _finding(name, "differs", text, *numbers)
+    state, shifted = "agrees", size > max(MIN_SHIFT_PX, SIGMAS * spread)
+    if spread > MAX_SHIFT_SE_PX or (shifted and gain <= MIN_SHIFT_GAIN):
+        state = "cannot_tell"
+        text = "the images at depth edges do not show whether depth is shifted"
+    elif shifted:
+        state = "differs"
+        text += (
+            ": colour and depth look unregistered; register depth to colour, or give the "
+            "intrinsics of the colour camera"
+        )
+    return Finding(state, text, value.tolist(), error.tolist(), "px")
 
 
 def _minimum(cost: np.ndarray) -> np.ndarray:
@@ -366,33 +352,38 @@ def _minimum(cost: np.ndarray) -> np.ndarray:
     return np.array([right, down])
 
 
-def _exposure(evidence: Evidence) -> dict[str, Any]:
-    name = "exposure"
+def _exposure(evidence: Evidence) -> Finding:
     if not evidence.greys:
-        return _finding(name, "cannot_tell", "no pair has two images")
+        return Finding("cannot_tell", "no pair has two images")
     steps = [pair for pair in evidence.greys if abs(math.log(pair[1])) > MAX_GREY_STEP]
     dark = sorted(set(evidence.dark))
-    share = len(steps) / len(evidence.greys)
     text = f"brightness changes by over 15 % in {len(steps)} of {len(evidence.greys)} pairs"
     if steps:
         index, ratio = max(steps, key=lambda step: abs(math.log(step[1])))
         text += f", most from frame {index} to the next (times {ratio:.2f})"
     if dark:
-        shown = ", ".join(map(str, dark[:5])) + (", ..." if len(dark) > 5 else "")
-        text += f"; {len(dark)} frames are dark: {shown}"
-    state = "differs" if steps or dark else "agrees"
-    return _finding(name, state, text, share, None, "fraction of pairs")
+        text += f"; {len(dark)} frames are dark: {shown(dark)}"
+    share = len(steps) / len(evidence.greys)
+    return Finding("differs" if steps or dark else "agrees", text, share, unit="fraction of pairs")
 
 
-def _images_against_flow(evidence: Evidence) -> dict[str, Any]:
-    name = "images against flow"
+def _images_against_flow(evidence: Evidence) -> Finding:
     n = len(evidence.contradictions)
     if not n:
-        return _finding(name, "cannot_tell", "no pair has images with a flow or a motion")
+        return Finding("cannot_tell", "no pair has images with a flow or a motion")
     against = [(index, why) for index, why in evidence.contradictions if why is not None]
     share = len(against) / n
     text = f"the flow contradicts the images in {len(against)} of {n} pairs"
     if share <= MAX_CONTRADICTED:
-        return _finding(name, "agrees", text, share, None, "fraction of pairs")
+        return Finding("agrees", text, share, unit="fraction of pairs")
     index, why = against[0]
-    return _finding(name, "differs", f"{text}; frame {index}: {why}", share, None, "fraction")
+    return Finding("differs", f"{text}; frame {index}: {why}", share, unit="fraction of pairs")
+
+
+QUESTIONS: dict[str, Callable[[Evidence], Finding]] = {
+    "depth units": _units,
+    "depth from frame to frame": _depth_steps,
+    "depth against colour": _depth_against_colour,
+    "exposure": _exposure,
+    "images against flow": _images_against_flow,
+}

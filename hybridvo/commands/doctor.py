@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import platform
 from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, requires, version
+from importlib.util import find_spec
 from typing import Any
 
 import hybridvo
@@ -29,29 +29,25 @@ def doctor() -> dict[str, Any]:
         or why it cannot run); ``usable`` (whether ``hybridvo run`` can work).
     """
     packages = {name: _version(name) for name in _required()}
-    report: dict[str, Any] = {
+    missing = {name: f"pip install {name}" for name, found in packages.items() if not found}
+    optional = {
+        name: {"installed": find_spec(name) is not None, "install": install, "for": purpose}
+        for name, (install, purpose) in _OPTIONAL.items()
+    }
+    return {
         "hybridvo": hybridvo.__version__,
         "python": platform.python_version(),
         "platform": platform.platform(),
         "packages": packages,
-        "missing": {name: f"pip install {name}" for name, found in packages.items() if not found},
-        "optional": {
-            name: {
-                "installed": importlib.util.find_spec(name) is not None,
-                "install": install,
-                "for": purpose,
-            }
-            for name, (install, purpose) in _OPTIONAL.items()
-        },
-        "devices": {},
-        "threads": {"cpus": os.cpu_count()},
-        "warm_up_s": None,
-        "methods": {},
+        "missing": missing,
+        "optional": optional,
+        **(
+            {"devices": {}, "threads": {}, "warm_up_s": None, "methods": {}}
+            if missing
+            else _what_runs()
+        ),
+        "usable": not missing,
     }
-    if not report["missing"]:
-        report["devices"] = _devices()
-        _look_inside(report)
-    return report | {"usable": not report["missing"]}
 
 
 def doctor_text(report: Mapping[str, Any]) -> str:
@@ -91,7 +87,7 @@ def _version(name: str) -> str | None:
         return version(name)
     except PackageNotFoundError:
         # OpenCV comes in several distributions of the same module
-        other = name.startswith("opencv") and importlib.util.find_spec("cv2")
+        other = name.startswith("opencv") and find_spec("cv2")
         return "another distribution" if other else None
 
 
@@ -111,8 +107,8 @@ def _devices() -> dict[str, str]:
     return found
 
 
-def _look_inside(report: dict[str, Any]) -> None:
-    """Threads, time of the first call and methods."""
+def _what_runs() -> dict[str, Any]:
+    """Devices, threads, time of the first call, and methods."""
     import cv2
     import numba
     import torch
@@ -120,15 +116,21 @@ def _look_inside(report: dict[str, Any]) -> None:
     from hybridvo.errors import InputError
     from hybridvo.pipeline import METHODS, check_method, warm_up
 
-    report["threads"] |= {
-        "torch": torch.get_num_threads(),
-        "opencv": cv2.getNumThreads(),
-        "numba": numba.get_num_threads(),
-    }
-    report["warm_up_s"] = warm_up()
+    methods = {}
     for method in METHODS:
         try:
             check_method(method)
-            report["methods"][method] = ""
+            methods[method] = ""
         except InputError as error:
-            report["methods"][method] = str(error)
+            methods[method] = str(error)
+    return {
+        "devices": _devices(),
+        "threads": {
+            "cpus": os.cpu_count(),
+            "torch": torch.get_num_threads(),
+            "opencv": cv2.getNumThreads(),
+            "numba": numba.get_num_threads(),
+        },
+        "warm_up_s": warm_up(),
+        "methods": methods,
+    }

@@ -1,17 +1,14 @@
-"""What goes into a run: the flow, the weights, and the facts of the machine and the sequence."""
+"""What goes into a run: the flow, the weights, and facts of the machine and the images."""
 
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import logging
-import os
 import platform
-import re
 import time
 from collections.abc import Iterable
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -80,8 +77,7 @@ def flow_provider(sequence: Sequence, options: Options) -> FlowProvider:
     dis = dis_flow(options.flow.dis_preset, options.flow.forward_backward)
     if source == "auto" and sequence.has_flow and stride == 1:
         # a damaged file is no reason to stop where DIS can stand in
-        strict = options.run.strict
-        return fallback(TimedFlow(file_flow(sequence), strict), dis)
+        return fallback(TimedFlow(file_flow(sequence), options.run.strict), dis)
     return dis
 
 
@@ -107,22 +103,6 @@ def make_models(weights: Iterable[str], method: str, device: str) -> Models:
     return Models(device, files)
 
 
-def run_name(sequence: Sequence) -> str:
-    """Name of a sequence as one plain path part."""
-    return re.sub(r"[^\w.-]+", "_", sequence.name).strip("._") or "sequence"
-
-
-def check_outside(out: Path, sequence: Sequence) -> None:
-    """Refuse to write among the frames of the sequence: the next run would read what is drawn."""
-    images = (".png", ".jpg", ".jpeg", ".npy", ".dpt", ".flo")
-    folders = {path.parent.resolve() for path in sequence.files() if path.suffix.lower() in images}
-    if out.resolve() in folders:
-        raise InputError(
-            f"{out}: holds frames of the sequence, and results among them would be taken for "
-            f"input. Choose another --out."
-        )
-
-
 def is_dark(rgb: np.ndarray | None) -> bool:
     """Whether an image (H, W, 3) uint8 is too dark to see anything in."""
     if rgb is None:
@@ -132,50 +112,8 @@ def is_dark(rgb: np.ndarray | None) -> bool:
 
 def versions() -> dict[str, str]:
     """Versions of Python and of the packages that decide numbers; absent ones are left out."""
-    from importlib.metadata import PackageNotFoundError, version
-
     found = {"python": platform.python_version(), "hybridvo": hybridvo.__version__}
     for name in ("numpy", "scipy", "opencv-python-headless", "numba", "torch", "evo", "poselib"):
         with contextlib.suppress(PackageNotFoundError):
             found[name] = version(name)
     return found
-
-
-def run_header(
-    sequence: Sequence, frames: range, options: Options, command: Iterable[str]
-) -> dict[str, Any]:
-    """What ``run.json`` says of a run beside its state."""
-    return {
-        "command": list(command),
-        "versions": versions(),
-        "machine": {"platform": platform.platform(), "cpus": os.cpu_count()},
-        "options": dataclasses.asdict(options),
-        "sequence": {
-            "name": sequence.name,
-            "kind": sequence.kind,
-            "path": os.fspath(sequence.root),
-            "frames": len(frames),
-            "depth_source": sequence.depth_source,
-            "warnings": list(sequence.warnings),
-        },
-    }
-
-
-def is_repeated(prev: Frame, curr: Frame) -> bool:
-    """Whether a frame has the very image of the one before, but another depth map.
-
-    A camera at rest gives no two equal images, and a rendered one equal depth as well: a driver has
-    handed out an old image.
-    """
-    if prev.rgb is None or curr.rgb is None or prev.depth is None or curr.depth is None:
-        return False
-    same = np.array_equal(prev.rgb, curr.rgb)
-    return same and not np.array_equal(prev.depth, curr.depth, equal_nan=True)
-
-
-def deciding(options: Options) -> dict[str, Any]:
-    """The options that decide the result: what a resumed run must share."""
-    values = dataclasses.asdict(options)
-    for name in ("max_failed", "strict", "device"):
-        del values["run"][name]
-    return values

@@ -7,7 +7,10 @@ depth) is named in every output.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import os
+import platform
+import re
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -18,30 +21,21 @@ import numpy as np
 
 import hybridvo
 from hybridvo.commands import results
-from hybridvo.commands.inputs import (
-    TimedFlow,
-    check_outside,
-    deciding,
-    flow_provider,
-    is_dark,
-    is_repeated,
-    run_header,
-    run_name,
-)
+from hybridvo.commands.inputs import TimedFlow, flow_provider, is_dark, versions
 from hybridvo.commands.progress import Progress, interruptible
 from hybridvo.commands.recording import Recording, check_recording
-from hybridvo.commands.run_folder import RESULTS, Mode, RunFolder
+from hybridvo.commands.run_folder import RESULTS, STATE, Mode, RunFolder
 from hybridvo.data.sequence import Sequence
-from hybridvo.depth_steps import depth_ratio
 from hybridvo.errors import InputError
 from hybridvo.evaluation.pair_errors import pair_errors
-from hybridvo.files import fingerprint, write_json
-from hybridvo.geometry import invert
+from hybridvo.files import fingerprint
+from hybridvo.geometry import invert, se3_log
 from hybridvo.odometry import Odometry
 from hybridvo.options import Options
 from hybridvo.pipeline import Models, check_method, weights_hash
+from hybridvo.refinement.depth_agreement import depth_ratio
 from hybridvo.tracking.state import TrackerState
-from hybridvo.trajectory import Trajectory, read_trajectory
+from hybridvo.trajectory import Trajectory
 from hybridvo.types import Frame, State, Step
 
 EXIT_DONE, EXIT_FAILED_FRAMES, EXIT_INTERRUPTED = 0, 3, 130
@@ -49,7 +43,7 @@ EXIT_DONE, EXIT_FAILED_FRAMES, EXIT_INTERRUPTED = 0, 3, 130
 RECORDING = "recording.rrd"
 """Name of a Rerun recording within the output folder."""
 SAVE_EVERY = 50
-"""Frames after which the tracker's state is written."""
+"""Frames after which the run can be resumed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,14 +53,14 @@ class RunResult:
     Args:
         exit_code: 0, 3 (too many failed frames) or 130 (interrupted).
         summary: JSON-ready: state, counts, oracles, times, metrics, files.
-        trajectory: the poses so far, or None where no frame was finished.
+        trajectory: the poses so far; None where no frame was finished, or all before a resume.
         gt: true poses, or None.
     """
 
     exit_code: int
     summary: dict[str, Any]
-    trajectory: Trajectory | None
-    gt: Trajectory | None
+    trajectory: Trajectory | None = None
+    gt: Trajectory | None = None
 
 
 def run(
@@ -101,42 +95,36 @@ def run(
     check_method(method, models)
     if rrd is not None:
         check_recording(rrd or RECORDING)
-    stop = min(options.run.stop or len(sequence), len(sequence))
-    frames = range(options.run.start, stop, options.run.stride)
-    if not frames:
-        raise InputError(
-            f"{sequence.name}: no frames from {options.run.start} to {stop}: there are "
-            f"{len(sequence)}."
-        )
+    frames = _frames(sequence, options)
     flow = TimedFlow(flow_provider(sequence, options), options.run.strict)
-    out = Path("runs") / run_name(sequence) if out is None else Path(out)
-    check_outside(out, sequence)
+    out = _folder(out, sequence)
     vo = Odometry(models, flow=flow, method=method, options=options, seed=options.run.seed)
     vo.warm_up()  # before the folder is taken: it may last
     identity = {
         "input_hash": fingerprint(sequence.files()),
-        "options": deciding(options),
+        "options": _deciding(options),
         "weights": weights_hash(method, models),
         "hybridvo": hybridvo.__version__,
     }
-    header = run_header(sequence, frames, options, command) | {"input_hash": identity["input_hash"]}
-    with RunFolder(out, identity, header, mode, (*RESULTS, RECORDING)) as folder:
+    header = _header(sequence, frames, options, command) | {"input_hash": identity["input_hash"]}
+    with RunFolder(out, identity, header, mode) as folder, contextlib.ExitStack() as stack:
         if folder.finished:
-            return _finished_before(folder)
-        with contextlib.ExitStack() as stack:
-            recording = None
-            if rrd is not None:
-                recording = Recording(
-                    rrd or out / RECORDING,
-                    sequence.name,
-                    str(identity["input_hash"]),
-                    len(frames),
-                    first=folder.frames_done,
-                    poses=None if sequence.poses is None else sequence.poses[list(frames)],
-                )
-                stack.enter_context(recording)
-            job = _Job(sequence, frames, options, vo, flow, folder, recording)
-            result = job.run(quiet)
+            summary = folder.read_json(STATE)["summary"]
+            summary |= {"state": "done", "metrics": folder.read_json("metrics.json") or None}
+            return RunResult(_exit_code(summary, options), summary)
+        recording = None
+        if rrd is not None:
+            poses = None if sequence.poses is None else sequence.poses[list(frames)]
+            recording = Recording(
+                rrd or out / RECORDING,
+                sequence.name,
+                str(identity["input_hash"]),
+                len(frames),
+                first=len(folder.rows),
+                poses=poses,
+            )
+            stack.enter_context(recording)
+        result = _Job(sequence, frames, options, vo, flow, folder, recording).run(quiet)
         if recording is not None:
             result.summary["recording"] = os.fspath(recording.path)
         return result
@@ -156,30 +144,30 @@ class _Job:
 
     def run(self, quiet: bool) -> RunResult:
         label = f"{self.sequence.name} [{self.options.run.method}]"
-        done = self.folder.frames_done
+        rows, total = self.folder.rows, len(self.frames)
         with (
             interruptible() as interrupted,
-            Progress(len(self.frames), label, quiet=quiet, done=done) as progress,
+            Progress(total, label, quiet=quiet, done=len(rows)) as progress,
         ):
             for warning in self.sequence.warnings:
                 progress.say(f"warning: {warning}")
             if self.folder.tracker is not None:
                 self.vo.resume(TrackerState.from_arrays(self.folder.tracker))
-                progress.say(f"resumed after {done} of {len(self.frames)} frames")
-            failed = sum(row["status"] == "failed" for row in self.folder.rows())
-            for index in self.frames[done:]:
+                progress.say(f"resumed after {len(rows)} of {total} frames")
+            failed = sum(row["status"] == "failed" for row in rows)
+            for index in self.frames[len(rows) :]:
                 if interrupted.is_set():
                     break
                 row = self._track(index, progress)
                 failed += row["status"] == "failed"
                 self.folder.append(row)
-                progress.update(self.folder.frames_done, failed)
-                if self.folder.frames_done % SAVE_EVERY == 0:
-                    self.folder.save_tracker(self.vo.state.to_arrays())
+                progress.update(len(rows), failed)
+                if len(rows) % SAVE_EVERY == 0:
+                    self.folder.save_checkpoint(self.vo.state.to_arrays())
             if interrupted.is_set():
-                self.folder.save_tracker(self.vo.state.to_arrays())
-                kept = self.folder.frames_done
-                progress.say(f"interrupted: {kept} frames are kept; go on with --resume")
+                if rows:
+                    self.folder.save_checkpoint(self.vo.state.to_arrays())
+                progress.say(f"interrupted: {len(rows)} frames are kept; go on with --resume")
             return self._write(interrupted.is_set())
 
     def _track(self, index: int, progress: Progress) -> dict[str, Any]:
@@ -211,25 +199,23 @@ class _Job:
     def _row(
         self, step: Step, prev: Frame | None, frame: Frame | None, ms: float
     ) -> dict[str, Any]:
+        """What is kept of a frame, JSON-ready: the columns of ``steps.csv`` and more."""
         motion, field = step.motion, self.flow.field
         flow = None if field is None else field.flow
-        message = step.status.message
+        message = " ".join(step.status.message.split())
         if frame is not None and not step.ok and is_dark(frame.rgb):
             message = f"the image is dark; {message}"
-        ratio, repeated = None, False
+        ratio = None
         if prev is not None and frame is not None and step.status.state is not State.FAILED:
             ratio = depth_ratio(prev, frame, flow, step.T_curr_prev)
-            repeated = is_repeated(prev, frame)
+        values = [*motion.T_curr_prev[:3, 3].tolist(), *se3_log(motion.T_curr_prev)[3:].tolist()]
         return {
             "index": step.index,
             "timestamp": step.timestamp,
             "status": step.status.state.value,
             "reason": step.status.reason.value,
             "probability": float(motion.probability),
-            "message": message,
-            "T_curr_prev": motion.T_curr_prev.ravel().tolist(),
-            "T_world_cam": step.T_world_cam.ravel().tolist(),
-            "covariance": motion.covariance.ravel().tolist(),
+            **dict(zip(("tx", "ty", "tz", "rx", "ry", "rz"), values, strict=True)),
             "inlier_ratio": float(motion.inlier_ratio),
             "iterations": int(motion.iterations),
             "cost": float(motion.cost),
@@ -238,10 +224,13 @@ class _Job:
             "frame_ms": round(ms, 3),
             "prev_index": None if prev is None else prev.index,
             "flow_source": None if field is None else field.source,
+            "message": message,
+            "T_curr_prev": motion.T_curr_prev.tolist(),
+            "T_world_cam": step.T_world_cam.tolist(),
+            "covariance": motion.covariance.tolist(),
             "flow_is_true": flow is not None and field is not None and field.is_true,
             "errors": self._errors(prev, step),
             "depth_ratio": ratio,
-            "repeated": repeated,
         }
 
     def _errors(self, prev: Frame | None, step: Step) -> dict[str, Any] | None:
@@ -257,43 +246,87 @@ class _Job:
         return pair_errors(step.T_curr_prev, T_true, prev.depth, prev.camera, camera)
 
     def _write(self, interrupted: bool) -> RunResult:
-        """Results of the rows kept so far; all of them and the scores where the run is complete."""
-        folder, path = self.folder, self.folder.path
-        rows = list(folder.rows())
+        """Results of the rows kept so far, and the scores where the run is complete."""
+        folder, path, rows = self.folder, self.folder.path, self.folder.rows
         if not rows:  # interrupted before the first frame
             folder.write_state("interrupted")
-            return RunResult(EXIT_INTERRUPTED, {"state": "interrupted", "frames": 0}, None, None)
-        poses = np.array([row["T_world_cam"] for row in rows]).reshape(-1, 4, 4)
-        trajectory = Trajectory(np.array([row["timestamp"] for row in rows]), poses)
+            return RunResult(EXIT_INTERRUPTED, {"state": "interrupted", "frames": 0})
+        trajectory = results.write_motions(path, rows)
         gt = results.ground_truth(self.sequence, self.frames)
-        trajectory.save(path / "trajectory.tum")
-        trajectory.save(path / "trajectory.kitti")
-        results.write_steps(path, rows)
         summary = results.summarise(rows, self.sequence, self.options.run.method)
         summary["out"] = os.fspath(path)
         if interrupted:
             folder.write_state("interrupted", summary=summary)
             return RunResult(EXIT_INTERRUPTED, summary | {"state": "interrupted"}, trajectory, gt)
-        allowed = self.options.run.max_failed
-        too_many = summary["failed_fraction"] > allowed
-        if too_many:
+        exit_code = _exit_code(summary, self.options)
+        if exit_code == EXIT_FAILED_FRAMES:
+            allowed = self.options.run.max_failed
             summary["warnings"].append(f"more motions failed than --max-failed {allowed:g} allows")
         metrics = None
         if gt is not None:
-            metrics = results.score(rows, trajectory, gt, summary, self.options.run.alignment)
-            write_json(path / "metrics.json", metrics)
+            alignment = self.options.run.alignment
+            metrics = results.write_metrics(path, rows, trajectory, gt, summary, alignment)
         results.draw(path / "trajectory.png", trajectory, gt, summary)
+        written = (path / name for name in (*RESULTS, STATE))
+        summary["files"] = [os.fspath(file) for file in written if file.exists()]
         folder.finish(summary=summary)
-        names = (*RESULTS, "run.json")
-        summary["files"] = [os.fspath(path / name) for name in names if (path / name).exists()]
-        summary |= {"state": "done", "metrics": metrics}
-        return RunResult(EXIT_FAILED_FRAMES if too_many else EXIT_DONE, summary, trajectory, gt)
+        return RunResult(exit_code, summary | {"state": "done", "metrics": metrics}, trajectory, gt)
 
 
-def _finished_before(folder: RunFolder) -> RunResult:
-    """Result of a run that was complete when it was resumed."""
-    summary = folder.state["summary"] | {"state": "done"}
-    summary["metrics"] = folder.read_json("metrics.json")
-    trajectory = read_trajectory(folder.path / "trajectory.tum", "tum")
-    too_many = summary["failed_fraction"] > folder.state["options"]["run"]["max_failed"]
-    return RunResult(EXIT_FAILED_FRAMES if too_many else EXIT_DONE, summary, trajectory, None)
+def _frames(sequence: Sequence, options: Options) -> range:
+    """Indices of the frames that the options ask for."""
+    stop = min(options.run.stop or len(sequence), len(sequence))
+    frames = range(options.run.start, stop, options.run.stride)
+    if not frames:
+        raise InputError(
+            f"{sequence.name}: no frames from {options.run.start} to {stop}: there are "
+            f"{len(sequence)}."
+        )
+    return frames
+
+
+def _folder(out: str | os.PathLike[str] | None, sequence: Sequence) -> Path:
+    """The output folder; never that of the frames: the next run would read what is drawn."""
+    name = re.sub(r"[^\w.-]+", "_", sequence.name).strip("._") or "sequence"
+    out = Path("runs") / name if out is None else Path(out)
+    images = (".png", ".jpg", ".jpeg", ".npy", ".dpt", ".flo")
+    folders = {path.parent.resolve() for path in sequence.files() if path.suffix.lower() in images}
+    if out.resolve() in folders:
+        raise InputError(
+            f"{out}: holds frames of the sequence, and results among them would be taken for "
+            f"input. Choose another --out."
+        )
+    return out
+
+
+def _header(
+    sequence: Sequence, frames: range, options: Options, command: Iterable[str]
+) -> dict[str, Any]:
+    """What ``run.json`` says of a run beside its state."""
+    return {
+        "command": list(command),
+        "versions": versions(),
+        "machine": {"platform": platform.platform(), "cpus": os.cpu_count()},
+        "options": dataclasses.asdict(options),
+        "sequence": {
+            "name": sequence.name,
+            "kind": sequence.kind,
+            "path": os.fspath(sequence.root),
+            "frames": len(frames),
+            "depth_source": sequence.depth_source,
+            "warnings": list(sequence.warnings),
+        },
+    }
+
+
+def _deciding(options: Options) -> dict[str, Any]:
+    """The options that decide the result: what a resumed run must share."""
+    values = dataclasses.asdict(options)
+    for name in ("max_failed", "strict", "device"):
+        del values["run"][name]
+    return values
+
+
+def _exit_code(summary: dict[str, Any], options: Options) -> int:
+    too_many = summary["failed_fraction"] > options.run.max_failed
+    return EXIT_FAILED_FRAMES if too_many else EXIT_DONE

@@ -1,15 +1,16 @@
 """The output folder of one run: lock, refusal to overwrite, frames kept as they finish.
 
-``run.json`` says what the run is and how far it came. Until the results are written,
-``steps.partial.jsonl`` holds a line for every finished frame, and ``tracker.npz`` the tracker's
-state after every fiftieth: a run that was killed goes on from there and loses at most 50 frames.
+``run.json`` says what the run is and how far it came, ``steps.csv`` gets a line as each frame
+finishes. ``checkpoint.npz`` holds the rows and the tracker's state after every fiftieth: a run that
+was killed goes on from there.
 """
 
 from __future__ import annotations
 
+import csv
 import json
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,28 +18,22 @@ import filelock
 import numpy as np
 
 from hybridvo.errors import InputError, LockedError, OutputError
-from hybridvo.files import atomic_write, write_json
+from hybridvo.files import atomic_write, make_folder, write_csv, write_json
 
 RESULTS = (
     *("trajectory.tum", "trajectory.kitti", "trajectory.png"),
-    *("steps.csv", "steps.npz", "metrics.json"),
+    *("steps.csv", "steps.npz", "metrics.json", "recording.rrd"),
 )
-"""Files that a finished run leaves beside ``run.json``."""
-STATE, PARTIAL, TRACKER, LOCK = "run.json", "steps.partial.jsonl", "tracker.npz", ".run.lock"
+"""Files that a finished run may leave beside ``run.json``."""
+STATE, STEPS, CHECKPOINT, LOCK = "run.json", "steps.csv", "checkpoint.npz", ".run.lock"
+STEP_COLUMNS = (
+    *("index", "timestamp", "status", "reason", "probability"),
+    *("tx", "ty", "tz", "rx", "ry", "rz"),
+    *("inlier_ratio", "iterations", "cost", "flow_ms", "motion_ms", "frame_ms"),
+    *("prev_index", "flow_source", "message"),
+)
 
 Mode = Literal["new", "resume", "overwrite"]
-
-
-def make_folder(path: Path) -> None:
-    """Make a folder for results, and those above it.
-
-    Raises:
-        OutputError: it cannot be made.
-    """
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be created: {error.strerror or error}.") from error
 
 
 class RunFolder:
@@ -51,11 +46,10 @@ class RunFolder:
         header: what else ``run.json`` says.
         mode: ``new`` refuses a folder with results, ``overwrite`` removes those of a run (and no
             other files), ``resume`` goes on.
-        results: names of the files that a finished run leaves.
 
     Attributes:
-        frames_done: frames whose rows are kept.
-        tracker: arrays of the tracker's state after them, or None.
+        rows: of the finished frames, JSON-ready, in order.
+        tracker: arrays of the tracker's state after them where the run is resumed, or None.
         finished: whether the run that is resumed was complete already.
 
     Raises:
@@ -71,13 +65,11 @@ class RunFolder:
         identity: Mapping[str, Any],
         header: Mapping[str, Any],
         mode: Mode = "new",
-        results: Iterable[str] = RESULTS,
     ) -> None:
         self.path = Path(path)
-        self.frames_done, self.finished = 0, False
+        self.rows: list[dict[str, Any]] = []
         self.tracker: dict[str, np.ndarray] | None = None
-        self.state: dict[str, Any] = {}
-        self._results = tuple(results)
+        self.finished = False
         self._identity = json.loads(json.dumps(identity))
         self._header = dict(header)
         make_folder(self.path)
@@ -93,17 +85,19 @@ class RunFolder:
         try:
             self._prepare(mode)
         except BaseException:
-            self._lock.release()
+            self.__exit__()
             raise
 
     def __enter__(self) -> RunFolder:
         return self
 
     def __exit__(self, *_: object) -> None:
+        # removed before it is released: afterwards it may be another run's
+        (self.path / LOCK).unlink(missing_ok=True)
         self._lock.release()
 
     def _prepare(self, mode: Mode) -> None:
-        present = [n for n in (STATE, PARTIAL, *self._results) if os.path.lexists(self.path / n)]
+        present = [name for name in (STATE, *RESULTS) if os.path.lexists(self.path / name)]
         if present and mode == "new":
             raise InputError(
                 f"{self.path}: holds results of a run already ({', '.join(present[:3])}"
@@ -114,101 +108,89 @@ class RunFolder:
             self._load()
             if self.finished:
                 return
-        elif present and not self._is_a_run():
+        elif present and "identity" not in self.read_json(STATE):
             raise InputError(
                 f"{self.path}: holds {', '.join(present[:3])} and no {STATE} of a run: not "
                 f"replaced. Move the files away, or choose another --out."
             )
         # before the old results go: without it nothing would say that what is left is a run's
         self.write_state("running")
-        if self.frames_done == 0:
-            self._remove(PARTIAL, TRACKER, *self._results)
-
-    def _is_a_run(self) -> bool:
-        state = self.read_json(STATE)
-        return isinstance(state, dict) and "identity" in state
+        if self.rows:  # what follows the checkpoint is computed again
+            write_csv(self.path / STEPS, STEP_COLUMNS, self.rows)
+        else:
+            self._remove(CHECKPOINT, *RESULTS)
 
     def _load(self) -> None:
-        """State, rows and tracker of an earlier run of the same identity."""
-        if not self._is_a_run():
+        """Rows and tracker of an earlier run of the same identity."""
+        state = self.read_json(STATE)
+        if "identity" not in state:
             raise InputError(
                 f"{self.path / STATE}: cannot be read, so the run cannot be resumed. "
                 f"Pass --overwrite to start anew."
             )
-        self.state = self.read_json(STATE)
-        then = self.state["identity"]
-        for key in sorted({*then, *self._identity}):
-            if then.get(key) != self._identity.get(key):
+        then, now = _flat(state["identity"]), _flat(self._identity)
+        for key in sorted({*then, *now}):
+            if then.get(key) != now.get(key):
                 raise InputError(
-                    f"{self.path}: cannot be resumed: {_difference(key, then, self._identity)}. "
-                    f"Pass --overwrite to start anew."
+                    f"{self.path}: cannot be resumed: {key} differs ({str(then.get(key))[:40]} "
+                    f"then, {str(now.get(key))[:40]} now). Pass --overwrite to start anew."
                 )
-        self.finished = self.state["state"] == "done"
-        if self.finished or not (self.path / TRACKER).is_file():
+        self.finished = state["state"] == "done"
+        if self.finished or not (self.path / CHECKPOINT).is_file():
             return
         try:
-            with np.load(self.path / TRACKER, allow_pickle=False) as stored:
-                tracker = dict(stored)
-            done = int(tracker.pop("frames_done"))
-            rows = list(self.rows(done))
+            with np.load(self.path / CHECKPOINT, allow_pickle=False) as stored:
+                arrays = dict(stored)
+            self.rows, self.tracker = json.loads(arrays.pop("rows").tobytes()), arrays
         except (OSError, ValueError, KeyError) as error:
             raise InputError(
-                f"{self.path / TRACKER}: cannot be read ({error}), so the run cannot be resumed. "
-                f"Pass --overwrite to start anew."
+                f"{self.path / CHECKPOINT}: cannot be read ({error}), so the run cannot be "
+                f"resumed. Pass --overwrite to start anew."
             ) from None
-        # what follows the tracker's state is computed again
-        with atomic_write(self.path / PARTIAL) as file:
-            file.writelines(json.dumps(row) + "\n" for row in rows)
-        self.frames_done, self.tracker = done, tracker
 
-    def rows(self, count: int | None = None) -> Iterator[dict[str, Any]]:
-        """The rows kept so far, in order: ``count`` of them, by default all."""
-        if not (self.path / PARTIAL).exists():
-            return
-        with (self.path / PARTIAL).open(encoding="utf-8") as file:
-            for number, line in enumerate(file):
-                if number == (self.frames_done if count is None else count):
-                    break
-                yield json.loads(line)
-
-    def read_json(self, name: str) -> Any:
-        """Content of a JSON file of the folder; None where it is absent or damaged."""
+    def read_json(self, name: str) -> dict[str, Any]:
+        """Content of a JSON file of the folder; empty where it is absent or damaged."""
         try:
-            return json.loads((self.path / name).read_text(encoding="utf-8"))
+            content = json.loads((self.path / name).read_text(encoding="utf-8"))
         except (OSError, ValueError):
-            return None
+            return {}
+        return content if isinstance(content, dict) else {}
 
-    def append(self, row: Mapping[str, Any]) -> None:
-        """Keep the row of a finished frame.
+    def append(self, row: dict[str, Any]) -> None:
+        """Keep the row of a finished frame, and write its line of ``steps.csv``.
 
         Raises:
-            OutputError: it cannot be written; rows kept before stay valid.
+            OutputError: it cannot be written; lines written before stay valid.
         """
+        path = self.path / STEPS
         try:
-            with (self.path / PARTIAL).open("a", encoding="utf-8") as file:
-                file.write(json.dumps(row, separators=(",", ":")) + "\n")
+            with path.open("a", encoding="utf-8", newline="") as file:
+                writer = csv.DictWriter(
+                    file, STEP_COLUMNS, extrasaction="ignore", lineterminator="\n"
+                )
+                if not self.rows:
+                    writer.writeheader()
+                writer.writerow(row)
         except OSError as error:
-            raise OutputError(
-                f"{self.path / PARTIAL}: cannot be written: {error.strerror or error}."
-            ) from error
-        self.frames_done += 1
+            raise OutputError(f"{path}: cannot be written: {error.strerror or error}.") from error
+        self.rows.append(row)
 
-    def save_tracker(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Keep the tracker's state after the rows kept so far."""
-        with atomic_write(self.path / TRACKER, "wb") as file:
-            content: dict[str, Any] = {"frames_done": self.frames_done, **arrays}
+    def save_checkpoint(self, tracker: Mapping[str, np.ndarray]) -> None:
+        """Keep the rows and the tracker's state after them."""
+        rows = np.frombuffer(json.dumps(self.rows).encode(), np.uint8)
+        content: dict[str, Any] = {"rows": rows, **tracker}
+        with atomic_write(self.path / CHECKPOINT, "wb") as file:
             np.savez(file, **content)
 
     def write_state(self, state: str, **more: Any) -> None:
         """Write ``run.json``; ``state`` is ``running``, ``interrupted`` or ``done``."""
-        self._header |= more
-        content = {"identity": self._identity, "state": state, "frames_done": self.frames_done}
-        write_json(self.path / STATE, {**self._header, **content})
+        content = {"identity": self._identity, "state": state, "frames_done": len(self.rows)}
+        write_json(self.path / STATE, {**self._header, **more, **content})
 
     def finish(self, **more: Any) -> None:
-        """The results are written: the kept rows are not needed any more."""
+        """The results are written: the checkpoint is not needed any more."""
         self.write_state("done", **more)
-        self._remove(PARTIAL, TRACKER)
+        self._remove(CHECKPOINT)
 
     def _remove(self, *names: str) -> None:
         for name in names:
@@ -220,12 +202,10 @@ class RunFolder:
                 ) from error
 
 
-def _difference(key: str, then: Any, now: Any) -> str:
-    """``options.run.seed: 0 then, 1 now``: the first thing in which two settings differ."""
-    path = [key]
-    then, now = then.get(key), now.get(key)
-    while isinstance(then, dict) and isinstance(now, dict):
-        inner = next(k for k in sorted({*then, *now}) if then.get(k) != now.get(k))
-        path.append(inner)
-        then, now = then.get(inner), now.get(inner)
-    return f"{'.'.join(path)} differs ({str(then)[:40]} then, {str(now)[:40]} now)"
+def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """``{"options.run.seed": 0}`` of ``{"options": {"run": {"seed": 0}}}``."""
+    found: dict[str, Any] = {}
+    for key, value in values.items():
+        inner = isinstance(value, dict)
+        found |= _flat(value, f"{prefix}{key}.") if inner else {f"{prefix}{key}": value}
+    return found

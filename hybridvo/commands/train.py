@@ -25,8 +25,6 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).resolve().parents[2]
-
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code (2: bad input, 5: output that cannot be written)."""
@@ -106,8 +104,7 @@ def _processes() -> Iterator[None]:
 
 
 def _pwvo(args: argparse.Namespace, command: str) -> None:
-    import torch
-
+    from hybridvo.network.models import torch_device
     from hybridvo.training.options import load_pwvo_options
     from hybridvo.training.pwvo_task import PwvoTask
 
@@ -115,9 +112,7 @@ def _pwvo(args: argparse.Namespace, command: str) -> None:
     names = ("steps", "batch_size", "seed")
     changes = {n: getattr(args, n) for n in names if getattr(args, n) is not None}
     options = dataclasses.replace(options, **changes)
-    device = args.device
-    if device == "auto":
-        device = "cuda" if torch.cuda.is_available() else "cpu"
+    device = torch_device(args.device)
     _train(args, command, PwvoTask(options, mixture), device, args.workers)
 
 
@@ -142,7 +137,6 @@ def _train(args: argparse.Namespace, command: str, task: Any, device: str, worke
 
     from hybridvo.errors import InputError
     from hybridvo.files import write_json
-    from hybridvo.network.weights import load_weights, pretrained, pretrained_names
     from hybridvo.training.export import RUN
     from hybridvo.training.provenance import source_commit
     from hybridvo.training.trainer import CHECKPOINT, LOG, Trainer
@@ -157,18 +151,22 @@ def _train(args: argparse.Namespace, command: str, task: Any, device: str, worke
         for name in (CHECKPOINT, LOG, RUN):
             (args.out / name).unlink(missing_ok=True)
     trainer = Trainer(task, args.out, device, workers, report=_report)
+
+    def say(text: str) -> None:
+        if trainer.rank == 0:
+            print(text, file=sys.stderr)
+
     if trainer.resume():
-        _say(trainer, f"goes on at update {trainer.step}")
+        say(f"goes on at update {trainer.step}")
     else:
         if args.init is not None:
-            path = pretrained(args.init) if args.init in pretrained_names() else args.init
-            trainer.start_from(load_weights(path)[0].state_dict(), str(path))
+            trainer.start_from(_network(args.init).state_dict(), args.init)
         if trainer.rank == 0:
             about = {"command": command, "commit": source_commit(), "torch": torch.__version__}
             write_json(args.out / RUN, about)
     with _clean_stop(trainer):
         why = trainer.run(60 * args.time_limit)
-    _say(trainer, f"ended by {why} at update {trainer.step}, {trainer.samples} samples")
+    say(f"ended by {why} at update {trainer.step}, {trainer.samples} samples")
     return trainer
 
 
@@ -196,7 +194,6 @@ def _export(args: argparse.Namespace, command: str) -> None:
 
 def _selector_data(args: argparse.Namespace, command: str) -> None:
     from hybridvo.errors import InputError
-    from hybridvo.network.weights import load_weights, pretrained, pretrained_names
     from hybridvo.training.selector_data import PER_SHARD, write_shard
     from hybridvo.training.selector_proposals import write_proposals
 
@@ -206,9 +203,14 @@ def _selector_data(args: argparse.Namespace, command: str) -> None:
     for seed in range(args.first_seed, args.first_seed + args.seeds, PER_SHARD):
         print(f"seeds from {seed}: {write_shard(args.data, seed)} samples", flush=True)
     if args.propose is not None:
-        known = args.propose in pretrained_names()
-        path = pretrained(args.propose) if known else args.propose
-        print(f"asked about {write_proposals(args.data, load_weights(path)[0])} samples")
+        print(f"asked about {write_proposals(args.data, _network(args.propose))} samples")
+
+
+def _network(name: str) -> Any:
+    """The network of a weights file, or of a pretrained name."""
+    from hybridvo.network.weights import load_weights, pretrained, pretrained_names
+
+    return load_weights(pretrained(name) if name in pretrained_names() else name)[0]
 
 
 def _report(entry: dict[str, Any]) -> None:
@@ -218,9 +220,4 @@ def _report(entry: dict[str, Any]) -> None:
     for name, result in entry.get("results", {}).items():
         figures = " ".join(f"{k}={v:.4g}" for k, v in result.items() if isinstance(v, float))
         line += f"\n  {name}: {figures}"
-    sys.stderr.write(line + "\n")
-
-
-def _say(trainer: Any, text: str) -> None:
-    if trainer.rank == 0:
-        sys.stderr.write(text + "\n")
+    print(line, file=sys.stderr)

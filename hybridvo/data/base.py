@@ -12,7 +12,7 @@ import numpy as np
 
 from hybridvo.data.camera_file import IMAGES, Calibration, Lens, parse_camera, units_per_metre
 from hybridvo.data.image_io import image_size, read_depth, read_flow, read_mask_png, read_rgb
-from hybridvo.data.lists import check_increasing, shown, sorted_files
+from hybridvo.data.lists import check_increasing, gap_warning, shown, sorted_files
 from hybridvo.errors import FormatError, InputError
 from hybridvo.types import Camera, Frame
 from hybridvo.units import depth_advice, typical_depth
@@ -48,6 +48,27 @@ class Listing:
     poses: np.ndarray | None = None
     sources: list[Path] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
+
+
+def numbered_listing(
+    name: str,
+    rgb: dict[int, Path],
+    depth: dict[int, Path],
+    frames_per_second: float,
+    flow: dict[int, Path] | None = None,
+) -> tuple[list[int], Listing]:
+    """Numbers of all frames with an image or depth, and their listing; stamps count from 0."""
+    frames = {*rgb, *depth}
+    numbers = sorted(frames)
+    flow = flow or {}
+    listing = Listing(
+        rgb=[rgb.get(n) for n in numbers],
+        depth=[depth.get(n) for n in numbers],
+        flow=[flow.get(n) if n + 1 in frames else None for n in numbers],  # none across a gap
+        timestamps=(np.array(numbers) - min(numbers, default=0)) / frames_per_second,
+        warnings=gap_warning(name, numbers),
+    )
+    return numbers, listing
 
 
 class Sequence:
@@ -86,7 +107,7 @@ class Sequence:
         self.poses, self._sources = listing.poses, listing.sources
         self.warnings = listing.warnings
         if count == 0:
-            raise InputError(f"{root}: no frames.")
+            raise InputError(f"{root}: no frames. Looked for {self.looks_for}")
         check_increasing(self.timestamps, str(root))
         self.height, self.width = self._find_size()
         if given.camera is None:
@@ -97,7 +118,13 @@ class Sequence:
         self.warnings += told
         self._camera = self._lens = None
         if calibration is not None:
-            self._camera = self._checked(calibration.camera)
+            self._camera = camera = calibration.camera
+            if camera.shape != (self.height, self.width):
+                raise InputError(
+                    f"{root}: images are {self.width}x{self.height}, the camera is for "
+                    f"{camera.width}x{camera.height} pixels. Intrinsics belong to one image size: "
+                    f"give those of these images (--camera fx,fy,cx,cy or --camera FILE)."
+                )
             self.warnings += calibration.warnings
             if any(calibration.distortion):
                 self._lens = Lens(calibration.camera, calibration.distortion)
@@ -214,16 +241,6 @@ class Sequence:
     def _depth_variance(self, depth: np.ndarray) -> np.ndarray | None:
         """Variance of log depth, where the source allows to state one."""
         return None
-
-    def _checked(self, camera: Camera) -> Camera:
-        """Camera whose size must be that of the images."""
-        if camera.shape != (self.height, self.width):
-            raise InputError(
-                f"{self.root}: images are {self.width}x{self.height}, the camera is for "
-                f"{camera.width}x{camera.height} pixels. Intrinsics belong to one image size: "
-                f"give those of these images (--camera fx,fy,cx,cy or --camera FILE)."
-            )
-        return camera
 
     def _check_shape(self, array: np.ndarray, path: Path, what: str) -> None:
         if array.shape[:2] != (self.height, self.width):

@@ -37,7 +37,7 @@ width: {width}
 height: {height}
 # Units per metre of the depth images: 1000 for millimetres (RealSense, Kinect, ZED), 5000 for TUM.
 # Leave it out where depth/ holds .npy or .dpt in metres.
-depth_scale: 1000
+{comment}depth_scale: 1000
 # Lens distortion k1, k2, p1, p2, k3 (OpenCV's order); leave it out for rectified images.
 # distortion: [0, 0, 0, 0, 0]
 # Images a second, where neither file names nor timestamps.txt give time stamps.
@@ -179,16 +179,17 @@ def units_per_metre(scale: float | None, where: str) -> tuple[float | None, list
 
 
 def write_camera_template(directory: str | os.PathLike[str]) -> Path:
-    """Write a ``camera.yaml`` to fill in, with the image size where rgb/ has an image."""
+    """Write a ``camera.yaml`` to fill in, with what the files in rgb/ and depth/ say."""
     folder = Path(directory)
     path = folder / CAMERA_FILE
     if path.exists():
         raise InputError(f"{path}: exists already; remove it first, or edit it.")
     images = sorted_files(folder / "rgb", IMAGES)
     height, width = image_size(images[0]) if images else ("", "")
+    comment = "# " if sorted_files(folder / "depth", (".npy", ".dpt")) else ""
     folder.mkdir(parents=True, exist_ok=True)
     with atomic_write(path) as file:
-        file.write(TEMPLATE.format(width=width, height=height))
+        file.write(TEMPLATE.format(width=width, height=height, comment=comment))
     return path
 
 

@@ -21,8 +21,6 @@ LEFT_AND_RIGHT = (("image_2", "image_3"), ("image_0", "image_1"))
 IMAGE_PATTERN = r"(\d+)\.(?:png|jpg)"
 MAX_ENTRY = 1e12
 """No entry of a projection matrix is larger."""
-MIN_STEREO_WIDTH = 32
-"""Images narrower than this are not matched: OpenCV's matcher fails, or crashes, below 17 px."""
 DISPARITY_SIGMA_PX = 0.5
 """Assumed standard deviation of a block-matched disparity, px: sets the relative depth noise."""
 
@@ -122,8 +120,6 @@ class KittiSequence(Sequence):
 
 def _match(left: np.ndarray, right: np.ndarray) -> np.ndarray:
     """(H, W) float32 disparity in pixels of a rectified pair; 0 or less where nothing matches."""
-    if left.shape[1] < MIN_STEREO_WIDTH:
-        return np.zeros(left.shape[:2], np.float32)
     # 128 px at KITTI's size: everything beyond 3 m. Narrow images cannot be searched as far.
     disparities = min(128, max(16, left.shape[1] // 2 // 16 * 16))
     block = 5

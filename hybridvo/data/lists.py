@@ -78,12 +78,6 @@ def gap_warning(name: str, numbers: Many[int]) -> list[str]:
     return [told] if spans else []
 
 
-def flow_of_next(flow: dict[int, Path], numbers: Many[int]) -> list[Path | None]:
-    """Flow file of each frame that leads to the following frame: across a gap there is none."""
-    following = [*numbers[1:], None]
-    return [flow.get(n) if m == n + 1 else None for n, m in zip(numbers, following, strict=True)]
-
-
 def shown(names: Many[object], most: int = 8) -> str:
     """The first names of a list, for a message."""
     return ", ".join(map(str, names[:most])) + (", ..." if len(names) > most else "")

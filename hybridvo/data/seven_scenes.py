@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from hybridvo.data.base import Given, Listing, Sequence
+from hybridvo.data.base import Given, Sequence, numbered_listing
 from hybridvo.data.camera_file import Calibration
 from hybridvo.data.image_io import read_depth, read_text
-from hybridvo.data.lists import gap_warning, numbered_files, rigid
-from hybridvo.errors import FormatError, InputError
+from hybridvo.data.lists import numbered_files, rigid
+from hybridvo.errors import FormatError
 from hybridvo.types import Camera
 
 INVALID_DEPTH = 65535
@@ -36,28 +36,17 @@ class SevenScenesSequence(Sequence):
         rgb = numbered_files(root, IMAGE_PATTERN)
         depth = numbered_files(root, DEPTH_PATTERN)
         pose_files = numbered_files(root, r"frame-(\d+)\.pose\.txt")
-        numbers = sorted(set(rgb) | set(depth))
-        if not numbers:
-            raise InputError(
-                f"{root}: no frames matched frame-NUMBER.color.png or frame-NUMBER.depth.png."
-            )
         name = f"{root.parent.name}_{root.name}" if root.name.startswith("seq-") else root.name
+        numbers, listing = numbered_listing(name, rgb, depth, FRAMES_PER_SECOND)
         poses = np.full((len(numbers), 4, 4), np.nan)
-        warnings = gap_warning(name, numbers)
         for i, n in enumerate(numbers):
             try:
                 if n in pose_files:
                     poses[i] = _read_pose(pose_files[n])
             except FormatError as error:
-                warnings.append(f"no ground truth for frame {i}: {error}")
-        listing = Listing(
-            rgb=[rgb.get(n) for n in numbers],
-            depth=[depth.get(n) for n in numbers],
-            timestamps=(np.array(numbers) - numbers[0]) / FRAMES_PER_SECOND,
-            poses=poses if pose_files else None,
-            sources=[pose_files[n] for n in numbers if n in pose_files],
-            warnings=warnings,
-        )
+                listing.warnings.append(f"no ground truth for frame {i}: {error}")
+        listing.poses = poses if pose_files else None
+        listing.sources = [*pose_files.values()]
         super().__init__(root, name, listing, given)
 
     @staticmethod

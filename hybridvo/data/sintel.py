@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from hybridvo.data.base import Given, Listing, Sequence
+from hybridvo.data.base import Given, Sequence, numbered_listing
 from hybridvo.data.camera_file import Calibration
 from hybridvo.data.image_io import read_cam, read_flow, read_mask_png
-from hybridvo.data.lists import flow_of_next, gap_warning, numbered_files
+from hybridvo.data.lists import numbered_files
 from hybridvo.errors import FormatError, InputError
 from hybridvo.geometry import invert
 from hybridvo.types import Camera
@@ -45,12 +45,9 @@ class SintelSequence(Sequence):
             for folder, suffix in SUFFIXES.items()
         }
         rgb = numbered_files(images, r"frame_(\d+)\.(?:png|jpg|jpeg)")
-        numbers = sorted(set(rgb) | set(files["depth"]))
-        if not numbers:
-            raise InputError(
-                f"{path}: no frames matched frame_*.png or frame_*.dpt in {images or base} and "
-                f"{base / 'depth' / name}."
-            )
+        numbers, listing = numbered_listing(
+            name, rgb, files["depth"], FRAMES_PER_SECOND, files["flow"]
+        )
         if not files["camdata_left"]:
             raise InputError(
                 f"{base}: no frames matched frame_*.cam in camdata_left/{name}. The camera data "
@@ -59,14 +56,7 @@ class SintelSequence(Sequence):
         self._cameras = [files["camdata_left"].get(n) for n in numbers]
         self._invalid = [files["invalid"].get(n) for n in numbers]
         sources = (*self._cameras, *self._invalid)
-        listing = Listing(
-            rgb=[rgb.get(n) for n in numbers],
-            depth=[files["depth"].get(n) for n in numbers],
-            flow=flow_of_next(files["flow"], numbers),
-            timestamps=(np.array(numbers) - numbers[0]) / FRAMES_PER_SECOND,
-            sources=[p for p in sources if p is not None],
-            warnings=gap_warning(name, numbers),
-        )
+        listing.sources = [p for p in sources if p is not None]
         super().__init__(path if path.is_dir() else base, name, listing, given)
         self.poses = self._read_poses()
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hybridvo.data.base import Given, Listing, Sequence
+from hybridvo.data.base import Given, Sequence, numbered_listing
 from hybridvo.data.camera_file import Calibration
 from hybridvo.data.image_io import (
     read_depth_rgba_png,
@@ -15,7 +15,7 @@ from hybridvo.data.image_io import (
     read_mask_png,
     read_npy,
 )
-from hybridvo.data.lists import flow_of_next, gap_warning, numbered_files, read_poses
+from hybridvo.data.lists import numbered_files, read_poses
 from hybridvo.errors import InputError
 from hybridvo.geometry import ned_to_camera
 from hybridvo.types import Camera
@@ -50,25 +50,14 @@ class TartanAirSequence(Sequence):
         camera, flow_folder = VERSIONS[self.version]
         rgb = numbered_files(root / f"image_{camera}", rf"(\d+)_{camera}\.(?:png|jpg)")
         depth = numbered_files(root / f"depth_{camera}", rf"(\d+)_{camera}_depth\.(?:npy|png)")
-        numbers = sorted(set(rgb) | set(depth))
-        if not numbers:
-            raise InputError(
-                f"{root}: no frames matched NUMBER_{camera}.png in image_{camera} or "
-                f"NUMBER_{camera}_depth.npy/.png in depth_{camera}."
-            )
         flow = numbered_files(root / flow_folder, r"(\d+)_\d+_flow\.(?:npy|png)")
         pose_file = root / f"pose_{camera}.txt"
         name = "_".join(root.parts[-3:]) if root.parent.name in ("Easy", "Hard") else root.name
-        poses, told = _read_poses(pose_file, numbers)
-        listing = Listing(
-            rgb=[rgb.get(n) for n in numbers],
-            depth=[depth.get(n) for n in numbers],
-            flow=flow_of_next(flow, numbers),
-            timestamps=(np.array(numbers) - numbers[0]) / FRAMES_PER_SECOND,
-            poses=poses,
-            sources=[pose_file, *(p for p in map(_mask_file, flow.values()) if p is not None)],
-            warnings=gap_warning(name, numbers) + told,
-        )
+        numbers, listing = numbered_listing(name, rgb, depth, FRAMES_PER_SECOND, flow)
+        listing.poses, told = _read_poses(pose_file, numbers)
+        listing.warnings += told
+        masks = [_mask_file(path) for path in flow.values()]
+        listing.sources = [pose_file, *(path for path in masks if path is not None)]
         super().__init__(root, name, listing, given)
 
     @staticmethod
@@ -120,7 +109,7 @@ def _mask_file(flow: Path) -> Path | None:
 
 def _read_poses(path: Path, numbers: list[int]) -> tuple[np.ndarray | None, list[str]]:
     """Poses in camera axes of the frames with these numbers: line i belongs to frame i."""
-    if not path.exists():
+    if not path.exists() or not numbers:
         return None, []
     converted = ned_to_camera(read_poses(path, "tx ty tz qx qy qz qw")[1])
     known = np.array(numbers) < len(converted)

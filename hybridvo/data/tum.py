@@ -16,7 +16,6 @@ from hybridvo.data.lists import (
     read_rows,
     to_seconds,
 )
-from hybridvo.errors import InputError
 from hybridvo.geometry import invert, pose_matrix
 from hybridvo.types import Camera
 
@@ -72,8 +71,6 @@ class TumSequence(Sequence):
         listing = _read_lists(root) if (root / "rgb.txt").exists() else _read_pairs(root)
         if self._is_icl:
             listing.timestamps = listing.timestamps / ICL_FRAMES_PER_SECOND
-        if not listing.rgb:
-            raise InputError(f"{root}: no frames matched the entries of {listing.sources[0].name}.")
         pose_file = icl or root / "groundtruth.txt"
         if pose_file.exists():
             self._add_poses(pose_file, listing, is_bonn="bonn" in root.name.lower())

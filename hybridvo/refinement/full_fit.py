@@ -14,9 +14,12 @@ from hybridvo.refinement.depth_agreement import DepthAgreement, depth_agreement
 from hybridvo.refinement.pixels import CoarseGrid, PixelGrid, as_contiguous
 from hybridvo.types import FramePair
 
-DEPTH_STEPS = 5
-"""Most Newton steps on the full grid with the current depth; without it one is enough: 1, 2 and 4
-steps more give the very same answers on the scenarios."""
+LONG_STEP = 1e3
+"""Squared length, in standard deviations, of a step that may not be the last. The coarse fit is
+about sqrt(6 x 60) of the full fit's standard deviations away (60 times fewer pixels), and the step
+is wrong by some 2 % of its length, the statistical error of the curvature."""
+MAX_STEPS = 5
+"""Newton steps on the full grid."""
 NOISE_PIXELS = 4000
 """Pixels that the final noise estimate looks at."""
 MIN_SAMPLES = 1500
@@ -165,7 +168,8 @@ def fit_full_grid(
         solver.set_noise(sf, sd, options.cutoff, noise)
     per_pixel = _curvature(image, samples, n, pose, noise)
     # with the current depth the weak directions are far from where the flow put them
-    for step in range(1 if term is None else DEPTH_STEPS):
+    long = LONG_STEP if term is None else 1.0
+    for step in range(MAX_STEPS):
         tiles, rest, weights = image.full_pass(pose, noise, tile)
         curvature = per_pixel * rest[2]
         if term:
@@ -175,7 +179,7 @@ def fit_full_grid(
         total = np.concatenate([tiles.sum(axis=(0, 1)), rest])
         length = _newton_step(total, curvature[:21], pose)
         iterations += step > 0
-        if not length > 1.0:
+        if not length > long:
             break
     covariance, eigenvalues, definite = _covariance(
         image, tiles, total, curvature, pose, (sf, sd), depth_scale

@@ -12,10 +12,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from hybridvo.checks import make_folder
 from hybridvo.data.base import Sequence
 from hybridvo.data.image_io import write_cam, write_dpt, write_flo
 from hybridvo.errors import InputError, OutputError
+from hybridvo.files import make_folder
 from hybridvo.geometry import invert
 from hybridvo.synthetic.raycast import cast, motion, screen_bounds, shade
 from hybridvo.synthetic.scenes import compose_world

@@ -14,7 +14,7 @@ import pytest
 
 import hybridvo as hvo
 from hybridvo.cli import main
-from hybridvo.commands.run_folder import PARTIAL, STATE, TRACKER
+from hybridvo.commands.run_folder import CHECKPOINT, STATE
 from hybridvo.synthetic.render import make_scene
 from hybridvo.trajectory import read_trajectory
 
@@ -47,7 +47,7 @@ def true_poses() -> np.ndarray:
 def test_true_flow_gives_the_true_trajectory_and_every_file(dataset, tmp_path, capsys):
     out = tmp_path / "out"
     assert run(dataset, out, "--flow", "file") == 0
-    assert {path.name for path in out.iterdir() if not path.name.startswith(".")} == {
+    assert {path.name for path in out.iterdir()} == {
         *("metrics.json", "run.json", "steps.csv", "steps.npz"),
         *("trajectory.kitti", "trajectory.png", "trajectory.tum"),
     }
@@ -160,12 +160,12 @@ def test_resume_goes_on_where_a_killed_run_was(dataset, tmp_path, monkeypatch):
         patch.setattr(hvo.Odometry, "track", track)
         with pytest.raises(SystemExit):
             run(dataset, cut, "--flow", "dis")
-    assert (cut / TRACKER).exists() and load(cut, STATE)["state"] == "running"
-    assert len((cut / PARTIAL).read_text().splitlines()) == 3
+    assert (cut / CHECKPOINT).exists() and load(cut, STATE)["state"] == "running"
+    assert len(rows(cut)) == 3
     count = 0
     assert run(dataset, cut, "--flow", "dis", "--resume") == 0
     np.testing.assert_allclose(poses(cut), poses(whole), atol=1e-6)
-    assert len(rows(cut)) == FRAMES and not (cut / TRACKER).exists()
+    assert len(rows(cut)) == FRAMES and not (cut / CHECKPOINT).exists()
 
 
 def test_resume_of_a_finished_run_repeats_its_answer(dataset, tmp_path, capsys):

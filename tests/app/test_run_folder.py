@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from hybridvo.commands.progress import Progress, interruptible
-from hybridvo.commands.run_folder import PARTIAL, STATE, RunFolder
+from hybridvo.commands.run_folder import STATE, STEPS, RunFolder
 from hybridvo.errors import InputError, LockedError, OutputError
 from hybridvo.trajectory import read_trajectory
 
@@ -27,20 +27,16 @@ def state(path: Path) -> dict:
     return json.loads((path / STATE).read_text())
 
 
-def visible(path: Path) -> list[str]:
-    return sorted(p.name for p in path.iterdir() if not p.name.startswith("."))
-
-
-def test_rows_are_on_disk_as_they_are_appended(tmp_path):
-    with start(tmp_path / "out") as folder:
+def test_steps_are_on_disk_as_they_are_appended(tmp_path):
+    out = tmp_path / "out"
+    with start(out) as folder:
         for i in range(3):
             folder.append({"index": i})
-            assert len((tmp_path / "out" / PARTIAL).read_text().splitlines()) == i + 1
-        assert [row["index"] for row in folder.rows()] == [0, 1, 2]
-        assert state(tmp_path / "out")["state"] == "running"
+            assert len((out / STEPS).read_text().splitlines()) == i + 2  # and the header
+        assert state(out)["state"] == "running"
         folder.finish(summary={"n": 3})
-    assert state(tmp_path / "out")["frames_done"] == 3
-    assert visible(tmp_path / "out") == [STATE]
+    assert state(out)["frames_done"] == 3 and state(out)["summary"] == {"n": 3}
+    assert sorted(path.name for path in out.iterdir()) == [STATE, STEPS]
 
 
 def test_results_are_replaced_only_when_asked_and_only_those_of_a_run(tmp_path):
@@ -73,26 +69,27 @@ def test_overwrite_removes_a_link_and_not_what_it_points_to(tmp_path):
     assert not (tmp_path / "out" / "trajectory.tum").is_symlink()
 
 
-def test_resume_goes_on_from_the_trackers_state(tmp_path):
+def test_resume_goes_on_from_the_checkpoint(tmp_path):
     with start(tmp_path) as folder:
         folder.append({"index": 0})
         folder.append({"index": 1})
-        folder.save_tracker({"T": np.eye(4)})
-        folder.append({"index": 2})  # after the state: computed again
-    with (tmp_path / PARTIAL).open("a") as file:
-        file.write('{"index": 3, "val')  # torn by the end of the process
+        folder.save_checkpoint({"T": np.eye(4)})
+        folder.append({"index": 2})  # after it: computed again
+    with (tmp_path / STEPS).open("a") as file:
+        file.write("3,0.1,o")  # torn by the end of the process
     with start(tmp_path, "resume") as folder:
-        assert folder.frames_done == 2
+        assert [row["index"] for row in folder.rows] == [0, 1]
         np.testing.assert_array_equal(folder.tracker["T"], np.eye(4))
         folder.append({"index": 2})
-        assert [row["index"] for row in folder.rows()] == [0, 1, 2]
+    lines = (tmp_path / STEPS).read_text().splitlines()
+    assert [line.split(",")[0] for line in lines] == ["index", "0", "1", "2"]
 
 
-def test_resume_without_a_state_or_of_nothing_starts_anew(tmp_path):
+def test_resume_without_a_checkpoint_or_of_nothing_starts_anew(tmp_path):
     with start(tmp_path, "resume") as folder:
         folder.append({"index": 0})
     with start(tmp_path, "resume") as folder:
-        assert folder.frames_done == 0 and not folder.finished and list(folder.rows()) == []
+        assert folder.rows == [] and not folder.finished
         folder.finish()
     with start(tmp_path, "resume") as folder:
         assert folder.finished
@@ -126,7 +123,7 @@ def test_a_file_in_place_of_the_folder(tmp_path):
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
 def test_a_full_disk_is_an_output_error(tmp_path):
     with start(tmp_path) as folder:
-        (tmp_path / PARTIAL).symlink_to("/dev/full")
+        (tmp_path / STEPS).symlink_to("/dev/full")
         with pytest.raises(OutputError, match="No space left"):
             folder.append({"index": 0})
 
@@ -165,7 +162,7 @@ def test_a_run_that_was_stopped_is_resumed_to_the_same_end(dataset, tmp_path, nu
     subprocess.run([*command, str(tmp_path / "whole")], check=True, capture_output=True)
     cut = tmp_path / "cut"
     child = subprocess.Popen([*command, str(cut)], stdout=subprocess.DEVNULL)
-    while child.poll() is None and not (cut / PARTIAL).exists():
+    while child.poll() is None and not (cut / STEPS).exists():
         time.sleep(0.01)
     child.send_signal(number)
     child.wait()

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from hybridvo.data.camera_file import read_camera_file, write_camera_template
 from hybridvo.data.image_io import write_flo
-from hybridvo.data.lists import associate, natural_key, to_seconds
+from hybridvo.data.lists import associate, to_seconds
 from hybridvo.data.sequence import open_sequence
 from hybridvo.errors import FormatError, InputError
 from hybridvo.types import Camera
@@ -204,12 +204,6 @@ def test_association_is_greedy_one_to_one(a, b):
     assert associate(first, second, 0.02) == sorted(expected)
 
 
-def test_natural_order():
-    names = ["f10", "f9", "f1", "b\N{SUPERSCRIPT TWO}", "\N{ARABIC-INDIC DIGIT THREE}1"]
-    found = [path.name for path in sorted(map(Path, names), key=natural_key)]
-    assert [name for name in found if name.startswith("f")] == ["f1", "f9", "f10"]
-
-
 EPOCH = 1_700_000_000.25
 
 
@@ -388,12 +382,16 @@ def test_template_is_filled_in_and_read(tmp_path):
     with pytest.raises(FormatError, match=r"camera\.yaml: missing: fx, fy, cx, cy\."):
         open_sequence(root)
     text = path.read_text()
+    assert "\ndepth_scale: 1000" in text
     for key in ("fx", "fy", "cx", "cy"):
         text = text.replace(f"\n{key}:", f"\n{key}: 16.5")
     path.write_text(text)
     assert open_sequence(root)[0].camera == Camera(16.5, 16.5, 16.5, 16.5, 24, 32)
     with pytest.raises(InputError, match="exists already"):
         write_camera_template(root)
+    (tmp_path / "metres" / "depth").mkdir(parents=True)
+    np.save(tmp_path / "metres" / "depth" / "0.npy", np.ones(SIZE))
+    assert "\n# depth_scale" in write_camera_template(tmp_path / "metres").read_text()
 
 
 @pytest.mark.parametrize(

@@ -51,18 +51,7 @@ IMPORTS: dict[str, set[str]] = {
     "__init__": set(),
 }
 """Room (a folder, or a file at the top) -> rooms it may import."""
-APPLICATION = {
-    "cli",
-    "commands",
-    "configuration",
-    "console",
-    "demo",
-    "depth_steps",
-    "diagnosis",
-} | {
-    *("diagnosis_findings", "doctor", "recording", "run", "run_folder", "run_report"),
-    "run_results",
-}
+APPLICATION = {"cli", "commands"}
 """The command line: may import everything, and nothing imports it."""
 
 LAZY = {"network/pwvo.py": {"network/weights.py", "learned.py"}}
@@ -73,8 +62,8 @@ ONLY_IN = {
     "matplotlib": {"evaluation/plots.py"},
     "plotly": {"evaluation/"},
     "pandas": {"evaluation/"},
-    "rerun": {"recording.py", "commands/recording.py"},
-    "rich": {"console.py", "commands/"},
+    "rerun": {"commands/recording.py"},
+    "rich": {"commands/"},
     "yaml": {"files.py", "evaluation/protocols.py", "commands/", "options.py"},
     "open3d": {"baselines/"},
     "poselib": {"baselines/"},

