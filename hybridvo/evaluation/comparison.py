@@ -29,9 +29,8 @@ import pandas as pd
 import hybridvo
 from hybridvo.data.sequence import Sequence, open_sequence
 from hybridvo.errors import HybridVOError, InputError, LockedError
-from hybridvo.evaluation.breakdown import breakdown, worst_pairs
 from hybridvo.evaluation.protocols import Protocol, check_protocol, protocol_summary
-from hybridvo.evaluation.scores import ROW_COLUMNS, total_row
+from hybridvo.evaluation.scores import ROW_COLUMNS, breakdown, total_row
 from hybridvo.evaluation.sequence_job import (
     PAIR_COLUMNS,
     ComparisonOptions,
@@ -40,6 +39,7 @@ from hybridvo.evaluation.sequence_job import (
     run_sequence,
 )
 from hybridvo.evaluation.sources import expand, methods_to_run
+from hybridvo.evaluation.worst import draw_worst, worst_pairs
 from hybridvo.files import write_csv, write_json
 from hybridvo.pipeline import Models, weights_hash
 from hybridvo.trajectory import Trajectory, write_tum
@@ -355,8 +355,6 @@ def _draw_worst(
     parts: Iterable[Mapping[str, Any]],
 ) -> list[dict[str, Any]]:
     """``worst_pairs`` with ``picture`` (path of a JPEG) or ``picture_reason``."""
-    from hybridvo.evaluation.drawing import draw_worst
-
     (out / "worst").mkdir(exist_ok=True)
     for number, (job, part) in enumerate(zip(jobs, parts, strict=True)):
         mine = [entry for entry in worst if entry["sequence"] == job.name]
@@ -364,7 +362,8 @@ def _draw_worst(
         if mine:
             sequence = open_sequence(job.path, job.options.dataset)
             stem = f"worst/{number:03d}_{_plain(part)}"
-            draw_worst(out, stem, sequence, mine, motions, job.flows)
+            models = Models(job.options.device, job.options.weights)
+            draw_worst(out, stem, sequence, mine, motions, job.flows, models)
     return worst
 
 

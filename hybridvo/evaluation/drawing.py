@@ -1,13 +1,12 @@
-"""Images of pairs: the paper's figures of one pair, and the worst pairs of a comparison."""
+"""Images of one pair: the paper's figures, and what networks look at."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from hybridvo.data.sequence import Sequence, iter_pairs, open_sequence
@@ -15,7 +14,6 @@ from hybridvo.errors import InputError
 from hybridvo.evaluation.maps import (
     Saliency,
     error_map,
-    flow_colours,
     integrated_gradients,
     longest_flow,
     moving_pixels,
@@ -25,19 +23,15 @@ from hybridvo.evaluation.maps import (
     uncertainty_maps,
 )
 from hybridvo.evaluation.pair_errors import pair_errors
-from hybridvo.evaluation.panels import FlowPanel, ImagePanel, Panel, ScalarPanel, maps_png
+from hybridvo.evaluation.plots import FlowPanel, ImagePanel, Panel, ScalarPanel, maps_png
 from hybridvo.evaluation.sequence_job import true_motion
 from hybridvo.evaluation.sources import SharedFlow
 from hybridvo.files import atomic_write, write_json
 from hybridvo.geometry import matrix_to_euler_deg
-from hybridvo.types import Frame, FramePair, PixelwisePrediction
+from hybridvo.network.options import KINDS
+from hybridvo.pipeline import DEFAULT_METHOD, estimate
+from hybridvo.types import FramePair, PixelwisePrediction
 
-THUMBNAIL_WIDTH = 256
-"""Width of each of the three panels of a worst pair, px: a report holds a hundred of them."""
-JPEG_QUALITY = 80
-CAPTION_PX = 18
-ERROR_RANGE_PX = (0.01, 10.0)
-"""Ends of the colours of every error map of the worst pairs, px, logarithmic."""
 SALIENCY_BLOCK = 4
 """Pixels whose saliency is summed for display: networks read one of some pixels only."""
 
@@ -74,8 +68,6 @@ def draw(
         InputError: unknown sequence, pair or weights, or an image that exists or is no PNG.
         OutputError: the image cannot be written.
     """
-    from hybridvo.pipeline import DEFAULT_METHOD, estimate
-
     out = Path(out)
     if out.suffix.lower() != ".png":
         raise InputError(f"{out}: expected a name that ends in .png.")
@@ -193,14 +185,7 @@ def network_panels(
     steps: int,
 ) -> tuple[list[Panel], dict[str, float | None]]:
     """Panels and numbers of one network: uncertainty, errors, saliency of its last pass."""
-    import torch
-
-    from hybridvo.network.inputs import assemble_inputs
-
-    inputs = assemble_inputs(pair)
-    T_start = start_of(network, inputs)
-    with torch.no_grad():
-        output = network(inputs, T_start)
+    output, inputs, T_start = predict(network, pair)
     panels: list[Panel] = []
     numbers: dict[str, float | None] = {}
     if isinstance(output, PixelwisePrediction):
@@ -225,6 +210,20 @@ def network_panels(
             f"{name}: part of the {what} that the saliency misses": saliency.completeness_error,
         }
     return panels, numbers
+
+
+def predict(network: Any, pair: FramePair) -> tuple[Any, Any, Any]:
+    """(output, inputs, start) of the last pass of a network."""
+    import torch
+
+    from hybridvo.network.inputs import assemble_inputs
+
+    inputs = assemble_inputs(pair)
+    device = next(network.parameters()).device
+    inputs = inputs.to(device) if device.type != "cpu" else inputs
+    T_start = start_of(network, inputs)
+    with torch.no_grad():
+        return network(inputs, T_start), inputs, T_start
 
 
 def _block_sums(values: np.ndarray) -> np.ndarray:
@@ -285,81 +284,3 @@ def _weighted_map(run: Callable[..., Any], name: str, weights: Any) -> Callable[
 
 def _along(run: Callable[..., Any], part: int, direction: Any) -> Callable[..., Any]:
     return lambda *tensors: (direction * run(*tensors)[part]).sum()
-
-
-# -- worst pairs of a comparison ------------------------------------------------------------------
-
-
-def draw_worst(
-    out: Path,
-    stem: str,
-    sequence: Sequence,
-    entries: Iterable[dict[str, Any]],
-    results: Mapping[tuple[int, str, str], Mapping[str, Any]],
-    flows: Iterable[str],
-) -> None:
-    """Draw worst pairs of one sequence, with the motion that the comparison found.
-
-    Args:
-        out: folder of the comparison.
-        stem: of the names of the images in it.
-        sequence: an open one.
-        entries: get ``picture``, or None and ``picture_reason``.
-        results: (index, method, flow source) -> its row with ``prev``, ``next``, ``T_curr_prev``.
-        flows: ``dis``, ``file``.
-    """
-    providers = {provider.label: provider for provider in (SharedFlow(f, sequence) for f in flows)}
-    for entry in entries:
-        method, label = entry["method"], entry["flow_source"]
-        row = results[entry["index"], method, label]
-        entry |= {"picture": None, "picture_reason": None}
-        try:
-            prev, curr = sequence.frame(row["prev"]), sequence.frame(row["next"])
-        except (InputError, OSError) as error:
-            entry["picture_reason"] = f"the pair cannot be read: {error}"
-            continue
-        flow = providers[label](prev, curr).flow
-        T_est = np.array(row["T_curr_prev"]).reshape(4, 4)
-        image = _three_panels(
-            prev, curr, flow, T_est, true_motion(sequence, prev.index, curr.index)
-        )
-        entry["picture"] = f"{stem}_{entry['index']:06d}_{method}_{label.split()[0]}.jpg"
-        encoded = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-        with atomic_write(out / entry["picture"], "wb") as file:
-            file.write(encoded[1].tobytes())
-
-
-def _three_panels(
-    prev: Frame, curr: Frame, flow: np.ndarray | None, T_est: np.ndarray, T_gt: np.ndarray | None
-) -> np.ndarray:
-    """(H, W, 3) uint8 RGB: previous frame, flow, and distance of the two ego flows."""
-    panels = [(prev.rgb, f"frame {prev.index}" if prev.rgb is not None else "no image")]
-    if flow is None:
-        panels.append((None, "no flow"))
-    else:
-        longest = longest_flow(flow)
-        panels.append((flow_colours(flow, longest), f"flow, to {longest:.3g} px"))
-    if T_gt is None or prev.depth is None:
-        panels.append((None, "error unknown"))
-    else:
-        low, high = ERROR_RANGE_PX
-        with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-            error = error_map(T_est, T_gt, prev.depth, prev.camera, curr.camera)
-            relative = np.log(error / low) / np.log(high / low)
-        grey = np.clip(255 * np.nan_to_num(relative, nan=0.0), 0, 255).astype(np.uint8)
-        heat = cv2.applyColorMap(grey, cv2.COLORMAP_INFERNO)[..., ::-1].copy()
-        heat[~np.isfinite(error)] = 128
-        panels.append((heat, f"error {low:g} to {high:g} px, log"))
-    return np.concatenate([_panel(*panel, prev.camera.shape) for panel in panels], axis=1)
-
-
-def _panel(image: np.ndarray | None, caption: str, shape: tuple[int, int]) -> np.ndarray:
-    """Image of the common width with a line of text below."""
-    size = THUMBNAIL_WIDTH, max(1, round(THUMBNAIL_WIDTH * shape[0] / shape[1]))
-    small = np.full((size[1], size[0], 3), 128, np.uint8)
-    if image is not None:
-        small[:] = cv2.resize(np.ascontiguousarray(image), size, interpolation=cv2.INTER_AREA)
-    strip = np.full((CAPTION_PX, THUMBNAIL_WIDTH, 3), 255, np.uint8)
-    place, font = (4, CAPTION_PX - 5), cv2.FONT_HERSHEY_SIMPLEX
-    cv2.putText(strip, caption, place, font, 0.4, (0, 0, 0), 1, cv2.LINE_AA)
-    return np.concatenate([small, strip])

@@ -11,16 +11,19 @@ import json
 import math
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
+from plotly.graph_objects import Figure
 
 from hybridvo.errors import FormatError, InputError
 from hybridvo.evaluation.charts import (
     error_distribution,
     factor_charts,
     failure_chart,
+    is_oracle,
     path_charts,
     time_chart,
 )
@@ -62,8 +65,8 @@ SEQUENCE_COLUMNS: tuple[Column, ...] = (
     ("t_err", "paper's T_err [cm]", 100.0),
     ("dynamic_fraction", "moving [%]", 100.0),
 )
-MORE_IS_NO_MERIT = ("pairs", "flow_ms_median", "dynamic_fraction")
-"""Columns without a best value."""
+NO_MERIT = ("pairs", "moving [%]", "time [ms]", "+ flow [ms]")
+"""Columns without a best value: doing nothing takes no time."""
 
 
 def write_report(folder: str | os.PathLike[str]) -> list[Path]:
@@ -94,25 +97,23 @@ def write_report(folder: str | os.PathLike[str]) -> list[Path]:
         ("What makes it fail", factor_charts(result["breakdown"], methods)),
         ("Error against time", time_chart(result["totals"], methods)),
     ]
+    names = dict.fromkeys(row["sequence"] for row in result["rows"])
+    paths = {name: path_charts(folder, result, pairs, name, methods) for name in names}
     html = environment.get_template("report.html").render(
         headline=headline(result),
         result=result,
         pairs=len(pairs.drop_duplicates(["sequence", "index"])),
         methods=methods,
-        tables=[(flow, html_table(rows, RESULT_COLUMNS)) for flow, rows in by_flow(result)],
+        tables=[(flow, make_table(rows, RESULT_COLUMNS)) for flow, rows in by_flow(result)],
         worst=_gallery(folder, result),
-        sections=[
-            (name, [_json(chart) for chart in charts]) for name, charts in sections if charts
-        ],
-        sequences=[
-            (name, [_json(chart) for chart in path_charts(folder, result, pairs, name, methods)])
-            for name in dict.fromkeys(row["sequence"] for row in result["rows"])
-        ],
+        sections=[(name, _json(charts)) for name, charts in sections if charts],
+        sequences=[(name, _json(charts)) for name, charts in paths.items()],
         protocol=_protocol_tables(result),
-        numbers=html_table(
+        numbers=make_table(
             [row for _, rows in by_flow(result, "rows") for row in rows],
             SEQUENCE_COLUMNS,
             ("sequence", "method", "flow_source"),
+            ranked=False,
         ),
         provenance=_provenance(result),
         plotly=get_plotlyjs(),
@@ -138,11 +139,6 @@ def read_comparison(folder: Path) -> tuple[dict[str, Any], pd.DataFrame]:
         raise FormatError(
             f"{folder}: results.json or pairs.csv is not what a comparison writes: {error!r}."
         ) from None
-
-
-def is_oracle(flow: str) -> bool:
-    """Whether a source of flow is ground truth."""
-    return "(true)" in flow
 
 
 def by_flow(result: Mapping[str, Any], key: str = "totals") -> list[tuple[str, list[Any]]]:
@@ -213,84 +209,75 @@ def number(value: float | None, digits: int = 3) -> str:
 # -- tables ---------------------------------------------------------------------------------------
 
 
-def _cells(
-    rows: Sequence[Mapping[str, Any]], columns: Sequence[Column]
-) -> list[list[tuple[str, str, bool]]]:
-    """(text, reason why it is missing, whether it is the best of its column and flow)."""
-    best: dict[tuple[str, str], float] = {}
-    for row in rows:
-        for key, _, _ in columns:
-            value = row.get(key)
-            place = key, row.get("sequence", "") + row["flow_source"]
-            if value is not None and _counts(row, key):
-                best[place] = min(best.get(place, math.inf), value)
-    lines = []
-    for row in rows:
-        line = []
-        for key, _, factor in columns:
-            value = row.get(key)
-            text = MISSING if value is None else number(factor * value)
-            wins = (
-                len(rows) > 1
-                and value is not None
-                and _counts(row, key)
-                and value == best[key, row.get("sequence", "") + row["flow_source"]]
-            )
-            line.append((text, str(row.get("reasons", {}).get(key, "")), wins))
-        lines.append(line)
-    return lines
+@dataclass(frozen=True, eq=False)
+class Table:
+    """Rows under the names that people read.
+
+    Args:
+        frame: texts of ``named`` first, then numbers, NaN where there is none.
+        named: how many columns are texts.
+        reasons: why numbers are missing.
+        ranked: whether the best number of a column is marked.
+    """
+
+    frame: pd.DataFrame
+    named: int
+    reasons: list[str]
+    ranked: bool = True
+
+    def html(self) -> str:
+        """A table element; every text is escaped."""
+        texts, labels = self.frame.columns[: self.named], self.frame.columns[self.named :]
+        style = self.frame.style.format(number, subset=labels).format(escape="html", subset=texts)
+        style = style.format_index(escape="html", axis="columns").hide(axis="index")
+        if self.ranked and len(self.frame) > 1:
+            merits = [label for label in labels if label not in NO_MERIT]
+            style = style.highlight_min(subset=merits, props="font-weight: 700; color: #0072b2")
+        return style.set_properties(subset=texts, **{"text-align": "left"}).to_html()
+
+    def markdown(self) -> str:
+        """The table in Markdown."""
+        lines = [[str(label) for label in self.frame.columns]]
+        lines.append(["---"] * self.named + ["---:"] * (len(lines[0]) - self.named))
+        for row in self.frame.itertuples(index=False):
+            lines.append([*map(str, row[: self.named]), *map(number, row[self.named :])])
+        cells = ([text.replace("|", "\\|") for text in line] for line in lines)
+        return "".join("| " + " | ".join(line) + " |\n" for line in cells)
 
 
-def _counts(row: Mapping[str, Any], key: str) -> bool:
-    """Whether a value is a merit: not the time of doing nothing, nor what is no error at all."""
-    idle = "ms" in key and row["method"] == "identity"
-    return not (idle or key in MORE_IS_NO_MERIT)
-
-
-def html_table(
+def make_table(
     rows: Sequence[Mapping[str, Any]],
     columns: Sequence[Column],
     named: Sequence[str] = ("method",),
-) -> dict[str, Any]:
-    """Header, lines of (names, cells) and the reasons of missing values, for the template."""
-    cells = _cells(rows, columns)
-    lines = [([str(row[n]) for n in named], line) for row, line in zip(rows, cells, strict=True)]
+    ranked: bool = True,
+) -> Table:
+    """Table of rows of ``results.json``."""
+    texts = {name.replace("_", " "): [str(row[name]) for row in rows] for name in named}
+    numbers = {
+        label: [math.nan if row.get(key) is None else factor * row[key] for row in rows]
+        for key, label, factor in columns
+    }
     reasons = dict.fromkeys(
         f"{row['method']}: {label}: {row['reasons'][key]}"
         for row in rows
         for key, label, _ in columns
         if row.get(key) is None and key in row.get("reasons", {})
     )
-    labels = [label for _, label, _ in columns]
-    return {"named": list(named), "columns": labels, "lines": lines, "reasons": list(reasons)}
+    return Table(pd.DataFrame(texts | numbers), len(named), list(reasons), ranked)
 
 
-def _protocol_tables(result: Mapping[str, Any]) -> list[tuple[str, dict[str, Any]]]:
+def _protocol_tables(result: Mapping[str, Any]) -> list[tuple[str, Table]]:
     """Measured here, and what others published."""
     protocol = result.get("protocol")
     if not protocol:
         return []
     columns = [(m["key"], f"{m['label']} [{m['unit']}]", 1.0) for m in protocol["metrics"]]
-    mine = [*protocol["table"]]
-    measured = html_table(mine, [*columns, ("pairs", "pairs", 1.0)], ("method", "flow_source"))
-    others = [{**line, "method": line["name"], "flow_source": ""} for line in protocol["published"]]
-    published = html_table(others, columns, ("name", "inputs", "source", "note"))
-    published["lines"] = [
-        (names, [(text, reason, False) for text, reason, _ in line])
-        for names, line in published["lines"]
+    here = [*columns, ("pairs", "pairs", 1.0)]
+    others = ("name", "inputs", "source", "note")
+    return [
+        ("Measured here", make_table(protocol["table"], here, ("method", "flow_source"))),
+        ("Published by others", make_table(protocol["published"], columns, others, ranked=False)),
     ]
-    return [("Measured here", measured), ("Published by others", published)]
-
-
-def _markdown_table(table: Mapping[str, Any]) -> str:
-    def line(items: Sequence[str]) -> str:
-        return "| " + " | ".join(item.replace("|", "\\|") for item in items) + " |\n"
-
-    text = line([*table["named"], *table["columns"]])
-    text += "|" + "---|" * len(table["named"]) + "---:|" * len(table["columns"]) + "\n"
-    for names, cells in table["lines"]:
-        text += line([*names, *(f"**{t}**" if best else t for t, _, best in cells)])
-    return text
 
 
 def _markdown(result: Mapping[str, Any]) -> str:
@@ -298,7 +285,7 @@ def _markdown(result: Mapping[str, Any]) -> str:
     parts = ["# Comparison of methods\n", headline(result) + "\n"]
     for flow, rows in by_flow(result):
         oracle = " (an oracle: ground truth)" if is_oracle(flow) else ""
-        parts += [f"## {flow} flow{oracle}\n", _markdown_table(html_table(rows, RESULT_COLUMNS))]
+        parts += [f"## {flow} flow{oracle}\n", make_table(rows, RESULT_COLUMNS).markdown()]
     parts.append("## Worst pairs\n")
     for entry in sorted(result["worst_pairs"], key=lambda e: is_oracle(e["flow_source"])):
         error = number(entry["epe_l2_px"])
@@ -310,7 +297,7 @@ def _markdown(result: Mapping[str, Any]) -> str:
     for name, table in _protocol_tables(result):
         title = result["protocol"]["title"]
         note = result["protocol"]["note"]
-        parts += [f"## {name}: {title}\n", f"{note}\n" if note else "", _markdown_table(table)]
+        parts += [f"## {name}: {title}\n", f"{note}\n" if note else "", table.markdown()]
     notes = [f"- not run: {name}: {reason}" for name, reason in result["missing"].items()]
     for sequence in result["sequences"]:
         notes += [f"- {sequence['name']}: {warning}" for warning in sequence["warnings"]]
@@ -349,26 +336,12 @@ def _gallery(folder: Path, result: Mapping[str, Any]) -> list[tuple[str, list[di
 
 
 def _provenance(result: Mapping[str, Any]) -> list[tuple[str, str]]:
-    def flat(value: Any) -> str:
-        if isinstance(value, Mapping):
-            return ", ".join(f"{key} {flat(item)}" for key, item in value.items())
-        if isinstance(value, (list, tuple)):
-            return ", ".join(map(flat, value))
-        return str(value)
-
-    names = (
-        "command",
-        "versions",
-        "machine",
-        "weights",
-        "options",
-        "timing",
-        "started",
-        "finished",
-    )
-    return [(name, flat(result[name])) for name in names if result.get(name)]
+    """What the comparison was made of and when, name and text."""
+    names = ("command", "versions", "machine", "weights", "options", "timing")
+    found = [(name, result[name]) for name in (*names, "started", "finished") if result[name]]
+    return [(name, v if isinstance(v, str) else json.dumps(v)) for name, v in found]
 
 
-def _json(chart: Any) -> str:
+def _json(charts: Sequence[Figure]) -> list[str]:
     """JSON that may stand inside of a script element."""
-    return json.dumps(chart, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
+    return [chart.to_json().replace("<", "\\u003c") for chart in charts]

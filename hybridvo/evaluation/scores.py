@@ -9,6 +9,7 @@ with the motion it carries, which is none, in every mean and median.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -49,6 +50,26 @@ SCALE_FACTOR = 3.0
 """Factor beyond which ground truth and all estimates disagree about the unit."""
 SCALE_SPREAD = 1.5
 """Factor within which the estimates must agree about that."""
+FACTORS: Mapping[str, tuple[str, str, tuple[float, ...]]] = {
+    "dynamic_fraction": (
+        "share of pixels that move by themselves",
+        "",
+        (0.0, 0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 1.0),
+    ),
+    "flow_magnitude_px": (
+        "median length of the true ego flow",
+        "px",
+        (0.0, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, math.inf),
+    ),
+    "rotation_deg": ("true rotation", "deg", (0.0, 0.1, 0.3, 1.0, 3.0, 10.0, 180.0)),
+    "translation_m": ("true translation", "m", (0.0, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, math.inf)),
+    "depth_spread": (
+        "90th over 10th percentile of the depth",
+        "",
+        (1.0, 1.5, 2.0, 4.0, 8.0, 16.0, math.inf),
+    ),
+}
+"""Column of ``pairs.csv`` -> label, unit, edges of the bins (a bin holds its lower edge)."""
 
 
 def failure_rate(pairs: pd.DataFrame) -> dict[str, Any]:
@@ -184,3 +205,50 @@ def scale_warning(rows: Iterable[Mapping[str, Any]]) -> list[str]:
         f"the unit of the ground truth or of the depth is wrong, and so are the errors in metres "
         f"and pixels"
     ]
+
+
+def breakdown(pairs: pd.DataFrame) -> dict[str, Any]:
+    """Errors and failure rates by factor.
+
+    Args:
+        pairs: table of all pairs and methods.
+
+    Returns:
+        ``failure_px``, ``confidence``; ``factors``: ``name``, ``label``, ``unit``, ``pairs`` (that
+        know it); ``cells``: for each method, flow source, factor and bin that holds a pair:
+        ``low``, ``high`` (None where open), failure rate with interval and EPE quartiles;
+        ``failure_rates``: one for each method and flow source.
+    """
+    cells = []
+    for name, (_, _, edges) in FACTORS.items():
+        values = pairs[name].clip(upper=edges[-1] * (1 - 1e-12))  # the last bin holds its end
+        bins = pd.cut(values, edges, right=False, labels=False)
+        for key, group in pairs.groupby(["method", "flow_source", bins], sort=False):
+            method, flow, k = key
+            low, high = edges[int(k)], edges[int(k) + 1]
+            quartiles = group["epe_l2_px"].quantile([0.25, 0.5, 0.75])
+            named = dict(method=method, flow_source=flow, factor=name, bin=int(k))
+            limits = dict(low=low, high=None if math.isinf(high) else high)
+            middle = ("epe_l2_px_q25", "epe_l2_px_median", "epe_l2_px_q75")
+            epe = dict(zip(middle, map(known_number, quartiles), strict=True))
+            cells.append({**named, **limits, **failure_rate(group), **epe})
+    rates = [
+        {"method": method, "flow_source": flow, **failure_rate(group)}
+        for (method, flow), group in pairs.groupby(["method", "flow_source"], sort=False)
+    ]
+    known = pairs.drop_duplicates(["sequence", "index"])
+    return {
+        "failure_px": FAILURE_PX,
+        "confidence": CONFIDENCE,
+        "factors": [
+            {"name": name, "label": label, "unit": unit, "pairs": int(known[name].notna().sum())}
+            for name, (label, unit, _) in FACTORS.items()
+        ],
+        "cells": cells,
+        "failure_rates": rates,
+    }
+
+
+def known_number(value: float) -> float | None:
+    """The number, None for NaN."""
+    return None if math.isnan(value) else float(value)

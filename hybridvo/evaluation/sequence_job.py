@@ -12,10 +12,9 @@ import pandas as pd
 
 from hybridvo.data.sequence import Sequence, open_sequence
 from hybridvo.errors import InputError
-from hybridvo.evaluation.breakdown import FACTORS
 from hybridvo.evaluation.pair_errors import pair_errors, pair_facts
 from hybridvo.evaluation.protocols import same_intrinsics
-from hybridvo.evaluation.scores import scale_warning, sequence_row
+from hybridvo.evaluation.scores import FACTORS, scale_warning, sequence_row
 from hybridvo.evaluation.sources import SharedFlow, true_flow
 from hybridvo.geometry import invert, pose_matrix
 from hybridvo.odometry import Odometry

@@ -4,13 +4,14 @@ import csv
 import json
 import shutil
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
+import cv2
 import filelock
 import numpy as np
 import pytest
 
+from hybridvo.cli import main
 from hybridvo.data.sequence import open_sequence
 from hybridvo.errors import InputError, LockedError
 from hybridvo.evaluation.comparison import WRITTEN, ComparisonOptions, compare
@@ -21,7 +22,6 @@ from hybridvo.pipeline import METHODS, Models, weights_hash
 from hybridvo.synthetic.render import make_scene, write_sintel
 from hybridvo.trajectory import read_trajectory
 from hybridvo.types import RelativePose
-from tests.scripts import load_script
 
 ROWS = (  # what other programs rely on
     *("sequence", "method", "flow_source", "depth_source", "pairs", "failed", "r_err_deg", "t_err"),
@@ -34,11 +34,6 @@ PAIRS = (
     *("epe_l2_px", "rot_err_deg", "trans_err", "ms"),
 )
 FAST = ("pnp-ransac", "identity")
-
-
-@pytest.fixture(scope="module")
-def tool() -> ModuleType:
-    return load_script("tools/compare_methods.py")
 
 
 @pytest.fixture(scope="module")
@@ -74,11 +69,11 @@ def outcome(out: Path) -> tuple[Any, Any]:
     )  # fmt: skip
 
 
-def test_results_hold_what_the_interface_promises(tool, tiny, tmp_path, capsys) -> None:
+def test_results_hold_what_the_interface_promises(tiny, tmp_path, capsys) -> None:
     out = tmp_path / "out"
     methods = "refine,pnp-ransac,identity"
-    arguments = ["--sequence", str(tiny), "--out", str(out), "--methods", methods, "-q"]
-    assert tool.main(arguments) == 0
+    arguments = ["compare", "--sequence", str(tiny), "--out", str(out), "--methods", methods, "-q"]
+    assert main(arguments) == 0
     assert capsys.readouterr().out.splitlines() == [str(out / name) for name in WRITTEN]
     result = json.loads((out / "results.json").read_text())
     assert set(result) >= {"command", "versions", "machine", "rows"}
@@ -109,7 +104,8 @@ def test_results_hold_what_the_interface_promises(tool, tiny, tmp_path, capsys) 
         assert float(line["epe_l2_px"]) == row["epe_l2_px"]
     assert not (out / "parts").exists()
     assert all((out / entry["path"]).exists() for entry in result["trajectories"])
-    assert all((out / entry["picture"]).exists() for entry in result["worst_pairs"])
+    images = {e["method"]: cv2.imread(str(out / e["picture"])) for e in result["worst_pairs"]}
+    assert images["refine"].shape[1] > images["identity"].shape[1]  # with the pixels' weights
 
 
 @pytest.mark.parametrize("method", ["refine", "pnp-ransac-tuned"])
@@ -213,9 +209,9 @@ def test_refused_folders(tiny: Path, tmp_path: Path) -> None:
         (["--protocol", "paper"], "tiny"),
     ],
 )
-def test_bad_options(tool, tiny, tmp_path, arguments, field, capsys) -> None:
+def test_bad_options(tiny, tmp_path, arguments, field, capsys) -> None:
     given = ["--sequence", str(tiny), "--out", str(tmp_path / "out"), "-q", "--methods", "identity"]
-    assert tool.main([*given, *arguments]) == 2
+    assert main(["compare", *given, *arguments]) == 2
     assert field in capsys.readouterr().err
     assert not (tmp_path / "out" / "results.json").exists()
 

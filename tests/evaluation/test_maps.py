@@ -3,13 +3,13 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
 
 import cv2
 import numpy as np
 import pytest
 import torch
 
+from hybridvo.cli import main
 from hybridvo.errors import InputError
 from hybridvo.evaluation.drawing import draw, networks, saliencies, start_of
 from hybridvo.evaluation.maps import (
@@ -24,19 +24,13 @@ from hybridvo.evaluation.maps import (
     uncertainty_maps,
 )
 from hybridvo.evaluation.pair_errors import dynamic_fraction, pair_errors
-from hybridvo.evaluation.panels import FlowPanel, ImagePanel, ScalarPanel, maps_png
+from hybridvo.evaluation.plots import FlowPanel, ImagePanel, ScalarPanel, maps_png
 from hybridvo.geometry import invert, se3_exp
 from hybridvo.network.inputs import assemble_inputs
 from hybridvo.network.pwvo import NetworkOptions, build_network
 from hybridvo.network.weights import save_weights
 from hybridvo.synthetic.render import SyntheticSequence, make_scene, write_sintel
 from hybridvo.types import FramePair, PixelwisePrediction
-from tests.scripts import load_script
-
-
-@pytest.fixture(scope="module")
-def tool() -> ModuleType:
-    return load_script("tools/visualize.py")
 
 
 @pytest.fixture(scope="module")
@@ -236,14 +230,14 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-def test_the_tool_draws_a_pair(tool, folder: Path, tmp_path: Path, capsys) -> None:
+def test_the_tool_draws_a_pair(folder: Path, tmp_path: Path, capsys) -> None:
     sequence = str(folder / "training" / "clean" / "tiny")
     out = tmp_path / "new" / "pair.png"
     arguments = ["--sequence", sequence, "--pair", "1", "--flow", "dis", "--steps", "4"]
     arguments += ["--method", "refine"]
     for kind in ("pwvo", "vonet"):
         arguments += ["--weights", str(folder / f"{kind}.safetensors")]
-    assert tool.main([*arguments, "--out", str(out)]) == 0
+    assert main(["show", *arguments, "--out", str(out)]) == 0
     assert capsys.readouterr().out.split() == [str(out), str(out.with_suffix(".json"))]
     # image, three flows, error, weights; four maps and two saliencies of pwvo, two of vonet
     assert cv2.imread(str(out)).shape[0] > 1500
@@ -255,7 +249,7 @@ def test_the_tool_draws_a_pair(tool, folder: Path, tmp_path: Path, capsys) -> No
             assert values[f"{kind}: part of the {what} that the saliency misses"] < 0.15
     assert 0 < values["moving share, true flow and motion"] < 1
     before = out.read_bytes()
-    assert tool.main([*arguments, "--out", str(out)]) == 2
+    assert main(["show", *arguments, "--out", str(out)]) == 2
     assert "pass --overwrite" in capsys.readouterr().err
     assert out.read_bytes() == before
 
@@ -270,15 +264,15 @@ def test_the_tool_draws_a_pair(tool, folder: Path, tmp_path: Path, capsys) -> No
         (["--pair", "0", "--method", "refin"], "refine"),
     ],
 )
-def test_bad_options(tool, folder: Path, tmp_path: Path, options, field, capsys) -> None:
+def test_bad_options(folder: Path, tmp_path: Path, options, field, capsys) -> None:
     sequence = str(folder / "training" / "clean" / "tiny")
     out = tmp_path / "out.png"
-    assert tool.main(["--sequence", sequence, "--out", str(out), *options]) == 2
+    assert main(["show", "--sequence", sequence, "--out", str(out), *options]) == 2
     assert field in capsys.readouterr().err
     assert not out.exists()
 
 
-def test_networks_that_predict_no_motion_are_refused(tool, tmp_path: Path) -> None:
+def test_networks_that_predict_no_motion_are_refused(tmp_path: Path) -> None:
     from hybridvo.network.selector_net import SelectorNetwork, SelectorNetworkOptions
 
     options = SelectorNetworkOptions()

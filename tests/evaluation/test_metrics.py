@@ -9,14 +9,15 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from hybridvo.errors import FormatError, InputError
+from hybridvo.evaluation.drift import kitti_drift
 from hybridvo.evaluation.metrics import (
+    associate,
+    ate,
     evaluate,
     evaluate_files,
-    kitti_drift,
-    nees,
+    rpe,
 )
-from hybridvo.evaluation.trajectory_errors import associate, ate, rpe
-from hybridvo.geometry import invert, make_transform, se3_exp, se3_log
+from hybridvo.geometry import make_transform, se3_exp
 from hybridvo.trajectory import Trajectory, read_trajectory, write_tum
 
 
@@ -122,7 +123,6 @@ def test_ate_by_hand():
     est = from_positions([[0, 0, 3], [1, 0, 3], [1, 1, 4]])
     report = evaluate(est, truth, alignment="none")
     assert report["ate_rmse"] == pytest.approx(np.sqrt((9 + 9 + 16) / 3))
-    assert report["ate_max"] == pytest.approx(4)
     assert report["ate_rmse_unaligned"] == report["ate_rmse"]
     assert ate(est, truth, "origin").rmse == pytest.approx(np.sqrt(1 / 3))
 
@@ -320,16 +320,6 @@ def test_drift_by_hand():
     assert both["translation"] == pytest.approx((0.024 + 0.022) / 2)
 
 
-def test_drift_of_rotation_by_hand():
-    T_true = from_positions([[0, 0, k] for k in range(13)]).T_world_cam
-    T_est = T_true.copy()
-    for k in range(13):
-        T_est[k, :3, :3] = Rotation.from_euler("z", 0.5 * k, degrees=True).as_matrix()
-    drift = kitti_drift(T_est, T_true, lengths=[10])
-    assert drift["rotation_deg_per_m"] == pytest.approx(11 * 0.5 / 10)
-    assert drift["translation"] == pytest.approx(0, abs=1e-15)
-
-
 def test_drift_against_a_plain_loop(rng):
     truth = random_trajectory(rng, 120)
     est = perturbed(truth, rng)
@@ -350,17 +340,6 @@ def test_drift_against_a_plain_loop(rng):
     drift = kitti_drift(est.T_world_cam, truth.T_world_cam, lengths=lengths)
     assert drift["translation"] == pytest.approx(np.mean(translations), rel=1e-9)
     assert drift["rotation_deg_per_m"] == pytest.approx(np.mean(rotations), rel=1e-9)
-
-
-def test_nees_of_drawn_motions_is_six(rng):
-    A = rng.standard_normal((6, 6)) * [1e-2, 1e-3, 1e-2, 1e-4, 1e-5, 1e-4]
-    covariance = A.T @ A + np.diag([1e-6] * 3 + [1e-10] * 3)
-    T = se3_exp(0.3 * rng.standard_normal(6))
-    deltas = rng.multivariate_normal(np.zeros(6), covariance, 2000, check_valid="ignore")
-    values = [nees(T, se3_exp(delta) @ T, covariance) for delta in deltas]
-    assert np.mean(values) == pytest.approx(6.0, abs=0.4)
-    delta = se3_log(se3_exp(deltas[0]) @ T @ invert(T))
-    assert values[0] == pytest.approx(delta @ np.linalg.solve(covariance, delta), rel=1e-6)
 
 
 def test_ate_reads_what_write_tum_wrote(tmp_path, rng):

@@ -139,28 +139,6 @@ def test_pair_errors_refuses_bad_input():
         pair_errors(np.eye(4), np.eye(4), depth[:5], CAMERA, CAMERA)
 
 
-def test_mean_pair_errors_by_hand():
-    pairs = [
-        {
-            "r_err_deg": 1.0,
-            "t_err": 0.1,
-            "epe": 2.0,
-            "epe_l2_px": 3.0,
-            "rot_err_deg": r,
-            "trans_err": t,
-        }
-        for r, t in ((1.0, 0.1), (2.0, 0.2), (9.0, 0.6))
-    ]
-    report = mean_pair_errors(pairs)
-    assert report["pairs"] == 3
-    assert report["rot_err_deg_mean"] == pytest.approx(4.0)
-    assert report["rot_err_deg_median"] == 2.0
-    assert report["trans_err_mean"] == pytest.approx(0.3)
-    assert report["trans_err_median"] == 0.2
-    assert report["epe_l2_px"] == 3.0
-    assert report["reasons"] == {}
-
-
 def test_dynamic_fraction_by_hand():
     depth = np.full(CAMERA.shape, 4.0)
     T = make_transform(np.eye(3), np.array([0.02, 0.0, 0.0]))

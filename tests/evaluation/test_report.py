@@ -12,11 +12,17 @@ import numpy as np
 import pytest
 
 from hybridvo.errors import FormatError, InputError
-from hybridvo.evaluation.breakdown import breakdown, worst_pairs
+from hybridvo.evaluation.charts import (
+    error_distribution,
+    factor_charts,
+    failure_chart,
+    path_charts,
+)
 from hybridvo.evaluation.protocols import protocol_summary, protocols
-from hybridvo.evaluation.report import headline, number, write_report
-from hybridvo.evaluation.scores import sequence_row, total_row
+from hybridvo.evaluation.report import headline, number, read_comparison, write_report
+from hybridvo.evaluation.scores import breakdown, sequence_row, total_row
 from hybridvo.evaluation.sequence_job import PAIR_COLUMNS, pair_table
+from hybridvo.evaluation.worst import worst_pairs
 from hybridvo.files import write_csv, write_json
 from hybridvo.geometry import se3_exp
 from hybridvo.trajectory import Trajectory, write_tum
@@ -104,30 +110,22 @@ def test_the_page_needs_no_other_file_and_runs_no_name(folder: Path) -> None:
     assert body.count("data:image/jpeg;base64,") == 6
 
 
-def charts(folder: Path) -> list[dict[str, Any]]:
-    write_report(folder)
-    page = (folder / "report.html").read_text()
-    found = re.findall(r'<script type="application/json">(.*?)</script>', page, re.DOTALL)
-    return [json.loads(text) for text in found]
-
-
-def test_charts_have_distinct_colours_one_scale_and_no_single_bins(folder: Path) -> None:
-    found = charts(folder)
-    titles = [chart["layout"]["xaxis"]["title"]["text"] for chart in found]
-    assert any("share of pixels" in title for title in titles)
-    assert not any("true rotation" in title for title in titles)  # one bin tells nothing
-    spread = [c for c in found if "EPE [px]" in c["layout"]["xaxis"]["title"]["text"]]
-    assert len(spread) == 2  # both flows side by side
-    assert spread[0]["layout"]["xaxis"]["range"] == spread[1]["layout"]["xaxis"]["range"]
-    colours = {trace["name"]: trace["line"]["color"] for trace in spread[0]["data"]}
-    assert set(colours) == set(ERRORS) and len(set(colours.values())) == 3
-    curve = {trace["name"]: trace for trace in spread[0]["data"]}["pnp-ransac"]
-    assert curve["y"][-1] == 100 and curve["x"] == sorted(curve["x"])
-    above = next(c for c in found if "from above" in c["layout"]["title"]["text"])
-    gt, *paths = above["data"]
-    assert gt["name"] == "ground truth" and len(paths) == 3
-    np.testing.assert_allclose(paths[0]["x"], gt["x"], atol=1e-4)  # aligned: the same path
-    assert [c["data"][0]["type"] for c in found].count("scatter3d") == 1
+def test_charts_show_every_method_and_no_single_bins(folder: Path) -> None:
+    result, pairs = read_comparison(folder)
+    methods = list(ERRORS)
+    (spread,) = error_distribution(pairs, methods)
+    assert {trace.name for trace in spread.data} == set(ERRORS) and len(spread.data) == 6
+    assert len({trace.line.color for trace in spread.data}) == 3
+    curve = next(trace for trace in spread.data if trace.name == "pnp-ransac")
+    assert curve.y[-1] == 100 and list(curve.x) == sorted(curve.x)
+    (factor,) = factor_charts(result["breakdown"], methods)  # the rotation has one bin
+    assert "share of pixels" in factor.layout.xaxis.title.text
+    assert len(failure_chart(result["breakdown"], methods)[0].data) == 6
+    above, errors, space = path_charts(folder, result, pairs, NAME, methods)
+    gt, *paths = above.data
+    assert gt.name == "ground truth" and len(paths) == len(errors.data) == 3
+    np.testing.assert_allclose(paths[0].x, gt.x, atol=1e-6)  # aligned: the same path
+    assert {trace.type for trace in space.data} == {"scatter3d"}
 
 
 def test_nothing_scored_and_foreign_folders(folder: Path, tmp_path: Path) -> None:

@@ -9,9 +9,15 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from hybridvo.evaluation.breakdown import breakdown, worst_pairs
-from hybridvo.evaluation.scores import failure_rate, scale_warning, sequence_row, total_row
+from hybridvo.evaluation.scores import (
+    breakdown,
+    failure_rate,
+    scale_warning,
+    sequence_row,
+    total_row,
+)
 from hybridvo.evaluation.sequence_job import pair_table
+from hybridvo.evaluation.worst import worst_pairs
 from hybridvo.geometry import se3_exp
 from hybridvo.trajectory import Trajectory
 

@@ -57,8 +57,8 @@ LAZY = {"network/pwvo.py": {"network/weights.py", "learned.py"}}
 """Imports inside a function that lead back: ``PWVO.from_pretrained`` and ``predict``."""
 
 ONLY_IN = {
-    "evo": {"trajectory.py", "evaluation/metrics.py", "evaluation/trajectory_errors.py"},
-    "matplotlib": {"evaluation/plots.py", "evaluation/panels.py", "evaluation/maps.py"},
+    "evo": {"trajectory.py", "evaluation/metrics.py"},
+    "matplotlib": {"evaluation/plots.py"},
     "plotly": {"evaluation/"},
     "pandas": {"evaluation/"},
     "rerun": {"commands/recording.py"},
