@@ -161,7 +161,6 @@ def pair_panels(
 def networks(files: Iterable[str | Path] = ()) -> list[tuple[str, Any]]:
     """(name, network) of the given files, or of all pretrained ones that predict a motion."""
     from hybridvo.network.models import load_weights
-    from hybridvo.network.options import KINDS
     from hybridvo.network.weights import pretrained, pretrained_names
 
     found = []
