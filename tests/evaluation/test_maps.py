@@ -11,7 +11,7 @@ import torch
 
 from hybridvo.cli import main
 from hybridvo.errors import InputError
-from hybridvo.evaluation.drawing import draw, networks, saliencies, start_of
+from hybridvo.evaluation.drawing import draw, networks, saliencies
 from hybridvo.evaluation.maps import (
     colour_wheel,
     error_map,
@@ -28,6 +28,7 @@ from hybridvo.evaluation.plots import FlowPanel, ImagePanel, ScalarPanel, maps_p
 from hybridvo.geometry import invert, se3_exp
 from hybridvo.network.inputs import assemble_inputs
 from hybridvo.network.pwvo import NetworkOptions, build_network
+from hybridvo.network.selection import select_motion
 from hybridvo.network.weights import save_weights
 from hybridvo.synthetic.render import SyntheticSequence, make_scene, write_sintel
 from hybridvo.types import FramePair, PixelwisePrediction
@@ -178,7 +179,12 @@ def test_the_saliency_is_complete(known, options: NetworkOptions) -> None:
     torch.manual_seed(0)
     network = build_network(options).eval()
     inputs = assemble_inputs(pair, (64, 128))
-    found = saliencies(network, inputs, start_of(network, inputs), 16)
+    start = None
+    if options.passes > 1:
+        # not the fit: it leaves so little that the path needs 256 steps for 7 % (measured)
+        with torch.no_grad():
+            start = select_motion(network(inputs))
+    found = saliencies(network, inputs, start, 16)
     assert list(found) == ["rotation", "translation"]
     for saliency in found.values():
         assert saliency.magnitude.shape == (64, 128)
