@@ -75,7 +75,7 @@ class Context:
 
     def selector(self) -> Selector:
         """The learned selector."""
-        from hybridvo.network.scorer import NetworkScorer
+        from hybridvo.network.selector_net import NetworkScorer
 
         scorer = NetworkScorer(self.models.network("selector"), self.models.device)
         return MaskSelector(scorer, self.options)
@@ -142,7 +142,7 @@ def pwvo_refine(pair: FramePair, ctx: Context) -> RelativePose:
 
     The same lines serve batches, with gradients to flow, depth, weights and maps.
     """
-    from hybridvo.network.models import plain_torch
+    from hybridvo.network.inference import plain_torch
     from hybridvo.network.selection import select
     from hybridvo.refinement.torch_backend import refine_batch
 

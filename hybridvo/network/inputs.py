@@ -1,6 +1,6 @@
 """Frame pairs -> what the networks read, assembled in one place.
 
-The pictures are brought to the network's size by taking the nearest pixel, for flow and depth
+The images are brought to the network's size by taking the nearest pixel, for flow and depth
 alike. An average would blend a mover with what is behind it into flows and depths that belong to
 neither; the nearest pixel keeps flow, depth and ray of one and the same measured point together.
 The ray is that of the pixel that was taken, so nothing is rounded in what the network sees.
@@ -14,16 +14,8 @@ from dataclasses import dataclass, fields
 import torch
 
 from hybridvo.errors import InputError
+from hybridvo.refinement.batch import checked_batch
 from hybridvo.types import FramePair, PairBatch
-
-__all__ = [
-    "FLOW_SCALE_PX",
-    "NETWORK_SIZE",
-    "NetworkInputs",
-    "assemble_aligned",
-    "assemble_inputs",
-    "subsampled_intrinsics",
-]
 
 FLOW_SCALE_PX = 200.0
 """Flow is divided by this before it enters a network."""
@@ -31,7 +23,7 @@ FLOW_SCALE_PX = 200.0
 NETWORK_SIZE = (128, 256)
 """Height and width of the paper's inputs."""
 
-NEAREST_DEPTH = 1e-2
+MIN_DEPTH = 1e-2
 """Depths below one centimetre are taken for damage: invalid."""
 
 
@@ -101,9 +93,16 @@ class NetworkInputs:
 
 def subsampled_intrinsics(K: torch.Tensor, stride: int) -> torch.Tensor:
     """(B, 3, 3) intrinsics of the pixels n // 2, n // 2 + n, .. of each axis, n = ``stride``."""
+    return _scaled_intrinsics(K, 1 / stride, -(stride // 2) / stride)
+
+
+def _scaled_intrinsics(
+    K: torch.Tensor, scale: float | torch.Tensor, offset: float | torch.Tensor
+) -> torch.Tensor:
+    """(B, 3, 3) intrinsics after pixel coordinates x became scale * x + offset, of both axes."""
     out = K.clone()
-    out[:, :2, :2] = K[:, :2, :2] / stride
-    out[:, :2, 2] = (K[:, :2, 2] - stride // 2) / stride
+    out[:, 0, 0], out[:, 1, 1] = (K.diagonal(dim1=1, dim2=2)[:, :2] * scale).unbind(1)
+    out[:, :2, 2] = scale * K[:, :2, 2] + offset
     return out
 
 
@@ -125,14 +124,17 @@ def assemble_inputs(
     Raises:
         InputError: another type, shapes that do not fit each other, or a size that is not positive.
     """
-    size = _check_size(size)
-    if isinstance(pair, FramePair):
-        return _from_batch(PairBatch.from_pairs([pair]), size)
+    if not (
+        isinstance(size, tuple) and len(size) == 2 and all(type(n) is int and n > 0 for n in size)
+    ):
+        raise InputError(
+            f"assemble_inputs: expected size as two positive integers (height, width), got {size}."
+        )
     if isinstance(pair, PairBatch):
-        _check_batch(pair)
-        return _from_batch(pair, size)
-    if isinstance(pair, Sequence) and pair and all(isinstance(p, FramePair) for p in pair):
-        parts = [_from_batch(PairBatch.from_pairs([p]), size) for p in pair]
+        return _from_batch(checked_batch(pair, where="assemble_inputs")[0], size)
+    pairs = [pair] if isinstance(pair, FramePair) else pair
+    if isinstance(pairs, Sequence) and pairs and all(isinstance(p, FramePair) for p in pairs):
+        parts = [_from_batch(PairBatch.from_pairs([p]), size) for p in pairs]
         return NetworkInputs(
             *(torch.cat([getattr(p, f.name) for p in parts]) for f in fields(NetworkInputs))
         )
@@ -168,39 +170,53 @@ def assemble_aligned(
     """
     K_curr = K_prev if K_curr is None else K_curr
     batch = PairBatch(flow, depth_prev, K_prev, K_curr, depth_curr=depth_curr, valid=valid)
-    _check_batch(batch)
-    height, width = flow.shape[1:3]
-    rows = torch.arange(height, device=flow.device)
-    cols = torch.arange(width, device=flow.device)
-    return _finish(flow, depth_prev, depth_curr, valid, K_prev, K_curr, K_prev, rows, cols)
+    batch, _ = checked_batch(batch, where="assemble_aligned")
+    rows, cols = (torch.arange(n, device=flow.device) for n in flow.shape[1:3])
+    return _normalize(batch, _rays(rows, cols, batch.K_prev))
 
 
 def _from_batch(batch: PairBatch, size: tuple[int, int]) -> NetworkInputs:
     """Resize, bring the current depth onto the previous grid, normalise."""
     height, width = batch.flow.shape[1:3]
-    rows, row_scale = _nearest(height, size[0], batch.flow.device)
-    cols, col_scale = _nearest(width, size[1], batch.flow.device)
+    rows, cols = (
+        _nearest(native, target).to(batch.flow.device)
+        for native, target in ((height, size[0]), (width, size[1]))
+    )
 
     def pick(x: torch.Tensor) -> torch.Tensor:
         return x.index_select(1, rows).index_select(2, cols)
 
-    flow, depth_prev = pick(batch.flow), pick(batch.depth_prev)
-    depth_curr = torch.full_like(depth_prev, torch.nan)
+    flow = pick(batch.flow)
+    depth_curr = None
     if batch.depth_curr is not None:
         depth_curr = _sample_at_flow(batch.depth_curr, flow, rows, cols)
-    valid = None if batch.valid is None else pick(batch.valid)
-    scale = torch.tensor([col_scale, row_scale], dtype=flow.dtype, device=flow.device)
-    K_prev, K_curr = (_scale_intrinsics(K, scale) for K in (batch.K_prev, batch.K_curr))
-    return _finish(
-        flow * scale, depth_prev, depth_curr, valid, K_prev, K_curr, batch.K_prev, rows, cols
+    scale = flow.new_tensor([size[1] / width, size[0] / height])
+    # pixel centres lie at whole coordinates: c' = s (c + 0.5) - 0.5
+    K_prev, K_curr = (
+        _scaled_intrinsics(K, scale, 0.5 * scale - 0.5) for K in (batch.K_prev, batch.K_curr)
     )
+    resized = PairBatch(
+        flow * scale,
+        pick(batch.depth_prev),
+        K_prev,
+        K_curr,
+        depth_curr=depth_curr,
+        valid=None if batch.valid is None else pick(batch.valid),
+    )
+    return _normalize(resized, _rays(rows, cols, batch.K_prev))
 
 
-def _nearest(native: int, target: int, device: torch.device) -> tuple[torch.Tensor, float]:
-    """Native index of the pixel nearest to each target pixel's centre, and the scale."""
-    scale = target / native
-    index = ((torch.arange(target, dtype=torch.float64) + 0.5) / scale).floor().long()
-    return index.clamp(max=native - 1).to(device), scale
+def _rays(rows: torch.Tensor, cols: torch.Tensor, K: torch.Tensor) -> torch.Tensor:
+    """(B, 2, h, w) first two components of K^-1 x at rows (h,) and columns (w,) of pixels."""
+    v, u = torch.meshgrid(rows, cols, indexing="ij")
+    focal = K.diagonal(dim1=1, dim2=2)[:, :2, None, None]
+    return (torch.stack([u, v]).to(K.dtype) - K[:, :2, 2, None, None]) / focal
+
+
+def _nearest(native: int, target: int) -> torch.Tensor:
+    """Native index of the pixel nearest to each target pixel's centre."""
+    centre = (torch.arange(target, dtype=torch.float64) + 0.5) * native / target
+    return centre.floor().long().clamp(max=native - 1)
 
 
 def _sample_at_flow(
@@ -215,113 +231,41 @@ def _sample_at_flow(
         cols: (w,) native columns.
 
     Returns:
-        (B, h, w); NaN where x + F leaves the picture or the flow is not finite.
+        (B, h, w); NaN where x + F leaves the image or the flow is not finite.
     """
     height, width = depth_curr.shape[1:]
     u = cols.to(flow.dtype) + flow[..., 0]
     v = rows.to(flow.dtype)[:, None] + flow[..., 1]
     inside = (u > -0.5) & (u < width - 0.5) & (v > -0.5) & (v < height - 0.5)
     # Comparisons with NaN are false, so what is looked up is finite and inside.
-    col = torch.where(inside, u, torch.zeros_like(u)).round().long().clamp(0, width - 1)
-    row = torch.where(inside, v, torch.zeros_like(v)).round().long().clamp(0, height - 1)
+    col = torch.where(inside, u, 0.0).round().long().clamp(0, width - 1)
+    row = torch.where(inside, v, 0.0).round().long().clamp(0, height - 1)
     sampled = depth_curr.flatten(1).gather(1, (row * width + col).flatten(1)).view_as(u)
-    return torch.where(inside, sampled, torch.full_like(sampled, torch.nan))
+    return torch.where(inside, sampled, torch.nan)
 
 
-def _scale_intrinsics(K: torch.Tensor, scale: torch.Tensor) -> torch.Tensor:
-    """(B, 3, 3) intrinsics after resizing by (x, y) ``scale``: c' = s (c + 0.5) - 0.5."""
-    out = K.clone()
-    out[:, :2, :2] = K[:, :2, :2] * scale[:, None]
-    out[:, :2, 2] = scale * (K[:, :2, 2] + 0.5) - 0.5
-    return out
-
-
-def _finish(
-    flow: torch.Tensor,
-    depth_prev: torch.Tensor,
-    depth_curr: torch.Tensor,
-    valid: torch.Tensor | None,
-    K_prev: torch.Tensor,
-    K_curr: torch.Tensor,
-    K_pixels: torch.Tensor,
-    rows: torch.Tensor,
-    cols: torch.Tensor,
-) -> NetworkInputs:
-    """Mask, normalise and name the tensors; ``K_pixels`` belongs to the pixels (rows, cols)."""
+def _normalize(batch: PairBatch, rays: torch.Tensor) -> NetworkInputs:
+    """Inputs of a batch of the network's size, whose pixels have the rays (B, 2, h, w)."""
+    flow, prev, curr = batch.flow, batch.depth_prev, batch.depth_curr
+    if curr is None:
+        curr = torch.full_like(prev, torch.nan)
     flow_ok = torch.isfinite(flow).all(-1)
-    prev_ok = torch.isfinite(depth_prev) & (depth_prev >= NEAREST_DEPTH)
-    if valid is not None:
-        flow_ok, prev_ok = flow_ok & valid, prev_ok & valid
-    curr_ok = torch.isfinite(depth_curr) & (depth_curr >= NEAREST_DEPTH) & flow_ok
-
-    def keep(x: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
-        return torch.where(mask, x, torch.zeros_like(x))
-
-    def invert(x: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
-        return torch.where(mask, 1.0 / torch.where(mask, x, torch.ones_like(x)), 0.0)
-
-    shape = depth_prev.shape
-    fx, fy, cx, cy = (K_pixels[:, i, j, None, None] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    x = ((cols.to(flow.dtype) - cx) / fx).expand(shape)
-    y = ((rows.to(flow.dtype)[:, None] - cy) / fy).expand(shape)
+    prev_ok = torch.isfinite(prev) & (prev >= MIN_DEPTH)
+    if batch.valid is not None:
+        flow_ok, prev_ok = flow_ok & batch.valid, prev_ok & batch.valid
+    curr_ok = torch.isfinite(curr) & (curr >= MIN_DEPTH) & flow_ok
+    inverse = [
+        # no 1 / 0 in the gradient of what is not selected
+        torch.where(ok, 1.0 / torch.where(ok, depth, 1.0), 0.0)
+        for depth, ok in ((prev, prev_ok), (curr, curr_ok))
+    ]
     return NetworkInputs(
-        flow=keep(flow, flow_ok[..., None]).permute(0, 3, 1, 2) / FLOW_SCALE_PX,
-        inverse_depth=torch.stack(
-            [invert(depth_prev, prev_ok), invert(depth_curr, curr_ok)], dim=1
-        ),
-        rays=torch.stack([x, y], dim=1),
+        flow=torch.where(flow_ok[..., None], flow, 0.0).permute(0, 3, 1, 2) / FLOW_SCALE_PX,
+        inverse_depth=torch.stack(inverse, dim=1),
+        rays=rays,
         valid=flow_ok & prev_ok,
-        depth_prev=keep(depth_prev, prev_ok),
-        depth_curr=keep(depth_curr, curr_ok),
-        K_prev=K_prev,
-        K_curr=K_curr,
+        depth_prev=torch.where(prev_ok, prev, 0.0),
+        depth_curr=torch.where(curr_ok, curr, 0.0),
+        K_prev=batch.K_prev,
+        K_curr=batch.K_curr,
     )
-
-
-def _check_size(size: tuple[int, int]) -> tuple[int, int]:
-    try:
-        height, width = (int(s) for s in size)
-        exact = (height, width) == tuple(size)
-    except (TypeError, ValueError):
-        exact = False
-    if not exact or height < 1 or width < 1:
-        raise InputError(
-            f"assemble_inputs: expected size as two positive integers (height, width), got {size}."
-        )
-    return height, width
-
-
-def _check_batch(batch: PairBatch) -> None:
-    flow = batch.flow
-    if not isinstance(flow, torch.Tensor) or flow.ndim != 4 or flow.shape[3] != 2:
-        got = tuple(flow.shape) if isinstance(flow, torch.Tensor) else type(flow).__name__
-        raise InputError(f"PairBatch.flow: expected a tensor of shape (B, H, W, 2), got {got}.")
-    if not flow.is_floating_point() or 0 in flow.shape:
-        raise InputError(
-            f"PairBatch.flow: expected a non-empty floating-point tensor in pixels, got "
-            f"{flow.dtype} of shape {tuple(flow.shape)}."
-        )
-    image, matrix = tuple(flow.shape[:3]), (flow.shape[0], 3, 3)
-    expected = {
-        "depth_prev": image,
-        "depth_curr": image,
-        "valid": image,
-        "K_prev": matrix,
-        "K_curr": matrix,
-    }
-    for name, shape in expected.items():
-        value = getattr(batch, name)
-        if value is None and name in ("depth_curr", "valid"):
-            continue
-        if not isinstance(value, torch.Tensor) or tuple(value.shape) != shape:
-            found = tuple(value.shape) if isinstance(value, torch.Tensor) else type(value).__name__
-            raise InputError(
-                f"PairBatch.{name}: expected shape {shape} to match the flow, got {found}."
-            )
-        if name == "valid" and value.dtype != torch.bool:
-            raise InputError(f"PairBatch.valid: expected bool, got {value.dtype}.")
-        if name != "valid" and not value.is_floating_point():
-            raise InputError(
-                f"PairBatch.{name}: expected floating point, got {value.dtype}. "
-                f"Depth is in metres, intrinsics in pixels."
-            )

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import nn
 
+from hybridvo.network.inference import plain_torch
 from hybridvo.network.inputs import NetworkInputs, assemble_inputs
-from hybridvo.network.models import plain_torch
 from hybridvo.network.normalization import predict
 from hybridvo.network.selection import NetworkOutput, select_motion, select_pose
 from hybridvo.network.weighted_fit import fitted_motion, on_grid_of, pixel_weights

@@ -138,14 +138,16 @@ class BatchedPose:
 
 
 def checked_batch(
-    batch: PairBatch, weights: Any, use_depth_curr: bool
+    batch: PairBatch,
+    weights: Any = None,
+    use_depth_curr: bool = False,
+    where: str = "refine_batch",
 ) -> tuple[PairBatch, torch.Tensor | None]:
     """The batch and its weights in one floating type, on one device.
 
     Raises:
         InputError: what does not fit, named.
     """
-    where = "refine_batch"
     flow, depth = batch.flow, batch.depth_prev
     for name, value in (("flow", flow), ("depth_prev", depth)):
         if not isinstance(value, torch.Tensor) or not value.is_floating_point():

@@ -16,7 +16,8 @@ from hybridvo.geometry import pose_matrix, se3_exp
 from hybridvo.hypotheses import search
 from hybridvo.hypotheses.generate import fit_in_mask
 from hybridvo.hypotheses.selector import mask_weights, nearest_motion
-from hybridvo.network.selector_net import SelectorInputs, SelectorOutput, prior_information_of
+from hybridvo.network.selector_inputs import SelectorInputs, prior_information_of
+from hybridvo.network.selector_net import SelectorOutput
 from hybridvo.options import RefineOptions
 from hybridvo.refinement import kernels
 from hybridvo.synthetic.sensors import log_uniform

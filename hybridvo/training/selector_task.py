@@ -17,7 +17,8 @@ import torch
 import torch.nn.functional as F
 
 from hybridvo.errors import InputError
-from hybridvo.network.selector_net import SelectorInputs, SelectorNetwork, SelectorOutput
+from hybridvo.network.selector_inputs import SelectorInputs
+from hybridvo.network.selector_net import SelectorNetwork, SelectorOutput
 from hybridvo.training.options import SelectorOptions
 from hybridvo.training.rendered import MOVING, STATIC
 from hybridvo.training.selector_batches import (

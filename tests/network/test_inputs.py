@@ -260,7 +260,7 @@ def test_bad_arguments_are_refused():
         {"valid": depth},
         {"valid": depth[:, :2] > 0},
     ):
-        with pytest.raises(InputError, match="PairBatch"):
+        with pytest.raises(InputError, match="assemble_inputs: expected"):
             assemble_inputs(replace(good, **changes))
 
 

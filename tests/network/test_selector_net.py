@@ -11,9 +11,13 @@ import torch
 from hybridvo.geometry import se3_exp
 from hybridvo.hypotheses.generate import HypothesisSet, generate
 from hybridvo.hypotheses.selector import _searched
-from hybridvo.network import selector_net
-from hybridvo.network.scorer import selector_inputs
-from hybridvo.network.selector_net import SelectorInputs, SelectorNetwork
+from hybridvo.network.selector_inputs import (
+    SelectorInputs,
+    candidate_channels,
+    prior_information_of,
+    selector_inputs,
+)
+from hybridvo.network.selector_net import SelectorNetwork
 from hybridvo.options import Options
 from hybridvo.pipeline import refine
 from hybridvo.synthetic.scenarios import Scenario, make_pair
@@ -119,26 +123,26 @@ def test_what_was_expected_is_weighed_by_its_covariance() -> None:
         prior_information=torch.diag(1 / sigma**2)[None],
         pose=pose.expand(len(inputs.owner), 3, 4),
     )
-    _, scalars, _ = selector_net.candidate_channels(told, None)
+    _, scalars, _ = candidate_channels(told, None)
     # three of six: 1 / (1 + 3 / 6). First order leaves half of 0.02 rad x 0.4 m, 0.04 of 0.1 m:
     # 0.08 in the square, 0.006 here
     torch.testing.assert_close(scalars[0, 4], torch.tensor(2 / 3), atol=7e-3, rtol=0)
     assert scalars[0, 5] == 1
     far = replace(told, prior_information=1e12 * told.prior_information)
-    _, scalars, _ = selector_net.candidate_channels(far, None)
+    _, scalars, _ = candidate_channels(far, None)
     # a prior that is sure of itself says a bounded amount
     assert torch.isfinite(scalars).all() and scalars.abs().max() < 5
-    _, unknown, _ = selector_net.candidate_channels(inputs, None)
+    _, unknown, _ = candidate_channels(inputs, None)
     assert (unknown[:, 4:] == 0).all()
 
 
 def test_a_covariance_that_is_none_counts_as_unknown() -> None:
     inputs = inputs_of(1)
-    usual = selector_net.prior_information_of(inputs.depth, inputs.usable, None)
+    usual = prior_information_of(inputs.depth, inputs.usable, None)
     for broken in (torch.zeros(1, 6, 6), torch.full((1, 6, 6), torch.nan)):
-        told = selector_net.prior_information_of(inputs.depth, inputs.usable, broken)
+        told = prior_information_of(inputs.depth, inputs.usable, broken)
         torch.testing.assert_close(told, usual)
-    exact = selector_net.prior_information_of(
+    exact = prior_information_of(
         inputs.depth, inputs.usable, torch.diag(torch.tensor([4.0] * 3 + [0.25] * 3))[None]
     )
     torch.testing.assert_close(exact[0].diagonal(), torch.tensor([0.25] * 3 + [4.0] * 3))

@@ -1,0 +1,308 @@
+"""What the selector network sees: an image, and what each candidate motion leaves unexplained.
+
+Of every candidate the residuals of flow and second depth, measured against the noise that the
+candidate itself found, and the support it takes away from its rivals; beside them the image's flow,
+depth and rays, each over the pair's own scale.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from hybridvo.hypotheses import search
+from hybridvo.hypotheses.generate import GridMaps
+from hybridvo.hypotheses.selector import Candidates
+from hybridvo.types import MotionPrior
+
+REFERENCE_WIDTH = 1024.0
+"""px, width at which absolute residuals and noises are compared between images."""
+MIN_FLOW_NOISE = 0.01
+SUPPORT_CUTOFF_SQUARED = 9.0
+DEPTH_FLOOR = 0.003
+"""Spread of log depth that even exact depths have between neighbouring pixels."""
+USUAL_CHANGE = 0.01
+"""rad of the image by which a motion usually differs from the one before."""
+MAX_LOGIT = 6.0
+"""Largest logit of another network's static probability that is believed."""
+
+
+@dataclass(frozen=True, eq=False)
+class SelectorInputs:
+    """B images on their coarse grid (h, w) and N candidate motions of theirs.
+
+    Args:
+        ray: (B, 2, h, w) K^-1 x without the one.
+        depth: (B, h, w) metres.
+        target: (B, 2, h, w) px, x + flow.
+        flow_variance, depth_variance: (B, h, w) relative to the typical one.
+        usable: (B, h, w) bool.
+        log_depth_curr: (B, h, w) log metres of the second depth at the target; NaN where unknown.
+        K: (B, 4) fx, fy, cx, cy of the current camera, px.
+        image_width: (B,) px, of the whole image.
+        static: (B, h, w) logit of the probability to be static world that another network states.
+        has_static: (B,) bool, whether it was asked.
+        T_prior: (B, 3, 4) motion that is expected from those before.
+        prior_information: (B, 6, 6) inverse of the covariance of ``Exp(delta) T_prior``,
+            translation first.
+        has_prior: (B,) bool, whether it is known.
+        owner: (N,) int64, image of each candidate.
+        parent: (N,) int64, for refits: the motion of the search it came from; for those: itself.
+        pose: (N, 3, 4) T_curr_prev.
+        flow_noise: (N,) px. depth_noise: (N,) of log depth, both found with the candidate.
+    """
+
+    ray: torch.Tensor
+    depth: torch.Tensor
+    target: torch.Tensor
+    flow_variance: torch.Tensor
+    depth_variance: torch.Tensor
+    usable: torch.Tensor
+    log_depth_curr: torch.Tensor
+    static: torch.Tensor
+    has_static: torch.Tensor
+    K: torch.Tensor
+    image_width: torch.Tensor
+    T_prior: torch.Tensor
+    prior_information: torch.Tensor
+    has_prior: torch.Tensor
+    owner: torch.Tensor
+    parent: torch.Tensor
+    pose: torch.Tensor
+    flow_noise: torch.Tensor
+    depth_noise: torch.Tensor
+
+
+def selector_inputs(
+    maps: GridMaps,
+    candidates: Candidates,
+    part: slice,
+    prior: MotionPrior | None,
+    static: np.ndarray | None,
+    device: torch.device,
+) -> SelectorInputs:
+    """A batch of one image and a part of its candidates."""
+
+    def batch(x: Any) -> torch.Tensor:
+        return torch.as_tensor(np.ascontiguousarray(x), device=device)[None]
+
+    depth, usable = batch(maps.depth), batch(maps.usable)
+    expected = np.eye(4) if prior is None else prior.T_curr_prev
+    covariance = None if prior is None else batch(prior.covariance)
+    logit = torch.zeros_like(depth)
+    if static is not None:
+        logit = torch.logit(batch(static).to(torch.float32), eps=1e-4)
+    poses, facts = candidates.poses[part], candidates.facts[part]
+
+    def of(x: np.ndarray, dtype: torch.dtype) -> torch.Tensor:
+        return torch.as_tensor(x, dtype=dtype, device=device)
+
+    return SelectorInputs(
+        ray=batch(maps.ray),
+        depth=depth,
+        target=batch(maps.target),
+        flow_variance=batch(maps.flow_variance),
+        depth_variance=batch(maps.depth_variance),
+        usable=usable,
+        log_depth_curr=batch(maps.log_depth_curr),
+        static=logit,
+        has_static=torch.tensor([static is not None], device=device),
+        K=batch(maps.K),
+        image_width=torch.tensor([float(maps.width)], device=device),
+        T_prior=batch(expected[:3].astype(np.float32)),
+        prior_information=prior_information_of(depth, usable, covariance),
+        has_prior=torch.tensor([prior is not None], device=device),
+        owner=torch.zeros(len(poses), dtype=torch.int64, device=device),
+        parent=of(candidates.parents[part], torch.int64),
+        pose=of(poses, torch.float32),
+        flow_noise=of(facts[:, search.FLOW_NOISE], torch.float32),
+        depth_noise=of(facts[:, search.DEPTH_NOISE], torch.float32),
+    )
+
+
+def _squash(x: torch.Tensor) -> torch.Tensor:
+    """sign(x) log(1 + |x|)."""
+    return torch.copysign(torch.log1p(x.abs()), x)
+
+
+def candidate_channels(
+    inputs: SelectorInputs, first: tuple[SelectorInputs, torch.Tensor] | None
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """(channels (N, 8, h, w), scalars (N, 8), support (N, h, w)) of every candidate.
+
+    ``first``: inputs and support of the motions of the search, where these are refits of them.
+    """
+    own = inputs.owner
+    x, y = inputs.ray[own, 0], inputs.ray[own, 1]
+    z, usable = inputs.depth[own], inputs.usable[own]
+    fx, fy, cx, cy = (c[:, None, None] for c in inputs.K[own].unbind(1))
+    P = inputs.pose[:, :, :, None, None]
+    a, b, c = (z * (P[:, i, 0] * x + P[:, i, 1] * y + P[:, i, 2]) + P[:, i, 3] for i in range(3))
+    front = c > 1e-6
+    i = 1.0 / torch.where(front, c, torch.ones_like(c))
+    a, b = a * i, b * i
+    ru = inputs.target[own, 0] - (fx * a + cx)
+    rv = inputs.target[own, 1] - (fy * b + cy)
+    qu = fx * i * (a * P[:, 2, 3] - P[:, 0, 3])
+    qv = fy * i * (b * P[:, 2, 3] - P[:, 1, 3])
+    # whitened by the symmetric root of sf^2 v_f I + sd^2 v_d q q^T
+    sf = inputs.flow_noise.clamp(min=MIN_FLOW_NOISE)[:, None, None]
+    sd = inputs.depth_noise[:, None, None]
+    vd = sd * sd * inputs.depth_variance[own]
+    ip = 1.0 / (sf * sf * inputs.flow_variance[own])
+    g = vd * ip
+    root = torch.sqrt(1.0 + g * (qu * qu + qv * qv))
+    shrink = g / (root * (1.0 + root)) * (qu * ru + qv * rv)
+    scale = torch.sqrt(ip)
+    eu, ev = (ru - shrink * qu) * scale, (rv - shrink * qv) * scale
+    ok = usable & front
+    eu, ev = (torch.where(ok, e, torch.full_like(e, 1e3)).clamp(-1e3, 1e3) for e in (eu, ev))
+    d2 = eu * eu + ev * ev
+    support = torch.square(SUPPORT_CUTOFF_SQUARED / (SUPPORT_CUTOFF_SQUARED + d2)) * usable
+    wide = REFERENCE_WIDTH / inputs.image_width[own]
+    size = torch.sqrt(ru * ru + rv * rv) * wide[:, None, None]
+    size = torch.where(ok, size, torch.zeros_like(size))
+    second = inputs.log_depth_curr[own]
+    known = ok & torch.isfinite(second)
+    rz = torch.where(known, second, torch.zeros_like(z)) - torch.log(
+        torch.where(known, c, torch.ones_like(c))
+    )
+    ez = rz / torch.sqrt(2.0 * vd + DEPTH_FLOOR**2)
+    channels = torch.stack(
+        [
+            0.5 * _squash(eu),
+            0.5 * _squash(ev),
+            0.3 * torch.log1p(size),
+            0.5 * _squash(ez),
+            known.to(z.dtype),
+            0.3 * _squash(50.0 * rz),
+            support,
+            _rivals(inputs, support if first is None else first[1], (first or (inputs,))[0].owner),
+        ],
+        dim=1,
+    )
+    channels = channels * usable[:, None]
+    return channels, _scalars(inputs, support, wide, first is not None), support
+
+
+def _rivals(inputs: SelectorInputs, support: torch.Tensor, owner: torch.Tensor) -> torch.Tensor:
+    """(N, h, w): the largest support among the image's other motions of the search."""
+    out = support.new_zeros((len(inputs.owner), *support.shape[1:]))
+    index = torch.arange(len(support), device=support.device)
+    for k in range(len(out)):
+        rival = (owner == inputs.owner[k]) & (index != inputs.parent[k])
+        if rival.any():
+            out[k] = support[rival].amax(0)
+    return out
+
+
+def _scalars(
+    inputs: SelectorInputs, support: torch.Tensor, wide: torch.Tensor, refits: bool
+) -> torch.Tensor:
+    """(N, 8): share, noises, whether it is a refit, what was expected, what another network saw."""
+    own = inputs.owner
+    count = inputs.usable[own].sum((1, 2)).clamp(min=1)
+    share = support.sum((1, 2)) / count
+    known = inputs.has_prior[own].to(share.dtype)
+    step = _small_step(inputs.pose, inputs.T_prior[own])
+    # bounded on its near side and logarithmic on the far one: a prior that cannot trap
+    away = torch.einsum("ni,nij,nj->n", step, inputs.prior_information[own], step).clamp(0, 1e6) / 6
+    seen = torch.sigmoid(inputs.static) * inputs.usable
+    agreed = (support * seen[own]).sum((1, 2)) / seen.sum((1, 2)).clamp(min=1e-3)[own]
+    return torch.stack(
+        [
+            share,
+            0.3 * torch.log(inputs.flow_noise.clamp(min=MIN_FLOW_NOISE) * wide),
+            0.2 * torch.log(inputs.depth_noise.clamp(min=1e-4) / 1e-2),
+            torch.full_like(share, float(refits)),
+            known / (1.0 + away),
+            known,
+            0.2 * known * torch.log1p(away),
+            agreed * inputs.has_static[own],
+        ],
+        dim=1,
+    )
+
+
+def prior_information_of(
+    depth: torch.Tensor, usable: torch.Tensor, covariance: torch.Tensor | None
+) -> torch.Tensor:
+    """(B, 6, 6) inverse covariances of the motions expected.
+
+    Args:
+        depth: (B, h, w) metres.
+        usable: (B, h, w) bool.
+        covariance: (B, 6, 6), translation first; None where nobody knows: then
+            :data:`USUAL_CHANGE` of the image, and of the typical depth.
+    """
+    inverse = torch.where(usable, 1.0 / depth.clamp(min=1e-6), 0.0).sum((1, 2))
+    inverse = (inverse / usable.sum((1, 2)).clamp(min=1)).clamp(min=1e-6)
+    usual = torch.stack([inverse] * 3 + [torch.ones_like(inverse)] * 3, dim=1) / USUAL_CHANGE
+    usual = torch.diag_embed(usual * usual)
+    if covariance is None:
+        return usual
+    information, failed = torch.linalg.inv_ex(covariance.double())
+    sound = (failed == 0) & torch.isfinite(information).all((1, 2))
+    return torch.where(sound[:, None, None], information.to(usual.dtype), usual)
+
+
+def _small_step(pose: torch.Tensor, start: torch.Tensor) -> torch.Tensor:
+    """(N, 6) delta with pose = Exp(delta) start, translation first, to first order."""
+    R = pose[:, :, :3] @ start[:, :, :3].transpose(1, 2)
+    shift = pose[:, :, 3] - torch.einsum("nij,nj->ni", R, start[:, :, 3])
+    turn = torch.stack(
+        [R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], dim=1
+    )
+    return torch.cat([shift, turn / 2], dim=1)
+
+
+def shared_channels(inputs: SelectorInputs) -> torch.Tensor:
+    """(B, 11, h, w): flow, inverse depth, validity, rays, border, variances, static world."""
+    usable = inputs.usable
+    K = inputs.K[:, :, None, None]
+    # on the unit plane of the current camera: what is left is motion, whatever the lens
+    u = (inputs.target[:, 0] - K[:, 2]) / K[:, 0] - inputs.ray[:, 0]
+    v = (inputs.target[:, 1] - K[:, 3]) / K[:, 1] - inputs.ray[:, 1]
+    size = torch.sqrt(u * u + v * v)
+    typical = _median(size, usable).clamp(min=1e-5)
+    inverse = torch.where(usable, 1.0 / inputs.depth.clamp(min=1e-6), 0.0)
+    near = inverse / _median(inverse, usable).clamp(min=1e-9)
+    h, w = usable.shape[1:]
+    rows = torch.arange(h, device=u.device, dtype=u.dtype)
+    columns = torch.arange(w, device=u.device, dtype=u.dtype)
+    to_border = torch.minimum(
+        torch.minimum(rows, h - 1 - rows)[:, None], torch.minimum(columns, w - 1 - columns)[None]
+    )
+    border = torch.exp(-to_border / (0.06 * min(h, w))).expand(usable.shape)
+    asked = inputs.has_static[:, None, None].to(u.dtype)
+    channels = torch.stack(
+        [
+            _squash(u / typical),
+            _squash(v / typical),
+            torch.log1p(near),
+            usable.to(u.dtype),
+            inputs.ray[:, 0],
+            inputs.ray[:, 1],
+            border,
+            0.3 * torch.log(inputs.flow_variance.clamp(1e-3, 1e3)),
+            (0.2 * torch.log(size.clamp(min=1e-6) / 1e-2)),
+            inputs.static.clamp(-MAX_LOGIT, MAX_LOGIT) * asked / 3,
+            asked.expand(usable.shape),
+        ],
+        dim=1,
+    )
+    keep = usable[:, None].expand_as(channels).clone()
+    keep[:, 4:7] = True
+    return torch.where(keep, channels, torch.zeros_like(channels))
+
+
+def _median(x: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
+    """(B, 1, 1) median of the masked pixels of a quarter of the image."""
+    x, mask = x[:, ::2, ::2].flatten(1), mask[:, ::2, ::2].flatten(1)
+    order = torch.where(mask, x, torch.full_like(x, torch.inf)).sort(1).values
+    middle = (mask.sum(1, keepdim=True) // 2).clamp(max=x.shape[1] - 1)
+    value = order.gather(1, middle)
+    return torch.where(torch.isfinite(value), value, torch.ones_like(value))[..., None]
