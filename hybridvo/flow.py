@@ -152,6 +152,8 @@ class _Dis:
         if not self._forward_backward:
             return FlowField(forward, None, _lands_inside(forward), "dis")
         backward = _calc_dis(self._threads.dis, second, first)
+        if backward is None:
+            return none
         return FlowField(forward, *forward_backward_check(forward, backward), "dis")
 
 

@@ -329,11 +329,11 @@ def read_trajectory(
     if axes not in ("auto", "camera", "ned"):
         raise InputError(f"axes: expected auto, camera or ned, got {axes!r}.")
     path = Path(path)
-    format, rows, lines = _read_rows(path, format)
+    kind, rows, lines = _read_rows(path, format)
     stamps = np.arange(len(rows), dtype=np.float64)
     warnings: list[str] = []
     T = np.tile(np.eye(4), (len(rows), 1, 1))
-    if format == "kitti":
+    if kind == "kitti":
         T[:, :3] = rows.reshape(-1, 3, 4)
         error = _orthonormality_error(T[:, :3, :3])
         expected = "a rotation in columns 1-3, 5-7 and 9-11"
@@ -341,7 +341,7 @@ def read_trajectory(
         if error.max() > 1e-9:
             T[:, :3, :3] = Rotation.from_matrix(T[:, :3, :3]).as_matrix()
     else:
-        if format == "tum":
+        if kind == "tum":
             stamps, warnings = _to_seconds(path, rows[:, 0], lines)
         xyzw = rows[:, -4:]
         error = np.abs(np.linalg.norm(xyzw.clip(-2, 2), axis=1) - 1)
@@ -349,6 +349,6 @@ def read_trajectory(
         _refuse(error > _QUATERNION_NORM_TOLERANCE, path, lines, xyzw, expected)
         T[:, :3, :3] = Rotation.from_quat(xyzw).as_matrix()
         T[:, :3, 3] = rows[:, -7:-4]
-    if axes == "ned" or (axes == "auto" and format == "tartanair"):
+    if axes == "ned" or (axes == "auto" and kind == "tartanair"):
         T = ned_to_camera(T)
-    return Trajectory(stamps, T, has_timestamps=format == "tum", warnings=tuple(warnings))
+    return Trajectory(stamps, T, has_timestamps=kind == "tum", warnings=tuple(warnings))

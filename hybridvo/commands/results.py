@@ -27,7 +27,8 @@ def write_motions(folder: Path, rows: list[dict[str, Any]]) -> Trajectory:
     trajectory.save(folder / "trajectory.kitti")
     names = ("index", "timestamp", "status", "probability", "T_curr_prev", "covariance")
     with atomic_write(folder / "steps.npz", "wb") as file:
-        np.savez(file, **{name: np.array([row[name] for row in rows]) for name in names})
+        arrays: dict[str, Any] = {name: np.array([row[name] for row in rows]) for name in names}
+        np.savez(file, **arrays)
     return trajectory
 
 

@@ -70,7 +70,7 @@ def predict(
         selection: how one pose comes out of the pixels of a pass.
         passes: their number; by default the one that the network's options name.
     """
-    count = int(network.options.passes) if passes is None else passes  # type: ignore[union-attr]
+    count = int(network.options.passes) if passes is None else passes  # type: ignore[union-attr, arg-type]
     return network(inputs, first_motions(network, inputs, selection, count - 1))
 
 

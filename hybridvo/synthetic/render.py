@@ -218,9 +218,9 @@ class SyntheticSequence(Sequence):
         return self.scene.T_world_cam
 
     @property
-    def warnings(self) -> tuple[str, ...]:
+    def warnings(self) -> list[str]:  # type: ignore[override]
         """Nothing was mended."""
-        return ()
+        return []
 
     def __len__(self) -> int:
         return self.scene.frames

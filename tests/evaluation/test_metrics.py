@@ -224,7 +224,7 @@ def test_overflow_is_none_with_a_reason():
 def test_nan_in_a_file_names_the_line(tmp_path):
     write_tum(from_positions(np.eye(3)), tmp_path / "gt")
     (tmp_path / "est").write_text("0 0 0 0 0 0 0 1\n1 nan 0 0 0 0 0 1\n")
-    with pytest.raises(FormatError, match="est:2: expected finite numbers"):
+    with pytest.raises(FormatError, match=r"est:2: expected .*finite numbers"):
         evaluate_files(tmp_path / "est", tmp_path / "gt")
 
 
