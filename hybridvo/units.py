@@ -42,7 +42,7 @@ def stamp_unit(stamps: np.ndarray) -> tuple[float, str]:
 
 def typical_depth(depth: np.ndarray) -> float | None:
     """Median of the valid depths without the sky, in the map's unit; None where there are none."""
-    values = depth[np.isfinite(depth) & (depth > 0)]
+    values = depth[np.isfinite(depth) & (depth > 0)].astype(np.float64)
     near = values[values <= SKY_DEPTH_M]
     values = near if near.size > 0.1 * values.size else values
     return float(np.median(values)) if values.size else None

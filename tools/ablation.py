@@ -36,7 +36,7 @@ CLAIMS = (
 MILESTONES = (6_000, 12_000, 25_000, 50_000, 100_000)
 """Samples at which a row is scored, and at its end."""
 HELD_OUT = ("data_paper.yaml", "data_diverse.yaml")
-RULES = ("softmax", "min_variance", "median", "mean", "paper", "softmax-joint")
+RULES = ("softmax", "min_variance", "median", "mean", "paper")
 """Selection rules that a finished pixel-wise row with uncertainty is scored with."""
 
 

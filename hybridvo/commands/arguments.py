@@ -112,15 +112,11 @@ class _KeysInHelp(argparse.Action):
 def add_compare(compare: argparse.ArgumentParser) -> None:
     """Options of ``hybridvo compare``."""
     add = compare.add_argument
-    add(
-        "--sequence",
-        action="extend",
-        nargs="+",
-        required=True,
-        metavar="DIR",
-        help="sequence, or a folder of sequences (MPI Sintel as it was unpacked); repeatable",
-    )
-    add("--out", required=True, metavar="DIR")
+    many = "sequences, or folders of sequences (MPI Sintel as it was unpacked)"
+    add("paths", nargs="*", metavar="DIR", help=many)
+    named = "the same, by name; repeatable"
+    add("--sequence", action="extend", nargs="+", default=[], metavar="DIR", help=named)
+    add("--out", default="runs/compare", metavar="DIR", help="default: runs/compare")
     add("--methods", default="all", help="comma-separated; default: all that run here")
     flow = "auto: the sequence's flow files and DIS, side by side"
     add("--flow", choices=("auto", "file", "dis"), default="auto", help=flow)

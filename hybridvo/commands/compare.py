@@ -17,7 +17,7 @@ def compare_command(args: argparse.Namespace, command: list[str]) -> list[Path]:
         *("protocol", "worst", "jobs", "scheduler"),
     )
     options = ComparisonOptions(
-        sequences=tuple(args.sequence),
+        sequences=(*args.paths, *args.sequence),
         methods=tuple(name.strip() for name in args.methods.split(",") if name.strip()),
         weights=dict(text.split("=", 1) for text in args.weights if "=" in text),
         **{name: getattr(args, name) for name in given},

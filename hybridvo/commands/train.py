@@ -29,7 +29,7 @@ from typing import Any
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code (2: bad input, 5: output that cannot be written)."""
     try:
-        args = _parse(argv)
+        args = build_parser().parse_args(argv)
     except SystemExit as end:
         return int(end.code or 0)
     from hybridvo.errors import HybridVOError
@@ -44,7 +44,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
+def build_parser() -> argparse.ArgumentParser:
+    """The parser of ``hybridvo train``."""
     parser = argparse.ArgumentParser(
         prog="hybridvo train",
         description=__doc__,
@@ -82,7 +83,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     data.add_argument("--seeds", type=int, default=0, help="about as many samples")
     data.add_argument("--propose", metavar="NETWORK", help="ask these weights about the samples")
     data.set_defaults(run=_selector_data)
-    return parser.parse_args(argv)
+    return parser
 
 
 @contextlib.contextmanager

@@ -68,6 +68,8 @@ class ComparisonOptions:
     worst: int = 3
 
     def __post_init__(self) -> None:
+        if not self.sequences:
+            raise InputError("compare: expected at least one folder of a sequence, got none.")
         lowest = (("start", 0), ("stride", 1), ("seed", 0), ("jobs", 1), ("worst", 0))
         for name, least in lowest:
             if getattr(self, name) < least:

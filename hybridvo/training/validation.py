@@ -74,8 +74,7 @@ def evaluate_network(
         preset: what to draw; held-out data of its own (``for_evaluation``) are used where it has.
         seed: below 1000 for development, from 1000 for published figures.
         count: number of pairs, samples 0 to count - 1 of the seed.
-        selection: rule, with ``-joint`` behind it one pixel and weight for each three components;
-            VONets have none.
+        selection: one of ``SELECTION_METHODS``; VONets have none.
         batch_size: pairs at once.
         precision: ``float32`` or ``bfloat16`` (autocast).
 

@@ -144,6 +144,7 @@ def test_resume_keeps_finished_sequences(tree: Path, tmp_path: Path, monkeypatch
     assert outcome(tmp_path / "cut") == outcome(tmp_path / "whole")
 
 
+@pytest.mark.slow
 def test_processes_give_what_one_gives(tree: Path, tmp_path: Path) -> None:
     compare(options(tree, flow="file"), tmp_path / "one")
     compare(options(tree, flow="file", jobs=2), tmp_path / "two")

@@ -171,6 +171,7 @@ OPTIONS = (
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options", OPTIONS, ids=["pwvo", "pixelwise", "vonet", "attention", "scale-free"]
 )

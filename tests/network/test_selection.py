@@ -22,11 +22,10 @@ def random_prediction(seed: int, shape=(2, 3, 7, 9), dtype=torch.float64) -> Pix
     )
 
 
-def by_loop(value, s, method, patch, joint):
+def by_loop(value, s, method, patch):
     """Selection of (3, h, w) maps, written as plainly as possible."""
     _, height, width = value.shape
     out = []
-    rank = np.broadcast_to(s.mean(0), s.shape) if joint else s
     for c in range(3):
         if method == "mean":
             out.append(value[c].mean())
@@ -35,7 +34,7 @@ def by_loop(value, s, method, patch, joint):
         for top in range(0, height, patch):
             for left in range(0, width, patch):
                 cells = [
-                    (rank[c, i, j], value[c, i, j])
+                    (s[c, i, j], value[c, i, j])
                     for i in range(top, min(top + patch, height))
                     for j in range(left, min(left + patch, width))
                 ]
@@ -55,17 +54,16 @@ def by_loop(value, s, method, patch, joint):
 
 
 @pytest.mark.parametrize("method", SELECTION_METHODS)
-@pytest.mark.parametrize("joint", [False, True])
 @pytest.mark.parametrize(("shape", "patch"), [((8, 8), 4), ((7, 9), 4), ((5, 6), 10), ((3, 2), 1)])
-def test_equals_a_loop(method, joint, shape, patch):
+def test_equals_a_loop(method, shape, patch):
     prediction = random_prediction(5, (2, 3, *shape))
-    rotation, translation = select_pose(prediction, method, patch, joint)
+    rotation, translation = select_pose(prediction, method, patch)
     for b in range(2):
         for got, value, s in (
             (rotation, prediction.rotation, prediction.log_scale_rotation),
             (translation, prediction.translation, prediction.log_scale_translation),
         ):
-            expected = by_loop(value[b].numpy(), s[b].numpy(), method, patch, joint)
+            expected = by_loop(value[b].numpy(), s[b].numpy(), method, patch)
             np.testing.assert_allclose(got[b].numpy(), expected, rtol=1e-12, atol=1e-12)
 
 
@@ -90,15 +88,6 @@ def test_worked_by_hand(method, expected):
     rotation, translation = select_pose(worked_example(), method, patch=2)
     torch.testing.assert_close(rotation, torch.full((1, 3), expected))
     torch.testing.assert_close(translation, torch.full((1, 3), 10 * expected))
-
-
-def test_joint_takes_one_pixel_for_three_components():
-    # Component 0 is surest at the left pixel, 1 and 2 at the right; the sum is least at the right.
-    s = torch.tensor([[0.0, 1.0], [2.0, 0.5], [2.0, 0.5]])[None, :, None, :]
-    value = torch.tensor([[1.0, 2.0]]).expand(3, 2)[None, :, None, :]
-    prediction = PixelwisePrediction(value, value, s, s)
-    assert select_pose(prediction, patch=2)[0].tolist() == [[1.0, 2.0, 2.0]]
-    assert select_pose(prediction, patch=2, joint=True)[0].tolist() == [[2.0, 2.0, 2.0]]
 
 
 def test_default_patch_is_the_papers_grid():
@@ -132,13 +121,10 @@ def test_padding_never_wins():
     width=st.integers(1, 9),
     patch=st.integers(1, 10),
     method=st.sampled_from(SELECTION_METHODS),
-    joint=st.booleans(),
 )
-def test_result_lies_within_the_values_and_is_equivariant(
-    seed, height, width, patch, method, joint
-):
+def test_result_lies_within_the_values_and_is_equivariant(seed, height, width, patch, method):
     prediction = random_prediction(seed, (1, 3, height, width))
-    rotation, _ = select_pose(prediction, method, patch, joint)
+    rotation, _ = select_pose(prediction, method, patch)
     flat = prediction.rotation.flatten(2)
     assert (rotation >= flat.min(-1).values - 1e-12).all()
     assert (rotation <= flat.max(-1).values + 1e-12).all()
@@ -148,7 +134,7 @@ def test_result_lies_within_the_values_and_is_equivariant(
         prediction.log_scale_rotation,
         prediction.log_scale_translation,
     )
-    torch.testing.assert_close(select_pose(moved, method, patch, joint)[0], 2 * rotation + 5)
+    torch.testing.assert_close(select_pose(moved, method, patch)[0], 2 * rotation + 5)
     if method in ("softmax", "min_variance", "median"):
         louder = PixelwisePrediction(
             prediction.rotation,
@@ -156,20 +142,19 @@ def test_result_lies_within_the_values_and_is_equivariant(
             prediction.log_scale_rotation + 3,
             prediction.log_scale_translation,
         )
-        torch.testing.assert_close(select_pose(louder, method, patch, joint)[0], rotation)
+        torch.testing.assert_close(select_pose(louder, method, patch)[0], rotation)
 
 
 @pytest.mark.parametrize("method", SELECTION_METHODS)
-@pytest.mark.parametrize("joint", [False, True])
-def test_damage_is_not_heard(method, joint):
+def test_damage_is_not_heard(method):
     clean = random_prediction(2, (2, 3, 8, 8))
     maps = [v.clone() for v in list(vars(clean).values())[:4]]
     for i, broken in enumerate((torch.nan, torch.inf, torch.nan, -torch.inf)):
         maps[i][0, :, :4, :4] = broken  # a whole patch, and one pixel of another
         maps[i][0, :, 6, 6] = broken
     prediction = PixelwisePrediction(*maps)
-    rotation, translation = select_pose(prediction, method, 4, joint)
-    reference = select_pose(clean, method, 4, joint)
+    rotation, translation = select_pose(prediction, method, 4)
+    reference = select_pose(clean, method, 4)
     assert torch.isfinite(rotation).all()
     assert torch.isfinite(translation).all()
     torch.testing.assert_close(rotation[1], reference[0][1])
@@ -199,12 +184,11 @@ def test_extreme_scales_stay_finite_in_value_and_gradient():
 
 
 @pytest.mark.parametrize("method", ["softmax", "min_variance", "mean", "paper", "median"])
-@pytest.mark.parametrize("joint", [False, True])
-def test_gradcheck(method, joint):
+def test_gradcheck(method):
     maps = [v.requires_grad_() for v in list(vars(random_prediction(3, (1, 3, 3, 4))).values())[:4]]
 
     def pose(*values):
-        return torch.cat(select_pose(PixelwisePrediction(*values), method, 2, joint), dim=1)
+        return torch.cat(select_pose(PixelwisePrediction(*values), method, 2), dim=1)
 
     torch.autograd.gradcheck(pose, maps)
     if method in ("softmax", "min_variance", "paper"):

@@ -307,6 +307,7 @@ def test_bad_depth_never_gives_a_pose_that_is_not_finite(bad: float) -> None:
     assert np.isfinite(step.T_world_cam).all() and np.isfinite(step.covariance).all()
 
 
+@pytest.mark.slow
 def test_memory_is_constant_over_200_frames() -> None:
     vo = tracker()
     for i in range(20):
