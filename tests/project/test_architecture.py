@@ -79,9 +79,9 @@ ONLY_IN = {
 MAX_FILE_LINES = 645
 MAX_FUNCTION_LINES = 97
 MAX_FOLDER_FILES = 18
-MAX_CONSTANTS = 363
+MAX_CONSTANTS = 358
 """Module-level names in capitals that hold numbers, outside ``calibration.py``."""
-MAX_LINES = {"hybridvo": 29_300, "tests": 15_000, "tools": 3_000}
+MAX_LINES = {"hybridvo": 28_300, "tests": 15_000, "tools": 3_000}
 MAX_PUBLIC_NAMES = 24
 
 
