@@ -364,8 +364,9 @@ def refine(
         pair: a :class:`FramePair` (numpy), or a :class:`PairBatch` (torch) for the batched,
             differentiable path, see :func:`hybridvo.refinement.torch_backend.refine_batch`: that
             one draws nothing at random, and follows the largest motion where nothing is handed in.
-        T_init: (4, 4) T_curr_prev, the only start; None: every strong motion is searched, and
-            hand-made cues say which is the camera's.
+        T_init: (4, 4) T_curr_prev, the only start, from which the fit may leave for a larger motion
+            unless weights hold it; None: every strong motion is searched, and hand-made cues say
+            which is the camera's.
         weights: (H, W) factors on the information of each pixel; 0 and NaN switch a pixel off.
         options: ``search`` and ``refine`` are read.
         seed: of the search.

@@ -388,19 +388,23 @@ class _Solver:
         for k in range(options.iterations):
             now = linearize(pixels, T, how, self.run)
             H, g = now.total()
-            if tight and k == 2:
+            if tight and k % 3 == 2:  # anew, for samples that were far when it was made
                 matrix = newton_matrix(pixels, T, how).double()
             newton = H - curvature * weight if matrix is None else matrix
             step, good = solve_small(newton, g)
             ahead = (step * g).sum(dim=1)
             # under a kernel that turns over the equations may be far from definite: Gauss-Newton
-            good = good & (ahead > 0) & (_energy(step, H) <= 4 * ahead)
+            # (near the solution the full derivative may be much flatter than H, and is right)
+            longest = 4 if matrix is None else 100
+            good = good & (ahead > 0) & (_energy(step, H) <= longest * ahead)
             plain, solved = solve_small(H, g, MIN_DAMPING)
             step = torch.where(good[:, None], step, plain)
             step = torch.where(done[:, None], torch.zeros_like(step), step)
             moved = (_energy(step, H) / now.weight_sum.double().clamp(min=1e-12)).sqrt()
             T, iterations = left_update(step, T), iterations + (~done).long()
-            rounded = (moved > 0.5 * best) & (moved < ROUNDED_STEP) & (k > 3 or not tight)
+            rounded = (
+                (moved > 0.5 * best) & (moved < ROUNDED_STEP) & ((good & (k > 3)) | (not tight))
+            )
             converged = converged | (~done & solved & ((moved < enough) | rounded))
             best = torch.where(done, best, torch.minimum(best, moved))
             done = converged | ~solved
