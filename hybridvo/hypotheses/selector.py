@@ -76,21 +76,24 @@ class Scores:
 class Scorer(Protocol):
     """Scores the motions of a pair by what they leave unexplained, pixel by pixel."""
 
-    def score(
-        self,
-        maps: GridMaps,
-        candidates: Candidates,
-        prior: MotionPrior | None,
-        static: np.ndarray | None,
-        masks: int,
-    ) -> Scores:
-        """Scores of all candidates, and masks for the best of them.
+    def look(self, maps: GridMaps, prior: MotionPrior | None, static: np.ndarray | None) -> Look:
+        """The pair to be judged.
 
         Args:
             maps: the pixels.
-            candidates: the motions.
             prior: what is known of the motion, or None.
             static: (h, w) probability of being static that a network predicts, or None.
+        """
+
+
+class Look(Protocol):
+    """One pair as a scorer sees it."""
+
+    def score(self, candidates: Candidates, masks: int) -> Scores:
+        """Scores of all candidates, and masks for the best of them.
+
+        Args:
+            candidates: the motions; those of an earlier call come first, in the same order.
             masks: how many masks are wanted at most.
         """
 
@@ -187,7 +190,8 @@ class MaskSelector:
             candidates = self._refit(
                 found, candidates, masks, [(prediction.T_curr_prev[:3], mask_weights(static), None)]
             )
-        scores = self.scorer.score(maps, candidates, prior, static, limits.refits)
+        look = self.scorer.look(maps, prior, static)
+        scores = look.score(candidates, limits.refits)
         for _ in range(ROUNDS):
             known = len(candidates.poses)
             entries = [
@@ -197,7 +201,7 @@ class MaskSelector:
             candidates = self._refit(found, candidates, masks, entries)
             if len(candidates.poses) == known:
                 break
-            scores = self.scorer.score(maps, candidates, prior, static, 1)
+            scores = look.score(candidates, 1)
             if int(np.argmax(scores.score)) < known:
                 break
         return _selection(found, candidates, scores.score, masks, scores.confidence)
