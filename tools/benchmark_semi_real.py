@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import functools
+import itertools
 import sys
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,8 @@ from measuring import digits, ego_flow_error, proportion, provenance, timed
 
 METHODS = ("refine", "hybrid-flow", "poselib")
 WRONG_PX, WRONG_FACTOR = 1.0, 3.0
+LEAST_MOVING = 0.2
+"""Share of the image that moves at least where anything does."""
 BINS = 10
 """Bins of the stated probability for its calibration error."""
 SEEDS = {"train": 1, "development": 2, "test": 3}
@@ -69,12 +72,11 @@ def measure(args: argparse.Namespace, recordings: Any) -> list[dict[str, Any]]:
     """Errors, statuses and probabilities of every method on every pair."""
     from hybridvo import estimate, refine
     from hybridvo.network.models import Models
-    from hybridvo.synthetic.semi_real import draw_pair
 
     models = Models(weights={"selector": args.selector}) if args.selector else None
     rows = []
     for k in range(args.first, args.first + args.pairs):
-        drawn = draw_pair(np.random.default_rng([SEEDS[args.split], k]), recordings)
+        drawn = draw(args.split, k, recordings)
         pair, T = drawn.pair, drawn.T_curr_prev
         depth = np.where(drawn.moving, 0, drawn.depth)
         usable = pair.flow_valid & (pair.prev.depth > 0)
@@ -101,6 +103,17 @@ def measure(args: argparse.Namespace, recordings: Any) -> list[dict[str, Any]]:
             }
         rows.append(row)
     return rows
+
+
+def draw(split: str, number: int, recordings: Any) -> Any:
+    """A pair in which nothing moves, every eighth, or :data:`LEAST_MOVING` of the image does."""
+    from hybridvo.synthetic.semi_real import draw_pair
+
+    for attempt in itertools.count():
+        rng = np.random.default_rng([SEEDS[split], number, attempt])
+        drawn = draw_pair(rng, recordings, 0 if number % 8 == 0 else int(rng.integers(1, 5)))
+        if drawn.movers == 0 or drawn.moving.mean() > LEAST_MOVING:
+            return drawn
 
 
 def summarise(rows: list[dict[str, Any]], method: str) -> dict[str, Any]:

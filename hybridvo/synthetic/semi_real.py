@@ -182,19 +182,24 @@ def draw_pair(
     at = int(rng.integers(len(world.frames)))
     canvases, T, camera = _world(rng, world, at)
     if movers is None:
-        movers = int(rng.choice(5, p=(0.12, 0.3, 0.28, 0.18, 0.12)))
-    coverage = rng.uniform(0.3, 3.0)
-    for _ in range(movers):
+        movers = int(rng.choice(5, p=(0.12, 0.4, 0.24, 0.14, 0.1)))
+    coverage = rng.uniform(0.1, 0.8)
+    one_body = None
+    for tried in range(movers + 4 if movers else 0):
+        if tried >= movers and canvases[0].moving.mean() > 0.7 * coverage:
+            break
         frame = _elsewhere(rng, recordings, world, at)
-        side = 1.5 * np.sqrt(coverage / movers * camera.height * camera.width)
+        side = 1.6 * np.sqrt(coverage / movers * camera.height * camera.width)
         mover = _cut(rng, frame, int(side), canvases[0], camera)
         if mover is None:
             continue
-        points = _moved(rng, mover, T, camera)
+        if one_body is None or rng.random() < 0.5:
+            one_body = _own_motion(rng, mover, T, camera)
+        points = _moved(rng, mover, *one_body, camera)
         own = _image(points, camera) - _image(mover.points @ T[:3, :3].T + T[:3, 3], camera)
         goes = np.linalg.norm(own, axis=2) > STILL_PX * camera.width / 1024
         canvases[0].draw(mover, mover.points, goes, camera)
-        mover.image *= rng.uniform(0.93, 1.07)
+        mover.image *= rng.uniform(0.95, 1.05)
         canvases[1].draw(mover, points, goes, camera)
     frames = [_sensed(rng, canvas, camera) for canvas in canvases]
     field = dis_flow()(*frames)
@@ -307,6 +312,7 @@ def _filled(depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return of_label[labels], known
 
 
+@functools.lru_cache(maxsize=128)
 def _surface(frame: Frame) -> _Surface:
     """Everything that a frame shows, as a mesh that is torn nowhere but measured only on planes."""
     assert frame.depth is not None and frame.rgb is not None
@@ -351,6 +357,7 @@ def _world(
             depth, known = (x[window].copy() for x in _filled(frame.depth))
             image = frame.rgb[window].astype(np.float32)
             canvases.append(_Canvas(image, depth, known.astype(np.float32), np.zeros_like(depth)))
+        _paler(rng, canvases)
         return canvases, T, camera
     surface = _surface(recording.frames[at])
     near = float(np.median(surface.points[..., 2]))
@@ -369,7 +376,15 @@ def _world(
         points = surface.points @ pose[:3, :3].T + pose[:3, 3]
         canvas.draw(surface, points, np.zeros(points.shape[:2]), camera)
         canvases.append(canvas)
+    _paler(rng, canvases)
     return canvases, half @ half, camera
+
+
+def _paler(rng: np.random.Generator, canvases: list[_Canvas]) -> None:
+    """Take contrast from a world at times, as distance and darkness do."""
+    contrast = rng.uniform(0.25, 1.0) if rng.random() < 0.5 else 1.0
+    for canvas in canvases:
+        canvas.image = canvas.image * contrast + (1 - contrast) * 90.0
 
 
 def _cut(
@@ -406,37 +421,44 @@ def _cut(
     )
 
 
-def _moved(rng: np.random.Generator, mover: _Surface, T: np.ndarray, camera: Camera) -> np.ndarray:
-    """(h, w, 3) where a mover's points are in the second view."""
-    points = mover.points
-    centre = points[mover.inside].mean(axis=0) if mover.inside.any() else points.mean((0, 1))
+def _own_motion(
+    rng: np.random.Generator, mover: _Surface, T: np.ndarray, camera: Camera
+) -> tuple[np.ndarray, str]:
+    """(4, 4) from the first view to the second, and its kind."""
+    centre = mover.points[mover.inside].mean(axis=0) if mover.inside.any() else mover.points[0, 0]
     kind = str(rng.choice(["slide", "turn", "both", "approach", "follow", "stand"],
-                          p=(0.3, 0.15, 0.25, 0.1, 0.12, 0.08)))  # fmt: skip
+                          p=(0.32, 0.12, 0.24, 0.1, 0.16, 0.06)))  # fmt: skip
     step = np.zeros(6)
-    px = log_uniform(rng, (1.5, 25.0)) / camera.fx
     if kind in ("slide", "both", "follow"):
-        if kind == "follow":
-            px = log_uniform(rng, (0.05, 2.0)) / camera.fx
+        reach = (0.05, 2.0) if kind == "follow" else (1.5, 25.0)
+        px = log_uniform(rng, reach) / camera.fx
         step[:3] = rng.standard_normal(3) * (1.0, 0.7, 0.6) * px * centre[2]
     if kind in ("turn", "both"):
         step[3:] = rng.standard_normal(3) * log_uniform(rng, (0.02, 0.2))
     if kind == "approach":
         step[:3] = centre * rng.uniform(-0.12, 0.12)
     own = _about(centre, step)
-    view = np.eye(4) if kind == "follow" else T
-    out = points @ own[:3, :3].T + own[:3, 3]
-    if kind not in ("follow", "stand") and rng.random() < 0.35:  # a second part on a hinge
-        line = rng.standard_normal(2)
-        side = (points[..., :2] - centre[:2]) @ line > 0
-        swing = np.concatenate(
-            [np.zeros(3), rng.standard_normal(3) * log_uniform(rng, (0.03, 0.25))]
-        )
-        other = own @ _about(centre, swing)
+    return (own if kind == "follow" else T @ own), kind
+
+
+def _moved(
+    rng: np.random.Generator, mover: _Surface, motion: np.ndarray, kind: str, camera: Camera
+) -> np.ndarray:
+    """(h, w, 3) where a mover's points are in the second view: on a hinge, or not quite rigid."""
+    points = mover.points
+    out = points @ motion[:3, :3].T + motion[:3, 3]
+    if kind == "stand":
+        return out
+    centre = points[mover.inside].mean(axis=0) if mover.inside.any() else points.mean((0, 1))
+    if rng.random() < 0.2:
+        side = (points[..., :2] - centre[:2]) @ rng.standard_normal(2) > 0
+        swing = rng.standard_normal(6) * log_uniform(rng, (0.03, 0.25)) * (0, 0, 0, 1, 1, 1)
+        other = motion @ _about(centre, swing)
         out = np.where(side[..., None], points @ other[:3, :3].T + other[:3, 3], out)
-    if kind != "stand":  # nothing that lives is quite rigid
+    if rng.random() < 0.4:
         wobble = smooth_field(rng, *points.shape[:2], 5, 3)
         out = out + wobble * np.float32(rng.uniform(0, 0.5) * centre[2] / camera.fx)
-    return out @ view[:3, :3].T + view[:3, 3]
+    return out
 
 
 def _about(centre: np.ndarray, step: np.ndarray) -> np.ndarray:
@@ -464,6 +486,10 @@ def _sensed(rng: np.random.Generator, canvas: _Canvas, camera: Camera) -> Frame:
     if rng.random() < 0.5:  # holes, on movers as in the world
         field = smooth_field(rng, *shape, int(rng.integers(4, 24)))
         lost |= field > rng.uniform(0.8, 2.5)
+    if rng.random() < 0.4:  # beyond its range
+        middle, far = np.quantile(depth[::5, ::5], (0.5, 0.98))
+        reach = rng.uniform(middle, max(far, middle + 1e-3))
+        lost |= depth > reach * (1 + 0.2 * smooth_field(rng, *shape, 16))
     if rng.random() < 0.3:  # the sensor's field of view ends before the image
         cut = rng.integers(0, (shape[0] // 8, shape[0] // 8, shape[1] // 8, shape[1] // 8))
         lost[: cut[0]] = lost[shape[0] - cut[1] :] = True

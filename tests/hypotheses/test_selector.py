@@ -29,7 +29,10 @@ class Oracle:
     def __init__(self, static: np.ndarray, refits: bool, confidence: float = 0.9) -> None:
         self.static, self.refits, self.confidence = static, refits, confidence
 
-    def score(self, maps, candidates: Candidates, prior, static, masks: int) -> Scores:
+    def look(self, maps, prior, static) -> Oracle:
+        return self
+
+    def score(self, candidates: Candidates, masks: int) -> Scores:
         count = len(candidates.poses)
         score = np.zeros(count)
         score[-1 if self.refits else 0] = 5.0
