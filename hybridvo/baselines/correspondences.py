@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from hybridvo.errors import InputError
-from hybridvo.types import Camera, FramePair, Reason, RelativePose, Status
+from hybridvo.results import Reason, RelativePose, Status
+from hybridvo.types import Camera, FramePair
 
 __all__ = [
     "DEPTH_RANGE_M",

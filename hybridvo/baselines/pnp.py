@@ -1,7 +1,7 @@
 """The estimators that others use today, behind one signature, with their answers checked.
 
 Every estimator is called as ``estimator(pair, seed=0)`` and returns a
-:class:`~hybridvo.types.RelativePose`. 3-D points come from the previous depth and ``K_prev``, 2-D
+:class:`~hybridvo.results.RelativePose`. 3-D points come from the previous depth and ``K_prev``, 2-D
 points from the flow, seen by ``K_curr``. A solver's own "success" is not believed: the answer must
 be finite, keep its inliers in front of the camera, have enough of them, and they must determine all
 six degrees of freedom. Bad data gives a failed status, never an exception and never NaN.
@@ -29,7 +29,8 @@ from hybridvo.baselines.correspondences import (
 from hybridvo.baselines.rgbd import REMEDIES, open3d_rgbd, opencv_rgbd
 from hybridvo.errors import InputError
 from hybridvo.geometry import make_transform
-from hybridvo.types import Camera, FramePair, RelativePose, Status
+from hybridvo.results import RelativePose, Status
+from hybridvo.types import Camera, FramePair
 
 __all__ = [
     "baselines",

@@ -25,7 +25,8 @@ from hybridvo.baselines.correspondences import (
 )
 from hybridvo.errors import InputError
 from hybridvo.geometry import make_transform
-from hybridvo.types import Camera, FramePair, Reason, RelativePose, Status
+from hybridvo.results import Reason, RelativePose, Status
+from hybridvo.types import Camera, FramePair
 
 __all__ = ["open3d_rgbd", "opencv_rgbd"]
 

@@ -25,8 +25,8 @@ import torch
 import torch.nn.functional as F
 
 from hybridvo.errors import InputError
+from hybridvo.results import PixelwisePrediction
 from hybridvo.torch_geometry import euler_transform
-from hybridvo.types import PixelwisePrediction
 
 SELECTION_METHODS = ("softmax", "min_variance", "median", "mean", "paper")
 
