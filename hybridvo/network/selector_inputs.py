@@ -17,7 +17,7 @@ import torch.nn.functional as F
 
 from hybridvo.hypotheses import search
 from hybridvo.hypotheses.generate import GridMaps
-from hybridvo.types import MotionPrior
+from hybridvo.results import MotionPrior
 
 REFERENCE_WIDTH = 1024.0
 """px, width at which absolute residuals and noises are compared between images."""
