@@ -196,10 +196,10 @@ def draw_pair(
         if one_body is None or rng.random() < 0.5:
             one_body = _own_motion(rng, mover, T, camera)
         points = _moved(rng, mover, *one_body, camera)
-        own = _image(points, camera) - _image(mover.points @ T[:3, :3].T + T[:3, 3], camera)
+        own = _image(points, camera) - _image(_transformed(mover.points, T), camera)
         goes = np.linalg.norm(own, axis=2) > STILL_PX * camera.width / 1024
         canvases[0].draw(mover, mover.points, goes, camera)
-        mover.image *= rng.uniform(0.95, 1.05)
+        mover.image *= np.float32(rng.uniform(0.95, 1.05))
         canvases[1].draw(mover, points, goes, camera)
     frames = [_sensed(rng, canvas, camera) for canvas in canvases]
     field = dis_flow()(*frames)
@@ -234,25 +234,30 @@ class _Canvas:
         self, surface: _Surface, points: np.ndarray, moving: np.ndarray, camera: Camera
     ) -> None:
         """Add a surface with its points where they are now, nearest wins."""
-        values = np.dstack([surface.image, surface.measured, moving]).astype(np.float32)
-        out = np.dstack([self.image, self.measured, self.moving]).astype(np.float32)
+        marks = surface.measured, moving
+        mesh = np.empty((*surface.measured.shape, 5), np.float32)
+        mesh[..., :3], mesh[..., 3], mesh[..., 4] = surface.image, *marks
+        out = np.empty((*self.depth.shape, 5), np.float32)
+        out[..., :3], out[..., 3], out[..., 4] = self.image, self.measured, self.moving
         before = self.depth.copy()
-        uv = _image(points, camera).astype(np.float32)
         z = np.ascontiguousarray(points[..., 2], np.float32)
-        _rasterise(uv, z, values, surface.inside, self.depth, out)
+        _rasterise(_image(points, camera), z, mesh, surface.inside, self.depth, out)
         # silhouettes are mixed pixels
         drawn = (self.depth != before).astype(np.float32)
         alpha = cv2.GaussianBlur(drawn, (3, 3), 0.7) * drawn
-        self.image = self.image + alpha[..., None] * (out[..., :3] - self.image)
+        self.image += alpha[..., None] * (out[..., :3] - self.image)
         self.measured, self.moving = out[..., 3], out[..., 4]
 
 
 def _image(points: np.ndarray, camera: Camera) -> np.ndarray:
-    """(h, w, 2) px of points (h, w, 3); far outside behind the camera."""
+    """(h, w, 2) float32 px of points (h, w, 3); far outside behind the camera."""
     z = points[..., 2]
-    safe = np.where(z > 1e-3, z, 1.0)
-    u = np.where(z > 1e-3, camera.fx * points[..., 0] / safe + camera.cx, -1e4)
-    return np.stack([u, camera.fy * points[..., 1] / safe + camera.cy], axis=-1)
+    front = z > 1e-3
+    inverse = 1.0 / np.where(front, z, 1.0)
+    uv = np.empty((*z.shape, 2), np.float32)
+    uv[..., 0] = np.where(front, camera.fx * points[..., 0] * inverse + camera.cx, -1e4)
+    uv[..., 1] = camera.fy * points[..., 1] * inverse + camera.cy
+    return uv
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
@@ -319,7 +324,7 @@ def _surface(frame: Frame) -> _Surface:
     depth, known = _filled(frame.depth)
     jump = cv2.dilate(depth, np.ones((3, 3))) - cv2.erode(depth, np.ones((3, 3)))
     measured = known & (jump < 2 * TEAR * depth)
-    points = backproject(depth, frame.camera)
+    points = backproject(depth, frame.camera).astype(np.float32)
     inside = np.ones(depth.shape, np.bool_)
     return _Surface(points, frame.rgb.astype(np.float32), measured.astype(np.float32), inside)
 
@@ -373,7 +378,7 @@ def _world(
             np.zeros(shape, np.float32),
             np.zeros(shape, np.float32),
         )
-        points = surface.points @ pose[:3, :3].T + pose[:3, 3]
+        points = _transformed(surface.points, pose)
         canvas.draw(surface, points, np.zeros(points.shape[:2]), camera)
         canvases.append(canvas)
     _paler(rng, canvases)
@@ -384,7 +389,7 @@ def _paler(rng: np.random.Generator, canvases: list[_Canvas]) -> None:
     """Take contrast from a world at times, as distance and darkness do."""
     contrast = rng.uniform(0.25, 1.0) if rng.random() < 0.5 else 1.0
     for canvas in canvases:
-        canvas.image = canvas.image * contrast + (1 - contrast) * 90.0
+        canvas.image = canvas.image * np.float32(contrast) + np.float32(90 * (1 - contrast))
 
 
 def _cut(
@@ -416,9 +421,8 @@ def _cut(
     size = rng.uniform(0.8, 1.25) * frame.camera.fx / camera.fx
     rays = (points[..., :2] / z[..., None] - centre[:2] / centre[2]) * size + goal
     z = z * (part * behind / middle)
-    return _Surface(
-        np.dstack([rays * z[..., None], z]), surface.image[window].copy(), measured.copy(), mask
-    )
+    placed = np.concatenate([rays * z[..., None], z[..., None]], axis=2).astype(np.float32)
+    return _Surface(placed, surface.image[window].copy(), measured.copy(), mask)
 
 
 def _own_motion(
@@ -446,7 +450,7 @@ def _moved(
 ) -> np.ndarray:
     """(h, w, 3) where a mover's points are in the second view: on a hinge, or not quite rigid."""
     points = mover.points
-    out = points @ motion[:3, :3].T + motion[:3, 3]
+    out = _transformed(points, motion)
     if kind == "stand":
         return out
     centre = points[mover.inside].mean(axis=0) if mover.inside.any() else points.mean((0, 1))
@@ -454,11 +458,16 @@ def _moved(
         side = (points[..., :2] - centre[:2]) @ rng.standard_normal(2) > 0
         swing = rng.standard_normal(6) * log_uniform(rng, (0.03, 0.25)) * (0, 0, 0, 1, 1, 1)
         other = motion @ _about(centre, swing)
-        out = np.where(side[..., None], points @ other[:3, :3].T + other[:3, 3], out)
+        out = np.where(side[..., None], _transformed(points, other), out)
     if rng.random() < 0.4:
         wobble = smooth_field(rng, *points.shape[:2], 5, 3)
         out = out + wobble * np.float32(rng.uniform(0, 0.5) * centre[2] / camera.fx)
     return out
+
+
+def _transformed(points: np.ndarray, T: np.ndarray) -> np.ndarray:
+    """(h, w, 3) float32 points after a motion (4, 4)."""
+    return points @ T[:3, :3].T.astype(np.float32) + T[:3, 3].astype(np.float32)
 
 
 def _about(centre: np.ndarray, step: np.ndarray) -> np.ndarray:
@@ -470,7 +479,8 @@ def _about(centre: np.ndarray, step: np.ndarray) -> np.ndarray:
 def _sensed(rng: np.random.Generator, canvas: _Canvas, camera: Camera) -> Frame:
     """What a camera and a depth sensor make of a view."""
     shape = camera.shape
-    image = canvas.image * rng.uniform(0.96, 1.04) + rng.uniform(-4, 4)
+    gain, offset = rng.uniform(0.96, 1.04), rng.uniform(-4, 4)
+    image = canvas.image * np.float32(gain) + np.float32(offset)
     if rng.random() < 0.5:
         image = cv2.GaussianBlur(image, (0, 0), log_uniform(rng, (0.3, 1.0)))
     noise = rng.standard_normal((*shape, 3), dtype=np.float32)

@@ -70,10 +70,10 @@ def draw_samples(seed: int, recordings: Sequence[Recording] = ()) -> list[dict[s
         if T_prior is not None and rng.random() < 0.7:
             starts.append(T_prior)
         found = generate(pair, np.stack(starts), Options(), int(rng.integers(1 << 30)))
-        full = (0, *pair.prev.camera.shape)
+        height, width = pair.prev.camera.shape
         if isinstance(found, RelativePose) or not found.is_ambiguous:
             continue
-        if (found.grid.box[0], found.grid.box[1], found.grid.box[3]) != full:
+        if found.grid.box != (0, height, 0, width):
             continue
         samples.append(_record(pair, found, truth, T_prior, log_depth_curr, source))
     return samples

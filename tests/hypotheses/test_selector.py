@@ -39,7 +39,7 @@ class Oracle:
         score[-1 if self.refits else 0] = 5.0
         best = np.arange(min(masks, count))
         drawn = np.stack([self.static] * len(best)) if masks else np.zeros((0, *self.static.shape))
-        return Scores(score, best, drawn, self.confidence)
+        return Scores(score, best, drawn, self.confidence, np.full((count, 2), 0.3))
 
 
 @pytest.fixture(scope="module")
