@@ -7,6 +7,8 @@ matters when weights are ported, not when they are trained here, and is not copi
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from itertools import pairwise
 
 import torch
@@ -140,6 +142,18 @@ class SelfAttention(nn.Module):
         query, key, value = (f(x).flatten(2) for f in (self.query, self.key, self.value))
         attention = torch.softmax(query.transpose(1, 2) @ key, dim=-1)
         return x + self.gain * (value @ attention.transpose(1, 2)).view_as(x)
+
+
+@contextlib.contextmanager
+def plain_torch() -> Iterator[None]:
+    """Inference in float32 on the CPU, whatever the caller set for networks of its own."""
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(torch.inference_mode())
+        if torch.is_autocast_enabled("cpu"):
+            stack.enter_context(torch.autocast("cpu", enabled=False))
+        if torch.get_default_device().type != "cpu":
+            stack.enter_context(torch.device("cpu"))
+        yield
 
 
 def initialize(network: nn.Module, uniform: tuple[nn.Module, ...] = ()) -> None:

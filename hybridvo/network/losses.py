@@ -24,8 +24,8 @@ from hybridvo.errors import InputError
 from hybridvo.network.inputs import MIN_DEPTH, TensorBatch
 from hybridvo.network.selection import NetworkOutput
 from hybridvo.options import Positive, option_group
+from hybridvo.results import PixelwisePrediction
 from hybridvo.torch_geometry import move, pixel_grid, project, rays
-from hybridvo.types import PixelwisePrediction
 
 MAX_EXPONENT = 30.0
 """exp(-s) goes on as a straight line beyond this."""

@@ -101,20 +101,6 @@ def default_models(device: str = "cpu") -> Models:
 
 
 @contextlib.contextmanager
-def plain_torch() -> Iterator[None]:
-    """Inference in float32 on the CPU, whatever the caller set for networks of its own."""
-    import torch
-
-    with contextlib.ExitStack() as stack:
-        stack.enter_context(torch.inference_mode())
-        if torch.is_autocast_enabled("cpu"):
-            stack.enter_context(torch.autocast("cpu", enabled=False))
-        if torch.get_default_device().type != "cpu":
-            stack.enter_context(torch.device("cpu"))
-        yield
-
-
-@contextlib.contextmanager
 def one_thread() -> Iterator[None]:
     """Run torch's CPU kernels on one thread, and as before afterwards.
 
