@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Any, overload
 import numpy as np
 
 from hybridvo.baselines import pnp, rgbd
-from hybridvo.checks import as_rigid, as_seed
 from hybridvo.errors import CheckpointError, InputError
 from hybridvo.flow import contradiction
 from hybridvo.geometry import ego_flow, se3_exp
@@ -28,16 +27,8 @@ from hybridvo.network.models import Models, default_models, one_thread
 from hybridvo.options import Options
 from hybridvo.refinement import refine as stage
 from hybridvo.refinement.photometric import refine_photometric
-from hybridvo.types import (
-    Camera,
-    Frame,
-    FramePair,
-    MotionPrediction,
-    MotionPrior,
-    PairBatch,
-    Reason,
-    RelativePose,
-)
+from hybridvo.results import MotionPrediction, MotionPrior, Reason, RelativePose
+from hybridvo.types import Camera, Frame, FramePair, PairBatch, as_rigid, as_seed
 from hybridvo.units import depth_advice, typical_depth
 
 if TYPE_CHECKING:
@@ -144,7 +135,7 @@ def pwvo_refine(pair: FramePair, ctx: Context) -> RelativePose:
 
     The same lines serve batches, with gradients to flow, depth, weights and maps.
     """
-    from hybridvo.network.inference import plain_torch
+    from hybridvo.network.layers import plain_torch
     from hybridvo.network.selection import select
     from hybridvo.refinement.torch_backend import refine_batch
 

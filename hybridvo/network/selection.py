@@ -23,8 +23,8 @@ import torch
 import torch.nn.functional as F
 
 from hybridvo.errors import InputError
+from hybridvo.results import PixelwisePrediction
 from hybridvo.torch_geometry import euler_transform
-from hybridvo.types import PixelwisePrediction
 
 SELECTION_METHODS = ("softmax", "argmin", "mean", "exp_plus_u", "joint")
 

@@ -18,8 +18,7 @@ from torch import nn
 from hybridvo.errors import CheckpointError, InputError
 from hybridvo.hypotheses.generate import GridMaps
 from hybridvo.hypotheses.selector import Candidates, Scores
-from hybridvo.network.inference import plain_torch
-from hybridvo.network.layers import scaled
+from hybridvo.network.layers import plain_torch, scaled
 from hybridvo.network.selector_inputs import (
     SelectorInputs,
     candidate_channels,
@@ -27,7 +26,7 @@ from hybridvo.network.selector_inputs import (
     shared_channels,
 )
 from hybridvo.network.weights import Weights
-from hybridvo.types import MotionPrior
+from hybridvo.results import MotionPrior
 
 CHANNELS = (24, 40, 64, 96)
 CANDIDATE_CHANNELS = 8

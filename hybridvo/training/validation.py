@@ -17,10 +17,10 @@ from hybridvo.errors import InputError
 from hybridvo.network.losses import NetworkOutput, reconstruct
 from hybridvo.network.normalization import predict
 from hybridvo.network.selection import select_pose
+from hybridvo.results import PixelwisePrediction
 from hybridvo.synthetic.presets import Preset
 from hybridvo.torch_geometry import euler_transform
 from hybridvo.training.stream import TrainingBatch, collate, sample_generator
-from hybridvo.types import PixelwisePrediction
 
 PUBLISHED_SEED = 1000
 """First seed of published figures; smaller ones are for development."""

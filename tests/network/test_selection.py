@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from hybridvo.errors import InputError
 from hybridvo.geometry import euler_deg_to_matrix
 from hybridvo.network.selection import SELECTION_METHODS, select_pose
+from hybridvo.results import PixelwisePrediction
 from hybridvo.torch_geometry import euler_transform
-from hybridvo.types import PixelwisePrediction
 
 
 def random_prediction(seed: int, shape=(2, 3, 7, 9), dtype=torch.float64) -> PixelwisePrediction:
