@@ -22,7 +22,7 @@ from hybridvo.errors import InputError
 if TYPE_CHECKING:
     import torch
 
-    from hybridvo.refinement.photometric_options import PhotometricReport
+    from hybridvo.refinement.photometric import PhotometricReport
 
 MAX_PIXELS = 2**28
 """Largest image, in pixels, that a frame or a file header may declare."""
