@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from hybridvo.checks import as_number, as_rigid, as_seed
 from hybridvo.errors import InputError
 from hybridvo.flow import FlowField, FlowProvider, check_field, dis_flow
 from hybridvo.geometry import invert, se3_exp, se3_log
@@ -27,12 +26,13 @@ from hybridvo.pipeline import (
     warm_up,
 )
 from hybridvo.refinement.photometric import refine_photometric
+from hybridvo.results import MotionPrior, Reason, RelativePose, State, Status, Step
 from hybridvo.tracking.keyframes import KeyFrame
 from hybridvo.tracking.pose_graph import Edge
 from hybridvo.tracking.state import TrackerState
 from hybridvo.tracking.window import Located, Window, corrected, locate
 from hybridvo.trajectory import chain
-from hybridvo.types import Frame, FramePair, MotionPrior, Reason, RelativePose, State, Status, Step
+from hybridvo.types import Frame, FramePair, as_number, as_rigid, as_seed
 
 FAILED_STD_M = 1.0
 FAILED_STD_RAD = 0.3

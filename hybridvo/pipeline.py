@@ -17,8 +17,7 @@ from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
-from hybridvo.baselines import pnp
-from hybridvo.checks import as_rigid, as_seed
+from hybridvo.baselines import pnp, rgbd
 from hybridvo.errors import CheckpointError, InputError
 from hybridvo.flow import contradiction
 from hybridvo.geometry import ego_flow, se3_exp
@@ -28,22 +27,16 @@ from hybridvo.network.models import Models, default_models, one_thread
 from hybridvo.options import Options
 from hybridvo.refinement import refine as stage
 from hybridvo.refinement.photometric import refine_photometric
-from hybridvo.types import (
-    Camera,
-    Frame,
-    FramePair,
-    MotionPrediction,
-    MotionPrior,
-    PairBatch,
-    Reason,
-    RelativePose,
-)
+from hybridvo.results import MotionPrediction, MotionPrior, Reason, RelativePose
+from hybridvo.types import Camera, Frame, FramePair, PairBatch, as_rigid, as_seed
 from hybridvo.units import depth_advice, typical_depth
 
 if TYPE_CHECKING:
     from hybridvo.refinement.batch import BatchedPose
 
 DEFAULT_METHOD = "hybrid"
+IDENTITY_STD = np.repeat([1.0, 0.3], 3)
+"""Standard deviations of no motion, m and rad: those of a step of a hand-held camera at most."""
 WARM_UP_SIZES = ((48, 64), (320, 400))
 """Height and width of the pairs of :func:`warm_up`; the second takes the parallel kernels."""
 
@@ -142,7 +135,7 @@ def pwvo_refine(pair: FramePair, ctx: Context) -> RelativePose:
 
     The same lines serve batches, with gradients to flow, depth, weights and maps.
     """
-    from hybridvo.network.inference import plain_torch
+    from hybridvo.network.layers import plain_torch
     from hybridvo.network.selection import select
     from hybridvo.refinement.torch_backend import refine_batch
 
@@ -166,28 +159,32 @@ def network_alone(name: str) -> Callable[[FramePair, Context], RelativePose]:
     return run
 
 
-def baseline(name: str) -> Callable[[FramePair, Context], RelativePose]:
-    """An estimator of another library."""
-    return lambda pair, ctx: pnp.baselines()[name](pair, seed=ctx.seed)
+def points_alone(name: str) -> Callable[[FramePair, Context], RelativePose]:
+    """A point solver of another library."""
+    return lambda pair, ctx: pnp.estimate_by_points(name, pair, ctx.seed)
+
+
+def images_alone(name: str) -> Callable[[FramePair, Context], RelativePose]:
+    """RGB-D odometry of another library."""
+    return lambda pair, ctx: rgbd.estimate_by_images(name, pair, ctx.seed)
+
+
+def identity(pair: FramePair, ctx: Context) -> RelativePose:
+    """No motion, with a fixed covariance: the floor that every method must beat."""
+    return RelativePose(covariance=np.diag(IDENTITY_STD**2))
 
 
 NETWORKS = ("pwvo", "pwvo-naive", "pixelwise", "vonet", "vonet-attention")
-BASELINES = (
-    "pnp-ransac",
-    "pnp-ransac-tuned",
-    "usac-magsac",
-    "poselib",
-    "opencv-rgbd",
-    "open3d-rgbd",
-    "identity",
-)
+BASELINES = (*pnp.SOLVERS, *rgbd.ALIGNERS, "identity")
 METHODS: dict[str, Callable[[FramePair, Context], RelativePose]] = {
     "hybrid": hybrid,
     "hybrid-flow": hybrid_flow,
     "refine": classical,
     "pwvo-refine": pwvo_refine,
     **{name: network_alone(name) for name in NETWORKS},
-    **{name: baseline(name) for name in BASELINES},
+    **{name: points_alone(name) for name in pnp.SOLVERS},
+    **{name: images_alone(name) for name in rgbd.ALIGNERS},
+    "identity": identity,
 }
 """Every method, in the order of the results' tables."""
 SELECTING = ("hybrid", "hybrid-flow")

@@ -1,225 +1,322 @@
-"""The estimators that others use today, behind one signature, with their answers checked.
+"""Point solvers of OpenCV and PoseLib: sample, solve, check.
 
-Every estimator is called as ``estimator(pair, seed=0)`` and returns a
-:class:`~hybridvo.types.RelativePose`. 3-D points come from the previous depth and ``K_prev``, 2-D
-points from the flow, seen by ``K_curr``. A solver's own "success" is not believed: the answer must
-be finite, keep its inliers in front of the camera, have enough of them, and they must determine all
-six degrees of freedom. Bad data gives a failed status, never an exception and never NaN.
+3-D points come from the previous depth and camera, 2-D points from the flow, seen by the current
+camera. A solver's own "success" is not believed: the motion must be finite, keep its inliers in
+front of the camera, have enough of them, and they must determine all six degrees of freedom. The
+check is the same for every baseline, so that "ok" means one thing in a comparison.
 """
 
 from __future__ import annotations
 
 import importlib
 import importlib.util
-import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
 import numpy as np
 
-from hybridvo.baselines.correspondences import (
-    MIN_POINTS,
-    POINTS,
-    Correspondences,
-    check_arguments,
-    check_pose,
-    sample_correspondences,
-)
-from hybridvo.baselines.rgbd import REMEDIES, open3d_rgbd, opencv_rgbd
-from hybridvo.errors import InputError
-from hybridvo.geometry import make_transform
-from hybridvo.types import Camera, FramePair, RelativePose, Status
+from hybridvo.geometry import make_transform, project
+from hybridvo.results import Reason, RelativePose, Status
+from hybridvo.types import Camera, FramePair
 
-__all__ = [
-    "baselines",
-    "identity",
-    "missing",
-    "open3d_rgbd",
-    "opencv_rgbd",
-    "pnp_ransac",
-    "pnp_ransac_tuned",
-    "poselib",
-    "usac_magsac",
-]
-
-Estimator = Callable[..., RelativePose]
-
-POSELIB_REMEDY = "PoseLib is not installed; pip install 'hybridvo[baselines]'"
-
-_IDENTITY_COVARIANCE = np.diag([1.0] * 3 + [0.1] * 3)
-_TUNED: dict[str, Any] = {"iterationsCount": 1000, "reprojectionError": 2.0, "confidence": 0.999}
-_NO_DISTORTION = np.zeros(4)
-_FOUND_NOTHING = (cv2.error, ValueError, RuntimeError, ArithmeticError)
+POINTS = 10_000
+"""Random valid pixels handed to a solver; all pixels cost 50 times more for no accuracy."""
+MIN_POINTS = 6
+"""Fewest correspondences and inliers: four always fit some pose, so they prove nothing."""
+DEPTH_RANGE_M = (1e-6, 1e6)
+"""Open interval of depths that can be metres; outside it squares leave the floating-point range."""
+MIN_INLIER_RATIO = 0.05
+"""Below this share of the sampled pixels a consensus is chance: failed."""
+LOW_INLIER_RATIO = 0.25
+"""Below this share the largest motion need not be the camera's: degraded."""
+SINGULAR_RATIO = 1e-10
+"""Eigenvalue ratio of the scaled information at which a direction is free: failed."""
+WEAK_RATIO = 1e-6
+"""Eigenvalue ratio below which a direction is weak: degraded. A frontal plane over a field of view
+of 20 degrees has 1e-4, a patch of 20 px at fx = 1000 has 1e-9."""
+TUNED: dict[str, Any] = {"iterationsCount": 1000, "reprojectionError": 2.0, "confidence": 0.999}
+TUNED_PX, DEFAULT_PX = 2.0, 8.0
+"""Largest residual of an inlier: of the tuned solvers, and OpenCV's default."""
+FOUND_NOTHING = (cv2.error, ValueError, RuntimeError, ArithmeticError)
 """What the libraries raise on data that determine no pose."""
 
 
-def pnp_ransac(pair: FramePair, *, seed: int = 0, points: int = POINTS) -> RelativePose:
-    """``cv2.solvePnPRansac`` with its defaults: 8 px, 100 iterations, confidence 0.99, EPnP.
+@dataclass(frozen=True, eq=False)
+class Correspondences:
+    """Sampled pixels of a pair.
 
     Args:
-        pair: depth of the previous frame (metres), flow (px) and both cameras are read.
-        seed: chooses the sampled pixels; OpenCV's own generator is fixed.
-        points: number of random valid pixels.
-
-    Returns:
-        ``T_curr_prev`` with covariance and status.
-
-    Raises:
-        InputError: ``pair`` is no FramePair, or ``seed`` or ``points`` cannot be used.
+        xyz: (n, 3) float64 metres in the previous camera.
+        uv: (n, 2) float64 px in the current image: pixel plus flow.
     """
 
-    def solve(data: Correspondences, camera: Camera, seed: int) -> np.ndarray | None:
-        found, rvec, tvec, _ = cv2.solvePnPRansac(data.xyz, data.uv, camera.K, _NO_DISTORTION)
-        return _opencv_pose(found, rvec, tvec)
-
-    return _sparse("pnp-ransac", solve, pair, seed, points, threshold_px=8.0)
+    xyz: np.ndarray
+    uv: np.ndarray
 
 
-def pnp_ransac_tuned(pair: FramePair, *, seed: int = 0, points: int = POINTS) -> RelativePose:
-    """``cv2.solvePnPRansac`` at 2 px, 1000 iterations, 0.999, then LM on the inliers.
-
-    Args, returns and raises as :func:`pnp_ransac`.
-    """
-
-    def solve(data: Correspondences, camera: Camera, seed: int) -> np.ndarray | None:
-        found, rvec, tvec, inliers = cv2.solvePnPRansac(
-            data.xyz,
-            data.uv,
-            camera.K,
-            _NO_DISTORTION,
-            **_TUNED,
-        )
-        if found and inliers is not None and len(inliers) >= MIN_POINTS:
-            keep = inliers[:, 0]
-            rvec, tvec = cv2.solvePnPRefineLM(
-                data.xyz[keep], data.uv[keep], camera.K, _NO_DISTORTION, rvec, tvec
-            )
-        return _opencv_pose(found, rvec, tvec)
-
-    return _sparse("pnp-ransac-tuned", solve, pair, seed, points)
+Solver = Callable[[Correspondences, Camera, int], np.ndarray | None]
+"""(correspondences, current camera, seed) -> (4, 4) T_curr_prev, or None."""
 
 
-def usac_magsac(pair: FramePair, *, seed: int = 0, points: int = POINTS) -> RelativePose:
-    """``cv2.solvePnPRansac`` with ``cv2.USAC_MAGSAC`` at 2 px, 1000 iterations, 0.999.
-
-    Args, returns and raises as :func:`pnp_ransac`.
-    """
-
-    def solve(data: Correspondences, camera: Camera, seed: int) -> np.ndarray | None:
-        found, rvec, tvec, _ = cv2.solvePnPRansac(
-            data.xyz,
-            data.uv,
-            camera.K,
-            _NO_DISTORTION,
-            **_TUNED,
-            flags=cv2.USAC_MAGSAC,
-        )
-        return _opencv_pose(found, rvec, tvec)
-
-    return _sparse("usac-magsac", solve, pair, seed, points)
+def solve_default(data: Correspondences, camera: Camera, seed: int) -> np.ndarray | None:
+    """``cv2.solvePnPRansac`` with its defaults: 8 px, 100 iterations, confidence 0.99, EPnP."""
+    found, rvec, tvec, _ = cv2.solvePnPRansac(data.xyz, data.uv, camera.K, None)
+    return _opencv_pose(found, rvec, tvec)
 
 
-def poselib(pair: FramePair, *, seed: int = 0, points: int = POINTS) -> RelativePose:
+def solve_tuned(data: Correspondences, camera: Camera, seed: int) -> np.ndarray | None:
+    """``cv2.solvePnPRansac`` at 2 px, 1000 iterations, 0.999, then LM on the inliers."""
+    found, rvec, tvec, inliers = cv2.solvePnPRansac(data.xyz, data.uv, camera.K, None, **TUNED)
+    if found and inliers is not None and len(inliers) >= MIN_POINTS:
+        xyz, uv = data.xyz[inliers[:, 0]], data.uv[inliers[:, 0]]
+        rvec, tvec = cv2.solvePnPRefineLM(xyz, uv, camera.K, None, rvec, tvec)
+    return _opencv_pose(found, rvec, tvec)
+
+
+def solve_magsac(data: Correspondences, camera: Camera, seed: int) -> np.ndarray | None:
+    """``cv2.solvePnPRansac`` with ``cv2.USAC_MAGSAC`` at 2 px, 1000 iterations, 0.999."""
+    found, rvec, tvec, _ = cv2.solvePnPRansac(
+        data.xyz, data.uv, camera.K, None, **TUNED, flags=cv2.USAC_MAGSAC
+    )
+    return _opencv_pose(found, rvec, tvec)
+
+
+def solve_poselib(data: Correspondences, camera: Camera, seed: int) -> np.ndarray | None:
     """PoseLib's LO-RANSAC at 2 px, 100 to 1000 iterations, 0.999, bundle adjustment included.
 
     Its default of at least 1000 iterations takes three times as long and is no more accurate here.
-    PoseLib takes one camera, that of the 2-D points: ``K_curr``.
-
-    Args, returns and raises as :func:`pnp_ransac`.
-
-    Raises:
-        InputError: PoseLib is not installed.
     """
-    try:
-        import poselib as library
-    except ImportError:
-        raise InputError(f"poselib: {POSELIB_REMEDY}.") from None
+    import poselib
 
-    def solve(data: Correspondences, camera: Camera, seed: int) -> np.ndarray | None:
-        model = {
-            "model": "PINHOLE",
-            "width": camera.width,
-            "height": camera.height,
-            "params": [camera.fx, camera.fy, camera.cx, camera.cy],
-        }
-        options = {
-            "max_reproj_error": 2.0,
-            "min_iterations": 100,
-            "max_iterations": 1000,
-            "success_prob": 0.999,
-            "seed": seed,
-        }
-        pose, _ = library.estimate_absolute_pose(data.uv, data.xyz, model, options, {})
-        return make_transform(np.asarray(pose.R), np.asarray(pose.t))
-
-    return _sparse("poselib", solve, pair, seed, points)
-
-
-def identity(pair: FramePair, *, seed: int = 0) -> RelativePose:
-    """The zero-motion predictor: the floor every method must beat.
-
-    Its covariance is a fixed prior of 1 m and 0.3 rad a step; nothing of the pair is read.
-    """
-    check_arguments("identity", pair, seed)
-    return RelativePose(covariance=_IDENTITY_COVARIANCE.copy(), method="identity")
-
-
-def baselines() -> dict[str, Estimator]:
-    """Name -> estimator, of every baseline that can run here; :func:`missing` names the others."""
-    known: dict[str, Estimator] = {
-        "pnp-ransac": pnp_ransac,
-        "pnp-ransac-tuned": pnp_ransac_tuned,
-        "usac-magsac": usac_magsac,
-        "poselib": poselib,
-        "opencv-rgbd": opencv_rgbd,
-        "open3d-rgbd": open3d_rgbd,
-        "identity": identity,
+    model = {
+        "model": "PINHOLE",
+        "width": camera.width,
+        "height": camera.height,
+        "params": [camera.fx, camera.fy, camera.cx, camera.cy],
     }
-    absent = missing()
-    return {name: estimator for name, estimator in known.items() if name not in absent}
+    options = {
+        "max_reproj_error": TUNED_PX,
+        "min_iterations": 100,
+        "max_iterations": TUNED["iterationsCount"],
+        "success_prob": TUNED["confidence"],
+        "seed": seed,
+    }
+    pose, _ = poselib.estimate_absolute_pose(data.uv, data.xyz, model, options, {})
+    return make_transform(np.asarray(pose.R), np.asarray(pose.t))
+
+
+SOLVERS: dict[str, tuple[Solver, float]] = {
+    "pnp-ransac": (solve_default, DEFAULT_PX),
+    "pnp-ransac-tuned": (solve_tuned, TUNED_PX),
+    "usac-magsac": (solve_magsac, TUNED_PX),
+    "poselib": (solve_poselib, TUNED_PX),
+}
+"""Solver and largest residual of an inlier, px, by method."""
+
+
+def estimate_by_points(method: str, pair: FramePair, seed: int = 0) -> RelativePose:
+    """Motion of a pair by one of :data:`SOLVERS`.
+
+    Args:
+        method: which.
+        pair: depth of the previous frame (metres), flow (px) and both cameras are read.
+        seed: chooses the sampled pixels; OpenCV's own generator is fixed.
+    """
+    solve, threshold_px = SOLVERS[method]
+    data = sample(pair, seed)
+    if isinstance(data, Status):
+        return RelativePose.failed(data.reason, data.message, method)
+    try:
+        T = solve(data, pair.curr.camera, seed)
+    except FOUND_NOTHING:
+        T = None
+    return check(method, T, data, pair.curr.camera, threshold_px)
 
 
 def missing() -> dict[str, str]:
     """Name -> reason and remedy, of every baseline that cannot run here."""
     absent = {}
     for name, library, remedy in (
-        ("poselib", "poselib", POSELIB_REMEDY),
-        ("open3d-rgbd", "open3d", REMEDIES["open3d-rgbd"]),
+        ("poselib", "poselib", "pip install 'hybridvo[baselines]'"),
+        ("open3d-rgbd", "open3d", "pip install open3d"),
     ):
         if importlib.util.find_spec(library) is None:
-            absent[name] = remedy
+            absent[name] = f"{library} is not installed; {remedy}"
             continue
         try:
             importlib.import_module(library)
         except ImportError as error:  # Open3D without its system libraries
             absent[name] = f"{library} is installed but cannot be imported: {error}; {remedy}"
     if not hasattr(cv2, "Odometry"):
-        absent["opencv-rgbd"] = REMEDIES["opencv-rgbd"]
+        absent["opencv-rgbd"] = (
+            "this OpenCV has no cv2.Odometry (it came with 5.0); "
+            "pip install 'opencv-python-headless>=5'"
+        )
     return absent
 
 
-def _sparse(
+def sample(pair: FramePair, seed: int, points: int = POINTS) -> Correspondences | Status:
+    """Random valid pixels as correspondences, or the reason why there are fewer than six.
+
+    Candidates are drawn first and checked after, so that a large image is not read as a whole for
+    ten thousand of its pixels; only where too many of them are invalid is the full mask made.
+    """
+    depth, flow, camera = pair.prev.depth, pair.flow, pair.prev.camera
+    if flow is None:
+        return Status.failed(Reason.NO_FLOW, "the pair has no flow")
+    if depth is None:
+        return Status.failed(Reason.NO_VALID_DEPTH, "the previous frame has no depth")
+    depth, flow = depth.reshape(-1), flow.reshape(-1, 2)
+    rng = np.random.default_rng(seed)
+
+    def usable(index: np.ndarray) -> np.ndarray:
+        index = index[depth_valid(depth[index])]
+        for mask in (pair.prev.mask, pair.flow_valid):
+            if mask is not None:
+                index = index[mask.reshape(-1)[index]]
+        v, u = np.divmod(index, camera.width)
+        x, y = u + flow[index, 0], v + flow[index, 1]
+        inside = (x > -0.5) & (x < camera.width - 0.5) & (y > -0.5) & (y < camera.height - 0.5)
+        return index[inside]
+
+    keep = np.arange(depth.size)
+    if depth.size > 4 * points:
+        keep = usable(rng.choice(depth.size, 2 * points, replace=False))
+    if len(keep) < points or depth.size <= 4 * points:
+        keep = usable(np.arange(depth.size))
+    if len(keep) < MIN_POINTS:
+        if not depth_valid(depth).any():
+            return Status.failed(
+                Reason.NO_VALID_DEPTH, "the previous depth has no finite positive value (metres)"
+            )
+        if not np.isfinite(flow).all(axis=-1).any():
+            return Status.failed(Reason.NO_FLOW, "the flow has no finite value")
+        return Status.failed(
+            Reason.LOW_INLIERS, f"{len(keep)} pixels with valid depth and flow, need {MIN_POINTS}"
+        )
+    if len(keep) > points:
+        keep = rng.choice(keep, points, replace=False)
+    v, u = np.divmod(keep, camera.width)
+    z = depth[keep].astype(np.float64)
+    xyz = np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], axis=-1)
+    return Correspondences(xyz, flow[keep].astype(np.float64) + np.stack([u, v], axis=-1))
+
+
+def depth_valid(depth: np.ndarray) -> np.ndarray:
+    """Boolean array: depth that can be metres; False for NaN, inf, zero and negative values."""
+    return (depth > DEPTH_RANGE_M[0]) & (depth < DEPTH_RANGE_M[1])
+
+
+def check(
     method: str,
-    solve: Callable[[Correspondences, Camera, int], np.ndarray | None],
-    pair: FramePair,
-    seed: int,
-    points: int,
-    threshold_px: float = 2.0,
+    T: np.ndarray | None,
+    data: Correspondences,
+    camera: Camera,
+    threshold_px: float,
+    sigma_px: float | None = None,
 ) -> RelativePose:
-    """Sample, solve, check: what all point solvers share."""
-    start = time.perf_counter()
-    check_arguments(method, pair, seed, points)
-    sampled = sample_correspondences(pair, points, int(seed))
-    if isinstance(sampled, Status):
-        result = RelativePose.failed(sampled.reason, sampled.message, method)
-    else:
-        try:
-            T = solve(sampled, pair.curr.camera, int(seed) % 2**31)
-        except _FOUND_NOTHING:
-            T = None
-        result = check_pose(method, T, sampled, pair.curr.camera, threshold_px)
-    return result.replace(ms=1e3 * (time.perf_counter() - start))
+    """A solver's motion with covariance and status; failed with the identity where it is none.
+
+    Inliers are counted again: in front of the camera after the motion and within ``threshold_px``.
+    Covariance sigma^2 (J^T J)^-1 over them, sigma^2 = |r|^2 / (2 n - 6) unless ``sigma_px`` is
+    given, J by the left perturbation, translation first. With a solver that stops short of the
+    least-squares optimum of its inliers this is the covariance of the optimum, thus optimistic.
+
+    Args:
+        method: name for the result and its messages.
+        T: (4, 4) the solver's ``T_curr_prev``, or None where it found none.
+        data: what the solver was given.
+        camera: of the current frame.
+        threshold_px: largest residual of an inlier.
+        sigma_px: standard deviation of the residuals where it is known.
+    """
+    diverged = RelativePose.failed(
+        Reason.SOLVER_DIVERGED, f"{method}: the solver found no finite rigid motion", method
+    )
+    if T is None or not is_rigid(T):
+        return _degenerate(method, data, camera) or diverged
+    moved = data.xyz @ T[:3, :3].T + T[:3, 3]
+    squared = ((project(moved, camera) - data.uv) ** 2).sum(axis=-1)  # NaN behind the camera
+    inlier = (moved[:, 2] > DEPTH_RANGE_M[0]) & (squared < threshold_px**2)
+    count, ratio = int(inlier.sum()), float(inlier.mean())
+    if count < MIN_POINTS or ratio < MIN_INLIER_RATIO:
+        message = f"{method}: {count} of {len(inlier)} sampled pixels follow the motion"
+        few = RelativePose.failed(Reason.LOW_INLIERS, message, method, inlier_ratio=ratio)
+        return _degenerate(method, data, camera) or few
+    values, vectors, scale = _information(moved[inlier], camera)
+    if values[0] <= SINGULAR_RATIO * values[-1]:
+        return _undetermined(method, count, values, ratio)
+    status = Status()
+    if values[0] <= WEAK_RATIO * values[-1]:
+        status = Status.degraded(
+            Reason.DEGENERATE_GEOMETRY, f"{method}: a direction of the motion is barely determined"
+        )
+    elif ratio < LOW_INLIER_RATIO:
+        status = Status.degraded(
+            Reason.LOW_INLIERS, f"{method}: only {ratio:.0%} of the pixels follow the motion"
+        )
+    cost = float(squared[inlier].sum())
+    sigma = np.sqrt(cost / (2 * count - 6)) if sigma_px is None else sigma_px
+    half = vectors * scale[:, None] / np.sqrt(values)
+    # exact data has no residual; float32 flow near 1000 px is rounded at 6e-5 px all the same
+    covariance = max(sigma, 1e-4) ** 2 * (half @ half.T)
+    t = T[:3, 3]
+    return RelativePose(
+        T_curr_prev=T,
+        covariance=covariance,
+        status=status,
+        inlier_ratio=ratio,
+        cost=cost / len(inlier),
+        residual_scale_px=float(sigma),
+        translation_direction_valid=bool(t @ np.linalg.solve(covariance[:3, :3], t) > 9.0),
+        information_eigenvalues=values,
+        method=method,
+    )
+
+
+def is_rigid(T: np.ndarray) -> bool:
+    """Whether ``T`` is a finite (4, 4) rigid transform of a length that can be metres."""
+    if T.shape != (4, 4) or not np.isfinite(T).all() or np.abs(T[:3, 3]).max() > DEPTH_RANGE_M[1]:
+        return False
+    R = T[:3, :3]
+    return bool(np.abs(R @ R.T - np.eye(3)).max() < 1e-6 and np.linalg.det(R) > 0)
+
+
+def _information(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Ascending eigenvalues and eigenvectors of J^T J with metres in typical depths; the scale."""
+    z = points[:, 2]
+    # both halves of the tangent are then in radians
+    scale = np.array([float(np.median(z))] * 3 + [1.0] * 3)
+    x, y, zero = points[:, 0] / z, points[:, 1] / z, np.zeros_like(z)
+    J = np.concatenate(
+        [
+            camera.fx * np.stack([1 / z, zero, -x / z, -x * y, 1 + x * x, -y], axis=-1),
+            camera.fy * np.stack([zero, 1 / z, -y / z, -1 - y * y, x * y, x], axis=-1),
+        ]
+    )
+    J *= scale
+    values, vectors = np.linalg.eigh(J.T @ J)
+    return values, vectors, scale
+
+
+def _degenerate(method: str, data: Correspondences, camera: Camera) -> RelativePose | None:
+    """The failure where no solver could have found the motion: the points are degenerate."""
+    values, _, _ = _information(data.xyz, camera)
+    if values[0] > SINGULAR_RATIO * values[-1]:
+        return None
+    return _undetermined(method, len(data.uv), values)
+
+
+def _undetermined(method: str, count: int, values: np.ndarray, ratio: float = 0.0) -> RelativePose:
+    return RelativePose.failed(
+        Reason.DEGENERATE_GEOMETRY,
+        f"{method}: the {count} points leave a direction of the motion undetermined",
+        method,
+        inlier_ratio=ratio,
+        information_eigenvalues=np.maximum(values, 0.0),
+    )
 
 
 def _opencv_pose(found: bool, rvec: np.ndarray, tvec: np.ndarray) -> np.ndarray | None:

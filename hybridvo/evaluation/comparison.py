@@ -42,7 +42,7 @@ from hybridvo.evaluation.sources import expand, methods_to_run
 from hybridvo.evaluation.worst import draw_worst, worst_pairs
 from hybridvo.files import write_csv, write_json
 from hybridvo.pipeline import Models, weights_hash
-from hybridvo.trajectory import Trajectory, write_tum
+from hybridvo.trajectory import Trajectory
 
 WRITTEN = ("results.json", "results.csv", "pairs.csv", "report.md", "report.html")
 """What a finished comparison leaves, beside ``trajectories/`` and ``worst/``."""
@@ -331,7 +331,7 @@ def _write_trajectories(out: Path, parts: Iterable[Mapping[str, Any]]) -> list[d
             stamps = part["timestamps"]["ground_truth" if true else "estimate"]
             kind = f"_{flow.split()[0]}" if flow else ""
             path = f"trajectories/{number:03d}_{_plain(part)}_{method}{kind}.tum"
-            write_tum(Trajectory(np.array(stamps), np.array(poses)), out / path)
+            Trajectory(np.array(stamps), np.array(poses)).save(out / path)
             found.append(
                 {
                     "sequence": part["sequence"]["name"],

@@ -20,7 +20,8 @@ from hybridvo.evaluation.sources import SharedFlow
 from hybridvo.files import atomic_write
 from hybridvo.network.options import KINDS
 from hybridvo.pipeline import Models, estimate, networks_of
-from hybridvo.types import FramePair, PixelwisePrediction
+from hybridvo.results import PixelwisePrediction
+from hybridvo.types import FramePair
 
 THUMBNAIL_WIDTH = 256
 """Width of each panel of a worst pair, px: a report holds a hundred of them."""

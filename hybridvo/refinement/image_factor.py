@@ -22,7 +22,8 @@ from hybridvo.refinement import photometric_kernels as kernels
 from hybridvo.refinement.full_fit import tile_size
 from hybridvo.refinement.pixels import as_contiguous, typical
 from hybridvo.refinement.solver import Linearization, positive_inverse
-from hybridvo.types import FramePair, RelativePose
+from hybridvo.results import RelativePose
+from hybridvo.types import FramePair
 
 CUTOFF = 3.0
 """c of the Geman-McClure kernel, in standard deviations."""

@@ -20,12 +20,12 @@ import numpy as np
 from hybridvo.errors import InputError
 from hybridvo.geometry import pose_matrix
 from hybridvo.options import PhotometricOptions
-from hybridvo.refinement.factors import PriorFactor
 from hybridvo.refinement.image_factor import ImageFactor
 from hybridvo.refinement.photometric_kernels import select_pixels
 from hybridvo.refinement.pixels import as_contiguous
-from hybridvo.refinement.solver import SolverOptions, gauss_newton, positive_inverse
-from hybridvo.types import Frame, FramePair, RelativePose
+from hybridvo.refinement.solver import PriorFactor, SolverOptions, gauss_newton, positive_inverse
+from hybridvo.results import RelativePose
+from hybridvo.types import Frame, FramePair
 
 PER_CELL = 4
 MIN_WEIGHT = 0.25

@@ -17,7 +17,8 @@ from hybridvo.options import RefineOptions
 from hybridvo.refinement.coarse_fit import fit_coarse
 from hybridvo.refinement.full_fit import MIN_TILES, FullFit, fit_full_grid
 from hybridvo.refinement.pixels import CoarseGrid, coarse_grid
-from hybridvo.types import FramePair, Hypothesis, Reason, RelativePose, Status
+from hybridvo.results import Hypothesis, Reason, RelativePose, Status
+from hybridvo.types import FramePair
 
 WEAK_RATIO = 2e-5
 """Ratio of the information's extreme eigenvalues below which errors that neighbours share, and that

@@ -17,6 +17,7 @@ import numpy as np
 
 from hybridvo.geometry import invert, se3_log
 from hybridvo.options import TrackOptions
+from hybridvo.results import Reason, RelativePose, State, Status
 from hybridvo.tracking.keyframes import KeyFrame, View, spread_px, static_cells
 from hybridvo.tracking.pose_graph import (
     CHI2_LIMIT,
@@ -26,7 +27,7 @@ from hybridvo.tracking.pose_graph import (
     compose_covariance,
     solve_graph,
 )
-from hybridvo.types import Frame, Reason, RelativePose, State, Status
+from hybridvo.types import Frame
 
 Register = Callable[["KeyFrame", Frame, np.ndarray, np.ndarray, np.ndarray], RelativePose]
 """(key frame, frame, predicted T_frame_key, its covariance, (H, W) weights) -> motion."""
