@@ -10,7 +10,14 @@ import pytest
 from hybridvo.errors import InputError
 from hybridvo.geometry import ego_flow, se3_exp
 from hybridvo.hypotheses.generate import HypothesisSet, generate
-from hybridvo.hypotheses.selector import Candidates, CueSelector, MaskSelector, Scores
+from hybridvo.hypotheses.selector import (
+    NO_RIVAL,
+    Candidates,
+    CueSelector,
+    MaskSelector,
+    Scores,
+    evidence_of,
+)
 from hybridvo.options import Options, SelectOptions
 from hybridvo.pipeline import Context, estimate, refine, refine_selection
 from hybridvo.results import MotionPrediction, MotionPrior, RelativePose, State
@@ -199,3 +206,25 @@ def test_masks_grow_to_the_image(case) -> None:
     small = replace(grid, shape=(2, 2, 4), size=(20, 20), box=(4, 12, 6, 14))
     inner = small.upsample(np.ones((2, 2), np.float32))
     assert inner.sum() == 64 and inner[4:12, 6:14].all()
+
+
+def test_only_another_motion_is_a_rival(case) -> None:
+    found, _, _ = case
+    poses = np.concatenate([found.poses, found.poses[:1]])  # the first one found twice
+    candidates = Candidates(poses, found.facts, np.arange(len(poses)), len(found.poses))
+    masks = np.zeros((0, 1, 1))
+    areas = np.full((len(poses), 2), 0.1)
+    areas[[0, -1]] = 0.4
+    scores = np.zeros(len(poses))
+    scores[[0, -1]] = 3.0
+    evidence = evidence_of(found, candidates, Scores(scores, np.zeros(0), masks, 0.9, areas))
+    np.testing.assert_allclose(evidence[:2], [np.log(9), 3.0])
+    assert (evidence[2:4] > 1).all() and (evidence[4:] == 0.4).all()
+    # a rival that explains as much leaves less to believe
+    areas[1] = 0.4
+    scores[1] = 2.9
+    equal = evidence_of(found, candidates, Scores(scores, np.zeros(0), masks, 0.9, areas))
+    np.testing.assert_allclose(equal[1:4], [0.1, 0.0, 0.0], atol=1e-12)
+    alone = replace(candidates, poses=poses[[0, -1]])
+    one = Scores(scores[[0, -1]], np.zeros(0), masks, 0.9, areas[[0, -1]])
+    assert evidence_of(found, alone, one)[1] == NO_RIVAL
