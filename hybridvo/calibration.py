@@ -7,7 +7,7 @@ last weight is the offset. ``python tools/calibrate.py`` fits them on the develo
 
 CUES_RIGHT = (4.4, 0.0)
 """Of the difference of the two best cue scores."""
-SELECTOR_RIGHT = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+SELECTOR_RIGHT = (1.0, 0.0, 0.0)
 """Of :func:`hybridvo.hypotheses.selector.evidence_of`."""
 CLEAR_RIGHT = 1.0
 """Share of right answers where the first motion explains nearly all that the depth sensor sees."""

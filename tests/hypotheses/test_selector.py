@@ -46,7 +46,7 @@ class Oracle:
         score[-1 if self.refits else 0] = 5.0
         best = np.arange(min(masks, count))
         drawn = np.stack([self.static] * len(best)) if masks else np.zeros((0, *self.static.shape))
-        return Scores(score, best, drawn, self.confidence, np.full((count, 2), 0.3))
+        return Scores(score, best, drawn, self.confidence)
 
 
 @pytest.fixture(scope="module")
@@ -213,18 +213,14 @@ def test_only_another_motion_is_a_rival(case) -> None:
     poses = np.concatenate([found.poses, found.poses[:1]])  # the first one found twice
     candidates = Candidates(poses, found.facts, np.arange(len(poses)), len(found.poses))
     masks = np.zeros((0, 1, 1))
-    areas = np.full((len(poses), 2), 0.1)
-    areas[[0, -1]] = 0.4
-    scores = np.zeros(len(poses))
-    scores[[0, -1]] = 3.0
-    evidence = evidence_of(found, candidates, Scores(scores, np.zeros(0), masks, 0.9, areas))
-    np.testing.assert_allclose(evidence[:2], [np.log(9), 3.0])
-    assert (evidence[2:4] > 1).all() and (evidence[4:] == 0.4).all()
-    # a rival that explains as much leaves less to believe
-    areas[1] = 0.4
-    scores[1] = 2.9
-    equal = evidence_of(found, candidates, Scores(scores, np.zeros(0), masks, 0.9, areas))
-    np.testing.assert_allclose(equal[1:4], [0.1, 0.0, 0.0], atol=1e-12)
+    score = np.zeros(len(poses))
+    score[[0, -1]] = 3.0
+    evidence = evidence_of(found, candidates, Scores(score, np.zeros(0), masks, 0.9))
+    np.testing.assert_allclose(evidence, [np.log(9), 3.0])
+    # a rival that looks as good leaves less to believe
+    score[1] = 2.9
+    doubted = evidence_of(found, candidates, Scores(score, np.zeros(0), masks, 0.9))
+    np.testing.assert_allclose(doubted[1], 0.1)
     alone = replace(candidates, poses=poses[[0, -1]])
-    one = Scores(scores[[0, -1]], np.zeros(0), masks, 0.9, areas[[0, -1]])
+    one = Scores(score[[0, -1]], np.zeros(0), masks, 0.9)
     assert evidence_of(found, alone, one)[1] == NO_RIVAL
