@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import subprocess
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,19 @@ SCALE_OF = {
     "laplace": "s of the translation is the log scale of a Laplace error in metres",
     "direction": "s of the translation is the log scale of the paper's direction-and-length error",
 }
+
+
+def source_commit() -> str | None:
+    """Commit of the working tree, with a mark if it was changed; None outside of a repository."""
+    command = ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude", "*"]
+    here = Path(__file__).resolve().parent
+    try:
+        done = subprocess.run(
+            command, cwd=here, capture_output=True, text=True, timeout=10, check=True
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout.strip() or None
 
 
 def run_card(trainer: Trainer) -> dict[str, Any]:
