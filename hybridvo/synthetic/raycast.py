@@ -3,6 +3,9 @@
 Every solid is a unit shape under an affine map, so that one intersection routine per shape serves
 rigid and deforming bodies alike. A ray is (x, y, 1) t in the camera frame: its parameter t *is* the
 depth, and an affine map leaves it unchanged. Compiled with numba, one thread, float64 throughout.
+
+P solids are given by ``shapes`` (P,) int64, ``A`` (P, 3, 4) maps from the unit shape to the camera
+frame in metres, their inverses ``B``, and ``bounds`` (P, 4) of :func:`screen_bounds`; K: (3, 3).
 """
 
 from __future__ import annotations
@@ -24,14 +27,7 @@ NEAR = 0.05
 def screen_bounds(A_cam_body: np.ndarray, K: np.ndarray, height: int, width: int) -> np.ndarray:
     """Pixel rectangles that surely contain each solid.
 
-    Args:
-        A_cam_body: (P, 3, 4) affine maps, unit shape to camera frame (metres).
-        K: (3, 3) intrinsics.
-        height: pixels.
-        width: pixels.
-
-    Returns:
-        (P, 4) int64 inclusive (u0, u1, v0, v1), clipped to the image; u0 > u1 where unseen.
+    (P, 4) int64 inclusive (u0, u1, v0, v1), clipped to the image; u0 > u1 where unseen.
     """
     cube = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
     corners = np.einsum("pij,cj->pci", A_cam_body[:, :, :3], cube) + A_cam_body[:, None, :, 3]
@@ -102,18 +98,8 @@ def _hit(shape, B, x, y):  # pragma: no cover - compiled
 
 @njit(cache=True, nogil=True)
 def cast(shapes, B_body_cam, bounds, K, height, width):  # pragma: no cover - compiled
-    """Nearest solid of every pixel.
-
-    Args:
-        shapes: (P,) int64 of BOX, ELLIPSOID, CYLINDER.
-        B_body_cam: (P, 3, 4) affine maps, camera frame (metres) to unit shape.
-        bounds: (P, 4) from :func:`screen_bounds`.
-        K: (3, 3) intrinsics.
-        height: pixels.
-        width: pixels.
-
-    Returns:
-        (H, W) float64 depth, inf where nothing is hit; (H, W) int32 solid index, -1 there.
+    """Nearest solid of every pixel: its depth (H, W) float64, inf where nothing is hit, and its
+    index (H, W) int32, -1 there.
     """
     depth = np.full((height, width), np.inf)
     index = np.full((height, width), -1, dtype=np.int32)
@@ -135,18 +121,8 @@ def motion(  # pragma: no cover - compiled
     """Exact optical flow and visibility of every pixel in the next frame.
 
     The visible point of a pixel is carried by its solid from t to t+1 and projected into the next
-    camera; a ray cast exactly there says whether it is seen.
-
-    Args:
-        depth: (H, W) from :func:`cast` of the previous frame.
-        index: (H, W) from the same call.
-        B_prev: (P, 3, 4) previous camera frame to unit shape.
-        K_prev: (3, 3) intrinsics of the previous camera.
-        shapes: (P,) as in :func:`cast`.
-        A_curr: (P, 3, 4) unit shape to current camera frame.
-        B_curr: (P, 3, 4) its inverse.
-        bounds_curr: (P, 4) from :func:`screen_bounds` of the current frame.
-        K_curr: (3, 3) intrinsics of the current camera.
+    camera; a ray cast exactly there says whether it is seen. ``depth`` and ``index`` are those of
+    :func:`cast` in the previous frame.
 
     Returns:
         (H, W, 2) float64 flow in pixels, NaN where there is no surface or it ends behind the next
@@ -271,19 +247,9 @@ def shade(  # pragma: no cover - compiled
 ):
     """Colour of every ray: solid multi-octave noise fixed to the body, times diffuse light.
 
-    Args:
-        depth: (H, W) from :func:`cast`.
-        index: (H, W) from the same call.
-        shapes: (P,) as in :func:`cast`.
-        B_body_cam: (P, 3, 4) as in :func:`cast`.
-        K: (3, 3) as in :func:`cast`.
-        scale: (P, 3) lattice steps of the coarsest octave per unit of the unit shape.
-        offset: (P, 3) place in the noise.
-        colours: (P, 2, 3) in [0, 1].
-        light_cam: (3,) unit direction towards the light, camera frame.
-
-    Returns:
-        (H, W, 3) float64 in [0, 1], 0 where nothing is hit.
+    ``scale`` (P, 3): lattice steps of the coarsest octave per unit of the unit shape; ``offset``
+    (P, 3): place in the noise; ``colours`` (P, 2, 3) in [0, 1]; ``light_cam`` (3,): unit direction
+    towards the light. (H, W, 3) float64 in [0, 1], 0 where nothing is hit.
     """
     height, width = depth.shape
     image = np.zeros((height, width, 3))

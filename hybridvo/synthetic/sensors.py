@@ -57,16 +57,9 @@ def _look_up(
 def degrade_flow(
     rng: np.random.Generator, flow: np.ndarray, hidden: np.ndarray, options: SensorOptions
 ) -> np.ndarray:
-    """Flow as DIS would have measured it.
+    """(H, W, 2) float32 px, flow as DIS would have measured the true one.
 
-    Args:
-        rng: source of randomness.
-        flow: (H, W, 2) float32 px, true.
-        hidden: (H, W) bool, points that are covered in the next frame or leave it.
-        options: strengths.
-
-    Returns:
-        (H, W, 2) float32 px.
+    ``hidden`` (H, W) bool: points that are covered in the next frame or leave it.
     """
     height, width = flow.shape[:2]
     o = options
@@ -114,15 +107,9 @@ def sample_at(depth: np.ndarray, offset: np.ndarray) -> np.ndarray:
 def degrade_depth(
     rng: np.random.Generator, depths: list[np.ndarray], options: SensorOptions
 ) -> list[np.ndarray]:
-    """Depths of one sensor: the same strengths for both frames, noise of their own.
+    """Depths (H, W) float32 in metres as one sensor would have measured them; 0 is invalid.
 
-    Args:
-        rng: source of randomness.
-        depths: (H, W) float32 metres each, 0 is invalid.
-        options: strengths.
-
-    Returns:
-        Damaged copies; 0 is invalid.
+    The same strengths for all frames, noise of their own.
     """
     o = options
     quadratic = rng.random() < 0.5

@@ -36,16 +36,12 @@ class OptimizerOptions:
         betas: moments' decay.
         weight_decay: decoupled; 0 is Adam.
         clip_norm: largest global norm of the gradient.
-        head_rate: factor on the rate of the motion heads' last layer. Its output is scaled by
-            0.01; at the common rate a short run spends itself on growing that layer's weights. 100
-            undoes the scale for Adam.
     """
 
     learning_rate: Positive = 1e-4
     betas: tuple[Below1, Below1] = (0.5, 0.999)
     weight_decay: NotNegative = 0.0
     clip_norm: Positive = 1.0
-    head_rate: Positive = 1.0
 
 
 @option_group
