@@ -19,9 +19,9 @@ from hybridvo.commands.inputs import is_dark
 from hybridvo.data.lists import shown
 from hybridvo.data.sequence import Sequence
 from hybridvo.errors import InputError
+from hybridvo.estimation import estimate
 from hybridvo.flow import contradiction, dis_flow, file_flow
 from hybridvo.geometry import ego_flow, invert
-from hybridvo.pipeline import estimate
 from hybridvo.refinement.depth_agreement import depth_ratio, is_step
 from hybridvo.types import Frame, FramePair, RelativePose
 from hybridvo.units import depth_advice, typical_depth

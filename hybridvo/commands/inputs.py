@@ -16,8 +16,9 @@ import hybridvo
 from hybridvo.data.sequence import Sequence
 from hybridvo.errors import InputError
 from hybridvo.flow import FlowField, FlowProvider, dis_flow, fallback, file_flow
+from hybridvo.network.models import Models
 from hybridvo.options import Options
-from hybridvo.pipeline import Models, networks_of
+from hybridvo.pipeline import networks_of
 from hybridvo.types import Frame
 
 DARK_LEVEL = 20.0

@@ -30,9 +30,10 @@ from hybridvo.errors import InputError
 from hybridvo.evaluation.pair_errors import pair_errors
 from hybridvo.files import fingerprint
 from hybridvo.geometry import invert, se3_log
+from hybridvo.network.models import Models
 from hybridvo.odometry import Odometry
 from hybridvo.options import Options
-from hybridvo.pipeline import Models, check_method, weights_hash
+from hybridvo.pipeline import check_method, weights_hash
 from hybridvo.refinement.depth_agreement import depth_ratio
 from hybridvo.tracking.state import TrackerState
 from hybridvo.trajectory import Trajectory

@@ -41,7 +41,8 @@ from hybridvo.evaluation.sequence_job import (
 from hybridvo.evaluation.sources import expand, methods_to_run
 from hybridvo.evaluation.worst import draw_worst, worst_pairs
 from hybridvo.files import write_csv, write_json
-from hybridvo.pipeline import Models, weights_hash
+from hybridvo.network.models import Models
+from hybridvo.pipeline import weights_hash
 from hybridvo.trajectory import Trajectory, write_tum
 
 WRITTEN = ("results.json", "results.csv", "pairs.csv", "report.md", "report.html")

@@ -11,6 +11,7 @@ import numpy as np
 
 from hybridvo.data.sequence import Sequence, iter_pairs, open_sequence
 from hybridvo.errors import InputError
+from hybridvo.estimation import estimate
 from hybridvo.evaluation.maps import (
     Saliency,
     error_map,
@@ -29,7 +30,7 @@ from hybridvo.evaluation.sources import SharedFlow
 from hybridvo.files import atomic_write, write_json
 from hybridvo.geometry import matrix_to_euler_deg
 from hybridvo.network.options import KINDS
-from hybridvo.pipeline import DEFAULT_METHOD, estimate
+from hybridvo.pipeline import DEFAULT_METHOD
 from hybridvo.types import FramePair, PixelwisePrediction
 
 SALIENCY_BLOCK = 4

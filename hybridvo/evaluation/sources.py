@@ -13,7 +13,8 @@ import numpy as np
 from hybridvo.data.sequence import Sequence, open_sequence
 from hybridvo.errors import HybridVOError, InputError
 from hybridvo.flow import FlowField, dis_flow, file_flow
-from hybridvo.pipeline import METHODS, Models, check_method
+from hybridvo.network.models import Models
+from hybridvo.pipeline import METHODS, check_method
 from hybridvo.types import Frame
 
 SINTEL_FOLDERS = ("camdata_left", "depth", "flow", "clean", "final")

@@ -12,14 +12,16 @@ import pandas as pd
 
 from hybridvo.data.sequence import Sequence
 from hybridvo.errors import InputError
+from hybridvo.estimation import estimate
 from hybridvo.evaluation.drawing import predict
 from hybridvo.evaluation.maps import error_map, flow_colours, longest_flow, uncertainty_maps
 from hybridvo.evaluation.scores import FACTORS, PAIR_ERRORS, is_failed, known_number
 from hybridvo.evaluation.sequence_job import true_motion
 from hybridvo.evaluation.sources import SharedFlow
 from hybridvo.files import atomic_write
+from hybridvo.network.models import Models
 from hybridvo.network.options import KINDS
-from hybridvo.pipeline import Models, estimate, networks_of
+from hybridvo.pipeline import networks_of
 from hybridvo.types import FramePair, PixelwisePrediction
 
 THUMBNAIL_WIDTH = 256

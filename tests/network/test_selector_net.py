@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from hybridvo.estimation import refine
 from hybridvo.geometry import se3_exp
 from hybridvo.hypotheses.generate import HypothesisSet, generate
 from hybridvo.hypotheses.selector import _searched
@@ -19,7 +20,6 @@ from hybridvo.network.selector_inputs import (
 )
 from hybridvo.network.selector_net import SelectorNetwork
 from hybridvo.options import Options
-from hybridvo.pipeline import refine
 from hybridvo.synthetic.scenarios import Scenario, make_pair
 
 CELL = Scenario(moving=0.6, objects=1, flow_noise_px=0.3, depth_noise=0.01)

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from hybridvo.errors import InputError
+from hybridvo.estimation import refine
 from hybridvo.flow import dis_flow
 from hybridvo.geometry import ego_flow, invert, se3_exp, se3_log
 from hybridvo.options import PhotometricOptions
-from hybridvo.pipeline import refine
 from hybridvo.refinement import photometric_kernels as kernels
 from hybridvo.refinement.photometric import refine_photometric
 from hybridvo.refinement.photometric_images import Level, blurred, grey_image, match_blur
