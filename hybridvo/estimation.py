@@ -7,22 +7,15 @@ from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
-from hybridvo.checks import as_rigid, as_seed
 from hybridvo.errors import InputError
 from hybridvo.flow import dis_flow
 from hybridvo.geometry import ego_flow, se3_exp
 from hybridvo.network.models import Models, default_models
 from hybridvo.options import Options
-from hybridvo.pipeline import (
-    BASELINES,
-    DEFAULT_METHOD,
-    Context,
-    classical,
-    networks_of,
-    run_method,
-)
+from hybridvo.pipeline import BASELINES, DEFAULT_METHOD, Context, classical, networks_of, run_method
 from hybridvo.refinement.refine import refine_pair, widened
-from hybridvo.types import Camera, Frame, FramePair, MotionPrior, PairBatch, RelativePose
+from hybridvo.results import MotionPrior, RelativePose
+from hybridvo.types import Camera, Frame, FramePair, PairBatch, as_rigid, as_seed
 
 if TYPE_CHECKING:
     from hybridvo.refinement.batch import BatchedPose

@@ -1,4 +1,4 @@
-"""Files: results written completely or not at all, YAML read, input told from other input."""
+"""Files: results written completely or not at all; text, lists and YAML read."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import re
 import secrets
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import IO, Any, Literal
+from typing import IO, Any, Literal, NamedTuple
 
 import yaml
 
@@ -85,14 +85,6 @@ def write_csv(
         writer.writerows(rows)
 
 
-def sha256(*paths: str | os.PathLike[str]) -> str:
-    """Hash of the content of files, in the order given."""
-    digest = hashlib.sha256()
-    for path in paths:
-        digest.update(Path(path).read_bytes())
-    return digest.hexdigest()
-
-
 def fingerprint(paths: Iterable[str | os.PathLike[str]]) -> str:
     """Hash of the names, sizes and times of files: tells whether input has changed since.
 
@@ -107,6 +99,57 @@ def fingerprint(paths: Iterable[str | os.PathLike[str]]) -> str:
             size, time = status.st_size, status.st_mtime_ns
         digest.update(f"{path.name}\0{size}\0{time}\0".encode(errors="surrogateescape"))
     return digest.hexdigest()
+
+
+def read_text(path: str | os.PathLike[str]) -> str:
+    """Text of a UTF-8 file, without a byte-order mark.
+
+    Raises:
+        FileNotFoundError: no such file. FormatError: it cannot be read, or holds binary data.
+    """
+    try:
+        return Path(path).read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        raise
+    except UnicodeDecodeError:
+        raise FormatError(f"{path}: expected a text file, got binary data.") from None
+    except (OSError, ValueError) as error:
+        raise FormatError(f"{str(path)[:200]!r}: cannot be read: {error}.") from None
+
+
+class Row(NamedTuple):
+    """One line of a list: its number in the file, its numbers, then its words."""
+
+    line: int
+    numbers: tuple[float, ...]
+    words: tuple[str, ...] = ()
+
+
+def read_rows(path: str | os.PathLike[str], columns: str, *, words: int = 0) -> list[Row]:
+    """Rows of a list file: a number for each of ``columns``, the last ``words`` of them text.
+
+    ``#`` starts a comment; the last word may contain spaces. Commas separate numbers too.
+
+    Raises:
+        FormatError: a row of another length or a number that cannot be read, with its line.
+    """
+    count = len(columns.split())
+    rows = []
+    for line, text in enumerate(read_text(path).split("\n"), start=1):
+        if words:
+            parts = [] if text.strip().startswith("#") else text.split(maxsplit=count - 1)
+        else:
+            parts = text.partition("#")[0].replace(",", " ").split()
+        if not parts:
+            continue
+        try:
+            numbers = tuple(map(float, parts[: count - words]))
+        except ValueError:
+            numbers = ()
+        if len(parts) != count or len(numbers) != count - words:
+            raise FormatError(f"{path}:{line}: expected '{columns}', got {text.strip()[:80]!r}.")
+        rows.append(Row(line, numbers, tuple(part.strip() for part in parts[count - words :])))
+    return rows
 
 
 class _Loader(yaml.SafeLoader):

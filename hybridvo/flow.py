@@ -14,9 +14,8 @@ from typing import Any, Protocol
 import cv2
 import numpy as np
 
-from hybridvo.checks import to_numpy
 from hybridvo.errors import InputError
-from hybridvo.types import Frame, FramePair
+from hybridvo.types import Frame, FramePair, to_numpy
 
 DIS_PRESETS = {
     "ultrafast": cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST,

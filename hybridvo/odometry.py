@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from hybridvo.checks import as_number, as_rigid, as_seed
 from hybridvo.errors import InputError
 from hybridvo.estimation import warm_up
 from hybridvo.flow import FlowField, FlowProvider, check_field, dis_flow
@@ -28,12 +27,13 @@ from hybridvo.pipeline import (
 )
 from hybridvo.refinement.photometric import refine_photometric
 from hybridvo.refinement.refine import widened
+from hybridvo.results import MotionPrior, Reason, RelativePose, State, Status, Step
 from hybridvo.tracking.keyframes import KeyFrame
 from hybridvo.tracking.pose_graph import Edge
 from hybridvo.tracking.state import TrackerState
 from hybridvo.tracking.window import STANDSTILL, Window, locate
 from hybridvo.trajectory import chain
-from hybridvo.types import Frame, FramePair, MotionPrior, Reason, RelativePose, State, Status, Step
+from hybridvo.types import Frame, FramePair, as_number, as_rigid, as_seed
 
 DEFAULT_WINDOW = 3
 """Key frames kept where the images refine the motion."""

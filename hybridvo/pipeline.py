@@ -26,7 +26,8 @@ from hybridvo.network.models import Models, default_models, one_thread
 from hybridvo.options import Options
 from hybridvo.refinement import refine as refinement
 from hybridvo.refinement.photometric import refine_photometric
-from hybridvo.types import FramePair, MotionPrediction, MotionPrior, PairBatch, Reason, RelativePose
+from hybridvo.results import MotionPrediction, MotionPrior, Reason, RelativePose
+from hybridvo.types import FramePair, PairBatch
 from hybridvo.units import depth_advice, typical_depth
 
 DEFAULT_METHOD = "hybrid"

@@ -1,4 +1,4 @@
-"""The types: camera, frame, pair, prior, prediction, hypothesis, relative pose, status and step.
+"""What goes in: camera, frame, pair and batch, with the checks of what users hand in.
 
 Conventions (pinned in ``tests/test_conventions.py``): ``T_target_source`` maps homogeneous points
 of ``source`` into ``target``; camera axes x right, y down, z forward; pixel (0, 0) is the centre of
@@ -9,25 +9,110 @@ pixels from the previous to the current frame, on the previous grid; tangent vec
 
 from __future__ import annotations
 
-import enum
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
+from numbers import Integral
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hybridvo.checks import as_float_image, as_number, as_rigid, to_numpy
 from hybridvo.errors import InputError
 
 if TYPE_CHECKING:
     import torch
 
-    from hybridvo.refinement.photometric_options import PhotometricReport
-
 MAX_PIXELS = 2**28
 """Largest image, in pixels, that a frame or a file header may declare."""
 FOCAL_RANGE = (1e-3, 1e9)
 """Focal lengths in pixels whose inverses and squares single precision can hold."""
+
+
+# -- checks ---------------------------------------------------------------------------------------
+
+
+def to_numpy(value: Any, name: str) -> np.ndarray:
+    """Numpy view of an array, a tensor or nested lists; masked floats become NaN.
+
+    Raises:
+        InputError: no array: ragged lists, or a tensor that records gradients or holds no values.
+    """
+    if isinstance(value, np.ma.MaskedArray) and value.dtype.kind == "f":
+        return np.asarray(value.filled(np.nan))
+    try:
+        return np.asarray(value)
+    except (RuntimeError, TypeError, ValueError) as error:
+        raise InputError(f"{name}: expected an array, got {error}.") from None
+
+
+def as_float_image(value: Any, name: str, channels: int | None) -> np.ndarray:
+    """Numpy view (or native-endian float32 copy) of an (H, W[, channels]) image of real numbers.
+
+    Raises:
+        InputError: another shape, or no floating-point numbers.
+    """
+    array = to_numpy(value, name)
+    expected = "(H, W)" if channels is None else f"(H, W, {channels})"
+    if array.ndim == 3 and channels is None and array.shape[2] == 1:
+        array = array[:, :, 0]
+    if array.ndim < 2 or array.shape[2:] != (() if channels is None else (channels,)):
+        raise InputError(f"{name}: expected shape {expected}, got {array.shape}.")
+    if array.dtype.kind != "f":
+        raise InputError(
+            f"{name}: expected a floating-point array, got dtype {array.dtype}. "
+            f"Convert to metres (depth) or pixels (flow) as float32 first."
+        )
+    with np.errstate(over="ignore"):  # beyond float32 is inf, which is invalid
+        return array.astype(np.float32, copy=False)
+
+
+def as_number(value: Any) -> float:
+    """A value as float; NaN where it is no number."""
+    try:
+        return float(value)
+    except (TypeError, ValueError, OverflowError):
+        return float("nan")
+
+
+def as_seed(seed: Any, where: str) -> int:
+    """A seed that every generator takes.
+
+    Raises:
+        InputError: no whole number from 0 to 2^31 - 1.
+    """
+    whole = isinstance(seed, Integral) and not isinstance(seed, bool)
+    if not whole or not 0 <= seed < 2**31:
+        raise InputError(f"{where}: expected a whole number from 0 to 2^31 - 1, got {seed!r}.")
+    return int(seed)
+
+
+def as_rigid(T: Any, where: str, tolerance: float = 1e-6, *, many: bool = False) -> np.ndarray:
+    """Float64 copy of a rigid transform (4, 4), or of ``many`` (N, 4, 4).
+
+    Raises:
+        InputError: another shape, values that are not finite, no rotation (to ``tolerance``) in the
+            upper left, or another last row than (0, 0, 0, 1); names the first bad one.
+    """
+    T = to_numpy(T, where)
+    if T.dtype.kind not in "fiu" or T.ndim != 2 + many or T.shape[-2:] != (4, 4):
+        shape = "(N, 4, 4)" if many else "(4, 4)"
+        raise InputError(f"{where}: expected shape {shape}, got {T.dtype} {T.shape}.")
+    T = T.astype(np.float64)
+    R = T[..., :3, :3]
+    with np.errstate(over="ignore", invalid="ignore"):
+        error = np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)).max(axis=(-1, -2))
+        error = np.maximum(error, np.abs(T[..., 3, :] - (0.0, 0.0, 0.0, 1.0)).max(axis=-1))
+        good = (error <= tolerance) & (np.linalg.det(R) > 0) & np.isfinite(T).all(axis=(-1, -2))
+    if not good.all():
+        k = int(np.argmin(good))
+        place, bad = (f"{where}[{k}]", T[k]) if many else (where, T)
+        raise InputError(
+            f"{place}: expected a finite rigid transform (rotation to {tolerance:g}, last row "
+            f"0 0 0 1), got {bad.tolist()}."
+        )
+    return T
+
+
+# -- inputs ---------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -53,10 +138,10 @@ class Camera:
 
     def __post_init__(self) -> None:
         for name in ("fx", "fy", "cx", "cy"):
-            value = getattr(self, name)
-            number = as_number(value)
+            number = as_number(getattr(self, name))
             if not np.isfinite(number):
-                raise InputError(f"Camera.{name}: expected a finite number, got {value!r}.")
+                got = getattr(self, name)
+                raise InputError(f"Camera.{name}: expected a finite number, got {got!r}.")
             object.__setattr__(self, name, number)
         for name in ("height", "width"):
             value = getattr(self, name)
@@ -68,14 +153,14 @@ class Camera:
             raise InputError(
                 f"Camera: {self.width}x{self.height} pixels is above the limit of {MAX_PIXELS}."
             )
-        for name in ("fx", "fy"):
-            if not FOCAL_RANGE[0] <= getattr(self, name) <= FOCAL_RANGE[1]:
+        low, high = FOCAL_RANGE
+        for name, focal in (("fx", self.fx), ("fy", self.fy)):
+            if not low <= focal <= high:
                 raise InputError(
-                    f"Camera.{name}: expected a positive focal length in pixels ({FOCAL_RANGE[0]:g}"
-                    f" to {FOCAL_RANGE[1]:g}), got {getattr(self, name)}."
+                    f"Camera.{name}: expected a positive focal length in pixels ({low:g} to "
+                    f"{high:g}), got {focal}."
                 )
-        for name, size in (("cx", self.width), ("cy", self.height)):
-            value = getattr(self, name)
+        for name, value, size in (("cx", self.cx, self.width), ("cy", self.cy, self.height)):
             if not -size <= value <= 2 * size:
                 raise InputError(
                     f"Camera.{name}: {value} lies far outside an image of {size} pixels. "
@@ -109,6 +194,14 @@ class Camera:
     def shape(self) -> tuple[int, int]:
         """(height, width)."""
         return self.height, self.width
+
+
+def _check_size(name: str, array: np.ndarray, camera: Camera) -> None:
+    if array.shape[:2] != camera.shape:
+        raise InputError(
+            f"{name}: expected {camera.shape} (height, width) as the camera has, got "
+            f"{array.shape[:2]}. Resize with hybridvo.data.resize, which also scales the camera."
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,21 +246,17 @@ class Frame:
                     f"Frame.rgb: expected shape (H, W, 3), got {rgb.shape}. "
                     f"Images are height, width, channels, in RGB order."
                 )
-            self._check_size("rgb", rgb)
-            object.__setattr__(self, "rgb", rgb)
+            self._set("rgb", rgb)
         for name in ("depth", "depth_variance"):
             if getattr(self, name) is not None:
-                array = as_float_image(getattr(self, name), f"Frame.{name}", None)
-                self._check_size(name, array)
-                object.__setattr__(self, name, array)
+                self._set(name, as_float_image(getattr(self, name), f"Frame.{name}", None))
         if self.mask is not None:
             mask = to_numpy(self.mask, "Frame.mask")
             if mask.dtype != np.bool_ or mask.ndim != 2:
                 raise InputError(
                     f"Frame.mask: expected a boolean (H, W) array, got {mask.dtype} {mask.shape}."
                 )
-            self._check_size("mask", mask)
-            object.__setattr__(self, "mask", mask)
+            self._set("mask", mask)
         stamp = as_number(self.timestamp)
         if not np.isfinite(stamp):
             raise InputError(f"Frame.timestamp: expected finite seconds, got {self.timestamp!r}.")
@@ -177,13 +266,9 @@ class Frame:
                 raise InputError(f"Frame.index: expected a whole number, got {self.index!r}.")
             object.__setattr__(self, "index", int(self.index))
 
-    def _check_size(self, name: str, array: np.ndarray) -> None:
-        if array.shape[:2] != self.camera.shape:
-            raise InputError(
-                f"Frame.{name}: expected shape {self.camera.shape} to match the camera, got "
-                f"{array.shape[:2]}. Resize with hybridvo.data.resize.resize_frame, which also "
-                f"scales the camera."
-            )
+    def _set(self, name: str, array: np.ndarray) -> None:
+        _check_size(f"Frame.{name}", array, self.camera)
+        object.__setattr__(self, name, array)
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,338 +306,25 @@ class FramePair:
             if not isinstance(getattr(self, name), Frame):
                 got = type(getattr(self, name)).__name__
                 raise InputError(f"FramePair.{name}: expected a Frame, got {got}.")
-        shape = self.prev.camera.shape
-        if self.curr.camera.shape != shape:
+        if self.curr.camera.shape != self.prev.camera.shape:
             raise InputError(
-                f"FramePair: the previous frame is {shape}, the current one "
+                f"FramePair: the previous frame is {self.prev.camera.shape}, the current one "
                 f"{self.curr.camera.shape} (height, width). All frames must have one size; resize "
                 f"with hybridvo.data.resize.resize_frame."
             )
         for name, channels in (("flow", 2), ("flow_variance", None)):
             if getattr(self, name) is not None:
                 array = as_float_image(getattr(self, name), f"FramePair.{name}", channels)
-                self._check(name, array, shape)
+                self._set(name, array)
         if self.flow_valid is not None:
             valid = to_numpy(self.flow_valid, "FramePair.flow_valid")
             if valid.dtype != np.bool_:
                 raise InputError(f"FramePair.flow_valid: expected bool, got dtype {valid.dtype}.")
-            self._check("flow_valid", valid, shape)
+            self._set("flow_valid", valid)
 
-    def _check(self, name: str, array: np.ndarray, shape: tuple[int, int]) -> None:
-        if array.shape[:2] != shape:
-            raise InputError(
-                f"FramePair.{name}: expected {shape} (height, width) to match the frames, "
-                f"got {array.shape[:2]}."
-            )
+    def _set(self, name: str, array: np.ndarray) -> None:
+        _check_size(f"FramePair.{name}", array, self.prev.camera)
         object.__setattr__(self, name, array)
-
-
-class State(enum.Enum):
-    """Outcome of one estimate."""
-
-    OK = "ok"
-    DEGRADED = "degraded"
-    FAILED = "failed"
-
-
-class Reason(enum.Enum):
-    """Why an estimate is not simply ok."""
-
-    NONE = ""
-    LOW_INLIERS = "low_inliers"
-    DEGENERATE_GEOMETRY = "degenerate_geometry"
-    NO_VALID_DEPTH = "no_valid_depth"
-    NO_FLOW = "no_flow"
-    MISSING_FRAME = "missing_frame"
-    SOLVER_DIVERGED = "solver_diverged"
-    NAN_INPUT = "nan_input"
-    AMBIGUOUS_MOTION = "ambiguous_motion"
-
-
-@dataclass(frozen=True)
-class Status:
-    """State, reason and a sentence that explains it."""
-
-    state: State = State.OK
-    reason: Reason = Reason.NONE
-    message: str = ""
-
-    @property
-    def ok(self) -> bool:
-        """Whether the state is OK: neither degraded nor failed."""
-        return self.state is State.OK
-
-    @property
-    def usable(self) -> bool:
-        """Whether there is an estimate: not failed. A degraded one has a wider covariance."""
-        return self.state is not State.FAILED
-
-    @classmethod
-    def degraded(cls, reason: Reason, message: str) -> Status:
-        """An estimate that may be used with care."""
-        return cls(State.DEGRADED, reason, message)
-
-    @classmethod
-    def failed(cls, reason: Reason, message: str) -> Status:
-        """An estimate that must not be used."""
-        return cls(State.FAILED, reason, message)
-
-    def __str__(self) -> str:
-        return self.state.value + (f"({self.reason.value})" if self.reason.value else "")
-
-
-@dataclass(frozen=True, eq=False)
-class MotionPrior:
-    """What is known of a motion before the pair is seen: one start among others, and a cue.
-
-    Args:
-        T_curr_prev: (4, 4) rigid transform, metres.
-        covariance: (6, 6) positive definite, of ``Exp(delta) T_curr_prev``, delta = (translation,
-            rotation) in the current camera; m^2, m rad, rad^2.
-
-    Raises:
-        InputError: no rigid transform, or no positive definite covariance.
-    """
-
-    T_curr_prev: np.ndarray
-    covariance: np.ndarray
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "T_curr_prev", as_rigid(self.T_curr_prev, "MotionPrior"))
-        covariance = to_numpy(self.covariance, "MotionPrior.covariance")
-        if covariance.shape != (6, 6) or covariance.dtype.kind not in "fiu":
-            raise InputError(
-                f"MotionPrior.covariance: expected numbers of shape (6, 6), got "
-                f"{covariance.dtype} of shape {covariance.shape}. A prior needs one: how far may "
-                f"the motion be from it?"
-            )
-        covariance = covariance.astype(np.float64)
-        if not (np.isfinite(covariance).all() and np.allclose(covariance, covariance.T)):
-            raise InputError("MotionPrior.covariance: expected a finite, symmetric matrix.")
-        if not np.linalg.eigvalsh(covariance)[0] > 0:
-            raise InputError(
-                "MotionPrior.covariance: expected a positive definite matrix, got one with the "
-                f"smallest eigenvalue {np.linalg.eigvalsh(covariance)[0]:.3g}."
-            )
-        object.__setattr__(self, "covariance", covariance)
-
-    def __repr__(self) -> str:
-        sigma = np.sqrt(np.diag(self.covariance))
-        return f"MotionPrior({_motion(self.T_curr_prev)}, sigma {_sizes(sigma[:3], sigma[3:])})"
-
-
-@dataclass(frozen=True, eq=False)
-class MotionPrediction:
-    """A network's prediction for one pair.
-
-    Args:
-        T_curr_prev: (4, 4) metres.
-        static_probability: (h, w) of every pixel of being static, 0 to 1, over the whole image at
-            any resolution.
-        covariance: (6, 6) of ``Exp(delta) T_curr_prev``, or None.
-    """
-
-    T_curr_prev: np.ndarray
-    static_probability: np.ndarray
-    covariance: np.ndarray | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class Hypothesis:
-    """One strong motion found in the image.
-
-    Args:
-        T_curr_prev: (4, 4).
-        source: which start led here (``identity``, ``prior``, ``window``, ``minimal``, ``refit``).
-        inlier_ratio: share of the valid pixels that follow this motion.
-        flow_noise_px: standard deviation of the flow about it, px. depth_noise: of log depth.
-        inliers: (h, w) float32 in [0, 1], robust weight of each pixel under this motion, on the
-            grid of ``stride``.
-        stride: px of the full image per step of that grid.
-        score: by which the camera's motion was chosen; larger is better.
-    """
-
-    T_curr_prev: np.ndarray
-    source: str
-    inlier_ratio: float
-    flow_noise_px: float
-    depth_noise: float
-    inliers: np.ndarray
-    stride: int
-    score: float = 0.0
-
-    def __repr__(self) -> str:
-        return (
-            f"Hypothesis({self.source}, {_motion(self.T_curr_prev)}, "
-            f"inliers {100 * self.inlier_ratio:.0f} %, score {self.score:.3g})"
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class RelativePose:
-    """Camera motion of one pair: the result of every estimator.
-
-    Args:
-        T_curr_prev: (4, 4) float64, points of the previous camera into the current one; metres.
-        covariance: (6, 6) of the left perturbation ``Exp(delta) T_curr_prev``, delta =
-            (translation, rotation) in the current camera; m^2, m rad, rad^2.
-        status: ok, degraded or failed with its reason. A failed motion is the identity.
-        inlier_ratio: share of the valid pixels that follow the motion.
-        iterations: Gauss-Newton steps spent (or RANSAC iterations).
-        cost: final robust cost per valid pixel, dimensionless.
-        residual_scale_px: estimated standard deviation of the flow noise, px, where variances were
-            handed in at a pixel of the typical one.
-        depth_noise: of the log depth, likewise.
-        weights: (h, w) float32 robust weight of each pixel on the grid of ``weights_stride``.
-        translation_direction_valid: whether the translation is longer than three of its own
-            standard deviations; its direction means nothing otherwise.
-        information_eigenvalues: (6,) ascending, of the information matrix scaled to pixels.
-        probability: that this is the camera's motion and not an object's, 0 to 1; 0 if failed.
-        hypotheses: every strong motion found, the chosen one first.
-        method: name of the estimator. ms: time spent, milliseconds.
-        terms: what carried the motion: ``flow``, ``depth`` (of the current frame), ``images``,
-            ``window`` (key frames).
-        photometric: :class:`hybridvo.refinement.photometric.PhotometricReport` where the images
-            took part or were refused, or None.
-    """
-
-    T_curr_prev: np.ndarray = field(default_factory=lambda: np.eye(4))
-    covariance: np.ndarray = field(default_factory=lambda: np.eye(6))
-    status: Status = field(default_factory=Status)
-    inlier_ratio: float = 0.0
-    iterations: int = 0
-    cost: float = 0.0
-    residual_scale_px: float = 0.0
-    depth_noise: float = 0.0
-    weights: np.ndarray | None = None
-    weights_stride: int = 1
-    translation_direction_valid: bool = False
-    information_eigenvalues: np.ndarray = field(default_factory=lambda: np.zeros(6))
-    probability: float = 1.0
-    hypotheses: tuple[Hypothesis, ...] = ()
-    method: str = ""
-    ms: float = 0.0
-    terms: tuple[str, ...] = ()
-    photometric: PhotometricReport | None = None
-
-    @property
-    def ok(self) -> bool:
-        """Whether the status is OK: neither degraded nor failed."""
-        return self.status.ok
-
-    @property
-    def usable(self) -> bool:
-        """Whether this is a measurement: not failed. The covariance of a degraded one is wider."""
-        return self.status.usable
-
-    @property
-    def T_prev_curr(self) -> np.ndarray:
-        """Inverse of ``T_curr_prev``: what a pose-graph "between" factor wants."""
-        R, t = self.T_curr_prev[:3, :3], self.T_curr_prev[:3, 3]
-        T = np.eye(4)
-        T[:3, :3] = R.T
-        T[:3, 3] = -R.T @ t
-        return T
-
-    @classmethod
-    def failed(cls, reason: Reason, message: str, method: str = "", **extra: Any) -> RelativePose:
-        """A failed estimate: identity with a covariance that carries no information."""
-        return cls(
-            covariance=np.diag([1e4] * 3 + [10.0] * 3),
-            status=Status.failed(reason, message),
-            method=method,
-            probability=0.0,
-            **extra,
-        )
-
-    def replace(self, **changes: Any) -> RelativePose:
-        """Copy with some fields changed."""
-        return replace(self, **changes)
-
-    def __repr__(self) -> str:
-        sigma = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
-        return (
-            f"RelativePose({self.method or 'motion'}: {self.status}, {_motion(self.T_curr_prev)}, "
-            f"sigma {_sizes(sigma[:3], sigma[3:])}, inliers {100 * self.inlier_ratio:.0f} %, "
-            f"probability {self.probability:.2f})"
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class Step:
-    """One tracked frame of :class:`hybridvo.Odometry`.
-
-    Args:
-        index, timestamp: of the current frame.
-        T_world_cam: (4, 4) camera to world; world = first camera unless set.
-        motion: relative pose from the previous frame; identity with status ok for the first frame.
-    """
-
-    index: int
-    timestamp: float
-    T_world_cam: np.ndarray
-    motion: RelativePose
-
-    @property
-    def ok(self) -> bool:
-        """Whether the motion is neither degraded nor failed."""
-        return self.motion.ok
-
-    @property
-    def usable(self) -> bool:
-        """Whether the motion did not fail."""
-        return self.motion.usable
-
-    @property
-    def probability(self) -> float:
-        """That the motion is the camera's, 0 to 1."""
-        return self.motion.probability
-
-    @property
-    def status(self) -> Status:
-        """Status of the motion."""
-        return self.motion.status
-
-    @property
-    def T_curr_prev(self) -> np.ndarray:
-        """(4, 4) points of the previous camera into the current one."""
-        return self.motion.T_curr_prev
-
-    @property
-    def T_prev_curr(self) -> np.ndarray:
-        """(4, 4) pose of the current camera in the previous one."""
-        return self.motion.T_prev_curr
-
-    @property
-    def covariance(self) -> np.ndarray:
-        """(6, 6) covariance of the motion."""
-        return self.motion.covariance
-
-    def __repr__(self) -> str:
-        x, y, z = self.T_world_cam[:3, 3]
-        return (
-            f"Step({self.index}, t {self.timestamp:.3f} s, at [{x:.3f} {y:.3f} {z:.3f}] m, "
-            f"{self.motion!r})"
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class PixelwisePrediction:
-    """Raw output of a pixel-wise network for a batch of pairs (paper, section 3.2).
-
-    Args:
-        rotation: (B, 3, h, w) Euler angles X-Y-Z in degrees (R = Rx Ry Rz), of T_curr_prev.
-        translation: (B, 3, h, w) metres, of T_curr_prev.
-        log_scale_rotation, log_scale_translation: (B, 3, h, w), s = log of the Laplace scale U, or
-            None where the network predicts no uncertainty.
-        image_size: (H, W) of the pairs that the network was given, or None.
-    """
-
-    rotation: torch.Tensor
-    translation: torch.Tensor
-    log_scale_rotation: torch.Tensor | None = None
-    log_scale_translation: torch.Tensor | None = None
-    image_size: tuple[int, int] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -610,36 +382,24 @@ class PairBatch:
             array = np.stack([absent if value is None else value for value in values])
             return torch.as_tensor(array, device=device).to(dtype or torch.float32)
 
-        def masked(array: np.ndarray | None, mask: np.ndarray | None) -> np.ndarray | None:
-            if array is None or mask is None:
-                return array
-            return np.where(mask, array, np.float32(np.nan))
-
         valid = np.ones((len(pairs), *size), np.bool_)
+        depth_curr = []
         for k, pair in enumerate(pairs):
             for mask in (pair.prev.mask, pair.flow_valid):
                 valid[k] &= True if mask is None else mask
+            depth = pair.curr.depth
+            if depth is not None and pair.curr.mask is not None:
+                depth = np.where(pair.curr.mask, depth, np.float32(np.nan))
+            depth_curr.append(depth)
         no_flow, no_depth = np.full((*size, 2), np.nan), np.full(size, np.nan)
         return cls(
             flow=stack([no_flow if p.flow is None else p.flow for p in pairs]),
             depth_prev=stack([no_depth if p.prev.depth is None else p.prev.depth for p in pairs]),
             K_prev=stack([p.prev.camera.K for p in pairs]),
             K_curr=stack([p.curr.camera.K for p in pairs]),
-            depth_curr=stack([masked(p.curr.depth, p.curr.mask) for p in pairs]),
+            depth_curr=stack(depth_curr),
             # a pair without variances beside one with them has those of a typical pixel
             flow_variance=stack([p.flow_variance for p in pairs], 1.0),
             depth_variance=stack([p.prev.depth_variance for p in pairs], 1.0),
             valid=torch.as_tensor(valid, device=device),
         )
-
-
-def _sizes(metres: np.ndarray, radians: np.ndarray) -> str:
-    return f"{np.linalg.norm(metres):.3g} m {np.rad2deg(np.linalg.norm(radians)):.3g} deg"
-
-
-def _motion(T: np.ndarray) -> str:
-    """Translation and angle of a (4, 4) transform, for a line of print."""
-    x, y, z = T[:3, 3]
-    sine = np.array([T[2, 1] - T[1, 2], T[0, 2] - T[2, 0], T[1, 0] - T[0, 1]])
-    angle = np.arctan2(np.linalg.norm(sine), np.trace(T[:3, :3]) - 1)
-    return f"t [{x:.4f} {y:.4f} {z:.4f}] m, {np.rad2deg(angle):.3f} deg"

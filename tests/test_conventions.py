@@ -39,8 +39,9 @@ from hybridvo.geometry import (
 )
 from hybridvo.network.inputs import assemble_inputs
 from hybridvo.refinement import solver
-from hybridvo.trajectory import Trajectory, read_trajectory, write_tum
-from hybridvo.types import Camera, Frame, FramePair, PairBatch, RelativePose, Step
+from hybridvo.results import RelativePose, Step
+from hybridvo.trajectory import Trajectory, read_trajectory
+from hybridvo.types import Camera, Frame, FramePair, PairBatch
 
 RIGHT_TURN_ABOUT_Z = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 """90 degrees about z: x goes to y, y goes to -x."""
@@ -367,7 +368,7 @@ def test_pypose_and_tum_are_xyzw_kornia_and_evo_wxyz():
 
 
 def test_identity_row_of_a_tum_file(tmp_path):
-    write_tum(Trajectory([0.0], np.eye(4)[None]), tmp_path / "written")
+    Trajectory([0.0], np.eye(4)[None]).save(tmp_path / "written")
     row = [float(x) for x in (tmp_path / "written").read_text().split()]
     assert row == [0, 0, 0, 0, 0, 0, 0, 1]
     (tmp_path / "read").write_text("3.5 0 0 0 0 0 0 1\n")

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from hybridvo.geometry import ego_flow, se3_exp
-from hybridvo.trajectory import Trajectory, chain, write_tum
+from hybridvo.trajectory import Trajectory, chain
 from hybridvo.types import Camera
 
 REFINE = ("--method", "refine", "--flow", "file", "-q")
@@ -49,7 +49,7 @@ def write_walk(
         else:
             for path in files.values():
                 os.link(path.with_stem(f"{k:06d}"), path)
-    write_tum(Trajectory(np.arange(frames) / 30, np.stack(poses)), root / "poses.txt")
+    Trajectory(np.arange(frames) / 30, np.stack(poses)).save(root / "poses.txt")
     return root
 
 

@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 
 from hybridvo.geometry import ego_flow, invert, se3_exp, se3_log
-from hybridvo.types import Camera, Frame, FramePair, State
+from hybridvo.results import State
+from hybridvo.types import Camera, Frame, FramePair
 
 SIZE = (96, 128)
 MOTION = (0.02, -0.01, 0.05, 0.002, 0.004, -0.003)

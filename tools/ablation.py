@@ -2,12 +2,14 @@
 
     hybridvo generate paper --size 64 128 --count 100000 --out runs/paper_samples
     python tools/ablation.py --out runs/ablation --data runs/paper_samples --seeds 3
+    python tools/ablation.py --out runs/ablation --seeds 3 --score
 
 A row is a file of configs/ablation. The rows that decide the paper's order have several seeds, the
 others one; every row is scored on held-out pairs at 6, 12, 25, 50 and 100 thousand samples, so that
 a reader sees whether an order is settled. Started again with the same ``--out`` it goes on where it
 was: each row's state is ``OUT/ROW-seedN`` (checkpoint.pt, log.jsonl, result.json, and at the end
 weights.safetensors). ``OUT/ablation.json`` is written after every score, with what is there.
+``--score`` trains nothing: finished rows are scored anew from their weights.
 """
 
 from __future__ import annotations
@@ -36,8 +38,6 @@ CLAIMS = (
 MILESTONES = (6_000, 12_000, 25_000, 50_000, 100_000)
 """Samples at which a row is scored, and at its end."""
 HELD_OUT = ("data_paper.yaml", "data_diverse.yaml")
-RULES = ("softmax", "min_variance", "median", "mean", "paper")
-"""Selection rules that a finished pixel-wise row with uncertainty is scored with."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -69,6 +69,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     add("--threads", type=int, default=1, help="threads of torch")
     add("--workers", type=int, default=0, help="processes that draw samples (0: this one)")
     add("--device", choices=("cpu", "cuda"), default="cpu")
+    add("--score", action="store_true", help="score finished rows again, without training")
     return parser.parse_args(argv)
 
 
@@ -98,7 +99,9 @@ def _run(args: argparse.Namespace) -> int:
     cv2.setNumThreads(0)  # samples are small: threads inside OpenCV cost more than they give
     runs: dict[tuple[str, int], dict[str, Any]] = {}
     for name, seed in plan(names, args.seeds):
-        if not _train(args, name, seed, runs):
+        if args.score:
+            _score(args, name, seed, runs)
+        elif not _train(args, name, seed, runs):
             print("ablation.py: interrupted; start again to go on.", file=sys.stderr)
             return 130
     return 0
@@ -108,7 +111,6 @@ def _train(
     args: argparse.Namespace, name: str, seed: int, runs: dict[tuple[str, int], dict[str, Any]]
 ) -> bool:
     """Train and score one row; False if the training was interrupted."""
-    from hybridvo.files import write_json
     from hybridvo.network.weights import save_weights
     from hybridvo.training.trainer import Trainer
 
@@ -131,15 +133,50 @@ def _train(
             return False
         if str(samples) not in result["curve"]:
             last = samples == args.samples
-            scores = _scores(args, trainer.exported, options, last)
+            scores = _scores(args, trainer.exported, options.selection, options.data_size, last)
             result["curve"][str(samples)] = {"seconds": round(trainer.elapsed_s), **scores}
-            write_json(folder / "result.json", result)
-            print(f"{name} seed {seed}, {samples}: {_short(scores)}", file=sys.stderr, flush=True)
-        runs[name, seed] = result
-        write_json(args.out / "ablation.json", _summary(args, runs))
+        _store(args, name, seed, runs, result, samples)
     card = {"row": name, **trainer.record, "curve": result["curve"]}
     save_weights(folder / "weights.safetensors", trainer.exported, card, "float16")
     return True
+
+
+def _score(
+    args: argparse.Namespace, name: str, seed: int, runs: dict[tuple[str, int], dict[str, Any]]
+) -> None:
+    """Score a finished row anew from its weights; one that is not finished is passed over."""
+    from hybridvo.network.models import load_weights
+
+    folder = args.out / f"{name}-seed{seed}"
+    if not (folder / "weights.safetensors").exists():
+        print(f"{name} seed {seed}: not finished", file=sys.stderr)
+        return
+    network, card = load_weights(folder / "weights.safetensors")
+    curve = (_read(folder / "result.json") or {}).get("curve", card["curve"])
+    result = {"row": name, "seed": seed, "curve": curve}
+    result["parameters"] = sum(p.numel() for p in network.parameters())
+    samples = max(curve, key=int)
+    recipe = card["options"]
+    curve[samples] |= _scores(args, network, recipe["selection"], recipe["data_size"], last=True)
+    _store(args, name, seed, runs, result, int(samples))
+
+
+def _store(
+    args: argparse.Namespace,
+    name: str,
+    seed: int,
+    runs: dict[tuple[str, int], dict[str, Any]],
+    result: dict[str, Any],
+    samples: int,
+) -> None:
+    """Write the figures of a row, and those of all rows so far."""
+    from hybridvo.files import write_json
+
+    runs[name, seed] = result
+    write_json(args.out / f"{name}-seed{seed}" / "result.json", result)
+    write_json(args.out / "ablation.json", _summary(args, runs))
+    short = _short(result["curve"][str(samples)])
+    print(f"{name} seed {seed}, {samples}: {short}", file=sys.stderr, flush=True)
 
 
 def _task(args: argparse.Namespace, name: str, seed: int) -> Any:
@@ -157,24 +194,30 @@ def _task(args: argparse.Namespace, name: str, seed: int) -> Any:
     return PwvoTask(options, mixture)
 
 
-def _scores(args: argparse.Namespace, network: Any, options: Any, last: bool) -> dict[str, Any]:
+def _scores(
+    args: argparse.Namespace,
+    network: Any,
+    selection: str,
+    size: Sequence[int] | None,
+    last: bool,
+) -> dict[str, Any]:
     """Figures on held-out pairs of each preset; at the end by every rule of the selection."""
+    from hybridvo.network.selection import SELECTION_METHODS
     from hybridvo.synthetic.presets import load_preset
-    from hybridvo.training.validation import PUBLISHED_SEED, evaluate_network
+    from hybridvo.training.validation import FIGURES, PUBLISHED_SEED, evaluate_network
 
     scores: dict[str, Any] = {}
     for file in HELD_OUT:
-        preset = load_preset(ROWS.parent / file, size=options.data_size)
+        preset = load_preset(ROWS.parent / file, size=None if size is None else tuple(size))
 
         def evaluate(rule: str, preset: Any = preset) -> dict[str, Any]:
             return evaluate_network(network, preset, PUBLISHED_SEED, args.count, selection=rule)
 
-        scores[Path(file).stem] = evaluate(options.selection)
-        if last and options.loss.needs_uncertainty:
-            rules = {rule: evaluate(rule) for rule in RULES}
+        figures = scores[Path(file).stem] = evaluate(selection)
+        if last and figures["auroc_rotation"] is not None:
+            rules = {r: figures if r == selection else evaluate(r) for r in SELECTION_METHODS}
             scores[f"rules_{Path(file).stem}"] = {
-                rule: {key: figures[key] for key in ("epe", "r_err_deg", "t_err")}
-                for rule, figures in rules.items()
+                rule: {key: found[key] for key in FIGURES} for rule, found in rules.items()
             }
     return scores
 
@@ -248,8 +291,8 @@ def _without_pairs(scores: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _short(scores: Mapping[str, Any]) -> str:
-    named = {name: value for name, value in scores.items() if "epe" in value}
-    return ", ".join(f"{name} EPE {value['epe']:.3f} px" for name, value in named.items())
+    presets = [Path(file).stem for file in HELD_OUT]
+    return ", ".join(f"{preset} EPE {scores[preset]['epe']:.3f} px" for preset in presets)
 
 
 def _read(path: Path) -> dict[str, Any] | None:

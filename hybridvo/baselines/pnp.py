@@ -18,7 +18,8 @@ import cv2
 import numpy as np
 
 from hybridvo.geometry import make_transform, project
-from hybridvo.types import Camera, FramePair, Reason, RelativePose, Status
+from hybridvo.results import Reason, RelativePose, Status
+from hybridvo.types import Camera, FramePair
 
 POINTS = 10_000
 """Random valid pixels handed to a solver; all pixels cost 50 times more for no accuracy."""

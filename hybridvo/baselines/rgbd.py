@@ -22,7 +22,8 @@ from hybridvo.baselines.pnp import (
     sample,
 )
 from hybridvo.geometry import pose_matrix, project
-from hybridvo.types import Camera, FramePair, Reason, RelativePose, Status
+from hybridvo.results import Reason, RelativePose, Status
+from hybridvo.types import Camera, FramePair
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,8 @@ import numpy as np
 
 from hybridvo.errors import InputError, OutputError
 from hybridvo.evaluation.maps import flow_colours, longest_flow
-from hybridvo.types import Frame, State, Step
+from hybridvo.results import State, Step
+from hybridvo.types import Frame
 
 MAX_IMAGES = 300
 """Images of a kind in a recording: with the sizes below about 15 MB at most."""

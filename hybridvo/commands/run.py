@@ -35,9 +35,10 @@ from hybridvo.odometry import Odometry
 from hybridvo.options import Options
 from hybridvo.pipeline import check_method, weights_hash
 from hybridvo.refinement.depth_agreement import depth_ratio
+from hybridvo.results import State, Step
 from hybridvo.tracking.state import TrackerState
 from hybridvo.trajectory import Trajectory
-from hybridvo.types import Frame, State, Step
+from hybridvo.types import Frame
 
 EXIT_DONE, EXIT_FAILED_FRAMES, EXIT_INTERRUPTED = 0, 3, 130
 

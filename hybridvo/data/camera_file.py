@@ -11,18 +11,16 @@ from typing import Any
 import cv2
 import numpy as np
 
-from hybridvo.data.image_io import image_size, read_text
+from hybridvo.data.image_io import image_size
 from hybridvo.data.lists import sorted_files
 from hybridvo.errors import FormatError, InputError
-from hybridvo.files import atomic_write, parse_yaml
+from hybridvo.files import atomic_write, parse_yaml, read_text
 from hybridvo.types import Camera
 
 CAMERA_FILE = "camera.yaml"
 IMAGES = (".png", ".jpg", ".jpeg")
 REQUIRED = ("fx", "fy", "cx", "cy", "width", "height")
 KNOWN = (*REQUIRED, "distortion", "depth_scale", "fps")
-MAX_FILE_BYTES = 2**16
-"""Largest camera file; they are a few kilobytes."""
 BROWN_COUNTS = (4, 5, 8)
 """Lengths of k1 k2 p1 p2 [k3 [k4 k5 k6]], OpenCV's order."""
 
@@ -125,7 +123,7 @@ def read_camera_file(path: Path) -> Calibration:
         FormatError: not YAML, a key that is missing or unknown, a value that cannot be.
         FileNotFoundError: no such file.
     """
-    text = read_text(path, limit=MAX_FILE_BYTES).removesuffix("---\n")  # as ROS prints it
+    text = read_text(path).removesuffix("---\n")  # as ROS prints it
     content = parse_yaml(text, str(path))
     if not isinstance(content, dict):
         raise FormatError(f"{path}: expected 'key: value' lines, got a {type(content).__name__}.")

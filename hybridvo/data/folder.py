@@ -14,12 +14,12 @@ from hybridvo.data.lists import (
     depth_at,
     poses_at,
     read_poses,
-    read_rows,
     shown,
     sorted_files,
     to_seconds,
 )
 from hybridvo.errors import InputError
+from hybridvo.files import read_rows
 from hybridvo.units import stamp_unit
 
 DEFAULT_FPS = 30.0

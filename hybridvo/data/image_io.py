@@ -39,11 +39,6 @@ FLOW_OFFSET, FLOW_SCALE = np.float32(32768), np.float32(64)
 COPY_AGAIN = "Copy or download the file again."
 
 
-def read_text(path: str | os.PathLike[str], *, limit: int = 2**26) -> str:
-    """Text of a list or calibration file; bytes that are not UTF-8 survive as surrogates."""
-    return _read_bytes(path, limit).decode("utf-8-sig", errors="surrogateescape")
-
-
 def read_rgb(path: str | os.PathLike[str]) -> np.ndarray:
     """(H, W, 3) uint8 RGB from a PNG or JPEG; grey is repeated, alpha is dropped.
 

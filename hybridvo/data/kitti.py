@@ -9,9 +9,10 @@ import numpy as np
 
 from hybridvo.data.base import Given, Listing, Sequence
 from hybridvo.data.camera_file import Calibration
-from hybridvo.data.image_io import read_rgb, read_text
-from hybridvo.data.lists import gap_warning, numbered_files, read_rows, rigid, to_seconds
+from hybridvo.data.image_io import read_rgb
+from hybridvo.data.lists import gap_warning, numbered_files, rigid, to_seconds
 from hybridvo.errors import FormatError, InputError
+from hybridvo.files import read_rows, read_text
 from hybridvo.geometry import invert
 from hybridvo.types import Camera
 
@@ -152,7 +153,7 @@ def _sequence_folder(path: Path) -> Path | None:
 def _read_projections(path: Path) -> dict[str, np.ndarray]:
     """Name -> (3, 4) projection of a rectified camera: fx 0 cx tx, 0 fy cy ty, 0 0 1 tz."""
     matrices = {}
-    for line, text in enumerate(read_text(path, limit=2**20).split("\n"), start=1):
+    for line, text in enumerate(read_text(path).split("\n"), start=1):
         name, _, rest = text.partition(":")
         if not name.startswith("P"):
             continue

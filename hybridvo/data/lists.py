@@ -6,13 +6,12 @@ import itertools
 import re
 from collections.abc import Sequence as Many
 from pathlib import Path, PurePath
-from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hybridvo.data.image_io import read_text
 from hybridvo.errors import FormatError, InputError
+from hybridvo.files import read_rows
 from hybridvo.geometry import pose_matrix
 from hybridvo.units import stamp_unit
 
@@ -21,14 +20,6 @@ MAX_STAMP_DIFFERENCE_S = 0.02
 MAX_POSITION_M = 1e12
 """No position is larger, and squares of it are finite."""
 TIMED_POSE = "timestamp tx ty tz qx qy qz qw"
-
-
-class Row(NamedTuple):
-    """One line of a list: its number in the file, its numbers, then its words."""
-
-    line: int
-    numbers: tuple[float, ...]
-    words: tuple[str, ...]
 
 
 def natural_key(path: Path) -> list[str | int]:
@@ -88,31 +79,6 @@ def listed_path(root: Path, name: str, where: str) -> Path:
     if PurePath(name).is_absolute() or ".." in PurePath(name).parts or "\0" in name:
         raise FormatError(f"{where}: expected a file below {root}, got {name[:200]!r}.")
     return root / name
-
-
-def read_rows(path: Path, columns: str, *, words: int = 0) -> list[Row]:
-    """Rows of a list file: a number for each of ``columns``, the last ``words`` of them text.
-
-    ``#`` starts a comment line; the last word may contain spaces.
-
-    Raises:
-        FormatError: a row of another length or a number that cannot be read, with its line.
-    """
-    count = len(columns.split())
-    rows = []
-    for line, text in enumerate(read_text(path).split("\n"), start=1):
-        text = text.strip() if words else text.replace(",", " ").strip()
-        if not text or text.startswith("#"):
-            continue
-        parts = text.split(maxsplit=count - 1) if words else text.split()
-        try:
-            numbers = tuple(map(float, parts[: count - words]))
-        except ValueError:
-            numbers = ()
-        if len(parts) != count or len(numbers) != count - words:
-            raise FormatError(f"{path}:{line}: expected '{columns}', got {text[:80]!r}.")
-        rows.append(Row(line, numbers, tuple(parts[count - words :])))
-    return rows
 
 
 def to_seconds(stamps: Many[float] | np.ndarray, name: str) -> tuple[np.ndarray, list[str]]:

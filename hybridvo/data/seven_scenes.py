@@ -8,9 +8,10 @@ import numpy as np
 
 from hybridvo.data.base import Given, Sequence, numbered_listing
 from hybridvo.data.camera_file import Calibration
-from hybridvo.data.image_io import read_depth, read_text
+from hybridvo.data.image_io import read_depth
 from hybridvo.data.lists import numbered_files, rigid
 from hybridvo.errors import FormatError
+from hybridvo.files import read_text
 from hybridvo.types import Camera
 
 INVALID_DEPTH = 65535
@@ -67,7 +68,7 @@ class SevenScenesSequence(Sequence):
 def _read_pose(path: Path) -> np.ndarray:
     """(4, 4) T_world_cam; NaN where tracking was lost (the file then holds inf or nan)."""
     try:
-        T = np.array(read_text(path, limit=2**16).split(), dtype=np.float64).reshape(4, 4)
+        T = np.array(read_text(path).split(), dtype=np.float64).reshape(4, 4)
     except ValueError as error:
         raise FormatError(f"{path}: expected 16 numbers of a 4x4 matrix ({error}).") from None
     if not np.isfinite(T).all():

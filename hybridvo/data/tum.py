@@ -13,9 +13,9 @@ from hybridvo.data.lists import (
     listed_path,
     poses_at,
     read_poses,
-    read_rows,
     to_seconds,
 )
+from hybridvo.files import read_rows
 from hybridvo.geometry import invert, pose_matrix
 from hybridvo.types import Camera
 

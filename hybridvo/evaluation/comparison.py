@@ -43,7 +43,7 @@ from hybridvo.evaluation.worst import draw_worst, worst_pairs
 from hybridvo.files import write_csv, write_json
 from hybridvo.network.models import Models
 from hybridvo.pipeline import weights_hash
-from hybridvo.trajectory import Trajectory, write_tum
+from hybridvo.trajectory import Trajectory
 
 WRITTEN = ("results.json", "results.csv", "pairs.csv", "report.md", "report.html")
 """What a finished comparison leaves, beside ``trajectories/`` and ``worst/``."""
@@ -332,7 +332,7 @@ def _write_trajectories(out: Path, parts: Iterable[Mapping[str, Any]]) -> list[d
             stamps = part["timestamps"]["ground_truth" if true else "estimate"]
             kind = f"_{flow.split()[0]}" if flow else ""
             path = f"trajectories/{number:03d}_{_plain(part)}_{method}{kind}.tum"
-            write_tum(Trajectory(np.array(stamps), np.array(poses)), out / path)
+            Trajectory(np.array(stamps), np.array(poses)).save(out / path)
             found.append(
                 {
                     "sequence": part["sequence"]["name"],

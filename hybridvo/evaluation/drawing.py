@@ -31,7 +31,8 @@ from hybridvo.files import atomic_write, write_json
 from hybridvo.geometry import matrix_to_euler_deg
 from hybridvo.network.options import KINDS
 from hybridvo.pipeline import DEFAULT_METHOD
-from hybridvo.types import FramePair, PixelwisePrediction
+from hybridvo.results import PixelwisePrediction
+from hybridvo.types import FramePair
 
 SALIENCY_BLOCK = 4
 """Pixels whose saliency is summed for display: networks read one of some pixels only."""

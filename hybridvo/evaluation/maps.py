@@ -16,7 +16,8 @@ import numpy as np
 from hybridvo.errors import InputError
 from hybridvo.evaluation.pair_errors import MOVING_PX
 from hybridvo.geometry import ego_flow
-from hybridvo.types import Camera, FramePair, PixelwisePrediction
+from hybridvo.results import PixelwisePrediction
+from hybridvo.types import Camera, FramePair
 
 if TYPE_CHECKING:
     import torch

@@ -22,7 +22,8 @@ from hybridvo.files import atomic_write
 from hybridvo.network.models import Models
 from hybridvo.network.options import KINDS
 from hybridvo.pipeline import networks_of
-from hybridvo.types import FramePair, PixelwisePrediction
+from hybridvo.results import PixelwisePrediction
+from hybridvo.types import FramePair
 
 THUMBNAIL_WIDTH = 256
 """Width of each panel of a worst pair, px: a report holds a hundred of them."""

@@ -14,7 +14,7 @@ from hybridvo.calibration import CUE_WEIGHTS
 from hybridvo.geometry import invert, se3_log
 from hybridvo.hypotheses.generate import HypothesisSet
 from hybridvo.refinement import kernels
-from hybridvo.types import Hypothesis, MotionPrior
+from hybridvo.results import Hypothesis, MotionPrior
 
 BORDER = 0.06
 """Width of the border band, as a share of the image's shorter side (at least one cell)."""

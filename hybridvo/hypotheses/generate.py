@@ -13,7 +13,8 @@ from hybridvo.refinement import kernels
 from hybridvo.refinement.depth import look_up
 from hybridvo.refinement.full_fit import fit_coarse
 from hybridvo.refinement.pixels import CoarseGrid, as_contiguous, coarse_grid
-from hybridvo.types import FramePair, Reason, RelativePose
+from hybridvo.results import Reason, RelativePose
+from hybridvo.types import FramePair
 
 REFERENCE_WIDTH = 1024
 """px; residuals of images of different size are compared at this width."""

@@ -20,7 +20,7 @@ from hybridvo.hypotheses.cues import cue_scores
 from hybridvo.hypotheses.generate import SOURCE_REFIT, GridMaps, HypothesisSet, fit_in_mask
 from hybridvo.options import Options
 from hybridvo.refinement import solver
-from hybridvo.types import Hypothesis, MotionPrediction, MotionPrior
+from hybridvo.results import Hypothesis, MotionPrediction, MotionPrior
 
 SUPPORT_CUTOFF = 3.0
 """Cutoff of the robust kernel by which the inliers of a motion are told, standard deviations."""

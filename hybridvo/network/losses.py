@@ -23,7 +23,7 @@ from kornia.geometry.linalg import transform_points
 
 from hybridvo.errors import InputError
 from hybridvo.network.inputs import subsampled_intrinsics
-from hybridvo.types import PixelwisePrediction
+from hybridvo.results import PixelwisePrediction
 
 NetworkOutput = PixelwisePrediction | tuple[torch.Tensor, torch.Tensor]
 """What a network returns: maps, or (rotation_deg (B, 3), translation (B, 3)) of a VONet."""

@@ -14,14 +14,8 @@ from hybridvo.network.inputs import NetworkInputs, assemble_inputs
 from hybridvo.network.normalization import predict
 from hybridvo.network.selection import NetworkOutput, select_motion, select_pose
 from hybridvo.network.weighted_fit import fitted_motion, on_grid_of, pixel_weights
-from hybridvo.types import (
-    FramePair,
-    MotionPrediction,
-    PixelwisePrediction,
-    Reason,
-    RelativePose,
-    Status,
-)
+from hybridvo.results import MotionPrediction, PixelwisePrediction, Reason, RelativePose, Status
+from hybridvo.types import FramePair
 
 SELECTION = {
     "pwvo": "softmax",

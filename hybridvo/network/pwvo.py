@@ -30,7 +30,8 @@ from hybridvo.network.normalization import predict, remove_scale
 from hybridvo.network.options import NetworkOptions
 from hybridvo.network.vonet import OUTPUT_SCALE, VONet
 from hybridvo.network.weights import Weights, read_weights, weights_file
-from hybridvo.types import FramePair, PairBatch, PixelwisePrediction
+from hybridvo.results import PixelwisePrediction
+from hybridvo.types import FramePair, PairBatch
 
 INVALID_LOG_SCALE = 3.0
 """Least log scale where flow or depth is missing: U = 20 degrees or 20 m, "nothing was seen"."""
@@ -214,7 +215,7 @@ def build_network(options: NetworkOptions | None = None) -> nn.Module:
         options: kind and shapes; PWVO at full width by default.
 
     Returns:
-        :class:`PWVO`, whose output is a :class:`~hybridvo.types.PixelwisePrediction`, or
+        :class:`PWVO`, whose output is a :class:`~hybridvo.results.PixelwisePrediction`, or
         :class:`~hybridvo.network.vonet.VONet`, whose output is (rotation_deg, translation). Its
         attribute ``options`` keeps the options.
 

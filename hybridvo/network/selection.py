@@ -3,18 +3,16 @@
 In each patch the pixel of least uncertainty is chosen; the patches are then weighed. With
 s = log U, U the Laplace scale that the network predicts:
 
-========================  =========================================================================
-``softmax``               weights softmax(-s), that is 1/U: what the published code computes.
-                          Default: one over-confident patch cannot silence the rest as it does with
-                          1/U^2.
-``min_variance``          softmax(-2s), that is 1/U^2: least variance if the scales are exact and
-                          the patches independent.
-``median``                weighted median with weights 1/U: the maximum-likelihood estimate under
-                          the Laplace model; indifferent to a moving object that holds a minority.
-``mean``                  plain mean of all pixels, no patches: PWVO (naive), pixel-wise.
-``paper``                 softmax(+U) as the paper prints it. It prefers the most uncertain of the
-                          chosen pixels; kept for the record.
-========================  =========================================================================
+==============  ===================================================================================
+``softmax``     weights softmax(-s), that is 1/U: what the published code computes. Default: one
+                over-confident patch cannot silence the rest as it does with 1/U^2.
+``argmin``      the chosen pixels of all patches weigh alike.
+``mean``        plain mean of all pixels, no patches: PWVO (naive), pixel-wise.
+``exp_plus_u``  softmax(+U), as the paper prints it. It prefers the most uncertain of the chosen
+                pixels; kept for the record.
+``joint``       softmax(-s) with one s for all six numbers, their mean: one pixel a patch and one
+                weight for rotation and translation.
+==============  ===================================================================================
 """
 
 from __future__ import annotations
@@ -25,10 +23,10 @@ import torch
 import torch.nn.functional as F
 
 from hybridvo.errors import InputError
+from hybridvo.results import PixelwisePrediction
 from hybridvo.torch_geometry import euler_transform
-from hybridvo.types import PixelwisePrediction
 
-SELECTION_METHODS = ("softmax", "min_variance", "median", "mean", "paper")
+SELECTION_METHODS = ("softmax", "argmin", "mean", "exp_plus_u", "joint")
 
 PATCH_ROWS = 4
 """Rows of patches when no patch size is given: the paper has 4x8 patches of 32 in 128x256."""
@@ -111,11 +109,11 @@ def select_pose(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """One rotation and one translation per pair from the output of any network.
 
-    Each of the six numbers has its own pixels and weights, as in the published evaluation.
-    Differentiable in the predictions and, through the weights, in the log scales (``median`` in
-    the predictions only); the choice of the pixel has no gradient. Values that are not finite are
-    never chosen while their patch has another, and a patch without any has no weight; a pair
-    without any gives zero motion.
+    Each of the six numbers has its own pixels and weights, as in the published evaluation; those of
+    ``joint`` share theirs. Differentiable in the predictions and, through the weights, in the log
+    scales; the choice of the pixel has no gradient. Values that are not finite are never chosen
+    while their patch has another, and a patch without any has no weight; a pair without any gives
+    zero motion.
 
     Args:
         output: maps of (B, 3, h, w), or the pose itself (VONet).
@@ -138,22 +136,18 @@ def select_pose(
         )
     if patch is not None and patch < 1:
         raise InputError(f"select: expected a patch side of at least 1 cell, got {patch!r}.")
-    _check(output)
-    height, width = output.rotation.shape[2:]
-    patch = min(patch or -(-height // PATCH_ROWS), max(height, width))
-    pairs = (
-        (output.rotation, output.log_scale_rotation),
-        (output.translation, output.log_scale_translation),
-    )
-    rotation, translation = (
-        _mean(value) if scale is None or method == "mean" else _vote(value, scale, method, patch)
-        for value, scale in pairs
-    )
-    return rotation, translation
+    value, log_scale = _joined(output)
+    if log_scale is None or method == "mean":
+        motion = _mean(value)
+    else:
+        height, width = value.shape[2:]
+        patch = min(patch or -(-height // PATCH_ROWS), max(height, width))
+        motion = _vote(value, log_scale, method, patch)
+    return motion[:, :3], motion[:, 3:]
 
 
-def _check(prediction: PixelwisePrediction) -> None:
-    """Refuse what is no prediction, and maps that do not belong to each other."""
+def _joined(prediction: PixelwisePrediction) -> tuple[torch.Tensor, torch.Tensor | None]:
+    """(B, 6, h, w) values and log scales; refuses maps that do not belong to each other."""
     if not isinstance(prediction, PixelwisePrediction):
         got = type(prediction).__name__
         raise InputError(f"select: expected a PixelwisePrediction, got {got}.")
@@ -168,57 +162,51 @@ def _check(prediction: PixelwisePrediction) -> None:
                 f"select: expected {name} as floating-point maps of shape (B, 3, h, w), like the "
                 f"rotation's {shape}, got {value.dtype} of {tuple(value.shape)}."
             )
+    motion = torch.cat([prediction.rotation, prediction.translation], dim=1)
+    s_rotation, s_translation = prediction.log_scale_rotation, prediction.log_scale_translation
+    if s_rotation is None or s_translation is None:
+        return motion, None
+    return motion, torch.cat([s_rotation, s_translation], dim=1)
 
 
 def _mean(value: torch.Tensor) -> torch.Tensor:
-    """(B, 3, h, w) -> (B, 3), over the finite pixels."""
+    """(B, 6, h, w) -> (B, 6), over the finite pixels."""
     finite = torch.isfinite(value)
     total = torch.where(finite, value, 0.0).sum(dim=(2, 3))
     return total / finite.sum(dim=(2, 3)).clamp(min=1)
 
 
 def _vote(value: torch.Tensor, log_scale: torch.Tensor, method: str, patch: int) -> torch.Tensor:
-    """(B, 3, h, w) values and log scales -> (B, 3)."""
+    """(B, 6, h, w) values and log scales -> (B, 6)."""
     usable = torch.isfinite(value) & torch.isfinite(log_scale)
+    if method == "joint":
+        usable = usable.all(dim=1, keepdim=True).expand_as(usable)
     value = torch.where(usable, value, 0.0)
     log_scale = torch.where(usable, log_scale, 0.0).clamp(-MAX_LOG_SCALE, MAX_LOG_SCALE)
+    if method == "joint":
+        log_scale = log_scale.mean(dim=1, keepdim=True).expand_as(log_scale)
     # Padding that completes the last patches is infinitely uncertain and unusable: as every patch
     # holds at least one real pixel, and real ones rank below infinity, padding never wins.
     rank = torch.where(usable, log_scale, torch.finfo(log_scale.dtype).max).detach()
     winner = _patches(rank, patch, torch.inf).argmin(dim=-1, keepdim=True)
-    chosen, chosen_scale = (
-        _patches(x, patch, 0.0).gather(-1, winner)[..., 0] for x in (value, log_scale)
+    chosen, chosen_scale, known = (
+        _patches(x, patch, 0.0).gather(-1, winner)[..., 0]
+        for x in (value, log_scale, usable.to(value.dtype))
     )
-    known = _patches(usable.to(value.dtype), patch, 0.0).gather(-1, winner)[..., 0] > 0
-    if method == "paper":
-        logits = chosen_scale.exp()
+    if method == "argmin":
+        logits = torch.zeros_like(chosen_scale)
     else:
-        logits = -2 * chosen_scale if method == "min_variance" else -chosen_scale
+        logits = chosen_scale.exp() if method == "exp_plus_u" else -chosen_scale
     # Where no patch is known the weights are uniform over zeros.
-    nothing = ~known.any(dim=-1, keepdim=True)
-    weights = torch.softmax(logits.masked_fill(~(known | nothing), -torch.inf), dim=-1)
-    if method == "median":
-        return _weighted_median(chosen, weights.detach())
-    return (weights * chosen).sum(dim=-1)
+    nothing = ~known.bool().any(dim=-1, keepdim=True)
+    logits = logits.masked_fill(~(known.bool() | nothing), -torch.inf)
+    return (torch.softmax(logits, dim=-1) * chosen).sum(dim=-1)
 
 
 def _patches(x: torch.Tensor, patch: int, fill: float) -> torch.Tensor:
-    """(B, 3, h, w) -> (B, 3, patches, patch * patch), the border completed with ``fill``."""
+    """(B, 6, h, w) -> (B, 6, patches, patch * patch), the border completed with ``fill``."""
     batch, channels, height, width = x.shape
     rows, cols = -(-height // patch), -(-width // patch)
     x = F.pad(x, (0, cols * patch - width, 0, rows * patch - height), value=fill)
     x = x.reshape(batch, channels, rows, patch, cols, patch).transpose(3, 4)
     return x.reshape(batch, channels, rows * cols, patch * patch)
-
-
-def _weighted_median(value: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
-    """(..., N) values and weights that sum to one -> (...): the middle of the two medians."""
-    ordered, index = value.sort(dim=-1)
-    reached = weight.gather(-1, index).cumsum(dim=-1)
-    tolerance = 8 * torch.finfo(weight.dtype).eps
-    last = value.shape[-1] - 1
-    lower, upper = (
-        (reached < half).sum(dim=-1, keepdim=True).clamp(max=last)
-        for half in (0.5 - tolerance, 0.5 + tolerance)
-    )
-    return 0.5 * (ordered.gather(-1, lower) + ordered.gather(-1, upper))[..., 0]

@@ -16,7 +16,7 @@ import torch
 from hybridvo.hypotheses import search
 from hybridvo.hypotheses.generate import GridMaps
 from hybridvo.hypotheses.selector import Candidates
-from hybridvo.types import MotionPrior
+from hybridvo.results import MotionPrior
 
 REFERENCE_WIDTH = 1024.0
 """px, width at which absolute residuals and noises are compared between images."""

@@ -27,7 +27,7 @@ from hybridvo.network.selector_inputs import (
     shared_channels,
 )
 from hybridvo.network.weights import Weights
-from hybridvo.types import MotionPrior
+from hybridvo.results import MotionPrior
 
 CHANNELS = (24, 40, 64, 96)
 CANDIDATE_CHANNELS = 8

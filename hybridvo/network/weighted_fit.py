@@ -13,8 +13,8 @@ import torch.nn.functional as F
 from hybridvo.errors import InputError
 from hybridvo.network.inputs import NetworkInputs
 from hybridvo.network.selection import SHARPNESS, NetworkOutput, select_motion
+from hybridvo.results import PixelwisePrediction
 from hybridvo.torch_geometry import left_update, pp, se3
-from hybridvo.types import PixelwisePrediction
 
 CUTOFF = 1.5
 """Scale of the robust kernel in weighted medians of the residual."""
@@ -41,7 +41,7 @@ def fitted_motion(
     gradient.
 
     Args:
-        output: a :class:`~hybridvo.types.PixelwisePrediction` with log scales.
+        output: a :class:`~hybridvo.results.PixelwisePrediction` with log scales.
         inputs: that it was made from.
         selection: of the start.
 

@@ -11,8 +11,9 @@ import torch
 from hybridvo.errors import InputError
 from hybridvo.options import RefineOptions
 from hybridvo.refinement.torch_pixels import MAX_VALUE
+from hybridvo.results import Reason, RelativePose, Status
 from hybridvo.torch_geometry import MAX_DEPTH, MIN_DEPTH, pp, se3
-from hybridvo.types import PairBatch, Reason, RelativePose, Status
+from hybridvo.types import PairBatch
 
 DEPTH_CURR_FLOOR = 2e-3
 """Smallest noise of log D_curr assumed: what bilinear sampling of a smooth surface is good to."""

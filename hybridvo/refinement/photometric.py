@@ -25,7 +25,8 @@ from hybridvo.refinement.photometric_images import MID_GREY, Level, blurred, gre
 from hybridvo.refinement.photometric_options import PhotometricReport
 from hybridvo.refinement.photometric_problem import Problem, State, inverse, small_log
 from hybridvo.refinement.pixels import as_contiguous
-from hybridvo.types import FramePair, RelativePose
+from hybridvo.results import RelativePose
+from hybridvo.types import FramePair
 
 PER_CELL = 4
 MIN_WEIGHT = 0.25

@@ -13,7 +13,8 @@ from hybridvo.refinement.full_fit import tile_size
 from hybridvo.refinement.illumination import EXPLAINED, even_light
 from hybridvo.refinement.photometric_images import Level
 from hybridvo.refinement.pixels import as_contiguous, typical
-from hybridvo.types import FramePair, RelativePose
+from hybridvo.results import RelativePose
+from hybridvo.types import FramePair
 
 CUTOFF = 3.0
 """c of the Geman-McClure kernel, in standard deviations."""

@@ -13,7 +13,8 @@ import numpy as np
 
 from hybridvo.options import RefineOptions
 from hybridvo.refinement import kernels
-from hybridvo.types import Camera, FramePair, Reason, RelativePose
+from hybridvo.results import Reason, RelativePose
+from hybridvo.types import Camera, FramePair
 
 MIN_USABLE = 0.1
 """Share of usable grid pixels below which the grid is drawn anew, finer, where they are."""

@@ -16,7 +16,8 @@ from hybridvo.geometry import invert, pose_matrix, se3_log
 from hybridvo.options import RefineOptions
 from hybridvo.refinement.full_fit import MIN_TILES, FullFit, fit_coarse, fit_full_grid
 from hybridvo.refinement.pixels import CoarseGrid, coarse_grid
-from hybridvo.types import FramePair, Hypothesis, Reason, RelativePose, Status
+from hybridvo.results import Hypothesis, Reason, RelativePose, Status
+from hybridvo.types import FramePair
 
 WEAK_RATIO = 2e-5
 """Ratio of the information's extreme eigenvalues below which errors that neighbours share, and that

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hybridvo.types import Frame, RelativePose
+from hybridvo.results import RelativePose
+from hybridvo.types import Frame
 
 GRID_COLUMNS = 128
 """Cells in a row of the coarse grid on which static pixels and overlap are known."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hybridvo.geometry import invert, pose_matrix, se3_log
-from hybridvo.types import MotionPrior
+from hybridvo.results import MotionPrior
 
 MEMORY = 10
 """Motions after which a change counts 1 / e of a new one."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from hybridvo.geometry import invert, pose_matrix, se3_exp, se3_log
 from hybridvo.refinement.photometric_problem import small_log
-from hybridvo.types import Status
+from hybridvo.results import Status
 
 CHI2_LIMIT = 22.5
 """Squared Mahalanobis distance that 0.1 % of right motions exceed (chi-square, 6 degrees)."""

@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 
 from hybridvo.errors import InputError
+from hybridvo.results import Reason, State, Status
 from hybridvo.tracking.keyframes import KeyFrame
 from hybridvo.tracking.motion_model import MotionModel
 from hybridvo.tracking.pose_graph import Edge
 from hybridvo.tracking.window import Window
-from hybridvo.types import Camera, Frame, Reason, State, Status
+from hybridvo.types import Camera, Frame
 
 IMAGES = ("rgb", "depth", "depth_variance", "mask")
 

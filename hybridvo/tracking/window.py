@@ -18,9 +18,10 @@ import numpy as np
 from hybridvo.calibration import CORRECTION_LIMIT
 from hybridvo.geometry import invert, se3_log
 from hybridvo.options import TrackOptions
+from hybridvo.results import MotionPrior, Reason, RelativePose, State, Status
 from hybridvo.tracking.keyframes import KeyFrame, View, spread_px, static_cells
 from hybridvo.tracking.pose_graph import Edge, adjoint, chi2, compose_covariance, solve_graph
-from hybridvo.types import Frame, MotionPrior, Reason, RelativePose, State, Status
+from hybridvo.types import Frame
 
 Register = Callable[[KeyFrame, Frame, MotionPrior | None, np.ndarray], RelativePose]
 """(key frame, frame, predicted T_frame_key or None, (H, W) weights) -> motion."""

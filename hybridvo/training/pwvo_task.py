@@ -15,10 +15,10 @@ from hybridvo.network.normalization import first_motions
 from hybridvo.network.pwvo import build_network
 from hybridvo.network.selection import select_motion
 from hybridvo.network.weighted_fit import fitted_motion
+from hybridvo.results import PixelwisePrediction
 from hybridvo.training.options import PwvoOptions, described
 from hybridvo.training.stream import Mixture, SampleStream, TrainingBatch
 from hybridvo.training.validation import evaluate_network
-from hybridvo.types import PixelwisePrediction
 
 FIT_FLOOR_PX = 0.05
 """Pixels of the inputs: below it the noise of the inputs decides the fit."""

@@ -20,11 +20,12 @@ from hybridvo.geometry import invert, se3_exp
 from hybridvo.hypotheses.generate import HypothesisSet, generate
 from hybridvo.options import Options
 from hybridvo.refinement import kernels
+from hybridvo.results import RelativePose
 from hybridvo.synthetic.diverse import DiverseOptions, diverse_sample
 from hybridvo.synthetic.sensors import SensorOptions, degrade_depth, log_uniform
 from hybridvo.synthetic.training_scenes import training_scene
 from hybridvo.training.rendered import MOVING, STATIC, UNKNOWN
-from hybridvo.types import Camera, Frame, FramePair, RelativePose
+from hybridvo.types import Camera, Frame, FramePair
 
 PER_SHARD = 64
 MAX_MOTIONS = 5

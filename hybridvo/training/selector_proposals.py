@@ -18,9 +18,9 @@ from hybridvo.network.inputs import NETWORK_SIZE
 from hybridvo.network.normalization import predict
 from hybridvo.network.prediction import static_probability
 from hybridvo.network.weighted_fit import fitted_motion, on_grid_of
+from hybridvo.results import PixelwisePrediction
 from hybridvo.training.rendered import grid_sample
 from hybridvo.training.stream import collate
-from hybridvo.types import PixelwisePrediction
 
 FOLDER = "proposals"
 AT_ONCE = 16

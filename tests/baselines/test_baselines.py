@@ -16,8 +16,9 @@ from hybridvo.errors import InputError
 from hybridvo.estimation import estimate
 from hybridvo.geometry import ego_flow, invert, make_transform, rotation_angle, se3_exp, se3_log
 from hybridvo.pipeline import check_method
+from hybridvo.results import Reason, RelativePose, State
 from hybridvo.synthetic.scenarios import Scenario, make_pair
-from hybridvo.types import Camera, Frame, FramePair, Reason, RelativePose, State
+from hybridvo.types import Camera, Frame, FramePair
 
 POINT_SOLVERS = ["pnp-ransac", "pnp-ransac-tuned", "usac-magsac", "poselib"]
 ALL = [*POINT_SOLVERS, "opencv-rgbd", "open3d-rgbd", "identity"]

@@ -18,7 +18,8 @@ from hybridvo.errors import InputError
 from hybridvo.estimation import estimate
 from hybridvo.geometry import se3_exp
 from hybridvo.pipeline import DEFAULT_METHOD, METHODS, check_method
-from hybridvo.types import FramePair, MotionPrior, Reason, State
+from hybridvo.results import MotionPrior, Reason, State
+from hybridvo.types import FramePair
 from tests import worlds
 
 SEARCHING = ("hybrid", "hybrid-flow", "refine")

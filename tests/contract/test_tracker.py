@@ -16,7 +16,7 @@ import torch
 import hybridvo as hvo
 from hybridvo.flow import dis_flow
 from hybridvo.geometry import invert
-from hybridvo.types import Reason, State
+from hybridvo.results import Reason, State
 from tests import worlds
 
 PAIR, T_TRUE = worlds.world()

@@ -20,9 +20,9 @@ from hybridvo.evaluation.sources import SharedFlow, expand, methods_to_run
 from hybridvo.network.models import Models
 from hybridvo.odometry import Odometry
 from hybridvo.pipeline import METHODS, weights_hash
+from hybridvo.results import RelativePose
 from hybridvo.synthetic.render import make_scene, write_sintel
 from hybridvo.trajectory import read_trajectory
-from hybridvo.types import RelativePose
 
 ROWS = (  # what other programs rely on
     *("sequence", "method", "flow_source", "depth_source", "pairs", "failed", "r_err_deg", "t_err"),

@@ -30,8 +30,9 @@ from hybridvo.network.inputs import assemble_inputs
 from hybridvo.network.pwvo import NetworkOptions, build_network
 from hybridvo.network.selection import select_motion
 from hybridvo.network.weights import save_weights
+from hybridvo.results import PixelwisePrediction
 from hybridvo.synthetic.render import SyntheticSequence, make_scene, write_sintel
-from hybridvo.types import FramePair, PixelwisePrediction
+from hybridvo.types import FramePair
 
 
 @pytest.fixture(scope="module")

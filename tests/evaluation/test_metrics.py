@@ -18,7 +18,7 @@ from hybridvo.evaluation.metrics import (
     rpe,
 )
 from hybridvo.geometry import make_transform, se3_exp
-from hybridvo.trajectory import Trajectory, read_trajectory, write_tum
+from hybridvo.trajectory import Trajectory, read_trajectory
 
 
 def random_trajectory(rng: np.random.Generator, frames: int = 40) -> Trajectory:
@@ -222,7 +222,7 @@ def test_overflow_is_none_with_a_reason():
 
 
 def test_nan_in_a_file_names_the_line(tmp_path):
-    write_tum(from_positions(np.eye(3)), tmp_path / "gt")
+    from_positions(np.eye(3)).save(tmp_path / "gt")
     (tmp_path / "est").write_text("0 0 0 0 0 0 0 1\n1 nan 0 0 0 0 0 1\n")
     with pytest.raises(FormatError, match=r"est:2: expected .*finite numbers"):
         evaluate_files(tmp_path / "est", tmp_path / "gt")
@@ -342,7 +342,7 @@ def test_drift_against_a_plain_loop(rng):
     assert drift["rotation_deg_per_m"] == pytest.approx(np.mean(rotations), rel=1e-9)
 
 
-def test_ate_reads_what_write_tum_wrote(tmp_path, rng):
+def test_ate_reads_what_save_wrote(tmp_path, rng):
     truth = random_trajectory(rng)
-    write_tum(truth, tmp_path / "t")
+    truth.save(tmp_path / "t")
     assert ate(read_trajectory(tmp_path / "t"), truth).rmse == pytest.approx(0, abs=1e-12)

@@ -25,7 +25,7 @@ from hybridvo.evaluation.sequence_job import PAIR_COLUMNS, pair_table
 from hybridvo.evaluation.worst import worst_pairs
 from hybridvo.files import write_csv, write_json
 from hybridvo.geometry import se3_exp
-from hybridvo.trajectory import Trajectory, write_tum
+from hybridvo.trajectory import Trajectory
 
 ERRORS = {"hybrid": 0.01, "refine": 0.1, "pnp-ransac": 3.0}
 FLOWS = ("file (true)", "dis")
@@ -39,7 +39,7 @@ def folder(tmp_path: Path) -> Path:
     gt = Trajectory(np.arange(7) / 10, poses)
     (tmp_path / "trajectories").mkdir()
     (tmp_path / "worst").mkdir()
-    write_tum(gt, tmp_path / "trajectories" / "gt.tum")
+    gt.save(tmp_path / "trajectories" / "gt.tum")
     cv2.imwrite(str(tmp_path / "worst" / "a.jpg"), np.zeros((8, 8, 3), np.uint8))
     pairs = [
         {

@@ -14,9 +14,10 @@ from hybridvo.hypotheses.generate import HypothesisSet, generate
 from hybridvo.hypotheses.selector import Candidates, CueSelector, MaskSelector, Scores
 from hybridvo.options import Options, SelectOptions
 from hybridvo.pipeline import Context
+from hybridvo.results import MotionPrediction, MotionPrior, RelativePose, State
 from hybridvo.synthetic.render import SyntheticSequence, make_scene
 from hybridvo.synthetic.scenarios import Scenario, make_pair
-from hybridvo.types import FramePair, MotionPrediction, MotionPrior, RelativePose, State
+from hybridvo.types import FramePair
 
 SCENARIO = Scenario(moving=0.6, objects=1, flow_noise_px=0.3, depth_noise=0.01)
 SIZE = {"height": 96, "width": 224}

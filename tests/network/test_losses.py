@@ -11,8 +11,9 @@ from hybridvo.errors import InputError
 from hybridvo.geometry import ego_flow, euler_deg_to_matrix, make_transform
 from hybridvo.network.losses import LossOptions, LossTargets, reconstruct, total_loss
 from hybridvo.network.selection import select_pose
+from hybridvo.results import PixelwisePrediction
 from hybridvo.torch_geometry import euler_transform
-from hybridvo.types import Camera, PixelwisePrediction
+from hybridvo.types import Camera
 
 PLAIN = {"pose_uncertainty": False, "flow_uncertainty": False, "depth_uncertainty": False}
 POSE = {"flow": False, "depth": False}

@@ -14,8 +14,9 @@ from hybridvo.network.prediction import estimate_by_network, propose_motion, sta
 from hybridvo.network.pwvo import NetworkOptions, build_network
 from hybridvo.network.selection import select_motion
 from hybridvo.network.weighted_fit import fitted_motion
+from hybridvo.results import PixelwisePrediction, Reason, State
 from hybridvo.synthetic.scenarios import Scenario, make_pair
-from hybridvo.types import Camera, Frame, FramePair, PixelwisePrediction, Reason, State
+from hybridvo.types import Camera, Frame, FramePair
 
 STRIDE = 4
 

@@ -8,7 +8,7 @@ import torch
 from hybridvo.errors import InputError
 from hybridvo.network.inputs import NetworkInputs, assemble_aligned
 from hybridvo.network.pwvo import INVALID_LOG_SCALE, NetworkOptions, build_network
-from hybridvo.types import PixelwisePrediction
+from hybridvo.results import PixelwisePrediction
 
 TINY = NetworkOptions(width=0.125)
 

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from hybridvo.errors import InputError
 from hybridvo.geometry import euler_deg_to_matrix
 from hybridvo.network.selection import SELECTION_METHODS, select_pose
+from hybridvo.results import PixelwisePrediction
 from hybridvo.torch_geometry import euler_transform
-from hybridvo.types import PixelwisePrediction
 
 
 def random_prediction(seed: int, shape=(2, 3, 7, 9), dtype=torch.float64) -> PixelwisePrediction:
@@ -23,10 +23,12 @@ def random_prediction(seed: int, shape=(2, 3, 7, 9), dtype=torch.float64) -> Pix
 
 
 def by_loop(value, s, method, patch):
-    """Selection of (3, h, w) maps, written as plainly as possible."""
+    """Selection of (6, h, w) maps, written as plainly as possible."""
     _, height, width = value.shape
+    if method == "joint":
+        s = np.broadcast_to(s.mean(axis=0), s.shape)
     out = []
-    for c in range(3):
+    for c in range(6):
         if method == "mean":
             out.append(value[c].mean())
             continue
@@ -39,17 +41,9 @@ def by_loop(value, s, method, patch):
                     for j in range(left, min(left + patch, width))
                 ]
                 picked.append(min(cells))
-        scales = np.array([p[0] for p in picked])
-        values = np.array([p[1] for p in picked])
-        if method == "median":
-            weights = np.exp(-scales) / np.exp(-scales).sum()
-            order = np.argsort(values)
-            reached = np.cumsum(weights[order])
-            out.append(values[order][np.searchsorted(reached, 0.5)])
-            continue
-        logits = {"softmax": -scales, "min_variance": -2 * scales, "paper": np.exp(scales)}[method]
-        weights = np.exp(logits - logits.max())
-        out.append((weights / weights.sum() * values).sum())
+        scales, values = np.array(picked).T
+        weights = {"argmin": np.ones_like(scales), "exp_plus_u": np.exp(np.exp(scales))}
+        out.append(np.average(values, weights=weights.get(method, np.exp(-scales))))
     return np.array(out)
 
 
@@ -57,14 +51,12 @@ def by_loop(value, s, method, patch):
 @pytest.mark.parametrize(("shape", "patch"), [((8, 8), 4), ((7, 9), 4), ((5, 6), 10), ((3, 2), 1)])
 def test_equals_a_loop(method, shape, patch):
     prediction = random_prediction(5, (2, 3, *shape))
-    rotation, translation = select_pose(prediction, method, patch)
+    got = torch.cat(select_pose(prediction, method, patch), dim=1)
+    value = np.concatenate([prediction.rotation, prediction.translation], axis=1)
+    s = np.concatenate([prediction.log_scale_rotation, prediction.log_scale_translation], axis=1)
     for b in range(2):
-        for got, value, s in (
-            (rotation, prediction.rotation, prediction.log_scale_rotation),
-            (translation, prediction.translation, prediction.log_scale_translation),
-        ):
-            expected = by_loop(value[b].numpy(), s[b].numpy(), method, patch)
-            np.testing.assert_allclose(got[b].numpy(), expected, rtol=1e-12, atol=1e-12)
+        expected = by_loop(value[b], s[b], method, patch)
+        np.testing.assert_allclose(got[b], expected, rtol=1e-12, atol=1e-12)
 
 
 def worked_example() -> PixelwisePrediction:
@@ -78,10 +70,10 @@ def worked_example() -> PixelwisePrediction:
     ("method", "expected"),
     [
         ("softmax", (2 * 1 + 1 * 4) / 3),  # 1/U: weights 2/3, 1/3
-        ("min_variance", (4 * 1 + 1 * 4) / 5),  # 1/U^2: weights 4/5, 1/5
-        ("median", 1.0),  # two thirds of the weight
+        ("argmin", (1 + 4) / 2),
         ("mean", (1 + 4 + 6 * 9) / 8),
-        ("paper", (1 + math.e * 4) / (1 + math.e)),  # exp(1), exp(2)
+        ("exp_plus_u", (1 + math.e * 4) / (1 + math.e)),  # exp(1), exp(2)
+        ("joint", (2 * 1 + 1 * 4) / 3),  # all six have the same U here
     ],
 )
 def test_worked_by_hand(method, expected):
@@ -135,7 +127,7 @@ def test_result_lies_within_the_values_and_is_equivariant(seed, height, width, p
         prediction.log_scale_translation,
     )
     torch.testing.assert_close(select_pose(moved, method, patch)[0], 2 * rotation + 5)
-    if method in ("softmax", "min_variance", "median"):
+    if method in ("softmax", "argmin"):
         louder = PixelwisePrediction(
             prediction.rotation,
             prediction.translation,
@@ -183,7 +175,7 @@ def test_extreme_scales_stay_finite_in_value_and_gradient():
         assert s.grad is None or torch.isfinite(s.grad).all()
 
 
-@pytest.mark.parametrize("method", ["softmax", "min_variance", "mean", "paper", "median"])
+@pytest.mark.parametrize("method", SELECTION_METHODS)
 def test_gradcheck(method):
     maps = [v.requires_grad_() for v in list(vars(random_prediction(3, (1, 3, 3, 4))).values())[:4]]
 
@@ -191,7 +183,7 @@ def test_gradcheck(method):
         return torch.cat(select_pose(PixelwisePrediction(*values), method, 2), dim=1)
 
     torch.autograd.gradcheck(pose, maps)
-    if method in ("softmax", "min_variance", "paper"):
+    if method in ("softmax", "exp_plus_u", "joint"):
         pose(*maps).sum().backward()
         assert maps[2].grad.abs().sum() > 0
 

@@ -14,13 +14,12 @@ import pytest
 
 from tests.project import source_tree as source
 
-BASE = {"errors", "checks", "compilation", "units", "files"}
+BASE = {"errors", "compilation", "units", "files"}
 """Files without a notion of cameras: everything may import them."""
-NOUNS = BASE | {"types", "geometry", "calibration", "options"}
+NOUNS = BASE | {"types", "geometry", "results", "calibration", "options"}
 IMPORTS: dict[str, set[str]] = {
     # data walk from left to right
     "errors": set(),
-    "checks": {"errors"},
     "compilation": {"errors"},
     "units": {"errors"},
     "files": {"errors"},
@@ -28,6 +27,7 @@ IMPORTS: dict[str, set[str]] = {
     "options": {"errors", "calibration"},
     "types": BASE,
     "geometry": BASE | {"types"},
+    "results": BASE | {"types", "geometry"},
     "torch_geometry": BASE | {"types"},
     "flow": NOUNS,
     "trajectory": NOUNS,

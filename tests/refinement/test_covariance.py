@@ -22,8 +22,9 @@ from hybridvo.refinement.covariance import (
 )
 from hybridvo.refinement.pixels import PixelGrid
 from hybridvo.refinement.refine import widened
+from hybridvo.results import Reason, State, Status
 from hybridvo.synthetic.scenarios import make_pair
-from hybridvo.types import FramePair, Reason, State, Status
+from hybridvo.types import FramePair
 
 FINE, ROWS, COLUMNS = 4, 7, 16
 """Readings along the side of a tile, and tiles: those of a image of 436x1024."""

@@ -14,7 +14,8 @@ from hybridvo.geometry import ego_flow, se3_exp
 from hybridvo.options import Options, RefineOptions
 from hybridvo.refinement import kernels
 from hybridvo.refinement.depth_agreement import depth_agreement
-from hybridvo.types import Camera, Frame, FramePair, Reason
+from hybridvo.results import Reason
+from hybridvo.types import Camera, Frame, FramePair
 
 K = Camera(140, 140, 127.5, 95.5, 192, 256)
 T = se3_exp(np.array([0.05, -0.03, 0.1, 0.01, -0.02, 0.015]))

@@ -10,8 +10,8 @@ import torch
 
 import hybridvo as hvo
 from hybridvo import torch_geometry
+from hybridvo.results import PixelwisePrediction
 from hybridvo.synthetic.scenarios import make_pair
-from hybridvo.types import PixelwisePrediction
 
 SIZE = (120, 160)
 

@@ -17,8 +17,9 @@ from hybridvo.refinement import photometric_kernels as kernels
 from hybridvo.refinement.photometric import refine_photometric
 from hybridvo.refinement.photometric_images import Level, blurred, grey_image, match_blur
 from hybridvo.refinement.photometric_problem import Problem, State, small_log
+from hybridvo.results import RelativePose
 from hybridvo.synthetic.render import SyntheticSequence, make_scene
-from hybridvo.types import FramePair, RelativePose
+from hybridvo.types import FramePair
 
 MEASURED = range(300, 306)
 """Seeds of the development range that no constant was tuned on."""

@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 from hybridvo.estimation import refine
 from hybridvo.geometry import ego_flow, invert, make_transform, rotation_angle, se3_exp, se3_log
 from hybridvo.options import Options, RefineOptions
+from hybridvo.results import Reason, State
 from hybridvo.synthetic.scenarios import make_pair
-from hybridvo.types import Camera, Frame, FramePair, Reason, State
+from hybridvo.types import Camera, Frame, FramePair
 
 CAMERA = Camera(350.0, 340.0, 159.0, 82.0, 160, 320)
 CHI2_6_3SIGMA = 20.06  # 0.9973 quantile of chi-square with 6 degrees of freedom

@@ -14,9 +14,10 @@ from hybridvo.estimation import refine
 from hybridvo.geometry import rotation_angle, se3_exp
 from hybridvo.refinement.batch import BatchedPose, BatchOptions
 from hybridvo.refinement.torch_backend import refine_batch
+from hybridvo.results import Reason, State
 from hybridvo.synthetic.scenarios import make_pair
 from hybridvo.torch_geometry import pixel_grid, pp, reproject, se3
-from hybridvo.types import PairBatch, Reason, State
+from hybridvo.types import PairBatch
 from tests.refinement.batches import F64, noisy_batch
 
 FIELDS = ("SE3", "covariance", "converged", "failed", "cost", "weights", "noise")

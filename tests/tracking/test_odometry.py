@@ -15,8 +15,9 @@ from hybridvo.geometry import ego_flow, invert, se3_exp
 from hybridvo.odometry import Odometry
 from hybridvo.options import Options, TrackOptions
 from hybridvo.pipeline import DEFAULT_METHOD
+from hybridvo.results import Reason, State
 from hybridvo.synthetic.render import make_scene
-from hybridvo.types import Camera, Frame, Reason, State
+from hybridvo.types import Camera, Frame
 
 HEIGHT, WIDTH = 48, 64
 CAMERA = Camera(60, 60, 31.5, 23.5, HEIGHT, WIDTH)

@@ -12,6 +12,7 @@ from scipy.optimize import least_squares
 from hybridvo.errors import InputError
 from hybridvo.geometry import invert, se3_exp, se3_log
 from hybridvo.options import TrackOptions
+from hybridvo.results import Reason, RelativePose, State, Status
 from hybridvo.tracking.keyframes import KeyFrame, View
 from hybridvo.tracking.motion_model import MotionModel
 from hybridvo.tracking.pose_graph import (
@@ -24,7 +25,7 @@ from hybridvo.tracking.pose_graph import (
 )
 from hybridvo.tracking.state import TrackerState
 from hybridvo.tracking.window import Located, Window, locate
-from hybridvo.types import Camera, Frame, Reason, RelativePose, State, Status
+from hybridvo.types import Camera, Frame
 
 HEIGHT, WIDTH = 48, 64
 CAMERA = Camera(60, 60, 31.5, 23.5, HEIGHT, WIDTH)

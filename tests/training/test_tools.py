@@ -9,6 +9,7 @@ import pytest
 
 from hybridvo.errors import CheckpointError
 from hybridvo.network.models import load_weights
+from hybridvo.network.selection import SELECTION_METHODS
 from hybridvo.training.export import export_pwvo, open_run
 from hybridvo.training.options import load_pwvo_options, load_selector_options
 from tests.scripts import load_script
@@ -108,8 +109,16 @@ def test_ablation_scores_milestones_and_goes_on(tmp_path, monkeypatch):
     claim = next(c for c in result["claims"] if c["samples"] == 8)
     assert claim["as_claimed"].endswith("of 2") and claim["spread_of_seeds_px"] >= 0
     rules = result["runs"][0]["curve"]["8"]["rules_data_paper"]
-    assert set(rules) == set(tool.RULES)
+    assert set(rules) == set(SELECTION_METHODS)
     load_weights(out / "pwvo-paper-seed0" / "weights.safetensors")
+    (out / "pwvo-paper-seed1" / "weights.safetensors").unlink()
+    assert tool.main([*words, "--seeds", "2", "--score"]) == 0
+    again = json.loads((out / "ablation.json").read_text())["runs"]
+    assert [(run["row"], run["seed"]) for run in again] == [
+        *(("pwvo-paper", 0), ("vonet", 0), ("vonet", 1)),
+    ]
+    old, new = (runs[0]["curve"]["8"]["data_paper"] for runs in (result["runs"], again))
+    assert new["epe"] == pytest.approx(old["epe"], rel=0.01)  # weights are rounded to float16
     trained = (out / "vonet-seed0" / "log.jsonl").read_text()
     assert tool.main([*words, "--seeds", "2"]) == 0
     assert (out / "vonet-seed0" / "log.jsonl").read_text() == trained

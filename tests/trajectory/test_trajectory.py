@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hybridvo.errors import FormatError, InputError, OutputError
 from hybridvo.files import atomic_write
 from hybridvo.geometry import euler_deg_to_matrix, make_transform, ned_to_camera, se3_exp
-from hybridvo.trajectory import Trajectory, chain, read_trajectory, write_kitti, write_tum
+from hybridvo.trajectory import Trajectory, chain, read_trajectory
 
 IDENTITY_TUM = "0 0 0 0 0 0 1"
 
@@ -88,7 +88,7 @@ def test_bad_poses():
     reflection = np.diag([1.0, 1.0, -1.0, 1.0])
     with pytest.raises(InputError, match=r"T_world_cam\[0\]: expected a finite rigid"):
         Trajectory([0.0], reflection[None])
-    with pytest.raises(InputError, match=r"expected shape \(N, 4, 4\), got \(2, 3, 4\)"):
+    with pytest.raises(InputError, match=r"expected shape \(N, 4, 4\), got float64 \(2, 3, 4\)"):
         Trajectory([0.0, 1.0], np.zeros((2, 3, 4)))
     with pytest.raises(InputError, match="at least one pose"):
         Trajectory([], np.zeros((0, 4, 4)))
@@ -104,8 +104,8 @@ def test_tum_and_kitti_round_trip_and_evo_reads_them(tmp_path, rng):
 
     trajectory = random_trajectory(rng)
     tum, kitti = tmp_path / "t.tum", tmp_path / "t.kitti"
-    write_tum(trajectory, tum)
-    write_kitti(trajectory, kitti)
+    trajectory.save(tum)
+    trajectory.save(kitti)
     again = read_trajectory(tum)
     np.testing.assert_array_equal(again.timestamps, trajectory.timestamps)
     # quaternion and back: a few ulp of 1
@@ -120,7 +120,7 @@ def test_tum_and_kitti_round_trip_and_evo_reads_them(tmp_path, rng):
 
 
 def test_identity_row_reads_zeros_and_one(tmp_path):
-    write_tum(Trajectory([2.5], np.eye(4)[None]), tmp_path / "t")
+    Trajectory([2.5], np.eye(4)[None]).save(tmp_path / "t")
     row = (tmp_path / "t").read_text().split()
     assert [float(value) for value in row] == [2.5, 0, 0, 0, 0, 0, 0, 1]
 
@@ -137,10 +137,10 @@ def test_a_failed_write_leaves_the_old_file_and_no_litter(tmp_path):
 def test_output_error_names_the_file(tmp_path):
     blocker = write(tmp_path / "file", "x")
     with pytest.raises(OutputError, match=r"t\.tum: cannot be written"):
-        write_tum(Trajectory([0.0], np.eye(4)[None]), blocker / "t.tum")
+        Trajectory([0.0], np.eye(4)[None]).save(blocker / "t.tum")
     (tmp_path / "folder").mkdir()
     with pytest.raises(OutputError, match="folder: cannot be written"):
-        write_kitti(Trajectory([0.0], np.eye(4)[None]), tmp_path / "folder")
+        Trajectory([0.0], np.eye(4)[None]).save(tmp_path / "folder")
     assert sorted(os.listdir(tmp_path)) == ["file", "folder"]
 
 
@@ -148,7 +148,7 @@ def test_a_symbolic_link_is_replaced_not_followed(tmp_path):
     sentinel = write(tmp_path / "sentinel", "mine")
     link = tmp_path / "t.tum"
     link.symlink_to(sentinel)
-    write_tum(Trajectory([0.0], np.eye(4)[None]), link)
+    Trajectory([0.0], np.eye(4)[None]).save(link)
     assert sentinel.read_text() == "mine\n"
     assert not link.is_symlink()
 
@@ -181,13 +181,13 @@ def test_comments_crlf_tabs_bom_and_blank_lines(tmp_path):
         (["1 2 3"], r":1: expected 8 numbers \(TUM\), 12 \(KITTI\) or 7 \(TartanAir\).*got 3"),
         (
             [f"0 {IDENTITY_TUM}", f"1 {IDENTITY_TUM[:-1]}x"],
-            r":2: expected 8 finite numbers .*got 8: '1 0",
+            r":2: expected 'timestamp tx .* got '1 0",
         ),
-        ([f"0 {IDENTITY_TUM}", IDENTITY_TUM], r":2: expected 8 finite numbers .* got 7"),
-        (["# head", "0 nan 0 0 0 0 0 1"], r":2: expected 8 finite"),
-        (["0 0 0 0 0 0 0 inf"], r":1: expected 8 finite"),
-        (["0 0 0 0 0 0 0 0"], r":1: expected a unit quaternion.*got \[0"),
-        (["0 0 0 0 0 0 3 4"], r":1: expected a unit quaternion.*got \[0.0, 0.0, 3"),
+        ([f"0 {IDENTITY_TUM}", IDENTITY_TUM], r":2: expected 'timestamp tx"),
+        (["# head", "0 nan 0 0 0 0 0 1"], r":2: expected finite"),
+        (["0 0 0 0 0 0 0 inf"], r":1: expected finite"),
+        (["0 0 0 0 0 0 0 0"], r":1: expected a unit quaternion"),
+        (["0 0 0 0 0 0 3 4"], r":1: expected a unit quaternion.*3.0, 4.0"),
         ([f"1 {IDENTITY_TUM}", f"0 {IDENTITY_TUM}"], r":2: expected increasing"),
         (
             [f"1 {IDENTITY_TUM}", "", f"1 {IDENTITY_TUM}"],
@@ -208,7 +208,7 @@ def test_malformed_files(tmp_path, lines, match):
 
 
 def test_missing_binary_and_folder(tmp_path):
-    with pytest.raises(InputError, match=r"none\.txt: .*No such file"):
+    with pytest.raises(InputError, match=r"none\.txt: .*no such file"):
         read_trajectory(tmp_path / "none.txt")
     with pytest.raises(InputError, match="cannot be read"):
         read_trajectory(tmp_path)
@@ -220,7 +220,7 @@ def test_missing_binary_and_folder(tmp_path):
         read_trajectory(good, "csv")  # type: ignore[arg-type]
     with pytest.raises(InputError, match="axes: expected auto"):
         read_trajectory(good, axes="enu")  # type: ignore[arg-type]
-    with pytest.raises(FormatError, match=":1: expected 12 finite"):
+    with pytest.raises(FormatError, match=":1: expected 'r11"):
         read_trajectory(good, "kitti")
 
 
@@ -341,7 +341,7 @@ def test_world_is_the_first_camera_unless_given():
 def test_tum_files_hold_camera_to_world_and_quaternions_xyzw(tmp_path):
     # 90 deg about z: q = (0, 0, sin 45, cos 45) in xyzw
     T = make_transform(np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]]), np.array([1.0, 2.0, 3.0]))
-    write_tum(Trajectory([4.0], T[None]), tmp_path / "t")
+    Trajectory([4.0], T[None]).save(tmp_path / "t")
     row = [float(value) for value in (tmp_path / "t").read_text().split()]
     np.testing.assert_allclose(row, [4, 1, 2, 3, 0, 0, 0.5**0.5, 0.5**0.5], atol=1e-15)
     np.testing.assert_allclose(read_trajectory(tmp_path / "t").T_world_cam[0], T, atol=1e-15)

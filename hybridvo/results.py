@@ -1,0 +1,332 @@
+"""What comes out: status, motions with covariance, predictions of networks, and tracked steps."""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from hybridvo.errors import InputError
+from hybridvo.geometry import invert, rotation_angle
+from hybridvo.types import as_rigid, to_numpy
+
+if TYPE_CHECKING:
+    import torch
+
+    from hybridvo.refinement.photometric_options import PhotometricReport
+
+
+class State(enum.Enum):
+    """Outcome of one estimate."""
+
+    OK = "ok"
+    DEGRADED = "degraded"
+    FAILED = "failed"
+
+
+class Reason(enum.Enum):
+    """Why an estimate is not simply ok."""
+
+    NONE = ""
+    LOW_INLIERS = "low_inliers"
+    DEGENERATE_GEOMETRY = "degenerate_geometry"
+    NO_VALID_DEPTH = "no_valid_depth"
+    NO_FLOW = "no_flow"
+    MISSING_FRAME = "missing_frame"
+    SOLVER_DIVERGED = "solver_diverged"
+    NAN_INPUT = "nan_input"
+    AMBIGUOUS_MOTION = "ambiguous_motion"
+
+
+@dataclass(frozen=True)
+class Status:
+    """State, reason and a sentence that explains it."""
+
+    state: State = State.OK
+    reason: Reason = Reason.NONE
+    message: str = ""
+
+    @property
+    def ok(self) -> bool:
+        """Whether the state is OK: neither degraded nor failed."""
+        return self.state is State.OK
+
+    @property
+    def usable(self) -> bool:
+        """Whether there is an estimate: not failed. A degraded one has a wider covariance."""
+        return self.state is not State.FAILED
+
+    @classmethod
+    def degraded(cls, reason: Reason, message: str) -> Status:
+        """An estimate that may be used with care."""
+        return cls(State.DEGRADED, reason, message)
+
+    @classmethod
+    def failed(cls, reason: Reason, message: str) -> Status:
+        """An estimate that must not be used."""
+        return cls(State.FAILED, reason, message)
+
+    def __str__(self) -> str:
+        return self.state.value + (f"({self.reason.value})" if self.reason.value else "")
+
+
+@dataclass(frozen=True, eq=False)
+class MotionPrior:
+    """What is known of a motion before the pair is seen: one start among others, and a cue.
+
+    Args:
+        T_curr_prev: (4, 4) rigid transform, metres.
+        covariance: (6, 6) positive definite, of ``Exp(delta) T_curr_prev``, delta = (translation,
+            rotation) in the current camera; m^2, m rad, rad^2.
+
+    Raises:
+        InputError: no rigid transform, or no positive definite covariance.
+    """
+
+    T_curr_prev: np.ndarray
+    covariance: np.ndarray
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "T_curr_prev", as_rigid(self.T_curr_prev, "MotionPrior"))
+        covariance = to_numpy(self.covariance, "MotionPrior.covariance")
+        if covariance.shape != (6, 6) or covariance.dtype.kind not in "fiu":
+            raise InputError(
+                f"MotionPrior.covariance: expected numbers of shape (6, 6), got "
+                f"{covariance.dtype} of shape {covariance.shape}. A prior needs one: how far may "
+                f"the motion be from it?"
+            )
+        covariance = covariance.astype(np.float64)
+        if not (np.isfinite(covariance).all() and np.allclose(covariance, covariance.T)):
+            raise InputError("MotionPrior.covariance: expected a finite, symmetric matrix.")
+        if not np.linalg.eigvalsh(covariance)[0] > 0:
+            raise InputError(
+                "MotionPrior.covariance: expected a positive definite matrix, got one with the "
+                f"smallest eigenvalue {np.linalg.eigvalsh(covariance)[0]:.3g}."
+            )
+        object.__setattr__(self, "covariance", covariance)
+
+    def __repr__(self) -> str:
+        sigma = np.sqrt(np.diag(self.covariance))
+        return f"MotionPrior({_motion(self.T_curr_prev)}, sigma {_sizes(sigma[:3], sigma[3:])})"
+
+
+@dataclass(frozen=True, eq=False)
+class MotionPrediction:
+    """A network's prediction for one pair.
+
+    Args:
+        T_curr_prev: (4, 4) metres.
+        static_probability: (h, w) of every pixel of being static, 0 to 1, over the whole image at
+            any resolution.
+        covariance: (6, 6) of ``Exp(delta) T_curr_prev``, or None.
+    """
+
+    T_curr_prev: np.ndarray
+    static_probability: np.ndarray
+    covariance: np.ndarray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """One strong motion found in the image.
+
+    Args:
+        T_curr_prev: (4, 4).
+        source: which start led here (``identity``, ``prior``, ``window``, ``minimal``, ``refit``).
+        inlier_ratio: share of the valid pixels that follow this motion.
+        flow_noise_px: standard deviation of the flow about it, px. depth_noise: of log depth.
+        inliers: (h, w) float32 in [0, 1], robust weight of each pixel under this motion, on the
+            grid of ``stride``.
+        stride: px of the full image per step of that grid.
+        score: by which the camera's motion was chosen; larger is better.
+    """
+
+    T_curr_prev: np.ndarray
+    source: str
+    inlier_ratio: float
+    flow_noise_px: float
+    depth_noise: float
+    inliers: np.ndarray
+    stride: int
+    score: float = 0.0
+
+    def __repr__(self) -> str:
+        return (
+            f"Hypothesis({self.source}, {_motion(self.T_curr_prev)}, "
+            f"inliers {100 * self.inlier_ratio:.0f} %, score {self.score:.3g})"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class RelativePose:
+    """Camera motion of one pair: the result of every estimator.
+
+    Args:
+        T_curr_prev: (4, 4) float64, points of the previous camera into the current one; metres.
+        covariance: (6, 6) of the left perturbation ``Exp(delta) T_curr_prev``, delta =
+            (translation, rotation) in the current camera; m^2, m rad, rad^2.
+        status: ok, degraded or failed with its reason. A failed motion is the identity.
+        inlier_ratio: share of the valid pixels that follow the motion.
+        iterations: Gauss-Newton steps spent (or RANSAC iterations).
+        cost: final robust cost per valid pixel, dimensionless.
+        residual_scale_px: estimated standard deviation of the flow noise, px, where variances were
+            handed in at a pixel of the typical one.
+        depth_noise: of the log depth, likewise.
+        weights: (h, w) float32 robust weight of each pixel on the grid of ``weights_stride``.
+        translation_direction_valid: whether the translation is longer than three of its own
+            standard deviations; its direction means nothing otherwise.
+        information_eigenvalues: (6,) ascending, of the information matrix scaled to pixels.
+        probability: that this is the camera's motion and not an object's, 0 to 1; 0 if failed.
+        hypotheses: every strong motion found, the chosen one first.
+        method: name of the estimator. ms: time spent, milliseconds.
+        terms: what carried the motion: ``flow``, ``depth`` (of the current frame), ``images``,
+            ``window`` (key frames).
+        photometric: :class:`hybridvo.refinement.photometric.PhotometricReport` where the images
+            took part or were refused, or None.
+    """
+
+    T_curr_prev: np.ndarray = field(default_factory=lambda: np.eye(4))
+    covariance: np.ndarray = field(default_factory=lambda: np.eye(6))
+    status: Status = field(default_factory=Status)
+    inlier_ratio: float = 0.0
+    iterations: int = 0
+    cost: float = 0.0
+    residual_scale_px: float = 0.0
+    depth_noise: float = 0.0
+    weights: np.ndarray | None = None
+    weights_stride: int = 1
+    translation_direction_valid: bool = False
+    information_eigenvalues: np.ndarray = field(default_factory=lambda: np.zeros(6))
+    probability: float = 1.0
+    hypotheses: tuple[Hypothesis, ...] = ()
+    method: str = ""
+    ms: float = 0.0
+    terms: tuple[str, ...] = ()
+    photometric: PhotometricReport | None = None
+
+    @property
+    def ok(self) -> bool:
+        """Whether the status is OK: neither degraded nor failed."""
+        return self.status.ok
+
+    @property
+    def usable(self) -> bool:
+        """Whether this is a measurement: not failed. The covariance of a degraded one is wider."""
+        return self.status.usable
+
+    @property
+    def T_prev_curr(self) -> np.ndarray:
+        """Inverse of ``T_curr_prev``: what a pose-graph "between" factor wants."""
+        return invert(self.T_curr_prev)
+
+    @classmethod
+    def failed(cls, reason: Reason, message: str, method: str = "", **extra: Any) -> RelativePose:
+        """A failed estimate: identity with a covariance that carries no information."""
+        return cls(
+            covariance=np.diag([1e4] * 3 + [10.0] * 3),
+            status=Status.failed(reason, message),
+            method=method,
+            probability=0.0,
+            **extra,
+        )
+
+    def replace(self, **changes: Any) -> RelativePose:
+        """Copy with some fields changed."""
+        return replace(self, **changes)
+
+    def __repr__(self) -> str:
+        sigma = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+        return (
+            f"RelativePose({self.method or 'motion'}: {self.status}, {_motion(self.T_curr_prev)}, "
+            f"sigma {_sizes(sigma[:3], sigma[3:])}, inliers {100 * self.inlier_ratio:.0f} %, "
+            f"probability {self.probability:.2f})"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """One tracked frame of :class:`hybridvo.Odometry`.
+
+    Args:
+        index, timestamp: of the current frame.
+        T_world_cam: (4, 4) camera to world; world = first camera unless set.
+        motion: relative pose from the previous frame; identity with status ok for the first frame.
+    """
+
+    index: int
+    timestamp: float
+    T_world_cam: np.ndarray
+    motion: RelativePose
+
+    @property
+    def ok(self) -> bool:
+        """Whether the motion is neither degraded nor failed."""
+        return self.motion.ok
+
+    @property
+    def usable(self) -> bool:
+        """Whether the motion did not fail."""
+        return self.motion.usable
+
+    @property
+    def probability(self) -> float:
+        """That the motion is the camera's, 0 to 1."""
+        return self.motion.probability
+
+    @property
+    def status(self) -> Status:
+        """Status of the motion."""
+        return self.motion.status
+
+    @property
+    def T_curr_prev(self) -> np.ndarray:
+        """(4, 4) points of the previous camera into the current one."""
+        return self.motion.T_curr_prev
+
+    @property
+    def T_prev_curr(self) -> np.ndarray:
+        """(4, 4) pose of the current camera in the previous one."""
+        return self.motion.T_prev_curr
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """(6, 6) covariance of the motion."""
+        return self.motion.covariance
+
+    def __repr__(self) -> str:
+        x, y, z = self.T_world_cam[:3, 3]
+        return (
+            f"Step({self.index}, t {self.timestamp:.3f} s, at [{x:.3f} {y:.3f} {z:.3f}] m, "
+            f"{self.motion!r})"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class PixelwisePrediction:
+    """Raw output of a pixel-wise network for a batch of pairs (paper, section 3.2).
+
+    Args:
+        rotation: (B, 3, h, w) Euler angles X-Y-Z in degrees (R = Rx Ry Rz), of T_curr_prev.
+        translation: (B, 3, h, w) metres, of T_curr_prev.
+        log_scale_rotation, log_scale_translation: (B, 3, h, w), s = log of the Laplace scale U, or
+            None where the network predicts no uncertainty.
+        image_size: (H, W) of the pairs that the network was given, or None.
+    """
+
+    rotation: torch.Tensor
+    translation: torch.Tensor
+    log_scale_rotation: torch.Tensor | None = None
+    log_scale_translation: torch.Tensor | None = None
+    image_size: tuple[int, int] | None = None
+
+
+def _sizes(metres: np.ndarray, radians: np.ndarray) -> str:
+    return f"{np.linalg.norm(metres):.3g} m {np.rad2deg(np.linalg.norm(radians)):.3g} deg"
+
+
+def _motion(T: np.ndarray) -> str:
+    """Translation and angle of a (4, 4) transform, for a line of print."""
+    x, y, z = T[:3, 3]
+    return f"t [{x:.4f} {y:.4f} {z:.4f}] m, {np.rad2deg(rotation_angle(T[:3, :3])):.3f} deg"
