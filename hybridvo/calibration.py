@@ -1,9 +1,16 @@
-"""Numbers fitted on data: value, unit, data, and how they are found again."""
+"""Numbers fitted on data: value, unit, data, and how they are found again.
 
-CUE_GAP = (4.4, 0.0)
-"""Slope and offset of the logit of being right (ego-flow error of at most 1 px) in the difference
-of the two best cue scores, both dimensionless. Logistic regression over 119 ambiguous pairs of the
-heavy development scenes, seeds 900-905, DIS flow; 92 of them right."""
+The probabilities of being right are logistic in what a selector has seen, all without a unit; the
+last weight is the offset. ``python tools/calibrate.py`` fits them on the development recordings of
+:mod:`hybridvo.synthetic.semi_real` and on the heavy development scenes, with DIS flow.
+"""
+
+CUES_RIGHT = (4.4, 0.0)
+"""Of the difference of the two best cue scores."""
+SELECTOR_RIGHT = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+"""Of :func:`hybridvo.hypotheses.selector.evidence_of`."""
+CLEAR_RIGHT = 1.0
+"""Share of right answers where the first motion explains nearly all that the depth sensor sees."""
 CUE_WEIGHTS = {
     "border": 1.2,
     "excess": -1.5,
@@ -17,8 +24,8 @@ CUE_WEIGHTS = {
 900-905 of the heavy development scenes and the scenario ``one60``;
 ``python tools/golden.py --only /refine`` shows what they give."""
 MIN_CONFIDENCE = 0.65
-"""Probability of being right below which a motion is degraded. Of the same 120 pairs with DIS flow
-the 3 wrong ones have 0.1 to 0.44, the others 0.65 to 1;
+"""Probability of being right below which a motion is degraded. Of the 120 pairs of the heavy
+development scenes, seeds 900-905, with DIS flow, the 3 wrong ones have 0.1 to 0.44, the others 0.65 to 1;
 ``python tools/golden.py --only heavy_ --seeds 3``."""
 CLEAR_COHERENCE = 0.5
 """Spatial correlation of the residuals above which even a motion that most of the image follows may

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from hybridvo.calibration import CLEAR_BEND_PX, CLEAR_COHERENCE
@@ -14,7 +15,7 @@ from hybridvo.refinement.depth import look_up
 from hybridvo.refinement.full_fit import fit_coarse
 from hybridvo.refinement.pixels import CoarseGrid, as_contiguous, coarse_grid
 from hybridvo.results import Reason, RelativePose
-from hybridvo.types import FramePair
+from hybridvo.types import Frame, FramePair
 
 REFERENCE_WIDTH = 1024
 """px; residuals of images of different size are compared at this width."""
@@ -39,6 +40,10 @@ class GridMaps:
         K: (4,) fx, fy, cx, cy of the current camera.
         width: px, of the whole image.
         stride: px between the grid's pixels.
+        seen: (h, w) bool, depth is there, with or without flow.
+        image_prev, image_curr: (h, w) float32 grey levels, each frame on its own grid; 0 without.
+        log_depth_seen: (h, w) float32, log metres of the current frame on its own grid; NaN where
+            unknown.
     """
 
     ray: np.ndarray
@@ -51,6 +56,10 @@ class GridMaps:
     K: np.ndarray
     width: int
     stride: int
+    seen: np.ndarray
+    image_prev: np.ndarray
+    image_curr: np.ndarray
+    log_depth_seen: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +106,34 @@ class HypothesisSet:
             K=grid.pixels.K,
             width=pair.prev.camera.width,
             stride=stride,
+            seen=np.isfinite(_log_depth(pair.prev, grid)),
+            image_prev=_grey(pair.prev, grid),
+            image_curr=_grey(pair.curr, grid),
+            log_depth_seen=_log_depth(pair.curr, grid),
         )
+
+
+def _pick(grid: CoarseGrid) -> tuple[slice, slice]:
+    """The grid's pixels of a whole image."""
+    stride, (v0, v1, u0, u1) = grid.shape[2], grid.box
+    return slice(v0 + stride // 2, v1, stride), slice(u0 + stride // 2, u1, stride)
+
+
+def _grey(frame: Frame, grid: CoarseGrid) -> np.ndarray:
+    """(h, w) float32 grey levels, each the mean of what it stands for; 0 without an image."""
+    if frame.rgb is None:
+        return np.zeros(grid.shape[:2], np.float32)
+    grey = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
+    return cv2.blur(grey, (grid.shape[2],) * 2)[_pick(grid)].astype(np.float32)
+
+
+def _log_depth(frame: Frame, grid: CoarseGrid) -> np.ndarray:
+    """(h, w) float32 log metres; NaN where unknown."""
+    if frame.depth is None:
+        return np.full(grid.shape[:2], np.nan, np.float32)
+    depth = frame.depth[_pick(grid)]
+    known = (depth > kernels.MIN_DEPTH) & (depth < kernels.MAX_VALUE)
+    return np.log(np.where(known, depth, np.float32(np.nan)))
 
 
 def generate(
@@ -119,8 +155,11 @@ def generate(
     grid = coarse_grid(pair, weights, options.refine)
     if isinstance(grid, RelativePose):
         return grid
+    # of what the sensor sees: a mover may hold most of what has flow
+    seen = np.count_nonzero(np.isfinite(_log_depth(pair.prev, grid)))
+    decisive = options.search.unambiguous_ratio * seen / max(np.count_nonzero(grid.weight > 0), 1)
     poses, facts, depth_scale = search.find_motions(
-        grid, np.ascontiguousarray(starts[:, :3]), options, seed
+        grid, np.ascontiguousarray(starts[:, :3]), options, decisive, seed
     )
     if len(poses) == 0:
         return RelativePose.failed(
@@ -128,7 +167,7 @@ def generate(
         )
     clear = (
         len(poses) == 1
-        and bool(facts[0, search.SHARE] >= options.search.unambiguous_ratio)
+        and bool(facts[0, search.SHARE] >= decisive)
         and _is_rigid(grid, poses[0], facts[0], pair.prev.camera.width)
     )
     return HypothesisSet(pair, grid, depth_scale, poses, facts, not clear)

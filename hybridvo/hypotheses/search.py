@@ -68,7 +68,7 @@ SOURCE_WINDOW, SOURCE_MINIMAL = 100, 101
 
 
 def find_motions(
-    grid: CoarseGrid, starts: np.ndarray, options: Options, seed: int
+    grid: CoarseGrid, starts: np.ndarray, options: Options, decisive: float, seed: int
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """All strong motions, in the order of their strength.
 
@@ -79,6 +79,7 @@ def find_motions(
         grid: pixels on which motions are refined.
         starts: (S, 3, 4) poses T_curr_prev, the first one seen from afar only.
         options: ``search`` and ``refine`` are read.
+        decisive: share of the usable pixels above which the first motion stands alone.
         seed: of the minimal samples.
 
     Returns:
@@ -117,7 +118,7 @@ def find_motions(
             break
         poses.append(pose)
         table.append(facts)
-        if len(poses) == 1 and facts[SHARE] >= limits.unambiguous_ratio:
+        if len(poses) == 1 and facts[SHARE] >= decisive:
             break
         for samples, count in ((coarse, n), (small, sh * sw)):
             set_aside(samples, count, pose, K, facts[FLOW_NOISE], facts[DEPTH_NOISE], cutoff, work)
