@@ -25,7 +25,8 @@ CUE_WEIGHTS = {
 ``python tools/golden.py --only /refine`` shows what they give."""
 MIN_CONFIDENCE = 0.65
 """Probability of being right below which a motion is degraded. Of the 120 pairs of the heavy
-development scenes, seeds 900-905, with DIS flow, the 3 wrong ones have 0.1 to 0.44, the others 0.65 to 1;
+development scenes, seeds 900-905, with DIS flow, the 3 wrong ones have 0.1 to 0.44, the others 0.65
+to 1;
 ``python tools/golden.py --only heavy_ --seeds 3``."""
 CLEAR_COHERENCE = 0.5
 """Spatial correlation of the residuals above which even a motion that most of the image follows may

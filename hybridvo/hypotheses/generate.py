@@ -157,7 +157,8 @@ def generate(
         return grid
     # of what the sensor sees: a mover may hold most of what has flow
     seen = np.count_nonzero(np.isfinite(_log_depth(pair.prev, grid)))
-    decisive = options.search.unambiguous_ratio * seen / max(np.count_nonzero(grid.weight > 0), 1)
+    usable = max(int(np.count_nonzero(grid.weight > 0)), 1)
+    decisive = options.search.unambiguous_ratio * seen / usable
     poses, facts, depth_scale = search.find_motions(
         grid, np.ascontiguousarray(starts[:, :3]), options, decisive, seed
     )
