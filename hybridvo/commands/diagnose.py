@@ -22,7 +22,7 @@ from hybridvo.errors import InputError
 from hybridvo.estimation import estimate
 from hybridvo.flow import contradiction, dis_flow, file_flow
 from hybridvo.geometry import ego_flow, invert
-from hybridvo.refinement.depth_agreement import depth_ratio, is_step
+from hybridvo.refinement.depth import depth_ratio, is_step
 from hybridvo.results import RelativePose
 from hybridvo.types import Frame, FramePair
 from hybridvo.units import depth_advice, typical_depth

@@ -13,7 +13,7 @@ from hybridvo.evaluation.metrics import Alignment, evaluate
 from hybridvo.evaluation.pair_errors import mean_pair_errors
 from hybridvo.files import atomic_write, write_json
 from hybridvo.geometry import pose_matrix
-from hybridvo.refinement.depth_agreement import is_step
+from hybridvo.refinement.depth import is_step
 from hybridvo.trajectory import Trajectory
 
 Row = Mapping[str, Any]

@@ -34,7 +34,7 @@ from hybridvo.network.models import Models
 from hybridvo.odometry import Odometry
 from hybridvo.options import Options
 from hybridvo.pipeline import check_method, weights_hash
-from hybridvo.refinement.depth_agreement import depth_ratio
+from hybridvo.refinement.depth import depth_ratio
 from hybridvo.results import State, Step
 from hybridvo.tracking.state import TrackerState
 from hybridvo.trajectory import Trajectory

@@ -11,8 +11,8 @@ from hybridvo.calibration import CLEAR_BEND_PX, CLEAR_COHERENCE
 from hybridvo.hypotheses import search
 from hybridvo.options import Options
 from hybridvo.refinement import kernels
+from hybridvo.refinement.coarse_fit import fit_coarse
 from hybridvo.refinement.depth import look_up
-from hybridvo.refinement.full_fit import fit_coarse
 from hybridvo.refinement.pixels import CoarseGrid, as_contiguous, coarse_grid
 from hybridvo.results import Reason, RelativePose
 from hybridvo.types import Frame, FramePair

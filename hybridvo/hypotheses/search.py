@@ -15,7 +15,19 @@ import numpy as np
 from hybridvo.calibration import ASIDE, SETTLED_COHERENCE
 from hybridvo.compilation import njit
 from hybridvo.options import Options
-from hybridvo.refinement.full_fit import translation_scale
+from hybridvo.refinement.coarse_fit import (
+    DEPTH_NOISE_CAP,
+    FLOW_NOISE_CAP,
+    NOISE_PIXELS,
+    anneal,
+    gauss_newton,
+    reestimate,
+    residual,
+    residual_scale,
+    robust_weights,
+    set_noise,
+    translation_scale,
+)
 from hybridvo.refinement.kernels import (
     BUFFER_ROWS,
     FASTMATH,
@@ -28,21 +40,9 @@ from hybridvo.refinement.kernels import (
     YN,
     W,
     Z,
+    new_work,
 )
 from hybridvo.refinement.pixels import CoarseGrid
-from hybridvo.refinement.solver import (
-    DEPTH_NOISE_CAP,
-    FLOW_NOISE_CAP,
-    NOISE_PIXELS,
-    anneal,
-    gauss_newton,
-    new_work,
-    reestimate,
-    residual,
-    residual_scale,
-    robust_weights,
-    set_noise,
-)
 
 WINDOW_ROWS, WINDOW_COLUMNS = 3, 4
 MINIMAL_SAMPLES = 384

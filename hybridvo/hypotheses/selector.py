@@ -25,7 +25,7 @@ from hybridvo.hypotheses.generate import (
     fit_in_mask,
 )
 from hybridvo.options import Options
-from hybridvo.refinement import kernels, solver
+from hybridvo.refinement import coarse_fit, kernels
 from hybridvo.results import Hypothesis, MotionPrediction, MotionPrior
 
 SUPPORT_CUTOFF = 3.0
@@ -314,14 +314,16 @@ def hypotheses(found: HypothesisSet, candidates: Candidates) -> list[Hypothesis]
     """The candidates with their inliers, in their order."""
     grid = found.grid
     h, w, stride = grid.shape
-    work, noise = solver.new_work(), np.empty(3, np.float32)
+    work, noise = kernels.new_work(), np.empty(3, np.float32)
     total = max(float(grid.weight.sum()), 1e-9)
     made = []
     for pose, fact in zip(candidates.poses, candidates.facts, strict=True):
         inliers = np.empty(grid.count, np.float32)
         flow_noise, depth_noise = float(fact[search.FLOW_NOISE]), float(fact[search.DEPTH_NOISE])
-        solver.set_noise(max(flow_noise, MIN_NOISE_PX), depth_noise, SUPPORT_CUTOFF, noise)
-        solver.robust_weights(grid.samples, grid.count, pose, grid.pixels.K, noise, work, inliers)
+        coarse_fit.set_noise(max(flow_noise, MIN_NOISE_PX), depth_noise, SUPPORT_CUTOFF, noise)
+        coarse_fit.robust_weights(
+            grid.samples, grid.count, pose, grid.pixels.K, noise, work, inliers
+        )
         name = SOURCES.get(int(fact[search.SOURCE]), "start")
         share = float(np.where(grid.weight > 0, inliers, 0) @ grid.weight) / total
         T, shape = pose_matrix(pose), inliers.reshape(h, w)
