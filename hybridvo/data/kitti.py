@@ -20,8 +20,6 @@ FRAMES_PER_SECOND = 10.0
 DEPTH_FOLDERS = ("depth", "depth_2", "depth_0")
 LEFT_AND_RIGHT = (("image_2", "image_3"), ("image_0", "image_1"))
 IMAGE_PATTERN = r"(\d+)\.(?:png|jpg)"
-MAX_ENTRY = 1e12
-"""No entry of a projection matrix is larger."""
 DISPARITY_SIGMA_PX = 0.5
 """Assumed standard deviation of a block-matched disparity, px: sets the relative depth noise."""
 
@@ -162,7 +160,7 @@ def _read_projections(path: Path) -> dict[str, np.ndarray]:
         except ValueError:
             P = np.zeros((3, 4))
         is_rectified = P[1, 0] == 0 and np.allclose(P[2, :3], (0, 0, 1)) and P[0, 0] * P[1, 1] > 0
-        if not (is_rectified and np.abs(P).max() < MAX_ENTRY):
+        if not (is_rectified and np.isfinite(P).all()):
             raise FormatError(
                 f"{path}:{line}: expected {name}: fx 0 cx tx 0 fy cy ty 0 0 1 tz, got "
                 f"{rest[:200]!r}."
@@ -205,8 +203,8 @@ def _read_poses(path: Path, numbers: list[int], P_left: np.ndarray) -> tuple[np.
     T_cam_cam0[:3, 3] = np.linalg.solve(P_left[:, :3], P_left[:, 3])
     for i, n in enumerate(numbers):
         if n < len(rows) and np.isfinite(rows[n].numbers).all():
-            M = np.reshape(rows[n].numbers, (3, 4))
-            poses[i] = rigid(M[:, :3], M[:, 3], f"{path}:{rows[n].line}") @ invert(T_cam_cam0)
+            pose = rigid(np.reshape(rows[n].numbers, (3, 4)), f"{path}:{rows[n].line}")
+            poses[i] = pose @ invert(T_cam_cam0)
     missing = int(np.isnan(poses[:, 0, 0]).sum())
     told = f"{path}: {len(rows)} poses; {missing} of {len(numbers)} have no ground truth."
     return poses, [told] if missing else []

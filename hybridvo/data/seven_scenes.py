@@ -73,4 +73,4 @@ def _read_pose(path: Path) -> np.ndarray:
         raise FormatError(f"{path}: expected 16 numbers of a 4x4 matrix ({error}).") from None
     if not np.isfinite(T).all():
         return np.full((4, 4), np.nan)
-    return rigid(T[:3, :3], T[:3, 3], str(path))
+    return rigid(T[:3], str(path))

@@ -11,10 +11,10 @@ import pandas as pd
 import plotly.express as px
 from plotly.graph_objects import Figure
 
-from hybridvo.evaluation.metrics import ate
+from hybridvo.evaluation.metrics import aligned
 from hybridvo.evaluation.scores import FAILURE_PX
 from hybridvo.geometry import invert
-from hybridvo.trajectory import Trajectory, read_trajectory
+from hybridvo.trajectory import read_trajectory
 
 FLOOR_PX = 1e-4
 """Smaller errors are drawn here: rounding must not squeeze the logarithmic axis."""
@@ -206,18 +206,9 @@ def _positions(folder: Path, entries: pd.DataFrame) -> pd.DataFrame:
     gt = paths.get(TRUTH)
     tables = []
     for method, path in paths.items():
-        x, y, z = _in_first_camera(path, gt).T[:, :: len(path) // MAX_POINTS + 1]
+        first = path if gt is None else gt
+        path = path if gt is None else aligned(path, gt)[0]
+        places = path.transformed(invert(first.T_world_cam[0])).positions
+        x, y, z = places.T[:, :: len(path) // MAX_POINTS + 1]
         tables.append(pd.DataFrame({"method": method, "right": x, "forward": z, "up": -y}))
     return pd.concat(tables)
-
-
-def _in_first_camera(path: Trajectory, gt: Trajectory | None) -> np.ndarray:
-    """(N, 3) positions in the first true camera, aligned as far as the paths determine it."""
-    if gt is None:
-        return path.transformed(invert(path.T_world_cam[0])).positions
-    for alignment in ("se3", "origin"):
-        error = ate(path, gt, alignment)
-        if error.T_gt_est is not None:
-            path = path.transformed(error.T_gt_est)
-            break
-    return path.transformed(invert(gt.T_world_cam[0])).positions

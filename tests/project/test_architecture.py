@@ -70,7 +70,6 @@ ONLY_IN = {
     "pypose": {"torch_geometry.py"},
     "kornia": {"torch_geometry.py", "network/losses.py"},
     "pydantic": {"options.py", "synthetic/presets.py"},
-    "distributed": {"evaluation/comparison.py"},
 }
 """Library -> the only files, or folders, that may import it."""
 
