@@ -28,7 +28,7 @@ def describe(error: ValidationError, where: str) -> str:
 
 
 @dataclass_transform(frozen_default=True)
-def _group(cls: type[T]) -> type[T]:
+def option_group(cls: type[T]) -> type[T]:
     """A frozen pydantic dataclass whose errors are :class:`InputError`."""
     config = ConfigDict(extra="forbid", allow_inf_nan=False)
     made: Any = dataclass(frozen=True, config=config)(cls)
@@ -44,7 +44,7 @@ def _group(cls: type[T]) -> type[T]:
     return made
 
 
-@_group
+@option_group
 class FlowOptions:
     """Where the optical flow comes from.
 
@@ -60,7 +60,7 @@ class FlowOptions:
     forward_backward: bool = True
 
 
-@_group
+@option_group
 class SearchOptions:
     """The search for every strong motion of a pair.
 
@@ -77,7 +77,7 @@ class SearchOptions:
     unambiguous_ratio: Share = 0.85
 
 
-@_group
+@option_group
 class SelectOptions:
     """Which of the motions is the camera's.
 
@@ -94,7 +94,7 @@ class SelectOptions:
     min_confidence: Share = 0.65
 
 
-@_group
+@option_group
 class RefineOptions:
     """The refinement on flow and depth.
 
@@ -116,7 +116,7 @@ class RefineOptions:
     tiles: Count = 110
 
 
-@_group
+@option_group
 class PhotometricOptions:
     """The refinement on the two images, which follows that on the flow.
 
@@ -144,7 +144,7 @@ class PhotometricOptions:
     min_correlation: Annotated[float, Field(ge=-1, le=1)] = 0.5
 
 
-@_group
+@option_group
 class TrackOptions:
     """The tracker: motion model, and the window of key frames.
 
@@ -172,7 +172,7 @@ class TrackOptions:
     on_failure: Literal["hold", "constant_velocity"] = "hold"
 
 
-@_group
+@option_group
 class RunOptions:
     """A run over a sequence.
 
@@ -198,7 +198,7 @@ class RunOptions:
     seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
 
 
-@_group
+@option_group
 class Options:
     """The option tree.
 

@@ -135,7 +135,7 @@ def pwvo_refine(pair: FramePair, ctx: Context) -> RelativePose:
 
     The same lines serve batches, with gradients to flow, depth, weights and maps.
     """
-    from hybridvo.network.inference import plain_torch
+    from hybridvo.network.layers import plain_torch
     from hybridvo.network.selection import select
     from hybridvo.refinement.torch_backend import refine_batch
 

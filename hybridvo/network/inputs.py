@@ -9,7 +9,8 @@ The ray is that of the pixel that was taken, so nothing is rounded in what the n
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+from typing import Self
 
 import torch
 
@@ -19,16 +20,47 @@ from hybridvo.types import FramePair, PairBatch
 
 FLOW_SCALE_PX = 200.0
 """Flow is divided by this before it enters a network."""
-
 NETWORK_SIZE = (128, 256)
 """Height and width of the paper's inputs."""
-
 MIN_DEPTH = 1e-2
-"""Depths below one centimetre are taken for damage: invalid."""
+"""Metres; what is nearer is damage in a measurement, and behind the camera after a motion."""
+
+
+class TensorBatch:
+    """Tensors of a batch as the fields of a dataclass: maps of one size, cameras as ``K_*``."""
+
+    def __len__(self) -> int:
+        return len(next(iter(vars(self).values())))
+
+    def __getitem__(self, index: slice) -> Self:
+        """Part of the batch."""
+        return type(self)(**{name: x[index] for name, x in vars(self).items()})
+
+    def subsample(self, stride: int) -> Self:
+        """Every ``stride``-th pixel of every ``stride``-th row, flow in their pixels."""
+        if stride == 1:
+            return self
+        every = slice(stride // 2, None, stride)
+        out = {}
+        for name, x in vars(self).items():
+            if name.startswith("K_"):
+                x = subsampled_intrinsics(x, stride)
+            elif x.ndim > 2:
+                x = x[..., every, every]
+            out[name] = x / stride if "flow" in name else x
+        return type(self)(**out)
+
+    def to(self, *args: object, **kwargs: object) -> Self:
+        """Copy on another device, or of another floating-point type; masks stay boolean."""
+        moved = {}
+        for name, x in vars(self).items():
+            y = x.to(*args, **kwargs)
+            moved[name] = y.bool() if x.dtype is torch.bool else y
+        return type(self)(**moved)
 
 
 @dataclass(frozen=True, eq=False)
-class NetworkInputs:
+class NetworkInputs(TensorBatch):
     """Inputs of a batch of pairs at the network's size (h, w).
 
     Args:
@@ -60,35 +92,6 @@ class NetworkInputs:
     def size(self) -> tuple[int, int]:
         """(h, w)."""
         return self.flow.shape[2], self.flow.shape[3]
-
-    def __len__(self) -> int:
-        return self.flow.shape[0]
-
-    def __getitem__(self, index: slice) -> NetworkInputs:
-        """Part of the batch."""
-        return NetworkInputs(*(getattr(self, f.name)[index] for f in fields(self)))
-
-    def subsample(self, stride: int) -> NetworkInputs:
-        """Every ``stride``-th pixel of every ``stride``-th row, flow in their pixels."""
-        if stride == 1:
-            return self
-        first = stride // 2
-        pick = (..., slice(first, None, stride), slice(first, None, stride))
-        return NetworkInputs(
-            self.flow[pick] / stride,
-            self.inverse_depth[pick],
-            self.rays[pick],
-            self.valid[pick],
-            self.depth_prev[pick],
-            self.depth_curr[pick],
-            subsampled_intrinsics(self.K_prev, stride),
-            subsampled_intrinsics(self.K_curr, stride),
-        )
-
-    def to(self, *args: object, **kwargs: object) -> NetworkInputs:
-        """Copy on another device, or of another floating-point type; the mask stays boolean."""
-        moved = {f.name: getattr(self, f.name).to(*args, **kwargs) for f in fields(self)}
-        return NetworkInputs(**{**moved, "valid": moved["valid"].bool()})
 
 
 def subsampled_intrinsics(K: torch.Tensor, stride: int) -> torch.Tensor:
@@ -122,22 +125,14 @@ def assemble_inputs(
         Float32 tensors (the type of the batch for a PairBatch) on the CPU or the batch's device.
 
     Raises:
-        InputError: another type, shapes that do not fit each other, or a size that is not positive.
+        InputError: another type, or shapes that do not fit each other.
     """
-    if not (
-        isinstance(size, tuple) and len(size) == 2 and all(type(n) is int and n > 0 for n in size)
-    ):
-        raise InputError(
-            f"assemble_inputs: expected size as two positive integers (height, width), got {size}."
-        )
     if isinstance(pair, PairBatch):
         return _from_batch(checked_batch(pair, where="assemble_inputs")[0], size)
     pairs = [pair] if isinstance(pair, FramePair) else pair
     if isinstance(pairs, Sequence) and pairs and all(isinstance(p, FramePair) for p in pairs):
-        parts = [_from_batch(PairBatch.from_pairs([p]), size) for p in pairs]
-        return NetworkInputs(
-            *(torch.cat([getattr(p, f.name) for p in parts]) for f in fields(NetworkInputs))
-        )
+        parts = [vars(_from_batch(PairBatch.from_pairs([p]), size)) for p in pairs]
+        return NetworkInputs(*map(torch.cat, zip(*(p.values() for p in parts), strict=True)))
     raise InputError(
         f"assemble_inputs: expected a FramePair, a PairBatch or a non-empty sequence of "
         f"FramePairs, got {type(pair).__name__}."
@@ -145,12 +140,7 @@ def assemble_inputs(
 
 
 def assemble_aligned(
-    flow: torch.Tensor,
-    depth_prev: torch.Tensor,
-    depth_curr: torch.Tensor,
-    K_prev: torch.Tensor,
-    K_curr: torch.Tensor | None = None,
-    valid: torch.Tensor | None = None,
+    flow: torch.Tensor, depth_prev: torch.Tensor, depth_curr: torch.Tensor, K: torch.Tensor
 ) -> NetworkInputs:
     """Inputs from tensors that already have the network's size and stand on the previous grid.
 
@@ -161,15 +151,12 @@ def assemble_aligned(
         flow: (B, h, w, 2) px.
         depth_prev: (B, h, w) metres.
         depth_curr: (B, h, w) metres, on the grid of t like the previous one.
-        K_prev: (B, 3, 3) intrinsics.
-        K_curr: (B, 3, 3) intrinsics; the previous ones by default.
-        valid: (B, h, w) bool or None.
+        K: (B, 3, 3) intrinsics of both frames.
 
     Raises:
         InputError: shapes that do not fit each other.
     """
-    K_curr = K_prev if K_curr is None else K_curr
-    batch = PairBatch(flow, depth_prev, K_prev, K_curr, depth_curr=depth_curr, valid=valid)
+    batch = PairBatch(flow, depth_prev, K, K, depth_curr=depth_curr)
     batch, _ = checked_batch(batch, where="assemble_aligned")
     rows, cols = (torch.arange(n, device=flow.device) for n in flow.shape[1:3])
     return _normalize(batch, _rays(rows, cols, batch.K_prev))

@@ -7,6 +7,8 @@ matters when weights are ported, not when they are trained here, and is not copi
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from itertools import pairwise
 
 import torch
@@ -14,13 +16,6 @@ import torch.nn.functional as F
 from torch import nn
 
 from hybridvo.network.inputs import NetworkInputs
-
-ENCODER_CHANNELS = (64, 128, 128, 256, 256)
-"""Output channels of layer1 to layer5 at full width."""
-
-ENCODER_BLOCKS = (3, 4, 6, 7, 3)
-STEM_CHANNELS = 32
-BRANCH_CHANNELS = 8
 
 INPUT_LIMIT = 100.0
 """Inputs are clipped to this magnitude (20 000 px of flow, a depth of 1 cm): no finite input can
@@ -30,11 +25,6 @@ then overflow the activations, and no measurement that could be meant is touched
 def scaled(channels: int, width: float) -> int:
     """Number of channels at a width factor, at least one."""
     return max(1, round(channels * width))
-
-
-def match_size(x: torch.Tensor, like: torch.Tensor) -> torch.Tensor:
-    """Drop the last row or column of ``x`` (B, C, h, w) where upsampling gave one too many."""
-    return x[:, :, : like.shape[2], : like.shape[3]]
 
 
 class ResidualBlock(nn.Module):
@@ -78,12 +68,12 @@ class ResidualBlock(nn.Module):
 class InputBranches(nn.Module):
     """The three inputs side by side: flow as it is, depths and rays through a 1x1 convolution."""
 
-    out_channels = 2 + 2 * BRANCH_CHANNELS
+    out_channels = 2 + 8 + 8
 
     def __init__(self) -> None:
         super().__init__()
-        self.depth = nn.Conv2d(2, BRANCH_CHANNELS, 1)
-        self.rays = nn.Conv2d(2, BRANCH_CHANNELS, 1)
+        self.depth = nn.Conv2d(2, 8, 1)
+        self.rays = nn.Conv2d(2, 8, 1)
 
     def forward(self, inputs: NetworkInputs) -> torch.Tensor:
         """Network inputs -> (B, 18, h, w)."""
@@ -106,13 +96,13 @@ class Encoder(nn.Module):
 
     def __init__(self, in_channels: int, width: float = 1.0, inner_activation: bool = True) -> None:
         super().__init__()
-        stem = scaled(STEM_CHANNELS, width)
+        stem = scaled(32, width)
         strides = ((in_channels, 2), (stem, 1), (stem, 1))
         self.stem = nn.ModuleList(nn.Conv2d(n, stem, 3, stride, 1) for n, stride in strides)
-        self.channels = tuple(scaled(c, width) for c in ENCODER_CHANNELS)
+        self.channels = tuple(scaled(c, width) for c in (64, 128, 128, 256, 256))
         stages = []
         for count, (before, after) in zip(
-            ENCODER_BLOCKS, pairwise((stem, *self.channels)), strict=True
+            (3, 4, 6, 7, 3), pairwise((stem, *self.channels)), strict=True
         ):
             blocks = [ResidualBlock(before, after, 2, inner_activation)]
             blocks += [ResidualBlock(after, after, 1, inner_activation) for _ in range(count - 1)]
@@ -152,6 +142,18 @@ class SelfAttention(nn.Module):
         query, key, value = (f(x).flatten(2) for f in (self.query, self.key, self.value))
         attention = torch.softmax(query.transpose(1, 2) @ key, dim=-1)
         return x + self.gain * (value @ attention.transpose(1, 2)).view_as(x)
+
+
+@contextlib.contextmanager
+def plain_torch() -> Iterator[None]:
+    """Inference in float32 on the CPU, whatever the caller set for networks of its own."""
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(torch.inference_mode())
+        if torch.is_autocast_enabled("cpu"):
+            stack.enter_context(torch.autocast("cpu", enabled=False))
+        if torch.get_default_device().type != "cpu":
+            stack.enter_context(torch.device("cpu"))
+        yield
 
 
 def initialize(network: nn.Module, uniform: tuple[nn.Module, ...] = ()) -> None:

@@ -10,15 +10,16 @@ from typing import Any
 
 from hybridvo.errors import CheckpointError, InputError
 
-KIND_OF = {
-    "selector": "selector",
-    "pwvo": "pwvo",
-    "pwvo-naive": "pwvo",
-    "pixelwise": "pwvo",
-    "vonet": "vonet",
-    "vonet-attention": "vonet-attention",
+SELECTION = {
+    "pwvo": "softmax",
+    "pwvo-paper": "softmax",
+    "pwvo-uncertain": "mean",
+    "pwvo-naive": "mean",
+    "pixelwise": "mean",
+    "vonet": "mean",
+    "vonet-attention": "mean",
 }
-"""Name of the weights -> kind of network, as its options state it."""
+"""Methods that are a network alone, and how one motion is selected from its pixels, if any."""
 
 
 def load_weights(path: str | Path) -> tuple[Any, dict[str, Any]]:
@@ -83,7 +84,8 @@ class Models:
         if name not in self._networks:
             path = self.path(name)
             network, _ = load_weights(path)
-            if network.options.kind != KIND_OF[name]:
+            own = name == "selector" or name.startswith("vonet")  # the other names are PWVOs
+            if network.options.kind != (name if own else "pwvo"):
                 raise CheckpointError(
                     f"{path}: expected the weights of a {name}, got a {network.options.kind}'s."
                 )

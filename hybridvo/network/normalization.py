@@ -17,35 +17,26 @@ from dataclasses import dataclass, replace
 import torch
 from torch import nn
 
-from hybridvo.network.inputs import NetworkInputs
+from hybridvo.network.inputs import MIN_DEPTH, NetworkInputs
+from hybridvo.network.options import NetworkOptions
 from hybridvo.network.selection import NetworkOutput
 from hybridvo.network.weighted_fit import fitted_motion
 from hybridvo.torch_geometry import euler_deg
 
+OUTPUT_SCALE = 0.01
+"""Without scales of the pair, raw outputs times this are degrees and metres, as published."""
 MIN_MOTION = 5e-5
 """rad; flow smaller than this is not amplified any further: at 2000 px of focal length 0.1 px."""
-
-QUANTILE = 0.4
-"""Of the lengths of the flow: below one half, so that movers on half of the picture do not set the
-scale of what is left of the world."""
-
-NEAR_QUANTILE = 0.9
-"""Of the inverse depth: near things tell the translation, and set its scale."""
-
 MIN_NEARNESS = 1 / 50
 """1 / metres; where all is farther, flow tells no translation, and a camera still moves by metres.
 """
-
 LIMIT = 10.0
 """Magnitude that squashed values approach; values of the order of one stay as they are."""
-
-NEAREST = 1e-2
-"""Metres; a moved point nearer than this, or behind the camera, has no residual."""
 
 
 @dataclass(frozen=True, eq=False)
 class MotionScale:
-    """What turns a network's scale-free outputs into motions.
+    """What turns a network's raw outputs into motions.
 
     Args:
         factor: (B, 6) scales of rx, ry, rz (degrees) and tx, ty, tz (metres).
@@ -54,6 +45,26 @@ class MotionScale:
 
     factor: torch.Tensor
     start: torch.Tensor
+
+    def motion(self, raw: torch.Tensor) -> torch.Tensor:
+        """Motions of raw outputs (B, 6) or (B, 6, h, w), in their type.
+
+        The sum of two small motions: of second order, and the next pass sees what it misses.
+        """
+        shape = (-1, 6) + (1,) * (raw.ndim - 2)
+        factor, start = (x.to(raw.dtype).view(shape) for x in (self.factor, self.start))
+        return start + factor * raw
+
+
+def normalize(
+    inputs: NetworkInputs, options: NetworkOptions, T_start: torch.Tensor | None
+) -> tuple[NetworkInputs, MotionScale]:
+    """What a network with these options looks at, and the scale of its outputs."""
+    inputs = inputs.subsample(options.input_stride)
+    if options.scale_free:
+        return remove_scale(inputs, T_start, options.later_quantile)
+    factor = torch.full((len(inputs), 6), OUTPUT_SCALE, device=inputs.flow.device)
+    return inputs, MotionScale(factor, torch.zeros_like(factor))
 
 
 def predict(
@@ -86,7 +97,7 @@ def first_motions(
 
 
 def remove_scale(
-    inputs: NetworkInputs, T_start: torch.Tensor | None = None, later_quantile: float = QUANTILE
+    inputs: NetworkInputs, T_start: torch.Tensor | None = None, later_quantile: float = 0.4
 ) -> tuple[NetworkInputs, MotionScale]:
     """Take a first motion out of a batch's inputs and divide them by the scales of each pair.
 
@@ -109,7 +120,8 @@ def remove_scale(
     both = (inverse > 0).all(dim=1, keepdim=True)
     change = -torch.where(both, inverse, 1.0).log().diff(dim=1)
     start = flow.new_zeros(len(inputs), 6)
-    quantile = flow.new_full((len(inputs), 1), QUANTILE)
+    # below one half: movers on half of the image do not set the scale of what is left of the scene
+    quantile = flow.new_full((len(inputs), 1), 0.4)
     if T_start is not None:
         T_start = T_start.to(flow.dtype)
         start = torch.cat([euler_deg(T_start[:, :3, :3]), T_start[:, :3, 3]], dim=1)
@@ -122,11 +134,10 @@ def remove_scale(
     angle = flow / _focal(inputs.K_prev)
     length = (angle.square().sum(dim=1) + 1e-20).sqrt()
     motion = _quantile(length, inputs.valid, quantile).clamp(MIN_MOTION, 1.0)
-    nearness = _quantile(
-        inverse[:, 0],
-        inputs.valid & (inverse[:, 0] > 0),
-        torch.full_like(quantile, NEAR_QUANTILE),
-    ).clamp(MIN_NEARNESS, 1e3)
+    # near things tell the translation, and set its scale
+    near_quantile = torch.full_like(quantile, 0.9)
+    known = inputs.valid & (inverse[:, 0] > 0)
+    nearness = _quantile(inverse[:, 0], known, near_quantile).clamp(MIN_NEARNESS, 1e3)
     m, near = (x[:, None, None, None] for x in (motion, nearness))
     change = torch.where(both, change / m, 0.0)
     depth = torch.cat([_squash(inverse[:, :1] / near), _squash(change)], dim=1)
@@ -145,7 +156,7 @@ def _ego_motion(
     rays, inverse = inputs.rays.flatten(2), inverse.flatten(1)[:, None]
     moved = T[:, :3, :2] @ rays + T[:, :3, 2:3] + T[:, :3, 3:] * inverse
     moved = moved.unflatten(2, inputs.size)
-    front = moved[:, 2:] > NEAREST * inverse.unflatten(2, inputs.size).clamp(min=1e-3)
+    front = moved[:, 2:] > MIN_DEPTH * inverse.unflatten(2, inputs.size).clamp(min=1e-3)
     z = torch.where(front, moved[:, 2:], 1.0)
     now = _focal(inputs.K_curr) * moved[:, :2] / z + inputs.K_curr[:, :2, 2, None, None]
     before = _focal(inputs.K_prev) * inputs.rays + inputs.K_prev[:, :2, 2, None, None]

@@ -9,22 +9,14 @@ import numpy as np
 import torch
 from torch import nn
 
-from hybridvo.network.inference import plain_torch
 from hybridvo.network.inputs import NetworkInputs, assemble_inputs
+from hybridvo.network.layers import plain_torch
+from hybridvo.network.models import SELECTION
 from hybridvo.network.normalization import predict
 from hybridvo.network.selection import NetworkOutput, select_motion, select_pose
 from hybridvo.network.weighted_fit import fitted_motion, on_grid_of, pixel_weights
 from hybridvo.results import MotionPrediction, PixelwisePrediction, Reason, RelativePose, Status
 from hybridvo.types import FramePair
-
-SELECTION = {
-    "pwvo": "softmax",
-    "pwvo-naive": "mean",
-    "pixelwise": "mean",
-    "vonet": "mean",
-    "vonet-attention": "mean",
-}
-"""Methods that are a network alone, and how one motion is selected from its pixels, if any."""
 
 STATIC_AT, STATIC_SLOPE = 1.64, 1.63
 """Where the probability to be static is one half, in units of s above the trusted pixels', and the

@@ -23,12 +23,11 @@ from hybridvo.network.layers import (
     InputBranches,
     ResidualBlock,
     initialize,
-    match_size,
     scaled,
 )
-from hybridvo.network.normalization import predict, remove_scale
+from hybridvo.network.normalization import normalize, predict
 from hybridvo.network.options import NetworkOptions
-from hybridvo.network.vonet import OUTPUT_SCALE, VONet
+from hybridvo.network.vonet import VONet
 from hybridvo.network.weights import Weights, read_weights, weights_file
 from hybridvo.results import PixelwisePrediction
 from hybridvo.types import FramePair, PairBatch
@@ -46,7 +45,8 @@ class _UpStage(nn.Module):
         self.block = ResidualBlock(up + skip, out, project=project)
 
     def forward(self, x: torch.Tensor, like: torch.Tensor, skip: bool) -> torch.Tensor:
-        x = match_size(self.up(x), like)
+        # upsampling gives a row or column too many where the encoder met an odd size
+        x = self.up(x)[:, :, : like.shape[2], : like.shape[3]]
         if skip:
             x = torch.cat([x, like.to(x.dtype)], dim=1)
         return self.block(x)
@@ -165,28 +165,19 @@ class PWVO(nn.Module):
         options = self.options
         if not isinstance(inputs, NetworkInputs):
             return self._predict(inputs)
-        scale = None
-        inputs = inputs.subsample(options.input_stride)
-        if options.scale_free:
-            inputs, scale = remove_scale(inputs, T_start, options.later_quantile)
+        inputs, scale = normalize(inputs, options, T_start)
         x = self.branches(inputs)
         features = self.encoder(x)
         dtype = next(self.parameters()).dtype
         shared = self.decoder(x, features)
-        motion = self.head_motion(shared).to(dtype)
-        if scale is None:
-            motion = OUTPUT_SCALE * motion
-        else:
-            factor, start = (x.to(dtype)[:, :, None, None] for x in (scale.factor, scale.start))
-            # The sum of two small motions: of second order, and the next pass sees what it misses.
-            motion = start + factor * motion
+        motion = scale.motion(self.head_motion(shared).to(dtype))
         if self.head_uncertainty is None:
             return PixelwisePrediction(motion[:, :3], motion[:, 3:])
         if self.decoder_uncertainty is not None:
             shared = self.decoder_uncertainty(x, features)
         log_scale = self.head_uncertainty(shared).to(dtype)
-        if scale is not None:
-            log_scale = log_scale + factor.log()
+        if options.scale_free:
+            log_scale = log_scale + scale.factor.to(dtype).log()[:, :, None, None]
         seen = inputs.valid[:, None].to(dtype)
         if options.head_stride > 1:
             seen = F.max_pool2d(seen, options.head_stride, ceil_mode=True)
@@ -199,13 +190,11 @@ class PWVO(nn.Module):
         inputs = assemble_inputs(pairs).to(device=own.device, dtype=own.dtype)
         output = predict(self, inputs)
         assert isinstance(output, PixelwisePrediction)
-        return replace(output, image_size=_image_size(pairs))
-
-
-def _image_size(pairs: FramePair | PairBatch | Sequence[FramePair]) -> tuple[int, int]:
-    if isinstance(pairs, PairBatch):
-        return pairs.flow.shape[1], pairs.flow.shape[2]
-    return (pairs if isinstance(pairs, FramePair) else pairs[0]).prev.camera.shape
+        if isinstance(pairs, PairBatch):
+            size = pairs.flow.shape[1], pairs.flow.shape[2]
+        else:
+            size = (pairs if isinstance(pairs, FramePair) else pairs[0]).prev.camera.shape
+        return replace(output, image_size=size)
 
 
 def build_network(options: NetworkOptions | None = None) -> nn.Module:

@@ -18,8 +18,7 @@ from torch import nn
 from hybridvo.errors import CheckpointError, InputError
 from hybridvo.hypotheses.generate import GridMaps
 from hybridvo.hypotheses.selector import Candidates, Scores
-from hybridvo.network.inference import plain_torch
-from hybridvo.network.layers import scaled
+from hybridvo.network.layers import plain_torch, scaled
 from hybridvo.network.selector_inputs import (
     SelectorInputs,
     candidate_channels,

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 import torch.nn.functional as F
 from torch import nn
 
 from hybridvo.network.inputs import NetworkInputs
 from hybridvo.network.layers import Encoder, InputBranches, SelfAttention, initialize
-from hybridvo.network.normalization import remove_scale
+from hybridvo.network.normalization import normalize
 from hybridvo.network.options import NetworkOptions
-
-OUTPUT_SCALE = 0.01
-"""Raw head outputs are multiplied by this to give degrees and metres."""
-
-FEATURE_GRID = (2, 4)
-"""Grid on which the fully connected heads read the embedding: that of a 128x256 input."""
 
 
 class _PoseHead(nn.Sequential):
@@ -37,6 +33,8 @@ class VONet(nn.Module):
         options: kind ``vonet`` or ``vonet-attention`` (the paper's "VONet + self-att.").
     """
 
+    grid = (2, 4)  # of the embedding of a 128x256 input
+
     def __init__(self, options: NetworkOptions | None = None) -> None:
         super().__init__()
         options = NetworkOptions(kind="vonet") if options is None else options
@@ -47,7 +45,7 @@ class VONet(nn.Module):
         self.attention = (
             SelfAttention(channels) if options.kind == "vonet-attention" else nn.Identity()
         )
-        features = channels * FEATURE_GRID[0] * FEATURE_GRID[1]
+        features = channels * math.prod(self.grid)
         self.head_rotation = _PoseHead(features)
         self.head_translation = _PoseHead(features)
         initialize(self, uniform=(self.head_rotation, self.head_translation))
@@ -65,20 +63,11 @@ class VONet(nn.Module):
             (B, 3) Euler angles X-Y-Z in degrees (R = Rx Ry Rz) and (B, 3) translation in metres, of
             T_curr_prev, both float32 (float64 for a float64 network). Finite for any input.
         """
-        scale = None
-        inputs = inputs.subsample(self.options.input_stride)
-        if self.options.scale_free:
-            inputs, scale = remove_scale(inputs, T_start, self.options.later_quantile)
+        inputs, scale = normalize(inputs, self.options, T_start)
         embedding = self.attention(self.encoder(self.branches(inputs))[-1])
-        if embedding.shape[2:] != FEATURE_GRID:
-            embedding = F.adaptive_avg_pool2d(embedding, FEATURE_GRID)
+        if embedding.shape[2:] != self.grid:
+            embedding = F.adaptive_avg_pool2d(embedding, self.grid)
         features = embedding.flatten(1)
-        rotation, translation = self.head_rotation(features), self.head_translation(features)
-        dtype = next(self.parameters()).dtype
-        if scale is None:
-            return OUTPUT_SCALE * rotation.to(dtype), OUTPUT_SCALE * translation.to(dtype)
-        factor, start = scale.factor.to(dtype), scale.start.to(dtype)
-        return (
-            start[:, :3] + factor[:, :3] * rotation.to(dtype),
-            start[:, 3:] + factor[:, 3:] * translation.to(dtype),
-        )
+        raw = torch.cat([self.head_rotation(features), self.head_translation(features)], dim=1)
+        motion = scale.motion(raw.to(next(self.parameters()).dtype))
+        return motion[:, :3], motion[:, 3:]

@@ -155,9 +155,7 @@ def test_the_truth_has_no_flow_loss_on_fewer_pixels():
         K_curr=inputs.K_curr,
     ).subsample(4)
     assert targets.depth_prev.shape == (1, 8, 16)
-    options = LossOptions(
-        pose=False, pose_uncertainty=False, flow_uncertainty=False, depth_uncertainty=False
-    )
+    options = LossOptions(pose_uncertainty=False, flow_uncertainty=False, depth_uncertainty=False)
     output = (targets.rotation_deg, targets.translation)
     _, parts = total_loss(output, targets, options, T)
     # float32 coordinates of 64 px: 4e-6 px

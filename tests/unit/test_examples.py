@@ -75,3 +75,11 @@ def test_gtsam_finds_the_same_poses() -> None:
     # a covariance in the wrong order or on the wrong side moves the poses by millimetres
     for a, b in zip(ours, theirs, strict=True):
         np.testing.assert_allclose(a, b, atol=1e-5)
+
+
+@pytest.mark.slow
+def test_weights_are_learned_through_the_refinement(capsys: pytest.CaptureFixture[str]) -> None:
+    assert load("learn_weights").main(["--updates", "16", "--pairs", "32"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    before, after = (float(re.findall(r"([\d.]+) px", line)[0]) for line in (lines[0], lines[-1]))
+    assert after < 0.7 * before
