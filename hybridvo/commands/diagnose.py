@@ -182,7 +182,7 @@ def _units(pairs: list[Pair]) -> Finding:
             text += f", which cannot be metres; probable remedy: {advice}"
             return Finding("differs", text, median, unit="m")
         # all depths and all translations times s project to the same pixels: no pair can tell
-        text += "; no image knows its scale without true poses"
+        text += f"; {len(scales)} pairs with a true motion on file, {MIN_PAIRS} needed"
         return Finding("cannot_tell", text, median, unit="m")
     logs = np.log(np.maximum(scales, 1e-6))
     value = float(np.exp(np.median(logs)))

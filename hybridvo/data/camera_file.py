@@ -21,8 +21,6 @@ CAMERA_FILE = "camera.yaml"
 IMAGES = (".png", ".jpg", ".jpeg")
 REQUIRED = ("fx", "fy", "cx", "cy", "width", "height")
 KNOWN = (*REQUIRED, "distortion", "depth_scale", "fps")
-BROWN_COUNTS = (4, 5, 8)
-"""Lengths of k1 k2 p1 p2 [k3 [k4 k5 k6]], OpenCV's order."""
 
 TEMPLATE = """\
 # The camera of the images in rgb/, in pixels; (0, 0) is the centre of the top-left pixel.
@@ -250,7 +248,7 @@ def _number(value: Any, where: str) -> float:
 def _distortion(value: Any, path: Path) -> tuple[float, ...]:
     if value is None or value == []:
         return ()
-    if not isinstance(value, list) or len(value) not in BROWN_COUNTS:
+    if not isinstance(value, list) or len(value) not in (4, 5, 8):
         raise FormatError(
             f"{path}: distortion: expected a list of 4, 5 or 8 numbers [k1, k2, p1, p2, k3, ...]."
         )

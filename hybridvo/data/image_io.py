@@ -27,8 +27,6 @@ TAG_BYTES = struct.pack("<f", 202021.25)
 NPY_MAGIC = b"\x93NUMPY"
 PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 JPEG_MAGIC = b"\xff\xd8"
-MAX_HEADER_BYTES = 2**18
-"""How much of an image file is read to learn its size (a JPEG may carry a thumbnail first)."""
 UNKNOWN_FLOW = 1e9
 """Middlebury's mark: flow beyond this is unknown."""
 COPY_AGAIN = "Copy or download the file again."
@@ -149,7 +147,7 @@ def read_npy(path: str | os.PathLike[str], *, channels: int | None = None) -> np
 def image_size(path: str | os.PathLike[str]) -> tuple[int, int]:
     """(height, width) from the header of a PNG, JPEG, ``.npy``, ``.flo`` or ``.dpt`` file."""
     with _open(path) as file:
-        data = file.read(MAX_HEADER_BYTES)
+        data = file.read(2**18)  # a JPEG may carry a thumbnail before its size
     if data.startswith(NPY_MAGIC):
         height, width = _map_npy(path).shape[:2]
         return height, width

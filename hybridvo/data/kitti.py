@@ -16,7 +16,6 @@ from hybridvo.files import read_rows, read_text
 from hybridvo.geometry import invert
 from hybridvo.types import Camera
 
-FRAMES_PER_SECOND = 10.0
 DEPTH_FOLDERS = ("depth", "depth_2", "depth_0")
 LEFT_AND_RIGHT = (("image_2", "image_3"), ("image_0", "image_1"))
 IMAGE_PATTERN = r"(\d+)\.(?:png|jpg)"
@@ -33,6 +32,7 @@ class KittiSequence(Sequence):
     """
 
     kind = "kitti"
+    frames_per_second = 10.0  # where times.txt is missing
     depth_source = "file"
     depth_scale = 256.0
     looks_for = "kitti: calib.txt and image_2 or image_0"
@@ -71,7 +71,7 @@ class KittiSequence(Sequence):
                     f"{calibration}: expected the camera of {right_name} to the right of the one "
                     f"of {left_name}."
                 )
-        stamps, told = _read_times(root / "times.txt", numbers)
+        stamps, told = _read_times(root / "times.txt", numbers, self.frames_per_second)
         listing = Listing(
             rgb=[left[n] for n in numbers],
             depth=[depth.get(n) for n in numbers],
@@ -176,11 +176,11 @@ def _projection(matrices: dict[str, np.ndarray], number: str, path: Path) -> np.
     return matrices[name]
 
 
-def _read_times(path: Path, numbers: list[int]) -> tuple[np.ndarray, list[str]]:
+def _read_times(path: Path, numbers: list[int], per_second: float) -> tuple[np.ndarray, list[str]]:
     """Line i belongs to image number i."""
     if not path.exists():
-        told = f"{path}: not there; stamps count {FRAMES_PER_SECOND:g} frames a second."
-        return (np.array(numbers) - numbers[0]) / FRAMES_PER_SECOND, [told]
+        told = f"{path}: not there; stamps count {per_second:g} frames a second."
+        return (np.array(numbers) - numbers[0]) / per_second, [told]
     times, warnings = to_seconds([row.numbers[0] for row in read_rows(path, "seconds")], path.name)
     if numbers[-1] >= len(times):
         raise FormatError(

@@ -32,9 +32,6 @@ from hybridvo.pipeline import DEFAULT_METHOD, estimate
 from hybridvo.results import PixelwisePrediction, RelativePose
 from hybridvo.types import FramePair
 
-SALIENCY_BLOCK = 4
-"""Pixels whose saliency is summed for display: networks read one of some pixels only."""
-
 
 def draw(
     sequence: Sequence,
@@ -195,7 +192,7 @@ def network_panels(
             for (what, unit), values in zip(units, prediction_errors(output, *true), strict=True):
                 panels.append(ScalarPanel(f"{name}: error of the {what}", values, unit))
     for what, saliency in saliencies(network, inputs, T_start, steps).items():
-        n = SALIENCY_BLOCK
+        n = 4  # summed over blocks: networks read one of some pixels only
         h, w = (size // n for size in saliency.magnitude.shape)
         shown = saliency.magnitude[: n * h, : n * w].reshape(h, n, w, n).sum(axis=(1, 3))
         relative = shown / max(float(np.percentile(shown, 99)), 1e-30)

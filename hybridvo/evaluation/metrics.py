@@ -25,8 +25,6 @@ from hybridvo.trajectory import Trajectory, read_trajectory
 Alignment = Literal["se3", "sim3", "origin", "none"]
 DeltaUnit = Literal["frames", "s"]
 
-MIN_POSES = 3
-"""Fewest poses that determine a rigid alignment."""
 MIN_WIDTH = 1e-12
 """Product of the relative widths of both paths below which they are straight: above rounding
 (1e-16), below one millimetre aside on a hundred metres (1e-10)."""
@@ -124,8 +122,8 @@ def _to_evo(trajectory: Trajectory, indices: np.ndarray) -> Any:
 
 def _degeneracy(est: np.ndarray, gt: np.ndarray) -> str:
     """Why (M, 3) positions of estimate and truth determine no alignment, or the empty string."""
-    if len(est) < MIN_POSES:
-        return f"not enough poses: {len(est)} matched, an alignment needs {MIN_POSES}"
+    if len(est) < 3:
+        return f"not enough poses: {len(est)} matched, an alignment needs 3"
     centred = []
     for name, positions in (("estimate", est), ("ground truth", gt)):
         moved = positions - positions.mean(axis=0)

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from hybridvo.data.base import Sequence
+from hybridvo.data.image_io import UNKNOWN_FLOW
 from hybridvo.data.resize import resize_camera
 from hybridvo.errors import InputError
 from hybridvo.geometry import invert, matrix_to_euler_deg, rotation_angle
@@ -20,10 +21,6 @@ from hybridvo.types import Camera
 
 PAPER_SIZE = (128, 256)
 """(height, width) at which the paper measures its EPE."""
-PAPER_MAX_FLOW_PX = 400.0
-"""Pixels whose true ego flow is at least this long count with error zero in the paper's EPE."""
-UNKNOWN_FLOW_PX = 1e9
-"""Middlebury's mark of an unknown flow vector."""
 MOVING_PX = 1.0
 """A pixel whose true flow differs by more than this from the true ego flow moves by itself."""
 NO_DEPTH = "no pixel has a valid depth and a true motion that stays in front of the camera"
@@ -99,7 +96,7 @@ def _paper_epe(
         x, y, s = _moved(T, prev, curr, inverse_depth)
         s = np.abs(s) + 1e-12  # as in the published code ("to avoid reflection"): never undefined
         flows.append(np.stack([x / s - u, y / s - v]))
-    counted = valid & (np.hypot(*flows[1]) < PAPER_MAX_FLOW_PX)
+    counted = valid & (np.hypot(*flows[1]) < 400.0)  # longer true flow counts as right
     return float(np.abs(flows[0] - flows[1])[:, counted].sum()) / (2 * valid.size)
 
 
@@ -225,7 +222,7 @@ def pair_facts(
         if np.shape(flow_gt) != (*camera_prev.shape, 2):
             expected = (*camera_prev.shape, 2)
             raise InputError(f"flow_gt: expected {expected}, got {np.shape(flow_gt)}.")
-        valid &= (np.abs(flow_gt) < UNKNOWN_FLOW_PX).all(axis=2)
+        valid &= (np.abs(flow_gt) < UNKNOWN_FLOW).all(axis=2)
         moving = np.hypot(du - flow_gt[..., 0], dv - flow_gt[..., 1])[valid] > MOVING_PX
         facts["dynamic_fraction"] = float(moving.mean()) if len(moving) else None
     return facts

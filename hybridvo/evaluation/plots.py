@@ -30,8 +30,6 @@ _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 _STYLES = ("-", "--", "-.", ":")
 _TRUTH_COLOUR = "#222222"
 _FORMATS = (".png", ".pdf", ".svg")
-COLUMNS = 2
-PANEL_WIDTH_INCHES = 5.4
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,13 +230,12 @@ def maps_png(panels: Sequence[Panel], heading: str, aspect: float) -> bytes:
     """
     if not panels:
         raise InputError("maps_png: expected at least one panel, got none.")
-    rows = -(-len(panels) // COLUMNS)
-    height = rows * (PANEL_WIDTH_INCHES / aspect * 0.92 + 0.42) + 0.45
-    figure = _figure(COLUMNS * PANEL_WIDTH_INCHES, height)
-    grid = figure.add_gridspec(rows, COLUMNS)
+    rows, width = -(-len(panels) // 2), 5.4  # inches a panel
+    figure = _figure(2 * width, rows * (width / aspect * 0.92 + 0.42) + 0.45)
+    grid = figure.add_gridspec(rows, 2)
     tops = _shared_tops(panels)
     for k, panel in enumerate(panels):
-        axes = figure.add_subplot(grid[k // COLUMNS, k % COLUMNS])
+        axes = figure.add_subplot(grid[k // 2, k % 2])
         axes.set_title(panel.title, fontsize=10, loc="left", parse_math=False)
         axes.set_xticks([])
         axes.set_yticks([])

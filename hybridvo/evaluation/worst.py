@@ -25,7 +25,6 @@ from hybridvo.types import FramePair
 
 THUMBNAIL_WIDTH = 256
 """Width of each panel of a worst pair, px: a report holds a hundred of them."""
-CAPTION_PX = 18
 ERROR_RANGE_PX = (0.01, 10.0)
 """Ends of the colours of every error map of the worst pairs, px, logarithmic."""
 
@@ -150,7 +149,7 @@ def _panel(image: np.ndarray | None, caption: str, shape: tuple[int, int]) -> np
     small = np.full((size[1], size[0], 3), 128, np.uint8)
     if image is not None:
         small[:] = cv2.resize(np.ascontiguousarray(image), size, interpolation=cv2.INTER_AREA)
-    strip = np.full((CAPTION_PX, THUMBNAIL_WIDTH, 3), 255, np.uint8)
-    place, font = (4, CAPTION_PX - 5), cv2.FONT_HERSHEY_SIMPLEX
+    strip = np.full((18, THUMBNAIL_WIDTH, 3), 255, np.uint8)
+    place, font = (4, 13), cv2.FONT_HERSHEY_SIMPLEX
     cv2.putText(strip, caption, place, font, 0.4, (0, 0, 0), 1, cv2.LINE_AA)
     return np.concatenate([small, strip])

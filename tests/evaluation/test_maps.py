@@ -239,7 +239,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_tool_draws_a_pair(folder: Path, tmp_path: Path, capsys) -> None:
     sequence = str(folder / "training" / "clean" / "tiny")
     out = tmp_path / "new" / "pair.png"
-    arguments = ["--sequence", sequence, "--pair", "1", "--flow", "dis", "--steps", "3"]
+    arguments = ["--sequence", sequence, "--pair", "1", "--flow", "dis", "--steps", "4"]
     arguments += ["--method", "refine"]
     for kind in ("pwvo", "vonet"):
         arguments += ["--weights", str(folder / f"{kind}.safetensors")]
