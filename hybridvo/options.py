@@ -68,7 +68,7 @@ class SearchOptions:
         grid_pixels: pixels of the grid on which starts are made and scored.
         max_hypotheses: largest number of motions.
         min_inlier_ratio: smallest share of the usable pixels that a further motion must hold.
-        unambiguous_ratio: share of the usable pixels above which the first motion stands alone.
+        unambiguous_ratio: share of the pixels with depth above which the first motion stands alone.
     """
 
     grid_pixels: Count = 1800

@@ -15,7 +15,7 @@ from hybridvo.types import as_rigid, to_numpy
 if TYPE_CHECKING:
     import torch
 
-    from hybridvo.refinement.photometric_options import PhotometricReport
+    from hybridvo.refinement.photometric import PhotometricReport
 
 
 class State(enum.Enum):

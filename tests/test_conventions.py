@@ -38,7 +38,7 @@ from hybridvo.geometry import (
     xyzw_to_wxyz,
 )
 from hybridvo.network.inputs import assemble_inputs
-from hybridvo.refinement import solver
+from hybridvo.refinement import coarse_fit
 from hybridvo.results import RelativePose, Step
 from hybridvo.trajectory import Trajectory, read_trajectory
 from hybridvo.types import Camera, Frame, FramePair, PairBatch
@@ -420,7 +420,7 @@ def update(twin: str, delta: np.ndarray, T: np.ndarray) -> np.ndarray:
     """Exp(delta) T by one of the solvers' own updates."""
     if twin == "numba":
         out = np.eye(4)
-        solver.left_update(delta, np.ascontiguousarray(T[:3]), out[:3])
+        coarse_fit.left_update(delta, np.ascontiguousarray(T[:3]), out[:3])
         return out
     pose = torch_geometry.se3(torch.tensor(T)[None])
     return torch_geometry.left_update(torch.tensor(delta)[None], pose)[0].matrix().numpy()

@@ -23,7 +23,7 @@ from hybridvo.evaluation.pair_errors import true_motion
 from hybridvo.flow import contradiction, dis_flow, file_flow
 from hybridvo.geometry import ego_flow
 from hybridvo.pipeline import estimate
-from hybridvo.refinement.depth_agreement import depth_ratio, is_step
+from hybridvo.refinement.depth import depth_ratio, is_step
 from hybridvo.types import Frame, FramePair
 from hybridvo.units import depth_advice, typical_depth
 

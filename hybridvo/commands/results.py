@@ -12,7 +12,7 @@ from hybridvo.data.sequence import Sequence
 from hybridvo.evaluation.metrics import Alignment, evaluate
 from hybridvo.evaluation.pair_errors import mean_pair_errors
 from hybridvo.files import atomic_write, write_json
-from hybridvo.refinement.depth_agreement import is_step
+from hybridvo.refinement.depth import is_step
 from hybridvo.trajectory import Trajectory
 
 Row = Mapping[str, Any]

@@ -32,7 +32,7 @@ from hybridvo.geometry import se3_log
 from hybridvo.odometry import Odometry
 from hybridvo.options import Options
 from hybridvo.pipeline import Models, check_method, weights_hash
-from hybridvo.refinement.depth_agreement import depth_ratio
+from hybridvo.refinement.depth import depth_ratio
 from hybridvo.results import State, Step
 from hybridvo.tracking.state import TrackerState
 from hybridvo.trajectory import Trajectory

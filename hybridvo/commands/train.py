@@ -81,6 +81,10 @@ def build_parser() -> argparse.ArgumentParser:
     data.add_argument("--data", type=Path, required=True, help="folder of the shards")
     data.add_argument("--first-seed", type=int, default=1_000_000, help="below 1000: held out")
     data.add_argument("--seeds", type=int, default=0, help="about as many samples")
+    data.add_argument(
+        "--recordings", type=Path, metavar="DIR", help="semi-real pairs of the recordings below it"
+    )
+    data.add_argument("--split", default="train", help="which of these recordings")
     data.add_argument("--propose", metavar="NETWORK", help="ask these weights about the samples")
     data.set_defaults(run=_selector_data)
     return parser
@@ -195,14 +199,17 @@ def _export(args: argparse.Namespace, command: str) -> None:
 
 def _selector_data(args: argparse.Namespace, command: str) -> None:
     from hybridvo.errors import InputError
+    from hybridvo.synthetic.semi_real import load_split
     from hybridvo.training.selector_data import PER_SHARD, write_shard
     from hybridvo.training.selector_proposals import write_proposals
 
     if args.first_seed < 0 or args.seeds < 0:
         raise InputError(f"expected --first-seed and --seeds >= 0, got {args.first_seed}.")
     args.data.mkdir(parents=True, exist_ok=True)
+    recordings = () if args.recordings is None else load_split(args.recordings, args.split)
     for seed in range(args.first_seed, args.first_seed + args.seeds, PER_SHARD):
-        print(f"seeds from {seed}: {write_shard(args.data, seed)} samples", flush=True)
+        count = write_shard(args.data, seed, recordings=recordings)
+        print(f"seeds from {seed}: {count} samples", flush=True)
     if args.propose is not None:
         print(f"asked about {write_proposals(args.data, _network(args.propose))} samples")
 

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from hybridvo.hypotheses import search
 from hybridvo.options import Options
 from hybridvo.refinement import kernels
+from hybridvo.refinement.coarse_fit import fit_coarse, translation_scale
 from hybridvo.refinement.depth import look_up
-from hybridvo.refinement.full_fit import fit_coarse, translation_scale
 from hybridvo.refinement.pixels import CoarseGrid, as_contiguous, coarse_grid
 from hybridvo.results import Reason, RelativePose
-from hybridvo.types import FramePair
+from hybridvo.types import Frame, FramePair
 
 REFERENCE_WIDTH = 1024
 """px; residuals of images of different size are compared at this width."""
@@ -45,6 +46,10 @@ class GridMaps:
         K: (4,) fx, fy, cx, cy of the current camera.
         width: px, of the whole image.
         stride: px between the grid's pixels.
+        seen: (h, w) bool, depth is there, with or without flow.
+        image_prev, image_curr: (h, w) float32 grey levels, each frame on its own grid; 0 without.
+        log_depth_seen: (h, w) float32, log metres of the current frame on its own grid; NaN where
+            unknown.
     """
 
     ray: np.ndarray
@@ -57,6 +62,10 @@ class GridMaps:
     K: np.ndarray
     width: int
     stride: int
+    seen: np.ndarray
+    image_prev: np.ndarray
+    image_curr: np.ndarray
+    log_depth_seen: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +112,34 @@ class HypothesisSet:
             K=grid.pixels.K,
             width=pair.prev.camera.width,
             stride=stride,
+            seen=np.isfinite(_log_depth(pair.prev, grid)),
+            image_prev=_grey(pair.prev, grid),
+            image_curr=_grey(pair.curr, grid),
+            log_depth_seen=_log_depth(pair.curr, grid),
         )
+
+
+def _pick(grid: CoarseGrid) -> tuple[slice, slice]:
+    """The grid's pixels of a whole image."""
+    stride, (v0, v1, u0, u1) = grid.shape[2], grid.box
+    return slice(v0 + stride // 2, v1, stride), slice(u0 + stride // 2, u1, stride)
+
+
+def _grey(frame: Frame, grid: CoarseGrid) -> np.ndarray:
+    """(h, w) float32 grey levels, each the mean of what it stands for; 0 without an image."""
+    if frame.rgb is None:
+        return np.zeros(grid.shape[:2], np.float32)
+    grey = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
+    return cv2.blur(grey, (grid.shape[2],) * 2)[_pick(grid)].astype(np.float32)
+
+
+def _log_depth(frame: Frame, grid: CoarseGrid) -> np.ndarray:
+    """(h, w) float32 log metres; NaN where unknown."""
+    if frame.depth is None:
+        return np.full(grid.shape[:2], np.nan, np.float32)
+    depth = frame.depth[_pick(grid)]
+    known = (depth > kernels.MIN_DEPTH) & (depth < kernels.MAX_VALUE)
+    return np.log(np.where(known, depth, np.float32(np.nan)))
 
 
 def generate(
@@ -132,9 +168,12 @@ def generate(
     poses = np.zeros((limits.max_hypotheses, 3, 4))
     facts = np.zeros((limits.max_hypotheses, search.FACTS))
     before = grid.samples[kernels.W].copy()  # the search uses the weights up
+    # of what the sensor sees: a mover may hold most of what has flow
+    seen = np.count_nonzero(np.isfinite(_log_depth(pair.prev, grid)))
+    decisive = limits.unambiguous_ratio * seen / max(np.count_nonzero(grid.weight > 0), 1)
     found = search.find_motions(
         small, sh, sw, grid.samples, h, w, K, np.ascontiguousarray(starts[:, :3]),
-        options.refine.cutoff, limits.unambiguous_ratio, limits.min_inlier_ratio,
+        options.refine.cutoff, decisive, limits.min_inlier_ratio,
         limits.max_hypotheses, depth_scale, seed, poses, facts,
     )  # fmt: skip
     grid.samples[kernels.W] = before
@@ -142,7 +181,7 @@ def generate(
         return RelativePose.failed(
             Reason.DEGENERATE_GEOMETRY, "the pixels do not determine any motion", "refine"
         )
-    clear = found == 1 and bool(facts[0, search.SHARE] >= limits.unambiguous_ratio)
+    clear = found == 1 and bool(facts[0, search.SHARE] >= decisive)
     clear = clear and _is_rigid(grid, poses[0], facts[0], pair.prev.camera.width)
     return HypothesisSet(pair, grid, depth_scale, poses[:found], facts[:found], not clear)
 

@@ -13,6 +13,18 @@ import math
 import numpy as np
 
 from hybridvo.compilation import njit
+from hybridvo.refinement.coarse_fit import (
+    DEPTH_NOISE_CAP,
+    FLOW_NOISE_CAP,
+    NOISE_PIXELS,
+    anneal,
+    left_update,
+    reestimate,
+    residual,
+    residual_scale,
+    robust_weights,
+    set_noise,
+)
 from hybridvo.refinement.kernels import (
     BUFFER_ROWS,
     FASTMATH,
@@ -25,19 +37,7 @@ from hybridvo.refinement.kernels import (
     YN,
     W,
     Z,
-)
-from hybridvo.refinement.solver import (
-    DEPTH_NOISE_CAP,
-    FLOW_NOISE_CAP,
-    NOISE_PIXELS,
-    anneal,
-    left_update,
     new_work,
-    reestimate,
-    residual,
-    residual_scale,
-    robust_weights,
-    set_noise,
 )
 
 WINDOW_ROWS, WINDOW_COLUMNS = 3, 4

@@ -13,13 +13,19 @@ from typing import Protocol
 
 import numpy as np
 
-from hybridvo.calibration import CUE_GAP
+from hybridvo.calibration import CLEAR_RIGHT, CUES_RIGHT, SELECTOR_RIGHT
 from hybridvo.geometry import invert, pose_matrix, se3_log
 from hybridvo.hypotheses import search
 from hybridvo.hypotheses.cues import cue_scores
-from hybridvo.hypotheses.generate import SOURCE_REFIT, GridMaps, HypothesisSet, fit_in_mask
+from hybridvo.hypotheses.generate import (
+    REFERENCE_WIDTH,
+    SOURCE_REFIT,
+    GridMaps,
+    HypothesisSet,
+    fit_in_mask,
+)
 from hybridvo.options import Options
-from hybridvo.refinement import solver
+from hybridvo.refinement import coarse_fit, kernels
 from hybridvo.results import Hypothesis, MotionPrediction, MotionPrior
 
 SUPPORT_CUTOFF = 3.0
@@ -31,6 +37,12 @@ MASK_RAMP = (0.4, 0.9)
 ROUNDS = 3
 """Most rounds of refits; only a refit that is the best goes into another one, inside its own mask.
 On 120 development pairs with DIS flow one round leaves a median error of 0.075 px, three 0.072."""
+OTHER_PX = 3.0
+"""Mean distance, px at a width of 1024, above which two motions are not the same."""
+NO_RIVAL = 8.0
+"""Gap of the scores where there is no other motion, and the largest that counts."""
+SMALL_AREA = 0.02
+"""Share of the image that counts as nothing in a ratio of areas."""
 MIN_COVERAGE = 0.02
 """Share of the usable pixels' weight that a mask must leave for a fit inside it."""
 SOURCES = {
@@ -65,32 +77,37 @@ class Scores:
         best: (R,) int64, the candidates worth a fit inside their mask.
         masks: (R, h, w) for each of them the probability of every pixel of being static.
         confidence: probability, 0 to 1, that the candidate with the largest score is right.
+        areas: (N, 2) share of the image that each candidate explains, by its flow and by its look.
     """
 
     score: np.ndarray
     best: np.ndarray
     masks: np.ndarray
     confidence: float
+    areas: np.ndarray
 
 
 class Scorer(Protocol):
     """Scores the motions of a pair by what they leave unexplained, pixel by pixel."""
 
-    def score(
-        self,
-        maps: GridMaps,
-        candidates: Candidates,
-        prior: MotionPrior | None,
-        static: np.ndarray | None,
-        masks: int,
-    ) -> Scores:
-        """Scores of all candidates, and masks for the best of them.
+    def look(self, maps: GridMaps, prior: MotionPrior | None, static: np.ndarray | None) -> Look:
+        """The pair to be judged.
 
         Args:
             maps: the pixels.
-            candidates: the motions.
             prior: what is known of the motion, or None.
             static: (h, w) probability of being static that a network predicts, or None.
+        """
+
+
+class Look(Protocol):
+    """One pair as a scorer sees it."""
+
+    def score(self, candidates: Candidates, masks: int) -> Scores:
+        """Scores of all candidates, and masks for the best of them.
+
+        Args:
+            candidates: the motions; those of an earlier call come first, in the same order.
             masks: how many masks are wanted at most.
         """
 
@@ -105,7 +122,8 @@ class Selection:
         mask: (h, w) weights on the coarse grid that it was fitted with, or None for all.
         coverage: share of the usable pixels' weight that the mask leaves.
         confidence: the selector's own probability, 0 to 1, that it is right.
-        probability: the same, calibrated.
+        evidence: what the calibrated probability is computed from, see :func:`evidence_of`.
+        probability: that the motion is right, calibrated.
         hypotheses: all candidates, the one selected first.
         iterations: Gauss-Newton steps spent on it.
     """
@@ -115,6 +133,7 @@ class Selection:
     mask: np.ndarray | None
     coverage: float
     confidence: float
+    evidence: np.ndarray
     probability: float
     hypotheses: tuple[Hypothesis, ...]
     iterations: int
@@ -151,11 +170,12 @@ class CueSelector:
         candidates = _searched(found)
         scores = cue_scores(found, hypotheses(found, candidates), prior)
         ordered = np.sort(scores)[::-1]
-        probability = 1.0
-        if found.is_ambiguous and len(scores) > 1:
-            slope, offset = CUE_GAP
-            probability = float(1 / (1 + np.exp(-slope * (ordered[0] - ordered[1]) - offset)))
-        return _selection(found, candidates, scores, [None] * len(scores), probability)
+        gap = ordered[0] - ordered[1] if len(scores) > 1 else NO_RIVAL
+        evidence = np.array([min(gap, NO_RIVAL)])
+        probability = _probability(evidence, CUES_RIGHT) if found.is_ambiguous else CLEAR_RIGHT
+        return _selection(
+            found, candidates, scores, [None] * len(scores), (probability, evidence, probability)
+        )
 
 
 class MaskSelector:
@@ -178,7 +198,8 @@ class MaskSelector:
         """See :class:`Selector`."""
         candidates = _searched(found)
         if not found.is_ambiguous:
-            return _selection(found, candidates, np.zeros(1), [None], 1.0)
+            sure = CLEAR_RIGHT, np.zeros(0), CLEAR_RIGHT
+            return _selection(found, candidates, np.zeros(1), [None], sure)
         maps, limits = found.maps(), self.options.select
         masks: list[np.ndarray | None] = [None] * candidates.searched
         static = None
@@ -187,7 +208,8 @@ class MaskSelector:
             candidates = self._refit(
                 found, candidates, masks, [(prediction.T_curr_prev[:3], mask_weights(static), None)]
             )
-        scores = self.scorer.score(maps, candidates, prior, static, limits.refits)
+        look = self.scorer.look(maps, prior, static)
+        scores = look.score(candidates, limits.refits)
         for _ in range(ROUNDS):
             known = len(candidates.poses)
             entries = [
@@ -197,10 +219,12 @@ class MaskSelector:
             candidates = self._refit(found, candidates, masks, entries)
             if len(candidates.poses) == known:
                 break
-            scores = self.scorer.score(maps, candidates, prior, static, 1)
+            scores = look.score(candidates, 1)
             if int(np.argmax(scores.score)) < known:
                 break
-        return _selection(found, candidates, scores.score, masks, scores.confidence)
+        evidence = evidence_of(found, candidates, scores)
+        trust = scores.confidence, evidence, _probability(evidence, SELECTOR_RIGHT)
+        return _selection(found, candidates, scores.score, masks, trust)
 
     def _refit(
         self,
@@ -235,6 +259,43 @@ class MaskSelector:
         )
 
 
+def evidence_of(found: HypothesisSet, candidates: Candidates, scores: Scores) -> np.ndarray:
+    """(6,) What speaks for the best candidate, and for the best motion that is another one.
+
+    The logit of the scorer's confidence, the gap of the scores, the logarithms of the ratios of the
+    areas that both explain (by flow, by look), and the areas that the best one explains.
+    """
+    best = int(np.argmax(scores.score))
+    apart = _distances(found, candidates.poses, best) > OTHER_PX
+    gap, rival = NO_RIVAL, np.zeros(2)
+    if apart.any():
+        gap = min(NO_RIVAL, float(scores.score[best] - scores.score[apart].max()))
+        rival = scores.areas[apart].max(axis=0)
+    confidence = float(np.clip(np.nan_to_num(scores.confidence), 1e-3, 1 - 1e-3))
+    own = scores.areas[best]
+    ratio = np.log((own + SMALL_AREA) / (rival + SMALL_AREA))
+    return np.array([np.log(confidence / (1 - confidence)), gap, *ratio, *own])
+
+
+def _distances(found: HypothesisSet, poses: np.ndarray, of: int) -> np.ndarray:
+    """(N,) mean distance between where poses bring the pixels and where one of them does, px at a
+    width of 1024.
+    """
+    samples = found.grid.samples[:, : found.grid.count : 7]
+    samples = samples[:, samples[kernels.W] > 0].astype(np.float64)
+    z = samples[kernels.Z]
+    points = np.stack([samples[kernels.XN] * z, samples[kernels.YN] * z, z])
+    moved = poses[:, :, :3] @ points + poses[:, :, 3:]
+    seen = moved[:, :2] / np.maximum(moved[:, 2:], 1e-3)
+    gap = np.linalg.norm((seen - seen[of]) * found.grid.pixels.K[:2, None], axis=1)
+    return np.minimum(gap, 1e3).mean(axis=1) * REFERENCE_WIDTH / found.pair.prev.camera.width
+
+
+def _probability(evidence: np.ndarray, weights: tuple[float, ...]) -> float:
+    """Of being right: logistic in the evidence; the last weight is the offset."""
+    return float(1 / (1 + np.exp(-evidence @ weights[:-1] - weights[-1])))
+
+
 def mask_weights(probability: np.ndarray, ramp: tuple[float, float] = MASK_RAMP) -> np.ndarray:
     """Weights of a fit from probabilities of being static: 0 below the ramp, 1 above it."""
     low, high = ramp
@@ -253,14 +314,16 @@ def hypotheses(found: HypothesisSet, candidates: Candidates) -> list[Hypothesis]
     """The candidates with their inliers, in their order."""
     grid = found.grid
     h, w, stride = grid.shape
-    work, noise = solver.new_work(), np.empty(3, np.float32)
+    work, noise = kernels.new_work(), np.empty(3, np.float32)
     total = max(float(grid.weight.sum()), 1e-9)
     made = []
     for pose, fact in zip(candidates.poses, candidates.facts, strict=True):
         inliers = np.empty(grid.count, np.float32)
         flow_noise, depth_noise = float(fact[search.FLOW_NOISE]), float(fact[search.DEPTH_NOISE])
-        solver.set_noise(max(flow_noise, MIN_NOISE_PX), depth_noise, SUPPORT_CUTOFF, noise)
-        solver.robust_weights(grid.samples, grid.count, pose, grid.pixels.K, noise, work, inliers)
+        coarse_fit.set_noise(max(flow_noise, MIN_NOISE_PX), depth_noise, SUPPORT_CUTOFF, noise)
+        coarse_fit.robust_weights(
+            grid.samples, grid.count, pose, grid.pixels.K, noise, work, inliers
+        )
         name = SOURCES.get(int(fact[search.SOURCE]), "start")
         share = float(np.where(grid.weight > 0, inliers, 0) @ grid.weight) / total
         T, shape = pose_matrix(pose), inliers.reshape(h, w)
@@ -284,9 +347,9 @@ def _selection(
     candidates: Candidates,
     scores: np.ndarray,
     masks: Sequence[np.ndarray | None],
-    confidence: float,
+    trust: tuple[float, np.ndarray, float],
 ) -> Selection:
-    """The candidate with the largest score."""
+    """The candidate with the largest score; ``trust``: confidence, evidence, probability."""
     scores = np.nan_to_num(scores, nan=-np.inf)
     order = np.argsort(-scores, kind="stable")
     best = int(order[0])
@@ -297,8 +360,9 @@ def _selection(
         noise=(float(fact[search.FLOW_NOISE]), float(fact[search.DEPTH_NOISE])),
         mask=mask,
         coverage=1.0 if mask is None else _coverage(found, mask),
-        confidence=float(np.nan_to_num(confidence)),
-        probability=float(np.nan_to_num(confidence)),
+        confidence=float(np.nan_to_num(trust[0])),
+        evidence=trust[1],
+        probability=float(np.nan_to_num(trust[2])),
         hypotheses=tuple(replace(motions[k], score=float(scores[k])) for k in order),
         iterations=int(fact[search.ITERATIONS]),
     )

@@ -1,21 +1,22 @@
 """What the selector network sees: an image, and what each candidate motion leaves unexplained.
 
 Of every candidate the residuals of flow and second depth, measured against the noise that the
-candidate itself found, and the support it takes away from its rivals; beside them the image's flow,
-depth and rays, each over the pair's own scale.
+candidate itself found, how well the current image and its depth look where the candidate says that
+the pixels go (also where there is no flow), and what its rivals explain; beside them the image's
+flow, depth and rays, each over the pair's own scale.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 
 from hybridvo.hypotheses import search
 from hybridvo.hypotheses.generate import GridMaps
-from hybridvo.hypotheses.selector import Candidates
 from hybridvo.results import MotionPrior
 
 REFERENCE_WIDTH = 1024.0
@@ -26,6 +27,12 @@ DEPTH_FLOOR = 0.003
 """Spread of log depth that even exact depths have between neighbouring pixels."""
 USUAL_CHANGE = 0.01
 """rad of the image by which a motion usually differs from the one before."""
+SAME_DEPTH = 0.05
+"""Difference of log depth up to which two readings may be of one surface."""
+PATCH = 5
+"""Side of the patches that are correlated, in pixels of the grid."""
+PLAIN = 9.0
+"""Variance of a patch, grey levels squared, that counts half: sensor noise alone has about 2."""
 MAX_LOGIT = 6.0
 """Largest logit of another network's static probability that is believed."""
 
@@ -49,6 +56,11 @@ class SelectorInputs:
         prior_information: (B, 6, 6) inverse of the covariance of ``Exp(delta) T_prior``,
             translation first.
         has_prior: (B,) bool, whether it is known.
+        seen: (B, h, w) bool, depth is there.
+        image_prev: (B, h, w) grey levels.
+        planes_curr: (B, 3, h, w) of the current frame on its own grid: grey levels, log metres (0
+            where unknown), whether these are known.
+        stride: (B,) px between the grid's pixels.
         owner: (N,) int64, image of each candidate.
         parent: (N,) int64, for refits: the motion of the search it came from; for those: itself.
         pose: (N, 3, 4) T_curr_prev.
@@ -69,22 +81,36 @@ class SelectorInputs:
     T_prior: torch.Tensor
     prior_information: torch.Tensor
     has_prior: torch.Tensor
+    seen: torch.Tensor
+    image_prev: torch.Tensor
+    planes_curr: torch.Tensor
+    stride: torch.Tensor
     owner: torch.Tensor
     parent: torch.Tensor
     pose: torch.Tensor
     flow_noise: torch.Tensor
     depth_noise: torch.Tensor
 
+    def asking(self, poses: Any, facts: Any, parents: Any) -> SelectorInputs:
+        """The same image with other candidates: (N, 3, 4), (N, FACTS) and (N,) of the one image."""
+
+        def of(x: Any, dtype: torch.dtype) -> torch.Tensor:
+            return torch.as_tensor(x, dtype=dtype, device=self.depth.device)
+
+        return replace(
+            self,
+            owner=torch.zeros(len(poses), dtype=torch.int64, device=self.depth.device),
+            parent=of(parents, torch.int64),
+            pose=of(poses, torch.float32),
+            flow_noise=of(facts[:, search.FLOW_NOISE], torch.float32),
+            depth_noise=of(facts[:, search.DEPTH_NOISE], torch.float32),
+        )
+
 
 def selector_inputs(
-    maps: GridMaps,
-    candidates: Candidates,
-    part: slice,
-    prior: MotionPrior | None,
-    static: np.ndarray | None,
-    device: torch.device,
+    maps: GridMaps, prior: MotionPrior | None, static: np.ndarray | None, device: torch.device
 ) -> SelectorInputs:
-    """A batch of one image and a part of its candidates."""
+    """A batch of one image, without candidates yet."""
 
     def batch(x: Any) -> torch.Tensor:
         return torch.as_tensor(np.ascontiguousarray(x), device=device)[None]
@@ -95,11 +121,7 @@ def selector_inputs(
     logit = torch.zeros_like(depth)
     if static is not None:
         logit = torch.logit(batch(static).to(torch.float32), eps=1e-4)
-    poses, facts = candidates.poses[part], candidates.facts[part]
-
-    def of(x: np.ndarray, dtype: torch.dtype) -> torch.Tensor:
-        return torch.as_tensor(x, dtype=dtype, device=device)
-
+    none = torch.zeros(0, device=device)
     return SelectorInputs(
         ray=batch(maps.ray),
         depth=depth,
@@ -115,12 +137,22 @@ def selector_inputs(
         T_prior=batch(expected[:3].astype(np.float32)),
         prior_information=prior_information_of(depth, usable, covariance),
         has_prior=torch.tensor([prior is not None], device=device),
-        owner=torch.zeros(len(poses), dtype=torch.int64, device=device),
-        parent=of(candidates.parents[part], torch.int64),
-        pose=of(poses, torch.float32),
-        flow_noise=of(facts[:, search.FLOW_NOISE], torch.float32),
-        depth_noise=of(facts[:, search.DEPTH_NOISE], torch.float32),
+        seen=batch(maps.seen),
+        image_prev=batch(maps.image_prev),
+        planes_curr=planes_of(batch(maps.image_curr), batch(maps.log_depth_seen)),
+        stride=torch.tensor([float(maps.stride)], device=device),
+        owner=none,
+        parent=none,
+        pose=none,
+        flow_noise=none,
+        depth_noise=none,
     )
+
+
+def planes_of(image: torch.Tensor, log_depth: torch.Tensor) -> torch.Tensor:
+    """(B, 3, h, w) as :class:`SelectorInputs` has them, from grey levels and log metres or NaN."""
+    known = torch.isfinite(log_depth)
+    return torch.stack([image, torch.nan_to_num(log_depth), known.to(image.dtype)], dim=1)
 
 
 def _squash(x: torch.Tensor) -> torch.Tensor:
@@ -131,9 +163,10 @@ def _squash(x: torch.Tensor) -> torch.Tensor:
 def candidate_channels(
     inputs: SelectorInputs, first: tuple[SelectorInputs, torch.Tensor] | None
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """(channels (N, 8, h, w), scalars (N, 8), support (N, h, w)) of every candidate.
+    """(channels (N, 14, h, w), scalars (N, 13), evidence (N, 2, h, w)) of every candidate.
 
-    ``first``: inputs and support of the motions of the search, where these are refits of them.
+    The evidence is the support that the flow gives, and the agreement of the images times their
+    texture. ``first``: inputs and evidence of the motions of the search, where these are refits.
     """
     own = inputs.owner
     x, y = inputs.ray[own, 0], inputs.ray[own, 1]
@@ -171,7 +204,11 @@ def candidate_channels(
         torch.where(known, c, torch.ones_like(c))
     )
     ez = rz / torch.sqrt(2.0 * vd + DEPTH_FLOOR**2)
-    channels = torch.stack(
+    texture, agreement, gap, met = _look(inputs, fx * a + cx, fy * b + cy, c, front)
+    evidence = torch.stack([support, agreement], 1)
+    rivals = _rivals(inputs, *((inputs, evidence) if first is None else first))
+    es = gap / torch.sqrt(2.0 * vd + DEPTH_FLOOR**2)
+    by_flow = torch.stack(
         [
             0.5 * _squash(eu),
             0.5 * _squash(ev),
@@ -180,22 +217,81 @@ def candidate_channels(
             known.to(z.dtype),
             0.3 * _squash(50.0 * rz),
             support,
-            _rivals(inputs, support if first is None else first[1], (first or (inputs,))[0].owner),
+            rivals[:, 0],
         ],
         dim=1,
     )
-    channels = channels * usable[:, None]
-    return channels, _scalars(inputs, support, wide, first is not None), support
+    by_images = torch.stack(
+        [texture, agreement, rivals[:, 1], 0.5 * _squash(es), met, 0.3 * _squash(50.0 * gap)], 1
+    )
+    channels = torch.cat([by_flow * usable[:, None], by_images], 1)
+    # areas of the whole image, not of what has flow
+    best = rivals[:, 1] * (texture > 0)
+    areas = [
+        agreement.clamp(min=0).mean((1, 2)),
+        (texture - agreement).mean((1, 2)),
+        (agreement - best).mean((1, 2)),
+        ((gap.abs() < SAME_DEPTH) * met).mean((1, 2)),
+        ((gap > SAME_DEPTH) * met).mean((1, 2)),
+    ]
+    scalars = _scalars(inputs, support, wide, first is not None)
+    return channels, torch.cat([scalars, 2.0 * torch.stack(areas, 1)], 1), evidence
 
 
-def _rivals(inputs: SelectorInputs, support: torch.Tensor, owner: torch.Tensor) -> torch.Tensor:
-    """(N, h, w): the largest support among the image's other motions of the search."""
-    out = support.new_zeros((len(inputs.owner), *support.shape[1:]))
-    index = torch.arange(len(support), device=support.device)
+def _look(
+    inputs: SelectorInputs, u: torch.Tensor, v: torch.Tensor, z: torch.Tensor, front: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+    """What the current frame shows where candidates say that pixels go, (N, h, w) each.
+
+    Returns:
+        Texture, 0 where nothing can be told to 1; it times the correlation of the patches; log of
+        the depth that is seen there over the one expected, positive where the candidate's point
+        should hide it; and whether both are known.
+    """
+    own = inputs.owner
+    planes = inputs.planes_curr
+    height, width = planes.shape[2:]
+    stride = inputs.stride[own, None, None]
+    first = torch.div(stride, 2, rounding_mode="floor")
+    where = torch.stack(
+        [
+            2 * ((u - first) / stride + 0.5) / width - 1,
+            2 * ((v - first) / stride + 0.5) / height - 1,
+        ],
+        dim=-1,
+    )
+    there = front & inputs.seen[own] & (where.abs() < 1).all(-1)
+    where = torch.where(there[..., None], where, torch.zeros_like(where))
+    warped = F.grid_sample(planes[own], where, align_corners=False, padding_mode="border")
+    there_f = there.to(z.dtype)
+    p, q = inputs.image_prev[own], warped[:, 0]
+    terms = torch.stack([torch.ones_like(p), p, q, p * p, q * q, p * q], 1) * there_f[:, None]
+    mean = F.avg_pool2d(terms, PATCH, 1, PATCH // 2)
+    count = mean[:, 0]
+    mean = mean[:, 1:] / count.clamp(min=1e-6)[:, None]
+    var_p = (mean[:, 2] - mean[:, 0] ** 2).clamp(min=0)
+    var_q = (mean[:, 3] - mean[:, 1] ** 2).clamp(min=0)
+    spread = torch.sqrt(var_p * var_q)
+    # a patch must be textured before the motion; whether it still is after it is the question
+    texture = var_p / (var_p + PLAIN) * there_f * (count > 0.3)
+    agreement = texture * (mean[:, 4] - mean[:, 0] * mean[:, 1]) / (spread + 0.5 * PLAIN)
+    known = there & (warped[:, 2] > 0.99)
+    gap = torch.where(known, warped[:, 1], torch.zeros_like(z)) - torch.log(
+        torch.where(known, z, torch.ones_like(z))
+    )
+    return texture, agreement, gap, known.to(z.dtype)
+
+
+def _rivals(
+    inputs: SelectorInputs, searched: SelectorInputs, evidence: torch.Tensor
+) -> torch.Tensor:
+    """(N, 2, h, w): the largest evidence among the image's other motions of the search."""
+    out = evidence.new_zeros((len(inputs.owner), *evidence.shape[1:]))
+    index = torch.arange(len(evidence), device=evidence.device)
     for k in range(len(out)):
-        rival = (owner == inputs.owner[k]) & (index != inputs.parent[k])
+        rival = (searched.owner == inputs.owner[k]) & (index != inputs.parent[k])
         if rival.any():
-            out[k] = support[rival].amax(0)
+            out[k] = evidence[rival].amax(0)
     return out
 
 

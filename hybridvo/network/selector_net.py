@@ -29,9 +29,9 @@ from hybridvo.network.weights import Weights
 from hybridvo.results import MotionPrior
 
 CHANNELS = (24, 40, 64, 96)
-CANDIDATE_CHANNELS = 8
+CANDIDATE_CHANNELS = 14
 SHARED_CHANNELS = 11
-SCALARS = 8
+SCALARS = 13
 HIDDEN = 96
 PIXEL_CHANNELS = 8
 MIRRORED_CANDIDATE = (0,)
@@ -75,13 +75,13 @@ class SelectorOutput:
         score: (N,) larger is more likely the world; softmax over a image's candidates.
         mask: (N, h, w) logit of the probability that a pixel is static world.
         hidden: (N, D) what :meth:`SelectorNetwork.confidence` looks at.
-        support: (N, h, w) robust weight in [0, 1] of each pixel under each candidate.
+        evidence: (N, 2, h, w) for each candidate, from the flow and from the images.
     """
 
     score: torch.Tensor
     mask: torch.Tensor
     hidden: torch.Tensor
-    support: torch.Tensor
+    evidence: torch.Tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,14 +89,14 @@ class SelectorFeatures:
     """Scores of N candidates, and what their masks are made of.
 
     Args:
-        score: (N,). hidden: (N, D). support: (N, h, w).
+        score: (N,). hidden: (N, D). evidence: (N, 2, h, w).
         common: (B, C, h', w') the first layer's view of what the candidates of a image share.
         levels: input channels and features of :meth:`SelectorNetwork.encode`, finest first.
     """
 
     score: torch.Tensor
     hidden: torch.Tensor
-    support: torch.Tensor
+    evidence: torch.Tensor
     common: torch.Tensor
     levels: tuple[torch.Tensor, ...]
 
@@ -166,7 +166,7 @@ class SelectorNetwork(nn.Module):
         mask = self.decode(features)
         if mirror is not None:
             mask = torch.where(mirror[inputs.owner][:, None, None], mask.flip(2), mask)
-        return SelectorOutput(features.score, mask, features.hidden, features.support)
+        return SelectorOutput(features.score, mask, features.hidden, features.evidence)
 
     def encode(
         self,
@@ -175,8 +175,8 @@ class SelectorNetwork(nn.Module):
         mirror: torch.Tensor | None = None,
     ) -> SelectorFeatures:
         """Scores without masks; arguments as those of :meth:`forward`."""
-        rivals = None if first is None else (first[0], first[1].support)
-        channels, scalars, support = candidate_channels(inputs, rivals)
+        rivals = None if first is None else (first[0], first[1].evidence)
+        channels, scalars, evidence = candidate_channels(inputs, rivals)
         if mirror is not None:
             channels = _mirrored(channels, mirror[inputs.owner], MIRRORED_CANDIDATE)
         channels = _padded(channels)
@@ -196,7 +196,7 @@ class SelectorNetwork(nn.Module):
         hidden = F.relu(self.summary(torch.cat(pooled, 1)))
         hidden = F.relu(self.inner(hidden))
         score = self.score(hidden)[:, 0]
-        return SelectorFeatures(score, hidden, support, common, (channels, x1, x2, x3, x4))
+        return SelectorFeatures(score, hidden, evidence, common, (channels, x1, x2, x3, x4))
 
     def decode(self, features: SelectorFeatures, pick: torch.Tensor | None = None) -> torch.Tensor:
         """(N, h, w) logits of the static masks, of all candidates or of ``pick`` (R,)."""
@@ -209,7 +209,7 @@ class SelectorNetwork(nn.Module):
         y = F.interpolate(self.merge2(F.relu_(y + x2)), scale_factor=2.0)
         y = F.relu_(self.merge1(F.relu_(y + x1)))
         y = F.interpolate(self.context(y), scale_factor=2.0, mode="bilinear", align_corners=False)
-        h, w = features.support.shape[1:]
+        h, w = features.evidence.shape[2:]
         return self.mask(F.relu_(y + self.pixel(channels)))[:, 0, :h, :w]
 
     def confidence(
@@ -261,7 +261,7 @@ def selector_of(weights: Weights) -> nn.Module:
 
 
 class NetworkScorer:
-    """A :class:`hybridvo.hypotheses.selector.Scorer`; keeps nothing between pairs.
+    """A :class:`hybridvo.hypotheses.selector.Scorer`.
 
     Args:
         network: of :func:`hybridvo.network.models.load_weights`.
@@ -273,41 +273,58 @@ class NetworkScorer:
         network = network.eval().to(self.device)
         self.network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
-    def score(
-        self,
-        maps: GridMaps,
-        candidates: Candidates,
-        prior: MotionPrior | None,
-        static: np.ndarray | None,
-        masks: int,
-    ) -> Scores:
+    def look(
+        self, maps: GridMaps, prior: MotionPrior | None, static: np.ndarray | None
+    ) -> NetworkLook:
         """See :class:`hybridvo.hypotheses.selector.Scorer`."""
-        n = candidates.searched
         with plain_torch():
-            first = selector_inputs(maps, candidates, slice(0, n), prior, static, self.device)
-            seen = [self.network.encode(first)]
-            if len(candidates.poses) > n:
-                refits = selector_inputs(
-                    maps, candidates, slice(n, None), prior, static, self.device
-                )
-                seen.append(self.network.encode(refits, (first, seen[0])))
-            score = torch.cat([features.score for features in seen])
-            hidden = torch.cat([features.hidden for features in seen])
+            return NetworkLook(self.network, selector_inputs(maps, prior, static, self.device))
+
+
+class NetworkLook:
+    """The candidates of one pair; each is encoded once."""
+
+    def __init__(self, network: SelectorNetwork, image: SelectorInputs) -> None:
+        self.network, self.image = network, image
+        self.seen: list[tuple[SelectorInputs, SelectorFeatures]] = []
+
+    def score(self, candidates: Candidates, masks: int) -> Scores:
+        """See :class:`hybridvo.hypotheses.selector.Look`."""
+        with plain_torch():
+            known = sum(len(features.score) for _, features in self.seen)
+            if not self.seen:
+                known = candidates.searched
+                self._encode(candidates, slice(0, known))
+            if len(candidates.poses) > known:
+                self._encode(candidates, slice(known, None))
+            score = torch.cat([features.score for _, features in self.seen])
+            hidden = torch.cat([features.hidden for _, features in self.seen])
             best = score.argsort(descending=True, stable=True)[:masks]
             best = best[score[best] > score.max() - MAX_LAG]
-            drawn = [self._mask(seen, int(k), n) for k in best]
-            owner = torch.zeros(len(score), dtype=torch.int64, device=self.device)
+            drawn = [self._mask(int(k)) for k in best]
+            owner = torch.zeros(len(score), dtype=torch.int64, device=score.device)
             confidence = torch.sigmoid(self.network.confidence(score, hidden, owner, 1))
-        h, w = maps.depth.shape
+            evidence = [f.evidence.clamp(min=0).mean((2, 3)) for _, f in self.seen]
         return Scores(
             score.double().cpu().numpy(),
             best.cpu().numpy(),
-            torch.stack(drawn).cpu().numpy() if drawn else np.zeros((0, h, w), np.float32),
+            torch.stack(drawn).cpu().numpy() if drawn else np.zeros((0, 1, 1), np.float32),
             float(confidence),
+            torch.cat(evidence).double().cpu().numpy(),
         )
 
-    def _mask(self, seen: list[SelectorFeatures], k: int, searched: int) -> torch.Tensor:
+    def _encode(self, candidates: Candidates, part: slice) -> None:
+        inputs = self.image.asking(
+            candidates.poses[part], candidates.facts[part], candidates.parents[part]
+        )
+        first = self.seen[0] if self.seen else None
+        self.seen.append((inputs, self.network.encode(inputs, first)))
+
+    def _mask(self, k: int) -> torch.Tensor:
         """(h, w) probability of being static, as candidate k sees it."""
-        refit = k >= searched
-        pick = torch.tensor([k - searched if refit else k], device=self.device)
-        return torch.sigmoid(self.network.decode(seen[refit], pick))[0]
+        for _, features in self.seen:
+            if k < len(features.score):
+                break
+            k -= len(features.score)
+        pick = torch.tensor([k], device=features.score.device)
+        return torch.sigmoid(self.network.decode(features, pick))[0]

@@ -17,6 +17,16 @@ import math
 import numpy as np
 
 from hybridvo.compilation import njit
+from hybridvo.refinement.kernels import (
+    BLOCK,
+    FASTMATH,
+    SUMS,
+    ZERO,
+    W,
+    keep_apart,
+    new_work,
+    project_block,
+)
 
 NOTHING = np.diag([1e4] * 3 + [10.0] * 3)
 """Covariance that carries no information (m^2, rad^2)."""
@@ -55,6 +65,70 @@ ORDER[UPPER] = ORDER.T[UPPER] = np.arange(21)
 def symmetric(upper: np.ndarray) -> np.ndarray:
     """(6, 6) from its 21 upper-triangle values, row by row."""
     return upper[ORDER]
+
+
+@njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
+def score_block(o, n, c2, external, work, rows, factors):
+    """Write w s = w J^T Sigma^-1 r of each pixel to ``rows`` (6, N), and to ``factors`` (N,) what
+    makes its outer product the curvature of the robust weights, ``-2 (dw / dd^2) s s^T``.
+
+    Subtracted from the Gauss-Newton Hessian the curvature gives the derivative of the estimating
+    equation, the "bread" of the sandwich covariance; the plain outer products are its "meat" under
+    independent errors.
+    """
+    keep_apart()  # type: ignore[call-arg]
+    A, B, IZ, N0, N1, S = work[0], work[1], work[2], work[6], work[7], work[8]
+    r0, r1, r2, r3, r4, r5 = (
+        rows[0][o:], rows[1][o:], rows[2][o:], rows[3][o:], rows[4][o:], rows[5][o:]
+    )  # fmt: skip
+    f, e = factors[o:], external[o:]
+    for k in range(n):
+        good = S[k] > np.float32(1e-12)  # elsewhere anything may stand, not a number either
+        a = A[k] if good else ZERO
+        b = B[k] if good else ZERO
+        i = IZ[k] if good else ZERO
+        x = N0[k] if good else ZERO
+        y = N1[k] if good else ZERO
+        c = a * x + b * y
+        r0[k] = x * i
+        r1[k] = y * i
+        r2[k] = -c * i
+        r3[k] = -(b * c + y)
+        r4[k] = a * c + x
+        r5[k] = a * y - b * x
+        # row = w s with w = x_w S, S = (c2 / (c2 + d2))^2; wanted 4 w / (c2 + d2) s s^T
+        f[k] = 4.0 / (np.float64(c2) * e[k] * np.sqrt(S[k])) if good else 0.0  # e as small as 1e-38
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def score_pixels(samples, n, R, t, K, noise, work, rows, factors, acc):
+    """:func:`score_block` of gathered pixels; cost and weights are added to ``acc`` (30,)."""
+    for o in range(0, n, BLOCK):
+        m = min(BLOCK, n - o)
+        project_block(samples, o, m, R, t, K, noise, work, work[8], acc)
+        score_block(o, m, noise[2], samples[W], work, rows, factors)
+
+
+def score_sums(
+    samples: np.ndarray, n: int, pose: np.ndarray, K: np.ndarray, noise: np.ndarray
+) -> np.ndarray:
+    """(42,) curvature of the robust weights and meat of independent errors, per unit of weight.
+
+    From a coarse grid: both are averages over many pixels and enter the result at second order.
+
+    Args:
+        samples: pixel buffer; its first ``n`` pixels count.
+        n: pixels.
+        pose: (3, 4) T_curr_prev.
+        K: (4,) float32 fx, fy, cx, cy of the current camera.
+        noise: (3,) float32, see :func:`hybridvo.refinement.coarse_fit.set_noise`.
+    """
+    R, t = pose[:, :3].astype(np.float32), pose[:, 3].astype(np.float32)
+    rows, factors, used = np.empty((6, n), np.float32), np.empty(n), np.zeros(SUMS)
+    score_pixels(samples, n, R, t, K, noise, new_work(), rows, factors, used)
+    wide = rows.astype(np.float64)  # squares of large external weights overflow in float32
+    out = np.concatenate([m[UPPER] for m in ((wide * factors) @ wide.T, wide @ wide.T)])
+    return out / max(used[29], 1e-12)
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
@@ -134,11 +208,9 @@ def long_range(growth: float, tiles: int) -> float:
 
 
 def sandwich_covariance(
-    total: np.ndarray,
+    tiles: np.ndarray,
     curvature: np.ndarray,
     meat: np.ndarray,
-    scores: np.ndarray,
-    information: np.ndarray,
     depth_scale: float,
     rounding: float = 0.0,
 ) -> tuple[np.ndarray, np.ndarray, bool]:
@@ -151,35 +223,38 @@ def sandwich_covariance(
     the errors reach beyond the blocks.
 
     Args:
-        total: (30,) sums of the normal equations over the full grid.
-        curvature: (21,) curvature of the robust weights.
-        meat: (21,) under independent errors.
-        scores: (rows, columns, 6) scores summed over tiles.
-        information: (rows, columns, 21) Gauss-Newton Hessian summed over tiles.
+        tiles: (rows, columns, 27) upper triangle of the Gauss-Newton Hessian and scores, summed
+            over tiles.
+        curvature: (6, 6) of the robust weights.
+        meat: (6, 6) under independent errors.
         depth_scale: 1 / m, turns metres of translation into radians of the image.
         rounding: what the rounding of exact data adds, in units of the model's own covariance.
     """
     scaling = np.array([1 / depth_scale] * 3 + [1.0] * 3)
     outer = np.outer(scaling, scaling)
+    total = tiles.sum(axis=(0, 1))
     H = symmetric(total[:21]) * outer
     eigenvalues = np.linalg.eigvalsh(H) if np.isfinite(H).all() else np.zeros(6)
     if not eigenvalues[0] > max(1e-8 * eigenvalues[-1], 1e-12):
         return NOTHING.copy(), eigenvalues, False
-    bread = H - symmetric(curvature) * outer
+    bread = H - curvature * outer
     if np.linalg.eigvalsh(bread)[0] <= 0.2 * eigenvalues[0]:
         bread = H  # too few inliers for the curvature to be believed
     inverse, model = np.linalg.inv(bread), np.linalg.inv(H)
-    alone = symmetric(meat) * outer
+    # scores of the tiles where all of them together are zero, to first order
+    step = (model * outer) @ total[21:]
+    scores = tiles[..., 21:] - tiles[..., :21][..., ORDER] @ step
+    alone = meat * outer
     meats, lost = np.empty((len(SIZES), 6, 6)), np.empty(len(SIZES))
-    tiles = block_sums(scores, information, model * outer, SIZES, ORDER, meats, lost)
+    occupied = block_sums(scores, tiles[..., :21], model * outer, SIZES, ORDER, meats, lost)
     meats = meats * outer / np.maximum(1 - lost, SMALLEST_REST)[:, None, None]
     try:
         inflation = np.trace(np.linalg.solve(alone, meats), axis1=1, axis2=2) / 6
     except np.linalg.LinAlgError:
         inflation = np.ones(len(SIZES))  # residuals of zero: no doubt that could be compared
-    reach = long_range(inflation[2] / inflation[0], tiles) if inflation[0] > 0 else 1.0
+    reach = long_range(inflation[2] / inflation[0], occupied) if inflation[0] > 0 else 1.0
     clustered = CLUSTERED * meats[1] + (1 - CLUSTERED) * max(1.0, inflation[1]) * alone
-    middle = reach * clustered + max(0.0, FEW_TILES / max(tiles, 1) - 1) * alone
+    middle = reach * clustered + max(0.0, FEW_TILES / max(occupied, 1) - 1) * alone
     # exact data leave no residuals to learn from: a hundredth of the model's own covariance stays
     covariance = inverse @ middle @ inverse + (0.01 + rounding) * model
     covariance = 0.5 * (covariance + covariance.T) * outer

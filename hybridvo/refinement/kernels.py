@@ -353,48 +353,6 @@ def sum_samples(samples, n, R, t, K, noise, work, acc):
         sum_rotation(0, m, work, acc)
 
 
-@njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
-def score_block(o, n, c2, external, work, rows, factors):
-    """Write w s = w J^T Sigma^-1 r of each pixel to ``rows`` (6, N), and to ``factors`` (N,) what
-    makes its outer product the curvature of the robust weights, ``-2 (dw / dd^2) s s^T``.
-
-    Subtracted from the Gauss-Newton Hessian the curvature gives the derivative of the estimating
-    equation, the "bread" of the sandwich covariance; the plain outer products are its "meat" under
-    independent errors.
-    """
-    keep_apart()  # type: ignore[call-arg]
-    A, B, IZ, N0, N1, S = work[0], work[1], work[2], work[6], work[7], work[8]
-    r0, r1, r2, r3, r4, r5 = (
-        rows[0][o:], rows[1][o:], rows[2][o:], rows[3][o:], rows[4][o:], rows[5][o:]
-    )  # fmt: skip
-    f, e = factors[o:], external[o:]
-    for k in range(n):
-        good = S[k] > np.float32(1e-12)  # elsewhere anything may stand, not a number either
-        a = A[k] if good else ZERO
-        b = B[k] if good else ZERO
-        i = IZ[k] if good else ZERO
-        x = N0[k] if good else ZERO
-        y = N1[k] if good else ZERO
-        c = a * x + b * y
-        r0[k] = x * i
-        r1[k] = y * i
-        r2[k] = -c * i
-        r3[k] = -(b * c + y)
-        r4[k] = a * c + x
-        r5[k] = a * y - b * x
-        # row = w s with w = x_w S, S = (c2 / (c2 + d2))^2; wanted 4 w / (c2 + d2) s s^T
-        f[k] = 4.0 / (np.float64(c2) * e[k] * np.sqrt(S[k])) if good else 0.0  # e as small as 1e-38
-
-
-@njit(error_model="numpy", cache=True, nogil=True)
-def score_pixels(samples, n, R, t, K, noise, work, rows, factors, acc):
-    """:func:`score_block` of gathered pixels; cost and weights are added to ``acc`` (30,)."""
-    for o in range(0, n, BLOCK):
-        m = min(BLOCK, n - o)
-        project_block(samples, o, m, R, t, K, noise, work, work[8], acc)
-        score_block(o, m, noise[2], samples[W], work, rows, factors)
-
-
 @njit(error_model="numpy", cache=True, nogil=True)
 def sum_tiles(data, camera, flags, scale, R, t, K, noise, band, tile, weights, sums, out):
     """One pass over the rows of one band of tiles of the full grid.
@@ -417,3 +375,10 @@ def sum_tiles(data, camera, flags, scale, R, t, K, noise, band, tile, weights, s
                 m = min(tile, n - o)
                 sum_translation(o, m, work, sums[band, (u0 + o) // tile])
                 sum_rotation(o, m, work, sums[band, (u0 + o) // tile])
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def new_work():
+    """Scratch memory of one solver."""
+    # rows a little longer than a block do not fall into the same sets of the cache
+    return np.empty((WORK_ROWS, BLOCK + 16), np.float32)

@@ -1,32 +1,31 @@
 """Photometric refinement: the motion that the flow found, made sharper by the images themselves.
 
-The flow brings the motion close; the images hold far more than the flow. The residual of a
-weighted static pixel, ``I_curr(pi(T X)) - gain I_prev - offset``, joins as information: the flow's
-(and the second depth's) covariance becomes a prior of Student's form around the motion of the
-refinement, and the 6x6 normal equations of both add up, each with its estimated noise. A guard
-keeps the motion of the flow where the images do not lower the joint cost, do not match, or lead
-outside of what the flow allows. Definition of the term:
-:mod:`hybridvo.refinement.photometric_kernels`.
+The flow brings the motion close; the images hold far more than the flow. They join as information:
+the flow's (and the second depth's) covariance becomes a prior of Student's form around the motion
+of the refinement, and the 6x6 normal equations of both add up. The motion of the flow stays where
+the images do not match along the motion, or lead outside of what the flow allows.
 """
 
 from __future__ import annotations
 
 import time
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import ClassVar
+from weakref import WeakKeyDictionary
 
+import cv2
 import numpy as np
 
 from hybridvo.errors import InputError
+from hybridvo.geometry import pose_matrix
 from hybridvo.options import PhotometricOptions
-from hybridvo.refinement import photometric_kernels as kernels
-from hybridvo.refinement.illumination import local_correlation
-from hybridvo.refinement.photometric_images import MID_GREY, Level, blurred, grey_image, match_blur
-from hybridvo.refinement.photometric_options import PhotometricReport
-from hybridvo.refinement.photometric_problem import Problem, State, inverse, small_log
+from hybridvo.refinement.image_factor import ImageFactor
+from hybridvo.refinement.photometric_kernels import select_pixels
 from hybridvo.refinement.pixels import as_contiguous
+from hybridvo.refinement.solver import PriorFactor, SolverOptions, gauss_newton, positive_inverse
 from hybridvo.results import RelativePose
-from hybridvo.types import FramePair
+from hybridvo.types import Frame, FramePair
 
 PER_CELL = 4
 MIN_WEIGHT = 0.25
@@ -38,16 +37,58 @@ MIN_GAIN = 0.1
 """Share of the flow's information that the images must add in some direction."""
 MAX_SHIFT = 9.0
 """Longest shift from the flow's motion, in its inflated standard deviations."""
-SAID = ("no_texture", "no_match", "out_of_view", "outside_flow", "higher_cost", "not_finite")
-"""Reasons that the status of the motion mentions."""
-HALF = 0.5
+MIN_AGREEMENT = 0.5
 """Agreement of the parts of the image below which the status mentions it."""
 COARSE_SPREAD = 0.3
 """Coarser blurs are used where the flow leaves more than this many finest blurs undecided."""
-COST_NOISE = 1.0
-"""A rise of the joint cost below this means nothing. Noise favours places between the pixels, where
-reading averages more of it: the root of the estimating equation, which has no such bias, lies
-beside the minimum of the cost."""
+TOLERANCE = 0.1
+"""Length of the last step, in standard deviations of the joint estimate."""
+MID_GREY = 128.0
+"""Taken off every grey value, so that gain and offset are nearly independent."""
+STRIPS, STRIP_ROWS = 4, 28
+"""Sharpness is measured on so many strips of so many rows."""
+UNLIKE = 1.1
+"""Ratio of two sharpnesses from which on an image is blurred to match the other."""
+MAX_BLUR_PX = 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class PhotometricReport:
+    """What the images add to the motion of one pair.
+
+    Args:
+        taken: whether the motion was changed.
+        reason: of a refusal, in a word: ``no_texture``, ``no_match`` (the images are not of one
+            scene along the motion) or ``rejected`` (the flow excludes where they lead); empty where
+            taken, not tried or not needed.
+        message: the same for people.
+        shift: (6,) left tangent from the flow's motion to that of the images and the flow.
+        shift_sigma: its length in standard deviations of the flow (inflated).
+        image_information: (6, 6) of the images alone; flow_information: (6, 6) of the flow alone,
+            both as they were added up.
+        gain, offset: of the current image over the previous one; offset in grey levels.
+        noise_grey: standard deviation of the residual, grey levels.
+        correlation: of the two images over the pixels used.
+        pixels: how many were used.
+        agreement: factor in (0, 1] on the information of the images by which the parts of the
+            image, held against each other, lowered it.
+        uneven_light: whether gain and offset had to vary over the image.
+    """
+
+    taken: bool
+    reason: str = ""
+    message: str = ""
+    shift: np.ndarray = field(default_factory=lambda: np.zeros(6))
+    shift_sigma: float = 0.0
+    image_information: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
+    flow_information: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
+    gain: float = 1.0
+    offset: float = 0.0
+    noise_grey: float = 0.0
+    correlation: float = 0.0
+    pixels: int = 0
+    agreement: float = 1.0
+    uneven_light: bool = False
 
 
 def refine_photometric(
@@ -59,8 +100,8 @@ def refine_photometric(
 
     Args:
         pair: the two frames; both with images.
-        pose: what :func:`hybridvo.refinement.refine.refine` found for them, with its weights and
-            covariance.
+        pose: what :func:`hybridvo.refinement.refine.refine_pair` found for them, with its weights
+            and covariance.
         options: see :class:`PhotometricOptions`.
 
     Returns:
@@ -76,157 +117,117 @@ def refine_photometric(
     return motion.replace(ms=pose.ms + 1e3 * (time.perf_counter() - started))
 
 
-def _unchanged(
-    pose: RelativePose, reason: str, message: str, report: PhotometricReport | None = None
-) -> RelativePose:
-    report = replace(
-        report or PhotometricReport(False), taken=False, reason=reason, message=message
-    )
-    if reason in SAID and pose.usable and not pose.status.message:
-        pose = pose.replace(status=replace(pose.status, message=f"images not used: {message}"))
-    return pose.replace(photometric=report)
-
-
 def _refine(pair: FramePair, pose: RelativePose, options: PhotometricOptions) -> RelativePose:
     prev, curr = pair.prev, pair.curr
     if prev.rgb is None or curr.rgb is None:
-        return _unchanged(pose, "no_images", "an image of the pair is missing")
+        return _unchanged(pose, "", "an image of the pair is missing")
     if not pose.usable or pose.weights is None or pose.weights_stride != 1 or prev.depth is None:
-        return _unchanged(pose, "no_estimate", "there is no weighted estimate to start from")
+        return _unchanged(pose, "", "there is no weighted estimate to start from")
     if pose.weights.shape != prev.camera.shape:
         raise InputError(
             f"refine_photometric: expected weights of shape {prev.camera.shape}, "
             f"got {pose.weights.shape}."
         )
-    flow_information = inverse(pose.covariance * options.prior_inflation)
+    flow_information = positive_inverse(pose.covariance * options.prior_inflation)
     if flow_information is None:
-        return _unchanged(pose, "no_estimate", "the estimate has no usable covariance")
-    images = match_blur(Level(grey_image(prev.rgb), grey_image(curr.rgb)))
-    first = blurred(images, options.blur_px[-1])
-    index = choose_pixels(first.prev, prev.depth, pose.weights, options)
+        return _unchanged(pose, "", "the estimate has no usable covariance")
+    images = GreyImage.of(prev), GreyImage.of(curr)
+    # the sharper of the two is blurred more
+    more = missing_blur(*images), missing_blur(*images[::-1])
+    index = choose_pixels(
+        images[0].blurred(options.blur_px[-1], more[0]), prev.depth, pose.weights, options.pixels
+    )
     if len(index) < MIN_PIXELS:
-        return _unchanged(
-            pose,
-            "no_texture",
-            f"{len(index)} static pixels with texture and depth, {MIN_PIXELS} needed",
-        )
-    problem = Problem(pair, pose, index, flow_information, options)
-    state = State(pose.T_curr_prev, 1.0, 0.0)
+        what = f"{len(index)} static pixels with texture and depth, {MIN_PIXELS} needed"
+        return _unchanged(pose, "no_texture", what)
+    factor = ImageFactor(pair, pose, index, options.image_inflation)
+    prior = PriorFactor(pose.T_curr_prev, flow_information)
+    blurs = options.blur_px
     # where the flow is sure to a fraction of the finest blur, that one is enough
-    coarse = problem.spread_px() > COARSE_SPREAD * options.blur_px[-1]
-    for blur in options.blur_px[:-1]:
-        if not coarse:
-            break
-        level = blurred(images, blur)
-        state = problem.solve(level, state, options.iterations)
-    state = problem.solve(first, state, options.iterations)
-    return _guarded(pose, problem, first, state, options)
+    if _spread_px(pair, index, pose.covariance * options.prior_inflation) < (
+        COARSE_SPREAD * blurs[-1]
+    ):
+        blurs = blurs[-1:]
+    T = pose.T_curr_prev
+    for blur in blurs:
+        factor.use(images[0].blurred(blur, more[0]), images[1].blurred(blur, more[1]), T)
+        half = (options.iterations + 1) // 2
+        for steps in (half, options.iterations - half):
+            T = gauss_newton((factor, prior), T, SolverOptions(steps, TOLERANCE)).T
+            factor.estimate(T)
+    return _judged(pose, factor, prior, T, options)
 
 
 def choose_pixels(
-    grey: np.ndarray, depth: np.ndarray, weights: np.ndarray, options: PhotometricOptions
+    grey: np.ndarray, depth: np.ndarray, weights: np.ndarray, count: int
 ) -> np.ndarray:
     """(N, 2) int32 rows and columns of the pixels to use: strong gradients, evenly spread."""
     height, width = grey.shape
-    cell = max(2, round(np.sqrt(height * width * PER_CELL / options.pixels)))
+    cell = max(2, round(np.sqrt(height * width * PER_CELL / count)))
     cells = (height // cell + 1) * (width // cell + 1)
     index = np.empty((cells * PER_CELL, 2), np.int32)
-    n = kernels.select_pixels(
+    n = select_pixels(
         grey, as_contiguous(depth), as_contiguous(weights, np.float32),
         np.float32(MIN_WEIGHT), cell, PER_CELL, index,
     )  # fmt: skip
     return index[:n]
 
 
-def _guarded(
+def _spread_px(pair: FramePair, index: np.ndarray, covariance: np.ndarray) -> float:
+    """How far a covariance (6, 6) lets the pixels move in the image, root mean square, px."""
+    v, u = index[:: max(1, len(index) // 200)].T
+    K, z = pair.prev.camera, np.asarray(pair.prev.depth)[v, u].astype(np.float64)
+    x, y, i, zero = (u - K.cx) / K.fx, (v - K.cy) / K.fy, 1 / z, np.zeros_like(z)
+    rows = (
+        pair.curr.camera.fx * np.array([i, zero, -x * i, -x * y, 1 + x * x, -y]),
+        pair.curr.camera.fy * np.array([zero, i, -y * i, -(1 + y * y), x * y, x]),
+    )
+    return float(np.sqrt(np.einsum("cpn,pq,cqn->", rows, covariance, rows) / len(z)))
+
+
+def _judged(
     pose: RelativePose,
-    problem: Problem,
-    level: Level,
-    state: State,
+    factor: ImageFactor,
+    prior: PriorFactor,
+    T: np.ndarray,
     options: PhotometricOptions,
 ) -> RelativePose:
     """The refined motion, or that of the flow where the images cannot be believed."""
-    problem.set_share()
-    photometric = problem.weigh(state.noise, kernels.ALL_COLUMNS)
-    used = problem.w > 0
-    weight = problem.buffer[kernels.W][used]
-    grey = problem.buffer[kernels.GREY][used]
-    seen = problem.r[used] + state.gain * grey + state.offset
-    if problem.uneven_light:
-        index, shape = problem.index[used], problem.pair.prev.camera.shape
-        given = level.prev[index[:, 0], index[:, 1]]  # without the fields
-        correlation = local_correlation(index, shape, given, seen, weight)
-    else:
-        correlation = _correlation(grey, seen, weight)
-    H = problem.marginal()[0]
-    images = problem.share * H
-    shift = small_log(state.T @ problem.T_flow_inverse)
-    flow = problem.flow_information
-    sigma = float(np.sqrt(max(shift @ flow @ shift, 0.0)))
-    depth_shift, depth_information = _depth_shift(problem)
+    images, flow = factor.linearize(T).H, prior.information
+    shift = prior.offset(T)
     report = PhotometricReport(
         True,
         shift=shift,
-        shift_sigma=sigma,
+        shift_sigma=float(np.sqrt(shift @ flow @ shift)),
         image_information=images,
         flow_information=flow,
-        gain=state.gain,
-        offset=state.offset + MID_GREY * (1 - state.gain),
-        noise_grey=state.noise,
-        correlation=correlation,
-        pixels=int(np.count_nonzero(used)),
-        agreement=problem.agreement,
-        uneven_light=problem.uneven_light,
-        depth_shift_px=depth_shift,
-        depth_shift_information=depth_information,
+        gain=factor.gain,
+        offset=factor.offset + MID_GREY * (1 - factor.gain),
+        noise_grey=factor.noise,
+        correlation=factor.correlation(),
+        pixels=factor.pixels,
+        agreement=factor.agreement,
+        uneven_light=factor.uneven_light,
     )
-    numbers: tuple[Any, ...] = (state.T, images, photometric, state.gain, state.offset)
-    if not all(np.isfinite(value).all() for value in numbers):
-        return _unchanged(pose, "not_finite", "the images gave no finite motion")
-    if problem.seen < MIN_SEEN:
-        return _unchanged(
-            pose,
-            "out_of_view",
-            f"{100 * problem.seen:.0f} % of the pixels are seen by both cameras",
-            report,
-        )
-    if not correlation >= options.min_correlation:
-        return _unchanged(
-            pose,
-            "no_match",
-            f"the two images do not match along the motion (correlation {correlation:.2f})",
-            report,
-        )
-    gain = float(np.linalg.eigvals(np.linalg.solve(flow, images)).real.max())
-    if gain < MIN_GAIN:
-        return _unchanged(
-            pose, "no_gain", "the images add little to what the flow already knows", report
-        )
-    if sigma > MAX_SHIFT:
-        return _unchanged(
-            pose,
-            "outside_flow",
-            f"the images lead {sigma:.1f} standard deviations away from the flow's motion",
-            report,
-        )
-    joint = problem.cost(photometric, state.T)
-    problem.project(level, replace(state, T=pose.T_curr_prev))
-    problem.settle(state, 1, fixed=True)
-    if not joint < problem.cost(problem.weigh(state.noise), pose.T_curr_prev) + COST_NOISE:
-        return _unchanged(
-            pose, "higher_cost", "the images do not lower the cost of the motion", report
-        )
-    covariance = inverse(images + problem.prior(state.T)[1])
+    covariance = positive_inverse(images + prior.linearize(T).H)
     if covariance is None:
-        return _unchanged(pose, "not_finite", "the joint information is not definite", report)
-    T = state.T.copy()
-    U, _, Vt = np.linalg.svd(T[:3, :3])
-    T[:3, :3] = U @ Vt
-    spread = np.sqrt(max(np.linalg.eigvalsh(covariance[:3, :3])[-1], 0.0))
+        return _unchanged(pose, "rejected", "the joint information is not definite", report)
+    if factor.seen < MIN_SEEN:
+        what = f"{100 * factor.seen:.0f} % of the pixels are seen by both cameras"
+        return _unchanged(pose, "no_match", what, report)
+    if not report.correlation >= options.min_correlation:
+        what = f"the two images do not match along the motion ({report.correlation:.2f} correlated)"
+        return _unchanged(pose, "no_match", what, report)
+    if np.linalg.eigvals(np.linalg.solve(flow, images)).real.max() < MIN_GAIN:
+        return _unchanged(pose, "", "the images add little to what the flow already knows", report)
+    if report.shift_sigma > MAX_SHIFT:
+        what = f"they lead {report.shift_sigma:.1f} standard deviations away from the flow's motion"
+        return _unchanged(pose, "rejected", what, report)
+    T = pose_matrix(T[:3])
+    spread = np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])
     status = pose.status
-    said = _remarks(report)
-    if said and not status.message:
-        status = replace(status, message=f"images: {said}")
+    if (remarks := _remarks(report)) and not status.message:
+        status = replace(status, message=f"images: {remarks}")
     return pose.replace(
         T_curr_prev=T,
         covariance=covariance,
@@ -237,12 +238,23 @@ def _guarded(
     )
 
 
+def _unchanged(
+    pose: RelativePose, reason: str, message: str, report: PhotometricReport | None = None
+) -> RelativePose:
+    report = replace(
+        report or PhotometricReport(False), taken=False, reason=reason, message=message
+    )
+    if reason and not pose.status.message:
+        pose = pose.replace(status=replace(pose.status, message=f"images not used: {message}"))
+    return pose.replace(photometric=report)
+
+
 def _remarks(report: PhotometricReport) -> str:
     """What was wrong with images that were used all the same."""
     parts = []
     if report.uneven_light:
         parts.append("the light changed differently over the image, evened out")
-    if report.agreement < HALF:
+    if report.agreement < MIN_AGREEMENT:
         parts.append(
             "parts of the image disagree about the motion (rolling shutter, lens, depth?), "
             "weighed down"
@@ -250,25 +262,78 @@ def _remarks(report: PhotometricReport) -> str:
     return "; ".join(parts)
 
 
-def _depth_shift(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
-    """((2,) px, (2, 2) information) of a shift of the depth map, motion and light free."""
-    c = kernels.COLUMNS
-    light = np.linalg.pinv(problem.H[:c, :c], rcond=1e-12, hermitian=True)
-    cross = problem.H[c:, :c] @ light
-    information = problem.H[c:, c:] - cross @ problem.H[:c, c:]
-    gradient = problem.g[c:] - cross @ problem.g[:c]
-    covariance = inverse(information)
-    if covariance is None:
-        return np.zeros(2), np.zeros((2, 2))
-    return covariance @ gradient, problem.share * information
+class GreyImage:
+    """The image of a frame, and what is made of it, each once."""
+
+    _of: ClassVar[WeakKeyDictionary[Frame, GreyImage]] = WeakKeyDictionary()
+
+    def __init__(self, rgb: np.ndarray) -> None:
+        # not rounded: 8 bits of grey would add as much noise as the camera's own rounding
+        weights = np.array([[0.299, 0.587, 0.114, -MID_GREY]])
+        self.grey = cv2.transform(np.ascontiguousarray(rgb).astype(np.float32), weights)
+        self._blurred: dict[float, np.ndarray] = {}
+
+    @classmethod
+    def of(cls, frame: Frame) -> GreyImage:
+        """That of a frame with an image, kept as long as the frame is."""
+        if frame not in cls._of:
+            cls._of[frame] = cls(np.asarray(frame.rgb))
+        return cls._of[frame]
+
+    def blurred(self, px: float, more: float = 0.0) -> np.ndarray:
+        """(H, W) float32 grey values less :data:`MID_GREY` under Gaussian blurs of these px."""
+        if more > 0:
+            return cv2.GaussianBlur(self.grey, (0, 0), np.hypot(px, more))
+        if px not in self._blurred:
+            self._blurred[px] = cv2.GaussianBlur(self.grey, (0, 0), px)
+        return self._blurred[px]
+
+    @cached_property
+    def strips(self) -> np.ndarray:
+        """Some rows of the image, at most a strip at each of :data:`STRIPS` heights."""
+        height = self.grey.shape[0]
+        if height <= STRIPS * STRIP_ROWS:
+            return self.grey
+        starts = [(2 * k + 1) * height // (2 * STRIPS) - STRIP_ROWS // 2 for k in range(STRIPS)]
+        return np.concatenate([self.grey[v : v + STRIP_ROWS] for v in starts])
+
+    @cached_property
+    def sharpness(self) -> float:
+        """See :meth:`sharpness_under`, without a blur."""
+        return self.sharpness_under(0.0)
+
+    def sharpness_under(self, px: float) -> float:
+        """Power of the gradient under a fine blur over that under a coarse one: free of the gain.
+
+        Args:
+            px: standard deviation of a blur before both.
+        """
+        fine, coarse = (
+            _gradient_power(cv2.GaussianBlur(self.strips, (0, 0), np.hypot(px, scale)))
+            for scale in (1.0, 2.0)
+        )
+        return fine / coarse if coarse > 1e-6 else 0.0
 
 
-def _correlation(a: np.ndarray, b: np.ndarray, weight: np.ndarray) -> float:
-    """Weighted correlation; 0 where one of them is constant."""
-    total = float(weight.sum())
-    if total <= 0:
+def missing_blur(image: GreyImage, other: GreyImage) -> float:
+    """Blur, px, after which ``image`` is about as sharp as ``other``; 0 where it is not sharper.
+
+    Motion blur and focus change from frame to frame; the difference of a sharp and a blurred edge
+    is no motion, but it pulls at one.
+    """
+    if not image.sharpness > UNLIKE * other.sharpness > 0:
         return 0.0
-    a = a - (weight @ a) / total
-    b = b - (weight @ b) / total
-    power = float(weight @ (a * a)) * float(weight @ (b * b))
-    return float(weight @ (a * b)) / np.sqrt(power) if power > 0 else 0.0
+    low, high = 0.0, MAX_BLUR_PX
+    for _ in range(5):
+        middle = 0.5 * (low + high)
+        if image.sharpness_under(middle) > other.sharpness:
+            low = middle
+        else:
+            high = middle
+    return 0.5 * (low + high)
+
+
+def _gradient_power(image: np.ndarray) -> float:
+    gx = image[:, 2:] - image[:, :-2]
+    gy = image[2:] - image[:-2]
+    return float(np.vdot(gx, gx)) / max(gx.size, 1) + float(np.vdot(gy, gy)) / max(gy.size, 1)

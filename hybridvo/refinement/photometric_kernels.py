@@ -10,9 +10,9 @@ i = 1/Z'):
   of constant depth (inverse compositional, Baker and Matthews, IJCV 2004): the noise of a central
   difference at x is independent of the noise of A at x, so noise alone moves nothing;
 - Jacobian of r: G^T diag(fx, fy) B_x with respect to the left perturbation (B_x as in
-  :mod:`hybridvo.refinement.kernels`), -A for the gain, -1 for the offset, and G^T q grad(log Z)
-  for a shift of the depth map, q = d pi(X') / d log Z;
-- variance s^2 + sd^2 v_d (G^T q)^2, s the noise of the residual in grey levels;
+  :mod:`hybridvo.refinement.kernels`), -A for the gain, -1 for the offset;
+- variance s^2 + sd^2 v_d (G^T q)^2, s the noise of the residual in grey levels, q = d pi(X') /
+  d log Z;
 - robust weight of Geman-McClure, (c^2 / (c^2 + d^2))^2 with d^2 = r^2 / variance.
 """
 
@@ -21,28 +21,30 @@ from __future__ import annotations
 import numpy as np
 
 from hybridvo.compilation import njit
-from hybridvo.refinement.kernels import FASTMATH, MAX_VALUE, MIN_DEPTH, ONE, ZERO, keep_apart
+from hybridvo.refinement.kernels import (
+    BLOCK,
+    FASTMATH,
+    MAX_VALUE,
+    MIN_DEPTH,
+    ONE,
+    ZERO,
+    keep_apart,
+)
 
-XN, YN, Z, GREY, GX, GY, PD, W, SU, SV = range(10)
+XN, YN, Z, GREY, GX, GY, PD, W = range(8)
 """Rows of a pixel buffer: ray x, ray y, depth, grey value, its gradient, relative depth variance,
-weight, gradient of log depth (per px)."""
-BUFFER_ROWS = 10
-POSE_COLUMNS = 6
-COLUMNS = 8
-"""Columns of the solve: translation, rotation, gain, offset."""
-ALL_COLUMNS = 10
-"""And the shift of the depth map, px, along u and v."""
-GQ = 10
-"""Row of the Jacobian that holds G^T q, for the variance."""
-JACOBIAN_ROWS = 11
+weight."""
+BUFFER_ROWS = 8
+POSE, COLUMNS, GQ = 6, 8, 8
+"""Columns of the motion (translation, rotation); with gain and offset; row of the Jacobian behind
+them that holds G^T q, for the variance."""
 MARGIN = 3
 """Pixels this close to the border are not read: gradients and cubic reading need neighbours."""
-HALF = np.float32(0.5)
-BLOCK = 512
 MIN_AREA = np.float32(1e-3)
 """A patch whose area shrinks below this share is seen edge-on."""
-STEEP = np.float32(0.2)
-"""A change of log depth over two pixels above this is an edge, where the shift means nothing."""
+GAINS = (0.2, 5.0)
+"""Limits of the gain between two images."""
+HALF = np.float32(0.5)
 
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
@@ -124,17 +126,6 @@ def gather_pixels(index, n, grey, depth, weights, depth_variance, typical, camer
             out[PD, k] = p / typical if good else ONE
             if not good:
                 out[W, k] = ZERO
-        out[SU, k] = log_slope(depth[v, u - 1], z, depth[v, u + 1])
-        out[SV, k] = log_slope(depth[v - 1, u], z, depth[v + 1, u])
-
-
-@njit(error_model="numpy", cache=True, nogil=True)
-def log_slope(before, here, after):
-    """Slope of log depth per px; 0 at edges and invalid neighbours."""
-    if not (before > MIN_DEPTH and before < MAX_VALUE and after > MIN_DEPTH and after < MAX_VALUE):
-        return ZERO
-    slope = HALF * (after - before) / here
-    return slope if abs(slope) < HALF * STEEP else ZERO
 
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
@@ -171,7 +162,7 @@ def project_pixels(buf, n, image, R, t, K, scale, light, J, r):
     """Residuals and Jacobians of ``n`` pixels; returns the weight that is seen.
 
     ``K`` = (fx, fy, cx, cy) of the current frame, ``scale`` = (1/fx, 1/fy) of the previous one,
-    ``light`` = (gain, offset), all float32. ``J`` (JACOBIAN_ROWS, N); ``r`` (N,), NaN where the
+    ``light`` = (gain, offset), all float32. ``J`` (GQ + 1, N); ``r`` (N,), NaN where the
     point is not seen.
     """
     H, width = image.shape
@@ -209,7 +200,7 @@ def project_pixels(buf, n, image, R, t, K, scale, light, J, r):
         determinant = w00 * w11 - w01 * w10
         seen = (Zc > MIN_DEPTH) & (u > low) & (u < high_u) & (v > low) & (v < high_v)
         if not (seen and determinant > MIN_AREA):
-            for p in range(JACOBIAN_ROWS):
+            for p in range(GQ + 1):
                 J[p, k] = ZERO
             r[k] = np.nan
             continue
@@ -231,8 +222,6 @@ def project_pixels(buf, n, image, R, t, K, scale, light, J, r):
         J[5, k] = gy * a - gx * b
         J[6, k] = -grey
         J[7, k] = -ONE
-        J[8, k] = gq * buf[SU, k]
-        J[9, k] = gq * buf[SV, k]
         J[GQ, k] = gq
         r[k] = e
         inside += weight
@@ -273,16 +262,8 @@ def weigh_pixels(buf, n, noise, J, r, w):
 
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
-def relight(buf, n, gain, offset, r):
-    """Residuals after a change of gain and offset by these."""
-    grey = buf[GREY]
-    for k in range(n):
-        r[k] -= gain * grey[k] + offset
-
-
-@njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
-def normal_equations(J, r, w, n, columns, H, g):
-    """``H`` = J w J^T and ``g`` = -J w r over ``n`` pixels and the first ``columns`` rows."""
+def sum_equations(J, r, w, n, H, g):
+    """Set ``H`` = J w J^T and ``g`` = -J w r over ``n`` pixels."""
     weighted = np.empty(BLOCK, np.float32)
     H[:, :] = 0.0
     g[:] = 0.0
@@ -290,7 +271,7 @@ def normal_equations(J, r, w, n, columns, H, g):
         m = min(BLOCK, n - o)
         residual = r[o : o + m]
         weight = w[o : o + m]
-        for p in range(columns):
+        for p in range(COLUMNS):
             row = J[p, o : o + m]
             s = ZERO
             for k in range(m):
@@ -298,15 +279,41 @@ def normal_equations(J, r, w, n, columns, H, g):
                 weighted[k] = value
                 s += value * (residual[k] if weight[k] > ZERO else ZERO)
             g[p] -= s
-            for q in range(p, columns):
+            for q in range(p, COLUMNS):
                 other = J[q, o : o + m]
                 s = ZERO
                 for k in range(m):
                     s += weighted[k] * other[k]
                 H[p, q] += s
-    for p in range(columns):
+    for p in range(COLUMNS):
         for q in range(p):
             H[p, q] = H[q, p]
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def normal_equations(buf, n, noise, light, J, r, w, H, g):
+    """Normal equations of the last projection, gain and offset being those that fit it best.
+
+    ``light`` (gain, offset) and the residuals are changed to them, weights are set. Returns the
+    cost.
+    """
+    weigh_pixels(buf, n, noise, J, r, w)
+    sum_equations(J, r, w, n, H, g)
+    a, b, c = H[6, 6], H[6, 7], H[7, 7]
+    determinant = a * c - b * b
+    gain = light[0]
+    if determinant > 1e-9 * a * c and a * c > 0:
+        gain += np.float32((c * g[6] - b * g[7]) / determinant)
+    gain = min(max(gain, np.float32(GAINS[0])), np.float32(GAINS[1]))
+    more = gain - light[0]
+    shift = np.float32((g[7] - b * more) / c) if c > 0 else ZERO
+    for k in range(n):
+        r[k] -= more * buf[GREY, k] + shift
+    light[0] = gain
+    light[1] += shift
+    cost = weigh_pixels(buf, n, noise, J, r, w)
+    sum_equations(J, r, w, n, H, g)
+    return cost
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
@@ -316,24 +323,60 @@ def tile_scores(index, n, J, r, w, tile, columns, light, scores, curvature, meat
     ``light`` (6, 2) takes the part of each pose column that gain and offset explain out of it;
     ``meat`` (6, 6) gets the outer products of all pixels.
     """
-    row = np.empty(POSE_COLUMNS)
+    row = np.empty(POSE)
     for k in range(n):
         weight = w[k]
         if not weight > ZERO:
             continue
         cell = (index[k, 0] // tile) * columns + index[k, 1] // tile
-        for p in range(POSE_COLUMNS):
+        for p in range(POSE):
             row[p] = J[p, k] - light[p, 0] * J[6, k] - light[p, 1] * J[7, k]
         s = weight * r[k]
         ss = s * s
-        for p in range(POSE_COLUMNS):
+        for p in range(POSE):
             scores[cell, p] += s * row[p]
             for q in range(p + 1):
                 product = row[p] * row[q]
                 curvature[cell, p, q] += weight * product
                 meat[p, q] += ss * product
-    for p in range(POSE_COLUMNS):
-        for q in range(p + 1, POSE_COLUMNS):
+    for p in range(POSE):
+        for q in range(p + 1, POSE):
             meat[p, q] = meat[q, p]
             for cell in range(curvature.shape[0]):
                 curvature[cell, p, q] = curvature[cell, q, p]
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def field_equations(place, grey, r, w, columns, H, g):
+    """Add up the normal equations of gain and offset at the nodes of a grid of ``columns``.
+
+    ``place`` (N, 2) is in cells of the grid. Returns the weighted squared residuals.
+    """
+    nodes = np.empty(4, np.int64)
+    share = np.empty(4)
+    power = 0.0
+    for k in range(place.shape[0]):
+        if not w[k] > ZERO:
+            continue
+        row, column = int(place[k, 0]), int(place[k, 1])
+        fv, fu = place[k, 0] - row, place[k, 1] - column
+        first = row * columns + column
+        nodes[0], nodes[1] = first, first + 1
+        nodes[2], nodes[3] = first + columns, first + columns + 1
+        share[0], share[1] = (1 - fv) * (1 - fu), (1 - fv) * fu
+        share[2], share[3] = fv * (1 - fu), fv * fu
+        a = grey[k]
+        power += w[k] * r[k] * r[k]
+        for i in range(4):
+            p = 2 * nodes[i]
+            s = w[k] * share[i]
+            g[p] += s * a * r[k]
+            g[p + 1] += s * r[k]
+            for j in range(4):
+                q = 2 * nodes[j]
+                t = s * share[j]
+                H[p, q] += t * a * a
+                H[p, q + 1] += t * a
+                H[p + 1, q] += t * a
+                H[p + 1, q + 1] += t
+    return power

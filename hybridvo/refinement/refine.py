@@ -12,9 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from hybridvo.geometry import invert, pose_matrix, se3_log
+from hybridvo.geometry import invert, se3_log
 from hybridvo.options import RefineOptions
-from hybridvo.refinement.full_fit import MIN_TILES, FullFit, fit_coarse, fit_full_grid
+from hybridvo.refinement.coarse_fit import fit_coarse
+from hybridvo.refinement.full_fit import MIN_TILES, FullFit, fit_full_grid
 from hybridvo.refinement.pixels import CoarseGrid, coarse_grid
 from hybridvo.results import Hypothesis, Reason, RelativePose, Status
 from hybridvo.types import FramePair
@@ -101,15 +102,14 @@ def refine_pair(
     failure = _failure(fit, share)
     if failure is not None:
         return RelativePose.failed(*failure, **common)
-    T = pose_matrix(fit.pose)
     status = _status(fit, share, context)
-    covariance = _with_doubt(fit, T)
+    covariance = _with_doubt(fit)
     spread = np.sqrt(max(np.linalg.eigvalsh(covariance[:3, :3])[-1], 0.0))
     return RelativePose(
-        T_curr_prev=T,
+        T_curr_prev=fit.T,
         covariance=covariance,
         status=status,
-        translation_direction_valid=bool(np.linalg.norm(T[:3, 3]) > 3 * spread),
+        translation_direction_valid=bool(np.linalg.norm(fit.T[:3, 3]) > 3 * spread),
         probability=context.probability,
         **common,
     )
@@ -117,7 +117,7 @@ def refine_pair(
 
 def _failure(fit: FullFit, share: float) -> tuple[Reason, str] | None:
     """Why there is no motion, or None."""
-    if not fit.definite or not np.isfinite(fit.pose).all():
+    if not fit.definite or not np.isfinite(fit.T).all():
         return (
             Reason.DEGENERATE_GEOMETRY,
             "the pixels leave a direction of the motion undetermined",
@@ -155,7 +155,7 @@ def _status(fit: FullFit, share: float, context: Context) -> Status:
     return Status()
 
 
-def _with_doubt(fit: FullFit, T_curr_prev: np.ndarray) -> np.ndarray:
+def _with_doubt(fit: FullFit) -> np.ndarray:
     """(6, 6) covariance that covers what the sums of one pair cannot know.
 
     Where few tiles hold pixels, errors that agree within them are averaged over as many readings
@@ -163,7 +163,7 @@ def _with_doubt(fit: FullFit, T_curr_prev: np.ndarray) -> np.ndarray:
     """
     covariance = fit.covariance * max(1.0, MIN_TILES / max(fit.tiles, 1))
     if fit.depths is not None and fit.depths.doubt:
-        t = T_curr_prev[:3, 3]
+        t = fit.T[:3, 3]
         share = np.log(fit.depths.ratio) ** 2 + fit.depths.spread**2
         covariance[:3, :3] += share * np.outer(t, t)
     return covariance

@@ -21,7 +21,6 @@ import torch
 
 from hybridvo.errors import InputError
 from hybridvo.options import RefineOptions
-from hybridvo.refinement import solver as numba_solver
 from hybridvo.refinement.batch import (
     DEPTH_CURR_FLOOR,
     BatchedPose,
@@ -32,6 +31,7 @@ from hybridvo.refinement.batch import (
     status_of,
 )
 from hybridvo.refinement.covariance import NOTHING, UPPER, sandwich_covariance
+from hybridvo.refinement.noise import estimate_noise
 from hybridvo.refinement.torch_factors import (
     KERNELS,
     Linearization,
@@ -203,13 +203,13 @@ class _Solver:
         T, noise = self._fit_subset(T, given)
         how = RobustNoise(noise, self.kernel, self.cutoff)
         curvature, meat = self._curvature(T, how)
-        T, last, step, converged, iterations = self._fit_all(T, how, curvature, tight)
+        T, last, converged, iterations = self._fit_all(T, how, curvature, tight)
         height, width = batch.depth_prev.shape[1:]
         near = (last.weights > 0) & (last.distance2 <= INLIER_DISTANCE2)
         weight = self.pixels.weight
         total = weight.sum(dim=1).clamp(min=1e-30)
         ratio = torch.nan_to_num((weight * near).sum(dim=1) / total)
-        covariance, definite = self._covariance(T, last, step, noise, curvature, meat)
+        covariance, definite = self._covariance(T, last, noise, curvature, meat)
         finite = torch.isfinite(T.tensor()).all(dim=1)
         usable = (weight > 0).sum(dim=1)
         lost = ratio < self.options.min_inlier_ratio
@@ -332,7 +332,7 @@ class _Solver:
             if not np.isfinite(pose).all():
                 out.append((sf, sd))
                 continue
-            found = numba_solver.estimate_noise(
+            found = estimate_noise(
                 buffers[k], count, pose, K[k], sf, sd, 1e3, DEPTH_NOISE_CAP, 6, count
             )
             out.append(found[:2] if np.isfinite(found[:2]).all() else (sf, sd))
@@ -372,8 +372,8 @@ class _Solver:
 
     def _fit_all(
         self, T: pp.LieTensor, how: RobustNoise, curvature: torch.Tensor, tight: bool
-    ) -> tuple[pp.LieTensor, Linearization, torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Newton steps on all pixels: (pose, last equations, step from them, converged, steps).
+    ) -> tuple[pp.LieTensor, Linearization, torch.Tensor, torch.Tensor]:
+        """Newton steps on all pixels: (pose, last equations, converged, steps).
 
         ``tight``: down to the precision of the numbers, which a gradient needs, from the third step
         on with the full derivative of the equations in place of the curvature of the subset.
@@ -410,26 +410,22 @@ class _Solver:
             done = converged | ~solved
             if bool(done.all()):
                 break
-        return T, now, step, converged, iterations
+        return T, now, converged, iterations
 
     def _covariance(
         self,
         T: pp.LieTensor,
         last: Linearization,
-        step: torch.Tensor,
         noise: torch.Tensor,
         curvature: torch.Tensor,
         meat: torch.Tensor,
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Sandwich covariance (B, 6, 6) by the numpy function, and whether it is definite (B,)."""
         weight = self.pixels.weight
-        information = last.H.double()
-        # the scores of the tiles where all of them together are zero, to first order
-        scores = last.g.double() - (information @ step[:, None, :, None])[..., 0]
         depth = weighted_median(self.few.points[:, 2], self.few.weight, 1.0)
         arrays = [
             x.double().cpu().numpy()
-            for x in (information, scores, curvature, meat, depth, noise, weight.sum(dim=1),
+            for x in (last.H, last.g, curvature, meat, depth, noise, weight.sum(dim=1),
                       self.pixels.K[:, 0, 0], T.translation())
         ]  # fmt: skip
         found = [
@@ -454,16 +450,13 @@ def _one_covariance(
     """Covariance of one sample from the sums of its tiles, and whether it is definite."""
     if not all(np.isfinite(x).all() for x in (information, scores, curvature, meat, translation)):
         return NOTHING, False
-    information, scores = information[:, UPPER[0], UPPER[1]], scores
-    total = np.concatenate([information.sum(axis=0), scores.sum(axis=0), np.zeros(3)])
+    tiles = np.concatenate([information[:, UPPER[0], UPPER[1]], scores], axis=1)
     sf, sd = noise[:2]
     parallax = focal * np.linalg.norm(translation) / depth
     covariance, _, definite = sandwich_covariance(
-        total,
-        curvature[UPPER] * weight,
-        meat[UPPER] * weight,
-        np.ascontiguousarray(scores.reshape(*shape, 6)),
-        np.ascontiguousarray(information.reshape(*shape, 21)),
+        tiles.reshape(*shape, 27),
+        curvature * weight,
+        meat * weight,
         1 / depth,
         weight * FLOW_ROUNDING**2 / (sf**2 + (parallax * sd) ** 2),
     )

@@ -7,17 +7,14 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from hybridvo.geometry import invert, pose_matrix, se3_exp, se3_log
-from hybridvo.refinement.photometric_problem import small_log
+from hybridvo.geometry import invert, pose_matrix, se3_log
+from hybridvo.refinement.solver import Linearization, SolverOptions, gauss_newton, student
 from hybridvo.results import Status
 
 CHI2_LIMIT = 22.5
 """Squared Mahalanobis distance that 0.1 % of right motions exceed (chi-square, 6 degrees)."""
 FREEDOM = 4.0
 """Of Student's kernel: covariances are estimates, and some motions are wrong."""
-ITERATIONS = 10
-TOLERANCE = 1e-3
-"""Of a step, in standard deviations."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +77,7 @@ def compose_covariance(first: np.ndarray, T: np.ndarray, second: np.ndarray) -> 
 
 def chi2(T_error: np.ndarray, covariance: np.ndarray) -> float:
     """Squared Mahalanobis length of a small transform."""
-    error = _log(T_error)
+    error = se3_log(T_error)
     return float(error @ np.linalg.solve(covariance, error))
 
 
@@ -94,76 +91,53 @@ def solve_graph(
         edges: between them.
         free: frames that may move; the others are held.
     """
-    Y = {name: invert(T) for name, T in T_world_cam.items()}
-    used = [e for e in edges if e.status.usable]
-    information = [np.linalg.inv(e.covariance) for e in used]
-    maps = [adjoint(e.T) for e in used]
-    column = {name: 6 * k for k, name in enumerate(free)}
-    n = 6 * len(free)
-
-    def lengths(Y: dict[int, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        errors = np.array([_log(e.T @ Y[e.prev] @ invert(Y[e.curr])) for e in used])
-        return errors, np.einsum("ei,eij,ej->e", errors, np.array(information), errors)
-
-    cost = 0.0
-    squared = np.zeros(0)
-    if used:
-        errors, squared = lengths(Y)
-        cost = _cost(squared)
-    for _ in range(ITERATIONS if used else 0):
-        H, g = np.zeros((n, n)), np.zeros(n)
-        weights = (FREEDOM + 6) / (FREEDOM + squared)
-        for e, A, W, error, weight in zip(used, maps, information, errors, weights, strict=True):
-            # the error changes by A d_prev - d_curr
-            WA = weight * W
-            a, b = column.get(e.prev), column.get(e.curr)
-            if b is not None:
-                H[b : b + 6, b : b + 6] += WA
-                g[b : b + 6] += WA @ error
-            if a is not None:
-                H[a : a + 6, a : a + 6] += A.T @ WA @ A
-                g[a : a + 6] -= A.T @ WA @ error
-            if a is not None and b is not None:
-                H[a : a + 6, b : b + 6] -= A.T @ WA
-                H[b : b + 6, a : a + 6] -= WA @ A
-        step, length = _solve(H, g)
-        if length < TOLERANCE**2:
-            break
-        moved = dict(Y)
-        for name, k in column.items():
-            moved[name] = se3_exp(step[k : k + 6]) @ Y[name]
-        new_errors, new_squared = lengths(moved)
-        new_cost = _cost(new_squared)
-        if not new_cost <= cost:
-            break
-        Y, errors, squared, cost = moved, new_errors, new_squared, new_cost
-    distances = iter(squared)
+    names = list(free)
+    graph = _EdgeFactor({k: invert(T) for k, T in T_world_cam.items()}, names, edges)
+    found = gauss_newton([graph], np.stack([graph.held[k] for k in names]), SolverOptions())
+    d2 = graph.distances(graph.errors(found.T))
     rated = []
-    for e in edges:
-        d2 = float(next(distances)) if e.status.usable else np.inf
-        weight = (FREEDOM + 6) / (FREEDOM + d2) if d2 < CHI2_LIMIT else 0.0
-        rated.append(replace(e, weight=weight))
-    poses = {name: pose_matrix(invert(T)[:3]) for name, T in Y.items()}
-    poses |= {name: T for name, T in T_world_cam.items() if name not in column}
-    return Solution(poses, tuple(rated), cost)
+    for k, edge in enumerate(edges):
+        used = edge.status.usable and d2[k] < CHI2_LIMIT
+        rated.append(replace(edge, weight=float(student(d2[k], FREEDOM)[1]) if used else 0.0))
+    moved = {k: pose_matrix(invert(T)[:3]) for k, T in zip(names, found.T, strict=True)}
+    return Solution(dict(T_world_cam) | moved, tuple(rated), found.at.cost)
 
 
-def _log(T: np.ndarray) -> np.ndarray:
-    """``se3_log``; below a right angle without scipy, whose 0.3 ms a call would be most of it."""
-    return small_log(T) if np.trace(T[:3, :3]) > 1.0 else se3_log(T)
+class _EdgeFactor:
+    """All edges, as a factor of the free frames' (n, 4, 4) T_cam_world."""
 
+    def __init__(
+        self, held: dict[int, np.ndarray], free: Sequence[int], edges: Sequence[Edge]
+    ) -> None:
+        self.held, self.edges = held, edges
+        self.place = {name: k for k, name in enumerate(free)}
+        self.information = np.array([np.linalg.inv(e.covariance) for e in edges])
 
-def _cost(squared: np.ndarray) -> float:
-    return float(0.5 * (FREEDOM + 6) * np.log1p(squared / FREEDOM).sum())
+    def errors(self, T: np.ndarray) -> np.ndarray:
+        """(E, 6) logarithm of what each edge says more than the poses."""
+        at = self.held | {name: T[k] for name, k in self.place.items()}
+        return np.array([se3_log(e.T @ at[e.prev] @ invert(at[e.curr])) for e in self.edges])
 
+    def distances(self, errors: np.ndarray) -> np.ndarray:
+        """(E,) squared Mahalanobis lengths."""
+        return np.einsum("ei,eij,ej->e", errors, self.information, errors)
 
-def _solve(H: np.ndarray, g: np.ndarray) -> tuple[np.ndarray, float]:
-    """Step and its squared length in deviations; zero where the graph does not hold together."""
-    scale = 1 / np.sqrt(np.maximum(np.diag(H), 1e-30))
-    try:
-        step = scale * np.linalg.solve(H * np.outer(scale, scale), scale * g)
-    except np.linalg.LinAlgError:
-        return np.zeros_like(g), 0.0
-    if not np.isfinite(step).all():
-        return np.zeros_like(g), 0.0
-    return step, float(step @ g)
+    def linearize(self, T: np.ndarray) -> Linearization:
+        """See :class:`hybridvo.refinement.solver.Factor`."""
+        n, total = len(self.place), 0.0
+        H, g = np.zeros((n, 6, n, 6)), np.zeros((n, 6))
+        errors = self.errors(T)
+        costs, weights = student(self.distances(errors), FREEDOM)
+        for k, edge in enumerate(self.edges):
+            if not edge.status.usable:
+                continue
+            total += float(costs[k])
+            information = weights[k] * self.information[k]
+            # the error changes by adjoint(T) d_prev - d_curr
+            ends = ((edge.prev, adjoint(edge.T)), (edge.curr, -np.eye(6)))
+            blocks = [(self.place[name], A) for name, A in ends if name in self.place]
+            for i, A in blocks:
+                g[i] -= A.T @ information @ errors[k]
+                for j, B in blocks:
+                    H[i, :, j] += A.T @ information @ B
+        return Linearization(H.reshape(6 * n, 6 * n), g.ravel(), total)

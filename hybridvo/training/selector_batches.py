@@ -16,7 +16,7 @@ from hybridvo.geometry import pose_matrix, se3_exp
 from hybridvo.hypotheses import search
 from hybridvo.hypotheses.generate import fit_in_mask
 from hybridvo.hypotheses.selector import mask_weights, nearest_motion
-from hybridvo.network.selector_inputs import SelectorInputs, prior_information_of
+from hybridvo.network.selector_inputs import SelectorInputs, planes_of, prior_information_of
 from hybridvo.network.selector_net import SelectorOutput
 from hybridvo.options import RefineOptions
 from hybridvo.refinement import kernels
@@ -121,6 +121,10 @@ def _collate(p: dict[str, np.ndarray]) -> SelectorBatch:
         T_prior=tensor(p["T_prior"]),
         prior_information=prior_information_of(exact[:, 2], usable, None),
         has_prior=tensor(p["has_prior"], torch.bool),
+        seen=tensor(p["seen"], torch.bool),
+        image_prev=tensor(p["images"][:, 0]),
+        planes_curr=planes_of(tensor(p["images"][:, 1]), tensor(p["log_depth_seen"])),
+        stride=tensor(p["stride"]),
         owner=tensor(owner, torch.int64),
         parent=torch.arange(len(owner)),
         pose=tensor(pose),

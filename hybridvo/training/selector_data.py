@@ -9,6 +9,7 @@ Shards are written atomically, so that a training can read them while others are
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from hybridvo.options import Options
 from hybridvo.refinement import kernels
 from hybridvo.results import RelativePose
 from hybridvo.synthetic.diverse import DiverseOptions, diverse_sample
+from hybridvo.synthetic.semi_real import Recording, draw_pair
 from hybridvo.synthetic.sensors import SensorOptions, degrade_depth, log_uniform
 from hybridvo.synthetic.training_scenes import training_scene
 from hybridvo.training.rendered import MOVING, STATIC, UNKNOWN
@@ -44,14 +46,20 @@ class _Truth:
     known: np.ndarray
 
 
-def draw_samples(seed: int) -> list[dict[str, Any]]:
-    """Samples of one seed: one of the diverse preset, or two of a rendered pair.
+def draw_samples(seed: int, recordings: Sequence[Recording] = ()) -> list[dict[str, Any]]:
+    """Samples of one seed: semi-real ones, or one of the diverse preset, or two of a rendered pair.
 
     Pairs that the search settles alone are left out: the selector is never asked about them.
+
+    Args:
+        seed: of everything drawn at random.
+        recordings: for semi-real pairs; none: the others.
     """
     rng = np.random.default_rng([0x6A64, seed])
     height, width = SIZES[int(rng.integers(len(SIZES)))]
-    if rng.random() < 0.5:
+    if recordings:
+        pairs = [_semi_real_pair(rng, recordings)]
+    elif rng.random() < 0.5:
         pairs = [_diverse_pair(rng, min(height, 160), min(width, 320))]
     else:
         pairs = _rendered_pairs(rng, seed, height, width)
@@ -62,10 +70,10 @@ def draw_samples(seed: int) -> list[dict[str, Any]]:
         if T_prior is not None and rng.random() < 0.7:
             starts.append(T_prior)
         found = generate(pair, np.stack(starts), Options(), int(rng.integers(1 << 30)))
-        full = (0, *pair.prev.camera.shape)
+        height, width = pair.prev.camera.shape
         if isinstance(found, RelativePose) or not found.is_ambiguous:
             continue
-        if (found.grid.box[0], found.grid.box[1], found.grid.box[3]) != full:
+        if found.grid.box != (0, height, 0, width):
             continue
         samples.append(_record(pair, found, truth, T_prior, log_depth_curr, source))
     return samples
@@ -116,6 +124,12 @@ def _diverse_pair(rng: np.random.Generator, height: int, width: int) -> tuple[An
         sample.depth_true > 0,
     )
     return pair, truth, log_depth.astype(np.float32), "diverse"
+
+
+def _semi_real_pair(rng: np.random.Generator, recordings: Sequence[Recording]) -> tuple[Any, ...]:
+    drawn = draw_pair(rng, recordings)
+    truth = _Truth(drawn.T_curr_prev, drawn.depth, drawn.moving, drawn.depth > 0)
+    return drawn.pair, truth, None, "semi-real"
 
 
 def _rendered_pairs(
@@ -170,7 +184,8 @@ def _record(
     """Everything about a sample, as small arrays."""
     h, w, stride = found.grid.shape
     pick = np.s_[stride // 2 :: stride, stride // 2 :: stride]
-    log_depth = found.maps().log_depth_curr
+    maps = found.maps()
+    log_depth = maps.log_depth_curr
     if log_depth_curr is not None:
         log_depth = log_depth_curr[pick]
     label = np.where(truth.moving, MOVING, STATIC)
@@ -185,6 +200,9 @@ def _record(
         "exact": rows[exact].reshape(5, h, w),
         "coarse": rows[[kernels.PF, kernels.PD, kernels.W]].reshape(3, h, w).astype(np.float16),
         "log_depth": log_depth.astype(np.float16),
+        "images": np.stack([maps.image_prev, maps.image_curr]).astype(np.uint8),
+        "log_depth_seen": maps.log_depth_seen.astype(np.float16),
+        "seen": maps.seen,
         "depth_true": np.minimum(truth.depth[pick], 6e4).astype(np.float16),
         "label": label.astype(np.uint8),
         "poses": poses,
@@ -196,11 +214,16 @@ def _record(
         "K": found.grid.pixels.K,
         "width": pair.prev.camera.width,
         "stride": stride,
-        "source": ("diverse", "true", "dis").index(source),
+        "source": ("diverse", "true", "dis", "semi-real").index(source),
     }
 
 
-def write_shard(path: str | os.PathLike[str], first_seed: int, seeds: int = PER_SHARD) -> int:
+def write_shard(
+    path: str | os.PathLike[str],
+    first_seed: int,
+    seeds: int = PER_SHARD,
+    recordings: Sequence[Recording] = (),
+) -> int:
     """Write the samples of some seeds, in one file for each grid shape.
 
     Returns:
@@ -209,7 +232,7 @@ def write_shard(path: str | os.PathLike[str], first_seed: int, seeds: int = PER_
     folder = Path(path)
     by_shape: dict[tuple[int, int], list[dict[str, Any]]] = {}
     for seed in range(first_seed, first_seed + seeds):
-        for sample in draw_samples(seed):
+        for sample in draw_samples(seed, recordings):
             by_shape.setdefault(sample["label"].shape, []).append(sample)
     for (h, w), samples in by_shape.items():
         arrays: dict[str, Any] = {key: np.stack([p[key] for p in samples]) for key in samples[0]}

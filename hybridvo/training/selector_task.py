@@ -32,8 +32,9 @@ RIGHT_PX = 1.0
 """px at a width of 1024: mean error of the ego flow up to which a motion is right."""
 RIGHT_SLOPE_PX = 0.15
 """px: softness of that limit as a target."""
-SOURCES = ("diverse", "rendered", "dis")
-"""Where samples come from: the layered generator, rendered scenes with true flow and with DIS."""
+SOURCES = ("diverse", "rendered", "dis", "semi-real")
+"""Where samples come from: the layered generator, rendered scenes with true flow and with DIS, and
+recordings with movers cut from others."""
 
 
 def choice_loss(
@@ -78,7 +79,7 @@ def trust_loss(
 
 def _float(out: SelectorOutput) -> SelectorOutput:
     """The answers in single precision."""
-    return SelectorOutput(out.score.float(), out.mask.float(), out.hidden.float(), out.support)
+    return SelectorOutput(out.score.float(), out.mask.float(), out.hidden.float(), out.evidence)
 
 
 class SelectorTask:

@@ -30,13 +30,16 @@ class Oracle:
     def __init__(self, static: np.ndarray, refits: bool, confidence: float = 0.9) -> None:
         self.static, self.refits, self.confidence = static, refits, confidence
 
-    def score(self, maps, candidates: Candidates, prior, static, masks: int) -> Scores:
+    def look(self, maps, prior, static) -> Oracle:
+        return self
+
+    def score(self, candidates: Candidates, masks: int) -> Scores:
         count = len(candidates.poses)
         score = np.zeros(count)
         score[-1 if self.refits else 0] = 5.0
         best = np.arange(min(masks, count))
         drawn = np.stack([self.static] * len(best)) if masks else np.zeros((0, *self.static.shape))
-        return Scores(score, best, drawn, self.confidence)
+        return Scores(score, best, drawn, self.confidence, np.full((count, 2), 0.3))
 
 
 @pytest.fixture(scope="module")

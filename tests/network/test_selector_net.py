@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from dataclasses import fields, replace
 
+import cv2
 import numpy as np
 import pytest
 import torch
 
-from hybridvo.geometry import se3_exp
+from hybridvo.geometry import pixel_grid, se3_exp
 from hybridvo.hypotheses.generate import HypothesisSet, generate
-from hybridvo.hypotheses.selector import _searched
+from hybridvo.hypotheses.search import FACTS
 from hybridvo.network.selector_inputs import (
     SelectorInputs,
     candidate_channels,
@@ -21,6 +22,7 @@ from hybridvo.network.selector_net import SelectorNetwork
 from hybridvo.options import Options
 from hybridvo.pipeline import refine
 from hybridvo.synthetic.scenarios import Scenario, make_pair
+from hybridvo.types import Camera, Frame, FramePair
 
 CELL = Scenario(moving=0.6, objects=1, flow_noise_px=0.3, depth_noise=0.01)
 SIZE = {"height": 96, "width": 224}
@@ -44,11 +46,12 @@ def search(seed: int, **cell: object) -> tuple[HypothesisSet, object, dict]:
 
 
 def inputs_of(seed: int) -> SelectorInputs:
-    found, _, _ = search(seed)
-    everything = slice(None)
-    return selector_inputs(
-        found.maps(), _searched(found), everything, None, None, torch.device("cpu")
-    )
+    return asked(search(seed)[0])
+
+
+def asked(found: HypothesisSet) -> SelectorInputs:
+    image = selector_inputs(found.maps(), None, None, torch.device("cpu"))
+    return image.asking(found.poses, found.facts, np.arange(len(found.poses)))
 
 
 def together(parts: list[SelectorInputs]) -> SelectorInputs:
@@ -65,7 +68,7 @@ def test_support_is_that_of_the_solver(network: SelectorNetwork) -> None:
     # the same robust weight, from torch formulas of their own and from the solver's kernel
     found, pair, _ = search(1)
     answer = refine(pair)
-    seen = network.encode(inputs_of(1)).support.detach().numpy()
+    seen = network.encode(inputs_of(1)).evidence[:, 0].detach().numpy()
     for hypothesis in answer.hypotheses:
         errors = [np.abs(s - hypothesis.inliers).max() for s in seen]
         # float32 residuals of 0.3 px noise: a hundredth of a standard deviation
@@ -96,7 +99,7 @@ def test_holes_and_unknown_depths_give_finite_answers(network: SelectorNetwork) 
         for mask in (usable, nothing):
             out = network(replace(inputs, usable=mask, log_depth_curr=unknown))
             assert torch.isfinite(out.score).all() and torch.isfinite(out.mask).all()
-            assert (out.support[~mask.expand_as(out.support)] == 0).all()
+            assert (out.evidence[:, 0][~mask.expand_as(out.evidence[:, 0])] == 0).all()
 
 
 def test_refits_share_what_the_search_has_seen(network: SelectorNetwork) -> None:
@@ -133,7 +136,7 @@ def test_what_was_expected_is_weighed_by_its_covariance() -> None:
     # a prior that is sure of itself says a bounded amount
     assert torch.isfinite(scalars).all() and scalars.abs().max() < 5
     _, unknown, _ = candidate_channels(inputs, None)
-    assert (unknown[:, 4:] == 0).all()
+    assert (unknown[:, 4:8] == 0).all()
 
 
 def test_a_covariance_that_is_none_counts_as_unknown() -> None:
@@ -150,3 +153,48 @@ def test_a_covariance_that_is_none_counts_as_unknown() -> None:
     near = (1 / inputs.depth[inputs.usable]).mean()
     torch.testing.assert_close(usual[0, 0, 0].sqrt(), near / 0.01)
     torch.testing.assert_close(usual[0, 5, 5].sqrt(), torch.tensor(100.0))
+
+
+def textured_pair(T: np.ndarray, depth_m: float = 2.0) -> FramePair:
+    """A textured wall seen from two places, without any flow to speak of."""
+    rng = np.random.default_rng(0)
+    camera = Camera(120.0, 120.0, 79.5, 59.5, 120, 160)
+    wall = cv2.GaussianBlur(rng.uniform(0, 255, (360, 480)).astype(np.float32), (0, 0), 4)
+    wall = 128 + 8 * (wall - wall.mean())
+    depth = np.full(camera.shape, depth_m, np.float32)
+    uv = pixel_grid(*camera.shape)
+    frames = []
+    for pose in (np.eye(4), T):
+        # the wall moves by ``pose``: a shift of a fronto-parallel plane
+        shift = 120.0 * pose[:2, 3] / depth_m
+        u, v = (uv[..., 0] - shift[0] + 160), (uv[..., 1] - shift[1] + 120)
+        grey = cv2.remap(wall, u.astype(np.float32), v.astype(np.float32), cv2.INTER_LINEAR)
+        rgb = np.clip(grey, 0, 255).astype(np.uint8)[..., None].repeat(3, 2)
+        frames.append(Frame(rgb, depth, camera))
+    flow = np.zeros((*camera.shape, 2), np.float32)
+    return FramePair(*frames, flow, None, np.ones(camera.shape, np.bool_))
+
+
+def test_images_and_depth_tell_motions_apart_where_there_is_no_flow() -> None:
+    T = np.eye(4)
+    T[0, 3] = 0.2  # 12 px
+    pair = textured_pair(T)
+    found = generate(pair, np.eye(4)[None], Options())
+    maps = replace(found.maps(), usable=np.zeros(found.grid.shape[:2], np.bool_))
+    image = selector_inputs(maps, None, None, torch.device("cpu"))
+    near, far = np.eye(4), np.eye(4)
+    near[2, 3], far[2, 3] = -0.6, 0.6
+    poses = np.stack([T, np.eye(4), near, far])[:, :3]
+    inputs = image.asking(poses, np.ones((4, FACTS)), np.arange(4))
+    channels, _, evidence = candidate_channels(inputs, None)
+    middle = (slice(None), slice(10, -10), slice(20, -20))
+    seen = evidence[:, 1][middle].mean((1, 2))
+    assert seen[0] > 0.6 and seen[1] < 0.5 * seen[0]
+    assert (channels[:, :8] == 0).all()
+    gap, known = channels[:, 13][middle], channels[:, 12][middle]
+    assert (known[0] == 1).all() and gap[0].abs().max() < 1e-3
+    # a point that comes nearer should hide the wall; one that goes away is hidden by it
+    assert (gap[2] > 0.1).all() and (gap[3][known[3] > 0] < -0.1).all()
+    blank = replace(image, image_prev=torch.full_like(image.image_prev, 90.0))
+    nothing = candidate_channels(blank.asking(poses, np.ones((4, FACTS)), np.arange(4)), None)[2]
+    assert nothing[:, 1].abs().max() < 1e-3

@@ -10,7 +10,7 @@ import pytest
 
 from hybridvo.geometry import invert, se3_log
 from hybridvo.pipeline import refine
-from hybridvo.refinement import kernels, solver
+from hybridvo.refinement import noise
 from hybridvo.refinement.covariance import (
     LONG_GROWTH,
     ORDER,
@@ -70,14 +70,10 @@ def answer(error: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     motion = np.linalg.solve(H, np.einsum("vuki,vuk->i", J, error))
     residual = error - J @ motion
     scores = to_tiles(np.einsum("vuki,vuk->vui", J, residual))
-    information = to_tiles(H_PIXEL)[..., UPPER[0], UPPER[1]]
-    total = np.zeros(kernels.SUMS)
-    total[:21] = H[UPPER]
+    tiles = np.concatenate([to_tiles(H_PIXEL)[..., UPPER[0], UPPER[1]], scores], axis=2)
     products = np.einsum("vuki,vuk->vui", J, residual).reshape(-1, 6)
-    meat = (products.T @ products)[UPPER]
-    covariance, _, definite = sandwich_covariance(
-        total, np.zeros(21), meat, scores, information, 1.0
-    )
+    meat = products.T @ products
+    covariance, _, definite = sandwich_covariance(tiles, np.zeros((6, 6)), meat, 1.0)
     assert definite
     return motion, covariance
 
@@ -194,8 +190,8 @@ def test_depth_noise_that_nothing_tells_is_doubted() -> None:
     pair, _ = make_pair("zero_motion", 5)
     samples, h, w, _ = (image := PixelGrid(pair, None)).samples(7500)
     pose = np.eye(4)[:3].copy()
-    facts = solver.estimate_noise(samples, h * w, pose, image.K, 0.5, 0.01, 2.0, 0.08, 5, 4000)
-    assert facts[3] == pytest.approx(solver.DOUBTFUL_DEPTH_NOISE**2)
+    facts = noise.estimate_noise(samples, h * w, pose, image.K, 0.5, 0.01, 2.0, 0.08, 5, 4000)
+    assert facts[3] == pytest.approx(noise.DOUBTFUL_DEPTH_NOISE**2)
 
 
 def test_a_degraded_motion_covers_its_doubt() -> None:

@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 from hybridvo.geometry import ego_flow, se3_exp
 from hybridvo.options import Options, RefineOptions
 from hybridvo.pipeline import estimate, refine
-from hybridvo.refinement import kernels
-from hybridvo.refinement.depth_agreement import depth_agreement
+from hybridvo.refinement.depth import depth_agreement
 from hybridvo.results import Reason
 from hybridvo.types import Camera, Frame, FramePair
 
@@ -47,24 +46,20 @@ def with_depths(pair: FramePair, change) -> FramePair:
 
 
 def test_numbers_by_hand() -> None:
-    # 200 points straight ahead, 4 m away; the camera goes 1 m towards them
-    samples = np.zeros((10, 200), np.float32)
-    samples[kernels.Z], samples[kernels.W] = 4.0, 1.0
-    samples[kernels.MU], samples[kernels.MV] = np.arange(200), 3.0
+    # 200 points 3 m away
+    u, v, moved = np.arange(200.0), np.full(200, 3.0), np.full(200, 3.0)
     depth = np.full((10, 300), 3.0)
     depth[3, :50], depth[3, 50:100], depth[3, 100:200] = 3.3, 2.7, 3.0
-    pose = np.eye(4)[:3]
-    pose[2, 3] = -1.0
-    found = depth_agreement(Frame(None, depth, Camera(9, 9, 0, 0, 10, 300)), samples,
-                            np.ones(200, np.float32), pose, (0.0, 0.0))  # fmt: skip
+    camera = Camera(9, 9, 0, 0, 10, 300)
+    found = depth_agreement(Frame(None, depth, camera), u, v, moved)
     assert found is not None
     # a quarter at log 1.1 = 0.0953, a quarter at log 0.9, a half at 0: the middle one is 0
     assert found.ratio == pytest.approx(1.0, abs=1e-6)
     assert 0 <= found.spread <= 0.106 and not found.doubt
-    twice = depth_agreement(Frame(None, 2 * depth, Camera(9, 9, 0, 0, 10, 300)), samples,
-                            np.ones(200, np.float32), pose, (0.0, 0.0))  # fmt: skip
+    twice = depth_agreement(Frame(None, 2 * depth, camera), u, v, moved)
     assert twice is not None and twice.ratio == pytest.approx(2.0, abs=1e-6)
     assert "2 times" in twice.doubt and not twice.is_none
+    assert depth_agreement(Frame(None, depth, camera), u[:99], v[:99], moved[:99]) is None
 
 
 def test_one_world_is_no_doubt() -> None:

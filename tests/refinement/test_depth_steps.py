@@ -11,7 +11,7 @@ import pytest
 from hybridvo.cli import main
 from hybridvo.geometry import ego_flow, se3_exp
 from hybridvo.pipeline import refine
-from hybridvo.refinement.depth_agreement import depth_ratio, is_step
+from hybridvo.refinement.depth import depth_ratio, is_step
 from hybridvo.types import Camera, Frame, FramePair
 from tests.walks import REFINE, command, write_walk
 

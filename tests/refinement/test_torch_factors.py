@@ -11,7 +11,7 @@ import torch
 
 from hybridvo.errors import InputError
 from hybridvo.geometry import ego_flow, pixel_grid, se3_exp
-from hybridvo.refinement import kernels, solver
+from hybridvo.refinement import coarse_fit, kernels
 from hybridvo.refinement.pixels import typical
 from hybridvo.refinement.torch_backend import solve_small
 from hybridvo.refinement.torch_factors import (
@@ -185,7 +185,7 @@ def numba_step(pair: PairBatch, weights: torch.Tensor | None, T: np.ndarray, noi
     K = pair.K_curr[0].numpy()
     current = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]], np.float32)
     three = np.empty(3, np.float32)
-    solver.set_noise(*noise, 3.0, three)
+    coarse_fit.set_noise(*noise, 3.0, three)
     R, t = T[:3, :3].astype(np.float32), T[:3, 3].astype(np.float32)
     height, width = pair.depth_prev.shape[1:]
     tile = 24
@@ -199,7 +199,7 @@ def numba_step(pair: PairBatch, weights: torch.Tensor | None, T: np.ndarray, noi
         )  # fmt: skip
     out[:27] = tiles.sum(axis=(0, 1))
     delta = np.zeros(6)
-    assert solver.solve6(out, 0.0, delta)
+    assert coarse_fit.solve6(out, 0.0, delta)
     return delta, out
 
 

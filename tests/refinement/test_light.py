@@ -1,4 +1,4 @@
-"""Polish under pictures that are wrong in a systematic way: light, rows, other scenes."""
+"""Photometric refinement of images that are wrong in a systematic way."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 from hybridvo.flow import dis_flow
 from hybridvo.geometry import ego_flow, invert
 from hybridvo.pipeline import refine
-from hybridvo.refinement.illumination import COLUMNS, ROWS, local_correlation
+from hybridvo.refinement.image_factor import correlation
 from hybridvo.refinement.photometric import refine_photometric
 from hybridvo.synthetic.render import SyntheticSequence, make_scene
 from hybridvo.types import Frame, FramePair
@@ -27,8 +27,8 @@ def made():
     return sequence.frame(0), sequence.frame(1), T, sequence.flow(0)[0]
 
 
-def polished(prev: Frame, curr: Frame):
-    """(flow's motion, polished motion) with the flow of these very pictures."""
+def refined(prev: Frame, curr: Frame):
+    """(flow's motion, refined motion) with the flow of these very images."""
     field = dis_flow()(prev, curr)
     pair = FramePair(prev, curr, field.flow, field.variance, field.valid, "dis")
     motion = refine(pair)
@@ -54,7 +54,7 @@ def lamp(rgb: np.ndarray) -> np.ndarray:
 
 def test_even_light_is_left_alone(made):
     prev, curr, T, _ = made
-    motion, done = polished(prev, curr)
+    motion, done = refined(prev, curr)
     assert done.photometric.taken and not done.photometric.uneven_light
     assert done.status.message == motion.status.message
     assert error_px(prev, done.T_curr_prev, T) < 0.3 * error_px(prev, motion.T_curr_prev, T)
@@ -67,14 +67,14 @@ def test_uneven_light_is_evened_out_and_said(both, made):
         prev, curr = (replace(f, rgb=vignette(f.rgb)) for f in (prev, curr))
     else:
         curr = replace(curr, rgb=lamp(curr.rgb))
-    motion, done = polished(prev, curr)
+    motion, done = refined(prev, curr)
     assert done.photometric.taken and done.photometric.uneven_light
     assert "light changed" in done.status.message
     # one gain a pair gave 0.9 to 1.0 in the median of rendered pairs, the fields 0.26 to 0.36
     assert error_px(prev, done.T_curr_prev, T) < 0.7 * error_px(prev, motion.T_curr_prev, T)
 
 
-def test_the_fields_do_not_make_another_picture_fit(made):
+def test_the_fields_do_not_make_another_image_fit(made):
     prev, curr, _, _ = made
     field = dis_flow()(prev, curr)
     other = SyntheticSequence(make_scene("static", 405, height=HEIGHT, width=WIDTH, frames=2))
@@ -91,7 +91,7 @@ def test_rows_taken_one_after_the_other_lower_the_weight(made):
     base = np.stack(np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT)), -1).astype(np.float32)
     late = (np.arange(HEIGHT, dtype=np.float32) / HEIGHT - 0.5)[:, None, None]
     place = base - 0.8 * late * np.nan_to_num(flow)
-    # the flow's motion is that of the upright pictures: only these contradict each other
+    # the flow's motion is that of the upright images: only these contradict each other
     field = dis_flow()(prev, curr)
     pair = FramePair(prev, curr, field.flow, field.variance, field.valid, "dis")
     motion = refine(pair)
@@ -103,16 +103,14 @@ def test_rows_taken_one_after_the_other_lower_the_weight(made):
     assert not done.photometric.taken or "parts of the image disagree" in done.status.message
 
 
-def test_local_correlation_forgets_what_a_cell_has_in_common():
+def test_correlation_within_cells_forgets_what_a_cell_has_in_common():
     rng = np.random.default_rng(0)
-    v, u = np.mgrid[:HEIGHT, :WIDTH].reshape(2, -1)
-    index = np.stack([v, u], axis=1)
-    weight = np.ones(len(index))
-    a, b = rng.standard_normal((2, len(index)))
-    cell = (v * 2 * (ROWS - 1) // HEIGHT) * 100 + u * 2 * (COLUMNS - 1) // WIDTH
-    common = 50.0 * rng.standard_normal(cell.max() + 1)[cell]
-    assert np.corrcoef(a + common, b + common)[0, 1] > 0.9
-    # sampling error of a correlation of 40 960 values: 0.005
-    assert abs(local_correlation(index, (HEIGHT, WIDTH), a + common, b + common, weight)) < 0.02
-    same = local_correlation(index, (HEIGHT, WIDTH), a + common, a - common, weight)
-    assert same == pytest.approx(1.0, abs=1e-6)
+    cell = np.arange(40_000) % 50
+    weight = np.ones(len(cell))
+    a, b = rng.standard_normal((2, len(cell)))
+    common = 50.0 * rng.standard_normal(50)[cell]
+    assert correlation(a + common, b + common, weight) > 0.9
+    # sampling error of a correlation of 40 000 values: 0.005
+    assert abs(correlation(a + common, b + common, weight, cell)) < 0.02
+    assert correlation(a + common, a - common, weight, cell) == pytest.approx(1.0, abs=1e-6)
+    assert correlation(np.ones(5), np.arange(5.0), np.ones(5)) == 0

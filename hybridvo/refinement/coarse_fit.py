@@ -1,0 +1,299 @@
+"""One motion on gathered pixels: Gauss-Newton under a graduated robust kernel (numba).
+
+Poses inside the kernels are (3, 4) float64 arrays [R | t]. The group operations are written out
+here because a tensor round trip per step would cost more than the step; a test holds them equal to
+pypose's.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from hybridvo.compilation import njit
+from hybridvo.refinement.kernels import (
+    BLOCK,
+    MU,
+    MV,
+    SUMS,
+    XN,
+    YN,
+    W,
+    Z,
+    new_work,
+    project_block,
+    sum_samples,
+)
+from hybridvo.refinement.noise import estimate_noise
+
+FLOW_NOISE_CAP = 1.2
+DEPTH_NOISE_CAP = 0.08
+"""Largest noise (px, log depth) that a motion may claim in the search; beyond it the fit would be a
+compromise between motions. The final fit may claim 2.5 times what the search found."""
+DAMPING = 1e-6
+NOISE_PIXELS = 1000
+"""Pixels that the noise estimate of the search looks at: flow noise to 2 %."""
+FINAL_NOISE_PIXELS = 4000
+"""The same of the last fit of a motion."""
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def solve6(acc, damping, delta):
+    """Solve (H + damping diag H) delta = g by Cholesky; False where H is not positive definite."""
+    L = np.zeros((6, 6))
+    q = 0
+    for i in range(6):
+        for j in range(i, 6):
+            L[j, i] = acc[q]
+            q += 1
+    scale = np.empty(6)
+    for i in range(6):
+        if not L[i, i] > 1e-30:
+            return False
+        scale[i] = 1.0 / math.sqrt(L[i, i])
+    for i in range(6):
+        for j in range(i + 1):
+            L[i, j] *= scale[i] * scale[j]
+        L[i, i] = 1.0 + damping
+    for i in range(6):
+        for j in range(i + 1):
+            s = L[i, j]
+            for k in range(j):
+                s -= L[i, k] * L[j, k]
+            if i == j:
+                if not s > 1e-13:
+                    return False
+                L[i, i] = math.sqrt(s)
+            else:
+                L[i, j] = s / L[j, j]
+    for i in range(6):
+        s = acc[21 + i] * scale[i]
+        for k in range(i):
+            s -= L[i, k] * delta[k]
+        delta[i] = s / L[i, i]
+    for i in range(5, -1, -1):
+        s = delta[i]
+        for k in range(i + 1, 6):
+            s -= L[k, i] * delta[k]
+        delta[i] = s / L[i, i]
+    for i in range(6):
+        delta[i] *= scale[i]
+        if not abs(delta[i]) < 1e6:
+            return False
+    return True
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def left_update(delta, pose, out):
+    """``out`` = Exp(delta) pose, delta = (translation, rotation)."""
+    wx, wy, wz = delta[3], delta[4], delta[5]
+    theta2 = wx * wx + wy * wy + wz * wz
+    if theta2 < 1e-8:
+        a = 1.0 - theta2 / 6.0
+        b = 0.5 - theta2 / 24.0
+        c = 1.0 / 6.0 - theta2 / 120.0
+    else:
+        theta = math.sqrt(theta2)
+        half = math.sin(0.5 * theta)
+        a = math.sin(theta) / theta
+        b = 2.0 * half * half / theta2
+        c = (1.0 - a) / theta2
+    S = np.array([[0.0, -wz, wy], [wz, 0.0, -wx], [-wy, wx, 0.0]])
+    S2 = np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            S2[i, j] = S[i, 0] * S[0, j] + S[i, 1] * S[1, j] + S[i, 2] * S[2, j]
+    E = np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            E[i, j] = a * S[i, j] + b * S2[i, j]
+        E[i, i] += 1.0
+    for i in range(3):
+        shift = delta[i]
+        for j in range(3):
+            shift += (b * S[i, j] + c * S2[i, j]) * delta[j]
+        for j in range(4):
+            value = E[i, 0] * pose[0, j] + E[i, 1] * pose[1, j] + E[i, 2] * pose[2, j]
+            out[i, j] = value + shift if j == 3 else value
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def set_noise(flow_sigma, depth_sigma, cutoff, out):
+    """``out`` (3,) float32 = (1/sf^2, sd^2, c^2)."""
+    out[0] = 1.0 / (flow_sigma * flow_sigma)
+    out[1] = depth_sigma * depth_sigma
+    out[2] = cutoff * cutoff
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def evaluate(samples, n, pose, K, noise, work, acc):
+    """Normal equations at ``pose``; returns the cost, pixels behind the camera at the full cost."""
+    R = pose[:, :3].astype(np.float32)
+    t = pose[:, 3].astype(np.float32)
+    sum_samples(samples, n, R, t, K, noise, work, acc)
+    return acc[27]
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def gauss_newton(samples, n, total, K, noise, steps, tolerance_px, pose, work):
+    """Damped Gauss-Newton in place; a step is taken only where the robust cost does not rise.
+
+    ``total`` is the sum of the external weights. Stops when the step moves the image by less
+    than ``tolerance_px``. Returns (iterations, cost, converged).
+    """
+    acc = np.zeros(SUMS)
+    other = np.zeros(SUMS)
+    delta = np.zeros(6)
+    candidate = np.empty((3, 4))
+    full = 0.5 * np.float64(noise[2])
+    cost = evaluate(samples, n, pose, K, noise, work, acc)
+    cost += full * max(0.0, total - acc[29])
+    damping = DAMPING
+    done = 0
+    for _ in range(steps):
+        if not solve6(acc, damping, delta):
+            damping = max(damping * 100.0, 1e-3)
+            if damping > 1e3:
+                return done, cost, False
+            continue
+        left_update(delta, pose, candidate)
+        new_cost = evaluate(samples, n, candidate, K, noise, work, other)
+        new_cost += full * max(0.0, total - other[29])
+        done += 1
+        if new_cost <= cost * (1.0 + 1e-9) + 1e-12:
+            # predicted mean squared motion of the image, px^2: delta^T H delta / weight
+            moved = 0.0
+            for i in range(6):
+                moved += delta[i] * acc[21 + i]
+            moved = moved / max(acc[28], 1e-12) / np.float64(noise[0])
+            pose[:, :] = candidate
+            acc[:] = other
+            cost = new_cost
+            damping = max(damping * 0.1, DAMPING)
+            if moved < tolerance_px * tolerance_px:
+                return done, cost, True
+        else:
+            damping = max(damping * 10.0, 1e-3)
+            if damping > 1e3:
+                return done, cost, True  # no descent left at the precision of the sums
+    return done, cost, False
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def residual_scale(samples, n, pose, K):
+    """Median length of the residual in px over up to about 1000 usable pixels."""
+    step = max(1, n // 1000)
+    values = np.empty(n // step + 1)
+    m = 0
+    for k in range(0, n, step):
+        if samples[W, k] > 0:
+            ru, rv, _, _, front = residual(samples, k, pose, K)
+            if front:
+                values[m] = math.sqrt(ru * ru + rv * rv)
+                m += 1
+    if m == 0:
+        return 1.0
+    return np.median(values[:m])
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def residual(samples, k, pose, K):
+    """(ru, rv, qu, qv, in front) of pixel ``k`` in double precision."""
+    x, y, z = samples[XN, k], samples[YN, k], samples[Z, k]
+    X = z * (pose[0, 0] * x + pose[0, 1] * y + pose[0, 2]) + pose[0, 3]
+    Y = z * (pose[1, 0] * x + pose[1, 1] * y + pose[1, 2]) + pose[1, 3]
+    Zc = z * (pose[2, 0] * x + pose[2, 1] * y + pose[2, 2]) + pose[2, 3]
+    if not Zc > 1e-6:
+        return 0.0, 0.0, 0.0, 0.0, False
+    a = X / Zc
+    b = Y / Zc
+    ru = samples[MU, k] - (K[0] * a + K[2])
+    rv = samples[MV, k] - (K[1] * b + K[3])
+    qu = K[0] / Zc * (a * pose[2, 3] - pose[0, 3])
+    qv = K[1] / Zc * (b * pose[2, 3] - pose[1, 3])
+    return ru, rv, qu, qv, True
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def anneal(samples, n, K, start_px, end_px, ratio, steps, pose, work):
+    """Graduated Geman-McClure with isotropic noise, from ``start_px`` down to ``end_px``."""
+    noise = np.empty(3, np.float32)
+    total = np.float64(np.sum(samples[W, :n]))
+    scale = max(start_px, end_px)
+    iterations = 0
+    while True:
+        set_noise(scale, 0.0, 1.0, noise)
+        done, _, _ = gauss_newton(samples, n, total, K, noise, steps, 0.1 * scale, pose, work)
+        iterations += done
+        if scale <= end_px:
+            return iterations
+        scale = max(end_px, scale * ratio)
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def reestimate(samples, n, K, sf, sd, sf_cap, sd_cap, cutoff, rounds, steps, limit, pose, work):
+    """Alternate noise estimate and Gauss-Newton with the full covariance, in place.
+
+    Returns (sf, sd, share, iterations, converged, standard error of sd^2).
+    """
+    noise = np.empty(3, np.float32)
+    total = np.float64(np.sum(samples[W, :n]))
+    iterations = 0
+    converged = False
+    share = 0.0
+    spread = 0.0
+    for _ in range(rounds):
+        sf, sd, share, spread = estimate_noise(
+            samples, n, pose, K, sf, sd, sf_cap, sd_cap, 5, limit
+        )
+        set_noise(sf, sd, cutoff, noise)
+        done, _, converged = gauss_newton(
+            samples, n, total, K, noise, steps, 1e-3 * sf + 1e-5, pose, work
+        )
+        iterations += done
+    return sf, sd, share, iterations, converged, spread
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def robust_weights(samples, n, pose, K, noise, work, out):
+    """Robust weight in [0, 1] of ``n`` pixels, without the external weight; 0 where unusable."""
+    R = pose[:, :3].astype(np.float32)
+    t = pose[:, 3].astype(np.float32)
+    acc = np.zeros(SUMS)
+    for o in range(0, n, BLOCK):
+        m = min(BLOCK, n - o)
+        project_block(samples, o, m, R, t, K, noise, work, out[o:], acc)
+
+
+def translation_scale(samples: np.ndarray, n: int) -> float:
+    """1 / typical depth, per metre: root mean square over the usable pixels."""
+    usable = samples[W, :n] > 0
+    inverse = 1.0 / samples[Z, :n][usable].astype(np.float64)
+    return max(1e-9, float(np.sqrt(np.mean(inverse**2)))) if len(inverse) else 1.0
+
+
+def fit_coarse(
+    samples: np.ndarray, n: int, K: np.ndarray, pose: np.ndarray, cutoff: float
+) -> tuple[np.ndarray, float, float, float, int]:
+    """One motion on gathered pixels, by graduated non-convexity from a start.
+
+    Args:
+        samples: pixel buffer; its first ``n`` pixels count.
+        n: pixels.
+        K: (4,) float32 fx, fy, cx, cy of the current camera.
+        pose: (3, 4) start; left as it is.
+        cutoff: of the robust kernel.
+
+    Returns:
+        Pose (3, 4), flow noise px, depth noise, inlier ratio of the weight, iterations.
+    """
+    work = new_work()
+    pose = np.array(pose, np.float64, order="C")
+    scale = min(64.0, max(1.0, 1.5 * residual_scale(samples, n, pose, K)))
+    steps = anneal(samples, n, K, scale, 0.4, 0.5, 3, pose, work)
+    sf, sd, share, more, _, _ = reestimate(
+        samples, n, K, 0.5, 0.01, FLOW_NOISE_CAP, DEPTH_NOISE_CAP, cutoff, 2, 4,
+        FINAL_NOISE_PIXELS, pose, work,
+    )  # fmt: skip
+    return pose, sf, sd, share, steps + more

@@ -1,0 +1,510 @@
+"""Pairs whose surfaces are real: recordings as the world, cuts from other recordings as movers.
+
+The world is two frames of a static recording, or one frame seen from two places. Movers are cut
+out of RGB-D frames along irregular outlines, placed in front of the world or partly behind it with
+a z-buffer, and each moves by itself. Both images get noise, blur and a change of light, both depth
+maps noise, holes and ragged borders, the movers no less than the world. Nothing is stored: a pair
+is drawn from its seed.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from hybridvo.compilation import njit
+from hybridvo.data.resize import resize_frame
+from hybridvo.data.sequence import open_sequence
+from hybridvo.errors import InputError
+from hybridvo.flow import dis_flow
+from hybridvo.geometry import backproject, invert, make_transform, rotation_angle, se3_exp
+from hybridvo.refinement.refine import refine_pair
+from hybridvo.synthetic.sensors import log_uniform, smooth_field
+from hybridvo.synthetic.silhouettes import silhouette_mask
+from hybridvo.types import Camera, Frame, FramePair
+
+PIXELS = 76_800
+"""Pixels of an image that is drawn: 320 x 240 in the shape of a Kinect's."""
+MARGIN = 0.85
+"""Part of a frame that is kept where it is seen from two places: the rest may come into view."""
+TEAR = 0.06
+"""Change of depth between neighbours, over depth, above which no surface joins them."""
+APART = 12
+"""Frames of one recording between a world and a mover: they show different things."""
+STILL_PX = 0.5
+"""px at a width of 1024: points that the camera's motion misses by less stand still."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """Frames of a recording below the data folder.
+
+    Args:
+        path: of its folder. start, stop: frames used, the second exclusive; None: to the end.
+        strides: frames between the two of a pair; none: its frames are seen from two places only.
+        world: whether it serves as a world; all serve as movers.
+    """
+
+    path: str
+    start: int = 0
+    stop: int | None = None
+    strides: tuple[int, ...] = ()
+    world: bool = True
+
+
+SPLITS = {
+    "train": (
+        Source("real_static/rooms_110", 0, 90, (1,)),
+        Source("tum/redwood_livingroom_5", strides=(1, 2, 3)),
+    ),
+    "development": (
+        Source("real_static/rooms_110", 93, 110, (1,)),
+        Source("tum/rgbd_dataset_freiburg1_xyz_first10", strides=(1, 2, 3, 4)),
+    ),
+    "test": (
+        Source("tum/rgbd_dataset_freiburg1_rpy_100", strides=(1, 2)),
+        Source("tartanair_v2/P000", strides=(1,)),
+        Source("real_dynamic/kitti06_stereo", strides=(1,)),
+        Source("real_dynamic/adt_slam_left"),
+        Source("real_dynamic/jvosf_two_people_moving"),
+        Source("real_dynamic/jvosf_robot"),
+        Source("real_dynamic/jvosf_opening_door", world=False),
+        Source("real_dynamic/kitti02_stereo", world=False),
+    ),
+}
+"""Recordings by what they may be used for; no frame serves in two of them."""
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """A source's frames, small, and the pairs of them whose motion is known.
+
+    Args:
+        source: which.
+        frames: of about :data:`PIXELS` / :data:`MARGIN` ** 2 pixels.
+        pairs: (first, second, T_curr_prev) of the frames.
+    """
+
+    source: Source
+    frames: tuple[Frame, ...]
+    pairs: tuple[tuple[int, int, np.ndarray], ...]
+
+
+@dataclass(frozen=True, eq=False)
+class SemiRealPair:
+    """A pair and its ground truth.
+
+    Args:
+        pair: two frames with DIS flow.
+        T_curr_prev: (4, 4) true motion of the camera.
+        depth: (H, W) metres of the previous frame before the sensor's errors, 0 where unknown.
+        moving: (H, W) bool, points that do not follow the camera's motion.
+        world: path of the recording. movers: how many were placed.
+    """
+
+    pair: FramePair
+    T_curr_prev: np.ndarray
+    depth: np.ndarray
+    moving: np.ndarray
+    world: str
+    movers: int
+
+
+@functools.cache
+def load_split(folder: str | Path, split: str) -> tuple[Recording, ...]:
+    """Recordings of a part of :data:`SPLITS` that lie below a folder.
+
+    Raises:
+        InputError: another part, or none of its recordings is there.
+    """
+    if split not in SPLITS:
+        raise InputError(f"split: expected {', '.join(SPLITS)}, got {split!r}.")
+    there = [s for s in SPLITS[split] if (Path(folder) / s.path).is_dir()]
+    if not any(s.world for s in there):
+        raise InputError(f"{folder}: no recording of '{split}', such as {SPLITS[split][0].path}.")
+    return tuple(_load(Path(folder), source) for source in there)
+
+
+def _load(folder: Path, source: Source) -> Recording:
+    sequence = open_sequence(folder / source.path)
+    indices = range(source.start, len(sequence) if source.stop is None else source.stop)
+    frames = []
+    for i in indices:
+        frame = sequence.frame(i)
+        scale = np.sqrt(PIXELS / (frame.camera.height * frame.camera.width)) / MARGIN
+        size = [round(scale * side / 2) * 2 for side in frame.camera.shape]
+        frames.append(resize_frame(frame, *size))
+    pairs = []
+    for stride in source.strides:
+        for k in range(len(frames) - stride):
+            stated = [sequence.poses[indices[i]] for i in (k + stride, k)]
+            T = _measured_motion(frames[k], frames[k + stride], invert(stated[0]) @ stated[1])
+            if T is not None:
+                pairs.append((k, k + stride, T))
+    return Recording(source, tuple(frames), tuple(pairs))
+
+
+def _measured_motion(prev: Frame, curr: Frame, T_stated: np.ndarray) -> np.ndarray | None:
+    """The motion refined from the recorded one on the static pair; None where they disagree.
+
+    Recorded motions are often wrong by 1 to 3 px: the labels need more.
+    """
+    field = dis_flow()(prev, curr)
+    pair = FramePair(prev, curr, field.flow, field.variance, field.valid)
+    found = refine_pair(pair, T_stated)
+    gap = invert(T_stated) @ found.T_curr_prev
+    far = 0.02 + 0.15 * float(np.linalg.norm(T_stated[:3, 3]))
+    if not found.usable or found.inlier_ratio < 0.5:
+        return None
+    if float(np.rad2deg(rotation_angle(gap[:3, :3]))) > 1.0 or np.linalg.norm(gap[:3, 3]) > far:
+        return None
+    return found.T_curr_prev
+
+
+def draw_pair(
+    rng: np.random.Generator, recordings: Sequence[Recording], movers: int | None = None
+) -> SemiRealPair:
+    """One pair, drawn from recordings.
+
+    Args:
+        rng: source of randomness.
+        recordings: of one part of :data:`SPLITS`.
+        movers: how many; None: drawn, 1 to 4 and sometimes none.
+    """
+    worlds = [r for r in recordings if r.source.world]
+    share = np.array([np.sqrt(len(r.frames)) for r in worlds])
+    world = worlds[int(rng.choice(len(worlds), p=share / share.sum()))]
+    at = int(rng.integers(len(world.frames)))
+    canvases, T, camera = _world(rng, world, at)
+    if movers is None:
+        movers = int(rng.choice(5, p=(0.12, 0.4, 0.24, 0.14, 0.1)))
+    coverage = rng.uniform(0.1, 0.8)
+    one_body = None
+    for tried in range(movers + 4 if movers else 0):
+        if tried >= movers and canvases[0].moving.mean() > 0.7 * coverage:
+            break
+        frame = _elsewhere(rng, recordings, world, at)
+        side = 1.6 * np.sqrt(coverage / movers * camera.height * camera.width)
+        mover = _cut(rng, frame, int(side), canvases[0], camera)
+        if mover is None:
+            continue
+        if one_body is None or rng.random() < 0.5:
+            one_body = _own_motion(rng, mover, T, camera)
+        points = _moved(rng, mover, *one_body, camera)
+        own = _image(points, camera) - _image(_transformed(mover.points, T), camera)
+        goes = np.linalg.norm(own, axis=2) > STILL_PX * camera.width / 1024
+        canvases[0].draw(mover, mover.points, goes, camera)
+        mover.image *= np.float32(rng.uniform(0.95, 1.05))
+        canvases[1].draw(mover, points, goes, camera)
+    frames = [_sensed(rng, canvas, camera) for canvas in canvases]
+    field = dis_flow()(*frames)
+    pair = FramePair(
+        *frames, field.flow, field.variance, field.valid, flow_source="dis", depth_source="sensor"
+    )
+    first = canvases[0]
+    depth = np.where(first.measured > 0.5, first.depth, 0).astype(np.float32)
+    return SemiRealPair(pair, T, depth, first.moving > 0.5, world.source.path, movers)
+
+
+@dataclass(eq=False)
+class _Surface:
+    """A mesh of pixels: points (h, w, 3), image (h, w, 3), measured (h, w), inside (h, w) bool."""
+
+    points: np.ndarray
+    image: np.ndarray
+    measured: np.ndarray
+    inside: np.ndarray
+
+
+@dataclass(eq=False)
+class _Canvas:
+    """An image (H, W, 3), its depth without holes, what of it a sensor measures, what moves."""
+
+    image: np.ndarray
+    depth: np.ndarray
+    measured: np.ndarray
+    moving: np.ndarray
+
+    def draw(
+        self, surface: _Surface, points: np.ndarray, moving: np.ndarray, camera: Camera
+    ) -> None:
+        """Add a surface with its points where they are now, nearest wins."""
+        marks = surface.measured, moving
+        mesh = np.empty((*surface.measured.shape, 5), np.float32)
+        mesh[..., :3], mesh[..., 3], mesh[..., 4] = surface.image, *marks
+        out = np.empty((*self.depth.shape, 5), np.float32)
+        out[..., :3], out[..., 3], out[..., 4] = self.image, self.measured, self.moving
+        before = self.depth.copy()
+        z = np.ascontiguousarray(points[..., 2], np.float32)
+        _rasterise(_image(points, camera), z, mesh, surface.inside, self.depth, out)
+        # silhouettes are mixed pixels
+        drawn = (self.depth != before).astype(np.float32)
+        alpha = cv2.GaussianBlur(drawn, (3, 3), 0.7) * drawn
+        self.image += alpha[..., None] * (out[..., :3] - self.image)
+        self.measured, self.moving = out[..., 3], out[..., 4]
+
+
+def _image(points: np.ndarray, camera: Camera) -> np.ndarray:
+    """(h, w, 2) float32 px of points (h, w, 3); far outside behind the camera."""
+    z = points[..., 2]
+    front = z > 1e-3
+    inverse = 1.0 / np.where(front, z, 1.0)
+    uv = np.empty((*z.shape, 2), np.float32)
+    uv[..., 0] = np.where(front, camera.fx * points[..., 0] * inverse + camera.cx, -1e4)
+    uv[..., 1] = camera.fy * points[..., 1] * inverse + camera.cy
+    return uv
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def _rasterise(uv, z, values, inside, depth, out):
+    """Draw the mesh of a pixel grid with a z-buffer, in place; values linear in the image."""
+    h, w = z.shape
+    H, W = depth.shape
+    rows, columns = np.zeros(3, np.int64), np.zeros(3, np.int64)
+    for r in range(h - 1):
+        for c in range(w - 1):
+            for half in range(2):
+                for k in range(3):
+                    corner = k + half  # 0 1 2 and 1 2 3 of the quad
+                    rows[k], columns[k] = r + corner // 2, c + corner % 2
+                whole = True
+                for k in range(3):
+                    whole = whole and inside[rows[k], columns[k]]
+                if not whole:
+                    continue
+                u0, v0 = uv[rows[0], columns[0]]
+                u1, v1 = uv[rows[1], columns[1]]
+                u2, v2 = uv[rows[2], columns[2]]
+                z0, z1, z2 = z[rows[0], columns[0]], z[rows[1], columns[1]], z[rows[2], columns[2]]
+                area = (u1 - u0) * (v2 - v0) - (u2 - u0) * (v1 - v0)
+                if min(z0, z1, z2) < 0.05 or abs(area) < 1e-6 or abs(area) > 1e4:
+                    continue
+                left = max(0, int(np.ceil(min(u0, u1, u2))))
+                right = min(W - 1, int(np.floor(max(u0, u1, u2))))
+                top = max(0, int(np.ceil(min(v0, v1, v2))))
+                bottom = min(H - 1, int(np.floor(max(v0, v1, v2))))
+                for y in range(top, bottom + 1):
+                    for x in range(left, right + 1):
+                        a = ((u1 - x) * (v2 - y) - (u2 - x) * (v1 - y)) / area
+                        b = ((u2 - x) * (v0 - y) - (u0 - x) * (v2 - y)) / area
+                        e = 1.0 - a - b
+                        if a < -1e-6 or b < -1e-6 or e < -1e-6:
+                            continue
+                        near = 1.0 / (a / z0 + b / z1 + e / z2)
+                        if near < depth[y, x]:
+                            depth[y, x] = near
+                            for q in range(out.shape[2]):
+                                out[y, x, q] = (
+                                    a * values[rows[0], columns[0], q]
+                                    + b * values[rows[1], columns[1], q]
+                                    + e * values[rows[2], columns[2], q]
+                                )
+
+
+def _filled(depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Depth with its holes filled by the nearest value, and where it was measured."""
+    known = np.isfinite(depth) & (depth > 0)
+    _, labels = cv2.distanceTransformWithLabels(
+        (~known).astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    of_label = np.ones(labels.max() + 1, np.float32)
+    of_label[labels[known]] = depth[known]
+    return of_label[labels], known
+
+
+@functools.lru_cache(maxsize=128)
+def _surface(frame: Frame) -> _Surface:
+    """Everything that a frame shows, as a mesh that is torn nowhere but measured only on planes."""
+    assert frame.depth is not None and frame.rgb is not None
+    depth, known = _filled(frame.depth)
+    jump = cv2.dilate(depth, np.ones((3, 3))) - cv2.erode(depth, np.ones((3, 3)))
+    measured = known & (jump < 2 * TEAR * depth)
+    points = backproject(depth, frame.camera).astype(np.float32)
+    inside = np.ones(depth.shape, np.bool_)
+    return _Surface(points, frame.rgb.astype(np.float32), measured.astype(np.float32), inside)
+
+
+def _elsewhere(
+    rng: np.random.Generator, recordings: Sequence[Recording], world: Recording, at: int
+) -> Frame:
+    """A frame of another recording, or of the same one from another place."""
+    frames = [
+        frame
+        for r in recordings
+        for k, frame in enumerate(r.frames)
+        if r is not world or abs(k - at) > APART
+    ]
+    return frames[int(rng.integers(len(frames)))]
+
+
+def _world(
+    rng: np.random.Generator, recording: Recording, at: int
+) -> tuple[list[_Canvas], np.ndarray, Camera]:
+    """Two views of a recording about a frame, the motion between them and their camera."""
+    height, width = (round(MARGIN * side) for side in recording.frames[0].camera.shape)
+    full = recording.frames[0].camera
+    v0, u0 = (full.height - height) // 2, (full.width - width) // 2
+    camera = Camera(full.fx, full.fy, full.cx - u0, full.cy - v0, height, width)
+    pairs = [pair for pair in recording.pairs if pair[0] == at]
+    if pairs and rng.random() < 0.65:
+        i, j, T = pairs[int(rng.integers(len(pairs)))]
+        if rng.random() < 0.5:
+            i, j, T = j, i, invert(T)
+        window = np.s_[v0 : v0 + height, u0 : u0 + width]
+        canvases = []
+        for frame in (recording.frames[i], recording.frames[j]):
+            assert frame.depth is not None and frame.rgb is not None
+            depth, known = (x[window].copy() for x in _filled(frame.depth))
+            image = frame.rgb[window].astype(np.float32)
+            canvases.append(_Canvas(image, depth, known.astype(np.float32), np.zeros_like(depth)))
+        _paler(rng, canvases)
+        return canvases, T, camera
+    surface = _surface(recording.frames[at])
+    near = float(np.median(surface.points[..., 2]))
+    shift_px, turn_px = log_uniform(rng, (0.5, 16)), log_uniform(rng, (0.5, 16))
+    step = rng.standard_normal(6) * np.repeat([near * shift_px, turn_px], 3) / camera.fx / 1.5
+    half = se3_exp(np.clip(step / 2, -0.3 * near, 0.3 * near))
+    canvases = []
+    for pose in (invert(half), half):
+        shape = (height, width)
+        canvas = _Canvas(
+            np.full((*shape, 3), 8, np.float32),
+            np.full(shape, 1e3, np.float32),
+            np.zeros(shape, np.float32),
+            np.zeros(shape, np.float32),
+        )
+        points = _transformed(surface.points, pose)
+        canvas.draw(surface, points, np.zeros(points.shape[:2]), camera)
+        canvases.append(canvas)
+    _paler(rng, canvases)
+    return canvases, half @ half, camera
+
+
+def _paler(rng: np.random.Generator, canvases: list[_Canvas]) -> None:
+    """Take contrast from a world at times, as distance and darkness do."""
+    contrast = rng.uniform(0.25, 1.0) if rng.random() < 0.5 else 1.0
+    for canvas in canvases:
+        canvas.image = canvas.image * np.float32(contrast) + np.float32(90 * (1 - contrast))
+
+
+def _cut(
+    rng: np.random.Generator, frame: Frame, side: int, canvas: _Canvas, camera: Camera
+) -> _Surface | None:
+    """A piece of a frame, placed in the first view; None where the frame has no depth there."""
+    assert frame.depth is not None
+    height, width = frame.camera.shape
+    mask = silhouette_mask(rng, max(24, min(side, height - 2)))
+    h, w = mask.shape
+    v0, u0 = int(rng.integers(height - h + 1)), int(rng.integers(max(width - w, 0) + 1))
+    window = np.s_[v0 : v0 + h, u0 : u0 + w]
+    mask = mask[:, : width - u0]
+    surface = _surface(frame)
+    points, measured = surface.points[window], surface.measured[window]
+    if (measured * mask).sum() < 0.3 * mask.sum():
+        return None
+    z = points[..., 2]
+    middle = float(np.median(z[mask & (measured > 0)]))
+    mask &= np.abs(z - middle) < rng.uniform(0.15, 0.8) * middle
+    if rng.random() < 0.5:  # ragged, as what a sensor sees of hair and leaves
+        mask &= smooth_field(rng, *mask.shape, 12) > -1.3
+    # rays turned to where it goes; any scaling of a rigid thing is one
+    centre = points[h // 2, min(w, mask.shape[1]) // 2]
+    to = rng.uniform(0.0, 1.0, 2) * (camera.width - 1, camera.height - 1)
+    behind = canvas.depth[int(to[1]), int(to[0])]
+    part = rng.uniform(0.9, 1.4) if rng.random() < 0.2 else rng.uniform(0.3, 0.95)
+    goal = (to - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+    size = rng.uniform(0.8, 1.25) * frame.camera.fx / camera.fx
+    rays = (points[..., :2] / z[..., None] - centre[:2] / centre[2]) * size + goal
+    z = z * (part * behind / middle)
+    placed = np.concatenate([rays * z[..., None], z[..., None]], axis=2).astype(np.float32)
+    return _Surface(placed, surface.image[window].copy(), measured.copy(), mask)
+
+
+def _own_motion(
+    rng: np.random.Generator, mover: _Surface, T: np.ndarray, camera: Camera
+) -> tuple[np.ndarray, str]:
+    """(4, 4) from the first view to the second, and its kind."""
+    centre = mover.points[mover.inside].mean(axis=0) if mover.inside.any() else mover.points[0, 0]
+    kind = str(rng.choice(["slide", "turn", "both", "approach", "follow", "stand"],
+                          p=(0.32, 0.12, 0.24, 0.1, 0.16, 0.06)))  # fmt: skip
+    step = np.zeros(6)
+    if kind in ("slide", "both", "follow"):
+        reach = (0.05, 2.0) if kind == "follow" else (1.5, 25.0)
+        px = log_uniform(rng, reach) / camera.fx
+        step[:3] = rng.standard_normal(3) * (1.0, 0.7, 0.6) * px * centre[2]
+    if kind in ("turn", "both"):
+        step[3:] = rng.standard_normal(3) * log_uniform(rng, (0.02, 0.2))
+    if kind == "approach":
+        step[:3] = centre * rng.uniform(-0.12, 0.12)
+    own = _about(centre, step)
+    return (own if kind == "follow" else T @ own), kind
+
+
+def _moved(
+    rng: np.random.Generator, mover: _Surface, motion: np.ndarray, kind: str, camera: Camera
+) -> np.ndarray:
+    """(h, w, 3) where a mover's points are in the second view: on a hinge, or not quite rigid."""
+    points = mover.points
+    out = _transformed(points, motion)
+    if kind == "stand":
+        return out
+    centre = points[mover.inside].mean(axis=0) if mover.inside.any() else points.mean((0, 1))
+    if rng.random() < 0.2:
+        side = (points[..., :2] - centre[:2]) @ rng.standard_normal(2) > 0
+        swing = rng.standard_normal(6) * log_uniform(rng, (0.03, 0.25)) * (0, 0, 0, 1, 1, 1)
+        other = motion @ _about(centre, swing)
+        out = np.where(side[..., None], _transformed(points, other), out)
+    if rng.random() < 0.4:
+        wobble = smooth_field(rng, *points.shape[:2], 5, 3)
+        out = out + wobble * np.float32(rng.uniform(0, 0.5) * centre[2] / camera.fx)
+    return out
+
+
+def _transformed(points: np.ndarray, T: np.ndarray) -> np.ndarray:
+    """(h, w, 3) float32 points after a motion (4, 4)."""
+    return points @ T[:3, :3].T.astype(np.float32) + T[:3, 3].astype(np.float32)
+
+
+def _about(centre: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """(4, 4) motion whose rotation is about a point."""
+    to = make_transform(np.eye(3), centre)
+    return make_transform(np.eye(3), step[:3]) @ to @ se3_exp(np.r_[0, 0, 0, step[3:]]) @ invert(to)
+
+
+def _sensed(rng: np.random.Generator, canvas: _Canvas, camera: Camera) -> Frame:
+    """What a camera and a depth sensor make of a view."""
+    shape = camera.shape
+    gain, offset = rng.uniform(0.96, 1.04), rng.uniform(-4, 4)
+    image = canvas.image * np.float32(gain) + np.float32(offset)
+    if rng.random() < 0.5:
+        image = cv2.GaussianBlur(image, (0, 0), log_uniform(rng, (0.3, 1.0)))
+    noise = rng.standard_normal((*shape, 3), dtype=np.float32)
+    image = image + noise * np.float32(log_uniform(rng, (0.7, 4.0)))
+    rgb = np.clip(image, 0, 255).astype(np.uint8)
+    depth = canvas.depth.copy()
+    kernel = np.ones((3, 3), np.uint8)
+    lost = canvas.measured < 0.5
+    if rng.random() < 0.6:  # silhouettes
+        jump = cv2.dilate(depth, kernel) - cv2.erode(depth, kernel)
+        edge = (jump > TEAR * depth) & (smooth_field(rng, *shape, 30) > rng.uniform(-1.5, 0.5))
+        lost |= cv2.dilate(edge.astype(np.uint8), kernel) > 0
+    if rng.random() < 0.5:  # holes, on movers as in the world
+        field = smooth_field(rng, *shape, int(rng.integers(4, 24)))
+        lost |= field > rng.uniform(0.8, 2.5)
+    if rng.random() < 0.4:  # beyond its range
+        middle, far = np.quantile(depth[::5, ::5], (0.5, 0.98))
+        reach = rng.uniform(middle, max(far, middle + 1e-3))
+        lost |= depth > reach * (1 + 0.2 * smooth_field(rng, *shape, 16))
+    if rng.random() < 0.3:  # the sensor's field of view ends before the image
+        cut = rng.integers(0, (shape[0] // 8, shape[0] // 8, shape[1] // 8, shape[1] // 8))
+        lost[: cut[0]] = lost[shape[0] - cut[1] :] = True
+        lost[:, : cut[2]] = lost[:, shape[1] - cut[3] :] = True
+    error = smooth_field(rng, *shape, 24) + 0.5 * rng.standard_normal(shape, dtype=np.float32)
+    depth *= 1 + np.float32(log_uniform(rng, (0.0005, 0.006))) * error
+    depth[lost] = 0
+    return Frame(rgb, depth, camera)

@@ -1,0 +1,73 @@
+"""Semi-real pairs: their ground truth is that of their images, and no frame serves twice."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from hybridvo.errors import InputError
+from hybridvo.geometry import ego_flow, se3_exp
+from hybridvo.synthetic.semi_real import SPLITS, Recording, Source, draw_pair, load_split
+from hybridvo.types import Camera, Frame
+
+
+def recording(seed: int, count: int = 2) -> Recording:
+    """Frames of a textured, curved wall with a hole in its depth; every one of another wall."""
+    rng = np.random.default_rng(seed)
+    camera = Camera(240.0, 240.0, 149.5, 112.5, 226, 300)
+    u, v = np.meshgrid(np.arange(300), np.arange(226))
+    frames = []
+    for k in range(count):
+        noise = rng.uniform(0, 255, (226, 300, 3)).astype(np.float32)
+        rgb = np.clip(128 + 8 * (cv2.GaussianBlur(noise, (0, 0), 4) - 128), 0, 255)
+        depth = (3 + k + np.sin(u / 40) * np.cos(v / 30)).astype(np.float32)
+        depth[100:110, 100:130] = 0
+        frames.append(Frame(rgb.astype(np.uint8), depth, camera))
+    return Recording(Source(f"made_{seed}"), tuple(frames), ())
+
+
+def test_flow_obeys_the_motion_where_the_world_stands_still() -> None:
+    recordings = [recording(1), recording(2)]
+    checked = 0
+    for seed in range(8):
+        drawn = draw_pair(np.random.default_rng(seed), recordings, movers=2)
+        pair, depth = drawn.pair, np.where(drawn.depth > 0, drawn.depth, np.nan)
+        own = ego_flow(depth, drawn.T_curr_prev, pair.prev.camera, pair.curr.camera)
+        error = np.linalg.norm(pair.flow - own, axis=2)
+        good = pair.flow_valid & np.isfinite(error)
+        assert np.median(error[good & ~drawn.moving]) < 0.5
+        if np.count_nonzero(good & drawn.moving) > 300:
+            checked += 1
+            assert np.median(error[good & drawn.moving]) > np.median(error[good & ~drawn.moving])
+    assert checked >= 4
+
+
+def test_a_pair_is_drawn_again_as_it_was_and_may_be_static() -> None:
+    recordings = [recording(1), recording(2)]
+    one, two = (draw_pair(np.random.default_rng(5), recordings) for _ in range(2))
+    np.testing.assert_array_equal(one.pair.curr.rgb, two.pair.curr.rgb)
+    np.testing.assert_array_equal(one.pair.prev.depth, two.pair.prev.depth)
+    still = draw_pair(np.random.default_rng(5), recordings, movers=0)
+    assert not still.moving.any() and still.movers == 0
+    np.testing.assert_allclose(still.T_curr_prev @ se3_exp(np.zeros(6)), still.T_curr_prev)
+
+
+def test_no_frame_serves_in_two_parts() -> None:
+    used: dict[str, list[tuple[float, str]]] = {}
+    for split, sources in SPLITS.items():
+        for source in sources:
+            stop = np.inf if source.stop is None else source.stop
+            for start, other_stop, other in used.setdefault(source.path, []):
+                assert other == split or source.start >= other_stop or stop <= start
+            used[source.path].append((source.start, stop, split))
+    for path, rows in used.items():
+        if path.startswith("real_dynamic"):
+            assert {split for _, _, split in rows} == {"test"}
+
+
+def test_a_folder_without_recordings_is_refused(tmp_path) -> None:
+    with pytest.raises(InputError, match="no recording of 'test'"):
+        load_split(tmp_path, "test")
+    with pytest.raises(InputError, match="expected train"):
+        load_split(tmp_path, "all")

@@ -1,0 +1,180 @@
+"""The right motion on real surfaces, and whether the stated probability can be believed.
+
+    python tools/benchmark_semi_real.py --pairs 160 --out docs/results/semi_real.json
+    python tools/benchmark_semi_real.py --split development --methods hybrid-flow
+
+Pairs of :mod:`hybridvo.synthetic.semi_real` on DIS flow, drawn from fixed seeds. An answer is wrong
+when its ego flow over the static pixels errs by more than 1 px and more than three times as much as
+``refine`` does inside the true static mask.
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import itertools
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from measuring import digits, ego_flow_error, proportion, provenance, timed
+
+METHODS = ("refine", "hybrid-flow", "poselib")
+WRONG_PX, WRONG_FACTOR = 1.0, 3.0
+LEAST_MOVING = 0.2
+"""Share of the image that moves at least where anything does."""
+BINS = 10
+"""Bins of the stated probability for its calibration error."""
+SEEDS = {"train": 1, "development": 2, "test": 3}
+"""First word of the seed of every pair."""
+
+
+def build_parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="benchmark_semi_real.py", description=(__doc__ or "").splitlines()[0]
+    )
+    parser.add_argument("--pairs", type=int, default=160)
+    parser.add_argument("--first", type=int, default=0, help="number of the first pair")
+    parser.add_argument("--split", default="test", choices=SEEDS)
+    parser.add_argument("--methods", default=",".join(METHODS))
+    parser.add_argument("--selector", metavar="FILE", help="weights instead of the shipped ones")
+    parser.add_argument("--data", type=Path, default=Path("../shared/data"), metavar="DIR")
+    parser.add_argument("--out", type=Path, metavar="FILE")
+    return parser
+
+
+def main(argv: list[str] | None = None) -> int:
+    args = build_parser().parse_args(argv)
+    from hybridvo.files import write_json
+    from hybridvo.synthetic.semi_real import load_split
+
+    recordings = load_split(args.data, args.split)
+    rows = measure(args, recordings)
+    methods = args.methods.split(",")
+    result = provenance("benchmark_semi_real.py", argv) | {
+        "split": args.split,
+        "recordings": {r.source.path: len(r.frames) for r in recordings},
+        "pairs": len(rows),
+        "with_movers": sum(row["moving"] > 0 for row in rows),
+        "summary": {method: summarise(rows, method) for method in methods},
+        "rows": rows,
+    }
+    for method, row in result["summary"].items():
+        print(method, {k: v for k, v in row.items() if k != "reliability"})
+    if args.out is not None:
+        args.out.parent.mkdir(parents=True, exist_ok=True)
+        write_json(args.out, result)
+    return 0
+
+
+def measure(args: argparse.Namespace, recordings: Any) -> list[dict[str, Any]]:
+    """Errors, statuses and probabilities of every method on every pair."""
+    from hybridvo import estimate, refine
+    from hybridvo.network.models import Models
+
+    models = Models(weights={"selector": args.selector}) if args.selector else None
+    rows = []
+    for k in range(args.first, args.first + args.pairs):
+        drawn = draw(args.split, k, recordings)
+        pair, T = drawn.pair, drawn.T_curr_prev
+        depth = np.where(drawn.moving, 0, drawn.depth)
+        usable = pair.flow_valid & (pair.prev.depth > 0)
+        told = refine(pair, weights=(~drawn.moving).astype(np.float32))
+        limit = ego_flow_error(told.T_curr_prev, T, depth, pair)
+        row: dict[str, Any] = {
+            "world": drawn.world,
+            "moving": digits(drawn.moving.mean()),
+            "static_usable": digits((usable & ~drawn.moving).sum() / max(usable.sum(), 1)),
+            "oracle_px": digits(limit),
+        }
+        for method in args.methods.split(","):
+            motion, ms = timed(functools.partial(estimate, pair, method=method, models=models))
+            error = ego_flow_error(motion.T_curr_prev, T, depth, pair)
+            others = [ego_flow_error(h.T_curr_prev, T, depth, pair) for h in motion.hypotheses]
+            row[method] = {
+                "px": digits(error),
+                "best_px": digits(min([error, *others])),
+                "wrong": bool(error > max(WRONG_PX, WRONG_FACTOR * limit)),
+                "status": motion.status.state.value,
+                "reason": motion.status.reason.value,
+                "probability": digits(motion.probability),
+                "ms": digits(ms),
+            }
+        rows.append(row)
+    return rows
+
+
+def draw(split: str, number: int, recordings: Any) -> Any:
+    """A pair in which nothing moves, every eighth, or :data:`LEAST_MOVING` of the image does."""
+    from hybridvo.synthetic.semi_real import draw_pair
+
+    for attempt in itertools.count():
+        rng = np.random.default_rng([SEEDS[split], number, attempt])
+        drawn = draw_pair(rng, recordings, 0 if number % 8 == 0 else int(rng.integers(1, 5)))
+        if drawn.movers == 0 or drawn.moving.mean() > LEAST_MOVING:
+            return drawn
+
+
+def summarise(rows: list[dict[str, Any]], method: str) -> dict[str, Any]:
+    """Shares of wrong answers, and how far the probability and the status tell them."""
+    of = [row[method] for row in rows]
+    wrong = np.array([row["wrong"] for row in of])
+    moving = np.array([row["moving"] > 0 for row in rows])
+    world = np.array([row["static_usable"] > 0.5 for row in rows])
+    ok = np.array([row["status"] == "ok" for row in of])
+    best = [
+        row["best_px"] > max(WRONG_PX, WRONG_FACTOR * r["oracle_px"])
+        for row, r in zip(of, rows, strict=True)
+    ]
+    probability = np.array([row["probability"] for row in of])
+
+    def share(what: np.ndarray, among: np.ndarray) -> dict[str, Any]:
+        return proportion(int((what & among).sum()), int(among.sum()))
+
+    return {
+        "wrong": share(wrong, moving),
+        "wrong_world_majority": share(wrong, moving & world),
+        "wrong_static": share(wrong, ~moving),
+        "wrong_best_hypothesis": share(np.array(best), moving),
+        "right_not_ok": share(~ok, ~wrong & moving),
+        "right_not_ok_static": share(~ok, ~wrong & ~moving),
+        "wrong_ok": share(ok, wrong),
+        "median_px_right": digits(np.median([r["px"] for r in of if not r["wrong"]] or [0])),
+        "auroc": auroc(probability, ~wrong),
+        "ece": calibration_error(probability, ~wrong),
+        "ms": digits(np.median([row["ms"] for row in of])),
+        "reliability": reliability(probability, ~wrong),
+    }
+
+
+def auroc(score: np.ndarray, positive: np.ndarray) -> float | None:
+    """Chance that a positive has the larger score; None without both kinds."""
+    from scipy.stats import rankdata
+
+    n, m = int(positive.sum()), int((~positive).sum())
+    if not n or not m:
+        return None
+    return digits((rankdata(score)[positive].sum() - n * (n + 1) / 2) / (n * m))
+
+
+def reliability(probability: np.ndarray, right: np.ndarray) -> list[dict[str, Any]]:
+    """Mean probability and share of right answers in each bin."""
+    number = np.minimum((probability * BINS).astype(int), BINS - 1)
+    rows = []
+    for k in range(BINS):
+        mine = number == k
+        if mine.any():
+            stated, true = digits(probability[mine].mean()), digits(right[mine].mean())
+            rows.append({"count": int(mine.sum()), "stated": stated, "right": true})
+    return rows
+
+
+def calibration_error(probability: np.ndarray, right: np.ndarray) -> float:
+    """Expected calibration error: mean gap of the bins, by their counts."""
+    rows = reliability(probability, right)
+    return digits(sum(r["count"] * abs(r["stated"] - r["right"]) for r in rows) / len(right))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
