@@ -20,12 +20,13 @@ from hybridvo.refinement.coarse_fit import (
     FLOW_NOISE_CAP,
     NOISE_PIXELS,
     anneal,
-    gauss_newton,
+    left_update,
     reestimate,
     residual,
     residual_scale,
     robust_weights,
     set_noise,
+    solve6,
     translation_scale,
 )
 from hybridvo.refinement.kernels import (
@@ -186,7 +187,7 @@ def candidates(small, h, w, K, starts, wide, triples, similar, work):
             if fit_window(small, w, r, r + rows, c, c + columns, K, few, pose, work):
                 keep_best(pose, score_pose(small, n, pose, K), SOURCE_WINDOW, best, similar)
     for s in range(triples.shape[0]):
-        if fit_minimal(small, triples[s], K, few, pose, work):
+        if fit_minimal(small, triples[s], pose, K):
             keep_best(pose, score_pose(small, n, pose, K), SOURCE_MINIMAL, best, similar)
     return best
 
@@ -247,16 +248,44 @@ def is_bounded(pose):
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
-def fit_minimal(samples, pick, K, few, pose, work):
+def fit_minimal(samples, pick, pose, K):
     """Three pixels, six equations: Newton steps from the identity, in place; False if it fails."""
-    for m in range(3):
-        for q in range(BUFFER_ROWS):
-            few[q, m] = samples[q, pick[m]]
-        few[W, m] = 1.0
-    noise = np.empty(3, np.float32)
-    set_noise(WIDE_PX, 0.0, 1.0, noise)
+    rows = np.empty((6, 7))
+    sums = np.empty(27)
+    delta = np.empty(6)
+    other = np.empty((3, 4))
     set_identity(pose)
-    gauss_newton(few, 3, 3.0, K, noise, MINIMAL_STEPS, 0.01, pose, work)
+    for _ in range(MINIMAL_STEPS):
+        for m in range(3):
+            k = pick[m]
+            x, y, z = samples[XN, k], samples[YN, k], samples[Z, k]
+            X = z * (pose[0, 0] * x + pose[0, 1] * y + pose[0, 2]) + pose[0, 3]
+            Y = z * (pose[1, 0] * x + pose[1, 1] * y + pose[1, 2]) + pose[1, 3]
+            Zc = z * (pose[2, 0] * x + pose[2, 1] * y + pose[2, 2]) + pose[2, 3]
+            if not Zc > 1e-6:
+                return False
+            i = 1.0 / Zc
+            a = X * i
+            b = Y * i
+            u = (samples[MU, k] - K[2]) / K[0] - a
+            v = (samples[MV, k] - K[3]) / K[1] - b
+            rows[2 * m] = (i, 0.0, -a * i, -a * b, 1.0 + a * a, -b, u)
+            rows[2 * m + 1] = (0.0, i, -b * i, -(1.0 + b * b), a * b, a, v)
+        q = 0
+        for i in range(6):
+            for j in range(i, 7):
+                total = 0.0
+                for r in range(6):
+                    total += rows[r, i] * rows[r, j]
+                if j == 6:
+                    sums[21 + i] = total
+                else:
+                    sums[q] = total
+                    q += 1
+        if not solve6(sums, 0.0, delta):
+            return False
+        other[:, :] = pose
+        left_update(delta, other, pose)
     return is_bounded(pose)
 
 

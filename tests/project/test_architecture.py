@@ -77,7 +77,6 @@ ONLY_IN = {
     "pypose": {"torch_geometry.py"},
     "kornia": {"torch_geometry.py"},
     "pydantic": {"options.py", "network/", "synthetic/", "training/"},
-    "distributed": {"evaluation/comparison.py"},
 }
 """Library -> the only files, or folders, that may import it."""
 

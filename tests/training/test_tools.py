@@ -83,7 +83,7 @@ def test_train_resumes_and_the_card_is_of_the_run(tmp_path, capsys):
 
 
 def test_an_export_needs_a_run(tmp_path):
-    with pytest.raises(CheckpointError, match="train first"):
+    with pytest.raises(CheckpointError, match="not a checkpoint"):
         export_pwvo(tmp_path, tmp_path / "w.safetensors")
 
 
