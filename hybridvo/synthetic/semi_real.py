@@ -23,6 +23,7 @@ from hybridvo.errors import InputError
 from hybridvo.flow import dis_flow
 from hybridvo.geometry import invert, make_transform, rotation_angle, se3_exp
 from hybridvo.refinement.refine import refine_pair
+from hybridvo.synthetic.draws import log_uniform, smooth_field
 from hybridvo.synthetic.meshes import (
     TEAR,
     Canvas,
@@ -32,7 +33,6 @@ from hybridvo.synthetic.meshes import (
     surface_of,
     transformed,
 )
-from hybridvo.synthetic.sensors import log_uniform, smooth_field
 from hybridvo.synthetic.silhouettes import silhouette_mask
 from hybridvo.types import Camera, Frame, FramePair
 
