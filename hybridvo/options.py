@@ -83,7 +83,7 @@ class SelectOptions:
     """Which of the motions is the camera's.
 
     Args:
-        consult_below: confidence of the selector (0 to 1) below which PWVO is asked as well; 1: in
+        consult_below: probability of being right (0 to 1) below which PWVO is asked as well; 1: in
             every ambiguous pair.
         refits: motions that are fitted again inside their masks, in each round.
         min_confidence: probability of being right (0 to 1) below which a motion is degraded.
