@@ -293,7 +293,7 @@ def fit_window(samples, w, r0, r1, c0, c1, K, few, pose, work):
 
 @njit(error_model="numpy", cache=True, nogil=True)
 def draw_three(samples, h, w, local, rng, pick):
-    """Draw three distinct usable pixels, near each other if ``local``; False where none is found."""
+    """Draw three distinct usable pixels, near by if ``local``; False where none is found."""
     m = 0
     for _ in range(60):
         k = int(rng.random() * h * w)
