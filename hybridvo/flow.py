@@ -194,7 +194,8 @@ def file_flow(sequence: Any, *, strict: bool = True) -> FlowProvider:
     """
 
     def provide(prev: Frame, curr: Frame) -> FlowField:
-        flow = valid = None
+        flow: np.ndarray | None = None
+        valid: np.ndarray | None = None
         if curr.index == prev.index + 1:
             try:
                 flow, valid = sequence.flow(prev.index)

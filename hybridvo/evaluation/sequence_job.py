@@ -119,8 +119,10 @@ def run_sequence(job: Job, progress: Callable[[int], None] | None = None) -> dic
     left_out: list[dict[str, Any]] = []
     prev: Frame | None = None
     for done, index in enumerate(job.indices):
-        frame, facts, is_scored = None, {}, prev is not None
+        frame: Frame | None = None
+        facts: dict[str, Any] = {}
         flow_ms: dict[str, float] = {}
+        is_scored = prev is not None
         try:
             frame = sequence.frame(index)
         except (InputError, OSError) as error:
@@ -192,7 +194,7 @@ def _result(
     table = pair_table(pairs)
     gt = true_trajectory(sequence, job.indices)
     stamps = sequence.timestamps[list(job.indices)]
-    paths = {"ground_truth": None if gt is None else gt.T_world_cam.tolist()}
+    paths: dict[str, Any] = {"ground_truth": None if gt is None else gt.T_world_cam.tolist()}
     rows = []
     for run in runs:
         est = Trajectory(stamps, np.stack([run.poses[i] for i in job.indices]))
