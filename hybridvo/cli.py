@@ -156,7 +156,7 @@ def _run(args: argparse.Namespace, command: list[str]) -> int:
     from hybridvo.commands.inputs import weight_files
     from hybridvo.commands.results import summary_text
     from hybridvo.commands.run import run
-    from hybridvo.pipeline import Models
+    from hybridvo.network.models import Models
 
     given = {
         f"run.{name}": getattr(args, name)

@@ -19,10 +19,10 @@ from hybridvo.commands.inputs import is_dark
 from hybridvo.data.lists import shown
 from hybridvo.data.sequence import Sequence
 from hybridvo.errors import InputError
+from hybridvo.estimation import estimate
 from hybridvo.evaluation.pair_errors import true_motion
 from hybridvo.flow import contradiction, dis_flow, file_flow
 from hybridvo.geometry import ego_flow
-from hybridvo.pipeline import estimate
 from hybridvo.refinement.depth import depth_ratio, is_step
 from hybridvo.types import Frame, FramePair
 from hybridvo.units import depth_advice, typical_depth

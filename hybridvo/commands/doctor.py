@@ -113,8 +113,8 @@ def _what_runs() -> dict[str, Any]:
     import numba
     import torch
 
+    from hybridvo.estimation import warm_up
     from hybridvo.evaluation.plan import methods_to_run
-    from hybridvo.pipeline import warm_up
 
     ready, absent = methods_to_run(("all",))
     return {

@@ -30,9 +30,10 @@ from hybridvo.evaluation.pair_errors import pair_errors, true_motion
 from hybridvo.files import fingerprint, versions
 from hybridvo.flow import FlowField, MeasuredFlow
 from hybridvo.geometry import se3_log
+from hybridvo.network.models import Models
 from hybridvo.odometry import Odometry
 from hybridvo.options import Options
-from hybridvo.pipeline import Models, check_method, weights_hash
+from hybridvo.pipeline import check_method, weights_hash
 from hybridvo.refinement.depth import depth_ratio
 from hybridvo.results import State, Step
 from hybridvo.tracking.state import TrackerState

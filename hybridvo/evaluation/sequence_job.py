@@ -18,8 +18,8 @@ from hybridvo.evaluation.protocols import same_intrinsics
 from hybridvo.evaluation.scores import FACTORS, scale_warning, sequence_row
 from hybridvo.flow import MeasuredFlow, dis_flow, file_flow
 from hybridvo.geometry import invert
+from hybridvo.network.models import Models
 from hybridvo.odometry import Odometry
-from hybridvo.pipeline import Models
 from hybridvo.trajectory import Trajectory
 from hybridvo.types import Frame
 

@@ -18,8 +18,9 @@ from hybridvo.errors import InputError, LockedError
 from hybridvo.evaluation.comparison import WRITTEN, compare
 from hybridvo.evaluation.plan import ComparisonOptions, expand, methods_to_run
 from hybridvo.evaluation.sequence_job import PAIR_COLUMNS
+from hybridvo.network.models import Models
 from hybridvo.odometry import Odometry
-from hybridvo.pipeline import METHODS, Models, weights_hash
+from hybridvo.pipeline import METHODS, weights_hash
 from hybridvo.results import RelativePose
 from hybridvo.synthetic.render import make_scene, write_sintel
 from hybridvo.trajectory import read_trajectory

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from hybridvo.errors import InputError
+from hybridvo.estimation import refine
 from hybridvo.geometry import rotation_angle, se3_exp
-from hybridvo.pipeline import refine
 from hybridvo.refinement.batch import BatchedPose, BatchOptions
 from hybridvo.refinement.torch_backend import refine_batch
 from hybridvo.results import Reason, State
