@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, TypeVar, dataclass_transform
 from pydantic import ConfigDict, Field, ValidationError
 from pydantic.dataclasses import dataclass
 
-from hybridvo.calibration import MIN_CONFIDENCE, SURE
+from hybridvo.calibration import MIN_CONFIDENCE
 from hybridvo.errors import InputError
 
 T = TypeVar("T")
@@ -89,7 +89,7 @@ class SelectOptions:
         min_confidence: probability of being right (0 to 1) below which a motion is degraded.
     """
 
-    consult_below: Share = SURE
+    consult_below: Share = MIN_CONFIDENCE
     refits: Annotated[int, Field(ge=0, le=16)] = 2
     min_confidence: Share = MIN_CONFIDENCE
 

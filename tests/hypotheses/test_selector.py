@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hybridvo.calibration import CLEAR_RIGHT, SURE
+from hybridvo.calibration import CLEAR_RIGHT, MIN_CONFIDENCE
 from hybridvo.errors import InputError
 from hybridvo.estimation import estimate, refine
 from hybridvo.geometry import ego_flow, se3_exp
@@ -106,7 +106,7 @@ def test_low_confidence_is_degraded_with_its_probability_and_a_wide_covariance(c
     sure = MaskSelector(Oracle(nowhere, refits=False, confidence=0.99)).select(found)
     scorer = Oracle(nowhere, refits=False, confidence=0.05, margin=0.01)
     chosen = MaskSelector(scorer).select(found)
-    assert chosen.probability < SURE < sure.probability and chosen.mask is None
+    assert chosen.probability < MIN_CONFIDENCE < sure.probability and chosen.mask is None
     answer = Context().refine(pair, found, chosen)
     assert answer.status.state is State.DEGRADED and not answer.ok and answer.usable
     assert answer.probability == chosen.probability
