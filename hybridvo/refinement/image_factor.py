@@ -18,6 +18,8 @@ from functools import cache
 
 import numpy as np
 
+from hybridvo.calibration import EVEN_PARTS, UNEVEN_LIGHT
+from hybridvo.options import RefineOptions
 from hybridvo.refinement import photometric_kernels as kernels
 from hybridvo.refinement.full_fit import tile_size
 from hybridvo.refinement.pixels import as_contiguous, typical
@@ -29,22 +31,11 @@ CUTOFF = 3.0
 """c of the Geman-McClure kernel, in standard deviations."""
 NOISE_FLOOR = 0.1
 """Grey levels: rounding to 8 bits leaves 0.08 after the finest blur."""
-NOISE_PIXELS = 2000
-"""Pixels that the noise estimate looks at: it is then good to 3 %."""
-TILES = 110
-"""As in the refinement: errors may be correlated within a tile."""
 PARTS = ((2, 2), (4, 1))
 """Rows and columns of parts of the image that are held against each other: a lens errs by
 quadrant, a rolling shutter by row."""
-EVEN = 0.7
-"""Dispersion of the parts' scores, as shares of the model's, below which they agree: rendered pairs
-have 0.25 in the median, 0.55 at the 90th percentile; with a rolling shutter 1.0 and 2.0."""
 ROWS, COLUMNS = 5, 7
 """Nodes of the fields."""
-EXPLAINED = 0.15
-"""Share of the weighted squared residuals that the fields must explain to be used. Of rendered
-pairs with even light they explain 0.02 to 0.12, with a vignette of 30 % in the corners, a lamp or
-a gamma of 0.6 from 0.26 on."""
 SMOOTH = 0.01
 """Weight of the differences between neighbouring nodes, in shares of a node's typical weight."""
 
@@ -121,7 +112,7 @@ class ImageFactor:
         self._project(T)
         for _ in range(2):
             self._settle()
-        self._uneven_here = self._even_light(EXPLAINED)
+        self._uneven_here = self._even_light(UNEVEN_LIGHT)
         self.uneven_light |= self._uneven_here
         self._settle()
 
@@ -176,7 +167,7 @@ class ImageFactor:
 
     def _settle(self) -> None:
         """Noise of the last projection, and the light under it."""
-        step = max(1, len(self._index) // NOISE_PIXELS)
+        step = max(1, len(self._index) // 2000)  # enough for 3 %
         lengths, weight = np.abs(self._r[::step]), self._buffer[kernels.W, ::step]
         seen = lengths >= 0  # not NaN
         if seen.any():
@@ -219,7 +210,7 @@ class ImageFactor:
         the tiles by ``inflation``, and by ``agreement`` where that is not enough.
         """
         height, width = self._shape
-        tile = tile_size((height, width), TILES)
+        tile = tile_size((height, width), RefineOptions().tiles)
         columns, rows = -(-width // tile), -(-height // tile)
         scores, curvature = np.zeros((rows * columns, 6)), np.zeros((rows * columns, 6, 6))
         meat = np.zeros((6, 6))
@@ -239,7 +230,7 @@ class ImageFactor:
         scale = 1.0 / (max(1.0, clusters * dispersion) * self._inflation)
         parts = scale * _dispersion(scores.reshape(rows, columns, 6), model)
         # what the parts disagree about is seen; as much again is common to them and is not
-        self.agreement = min(1.0, (EVEN / max(parts, EVEN)) ** 2)
+        self.agreement = min(1.0, (EVEN_PARTS / max(parts, EVEN_PARTS)) ** 2)
         self._scale = scale * self.agreement
 
 

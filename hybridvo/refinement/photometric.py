@@ -41,15 +41,12 @@ MIN_AGREEMENT = 0.5
 """Agreement of the parts of the image below which the status mentions it."""
 COARSE_SPREAD = 0.3
 """Coarser blurs are used where the flow leaves more than this many finest blurs undecided."""
-TOLERANCE = 0.1
-"""Length of the last step, in standard deviations of the joint estimate."""
 MID_GREY = 128.0
 """Taken off every grey value, so that gain and offset are nearly independent."""
 STRIPS, STRIP_ROWS = 4, 28
 """Sharpness is measured on so many strips of so many rows."""
 UNLIKE = 1.1
 """Ratio of two sharpnesses from which on an image is blurred to match the other."""
-MAX_BLUR_PX = 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,7 +150,7 @@ def _refine(pair: FramePair, pose: RelativePose, options: PhotometricOptions) ->
         factor.use(images[0].blurred(blur, more[0]), images[1].blurred(blur, more[1]), T)
         half = (options.iterations + 1) // 2
         for steps in (half, options.iterations - half):
-            T = gauss_newton((factor, prior), T, SolverOptions(steps, TOLERANCE)).T
+            T = gauss_newton((factor, prior), T, SolverOptions(steps, tolerance=0.1)).T
             factor.estimate(T)
     return _judged(pose, factor, prior, T, options)
 
@@ -323,7 +320,7 @@ def missing_blur(image: GreyImage, other: GreyImage) -> float:
     """
     if not image.sharpness > UNLIKE * other.sharpness > 0:
         return 0.0
-    low, high = 0.0, MAX_BLUR_PX
+    low, high = 0.0, 4.0
     for _ in range(5):
         middle = 0.5 * (low + high)
         if image.sharpness_under(middle) > other.sharpness:

@@ -250,24 +250,23 @@ def coarse_grid(
     if usable < MIN_USABLE * h * w or usable < MIN_USABLE_PIXELS:
         count, box = pixels.usable_box()
         if count < options.min_pixels:
-            return _too_few(pair, count, options.min_pixels)
+            why = too_few(pair.prev.depth, pair.flow, count, options.min_pixels)
+            return RelativePose.failed(*why, "refine")
         pixels.crop(pair.prev.camera, pair.curr.camera, box)
         samples, h, w, stride = pixels.samples(options.coarse_pixels)
     return CoarseGrid(pixels, samples, (h, w, stride), size, box)
 
 
-def _too_few(pair: FramePair, count: int, minimum: int) -> RelativePose:
-    """The failure that names what is missing."""
-    depth, flow = np.asarray(pair.prev.depth), np.asarray(pair.flow)
+def too_few(depth: np.ndarray, flow: np.ndarray, count: int, minimum: int) -> tuple[Reason, str]:
+    """Reason and words for a pair with ``count`` usable pixels, fewer than the ``minimum``."""
     with np.errstate(invalid="ignore"):
         depths = int(np.count_nonzero((depth > kernels.MIN_DEPTH) & (depth < kernels.MAX_VALUE)))
         flows = int(np.count_nonzero((np.abs(flow) < kernels.MAX_VALUE).all(axis=2)))
-    reason, what = Reason.LOW_INLIERS, f"{count} usable pixels"
     if depths < minimum:
-        reason, what = Reason.NO_VALID_DEPTH, f"{depths} pixels with valid depth"
-    elif flows < minimum:
-        reason, what = Reason.NO_FLOW, f"{flows} pixels with valid flow"
-    return RelativePose.failed(reason, f"{what}, {minimum} needed", "refine")
+        return Reason.NO_VALID_DEPTH, f"{depths} pixels with valid depth, {minimum} needed"
+    if flows < minimum:
+        return Reason.NO_FLOW, f"{flows} pixels with valid flow, {minimum} needed"
+    return Reason.LOW_INLIERS, f"{count} usable pixels, {minimum} needed"
 
 
 def as_contiguous(array: np.ndarray, dtype: Any = None) -> np.ndarray:

@@ -12,8 +12,8 @@ import torch
 from hybridvo.errors import InputError
 from hybridvo.geometry import ego_flow, pixel_grid, se3_exp
 from hybridvo.refinement import coarse_fit, kernels
+from hybridvo.refinement.batch import from_tiles, gather_pixels, sample_depth, to_tiles
 from hybridvo.refinement.pixels import typical
-from hybridvo.refinement.torch_backend import solve_small
 from hybridvo.refinement.torch_factors import (
     KERNELS,
     RobustNoise,
@@ -22,8 +22,8 @@ from hybridvo.refinement.torch_factors import (
     linearize,
     residuals,
     score_sum,
+    solve_small,
 )
-from hybridvo.refinement.torch_pixels import from_tiles, gather_pixels, sample_depth, to_tiles
 from hybridvo.torch_geometry import left_update, pp, reproject, se3
 from hybridvo.types import Camera, PairBatch
 from tests.refinement.batches import F64, noisy_batch
@@ -92,7 +92,7 @@ def test_derivatives_against_autograd() -> None:
     """The Jacobian in the pose, and the sensitivity to the log depth, of all three rows."""
     batch, T = noisy_batch(size=(6, 7), seed=5)
     batch = replace(batch, depth_curr=torch.full((2, 6, 7), 4.0, dtype=F64))
-    pixels = gather_pixels(batch, use_depth_curr=True)
+    pixels = gather_pixels(batch, with_depth=True)
     pose = se3(T)
     terms = residuals(pixels, pose)
     zero = torch.zeros(2, 6, dtype=F64)
@@ -116,7 +116,7 @@ def test_normal_equations_against_dense_algebra(kernel: str) -> None:
     weights = torch.rand(2, 5, 6, dtype=F64, generator=torch.Generator().manual_seed(1))
     c = KERNELS[kernel].cutoff
     how = RobustNoise(torch.tensor([[0.4, 0.05, 0.02], [0.3, 0.02, 0.05]], dtype=F64), kernel, c)
-    pixels = gather_pixels(batch, weights, use_depth_curr=True)
+    pixels = gather_pixels(batch, weights, with_depth=True)
     present = pixels.has_depth_curr
     assert present is not None and 0 < present.sum() < present.numel()
     found = linearize(pixels, se3(T), how, run=10, scores=True)
