@@ -6,12 +6,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 
 from hybridvo.errors import InputError
 from hybridvo.refinement import kernels
+from hybridvo.refinement.covariance import direction_is_known
 from hybridvo.refinement.depth import SURFACE
 from hybridvo.results import RelativePose, Status
 from hybridvo.torch_geometry import MAX_DEPTH, MIN_DEPTH, pixel_grid, pp, rays, se3
@@ -70,7 +70,6 @@ class BatchedPose:
         covariance = self.covariance[index].detach().double().cpu().numpy()
         noise = self.noise[index].tolist()
         T = self.SE3[index].detach().matrix().double().cpu().numpy()
-        spread = np.sqrt(max(np.linalg.eigvalsh(covariance[:3, :3])[-1], 0.0))
         return RelativePose(
             T_curr_prev=T,
             covariance=covariance,
@@ -81,7 +80,7 @@ class BatchedPose:
             residual_scale_px=noise[0],
             depth_noise=noise[1],
             weights=self.weights[index].detach().float().cpu().numpy(),
-            translation_direction_valid=bool(np.linalg.norm(T[:3, 3]) > 3 * spread),
+            translation_direction_valid=direction_is_known(T, covariance),
             probability=float(self.probability[index]),
             method=method,
             terms=("flow", "depth") if len(noise) == 3 else ("flow",),

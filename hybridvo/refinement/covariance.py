@@ -45,6 +45,12 @@ ORDER = np.zeros((6, 6), np.intp)
 ORDER[UPPER] = ORDER.T[UPPER] = np.arange(21)
 
 
+def direction_is_known(T: np.ndarray, covariance: np.ndarray) -> bool:
+    """Whether a translation is longer than three of its own standard deviations."""
+    spread = np.sqrt(max(np.linalg.eigvalsh(covariance[:3, :3])[-1], 0.0))
+    return bool(np.linalg.norm(T[:3, 3]) > 3 * spread)
+
+
 def symmetric(upper: np.ndarray) -> np.ndarray:
     """(6, 6) from its 21 upper-triangle values, row by row."""
     return upper[ORDER]

@@ -20,6 +20,7 @@ import numpy as np
 from hybridvo.errors import InputError
 from hybridvo.geometry import pose_matrix
 from hybridvo.options import PhotometricOptions
+from hybridvo.refinement.covariance import direction_is_known
 from hybridvo.refinement.image_factor import ImageFactor
 from hybridvo.refinement.photometric_kernels import select_pixels
 from hybridvo.refinement.pixels import as_contiguous
@@ -221,7 +222,6 @@ def _judged(
         what = f"they lead {report.shift_sigma:.1f} standard deviations away from the flow's motion"
         return _unchanged(pose, "rejected", what, report)
     T = pose_matrix(T[:3])
-    spread = np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])
     status = pose.status
     if (remarks := _remarks(report)) and not status.message:
         status = replace(status, message=f"images: {remarks}")
@@ -229,7 +229,7 @@ def _judged(
         T_curr_prev=T,
         covariance=covariance,
         status=status,
-        translation_direction_valid=bool(np.linalg.norm(T[:3, 3]) > 3 * spread),
+        translation_direction_valid=direction_is_known(T, covariance),
         terms=(*pose.terms, "images"),
         photometric=report,
     )

@@ -92,18 +92,8 @@ class PixelGrid:
 
     def usable_box(self) -> tuple[int, tuple[int, int, int, int]]:
         """(number of usable pixels, their bounding box) of the full grid."""
-        depth, flow, flow_variance, depth_variance, weights, valid = self.data
-        with np.errstate(invalid="ignore"):
-            usable = (depth > kernels.MIN_DEPTH) & (depth < kernels.MAX_VALUE)
-            usable &= (np.abs(flow) < kernels.MAX_VALUE).all(axis=2)
-            if self.flags & kernels.HAS_FLOW_VARIANCE:
-                usable &= (flow_variance > 0) & (flow_variance < kernels.MAX_VALUE)
-            if self.flags & kernels.HAS_DEPTH_VARIANCE:
-                usable &= (depth_variance >= 0) & (depth_variance < kernels.MAX_VALUE)
-            if self.flags & kernels.HAS_WEIGHTS:
-                usable &= (weights > 0) & (weights < kernels.MAX_VALUE)
-        if self.flags & kernels.HAS_VALID:
-            usable &= valid
+        buffer, height, width = self.strided(1)
+        usable = buffer[kernels.W, : height * width].reshape(height, width) > 0
         count = int(np.count_nonzero(usable))
         if count == 0:
             return 0, (0, 0, 0, 0)

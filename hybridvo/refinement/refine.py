@@ -16,6 +16,7 @@ from hybridvo.calibration import MIN_TILES, WEAK_RATIO
 from hybridvo.geometry import invert, se3_log
 from hybridvo.options import RefineOptions
 from hybridvo.refinement.coarse_fit import fit_coarse
+from hybridvo.refinement.covariance import direction_is_known
 from hybridvo.refinement.full_fit import FullFit, fit_full_grid
 from hybridvo.refinement.pixels import CoarseGrid, coarse_grid
 from hybridvo.results import Hypothesis, Reason, RelativePose, Status
@@ -101,12 +102,11 @@ def refine_pair(
         return RelativePose.failed(*failure, **common)
     status = _status(fit, share, context)
     covariance = _with_doubt(fit)
-    spread = np.sqrt(max(np.linalg.eigvalsh(covariance[:3, :3])[-1], 0.0))
     return RelativePose(
         T_curr_prev=fit.T,
         covariance=covariance,
         status=status,
-        translation_direction_valid=bool(np.linalg.norm(fit.T[:3, 3]) > 3 * spread),
+        translation_direction_valid=direction_is_known(fit.T, covariance),
         probability=context.probability,
         **common,
     )
