@@ -48,7 +48,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     arguments.add_compare(add("compare", _compare, "run methods side by side and write a report"))
     arguments.add_show(
-        add("show", _show, "draw the maps of one pair of a sequence", arguments.where())
+        add("show", _show, "draw the maps of one pair of a sequence", arguments.input())
     )
     arguments.add_evaluate(
         add("evaluate", _evaluate, "errors of a trajectory file against ground truth")
@@ -149,9 +149,10 @@ def _open(args: argparse.Namespace) -> Any:
 
 def _run(args: argparse.Namespace, command: list[str]) -> int:
     from hybridvo.commands.configuration import load_options
-    from hybridvo.commands.inputs import make_models
+    from hybridvo.commands.inputs import weight_files
     from hybridvo.commands.results import summary_text
     from hybridvo.commands.run import Mode, run
+    from hybridvo.network.models import Models
 
     given = {
         f"run.{name}": getattr(args, name)
@@ -159,11 +160,12 @@ def _run(args: argparse.Namespace, command: list[str]) -> int:
     }
     options = load_options(args.config, args.assignments, given | {"flow.source": args.flow})
     mode: Mode = "resume" if args.resume else "overwrite" if args.overwrite else "new"
+    files = weight_files(args.weights, [options.run.method])
     result = run(
         _open(args),
         args.out,
         options,
-        models=make_models(args.weights, options.run.method, options.run.device),
+        models=Models(options.run.device, files),
         mode=mode,
         command=command,
         quiet=args.quiet,
@@ -177,9 +179,11 @@ def _run(args: argparse.Namespace, command: list[str]) -> int:
 
 
 def _show(args: argparse.Namespace, command: list[str]) -> int:
-    from hybridvo.commands.show import show
+    from hybridvo.evaluation.drawing import draw
 
-    written = show(args)
+    given = ("flow", "method", "weights", "steps", "overwrite")
+    options = {name: getattr(args, name) for name in given}
+    written = [str(path) for path in draw(_open(args), args.pair, args.out, **options)]
     _print(args, {"files": written}, "\n".join(written))
     return 0
 

@@ -7,9 +7,11 @@ import csv
 import hashlib
 import json
 import os
+import platform
 import re
 import secrets
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import IO, Any, Literal, NamedTuple
 
@@ -150,6 +152,16 @@ def read_rows(path: str | os.PathLike[str], columns: str, *, words: int = 0) -> 
             raise FormatError(f"{path}:{line}: expected '{columns}', got {text.strip()[:80]!r}.")
         rows.append(Row(line, numbers, tuple(part.strip() for part in parts[count - words :])))
     return rows
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of the packages that decide numbers; absent ones are left out."""
+    found = {"python": platform.python_version()}
+    names = ("hybridvo", "numpy", "scipy", "opencv-python-headless", "numba", "torch", "evo")
+    for name in (*names, "poselib"):
+        with contextlib.suppress(PackageNotFoundError):
+            found[name] = version(name)
+    return found
 
 
 class _Loader(yaml.SafeLoader):

@@ -14,6 +14,7 @@ from typing import Any, Protocol
 import cv2
 import numpy as np
 
+from hybridvo.calibration import DIS_NOISE, FLOW_CONTRADICTION, MIN_TEXTURED
 from hybridvo.errors import InputError
 from hybridvo.types import Frame, FramePair, to_numpy
 
@@ -22,42 +23,6 @@ DIS_PRESETS = {
     "fast": cv2.DISOPTICAL_FLOW_PRESET_FAST,
     "medium": cv2.DISOPTICAL_FLOW_PRESET_MEDIUM,
 }
-"""Names of OpenCV's DIS presets."""
-
-BASE_STD_PX = 0.035
-ERROR_FACTOR = 1.2
-MAX_STD_PX = 5.0
-"""Flow noise: std^2 = BASE_STD_PX^2 + (ERROR_FACTOR * error)^2 per component, at most MAX_STD_PX.
-
-Measured on 18 pairs of the synthetic world (light, static and heavy_two scenes, DIS medium): among
-pixels that disagree by 0.015, 0.035, 0.075, 0.15, 0.25, 0.4, 0.6, 0.9, 1.2 px the true error has a
-(median-based) standard deviation of 0.038, 0.046, 0.077, 0.16, 0.32, 0.53, 0.86, 1.25, 1.8 px.
-"""
-MAX_ERROR_PX = 1.5
-MAX_RELATIVE_ERROR = 0.05
-"""A forward-backward error above both limits says that the pixel is occluded or mismatched."""
-TEXTURE_SIDE = 120
-"""Shorter side in pixels at which texture is looked for: a sensor's noise is averaged out there."""
-TEXTURE_LEVELS = 1.0
-"""Change in grey levels per pixel of that size that is texture."""
-MIN_TEXTURED = 0.002
-"""Smallest fraction of the image with texture across its weakest direction. Real and rendered
-images have 0.4 to 0.8, at a tenth of their brightness 0.006 to 0.28; a covered lens has none."""
-CONTRADICTION_SIDE = 100
-"""Shorter side in pixels at which a given flow is compared with the images."""
-CONTRADICTION_GRADIENT = 2.0
-"""Gradient in grey levels per pixel of that size where a shift can be seen."""
-CONTRADICTION_MIN_PIXELS = 200
-MAX_DIFFERENCE_RATIO = 0.8
-MIN_STILL_RATIO = 2.0
-"""A flow contradicts its images where the median difference after warping is above the first ratio
-times that without warping, while DIS reaches less than 1 / the second ratio of it (less one grey
-level).
-
-Measured on 27 pairs, rendered and real: warped over unwarped is 0.04 to 0.2 for the right flow, up
-to 0.25 with noise of 3 px or 30 % of wrong pixels; 1.3 to 1.8 for a negated or backward flow, 1.0
-for none, 0.85 to 1.2 for twice the flow. Half the flow (0.5 to 0.7) passes.
-"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,9 +55,9 @@ class FlowProvider(Protocol):
 def dis_flow(preset: str = "medium", forward_backward: bool = True) -> FlowProvider:
     """Provider of OpenCV's DIS flow on grey images (Kroeger et al., ECCV 2016).
 
-    A provider may serve several trackers and threads, and can be pickled. Where an image has no
-    texture (a covered lens, a dropped frame, parallel stripes) there is no flow: DIS itself would
-    return zero there, and both directions agree on it.
+    A provider may serve several trackers and threads. Where an image has no texture (a covered
+    lens, a dropped frame, parallel stripes) there is no flow: DIS itself would return zero there,
+    and both directions agree on it.
 
     Args:
         preset: ``ultrafast``, ``fast`` or ``medium``.
@@ -131,9 +96,6 @@ class _Dis:
         # a DIS object that two threads use at once ends the process
         self._threads = threading.local()
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        return _Dis, (self._preset, self._forward_backward)
-
     def __call__(self, prev: Frame, curr: Frame) -> FlowField:
         """Flow from ``prev`` to ``curr``; None where an image is missing or too small for DIS."""
         none = FlowField(None, source="dis")
@@ -160,12 +122,13 @@ def _textured(gray: np.ndarray) -> bool:
     """Whether some of an image changes along every direction, above the noise of a dark sensor."""
     if min(gray.shape) < 2:
         return False
-    factor = max(1, min(gray.shape) // TEXTURE_SIDE)
+    # at 120 pixels or more on the shorter side a sensor's noise is averaged out
+    factor = max(1, min(gray.shape) // 120)
     small = cv2.resize(gray, None, fx=1 / factor, fy=1 / factor, interpolation=cv2.INTER_AREA)
     small = cv2.blur(small.astype(np.float32), (3, 3))
     gradient = np.stack(np.gradient(small), axis=-1).reshape(-1, 2)
     weaker = np.linalg.eigh(gradient.T @ gradient)[1][:, 0]
-    return bool(np.mean(np.abs(gradient @ weaker) > TEXTURE_LEVELS) > MIN_TEXTURED)
+    return bool(np.mean(np.abs(gradient @ weaker) > 1.0) > MIN_TEXTURED)  # grey levels a pixel
 
 
 def forward_backward_check(
@@ -173,27 +136,28 @@ def forward_backward_check(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Variance and validity from the disagreement of the flows in both directions.
 
-    The error is e(x) = |F(x) + B(x + F(x))| with B sampled bilinearly. The constants of the
-    variance were measured on the synthetic world (see ``BASE_STD_PX``).
+    The error is e(x) = |F(x) + B(x + F(x))| with B sampled bilinearly.
 
     Args:
         forward: (H, W, 2) float32 px, previous to current, on the previous grid.
         backward: (H, W, 2) float32 px, current to previous, on the current grid.
 
     Returns:
-        variance (H, W) float32 px^2 per component, and valid (H, W) bool: False where the error
-        exceeds 1.5 px and 5 % of the flow, or where the flow leaves the image or is not finite.
+        variance (H, W) float32 px^2 per component, base^2 + (factor e)^2 of ``DIS_NOISE`` and at
+        most (5 px)^2; valid (H, W) bool: False where the error exceeds 1.5 px and 5 % of the flow,
+        or where the flow leaves the image or is not finite.
     """
     height, width = forward.shape[:2]
     du, dv = cv2.split(np.nan_to_num(forward, nan=1e9, posinf=1e9, neginf=-1e9))
     u, v = _targets(du, dv)
     back = cv2.remap(backward, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     squared = (du + back[..., 0]) ** 2 + (dv + back[..., 1]) ** 2
-    limit = np.maximum(MAX_ERROR_PX**2, MAX_RELATIVE_ERROR**2 * (du * du + dv * dv))
+    limit = np.maximum(1.5**2, 0.05**2 * (du * du + dv * dv))
     valid = (squared <= limit) & (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)
-    variance = np.float32(BASE_STD_PX**2) + np.float32(ERROR_FACTOR**2) * squared
-    np.clip(variance, None, np.float32(MAX_STD_PX**2), out=variance)
-    variance[~np.isfinite(variance)] = MAX_STD_PX**2
+    base, factor = (np.float32(value) for value in DIS_NOISE)
+    variance = base**2 + factor**2 * squared
+    np.clip(variance, None, np.float32(5.0**2), out=variance)
+    variance[~np.isfinite(variance)] = 5.0**2
     return variance, valid
 
 
@@ -288,7 +252,7 @@ def contradiction(pair: FramePair) -> str | None:
     if rgb_prev is None or rgb_curr is None or flow is None or pair.flow_source == "dis":
         return None
     height, width = flow.shape[:2]
-    factor = max(1, min(height, width) // CONTRADICTION_SIDE)
+    factor = max(1, min(height, width) // 100)  # at 100 pixels and more, details do not matter
     size = (width // factor, height // factor)
     first, second = (
         cv2.blur(
@@ -302,15 +266,16 @@ def contradiction(pair: FramePair) -> str | None:
         return None
     small, seen = _shrunk(flow, pair.flow_valid, factor, size)
     du, dv = cv2.Sobel(first, cv2.CV_32F, 1, 0) / 8, cv2.Sobel(first, cv2.CV_32F, 0, 1) / 8
-    seen &= cv2.magnitude(du, dv) > CONTRADICTION_GRADIENT
+    seen &= cv2.magnitude(du, dv) > 2.0  # grey levels a pixel: where a shift can be seen
     seen &= _lands_inside(small) & _lands_inside(own)
-    if np.count_nonzero(seen) < CONTRADICTION_MIN_PIXELS:
+    if np.count_nonzero(seen) < 200:
         return None
     given, best, still = (
         float(np.median(_warped_difference(first, second, shift)[seen]))
         for shift in (small, own, np.zeros_like(own))
     )
-    if given < MAX_DIFFERENCE_RATIO * still or still < MIN_STILL_RATIO * best + 1:
+    fits, is_decidable = FLOW_CONTRADICTION
+    if given < fits * still or still < is_decidable * best + 1:
         return None
     return (
         f"the flow ({pair.flow_source}) warps the previous image onto the current one hardly "

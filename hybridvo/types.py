@@ -27,9 +27,6 @@ FOCAL_RANGE = (1e-3, 1e9)
 """Focal lengths in pixels whose inverses and squares single precision can hold."""
 
 
-# -- checks ---------------------------------------------------------------------------------------
-
-
 def to_numpy(value: Any, name: str) -> np.ndarray:
     """Numpy view of an array, a tensor or nested lists; masked floats become NaN.
 
@@ -110,9 +107,6 @@ def as_rigid(T: Any, where: str, tolerance: float = 1e-6, *, many: bool = False)
             f"0 0 0 1), got {bad.tolist()}."
         )
     return T
-
-
-# -- inputs ---------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,6 @@ PLAUSIBLE_DEPTH_M = (0.1, 200.0)
 """Metres; a depth map whose median lies outside is not in metres."""
 EVERYDAY_DEPTH_M = (0.3, 8.0)
 """Metres; where the median of an indoor depth map usually lies."""
-SKY_DEPTH_M = 1000.0
-"""Metres; renderers mark the sky with larger values, which say nothing about the unit."""
 UNITS_PER_METRE = {1000: "millimetres", 5000: "TUM's unit", 100: "centimetres", 256: "KITTI's unit"}
 """Depth units in use, the most frequent first."""
 
@@ -43,7 +41,7 @@ def stamp_unit(stamps: np.ndarray) -> tuple[float, str]:
 def typical_depth(depth: np.ndarray) -> float | None:
     """Median of the valid depths without the sky, in the map's unit; None where there are none."""
     values = depth[np.isfinite(depth) & (depth > 0)].astype(np.float64)
-    near = values[values <= SKY_DEPTH_M]
+    near = values[values <= 1000.0]  # renderers mark the sky with larger values
     values = near if near.size > 0.1 * values.size else values
     return float(np.median(values)) if values.size else None
 

@@ -91,7 +91,7 @@ def answers(
     if not found.is_ambiguous:
         chosen = {"clear": chosen["selector"]}
     for name, selection in chosen.items():
-        motion = pipeline.refine_selection(pair, found, selection, ctx)
+        motion = ctx.refine(pair, found, selection)
         yield name, selection.evidence, ego_flow_error(motion.T_curr_prev, T, depth, pair)
 
 

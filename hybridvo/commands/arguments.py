@@ -25,8 +25,8 @@ def common() -> argparse.ArgumentParser:
     return common
 
 
-def where(required: bool = True) -> argparse.ArgumentParser:
-    """Which sequence."""
+def input(required: bool = True) -> argparse.ArgumentParser:
+    """Which sequence, and what its folder does not say."""
     given = argparse.ArgumentParser(add_help=False)
     where = given.add_mutually_exclusive_group(required=required)
     where.add_argument("path", nargs="?", metavar="DIR", help="folder of the sequence")
@@ -34,12 +34,6 @@ def where(required: bool = True) -> argparse.ArgumentParser:
     given.add_argument(
         "--dataset", metavar="KIND", help=f"one of {', '.join(KINDS)} (default: detected)"
     )
-    return given
-
-
-def input(required: bool = True) -> argparse.ArgumentParser:
-    """Which sequence, and what its folder does not say."""
-    given = where(required)
     given.add_argument(
         "--camera", metavar="FILE|fx,fy,cx,cy", help="camera.yaml, ROS camera_info, or numbers"
     )
@@ -132,8 +126,6 @@ def add_compare(compare: argparse.ArgumentParser) -> None:
     add("--protocol", choices=("paper", "trajectory14"), help=paper)
     add("--worst", type=int, default=3, help="worst pairs shown for each method")
     add("--jobs", type=int, default=1, metavar="N", help="sequences at a time, a process each")
-    cluster = "of a Dask cluster (tcp://host:8786) that works instead; extra 'cluster'"
-    add("--scheduler", metavar="ADDRESS", help=cluster)
     exists = compare.add_mutually_exclusive_group()
     exists.add_argument("--resume", action="store_true", help="keep the finished sequences")
     exists.add_argument("--overwrite", action="store_true", help="replace results in --out")

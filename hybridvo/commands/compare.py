@@ -6,20 +6,24 @@ import argparse
 from pathlib import Path
 from typing import Literal
 
+from hybridvo.commands.inputs import weight_files
 from hybridvo.commands.progress import Progress
-from hybridvo.evaluation.comparison import ComparisonOptions, compare
+from hybridvo.evaluation.comparison import compare
+from hybridvo.evaluation.plan import ComparisonOptions
+from hybridvo.pipeline import METHODS
 
 
 def compare_command(args: argparse.Namespace, command: list[str]) -> list[Path]:
     """Run a comparison with the arguments of the command line; the files written."""
     given = (
         *("flow", "dataset", "start", "stop", "stride", "seed", "device"),
-        *("protocol", "worst", "jobs", "scheduler"),
+        *("protocol", "worst", "jobs"),
     )
+    methods = tuple(name.strip() for name in args.methods.split(",") if name.strip())
     options = ComparisonOptions(
         sequences=(*args.paths, *args.sequence),
-        methods=tuple(name.strip() for name in args.methods.split(",") if name.strip()),
-        weights=dict(text.split("=", 1) for text in args.weights if "=" in text),
+        methods=methods,
+        weights=weight_files(args.weights, METHODS if methods == ("all",) else methods),
         **{name: getattr(args, name) for name in given},
     )
     mode: Literal["new", "resume", "overwrite"]

@@ -114,7 +114,8 @@ def _what_runs() -> dict[str, Any]:
     import torch
 
     from hybridvo.errors import InputError
-    from hybridvo.pipeline import METHODS, check_method, warm_up
+    from hybridvo.estimation import warm_up
+    from hybridvo.pipeline import METHODS, check_method
 
     methods = {}
     for method in METHODS:

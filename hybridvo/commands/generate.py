@@ -12,9 +12,6 @@ from hybridvo.synthetic.contact_sheet import write_contact_sheet
 from hybridvo.synthetic.dataset import read_sample, write_samples
 from hybridvo.synthetic.presets import PRESETS, Preset, load_preset
 
-SHOWN = 6
-"""Samples on the contact sheet."""
-
 
 def generate(
     preset: str,
@@ -49,7 +46,7 @@ def generate(
         if report is not None:
             report(done, count)
     sheet = Path(out) / "contact_sheet.png"
-    write_contact_sheet([read_sample(out, i) for i in range(min(SHOWN, count))], sheet)
+    write_contact_sheet([read_sample(out, i) for i in range(min(6, count))], sheet)
     return sheet
 
 

@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
-import platform
 import time
 from collections.abc import Iterable
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import numpy as np
 
-import hybridvo
 from hybridvo.data.sequence import Sequence
 from hybridvo.errors import InputError
 from hybridvo.flow import FlowField, FlowProvider, dis_flow, fallback, file_flow
 from hybridvo.options import Options
-from hybridvo.pipeline import Models, networks_of
+from hybridvo.pipeline import networks_of
 from hybridvo.types import Frame
 
 DARK_LEVEL = 20.0
@@ -81,26 +77,25 @@ def flow_provider(sequence: Sequence, options: Options) -> FlowProvider:
     return dis
 
 
-def make_models(weights: Iterable[str], method: str, device: str) -> Models:
-    """Networks of a run: the pretrained ones, or the files of ``NAME=FILE``.
+def weight_files(weights: Iterable[str], methods: Iterable[str]) -> dict[str, str]:
+    """Network -> file of the ``NAME=FILE`` that ``--weights`` was given.
 
     Raises:
-        InputError: another form, no such file, a name that the method does not use, or a device
-            that is not there.
+        InputError: another form, no such file, or a name that none of the methods uses.
     """
     files = {}
+    known = sorted({name for method in methods for name in networks_of(method)})
     for text in weights:
         name, sign, path = text.partition("=")
-        known = networks_of(method)
         if not sign or name not in known:
             raise InputError(
-                f"--weights: expected NAME=FILE with {' or '.join(known) or 'no name'} for "
-                f"--method {method}, got {text!r}."
+                f"--weights: expected NAME=FILE with {' or '.join(known) or 'no name'} for these "
+                f"methods, got {text!r}."
             )
         if not Path(path).is_file():
             raise InputError(f"--weights {name}: {path}: no such file.")
         files[name] = path
-    return Models(device, files)
+    return files
 
 
 def is_dark(rgb: np.ndarray | None) -> bool:
@@ -108,12 +103,3 @@ def is_dark(rgb: np.ndarray | None) -> bool:
     if rgb is None:
         return False
     return float(np.percentile(rgb[::4, ::4].max(axis=2), 90)) < DARK_LEVEL
-
-
-def versions() -> dict[str, str]:
-    """Versions of Python and of the packages that decide numbers; absent ones are left out."""
-    found = {"python": platform.python_version(), "hybridvo": hybridvo.__version__}
-    for name in ("numpy", "scipy", "opencv-python-headless", "numba", "torch", "evo", "poselib"):
-        with contextlib.suppress(PackageNotFoundError):
-            found[name] = version(name)
-    return found

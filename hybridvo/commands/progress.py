@@ -13,9 +13,6 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as Bar
 
-PLAIN_INTERVAL_S = 5.0
-"""Seconds between progress lines where stderr is no terminal."""
-
 
 @contextlib.contextmanager
 def interruptible() -> Iterator[threading.Event]:
@@ -90,7 +87,7 @@ class Progress:
         rate = f"{speed:.1f} {self._unit}/s" + (f", {failed} failed" if failed else "")
         if self._console.is_terminal:
             self._bar.update(self._task, completed=done, rate=rate)
-        elif now - self._last >= PLAIN_INTERVAL_S or done == self._total:
+        elif now - self._last >= 5.0 or done == self._total:
             self._last = now
             self.say(f"{self._label}: {done}/{self._total} {self._unit}, {rate}")
 

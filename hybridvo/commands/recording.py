@@ -21,11 +21,6 @@ from hybridvo.types import Frame
 MAX_IMAGES = 300
 """Images of a kind in a recording: with the sizes below about 15 MB at most."""
 MAX_SIDE = 480
-JPEG_QUALITY = 70
-SIGMAS = 3.0
-"""Size of the ellipsoids, in standard deviations."""
-SINCE_1970 = 1e8
-"""Seconds; larger stamps are dates."""
 
 
 def check_recording(path: str | os.PathLike[str]) -> None:
@@ -101,7 +96,7 @@ class Recording:
         rr, log = self._rr, self._stream.log
         self._stream.set_time("frame", sequence=step.index)
         # stamps of sensors count from 1970, those of rendered sequences from their start
-        clock = "timestamp" if step.timestamp > SINCE_1970 else "duration"
+        clock = "timestamp" if step.timestamp > 1e8 else "duration"
         self._stream.set_time("time", **{clock: step.timestamp})
         T = step.T_world_cam
         log("world/camera", rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]))
@@ -126,7 +121,7 @@ class Recording:
         values, axes = np.linalg.eigh(motion.covariance[:3, :3])
         if np.linalg.det(axes) < 0:
             axes[:, 0] *= -1
-        sizes = SIGMAS * np.sqrt(np.maximum(values, 0.0))
+        sizes = 3.0 * np.sqrt(np.maximum(values, 0.0))  # standard deviations
         log("world/camera/covariance", rr.Transform3D(mat3x3=axes))
         log("world/camera/covariance", rr.Ellipsoids3D(half_sizes=[sizes], colors=[213, 94, 0]))
 
@@ -149,5 +144,5 @@ class Recording:
         enlarged = rgb.shape[1] < size[0]  # weights may stand on a coarser grid
         method = cv2.INTER_NEAREST if enlarged else cv2.INTER_AREA
         bgr = cv2.resize(np.ascontiguousarray(rgb[..., ::-1]), size, interpolation=method)
-        _, content = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+        _, content = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, 70])
         return self._rr.EncodedImage(contents=content.tobytes(), media_type="image/jpeg")

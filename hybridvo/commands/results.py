@@ -12,7 +12,6 @@ from hybridvo.data.sequence import Sequence
 from hybridvo.evaluation.metrics import Alignment, evaluate
 from hybridvo.evaluation.pair_errors import mean_pair_errors
 from hybridvo.files import atomic_write, write_json
-from hybridvo.geometry import pose_matrix
 from hybridvo.refinement.depth import is_step
 from hybridvo.trajectory import Trajectory
 
@@ -30,18 +29,6 @@ def write_motions(folder: Path, rows: list[dict[str, Any]]) -> Trajectory:
         arrays: dict[str, Any] = {name: np.array([row[name] for row in rows]) for name in names}
         np.savez(file, **arrays)
     return trajectory
-
-
-def ground_truth(sequence: Sequence, frames: Iterable[int]) -> Trajectory | None:
-    """True poses of those frames that have one, or None."""
-    if sequence.poses is None:
-        return None
-    known = [i for i in frames if np.isfinite(sequence.poses[i]).all()]
-    if not known:
-        return None
-    # text files carry six digits: made orthonormal as the trajectory demands
-    T = np.stack([pose_matrix(sequence.poses[i][:3]) for i in known])
-    return Trajectory(sequence.timestamps[known], T)
 
 
 def summarise(rows: list[dict[str, Any]], sequence: Sequence, method: str) -> dict[str, Any]:

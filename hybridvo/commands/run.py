@@ -17,22 +17,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 import hybridvo
 from hybridvo.commands import results
-from hybridvo.commands.inputs import TimedFlow, flow_provider, is_dark, versions
+from hybridvo.commands.inputs import TimedFlow, flow_provider, is_dark
 from hybridvo.commands.progress import Progress, interruptible
 from hybridvo.commands.recording import Recording, check_recording
 from hybridvo.commands.run_folder import RESULTS, STATE, Mode, RunFolder
 from hybridvo.data.sequence import Sequence
 from hybridvo.errors import InputError
-from hybridvo.evaluation.pair_errors import pair_errors
-from hybridvo.files import fingerprint
-from hybridvo.geometry import invert, se3_log
+from hybridvo.evaluation.metrics import true_trajectory
+from hybridvo.evaluation.pair_errors import pair_errors, true_motion
+from hybridvo.files import fingerprint, versions
+from hybridvo.geometry import se3_log
+from hybridvo.network.models import Models
 from hybridvo.odometry import Odometry
 from hybridvo.options import Options
-from hybridvo.pipeline import Models, check_method, weights_hash
+from hybridvo.pipeline import check_method, weights_hash
 from hybridvo.refinement.depth import depth_ratio
 from hybridvo.results import State, Step
 from hybridvo.tracking.state import TrackerState
@@ -236,13 +236,9 @@ class _Job:
 
     def _errors(self, prev: Frame | None, step: Step) -> dict[str, Any] | None:
         """Errors of a step against the ground truth, or None where there is none."""
-        poses = self.sequence.poses
-        if poses is None or prev is None or prev.depth is None:
+        T_true = None if prev is None else true_motion(self.sequence, prev.index, step.index)
+        if T_true is None or prev is None or prev.depth is None:
             return None
-        T_world_prev, T_world_curr = poses[prev.index], poses[step.index]
-        if not (np.isfinite(T_world_prev).all() and np.isfinite(T_world_curr).all()):
-            return None
-        T_true = invert(T_world_curr) @ T_world_prev
         camera = self.sequence.camera(step.index)
         return pair_errors(step.T_curr_prev, T_true, prev.depth, prev.camera, camera)
 
@@ -253,7 +249,7 @@ class _Job:
             folder.write_state("interrupted")
             return RunResult(EXIT_INTERRUPTED, {"state": "interrupted", "frames": 0})
         trajectory = results.write_motions(path, rows)
-        gt = results.ground_truth(self.sequence, self.frames)
+        gt = true_trajectory(self.sequence, self.frames)
         summary = results.summarise(rows, self.sequence, self.options.run.method)
         summary["out"] = os.fspath(path)
         if interrupted:

@@ -142,8 +142,7 @@ def _train(args: argparse.Namespace, command: str, task: Any, device: str, worke
 
     from hybridvo.errors import InputError
     from hybridvo.files import write_json
-    from hybridvo.training.export import RUN
-    from hybridvo.training.provenance import source_commit
+    from hybridvo.training.export import RUN, source_commit
     from hybridvo.training.trainer import CHECKPOINT, LOG, Trainer
 
     if args.threads is not None:

@@ -15,14 +15,12 @@ from hybridvo.data.image_io import image_size
 from hybridvo.data.lists import sorted_files
 from hybridvo.errors import FormatError, InputError
 from hybridvo.files import atomic_write, parse_yaml, read_text
-from hybridvo.types import Camera
+from hybridvo.types import Camera, as_number
 
 CAMERA_FILE = "camera.yaml"
 IMAGES = (".png", ".jpg", ".jpeg")
 REQUIRED = ("fx", "fy", "cx", "cy", "width", "height")
 KNOWN = (*REQUIRED, "distortion", "depth_scale", "fps")
-BROWN_COUNTS = (4, 5, 8)
-"""Lengths of k1 k2 p1 p2 [k3 [k4 k5 k6]], OpenCV's order."""
 
 TEMPLATE = """\
 # The camera of the images in rgb/, in pixels; (0, 0) is the centre of the top-left pixel.
@@ -101,7 +99,8 @@ def parse_camera(
         return camera
     if isinstance(camera, Camera):
         return Calibration(camera)
-    if (numbers := _four_numbers(camera)) is not None:
+    numbers = [as_number(part) for part in os.fspath(camera).split(",")]
+    if len(numbers) == 4 and np.isfinite(numbers).all():
         return Calibration(Camera(*numbers, *shape))
     try:
         return read_camera_file(Path(camera))
@@ -191,15 +190,6 @@ def write_camera_template(directory: str | os.PathLike[str]) -> Path:
     return path
 
 
-def _four_numbers(camera: str | os.PathLike[str]) -> tuple[float, float, float, float] | None:
-    parts = os.fspath(camera).split(",")
-    try:
-        fx, fy, cx, cy = (float(part) for part in parts)
-        return fx, fy, cx, cy
-    except ValueError:
-        return None
-
-
 def _in_our_words(content: dict[Any, Any], path: Path) -> tuple[dict[str, Any], list[str]]:
     """The content with our keys: those of ROS and RealSense renamed, unknown ones refused."""
     matrix = _first_of(content, "camera_matrix", "K", "k")
@@ -249,11 +239,8 @@ def _data(value: Any) -> Any:
 
 def _number(value: Any, where: str) -> float:
     """A finite number of a file."""
-    try:
-        number = float("nan") if isinstance(value, bool) else float(value)
-    except (TypeError, ValueError, OverflowError):
-        number = float("nan")
-    if not np.isfinite(number):
+    number = as_number(value)
+    if isinstance(value, bool) or not np.isfinite(number):
         raise FormatError(f"{where}: expected a finite number, got {str(value)[:40]!r}.")
     return number
 
@@ -261,7 +248,7 @@ def _number(value: Any, where: str) -> float:
 def _distortion(value: Any, path: Path) -> tuple[float, ...]:
     if value is None or value == []:
         return ()
-    if not isinstance(value, list) or len(value) not in BROWN_COUNTS:
+    if not isinstance(value, list) or len(value) not in (4, 5, 8):
         raise FormatError(
             f"{path}: distortion: expected a list of 4, 5 or 8 numbers [k1, k2, p1, p2, k3, ...]."
         )

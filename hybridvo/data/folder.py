@@ -22,7 +22,6 @@ from hybridvo.errors import InputError
 from hybridvo.files import read_rows
 from hybridvo.units import stamp_unit
 
-DEFAULT_FPS = 30.0
 INNER_FOLDERS = ("rgb", "depth", "flow")
 
 
@@ -189,34 +188,28 @@ def _stamps_and_poses(
     root: Path, frames: list[Path], fps: float | None, told: list[str]
 ) -> tuple[np.ndarray, np.ndarray | None]:
     """Seconds of all frames and their ground-truth poses, where poses.txt has them."""
+    pose_file, poses = root / "poses.txt", None
+    pose_stamps = np.zeros(0)
     stamps = _listed_stamps(root / "timestamps.txt", frames, told)
-    pose_file = root / "poses.txt"
-    if not pose_file.exists():
-        return _assumed_stamps(root, frames, fps, told) if stamps is None else stamps, None
-    pose_stamps, poses = read_poses(pose_file)
-    pose_stamps, converted = to_seconds(pose_stamps, pose_file.name)
-    told += converted
-    if stamps is None and len(poses) == len(frames):
-        return pose_stamps, poses
+    if pose_file.exists():
+        pose_stamps, poses = read_poses(pose_file)
+        pose_stamps, converted = to_seconds(pose_stamps, pose_file.name)
+        told += converted
+        if stamps is None and len(poses) == len(frames):
+            return pose_stamps, poses
     if stamps is None:
-        stamps = _assumed_stamps(root, frames, fps, told)
-    matched, missing = poses_at(stamps, pose_stamps, poses, str(pose_file))
-    told += missing
-    return stamps, matched
-
-
-def _assumed_stamps(
-    root: Path, frames: list[Path], fps: float | None, told: list[str]
-) -> np.ndarray:
-    """Seconds from the file names, else from a frame rate."""
-    if (named := _stamps_in_names(frames, told)) is not None:
-        return named
-    if fps is None:
-        told.append(
-            f"{root.name}: no time stamps (timestamps.txt, one a line); {DEFAULT_FPS:g} frames a "
-            f"second assumed."
-        )
-    return np.arange(len(frames)) / (fps or DEFAULT_FPS)
+        stamps = _stamps_in_names(frames, told)
+    if stamps is None:
+        if fps is None:
+            told.append(
+                f"{root.name}: no time stamps (timestamps.txt, one a line); 30 frames a second "
+                f"assumed."
+            )
+        stamps = np.arange(len(frames)) / (fps or 30.0)
+    if poses is not None:
+        poses, missing = poses_at(stamps, pose_stamps, poses, str(pose_file))
+        told += missing
+    return stamps, poses
 
 
 def _own_stamps(path: Path, files: list[Path], told: list[str]) -> np.ndarray | None:

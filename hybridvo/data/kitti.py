@@ -16,12 +16,9 @@ from hybridvo.files import read_rows, read_text
 from hybridvo.geometry import invert
 from hybridvo.types import Camera
 
-FRAMES_PER_SECOND = 10.0
 DEPTH_FOLDERS = ("depth", "depth_2", "depth_0")
 LEFT_AND_RIGHT = (("image_2", "image_3"), ("image_0", "image_1"))
 IMAGE_PATTERN = r"(\d+)\.(?:png|jpg)"
-MAX_ENTRY = 1e12
-"""No entry of a projection matrix is larger."""
 DISPARITY_SIGMA_PX = 0.5
 """Assumed standard deviation of a block-matched disparity, px: sets the relative depth noise."""
 
@@ -35,6 +32,7 @@ class KittiSequence(Sequence):
     """
 
     kind = "kitti"
+    frames_per_second = 10.0  # where times.txt is missing
     depth_source = "file"
     depth_scale = 256.0
     looks_for = "kitti: calib.txt and image_2 or image_0"
@@ -73,7 +71,7 @@ class KittiSequence(Sequence):
                     f"{calibration}: expected the camera of {right_name} to the right of the one "
                     f"of {left_name}."
                 )
-        stamps, told = _read_times(root / "times.txt", numbers)
+        stamps, told = _read_times(root / "times.txt", numbers, self.frames_per_second)
         listing = Listing(
             rgb=[left[n] for n in numbers],
             depth=[depth.get(n) for n in numbers],
@@ -162,7 +160,7 @@ def _read_projections(path: Path) -> dict[str, np.ndarray]:
         except ValueError:
             P = np.zeros((3, 4))
         is_rectified = P[1, 0] == 0 and np.allclose(P[2, :3], (0, 0, 1)) and P[0, 0] * P[1, 1] > 0
-        if not (is_rectified and np.abs(P).max() < MAX_ENTRY):
+        if not (is_rectified and np.isfinite(P).all()):
             raise FormatError(
                 f"{path}:{line}: expected {name}: fx 0 cx tx 0 fy cy ty 0 0 1 tz, got "
                 f"{rest[:200]!r}."
@@ -178,11 +176,11 @@ def _projection(matrices: dict[str, np.ndarray], number: str, path: Path) -> np.
     return matrices[name]
 
 
-def _read_times(path: Path, numbers: list[int]) -> tuple[np.ndarray, list[str]]:
+def _read_times(path: Path, numbers: list[int], per_second: float) -> tuple[np.ndarray, list[str]]:
     """Line i belongs to image number i."""
     if not path.exists():
-        told = f"{path}: not there; stamps count {FRAMES_PER_SECOND:g} frames a second."
-        return (np.array(numbers) - numbers[0]) / FRAMES_PER_SECOND, [told]
+        told = f"{path}: not there; stamps count {per_second:g} frames a second."
+        return (np.array(numbers) - numbers[0]) / per_second, [told]
     times, warnings = to_seconds([row.numbers[0] for row in read_rows(path, "seconds")], path.name)
     if numbers[-1] >= len(times):
         raise FormatError(
@@ -205,8 +203,8 @@ def _read_poses(path: Path, numbers: list[int], P_left: np.ndarray) -> tuple[np.
     T_cam_cam0[:3, 3] = np.linalg.solve(P_left[:, :3], P_left[:, 3])
     for i, n in enumerate(numbers):
         if n < len(rows) and np.isfinite(rows[n].numbers).all():
-            M = np.reshape(rows[n].numbers, (3, 4))
-            poses[i] = rigid(M[:, :3], M[:, 3], f"{path}:{rows[n].line}") @ invert(T_cam_cam0)
+            pose = rigid(np.reshape(rows[n].numbers, (3, 4)), f"{path}:{rows[n].line}")
+            poses[i] = pose @ invert(T_cam_cam0)
     missing = int(np.isnan(poses[:, 0, 0]).sum())
     told = f"{path}: {len(rows)} poses; {missing} of {len(numbers)} have no ground truth."
     return poses, [told] if missing else []

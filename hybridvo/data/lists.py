@@ -13,12 +13,11 @@ from scipy.spatial.transform import Rotation
 from hybridvo.errors import FormatError, InputError
 from hybridvo.files import read_rows
 from hybridvo.geometry import pose_matrix
+from hybridvo.types import as_rigid
 from hybridvo.units import stamp_unit
 
 MAX_STAMP_DIFFERENCE_S = 0.02
 """Largest difference in seconds between stamps that belong together (the TUM tools' value)."""
-MAX_POSITION_M = 1e12
-"""No position is larger, and squares of it are finite."""
 TIMED_POSE = "timestamp tx ty tz qx qy qz qw"
 
 
@@ -104,17 +103,16 @@ def check_increasing(stamps: np.ndarray, where: str) -> None:
         )
 
 
-def rigid(R: np.ndarray, t: np.ndarray, where: str) -> np.ndarray:
-    """(4, 4) pose of a file: rotation brought onto the manifold, position in metres.
+def rigid(pose: np.ndarray, where: str) -> np.ndarray:
+    """(4, 4) of the (3, 4) pose of a file, its rotation brought onto the manifold.
 
     Raises:
-        FormatError: a matrix that is no rotation to 1 %, or a position beyond 1e12 m.
+        FormatError: values that are not finite, or a matrix that is no rotation to 1 %.
     """
-    if np.abs(R).max() > 2 or np.abs(R @ R.T - np.eye(3)).max() > 1e-2 or np.linalg.det(R) < 0:
-        raise FormatError(f"{where}: expected a rotation, got {R.tolist()}.")
-    if np.abs(t).max() > MAX_POSITION_M:
-        raise FormatError(f"{where}: expected a position in metres, got {t.tolist()}.")
-    return pose_matrix(np.column_stack([R, t]))
+    try:
+        return pose_matrix(as_rigid(np.vstack([pose, (0, 0, 0, 1)]), where, 1e-2)[:3])
+    except InputError as error:
+        raise FormatError(str(error)) from None
 
 
 def read_poses(path: Path, columns: str = TIMED_POSE) -> tuple[np.ndarray, np.ndarray]:
@@ -123,19 +121,19 @@ def read_poses(path: Path, columns: str = TIMED_POSE) -> tuple[np.ndarray, np.nd
     Poses that are not finite are NaN. Without a column of stamps the first numbers stand for them.
 
     Raises:
-        FormatError: a damaged row, a quaternion whose norm is not 1 to within 1 %, or a position
-            beyond 1e12 m, with its line number.
+        FormatError: a damaged row, or a quaternion whose norm is not 1 to within 1 %, with its
+            line number.
     """
     rows = read_rows(path, columns)
     values = np.array([row.numbers[-7:] for row in rows], dtype=np.float64).reshape(-1, 7)
     finite = np.isfinite(values).all(axis=1)
     norms = np.linalg.norm(values[:, 3:].clip(-2, 2), axis=1)
-    good = (np.abs(norms - 1) < 0.01) & (np.abs(values[:, :3]) <= MAX_POSITION_M).all(axis=1)
-    if (finite & ~good).any():
-        i = int(np.flatnonzero(finite & ~good)[0])
+    bad = finite & ~(np.abs(norms - 1) < 0.01)
+    if bad.any():
+        i = int(np.argmax(bad))
         raise FormatError(
-            f"{path}:{rows[i].line}: expected a position in metres and a unit quaternion qx qy qz "
-            f"qw, got {values[i].tolist()}."
+            f"{path}:{rows[i].line}: expected a unit quaternion qx qy qz qw, got "
+            f"{values[i].tolist()}."
         )
     poses = np.full((len(rows), 4, 4), np.nan)
     if finite.any():

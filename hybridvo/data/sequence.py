@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import itertools
 import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -121,7 +122,6 @@ def iter_pairs(
     start: int = 0,
     stop: int | None = None,
     stride: int = 1,
-    on_error: Callable[[int, Exception], None] | None = None,
 ) -> Iterator[FramePair]:
     """Consecutive pairs of a sequence; each frame is read once, two are in memory.
 
@@ -133,12 +133,10 @@ def iter_pairs(
         start: first frame.
         stop: the one after the last frame.
         stride: step between frames.
-        on_error: called with the index of a frame (or of a pair's previous frame) that cannot be
-            read and with the exception; that pair is left out. By default the exception is raised.
 
     Raises:
-        InputError: a range without a pair; flow files asked for where there are none, or with a
-            stride above 1. The iterator raises what reading a frame raises.
+        InputError: a negative range; flow files asked for where there are none, or with a stride
+            above 1. The iterator raises what reading a frame raises.
     """
     stop = len(sequence) if stop is None else min(stop, len(sequence))
     if stride < 1 or start < 0:
@@ -151,31 +149,8 @@ def iter_pairs(
             f"{sequence.name}: flow files lead from one frame to the next, not over a stride of "
             f"{stride}; {remedy}."
         )
-    return _pairs(sequence, flow, range(start, stop, stride), on_error)
-
-
-def _pairs(
-    sequence: Sequence,
-    flow: Callable[[Frame, Frame], Any] | None,
-    indices: range,
-    on_error: Callable[[int, Exception], None] | None,
-) -> Iterator[FramePair]:
-    prev: Frame | None = None
-    for index in indices:
-        curr = pair = None
-        failing = index
-        try:
-            curr = sequence.frame(index)
-            if prev is not None:
-                failing = prev.index
-                pair = _pair(sequence, flow, prev, curr)
-        except (InputError, OSError) as error:
-            if on_error is None:
-                raise
-            on_error(failing, error)
-        if pair is not None:
-            yield pair
-        prev = curr
+    frames = (sequence.frame(index) for index in range(start, stop, stride))
+    return (_pair(sequence, flow, prev, curr) for prev, curr in itertools.pairwise(frames))
 
 
 def _pair(

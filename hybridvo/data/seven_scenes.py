@@ -14,8 +14,6 @@ from hybridvo.errors import FormatError
 from hybridvo.files import read_text
 from hybridvo.types import Camera
 
-INVALID_DEPTH = 65535
-FRAMES_PER_SECOND = 30.0
 IMAGE_PATTERN = r"frame-(\d+)\.(?:color|rgb)\.(?:png|jpg|jpeg)"
 DEPTH_PATTERN = r"frame-(\d+)\.depth\.png"
 
@@ -29,6 +27,7 @@ class SevenScenesSequence(Sequence):
     """
 
     kind = "7scenes"
+    frames_per_second = 30.0
     depth_scale = 1000.0
     looks_for = "7scenes: frame-000000.color.png, .depth.png, .pose.txt"
 
@@ -38,7 +37,7 @@ class SevenScenesSequence(Sequence):
         depth = numbered_files(root, DEPTH_PATTERN)
         pose_files = numbered_files(root, r"frame-(\d+)\.pose\.txt")
         name = f"{root.parent.name}_{root.name}" if root.name.startswith("seq-") else root.name
-        numbers, listing = numbered_listing(name, rgb, depth, FRAMES_PER_SECOND)
+        numbers, listing = numbered_listing(name, rgb, depth, self.frames_per_second)
         poses = np.full((len(numbers), 4, 4), np.nan)
         for i, n in enumerate(numbers):
             try:
@@ -61,7 +60,7 @@ class SevenScenesSequence(Sequence):
     def _read_depth(self, path: Path, index: int, rgb: np.ndarray | None) -> np.ndarray:
         stored = read_depth(path)
         depth = self._metres(stored)
-        depth[stored == INVALID_DEPTH] = 0.0
+        depth[stored == 65535] = 0.0
         return depth
 
 
@@ -73,4 +72,4 @@ def _read_pose(path: Path) -> np.ndarray:
         raise FormatError(f"{path}: expected 16 numbers of a 4x4 matrix ({error}).") from None
     if not np.isfinite(T).all():
         return np.full((4, 4), np.nan)
-    return rigid(T[:3, :3], T[:3, 3], str(path))
+    return rigid(T[:3], str(path))

@@ -14,7 +14,6 @@ from hybridvo.errors import FormatError, InputError
 from hybridvo.geometry import invert
 from hybridvo.types import Camera
 
-FRAMES_PER_SECOND = 24.0
 IMAGE_PASSES = ("final", "clean", "albedo")
 SUFFIXES = {"flow": "flo", "depth": "dpt", "camdata_left": "cam", "invalid": "png"}
 FOLDERS = (*IMAGE_PASSES, *SUFFIXES, "occlusions")
@@ -30,6 +29,7 @@ class SintelSequence(Sequence):
     """
 
     kind = "sintel"
+    frames_per_second = 24.0
     depth_source = "true"
     flow_is_true = True
     looks_for = "sintel: .../{clean,final,flow,depth,camdata_left}/NAME with frame_0001.*"
@@ -46,7 +46,7 @@ class SintelSequence(Sequence):
         }
         rgb = numbered_files(images, r"frame_(\d+)\.(?:png|jpg|jpeg)")
         numbers, listing = numbered_listing(
-            name, rgb, files["depth"], FRAMES_PER_SECOND, files["flow"]
+            name, rgb, files["depth"], self.frames_per_second, files["flow"]
         )
         if not files["camdata_left"]:
             raise InputError(

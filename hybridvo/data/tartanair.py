@@ -20,10 +20,8 @@ from hybridvo.errors import InputError
 from hybridvo.geometry import ned_to_camera
 from hybridvo.types import Camera
 
-FRAMES_PER_SECOND = 10.0
 VERSIONS = {"V1": ("left", "flow"), "V2": ("lcam_front", "flow_lcam_front")}
 """Version -> (camera name in folders and files, folder of the flow)."""
-PUBLISHED_WIDTH = 640
 
 
 class TartanAirSequence(Sequence):
@@ -35,6 +33,7 @@ class TartanAirSequence(Sequence):
     """
 
     kind = "tartanair"
+    frames_per_second = 10.0
     depth_source = "true"
     flow_is_true = True
     looks_for = (
@@ -53,7 +52,7 @@ class TartanAirSequence(Sequence):
         flow = numbered_files(root / flow_folder, r"(\d+)_\d+_flow\.(?:npy|png)")
         pose_file = root / f"pose_{camera}.txt"
         name = "_".join(root.parts[-3:]) if root.parent.name in ("Easy", "Hard") else root.name
-        numbers, listing = numbered_listing(name, rgb, depth, FRAMES_PER_SECOND, flow)
+        numbers, listing = numbered_listing(name, rgb, depth, self.frames_per_second, flow)
         listing.poses, told = _read_poses(pose_file, numbers)
         listing.warnings += told
         masks = [_mask_file(path) for path in flow.values()]
@@ -71,7 +70,7 @@ class TartanAirSequence(Sequence):
         height, width = self.height, self.width
         camera = Camera(width / 2, width / 2, (width - 1) / 2, (height - 1) / 2, height, width)
         told = f"{self.name}: images are {width} pixels wide, TartanAir's 640: focal length scaled."
-        return Calibration(camera, warnings=() if width == PUBLISHED_WIDTH else (told,))
+        return Calibration(camera, warnings=() if width == 640 else (told,))
 
     def _read_depth(self, path: Path, index: int, rgb: np.ndarray | None) -> np.ndarray:
         if path.suffix == ".png":

@@ -19,20 +19,21 @@ from hybridvo.files import read_rows
 from hybridvo.geometry import invert, pose_matrix
 from hybridvo.types import Camera
 
-ICL_FRAMES_PER_SECOND = 30.0
-ICL = (481.2, 480.0, 319.5, 239.5)
-ICL_REFLECTION = np.diag([1.0, -1.0, 1.0, 1.0])
-DEFAULT = (525.0, 525.0, 319.5, 239.5)
-FREIBURG1 = (517.306408, 516.469215, 318.643040, 255.313989)
-FREIBURG2 = (520.908620, 521.007327, 325.141442, 249.701764)
-FREIBURG3 = (535.4, 539.2, 320.1, 247.6)
-BONN = (542.822841, 542.576870, 315.593520, 237.756098)
 # Published with the data sets: fx fy cx cy and k1 k2 p1 p2 k3, by what the folder's name holds.
 PUBLISHED = {
-    ("freiburg1", "fr1_"): (FREIBURG1, (0.262383, -0.953104, -0.005358, 0.002628, 1.163314)),
-    ("freiburg2", "fr2_"): (FREIBURG2, (0.231222, -0.784899, -0.003257, -0.000105, 0.917205)),
-    ("freiburg3", "fr3_"): (FREIBURG3, ()),
-    ("bonn",): (BONN, (0.039903, -0.099343, -0.000730, -0.000144, 0.0)),
+    ("freiburg1", "fr1_"): (
+        (517.306408, 516.469215, 318.643040, 255.313989),
+        (0.262383, -0.953104, -0.005358, 0.002628, 1.163314),
+    ),
+    ("freiburg2", "fr2_"): (
+        (520.908620, 521.007327, 325.141442, 249.701764),
+        (0.231222, -0.784899, -0.003257, -0.000105, 0.917205),
+    ),
+    ("freiburg3", "fr3_"): ((535.4, 539.2, 320.1, 247.6), ()),
+    ("bonn",): (
+        (542.822841, 542.576870, 315.593520, 237.756098),
+        (0.039903, -0.099343, -0.000730, -0.000144, 0.0),
+    ),
 }
 
 # From Bonn's page: the pose of the camera is T_ROS^-1 T T_ROS T_MARKER, T that of the tracked body.
@@ -59,6 +60,7 @@ class TumSequence(Sequence):
     """
 
     kind = "tum"
+    frames_per_second = 30.0  # of ICL-NUIM, which has frame numbers
     depth_scale = 5000.0
     looks_for = "tum: rgb.txt and depth.txt (or associations.txt)"
 
@@ -70,7 +72,7 @@ class TumSequence(Sequence):
         self._is_icl = icl is not None
         listing = _read_lists(root) if (root / "rgb.txt").exists() else _read_pairs(root)
         if self._is_icl:
-            listing.timestamps = listing.timestamps / ICL_FRAMES_PER_SECOND
+            listing.timestamps = listing.timestamps / self.frames_per_second
         pose_file = icl or root / "groundtruth.txt"
         if pose_file.exists():
             self._add_poses(pose_file, listing, is_bonn="bonn" in root.name.lower())
@@ -88,7 +90,8 @@ class TumSequence(Sequence):
         for keys, (intrinsics, distortion) in PUBLISHED.items():
             if any(key in name for key in keys):
                 return Calibration(Camera(*intrinsics, 480, 640), distortion)
-        intrinsics = ICL if self._is_icl else DEFAULT
+        published_icl, default = (481.2, 480.0, 319.5, 239.5), (525.0, 525.0, 319.5, 239.5)
+        intrinsics = published_icl if self._is_icl else default
         told = (
             f"{self.name}: camera {intrinsics} (fx fy cx cy) is assumed: the folder name says "
             f"neither fr1, fr2, fr3 nor Bonn. Give another one with --camera fx,fy,cx,cy or "
@@ -101,8 +104,9 @@ class TumSequence(Sequence):
         stamps, poses = read_poses(path)
         stamps, told = to_seconds(stamps, path.name)
         if self._is_icl:
-            stamps = stamps / ICL_FRAMES_PER_SECOND
-            poses = ICL_REFLECTION @ poses @ ICL_REFLECTION
+            stamps = stamps / self.frames_per_second
+            reflection = np.diag([1.0, -1.0, 1.0, 1.0])
+            poses = reflection @ poses @ reflection
             told.append(f"{path.name}: ICL-NUIM poses (y upwards) are reflected to camera axes.")
         elif is_bonn:
             poses = invert(BONN_ROS) @ poses @ BONN_ROS @ pose_matrix(BONN_MARKER)

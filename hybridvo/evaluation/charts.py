@@ -11,19 +11,13 @@ import pandas as pd
 import plotly.express as px
 from plotly.graph_objects import Figure
 
-from hybridvo.evaluation.metrics import ate
+from hybridvo.evaluation.metrics import aligned
 from hybridvo.evaluation.scores import FAILURE_PX
 from hybridvo.geometry import invert
-from hybridvo.trajectory import Trajectory, read_trajectory
+from hybridvo.trajectory import read_trajectory
 
 FLOOR_PX = 1e-4
 """Smaller errors are drawn here: rounding must not squeeze the logarithmic axis."""
-SHOWN_PATHS = 5
-"""Methods whose lines are shown at first; the legend turns on the others."""
-MAX_POINTS = 1500
-"""Points of a line; longer ones are thinned."""
-QUANTILES = 201
-"""Points of the curve of a distribution."""
 TRUTH = "ground truth"
 LABELS = {
     "epe_l2_px": "EPE [px]",
@@ -67,7 +61,7 @@ def error_distribution(pairs: pd.DataFrame, methods: Sequence[str]) -> list[Figu
     known = pairs.dropna(subset=["epe_l2_px"])
     if known.empty:
         return []
-    share = np.linspace(0, 1, QUANTILES)
+    share = np.linspace(0, 1, 201)
     groups = known.groupby(["flow_source", "method"])["epe_l2_px"]
     curves = groups.quantile(share).clip(lower=FLOOR_PX)
     curves = curves.rename_axis(["flow_source", "method", "below"]).reset_index()
@@ -187,7 +181,7 @@ def path_charts(
         error = px.line(known, x="index", y="epe_l2_px", log_y=True, title=title, **style)
         figures.insert(1, error.add_hline(FAILURE_PX, line_dash="dot"))
     medians = mine.groupby("method")["epe_l2_px"].median().sort_values()
-    shown = {TRUTH, *medians.index[:SHOWN_PATHS]}
+    shown = {TRUTH, *medians.index[:5]}  # the legend turns on the others
     for figure in figures:
         figure.for_each_trace(
             lambda trace: trace.update(visible=True if trace.name in shown else "legendonly")
@@ -206,18 +200,9 @@ def _positions(folder: Path, entries: pd.DataFrame) -> pd.DataFrame:
     gt = paths.get(TRUTH)
     tables = []
     for method, path in paths.items():
-        x, y, z = _in_first_camera(path, gt).T[:, :: len(path) // MAX_POINTS + 1]
+        first = path if gt is None else gt
+        path = path if gt is None else aligned(path, gt)[0]
+        places = path.transformed(invert(first.T_world_cam[0])).positions
+        x, y, z = places.T[:, :: len(path) // 1500 + 1]  # long lines are thinned
         tables.append(pd.DataFrame({"method": method, "right": x, "forward": z, "up": -y}))
     return pd.concat(tables)
-
-
-def _in_first_camera(path: Trajectory, gt: Trajectory | None) -> np.ndarray:
-    """(N, 3) positions in the first true camera, aligned as far as the paths determine it."""
-    if gt is None:
-        return path.transformed(invert(path.T_world_cam[0])).positions
-    for alignment in ("se3", "origin"):
-        error = ate(path, gt, alignment)
-        if error.T_gt_est is not None:
-            path = path.transformed(error.T_gt_est)
-            break
-    return path.transformed(invert(gt.T_world_cam[0])).positions

@@ -2,47 +2,43 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from hybridvo.data.sequence import Sequence, iter_pairs, open_sequence
+from hybridvo.data.sequence import Sequence, iter_pairs
 from hybridvo.errors import InputError
+from hybridvo.estimation import estimate
 from hybridvo.evaluation.maps import (
-    Saliency,
     error_map,
-    integrated_gradients,
     longest_flow,
     moving_pixels,
     object_flow,
     prediction_errors,
-    share_on,
     uncertainty_maps,
 )
-from hybridvo.evaluation.pair_errors import pair_errors
+from hybridvo.evaluation.pair_errors import pair_errors, true_motion
 from hybridvo.evaluation.plots import FlowPanel, ImagePanel, Panel, ScalarPanel, maps_png
-from hybridvo.evaluation.sequence_job import true_motion
-from hybridvo.evaluation.sources import SharedFlow
-from hybridvo.files import atomic_write, write_json
+from hybridvo.evaluation.saliency import last_pass, saliencies
+from hybridvo.files import atomic_write, make_folder, write_json
+from hybridvo.flow import dis_flow
 from hybridvo.geometry import matrix_to_euler_deg
+from hybridvo.network.models import load_weights
 from hybridvo.network.options import KINDS
-from hybridvo.pipeline import DEFAULT_METHOD, estimate
-from hybridvo.results import PixelwisePrediction
+from hybridvo.network.weights import pretrained, pretrained_names
+from hybridvo.pipeline import DEFAULT_METHOD
+from hybridvo.results import PixelwisePrediction, RelativePose
 from hybridvo.types import FramePair
-
-SALIENCY_BLOCK = 4
-"""Pixels whose saliency is summed for display: networks read one of some pixels only."""
 
 
 def draw(
-    sequence: str | Path,
+    sequence: Sequence,
     pair: int,
     out: str | Path,
     *,
-    dataset: str | None = None,
     flow: str = "auto",
     method: str | None = None,
     weights: Iterable[str | Path] = (),
@@ -52,10 +48,9 @@ def draw(
     """Draw the maps of one pair: flow and its parts, error, weights, and what networks look at.
 
     Args:
-        sequence: folder of the sequence.
+        sequence: an open one.
         pair: its first frame.
         out: image to write, .png; the numbers stand beside it as .json.
-        dataset: kind of the sequence; None detects it.
         flow: ``auto`` (files where there are some), ``file`` or ``dis``.
         method: estimate that is looked at; None: the default of ``hybridvo run``.
         weights: networks to look through; empty: the pretrained ones.
@@ -66,7 +61,7 @@ def draw(
         The files written.
 
     Raises:
-        InputError: unknown sequence, pair or weights, or an image that exists or is no PNG.
+        InputError: unknown pair or weights, or an image that exists or is no PNG.
         OutputError: the image cannot be written.
     """
     out = Path(out)
@@ -76,13 +71,12 @@ def draw(
         raise InputError(f"{out}: exists; pass --overwrite.")
     if steps < 1:
         raise InputError(f"steps: expected at least 1, got {steps}.")
+    given = read_pair(sequence, pair, flow)
     found = networks(weights)
-    opened = open_sequence(sequence, dataset)
-    given = read_pair(opened, pair, flow)
     flow_gt = None
-    if opened.has_flow and opened.flow_is_true:
-        flow_gt = given.flow if given.flow_is_true else opened.flow(pair)[0]
-    T_gt = true_motion(opened, pair, pair + 1)
+    if sequence.has_flow and sequence.flow_is_true:
+        flow_gt = given.flow if given.flow_is_true else sequence.flow(pair)[0]
+    T_gt = true_motion(sequence, pair, pair + 1)
     method = method or DEFAULT_METHOD
     motion = estimate(given, method=method)
     panels, numbers, moving = pair_panels(given, motion, T_gt, flow_gt)
@@ -91,9 +85,9 @@ def draw(
         panels += more
         numbers |= values
     source = f"{given.flow_source} (true)" if given.flow_is_true else given.flow_source
-    heading = f"{opened.name}, pair {pair}; flow: {source}; motion: {method}, {motion.status}"
+    heading = f"{sequence.name}, pair {pair}; flow: {source}; motion: {method}, {motion.status}"
     height, width = given.prev.camera.shape
-    out.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(out.parent)
     with atomic_write(out, "wb") as file:
         file.write(maps_png(panels, heading, width / height))
     record = {"title": heading, "image": out.name, "values": numbers}
@@ -111,10 +105,9 @@ def read_pair(sequence: Sequence, index: int, flow: str = "auto") -> FramePair:
         raise InputError(
             f"--pair: {sequence.name} has pairs 0 to {len(sequence) - 2}, got {index}."
         )
-    if flow == "auto":
-        flow = "file" if sequence.has_flow else "dis"
-    provider = SharedFlow(flow, sequence)
-    pair = next(iter(iter_pairs(sequence, provider, start=index, stop=index + 2)))
+    from_files = flow == "file" or (flow == "auto" and sequence.has_flow)
+    provider = None if from_files else dis_flow()
+    pair = next(iter_pairs(sequence, provider, start=index, stop=index + 2))
     if pair.flow is None or pair.prev.depth is None:
         missing = "flow" if pair.flow is None else "depth"
         raise InputError(f"{sequence.name}, pair {index}: there is no {missing} to look at.")
@@ -122,7 +115,7 @@ def read_pair(sequence: Sequence, index: int, flow: str = "auto") -> FramePair:
 
 
 def pair_panels(
-    pair: FramePair, motion: Any, T_gt: np.ndarray | None, flow_gt: np.ndarray | None
+    pair: FramePair, motion: RelativePose, T_gt: np.ndarray | None, flow_gt: np.ndarray | None
 ) -> tuple[list[Panel], dict[str, float | None], np.ndarray]:
     """Panels and numbers that need no network, and (H, W) which pixels move by themselves."""
     flow, depth = np.asarray(pair.flow), np.asarray(pair.prev.depth)
@@ -160,10 +153,11 @@ def pair_panels(
 
 
 def networks(files: Iterable[str | Path] = ()) -> list[tuple[str, Any]]:
-    """(name, network) of the given files, or of all pretrained ones that predict a motion."""
-    from hybridvo.network.models import load_weights
-    from hybridvo.network.weights import pretrained, pretrained_names
+    """(name, network) of the given files, or of all pretrained ones that predict a motion.
 
+    Raises:
+        InputError: a file that cannot be read, or a network that predicts no motion.
+    """
     found = []
     paths = [Path(file) for file in files]
     for path in paths or [pretrained(name) for name in pretrained_names()]:
@@ -185,7 +179,7 @@ def network_panels(
     steps: int,
 ) -> tuple[list[Panel], dict[str, float | None]]:
     """Panels and numbers of one network: uncertainty, errors, saliency of its last pass."""
-    output, inputs, T_start = predict(network, pair)
+    output, inputs, T_start = last_pass(network, pair)
     panels: list[Panel] = []
     numbers: dict[str, float | None] = {}
     if isinstance(output, PixelwisePrediction):
@@ -199,88 +193,14 @@ def network_panels(
             for (what, unit), values in zip(units, prediction_errors(output, *true), strict=True):
                 panels.append(ScalarPanel(f"{name}: error of the {what}", values, unit))
     for what, saliency in saliencies(network, inputs, T_start, steps).items():
-        shown = _block_sums(saliency.magnitude)
+        n = 4  # summed over blocks: networks read one of some pixels only
+        h, w = (size // n for size in saliency.magnitude.shape)
+        shown = saliency.magnitude[: n * h, : n * w].reshape(h, n, w, n).sum(axis=(1, 3))
         relative = shown / max(float(np.percentile(shown, 99)), 1e-30)
         title = f"{name}: saliency of the {what} (last pass)"
         panels.append(ScalarPanel(title, relative, "relative", 1.0, moving))
         numbers |= {
-            f"{name}: saliency of the {what} on moving pixels": share_on(
-                saliency.magnitude, moving
-            ),
+            f"{name}: saliency of the {what} on moving pixels": saliency.share_on(moving),
             f"{name}: part of the {what} that the saliency misses": saliency.completeness_error,
         }
     return panels, numbers
-
-
-def predict(network: Any, pair: FramePair) -> tuple[Any, Any, Any]:
-    """(output, inputs, start) of the last pass of a network."""
-    import torch
-
-    from hybridvo.network.inputs import assemble_inputs
-
-    inputs = assemble_inputs(pair)
-    device = next(network.parameters()).device
-    inputs = inputs.to(device) if device.type != "cpu" else inputs
-    T_start = start_of(network, inputs)
-    with torch.no_grad():
-        return network(inputs, T_start), inputs, T_start
-
-
-def _block_sums(values: np.ndarray) -> np.ndarray:
-    """Sums over square blocks of a map (h, w); a rest at the border is left out."""
-    n = SALIENCY_BLOCK
-    h, w = values.shape[0] // n, values.shape[1] // n
-    return values[: n * h, : n * w].reshape(h, n, w, n).sum(axis=(1, 3))
-
-
-def start_of(network: Any, inputs: Any) -> Any:
-    """Motion that a network of several passes starts its last one from; None for one pass."""
-    from hybridvo.network.normalization import first_motions
-
-    passes = int(network.options.passes)
-    return first_motions(network, inputs, "softmax", passes - 1)
-
-
-def saliencies(network: Any, inputs: Any, T_start: Any, steps: int) -> dict[str, Saliency]:
-    """Integrated gradients of rotation and translation over flow and inverse depth.
-
-    The answer is the length of the predicted rotation (or translation) along its own direction. Of
-    a pixel-wise network it is that of the pixels and weights that the selection chose for the real
-    input: with the choice itself inside, the answer would jump along the path. The path starts at
-    zero flow and zero inverse depth; for scale-free networks, which see the logarithm of the
-    depth, at zero flow. What earlier passes found is held fixed.
-    """
-    import torch
-
-    from hybridvo.network.selection import select_pose
-
-    names = ("flow",) if network.options.scale_free else ("flow", "inverse_depth")
-    given = tuple(getattr(inputs, name) for name in names)
-
-    def run(*tensors: Any) -> Any:
-        return network(replace(inputs, **dict(zip(names, tensors, strict=True))), T_start)
-
-    with torch.no_grad():
-        output = run(*given)
-    found = {}
-    for k, what in enumerate(("rotation", "translation")):
-        if isinstance(output, PixelwisePrediction):
-            maps = {name: getattr(output, name) for name in ("rotation", "translation")}
-            maps = {name: value.clone().requires_grad_() for name, value in maps.items()}
-            motion = select_pose(replace(output, **maps))[k]
-            direction = (motion / motion.norm().clamp(min=1e-12)).detach()
-            (weights,) = torch.autograd.grad((direction * motion).sum(), maps[what])
-            answer = _weighted_map(run, what, weights)
-        else:
-            motion = output[k]
-            answer = _along(run, k, motion / motion.norm().clamp(min=1e-12))
-        found[what] = integrated_gradients(answer, given, steps=steps)
-    return found
-
-
-def _weighted_map(run: Callable[..., Any], name: str, weights: Any) -> Callable[..., Any]:
-    return lambda *tensors: (weights * getattr(run(*tensors), name)).sum()
-
-
-def _along(run: Callable[..., Any], part: int, direction: Any) -> Callable[..., Any]:
-    return lambda *tensors: (direction * run(*tensors)[part]).sum()

@@ -7,25 +7,24 @@ paths: it gets copies, and only paths that determine the alignment.
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from hybridvo.data.base import Sequence
+from hybridvo.data.lists import MAX_STAMP_DIFFERENCE_S
+from hybridvo.data.lists import associate as associate_stamps
 from hybridvo.errors import InputError
 from hybridvo.evaluation.drift import KITTI_LENGTHS, NOT_FINITE, SHORT_LENGTHS, kitti_drift
+from hybridvo.geometry import invert, pose_matrix
 from hybridvo.trajectory import Trajectory, read_trajectory
 
 Alignment = Literal["se3", "sim3", "origin", "none"]
 DeltaUnit = Literal["frames", "s"]
 
-MAX_TIME_DIFFERENCE = 0.02
-"""Largest difference in seconds between the stamps of matched poses (TUM RGB-D's tools)."""
-MIN_MATCHED_SHARE = 0.5
-"""Smallest share of the shorter trajectory that has to find a partner."""
-MIN_POSES = 3
-"""Fewest poses that determine a rigid alignment."""
 MIN_WIDTH = 1e-12
 """Product of the relative widths of both paths below which they are straight: above rounding
 (1e-16), below one millimetre aside on a hundred metres (1e-10)."""
@@ -81,9 +80,7 @@ def _rms(errors: np.ndarray) -> float | None:
 
 
 def associate(est: Trajectory, gt: Trajectory, *, max_diff: float | None = None) -> Association:
-    """Match the poses of two trajectories one to one: by nearest timestamp, through evo.
-
-    Where one of them has no timestamps, poses are matched by index, which needs equal lengths.
+    """Match poses one to one: by nearest timestamp, or by index where one has no timestamps.
 
     Args:
         est: estimated trajectory.
@@ -91,8 +88,6 @@ def associate(est: Trajectory, gt: Trajectory, *, max_diff: float | None = None)
         max_diff: largest difference of matched timestamps, seconds. Default: 0.02, or half the
             median spacing of the sparser trajectory if that is smaller.
     """
-    from evo.core.sync import matching_time_indices
-
     total = min(len(est), len(gt))
     if not (est.has_timestamps and gt.has_timestamps):
         reason = ""
@@ -105,22 +100,18 @@ def associate(est: Trajectory, gt: Trajectory, *, max_diff: float | None = None)
         return Association(indices, indices, total, "index", None, reason)
     if max_diff is None:
         spacings = [float(np.median(np.diff(t.timestamps))) for t in (est, gt) if len(t) > 1]
-        max_diff = min([MAX_TIME_DIFFERENCE] + ([max(spacings) / 2] if spacings else []))
-    short, long = (est, gt) if len(est) <= len(gt) else (gt, est)
-    found = matching_time_indices(short.timestamps, long.timestamps, max_diff)
-    i, j = (np.array(indices, dtype=int) for indices in found)
-    # evo may give one pose of the longer trajectory to two of the shorter: the nearer one keeps it
-    order = np.lexsort((np.abs(short.timestamps[i] - long.timestamps[j]), j))
-    chosen = np.sort(order[np.unique(j[order], return_index=True)[1]])
-    i, j = i[chosen], j[chosen]
+        max_diff = min(MAX_STAMP_DIFFERENCE_S, max(spacings, default=np.inf) / 2)
+    within = np.nextafter(max_diff, np.inf)
+    matches = associate_stamps(est.timestamps, gt.timestamps, within)
+    i, j = np.array(matches, dtype=int).reshape(-1, 2).T
     reason = ""
-    if len(i) < MIN_MATCHED_SHARE * total or not len(i):
+    if 2 * len(i) < total:
         reason = (
             f"only {len(i)} of {total} poses match within {max_diff:.4g} s (estimate "
             f"{est.timestamps[0]:.6f} to {est.timestamps[-1]:.6f} s, ground truth "
             f"{gt.timestamps[0]:.6f} to {gt.timestamps[-1]:.6f} s)"
         )
-    return Association(*((i, j) if short is est else (j, i)), total, "time", max_diff, reason)
+    return Association(i, j, total, "time", max_diff, reason)
 
 
 def _to_evo(trajectory: Trajectory, indices: np.ndarray) -> Any:
@@ -129,12 +120,12 @@ def _to_evo(trajectory: Trajectory, indices: np.ndarray) -> Any:
     return PosePath3D(poses_se3=[T.copy() for T in trajectory.T_world_cam[indices]])
 
 
-def _degeneracy(x: np.ndarray, y: np.ndarray) -> str:
+def _degeneracy(est: np.ndarray, gt: np.ndarray) -> str:
     """Why (M, 3) positions of estimate and truth determine no alignment, or the empty string."""
-    if len(x) < MIN_POSES:
-        return f"not enough poses: {len(x)} matched, an alignment needs {MIN_POSES}"
+    if len(est) < 3:
+        return f"not enough poses: {len(est)} matched, an alignment needs 3"
     centred = []
-    for name, positions in (("estimate", x), ("ground truth", y)):
+    for name, positions in (("estimate", est), ("ground truth", gt)):
         moved = positions - positions.mean(axis=0)
         size = float(np.linalg.norm(moved))
         if not np.isfinite(size):
@@ -152,21 +143,20 @@ def _align(est: Any, gt: Any, alignment: Alignment) -> tuple[np.ndarray, float, 
     """Align the evo path ``est`` to ``gt`` in place: (T_gt_est, scale, reason why it failed)."""
     from evo import EvoException
 
+    T = np.eye(4)
     if alignment == "none":
-        return np.eye(4), 1.0, ""
+        return T, 1.0, ""
     if alignment == "origin":
         return np.asarray(est.align_origin(gt)), 1.0, ""
     reason = _degeneracy(est.positions_xyz, gt.positions_xyz)
     if reason:
-        return np.eye(4), 1.0, reason
+        return T, 1.0, reason
     try:
-        R, t, scale = est.align(gt, correct_scale=alignment == "sim3")
+        T[:3, :3], T[:3, 3], scale = est.align(gt, correct_scale=alignment == "sim3")
     except (EvoException, np.linalg.LinAlgError) as error:
-        return np.eye(4), 1.0, f"evo: {error}"
+        return T, 1.0, f"evo: {error}"
     if scale <= 0:
-        return np.eye(4), 1.0, "the paths are not correlated: no positive scale fits"
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = R, t
+        return T, 1.0, "the paths are not correlated: no positive scale fits"
     return T, float(scale), ""
 
 
@@ -207,6 +197,20 @@ def ate(
     )
 
 
+def aligned(
+    est: Trajectory, gt: Trajectory, alignment: Alignment = "se3"
+) -> tuple[Trajectory, TrajectoryError | None]:
+    """Estimate in the truth's world by the best alignment that the paths determine, and its ATE.
+
+    Paths of which nothing matches start at the same place, and their error is None.
+    """
+    for kind in dict.fromkeys((alignment, "origin")):
+        error = ate(est, gt, kind)
+        if error.T_gt_est is not None:
+            return est.transformed(error.T_gt_est, error.scale or 1.0), error
+    return est.transformed(gt.T_world_cam[0] @ invert(est.T_world_cam[0])), None
+
+
 def rpe(
     est: Trajectory,
     gt: Trajectory,
@@ -230,10 +234,10 @@ def rpe(
     from evo.core.metrics import RPE
 
     match = association or associate(est, gt)
-    reason = match.reason
-    if not reason and delta_unit == "s" and match.by != "time":
+    if match.reason:
+        return TrajectoryError(alignment, match.reason)
+    if delta_unit == "s" and match.by != "time":
         reason = "a distance in seconds needs timestamps in both trajectories"
-    if reason:
         return TrajectoryError(alignment, reason)
     stamps = gt.timestamps[match.gt_indices]
     first, last = _pairs(stamps, delta, delta_unit)
@@ -263,28 +267,27 @@ def _pairs(stamps: np.ndarray, delta: float, unit: DeltaUnit) -> tuple[np.ndarra
         last = first + int(delta)
     else:
         goal = stamps + delta
-        last = np.searchsorted(stamps, goal)
-        before = np.clip(last - 1, 0, len(stamps) - 1)
-        after = np.clip(last, 0, len(stamps) - 1)
-        nearer = np.abs(stamps[before] - goal) < np.abs(stamps[after] - goal)
-        last = np.where(nearer, before, after)
-        half = np.median(np.diff(stamps)) / 2 if len(stamps) > 1 else 0.0
+        after = np.searchsorted(stamps, goal).clip(max=len(stamps) - 1)
+        before = (after - 1).clip(min=0)
+        is_nearer = np.abs(stamps[before] - goal) < np.abs(stamps[after] - goal)
+        last = np.where(is_nearer, before, after)
         # half a frame, and rounding of the stamps
-        last[np.abs(stamps[last] - goal) > 1.01 * half] = len(stamps)
+        reach = 1.01 * np.median(np.diff(stamps)) / 2 if len(stamps) > 1 else 0.0
+        last[np.abs(stamps[last] - goal) > reach] = len(stamps)
     inside = (last < len(stamps)) & (last > first)
     return first[inside], last[inside]
 
 
-def _check(alignment: str, delta: float, delta_unit: str, max_diff: float | None) -> None:
-    if alignment not in ("se3", "sim3", "origin", "none"):
-        raise InputError(f"alignment: expected se3, sim3, origin or none, got {alignment!r}.")
-    if delta_unit not in ("frames", "s"):
-        raise InputError(f"delta_unit: expected frames or s, got {delta_unit!r}.")
-    whole = delta_unit == "s" or float(delta).is_integer()
-    if not (0 < delta < np.inf and whole):
-        raise InputError(f"delta: expected a positive number of {delta_unit}, got {delta!r}.")
-    if max_diff is not None and not 0 <= max_diff < np.inf:
-        raise InputError(f"max_diff: expected seconds >= 0, got {max_diff!r}.")
+def true_trajectory(sequence: Sequence, indices: Iterable[int]) -> Trajectory | None:
+    """True poses of those frames that have one; None where there are none."""
+    if sequence.poses is None:
+        return None
+    known = [i for i in indices if np.isfinite(sequence.poses[i]).all()]
+    if not known:
+        return None
+    # text files carry six digits: made orthonormal as the trajectory demands
+    T = np.stack([pose_matrix(sequence.poses[i][:3]) for i in known])
+    return Trajectory(sequence.timestamps[known], T)
 
 
 def evaluate(
@@ -318,13 +321,7 @@ def evaluate(
     """
     import evo
 
-    for name, value in (("estimate", estimate), ("gt", gt)):
-        if not isinstance(value, Trajectory):
-            raise InputError(
-                f"evaluate.{name}: expected a Trajectory, got {type(value).__name__}. Files are "
-                f"read by hybridvo.trajectory.read_trajectory."
-            )
-    _check(alignment, delta, delta_unit, max_diff)
+    _check(estimate, gt, alignment, delta, delta_unit, max_diff)
     match = associate(estimate, gt, max_diff=max_diff)
     report: dict[str, Any] = {
         "alignment": alignment,
@@ -361,6 +358,25 @@ def evaluate(
     return report | {"reasons": reasons}
 
 
+def _check(
+    estimate: Any, gt: Any, alignment: str, delta: float, delta_unit: str, max_diff: float | None
+) -> None:
+    for name, path in (("estimate", estimate), ("gt", gt)):
+        if not isinstance(path, Trajectory):
+            raise InputError(
+                f"evaluate.{name}: expected a Trajectory, got {type(path).__name__}. Files are "
+                f"read by hybridvo.trajectory.read_trajectory."
+            )
+    if alignment not in ("se3", "sim3", "origin", "none"):
+        raise InputError(f"alignment: expected se3, sim3, origin or none, got {alignment!r}.")
+    if delta_unit not in ("frames", "s"):
+        raise InputError(f"delta_unit: expected frames or s, got {delta_unit!r}.")
+    if not 0 < delta < np.inf or (delta_unit == "frames" and not float(delta).is_integer()):
+        raise InputError(f"delta: expected a positive number of {delta_unit}, got {delta!r}.")
+    if max_diff is not None and not 0 <= max_diff < np.inf:
+        raise InputError(f"max_diff: expected seconds >= 0, got {max_diff!r}.")
+
+
 def evaluate_files(
     est_path: str | os.PathLike[str],
     gt_path: str | os.PathLike[str],
@@ -373,18 +389,8 @@ def evaluate_files(
 ) -> dict[str, Any]:
     """Errors between two trajectory files: what ``hybridvo evaluate EST GT`` prints.
 
-    Args:
-        est_path: estimated trajectory.
-        gt_path: ground truth.
-        format_est: see :func:`hybridvo.trajectory.read_trajectory`.
-        format_gt: the same for the ground truth.
-        axes_est: see :func:`hybridvo.trajectory.read_trajectory`.
-        axes_gt: the same for the ground truth.
-        **options: of :func:`evaluate`.
-
-    Returns:
-        The report of :func:`evaluate` with ``estimate``, ``gt`` (paths) and ``warnings`` (what the
-        readers changed).
+    Formats and axes are those of :func:`hybridvo.trajectory.read_trajectory`, ``options`` those of
+    :func:`evaluate`, whose report it returns with ``estimate``, ``gt`` (paths) and ``warnings``.
 
     Raises:
         InputError: a file that is missing or malformed, or an unknown option.

@@ -1,9 +1,8 @@
 """Errors of one relative pose against the true one: the paper's three, and metric ones beside them.
 
-There is one definition of each name in the house. ``epe`` is the paper's: the mean over pixels *and
-components* of the absolute difference of ego flows at 128x256, with invalid pixels set to zero but
-counted. ``epe_l2_px`` is the usual end-point error: the mean L2 distance over valid pixels at
-native size.
+``epe`` is the paper's: the mean over pixels *and components* of the absolute difference of ego
+flows at 128x256, with invalid pixels set to zero but counted. ``epe_l2_px`` is the usual end-point
+error: the mean L2 distance over valid pixels at native size.
 """
 
 from __future__ import annotations
@@ -13,46 +12,50 @@ from typing import Any
 
 import numpy as np
 
+from hybridvo.data.base import Sequence
+from hybridvo.data.image_io import UNKNOWN_FLOW
+from hybridvo.data.resize import resize_camera
 from hybridvo.errors import InputError
-from hybridvo.geometry import matrix_to_euler_deg, rotation_angle
+from hybridvo.geometry import invert, matrix_to_euler_deg, rotation_angle
 from hybridvo.types import Camera
 
 PAPER_SIZE = (128, 256)
 """(height, width) at which the paper measures its EPE."""
-PAPER_MAX_FLOW_PX = 400.0
-"""Pixels whose true ego flow is at least this long count with error zero in the paper's EPE."""
-PAPER_MIN_DEPTH_M = 1e-12
-"""Added to |z| before the division, as in the published code."""
-UNKNOWN_FLOW_PX = 1e9
-"""Middlebury's mark of an unknown flow vector."""
 MOVING_PX = 1.0
 """A pixel whose true flow differs by more than this from the true ego flow moves by itself."""
 NO_DEPTH = "no pixel has a valid depth and a true motion that stays in front of the camera"
 
 
-def _check(T: Any, depth: Any, camera_prev: Camera, camera_curr: Camera) -> None:
-    for name, pose in T.items():
+def true_motion(sequence: Sequence, prev: int, curr: int) -> np.ndarray | None:
+    """True T_curr_prev (4, 4) between two frames of a sequence, or None where it is not known."""
+    if sequence.poses is None:
+        return None
+    T = invert(sequence.poses[curr]) @ sequence.poses[prev]
+    return T if np.isfinite(T).all() else None
+
+
+def _check(poses: Mapping[str, Any], depth: Any, prev: Camera, curr: Camera) -> None:
+    for name, pose in poses.items():
         if np.shape(pose) != (4, 4) or not np.isfinite(pose).all():
             raise InputError(f"{name}: expected a finite (4, 4) transform, got {np.shape(pose)}.")
-    if np.shape(depth) != camera_prev.shape or camera_curr.shape != camera_prev.shape:
+    if np.shape(depth) != prev.shape or curr.shape != prev.shape:
         raise InputError(
-            f"depth: expected shape {camera_prev.shape} of both cameras, got {np.shape(depth)} and "
-            f"a current camera of {camera_curr.shape}."
+            f"depth: expected shape {prev.shape} of both cameras, got {np.shape(depth)} and "
+            f"a current camera of {curr.shape}."
         )
 
 
 def _moved(
-    T: np.ndarray, K_prev: np.ndarray, K_curr: np.ndarray, inverse_depth: np.ndarray
+    T: np.ndarray, prev: Camera, curr: Camera, inverse_depth: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(x, y) of every pixel (H, W) after the motion, and its moved depth over its depth."""
-    A = K_curr @ T[:3, :3] @ np.linalg.inv(K_prev)
-    b = K_curr @ T[:3, 3]
-    v, u = np.ogrid[: inverse_depth.shape[0], : inverse_depth.shape[1]]
+    """Homogeneous (x, y, s) of every pixel (H, W) after the motion; s is moved depth over depth."""
+    A, b = curr.K @ T[:3, :3] @ np.linalg.inv(prev.K), curr.K @ T[:3, 3]
+    v, u = np.ogrid[: prev.height, : prev.width]
     x, y, s = (A[k, 0] * u + (A[k, 1] * v + A[k, 2]) + b[k] * inverse_depth for k in range(3))
-    return x / s, y / s, s
+    return x, y, s
 
 
-def _inverse(depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _inverse(depth: Any) -> tuple[np.ndarray, np.ndarray]:
     """(H, W) inverse depth, and which depths are valid: finite and positive."""
     inverse_depth = 1.0 / np.asarray(depth, dtype=np.float64)
     # 0 < 1/d < inf drops zero, negative, infinite and NaN depth at once
@@ -65,10 +68,10 @@ def _native_epe(
 ) -> float | None:
     """Mean L2 distance of the two ego flows over valid pixels, px."""
     inverse_depth, valid = _inverse(depth)
-    x_gt, y_gt, s_gt = _moved(T_gt, prev.K, curr.K, inverse_depth)
-    x_est, y_est, s_est = _moved(T_est, prev.K, curr.K, inverse_depth)
+    x_gt, y_gt, s_gt = _moved(T_gt, prev, curr, inverse_depth)
+    x_est, y_est, s_est = _moved(T_est, prev, curr, inverse_depth)
     valid &= s_gt > 0
-    error = np.sqrt((x_est - x_gt) ** 2 + (y_est - y_gt) ** 2)
+    error = np.sqrt((x_est / s_est - x_gt / s_gt) ** 2 + (y_est / s_est - y_gt / s_gt) ** 2)
     error[~(s_est > 0) | ~np.isfinite(error)] = np.hypot(*prev.shape)
     return float(error[valid].mean()) if valid.any() else None
 
@@ -78,31 +81,23 @@ def _paper_epe(
     T_est: np.ndarray, T_gt: np.ndarray, depth: np.ndarray, prev: Camera, curr: Camera
 ) -> float | None:
     """Component mean of |F_ego - F~_ego| at 128x256; None where no pixel has a depth."""
-    height, width = PAPER_SIZE
-    K = []
-    for camera in (prev, curr):
-        sx, sy = width / camera.width, height / camera.height
-        small = np.diag([sx, sy, 1.0]) @ camera.K
-        small[:2, 2] = sx * (camera.cx + 0.5) - 0.5, sy * (camera.cy + 0.5) - 0.5
-        K.append(small)
     # nearest at pixel centres: centre i of the small grid lies at (i + 0.5) / s - 0.5
-    rows = ((np.arange(height) + 0.5) * prev.height / height).astype(int)
-    columns = ((np.arange(width) + 0.5) * prev.width / width).astype(int)
-    depth = depth[np.ix_(rows, columns)].astype(np.float64)
-    valid = np.isfinite(depth) & (depth > 0)
+    rows, columns = (
+        ((np.arange(small) + 0.5) * size / small).astype(int)
+        for small, size in zip(PAPER_SIZE, prev.shape, strict=True)
+    )
+    inverse_depth, valid = _inverse(depth[np.ix_(rows, columns)])
     if not valid.any():
         return None
-    depth = np.where(valid, depth, 1.0)
-    v, u = np.mgrid[:height, :width]
-    points = np.linalg.inv(K[0]) @ np.stack([u, v, np.ones_like(u)]).reshape(3, -1) * depth.ravel()
+    prev, curr = (resize_camera(camera, *PAPER_SIZE) for camera in (prev, curr))
+    v, u = np.ogrid[: PAPER_SIZE[0], : PAPER_SIZE[1]]
     flows = []
     for T in (T_est, T_gt):
-        x, y, z = K[1] @ (T[:3, :3] @ points + T[:3, 3:])
-        # |z| as in the published code ("to avoid reflection"): never undefined
-        z = np.abs(z) + PAPER_MIN_DEPTH_M
-        flows.append(np.stack([x / z - u.ravel(), y / z - v.ravel()]))
-    counted = valid.ravel() & (np.hypot(*flows[1]) < PAPER_MAX_FLOW_PX)
-    return float(np.abs(flows[0] - flows[1])[:, counted].sum()) / (2 * height * width)
+        x, y, s = _moved(T, prev, curr, inverse_depth)
+        s = np.abs(s) + 1e-12  # as in the published code ("to avoid reflection"): never undefined
+        flows.append(np.stack([x / s - u, y / s - v]))
+    counted = valid & (np.hypot(*flows[1]) < 400.0)  # longer true flow counts as right
+    return float(np.abs(flows[0] - flows[1])[:, counted].sum()) / (2 * valid.size)
 
 
 def pair_errors(
@@ -152,9 +147,6 @@ def pair_errors(
 def mean_pair_errors(pairs: Iterable[Mapping[str, float | None]]) -> dict[str, Any]:
     """Means and medians of :func:`pair_errors` over pairs, under the names of ``results.json``.
 
-    Args:
-        pairs: what :func:`pair_errors` returned for each pair.
-
     Returns:
         ``pairs`` (their number), the means ``r_err_deg``, ``t_err``, ``epe``, ``epe_l2_px``,
         ``rot_err_deg_mean``, ``trans_err_mean``, the medians ``rot_err_deg_median``,
@@ -176,45 +168,10 @@ def mean_pair_errors(pairs: Iterable[Mapping[str, float | None]]) -> dict[str, A
         elif len(known) < len(pairs):
             missing = len(pairs) - len(known)
             reasons[key] = f"unknown for {missing} of {len(pairs)} pairs: {NO_DEPTH}"
-    report["reasons"] = reasons
-    return report
+    return report | {"reasons": reasons}
 
 
 @np.errstate(divide="ignore", invalid="ignore", over="ignore")
-def dynamic_fraction(
-    flow_gt: np.ndarray,
-    depth_prev: np.ndarray,
-    T_gt: np.ndarray,
-    camera_prev: Camera,
-    camera_curr: Camera,
-) -> float | None:
-    """Share of valid pixels whose true flow differs from the true ego flow by more than 1 px.
-
-    Args:
-        flow_gt: (H, W, 2) true total flow, px; NaN or components above 1e9 are unknown.
-        depth_prev: (H, W) true depth, metres.
-        T_gt: (4, 4) true ``T_curr_prev``.
-        camera_prev: previous camera, (H, W).
-        camera_curr: current camera, (H, W).
-
-    Returns:
-        The share in [0, 1]; None where no pixel has flow, depth and a point in front of the camera.
-
-    Raises:
-        InputError: shapes that do not match.
-    """
-    _check({"T_gt": T_gt}, depth_prev, camera_prev, camera_curr)
-    if np.shape(flow_gt) != (*camera_prev.shape, 2):
-        raise InputError(f"flow_gt: expected {(*camera_prev.shape, 2)}, got {np.shape(flow_gt)}.")
-    inverse_depth, valid = _inverse(depth_prev)
-    x, y, s = _moved(T_gt, camera_prev.K, camera_curr.K, inverse_depth)
-    du, dv = np.moveaxis(np.asarray(flow_gt, dtype=np.float64), 2, 0)
-    valid &= (np.abs(du) < UNKNOWN_FLOW_PX) & (np.abs(dv) < UNKNOWN_FLOW_PX) & (s > 0)
-    v, u = np.ogrid[: camera_prev.height, : camera_prev.width]
-    moving = np.hypot(x - u - du, y - v - dv)[valid] > MOVING_PX
-    return float(moving.mean()) if len(moving) else None
-
-
 def pair_facts(
     T_gt: np.ndarray | None,
     depth_prev: np.ndarray | None,
@@ -229,13 +186,14 @@ def pair_facts(
         depth_prev: (H, W) depth of the previous frame, metres, or None.
         camera_prev: previous camera, (H, W).
         camera_curr: current camera, (H, W).
-        flow_gt: (H, W, 2) true flow of everything, px, NaN where unknown; None where there is
-            none, or where it holds the motion of the camera alone.
+        flow_gt: (H, W, 2) true flow of everything, px; NaN or beyond 1e9 where unknown. None where
+            there is none, or where it holds the motion of the camera alone.
 
     Returns:
-        ``dynamic_fraction`` (:func:`dynamic_fraction`); ``flow_magnitude_px``: median length of the
-        true ego flow; ``rotation_deg`` and ``translation_m`` of the true motion;
-        ``depth_spread``: 90th over 10th percentile of the valid depth.
+        ``dynamic_fraction``: share of valid pixels whose true flow differs from the true ego flow
+        by more than 1 px; ``flow_magnitude_px``: median length of the true ego flow;
+        ``rotation_deg`` and ``translation_m`` of the true motion; ``depth_spread``: 90th over 10th
+        percentile of the valid depth.
 
     Raises:
         InputError: a pose that is not finite, shapes that do not match.
@@ -247,18 +205,24 @@ def pair_facts(
         facts["translation_m"] = float(np.linalg.norm(T_gt[:3, 3]))
     if depth_prev is None:
         return facts
-    if T_gt is not None and flow_gt is not None:
-        facts["dynamic_fraction"] = dynamic_fraction(
-            flow_gt, depth_prev, T_gt, camera_prev, camera_curr
-        )
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        inverse_depth, valid = _inverse(depth_prev)
-        if valid.any():
-            low, high = np.quantile(inverse_depth[valid], [0.1, 0.9])
-            facts["depth_spread"] = float(high / low)
-        if T_gt is not None:
-            x, y, s = _moved(T_gt, camera_prev.K, camera_curr.K, inverse_depth)
-            v, u = np.ogrid[: camera_prev.height, : camera_prev.width]
-            length = np.hypot(x - u, y - v)[valid & (s > 0)]
-            facts["flow_magnitude_px"] = float(np.median(length)) if length.size else None
+    inverse_depth, valid = _inverse(depth_prev)
+    if valid.any():
+        low, high = np.quantile(inverse_depth[valid], [0.1, 0.9])
+        facts["depth_spread"] = float(high / low)
+    if T_gt is None:
+        return facts
+    _check({"T_gt": T_gt}, depth_prev, camera_prev, camera_curr)
+    x, y, s = _moved(T_gt, camera_prev, camera_curr, inverse_depth)
+    v, u = np.ogrid[: camera_prev.height, : camera_prev.width]
+    du, dv = x / s - u, y / s - v
+    valid &= s > 0
+    if valid.any():
+        facts["flow_magnitude_px"] = float(np.median(np.hypot(du, dv)[valid]))
+    if flow_gt is not None:
+        if np.shape(flow_gt) != (*camera_prev.shape, 2):
+            expected = (*camera_prev.shape, 2)
+            raise InputError(f"flow_gt: expected {expected}, got {np.shape(flow_gt)}.")
+        valid &= (np.abs(flow_gt) < UNKNOWN_FLOW).all(axis=2)
+        moving = np.hypot(du - flow_gt[..., 0], dv - flow_gt[..., 1])[valid] > MOVING_PX
+        facts["dynamic_fraction"] = float(moving.mean()) if len(moving) else None
     return facts

@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 
 from hybridvo.errors import InputError
 from hybridvo.evaluation.maps import colour_wheel, flow_colours
-from hybridvo.evaluation.metrics import Alignment, TrajectoryError, ate
+from hybridvo.evaluation.metrics import Alignment, TrajectoryError, aligned
 from hybridvo.files import atomic_write
 from hybridvo.geometry import invert
 from hybridvo.trajectory import Trajectory
@@ -29,49 +29,17 @@ from hybridvo.trajectory import Trajectory
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 _STYLES = ("-", "--", "-.", ":")
 _TRUTH_COLOUR = "#222222"
-_GRID_COLOUR = "#e4e4e4"
 _FORMATS = (".png", ".pdf", ".svg")
-COLUMNS = 2
-PANEL_WIDTH_INCHES = 5.4
 
 
-def _fit(
-    est: Trajectory, truth: Trajectory, alignment: Alignment
-) -> tuple[Trajectory, TrajectoryError | None]:
-    """Estimate in the truth's world, by the best alignment that the paths determine."""
-    for kind in dict.fromkeys((alignment, "origin")):
-        error = ate(est, truth, kind)
-        if error.T_gt_est is not None:
-            return est.transformed(error.T_gt_est, error.scale or 1.0), error
-    # nothing could be matched: both start at the same place, and no error is drawn
-    T_gt_est = truth.T_world_cam[0] @ invert(est.T_world_cam[0])
-    return est.transformed(T_gt_est), None
+@dataclass(frozen=True, eq=False)
+class _Path:
+    """A line of the figure: label, positions (N, 3) in the first camera, and its errors."""
 
-
-def _label(name: str, error: TrajectoryError | None) -> str:
-    if error is None or error.rmse is None:
-        return f"{name} (no error: poses do not match)"
-    unit, factor = ("m", 1.0) if error.rmse >= 1.0 else ("cm", 100.0)
-    return f"{name}: ATE {error.rmse * factor:.3g} {unit} ({error.alignment})"
-
-
-def _style(axes: Any, title: str, x: str, y: str) -> None:
-    axes.set_title(title, fontsize=10, loc="left", parse_math=False)
-    axes.set_xlabel(x, fontsize=9)
-    axes.set_ylabel(y, fontsize=9)
-    axes.tick_params(labelsize=8)
-    axes.grid(True, color=_GRID_COLOUR, linewidth=0.8)
-    axes.set_axisbelow(True)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
-
-
-def _equal_scale(axes: Any, centre: np.ndarray) -> None:
-    """Same metres per inch on both axes; at least a millimetre, for a camera that does not move."""
-    axes.update_datalim([centre - 5e-4, centre + 5e-4])
-    axes.margins(0.06)
-    axes.set_aspect("equal", adjustable="datalim")
-    axes.autoscale_view()
+    label: str
+    positions: np.ndarray
+    style: dict[str, Any]
+    error: TrajectoryError | None = None
 
 
 def plot_trajectories(
@@ -98,90 +66,113 @@ def plot_trajectories(
     Raises:
         InputError: no trajectory, or another kind of file. OutputError: it cannot be written.
     """
+    path = Path(path)
     if not trajectories:
         raise InputError("plot_trajectories: expected at least one trajectory, got none.")
-    path = Path(path)
-    _check_format(path)
-    drawn: list[tuple[str, np.ndarray, dict[str, Any]]] = []
-    errors: list[tuple[TrajectoryError, dict[str, Any]]] = []
-    if truth is not None:
-        T_first_world = invert(truth.T_world_cam[0])
-        style: dict[str, Any] = {"color": _TRUTH_COLOUR, "linewidth": 2.6, "alpha": 0.55}
-        drawn.append(("ground truth", truth.transformed(T_first_world).positions, style))
-    for index, (name, trajectory) in enumerate(trajectories.items()):
-        style = {
-            "color": _COLOURS[index % len(_COLOURS)],
-            "linestyle": _STYLES[index // len(_COLOURS) % len(_STYLES)],
-            "linewidth": 1.4,
-        }
-        if truth is None:
-            moved, label = trajectory.transformed(invert(trajectory.T_world_cam[0])), name
-        else:
-            fitted, error = _fit(trajectory, truth, alignment)
-            moved, label = fitted.transformed(T_first_world), _label(name, error)
-            if error is not None:
-                errors.append((error, style))
-        drawn.append((label, moved.positions, style))
-
-    # the figure's own canvas: nothing is registered with pyplot, so threads do not meet
-    figure = Figure(figsize=(10.0, 7.4 if errors else 4.8), dpi=130, layout="constrained")
-    FigureCanvasAgg(figure)
-    grid = figure.add_gridspec(2 if errors else 1, 2, height_ratios=[2.0, 1.0] if errors else [1.0])
-    everything = np.concatenate([positions for _, positions, _ in drawn])
-    views = (
-        ("Top view", 0, 2, "x right [m]", "z forward [m]"),
-        ("Side view", 2, 1, "z forward [m]", "y down [m]"),
-    )
-    for column, (heading, a, b, x_label, y_label) in enumerate(views):
-        axes = figure.add_subplot(grid[0, column])
-        _style(axes, heading, x_label, y_label)
-        for _, positions, style in drawn:
-            axes.plot(positions[:, a], positions[:, b], **style)
-        start = drawn[0][1][0]
-        axes.plot(start[a], start[b], "o", color=_TRUTH_COLOUR, markersize=5, zorder=5)
-        _equal_scale(axes, everything[:, [a, b]].mean(axis=0))
-        if b == 1:
-            axes.invert_yaxis()  # y points down in the camera: down on the page as well
-    if errors:
-        axes = figure.add_subplot(grid[1, :])
-        timed = truth is not None and truth.has_timestamps
-        largest = max(float(np.max(error.translation)) for error, _ in errors)
-        unit, factor = ("m", 1.0) if largest >= 1.0 else ("cm", 100.0)
-        _style(axes, "Position error", "time [s]" if timed else "frame", f"error [{unit}]")
-        start_time = truth.timestamps[0] if truth is not None and timed else 0.0
-        for error, style in errors:
-            axes.plot(error.timestamps - start_time, error.translation * factor, **style)
-        axes.set_ylim(bottom=0.0)
-        axes.margins(x=0.01)
-    handles = [figure.axes[0].lines[i] for i in range(len(drawn))]
+    if path.suffix.lower() not in _FORMATS:
+        raise InputError(f"{path}: expected a picture name ending in {', '.join(_FORMATS)}.")
+    paths = _paths(trajectories, truth, alignment)
+    has_errors = any(line.error is not None for line in paths)
+    figure = _figure(10.0, 7.4 if has_errors else 4.8, dpi=130)
+    heights = [2.0, 1.0] if has_errors else [1.0]
+    grid = figure.add_gridspec(len(heights), 2, height_ratios=heights)
+    above, aside = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[0, 1])
+    _draw_view(above, paths, (0, 2), "Top view", "x right [m]", "z forward [m]")
+    _draw_view(aside, paths, (2, 1), "Side view", "z forward [m]", "y down [m]")
+    aside.invert_yaxis()  # y points down in the camera: down on the page as well
+    if has_errors:
+        _draw_errors(figure.add_subplot(grid[1, :]), paths, truth)
     figure.legend(
-        handles,
-        [label for label, _, _ in drawn],
+        above.lines[: len(paths)],
+        [line.label for line in paths],
         loc="outside lower center",
-        ncols=min(3, len(drawn)),
+        ncols=min(3, len(paths)),
         frameon=False,
         fontsize=9,
     )
-    if title:
-        # a folder's name: bytes that are no UTF-8 cannot be drawn, dollars in it are no formula
-        title = title.encode("utf-8", "replace").decode("utf-8")
-        figure.suptitle(title, fontsize=11, parse_math=False)
-    _save(figure, path)
-
-
-def _check_format(path: Path) -> None:
-    if path.suffix.lower() not in _FORMATS:
-        raise InputError(f"{path}: expected a picture name ending in {', '.join(_FORMATS)}.")
-
-
-def _save(figure: Figure, path: Path) -> None:
-    """Whole file or none; no date and no version in it: the same input gives the same bytes."""
-    metadata = {".png": {"Software": None}, ".pdf": {"CreationDate": None}, ".svg": {"Date": None}}
-    kind = path.suffix.lower()
+    # a folder's name: bytes that are no UTF-8 cannot be drawn, dollars in it are no formula
+    title = title.encode("utf-8", "replace").decode("utf-8")
+    figure.suptitle(title, fontsize=11, parse_math=False)
     # a name in letters that the font lacks is drawn as boxes, without a word on stderr for each
     quiet = warnings.catch_warnings(action="ignore", category=UserWarning)
     with atomic_write(path, "wb") as file, quiet:
-        figure.savefig(file, format=kind[1:], metadata=metadata[kind])
+        figure.savefig(file, format=path.suffix.lower()[1:])
+
+
+def _figure(width: float, height: float, dpi: int = 100) -> Figure:
+    """A figure with a canvas of its own: nothing is registered with pyplot, threads do not meet."""
+    figure = Figure(figsize=(width, height), dpi=dpi, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _paths(
+    trajectories: Mapping[str, Trajectory], truth: Trajectory | None, alignment: Alignment
+) -> list[_Path]:
+    """The truth and every estimate, aligned to it, in the first camera."""
+    found = []
+    if truth is not None:
+        style: dict[str, Any] = {"color": _TRUTH_COLOUR, "linewidth": 2.6, "alpha": 0.55}
+        found.append(_Path("ground truth", _in_first_camera(truth, truth), style))
+    for k, (name, trajectory) in enumerate(trajectories.items()):
+        line = _STYLES[k // len(_COLOURS) % len(_STYLES)]
+        style = {"color": _COLOURS[k % len(_COLOURS)], "linestyle": line, "linewidth": 1.4}
+        if truth is None:
+            found.append(_Path(name, _in_first_camera(trajectory, trajectory), style))
+            continue
+        fitted, error = aligned(trajectory, truth, alignment)
+        found.append(_Path(_label(name, error), _in_first_camera(fitted, truth), style, error))
+    return found
+
+
+def _in_first_camera(path: Trajectory, first: Trajectory) -> np.ndarray:
+    return path.transformed(invert(first.T_world_cam[0])).positions
+
+
+def _label(name: str, error: TrajectoryError | None) -> str:
+    if error is None or error.rmse is None:
+        return f"{name} (no error: poses do not match)"
+    unit, factor = ("m", 1.0) if error.rmse >= 1.0 else ("cm", 100.0)
+    return f"{name}: ATE {error.rmse * factor:.3g} {unit} ({error.alignment})"
+
+
+def _draw_view(
+    axes: Any, paths: Sequence[_Path], plane: tuple[int, int], title: str, x: str, y: str
+) -> None:
+    """Paths in a plane of the first camera, with the same metres per inch on both axes."""
+    _style(axes, title, x, y)
+    for line in paths:
+        axes.plot(*line.positions[:, plane].T, **line.style)
+    axes.plot(*paths[0].positions[0, plane], "o", color=_TRUTH_COLOUR, markersize=5, zorder=5)
+    centre = np.concatenate([line.positions for line in paths])[:, plane].mean(axis=0)
+    axes.update_datalim([centre - 5e-4, centre + 5e-4])  # for a camera that does not move
+    axes.margins(0.06)
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.autoscale_view()
+
+
+def _draw_errors(axes: Any, paths: Sequence[_Path], truth: Trajectory | None) -> None:
+    """Position error over time, or over the frames of a truth without time stamps."""
+    known = [(line.error, line.style) for line in paths if line.error is not None]
+    is_timed = truth is not None and truth.has_timestamps
+    start = truth.timestamps[0] if truth is not None and is_timed else 0.0
+    largest = max(float(np.max(error.translation)) for error, _ in known)
+    unit, factor = ("m", 1.0) if largest >= 1.0 else ("cm", 100.0)
+    _style(axes, "Position error", "time [s]" if is_timed else "frame", f"error [{unit}]")
+    for error, style in known:
+        axes.plot(error.timestamps - start, error.translation * factor, **style)
+    axes.set_ylim(bottom=0.0)
+    axes.margins(x=0.01)
+
+
+def _style(axes: Any, title: str, x: str, y: str) -> None:
+    axes.set_title(title, fontsize=10, loc="left", parse_math=False)
+    axes.set_xlabel(x, fontsize=9)
+    axes.set_ylabel(y, fontsize=9)
+    axes.tick_params(labelsize=8)
+    axes.grid(True, color="#e4e4e4", linewidth=0.8)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
 
 
 # -- maps of a pair -------------------------------------------------------------------------------
@@ -239,15 +230,12 @@ def maps_png(panels: Sequence[Panel], heading: str, aspect: float) -> bytes:
     """
     if not panels:
         raise InputError("maps_png: expected at least one panel, got none.")
-    rows = -(-len(panels) // COLUMNS)
-    height = rows * (PANEL_WIDTH_INCHES / aspect * 0.92 + 0.42) + 0.45
-    # the figure's own canvas: nothing is registered with pyplot, so threads do not meet
-    figure = Figure(figsize=(COLUMNS * PANEL_WIDTH_INCHES, height), dpi=100, layout="constrained")
-    FigureCanvasAgg(figure)
-    grid = figure.add_gridspec(rows, COLUMNS)
+    rows, width = -(-len(panels) // 2), 5.4  # inches a panel
+    figure = _figure(2 * width, rows * (width / aspect * 0.92 + 0.42) + 0.45)
+    grid = figure.add_gridspec(rows, 2)
     tops = _shared_tops(panels)
     for k, panel in enumerate(panels):
-        axes = figure.add_subplot(grid[k // COLUMNS, k % COLUMNS])
+        axes = figure.add_subplot(grid[k // 2, k % 2])
         axes.set_title(panel.title, fontsize=10, loc="left", parse_math=False)
         axes.set_xticks([])
         axes.set_yticks([])
@@ -260,7 +248,7 @@ def maps_png(panels: Sequence[Panel], heading: str, aspect: float) -> bytes:
             _scalar(figure, axes, panel, tops[panel.unit], aspect)
     figure.suptitle(heading, fontsize=11, x=0.01, ha="left", parse_math=False)
     stream = io.BytesIO()
-    figure.savefig(stream, format="png", metadata={"Software": None})
+    figure.savefig(stream, format="png")
     return stream.getvalue()
 
 

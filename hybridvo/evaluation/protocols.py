@@ -19,9 +19,6 @@ import yaml
 from hybridvo.errors import InputError
 from hybridvo.types import Camera
 
-SAME_FOCAL = 1e-9
-"""Relative difference of intrinsics that are equal: unchanged cameras have the same bytes."""
-
 
 @dataclass(frozen=True)
 class Protocol:
@@ -64,9 +61,7 @@ def protocols() -> dict[str, Protocol]:
 def same_intrinsics(first: Camera, second: Camera) -> bool:
     """Whether two cameras are one: the pairs that the paper keeps."""
     pairs = ((getattr(c, n) for c in (first, second)) for n in ("fx", "fy", "cx", "cy"))
-    return first.shape == second.shape and all(
-        abs(a - b) <= SAME_FOCAL * first.fx for a, b in pairs
-    )
+    return first.shape == second.shape and all(abs(a - b) <= 1e-9 * first.fx for a, b in pairs)
 
 
 def check_protocol(name: str, sequences: Sequence[Any]) -> Protocol:

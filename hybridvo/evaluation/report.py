@@ -35,8 +35,6 @@ PEERS = (
     *("pnp-ransac", "pnp-ransac-tuned", "usac-magsac", "poselib", "opencv-rgbd", "open3d-rgbd"),
 )
 """Methods of other projects."""
-LEVEL = 1.02
-"""Ratio of two errors below which neither has won."""
 EMBEDDED_BYTES = 2_000_000
 """Images that the page holds, so that it stays below 8 MB with plotly's 5 MB."""
 
@@ -130,12 +128,14 @@ def read_comparison(folder: Path) -> tuple[dict[str, Any], pd.DataFrame]:
     try:
         result = json.loads((folder / "results.json").read_text(encoding="utf-8"))
         pairs = pd.read_csv(folder / "pairs.csv")
-        return result | {"rows": [*result["rows"]], "totals": [*result["totals"]]}, pairs
+        if not {"rows", "totals", "worst_pairs"} <= set(result):
+            raise ValueError("results.json has other fields")
+        return result, pairs
     except FileNotFoundError as error:
         raise InputError(
             f"{error.filename}: no such file; expected the output folder of a comparison."
         ) from None
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, TypeError) as error:
         raise FormatError(
             f"{folder}: results.json or pairs.csv is not what a comparison writes: {error!r}."
         ) from None
@@ -159,37 +159,27 @@ def headline(result: Mapping[str, Any]) -> str:
     order = ranking(rows)
     if not order:
         return "Nothing is scored: no pair has ground truth and depth."
-    first = order[0]
+    first, best = order[0], order[0]["epe_l2_px_median"]
     oracle = ", an oracle" if is_oracle(flow) else ""
     text = (
         f"With {flow} flow{oracle}, {first['method']} has the smallest errors: median "
-        f"{number(first['epe_l2_px_median'])} px (error of the ego flow), {first['failures']} of "
-        f"{first['pairs']} pairs failed (above 1 px, or given up)"
+        f"{number(best)} px (error of the ego flow), {first['failures']} of {first['pairs']} pairs "
+        f"failed (above 1 px, or given up)"
     )
-    for label, others in (
-        ("next is", order[1:2]),
-        ("the best of other projects is", [r for r in order[2:] if r["method"] in PEERS][:1]),
-    ):
-        for row in others:
-            error = number(row["epe_l2_px_median"])
-            text += f"; {label} {row['method']}: {error} px{_times(row, first)}"
-            text += f", {row['failures']} failed"
-    worst = [
-        entry
-        for entry in result["worst_pairs"]
-        if (entry["method"], entry["flow_source"]) == (first["method"], flow)
-    ]
-    if worst and worst[0]["epe_l2_px"] is not None:
-        place = f"{worst[0]['sequence']}, pair {worst[0]['index']}"
-        text += f". Its worst pair is {place}: {number(worst[0]['epe_l2_px'])} px"
+    peers = [row for row in order[2:] if row["method"] in PEERS]
+    named = [("next is", row) for row in order[1:2]]
+    named += [("the best of other projects is", row) for row in peers[:1]]
+    for label, row in named:
+        error = row["epe_l2_px_median"]
+        times = f" ({number(error / best, 2)} times)" if best else ""
+        text += f"; {label} {row['method']}: {number(error)} px{times}, {row['failures']} failed"
+    for entry in result["worst_pairs"]:
+        if (entry["method"], entry["flow_source"]) == (first["method"], flow):
+            if entry["epe_l2_px"] is not None:
+                place = f"{entry['sequence']}, pair {entry['index']}"
+                text += f". Its worst pair is {place}: {number(entry['epe_l2_px'])} px"
+            break
     return text + "."
-
-
-def _times(row: Mapping[str, Any], first: Mapping[str, Any]) -> str:
-    if not first["epe_l2_px_median"]:
-        return ""
-    ratio = row["epe_l2_px_median"] / first["epe_l2_px_median"]
-    return " (level)" if 1 / LEVEL < ratio < LEVEL else f" ({number(ratio, 2)} times)"
 
 
 def number(value: float | None, digits: int = 3) -> str:
@@ -313,26 +303,21 @@ def _markdown(result: Mapping[str, Any]) -> str:
 def _gallery(folder: Path, result: Mapping[str, Any]) -> list[tuple[str, list[dict[str, Any]]]]:
     """Worst pairs by method, estimated flow first and the best method first, with images."""
     budget = EMBEDDED_BYTES
-    groups = []
+    groups: dict[str, list[dict[str, Any]]] = {}
     for flow, rows in by_flow(result):
-        order = [row["method"] for row in ranking(rows)]
-        methods = [*order, *(r["method"] for r in rows if r["method"] not in order)]
-        for method in methods:
-            entries = []
+        order = dict.fromkeys(row["method"] for row in [*ranking(rows), *rows])
+        for method in order:
             for entry in result["worst_pairs"]:
                 if (entry["method"], entry["flow_source"]) != (method, flow):
                     continue
-                source = None
-                path = entry["picture"] and folder / entry["picture"]
+                source, path = None, entry["picture"] and folder / entry["picture"]
                 if path and path.is_file() and path.stat().st_size <= budget:
-                    data = path.read_bytes()
-                    budget -= len(data)
-                    source = "data:image/jpeg;base64," + base64.b64encode(data).decode()
-                error = number(entry["epe_l2_px"])
-                entries.append({**entry, "source": source, "error": error})
-            if entries:
-                groups.append((f"{method}, {flow} flow", entries))
-    return groups
+                    budget -= path.stat().st_size
+                    encoded = base64.b64encode(path.read_bytes()).decode()
+                    source = f"data:image/jpeg;base64,{encoded}"
+                shown = {**entry, "source": source, "error": number(entry["epe_l2_px"])}
+                groups.setdefault(f"{method}, {flow} flow", []).append(shown)
+    return list(groups.items())
 
 
 def _provenance(result: Mapping[str, Any]) -> list[tuple[str, str]]:

@@ -46,10 +46,6 @@ ROW_COLUMNS = (
 NO_PAIRS = "no pair was estimated"
 NO_TRUTH = "the sequence has no ground truth for these frames"
 NO_MOVING = "needs true flow of the whole scene (moving objects included) and ground truth"
-SCALE_FACTOR = 3.0
-"""Factor beyond which ground truth and all estimates disagree about the unit."""
-SCALE_SPREAD = 1.5
-"""Factor within which the estimates must agree about that."""
 FACTORS: Mapping[str, tuple[str, str, tuple[float, ...]]] = {
     "dynamic_fraction": (
         "share of pixels that move by themselves",
@@ -196,9 +192,8 @@ def scale_warning(rows: Iterable[Mapping[str, Any]]) -> list[str]:
         for row in rows
         if row.get("scale_sim3") and row["method"] != "identity" and row["failed"] < row["pairs"]
     ]
-    if len(scales) < 2 or min(scales) <= 0 or max(scales) > SCALE_SPREAD * min(scales):
-        return []
-    if 1 / SCALE_FACTOR <= max(scales) and min(scales) <= SCALE_FACTOR:
+    agree = len(scales) > 1 and min(scales) > 0 and max(scales) <= 1.5 * min(scales)
+    if not agree or (max(scales) >= 1 / 3 and min(scales) <= 3):
         return []
     return [
         f"the true path is {min(scales):.3g} to {max(scales):.3g} times as long as every estimate: "

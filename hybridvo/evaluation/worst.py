@@ -10,23 +10,23 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from hybridvo.data.sequence import Sequence
+from hybridvo.data.sequence import open_sequence
 from hybridvo.errors import InputError
-from hybridvo.evaluation.drawing import predict
+from hybridvo.estimation import estimate
 from hybridvo.evaluation.maps import error_map, flow_colours, longest_flow, uncertainty_maps
+from hybridvo.evaluation.pair_errors import true_motion
+from hybridvo.evaluation.saliency import last_pass
 from hybridvo.evaluation.scores import FACTORS, PAIR_ERRORS, is_failed, known_number
-from hybridvo.evaluation.sequence_job import true_motion
-from hybridvo.evaluation.sources import SharedFlow
+from hybridvo.evaluation.sequence_job import Job, SharedFlow
 from hybridvo.files import atomic_write
+from hybridvo.network.models import Models
 from hybridvo.network.options import KINDS
-from hybridvo.pipeline import Models, estimate, networks_of
+from hybridvo.pipeline import networks_of
 from hybridvo.results import PixelwisePrediction
 from hybridvo.types import FramePair
 
 THUMBNAIL_WIDTH = 256
 """Width of each panel of a worst pair, px: a report holds a hundred of them."""
-JPEG_QUALITY = 80
-CAPTION_PX = 18
 ERROR_RANGE_PX = (0.01, 10.0)
 """Ends of the colours of every error map of the worst pairs, px, logarithmic."""
 
@@ -54,41 +54,39 @@ def worst_pairs(pairs: pd.DataFrame, count: int = 3) -> list[dict[str, Any]]:
 def draw_worst(
     out: Path,
     stem: str,
-    sequence: Sequence,
+    job: Job,
     entries: Iterable[dict[str, Any]],
-    results: Mapping[tuple[int, str, str], Mapping[str, Any]],
-    flows: Iterable[str],
-    models: Models,
+    rows: Iterable[Mapping[str, Any]],
 ) -> None:
     """Draw worst pairs of one sequence, with the motion that the comparison found.
 
     Args:
         out: folder of the comparison.
         stem: of the names of the images in it.
-        sequence: an open one.
-        entries: get ``picture``, or None and ``picture_reason``.
-        results: (index, method, flow source) -> its row with ``prev``, ``next``, ``T_curr_prev``.
-        flows: ``dis``, ``file``.
-        models: the networks of the comparison.
+        job: the sequence and the methods.
+        entries: get ``picture`` (a path), or None and ``picture_reason``.
+        rows: of the sequence, with ``prev``, ``next`` and ``T_curr_prev``.
     """
-    providers = {provider.label: provider for provider in (SharedFlow(f, sequence) for f in flows)}
+    sequence, models = open_sequence(job.path, job.dataset), Models(job.device, job.weights)
+    flows = {flow.label: flow for flow in (SharedFlow(name, sequence) for name in job.flows)}
+    found = {(row["index"], row["method"], row["flow_source"]): row for row in rows}
     for entry in entries:
         method, label = entry["method"], entry["flow_source"]
-        row = results[entry["index"], method, label]
+        row = found[entry["index"], method, label]
         entry |= {"picture": None, "picture_reason": None}
         try:
             prev, curr = sequence.frame(row["prev"]), sequence.frame(row["next"])
         except (InputError, OSError) as error:
             entry["picture_reason"] = f"the pair cannot be read: {error}"
             continue
-        field = providers[label](prev, curr)
+        field = flows[label](prev, curr)
         pair = FramePair(prev, curr, field.flow, field.variance, field.valid)
         panels = _worst_panels(pair, row, true_motion(sequence, prev.index, curr.index))
         if not entry["status"].startswith("failed"):
             panels += _weight_panels(pair, method, models)
         image = np.concatenate([_panel(*panel, prev.camera.shape) for panel in panels], axis=1)
         entry["picture"] = f"{stem}_{entry['index']:06d}_{method}_{label.split()[0]}.jpg"
-        encoded = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+        encoded = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 80])
         with atomic_write(out / entry["picture"], "wb") as file:
             file.write(encoded[1].tobytes())
 
@@ -130,7 +128,7 @@ def _weight_panels(
         network = models.network(name)
         if getattr(network, "options", None) is None or network.options.kind not in KINDS:
             continue
-        output = predict(network, pair)[0]
+        output = last_pass(network, pair)[0]
         if isinstance(output, PixelwisePrediction) and output.log_scale_rotation is not None:
             scale = uncertainty_maps(output)[0]
             top = max(float(np.percentile(scale, 99)), 1e-12)
@@ -153,7 +151,7 @@ def _panel(image: np.ndarray | None, caption: str, shape: tuple[int, int]) -> np
     small = np.full((size[1], size[0], 3), 128, np.uint8)
     if image is not None:
         small[:] = cv2.resize(np.ascontiguousarray(image), size, interpolation=cv2.INTER_AREA)
-    strip = np.full((CAPTION_PX, THUMBNAIL_WIDTH, 3), 255, np.uint8)
-    place, font = (4, CAPTION_PX - 5), cv2.FONT_HERSHEY_SIMPLEX
+    strip = np.full((18, THUMBNAIL_WIDTH, 3), 255, np.uint8)
+    place, font = (4, 13), cv2.FONT_HERSHEY_SIMPLEX
     cv2.putText(strip, caption, place, font, 0.4, (0, 0, 0), 1, cv2.LINE_AA)
     return np.concatenate([small, strip])

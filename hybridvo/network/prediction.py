@@ -24,12 +24,6 @@ slope of its logit: logistic regression over development pairs, both kinds of pi
 Over 300 pairs (wide, crowd, rendered) stated and observed ratios differ by at most 0.09."""
 MIN_PIXELS = 64
 """Pixels of the network's input with flow and depth below which it is not asked."""
-MIN_SCALE = 1e-4
-"""Least Laplace scale believed, degrees and metres: half-precision weights know no better."""
-UNCERTAIN_DEG = 2.0
-"""Rotation scale above which the answer is degraded: larger than most motions between frames."""
-UNKNOWN_M, UNKNOWN_DEG = 0.3, 1.0
-"""Scales stated for networks that give none: the largest usual motions, so that nobody trusts."""
 
 
 def static_probability(log_scale: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
@@ -109,7 +103,7 @@ def estimate_by_network(pair: FramePair, method: str, network: nn.Module) -> Rel
             Reason.DEGENERATE_GEOMETRY, "the network's answer is not finite", **common
         )
     status = Status()
-    if U[3:].max() > UNCERTAIN_DEG:
+    if U[3:].max() > 2.0:  # degrees: larger than most motions between frames
         status = Status.degraded(
             Reason.LOW_INLIERS, f"the network is uncertain by {U[3:].max():.1f} degrees"
         )
@@ -130,7 +124,8 @@ def _select_with_scale(
     output: NetworkOutput = predict(network, inputs, how)
     rotation, translation = (x.double() for x in select_pose(output, how))
     T = select_motion((rotation, translation), how)[0].numpy()
-    U = np.array([UNKNOWN_M] * 3 + [UNKNOWN_DEG] * 3)
+    # 0.3 m and 1 degree for networks that state none: the largest usual motions, so nobody trusts
+    U = np.array([0.3] * 3 + [1.0] * 3)
     if isinstance(output, PixelwisePrediction):
         log_r, log_t = output.log_scale_rotation, output.log_scale_translation
         if log_r is not None and log_t is not None:
@@ -138,4 +133,4 @@ def _select_with_scale(
             stated = PixelwisePrediction(log_r.exp(), log_t.exp(), log_r, log_t)
             scale_r, scale_t = select_pose(stated, how)
             U = torch.cat([scale_t, scale_r], dim=1)[0].double().numpy()
-    return T, np.maximum(U, MIN_SCALE)
+    return T, np.maximum(U, 1e-4)  # half-precision weights know no better

@@ -136,6 +136,10 @@ def pretrained_names() -> tuple[str, ...]:
     return tuple(sorted(p.stem for p in PRETRAINED.glob("*.safetensors")))
 
 
+def _known() -> str:
+    return f"Pretrained weights: {', '.join(pretrained_names())}."
+
+
 def pretrained(name: str | Path) -> Path:
     """File of pretrained weights.
 
@@ -151,10 +155,6 @@ def weights_file(name_or_path: str | Path) -> Path:
     """A pretrained name's file, else the path itself."""
     name = str(name_or_path)
     return pretrained(name) if name in pretrained_names() else Path(name_or_path)
-
-
-def _known() -> str:
-    return f"Pretrained weights: {', '.join(pretrained_names())}."
 
 
 def _check_finite(

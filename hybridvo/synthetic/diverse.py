@@ -8,120 +8,80 @@ cameras that follow an actor; inputs as a flow estimator and a depth sensor deli
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from typing import Annotated
 
 import cv2
 import numpy as np
+from pydantic import Field
 
 from hybridvo.errors import InputError
 from hybridvo.geometry import euler_deg_to_matrix, make_transform
+from hybridvo.options import Positive, Share, option_group
+from hybridvo.synthetic.draws import Range, about, direction, log_uniform, smooth_field
 from hybridvo.synthetic.layered import Layers, Sample, normalized_grid, visibility
-from hybridvo.synthetic.sensors import (
-    Range,
-    SensorOptions,
-    degrade_depth,
-    degrade_flow,
-    log_uniform,
-    sample_at,
-    smooth_field,
-)
+from hybridvo.synthetic.sensors import SensorOptions, degrade_depth, degrade_flow, sample_at
 from hybridvo.synthetic.silhouettes import Silhouette, outline, random_silhouette
 
 SKY_INVERSE_DEPTH = 1.0 / 2000.0
 """Surfaces farther than two kilometres are sky."""
 
+Pixels = Annotated[int, Field(ge=16)]
+Counts = tuple[Annotated[int, Field(ge=0)], int]
+Law = tuple[Positive, Positive, Positive]
+"""Median, spread of the logarithm, and largest value of a log-normal distribution."""
 
-@dataclass(frozen=True)
+
+@option_group
 class DiverseOptions:
-    """Options of the diverse preset; ranges of two numbers are drawn log-uniformly unless said.
+    """Options of the diverse preset; pairs are drawn uniformly in the logarithm unless said.
 
-    Args:
-        height: rows of the sample. width: columns.
-        field_of_view_deg: horizontal field of view.
-        aspect: fy / fx; pictures are stretched to the sample's shape.
-        centre_shift: largest shift of the principal point as a share of the size (crops).
-        scene_depth: metres, size of the scene.
-        room_probability: share of scenes closed on all sides; outdoor_probability: ground with
-            walls and sky; the rest are single slanted surfaces.
-        relief: largest spread of log depth of a surface's smooth relief.
-        sky_far_probability: share of skies that come as a huge depth instead of an invalid one.
-        static_layers: least and largest number of static occluders (uniform).
-        movers: least and largest number of small movers (uniform).
-        mover_radius: radius of a small mover as a share of the width.
-        still_probability: share of samples in which nothing moves but the camera.
-        large_mover_probability: share of samples with one large mover.
-        large_coverage: share of the picture that it covers (uniform).
-        articulated_probability: share of movers with limbs that turn about joints.
-        nonrigid_probability: share of movers that bend.
-        bend: spread of the bending as a share of depth.
-        follow_probability: share of samples whose camera follows the main mover.
-        follow_residual: factor on the mover's motion that is left in the picture.
-        camera_rotation_deg: median, spread of the logarithm, and largest camera rotation.
-        camera_translation: the same for the camera translation as a share of the near depth.
-        camera_translation_limit: metres, largest camera translation.
-        forward_probability: share of camera translations that are mainly along the axis.
-        object_rotation_deg: median, spread of the logarithm, and largest object rotation.
-        object_translation: the same for the object translation as a share of its depth.
-        limb_rotation_deg: the same for the rotation of a limb about its joint.
-        moving_threshold_px: a pixel moves if its true flow is that far from the ego flow.
-        flow_limit: scenes whose flow exceeds this share of the width in over a hundredth of the
-            picture are drawn again: no flow estimator follows such motion.
-        degradation: what measuring does to flow and depth.
+    Units and reasons stand in ``configs/data_diverse.yaml``.
 
     Raises:
         InputError: sizes, ranges or probabilities that cannot be meant.
     """
 
-    height: int = 128
-    width: int = 256
+    height: Pixels = 128
+    width: Pixels = 256
     field_of_view_deg: Range = (35.0, 105.0)
     aspect: Range = (0.45, 1.8)
-    centre_shift: float = 0.1
+    centre_shift: Share = 0.1
     scene_depth: Range = (1.0, 60.0)
-    room_probability: float = 0.4
-    outdoor_probability: float = 0.35
-    relief: float = 0.25
-    sky_far_probability: float = 0.5
-    static_layers: tuple[int, int] = (0, 7)
-    movers: tuple[int, int] = (0, 3)
+    room_probability: Share = 0.4
+    outdoor_probability: Share = 0.35
+    relief: Annotated[float, Field(ge=0)] = 0.25
+    sky_far_probability: Share = 0.5
+    static_layers: Counts = (0, 7)
+    movers: Counts = (0, 3)
     mover_radius: Range = (0.04, 0.25)
-    still_probability: float = 0.08
-    large_mover_probability: float = 0.5
+    still_probability: Share = 0.08
+    large_mover_probability: Share = 0.5
     large_coverage: Range = (0.4, 0.87)
-    articulated_probability: float = 0.35
-    nonrigid_probability: float = 0.3
+    articulated_probability: Share = 0.35
+    nonrigid_probability: Share = 0.3
     bend: Range = (0.002, 0.03)
-    follow_probability: float = 0.35
+    follow_probability: Share = 0.35
     follow_residual: Range = (0.02, 0.6)
-    camera_rotation_deg: tuple[float, float, float] = (0.5, 1.1, 12.0)
-    camera_translation: tuple[float, float, float] = (0.02, 1.1, 0.3)
-    camera_translation_limit: float = 3.0
-    forward_probability: float = 0.3
-    object_rotation_deg: tuple[float, float, float] = (1.5, 1.0, 15.0)
-    object_translation: tuple[float, float, float] = (0.03, 0.9, 0.25)
-    limb_rotation_deg: tuple[float, float, float] = (4.0, 0.7, 25.0)
-    moving_threshold_px: float = 0.5
-    flow_limit: float = 0.35
-    degradation: SensorOptions = field(default_factory=SensorOptions)
+    camera_rotation_deg: Law = (0.5, 1.1, 12.0)
+    camera_translation: Law = (0.02, 1.1, 0.3)
+    camera_translation_limit: Positive = 3.0
+    forward_probability: Share = 0.3
+    object_rotation_deg: Law = (1.5, 1.0, 15.0)
+    object_translation: Law = (0.03, 0.9, 0.25)
+    limb_rotation_deg: Law = (4.0, 0.7, 25.0)
+    moving_threshold_px: Positive = 0.5
+    flow_limit: Positive = 0.35
+    degradation: SensorOptions = SensorOptions()
 
     def __post_init__(self) -> None:
-        if min(self.height, self.width) < 16:
-            raise InputError("DiverseOptions: expected height and width of at least 16 pixels.")
-        for name, value in vars(self).items():
-            if name.endswith("_probability") and not 0 <= value <= 1:
-                raise InputError(f"DiverseOptions.{name}: expected 0..1, got {value}.")
-            if isinstance(value, tuple) and len(value) == 2:
-                least = 0 if name in ("static_layers", "movers") else 1e-9
-                if not least <= value[0] <= value[1]:
-                    raise InputError(f"DiverseOptions.{name}: expected low <= high, got {value}.")
+        for name in ("static_layers", "movers"):
+            low, high = getattr(self, name)
+            if low > high:
+                raise InputError(f"{name}: expected low <= high, got {low} and {high}")
         if not self.field_of_view_deg[1] < 175 or not self.large_coverage[1] < 1:
-            raise InputError(
-                "DiverseOptions: expected a field of view < 175 deg and a coverage < 1."
-            )
+            raise InputError("expected a field of view < 175 deg and a coverage < 1")
         if self.room_probability + self.outdoor_probability > 1:
-            raise InputError(
-                "DiverseOptions: room and outdoor probabilities add up to more than 1."
-            )
+            raise InputError("room and outdoor probabilities add up to more than 1")
 
     def sample(self, rng: np.random.Generator) -> Sample:
         """One pair: :func:`diverse_sample`."""
@@ -150,23 +110,21 @@ class _Scene(Layers):
         yaw, pitch, roll = rng.uniform(-40, 40), rng.normal(0, 10), rng.normal(0, 4)
         R = euler_deg_to_matrix(np.array([pitch, yaw, roll]))
         size = self.scale
-        planes: list[tuple[np.ndarray, float]] = []
-        floor = (np.array([0.0, 1.0, 0.0]), size * rng.uniform(0.25, 0.7))
+        down, right, forward = np.eye(3)[[1, 0, 2]]
+        planes = [(down, size * rng.uniform(0.25, 0.7))]
         if kind < o.room_probability:
-            planes = [
-                floor,
-                (np.array([0.0, -1.0, 0.0]), size * rng.uniform(0.25, 0.9)),
-                (np.array([1.0, 0.0, 0.0]), size * rng.uniform(0.3, 2.0)),
-                (np.array([-1.0, 0.0, 0.0]), size * rng.uniform(0.3, 2.0)),
-                (np.array([0.0, 0.0, 1.0]), size * rng.uniform(0.7, 3.0)),
+            planes += [
+                (-down, size * rng.uniform(0.25, 0.9)),
+                (right, size * rng.uniform(0.3, 2.0)),
+                (-right, size * rng.uniform(0.3, 2.0)),
+                (forward, size * rng.uniform(0.7, 3.0)),
             ]
         elif kind < o.room_probability + o.outdoor_probability:
-            planes = [floor]
             for side in (1.0, -1.0):
                 if rng.random() < 0.4:
-                    planes.append((np.array([side, 0.0, 0.0]), size * rng.uniform(0.3, 4.0)))
+                    planes.append((side * right, size * rng.uniform(0.3, 4.0)))
             if rng.random() < 0.4:
-                planes.append((np.array([0.0, 0.0, 1.0]), size * rng.uniform(1.0, 20.0)))
+                planes.append((forward, size * rng.uniform(1.0, 20.0)))
         else:
             tilt = rng.uniform(-0.9, 0.9, 2)
             normal = np.array([tilt[0], tilt[1], 1.0])
@@ -222,50 +180,42 @@ class _Scene(Layers):
         number = len(self.motions)
         shown = self.lay(box, inside, rho)
         rows, columns = np.nonzero(shown)
-        u, v = left + columns.mean(), top + rows.mean()
-        ray = np.array([(u - self.cx) / self.fx, (v - self.cy) / self.fy, 1.0])
-        return number, ray / inverse_depth
+        return number, self.ray(left + columns.mean(), top + rows.mean()) / inverse_depth
 
     def new_mask(self) -> np.ndarray:
         """Empty (H, W) uint8 mask."""
         return np.zeros((self.options.height, self.options.width), np.uint8)
 
+    def ray(self, u: float, v: float) -> np.ndarray:
+        """(3,) K^-1 (u, v, 1)."""
+        return np.array([(u - self.cx) / self.fx, (v - self.cy) / self.fy, 1.0])
 
-def _magnitude(rng: np.random.Generator, law: tuple[float, float, float]) -> float:
+
+def _magnitude(rng: np.random.Generator, law: Law) -> float:
     median, spread, largest = law
     return min(median * float(np.exp(spread * rng.standard_normal())), largest)
 
 
-def _direction(rng: np.random.Generator) -> np.ndarray:
-    v = rng.standard_normal(3)
-    return v / np.linalg.norm(v)
-
-
-def _random_turn(rng: np.random.Generator, law: tuple[float, float, float]) -> np.ndarray:
+def _random_turn(rng: np.random.Generator, law: Law) -> np.ndarray:
     """(3, 3) rotation of a drawn size about a drawn axis (small angles: Euler angles serve)."""
-    return euler_deg_to_matrix(_magnitude(rng, law) * _direction(rng))
-
-
-def _about(R: np.ndarray, t: np.ndarray, centre: np.ndarray) -> np.ndarray:
-    """(4, 4) rotation about a point, then translation."""
-    return make_transform(R, centre - R @ centre + t)
+    return euler_deg_to_matrix(_magnitude(rng, law) * direction(rng))
 
 
 def _camera(scene: _Scene, follow: bool) -> tuple[np.ndarray, np.ndarray]:
     """Euler angles in degrees and translation in metres of the camera's T_curr_prev."""
     o, rng = scene.options, scene.rng
-    angles = _magnitude(rng, o.camera_rotation_deg) * _direction(rng)
+    angles = _magnitude(rng, o.camera_rotation_deg) * direction(rng)
     seen = scene.rho[::2, ::2]
     seen = seen[seen > 0]
     nearest = float(seen.max()) if seen.size else 1.0 / scene.scale
     near = 1.0 / (float(np.quantile(seen, 0.8)) if seen.size else 1.0 / scene.scale)
-    direction = _direction(rng)
+    towards = direction(rng)
     if rng.random() < o.forward_probability:
-        direction = direction * 0.2 + np.array([0.0, 0.0, rng.choice([-1.0, -1.0, -1.0, 1.0])])
-        direction /= np.linalg.norm(direction)
+        towards = towards * 0.2 + np.array([0.0, 0.0, rng.choice([-1.0, -1.0, -1.0, 1.0])])
+        towards /= np.linalg.norm(towards)
     size = _magnitude(rng, o.camera_translation) * near * (1.5 if follow else 1.0)
     size = min(size, o.camera_translation_limit, 0.4 / nearest)
-    return angles, size * direction
+    return angles, size * towards
 
 
 def _add_mover(
@@ -293,12 +243,11 @@ def _add_mover(
     number, centre = added
     depth = float(centre[2])
     R = _random_turn(rng, o.object_rotation_deg)
-    t = _magnitude(rng, o.object_translation) * depth * _direction(rng) * np.array([1.0, 0.6, 0.8])
+    t = _magnitude(rng, o.object_translation) * depth * direction(rng) * np.array([1.0, 0.6, 0.8])
     if follow:
-        own = _about(euler_deg_to_matrix(follow * 3.0 * _direction(rng)), follow * t, centre)
-        total = own
+        total = about(euler_deg_to_matrix(follow * 3.0 * direction(rng)), centre, follow * t)
     else:
-        total = T_cam @ _about(R, t, centre)
+        total = T_cam @ about(R, centre, t)
     scene.motions[number] = total
     if rng.random() < o.nonrigid_probability:
         amplitude = np.float32(log_uniform(rng, o.bend) * depth)
@@ -312,18 +261,13 @@ def _add_mover(
             limb_radius = radius * rng.uniform(0.3, 0.8)
             limb = outline(rng, "bar" if rng.random() < 0.6 else "superellipse")
             joint = middle + radius * points[int(rng.integers(len(points)))] * 0.8
-            reach = limb_radius * limb[int(rng.integers(len(limb)))]
+            place = joint + limb_radius * limb[int(rng.integers(len(limb)))]
             limb_mask = scene.new_mask()
-            place = (float(joint[0] + reach[0]), float(joint[1] + reach[1]))
-            Silhouette(((limb, True),)).draw(limb_mask, place, limb_radius)
+            Silhouette(((limb, True),)).draw(limb_mask, tuple(place.tolist()), limb_radius)
             part = scene.add(limb_mask, True, 1.02 / depth)
-            if part is None:
-                continue
-            joint_ray = np.array(
-                [(joint[0] - scene.cx) / scene.fx, (joint[1] - scene.cy) / scene.fy, 1.0]
-            )
-            turn = _about(_random_turn(rng, o.limb_rotation_deg), np.zeros(3), joint_ray * depth)
-            scene.motions[part[0]] = total @ turn
+            if part is not None:
+                own = _random_turn(rng, o.limb_rotation_deg)
+                scene.motions[part[0]] = total @ about(own, scene.ray(*joint) * depth)
 
 
 def _populate(scene: _Scene) -> tuple[np.ndarray, np.ndarray]:
@@ -369,12 +313,12 @@ def _populate(scene: _Scene) -> tuple[np.ndarray, np.ndarray]:
     return angles, translation
 
 
-def diverse_sample(rng: np.random.Generator, options: DiverseOptions = DiverseOptions()) -> Sample:
+def diverse_sample(rng: np.random.Generator, options: DiverseOptions) -> Sample:
     """One pair of the diverse preset.
 
     Args:
         rng: source of randomness; the sample depends on nothing else.
-        options: defaults to the preset ``configs/data_diverse.yaml``.
+        options: sizes and distributions.
     """
     o = options
     while True:

@@ -11,19 +11,19 @@ are a download of a third party), and a sample depends on nothing but its genera
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
 
 from hybridvo.errors import InputError
 from hybridvo.geometry import euler_deg_to_matrix, make_transform
+from hybridvo.options import Positive, Share, option_group
 from hybridvo.synthetic.layered import Layers, Sample
 from hybridvo.synthetic.silhouettes import silhouette_mask
 
-MAX_REJECTIONS = 10_000
 
-
-@dataclass(frozen=True)
+@option_group
 class TailSampler:
     """Normal core with a heavy tail, truncated to an interval by rejection.
 
@@ -42,22 +42,16 @@ class TailSampler:
     """
 
     mean: float
-    tail_std: float
-    power: float
-    tail_probability: float
+    tail_std: Positive
+    power: Positive
+    tail_probability: Share
     low: float
     high: float
-    core_std: float
+    core_std: Positive
 
     def __post_init__(self) -> None:
         if not self.low < self.high:
-            raise InputError(f"TailSampler: expected low < high, got {self.low} and {self.high}.")
-        if not (self.tail_std > 0 and self.core_std > 0 and self.power > 0):
-            raise InputError("TailSampler: expected positive tail_std, core_std and power.")
-        if not 0 <= self.tail_probability <= 1:
-            raise InputError(
-                f"TailSampler: expected a tail_probability in [0, 1], got {self.tail_probability}."
-            )
+            raise InputError(f"expected low < high, got {self.low} and {self.high}")
 
     def draw(self, rng: np.random.Generator, low: float | None = None) -> float:
         """One value; ``low`` replaces the lower limit where the scene demands it.
@@ -68,34 +62,31 @@ class TailSampler:
         low = self.low if low is None else low
         tail = rng.random() < self.tail_probability
         spread = self.tail_std if tail else self.core_std
-        for _ in range(MAX_REJECTIONS):
+        for _ in range(10_000):
             value = self.mean + spread * rng.standard_normal()
             if tail:
                 value = np.sign(value) * abs(value) ** self.power
             if low <= value <= self.high:
                 return float(value)
         raise InputError(
-            f"TailSampler: no draw of {self} fell into [{low}, {self.high}] in {MAX_REJECTIONS}."
+            f"TailSampler: none of 10 000 draws of {self} fell into [{low}, {self.high}]."
         )
 
 
-def _rotation() -> tuple[TailSampler, TailSampler, TailSampler]:
-    return (
-        TailSampler(0.0, 1.5, 2.5, 0.15, -9.0, 9.0, 0.2),
-        TailSampler(0.0, 2.0, 2.0, 0.15, -9.0, 9.0, 0.2),
-        TailSampler(0.0, 1.5, 2.5, 0.15, -8.0, 8.0, 0.2),
-    )
+ThreeSamplers = tuple[TailSampler, TailSampler, TailSampler]
+ROTATION: ThreeSamplers = (
+    TailSampler(0.0, 1.5, 2.5, 0.15, -9.0, 9.0, 0.2),
+    TailSampler(0.0, 2.0, 2.0, 0.15, -9.0, 9.0, 0.2),
+    TailSampler(0.0, 1.5, 2.5, 0.15, -8.0, 8.0, 0.2),
+)
+TRANSLATION: ThreeSamplers = (
+    TailSampler(0.0, 0.4, 2.5, 0.15, -0.7, 0.7, 0.03),
+    TailSampler(0.0, 0.25, 2.0, 0.2, -0.4, 0.4, 0.025),
+    TailSampler(0.0, 1.8, 2.5, 0.15, -5.0, 5.0, 0.02),
+)
 
 
-def _translation() -> tuple[TailSampler, TailSampler, TailSampler]:
-    return (
-        TailSampler(0.0, 0.4, 2.5, 0.15, -0.7, 0.7, 0.03),
-        TailSampler(0.0, 0.25, 2.0, 0.2, -0.4, 0.4, 0.025),
-        TailSampler(0.0, 1.8, 2.5, 0.15, -5.0, 5.0, 0.02),
-    )
-
-
-@dataclass(frozen=True)
+@option_group
 class MotionSamplers:
     """Samplers of one rigid motion (step 3): the same for the camera and the objects.
 
@@ -106,9 +97,9 @@ class MotionSamplers:
             that nothing is carried through the image plane.
     """
 
-    rotation_deg: tuple[TailSampler, TailSampler, TailSampler] = field(default_factory=_rotation)
-    translation: tuple[TailSampler, TailSampler, TailSampler] = field(default_factory=_translation)
-    backward_share: float = 0.2
+    rotation_deg: ThreeSamplers = ROTATION
+    translation: ThreeSamplers = TRANSLATION
+    backward_share: Share = 0.2
 
     def draw(self, rng: np.random.Generator, depth: float) -> tuple[np.ndarray, np.ndarray]:
         """Euler angles (3,) in degrees and translation (3,) in metres of a thing at this depth."""
@@ -118,73 +109,49 @@ class MotionSamplers:
         return angles, np.array([x.draw(rng), y.draw(rng), z.draw(rng, low)])
 
 
-@dataclass(frozen=True)
+Pixels = Annotated[int, Field(ge=2)]
+
+
+@option_group
 class PaperOptions:
     """Options of the five steps; the defaults are the published ones.
 
-    Args:
-        height, width: size of the sample in pixels.
-        full_height, full_width: image size that focal lengths refer to.
-        focal: sampler of the position between ``focal_low`` and ``focal_high``.
-        focal_low, focal_high: focal length in pixels of the full image.
-        background_depth: sampler of the position between ``background_low`` and
-            ``background_high`` metres.
-        background_far_probability: share of backgrounds drawn uniformly between
-            ``background_high`` and ``background_far`` metres instead.
-        object_depth: sampler of the position between f / ``object_near_divisor`` metres and the
-            background.
-        objects: number of objects.
-        move_probability: share of the objects that move; the others are static occluders.
-        object_size: mean, spread, least and largest side of an object's square, as a share of the
-            width.
-        canvas_margin: objects are placed uniformly on a canvas that is larger by this share of the
-            picture on every side.
-        motion: samplers of camera and object motions.
+    Units and reasons stand in ``configs/data_paper.yaml``.
 
     Raises:
         InputError: sizes, limits or probabilities that cannot be meant.
     """
 
-    height: int = 128
-    width: int = 256
-    full_height: int = 436
-    full_width: int = 1024
+    height: Pixels = 128
+    width: Pixels = 256
+    full_height: Pixels = 436
+    full_width: Pixels = 1024
     focal: TailSampler = TailSampler(0.03, 0.5, 2.0, 0.4, 0.0, 1.0, 0.08)
-    focal_low: float = 576.0
-    focal_high: float = 3200.0
+    focal_low: Positive = 576.0
+    focal_high: Positive = 3200.0
     background_depth: TailSampler = TailSampler(0.6, 0.2, 2.0, 0.5, 0.0, 1.0, 0.1)
-    background_low: float = 1.0
-    background_high: float = 80.0
-    background_far_probability: float = 0.1
-    background_far: float = 3200.0
+    background_low: Positive = 1.0
+    background_high: Positive = 80.0
+    background_far_probability: Share = 0.1
+    background_far: Positive = 3200.0
     object_depth: TailSampler = TailSampler(0.6, 0.6, 1.5, 0.4, 0.0, 1.0, 0.2)
-    object_near_divisor: float = 5200.0
-    objects: int = 5
-    move_probability: float = 0.6
-    object_size: tuple[float, float, float, float] = (0.55, 0.2, 0.25, 0.7)
-    canvas_margin: float = 0.25
+    object_near_divisor: Positive = 5200.0
+    objects: Annotated[int, Field(ge=0, le=64)] = 5
+    move_probability: Share = 0.6
+    object_size: tuple[float, Positive, Positive, Share] = (0.55, 0.2, 0.25, 0.7)
+    canvas_margin: Annotated[float, Field(ge=0, le=4)] = 0.25
     motion: MotionSamplers = MotionSamplers()
 
     def __post_init__(self) -> None:
-        for name in ("height", "width", "full_height", "full_width"):
-            if getattr(self, name) < 2:
-                raise InputError(f"PaperOptions.{name}: expected at least 2 pixels.")
-        for name in ("background_far_probability", "move_probability"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise InputError(f"PaperOptions.{name}: expected a probability in [0, 1].")
-        if not 0 < self.focal_low <= self.focal_high:
-            raise InputError("PaperOptions: expected 0 < focal_low <= focal_high.")
-        if not 0 < self.background_low < self.background_high <= self.background_far:
-            raise InputError(
-                "PaperOptions: expected 0 < background_low < background_high <= background_far."
-            )
-        if not (0 <= self.objects <= 64 and 0 <= self.canvas_margin <= 4):
-            raise InputError("PaperOptions: expected 0..64 objects and a canvas_margin in 0..4.")
+        if not self.focal_low <= self.focal_high:
+            raise InputError("expected focal_low <= focal_high")
+        if not self.background_low < self.background_high <= self.background_far:
+            raise InputError("expected background_low < background_high <= background_far")
         mean, spread, low, high = self.object_size
-        if not (0 < low < high <= 1 and spread > 0 and low - 3 * spread < mean < high + 3 * spread):
+        if not (low < high and low - 3 * spread < mean < high + 3 * spread):
             raise InputError(
-                "PaperOptions.object_size: expected (mean, spread, low, high) with 0 < low < high "
-                f"<= 1, got {self.object_size}."
+                f"object_size: expected (mean, spread, low, high) with low < high, got "
+                f"{self.object_size}"
             )
 
     def sample(self, rng: np.random.Generator) -> Sample:
@@ -192,12 +159,12 @@ class PaperOptions:
         return paper_sample(rng, self)
 
 
-def paper_sample(rng: np.random.Generator, options: PaperOptions = PaperOptions()) -> Sample:
+def paper_sample(rng: np.random.Generator, options: PaperOptions) -> Sample:
     """One pair by the paper's five steps.
 
     Args:
         rng: source of randomness; the sample depends on nothing else.
-        options: defaults to the published configuration.
+        options: sizes and distributions.
     """
     o = options
     # Step 1. The published code resizes corner to corner, hence fx != fy at 128x256.

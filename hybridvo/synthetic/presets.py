@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
-import difflib
-import typing
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
-from pydantic import TypeAdapter, ValidationError
 
 from hybridvo.errors import FormatError, InputError
 from hybridvo.files import parse_yaml
@@ -63,31 +59,15 @@ def _merged(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
 
 
 def build_options(cls: type[OptionsT], mapping: dict[str, Any], where: str) -> OptionsT:
-    """Dataclass ``cls`` from plain values; keys that are left out keep their default.
+    """Options of a class from plain values; keys that are left out keep their default.
 
     Raises:
-        InputError: an unknown key (the nearest known one is named) or a value of another type.
+        InputError: an unknown key or a value out of bounds, with its place.
     """
-    _check_keys(cls, mapping, where)
     try:
-        return TypeAdapter(cls).validate_python(mapping)
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        key = ".".join(str(part) for part in first["loc"])
-        raise InputError(f"{where}: {key}: {first['msg']}, got {first['input']!r}.") from None
-
-
-def _check_keys(cls: type, mapping: dict[str, Any], where: str) -> None:
-    hints = typing.get_type_hints(cls)
-    for key, value in mapping.items():
-        if key not in hints:
-            near = difflib.get_close_matches(str(key), hints, n=1, cutoff=0.0)[0]
-            known = ", ".join(hints)
-            raise InputError(
-                f"{where}: unknown key {str(key)!r}, did you mean {near!r}? Known: {known}."
-            )
-        if dataclasses.is_dataclass(hints[key]) and isinstance(value, dict):
-            _check_keys(typing.cast(type, hints[key]), value, f"{where}: {key}")
+        return cls(**mapping)
+    except (InputError, TypeError) as error:
+        raise InputError(f"{where}: {error}") from None
 
 
 def load_preset(

@@ -3,45 +3,34 @@
 Every solid is a unit shape under an affine map, so that one intersection routine per shape serves
 rigid and deforming bodies alike. A ray is (x, y, 1) t in the camera frame: its parameter t *is* the
 depth, and an affine map leaves it unchanged. Compiled with numba, one thread, float64 throughout.
+
+P solids are given by ``shapes`` (P,) int64, ``A`` (P, 3, 4) maps from the unit shape to the camera
+frame in metres, their inverses ``B``, and ``bounds`` (P, 4) of :func:`screen_bounds`; K: (3, 3).
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
 
 from hybridvo.compilation import njit
 
-BOX = 0
-"""Cube [-1, 1]^3; seen from inside it is a room."""
-ELLIPSOID = 1
-"""Unit sphere."""
-CYLINDER = 2
-"""Radius 1 about the y axis, -1 <= y <= 1, with caps."""
-
+BOX, ELLIPSOID, CYLINDER = range(3)
+"""Cube [-1, 1]^3 (seen from inside it is a room); unit sphere; radius 1 about the y axis,
+-1 <= y <= 1, with caps."""
 NEAR = 0.05
 """Nothing closer than this depth (metres) is seen."""
-
-_VISIBLE_TOLERANCE = 1e-6
-_OCTAVES = 7
-_PERSISTENCE = 0.8
-_CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
 
 
 def screen_bounds(A_cam_body: np.ndarray, K: np.ndarray, height: int, width: int) -> np.ndarray:
     """Pixel rectangles that surely contain each solid.
 
-    Args:
-        A_cam_body: (P, 3, 4) affine maps, unit shape to camera frame (metres).
-        K: (3, 3) intrinsics.
-        height: pixels.
-        width: pixels.
-
-    Returns:
-        (P, 4) int64 inclusive (u0, u1, v0, v1), clipped to the image; u0 > u1 where unseen.
+    (P, 4) int64 inclusive (u0, u1, v0, v1), clipped to the image; u0 > u1 where unseen.
     """
-    corners = np.einsum("pij,cj->pci", A_cam_body[:, :, :3], _CORNERS) + A_cam_body[:, None, :, 3]
+    cube = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+    corners = np.einsum("pij,cj->pci", A_cam_body[:, :, :3], cube) + A_cam_body[:, None, :, 3]
     z = corners[..., 2]
     safe = np.maximum(z, NEAR)
     u = K[0, 0] * corners[..., 0] / safe + K[0, 2]
@@ -59,101 +48,58 @@ def screen_bounds(A_cam_body: np.ndarray, K: np.ndarray, height: int, width: int
 
 
 @njit(cache=True, nogil=True)
-def _hit_box(ox, oy, oz, dx, dy, dz):  # pragma: no cover - compiled
-    first, last = -np.inf, np.inf
-    for o, d in ((ox, dx), (oy, dy), (oz, dz)):
-        if d == 0.0:
-            if abs(o) > 1.0:
-                return np.inf
-            continue
-        a, b = (-1.0 - o) / d, (1.0 - o) / d
-        if a > b:
-            a, b = b, a
-        first, last = max(first, a), min(last, b)
-    if first > last:
-        return np.inf
-    if first > NEAR:
-        return first
-    return last if last > NEAR else np.inf
+def _slab(o, d, first, last):  # pragma: no cover - compiled
+    """The part of [first, last] in which |o + d t| <= 1; (inf, -inf) where there is none."""
+    if d == 0.0:
+        return (first, last) if abs(o) <= 1.0 else (np.inf, -np.inf)
+    a, b = (-1.0 - o) / d, (1.0 - o) / d
+    return max(first, min(a, b)), min(last, max(a, b))
 
 
 @njit(cache=True, nogil=True)
-def _roots(a, b, c):  # pragma: no cover - compiled
-    """Roots of a t^2 + 2 b t + c, without cancellation; (inf, inf) where there are none."""
+def _ball(a, b, c):  # pragma: no cover - compiled
+    """Where a t^2 + 2 b t + c <= 0, without cancellation; (inf, -inf) where nowhere."""
+    if a == 0.0:
+        return (-np.inf, np.inf) if c <= 0.0 else (np.inf, -np.inf)
     disc = b * b - a * c
-    if disc < 0.0 or a == 0.0:
-        return np.inf, np.inf
+    if disc < 0.0:
+        return np.inf, -np.inf
     q = -(b + math.copysign(math.sqrt(disc), b))
     if q == 0.0:
         return 0.0, 0.0
-    t0, t1 = q / a, c / q
-    return (t0, t1) if t0 < t1 else (t1, t0)
-
-
-@njit(cache=True, nogil=True)
-def _hit_ellipsoid(ox, oy, oz, dx, dy, dz):  # pragma: no cover - compiled
-    t0, t1 = _roots(
-        dx * dx + dy * dy + dz * dz,
-        ox * dx + oy * dy + oz * dz,
-        ox * ox + oy * oy + oz * oz - 1.0,
-    )
-    if t0 > NEAR:
-        return t0
-    return t1 if t1 > NEAR else np.inf
-
-
-@njit(cache=True, nogil=True)
-def _hit_cylinder(ox, oy, oz, dx, dy, dz):  # pragma: no cover - compiled
-    first, last = -np.inf, np.inf
-    if dx == 0.0 and dz == 0.0:
-        if ox * ox + oz * oz > 1.0:
-            return np.inf
-    else:
-        first, last = _roots(dx * dx + dz * dz, ox * dx + oz * dz, ox * ox + oz * oz - 1.0)
-        if first == np.inf:
-            return np.inf
-    if dy == 0.0:
-        if abs(oy) > 1.0:
-            return np.inf
-    else:
-        a, b = (-1.0 - oy) / dy, (1.0 - oy) / dy
-        if a > b:
-            a, b = b, a
-        first, last = max(first, a), min(last, b)
-    if first > last:
-        return np.inf
-    if first > NEAR:
-        return first
-    return last if last > NEAR else np.inf
+    return min(q / a, c / q), max(q / a, c / q)
 
 
 @njit(cache=True, nogil=True)
 def _hit(shape, B, x, y):  # pragma: no cover - compiled
     """Depth at which the ray (x, y, 1) meets a solid; B (3, 4) maps camera frame to unit shape."""
+    ox, oy, oz = B[0, 3], B[1, 3], B[2, 3]
     dx = B[0, 0] * x + B[0, 1] * y + B[0, 2]
     dy = B[1, 0] * x + B[1, 1] * y + B[1, 2]
     dz = B[2, 0] * x + B[2, 1] * y + B[2, 2]
-    if shape == BOX:
-        return _hit_box(B[0, 3], B[1, 3], B[2, 3], dx, dy, dz)
+    first, last = -np.inf, np.inf
     if shape == ELLIPSOID:
-        return _hit_ellipsoid(B[0, 3], B[1, 3], B[2, 3], dx, dy, dz)
-    return _hit_cylinder(B[0, 3], B[1, 3], B[2, 3], dx, dy, dz)
+        first, last = _ball(
+            dx * dx + dy * dy + dz * dz,
+            ox * dx + oy * dy + oz * dz,
+            ox * ox + oy * oy + oz * oz - 1.0,
+        )
+    else:
+        if shape == BOX:
+            first, last = _slab(ox, dx, first, last)
+            first, last = _slab(oz, dz, first, last)
+        else:
+            first, last = _ball(dx * dx + dz * dz, ox * dx + oz * dz, ox * ox + oz * oz - 1.0)
+        first, last = _slab(oy, dy, first, last)
+    if first > last or last <= NEAR:
+        return np.inf
+    return first if first > NEAR else last
 
 
 @njit(cache=True, nogil=True)
 def cast(shapes, B_body_cam, bounds, K, height, width):  # pragma: no cover - compiled
-    """Nearest solid of every pixel.
-
-    Args:
-        shapes: (P,) int64 of BOX, ELLIPSOID, CYLINDER.
-        B_body_cam: (P, 3, 4) affine maps, camera frame (metres) to unit shape.
-        bounds: (P, 4) from :func:`screen_bounds`.
-        K: (3, 3) intrinsics.
-        height: pixels.
-        width: pixels.
-
-    Returns:
-        (H, W) float64 depth, inf where nothing is hit; (H, W) int32 solid index, -1 there.
+    """Nearest solid of every pixel: its depth (H, W) float64, inf where nothing is hit, and its
+    index (H, W) int32, -1 there.
     """
     depth = np.full((height, width), np.inf)
     index = np.full((height, width), -1, dtype=np.int32)
@@ -175,18 +121,8 @@ def motion(  # pragma: no cover - compiled
     """Exact optical flow and visibility of every pixel in the next frame.
 
     The visible point of a pixel is carried by its solid from t to t+1 and projected into the next
-    camera; a ray cast exactly there says whether it is seen.
-
-    Args:
-        depth: (H, W) from :func:`cast` of the previous frame.
-        index: (H, W) from the same call.
-        B_prev: (P, 3, 4) previous camera frame to unit shape.
-        K_prev: (3, 3) intrinsics of the previous camera.
-        shapes: (P,) as in :func:`cast`.
-        A_curr: (P, 3, 4) unit shape to current camera frame.
-        B_curr: (P, 3, 4) its inverse.
-        bounds_curr: (P, 4) from :func:`screen_bounds` of the current frame.
-        K_curr: (3, 3) intrinsics of the current camera.
+    camera; a ray cast exactly there says whether it is seen. ``depth`` and ``index`` are those of
+    :func:`cast` in the previous frame.
 
     Returns:
         (H, W, 2) float64 flow in pixels, NaN where there is no surface or it ends behind the next
@@ -220,7 +156,7 @@ def motion(  # pragma: no cover - compiled
             flow[v, u, 1] = v1 - v
             if not (-0.5 <= u1 <= width - 0.5 and -0.5 <= v1 <= height - 0.5):
                 continue
-            limit = Z * (1.0 - _VISIBLE_TOLERANCE)
+            limit = Z * (1.0 - 1e-6)  # a surface does not hide itself
             seen = True
             for q in range(shapes.shape[0]):
                 b = bounds_curr[q]
@@ -264,26 +200,56 @@ def _noise(x, y, z):  # pragma: no cover - compiled
 
 
 @njit(cache=True, nogil=True)
+def _normal(shape, body, normal):  # pragma: no cover - compiled
+    """Direction outwards at a point of a unit shape, into ``normal``."""
+    normal[:] = body
+    if shape == BOX:
+        axis = 0
+        for i in range(1, 3):
+            if abs(body[i]) > abs(body[axis]):
+                axis = i
+        for i in range(3):
+            normal[i] = body[i] if i == axis else 0.0
+    elif shape == CYLINDER:
+        if body[1] * body[1] > body[0] * body[0] + body[2] * body[2]:
+            normal[0] = normal[2] = 0.0
+        else:
+            normal[1] = 0.0
+
+
+@njit(cache=True, nogil=True)
+def _texture(body, scale, offset, pixels):  # pragma: no cover - compiled
+    """Seven octaves of noise at a point, and the second alone; ``pixels`` a step of the first.
+
+    Octaves finer than about three pixels fade out, so that the picture does not alias.
+    """
+    value, coarse, amplitude, frequency = 0.0, 0.0, 1.0, 1.0
+    for octave in range(7):
+        fade = min(max((pixels / frequency - 1.5) / 2.0, 0.0), 1.0)
+        if fade <= 0.0:
+            break
+        n = _noise(
+            (body[0] * scale[0] + offset[0]) * frequency + 17.3 * octave,
+            (body[1] * scale[1] + offset[1]) * frequency + 5.1 * octave,
+            (body[2] * scale[2] + offset[2]) * frequency + 9.7 * octave,
+        )
+        if octave == 1:
+            coarse = n * fade
+        value += amplitude * fade * n
+        amplitude *= 0.8
+        frequency *= 2.0
+    return value, coarse
+
+
+@njit(cache=True, nogil=True)
 def shade(  # pragma: no cover - compiled
     depth, index, shapes, B_body_cam, K, scale, offset, colours, light_cam
 ):
     """Colour of every ray: solid multi-octave noise fixed to the body, times diffuse light.
 
-    Octaves finer than about three pixels fade out, so that the picture does not alias.
-
-    Args:
-        depth: (H, W) from :func:`cast`.
-        index: (H, W) from the same call.
-        shapes: (P,) as in :func:`cast`.
-        B_body_cam: (P, 3, 4) as in :func:`cast`.
-        K: (3, 3) as in :func:`cast`.
-        scale: (P, 3) lattice steps of the coarsest octave per unit of the unit shape.
-        offset: (P, 3) place in the noise.
-        colours: (P, 2, 3) in [0, 1].
-        light_cam: (3,) unit direction towards the light, camera frame.
-
-    Returns:
-        (H, W, 3) float64 in [0, 1], 0 where nothing is hit.
+    ``scale`` (P, 3): lattice steps of the coarsest octave per unit of the unit shape; ``offset``
+    (P, 3): place in the noise; ``colours`` (P, 2, 3) in [0, 1]; ``light_cam`` (3,): unit direction
+    towards the light. (H, W, 3) float64 in [0, 1], 0 where nothing is hit.
     """
     height, width = depth.shape
     image = np.zeros((height, width, 3))
@@ -297,19 +263,7 @@ def shade(  # pragma: no cover - compiled
             x, z, B = (u - K[0, 2]) / K[0, 0], depth[v, u], B_body_cam[p]
             for i in range(3):
                 body[i] = (B[i, 0] * x + B[i, 1] * y + B[i, 2]) * z + B[i, 3]
-                normal[i] = body[i]
-            if shapes[p] == BOX:
-                axis = 0
-                for i in range(1, 3):
-                    if abs(body[i]) > abs(body[axis]):
-                        axis = i
-                for i in range(3):
-                    normal[i] = body[i] if i == axis else 0.0
-            elif shapes[p] == CYLINDER:
-                if body[1] * body[1] > body[0] * body[0] + body[2] * body[2]:
-                    normal[0] = normal[2] = 0.0
-                else:
-                    normal[1] = 0.0
+            _normal(shapes[p], body, normal)
             for i in range(3):
                 n_cam[i] = B[0, i] * normal[0] + B[1, i] * normal[1] + B[2, i] * normal[2]
             length = math.sqrt(n_cam[0] ** 2 + n_cam[1] ** 2 + n_cam[2] ** 2)
@@ -325,22 +279,7 @@ def shade(  # pragma: no cover - compiled
             for i in range(3):
                 row = math.sqrt(B[i, 0] ** 2 + B[i, 1] ** 2 + B[i, 2] ** 2)
                 stretch = max(stretch, row * scale[p, i])
-            pixels = 1.0 / (step * stretch)
-            value, coarse, amplitude, frequency = 0.0, 0.0, 1.0, 1.0
-            for octave in range(_OCTAVES):
-                fade = min(max((pixels / frequency - 1.5) / 2.0, 0.0), 1.0)
-                if fade <= 0.0:
-                    break
-                n = _noise(
-                    (body[0] * scale[p, 0] + offset[p, 0]) * frequency + 17.3 * octave,
-                    (body[1] * scale[p, 1] + offset[p, 1]) * frequency + 5.1 * octave,
-                    (body[2] * scale[p, 2] + offset[p, 2]) * frequency + 9.7 * octave,
-                )
-                if octave == 1:
-                    coarse = n * fade
-                value += amplitude * fade * n
-                amplitude *= _PERSISTENCE
-                frequency *= 2.0
+            value, coarse = _texture(body, scale[p], offset[p], 1.0 / (step * stretch))
             brightness = min(max(0.68 + 0.62 * value, 0.05), 1.25)
             brightness *= 0.82 + 0.18 * lit
             mix = min(max(0.5 + 1.4 * coarse, 0.0), 1.0)

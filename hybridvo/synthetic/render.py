@@ -17,131 +17,14 @@ from hybridvo.data.image_io import write_cam, write_dpt, write_flo
 from hybridvo.errors import InputError, OutputError
 from hybridvo.files import make_folder
 from hybridvo.geometry import invert
-from hybridvo.synthetic.raycast import cast, motion, screen_bounds, shade
-from hybridvo.synthetic.scenes import compose_world
-from hybridvo.synthetic.world import World, invert_affine
+from hybridvo.synthetic.scene import Scene
+from hybridvo.synthetic.scenes import BANDS, draw_scene
 from hybridvo.types import Camera, Frame
 
-
-@dataclass(frozen=True, eq=False)
-class RenderedFrame:
-    """One rendered picture.
-
-    Args:
-        rgb: (H, W, 3) uint8. depth: (H, W) float32 metres at the pixel centres, inf where nothing
-            is hit. object_id: (H, W) int32, 0 static, 1.. movers, -1 where nothing is hit.
-    """
-
-    rgb: np.ndarray
-    depth: np.ndarray
-    object_id: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
-class Scene:
-    """A world that can be rendered, frame by frame and without memory of other frames.
-
-    Args:
-        world: what there is. noise: standard deviation of the sensor noise, grey levels.
-
-    Raises:
-        InputError: negative or non-finite noise, or a frame index out of range.
-    """
-
-    world: World
-    noise: float = 0.0
-
-    def __post_init__(self) -> None:
-        if not 0.0 <= self.noise < 256.0:
-            raise InputError(f"Scene.noise: expected 0 to 255 grey levels, got {self.noise}.")
-
-    @property
-    def frames(self) -> int:
-        """Number of frames."""
-        return len(self.world.cameras)
-
-    @property
-    def T_world_cam(self) -> np.ndarray:
-        """(N, 4, 4) camera to world, metres."""
-        return self.world.T_world_cam
-
-    def camera(self, index: int) -> Camera:
-        """Intrinsics of one frame."""
-        return self.world.cameras[self._check(index)]
-
-    def _check(self, index: int, last: int = 0) -> int:
-        if not 0 <= index < self.frames - last:
-            what = "pair" if last else "frame"
-            raise InputError(
-                f"Scene: {what} {index} of {self.frames - last}; "
-                f"expected 0 to {self.frames - last - 1}."
-            )
-        return int(index)
-
-    def _cast(self, index: int, K: np.ndarray, height: int, width: int) -> tuple[np.ndarray, ...]:
-        """Maps, bounds, depth and solid index of a frame under intrinsics K."""
-        A = self.world.A_cam_body(index)
-        B = invert_affine(A)
-        bounds = screen_bounds(A, K, height, width)
-        depth, solid = cast(self.world.shapes, B, bounds, K, height, width)
-        return A, B, bounds, depth, solid
-
-    def _object_id(self, solid: np.ndarray) -> np.ndarray:
-        return np.where(solid < 0, np.int32(-1), self.world.object_ids[solid])
-
-    def render(self, index: int) -> RenderedFrame:
-        """Picture, depth and object number of one frame.
-
-        Depth and object belong to the ray through the pixel centre; the colour is the mean of four
-        rays per pixel.
-        """
-        camera = self.camera(index)
-        height, width = camera.shape
-        *_, depth, solid = self._cast(index, camera.K, height, width)
-        # twice the resolution: u' = 2 u + 0.5 puts the four rays at +-0.25 px of the centre
-        K2 = np.array([[2.0, 0.0, 0.5], [0.0, 2.0, 0.5], [0.0, 0.0, 1.0]]) @ camera.K
-        _, B, _, depth2, solid2 = self._cast(index, K2, 2 * height, 2 * width)
-        scale, offset, colours = self._texture()
-        light = self.T_world_cam[index][:3, :3].T @ np.asarray(self.world.light, dtype=float)
-        light /= np.linalg.norm(light)
-        fine = shade(depth2, solid2, self.world.shapes, B, K2, scale, offset, colours, light)
-        image = 255.0 * fine.reshape(height, 2, width, 2, 3).mean(axis=(1, 3))
-        if self.noise > 0:
-            rng = np.random.default_rng([self.world.seed, index])
-            image = image + self.noise * rng.standard_normal(image.shape)
-        rgb = np.clip(np.rint(image), 0, 255).astype(np.uint8)
-        return RenderedFrame(rgb, depth.astype(np.float32), self._object_id(solid))
-
-    def _texture(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Lattice scale (P, 3), offset (P, 3) and colours (P, 2, 3) of all solids."""
-        solids = self.world.solids
-        first = np.stack([np.reshape(s.A_world_body, (-1, 3, 4))[0, :, :3] for s in solids])
-        wavelength = np.array([s.wavelength for s in solids])
-        scale = np.linalg.norm(first, axis=1) / wavelength[:, None]
-        offset = np.random.default_rng([self.world.seed, 1]).uniform(0, 500, (len(solids), 3))
-        return scale, offset, np.array([s.colours for s in solids], dtype=float)
-
-    def flow(self, index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Exact flow from frame ``index`` to the next one.
-
-        Returns:
-            flow (H, W, 2) float32 pixels, NaN where nothing is hit; occlusion (H, W) bool, True
-            where the point of the pixel is not visible in the next frame (hidden, or outside the
-            image); moving (H, W) bool, True on moving objects.
-        """
-        index = self._check(index, last=1)
-        camera, following = self.world.cameras[index], self.world.cameras[index + 1]
-        _, B, _, depth, solid = self._cast(index, camera.K, *camera.shape)
-        A1 = self.world.A_cam_body(index + 1)
-        bounds1 = screen_bounds(A1, following.K, *following.shape)
-        B1, K1 = invert_affine(A1), following.K
-        flow, hidden = motion(depth, solid, B, camera.K, self.world.shapes, A1, B1, bounds1, K1)
-        return flow.astype(np.float32), hidden, self._object_id(solid) > 0
-
-    def object_id(self, index: int) -> np.ndarray:
-        """(H, W) int32 object numbers of a frame, without rendering colour."""
-        camera = self.camera(index)
-        return self._object_id(self._cast(index, camera.K, *camera.shape)[-1])
+MAX_FRAMES = 100_000
+"""Of a scene: an hour at 30 frames a second. Its cameras are drawn at once, in memory."""
+ATTEMPTS = 200
+"""Draws of a family before a share is given up."""
 
 
 def make_scene(
@@ -159,18 +42,20 @@ def make_scene(
 
     Args:
         kind: ``static``; ``light`` (several movers, about 30 % of the pixels); ``pair`` (small
-            random); ``heavy_rigid``, ``heavy_deforming``, ``heavy_two``, ``heavy_ten`` (46 to 75 %
-            of the pixels moving in every frame).
-        seed: the same seed gives the same pictures.
+            random); ``heavy_rigid``, ``heavy_deforming``, ``heavy_two``, ``heavy_ten``: 46 to 75 %
+            of the pixels on movers in every frame, and at least 46 % whose flow differs from the
+            camera's by over 1/512 of the width.
+        seed: not negative; the same seed gives the same images.
         height: pixels.
         width: pixels.
-        frames: default 20, for ``pair`` 2.
-        moving: median share of moving pixels; None for the family's own.
+        frames: default 20, for ``pair`` 2; at most :data:`MAX_FRAMES`.
+        moving: median share of the pixels on movers; None for the family's own (light 0.3,
+            heavy 0.6, pair random).
         zoom: relative amplitude of a slow change of focal length.
         noise: sensor noise, standard deviation in grey levels.
 
     Raises:
-        InputError: an unknown kind or a value out of range.
+        InputError: an unknown kind, a value out of range, or a share that the family cannot keep.
 
     Example:
         >>> scene = make_scene("static", 0, height=16, width=32, frames=2)
@@ -179,10 +64,30 @@ def make_scene(
     """
     if frames is None:
         frames = 2 if kind == "pair" else 20
-    world = compose_world(
-        kind, seed, height=height, width=width, frames=frames, moving=moving, zoom=zoom
+    if kind not in BANDS:
+        raise InputError(f"scene kind: expected one of {', '.join(BANDS)}, got {kind!r}.")
+    for name, value, least in (("seed", seed, 0), ("frames", frames, 2), ("height", height, 8),
+                               ("width", width, 8)):  # fmt: skip
+        if isinstance(value, bool) or int(value) != value or value < least:
+            raise InputError(f"{name}: expected an integer of at least {least}, got {value!r}.")
+    if frames > MAX_FRAMES:
+        raise InputError(f"frames: expected at most {MAX_FRAMES}, got {frames}.")
+    if not 0.0 <= zoom <= 0.3:
+        raise InputError(f"zoom: expected 0 to 0.3, got {zoom}.")
+    low, high = BANDS[kind]
+    if moving is not None and (kind == "static" or not low < moving < high):
+        raise InputError(
+            f"moving: a {kind!r} scene can have {low} to {high} of its pixels moving, got {moving}."
+        )
+    for attempt in range(ATTEMPTS):
+        rng = np.random.default_rng([list(BANDS).index(kind), seed, attempt])
+        scene = draw_scene(rng, kind, (height, width), frames, moving, zoom, noise)
+        if scene is not None:
+            return scene
+    raise InputError(
+        f"scene {kind!r}, seed {seed}: no draw of {ATTEMPTS} kept {moving} of the pixels moving "
+        f"over {frames} frames; ask for another share or seed."
     )
-    return Scene(world, noise)
 
 
 @dataclass(frozen=True, eq=False)
@@ -230,7 +135,7 @@ class SyntheticSequence(Sequence):
         return self.scene.camera(index)
 
     def frame(self, index: int) -> Frame:
-        """Picture and true depth."""
+        """Image and true depth."""
         rendered = self.scene.render(index)
         stamp = float(self.timestamps[index])
         return Frame(rendered.rgb, rendered.depth, self.camera(index), stamp, int(index))
@@ -300,7 +205,7 @@ def _write_mask(path: Path, mask: np.ndarray) -> None:
 def _write_png(path: Path, image: np.ndarray) -> None:
     done, data = cv2.imencode(".png", np.ascontiguousarray(image))
     if not done:
-        raise OutputError(f"{path}: cannot encode a picture of shape {image.shape}.")
+        raise OutputError(f"{path}: cannot encode an image of shape {image.shape}.")
     try:
         path.write_bytes(data.tobytes())
     except OSError as error:

@@ -14,10 +14,10 @@ from typing import Any
 
 import cv2
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from hybridvo.errors import InputError
 from hybridvo.geometry import ego_flow, make_transform, se3_exp
+from hybridvo.synthetic.draws import about, direction, turn
 from hybridvo.types import Camera, Frame, FramePair
 
 
@@ -98,11 +98,11 @@ def make_pair(
     Raises:
         InputError: unknown cell, negative seed, or an image below 16 pixels.
     """
-    name = "custom"
+    name = cell if isinstance(cell, str) else "custom"
     if isinstance(cell, str):
         if cell not in SCENARIOS:
             raise InputError(f"make_pair: unknown cell {cell!r}; known: {', '.join(SCENARIOS)}.")
-        name, cell = cell, SCENARIOS[cell]
+        cell = SCENARIOS[cell]
     if seed < 0 or min(height, width) < 16:
         raise InputError(
             f"make_pair: expected seed >= 0 and at least 16x16 pixels, "
@@ -114,41 +114,18 @@ def make_pair(
     T = _motion(rng, cell)
     depth = _scene(rng, cell, height, width)
     label = _objects(rng, cell, depth)
-    u = (np.arange(width) - camera.cx) / focal
-    v = (np.arange(height)[:, None] - camera.cy) / focal
-
-    moved = _apply(T, u, v, depth)
-    for k in range(1, cell.objects + 1 if cell.moving > 0 else 1):
-        rows, columns = np.nonzero(label == k)
-        if len(rows) == 0:
-            continue
-        x, y, z = u[columns], v[rows, 0], depth[rows, columns].astype(np.float64)
-        centre = np.array([np.mean(x * z), np.mean(y * z), np.mean(z)])
-        own = T @ _object_motion(rng, centre, float(np.mean(z)), focal)
-        for plane, values in zip(moved, _apply(own, x, y, z), strict=True):
-            plane[rows, columns] = values
-    x, y, z = moved
+    x, y, z = _moved(rng, cell, T, camera, depth, label)
     target_x = focal * x / z + camera.cx
     target_y = focal * y / z + camera.cy
     flow_true = np.empty((height, width, 2), dtype=np.float32)
     flow_true[..., 0] = target_x - np.arange(width)
     flow_true[..., 1] = target_y - np.arange(height)[:, None]
-
-    flow = flow_true
-    if cell.flow_noise_px > 0:
-        noise = rng.standard_normal(flow.shape, dtype=np.float32)
-        flow = flow + np.float32(cell.flow_noise_px) * noise
-    outlier = np.zeros((height, width), dtype=bool)
-    if cell.outliers > 0:
-        outlier = rng.random((height, width), dtype=np.float32) < cell.outliers
-        gross = rng.uniform(-60, 60, (int(outlier.sum()), 2)).astype(np.float32)
-        flow = flow.copy() if flow is flow_true else flow
-        flow[outlier] += gross
+    flow, outlier = _measured(rng, cell, flow_true)
     depth_curr = _splat(target_x, target_y, z)
     pair = FramePair(
         prev=Frame(None, _with_noise(rng, cell, depth), camera, timestamp=0.0, index=0),
         curr=Frame(None, _with_noise(rng, cell, depth_curr), camera, timestamp=0.1, index=1),
-        flow=np.ascontiguousarray(flow),
+        flow=flow,
         flow_source="synthetic",
         depth_source="synthetic",
     )
@@ -217,33 +194,63 @@ def make_model_pair(
     return pair, {"T_curr_prev": T, "depth_true": depth, "flow_true": flow_true}
 
 
-def _direction(rng: np.random.Generator) -> np.ndarray:
-    axis = rng.standard_normal(3)
-    return axis / np.linalg.norm(axis)
-
-
 def _motion(rng: np.random.Generator, cell: Scenario) -> np.ndarray:
-    angle = np.deg2rad(rng.uniform(0, cell.rotation_deg))
+    angle_deg = rng.uniform(0, cell.rotation_deg)
     length = rng.uniform(cell.min_translation_m, cell.translation_m)
-    R = Rotation.from_rotvec(angle * _direction(rng)).as_matrix()
-    return make_transform(R, length * _direction(rng))
+    R = turn(rng, angle_deg)
+    return make_transform(R, length * direction(rng))
 
 
-def _object_motion(
-    rng: np.random.Generator, centre: np.ndarray, depth: float, focal: float
-) -> np.ndarray:
-    """Rigid motion about the object's centre: 8-70 px sideways, some depth, up to 5 degrees."""
-    heading = rng.uniform(0, 2 * np.pi)
-    metres = rng.uniform(8, 70) * focal / 1120 * depth / focal
-    t = metres * np.array([np.cos(heading), np.sin(heading), rng.uniform(-0.5, 0.5)])
-    R = Rotation.from_rotvec(np.deg2rad(rng.uniform(0, 5)) * _direction(rng)).as_matrix()
-    return make_transform(R, centre - R @ centre + t)
+def _moved(
+    rng: np.random.Generator,
+    cell: Scenario,
+    T: np.ndarray,
+    camera: Camera,
+    depth: np.ndarray,
+    label: np.ndarray,
+) -> list[np.ndarray]:
+    """Coordinates of each pixel's point in the current camera, three float64 planes.
+
+    An object moves rigidly about its centre: 8-70 px sideways (at 1024 columns), some depth, up to
+    5 degrees; its motion is composed with the camera's.
+    """
+    u = (np.arange(camera.width) - camera.cx) / camera.fx
+    v = (np.arange(camera.height)[:, None] - camera.cy) / camera.fx
+    moved = _apply(T, u, v, depth)
+    for k in range(1, cell.objects + 1 if cell.moving > 0 else 1):
+        rows, columns = np.nonzero(label == k)
+        if len(rows) == 0:
+            continue
+        x, y, z = u[columns], v[rows, 0], depth[rows, columns].astype(np.float64)
+        centre = np.array([np.mean(x * z), np.mean(y * z), np.mean(z)])
+        heading = rng.uniform(0, 2 * np.pi)
+        metres = rng.uniform(8, 70) / 1120 * float(np.mean(z))
+        t = metres * np.array([np.cos(heading), np.sin(heading), rng.uniform(-0.5, 0.5)])
+        own = T @ about(turn(rng, rng.uniform(0, 5)), centre, t)
+        for plane, values in zip(moved, _apply(own, x, y, z), strict=True):
+            plane[rows, columns] = values
+    return moved
 
 
 def _apply(T: np.ndarray, u: Any, v: Any, z: np.ndarray) -> list[np.ndarray]:
     """Coordinates of ``T (u z, v z, z)``, three float64 planes."""
     z = z.astype(np.float64)
     return [z * (row[0] * u + row[1] * v + row[2]) + row[3] for row in T[:3]]
+
+
+def _measured(
+    rng: np.random.Generator, cell: Scenario, flow: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """(H, W, 2) float32 flow with noise and gross errors, and (H, W) bool where these are."""
+    flow = flow.copy()
+    if cell.flow_noise_px > 0:
+        noise = rng.standard_normal(flow.shape, dtype=np.float32)
+        flow += np.float32(cell.flow_noise_px) * noise
+    outlier = np.zeros(flow.shape[:2], dtype=bool)
+    if cell.outliers > 0:
+        outlier = rng.random(flow.shape[:2], dtype=np.float32) < cell.outliers
+        flow[outlier] += rng.uniform(-60, 60, (int(outlier.sum()), 2)).astype(np.float32)
+    return flow, outlier
 
 
 def _smooth(rng: np.random.Generator, height: int, width: int, size: int) -> np.ndarray:
@@ -266,19 +273,13 @@ def _scene(rng: np.random.Generator, cell: Scenario, height: int, width: int) ->
         ).astype(np.float32)
     layers = 12
     centre = rng.uniform(-0.5, 0.5, (layers, 2)).astype(np.float32)
-    log_depth = rng.uniform(np.log(1.5), np.log(28.0), layers)
-    inverse = np.exp(-log_depth).astype(np.float32)
+    inverse = np.exp(-rng.uniform(np.log(1.5), np.log(28.0), layers)).astype(np.float32)
     slope = rng.uniform(-0.8, 0.8, (layers, 2)).astype(np.float32)
-    step = 4
-    coarse_x, coarse_y = x[::step], y[::step]
-    distance = np.stack([(coarse_x - c[0]) ** 2 + (coarse_y - c[1]) ** 2 for c in centre])
+    distance = np.stack([(x[::4] - c[0]) ** 2 + (y[::4] - c[1]) ** 2 for c in centre])
     owner = np.argmin(distance, axis=0).astype(np.uint8)
     owner = cv2.resize(owner, (width, height), interpolation=cv2.INTER_NEAREST)
-    plane = inverse[owner] * (
-        1
-        + slope[:, 0][owner] * (x - centre[:, 0][owner])
-        + slope[:, 1][owner] * (y - centre[:, 1][owner])
-    )
+    across, down = (slope[owner, i] * (p - centre[owner, i]) for i, p in enumerate((x, y)))
+    plane = inverse[owner] * (1 + across + down)
     bumps = np.exp(np.float32(0.06) * _smooth(rng, height, width, 48))
     if cell.scene == "far":
         return np.clip(7 * bumps / plane, 60.0, 200.0)
@@ -288,23 +289,29 @@ def _scene(rng: np.random.Generator, cell: Scenario, height: int, width: int) ->
 def _objects(rng: np.random.Generator, cell: Scenario, depth: np.ndarray) -> np.ndarray:
     """(H, W) uint8 object label, 0 = static; writes the objects' own surfaces into ``depth``.
 
-    The objects grow from their centres until together they cover the wanted share.
+    Ellipses grow from random centres until together they cover the wanted share.
     """
     height, width = depth.shape
     if cell.moving <= 0:
         return np.zeros((height, width), dtype=np.uint8)
-    step = 2
     aspect = width / height
-    x = np.linspace(-0.5, 0.5, width, dtype=np.float32)[::step] * aspect
-    y = np.linspace(-0.5, 0.5, height, dtype=np.float32)[::step, None]
-    # one object must not rival the world, or the pair has no right answer; ``one60`` is about that
+    x = np.linspace(-0.5, 0.5, width, dtype=np.float32)[::2] * aspect
+    y = np.linspace(-0.5, 0.5, height, dtype=np.float32)[::2, None]
+    # one object must not rival the scene, or the pair has no right answer; ``one60`` is about that
     largest = np.inf if cell.objects == 1 else 0.8 * (1 - cell.moving)
     for _ in range(50):
-        coarse = _grow(rng, cell, x, y)
+        distance = []
+        for _ in range(cell.objects):
+            cx, cy = rng.uniform(-0.42, 0.42) * float(x[-1] - x[0]), rng.uniform(-0.35, 0.35)
+            stretch = np.exp(rng.uniform(-0.4, 0.4))
+            distance.append(((x - cx) * stretch) ** 2 + ((y - cy) / stretch) ** 2)
+        stacked = np.stack(distance).astype(np.float32)
+        nearest = stacked.min(axis=0)
+        inside = nearest < np.quantile(nearest, cell.moving)
+        coarse = np.where(inside, stacked.argmin(axis=0) + 1, 0).astype(np.uint8)
         if np.bincount(coarse.ravel())[1:].max(initial=0) <= largest * coarse.size:
             break
-    label = np.repeat(np.repeat(coarse, step, axis=0), step, axis=1)[:height, :width]
-    label = np.ascontiguousarray(label)
+    label = np.repeat(np.repeat(coarse, 2, axis=0), 2, axis=1)[:height, :width]
     for k in range(1, cell.objects + 1):
         rows, columns = np.nonzero(label == k)
         z = np.float32(np.exp(rng.uniform(np.log(2.0), np.log(12.0))))
@@ -312,21 +319,7 @@ def _objects(rng: np.random.Generator, cell: Scenario, depth: np.ndarray) -> np.
         depth[rows, columns] = z / (
             1 + slope[0] * (columns / width - 0.5) + slope[1] * (rows / height - 0.5)
         )
-    return label
-
-
-def _grow(rng: np.random.Generator, cell: Scenario, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """uint8 labels on the grid of ``x`` (columns) and ``y`` (rows): ellipses at random centres."""
-    aspect = float(x[-1] - x[0])
-    distance = []
-    for _ in range(cell.objects):
-        cx, cy = rng.uniform(-0.42, 0.42) * aspect, rng.uniform(-0.35, 0.35)
-        stretch = np.exp(rng.uniform(-0.4, 0.4))
-        distance.append(((x - cx) * stretch) ** 2 + ((y - cy) / stretch) ** 2)
-    stacked = np.stack(distance).astype(np.float32)
-    nearest = stacked.min(axis=0)
-    limit = np.quantile(nearest, cell.moving)
-    return np.where(nearest < limit, stacked.argmin(axis=0) + 1, 0).astype(np.uint8)
+    return np.ascontiguousarray(label)
 
 
 def _with_noise(rng: np.random.Generator, cell: Scenario, depth: np.ndarray) -> np.ndarray:

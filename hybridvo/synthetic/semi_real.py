@@ -24,7 +24,7 @@ from hybridvo.errors import InputError
 from hybridvo.flow import dis_flow
 from hybridvo.geometry import backproject, invert, make_transform, rotation_angle, se3_exp
 from hybridvo.refinement.refine import refine_pair
-from hybridvo.synthetic.sensors import log_uniform, smooth_field
+from hybridvo.synthetic.draws import log_uniform, smooth_field
 from hybridvo.synthetic.silhouettes import silhouette_mask
 from hybridvo.types import Camera, Frame, FramePair
 

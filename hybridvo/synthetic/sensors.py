@@ -8,87 +8,40 @@ noise that grows with distance, a smooth bias, edges in the wrong place and hole
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 
-from hybridvo.errors import InputError
+from hybridvo.options import Share, option_group
+from hybridvo.synthetic.draws import Range, log_uniform, smooth_field
 
-Range = tuple[float, float]
 
-
-@dataclass(frozen=True)
+@option_group
 class SensorOptions:
     """How strongly inputs are damaged; a range is drawn log-uniformly once per sample.
 
-    Args:
-        exact_flow_probability: share of samples whose flow is the true one.
-        exact_depth_probability: share of samples whose depths are the true ones.
-        flow_white_px: spread of the noise of each pixel.
-        flow_smooth_px: spread of an error field that is smooth over an eighth of the picture.
-        flow_lag: largest share by which the flow falls behind the true motion, locally.
-        bleed_px: distance over which motion bleeds across a boundary.
-        block_share: share of the blocks whose flow is off.
-        block_px: spread of the offset of such a block.
-        textureless_probability: share of samples with an area where the flow is only a blurred
-            guess from around it.
-        hidden_px: spread of the additional error where a point is hidden or leaves the picture.
-        depth_relative: spread of depth noise over depth.
-        depth_quadratic: spread of the noise of a disparity sensor, 1 / metres: std = a z^2.
-        depth_bias: spread of a smooth relative error of depth.
-        depth_bleed_px: distance by which depth edges are displaced.
-        hole_share: largest share of the picture that is lost in blobs.
-        edge_hole_probability: share of samples that lose the depth along silhouettes.
-        range_limit_probability: share of samples whose sensor sees nothing beyond a distance.
+    Units and reasons stand in ``configs/data_diverse.yaml`` under ``degradation``.
 
     Raises:
-        InputError: a range in the wrong order or a probability outside [0, 1].
+        InputError: a range in the wrong order or a share outside [0, 1].
     """
 
-    exact_flow_probability: float = 0.35
-    exact_depth_probability: float = 0.4
+    exact_flow_probability: Share = 0.35
+    exact_depth_probability: Share = 0.4
     flow_white_px: Range = (0.005, 0.15)
     flow_smooth_px: Range = (0.01, 0.4)
-    flow_lag: float = 0.08
+    flow_lag: Share = 0.08
     bleed_px: Range = (0.5, 5.0)
     block_share: Range = (0.002, 0.08)
     block_px: Range = (0.3, 8.0)
-    textureless_probability: float = 0.3
+    textureless_probability: Share = 0.3
     hidden_px: Range = (0.2, 4.0)
     depth_relative: Range = (0.001, 0.03)
     depth_quadratic: Range = (0.0003, 0.006)
     depth_bias: Range = (0.001, 0.04)
     depth_bleed_px: Range = (0.3, 2.5)
-    hole_share: float = 0.3
-    edge_hole_probability: float = 0.3
-    range_limit_probability: float = 0.25
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if isinstance(value, tuple):
-                if not 0 < value[0] <= value[1]:
-                    raise InputError(
-                        f"SensorOptions.{name}: expected 0 < low <= high, got {value}."
-                    )
-            elif not 0 <= value <= 1:
-                raise InputError(f"SensorOptions.{name}: expected 0..1, got {value}.")
-
-
-def log_uniform(rng: np.random.Generator, limits: Range) -> float:
-    """One draw, uniform in the logarithm between two positive limits."""
-    return float(np.exp(rng.uniform(np.log(limits[0]), np.log(limits[1]))))
-
-
-def smooth_field(
-    rng: np.random.Generator, height: int, width: int, cells: int, channels: int = 1
-) -> np.ndarray:
-    """(H, W[, C]) float32 Gaussian field of about unit spread with ``cells`` knots per height."""
-    rows = max(cells, 2)
-    columns = max(round(cells * width / max(height, 1)), 2)
-    coarse = rng.standard_normal((rows, columns, channels), dtype=np.float32)
-    field = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
-    return field.reshape(height, width, channels) if channels > 1 else field.reshape(height, width)
+    hole_share: Share = 0.3
+    edge_hole_probability: Share = 0.3
+    range_limit_probability: Share = 0.25
 
 
 def _look_up(
@@ -104,16 +57,9 @@ def _look_up(
 def degrade_flow(
     rng: np.random.Generator, flow: np.ndarray, hidden: np.ndarray, options: SensorOptions
 ) -> np.ndarray:
-    """Flow as DIS would have measured it.
+    """(H, W, 2) float32 px, flow as DIS would have measured the true one.
 
-    Args:
-        rng: source of randomness.
-        flow: (H, W, 2) float32 px, true.
-        hidden: (H, W) bool, points that are covered in the next frame or leave it.
-        options: strengths.
-
-    Returns:
-        (H, W, 2) float32 px.
+    ``hidden`` (H, W) bool: points that are covered in the next frame or leave it.
     """
     height, width = flow.shape[:2]
     o = options
@@ -161,15 +107,9 @@ def sample_at(depth: np.ndarray, offset: np.ndarray) -> np.ndarray:
 def degrade_depth(
     rng: np.random.Generator, depths: list[np.ndarray], options: SensorOptions
 ) -> list[np.ndarray]:
-    """Depths of one sensor: the same strengths for both frames, noise of their own.
+    """Depths (H, W) float32 in metres as one sensor would have measured them; 0 is invalid.
 
-    Args:
-        rng: source of randomness.
-        depths: (H, W) float32 metres each, 0 is invalid.
-        options: strengths.
-
-    Returns:
-        Damaged copies; 0 is invalid.
+    The same strengths for all frames, noise of their own.
     """
     o = options
     quadratic = rng.random() < 0.5

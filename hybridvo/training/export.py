@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
+import subprocess
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import torch
-
-from hybridvo.errors import CheckpointError, InputError
+from hybridvo.errors import InputError
 from hybridvo.files import write_json
 from hybridvo.network.models import load_weights
 from hybridvo.network.weights import save_weights
 from hybridvo.training.options import recorded_run
 from hybridvo.training.pwvo_task import PwvoTask
-from hybridvo.training.selector_task import SelectorTask, evaluate_selector
-from hybridvo.training.trainer import CHECKPOINT, Trainer
+from hybridvo.training.selector_task import evaluate_selector
+from hybridvo.training.trainer import CHECKPOINT, Trainer, read_checkpoint
 from hybridvo.training.validation import PUBLISHED_SEED, calibrate_scales, evaluate_network
 
 RUN = "run.json"
@@ -27,6 +25,19 @@ SCALE_OF = {
     "laplace": "s of the translation is the log scale of a Laplace error in metres",
     "direction": "s of the translation is the log scale of the paper's direction-and-length error",
 }
+
+
+def source_commit() -> str | None:
+    """Commit of the working tree, with a mark if it was changed; None outside of a repository."""
+    command = ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude", "*"]
+    here = Path(__file__).resolve().parent
+    try:
+        done = subprocess.run(
+            command, cwd=here, capture_output=True, text=True, timeout=10, check=True
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout.strip() or None
 
 
 def run_card(trainer: Trainer) -> dict[str, Any]:
@@ -53,9 +64,7 @@ def open_run(folder: str | Path) -> Trainer:
     """
     folder = Path(folder)
     path = folder / CHECKPOINT
-    if not path.exists():
-        raise CheckpointError(f"{path}: no such checkpoint; train first.")
-    record = torch.load(path, map_location="cpu", weights_only=True)["record"]
+    record = read_checkpoint(path)["record"]
     trainer = Trainer(PwvoTask(*recorded_run(record, str(path))), folder)
     trainer.resume()
     return trainer
@@ -116,9 +125,7 @@ def export_selector(trainer: Trainer, held_out: str | Path, path: str | Path) ->
     Raises:
         InputError: no held-out shards.
     """
-    path, task = Path(path), trainer.task
-    assert isinstance(task, PwvoTask)
-    assert isinstance(task, SelectorTask)
+    path = Path(path)
     files = sorted(Path(held_out).glob("*.npz"))
     if not files:
         raise InputError(f"{held_out}: no shards; make some with seeds below 1000.")
@@ -127,8 +134,8 @@ def export_selector(trainer: Trainer, held_out: str | Path, path: str | Path) ->
         "what": "chooses the world among candidate motions, and where the world is",
         "held_out": evaluate_selector(network, files),
         "held_out_with_proposals": evaluate_selector(network, files, asked=True),
+        "network": trainer.record["options"]["network"],
     }
-    card["network"] = dataclasses.asdict(task.options.network)
     save_weights(path, network, card, dtype="float16")
     write_json(path.with_suffix(".json"), card)
     return card

@@ -1,34 +1,33 @@
-"""Options of a training: the frozen dataclasses behind ``configs/train_*.yaml``."""
+"""Options of a training: what stands in ``configs/train_*.yaml``."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, cast
+from typing import Annotated, Any, Literal, cast
+
+from pydantic import Field
 
 from hybridvo.errors import InputError
 from hybridvo.network.losses import LossOptions
 from hybridvo.network.options import NetworkOptions
-from hybridvo.network.selection import SELECTION_METHODS as SELECTIONS
+from hybridvo.network.selection import SELECTION_METHODS
 from hybridvo.network.selector_net import SelectorNetworkOptions
+from hybridvo.options import Count, Positive, Share, option_group
 from hybridvo.synthetic.dataset import StoredSamples
-from hybridvo.synthetic.presets import (
-    PRESETS,
-    Preset,
-    build_options,
-    load_preset,
-    read_yaml,
-)
+from hybridvo.synthetic.presets import PRESETS, Preset, build_options, load_preset, read_yaml
 from hybridvo.training.rendered import RenderedOptions
 from hybridvo.training.stream import Mixture
 
 KINDS = PRESETS | {"rendered": RenderedOptions, "folder": StoredSamples}
 """Data that a training can name."""
 
+Below1 = Annotated[float, Field(ge=0, lt=1)]
+NotNegative = Annotated[float, Field(ge=0)]
 
-@dataclass(frozen=True)
+
+@option_group
 class OptimizerOptions:
     """AdamW; the defaults are the published Adam.
 
@@ -37,30 +36,15 @@ class OptimizerOptions:
         betas: moments' decay.
         weight_decay: decoupled; 0 is Adam.
         clip_norm: largest global norm of the gradient.
-        head_rate: factor on the rate of the motion heads' last layer. Its output is scaled by
-            0.01; at the common rate a short run spends itself on growing that layer's weights. 100
-            undoes the scale for Adam.
-
-    Raises:
-        InputError: a rate or a norm that is not positive, betas outside [0, 1).
     """
 
-    learning_rate: float = 1e-4
-    betas: tuple[float, float] = (0.5, 0.999)
-    weight_decay: float = 0.0
-    clip_norm: float = 1.0
-    head_rate: float = 1.0
-
-    def __post_init__(self) -> None:
-        if not min(self.learning_rate, self.clip_norm, self.head_rate) > 0:
-            raise InputError(
-                "OptimizerOptions: expected learning_rate, clip_norm and head_rate above 0."
-            )
-        if not all(0 <= beta < 1 for beta in self.betas):
-            raise InputError(f"OptimizerOptions.betas: expected 0 <= beta < 1, got {self.betas}.")
+    learning_rate: Positive = 1e-4
+    betas: tuple[Below1, Below1] = (0.5, 0.999)
+    weight_decay: NotNegative = 0.0
+    clip_norm: Positive = 1.0
 
 
-@dataclass(frozen=True)
+@option_group
 class ScheduleOptions:
     """Factor on the learning rate over the run, of which p in [0, 1] is done.
 
@@ -71,22 +55,13 @@ class ScheduleOptions:
         final_share: share of the peak at which ``cosine`` ends.
         by: ``steps`` = p counts updates (the same however often the run is cut), ``time`` = p is
             the larger of that and the share of the time limit that is spent.
-
-    Raises:
-        InputError: an unknown word or a share outside [0, 1].
     """
 
-    kind: str = "halving"
-    warmup: float = 0.0
-    halvings: tuple[float, ...] = (0.25, 0.5, 0.75)
-    final_share: float = 0.0
-    by: str = "steps"
-
-    def __post_init__(self) -> None:
-        _one_of("ScheduleOptions.kind", self.kind, ("halving", "cosine", "constant"))
-        _one_of("ScheduleOptions.by", self.by, ("steps", "time"))
-        if not all(0 <= p <= 1 for p in (self.warmup, self.final_share, *self.halvings)):
-            raise InputError("ScheduleOptions: expected shares of the run in [0, 1].")
+    kind: Literal["halving", "cosine", "constant"] = "halving"
+    warmup: Share = 0.0
+    halvings: tuple[Share, ...] = (0.25, 0.5, 0.75)
+    final_share: Share = 0.0
+    by: Literal["steps", "time"] = "steps"
 
     def factor(self, progress: float) -> float:
         """Factor on the peak learning rate when ``progress`` in [0, 1] of the run is done."""
@@ -102,7 +77,7 @@ class ScheduleOptions:
         return 1.0
 
 
-@dataclass(frozen=True)
+@option_group
 class RunOptions:
     """What every training has; the defaults are the paper's.
 
@@ -110,7 +85,7 @@ class RunOptions:
         seed: of the weights and the samples.
         steps: updates.
         batch_size: samples an update and process.
-        precision: ``float32`` or ``bfloat16`` (autocast of the network's forward pass).
+        precision: of the network's forward pass (``bfloat16`` by autocast).
         channels_last: memory format of the network.
         ema_decay: of a running average of the weights, which is then what is exported; 0 = none.
         optimizer, schedule: see there.
@@ -120,35 +95,24 @@ class RunOptions:
         evaluate_count: held-out samples of each preset.
 
     Raises:
-        InputError: values that cannot be meant.
+        InputError: a value out of bounds, here and in every class of options.
     """
 
     seed: int = 0
-    steps: int = 100_000
-    batch_size: int = 100
-    precision: str = "float32"
+    steps: Count = 100_000
+    batch_size: Count = 100
+    precision: Literal["float32", "bfloat16"] = "float32"
     channels_last: bool = True
-    ema_decay: float = 0.0
-    optimizer: OptimizerOptions = field(default_factory=OptimizerOptions)
-    schedule: ScheduleOptions = field(default_factory=ScheduleOptions)
-    checkpoint_minutes: float = 5.0
-    log_every: int = 50
-    evaluate_every: int = 0
-    evaluate_count: int = 200
-
-    def __post_init__(self) -> None:
-        _one_of(f"{type(self).__name__}.precision", self.precision, ("float32", "bfloat16"))
-        for name in ("steps", "batch_size", "log_every", "evaluate_count"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{type(self).__name__}.{name}: expected at least 1.")
-        if not 0 <= self.ema_decay < 1 or self.checkpoint_minutes <= 0 or self.evaluate_every < 0:
-            raise InputError(
-                f"{type(self).__name__}: expected 0 <= ema_decay < 1, checkpoint_minutes > 0 and "
-                f"evaluate_every >= 0."
-            )
+    ema_decay: Below1 = 0.0
+    optimizer: OptimizerOptions = OptimizerOptions()
+    schedule: ScheduleOptions = ScheduleOptions()
+    checkpoint_minutes: Positive = 5.0
+    log_every: Count = 50
+    evaluate_every: Annotated[int, Field(ge=0)] = 0
+    evaluate_count: Count = 200
 
 
-@dataclass(frozen=True)
+@option_group
 class PwvoOptions(RunOptions):
     """A training of PWVO or of a baseline; the defaults are the paper's.
 
@@ -166,39 +130,31 @@ class PwvoOptions(RunOptions):
         data: preset files, beside the file that names them.
         data_weights: share of each.
         data_size: (height, width) of the drawn samples instead of the presets' own, or None.
-
-    Raises:
-        InputError: values that cannot be meant.
     """
 
-    network: NetworkOptions = field(default_factory=NetworkOptions)
-    loss: LossOptions = field(default_factory=LossOptions)
-    moving_weight: float = 0.0
-    fit_weight: float = 0.0
-    selection: str = "softmax"
-    loss_stride: int = 1
-    data: tuple[str, ...] = ("data_paper.yaml",)
+    network: NetworkOptions = NetworkOptions()
+    loss: LossOptions = LossOptions()
+    moving_weight: NotNegative = 0.0
+    fit_weight: NotNegative = 0.0
+    selection: Literal[SELECTION_METHODS] = "softmax"  # type: ignore[valid-type]
+    loss_stride: Count = 1
+    data: Annotated[tuple[str, ...], Field(min_length=1)] = ("data_paper.yaml",)
     data_weights: tuple[float, ...] = (1.0,)
-    data_size: tuple[int, int] | None = None
+    data_size: tuple[Count, Count] | None = None
 
     def __post_init__(self) -> None:
-        super().__post_init__()
-        _one_of("PwvoOptions.selection", self.selection, SELECTIONS)
-        weighs_pixels = self.loss.flow_uncertainty or self.loss.depth_uncertainty
-        if self.loss_stride < 1 or (self.loss_stride > 1 and weighs_pixels):
+        if self.loss_stride > 1 and (self.loss.flow_uncertainty or self.loss.depth_uncertainty):
             raise InputError(
-                "PwvoOptions.loss_stride: expected 1, or more with loss.flow_uncertainty and "
-                "loss.depth_uncertainty off; weighed by s, every pixel counts."
+                "loss_stride: expected 1, or more with loss.flow_uncertainty and "
+                "loss.depth_uncertainty off; weighed by s, every pixel counts"
             )
-        if not (self.moving_weight >= 0 and self.fit_weight >= 0):
-            raise InputError("PwvoOptions: expected moving_weight and fit_weight >= 0.")
         if self.fit_weight and not (self.network.kind == "pwvo" and self.network.uncertainty):
-            raise InputError("PwvoOptions.fit_weight: needs a pwvo network with uncertainty.")
-        if not self.data or len(self.data) != len(self.data_weights):
-            raise InputError("PwvoOptions: expected one of data_weights for each of data.")
+            raise InputError("fit_weight: needs a pwvo network with uncertainty")
+        if len(self.data) != len(self.data_weights):
+            raise InputError("expected one of data_weights for each of data")
 
 
-@dataclass(frozen=True)
+@option_group
 class SelectorOptions(RunOptions):
     """A training of the selector.
 
@@ -211,28 +167,15 @@ class SelectorOptions(RunOptions):
         asked_share: share of the samples in which the pixel-wise network's static world is shown
             and its motion takes part, as where the selector alone is in doubt.
         files: shards from which the samples of a round are mixed.
-
-    Raises:
-        InputError: values that cannot be meant.
     """
 
-    network: SelectorNetworkOptions = field(default_factory=SelectorNetworkOptions)
-    second_look_from: float = 0.1
-    refits: int = 2
-    mask_weight: float = 1.0
-    trust_weight: float = 0.5
-    asked_share: float = 0.5
-    files: int = 48
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if min(self.refits, self.files) < 1:
-            raise InputError("SelectorOptions: expected refits and files of at least 1.")
-
-
-def _one_of(name: str, value: str, known: tuple[str, ...]) -> None:
-    if value not in known:
-        raise InputError(f"{name}: expected {' or '.join(known)}, got {value!r}.")
+    network: SelectorNetworkOptions = SelectorNetworkOptions()
+    second_look_from: Share = 0.1
+    refits: Count = 2
+    mask_weight: NotNegative = 1.0
+    trust_weight: NotNegative = 0.5
+    asked_share: Share = 0.5
+    files: Count = 48
 
 
 def load_pwvo_options(path: str | Path) -> tuple[PwvoOptions, Mixture]:

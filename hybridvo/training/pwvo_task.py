@@ -20,14 +20,9 @@ from hybridvo.training.options import PwvoOptions, described
 from hybridvo.training.stream import Mixture, SampleStream, TrainingBatch
 from hybridvo.training.validation import evaluate_network
 
-FIT_FLOOR_PX = 0.05
-"""Pixels of the inputs: below it the noise of the inputs decides the fit."""
-FIT_LIMIT_PX = 100.0
-"""Most that a pixel of the fit is charged, and what one behind the camera is."""
-SEPARATION_SLOPE = 2.0
-"""Logits per unit of s: pixels apart by a factor of three in U count little."""
-SEPARATION_PIXELS = 700
-"""Of each kind in a batch, for the pairs of pixels that are compared."""
+FIT_FLOOR_PX, FIT_LIMIT_PX = 0.05, 100.0
+"""px of the inputs: error of the fit below which their noise decides it, and the most that a pixel
+is charged, also behind the camera."""
 
 
 class PwvoTask:
@@ -153,5 +148,6 @@ def separation_loss(
     kinds = [score[valid & (moving > 0.5)], score[valid & (moving < 0.5)]]
     if not all(len(kind) for kind in kinds):
         return s.new_zeros(())
-    above, below = (kind[:: -(-len(kind) // SEPARATION_PIXELS)] for kind in kinds)
-    return F.softplus(SEPARATION_SLOPE * (below[None] - above[:, None])).mean()
+    # 700 pixels of each kind make enough pairs; apart by a factor of three in U they count little
+    above, below = (kind[:: -(-len(kind) // 700)] for kind in kinds)
+    return F.softplus(2.0 * (below[None] - above[:, None])).mean()

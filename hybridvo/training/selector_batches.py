@@ -20,7 +20,7 @@ from hybridvo.network.selector_inputs import SelectorInputs, planes_of, prior_in
 from hybridvo.network.selector_net import SelectorOutput
 from hybridvo.options import RefineOptions
 from hybridvo.refinement import kernels
-from hybridvo.synthetic.sensors import log_uniform
+from hybridvo.synthetic.draws import log_uniform
 from hybridvo.training.selector_proposals import read_proposals
 
 

@@ -23,8 +23,9 @@ from hybridvo.options import Options
 from hybridvo.refinement import kernels
 from hybridvo.results import RelativePose
 from hybridvo.synthetic.diverse import DiverseOptions, diverse_sample
+from hybridvo.synthetic.draws import log_uniform
 from hybridvo.synthetic.semi_real import Recording, draw_pair
-from hybridvo.synthetic.sensors import SensorOptions, degrade_depth, log_uniform
+from hybridvo.synthetic.sensors import SensorOptions, degrade_depth
 from hybridvo.synthetic.training_scenes import training_scene
 from hybridvo.training.rendered import MOVING, STATIC, UNKNOWN
 from hybridvo.types import Camera, Frame, FramePair

@@ -126,18 +126,12 @@ class SampleStream(IterableDataset):
         seed: of the samples.
         start: index of the first sample, to resume.
         batch_size: samples in a batch.
-        rank: of this process.
+        rank: of this process, of ``world``.
         world: number of processes.
     """
 
     def __init__(
-        self,
-        preset: Preset,
-        seed: int,
-        start: int,
-        batch_size: int,
-        rank: int = 0,
-        world: int = 1,
+        self, preset: Preset, seed: int, start: int, batch_size: int, rank: int = 0, world: int = 1
     ) -> None:
         super().__init__()
         self.preset, self.seed, self.start, self.batch_size = preset, seed, start, batch_size

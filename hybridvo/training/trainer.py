@@ -6,6 +6,7 @@ interrupted, as long as the schedule counts updates.
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import dataclasses
 import json
@@ -25,12 +26,10 @@ from hybridvo.errors import CheckpointError, DegenerateError, InputError
 from hybridvo.files import atomic_write
 from hybridvo.training.options import RunOptions
 
-MAX_SKIPPED_IN_A_ROW = 50
-"""Updates with a loss or gradient that is not finite, after which a run gives up."""
-
 FREE_TO_CHANGE = ("checkpoint_minutes", "log_every", "evaluate_every", "evaluate_count")
 """Options in which a resumed run may differ: they do not touch what is learned."""
-
+PROGRESS = ("step", "samples", "skipped", "elapsed_s")
+"""Numbers of a run that its checkpoint keeps."""
 CHECKPOINT, LOG = "checkpoint.pt", "log.jsonl"
 
 
@@ -98,7 +97,7 @@ class Trainer:
         average = self.options.ema_decay > 0
         self.ema = copy.deepcopy(self.network).requires_grad_(False) if average else None
         self.optimizer = torch.optim.AdamW(
-            _parameter_groups(self.network, self.options.optimizer.head_rate),
+            self.network.parameters(),
             lr=self.options.optimizer.learning_rate,
             betas=self.options.optimizer.betas,
             weight_decay=self.options.optimizer.weight_decay,
@@ -134,7 +133,7 @@ class Trainer:
         optimizer = self.options.optimizer
         rate = optimizer.learning_rate * self.options.schedule.factor(progress)
         for group in self.optimizer.param_groups:
-            group["lr"] = rate * group["rate_factor"]
+            group["lr"] = rate
         self.optimizer.zero_grad(set_to_none=True)
         loss, parts = self.task.loss(self.model, batch.to(self.device), self.step, progress)
         loss.backward()
@@ -147,11 +146,11 @@ class Trainer:
         else:
             self.skipped += 1
             self.skipped_in_a_row += 1
-            if self.skipped_in_a_row >= MAX_SKIPPED_IN_A_ROW:
+            if self.skipped_in_a_row >= 50:
                 raise DegenerateError(
-                    f"training: loss or gradient not finite {MAX_SKIPPED_IN_A_ROW} times in a row "
-                    f"at update {self.step}. Lower optimizer.learning_rate or loss weights; the "
-                    f"last checkpoint is sound."
+                    f"training: loss or gradient not finite 50 times in a row at update "
+                    f"{self.step}. Lower optimizer.learning_rate or loss weights; the last "
+                    f"checkpoint is sound."
                 )
         self.step += 1
         self.samples += len(batch) * self.world
@@ -159,6 +158,7 @@ class Trainer:
         return figures | {name: float(part) for name, part in parts.items()}
 
     def _average(self) -> None:
+        """Let the running average of the weights follow."""
         if self.ema is None:
             return
         # A young average follows quickly: it must forget the random start.
@@ -230,7 +230,7 @@ class Trainer:
     def _log(self, entry: dict[str, Any]) -> None:
         if self.rank != 0:
             return
-        progress = {key: getattr(self, key) for key in ("step", "samples", "skipped")}
+        progress = {key: getattr(self, key) for key in PROGRESS}
         entry = progress | {"elapsed_s": round(self.elapsed_s, 1)} | entry
         if self.folder is not None:
             with (self.folder / LOG).open("a", encoding="utf-8") as file:
@@ -246,13 +246,12 @@ class Trainer:
         """
         if self.folder is None or self.rank != 0:
             return
-        progress = ("step", "samples", "skipped", "elapsed_s")
         state = {
             "record": self.record,
             "network": self.network.state_dict(),
             "optimizer": self.optimizer.state_dict(),
             "ema": None if self.ema is None else self.ema.state_dict(),
-            "progress": {key: getattr(self, key) for key in progress},
+            "progress": {key: getattr(self, key) for key in PROGRESS},
         }
         with atomic_write(self.folder / CHECKPOINT, "wb") as file:
             torch.save(state, file)
@@ -263,12 +262,10 @@ class Trainer:
         Raises:
             CheckpointError: weights of other shapes; names them by ``name``.
         """
-        try:
+        with _fits(name):
             self.network.load_state_dict(weights)
             if self.ema is not None:
                 self.ema.load_state_dict(weights)
-        except RuntimeError as error:
-            raise CheckpointError(f"{name}: does not fit this network: {error}") from None
 
     def resume(self) -> bool:
         """Go on where the folder's checkpoint ended, if there is one.
@@ -280,28 +277,44 @@ class Trainer:
         if self.folder is None or not (self.folder / CHECKPOINT).exists():
             return False
         path = self.folder / CHECKPOINT
-        try:
-            state = torch.load(path, map_location=self.device, weights_only=True)
-            record = state["record"]
-        except (OSError, RuntimeError, EOFError, KeyError, TypeError, pickle.UnpicklingError) as e:
-            reason = str(e).strip().splitlines()[0] if str(e).strip() else type(e).__name__
-            raise CheckpointError(f"{path}: not a checkpoint of a training: {reason}.") from None
-        changed = difference(record, self.record)
+        state = read_checkpoint(path, self.device)
+        changed = difference(state["record"], self.record)
         if changed:
             raise InputError(
                 f"{path}: is of a run with other options: {changed}. Choose another folder, or "
                 f"train anew with --overwrite."
             )
-        try:
+        with _fits(str(path)):
             self.network.load_state_dict(state["network"])
             self.optimizer.load_state_dict(state["optimizer"])
             if self.ema is not None:
                 self.ema.load_state_dict(state["ema"])
-            for key, value in state["progress"].items():
-                setattr(self, key, value)
-        except (RuntimeError, ValueError, KeyError, TypeError) as error:
-            raise CheckpointError(f"{path}: does not fit this network: {error}") from None
+            for key in PROGRESS:
+                setattr(self, key, state["progress"][key])
         return True
+
+
+@contextlib.contextmanager
+def _fits(name: str) -> Iterator[None]:
+    """Say of what does not fit a network where it comes from."""
+    try:
+        yield
+    except (RuntimeError, ValueError, KeyError, TypeError) as error:
+        raise CheckpointError(f"{name}: does not fit this network: {error}") from None
+
+
+def read_checkpoint(path: Path, device: torch.device | str = "cpu") -> dict[str, Any]:
+    """Content of a ``checkpoint.pt``; nothing in it can run.
+
+    Raises:
+        CheckpointError: no such file, or a damaged one.
+    """
+    try:
+        state = torch.load(path, map_location=device, weights_only=True)
+        return {**state, "record": state["record"]}
+    except (OSError, RuntimeError, EOFError, KeyError, TypeError, pickle.UnpicklingError) as error:
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+        raise CheckpointError(f"{path}: not a checkpoint of a training: {reason}.") from None
 
 
 def difference(before: Any, now: Any, where: str = "") -> str:
@@ -316,22 +329,6 @@ def difference(before: Any, now: Any, where: str = "") -> str:
                 return found
         return ""
     return "" if before == now else f"{where} was {before!r}, now {now!r}"
-
-
-def _parameter_groups(network: nn.Module, head_rate: float) -> list[dict[str, Any]]:
-    """Parameters in two groups: the motion heads' last layers have a rate of their own."""
-    last = []
-    for name in ("head_motion", "head_rotation", "head_translation"):
-        head = getattr(network, name, None)
-        if head is not None:
-            last.append(f"{name}.{len(head) - 1}.")
-    groups: list[dict[str, Any]] = [
-        {"params": [], "rate_factor": 1.0},
-        {"params": [], "rate_factor": head_rate},
-    ]
-    for name, parameter in network.named_parameters():
-        groups[name.startswith(tuple(last))]["params"].append(parameter)
-    return [group for group in groups if group["params"]]
 
 
 def _means(entries: list[dict[str, float]]) -> dict[str, float]:

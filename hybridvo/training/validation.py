@@ -28,9 +28,6 @@ PUBLISHED_SEED = 1000
 EPE_LIMIT_PX = 400.0
 """Pixels with a true ego flow of this length or more count as 0 in EPE, as published."""
 
-PIXEL_STRIDE = 4
-"""Every fourth row and column goes into the figures on uncertainty."""
-
 FIGURES = ("r_err_deg", "t_err", "epe")
 
 
@@ -97,22 +94,17 @@ def evaluate_network(
     errors, pixels = [], []
     was_training = network.training
     network.eval()
-    try:
-        for first in range(0, count, batch_size):
-            numbers = range(first, min(first + batch_size, count))
-            batch = collate([preset.sample(sample_generator(seed, i)) for i in numbers]).to(device)
-            half = precision == "bfloat16"
-            with torch.inference_mode(), torch.autocast(device.type, torch.bfloat16, enabled=half):
+    for first in range(0, count, batch_size):
+        numbers = range(first, min(first + batch_size, count))
+        batch = collate([preset.sample(sample_generator(seed, i)) for i in numbers]).to(device)
+        half = precision == "bfloat16"
+        with torch.inference_mode():
+            with torch.autocast(device.type, torch.bfloat16, enabled=half):
                 output = predict(network, batch.inputs, selection)
-            with torch.inference_mode():
-                errors.append(_errors(output, batch, selection))
-                if (
-                    isinstance(output, PixelwisePrediction)
-                    and output.log_scale_rotation is not None
-                ):
-                    pixels += _uncertainty(output, batch)
-    finally:
-        network.train(was_training)
+            errors.append(_errors(output, batch, selection))
+            if isinstance(output, PixelwisePrediction) and output.log_scale_rotation is not None:
+                pixels += _uncertainty(output, batch)
+    network.train(was_training)
     table = np.concatenate(errors)
     result: dict[str, Any] = {"seed": seed, "count": count}
     for i, name in enumerate(FIGURES):
@@ -156,19 +148,19 @@ def _uncertainty(output: PixelwisePrediction, batch: TrainingBatch) -> list[np.n
     |error| / U of each of the three numbers.
     """
     gt = batch.targets
-    valid = batch.inputs.valid[:, ::PIXEL_STRIDE, ::PIXEL_STRIDE]
+    pick = np.s_[..., ::4, ::4]  # enough for the figures
+    valid = batch.inputs.valid[pick]
     maps = [batch.moving[:, None].float()]
     for value, s, target in (
         (output.rotation, output.log_scale_rotation, gt.rotation_deg),
         (output.translation, output.log_scale_translation, gt.translation),
     ):
-        if s is None:
-            continue
+        assert s is not None
         error = (value - target[:, :, None, None]).abs()
         means = [x.mean(1, keepdim=True) for x in (s, error)]
         half = torch.cat([*means, error * (-s).exp()], dim=1)
         maps.append(F.interpolate(half.float(), size=batch.moving.shape[1:], mode="nearest"))
-    table = torch.cat(maps, dim=1)[..., ::PIXEL_STRIDE, ::PIXEL_STRIDE].permute(0, 2, 3, 1)
+    table = torch.cat(maps, dim=1)[pick].permute(0, 2, 3, 1)
     return [table[b][valid[b]].cpu().numpy() for b in range(len(batch))]
 
 

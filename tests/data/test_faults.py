@@ -11,7 +11,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from hybridvo.data.sequence import iter_pairs, open_sequence
+from hybridvo.data.sequence import open_sequence
 from hybridvo.errors import FormatError, InputError
 from tests import sequences as write
 
@@ -94,7 +94,6 @@ def test_damaged_binary_files(kind, originals, data):
     try:
         path.write_bytes(bytes(content))
         sane(originals[kind], kind)
-        list(iter_pairs(sequence, on_error=lambda index, error: None)) if sequence.has_flow else 0
     finally:
         path.write_bytes(whole)
 
@@ -105,7 +104,6 @@ def test_damaged_binary_files(kind, originals, data):
         ("tum", "groundtruth.txt", "# head\n1 2 3\n", 2),
         ("tum", "groundtruth.txt", "1 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 x\n", 2),
         ("tum", "groundtruth.txt", "1 0 0 0 0 0 0 0\n", 1),  # no unit quaternion
-        ("tum", "groundtruth.txt", "\n100 1e300 0 0 0 0 0 1\n", 2),
         ("tum", "groundtruth.txt", "100 0 0 0 1e200 0 0 1e200\n", 1),
         ("tum", "rgb.txt", "100.0 rgb/0.png\nabc rgb/1.png\n", 2),
         ("tum", "rgb.txt", "100.0\n", 1),
@@ -114,7 +112,6 @@ def test_damaged_binary_files(kind, originals, data):
         ("tartanair-v2", "pose_lcam_front.txt", "0 0 0 0 0 0 1\n0 0 0\n", 2),
         ("kitti", "calib.txt", "P0: 1 2\n", 1),
         ("kitti", "calib.txt", "P2: 20 0 4.5 5 0 0 2.5 0 0 0 1 0\n", 1),
-        ("kitti", "calib.txt", "\nP2: 20 0 4.5 1e308 0 20 2.5 0 0 0 1 0\n", 2),
         ("kitti", "../../poses/07.txt", "0 0 0 0 0 0 0 0 0 0 0 0\n" * 3, 1),
         ("kitti", "times.txt", "0\n0.1\nx\n", 3),
         ("folder", "poses.txt", "0 1 2 3 0 0 0 1\n0.5 1 2 3 0 0 0\n", 2),

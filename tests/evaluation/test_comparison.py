@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import csv
+import functools
 import json
 import shutil
 from pathlib import Path
@@ -14,11 +15,12 @@ import pytest
 from hybridvo.cli import main
 from hybridvo.data.sequence import open_sequence
 from hybridvo.errors import InputError, LockedError
-from hybridvo.evaluation.comparison import WRITTEN, ComparisonOptions, compare
-from hybridvo.evaluation.sequence_job import PAIR_COLUMNS
-from hybridvo.evaluation.sources import SharedFlow, expand, methods_to_run
+from hybridvo.evaluation.comparison import WRITTEN, compare
+from hybridvo.evaluation.plan import ComparisonOptions, expand, methods_to_run
+from hybridvo.evaluation.sequence_job import PAIR_COLUMNS, SharedFlow
+from hybridvo.network.models import Models
 from hybridvo.odometry import Odometry
-from hybridvo.pipeline import METHODS, Models, weights_hash
+from hybridvo.pipeline import METHODS, weights_hash
 from hybridvo.results import RelativePose
 from hybridvo.synthetic.render import make_scene, write_sintel
 from hybridvo.trajectory import read_trajectory
@@ -50,7 +52,7 @@ def tiny(tree: Path) -> Path:
     return tree / "training" / "clean" / "tiny"
 
 
-def options(*paths: Path, methods: tuple[str, ...] = FAST, **more: Any) -> ComparisonOptions:
+def make_options(*paths: Path, methods: tuple[str, ...] = FAST, **more: Any) -> ComparisonOptions:
     return ComparisonOptions(tuple(map(str, paths)), methods=methods, **more)
 
 
@@ -112,7 +114,7 @@ def test_results_hold_what_the_interface_promises(tiny, tmp_path, capsys) -> Non
 def test_a_method_gives_what_it_gives_alone(tree: Path, tmp_path: Path, method: str) -> None:
     """Beside others, and with flow that they share, as a tracker of its own: the same motions."""
     path = tree / "training" / "clean" / "longer"
-    compare(options(path, methods=("identity", method), flow="dis"), tmp_path / "out")
+    compare(make_options(path, methods=("identity", method), flow="dis"), tmp_path / "out")
     sequence = open_sequence(path)
     vo = Odometry(method=method)
     poses = [vo.track(sequence.frame(i)).T_world_cam for i in range(len(sequence))]
@@ -122,8 +124,9 @@ def test_a_method_gives_what_it_gives_alone(tree: Path, tmp_path: Path, method: 
     np.testing.assert_allclose(found.T_world_cam, poses, atol=1e-6)
 
 
-def test_resume_keeps_finished_sequences(tree: Path, tmp_path: Path, monkeypatch) -> None:
+def test_resume_keeps_finished_sequences(tree: Path, tmp_path: Path) -> None:
     paths = [tree / "training" / "clean" / name for name in ("tiny", "longer")]
+    options = functools.partial(make_options, flow="file")
     compare(options(*paths), tmp_path / "whole")
     # as after an interruption: the first sequence is finished, the second is not
     read: list[str] = []
@@ -146,8 +149,8 @@ def test_resume_keeps_finished_sequences(tree: Path, tmp_path: Path, monkeypatch
 
 @pytest.mark.slow
 def test_processes_give_what_one_gives(tree: Path, tmp_path: Path) -> None:
-    compare(options(tree, flow="file"), tmp_path / "one")
-    compare(options(tree, flow="file", jobs=2), tmp_path / "two")
+    compare(make_options(tree, flow="file"), tmp_path / "one")
+    compare(make_options(tree, flow="file", jobs=2), tmp_path / "two")
     assert outcome(tmp_path / "one") == outcome(tmp_path / "two")
 
 
@@ -157,7 +160,7 @@ def test_a_broken_frame_is_a_failed_pair_and_the_next_spans_it(tiny: Path, tmp_p
     sequence = root / "clean" / "tiny"
     sorted(sequence.glob("*.png"))[1].write_bytes(b"no image")
     out = tmp_path / "out"
-    compare(options(sequence, methods=("refine", "identity"), flow="dis"), out)
+    compare(make_options(sequence, methods=("refine", "identity"), flow="dis"), out)
     rows = [row for row in rows_of(out / "pairs.csv") if row["method"] == "refine"]
     assert [row["index"] for row in rows] == ["0", "1", "2"]
     assert rows[0]["status"].startswith("failed") and rows[0]["epe_l2_px"] == ""
@@ -172,7 +175,7 @@ def test_a_broken_frame_is_a_failed_pair_and_the_next_spans_it(tiny: Path, tmp_p
 def test_without_ground_truth_there_are_reasons(walk: Path, tmp_path: Path) -> None:
     shutil.copytree(walk, tmp_path / "walk")
     (tmp_path / "walk" / "poses.txt").unlink()
-    compare(options(tmp_path / "walk", flow="file"), tmp_path / "out")
+    compare(make_options(tmp_path / "walk", flow="file"), tmp_path / "out")
     result = json.loads((tmp_path / "out" / "results.json").read_text())
     for row in result["rows"]:
         for key in ("epe", "epe_l2_px", "ate_rmse", "rot_err_deg_mean", "failure_rate"):
@@ -186,7 +189,7 @@ def test_a_bug_of_a_method_costs_its_pairs(tiny: Path, tmp_path: Path, monkeypat
         raise ZeroDivisionError("a bug")
 
     monkeypatch.setitem(METHODS, "pnp-ransac", broken)
-    compare(options(tiny, flow="file"), tmp_path / "out")
+    compare(make_options(tiny, flow="file"), tmp_path / "out")
     rows = rows_of(tmp_path / "out" / "pairs.csv")
     status = {row["method"]: (row["status"], row["message"]) for row in rows}
     assert status["pnp-ransac"] == ("failed(raised)", "ZeroDivisionError: a bug")
@@ -196,7 +199,7 @@ def test_a_bug_of_a_method_costs_its_pairs(tiny: Path, tmp_path: Path, monkeypat
 def test_refused_folders(tiny: Path, tmp_path: Path) -> None:
     (tmp_path / "held").mkdir()
     with filelock.FileLock(tmp_path / "held" / ".lock"), pytest.raises(LockedError):
-        compare(options(tiny), tmp_path / "held")
+        compare(make_options(tiny), tmp_path / "held")
 
 
 @pytest.mark.parametrize(
@@ -208,6 +211,8 @@ def test_refused_folders(tiny: Path, tmp_path: Path) -> None:
         (["--start", "9"], "frames"),
         (["--stride", "2", "--flow", "file"], "stride"),
         (["--protocol", "paper"], "tiny"),
+        (["--weights", "mine.safetensors"], "NAME=FILE"),
+        (["--weights", "pwvo=none.safetensors", "--methods", "pwvo"], "none.safetensors"),
     ],
 )
 def test_bad_options(tiny, tmp_path, arguments, field, capsys) -> None:

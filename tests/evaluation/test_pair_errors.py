@@ -8,7 +8,6 @@ from scipy.spatial.transform import Rotation
 
 from hybridvo.errors import InputError
 from hybridvo.evaluation.pair_errors import (
-    dynamic_fraction,
     mean_pair_errors,
     pair_errors,
     pair_facts,
@@ -140,19 +139,22 @@ def test_pair_errors_refuses_bad_input():
 
 
 def test_dynamic_fraction_by_hand():
+    def dynamic_fraction(flow, depth):
+        return pair_facts(T, depth, CAMERA, CAMERA, flow)["dynamic_fraction"]
+
     depth = np.full(CAMERA.shape, 4.0)
     T = make_transform(np.eye(3), np.array([0.02, 0.0, 0.0]))
     flow = ego_flow(depth, T, CAMERA, CAMERA).astype(np.float32)
-    assert dynamic_fraction(flow, depth, T, CAMERA, CAMERA) == 0.0
+    assert dynamic_fraction(flow, depth) == 0.0
     flow[:32, :, 0] += 0.9  # a quarter moves by less than a pixel
     flow[32:64, :, 1] += 1.1  # a quarter by more
-    assert dynamic_fraction(flow, depth, T, CAMERA, CAMERA) == 0.25
+    assert dynamic_fraction(flow, depth) == 0.25
     flow[64:96] = np.nan  # unknown pixels do not count
     depth[96:] = 0.0
-    assert dynamic_fraction(flow, depth, T, CAMERA, CAMERA) == 0.5
+    assert dynamic_fraction(flow, depth) == 0.5
     flow[32:48] = 1.666e9  # Middlebury's unknown
-    assert dynamic_fraction(flow, depth, T, CAMERA, CAMERA) == pytest.approx(1 / 3)
-    assert dynamic_fraction(flow, depth * 0, T, CAMERA, CAMERA) is None
+    assert dynamic_fraction(flow, depth) == pytest.approx(1 / 3)
+    assert dynamic_fraction(flow, depth * 0) is None
 
 
 def test_facts_of_a_pair_by_hand():

@@ -6,11 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
+from hybridvo.calibration import DIS_NOISE
 from hybridvo.errors import FormatError, InputError
 from hybridvo.flow import (
-    BASE_STD_PX,
-    ERROR_FACTOR,
-    MAX_STD_PX,
     FlowField,
     check_field,
     contradiction,
@@ -23,6 +21,7 @@ from hybridvo.synthetic.render import SyntheticSequence, make_scene
 from hybridvo.types import Camera, Frame, FramePair
 
 HEIGHT, WIDTH = 96, 128
+BASE, FACTOR = DIS_NOISE
 CAMERA = Camera(100, 100, 63.5, 47.5, HEIGHT, WIDTH)
 
 
@@ -48,7 +47,7 @@ def test_dis_finds_a_shift_and_knows_what_leaves_the_image(texture: np.ndarray) 
     assert np.median(np.abs(inner - (-4.0, 0.0))) < 0.1
     assert not field.valid[:, :3].any()
     assert field.valid[8:-8, 16:-16].mean() > 0.95
-    assert field.variance.min() >= BASE_STD_PX**2 * (1 - 1e-6)
+    assert field.variance.min() >= BASE**2 * (1 - 1e-6)
 
 
 def test_dis_without_backward_flow_has_no_variance(texture: np.ndarray) -> None:
@@ -86,11 +85,11 @@ def test_forward_backward_by_hand() -> None:
     forward[4, 6] = (1.0, 0.0)  # leaves the image
     forward[3, 0] = np.nan
     variance, valid = forward_backward_check(forward, backward)
-    assert valid[2, 3] and variance[2, 3] == pytest.approx(BASE_STD_PX**2)
-    assert not valid[0, 0] and variance[0, 0] == pytest.approx(BASE_STD_PX**2 + 4 * ERROR_FACTOR**2)
-    assert valid[1, 1] and variance[1, 1] == pytest.approx(BASE_STD_PX**2 + ERROR_FACTOR**2)
+    assert valid[2, 3] and variance[2, 3] == pytest.approx(BASE**2)
+    assert not valid[0, 0] and variance[0, 0] == pytest.approx(BASE**2 + 4 * FACTOR**2)
+    assert valid[1, 1] and variance[1, 1] == pytest.approx(BASE**2 + FACTOR**2)
     assert not valid[4, 6]
-    assert not valid[3, 0] and variance[3, 0] == pytest.approx(MAX_STD_PX**2)
+    assert not valid[3, 0] and variance[3, 0] == pytest.approx(25.0)
     assert np.isfinite(variance).all()
 
 

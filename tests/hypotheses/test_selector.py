@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from hybridvo.errors import InputError
+from hybridvo.estimation import estimate, refine
 from hybridvo.geometry import ego_flow, se3_exp
 from hybridvo.hypotheses.generate import HypothesisSet, generate
 from hybridvo.hypotheses.selector import Candidates, CueSelector, MaskSelector, Scores
 from hybridvo.options import Options, SelectOptions
-from hybridvo.pipeline import Context, estimate, refine, refine_selection
+from hybridvo.pipeline import Context
 from hybridvo.results import MotionPrediction, MotionPrior, RelativePose, State
 from hybridvo.synthetic.render import SyntheticSequence, make_scene
 from hybridvo.synthetic.scenarios import Scenario, make_pair
@@ -61,7 +62,7 @@ def gap(T: np.ndarray, pair: FramePair, truth: dict) -> float:
 def refined(case, scorer: Oracle, prediction: MotionPrediction | None = None) -> RelativePose:
     found, pair, _ = case
     chosen = MaskSelector(scorer).select(found, None, prediction)
-    return refine_selection(pair, found, chosen, Context())
+    return Context().refine(pair, found, chosen)
 
 
 def test_the_camera_is_fitted_where_the_mask_says(case) -> None:
@@ -93,7 +94,7 @@ def test_low_confidence_is_degraded_with_its_probability_and_a_wide_covariance(c
     scorer = Oracle(np.zeros(found.grid.shape[:2], np.float32), refits=False, confidence=0.05)
     chosen = MaskSelector(scorer).select(found)
     assert chosen.probability == pytest.approx(0.05) and chosen.mask is None
-    answer = refine_selection(pair, found, chosen, Context())
+    answer = Context().refine(pair, found, chosen)
     assert answer.status.state is State.DEGRADED and not answer.ok and answer.usable
     assert answer.probability == pytest.approx(0.05)
 

@@ -37,16 +37,26 @@ IMPORTS: dict[str, set[str]] = {
     "hypotheses": NOUNS | {"refinement"},
     "network": NOUNS | {"torch_geometry", "refinement", "hypotheses"},
     "pipeline": NOUNS | {"network", "hypotheses", "refinement", "baselines", "flow"},
+    "estimation": NOUNS | {"network", "refinement", "flow", "pipeline"},
     "tracking": NOUNS | {"refinement"},
     "odometry": NOUNS
-    | {"pipeline", "tracking", "flow", "trajectory", "refinement", "network", "hypotheses"},
+    | {
+        "pipeline",
+        "estimation",
+        "tracking",
+        "flow",
+        "trajectory",
+        "refinement",
+        "network",
+        "hypotheses",
+    },
     "synthetic": NOUNS | {"trajectory", "data"},
     "evaluation": NOUNS
-    | {"trajectory", "data", "pipeline", "odometry", "flow", "network", "refinement"}
+    | {"trajectory", "data", "pipeline", "estimation", "odometry", "flow", "network", "refinement"}
     | {"__init__"},
     "training": NOUNS
     | {"torch_geometry", "data", "synthetic", "network", "hypotheses", "refinement"}
-    | {"flow", "pipeline", "trajectory"},
+    | {"flow", "pipeline", "estimation", "trajectory"},
     "__init__": set(),
 }
 """Room (a folder, or a file at the top) -> rooms it may import."""
@@ -67,7 +77,6 @@ ONLY_IN = {
     "pypose": {"torch_geometry.py"},
     "kornia": {"torch_geometry.py"},
     "pydantic": {"options.py", "network/", "synthetic/", "training/"},
-    "distributed": {"evaluation/comparison.py"},
 }
 """Library -> the only files, or folders, that may import it."""
 

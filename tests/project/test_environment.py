@@ -80,7 +80,7 @@ def test_home_does_not_matter(walk: Path, tmp_path: Path, home: str | None) -> N
 
 @pytest.mark.slow
 def test_the_core_needs_no_optional_library(walk: Path, tmp_path: Path) -> None:
-    optional = "rerun,poselib,open3d,distributed,dask,torchvision,gtsam"
+    optional = "rerun,poselib,open3d,torchvision,gtsam"
     for out, hidden in (("with", "nothing"), ("without", optional)):
         arguments = command(walk, tmp_path / out, "--method", "refine", "--flow", "file", "-q")
         done = child(HIDDEN, hidden, *arguments)

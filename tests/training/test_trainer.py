@@ -134,7 +134,7 @@ def test_steps_that_are_not_finite_are_skipped_and_counted(mixture):
 def test_loss_falls(mixture):
     options = changed(
         network=NetworkOptions(width=0.25, head_stride=2),
-        optimizer=OptimizerOptions(learning_rate=2e-3, betas=(0.9, 0.999), head_rate=5.0),
+        optimizer=OptimizerOptions(learning_rate=5e-3, betas=(0.9, 0.999)),
         schedule=ScheduleOptions(kind="constant"),
         loss=LossOptions(translation_form="laplace"),
     )

@@ -29,16 +29,11 @@ def write(path: Path, *lines: str) -> Path:
 # -- the class --------------------------------------------------------------------------------
 
 
-def test_rotation_stays_orthonormal_over_1e5_steps(rng):
+def test_rotation_stays_orthonormal_over_many_rounded_steps(rng):
     relative = np.array([se3_exp(0.1 * rng.standard_normal(6)) for _ in range(1000)])
-    trajectory = Trajectory.from_relative(np.tile(relative, (100, 1, 1)), np.arange(100_001.0))
+    relative = np.tile(relative.astype(np.float32), (20, 1, 1))
+    trajectory = Trajectory.from_relative(relative, np.arange(20_001.0))
     R = trajectory.T_world_cam[:, :3, :3]
-    assert np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max() < 1e-12
-
-
-def test_rotations_rounded_to_float32_are_made_orthonormal(rng):
-    relative = [se3_exp(0.1 * rng.standard_normal(6)).astype(np.float32) for _ in range(500)]
-    R = Trajectory.from_relative(relative, np.arange(501.0)).T_world_cam[:, :3, :3]
     assert np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max() < 1e-12
 
 

@@ -1,0 +1,131 @@
+"""What a network looks at: integrated gradients of its answer over flow and depth."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from hybridvo.network.inputs import assemble_inputs
+from hybridvo.network.normalization import first_motions
+from hybridvo.network.selection import select_pose
+from hybridvo.results import PixelwisePrediction
+from hybridvo.types import FramePair
+
+PARTS = ("rotation", "translation")
+
+
+@dataclass(frozen=True, eq=False)
+class Saliency:
+    """How much each pixel of a network's input matters to its answer.
+
+    Args:
+        magnitude: (h, w) sum over the channels of the absolute attributions.
+        total: sum of all attributions, with their signs.
+        change: answer for the input minus answer for zeros. Equal to ``total`` up to the
+            error of the integral (completeness).
+    """
+
+    magnitude: np.ndarray
+    total: float
+    change: float
+
+    @property
+    def completeness_error(self) -> float:
+        """Share of the change that the attributions miss; 0 where nothing changes."""
+        return abs(self.total - self.change) / max(abs(self.change), 1e-12) if self.change else 0.0
+
+    def share_on(self, mask: np.ndarray) -> float | None:
+        """Share that falls on a mask (H, W) of any size, 0 to 1; None where there is none."""
+        rows, cols = (
+            ((np.arange(small) + 0.5) * size / small).astype(int)
+            for small, size in zip(self.magnitude.shape, mask.shape, strict=True)
+        )
+        total = float(self.magnitude.sum(dtype=np.float64))
+        if not math.isfinite(total) or total <= 0:
+            return None
+        return float((self.magnitude * mask[np.ix_(rows, cols)]).sum(dtype=np.float64)) / total
+
+
+def integrated_gradients(
+    answer: Callable[..., torch.Tensor],
+    inputs: tuple[torch.Tensor, ...],
+    steps: int = 32,
+) -> Saliency:
+    """Integrated gradients of a scalar answer (Sundararajan, Taly and Yan, ICML 2017).
+
+    The integral from zero to the input goes over Gauss-Legendre nodes: for smooth networks
+    32 of them leave less than a percent of the change unexplained.
+
+    Args:
+        answer: takes tensors like ``inputs``, returns one number, differentiable.
+        inputs: tensors of (1, C, h, w), all of one (h, w).
+        steps: nodes of the integral, at least 1; each costs one forward and one backward pass.
+    """
+    nodes, weights = np.polynomial.legendre.leggauss(steps)
+    sums = [torch.zeros_like(x) for x in inputs]
+    for node, weight in zip((nodes + 1) / 2, weights / 2, strict=True):
+        points = [(float(node) * x).detach().requires_grad_() for x in inputs]
+        # an input that the answer does not depend on has no gradient
+        gradients = torch.autograd.grad(answer(*points), points, allow_unused=True)
+        for total, gradient in zip(sums, gradients, strict=True):
+            if gradient is not None:
+                total += float(weight) * gradient
+    with torch.no_grad():
+        attributions = [total * x for total, x in zip(sums, inputs, strict=True)]
+        change = float(answer(*inputs)) - float(answer(*map(torch.zeros_like, inputs)))
+        magnitude = sum(a[0].abs().sum(0) for a in attributions)
+    total = float(sum(a.double().sum() for a in attributions))
+    return Saliency(torch.as_tensor(magnitude).cpu().numpy(), total, change)
+
+
+def last_pass(network: Any, pair: FramePair) -> tuple[Any, Any, Any]:
+    """(output, inputs, start) of the last pass of a network on a pair."""
+    inputs = assemble_inputs(pair)
+    device = next(network.parameters()).device
+    inputs = inputs.to(device) if device.type != "cpu" else inputs
+    T_start = first_motions(network, inputs, "softmax", int(network.options.passes) - 1)
+    with torch.no_grad():
+        return network(inputs, T_start), inputs, T_start
+
+
+def saliencies(network: Any, inputs: Any, T_start: Any, steps: int) -> dict[str, Saliency]:
+    """Integrated gradients of rotation and translation over flow and inverse depth.
+
+    The answer is the length of the predicted rotation (or translation) along its own direction. Of
+    a pixel-wise network it is that of the pixels and weights that the selection chose for the real
+    input: with the choice itself inside, the answer would jump along the path. The path starts at
+    zero flow and zero inverse depth; for scale-free networks, which see the logarithm of the
+    depth, at zero flow. What earlier passes found is held fixed.
+    """
+    names = ("flow",) if network.options.scale_free else ("flow", "inverse_depth")
+    given = tuple(getattr(inputs, name) for name in names)
+
+    def run(tensors: tuple[torch.Tensor, ...]) -> Any:
+        return network(replace(inputs, **dict(zip(names, tensors, strict=True))), T_start)
+
+    with torch.no_grad():
+        output = run(given)
+    found = {}
+    for k, what in enumerate(PARTS):
+        if isinstance(output, PixelwisePrediction):
+            maps = {n: getattr(output, n).clone().requires_grad_() for n in PARTS}
+            motion = select_pose(replace(output, **maps))[k]
+            direction = (motion / motion.norm().clamp(min=1e-12)).detach()
+            (weights,) = torch.autograd.grad((direction * motion).sum(), maps[what])
+
+            def answer(*tensors: Any, what: str = what, weights: Any = weights) -> Any:
+                return (weights * getattr(run(tensors), what)).sum()
+
+        else:
+            direction = output[k] / output[k].norm().clamp(min=1e-12)
+
+            def answer(*tensors: Any, k: int = k, direction: Any = direction) -> Any:
+                return (direction * run(tensors)[k]).sum()
+
+        found[what] = integrated_gradients(answer, given, steps=steps)
+    return found
