@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -133,6 +134,24 @@ class FullFit:
     depths: depth.DepthAgreement | None
 
 
+class PairNoise(NamedTuple):
+    """Noise of the pixels that follow a motion.
+
+    Args:
+        flow: px. depth: of log depth.
+        share: of the weight that follows.
+        depth_error: standard error of the depth noise squared.
+        current_depth: standard deviation of the log of the current depth, given the flow; 0 where
+            it cannot be told.
+    """
+
+    flow: float
+    depth: float
+    share: float
+    depth_error: float
+    current_depth: float
+
+
 def tile_size(shape: tuple[int, int], tiles: int) -> int:
     """Side, px, of the tiles that cut an image into about ``tiles``; 8 to 64."""
     return int(np.clip(round(np.sqrt(shape[0] * shape[1] / tiles)), 8, 64))
@@ -158,7 +177,8 @@ def fit_full_grid(
     tile = tile_size(image.shape, options.tiles)
     depth_scale = coarse_fit.translation_scale(grid.samples, grid.count)
     samples, n = _enough_samples(grid)
-    sf, sd, share, sigma = pair_noise(pair, grid, pose, noise_start, options)
+    found_noise = pair_noise(pair, grid, pose, noise_start, options)
+    sf, sd, share, _, sigma = found_noise
     noise = np.empty(3, np.float32)
     coarse_fit.set_noise(sf, sd, options.cutoff, noise)
     total = float(samples[kernels.W, :n].sum(dtype=np.float64))
@@ -183,6 +203,11 @@ def fit_full_grid(
     covariance, eigenvalues, definite = sandwich_covariance(
         tiles, np.asarray(found.at.curvature), symmetric(meat), depth_scale, rounding
     )
+    if definite:
+        newton = found.at.H - found.at.curvature
+        shift = _slope_in_depth_variance(image, samples, n, T, found_noise, options) * usable
+        shift = np.linalg.lstsq(newton, shift, rcond=1e-12)[0] * found_noise.depth_error
+        covariance += np.outer(shift, shift)
     # whether depth errs about its log, its value or its inverse is not known: the translation's
     # length is uncertain by half the variance of log depth
     covariance[:3, :3] += (0.5 * sd**2) ** 2 * np.outer(T[:3, 3], T[:3, 3])
@@ -241,7 +266,7 @@ def pair_noise(
     pose: np.ndarray,
     start: tuple[float, float],
     options: RefineOptions,
-) -> tuple[float, float, float, float]:
+) -> PairNoise:
     """Noise of the pixels that follow a motion.
 
     The current depth bounds the noise of the first, and tells it where the flow cannot.
@@ -252,10 +277,6 @@ def pair_noise(
         pose: (3, 4) T_curr_prev.
         start: (sf, sd) found before.
         options: ``current_depth``.
-
-    Returns:
-        Flow noise px, noise of log depth, share of the weight that follows, standard deviation of
-        the current depth given the flow (0 where it cannot be told).
     """
     samples, n = _enough_samples(grid)
     (sf, sd), K, count = start, grid.pixels.K, coarse_fit.FINAL_NOISE_PIXELS
@@ -263,7 +284,7 @@ def pair_noise(
         samples, n, pose, K, sf, sd, 2.5 * sf, max(2.5 * sd, 0.02), 30, count
     )
     if options.current_depth == "off" or pair.curr.depth is None:
-        return sf, sd, share, 0.0
+        return PairNoise(sf, sd, share, spread, 0.0)
     samples, n, noise = grid.samples, grid.count, np.empty(3, np.float32)
     coarse_fit.set_noise(sf, sd, options.cutoff, noise)
     log_depth, robust = np.empty(n, np.float32), np.empty(n, np.float32)
@@ -273,12 +294,34 @@ def pair_noise(
     coarse_fit.robust_weights(samples, n, pose, K, noise, kernels.new_work(), robust)
     sigma, raw = depth.depth_scale(samples, n, log_depth, robust, pose, K, noise)
     if raw <= 0:
-        return sf, sd, share, 0.0
+        return PairNoise(sf, sd, share, spread, 0.0)
     # var(rz) = sz^2 + h^2 sd^2: with two depths of one sensor sd is about raw / sqrt(2)
     if sd**2 < 2 * spread:
         # too little parallax for the flow to tell; errors that both depths share do not show here
         sd = min(raw / DEPTHS_PER_PAIR, coarse_fit.DEPTH_NOISE_CAP)
-    return sf, min(sd, raw), share, max(sigma, 1e-4)
+        spread = max(sd**2, 1e-10)
+    return PairNoise(sf, min(sd, raw), share, spread, max(sigma, 1e-4))
+
+
+def _slope_in_depth_variance(
+    image: PixelGrid,
+    samples: np.ndarray,
+    n: int,
+    T: np.ndarray,
+    found: PairNoise,
+    options: RefineOptions,
+) -> np.ndarray:
+    """(6,) derivative of the estimating equation in the depth's variance, per unit of weight.
+
+    What is not known of that variance moves the answer, through the correction of the depth.
+    """
+    sums, noise = np.zeros((2, kernels.SUMS)), np.empty(3, np.float32)
+    variances = 0.9 * found.depth**2, 1.1 * found.depth**2 + 1e-8
+    for row, variance in zip(sums, variances, strict=True):
+        coarse_fit.set_noise(found.flow, np.sqrt(variance), options.cutoff, noise)
+        coarse_fit.evaluate(samples, n, T[:3], image.K, noise, kernels.new_work(), row)
+    difference = sums[1, 21:27] - sums[0, 21:27]
+    return difference / (variances[1] - variances[0]) / max(sums[0, 29], 1e-12)
 
 
 def _depth_factor(
