@@ -189,18 +189,18 @@ class ImageFactor:
         fields = light_fields(*arrays)
         if fields is None:
             return False
-        more, shift = fields
-        self._r -= more * grey + shift
-        factor = 1 + more / self._light[0]
-        grey *= factor
-        grey += shift / self._light[0]
-        self._buffer[[kernels.GX, kernels.GY]] *= factor
+        kernels.apply_fields(self._places, fields, self._light[0], self._buffer, self._r)
         return True
 
     def _marginal(self) -> tuple[np.ndarray, np.ndarray]:
         """(H (6, 6) with gain and offset free, what they explain of each column (6, 2))."""
-        H = self._H
-        light = H[:6, 6:] @ np.linalg.pinv(H[6:, 6:], rcond=1e-9, hermitian=True)
+        H, (a, b, c) = self._H, (self._H[6, 6], self._H[6, 7], self._H[7, 7])
+        determinant = a * c - b * b
+        if determinant > 1e-9 * a * c > 0:
+            inverse = np.array([[c, -b], [-b, a]]) / determinant
+        else:
+            inverse = np.diag([0.0, 1 / c if c > 0 else 0.0])
+        light = H[:6, 6:] @ inverse
         return H[:6, :6] - light @ H[6:, :6], light
 
     def _estimate_scale(self) -> None:
@@ -254,7 +254,7 @@ def _dispersion(scores: np.ndarray, model: np.ndarray) -> float:
 
 def light_fields(
     place: np.ndarray, grey: np.ndarray, r: np.ndarray, w: np.ndarray, least: float = 0.0
-) -> tuple[np.ndarray, np.ndarray] | None:
+) -> np.ndarray | None:
     """Smooth changes of gain and offset that explain the residuals best.
 
     Args:
@@ -265,7 +265,8 @@ def light_fields(
         least: share of the squared residuals that the fields must explain.
 
     Returns:
-        (N,) changes of gain and of offset; None where they explain less.
+        (ROWS, COLUMNS, 2) float32 changes of gain and offset at the nodes; None where they explain
+        less.
     """
     nodes = ROWS * COLUMNS
     H, g = np.zeros((2 * nodes,) * 2), np.zeros(2 * nodes)
@@ -277,13 +278,7 @@ def light_fields(
     field = np.linalg.solve(H + np.diag(1e-4 * scale + 1e-12), g)
     if not (np.isfinite(field).all() and field @ g >= least * power and power > 0):
         return None
-    field = field.astype(np.float32).reshape(ROWS, COLUMNS, 2)
-    row, column = place.astype(np.intp).T
-    fv, fu = (place - np.floor(place)).T[:, :, None]
-    above = field[row, column] * (1 - fu) + field[row, column + 1] * fu
-    below = field[row + 1, column] * (1 - fu) + field[row + 1, column + 1] * fu
-    gain, offset = (above * (1 - fv) + below * fv).T
-    return gain, offset
+    return field.astype(np.float32).reshape(ROWS, COLUMNS, 2)
 
 
 def field_places(index: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
