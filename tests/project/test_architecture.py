@@ -82,12 +82,12 @@ ONLY_IN = {
 
 # Ceilings of today; they only fall. The aims: 400 lines a file, 60 a function, 15 files a folder,
 # 300 constants; 24 000, 15 000 and 3 000 lines
-MAX_FILE_LINES = 645
-MAX_FUNCTION_LINES = 97
-MAX_FOLDER_FILES = 18
-MAX_CONSTANTS = 358
+MAX_FILE_LINES = 520
+MAX_FUNCTION_LINES = 90
+MAX_FOLDER_FILES = 17
+MAX_CONSTANTS = 270
 """Module-level names in capitals that hold numbers, outside ``calibration.py``."""
-MAX_LINES = {"hybridvo": 28_300, "tests": 15_000, "tools": 3_000}
+MAX_LINES = {"hybridvo": 27_900, "tests": 14_700, "tools": 2_900}
 MAX_PUBLIC_NAMES = 24
 
 
