@@ -282,7 +282,7 @@ def light_fields(
 
 
 def field_places(index: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """(N, 2) float32 place of pixels (v, u) of an image (H, W), in cells of the fields."""
+    """(N, 2) place of pixels (v, u) of an image (H, W), in cells of the fields."""
     return index * np.array([(ROWS - 1) / shape[0], (COLUMNS - 1) / shape[1]], np.float32)
 
 
