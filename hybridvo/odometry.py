@@ -30,7 +30,7 @@ from hybridvo.refinement.refine import widened
 from hybridvo.results import MotionPrior, Reason, RelativePose, State, Status, Step
 from hybridvo.tracking.keyframes import KeyFrame
 from hybridvo.tracking.pose_graph import Edge
-from hybridvo.tracking.state import TrackerState
+from hybridvo.tracking.state import IMAGES, TrackerState
 from hybridvo.tracking.window import STANDSTILL, Window, locate
 from hybridvo.trajectory import chain
 from hybridvo.types import Frame, FramePair, as_number, as_rigid, as_seed
@@ -272,9 +272,9 @@ class Odometry:
         return replace(state, T_world_last=T_world_cam, gap=state.gap + 1, count=state.count + 1)
 
     def _estimate(self, pair: FramePair, prior: MotionPrior | None) -> RelativePose:
-        context = Context(self.options, prior, self.seed, None, self._models)
         # the images are asked whether a flow can be theirs until one is
-        context = replace(context, check_flow=not self._flow_fits)
+        check_flow = not self._flow_fits
+        context = Context(self.options, prior, self.seed, None, self._models, check_flow)
         found = run_method(pair, self.method, context)
         self._flow_fits |= found.usable
         return found
@@ -379,17 +379,10 @@ class Odometry:
 
 def _own(frame: Frame) -> Frame:
     """Copy whose arrays nobody else can change."""
-
-    def copy(array: np.ndarray | None) -> np.ndarray | None:
-        return None if array is None else array.copy()
-
-    return replace(
-        frame,
-        rgb=copy(frame.rgb),
-        depth=copy(frame.depth),
-        depth_variance=copy(frame.depth_variance),
-        mask=copy(frame.mask),
-    )
+    images: dict[str, Any] = {
+        name: image.copy() for name in IMAGES if (image := getattr(frame, name)) is not None
+    }
+    return replace(frame, **images)
 
 
 def _models(network: Any, method: str, options: Options) -> Models:

@@ -95,8 +95,7 @@ def find_motions(
     rng = np.random.default_rng(seed)
 
     def search_round(starts: np.ndarray, samples: int) -> tuple[np.ndarray, np.ndarray] | None:
-        triples = draw_triples(small[W, : sh * sw], sh, sw, samples, rng)
-        best = candidates(small, sh, sw, K, starts, samples > 0, triples, depth_scale, work)
+        best = candidates(small, sh, sw, K, starts, samples, rng, depth_scale, work)
         pose, facts = np.zeros((3, 4)), np.zeros(FACTS)
         ok = refine_best(small, sh * sw, coarse, n, K, best, cutoff, pose, facts, work)
         return (pose, facts) if ok else None
@@ -137,30 +136,11 @@ def _is_settled(
     return bool(residual_coherence(samples, h, w, pose, K, *noise) < SETTLED_COHERENCE)
 
 
-def draw_triples(
-    weight: np.ndarray, h: int, w: int, count: int, rng: np.random.Generator
-) -> np.ndarray:
-    """At most ``count`` triples (M, 3) of distinct pixels, by weight; two in three near by."""
-    if not count or not weight.any():
-        return np.zeros((0, 3), np.int64)
-    share = weight.astype(np.float64) / weight.sum(dtype=np.float64)
-    picks = rng.choice(h * w, (2 * count, 3), p=share)
-    rows = picks[:, :1] // w + np.rint(rng.uniform(-0.25, 0.25, (2 * count, 2)) * h).astype(int)
-    columns = picks[:, :1] % w + np.rint(rng.uniform(-0.2, 0.2, (2 * count, 2)) * w).astype(int)
-    inside = (rows >= 0) & (rows < h) & (columns >= 0) & (columns < w)
-    beside = np.where(inside, rows * w + columns, picks[:, :1])
-    local = np.arange(2 * count) % 3 > 0
-    picks[local, 1:] = beside[local]
-    distinct = (picks != np.roll(picks, 1, axis=1)).all(axis=1)
-    usable = (weight[picks] > rng.random(picks.shape)).all(axis=1) | ~local
-    return picks[distinct & usable][:count]
-
-
 @njit(error_model="numpy", cache=True, nogil=True)
-def candidates(small, h, w, K, starts, wide, triples, similar, work):
+def candidates(small, h, w, K, starts, samples, rng, similar, work):
     """The best distinct candidates: (poses, scores, sources), best first.
 
-    With ``wide`` windows, and ``triples`` (M, 3) of pixels, compete with the ``starts`` (S, 3, 4).
+    With ``samples`` minimal samples, and windows, they compete with the ``starts`` (S, 3, 4).
     """
     n = h * w
     best = (np.zeros((REFINED, 3, 4)), np.zeros(REFINED), np.zeros(REFINED))
@@ -175,7 +155,7 @@ def candidates(small, h, w, K, starts, wide, triples, similar, work):
                 scale = min(WIDE_PX, max(1.0, 1.5 * residual_scale(small, n, pose, K)))
             anneal(small, n, K, scale, 0.7, 0.4, 2, pose, work)
             keep_best(pose, score_pose(small, n, pose, K), s, best, similar)
-    if not wide:
+    if samples == 0:
         return best
     few = np.zeros((BUFFER_ROWS, n + 1), np.float32)
     rows = min(h, max(3, (2 * h) // (WINDOW_ROWS + 1)))
@@ -186,8 +166,10 @@ def candidates(small, h, w, K, starts, wide, triples, similar, work):
             c = j * (w - columns) // (WINDOW_COLUMNS - 1)
             if fit_window(small, w, r, r + rows, c, c + columns, K, few, pose, work):
                 keep_best(pose, score_pose(small, n, pose, K), SOURCE_WINDOW, best, similar)
-    for s in range(triples.shape[0]):
-        if fit_minimal(small, triples[s], pose, K):
+    pick = np.zeros(3, np.int64)
+    for s in range(samples):
+        drawn = draw_three(small, h, w, s % 3 != 0, rng, pick)
+        if drawn and fit_minimal(small, pick, pose, K):
             keep_best(pose, score_pose(small, n, pose, K), SOURCE_MINIMAL, best, similar)
     return best
 
@@ -307,6 +289,27 @@ def fit_window(samples, w, r0, r1, c0, c1, K, few, pose, work):
     scale = min(WIDE_PX, max(1.0, residual_scale(few, m, pose, K)))
     anneal(few, m, K, scale, 0.7, 0.4, 2, pose, work)
     return is_bounded(pose)
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def draw_three(samples, h, w, local, rng, pick):
+    """Draw three distinct usable pixels, near by if ``local``; False where none is found."""
+    m = 0
+    for _ in range(60):
+        k = int(rng.random() * h * w)
+        if m > 0 and local:
+            row = pick[0] // w + int((rng.random() - 0.5) * 0.5 * h)
+            column = pick[0] % w + int((rng.random() - 0.5) * 0.4 * w)
+            if row < 0 or row >= h or column < 0 or column >= w:
+                continue
+            k = row * w + column
+        if samples[W, k] < rng.random() or k in pick[:m]:
+            continue
+        pick[m] = k
+        m += 1
+        if m == 3:
+            return True
+    return False
 
 
 @njit(error_model="numpy", cache=True, nogil=True)

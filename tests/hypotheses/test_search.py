@@ -4,7 +4,7 @@ import numpy as np
 
 from hybridvo.geometry import ego_flow, invert, se3_exp, se3_log
 from hybridvo.hypotheses.generate import HypothesisSet, generate
-from hybridvo.hypotheses.search import draw_triples
+from hybridvo.hypotheses.search import draw_three
 from hybridvo.options import Options
 from hybridvo.types import Camera, Frame, FramePair
 
@@ -43,10 +43,14 @@ def test_a_seed_gives_the_same_motions_again() -> None:
     np.testing.assert_allclose(search(3).poses, search(3).poses, atol=1e-9)
 
 
-def test_triples_are_distinct_usable_pixels() -> None:
-    weight = np.zeros(12 * 16, np.float32)
-    weight[::3] = 1.0
-    triples = draw_triples(weight, 12, 16, 200, np.random.default_rng(1))
-    assert 100 < len(triples) <= 200 and (weight[triples] > 0).all()
-    assert all(len(set(triple)) == 3 for triple in triples.tolist())
-    assert len(draw_triples(0 * weight, 12, 16, 200, np.random.default_rng(1))) == 0
+def test_drawn_pixels_are_distinct_and_usable() -> None:
+    samples = np.zeros((8, 12 * 16), np.float32)
+    samples[7, ::3] = 1.0
+    rng, pick = np.random.default_rng(1), np.zeros(3, np.int64)
+    drawn = 0
+    for k in range(200):
+        if draw_three(samples, 12, 16, k % 2 == 0, rng, pick):
+            drawn += 1
+            assert len(set(pick.tolist())) == 3 and (pick % 3 == 0).all()
+    assert drawn > 180  # in a corner there may be no other one near by
+    assert not draw_three(0 * samples, 12, 16, False, rng, pick)
