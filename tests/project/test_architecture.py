@@ -50,7 +50,8 @@ IMPORTS: dict[str, set[str]] = {
         "network",
         "hypotheses",
     },
-    "synthetic": NOUNS | {"trajectory", "data"},
+    # pairs made of recordings are refined before something is moved in them
+    "synthetic": NOUNS | {"trajectory", "data", "flow", "refinement"},
     "evaluation": NOUNS
     | {"trajectory", "data", "pipeline", "estimation", "odometry", "flow", "network", "refinement"}
     | {"__init__"},
