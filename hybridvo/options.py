@@ -83,13 +83,13 @@ class SelectOptions:
     """Which of the motions is the camera's.
 
     Args:
-        consult_below: confidence of the selector (0 to 1) below which PWVO is asked as well; 1: in
+        consult_below: probability of being right (0 to 1) below which PWVO is asked as well; 1: in
             every ambiguous pair.
         refits: motions that are fitted again inside their masks, in each round.
         min_confidence: probability of being right (0 to 1) below which a motion is degraded.
     """
 
-    consult_below: Share = 0.8
+    consult_below: Share = MIN_CONFIDENCE
     refits: Annotated[int, Field(ge=0, le=16)] = 2
     min_confidence: Share = MIN_CONFIDENCE
 

@@ -78,14 +78,15 @@ def answers(
     pair: Any, T: np.ndarray, depth: np.ndarray, selector: str | None
 ) -> Iterator[tuple[str, np.ndarray, float]]:
     """(which probability, its evidence, error in px) of both selectors."""
-    from hybridvo import pipeline
     from hybridvo.hypotheses.selector import CueSelector
     from hybridvo.network.models import Models
+    from hybridvo.pipeline import Context
+    from hybridvo.results import RelativePose
 
     weights = {"selector": selector} if selector else None
-    ctx = pipeline.Context(models=MODELS.setdefault(selector, Models(weights=weights)))
+    ctx = Context(models=MODELS.setdefault(selector, Models(weights=weights)))
     found = ctx.search(pair)
-    if isinstance(found, pipeline.RelativePose):
+    if isinstance(found, RelativePose):
         return
     chosen = {"cues": CueSelector().select(found), "selector": ctx.selector().select(found)}
     if not found.is_ambiguous:
