@@ -81,8 +81,8 @@ def integrated_gradients(
         attributions = [total * x for total, x in zip(sums, inputs, strict=True)]
         change = float(answer(*inputs)) - float(answer(*map(torch.zeros_like, inputs)))
         magnitude = sum(a[0].abs().sum(0) for a in attributions)
-    total = float(sum(a.double().sum() for a in attributions))
-    return Saliency(torch.as_tensor(magnitude).cpu().numpy(), total, change)
+    whole = float(sum(a.double().sum() for a in attributions))
+    return Saliency(torch.as_tensor(magnitude).cpu().numpy(), whole, change)
 
 
 def last_pass(network: Any, pair: FramePair) -> tuple[Any, Any, Any]:
