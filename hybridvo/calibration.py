@@ -29,7 +29,7 @@ CUE_WEIGHTS = {
 MIN_CONFIDENCE = 0.65
 """Probability of being right below which a motion is degraded. Of the 120 pairs of the heavy
 development scenes, seeds 900-905, with DIS flow, the 3 wrong ones have 0.1 to 0.44, the others 0.65
-to 1; ``python tools/golden.py --only heavy_ --seeds 3``. On semi-real pairs it is far too strict."""
+to 1; ``python tools/golden.py --only heavy_ --seeds 3``. It is too strict on semi-real pairs."""
 CLEAR_COHERENCE = 0.5
 """Spatial correlation of the residuals above which even a motion that most of the image follows may
 be a compromise: 0.02 for independent noise, 0.25 to 0.4 for DIS flow of static scenes, above 0.6

@@ -155,10 +155,7 @@ def generate(
     grid = coarse_grid(pair, weights, options.refine)
     if isinstance(grid, RelativePose):
         return grid
-    # of what the sensor sees: a mover may hold most of what has flow
-    seen = np.count_nonzero(np.isfinite(_log_depth(pair.prev, grid)))
-    usable = max(int(np.count_nonzero(grid.weight > 0)), 1)
-    decisive = options.search.unambiguous_ratio * seen / usable
+    decisive = options.search.unambiguous_ratio
     poses, facts, depth_scale = search.find_motions(
         grid, np.ascontiguousarray(starts[:, :3]), options, decisive, seed
     )
