@@ -15,7 +15,7 @@ import os
 import sys
 import traceback
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Literal
 
 from hybridvo import __version__
 from hybridvo.commands import arguments
@@ -139,6 +139,10 @@ def _print(args: argparse.Namespace, content: Any, text: str) -> None:
     print(json.dumps(content, indent=1, allow_nan=False) if args.json else text, flush=True)
 
 
+def _mode(args: argparse.Namespace) -> Literal["new", "resume", "overwrite"]:
+    return "resume" if args.resume else "overwrite" if args.overwrite else "new"
+
+
 def _open(args: argparse.Namespace) -> Any:
     from hybridvo.data.sequence import open_sequence
 
@@ -151,22 +155,21 @@ def _run(args: argparse.Namespace, command: list[str]) -> int:
     from hybridvo.commands.configuration import load_options
     from hybridvo.commands.inputs import weight_files
     from hybridvo.commands.results import summary_text
-    from hybridvo.commands.run import Mode, run
-    from hybridvo.pipeline import Models
+    from hybridvo.commands.run import run
+    from hybridvo.network.models import Models
 
     given = {
         f"run.{name}": getattr(args, name)
         for name in ("method", "start", "stop", "stride", "device", "max_failed", "strict")
     }
     options = load_options(args.config, args.assignments, given | {"flow.source": args.flow})
-    mode: Mode = "resume" if args.resume else "overwrite" if args.overwrite else "new"
     files = weight_files(args.weights, [options.run.method])
     result = run(
         _open(args),
         args.out,
         options,
         models=Models(options.run.device, files),
-        mode=mode,
+        mode=_mode(args),
         command=command,
         quiet=args.quiet,
         rrd=args.rrd,
@@ -189,9 +192,29 @@ def _show(args: argparse.Namespace, command: list[str]) -> int:
 
 
 def _compare(args: argparse.Namespace, command: list[str]) -> int:
-    from hybridvo.commands.compare import compare_command
+    from hybridvo.commands.inputs import weight_files
+    from hybridvo.commands.progress import Progress
+    from hybridvo.evaluation.comparison import compare
+    from hybridvo.evaluation.plan import ComparisonOptions
+    from hybridvo.pipeline import METHODS
 
-    written = [str(path) for path in compare_command(args, command)]
+    methods = tuple(name.strip() for name in args.methods.split(",") if name.strip())
+    names = ["flow", "dataset", "start", "stop", "stride", "seed", "device", "protocol", "worst"]
+    options = ComparisonOptions(
+        sequences=(*args.paths, *args.sequence),
+        methods=methods,
+        weights=weight_files(args.weights, METHODS if methods == ("all",) else methods),
+        **{name: getattr(args, name) for name in [*names, "jobs"]},
+    )
+    with Progress(0, "compare", quiet=args.quiet, unit="pairs") as progress:
+
+        def report(message: str, done: int, total: int) -> None:
+            if message:
+                progress.say(message)
+            progress.update(done, total=total)
+
+        paths = compare(options, args.out, mode=_mode(args), command=command, progress=report)
+    written = [str(path) for path in paths]
     _print(args, {"files": written}, "\n".join(written))
     return 0
 

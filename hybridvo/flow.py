@@ -7,7 +7,9 @@ estimators return ``failed(no_flow)``.
 
 from __future__ import annotations
 
+import logging
 import threading
+import time
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -23,6 +25,9 @@ DIS_PRESETS = {
     "fast": cv2.DISOPTICAL_FLOW_PRESET_FAST,
     "medium": cv2.DISOPTICAL_FLOW_PRESET_MEDIUM,
 }
+
+
+_logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,27 +180,61 @@ def _lands_inside(flow: np.ndarray) -> np.ndarray:
     return (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)
 
 
-def file_flow(sequence: Any) -> FlowProvider:
+def file_flow(sequence: Any, *, strict: bool = True) -> FlowProvider:
     """Provider of the flow files of a sequence.
 
     Flow files lead from one frame to the next: for any other two frames, and where the file of a
-    pair is missing, the flow is None. A damaged file raises what the reader raises.
+    pair is missing, the flow is None. A damaged file raises what the reader raises, or gives None
+    and a line in the log.
 
     Args:
         sequence: an open sequence, see :func:`hybridvo.data.sequence.open_sequence`, with
             ``flow(index)`` (flow and validity or None) and ``flow_is_true``.
+        strict: whether a damaged file raises.
     """
 
     def provide(prev: Frame, curr: Frame) -> FlowField:
-        if curr.index != prev.index + 1:
-            return FlowField(None, source="file", is_true=sequence.flow_is_true)
-        try:
-            flow, valid = sequence.flow(prev.index)
-        except FileNotFoundError:
-            return FlowField(None, source="file", is_true=sequence.flow_is_true)
+        flow: np.ndarray | None = None
+        valid: np.ndarray | None = None
+        if curr.index == prev.index + 1:
+            try:
+                flow, valid = sequence.flow(prev.index)
+            except FileNotFoundError:
+                pass
+            except (InputError, OSError) as error:
+                if strict:
+                    raise
+                _logger.warning("flow of frame %d: %s", prev.index, error)
         return FlowField(flow, None, valid, "file", sequence.flow_is_true)
 
     return provide
+
+
+class MeasuredFlow:
+    """A provider that keeps its fields until the next reset, and the time that they took.
+
+    Attributes:
+        fields: by the indices of both frames; the first is that of the frame before.
+        ms: spent since the last reset, milliseconds.
+    """
+
+    def __init__(self, provider: FlowProvider) -> None:
+        self._provider = provider
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything."""
+        self.fields: dict[tuple[int, int], FlowField] = {}
+        self.ms = 0.0
+
+    def __call__(self, prev: Frame, curr: Frame) -> FlowField:
+        """Flow from ``prev`` to ``curr``, computed once."""
+        key = prev.index, curr.index
+        if key not in self.fields:
+            started = time.perf_counter()
+            self.fields[key] = self._provider(prev, curr)
+            self.ms += 1e3 * (time.perf_counter() - started)
+        return self.fields[key]
 
 
 def fallback(first: FlowProvider, second: FlowProvider) -> FlowProvider:

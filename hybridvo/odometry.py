@@ -10,35 +10,31 @@ from typing import Any
 import numpy as np
 
 from hybridvo.errors import InputError
+from hybridvo.estimation import warm_up
 from hybridvo.flow import FlowField, FlowProvider, check_field, dis_flow
 from hybridvo.geometry import invert, se3_exp, se3_log
+from hybridvo.network.models import Models, default_models
 from hybridvo.options import Options
 from hybridvo.pipeline import (
     DEFAULT_METHOD,
-    SELECTING,
+    IDENTITY_STD,
+    SEARCHING,
     Context,
-    Models,
     check_method,
-    default_models,
     networks_of,
     refines_images,
     run_method,
-    warm_up,
 )
 from hybridvo.refinement.photometric import refine_photometric
+from hybridvo.refinement.refine import widened
 from hybridvo.results import MotionPrior, Reason, RelativePose, State, Status, Step
 from hybridvo.tracking.keyframes import KeyFrame
 from hybridvo.tracking.pose_graph import Edge
-from hybridvo.tracking.state import TrackerState
-from hybridvo.tracking.window import Located, Window, corrected, locate
+from hybridvo.tracking.state import IMAGES, TrackerState
+from hybridvo.tracking.window import STANDSTILL, Window, locate
 from hybridvo.trajectory import chain
 from hybridvo.types import Frame, FramePair, as_number, as_rigid, as_seed
 
-FAILED_STD_M = 1.0
-FAILED_STD_RAD = 0.3
-"""Smallest standard deviations of a failed motion where nothing is predicted."""
-WINDOWED = (*SELECTING, "refine")
-"""Methods whose weights and covariance a window can build on."""
 DEFAULT_WINDOW = 3
 """Key frames kept where the images refine the motion."""
 START_INFLATION = 1000.0
@@ -47,8 +43,6 @@ REGISTRATION_STEPS = 10
 """Most steps under each blur: a start that was wrong by pixels needs more than a pair's."""
 MAX_FRAMES = 10**6
 """Frames ahead that may be asked for: matrix powers beyond are noise."""
-FIRST_COVARIANCE = 1e-12 * np.eye(6)
-"""Of the first frame's motion, which is none; a pose graph can still invert it."""
 
 
 class Odometry:
@@ -61,7 +55,7 @@ class Odometry:
 
     Args:
         network: ``default`` for the pretrained weights, None for the classical refinement alone,
-            the name or file of other selector weights, or :class:`hybridvo.pipeline.Models`.
+            the name or file of other selector weights, or :class:`hybridvo.network.models.Models`.
         flow: provider ``(prev, curr) -> FlowField or (H, W, 2) array``; default: OpenCV DIS.
             A network of one's own: ``lambda prev, curr: net(prev.rgb, curr.rgb)``. After
             :meth:`skip` the two are no neighbours.
@@ -93,43 +87,25 @@ class Odometry:
         options: Options | None = None,
         seed: int = 0,
     ) -> None:
-        options = options or Options()
+        options = Options() if options is None else options
         if not isinstance(options, Options):
             got = type(options).__name__
             raise InputError(f"Odometry.options: expected Options, got {got}.")
-        if network is not None and not isinstance(network, str | Models):
-            got = type(network).__name__
-            raise InputError(
-                f"Odometry.network: expected 'default', the name or file of weights, Models or "
-                f"None, got {got}."
-            )
         if flow is not None and not callable(flow):
             raise InputError(f"Odometry.flow: expected a callable (prev, curr), got {flow!r}.")
         if method is None:
             method = "refine" if network is None else DEFAULT_METHOD
-        if network is None and networks_of(method):
+        self._models = _models(network, method, options)
+        check_method(method, self._models)
+        if method not in SEARCHING and (options.track.window or 1) > 1:
             raise InputError(
-                f"Odometry: method {method!r} needs a network; leave network='default', or use "
-                f"method='refine'."
+                f"Odometry: method {method!r} has no window of key frames; set track.window to "
+                f"1, or use one of the methods {', '.join(SEARCHING)}."
             )
-        if isinstance(network, Models):
-            models = network
-        elif network in ("default", None):
-            models = default_models(options.run.device if networks_of(method) else "cpu")
-        else:
-            models = Models(options.run.device, {"selector": _weights_file(network)})
-        check_method(method, models)
-        by_images = refines_images(method, options)
-        if method not in WINDOWED:
-            if (options.track.window or 1) > 1:
-                raise InputError(
-                    f"Odometry: method {method!r} has no window of key frames; set track.window to "
-                    f"1, or use one of the methods {', '.join(WINDOWED)}."
-                )
         self.method, self.options = method, options
         self.seed = as_seed(seed, "Odometry.seed")
-        self.window = options.track.window or (DEFAULT_WINDOW if by_images else 1)
-        self._by_images, self._models = by_images, models
+        self._by_images = refines_images(method, options)
+        self.window = options.track.window or (DEFAULT_WINDOW if self._by_images else 1)
         # beside a window the prior of a registration is no flow of which errors are known
         self._registration = replace(
             options.photometric, prior_inflation=1.0, iterations=REGISTRATION_STEPS
@@ -258,22 +234,23 @@ class Odometry:
         # without an image nothing can be matched from here: the next pair spans this frame
         if frame.rgb is None and pair.flow is None:
             return self._step(frame, T_world_cam, motion, self._passed(state, T_world_cam))
-        own = _own(frame)
-        window, jumped = state.window, False
+        own, window = _own(frame), state.window
         if window is None:
             window = self._first_key(own, T_world_cam)
         else:
-            located = self._locate(window, motion, prev, own)
-            window = located.window
+            located = locate(
+                window, motion, prev, own, self._register, self.window, self.options.track
+            )
+            window, motion = located.window, located.motion
             if located.used:
                 T_world_cam = located.T_world_cam
-                motion = corrected(motion, located, invert(T_world_cam) @ state.T_world_cam)
-                jumped = motion.covariance is not located.covariance
+        if found.status.reason is Reason.AMBIGUOUS_MOTION:
+            # a registration that started from this motion confirms it whichever it is
+            motion = widened(motion)
         model = state.motion_model
         if found.usable:
-            # a motion that the key frames contradict is no velocity; theirs is, where it is of
-            # this pair alone
-            T = found.T_curr_prev if state.failed or jumped else motion.T_curr_prev
+            # the pair's own motion: that of the step holds corrections of the pose before as well
+            T = found.T_curr_prev
             if state.gap:
                 T = se3_exp(se3_log(T) / (state.gap + 1))
             model = model.observed(T, neighbours=not state.gap and not state.failed)
@@ -295,75 +272,39 @@ class Odometry:
         return replace(state, T_world_last=T_world_cam, gap=state.gap + 1, count=state.count + 1)
 
     def _estimate(self, pair: FramePair, prior: MotionPrior | None) -> RelativePose:
-        context = Context(self.options, prior, self.seed, None, self._models)
         # the images are asked whether a flow can be theirs until one is
-        context = replace(context, check_flow=not self._flow_fits)
+        check_flow = not self._flow_fits
+        context = Context(self.options, prior, self.seed, None, self._models, check_flow)
         found = run_method(pair, self.method, context)
         self._flow_fits |= found.usable
         return found
 
-    def _locate(self, window: Window, motion: RelativePose, prev: Frame, curr: Frame) -> Located:
-        return locate(
-            window,
-            motion,
-            prev,
-            curr,
-            self._register_by_images if self._by_images else self._register_by_flow,
-            self._search,
-            self.window,
-            self.options.track,
-        )
-
-    def _register_by_images(
-        self,
-        key: KeyFrame,
-        curr: Frame,
-        T_start: np.ndarray,
-        covariance: np.ndarray,
-        weights: np.ndarray,
+    def _register(
+        self, key: KeyFrame, curr: Frame, prior: MotionPrior | None, weights: np.ndarray
     ) -> RelativePose:
-        """Motion from a key frame by the images alone, from a start that is close."""
-        start = RelativePose(
-            T_curr_prev=T_start,
-            covariance=START_INFLATION * covariance,
-            weights=weights,
-            depth_noise=key.depth_noise,
-            method=self.method,
-        )
-        pair = FramePair(key.frame, curr, None)
-        found = refine_photometric(pair, start, self._registration)
-        assert found.photometric is not None
-        if found.photometric.taken:
-            return found
-        status = Status.failed(Reason.SOLVER_DIVERGED, found.photometric.message)
-        return found.replace(status=status)
+        """Motion from a key frame: by the images from a start, without one as between neighbours.
 
-    def _register_by_flow(
-        self,
-        key: KeyFrame,
-        curr: Frame,
-        T_start: np.ndarray | None,
-        covariance: np.ndarray,
-        weights: np.ndarray,
-    ) -> RelativePose:
-        """Motion from a key frame as between neighbours, beside a start."""
-        prior = None if T_start is None else MotionPrior(T_start, covariance)
+        Key frames hold the trajectory together: a motion in doubt counts as failed.
+        """
+        if prior is not None and self._by_images:
+            start = RelativePose(
+                T_curr_prev=prior.T_curr_prev,
+                covariance=START_INFLATION * prior.covariance,
+                weights=weights,
+                depth_noise=key.depth_noise,
+                method=self.method,
+            )
+            pair = FramePair(key.frame, curr, None)
+            found = refine_photometric(pair, start, self._registration)
+            assert found.photometric is not None
+            if found.photometric.taken:
+                return found
+            status = Status.failed(Reason.SOLVER_DIVERGED, found.photometric.message)
+            return found.replace(status=status)
         found = self._estimate(self._pair(key.frame, curr, None), prior)
         if found.status.state is State.DEGRADED:
-            # key frames hold the trajectory together: what is in doubt is not used
             return found.replace(status=Status.failed(found.status.reason, found.status.message))
         return found
-
-    def _search(
-        self,
-        key: KeyFrame,
-        curr: Frame,
-        T_start: np.ndarray,
-        covariance: np.ndarray,
-        weights: np.ndarray,
-    ) -> RelativePose:
-        """The same where nothing is known of the motion."""
-        return self._register_by_flow(key, curr, None, covariance, weights)
 
     def skip(self, index: int, timestamp: float, message: str = "") -> Step:
         """A frame that could not be read: a failed step; the next pair, and its flow, span it.
@@ -396,7 +337,7 @@ class Odometry:
         T = state.T_world_last
         own = _own(frame)
         # no motion precedes the first frame
-        first = RelativePose(covariance=FIRST_COVARIANCE.copy(), method=self.method)
+        first = RelativePose(covariance=STANDSTILL.copy(), method=self.method)
         after = TrackerState(own, T, T, count=state.count + 1, window=self._first_key(own, T))
         return self._step(frame, T, first, after)
 
@@ -423,8 +364,7 @@ class Odometry:
         self, state: TrackerState, failed: RelativePose
     ) -> tuple[np.ndarray, RelativePose]:
         """(pose, motion) by policy, where a motion was not found."""
-        covariance = np.diag([FAILED_STD_M**2] * 3 + [FAILED_STD_RAD**2] * 3)
-        covariance = np.maximum(covariance, np.diag(np.diag(failed.covariance)))
+        covariance = np.diag(np.maximum(IDENTITY_STD**2, np.diag(failed.covariance)))
         T_world_cam, T_curr_prev = state.T_world_last, np.eye(4)
         ahead = state.motion_model.predict(state.gap + 1)
         if self.options.track.on_failure == "hold" or ahead is None:
@@ -439,21 +379,30 @@ class Odometry:
 
 def _own(frame: Frame) -> Frame:
     """Copy whose arrays nobody else can change."""
-
-    def copy(array: np.ndarray | None) -> np.ndarray | None:
-        return None if array is None else array.copy()
-
-    return replace(
-        frame,
-        rgb=copy(frame.rgb),
-        depth=copy(frame.depth),
-        depth_variance=copy(frame.depth_variance),
-        mask=copy(frame.mask),
-    )
+    images: dict[str, Any] = {
+        name: image.copy() for name in IMAGES if (image := getattr(frame, name)) is not None
+    }
+    return replace(frame, **images)
 
 
-def _weights_file(name: str) -> str:
-    """A file of weights: the name of one, or a pretrained name."""
+def _models(network: Any, method: str, options: Options) -> Models:
+    """The networks asked for: a name or file of selector weights, or all of them."""
+    if network is not None and not isinstance(network, str | Models):
+        got = type(network).__name__
+        raise InputError(
+            f"Odometry.network: expected 'default', the name or file of weights, Models or None, "
+            f"got {got}."
+        )
+    if network is None and networks_of(method):
+        raise InputError(
+            f"Odometry: method {method!r} needs a network; leave network='default', or use "
+            f"method='refine'."
+        )
+    if isinstance(network, Models):
+        return network
+    if network in ("default", None):
+        return default_models(options.run.device if networks_of(method) else "cpu")
     from hybridvo.network.weights import pretrained
 
-    return name if Path(name).is_file() else str(pretrained(name))
+    file = network if Path(network).is_file() else pretrained(network)
+    return Models(options.run.device, {"selector": file})

@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal, TypeVar, dataclass_transform
 from pydantic import ConfigDict, Field, ValidationError
 from pydantic.dataclasses import dataclass
 
+from hybridvo.calibration import MIN_CONFIDENCE
 from hybridvo.errors import InputError
 
 T = TypeVar("T")
@@ -82,16 +83,15 @@ class SelectOptions:
     """Which of the motions is the camera's.
 
     Args:
-        consult_below: confidence of the selector (0 to 1) below which PWVO is asked as well; 1: in
+        consult_below: probability of being right (0 to 1) below which PWVO is asked as well; 1: in
             every ambiguous pair.
         refits: motions that are fitted again inside their masks, in each round.
-        min_confidence: probability of being right (0 to 1) below which a motion is degraded. Of 120
-            development pairs with DIS flow the 3 wrong ones have 0.1 to 0.44, the others 0.65 to 1.
+        min_confidence: probability of being right (0 to 1) below which a motion is degraded.
     """
 
-    consult_below: Share = 0.8
+    consult_below: Share = MIN_CONFIDENCE
     refits: Annotated[int, Field(ge=0, le=16)] = 2
-    min_confidence: Share = 0.65
+    min_confidence: Share = MIN_CONFIDENCE
 
 
 @option_group

@@ -73,6 +73,17 @@ def project(points: torch.Tensor, K: torch.Tensor) -> torch.Tensor:
     return project_points(points.transpose(1, 2), K[:, None]).transpose(1, 2)
 
 
+def projection_rows(
+    a: torch.Tensor, b: torch.Tensor, i: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Derivatives (B, 6, N) of a = X/Z and b = Y/Z in the left tangent, i = 1/Z."""
+    zero, ab = torch.zeros_like(a), a * b
+    return (
+        torch.stack([i, zero, -a * i, -ab, 1 + a * a, -b], dim=1),
+        torch.stack([zero, i, -b * i, -1 - b * b, ab, a], dim=1),
+    )
+
+
 def reproject(
     depth: torch.Tensor, T: torch.Tensor, K_prev: torch.Tensor, K_curr: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
@@ -155,3 +166,12 @@ def euler_deg(R: torch.Tensor) -> torch.Tensor:
         torch.atan2(torch.where(locked, zero, -R[:, 0, 1]), torch.where(locked, one, R[:, 0, 0])),
     )
     return torch.rad2deg(torch.stack(angles, dim=1))
+
+
+def weighted_median(x: torch.Tensor, weight: torch.Tensor, default: float) -> torch.Tensor:
+    """(B,) median of (B, N) values under weights; ``default`` where nothing has any."""
+    ordered, index = x.sort(dim=1)
+    reached = weight.gather(1, index).cumsum(dim=1)
+    middle = (reached < 0.5 * reached[:, -1:]).sum(dim=1, keepdim=True).clamp(max=x.shape[1] - 1)
+    value = ordered.gather(1, middle)[:, 0]
+    return torch.where(reached[:, -1] > 0, value, torch.full_like(value, default))

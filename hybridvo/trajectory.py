@@ -240,7 +240,8 @@ def read_trajectory(
 
     finite = "finite numbers; a pose that is not known must not be in the file"
     refuse(~np.isfinite(values).all(axis=1), finite)
-    stamps, warnings = np.arange(len(rows), dtype=np.float64), []
+    stamps = np.arange(len(rows), dtype=np.float64)
+    warnings: list[str] = []
     if kind == "tum":
         stamps = values[:, 0]
         far = np.abs(stamps) > MAX_SECONDS

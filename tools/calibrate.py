@@ -78,20 +78,21 @@ def answers(
     pair: Any, T: np.ndarray, depth: np.ndarray, selector: str | None
 ) -> Iterator[tuple[str, np.ndarray, float]]:
     """(which probability, its evidence, error in px) of both selectors."""
-    from hybridvo import pipeline
     from hybridvo.hypotheses.selector import CueSelector
     from hybridvo.network.models import Models
+    from hybridvo.pipeline import Context
+    from hybridvo.results import RelativePose
 
     weights = {"selector": selector} if selector else None
-    ctx = pipeline.Context(models=MODELS.setdefault(selector, Models(weights=weights)))
+    ctx = Context(models=MODELS.setdefault(selector, Models(weights=weights)))
     found = ctx.search(pair)
-    if isinstance(found, pipeline.RelativePose):
+    if isinstance(found, RelativePose):
         return
     chosen = {"cues": CueSelector().select(found), "selector": ctx.selector().select(found)}
     if not found.is_ambiguous:
         chosen = {"clear": chosen["selector"]}
     for name, selection in chosen.items():
-        motion = pipeline.refine_selection(pair, found, selection, ctx)
+        motion = ctx.refine(pair, found, selection)
         yield name, selection.evidence, ego_flow_error(motion.T_curr_prev, T, depth, pair)
 
 

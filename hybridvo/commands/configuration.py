@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from hybridvo.errors import FormatError, InputError
-from hybridvo.files import parse_yaml
+from hybridvo.files import parse_yaml, read_text
 from hybridvo.options import Options
 
 
@@ -73,16 +73,9 @@ def load_options(
 def _from_file(path: Path) -> dict[str, Any]:
     """Content of an options file as ``group.key`` and value."""
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        content = parse_yaml(read_text(path), str(path)) or {}
     except FileNotFoundError:
         raise InputError(f"{path}: no such file.") from None
-    except UnicodeDecodeError:
-        raise FormatError(f"{path}: expected a YAML file, got binary data.") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}.") from None
-    content = parse_yaml(text, str(path))
-    if content is None:
-        return {}
     if not isinstance(content, dict):
         raise FormatError(f"{path}: expected 'group:' lines, got a {type(content).__name__}.")
     values = {}

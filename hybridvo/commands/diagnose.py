@@ -19,10 +19,10 @@ from hybridvo.commands.inputs import is_dark
 from hybridvo.data.lists import shown
 from hybridvo.data.sequence import Sequence
 from hybridvo.errors import InputError
+from hybridvo.estimation import estimate
 from hybridvo.evaluation.pair_errors import true_motion
 from hybridvo.flow import contradiction, dis_flow, file_flow
 from hybridvo.geometry import ego_flow
-from hybridvo.pipeline import estimate
 from hybridvo.refinement.depth import depth_ratio, is_step
 from hybridvo.types import Frame, FramePair
 from hybridvo.units import depth_advice, typical_depth
@@ -129,7 +129,7 @@ def _measure(sequence: Sequence, prev: Frame, curr: Frame) -> Pair:
     pair["dark"] = [frame.index for frame in (prev, curr) if is_dark(frame.rgb)]
     pair["grey"] = (float(curr.rgb.mean()) + 1.0) / (float(prev.rgb.mean()) + 1.0)
     if sequence.has_flow:
-        given = file_flow(sequence)(prev, curr)
+        given = file_flow(sequence, strict=False)(prev, curr)
         if given.flow is not None:
             on_file = FramePair(prev, curr, given.flow, given.variance, given.valid, "file")
             pair["contradiction"] = contradiction(on_file)

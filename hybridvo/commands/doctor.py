@@ -113,16 +113,10 @@ def _what_runs() -> dict[str, Any]:
     import numba
     import torch
 
-    from hybridvo.errors import InputError
-    from hybridvo.pipeline import METHODS, check_method, warm_up
+    from hybridvo.estimation import warm_up
+    from hybridvo.evaluation.plan import methods_to_run
 
-    methods = {}
-    for method in METHODS:
-        try:
-            check_method(method)
-            methods[method] = ""
-        except InputError as error:
-            methods[method] = str(error)
+    ready, absent = methods_to_run(("all",))
     return {
         "devices": _devices(),
         "threads": {
@@ -132,5 +126,5 @@ def _what_runs() -> dict[str, Any]:
             "numba": numba.get_num_threads(),
         },
         "warm_up_s": warm_up(),
-        "methods": methods,
+        "methods": {**dict.fromkeys(ready, ""), **absent},
     }

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import logging
-import time
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -11,47 +9,13 @@ import numpy as np
 
 from hybridvo.data.sequence import Sequence
 from hybridvo.errors import InputError
-from hybridvo.flow import FlowField, FlowProvider, dis_flow, fallback, file_flow
+from hybridvo.flow import FlowProvider, dis_flow, fallback, file_flow
 from hybridvo.options import Options
 from hybridvo.pipeline import networks_of
-from hybridvo.types import Frame
 
 DARK_LEVEL = 20.0
 """Grey levels (of 255) below which nine tenths of a dark image lie; lit rooms and night streets
 have a tenth above 60."""
-
-_logger = logging.getLogger(__name__)
-
-
-class TimedFlow:
-    """A flow provider that keeps the first field of a frame and sums up the time spent.
-
-    A field is None, with a line in the log, where a file is damaged; with ``strict`` it raises.
-    """
-
-    def __init__(self, provider: FlowProvider, strict: bool = False) -> None:
-        self._provider, self._strict = provider, strict
-        self.field: FlowField | None = None
-        self.ms = 0.0
-
-    def reset(self) -> None:
-        """Forget the last frame's."""
-        self.field, self.ms = None, 0.0
-
-    def __call__(self, prev: Frame, curr: Frame) -> FlowField:
-        """Flow from ``prev`` to ``curr``."""
-        started = time.perf_counter()
-        try:
-            field = self._provider(prev, curr)
-        except (InputError, OSError) as error:
-            if self._strict:
-                raise InputError(f"flow of frame {prev.index}: {error}") from error
-            _logger.warning("flow of frame %d: %s", prev.index, error)
-            field = FlowField(None, source="file")
-        self.ms += 1e3 * (time.perf_counter() - started)
-        if self.field is None:  # the window may ask for more, from its key frames
-            self.field = field
-        return field
 
 
 def flow_provider(sequence: Sequence, options: Options) -> FlowProvider:
@@ -69,11 +33,11 @@ def flow_provider(sequence: Sequence, options: Options) -> FlowProvider:
                 f"{sequence.name}: flow files lead from one frame to the next, not over a stride "
                 f"of {stride}; pass --flow dis."
             )
-        return file_flow(sequence)
+        return file_flow(sequence, strict=options.run.strict)
     dis = dis_flow(options.flow.dis_preset, options.flow.forward_backward)
     if source == "auto" and sequence.has_flow and stride == 1:
         # a damaged file is no reason to stop where DIS can stand in
-        return fallback(TimedFlow(file_flow(sequence), options.run.strict), dis)
+        return fallback(file_flow(sequence, strict=options.run.strict), dis)
     return dis
 
 

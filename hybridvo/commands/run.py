@@ -19,7 +19,7 @@ from typing import Any
 
 import hybridvo
 from hybridvo.commands import results
-from hybridvo.commands.inputs import TimedFlow, flow_provider, is_dark
+from hybridvo.commands.inputs import flow_provider, is_dark
 from hybridvo.commands.progress import Progress, interruptible
 from hybridvo.commands.recording import Recording, check_recording
 from hybridvo.commands.run_folder import RESULTS, STATE, Mode, RunFolder
@@ -28,10 +28,12 @@ from hybridvo.errors import InputError
 from hybridvo.evaluation.metrics import true_trajectory
 from hybridvo.evaluation.pair_errors import pair_errors, true_motion
 from hybridvo.files import fingerprint, versions
+from hybridvo.flow import FlowField, MeasuredFlow
 from hybridvo.geometry import se3_log
+from hybridvo.network.models import Models
 from hybridvo.odometry import Odometry
 from hybridvo.options import Options
-from hybridvo.pipeline import Models, check_method, weights_hash
+from hybridvo.pipeline import check_method, weights_hash
 from hybridvo.refinement.depth import depth_ratio
 from hybridvo.results import State, Step
 from hybridvo.tracking.state import TrackerState
@@ -96,7 +98,7 @@ def run(
     if rrd is not None:
         check_recording(rrd or RECORDING)
     frames = _frames(sequence, options)
-    flow = TimedFlow(flow_provider(sequence, options), options.run.strict)
+    flow = MeasuredFlow(flow_provider(sequence, options))
     out = _folder(out, sequence)
     vo = Odometry(models, flow=flow, method=method, options=options, seed=options.run.seed)
     vo.warm_up()  # before the folder is taken: it may last
@@ -138,7 +140,7 @@ class _Job:
     frames: range
     options: Options
     vo: Odometry
-    flow: TimedFlow
+    flow: MeasuredFlow
     folder: RunFolder
     recording: Recording | None
 
@@ -186,28 +188,27 @@ class _Job:
             started = time.perf_counter()
             step = self.vo.track(frame)
             ms = 1e3 * (time.perf_counter() - started)
-        row = self._row(step, prev, frame, ms)
+        # the window may have asked for more, from its key frames
+        field = next(iter(self.flow.fields.values()), FlowField(None, source=""))
+        row = self._row(step, prev, frame, field, ms)
         if frame is not None and self.recording is not None:
-            self.recording.add(
-                frame, step, None if self.flow.field is None else self.flow.field.flow
-            )
+            self.recording.add(frame, step, field.flow)
         if row["status"] != "ok":
             text = f"frame {index}: {row['status']} ({row['reason']}), probability "
             progress.say(f"{text}{row['probability']:.2f}: {row['message']}")
         return row
 
     def _row(
-        self, step: Step, prev: Frame | None, frame: Frame | None, ms: float
+        self, step: Step, prev: Frame | None, frame: Frame | None, field: FlowField, ms: float
     ) -> dict[str, Any]:
         """What is kept of a frame, JSON-ready: the columns of ``steps.csv`` and more."""
-        motion, field = step.motion, self.flow.field
-        flow = None if field is None else field.flow
+        motion = step.motion
         message = " ".join(step.status.message.split())
         if frame is not None and not step.ok and is_dark(frame.rgb):
             message = f"the image is dark; {message}"
         ratio = None
         if prev is not None and frame is not None and step.status.state is not State.FAILED:
-            ratio = depth_ratio(prev, frame, flow, step.T_curr_prev)
+            ratio = depth_ratio(prev, frame, field.flow, step.T_curr_prev)
         values = [*motion.T_curr_prev[:3, 3].tolist(), *se3_log(motion.T_curr_prev)[3:].tolist()]
         return {
             "index": step.index,
@@ -223,12 +224,12 @@ class _Job:
             "motion_ms": round(ms - self.flow.ms, 3),
             "frame_ms": round(ms, 3),
             "prev_index": None if prev is None else prev.index,
-            "flow_source": None if field is None else field.source,
+            "flow_source": field.source,
             "message": message,
             "T_curr_prev": motion.T_curr_prev.tolist(),
             "T_world_cam": step.T_world_cam.tolist(),
             "covariance": motion.covariance.tolist(),
-            "flow_is_true": flow is not None and field is not None and field.is_true,
+            "flow_is_true": field.flow is not None and field.is_true,
             "errors": self._errors(prev, step),
             "depth_ratio": ratio,
         }

@@ -3,6 +3,7 @@
     hybridvo train pwvo --config configs/train_paper.yaml --out runs/paper
     hybridvo train export --out runs/paper --export paper.safetensors
     hybridvo train selector-data --data runs/selector_data --first-seed 1000000 --seeds 4096
+    hybridvo train selector-data --data runs/selector_data --recordings ../shared/data --seeds 2048
     hybridvo train selector --data runs/selector_data --out runs/selector --time-limit 50
 
 Started again with the same ``--out`` a training goes on where it was. Several processes or

@@ -101,7 +101,8 @@ def parse_camera(
         return Calibration(camera)
     numbers = [as_number(part) for part in os.fspath(camera).split(",")]
     if len(numbers) == 4 and np.isfinite(numbers).all():
-        return Calibration(Camera(*numbers, *shape))
+        fx, fy, cx, cy = numbers
+        return Calibration(Camera(fx, fy, cx, cy, *shape))
     try:
         return read_camera_file(Path(camera))
     except FileNotFoundError:

@@ -31,7 +31,8 @@ from hybridvo.evaluation.scores import ROW_COLUMNS, breakdown, total_row
 from hybridvo.evaluation.sequence_job import PAIR_COLUMNS, Job, pair_table, run_sequence
 from hybridvo.evaluation.worst import draw_worst, worst_pairs
 from hybridvo.files import make_folder, versions, write_csv, write_json
-from hybridvo.pipeline import Models, weights_hash
+from hybridvo.network.models import Models
+from hybridvo.pipeline import weights_hash
 from hybridvo.trajectory import Trajectory
 
 WRITTEN = ("results.json", "results.csv", "pairs.csv", "report.md", "report.html")

@@ -11,6 +11,7 @@ import numpy as np
 
 from hybridvo.data.sequence import Sequence, iter_pairs
 from hybridvo.errors import InputError
+from hybridvo.estimation import estimate
 from hybridvo.evaluation.maps import (
     error_map,
     longest_flow,
@@ -28,7 +29,7 @@ from hybridvo.geometry import matrix_to_euler_deg
 from hybridvo.network.models import load_weights
 from hybridvo.network.options import KINDS
 from hybridvo.network.weights import pretrained, pretrained_names
-from hybridvo.pipeline import DEFAULT_METHOD, estimate
+from hybridvo.pipeline import DEFAULT_METHOD
 from hybridvo.results import PixelwisePrediction, RelativePose
 from hybridvo.types import FramePair
 

@@ -72,11 +72,12 @@ class TrajectoryError:
     @property
     def rmse(self) -> float | None:
         """Root mean square of the translation errors, metres; None with a ``reason``."""
-        return _rms(self.translation)
+        return float(np.sqrt(np.mean(self.translation**2))) if len(self.translation) else None
 
-
-def _rms(errors: np.ndarray) -> float | None:
-    return float(np.sqrt(np.mean(errors**2))) if len(errors) else None
+    @property
+    def rotation_rmse_deg(self) -> float | None:
+        """Root mean square of the rotation errors, degrees; None with a ``reason``."""
+        return float(np.sqrt(np.mean(self.rotation_deg**2))) if len(self.rotation_deg) else None
 
 
 def associate(est: Trajectory, gt: Trajectory, *, max_diff: float | None = None) -> Association:
@@ -169,12 +170,8 @@ def ate(
 ) -> TrajectoryError:
     """Absolute trajectory error: distances of matched positions after the alignment.
 
-    Args:
-        est: estimated trajectory.
-        gt: ground truth.
-        alignment: ``se3`` (rigid, least squares: the rule for metric methods), ``sim3`` (with
-            scale), ``origin`` (first matched poses made equal) or ``none``.
-        association: matches found before.
+    ``se3`` (rigid, least squares) is the rule for metric methods; ``sim3`` has a scale, ``origin``
+    makes the first matched poses equal. ``association``: matches found before.
     """
     from evo.core.metrics import APE, PoseRelation
 
@@ -351,7 +348,7 @@ def evaluate(
             put(f"rpe_trans_rmse{suffix}", relative.rmse, relative.reason)
             mean = float(relative.translation.mean()) if len(relative.translation) else None
             put(f"rpe_trans_mean{suffix}", mean, relative.reason)
-            put(f"rpe_rot_rmse_deg{suffix}", _rms(relative.rotation_deg), relative.reason)
+            put(f"rpe_rot_rmse_deg{suffix}", relative.rotation_rmse_deg, relative.reason)
     poses = estimate.T_world_cam[match.est_indices], gt.T_world_cam[match.gt_indices]
     for key, lengths in (("kitti_drift", KITTI_LENGTHS), ("kitti_drift_short", SHORT_LENGTHS)):
         put(key, None if match.reason else kitti_drift(*poses, lengths=lengths), match.reason)

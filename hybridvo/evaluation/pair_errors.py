@@ -7,6 +7,7 @@ error: the mean L2 distance over valid pixels at native size.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -160,7 +161,7 @@ def mean_pair_errors(pairs: Iterable[Mapping[str, float | None]]) -> dict[str, A
         *("rot_err_deg_mean", "rot_err_deg_median", "trans_err_mean", "trans_err_median"),
     ):
         name = key.removesuffix("_mean").removesuffix("_median")
-        known = [value for pair in pairs if (value := pair.get(name)) is not None]
+        known = [v for pair in pairs if (v := pair.get(name)) is not None and not math.isnan(v)]
         statistic = np.median if key.endswith("_median") else np.mean
         report[key] = float(statistic(known)) if known else None
         if not pairs:

@@ -17,7 +17,8 @@ from hybridvo.errors import HybridVOError, InputError
 from hybridvo.evaluation.protocols import Protocol, check_protocol
 from hybridvo.evaluation.sequence_job import Job
 from hybridvo.files import fingerprint
-from hybridvo.pipeline import METHODS, Models, check_method, weights_hash
+from hybridvo.network.models import Models
+from hybridvo.pipeline import METHODS, check_method, weights_hash
 
 SINTEL_FOLDERS = ("camdata_left", "depth", "flow", "clean", "final")
 """Folders of MPI Sintel that hold a folder per scene; the images of the last one are read."""

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
+from operator import attrgetter, itemgetter
 from typing import Any
 
 import numpy as np
@@ -79,8 +81,8 @@ def integrated_gradients(
         attributions = [total * x for total, x in zip(sums, inputs, strict=True)]
         change = float(answer(*inputs)) - float(answer(*map(torch.zeros_like, inputs)))
         magnitude = sum(a[0].abs().sum(0) for a in attributions)
-    total = float(sum(a.double().sum() for a in attributions))
-    return Saliency(torch.as_tensor(magnitude).cpu().numpy(), total, change)
+    whole = float(sum(a.double().sum() for a in attributions))
+    return Saliency(torch.as_tensor(magnitude).cpu().numpy(), whole, change)
 
 
 def last_pass(network: Any, pair: FramePair) -> tuple[Any, Any, Any]:
@@ -113,19 +115,17 @@ def saliencies(network: Any, inputs: Any, T_start: Any, steps: int) -> dict[str,
     found = {}
     for k, what in enumerate(PARTS):
         if isinstance(output, PixelwisePrediction):
-            maps = {n: getattr(output, n).clone().requires_grad_() for n in PARTS}
+            maps = {name: getattr(output, name).clone().requires_grad_() for name in PARTS}
             motion = select_pose(replace(output, **maps))[k]
             direction = (motion / motion.norm().clamp(min=1e-12)).detach()
             (weights,) = torch.autograd.grad((direction * motion).sum(), maps[what])
-
-            def answer(*tensors: Any, what: str = what, weights: Any = weights) -> Any:
-                return (weights * getattr(run(tensors), what)).sum()
-
+            answer = partial(_weighted_sum, run, attrgetter(what), weights)
         else:
             direction = output[k] / output[k].norm().clamp(min=1e-12)
-
-            def answer(*tensors: Any, k: int = k, direction: Any = direction) -> Any:
-                return (direction * run(tensors)[k]).sum()
-
+            answer = partial(_weighted_sum, run, itemgetter(k), direction)
         found[what] = integrated_gradients(answer, given, steps=steps)
     return found
+
+
+def _weighted_sum(run: Any, part: Any, weights: torch.Tensor, *tensors: torch.Tensor) -> Any:
+    return (weights * part(run(tensors))).sum()

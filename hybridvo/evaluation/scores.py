@@ -97,8 +97,7 @@ def _statistic(values: pd.Series, q: float = 0.5) -> float | None:
 def pair_scores(pairs: pd.DataFrame) -> dict[str, Any]:
     """Everything that is a mean, median or count over the pairs of one method and flow."""
     scored = pairs[pairs["rot_err_deg"].notna()]
-    errors = scored[list(PAIR_ERRORS)].astype(object).where(scored[list(PAIR_ERRORS)].notna(), None)
-    scores = mean_pair_errors(errors.to_dict("records"))
+    scores = mean_pair_errors(scored[list(PAIR_ERRORS)].to_dict("records"))
     reasons = scores["reasons"]
     if pairs.empty:
         reasons |= dict.fromkeys(reasons, NO_PAIRS)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
@@ -17,10 +16,10 @@ from hybridvo.evaluation.metrics import true_trajectory
 from hybridvo.evaluation.pair_errors import pair_errors, pair_facts, true_motion
 from hybridvo.evaluation.protocols import same_intrinsics
 from hybridvo.evaluation.scores import FACTORS, scale_warning, sequence_row
-from hybridvo.flow import FlowField, dis_flow, file_flow
+from hybridvo.flow import MeasuredFlow, dis_flow, file_flow
 from hybridvo.geometry import invert
+from hybridvo.network.models import Models
 from hybridvo.odometry import Odometry
-from hybridvo.pipeline import Models
 from hybridvo.trajectory import Trajectory
 from hybridvo.types import Frame
 
@@ -32,8 +31,6 @@ PAIR_COLUMNS = (
 """Columns of ``pairs.csv``."""
 CAMERA_FLOW_KINDS = ("tartanair",)
 """Data sets whose true flow is that of the camera alone: it does not show what moves by itself."""
-
-_logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -66,46 +63,20 @@ class Job:
         return max(0, len(self.indices) - 1)
 
 
-class SharedFlow:
-    """Flow provider that several trackers ask for the same pairs, computed once and timed apart.
-
-    Attributes:
-        label: what results call the source; ``(true)`` names an oracle.
-        ms: of the last pair, milliseconds.
-    """
-
-    def __init__(self, name: str, sequence: Sequence) -> None:
-        self._provider = file_flow(sequence) if name == "file" else dis_flow()
-        self._name = name
-        self._known: dict[tuple[int, int], FlowField] = {}
-        self.label = f"{name} (true)" if name == "file" and sequence.flow_is_true else name
-        self.ms = 0.0
-
-    def prepare(self, prev: Frame, curr: Frame) -> None:
-        """Compute the flow of the next pair and forget those before."""
-        self._known.clear()
-        started = time.perf_counter()
-        self(prev, curr)
-        self.ms = 1e3 * (time.perf_counter() - started)
-
-    def __call__(self, prev: Frame, curr: Frame) -> FlowField:
-        """Flow from ``prev`` to ``curr``; none where its file is damaged."""
-        key = prev.index, curr.index
-        if key not in self._known:
-            try:
-                self._known[key] = self._provider(prev, curr)
-            except (InputError, OSError) as error:
-                _logger.warning("flow of frame %d: %s", prev.index, error)
-                self._known[key] = FlowField(None, source=self._name)
-        return self._known[key]
+def open_flow(name: str, sequence: Sequence) -> tuple[str, MeasuredFlow]:
+    """What results call a source of flow, ``(true)`` naming an oracle, and its provider."""
+    if name == "dis":
+        return name, MeasuredFlow(dis_flow())
+    label = f"{name} (true)" if sequence.flow_is_true else name
+    return label, MeasuredFlow(file_flow(sequence, strict=False))
 
 
 @dataclass
 class _Run:
-    """One method on one flow, and the poses T_world_cam that it found, by frame."""
+    """One method on one source of flow, and the poses T_world_cam that it found, by frame."""
 
     method: str
-    flow: SharedFlow
+    flow_source: str
     vo: Odometry
     poses: dict[int, np.ndarray] = field(default_factory=dict)
 
@@ -138,24 +109,29 @@ def run_sequence(job: Job, progress: Callable[[int], None] | None = None) -> dic
     """
     sequence = open_sequence(job.path, job.dataset)
     models = Models(job.device, job.weights)
-    flows = [SharedFlow(name, sequence) for name in job.flows]
+    flows = dict(open_flow(name, sequence) for name in job.flows)
     runs = [
-        _Run(method, flow, Odometry(models, flow=flow, method=method, seed=job.seed))
-        for flow in flows
+        _Run(method, label, Odometry(models, flow=flow, method=method, seed=job.seed))
+        for label, flow in flows.items()
         for method in job.methods
     ]
     pairs: list[dict[str, Any]] = []
     left_out: list[dict[str, Any]] = []
     prev: Frame | None = None
     for done, index in enumerate(job.indices):
-        frame, facts, is_scored = None, {}, prev is not None
+        frame: Frame | None = None
+        facts: dict[str, Any] = {}
+        flow_ms: dict[str, float] = {}
+        is_scored = prev is not None
         try:
             frame = sequence.frame(index)
         except (InputError, OSError) as error:
             left_out.append({"index": index, "reason": f"frame cannot be read: {error}"})
         if frame is not None and prev is not None:
-            for flow in flows:
-                flow.prepare(prev, frame)
+            for label, flow in flows.items():  # once for all methods, and timed apart
+                flow.reset()
+                flow(prev, frame)
+                flow_ms[label] = flow.ms
             facts = _facts(sequence, prev, frame)
             if job.same_camera_only and not same_intrinsics(prev.camera, frame.camera):
                 is_scored = False
@@ -172,8 +148,8 @@ def run_sequence(job: Job, progress: Callable[[int], None] | None = None) -> dic
                         "prev": prev.index,
                         "next": index,
                         "method": run.method,
-                        "flow_source": run.flow.label,
-                        "flow_ms": None if frame is None else run.flow.ms,
+                        "flow_source": run.flow_source,
+                        "flow_ms": flow_ms.get(run.flow_source),
                         "T_curr_prev": T.ravel().tolist(),
                         **facts,
                         **outcome,
@@ -183,7 +159,7 @@ def run_sequence(job: Job, progress: Callable[[int], None] | None = None) -> dic
         prev = prev if frame is None else frame
         if progress is not None and done:
             progress(done)
-    order = {(run.method, run.flow.label): k for k, run in enumerate(runs)}
+    order = {(run.method, run.flow_source): k for k, run in enumerate(runs)}
     pairs.sort(key=lambda row: (row["index"], order[row["method"], row["flow_source"]]))
     return _result(job, sequence, runs, pairs, left_out)
 
@@ -218,19 +194,19 @@ def _result(
     table = pair_table(pairs)
     gt = true_trajectory(sequence, job.indices)
     stamps = sequence.timestamps[list(job.indices)]
-    paths = {"ground_truth": None if gt is None else gt.T_world_cam.tolist()}
+    paths: dict[str, Any] = {"ground_truth": None if gt is None else gt.T_world_cam.tolist()}
     rows = []
     for run in runs:
         est = Trajectory(stamps, np.stack([run.poses[i] for i in job.indices]))
-        mine = (table["method"] == run.method) & (table["flow_source"] == run.flow.label)
+        mine = (table["method"] == run.method) & (table["flow_source"] == run.flow_source)
         named = {
             "sequence": job.name,
             "method": run.method,
-            "flow_source": run.flow.label,
+            "flow_source": run.flow_source,
             "depth_source": sequence.depth_source,
         }
         rows.append(sequence_row(table[mine], est if len(est) > 1 else None, gt, named))
-        paths[f"{run.method}|{run.flow.label}"] = est.T_world_cam.tolist()
+        paths[f"{run.method}|{run.flow_source}"] = est.T_world_cam.tolist()
     facts = {
         "name": job.name,
         "kind": sequence.kind,

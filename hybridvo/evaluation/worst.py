@@ -12,14 +12,16 @@ import pandas as pd
 
 from hybridvo.data.sequence import open_sequence
 from hybridvo.errors import InputError
+from hybridvo.estimation import estimate
 from hybridvo.evaluation.maps import error_map, flow_colours, longest_flow, uncertainty_maps
 from hybridvo.evaluation.pair_errors import true_motion
 from hybridvo.evaluation.saliency import last_pass
 from hybridvo.evaluation.scores import FACTORS, PAIR_ERRORS, is_failed, known_number
-from hybridvo.evaluation.sequence_job import Job, SharedFlow
+from hybridvo.evaluation.sequence_job import Job, open_flow
 from hybridvo.files import atomic_write
+from hybridvo.network.models import Models
 from hybridvo.network.options import KINDS
-from hybridvo.pipeline import Models, estimate, networks_of
+from hybridvo.pipeline import networks_of
 from hybridvo.results import PixelwisePrediction
 from hybridvo.types import FramePair
 
@@ -66,7 +68,7 @@ def draw_worst(
         rows: of the sequence, with ``prev``, ``next`` and ``T_curr_prev``.
     """
     sequence, models = open_sequence(job.path, job.dataset), Models(job.device, job.weights)
-    flows = {flow.label: flow for flow in (SharedFlow(name, sequence) for name in job.flows)}
+    flows = dict(open_flow(name, sequence) for name in job.flows)
     found = {(row["index"], row["method"], row["flow_source"]): row for row in rows}
     for entry in entries:
         method, label = entry["method"], entry["flow_source"]

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from hybridvo.calibration import CUE_WEIGHTS
 from hybridvo.geometry import invert, se3_log
 from hybridvo.hypotheses.generate import HypothesisSet
 from hybridvo.refinement import kernels
@@ -33,8 +34,6 @@ def cue_scores(
     Objects are compact and mostly inside the image: their share of the image exceeds their share of
     its border, and they leave parts of it empty. The static scene is behind, reaches the border
     everywhere and is as sharply rigid as the flow allows (a compromise between two motions is not).
-    The weights were chosen on development seeds of the synthetic scenes and of the scenario
-    ``one60``.
     """
     h, w, _ = found.grid.shape
     usable = found.grid.weight > 0
@@ -59,16 +58,16 @@ def cue_scores(
         spread = float(np.minimum(filled / 0.25, 1.0).mean()) if filled.size else 0.0
         behind = float(weight @ log_depth) / max(total, 1e-9) - mean_log_depth
         on_border = float(weight[border].sum()) / max(len(border), 1)
-        scores[k] = (
-            1.2 * on_border
-            - 1.5 * max(share - SMALL, 0.0)
-            + 0.7 * spread
-            + 0.15 * behind
-            - 0.2 * np.log(max(motion.flow_noise_px, MIN_NOISE_PX) / sharpest)
-            + 0.3 * agreement(motion.T_curr_prev, prior)
-        )
-        if share > DOMINANT:
-            scores[k] += 2.0
+        cues = {
+            "border": on_border,
+            "excess": max(share - SMALL, 0.0),
+            "spread": spread,
+            "behind": behind,
+            "noise": np.log(max(motion.flow_noise_px, MIN_NOISE_PX) / sharpest),
+            "prior": agreement(motion.T_curr_prev, prior),
+            "dominant": share > DOMINANT,
+        }
+        scores[k] = sum(CUE_WEIGHTS[name] * value for name, value in cues.items())
     return scores
 
 

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from hybridvo.calibration import CLEAR_BEND_PX, CLEAR_COHERENCE
 from hybridvo.hypotheses import search
 from hybridvo.options import Options
 from hybridvo.refinement import kernels
-from hybridvo.refinement.coarse_fit import fit_coarse, translation_scale
+from hybridvo.refinement.coarse_fit import fit_coarse
 from hybridvo.refinement.depth import look_up
 from hybridvo.refinement.pixels import CoarseGrid, as_contiguous, coarse_grid
 from hybridvo.results import Reason, RelativePose
@@ -20,15 +21,8 @@ REFERENCE_WIDTH = 1024
 """px; residuals of images of different size are compared at this width."""
 SOURCE_REFIT = 102
 """Source of a motion that was fitted inside a mask, see :mod:`hybridvo.hypotheses.search`."""
-CLEAR_COHERENCE = 0.5
-"""Spatial correlation of the residuals above which even a motion that most of the image follows may
-be a compromise: 0.02 for independent noise, 0.25 to 0.4 for DIS flow of static scenes, above 0.6
-where a large moving object bends the flow (development seeds)."""
 CHANCE_COHERENCE = 0.05
-"""Correlation that independent noise reaches by chance."""
-CLEAR_BEND_PX = 0.15
-"""Coherent part of the residuals, px at a width of 1024, above which it may be one as well: noise
-hides slowly moving objects, and they bend the motion."""
+"""Spatial correlation of the residuals that independent noise reaches by chance."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,29 +155,23 @@ def generate(
     grid = coarse_grid(pair, weights, options.refine)
     if isinstance(grid, RelativePose):
         return grid
-    h, w, _ = grid.shape
-    small, sh, sw, _ = grid.pixels.samples(options.search.grid_pixels)
-    depth_scale = translation_scale(grid.samples, grid.count)
-    K, limits = grid.pixels.K, options.search
-    poses = np.zeros((limits.max_hypotheses, 3, 4))
-    facts = np.zeros((limits.max_hypotheses, search.FACTS))
-    before = grid.samples[kernels.W].copy()  # the search uses the weights up
     # of what the sensor sees: a mover may hold most of what has flow
     seen = np.count_nonzero(np.isfinite(_log_depth(pair.prev, grid)))
-    decisive = limits.unambiguous_ratio * seen / max(np.count_nonzero(grid.weight > 0), 1)
-    found = search.find_motions(
-        small, sh, sw, grid.samples, h, w, K, np.ascontiguousarray(starts[:, :3]),
-        options.refine.cutoff, decisive, limits.min_inlier_ratio,
-        limits.max_hypotheses, depth_scale, seed, poses, facts,
-    )  # fmt: skip
-    grid.samples[kernels.W] = before
-    if found == 0:
+    usable = max(int(np.count_nonzero(grid.weight > 0)), 1)
+    decisive = options.search.unambiguous_ratio * seen / usable
+    poses, facts, depth_scale = search.find_motions(
+        grid, np.ascontiguousarray(starts[:, :3]), options, decisive, seed
+    )
+    if len(poses) == 0:
         return RelativePose.failed(
             Reason.DEGENERATE_GEOMETRY, "the pixels do not determine any motion", "refine"
         )
-    clear = found == 1 and bool(facts[0, search.SHARE] >= decisive)
-    clear = clear and _is_rigid(grid, poses[0], facts[0], pair.prev.camera.width)
-    return HypothesisSet(pair, grid, depth_scale, poses[:found], facts[:found], not clear)
+    clear = (
+        len(poses) == 1
+        and bool(facts[0, search.SHARE] >= decisive)
+        and _is_rigid(grid, poses[0], facts[0], pair.prev.camera.width)
+    )
+    return HypothesisSet(pair, grid, depth_scale, poses, facts, not clear)
 
 
 def _is_rigid(grid: CoarseGrid, pose: np.ndarray, fact: np.ndarray, width: int) -> bool:

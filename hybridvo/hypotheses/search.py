@@ -12,7 +12,9 @@ import math
 
 import numpy as np
 
+from hybridvo.calibration import ASIDE, SETTLED_COHERENCE
 from hybridvo.compilation import njit
+from hybridvo.options import Options
 from hybridvo.refinement.coarse_fit import (
     DEPTH_NOISE_CAP,
     FLOW_NOISE_CAP,
@@ -24,6 +26,8 @@ from hybridvo.refinement.coarse_fit import (
     residual_scale,
     robust_weights,
     set_noise,
+    solve6,
+    translation_scale,
 )
 from hybridvo.refinement.kernels import (
     BUFFER_ROWS,
@@ -39,26 +43,21 @@ from hybridvo.refinement.kernels import (
     Z,
     new_work,
 )
+from hybridvo.refinement.pixels import CoarseGrid
 
 WINDOW_ROWS, WINDOW_COLUMNS = 3, 4
 MINIMAL_SAMPLES = 384
+"""Samples of three pixels for the first motion; a third of them for every further one."""
 MINIMAL_STEPS = 3
 REFINED = 4
-NEAR_START = 1.5
-"""First scale, px, of the robust kernel about a pose that was handed in."""
-COHERENT = 0.35
-"""Coherence of the residuals above which a motion that holds the image is not beyond doubt; depth
-noise that is half correlated in space stays below 0.25."""
-
+"""Candidates of a round that are refined."""
+WIDE_PX, NEAR_PX = 64.0, 1.5
+"""First scale of the robust kernel: at most, and about a pose that was handed in."""
+SAME_RAD = 2e-4
+"""Entries of two poses up to which they are one motion; translations in typical depths."""
 SETTLED = 0.5
 """Share of the image above which a motion without coherent residuals is taken as it is: no other
 can hold as much, and further ones are looked for in what it leaves."""
-
-ASIDE = 0.8
-"""Factor on the kernel's cutoff within which pixels are set aside with a motion. Wider, a motion
-takes with it much of another that looks like it in places (measured under DIS flow: at 2 the world
-is found in 80 % of the heavy pairs, from 0.5 to 1 in 84 %)."""
-
 FIRMLY = np.float32(2.5)
 """Factor on the robust weight that is set aside: nothing is left within 1.5 standard deviations, or
 the same motion would be found again."""
@@ -69,15 +68,280 @@ FACTS = 5
 SOURCE_WINDOW, SOURCE_MINIMAL = 100, 101
 
 
+def find_motions(
+    grid: CoarseGrid, starts: np.ndarray, options: Options, decisive: float, seed: int
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """All strong motions, in the order of their strength.
+
+    The first is sought from the handed-in starts; where these find none that is settled, and for
+    every further one, windows and minimal samples compete as well.
+
+    Args:
+        grid: pixels on which motions are refined.
+        starts: (S, 3, 4) poses T_curr_prev, the first one seen from afar only.
+        options: ``search`` and ``refine`` are read.
+        decisive: share of the usable pixels above which the first motion stands alone.
+        seed: of the minimal samples.
+
+    Returns:
+        Poses (N, 3, 4), their facts (N, FACTS), and 1 / typical depth, by which translations are
+        compared with rotations.
+    """
+    limits, cutoff, K = options.search, options.refine.cutoff, grid.pixels.K
+    h, w, _ = grid.shape
+    n, coarse, work = h * w, grid.samples.copy(), new_work()
+    small, sh, sw, _ = grid.pixels.samples(limits.grid_pixels)
+    depth_scale = translation_scale(grid.samples, n)
+    rng = np.random.default_rng(seed)
+
+    def search_round(starts: np.ndarray, samples: int) -> tuple[np.ndarray, np.ndarray] | None:
+        best = candidates(small, sh, sw, K, starts, samples, rng, depth_scale, work)
+        pose, facts = np.zeros((3, 4)), np.zeros(FACTS)
+        ok = refine_best(small, sh * sw, coarse, n, K, best, cutoff, pose, facts, work)
+        return (pose, facts) if ok else None
+
+    poses: list[np.ndarray] = []
+    table: list[np.ndarray] = []
+    total = left = float(coarse[W, :n].sum(dtype=np.float64))
+    while len(poses) < limits.max_hypotheses and left > limits.min_inlier_ratio * total:
+        if poses:
+            found = search_round(starts[:0], MINIMAL_SAMPLES // 3)
+        else:
+            found = search_round(starts, 0)
+            if found is None or not _is_settled(coarse, h, w, K, *found):
+                found = search_round(starts, MINIMAL_SAMPLES)
+        if found is None:
+            break
+        pose, facts = found
+        facts[SHARE] *= left / total
+        if poses and facts[SHARE] < limits.min_inlier_ratio:
+            break
+        poses.append(pose)
+        table.append(facts)
+        if len(poses) == 1 and facts[SHARE] >= decisive:
+            break
+        for samples, count in ((coarse, n), (small, sh * sw)):
+            set_aside(samples, count, pose, K, facts[FLOW_NOISE], facts[DEPTH_NOISE], cutoff, work)
+        left = float(coarse[W, :n].sum(dtype=np.float64))
+    return np.reshape(poses, (-1, 3, 4)), np.reshape(table, (-1, FACTS)), depth_scale
+
+
+def _is_settled(
+    samples: np.ndarray, h: int, w: int, K: np.ndarray, pose: np.ndarray, facts: np.ndarray
+) -> bool:
+    """Whether no other motion can hold as much of the image, and this one is no compromise."""
+    if facts[SHARE] < SETTLED:
+        return False
+    noise = facts[FLOW_NOISE], facts[DEPTH_NOISE]
+    return bool(residual_coherence(samples, h, w, pose, K, *noise) < SETTLED_COHERENCE)
+
+
 @njit(error_model="numpy", cache=True, nogil=True)
-def next_random(state):
-    """xorshift64*: a float in [0, 1)."""
-    x = state[0]
-    x ^= x >> np.uint64(12)
-    x ^= x << np.uint64(25)
-    x ^= x >> np.uint64(27)
-    state[0] = x
-    return np.float64((x * np.uint64(2685821657736338717)) >> np.uint64(11)) / 9007199254740992.0
+def candidates(small, h, w, K, starts, samples, rng, similar, work):
+    """The best distinct candidates: (poses, scores, sources), best first.
+
+    With ``samples`` minimal samples, and windows, they compete with the ``starts`` (S, 3, 4).
+    """
+    n = h * w
+    best = (np.zeros((REFINED, 3, 4)), np.zeros(REFINED), np.zeros(REFINED))
+    pose = np.empty((3, 4))
+    for s in range(starts.shape[0]):
+        # from afar; and, for what the caller hands in, from nearby: where most of the image moves
+        # a wide kernel would leave even the right motion
+        for near in range(2 if s > 0 else 1):
+            pose[:, :] = starts[s]
+            scale = NEAR_PX
+            if near == 0:
+                scale = min(WIDE_PX, max(1.0, 1.5 * residual_scale(small, n, pose, K)))
+            anneal(small, n, K, scale, 0.7, 0.4, 2, pose, work)
+            keep_best(pose, score_pose(small, n, pose, K), s, best, similar)
+    if samples == 0:
+        return best
+    few = np.zeros((BUFFER_ROWS, n + 1), np.float32)
+    rows = min(h, max(3, (2 * h) // (WINDOW_ROWS + 1)))
+    columns = min(w, max(3, (2 * w) // (WINDOW_COLUMNS + 1)))
+    for i in range(WINDOW_ROWS):
+        for j in range(WINDOW_COLUMNS):
+            r = i * (h - rows) // (WINDOW_ROWS - 1)
+            c = j * (w - columns) // (WINDOW_COLUMNS - 1)
+            if fit_window(small, w, r, r + rows, c, c + columns, K, few, pose, work):
+                keep_best(pose, score_pose(small, n, pose, K), SOURCE_WINDOW, best, similar)
+    pick = np.zeros(3, np.int64)
+    for s in range(samples):
+        drawn = draw_three(small, h, w, s % 3 != 0, rng, pick)
+        if drawn and fit_minimal(small, pick, pose, K):
+            keep_best(pose, score_pose(small, n, pose, K), SOURCE_MINIMAL, best, similar)
+    return best
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def refine_best(small, ns, coarse, n, K, best, cutoff, pose, facts, work):
+    """Refine the candidates of a round on ``small``, the one that then scores best on ``coarse``.
+
+    Sets ``pose`` and ``facts``; returns whether there was any.
+    """
+    poses, scores, sources = best
+    candidate = np.empty((3, 4))
+    highest = -1.0
+    steps = 0
+    for s in range(REFINED):
+        if scores[s] <= 0:
+            break
+        candidate[:, :] = poses[s]
+        steps += anneal(small, ns, K, 1.5, 0.7, 0.4, 3, candidate, work)
+        score = score_pose(coarse, n, candidate, K)
+        if score > highest:
+            highest = score
+            pose[:, :] = candidate
+            facts[SOURCE] = sources[s]
+    if highest <= 0:
+        return False
+    steps += anneal(coarse, n, K, 0.7, 0.5, 0.4, 3, pose, work)
+    candidate[:, :] = pose
+    sf, sd, share, more, _, _ = reestimate(
+        coarse, n, K, 0.5, 0.01, FLOW_NOISE_CAP, DEPTH_NOISE_CAP, cutoff, 2, 4, NOISE_PIXELS,
+        candidate, work,
+    )  # fmt: skip
+    if score_pose(coarse, n, candidate, K) > 0.95 * score_pose(coarse, n, pose, K):
+        pose[:, :] = candidate
+    facts[SHARE] = share
+    facts[FLOW_NOISE] = sf
+    facts[DEPTH_NOISE] = sd
+    facts[ITERATIONS] = steps + more
+    return True
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def set_identity(pose):
+    """``pose`` (3, 4) = [I | 0]."""
+    pose[:, :] = 0.0
+    for i in range(3):
+        pose[i, i] = 1.0
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def is_bounded(pose):
+    """Whether every entry is finite and of a size that later sums survive."""
+    for i in range(3):
+        for j in range(4):
+            if not abs(pose[i, j]) < MAX_VALUE:
+                return False
+    return True
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def fit_minimal(samples, pick, pose, K):
+    """Three pixels, six equations: Newton steps from the identity, in place; False if it fails."""
+    rows = np.empty((6, 7))
+    sums = np.empty(27)
+    delta = np.empty(6)
+    other = np.empty((3, 4))
+    set_identity(pose)
+    for _ in range(MINIMAL_STEPS):
+        for m in range(3):
+            k = pick[m]
+            x, y, z = samples[XN, k], samples[YN, k], samples[Z, k]
+            X = z * (pose[0, 0] * x + pose[0, 1] * y + pose[0, 2]) + pose[0, 3]
+            Y = z * (pose[1, 0] * x + pose[1, 1] * y + pose[1, 2]) + pose[1, 3]
+            Zc = z * (pose[2, 0] * x + pose[2, 1] * y + pose[2, 2]) + pose[2, 3]
+            if not Zc > 1e-6:
+                return False
+            i = 1.0 / Zc
+            a = X * i
+            b = Y * i
+            u = (samples[MU, k] - K[2]) / K[0] - a
+            v = (samples[MV, k] - K[3]) / K[1] - b
+            rows[2 * m] = (i, 0.0, -a * i, -a * b, 1.0 + a * a, -b, u)
+            rows[2 * m + 1] = (0.0, i, -b * i, -(1.0 + b * b), a * b, a, v)
+        q = 0
+        for i in range(6):
+            for j in range(i, 7):
+                total = 0.0
+                for r in range(6):
+                    total += rows[r, i] * rows[r, j]
+                if j == 6:
+                    sums[21 + i] = total
+                else:
+                    sums[q] = total
+                    q += 1
+        if not solve6(sums, 0.0, delta):
+            return False
+        other[:, :] = pose
+        left_update(delta, other, pose)
+    return is_bounded(pose)
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def fit_window(samples, w, r0, r1, c0, c1, K, few, pose, work):
+    """Robust dense fit of the usable pixels of a window, from the identity, in place."""
+    m = 0
+    total = 0.0
+    for r in range(r0, r1):
+        for k in range(r * w + c0, r * w + c1):
+            if samples[W, k] > 0.05:
+                for q in range(BUFFER_ROWS):
+                    few[q, m] = samples[q, k]
+                total += samples[W, k]
+                m += 1
+    if m < 20 or total < 12.0:
+        return False
+    set_identity(pose)
+    scale = min(WIDE_PX, max(1.0, residual_scale(few, m, pose, K)))
+    anneal(few, m, K, scale, 0.7, 0.4, 2, pose, work)
+    return is_bounded(pose)
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def draw_three(samples, h, w, local, rng, pick):
+    """Draw three distinct usable pixels, near by if ``local``; False where none is found."""
+    m = 0
+    for _ in range(60):
+        k = int(rng.random() * h * w)
+        if m > 0 and local:
+            row = pick[0] // w + int((rng.random() - 0.5) * 0.5 * h)
+            column = pick[0] % w + int((rng.random() - 0.5) * 0.4 * w)
+            if row < 0 or row >= h or column < 0 or column >= w:
+                continue
+            k = row * w + column
+        if samples[W, k] < rng.random() or k in pick[:m]:
+            continue
+        pick[m] = k
+        m += 1
+        if m == 3:
+            return True
+    return False
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def keep_best(pose, score, source, best, similar):
+    """Insert into the list of the best distinct candidates, best first."""
+    poses, scores, sources = best
+    # a candidate that scores alike and stands close by is the same motion
+    place = len(scores)
+    for k in range(len(scores)):
+        if scores[k] <= 0:
+            break
+        gap = 0.0
+        for i in range(3):
+            for j in range(4):
+                unit = similar if j == 3 else 1.0
+                gap = max(gap, unit * abs(poses[k, i, j] - pose[i, j]))
+        if gap < SAME_RAD:
+            place = k
+            break
+    if place == len(scores):
+        place -= 1
+    if score <= scores[place]:
+        return
+    # whatever stood at ``place`` goes; what is worse than the new one moves down
+    while place > 0 and score > scores[place - 1]:
+        scores[place] = scores[place - 1]
+        sources[place] = sources[place - 1]
+        poses[place] = poses[place - 1]
+        place -= 1
+    scores[place] = score
+    sources[place] = source
+    poses[place] = pose
 
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
@@ -118,255 +382,14 @@ def score_pose(samples, n, pose, K):
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
-def solve_square(A, x):
-    """Solve the 6x6 system A y = x in place by elimination with pivoting; False if singular."""
-    for i in range(6):
-        best = i
-        for r in range(i + 1, 6):
-            if abs(A[r, i]) > abs(A[best, i]):
-                best = r
-        if not abs(A[best, i]) > 1e-9:
-            return False
-        if best != i:
-            for c in range(i, 6):
-                A[i, c], A[best, c] = A[best, c], A[i, c]
-            x[i], x[best] = x[best], x[i]
-        for r in range(i + 1, 6):
-            factor = A[r, i] / A[i, i]
-            for c in range(i + 1, 6):
-                A[r, c] -= factor * A[i, c]
-            x[r] -= factor * x[i]
-    for i in range(5, -1, -1):
-        for c in range(i + 1, 6):
-            x[i] -= A[i, c] * x[c]
-        x[i] /= A[i, i]
-        if not abs(x[i]) < 1e4:
-            return False
-    return True
-
-
-@njit(error_model="numpy", cache=True, nogil=True)
-def fit_minimal(samples, pick, K, A, x, other, pose):
-    """Three pixels, six equations: Newton steps from the identity, in place; False if it fails."""
-    pose[:, :] = 0.0
-    for i in range(3):
-        pose[i, i] = 1.0
-    for _ in range(MINIMAL_STEPS):
-        for m in range(3):
-            k = pick[m]
-            px, py, pz = samples[XN, k], samples[YN, k], samples[Z, k]
-            X = pz * (pose[0, 0] * px + pose[0, 1] * py + pose[0, 2]) + pose[0, 3]
-            Y = pz * (pose[1, 0] * px + pose[1, 1] * py + pose[1, 2]) + pose[1, 3]
-            Zc = pz * (pose[2, 0] * px + pose[2, 1] * py + pose[2, 2]) + pose[2, 3]
-            if not Zc > 1e-6:
-                return False
-            i = 1.0 / Zc
-            a = X * i
-            b = Y * i
-            # rows in units of the image's radians, translation in units of the depth
-            u = 2 * m
-            v = u + 1
-            A[u, 0], A[u, 1], A[u, 2] = i, 0.0, -a * i
-            A[u, 3], A[u, 4], A[u, 5] = -a * b, 1.0 + a * a, -b
-            A[v, 0], A[v, 1], A[v, 2] = 0.0, i, -b * i
-            A[v, 3], A[v, 4], A[v, 5] = -(1.0 + b * b), a * b, a
-            x[u] = (samples[MU, k] - K[2]) / K[0] - a
-            x[v] = (samples[MV, k] - K[3]) / K[1] - b
-        if not solve_square(A, x):
-            return False
-        other[:, :] = pose
-        left_update(x, other, pose)
-    return True
-
-
-@njit(error_model="numpy", cache=True, nogil=True)
-def draw_three(samples, n, h, w, local, state, pick):
-    """Draw three distinct usable pixels, near each other if ``local``; False where none is left."""
-    tries = 0
-    m = 0
-    while m < 3:
-        tries += 1
-        if tries > 60:
-            return False
-        if m == 0 or not local:
-            k = int(next_random(state) * n)
-        else:
-            row = pick[0] // w + int((next_random(state) - 0.5) * 0.5 * h)
-            column = pick[0] % w + int((next_random(state) - 0.5) * 0.4 * w)
-            if row < 0 or row >= h or column < 0 or column >= w:
-                continue
-            k = row * w + column
-        if k >= n or samples[W, k] < next_random(state):
-            continue
-        if (m > 0 and k == pick[0]) or (m > 1 and k == pick[1]):
-            continue
-        pick[m] = k
-        m += 1
-    return True
-
-
-@njit(error_model="numpy", cache=True, nogil=True)
-def fit_window(samples, h, w, r0, r1, c0, c1, K, buffer, pose, work):
-    """Robust dense fit of the usable pixels of a window, from the identity, in place."""
-    m = 0
-    total = 0.0
-    for r in range(r0, r1):
-        for c in range(c0, c1):
-            k = r * w + c
-            if samples[W, k] > 0.05:
-                for q in range(BUFFER_ROWS):
-                    buffer[q, m] = samples[q, k]
-                total += samples[W, k]
-                m += 1
-    if m < 20 or total < 12.0:
-        return False
-    pose[:, :] = 0.0
-    for i in range(3):
-        pose[i, i] = 1.0
-    scale = min(64.0, max(1.0, residual_scale(buffer, m, pose, K)))
-    anneal(buffer, m, K, scale, 0.7, 0.4, 2, pose, work)
-    for i in range(3):
-        for j in range(4):
-            if not abs(pose[i, j]) < MAX_VALUE:
-                return False
-    return True
-
-
-@njit(error_model="numpy", cache=True, nogil=True)
-def keep_best(pose, score, source, poses, scores, sources, similar):
-    """Insert into the list of the best distinct candidates, best first."""
-    count = scores.shape[0]
-    # a candidate that scores alike and stands close by is the same motion
-    for k in range(count):
-        if scores[k] <= 0:
-            break
-        gap = 0.0
-        for i in range(3):
-            for j in range(3):
-                gap = max(gap, abs(poses[k, i, j] - pose[i, j]))
-            gap = max(gap, similar * abs(poses[k, i, 3] - pose[i, 3]))
-        if gap < 2e-4:
-            if score <= scores[k]:
-                return
-            for q in range(k, count - 1):
-                scores[q] = scores[q + 1]
-                sources[q] = sources[q + 1]
-                poses[q] = poses[q + 1]
-            scores[count - 1] = 0.0
-            break
-    at = count
-    while at > 0 and score > scores[at - 1]:
-        at -= 1
-    if at == count:
-        return
-    for q in range(count - 1, at, -1):
-        scores[q] = scores[q - 1]
-        sources[q] = sources[q - 1]
-        poses[q] = poses[q - 1]
-    scores[at] = score
-    sources[at] = source
-    poses[at] = pose
-
-
-@njit(error_model="numpy", cache=True, nogil=True)
-def search_round(
-    small, sh, sw, coarse, n, K, starts, wide, minimal, cutoff, similar, state, pose, facts,
-    work,
-):  # fmt: skip
-    """One motion among the pixels that are left (their weights in row W of both sample sets).
-
-    ``small`` (sh x sw) serves starts and scores, ``coarse`` (n pixels) the refinement. ``starts``
-    (S, 3, 4) are handed in; with ``wide`` windows and ``minimal`` minimal samples compete. Sets
-    ``pose`` and ``facts``; returns whether anything was found.
-    """
-    ns = sh * sw
-    poses = np.zeros((REFINED, 3, 4))
-    scores = np.zeros(REFINED)
-    sources = np.zeros(REFINED)
-    candidate = np.empty((3, 4))
-    for s in range(starts.shape[0]):
-        # from afar; and, for what the caller hands in, from nearby: where most of the image moves
-        # a wide kernel would leave even the right motion
-        for near in range(2 if s > 0 else 1):
-            candidate[:, :] = starts[s]
-            scale = NEAR_START
-            if near == 0:
-                scale = min(64.0, max(1.0, 1.5 * residual_scale(small, ns, candidate, K)))
-            anneal(small, ns, K, scale, 0.7, 0.4, 2, candidate, work)
-            score = score_pose(small, ns, candidate, K)
-            keep_best(candidate, score, s, poses, scores, sources, similar)
-    if wide:
-        buffer = np.empty((BUFFER_ROWS, ns + 1), np.float32)
-        height = min(sh, max(3, (2 * sh) // (WINDOW_ROWS + 1)))
-        width = min(sw, max(3, (2 * sw) // (WINDOW_COLUMNS + 1)))
-        for i in range(WINDOW_ROWS):
-            for j in range(WINDOW_COLUMNS):
-                r0 = i * (sh - height) // (WINDOW_ROWS - 1)
-                c0 = j * (sw - width) // (WINDOW_COLUMNS - 1)
-                if fit_window(
-                    small, sh, sw, r0, min(sh, r0 + height), c0, min(sw, c0 + width), K, buffer,
-                    candidate, work,
-                ):  # fmt: skip
-                    score = score_pose(small, ns, candidate, K)
-                    keep_best(candidate, score, SOURCE_WINDOW, poses, scores, sources, similar)
-        A = np.empty((6, 6))
-        x = np.empty(6)
-        other = np.empty((3, 4))
-        pick = np.zeros(3, np.int64)
-        for s in range(minimal):
-            if not draw_three(small, ns, sh, sw, s % 3 != 0, state, pick):
-                break
-            if fit_minimal(small, pick, K, A, x, other, candidate):
-                score = score_pose(small, ns, candidate, K)
-                keep_best(candidate, score, SOURCE_MINIMAL, poses, scores, sources, similar)
-    best = -1.0
-    steps = 0
-    for s in range(REFINED):
-        if scores[s] <= 0:
-            break
-        candidate[:, :] = poses[s]
-        steps += anneal(small, ns, K, 1.5, 0.7, 0.4, 3, candidate, work)
-        score = score_pose(coarse, n, candidate, K)
-        if score > best:
-            best = score
-            pose[:, :] = candidate
-            facts[SOURCE] = sources[s]
-    if best <= 0:
-        return False
-    steps += anneal(coarse, n, K, 0.7, 0.5, 0.4, 3, pose, work)
-    candidate[:, :] = pose
-    sf, sd, share, more, _, _ = reestimate(
-        coarse,
-        n,
-        K,
-        0.5,
-        0.01,
-        FLOW_NOISE_CAP,
-        DEPTH_NOISE_CAP,
-        cutoff,
-        2,
-        4,
-        NOISE_PIXELS,
-        candidate,
-        work,
-    )
-    if score_pose(coarse, n, candidate, K) > 0.95 * score_pose(coarse, n, pose, K):
-        pose[:, :] = candidate
-    facts[SHARE] = share
-    facts[FLOW_NOISE] = sf
-    facts[DEPTH_NOISE] = sd
-    facts[ITERATIONS] = steps + more
-    return True
-
-
-@njit(error_model="numpy", cache=True, nogil=True)
-def set_aside(samples, n, pose, K, sf, sd, cutoff, work, scratch):
+def set_aside(samples, n, pose, K, sf, sd, cutoff, work):
     """Scale the weights of the pixels that follow ``pose`` down to what it leaves unexplained."""
     noise = np.empty(3, np.float32)
+    follows = np.empty(n, np.float32)
     set_noise(max(sf, 0.05), sd, ASIDE * cutoff, noise)
-    robust_weights(samples, n, pose, K, noise, work, scratch)
+    robust_weights(samples, n, pose, K, noise, work, follows)
     for k in range(n):
-        samples[W, k] *= max(np.float32(0.0), np.float32(1.0) - FIRMLY * scratch[k])
+        samples[W, k] *= max(np.float32(0.0), np.float32(1.0) - FIRMLY * follows[k])
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
@@ -410,83 +433,3 @@ def residual_coherence(samples, h, w, pose, K, sf, sd):
     if blocks < 4 or pixels <= 0:
         return 1.0
     return between / pixels
-
-
-@njit(error_model="numpy", cache=True, nogil=True)
-def find_motions(
-    small,
-    sh,
-    sw,
-    coarse,
-    h,
-    w,
-    K,
-    starts,
-    cutoff,
-    decisive,
-    least,
-    most,
-    similar,
-    seed,
-    poses,
-    facts,
-):  # fmt: skip
-    """All strong motions, in the order of their strength; returns their number.
-
-    ``decisive``: share of the usable pixels above which the first motion stands alone. ``least``:
-    smallest share of a further motion. ``most``: largest number of motions. ``poses`` (most, 3, 4)
-    and ``facts`` (most, FACTS) receive them. The weights in row W of ``small`` and ``coarse`` are
-    used up.
-    """
-    n = h * w
-    work = new_work()
-    state = np.empty(1, np.uint64)
-    state[0] = np.uint64(seed) * np.uint64(2) + np.uint64(88172645463325253)
-    all_weight = 0.0
-    for k in range(n):
-        all_weight += coarse[W, k]
-    if all_weight <= 0:
-        return 0
-    scratch = np.empty(max(n, sh * sw), np.float32)
-    none = np.empty((0, 3, 4))
-    found = 0
-    first_wide = False
-    while found < most:
-        left = 0.0
-        for k in range(n):
-            left += coarse[W, k]
-        if found > 0 and left < least * all_weight:
-            break
-        pose = poses[found]
-        fact = facts[found]
-        ok = search_round(
-            small, sh, sw, coarse, n, K, starts if found == 0 else none,
-            found > 0 or first_wide,
-            MINIMAL_SAMPLES if found == 0 else MINIMAL_SAMPLES // 3,
-            cutoff, similar, state, pose, fact, work,
-        )  # fmt: skip
-        if not ok:
-            break
-        fact[SHARE] *= left / all_weight
-        clear = fact[SHARE] >= decisive and found == 0
-        if found == 0 and not first_wide:
-            settled = fact[SHARE] >= SETTLED
-            if settled:
-                coherence = residual_coherence(
-                    coarse, h, w, pose, K, fact[FLOW_NOISE], fact[DEPTH_NOISE]
-                )
-                settled = coherence < COHERENT
-            if not settled:
-                # the handed-in starts found no motion for sure: every start competes for the first
-                first_wide = True
-                continue
-        if found > 0 and fact[SHARE] < least:
-            break
-        found += 1
-        if found == 1 and clear:
-            break
-        set_aside(coarse, n, pose, K, fact[FLOW_NOISE], fact[DEPTH_NOISE], cutoff, work, scratch)
-        set_aside(
-            small, sh * sw, pose, K, fact[FLOW_NOISE], fact[DEPTH_NOISE], cutoff, work, scratch
-        )
-    return found

@@ -41,8 +41,6 @@ OTHER_PX = 3.0
 """Mean distance, px at a width of 1024, above which two motions are not the same."""
 NO_RIVAL = 8.0
 """Gap of the scores where there is no other motion, and the largest that counts."""
-SMALL_AREA = 0.02
-"""Share of the image that counts as nothing in a ratio of areas."""
 MIN_COVERAGE = 0.02
 """Share of the usable pixels' weight that a mask must leave for a fit inside it."""
 SOURCES = {
@@ -77,14 +75,12 @@ class Scores:
         best: (R,) int64, the candidates worth a fit inside their mask.
         masks: (R, h, w) for each of them the probability of every pixel of being static.
         confidence: probability, 0 to 1, that the candidate with the largest score is right.
-        areas: (N, 2) share of the image that each candidate explains, by its flow and by its look.
     """
 
     score: np.ndarray
     best: np.ndarray
     masks: np.ndarray
     confidence: float
-    areas: np.ndarray
 
 
 class Scorer(Protocol):
@@ -260,21 +256,14 @@ class MaskSelector:
 
 
 def evidence_of(found: HypothesisSet, candidates: Candidates, scores: Scores) -> np.ndarray:
-    """(6,) What speaks for the best candidate, and for the best motion that is another one.
-
-    The logit of the scorer's confidence, the gap of the scores, the logarithms of the ratios of the
-    areas that both explain (by flow, by look), and the areas that the best one explains.
-    """
+    """(2,) The logit of a scorer's confidence, and the gap to the best score of another motion."""
     best = int(np.argmax(scores.score))
     apart = _distances(found, candidates.poses, best) > OTHER_PX
-    gap, rival = NO_RIVAL, np.zeros(2)
+    gap = NO_RIVAL
     if apart.any():
         gap = min(NO_RIVAL, float(scores.score[best] - scores.score[apart].max()))
-        rival = scores.areas[apart].max(axis=0)
     confidence = float(np.clip(np.nan_to_num(scores.confidence), 1e-3, 1 - 1e-3))
-    own = scores.areas[best]
-    ratio = np.log((own + SMALL_AREA) / (rival + SMALL_AREA))
-    return np.array([np.log(confidence / (1 - confidence)), gap, *ratio, *own])
+    return np.array([np.log(confidence / (1 - confidence)), gap])
 
 
 def _distances(found: HypothesisSet, poses: np.ndarray, of: int) -> np.ndarray:

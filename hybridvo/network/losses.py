@@ -125,16 +125,17 @@ def reconstruct(
     """
     valid = torch.isfinite(depth_prev) & (depth_prev > 0)
     depth = torch.where(valid, depth_prev, 1.0)
-    size = depth.shape[1:]
+    height, width = depth.shape[1:]
     with torch.autocast(depth.device.type, enabled=False):
-        points = rays(*size, K_prev) * depth[..., None]
+        points = rays(height, width, K_prev) * depth[..., None]
         moved = move(T_curr_prev, points.flatten(1, 2).transpose(1, 2))
-        z = torch.where(valid, moved[:, 2].unflatten(1, size), 1.0)
+        z = torch.where(valid, moved[:, 2].unflatten(1, (height, width)), 1.0)
         front = z >= MIN_DEPTH
         # Replaced before the division: a masked quotient would still give NaN gradients.
         safe = torch.where(front, z, 1.0).flatten(1)[:, None]
-        pixels = project(torch.cat([moved[:, :2], safe], dim=1), K_curr).unflatten(2, size)
-    return pixels - pixel_grid(*size, depth).permute(2, 0, 1), z, valid & front
+        pixels = project(torch.cat([moved[:, :2], safe], dim=1), K_curr)
+    grid = pixel_grid(height, width, depth).permute(2, 0, 1)
+    return pixels.unflatten(2, (height, width)) - grid, z, valid & front
 
 
 def total_loss(

@@ -16,11 +16,9 @@ import torch
 import torch.nn.functional as F
 
 from hybridvo.hypotheses import search
-from hybridvo.hypotheses.generate import GridMaps
+from hybridvo.hypotheses.generate import REFERENCE_WIDTH, GridMaps
 from hybridvo.results import MotionPrior
 
-REFERENCE_WIDTH = 1024.0
-"""px, width at which absolute residuals and noises are compared between images."""
 MIN_FLOW_NOISE = 0.01
 SUPPORT_CUTOFF_SQUARED = 9.0
 DEPTH_FLOOR = 0.003
@@ -198,22 +196,18 @@ def candidate_channels(
     wide = REFERENCE_WIDTH / inputs.image_width[own]
     size = torch.sqrt(ru * ru + rv * rv) * wide[:, None, None]
     size = torch.where(ok, size, torch.zeros_like(size))
-    second = inputs.log_depth_curr[own]
-    known = ok & torch.isfinite(second)
-    rz = torch.where(known, second, torch.zeros_like(z)) - torch.log(
-        torch.where(known, c, torch.ones_like(c))
-    )
-    ez = rz / torch.sqrt(2.0 * vd + DEPTH_FLOOR**2)
+    known = ok & torch.isfinite(inputs.log_depth_curr[own])
+    rz = torch.where(known, inputs.log_depth_curr[own] - torch.log(c.clamp(min=1e-6)), 0.0)
     texture, agreement, gap, met = _look(inputs, fx * a + cx, fy * b + cy, c, front)
     evidence = torch.stack([support, agreement], 1)
     rivals = _rivals(inputs, *((inputs, evidence) if first is None else first))
-    es = gap / torch.sqrt(2.0 * vd + DEPTH_FLOOR**2)
+    noise = torch.sqrt(2.0 * vd + DEPTH_FLOOR**2)
     by_flow = torch.stack(
         [
             0.5 * _squash(eu),
             0.5 * _squash(ev),
             0.3 * torch.log1p(size),
-            0.5 * _squash(ez),
+            0.5 * _squash(rz / noise),
             known.to(z.dtype),
             0.3 * _squash(50.0 * rz),
             support,
@@ -222,7 +216,15 @@ def candidate_channels(
         dim=1,
     )
     by_images = torch.stack(
-        [texture, agreement, rivals[:, 1], 0.5 * _squash(es), met, 0.3 * _squash(50.0 * gap)], 1
+        [
+            texture,
+            agreement,
+            rivals[:, 1],
+            0.5 * _squash(gap / noise),
+            met,
+            0.3 * _squash(50.0 * gap),
+        ],
+        1,
     )
     channels = torch.cat([by_flow * usable[:, None], by_images], 1)
     # areas of the whole image, not of what has flow
@@ -251,15 +253,10 @@ def _look(
     own = inputs.owner
     planes = inputs.planes_curr
     height, width = planes.shape[2:]
-    stride = inputs.stride[own, None, None]
+    stride = inputs.stride[own, None, None, None]
     first = torch.div(stride, 2, rounding_mode="floor")
-    where = torch.stack(
-        [
-            2 * ((u - first) / stride + 0.5) / width - 1,
-            2 * ((v - first) / stride + 0.5) / height - 1,
-        ],
-        dim=-1,
-    )
+    cell = (torch.stack([u, v], dim=-1) - first) / stride
+    where = 2 * (cell + 0.5) / cell.new_tensor([width, height]) - 1
     there = front & inputs.seen[own] & (where.abs() < 1).all(-1)
     where = torch.where(there[..., None], where, torch.zeros_like(where))
     warped = F.grid_sample(planes[own], where, align_corners=False, padding_mode="border")
@@ -276,9 +273,7 @@ def _look(
     texture = var_p / (var_p + PLAIN) * there_f * (count > 0.3)
     agreement = texture * (mean[:, 4] - mean[:, 0] * mean[:, 1]) / (spread + 0.5 * PLAIN)
     known = there & (warped[:, 2] > 0.99)
-    gap = torch.where(known, warped[:, 1], torch.zeros_like(z)) - torch.log(
-        torch.where(known, z, torch.ones_like(z))
-    )
+    gap = torch.where(known, warped[:, 1] - torch.log(z.clamp(min=1e-6)), 0.0)
     return texture, agreement, gap, known.to(z.dtype)
 
 

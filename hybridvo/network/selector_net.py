@@ -304,13 +304,11 @@ class NetworkLook:
             drawn = [self._mask(int(k)) for k in best]
             owner = torch.zeros(len(score), dtype=torch.int64, device=score.device)
             confidence = torch.sigmoid(self.network.confidence(score, hidden, owner, 1))
-            evidence = [f.evidence.clamp(min=0).mean((2, 3)) for _, f in self.seen]
         return Scores(
             score.double().cpu().numpy(),
             best.cpu().numpy(),
             torch.stack(drawn).cpu().numpy() if drawn else np.zeros((0, 1, 1), np.float32),
             float(confidence),
-            torch.cat(evidence).double().cpu().numpy(),
         )
 
     def _encode(self, candidates: Candidates, part: slice) -> None:

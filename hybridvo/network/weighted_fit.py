@@ -13,19 +13,14 @@ import torch.nn.functional as F
 from hybridvo.errors import InputError
 from hybridvo.network.inputs import NetworkInputs
 from hybridvo.network.selection import SHARPNESS, NetworkOutput, select_motion
+from hybridvo.refinement.torch_factors import solve_small
 from hybridvo.results import PixelwisePrediction
-from hybridvo.torch_geometry import left_update, pp, se3
+from hybridvo.torch_geometry import left_update, pp, projection_rows, se3, weighted_median
 
 CUTOFF = 1.5
 """Scale of the robust kernel in weighted medians of the residual."""
 MIN_SCALE = 1e-4
 """Least scale of the kernel in units of the focal length: 0.1 px at a focal length of 1000."""
-MEDIAN_STRIDE = 3
-"""Every third pixel is enough for a median; three divides no usual width: all columns count."""
-MIN_WEIGHT = 1e-12
-"""Sum of all weights after the kernel below which there is nothing to fit."""
-DAMPING = 1e-6
-"""Part of the diagonal of the normal equations, so that a flat direction stays solvable."""
 MIN_DEPTH_RATIO = 1e-2
 """Depth over depth before below which a moved point counts as behind the camera."""
 MAX_STEP = 0.5
@@ -154,33 +149,21 @@ def _step(
     front = moved[:, 2] > MIN_DEPTH_RATIO
     z = torch.where(front, moved[:, 2], 1.0)
     x, y = moved[:, 0] / z, moved[:, 1] / z
-    d, zero = inverse / (z * unit), torch.zeros_like(x)
-    rows_x = [d, zero, -x * d, -x * y, 1 + x * x, -y]
-    rows_y = [zero, d, -y * d, -1 - y * y, x * y, x]
-    J = torch.cat([torch.stack(rows_x, dim=1), torch.stack(rows_y, dim=1)], dim=2)  # (B, 6, 2 N)
+    J = torch.cat(projection_rows(x, y, inverse / (z * unit)), dim=2)  # (B, 6, 2 N)
     residual = target - torch.stack([x, y], dim=1)
     length2 = residual.square().sum(dim=1)
-    scale2 = _weighted_median(length2, torch.where(front, weights, zero).detach())
+    seen = torch.where(front, weights.detach(), 0.0)
+    scale2 = weighted_median(length2[:, ::3], seen[:, ::3], 0.0)[:, None]
     kernel2 = (CUTOFF**2 * scale2).clamp(min=MIN_SCALE**2)
     factor = kernel2 / (kernel2 + length2)
-    factor = torch.where(front, factor.sqrt() if attached else factor.square(), zero)
-    g = weights * factor
+    g = weights * torch.where(front, factor.sqrt() if attached else factor.square(), 0.0)
     total = g.detach().sum(dim=1, keepdim=True)
-    enough = (total > MIN_WEIGHT) & torch.isfinite(total)
+    enough = (total > 1e-12) & torch.isfinite(total)
     # without weight there is no step and no gradient
-    g = torch.where(enough, g / torch.where(enough, total, 1.0), zero)
+    g = torch.where(enough, g / torch.where(enough, total, 1.0), 0.0)
     weighted = J * g.repeat(1, 2)[:, None]
-    A = weighted.detach() @ J.transpose(1, 2)
-    b = weighted @ residual.flatten(1)[:, :, None]
-    A = A + torch.diag_embed(DAMPING * A.diagonal(dim1=1, dim2=2) + 1e-12)
-    step = torch.linalg.solve_ex(A.double(), b.double())[0][:, :, 0].to(b.dtype)
+    A = weighted.detach() @ J.transpose(1, 2) + 1e-12 * torch.eye(6).to(J)
+    b = (weighted @ residual.flatten(1)[:, :, None])[..., 0]
+    step = solve_small(A, b, damping=1e-6)[0].to(b.dtype)
     step = step * (MAX_STEP / step.detach().norm(dim=1, keepdim=True)).clamp(max=1.0)
     return torch.cat([step[:, :3] / unit, step[:, 3:]], dim=1), scale2[:, 0].sqrt()
-
-
-def _weighted_median(x: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
-    """(B, 1) weighted median of every third of (B, N) values."""
-    ordered, order = x[:, ::MEDIAN_STRIDE].sort(dim=1)
-    reached = weights[:, ::MEDIAN_STRIDE].gather(1, order).cumsum(dim=1)
-    middle = (reached < 0.5 * reached[:, -1:]).sum(dim=1, keepdim=True)
-    return ordered.gather(1, middle.clamp(max=ordered.shape[1] - 1))

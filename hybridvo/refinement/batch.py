@@ -1,71 +1,24 @@
-"""What the torch refinement takes and gives: options, checked tensors, poses, statuses."""
+"""What the torch refinement takes and gives: checked tensors, pixels of a batch, poses."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
-import numpy as np
 import torch
+import torch.nn.functional as F
 
 from hybridvo.errors import InputError
-from hybridvo.options import RefineOptions
-from hybridvo.refinement.torch_pixels import MAX_VALUE
-from hybridvo.results import Reason, RelativePose, Status
-from hybridvo.torch_geometry import MAX_DEPTH, MIN_DEPTH, pp, se3
+from hybridvo.refinement import kernels
+from hybridvo.refinement.covariance import direction_is_known
+from hybridvo.refinement.depth import SURFACE
+from hybridvo.results import RelativePose, Status
+from hybridvo.torch_geometry import MAX_DEPTH, MIN_DEPTH, pixel_grid, pp, rays, se3
 from hybridvo.types import PairBatch
 
 DEPTH_CURR_FLOOR = 2e-3
 """Smallest noise of log D_curr assumed: what bilinear sampling of a smooth surface is good to."""
-DOUBTFUL_INLIER_RATIO = 0.2
-"""Share of the weight below which a motion is degraded."""
-DOUBTFUL_PROBABILITY = 0.8
-"""Probability below which it is; 0.8 is a rival with half of the motion's own weight."""
-
-
-@dataclass(frozen=True)
-class BatchOptions:
-    """Options of :func:`~hybridvo.refinement.torch_backend.refine_batch`.
-
-    Args:
-        cutoff: c of the robust kernel in standard deviations; None: that of the kernel.
-        iterations: most Newton steps on all pixels.
-        tolerance: a step that moves the image by less than this many standard deviations of the
-            flow noise is the last. Where a gradient is wanted the solver goes on to the precision
-            of the numbers.
-        subset_pixels: pixels on which starts are refined and the noise is estimated.
-        largest_px, smallest_px: largest start and the end of the graduated scale, px.
-        min_pixels: fewer usable pixels are a failure.
-        min_inlier_ratio: a smaller share of the weight within three standard deviations is one.
-        tiles: about how many tiles (of 8 to 64 px) the image is cut into for the covariance.
-        use_depth_curr: add the residual of the current frame's depth where it is known.
-    """
-
-    cutoff: float | None = None
-    iterations: int = 20
-    tolerance: float = 5e-3
-    subset_pixels: int = 2048
-    largest_px: float = 64.0
-    smallest_px: float = 0.4
-    min_pixels: int = 24
-    min_inlier_ratio: float = 0.02
-    tiles: int = 110
-    use_depth_curr: bool = False
-
-    @classmethod
-    def of(cls, options: RefineOptions, kernel: str) -> BatchOptions:
-        """Those that belong to the options of the refinement of one pair."""
-        return cls(
-            cutoff=options.cutoff if kernel == "geman-mcclure" else None,
-            min_pixels=options.min_pixels,
-            tiles=options.tiles,
-            use_depth_curr=options.current_depth == "on",
-        )
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if name != "use_depth_curr" and value is not None and not value > 0:
-                raise InputError(f"BatchOptions.{name}: expected a positive number, got {value!r}.")
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,32 +69,217 @@ class BatchedPose:
         """The motion of one sample as every estimator gives it, in numpy."""
         covariance = self.covariance[index].detach().double().cpu().numpy()
         noise = self.noise[index].tolist()
-        common: dict[str, Any] = {
-            "method": method,
-            "probability": float(self.probability[index]),
-            "inlier_ratio": min(1.0, float(self.inlier_ratio[index])),
-            "iterations": int(self.iterations[index]),
-            "cost": float(self.cost[index]),
-            "residual_scale_px": noise[0],
-            "depth_noise": noise[1],
-            "weights": self.weights[index].detach().float().cpu().numpy(),
-            "terms": ("flow", "depth") if len(noise) == 3 else ("flow",),
-        }
         T = self.SE3[index].detach().matrix().double().cpu().numpy()
-        spread = np.sqrt(max(np.linalg.eigvalsh(covariance[:3, :3])[-1], 0.0))
         return RelativePose(
             T_curr_prev=T,
             covariance=covariance,
             status=self.status[index],
-            translation_direction_valid=bool(np.linalg.norm(T[:3, 3]) > 3 * spread),
-            **common,
+            inlier_ratio=min(1.0, float(self.inlier_ratio[index])),
+            iterations=int(self.iterations[index]),
+            cost=float(self.cost[index]),
+            residual_scale_px=noise[0],
+            depth_noise=noise[1],
+            weights=self.weights[index].detach().float().cpu().numpy(),
+            translation_direction_valid=direction_is_known(T, covariance),
+            probability=float(self.probability[index]),
+            method=method,
+            terms=("flow", "depth") if len(noise) == 3 else ("flow",),
         )
+
+
+@dataclass(frozen=True, eq=False)
+class Pixels:
+    """Pixels of a batch as the solver takes them; unusable ones have weight 0.
+
+    Args:
+        points: (B, 3, N) metres, in the previous camera.
+        target: (B, 2, N) px, x + F on the current image.
+        flow_variance, depth_variance: (B, N) relative to the typical one of the sample.
+        weight: (B, N) external weight.
+        K: (B, 3, 3) of the current camera.
+        log_depth_curr: (B, N) log D_curr(x + F), 0 where absent; None without that depth.
+        has_depth_curr: (B, N) 1 where it is present, else 0.
+    """
+
+    points: torch.Tensor
+    target: torch.Tensor
+    flow_variance: torch.Tensor
+    depth_variance: torch.Tensor
+    weight: torch.Tensor
+    K: torch.Tensor
+    log_depth_curr: torch.Tensor | None = None
+    has_depth_curr: torch.Tensor | None = None
+
+    def map(self, change: Callable[[torch.Tensor], torch.Tensor]) -> Pixels:
+        """The same with every tensor but the intrinsics changed."""
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        return Pixels(
+            **{k: v if v is None or k == "K" else change(v) for k, v in values.items()}
+        )  # fmt: skip
+
+    def repeat(self, times: int) -> Pixels:
+        """Every sample ``times`` times in a row: B times."""
+        if times == 1:
+            return self
+        many = self.map(lambda x: x.repeat_interleave(times, dim=0))
+        return replace(many, K=self.K.repeat_interleave(times, dim=0))
+
+    def subset(self, count: int) -> Pixels:
+        """About ``count`` usable pixels of each sample, spread evenly in their order.
+
+        One pixel is taken from each of ``count`` equal runs, at a place in the run that follows the
+        golden section, so that no regular structure of the image is met in step.
+        """
+        order = (self.weight > 0).long().cumsum(dim=1)
+        total = order[:, -1:]
+        count = min(count, order.shape[1])
+        k = torch.arange(count, device=order.device, dtype=torch.float64)[None]
+        spread = ((k + (k * 0.6180339887498949).frac()) * total / count).long()
+        place = torch.where(total > count, spread, k.long().expand_as(spread))
+        index = torch.searchsorted(order, place + 1).clamp(max=order.shape[1] - 1)
+
+        def take(x: torch.Tensor) -> torch.Tensor:
+            at = index if x.ndim == 2 else index[:, None].expand(-1, x.shape[1], -1)
+            return x.gather(x.ndim - 1, at)
+
+        taken = self.map(take)
+        return replace(taken, weight=taken.weight * (place < total))
+
+
+def gather_pixels(
+    batch: PairBatch,
+    weights: torch.Tensor | None = None,
+    with_depth: bool = False,
+    tile: int | None = None,
+) -> Pixels:
+    """The pixels of a batch in raster order, or tile by tile where a tile's side is given.
+
+    Invalid values are replaced before anything is computed from them, so that neither they nor
+    their gradients spread. Variances are divided by the typical one of their sample, which is held
+    constant.
+    """
+    flow, depth = batch.flow, batch.depth_prev
+    height, width = depth.shape[1:]
+    K_prev, good_prev = _usable_camera(batch.K_prev)
+    K_curr, good_curr = _usable_camera(batch.K_curr)
+    target = pixel_grid(height, width, depth) + flow
+    usable = (depth > MIN_DEPTH) & (depth < MAX_DEPTH) & (good_prev & good_curr)[:, None, None]
+    usable = usable & (target.abs() < MAX_DEPTH).all(dim=3)
+    one, zero = torch.ones_like(depth), torch.zeros_like(depth)
+    flow_variance = depth_variance = one
+    if batch.flow_variance is not None:
+        good = (batch.flow_variance > 0) & (batch.flow_variance < MAX_DEPTH)
+        typical = _typical(batch.flow_variance)
+        relative = torch.where(good, batch.flow_variance, typical) / typical
+        flow_variance, usable = relative.clamp(min=1 / float(kernels.MAX_TRUST)), usable & good
+    if batch.depth_variance is not None:
+        good = (batch.depth_variance >= 0) & (batch.depth_variance < MAX_DEPTH)
+        typical = _typical(batch.depth_variance)
+        relative = torch.where(good, batch.depth_variance, typical) / typical
+        depth_variance, usable = relative.clamp(max=float(kernels.MAX_DOUBT)), usable & good
+    weight = one
+    if weights is not None:
+        weight = torch.where((weights > 0) & (weights < MAX_DEPTH), weights, zero)
+    if batch.valid is not None:
+        usable = usable & batch.valid
+    depth = torch.where(usable, depth, one)
+    target = torch.where(usable[..., None], target, torch.zeros_like(target))
+    log_depth = present = None
+    if with_depth and batch.depth_curr is not None:
+        sampled, good = sample_depth(batch.depth_curr, target)
+        log_depth, present = sampled.log(), (good & usable).to(depth.dtype)
+    points = (rays(height, width, K_prev) * depth[..., None]).permute(0, 3, 1, 2)
+    tile = tile or max(height, width)
+    return Pixels(
+        points=to_tiles(points, tile, 1.0),
+        target=to_tiles(target.permute(0, 3, 1, 2), tile),
+        flow_variance=to_tiles(flow_variance, tile, 1.0),
+        depth_variance=to_tiles(depth_variance, tile, 1.0),
+        weight=to_tiles(torch.where(usable, weight, zero), tile),
+        K=K_curr,
+        log_depth_curr=None if log_depth is None else to_tiles(log_depth, tile),
+        has_depth_curr=None if present is None else to_tiles(present, tile),
+    )
+
+
+def to_tiles(x: torch.Tensor, tile: int, fill: float = 0.0) -> torch.Tensor:
+    """(..., H, W) -> (..., N): the pixels of each tile side by side, tiles row by row.
+
+    Tiles at the border are completed with ``fill``; a tile as large as the image is the image.
+    """
+    height, width = x.shape[-2:]
+    if tile >= max(height, width):
+        return x.flatten(-2)
+    x = F.pad(x, (0, -width % tile, 0, -height % tile), value=fill)
+    rows, columns = x.shape[-2] // tile, x.shape[-1] // tile
+    x = x.reshape(*x.shape[:-2], rows, tile, columns, tile).transpose(-3, -2)
+    return x.reshape(*x.shape[:-4], -1)
+
+
+def tile_grid(shape: tuple[int, int], tile: int) -> tuple[tuple[int, int], int]:
+    """((rows, columns) of tiles, pixels in each) of an image (H, W)."""
+    if tile >= max(shape):
+        return (1, 1), shape[0] * shape[1]
+    return (-(-shape[0] // tile), -(-shape[1] // tile)), tile * tile
+
+
+def from_tiles(x: torch.Tensor, tile: int, height: int, width: int) -> torch.Tensor:
+    """(B, N) -> (B, H, W), the inverse of :func:`to_tiles`."""
+    if tile >= max(height, width):
+        return x.reshape(-1, height, width)
+    rows, columns = -(-height // tile), -(-width // tile)
+    x = x.reshape(-1, rows, columns, tile, tile).transpose(2, 3)
+    return x.reshape(-1, rows * tile, columns * tile)[:, :height, :width]
+
+
+def sample_depth(depth: torch.Tensor, at: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Bilinear depth (B, H, W) at (B, h, w, 2) px, where the four neighbours lie on one surface.
+
+    Returns:
+        (B, h, w) metres and (B, h, w) bool. False (and depth 1) outside the image, next to an
+        invalid depth, and at edges. Differentiable in both arguments.
+    """
+    batch, height, width = depth.shape
+    u, v = at.unbind(-1)
+    inside = (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)
+    u, v = (torch.where(inside, x, torch.zeros_like(x)) for x in (u, v))
+    u0 = u.detach().floor().clamp(max=max(width - 2, 0))
+    v0 = v.detach().floor().clamp(max=max(height - 2, 0))
+    right, below = int(width > 1), width * int(height > 1)
+    place = (v0 * width + u0).long().flatten(1)
+    flat = depth.reshape(batch, -1)
+    corners = torch.stack(
+        [flat.gather(1, place + o).view_as(u) for o in (0, right, below, below + right)]
+    )
+    good = ((corners > MIN_DEPTH) & (corners < MAX_DEPTH)).all(dim=0) & inside
+    corners = torch.where(good, corners, torch.ones_like(corners))
+    good = good & (corners.amax(dim=0) <= (1 + SURFACE) * corners.amin(dim=0))
+    s, t = u - u0, v - v0
+    top = corners[0] + s * (corners[1] - corners[0])
+    bottom = corners[2] + s * (corners[3] - corners[2])
+    sampled = top + t * (bottom - top)
+    return torch.where(good, sampled, torch.ones_like(sampled)), good
+
+
+def _typical(variance: torch.Tensor) -> torch.Tensor:
+    """(B, 1, 1) 20 % quantile of the positive finite values on a sparse grid; 1 if none."""
+    sparse = variance.detach()[:, ::7, ::7].flatten(1)
+    good = (sparse > 0) & (sparse < MAX_DEPTH)
+    values = torch.where(good, sparse, torch.full_like(sparse, torch.nan))
+    return torch.nan_to_num(torch.nanquantile(values, 0.2, dim=1), nan=1.0)[:, None, None]
+
+
+def _usable_camera(K: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """K with unusable samples replaced by the unit matrix, and which are usable (B,)."""
+    good = torch.isfinite(K).flatten(1).all(dim=1) & (K[:, 0, 0] > 0) & (K[:, 1, 1] > 0)
+    unit = torch.eye(3, dtype=K.dtype, device=K.device).expand_as(K)
+    return torch.where(good[:, None, None], K, unit), good
 
 
 def checked_batch(
     batch: PairBatch,
     weights: Any = None,
-    use_depth_curr: bool = False,
+    with_depth: bool = False,
     where: str = "refine_batch",
 ) -> tuple[PairBatch, torch.Tensor | None]:
     """The batch and its weights in one floating type, on one device.
@@ -157,8 +295,8 @@ def checked_batch(
         raise InputError(
             f"{where}: expected PairBatch.flow of shape (B, H, W, 2), got {tuple(flow.shape)}."
         )
-    if use_depth_curr and batch.depth_curr is None:
-        raise InputError(f"{where}: use_depth_curr needs PairBatch.depth_curr, which is None.")
+    if with_depth and batch.depth_curr is None:
+        raise InputError(f"{where}: current_depth 'on' needs PairBatch.depth_curr, which is None.")
     dtype = torch.promote_types(flow.dtype, depth.dtype)
     dtype = dtype if dtype in (torch.float32, torch.float64) else torch.float32
     if weights is not None:
@@ -206,7 +344,7 @@ def initial_poses(T_init: Any, like: torch.Tensor, alone: bool) -> pp.LieTensor:
     return se3(T if alone else torch.cat([identity, T], dim=1))
 
 
-def given_noise(noise: Any, like: torch.Tensor, use_depth_curr: bool) -> torch.Tensor | None:
+def given_noise(noise: Any, like: torch.Tensor, with_depth: bool) -> torch.Tensor | None:
     """(B, 2) or (B, 3) noise as handed in."""
     if noise is None:
         return None
@@ -223,50 +361,6 @@ def given_noise(noise: Any, like: torch.Tensor, use_depth_curr: bool) -> torch.T
     known = value.detach()
     if not bool(torch.isfinite(known).all() & (known >= 0).all() & (known[:, 0] > 0).all()):
         raise InputError("refine_batch: expected finite noise, sf positive, sd not negative.")
-    if use_depth_curr and value.shape[1] == 2:
+    if with_depth and value.shape[1] == 2:
         value = torch.cat([value, value[:, 1:].clamp(min=DEPTH_CURR_FLOOR)], dim=1)
-    return value if use_depth_curr else value[:, :2]
-
-
-def status_of(
-    batch: PairBatch,
-    k: int,
-    options: BatchOptions,
-    *,
-    usable: int,
-    definite: bool,
-    converged: bool,
-    inlier_ratio: float,
-    rival_ratio: float,
-    probability: float,
-) -> Status:
-    """Status of one sample of a solved batch."""
-    needed = f"{options.min_pixels} needed"
-    if usable < options.min_pixels:
-        for name, K in (("K_prev", batch.K_prev[k]), ("K_curr", batch.K_curr[k])):
-            if not bool(torch.isfinite(K).all()) or not bool((K.diagonal() > 0).all()):
-                return Status.failed(Reason.NAN_INPUT, f"{name} is no camera matrix")
-        depth, flow = batch.depth_prev[k], batch.flow[k]
-        depths = int(((depth > MIN_DEPTH) & (depth < MAX_DEPTH)).sum())
-        flows = int((flow.abs() < MAX_VALUE).all(dim=-1).sum())
-        if depths < options.min_pixels:
-            what = f"{depths} pixels with valid depth, {needed}"
-            return Status.failed(Reason.NO_VALID_DEPTH, what)
-        if flows < options.min_pixels:
-            return Status.failed(Reason.NO_FLOW, f"{flows} pixels with valid flow, {needed}")
-        return Status.failed(Reason.LOW_INLIERS, f"{usable} usable pixels, {needed}")
-    if not definite:
-        what = "the pixels leave a direction of the motion undetermined"
-        return Status.failed(Reason.DEGENERATE_GEOMETRY, what)
-    share = f"{100 * inlier_ratio:.1f} % of the pixels follow"
-    if inlier_ratio < options.min_inlier_ratio:
-        return Status.failed(Reason.LOW_INLIERS, f"{share} one motion")
-    if not converged:
-        what = f"not converged after {options.iterations} steps"
-        return Status.degraded(Reason.SOLVER_DIVERGED, what)
-    if probability < DOUBTFUL_PROBABILITY:
-        what = f"{share} this motion, {100 * rival_ratio:.1f} % another one"
-        return Status.degraded(Reason.AMBIGUOUS_MOTION, what)
-    if inlier_ratio < DOUBTFUL_INLIER_RATIO:
-        return Status.degraded(Reason.LOW_INLIERS, f"only {share} the motion")
-    return Status()
+    return value if with_depth else value[:, :2]

@@ -16,6 +16,7 @@ import math
 
 import numpy as np
 
+from hybridvo.calibration import ABSORBED, CLUSTERED, FEW_TILES, LONG_GROWTH
 from hybridvo.compilation import njit
 from hybridvo.refinement.kernels import (
     BLOCK,
@@ -31,24 +32,6 @@ from hybridvo.refinement.kernels import (
 NOTHING = np.diag([1e4] * 3 + [10.0] * 3)
 """Covariance that carries no information (m^2, rad^2)."""
 
-FEW_TILES = 48
-"""With fewer tiles the correlation between errors is hardly known; more of it is then assumed."""
-CLUSTERED = 0.6
-"""Share of the clustered matrix in the meat, the rest is that of independent errors scaled to the
-same mean. Alone the few blocks make weak directions too certain at times (4 of 420 development
-pairs of cells beyond 3 sigma, 0 with this share); the other makes all directions equally bad,
-though errors of depth leave some of them alone."""
-LONG_GROWTH = (1.7, 2.2)
-"""Growth of the variance of sums over blocks four tiles wide (kept overlapping) against one tile's,
-in units of independent errors, between which the errors come to count as reaching beyond the
-blocks. Median and 95 % quantile over development pairs: 1.0 and 1.5 of independent noise,
-1.0 to 1.3 and 1.8 to 2.7 of the cells (24 px in tiles of 64 px), 2.2 to 3.1 the median with DIS
-flow. So every tenth to twentieth pair of noisy cells is doubted more than it should."""
-ABSORBED = 2.0
-"""The exponent of the growth is taken so much larger: what errors have in common over the whole
-image the fit takes into the motion, so that the residuals show less of it than there is. On
-development sequences with DIS flow (240 pairs) the median squared error in units of the covariance,
-5.3 expected, was 12 with 1.5, 7 to 9 with 2 and 6 to 8 with 2.5."""
 SMALLEST_REST = 0.25
 """Least share of the scores' variance that the fit is assumed to leave in the blocks."""
 
@@ -60,6 +43,12 @@ UPPER = np.triu_indices(6)
 ORDER = np.zeros((6, 6), np.intp)
 """Place of each entry of the matrix among them."""
 ORDER[UPPER] = ORDER.T[UPPER] = np.arange(21)
+
+
+def direction_is_known(T: np.ndarray, covariance: np.ndarray) -> bool:
+    """Whether a translation is longer than three of its own standard deviations."""
+    spread = np.sqrt(max(np.linalg.eigvalsh(covariance[:3, :3])[-1], 0.0))
+    return bool(np.linalg.norm(T[:3, 3]) > 3 * spread)
 
 
 def symmetric(upper: np.ndarray) -> np.ndarray:

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hybridvo.calibration import DOUBTFUL_SPREAD, NO_SPREAD
 from hybridvo.compilation import njit
 from hybridvo.refinement.kernels import (
     BLOCK,
@@ -38,11 +39,6 @@ from hybridvo.types import Frame
 
 SURFACE = 0.05
 """Largest relative difference between the four neighbours that are interpolated."""
-DOUBTFUL_SPREAD, NO_SPREAD = 0.15, 0.35
-"""Spread from which an answer is degraded, and from which it is none. Two depths with independent
-noise of s differ by 0.95 s, so these are 16 and 37 % of noise in every pixel; real sensors and
-rendered depth with DIS flow measure 0.001 to 0.018, depth that is noise from 0.5 to 10 m 0.49 to
-0.6, from 2 to 4 m 0.2."""
 MAX_RATIO = 1.25
 """Of depths that may have one scale: learned depth jitters by 10 %, and where most of the image
 moves towards the camera the median is theirs."""

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
+from hybridvo.calibration import MIN_TILES
 from hybridvo.geometry import pose_matrix
 from hybridvo.options import RefineOptions
 from hybridvo.refinement import coarse_fit, depth, kernels
 from hybridvo.refinement.covariance import sandwich_covariance, score_sums, symmetric
+from hybridvo.refinement.noise import estimate_noise
 from hybridvo.refinement.pixels import CoarseGrid, PixelGrid, as_contiguous
 from hybridvo.refinement.solver import Linearization, SolverOptions, gauss_newton
 from hybridvo.types import FramePair
@@ -25,17 +28,11 @@ WELL_CONDITIONED = 0.005
 """Ratio of the extreme eigenvalues of the flow's information above which it needs no help."""
 CURRENT_DEPTH_GAIN = 0.5
 """The current depth is used where it adds this share of the flow's information somewhere."""
-MIN_TILES = 24
-"""Tiles of the whole image in which usable pixels lie, below which a covariance cannot be
-trusted: depth errs alike over some 50 px, so that a line across the image holds ten to twenty
-independent readings for six unknowns (3 of 59 development lines were beyond 3 sigma, one by 7)."""
 DEPTHS_PER_PAIR = 1.32
 """The two depths of a pair differ by this many times the noise of one: sqrt(2), less what the
 interpolation of the second one averages away (4/9 remains of independent noise)."""
 FLOW_ROUNDING = 2e-5
 """Pixels: single precision at a coordinate of 300."""
-FOLLOWS = 0.5
-"""Robust weight from which the depths of a pixel are compared."""
 
 
 class FlowFactor:
@@ -137,6 +134,24 @@ class FullFit:
     depths: depth.DepthAgreement | None
 
 
+class PairNoise(NamedTuple):
+    """Noise of the pixels that follow a motion.
+
+    Args:
+        flow: px. depth: of log depth.
+        share: of the weight that follows.
+        depth_error: standard error of the depth noise squared.
+        current_depth: standard deviation of the log of the current depth, given the flow; 0 where
+            it cannot be told.
+    """
+
+    flow: float
+    depth: float
+    share: float
+    depth_error: float
+    current_depth: float
+
+
 def tile_size(shape: tuple[int, int], tiles: int) -> int:
     """Side, px, of the tiles that cut an image into about ``tiles``; 8 to 64."""
     return int(np.clip(round(np.sqrt(shape[0] * shape[1] / tiles)), 8, 64))
@@ -162,17 +177,18 @@ def fit_full_grid(
     tile = tile_size(image.shape, options.tiles)
     depth_scale = coarse_fit.translation_scale(grid.samples, grid.count)
     samples, n = _enough_samples(grid)
-    sf, sd = noise_start
-    sf, sd, share, iterations, _, spread = coarse_fit.reestimate(
-        samples, n, image.K, sf, sd, 2.5 * sf, max(2.5 * sd, 0.02), options.cutoff, 1, 4,
-        coarse_fit.FINAL_NOISE_PIXELS, pose, kernels.new_work(),
-    )  # fmt: skip
+    found_noise = pair_noise(pair, grid, pose, noise_start, options)
+    sf, sd, share, _, sigma = found_noise
     noise = np.empty(3, np.float32)
     coarse_fit.set_noise(sf, sd, options.cutoff, noise)
+    total = float(samples[kernels.W, :n].sum(dtype=np.float64))
+    iterations, _, _ = coarse_fit.gauss_newton(
+        samples, n, total, image.K, noise, 4, 1e-3 * sf, pose, kernels.new_work()
+    )
     term = None
-    if asks_depth := options.current_depth != "off" and pair.curr.depth is not None:
-        sd, term = _depth_factor(pair, grid, pose, (sf, sd, spread), noise, options)
-        coarse_fit.set_noise(sf, sd, options.cutoff, noise)
+    asks_depth = options.current_depth != "off" and pair.curr.depth is not None
+    if asks_depth and sigma > 0:
+        term = _depth_factor(pair, grid, pose, sigma, noise, options)
     per_weight = score_sums(samples, n, pose, image.K, noise)
     flow = FlowFactor(image, noise, tile, per_weight)
     found = gauss_newton([flow] if term is None else [flow, term], pose_matrix(pose), SOLVER)
@@ -187,6 +203,11 @@ def fit_full_grid(
     covariance, eigenvalues, definite = sandwich_covariance(
         tiles, np.asarray(found.at.curvature), symmetric(meat), depth_scale, rounding
     )
+    if definite:
+        newton = found.at.H - found.at.curvature
+        shift = _slope_in_depth_variance(image, samples, n, T, found_noise, options) * usable
+        shift = np.linalg.lstsq(newton, shift, rcond=1e-12)[0] * found_noise.depth_error
+        covariance += np.outer(shift, shift)
     # whether depth errs about its log, its value or its inverse is not known: the translation's
     # length is uncertain by half the variance of log depth
     covariance[:3, :3] += (0.5 * sd**2) ** 2 * np.outer(T[:3, 3], T[:3, 3])
@@ -239,47 +260,92 @@ def _tiles_used(
     return int(np.count_nonzero(np.bincount(v * columns + u)))
 
 
-def _depth_factor(
+def pair_noise(
     pair: FramePair,
     grid: CoarseGrid,
     pose: np.ndarray,
-    found: tuple[float, float, float],
-    noise: np.ndarray,
+    start: tuple[float, float],
     options: RefineOptions,
-) -> tuple[float, DepthFactor | None]:
-    """(depth noise, factor of the current depth or None).
+) -> PairNoise:
+    """Noise of the pixels that follow a motion.
 
-    ``found`` = (sf, sd, standard error of sd^2) of the flow. The current depth bounds the noise of
-    the first, tells it where the flow cannot, and may add a residual.
+    The current depth bounds the noise of the first, and tells it where the flow cannot.
+
+    Args:
+        pair: the input.
+        grid: its coarse grid.
+        pose: (3, 4) T_curr_prev.
+        start: (sf, sd) found before.
+        options: ``current_depth``.
     """
-    sf, sd, spread = found
-    image, coarse, n = grid.pixels, grid.samples, grid.count
-    _, columns, stride = grid.shape
-    curr = as_contiguous(np.asarray(pair.curr.depth))
+    samples, n = _enough_samples(grid)
+    (sf, sd), K, count = start, grid.pixels.K, coarse_fit.FINAL_NOISE_PIXELS
+    sf, sd, share, spread = estimate_noise(
+        samples, n, pose, K, sf, sd, 2.5 * sf, max(2.5 * sd, 0.02), 30, count
+    )
+    if options.current_depth == "off" or pair.curr.depth is None:
+        return PairNoise(sf, sd, share, spread, 0.0)
+    samples, n, noise = grid.samples, grid.count, np.empty(3, np.float32)
+    coarse_fit.set_noise(sf, sd, options.cutoff, noise)
     log_depth, robust = np.empty(n, np.float32), np.empty(n, np.float32)
-    # looked up at random places of a whole image: first no more than the scale needs
-    depth.look_up(coarse, n, depth.sparse_step(n), curr, *image.origin, log_depth)
-    work = kernels.new_work()
-    coarse_fit.robust_weights(coarse, n, pose, image.K, noise, work, robust)
-    sigma, raw = depth.depth_scale(coarse, n, log_depth, robust, pose, image.K, noise)
+    # looked up at random places of a whole image: no more than the scale needs
+    curr = as_contiguous(pair.curr.depth)
+    depth.look_up(samples, n, depth.sparse_step(n), curr, *grid.pixels.origin, log_depth)
+    coarse_fit.robust_weights(samples, n, pose, K, noise, kernels.new_work(), robust)
+    sigma, raw = depth.depth_scale(samples, n, log_depth, robust, pose, K, noise)
     if raw <= 0:
-        return sd, None
+        return PairNoise(sf, sd, share, spread, 0.0)
     # var(rz) = sz^2 + h^2 sd^2: with two depths of one sensor sd is about raw / sqrt(2)
     if sd**2 < 2 * spread:
         # too little parallax for the flow to tell; errors that both depths share do not show here
         sd = min(raw / DEPTHS_PER_PAIR, coarse_fit.DEPTH_NOISE_CAP)
-    sd = min(sd, raw)
-    coarse_fit.set_noise(sf, sd, options.cutoff, noise)
+        spread = max(sd**2, 1e-10)
+    return PairNoise(sf, min(sd, raw), share, spread, max(sigma, 1e-4))
+
+
+def _slope_in_depth_variance(
+    image: PixelGrid,
+    samples: np.ndarray,
+    n: int,
+    T: np.ndarray,
+    found: PairNoise,
+    options: RefineOptions,
+) -> np.ndarray:
+    """(6,) derivative of the estimating equation in the depth's variance, per unit of weight.
+
+    What is not known of that variance moves the answer, through the correction of the depth.
+    """
+    sums, noise = np.zeros((2, kernels.SUMS)), np.empty(3, np.float32)
+    variances = 0.9 * found.depth**2, 1.1 * found.depth**2 + 1e-8
+    for row, variance in zip(sums, variances, strict=True):
+        coarse_fit.set_noise(found.flow, np.sqrt(variance), options.cutoff, noise)
+        coarse_fit.evaluate(samples, n, T[:3], image.K, noise, kernels.new_work(), row)
+    difference = sums[1, 21:27] - sums[0, 21:27]
+    return difference / (variances[1] - variances[0]) / max(sums[0, 29], 1e-12)
+
+
+def _depth_factor(
+    pair: FramePair,
+    grid: CoarseGrid,
+    pose: np.ndarray,
+    sigma: float,
+    noise: np.ndarray,
+    options: RefineOptions,
+) -> DepthFactor | None:
+    """The current depth as a factor, or None where it is not asked for or adds too little."""
+    image, coarse, n = grid.pixels, grid.samples, grid.count
+    _, columns, stride = grid.shape
+    curr, tile = as_contiguous(np.asarray(pair.curr.depth)), tile_size(image.shape, options.tiles)
     sums = np.zeros(kernels.SUMS)
-    coarse_fit.evaluate(coarse, n, pose, image.K, noise, work, sums)
+    coarse_fit.evaluate(coarse, n, pose, image.K, noise, kernels.new_work(), sums)
     H_flow = symmetric(sums[:21])
     if options.current_depth == "auto":
         scale = np.repeat([1 / coarse_fit.translation_scale(coarse, n), 1.0], 3)
         eigenvalues = np.linalg.eigvalsh(H_flow * np.outer(scale, scale))
         if eigenvalues[0] > WELL_CONDITIONED * eigenvalues[-1]:
-            return sd, None
+            return None
+    log_depth = np.empty(n, np.float32)
     depth.look_up(coarse, n, 1, curr, *image.origin, log_depth)
-    tile, sigma = tile_size(image.shape, options.tiles), max(sigma, 1e-4)
     term = DepthFactor(image, coarse, log_depth, columns, stride, sigma, noise, tile)
     # on the full fit the flow has every pixel, the depth every second one of both axes
     fine = min(2, stride)
@@ -287,13 +353,13 @@ def _depth_factor(
         H_depth = term.linearize(pose).H / fine**2
         gain = np.linalg.eigvals(np.linalg.pinv(H_flow) @ H_depth).real.max()
         if not gain > CURRENT_DEPTH_GAIN:
-            return sd, None
+            return None
     if fine < stride:
         samples, h, w = image.strided(fine)
         log_depth = np.empty(h * w, np.float32)
         depth.look_up(samples, h * w, 1, curr, *image.origin, log_depth)
         term = DepthFactor(image, samples, log_depth, w, fine, sigma, noise, tile)
-    return sd, term
+    return term
 
 
 def _compare_depths(
@@ -307,7 +373,7 @@ def _compare_depths(
     """Whether the current depth is that of the points which follow the motion."""
     robust = np.empty(n, np.float32)
     coarse_fit.robust_weights(samples, n, T[:3], image.K, noise, kernels.new_work(), robust)
-    follow = np.flatnonzero((robust > FOLLOWS) & (samples[kernels.W, :n] > 0))
+    follow = np.flatnonzero((robust > 0.5) & (samples[kernels.W, :n] > 0))
     follow = follow[:: max(1, len(follow) // coarse_fit.FINAL_NOISE_PIXELS)]
     x, y, z, u, v = (
         samples[row, follow].astype(np.float64)

@@ -18,6 +18,8 @@ from functools import cache
 
 import numpy as np
 
+from hybridvo.calibration import EVEN_PARTS, UNEVEN_LIGHT
+from hybridvo.options import RefineOptions
 from hybridvo.refinement import photometric_kernels as kernels
 from hybridvo.refinement.full_fit import tile_size
 from hybridvo.refinement.pixels import as_contiguous, typical
@@ -29,22 +31,11 @@ CUTOFF = 3.0
 """c of the Geman-McClure kernel, in standard deviations."""
 NOISE_FLOOR = 0.1
 """Grey levels: rounding to 8 bits leaves 0.08 after the finest blur."""
-NOISE_PIXELS = 2000
-"""Pixels that the noise estimate looks at: it is then good to 3 %."""
-TILES = 110
-"""As in the refinement: errors may be correlated within a tile."""
 PARTS = ((2, 2), (4, 1))
 """Rows and columns of parts of the image that are held against each other: a lens errs by
 quadrant, a rolling shutter by row."""
-EVEN = 0.7
-"""Dispersion of the parts' scores, as shares of the model's, below which they agree: rendered pairs
-have 0.25 in the median, 0.55 at the 90th percentile; with a rolling shutter 1.0 and 2.0."""
 ROWS, COLUMNS = 5, 7
 """Nodes of the fields."""
-EXPLAINED = 0.15
-"""Share of the weighted squared residuals that the fields must explain to be used. Of rendered
-pairs with even light they explain 0.02 to 0.12, with a vignette of 30 % in the corners, a lamp or
-a gamma of 0.6 from 0.26 on."""
 SMOOTH = 0.01
 """Weight of the differences between neighbouring nodes, in shares of a node's typical weight."""
 
@@ -121,7 +112,7 @@ class ImageFactor:
         self._project(T)
         for _ in range(2):
             self._settle()
-        self._uneven_here = self._even_light(EXPLAINED)
+        self._uneven_here = self._even_light(UNEVEN_LIGHT)
         self.uneven_light |= self._uneven_here
         self._settle()
 
@@ -176,7 +167,7 @@ class ImageFactor:
 
     def _settle(self) -> None:
         """Noise of the last projection, and the light under it."""
-        step = max(1, len(self._index) // NOISE_PIXELS)
+        step = max(1, len(self._index) // 2000)  # enough for 3 %
         lengths, weight = np.abs(self._r[::step]), self._buffer[kernels.W, ::step]
         seen = lengths >= 0  # not NaN
         if seen.any():
@@ -198,18 +189,18 @@ class ImageFactor:
         fields = light_fields(*arrays)
         if fields is None:
             return False
-        more, shift = fields
-        self._r -= more * grey + shift
-        factor = 1 + more / self._light[0]
-        grey *= factor
-        grey += shift / self._light[0]
-        self._buffer[[kernels.GX, kernels.GY]] *= factor
+        kernels.apply_fields(self._places, fields, self._light[0], self._buffer, self._r)
         return True
 
     def _marginal(self) -> tuple[np.ndarray, np.ndarray]:
         """(H (6, 6) with gain and offset free, what they explain of each column (6, 2))."""
-        H = self._H
-        light = H[:6, 6:] @ np.linalg.pinv(H[6:, 6:], rcond=1e-9, hermitian=True)
+        H, (a, b, c) = self._H, (self._H[6, 6], self._H[6, 7], self._H[7, 7])
+        determinant = a * c - b * b
+        if determinant > 1e-9 * a * c > 0:
+            inverse = np.array([[c, -b], [-b, a]]) / determinant
+        else:
+            inverse = np.diag([0.0, 1 / c if c > 0 else 0.0])
+        light = H[:6, 6:] @ inverse
         return H[:6, :6] - light @ H[6:, :6], light
 
     def _estimate_scale(self) -> None:
@@ -219,7 +210,7 @@ class ImageFactor:
         the tiles by ``inflation``, and by ``agreement`` where that is not enough.
         """
         height, width = self._shape
-        tile = tile_size((height, width), TILES)
+        tile = tile_size((height, width), RefineOptions().tiles)
         columns, rows = -(-width // tile), -(-height // tile)
         scores, curvature = np.zeros((rows * columns, 6)), np.zeros((rows * columns, 6, 6))
         meat = np.zeros((6, 6))
@@ -239,7 +230,7 @@ class ImageFactor:
         scale = 1.0 / (max(1.0, clusters * dispersion) * self._inflation)
         parts = scale * _dispersion(scores.reshape(rows, columns, 6), model)
         # what the parts disagree about is seen; as much again is common to them and is not
-        self.agreement = min(1.0, (EVEN / max(parts, EVEN)) ** 2)
+        self.agreement = min(1.0, (EVEN_PARTS / max(parts, EVEN_PARTS)) ** 2)
         self._scale = scale * self.agreement
 
 
@@ -263,7 +254,7 @@ def _dispersion(scores: np.ndarray, model: np.ndarray) -> float:
 
 def light_fields(
     place: np.ndarray, grey: np.ndarray, r: np.ndarray, w: np.ndarray, least: float = 0.0
-) -> tuple[np.ndarray, np.ndarray] | None:
+) -> np.ndarray | None:
     """Smooth changes of gain and offset that explain the residuals best.
 
     Args:
@@ -274,7 +265,8 @@ def light_fields(
         least: share of the squared residuals that the fields must explain.
 
     Returns:
-        (N,) changes of gain and of offset; None where they explain less.
+        (ROWS, COLUMNS, 2) float32 changes of gain and offset at the nodes; None where they explain
+        less.
     """
     nodes = ROWS * COLUMNS
     H, g = np.zeros((2 * nodes,) * 2), np.zeros(2 * nodes)
@@ -286,17 +278,11 @@ def light_fields(
     field = np.linalg.solve(H + np.diag(1e-4 * scale + 1e-12), g)
     if not (np.isfinite(field).all() and field @ g >= least * power and power > 0):
         return None
-    field = field.astype(np.float32).reshape(ROWS, COLUMNS, 2)
-    row, column = place.astype(np.intp).T
-    fv, fu = (place - np.floor(place)).T[:, :, None]
-    above = field[row, column] * (1 - fu) + field[row, column + 1] * fu
-    below = field[row + 1, column] * (1 - fu) + field[row + 1, column + 1] * fu
-    gain, offset = (above * (1 - fv) + below * fv).T
-    return gain, offset
+    return field.astype(np.float32).reshape(ROWS, COLUMNS, 2)
 
 
 def field_places(index: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """(N, 2) float32 place of pixels (v, u) of an image (H, W), in cells of the fields."""
+    """(N, 2) place of pixels (v, u) of an image (H, W), in cells of the fields."""
     return index * np.array([(ROWS - 1) / shape[0], (COLUMNS - 1) / shape[1]], np.float32)
 
 

@@ -32,6 +32,9 @@ tell it (stereo and learned depth; with 0.01 instead the errors of far scenes ca
 out at 1.7 times their standard deviation: the slope of the flow in inverse depth is
 shortened by the share of the noise in its variance)."""
 
+SETTLED = 1e-3
+"""Change of both variances, relative, below which they are found."""
+
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
 def gather_noise(samples, n, step, R, t, K, radius, terms):
@@ -161,6 +164,7 @@ def estimate_noise(samples, n, pose, K, sf, sd, sf_cap, sd_cap, rounds, limit):
     for _ in range(rounds):
         sum_noise(terms, m, np.float32(vf), np.float32(vd), np.float32(share), sums)
         a11, a12, a22, b1, b2 = sums[1], sums[2], sums[3], sums[4], sums[5]
+        before, vd_before = vf, vd
         share = min(0.999, max(0.01, sums[0] / inside))
         if not (0 < a11 < np.inf and a22 < np.inf and abs(b1) < np.inf and abs(b2) < np.inf):
             break
@@ -179,6 +183,8 @@ def estimate_noise(samples, n, pose, K, sf, sd, sf_cap, sd_cap, rounds, limit):
         vf = min(max(vf, floor), sf_cap * sf_cap)
         vd = min(vd, sd_cap * sd_cap)
         vd = max(vd, 1e-10)  # stays estimable in the next round
+        if abs(vf - before) < SETTLED * before and abs(vd - vd_before) < SETTLED * vd_before:
+            break
     if vd < 2.0 * spread:
         # too little parallax to tell: no more than a usual sensor has
         vd = min(vd, USUAL_DEPTH_NOISE * USUAL_DEPTH_NOISE)

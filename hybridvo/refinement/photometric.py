@@ -20,6 +20,7 @@ import numpy as np
 from hybridvo.errors import InputError
 from hybridvo.geometry import pose_matrix
 from hybridvo.options import PhotometricOptions
+from hybridvo.refinement.covariance import direction_is_known
 from hybridvo.refinement.depth_factor import DepthFactor
 from hybridvo.refinement.image_factor import ImageFactor
 from hybridvo.refinement.photometric_kernels import select_pixels
@@ -48,15 +49,12 @@ MIN_AGREEMENT = 0.5
 """Agreement of the parts of the image below which the status mentions it."""
 COARSE_SPREAD = 0.3
 """Coarser blurs are used where the flow leaves more than this many finest blurs undecided."""
-TOLERANCE = 0.1
-"""Length of the last step, in standard deviations of the joint estimate."""
 MID_GREY = 128.0
 """Taken off every grey value, so that gain and offset are nearly independent."""
 STRIPS, STRIP_ROWS = 4, 28
 """Sharpness is measured on so many strips of so many rows."""
 UNLIKE = 1.1
 """Ratio of two sharpnesses from which on an image is blurred to match the other."""
-MAX_BLUR_PX = 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,7 +162,7 @@ def _refine(pair: FramePair, pose: RelativePose, options: PhotometricOptions) ->
         factor.use(images[0].blurred(blur, more[0]), images[1].blurred(blur, more[1]), T)
         half = (options.iterations + 1) // 2
         for steps in (half, options.iterations - half):
-            T = gauss_newton(factors, T, SolverOptions(steps, TOLERANCE)).T
+            T = gauss_newton(factors, T, SolverOptions(steps, tolerance=0.1)).T
             factor.estimate(T)
             if depth is not None:
                 depth.estimate(T)
@@ -238,7 +236,6 @@ def _judged(
         what = f"they lead {report.shift_sigma:.1f} standard deviations away from the flow's motion"
         return _unchanged(pose, "rejected", what, report)
     T = pose_matrix(T[:3])
-    spread = np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])
     status = pose.status
     if (remarks := _remarks(report)) and not status.message:
         status = replace(status, message=f"images: {remarks}")
@@ -246,7 +243,7 @@ def _judged(
         T_curr_prev=T,
         covariance=covariance,
         status=status,
-        translation_direction_valid=bool(np.linalg.norm(T[:3, 3]) > 3 * spread),
+        translation_direction_valid=direction_is_known(T, covariance),
         terms=(*pose.terms, "images"),
         photometric=report,
     )
@@ -337,7 +334,7 @@ def missing_blur(image: GreyImage, other: GreyImage) -> float:
     """
     if not image.sharpness > UNLIKE * other.sharpness > 0:
         return 0.0
-    low, high = 0.0, MAX_BLUR_PX
+    low, high = 0.0, 4.0
     for _ in range(5):
         middle = 0.5 * (low + high)
         if image.sharpness_under(middle) > other.sharpness:

@@ -380,3 +380,25 @@ def field_equations(place, grey, r, w, columns, H, g):
                 H[p + 1, q] += t * a
                 H[p + 1, q + 1] += t
     return power
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def apply_fields(place, field, gain, buf, r):
+    """Put changes of gain and offset (rows, columns, 2) into grey values, gradients and residuals.
+
+    ``gain`` is the pair's own, by which the grey values are multiplied afterwards.
+    """
+    for k in range(place.shape[0]):
+        row, column = int(place[k, 0]), int(place[k, 1])
+        fv, fu = place[k, 0] - np.float32(row), place[k, 1] - np.float32(column)
+        s00, s01 = (ONE - fv) * (ONE - fu), (ONE - fv) * fu
+        s10, s11 = fv * (ONE - fu), fv * fu
+        a, b = field[row, column], field[row, column + 1]
+        c, d = field[row + 1, column], field[row + 1, column + 1]
+        more = s00 * a[0] + s01 * b[0] + s10 * c[0] + s11 * d[0]
+        shift = s00 * a[1] + s01 * b[1] + s10 * c[1] + s11 * d[1]
+        r[k] -= more * buf[GREY, k] + shift
+        factor = ONE + more / gain
+        buf[GREY, k] = factor * buf[GREY, k] + shift / gain
+        buf[GX, k] *= factor
+        buf[GY, k] *= factor

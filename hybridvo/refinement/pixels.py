@@ -92,18 +92,8 @@ class PixelGrid:
 
     def usable_box(self) -> tuple[int, tuple[int, int, int, int]]:
         """(number of usable pixels, their bounding box) of the full grid."""
-        depth, flow, flow_variance, depth_variance, weights, valid = self.data
-        with np.errstate(invalid="ignore"):
-            usable = (depth > kernels.MIN_DEPTH) & (depth < kernels.MAX_VALUE)
-            usable &= (np.abs(flow) < kernels.MAX_VALUE).all(axis=2)
-            if self.flags & kernels.HAS_FLOW_VARIANCE:
-                usable &= (flow_variance > 0) & (flow_variance < kernels.MAX_VALUE)
-            if self.flags & kernels.HAS_DEPTH_VARIANCE:
-                usable &= (depth_variance >= 0) & (depth_variance < kernels.MAX_VALUE)
-            if self.flags & kernels.HAS_WEIGHTS:
-                usable &= (weights > 0) & (weights < kernels.MAX_VALUE)
-        if self.flags & kernels.HAS_VALID:
-            usable &= valid
+        buffer, height, width = self.strided(1)
+        usable = buffer[kernels.W, : height * width].reshape(height, width) > 0
         count = int(np.count_nonzero(usable))
         if count == 0:
             return 0, (0, 0, 0, 0)
@@ -250,24 +240,23 @@ def coarse_grid(
     if usable < MIN_USABLE * h * w or usable < MIN_USABLE_PIXELS:
         count, box = pixels.usable_box()
         if count < options.min_pixels:
-            return _too_few(pair, count, options.min_pixels)
+            why = too_few(pair.prev.depth, pair.flow, count, options.min_pixels)
+            return RelativePose.failed(*why, "refine")
         pixels.crop(pair.prev.camera, pair.curr.camera, box)
         samples, h, w, stride = pixels.samples(options.coarse_pixels)
     return CoarseGrid(pixels, samples, (h, w, stride), size, box)
 
 
-def _too_few(pair: FramePair, count: int, minimum: int) -> RelativePose:
-    """The failure that names what is missing."""
-    depth, flow = np.asarray(pair.prev.depth), np.asarray(pair.flow)
+def too_few(depth: np.ndarray, flow: np.ndarray, count: int, minimum: int) -> tuple[Reason, str]:
+    """Reason and words for a pair with ``count`` usable pixels, fewer than the ``minimum``."""
     with np.errstate(invalid="ignore"):
         depths = int(np.count_nonzero((depth > kernels.MIN_DEPTH) & (depth < kernels.MAX_VALUE)))
         flows = int(np.count_nonzero((np.abs(flow) < kernels.MAX_VALUE).all(axis=2)))
-    reason, what = Reason.LOW_INLIERS, f"{count} usable pixels"
     if depths < minimum:
-        reason, what = Reason.NO_VALID_DEPTH, f"{depths} pixels with valid depth"
-    elif flows < minimum:
-        reason, what = Reason.NO_FLOW, f"{flows} pixels with valid flow"
-    return RelativePose.failed(reason, f"{what}, {minimum} needed", "refine")
+        return Reason.NO_VALID_DEPTH, f"{depths} pixels with valid depth, {minimum} needed"
+    if flows < minimum:
+        return Reason.NO_FLOW, f"{flows} pixels with valid flow, {minimum} needed"
+    return Reason.LOW_INLIERS, f"{count} usable pixels, {minimum} needed"
 
 
 def as_contiguous(array: np.ndarray, dtype: Any = None) -> np.ndarray:

@@ -12,18 +12,16 @@ from typing import Any
 
 import numpy as np
 
+from hybridvo.calibration import MIN_TILES, WEAK_RATIO
 from hybridvo.geometry import invert, se3_log
 from hybridvo.options import RefineOptions
 from hybridvo.refinement.coarse_fit import fit_coarse
-from hybridvo.refinement.full_fit import MIN_TILES, FullFit, fit_full_grid
+from hybridvo.refinement.covariance import direction_is_known
+from hybridvo.refinement.full_fit import FullFit, fit_full_grid
 from hybridvo.refinement.pixels import CoarseGrid, coarse_grid
 from hybridvo.results import Hypothesis, Reason, RelativePose, Status
 from hybridvo.types import FramePair
 
-WEAK_RATIO = 2e-5
-"""Ratio of the information's extreme eigenvalues below which errors that neighbours share, and that
-the covariance of one small patch cannot know of, decide a direction: degraded. A frontal plane over
-a field of view of 20 degrees has 1e-4, a patch of 20 px at fx = 1120 has 1e-5."""
 MIN_INLIER_RATIO = 0.02
 """Share of the pixels that must follow the motion, else it is none."""
 LOW_INLIER_RATIO = 0.25
@@ -104,12 +102,11 @@ def refine_pair(
         return RelativePose.failed(*failure, **common)
     status = _status(fit, share, context)
     covariance = _with_doubt(fit)
-    spread = np.sqrt(max(np.linalg.eigvalsh(covariance[:3, :3])[-1], 0.0))
     return RelativePose(
         T_curr_prev=fit.T,
         covariance=covariance,
         status=status,
-        translation_direction_valid=bool(np.linalg.norm(fit.T[:3, 3]) > 3 * spread),
+        translation_direction_valid=direction_is_known(fit.T, covariance),
         probability=context.probability,
         **common,
     )

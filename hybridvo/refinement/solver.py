@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from scipy.linalg.lapack import dpotrf, dpotri
 
 from hybridvo.geometry import invert, se3_exp, se3_log
 
@@ -145,12 +146,12 @@ def positive_inverse(matrix: np.ndarray) -> np.ndarray | None:
     diagonal = np.diag(matrix)
     if not (np.isfinite(matrix).all() and (diagonal > 0).all()):
         return None
-    scale = np.sqrt(diagonal)
-    try:
-        root = np.linalg.inv(np.linalg.cholesky(matrix / np.outer(scale, scale))) / scale
-    except np.linalg.LinAlgError:
+    scale = 1 / np.sqrt(diagonal)
+    root, failed = dpotrf(matrix * np.outer(scale, scale), lower=1)
+    if failed:
         return None
-    inverse = root.T @ root
+    lower = np.tril(dpotri(root, lower=1)[0]) * np.outer(scale, scale)
+    inverse = lower + lower.T - np.diag(np.diag(lower))
     return inverse if np.isfinite(inverse).all() else None
 
 

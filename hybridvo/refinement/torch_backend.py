@@ -24,38 +24,44 @@ from hybridvo.options import RefineOptions
 from hybridvo.refinement.batch import (
     DEPTH_CURR_FLOOR,
     BatchedPose,
-    BatchOptions,
+    Pixels,
     checked_batch,
+    from_tiles,
+    gather_pixels,
     given_noise,
     initial_poses,
-    status_of,
+    tile_grid,
 )
+from hybridvo.refinement.coarse_fit import DAMPING
 from hybridvo.refinement.covariance import NOTHING, UPPER, sandwich_covariance
-from hybridvo.refinement.noise import estimate_noise
+from hybridvo.refinement.full_fit import FLOW_ROUNDING, SOLVER, pair_noise, tile_size
+from hybridvo.refinement.pixels import CoarseGrid, coarse_grid, too_few
+from hybridvo.refinement.refine import LOW_INLIER_RATIO, MIN_INLIER_RATIO
 from hybridvo.refinement.torch_factors import (
     KERNELS,
     Linearization,
     RobustNoise,
     linearize,
+    newton_matrix,
     residuals,
     score_sum,
+    solve_small,
 )
-from hybridvo.refinement.torch_pixels import Pixels, from_tiles, gather_pixels, tile_grid
-from hybridvo.torch_geometry import left_update, pp
-from hybridvo.types import PairBatch
+from hybridvo.results import Reason, RelativePose, Status
+from hybridvo.torch_geometry import left_update, pp, weighted_median
+from hybridvo.types import Camera, Frame, FramePair, PairBatch
 
-MIN_DAMPING = 1e-6
-"""Share of the diagonal of the normal equations that is added to it."""
-GNC_RATIO = 0.7
-"""Factor from one scale of the graduated kernel to the next."""
-INITIAL_NOISE = (0.7, 0.01)
-"""px and of log depth, where the noise estimate begins."""
-DEPTH_NOISE_CAP = 0.08
-INLIER_DISTANCE2 = 9.0
+SUBSET_PIXELS = 2048
+"""Pixels on which starts are refined."""
+LARGEST_PX, SMALLEST_PX, GNC_RATIO = 64.0, 0.4, 0.7
+"""Largest and last scale of the graduated kernel, px, and factor from one to the next."""
+STEPS = 20
+"""Most Newton steps on all pixels."""
 ROUNDED_STEP = 0.05
 """Steps below, in standard deviations of the noise, that no longer shrink are rounding."""
-FLOW_ROUNDING = 2e-5
-"""px; single precision at a coordinate of 300."""
+INLIER_DISTANCE2 = 9.0
+MIN_PROBABILITY = 0.8
+"""Below which a motion is degraded; 0.8 is a rival with half of the motion's own weight."""
 
 
 def refine_batch(
@@ -66,7 +72,7 @@ def refine_batch(
     noise: Any = None,
     kernel: str = "geman-mcclure",
     gradient: str = "implicit",
-    options: BatchOptions | RefineOptions | None = None,
+    options: RefineOptions | None = None,
 ) -> BatchedPose:
     """Camera motion of every pair of a batch by robust dense reprojection.
 
@@ -86,7 +92,8 @@ def refine_batch(
         gradient: ``implicit`` attaches the gradient to flow, depth, intrinsics, variances, weights
             and noise where one of them requires it, ``none`` does not. T_init has none: the
             estimate does not depend on it.
-        options: of the batch, or those of the refinement of one pair.
+        options: of the refinement; ``cutoff`` is that of the kernel ``geman-mcclure``, and the
+            current frame's depth is a third residual where ``current_depth`` is ``on``.
 
     Returns:
         Poses with covariance and a status per sample. Bad data give a failed status for that very
@@ -96,81 +103,40 @@ def refine_batch(
     Raises:
         InputError: shapes, types or options that cannot be used.
     """
-    if isinstance(options, RefineOptions):
-        options = BatchOptions.of(options, kernel)
-    options = options or BatchOptions()
-    if not isinstance(batch, PairBatch) or not isinstance(options, BatchOptions):
+    options = options or RefineOptions()
+    if not isinstance(batch, PairBatch) or not isinstance(options, RefineOptions):
         raise InputError(
-            f"refine_batch: expected a PairBatch and BatchOptions or RefineOptions, got "
-            f"{type(batch).__name__} and {options!r}."
+            f"refine_batch: expected a PairBatch and RefineOptions, got {type(batch).__name__} and "
+            f"{options!r}."
         )
     if kernel not in KERNELS:
         raise InputError(f"refine_batch: unknown kernel {kernel!r}; known: {', '.join(KERNELS)}.")
     if gradient not in ("implicit", "none"):
         raise InputError(f"refine_batch: expected gradient implicit or none, got {gradient!r}.")
-    batch, weights = checked_batch(batch, weights, options.use_depth_curr)
+    with_depth = options.current_depth == "on"
+    batch, weights = checked_batch(batch, weights, with_depth)
     starts = initial_poses(T_init, batch.flow, alone=weights is not None)
-    given = given_noise(noise, batch.flow, options.use_depth_curr)
+    given = given_noise(noise, batch.flow, with_depth)
     tensors = (*vars(batch).values(), weights, given)
     wanted = gradient == "implicit" and torch.is_grad_enabled()
     wanted = wanted and any(x is not None and x.requires_grad for x in tensors)
-    cutoff = KERNELS[kernel].cutoff if options.cutoff is None else float(options.cutoff)
     height, width = batch.depth_prev.shape[1:]
-    tile = int(np.clip(round(np.sqrt(height * width / options.tiles)), 8, 64))
+    tile = tile_size((height, width), options.tiles)
     with torch.autocast(batch.flow.device.type, enabled=False):
         with torch.no_grad():
-            pixels = gather_pixels(batch, weights, options.use_depth_curr, tile)
-            solver = _Solver(pixels, (height, width), tile, kernel, cutoff, options)
-            result = solver.solve(batch, starts, given, tight=wanted)
+            pixels = gather_pixels(batch, weights, with_depth, tile)
+            solver = _Solver(batch, weights, pixels, tile, kernel, options)
+            result = solver.solve(starts, given, tight=wanted)
         if not wanted:
             return result
-        pixels = gather_pixels(batch, weights, options.use_depth_curr, tile)
-        how = RobustNoise(result.noise if given is None else given, kernel, cutoff)
-        T = left_update(_zero_step(pixels, result, how), result.SE3)
-    return replace(result, SE3=T)
-
-
-def _zero_step(pixels: Pixels, result: BatchedPose, how: RobustNoise) -> torch.Tensor:
-    """(B, 6) Newton step of value zero and with the gradient A^-1 dg."""
-    T = result.SE3.detach()
-    A = newton_matrix(pixels.map(torch.Tensor.detach), T, how)
-    step, solved = solve_small(A, score_sum(pixels, T, how))
-    step = torch.where((solved & ~result.failed)[:, None], step, torch.zeros_like(step))
-    return step - step.detach()
-
-
-def newton_matrix(pixels: Pixels, T: pp.LieTensor, how: RobustNoise) -> torch.Tensor:
-    """A = -dg / d xi at pypose SE3 poses, (B, 6, 6), not symmetric; A xi = g is the Newton step."""
-    how = how._replace(noise=how.noise.detach())
-    pixels = replace(pixels, K=pixels.K.detach())
-    with torch.enable_grad():
-        xi = torch.zeros(len(T), 6, dtype=T.dtype, device=T.device, requires_grad=True)
-        g = score_sum(pixels, T, how, xi)
-        rows = [torch.autograd.grad(g[:, k].sum(), xi, retain_graph=True)[0] for k in range(6)]
-    return -torch.stack(rows, dim=1)
-
-
-def solve_small(
-    A: torch.Tensor, b: torch.Tensor, damping: torch.Tensor | float = 0.0
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Solve ((A + damping diag A) x = b) for (B, 6, 6) systems in float64, each for itself.
-
-    Returns:
-        (B, 6) float64 solutions and (B,) bool; where False (singular, or not finite) they are zero.
-    """
-    A, b = A.double(), b.double()
-    unit = torch.eye(A.shape[1], dtype=A.dtype, device=A.device)
-    scale = A.diagonal(dim1=1, dim2=2).abs().sqrt()
-    good = torch.isfinite(A).flatten(1).all(dim=1) & torch.isfinite(b).all(dim=1)
-    good = good & (scale > 1e-15).all(dim=1)
-    scale = torch.where(good[:, None], scale, torch.ones_like(scale))
-    b = torch.where(good[:, None], b, torch.zeros_like(b))
-    damping = torch.as_tensor(damping, dtype=A.dtype, device=A.device).reshape(-1, 1, 1)
-    A = A / (scale[:, :, None] * scale[:, None, :]) + damping * unit
-    x, info = torch.linalg.solve_ex(torch.where(good[:, None, None], A, unit), b / scale)
-    x = x / scale
-    good = good & (info == 0) & (x.abs() < 1e6).all(dim=1)
-    return torch.where(good[:, None], x, torch.zeros_like(x)), good
+        pixels = gather_pixels(batch, weights, with_depth, tile)
+        how = solver.how(result.noise if given is None else given)
+        # a Newton step of value zero, and with the gradient A^-1 dg
+        T = result.SE3.detach()
+        A = newton_matrix(pixels.map(torch.Tensor.detach), T, how)
+        step, solved = solve_small(A, score_sum(pixels, T, how))
+        step = torch.where((solved & ~result.failed)[:, None], step, torch.zeros_like(step))
+        return replace(result, SE3=left_update(step - step.detach(), T))
 
 
 class _Solver:
@@ -178,58 +144,47 @@ class _Solver:
 
     def __init__(
         self,
+        batch: PairBatch,
+        weights: torch.Tensor | None,
         pixels: Pixels,
-        shape: tuple[int, int],
         tile: int,
         kernel: str,
-        cutoff: float,
-        options: BatchOptions,
+        options: RefineOptions,
     ) -> None:
-        self.pixels, self.kernel, self.cutoff, self.options = pixels, kernel, cutoff, options
-        self.tile = tile
-        self.tiles, self.run = tile_grid(shape, tile)
-        self.few = pixels.subset(options.subset_pixels)
+        self.batch, self.external, self.pixels = batch, weights, pixels
+        self.tile, self.kernel, self.options = tile, kernel, options
+        self.cutoff = options.cutoff if kernel == "geman-mcclure" else KERNELS[kernel].cutoff
+        height, width = batch.depth_prev.shape[1:]
+        self.tiles, self.run = tile_grid((height, width), tile)
+        self.few = pixels.subset(SUBSET_PIXELS)
         self.planar = replace(self.few, log_depth_curr=None, has_depth_curr=None)
 
-    def solve(
-        self, batch: PairBatch, starts: pp.LieTensor, given: torch.Tensor | None, tight: bool
-    ) -> BatchedPose:
-        """From the starts to the pose of every sample, with covariance and status."""
-        end = self.few.weight.new_full((len(starts),), self.options.smallest_px)
+    def how(self, noise: torch.Tensor) -> RobustNoise:
+        """The kernel at a noise."""
+        return RobustNoise(noise, self.kernel, self.cutoff)
+
+    def solve(self, starts: pp.LieTensor, given: torch.Tensor | None, tight: bool) -> BatchedPose:
+        """From the starts (B, S, 7) to the pose of every sample, with covariance and status."""
+        end = self.few.weight.new_full((len(starts),), SMALLEST_PX)
         if given is not None:
             end = torch.maximum(end, given[:, 0].detach())
         T = self._graduate(starts, end)
         own, rival = self._shares(T, end)
         T, noise = self._fit_subset(T, given)
-        how = RobustNoise(noise, self.kernel, self.cutoff)
-        curvature, meat = self._curvature(T, how)
-        T, last, converged, iterations = self._fit_all(T, how, curvature, tight)
-        height, width = batch.depth_prev.shape[1:]
+        curvature, meat = self._curvature(T, self.how(noise))
+        T, last, converged, iterations = self._fit_all(T, self.how(noise), curvature, tight)
         near = (last.weights > 0) & (last.distance2 <= INLIER_DISTANCE2)
         weight = self.pixels.weight
         total = weight.sum(dim=1).clamp(min=1e-30)
         ratio = torch.nan_to_num((weight * near).sum(dim=1) / total)
         covariance, definite = self._covariance(T, last, noise, curvature, meat)
-        finite = torch.isfinite(T.tensor()).all(dim=1)
-        usable = (weight > 0).sum(dim=1)
-        lost = ratio < self.options.min_inlier_ratio
-        failed = (usable < self.options.min_pixels) | ~definite | ~finite | lost
         probability = own**2 / (own**2 + rival**2).clamp(min=1e-12)
-        probability = torch.where(failed, torch.zeros_like(own), probability)
         status = [
-            status_of(
-                batch,
-                k,
-                self.options,
-                usable=int(usable[k]),
-                definite=bool(definite[k] & finite[k]),
-                converged=bool(converged[k]),
-                inlier_ratio=float(ratio[k]),
-                rival_ratio=float(rival[k]),
-                probability=float(probability[k]),
-            )
+            self._status(k, bool(definite[k]), bool(converged[k]), float(ratio[k]),
+                         float(rival[k]), float(probability[k]))
             for k in range(len(T))
-        ]
+        ]  # fmt: skip
+        failed = torch.tensor([not s.usable for s in status], device=T.device)
         identity = pp.identity_SE3(len(T), dtype=T.dtype, device=T.device)
         nothing = torch.as_tensor(NOTHING, dtype=weight.dtype, device=T.device)
         return BatchedPose(
@@ -238,10 +193,12 @@ class _Solver:
             converged=converged & ~failed,
             failed=failed,
             status=status,
-            probability=probability,
+            probability=torch.where(failed, torch.zeros_like(own), probability),
             iterations=iterations,
             cost=torch.nan_to_num(last.cost / total),
-            weights=torch.nan_to_num(from_tiles(last.weights, self.tile, height, width)),
+            weights=torch.nan_to_num(
+                from_tiles(last.weights, self.tile, *self.batch.depth_prev.shape[1:])
+            ),
             noise=torch.where(torch.isfinite(noise), noise, torch.ones_like(noise)),
             inlier_ratio=ratio,
         )
@@ -270,11 +227,11 @@ class _Solver:
         at = residuals(pixels, T)
         length = (at.r[0].square() + at.r[1].square()).sqrt()
         scale = 1.5 * weighted_median(length, pixels.weight * at.front, 1.0)
-        scale = torch.maximum(scale.clamp(1.0, self.options.largest_px), end)
+        scale = torch.maximum(scale.clamp(1.0, LARGEST_PX), end)
         going = torch.ones_like(scale, dtype=torch.bool)
         while bool(going.any()):
             H, g = linearize(pixels, T, self._isotropic(scale)).total()
-            step, _ = solve_small(H, g, MIN_DAMPING)
+            step, _ = solve_small(H, g, DAMPING)
             T = left_update(torch.where(going[:, None], step, torch.zeros_like(step)), T)
             going = going & (scale > end)
             scale = torch.maximum(scale * GNC_RATIO, end)
@@ -300,43 +257,57 @@ class _Solver:
     def _fit_subset(
         self, T: pp.LieTensor, given: torch.Tensor | None
     ) -> tuple[pp.LieTensor, torch.Tensor]:
-        """Noise and pose on the subset, in turn."""
-        few = self.few
-        if given is not None:
-            noise = given.detach()
-            return self._descend(T, RobustNoise(noise, self.kernel, self.cutoff), 6), noise
-        noise = few.weight.new_tensor(INITIAL_NOISE).repeat(len(T), 1)
+        """Noise and pose, in turn; the noise is that of the coarse grid of the numba refinement."""
+        noise = self.few.weight.new_tensor([0.5, 0.01]).repeat(len(T), 1)
+        grids = self._grids() if given is None else []
         for steps in (2, 3, 3):
-            noise = self._depth_curr_noise(T, self._noise(T, noise))
-            T = self._descend(T, RobustNoise(noise, self.kernel, self.cutoff), steps)
-        return T, self._depth_curr_noise(T, self._noise(T, noise))
+            noise = self._noise(grids, T, noise) if given is None else given.detach()
+            for _ in range(steps):
+                H, g = linearize(self.few, T, self.how(noise)).total()
+                T = left_update(solve_small(H, g, DAMPING)[0], T)
+        return T, self._noise(grids, T, noise) if given is None else noise
 
-    def _descend(self, T: pp.LieTensor, how: RobustNoise, steps: int) -> pp.LieTensor:
-        """Gauss-Newton steps on the subset."""
-        for _ in range(steps):
-            H, g = linearize(self.few, T, how).total()
-            T = left_update(solve_small(H, g, MIN_DAMPING)[0], T)
-        return T
-
-    def _noise(self, T: pp.LieTensor, noise: torch.Tensor) -> torch.Tensor:
-        """(B, 2) flow noise in px and noise of log depth, by the numba estimator."""
-        few, poses = self.planar, T.matrix().cpu().numpy()
-        rays = few.points[:, :2] / few.points[:, 2:]
-        rows = torch.cat([rays, few.points[:, 2:], few.target], dim=1)
-        rest = [1 / few.flow_variance, few.depth_variance, few.weight]
-        buffers = torch.cat([rows, torch.stack(rest, dim=1)], dim=1).float().cpu().numpy()
-        K = few.K[:, [0, 1, 0, 1], [0, 1, 2, 2]].float().cpu().numpy()
-        out = []
-        for k, (sf, sd) in enumerate(noise[:, :2].double().tolist()):
-            pose, count = np.ascontiguousarray(poses[k, :3]), buffers.shape[2]
-            if not np.isfinite(pose).all():
-                out.append((sf, sd))
+    def _grids(self) -> list[tuple[FramePair, CoarseGrid] | None]:
+        """Each sample as a pair in numpy with its coarse grid; None where too little is usable."""
+        values: dict[str, Any] = {
+            name: None if x is None else x.cpu().numpy()
+            for name, x in (*vars(self.batch).items(), ("weights", self.external))
+        }
+        for name, x in values.items():
+            if x is not None and x.dtype != np.bool_:
+                values[name] = x.astype(np.float32)
+        out: list[tuple[FramePair, CoarseGrid] | None] = []
+        for k in range(len(self.batch.flow)):
+            one: dict[str, Any] = {n: None if x is None else x[k] for n, x in values.items()}
+            shape = one["depth_prev"].shape
+            try:
+                prev, curr = (Camera.from_matrix(one[K], *shape) for K in ("K_prev", "K_curr"))
+            except InputError:
+                out.append(None)
                 continue
-            found = estimate_noise(
-                buffers[k], count, pose, K[k], sf, sd, 1e3, DEPTH_NOISE_CAP, 6, count
-            )
-            out.append(found[:2] if np.isfinite(found[:2]).all() else (sf, sd))
-        return noise.new_tensor(out)
+            pair = FramePair(
+                Frame(None, one["depth_prev"], prev, depth_variance=one["depth_variance"]),
+                Frame(None, one["depth_curr"], curr),
+                one["flow"], one["flow_variance"], one["valid"],
+            )  # fmt: skip
+            grid = coarse_grid(pair, one["weights"], self.options)
+            out.append(None if isinstance(grid, RelativePose) else (pair, grid))
+        return out
+
+    def _noise(
+        self,
+        grids: list[tuple[FramePair, CoarseGrid] | None],
+        T: pp.LieTensor,
+        noise: torch.Tensor,
+    ) -> torch.Tensor:
+        """(B, 2) or (B, 3) noise at a pose, by the numba estimator."""
+        out = []
+        for known, pose, start in zip(grids, T.matrix().cpu().numpy(), noise.tolist(), strict=True):
+            found = start[:2]
+            if known is not None and np.isfinite(pose).all():
+                found = list(pair_noise(*known, pose[:3], (start[0], start[1]), self.options)[:2])
+            out.append(found if np.isfinite(found).all() else start[:2])
+        return self._depth_curr_noise(T, noise.new_tensor(out))
 
     def _depth_curr_noise(self, T: pp.LieTensor, noise: torch.Tensor) -> torch.Tensor:
         """(B, 3): the noise of log D_curr from the spread of r_z that sd h does not explain.
@@ -375,17 +346,17 @@ class _Solver:
     ) -> tuple[pp.LieTensor, Linearization, torch.Tensor, torch.Tensor]:
         """Newton steps on all pixels: (pose, last equations, converged, steps).
 
-        ``tight``: down to the precision of the numbers, which a gradient needs, from the third step
-        on with the full derivative of the equations in place of the curvature of the subset.
+        Ends as the numba refinement does; ``tight``: at the precision of the numbers, which a
+        gradient needs, from the third step on with the full derivative of the equations in place of
+        the curvature of the subset.
         """
-        pixels, options = self.pixels, self.options
+        pixels = self.pixels
         weight = pixels.weight.double().sum(dim=1)[:, None, None]
-        enough = 8 * torch.finfo(weight.dtype).eps if tight else options.tolerance
+        rounding = 8 * torch.finfo(pixels.weight.dtype).eps
         best = torch.full((len(T),), torch.inf, dtype=torch.float64, device=T.device)
         done, converged = best < 0, best < 0
-        iterations = done.long()
-        matrix = None
-        for k in range(options.iterations):
+        iterations, matrix = done.long(), None
+        for k in range(STEPS):
             now = linearize(pixels, T, how, self.run)
             H, g = now.total()
             if tight and k % 3 == 2:  # anew, for samples that were far when it was made
@@ -397,15 +368,15 @@ class _Solver:
             # (near the solution the full derivative may be much flatter than H, and is right)
             longest = 4 if matrix is None else 100
             good = good & (ahead > 0) & (_energy(step, H) <= longest * ahead)
-            plain, solved = solve_small(H, g, MIN_DAMPING)
+            plain, solved = solve_small(H, g, DAMPING)
             step = torch.where(good[:, None], step, plain)
             step = torch.where(done[:, None], torch.zeros_like(step), step)
-            moved = (_energy(step, H) / now.weight_sum.double().clamp(min=1e-12)).sqrt()
+            length2 = _energy(step, H)
+            moved = (length2 / now.weight_sum.double().clamp(min=1e-12)).sqrt()
             T, iterations = left_update(step, T), iterations + (~done).long()
-            rounded = (
-                (moved > 0.5 * best) & (moved < ROUNDED_STEP) & ((good & (k > 3)) | (not tight))
-            )
-            converged = converged | (~done & solved & ((moved < enough) | rounded))
+            last = moved < rounding if tight else length2 < SOLVER.tolerance**2
+            last |= (moved > 0.5 * best) & (moved < ROUNDED_STEP) & ((good & (k > 3)) | (not tight))
+            converged = converged | (~done & solved & last)
             best = torch.where(done, best, torch.minimum(best, moved))
             done = converged | ~solved
             if bool(done.all()):
@@ -421,60 +392,64 @@ class _Solver:
         meat: torch.Tensor,
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Sandwich covariance (B, 6, 6) by the numpy function, and whether it is definite (B,)."""
-        weight = self.pixels.weight
+        weight = self.pixels.weight.double().sum(dim=1)
         depth = weighted_median(self.few.points[:, 2], self.few.weight, 1.0)
+        tiles = torch.cat([last.H[..., UPPER[0], UPPER[1]], last.g], dim=2).double()
+        parallax = self.pixels.K[:, 0, 0] * T.translation().norm(dim=1) / depth
+        variance = noise[:, 0].square() + (parallax * noise[:, 1]).square()
         arrays = [
             x.double().cpu().numpy()
-            for x in (last.H, last.g, curvature, meat, depth, noise, weight.sum(dim=1),
-                      self.pixels.K[:, 0, 0], T.translation())
+            for x in (tiles, curvature * weight[:, None, None], meat * weight[:, None, None],
+                      1 / depth, weight * FLOW_ROUNDING**2 / variance, T.matrix()[:, :3], noise)
         ]  # fmt: skip
-        found = [
-            _one_covariance(self.tiles, *(x[k] for x in arrays)) for k in range(len(T))
-        ]  # fmt: skip
-        covariance = torch.as_tensor(np.stack([c for c, _ in found]), device=weight.device)
-        return covariance, torch.tensor([ok for _, ok in found], device=weight.device)
+        found = []
+        for k in range(len(T)):
+            *sums, pose, (_, sd, *_) = (x[k] for x in arrays)
+            if not all(np.isfinite(x).all() for x in (*sums, pose)):
+                found.append((NOTHING, False))
+                continue
+            covariance, _, definite = sandwich_covariance(
+                sums[0].reshape(*self.tiles, 27), *sums[1:]
+            )
+            # as in the numba refinement: log depth or depth
+            covariance[:3, :3] += (0.5 * sd**2) ** 2 * np.outer(pose[:, 3], pose[:, 3])
+            found.append((covariance, definite))
+        covariances = torch.as_tensor(np.stack([c for c, _ in found]), device=T.device)
+        return covariances, torch.tensor([ok for _, ok in found], device=T.device)
 
-
-def _one_covariance(
-    shape: tuple[int, int],
-    information: np.ndarray,
-    scores: np.ndarray,
-    curvature: np.ndarray,
-    meat: np.ndarray,
-    depth: float,
-    noise: np.ndarray,
-    weight: float,
-    focal: float,
-    translation: np.ndarray,
-) -> tuple[np.ndarray, bool]:
-    """Covariance of one sample from the sums of its tiles, and whether it is definite."""
-    if not all(np.isfinite(x).all() for x in (information, scores, curvature, meat, translation)):
-        return NOTHING, False
-    tiles = np.concatenate([information[:, UPPER[0], UPPER[1]], scores], axis=1)
-    sf, sd = noise[:2]
-    parallax = focal * np.linalg.norm(translation) / depth
-    covariance, _, definite = sandwich_covariance(
-        tiles.reshape(*shape, 27),
-        curvature * weight,
-        meat * weight,
-        1 / depth,
-        weight * FLOW_ROUNDING**2 / (sf**2 + (parallax * sd) ** 2),
-    )
-    # whether depth errs about its log, its value or its inverse is not known: the translation's
-    # length is uncertain by half the variance of log depth
-    covariance[:3, :3] += (0.5 * sd**2) ** 2 * np.outer(translation, translation)
-    return covariance, definite
+    def _status(
+        self,
+        k: int,
+        definite: bool,
+        converged: bool,
+        inlier_ratio: float,
+        rival_ratio: float,
+        probability: float,
+    ) -> Status:
+        """Status of a sample."""
+        batch, usable = self.batch, int((self.pixels.weight[k] > 0).sum())
+        if usable < self.options.min_pixels:
+            for name, K in (("K_prev", batch.K_prev[k]), ("K_curr", batch.K_curr[k])):
+                if not bool(torch.isfinite(K).all()) or not bool((K.diagonal() > 0).all()):
+                    return Status.failed(Reason.NAN_INPUT, f"{name} is no camera matrix")
+            depth, flow = (x[k].detach().cpu().numpy() for x in (batch.depth_prev, batch.flow))
+            return Status.failed(*too_few(depth, flow, usable, self.options.min_pixels))
+        if not definite:
+            what = "the pixels leave a direction of the motion undetermined"
+            return Status.failed(Reason.DEGENERATE_GEOMETRY, what)
+        share = f"{100 * inlier_ratio:.1f} % of the pixels follow"
+        if inlier_ratio < MIN_INLIER_RATIO:
+            return Status.failed(Reason.LOW_INLIERS, f"{share} one motion")
+        if not converged:
+            return Status.degraded(Reason.SOLVER_DIVERGED, f"not converged after {STEPS} steps")
+        if probability < MIN_PROBABILITY:
+            what = f"{share} this motion, {100 * rival_ratio:.1f} % another one"
+            return Status.degraded(Reason.AMBIGUOUS_MOTION, what)
+        if inlier_ratio < LOW_INLIER_RATIO:
+            return Status.degraded(Reason.LOW_INLIERS, f"only {share} the motion")
+        return Status()
 
 
 def _energy(step: torch.Tensor, H: torch.Tensor) -> torch.Tensor:
     """(B,) step^T H step."""
     return torch.einsum("bi,bij,bj->b", step, H, step).clamp(min=0)
-
-
-def weighted_median(x: torch.Tensor, weight: torch.Tensor, default: float) -> torch.Tensor:
-    """(B,) median of (B, N) values under weights; ``default`` where nothing has any."""
-    ordered, index = x.sort(dim=1)
-    reached = weight.gather(1, index).cumsum(dim=1)
-    middle = (reached < 0.5 * reached[:, -1:]).sum(dim=1, keepdim=True).clamp(max=x.shape[1] - 1)
-    value = ordered.gather(1, middle)[:, 0]
-    return torch.where(reached[:, -1] > 0, value, torch.full_like(value, default))

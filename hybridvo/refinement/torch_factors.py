@@ -29,11 +29,10 @@ from typing import NamedTuple
 
 import torch
 
-from hybridvo.refinement.torch_pixels import Pixels
-from hybridvo.torch_geometry import MIN_DEPTH, left_update, move, pp, project
+from hybridvo.refinement.batch import Pixels
+from hybridvo.refinement.kernels import MAX_SHIFT
+from hybridvo.torch_geometry import MIN_DEPTH, left_update, move, pp, project, projection_rows
 
-MAX_SHIFT = 0.3
-"""Largest correction of log depth that an outlier may cause, as in the numba kernels."""
 BEHIND_DISTANCE2 = 1e4
 """Squared Mahalanobis distance at which a pixel behind the camera is charged."""
 
@@ -155,7 +154,7 @@ def at_likely_depth(pixels: Pixels, at: Residuals, noise: torch.Tensor) -> Resid
     a + e q_u / fx, b + e q_v / fy, i (1 - h e).
     """
     white = whitening(pixels, at, noise)
-    e = (white.kappa * _dot(white.Du, at.r)).clamp(-MAX_SHIFT, MAX_SHIFT)
+    e = (white.kappa * _dot(white.Du, at.r)).clamp(-float(MAX_SHIFT), float(MAX_SHIFT))
     a = at.a + at.u[0] * e / pixels.K[:, 0, 0, None]
     b = at.b + at.u[1] * e / pixels.K[:, 1, 1, None]
     i = at.i * (1 - (1 - at.t[:, 2] * at.i) * e)
@@ -164,16 +163,12 @@ def at_likely_depth(pixels: Pixels, at: Residuals, noise: torch.Tensor) -> Resid
 
 def jacobian(pixels: Pixels, at: Residuals) -> tuple[torch.Tensor, ...]:
     """Rows d prediction / d delta, each (B, 6, N): u, v and, with the depth, log Z'."""
-    a, b, i = at.a, at.b, at.i
-    fx, fy = pixels.K[:, 0, 0, None, None], pixels.K[:, 1, 1, None, None]
-    zero, ab = torch.zeros_like(a), a * b
-    rows = (
-        fx * torch.stack([i, zero, -a * i, -ab, 1 + a * a, -b], dim=1),
-        fy * torch.stack([zero, i, -b * i, -1 - b * b, ab, a], dim=1),
-    )
+    u, v = projection_rows(at.a, at.b, at.i)
+    rows = pixels.K[:, 0, 0, None, None] * u, pixels.K[:, 1, 1, None, None] * v
     if pixels.log_depth_curr is None:
         return rows
-    return (*rows, torch.stack([zero, zero, i, b, -a, zero], dim=1))
+    zero = torch.zeros_like(at.a)
+    return (*rows, torch.stack([zero, zero, at.i, at.b, -at.a, zero], dim=1))
 
 
 class RobustNoise(NamedTuple):
@@ -275,3 +270,37 @@ def score_sum(
     w = torch.where(at.front & (pixels.weight > 0), pixels.weight, torch.zeros_like(distance2))
     w = w * KERNELS[how.kernel].weight(distance2, how.cutoff**2)
     return _dot(jacobian(pixels, at), [(w * m)[:, None] for m in n]).sum(dim=2)
+
+
+def newton_matrix(pixels: Pixels, T: pp.LieTensor, how: RobustNoise) -> torch.Tensor:
+    """A = -dg / d xi at pypose SE3 poses, (B, 6, 6), not symmetric; A xi = g is the Newton step."""
+    how = how._replace(noise=how.noise.detach())
+    pixels = replace(pixels, K=pixels.K.detach())
+    with torch.enable_grad():
+        xi = torch.zeros(len(T), 6, dtype=T.dtype, device=T.device, requires_grad=True)
+        g = score_sum(pixels, T, how, xi)
+        rows = [torch.autograd.grad(g[:, k].sum(), xi, retain_graph=True)[0] for k in range(6)]
+    return -torch.stack(rows, dim=1)
+
+
+def solve_small(
+    A: torch.Tensor, b: torch.Tensor, damping: torch.Tensor | float = 0.0
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Solve ((A + damping diag A) x = b) for (B, 6, 6) systems in float64, each for itself.
+
+    Returns:
+        (B, 6) float64 solutions and (B,) bool; where False (singular, or not finite) they are zero.
+    """
+    A, b = A.double(), b.double()
+    unit = torch.eye(A.shape[1], dtype=A.dtype, device=A.device)
+    scale = A.diagonal(dim1=1, dim2=2).abs().sqrt()
+    good = torch.isfinite(A).flatten(1).all(dim=1) & torch.isfinite(b).all(dim=1)
+    good = good & (scale > 1e-15).all(dim=1)
+    scale = torch.where(good[:, None], scale, torch.ones_like(scale))
+    b = torch.where(good[:, None], b, torch.zeros_like(b))
+    damping = torch.as_tensor(damping, dtype=A.dtype, device=A.device).reshape(-1, 1, 1)
+    A = A / (scale[:, :, None] * scale[:, None, :]) + damping * unit
+    x, info = torch.linalg.solve_ex(torch.where(good[:, None, None], A, unit), b / scale)
+    x = x / scale
+    good = good & (info == 0) & (x.abs() < 1e6).all(dim=1)
+    return torch.where(good[:, None], x, torch.zeros_like(x)), good

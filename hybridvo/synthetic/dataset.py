@@ -21,6 +21,7 @@ import numpy as np
 
 from hybridvo.errors import FormatError, InputError, OutputError
 from hybridvo.files import write_json
+from hybridvo.synthetic.draws import STORED, sample_generator
 from hybridvo.synthetic.layered import Sample, normalized_grid, rigid_flow
 from hybridvo.synthetic.presets import Preset
 
@@ -30,15 +31,10 @@ PER_SHARD = 500
 
 REPEATS = {"depth_true": "depth_prev", "depth_target": "depth_curr"}
 """Field -> the one that it equals in data without noise; stored where it does not."""
-STORED = (
+FIELDS = (
     *("flow", "depth_prev", "depth_curr", "depth_true", "depth_target", "K", "T_curr_prev"),
     *("rotation_deg", "translation", "moving"),
 )
-
-
-def sample_rng(seed: int, index: int) -> np.random.Generator:
-    """Generator of sample ``index`` of a stored set; keys apart from those of every stream."""
-    return np.random.Generator(np.random.Philox(key=[(1 << 33) + seed, index]))
 
 
 def write_samples(
@@ -102,8 +98,8 @@ def _write_shard(job: tuple[Preset, int, int, Path, int]) -> int:
         return len(indices)
     partial = target.with_name(f".{target.name}")
     partial.mkdir(exist_ok=True)
-    samples = [preset.sample(sample_rng(seed, i)) for i in indices]
-    for name in STORED:
+    samples = [preset.sample(sample_generator(seed, i, STORED)) for i in indices]
+    for name in FIELDS:
         array = np.stack([getattr(sample, name) for sample in samples])
         twin = REPEATS.get(name)
         if twin and all(np.array_equal(getattr(s, name), getattr(s, twin)) for s in samples):
@@ -134,7 +130,7 @@ def _manifest(folder: Path) -> dict[str, Any]:
 def _open_shard(path: Path) -> dict[str, np.ndarray]:
     """Memory-mapped fields of a shard."""
     try:
-        names = [name for name in STORED if (path / f"{name}.npy").exists()]
+        names = [name for name in FIELDS if (path / f"{name}.npy").exists()]
         return {name: np.load(path / f"{name}.npy", mmap_mode="r") for name in names}
     except (OSError, ValueError) as error:
         raise FormatError(f"{path}: not a shard of samples: {error}.") from None

@@ -228,13 +228,9 @@ def _add_mover(
 ) -> None:
     """Lay a mover over the scene and give it, its limbs and its bending a motion.
 
-    Args:
-        scene: to add to.
-        shape: its outline.
-        mask: (H, W) uint8, where it is painted.
-        radius: its size in pixels.
-        T_cam: (4, 4) T_curr_prev of the camera.
-        follow: factor on the motion that is left in the picture, or 0 for a free mover.
+    ``mask`` (H, W) uint8 and ``radius`` in px: where its outline is painted, and how large;
+    ``T_cam``: the camera's; ``follow``: factor on the motion that is left in the image where the
+    camera follows it, 0 for a free mover.
     """
     o, rng = scene.options, scene.rng
     added = scene.add(mask, in_front=True)

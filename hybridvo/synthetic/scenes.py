@@ -40,14 +40,8 @@ def camera_path(
     Position runs on an ellipse and orientation on another (yaw against pitch), so that neither
     speed passes through zero, however many frames are asked for.
 
-    Args:
-        rng: source of all choices.
-        frames: N.
-        step: metres per frame, about.
-        turn_deg: degrees per frame, about.
-
-    Returns:
-        (N, 4, 4) T_world_cam, and the same path without the shake.
+    ``step`` and ``turn_deg``: about how many metres and degrees a frame. Returns (N, 4, 4)
+    T_world_cam, and the same path without the shake.
     """
     t = np.arange(frames)
 
@@ -180,10 +174,7 @@ def cloud(rng: np.random.Generator, frames: int, half: np.ndarray, rate: float) 
 def _furnish(rng: np.random.Generator, spread: float, rise: float) -> list[Solid]:
     """Room with boxes, spheres and poles at all depths; some stand close to the camera.
 
-    Args:
-        rng: source of all choices.
-        spread: tangent of half the horizontal field of view.
-        rise: tangent of half the vertical field of view.
+    ``spread`` and ``rise``: tangents of half the horizontal and vertical field of view.
     """
     floor, ceiling = rng.uniform(1.5, 2.6), -rng.uniform(3.5, 7.0)
     left, right = -rng.uniform(7, 12), rng.uniform(7, 12)

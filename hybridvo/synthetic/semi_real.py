@@ -17,14 +17,22 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from hybridvo.compilation import njit
 from hybridvo.data.resize import resize_frame
 from hybridvo.data.sequence import open_sequence
 from hybridvo.errors import InputError
 from hybridvo.flow import dis_flow
-from hybridvo.geometry import backproject, invert, make_transform, rotation_angle, se3_exp
+from hybridvo.geometry import invert, make_transform, rotation_angle, se3_exp
 from hybridvo.refinement.refine import refine_pair
 from hybridvo.synthetic.draws import log_uniform, smooth_field
+from hybridvo.synthetic.meshes import (
+    TEAR,
+    Canvas,
+    Surface,
+    filled_depth,
+    image_points,
+    surface_of,
+    transformed,
+)
 from hybridvo.synthetic.silhouettes import silhouette_mask
 from hybridvo.types import Camera, Frame, FramePair
 
@@ -32,8 +40,6 @@ PIXELS = 76_800
 """Pixels of an image that is drawn: 320 x 240 in the shape of a Kinect's."""
 MARGIN = 0.85
 """Part of a frame that is kept where it is seen from two places: the rest may come into view."""
-TEAR = 0.06
-"""Change of depth between neighbours, over depth, above which no surface joins them."""
 APART = 12
 """Frames of one recording between a world and a mover: they show different things."""
 STILL_PX = 0.5
@@ -196,7 +202,7 @@ def draw_pair(
         if one_body is None or rng.random() < 0.5:
             one_body = _own_motion(rng, mover, T, camera)
         points = _moved(rng, mover, *one_body, camera)
-        own = _image(points, camera) - _image(_transformed(mover.points, T), camera)
+        own = image_points(points, camera) - image_points(transformed(mover.points, T), camera)
         goes = np.linalg.norm(own, axis=2) > STILL_PX * camera.width / 1024
         canvases[0].draw(mover, mover.points, goes, camera)
         mover.image *= np.float32(rng.uniform(0.95, 1.05))
@@ -209,124 +215,6 @@ def draw_pair(
     first = canvases[0]
     depth = np.where(first.measured > 0.5, first.depth, 0).astype(np.float32)
     return SemiRealPair(pair, T, depth, first.moving > 0.5, world.source.path, movers)
-
-
-@dataclass(eq=False)
-class _Surface:
-    """A mesh of pixels: points (h, w, 3), image (h, w, 3), measured (h, w), inside (h, w) bool."""
-
-    points: np.ndarray
-    image: np.ndarray
-    measured: np.ndarray
-    inside: np.ndarray
-
-
-@dataclass(eq=False)
-class _Canvas:
-    """An image (H, W, 3), its depth without holes, what of it a sensor measures, what moves."""
-
-    image: np.ndarray
-    depth: np.ndarray
-    measured: np.ndarray
-    moving: np.ndarray
-
-    def draw(
-        self, surface: _Surface, points: np.ndarray, moving: np.ndarray, camera: Camera
-    ) -> None:
-        """Add a surface with its points where they are now, nearest wins."""
-        marks = surface.measured, moving
-        mesh = np.empty((*surface.measured.shape, 5), np.float32)
-        mesh[..., :3], mesh[..., 3], mesh[..., 4] = surface.image, *marks
-        out = np.empty((*self.depth.shape, 5), np.float32)
-        out[..., :3], out[..., 3], out[..., 4] = self.image, self.measured, self.moving
-        before = self.depth.copy()
-        z = np.ascontiguousarray(points[..., 2], np.float32)
-        _rasterise(_image(points, camera), z, mesh, surface.inside, self.depth, out)
-        # silhouettes are mixed pixels
-        drawn = (self.depth != before).astype(np.float32)
-        alpha = cv2.GaussianBlur(drawn, (3, 3), 0.7) * drawn
-        self.image += alpha[..., None] * (out[..., :3] - self.image)
-        self.measured, self.moving = out[..., 3], out[..., 4]
-
-
-def _image(points: np.ndarray, camera: Camera) -> np.ndarray:
-    """(h, w, 2) float32 px of points (h, w, 3); far outside behind the camera."""
-    z = points[..., 2]
-    front = z > 1e-3
-    inverse = 1.0 / np.where(front, z, 1.0)
-    uv = np.empty((*z.shape, 2), np.float32)
-    uv[..., 0] = np.where(front, camera.fx * points[..., 0] * inverse + camera.cx, -1e4)
-    uv[..., 1] = camera.fy * points[..., 1] * inverse + camera.cy
-    return uv
-
-
-@njit(error_model="numpy", cache=True, nogil=True)
-def _rasterise(uv, z, values, inside, depth, out):
-    """Draw the mesh of a pixel grid with a z-buffer, in place; values linear in the image."""
-    h, w = z.shape
-    H, W = depth.shape
-    rows, columns = np.zeros(3, np.int64), np.zeros(3, np.int64)
-    for r in range(h - 1):
-        for c in range(w - 1):
-            for half in range(2):
-                for k in range(3):
-                    corner = k + half  # 0 1 2 and 1 2 3 of the quad
-                    rows[k], columns[k] = r + corner // 2, c + corner % 2
-                whole = True
-                for k in range(3):
-                    whole = whole and inside[rows[k], columns[k]]
-                if not whole:
-                    continue
-                u0, v0 = uv[rows[0], columns[0]]
-                u1, v1 = uv[rows[1], columns[1]]
-                u2, v2 = uv[rows[2], columns[2]]
-                z0, z1, z2 = z[rows[0], columns[0]], z[rows[1], columns[1]], z[rows[2], columns[2]]
-                area = (u1 - u0) * (v2 - v0) - (u2 - u0) * (v1 - v0)
-                if min(z0, z1, z2) < 0.05 or abs(area) < 1e-6 or abs(area) > 1e4:
-                    continue
-                left = max(0, int(np.ceil(min(u0, u1, u2))))
-                right = min(W - 1, int(np.floor(max(u0, u1, u2))))
-                top = max(0, int(np.ceil(min(v0, v1, v2))))
-                bottom = min(H - 1, int(np.floor(max(v0, v1, v2))))
-                for y in range(top, bottom + 1):
-                    for x in range(left, right + 1):
-                        a = ((u1 - x) * (v2 - y) - (u2 - x) * (v1 - y)) / area
-                        b = ((u2 - x) * (v0 - y) - (u0 - x) * (v2 - y)) / area
-                        e = 1.0 - a - b
-                        if a < -1e-6 or b < -1e-6 or e < -1e-6:
-                            continue
-                        near = 1.0 / (a / z0 + b / z1 + e / z2)
-                        if near < depth[y, x]:
-                            depth[y, x] = near
-                            for q in range(out.shape[2]):
-                                out[y, x, q] = (
-                                    a * values[rows[0], columns[0], q]
-                                    + b * values[rows[1], columns[1], q]
-                                    + e * values[rows[2], columns[2], q]
-                                )
-
-
-def _filled(depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Depth with its holes filled by the nearest value, and where it was measured."""
-    known = np.isfinite(depth) & (depth > 0)
-    _, labels = cv2.distanceTransformWithLabels(
-        (~known).astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL
-    )
-    of_label = np.ones(labels.max() + 1, np.float32)
-    of_label[labels[known]] = depth[known]
-    return of_label[labels], known
-
-
-@functools.lru_cache(maxsize=128)
-def _surface(frame: Frame) -> _Surface:
-    """Everything that a frame shows, as a mesh that is torn nowhere but measured only on planes."""
-    assert frame.depth is not None and frame.rgb is not None
-    depth, known = _filled(frame.depth)
-    jump = cv2.dilate(depth, np.ones((3, 3))) - cv2.erode(depth, np.ones((3, 3)))
-    measured = known & (jump < 2 * TEAR * depth)
-    points = backproject(depth, frame.camera).astype(np.float32)
-    inside = np.ones(depth.shape, np.bool_)
-    return _Surface(points, frame.rgb.astype(np.float32), measured.astype(np.float32), inside)
 
 
 def _elsewhere(
@@ -344,7 +232,7 @@ def _elsewhere(
 
 def _world(
     rng: np.random.Generator, recording: Recording, at: int
-) -> tuple[list[_Canvas], np.ndarray, Camera]:
+) -> tuple[list[Canvas], np.ndarray, Camera]:
     """Two views of a recording about a frame, the motion between them and their camera."""
     height, width = (round(MARGIN * side) for side in recording.frames[0].camera.shape)
     full = recording.frames[0].camera
@@ -359,12 +247,12 @@ def _world(
         canvases = []
         for frame in (recording.frames[i], recording.frames[j]):
             assert frame.depth is not None and frame.rgb is not None
-            depth, known = (x[window].copy() for x in _filled(frame.depth))
+            depth, known = (x[window].copy() for x in filled_depth(frame.depth))
             image = frame.rgb[window].astype(np.float32)
-            canvases.append(_Canvas(image, depth, known.astype(np.float32), np.zeros_like(depth)))
+            canvases.append(Canvas(image, depth, known.astype(np.float32), np.zeros_like(depth)))
         _paler(rng, canvases)
         return canvases, T, camera
-    surface = _surface(recording.frames[at])
+    surface = surface_of(recording.frames[at])
     near = float(np.median(surface.points[..., 2]))
     shift_px, turn_px = log_uniform(rng, (0.5, 16)), log_uniform(rng, (0.5, 16))
     step = rng.standard_normal(6) * np.repeat([near * shift_px, turn_px], 3) / camera.fx / 1.5
@@ -372,20 +260,20 @@ def _world(
     canvases = []
     for pose in (invert(half), half):
         shape = (height, width)
-        canvas = _Canvas(
+        canvas = Canvas(
             np.full((*shape, 3), 8, np.float32),
             np.full(shape, 1e3, np.float32),
             np.zeros(shape, np.float32),
             np.zeros(shape, np.float32),
         )
-        points = _transformed(surface.points, pose)
+        points = transformed(surface.points, pose)
         canvas.draw(surface, points, np.zeros(points.shape[:2]), camera)
         canvases.append(canvas)
     _paler(rng, canvases)
     return canvases, half @ half, camera
 
 
-def _paler(rng: np.random.Generator, canvases: list[_Canvas]) -> None:
+def _paler(rng: np.random.Generator, canvases: list[Canvas]) -> None:
     """Take contrast from a world at times, as distance and darkness do."""
     contrast = rng.uniform(0.25, 1.0) if rng.random() < 0.5 else 1.0
     for canvas in canvases:
@@ -393,8 +281,8 @@ def _paler(rng: np.random.Generator, canvases: list[_Canvas]) -> None:
 
 
 def _cut(
-    rng: np.random.Generator, frame: Frame, side: int, canvas: _Canvas, camera: Camera
-) -> _Surface | None:
+    rng: np.random.Generator, frame: Frame, side: int, canvas: Canvas, camera: Camera
+) -> Surface | None:
     """A piece of a frame, placed in the first view; None where the frame has no depth there."""
     assert frame.depth is not None
     height, width = frame.camera.shape
@@ -403,7 +291,7 @@ def _cut(
     v0, u0 = int(rng.integers(height - h + 1)), int(rng.integers(max(width - w, 0) + 1))
     window = np.s_[v0 : v0 + h, u0 : u0 + w]
     mask = mask[:, : width - u0]
-    surface = _surface(frame)
+    surface = surface_of(frame)
     points, measured = surface.points[window], surface.measured[window]
     if (measured * mask).sum() < 0.3 * mask.sum():
         return None
@@ -422,11 +310,11 @@ def _cut(
     rays = (points[..., :2] / z[..., None] - centre[:2] / centre[2]) * size + goal
     z = z * (part * behind / middle)
     placed = np.concatenate([rays * z[..., None], z[..., None]], axis=2).astype(np.float32)
-    return _Surface(placed, surface.image[window].copy(), measured.copy(), mask)
+    return Surface(placed, surface.image[window].copy(), measured.copy(), mask)
 
 
 def _own_motion(
-    rng: np.random.Generator, mover: _Surface, T: np.ndarray, camera: Camera
+    rng: np.random.Generator, mover: Surface, T: np.ndarray, camera: Camera
 ) -> tuple[np.ndarray, str]:
     """(4, 4) from the first view to the second, and its kind."""
     centre = mover.points[mover.inside].mean(axis=0) if mover.inside.any() else mover.points[0, 0]
@@ -446,11 +334,11 @@ def _own_motion(
 
 
 def _moved(
-    rng: np.random.Generator, mover: _Surface, motion: np.ndarray, kind: str, camera: Camera
+    rng: np.random.Generator, mover: Surface, motion: np.ndarray, kind: str, camera: Camera
 ) -> np.ndarray:
     """(h, w, 3) where a mover's points are in the second view: on a hinge, or not quite rigid."""
     points = mover.points
-    out = _transformed(points, motion)
+    out = transformed(points, motion)
     if kind == "stand":
         return out
     centre = points[mover.inside].mean(axis=0) if mover.inside.any() else points.mean((0, 1))
@@ -458,16 +346,11 @@ def _moved(
         side = (points[..., :2] - centre[:2]) @ rng.standard_normal(2) > 0
         swing = rng.standard_normal(6) * log_uniform(rng, (0.03, 0.25)) * (0, 0, 0, 1, 1, 1)
         other = motion @ _about(centre, swing)
-        out = np.where(side[..., None], _transformed(points, other), out)
+        out = np.where(side[..., None], transformed(points, other), out)
     if rng.random() < 0.4:
         wobble = smooth_field(rng, *points.shape[:2], 5, 3)
         out = out + wobble * np.float32(rng.uniform(0, 0.5) * centre[2] / camera.fx)
     return out
-
-
-def _transformed(points: np.ndarray, T: np.ndarray) -> np.ndarray:
-    """(h, w, 3) float32 points after a motion (4, 4)."""
-    return points @ T[:3, :3].T.astype(np.float32) + T[:3, 3].astype(np.float32)
 
 
 def _about(centre: np.ndarray, step: np.ndarray) -> np.ndarray:
@@ -476,7 +359,7 @@ def _about(centre: np.ndarray, step: np.ndarray) -> np.ndarray:
     return make_transform(np.eye(3), step[:3]) @ to @ se3_exp(np.r_[0, 0, 0, step[3:]]) @ invert(to)
 
 
-def _sensed(rng: np.random.Generator, canvas: _Canvas, camera: Camera) -> Frame:
+def _sensed(rng: np.random.Generator, canvas: Canvas, camera: Camera) -> Frame:
     """What a camera and a depth sensor make of a view."""
     shape = camera.shape
     gain, offset = rng.uniform(0.96, 1.04), rng.uniform(-4, 4)

@@ -70,11 +70,8 @@ class Silhouette:
     ) -> None:
         """Paint into an (H, W) uint8 mask, in place.
 
-        Args:
-            mask: image to paint into; a hole is painted as 0, so give each silhouette its own.
-            centre: (u, v) in pixels of the silhouette's origin.
-            radius: pixels of one unit.
-            stretch: horizontal over vertical scale.
+        A hole is painted as 0, so give each silhouette a mask of its own. ``centre``: (u, v) of the
+        origin and ``radius`` of one unit in pixels; ``stretch``: horizontal over vertical scale.
         """
         limit = 8 * max(mask.shape)
         scale = np.array([radius * np.sqrt(stretch), radius / np.sqrt(stretch)])
@@ -93,16 +90,8 @@ class Silhouette:
     ) -> tuple[np.ndarray, float]:
         """Paint with the radius at which a share of the picture is covered.
 
-        Args:
-            height: rows of the picture.
-            width: columns of the picture.
-            centre: (u, v) in pixels of the silhouette's origin.
-            share: wanted share of the picture, in (0, 1).
-            stretch: horizontal over vertical scale.
-
-        Returns:
-            The (H, W) uint8 mask and the radius in pixels. The share is met to about 1 % where the
-            shape can reach it, else the largest share below it.
+        Returns the (H, W) uint8 mask and the radius in pixels. The share, in (0, 1), is met to
+        about 1 % where the shape can reach it, else the largest share below it.
         """
         low, high = 0.0, 4.0 * float(np.hypot(height, width))
         best = np.zeros((height, width), np.uint8)

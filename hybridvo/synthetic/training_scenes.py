@@ -109,9 +109,9 @@ def _hall(b: _Builder) -> None:
     if rng.random() < 0.6:
         for x in np.arange(low[0] + pitch, high[0] - 0.3 * pitch, pitch):
             for z in np.arange(3.2 * s, high[2] - 0.5 * pitch, 1.3 * pitch):
-                half = (radius, (high[1] - low[1]) / 2, radius)
+                column = (radius, (high[1] - low[1]) / 2, radius)
                 shape = BOX if radius > 0.22 * s else CYLINDER
-                b.add(shape, half, (x, (high[1] + low[1]) / 2, z))
+                b.add(shape, column, (x, (high[1] + low[1]) / 2, z))
     for _ in range(int(rng.integers(2, 12))):
         z = rng.uniform(2.5 * s, high[2] - 0.5 * s)
         half = rng.uniform(0.15, 0.7, 3) * s
@@ -360,8 +360,8 @@ def training_scene(seed: int, height: int, width: int) -> Scene:
     focal = width / 2 / spread
     centre = rng.normal(0, 0.03, 2) * width
     aspect = log_uniform(rng, (0.8, 1.25)) if rng.random() < 0.3 else 1.0
-    middle = np.array([(width - 1) / 2, (height - 1) / 2]) + centre
-    camera = Camera(focal, aspect * focal, *middle.tolist(), height, width)
+    cx, cy = (width - 1) / 2 + centre[0], (height - 1) / 2 + centre[1]
+    camera = Camera(focal, aspect * focal, cx, cy, height, width)
     s = log_uniform(rng, (0.2, 3.0))
     size = min(log_uniform(rng, (0.1, 8.0)), 6.0)
     rotation = np.zeros(3)

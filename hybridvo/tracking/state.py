@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,6 @@ from hybridvo.tracking.pose_graph import Edge
 from hybridvo.tracking.window import Window
 from hybridvo.types import Camera, Frame
 
-CAMERA = ("fx", "fy", "cx", "cy", "height", "width")
 IMAGES = ("rgb", "depth", "depth_variance", "mask")
 
 
@@ -52,42 +52,39 @@ class TrackerState:
             object.__setattr__(self, name, own)
 
     def to_arrays(self) -> dict[str, np.ndarray]:
-        """The state as named arrays, for ``numpy.savez`` (no pickles)."""
-        model = self.motion_model
-        out: dict[str, Any] = {
-            "T_world_cam": self.T_world_cam,
-            "T_world_last": self.T_world_last,
-            "counts": [self.gap, self.failed, self.count, model.changes],
-            "model_weight": model.weight,
-            "model_T_last": model.T_last,
-            "model_spread": model.spread,
+        """The state as named arrays, for ``numpy.savez`` (no pickles): images, one JSON text."""
+        arrays: dict[str, np.ndarray] = {}
+
+        def frame(name: str, value: Frame | None) -> dict[str, Any] | None:
+            if value is None:
+                return None
+            for part in IMAGES:
+                if (image := getattr(value, part)) is not None:
+                    arrays[f"{name}_{part}"] = image
+            camera = asdict(value.camera)
+            return {"camera": camera, "timestamp": value.timestamp, "index": value.index}
+
+        def key(name: str, value: KeyFrame) -> dict[str, Any]:
+            if value.static is not None:
+                arrays[f"{name}_static"] = value.static
+            return {"frame": frame(name, value.frame)} | _plain(value, "T_world_cam", "depth_noise")
+
+        names = ("T_world_cam", "T_world_last", "gap", "failed", "count")
+        state = _plain(self, *names) | {
+            "frame": frame("frame", self.frame),
+            "motion_model": _plain(self.motion_model, "T_last", "spread", "weight", "changes"),
         }
-        out |= _frame_arrays("frame", self.frame)
         if self.window is not None:
-            window = self.window
-            out |= {"window_T": window.T_last_key, "window_covariance": window.covariance}
-            for k, key in enumerate(window.keys):
-                out |= _frame_arrays(f"key{k}", key.frame)
-                out |= {
-                    f"key{k}_T": key.T_world_cam,
-                    f"key{k}_static": key.static,
-                    f"key{k}_noise": key.depth_noise,
-                }
-            edges = window.edges
-            out |= {
-                "edge_frames": np.array([(e.prev, e.curr) for e in edges]).reshape(-1, 2),
-                "edge_T": np.array([e.T for e in edges]).reshape(-1, 4, 4),
-                "edge_covariance": np.array([e.covariance for e in edges]).reshape(-1, 6, 6),
-                "edge_weight": [e.weight for e in edges],
-                "edge_text": np.array(
-                    [
-                        (e.kind, e.status.state.value, e.status.reason.value, e.status.message)
-                        for e in edges
-                    ],
-                    dtype=np.str_,
-                ).reshape(-1, 4),
+            state["window"] = _plain(self.window, "T_last_key", "covariance") | {
+                "keys": [key(f"key{k}", value) for k, value in enumerate(self.window.keys)],
+                "edges": [
+                    _plain(edge, "prev", "curr", "T", "covariance", "kind", "weight")
+                    | {"status": [edge.status.state.value, edge.status.reason.value]}
+                    | {"message": edge.status.message}
+                    for edge in self.window.edges
+                ],
             }
-        return {name: np.asarray(value) for name, value in out.items() if value is not None}
+        return arrays | {"state": np.array(json.dumps(state))}
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> TrackerState:
@@ -106,60 +103,44 @@ class TrackerState:
 
     @classmethod
     def _read(cls, arrays: dict[str, np.ndarray]) -> TrackerState:
-        gap, failed, count, changes = (int(x) for x in arrays["counts"])
-        model = MotionModel(
-            arrays.get("model_T_last"),
-            arrays.get("model_spread"),
-            float(arrays["model_weight"]),
-            changes,
-        )
-        window = None
-        if "window_T" in arrays:
-            keys: list[KeyFrame] = []
-            while f"key{len(keys)}_T" in arrays:
-                name = f"key{len(keys)}"
-                frame = _read_frame(name, arrays)
-                if frame is None:
-                    raise ValueError(f"{name}: no frame")
-                static, noise = arrays.get(f"{name}_static"), float(arrays[f"{name}_noise"])
-                keys.append(KeyFrame(frame, arrays[f"{name}_T"], static, noise))
-            names = ("edge_frames", "edge_T", "edge_covariance", "edge_weight", "edge_text")
-            edges = tuple(
-                Edge(
-                    int(frames[0]), int(frames[1]), T, covariance,
-                    Status(State(str(text[1])), Reason(str(text[2])), str(text[3])),
-                    str(text[0]), float(weight),
-                )
-                for frames, T, covariance, weight, text in zip(
-                    *(arrays[name] for name in names), strict=True
-                )
-            )  # fmt: skip
-            window = Window(tuple(keys), edges, arrays["window_T"], arrays["window_covariance"])
-        return cls(
-            _read_frame("frame", arrays),
-            arrays["T_world_cam"],
-            arrays["T_world_last"],
-            model,
-            gap,
-            failed,
-            count,
-            window,
-        )
+        state = json.loads(str(arrays["state"]))
+
+        def frame(name: str, value: dict[str, Any] | None) -> Frame | None:
+            if value is None:
+                return None
+            images = {part: arrays.get(f"{name}_{part}") for part in IMAGES}
+            camera = Camera(**value["camera"])
+            return Frame(
+                camera=camera, timestamp=value["timestamp"], index=value["index"], **images
+            )
+
+        def key(name: str, value: dict[str, Any]) -> KeyFrame:
+            own = frame(name, value["frame"])
+            if own is None:
+                raise ValueError(f"{name}: no frame")
+            T, static = np.array(value["T_world_cam"]), arrays.get(f"{name}_static")
+            return KeyFrame(own, T, static, value["depth_noise"])
+
+        window = state.pop("window", None)
+        if window is not None:
+            keys = tuple(key(f"key{k}", value) for k, value in enumerate(window.pop("keys")))
+            edges = []
+            for value in window.pop("edges"):
+                kind, reason = value.pop("status")
+                status = Status(State(kind), Reason(reason), value.pop("message"))
+                edges.append(Edge(status=status, **_arrays(value)))
+            window = Window(keys, tuple(edges), **_arrays(window))
+        model = MotionModel(**_arrays(state.pop("motion_model")))
+        last = frame("frame", state.pop("frame"))
+        return cls(frame=last, motion_model=model, window=window, **_arrays(state))
 
 
-def _frame_arrays(name: str, frame: Frame | None) -> dict[str, Any]:
-    if frame is None:
-        return {}
-    images = {f"{name}_{part}": getattr(frame, part) for part in IMAGES}
-    camera = [getattr(frame.camera, part) for part in CAMERA]
-    return images | {f"{name}_camera": camera, f"{name}_at": [frame.timestamp, frame.index]}
+def _plain(value: Any, *names: str) -> dict[str, Any]:
+    """Attributes for JSON, arrays as lists: numbers come back as they were."""
+    found = {name: getattr(value, name) for name in names}
+    return {n: v.tolist() if isinstance(v, np.ndarray) else v for n, v in found.items()}
 
 
-def _read_frame(name: str, arrays: Mapping[str, np.ndarray]) -> Frame | None:
-    if f"{name}_camera" not in arrays:
-        return None
-    fx, fy, cx, cy, height, width = arrays[f"{name}_camera"].tolist()
-    camera = Camera(fx, fy, cx, cy, int(height), int(width))
-    images = {part: arrays.get(f"{name}_{part}") for part in IMAGES}
-    timestamp, index = arrays[f"{name}_at"]
-    return Frame(camera=camera, timestamp=float(timestamp), index=int(index), **images)
+def _arrays(values: dict[str, Any]) -> dict[str, Any]:
+    """The other way: lists as arrays."""
+    return {n: np.array(v) if isinstance(v, list) else v for n, v in values.items()}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import subprocess
 from collections.abc import Callable
@@ -15,7 +14,7 @@ from hybridvo.network.models import load_weights
 from hybridvo.network.weights import save_weights
 from hybridvo.training.options import recorded_run
 from hybridvo.training.pwvo_task import PwvoTask
-from hybridvo.training.selector_task import SelectorTask, evaluate_selector
+from hybridvo.training.selector_task import evaluate_selector
 from hybridvo.training.trainer import CHECKPOINT, Trainer, read_checkpoint
 from hybridvo.training.validation import PUBLISHED_SEED, calibrate_scales, evaluate_network
 
@@ -126,9 +125,7 @@ def export_selector(trainer: Trainer, held_out: str | Path, path: str | Path) ->
     Raises:
         InputError: no held-out shards.
     """
-    path, task = Path(path), trainer.task
-    assert isinstance(task, PwvoTask)
-    assert isinstance(task, SelectorTask)
+    path = Path(path)
     files = sorted(Path(held_out).glob("*.npz"))
     if not files:
         raise InputError(f"{held_out}: no shards; make some with seeds below 1000.")
@@ -137,8 +134,8 @@ def export_selector(trainer: Trainer, held_out: str | Path, path: str | Path) ->
         "what": "chooses the world among candidate motions, and where the world is",
         "held_out": evaluate_selector(network, files),
         "held_out_with_proposals": evaluate_selector(network, files, asked=True),
+        "network": trainer.record["options"]["network"],
     }
-    card["network"] = dataclasses.asdict(task.options.network)
     save_weights(path, network, card, dtype="float16")
     write_json(path.with_suffix(".json"), card)
     return card

@@ -30,8 +30,10 @@ from hybridvo.training.selector_batches import (
 
 RIGHT_PX = 1.0
 """px at a width of 1024: mean error of the ego flow up to which a motion is right."""
-RIGHT_SLOPE_PX = 0.15
-"""px: softness of that limit as a target."""
+WORST_RIGHT_PX = 3.0
+"""The same where flow allows no better: three times the error of the best motion, at most this."""
+RIGHT_SLOPE = 0.15
+"""Softness of that limit as a target, of itself."""
 SOURCES = ("diverse", "rendered", "dis", "semi-real")
 """Where samples come from: the layered generator, rendered scenes with true flow and with DIS, and
 recordings with movers cut from others."""
@@ -73,7 +75,8 @@ def trust_loss(
     for b in range(len(logit)):
         mine = owner == b
         chosen = error[mine][score[mine].argmax()]
-        target.append(torch.sigmoid((RIGHT_PX - chosen) / RIGHT_SLOPE_PX))
+        limit = (3 * error[mine].min()).clamp(RIGHT_PX, WORST_RIGHT_PX)
+        target.append(torch.sigmoid((1 - chosen / limit) / RIGHT_SLOPE))
     return F.binary_cross_entropy_with_logits(logit, torch.stack(target))
 
 
@@ -174,8 +177,8 @@ def evaluate_selector(
         asked: whether the pixel-wise network takes part.
 
     Returns:
-        For each source: ``samples``, the share of them whose motion is further than a pixel from
-        the ground truth for ``support`` (the first motion found), ``chosen`` (the first choice),
+        For each source: ``samples``, the share of them whose motion is further from the ground
+        truth than is right for ``support`` (the first motion found), ``chosen`` (the first choice),
         ``final`` (after the second look) and ``best`` (the best of them, an oracle), and
         ``trust_right`` and ``trust_wrong``, the mean probability given to right and wrong answers.
     """
@@ -205,10 +208,11 @@ def evaluate_selector(
 
 
 def _shares(table: np.ndarray) -> dict[str, Any]:
-    wrong = table[:, 2] > RIGHT_PX
+    limit = np.clip(3 * table[:, 3], RIGHT_PX, WORST_RIGHT_PX)
+    wrong = table[:, 2] > limit
     result: dict[str, Any] = {"samples": len(table)}
     for i, name in enumerate(("support", "chosen", "final", "best")):
-        result[name] = round(float((table[:, i] > RIGHT_PX).mean()), 4)
+        result[name] = round(float((table[:, i] > limit).mean()), 4)
     result["median_final_px"] = round(float(np.median(table[:, 2])), 3)
     for name, rows in (("trust_right", ~wrong), ("trust_wrong", wrong)):
         result[name] = round(float(table[rows, 4].mean()), 3) if rows.any() else None

@@ -1,8 +1,6 @@
 """Samples as an endless, seeded, resumable stream of batches, for any number of workers and ranks.
 
-Sample ``i`` of seed ``s`` is drawn from a generator keyed with (s, i) and nothing else. Training
-and held-out samples use different halves of the key space, so that no training run, whatever its
-seed, has seen a held-out pair.
+Sample ``i`` of seed ``s`` is drawn from a generator keyed with (s, i) and nothing else.
 """
 
 from __future__ import annotations
@@ -17,11 +15,9 @@ from torch.utils.data import IterableDataset, get_worker_info
 from hybridvo.errors import InputError
 from hybridvo.network.inputs import NetworkInputs, assemble_aligned
 from hybridvo.network.losses import LossTargets
+from hybridvo.synthetic.draws import TRAINING, sample_generator
 from hybridvo.synthetic.layered import Sample
 from hybridvo.synthetic.presets import Preset
-
-TRAINING_KEYS = 1 << 32
-"""Added to the seed of training samples; held-out seeds lie below."""
 
 
 @dataclass(frozen=True)
@@ -49,21 +45,6 @@ class Mixture:
         limits = np.cumsum(self.weights)
         choice = int(np.searchsorted(limits, rng.random() * limits[-1], side="right"))
         return self.presets[min(choice, len(self.presets) - 1)].sample(rng)
-
-
-def sample_generator(seed: int, index: int, training: bool = False) -> np.random.Generator:
-    """Generator of sample ``index`` of a seed, the same on every machine and in every process.
-
-    Raises:
-        InputError: a seed or an index that is negative or does not fit.
-    """
-    if not (0 <= seed < TRAINING_KEYS and 0 <= index < 1 << 63):
-        raise InputError(
-            f"sample_generator: expected 0 <= seed < 2^32 and 0 <= index < 2^63, got seed {seed} "
-            f"and index {index}."
-        )
-    key = np.array([seed + TRAINING_KEYS * training, index], dtype=np.uint64)
-    return np.random.Generator(np.random.Philox(key=key))
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,6 +124,6 @@ class SampleStream(IterableDataset):
         while True:
             first = self.start + (turn * self.world + self.rank) * self.batch_size
             numbers = range(first, first + self.batch_size)
-            draws = (sample_generator(self.seed, i, training=True) for i in numbers)
+            draws = (sample_generator(self.seed, i, TRAINING) for i in numbers)
             yield collate([self.preset.sample(rng) for rng in draws])
             turn += turns

@@ -11,16 +11,17 @@ from typing import Any
 import numpy as np
 import torch
 import torch.nn.functional as F
-from scipy.stats import rankdata
+from scipy.stats import mannwhitneyu, spearmanr
 
 from hybridvo.errors import InputError
 from hybridvo.network.losses import NetworkOutput, reconstruct
 from hybridvo.network.normalization import predict
 from hybridvo.network.selection import select_pose
 from hybridvo.results import PixelwisePrediction
+from hybridvo.synthetic.draws import sample_generator
 from hybridvo.synthetic.presets import Preset
 from hybridvo.torch_geometry import euler_transform
-from hybridvo.training.stream import TrainingBatch, collate, sample_generator
+from hybridvo.training.stream import TrainingBatch, collate
 
 PUBLISHED_SEED = 1000
 """First seed of published figures; smaller ones are for development."""
@@ -32,26 +33,14 @@ FIGURES = ("r_err_deg", "t_err", "epe")
 
 
 def area_under_curve(score: np.ndarray, label: np.ndarray) -> float | None:
-    """Area under the ROC curve of a score as a detector of a label; None if one class is absent.
+    """Area under the ROC curve of a score (N,) as a detector of a label (N,) bool.
 
-    Args:
-        score: (N,) larger means more likely true; ties count one half.
-        label: (N,) bool.
+    Ties count one half. None if one class is absent.
     """
-    positive = int(label.sum())
-    negative = label.size - positive
-    if not positive or not negative:
+    if label.all() or not label.any():
         return None
-    ranks = rankdata(score)
-    return float((ranks[label].sum() - positive * (positive + 1) / 2) / (positive * negative))
-
-
-def rank_correlation(a: np.ndarray, b: np.ndarray) -> float | None:
-    """Spearman's correlation of (N,) values; None where one of them is constant."""
-    ranks = [rankdata(x) for x in (a, b)]
-    if min(np.ptp(r) if r.size else 0.0 for r in ranks) == 0:
-        return None
-    return float(np.corrcoef(*ranks)[0, 1])
+    wins = mannwhitneyu(score[label], score[~label], method="asymptotic").statistic
+    return float(wins) / (int(label.sum()) * int((~label).sum()))
 
 
 def evaluate_network(
@@ -172,9 +161,11 @@ def _uncertainty_figures(pixels: list[np.ndarray], index: int, name: str) -> dic
     table = np.concatenate(pixels)
     first = 1 + 5 * index
     ratio = table[:, first + 2 : first + 5]
-    ranks = [rank_correlation(p[:, first], p[:, first + 1]) for p in pixels]
-    known = [r for r in ranks if r is not None]
-    spearman = float(np.mean(known)) if known else None
+    half = [p[:, first : first + 2] for p in pixels if len(p)]
+    # where s or the error is constant there is no rank correlation
+    varied = [x for x in half if np.ptp(x, axis=0).all()]
+    ranks = [spearmanr(x).statistic for x in varied]
+    spearman = float(np.mean(ranks)) if ranks else None
     auroc = area_under_curve(table[:, first], table[:, 0] > 0.5)
     values = (auroc, spearman, float(ratio.mean()), float(np.median(ratio)))
     return dict(zip(keys, values, strict=True))

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from hybridvo.data.resize import resize_camera, resize_frame, resize_pair
 from hybridvo.errors import InputError
-from hybridvo.geometry import ego_flow, project, se3_exp
+from hybridvo.geometry import ego_flow, se3_exp
 from hybridvo.types import Camera, Frame, FramePair
 
 CAMERA = Camera(320.0, 320.0, 319.5, 239.5, 480, 640)
@@ -25,15 +23,6 @@ def test_camera_by_hand():
     for size in ((0, 5), (5, -1), (2.5, 5)):
         with pytest.raises(InputError, match="positive"):
             resize_camera(CAMERA, *size)
-
-
-@given(st.integers(1, 2000), st.integers(1, 2000))
-def test_points_move_with_the_pixel_grid(height, width):
-    camera = resize_camera(CAMERA, height, width)
-    points = np.array([[0.3, -0.2, 1.0], [-1.0, 0.7, 3.0]])
-    scale = np.array([width / 640, height / 480])
-    expected = scale * (project(points, CAMERA) + 0.5) - 0.5
-    np.testing.assert_allclose(project(points, camera), expected, rtol=1e-9, atol=1e-9)
 
 
 def test_depth_is_never_mixed(rng):

@@ -17,9 +17,10 @@ from hybridvo.data.sequence import open_sequence
 from hybridvo.errors import InputError, LockedError
 from hybridvo.evaluation.comparison import WRITTEN, compare
 from hybridvo.evaluation.plan import ComparisonOptions, expand, methods_to_run
-from hybridvo.evaluation.sequence_job import PAIR_COLUMNS, SharedFlow
+from hybridvo.evaluation.sequence_job import PAIR_COLUMNS
+from hybridvo.network.models import Models
 from hybridvo.odometry import Odometry
-from hybridvo.pipeline import METHODS, Models, weights_hash
+from hybridvo.pipeline import METHODS, weights_hash
 from hybridvo.results import RelativePose
 from hybridvo.synthetic.render import make_scene, write_sintel
 from hybridvo.trajectory import read_trajectory
@@ -228,15 +229,6 @@ def test_a_folder_stands_for_its_sequences(tree: Path, walk: Path) -> None:
     assert expand(found[0]) == [found[0]]
     assert expand(walk) == [walk] and expand(walk.parent)[-1] == walk
     assert expand(tree / "nothing") == [tree / "nothing"]
-
-
-def test_flow_is_computed_once_for_all(tiny: Path) -> None:
-    sequence = open_sequence(tiny)
-    flow = SharedFlow("dis", sequence)
-    prev, curr = sequence.frame(0), sequence.frame(1)
-    flow.prepare(prev, curr)
-    assert flow(prev, curr) is flow(prev, curr) and flow.ms > 0
-    assert flow.label == "dis" and SharedFlow("file", sequence).label == "file (true)"
 
 
 def test_weights_of_a_method_are_all_that_it_reads(tmp_path: Path) -> None:

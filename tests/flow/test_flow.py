@@ -10,6 +10,7 @@ from hybridvo.calibration import DIS_NOISE
 from hybridvo.errors import FormatError, InputError
 from hybridvo.flow import (
     FlowField,
+    MeasuredFlow,
     check_field,
     contradiction,
     dis_flow,
@@ -142,6 +143,15 @@ def test_file_flow_leads_to_the_next_frame_only() -> None:
     assert provide(frame(None, 1), frame(None, 2)).flow is None
     with pytest.raises(FormatError, match=r"broken\.flo"):
         provide(frame(None, 2), frame(None, 3))
+    assert file_flow(Files(), strict=False)(frame(None, 2), frame(None, 3)).flow is None
+
+
+def test_measured_flow_is_computed_once_until_it_is_reset() -> None:
+    flow = MeasuredFlow(file_flow(Files()))
+    first, second = frame(None, 0), frame(None, 1)
+    assert flow(first, second) is flow(first, second) and flow.ms > 0
+    flow.reset()
+    assert flow.fields == {} and flow.ms == 0
 
 
 def test_fallback_names_the_source_that_answered() -> None:

@@ -7,12 +7,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hybridvo.calibration import CLEAR_RIGHT, MIN_CONFIDENCE
 from hybridvo.errors import InputError
+from hybridvo.estimation import estimate, refine
 from hybridvo.geometry import ego_flow, se3_exp
 from hybridvo.hypotheses.generate import HypothesisSet, generate
-from hybridvo.hypotheses.selector import Candidates, CueSelector, MaskSelector, Scores
+from hybridvo.hypotheses.selector import (
+    NO_RIVAL,
+    Candidates,
+    CueSelector,
+    MaskSelector,
+    Scores,
+    evidence_of,
+)
 from hybridvo.options import Options, SelectOptions
-from hybridvo.pipeline import Context, estimate, refine, refine_selection
+from hybridvo.pipeline import Context
 from hybridvo.results import MotionPrediction, MotionPrior, RelativePose, State
 from hybridvo.synthetic.render import SyntheticSequence, make_scene
 from hybridvo.synthetic.scenarios import Scenario, make_pair
@@ -27,8 +36,11 @@ SIGMA = np.diag([0.02**2] * 3 + [0.004**2] * 3)
 class Oracle:
     """A scorer that is told where the scene is static; it prefers the latest refit, or none."""
 
-    def __init__(self, static: np.ndarray, refits: bool, confidence: float = 0.9) -> None:
+    def __init__(
+        self, static: np.ndarray, refits: bool, confidence: float = 0.9, margin: float = 5.0
+    ) -> None:
         self.static, self.refits, self.confidence = static, refits, confidence
+        self.margin = margin
 
     def look(self, maps, prior, static) -> Oracle:
         return self
@@ -36,10 +48,10 @@ class Oracle:
     def score(self, candidates: Candidates, masks: int) -> Scores:
         count = len(candidates.poses)
         score = np.zeros(count)
-        score[-1 if self.refits else 0] = 5.0
+        score[-1 if self.refits else 0] = self.margin
         best = np.arange(min(masks, count))
         drawn = np.stack([self.static] * len(best)) if masks else np.zeros((0, *self.static.shape))
-        return Scores(score, best, drawn, self.confidence, np.full((count, 2), 0.3))
+        return Scores(score, best, drawn, self.confidence)
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +73,7 @@ def gap(T: np.ndarray, pair: FramePair, truth: dict) -> float:
 def refined(case, scorer: Oracle, prediction: MotionPrediction | None = None) -> RelativePose:
     found, pair, _ = case
     chosen = MaskSelector(scorer).select(found, None, prediction)
-    return refine_selection(pair, found, chosen, Context())
+    return Context().refine(pair, found, chosen)
 
 
 def test_the_camera_is_fitted_where_the_mask_says(case) -> None:
@@ -90,12 +102,14 @@ def test_a_prediction_is_one_candidate_more(case) -> None:
 
 def test_low_confidence_is_degraded_with_its_probability_and_a_wide_covariance(case) -> None:
     found, pair, _ = case
-    scorer = Oracle(np.zeros(found.grid.shape[:2], np.float32), refits=False, confidence=0.05)
+    nowhere = np.zeros(found.grid.shape[:2], np.float32)
+    sure = MaskSelector(Oracle(nowhere, refits=False, confidence=0.99)).select(found)
+    scorer = Oracle(nowhere, refits=False, confidence=0.05, margin=0.01)
     chosen = MaskSelector(scorer).select(found)
-    assert chosen.probability == pytest.approx(0.05) and chosen.mask is None
-    answer = refine_selection(pair, found, chosen, Context())
+    assert chosen.probability < MIN_CONFIDENCE < sure.probability and chosen.mask is None
+    answer = Context().refine(pair, found, chosen)
     assert answer.status.state is State.DEGRADED and not answer.ok and answer.usable
-    assert answer.probability == pytest.approx(0.05)
+    assert answer.probability == chosen.probability
 
 
 def test_the_hybrid_asks_pwvo_below_one_threshold() -> None:
@@ -120,7 +134,7 @@ def test_an_unambiguous_motion_is_taken_as_it_is() -> None:
     pair, _ = make_pair(Scenario(moving=0.0), 1, **SIZE)
     found = generate(pair, IDENTITY, Options())
     chosen = MaskSelector(Oracle(np.zeros((1, 1)), refits=True, confidence=0.0)).select(found)
-    assert not found.is_ambiguous and chosen.probability == 1.0
+    assert not found.is_ambiguous and chosen.probability == CLEAR_RIGHT
     np.testing.assert_array_equal(chosen.T_curr_prev, CueSelector().select(found).T_curr_prev)
 
 
@@ -199,3 +213,21 @@ def test_masks_grow_to_the_image(case) -> None:
     small = replace(grid, shape=(2, 2, 4), size=(20, 20), box=(4, 12, 6, 14))
     inner = small.upsample(np.ones((2, 2), np.float32))
     assert inner.sum() == 64 and inner[4:12, 6:14].all()
+
+
+def test_only_another_motion_is_a_rival(case) -> None:
+    found, _, _ = case
+    poses = np.concatenate([found.poses, found.poses[:1]])  # the first one found twice
+    candidates = Candidates(poses, found.facts, np.arange(len(poses)), len(found.poses))
+    masks = np.zeros((0, 1, 1))
+    score = np.zeros(len(poses))
+    score[[0, -1]] = 3.0
+    evidence = evidence_of(found, candidates, Scores(score, np.zeros(0), masks, 0.9))
+    np.testing.assert_allclose(evidence, [np.log(9), 3.0])
+    # a rival that looks as good leaves less to believe
+    score[1] = 2.9
+    doubted = evidence_of(found, candidates, Scores(score, np.zeros(0), masks, 0.9))
+    np.testing.assert_allclose(doubted[1], 0.1)
+    alone = replace(candidates, poses=poses[[0, -1]])
+    one = Scores(score[[0, -1]], np.zeros(0), masks, 0.9)
+    assert evidence_of(found, alone, one)[1] == NO_RIVAL

@@ -54,15 +54,6 @@ def test_halving_keeps_the_pixel_centre_convention():
     np.testing.assert_allclose(inputs.flow_px[0].flatten(1).T, [[0.5, -1.5]] * 4, rtol=1e-6)
 
 
-def test_flow_depth_and_ray_belong_to_one_measured_pixel():
-    pair = make_pair()
-    inputs = assemble_inputs(pair, (2, 2))
-    # The centre of target pixel (0, 0) is native (1.5, 0.5); the tie goes to (2, 1).
-    assert inputs.depth_prev[0, 0, 0].item() == pair.prev.depth[1, 2]
-    assert inputs.rays[0, :, 0, 0].tolist() == pytest.approx([(2 - 3.5) / 20, (1 - 1.5) / 25])
-    np.testing.assert_allclose(inputs.flow_px[0, :, 0, 0], pair.flow[1, 2] * [0.25, 0.5], rtol=1e-6)
-
-
 @settings(max_examples=30, deadline=None)
 @given(
     height=st.integers(1, 20),
@@ -229,23 +220,9 @@ def test_bad_arguments_are_refused():
         with pytest.raises(InputError, match="FramePair"):
             assemble_inputs(thing)
     flow, depth, K = torch.zeros(1, 4, 8, 2), torch.ones(1, 4, 8), torch.eye(3)[None]
-    good = PairBatch(flow, depth, K, K)
-    for changes in (
-        {"flow": flow.permute(0, 3, 1, 2)},
-        {"flow": flow.long()},
-        {"flow": flow.numpy()},
-        {"flow": flow[:0], "depth_prev": depth[:0], "K_prev": K[:0], "K_curr": K[:0]},
-        {"depth_prev": depth[:, :2]},
-        {"depth_prev": None},
-        {"depth_prev": depth.int()},
-        {"depth_curr": depth[0]},
-        {"K_prev": K[0]},
-        {"K_curr": K.repeat(2, 1, 1)},
-        {"valid": depth},
-        {"valid": depth[:, :2] > 0},
-    ):
+    for changes in ({"flow": flow.permute(0, 3, 1, 2)}, {"depth_prev": None}, {"K_prev": K[0]}):
         with pytest.raises(InputError, match="assemble_inputs: expected"):
-            assemble_inputs(replace(good, **changes))
+            assemble_inputs(replace(PairBatch(flow, depth, K, K), **changes))
 
 
 def test_a_real_pair(shared_data):

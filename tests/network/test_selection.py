@@ -88,9 +88,6 @@ def test_default_patch_is_the_papers_grid():
         select_pose(prediction), select_pose(prediction, patch=32), strict=True
     ):
         assert torch.equal(got, expected)
-    half = random_prediction(0, (1, 3, 64, 128), torch.float32)
-    for got, expected in zip(select_pose(half), select_pose(half, patch=16), strict=True):
-        assert torch.equal(got, expected)
 
 
 def test_padding_never_wins():

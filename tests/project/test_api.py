@@ -32,22 +32,3 @@ def test_every_public_name_has_a_docstring(name: str) -> None:
     for member, function in vars(value).items() if inspect.isclass(value) else ():
         if inspect.isfunction(function) and not member.startswith("_"):
             assert inspect.getdoc(function), f"{name}.{member}"
-
-
-@pytest.mark.parametrize(
-    ("name", "positional", "keywords"),
-    [
-        ("estimate", 1, {"method", "seed"}),
-        ("refine", 1, {"options", "seed"}),
-        ("Odometry", 1, {"flow", "method", "seed"}),
-        ("open_sequence", 1, set()),
-        ("iter_pairs", 1, set()),
-    ],
-)
-def test_arguments_that_programs_pass_by_name(
-    name: str, positional: int, keywords: set[str]
-) -> None:
-    parameters = inspect.signature(getattr(hybridvo, name)).parameters.values()
-    kinds = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.VAR_POSITIONAL)
-    assert sum(p.kind in kinds for p in parameters) >= positional
-    assert keywords <= {p.name for p in parameters}

@@ -37,16 +37,27 @@ IMPORTS: dict[str, set[str]] = {
     "hypotheses": NOUNS | {"refinement"},
     "network": NOUNS | {"torch_geometry", "refinement", "hypotheses"},
     "pipeline": NOUNS | {"network", "hypotheses", "refinement", "baselines", "flow"},
+    "estimation": NOUNS | {"network", "refinement", "flow", "pipeline"},
     "tracking": NOUNS | {"refinement"},
     "odometry": NOUNS
-    | {"pipeline", "tracking", "flow", "trajectory", "refinement", "network", "hypotheses"},
-    "synthetic": NOUNS | {"trajectory", "data"},
+    | {
+        "pipeline",
+        "estimation",
+        "tracking",
+        "flow",
+        "trajectory",
+        "refinement",
+        "network",
+        "hypotheses",
+    },
+    # pairs made of recordings are refined before something is moved in them
+    "synthetic": NOUNS | {"trajectory", "data", "flow", "refinement"},
     "evaluation": NOUNS
-    | {"trajectory", "data", "pipeline", "odometry", "flow", "network", "refinement"}
+    | {"trajectory", "data", "pipeline", "estimation", "odometry", "flow", "network", "refinement"}
     | {"__init__"},
     "training": NOUNS
     | {"torch_geometry", "data", "synthetic", "network", "hypotheses", "refinement"}
-    | {"flow", "pipeline", "trajectory"},
+    | {"flow", "pipeline", "estimation", "trajectory"},
     "__init__": set(),
 }
 """Room (a folder, or a file at the top) -> rooms it may import."""
@@ -72,12 +83,12 @@ ONLY_IN = {
 
 # Ceilings of today; they only fall. The aims: 400 lines a file, 60 a function, 15 files a folder,
 # 300 constants; 24 000, 15 000 and 3 000 lines
-MAX_FILE_LINES = 645
-MAX_FUNCTION_LINES = 97
-MAX_FOLDER_FILES = 18
-MAX_CONSTANTS = 358
+MAX_FILE_LINES = 520
+MAX_FUNCTION_LINES = 90
+MAX_FOLDER_FILES = 17
+MAX_CONSTANTS = 270
 """Module-level names in capitals that hold numbers, outside ``calibration.py``."""
-MAX_LINES = {"hybridvo": 28_300, "tests": 15_000, "tools": 3_000}
+MAX_LINES = {"hybridvo": 27_900, "tests": 14_700, "tools": 2_900}
 MAX_PUBLIC_NAMES = 24
 
 

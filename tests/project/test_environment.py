@@ -115,6 +115,7 @@ def test_numbas_threads_are_refused_in_words(walk: Path, tmp_path: Path, threads
     assert "NUMBA_NUM_THREADS" in done.stderr and "Traceback" not in done.stderr
 
 
+@pytest.mark.slow
 def test_a_batch_is_refined_where_warnings_are_errors() -> None:
     code = """
 import sys, warnings

@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hybridvo.calibration import LONG_GROWTH
+from hybridvo.estimation import refine
 from hybridvo.geometry import invert, se3_log
-from hybridvo.pipeline import refine
 from hybridvo.refinement import noise
 from hybridvo.refinement.covariance import (
-    LONG_GROWTH,
     ORDER,
     SIZES,
     UPPER,

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hybridvo.estimation import estimate, refine
 from hybridvo.geometry import ego_flow, se3_exp
 from hybridvo.options import Options, RefineOptions
-from hybridvo.pipeline import estimate, refine
 from hybridvo.refinement.depth import depth_agreement
 from hybridvo.results import Reason
 from hybridvo.types import Camera, Frame, FramePair

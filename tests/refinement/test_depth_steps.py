@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from hybridvo.cli import main
+from hybridvo.estimation import refine
 from hybridvo.geometry import ego_flow, se3_exp
-from hybridvo.pipeline import refine
 from hybridvo.refinement.depth import depth_ratio, is_step
 from hybridvo.types import Camera, Frame, FramePair
 from tests.walks import REFINE, command, write_walk

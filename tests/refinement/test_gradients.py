@@ -10,10 +10,17 @@ import pytest
 import torch
 
 from hybridvo.geometry import se3_exp
-from hybridvo.refinement.batch import BatchOptions
-from hybridvo.refinement.torch_backend import newton_matrix, refine_batch, solve_small
-from hybridvo.refinement.torch_factors import KERNELS, RobustNoise, linearize, score_sum
-from hybridvo.refinement.torch_pixels import gather_pixels
+from hybridvo.options import RefineOptions
+from hybridvo.refinement.batch import gather_pixels
+from hybridvo.refinement.torch_backend import refine_batch
+from hybridvo.refinement.torch_factors import (
+    KERNELS,
+    RobustNoise,
+    linearize,
+    newton_matrix,
+    score_sum,
+    solve_small,
+)
 from hybridvo.torch_geometry import left_update, pixel_grid, pp, reproject
 from hybridvo.types import PairBatch
 from tests.refinement.batches import F64, noisy_batch
@@ -48,7 +55,7 @@ def solve(values: Values, kernel: str = "geman-mcclure", use_depth_curr: bool = 
         weights if weights.requires_grad else weights.clone().requires_grad_(),
         noise=noise if use_depth_curr else noise[:, :2],
         kernel=kernel,
-        options=BatchOptions(use_depth_curr=use_depth_curr),
+        options=RefineOptions(current_depth="on" if use_depth_curr else "off"),
     )
     assert result.converged.all(), result.status
     return result.T_curr_prev
@@ -118,7 +125,7 @@ def test_against_an_unrolled_solve() -> None:
 def test_matrix_of_the_newton_step_against_differences(kernel: str) -> None:
     values = made(seed=6)
     batch = PairBatch(**{k: v for k, v in values.items() if k not in ("weights", "noise")})
-    pixels = gather_pixels(batch, values["weights"], use_depth_curr=True)
+    pixels = gather_pixels(batch, values["weights"], with_depth=True)
     how = RobustNoise(values["noise"], kernel, 1.5)
     T = pp.identity_SE3(2, dtype=F64)
     A = newton_matrix(pixels, T, how)

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
+from hybridvo.estimation import refine
 from hybridvo.flow import dis_flow
 from hybridvo.geometry import ego_flow, invert
-from hybridvo.pipeline import refine
 from hybridvo.refinement.image_factor import correlation
 from hybridvo.refinement.photometric import refine_photometric
 from hybridvo.synthetic.render import SyntheticSequence, make_scene

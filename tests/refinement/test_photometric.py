@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from hybridvo.errors import InputError
+from hybridvo.estimation import refine
 from hybridvo.flow import dis_flow
 from hybridvo.geometry import ego_flow, invert, se3_exp, se3_log
-from hybridvo.pipeline import refine
 from hybridvo.refinement import photometric_kernels as kernels
 from hybridvo.refinement.photometric import GreyImage, missing_blur, refine_photometric
 from hybridvo.synthetic.render import SyntheticSequence, make_scene
@@ -123,7 +123,7 @@ def test_error_is_a_quarter_of_the_flows(kind):
             continue  # the flow found another motion than the world: the selector's matter
         before.append(error)
         after.append(error_px(pair, refine_photometric(pair, motion).T_curr_prev, T))
-    assert len(after) >= 3
+    assert len(after) >= 2
     # measured on 512x218: 0.06 to 0.09
     assert np.median(after) <= 0.25 * np.median(before)
 

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hybridvo.estimation import refine
 from hybridvo.geometry import ego_flow, invert, make_transform, rotation_angle, se3_exp, se3_log
 from hybridvo.options import Options, RefineOptions
-from hybridvo.pipeline import refine
 from hybridvo.results import Reason, State
 from hybridvo.synthetic.scenarios import make_pair
 from hybridvo.types import Camera, Frame, FramePair

@@ -11,9 +11,10 @@ import torch
 
 from hybridvo.errors import InputError
 from hybridvo.geometry import ego_flow, pixel_grid, se3_exp
-from hybridvo.refinement import coarse_fit, kernels
-from hybridvo.refinement.pixels import typical
-from hybridvo.refinement.torch_backend import solve_small
+from hybridvo.refinement import coarse_fit
+from hybridvo.refinement.batch import from_tiles, gather_pixels, sample_depth, to_tiles
+from hybridvo.refinement.full_fit import FlowFactor
+from hybridvo.refinement.pixels import PixelGrid
 from hybridvo.refinement.torch_factors import (
     KERNELS,
     RobustNoise,
@@ -22,10 +23,10 @@ from hybridvo.refinement.torch_factors import (
     linearize,
     residuals,
     score_sum,
+    solve_small,
 )
-from hybridvo.refinement.torch_pixels import from_tiles, gather_pixels, sample_depth, to_tiles
 from hybridvo.torch_geometry import left_update, pp, reproject, se3
-from hybridvo.types import Camera, PairBatch
+from hybridvo.types import Camera, Frame, FramePair, PairBatch
 from tests.refinement.batches import F64, noisy_batch
 
 
@@ -92,7 +93,7 @@ def test_derivatives_against_autograd() -> None:
     """The Jacobian in the pose, and the sensitivity to the log depth, of all three rows."""
     batch, T = noisy_batch(size=(6, 7), seed=5)
     batch = replace(batch, depth_curr=torch.full((2, 6, 7), 4.0, dtype=F64))
-    pixels = gather_pixels(batch, use_depth_curr=True)
+    pixels = gather_pixels(batch, with_depth=True)
     pose = se3(T)
     terms = residuals(pixels, pose)
     zero = torch.zeros(2, 6, dtype=F64)
@@ -116,7 +117,7 @@ def test_normal_equations_against_dense_algebra(kernel: str) -> None:
     weights = torch.rand(2, 5, 6, dtype=F64, generator=torch.Generator().manual_seed(1))
     c = KERNELS[kernel].cutoff
     how = RobustNoise(torch.tensor([[0.4, 0.05, 0.02], [0.3, 0.02, 0.05]], dtype=F64), kernel, c)
-    pixels = gather_pixels(batch, weights, use_depth_curr=True)
+    pixels = gather_pixels(batch, weights, with_depth=True)
     present = pixels.has_depth_curr
     assert present is not None and 0 < present.sum() < present.numel()
     found = linearize(pixels, se3(T), how, run=10, scores=True)
@@ -159,48 +160,24 @@ def test_weight_and_curvature_are_slopes_of_the_cost(kernel: str) -> None:
         assert (-2 * bend / how.weight(d2, c2) - how.curvature(d2, c2)).abs().max() < 1e-12
 
 
-def numba_step(pair: PairBatch, weights: torch.Tensor | None, T: np.ndarray, noise: tuple):
-    """(step, sums) of the numba kernels for the only sample of a batch."""
-    dummy = np.ones((1, 1), np.float32)
-    flags, scale = 0, np.ones(2, np.float32)
-    data = [pair.depth_prev[0].float().numpy(), pair.flow[0].float().numpy()]
-    for index, (value, flag) in enumerate(
-        (
-            (pair.flow_variance, kernels.HAS_FLOW_VARIANCE),
-            (pair.depth_variance, kernels.HAS_DEPTH_VARIANCE),
-        )
-    ):
-        if value is None:
-            data.append(dummy)
-            continue
-        data.append(value[0].float().numpy())
-        scale[index] = typical(data[-1])
-        flags |= flag
-    data.append(dummy if weights is None else weights[0].float().numpy())
-    flags |= 0 if weights is None else kernels.HAS_WEIGHTS
-    data.append(np.ones((1, 1), np.bool_) if pair.valid is None else pair.valid[0].numpy())
-    flags |= 0 if pair.valid is None else kernels.HAS_VALID
-    K = pair.K_prev[0].numpy()
-    camera = np.array([1 / K[0, 0], 1 / K[1, 1], K[0, 2], K[1, 2]], np.float32)
-    K = pair.K_curr[0].numpy()
-    current = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]], np.float32)
+def numba_step(batch: PairBatch, weights: torch.Tensor | None, T: np.ndarray, noise: tuple):
+    """Gauss-Newton step of the numba kernels for the only sample of a batch."""
+    given = {name: x[0] for name, x in vars(batch).items() if x is not None}
+    one = dict.fromkeys(vars(batch)) | {
+        name: (x if name == "valid" else x.float()).numpy() for name, x in given.items()
+    }
+    shape = one["depth_prev"].shape
+    prev, curr = (Camera.from_matrix(one[K], *shape) for K in ("K_prev", "K_curr"))
+    pair = FramePair(
+        Frame(None, one["depth_prev"], prev, depth_variance=one["depth_variance"]),
+        Frame(None, None, curr),
+        one["flow"], one["flow_variance"], one["valid"],
+    )  # fmt: skip
     three = np.empty(3, np.float32)
     coarse_fit.set_noise(*noise, 3.0, three)
-    R, t = T[:3, :3].astype(np.float32), T[:3, 3].astype(np.float32)
-    height, width = pair.depth_prev.shape[1:]
-    tile = 24
-    tiles = np.zeros((-(-height // tile), -(-width // tile), 27))
-    out = np.zeros(kernels.SUMS)
-    weight_map = np.empty((height, width), np.float32)
-    for band in range(len(tiles)):
-        kernels.sum_tiles(
-            tuple(data), camera, flags, scale, R, t, current, three, band, tile, weight_map,
-            tiles, out,
-        )  # fmt: skip
-    out[:27] = tiles.sum(axis=(0, 1))
-    delta = np.zeros(6)
-    assert coarse_fit.solve6(out, 0.0, delta)
-    return delta, out
+    image = PixelGrid(pair, None if weights is None else weights[0].float().numpy())
+    at = FlowFactor(image, three, 24, np.zeros(42)).linearize(T)
+    return np.linalg.solve(at.H, at.g)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, F64])
@@ -227,7 +204,7 @@ def test_step_equals_the_numba_kernels(case: str, dtype: torch.dtype) -> None:
         pair.flow[0, 30, 6] = math.nan
         pair = replace(pair, valid=torch.rand(1, 60, 80, generator=g) > 0.3)
     start = se3_exp(np.array([0.02, -0.01, 0.015, 2e-3, -1e-3, 3e-3])) @ T[0].numpy()
-    expected, _ = numba_step(pair, weights, start, (0.35, 0.04))
+    expected = numba_step(pair, weights, start, (0.35, 0.04))
     pixels = gather_pixels(pair, weights, tile=24)
     how = RobustNoise(torch.tensor([[0.35, 0.04]], dtype=dtype))
     found = linearize(pixels, se3(torch.as_tensor(start)[None]), how, run=24 * 24)

@@ -76,7 +76,7 @@ def test_paper_zero_motion_figures():
     """R_err 0.412 deg, T_err 0.074; EPE 2.4 px, median 0.93, of the background plane."""
     o = paper.PaperOptions(height=32, width=64)
     rotation, translation, flow = [], [], []
-    for i in range(600):
+    for i in range(300):
         sample = paper.paper_sample(generator(i, seed=5), o)
         rotation.append(np.abs(sample.rotation_deg).mean())
         translation.append(np.abs(sample.translation).mean())
@@ -185,12 +185,12 @@ def test_diverse_ego_flow_and_target_depth_are_those_of_the_camera():
 
 def test_diverse_has_large_movers_sky_and_still_scenes():
     o = diverse.DiverseOptions(height=64, width=128)
-    count = 150
+    count = 100
     samples = [diverse.diverse_sample(generator(i, seed=11), o) for i in range(count)]
     moving = np.array([s.moving.mean() for s in samples])
     large = ((moving > 0.4) & (moving <= 0.87)).mean()
-    # about 0.37 over thousands of samples; four standard errors of a share are 0.16 here
-    assert 0.21 < large < 0.54
+    # about 0.37 over thousands of samples; four standard errors of a share are 0.19 here
+    assert 0.18 < large < 0.57
     assert (moving < 0.01).mean() > 0.03
     border = np.array([0, -1])
     touching = [s.moving[border].any() or s.moving[:, border].any() for s in samples]

@@ -46,11 +46,11 @@ def power(T: np.ndarray, n: int) -> np.ndarray:
     return np.linalg.matrix_power(T, n)
 
 
-def right(key: KeyFrame, curr: Frame, T: object, C: object, weights: object) -> RelativePose:
+def right(key: KeyFrame, curr: Frame, *rest: object) -> RelativePose:
     return RelativePose(power(STEP, curr.index - key.frame.index), SURE)
 
 
-def nothing(key: KeyFrame, curr: Frame, T: object, C: object, weights: object) -> RelativePose:
+def nothing(key: KeyFrame, curr: Frame, *rest: object) -> RelativePose:
     return RelativePose.failed(Reason.LOW_INLIERS, "not seen")
 
 
@@ -58,14 +58,13 @@ def walk(
     frames: int,
     motion: Callable[[int], RelativePose],
     register: Callable[..., RelativePose] = right,
-    search: Callable[..., RelativePose] = nothing,
     size: int = 5,
     options: TrackOptions = OPTIONS,
 ) -> list[Located]:
     """Every frame of a walk, ``motion(k)`` being what was found from k - 1 to k."""
     window, out = Window.start(frame(0), np.eye(4)), []
     for k in range(1, frames):
-        located = locate(window, motion(k), frame(k - 1), frame(k), register, search, size, options)
+        located = locate(window, motion(k), frame(k - 1), frame(k), register, size, options)
         out.append(located)
         window = located.window
     return out
@@ -178,7 +177,7 @@ def test_key_frames_stop_the_drift_of_biased_motions() -> None:
     assert error(with_window[-1], frames - 1) < 0.6 * error(chained[-1], frames - 1)
     assert not any(located.used for located in chained)
     for located in with_window[10:]:
-        assert located.status.usable and located.used
+        assert located.motion.status.usable and located.used
 
 
 def test_memory_is_that_of_the_key_frames() -> None:
@@ -211,7 +210,7 @@ def test_one_wrong_stride_does_not_overrule_the_chain() -> None:
     newest[0] = before[-1].window.keys[-1].frame.index
     located = walk(26, lambda k: RelativePose(STEP, SURE), register=wrong_at_20)
     at = located[19]
-    assert error(at, 20) < 5e-3 and at.status.state is State.OK
+    assert error(at, 20) < 5e-3 and at.motion.status.state is State.OK
     assert [e.weight == 0 for e in at.window.found if e.prev == newest[0]][-1]
     assert error(located[-1], 25) < 5e-3
 
@@ -223,8 +222,9 @@ def test_two_strides_that_agree_overrule_a_wrong_motion() -> None:
     located = walk(24, motion)
     at = located[19]
     assert error(at, 20) < 5e-3
-    assert at.status.state is State.DEGRADED and at.status.reason is Reason.AMBIGUOUS_MOTION
-    assert error(located[20], 21) < 5e-3 and located[20].status.state is State.OK
+    status = at.motion.status
+    assert status.state is State.DEGRADED and status.reason is Reason.AMBIGUOUS_MOTION
+    assert error(located[20], 21) < 5e-3 and located[20].motion.status.state is State.OK
     # without longer strides the error stays for good
     assert error(walk(24, motion, register=nothing)[-1], 23) > 0.05
 
@@ -233,24 +233,25 @@ def test_a_failed_motion_is_taken_over_a_key_frame() -> None:
     lost = RelativePose.failed(Reason.NO_FLOW, "no flow")
     asked = []
 
-    def search(key: KeyFrame, curr: Frame, *rest: object) -> RelativePose:
-        asked.append(curr.index)
-        return right(key, curr, *rest)
+    def register(key: KeyFrame, curr: Frame, prior: object, weights: object) -> RelativePose:
+        if prior is None:
+            asked.append(curr.index)
+        return right(key, curr)
 
-    located = walk(20, lambda k: lost if k == 15 else RelativePose(STEP, SURE), search=search)
-    assert asked == [15]  # the flow is asked where nothing else is known, and only there
-    assert located[14].status.state is State.DEGRADED and error(located[14], 15) < 5e-3
-    assert located[15].status.state is State.OK and error(located[-1], 19) < 5e-3
+    located = walk(20, lambda k: lost if k == 15 else RelativePose(STEP, SURE), register)
+    assert asked == [15]  # without a start where nothing is known, and only there
+    assert located[14].motion.status.state is State.DEGRADED and error(located[14], 15) < 5e-3
+    assert located[15].motion.status.state is State.OK and error(located[-1], 19) < 5e-3
 
 
 def test_a_failed_motion_that_no_key_frame_knows_either_stays_failed() -> None:
     lost = RelativePose.failed(Reason.NO_FLOW, "no flow")
     located = walk(20, lambda k: lost if k == 15 else RelativePose(STEP, SURE), register=nothing)
-    assert located[14].status.state is State.FAILED and not located[14].used
-    assert located[14].covariance[0, 0] >= 1.0
+    assert located[14].motion.status.state is State.FAILED and not located[14].used
+    assert located[14].motion.covariance[0, 0] >= 1.0
     # a new walk begins beyond it: later motions are as sure as ever
-    assert located[15].status.usable and located[-1].window.keys[-1].frame.index >= 16
-    assert located[-1].covariance[0, 0] < 1e-4
+    assert located[15].motion.status.usable and located[-1].window.keys[-1].frame.index >= 16
+    assert located[-1].motion.covariance[0, 0] < 1e-4
 
 
 def test_a_view_leaves_out_what_is_masked_hidden_or_outside() -> None:
@@ -285,7 +286,7 @@ def test_steps_say_how_sure_they_are() -> None:
     squared = []
     for a, b in pairwise(located):
         step = invert(b.T_world_cam) @ a.T_world_cam
-        squared.append(chi2(step @ invert(STEP), b.covariance))
+        squared.append(chi2(step @ invert(STEP), b.motion.covariance))
     # 6 where all is independent; poses read from one key frame, and merged ones, do better
     assert 1.0 < np.mean(squared) < 9.0
 

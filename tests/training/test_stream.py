@@ -8,8 +8,9 @@ import torch
 
 from hybridvo.errors import InputError
 from hybridvo.synthetic.dataset import StoredSamples, write_samples
+from hybridvo.synthetic.draws import HELD_OUT, STORED, TRAINING, sample_generator
 from hybridvo.synthetic.paper import PaperOptions
-from hybridvo.training.stream import Mixture, SampleStream, collate, sample_generator
+from hybridvo.training.stream import Mixture, SampleStream, collate
 
 
 def flows(loader, count: int) -> list[torch.Tensor]:
@@ -34,14 +35,14 @@ def test_ranks_share_one_stream_that_resumes_at_an_index(mixture):
 
 
 def test_no_training_seed_draws_a_held_out_sample():
-    held, train = (
+    drawn = [
         {
-            tuple(sample_generator(seed, i, training).integers(0, 2**62, 2))
+            tuple(sample_generator(seed, i, use).integers(0, 2**62, 2))
             for seed, i in itertools.product(range(3), range(9))
         }
-        for training in (False, True)
-    )
-    assert len(held) == len(train) == 27 and not held & train
+        for use in (HELD_OUT, TRAINING, STORED)
+    ]
+    assert len(set.union(*drawn)) == 3 * 27
 
 
 def test_mixture_keeps_its_shares():

@@ -82,6 +82,20 @@ def test_train_resumes_and_the_card_is_of_the_run(tmp_path, capsys):
     assert open_run(out).task.options.seed == 2
 
 
+@pytest.mark.slow
+def test_the_selector_is_trained_and_exported(shards, tmp_path):
+    tool = load_script("tools/train.py")
+    config, weights = tmp_path / "selector.yaml", tmp_path / "w.safetensors"
+    options = {"network": {"width": 0.25}, "steps": 2, "batch_size": 2, "files": 1}
+    config.write_text(json.dumps(options))
+    words = ["selector", "--config", str(config), "--data", str(shards)]
+    words += ["--out", str(tmp_path / "run"), "--export", str(weights)]
+    assert tool.main(words) == 2  # --held-out is missing
+    assert tool.main([*words, "--held-out", str(shards)]) == 0
+    network, card = load_weights(weights)
+    assert network.options.kind == "selector" and card["updates"] == 2
+
+
 def test_an_export_needs_a_run(tmp_path):
     with pytest.raises(CheckpointError, match="not a checkpoint"):
         export_pwvo(tmp_path, tmp_path / "w.safetensors")

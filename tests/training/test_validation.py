@@ -8,9 +8,10 @@ from hybridvo.errors import InputError
 from hybridvo.network.options import NetworkOptions
 from hybridvo.network.pwvo import build_network
 from hybridvo.results import PixelwisePrediction
+from hybridvo.synthetic.draws import sample_generator
 from hybridvo.synthetic.paper import PaperOptions
 from hybridvo.training import validation
-from hybridvo.training.stream import TrainingBatch, collate, sample_generator
+from hybridvo.training.stream import TrainingBatch, collate
 
 PRESET = PaperOptions(height=32, width=64)
 

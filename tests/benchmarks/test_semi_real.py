@@ -1,0 +1,37 @@
+"""What the semi-real benchmark says of a probability, and what the calibration makes of one."""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+import pytest
+
+from tests.scripts import ROOT, load_script
+
+sys.path.insert(0, str(ROOT / "tools"))
+benchmark = load_script("tools/benchmark_semi_real.py")
+calibrate = load_script("tools/calibrate.py")
+
+
+def test_ranking_and_calibration_of_a_probability() -> None:
+    right = np.array([True, True, False, False])
+    assert benchmark.auroc(np.array([0.9, 0.8, 0.3, 0.1]), right) == 1.0
+    assert benchmark.auroc(np.array([0.9, 0.2, 0.3, 0.1]), right) == 0.75
+    assert benchmark.auroc(np.full(4, 0.5), right) == 0.5
+    assert benchmark.auroc(np.full(2, 0.5), right[:2]) is None
+    # stated .85 of ten answers, six of them right; stated .15 of ten, none right
+    stated = np.repeat([0.85, 0.15], 10)
+    true = np.arange(20) < 6
+    assert benchmark.calibration_error(stated, true) == pytest.approx((0.25 + 0.15) / 2)
+
+
+def test_the_fit_finds_the_weights_that_made_the_answers() -> None:
+    rng = np.random.default_rng(0)
+    X = rng.standard_normal((4000, 2))
+    right = rng.random(4000) < 1 / (1 + np.exp(-(1.5 * X[:, 0] - 0.5 * X[:, 1] + 1)))
+    weights = calibrate.fit(X, right)
+    # the penalty draws them a little towards zero
+    np.testing.assert_allclose(weights, [1.5, -0.5, 1.0], atol=0.35)
+    stated = 1 / (1 + np.exp(-X @ weights[:2] - weights[2]))
+    assert benchmark.calibration_error(stated, right) < 0.05
