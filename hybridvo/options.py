@@ -128,7 +128,8 @@ class PhotometricOptions:
         prior_inflation: factor on the covariance of the flow's motion. The errors of estimated flow
             are alike far beyond the tiles: with DIS the squared error in units of that covariance
             has a median of 8 to 10 where 5.4 is expected, and a long tail.
-        image_inflation: the same for the images, beyond their tiles (interpolation, shading).
+        image_inflation: the same for the images and the depth maps, beyond their tiles
+            (interpolation, shading, a bent sensor).
         min_correlation: of the two images over the pixels used; below it they do not match.
     """
 

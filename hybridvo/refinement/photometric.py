@@ -11,7 +11,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import ClassVar
+from typing import Any, ClassVar
 from weakref import WeakKeyDictionary
 
 import cv2
@@ -21,10 +21,17 @@ from hybridvo.errors import InputError
 from hybridvo.geometry import pose_matrix
 from hybridvo.options import PhotometricOptions
 from hybridvo.refinement.covariance import direction_is_known
+from hybridvo.refinement.depth_factor import DepthFactor
 from hybridvo.refinement.image_factor import ImageFactor
 from hybridvo.refinement.photometric_kernels import select_pixels
 from hybridvo.refinement.pixels import as_contiguous
-from hybridvo.refinement.solver import PriorFactor, SolverOptions, gauss_newton, positive_inverse
+from hybridvo.refinement.solver import (
+    Factor,
+    PriorFactor,
+    SolverOptions,
+    gauss_newton,
+    positive_inverse,
+)
 from hybridvo.results import RelativePose
 from hybridvo.types import Frame, FramePair
 
@@ -140,6 +147,10 @@ def _refine(pair: FramePair, pose: RelativePose, options: PhotometricOptions) ->
         return _unchanged(pose, "no_texture", what)
     factor = ImageFactor(pair, pose, index, options.image_inflation)
     prior = PriorFactor(pose.T_curr_prev, flow_information)
+    depth = DepthFactor.of(pair, pose.weights, MIN_WEIGHT, options.image_inflation)
+    factors: list[Factor] = [factor, prior]
+    if depth is not None and depth.estimate(pose.T_curr_prev):
+        factors.append(depth)
     blurs = options.blur_px
     # where the flow is sure to a fraction of the finest blur, that one is enough
     if _spread_px(pair, index, pose.covariance * options.prior_inflation) < (
@@ -151,9 +162,11 @@ def _refine(pair: FramePair, pose: RelativePose, options: PhotometricOptions) ->
         factor.use(images[0].blurred(blur, more[0]), images[1].blurred(blur, more[1]), T)
         half = (options.iterations + 1) // 2
         for steps in (half, options.iterations - half):
-            T = gauss_newton((factor, prior), T, SolverOptions(steps, tolerance=0.1)).T
+            T = gauss_newton(factors, T, SolverOptions(steps, tolerance=0.1)).T
             factor.estimate(T)
-    return _judged(pose, factor, prior, T, options)
+            if depth is not None:
+                depth.estimate(T)
+    return _judged(pose, factor, factors[1:], T, options)
 
 
 def choose_pixels(
@@ -186,11 +199,12 @@ def _spread_px(pair: FramePair, index: np.ndarray, covariance: np.ndarray) -> fl
 def _judged(
     pose: RelativePose,
     factor: ImageFactor,
-    prior: PriorFactor,
+    others: list[Any],
     T: np.ndarray,
     options: PhotometricOptions,
 ) -> RelativePose:
     """The refined motion, or that of the flow where the images cannot be believed."""
+    prior: PriorFactor = others[0]
     images, flow = factor.linearize(T).H, prior.information
     shift = prior.offset(T)
     report = PhotometricReport(
@@ -207,7 +221,7 @@ def _judged(
         agreement=factor.agreement,
         uneven_light=factor.uneven_light,
     )
-    covariance = positive_inverse(images + prior.linearize(T).H)
+    covariance = positive_inverse(images + sum(other.linearize(T).H for other in others))
     if covariance is None:
         return _unchanged(pose, "rejected", "the joint information is not definite", report)
     if factor.seen < MIN_SEEN:

@@ -1,0 +1,79 @@
+"""The depth maps as a factor: points to planes, and the noise law of the sensor."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hybridvo.geometry import se3_exp
+from hybridvo.refinement.depth_factor import DepthFactor
+from hybridvo.refinement.solver import SolverOptions, gauss_newton
+from tests import worlds
+
+SIZE = (192, 256)
+
+
+def factor_of(pair) -> DepthFactor:
+    factor = DepthFactor.of(pair, np.ones(SIZE, np.float32), 0.25)
+    assert factor is not None
+    return factor
+
+
+def noisy(pair, law, seed: int):
+    """The pair with Gaussian noise of standard deviation a + b z + c z^2 on both depth maps."""
+    rng = np.random.default_rng(seed)
+
+    def spoilt(frame):
+        z = frame.depth.astype(np.float64)
+        sigma = law[0] + law[1] * z + law[2] * z * z
+        return replace(frame, depth=(z + sigma * rng.standard_normal(z.shape)).astype(np.float32))
+
+    return replace(pair, prev=spoilt(pair.prev), curr=spoilt(pair.curr))
+
+
+def test_exact_depth_alone_gives_the_motion():
+    pair, T = worlds.world(SIZE)
+    factor = factor_of(pair)
+    start = se3_exp(np.array([0.01, -0.01, 0.02, 0.003, -0.002, 0.004])) @ T
+    for _ in range(3):
+        assert factor.estimate(start)
+        start = gauss_newton((factor,), start, SolverOptions(20, 1e-3)).T
+    worlds.assert_pose_close(start, T, rad=2e-4, m=1e-3)
+
+
+def test_the_gradient_is_that_of_the_cost():
+    # without noise: a point that comes to another pixel of a plane finds the same plane there
+    pair, T = worlds.world(SIZE, walls=worlds.WALLS[1:2])
+    factor = factor_of(pair)
+    at = se3_exp(np.array([0.01, 0.0, 0.02, 0.002, -0.001, 0.0])) @ T
+    factor.estimate(at)
+    g, h = factor.linearize(at).g, 1e-5
+    for k in range(6):
+        delta = h * np.eye(6)[k]
+        costs = [factor.linearize(se3_exp(s * delta) @ at).cost for s in (1, -1)]
+        slope = (costs[0] - costs[1]) / (2 * h)
+        assert -slope == pytest.approx(g[k], rel=0.02, abs=0.02 * np.abs(g).max())
+
+
+@pytest.mark.parametrize(
+    ("law", "least", "most"), [((0.003, 0, 0), 0.6, 1.3), ((0, 0, 0.0002), 1.4, 2.64)]
+)
+def test_the_noise_follows_the_sensor(law, least, most):
+    # a wall from 3.8 to 7 m; its near end is seen at a right angle, its far end is not
+    pair, T = worlds.world(SIZE, walls=((0.6, 0.0, 1.0, 5.0),))
+    factor = factor_of(noisy(pair, law, 1))
+    assert factor.estimate(T)
+    near, middle, far = factor.noise(np.array([4.0, 5.0, 6.5]))
+    assert least <= far / near <= most
+    assert 0.9 < middle / (law[0] + 25 * law[2]) < 1.5
+
+
+def test_nothing_is_made_of_maps_without_depth():
+    pair, T = worlds.world(SIZE)
+    ones = np.ones(SIZE, np.float32)
+    assert DepthFactor.of(replace(pair, curr=replace(pair.curr, depth=None)), ones, 0.25) is None
+    assert DepthFactor.of(pair, np.zeros(SIZE, np.float32), 0.25) is None
+    empty = replace(pair, curr=replace(pair.curr, depth=np.zeros(SIZE, np.float32)))
+    assert not factor_of(empty).estimate(T)
