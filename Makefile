@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 PIP_INSTALL := pip install --quiet --disable-pip-version-check
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 
-.PHONY: demo test test-slow golden check format docs clean
+.PHONY: demo test test-slow golden check format docs paper clean
 
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -39,6 +39,10 @@ format: $(STAMP)
 docs: $(STAMP)
 	$(BIN)/$(PIP_INSTALL) -c constraints.txt -e ".[docs]"
 	$(BIN)/mkdocs build --strict -f configs/mkdocs.yml
+
+paper: $(STAMP)  # docs/paper.md from the rows that tools/ablation.py trained in runs/ablation
+	$(BIN)/python tools/paper.py --ablation runs/ablation
+	$(BIN)/python tools/make_docs.py
 
 clean:
 	rm -rf $(VENV) build dist runs site

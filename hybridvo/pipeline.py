@@ -22,7 +22,7 @@ from hybridvo.errors import CheckpointError, InputError
 from hybridvo.flow import contradiction
 from hybridvo.hypotheses.generate import HypothesisSet, generate
 from hybridvo.hypotheses.selector import CueSelector, MaskSelector, Selection, Selector
-from hybridvo.network.models import Models, default_models, one_thread
+from hybridvo.network.models import SELECTION, Models, default_models, one_thread
 from hybridvo.options import Options
 from hybridvo.refinement import refine as refinement
 from hybridvo.refinement.photometric import refine_photometric
@@ -31,7 +31,7 @@ from hybridvo.types import FramePair, PairBatch
 from hybridvo.units import depth_advice, typical_depth
 
 DEFAULT_METHOD = "hybrid"
-NETWORKS = ("pwvo", "pwvo-naive", "pixelwise", "vonet", "vonet-attention")
+NETWORKS = tuple(SELECTION)
 BASELINES = (*pnp.SOLVERS, *rgbd.ALIGNERS, "identity")
 SELECTING = ("hybrid", "hybrid-flow")
 """Methods that ask the selector network."""

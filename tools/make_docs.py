@@ -1,9 +1,10 @@
-"""The tables of the README and of docs/results.md, from docs/results.
+"""The tables of the README, of docs/paper.md and of docs/results.md, from docs/results.
 
-    python tools/make_docs.py            # fill README.md, write docs/results.md
+    python tools/make_docs.py            # fill README.md and docs/paper.md, write docs/results.md
     python tools/make_docs.py --check    # exit code 1 if they are not up to date
 
-In the README, what stands between ``<!-- table:NAME -->`` and ``<!-- end:NAME -->`` is made here.
+In the first two, what stands between ``<!-- table:NAME -->`` and ``<!-- end:NAME -->`` is made
+here.
 """
 
 from __future__ import annotations
@@ -16,6 +17,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import paper_tables
+from markdown_table import number, table
 from measuring import ROOT
 
 PART = re.compile(r"(<!-- table:(\w+) -->\n)(.*?)(<!-- end:\2 -->)", re.DOTALL)
@@ -29,6 +32,7 @@ def build_parser() -> argparse.ArgumentParser:
         prog="make_docs.py", description=(__doc__ or "").splitlines()[0]
     )
     parser.add_argument("--readme", type=Path, default=ROOT / "README.md")
+    parser.add_argument("--paper", type=Path, default=ROOT / "docs" / "paper.md")
     parser.add_argument("--page", type=Path, default=ROOT / "docs" / "results.md")
     parser.add_argument("--results", type=Path, default=ROOT / "docs" / "results", metavar="DIR")
     parser.add_argument("--check", action="store_true", help="write nothing, only compare")
@@ -41,6 +45,7 @@ def main(argv: list[str] | None = None) -> int:
     stale = 0
     for path, text in (
         (args.readme, fill(args.readme.read_text(encoding="utf-8"), results)),
+        (args.paper, fill(args.paper.read_text(encoding="utf-8"), results)),
         (args.page, page(results)),
     ):
         if path.is_file() and path.read_text(encoding="utf-8") == text:
@@ -87,23 +92,6 @@ def page(results: Results) -> str:
         if table_lines:
             lines += [f"## {title}", "", *table_lines, ""]
     return "\n".join(lines).rstrip() + "\n"
-
-
-def table(header: list[str], rows: list[list[str]]) -> list[str]:
-    """A Markdown table, names left and numbers right."""
-    ruler = "|---" * 1 + "|---:" * (len(header) - 1) + "|"
-    return [line(header), ruler, *map(line, rows)]
-
-
-def line(cells: list[str]) -> str:
-    return "| " + " | ".join(cells) + " |"
-
-
-def number(value: float | None) -> str:
-    """Three significant digits; a dash where there is none."""
-    if value is None:
-        return "-"
-    return f"{value:.3g}" if value < 1000 else f"{value:.0f}"
 
 
 def error(row: dict[str, Any]) -> str:
@@ -319,6 +307,7 @@ TABLES: dict[str, Callable[[Results], list[str]]] = {
     "real": real,
     "sequences": sequences,
     "costs": costs,
+    **paper_tables.TABLES,
 }
 PAGE = (
     ("Most of the image moves", "heavy"),

@@ -63,7 +63,7 @@ def generate(
         if report is not None:
             report(done, count)
     sheet = Path(out) / "contact_sheet.png"
-    _write_sheet([read_sample(out, i) for i in range(min(6, count))], sheet)
+    write_sheet([read_sample(out, i) for i in range(min(6, count))], sheet)
     return sheet
 
 
@@ -79,7 +79,7 @@ def _preset(name: str, size: tuple[int, int] | None) -> Preset:
     return load_preset(name, size=size)
 
 
-def _write_sheet(samples: Sequence[Sample], path: str | Path) -> None:
+def write_sheet(samples: Sequence[Sample], path: str | Path) -> None:
     """Write a PNG with the five steps of each sample.
 
     Flow is coloured by direction, and the more the longer up to the sample's 98 % quantile; depth

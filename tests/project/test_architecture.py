@@ -88,7 +88,7 @@ MAX_FUNCTION_LINES = 90
 MAX_FOLDER_FILES = 17
 MAX_CONSTANTS = 270
 """Module-level names in capitals that hold numbers, outside ``calibration.py``."""
-MAX_LINES = {"hybridvo": 27_900, "tests": 14_700, "tools": 2_900}
+MAX_LINES = {"hybridvo": 27_900, "tests": 14_700, "tools": 3_200}
 MAX_PUBLIC_NAMES = 24
 
 

@@ -1,0 +1,215 @@
+"""Figures and statistics of the paper's page, from the rows that ``tools/ablation.py`` trained.
+
+    python tools/paper.py --ablation runs/ablation            # figures, docs/results/paper.json
+    python tools/paper.py --ablation runs/ablation --install  # and put the rows into the package
+
+Draws the five steps of the data workflow, where VONet and PWVO look (integrated gradients), the
+uncertainty beside the error and the objects' flow, and the factorised flow beside the ground truth;
+measures on held-out pairs which share of the saliency lies on moving pixels. ``make_docs.py`` fills
+docs/paper.md from the JSON files.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from measuring import ROOT, provenance, revision
+
+from hybridvo.commands.generate import write_sheet
+from hybridvo.evaluation.maps import longest_flow, prediction_errors, uncertainty_maps
+from hybridvo.evaluation.plots import FlowPanel, Panel, ScalarPanel, maps_png
+from hybridvo.evaluation.saliency import saliencies
+from hybridvo.files import atomic_write, write_json
+from hybridvo.network.losses import reconstruct
+from hybridvo.network.models import load_weights
+from hybridvo.network.selection import select_motion
+from hybridvo.network.weights import PRETRAINED, save_weights
+from hybridvo.synthetic.draws import sample_generator
+from hybridvo.synthetic.presets import load_preset
+from hybridvo.training.stream import collate
+from hybridvo.training.validation import PUBLISHED_SEED
+
+ROWS = ("pwvo-paper", "pwvo-uncertain", "pwvo-naive", "pixelwise", "vonet", "vonet-attention")
+COMPARED = ("vonet", "pwvo-paper")
+"""Rows whose saliency the paper sets beside each other."""
+SHOWN = 2
+"""Held-out pairs of a figure."""
+MIN_MOVING, MAX_MOVING = 0.05, 0.5
+"""Share of moving pixels of the pairs that are shown: a mover must be there to be looked at."""
+STEPS = 16
+"""Nodes of the integrated gradients."""
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the tool."""
+    parser = argparse.ArgumentParser(
+        prog="paper.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    add = parser.add_argument
+    add("--ablation", type=Path, required=True, metavar="DIR", help="of tools/ablation.py")
+    add("--pairs", type=int, default=200, help="held-out pairs of the statistics")
+    add("--figures", type=Path, default=ROOT / "docs" / "figures", metavar="DIR")
+    add("--results", type=Path, default=ROOT / "docs" / "results", metavar="DIR")
+    add("--install", action="store_true", help="copy the rows' weights into the package")
+    args = parser.parse_args(argv)
+    rows = {name: args.ablation / f"{name}-seed0" / "weights.safetensors" for name in ROWS}
+    networks = {name: load_weights(path)[0] for name, path in rows.items() if path.is_file()}
+    preset = load_preset(ROOT / "configs" / "data_paper.yaml", size=(64, 128))
+    samples = [preset.sample(sample_generator(PUBLISHED_SEED, i)) for i in range(args.pairs)]
+    shown = [s for s in samples if MIN_MOVING < s.moving.mean() < MAX_MOVING][:SHOWN]
+
+    figures = args.figures
+    figures.mkdir(parents=True, exist_ok=True)
+    write_sheet(shown, figures / "paper_workflow.png")
+    if set(COMPARED) <= set(networks):
+        panels = [p for s in shown for name in COMPARED for p in saliency(name, networks[name], s)]
+        write(figures / "paper_saliency.png", panels, "Where the networks look")
+    if "pwvo-paper" in networks:
+        network = networks["pwvo-paper"]
+        write(
+            figures / "paper_uncertainty.png",
+            uncertainty(network, shown[0]),
+            "Uncertainty, error and object flow",
+        )
+        write(
+            figures / "paper_flow.png",
+            factorised(network, shown[0]),
+            "Flow in parts beside the ground truth",
+        )
+    shares = {
+        name: saliency_on_movers(networks[name], samples) for name in COMPARED if name in networks
+    }
+    record = {
+        "pairs": args.pairs,
+        "seed": PUBLISHED_SEED,
+        "saliency": shares,
+        **provenance("paper.py", argv),
+    }
+    write_json(args.results / "paper.json", record)
+    content = json.loads((args.ablation / "ablation.json").read_text(encoding="utf-8"))
+    content.setdefault("commit", revision())
+    content["command"] = [without_folders(word) for word in content["command"]]
+    write_json(args.results / "ablation.json", content)
+    if args.install:
+        for name, path in rows.items():
+            if path.is_file():
+                install(name, path, content)
+    return 0
+
+
+def install(name: str, path: Path, ablation: dict[str, Any]) -> None:
+    """Put a row into the package; there it reads every second pixel of the usual 128x256 inputs."""
+    network, card = load_weights(path)
+    card = without_folders(card)
+    card |= {"command": " ".join(ablation["command"]), "commit": ablation["commit"]}
+    network.options = dataclasses.replace(network.options, input_stride=2)
+    curve = card.pop("curve")
+    scores = curve[max(curve, key=int)]
+    card["held_out"] = {
+        key: {k: v for k, v in value.items() if k != "epe_of_pairs"}
+        for key, value in scores.items()
+        if key.startswith("data_")
+    }
+    save_weights(PRETRAINED / f"{name}.safetensors", network, card, "float16")
+    write_json(PRETRAINED / f"{name}.json", card)
+
+
+def without_folders(value: Any) -> Any:
+    """The value with the last part of every absolute path in it: where a run stood says nothing."""
+    if isinstance(value, dict):
+        return {key: without_folders(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [without_folders(item) for item in value]
+    return Path(value).name if isinstance(value, str) and Path(value).is_absolute() else value
+
+
+def predict(network: Any, sample: Any) -> tuple[Any, Any]:
+    """(batch of one, output) of a sample."""
+    batch = collate([sample])
+    with torch.no_grad():
+        return batch, network(batch.inputs)
+
+
+def saliency(name: str, network: Any, sample: Any) -> list[Panel]:
+    """What decides rotation and translation, with the outline of what moves."""
+    inputs = collate([sample]).inputs
+    panels: list[Panel] = []
+    for what, found in saliencies(network, inputs, None, STEPS).items():
+        relative = found.magnitude / max(float(np.percentile(found.magnitude, 99)), 1e-30)
+        panels.append(ScalarPanel(f"{name}: {what}", relative, "relative", 1.0, sample.moving))
+    return panels
+
+
+def saliency_on_movers(network: Any, samples: list[Any]) -> dict[str, Any]:
+    """Share of the saliency on moving pixels over their share of the image, mean over pairs."""
+    ratios: dict[str, list[float]] = {"rotation": [], "translation": []}
+    missed = []
+    for sample in samples:
+        moving = float(sample.moving.mean())
+        if moving < MIN_MOVING:
+            continue
+        for what, found in saliencies(network, collate([sample]).inputs, None, STEPS).items():
+            share = found.share_on(sample.moving)
+            if share is not None:
+                ratios[what].append(share / moving)
+                missed.append(found.completeness_error)
+    result: dict[str, Any] = {}
+    for what, values in ratios.items():
+        result[what] = {
+            "mean": float(np.mean(values)),
+            "standard_error": float(np.std(values) / np.sqrt(len(values))),
+            "pairs": len(values),
+        }
+    return result | {"median_part_missed": float(np.median(missed))}
+
+
+def uncertainty(network: Any, sample: Any) -> list[Panel]:
+    """Uncertainty of both halves, their errors, and the objects' flow."""
+    _, output = predict(network, sample)
+    panels: list[Panel] = []
+    errors = prediction_errors(output, sample.rotation_deg, sample.translation)
+    for what, unit, U, error in zip(
+        ("rotation", "translation"), ("deg", "m"), uncertainty_maps(output), errors, strict=True
+    ):
+        # each beside its own scale: the paper compares where they are large, not how large
+        panels.append(
+            ScalarPanel(f"uncertainty of the {what}", U, f"{unit}, U", None, sample.moving)
+        )
+        panels.append(ScalarPanel(f"error of the {what}", error, unit, None, sample.moving))
+    objects = sample.flow - sample.ego_flow
+    longest = longest_flow(sample.flow)
+    total = FlowPanel("total flow", sample.flow, longest)
+    return [total, FlowPanel("flow of the objects", objects, longest), *panels]
+
+
+def factorised(network: Any, sample: Any) -> list[Panel]:
+    """Ego and object flow of the estimate beside the true ones."""
+    batch, output = predict(network, sample)
+    T, gt = select_motion(output), batch.targets
+    ego = reconstruct(gt.depth_prev, T, gt.K_prev, gt.K_curr)[0][0].permute(1, 2, 0).numpy()
+    longest = longest_flow(sample.flow)
+    flows = {
+        "ego flow, estimate": ego,
+        "ego flow, ground truth": sample.ego_flow,
+        "object flow, estimate": sample.flow - ego,
+        "object flow, ground truth": sample.flow - sample.ego_flow,
+    }
+    return [FlowPanel(title, flow, longest) for title, flow in flows.items()]
+
+
+def write(path: Path, panels: list[Panel], heading: str) -> None:
+    """Panels as a PNG."""
+    with atomic_write(path, "wb") as file:
+        file.write(maps_png(panels, heading, 2.0))
+    print(path)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
