@@ -138,6 +138,9 @@ def load_split(folder: str | Path, split: str) -> tuple[Recording, ...]:
 
 def _load(folder: Path, source: Source) -> Recording:
     sequence = open_sequence(folder / source.path)
+    poses = sequence.poses
+    if poses is None:
+        raise InputError(f"{source.path}: expected a recording with ground truth, got none.")
     indices = range(source.start, len(sequence) if source.stop is None else source.stop)
     frames = []
     for i in indices:
@@ -148,7 +151,7 @@ def _load(folder: Path, source: Source) -> Recording:
     pairs = []
     for stride in source.strides:
         for k in range(len(frames) - stride):
-            stated = [sequence.poses[indices[i]] for i in (k + stride, k)]
+            stated = [poses[indices[i]] for i in (k + stride, k)]
             T = _measured_motion(frames[k], frames[k + stride], invert(stated[0]) @ stated[1])
             if T is not None:
                 pairs.append((k, k + stride, T))
@@ -207,10 +210,16 @@ def draw_pair(
         canvases[0].draw(mover, mover.points, goes, camera)
         mover.image *= np.float32(rng.uniform(0.95, 1.05))
         canvases[1].draw(mover, points, goes, camera)
-    frames = [_sensed(rng, canvas, camera) for canvas in canvases]
-    field = dis_flow()(*frames)
+    prev, curr = (_sensed(rng, canvas, camera) for canvas in canvases)
+    field = dis_flow()(prev, curr)
     pair = FramePair(
-        *frames, field.flow, field.variance, field.valid, flow_source="dis", depth_source="sensor"
+        prev,
+        curr,
+        field.flow,
+        field.variance,
+        field.valid,
+        flow_source="dis",
+        depth_source="sensor",
     )
     first = canvases[0]
     depth = np.where(first.measured > 0.5, first.depth, 0).astype(np.float32)
@@ -299,7 +308,8 @@ def _cut(
     middle = float(np.median(z[mask & (measured > 0)]))
     mask &= np.abs(z - middle) < rng.uniform(0.15, 0.8) * middle
     if rng.random() < 0.5:  # ragged, as what a sensor sees of hair and leaves
-        mask &= smooth_field(rng, *mask.shape, 12) > -1.3
+        height, width = mask.shape
+        mask &= smooth_field(rng, height, width, 12) > -1.3
     # rays turned to where it goes; any scaling of a rigid thing is one
     centre = points[h // 2, min(w, mask.shape[1]) // 2]
     to = rng.uniform(0.0, 1.0, 2) * (camera.width - 1, camera.height - 1)
@@ -348,7 +358,8 @@ def _moved(
         other = motion @ _about(centre, swing)
         out = np.where(side[..., None], transformed(points, other), out)
     if rng.random() < 0.4:
-        wobble = smooth_field(rng, *points.shape[:2], 5, 3)
+        height, width = points.shape[:2]
+        wobble = smooth_field(rng, height, width, 5, 3)
         out = out + wobble * np.float32(rng.uniform(0, 0.5) * centre[2] / camera.fx)
     return out
 
@@ -363,7 +374,7 @@ def _sensed(rng: np.random.Generator, canvas: Canvas, camera: Camera) -> Frame:
     """What a camera and a depth sensor make of a view."""
     shape = camera.shape
     gain, offset = rng.uniform(0.96, 1.04), rng.uniform(-4, 4)
-    image = canvas.image * np.float32(gain) + np.float32(offset)
+    image: np.ndarray = canvas.image * np.float32(gain) + np.float32(offset)
     if rng.random() < 0.5:
         image = cv2.GaussianBlur(image, (0, 0), log_uniform(rng, (0.3, 1.0)))
     noise = rng.standard_normal((*shape, 3), dtype=np.float32)
