@@ -101,6 +101,9 @@ class _Dis:
         # a DIS object that two threads use at once ends the process
         self._threads = threading.local()
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _Dis, (self._preset, self._forward_backward)
+
     def __call__(self, prev: Frame, curr: Frame) -> FlowField:
         """Flow from ``prev`` to ``curr``; None where an image is missing or too small for DIS."""
         none = FlowField(None, source="dis")

@@ -9,6 +9,7 @@ the images do not match along the motion, or lead outside of what the flow allow
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, ClassVar
@@ -69,8 +70,8 @@ class PhotometricReport:
         message: the same for people.
         shift: (6,) left tangent from the flow's motion to that of the images and the flow.
         shift_sigma: its length in standard deviations of the flow (inflated).
-        image_information: (6, 6) of the images alone; flow_information: (6, 6) of the flow alone,
-            both as they were added up.
+        image_information: (6, 6) of the images alone; flow_information: of the flow alone;
+            depth_information: of both depth maps, 0 without them; all as they were added up.
         gain, offset: of the current image over the previous one; offset in grey levels.
         noise_grey: standard deviation of the residual, grey levels.
         correlation: of the two images over the pixels used.
@@ -87,6 +88,7 @@ class PhotometricReport:
     shift_sigma: float = 0.0
     image_information: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
     flow_information: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
+    depth_information: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
     gain: float = 1.0
     offset: float = 0.0
     noise_grey: float = 0.0
@@ -166,7 +168,7 @@ def _refine(pair: FramePair, pose: RelativePose, options: PhotometricOptions) ->
             factor.estimate(T)
             if depth is not None:
                 depth.estimate(T)
-    return _judged(pose, factor, factors[1:], T, options)
+    return _judged(pose, factors, T, options)
 
 
 def choose_pixels(
@@ -198,13 +200,20 @@ def _spread_px(pair: FramePair, index: np.ndarray, covariance: np.ndarray) -> fl
 
 def _judged(
     pose: RelativePose,
-    factor: ImageFactor,
-    others: list[Any],
+    factors: Sequence[Any],
     T: np.ndarray,
     options: PhotometricOptions,
 ) -> RelativePose:
-    """The refined motion, or that of the flow where the images cannot be believed."""
-    prior: PriorFactor = others[0]
+    """The refined motion, or that of the flow where the images cannot be believed.
+
+    Args:
+        pose: that of the flow.
+        factors: of the images, of the flow's motion and, where there are two, of the depth maps.
+        T: where their joint cost is least.
+        options: of the refinement.
+    """
+    factor: ImageFactor = factors[0]
+    prior: PriorFactor = factors[1]
     images, flow = factor.linearize(T).H, prior.information
     shift = prior.offset(T)
     report = PhotometricReport(
@@ -213,6 +222,7 @@ def _judged(
         shift_sigma=float(np.sqrt(shift @ flow @ shift)),
         image_information=images,
         flow_information=flow,
+        depth_information=sum((f.linearize(T).H for f in factors[2:]), np.zeros((6, 6))),
         gain=factor.gain,
         offset=factor.offset + MID_GREY * (1 - factor.gain),
         noise_grey=factor.noise,
@@ -221,7 +231,7 @@ def _judged(
         agreement=factor.agreement,
         uneven_light=factor.uneven_light,
     )
-    covariance = positive_inverse(images + sum(other.linearize(T).H for other in others))
+    covariance = positive_inverse(images + prior.linearize(T).H + report.depth_information)
     if covariance is None:
         return _unchanged(pose, "rejected", "the joint information is not definite", report)
     if factor.seen < MIN_SEEN:

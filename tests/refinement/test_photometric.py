@@ -134,7 +134,8 @@ def test_information_adds_up(light):
     assert done.photometric.taken
     assert done.terms == (*motion.terms, "images")
     images, flow = done.photometric.image_information, done.photometric.flow_information
-    joint = np.linalg.inv(done.covariance)
+    assert np.trace(done.photometric.depth_information) > 0
+    joint = np.linalg.inv(done.covariance) - done.photometric.depth_information
     # Student's prior weighs the flow by (6 + 6) / (6 + d^2), at most 2
     weight = 12 / (6 + done.photometric.shift_sigma**2)
     scale = np.sqrt(np.diag(joint))
