@@ -36,13 +36,15 @@ def load_weights(path: str | Path) -> tuple[Any, dict[str, Any]]:
             program or architecture, or with values that are not finite; names the file and what
             does not match.
     """
-    from hybridvo.network.pwvo import network_of
-    from hybridvo.network.selector_net import selector_of
+    from hybridvo.network.options import NetworkOptions
+    from hybridvo.network.pwvo import build_network
+    from hybridvo.network.selector_net import SelectorNetwork, SelectorNetworkOptions
     from hybridvo.network.weights import read_weights
 
     weights = read_weights(path)
-    is_selector = weights.options.get("kind") == "selector"
-    return (selector_of if is_selector else network_of)(weights), weights.card
+    if weights.options.get("kind") == "selector":
+        return weights.build(SelectorNetworkOptions, SelectorNetwork), weights.card
+    return weights.build(NetworkOptions, build_network), weights.card
 
 
 class Models:

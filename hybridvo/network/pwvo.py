@@ -16,7 +16,7 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from hybridvo.errors import CheckpointError, InputError
+from hybridvo.errors import CheckpointError
 from hybridvo.network.inputs import NetworkInputs, assemble_inputs
 from hybridvo.network.layers import (
     Encoder,
@@ -28,7 +28,7 @@ from hybridvo.network.layers import (
 from hybridvo.network.normalization import normalize, predict
 from hybridvo.network.options import NetworkOptions
 from hybridvo.network.vonet import VONet
-from hybridvo.network.weights import Weights, read_weights, weights_file
+from hybridvo.network.weights import read_weights, weights_file
 from hybridvo.results import PixelwisePrediction
 from hybridvo.types import FramePair, PairBatch
 
@@ -133,7 +133,7 @@ class PWVO(nn.Module):
             CheckpointError: no such weights, damaged ones, or another network's.
         """
         weights = read_weights(weights_file(name_or_path))
-        network = network_of(weights)
+        network = weights.build(NetworkOptions, build_network)
         if not isinstance(network, cls):
             raise CheckpointError(
                 f"{weights.path}: expected the weights of a PWVO, got another network's."
@@ -217,16 +217,3 @@ def build_network(options: NetworkOptions | None = None) -> nn.Module:
     options = NetworkOptions() if options is None else options
     network: Any = PWVO(options) if options.kind == "pwvo" else VONet(options)
     return network
-
-
-def network_of(weights: Weights) -> nn.Module:
-    """The network of a weights file, in evaluation mode.
-
-    Raises:
-        CheckpointError: options that are not a network's, or weights that do not fit them.
-    """
-    try:
-        options = NetworkOptions(**weights.options)
-    except (InputError, TypeError) as error:
-        raise CheckpointError(f"{weights.path}: {error}") from None
-    return weights.into(build_network(options))

@@ -15,7 +15,7 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from hybridvo.errors import CheckpointError, InputError
+from hybridvo.errors import InputError
 from hybridvo.hypotheses.generate import GridMaps
 from hybridvo.hypotheses.selector import Candidates, Scores
 from hybridvo.network.layers import plain_torch, scaled
@@ -25,7 +25,6 @@ from hybridvo.network.selector_inputs import (
     selector_inputs,
     shared_channels,
 )
-from hybridvo.network.weights import Weights
 from hybridvo.results import MotionPrior
 
 CHANNELS = (24, 40, 64, 96)
@@ -245,19 +244,6 @@ def _mirrored(x: torch.Tensor, mirror: torch.Tensor, signed: tuple[int, ...]) ->
     turned = x.flip(3)
     turned[:, list(signed)] *= -1
     return torch.where(mirror[:, None, None, None], turned, x)
-
-
-def selector_of(weights: Weights) -> nn.Module:
-    """The selector of a weights file, in evaluation mode.
-
-    Raises:
-        CheckpointError: options that are not a selector's, or weights that do not fit them.
-    """
-    try:
-        options = SelectorNetworkOptions(**weights.options)
-    except (InputError, TypeError) as error:
-        raise CheckpointError(f"{weights.path}: {error}") from None
-    return weights.into(SelectorNetwork(options))
 
 
 class NetworkScorer:

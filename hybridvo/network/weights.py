@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -42,12 +42,21 @@ class Weights:
     card: dict[str, Any]
     tensors: dict[str, torch.Tensor]
 
-    def into(self, network: nn.Module) -> nn.Module:
-        """The network with these weights, in evaluation mode.
+    def build(self, kind: Callable[..., Any], network_of: Callable[[Any], nn.Module]) -> nn.Module:
+        """The network of the file, in evaluation mode.
+
+        Args:
+            kind: class of its options.
+            network_of: what makes a network of them.
 
         Raises:
-            CheckpointError: names or shapes that are not those of the network.
+            CheckpointError: options that are not of this kind, or names or shapes of the weights
+                that are not those of the network.
         """
+        try:
+            network = network_of(kind(**self.options))
+        except (InputError, TypeError) as error:
+            raise CheckpointError(f"{self.path}: {error}") from None
         try:
             network.load_state_dict(self.tensors, strict=True)
         except RuntimeError as error:
