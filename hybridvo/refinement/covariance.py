@@ -28,6 +28,7 @@ from hybridvo.refinement.kernels import (
     new_work,
     project_block,
 )
+from hybridvo.refinement.solver import positive_inverse
 
 NOTHING = np.diag([1e4] * 3 + [10.0] * 3)
 """Covariance that carries no information (m^2, rad^2)."""
@@ -250,3 +251,21 @@ def sandwich_covariance(
     if not np.isfinite(covariance).all():
         return NOTHING.copy(), eigenvalues, False
     return covariance, eigenvalues, True
+
+
+def dispersion(sums: np.ndarray, meat: np.ndarray, model: np.ndarray) -> float | None:
+    """How many times larger the sandwich covariance over tiles is than that of the model.
+
+    Args:
+        sums: (n, 6) sums of the scores of each tile.
+        meat: (6, 6) outer products of the scores of all pixels, added up.
+        model: (6, 6) covariance if the pixels' errors are independent and of the stated size.
+
+    Returns:
+        Ratio of the traces, at least 1; None where the scores leave a direction open.
+    """
+    independent = positive_inverse(meat)
+    if independent is None:
+        return None
+    clusters = max(1.0, np.trace(independent @ sums.T @ sums) / 6)
+    return float(max(1.0, clusters * np.trace(model @ meat) / 6))

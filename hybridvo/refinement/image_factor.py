@@ -21,6 +21,7 @@ import numpy as np
 from hybridvo.calibration import EVEN_PARTS, UNEVEN_LIGHT
 from hybridvo.options import RefineOptions
 from hybridvo.refinement import photometric_kernels as kernels
+from hybridvo.refinement.covariance import dispersion
 from hybridvo.refinement.full_fit import tile_size
 from hybridvo.refinement.pixels import as_contiguous, typical
 from hybridvo.refinement.solver import Linearization, positive_inverse
@@ -219,22 +220,24 @@ class ImageFactor:
             self._index, len(self._index), self._J, self._r, self._w, tile, columns, light, scores,
             curvature, meat,
         )  # fmt: skip
-        model, independent = positive_inverse(H), positive_inverse(meat)
-        if model is None or independent is None:
+        model = positive_inverse(H)
+        if model is None:
             self._scale = 0.0
             return
         # as at the optimum of the images alone, to first order: the flow pulls away from it
         scores -= curvature @ (model @ scores.sum(axis=0))
-        clusters = max(1.0, np.trace(independent @ scores.T @ scores) / 6)
-        dispersion = np.trace(model @ meat) / 6
-        scale = 1.0 / (max(1.0, clusters * dispersion) * self._inflation)
-        parts = scale * _dispersion(scores.reshape(rows, columns, 6), model)
+        factor = dispersion(scores, meat, model)
+        if factor is None:
+            self._scale = 0.0
+            return
+        scale = 1.0 / (factor * self._inflation)
+        parts = scale * parts_dispersion(scores.reshape(rows, columns, 6), model)
         # what the parts disagree about is seen; as much again is common to them and is not
         self.agreement = min(1.0, (EVEN_PARTS / max(parts, EVEN_PARTS)) ** 2)
         self._scale = scale * self.agreement
 
 
-def _dispersion(scores: np.ndarray, model: np.ndarray) -> float:
+def parts_dispersion(scores: np.ndarray, model: np.ndarray) -> float:
     """Dispersion of the scores (rows, columns, 6) of tiles, summed over each of :data:`PARTS`.
 
     1 where the parts are independent and the ``model`` covariance (6, 6) is right.

@@ -22,10 +22,10 @@ from hybridvo.errors import InputError
 from hybridvo.geometry import pose_matrix
 from hybridvo.options import PhotometricOptions
 from hybridvo.refinement.covariance import direction_is_known
-from hybridvo.refinement.depth_factor import DepthFactor
 from hybridvo.refinement.image_factor import ImageFactor
 from hybridvo.refinement.photometric_kernels import select_pixels
 from hybridvo.refinement.pixels import as_contiguous
+from hybridvo.refinement.plane_factor import PlaneFactor
 from hybridvo.refinement.solver import (
     Factor,
     PriorFactor,
@@ -149,7 +149,7 @@ def _refine(pair: FramePair, pose: RelativePose, options: PhotometricOptions) ->
         return _unchanged(pose, "no_texture", what)
     factor = ImageFactor(pair, pose, index, options.image_inflation)
     prior = PriorFactor(pose.T_curr_prev, flow_information)
-    depth = DepthFactor.of(pair, pose.weights, MIN_WEIGHT, options.image_inflation)
+    depth = PlaneFactor.of(pair, pose.weights, MIN_WEIGHT, options.image_inflation)
     factors: list[Factor] = [factor, prior]
     if depth is not None and depth.estimate(pose.T_curr_prev):
         factors.append(depth)

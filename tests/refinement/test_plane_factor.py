@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 from hybridvo.geometry import se3_exp
-from hybridvo.refinement.depth_factor import DepthFactor
+from hybridvo.refinement.plane_factor import PlaneFactor
 from hybridvo.refinement.solver import SolverOptions, gauss_newton
 from tests import worlds
 
 SIZE = (192, 256)
 
 
-def factor_of(pair) -> DepthFactor:
-    factor = DepthFactor.of(pair, np.ones(SIZE, np.float32), 0.25)
+def factor_of(pair) -> PlaneFactor:
+    factor = PlaneFactor.of(pair, np.ones(SIZE, np.float32), 0.25)
     assert factor is not None
     return factor
 
@@ -73,7 +73,7 @@ def test_the_noise_follows_the_sensor(law, least, most):
 def test_nothing_is_made_of_maps_without_depth():
     pair, T = worlds.world(SIZE)
     ones = np.ones(SIZE, np.float32)
-    assert DepthFactor.of(replace(pair, curr=replace(pair.curr, depth=None)), ones, 0.25) is None
-    assert DepthFactor.of(pair, np.zeros(SIZE, np.float32), 0.25) is None
+    assert PlaneFactor.of(replace(pair, curr=replace(pair.curr, depth=None)), ones, 0.25) is None
+    assert PlaneFactor.of(pair, np.zeros(SIZE, np.float32), 0.25) is None
     empty = replace(pair, curr=replace(pair.curr, depth=np.zeros(SIZE, np.float32)))
     assert not factor_of(empty).estimate(T)

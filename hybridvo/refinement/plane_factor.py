@@ -15,6 +15,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import nnls
 
+from hybridvo.options import RefineOptions
+from hybridvo.refinement.covariance import dispersion
 from hybridvo.refinement.full_fit import tile_size
 from hybridvo.refinement.solver import Linearization, positive_inverse
 from hybridvo.types import FramePair
@@ -32,12 +34,10 @@ FLOOR = 1e-4
 """Least standard deviation, in shares of the depth."""
 MEAN_LENGTH = np.sqrt(2 / np.pi)
 """Mean absolute value of a standard normal number."""
-TILES = 110
-"""As in the refinement: errors may be correlated within a tile."""
 MIN_PIXELS = 300
 
 
-class DepthFactor:
+class PlaneFactor:
     """The two depth maps of a pair, see :class:`hybridvo.refinement.solver.Factor`.
 
     Args:
@@ -59,17 +59,18 @@ class DepthFactor:
         u, v, z = u[used], v[used], z[used]
         self._points = np.stack([(u - prev.cx) / prev.fx * z, (v - prev.cy) / prev.fy * z, z], 1)
         self._weight = weight[used].astype(np.float64)
-        tile = tile_size(prev.shape, TILES)
+        tile = tile_size(prev.shape, RefineOptions().tiles)
         self._tile = (v // tile) * -(-prev.width // tile) + u // tile
         self._camera = pair.curr.camera
-        self._depth = np.asarray(pair.curr.depth, np.float64)
+        self._depth = np.asarray(pair.curr.depth)
+        self._at: np.ndarray | None = None
         self._inflation = inflation
         self._law, self._scale = np.array([0.0, 0.0, 1.0]), 1.0
 
     @classmethod
     def of(
         cls, pair: FramePair, weights: np.ndarray, least: float, inflation: float = 1.0
-    ) -> DepthFactor | None:
+    ) -> PlaneFactor | None:
         """None where a depth map is missing or has too few pixels."""
         if pair.prev.depth is None or pair.curr.depth is None:
             return None
@@ -119,6 +120,12 @@ class DepthFactor:
         return J, r, self._weight * robust**2 / sigma**2, float(cost)
 
     def _residuals(self, T: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """What :meth:`_measure` finds at a motion; the last one's is kept."""
+        if T is not self._at:
+            self._found, self._at = self._measure(T), T
+        return self._found
+
+    def _measure(self, T: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """(r (N,), J (N, 6), depth (N,), seen (N,) bool) at a motion; finite where not seen."""
         K, depth = self._camera, self._depth
         moved = self._points @ T[:3, :3].T + T[:3, 3]
@@ -128,12 +135,12 @@ class DepthFactor:
         seen = (moved[:, 2] > 1e-6) & (u >= REACH) & (u < K.width - REACH)
         seen &= (v >= REACH) & (v < K.height - REACH)
         u, v = np.where(seen, u, REACH), np.where(seen, v, REACH)
-        z = depth[v, u]
+        z = depth[v, u].astype(np.float64)
         seen &= np.isfinite(z) & (z > 0)
         z = np.where(seen, z, 1.0)
 
         def point(du: int, dv: int) -> tuple[np.ndarray, np.ndarray]:
-            other = depth[v + dv, u + du]
+            other = depth[v + dv, u + du].astype(np.float64)
             near = np.abs(other - z) < EDGE * z  # False where not finite
             other = np.where(near, other, z)
             x, y = (u + du - K.cx) / K.fx, (v + dv - K.cy) / K.fy
@@ -151,17 +158,10 @@ class DepthFactor:
 
     def _estimate_scale(self, T: np.ndarray) -> None:
         """Share of the information that is left under errors alike within a tile."""
-        self._scale = 1.0
         J, r, w, _ = self._weighted(T)
         scores = J * (w * r)[:, None]
         model = positive_inverse((J * w[:, None]).T @ J)
-        meat = scores.T @ scores
-        independent = positive_inverse(meat)
-        if model is None or independent is None:
-            self._scale = 0.0
-            return
         sums = np.zeros((self._tile.max() + 1, 6))
         np.add.at(sums, self._tile, scores)
-        clusters = max(1.0, np.trace(independent @ sums.T @ sums) / 6)
-        dispersion = max(1.0, clusters * np.trace(model @ meat) / 6)
-        self._scale = 1.0 / (dispersion * self._inflation)
+        factor = None if model is None else dispersion(sums, scores.T @ scores, model)
+        self._scale = 0.0 if factor is None else 1.0 / (factor * self._inflation)
