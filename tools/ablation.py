@@ -23,6 +23,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from measuring import provenance
+
 ROWS = Path(__file__).resolve().parents[1] / "configs" / "ablation"
 DECIDING = ("pwvo-paper", "pwvo-naive", "vonet", "pwvo-uncertain")
 """Rows whose order is the paper's claim: these are trained with several seeds."""
@@ -237,7 +239,7 @@ def _summary(args: argparse.Namespace, runs: Mapping[tuple[str, int], Any]) -> d
         if (claim := _claim(runs, better, worse, preset, str(samples))) is not None
     ]
     return {
-        "command": ["tools/ablation.py", *sys.argv[1:]],
+        **provenance("ablation.py", None),
         "samples": args.samples,
         "held_out": {"count": args.count, "presets": presets},
         "epe": "component mean, px at the size of the samples",

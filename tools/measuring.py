@@ -151,7 +151,9 @@ def provenance(tool: str, argv: list[str] | None) -> dict[str, Any]:
         except PackageNotFoundError:
             packages[package] = None
     return {
-        "command": shlex.join(["python", f"tools/{tool}", *map(str, words)]),
+        "command": shlex.join(
+            ["python", f"tools/{tool}", *(without_folders(str(word)) for word in words)]
+        ),
         "commit": revision(),
         "machine": {
             "processor": processor(),
@@ -161,6 +163,15 @@ def provenance(tool: str, argv: list[str] | None) -> dict[str, Any]:
         },
         "versions": {"python": platform.python_version()} | packages,
     }
+
+
+def without_folders(value: Any) -> Any:
+    """The value with the last part of every absolute path in it: where a run stood says nothing."""
+    if isinstance(value, dict):
+        return {key: without_folders(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [without_folders(item) for item in value]
+    return Path(value).name if isinstance(value, str) and Path(value).is_absolute() else value
 
 
 def revision() -> str:

@@ -20,7 +20,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from measuring import ROOT, provenance, revision
+from measuring import ROOT, provenance, without_folders
+from paper_tables import ROWS
 
 from hybridvo.commands.generate import write_sheet
 from hybridvo.evaluation.maps import longest_flow, prediction_errors, uncertainty_maps
@@ -36,7 +37,6 @@ from hybridvo.synthetic.presets import load_preset
 from hybridvo.training.stream import collate
 from hybridvo.training.validation import PUBLISHED_SEED
 
-ROWS = ("pwvo-paper", "pwvo-uncertain", "pwvo-naive", "pixelwise", "vonet", "vonet-attention")
 COMPARED = ("vonet", "pwvo-paper")
 """Rows whose saliency the paper sets beside each other."""
 SHOWN = 2
@@ -94,8 +94,6 @@ def main(argv: list[str] | None = None) -> int:
     }
     write_json(args.results / "paper.json", record)
     content = json.loads((args.ablation / "ablation.json").read_text(encoding="utf-8"))
-    content.setdefault("commit", revision())
-    content["command"] = [without_folders(word) for word in content["command"]]
     write_json(args.results / "ablation.json", content)
     if args.install:
         for name, path in rows.items():
@@ -108,7 +106,7 @@ def install(name: str, path: Path, ablation: dict[str, Any]) -> None:
     """Put a row into the package; there it reads every second pixel of the usual 128x256 inputs."""
     network, card = load_weights(path)
     card = without_folders(card)
-    card |= {"command": " ".join(ablation["command"]), "commit": ablation["commit"]}
+    card |= {"command": ablation["command"], "commit": ablation["commit"]}
     network.options = dataclasses.replace(network.options, input_stride=2)
     curve = card.pop("curve")
     scores = curve[max(curve, key=int)]
@@ -119,15 +117,6 @@ def install(name: str, path: Path, ablation: dict[str, Any]) -> None:
     }
     save_weights(PRETRAINED / f"{name}.safetensors", network, card, "float16")
     write_json(PRETRAINED / f"{name}.json", card)
-
-
-def without_folders(value: Any) -> Any:
-    """The value with the last part of every absolute path in it: where a run stood says nothing."""
-    if isinstance(value, dict):
-        return {key: without_folders(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [without_folders(item) for item in value]
-    return Path(value).name if isinstance(value, str) and Path(value).is_absolute() else value
 
 
 def predict(network: Any, sample: Any) -> tuple[Any, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -25,7 +26,7 @@ WITHOUT_FLOW = {  # the paper's Table 3: EPE px, R_err deg, T_err m
     "pwvo-naive": (1.241, 0.144, 0.095),
 }
 """The line that the paper calls PWVO there has the figures of its PWVO (naive)."""
-FIGURES = ("epe", "r_err_deg", "t_err")
+FIGURES = {"epe": "EPE", "r_err_deg": "R_err", "t_err": "T_err"}
 PRESETS = {"data_paper": "paper's data", "data_diverse": "diverse data"}
 
 
@@ -50,6 +51,11 @@ def final(results: Results, row: str, preset: str, key: str) -> str:
     return number(float(np.mean(values))) + spread
 
 
+def published(row: str) -> Mapping[str, Any]:
+    """Figures of a row in the paper."""
+    return next(line for line in protocols()["paper"].published if line["method"] == row)
+
+
 def budget(results: Results) -> str:
     """One line on what the rows were trained with."""
     content = results["ablation"]
@@ -59,7 +65,7 @@ def budget(results: Results) -> str:
         f"Ours: {content['samples']} samples a row (the paper: 10 000 000), seeds: {counted}, "
         "quarter width, 64x128, inputs without units, batches of 8; "
         f"{content['held_out']['count']} held-out pairs, EPE in px of 64x128 (component mean). "
-        f"Published: Sintel, px of 128x256. `{' '.join(content['command'])}`"
+        f"Published: Sintel, px of 128x256. `{content['command']}`"
     )
 
 
@@ -67,14 +73,13 @@ def main_table(results: Results) -> list[str]:
     """Tables 1 and 2 of the paper."""
     if not any(runs_of(results, row) for row in ROWS):
         return []
-    published = {line["method"]: line for line in protocols()["paper"].published}
     rows = []
     for row, title in ROWS.items():
-        cells = [number(published[row][key]) for key in FIGURES]
+        cells = [number(published(row)[key]) for key in FIGURES]
         cells += [final(results, row, preset, key) for preset in PRESETS for key in FIGURES]
         rows.append([title, *cells])
-    names = ("EPE", "R_err", "T_err")
-    header = [f"{name}, {whose}" for whose in ("published", *PRESETS.values()) for name in names]
+    columns = ("published", *PRESETS.values())
+    header = [f"{name}, {whose}" for whose in columns for name in FIGURES.values()]
     return [*table(["row", *header], rows), "", budget(results)]
 
 
@@ -84,19 +89,16 @@ def flow_table(results: Results) -> list[str]:
     for row, without in WITHOUT_FLOW.items():
         if not runs_of(results, f"{row}-without-flow"):
             continue
-        published = next(x for x in protocols()["paper"].published if x["method"] == row)
         cells = []
         for key, value in zip(FIGURES, without, strict=True):
             ours = [
                 final(results, name, "data_paper", key) for name in (row, f"{row}-without-flow")
             ]
-            cells += [f"{number(published[key])} / {number(value)}", " / ".join(ours)]
+            cells += [f"{number(published(row)[key])} / {number(value)}", " / ".join(ours)]
         rows.append([ROWS[row], *cells])
     if not rows:
         return []
-    names = [
-        f"{name}, {whose}" for name in ("EPE", "R_err", "T_err") for whose in ("published", "ours")
-    ]
+    names = [f"{name}, {whose}" for name in FIGURES.values() for whose in ("published", "ours")]
     return [*table(["row, with / without L^F", *names], rows), "", budget(results)]
 
 
@@ -154,9 +156,7 @@ def selection_table(results: Results) -> list[str]:
                 values = [curve[last][f"rules_{preset}"][rule][key] for curve in curves]
                 cells.append(number(float(np.mean(values))))
         rows.append([f"`{rule}`", *cells])
-    header = [
-        f"{name}, {title}" for title in PRESETS.values() for name in ("EPE", "R_err", "T_err")
-    ]
+    header = [f"{name}, {title}" for title in PRESETS.values() for name in FIGURES.values()]
     return table(["rule", *header], rows)
 
 
