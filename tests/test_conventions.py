@@ -42,6 +42,7 @@ from hybridvo.refinement import coarse_fit
 from hybridvo.results import RelativePose, Step
 from hybridvo.trajectory import Trajectory, read_trajectory
 from hybridvo.types import Camera, Frame, FramePair, PairBatch
+from tests.walks import chained
 
 RIGHT_TURN_ABOUT_Z = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 """90 degrees about z: x goes to y, y goes to -x."""
@@ -86,12 +87,12 @@ def test_forward_is_plus_z_and_points_come_nearer():
     np.testing.assert_allclose(flow[40, 60], [10, 0], atol=1e-12)
     np.testing.assert_allclose(flow[40, 40], [-10, 0], atol=1e-12)
     np.testing.assert_allclose(flow[50, 50], [0, 10], atol=1e-12)
-    path = Trajectory.from_relative([T_curr_prev], [0.0, 1.0])
+    path = chained([T_curr_prev], [0.0, 1.0])
     np.testing.assert_allclose(path.T_world_cam[1], translation(0, 0, 1))
 
 
 def test_world_is_the_first_camera():
-    path = Trajectory.from_relative([translation(0, 0, -1)], [0.0, 1.0])
+    path = chained([translation(0, 0, -1)], [0.0, 1.0])
     np.testing.assert_array_equal(path.T_world_cam[0], np.eye(4))
 
 
