@@ -74,7 +74,7 @@ def demo(
         if results[method].exit_code == EXIT_INTERRUPTED:
             return None
     moving = float(np.median([(scene.object_id(i) > 0).mean() for i in range(scene.frames)]))
-    content = {
+    content: dict[str, Any] = {
         "command": list(command),
         "scene": {"kind": SCENE, "seed": seed, "frames": frames, "height": HEIGHT, "width": WIDTH},
         "moving_fraction": moving,
