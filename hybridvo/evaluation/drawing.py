@@ -26,8 +26,8 @@ from hybridvo.evaluation.saliency import last_pass, saliencies
 from hybridvo.files import atomic_write, make_folder, write_json
 from hybridvo.flow import dis_flow
 from hybridvo.geometry import matrix_to_euler_deg
+from hybridvo.network.layers import KINDS
 from hybridvo.network.models import load_weights
-from hybridvo.network.options import KINDS
 from hybridvo.network.weights import pretrained, pretrained_names
 from hybridvo.pipeline import DEFAULT_METHOD
 from hybridvo.results import PixelwisePrediction, RelativePose

@@ -19,8 +19,8 @@ from hybridvo.evaluation.saliency import last_pass
 from hybridvo.evaluation.scores import FACTORS, PAIR_ERRORS, is_failed, known_number
 from hybridvo.evaluation.sequence_job import Job, open_flow
 from hybridvo.files import atomic_write
+from hybridvo.network.layers import KINDS
 from hybridvo.network.models import Models
-from hybridvo.network.options import KINDS
 from hybridvo.pipeline import networks_of
 from hybridvo.results import PixelwisePrediction
 from hybridvo.types import FramePair
