@@ -103,11 +103,11 @@ def _guarded(args: argparse.Namespace, command: list[str]) -> int:
     from hybridvo.errors import HybridVOError
 
     logger, handler = logging.getLogger("hybridvo"), logging.StreamHandler()
+    handler.setLevel(logging.ERROR if args.quiet else logging.NOTSET)
     before = logger.level
     logger.addHandler(handler)
-    logger.setLevel(
-        logging.DEBUG if args.verbose else logging.ERROR if args.quiet else logging.WARNING
-    )
+    if args.verbose:
+        logger.setLevel(logging.DEBUG)
     try:
         return args.call(args, command)
     except KeyboardInterrupt:

@@ -188,8 +188,7 @@ def _export(args: argparse.Namespace, command: str) -> None:
 def _selector_data(args: argparse.Namespace, command: str) -> None:
     from hybridvo.errors import InputError
     from hybridvo.synthetic.semi_real import load_split
-    from hybridvo.training.selector_data import PER_SHARD, write_shard
-    from hybridvo.training.selector_proposals import write_proposals
+    from hybridvo.training.selector_data import PER_SHARD, write_proposals, write_shard
 
     if args.first_seed < 0 or args.seeds < 0:
         raise InputError(f"expected --first-seed and --seeds >= 0, got {args.first_seed}.")

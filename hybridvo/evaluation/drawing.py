@@ -28,8 +28,8 @@ from hybridvo.evaluation.sequence_job import Job
 from hybridvo.files import atomic_write, make_folder, write_json
 from hybridvo.flow import dis_flow
 from hybridvo.geometry import matrix_to_euler_deg
+from hybridvo.network.layers import KINDS
 from hybridvo.network.models import load_weights
-from hybridvo.network.options import KINDS
 from hybridvo.network.weights import pretrained, pretrained_names
 from hybridvo.pipeline import DEFAULT_METHOD
 from hybridvo.results import PixelwisePrediction

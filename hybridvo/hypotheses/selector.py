@@ -164,10 +164,13 @@ class CueSelector:
     ) -> Selection:
         """See :class:`Selector`; a prediction is not looked at."""
         candidates = _searched(found)
-        scores = cue_scores(found, hypotheses(found, candidates), prior)
-        ordered = np.sort(scores)[::-1]
-        gap = ordered[0] - ordered[1] if len(scores) > 1 else NO_RIVAL
-        evidence = np.array([min(gap, NO_RIVAL)])
+        motions = hypotheses(found, candidates)
+        seen = cue_scores(found, motions)
+        scores = seen if prior is None else cue_scores(found, motions, prior)
+        # a prior may say which motion; that it is right the image has to say
+        best = int(np.argmax(scores))
+        others = np.delete(seen, best)
+        evidence = np.array([min(seen[best] - others.max(initial=-np.inf), NO_RIVAL)])
         probability = _probability(evidence, CUES_RIGHT) if found.is_ambiguous else CLEAR_RIGHT
         return _selection(
             found, candidates, scores, [None] * len(scores), (probability, evidence, probability)

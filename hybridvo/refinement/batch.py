@@ -12,13 +12,9 @@ import torch.nn.functional as F
 from hybridvo.errors import InputError
 from hybridvo.refinement import kernels
 from hybridvo.refinement.covariance import direction_is_known
-from hybridvo.refinement.depth import SURFACE
 from hybridvo.results import RelativePose, Status
 from hybridvo.torch_geometry import MAX_DEPTH, MIN_DEPTH, pixel_grid, pp, rays, se3
 from hybridvo.types import PairBatch
-
-DEPTH_CURR_FLOOR = 2e-3
-"""Smallest noise of log D_curr assumed: what bilinear sampling of a smooth surface is good to."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,8 +31,7 @@ class BatchedPose:
         iterations: (B,) Newton steps on all pixels.
         cost: (B,) robust cost per unit of external weight.
         weights: (B, H, W) robust weights without the external ones, 0 where unusable.
-        noise: (B, 2) flow noise in px and noise of log depth, estimated or as given; (B, 3) with
-            that of the current frame's depth where it is used.
+        noise: (B, 2) flow noise in px and noise of log depth, estimated or as given.
         inlier_ratio: (B,) share of the external weight within three standard deviations.
     """
 
@@ -68,7 +63,6 @@ class BatchedPose:
     def one(self, index: int, method: str = "refine") -> RelativePose:
         """The motion of one sample as every estimator gives it, in numpy."""
         covariance = self.covariance[index].detach().double().cpu().numpy()
-        noise = self.noise[index].tolist()
         T = self.SE3[index].detach().matrix().double().cpu().numpy()
         return RelativePose(
             T_curr_prev=T,
@@ -77,13 +71,13 @@ class BatchedPose:
             inlier_ratio=min(1.0, float(self.inlier_ratio[index])),
             iterations=int(self.iterations[index]),
             cost=float(self.cost[index]),
-            residual_scale_px=noise[0],
-            depth_noise=noise[1],
+            residual_scale_px=float(self.noise[index, 0]),
+            depth_noise=float(self.noise[index, 1]),
             weights=self.weights[index].detach().float().cpu().numpy(),
             translation_direction_valid=direction_is_known(T, covariance),
             probability=float(self.probability[index]),
             method=method,
-            terms=("flow", "depth") if len(noise) == 3 else ("flow",),
+            terms=("flow",),
         )
 
 
@@ -97,8 +91,6 @@ class Pixels:
         flow_variance, depth_variance: (B, N) relative to the typical one of the sample.
         weight: (B, N) external weight.
         K: (B, 3, 3) of the current camera.
-        log_depth_curr: (B, N) log D_curr(x + F), 0 where absent; None without that depth.
-        has_depth_curr: (B, N) 1 where it is present, else 0.
     """
 
     points: torch.Tensor
@@ -107,22 +99,10 @@ class Pixels:
     depth_variance: torch.Tensor
     weight: torch.Tensor
     K: torch.Tensor
-    log_depth_curr: torch.Tensor | None = None
-    has_depth_curr: torch.Tensor | None = None
 
     def map(self, change: Callable[[torch.Tensor], torch.Tensor]) -> Pixels:
-        """The same with every tensor but the intrinsics changed."""
-        values = {f.name: getattr(self, f.name) for f in fields(self)}
-        return Pixels(
-            **{k: v if v is None or k == "K" else change(v) for k, v in values.items()}
-        )  # fmt: skip
-
-    def repeat(self, times: int) -> Pixels:
-        """Every sample ``times`` times in a row: B times."""
-        if times == 1:
-            return self
-        many = self.map(lambda x: x.repeat_interleave(times, dim=0))
-        return replace(many, K=self.K.repeat_interleave(times, dim=0))
+        """The same with every tensor changed."""
+        return Pixels(*(change(getattr(self, f.name)) for f in fields(self)))
 
     def subset(self, count: int) -> Pixels:
         """About ``count`` usable pixels of each sample, spread evenly in their order.
@@ -139,6 +119,8 @@ class Pixels:
         index = torch.searchsorted(order, place + 1).clamp(max=order.shape[1] - 1)
 
         def take(x: torch.Tensor) -> torch.Tensor:
+            if x is self.K:
+                return x
             at = index if x.ndim == 2 else index[:, None].expand(-1, x.shape[1], -1)
             return x.gather(x.ndim - 1, at)
 
@@ -147,10 +129,7 @@ class Pixels:
 
 
 def gather_pixels(
-    batch: PairBatch,
-    weights: torch.Tensor | None = None,
-    with_depth: bool = False,
-    tile: int | None = None,
+    batch: PairBatch, weights: torch.Tensor | None = None, tile: int | None = None
 ) -> Pixels:
     """The pixels of a batch in raster order, or tile by tile where a tile's side is given.
 
@@ -166,30 +145,20 @@ def gather_pixels(
     usable = (depth > MIN_DEPTH) & (depth < MAX_DEPTH) & (good_prev & good_curr)[:, None, None]
     usable = usable & (target.abs() < MAX_DEPTH).all(dim=3)
     one, zero = torch.ones_like(depth), torch.zeros_like(depth)
-    flow_variance = depth_variance = one
+    flow_variance = depth_variance = weight = one
     if batch.flow_variance is not None:
-        good = (batch.flow_variance > 0) & (batch.flow_variance < MAX_DEPTH)
-        typical = _typical(batch.flow_variance)
-        relative = torch.where(good, batch.flow_variance, typical) / typical
-        flow_variance, usable = relative.clamp(min=1 / float(kernels.MAX_TRUST)), usable & good
+        flow_variance, good = _relative(batch.flow_variance, batch.flow_variance > 0)
+        flow_variance, usable = flow_variance.clamp(min=1 / float(kernels.MAX_TRUST)), usable & good
     if batch.depth_variance is not None:
-        good = (batch.depth_variance >= 0) & (batch.depth_variance < MAX_DEPTH)
-        typical = _typical(batch.depth_variance)
-        relative = torch.where(good, batch.depth_variance, typical) / typical
-        depth_variance, usable = relative.clamp(max=float(kernels.MAX_DOUBT)), usable & good
-    weight = one
+        depth_variance, good = _relative(batch.depth_variance, batch.depth_variance >= 0)
+        depth_variance, usable = depth_variance.clamp(max=float(kernels.MAX_DOUBT)), usable & good
     if weights is not None:
         weight = torch.where((weights > 0) & (weights < MAX_DEPTH), weights, zero)
     if batch.valid is not None:
         usable = usable & batch.valid
     depth = torch.where(usable, depth, one)
     target = torch.where(usable[..., None], target, torch.zeros_like(target))
-    log_depth = present = None
-    if with_depth and batch.depth_curr is not None:
-        sampled, good = sample_depth(batch.depth_curr, target)
-        log_depth, present = sampled.log(), (good & usable).to(depth.dtype)
     points = (rays(height, width, K_prev) * depth[..., None]).permute(0, 3, 1, 2)
-    tile = tile or max(height, width)
     return Pixels(
         points=to_tiles(points, tile, 1.0),
         target=to_tiles(target.permute(0, 3, 1, 2), tile),
@@ -197,68 +166,31 @@ def gather_pixels(
         depth_variance=to_tiles(depth_variance, tile, 1.0),
         weight=to_tiles(torch.where(usable, weight, zero), tile),
         K=K_curr,
-        log_depth_curr=None if log_depth is None else to_tiles(log_depth, tile),
-        has_depth_curr=None if present is None else to_tiles(present, tile),
     )
 
 
-def to_tiles(x: torch.Tensor, tile: int, fill: float = 0.0) -> torch.Tensor:
+def to_tiles(x: torch.Tensor, tile: int | None, fill: float = 0.0) -> torch.Tensor:
     """(..., H, W) -> (..., N): the pixels of each tile side by side, tiles row by row.
 
-    Tiles at the border are completed with ``fill``; a tile as large as the image is the image.
+    Tiles at the border are completed with ``fill``; without a tile it is the raster order.
     """
-    height, width = x.shape[-2:]
-    if tile >= max(height, width):
+    if tile is None:
         return x.flatten(-2)
-    x = F.pad(x, (0, -width % tile, 0, -height % tile), value=fill)
-    rows, columns = x.shape[-2] // tile, x.shape[-1] // tile
-    x = x.reshape(*x.shape[:-2], rows, tile, columns, tile).transpose(-3, -2)
-    return x.reshape(*x.shape[:-4], -1)
-
-
-def tile_grid(shape: tuple[int, int], tile: int) -> tuple[tuple[int, int], int]:
-    """((rows, columns) of tiles, pixels in each) of an image (H, W)."""
-    if tile >= max(shape):
-        return (1, 1), shape[0] * shape[1]
-    return (-(-shape[0] // tile), -(-shape[1] // tile)), tile * tile
+    x = F.pad(x, (0, -x.shape[-1] % tile, 0, -x.shape[-2] % tile), value=fill)
+    x = x.unflatten(-1, (-1, tile)).unflatten(-3, (-1, tile)).transpose(-3, -2)
+    return x.flatten(-4)
 
 
 def from_tiles(x: torch.Tensor, tile: int, height: int, width: int) -> torch.Tensor:
     """(B, N) -> (B, H, W), the inverse of :func:`to_tiles`."""
-    if tile >= max(height, width):
-        return x.reshape(-1, height, width)
-    rows, columns = -(-height // tile), -(-width // tile)
-    x = x.reshape(-1, rows, columns, tile, tile).transpose(2, 3)
-    return x.reshape(-1, rows * tile, columns * tile)[:, :height, :width]
+    x = x.reshape(len(x), -(-height // tile), -(-width // tile), tile, tile).transpose(2, 3)
+    return x.flatten(3).flatten(1, 2)[:, :height, :width]
 
 
-def sample_depth(depth: torch.Tensor, at: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Bilinear depth (B, H, W) at (B, h, w, 2) px, where the four neighbours lie on one surface.
-
-    Returns:
-        (B, h, w) metres and (B, h, w) bool. False (and depth 1) outside the image, next to an
-        invalid depth, and at edges. Differentiable in both arguments.
-    """
-    batch, height, width = depth.shape
-    u, v = at.unbind(-1)
-    inside = (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)
-    u, v = (torch.where(inside, x, torch.zeros_like(x)) for x in (u, v))
-    u0 = u.detach().floor().clamp(max=max(width - 2, 0))
-    v0 = v.detach().floor().clamp(max=max(height - 2, 0))
-    right, below = int(width > 1), width * int(height > 1)
-    place = (v0 * width + u0).long().flatten(1)
-    flat = depth.reshape(batch, -1)
-    corners = torch.stack(
-        [flat.gather(1, place + o).view_as(u) for o in (0, right, below, below + right)]
-    )
-    good = ((corners > MIN_DEPTH) & (corners < MAX_DEPTH)).all(dim=0) & inside
-    corners = torch.where(good, corners, torch.ones_like(corners))
-    good = good & (corners.amax(dim=0) <= (1 + SURFACE) * corners.amin(dim=0))
-    s, t = u - u0, v - v0
-    top = corners[0] + s * (corners[1] - corners[0])
-    bottom = corners[2] + s * (corners[3] - corners[2])
-    sampled = top + t * (bottom - top)
-    return torch.where(good, sampled, torch.ones_like(sampled)), good
+def _relative(variance: torch.Tensor, good: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """A variance in units of the typical one of its sample, 1 where not good; what is good."""
+    good, typical = good & (variance < MAX_DEPTH), _typical(variance)
+    return torch.where(good, variance, typical) / typical, good
 
 
 def _typical(variance: torch.Tensor) -> torch.Tensor:
@@ -277,10 +209,7 @@ def _usable_camera(K: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def checked_batch(
-    batch: PairBatch,
-    weights: Any = None,
-    with_depth: bool = False,
-    where: str = "refine_batch",
+    batch: PairBatch, weights: Any = None, where: str = "refine_batch"
 ) -> tuple[PairBatch, torch.Tensor | None]:
     """The batch and its weights in one floating type, on one device.
 
@@ -295,8 +224,6 @@ def checked_batch(
         raise InputError(
             f"{where}: expected PairBatch.flow of shape (B, H, W, 2), got {tuple(flow.shape)}."
         )
-    if with_depth and batch.depth_curr is None:
-        raise InputError(f"{where}: current_depth 'on' needs PairBatch.depth_curr, which is None.")
     dtype = torch.promote_types(flow.dtype, depth.dtype)
     dtype = dtype if dtype in (torch.float32, torch.float64) else torch.float32
     if weights is not None:
@@ -342,25 +269,3 @@ def initial_poses(T_init: Any, like: torch.Tensor, alone: bool) -> pp.LieTensor:
     good = torch.isfinite(T).flatten(2).all(dim=2) & (T.abs().flatten(2).amax(dim=2) < 1e9)
     T = torch.where(good[:, :, None, None], T, unit)
     return se3(T if alone else torch.cat([identity, T], dim=1))
-
-
-def given_noise(noise: Any, like: torch.Tensor, with_depth: bool) -> torch.Tensor | None:
-    """(B, 2) or (B, 3) noise as handed in."""
-    if noise is None:
-        return None
-    if isinstance(noise, (tuple, list)):
-        columns = [torch.as_tensor(x, dtype=like.dtype, device=like.device) for x in noise]
-        value = torch.stack([x.expand(len(like)) for x in columns], dim=1)
-    else:
-        value = torch.as_tensor(noise, device=like.device).to(like.dtype)
-    if value.ndim != 2 or len(value) != len(like) or value.shape[1] not in (2, 3):
-        raise InputError(
-            f"refine_batch: expected noise as (sf, sd), (sf, sd, sz) or a tensor of shape "
-            f"({len(like)}, 2) or ({len(like)}, 3), got {tuple(value.shape)}."
-        )
-    known = value.detach()
-    if not bool(torch.isfinite(known).all() & (known >= 0).all() & (known[:, 0] > 0).all()):
-        raise InputError("refine_batch: expected finite noise, sf positive, sd not negative.")
-    if with_depth and value.shape[1] == 2:
-        value = torch.cat([value, value[:, 1:].clamp(min=DEPTH_CURR_FLOOR)], dim=1)
-    return value if with_depth else value[:, :2]

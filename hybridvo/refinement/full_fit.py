@@ -21,9 +21,6 @@ SOLVER = SolverOptions(iterations=5, tolerance=0.5)
 """The coarse fit is about sqrt(6 x 60) of the full fit's standard deviations away (60 times fewer
 pixels), and a step is wrong by some 2 % of its length, the statistical error of the curvature: the
 second step is the last."""
-MIN_SAMPLES = 1500
-"""With fewer usable pixels on the coarse grid (a line across the image leaves 50) noise and
-curvature are averaged over the usable pixels of a finer one."""
 WELL_CONDITIONED = 0.005
 """Ratio of the extreme eigenvalues of the flow's information above which it needs no help."""
 CURRENT_DEPTH_GAIN = 0.5
@@ -176,8 +173,12 @@ def fit_full_grid(
     image, pose = grid.pixels, pose.copy()
     tile = tile_size(image.shape, options.tiles)
     depth_scale = coarse_fit.translation_scale(grid.samples, grid.count)
-    samples, n = _enough_samples(grid)
-    found_noise = pair_noise(pair, grid, pose, noise_start, options)
+    samples, n = grid.samples, grid.count
+    asks_depth = options.current_depth != "off" and pair.curr.depth is not None
+    found_noise = pair_noise(
+        samples, n, image.K, pose, noise_start, options.cutoff,
+        pair.curr.depth if asks_depth else None, image.origin,
+    )  # fmt: skip
     sf, sd, share, _, sigma = found_noise
     noise = np.empty(3, np.float32)
     coarse_fit.set_noise(sf, sd, options.cutoff, noise)
@@ -186,7 +187,6 @@ def fit_full_grid(
         samples, n, total, image.K, noise, 4, 1e-3 * sf, pose, kernels.new_work()
     )
     term = None
-    asks_depth = options.current_depth != "off" and pair.curr.depth is not None
     if asks_depth and sigma > 0:
         term = _depth_factor(pair, grid, pose, sigma, noise, options)
     per_weight = score_sums(samples, n, pose, image.K, noise)
@@ -229,18 +229,6 @@ def fit_full_grid(
     )
 
 
-def _enough_samples(grid: CoarseGrid) -> tuple[np.ndarray, int]:
-    """The coarse grid and its size or, where few of its pixels are usable, those of a finer one."""
-    coarse, n, stride = grid.samples, grid.count, grid.shape[2]
-    usable = np.count_nonzero(grid.weight > 0)
-    fine = int(stride * np.sqrt(usable / MIN_SAMPLES))
-    if usable >= MIN_SAMPLES or stride == 1 or fine >= stride:
-        return coarse, n
-    samples, h, w = grid.pixels.strided(max(1, fine))
-    samples = np.ascontiguousarray(samples[:, : h * w][:, samples[kernels.W, : h * w] > 0])
-    return samples, samples.shape[1]
-
-
 def _tiles_used(
     image: PixelGrid, samples: np.ndarray, n: int, shape: tuple[int, int], tiles: int
 ) -> int:
@@ -261,36 +249,41 @@ def _tiles_used(
 
 
 def pair_noise(
-    pair: FramePair,
-    grid: CoarseGrid,
+    samples: np.ndarray,
+    n: int,
+    K: np.ndarray,
     pose: np.ndarray,
     start: tuple[float, float],
-    options: RefineOptions,
+    cutoff: float,
+    curr: np.ndarray | None = None,
+    origin: tuple[int, int] = (0, 0),
 ) -> PairNoise:
     """Noise of the pixels that follow a motion.
 
     The current depth bounds the noise of the first, and tells it where the flow cannot.
 
     Args:
-        pair: the input.
-        grid: its coarse grid.
+        samples: buffer of pixels; its first ``n`` count.
+        n: pixels.
+        K: (4,) float32 fx, fy, cx, cy of the current camera.
         pose: (3, 4) T_curr_prev.
         start: (sf, sd) found before.
-        options: ``current_depth``.
+        cutoff: of the robust kernel.
+        curr: (H, W) current depth, or None.
+        origin: (u, v) of its pixel at which the samples' coordinates begin.
     """
-    samples, n = _enough_samples(grid)
-    (sf, sd), K, count = start, grid.pixels.K, coarse_fit.FINAL_NOISE_PIXELS
+    sf, sd = start
     sf, sd, share, spread = estimate_noise(
-        samples, n, pose, K, sf, sd, 2.5 * sf, max(2.5 * sd, 0.02), 30, count
-    )
-    if options.current_depth == "off" or pair.curr.depth is None:
+        samples, n, pose, K, sf, sd, 2.5 * sf, max(2.5 * sd, 0.02), 30,
+        coarse_fit.FINAL_NOISE_PIXELS,
+    )  # fmt: skip
+    if curr is None:
         return PairNoise(sf, sd, share, spread, 0.0)
-    samples, n, noise = grid.samples, grid.count, np.empty(3, np.float32)
-    coarse_fit.set_noise(sf, sd, options.cutoff, noise)
+    noise = np.empty(3, np.float32)
+    coarse_fit.set_noise(sf, sd, cutoff, noise)
     log_depth, robust = np.empty(n, np.float32), np.empty(n, np.float32)
     # looked up at random places of a whole image: no more than the scale needs
-    curr = as_contiguous(pair.curr.depth)
-    depth.look_up(samples, n, depth.sparse_step(n), curr, *grid.pixels.origin, log_depth)
+    depth.look_up(samples, n, depth.sparse_step(n), as_contiguous(curr), *origin, log_depth)
     coarse_fit.robust_weights(samples, n, pose, K, noise, kernels.new_work(), robust)
     sigma, raw = depth.depth_scale(samples, n, log_depth, robust, pose, K, noise)
     if raw <= 0:

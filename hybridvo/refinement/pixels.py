@@ -76,8 +76,7 @@ class PixelGrid:
 
     def samples(self, pixels: int) -> tuple[np.ndarray, int, int, int]:
         """(buffer, h, w, stride) of a regular grid of about ``pixels`` pixels."""
-        height, width = self.shape
-        stride = max(1, round(np.sqrt(height * width / pixels)))
+        stride = grid_stride(self.shape, pixels)
         return *self.strided(stride), stride
 
     def strided(self, stride: int) -> tuple[np.ndarray, int, int]:
@@ -149,6 +148,11 @@ class PixelGrid:
         helper.start()
         take()
         helper.join()
+
+
+def grid_stride(shape: tuple[int, int], pixels: int) -> int:
+    """Distance, px, of the pixels of a grid of about ``pixels``."""
+    return max(1, round(np.sqrt(shape[0] * shape[1] / pixels)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -97,10 +97,9 @@ def refine_pair(
         "information_eigenvalues": fit.eigenvalues,
         "hypotheses": context.hypotheses,
     }
-    failure = _failure(fit, share)
-    if failure is not None:
-        return RelativePose.failed(*failure, **common)
     status = _status(fit, share, context)
+    if not status.usable:
+        return RelativePose.failed(status.reason, status.message, **common)
     covariance = _with_doubt(fit)
     return RelativePose(
         T_curr_prev=fit.T,
@@ -112,39 +111,52 @@ def refine_pair(
     )
 
 
-def _failure(fit: FullFit, share: float) -> tuple[Reason, str] | None:
-    """Why there is no motion, or None."""
-    if not fit.definite or not np.isfinite(fit.T).all():
-        return (
-            Reason.DEGENERATE_GEOMETRY,
-            "the pixels leave a direction of the motion undetermined",
-        )
-    if fit.weight < 6 or share < MIN_INLIER_RATIO:
-        return Reason.LOW_INLIERS, f"{100 * share:.1f} % of the pixels follow one motion"
-    if fit.depths is not None and fit.depths.is_none:
-        return Reason.NO_VALID_DEPTH, fit.depths.doubt
-    return None
-
-
 def _status(fit: FullFit, share: float, context: Context) -> Status:
-    """Ok, or degraded with the first reason that holds."""
-    if fit.depths is not None and fit.depths.doubt:
-        return Status.degraded(Reason.NO_VALID_DEPTH, fit.depths.doubt)
-    if context.probability < context.min_probability:
-        return Status.degraded(
-            Reason.AMBIGUOUS_MOTION,
-            f"another of the motions found could be the camera's (probability of this one "
-            f"{100 * context.probability:.0f} %)",
-        )
+    """Status of a fit."""
+    agreement, depth, weak = fit.depths, None, None
+    if agreement is not None and agreement.doubt:
+        depth = Reason.NO_VALID_DEPTH, agreement.doubt
     if fit.eigenvalues[0] < WEAK_RATIO * fit.eigenvalues[-1]:
-        return Status.degraded(
-            Reason.DEGENERATE_GEOMETRY, "a direction of the motion is barely determined"
-        )
-    if fit.tiles < MIN_TILES:
-        return Status.degraded(
+        weak = Reason.DEGENERATE_GEOMETRY, "a direction of the motion is barely determined"
+    elif fit.tiles < MIN_TILES:
+        weak = (
             Reason.DEGENERATE_GEOMETRY,
             "the pixels cover too little of the image to tell how far their errors agree",
         )
+    definite = fit.definite and bool(np.isfinite(fit.T).all())
+    share = share if fit.weight >= 6 else 0.0
+    status = status_of(definite, share, depth, context.probability, context.min_probability, weak)
+    if status.usable and agreement is not None and agreement.is_none:
+        return Status.failed(Reason.NO_VALID_DEPTH, agreement.doubt)
+    return status
+
+
+def status_of(
+    definite: bool,
+    share: float,
+    doubt: tuple[Reason, str] | None,
+    probability: float,
+    min_probability: float,
+    weak: tuple[Reason, str] | None = None,
+) -> Status:
+    """Status of a motion that ``share`` of the pixels follow; the first reason that holds."""
+    if not definite:
+        what = "the pixels leave a direction of the motion undetermined"
+        return Status.failed(Reason.DEGENERATE_GEOMETRY, what)
+    if share < MIN_INLIER_RATIO:
+        return Status.failed(
+            Reason.LOW_INLIERS, f"{100 * share:.1f} % of the pixels follow one motion"
+        )
+    if doubt is not None:
+        return Status.degraded(*doubt)
+    if probability < min_probability:
+        return Status.degraded(
+            Reason.AMBIGUOUS_MOTION,
+            f"another of the motions found could be the camera's (probability of this one "
+            f"{100 * probability:.0f} %)",
+        )
+    if weak is not None:
+        return Status.degraded(*weak)
     if share < LOW_INLIER_RATIO:
         return Status.degraded(
             Reason.LOW_INLIERS, f"only {100 * share:.0f} % of the pixels follow the motion"

@@ -21,35 +21,32 @@ import torch
 
 from hybridvo.errors import InputError
 from hybridvo.options import RefineOptions
+from hybridvo.refinement import kernels
 from hybridvo.refinement.batch import (
-    DEPTH_CURR_FLOOR,
     BatchedPose,
     Pixels,
     checked_batch,
     from_tiles,
     gather_pixels,
-    given_noise,
     initial_poses,
-    tile_grid,
 )
 from hybridvo.refinement.coarse_fit import DAMPING
 from hybridvo.refinement.covariance import NOTHING, UPPER, sandwich_covariance
 from hybridvo.refinement.full_fit import FLOW_ROUNDING, SOLVER, pair_noise, tile_size
-from hybridvo.refinement.pixels import CoarseGrid, coarse_grid, too_few
-from hybridvo.refinement.refine import LOW_INLIER_RATIO, MIN_INLIER_RATIO
+from hybridvo.refinement.pixels import grid_stride, too_few
+from hybridvo.refinement.refine import status_of
 from hybridvo.refinement.torch_factors import (
-    KERNELS,
     Linearization,
     RobustNoise,
     linearize,
     newton_matrix,
     residuals,
-    score_sum,
+    scores,
     solve_small,
 )
-from hybridvo.results import Reason, RelativePose, Status
+from hybridvo.results import Reason, Status
 from hybridvo.torch_geometry import left_update, pp, weighted_median
-from hybridvo.types import Camera, Frame, FramePair, PairBatch
+from hybridvo.types import PairBatch
 
 SUBSET_PIXELS = 2048
 """Pixels on which starts are refined."""
@@ -70,14 +67,13 @@ def refine_batch(
     weights: Any = None,
     *,
     noise: Any = None,
-    kernel: str = "geman-mcclure",
-    gradient: str = "implicit",
     options: RefineOptions | None = None,
 ) -> BatchedPose:
     """Camera motion of every pair of a batch by robust dense reprojection.
 
     Works in the floating type of the flow and depth (half types are raised to float32), outside
-    autocast.
+    autocast. Gradients reach flow, depth, intrinsics, variances, weights and noise where one of
+    them requires it; not ``T_init``, on which the estimate does not depend.
 
     Args:
         batch: see :class:`~hybridvo.types.PairBatch`.
@@ -86,14 +82,8 @@ def refine_batch(
             what is handed in is.
         weights: (B, H, W) factors on the information; what is not positive and finite switches a
             pixel off.
-        noise: (sf, sd) flow noise in px and noise of log depth, or (sf, sd, sz) with that of the
-            current frame's depth; numbers, or a (B, 2) or (B, 3) tensor. None: estimated.
-        kernel: ``geman-mcclure``, ``cauchy``, ``huber`` or ``l2``.
-        gradient: ``implicit`` attaches the gradient to flow, depth, intrinsics, variances, weights
-            and noise where one of them requires it, ``none`` does not. T_init has none: the
-            estimate does not depend on it.
-        options: of the refinement; ``cutoff`` is that of the kernel ``geman-mcclure``, and the
-            current frame's depth is a third residual where ``current_depth`` is ``on``.
+        noise: flow noise in px and noise of log depth, as (2,) or (B, 2); None: estimated.
+        options: of the refinement.
 
     Returns:
         Poses with covariance and a status per sample. Bad data give a failed status for that very
@@ -101,67 +91,58 @@ def refine_batch(
         sample is zero.
 
     Raises:
-        InputError: shapes, types or options that cannot be used.
+        InputError: shapes or types that cannot be used.
     """
     options = options or RefineOptions()
-    if not isinstance(batch, PairBatch) or not isinstance(options, RefineOptions):
-        raise InputError(
-            f"refine_batch: expected a PairBatch and RefineOptions, got {type(batch).__name__} and "
-            f"{options!r}."
-        )
-    if kernel not in KERNELS:
-        raise InputError(f"refine_batch: unknown kernel {kernel!r}; known: {', '.join(KERNELS)}.")
-    if gradient not in ("implicit", "none"):
-        raise InputError(f"refine_batch: expected gradient implicit or none, got {gradient!r}.")
-    with_depth = options.current_depth == "on"
-    batch, weights = checked_batch(batch, weights, with_depth)
+    batch, weights = checked_batch(batch, weights)
     starts = initial_poses(T_init, batch.flow, alone=weights is not None)
-    given = given_noise(noise, batch.flow, with_depth)
+    given = _given_noise(noise, batch.flow)
     tensors = (*vars(batch).values(), weights, given)
-    wanted = gradient == "implicit" and torch.is_grad_enabled()
-    wanted = wanted and any(x is not None and x.requires_grad for x in tensors)
+    wanted = torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in tensors)
     height, width = batch.depth_prev.shape[1:]
     tile = tile_size((height, width), options.tiles)
     with torch.autocast(batch.flow.device.type, enabled=False):
         with torch.no_grad():
-            pixels = gather_pixels(batch, weights, with_depth, tile)
-            solver = _Solver(batch, weights, pixels, tile, kernel, options)
-            result = solver.solve(starts, given, tight=wanted)
+            pixels = gather_pixels(batch, weights, tile)
+            result = _Solver(batch, pixels, tile, options).solve(starts, given, tight=wanted)
         if not wanted:
             return result
-        pixels = gather_pixels(batch, weights, with_depth, tile)
-        how = solver.how(result.noise if given is None else given)
+        pixels = gather_pixels(batch, weights, tile)
+        how = RobustNoise(result.noise if given is None else given, options.cutoff)
         # a Newton step of value zero, and with the gradient A^-1 dg
         T = result.SE3.detach()
         A = newton_matrix(pixels.map(torch.Tensor.detach), T, how)
-        step, solved = solve_small(A, score_sum(pixels, T, how))
+        step, solved = solve_small(A, scores(pixels, T, how)[0].sum(dim=2))
         step = torch.where((solved & ~result.failed)[:, None], step, torch.zeros_like(step))
         return replace(result, SE3=left_update(step - step.detach(), T))
+
+
+def _given_noise(noise: Any, like: torch.Tensor) -> torch.Tensor | None:
+    """(B, 2) noise as handed in."""
+    if noise is None:
+        return None
+    value = torch.as_tensor(noise, device=like.device).to(like.dtype)
+    known = value.detach()
+    if value.shape not in ((2,), (len(like), 2)) or not bool(
+        (torch.isfinite(known) & (known >= 0)).all() & (known[..., 0] > 0).all()
+    ):
+        raise InputError(
+            f"refine_batch: expected noise (sf, sd) of shape (2,) or ({len(like)}, 2), finite, sf "
+            f"positive, sd not negative, got {noise!r}."
+        )
+    return value.expand(len(like), 2)
 
 
 class _Solver:
     """The stages of the estimate on one batch of pixels, without gradient."""
 
-    def __init__(
-        self,
-        batch: PairBatch,
-        weights: torch.Tensor | None,
-        pixels: Pixels,
-        tile: int,
-        kernel: str,
-        options: RefineOptions,
-    ) -> None:
-        self.batch, self.external, self.pixels = batch, weights, pixels
-        self.tile, self.kernel, self.options = tile, kernel, options
-        self.cutoff = options.cutoff if kernel == "geman-mcclure" else KERNELS[kernel].cutoff
-        height, width = batch.depth_prev.shape[1:]
-        self.tiles, self.run = tile_grid((height, width), tile)
+    def __init__(self, batch: PairBatch, pixels: Pixels, tile: int, options: RefineOptions) -> None:
+        self.batch, self.pixels, self.tile, self.options = batch, pixels, tile, options
         self.few = pixels.subset(SUBSET_PIXELS)
-        self.planar = replace(self.few, log_depth_curr=None, has_depth_curr=None)
 
     def how(self, noise: torch.Tensor) -> RobustNoise:
         """The kernel at a noise."""
-        return RobustNoise(noise, self.kernel, self.cutoff)
+        return RobustNoise(noise, self.options.cutoff)
 
     def solve(self, starts: pp.LieTensor, given: torch.Tensor | None, tight: bool) -> BatchedPose:
         """From the starts (B, S, 7) to the pose of every sample, with covariance and status."""
@@ -180,10 +161,9 @@ class _Solver:
         covariance, definite = self._covariance(T, last, noise, curvature, meat)
         probability = own**2 / (own**2 + rival**2).clamp(min=1e-12)
         status = [
-            self._status(k, bool(definite[k]), bool(converged[k]), float(ratio[k]),
-                         float(rival[k]), float(probability[k]))
-            for k in range(len(T))
-        ]  # fmt: skip
+            self._status(k, bool(definite[k]), bool(converged[k]), float(ratio[k]), float(p))
+            for k, p in enumerate(probability)
+        ]
         failed = torch.tensor([not s.usable for s in status], device=T.device)
         identity = pp.identity_SE3(len(T), dtype=T.dtype, device=T.device)
         nothing = torch.as_tensor(NOTHING, dtype=weight.dtype, device=T.device)
@@ -206,7 +186,7 @@ class _Solver:
     def _graduate(self, starts: pp.LieTensor, end: torch.Tensor) -> pp.LieTensor:
         """The start of least cost at the scale ``end`` px, refined: (B, 7)."""
         batch, count = starts.shape[:2]
-        pixels = self.planar.repeat(count)
+        pixels = self.few.map(lambda x: x.repeat_interleave(count, dim=0))
         ends = end.repeat_interleave(count)
         T = self._shrink_scale(pixels, pp.SE3(starts.tensor().flatten(0, 1)), ends)
         if count == 1:
@@ -217,7 +197,7 @@ class _Solver:
         return pp.SE3(T.tensor().reshape(batch, count, 7)[index, best])
 
     def _isotropic(self, scale: torch.Tensor) -> RobustNoise:
-        return RobustNoise(torch.stack([scale, torch.zeros_like(scale)], dim=1), self.kernel, 1.0)
+        return RobustNoise(torch.stack([scale, torch.zeros_like(scale)], dim=1), 1.0)
 
     def _shrink_scale(self, pixels: Pixels, T: pp.LieTensor, end: torch.Tensor) -> pp.LieTensor:
         """One Gauss-Newton step for each scale of the kernel from the residuals' down to ``end``.
@@ -225,8 +205,7 @@ class _Solver:
         A sample whose scale has come to the end stands still, whatever the others do.
         """
         at = residuals(pixels, T)
-        length = (at.r[0].square() + at.r[1].square()).sqrt()
-        scale = 1.5 * weighted_median(length, pixels.weight * at.front, 1.0)
+        scale = 1.5 * weighted_median(at.r.norm(dim=1), pixels.weight * at.front, 1.0)
         scale = torch.maximum(scale.clamp(1.0, LARGEST_PX), end)
         going = torch.ones_like(scale, dtype=torch.bool)
         while bool(going.any()):
@@ -243,7 +222,7 @@ class _Solver:
         Both within the same few pixels: a compromise between two motions explains neither, however
         much noise is granted to it afterwards.
         """
-        pixels = self.planar
+        pixels = self.few
         own = linearize(pixels, T, self._isotropic(3 * end)).weights
         rest = replace(pixels, weight=pixels.weight * (own < 0.25))
         identity = pp.identity_SE3(len(T), dtype=T.dtype, device=T.device)
@@ -257,87 +236,49 @@ class _Solver:
     def _fit_subset(
         self, T: pp.LieTensor, given: torch.Tensor | None
     ) -> tuple[pp.LieTensor, torch.Tensor]:
-        """Noise and pose, in turn; the noise is that of the coarse grid of the numba refinement."""
+        """Noise and pose, in turn; the noise by the function of the numba refinement."""
         noise = self.few.weight.new_tensor([0.5, 0.01]).repeat(len(T), 1)
-        grids = self._grids() if given is None else []
+        samples = None if given is not None else self._samples()
         for steps in (2, 3, 3):
-            noise = self._noise(grids, T, noise) if given is None else given.detach()
+            noise = given.detach() if given is not None else self._noise(samples, T, noise)
             for _ in range(steps):
                 H, g = linearize(self.few, T, self.how(noise)).total()
                 T = left_update(solve_small(H, g, DAMPING)[0], T)
-        return T, self._noise(grids, T, noise) if given is None else noise
+        return T, noise if given is not None else self._noise(samples, T, noise)
 
-    def _grids(self) -> list[tuple[FramePair, CoarseGrid] | None]:
-        """Each sample as a pair in numpy with its coarse grid; None where too little is usable."""
-        values: dict[str, Any] = {
-            name: None if x is None else x.cpu().numpy()
-            for name, x in (*vars(self.batch).items(), ("weights", self.external))
-        }
-        for name, x in values.items():
-            if x is not None and x.dtype != np.bool_:
-                values[name] = x.astype(np.float32)
-        out: list[tuple[FramePair, CoarseGrid] | None] = []
-        for k in range(len(self.batch.flow)):
-            one: dict[str, Any] = {n: None if x is None else x[k] for n, x in values.items()}
-            shape = one["depth_prev"].shape
-            try:
-                prev, curr = (Camera.from_matrix(one[K], *shape) for K in ("K_prev", "K_curr"))
-            except InputError:
-                out.append(None)
-                continue
-            pair = FramePair(
-                Frame(None, one["depth_prev"], prev, depth_variance=one["depth_variance"]),
-                Frame(None, one["depth_curr"], curr),
-                one["flow"], one["flow_variance"], one["valid"],
-            )  # fmt: skip
-            grid = coarse_grid(pair, one["weights"], self.options)
-            out.append(None if isinstance(grid, RelativePose) else (pair, grid))
-        return out
+    def _samples(self) -> np.ndarray:
+        """(B, 8, n) the coarse grid of the numba refinement, as a buffer of its kernels."""
+        p, (height, width) = self.pixels, self.batch.depth_prev.shape[1:]
+        z = p.points[:, 2:]
+        more = torch.stack([1 / p.flow_variance, p.depth_variance, p.weight], dim=1)
+        rows = torch.cat([p.points[:, :2] / z, z, p.target, more], dim=1)
+        step = grid_stride((height, width), self.options.coarse_pixels)
+        images = from_tiles(rows.flatten(0, 1), self.tile, height, width)
+        sparse = images[:, step // 2 :: step, step // 2 :: step].unflatten(0, (-1, 8)).flatten(2)
+        return sparse.float().cpu().numpy()
 
-    def _noise(
-        self,
-        grids: list[tuple[FramePair, CoarseGrid] | None],
-        T: pp.LieTensor,
-        noise: torch.Tensor,
-    ) -> torch.Tensor:
-        """(B, 2) or (B, 3) noise at a pose, by the numba estimator."""
-        out = []
-        for known, pose, start in zip(grids, T.matrix().cpu().numpy(), noise.tolist(), strict=True):
-            found = start[:2]
-            if known is not None and np.isfinite(pose).all():
-                found = list(pair_noise(*known, pose[:3], (start[0], start[1]), self.options)[:2])
-            out.append(found if np.isfinite(found).all() else start[:2])
-        return self._depth_curr_noise(T, noise.new_tensor(out))
-
-    def _depth_curr_noise(self, T: pp.LieTensor, noise: torch.Tensor) -> torch.Tensor:
-        """(B, 3): the noise of log D_curr from the spread of r_z that sd h does not explain.
-
-        sd may explain half of the variance at most: the two depths come from one sensor, and the
-        flow of a slow camera says next to nothing of sd.
-        """
-        few = self.few
-        if few.has_depth_curr is None:
-            return noise
-        at = residuals(few, T)
-        reach = (8 * noise[:, :1]).clamp(min=4.0).square()
-        near = at.r[0].square() + at.r[1].square() <= reach
-        used = few.weight * few.has_depth_curr * at.front * near
-        spread = 1.4826 * weighted_median(at.r[2].abs(), used, 0.02)
-        h = weighted_median(at.u[2].abs(), used, 1.0).clamp(min=1e-3)
-        sd = torch.minimum(noise[:, 1], 0.5**0.5 * spread / h)
-        sz = (spread.square() - (sd * h).square()).clamp(min=DEPTH_CURR_FLOOR**2).sqrt()
-        return torch.stack([noise[:, 0], sd, sz], dim=1)
+    def _noise(self, samples: Any, T: pp.LieTensor, noise: torch.Tensor) -> torch.Tensor:
+        """(B, 2) noise at a pose; as before where there is none to be had."""
+        depth = None if self.options.current_depth == "off" else self.batch.depth_curr
+        K = self.pixels.K[:, [0, 1, 0, 1], [0, 1, 2, 2]].float().cpu().numpy()
+        poses, count, out = T.matrix().cpu().numpy(), samples.shape[2], noise.tolist()
+        for k, (sf, sd) in enumerate(noise.tolist()):
+            if np.isfinite(poses[k]).all() and (samples[k, kernels.W] > 0).any():
+                curr = None if depth is None else depth[k].float().cpu().numpy()
+                where = samples[k], count, K[k], poses[k, :3]
+                found = pair_noise(*where, (sf, sd), self.options.cutoff, curr)[:2]
+                out[k] = found if np.isfinite(found).all() else out[k]
+        return noise.new_tensor(out)
 
     def _curvature(self, T: pp.LieTensor, how: RobustNoise) -> tuple[torch.Tensor, torch.Tensor]:
         """(B, 6, 6) curvature of the robust weights and scores' outer products, per unit of weight.
 
         From the subset: both are averages over many pixels and enter the result at second order.
         """
-        at = linearize(self.few, T, how, scores=True)
-        assert at.scores is not None
-        s, w = at.scores.double(), (self.few.weight * at.weights).double()
-        ratio = KERNELS[self.kernel].curvature(at.distance2, self.cutoff**2)
-        factor = torch.where(w > 1e-12, ratio / w.clamp(min=1e-12), torch.zeros_like(w))
+        each, at = scores(self.few, T, how)
+        s, w = each.double(), (self.few.weight * at.robust).double()
+        slope = how.kernel(at.distance2)[2]
+        factor = torch.where(w > 1e-12, slope / w.clamp(min=1e-12), torch.zeros_like(w))
         total = self.few.weight.double().sum(dim=1).clamp(min=1e-12)[:, None, None]
         return (s * factor[:, None]) @ s.transpose(1, 2) / total, s @ s.transpose(1, 2) / total
 
@@ -357,7 +298,7 @@ class _Solver:
         done, converged = best < 0, best < 0
         iterations, matrix = done.long(), None
         for k in range(STEPS):
-            now = linearize(pixels, T, how, self.run)
+            now = linearize(pixels, T, how, self.tile**2)
             H, g = now.total()
             if tight and k % 3 == 2:  # anew, for samples that were far when it was made
                 matrix = newton_matrix(pixels, T, how).double()
@@ -403,14 +344,12 @@ class _Solver:
                       1 / depth, weight * FLOW_ROUNDING**2 / variance, T.matrix()[:, :3], noise)
         ]  # fmt: skip
         found = []
-        for k in range(len(T)):
-            *sums, pose, (_, sd, *_) = (x[k] for x in arrays)
-            if not all(np.isfinite(x).all() for x in (*sums, pose)):
+        rows = -(-self.batch.depth_prev.shape[1] // self.tile)
+        for sums, *more, pose, (_, sd) in zip(*arrays, strict=True):
+            if not all(np.isfinite(x).all() for x in (sums, *more, pose)):
                 found.append((NOTHING, False))
                 continue
-            covariance, _, definite = sandwich_covariance(
-                sums[0].reshape(*self.tiles, 27), *sums[1:]
-            )
+            covariance, _, definite = sandwich_covariance(sums.reshape(rows, -1, 27), *more)
             # as in the numba refinement: log depth or depth
             covariance[:3, :3] += (0.5 * sd**2) ** 2 * np.outer(pose[:, 3], pose[:, 3])
             found.append((covariance, definite))
@@ -418,13 +357,7 @@ class _Solver:
         return covariances, torch.tensor([ok for _, ok in found], device=T.device)
 
     def _status(
-        self,
-        k: int,
-        definite: bool,
-        converged: bool,
-        inlier_ratio: float,
-        rival_ratio: float,
-        probability: float,
+        self, k: int, definite: bool, converged: bool, share: float, probability: float
     ) -> Status:
         """Status of a sample."""
         batch, usable = self.batch, int((self.pixels.weight[k] > 0).sum())
@@ -434,20 +367,10 @@ class _Solver:
                     return Status.failed(Reason.NAN_INPUT, f"{name} is no camera matrix")
             depth, flow = (x[k].detach().cpu().numpy() for x in (batch.depth_prev, batch.flow))
             return Status.failed(*too_few(depth, flow, usable, self.options.min_pixels))
-        if not definite:
-            what = "the pixels leave a direction of the motion undetermined"
-            return Status.failed(Reason.DEGENERATE_GEOMETRY, what)
-        share = f"{100 * inlier_ratio:.1f} % of the pixels follow"
-        if inlier_ratio < MIN_INLIER_RATIO:
-            return Status.failed(Reason.LOW_INLIERS, f"{share} one motion")
-        if not converged:
-            return Status.degraded(Reason.SOLVER_DIVERGED, f"not converged after {STEPS} steps")
-        if probability < MIN_PROBABILITY:
-            what = f"{share} this motion, {100 * rival_ratio:.1f} % another one"
-            return Status.degraded(Reason.AMBIGUOUS_MOTION, what)
-        if inlier_ratio < LOW_INLIER_RATIO:
-            return Status.degraded(Reason.LOW_INLIERS, f"only {share} the motion")
-        return Status()
+        open_end = Reason.SOLVER_DIVERGED, f"not converged after {STEPS} steps"
+        return status_of(
+            definite, share, None if converged else open_end, probability, MIN_PROBABILITY
+        )
 
 
 def _energy(step: torch.Tensor, H: torch.Tensor) -> torch.Tensor:

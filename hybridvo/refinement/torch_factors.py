@@ -1,30 +1,11 @@
 """The ego-flow reprojection residual of a batch of pairs in torch, and its normal equations.
 
-The same definition as the numba kernels; a test holds both equal. Per pixel, with X' = T X,
-a = X'/Z', b = Y'/Z', i = 1/Z':
-
-- residual r = (x + F) - pi(X') in px (paper, equations 6 and 8);
-- Jacobian of pi(X') with respect to the left perturbation (translation, rotation):
-  diag(fx, fy) [[i, 0, -a i, -a b, 1 + a^2, -b], [0, i, -b i, -(1 + b^2), a b, a]];
-- u = q = d pi(X') / d log Z = (fx i (a tz - tx), fy i (b tz - ty));
-- covariance Sigma = diag(sf^2 v_f, sf^2 v_f) + sd^2 v_d u u^T;
-- a, b, i and u of the Jacobian and of Sigma (not of r) are taken at log Z + e, the posterior mean
-  of the true log depth, e = sd^2 v_d u^T Sigma^-1 r (errors in variables: at the measured depth the
-  translation comes out wrong by a share of about sd^2).
-
-With the current frame's depth a third row joins, r_z = log D_curr(x + F) - log Z', with Jacobian
-[0, 0, i, b, -a, 0] and sensitivity h = d log Z' / d log Z = 1 - tz i: u = (q, h) and
-Sigma = diag(sf^2 v_f, sf^2 v_f, sz^2) + sd^2 v_d u u^T.
-
-Sigma is inverted by the rank-one identity: with D the inverse of the diagonal, Sigma^-1 =
-D - kappa (D u)(D u)^T, kappa = sd^2 v_d / (1 + sd^2 v_d u^T D u).
+The same definition as :mod:`hybridvo.refinement.kernels`, formulas there; a test holds both equal.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import reduce
 from typing import NamedTuple
 
 import torch
@@ -36,147 +17,110 @@ from hybridvo.torch_geometry import MIN_DEPTH, left_update, move, pp, project, p
 BEHIND_DISTANCE2 = 1e4
 """Squared Mahalanobis distance at which a pixel behind the camera is charged."""
 
-Rows = Sequence[torch.Tensor]
 
+class RobustNoise(NamedTuple):
+    """How residuals are weighed: (B, 2) noise sf px, sd; cutoff of the Geman-McClure kernel."""
 
-class Kernel(NamedTuple):
-    """Robust kernel of the squared Mahalanobis distance d2 at the squared cutoff c2.
+    noise: torch.Tensor
+    cutoff: float = 3.0
 
-    Args:
-        weight: 2 d rho / d d2, 1 at 0. cost: rho. curvature: -2 (d weight / d d2) / weight.
-        cutoff: default c in standard deviations.
-    """
-
-    weight: Callable[[torch.Tensor, float], torch.Tensor]
-    cost: Callable[[torch.Tensor, float], torch.Tensor]
-    curvature: Callable[[torch.Tensor, float], torch.Tensor]
-    cutoff: float
-
-
-KERNELS = {
-    "geman-mcclure": Kernel(
-        lambda d2, c2: (c2 / (c2 + d2)).square(),
-        lambda d2, c2: 0.5 * c2 * d2 / (c2 + d2),
-        lambda d2, c2: 4 / (c2 + d2),
-        3.0,
-    ),
-    "cauchy": Kernel(
-        lambda d2, c2: c2 / (c2 + d2),
-        lambda d2, c2: 0.5 * c2 * torch.log1p(d2 / c2),
-        lambda d2, c2: 2 / (c2 + d2),
-        2.385,
-    ),
-    "huber": Kernel(
-        lambda d2, c2: (c2 / d2.clamp(min=c2)).sqrt(),
-        lambda d2, c2: torch.where(d2 <= c2, 0.5 * d2, (c2 * d2.clamp(min=c2)).sqrt() - 0.5 * c2),
-        lambda d2, c2: (d2 > c2) / d2.clamp(min=c2),
-        1.345,
-    ),
-    "l2": Kernel(
-        lambda d2, c2: torch.ones_like(d2),
-        lambda d2, c2: 0.5 * d2,
-        lambda d2, c2: torch.zeros_like(d2),
-        1.0,
-    ),
-}
-"""Cutoffs: 3 as in the numba solver; the 95 % efficient ones for Huber and Cauchy (P. J. Huber,
-Robust Statistics)."""
+    def kernel(self, distance2: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """(cost rho, weight 2 d rho / d d2, its relative slope -2 (d weight / d d2) / weight)."""
+        c2 = self.cutoff**2
+        share = c2 / (c2 + distance2)
+        return 0.5 * share * distance2, share.square(), 4 * share / c2
 
 
 @dataclass(frozen=True, eq=False)
 class Residuals:
-    """What a pose says of every pixel, (B, N) each; see this module's formulas."""
+    """What a pose says of every pixel: a, b, i (B, N), r and its sensitivity q (B, 2, N)."""
 
     a: torch.Tensor
     b: torch.Tensor
     i: torch.Tensor
-    r: tuple[torch.Tensor, ...]
-    u: tuple[torch.Tensor, ...]
+    r: torch.Tensor
+    q: torch.Tensor
     t: torch.Tensor
     front: torch.Tensor
 
 
 def residuals(pixels: Pixels, T: pp.LieTensor) -> Residuals:
-    """Residuals and their sensitivity to the depth at pypose SE3 poses (B, 7)."""
+    """Residuals and their sensitivity to the log depth at pypose SE3 poses (B, 7)."""
     matrix = T.matrix().to(pixels.points.dtype)
     moved = move(matrix, pixels.points)
     front = moved[:, 2] > MIN_DEPTH
     moved = torch.where(front[:, None], moved, torch.ones_like(moved))
-    r = (pixels.target - project(moved, pixels.K)).unbind(1)
-    i = 1 / moved[:, 2]
-    if pixels.log_depth_curr is not None:
-        r = (*r, pixels.log_depth_curr + i.log())
+    r, i = pixels.target - project(moved, pixels.K), 1 / moved[:, 2]
     a, b, t = moved[:, 0] * i, moved[:, 1] * i, matrix[:, :3, 3, None]
     return Residuals(a, b, i, r, _sensitivity(pixels, a, b, i, t), t, front)
 
 
+def _focal(pixels: Pixels) -> torch.Tensor:
+    return pixels.K.diagonal(dim1=1, dim2=2)[:, :2, None]
+
+
 def _sensitivity(
     pixels: Pixels, a: torch.Tensor, b: torch.Tensor, i: torch.Tensor, t: torch.Tensor
-) -> tuple[torch.Tensor, ...]:
-    """U = d prediction / d log Z."""
-    fx, fy = pixels.K[:, 0, 0, None], pixels.K[:, 1, 1, None]
-    u = (fx * i * (a * t[:, 2] - t[:, 0]), fy * i * (b * t[:, 2] - t[:, 1]))
-    return u if pixels.log_depth_curr is None else (*u, 1 - t[:, 2] * i)
+) -> torch.Tensor:
+    """Q = d pi(X') / d log Z."""
+    return _focal(pixels) * torch.stack(
+        [i * (a * t[:, 2] - t[:, 0]), i * (b * t[:, 2] - t[:, 1])], 1
+    )
 
 
-class Whitening(NamedTuple):
-    """D, kappa and D u of Sigma^-1 = diag(D) - kappa (D u)(D u)^T."""
-
-    D: tuple[torch.Tensor, ...]
-    kappa: torch.Tensor
-    Du: tuple[torch.Tensor, ...]
-
-    def apply(self, r: Rows) -> tuple[list[torch.Tensor], torch.Tensor]:
-        """(Sigma^-1 r, squared Mahalanobis distance)."""
-        along = self.kappa * _dot(self.Du, r)
-        n = [d * x - along * v for d, x, v in zip(self.D, r, self.Du, strict=True)]
-        return n, _dot(n, r).clamp(min=0)
-
-
-def _dot(a: Rows, b: Rows) -> torch.Tensor:
-    return reduce(torch.add, (x * y for x, y in zip(a, b, strict=True)))
-
-
-def whitening(pixels: Pixels, at: Residuals, noise: torch.Tensor) -> Whitening:
-    """Inverse covariance of each pixel, for noise (B, 2) sf px, sd; (B, 3) with sz."""
-    flow = 1 / (noise[:, 0, None].square() * pixels.flow_variance)
-    D: tuple[torch.Tensor, ...] = (flow, flow)
-    if pixels.has_depth_curr is not None:
-        D = (*D, pixels.has_depth_curr / noise[:, 2, None].square())
-    Du = tuple(d * u for d, u in zip(D, at.u, strict=True))
+def _information(
+    pixels: Pixels, at: Residuals, noise: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """(p, kappa) (B, N) of Sigma^-1 = p I - kappa p q (p q)^T."""
+    p = 1 / (noise[:, 0, None].square() * pixels.flow_variance)
     depth = noise[:, 1, None].square() * pixels.depth_variance
-    return Whitening(D, depth / (1 + depth * _dot(Du, at.u)), Du)
+    return p, depth / (1 + depth * p * at.q.square().sum(dim=1))
 
 
 def at_likely_depth(pixels: Pixels, at: Residuals, noise: torch.Tensor) -> Residuals:
-    """The same at the depths that the residuals make most likely; the residuals stay.
-
-    a + e q_u / fx, b + e q_v / fy, i (1 - h e).
-    """
-    white = whitening(pixels, at, noise)
-    e = (white.kappa * _dot(white.Du, at.r)).clamp(-float(MAX_SHIFT), float(MAX_SHIFT))
-    a = at.a + at.u[0] * e / pixels.K[:, 0, 0, None]
-    b = at.b + at.u[1] * e / pixels.K[:, 1, 1, None]
+    """The same at the depths that the residuals make most likely; the residuals stay."""
+    p, kappa = _information(pixels, at, noise)
+    e = (kappa * p * (at.q * at.r).sum(dim=1)).clamp(-float(MAX_SHIFT), float(MAX_SHIFT))
+    a, b = (torch.stack([at.a, at.b], 1) + at.q * e[:, None] / _focal(pixels)).unbind(1)
     i = at.i * (1 - (1 - at.t[:, 2] * at.i) * e)
-    return replace(at, a=a, b=b, i=i, u=_sensitivity(pixels, a, b, i, at.t))
+    return replace(at, a=a, b=b, i=i, q=_sensitivity(pixels, a, b, i, at.t))
 
 
-def jacobian(pixels: Pixels, at: Residuals) -> tuple[torch.Tensor, ...]:
-    """Rows d prediction / d delta, each (B, 6, N): u, v and, with the depth, log Z'."""
-    u, v = projection_rows(at.a, at.b, at.i)
-    rows = pixels.K[:, 0, 0, None, None] * u, pixels.K[:, 1, 1, None, None] * v
-    if pixels.log_depth_curr is None:
-        return rows
-    zero = torch.zeros_like(at.a)
-    return (*rows, torch.stack([zero, zero, at.i, at.b, -at.a, zero], dim=1))
+def jacobian(pixels: Pixels, at: Residuals) -> torch.Tensor:
+    """(B, 2, 6, N) d pi(X') / d delta."""
+    return _focal(pixels)[..., None] * torch.stack(projection_rows(at.a, at.b, at.i), dim=1)
 
 
-class RobustNoise(NamedTuple):
-    """How residuals are weighed: (B, 2) or (B, 3) noise, name of the kernel, its cutoff."""
+@dataclass(frozen=True, eq=False)
+class Weighted:
+    """Residuals under their covariance and the robust kernel.
 
-    noise: torch.Tensor
-    kernel: str = "geman-mcclure"
-    cutoff: float = KERNELS["geman-mcclure"].cutoff
+    Args:
+        at: at the likely depths.
+        p, kappa: (B, N) of the information.
+        right: (B, 2, N) Sigma^-1 r.
+        distance2: (B, N) squared Mahalanobis distances.
+        robust: (B, N) robust weights without the external ones, 0 where unusable.
+    """
+
+    at: Residuals
+    p: torch.Tensor
+    kappa: torch.Tensor
+    right: torch.Tensor
+    distance2: torch.Tensor
+    robust: torch.Tensor
+
+
+def weigh(pixels: Pixels, T: pp.LieTensor, how: RobustNoise) -> Weighted:
+    """Residuals at pypose SE3 poses (B, 7), weighed."""
+    at = at_likely_depth(pixels, residuals(pixels, T), how.noise)
+    p, kappa = _information(pixels, at, how.noise)
+    along = kappa * p * (at.q * at.r).sum(dim=1)
+    right = p[:, None] * (at.r - along[:, None] * at.q)
+    distance2 = (right * at.r).sum(dim=1).clamp(min=0)
+    usable = at.front & (pixels.weight > 0)
+    robust = torch.where(usable, how.kernel(distance2)[1], torch.zeros_like(distance2))
+    return Weighted(at, p, kappa, right, distance2, robust)
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,7 +133,6 @@ class Linearization:
         weights: (B, N) robust weights without the external ones, 0 where unusable.
         weight_sum: (B,) sum of robust times external weights.
         distance2: (B, N) squared Mahalanobis distances.
-        scores: (B, 6, N) w J^T Sigma^-1 r per pixel where asked for, else None.
     """
 
     H: torch.Tensor
@@ -198,7 +141,6 @@ class Linearization:
     weights: torch.Tensor
     weight_sum: torch.Tensor
     distance2: torch.Tensor
-    scores: torch.Tensor | None = None
 
     def total(self) -> tuple[torch.Tensor, torch.Tensor]:
         """(H (B, 6, 6), g (B, 6)) in float64: a float32 sum over an image loses its fifth digit."""
@@ -206,85 +148,58 @@ class Linearization:
 
 
 def linearize(
-    pixels: Pixels,
-    T: pp.LieTensor,
-    how: RobustNoise,
-    run: int | None = None,
-    scores: bool = False,
+    pixels: Pixels, T: pp.LieTensor, how: RobustNoise, run: int | None = None
 ) -> Linearization:
-    """Normal equations of a batch at pypose SE3 poses (B, 7).
+    """Normal equations at pypose SE3 poses (B, 7), summed over runs of ``run`` pixels or all."""
+    found = weigh(pixels, T, how)
+    at, w, length = found.at, pixels.weight * found.robust, run or pixels.weight.shape[1]
 
-    Args:
-        pixels: of the batch.
-        T: T_curr_prev.
-        how: noise and kernel.
-        run: number of pixels in a run, a divisor of N; all of them by default.
-        scores: whether the score of each pixel is asked for.
-    """
-    kernel, c2 = KERNELS[how.kernel], how.cutoff**2
-    at = residuals(pixels, T)
-    at = at_likely_depth(pixels, at, how.noise)
-    white = whitening(pixels, at, how.noise)
-    n, distance2 = white.apply(at.r)
-    usable = at.front & (pixels.weight > 0)
-    weights = torch.where(usable, kernel.weight(distance2, c2), torch.zeros_like(distance2))
-    w = pixels.weight * weights
-    rows = jacobian(pixels, at)
-    batch, count = w.shape
-    shape = (batch, -1, run or count)
+    def runs(x: torch.Tensor) -> torch.Tensor:
+        """(B, C, K L) or (B, C, 6, K L) of (B, K, N) or (B, K, 6, N): K values run by run."""
+        return x.unflatten(-1, (-1, length)).movedim(-2, 1).movedim(2, -2).flatten(-2)
 
-    def runs(x: Rows, axis: int) -> torch.Tensor:
-        """Columns (B, N) or rows (B, 6, N) side by side, run by run."""
-        return torch.cat([v.reshape(*v.shape[:-1], *shape[1:]) for v in x], dim=axis)
-
-    along = _dot(rows, [v[:, None] for v in white.Du])
-    G = runs([*rows, along], 3).transpose(1, 2)  # (B, C, 6, rows * L)
-    information = runs([*(w * d for d in white.D), -w * white.kappa], 2)
-    H = (G * information[:, :, None]) @ G.transpose(2, 3)
-    right = runs([w * m for m in n], 2)
+    J = jacobian(pixels, at)
+    along = (J * (found.p[:, None] * at.q)[:, :, None]).sum(dim=1, keepdim=True)
+    G = runs(torch.cat([J, along], dim=1))
+    information = w[:, None] * torch.stack([found.p, found.p, -found.kappa], dim=1)
+    H = (G * runs(information)[:, :, None]) @ G.transpose(2, 3)
+    right = runs(w[:, None] * found.right)
     g = (G[..., : right.shape[2]] @ right[..., None])[..., 0]
-    behind = distance2.new_full((), BEHIND_DISTANCE2)
-    rho = torch.where(at.front, kernel.cost(distance2, c2), kernel.cost(behind, c2))
+    behind = torch.full_like(found.distance2, BEHIND_DISTANCE2)
+    cost = how.kernel(torch.where(at.front, found.distance2, behind))[0]
     return Linearization(
         H=0.5 * (H + H.transpose(2, 3)),
         g=g,
-        cost=(pixels.weight * rho).sum(dim=1),
-        weights=weights,
+        cost=(pixels.weight * cost).sum(dim=1),
+        weights=found.robust,
         weight_sum=w.sum(dim=1),
-        distance2=distance2,
-        scores=_dot(rows, [(w * m)[:, None] for m in n]) if scores else None,
+        distance2=found.distance2,
     )
 
 
-def score_sum(
-    pixels: Pixels, T: pp.LieTensor, how: RobustNoise, xi: torch.Tensor | None = None
-) -> torch.Tensor:
-    """(B, 6) estimating equation g = sum of w J^T Sigma^-1 r at Exp(xi) T, for differentiation.
+def scores(pixels: Pixels, T: pp.LieTensor, how: RobustNoise) -> tuple[torch.Tensor, Weighted]:
+    """(B, 6, N) w J^T Sigma^-1 r of each pixel; their sum is zero at the estimate.
 
-    The pose that solves g = 0 is the estimate; g is not the gradient of the cost, since Sigma moves
-    with the pose.
+    It is not the gradient of the cost, since Sigma moves with the pose.
     """
-    at = residuals(pixels, T if xi is None else left_update(xi, T))
-    at = at_likely_depth(pixels, at, how.noise)
-    n, distance2 = whitening(pixels, at, how.noise).apply(at.r)
-    w = torch.where(at.front & (pixels.weight > 0), pixels.weight, torch.zeros_like(distance2))
-    w = w * KERNELS[how.kernel].weight(distance2, how.cutoff**2)
-    return _dot(jacobian(pixels, at), [(w * m)[:, None] for m in n]).sum(dim=2)
+    found = weigh(pixels, T, how)
+    right = (pixels.weight * found.robust)[:, None] * found.right
+    return (jacobian(pixels, found.at) * right[:, :, None]).sum(dim=1), found
 
 
 def newton_matrix(pixels: Pixels, T: pp.LieTensor, how: RobustNoise) -> torch.Tensor:
-    """A = -dg / d xi at pypose SE3 poses, (B, 6, 6), not symmetric; A xi = g is the Newton step."""
+    """A = -dg / d xi, g the sum of the scores: (B, 6, 6), not symmetric; A xi = g is the step."""
     how = how._replace(noise=how.noise.detach())
     pixels = replace(pixels, K=pixels.K.detach())
     with torch.enable_grad():
         xi = torch.zeros(len(T), 6, dtype=T.dtype, device=T.device, requires_grad=True)
-        g = score_sum(pixels, T, how, xi)
+        g = scores(pixels, left_update(xi, T), how)[0].sum(dim=2)
         rows = [torch.autograd.grad(g[:, k].sum(), xi, retain_graph=True)[0] for k in range(6)]
     return -torch.stack(rows, dim=1)
 
 
 def solve_small(
-    A: torch.Tensor, b: torch.Tensor, damping: torch.Tensor | float = 0.0
+    A: torch.Tensor, b: torch.Tensor, damping: float = 0.0
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Solve ((A + damping diag A) x = b) for (B, 6, 6) systems in float64, each for itself.
 
@@ -298,7 +213,6 @@ def solve_small(
     good = good & (scale > 1e-15).all(dim=1)
     scale = torch.where(good[:, None], scale, torch.ones_like(scale))
     b = torch.where(good[:, None], b, torch.zeros_like(b))
-    damping = torch.as_tensor(damping, dtype=A.dtype, device=A.device).reshape(-1, 1, 1)
     A = A / (scale[:, :, None] * scale[:, None, :]) + damping * unit
     x, info = torch.linalg.solve_ex(torch.where(good[:, None, None], A, unit), b / scale)
     x = x / scale
