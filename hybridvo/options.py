@@ -74,7 +74,7 @@ class SearchOptions:
     """
 
     grid_pixels: Count = 1800
-    max_hypotheses: Annotated[int, Field(ge=1, le=16)] = 5
+    max_hypotheses: Annotated[int, Field(ge=1, le=16)] = 8
     min_inlier_ratio: Share = 0.08
     unambiguous_ratio: Share = 0.85
 

@@ -17,8 +17,6 @@ from hybridvo.refinement.pixels import CoarseGrid, as_contiguous, coarse_grid
 from hybridvo.results import Reason, RelativePose
 from hybridvo.types import Frame, FramePair
 
-REFERENCE_WIDTH = 1024
-"""px; residuals of images of different size are compared at this width."""
 SOURCE_REFIT = 102
 """Source of a motion that was fitted inside a mask, see :mod:`hybridvo.hypotheses.search`."""
 CHANCE_COHERENCE = 0.05
@@ -177,7 +175,7 @@ def _is_rigid(grid: CoarseGrid, pose: np.ndarray, fact: np.ndarray, width: int) 
     noise = fact[search.FLOW_NOISE], fact[search.DEPTH_NOISE]
     coherence = search.residual_coherence(grid.samples, h, w, pose, grid.pixels.K, *noise)
     excess = max(coherence - CHANCE_COHERENCE, 0.0)
-    bend_px = np.sqrt(excess * grid.pixels.scale[0]) * noise[0] * REFERENCE_WIDTH / width
+    bend_px = np.sqrt(excess * grid.pixels.scale[0]) * noise[0] * search.REFERENCE_WIDTH / width
     return bool(coherence < CLEAR_COHERENCE and bend_px < CLEAR_BEND_PX)
 
 

@@ -3,12 +3,15 @@
 Starts come from three sources: poses that the caller hands in (identity, the last motion, a
 network's seed), robust dense fits of overlapping windows, and minimal three-pixel samples. They are
 scored at two residual scales at once, the best few are refined, and the pixels that follow the
-winner are set aside before the next round. Everything is deterministic for a seed.
+winner are set aside before the next round. The winner may be a compromise that takes the pixels of
+a weaker motion with it, so the others of a round are kept, behind all winners. Everything is
+deterministic for a seed.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -65,7 +68,11 @@ the same motion would be found again."""
 SHARE, FLOW_NOISE, DEPTH_NOISE, SOURCE, ITERATIONS = range(5)
 FACTS = 5
 """Columns of the table of facts of the hypotheses."""
-SOURCE_WINDOW, SOURCE_MINIMAL = 100, 101
+SOURCE_WINDOW, SOURCE_MINIMAL, RUNNER_UP = 100, 101, 103
+REFERENCE_WIDTH = 1024
+"""px; images of different size are compared at this width."""
+OTHER_PX = 3.0
+"""Mean distance, px at that width, above which two motions are not the same."""
 
 
 def find_motions(
@@ -94,36 +101,72 @@ def find_motions(
     depth_scale = translation_scale(grid.samples, n)
     rng = np.random.default_rng(seed)
 
-    def search_round(starts: np.ndarray, samples: int) -> tuple[np.ndarray, np.ndarray] | None:
+    def search_round(starts: np.ndarray, samples: int) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Motions of the pixels that are left, the strongest first: (pose, facts)."""
         best = candidates(small, sh, sw, K, starts, samples, rng, depth_scale, work)
-        pose, facts = np.zeros((3, 4)), np.zeros(FACTS)
-        ok = refine_best(small, sh * sw, coarse, n, K, best, cutoff, pose, facts, work)
-        return (pose, facts) if ok else None
+        scores, steps = refine_candidates(small, sh * sw, coarse, n, K, best, work)
+        found: list[tuple[np.ndarray, np.ndarray]] = []
+        for k in np.argsort(-scores, kind="stable"):
+            pose, facts = best[0][k], np.zeros(FACTS)
+            if scores[k] > 0 and _is_new(grid, pose, [*found, *seen] if found else []):
+                facts[SOURCE] = best[2][k]
+                facts[ITERATIONS] = steps[k]
+                finish(coarse, n, K, cutoff, pose, facts, work)
+                facts[SHARE] *= left / total
+                found.append((pose, facts))
+        seen.extend(found)
+        return found
 
-    poses: list[np.ndarray] = []
-    table: list[np.ndarray] = []
+    motions: list[tuple[np.ndarray, np.ndarray]] = []
+    seen: list[tuple[np.ndarray, np.ndarray]] = []
     total = left = float(coarse[W, :n].sum(dtype=np.float64))
-    while len(poses) < limits.max_hypotheses and left > limits.min_inlier_ratio * total:
-        if poses:
+    while len(motions) < limits.max_hypotheses and left > limits.min_inlier_ratio * total:
+        if motions:
             found = search_round(starts[:0], MINIMAL_SAMPLES // 3)
         else:
             found = search_round(starts, 0)
-            if found is None or not _is_settled(coarse, h, w, K, *found):
+            if not found or not _is_settled(coarse, h, w, K, *found[0]):
                 found = search_round(starts, MINIMAL_SAMPLES)
-        if found is None:
+        if not found:
             break
-        pose, facts = found
-        facts[SHARE] *= left / total
-        if poses and facts[SHARE] < limits.min_inlier_ratio:
+        pose, facts = found[0]
+        if motions and facts[SHARE] < limits.min_inlier_ratio:
             break
-        poses.append(pose)
-        table.append(facts)
-        if len(poses) == 1 and facts[SHARE] >= decisive:
-            break
+        motions.append((pose, facts))
+        if len(motions) == 1 and facts[SHARE] >= decisive:
+            return pose[None], facts[None], depth_scale
         for samples, count in ((coarse, n), (small, sh * sw)):
             set_aside(samples, count, pose, K, facts[FLOW_NOISE], facts[DEPTH_NOISE], cutoff, work)
         left = float(coarse[W, :n].sum(dtype=np.float64))
+    for pose, facts in sorted(seen, key=lambda motion: -motion[1][SHARE]):
+        more = len(motions) < limits.max_hypotheses and facts[SHARE] >= limits.min_inlier_ratio
+        if more and motions and _is_new(grid, pose, motions):
+            facts[SOURCE] = RUNNER_UP
+            motions.append((pose, facts))
+    poses, table = ([motion[i] for motion in motions] for i in range(2))
     return np.reshape(poses, (-1, 3, 4)), np.reshape(table, (-1, FACTS)), depth_scale
+
+
+def _is_new(
+    grid: CoarseGrid, pose: np.ndarray, motions: Sequence[tuple[np.ndarray, np.ndarray]]
+) -> bool:
+    """Whether a pose is none of the motions."""
+    poses = np.stack([pose, *(other for other, _ in motions)])
+    return bool((distances(grid, poses, 0)[1:] > OTHER_PX).all())
+
+
+def distances(grid: CoarseGrid, poses: np.ndarray, of: int) -> np.ndarray:
+    """(N,) mean distance between where poses (N, 3, 4) bring the pixels and where one of them does,
+    px at a width of 1024.
+    """
+    samples = grid.samples[:, : grid.count : 7]
+    samples = samples[:, samples[W] > 0].astype(np.float64)
+    z = samples[Z]
+    points = np.stack([samples[XN] * z, samples[YN] * z, z])
+    moved = poses[:, :, :3] @ points + poses[:, :, 3:]
+    seen = moved[:, :2] / np.maximum(moved[:, 2:], 1e-3)
+    gap = np.linalg.norm((seen - seen[of]) * grid.pixels.K[:2, None], axis=1)
+    return np.minimum(gap, 1e3).mean(axis=1) * REFERENCE_WIDTH / grid.size[1]
 
 
 def _is_settled(
@@ -175,29 +218,25 @@ def candidates(small, h, w, K, starts, samples, rng, similar, work):
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
-def refine_best(small, ns, coarse, n, K, best, cutoff, pose, facts, work):
-    """Refine the candidates of a round on ``small``, the one that then scores best on ``coarse``.
+def refine_candidates(small, ns, coarse, n, K, best, work):
+    """Refine the candidates of a round, in place, on ``small``: their scores on ``coarse``, steps.
 
-    Sets ``pose`` and ``facts``; returns whether there was any.
+    The scores are 0 where there is no candidate.
     """
-    poses, scores, sources = best
-    candidate = np.empty((3, 4))
-    highest = -1.0
-    steps = 0
+    poses, scores, _ = best
+    on_coarse, steps = np.zeros(REFINED), np.zeros(REFINED)
     for s in range(REFINED):
-        if scores[s] <= 0:
-            break
-        candidate[:, :] = poses[s]
-        steps += anneal(small, ns, K, 1.5, 0.7, 0.4, 3, candidate, work)
-        score = score_pose(coarse, n, candidate, K)
-        if score > highest:
-            highest = score
-            pose[:, :] = candidate
-            facts[SOURCE] = sources[s]
-    if highest <= 0:
-        return False
-    steps += anneal(coarse, n, K, 0.7, 0.5, 0.4, 3, pose, work)
-    candidate[:, :] = pose
+        if scores[s] > 0:
+            steps[s] = anneal(small, ns, K, 1.5, 0.7, 0.4, 3, poses[s], work)
+            on_coarse[s] = score_pose(coarse, n, poses[s], K)
+    return on_coarse, steps
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def finish(coarse, n, K, cutoff, pose, facts, work):
+    """Refine a pose on ``coarse``, in place, and fill in its facts."""
+    facts[ITERATIONS] += anneal(coarse, n, K, 0.7, 0.5, 0.4, 3, pose, work)
+    candidate = pose.copy()
     sf, sd, share, more, _, _ = reestimate(
         coarse, n, K, 0.5, 0.01, FLOW_NOISE_CAP, DEPTH_NOISE_CAP, cutoff, 2, 4, NOISE_PIXELS,
         candidate, work,
@@ -207,8 +246,7 @@ def refine_best(small, ns, coarse, n, K, best, cutoff, pose, facts, work):
     facts[SHARE] = share
     facts[FLOW_NOISE] = sf
     facts[DEPTH_NOISE] = sd
-    facts[ITERATIONS] = steps + more
-    return True
+    facts[ITERATIONS] += more
 
 
 @njit(error_model="numpy", cache=True, nogil=True)

@@ -18,7 +18,6 @@ from hybridvo.geometry import invert, pose_matrix, se3_log
 from hybridvo.hypotheses import search
 from hybridvo.hypotheses.cues import cue_scores
 from hybridvo.hypotheses.generate import (
-    REFERENCE_WIDTH,
     SOURCE_REFIT,
     GridMaps,
     HypothesisSet,
@@ -37,8 +36,6 @@ MASK_RAMP = (0.4, 0.9)
 ROUNDS = 3
 """Most rounds of refits; only a refit that is the best goes into another one, inside its own mask.
 On 120 development pairs with DIS flow one round leaves a median error of 0.075 px, three 0.072."""
-OTHER_PX = 3.0
-"""Mean distance, px at a width of 1024, above which two motions are not the same."""
 NO_RIVAL = 8.0
 """Gap of the scores where there is no other motion, and the largest that counts."""
 MIN_COVERAGE = 0.02
@@ -46,6 +43,7 @@ MIN_COVERAGE = 0.02
 SOURCES = {
     search.SOURCE_WINDOW: "window",
     search.SOURCE_MINIMAL: "minimal",
+    search.RUNNER_UP: "runner-up",
     SOURCE_REFIT: "refit",
 }
 
@@ -163,6 +161,9 @@ class CueSelector:
         prediction: MotionPrediction | None = None,
     ) -> Selection:
         """See :class:`Selector`; a prediction is not looked at."""
+        # the cues compare motions that share no pixels
+        kept = found.facts[:, search.SOURCE] != search.RUNNER_UP
+        found = replace(found, poses=found.poses[kept], facts=found.facts[kept])
         candidates = _searched(found)
         motions = hypotheses(found, candidates)
         seen = cue_scores(found, motions)
@@ -261,26 +262,12 @@ class MaskSelector:
 def evidence_of(found: HypothesisSet, candidates: Candidates, scores: Scores) -> np.ndarray:
     """(2,) The logit of a scorer's confidence, and the gap to the best score of another motion."""
     best = int(np.argmax(scores.score))
-    apart = _distances(found, candidates.poses, best) > OTHER_PX
+    apart = search.distances(found.grid, candidates.poses, best) > search.OTHER_PX
     gap = NO_RIVAL
     if apart.any():
         gap = min(NO_RIVAL, float(scores.score[best] - scores.score[apart].max()))
     confidence = float(np.clip(np.nan_to_num(scores.confidence), 1e-3, 1 - 1e-3))
     return np.array([np.log(confidence / (1 - confidence)), gap])
-
-
-def _distances(found: HypothesisSet, poses: np.ndarray, of: int) -> np.ndarray:
-    """(N,) mean distance between where poses bring the pixels and where one of them does, px at a
-    width of 1024.
-    """
-    samples = found.grid.samples[:, : found.grid.count : 7]
-    samples = samples[:, samples[kernels.W] > 0].astype(np.float64)
-    z = samples[kernels.Z]
-    points = np.stack([samples[kernels.XN] * z, samples[kernels.YN] * z, z])
-    moved = poses[:, :, :3] @ points + poses[:, :, 3:]
-    seen = moved[:, :2] / np.maximum(moved[:, 2:], 1e-3)
-    gap = np.linalg.norm((seen - seen[of]) * found.grid.pixels.K[:2, None], axis=1)
-    return np.minimum(gap, 1e3).mean(axis=1) * REFERENCE_WIDTH / found.pair.prev.camera.width
 
 
 def _probability(evidence: np.ndarray, weights: tuple[float, ...]) -> float:

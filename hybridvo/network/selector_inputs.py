@@ -16,7 +16,8 @@ import torch
 import torch.nn.functional as F
 
 from hybridvo.hypotheses import search
-from hybridvo.hypotheses.generate import REFERENCE_WIDTH, GridMaps
+from hybridvo.hypotheses.generate import GridMaps
+from hybridvo.hypotheses.search import REFERENCE_WIDTH
 from hybridvo.results import MotionPrior
 
 MIN_FLOW_NOISE = 0.01
