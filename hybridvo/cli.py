@@ -150,8 +150,7 @@ def _open(args: argparse.Namespace) -> Any:
 
 
 def _run(args: argparse.Namespace, command: list[str]) -> int:
-    from hybridvo.commands.configuration import load_options
-    from hybridvo.commands.inputs import weight_files
+    from hybridvo.commands.configuration import load_options, weight_files
     from hybridvo.commands.results import summary_text
     from hybridvo.commands.run import run
     from hybridvo.network.models import Models
@@ -190,7 +189,7 @@ def _show(args: argparse.Namespace, command: list[str]) -> int:
 
 
 def _compare(args: argparse.Namespace, command: list[str]) -> int:
-    from hybridvo.commands.inputs import weight_files
+    from hybridvo.commands.configuration import weight_files
     from hybridvo.commands.progress import Progress
     from hybridvo.evaluation.comparison import compare
     from hybridvo.evaluation.sequence_job import ComparisonOptions

@@ -32,11 +32,8 @@ def write_motions(folder: Path, rows: list[dict[str, Any]]) -> Trajectory:
 
 
 def summarise(rows: list[dict[str, Any]], sequence: Sequence, method: str) -> dict[str, Any]:
-    """Counts, sources, oracles, times and warnings of a run, JSON-ready.
-
-    The first frame has no motion: a run of n frames has n - 1.
-    """
-    motions = rows[1:]
+    """Counts, sources, oracles, times and warnings of a run, JSON-ready."""
+    motions = rows[1:]  # the first frame has none
     failed = [row for row in motions if row["status"] == "failed"]
     timed = [row for row in motions if row["reason"] != "missing_frame"]
 
