@@ -44,37 +44,17 @@ def build_parser() -> argparse.ArgumentParser:
         command.set_defaults(call=call)
         return command
 
-    arguments.add_run(
-        add("run", _run, "estimate the camera motion of a sequence", arguments.input())
-    )
+    sequence = arguments.input()
+    arguments.add_run(add("run", _run, "estimate the camera motion of a sequence", sequence))
     arguments.add_compare(add("compare", _compare, "run methods side by side and write a report"))
-    arguments.add_show(
-        add("show", _show, "draw the maps of one pair of a sequence", arguments.input())
-    )
-    arguments.add_evaluate(
-        add("evaluate", _evaluate, "errors of a trajectory file against ground truth")
-    )
-    doctor = add(
-        "doctor",
-        _doctor,
-        "what is missing here, or wrong with a sequence",
-        arguments.input(required=False),
-    )
+    arguments.add_show(add("show", _show, "draw the maps of one pair of a sequence", sequence))
+    errors = "errors of a trajectory file against ground truth"
+    arguments.add_evaluate(add("evaluate", _evaluate, errors))
+    wrong, optional = "what is missing here, or wrong with a sequence", arguments.input(False)
+    doctor = add("doctor", _doctor, wrong, optional)
     doctor.add_argument("--pairs", type=int, default=40, metavar="N", help="pairs (default 40)")
-    demo = add("demo", _demo, "render a scene with moving objects and run on it")
-    demo.add_argument("--out", default="runs/demo", metavar="DIR", help="default: runs/demo")
-    demo.add_argument("--overwrite", action="store_true", help="replace the results in --out")
-    demo.add_argument("--frames", type=int, default=20, metavar="N", help="default: 20")
-    demo.add_argument("--seed", type=int, default=0, metavar="N", help="of the scene")
-    generate = add("generate", _generate, "draw training samples into a folder")
-    which = generate.add_mutually_exclusive_group(required=True)
-    which.add_argument("path", nargs="?", metavar="PRESET", help="paper, diverse or a YAML file")
-    which.add_argument("--preset", metavar="PRESET", help="the same, by name")
-    generate.add_argument("--out", required=True, metavar="DIR", help="folder of the samples")
-    generate.add_argument("--count", type=int, default=1000, metavar="N", help="default: 1000")
-    generate.add_argument("--seed", type=int, default=0, metavar="N")
-    generate.add_argument("--size", type=int, nargs=2, metavar=("H", "W"), help="pixels")
-    generate.add_argument("--workers", type=int, default=1, metavar="N", help="processes")
+    arguments.add_demo(add("demo", _demo, "render a scene with moving objects and run on it"))
+    arguments.add_generate(add("generate", _generate, "draw training samples into a folder"))
     training = commands.add_parser("train", help="train a network")
     training.set_defaults(call=train)
     add_train(training, arguments.common())

@@ -33,10 +33,6 @@ def load_options(
     ``path`` is a YAML file, or None for the defaults; the values of ``assignments`` are YAML;
     those of ``given``, such as ``{"run.method": "refine"}``, are left out where they are None.
 
-    Raises:
-        InputError: no such file, an unknown key (the nearest known one is named), a value that is
-            out of bounds. FormatError: the file is no YAML mapping.
-
     Example:
         >>> load_options(assignments=["refine.cutoff=2.5"]).refine.cutoff
         2.5
@@ -103,11 +99,7 @@ def _known(key: str, where: str) -> str:
 
 
 def weight_files(weights: Iterable[str], methods: Iterable[str]) -> dict[str, str]:
-    """Network -> file of the ``NAME=FILE`` that ``--weights`` was given.
-
-    Raises:
-        InputError: another form, no such file, or a name that none of the methods uses.
-    """
+    """Network -> file of the ``NAME=FILE`` that ``--weights`` was given."""
     files = {}
     known = sorted({name for method in methods for name in networks_of(method)})
     for text in weights:

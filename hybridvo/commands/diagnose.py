@@ -69,9 +69,6 @@ def diagnose(sequence: Sequence, *, pairs: int = 40) -> dict[str, Any]:
 
     At most ``pairs`` pairs of neighbouring frames are looked at, spread evenly. The true poses of
     the sequence serve for nothing but the scale of depth. ``ok``: nothing differs.
-
-    Raises:
-        InputError: fewer than two frames, or ``pairs`` below 1.
     """
     if pairs < 1 or len(sequence) < 2:
         raise InputError(

@@ -88,7 +88,7 @@ def _what_runs() -> dict[str, Any]:
     import torch
 
     from hybridvo.estimation import warm_up
-    from hybridvo.evaluation.plan import methods_to_run
+    from hybridvo.evaluation.comparison import methods_to_run
 
     devices = {}
     for name in ("cpu", *(f"cuda:{k}" for k in range(torch.cuda.device_count()))):

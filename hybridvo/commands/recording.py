@@ -24,11 +24,7 @@ MAX_SIDE = 480
 
 
 def check_recording(path: str | os.PathLike[str]) -> None:
-    """Refuse what cannot become a recording, before a run is started.
-
-    Raises:
-        InputError: Rerun is not installed, or the name does not end in ``.rrd``.
-    """
+    """Refuse what cannot become a recording, before a run is started."""
     if Path(path).suffix != ".rrd" or Path(path).is_dir():
         raise InputError(f"--rrd {os.fspath(path)}: expected the name of a file that ends in .rrd.")
     if find_spec("rerun") is None:

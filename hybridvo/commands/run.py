@@ -294,19 +294,14 @@ def _frames(sequence: Sequence, options: Options) -> range:
 def _flow_provider(sequence: Sequence, options: Options) -> FlowProvider:
     """Provider of the flow that the options ask for."""
     source, stride = options.flow.source, options.run.stride
+    from_files = file_flow(sequence, strict=options.run.strict)
     if source == "file":
-        if not sequence.has_flow:
-            raise InputError(f"{sequence.name}: there are no flow files; pass --flow dis.")
-        if stride > 1:
-            raise InputError(
-                f"{sequence.name}: flow files lead from one frame to the next, not over a stride "
-                f"of {stride}; pass --flow dis."
-            )
-        return file_flow(sequence, strict=options.run.strict)
+        sequence.check_flow(stride)
+        return from_files
     dis = dis_flow(options.flow.dis_preset, options.flow.forward_backward)
     if source == "auto" and sequence.has_flow and stride == 1:
         # a damaged file is no reason to stop where DIS can stand in
-        return fallback(file_flow(sequence, strict=options.run.strict), dis)
+        return fallback(from_files, dis)
     return dis
 
 

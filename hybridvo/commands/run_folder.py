@@ -143,11 +143,7 @@ class RunFolder:
             return {}
 
     def append(self, row: dict[str, Any]) -> None:
-        """Keep the row of a finished frame, and write its line of ``steps.csv``.
-
-        Raises:
-            OutputError: it cannot be written; lines written before stay valid.
-        """
+        """Keep the row of a finished frame, and write its line of ``steps.csv``."""
         path = self.path / STEPS
         try:
             with path.open("a", encoding="utf-8", newline="") as file:

@@ -152,11 +152,7 @@ def _read_pair(sequence: Sequence, index: int, flow: str) -> FramePair:
 
 
 def networks(files: Iterable[str | Path] = ()) -> list[tuple[str, Any]]:
-    """(name, network) of the given files, or of all pretrained ones that predict a motion.
-
-    Raises:
-        InputError: a file that cannot be read, or a network that predicts no motion.
-    """
+    """(name, network) of the given files, or of all pretrained ones that predict a motion."""
     found = []
     paths = [Path(file) for file in files]
     for path in paths or [pretrained(name) for name in pretrained_names()]:

@@ -122,9 +122,6 @@ def pair_errors(
         valid pixels at native size; a pixel that the estimate puts behind the camera counts with
         the image diagonal. ``rot_err_deg``: geodesic angle. ``trans_err``: norm of the translation
         difference, m. ``epe`` and ``epe_l2_px`` are None where no pixel is valid.
-
-    Raises:
-        InputError: poses that are not finite, shapes that do not match.
     """
     _check({"T_est": T_est, "T_gt": T_gt}, depth_prev, camera_prev, camera_curr)
     T_est, T_gt = np.asarray(T_est, dtype=np.float64), np.asarray(T_gt, dtype=np.float64)
