@@ -21,7 +21,9 @@ from hybridvo import __version__
 from hybridvo.commands import arguments
 from hybridvo.commands.train import add_train, train
 
-Call = Callable[[argparse.Namespace, list[str]], int]
+Result = tuple[Any, str, int]
+"""What a command gives: JSON-ready, for people, and the exit code."""
+Call = Callable[[argparse.Namespace, list[str]], Result]
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -78,7 +80,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
 
 
-def _guarded(args: argparse.Namespace, command: list[str]) -> int:
+def _guarded(args: argparse.Namespace, command: list[str]) -> Result:
     """Exit code of a command; errors become one line on stderr."""
     from hybridvo.errors import HybridVOError
 
@@ -89,7 +91,10 @@ def _guarded(args: argparse.Namespace, command: list[str]) -> int:
     if args.verbose:
         logger.setLevel(logging.DEBUG)
     try:
-        return args.call(args, command)
+        content, text, code = args.call(args, command)
+        # the result on stdout, as JSON or for people
+        print(json.dumps(content, indent=1, allow_nan=False) if args.json else text, flush=True)
+        return code
     except KeyboardInterrupt:
         print("hybridvo: interrupted.", file=sys.stderr)
         return 130
@@ -112,11 +117,6 @@ def _guarded(args: argparse.Namespace, command: list[str]) -> int:
         logger.setLevel(before)
 
 
-def _print(args: argparse.Namespace, content: Any, text: str) -> None:
-    """The result on stdout, as JSON or for people."""
-    print(json.dumps(content, indent=1, allow_nan=False) if args.json else text, flush=True)
-
-
 def _mode(args: argparse.Namespace) -> Literal["new", "resume", "overwrite"]:
     return "resume" if args.resume else "overwrite" if args.overwrite else "new"
 
@@ -129,7 +129,7 @@ def _open(args: argparse.Namespace) -> Any:
     return open_sequence(args.path or args.sequence, args.dataset, **given)
 
 
-def _run(args: argparse.Namespace, command: list[str]) -> int:
+def _run(args: argparse.Namespace, command: list[str]) -> Result:
     from hybridvo.commands.configuration import load_options, weight_files
     from hybridvo.commands.results import summary_text
     from hybridvo.commands.run import run
@@ -151,24 +151,22 @@ def _run(args: argparse.Namespace, command: list[str]) -> int:
         quiet=args.quiet,
         rrd=args.rrd,
     )
-    _print(args, result.summary, summary_text(result.summary))
     if not args.quiet:
         for warning in result.summary.get("warnings", []):
             print(f"hybridvo: warning: {warning}", file=sys.stderr)
-    return result.exit_code
+    return result.summary, summary_text(result.summary), result.exit_code
 
 
-def _show(args: argparse.Namespace, command: list[str]) -> int:
+def _show(args: argparse.Namespace, command: list[str]) -> Result:
     from hybridvo.evaluation.drawing import draw
 
     given = ("flow", "method", "weights", "steps", "overwrite")
     options = {name: getattr(args, name) for name in given}
     written = [str(path) for path in draw(_open(args), args.pair, args.out, **options)]
-    _print(args, {"files": written}, "\n".join(written))
-    return 0
+    return {"files": written}, "\n".join(written), 0
 
 
-def _compare(args: argparse.Namespace, command: list[str]) -> int:
+def _compare(args: argparse.Namespace, command: list[str]) -> Result:
     from hybridvo.commands.configuration import weight_files
     from hybridvo.commands.progress import Progress
     from hybridvo.evaluation.comparison import compare
@@ -192,57 +190,45 @@ def _compare(args: argparse.Namespace, command: list[str]) -> int:
 
         paths = compare(options, args.out, mode=_mode(args), command=command, progress=report)
     written = [str(path) for path in paths]
-    _print(args, {"files": written}, "\n".join(written))
-    return 0
+    return {"files": written}, "\n".join(written), 0
 
 
-def _evaluate(args: argparse.Namespace, command: list[str]) -> int:
+def _evaluate(args: argparse.Namespace, command: list[str]) -> Result:
     from hybridvo.commands.results import evaluation_text
     from hybridvo.evaluation.metrics import evaluate_files
 
     names = ["alignment", "delta", "delta_unit", "max_diff"]
     names += ["format_est", "format_gt", "axes_est", "axes_gt"]
     report = evaluate_files(args.estimate, args.gt, **{name: getattr(args, name) for name in names})
-    _print(args, report, evaluation_text(report))
-    if report["ate_rmse_unaligned"] is None:  # not one figure: the files do not belong together
+    # not one figure: the files do not belong together
+    code = 2 if report["ate_rmse_unaligned"] is None else 0
+    if code:
         reason = report["reasons"]["ate_rmse_unaligned"]
         print(f"hybridvo: nothing could be compared: {reason}.", file=sys.stderr)
-        return 2
-    return 0
+    return report, evaluation_text(report), code
 
 
-def _doctor(args: argparse.Namespace, command: list[str]) -> int:
+def _doctor(args: argparse.Namespace, command: list[str]) -> Result:
     if args.path or args.sequence:
         from hybridvo.commands.diagnose import diagnose, diagnosis_text
 
         found = diagnose(_open(args), pairs=args.pairs)
-        _print(args, found, diagnosis_text(found))
-        return 0 if found["ok"] else 1
+        return found, diagnosis_text(found), 0 if found["ok"] else 1
     from hybridvo.commands.doctor import doctor, doctor_text
 
     report = doctor()
-    _print(args, report, doctor_text(report))
-    return 0 if report["usable"] else 2
+    return report, doctor_text(report), 0 if report["usable"] else 2
 
 
-def _demo(args: argparse.Namespace, command: list[str]) -> int:
+def _demo(args: argparse.Namespace, command: list[str]) -> Result:
     from hybridvo.commands.demo import demo, demo_text
 
-    content = demo(
-        args.out,
-        frames=args.frames,
-        seed=args.seed,
-        overwrite=args.overwrite,
-        command=command,
-        quiet=args.quiet,
-    )
-    if content is None:
-        return 130
-    _print(args, content, demo_text(content))
-    return 0
+    options = {name: getattr(args, name) for name in ("frames", "seed", "overwrite", "quiet")}
+    content = demo(args.out, **options, command=command)
+    return content, demo_text(content), 0
 
 
-def _generate(args: argparse.Namespace, command: list[str]) -> int:
+def _generate(args: argparse.Namespace, command: list[str]) -> Result:
     from hybridvo.commands.generate import generate
     from hybridvo.commands.progress import Progress
 
@@ -257,17 +243,15 @@ def _generate(args: argparse.Namespace, command: list[str]) -> int:
             workers=args.workers,
             report=lambda done, total: progress.update(done, total=total),
         )
-    _print(args, {"contact_sheet": str(sheet)}, str(sheet))
-    return 0
+    return {"contact_sheet": str(sheet)}, str(sheet), 0
 
 
-def _init(args: argparse.Namespace, command: list[str]) -> int:
+def _init(args: argparse.Namespace, command: list[str]) -> Result:
     from hybridvo.data.camera_file import write_camera_template
 
     path = write_camera_template(args.directory)
     next_step = f"fill it in, then: hybridvo run {args.directory}"
-    _print(args, {"file": str(path)}, f"{path}\n{next_step}")
-    return 0
+    return {"file": str(path)}, f"{path}\n{next_step}", 0
 
 
 if __name__ == "__main__":

@@ -55,37 +55,33 @@ FlowProvider = Callable[[Frame, Frame], FlowField]
 # -- DIS ------------------------------------------------------------------------------------------
 
 
-def dis_flow(preset: str = "medium", forward_backward: bool = True) -> FlowProvider:
+def dis_flow(preset: str = "medium") -> FlowProvider:
     """Provider of OpenCV's DIS flow on grey images (Kroeger et al., ECCV 2016).
 
-    A provider may serve several trackers and threads. Where an image has no texture (a covered
-    lens, a dropped frame, parallel stripes) there is no flow: DIS itself would return zero there,
-    and both directions agree on it.
+    It is computed in both directions, whose disagreement gives variance and validity. A provider
+    may serve several trackers and threads. Where an image has no texture (a covered lens, a dropped
+    frame, parallel stripes) there is no flow: DIS would return zero there, in both directions.
 
     Args:
-        preset: ``ultrafast``, ``fast`` or ``medium``.
-        forward_backward: compute the backward flow as well, and turn the disagreement of the two
-            into a variance and a validity per pixel; twice the time.
+        preset: effort: ``ultrafast``, ``fast`` or ``medium``.
 
     Raises:
         InputError: an unknown preset.
     """
     if preset not in DIS_PRESETS:
         raise InputError(f"DIS preset: expected {', '.join(DIS_PRESETS)}, got {preset!r}.")
-    return _Dis(preset, forward_backward)
+    return _Dis(preset)
 
 
+# a DIS object that two threads use at once ends the process
+_of_thread = threading.local()
+
+
+@dataclass(frozen=True)
 class _Dis:
     """See :func:`dis_flow`."""
 
-    def __init__(self, preset: str, forward_backward: bool) -> None:
-        self._preset = preset
-        self._forward_backward = bool(forward_backward)
-        # a DIS object that two threads use at once ends the process
-        self._threads = threading.local()
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return _Dis, (self._preset, self._forward_backward)
+    preset: str
 
     def __call__(self, prev: Frame, curr: Frame) -> FlowField:
         none = FlowField(None, source="dis")
@@ -95,15 +91,11 @@ class _Dis:
         second = cv2.cvtColor(curr.rgb, cv2.COLOR_RGB2GRAY)
         if not (_textured(first) and _textured(second)):
             return none
-        if not hasattr(self._threads, "dis"):
-            self._threads.dis = cv2.DISOpticalFlow.create(DIS_PRESETS[self._preset])
-        forward = _calc_dis(self._threads.dis, first, second)
-        if forward is None:
-            return none
-        if not self._forward_backward:
-            return FlowField(forward, None, _lands_inside(forward), "dis")
-        backward = _calc_dis(self._threads.dis, second, first)
-        if backward is None:
+        if not hasattr(_of_thread, self.preset):
+            setattr(_of_thread, self.preset, cv2.DISOpticalFlow.create(DIS_PRESETS[self.preset]))
+        dis = getattr(_of_thread, self.preset)
+        forward, backward = _calc_dis(dis, first, second), _calc_dis(dis, second, first)
+        if forward is None or backward is None:
             return none
         return FlowField(forward, *forward_backward_check(forward, backward), "dis")
 

@@ -42,8 +42,8 @@ def demo(
     overwrite: bool = False,
     command: Iterable[str] = (),
     quiet: bool = False,
-) -> dict[str, Any] | None:
-    """Render, run and compare; JSON-ready, None where it was interrupted.
+) -> dict[str, Any]:
+    """Render, run and compare; JSON-ready.
 
     The scene is written in Sintel's layout under ``out/data``; flow comes from OpenCV DIS, never
     from the true flow that is written beside it. Depth is the renderer's.
@@ -69,7 +69,7 @@ def demo(
             quiet=quiet,
         )
         if results[method].exit_code == EXIT_INTERRUPTED:
-            return None
+            raise KeyboardInterrupt
     moving = float(np.median([(scene.object_id(i) > 0).mean() for i in range(scene.frames)]))
     content: dict[str, Any] = {
         "command": list(command),

@@ -298,7 +298,7 @@ def _flow_provider(sequence: Sequence, options: Options) -> FlowProvider:
     if source == "file":
         sequence.check_flow(stride)
         return from_files
-    dis = dis_flow(options.flow.dis_preset, options.flow.forward_backward)
+    dis = dis_flow(options.flow.dis_preset)
     if source == "auto" and sequence.has_flow and stride == 1:
         # a damaged file is no reason to stop where DIS can stand in
         return fallback(from_files, dis)
