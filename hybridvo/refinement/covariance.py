@@ -225,6 +225,11 @@ def sandwich_covariance(
     return covariance, eigenvalues, True
 
 
+def tile_sums(scores: np.ndarray, tile: np.ndarray, count: int) -> np.ndarray:
+    """(count, 6) sums of (6, N) scores over the tiles that (N,) ``tile`` says."""
+    return np.stack([np.bincount(tile, row, count) for row in scores], axis=1)
+
+
 def dispersion(sums: np.ndarray, meat: np.ndarray, model: np.ndarray) -> float | None:
     """How many times larger the sandwich covariance over tiles is than that of the model.
 

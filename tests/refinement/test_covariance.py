@@ -126,7 +126,7 @@ def test_errors_over_the_whole_image_are_continued_beyond_the_blocks() -> None:
         information = to_tiles(H_PIXEL)[..., UPPER[0], UPPER[1]]
         scores = to_tiles(np.einsum("vuki,vuk->vui", J, error - J @ motion))
         tiles = np.concatenate([information, scores], axis=2)
-        meats, lost, _ = block_sums(tiles, np.linalg.inv(H))
+        meats, _, _ = block_sums(tiles, np.linalg.inv(H))
         tiles_only = np.linalg.inv(H) @ meats[0] @ np.linalg.inv(H)
         without.append(motion @ np.linalg.solve(tiles_only, motion))
     # expected 6; tiles alone know nothing of what is wider than they are
