@@ -1,9 +1,7 @@
-"""Frame pairs -> what the networks read, assembled in one place.
+"""Frame pairs -> what the networks read, at their size by taking the nearest pixel.
 
-The images are brought to the network's size by taking the nearest pixel, for flow and depth
-alike. An average would blend a mover with what is behind it into flows and depths that belong to
-neither; the nearest pixel keeps flow, depth and ray of one and the same measured point together.
-The ray is that of the pixel that was taken, so nothing is rounded in what the network sees.
+An average would blend a mover with what is behind it; the nearest pixel keeps flow, depth and ray
+of one and the same measured point together.
 """
 
 from __future__ import annotations
@@ -27,7 +25,7 @@ MIN_DEPTH = 1e-2
 
 
 class TensorBatch:
-    """Tensors of a batch as the fields of a dataclass: maps of one size, cameras as ``K_*``."""
+    """Base of dataclasses of tensors: maps of one size, flow among them, cameras as ``K_*``."""
 
     def __len__(self) -> int:
         return len(next(iter(vars(self).values())))
@@ -142,16 +140,10 @@ def assemble_inputs(
 def assemble_aligned(
     flow: torch.Tensor, depth_prev: torch.Tensor, depth_curr: torch.Tensor, K: torch.Tensor
 ) -> NetworkInputs:
-    """Inputs from tensors that already have the network's size and stand on the previous grid.
+    """Inputs from tensors of the network's size, both depths on the previous grid.
 
-    This is the form of the paper's training data, whose second depth is that of the same scene
-    point one step later.
-
-    Args:
-        flow: (B, h, w, 2) px.
-        depth_prev: (B, h, w) metres.
-        depth_curr: (B, h, w) metres, on the grid of t like the previous one.
-        K: (B, 3, 3) intrinsics of both frames.
+    This is the form of the paper's training data: flow (B, h, w, 2) px, depths (B, h, w) metres of
+    the same scene points one step apart, K (B, 3, 3) of both frames.
 
     Raises:
         InputError: shapes that do not fit each other.
@@ -209,16 +201,9 @@ def _nearest(native: int, target: int) -> torch.Tensor:
 def _sample_at_flow(
     depth_curr: torch.Tensor, flow: torch.Tensor, rows: torch.Tensor, cols: torch.Tensor
 ) -> torch.Tensor:
-    """Current depth at x + F, nearest pixel: interpolation would invent depths at edges.
+    """(B, h, w) current depth (B, H, W) at x + F, nearest pixel; NaN where that is not inside.
 
-    Args:
-        depth_curr: (B, H, W) metres, at native size.
-        flow: (B, h, w, 2) in native pixels.
-        rows: (h,) native rows of the flow's pixels.
-        cols: (w,) native columns.
-
-    Returns:
-        (B, h, w); NaN where x + F leaves the image or the flow is not finite.
+    ``flow`` in native pixels, at native rows (h,) and columns (w,).
     """
     height, width = depth_curr.shape[1:]
     u = cols.to(flow.dtype) + flow[..., 0]

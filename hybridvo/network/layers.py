@@ -1,8 +1,7 @@
-"""Building blocks that PWVO and the VONet baselines share: blocks, the encoder, self-attention.
+"""What PWVO and the VONet baselines share: options, blocks, the encoder, self-attention.
 
-Stride-2 convolutions pad one pixel on every side (output pixel j is centred on input pixel 2j). The
-published TensorFlow code pads bottom and right only, which shifts its centres by half a step; that
-matters when weights are ported, not when they are trained here, and is not copied.
+Stride-2 convolutions pad one pixel on every side (output pixel j is centred on input pixel 2j);
+the published TensorFlow code pads bottom and right only, which matters when weights are ported.
 """
 
 from __future__ import annotations
@@ -10,16 +9,71 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator
 from itertools import pairwise
+from typing import Annotated, Literal, get_args
 
 import torch
 import torch.nn.functional as F
+from pydantic import Field
 from torch import nn
 
+from hybridvo.errors import InputError
 from hybridvo.network.inputs import NetworkInputs
+from hybridvo.options import option_group
 
 INPUT_LIMIT = 100.0
 """Inputs are clipped to this magnitude (20 000 px of flow, a depth of 1 cm): no finite input can
 then overflow the activations, and no measurement that could be meant is touched."""
+
+
+Kind = Literal["pwvo", "vonet", "vonet-attention"]
+KINDS = get_args(Kind)
+
+
+@option_group
+class NetworkOptions:
+    """What decides the shapes of a network's weights.
+
+    Args:
+        kind: ``pwvo`` (also PWVO naive and the pixel-wise network: same shapes, other losses),
+            ``vonet`` or ``vonet-attention``.
+        width: factor on all channel counts; 0.5 has about a quarter of the parameters.
+        decoders: 1 = one decoder shared by both heads (published code), 2 = one for the pose and
+            one for the uncertainty (the paper's text).
+        head_stride: 1 = predictions at the resolution of the input, 2 = at half of it, without the
+            decoder's last stage: the same pose at about half the time on a CPU.
+        uncertainty: whether the pixel-wise network has an uncertainty head.
+        scale_free: divide the inputs by the pair's own scales and multiply the outputs by them, see
+            :mod:`hybridvo.network.normalization`. Off as published.
+        passes: how often a scale-free network is used: each later pass looks at what the motion
+            that the trusted pixels of the one before agree on leaves unexplained.
+        input_stride: the network reads every n-th pixel of its inputs.
+        later_quantile: quantile of the lengths of the unexplained flow that scales the inputs of a
+            later pass; 0.4 in the first one. After a good start what is left of the static scene
+            is short and the flow of moving objects long, whatever their share.
+
+    Raises:
+        InputError: a value out of bounds, or two that exclude each other.
+    """
+
+    kind: Kind = "pwvo"
+    width: Annotated[float, Field(gt=0, le=4)] = 1.0
+    decoders: Literal[1, 2] = 1
+    head_stride: Literal[1, 2] = 1
+    uncertainty: bool = True
+    scale_free: bool = False
+    passes: Annotated[int, Field(ge=1, le=8)] = 1
+    input_stride: Literal[1, 2, 4] = 1
+    later_quantile: Annotated[float, Field(gt=0, le=0.5)] = 0.4
+
+    def __post_init__(self) -> None:
+        if self.passes > 1 and not (self.scale_free and self.kind == "pwvo" and self.uncertainty):
+            raise InputError(
+                "passes above 1 need scale_free=True and the uncertainty of kind='pwvo'"
+            )
+        if self.decoders == 2 and not self.uncertainty:
+            raise InputError(
+                "decoders=2 gives the uncertainty its own decoder; without it set decoders=1"
+            )
 
 
 def scaled(channels: int, width: float) -> int:
@@ -30,12 +84,8 @@ def scaled(channels: int, width: float) -> int:
 class ResidualBlock(nn.Module):
     """Two 3x3 convolutions with a shortcut and ELU.
 
-    Args:
-        in_channels, out_channels: channels before and after.
-        stride: of the first convolution and of the shortcut.
-        inner_activation: ELU after the second convolution, before the sum (PWVO has it, the VONet
-            baselines do not).
-        project: use a 1x1 convolution as shortcut even where the shapes agree.
+    ``inner_activation``: ELU before the sum (PWVO has it, the VONet baselines do not); ``project``:
+    a 1x1 convolution as shortcut even where the shapes agree.
     """
 
     def __init__(
@@ -86,13 +136,7 @@ class InputBranches(nn.Module):
 
 
 class Encoder(nn.Module):
-    """Stem of three convolutions and five stages of residual blocks, each halving the image.
-
-    Args:
-        in_channels: channels of the assembled inputs.
-        width: factor on all channel counts.
-        inner_activation: see :class:`ResidualBlock`.
-    """
+    """Stem of three convolutions and five stages of residual blocks, each halving the image."""
 
     def __init__(self, in_channels: int, width: float = 1.0, inner_activation: bool = True) -> None:
         super().__init__()
@@ -123,10 +167,9 @@ class Encoder(nn.Module):
 
 
 class SelfAttention(nn.Module):
-    """Self-attention over all positions with a learned gain that starts at zero.
+    """Self-attention over all positions, ``x + gain * attended``, with a gain that starts at zero.
 
-    The baseline "VONet + self-att." of the paper: 1x1 query and key with an eighth of the channels,
-    unscaled dot products, softmax over positions, ``x + gain * attended``.
+    Of the paper's "VONet + self-att.": unscaled dot products, an eighth of the channels.
     """
 
     def __init__(self, channels: int) -> None:
@@ -147,12 +190,7 @@ class SelfAttention(nn.Module):
 @contextlib.contextmanager
 def plain_torch() -> Iterator[None]:
     """Inference in float32 on the CPU, whatever the caller set for networks of its own."""
-    with contextlib.ExitStack() as stack:
-        stack.enter_context(torch.inference_mode())
-        if torch.is_autocast_enabled("cpu"):
-            stack.enter_context(torch.autocast("cpu", enabled=False))
-        if torch.get_default_device().type != "cpu":
-            stack.enter_context(torch.device("cpu"))
+    with torch.inference_mode(), torch.autocast("cpu", enabled=False), torch.device("cpu"):
         yield
 
 

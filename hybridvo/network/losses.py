@@ -6,9 +6,8 @@ Four terms, each plain or weighed by uncertainty, with s = log U:
 * ego flow L^F and depth L^D: the *selected* motion, applied to the true depth, must reproduce the
   flow and the next depth that the camera motion alone causes.
 
-They are those of the published code, with three departures: pixels without depth are left out; a
-point that the motion brings behind the camera is charged instead of projected through an absolute
-value; and s may have a coarser grid than the flow, where each cell answers for its pixels.
+They are those of the published code, but pixels without depth are left out, a point that the motion
+brings behind the camera is charged, and s may have a coarser grid than the flow.
 """
 
 from __future__ import annotations
@@ -20,7 +19,6 @@ import torch
 import torch.nn.functional as F
 from pydantic import Field
 
-from hybridvo.errors import InputError
 from hybridvo.network.inputs import MIN_DEPTH, TensorBatch
 from hybridvo.network.selection import NetworkOutput
 from hybridvo.options import Positive, option_group
@@ -69,14 +67,10 @@ class LossOptions:
         return self.flow or self.depth
 
     @property
-    def weighs_pixels(self) -> bool:
-        """Whether L^F or L^D is weighed by the network's log scales."""
-        return (self.flow and self.flow_uncertainty) or (self.depth and self.depth_uncertainty)
-
-    @property
     def needs_uncertainty(self) -> bool:
         """Whether a term needs the network's log scales."""
-        return self.pose_uncertainty or self.weighs_pixels
+        flow, depth = self.flow and self.flow_uncertainty, self.depth and self.depth_uncertainty
+        return self.pose_uncertainty or flow or depth
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,13 +104,7 @@ def reconstruct(
     """Flow and depth that a camera motion causes (paper, equation 8), differentiable.
 
     F_ego = pi(K_curr, T_curr_prev D K_prev^-1 x) - x, and the depth of the moved point, on the grid
-    of the previous frame. With the true motion it makes the targets of :class:`LossTargets`.
-
-    Args:
-        depth_prev: (B, h, w) metres.
-        T_curr_prev: (B, 4, 4).
-        K_prev: (B, 3, 3) intrinsics of the previous camera.
-        K_curr: (B, 3, 3) intrinsics of the current camera.
+    of the previous frame (B, h, w).
 
     Returns:
         (B, 2, h, w) ego flow in px, (B, h, w) depth in metres (below ``MIN_DEPTH`` behind the
@@ -144,36 +132,23 @@ def total_loss(
     options: LossOptions,
     T_curr_prev: torch.Tensor | None = None,
 ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-    """Weighted sum of the terms that are on.
-
-    Args:
-        output: of a network.
-        targets: ground truth.
-        options: which terms. Outputs without uncertainty (VONet,
-            pixel-wise) need the three ``*_uncertainty`` switches off.
-        T_curr_prev: (B, 4, 4) the selected motion; needed by L^F and L^D only.
+    """Weighted sum of the terms that are on; L^F and L^D need the selected motion (B, 4, 4).
 
     Returns:
         Scalar loss, and its unweighted terms without gradient under ``rotation``, ``translation``,
         ``flow`` and ``depth``.
-
-    Raises:
-        InputError: the selected motion or the uncertainty is missing, or shapes do not fit.
     """
-    s = _log_scales(output, targets, options) if options.needs_uncertainty else None
+    s = None
     if isinstance(output, PixelwisePrediction):
+        if output.log_scale_rotation is not None and output.log_scale_translation is not None:
+            s = torch.cat([output.log_scale_rotation, output.log_scale_translation], dim=1)
         parts = _pose_losses(output, targets, s if options.pose_uncertainty else None, options)
     else:
         pairs = zip(output, (targets.rotation_deg, targets.translation), strict=True)
         rotation, translation = ((value - true).abs().mean() for value, true in pairs)
         parts = {"rotation": rotation, "translation": translation}
     if options.reconstructs:
-        if T_curr_prev is None or T_curr_prev.shape != (len(targets), 4, 4):
-            got = None if T_curr_prev is None else tuple(T_curr_prev.shape)
-            raise InputError(
-                f"total_loss: expected T_curr_prev, the selected motion, of shape "
-                f"({len(targets)}, 4, 4) for L^F and L^D, got {got}."
-            )
+        assert T_curr_prev is not None
         K = targets.K_prev, targets.K_curr
         flow, depth, defined = reconstruct(targets.depth_prev, T_curr_prev, *K)
         known = torch.isfinite(targets.depth_prev) & (targets.depth_prev > 0)
@@ -185,28 +160,6 @@ def total_loss(
             parts["depth"] = _depth_loss(error, known, s if options.depth_uncertainty else None)
     loss = sum((options.flow_weight if k == "flow" else 1.0) * x for k, x in parts.items())
     return torch.as_tensor(loss), {name: part.detach() for name, part in parts.items()}
-
-
-def _log_scales(output: NetworkOutput, targets: LossTargets, options: LossOptions) -> torch.Tensor:
-    """(B, 6, h, w) log scales of an output that the options weigh by."""
-    if (
-        not isinstance(output, PixelwisePrediction)
-        or output.log_scale_rotation is None
-        or output.log_scale_translation is None
-    ):
-        raise InputError(
-            "total_loss: the network's output has no uncertainty. Set pose_uncertainty, "
-            "flow_uncertainty and depth_uncertainty to False."
-        )
-    s = torch.cat([output.log_scale_rotation, output.log_scale_translation], dim=1)
-    height, width = targets.depth_prev.shape[1:]
-    side = -(-height // s.shape[2])
-    if options.weighs_pixels and (-(-height // side), -(-width // side)) != tuple(s.shape[2:]):
-        raise InputError(
-            f"total_loss: expected a prediction that divides the targets' size {(height, width)} "
-            f"evenly, got {tuple(s.shape[2:])}."
-        )
-    return s
 
 
 def _inverse_scale(s: torch.Tensor) -> torch.Tensor:

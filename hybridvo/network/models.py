@@ -23,20 +23,16 @@ SELECTION = {
 
 
 def load_weights(path: str | Path) -> tuple[Any, dict[str, Any]]:
-    """Network of a weights file, in evaluation mode and float32 on the CPU.
+    """Network of a weights file, in evaluation mode and float32 on the CPU, and its model card.
 
-    Args:
-        path: of a file that :func:`hybridvo.network.weights.save_weights` wrote.
-
-    Returns:
-        The network, whose ``options`` attribute says what it is, and the model card.
+    The network's ``options`` attribute says what it is.
 
     Raises:
         CheckpointError: missing, truncated, no safetensors file (a pickle, text), of another
             program or architecture, or with values that are not finite; names the file and what
             does not match.
     """
-    from hybridvo.network.options import NetworkOptions
+    from hybridvo.network.layers import NetworkOptions
     from hybridvo.network.pwvo import build_network
     from hybridvo.network.selector_net import SelectorNetwork, SelectorNetworkOptions
     from hybridvo.network.weights import read_weights

@@ -1,13 +1,9 @@
 """Inputs without units: one network for a desk and a street, for a slow and a fast camera.
 
-Twice the flow is twice the motion, and a scene twice as large moves by twice as many metres: the
-network need not learn that if its inputs are divided by the pair's own scales and its outputs are
-multiplied by them. To first order in the motion nothing is lost: over the focal length, flow is
-rotation + translation / depth.
-
-The same network then refines its own answer: what the flow and the second depth leave unexplained
-after a first motion is, to first order, the flow of the motion that is missing, and over its own
-scale it looks like any other pair. What moves by itself stands out in it.
+Inputs are divided by the pair's own scales, outputs multiplied by them; to first order in the
+motion nothing is lost: over the focal length, flow is rotation + translation / depth. What flow and
+depth leave unexplained after a first motion is the flow of the motion that is missing, and over its
+own scale looks like any other pair: the network refines its own answer in several passes.
 """
 
 from __future__ import annotations
@@ -18,9 +14,8 @@ import torch
 from torch import nn
 
 from hybridvo.network.inputs import MIN_DEPTH, NetworkInputs
-from hybridvo.network.options import NetworkOptions
-from hybridvo.network.selection import NetworkOutput
-from hybridvo.network.weighted_fit import fitted_motion
+from hybridvo.network.layers import NetworkOptions
+from hybridvo.network.selection import NetworkOutput, fitted_motion
 from hybridvo.torch_geometry import euler_deg
 
 OUTPUT_SCALE = 0.01
@@ -75,11 +70,8 @@ def predict(
 ) -> NetworkOutput:
     """Output of the last of several passes, each on what the one before left unexplained.
 
-    Args:
-        network: of ``build_network``.
-        inputs: of size (h, w).
-        selection: how one pose comes out of the pixels of a pass.
-        passes: their number; by default the one that the network's options name.
+    ``selection``: how one pose comes out of the pixels of a pass; ``passes``: by default as many as
+    the network's options name.
     """
     count = int(network.options.passes) if passes is None else passes  # type: ignore[union-attr, arg-type]
     return network(inputs, first_motions(network, inputs, selection, count - 1))
@@ -99,13 +91,10 @@ def first_motions(
 def remove_scale(
     inputs: NetworkInputs, T_start: torch.Tensor | None = None, later_quantile: float = 0.4
 ) -> tuple[NetworkInputs, MotionScale]:
-    """Take a first motion out of a batch's inputs and divide them by the scales of each pair.
+    """Take a first motion (B, 4, 4) out of a batch's inputs and divide them by each pair's scales.
 
-    Args:
-        inputs: of size (h, w).
-        T_start: (B, 4, 4) T_curr_prev of the first motion; none by default.
-        later_quantile: of the lengths of the flow that sets the scale of the pairs whose first
-            motion is not the identity.
+    ``later_quantile``: of the lengths of the flow that sets the scale of the pairs whose first
+    motion is not the identity.
 
     Returns:
         Inputs whose ``flow`` is what the flow leaves unexplained, over the focal length and over

@@ -13,8 +13,14 @@ from hybridvo.network.inputs import NetworkInputs, assemble_inputs
 from hybridvo.network.layers import plain_torch
 from hybridvo.network.models import SELECTION
 from hybridvo.network.normalization import predict
-from hybridvo.network.selection import NetworkOutput, select_motion, select_pose
-from hybridvo.network.weighted_fit import fitted_motion, on_grid_of, pixel_weights
+from hybridvo.network.selection import (
+    NetworkOutput,
+    fitted_motion,
+    on_grid_of,
+    pixel_weights,
+    select_motion,
+    select_pose,
+)
 from hybridvo.results import MotionPrediction, PixelwisePrediction, Reason, RelativePose, Status
 from hybridvo.types import FramePair
 
@@ -27,15 +33,9 @@ MIN_PIXELS = 64
 
 
 def static_probability(log_scale: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
-    """Probability of every pixel to be static world, from the log scales of a network.
+    """(B, h, w) probability of being static from log scales (B, 3, h, w) of the rotation.
 
-    Args:
-        log_scale: (B, 3, h, w) of the rotation.
-        valid: (B, h, w) bool; 0 where False.
-
-    Returns:
-        (B, h, w). What counts is how far s lies above that of the pixels with weight in the fit;
-        the map from there is logistic, see :data:`STATIC_AT`.
+    Logistic in how far s lies above that of the pixels with weight in the fit; 0 where not valid.
     """
     s = log_scale.mean(dim=1)
     trusted = (pixel_weights(log_scale, valid) * s).flatten(1).sum(dim=1)[:, None, None]
@@ -43,15 +43,8 @@ def static_probability(log_scale: torch.Tensor, valid: torch.Tensor) -> torch.Te
 
 
 def propose_motion(network: nn.Module, pair: FramePair) -> MotionPrediction | None:
-    """A pixel-wise network's motion and static world, for an ambiguous pair.
-
-    Args:
-        network: a PWVO with uncertainty.
-        pair: two frames, the flow between them and the depth of the first.
-
-    Returns:
-        The motion that the trusted pixels agree on, after the last pass; None where too little is
-        valid, or the answer is not finite.
+    """The motion that a PWVO's trusted pixels agree on after the last pass, and its static world;
+    None where too little is valid, or the answer is not finite.
     """
     with plain_torch():
         inputs = assemble_inputs(pair)
@@ -72,14 +65,8 @@ def propose_motion(network: nn.Module, pair: FramePair) -> MotionPrediction | No
 def estimate_by_network(pair: FramePair, method: str, network: nn.Module) -> RelativePose:
     """Camera motion of one pair by a network and the paper's selection, without any refinement.
 
-    Args:
-        pair: two frames and the flow between them.
-        method: one of :data:`SELECTION`.
-        network: of the kind that the method uses.
-
-    Returns:
-        ``T_curr_prev``. Its covariance is diagonal: of a Laplace variable with the scales that the
-        selected pixels state (2 U^2). Bad data give a failed status.
+    The covariance is diagonal: of a Laplace variable with the scales that the selected pixels state
+    (2 U^2). Bad data give a failed status.
     """
     started = time.perf_counter()
     if pair.flow is None:

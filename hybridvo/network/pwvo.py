@@ -1,12 +1,12 @@
-"""PWVO: a pose and its uncertainty at every pixel, and the one door to all networks.
+"""The paper's networks: PWVO, a pose and its uncertainty at every pixel, and the VONet baselines.
 
-Architecture of the published code, layer by layer (reference/pwvo.md, section 2): one shared U-Net
-decoder with two heads of two convolutions. The paper's text has two decoders; ``decoders=2`` builds
-them.
+PWVO is that of the published code, layer by layer (reference/pwvo.md, section 2): one shared U-Net
+decoder with two heads of two convolutions. ``decoders=2`` builds the two of the paper's text.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -21,13 +21,13 @@ from hybridvo.network.inputs import NetworkInputs, assemble_inputs
 from hybridvo.network.layers import (
     Encoder,
     InputBranches,
+    NetworkOptions,
     ResidualBlock,
+    SelfAttention,
     initialize,
     scaled,
 )
 from hybridvo.network.normalization import normalize, predict
-from hybridvo.network.options import NetworkOptions
-from hybridvo.network.vonet import VONet
 from hybridvo.network.weights import read_weights, weights_file
 from hybridvo.results import PixelwisePrediction
 from hybridvo.types import FramePair, PairBatch
@@ -53,13 +53,7 @@ class _UpStage(nn.Module):
 
 
 class Decoder(nn.Module):
-    """U-Net decoder from the embedding to a feature map of the heads' resolution.
-
-    Args:
-        channels: of the encoder's layer1 to layer5.
-        width: factor on all channel counts.
-        head_stride: 1 or 2; 2 leaves out the last stage.
-    """
+    """U-Net decoder from the embedding to the heads' resolution; stride 2 leaves out a stage."""
 
     def __init__(self, channels: tuple[int, ...], width: float, head_stride: int) -> None:
         super().__init__()
@@ -87,7 +81,7 @@ class Decoder(nn.Module):
         return self.out(x)
 
 
-class _Head(nn.Sequential):
+class _MapHead(nn.Sequential):
     """Two 3x3 convolutions to six channels: rx, ry, rz, tx, ty, tz."""
 
     def __init__(self, channels: int) -> None:
@@ -99,11 +93,7 @@ class _Head(nn.Sequential):
 
 
 class PWVO(nn.Module):
-    """Pixel-wise prediction of the camera motion with uncertainty (paper, section 3.2).
-
-    Args:
-        options: kind ``pwvo``; see :class:`NetworkOptions`.
-    """
+    """Pixel-wise prediction of the camera motion with uncertainty (paper, section 3.2)."""
 
     def __init__(self, options: NetworkOptions | None = None) -> None:
         super().__init__()
@@ -117,8 +107,8 @@ class PWVO(nn.Module):
             Decoder(self.encoder.channels, width, stride) if options.decoders == 2 else None
         )
         channels = scaled(32, width)
-        self.head_motion = _Head(channels)
-        self.head_uncertainty = _Head(channels) if options.uncertainty else None
+        self.head_motion = _MapHead(channels)
+        self.head_uncertainty = _MapHead(channels) if options.uncertainty else None
         heads = [h for h in (self.head_motion, self.head_uncertainty) if h is not None]
         initialize(self, uniform=tuple(heads))
 
@@ -147,11 +137,8 @@ class PWVO(nn.Module):
     ) -> PixelwisePrediction:
         """Pose and log scale at every pixel: of assembled inputs in one pass, of pairs in all.
 
-        Pairs are brought to the size of the network, to its device and type, and looked at as often
-        as its options say, each time at what the motion found before leaves unexplained.
-
         Where flow or depth is missing (``inputs.valid`` is False) the log scale is at least
-        ``INVALID_LOG_SCALE``, in training and in use: no selection prefers such a pixel.
+        ``INVALID_LOG_SCALE``: no selection prefers such a pixel.
 
         Args:
             inputs: pairs of any size; or inputs of size (h, w), multiples of 32 waste no border.
@@ -197,16 +184,59 @@ class PWVO(nn.Module):
         return replace(output, image_size=size)
 
 
+class _PoseHead(nn.Sequential):
+    """Fully connected 128-32-3."""
+
+    def __init__(self, features: int) -> None:
+        super().__init__(
+            nn.Linear(features, 128), nn.ELU(), nn.Linear(128, 32), nn.ELU(), nn.Linear(32, 3)
+        )
+
+
+class VONet(nn.Module):
+    """PWVO's encoder with two fully connected heads (the paper's VONet baselines).
+
+    Inputs of another size than 128x256 are averaged to the same 2x4 grid of features before the
+    heads, so that one set of weights serves every size.
+    """
+
+    grid = (2, 4)  # of the embedding of a 128x256 input
+
+    def __init__(self, options: NetworkOptions | None = None) -> None:
+        super().__init__()
+        options = NetworkOptions(kind="vonet") if options is None else options
+        self.options = options
+        self.branches = InputBranches()
+        self.encoder = Encoder(InputBranches.out_channels, options.width, inner_activation=False)
+        channels = self.encoder.channels[-1]
+        self.attention = (
+            SelfAttention(channels) if options.kind == "vonet-attention" else nn.Identity()
+        )
+        features = channels * math.prod(self.grid)
+        self.head_rotation = _PoseHead(features)
+        self.head_translation = _PoseHead(features)
+        initialize(self, uniform=(self.head_rotation, self.head_translation))
+
+    def forward(
+        self, inputs: NetworkInputs, T_start: torch.Tensor | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """(B, 3) Euler angles X-Y-Z in degrees (R = Rx Ry Rz) and (B, 3) translation in metres of
+        T_curr_prev; ``T_start``: (B, 4, 4) a first motion, for scale-free networks.
+        """
+        inputs, scale = normalize(inputs, self.options, T_start)
+        embedding = self.attention(self.encoder(self.branches(inputs))[-1])
+        if embedding.shape[2:] != self.grid:
+            embedding = F.adaptive_avg_pool2d(embedding, self.grid)
+        features = embedding.flatten(1)
+        raw = torch.cat([self.head_rotation(features), self.head_translation(features)], dim=1)
+        motion = scale.motion(raw.to(next(self.parameters()).dtype))
+        return motion[:, :3], motion[:, 3:]
+
+
 def build_network(options: NetworkOptions | None = None) -> nn.Module:
-    """Network with fresh weights (Glorot, from torch's global generator).
+    """A :class:`PWVO` or :class:`VONet` with fresh weights (Glorot, from torch's global generator).
 
-    Args:
-        options: kind and shapes; PWVO at full width by default.
-
-    Returns:
-        :class:`PWVO`, whose output is a :class:`~hybridvo.results.PixelwisePrediction`, or
-        :class:`~hybridvo.network.vonet.VONet`, whose output is (rotation_deg, translation). Its
-        attribute ``options`` keeps the options.
+    PWVO at full width by default; the attribute ``options`` keeps the options.
 
     Example:
         >>> from hybridvo.network.pwvo import NetworkOptions, build_network

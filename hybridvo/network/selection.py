@@ -1,4 +1,4 @@
-"""Many pixel-wise poses -> one: the paper's selection module (section 3.3) and its alternatives.
+"""Many pixel-wise poses -> one: the paper's selection (section 3.3), and a fit to trusted pixels.
 
 In each patch the pixel of least uncertainty is chosen; the patches are then weighed. With
 s = log U, U the Laplace scale that the network predicts:
@@ -13,6 +13,10 @@ s = log U, U the Laplace scale that the network predicts:
 ``joint``       softmax(-s) with one s for all six numbers, their mean: one pixel a patch and one
                 weight for rotation and translation.
 ==============  ===================================================================================
+
+A pixel-wise network tells better where the world is than how it moves: :func:`fitted_motion` solves
+the ego-flow equation (paper, equation 8), weighed by s, from the selected motion. It is
+differentiable in s: the network learns the doubt that the fit needs.
 """
 
 from __future__ import annotations
@@ -23,8 +27,17 @@ import torch
 import torch.nn.functional as F
 
 from hybridvo.errors import InputError
+from hybridvo.network.inputs import NetworkInputs
+from hybridvo.refinement.torch_factors import solve_small
 from hybridvo.results import PixelwisePrediction
-from hybridvo.torch_geometry import euler_transform
+from hybridvo.torch_geometry import (
+    euler_transform,
+    left_update,
+    pp,
+    projection_rows,
+    se3,
+    weighted_median,
+)
 
 SELECTION_METHODS = ("softmax", "argmin", "mean", "exp_plus_u", "joint")
 
@@ -39,6 +52,15 @@ one on two thirds of the image must not outvote what is left. On development pai
 error, 8 the same as 4."""
 MIN_WEIGHT = 1e-4
 """Of a pixel, in units of the most certain one's: the refinement hears it where no other speaks."""
+
+CUTOFF = 1.5
+"""Scale of the robust kernel in weighted medians of the residual."""
+MIN_SCALE = 1e-4
+"""Least scale of the kernel in units of the focal length: 0.1 px at a focal length of 1000."""
+MIN_DEPTH_RATIO = 1e-2
+"""Depth over depth before below which a moved point counts as behind the camera."""
+MAX_STEP = 0.5
+"""Of one iteration, in radians and in nearest depths: the linear model holds no farther."""
 
 NetworkOutput = PixelwisePrediction | tuple[torch.Tensor, torch.Tensor]
 
@@ -58,14 +80,11 @@ class PoseSeed:
 
 
 def select(maps: PixelwisePrediction, method: str = "softmax") -> PoseSeed:
-    """The paper's selection as the start of a refinement.
+    """The paper's selection as the start of a refinement, with weights from the uncertainty.
 
     Args:
         maps: of a :class:`~hybridvo.network.pwvo.PWVO` that was given pairs.
         method: one of ``SELECTION_METHODS``.
-
-    Returns:
-        The selected motion, and weights from the uncertainty, see :func:`seed_weights`.
 
     Raises:
         InputError: no prediction, an unknown method.
@@ -92,9 +111,14 @@ def seed_weights(log_scale: torch.Tensor) -> torch.Tensor:
 
     Of all log scales those of the rotation tell moving objects best.
     """
-    s = torch.nan_to_num(log_scale.mean(dim=1), 50.0, 50.0, -50.0).clamp(-50.0, 50.0)
+    s = _doubt(log_scale)
     least = s.flatten(1).amin(dim=1)[:, None, None]
     return torch.exp(-SHARPNESS * (s - least)).clamp(min=MIN_WEIGHT)
+
+
+def _doubt(log_scale: torch.Tensor) -> torch.Tensor:
+    """(B, h, w) mean log scale of a pixel, finite."""
+    return torch.nan_to_num(log_scale.mean(dim=1), 50.0, 50.0, -50.0).clamp(-50.0, 50.0)
 
 
 def select_motion(output: NetworkOutput, method: str = "softmax") -> torch.Tensor:
@@ -109,18 +133,15 @@ def select_pose(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """One rotation and one translation per pair from the output of any network.
 
-    Each of the six numbers has its own pixels and weights, as in the published evaluation; those of
-    ``joint`` share theirs. Differentiable in the predictions and, through the weights, in the log
-    scales; the choice of the pixel has no gradient. Values that are not finite are never chosen
-    while their patch has another, and a patch without any has no weight; a pair without any gives
-    zero motion.
+    Each of the six numbers has its own pixels and weights; those of ``joint`` share theirs.
+    Differentiable in the predictions and, through the weights, in the log scales. Values that are
+    not finite are never chosen while their patch has another; a pair without any gives zero motion.
 
     Args:
         output: maps of (B, 3, h, w), or the pose itself (VONet).
-        method: one of ``SELECTION_METHODS``, see the table above; maps without uncertainty are
-            averaged whatever it says.
-        patch: side of the square patches in cells of the maps; patches at the right and lower
-            border may be smaller. A quarter of the height by default: 32 at 128x256 (the paper).
+        method: one of ``SELECTION_METHODS``; without uncertainty always ``mean``.
+        patch: side of the square patches in cells of the maps; a quarter of the height by default:
+            32 at 128x256 (the paper).
 
     Returns:
         (B, 3) Euler angles X-Y-Z in degrees and (B, 3) translation in metres, of T_curr_prev.
@@ -152,15 +173,11 @@ def _joined(prediction: PixelwisePrediction) -> tuple[torch.Tensor, torch.Tensor
         got = type(prediction).__name__
         raise InputError(f"select: expected a PixelwisePrediction, got {got}.")
     shape = tuple(prediction.rotation.shape)
-    for name in ("rotation", "translation", "log_scale_rotation", "log_scale_translation"):
-        value = getattr(prediction, name)
-        if value is None and name.startswith("log"):
-            continue
-        good = tuple(value.shape) == shape and len(shape) == 4 and shape[1] == 3
-        if not good or 0 in shape or not value.is_floating_point():
+    for name, value in vars(prediction).items():
+        if isinstance(value, torch.Tensor) and (value.shape != shape or len(shape) != 4):
             raise InputError(
-                f"select: expected {name} as floating-point maps of shape (B, 3, h, w), like the "
-                f"rotation's {shape}, got {value.dtype} of {tuple(value.shape)}."
+                f"select: expected {name} of shape (B, 3, h, w), like the rotation's {shape}, got "
+                f"{tuple(value.shape)}."
             )
     motion = torch.cat([prediction.rotation, prediction.translation], dim=1)
     s_rotation, s_translation = prediction.log_scale_rotation, prediction.log_scale_translation
@@ -210,3 +227,127 @@ def _patches(x: torch.Tensor, patch: int, fill: float) -> torch.Tensor:
     x = F.pad(x, (0, cols * patch - width, 0, rows * patch - height), value=fill)
     x = x.reshape(batch, channels, rows, patch, cols, patch).transpose(3, 4)
     return x.reshape(batch, channels, rows * cols, patch * patch)
+
+
+def fitted_motion(
+    output: NetworkOutput, inputs: NetworkInputs, selection: str = "softmax"
+) -> torch.Tensor:
+    """(B, 4, 4) motion that the pixels agree on which a prediction of these inputs trusts.
+
+    The selected pose is the start; the log scales of the rotation are the weights, and carry the
+    gradient.
+
+    Raises:
+        InputError: a prediction without uncertainty.
+    """
+    if not isinstance(output, PixelwisePrediction) or output.log_scale_rotation is None:
+        raise InputError("fitted_motion: expected a prediction with uncertainty.")
+    log_scale = output.log_scale_rotation
+    inputs = on_grid_of(log_scale, inputs)
+    if tuple(log_scale.shape[2:]) != inputs.size:
+        log_scale = F.interpolate(log_scale, inputs.size, mode="nearest")
+    f_prev, f_curr = (
+        K.diagonal(dim1=1, dim2=2)[:, :2, None, None] for K in (inputs.K_prev, inputs.K_curr)
+    )
+    c_prev, c_curr = (K[:, :2, 2, None, None] for K in (inputs.K_prev, inputs.K_curr))
+    target = (inputs.rays * f_prev + c_prev + inputs.flow_px - c_curr) / f_curr
+    return weighted_fit(
+        inputs.rays.flatten(2),
+        inputs.inverse_depth[:, 0].flatten(1),
+        target.flatten(2),
+        pixel_weights(log_scale, inputs.valid).flatten(1),
+        select_motion(output, selection),
+    )
+
+
+def on_grid_of(prediction: torch.Tensor, inputs: NetworkInputs) -> NetworkInputs:
+    """Every n-th pixel of the inputs, one for each cell (.., h, w) of a prediction."""
+    return inputs.subsample(max(1, round(inputs.size[0] / prediction.shape[-2])))
+
+
+def pixel_weights(log_scale: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
+    """(B, h, w) weights of a fit from log scales (B, C, h, w): 0 where invalid, their sum one."""
+    s = _doubt(log_scale)
+    s = torch.where(valid, -SHARPNESS * s, torch.full_like(s, -1e4))
+    return torch.softmax(s.flatten(1), dim=1).view_as(s) * valid
+
+
+def weighted_fit(
+    ray: torch.Tensor,
+    inverse_depth: torch.Tensor,
+    target: torch.Tensor,
+    weights: torch.Tensor,
+    T_start: torch.Tensor,
+    iterations: int = 6,
+) -> torch.Tensor:
+    """(B, 4, 4) motion that maps rays onto targets best under weights, by robust Gauss-Newton.
+
+    Its gradient goes into the weights alone, through the pull of the pixels at the solution; pixels
+    far away pull with constant strength there, since a network that has settled on a mover would
+    never learn of the world. Where the fit is not finite, or explains the weighted median pixel no
+    better than the start, the value is that of ``T_start``.
+
+    ``ray`` (B, 2, N) x / z and y / z of the previous camera; ``inverse_depth`` (B, N) 1 / metres, 0
+    is infinitely far; ``target`` (B, 2, N) ray plus flow in the current camera, over its focal
+    lengths; ``weights`` (B, N), 0 where flow or depth is missing.
+    """
+    with torch.autocast(weights.device.type, enabled=False):
+        number = torch.float64 if ray.dtype == torch.float64 else torch.float32
+        ray, inverse, target, weights = (
+            torch.nan_to_num(x.to(number), 0.0, 0.0, 0.0)
+            for x in (ray, inverse_depth, target, weights)
+        )
+        # The nearest tenth sets the unit of length, so that rotations and translations are alike.
+        pixels = (ray, inverse, target, inverse.quantile(0.9, dim=1).clamp(min=1e-3)[:, None])
+        T = start = se3(T_start.detach().to(number))
+        with torch.no_grad():
+            step, first = _step(*pixels, weights, T)
+            for _ in range(iterations):
+                T = left_update(step, T)
+                step, last = _step(*pixels, weights, T)
+            good = torch.isfinite(T.tensor()).all(dim=1) & (last <= first)
+            T = pp.SE3(torch.where(good[:, None], T.tensor(), start.tensor()))
+        if weights.requires_grad:
+            step, _ = _step(*pixels, weights, T, attached=True)
+            # value of the solution, gradient of the step
+            T = left_update(step - step.detach(), T)
+    return T.matrix().to(T_start.dtype)
+
+
+def _step(
+    ray: torch.Tensor,
+    inverse: torch.Tensor,
+    target: torch.Tensor,
+    unit: torch.Tensor,
+    weights: torch.Tensor,
+    T: pp.LieTensor,
+    attached: bool = False,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """((B, 6) Gauss-Newton step (translation, rotation), (B,) scale of the residuals).
+
+    ``attached``: the step that carries the gradient: pixels far away pull with constant strength,
+    and the gradient is that of the right-hand side alone.
+    """
+    M = T.matrix()
+    moved = M[:, :3, :2] @ ray + M[:, :3, 2:3] + M[:, :3, 3:] * inverse[:, None]
+    front = moved[:, 2] > MIN_DEPTH_RATIO
+    z = torch.where(front, moved[:, 2], 1.0)
+    x, y = moved[:, 0] / z, moved[:, 1] / z
+    J = torch.cat(projection_rows(x, y, inverse / (z * unit)), dim=2)  # (B, 6, 2 N)
+    residual = target - torch.stack([x, y], dim=1)
+    length2 = residual.square().sum(dim=1)
+    seen = torch.where(front, weights.detach(), 0.0)
+    scale2 = weighted_median(length2[:, ::3], seen[:, ::3], 0.0)[:, None]
+    kernel2 = (CUTOFF**2 * scale2).clamp(min=MIN_SCALE**2)
+    factor = kernel2 / (kernel2 + length2)
+    g = weights * torch.where(front, factor.sqrt() if attached else factor.square(), 0.0)
+    total = g.detach().sum(dim=1, keepdim=True)
+    enough = (total > 1e-12) & torch.isfinite(total)
+    # without weight there is no step and no gradient
+    g = torch.where(enough, g / torch.where(enough, total, 1.0), 0.0)
+    weighted = J * g.repeat(1, 2)[:, None]
+    A = weighted.detach() @ J.transpose(1, 2) + 1e-12 * torch.eye(6).to(J)
+    b = (weighted @ residual.flatten(1)[:, :, None])[..., 0]
+    step = solve_small(A, b, damping=1e-6)[0].to(b.dtype)
+    step = step * (MAX_STEP / step.detach().norm(dim=1, keepdim=True)).clamp(max=1.0)
+    return torch.cat([step[:, :3] / unit, step[:, 3:]], dim=1), scale2[:, 0].sqrt()

@@ -39,26 +39,19 @@ MAX_LOGIT = 6.0
 class SelectorInputs:
     """B images on their coarse grid (h, w) and N candidate motions of theirs.
 
+    The maps are those of :class:`hybridvo.hypotheses.generate.GridMaps`, with a first axis.
+
     Args:
-        ray: (B, 2, h, w) K^-1 x without the one.
-        depth: (B, h, w) metres.
-        target: (B, 2, h, w) px, x + flow.
-        flow_variance, depth_variance: (B, h, w) relative to the typical one.
-        usable: (B, h, w) bool.
-        log_depth_curr: (B, h, w) log metres of the second depth at the target; NaN where unknown.
         K: (B, 4) fx, fy, cx, cy of the current camera, px.
-        image_width: (B,) px, of the whole image.
+        image_width: (B,) px, of the whole image. stride: (B,) px between the grid's pixels.
         static: (B, h, w) logit of the probability to be static world that another network states.
         has_static: (B,) bool, whether it was asked.
         T_prior: (B, 3, 4) motion that is expected from those before.
         prior_information: (B, 6, 6) inverse of the covariance of ``Exp(delta) T_prior``,
             translation first.
         has_prior: (B,) bool, whether it is known.
-        seen: (B, h, w) bool, depth is there.
-        image_prev: (B, h, w) grey levels.
         planes_curr: (B, 3, h, w) of the current frame on its own grid: grey levels, log metres (0
             where unknown), whether these are known.
-        stride: (B,) px between the grid's pixels.
         owner: (N,) int64, image of each candidate.
         parent: (N,) int64, for refits: the motion of the search it came from; for those: itself.
         pose: (N, 3, 4) T_curr_prev.
@@ -72,85 +65,102 @@ class SelectorInputs:
     depth_variance: torch.Tensor
     usable: torch.Tensor
     log_depth_curr: torch.Tensor
-    static: torch.Tensor
-    has_static: torch.Tensor
-    K: torch.Tensor
-    image_width: torch.Tensor
-    T_prior: torch.Tensor
-    prior_information: torch.Tensor
-    has_prior: torch.Tensor
     seen: torch.Tensor
     image_prev: torch.Tensor
     planes_curr: torch.Tensor
+    K: torch.Tensor
+    image_width: torch.Tensor
     stride: torch.Tensor
+    static: torch.Tensor
+    has_static: torch.Tensor
+    T_prior: torch.Tensor
+    prior_information: torch.Tensor
+    has_prior: torch.Tensor
     owner: torch.Tensor
     parent: torch.Tensor
     pose: torch.Tensor
     flow_noise: torch.Tensor
     depth_noise: torch.Tensor
 
-    def asking(self, poses: Any, facts: Any, parents: Any) -> SelectorInputs:
-        """The same image with other candidates: (N, 3, 4), (N, FACTS) and (N,) of the one image."""
+    def asking(self, poses: Any, facts: Any, parents: Any, owner: Any = None) -> SelectorInputs:
+        """The same images with other candidates; ``owner``: all of them the first image's."""
 
-        def of(x: Any, dtype: torch.dtype) -> torch.Tensor:
+        def tensor(x: Any, dtype: torch.dtype = torch.float32) -> torch.Tensor:
             return torch.as_tensor(x, dtype=dtype, device=self.depth.device)
 
         return replace(
             self,
-            owner=torch.zeros(len(poses), dtype=torch.int64, device=self.depth.device),
-            parent=of(parents, torch.int64),
-            pose=of(poses, torch.float32),
-            flow_noise=of(facts[:, search.FLOW_NOISE], torch.float32),
-            depth_noise=of(facts[:, search.DEPTH_NOISE], torch.float32),
+            owner=tensor([0] * len(poses) if owner is None else owner, torch.int64),
+            parent=tensor(parents, torch.int64),
+            pose=tensor(poses),
+            flow_noise=tensor(facts[:, search.FLOW_NOISE]),
+            depth_noise=tensor(facts[:, search.DEPTH_NOISE]),
         )
 
 
 def selector_inputs(
     maps: GridMaps, prior: MotionPrior | None, static: np.ndarray | None, device: torch.device
 ) -> SelectorInputs:
-    """A batch of one image, without candidates yet."""
-
-    def batch(x: Any) -> torch.Tensor:
-        return torch.as_tensor(np.ascontiguousarray(x), device=device)[None]
-
-    depth, usable = batch(maps.depth), batch(maps.usable)
-    expected = np.eye(4) if prior is None else prior.T_curr_prev
-    covariance = None if prior is None else batch(prior.covariance)
-    logit = torch.zeros_like(depth)
+    """A batch of one image, without candidates yet; ``static``: probabilities, or None."""
+    stacked: dict[str, Any] = {name: np.asarray(value)[None] for name, value in vars(maps).items()}
+    inputs = stacked_inputs(GridMaps(**stacked), device)
     if static is not None:
-        logit = torch.logit(batch(static).to(torch.float32), eps=1e-4)
+        told = torch.as_tensor(static, dtype=torch.float32, device=device)[None]
+        inputs = replace(
+            inputs,
+            static=torch.logit(told, eps=1e-4),
+            has_static=torch.ones_like(inputs.has_static),
+        )
+    if prior is not None:
+        expected, covariance = (
+            torch.as_tensor(x, device=device)[None] for x in (prior.T_curr_prev, prior.covariance)
+        )
+        inputs = replace(
+            inputs,
+            T_prior=expected[:, :3].float(),
+            prior_information=prior_information_of(inputs.depth, inputs.usable, covariance),
+            has_prior=torch.ones_like(inputs.has_prior),
+        )
+    return inputs
+
+
+def stacked_inputs(maps: GridMaps, device: torch.device) -> SelectorInputs:
+    """Images whose maps have a first axis, of which nothing is known beforehand."""
+
+    def tensor(x: Any, dtype: torch.dtype = torch.float32) -> torch.Tensor:
+        return torch.as_tensor(np.ascontiguousarray(x)).to(device, dtype)
+
+    depth, usable = tensor(maps.depth), tensor(maps.usable, torch.bool)
+    log_depth = tensor(maps.log_depth_seen)
+    known = torch.isfinite(log_depth)
+    planes = [tensor(maps.image_curr), torch.nan_to_num(log_depth), known.float()]
+    nothing = torch.zeros(len(depth), dtype=torch.bool, device=device)
     none = torch.zeros(0, device=device)
     return SelectorInputs(
-        ray=batch(maps.ray),
+        ray=tensor(maps.ray),
         depth=depth,
-        target=batch(maps.target),
-        flow_variance=batch(maps.flow_variance),
-        depth_variance=batch(maps.depth_variance),
+        target=tensor(maps.target),
+        flow_variance=tensor(maps.flow_variance),
+        depth_variance=tensor(maps.depth_variance),
         usable=usable,
-        log_depth_curr=batch(maps.log_depth_curr),
-        static=logit,
-        has_static=torch.tensor([static is not None], device=device),
-        K=batch(maps.K),
-        image_width=torch.tensor([float(maps.width)], device=device),
-        T_prior=batch(expected[:3].astype(np.float32)),
-        prior_information=prior_information_of(depth, usable, covariance),
-        has_prior=torch.tensor([prior is not None], device=device),
-        seen=batch(maps.seen),
-        image_prev=batch(maps.image_prev),
-        planes_curr=planes_of(batch(maps.image_curr), batch(maps.log_depth_seen)),
-        stride=torch.tensor([float(maps.stride)], device=device),
+        log_depth_curr=tensor(maps.log_depth_curr),
+        seen=tensor(maps.seen, torch.bool),
+        image_prev=tensor(maps.image_prev),
+        planes_curr=torch.stack(planes, dim=1),
+        K=tensor(maps.K),
+        image_width=tensor(maps.width),
+        stride=tensor(maps.stride),
+        static=torch.zeros_like(depth),
+        has_static=nothing,
+        T_prior=torch.eye(3, 4, device=device).repeat(len(depth), 1, 1),
+        prior_information=prior_information_of(depth, usable, None),
+        has_prior=nothing,
         owner=none,
         parent=none,
         pose=none,
         flow_noise=none,
         depth_noise=none,
     )
-
-
-def planes_of(image: torch.Tensor, log_depth: torch.Tensor) -> torch.Tensor:
-    """(B, 3, h, w) as :class:`SelectorInputs` has them, from grey levels and log metres or NaN."""
-    known = torch.isfinite(log_depth)
-    return torch.stack([image, torch.nan_to_num(log_depth), known.to(image.dtype)], dim=1)
 
 
 def _squash(x: torch.Tensor) -> torch.Tensor:
@@ -202,31 +212,12 @@ def candidate_channels(
     evidence = torch.stack([support, agreement], 1)
     rivals = _rivals(inputs, *((inputs, evidence) if first is None else first))
     noise = torch.sqrt(2.0 * vd + DEPTH_FLOOR**2)
-    by_flow = torch.stack(
-        [
-            0.5 * _squash(eu),
-            0.5 * _squash(ev),
-            0.3 * torch.log1p(size),
-            0.5 * _squash(rz / noise),
-            known.to(z.dtype),
-            0.3 * _squash(50.0 * rz),
-            support,
-            rivals[:, 0],
-        ],
-        dim=1,
-    )
-    by_images = torch.stack(
-        [
-            texture,
-            agreement,
-            rivals[:, 1],
-            0.5 * _squash(gap / noise),
-            met,
-            0.3 * _squash(50.0 * gap),
-        ],
-        1,
-    )
-    channels = torch.cat([by_flow * usable[:, None], by_images], 1)
+    by_flow = [0.5 * _squash(eu), 0.5 * _squash(ev), 0.3 * torch.log1p(size)]
+    by_flow += [0.5 * _squash(rz / noise), known.to(z.dtype), 0.3 * _squash(50.0 * rz)]
+    by_flow += [support, rivals[:, 0]]
+    by_images = [texture, agreement, rivals[:, 1]]
+    by_images += [0.5 * _squash(gap / noise), met, 0.3 * _squash(50.0 * gap)]
+    channels = torch.stack([*(x * usable for x in by_flow), *by_images], 1)
     # areas of the whole image, not of what has flow
     best = rivals[:, 1] * (texture > 0)
     areas = [
@@ -243,12 +234,10 @@ def candidate_channels(
 def _look(
     inputs: SelectorInputs, u: torch.Tensor, v: torch.Tensor, z: torch.Tensor, front: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-    """What the current frame shows where candidates say that pixels go, (N, h, w) each.
-
-    Returns:
-        Texture, 0 where nothing can be told to 1; it times the correlation of the patches; log of
-        the depth that is seen there over the one expected, positive where the candidate's point
-        should hide it; and whether both are known.
+    """What the current frame shows where candidates say that pixels go, (N, h, w) each: texture,
+    0 where nothing can be told to 1; it times the correlation of the patches; log of the depth that
+    is seen there over the one expected, positive where the candidate's point should hide it; and
+    whether both are known.
     """
     own = inputs.owner
     planes = inputs.planes_curr
@@ -321,13 +310,8 @@ def _scalars(
 def prior_information_of(
     depth: torch.Tensor, usable: torch.Tensor, covariance: torch.Tensor | None
 ) -> torch.Tensor:
-    """(B, 6, 6) inverse covariances of the motions expected.
-
-    Args:
-        depth: (B, h, w) metres.
-        usable: (B, h, w) bool.
-        covariance: (B, 6, 6), translation first; None where nobody knows: then
-            :data:`USUAL_CHANGE` of the image, and of the typical depth.
+    """(B, 6, 6) inverse covariances of the motions expected, translation first; where nobody knows
+    :data:`USUAL_CHANGE` of the image, and of the typical depth.
     """
     inverse = torch.where(usable, 1.0 / depth.clamp(min=1e-6), 0.0).sum((1, 2))
     inverse = (inverse / usable.sum((1, 2)).clamp(min=1)).clamp(min=1e-6)

@@ -8,14 +8,15 @@ question than segmenting motion from raw flow.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
 import torch.nn.functional as F
+from pydantic import Field
 from torch import nn
 
-from hybridvo.errors import InputError
 from hybridvo.hypotheses.generate import GridMaps
 from hybridvo.hypotheses.selector import Candidates, Scores
 from hybridvo.network.layers import plain_torch, scaled
@@ -25,6 +26,7 @@ from hybridvo.network.selector_inputs import (
     selector_inputs,
     shared_channels,
 )
+from hybridvo.options import option_group
 from hybridvo.results import MotionPrior
 
 CHANNELS = (24, 40, 64, 96)
@@ -36,34 +38,16 @@ PIXEL_CHANNELS = 8
 MIRRORED_CANDIDATE = (0,)
 MIRRORED_SHARED = (0, 4)
 """Channels that change their sign in a mirror."""
-
-
 MAX_LAG = 3.0
 """How far a score may stay behind the best for a mask: at a twentieth of its probability."""
 
 
-@dataclass(frozen=True)
+@option_group
 class SelectorNetworkOptions:
-    """What decides the shapes of the weights.
+    """What decides the shapes of the weights; ``width``: factor on all channel counts."""
 
-    Args:
-        kind: ``selector``.
-        width: factor on all channel counts, in (0, 4].
-
-    Raises:
-        InputError: another kind or width.
-    """
-
-    kind: str = "selector"
-    width: float = 1.0
-
-    def __post_init__(self) -> None:
-        if self.kind != "selector":
-            raise InputError(
-                f"SelectorNetworkOptions.kind: expected 'selector', got {self.kind!r}."
-            )
-        if isinstance(self.width, bool) or not 0 < self.width <= 4:
-            raise InputError(f"SelectorNetworkOptions.width: expected 0 to 4, got {self.width!r}.")
+    kind: Literal["selector"] = "selector"
+    width: Annotated[float, Field(gt=0, le=4)] = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,26 +55,12 @@ class SelectorOutput:
     """Answers about N candidates.
 
     Args:
-        score: (N,) larger is more likely the world; softmax over a image's candidates.
-        mask: (N, h, w) logit of the probability that a pixel is static world.
+        score: (N,) larger is more likely the world; softmax over an image's candidates.
         hidden: (N, D) what :meth:`SelectorNetwork.confidence` looks at.
         evidence: (N, 2, h, w) for each candidate, from the flow and from the images.
-    """
-
-    score: torch.Tensor
-    mask: torch.Tensor
-    hidden: torch.Tensor
-    evidence: torch.Tensor
-
-
-@dataclass(frozen=True, eq=False)
-class SelectorFeatures:
-    """Scores of N candidates, and what their masks are made of.
-
-    Args:
-        score: (N,). hidden: (N, D). evidence: (N, 2, h, w).
-        common: (B, C, h', w') the first layer's view of what the candidates of a image share.
+        common: (B, C, h', w') the first layer's view of what the candidates of an image share.
         levels: input channels and features of :meth:`SelectorNetwork.encode`, finest first.
+        mask: (N, h, w) logit of the probability that a pixel is static world, if it was drawn.
     """
 
     score: torch.Tensor
@@ -98,6 +68,17 @@ class SelectorFeatures:
     evidence: torch.Tensor
     common: torch.Tensor
     levels: tuple[torch.Tensor, ...]
+    mask: torch.Tensor | None = None
+
+    def and_of(self, other: SelectorOutput) -> SelectorOutput:
+        """The answers about these candidates and about others of the same images."""
+        return SelectorOutput(
+            torch.cat([self.score, other.score]),
+            torch.cat([self.hidden, other.hidden]),
+            torch.cat([self.evidence, other.evidence]),
+            self.common,
+            tuple(torch.cat(pair) for pair in zip(self.levels, other.levels, strict=True)),
+        )
 
 
 class _Block(nn.Module):
@@ -153,7 +134,7 @@ class SelectorNetwork(nn.Module):
         first: tuple[SelectorInputs, SelectorOutput] | None = None,
         mirror: torch.Tensor | None = None,
     ) -> SelectorOutput:
-        """Answers about every candidate.
+        """Answers about every candidate, masks included.
 
         Args:
             inputs: images and candidates.
@@ -161,25 +142,25 @@ class SelectorNetwork(nn.Module):
             mirror: (B,) bool, images to look at in a mirror (training); the masks come back
                 unmirrored.
         """
-        features = self.encode(inputs, first, mirror)
-        mask = self.decode(features)
+        output = self.encode(inputs, first, mirror)
+        mask = self.decode(output.levels, output.evidence.shape[2:])
         if mirror is not None:
             mask = torch.where(mirror[inputs.owner][:, None, None], mask.flip(2), mask)
-        return SelectorOutput(features.score, mask, features.hidden, features.evidence)
+        return replace(output, mask=mask)
 
     def encode(
         self,
         inputs: SelectorInputs,
-        first: tuple[SelectorInputs, SelectorOutput | SelectorFeatures] | None = None,
+        first: tuple[SelectorInputs, SelectorOutput] | None = None,
         mirror: torch.Tensor | None = None,
-    ) -> SelectorFeatures:
-        """Scores without masks; arguments as those of :meth:`forward`."""
+    ) -> SelectorOutput:
+        """Answers without masks; arguments as those of :meth:`forward`."""
         rivals = None if first is None else (first[0], first[1].evidence)
         channels, scalars, evidence = candidate_channels(inputs, rivals)
         if mirror is not None:
             channels = _mirrored(channels, mirror[inputs.owner], MIRRORED_CANDIDATE)
         channels = _padded(channels)
-        if first is not None and isinstance(first[1], SelectorFeatures):
+        if first is not None:
             common = first[1].common
         else:
             shared = shared_channels(inputs)
@@ -195,32 +176,23 @@ class SelectorNetwork(nn.Module):
         hidden = F.relu(self.summary(torch.cat(pooled, 1)))
         hidden = F.relu(self.inner(hidden))
         score = self.score(hidden)[:, 0]
-        return SelectorFeatures(score, hidden, evidence, common, (channels, x1, x2, x3, x4))
+        return SelectorOutput(score, hidden, evidence, common, (channels, x1, x2, x3, x4))
 
-    def decode(self, features: SelectorFeatures, pick: torch.Tensor | None = None) -> torch.Tensor:
-        """(N, h, w) logits of the static masks, of all candidates or of ``pick`` (R,)."""
-        levels = features.levels
-        if pick is not None:
-            levels = tuple(x[pick] for x in levels)
+    def decode(self, levels: tuple[torch.Tensor, ...], size: torch.Size) -> torch.Tensor:
+        """(N, h, w) logits of static masks of this size, from the levels of :meth:`encode`."""
         channels, x1, x2, x3, x4 = levels
         y = F.interpolate(self.up3(x4), scale_factor=2.0)
         y = F.interpolate(self.merge3(F.relu_(y + x3)), scale_factor=2.0)
         y = F.interpolate(self.merge2(F.relu_(y + x2)), scale_factor=2.0)
         y = F.relu_(self.merge1(F.relu_(y + x1)))
         y = F.interpolate(self.context(y), scale_factor=2.0, mode="bilinear", align_corners=False)
-        h, w = features.evidence.shape[2:]
-        return self.mask(F.relu_(y + self.pixel(channels)))[:, 0, :h, :w]
+        return self.mask(F.relu_(y + self.pixel(channels)))[:, 0, : size[0], : size[1]]
 
     def confidence(
         self, score: torch.Tensor, hidden: torch.Tensor, owner: torch.Tensor, images: int
     ) -> torch.Tensor:
-        """(B,) logit of the probability that the best candidate of a image is right.
-
-        Args:
-            score: (N,) of all of its candidates, refits included.
-            hidden: (N, D).
-            owner: (N,) image of each.
-            images: B.
+        """(B,) logit of the probability that the best candidate of an image is right, from the
+        scores (N,) of all of its candidates, refits included, and what is ``hidden`` of them.
         """
         out = []
         for b in range(images):
@@ -272,43 +244,37 @@ class NetworkLook:
 
     def __init__(self, network: SelectorNetwork, image: SelectorInputs) -> None:
         self.network, self.image = network, image
-        self.seen: list[tuple[SelectorInputs, SelectorFeatures]] = []
+        self.first: tuple[SelectorInputs, SelectorOutput] | None = None
+        self.seen: SelectorOutput | None = None
 
     def score(self, candidates: Candidates, masks: int) -> Scores:
         """See :class:`hybridvo.hypotheses.selector.Look`."""
         with plain_torch():
-            known = sum(len(features.score) for _, features in self.seen)
-            if not self.seen:
-                known = candidates.searched
-                self._encode(candidates, slice(0, known))
+            if self.seen is None:
+                self.first = self._encode(candidates, slice(0, candidates.searched))
+                self.seen = self.first[1]
+            known = len(self.seen.score)
             if len(candidates.poses) > known:
-                self._encode(candidates, slice(known, None))
-            score = torch.cat([features.score for _, features in self.seen])
-            hidden = torch.cat([features.hidden for _, features in self.seen])
+                self.seen = self.seen.and_of(self._encode(candidates, slice(known, None))[1])
+            score, size = self.seen.score, self.seen.evidence.shape[2:]
             best = score.argsort(descending=True, stable=True)[:masks]
             best = best[score[best] > score.max() - MAX_LAG]
-            drawn = [self._mask(int(k)) for k in best]
+            drawn = torch.zeros(0, *size)
+            if len(best):
+                drawn = torch.sigmoid(
+                    self.network.decode(tuple(x[best] for x in self.seen.levels), size)
+                )
             owner = torch.zeros(len(score), dtype=torch.int64, device=score.device)
-            confidence = torch.sigmoid(self.network.confidence(score, hidden, owner, 1))
+            logit = self.network.confidence(score, self.seen.hidden, owner, 1)
         return Scores(
             score.double().cpu().numpy(),
             best.cpu().numpy(),
-            torch.stack(drawn).cpu().numpy() if drawn else np.zeros((0, 1, 1), np.float32),
-            float(confidence),
+            drawn.cpu().numpy(),
+            float(torch.sigmoid(logit)),
         )
 
-    def _encode(self, candidates: Candidates, part: slice) -> None:
+    def _encode(self, candidates: Candidates, part: slice) -> tuple[SelectorInputs, SelectorOutput]:
         inputs = self.image.asking(
             candidates.poses[part], candidates.facts[part], candidates.parents[part]
         )
-        first = self.seen[0] if self.seen else None
-        self.seen.append((inputs, self.network.encode(inputs, first)))
-
-    def _mask(self, k: int) -> torch.Tensor:
-        """(h, w) probability of being static, as candidate k sees it."""
-        for _, features in self.seen:
-            if k < len(features.score):
-                break
-            k -= len(features.score)
-        pick = torch.tensor([k], device=features.score.device)
-        return torch.sigmoid(self.network.decode(features, pick))[0]
+        return inputs, self.network.encode(inputs, self.first)

@@ -1,7 +1,4 @@
-"""Weights on disk: safetensors with the network's options and a model card in the header.
-
-No pickle: a weights file is data and cannot run anything.
-"""
+"""Weights on disk: safetensors, with the network's options and a model card in the header."""
 
 from __future__ import annotations
 
@@ -23,19 +20,12 @@ from hybridvo.files import atomic_write
 FORMAT = "hybridvo-network-1"
 """Value of the header's ``format`` key."""
 PRETRAINED = Path(__file__).parent / "pretrained"
-DTYPES = {"float16": torch.float16, "bfloat16": torch.bfloat16, "float32": torch.float32}
+DTYPES = {"float16": torch.float16, "float32": torch.float32}
 
 
 @dataclass(frozen=True, eq=False)
 class Weights:
-    """Content of a weights file.
-
-    Args:
-        path: of the file.
-        options: of the network, as they were written.
-        card: the model card.
-        tensors: float32, by name.
-    """
+    """Content of a weights file: the network's options, its model card, float32 tensors by name."""
 
     path: Path
     options: dict[str, Any]
@@ -43,11 +33,7 @@ class Weights:
     tensors: dict[str, torch.Tensor]
 
     def build(self, kind: Callable[..., Any], network_of: Callable[[Any], nn.Module]) -> nn.Module:
-        """The network of the file, in evaluation mode.
-
-        Args:
-            kind: class of its options.
-            network_of: what makes a network of them.
+        """The network of the file in evaluation mode, by the class of its options and its maker.
 
         Raises:
             CheckpointError: options that are not of this kind, or names or shapes of the weights
@@ -76,10 +62,7 @@ def save_weights(
         path: of the file, by custom ``*.safetensors``; its folder must exist.
         network: with its options as the attribute ``options``, which are stored in the header.
         card: model card, JSON values only: preset, samples seen, seed, command, commit, figures.
-        dtype: ``float32``, or ``float16`` or ``bfloat16`` for half the size.
-
-    Returns:
-        The path.
+        dtype: ``float32``, or ``float16`` for half the size.
 
     Raises:
         InputError: weights that are not finite or not representable in ``dtype``, a card that is

@@ -10,8 +10,8 @@ from typing import Annotated, Any, Literal, cast
 from pydantic import Field
 
 from hybridvo.errors import InputError
+from hybridvo.network.layers import NetworkOptions
 from hybridvo.network.losses import LossOptions
-from hybridvo.network.options import NetworkOptions
 from hybridvo.network.selection import SELECTION_METHODS
 from hybridvo.network.selector_net import SelectorNetworkOptions
 from hybridvo.options import Count, Positive, Share, option_group
@@ -148,8 +148,11 @@ class PwvoOptions(RunOptions):
                 "loss_stride: expected 1, or more with loss.flow_uncertainty and "
                 "loss.depth_uncertainty off; weighed by s, every pixel counts"
             )
-        if self.fit_weight and not (self.network.kind == "pwvo" and self.network.uncertainty):
-            raise InputError("fit_weight: needs a pwvo network with uncertainty")
+        certain = self.network.kind != "pwvo" or not self.network.uncertainty
+        if certain and (self.fit_weight or self.loss.needs_uncertainty):
+            raise InputError(
+                "fit_weight and the *_uncertainty of the loss need a pwvo network with uncertainty"
+            )
         if len(self.data) != len(self.data_weights):
             raise InputError("expected one of data_weights for each of data")
 

@@ -13,8 +13,7 @@ from torch import nn
 from hybridvo.network.losses import NetworkOutput, reconstruct, total_loss
 from hybridvo.network.normalization import first_motions
 from hybridvo.network.pwvo import build_network
-from hybridvo.network.selection import select_motion
-from hybridvo.network.weighted_fit import fitted_motion
+from hybridvo.network.selection import fitted_motion, select_motion
 from hybridvo.results import PixelwisePrediction
 from hybridvo.training.options import PwvoOptions, described
 from hybridvo.training.stream import Mixture, SampleStream, TrainingBatch

@@ -13,15 +13,13 @@ import torch
 
 from hybridvo.errors import FormatError
 from hybridvo.geometry import pose_matrix, se3_exp
-from hybridvo.hypotheses import search
-from hybridvo.hypotheses.generate import fit_in_mask
+from hybridvo.hypotheses.generate import GridMaps, fit_in_mask
 from hybridvo.hypotheses.selector import mask_weights, nearest_motion
-from hybridvo.network.selector_inputs import SelectorInputs, planes_of, prior_information_of
+from hybridvo.network.selector_inputs import SelectorInputs, stacked_inputs
 from hybridvo.network.selector_net import SelectorOutput
 from hybridvo.options import RefineOptions
 from hybridvo.refinement import kernels
 from hybridvo.synthetic.draws import log_uniform
-from hybridvo.training.selector_proposals import read_proposals
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,33 +102,27 @@ def _collate(p: dict[str, np.ndarray]) -> SelectorBatch:
     def tensor(x: Any, kind: torch.dtype = torch.float32) -> torch.Tensor:
         return torch.as_tensor(np.ascontiguousarray(x)).to(kind)
 
-    exact = tensor(p["exact"])
-    usable = tensor(coarse[:, 2] > 0, torch.bool)
-    inputs = SelectorInputs(
-        ray=exact[:, 0:2],
-        depth=exact[:, 2],
-        target=exact[:, 3:5],
-        flow_variance=1.0 / tensor(coarse[:, 0]).clamp(min=1e-6),
-        depth_variance=tensor(coarse[:, 1]),
-        usable=usable,
-        log_depth_curr=tensor(p["log_depth"]),
-        static=torch.zeros(size, h, w),
-        has_static=torch.zeros(size, dtype=torch.bool),
-        K=tensor(p["K"]),
-        image_width=tensor(p["width"]),
-        T_prior=tensor(p["T_prior"]),
-        prior_information=prior_information_of(exact[:, 2], usable, None),
-        has_prior=tensor(p["has_prior"], torch.bool),
-        seen=tensor(p["seen"], torch.bool),
-        image_prev=tensor(p["images"][:, 0]),
-        planes_curr=planes_of(tensor(p["images"][:, 1]), tensor(p["log_depth_seen"])),
-        stride=tensor(p["stride"]),
-        owner=tensor(owner, torch.int64),
-        parent=torch.arange(len(owner)),
-        pose=tensor(pose),
-        flow_noise=tensor(facts[:, search.FLOW_NOISE]),
-        depth_noise=tensor(facts[:, search.DEPTH_NOISE]),
+    maps: dict[str, Any] = dict(
+        ray=p["exact"][:, 0:2],
+        depth=p["exact"][:, 2],
+        target=p["exact"][:, 3:5],
+        flow_variance=1.0 / np.maximum(coarse[:, 0], np.float32(1e-6)),
+        depth_variance=coarse[:, 1],
+        usable=coarse[:, 2] > 0,
+        log_depth_curr=p["log_depth"],
+        K=p["K"],
+        width=p["width"],
+        stride=p["stride"],
+        seen=p["seen"],
+        image_prev=p["images"][:, 0],
+        image_curr=p["images"][:, 1],
+        log_depth_seen=p["log_depth_seen"],
     )
+    inputs = replace(
+        stacked_inputs(GridMaps(**maps), torch.device("cpu")),
+        T_prior=tensor(p["T_prior"]),
+        has_prior=tensor(p["has_prior"], torch.bool),
+    ).asking(pose, facts, np.arange(len(owner)), owner)
     return SelectorBatch(
         inputs,
         samples,
@@ -140,25 +132,21 @@ def _collate(p: dict[str, np.ndarray]) -> SelectorBatch:
         np.asarray(p["source"]),
         tensor(p["static"]),
         p["proposal"].astype(np.float64),
-        tensor(p["proposed"], torch.bool),
+        tensor(np.isfinite(p["proposal"]).all((1, 2)), torch.bool),
     )
 
 
 def _read_shard(path: Path) -> dict[str, np.ndarray]:
-    """Arrays of a shard.
-
-    Raises:
-        FormatError: a file that is none.
-    """
+    """Arrays of a shard; where no network was asked about it, what counts as no answer."""
     try:
         with np.load(path) as file:
             arrays = dict(file)
+            shape = arrays["label"].shape
     except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
         raise FormatError(f"{path}: not a shard of samples ({error}).") from None
-    for name in ("count", "label"):
-        if name not in arrays:
-            raise FormatError(f"{path}: not a shard of samples (no array '{name}').")
-    return arrays | read_proposals(path, arrays["label"].shape)
+    arrays.setdefault("proposal", np.full((shape[0], 3, 4), np.nan))
+    arrays.setdefault("static", np.full(shape, 0.5, np.float16))
+    return arrays
 
 
 def read_batches(
@@ -211,18 +199,14 @@ def ego_flow_error(pose: torch.Tensor, owner: torch.Tensor, batch: SelectorBatch
 def refits_of(
     batch: SelectorBatch, out: SelectorOutput, count: int, extra: torch.Generator | None = None
 ) -> SelectorInputs | None:
-    """The best motions of every sample, fitted inside their masks, as candidates of their own.
-
-    Args:
-        batch: samples.
-        out: answers about their motions.
-        count: fits of a sample.
-        extra: draws one of them anew at times (training), so that more than the best is seen.
+    """The ``count`` best motions of every sample, fitted inside their masks, as new candidates.
 
     Where the selector is shown another network's static world, that network's motion takes part.
+    ``extra`` draws one of them anew at times (training), so that more than the best is seen.
     """
     inputs = batch.inputs
     cutoff = RefineOptions().cutoff
+    assert out.mask is not None
     probability = torch.sigmoid(out.mask).numpy()
     poses, found, parents = [], [], []
     for b in range(len(batch.T)):
@@ -251,13 +235,5 @@ def refits_of(
                 parents.append(k)
     if not poses:
         return None
-    facts = torch.as_tensor(np.stack(found), dtype=torch.float32)
-    parent = torch.tensor(parents)
-    return replace(
-        inputs,
-        owner=inputs.owner[parent],
-        parent=parent,
-        pose=torch.as_tensor(np.stack(poses), dtype=torch.float32),
-        flow_noise=facts[:, search.FLOW_NOISE],
-        depth_noise=facts[:, search.DEPTH_NOISE],
-    )
+    owner = inputs.owner[torch.tensor(parents)]
+    return inputs.asking(np.stack(poses), np.stack(found), parents, owner)

@@ -1,36 +1,43 @@
 """Training samples of the selector: the motions that the real search finds, and which are right.
 
 A sample is the coarse grid of a pair, the motions that the search found on it (its failures
-included), and ground truth: the motion, the depth and who moves. Samples come from the ``wide``
-preset with its degraded flow and depth, and from rendered scenes with true, noisy and DIS flow.
-Shards are written atomically, so that a training can read them while others are being made.
+included), and ground truth: the motion, the depth and who moves. Shards are written atomically: a
+training can read them while others are being made.
 """
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
+import torch.nn.functional as F
 
+from hybridvo.files import atomic_write
 from hybridvo.flow import dis_flow
-from hybridvo.geometry import invert, se3_exp
+from hybridvo.geometry import ego_flow, invert, se3_exp
 from hybridvo.hypotheses.generate import HypothesisSet, generate
+from hybridvo.network.inputs import NETWORK_SIZE
+from hybridvo.network.normalization import predict
+from hybridvo.network.prediction import static_probability
+from hybridvo.network.selection import fitted_motion, on_grid_of
 from hybridvo.options import Options
 from hybridvo.refinement import kernels
-from hybridvo.results import RelativePose
+from hybridvo.results import PixelwisePrediction, RelativePose
 from hybridvo.synthetic.diverse import DiverseOptions, diverse_sample
 from hybridvo.synthetic.draws import log_uniform
 from hybridvo.synthetic.semi_real import Recording, draw_pair
 from hybridvo.synthetic.sensors import SensorOptions, degrade_depth
 from hybridvo.synthetic.training_scenes import training_scene
-from hybridvo.training.rendered import MOVING, STATIC, UNKNOWN
+from hybridvo.training.rendered import MOVING, STATIC, UNKNOWN, grid_sample
+from hybridvo.training.stream import collate
 from hybridvo.types import Camera, Frame, FramePair
 
-PER_SHARD = 64
+PER_SHARD, AT_ONCE = 64, 16
+"""Seeds of a shard, and samples that a network is asked about together."""
 MAX_MOTIONS = 5
 """Motions of a sample."""
 SIZES = ((160, 320), (160, 320), (128, 256), (192, 256), (120, 400), (218, 512))
@@ -38,13 +45,19 @@ SIZES = ((160, 320), (160, 320), (128, 256), (192, 256), (120, 400), (218, 512))
 
 
 @dataclass(frozen=True, eq=False)
-class _Truth:
-    """T_curr_prev (4, 4), depth (H, W), moving (H, W) bool, known (H, W) bool."""
+class _Drawn:
+    """A pair and its ground truth: T_curr_prev (4, 4), depth, moving and known (H, W).
 
+    ``log_depth_curr``: (H, W) log depth of the current frame at x + F where it has no depth map.
+    """
+
+    pair: FramePair
+    source: str
     T_curr_prev: np.ndarray
     depth: np.ndarray
     moving: np.ndarray
     known: np.ndarray
+    log_depth_curr: np.ndarray | None = None
 
 
 def draw_samples(seed: int, recordings: Sequence[Recording] = ()) -> list[dict[str, Any]]:
@@ -65,18 +78,18 @@ def draw_samples(seed: int, recordings: Sequence[Recording] = ()) -> list[dict[s
     else:
         pairs = _rendered_pairs(rng, seed, height, width)
     samples = []
-    for pair, truth, log_depth_curr, source in pairs:
-        T_prior = _last_motion(rng, truth.T_curr_prev)
+    for drawn in pairs:
+        T_prior = _last_motion(rng, drawn.T_curr_prev)
         starts = [np.eye(4)]
         if T_prior is not None and rng.random() < 0.7:
             starts.append(T_prior)
-        found = generate(pair, np.stack(starts), Options(), int(rng.integers(1 << 30)))
-        height, width = pair.prev.camera.shape
+        found = generate(drawn.pair, np.stack(starts), Options(), int(rng.integers(1 << 30)))
+        height, width = drawn.pair.prev.camera.shape
         if isinstance(found, RelativePose) or not found.is_ambiguous:
             continue
         if found.grid.box != (0, height, 0, width):
             continue
-        samples.append(_record(pair, found, truth, T_prior, log_depth_curr, source))
+        samples.append(_record(drawn, found, T_prior))
     return samples
 
 
@@ -105,7 +118,7 @@ def _noisy(rng: np.random.Generator, flow: np.ndarray) -> np.ndarray:
     return flow
 
 
-def _diverse_pair(rng: np.random.Generator, height: int, width: int) -> tuple[Any, ...]:
+def _diverse_pair(rng: np.random.Generator, height: int, width: int) -> _Drawn:
     sample = diverse_sample(rng, DiverseOptions(height=height, width=width))
     K = sample.K.astype(float)
     camera = Camera(K[0, 0], K[1, 1], K[0, 2], K[1, 2], height, width)
@@ -118,24 +131,18 @@ def _diverse_pair(rng: np.random.Generator, height: int, width: int) -> tuple[An
         log_depth = np.where(sample.depth_curr > 0, np.log(sample.depth_curr), np.nan)
     if rng.random() < 0.1:
         log_depth = np.full_like(log_depth, np.nan)
-    truth = _Truth(
-        sample.T_curr_prev.astype(float),
-        sample.depth_true,
-        sample.moving,
-        sample.depth_true > 0,
-    )
-    return pair, truth, log_depth.astype(np.float32), "diverse"
+    T, depth = sample.T_curr_prev.astype(float), sample.depth_true
+    log_depth = log_depth.astype(np.float32)
+    return _Drawn(pair, "diverse", T, depth, sample.moving, depth > 0, log_depth)
 
 
-def _semi_real_pair(rng: np.random.Generator, recordings: Sequence[Recording]) -> tuple[Any, ...]:
+def _semi_real_pair(rng: np.random.Generator, recordings: Sequence[Recording]) -> _Drawn:
     drawn = draw_pair(rng, recordings)
-    truth = _Truth(drawn.T_curr_prev, drawn.depth, drawn.moving, drawn.depth > 0)
-    return drawn.pair, truth, None, "semi-real"
+    truth = drawn.T_curr_prev, drawn.depth, drawn.moving, drawn.depth > 0
+    return _Drawn(drawn.pair, "semi-real", *truth)
 
 
-def _rendered_pairs(
-    rng: np.random.Generator, seed: int, height: int, width: int
-) -> list[tuple[Any, ...]]:
+def _rendered_pairs(rng: np.random.Generator, seed: int, height: int, width: int) -> list[_Drawn]:
     scene = training_scene(seed, height, width)
     frames = [scene.render(k) for k in (0, 1)]
     flow, _, _ = scene.flow(0)
@@ -144,7 +151,7 @@ def _rendered_pairs(
     depth = [np.where(np.isfinite(f.depth), f.depth, 0).astype(np.float32) for f in frames]
     known = frames[0].object_id >= 0
     moving = _moving(flow, T, camera, depth[0], frames[0].object_id > 0)
-    truth = _Truth(T, depth[0], moving, known)
+    truth = T, depth[0], moving, known
     if rng.random() < 0.5:
         depth = degrade_depth(rng, depth, SensorOptions())
     second = rng.random() > 0.1
@@ -152,11 +159,11 @@ def _rendered_pairs(
         flow = _noisy(rng, flow)
     prev = Frame(frames[0].rgb, depth[0], camera)
     curr = Frame(frames[1].rgb, depth[1] if second else None, camera)
-    pairs = [(FramePair(prev, curr, np.ascontiguousarray(flow)), truth, None, "true")]
+    pairs = [_Drawn(FramePair(prev, curr, np.ascontiguousarray(flow)), "true", *truth)]
     field = dis_flow()(prev, curr)
     if field.flow is not None:
         estimated = FramePair(prev, curr, field.flow, field.variance, field.valid)
-        pairs.append((estimated, truth, None, "dis"))
+        pairs.append(_Drawn(estimated, "dis", *truth))
     return pairs
 
 
@@ -167,30 +174,21 @@ def _moving(
 
     A mover that happens to stand still helps the fit; half a pixel at a width of 1024 counts.
     """
-    from hybridvo.geometry import ego_flow
-
     with np.errstate(invalid="ignore"):
         own = np.nan_to_num(flow) - np.nan_to_num(ego_flow(depth, T, camera, camera))
     return mover & (np.square(own).sum(axis=2) > (0.5 * camera.width / 1024) ** 2)
 
 
-def _record(
-    pair: FramePair,
-    found: HypothesisSet,
-    truth: _Truth,
-    T_prior: np.ndarray | None,
-    log_depth_curr: np.ndarray | None,
-    source: str,
-) -> dict[str, Any]:
+def _record(drawn: _Drawn, found: HypothesisSet, T_prior: np.ndarray | None) -> dict[str, Any]:
     """Everything about a sample, as small arrays."""
     h, w, stride = found.grid.shape
     pick = np.s_[stride // 2 :: stride, stride // 2 :: stride]
     maps = found.maps()
     log_depth = maps.log_depth_curr
-    if log_depth_curr is not None:
-        log_depth = log_depth_curr[pick]
-    label = np.where(truth.moving, MOVING, STATIC)
-    label = np.where(truth.known, label, UNKNOWN)[pick]
+    if drawn.log_depth_curr is not None:
+        log_depth = drawn.log_depth_curr[pick]
+    label = np.where(drawn.moving, MOVING, STATIC)
+    label = np.where(drawn.known, label, UNKNOWN)[pick]
     n = found.grid.count
     rows = found.grid.samples[:, :n]
     poses = np.zeros((MAX_MOTIONS, 3, 4))
@@ -204,42 +202,75 @@ def _record(
         "images": np.stack([maps.image_prev, maps.image_curr]).astype(np.uint8),
         "log_depth_seen": maps.log_depth_seen.astype(np.float16),
         "seen": maps.seen,
-        "depth_true": np.minimum(truth.depth[pick], 6e4).astype(np.float16),
+        "depth_true": np.minimum(drawn.depth[pick], 6e4).astype(np.float16),
         "label": label.astype(np.uint8),
         "poses": poses,
         "facts": facts,
         "count": len(found.poses),
-        "T": truth.T_curr_prev[:3],
+        "T": drawn.T_curr_prev[:3],
         "T_prior": (np.eye(4) if T_prior is None else T_prior)[:3],
         "has_prior": T_prior is not None,
         "K": found.grid.pixels.K,
-        "width": pair.prev.camera.width,
+        "width": drawn.pair.prev.camera.width,
         "stride": stride,
-        "source": ("diverse", "true", "dis", "semi-real").index(source),
+        "source": ("diverse", "true", "dis", "semi-real").index(drawn.source),
     }
 
 
 def write_shard(
-    path: str | os.PathLike[str],
-    first_seed: int,
-    seeds: int = PER_SHARD,
-    recordings: Sequence[Recording] = (),
+    folder: Path, first_seed: int, seeds: int = PER_SHARD, recordings: Sequence[Recording] = ()
 ) -> int:
-    """Write the samples of some seeds, in one file for each grid shape.
-
-    Returns:
-        Number of samples written.
-    """
-    folder = Path(path)
+    """Write the samples of some seeds, in one file for each grid shape; returns their number."""
     by_shape: dict[tuple[int, int], list[dict[str, Any]]] = {}
     for seed in range(first_seed, first_seed + seeds):
         for sample in draw_samples(seed, recordings):
             by_shape.setdefault(sample["label"].shape, []).append(sample)
     for (h, w), samples in by_shape.items():
-        arrays: dict[str, Any] = {key: np.stack([p[key] for p in samples]) for key in samples[0]}
-        target = folder / f"{first_seed:08d}_{h}x{w}.npz"
-        temporary = target.with_suffix(".tmp")
-        with open(temporary, "wb") as file:
-            np.savez(file, **arrays)
-        os.replace(temporary, target)
+        arrays = {key: np.stack([p[key] for p in samples]) for key in samples[0]}
+        _write(folder / f"{first_seed:08d}_{h}x{w}.npz", arrays)
     return sum(len(p) for p in by_shape.values())
+
+
+def _write(path: Path, arrays: dict[str, Any]) -> None:
+    with atomic_write(path, "wb") as file:
+        np.savez(file, **arrays)
+
+
+def write_proposals(folder: Path, network: torch.nn.Module) -> int:
+    """Ask a PWVO about the samples of all shards of a folder: a motion, and where nothing moves.
+
+    The answers stand in the shards; asked again, a network that has learned more replaces them.
+    Returns the number of samples.
+    """
+    total = 0
+    for path in sorted(folder.glob("*.npz")):
+        with np.load(path) as file:
+            shard = dict(file)
+        numbers = np.arange(len(shard["source"]))
+        said = [
+            _proposals({name: x[some] for name, x in shard.items()}, network)
+            for some in np.array_split(numbers, -(-len(numbers) // AT_ONCE))
+        ]
+        proposal, static = (np.concatenate(x) for x in zip(*said, strict=True))
+        _write(path, shard | {"proposal": proposal, "static": static.astype(np.float16)})
+        total += len(numbers)
+    return total
+
+
+def _proposals(
+    shard: dict[str, np.ndarray], network: torch.nn.Module
+) -> tuple[np.ndarray, np.ndarray]:
+    """Motions (n, 3, 4) and static probabilities (n, h, w) of some samples."""
+    count, *size = shard["label"].shape
+    samples = [
+        grid_sample({name: x[i] for name, x in shard.items()}, NETWORK_SIZE) for i in range(count)
+    ]
+    with torch.inference_mode():
+        inputs = collate(samples).inputs
+        output = predict(network, inputs)
+        assert isinstance(output, PixelwisePrediction) and output.log_scale_rotation is not None
+        scale = output.log_scale_rotation
+        static = static_probability(scale, on_grid_of(scale, inputs).valid)[:, None]
+        static = F.interpolate(static, size, mode="bilinear", align_corners=False)[:, 0]
+        motion = fitted_motion(output, inputs)[:, :3]
+    return motion.double().numpy(), static.numpy()

@@ -1,8 +1,6 @@
 """Training of the selector: choose, refit inside the masks it draws, choose again.
 
-Every update judges the motions of a few samples, fits the best of them inside the network's own
-masks with the solver of the pipeline, and judges the fits beside the old ones: the final choice is
-learned on what it will be asked about.
+The fits are those of the pipeline: the final choice is learned on what it will be asked about.
 """
 
 from __future__ import annotations
@@ -57,13 +55,13 @@ def choice_loss(
     return torch.stack(losses).mean()
 
 
-def mask_loss(mask: torch.Tensor, inputs: SelectorInputs, label: torch.Tensor) -> torch.Tensor:
+def mask_loss(out: SelectorOutput, inputs: SelectorInputs, label: torch.Tensor) -> torch.Tensor:
     """Binary cross entropy of the masks over usable pixels of known kind."""
     label = label[inputs.owner]
     known = inputs.usable[inputs.owner] & ((label == STATIC) | (label == MOVING))
-    loss = F.binary_cross_entropy_with_logits(
-        mask, (label == STATIC).to(mask.dtype), reduction="none"
-    )
+    static = (label == STATIC).float()
+    assert out.mask is not None
+    loss = F.binary_cross_entropy_with_logits(out.mask, static, reduction="none")
     return ((loss * known).sum((1, 2)) / known.sum((1, 2)).clamp(min=1)).mean()
 
 
@@ -80,9 +78,44 @@ def trust_loss(
     return F.binary_cross_entropy_with_logits(logit, torch.stack(target))
 
 
-def _float(out: SelectorOutput) -> SelectorOutput:
-    """The answers in single precision."""
-    return SelectorOutput(out.score.float(), out.mask.float(), out.hidden.float(), out.evidence)
+class Looks:
+    """What a network answers about the motions of a batch, and about their refits."""
+
+    def __init__(
+        self,
+        model: torch.nn.Module,
+        batch: SelectorBatch,
+        mirror: torch.Tensor | None = None,
+        half: bool = False,
+    ) -> None:
+        self.model, self.batch, self.mirror, self.half = model, batch, mirror, half
+        self.first = self._ask(batch.inputs, None)
+        self.owner, self.score = batch.inputs.owner, self.first.score
+        self.hidden = self.first.hidden
+        self.error = ego_flow_error(batch.inputs.pose, self.owner, batch)
+
+    def _ask(
+        self, inputs: SelectorInputs, first: tuple[SelectorInputs, SelectorOutput] | None
+    ) -> SelectorOutput:
+        with torch.autocast("cpu", torch.bfloat16, enabled=self.half):
+            out = self.model(inputs, first, self.mirror)
+        single = {name: getattr(out, name).float() for name in ("score", "hidden", "mask")}
+        return replace(out, **single)
+
+    def again(
+        self, refits: int, draw: torch.Generator | None = None
+    ) -> tuple[SelectorOutput, SelectorInputs] | None:
+        """Fit the best inside their masks and add the answers about these; None without a fit."""
+        with torch.no_grad():
+            more = refits_of(self.batch, self.first, refits, draw)
+        if more is None:
+            return None
+        out = self._ask(more, (self.batch.inputs, self.first))
+        self.owner = torch.cat([self.owner, more.owner])
+        self.score = torch.cat([self.score, out.score])
+        self.hidden = torch.cat([self.hidden, out.hidden])
+        self.error = torch.cat([self.error, ego_flow_error(more.pose, more.owner, self.batch)])
+        return out, more
 
 
 class SelectorTask:
@@ -120,42 +153,25 @@ class SelectorTask:
         draw = torch.Generator().manual_seed((o.seed << 32) + step)
         asked = torch.rand(count, generator=draw) < o.asked_share
         batch = batch.expecting(np.random.default_rng([o.seed, step])).shown(asked)
-        inputs = batch.inputs
         mirror = torch.rand(count, generator=draw) < 0.5
-        half = o.precision == "bfloat16"
-        with torch.autocast("cpu", torch.bfloat16, enabled=half):
-            out = _float(model(inputs, mirror=mirror))
-        error = ego_flow_error(inputs.pose, inputs.owner, batch)
+        looks = Looks(model, batch, mirror, o.precision == "bfloat16")
         losses = {
-            "choice": choice_loss(out.score, error, inputs.owner, count),
-            "mask": o.mask_weight * mask_loss(out.mask, inputs, batch.label),
+            "choice": choice_loss(looks.score, looks.error, looks.owner, count),
+            "mask": o.mask_weight * mask_loss(looks.first, batch.inputs, batch.label),
         }
-        score, hidden, owner = out.score, out.hidden, inputs.owner
-        more = self._refits(batch, out, draw) if progress >= o.second_look_from else None
-        if more is not None:
-            with torch.autocast("cpu", torch.bfloat16, enabled=half):
-                again = _float(model(more, (inputs, out), mirror))
-            owner = torch.cat([owner, more.owner])
-            score = torch.cat([score, again.score])
-            hidden = torch.cat([hidden, again.hidden])
-            error = torch.cat([error, ego_flow_error(more.pose, more.owner, batch)])
-            losses["second"] = choice_loss(score, error, owner, count)
-            losses["second_mask"] = 0.5 * o.mask_weight * mask_loss(again.mask, more, batch.label)
-        trust = self.network.confidence(score, hidden, owner, count)
-        losses["trust"] = o.trust_weight * trust_loss(trust, score.detach(), error, owner)
+        if progress >= o.second_look_from:
+            # one fit less in half of the updates: cheaper, and the best one is seen most
+            fewer = o.refits > 1 and bool(torch.rand((), generator=draw) < 0.5)
+            again = looks.again(o.refits - fewer, draw)
+            if again is not None:
+                losses["second"] = choice_loss(looks.score, looks.error, looks.owner, count)
+                losses["second_mask"] = 0.5 * o.mask_weight * mask_loss(*again, batch.label)
+        trust = self.network.confidence(looks.score, looks.hidden, looks.owner, count)
+        losses["trust"] = o.trust_weight * trust_loss(
+            trust, looks.score.detach(), looks.error, looks.owner
+        )
         total = torch.stack(list(losses.values())).sum()
         return total, {name: value.detach() for name, value in losses.items()}
-
-    def _refits(
-        self, batch: SelectorBatch, out: SelectorOutput, draw: torch.Generator
-    ) -> SelectorInputs | None:
-        """Candidates fitted inside their masks, without gradient."""
-        refits = self.options.refits
-        with torch.no_grad():
-            told = replace(out, score=out.score.detach(), mask=out.mask.detach())
-            # one fit less in half of the updates: cheaper, and the best one is seen most
-            fewer = refits > 1 and bool(torch.rand((), generator=draw) < 0.5)
-            return refits_of(batch, told, refits - fewer, draw)
 
     def evaluate(self, network: torch.nn.Module) -> dict[str, Any]:
         """Figures on the held-out shards beside the training's, ``FOLDER_held_out``."""
@@ -168,38 +184,23 @@ class SelectorTask:
 def evaluate_selector(
     network: Any, files: list[Path], refits: int = 2, asked: bool = False
 ) -> dict[str, dict[str, Any]]:
-    """Shares of wrong answers on samples of shards, by source.
+    """Shares of wrong answers on samples of shards, by source; ``asked``: with the other network.
 
-    Args:
-        network: the selector.
-        files: shards.
-        refits: motions of a sample that are fitted again.
-        asked: whether the pixel-wise network takes part.
-
-    Returns:
-        For each source: ``samples``, the share of them whose motion is further from the ground
-        truth than is right for ``support`` (the first motion found), ``chosen`` (the first choice),
-        ``final`` (after the second look) and ``best`` (the best of them, an oracle), and
-        ``trust_right`` and ``trust_wrong``, the mean probability given to right and wrong answers.
+    For each source: ``samples``, the share of them whose motion is further from the ground truth
+    than is right for ``support`` (the first motion found), ``chosen`` (the first choice), ``final``
+    (after the second look) and ``best`` (the best of them, an oracle), and ``trust_right`` and
+    ``trust_wrong``, the mean probability given to right and wrong answers.
     """
     rows: dict[int, list[list[float]]] = {source: [] for source in range(len(SOURCES))}
     for batch in read_batches(files, 8, None):
         batch = batch.shown(torch.full((len(batch),), asked))
-        inputs = batch.inputs
-        out = network(inputs)
-        more = refits_of(batch, out, refits)
-        owner, score, hidden = inputs.owner, out.score, out.hidden
-        error = ego_flow_error(inputs.pose, owner, batch)
-        first_look = len(owner)
-        if more is not None:
-            again = network(more, (inputs, out))
-            owner = torch.cat([owner, more.owner])
-            score = torch.cat([score, again.score])
-            hidden = torch.cat([hidden, again.hidden])
-            error = torch.cat([error, ego_flow_error(more.pose, more.owner, batch)])
-        trust = torch.sigmoid(network.confidence(score, hidden, owner, len(batch)))
+        looks = Looks(network, batch)
+        first_look = len(looks.owner)
+        looks.again(refits)
+        score, error = looks.score, looks.error
+        trust = network.confidence(score, looks.hidden, looks.owner, len(batch)).sigmoid()
         for b in range(len(batch)):
-            mine = torch.nonzero(owner == b)[:, 0]
+            mine = torch.nonzero(looks.owner == b)[:, 0]
             first = mine[mine < first_look]
             picks = (first[0], first[score[first].argmax()], mine[score[mine].argmax()])
             wrong = [float(error[k]) for k in picks] + [float(error[mine].min()), float(trust[b])]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import sys
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,6 @@ import pytest
 
 from tests.scripts import ROOT, load_script
 
-sys.path.insert(0, str(ROOT / "tools"))
 compare = load_script("tools/golden_compare.py").compare
 measuring = load_script("tools/measuring.py")
 

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import sys
-
 import numpy as np
 import pytest
 
-from tests.scripts import ROOT, load_script
+from tests.scripts import load_script
 
-sys.path.insert(0, str(ROOT / "tools"))
 benchmark = load_script("tools/benchmark_semi_real.py")
 calibrate = load_script("tools/calibrate.py")
 

@@ -333,22 +333,6 @@ def test_scale_learns_the_mean_error():
     assert s.mean().exp().item() == pytest.approx(0.35, rel=1e-3)
 
 
-def test_missing_pieces_are_named():
-    targets = make_targets()
-    bare = PixelwisePrediction(STILL.rotation, STILL.translation)
-    vonet = (targets.rotation_deg, targets.translation)
-    uneven = predict(*[(0, 0, 0)] * 4, size=(2, 3))
-    for output, options, T, name in (
-        (STILL, LossOptions(), None, "T_curr_prev"),
-        (STILL, LossOptions(), shift()[0], "T_curr_prev"),
-        (vonet, LossOptions(**POSE), None, "uncertainty"),
-        (bare, LossOptions(), shift(), "uncertainty"),
-        (uneven, LossOptions(), shift(), r"\(2, 4\).*\(2, 3\)"),
-    ):
-        with pytest.raises(InputError, match=name):
-            total_loss(output, targets, options, T)
-
-
 @pytest.mark.parametrize(
     "changes",
     [

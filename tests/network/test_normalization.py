@@ -13,7 +13,7 @@ from hybridvo.network.inputs import NetworkInputs, assemble_aligned, subsampled_
 from hybridvo.network.losses import LossOptions, LossTargets, total_loss
 from hybridvo.network.normalization import first_motions, predict, remove_scale
 from hybridvo.network.pwvo import NetworkOptions, build_network
-from hybridvo.network.weighted_fit import fitted_motion
+from hybridvo.network.selection import fitted_motion
 from hybridvo.torch_geometry import euler_deg
 from hybridvo.types import Camera
 

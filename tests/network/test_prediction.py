@@ -12,8 +12,7 @@ from hybridvo.network.inputs import assemble_inputs
 from hybridvo.network.normalization import predict
 from hybridvo.network.prediction import estimate_by_network, propose_motion, static_probability
 from hybridvo.network.pwvo import NetworkOptions, build_network
-from hybridvo.network.selection import select_motion
-from hybridvo.network.weighted_fit import fitted_motion
+from hybridvo.network.selection import fitted_motion, select_motion
 from hybridvo.results import PixelwisePrediction, Reason, State
 from hybridvo.synthetic.scenarios import Scenario, make_pair
 from hybridvo.types import Camera, Frame, FramePair

@@ -108,9 +108,7 @@ def test_refits_share_what_the_search_has_seen(network: SelectorNetwork) -> None
     with torch.no_grad():
         first = network.encode(inputs)
         again = network.encode(inputs, (inputs, first))
-        anew = network.encode(inputs, (inputs, network(inputs)))
     torch.testing.assert_close(first.levels[0], again.levels[0])
-    torch.testing.assert_close(again.score, anew.score)
     assert (first.score - again.score).abs().max() > 1e-6
 
 

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hybridvo.geometry import rotation_angle, se3_exp
-from hybridvo.network.weighted_fit import pixel_weights, weighted_fit
+from hybridvo.network.selection import pixel_weights, weighted_fit
 
 COUNT = 600
 

@@ -65,7 +65,7 @@ def test_round_trip_is_exact(tmp_path, options):
         assert torch.equal(loaded.state_dict()[name], value)
 
 
-@pytest.mark.parametrize(("dtype", "tolerance"), [("float16", 2**-11), ("bfloat16", 2**-8)])
+@pytest.mark.parametrize(("dtype", "tolerance"), [("float16", 2**-11)])
 def test_half_storage_comes_back_as_float32(tmp_path, network, dtype, tolerance):
     small = save_weights(tmp_path / "half.safetensors", network, CARD, dtype=dtype)
     for name, value in load_weights(small)[0].state_dict().items():

@@ -14,8 +14,8 @@ import pytest
 import torch
 
 from hybridvo.errors import CheckpointError, DegenerateError, InputError
+from hybridvo.network.layers import NetworkOptions
 from hybridvo.network.losses import LossOptions
-from hybridvo.network.options import NetworkOptions
 from hybridvo.synthetic.paper import PaperOptions
 from hybridvo.training.options import OptimizerOptions, PwvoOptions, ScheduleOptions
 from hybridvo.training.pwvo_task import PwvoTask

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from hybridvo.errors import InputError
-from hybridvo.network.options import NetworkOptions
+from hybridvo.network.layers import NetworkOptions
 from hybridvo.network.pwvo import build_network
 from hybridvo.results import PixelwisePrediction
 from hybridvo.synthetic.draws import sample_generator
