@@ -80,7 +80,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
 
 
-def _guarded(args: argparse.Namespace, command: list[str]) -> Result:
+def _guarded(args: argparse.Namespace, command: list[str]) -> int:
     """Exit code of a command; errors become one line on stderr."""
     from hybridvo.errors import HybridVOError
 

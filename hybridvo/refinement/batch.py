@@ -12,6 +12,7 @@ import torch.nn.functional as F
 from hybridvo.errors import InputError
 from hybridvo.refinement import kernels
 from hybridvo.refinement.covariance import direction_is_known
+from hybridvo.refinement.depth import SURFACE
 from hybridvo.results import RelativePose, Status
 from hybridvo.torch_geometry import MAX_DEPTH, MIN_DEPTH, pixel_grid, pp, rays, se3
 from hybridvo.types import PairBatch
@@ -31,7 +32,8 @@ class BatchedPose:
         iterations: (B,) Newton steps on all pixels.
         cost: (B,) robust cost per unit of external weight.
         weights: (B, H, W) robust weights without the external ones, 0 where unusable.
-        noise: (B, 2) flow noise in px and noise of log depth, estimated or as given.
+        noise: (B, 2) flow noise in px and noise of log depth, estimated or as given; (B, 3) with
+            that of the current frame's log depth.
         inlier_ratio: (B,) share of the external weight within three standard deviations.
     """
 
@@ -91,6 +93,8 @@ class Pixels:
         flow_variance, depth_variance: (B, N) relative to the typical one of the sample.
         weight: (B, N) external weight.
         K: (B, 3, 3) of the current camera.
+        log_depth_curr: (B, N) log D_curr(x + F), 0 where absent; None without that depth.
+        has_depth_curr: (B, N) 1 where it is present, else 0.
     """
 
     points: torch.Tensor
@@ -99,10 +103,13 @@ class Pixels:
     depth_variance: torch.Tensor
     weight: torch.Tensor
     K: torch.Tensor
+    log_depth_curr: torch.Tensor | None = None
+    has_depth_curr: torch.Tensor | None = None
 
     def map(self, change: Callable[[torch.Tensor], torch.Tensor]) -> Pixels:
         """The same with every tensor changed."""
-        return Pixels(*(change(getattr(self, f.name)) for f in fields(self)))
+        values: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
+        return Pixels(**{k: None if x is None else change(x) for k, x in values.items()})
 
     def subset(self, count: int) -> Pixels:
         """About ``count`` usable pixels of each sample, spread evenly in their order.
@@ -129,9 +136,14 @@ class Pixels:
 
 
 def gather_pixels(
-    batch: PairBatch, weights: torch.Tensor | None = None, tile: int | None = None
+    batch: PairBatch,
+    weights: torch.Tensor | None = None,
+    tile: int | None = None,
+    with_depth: bool = False,
 ) -> Pixels:
     """The pixels of a batch in raster order, or tile by tile where a tile's side is given.
+
+    ``with_depth`` joins the current frame's depth.
 
     Invalid values are replaced before anything is computed from them, so that neither they nor
     their gradients spread. Variances are divided by the typical one of their sample, which is held
@@ -158,6 +170,11 @@ def gather_pixels(
         usable = usable & batch.valid
     depth = torch.where(usable, depth, one)
     target = torch.where(usable[..., None], target, torch.zeros_like(target))
+    log_depth = present = None
+    if with_depth and batch.depth_curr is not None:
+        sampled, good = sample_depth(batch.depth_curr, target)
+        log_depth = to_tiles(sampled.log(), tile)
+        present = to_tiles((good & usable).to(depth.dtype), tile)
     points = (rays(height, width, K_prev) * depth[..., None]).permute(0, 3, 1, 2)
     return Pixels(
         points=to_tiles(points, tile, 1.0),
@@ -166,7 +183,35 @@ def gather_pixels(
         depth_variance=to_tiles(depth_variance, tile, 1.0),
         weight=to_tiles(torch.where(usable, weight, zero), tile),
         K=K_curr,
+        log_depth_curr=log_depth,
+        has_depth_curr=present,
     )
+
+
+def sample_depth(depth: torch.Tensor, at: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Bilinear depth (B, H, W) at (B, h, w, 2) px, where the four neighbours lie on one surface.
+
+    Returns:
+        (B, h, w) metres and (B, h, w) bool. False (and depth 1) outside the image, next to an
+        invalid depth, and at edges. Differentiable in both arguments.
+    """
+    height, width = depth.shape[1:]
+    u, v = at.unbind(-1)
+    inside = (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)
+    u, v = (torch.where(inside, x, torch.zeros_like(x)) for x in (u, v))
+    u0 = u.detach().floor().clamp(max=max(width - 2, 0))
+    v0 = v.detach().floor().clamp(max=max(height - 2, 0))
+    right, below = int(width > 1), width * int(height > 1)
+    place, flat = (v0 * width + u0).long().flatten(1), depth.flatten(1)
+    corners = torch.stack(
+        [flat.gather(1, place + o).view_as(u) for o in (0, right, below, below + right)]
+    )
+    good = ((corners > MIN_DEPTH) & (corners < MAX_DEPTH)).all(dim=0) & inside
+    corners = torch.where(good, corners, torch.ones_like(corners))
+    good = good & (corners.amax(dim=0) <= (1 + SURFACE) * corners.amin(dim=0))
+    top = torch.lerp(corners[0], corners[1], u - u0)
+    sampled = torch.lerp(top, torch.lerp(corners[2], corners[3], u - u0), v - v0)
+    return torch.where(good, sampled, torch.ones_like(sampled)), good
 
 
 def to_tiles(x: torch.Tensor, tile: int | None, fill: float = 0.0) -> torch.Tensor:

@@ -203,7 +203,8 @@ class ImageFactor:
         """Put fields of gain and offset into the grey values where they explain enough."""
         buffer, (gain, _) = self._buffer, self._light
         data = np.stack([buffer[kernels.GREY], self._r, self._w])
-        if least > 0 and light_fields(self._to_nodes[::4], *data[:, ::4], least=least) is None:
+        grey, r, w = data[:, ::4]
+        if least > 0 and light_fields(self._to_nodes[::4], grey, r, w, least=least) is None:
             return False
         fields = light_fields(self._to_nodes, *data)
         if fields is None:

@@ -36,6 +36,7 @@ from hybridvo.refinement.full_fit import FLOW_ROUNDING, SOLVER, pair_noise, tile
 from hybridvo.refinement.pixels import grid_stride, too_few
 from hybridvo.refinement.refine import status_of
 from hybridvo.refinement.torch_factors import (
+    KERNELS,
     Linearization,
     RobustNoise,
     linearize,
@@ -57,6 +58,10 @@ STEPS = 20
 ROUNDED_STEP = 0.05
 """Steps below, in standard deviations of the noise, that no longer shrink are rounding."""
 INLIER_DISTANCE2 = 9.0
+CUTOFFS = {"cauchy": 2.385, "huber": 1.345, "l2": 1.0}
+"""Standard deviations, 95 % efficient under normal noise (P. J. Huber, Robust Statistics)."""
+DEPTH_NOISE_FLOOR = 2e-3
+"""Least noise of the current frame's log depth."""
 MIN_PROBABILITY = 0.8
 """Below which a motion is degraded; 0.8 is a rival with half of the motion's own weight."""
 
@@ -67,6 +72,7 @@ def refine_batch(
     weights: Any = None,
     *,
     noise: Any = None,
+    kernel: str = "geman-mcclure",
     options: RefineOptions | None = None,
 ) -> BatchedPose:
     """Camera motion of every pair of a batch by robust dense reprojection.
@@ -82,8 +88,11 @@ def refine_batch(
             what is handed in is.
         weights: (B, H, W) factors on the information; what is not positive and finite switches a
             pixel off.
-        noise: flow noise in px and noise of log depth, as (2,) or (B, 2); None: estimated.
-        options: of the refinement.
+        noise: flow noise in px and noise of log depth, as (2,) or (B, 2), and with the current
+            frame's depth that of its log; None: estimated.
+        kernel: ``geman-mcclure``, with the cutoff of the options, ``cauchy``, ``huber`` or ``l2``.
+        options: of the refinement; the current frame's depth is a third residual where
+            ``current_depth`` is ``on``.
 
     Returns:
         Poses with covariance and a status per sample. Bad data give a failed status for that very
@@ -91,24 +100,30 @@ def refine_batch(
         sample is zero.
 
     Raises:
-        InputError: shapes or types that cannot be used.
+        InputError: shapes, types or options that cannot be used.
     """
     options = options or RefineOptions()
+    if kernel not in KERNELS:
+        raise InputError(f"refine_batch: unknown kernel {kernel!r}; known: {', '.join(KERNELS)}.")
     batch, weights = checked_batch(batch, weights)
+    with_depth = options.current_depth == "on"
+    if with_depth and batch.depth_curr is None:
+        raise InputError("refine_batch: current_depth 'on' needs PairBatch.depth_curr.")
     starts = initial_poses(T_init, batch.flow, alone=weights is not None)
-    given = _given_noise(noise, batch.flow)
+    given = _given_noise(noise, batch.flow, with_depth)
     tensors = (*vars(batch).values(), weights, given)
     wanted = torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in tensors)
     height, width = batch.depth_prev.shape[1:]
     tile = tile_size((height, width), options.tiles)
     with torch.autocast(batch.flow.device.type, enabled=False):
         with torch.no_grad():
-            pixels = gather_pixels(batch, weights, tile)
-            result = _Solver(batch, pixels, tile, options).solve(starts, given, tight=wanted)
+            pixels = gather_pixels(batch, weights, tile, with_depth)
+            solver = _Solver(batch, pixels, tile, kernel, options)
+            result = solver.solve(starts, given, tight=wanted)
         if not wanted:
             return result
-        pixels = gather_pixels(batch, weights, tile)
-        how = RobustNoise(result.noise if given is None else given, options.cutoff)
+        pixels = gather_pixels(batch, weights, tile, with_depth)
+        how = solver.how(result.noise if given is None else given)
         # a Newton step of value zero, and with the gradient A^-1 dg
         T = result.SE3.detach()
         A = newton_matrix(pixels.map(torch.Tensor.detach), T, how)
@@ -117,32 +132,40 @@ def refine_batch(
         return replace(result, SE3=left_update(step - step.detach(), T))
 
 
-def _given_noise(noise: Any, like: torch.Tensor) -> torch.Tensor | None:
-    """(B, 2) noise as handed in."""
+def _given_noise(noise: Any, like: torch.Tensor, with_depth: bool) -> torch.Tensor | None:
+    """(B, 2) noise as handed in; (B, 3) with the current depth, whose noise is sd unless stated."""
     if noise is None:
         return None
     value = torch.as_tensor(noise, device=like.device).to(like.dtype)
-    known = value.detach()
-    if value.shape not in ((2,), (len(like), 2)) or not bool(
-        (torch.isfinite(known) & (known >= 0)).all() & (known[..., 0] > 0).all()
+    known, sizes = value.detach(), (2, 3) if with_depth else (2,)
+    shapes = [shape for n in sizes for shape in ((n,), (len(like), n))]
+    if value.shape not in shapes or not bool(
+        (torch.isfinite(known) & (known >= 0)).all() & (known[..., ::2] > 0).all()
     ):
         raise InputError(
-            f"refine_batch: expected noise (sf, sd) of shape (2,) or ({len(like)}, 2), finite, sf "
-            f"positive, sd not negative, got {noise!r}."
+            f"refine_batch: expected noise (sf, sd{', sz' * with_depth}), one or {len(like)} rows, "
+            f"finite, sf positive, sd not negative, got {noise!r}."
         )
-    return value.expand(len(like), 2)
+    value = value.expand(len(like), value.shape[-1])
+    if with_depth and value.shape[1] == 2:
+        value = torch.cat([value, value[:, 1:].clamp(min=DEPTH_NOISE_FLOOR)], dim=1)
+    return value
 
 
 class _Solver:
     """The stages of the estimate on one batch of pixels, without gradient."""
 
-    def __init__(self, batch: PairBatch, pixels: Pixels, tile: int, options: RefineOptions) -> None:
-        self.batch, self.pixels, self.tile, self.options = batch, pixels, tile, options
+    def __init__(
+        self, batch: PairBatch, pixels: Pixels, tile: int, kernel: str, options: RefineOptions
+    ) -> None:
+        self.batch, self.pixels, self.tile = batch, pixels, tile
+        self.kernel, self.options = kernel, options
         self.few = pixels.subset(SUBSET_PIXELS)
+        self.flow_only = replace(self.few, log_depth_curr=None, has_depth_curr=None)
 
     def how(self, noise: torch.Tensor) -> RobustNoise:
         """The kernel at a noise."""
-        return RobustNoise(noise, self.options.cutoff)
+        return RobustNoise(noise, CUTOFFS.get(self.kernel, self.options.cutoff), self.kernel)
 
     def solve(self, starts: pp.LieTensor, given: torch.Tensor | None, tight: bool) -> BatchedPose:
         """From the starts (B, S, 7) to the pose of every sample, with covariance and status."""
@@ -186,7 +209,7 @@ class _Solver:
     def _graduate(self, starts: pp.LieTensor, end: torch.Tensor) -> pp.LieTensor:
         """The start of least cost at the scale ``end`` px, refined: (B, 7)."""
         batch, count = starts.shape[:2]
-        pixels = self.few.map(lambda x: x.repeat_interleave(count, dim=0))
+        pixels = self.flow_only.map(lambda x: x.repeat_interleave(count, dim=0))
         ends = end.repeat_interleave(count)
         T = self._shrink_scale(pixels, pp.SE3(starts.tensor().flatten(0, 1)), ends)
         if count == 1:
@@ -205,7 +228,7 @@ class _Solver:
         A sample whose scale has come to the end stands still, whatever the others do.
         """
         at = residuals(pixels, T)
-        scale = 1.5 * weighted_median(at.r.norm(dim=1), pixels.weight * at.front, 1.0)
+        scale = 1.5 * weighted_median(at.r[:, :2].norm(dim=1), pixels.weight * at.front, 1.0)
         scale = torch.maximum(scale.clamp(1.0, LARGEST_PX), end)
         going = torch.ones_like(scale, dtype=torch.bool)
         while bool(going.any()):
@@ -222,7 +245,7 @@ class _Solver:
         Both within the same few pixels: a compromise between two motions explains neither, however
         much noise is granted to it afterwards.
         """
-        pixels = self.few
+        pixels = self.flow_only
         own = linearize(pixels, T, self._isotropic(3 * end)).weights
         rest = replace(pixels, weight=pixels.weight * (own < 0.25))
         identity = pp.identity_SE3(len(T), dtype=T.dtype, device=T.device)
@@ -262,13 +285,31 @@ class _Solver:
         depth = None if self.options.current_depth == "off" else self.batch.depth_curr
         K = self.pixels.K[:, [0, 1, 0, 1], [0, 1, 2, 2]].float().cpu().numpy()
         poses, count, out = T.matrix().cpu().numpy(), samples.shape[2], noise.tolist()
-        for k, (sf, sd) in enumerate(noise.tolist()):
+        for k, (sf, sd, *_) in enumerate(noise.tolist()):
             if np.isfinite(poses[k]).all() and (samples[k, kernels.W] > 0).any():
                 curr = None if depth is None else depth[k].float().cpu().numpy()
                 where = samples[k], count, K[k], poses[k, :3]
                 found = pair_noise(*where, (sf, sd), self.options.cutoff, curr)[:2]
-                out[k] = found if np.isfinite(found).all() else out[k]
-        return noise.new_tensor(out)
+                out[k] = found if np.isfinite(found).all() else out[k][:2]
+        return self._with_depth_noise(T, noise.new_tensor([row[:2] for row in out]))
+
+    def _with_depth_noise(self, T: pp.LieTensor, noise: torch.Tensor) -> torch.Tensor:
+        """The noise of log D_curr beside (B, 2): the spread of r_z that sd does not explain.
+
+        sd may explain half of the variance at most: the two depths come from one sensor, and the
+        flow of a slow camera says next to nothing of sd.
+        """
+        few = self.few
+        if few.has_depth_curr is None:
+            return noise
+        at = residuals(few, T)
+        near = at.r[:, :2].square().sum(dim=1) <= (8 * noise[:, :1]).clamp(min=4.0).square()
+        used = few.weight * few.has_depth_curr * at.front * near
+        spread = 1.4826 * weighted_median(at.r[:, 2].abs(), used, 0.02)
+        h = weighted_median(at.u[:, 2].abs(), used, 1.0).clamp(min=1e-3)
+        sd = torch.minimum(noise[:, 1], 0.5**0.5 * spread / h)
+        sz = (spread.square() - (sd * h).square()).clamp(min=DEPTH_NOISE_FLOOR**2).sqrt()
+        return torch.stack([noise[:, 0], sd, sz], dim=1)
 
     def _curvature(self, T: pp.LieTensor, how: RobustNoise) -> tuple[torch.Tensor, torch.Tensor]:
         """(B, 6, 6) curvature of the robust weights and scores' outer products, per unit of weight.
@@ -277,7 +318,7 @@ class _Solver:
         """
         each, at = scores(self.few, T, how)
         s, w = each.double(), (self.few.weight * at.robust).double()
-        slope = how.kernel(at.distance2)[2]
+        slope = how.kernel(at.distance2).slope
         factor = torch.where(w > 1e-12, slope / w.clamp(min=1e-12), torch.zeros_like(w))
         total = self.few.weight.double().sum(dim=1).clamp(min=1e-12)[:, None, None]
         return (s * factor[:, None]) @ s.transpose(1, 2) / total, s @ s.transpose(1, 2) / total
@@ -345,7 +386,7 @@ class _Solver:
         ]  # fmt: skip
         found = []
         rows = -(-self.batch.depth_prev.shape[1] // self.tile)
-        for sums, *more, pose, (_, sd) in zip(*arrays, strict=True):
+        for sums, *more, pose, (_, sd, *_) in zip(*arrays, strict=True):
             if not all(np.isfinite(x).all() for x in (sums, *more, pose)):
                 found.append((NOTHING, False))
                 continue

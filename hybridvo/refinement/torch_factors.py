@@ -1,11 +1,13 @@
 """The ego-flow reprojection residual of a batch of pairs in torch, and its normal equations.
 
 The same definition as :mod:`hybridvo.refinement.kernels`, formulas there; a test holds both equal.
+With the current frame's depth a third row joins, ``r_z = log D_curr(x + F) - log Z'``.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import reduce
 from typing import NamedTuple
 
 import torch
@@ -18,28 +20,62 @@ BEHIND_DISTANCE2 = 1e4
 """Squared Mahalanobis distance at which a pixel behind the camera is charged."""
 
 
+def _geman_mcclure(d2: torch.Tensor, c2: float) -> Kernel:
+    share = c2 / (c2 + d2)
+    return Kernel(0.5 * share * d2, share.square(), 4 * share / c2)
+
+
+def _cauchy(d2: torch.Tensor, c2: float) -> Kernel:
+    share = c2 / (c2 + d2)
+    return Kernel(0.5 * c2 * torch.log1p(d2 / c2), share, 2 * share / c2)
+
+
+def _huber(d2: torch.Tensor, c2: float) -> Kernel:
+    beyond = d2.clamp(min=c2)
+    cost = torch.where(d2 <= c2, 0.5 * d2, (c2 * beyond).sqrt() - 0.5 * c2)
+    return Kernel(cost, (c2 / beyond).sqrt(), (d2 > c2) / beyond)
+
+
+def _l2(d2: torch.Tensor, c2: float) -> Kernel:
+    return Kernel(0.5 * d2, torch.ones_like(d2), torch.zeros_like(d2))
+
+
+class Kernel(NamedTuple):
+    """Cost rho of squared distances d2, weight 2 rho', slope -2 weight' / weight."""
+
+    cost: torch.Tensor
+    weight: torch.Tensor
+    slope: torch.Tensor
+
+
+KERNELS = {"geman-mcclure": _geman_mcclure, "cauchy": _cauchy, "huber": _huber, "l2": _l2}
+"""Robust kernels of the squared Mahalanobis distance, for a squared cutoff."""
+
+
 class RobustNoise(NamedTuple):
-    """How residuals are weighed: (B, 2) noise sf px, sd; cutoff of the Geman-McClure kernel."""
+    """How residuals are weighed: (B, 2) noise sf px, sd, or (B, 3) with sz; kernel and cutoff."""
 
     noise: torch.Tensor
     cutoff: float = 3.0
+    name: str = "geman-mcclure"
 
-    def kernel(self, distance2: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """(cost rho, weight 2 d rho / d d2, its relative slope -2 (d weight / d d2) / weight)."""
-        c2 = self.cutoff**2
-        share = c2 / (c2 + distance2)
-        return 0.5 * share * distance2, share.square(), 4 * share / c2
+    def kernel(self, distance2: torch.Tensor) -> Kernel:
+        """The robust kernel at squared Mahalanobis distances."""
+        return KERNELS[self.name](distance2, self.cutoff**2)
 
 
 @dataclass(frozen=True, eq=False)
 class Residuals:
-    """What a pose says of every pixel: a, b, i (B, N), r and its sensitivity q (B, 2, N)."""
+    """What a pose says of every pixel: a, b, i (B, N), r and its sensitivity u (B, R, N).
+
+    R is 2, the flow, or 3 with the log depth of the current frame.
+    """
 
     a: torch.Tensor
     b: torch.Tensor
     i: torch.Tensor
     r: torch.Tensor
-    q: torch.Tensor
+    u: torch.Tensor
     t: torch.Tensor
     front: torch.Tensor
 
@@ -51,6 +87,8 @@ def residuals(pixels: Pixels, T: pp.LieTensor) -> Residuals:
     front = moved[:, 2] > MIN_DEPTH
     moved = torch.where(front[:, None], moved, torch.ones_like(moved))
     r, i = pixels.target - project(moved, pixels.K), 1 / moved[:, 2]
+    if pixels.log_depth_curr is not None:
+        r = torch.cat([r, (pixels.log_depth_curr + i.log())[:, None]], 1)
     a, b, t = moved[:, 0] * i, moved[:, 1] * i, matrix[:, :3, 3, None]
     return Residuals(a, b, i, r, _sensitivity(pixels, a, b, i, t), t, front)
 
@@ -62,35 +100,43 @@ def _focal(pixels: Pixels) -> torch.Tensor:
 def _sensitivity(
     pixels: Pixels, a: torch.Tensor, b: torch.Tensor, i: torch.Tensor, t: torch.Tensor
 ) -> torch.Tensor:
-    """Q = d pi(X') / d log Z."""
-    return _focal(pixels) * torch.stack(
-        [i * (a * t[:, 2] - t[:, 0]), i * (b * t[:, 2] - t[:, 1])], 1
-    )
+    """U = d prediction / d log Z: d pi(X') / d log Z, and d log Z' / d log Z."""
+    q = [i * (a * t[:, 2] - t[:, 0]), i * (b * t[:, 2] - t[:, 1])]
+    u = _focal(pixels) * torch.stack(q, 1)
+    return u if pixels.log_depth_curr is None else torch.cat([u, (1 - t[:, 2] * i)[:, None]], 1)
 
 
 def _information(
     pixels: Pixels, at: Residuals, noise: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """(p, kappa) (B, N) of Sigma^-1 = p I - kappa p q (p q)^T."""
-    p = 1 / (noise[:, 0, None].square() * pixels.flow_variance)
+    """(D (B, R, N), kappa (B, N)) of Sigma^-1 = diag(D) - kappa (D u)(D u)^T."""
+    flow = 1 / (noise[:, 0, None].square() * pixels.flow_variance)
+    rows = [flow, flow]
+    if pixels.has_depth_curr is not None:
+        rows.append(pixels.has_depth_curr / noise[:, 2, None].square())
+    D = torch.stack(rows, 1)
     depth = noise[:, 1, None].square() * pixels.depth_variance
-    return p, depth / (1 + depth * p * at.q.square().sum(dim=1))
+    return D, depth / (1 + depth * (D * at.u.square()).sum(dim=1))
 
 
 def at_likely_depth(pixels: Pixels, at: Residuals, noise: torch.Tensor) -> Residuals:
     """The same at the depths that the residuals make most likely; the residuals stay."""
-    p, kappa = _information(pixels, at, noise)
-    e = (kappa * p * (at.q * at.r).sum(dim=1)).clamp(-float(MAX_SHIFT), float(MAX_SHIFT))
-    a, b = (torch.stack([at.a, at.b], 1) + at.q * e[:, None] / _focal(pixels)).unbind(1)
+    D, kappa = _information(pixels, at, noise)
+    e = (kappa * (D * at.u * at.r).sum(dim=1)).clamp(-float(MAX_SHIFT), float(MAX_SHIFT))
+    a, b = (torch.stack([at.a, at.b], 1) + at.u[:, :2] * e[:, None] / _focal(pixels)).unbind(1)
     i = at.i * (1 - (1 - at.t[:, 2] * at.i) * e)
-    return replace(at, a=a, b=b, i=i, q=_sensitivity(pixels, a, b, i, at.t))
+    return replace(at, a=a, b=b, i=i, u=_sensitivity(pixels, a, b, i, at.t))
 
 
-def jacobian(pixels: Pixels, at: Residuals) -> tuple[torch.Tensor, torch.Tensor]:
-    """Both rows (B, 6, N) of d pi(X') / d delta."""
+def jacobian(pixels: Pixels, at: Residuals) -> tuple[torch.Tensor, ...]:
+    """Rows (B, 6, N) of d pi(X') / d delta and, with the current depth, d log Z' / d delta."""
     u, v = projection_rows(at.a, at.b, at.i)
     f = _focal(pixels)
-    return f[:, :1] * u, f[:, 1:] * v
+    rows = f[:, :1] * u, f[:, 1:] * v
+    if pixels.log_depth_curr is None:
+        return rows
+    zero = torch.zeros_like(at.a)
+    return (*rows, torch.stack([zero, zero, at.i, at.b, -at.a, zero], dim=1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,14 +145,14 @@ class Weighted:
 
     Args:
         at: at the likely depths.
-        p, kappa: (B, N) of the information.
-        right: (B, 2, N) Sigma^-1 r.
+        D: (B, R, N) and kappa (B, N) of the information.
+        right: (B, R, N) Sigma^-1 r.
         distance2: (B, N) squared Mahalanobis distances.
         robust: (B, N) robust weights without the external ones, 0 where unusable.
     """
 
     at: Residuals
-    p: torch.Tensor
+    D: torch.Tensor
     kappa: torch.Tensor
     right: torch.Tensor
     distance2: torch.Tensor
@@ -116,13 +162,19 @@ class Weighted:
 def weigh(pixels: Pixels, T: pp.LieTensor, how: RobustNoise) -> Weighted:
     """Residuals at pypose SE3 poses (B, 7), weighed."""
     at = at_likely_depth(pixels, residuals(pixels, T), how.noise)
-    p, kappa = _information(pixels, at, how.noise)
-    along = kappa * p * (at.q * at.r).sum(dim=1)
-    right = p[:, None] * (at.r - along[:, None] * at.q)
+    D, kappa = _information(pixels, at, how.noise)
+    along = kappa * (D * at.u * at.r).sum(dim=1)
+    right = D * (at.r - along[:, None] * at.u)
     distance2 = (right * at.r).sum(dim=1).clamp(min=0)
     usable = at.front & (pixels.weight > 0)
-    robust = torch.where(usable, how.kernel(distance2)[1], torch.zeros_like(distance2))
-    return Weighted(at, p, kappa, right, distance2, robust)
+    robust = torch.where(usable, how.kernel(distance2).weight, torch.zeros_like(distance2))
+    return Weighted(at, D, kappa, right, distance2, robust)
+
+
+def _along(rows: tuple[torch.Tensor, ...], values: torch.Tensor) -> torch.Tensor:
+    """(B, 6, N) sum of rows (B, 6, N) times values (B, R, N)."""
+    each = (row * value[:, None] for row, value in zip(rows, values.unbind(1), strict=True))
+    return reduce(torch.add, each)
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,16 +212,14 @@ def linearize(
         """Values (B, N) or rows (B, 6, N) side by side, run by run."""
         return torch.cat([v.unflatten(-1, (-1, length)) for v in x], dim=axis)
 
-    u, v = jacobian(pixels, at)
-    pq = found.p[:, None] * at.q
-    along = u * pq[:, :1] + v * pq[:, 1:]
-    G = runs([u, v, along], 3).transpose(1, 2)  # (B, C, 6, 3 L)
-    information = runs([w * found.p, w * found.p, -w * found.kappa], 2)
+    rows = jacobian(pixels, at)
+    G = runs([*rows, _along(rows, found.D * at.u)], 3).transpose(1, 2)  # (B, C, 6, (R + 1) L)
+    information = runs([*(w[:, None] * found.D).unbind(1), -w * found.kappa], 2)
     H = (G * information[:, :, None]) @ G.transpose(2, 3)
     right = runs(list((w[:, None] * found.right).unbind(1)), 2)
     g = (G[..., : right.shape[2]] @ right[..., None])[..., 0]
     behind = torch.full_like(found.distance2, BEHIND_DISTANCE2)
-    cost = how.kernel(torch.where(at.front, found.distance2, behind))[0]
+    cost = how.kernel(torch.where(at.front, found.distance2, behind)).cost
     return Linearization(
         H=0.5 * (H + H.transpose(2, 3)),
         g=g,
@@ -187,8 +237,7 @@ def scores(pixels: Pixels, T: pp.LieTensor, how: RobustNoise) -> tuple[torch.Ten
     """
     found = weigh(pixels, T, how)
     right = (pixels.weight * found.robust)[:, None] * found.right
-    u, v = jacobian(pixels, found.at)
-    return u * right[:, :1] + v * right[:, 1:], found
+    return _along(jacobian(pixels, found.at), right), found
 
 
 def newton_matrix(pixels: Pixels, T: pp.LieTensor, how: RobustNoise) -> torch.Tensor:

@@ -12,10 +12,11 @@ import torch
 from hybridvo.errors import InputError
 from hybridvo.geometry import ego_flow, pixel_grid, se3_exp
 from hybridvo.refinement import coarse_fit
-from hybridvo.refinement.batch import from_tiles, gather_pixels, to_tiles
+from hybridvo.refinement.batch import from_tiles, gather_pixels, sample_depth, to_tiles
 from hybridvo.refinement.full_fit import FlowFactor
 from hybridvo.refinement.pixels import PixelGrid
 from hybridvo.refinement.torch_factors import (
+    KERNELS,
     RobustNoise,
     at_likely_depth,
     jacobian,
@@ -41,7 +42,7 @@ def test_one_pixel_by_hand() -> None:
     assert pixels.weight.sum() == 1
     terms, at = residuals(pixels, T), 5
     # a = 0.048, so the pixel lands at 5.8: residual 7 - 5.8; q = 100/2.5 (0.048 0.5 - 0.1)
-    found = [float(x) for x in (*terms.r[0, :, at], *terms.q[0, :, at])]
+    found = [float(x) for x in (*terms.r[0, :, at], *terms.u[0, :, at])]
     assert found == pytest.approx([1.2, 1.0, 40 * (0.024 - 0.1), 0.0], abs=1e-12)
     rows = torch.stack(jacobian(pixels, terms), dim=1)[0]
     expected = 100 * np.array([0.4, 0, -0.048 * 0.4, 0, 1 + 0.048**2, 0])
@@ -89,39 +90,48 @@ def test_reproject_marks_points_behind_and_stays_finite() -> None:
 
 
 def test_derivatives_against_autograd() -> None:
-    """The Jacobian in the pose, and the sensitivity to the log depth, of both rows."""
+    """The Jacobian in the pose, and the sensitivity to the log depth, of all three rows."""
     batch, T = noisy_batch(size=(6, 7), seed=5)
-    pixels, pose = gather_pixels(batch), se3(T)
+    batch = replace(batch, depth_curr=torch.full((2, 6, 7), 4.0, dtype=F64))
+    pixels = gather_pixels(batch, with_depth=True)
+    pose = se3(T)
     terms = residuals(pixels, pose)
     zero = torch.zeros(2, 6, dtype=F64)
-    rows = torch.stack(jacobian(pixels, terms), dim=1)
-    for k in range(2):
+    for k, row in enumerate(jacobian(pixels, terms)):
         full = torch.autograd.functional.jacobian(
             lambda d, k=k: -residuals(pixels, left_update(d, pose)).r[:, k], zero
         )
         auto = torch.stack([full[b, :, b] for b in range(2)])
-        assert (rows[:, k].transpose(1, 2) - auto).abs().max() < 1e-10
+        assert (row.transpose(1, 2) - auto).abs().max() < 1e-10
         scale = torch.ones_like(pixels.weight).requires_grad_()
         r = residuals(replace(pixels, points=pixels.points * scale[:, None]), pose).r[:, k]
         (slope,) = torch.autograd.grad(-r.sum(), scale)  # at 1: the derivative in log Z
-        assert (slope - terms.q[:, k]).abs().max() < 1e-10
+        assert (slope - terms.u[:, k]).abs().max() < 1e-10
 
 
-def test_normal_equations_against_dense_algebra() -> None:
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_normal_equations_against_dense_algebra(kernel: str) -> None:
     batch, T = noisy_batch(size=(5, 6), seed=7)
+    smooth = torch.linspace(3, 3.4, 30, dtype=F64).reshape(5, 6)
+    batch = replace(batch, depth_curr=smooth.repeat(2, 1, 1))
     weights = torch.rand(2, 5, 6, dtype=F64, generator=torch.Generator().manual_seed(1))
-    how = RobustNoise(torch.tensor([[0.4, 0.05], [0.3, 0.02]], dtype=F64))
-    pixels = gather_pixels(batch, weights)
+    noise = torch.tensor([[0.4, 0.05, 0.02], [0.3, 0.02, 0.05]], dtype=F64)
+    how = RobustNoise(noise, 1.7, kernel)
+    pixels = gather_pixels(batch, weights, with_depth=True)
+    present = pixels.has_depth_curr
+    assert present is not None and 0 < present.sum() < present.numel()
     found = linearize(pixels, se3(T), how, run=10)
     terms = residuals(pixels, se3(T))
     moved = at_likely_depth(pixels, terms, how.noise)
-    rows = torch.stack(jacobian(pixels, moved), dim=1)
+    rows = torch.stack(jacobian(pixels, moved), 1)
     for b in range(2):
         H, g, cost = np.zeros((6, 6)), np.zeros(6), 0.0
         for k in range(30):
-            J, q, r = (x[b, ..., k].numpy() for x in (rows, moved.q, terms.r))
-            sf, sd = how.noise[b].tolist()
-            information = np.linalg.inv(sf**2 * np.eye(2) + sd**2 * np.outer(q, q))
+            keep = 3 if present[b, k] else 2
+            J, u, r = (x[b, :keep, ..., k].numpy() for x in (rows, moved.u, terms.r))
+            sf, sd, sz = how.noise[b].tolist()
+            sigma = np.diag([sf**2, sf**2, sz**2][:keep]) + sd**2 * np.outer(u, u)
+            information = np.linalg.inv(sigma)
             rho, weight, _ = how.kernel(torch.tensor(r @ information @ r, dtype=F64))
             w = float(weights[b].flatten()[k])
             H += w * float(weight) * J.T @ information @ J
@@ -136,13 +146,15 @@ def test_normal_equations_against_dense_algebra() -> None:
     assert (scores(pixels, se3(T), how)[0].sum(dim=2) - g).abs().max() < 1e-9 * g.abs().max()
 
 
-def test_weight_and_curvature_are_slopes_of_the_cost() -> None:
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_weight_and_curvature_are_slopes_of_the_cost(kernel: str) -> None:
     d2 = torch.tensor([0.0, 0.3, 1.0, 4.0, 60.0], dtype=F64, requires_grad=True)
-    cost, weight, curvature = RobustNoise(torch.zeros(0), 1.7).kernel(d2)
+    cost, weight, curvature = RobustNoise(torch.zeros(0), 1.7, kernel).kernel(d2)
     (slope,) = torch.autograd.grad(cost.sum(), d2, retain_graph=True)
     assert (2 * slope - weight).abs().max() < 1e-14
-    (bend,) = torch.autograd.grad(weight.sum(), d2)
-    assert (-2 * bend / weight - curvature).abs().max() < 1e-12
+    if kernel != "l2":
+        (bend,) = torch.autograd.grad(weight.sum(), d2)
+        assert (-2 * bend / weight - curvature).abs().max() < 1e-12
 
 
 def numba_step(batch: PairBatch, weights: torch.Tensor | None, T: np.ndarray, noise: tuple):
@@ -199,6 +211,20 @@ def test_step_equals_the_numba_kernels(case: str, dtype: torch.dtype) -> None:
     for part in (slice(0, 3), slice(3, 6)):
         length = np.linalg.norm(expected[part])
         assert np.abs(step[0, part].numpy() - expected[part]).max() < 1e-5 * length
+
+
+def test_sampled_depth_by_hand() -> None:
+    depth = torch.tensor([[[4.0, 4.1, 8.0], [4.05, 4.15, 8.0]]], dtype=F64)
+    u = torch.tensor([0.25, 1.0, 1.5, 2.0, -0.1, math.nan], dtype=F64)
+    v = torch.tensor([0.5, 1.0, 0.5, 1.0, 0.0, 0.0], dtype=F64)
+    at = torch.stack([u, v], dim=1)[None, None]
+    sampled, good = sample_depth(depth, at)
+    assert good[0, 0].tolist() == [True, False, False, False, False, False]
+    assert sampled[0, 0, 0] == pytest.approx(0.75 * 4.025 + 0.25 * 4.125)
+    depth[0, 1, 0] = math.nan
+    assert not sample_depth(depth, at)[1].any()
+    corners = torch.tensor([[4.0, 3.0], [0.0, 0.0]], dtype=F64)[None, None]
+    assert sample_depth(torch.full((1, 4, 5), 3.0, dtype=F64), corners)[1].all()
 
 
 def test_unusable_values_leave_no_trace_in_gradients() -> None:
