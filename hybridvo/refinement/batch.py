@@ -108,8 +108,9 @@ class Pixels:
 
     def map(self, change: Callable[[torch.Tensor], torch.Tensor]) -> Pixels:
         """The same with every tensor changed."""
-        values: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
-        return Pixels(**{k: None if x is None else change(x) for k, x in values.items()})
+        there = {f.name: getattr(self, f.name) for f in fields(self)}
+        changed: dict[str, Any] = {name: change(x) for name, x in there.items() if x is not None}
+        return Pixels(**changed)
 
     def subset(self, count: int) -> Pixels:
         """About ``count`` usable pixels of each sample, spread evenly in their order.
