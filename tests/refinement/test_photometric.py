@@ -14,7 +14,8 @@ from hybridvo.flow import dis_flow
 from hybridvo.geometry import ego_flow, invert, se3_exp, se3_log
 from hybridvo.refinement import photometric_kernels as kernels
 from hybridvo.refinement.photometric import GreyImage, missing_blur, refine_photometric
-from hybridvo.synthetic.render import SyntheticSequence, make_scene
+from hybridvo.synthetic.render import SyntheticSequence
+from hybridvo.synthetic.scenes import make_scene
 from hybridvo.types import FramePair
 
 MEASURED = range(300, 306)
