@@ -19,6 +19,7 @@ from typing import Any, Literal
 
 from hybridvo import __version__
 from hybridvo.commands import arguments
+from hybridvo.commands.train import add_train, train
 
 Call = Callable[[argparse.Namespace, list[str]], int]
 
@@ -74,8 +75,9 @@ def build_parser() -> argparse.ArgumentParser:
     generate.add_argument("--seed", type=int, default=0, metavar="N")
     generate.add_argument("--size", type=int, nargs=2, metavar=("H", "W"), help="pixels")
     generate.add_argument("--workers", type=int, default=1, metavar="N", help="processes")
-    # has a parser of its own, see main
-    commands.add_parser("train", help="train a network (hybridvo train --help)", add_help=False)
+    training = commands.add_parser("train", help="train a network")
+    training.set_defaults(call=train)
+    add_train(training, arguments.common())
     init = add("init", _init, "write a camera.yaml to fill in, for a recording of your own")
     init.add_argument("directory", metavar="DIR", help="folder with rgb/ and depth/")
     return parser
@@ -84,10 +86,6 @@ def build_parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     given = sys.argv[1:] if argv is None else list(argv)
-    if given[:1] == ["train"]:
-        from hybridvo.commands.train import main as train
-
-        return train(given[1:])
     try:
         args = build_parser().parse_args(given)
     except SystemExit as end:  # argparse: 0 after --help and --version, 2 for wrong usage
@@ -195,7 +193,7 @@ def _compare(args: argparse.Namespace, command: list[str]) -> int:
     from hybridvo.commands.inputs import weight_files
     from hybridvo.commands.progress import Progress
     from hybridvo.evaluation.comparison import compare
-    from hybridvo.evaluation.plan import ComparisonOptions
+    from hybridvo.evaluation.sequence_job import ComparisonOptions
     from hybridvo.pipeline import METHODS
 
     methods = tuple(name.strip() for name in args.methods.split(",") if name.strip())

@@ -101,15 +101,10 @@ def _skew(w: np.ndarray) -> np.ndarray:
 
 
 def se3_exp(delta: np.ndarray) -> np.ndarray:
-    """(4, 4) exponential of a 6-vector (translation, rotation); pypose's ``se3.Exp``, in numpy.
-
-    For the solver's inner loop, where a tensor round trip per step would dominate; a test holds it
-    equal to pypose.
-    """
-    delta = np.asarray(delta, dtype=np.float64)
-    rho, phi = delta[:3], delta[3:]
-    theta2 = float(phi @ phi)
-    W = _skew(phi)
+    """(4, 4) exponential of a 6-vector (translation, rotation); also compiled, for the kernels."""
+    delta = np.asarray(delta)
+    x, y, z = delta[3], delta[4], delta[5]
+    theta2 = x * x + y * y + z * z
     if theta2 < 1e-8:
         a, b, c = 1 - theta2 / 6, 0.5 - theta2 / 24, 1 / 6 - theta2 / 120
     else:
@@ -117,8 +112,20 @@ def se3_exp(delta: np.ndarray) -> np.ndarray:
         a = np.sin(theta) / theta
         b = 2 * np.sin(theta / 2) ** 2 / theta2
         c = (1 - a) / theta2
-    W2 = W @ W
-    return make_transform(np.eye(3) + a * W + b * W2, (np.eye(3) + b * W + c * W2) @ rho)
+    W = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    W2 = np.array(
+        [
+            [x * x - theta2, x * y, x * z],
+            [x * y, y * y - theta2, y * z],
+            [x * z, y * z, z * z - theta2],
+        ]
+    )
+    T = np.eye(4)
+    T[:3, :3] += a * W + b * W2
+    V = b * W + c * W2
+    for i in range(3):
+        T[i, 3] = delta[i] + V[i, 0] * delta[0] + V[i, 1] * delta[1] + V[i, 2] * delta[2]
+    return T
 
 
 def se3_log(T: np.ndarray) -> np.ndarray:

@@ -17,6 +17,7 @@ from hybridvo.errors import InputError
 T = TypeVar("T")
 Positive = Annotated[float, Field(gt=0)]
 Count = Annotated[int, Field(ge=1)]
+Natural = Annotated[int, Field(ge=0)]
 Share = Annotated[float, Field(ge=0, le=1)]
 
 
@@ -189,7 +190,7 @@ class RunOptions:
     """
 
     method: str = "hybrid"
-    start: Annotated[int, Field(ge=0)] = 0
+    start: Natural = 0
     stop: Count | None = None
     stride: Count = 1
     device: Literal["auto", "cpu", "cuda"] = "auto"

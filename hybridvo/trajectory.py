@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -18,7 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hybridvo.errors import FormatError, InputError
-from hybridvo.files import atomic_write, read_rows, read_text
+from hybridvo.files import Row, atomic_write, read_rows, read_text
 from hybridvo.geometry import invert, ned_to_camera, xyzw_to_wxyz
 from hybridvo.types import as_rigid, to_numpy
 from hybridvo.units import MAX_SECONDS, stamp_unit
@@ -43,12 +42,7 @@ def chain(T_world_prev: np.ndarray, T_curr_prev: np.ndarray) -> np.ndarray:
     One Newton step of the polar decomposition keeps the rotation orthonormal, so that rounding does
     not accumulate over long sequences.
 
-    Args:
-        T_world_prev: (4, 4) previous camera to world, orthonormal to 1e-6.
-        T_curr_prev: (4, 4) points of the previous camera into the current one, orthonormal to 1e-6.
-
-    Returns:
-        (4, 4) current camera to world, orthonormal to 1e-12.
+    Both are (4, 4) and orthonormal to 1e-6, the result to 1e-12.
     """
     T_world_curr = T_world_prev @ invert(T_curr_prev)
     R = T_world_curr[:3, :3]
@@ -107,67 +101,18 @@ class Trajectory:
         return len(self.timestamps)
 
     def __repr__(self) -> str:
-        return f"Trajectory({len(self)} poses, {self.length:.3g} m)"
+        return f"Trajectory({len(self)} poses)"
 
     @property
     def positions(self) -> np.ndarray:
         """(N, 3) camera centres in the world, metres."""
         return self.T_world_cam[:, :3, 3]
 
-    @property
-    def length(self) -> float:
-        """Length of the path, metres."""
-        return float(np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum())
-
-    @classmethod
-    def from_relative(
-        cls,
-        T_curr_prev: Sequence[np.ndarray] | np.ndarray,
-        timestamps: Sequence[float] | np.ndarray,
-        T_world_first: np.ndarray | None = None,
-    ) -> Trajectory:
-        """Chain relative poses, see :func:`chain`.
-
-        Args:
-            T_curr_prev: N - 1 transforms (4, 4), points of camera i into camera i + 1.
-            timestamps: (N,) seconds, one for every frame.
-            T_world_first: (4, 4) pose of the first camera; identity (world = first camera) if None.
-
-        Raises:
-            InputError: transforms that are not rigid (to 1e-3) or not finite, or counts that do not
-                match.
-        """
-        count = len(T_curr_prev)
-        relative = as_rigid(
-            T_curr_prev if count else np.empty((0, 4, 4)), "T_curr_prev", 1e-3, many=True
-        )
-        if len(np.atleast_1d(timestamps)) != count + 1:
-            raise InputError(
-                f"Trajectory.from_relative: expected {count + 1} timestamps for {count} relative "
-                f"poses, got {len(np.atleast_1d(timestamps))}."
-            )
-        T = np.eye(4) if T_world_first is None else as_rigid(T_world_first, "T_world_first", 1e-3)
-        T[:3, :3] = Rotation.from_matrix(T[:3, :3]).as_matrix()
-        if count:
-            relative[:, :3, :3] = Rotation.from_matrix(relative[:, :3, :3]).as_matrix()
-        poses = [T]
-        for step in relative:
-            poses.append(chain(poses[-1], step))
-        return cls(np.asarray(timestamps), np.stack(poses))
-
-    def relative(self) -> np.ndarray:
-        """(N - 1, 4, 4) ``T_curr_prev`` between neighbours; inverse of :meth:`from_relative`."""
-        return invert(self.T_world_cam[1:]) @ self.T_world_cam[:-1]
-
     def transformed(self, T_new_world: np.ndarray, scale: float = 1.0) -> Trajectory:
         """The same path in another world: positions times ``scale``, then moved by ``T_new_world``.
 
-        Args:
-            T_new_world: (4, 4) rigid transform from the (scaled) old world into the new one.
-            scale: factor on the positions; rotations do not change.
-
         Raises:
-            InputError: ``T_new_world`` is no rigid transform, or ``scale`` is not finite.
+            InputError: ``T_new_world`` (4, 4) is no rigid transform, or ``scale`` is not finite.
         """
         T = self.T_world_cam.copy()
         T[:, :3, 3] *= scale
@@ -228,63 +173,69 @@ def read_trajectory(
     if not path.is_file():
         raise InputError(f"{path}: trajectory file cannot be read: no such file.")
     kind = _format_of(path) if format == "auto" else format
-    rows = read_rows(path, COLUMNS[kind])
+    rows, T = read_poses(path, COLUMNS[kind])
     if not rows:
         raise FormatError(f"{path}: expected at least one pose, got none.")
-    values = np.array([row.numbers for row in rows])
-
-    def refuse(bad: np.ndarray, expected: str) -> None:
-        if bad.any():
-            row = rows[int(np.argmax(bad))]
-            raise FormatError(f"{path}:{row.line}: expected {expected}, got {list(row.numbers)}.")
-
+    first = np.array([row.numbers[0] for row in rows])
     finite = "finite numbers; a pose that is not known must not be in the file"
-    refuse(~np.isfinite(values).all(axis=1), finite)
+    _refuse(path, rows, ~np.isfinite(first) | np.isnan(T[:, 0, 0]), finite)
     stamps = np.arange(len(rows), dtype=np.float64)
-    warnings: list[str] = []
+    warnings: tuple[str, ...] = ()
     if kind == "tum":
-        stamps = values[:, 0]
-        far = np.abs(stamps) > MAX_SECONDS
-        refuse(far != far[0], f"timestamps that do not mix units ({stamps[0]} before)")
-        late = np.diff(stamps, prepend=-np.inf) <= 0
-        refuse(late, "increasing timestamps: sort the file, drop duplicates")
-        factor, unit = stamp_unit(stamps)
-        stamps = stamps / factor
+        far = np.abs(first) > MAX_SECONDS
+        unmixed = f"timestamps that do not mix units ({first[0]} before)"
+        _refuse(path, rows, far != far[0], unmixed)
+        late = np.diff(first, prepend=-np.inf) <= 0
+        _refuse(path, rows, late, "increasing timestamps: sort the file, drop duplicates")
+        factor, unit = stamp_unit(first)
+        stamps = first / factor
         if factor != 1:
-            warnings.append(f"{path}: timestamps are {unit}; converted to seconds.")
+            warnings = (f"{path}: timestamps are {unit}; converted to seconds.",)
             _logger.warning(warnings[0])
-    T = _from_matrices(values, refuse) if kind == "kitti" else _from_quaternions(values, refuse)
     if axes == "ned" or (axes == "auto" and kind == "tartanair"):
         T = ned_to_camera(T)
-    return Trajectory(stamps, T, has_timestamps=kind == "tum", warnings=tuple(warnings))
+    return Trajectory(stamps, T, has_timestamps=kind == "tum", warnings=warnings)
 
 
-Refuse = Callable[[np.ndarray, str], None]
-"""Raises where an entry of (N,) bool is True, with what was expected."""
+def read_poses(path: Path, columns: str) -> tuple[list[Row], np.ndarray]:
+    """Rows of a list of poses, and (N, 4, 4) what they hold, NaN where that is not finite.
+
+    The last ``columns`` are ``tx ty tz qx qy qz qw``, or the first three rows of the matrix.
+
+    Raises:
+        FormatError: a damaged row, a quaternion that is not of unit length, a matrix that is no
+            rotation; names file and line.
+    """
+    rows = read_rows(path, columns)
+    is_matrix = columns == COLUMNS["kitti"]
+    width = 12 if is_matrix else 7
+    values = np.array([row.numbers[-width:] for row in rows]).reshape(-1, width)
+    known = np.isfinite(values).all(axis=1)
+    values[~known] = np.eye(4)[:3].ravel() if is_matrix else (0, 0, 0, 0, 0, 0, 1)
+    T = np.tile(np.eye(4), (len(rows), 1, 1))
+    if is_matrix:
+        T[:, :3] = values.reshape(-1, 3, 4)
+        R = T[:, :3, :3]
+        with np.errstate(over="ignore", invalid="ignore"):
+            error = np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max(axis=(1, 2))
+            bad = ~(error <= FILE_TOLERANCE) | (np.linalg.det(R) < 0)
+        _refuse(path, rows, bad, "a rotation in columns 1-3, 5-7 and 9-11")
+        if error.max(initial=0) > 1e-9:
+            T[:, :3, :3] = Rotation.from_matrix(R).as_matrix()
+    elif rows:
+        norms = np.linalg.norm(values[:, 3:].clip(-2, 2), axis=1)
+        _refuse(path, rows, np.abs(norms - 1) > FILE_TOLERANCE, "a unit quaternion qx qy qz qw")
+        T[:, :3, :3] = Rotation.from_quat(values[:, 3:]).as_matrix()
+        T[:, :3, 3] = values[:, :3]
+    T[~known] = np.nan
+    return rows, T
 
 
-def _from_matrices(values: np.ndarray, refuse: Refuse) -> np.ndarray:
-    """(N, 4, 4) poses of (N, 12) rows of KITTI, brought onto the manifold."""
-    T = np.tile(np.eye(4), (len(values), 1, 1))
-    T[:, :3] = values.reshape(-1, 3, 4)
-    R = T[:, :3, :3]
-    with np.errstate(over="ignore", invalid="ignore"):
-        error = np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max(axis=(1, 2))
-        bad = ~(error <= FILE_TOLERANCE) | (np.linalg.det(R) < 0)
-    refuse(bad, "a rotation in columns 1-3, 5-7 and 9-11")
-    if error.max() > 1e-9:
-        T[:, :3, :3] = Rotation.from_matrix(R).as_matrix()
-    return T
-
-
-def _from_quaternions(values: np.ndarray, refuse: Refuse) -> np.ndarray:
-    """(N, 4, 4) poses of rows that end in tx ty tz qx qy qz qw."""
-    norms = np.linalg.norm(values[:, -4:].clip(-2, 2), axis=1)
-    refuse(np.abs(norms - 1) > 10 * FILE_TOLERANCE, "a unit quaternion qx qy qz qw")
-    T = np.tile(np.eye(4), (len(values), 1, 1))
-    T[:, :3, :3] = Rotation.from_quat(values[:, -4:]).as_matrix()
-    T[:, :3, 3] = values[:, -7:-4]
-    return T
+def _refuse(path: Path, rows: list[Row], bad: np.ndarray, expected: str) -> None:
+    """Name the first bad row."""
+    if bad.any():
+        row = rows[int(np.argmax(bad))]
+        raise FormatError(f"{path}:{row.line}: expected {expected}, got {list(row.numbers)}.")
 
 
 def _format_of(path: Path) -> str:

@@ -18,7 +18,7 @@ import torch
 
 import hybridvo
 from hybridvo import torch_geometry
-from hybridvo.data.resize import resize_camera, resize_pair
+from hybridvo.data.resize import resize_camera
 from hybridvo.data.sequence import iter_pairs, open_sequence
 from hybridvo.geometry import (
     backproject,
@@ -42,6 +42,7 @@ from hybridvo.refinement import coarse_fit
 from hybridvo.results import RelativePose, Step
 from hybridvo.trajectory import Trajectory, read_trajectory
 from hybridvo.types import Camera, Frame, FramePair, PairBatch
+from tests.walks import chained
 
 RIGHT_TURN_ABOUT_Z = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 """90 degrees about z: x goes to y, y goes to -x."""
@@ -86,12 +87,12 @@ def test_forward_is_plus_z_and_points_come_nearer():
     np.testing.assert_allclose(flow[40, 60], [10, 0], atol=1e-12)
     np.testing.assert_allclose(flow[40, 40], [-10, 0], atol=1e-12)
     np.testing.assert_allclose(flow[50, 50], [0, 10], atol=1e-12)
-    path = Trajectory.from_relative([T_curr_prev], [0.0, 1.0])
+    path = chained([T_curr_prev], [0.0, 1.0])
     np.testing.assert_allclose(path.T_world_cam[1], translation(0, 0, 1))
 
 
 def test_world_is_the_first_camera():
-    path = Trajectory.from_relative([translation(0, 0, -1)], [0.0, 1.0])
+    path = chained([translation(0, 0, -1)], [0.0, 1.0])
     np.testing.assert_array_equal(path.T_world_cam[0], np.eye(4))
 
 
@@ -138,20 +139,6 @@ def test_resizing_keeps_the_borders_where_they_are():
     sintel = resize_camera(Camera(1120, 1120, 511.5, 217.5, 436, 1024), 128, 256)
     assert sintel.cx == 127.5
     assert sintel.cy == pytest.approx(63.5, abs=1e-12)
-
-
-def test_resizing_scales_flow_and_cameras_together():
-    # a sideways step of 0.1 m at 2 m: 5 px at f = 100, 2.5 px at half the size
-    frame = Frame(None, constant_depth(2)[:80, :100], Camera(100, 100, 49.5, 39.5, 80, 100))
-    flow = np.full((80, 100, 2), (5, 0), np.float32)
-    small = resize_pair(FramePair(frame, frame, flow), 40, 50)
-    expected = ego_flow(
-        small.prev.depth, translation(0.1, 0, 0), small.prev.camera, small.curr.camera
-    )
-    np.testing.assert_allclose(expected[7, 9], [2.5, 0], atol=1e-12)
-    np.testing.assert_allclose(small.flow, expected, atol=1e-6)  # float32
-    tall = resize_pair(FramePair(frame, frame, flow), 160, 50)
-    np.testing.assert_allclose(tall.flow[0, 0], [2.5, 0])
 
 
 def test_network_inputs_scale_intrinsics_the_same_way():

@@ -15,6 +15,14 @@ from hybridvo.types import Camera
 REFINE = ("--method", "refine", "--flow", "file", "-q")
 
 
+def chained(relative, timestamps, T_world_first=None) -> Trajectory:
+    """Trajectory of N - 1 motions T_curr_prev and N stamps."""
+    poses = [np.eye(4) if T_world_first is None else T_world_first]
+    for T_curr_prev in relative:
+        poses.append(chain(poses[-1], T_curr_prev))
+    return Trajectory(timestamps, np.stack(poses))
+
+
 def write_walk(
     root: Path,
     frames: int,

@@ -24,8 +24,9 @@ from measuring import ROOT, provenance, without_folders
 from paper_tables import ROWS
 
 from hybridvo.commands.generate import write_sheet
+from hybridvo.evaluation.drawing import flow_panel
 from hybridvo.evaluation.maps import longest_flow, prediction_errors, uncertainty_maps
-from hybridvo.evaluation.plots import FlowPanel, Panel, ScalarPanel, maps_png
+from hybridvo.evaluation.plots import Panel, draw_panels
 from hybridvo.evaluation.saliency import saliencies
 from hybridvo.files import atomic_write, write_json
 from hybridvo.network.losses import reconstruct
@@ -132,7 +133,7 @@ def saliency(name: str, network: Any, sample: Any) -> list[Panel]:
     panels: list[Panel] = []
     for what, found in saliencies(network, inputs, None, STEPS).items():
         relative = found.magnitude / max(float(np.percentile(found.magnitude, 99)), 1e-30)
-        panels.append(ScalarPanel(f"{name}: {what}", relative, "relative", 1.0, sample.moving))
+        panels.append(Panel(f"{name}: {what}", relative, "relative", 1.0, sample.moving))
     return panels
 
 
@@ -168,14 +169,12 @@ def uncertainty(network: Any, sample: Any) -> list[Panel]:
         ("rotation", "translation"), ("deg", "m"), uncertainty_maps(output), errors, strict=True
     ):
         # each beside its own scale: the paper compares where they are large, not how large
-        panels.append(
-            ScalarPanel(f"uncertainty of the {what}", U, f"{unit}, U", None, sample.moving)
-        )
-        panels.append(ScalarPanel(f"error of the {what}", error, unit, None, sample.moving))
+        panels.append(Panel(f"uncertainty of the {what}", U, f"{unit}, U", None, sample.moving))
+        panels.append(Panel(f"error of the {what}", error, unit, None, sample.moving))
     objects = sample.flow - sample.ego_flow
     longest = longest_flow(sample.flow)
-    total = FlowPanel("total flow", sample.flow, longest)
-    return [total, FlowPanel("flow of the objects", objects, longest), *panels]
+    total = flow_panel("total flow", sample.flow, longest)
+    return [total, flow_panel("flow of the objects", objects, longest), *panels]
 
 
 def factorised(network: Any, sample: Any) -> list[Panel]:
@@ -190,13 +189,13 @@ def factorised(network: Any, sample: Any) -> list[Panel]:
         "object flow, estimate": sample.flow - ego,
         "object flow, ground truth": sample.flow - sample.ego_flow,
     }
-    return [FlowPanel(title, flow, longest) for title, flow in flows.items()]
+    return [flow_panel(title, flow, longest) for title, flow in flows.items()]
 
 
 def write(path: Path, panels: list[Panel], heading: str) -> None:
     """Panels as a PNG."""
     with atomic_write(path, "wb") as file:
-        file.write(maps_png(panels, heading, 2.0))
+        file.write(draw_panels(panels, heading, 2.0))
     print(path)
 
 

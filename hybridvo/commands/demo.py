@@ -8,7 +8,6 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from hybridvo.commands.configuration import load_options
@@ -16,7 +15,7 @@ from hybridvo.commands.run import EXIT_INTERRUPTED, RunResult, run
 from hybridvo.data.sequence import open_sequence
 from hybridvo.errors import InputError, OutputError
 from hybridvo.evaluation.plots import plot_trajectories
-from hybridvo.files import atomic_write, make_folder, write_json
+from hybridvo.files import make_folder, write_json
 from hybridvo.synthetic.render import write_sintel
 from hybridvo.synthetic.scenes import make_scene
 
@@ -44,13 +43,10 @@ def demo(
     command: Iterable[str] = (),
     quiet: bool = False,
 ) -> dict[str, Any] | None:
-    """Render, run and compare.
+    """Render, run and compare; JSON-ready, None where it was interrupted.
 
     The scene is written in Sintel's layout under ``out/data``; flow comes from OpenCV DIS, never
     from the true flow that is written beside it. Depth is the renderer's.
-
-    Returns:
-        JSON-ready: the scene, a row for each method, ``image``; None where it was interrupted.
 
     Raises:
         InputError: too few frames, or a folder that holds something already.
@@ -79,7 +75,7 @@ def demo(
         if results[method].exit_code == EXIT_INTERRUPTED:
             return None
     moving = float(np.median([(scene.object_id(i) > 0).mean() for i in range(scene.frames)]))
-    content = {
+    content: dict[str, Any] = {
         "command": list(command),
         "scene": {"kind": SCENE, "seed": seed, "frames": frames, "height": HEIGHT, "width": WIDTH},
         "moving_fraction": moving,
@@ -87,10 +83,12 @@ def demo(
         "depth_source": "true",
         "alignment": "origin",
         "rows": [_row(method, result.summary) for method, result in results.items()],
-        "image": os.fspath(out / "demo.png"),
+        "image": os.fspath(out / "trajectory.png"),
     }
-    title = f"{100 * moving:.0f} % of the pixels (in colour) move by themselves"
-    _draw(out / "demo.png", sequence.frame(0).rgb, scene.object_id(0) > 0, results, title)
+    paths = {METHODS[m]: path for m in DRAWN if (path := results[m].trajectory) is not None}
+    title = f"{100 * moving:.0f} % of the pixels move by themselves"
+    truth = results["hybrid"].gt
+    plot_trajectories(paths, content["image"], truth=truth, alignment="origin", title=title)
     write_json(out / MARK, content)
     return content
 
@@ -152,19 +150,3 @@ def _row(method: str, summary: dict[str, Any]) -> dict[str, Any]:
         "failed": summary["failed"],
         "frame_ms": summary["frame_ms_median"],
     }
-
-
-def _draw(
-    path: Path, rgb: Any, moving: np.ndarray, results: dict[str, RunResult], title: str
-) -> None:
-    """The first frame, its moving pixels in colour, above the paths."""
-    paths = path.with_name("trajectory.png")
-    drawn = {METHODS[m]: t for m in DRAWN if (t := results[m].trajectory) is not None}
-    plot_trajectories(drawn, paths, truth=results["hybrid"].gt, alignment="origin", title=title)
-    below = np.asarray(cv2.imread(os.fspath(paths)))
-    grey = cv2.cvtColor(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), cv2.COLOR_GRAY2RGB)
-    bgr = np.ascontiguousarray(np.where(moving[..., None], rgb, grey)[..., ::-1])
-    height = round(bgr.shape[0] * below.shape[1] / bgr.shape[1])
-    above = cv2.resize(bgr, (below.shape[1], height), interpolation=cv2.INTER_CUBIC)
-    with atomic_write(path, "wb") as file:
-        file.write(cv2.imencode(".png", np.vstack([above, below]))[1].tobytes())

@@ -25,8 +25,8 @@ TITLES = (
     "5 total flow",
     "5 depth of t+1",
 )
-LINE_PX, GAP_PX = 18, 4
-"""Height of a line of text, space between tiles."""
+LINE_PX = 18
+"""Height of the line of text."""
 
 
 def generate(
@@ -39,7 +39,7 @@ def generate(
     workers: int = 1,
     report: Callable[[int, int], None] | None = None,
 ) -> Path:
-    """Draw samples; a call that was interrupted goes on where it was.
+    """Draw samples, and a contact sheet of the first; goes on where it was interrupted.
 
     Args:
         preset: ``paper``, ``diverse`` or a YAML file such as ``configs/data_paper.yaml``, which
@@ -50,9 +50,6 @@ def generate(
         size: (height, width) in pixels instead of the preset's.
         workers: processes.
         report: called with the samples done and asked for.
-
-    Returns:
-        The contact sheet.
 
     Raises:
         InputError: an unknown preset, a value that cannot be meant, or a folder of other samples.
@@ -79,32 +76,32 @@ def _preset(name: str, size: tuple[int, int] | None) -> Preset:
 
 
 def write_sheet(samples: Sequence[Sample], path: str | Path) -> None:
-    """Write a PNG with the five steps of each sample.
+    """Write a PNG with the five steps of each sample in a row.
 
     Flow is coloured by direction, and the more the longer up to the sample's 98 % quantile; depth
-    is bright where near. Under each row stand the camera's motion and focal length.
+    is bright where near.
 
     Raises:
         OutputError: it cannot be written.
     """
-    rows = [_header(samples[0].flow.shape[1])]
-    rows += [_row(sample) for sample in samples]
-    data = cv2.imencode(".png", np.concatenate(rows)[..., ::-1])[1]
+    width = samples[0].moving.shape[1]
+    header = np.full((LINE_PX, len(TITLES) * width, 3), 255, np.uint8)
+    for k, title in enumerate(TITLES):
+        place, font = (k * width + 2, 13), cv2.FONT_HERSHEY_SIMPLEX
+        cv2.putText(header, title, place, font, 0.38, (0, 0, 0), 1, cv2.LINE_AA)
+    sheet = np.concatenate([header, *(np.hstack(_steps(sample)) for sample in samples)])
     with atomic_write(path, "wb") as file:
-        file.write(data.tobytes())
+        file.write(cv2.imencode(".png", sheet[..., ::-1])[1].tobytes())
 
 
-def _header(width: int) -> np.ndarray:
-    return _joined([_text(title, width) for title in TITLES])
-
-
-def _row(sample: Sample) -> np.ndarray:
+def _steps(sample: Sample) -> list[np.ndarray]:
+    """Images (H, W, 3) under :data:`TITLES`."""
     height, width = sample.moving.shape
     x = (np.arange(width) - sample.K[0, 2]) / sample.K[0, 0]
     y = (np.arange(height) - sample.K[1, 2]) / sample.K[1, 1]
     rays = np.stack(np.broadcast_arrays(x, y[:, None]), axis=-1)
     longest = max(float(np.quantile(np.linalg.norm(sample.flow, axis=-1), 0.98)), 1e-3)
-    tiles = [
+    return [
         flow_colours(rays, 1.0),
         _depth_gray(sample.depth_prev),
         np.repeat(np.where(sample.moving, 255, 40).astype(np.uint8)[..., None], 3, axis=2),
@@ -113,23 +110,6 @@ def _row(sample: Sample) -> np.ndarray:
         flow_colours(sample.flow, longest),
         _depth_gray(sample.depth_curr),
     ]
-    image = _joined(tiles)
-    angles, t = (
-        " ".join(f"{v:+.2f}" for v in x) for x in (sample.rotation_deg, sample.translation)
-    )
-    line = f"rotation {angles} deg, translation {t} m, fx {sample.K[0, 0]:.0f} px"
-    return np.concatenate([image, _text(line, image.shape[1])])
-
-
-def _joined(tiles: list[np.ndarray]) -> np.ndarray:
-    gap = np.full((tiles[0].shape[0], GAP_PX, 3), 255, np.uint8)
-    return np.concatenate([part for tile in tiles for part in (tile, gap)], axis=1)
-
-
-def _text(line: str, width: int) -> np.ndarray:
-    image = np.full((LINE_PX, width, 3), 255, np.uint8)
-    cv2.putText(image, line, (2, 13), cv2.FONT_HERSHEY_SIMPLEX, 0.38, (0, 0, 0), 1, cv2.LINE_AA)
-    return image
 
 
 def _depth_gray(depth: np.ndarray) -> np.ndarray:

@@ -25,8 +25,7 @@ from hybridvo.commands.recording import Recording, check_recording
 from hybridvo.commands.run_folder import RESULTS, STATE, Mode, RunFolder
 from hybridvo.data.sequence import Sequence
 from hybridvo.errors import InputError
-from hybridvo.evaluation.metrics import true_trajectory
-from hybridvo.evaluation.pair_errors import pair_errors, true_motion
+from hybridvo.evaluation.pair_errors import pair_errors, true_motion, true_trajectory
 from hybridvo.files import fingerprint, versions
 from hybridvo.flow import FlowField, MeasuredFlow
 from hybridvo.geometry import se3_log

@@ -22,47 +22,31 @@ import os
 import shlex
 import signal
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command; returns its exit code (2: bad input, 5: output that cannot be written)."""
-    try:
-        args = build_parser().parse_args(argv)
-    except SystemExit as end:
-        return int(end.code or 0)
-    from hybridvo.errors import HybridVOError
+def add_train(train: argparse.ArgumentParser, common: argparse.ArgumentParser) -> None:
+    """Commands of ``hybridvo train`` and their options; ``common`` are those of every command."""
+    train.description = __doc__
+    train.formatter_class = argparse.RawDescriptionHelpFormatter
+    commands = train.add_subparsers(required=True, metavar="WHAT")
 
-    command = "hybridvo train " + shlex.join(sys.argv[1:] if argv is None else argv)
-    try:
-        with _processes():
-            args.run(args, command)
-    except HybridVOError as error:
-        sys.stderr.write(f"hybridvo: {error}\n")
-        return error.exit_code
-    return 0
+    def command(name: str, call: Callable[..., None], help: str) -> argparse.ArgumentParser:
+        made = commands.add_parser(name, help=help, parents=[common])
+        made.set_defaults(train=call)
+        return made
 
-
-def build_parser() -> argparse.ArgumentParser:
-    """The parser of ``hybridvo train``."""
-    parser = argparse.ArgumentParser(
-        prog="hybridvo train",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    commands = parser.add_subparsers(required=True)
-    pwvo = commands.add_parser("pwvo", help="train a network of the paper")
-    selector = commands.add_parser("selector", help="train the selector")
-    for part, run in ((pwvo, _pwvo), (selector, _selector)):
+    pwvo = command("pwvo", _pwvo, "train a network of the paper")
+    selector = command("selector", _selector, "train the selector")
+    for part in (pwvo, selector):
         add = part.add_argument
         add("--out", type=Path, required=True, help="folder of the run; goes on where it was")
         add("--time-limit", type=float, default=math.inf, metavar="MIN", help="minutes in all")
         add("--threads", type=int, help="threads of torch; by default torch's own choice")
         add("--overwrite", action="store_true", help="start anew where --out has a training")
         add("--init", metavar="FILE", help="start from these weights: a file, or a pretrained name")
-        part.set_defaults(run=run)
     pwvo.add_argument("--config", type=Path, required=True, help="configs/train_*.yaml")
     pwvo.add_argument("--workers", type=int, default=0, help="processes that draw samples")
     pwvo.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda"))
@@ -72,13 +56,12 @@ def build_parser() -> argparse.ArgumentParser:
     selector.add_argument("--data", type=Path, required=True, help="folder of the shards")
     selector.add_argument("--export", type=Path, metavar="FILE", help="write weights when done")
     selector.add_argument("--held-out", type=Path, help="shards of held-out samples, for --export")
-    export = commands.add_parser("export", help="write a network's weights for users (float16)")
+    export = command("export", _export, "write a network's weights for users (float16)")
     export.add_argument("--out", type=Path, required=True, help="folder of the run")
     export.add_argument("--export", type=Path, required=True, metavar="FILE", help="*.safetensors")
     export.add_argument("--count", type=int, default=1000, help="held-out pairs of each preset")
     export.add_argument("--calibrate", type=int, default=0, metavar="N", help="shift s by N pairs")
-    export.set_defaults(run=_export)
-    data = commands.add_parser("selector-data", help="draw samples for the selector")
+    data = command("selector-data", _selector_data, "draw samples for the selector")
     data.add_argument("--data", type=Path, required=True, help="folder of the shards")
     data.add_argument("--first-seed", type=int, default=1_000_000, help="below 1000: held out")
     data.add_argument("--seeds", type=int, default=0, help="about as many samples")
@@ -87,8 +70,13 @@ def build_parser() -> argparse.ArgumentParser:
     )
     data.add_argument("--split", default="train", help="which of these recordings")
     data.add_argument("--propose", metavar="NETWORK", help="ask these weights about the samples")
-    data.set_defaults(run=_selector_data)
-    return parser
+
+
+def train(args: argparse.Namespace, command: list[str]) -> int:
+    """Run the command."""
+    with _processes():
+        args.train(args, shlex.join(command))
+    return 0
 
 
 @contextlib.contextmanager

@@ -13,7 +13,7 @@ from hybridvo.data.camera_file import CAMERA_FILE, IMAGES, Calibration, read_cam
 from hybridvo.data.lists import (
     depth_at,
     poses_at,
-    read_poses,
+    read_timed_poses,
     shown,
     sorted_files,
     to_seconds,
@@ -192,8 +192,7 @@ def _stamps_and_poses(
     pose_stamps = np.zeros(0)
     stamps = _listed_stamps(root / "timestamps.txt", frames, told)
     if pose_file.exists():
-        pose_stamps, poses = read_poses(pose_file)
-        pose_stamps, converted = to_seconds(pose_stamps, pose_file.name)
+        pose_stamps, poses, converted = read_timed_poses(pose_file)
         told += converted
         if stamps is None and len(poses) == len(frames):
             return pose_stamps, poses

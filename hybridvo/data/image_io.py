@@ -1,11 +1,8 @@
 """Readers and writers of image, depth, flow and camera files.
 
-Every reader compares the size that a header declares with the size of the file before it decodes
-anything. A file that does not fit its format (truncated, damaged, bytes left over, objects to
-unpickle) is a :class:`FormatError` with path, expected and found; none is a ``FileNotFoundError``.
-
-Formats: ``.flo`` of Middlebury and Sintel, Sintel's ``.dpt`` and ``.cam`` (little-endian, tag
-202021.25), ``.npy``, PNG of 8 and 16 bits, JPEG.
+Every reader compares the size that a header declares with that of the file before it decodes
+anything. A file that does not fit its format is a :class:`FormatError` with path, expected and
+found; none is a ``FileNotFoundError``.
 """
 
 from __future__ import annotations
@@ -13,7 +10,6 @@ from __future__ import annotations
 import os
 import struct
 from pathlib import Path
-from typing import IO
 
 import cv2
 import numpy as np
@@ -24,7 +20,6 @@ from hybridvo.files import atomic_write
 from hybridvo.types import MAX_PIXELS
 
 TAG_BYTES = struct.pack("<f", 202021.25)
-NPY_MAGIC = b"\x93NUMPY"
 PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 JPEG_MAGIC = b"\xff\xd8"
 UNKNOWN_FLOW = 1e9
@@ -85,11 +80,7 @@ def read_flow(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray | No
 
 
 def read_depth_rgba_png(path: str | os.PathLike[str]) -> np.ndarray:
-    """(H, W) float32 metres from a TartanAir V2 depth PNG (four bytes of a little-endian float).
-
-    The writer handed the bytes to OpenCV as they lie in memory, so OpenCV's own channel order
-    gives them back.
-    """
+    """(H, W) float32 metres from a TartanAir V2 depth PNG (four bytes of a little-endian float)."""
     image = _decode_exact(path, np.uint8, 4, "a float32 depth PNG of TartanAir V2")
     return np.ascontiguousarray(image).view("<f4")[:, :, 0].astype(np.float32)
 
@@ -146,11 +137,10 @@ def read_npy(path: str | os.PathLike[str], *, channels: int | None = None) -> np
 
 def image_size(path: str | os.PathLike[str]) -> tuple[int, int]:
     """(height, width) from the header of a PNG, JPEG, ``.npy``, ``.flo`` or ``.dpt`` file."""
-    with _open(path) as file:
-        data = file.read(2**18)  # a JPEG may carry a thumbnail before its size
-    if data.startswith(NPY_MAGIC):
+    if Path(path).suffix.lower() == ".npy":
         height, width = _map_npy(path).shape[:2]
         return height, width
+    data = _read_bytes(path)
     if data.startswith(TAG_BYTES):
         return _tagged_size(data, path, Path(path).suffix)
     return _encoded_size(data, path)
@@ -173,19 +163,13 @@ def write_cam(path: str | os.PathLike[str], K: np.ndarray, T_cam_world: np.ndarr
         file.write(np.asarray(T_cam_world, "<f8")[:3].tobytes())
 
 
-def _open(path: str | os.PathLike[str]) -> IO[bytes]:
-    """The file, open for reading; FormatError where it cannot be read."""
+def _read_bytes(path: str | os.PathLike[str]) -> bytes:
     try:
-        return open(path, "rb")
+        return Path(path).read_bytes()
     except FileNotFoundError:
         raise
     except (OSError, ValueError) as error:
         raise FormatError(f"{str(path)[:200]!r}: cannot be read: {error}.") from None
-
-
-def _read_bytes(path: str | os.PathLike[str]) -> bytes:
-    with _open(path) as file:
-        return file.read()
 
 
 def _check_size(path: object, expected: int, got: int, what: str) -> None:
@@ -241,11 +225,11 @@ def _write_tagged(path: str | os.PathLike[str], array: np.ndarray, channels: int
 
 def _map_npy(path: str | os.PathLike[str]) -> np.memmap:
     """Image stored as .npy, mapped: its header is checked, no value is read."""
-    with _open(path):
-        pass
     try:
         array = np.load(path, mmap_mode="r", allow_pickle=False)
         trailing = os.path.getsize(path) - array.offset - array.nbytes
+    except FileNotFoundError:
+        raise
     except Exception as error:  # numpy raises errors of many kinds for a damaged header
         reason = " ".join(str(error).split())[:200]
         raise FormatError(f"{path}: expected a whole .npy file of one array ({reason}).") from None

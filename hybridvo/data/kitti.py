@@ -10,10 +10,11 @@ import numpy as np
 from hybridvo.data.base import Given, Listing, Sequence
 from hybridvo.data.camera_file import Calibration
 from hybridvo.data.image_io import read_rgb
-from hybridvo.data.lists import gap_warning, numbered_files, rigid, to_seconds
+from hybridvo.data.lists import gap_warning, numbered_files, poses_of, to_seconds
 from hybridvo.errors import FormatError, InputError
 from hybridvo.files import read_rows, read_text
 from hybridvo.geometry import invert
+from hybridvo.trajectory import COLUMNS, read_poses
 from hybridvo.types import Camera
 
 DEPTH_FOLDERS = ("depth", "depth_2", "depth_0")
@@ -197,14 +198,9 @@ def _pose_file(root: Path) -> Path | None:
 
 def _read_poses(path: Path, numbers: list[int], P_left: np.ndarray) -> tuple[np.ndarray, list[str]]:
     """(N, 4, 4) T_world_cam of the left camera that is read; the file holds those of camera 0."""
-    rows = read_rows(path, "r11 r12 r13 tx r21 r22 r23 ty r31 r32 r33 tz")
-    poses = np.full((len(numbers), 4, 4), np.nan)
     T_cam_cam0 = np.eye(4)
     T_cam_cam0[:3, 3] = np.linalg.solve(P_left[:, :3], P_left[:, 3])
-    for i, n in enumerate(numbers):
-        if n < len(rows) and np.isfinite(rows[n].numbers).all():
-            pose = rigid(np.reshape(rows[n].numbers, (3, 4)), f"{path}:{rows[n].line}")
-            poses[i] = pose @ invert(T_cam_cam0)
-    missing = int(np.isnan(poses[:, 0, 0]).sum())
-    told = f"{path}: {len(rows)} poses; {missing} of {len(numbers)} have no ground truth."
+    stored = read_poses(path, COLUMNS["kitti"])[1] @ invert(T_cam_cam0)
+    poses, missing = poses_of(numbers, stored)
+    told = f"{path}: {len(stored)} poses; {missing} of {len(numbers)} have no ground truth."
     return poses, [told] if missing else []

@@ -8,17 +8,15 @@ from collections.abc import Sequence as Many
 from pathlib import Path, PurePath
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from hybridvo.errors import FormatError, InputError
-from hybridvo.files import read_rows
 from hybridvo.geometry import pose_matrix
+from hybridvo.trajectory import COLUMNS, read_poses
 from hybridvo.types import as_rigid
 from hybridvo.units import stamp_unit
 
 MAX_STAMP_DIFFERENCE_S = 0.02
 """Largest difference in seconds between stamps that belong together (the TUM tools' value)."""
-TIMED_POSE = "timestamp tx ty tz qx qy qz qw"
 
 
 def natural_key(path: Path) -> list[str | int]:
@@ -115,32 +113,19 @@ def rigid(pose: np.ndarray, where: str) -> np.ndarray:
         raise FormatError(str(error)) from None
 
 
-def read_poses(path: Path, columns: str = TIMED_POSE) -> tuple[np.ndarray, np.ndarray]:
-    """Stamps (N,), as in the file, and poses (N, 4, 4) of a list ``[timestamp] tx .. qw``.
+def poses_of(numbers: Many[int], stored: np.ndarray) -> tuple[np.ndarray, int]:
+    """(N, 4, 4) stored pose of each frame number, NaN beyond the last; how many are unknown."""
+    poses = np.full((len(numbers), 4, 4), np.nan)
+    known = np.array(numbers) < len(stored)
+    poses[known] = stored[np.array(numbers)[known]]
+    return poses, int(np.isnan(poses[:, 0, 0]).sum())
 
-    Poses that are not finite are NaN. Without a column of stamps the first numbers stand for them.
 
-    Raises:
-        FormatError: a damaged row, or a quaternion whose norm is not 1 to within 1 %, with its
-            line number.
-    """
-    rows = read_rows(path, columns)
-    values = np.array([row.numbers[-7:] for row in rows], dtype=np.float64).reshape(-1, 7)
-    finite = np.isfinite(values).all(axis=1)
-    norms = np.linalg.norm(values[:, 3:].clip(-2, 2), axis=1)
-    bad = finite & ~(np.abs(norms - 1) < 0.01)
-    if bad.any():
-        i = int(np.argmax(bad))
-        raise FormatError(
-            f"{path}:{rows[i].line}: expected a unit quaternion qx qy qz qw, got "
-            f"{values[i].tolist()}."
-        )
-    poses = np.full((len(rows), 4, 4), np.nan)
-    if finite.any():
-        poses[finite] = np.eye(4)
-        poses[finite, :3, :3] = Rotation.from_quat(values[finite, 3:]).as_matrix()
-        poses[finite, :3, 3] = values[finite, :3]
-    return np.array([row.numbers[0] for row in rows]), poses
+def read_timed_poses(path: Path) -> tuple[np.ndarray, np.ndarray, list[str]]:
+    """Stamps (N,) in seconds, poses (N, 4, 4) and warnings of a list ``timestamp tx .. qw``."""
+    rows, poses = read_poses(path, COLUMNS["tum"])
+    stamps, told = to_seconds([row.numbers[0] for row in rows], path.name)
+    return stamps, poses, told
 
 
 def poses_at(

@@ -1,8 +1,7 @@
-"""Resizes images, depth, flow and intrinsics together.
+"""Resizes images, depth and intrinsics together.
 
 Pixel (0, 0) is a centre, so resizing by s moves a point to u' = s (u + 0.5) - 0.5, the principal
-point with it, while focal lengths and flow vectors are multiplied by s. Depth and flow take the
-nearest value: a mean across an edge is a surface, or a motion, that does not exist.
+point with it, while focal lengths are multiplied by s.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from hybridvo.types import Camera, Frame, FramePair
+from hybridvo.types import Camera, Frame
 
 
 def resize_camera(camera: Camera, height: int, width: int) -> Camera:
@@ -23,8 +22,19 @@ def resize_camera(camera: Camera, height: int, width: int) -> Camera:
 
 
 def resize_frame(frame: Frame, height: int, width: int) -> Frame:
-    """Frame of another size: image by area (or bilinear when it grows), the rest by nearest."""
-    camera = resize_camera(frame.camera, height, width)
+    """Frame of another size: image by area (or bilinear when it grows), the rest by nearest.
+
+    A mean of depths across an edge would be a surface that does not exist.
+    """
+    # source pixels whose centres are nearest (cv2's INTER_NEAREST takes corners, and no bool)
+    rows, columns = (
+        ((np.arange(size) + 0.5) * (old / size)).astype(np.intp).clip(0, old - 1)
+        for size, old in zip((height, width), frame.camera.shape, strict=True)
+    )
+
+    def nearest(array: np.ndarray | None) -> np.ndarray | None:
+        return None if array is None else array[np.ix_(rows, columns)]
+
     rgb = frame.rgb
     if rgb is not None:
         shrinks = height <= rgb.shape[0] and width <= rgb.shape[1]
@@ -33,41 +43,8 @@ def resize_frame(frame: Frame, height: int, width: int) -> Frame:
     return replace(
         frame,
         rgb=rgb,
-        depth=_nearest(frame.depth, camera),
-        camera=camera,
-        depth_variance=_nearest(frame.depth_variance, camera),
-        mask=_nearest(frame.mask, camera),
+        depth=nearest(frame.depth),
+        camera=resize_camera(frame.camera, height, width),
+        depth_variance=nearest(frame.depth_variance),
+        mask=nearest(frame.mask),
     )
-
-
-def resize_pair(pair: FramePair, height: int, width: int) -> FramePair:
-    """Pair of another size: both frames, both cameras, and the flow with its vectors (px) scaled.
-
-    Flow variance (px^2) is scaled with the area of a pixel.
-    """
-    prev, curr = (resize_frame(frame, height, width) for frame in (pair.prev, pair.curr))
-    scale = np.array([width, height]) / (pair.prev.camera.width, pair.prev.camera.height)
-    flow = _nearest(pair.flow, prev.camera)
-    variance = _nearest(pair.flow_variance, prev.camera)
-    return replace(
-        pair,
-        prev=prev,
-        curr=curr,
-        flow=None if flow is None else flow * scale.astype(np.float32),
-        flow_valid=_nearest(pair.flow_valid, prev.camera),
-        flow_variance=None if variance is None else variance * np.float32(scale.prod()),
-    )
-
-
-def _nearest(array: np.ndarray | None, camera: Camera) -> np.ndarray | None:
-    """(height, width, ...) values of the source pixels whose centres are nearest to the camera's.
-
-    cv2's INTER_NEAREST takes corners, not centres, and no bool.
-    """
-    if array is None:
-        return None
-    rows, columns = (
-        ((np.arange(size) + 0.5) * (old / size)).astype(np.intp).clip(0, old - 1)
-        for size, old in zip(camera.shape, array.shape, strict=False)
-    )
-    return np.ascontiguousarray(array[rows[:, None], columns[None, :]])

@@ -15,9 +15,10 @@ from hybridvo.data.image_io import (
     read_mask_png,
     read_npy,
 )
-from hybridvo.data.lists import numbered_files, read_poses
+from hybridvo.data.lists import numbered_files, poses_of
 from hybridvo.errors import InputError
 from hybridvo.geometry import ned_to_camera
+from hybridvo.trajectory import COLUMNS, read_poses
 from hybridvo.types import Camera
 
 VERSIONS = {"V1": ("left", "flow"), "V2": ("lcam_front", "flow_lcam_front")}
@@ -110,12 +111,9 @@ def _read_poses(path: Path, numbers: list[int]) -> tuple[np.ndarray | None, list
     """Poses in camera axes of the frames with these numbers: line i belongs to frame i."""
     if not path.exists() or not numbers:
         return None, []
-    converted = ned_to_camera(read_poses(path, "tx ty tz qx qy qz qw")[1])
-    known = np.array(numbers) < len(converted)
-    if not known.any() and len(converted) == len(numbers):
-        return converted, [f"{path}: frames start at {numbers[0]}; pose lines are taken in order."]
-    poses = np.full((len(numbers), 4, 4), np.nan)
-    poses[known] = converted[np.array(numbers)[known]]
-    lost = int((~known).sum())
-    told = f"{path}: {len(converted)} poses: {lost} frames have no ground truth."
+    stored = ned_to_camera(read_poses(path, COLUMNS["tartanair"])[1])
+    if min(numbers) >= len(stored) == len(numbers):
+        return stored, [f"{path}: frames start at {numbers[0]}; pose lines are taken in order."]
+    poses, lost = poses_of(numbers, stored)
+    told = f"{path}: {len(stored)} poses: {lost} frames have no ground truth."
     return poses, [told] if lost else []

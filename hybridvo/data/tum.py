@@ -12,7 +12,7 @@ from hybridvo.data.lists import (
     depth_at,
     listed_path,
     poses_at,
-    read_poses,
+    read_timed_poses,
     to_seconds,
 )
 from hybridvo.files import read_rows
@@ -101,8 +101,7 @@ class TumSequence(Sequence):
 
     def _add_poses(self, path: Path, listing: Listing, is_bonn: bool) -> None:
         """Poses of the nearest stamps of the ground truth, in camera axes."""
-        stamps, poses = read_poses(path)
-        stamps, told = to_seconds(stamps, path.name)
+        stamps, poses, told = read_timed_poses(path)
         if self._is_icl:
             stamps = stamps / self.frames_per_second
             reflection = np.diag([1.0, -1.0, 1.0, 1.0])

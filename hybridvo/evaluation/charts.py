@@ -42,15 +42,15 @@ def is_oracle(flow: str) -> bool:
     return "(true)" in flow
 
 
-def _style(methods: Sequence[str]) -> dict[str, Any]:
-    """What all charts share: a colour for each method, black for the ground truth."""
+def _style(methods: Sequence[str], **orders: Sequence[str]) -> dict[str, Any]:
+    """What all charts share: a colour for each method, black for the ground truth; orders."""
     palette = px.colors.qualitative.Dark24
     colours = {method: palette[k % len(palette)] for k, method in enumerate(methods)}
     return {
         "labels": LABELS,
         "template": "plotly_white",
         "height": 420,
-        "category_orders": {"method": [TRUTH, *methods]},
+        "category_orders": {"method": [TRUTH, *methods], **orders},
         "color": "method",
         "color_discrete_map": colours | {TRUTH: "#000"},
     }
@@ -72,16 +72,9 @@ def error_distribution(pairs: pd.DataFrame, methods: Sequence[str]) -> list[Figu
         y="below",
         facet_col="flow_source",
         log_x=True,
-        **_style_of_panels(known, methods),
+        **_style(methods, flow_source=flow_sources(known)),
     )
     return [figure.add_vline(FAILURE_PX, line_dash="dot")]
-
-
-def _style_of_panels(rows: pd.DataFrame, methods: Sequence[str]) -> dict[str, Any]:
-    """Style of a chart with a panel for each source of flow."""
-    style = _style(methods)
-    style["category_orders"]["flow_source"] = flow_sources(rows)
-    return style
 
 
 def failure_chart(breakdown: Mapping[str, Any], methods: Sequence[str]) -> list[Figure]:
@@ -100,7 +93,7 @@ def failure_chart(breakdown: Mapping[str, Any], methods: Sequence[str]) -> list[
         error_x="above",
         error_x_minus="under",
         facet_col="flow_source",
-        **_style_of_panels(rates, methods),
+        **_style(methods, flow_source=flow_sources(rates)),
     )
     return [figure.update_layout(showlegend=False)]
 
@@ -122,8 +115,7 @@ def factor_charts(breakdown: Mapping[str, Any], methods: Sequence[str]) -> list[
         unit = f" [{factor['unit']}]" if factor["unit"] else ""
         column = f"{factor['label']}{unit}"
         mine = mine.assign(**{column: mine.apply(_bin, axis=1)})
-        style = _style(methods)
-        style["category_orders"][column] = list(mine[column].unique())
+        style = _style(methods, **{column: list(mine[column].unique())})
         figure = px.line(mine, x=column, y="epe_l2_px_median", markers=True, log_y=True, **style)
         figures.append(figure.add_hline(FAILURE_PX, line_dash="dot"))
     return figures

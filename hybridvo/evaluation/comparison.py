@@ -13,7 +13,7 @@ import multiprocessing
 import os
 import platform
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict
@@ -23,13 +23,20 @@ from typing import Any, Literal
 
 import filelock
 import numpy as np
+import pandas as pd
 
 from hybridvo.errors import HybridVOError, InputError, LockedError
-from hybridvo.evaluation.plan import ComparisonOptions, methods_to_run, plan
+from hybridvo.evaluation.drawing import draw_worst
+from hybridvo.evaluation.plan import methods_to_run, plan
 from hybridvo.evaluation.protocols import Protocol, protocol_summary
-from hybridvo.evaluation.scores import ROW_COLUMNS, breakdown, total_row
-from hybridvo.evaluation.sequence_job import PAIR_COLUMNS, Job, pair_table, run_sequence
-from hybridvo.evaluation.worst import draw_worst, worst_pairs
+from hybridvo.evaluation.scores import ROW_COLUMNS, breakdown, total_row, worst_pairs
+from hybridvo.evaluation.sequence_job import (
+    PAIR_COLUMNS,
+    ComparisonOptions,
+    Job,
+    pair_table,
+    run_sequence,
+)
 from hybridvo.files import make_folder, versions, write_csv, write_json
 from hybridvo.network.models import Models
 from hybridvo.pipeline import weights_hash
@@ -50,18 +57,11 @@ def compare(
     command: Iterable[str] = (),
     progress: ReportProgress | None = None,
 ) -> list[Path]:
-    """Run every method on every sequence and write the results.
+    """Run every method on every sequence and write the results; returns paths of :data:`WRITTEN`.
 
-    Args:
-        options: what and where.
-        out: output folder.
-        mode: ``new`` refuses a folder with results, ``resume`` keeps finished sequences,
-            ``overwrite`` starts anew.
-        command: for ``results.json``.
-        progress: told of every pair (of every sequence, where several run at a time).
-
-    Returns:
-        Paths of :data:`WRITTEN`.
+    ``new`` refuses a folder with results, ``resume`` keeps finished sequences, ``overwrite`` starts
+    anew. ``command`` is for ``results.json``; ``progress`` is told of every pair (of every
+    sequence, where several run at a time).
 
     Raises:
         InputError: options, sequences or methods that cannot be used. LockedError: another run
@@ -84,25 +84,25 @@ def compare(
         for part in parts:
             for warning in part["sequence"]["warnings"]:
                 report(f"{part['sequence']['name']}: {warning}", total, total)
+        table = pair_table(row for part in parts for row in part["pairs"])
+        at_a_time = "up to {} estimates at the same time: times are upper bounds"
         result = {
             "command": list(command),
             "versions": versions(),
             "machine": {"platform": platform.platform(), "cpus": os.cpu_count()},
             "options": asdict(options),
             "weights": {name: weights_hash(name, models) for name in methods},
-            "timing": (
-                f"up to {options.jobs} estimates at the same time: times are upper bounds"
-                if options.jobs > 1
-                else "one estimate at a time"
-            ),
+            "timing": at_a_time.format(options.jobs) if options.jobs > 1 else "one at a time",
             "started": started,
             "finished": datetime.now(UTC).isoformat(timespec="seconds"),
             "missing": missing,
-            **_scored(out, jobs, parts, protocol, options.worst),
+            **_scores(table, parts, protocol),
+            **_write_sequences(out, jobs, parts, worst_pairs(table, options.worst)),
         }
+        write_csv(out / "pairs.csv", PAIR_COLUMNS, (r for part in parts for r in part["pairs"]))
         write_json(out / "results.json", result)
         write_csv(out / "results.csv", ROW_COLUMNS, result["rows"])
-        write_report(out)
+        write_report(out, result, table)
         shutil.rmtree(out / "parts", ignore_errors=True)
     return [out / name for name in WRITTEN]
 
@@ -193,60 +193,44 @@ def _start_worker(threads: int) -> None:
 # -- results --------------------------------------------------------------------------------------
 
 
-def _scored(
-    out: Path,
-    jobs: list[Job],
-    parts: list[dict[str, Any]],
-    protocol: Protocol | None,
-    worst: int,
+def _scores(
+    table: pd.DataFrame, parts: list[dict[str, Any]], protocol: Protocol | None
 ) -> dict[str, Any]:
-    """Lines, tables and files of all sequences; writes ``pairs.csv``, trajectories and images."""
-    pairs = [row for part in parts for row in part["pairs"]]
-    write_csv(out / "pairs.csv", PAIR_COLUMNS, pairs)
-    table = pair_table(pairs)
+    """Lines and tables of all sequences."""
     rows = [row for part in parts for row in part["rows"]]
     totals = [
         total_row(group, [row for row in rows if (row["method"], row["flow_source"]) == key])
         for key, group in table.groupby(["method", "flow_source"], sort=False)
     ]
     counts = {part["sequence"]["name"]: part["sequence"]["pairs_scored"] for part in parts}
-    entries = worst_pairs(table, worst)
+    return {
+        "rows": rows,
+        "totals": totals,
+        "sequences": [part["sequence"] for part in parts],
+        "breakdown": breakdown(table),
+        "protocol": protocol and protocol_summary(protocol, totals, counts),
+    }
+
+
+def _write_sequences(
+    out: Path, jobs: list[Job], parts: list[dict[str, Any]], worst: list[dict[str, Any]]
+) -> dict[str, Any]:
+    """Write the paths of every sequence and the images of its worst pairs, and say where."""
     trajectories = []
     for folder in ("trajectories", "worst"):
         make_folder(out / folder)
     for number, (job, part) in enumerate(zip(jobs, parts, strict=True)):
         plain = "".join(c if c.isalnum() or c in "-_." else "_" for c in job.name)[:60]
         stem = f"{number:03d}_{plain}"
-        trajectories += _write_trajectories(out, stem, part)
-        mine = [entry for entry in entries if entry["sequence"] == job.name]
+        for key, poses in part["trajectories"].items():
+            if poses is None:
+                continue
+            method, _, flow = key.partition("|")
+            stamps = part["timestamps"]["estimate" if flow else "ground_truth"]
+            path = "_".join([f"trajectories/{stem}", method, *flow.split()[:1]]) + ".tum"
+            Trajectory(np.array(stamps), np.array(poses)).save(out / path)
+            named = {"method": method if flow else None, "flow_source": flow or None}
+            trajectories.append({"sequence": job.name, **named, "path": path})
+        mine = [entry for entry in worst if entry["sequence"] == job.name]
         draw_worst(out, f"worst/{stem}", job, mine, part["pairs"])
-    return {
-        "rows": rows,
-        "totals": totals,
-        "sequences": [part["sequence"] for part in parts],
-        "trajectories": trajectories,
-        "breakdown": breakdown(table),
-        "worst_pairs": entries,
-        "protocol": protocol and protocol_summary(protocol, totals, counts),
-    }
-
-
-def _write_trajectories(out: Path, stem: str, part: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """TUM files of the paths of a sequence, and what they are."""
-    found = []
-    for key, poses in part["trajectories"].items():
-        if poses is None:
-            continue
-        method, _, flow = key.partition("|")
-        stamps = part["timestamps"]["estimate" if flow else "ground_truth"]
-        path = "_".join([f"trajectories/{stem}", method, *flow.split()[:1]]) + ".tum"
-        Trajectory(np.array(stamps), np.array(poses)).save(out / path)
-        found.append(
-            {
-                "sequence": part["sequence"]["name"],
-                "method": method if flow else None,
-                "flow_source": flow or None,
-                "path": path,
-            }
-        )
-    return found
+    return {"trajectories": trajectories, "worst_pairs": worst}

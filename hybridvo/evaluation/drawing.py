@@ -1,8 +1,8 @@
-"""Images of one pair: the paper's figures, and what networks look at."""
+"""Images of one pair: the paper's figures, what networks look at, and the worst of a comparison."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ from hybridvo.errors import InputError
 from hybridvo.estimation import estimate
 from hybridvo.evaluation.maps import (
     error_map,
+    flow_colours,
     longest_flow,
     moving_pixels,
     object_flow,
@@ -21,8 +22,9 @@ from hybridvo.evaluation.maps import (
     uncertainty_maps,
 )
 from hybridvo.evaluation.pair_errors import pair_errors, true_motion
-from hybridvo.evaluation.plots import FlowPanel, ImagePanel, Panel, ScalarPanel, maps_png
+from hybridvo.evaluation.plots import Panel, draw_panels
 from hybridvo.evaluation.saliency import last_pass, saliencies
+from hybridvo.evaluation.sequence_job import Job
 from hybridvo.files import atomic_write, make_folder, write_json
 from hybridvo.flow import dis_flow
 from hybridvo.geometry import matrix_to_euler_deg
@@ -30,7 +32,7 @@ from hybridvo.network.layers import KINDS
 from hybridvo.network.models import load_weights
 from hybridvo.network.weights import pretrained, pretrained_names
 from hybridvo.pipeline import DEFAULT_METHOD
-from hybridvo.results import PixelwisePrediction, RelativePose
+from hybridvo.results import PixelwisePrediction
 from hybridvo.types import FramePair
 
 
@@ -57,9 +59,6 @@ def draw(
         steps: of the integrated gradients.
         overwrite: replace what is there.
 
-    Returns:
-        The files written.
-
     Raises:
         InputError: unknown pair or weights, or an image that exists or is no PNG.
         OutputError: the image cannot be written.
@@ -71,7 +70,7 @@ def draw(
         raise InputError(f"{out}: exists; pass --overwrite.")
     if steps < 1:
         raise InputError(f"steps: expected at least 1, got {steps}.")
-    given = read_pair(sequence, pair, flow)
+    given = _read_pair(sequence, pair, flow)
     found = networks(weights)
     flow_gt = None
     if sequence.has_flow and sequence.flow_is_true:
@@ -79,9 +78,9 @@ def draw(
     T_gt = true_motion(sequence, pair, pair + 1)
     method = method or DEFAULT_METHOD
     motion = estimate(given, method=method)
-    panels, numbers, moving = pair_panels(given, motion, T_gt, flow_gt)
+    panels, numbers, moving = _pair_panels(given, motion.T_curr_prev, motion.weights, T_gt, flow_gt)
     for name, network in found:
-        more, values = network_panels(name, network, given, T_gt, moving, steps)
+        more, values = _network_panels(name, network, given, T_gt, moving, steps)
         panels += more
         numbers |= values
     source = f"{given.flow_source} (true)" if given.flow_is_true else given.flow_source
@@ -89,18 +88,56 @@ def draw(
     height, width = given.prev.camera.shape
     make_folder(out.parent)
     with atomic_write(out, "wb") as file:
-        file.write(maps_png(panels, heading, width / height))
+        file.write(draw_panels(panels, heading, width / height))
     record = {"title": heading, "image": out.name, "values": numbers}
     write_json(out.with_suffix(".json"), record)
     return [out, out.with_suffix(".json")]
 
 
-def read_pair(sequence: Sequence, index: int, flow: str = "auto") -> FramePair:
-    """Pair of a sequence that has flow and depth.
+def draw_worst(
+    out: Path,
+    stem: str,
+    job: Job,
+    entries: Iterable[dict[str, Any]],
+    rows: Iterable[Mapping[str, Any]],
+) -> None:
+    """Draw worst pairs of one sequence of a comparison, with the motion that it found.
 
-    Raises:
-        InputError: no such pair, or one without flow or depth.
+    Each of ``entries`` gets ``picture`` (a path below ``out`` that begins with ``stem``), or None
+    and ``picture_reason``. ``rows`` are the pairs of the sequence.
     """
+    sequence, models, flows = job.open()
+    found = {(row["index"], row["method"], row["flow_source"]): row for row in rows}
+    for entry in entries:
+        method, label = entry["method"], entry["flow_source"]
+        row = found[entry["index"], method, label]
+        entry |= {"picture": None, "picture_reason": None}
+        try:
+            prev, curr = sequence.frame(row["prev"]), sequence.frame(row["next"])
+        except (InputError, OSError) as error:
+            entry["picture_reason"] = f"the pair cannot be read: {error}"
+            continue
+        field = flows[label](prev, curr)
+        if field.flow is None or prev.depth is None:
+            entry["picture_reason"] = "the pair has no flow, or no depth"
+            continue
+        pair = FramePair(prev, curr, field.flow, field.variance, field.valid)
+        weights = None
+        if not entry["status"].startswith("failed"):  # of the pair on its own, without a tracker
+            weights = estimate(pair, method=method, models=models).weights
+        T_gt = true_motion(sequence, prev.index, curr.index)
+        T_est = np.array(row["T_curr_prev"]).reshape(4, 4)
+        panels = _pair_panels(pair, T_est, weights, T_gt, None)[0]
+        aspect = prev.camera.width / prev.camera.height
+        entry["picture"] = f"{stem}_{entry['index']:06d}_{method}_{label.split()[0]}.jpg"
+        with atomic_write(out / entry["picture"], "wb") as file:
+            file.write(
+                draw_panels(panels, "", aspect, columns=len(panels), inches=2.2, format="jpeg")
+            )
+
+
+def _read_pair(sequence: Sequence, index: int, flow: str) -> FramePair:
+    """Pair of a sequence that has flow and depth."""
     if not 0 <= index < len(sequence) - 1:
         raise InputError(
             f"--pair: {sequence.name} has pairs 0 to {len(sequence) - 2}, got {index}."
@@ -112,44 +149,6 @@ def read_pair(sequence: Sequence, index: int, flow: str = "auto") -> FramePair:
         missing = "flow" if pair.flow is None else "depth"
         raise InputError(f"{sequence.name}, pair {index}: there is no {missing} to look at.")
     return pair
-
-
-def pair_panels(
-    pair: FramePair, motion: RelativePose, T_gt: np.ndarray | None, flow_gt: np.ndarray | None
-) -> tuple[list[Panel], dict[str, float | None], np.ndarray]:
-    """Panels and numbers that need no network, and (H, W) which pixels move by themselves."""
-    flow, depth = np.asarray(pair.flow), np.asarray(pair.prev.depth)
-    ego, objects = object_flow(pair, motion.T_curr_prev)
-    real, whose = objects, "this flow and the estimate"
-    if T_gt is not None and flow_gt is not None:
-        real = object_flow(replace(pair, flow=flow_gt), T_gt)[1]
-        whose = "true flow and motion"
-    moving = moving_pixels(real)
-    # one scale for all three: the parts are to be seen beside the whole
-    longest = longest_flow(flow)
-    panels: list[Panel] = []
-    if pair.prev.rgb is not None:
-        panels.append(ImagePanel("previous image", pair.prev.rgb))
-    panels += [
-        FlowPanel("input flow F", flow, longest),
-        FlowPanel("ego flow of the estimate", ego, longest),
-        FlowPanel("object flow, F minus ego flow", objects, longest),
-    ]
-    numbers: dict[str, float | None] = {f"moving share, {whose}": float(moving.mean())}
-    if T_gt is not None:
-        prev, curr = pair.prev.camera, pair.curr.camera
-        error = error_map(motion.T_curr_prev, T_gt, depth, prev, curr)
-        panels.append(ScalarPanel("error of the ego flow", error, "px"))
-        errors = pair_errors(motion.T_curr_prev, T_gt, depth, prev, curr)
-        numbers |= {
-            "EPE, px": errors["epe_l2_px"],
-            "rotation error, deg": errors["rot_err_deg"],
-            "translation error, m": errors["trans_err"],
-        }
-    if motion.weights is not None:
-        title = "weights of the motion (outline: what moves by itself)"
-        panels.append(ScalarPanel(title, motion.weights, "weight", 1.0, moving))
-    return panels, numbers, moving
 
 
 def networks(files: Iterable[str | Path] = ()) -> list[tuple[str, Any]]:
@@ -170,7 +169,55 @@ def networks(files: Iterable[str | Path] = ()) -> list[tuple[str, Any]]:
     return found
 
 
-def network_panels(
+# -- panels ---------------------------------------------------------------------------------------
+
+
+def flow_panel(title: str, flow: np.ndarray, longest: float) -> Panel:
+    """A flow (H, W, 2) in colours, of full saturation at ``longest`` px."""
+    return Panel(f"{title} (full colour: {longest:.3g} px)", flow_colours(flow, longest))
+
+
+def _pair_panels(
+    pair: FramePair,
+    T_est: np.ndarray,
+    weights: np.ndarray | None,
+    T_gt: np.ndarray | None,
+    flow_gt: np.ndarray | None,
+) -> tuple[list[Panel], dict[str, float | None], np.ndarray]:
+    """Panels and numbers that need no network, and (H, W) which pixels move by themselves."""
+    flow, depth = np.asarray(pair.flow), np.asarray(pair.prev.depth)
+    ego, objects = object_flow(pair, T_est)
+    real, whose = objects, "this flow and the estimate"
+    if T_gt is not None and flow_gt is not None:
+        real = object_flow(replace(pair, flow=flow_gt), T_gt)[1]
+        whose = "true flow and motion"
+    moving = moving_pixels(real)
+    # one scale for all three: the parts are to be seen beside the whole
+    longest = longest_flow(flow)
+    panels = [] if pair.prev.rgb is None else [Panel("previous image", pair.prev.rgb)]
+    panels += [
+        flow_panel("flow F", flow, longest),
+        flow_panel("ego flow", ego, longest),
+        flow_panel("F minus ego flow", objects, longest),
+    ]
+    numbers: dict[str, float | None] = {f"moving share, {whose}": float(moving.mean())}
+    if T_gt is not None:
+        cameras = pair.prev.camera, pair.curr.camera
+        error = error_map(T_est, T_gt, depth, *cameras)
+        panels.append(Panel("error of the ego flow", error, "px"))
+        errors = pair_errors(T_est, T_gt, depth, *cameras)
+        numbers |= {
+            "EPE, px": errors["epe_l2_px"],
+            "rotation error, deg": errors["rot_err_deg"],
+            "translation error, m": errors["trans_err"],
+        }
+    if weights is not None:
+        title = "weights (outline: moving)"
+        panels.append(Panel(title, weights, "weight", 1.0, moving))
+    return panels, numbers, moving
+
+
+def _network_panels(
     name: str,
     network: Any,
     pair: FramePair,
@@ -183,22 +230,21 @@ def network_panels(
     panels: list[Panel] = []
     numbers: dict[str, float | None] = {}
     if isinstance(output, PixelwisePrediction):
-        units = [("rotation", "deg"), ("translation", "m")]
-        if output.log_scale_rotation is not None:
-            for (what, unit), values in zip(units, uncertainty_maps(output), strict=True):
-                title = f"{name}: uncertainty of the {what}"
-                panels.append(ScalarPanel(title, values, f"{unit} (1 sigma)", None, moving))
+        halves = (("rotation", "deg"), ("translation", "m"))
+        for (what, unit), values in zip(halves, uncertainty_maps(output), strict=False):
+            title = f"{name}: uncertainty of the {what}"
+            panels.append(Panel(title, values, f"{unit} (1 sigma)", None, moving))
         if T_gt is not None:
             true = matrix_to_euler_deg(T_gt[:3, :3]), T_gt[:3, 3]
-            for (what, unit), values in zip(units, prediction_errors(output, *true), strict=True):
-                panels.append(ScalarPanel(f"{name}: error of the {what}", values, unit))
+            for (what, unit), values in zip(halves, prediction_errors(output, *true), strict=True):
+                panels.append(Panel(f"{name}: error of the {what}", values, unit))
     for what, saliency in saliencies(network, inputs, T_start, steps).items():
         n = 4  # summed over blocks: networks read one of some pixels only
         h, w = (size // n for size in saliency.magnitude.shape)
         shown = saliency.magnitude[: n * h, : n * w].reshape(h, n, w, n).sum(axis=(1, 3))
         relative = shown / max(float(np.percentile(shown, 99)), 1e-30)
         title = f"{name}: saliency of the {what} (last pass)"
-        panels.append(ScalarPanel(title, relative, "relative", 1.0, moving))
+        panels.append(Panel(title, relative, "relative", 1.0, moving))
         numbers |= {
             f"{name}: saliency of the {what} on moving pixels": saliency.share_on(moving),
             f"{name}: part of the {what} that the saliency misses": saliency.completeness_error,

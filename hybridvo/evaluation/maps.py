@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from hybridvo.errors import InputError
 from hybridvo.evaluation.pair_errors import MOVING_PX
 from hybridvo.geometry import ego_flow
 from hybridvo.results import PixelwisePrediction
@@ -23,22 +22,13 @@ _COLOURS = 255 * np.array(
 
 
 def flow_colours(flow: np.ndarray, longest: float | None = None) -> np.ndarray:
-    """Flow in the standard colours of Middlebury: hue is the direction, saturation the length.
+    """(H, W, 3) uint8 RGB of a flow (H, W, 2) in the standard colours of Middlebury.
 
-    Args:
-        flow: (H, W, 2) px; NaN and inf are black.
-        longest: length that has full saturation, px; default: the 99th percentile. Longer vectors
-            are darker, as in the benchmark's own pictures.
-
-    Returns:
-        (H, W, 3) uint8 RGB; white is no motion, red to the right, yellow-green downwards.
-
-    Raises:
-        InputError: another shape.
+    Hue is the direction (red to the right, yellow-green downwards), saturation the length. Vectors
+    of ``longest`` px have full saturation (default: the 99th percentile), longer ones are darker;
+    no motion is white, NaN and inf are black.
     """
     flow = np.asarray(flow)
-    if flow.ndim != 3 or flow.shape[2] != 2:
-        raise InputError(f"flow_colours: expected flow of shape (H, W, 2), got {flow.shape}.")
     known = np.isfinite(flow).all(axis=2)
     u, v = np.moveaxis(np.where(known[..., None], flow, 0.0), 2, 0)
     radius = (np.hypot(u, v) / (longest or longest_flow(flow)))[..., None]
@@ -55,29 +45,11 @@ def longest_flow(flow: np.ndarray) -> float:
     return max(float(np.percentile(length, 99)), 1e-6) if length.size else 1.0
 
 
-def colour_wheel(size: int = 65) -> np.ndarray:
-    """Legend of :func:`flow_colours`: (size, size, 4) uint8 RGBA, the longest vectors at the rim.
-
-    A pixel of the wheel has the colour of a flow that points from the centre to it.
-    """
-    half = (size - 1) / 2
-    v, u = (np.mgrid[0:size, 0:size] - half) / half
-    rgb = flow_colours(np.dstack([u, v]), 1.0)
-    alpha = np.where(np.hypot(u, v) <= 1.0, 255, 0).astype(np.uint8)
-    return np.dstack([rgb, alpha])
-
-
 def object_flow(pair: FramePair, T_curr_prev: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(ego flow, object flow) of a pair under a motion, (H, W, 2) px each, NaN where unknown.
-
-    Raises:
-        InputError: a pair without flow or depth.
-    """
-    if pair.flow is None or pair.prev.depth is None:
-        missing = "flow" if pair.flow is None else "previous depth"
-        raise InputError(f"object_flow: the pair has no {missing}.")
-    ego = ego_flow(pair.prev.depth, T_curr_prev, pair.prev.camera, pair.curr.camera)
-    return ego, pair.flow - ego
+    """(ego flow, object flow) of a pair with flow and depth, (H, W, 2) px, NaN where unknown."""
+    depth = np.asarray(pair.prev.depth)
+    ego = ego_flow(depth, T_curr_prev, pair.prev.camera, pair.curr.camera)
+    return ego, np.asarray(pair.flow) - ego
 
 
 def moving_pixels(objects: np.ndarray) -> np.ndarray:
@@ -94,39 +66,25 @@ def error_map(
     return np.hypot(difference[..., 0], difference[..., 1])
 
 
-def uncertainty_maps(prediction: PixelwisePrediction) -> tuple[np.ndarray, np.ndarray]:
-    """Predicted uncertainty of rotation and translation at every pixel of the first pair.
+def uncertainty_maps(prediction: PixelwisePrediction) -> list[np.ndarray]:
+    """Predicted uncertainty of rotation (degrees) and translation (m) of the first pair.
 
-    Returns:
-        Two (h, w) maps: the geometric mean of the three Laplace scales U, in degrees and metres.
-
-    Raises:
-        InputError: the network predicts no uncertainty.
+    Two (h, w) maps: the geometric mean of the three Laplace scales U at every pixel.
     """
-    rotation, translation = prediction.log_scale_rotation, prediction.log_scale_translation
-    if rotation is None or translation is None:
-        raise InputError("uncertainty_maps: the network predicts no uncertainty.")
-    first, second = (
-        scale[0].detach().float().mean(0).exp().cpu().numpy() for scale in (rotation, translation)
-    )
-    return first, second
+    scales = (prediction.log_scale_rotation, prediction.log_scale_translation)
+    return [s[0].detach().float().mean(0).exp().cpu().numpy() for s in scales if s is not None]
 
 
 def prediction_errors(
     prediction: PixelwisePrediction, euler_deg: np.ndarray, translation: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+) -> list[np.ndarray]:
     """Error of the predicted motion at every pixel of the first pair: the paper's error maps.
 
-    Args:
-        prediction: maps of (B, 3, h, w).
-        euler_deg: (3,) true Euler angles X-Y-Z of T_curr_prev, degrees.
-        translation: (3,) true translation of T_curr_prev, metres.
-
-    Returns:
-        Two (h, w) maps: mean absolute difference over the three components, degrees and metres.
+    Two (h, w) maps: mean absolute difference from the true Euler angles X-Y-Z (3,) of T_curr_prev,
+    degrees, and from its translation (3,), metres.
     """
-    first, second = (
+    parts = ((prediction.rotation, euler_deg), (prediction.translation, translation))
+    return [
         np.abs(value[0].detach().cpu().double().numpy() - np.reshape(true, (3, 1, 1))).mean(axis=0)
-        for value, true in ((prediction.rotation, euler_deg), (prediction.translation, translation))
-    )
-    return first, second
+        for value, true in parts
+    ]

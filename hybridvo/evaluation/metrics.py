@@ -1,25 +1,23 @@
-"""Errors of a trajectory against ground truth: ATE and RPE through evo, KITTI's drift.
+"""Errors of a trajectory against ground truth: ATE and RPE through evo, drift as KITTI measures it.
 
-A value that cannot be computed is None with a reason. evo aligns in place and raises on degenerate
-paths: it gets copies, and only paths that determine the alignment.
+What the paths do not determine is a :class:`DegenerateError`; a report holds None and its reason.
 """
 
 from __future__ import annotations
 
+import functools
 import os
-from collections.abc import Iterable
-from dataclasses import dataclass, field
-from typing import Any, Literal
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hybridvo.data.base import Sequence
 from hybridvo.data.lists import MAX_STAMP_DIFFERENCE_S
 from hybridvo.data.lists import associate as associate_stamps
-from hybridvo.errors import InputError
-from hybridvo.evaluation.drift import KITTI_LENGTHS, NOT_FINITE, SHORT_LENGTHS, kitti_drift
-from hybridvo.geometry import invert, pose_matrix
+from hybridvo.errors import DegenerateError, InputError
+from hybridvo.geometry import invert, rotation_angle
 from hybridvo.trajectory import Trajectory, read_trajectory
 
 Alignment = Literal["se3", "sim3", "origin", "none"]
@@ -28,17 +26,19 @@ DeltaUnit = Literal["frames", "s"]
 MIN_WIDTH = 1e-12
 """Product of the relative widths of both paths below which they are straight: above rounding
 (1e-16), below one millimetre aside on a hundred metres (1e-10)."""
+KITTI_LENGTHS = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
+"""Sub-path lengths of the KITTI odometry benchmark, metres."""
+SHORT_LENGTHS = (5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0)
+"""Sub-path lengths for indoor sequences, metres (TartanAir's evaluator)."""
+NOT_FINITE = "the error is not a finite number: positions are too large"
 
 
 @dataclass(frozen=True, eq=False)
 class Association:
     """Poses of two trajectories that belong together: (M,) indices into each.
 
-    Args:
-        est_indices, gt_indices: matched poses. total: poses of the shorter trajectory.
-        by: ``time`` or, where a file has no timestamps, ``index``.
-        max_diff: largest time difference allowed, seconds; None by index.
-        reason: why no error can be computed from these matches, or the empty string.
+    ``total`` counts the poses of the shorter one, ``by`` is ``time`` or ``index``, ``max_diff`` the
+    largest time difference allowed (s), ``reason`` why no error can be computed from the matches.
     """
 
     est_indices: np.ndarray
@@ -51,47 +51,41 @@ class Association:
 
 @dataclass(frozen=True, eq=False)
 class TrajectoryError:
-    """Absolute or relative errors of matched poses; empty arrays with a ``reason`` if none.
+    """Errors of matched poses: (M,) metres and degrees at (M,) stamps of the ground truth.
 
-    Args:
-        alignment: how the estimate was aligned. reason: why there are no errors.
-        translation: (M,) metres. rotation_deg: (M,) degrees, of relative errors only.
-        timestamps: (M,) of the ground truth, seconds.
-        scale: factor that the alignment put on the estimate, or None.
-        T_gt_est: (4, 4) alignment: an estimated position p becomes ``T_gt_est @ (scale p)``.
+    An estimated position p was taken as ``T_gt_est @ (scale p)``.
     """
 
-    alignment: Alignment
-    reason: str = ""
-    translation: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    rotation_deg: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    timestamps: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    scale: float | None = None
-    T_gt_est: np.ndarray | None = None
+    translation: np.ndarray
+    rotation_deg: np.ndarray
+    timestamps: np.ndarray
+    scale: float
+    T_gt_est: np.ndarray
+
+    def __post_init__(self) -> None:
+        with np.errstate(over="ignore", invalid="ignore"):
+            if not np.isfinite(self.translation**2).all():
+                raise DegenerateError(NOT_FINITE)
 
     @property
-    def rmse(self) -> float | None:
-        """Root mean square of the translation errors, metres; None with a ``reason``."""
-        return float(np.sqrt(np.mean(self.translation**2))) if len(self.translation) else None
+    def rmse(self) -> float:
+        """Root mean square of the translation errors, metres."""
+        return float(np.sqrt(np.mean(self.translation**2)))
 
     @property
-    def rotation_rmse_deg(self) -> float | None:
-        """Root mean square of the rotation errors, degrees; None with a ``reason``."""
-        return float(np.sqrt(np.mean(self.rotation_deg**2))) if len(self.rotation_deg) else None
+    def rotation_rmse_deg(self) -> float:
+        """Root mean square of the rotation errors, degrees."""
+        return float(np.sqrt(np.mean(self.rotation_deg**2)))
 
 
 def associate(est: Trajectory, gt: Trajectory, *, max_diff: float | None = None) -> Association:
     """Match poses one to one: by nearest timestamp, or by index where one has no timestamps.
 
-    Args:
-        est: estimated trajectory.
-        gt: ground truth.
-        max_diff: largest difference of matched timestamps, seconds. Default: 0.02, or half the
-            median spacing of the sparser trajectory if that is smaller.
+    ``max_diff`` is the largest difference of matched timestamps, seconds; by default 0.02, or half
+    the median spacing of the sparser trajectory if that is smaller.
     """
-    total = min(len(est), len(gt))
+    total, reason = min(len(est), len(gt)), ""
     if not (est.has_timestamps and gt.has_timestamps):
-        reason = ""
         if len(est) != len(gt):
             reason = (
                 f"poses without timestamps can only be matched one by one, but the estimate has "
@@ -105,7 +99,6 @@ def associate(est: Trajectory, gt: Trajectory, *, max_diff: float | None = None)
     within = np.nextafter(max_diff, np.inf)
     matches = associate_stamps(est.timestamps, gt.timestamps, within)
     i, j = np.array(matches, dtype=int).reshape(-1, 2).T
-    reason = ""
     if 2 * len(i) < total:
         reason = (
             f"only {len(i)} of {total} poses match within {max_diff:.4g} s (estimate "
@@ -115,50 +108,53 @@ def associate(est: Trajectory, gt: Trajectory, *, max_diff: float | None = None)
     return Association(i, j, total, "time", max_diff, reason)
 
 
-def _to_evo(trajectory: Trajectory, indices: np.ndarray) -> Any:
+def _evo_paths(est: Trajectory, gt: Trajectory, match: Association | None) -> tuple[Any, ...]:
+    """Matched poses as evo's paths (copies: evo aligns in place), and the true stamps."""
     from evo.core.trajectory import PosePath3D
 
-    return PosePath3D(poses_se3=[T.copy() for T in trajectory.T_world_cam[indices]])
+    match = match or associate(est, gt)
+    if match.reason:
+        raise DegenerateError(match.reason)
+    matched = (est.T_world_cam[match.est_indices], gt.T_world_cam[match.gt_indices])
+    paths = (PosePath3D(poses_se3=[T.copy() for T in poses]) for poses in matched)
+    return (*paths, gt.timestamps[match.gt_indices])
 
 
-def _degeneracy(est: np.ndarray, gt: np.ndarray) -> str:
-    """Why (M, 3) positions of estimate and truth determine no alignment, or the empty string."""
+def _check_width(est: np.ndarray, gt: np.ndarray) -> None:
+    """Refuse (M, 3) positions of estimate and truth that determine no alignment."""
     if len(est) < 3:
-        return f"not enough poses: {len(est)} matched, an alignment needs 3"
+        raise DegenerateError(f"not enough poses: {len(est)} matched, an alignment needs 3")
     centred = []
     for name, positions in (("estimate", est), ("ground truth", gt)):
         moved = positions - positions.mean(axis=0)
         size = float(np.linalg.norm(moved))
         if not np.isfinite(size):
-            return NOT_FINITE
+            raise DegenerateError(NOT_FINITE)
         if size <= 1e-12 * float(np.abs(positions).max()):
-            return f"static camera: the positions of the {name} do not move"
+            raise DegenerateError(f"static camera: the positions of the {name} do not move")
         centred.append(moved / size)
     if np.linalg.svd(centred[1].T @ centred[0], compute_uv=False)[1] <= MIN_WIDTH:
-        return "straight line: the camera path leaves the rotation about it open"
-    return ""
+        raise DegenerateError("straight line: the camera path leaves the rotation about it open")
 
 
 @np.errstate(over="ignore", invalid="ignore")
-def _align(est: Any, gt: Any, alignment: Alignment) -> tuple[np.ndarray, float, str]:
-    """Align the evo path ``est`` to ``gt`` in place: (T_gt_est, scale, reason why it failed)."""
+def _align(est: Any, gt: Any, alignment: Alignment) -> tuple[np.ndarray, float]:
+    """Align the evo path ``est`` to ``gt`` in place: T_gt_est and scale."""
     from evo import EvoException
 
     T = np.eye(4)
     if alignment == "none":
-        return T, 1.0, ""
+        return T, 1.0
     if alignment == "origin":
-        return np.asarray(est.align_origin(gt)), 1.0, ""
-    reason = _degeneracy(est.positions_xyz, gt.positions_xyz)
-    if reason:
-        return T, 1.0, reason
+        return np.asarray(est.align_origin(gt)), 1.0
+    _check_width(est.positions_xyz, gt.positions_xyz)
     try:
         T[:3, :3], T[:3, 3], scale = est.align(gt, correct_scale=alignment == "sim3")
     except (EvoException, np.linalg.LinAlgError) as error:
-        return T, 1.0, f"evo: {error}"
+        raise DegenerateError(f"evo: {error}") from error
     if scale <= 0:
-        return T, 1.0, "the paths are not correlated: no positive scale fits"
-    return T, float(scale), ""
+        raise DegenerateError("the paths are not correlated: no positive scale fits")
+    return T, float(scale)
 
 
 def ate(
@@ -172,40 +168,35 @@ def ate(
 
     ``se3`` (rigid, least squares) is the rule for metric methods; ``sim3`` has a scale, ``origin``
     makes the first matched poses equal. ``association``: matches found before.
+
+    Raises:
+        DegenerateError: too few poses match, or they determine no alignment.
     """
     from evo.core.metrics import APE, PoseRelation
 
-    match = association or associate(est, gt)
-    if match.reason:
-        return TrajectoryError(alignment, match.reason)
-    paths = _to_evo(est, match.est_indices), _to_evo(gt, match.gt_indices)
-    T, scale, reason = _align(*paths, alignment)
-    if reason:
-        return TrajectoryError(alignment, reason)
+    path, true_path, stamps = _evo_paths(est, gt, association)
+    T, scale = _align(path, true_path, alignment)
     metric = APE(PoseRelation.translation_part)
     with np.errstate(over="ignore", invalid="ignore"):
-        metric.process_data((paths[1], paths[0]))
-        errors = np.asarray(metric.error)
-        if not np.isfinite(errors**2).all():
-            return TrajectoryError(alignment, NOT_FINITE)
-    stamps = gt.timestamps[match.gt_indices]
-    return TrajectoryError(
-        alignment, translation=errors, timestamps=stamps, scale=scale, T_gt_est=T
-    )
+        metric.process_data((true_path, path))
+    return TrajectoryError(np.asarray(metric.error), np.zeros(0), stamps, scale, T)
 
 
 def aligned(
     est: Trajectory, gt: Trajectory, alignment: Alignment = "se3"
-) -> tuple[Trajectory, TrajectoryError | None]:
+) -> tuple[Trajectory, TrajectoryError | None, Alignment]:
     """Estimate in the truth's world by the best alignment that the paths determine, and its ATE.
 
     Paths of which nothing matches start at the same place, and their error is None.
     """
-    for kind in dict.fromkeys((alignment, "origin")):
-        error = ate(est, gt, kind)
-        if error.T_gt_est is not None:
-            return est.transformed(error.T_gt_est, error.scale or 1.0), error
-    return est.transformed(gt.T_world_cam[0] @ invert(est.T_world_cam[0])), None
+    kinds: tuple[Alignment, ...] = (alignment, "origin")
+    for kind in kinds:
+        try:
+            error = ate(est, gt, kind)
+        except DegenerateError:
+            continue
+        return est.transformed(error.T_gt_est, error.scale), error, kind
+    return est.transformed(gt.T_world_cam[0] @ invert(est.T_world_cam[0])), None, "origin"
 
 
 def rpe(
@@ -217,44 +208,32 @@ def rpe(
     *,
     association: Association | None = None,
 ) -> TrajectoryError:
-    """Relative pose error over all (overlapping) pairs that are ``delta`` apart.
+    """Relative pose error over all (overlapping) pairs of poses that are ``delta`` apart.
 
-    Args:
-        est: estimated trajectory.
-        gt: ground truth.
-        delta: distance of the two poses of a pair.
-        delta_unit: ``frames``, or ``s``: the partner is the pose nearest to that time, at most
-            half a frame away.
-        alignment: only ``sim3`` changes the values: its scale is applied to the estimate.
-        association: matches found before.
+    In seconds the partner is the pose nearest to that time, at most half a frame away. Only
+    ``sim3`` changes the values: its scale is applied to the estimate.
+
+    Raises:
+        DegenerateError: too few poses match, or no two are ``delta`` apart.
     """
     from evo.core.metrics import RPE
 
     match = association or associate(est, gt)
-    if match.reason:
-        return TrajectoryError(alignment, match.reason)
+    path, true_path, stamps = _evo_paths(est, gt, match)
     if delta_unit == "s" and match.by != "time":
-        reason = "a distance in seconds needs timestamps in both trajectories"
-        return TrajectoryError(alignment, reason)
-    stamps = gt.timestamps[match.gt_indices]
+        raise DegenerateError("a distance in seconds needs timestamps in both trajectories")
     first, last = _pairs(stamps, delta, delta_unit)
     if not len(first):
         reason = f"not enough poses: of {len(stamps)} no two are {delta:g} {delta_unit} apart"
-        return TrajectoryError(alignment, reason)
-    paths, scale = (_to_evo(est, match.est_indices), _to_evo(gt, match.gt_indices)), 1.0
-    if alignment == "sim3":
-        _, scale, reason = _align(*paths, "sim3")
-        if reason:
-            return TrajectoryError(alignment, reason)
-    P, Q = (path.poses_se3 for path in paths)
+        raise DegenerateError(reason)
+    T, scale = _align(path, true_path, "sim3" if alignment == "sim3" else "none")
+    P, Q = path.poses_se3, true_path.poses_se3
     with np.errstate(over="ignore", invalid="ignore"):
-        errors = [RPE.rpe_base(Q[i], Q[j], P[i], P[j]) for i, j in zip(first, last, strict=True)]
-        E = np.array(errors)
+        pairs = zip(first, last, strict=True)
+        E = np.array([RPE.rpe_base(Q[i], Q[j], P[i], P[j]) for i, j in pairs])
         translation = np.linalg.norm(E[:, :3, 3], axis=1)
-        if not np.isfinite(translation**2).all():
-            return TrajectoryError(alignment, NOT_FINITE)
     angles = np.degrees(Rotation.from_matrix(E[:, :3, :3]).magnitude())
-    return TrajectoryError(alignment, "", translation, angles, stamps[first], scale)
+    return TrajectoryError(translation, angles, stamps[first], scale, T)
 
 
 def _pairs(stamps: np.ndarray, delta: float, unit: DeltaUnit) -> tuple[np.ndarray, np.ndarray]:
@@ -275,16 +254,47 @@ def _pairs(stamps: np.ndarray, delta: float, unit: DeltaUnit) -> tuple[np.ndarra
     return first[inside], last[inside]
 
 
-def true_trajectory(sequence: Sequence, indices: Iterable[int]) -> Trajectory | None:
-    """True poses of those frames that have one; None where there are none."""
-    if sequence.poses is None:
-        return None
-    known = [i for i in indices if np.isfinite(sequence.poses[i]).all()]
-    if not known:
-        return None
-    # text files carry six digits: made orthonormal as the trajectory demands
-    T = np.stack([pose_matrix(sequence.poses[i][:3]) for i in known])
-    return Trajectory(sequence.timestamps[known], T)
+@np.errstate(over="ignore", invalid="ignore")
+def kitti_drift(
+    T_world_cam_est: np.ndarray,
+    T_world_cam_gt: np.ndarray,
+    *,
+    lengths: Sequence[float] = KITTI_LENGTHS,
+) -> dict[str, Any]:
+    """Drift of (N, 4, 4) poses as KITTI's odometry benchmark defines it (Geiger et al., CVPR 2012).
+
+    From every frame and for every length L (m), the sub-path ends at the first frame whose distance
+    along the true path exceeds L; translation and angle of its relative error are divided by L and
+    averaged within each length, then over the lengths. Nothing is aligned or scaled.
+
+    Returns:
+        ``translation`` (fraction) and ``rotation_deg_per_m``, None with ``reasons`` where the path
+        is shorter than every length; ``segments``, ``path_length_m``.
+    """
+    est, gt = np.asarray(T_world_cam_est), np.asarray(T_world_cam_gt)
+    steps = np.linalg.norm(np.diff(gt[:, :3, 3], axis=0), axis=1)
+    distance = np.concatenate([[0.0], np.cumsum(steps)])
+    means, segments = [], 0
+    for length in lengths:
+        last = np.searchsorted(distance, distance + length, side="right")
+        (first,) = np.nonzero(last < len(gt))
+        if len(first):
+            last = last[first]
+            error = invert(invert(est[first]) @ est[last]) @ (invert(gt[first]) @ gt[last])
+            translation = np.linalg.norm(error[:, :3, 3], axis=1).mean() / length
+            rotation = np.degrees(rotation_angle(error[:, :3, :3])).mean() / length
+            means.append((translation, rotation))
+            segments += len(first)
+    values = [float(x) for x in np.mean(means, axis=0)] if means else [np.nan, np.nan]
+    names = ("translation", "rotation_deg_per_m")
+    found = {n: v if np.isfinite(v) else None for n, v in zip(names, values, strict=True)}
+    short = f"the true path of {distance[-1]:.4g} m is shorter than {min(lengths):g} m"
+    return {
+        **found,
+        "segments": segments,
+        "path_length_m": float(distance[-1]) if np.isfinite(distance[-1]) else None,
+        "reasons": {n: NOT_FINITE if means else short for n in names if found[n] is None},
+    }
 
 
 def evaluate(
@@ -298,13 +308,8 @@ def evaluate(
 ) -> dict[str, Any]:
     """Every trajectory error of one estimate, JSON-ready.
 
-    Args:
-        estimate: estimated trajectory.
-        gt: ground truth.
-        alignment: of ``ate_rmse``; ``se3`` for metric methods.
-        delta: of the relative error.
-        delta_unit: ``frames`` or ``s``.
-        max_diff: see :func:`associate`.
+    ``alignment`` is that of ``ate_rmse``, ``delta`` that of the relative error, ``max_diff`` (s)
+    the largest difference of matched timestamps.
 
     Returns:
         ``ate_rmse`` (m, after ``alignment``) with ``scale``, ``ate_rmse_unaligned``,
@@ -331,47 +336,55 @@ def evaluate(
     }
     reasons: dict[str, str] = {}
 
-    def put(key: str, value: Any, reason: str) -> None:
-        report[key] = value
-        if value is None:
-            reasons[key] = reason
+    def put(names: Sequence[str], compute: Callable[[], Iterable[float | None]]) -> None:
+        """Put the first computed values under the names, or None with the reason."""
+        try:
+            values = compute()
+        except DegenerateError as error:
+            values = [None] * len(names)
+            reasons.update(dict.fromkeys(names, str(error)))
+        report.update(zip(names, values, strict=False))
 
-    kinds: tuple[tuple[Alignment, str], ...] = (
-        *((alignment, ""), ("none", "_unaligned"), ("origin", "_origin"), ("sim3", "_sim3")),
-    )
-    for kind, suffix in kinds:
+    def absolute(kind: Alignment) -> tuple[float, float]:
         error = ate(estimate, gt, kind, association=match)
-        put(f"ate_rmse{suffix}", error.rmse, error.reason)
-        if suffix in ("", "_sim3"):
-            put(f"scale{suffix}", error.scale, error.reason)
-            relative = rpe(estimate, gt, delta, delta_unit, kind, association=match)
-            put(f"rpe_trans_rmse{suffix}", relative.rmse, relative.reason)
-            mean = float(relative.translation.mean()) if len(relative.translation) else None
-            put(f"rpe_trans_mean{suffix}", mean, relative.reason)
-            put(f"rpe_rot_rmse_deg{suffix}", relative.rotation_rmse_deg, relative.reason)
+        return error.rmse, error.scale
+
+    def relative(kind: Alignment) -> tuple[float, float, float]:
+        error = rpe(estimate, gt, delta, delta_unit, kind, association=match)
+        return error.rmse, float(error.translation.mean()), error.rotation_rmse_deg
+
+    put(["ate_rmse_unaligned"], lambda: absolute("none"))
+    put(["ate_rmse_origin"], lambda: absolute("origin"))
+    kinds: tuple[tuple[Alignment, str], ...] = ((alignment, ""), ("sim3", "_sim3"))
+    for kind, suffix in kinds:
+        put([f"ate_rmse{suffix}", f"scale{suffix}"], functools.partial(absolute, kind))
+        names = ("rpe_trans_rmse", "rpe_trans_mean", "rpe_rot_rmse_deg")
+        put([name + suffix for name in names], functools.partial(relative, kind))
     poses = estimate.T_world_cam[match.est_indices], gt.T_world_cam[match.gt_indices]
     for key, lengths in (("kitti_drift", KITTI_LENGTHS), ("kitti_drift_short", SHORT_LENGTHS)):
-        put(key, None if match.reason else kitti_drift(*poses, lengths=lengths), match.reason)
+        report[key] = None if match.reason else kitti_drift(*poses, lengths=lengths)
+        reasons |= {key: match.reason} if match.reason else {}
     return report | {"reasons": reasons}
 
 
 def _check(
     estimate: Any, gt: Any, alignment: str, delta: float, delta_unit: str, max_diff: float | None
 ) -> None:
-    for name, path in (("estimate", estimate), ("gt", gt)):
-        if not isinstance(path, Trajectory):
-            raise InputError(
-                f"evaluate.{name}: expected a Trajectory, got {type(path).__name__}. Files are "
-                f"read by hybridvo.trajectory.read_trajectory."
-            )
-    if alignment not in ("se3", "sim3", "origin", "none"):
-        raise InputError(f"alignment: expected se3, sim3, origin or none, got {alignment!r}.")
-    if delta_unit not in ("frames", "s"):
-        raise InputError(f"delta_unit: expected frames or s, got {delta_unit!r}.")
-    if not 0 < delta < np.inf or (delta_unit == "frames" and not float(delta).is_integer()):
-        raise InputError(f"delta: expected a positive number of {delta_unit}, got {delta!r}.")
-    if max_diff is not None and not 0 <= max_diff < np.inf:
-        raise InputError(f"max_diff: expected seconds >= 0, got {max_diff!r}.")
+    """Refuse arguments of :func:`evaluate` that cannot be meant."""
+    paths = [
+        (name, isinstance(path, Trajectory), "a Trajectory (read_trajectory)", type(path).__name__)
+        for name, path in (("estimate", estimate), ("gt", gt))
+    ]
+    is_whole = delta_unit != "frames" or float(delta).is_integer()
+    for name, is_good, expected, got in (
+        *paths,
+        ("alignment", alignment in get_args(Alignment), "se3, sim3, origin or none", alignment),
+        ("delta_unit", delta_unit in get_args(DeltaUnit), "frames or s", delta_unit),
+        ("delta", 0 < delta < np.inf and is_whole, f"a positive number of {delta_unit}", delta),
+        ("max_diff", max_diff is None or 0 <= max_diff < np.inf, "seconds >= 0", max_diff),
+    ):
+        if not is_good:
+            raise InputError(f"{name}: expected {expected}, got {got!r}.")
 
 
 def evaluate_files(
@@ -387,7 +400,7 @@ def evaluate_files(
     """Errors between two trajectory files: what ``hybridvo evaluate EST GT`` prints.
 
     Formats and axes are those of :func:`hybridvo.trajectory.read_trajectory`, ``options`` those of
-    :func:`evaluate`, whose report it returns with ``estimate``, ``gt`` (paths) and ``warnings``.
+    :func:`evaluate`; its report also has ``estimate``, ``gt`` (paths) and ``warnings``.
 
     Raises:
         InputError: a file that is missing or malformed, or an unknown option.

@@ -17,7 +17,16 @@ from hybridvo.data.base import Sequence
 from hybridvo.data.image_io import UNKNOWN_FLOW
 from hybridvo.data.resize import resize_camera
 from hybridvo.errors import InputError
-from hybridvo.geometry import invert, matrix_to_euler_deg, rotation_angle
+from hybridvo.geometry import (
+    backproject,
+    ego_flow,
+    invert,
+    matrix_to_euler_deg,
+    pixel_grid,
+    pose_matrix,
+    rotation_angle,
+)
+from hybridvo.trajectory import Trajectory
 from hybridvo.types import Camera
 
 PAPER_SIZE = (128, 256)
@@ -35,6 +44,18 @@ def true_motion(sequence: Sequence, prev: int, curr: int) -> np.ndarray | None:
     return T if np.isfinite(T).all() else None
 
 
+def true_trajectory(sequence: Sequence, indices: Iterable[int]) -> Trajectory | None:
+    """True poses of those frames that have one; None where there are none."""
+    if sequence.poses is None:
+        return None
+    known = [i for i in indices if np.isfinite(sequence.poses[i]).all()]
+    if not known:
+        return None
+    # text files carry six digits: made orthonormal as the trajectory demands
+    T = np.stack([pose_matrix(sequence.poses[i][:3]) for i in known])
+    return Trajectory(sequence.timestamps[known], T)
+
+
 def _check(poses: Mapping[str, Any], depth: Any, prev: Camera, curr: Camera) -> None:
     for name, pose in poses.items():
         if np.shape(pose) != (4, 4) or not np.isfinite(pose).all():
@@ -46,35 +67,15 @@ def _check(poses: Mapping[str, Any], depth: Any, prev: Camera, curr: Camera) -> 
         )
 
 
-def _moved(
-    T: np.ndarray, prev: Camera, curr: Camera, inverse_depth: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Homogeneous (x, y, s) of every pixel (H, W) after the motion; s is moved depth over depth."""
-    A, b = curr.K @ T[:3, :3] @ np.linalg.inv(prev.K), curr.K @ T[:3, 3]
-    v, u = np.ogrid[: prev.height, : prev.width]
-    x, y, s = (A[k, 0] * u + (A[k, 1] * v + A[k, 2]) + b[k] * inverse_depth for k in range(3))
-    return x, y, s
-
-
-def _inverse(depth: Any) -> tuple[np.ndarray, np.ndarray]:
-    """(H, W) inverse depth, and which depths are valid: finite and positive."""
-    inverse_depth = 1.0 / np.asarray(depth, dtype=np.float64)
-    # 0 < 1/d < inf drops zero, negative, infinite and NaN depth at once
-    return inverse_depth, (inverse_depth > 0) & (inverse_depth < np.inf)
-
-
-@np.errstate(divide="ignore", invalid="ignore", over="ignore")
 def _native_epe(
     T_est: np.ndarray, T_gt: np.ndarray, depth: np.ndarray, prev: Camera, curr: Camera
 ) -> float | None:
     """Mean L2 distance of the two ego flows over valid pixels, px."""
-    inverse_depth, valid = _inverse(depth)
-    x_gt, y_gt, s_gt = _moved(T_gt, prev, curr, inverse_depth)
-    x_est, y_est, s_est = _moved(T_est, prev, curr, inverse_depth)
-    valid &= s_gt > 0
-    error = np.sqrt((x_est / s_est - x_gt / s_gt) ** 2 + (y_est / s_est - y_gt / s_gt) ** 2)
-    error[~(s_est > 0) | ~np.isfinite(error)] = np.hypot(*prev.shape)
-    return float(error[valid].mean()) if valid.any() else None
+    est, gt = (ego_flow(depth, T, prev, curr) for T in (T_est, T_gt))
+    valid = np.isfinite(gt).all(axis=2)
+    error = np.linalg.norm(est[valid] - gt[valid], axis=1)
+    error[~np.isfinite(error)] = np.hypot(*prev.shape)
+    return float(error.mean()) if len(error) else None
 
 
 @np.errstate(divide="ignore", invalid="ignore", over="ignore")
@@ -87,18 +88,20 @@ def _paper_epe(
         ((np.arange(small) + 0.5) * size / small).astype(int)
         for small, size in zip(PAPER_SIZE, prev.shape, strict=True)
     )
-    inverse_depth, valid = _inverse(depth[np.ix_(rows, columns)])
+    small = np.asarray(depth[np.ix_(rows, columns)], dtype=np.float64)
+    valid = np.isfinite(small) & (small > 0)
     if not valid.any():
         return None
     prev, curr = (resize_camera(camera, *PAPER_SIZE) for camera in (prev, curr))
-    v, u = np.ogrid[: PAPER_SIZE[0], : PAPER_SIZE[1]]
+    points = backproject(np.where(valid, small, np.nan), prev)
     flows = []
     for T in (T_est, T_gt):
-        x, y, s = _moved(T, prev, curr, inverse_depth)
-        s = np.abs(s) + 1e-12  # as in the published code ("to avoid reflection"): never undefined
-        flows.append(np.stack([x / s - u, y / s - v]))
-    counted = valid & (np.hypot(*flows[1]) < 400.0)  # longer true flow counts as right
-    return float(np.abs(flows[0] - flows[1])[:, counted].sum()) / (2 * valid.size)
+        moved = (points @ T[:3, :3].T + T[:3, 3]) @ curr.K.T
+        # as in the published code ("to avoid reflection"): never undefined
+        moved = moved[..., :2] / (np.abs(moved[..., 2:]) + 1e-12)
+        flows.append(moved - pixel_grid(*PAPER_SIZE))
+    counted = valid & (np.linalg.norm(flows[1], axis=2) < 400.0)  # longer true flow counts as right
+    return float(np.abs(flows[0] - flows[1])[counted].sum()) / (2 * valid.size)
 
 
 def pair_errors(
@@ -108,15 +111,9 @@ def pair_errors(
     camera_prev: Camera,
     camera_curr: Camera,
 ) -> dict[str, float | None]:
-    """Errors of one estimated ``T_curr_prev``.
+    """Errors of one estimated ``T_curr_prev`` (4, 4), metres.
 
-    Args:
-        T_est: (4, 4) estimated ``T_curr_prev``, metres.
-        T_gt: (4, 4) true ``T_curr_prev``, metres.
-        depth_prev: (H, W) true depth of the previous frame, metres; not finite or not positive is
-            invalid.
-        camera_prev: previous camera, (H, W).
-        camera_curr: current camera, (H, W).
+    ``depth_prev`` (H, W) is the true depth, metres; not finite or not positive is invalid.
 
     Returns:
         ``r_err_deg``: mean over the axes of the absolute Euler X-Y-Z difference, degrees (wrapped
@@ -148,10 +145,7 @@ def pair_errors(
 def mean_pair_errors(pairs: Iterable[Mapping[str, float | None]]) -> dict[str, Any]:
     """Means and medians of :func:`pair_errors` over pairs, under the names of ``results.json``.
 
-    Returns:
-        ``pairs`` (their number), the means ``r_err_deg``, ``t_err``, ``epe``, ``epe_l2_px``,
-        ``rot_err_deg_mean``, ``trans_err_mean``, the medians ``rot_err_deg_median``,
-        ``trans_err_median``, and ``reasons`` for every value that is None or leaves pairs out.
+    ``pairs`` is their number; ``reasons`` name every value that is None or leaves pairs out.
     """
     pairs = list(pairs)
     report: dict[str, Any] = {"pairs": len(pairs)}
@@ -172,7 +166,6 @@ def mean_pair_errors(pairs: Iterable[Mapping[str, float | None]]) -> dict[str, A
     return report | {"reasons": reasons}
 
 
-@np.errstate(divide="ignore", invalid="ignore", over="ignore")
 def pair_facts(
     T_gt: np.ndarray | None,
     depth_prev: np.ndarray | None,
@@ -182,22 +175,14 @@ def pair_facts(
 ) -> dict[str, float | None]:
     """What may explain an error: how much moves, how far, before what. None where unknown.
 
-    Args:
-        T_gt: (4, 4) true ``T_curr_prev``, metres, or None.
-        depth_prev: (H, W) depth of the previous frame, metres, or None.
-        camera_prev: previous camera, (H, W).
-        camera_curr: current camera, (H, W).
-        flow_gt: (H, W, 2) true flow of everything, px; NaN or beyond 1e9 where unknown. None where
-            there is none, or where it holds the motion of the camera alone.
+    ``flow_gt`` (H, W, 2) is the true flow of everything, px, NaN or beyond 1e9 where unknown; None
+    where there is none, or where it holds the motion of the camera alone.
 
     Returns:
         ``dynamic_fraction``: share of valid pixels whose true flow differs from the true ego flow
         by more than 1 px; ``flow_magnitude_px``: median length of the true ego flow;
         ``rotation_deg`` and ``translation_m`` of the true motion; ``depth_spread``: 90th over 10th
         percentile of the valid depth.
-
-    Raises:
-        InputError: a pose that is not finite, shapes that do not match.
     """
     names = ("dynamic_fraction", "flow_magnitude_px", "rotation_deg", "translation_m")
     facts: dict[str, float | None] = dict.fromkeys((*names, "depth_spread"))
@@ -206,24 +191,18 @@ def pair_facts(
         facts["translation_m"] = float(np.linalg.norm(T_gt[:3, 3]))
     if depth_prev is None:
         return facts
-    inverse_depth, valid = _inverse(depth_prev)
-    if valid.any():
-        low, high = np.quantile(inverse_depth[valid], [0.1, 0.9])
+    known = depth_prev[np.isfinite(depth_prev) & (depth_prev > 0)].astype(np.float64)
+    if len(known):
+        low, high = np.quantile(1 / known, [0.1, 0.9])
         facts["depth_spread"] = float(high / low)
     if T_gt is None:
         return facts
-    _check({"T_gt": T_gt}, depth_prev, camera_prev, camera_curr)
-    x, y, s = _moved(T_gt, camera_prev, camera_curr, inverse_depth)
-    v, u = np.ogrid[: camera_prev.height, : camera_prev.width]
-    du, dv = x / s - u, y / s - v
-    valid &= s > 0
+    ego = ego_flow(depth_prev, T_gt, camera_prev, camera_curr)
+    valid = np.isfinite(ego).all(axis=2)
     if valid.any():
-        facts["flow_magnitude_px"] = float(np.median(np.hypot(du, dv)[valid]))
+        facts["flow_magnitude_px"] = float(np.median(np.linalg.norm(ego[valid], axis=1)))
     if flow_gt is not None:
-        if np.shape(flow_gt) != (*camera_prev.shape, 2):
-            expected = (*camera_prev.shape, 2)
-            raise InputError(f"flow_gt: expected {expected}, got {np.shape(flow_gt)}.")
         valid &= (np.abs(flow_gt) < UNKNOWN_FLOW).all(axis=2)
-        moving = np.hypot(du - flow_gt[..., 0], dv - flow_gt[..., 1])[valid] > MOVING_PX
+        moving = np.linalg.norm(ego[valid] - flow_gt[valid], axis=1) > MOVING_PX
         facts["dynamic_fraction"] = float(moving.mean()) if len(moving) else None
     return facts

@@ -1,71 +1,24 @@
-"""What a comparison works on: its options, the sequences of a folder, the methods that run here."""
+"""What a comparison works on: the sequences of a folder, the methods that run here."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import os
-from collections.abc import Mapping
 from collections.abc import Sequence as Several
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
 
 import hybridvo
 from hybridvo.data.sequence import Sequence, open_sequence
 from hybridvo.errors import HybridVOError, InputError
 from hybridvo.evaluation.protocols import Protocol, check_protocol
-from hybridvo.evaluation.sequence_job import Job
+from hybridvo.evaluation.sequence_job import ComparisonOptions, Job
 from hybridvo.files import fingerprint
 from hybridvo.network.models import Models
 from hybridvo.pipeline import METHODS, check_method, weights_hash
 
 SINTEL_FOLDERS = ("camdata_left", "depth", "flow", "clean", "final")
 """Folders of MPI Sintel that hold a folder per scene; the images of the last one are read."""
-
-
-@dataclass(frozen=True)
-class ComparisonOptions:
-    """What to compare, and where to work.
-
-    Args:
-        sequences: folders; a folder of sequences stands for all of them.
-        methods: names, or ``("all",)`` for all that can run.
-        flow: ``auto`` (every source that a sequence has, side by side), ``file`` or ``dis``.
-        dataset: kind of the sequences; None detects it.
-        start, stop, stride: range of frames.
-        seed: of everything drawn at random.
-        protocol: ``paper`` or ``trajectory14`` (MPI Sintel as others score it), or None.
-        weights: name of a network -> its file; the pretrained one where absent.
-        device: ``auto``, ``cpu`` or ``cuda``.
-        jobs: sequences at a time, a process each.
-        worst: pairs shown for each method and flow.
-
-    Raises:
-        InputError: a number out of range.
-    """
-
-    sequences: tuple[str, ...]
-    methods: tuple[str, ...] = ("all",)
-    flow: Literal["auto", "file", "dis"] = "auto"
-    dataset: str | None = None
-    start: int = 0
-    stop: int | None = None
-    stride: int = 1
-    seed: int = 0
-    protocol: str | None = None
-    weights: Mapping[str, str] = field(default_factory=dict)
-    device: Literal["auto", "cpu", "cuda"] = "auto"
-    jobs: int = 1
-    worst: int = 3
-
-    def __post_init__(self) -> None:
-        if not self.sequences:
-            raise InputError("compare: expected at least one folder of a sequence, got none.")
-        lowest = (("start", 0), ("stride", 1), ("seed", 0), ("jobs", 1), ("worst", 0))
-        for name, least in lowest:
-            if getattr(self, name) < least:
-                raise InputError(f"--{name}: expected at least {least}, got {getattr(self, name)}.")
 
 
 def methods_to_run(
@@ -76,18 +29,18 @@ def methods_to_run(
     Raises:
         InputError: no name, an unknown one, or one that cannot run here.
     """
-    if list(names) != ["all"]:
-        if not names:
-            raise InputError(f"--methods: expected names, got none; known: {', '.join(METHODS)}.")
-        for name in names:
-            check_method(name, models)
-        return tuple(dict.fromkeys(names)), {}
-    runnable, missing = [], {}
-    for name in METHODS:
+    if not names:
+        raise InputError(f"--methods: expected names, got none; known: {', '.join(METHODS)}.")
+    is_all = list(names) == ["all"]
+    runnable: dict[str, None] = {}
+    missing: dict[str, str] = {}
+    for name in METHODS if is_all else names:
         try:
             check_method(name, models)
-            runnable.append(name)
+            runnable[name] = None
         except InputError as error:
+            if not is_all:
+                raise
             missing[name] = str(error)
     return tuple(runnable), missing
 
@@ -132,6 +85,8 @@ def plan(options: ComparisonOptions, methods: tuple[str, ...]) -> tuple[list[Job
     Raises:
         InputError: sequences, frames or flow that are not there, or that no protocol knows.
     """
+    if not options.sequences:
+        raise InputError("compare: expected at least one folder of a sequence, got none.")
     paths = [path for given in options.sequences for path in expand(given, options.dataset)]
     opened = {path: open_sequence(path, options.dataset) for path in paths}
     protocol = None
@@ -163,21 +118,8 @@ def plan(options: ComparisonOptions, methods: tuple[str, ...]) -> tuple[list[Job
         same_camera_only = protocol is not None and protocol.same_camera_only
         deciding = [fingerprint(sequence.files()), list(frames), flows, options.seed]
         deciding += [same_camera_only, options.device, hashes, hybridvo.__version__]
-        jobs.append(
-            Job(
-                path=str(path),
-                dataset=options.dataset,
-                name=name,
-                flows=flows,
-                methods=methods,
-                indices=frames,
-                same_camera_only=same_camera_only,
-                seed=options.seed,
-                device=options.device,
-                weights=options.weights,
-                fingerprint=hashlib.sha256(json.dumps(deciding).encode()).hexdigest(),
-            )
-        )
+        digest = hashlib.sha256(json.dumps(deciding).encode()).hexdigest()
+        jobs.append(Job(str(path), name, options, flows, methods, frames, same_camera_only, digest))
     return jobs, protocol
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,11 +26,9 @@ class Protocol:
 
     Args:
         name: option value. title: for people. sequences: name -> frames of the complete set.
-        pairs: number of pairs of the complete set. same_camera_only: whether pairs whose
-            intrinsics change are not scored. metrics: ``key``, ``label``, ``unit`` of each column.
-        over: ``pairs`` or ``sequences``: what the means are taken over. published: lines of
-            others: ``name``, the metrics they give, ``source``, ``inputs``, ``method`` (our name
-            of the same method, or empty) and ``note``.
+        pairs: of the complete set. same_camera_only: pairs whose intrinsics change do not count.
+        metrics: ``key``, ``label``, ``unit`` of each column. over: what the means are taken over,
+            ``pairs`` or ``sequences``. published: lines of others; ``method``: our name of it.
     """
 
     name: str
@@ -88,16 +86,10 @@ def protocol_summary(
 ) -> dict[str, Any]:
     """What stands under ``protocol`` in ``results.json``.
 
-    Args:
-        protocol: which one.
-        totals: a line per method and flow source over all sequences.
-        pairs: sequence -> pairs that were scored.
-
-    Returns:
-        ``name``, ``title``, ``over``, ``metrics``; ``complete`` (every sequence is there, with
-        every pair), ``note`` (what is missing, or empty), ``missing_sequences``, ``pairs``,
-        ``pairs_expected``; ``table``: a line per method and flow source with the authors' own line
-        of the same method under ``published``, or None; ``published``: all lines of others.
+    ``totals`` has a line per method and flow source over all sequences, ``pairs`` those scored of
+    each sequence. Beside the protocol's fields stand ``complete`` (every pair of every sequence is
+    there), ``note`` (what is missing), ``missing_sequences``, ``pairs``, ``pairs_expected`` and
+    ``table``, whose lines hold the authors' own line of the same method under ``published``.
     """
     absent = [name for name in protocol.sequences if name not in pairs]
     count = sum(pairs.values())
@@ -120,16 +112,11 @@ def protocol_summary(
         }
         for row in totals
     ]
-    return {
-        "name": protocol.name,
-        "title": protocol.title,
-        "over": protocol.over,
-        "metrics": list(protocol.metrics),
+    return asdict(protocol) | {
         "complete": not notes,
         "note": "; ".join(notes),
         "missing_sequences": absent,
         "pairs": count,
         "pairs_expected": protocol.pairs,
         "table": table,
-        "published": list(protocol.published),
     }

@@ -1,15 +1,12 @@
 """The report of a comparison: ``report.html`` (one file, interactive) and ``report.md``.
 
-Read from ``results.json``, ``pairs.csv`` and ``trajectories/`` of the output folder. Estimated flow
-stands before true flow (an oracle) everywhere.
+Estimated flow stands before true flow (an oracle) everywhere.
 """
 
 from __future__ import annotations
 
 import base64
-import json
 import math
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +15,6 @@ from typing import Any
 import pandas as pd
 from plotly.graph_objects import Figure
 
-from hybridvo.errors import FormatError, InputError
 from hybridvo.evaluation.charts import (
     error_distribution,
     factor_charts,
@@ -67,78 +63,56 @@ NO_MERIT = ("pairs", "moving [%]", "time [ms]", "+ flow [ms]")
 """Columns without a best value: doing nothing takes no time."""
 
 
-def write_report(folder: str | os.PathLike[str]) -> list[Path]:
-    """Write ``report.html`` and ``report.md`` of a comparison.
+def write_report(folder: Path, result: Mapping[str, Any], pairs: pd.DataFrame) -> None:
+    """Write ``report.html`` and ``report.md`` beside the trajectories and images of a comparison.
 
     Args:
         folder: output of :func:`hybridvo.evaluation.comparison.compare`.
+        result: what ``results.json`` holds.
+        pairs: the table of all pairs.
 
     Raises:
-        InputError: no ``results.json`` or ``pairs.csv``. FormatError: they are not a comparison's.
         OutputError: a file cannot be written.
     """
     import jinja2
     from plotly.offline import get_plotlyjs
 
-    folder = Path(folder)
-    result, pairs = read_comparison(folder)
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"),
-        autoescape=True,
+        autoescape=jinja2.select_autoescape(["html"]),
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
     )
     methods = list(dict.fromkeys(row["method"] for row in result["totals"]))
-    sections = [
-        ("How the errors are distributed", error_distribution(pairs, methods)),
-        ("How often an estimate fails", failure_chart(result["breakdown"], methods)),
-        ("What makes it fail", factor_charts(result["breakdown"], methods)),
-        ("Error against time", time_chart(result["totals"], methods)),
-    ]
+    sections = {
+        "How the errors are distributed": error_distribution(pairs, methods),
+        "How often an estimate fails": failure_chart(result["breakdown"], methods),
+        "What makes it fail": factor_charts(result["breakdown"], methods),
+        "Error against time": time_chart(result["totals"], methods),
+    }
     names = dict.fromkeys(row["sequence"] for row in result["rows"])
     paths = {name: path_charts(folder, result, pairs, name, methods) for name in names}
-    html = environment.get_template("report.html").render(
-        headline=headline(result),
-        result=result,
-        pairs=len(pairs.drop_duplicates(["sequence", "index"])),
-        methods=methods,
-        tables=[(flow, make_table(rows, RESULT_COLUMNS)) for flow, rows in by_flow(result)],
-        worst=_gallery(folder, result),
-        sections=[(name, _json(charts)) for name, charts in sections if charts],
-        sequences=[(name, _json(charts)) for name, charts in paths.items()],
-        protocol=_protocol_tables(result),
-        numbers=make_table(
+    content = {
+        "headline": headline(result),
+        "result": result,
+        "pairs": len(pairs.drop_duplicates(["sequence", "index"])),
+        "methods": methods,
+        "tables": [(flow, make_table(rows, RESULT_COLUMNS)) for flow, rows in by_flow(result)],
+        "worst": _gallery(folder, result),
+        "sections": [(name, _json(charts)) for name, charts in sections.items() if charts],
+        "sequences": [(name, _json(charts)) for name, charts in paths.items()],
+        "protocol": _protocol_tables(result),
+        "numbers": make_table(
             [row for _, rows in by_flow(result, "rows") for row in rows],
             SEQUENCE_COLUMNS,
             ("sequence", "method", "flow_source"),
             ranked=False,
         ),
-        provenance=_provenance(result),
-        plotly=get_plotlyjs(),
-    )
-    written = {"report.html": html, "report.md": _markdown(result)}
-    for name, text in written.items():
+    }
+    for name in ("report.html", "report.md"):
+        text = environment.get_template(name).render(content, plotly=get_plotlyjs())
         with atomic_write(folder / name) as file:
             file.write(text)
-    return [folder / name for name in written]
-
-
-def read_comparison(folder: Path) -> tuple[dict[str, Any], pd.DataFrame]:
-    """``results.json`` and ``pairs.csv`` of a folder."""
-    try:
-        result = json.loads((folder / "results.json").read_text(encoding="utf-8"))
-        pairs = pd.read_csv(folder / "pairs.csv")
-        if not {"rows", "totals", "worst_pairs"} <= set(result):
-            raise ValueError("results.json has other fields")
-        return result, pairs
-    except FileNotFoundError as error:
-        raise InputError(
-            f"{error.filename}: no such file; expected the output folder of a comparison."
-        ) from None
-    except (OSError, ValueError, TypeError) as error:
-        raise FormatError(
-            f"{folder}: results.json or pairs.csv is not what a comparison writes: {error!r}."
-        ) from None
 
 
 def by_flow(result: Mapping[str, Any], key: str = "totals") -> list[tuple[str, list[Any]]]:
@@ -270,33 +244,6 @@ def _protocol_tables(result: Mapping[str, Any]) -> list[tuple[str, Table]]:
     ]
 
 
-def _markdown(result: Mapping[str, Any]) -> str:
-    """``report.md``: headline, tables, worst pairs, what is missing."""
-    parts = ["# Comparison of methods\n", headline(result) + "\n"]
-    for flow, rows in by_flow(result):
-        oracle = " (an oracle: ground truth)" if is_oracle(flow) else ""
-        parts += [f"## {flow} flow{oracle}\n", make_table(rows, RESULT_COLUMNS).markdown()]
-    parts.append("## Worst pairs\n")
-    for entry in sorted(result["worst_pairs"], key=lambda e: is_oracle(e["flow_source"])):
-        error = number(entry["epe_l2_px"])
-        place = f"{entry['sequence']}, pair {entry['index']}"
-        parts.append(
-            f"- {entry['method']}, {entry['flow_source']}: {place}: {error} px, {entry['status']}"
-        )
-    parts.append("")
-    for name, table in _protocol_tables(result):
-        title = result["protocol"]["title"]
-        note = result["protocol"]["note"]
-        parts += [f"## {name}: {title}\n", f"{note}\n" if note else "", table.markdown()]
-    notes = [f"- not run: {name}: {reason}" for name, reason in result["missing"].items()]
-    for sequence in result["sequences"]:
-        notes += [f"- {sequence['name']}: {warning}" for warning in sequence["warnings"]]
-    if notes:
-        parts += ["## Notes\n", *notes, ""]
-    parts += ["## Command\n", "```", " ".join(result["command"]), "```"]
-    return "\n".join(parts) + "\n"
-
-
 # -- page -----------------------------------------------------------------------------------------
 
 
@@ -318,13 +265,6 @@ def _gallery(folder: Path, result: Mapping[str, Any]) -> list[tuple[str, list[di
                 shown = {**entry, "source": source, "error": number(entry["epe_l2_px"])}
                 groups.setdefault(f"{method}, {flow} flow", []).append(shown)
     return list(groups.items())
-
-
-def _provenance(result: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """What the comparison was made of and when, name and text."""
-    names = ("command", "versions", "machine", "weights", "options", "timing")
-    found = [(name, result[name]) for name in (*names, "started", "finished") if result[name]]
-    return [(name, v if isinstance(v, str) else json.dumps(v)) for name, v in found]
 
 
 def _json(charts: Sequence[Figure]) -> list[str]:

@@ -1,10 +1,7 @@
 """Lines of ``results.json``: one method on one sequence, and one method on all of them.
 
-Fields beyond those of the interface: ``pairs_scored`` and ``pairs_scored_epe`` (pairs over which
-means and medians are taken), ``epe_l2_px_median``, ``failures``, ``failure_rate`` with its Wilson
-interval, errors after a similarity (``_sim3``), ``ms_per_pair_p95``, ``flow_ms_median``,
-``ms_with_flow_median`` and ``reasons``: why a value is None, by its name. A failed estimate counts
-with the motion it carries, which is none, in every mean and median.
+``reasons`` says of every value that is None why. A failed estimate counts with the motion it
+carries, which is none, in every mean and median.
 """
 
 from __future__ import annotations
@@ -46,24 +43,13 @@ ROW_COLUMNS = (
 NO_PAIRS = "no pair was estimated"
 NO_TRUTH = "the sequence has no ground truth for these frames"
 NO_MOVING = "needs true flow of the whole scene (moving objects included) and ground truth"
+_INF = math.inf
 FACTORS: Mapping[str, tuple[str, str, tuple[float, ...]]] = {
-    "dynamic_fraction": (
-        "share of pixels that move by themselves",
-        "",
-        (0.0, 0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 1.0),
-    ),
-    "flow_magnitude_px": (
-        "median length of the true ego flow",
-        "px",
-        (0.0, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, math.inf),
-    ),
-    "rotation_deg": ("true rotation", "deg", (0.0, 0.1, 0.3, 1.0, 3.0, 10.0, 180.0)),
-    "translation_m": ("true translation", "m", (0.0, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, math.inf)),
-    "depth_spread": (
-        "90th over 10th percentile of the depth",
-        "",
-        (1.0, 1.5, 2.0, 4.0, 8.0, 16.0, math.inf),
-    ),
+    "dynamic_fraction": ("share of pixels that move", "", (0, 0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 1)),
+    "flow_magnitude_px": ("median true ego flow", "px", (0, 1, 2, 5, 10, 20, 50, _INF)),
+    "rotation_deg": ("true rotation", "deg", (0, 0.1, 0.3, 1, 3, 10, 180)),
+    "translation_m": ("true translation", "m", (0, 0.003, 0.01, 0.03, 0.1, 0.3, 1, _INF)),
+    "depth_spread": ("90th over 10th percentile of depth", "", (1, 1.5, 2, 4, 8, 16, _INF)),
 }
 """Column of ``pairs.csv`` -> label, unit, edges of the bins (a bin holds its lower edge)."""
 
@@ -154,10 +140,8 @@ def sequence_row(
 def total_row(pairs: pd.DataFrame, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Line of one method over all sequences: pairs pooled, trajectory errors as plain means.
 
-    Args:
-        pairs: all pairs of the method and flow.
-        rows: its lines of the single sequences; a trajectory error that one of them lacks is the
-            mean over the others, and ``reasons`` says which are missing.
+    A trajectory error that one of its ``rows`` of single sequences lacks is the mean over the
+    others, and ``reasons`` says which are missing.
     """
     scores = pair_scores(pairs)
     reasons = scores["reasons"]
@@ -183,8 +167,7 @@ def total_row(pairs: pd.DataFrame, rows: Sequence[Mapping[str, Any]]) -> dict[st
 def scale_warning(rows: Iterable[Mapping[str, Any]]) -> list[str]:
     """Warning of a ground truth whose unit is not that of the depth, from rows of one sequence.
 
-    Every method measures in the unit of the depth: where all of them are wrong by about the same
-    large factor, the ground truth is.
+    Where all methods are wrong by about the same large factor, the ground truth is.
     """
     scales = [
         float(row["scale_sim3"])
@@ -202,16 +185,11 @@ def scale_warning(rows: Iterable[Mapping[str, Any]]) -> list[str]:
 
 
 def breakdown(pairs: pd.DataFrame) -> dict[str, Any]:
-    """Errors and failure rates by factor.
+    """Errors and failure rates by factor, of a table of all pairs and methods.
 
-    Args:
-        pairs: table of all pairs and methods.
-
-    Returns:
-        ``failure_px``, ``confidence``; ``factors``: ``name``, ``label``, ``unit``, ``pairs`` (that
-        know it); ``cells``: for each method, flow source, factor and bin that holds a pair:
-        ``low``, ``high`` (None where open), failure rate with interval and EPE quartiles;
-        ``failure_rates``: one for each method and flow source.
+    ``cells`` holds for each method, flow source, factor and bin that has a pair: ``low``, ``high``
+    (None where open), failure rate with interval and EPE quartiles. ``factors`` count the pairs
+    that know them.
     """
     cells = []
     for name, (_, _, edges) in FACTORS.items():
@@ -246,3 +224,19 @@ def breakdown(pairs: pd.DataFrame) -> dict[str, Any]:
 def known_number(value: float) -> float | None:
     """The number, None for NaN."""
     return None if math.isnan(value) else float(value)
+
+
+def worst_pairs(pairs: pd.DataFrame, count: int = 3) -> list[dict[str, Any]]:
+    """The ``count`` worst pairs of each method and flow source, worst first.
+
+    Pairs without a known error come last, and only if their estimate failed.
+    """
+    columns = ["sequence", "index", "status", "message", *PAIR_ERRORS, *FACTORS]
+    found = []
+    for (method, flow), group in pairs.groupby(["method", "flow_source"], sort=False):
+        known = group[group["epe_l2_px"].notna() | is_failed(group)]
+        worst = known.sort_values("epe_l2_px", ascending=False, kind="stable").head(count)
+        for rank, row in enumerate(worst[columns].to_dict("records"), 1):
+            values = {k: known_number(v) if isinstance(v, float) else v for k, v in row.items()}
+            found.append({"method": method, "flow_source": flow, "rank": rank, **values})
+    return found

@@ -5,21 +5,21 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
 
 from hybridvo.data.sequence import Sequence, open_sequence
 from hybridvo.errors import InputError
-from hybridvo.evaluation.metrics import true_trajectory
-from hybridvo.evaluation.pair_errors import pair_errors, pair_facts, true_motion
+from hybridvo.evaluation.pair_errors import pair_errors, pair_facts, true_motion, true_trajectory
 from hybridvo.evaluation.protocols import same_intrinsics
 from hybridvo.evaluation.scores import FACTORS, scale_warning, sequence_row
 from hybridvo.flow import MeasuredFlow, dis_flow, file_flow
 from hybridvo.geometry import invert
 from hybridvo.network.models import Models
 from hybridvo.odometry import Odometry
+from hybridvo.options import Count, Natural, option_group
 from hybridvo.trajectory import Trajectory
 from hybridvo.types import Frame
 
@@ -33,42 +33,75 @@ CAMERA_FLOW_KINDS = ("tartanair",)
 """Data sets whose true flow is that of the camera alone: it does not show what moves by itself."""
 
 
+@option_group
+class ComparisonOptions:
+    """What to compare, and where to work.
+
+    Args:
+        sequences: folders; a folder of sequences stands for all of them.
+        methods: names, or ``("all",)`` for all that can run.
+        flow: ``auto`` (every source that a sequence has, side by side), ``file`` or ``dis``.
+        dataset: kind of the sequences; None detects it.
+        start, stop, stride: range of frames.
+        seed: of everything drawn at random.
+        protocol: ``paper`` or ``trajectory14`` (MPI Sintel as others score it), or None.
+        weights: name of a network -> its file; the pretrained one where absent.
+        device: ``auto``, ``cpu`` or ``cuda``.
+        jobs: sequences at a time, a process each.
+        worst: pairs shown for each method and flow.
+    """
+
+    sequences: tuple[str, ...]
+    methods: tuple[str, ...] = ("all",)
+    flow: Literal["auto", "file", "dis"] = "auto"
+    dataset: str | None = None
+    start: Natural = 0
+    stop: int | None = None
+    stride: Count = 1
+    seed: Natural = 0
+    protocol: str | None = None
+    weights: Mapping[str, str] = field(default_factory=dict)
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    jobs: Count = 1
+    worst: Natural = 3
+
+
 @dataclass(frozen=True)
 class Job:
     """All methods and flows on one sequence; plain data, for another process.
 
     Args:
-        path, dataset: of the sequence. name: in the results.
+        path: of the sequence. name: in the results. options: what is compared.
         flows: ``dis``, ``file``. methods: names. indices: of the frames.
         same_camera_only: leave pairs unscored whose intrinsics change.
-        seed, device, weights: of the estimates.
         fingerprint: what decides the result.
     """
 
     path: str
-    dataset: str | None
     name: str
+    options: ComparisonOptions
     flows: tuple[str, ...]
     methods: tuple[str, ...]
     indices: range
     same_camera_only: bool
-    seed: int
-    device: str
-    weights: Mapping[str, str]
-    fingerprint: str = ""
+    fingerprint: str
 
     @property
     def pairs(self) -> int:
         """Number of pairs of neighbouring frames."""
-        return max(0, len(self.indices) - 1)
+        return len(self.indices) - 1
 
-
-def open_flow(name: str, sequence: Sequence) -> tuple[str, MeasuredFlow]:
-    """What results call a source of flow, ``(true)`` naming an oracle, and its provider."""
-    if name == "dis":
-        return name, MeasuredFlow(dis_flow())
-    label = f"{name} (true)" if sequence.flow_is_true else name
-    return label, MeasuredFlow(file_flow(sequence, strict=False))
+    def open(self) -> tuple[Sequence, Models, dict[str, MeasuredFlow]]:
+        """The sequence, the networks, and a provider for each flow, by its name in the results."""
+        sequence = open_sequence(self.path, self.options.dataset)
+        flows = {}
+        for name in self.flows:
+            if name == "dis":
+                flows[name] = MeasuredFlow(dis_flow())
+            else:  # an oracle is named
+                label = f"{name} (true)" if sequence.flow_is_true else name
+                flows[label] = MeasuredFlow(file_flow(sequence, strict=False))
+        return sequence, Models(self.options.device, self.options.weights), flows
 
 
 @dataclass
@@ -107,11 +140,9 @@ def run_sequence(job: Job, progress: Callable[[int], None] | None = None) -> dic
         JSON-ready: ``fingerprint``, ``sequence`` (facts), ``rows`` (a line per method and flow),
         ``pairs``, ``timestamps`` and ``trajectories`` (T_world_cam by ``method|flow``).
     """
-    sequence = open_sequence(job.path, job.dataset)
-    models = Models(job.device, job.weights)
-    flows = dict(open_flow(name, sequence) for name in job.flows)
+    sequence, models, flows = job.open()
     runs = [
-        _Run(method, label, Odometry(models, flow=flow, method=method, seed=job.seed))
+        _Run(method, label, Odometry(models, flow=flow, method=method, seed=job.options.seed))
         for label, flow in flows.items()
         for method in job.methods
     ]
@@ -198,14 +229,10 @@ def _result(
     rows = []
     for run in runs:
         est = Trajectory(stamps, np.stack([run.poses[i] for i in job.indices]))
-        mine = (table["method"] == run.method) & (table["flow_source"] == run.flow_source)
-        named = {
-            "sequence": job.name,
-            "method": run.method,
-            "flow_source": run.flow_source,
-            "depth_source": sequence.depth_source,
-        }
-        rows.append(sequence_row(table[mine], est if len(est) > 1 else None, gt, named))
+        named = {"method": run.method, "flow_source": run.flow_source}
+        mine = table[(table[list(named)] == pd.Series(named)).all(axis=1)]
+        named |= {"sequence": job.name, "depth_source": sequence.depth_source}
+        rows.append(sequence_row(mine, est if len(est) > 1 else None, gt, named))
         paths[f"{run.method}|{run.flow_source}"] = est.T_world_cam.tolist()
     facts = {
         "name": job.name,

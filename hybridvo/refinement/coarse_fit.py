@@ -1,8 +1,6 @@
 """One motion on gathered pixels: Gauss-Newton under a graduated robust kernel (numba).
 
-Poses inside the kernels are (3, 4) float64 arrays [R | t]. The group operations are written out
-here because a tensor round trip per step would cost more than the step; a test holds them equal to
-pypose's.
+Poses inside the kernels are (3, 4) float64 arrays [R | t].
 """
 
 from __future__ import annotations
@@ -12,6 +10,7 @@ import math
 import numpy as np
 
 from hybridvo.compilation import njit
+from hybridvo.geometry import se3_exp
 from hybridvo.refinement.kernels import (
     BLOCK,
     MU,
@@ -84,38 +83,17 @@ def solve6(acc, damping, delta):
     return True
 
 
+exponential = njit(error_model="numpy", cache=True, nogil=True)(se3_exp)
+
+
 @njit(error_model="numpy", cache=True, nogil=True)
 def left_update(delta, pose, out):
     """``out`` = Exp(delta) pose, delta = (translation, rotation)."""
-    wx, wy, wz = delta[3], delta[4], delta[5]
-    theta2 = wx * wx + wy * wy + wz * wz
-    if theta2 < 1e-8:
-        a = 1.0 - theta2 / 6.0
-        b = 0.5 - theta2 / 24.0
-        c = 1.0 / 6.0 - theta2 / 120.0
-    else:
-        theta = math.sqrt(theta2)
-        half = math.sin(0.5 * theta)
-        a = math.sin(theta) / theta
-        b = 2.0 * half * half / theta2
-        c = (1.0 - a) / theta2
-    S = np.array([[0.0, -wz, wy], [wz, 0.0, -wx], [-wy, wx, 0.0]])
-    S2 = np.empty((3, 3))
+    E = exponential(delta)
     for i in range(3):
-        for j in range(3):
-            S2[i, j] = S[i, 0] * S[0, j] + S[i, 1] * S[1, j] + S[i, 2] * S[2, j]
-    E = np.empty((3, 3))
-    for i in range(3):
-        for j in range(3):
-            E[i, j] = a * S[i, j] + b * S2[i, j]
-        E[i, i] += 1.0
-    for i in range(3):
-        shift = delta[i]
-        for j in range(3):
-            shift += (b * S[i, j] + c * S2[i, j]) * delta[j]
         for j in range(4):
-            value = E[i, 0] * pose[0, j] + E[i, 1] * pose[1, j] + E[i, 2] * pose[2, j]
-            out[i, j] = value + shift if j == 3 else value
+            out[i, j] = E[i, 0] * pose[0, j] + E[i, 1] * pose[1, j] + E[i, 2] * pose[2, j]
+        out[i, 3] += E[i, 3]
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
@@ -129,9 +107,7 @@ def set_noise(flow_sigma, depth_sigma, cutoff, out):
 @njit(error_model="numpy", cache=True, nogil=True)
 def evaluate(samples, n, pose, K, noise, work, acc):
     """Normal equations at ``pose``; returns the cost, pixels behind the camera at the full cost."""
-    R = pose[:, :3].astype(np.float32)
-    t = pose[:, 3].astype(np.float32)
-    sum_samples(samples, n, R, t, K, noise, work, acc)
+    sum_samples(samples, n, pose, K, noise, work, acc)
     return acc[27]
 
 
@@ -258,12 +234,10 @@ def reestimate(samples, n, K, sf, sd, sf_cap, sd_cap, cutoff, rounds, steps, lim
 @njit(error_model="numpy", cache=True, nogil=True)
 def robust_weights(samples, n, pose, K, noise, work, out):
     """Robust weight in [0, 1] of ``n`` pixels, without the external weight; 0 where unusable."""
-    R = pose[:, :3].astype(np.float32)
-    t = pose[:, 3].astype(np.float32)
     acc = np.zeros(SUMS)
     for o in range(0, n, BLOCK):
         m = min(BLOCK, n - o)
-        project_block(samples, o, m, R, t, K, noise, work, out[o:], acc)
+        project_block(samples, o, m, pose, K, noise, work, out[o:], acc)
 
 
 def translation_scale(samples: np.ndarray, n: int) -> float:

@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from hybridvo.calibration import ABSORBED, CLUSTERED, FEW_TILES, LONG_GROWTH
 from hybridvo.compilation import njit
@@ -36,7 +37,7 @@ NOTHING = np.diag([1e4] * 3 + [10.0] * 3)
 SMALLEST_REST = 0.25
 """Least share of the scores' variance that the fit is assumed to leave in the blocks."""
 
-SIZES = np.array([[1, 1], [2, 1], [4, 2]])
+SIZES = ((1, 1), (2, 1), (4, 2))
 """Width of the blocks and distance between them, in tiles."""
 
 UPPER = np.triu_indices(6)
@@ -91,11 +92,11 @@ def score_block(o, n, c2, external, work, rows, factors):
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
-def score_pixels(samples, n, R, t, K, noise, work, rows, factors, acc):
+def score_pixels(samples, n, pose, K, noise, work, rows, factors, acc):
     """:func:`score_block` of gathered pixels; cost and weights are added to ``acc`` (30,)."""
     for o in range(0, n, BLOCK):
         m = min(BLOCK, n - o)
-        project_block(samples, o, m, R, t, K, noise, work, work[8], acc)
+        project_block(samples, o, m, pose, K, noise, work, work[8], acc)
         score_block(o, m, noise[2], samples[W], work, rows, factors)
 
 
@@ -113,70 +114,41 @@ def score_sums(
         K: (4,) float32 fx, fy, cx, cy of the current camera.
         noise: (3,) float32, see :func:`hybridvo.refinement.coarse_fit.set_noise`.
     """
-    R, t = pose[:, :3].astype(np.float32), pose[:, 3].astype(np.float32)
     rows, factors, used = np.empty((6, n), np.float32), np.empty(n), np.zeros(SUMS)
-    score_pixels(samples, n, R, t, K, noise, new_work(), rows, factors, used)
+    score_pixels(samples, n, pose, K, noise, new_work(), rows, factors, used)
     wide = rows.astype(np.float64)  # squares of large external weights overflow in float32
     out = np.concatenate([m[UPPER] for m in ((wide * factors) @ wide.T, wide @ wide.T)])
     return out / max(used[29], 1e-12)
 
 
-@njit(error_model="numpy", cache=True, nogil=True)
-def block_sums(scores, information, inverse, sizes, order, meats, lost):
+def block_sums(tiles: np.ndarray, inverse: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
     """Outer products of the scores summed over blocks of tiles, and what the fit took from them.
 
     Blocks reach over the border, so that every tile lies in as many of them; (width / step)^2 of
     them cover a tile, and each counts for that share. Under independent errors of the model's size
-    a block with information H_b has scores of covariance H_b - H_b H^-1 H_b about the estimate:
-    ``lost`` is the second term in units of the first, averaged over the directions.
+    a block with information H_b has scores of covariance H_b - H_b H^-1 H_b about the estimate: the
+    second term in units of the first, averaged over the directions, is what the fit took.
 
     Args:
-        scores: (rows, columns, 6) of the tiles.
-        information: (rows, columns, 21) of the tiles.
+        tiles: (rows, columns, 27) information and scores.
         inverse: (6, 6) of the whole information.
-        sizes: (S, 2) width and step of the blocks.
-        order: :data:`ORDER`.
-        meats: (S, 6, 6), set.
-        lost: (S,), set.
 
     Returns:
-        The number of tiles with a score.
+        (S, 6, 6), (S,), number of tiles with a score.
     """
-    rows, columns = scores.shape[:2]
-    s = np.empty(6)
-    h = np.empty(21)
-    X = np.empty((6, 6))
-    occupied = 0
-    meats[:] = 0.0
-    for k in range(len(sizes)):
-        width, step = sizes[k, 0], sizes[k, 1]
+    meats, lost, counts = [], [], []
+    for width, step in SIZES:
+        border = (width - step, width)
+        padded = np.pad(tiles, (border, border, (0, 0)))
+        windows = sliding_window_view(padded, (width, width), axis=(0, 1))[::step, ::step]
+        blocks = windows.sum(axis=(3, 4)).reshape(-1, tiles.shape[2])
+        blocks = blocks[blocks[:, 0] > 0]
+        X = inverse @ blocks[:, ORDER]
         share = (step / width) ** 2
-        trace = 0.0
-        for v in range(step - width, rows, step):
-            for u in range(step - width, columns, step):
-                s[:] = 0.0
-                h[:] = 0.0
-                for i in range(max(v, 0), min(v + width, rows)):
-                    for j in range(max(u, 0), min(u + width, columns)):
-                        for p in range(6):
-                            s[p] += scores[i, j, p]
-                        for q in range(21):
-                            h[q] += information[i, j, q]
-                if not h[0] > 0.0:
-                    continue
-                occupied += width == 1
-                for p in range(6):
-                    for r in range(6):
-                        meats[k, p, r] += share * s[p] * s[r]
-                        x = 0.0
-                        for m in range(6):
-                            x += inverse[p, m] * h[order[m, r]]
-                        X[p, r] = x
-                for p in range(6):
-                    for r in range(6):
-                        trace += share * X[p, r] * X[r, p]
-        lost[k] = trace / 6.0
-    return occupied
+        meats.append(share * blocks[:, 21:].T @ blocks[:, 21:])
+        lost.append(share * np.einsum("bij,bji->", X, X) / 6)
+        counts.append(len(blocks))
+    return np.array(meats), np.array(lost), counts[0]
 
 
 def long_range(growth: float, tiles: int) -> float:
@@ -235,8 +207,8 @@ def sandwich_covariance(
     step = (model * outer) @ total[21:]
     scores = tiles[..., 21:] - tiles[..., :21][..., ORDER] @ step
     alone = meat * outer
-    meats, lost = np.empty((len(SIZES), 6, 6)), np.empty(len(SIZES))
-    occupied = block_sums(scores, tiles[..., :21], model * outer, SIZES, ORDER, meats, lost)
+    centred = np.concatenate([tiles[..., :21], scores], axis=2)
+    meats, lost, occupied = block_sums(centred, model * outer)
     meats = meats * outer / np.maximum(1 - lost, SMALLEST_REST)[:, None, None]
     try:
         inflation = np.trace(np.linalg.solve(alone, meats), axis1=1, axis2=2) / 6
@@ -251,6 +223,11 @@ def sandwich_covariance(
     if not np.isfinite(covariance).all():
         return NOTHING.copy(), eigenvalues, False
     return covariance, eigenvalues, True
+
+
+def tile_sums(scores: np.ndarray, tile: np.ndarray, count: int) -> np.ndarray:
+    """(count, 6) sums of (6, N) scores over the tiles that (N,) ``tile`` says."""
+    return np.stack([np.bincount(tile, row, count) for row in scores], axis=1)
 
 
 def dispersion(sums: np.ndarray, meat: np.ndarray, model: np.ndarray) -> float | None:

@@ -72,21 +72,22 @@ def look_up(samples, n, step, depth, u0, v0, out):
 
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
-def conditional(samples, k, log_depth, R, t, K, noise, row):
+def conditional(samples, k, log_depth, pose, K, noise, row):
     """(conditional residual, raw residual, in front) of pixel ``k``; its Jacobian in ``row``."""
     x, y, z = samples[XN, k], samples[YN, k], samples[Z, k]
-    X = z * (R[0, 0] * x + R[0, 1] * y + R[0, 2]) + t[0]
-    Y = z * (R[1, 0] * x + R[1, 1] * y + R[1, 2]) + t[1]
-    Zc = z * (R[2, 0] * x + R[2, 1] * y + R[2, 2]) + t[2]
+    X = z * (pose[0, 0] * x + pose[0, 1] * y + pose[0, 2]) + pose[0, 3]
+    Y = z * (pose[1, 0] * x + pose[1, 1] * y + pose[1, 2]) + pose[1, 3]
+    Zc = z * (pose[2, 0] * x + pose[2, 1] * y + pose[2, 2]) + pose[2, 3]
     if not Zc > 1e-6:
         return 0.0, 0.0, False
+    tx, ty, tz = pose[0, 3], pose[1, 3], pose[2, 3]
     i = 1.0 / Zc
     a = X * i
     b = Y * i
     ru = samples[MU, k] - (K[0] * a + K[2])
     rv = samples[MV, k] - (K[1] * b + K[3])
-    qu = K[0] * i * (a * t[2] - t[0])
-    qv = K[1] * i * (b * t[2] - t[1])
+    qu = K[0] * i * (a * tz - tx)
+    qv = K[1] * i * (b * tz - ty)
     g = noise[1] * samples[PD, k] * noise[0] * samples[PF, k]
     raw = log_depth[k] - math.log(Zc)
     # Jacobian and q at the depth that the flow makes most likely, as in the kernels
@@ -94,11 +95,11 @@ def conditional(samples, k, log_depth, R, t, K, noise, row):
     shift = min(max(shift, -MAX_SHIFT), MAX_SHIFT)
     a += qu * shift / K[0]
     b += qv * shift / K[1]
-    i *= 1.0 - (1.0 - t[2] * i) * shift
-    qu = K[0] * i * (a * t[2] - t[0])
-    qv = K[1] * i * (b * t[2] - t[1])
+    i *= 1.0 - (1.0 - tz * i) * shift
+    qu = K[0] * i * (a * tz - tx)
+    qv = K[1] * i * (b * tz - ty)
     shrink = 1.0 / (1.0 + g * (qu * qu + qv * qv))
-    h = 1.0 - t[2] * i
+    h = 1.0 - tz * i
     ku = h * g * shrink * qu
     kv = h * g * shrink * qv
     fx, fy = K[0], K[1]
@@ -120,8 +121,6 @@ def sparse_step(n):
 @njit(error_model="numpy", cache=True, nogil=True)
 def depth_scale(samples, n, log_depth, robust, pose, K, noise):
     """Robust standard deviations of (conditional residual, raw residual); 0 if too few pixels."""
-    R = pose[:, :3].astype(np.float32)
-    t = pose[:, 3].astype(np.float32)
     row = np.empty(6)
     step = sparse_step(n)
     size = n // step + 1
@@ -131,7 +130,7 @@ def depth_scale(samples, n, log_depth, robust, pose, K, noise):
     for k in range(0, n, step):
         if not (robust[k] > 0.3 and abs(log_depth[k]) < 1e6):
             continue
-        e, raw, front = conditional(samples, k, log_depth, R, t, K, noise, row)
+        e, raw, front = conditional(samples, k, log_depth, pose, K, noise, row)
         if not front:
             continue
         one[m] = abs(e)
@@ -152,20 +151,18 @@ def sum_depth(
     k on the grid of ``width`` pixels, ``step`` apart, with ``columns`` tiles in a row; ``meat``
     (21,) gets the sum of w^2 s s^T. Returns the cost.
     """
-    R = pose[:, :3].astype(np.float32)
-    t = pose[:, 3].astype(np.float32)
     c2 = np.float64(noise[2])
     dummy = np.zeros(SUMS)
     row = np.empty(6)
     cost = 0.0
     for o in range(0, n, BLOCK):
         m = min(BLOCK, n - o)
-        project_block(samples, o, m, R, t, K, noise, work, work[8], dummy)
+        project_block(samples, o, m, pose, K, noise, work, work[8], dummy)
         for j in range(m):
             k = o + j
             if not abs(log_depth[k]) < 1e6:
                 continue
-            e, _, front = conditional(samples, k, log_depth, R, t, K, noise, row)
+            e, _, front = conditional(samples, k, log_depth, pose, K, noise, row)
             if not front:
                 continue
             v = sz * sz

@@ -17,13 +17,15 @@ from __future__ import annotations
 from functools import cache
 
 import numpy as np
+from scipy.sparse import csr_array, hstack
 
 from hybridvo.calibration import EVEN_PARTS, UNEVEN_LIGHT
 from hybridvo.options import RefineOptions
 from hybridvo.refinement import photometric_kernels as kernels
-from hybridvo.refinement.covariance import dispersion
+from hybridvo.refinement.covariance import dispersion, tile_sums
 from hybridvo.refinement.full_fit import tile_size
-from hybridvo.refinement.pixels import as_contiguous, typical
+from hybridvo.refinement.kernels import MAX_VALUE
+from hybridvo.refinement.pixels import typical
 from hybridvo.refinement.solver import Linearization, positive_inverse
 from hybridvo.results import RelativePose
 from hybridvo.types import FramePair
@@ -32,6 +34,8 @@ CUTOFF = 3.0
 """c of the Geman-McClure kernel, in standard deviations."""
 NOISE_FLOOR = 0.1
 """Grey levels: rounding to 8 bits leaves 0.08 after the finest blur."""
+GAINS = (0.2, 5.0)
+"""Limits of the gain between two images."""
 PARTS = ((2, 2), (4, 1))
 """Rows and columns of parts of the image that are held against each other: a lens errs by
 quadrant, a rolling shutter by row."""
@@ -56,23 +60,29 @@ class ImageFactor:
         self, pair: FramePair, pose: RelativePose, index: np.ndarray, inflation: float
     ) -> None:
         prev, curr, n = pair.prev.camera, pair.curr.camera, len(index)
-        self._depth = as_contiguous(np.asarray(pair.prev.depth))
-        self._weights = as_contiguous(np.asarray(pose.weights), np.float32)
-        variance = pair.prev.depth_variance
-        self._unit = np.float32(1.0 if variance is None else typical(variance))
-        self._variance = as_contiguous(
-            np.ones((1, 1), np.float32) if variance is None else variance
-        )
-        self._shape, self._index = prev.shape, index
+        rows, columns = index.T
+        buffer = np.ones((kernels.BUFFER_ROWS, n), np.float32)
+        buffer[kernels.XN] = (columns - prev.cx) / prev.fx
+        buffer[kernels.YN] = (rows - prev.cy) / prev.fy
+        buffer[kernels.Z] = np.asarray(pair.prev.depth)[rows, columns]
+        buffer[kernels.W] = np.minimum(np.asarray(pose.weights)[rows, columns], 1.0)
+        if pair.prev.depth_variance is not None:
+            variance = pair.prev.depth_variance[rows, columns]
+            good = (variance >= 0) & (variance < MAX_VALUE)
+            buffer[kernels.PD, good] = variance[good] / typical(pair.prev.depth_variance)
+            buffer[kernels.W, ~good] = 0.0
+        self._buffer, self._index = buffer, index
         self._depth_noise, self._inflation = pose.depth_noise, inflation
-        self._camera = np.array([1 / prev.fx, 1 / prev.fy, prev.cx, prev.cy], np.float32)
+        self._scales = np.array([1 / prev.fx, 1 / prev.fy], np.float32)
         self._K = np.array([curr.fx, curr.fy, curr.cx, curr.cy], np.float32)
-        self._buffer = np.empty((kernels.BUFFER_ROWS, n), np.float32)
         self._J = np.empty((kernels.GQ + 1, n), np.float32)
         self._r, self._w = np.empty(n, np.float32), np.empty(n, np.float32)
-        self._H, self._g = np.empty((kernels.COLUMNS,) * 2), np.empty(kernels.COLUMNS)
         self._light = np.array([1.0, 0.0], np.float32)
-        self._places = field_places(index, prev.shape)
+        self._places = index * [(ROWS - 1) / prev.height, (COLUMNS - 1) / prev.width]
+        self._to_nodes = interpolation(self._places)
+        tile = tile_size(prev.shape, RefineOptions().tiles)
+        self._tiles = -(-prev.height // tile), -(-prev.width // tile)
+        self._tile = rows // tile * self._tiles[1] + columns // tile
         self._scale = 1.0 / inflation
         self._uneven_here = False
         self.noise = 0.0
@@ -93,11 +103,6 @@ class ImageFactor:
         return float(self._light[1])
 
     @property
-    def pixels(self) -> int:
-        """How many are seen."""
-        return int(np.count_nonzero(self._w))
-
-    @property
     def seen(self) -> float:
         """Share of the weight that falls inside the current image."""
         weight = self._buffer[kernels.W]
@@ -105,10 +110,10 @@ class ImageFactor:
 
     def use(self, prev: np.ndarray, curr: np.ndarray, T: np.ndarray) -> None:
         """Take two images (H, W) and estimate noise and light at a motion."""
-        kernels.gather_pixels(
-            self._index, len(self._index), prev, self._depth, self._weights, self._variance,
-            self._unit, self._camera, self._buffer,
-        )  # fmt: skip
+        rows, columns = self._index.T
+        self._buffer[kernels.GREY] = prev[rows, columns]
+        self._buffer[kernels.GX] = 0.5 * (prev[rows, columns + 1] - prev[rows, columns - 1])
+        self._buffer[kernels.GY] = 0.5 * (prev[rows + 1, columns] - prev[rows - 1, columns])
         self._prev, self._curr, self._at = prev, curr, np.empty(0)
         self._project(T)
         for _ in range(2):
@@ -150,21 +155,36 @@ class ImageFactor:
     def _project(self, T: np.ndarray) -> None:
         if T is self._at:
             return
-        R, t = T[:3, :3].astype(np.float32), T[:3, 3].astype(np.float32)
         kernels.project_pixels(
-            self._buffer, len(self._index), self._curr, R, t, self._K, self._camera[:2],
-            self._light, self._J, self._r,
-        )  # fmt: skip
+            self._buffer, self._curr, T[:3], self._K, self._scales, self._light, self._J, self._r
+        )
         self._at = T
 
     def _weigh(self) -> float:
-        """Weights, light, H and g of the last projection; returns the cost."""
+        """Weights, H and g of the last projection under the light that fits best; the cost."""
+        self._sum()
+        (a, b), (_, c) = self._H[6:, 6:]
+        gain, determinant = float(self._light[0]), a * c - b * b
+        if determinant > 1e-9 * a * c > 0:
+            gain += (c * self._g[6] - b * self._g[7]) / determinant
+        more = np.float32(min(max(gain, GAINS[0]), GAINS[1])) - self._light[0]
+        shift = np.float32((self._g[7] - b * more) / c if c > 0 else 0.0)
+        self._r -= more * self._buffer[kernels.GREY] + shift
+        self._light += more, shift
+        return self._sum()
+
+    def _sum(self) -> float:
+        """Weights, H (8, 8) and g (8,) of motion, gain and offset; the cost."""
         # depth_noise belongs to the typical depth variance, the unit of the buffer's
         noise = 1 / max(self.noise, NOISE_FLOOR) ** 2, self._depth_noise**2, CUTOFF**2
-        return kernels.normal_equations(
-            self._buffer, len(self._index), np.array(noise, np.float32), self._light, self._J,
-            self._r, self._w, self._H, self._g,
-        )  # fmt: skip
+        cost = kernels.weigh_pixels(
+            self._buffer, np.array(noise, np.float32), self._J, self._r, self._w
+        )
+        J = self._J[: kernels.GQ]
+        weighted = J * self._w
+        self._H = (weighted @ J.T).astype(np.float64)
+        self._g = -(weighted @ np.where(self._w > 0, self._r, 0)).astype(np.float64)
+        return cost
 
     def _settle(self) -> None:
         """Noise of the last projection, and the light under it."""
@@ -181,16 +201,18 @@ class ImageFactor:
 
     def _even_light(self, least: float) -> bool:
         """Put fields of gain and offset into the grey values where they explain enough."""
-        grey = self._buffer[kernels.GREY]
-        arrays = self._places, grey, self._r, self._w
-        if least > 0:
-            a, b, c, d = (np.ascontiguousarray(x[::4]) for x in arrays)
-            if light_fields(a, b, c, d, least) is None:
-                return False
-        fields = light_fields(*arrays)
+        buffer, (gain, _) = self._buffer, self._light
+        data = np.stack([buffer[kernels.GREY], self._r, self._w])
+        if least > 0 and light_fields(self._to_nodes[::4], *data[:, ::4], least=least) is None:
+            return False
+        fields = light_fields(self._to_nodes, *data)
         if fields is None:
             return False
-        kernels.apply_fields(self._places, fields, self._light[0], self._buffer, self._r)
+        more, shift = (self._to_nodes @ field for field in fields)
+        self._r -= more * buffer[kernels.GREY] + shift
+        factor = 1 + more / gain
+        buffer[[kernels.GREY, kernels.GX, kernels.GY]] *= factor
+        buffer[kernels.GREY] += shift / gain
         return True
 
     def _marginal(self) -> tuple[np.ndarray, np.ndarray]:
@@ -210,28 +232,23 @@ class ImageFactor:
         Trace ratio of the sandwich covariance over tiles to that of the model, at least 1; beyond
         the tiles by ``inflation``, and by ``agreement`` where that is not enough.
         """
-        height, width = self._shape
-        tile = tile_size((height, width), RefineOptions().tiles)
-        columns, rows = -(-width // tile), -(-height // tile)
-        scores, curvature = np.zeros((rows * columns, 6)), np.zeros((rows * columns, 6, 6))
-        meat = np.zeros((6, 6))
         H, light = self._marginal()
-        kernels.tile_scores(
-            self._index, len(self._index), self._J, self._r, self._w, tile, columns, light, scores,
-            curvature, meat,
-        )  # fmt: skip
         model = positive_inverse(H)
         if model is None:
             self._scale = 0.0
             return
+        rows = self._J[:6].astype(np.float64) - light @ self._J[6:8]
+        r = np.where(self._w > 0, self._r, 0.0)
+        pull = rows * (self._w * r)
         # as at the optimum of the images alone, to first order: the flow pulls away from it
-        scores -= curvature @ (model @ scores.sum(axis=0))
-        factor = dispersion(scores, meat, model)
+        r = r - (model @ pull.sum(axis=1)) @ rows
+        scores = tile_sums(rows * (self._w * r), self._tile, self._tiles[0] * self._tiles[1])
+        factor = dispersion(scores, pull @ pull.T, model)
         if factor is None:
             self._scale = 0.0
             return
         scale = 1.0 / (factor * self._inflation)
-        parts = scale * parts_dispersion(scores.reshape(rows, columns, 6), model)
+        parts = scale * parts_dispersion(scores.reshape(*self._tiles, 6), model)
         # what the parts disagree about is seen; as much again is common to them and is not
         self.agreement = min(1.0, (EVEN_PARTS / max(parts, EVEN_PARTS)) ** 2)
         self._scale = scale * self.agreement
@@ -255,38 +272,42 @@ def parts_dispersion(scores: np.ndarray, model: np.ndarray) -> float:
     return float(np.mean(found))
 
 
+def interpolation(places: np.ndarray) -> csr_array:
+    """(N, ROWS x COLUMNS) bilinear weights of the nodes at places (N, 2) in cells of the fields."""
+    whole = places.astype(np.intp)
+    f, first = places - whole, whole[:, 0] * COLUMNS + whole[:, 1]
+    v, u = f.T
+    weights = np.stack([(1 - v) * (1 - u), (1 - v) * u, v * (1 - u), v * u], axis=1)
+    nodes = first[:, None] + [0, 1, COLUMNS, COLUMNS + 1]
+    starts = np.arange(0, weights.size + 1, 4)
+    shape = len(places), ROWS * COLUMNS
+    return csr_array((weights.ravel().astype(np.float32), nodes.ravel(), starts), shape)
+
+
 def light_fields(
-    place: np.ndarray, grey: np.ndarray, r: np.ndarray, w: np.ndarray, least: float = 0.0
+    to_nodes: csr_array, grey: np.ndarray, r: np.ndarray, w: np.ndarray, least: float = 0.0
 ) -> np.ndarray | None:
-    """Smooth changes of gain and offset that explain the residuals best.
+    """Smooth changes of gain and offset (2, nodes) that explain the residuals best.
 
     Args:
-        place: (N, 2) v and u in cells of the fields, see :func:`field_places`.
+        to_nodes: (N, nodes) bilinear weights.
         grey: (N,) grey values.
         r: (N,) residuals.
         w: (N,) their weights, 0 where not seen.
-        least: share of the squared residuals that the fields must explain.
-
-    Returns:
-        (ROWS, COLUMNS, 2) float32 changes of gain and offset at the nodes; None where they explain
-        less.
+        least: share of the squared residuals that they must explain, else None.
     """
+    r = np.where(w > 0, r, 0)
+    design = hstack([to_nodes.multiply(grey[:, None]), to_nodes], format="csr")
+    weighted = design.multiply(w[:, None]).T
+    H, g = (weighted @ design).toarray().astype(np.float64), weighted @ r.astype(np.float64)
     nodes = ROWS * COLUMNS
-    H, g = np.zeros((2 * nodes,) * 2), np.zeros(2 * nodes)
-    power = kernels.field_equations(place, grey, r, w, COLUMNS, H, g)
-    scale = np.tile([np.trace(H[::2, ::2]), np.trace(H[1::2, 1::2])], nodes) / nodes
-    H[::2, ::2] += SMOOTH * scale[0] * _differences()
-    H[1::2, 1::2] += SMOOTH * scale[1] * _differences()
+    scale = np.repeat([np.trace(H[:nodes, :nodes]), np.trace(H[nodes:, nodes:])], nodes) / nodes
+    H += SMOOTH * scale * np.kron(np.eye(2), _differences())
     # and a weak pull to no change, for nodes that no pixel is near to
-    field = np.linalg.solve(H + np.diag(1e-4 * scale + 1e-12), g)
+    field, power = np.linalg.solve(H + np.diag(1e-4 * scale + 1e-12), g), w @ (r * r)
     if not (np.isfinite(field).all() and field @ g >= least * power and power > 0):
         return None
-    return field.astype(np.float32).reshape(ROWS, COLUMNS, 2)
-
-
-def field_places(index: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """(N, 2) place of pixels (v, u) of an image (H, W), in cells of the fields."""
-    return index * np.array([(ROWS - 1) / shape[0], (COLUMNS - 1) / shape[1]], np.float32)
+    return field.astype(np.float32).reshape(2, nodes)
 
 
 def correlation(

@@ -153,20 +153,28 @@ def gather_grid(stride, data, camera, flags, scale, out):
     return h, w
 
 
+@njit(error_model="numpy", cache=True, nogil=True)
+def pose_entries(pose):
+    """The twelve numbers of a (3, 4) pose, row by row, in single precision."""
+    p = pose.astype(np.float32)
+    return (
+        p[0, 0], p[0, 1], p[0, 2], p[0, 3], p[1, 0], p[1, 1],
+        p[1, 2], p[1, 3], p[2, 0], p[2, 1], p[2, 2], p[2, 3],
+    )  # fmt: skip
+
+
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
-def project_block(buf, o, n, R, t, K, noise, work, robust, acc):
+def project_block(buf, o, n, pose, K, noise, work, robust, acc):
     """First stage, pixels ``o .. o + n - 1``: residuals, robust weights, weighted information.
 
-    ``K`` = (fx, fy, cx, cy) of the current frame; ``noise`` = (1/sf^2, sd^2, c^2); all float32.
+    ``pose`` (3, 4) float64; ``K`` = (fx, fy, cx, cy) of the current frame and ``noise`` =
+    (1/sf^2, sd^2, c^2), float32.
     ``work`` rows: a, b, i, m00, m01, m11 (information in units of B), n0, n1 (gradient).
     ``robust`` (N,): robust weight without the external one, 0 where unusable.
     """
     keep_apart()  # type: ignore[call-arg]
     fx, fy, cx, cy = K[0], K[1], K[2], K[3]
-    r00, r01, r02 = R[0, 0], R[0, 1], R[0, 2]
-    r10, r11, r12 = R[1, 0], R[1, 1], R[1, 2]
-    r20, r21, r22 = R[2, 0], R[2, 1], R[2, 2]
-    tx, ty, tz = t[0], t[1], t[2]
+    r00, r01, r02, tx, r10, r11, r12, ty, r20, r21, r22, tz = pose_entries(pose)
     isf2, sd2, c2 = noise[0], noise[1], noise[2]
     b_x, b_y, b_z, b_u = buf[XN][o:], buf[YN][o:], buf[Z][o:], buf[MU][o:]
     b_v, b_f, b_d, b_w = buf[MV][o:], buf[PF][o:], buf[PD][o:], buf[W][o:]
@@ -343,18 +351,18 @@ def sum_rotation(o, n, work, acc):
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
-def sum_samples(samples, n, R, t, K, noise, work, acc):
+def sum_samples(samples, n, pose, K, noise, work, acc):
     """Normal equations of gathered pixels, set in ``acc`` (30,) float64."""
     acc[:] = 0.0
     for o in range(0, n, BLOCK):
         m = min(BLOCK, n - o)
-        project_block(samples, o, m, R, t, K, noise, work, work[8], acc)
+        project_block(samples, o, m, pose, K, noise, work, work[8], acc)
         sum_translation(0, m, work, acc)
         sum_rotation(0, m, work, acc)
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
-def sum_tiles(data, camera, flags, scale, R, t, K, noise, band, tile, weights, sums, out):
+def sum_tiles(data, camera, flags, scale, pose, K, noise, band, tile, weights, sums, out):
     """One pass over the rows of one band of tiles of the full grid.
 
     Adds the normal equations of each tile to ``sums`` (rows of tiles, columns of tiles, 27), cost
@@ -370,7 +378,7 @@ def sum_tiles(data, camera, flags, scale, R, t, K, noise, band, tile, weights, s
         for u0 in range(0, width, part):
             n = min(part, width - u0)
             gather_row(v, u0, u0 + n, data, camera, flags, scale, buf)
-            project_block(buf, 0, n, R, t, K, noise, work, weights[v, u0:], out)
+            project_block(buf, 0, n, pose, K, noise, work, weights[v, u0:], out)
             for o in range(0, n, tile):
                 m = min(tile, n - o)
                 sum_translation(o, m, work, sums[band, (u0 + o) // tile])

@@ -21,6 +21,7 @@ from hybridvo.refinement.kernels import (
     W,
     Z,
     keep_apart,
+    pose_entries,
 )
 
 FLOW_NOISE_FLOOR = 2e-3
@@ -37,7 +38,7 @@ SETTLED = 1e-3
 
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
-def gather_noise(samples, n, step, R, t, K, radius, terms):
+def gather_noise(samples, n, step, pose, K, radius, terms):
     """What the noise estimate needs of every ``step``-th pixel, as rows of ``terms`` (6, N).
 
     Squared residual along q and across it, variance of the flow and of the depth (through q) in
@@ -46,10 +47,7 @@ def gather_noise(samples, n, step, R, t, K, radius, terms):
     """
     keep_apart()  # type: ignore[call-arg]
     fx, fy, cx, cy = K[0], K[1], K[2], K[3]
-    r00, r01, r02 = R[0, 0], R[0, 1], R[0, 2]
-    r10, r11, r12 = R[1, 0], R[1, 1], R[1, 2]
-    r20, r21, r22 = R[2, 0], R[2, 1], R[2, 2]
-    tx, ty, tz = t[0], t[1], t[2]
+    r00, r01, r02, tx, r10, r11, r12, ty, r20, r21, r22, tz = pose_entries(pose)
     b_x, b_y, b_z, b_u = samples[XN], samples[YN], samples[Z], samples[MU]
     b_v, b_f, b_d, b_w = samples[MV], samples[PF], samples[PD], samples[W]
     along, across, alpha = terms[0], terms[1], terms[2]
@@ -150,10 +148,8 @@ def estimate_noise(samples, n, pose, K, sf, sd, sf_cap, sd_cap, rounds, limit):
     """
     step = max(1, n // limit)
     terms = np.empty((6, ((n // step + 16) // 16 | 1) * 16), np.float32)
-    R = pose[:, :3].astype(np.float32)
-    t = pose[:, 3].astype(np.float32)
     radius = np.float32(max(4.0, 8.0 * sf))
-    m, total, inside = gather_noise(samples, n, step, R, t, K, radius, terms)
+    m, total, inside = gather_noise(samples, n, step, pose, K, radius, terms)
     if m < 8 or not inside > 0:
         return sf, sd, 0.0, sd * sd
     vf = sf * sf

@@ -11,8 +11,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
-from typing import Any, ClassVar
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import cv2
@@ -52,10 +51,9 @@ COARSE_SPREAD = 0.3
 """Coarser blurs are used where the flow leaves more than this many finest blurs undecided."""
 MID_GREY = 128.0
 """Taken off every grey value, so that gain and offset are nearly independent."""
-STRIPS, STRIP_ROWS = 4, 28
-"""Sharpness is measured on so many strips of so many rows."""
-UNLIKE = 1.1
-"""Ratio of two sharpnesses from which on an image is blurred to match the other."""
+GREY = np.array([[0.299, 0.587, 0.114, -MID_GREY]])
+_IMAGES: WeakKeyDictionary[Frame, dict[float, np.ndarray]] = WeakKeyDictionary()
+"""Blurred images by blur, as long as the frame is kept."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,9 +71,6 @@ class PhotometricReport:
         image_information: (6, 6) of the images alone; flow_information: of the flow alone;
             depth_information: of both depth maps, 0 without them; all as they were added up.
         gain, offset: of the current image over the previous one; offset in grey levels.
-        noise_grey: standard deviation of the residual, grey levels.
-        correlation: of the two images over the pixels used.
-        pixels: how many were used.
         agreement: factor in (0, 1] on the information of the images by which the parts of the
             image, held against each other, lowered it.
         uneven_light: whether gain and offset had to vary over the image.
@@ -91,9 +86,6 @@ class PhotometricReport:
     depth_information: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
     gain: float = 1.0
     offset: float = 0.0
-    noise_grey: float = 0.0
-    correlation: float = 0.0
-    pixels: int = 0
     agreement: float = 1.0
     uneven_light: bool = False
 
@@ -109,12 +101,12 @@ def refine_photometric(
         pair: the two frames; both with images.
         pose: what :func:`hybridvo.refinement.refine.refine_pair` found for them, with its weights
             and covariance.
-        options: see :class:`PhotometricOptions`.
+        options: of the refinement.
 
     Returns:
         The motion with its covariance, ``terms`` and report (``photometric``). Where images are
         missing or of no use, or the acceptance test refuses them, the motion is that of ``pose``,
-        and the report and the status' message say why. Never a value that is not finite.
+        and the report and the status' message say why.
 
     Raises:
         InputError: weights of another shape than the image.
@@ -135,33 +127,25 @@ def _refine(pair: FramePair, pose: RelativePose, options: PhotometricOptions) ->
             f"refine_photometric: expected weights of shape {prev.camera.shape}, "
             f"got {pose.weights.shape}."
         )
-    flow_information = positive_inverse(pose.covariance * options.prior_inflation)
+    inflated, blurs = pose.covariance * options.prior_inflation, options.blur_px
+    flow_information = positive_inverse(inflated)
     if flow_information is None:
         return _unchanged(pose, "", "the estimate has no usable covariance")
-    images = GreyImage.of(prev), GreyImage.of(curr)
-    # the sharper of the two is blurred more
-    more = missing_blur(*images), missing_blur(*images[::-1])
-    index = choose_pixels(
-        images[0].blurred(options.blur_px[-1], more[0]), prev.depth, pose.weights, options.pixels
-    )
+    index = choose_pixels(blurred(prev, blurs[-1]), prev.depth, pose.weights, options.pixels)
     if len(index) < MIN_PIXELS:
         what = f"{len(index)} static pixels with texture and depth, {MIN_PIXELS} needed"
         return _unchanged(pose, "no_texture", what)
     factor = ImageFactor(pair, pose, index, options.image_inflation)
-    prior = PriorFactor(pose.T_curr_prev, flow_information)
+    factors: list[Factor] = [factor, PriorFactor(pose.T_curr_prev, flow_information)]
     depth = PlaneFactor.of(pair, pose.weights, MIN_WEIGHT, options.image_inflation)
-    factors: list[Factor] = [factor, prior]
     if depth is not None and depth.estimate(pose.T_curr_prev):
         factors.append(depth)
-    blurs = options.blur_px
     # where the flow is sure to a fraction of the finest blur, that one is enough
-    if _spread_px(pair, index, pose.covariance * options.prior_inflation) < (
-        COARSE_SPREAD * blurs[-1]
-    ):
+    if _spread_px(pair, index, inflated) < COARSE_SPREAD * blurs[-1]:
         blurs = blurs[-1:]
     T = pose.T_curr_prev
     for blur in blurs:
-        factor.use(images[0].blurred(blur, more[0]), images[1].blurred(blur, more[1]), T)
+        factor.use(blurred(prev, blur), blurred(curr, blur), T)
         half = (options.iterations + 1) // 2
         for steps in (half, options.iterations - half):
             T = gauss_newton(factors, T, SolverOptions(steps, tolerance=0.1)).T
@@ -169,6 +153,17 @@ def _refine(pair: FramePair, pose: RelativePose, options: PhotometricOptions) ->
             if depth is not None:
                 depth.estimate(T)
     return _judged(pose, factors, T, options)
+
+
+def blurred(frame: Frame, px: float) -> np.ndarray:
+    """(H, W) float32 grey values less :data:`MID_GREY` under a Gaussian blur."""
+    images = _IMAGES.setdefault(frame, {})
+    if 0.0 not in images:
+        # not rounded: 8 bits of grey would add as much noise as the camera's own rounding
+        images[0.0] = cv2.transform(np.ascontiguousarray(frame.rgb).astype(np.float32), GREY)
+    if px not in images:
+        images[px] = cv2.GaussianBlur(images[0.0], (0, 0), px)
+    return images[px]
 
 
 def choose_pixels(
@@ -204,14 +199,7 @@ def _judged(
     T: np.ndarray,
     options: PhotometricOptions,
 ) -> RelativePose:
-    """The refined motion, or that of the flow where the images cannot be believed.
-
-    Args:
-        pose: that of the flow.
-        factors: of the images, of the flow's motion and, where there are two, of the depth maps.
-        T: where their joint cost is least.
-        options: of the refinement.
-    """
+    """The refined motion ``T``, or that of the flow where the images cannot be believed."""
     factor: ImageFactor = factors[0]
     prior: PriorFactor = factors[1]
     images, flow = factor.linearize(T).H, prior.information
@@ -225,9 +213,6 @@ def _judged(
         depth_information=sum((f.linearize(T).H for f in factors[2:]), np.zeros((6, 6))),
         gain=factor.gain,
         offset=factor.offset + MID_GREY * (1 - factor.gain),
-        noise_grey=factor.noise,
-        correlation=factor.correlation(),
-        pixels=factor.pixels,
         agreement=factor.agreement,
         uneven_light=factor.uneven_light,
     )
@@ -237,8 +222,9 @@ def _judged(
     if factor.seen < MIN_SEEN:
         what = f"{100 * factor.seen:.0f} % of the pixels are seen by both cameras"
         return _unchanged(pose, "no_match", what, report)
-    if not report.correlation >= options.min_correlation:
-        what = f"the two images do not match along the motion ({report.correlation:.2f} correlated)"
+    correlated = factor.correlation()
+    if not correlated >= options.min_correlation:
+        what = f"the two images do not match along the motion ({correlated:.2f} correlated)"
         return _unchanged(pose, "no_match", what, report)
     if np.linalg.eigvals(np.linalg.solve(flow, images)).real.max() < MIN_GAIN:
         return _unchanged(pose, "", "the images add little to what the flow already knows", report)
@@ -246,9 +232,17 @@ def _judged(
         what = f"they lead {report.shift_sigma:.1f} standard deviations away from the flow's motion"
         return _unchanged(pose, "rejected", what, report)
     T = pose_matrix(T[:3])
+    remarks = []
+    if report.uneven_light:
+        remarks.append("the light changed differently over the image, evened out")
+    if report.agreement < MIN_AGREEMENT:
+        remarks.append(
+            "parts of the image disagree about the motion (rolling shutter, lens, depth?), "
+            "weighed down"
+        )
     status = pose.status
-    if (remarks := _remarks(report)) and not status.message:
-        status = replace(status, message=f"images: {remarks}")
+    if remarks and not status.message:
+        status = replace(status, message=f"images: {'; '.join(remarks)}")
     return pose.replace(
         T_curr_prev=T,
         covariance=covariance,
@@ -268,93 +262,3 @@ def _unchanged(
     if reason and not pose.status.message:
         pose = pose.replace(status=replace(pose.status, message=f"images not used: {message}"))
     return pose.replace(photometric=report)
-
-
-def _remarks(report: PhotometricReport) -> str:
-    """What was wrong with images that were used all the same."""
-    parts = []
-    if report.uneven_light:
-        parts.append("the light changed differently over the image, evened out")
-    if report.agreement < MIN_AGREEMENT:
-        parts.append(
-            "parts of the image disagree about the motion (rolling shutter, lens, depth?), "
-            "weighed down"
-        )
-    return "; ".join(parts)
-
-
-class GreyImage:
-    """The image of a frame, and what is made of it, each once."""
-
-    _of: ClassVar[WeakKeyDictionary[Frame, GreyImage]] = WeakKeyDictionary()
-
-    def __init__(self, rgb: np.ndarray) -> None:
-        # not rounded: 8 bits of grey would add as much noise as the camera's own rounding
-        weights = np.array([[0.299, 0.587, 0.114, -MID_GREY]])
-        self.grey = cv2.transform(np.ascontiguousarray(rgb).astype(np.float32), weights)
-        self._blurred: dict[float, np.ndarray] = {}
-
-    @classmethod
-    def of(cls, frame: Frame) -> GreyImage:
-        """That of a frame with an image, kept as long as the frame is."""
-        if frame not in cls._of:
-            cls._of[frame] = cls(np.asarray(frame.rgb))
-        return cls._of[frame]
-
-    def blurred(self, px: float, more: float = 0.0) -> np.ndarray:
-        """(H, W) float32 grey values less :data:`MID_GREY` under Gaussian blurs of these px."""
-        if more > 0:
-            return cv2.GaussianBlur(self.grey, (0, 0), np.hypot(px, more))
-        if px not in self._blurred:
-            self._blurred[px] = cv2.GaussianBlur(self.grey, (0, 0), px)
-        return self._blurred[px]
-
-    @cached_property
-    def strips(self) -> np.ndarray:
-        """Some rows of the image, at most a strip at each of :data:`STRIPS` heights."""
-        height = self.grey.shape[0]
-        if height <= STRIPS * STRIP_ROWS:
-            return self.grey
-        starts = [(2 * k + 1) * height // (2 * STRIPS) - STRIP_ROWS // 2 for k in range(STRIPS)]
-        return np.concatenate([self.grey[v : v + STRIP_ROWS] for v in starts])
-
-    @cached_property
-    def sharpness(self) -> float:
-        """See :meth:`sharpness_under`, without a blur."""
-        return self.sharpness_under(0.0)
-
-    def sharpness_under(self, px: float) -> float:
-        """Power of the gradient under a fine blur over that under a coarse one: free of the gain.
-
-        Args:
-            px: standard deviation of a blur before both.
-        """
-        fine, coarse = (
-            _gradient_power(cv2.GaussianBlur(self.strips, (0, 0), np.hypot(px, scale)))
-            for scale in (1.0, 2.0)
-        )
-        return fine / coarse if coarse > 1e-6 else 0.0
-
-
-def missing_blur(image: GreyImage, other: GreyImage) -> float:
-    """Blur, px, after which ``image`` is about as sharp as ``other``; 0 where it is not sharper.
-
-    Motion blur and focus change from frame to frame; the difference of a sharp and a blurred edge
-    is no motion, but it pulls at one.
-    """
-    if not image.sharpness > UNLIKE * other.sharpness > 0:
-        return 0.0
-    low, high = 0.0, 4.0
-    for _ in range(5):
-        middle = 0.5 * (low + high)
-        if image.sharpness_under(middle) > other.sharpness:
-            low = middle
-        else:
-            high = middle
-    return 0.5 * (low + high)
-
-
-def _gradient_power(image: np.ndarray) -> float:
-    gx = image[:, 2:] - image[:, :-2]
-    gy = image[2:] - image[:-2]
-    return float(np.vdot(gx, gx)) / max(gx.size, 1) + float(np.vdot(gy, gy)) / max(gy.size, 1)

@@ -29,21 +29,19 @@ from hybridvo.refinement.kernels import (
     ONE,
     ZERO,
     keep_apart,
+    pose_entries,
 )
 
 XN, YN, Z, GREY, GX, GY, PD, W = range(8)
 """Rows of a pixel buffer: ray x, ray y, depth, grey value, its gradient, relative depth variance,
 weight."""
 BUFFER_ROWS = 8
-POSE, COLUMNS, GQ = 6, 8, 8
-"""Columns of the motion (translation, rotation); with gain and offset; row of the Jacobian behind
-them that holds G^T q, for the variance."""
+GQ = 8
+"""Row of the Jacobian, behind motion, gain and offset, that holds G^T q, for the variance."""
 MARGIN = 3
 """Pixels this close to the border are not read: gradients and cubic reading need neighbours."""
 MIN_AREA = np.float32(1e-3)
 """A patch whose area shrinks below this share is seen edge-on."""
-GAINS = (0.2, 5.0)
-"""Limits of the gain between two images."""
 HALF = np.float32(0.5)
 
 
@@ -102,32 +100,6 @@ def select_pixels(grey, depth, weights, least, cell, per_cell, index):
     return n
 
 
-@njit(error_model="numpy", cache=True, nogil=True)
-def gather_pixels(index, n, grey, depth, weights, depth_variance, typical, camera, out):
-    """Fill ``out`` (BUFFER_ROWS, N) for the chosen pixels; ``camera`` = (1/fx, 1/fy, cx, cy).
-
-    ``depth_variance`` is (1, 1) where there is none, ``typical`` its unit.
-    """
-    has_variance = depth_variance.shape[0] > 1
-    for k in range(n):
-        v, u = index[k, 0], index[k, 1]
-        z = depth[v, u]
-        out[XN, k] = (np.float32(u) - camera[2]) * camera[0]
-        out[YN, k] = (np.float32(v) - camera[3]) * camera[1]
-        out[Z, k] = z
-        out[GREY, k] = grey[v, u]
-        out[GX, k] = HALF * (grey[v, u + 1] - grey[v, u - 1])
-        out[GY, k] = HALF * (grey[v + 1, u] - grey[v - 1, u])
-        out[W, k] = min(weights[v, u], ONE)
-        out[PD, k] = ONE
-        if has_variance:
-            p = depth_variance[v, u]
-            good = (p >= ZERO) & (p < MAX_VALUE)
-            out[PD, k] = p / typical if good else ONE
-            if not good:
-                out[W, k] = ZERO
-
-
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
 def read_cubic(image, u, v):
     """Value of ``image`` at (u, v) by cubic convolution with a = -1/2 (Keys 1981)."""
@@ -158,31 +130,26 @@ def read_cubic(image, u, v):
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
-def project_pixels(buf, n, image, R, t, K, scale, light, J, r):
-    """Residuals and Jacobians of ``n`` pixels; returns the weight that is seen.
+def project_pixels(buf, image, pose, K, scale, light, J, r):
+    """Residuals and Jacobians of gathered pixels.
 
-    ``K`` = (fx, fy, cx, cy) of the current frame, ``scale`` = (1/fx, 1/fy) of the previous one,
-    ``light`` = (gain, offset), all float32. ``J`` (GQ + 1, N); ``r`` (N,), NaN where the
-    point is not seen.
+    ``pose`` (3, 4) float64; ``K`` = (fx, fy, cx, cy) of the current frame, ``scale`` = (1/fx, 1/fy)
+    of the previous one, ``light`` = (gain, offset), all float32. ``J`` (GQ + 1, N); ``r`` (N,), NaN
+    where the point is not seen.
     """
     H, width = image.shape
     fx, fy, cx, cy = K[0], K[1], K[2], K[3]
     sx, sy = fx * scale[0], fx * scale[1]
     tx_, ty_ = fy * scale[0], fy * scale[1]
-    r00, r01, r02 = R[0, 0], R[0, 1], R[0, 2]
-    r10, r11, r12 = R[1, 0], R[1, 1], R[1, 2]
-    r20, r21, r22 = R[2, 0], R[2, 1], R[2, 2]
-    tx, ty, tz = t[0], t[1], t[2]
+    r00, r01, r02, tx, r10, r11, r12, ty, r20, r21, r22, tz = pose_entries(pose)
     gain, offset = light[0], light[1]
     low = np.float32(MARGIN - 1)
     high_u = np.float32(width - MARGIN)
     high_v = np.float32(H - MARGIN)
-    inside = 0.0
-    for k in range(n):
+    for k in range(len(r)):
         xn = buf[XN, k]
         yn = buf[YN, k]
         z = buf[Z, k]
-        weight = buf[W, k]
         X = z * (r00 * xn + r01 * yn + r02) + tx
         Y = z * (r10 * xn + r11 * yn + r12) + ty
         Zc = z * (r20 * xn + r21 * yn + r22) + tz
@@ -224,12 +191,10 @@ def project_pixels(buf, n, image, R, t, K, scale, light, J, r):
         J[7, k] = -ONE
         J[GQ, k] = gq
         r[k] = e
-        inside += weight
-    return inside
 
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
-def weigh_pixels(buf, n, noise, J, r, w):
+def weigh_pixels(buf, noise, J, r, w):
     """Robust weight x weight / variance in ``w`` (N,), 0 where not seen; returns the robust cost.
 
     ``noise`` = (1/s^2, sd^2, c^2) float32. Unseen points count at the full cost.
@@ -237,7 +202,7 @@ def weigh_pixels(buf, n, noise, J, r, w):
     keep_apart()  # type: ignore[call-arg]
     is2, sd2, c2 = noise[0], noise[1], noise[2]
     weights, relative, gradient = buf[W], buf[PD], J[GQ]
-    total = 0.0
+    total, n = 0.0, len(r)
     # no sum in a loop that stores: whether that one runs in vectors, and so the order of the sum,
     # depends on where its arrays happen to lie in memory
     costs = np.empty(BLOCK, np.float32)
@@ -259,146 +224,3 @@ def weigh_pixels(buf, n, noise, J, r, w):
             cost += costs[j]
         total += cost
     return total
-
-
-@njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
-def sum_equations(J, r, w, n, H, g):
-    """Set ``H`` = J w J^T and ``g`` = -J w r over ``n`` pixels."""
-    weighted = np.empty(BLOCK, np.float32)
-    H[:, :] = 0.0
-    g[:] = 0.0
-    for o in range(0, n, BLOCK):
-        m = min(BLOCK, n - o)
-        residual = r[o : o + m]
-        weight = w[o : o + m]
-        for p in range(COLUMNS):
-            row = J[p, o : o + m]
-            s = ZERO
-            for k in range(m):
-                value = weight[k] * row[k]
-                weighted[k] = value
-                s += value * (residual[k] if weight[k] > ZERO else ZERO)
-            g[p] -= s
-            for q in range(p, COLUMNS):
-                other = J[q, o : o + m]
-                s = ZERO
-                for k in range(m):
-                    s += weighted[k] * other[k]
-                H[p, q] += s
-    for p in range(COLUMNS):
-        for q in range(p):
-            H[p, q] = H[q, p]
-
-
-@njit(error_model="numpy", cache=True, nogil=True)
-def normal_equations(buf, n, noise, light, J, r, w, H, g):
-    """Normal equations of the last projection, gain and offset being those that fit it best.
-
-    ``light`` (gain, offset) and the residuals are changed to them, weights are set. Returns the
-    cost.
-    """
-    weigh_pixels(buf, n, noise, J, r, w)
-    sum_equations(J, r, w, n, H, g)
-    a, b, c = H[6, 6], H[6, 7], H[7, 7]
-    determinant = a * c - b * b
-    gain = light[0]
-    if determinant > 1e-9 * a * c and a * c > 0:
-        gain += np.float32((c * g[6] - b * g[7]) / determinant)
-    gain = min(max(gain, np.float32(GAINS[0])), np.float32(GAINS[1]))
-    more = gain - light[0]
-    shift = np.float32((g[7] - b * more) / c) if c > 0 else ZERO
-    for k in range(n):
-        r[k] -= more * buf[GREY, k] + shift
-    light[0] = gain
-    light[1] += shift
-    cost = weigh_pixels(buf, n, noise, J, r, w)
-    sum_equations(J, r, w, n, H, g)
-    return cost
-
-
-@njit(error_model="numpy", cache=True, nogil=True)
-def tile_scores(index, n, J, r, w, tile, columns, light, scores, curvature, meat):
-    """Sums of J w r of the pose per tile, their ``curvature`` (J w J^T), and outer products.
-
-    ``light`` (6, 2) takes the part of each pose column that gain and offset explain out of it;
-    ``meat`` (6, 6) gets the outer products of all pixels.
-    """
-    row = np.empty(POSE)
-    for k in range(n):
-        weight = w[k]
-        if not weight > ZERO:
-            continue
-        cell = (index[k, 0] // tile) * columns + index[k, 1] // tile
-        for p in range(POSE):
-            row[p] = J[p, k] - light[p, 0] * J[6, k] - light[p, 1] * J[7, k]
-        s = weight * r[k]
-        ss = s * s
-        for p in range(POSE):
-            scores[cell, p] += s * row[p]
-            for q in range(p + 1):
-                product = row[p] * row[q]
-                curvature[cell, p, q] += weight * product
-                meat[p, q] += ss * product
-    for p in range(POSE):
-        for q in range(p + 1, POSE):
-            meat[p, q] = meat[q, p]
-            for cell in range(curvature.shape[0]):
-                curvature[cell, p, q] = curvature[cell, q, p]
-
-
-@njit(error_model="numpy", cache=True, nogil=True)
-def field_equations(place, grey, r, w, columns, H, g):
-    """Add up the normal equations of gain and offset at the nodes of a grid of ``columns``.
-
-    ``place`` (N, 2) is in cells of the grid. Returns the weighted squared residuals.
-    """
-    nodes = np.empty(4, np.int64)
-    share = np.empty(4)
-    power = 0.0
-    for k in range(place.shape[0]):
-        if not w[k] > ZERO:
-            continue
-        row, column = int(place[k, 0]), int(place[k, 1])
-        fv, fu = place[k, 0] - row, place[k, 1] - column
-        first = row * columns + column
-        nodes[0], nodes[1] = first, first + 1
-        nodes[2], nodes[3] = first + columns, first + columns + 1
-        share[0], share[1] = (1 - fv) * (1 - fu), (1 - fv) * fu
-        share[2], share[3] = fv * (1 - fu), fv * fu
-        a = grey[k]
-        power += w[k] * r[k] * r[k]
-        for i in range(4):
-            p = 2 * nodes[i]
-            s = w[k] * share[i]
-            g[p] += s * a * r[k]
-            g[p + 1] += s * r[k]
-            for j in range(4):
-                q = 2 * nodes[j]
-                t = s * share[j]
-                H[p, q] += t * a * a
-                H[p, q + 1] += t * a
-                H[p + 1, q] += t * a
-                H[p + 1, q + 1] += t
-    return power
-
-
-@njit(error_model="numpy", cache=True, nogil=True)
-def apply_fields(place, field, gain, buf, r):
-    """Put changes of gain and offset (rows, columns, 2) into grey values, gradients and residuals.
-
-    ``gain`` is the pair's own, by which the grey values are multiplied afterwards.
-    """
-    for k in range(place.shape[0]):
-        row, column = int(place[k, 0]), int(place[k, 1])
-        fv, fu = place[k, 0] - np.float32(row), place[k, 1] - np.float32(column)
-        s00, s01 = (ONE - fv) * (ONE - fu), (ONE - fv) * fu
-        s10, s11 = fv * (ONE - fu), fv * fu
-        a, b = field[row, column], field[row, column + 1]
-        c, d = field[row + 1, column], field[row + 1, column + 1]
-        more = s00 * a[0] + s01 * b[0] + s10 * c[0] + s11 * d[0]
-        shift = s00 * a[1] + s01 * b[1] + s10 * c[1] + s11 * d[1]
-        r[k] -= more * buf[GREY, k] + shift
-        factor = ONE + more / gain
-        buf[GREY, k] = factor * buf[GREY, k] + shift / gain
-        buf[GX, k] *= factor
-        buf[GY, k] *= factor

@@ -109,7 +109,6 @@ class PixelGrid:
             Sums of each tile (rows, columns, 27), cost and the two sums of weights (3,), robust
             weights (H, W).
         """
-        R, t = pose[:, :3].astype(np.float32), pose[:, 3].astype(np.float32)
         height, width = self.shape
         bands = -(-height // tile)
         sums = np.zeros((bands, -(-width // tile), kernels.COST))
@@ -120,7 +119,7 @@ class PixelGrid:
 
         def work(band: int) -> None:
             kernels.sum_tiles(
-                *arguments, R, t, self.K, noise, band, tile, weights, sums, totals[band]
+                *arguments, pose, self.K, noise, band, tile, weights, sums, totals[band]
             )
 
         self._run(work, bands)

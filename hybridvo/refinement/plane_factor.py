@@ -16,7 +16,7 @@ import numpy as np
 from scipy.optimize import nnls
 
 from hybridvo.options import RefineOptions
-from hybridvo.refinement.covariance import dispersion
+from hybridvo.refinement.covariance import dispersion, tile_sums
 from hybridvo.refinement.full_fit import tile_size
 from hybridvo.refinement.solver import Linearization, positive_inverse
 from hybridvo.types import FramePair
@@ -161,7 +161,6 @@ class PlaneFactor:
         J, r, w, _ = self._weighted(T)
         scores = J * (w * r)[:, None]
         model = positive_inverse((J * w[:, None]).T @ J)
-        sums = np.zeros((self._tile.max() + 1, 6))
-        np.add.at(sums, self._tile, scores)
+        sums = tile_sums(scores.T, self._tile, self._tile.max() + 1)
         factor = None if model is None else dispersion(sums, scores.T @ scores, model)
         self._scale = 0.0 if factor is None else 1.0 / (factor * self._inflation)

@@ -86,9 +86,11 @@ def at_likely_depth(pixels: Pixels, at: Residuals, noise: torch.Tensor) -> Resid
     return replace(at, a=a, b=b, i=i, q=_sensitivity(pixels, a, b, i, at.t))
 
 
-def jacobian(pixels: Pixels, at: Residuals) -> torch.Tensor:
-    """(B, 2, 6, N) d pi(X') / d delta."""
-    return _focal(pixels)[..., None] * torch.stack(projection_rows(at.a, at.b, at.i), dim=1)
+def jacobian(pixels: Pixels, at: Residuals) -> tuple[torch.Tensor, torch.Tensor]:
+    """Both rows (B, 6, N) of d pi(X') / d delta."""
+    u, v = projection_rows(at.a, at.b, at.i)
+    f = _focal(pixels)
+    return f[:, :1] * u, f[:, 1:] * v
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,16 +156,17 @@ def linearize(
     found = weigh(pixels, T, how)
     at, w, length = found.at, pixels.weight * found.robust, run or pixels.weight.shape[1]
 
-    def runs(x: torch.Tensor) -> torch.Tensor:
-        """(B, C, K L) or (B, C, 6, K L) of (B, K, N) or (B, K, 6, N): K values run by run."""
-        return x.unflatten(-1, (-1, length)).movedim(-2, 1).movedim(2, -2).flatten(-2)
+    def runs(x: list[torch.Tensor], axis: int) -> torch.Tensor:
+        """Values (B, N) or rows (B, 6, N) side by side, run by run."""
+        return torch.cat([v.unflatten(-1, (-1, length)) for v in x], dim=axis)
 
-    J = jacobian(pixels, at)
-    along = (J * (found.p[:, None] * at.q)[:, :, None]).sum(dim=1, keepdim=True)
-    G = runs(torch.cat([J, along], dim=1))
-    information = w[:, None] * torch.stack([found.p, found.p, -found.kappa], dim=1)
-    H = (G * runs(information)[:, :, None]) @ G.transpose(2, 3)
-    right = runs(w[:, None] * found.right)
+    u, v = jacobian(pixels, at)
+    pq = found.p[:, None] * at.q
+    along = u * pq[:, :1] + v * pq[:, 1:]
+    G = runs([u, v, along], 3).transpose(1, 2)  # (B, C, 6, 3 L)
+    information = runs([w * found.p, w * found.p, -w * found.kappa], 2)
+    H = (G * information[:, :, None]) @ G.transpose(2, 3)
+    right = runs(list((w[:, None] * found.right).unbind(1)), 2)
     g = (G[..., : right.shape[2]] @ right[..., None])[..., 0]
     behind = torch.full_like(found.distance2, BEHIND_DISTANCE2)
     cost = how.kernel(torch.where(at.front, found.distance2, behind))[0]
@@ -184,7 +187,8 @@ def scores(pixels: Pixels, T: pp.LieTensor, how: RobustNoise) -> tuple[torch.Ten
     """
     found = weigh(pixels, T, how)
     right = (pixels.weight * found.robust)[:, None] * found.right
-    return (jacobian(pixels, found.at) * right[:, :, None]).sum(dim=1), found
+    u, v = jacobian(pixels, found.at)
+    return u * right[:, :1] + v * right[:, 1:], found
 
 
 def newton_matrix(pixels: Pixels, T: pp.LieTensor, how: RobustNoise) -> torch.Tensor:

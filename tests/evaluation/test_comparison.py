@@ -16,8 +16,8 @@ from hybridvo.cli import main
 from hybridvo.data.sequence import open_sequence
 from hybridvo.errors import InputError, LockedError
 from hybridvo.evaluation.comparison import WRITTEN, compare
-from hybridvo.evaluation.plan import ComparisonOptions, expand, methods_to_run
-from hybridvo.evaluation.sequence_job import PAIR_COLUMNS
+from hybridvo.evaluation.plan import expand, methods_to_run
+from hybridvo.evaluation.sequence_job import PAIR_COLUMNS, ComparisonOptions
 from hybridvo.network.models import Models
 from hybridvo.odometry import Odometry
 from hybridvo.pipeline import METHODS, weights_hash
@@ -208,7 +208,7 @@ def test_refused_folders(tiny: Path, tmp_path: Path) -> None:
     [
         (["--methods", "pnp-ransak"], "pnp-ransac"),
         (["--methods", ","], "--methods"),
-        (["--jobs", "0"], "--jobs"),
+        (["--jobs", "0"], "jobs"),
         (["--start", "9"], "frames"),
         (["--stride", "2", "--flow", "file"], "stride"),
         (["--protocol", "paper"], "tiny"),

@@ -12,9 +12,8 @@ import torch
 from hybridvo.cli import main
 from hybridvo.data.sequence import open_sequence
 from hybridvo.errors import InputError
-from hybridvo.evaluation.drawing import draw, networks
+from hybridvo.evaluation.drawing import draw, flow_panel, networks
 from hybridvo.evaluation.maps import (
-    colour_wheel,
     error_map,
     flow_colours,
     moving_pixels,
@@ -23,7 +22,7 @@ from hybridvo.evaluation.maps import (
     uncertainty_maps,
 )
 from hybridvo.evaluation.pair_errors import pair_errors, pair_facts
-from hybridvo.evaluation.plots import FlowPanel, ImagePanel, ScalarPanel, maps_png
+from hybridvo.evaluation.plots import Panel, draw_panels
 from hybridvo.evaluation.saliency import Saliency, integrated_gradients, saliencies
 from hybridvo.geometry import invert, se3_exp
 from hybridvo.network.inputs import assemble_inputs
@@ -68,19 +67,6 @@ def test_colours_of_lengths() -> None:
     assert half == [255, 128, 128] and full == [255, 0, 0] and longer == [191, 0, 0]
     assert nan == inf == [0, 0, 0]
     assert flow_colours(np.full((3, 4, 2), np.nan)).max() == 0
-    for bad in (np.zeros((3, 4)), np.zeros((3, 4, 3))):
-        with pytest.raises(InputError, match=r"shape \(H, W, 2\)"):
-            flow_colours(bad)
-
-
-def test_the_wheel_is_a_legend() -> None:
-    wheel = colour_wheel(65)
-    assert wheel.shape == (65, 65, 4)
-    assert wheel[0, 0, 3] == 0 and wheel[32, 32, 3] == 255
-    assert list(wheel[32, 32, :3]) == [255, 255, 255]
-    flow = np.array([[[0.6, -0.3]]])
-    place = wheel[32 + round(-0.3 * 32), 32 + round(0.6 * 32), :3].astype(int)
-    assert np.abs(place - flow_colours(flow, 1.0)[0, 0].astype(int)).max() <= 6
 
 
 # -- flow in parts --------------------------------------------------------------------------------
@@ -98,14 +84,6 @@ def test_the_parts_add_up_and_movers_stand_out(known) -> None:
     assert moving_pixels(objects)[valid].mean() == pytest.approx(share, abs=0.005)
     still = object_flow(replace(pair, flow=ego.astype(np.float32)), T)[1]
     assert np.nanmax(np.abs(still)) < 1e-4 and not moving_pixels(still).any()
-
-
-def test_missing_inputs_are_named(known) -> None:
-    pair, T = known
-    with pytest.raises(InputError, match="no flow"):
-        object_flow(replace(pair, flow=None), T)
-    with pytest.raises(InputError, match="no previous depth"):
-        object_flow(replace(pair, prev=replace(pair.prev, depth=None)), T)
 
 
 def test_the_error_map_has_the_mean_of_the_metric(known) -> None:
@@ -132,8 +110,7 @@ def test_uncertainty_and_error_maps_by_hand() -> None:
     errors = prediction_errors(prediction, np.array([1.0, 2.0, 3.0]), np.array([2.0, 2.0, 0.5]))
     np.testing.assert_allclose(errors[0], np.full((4, 5), 2.0))
     np.testing.assert_allclose(errors[1], np.full((4, 5), 0.5))
-    with pytest.raises(InputError, match="no uncertainty"):
-        uncertainty_maps(PixelwisePrediction(maps, maps))
+    assert uncertainty_maps(PixelwisePrediction(maps, maps)) == []
 
 
 def test_gradients_of_a_linear_answer_are_its_terms() -> None:
@@ -211,19 +188,17 @@ def test_the_picture_has_all_panels() -> None:
     mask = np.zeros((20, 40), bool)
     mask[5:9, 5:9] = True
     panels = [
-        ImagePanel("image", np.full((20, 40, 3), 200, np.uint8)),
-        FlowPanel("flow", flow, 2.0),
-        ScalarPanel("weights", rng.uniform(size=(10, 20)), "", 1.0, mask),
-        ScalarPanel("nothing known", np.full((5, 10), np.nan), "px"),
-        ScalarPanel("zeros", np.zeros((5, 10)), "px"),
+        Panel("image", np.full((20, 40, 3), 200, np.uint8)),
+        flow_panel("flow", flow, 2.0),
+        Panel("weights", rng.uniform(size=(10, 20)), "", 1.0, mask),
+        Panel("nothing known", np.full((5, 10), np.nan), "px"),
+        Panel("zeros", np.zeros((5, 10)), "px"),
     ]
-    content = maps_png(panels, "heading", 2.0)
+    content = draw_panels(panels, "heading", 2.0)
     picture = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
-    few = cv2.imdecode(np.frombuffer(maps_png(panels[:2], "h", 2.0), np.uint8), cv2.IMREAD_COLOR)
+    few = cv2.imdecode(np.frombuffer(draw_panels(panels[:2], "h", 2.0), np.uint8), cv2.IMREAD_COLOR)
     assert picture.shape[1] == few.shape[1] > 1000
     assert picture.shape[0] > 2.4 * few.shape[0]
-    with pytest.raises(InputError, match="at least one panel"):
-        maps_png([], "h", 2.0)
 
 
 @pytest.fixture(scope="module")

@@ -13,11 +13,12 @@ from hybridvo.errors import InputError, OutputError
 from hybridvo.evaluation.plots import plot_trajectories
 from hybridvo.geometry import se3_exp
 from hybridvo.trajectory import Trajectory
+from tests.walks import chained
 
 
 def random_trajectory(rng: np.random.Generator, frames: int = 30) -> Trajectory:
     relative = [se3_exp(0.1 * rng.standard_normal(6)) for _ in range(frames - 1)]
-    return Trajectory.from_relative(relative, 1e9 + np.arange(frames) / 30)
+    return chained(relative, 1e9 + np.arange(frames) / 30)
 
 
 def coloured(path: Path, rgb: tuple[int, int, int]) -> int:

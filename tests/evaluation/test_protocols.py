@@ -11,8 +11,8 @@ import pytest
 
 from hybridvo.errors import InputError
 from hybridvo.evaluation.comparison import compare
-from hybridvo.evaluation.plan import ComparisonOptions
 from hybridvo.evaluation.protocols import protocol_summary, protocols, same_intrinsics
+from hybridvo.evaluation.sequence_job import ComparisonOptions
 from hybridvo.geometry import ego_flow, make_transform
 from hybridvo.types import Camera
 

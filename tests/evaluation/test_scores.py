@@ -15,9 +15,9 @@ from hybridvo.evaluation.scores import (
     scale_warning,
     sequence_row,
     total_row,
+    worst_pairs,
 )
 from hybridvo.evaluation.sequence_job import pair_table
-from hybridvo.evaluation.worst import worst_pairs
 from hybridvo.geometry import se3_exp
 from hybridvo.trajectory import Trajectory
 

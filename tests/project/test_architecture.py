@@ -31,7 +31,7 @@ IMPORTS: dict[str, set[str]] = {
     "torch_geometry": BASE | {"types"},
     "flow": NOUNS,
     "trajectory": NOUNS,
-    "data": NOUNS,
+    "data": NOUNS | {"trajectory"},
     "refinement": NOUNS | {"torch_geometry"},
     "baselines": NOUNS,
     "hypotheses": NOUNS | {"refinement"},

@@ -9,7 +9,6 @@ import pytest
 
 import hybridvo
 from hybridvo.cli import build_parser
-from hybridvo.commands import train
 from tests.scripts import ROOT, load_script
 
 PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")])
@@ -57,11 +56,9 @@ def test_every_command_is_understood(page, command):
     if program == "make":
         makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
         assert re.search(rf"^{first}:", makefile, re.MULTILINE)
-    elif [program, first] == ["hybridvo", "train"]:
-        if len(rest) > 1:  # else only the name of the command
-            train.build_parser().parse_args(rest)
     elif program == "hybridvo":
-        build_parser().parse_args([first, *rest])
+        if first != "train" or len(rest) > 1:  # else only the name of the command
+            build_parser().parse_args([first, *rest])
     elif first.endswith(".py"):
         assert (ROOT / first).is_file()
         script = load_script(first)

@@ -13,8 +13,6 @@ from hybridvo.estimation import refine
 from hybridvo.geometry import invert, se3_log
 from hybridvo.refinement import noise
 from hybridvo.refinement.covariance import (
-    ORDER,
-    SIZES,
     UPPER,
     block_sums,
     long_range,
@@ -127,8 +125,8 @@ def test_errors_over_the_whole_image_are_continued_beyond_the_blocks() -> None:
         nees.append(motion @ np.linalg.solve(C, motion))
         information = to_tiles(H_PIXEL)[..., UPPER[0], UPPER[1]]
         scores = to_tiles(np.einsum("vuki,vuk->vui", J, error - J @ motion))
-        meats, lost = np.empty((len(SIZES), 6, 6)), np.empty(len(SIZES))
-        block_sums(scores, information, np.linalg.inv(H), SIZES, ORDER, meats, lost)
+        tiles = np.concatenate([information, scores], axis=2)
+        meats, _, _ = block_sums(tiles, np.linalg.inv(H))
         tiles_only = np.linalg.inv(H) @ meats[0] @ np.linalg.inv(H)
         without.append(motion @ np.linalg.solve(tiles_only, motion))
     # expected 6; tiles alone know nothing of what is wider than they are
@@ -152,8 +150,8 @@ def test_block_sums_by_hand() -> None:
     s[0, 0, 0], s[0, 1, 0], s[0, 1, 1] = 2.0, -1.0, 3.0
     information = np.zeros((1, 2, 21))
     information[..., np.flatnonzero(UPPER[0] == UPPER[1])] = 0.5  # half of the unit matrix each
-    meats, lost = np.empty((len(SIZES), 6, 6)), np.empty(len(SIZES))
-    assert block_sums(s, information, np.eye(6), SIZES, ORDER, meats, lost) == 2
+    meats, lost, count = block_sums(np.concatenate([information, s], axis=2), np.eye(6))
+    assert count == 2
     assert meats[0][:2, :2].tolist() == [[5.0, -3.0], [-3.0, 9.0]]
     # blocks {1}, {1, 2}, {2}, each in two rows, a quarter each: sum (1, 3) of both
     assert meats[1][:2, :2].tolist() == [[3.0, 0.0], [0.0, 9.0]]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 
@@ -13,7 +12,9 @@ from hybridvo.estimation import refine
 from hybridvo.flow import dis_flow
 from hybridvo.geometry import ego_flow, invert, se3_exp, se3_log
 from hybridvo.refinement import photometric_kernels as kernels
-from hybridvo.refinement.photometric import GreyImage, missing_blur, refine_photometric
+from hybridvo.refinement.image_factor import ImageFactor
+from hybridvo.refinement.photometric import blurred, refine_photometric
+from hybridvo.results import RelativePose
 from hybridvo.synthetic.render import SyntheticSequence
 from hybridvo.synthetic.scenes import make_scene
 from hybridvo.types import FramePair
@@ -62,24 +63,17 @@ def test_cubic_reading_is_exact_on_parabolas():
 def test_jacobian_is_that_of_the_residual(light):
     # at the identity, on one image, the slope of cubic reading is the central difference
     frame = light[0].prev
-    image = GreyImage(frame.rgb).blurred(1.0)
+    image = blurred(frame, 1.0)
     rng = np.random.default_rng(0)
     index = np.stack([rng.integers(8, n - 8, 400) for n in image.shape], axis=1).astype(np.int32)
     index = index[np.isfinite(frame.depth[tuple(index.T)])]
-    n, K = len(index), frame.camera
-    camera = np.array([1 / K.fx, 1 / K.fy, K.cx, K.cy], np.float32)
-    buffer = np.empty((kernels.BUFFER_ROWS, n), np.float32)
-    one = np.ones((1, 1), np.float32)
-    weights = np.ones(image.shape, np.float32)
-    kernels.gather_pixels(index, n, image, frame.depth, weights, one, np.float32(1), camera, buffer)
+    pose = RelativePose(weights=np.ones(image.shape, np.float32))
+    factor = ImageFactor(FramePair(frame, frame, None), pose, index, 1.0)
+    factor.use(image, image, np.eye(4))
 
     def project(T):
-        J, r = np.empty((kernels.GQ + 1, n), np.float32), np.empty(n, np.float32)
-        R, t = T[:3, :3].astype(np.float32), T[:3, 3].astype(np.float32)
-        inside = np.array([K.fx, K.fy, K.cx, K.cy], np.float32)
-        light = np.array([1, 0], np.float32)
-        kernels.project_pixels(buffer, n, image, R, t, inside, camera[:2], light, J, r)
-        return J, r
+        factor._project(T)
+        return factor._J[:6].copy(), factor._r.copy()
 
     J, _ = project(np.eye(4))
     for column in range(6):
@@ -171,18 +165,6 @@ def test_exposure_does_not_matter(light):
     assert done.photometric.gain == pytest.approx(0.6, abs=0.02)
     assert done.photometric.offset == pytest.approx(20, abs=4)
     assert error_px(pair, done.T_curr_prev, T) < 0.3 * error_px(pair, motion.T_curr_prev, T)
-
-
-def test_a_blurred_image_is_matched():
-    rng = np.random.default_rng(3)
-    rgb = (255 * rng.random((160, 200, 3), dtype=np.float32)).astype(np.uint8)
-    sharp = cv2.GaussianBlur(rgb, (0, 0), 1.0)
-    soft = cv2.GaussianBlur(rgb, (0, 0), 2.0)
-    one, other = GreyImage(sharp), GreyImage(soft)
-    # blurs add up in squares
-    assert missing_blur(one, other) == pytest.approx(np.sqrt(3), abs=0.15)
-    assert missing_blur(other, one) == 0
-    assert missing_blur(one, GreyImage(sharp[::-1])) == 0
 
 
 OTHER = {

@@ -43,7 +43,7 @@ def test_one_pixel_by_hand() -> None:
     # a = 0.048, so the pixel lands at 5.8: residual 7 - 5.8; q = 100/2.5 (0.048 0.5 - 0.1)
     found = [float(x) for x in (*terms.r[0, :, at], *terms.q[0, :, at])]
     assert found == pytest.approx([1.2, 1.0, 40 * (0.024 - 0.1), 0.0], abs=1e-12)
-    rows = jacobian(pixels, terms)[0]
+    rows = torch.stack(jacobian(pixels, terms), dim=1)[0]
     expected = 100 * np.array([0.4, 0, -0.048 * 0.4, 0, 1 + 0.048**2, 0])
     assert rows[0, :, at].numpy() == pytest.approx(expected, abs=1e-12)
     assert rows[1, :, at].numpy() == pytest.approx([0, 40, 0, -100, 0, 4.8], abs=1e-12)
@@ -94,7 +94,7 @@ def test_derivatives_against_autograd() -> None:
     pixels, pose = gather_pixels(batch), se3(T)
     terms = residuals(pixels, pose)
     zero = torch.zeros(2, 6, dtype=F64)
-    rows = jacobian(pixels, terms)
+    rows = torch.stack(jacobian(pixels, terms), dim=1)
     for k in range(2):
         full = torch.autograd.functional.jacobian(
             lambda d, k=k: -residuals(pixels, left_update(d, pose)).r[:, k], zero
@@ -115,7 +115,7 @@ def test_normal_equations_against_dense_algebra() -> None:
     found = linearize(pixels, se3(T), how, run=10)
     terms = residuals(pixels, se3(T))
     moved = at_likely_depth(pixels, terms, how.noise)
-    rows = jacobian(pixels, moved)
+    rows = torch.stack(jacobian(pixels, moved), dim=1)
     for b in range(2):
         H, g, cost = np.zeros((6, 6)), np.zeros(6), 0.0
         for k in range(30):

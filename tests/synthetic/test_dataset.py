@@ -67,8 +67,7 @@ def test_the_command_writes_samples_and_a_contact_sheet(tmp_path):
     sheet = generate("paper", 3, tmp_path / "a", size=(32, 64), report=lambda *x: seen.append(x))
     assert seen == [(3, 3)]
     image = cv2.imread(str(sheet))
-    # seven tiles of 64 px with their gaps; three rows of 32 px with a line of text each, a header
-    assert image.shape == (18 + 3 * (32 + 18), 7 * (64 + 4), 3)
+    assert image.shape == (18 + 3 * 32, 7 * 64, 3)  # seven tiles of 64 px, a header
     assert dataset.read_sample(tmp_path / "a", 0).flow.shape == (32, 64, 2)
     with pytest.raises(InputError, match="paper, diverse"):
         generate("real", 3, tmp_path / "b")

@@ -10,15 +10,16 @@ from hypothesis import strategies as st
 
 from hybridvo.errors import FormatError, InputError, OutputError
 from hybridvo.files import atomic_write
-from hybridvo.geometry import euler_deg_to_matrix, make_transform, ned_to_camera, se3_exp
+from hybridvo.geometry import euler_deg_to_matrix, invert, make_transform, ned_to_camera, se3_exp
 from hybridvo.trajectory import Trajectory, chain, read_trajectory
+from tests.walks import chained
 
 IDENTITY_TUM = "0 0 0 0 0 0 1"
 
 
 def random_trajectory(rng: np.random.Generator, frames: int = 20) -> Trajectory:
     relative = [se3_exp(0.1 * rng.standard_normal(6)) for _ in range(frames - 1)]
-    return Trajectory.from_relative(relative, 1.3e9 + np.arange(frames) / 30)
+    return chained(relative, 1.3e9 + np.arange(frames) / 30)
 
 
 def write(path: Path, *lines: str) -> Path:
@@ -32,22 +33,23 @@ def write(path: Path, *lines: str) -> Path:
 def test_rotation_stays_orthonormal_over_many_rounded_steps(rng):
     relative = np.array([se3_exp(0.1 * rng.standard_normal(6)) for _ in range(1000)])
     relative = np.tile(relative.astype(np.float32), (20, 1, 1))
-    trajectory = Trajectory.from_relative(relative, np.arange(20_001.0))
+    trajectory = chained(relative, np.arange(20_001.0))
     R = trajectory.T_world_cam[:, :3, :3]
     assert np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max() < 1e-12
 
 
 @settings(max_examples=30, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), frames=st.integers(1, 12), size=st.sampled_from([1e-7, 1.0]))
-def test_relative_is_the_inverse_of_from_relative(seed, frames, size):
+def test_chained_motions_are_those_between_the_poses(seed, frames, size):
     rng = np.random.default_rng(seed)
     relative = np.array([se3_exp(size * rng.standard_normal(6)) for _ in range(frames - 1)])
     first = se3_exp(rng.standard_normal(6))
-    trajectory = Trajectory.from_relative(relative.reshape(-1, 4, 4), np.arange(frames), first)
+    trajectory = chained(relative.reshape(-1, 4, 4), np.arange(frames), first)
     assert len(trajectory) == frames
     np.testing.assert_allclose(trajectory.T_world_cam[0], first, atol=1e-14)
     # a few roundings of numbers up to about 20
-    np.testing.assert_allclose(trajectory.relative(), relative.reshape(-1, 4, 4), atol=1e-13)
+    T = trajectory.T_world_cam
+    np.testing.assert_allclose(invert(T[1:]) @ T[:-1], relative.reshape(-1, 4, 4), atol=1e-13)
 
 
 def test_arrays_are_copied_and_read_only():
@@ -87,8 +89,8 @@ def test_bad_poses():
         Trajectory([0.0, 1.0], np.zeros((2, 3, 4)))
     with pytest.raises(InputError, match="at least one pose"):
         Trajectory([], np.zeros((0, 4, 4)))
-    with pytest.raises(InputError, match="expected 2 timestamps for 1 relative poses, got 3"):
-        Trajectory.from_relative([np.eye(4)], [0.0, 1.0, 2.0])
+    with pytest.raises(InputError, match="got 3 timestamps for 1 poses"):
+        Trajectory([0.0, 1.0, 2.0], np.eye(4)[None])
 
 
 # -- writing ------------------------------------------------------------------------------------
@@ -302,7 +304,7 @@ def test_turn_right_then_forward():
     turn = make_transform(euler_deg_to_matrix(np.array([0.0, -90.0, 0.0])), np.zeros(3))
     np.testing.assert_allclose(turn[:3, :3] @ [0, 0, 1], [-1, 0, 0], atol=1e-15)
     forward = make_transform(np.eye(3), np.array([0.0, 0.0, -1.0]))
-    trajectory = Trajectory.from_relative([turn, forward], [0.0, 1.0, 2.0])
+    trajectory = chained([turn, forward], [0.0, 1.0, 2.0])
     # after the turn, forward is to the right of the world: +x
     np.testing.assert_allclose(trajectory.positions[2], [1, 0, 0], atol=1e-15)
 
