@@ -52,13 +52,6 @@ def test_dis_finds_a_shift_and_knows_what_leaves_the_image(texture: np.ndarray) 
     assert field.variance.min() >= BASE**2 * (1 - 1e-6)
 
 
-def test_dis_without_backward_flow_has_no_variance(texture: np.ndarray) -> None:
-    prev, curr = frame(texture[:, 4:-4]), frame(np.ascontiguousarray(texture[:, 8:]), 1)
-    field = dis_flow("fast", forward_backward=False)(prev, curr)
-    assert field.variance is None
-    assert not field.valid[:, :2].any()
-
-
 @pytest.mark.parametrize("rgb", [None, np.zeros((HEIGHT, WIDTH, 3), np.uint8)])
 def test_a_missing_image_has_no_flow(rgb: np.ndarray | None) -> None:
     assert dis_flow()(frame(rgb), frame(None)).flow is None
