@@ -21,7 +21,9 @@ from hybridvo import __version__
 from hybridvo.commands import arguments
 from hybridvo.commands.train import add_train, train
 
-Call = Callable[[argparse.Namespace, list[str]], int]
+Result = tuple[Any, str, int]
+"""What a command gives: JSON-ready, for people, and the exit code."""
+Call = Callable[[argparse.Namespace, list[str]], Result]
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -44,37 +46,17 @@ def build_parser() -> argparse.ArgumentParser:
         command.set_defaults(call=call)
         return command
 
-    arguments.add_run(
-        add("run", _run, "estimate the camera motion of a sequence", arguments.input())
-    )
+    sequence = arguments.input()
+    arguments.add_run(add("run", _run, "estimate the camera motion of a sequence", sequence))
     arguments.add_compare(add("compare", _compare, "run methods side by side and write a report"))
-    arguments.add_show(
-        add("show", _show, "draw the maps of one pair of a sequence", arguments.input())
-    )
-    arguments.add_evaluate(
-        add("evaluate", _evaluate, "errors of a trajectory file against ground truth")
-    )
-    doctor = add(
-        "doctor",
-        _doctor,
-        "what is missing here, or wrong with a sequence",
-        arguments.input(required=False),
-    )
+    arguments.add_show(add("show", _show, "draw the maps of one pair of a sequence", sequence))
+    errors = "errors of a trajectory file against ground truth"
+    arguments.add_evaluate(add("evaluate", _evaluate, errors))
+    wrong, optional = "what is missing here, or wrong with a sequence", arguments.input(False)
+    doctor = add("doctor", _doctor, wrong, optional)
     doctor.add_argument("--pairs", type=int, default=40, metavar="N", help="pairs (default 40)")
-    demo = add("demo", _demo, "render a scene with moving objects and run on it")
-    demo.add_argument("--out", default="runs/demo", metavar="DIR", help="default: runs/demo")
-    demo.add_argument("--overwrite", action="store_true", help="replace the results in --out")
-    demo.add_argument("--frames", type=int, default=20, metavar="N", help="default: 20")
-    demo.add_argument("--seed", type=int, default=0, metavar="N", help="of the scene")
-    generate = add("generate", _generate, "draw training samples into a folder")
-    which = generate.add_mutually_exclusive_group(required=True)
-    which.add_argument("path", nargs="?", metavar="PRESET", help="paper, diverse or a YAML file")
-    which.add_argument("--preset", metavar="PRESET", help="the same, by name")
-    generate.add_argument("--out", required=True, metavar="DIR", help="folder of the samples")
-    generate.add_argument("--count", type=int, default=1000, metavar="N", help="default: 1000")
-    generate.add_argument("--seed", type=int, default=0, metavar="N")
-    generate.add_argument("--size", type=int, nargs=2, metavar=("H", "W"), help="pixels")
-    generate.add_argument("--workers", type=int, default=1, metavar="N", help="processes")
+    arguments.add_demo(add("demo", _demo, "render a scene with moving objects and run on it"))
+    arguments.add_generate(add("generate", _generate, "draw training samples into a folder"))
     training = commands.add_parser("train", help="train a network")
     training.set_defaults(call=train)
     add_train(training, arguments.common())
@@ -98,7 +80,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
 
 
-def _guarded(args: argparse.Namespace, command: list[str]) -> int:
+def _guarded(args: argparse.Namespace, command: list[str]) -> Result:
     """Exit code of a command; errors become one line on stderr."""
     from hybridvo.errors import HybridVOError
 
@@ -109,7 +91,10 @@ def _guarded(args: argparse.Namespace, command: list[str]) -> int:
     if args.verbose:
         logger.setLevel(logging.DEBUG)
     try:
-        return args.call(args, command)
+        content, text, code = args.call(args, command)
+        # the result on stdout, as JSON or for people
+        print(json.dumps(content, indent=1, allow_nan=False) if args.json else text, flush=True)
+        return code
     except KeyboardInterrupt:
         print("hybridvo: interrupted.", file=sys.stderr)
         return 130
@@ -132,11 +117,6 @@ def _guarded(args: argparse.Namespace, command: list[str]) -> int:
         logger.setLevel(before)
 
 
-def _print(args: argparse.Namespace, content: Any, text: str) -> None:
-    """The result on stdout, as JSON or for people."""
-    print(json.dumps(content, indent=1, allow_nan=False) if args.json else text, flush=True)
-
-
 def _mode(args: argparse.Namespace) -> Literal["new", "resume", "overwrite"]:
     return "resume" if args.resume else "overwrite" if args.overwrite else "new"
 
@@ -149,9 +129,8 @@ def _open(args: argparse.Namespace) -> Any:
     return open_sequence(args.path or args.sequence, args.dataset, **given)
 
 
-def _run(args: argparse.Namespace, command: list[str]) -> int:
-    from hybridvo.commands.configuration import load_options
-    from hybridvo.commands.inputs import weight_files
+def _run(args: argparse.Namespace, command: list[str]) -> Result:
+    from hybridvo.commands.configuration import load_options, weight_files
     from hybridvo.commands.results import summary_text
     from hybridvo.commands.run import run
     from hybridvo.network.models import Models
@@ -172,25 +151,23 @@ def _run(args: argparse.Namespace, command: list[str]) -> int:
         quiet=args.quiet,
         rrd=args.rrd,
     )
-    _print(args, result.summary, summary_text(result.summary))
     if not args.quiet:
         for warning in result.summary.get("warnings", []):
             print(f"hybridvo: warning: {warning}", file=sys.stderr)
-    return result.exit_code
+    return result.summary, summary_text(result.summary), result.exit_code
 
 
-def _show(args: argparse.Namespace, command: list[str]) -> int:
+def _show(args: argparse.Namespace, command: list[str]) -> Result:
     from hybridvo.evaluation.drawing import draw
 
     given = ("flow", "method", "weights", "steps", "overwrite")
     options = {name: getattr(args, name) for name in given}
     written = [str(path) for path in draw(_open(args), args.pair, args.out, **options)]
-    _print(args, {"files": written}, "\n".join(written))
-    return 0
+    return {"files": written}, "\n".join(written), 0
 
 
-def _compare(args: argparse.Namespace, command: list[str]) -> int:
-    from hybridvo.commands.inputs import weight_files
+def _compare(args: argparse.Namespace, command: list[str]) -> Result:
+    from hybridvo.commands.configuration import weight_files
     from hybridvo.commands.progress import Progress
     from hybridvo.evaluation.comparison import compare
     from hybridvo.evaluation.sequence_job import ComparisonOptions
@@ -213,57 +190,45 @@ def _compare(args: argparse.Namespace, command: list[str]) -> int:
 
         paths = compare(options, args.out, mode=_mode(args), command=command, progress=report)
     written = [str(path) for path in paths]
-    _print(args, {"files": written}, "\n".join(written))
-    return 0
+    return {"files": written}, "\n".join(written), 0
 
 
-def _evaluate(args: argparse.Namespace, command: list[str]) -> int:
+def _evaluate(args: argparse.Namespace, command: list[str]) -> Result:
     from hybridvo.commands.results import evaluation_text
     from hybridvo.evaluation.metrics import evaluate_files
 
     names = ["alignment", "delta", "delta_unit", "max_diff"]
     names += ["format_est", "format_gt", "axes_est", "axes_gt"]
     report = evaluate_files(args.estimate, args.gt, **{name: getattr(args, name) for name in names})
-    _print(args, report, evaluation_text(report))
-    if report["ate_rmse_unaligned"] is None:  # not one figure: the files do not belong together
+    # not one figure: the files do not belong together
+    code = 2 if report["ate_rmse_unaligned"] is None else 0
+    if code:
         reason = report["reasons"]["ate_rmse_unaligned"]
         print(f"hybridvo: nothing could be compared: {reason}.", file=sys.stderr)
-        return 2
-    return 0
+    return report, evaluation_text(report), code
 
 
-def _doctor(args: argparse.Namespace, command: list[str]) -> int:
+def _doctor(args: argparse.Namespace, command: list[str]) -> Result:
     if args.path or args.sequence:
         from hybridvo.commands.diagnose import diagnose, diagnosis_text
 
         found = diagnose(_open(args), pairs=args.pairs)
-        _print(args, found, diagnosis_text(found))
-        return 0 if found["ok"] else 1
+        return found, diagnosis_text(found), 0 if found["ok"] else 1
     from hybridvo.commands.doctor import doctor, doctor_text
 
     report = doctor()
-    _print(args, report, doctor_text(report))
-    return 0 if report["usable"] else 2
+    return report, doctor_text(report), 0 if report["usable"] else 2
 
 
-def _demo(args: argparse.Namespace, command: list[str]) -> int:
+def _demo(args: argparse.Namespace, command: list[str]) -> Result:
     from hybridvo.commands.demo import demo, demo_text
 
-    content = demo(
-        args.out,
-        frames=args.frames,
-        seed=args.seed,
-        overwrite=args.overwrite,
-        command=command,
-        quiet=args.quiet,
-    )
-    if content is None:
-        return 130
-    _print(args, content, demo_text(content))
-    return 0
+    options = {name: getattr(args, name) for name in ("frames", "seed", "overwrite", "quiet")}
+    content = demo(args.out, **options, command=command)
+    return content, demo_text(content), 0
 
 
-def _generate(args: argparse.Namespace, command: list[str]) -> int:
+def _generate(args: argparse.Namespace, command: list[str]) -> Result:
     from hybridvo.commands.generate import generate
     from hybridvo.commands.progress import Progress
 
@@ -278,17 +243,15 @@ def _generate(args: argparse.Namespace, command: list[str]) -> int:
             workers=args.workers,
             report=lambda done, total: progress.update(done, total=total),
         )
-    _print(args, {"contact_sheet": str(sheet)}, str(sheet))
-    return 0
+    return {"contact_sheet": str(sheet)}, str(sheet), 0
 
 
-def _init(args: argparse.Namespace, command: list[str]) -> int:
+def _init(args: argparse.Namespace, command: list[str]) -> Result:
     from hybridvo.data.camera_file import write_camera_template
 
     path = write_camera_template(args.directory)
     next_step = f"fill it in, then: hybridvo run {args.directory}"
-    _print(args, {"file": str(path)}, f"{path}\n{next_step}")
-    return 0
+    return {"file": str(path)}, f"{path}\n{next_step}", 0
 
 
 if __name__ == "__main__":

@@ -172,7 +172,7 @@ def _pair_of(prev: Any, curr: Any, options: Options) -> FramePair:
     """A pair of two frames with DIS flow between them."""
     for name, frame in (("first of two", prev), ("second of two", curr)):
         _check_kind(f"estimate, {name}", frame, Frame)
-    flow = dis_flow(options.flow.dis_preset, options.flow.forward_backward)(prev, curr)
+    flow = dis_flow(options.flow.dis_preset)(prev, curr)
     return FramePair(prev, curr, flow.flow, flow.variance, flow.valid, flow.source, flow.is_true)
 
 

@@ -8,7 +8,6 @@ import hashlib
 import json
 import os
 import platform
-import re
 import secrets
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
@@ -51,11 +50,7 @@ def atomic_write(path: str | os.PathLike[str], mode: Literal["w", "wb"] = "w") -
 
 
 def make_folder(path: Path) -> None:
-    """Make a folder for results, and those above it.
-
-    Raises:
-        OutputError: it cannot be made.
-    """
+    """Make a folder for results, and those above it."""
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -63,11 +58,7 @@ def make_folder(path: Path) -> None:
 
 
 def write_json(path: str | os.PathLike[str], value: Any) -> None:
-    """Write a value as indented JSON; a number that is not finite is refused by ``json``.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
+    """Write a value as indented JSON; a number that is not finite is refused by ``json``."""
     text = json.dumps(value, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
     with atomic_write(path) as file:
         file.write(text)
@@ -76,11 +67,7 @@ def write_json(path: str | os.PathLike[str], value: Any) -> None:
 def write_csv(
     path: str | os.PathLike[str], columns: Sequence[str], rows: Iterable[Mapping[str, Any]]
 ) -> None:
-    """Write rows as CSV with a header line; a missing value is an empty cell.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
+    """Write rows as CSV with a header line; a missing value is an empty cell."""
     with atomic_write(path) as file:
         writer = csv.DictWriter(file, columns, extrasaction="ignore", lineterminator="\n")
         writer.writeheader()
@@ -104,11 +91,7 @@ def fingerprint(paths: Iterable[str | os.PathLike[str]]) -> str:
 
 
 def read_text(path: str | os.PathLike[str]) -> str:
-    """Text of a UTF-8 file, without a byte-order mark.
-
-    Raises:
-        FileNotFoundError: no such file. FormatError: it cannot be read, or holds binary data.
-    """
+    """Text of a UTF-8 file, without a byte-order mark."""
     try:
         return Path(path).read_text(encoding="utf-8-sig")
     except FileNotFoundError:
@@ -164,25 +147,10 @@ def versions() -> dict[str, str]:
     return found
 
 
-class _Loader(yaml.SafeLoader):
-    """YAML 1.1 reads 1e-3 as a word; everybody who writes it means the number."""
-
-
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float",
-    re.compile(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)[eE][-+]?[0-9]+$"),
-    list("-+.0123456789"),
-)
-
-
 def parse_yaml(text: str, where: str) -> Any:
-    """Content of a YAML document by the safe loader.
-
-    Raises:
-        FormatError: not YAML; names ``where`` and the line.
-    """
+    """Content of a YAML document by the safe loader, to which 1e-3 is a text."""
     try:
-        return yaml.load(text, Loader=_Loader)  # noqa: S506  (a SafeLoader)
+        return yaml.safe_load(text)
     # ValueError: dates and numbers that are none; RecursionError: thousands of brackets
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         mark = getattr(error, "problem_mark", None)

@@ -10,8 +10,9 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import cv2
 import numpy as np
@@ -25,8 +26,6 @@ DIS_PRESETS = {
     "fast": cv2.DISOPTICAL_FLOW_PRESET_FAST,
     "medium": cv2.DISOPTICAL_FLOW_PRESET_MEDIUM,
 }
-
-
 _logger = logging.getLogger(__name__)
 
 
@@ -35,8 +34,7 @@ class FlowField:
     """Optical flow of one pair.
 
     Args:
-        flow: (H, W, 2) float32 px, previous to current, on the previous grid; None where no flow
-            could be had.
+        flow: (H, W, 2) float32 px, previous to current, on the previous grid, or None.
         variance: (H, W) float32 px^2 per component, or None.
         valid: (H, W) bool, False where the flow is known to be wrong, or None.
         source: ``file``, ``dis`` or the name of a callable.
@@ -50,62 +48,42 @@ class FlowField:
     is_true: bool = False
 
 
-class FlowProvider(Protocol):
-    """Computes or reads the flow of a pair."""
-
-    def __call__(self, prev: Frame, curr: Frame) -> FlowField:
-        """Flow from ``prev`` to ``curr``."""
+FlowProvider = Callable[[Frame, Frame], FlowField]
+"""Computes or reads the flow from the first frame to the second."""
 
 
-def dis_flow(preset: str = "medium", forward_backward: bool = True) -> FlowProvider:
+# -- DIS ------------------------------------------------------------------------------------------
+
+
+def dis_flow(preset: str = "medium") -> FlowProvider:
     """Provider of OpenCV's DIS flow on grey images (Kroeger et al., ECCV 2016).
 
-    A provider may serve several trackers and threads. Where an image has no texture (a covered
-    lens, a dropped frame, parallel stripes) there is no flow: DIS itself would return zero there,
-    and both directions agree on it.
+    It is computed in both directions, whose disagreement gives variance and validity. A provider
+    may serve several trackers and threads. Where an image has no texture (a covered lens, a dropped
+    frame, parallel stripes) there is no flow: DIS would return zero there, in both directions.
 
     Args:
-        preset: ``ultrafast``, ``fast`` or ``medium``.
-        forward_backward: compute the backward flow as well, and turn the disagreement of the two
-            into a variance and a validity per pixel; twice the time.
+        preset: effort: ``ultrafast``, ``fast`` or ``medium``.
 
     Raises:
         InputError: an unknown preset.
     """
     if preset not in DIS_PRESETS:
         raise InputError(f"DIS preset: expected {', '.join(DIS_PRESETS)}, got {preset!r}.")
-    return _Dis(preset, forward_backward)
+    return _Dis(preset)
 
 
-def _calc_dis(dis: Any, first: np.ndarray, second: np.ndarray) -> np.ndarray | None:
-    """(H, W, 2) flow between grey images, or None where they are too small.
-
-    Below 32 rows DIS chooses its coarsest level by the width alone; where fewer rows than a patch
-    are left it would end the process.
-    """
-    height, width = first.shape
-    if height < 32 and width > 2 * height:
-        return None
-    try:
-        return np.asarray(dis.calc(first, second, None))
-    except cv2.error:  # smaller than its patches
-        return None
+# a DIS object that two threads use at once ends the process
+_of_thread = threading.local()
 
 
+@dataclass(frozen=True)
 class _Dis:
     """See :func:`dis_flow`."""
 
-    def __init__(self, preset: str, forward_backward: bool) -> None:
-        self._preset = preset
-        self._forward_backward = bool(forward_backward)
-        # a DIS object that two threads use at once ends the process
-        self._threads = threading.local()
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return _Dis, (self._preset, self._forward_backward)
+    preset: str
 
     def __call__(self, prev: Frame, curr: Frame) -> FlowField:
-        """Flow from ``prev`` to ``curr``; None where an image is missing or too small for DIS."""
         none = FlowField(None, source="dis")
         if prev.rgb is None or curr.rgb is None or prev.rgb.shape != curr.rgb.shape:
             return none
@@ -113,17 +91,26 @@ class _Dis:
         second = cv2.cvtColor(curr.rgb, cv2.COLOR_RGB2GRAY)
         if not (_textured(first) and _textured(second)):
             return none
-        if not hasattr(self._threads, "dis"):
-            self._threads.dis = cv2.DISOpticalFlow.create(DIS_PRESETS[self._preset])
-        forward = _calc_dis(self._threads.dis, first, second)
-        if forward is None:
-            return none
-        if not self._forward_backward:
-            return FlowField(forward, None, _lands_inside(forward), "dis")
-        backward = _calc_dis(self._threads.dis, second, first)
-        if backward is None:
+        if not hasattr(_of_thread, self.preset):
+            setattr(_of_thread, self.preset, cv2.DISOpticalFlow.create(DIS_PRESETS[self.preset]))
+        dis = getattr(_of_thread, self.preset)
+        forward, backward = _calc_dis(dis, first, second), _calc_dis(dis, second, first)
+        if forward is None or backward is None:
             return none
         return FlowField(forward, *forward_backward_check(forward, backward), "dis")
+
+
+def _calc_dis(dis: Any, first: np.ndarray, second: np.ndarray) -> np.ndarray | None:
+    """(H, W, 2) flow between grey images, or None where they are too small."""
+    height, width = first.shape
+    # below 32 rows DIS chooses its coarsest level by the width alone; where fewer rows than a patch
+    # are left it would end the process
+    if height < 32 and width > 2 * height:
+        return None
+    try:
+        return np.asarray(dis.calc(first, second, None))
+    except cv2.error:  # smaller than its patches
+        return None
 
 
 def _textured(gray: np.ndarray) -> bool:
@@ -142,13 +129,9 @@ def _textured(gray: np.ndarray) -> bool:
 def forward_backward_check(
     forward: np.ndarray, backward: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Variance and validity from the disagreement of the flows in both directions.
+    """Variance and validity from the disagreement of the flows (H, W, 2) in both directions, px.
 
     The error is e(x) = |F(x) + B(x + F(x))| with B sampled bilinearly.
-
-    Args:
-        forward: (H, W, 2) float32 px, previous to current, on the previous grid.
-        backward: (H, W, 2) float32 px, current to previous, on the current grid.
 
     Returns:
         variance (H, W) float32 px^2 per component, base^2 + (factor e)^2 of ``DIS_NOISE`` and at
@@ -183,22 +166,19 @@ def _lands_inside(flow: np.ndarray) -> np.ndarray:
     return (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)
 
 
+# -- other providers ------------------------------------------------------------------------------
+
+
 def file_flow(sequence: Any, *, strict: bool = True) -> FlowProvider:
-    """Provider of the flow files of a sequence.
+    """Provider of the flow files of an open sequence.
 
     Flow files lead from one frame to the next: for any other two frames, and where the file of a
-    pair is missing, the flow is None. A damaged file raises what the reader raises, or gives None
-    and a line in the log.
-
-    Args:
-        sequence: an open sequence, see :func:`hybridvo.data.sequence.open_sequence`, with
-            ``flow(index)`` (flow and validity or None) and ``flow_is_true``.
-        strict: whether a damaged file raises.
+    pair is missing, the flow is None. A damaged file raises what the reader raises if ``strict``,
+    else it gives None and a line in the log.
     """
 
     def provide(prev: Frame, curr: Frame) -> FlowField:
-        flow: np.ndarray | None = None
-        valid: np.ndarray | None = None
+        flow = valid = None
         if curr.index == prev.index + 1:
             try:
                 flow, valid = sequence.flow(prev.index)
@@ -250,20 +230,20 @@ def fallback(first: FlowProvider, second: FlowProvider) -> FlowProvider:
     return provide
 
 
-def check_field(result: Any, prev: Frame, source: str, is_true: bool = False) -> FlowField:
+def check_field(result: Any, prev: Frame, source: str) -> FlowField:
     """FlowField from what a provider returns: an array, a FlowField or None.
 
     Raises:
         InputError: another shape than the frame's, or values that are not numbers.
     """
+    expected = (*prev.camera.shape, 2)
     if isinstance(result, FlowField):
-        if result.flow is None or result.flow.shape == (*prev.camera.shape, 2):
+        if result.flow is None or result.flow.shape == expected:
             return result
         result = result.flow
     if result is None:
-        return FlowField(None, source=source, is_true=is_true)
+        return FlowField(None, source=source)
     array = to_numpy(result, f"flow ({source})")
-    expected = (*prev.camera.shape, 2)
     if array.shape != expected or array.dtype.kind not in "fiu":
         raise InputError(
             f"flow ({source}): expected numbers of shape {expected} = (H, W, 2), pixels on the "
@@ -274,21 +254,21 @@ def check_field(result: Any, prev: Frame, source: str, is_true: bool = False) ->
         flow = array.astype(np.float32)
     finite = np.asarray(np.isfinite(flow).all(axis=2))
     if finite.all():
-        return FlowField(flow, source=source, is_true=is_true)
+        return FlowField(flow, source=source)
     flow[~finite] = np.nan
-    return FlowField(flow, None, finite, source, is_true)
+    return FlowField(flow, None, finite, source)
+
+
+# -- a given flow against the images --------------------------------------------------------------
 
 
 def contradiction(pair: FramePair) -> str | None:
-    """Why the flow of a pair cannot be that of its images, or None.
+    """Why the flow of a pair cannot be that of its images, as a sentence, or None.
 
     A flow with the wrong sign, direction, unit, channel order or of another pair is a flawless flow
     of another motion; only the images show it: such a flow warps one image onto the other no better
-    than no flow does.
-
-    Returns:
-        A sentence; None where the flow fits, where an image or the flow is missing, where the flow
-        was computed from the images (source ``dis``), or where there is too little texture.
+    than no flow does. None also where the flow was computed from the images (source ``dis``), where
+    one of them is missing, or where there is too little texture.
     """
     rgb_prev, rgb_curr, flow = pair.prev.rgb, pair.curr.rgb, pair.flow
     if rgb_prev is None or rgb_curr is None or flow is None or pair.flow_source == "dis":
@@ -296,26 +276,29 @@ def contradiction(pair: FramePair) -> str | None:
     height, width = flow.shape[:2]
     factor = max(1, min(height, width) // 100)  # at 100 pixels and more, details do not matter
     size = (width // factor, height // factor)
-    first, second = (
-        cv2.blur(
-            cv2.resize(cv2.cvtColor(x, cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_AREA),
-            (3, 3),
-        )
-        for x in (rgb_prev, rgb_curr)
-    )
+
+    def shrunk(rgb: np.ndarray) -> np.ndarray:
+        gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+        return cv2.blur(cv2.resize(gray, size, interpolation=cv2.INTER_AREA), (3, 3))
+
+    first, second = shrunk(rgb_prev), shrunk(rgb_curr)
     own = _calc_dis(cv2.DISOpticalFlow.create(DIS_PRESETS["fast"]), first, second)
     if own is None:
         return None
-    small, seen = _shrunk(flow, pair.flow_valid, factor, size)
+    small, seen = _shrunk_flow(flow, pair.flow_valid, factor, size)
     du, dv = cv2.Sobel(first, cv2.CV_32F, 1, 0) / 8, cv2.Sobel(first, cv2.CV_32F, 0, 1) / 8
     seen &= cv2.magnitude(du, dv) > 2.0  # grey levels a pixel: where a shift can be seen
     seen &= _lands_inside(small) & _lands_inside(own)
     if np.count_nonzero(seen) < 200:
         return None
-    given, best, still = (
-        float(np.median(_warped_difference(first, second, shift)[seen]))
-        for shift in (small, own, np.zeros_like(own))
-    )
+
+    def difference(flow: np.ndarray) -> float:
+        """Median grey levels between the first image and the second one warped onto it."""
+        u, v = _targets(flow[..., 0], flow[..., 1])
+        warped = cv2.remap(second.astype(np.float32), u, v, cv2.INTER_LINEAR)
+        return float(np.median(np.abs(warped - first)[seen]))
+
+    given, best, still = map(difference, (small, own, np.zeros_like(own)))
     fits, is_decidable = FLOW_CONTRADICTION
     if given < fits * still or still < is_decidable * best + 1:
         return None
@@ -327,7 +310,7 @@ def contradiction(pair: FramePair) -> str | None:
     )
 
 
-def _shrunk(
+def _shrunk_flow(
     flow: np.ndarray, valid: np.ndarray | None, factor: int, size: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Smoothed flow on a coarser grid of (width, height), in its pixels, and where it is known."""
@@ -341,9 +324,3 @@ def _shrunk(
     small = np.where(seen[..., None], small, np.float32(0))
     # single wrong pixels do not matter
     return np.dstack([cv2.blur(cv2.medianBlur(x, 5), (5, 5)) for x in cv2.split(small)]), seen
-
-
-def _warped_difference(first: np.ndarray, second: np.ndarray, flow: np.ndarray) -> np.ndarray:
-    """(H, W) absolute grey levels between the first image and the second one warped onto it."""
-    u, v = _targets(flow[..., 0], flow[..., 1])
-    return np.abs(cv2.remap(second.astype(np.float32), u, v, cv2.INTER_LINEAR) - first)

@@ -110,7 +110,7 @@ class Odometry:
         self._registration = replace(
             options.photometric, prior_inflation=1.0, iterations=REGISTRATION_STEPS
         )
-        self._flow = flow or dis_flow(options.flow.dis_preset, options.flow.forward_backward)
+        self._flow = flow or dis_flow(options.flow.dis_preset)
         self.reset()
 
     @classmethod

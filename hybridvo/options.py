@@ -53,13 +53,10 @@ class FlowOptions:
     Args:
         source: ``file``, ``dis``, or ``auto``: files where the sequence has them, else DIS.
         dis_preset: effort of OpenCV's DIS.
-        forward_backward: compute DIS in both directions, which gives variance and validity at twice
-            the time.
     """
 
     source: Literal["auto", "file", "dis"] = "auto"
     dis_preset: Literal["ultrafast", "fast", "medium"] = "medium"
-    forward_backward: bool = True
 
 
 @option_group

@@ -1,8 +1,7 @@
 """Camera trajectories: chained from relative poses, read from and written to text files.
 
-A trajectory holds ``T_world_cam`` (camera to world, as TUM, KITTI and evo store it) in camera axes
-(x right, y down, z forward). evo writes the files. They are read here: evo names neither the line
-of a mistake nor accepts tabs and Windows line ends.
+A trajectory holds ``T_world_cam`` (camera to world) in camera axes. evo writes the files. They are
+read here: evo names neither the line of a mistake nor accepts tabs and Windows line ends.
 """
 
 from __future__ import annotations
@@ -39,10 +38,8 @@ _logger = logging.getLogger(__name__)
 def chain(T_world_prev: np.ndarray, T_curr_prev: np.ndarray) -> np.ndarray:
     """Next camera pose: ``T_world_curr = T_world_prev @ inv(T_curr_prev)``.
 
-    One Newton step of the polar decomposition keeps the rotation orthonormal, so that rounding does
-    not accumulate over long sequences.
-
-    Both are (4, 4) and orthonormal to 1e-6, the result to 1e-12.
+    Both are (4, 4) and orthonormal to 1e-6, the result to 1e-12: one Newton step of the polar
+    decomposition, so that rounding does not accumulate over long sequences.
     """
     T_world_curr = T_world_prev @ invert(T_curr_prev)
     R = T_world_curr[:3, :3]
@@ -86,12 +83,10 @@ class Trajectory:
                 f"{stamps[max(k - 1, 0) : k + 1].tolist()}. Sort the poses, drop duplicates."
             )
         T = as_rigid(self.T_world_cam, "Trajectory.T_world_cam", many=True)
-        if len(T) == 0:
-            raise InputError("Trajectory: expected at least one pose, got none.")
-        if len(stamps) != len(T):
+        if len(T) == 0 or len(stamps) != len(T):
             raise InputError(
-                f"Trajectory: expected one timestamp per pose, got {len(stamps)} timestamps "
-                f"for {len(T)} poses."
+                f"Trajectory: expected at least one pose, and a timestamp for each; got "
+                f"{len(stamps)} timestamps for {len(T)} poses."
             )
         stamps.flags.writeable = T.flags.writeable = False
         object.__setattr__(self, "timestamps", stamps)
@@ -109,22 +104,14 @@ class Trajectory:
         return self.T_world_cam[:, :3, 3]
 
     def transformed(self, T_new_world: np.ndarray, scale: float = 1.0) -> Trajectory:
-        """The same path in another world: positions times ``scale``, then moved by ``T_new_world``.
-
-        Raises:
-            InputError: ``T_new_world`` (4, 4) is no rigid transform, or ``scale`` is not finite.
-        """
+        """The same path in another world: positions times ``scale``, then moved."""
         T = self.T_world_cam.copy()
         T[:, :3, 3] *= scale
         T = as_rigid(T_new_world, "T_new_world") @ T
         return Trajectory(self.timestamps, T, self.has_timestamps, self.warnings)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the trajectory: KITTI's form where the name ends in ``.kitti``, else TUM's.
-
-        Raises:
-            OutputError: the file cannot be written; an older file at ``path`` is then unchanged.
-        """
+        """Write the trajectory: KITTI's form where the name ends in ``.kitti``, else TUM's."""
         # imported when used: evo takes a second
         from evo.core.trajectory import PosePath3D, PoseTrajectory3D
         from evo.tools import file_interface
@@ -149,9 +136,7 @@ def read_trajectory(
 
     Args:
         path: text file, one pose a line.
-        format: ``tum`` (8 columns: timestamp tx ty tz qx qy qz qw), ``kitti`` (12 columns, first
-            three rows of the matrix), ``tartanair`` (7 columns: tx ty tz qx qy qz qw), or ``auto``:
-            by the number of columns.
+        format: ``tum``, ``kitti``, ``tartanair``, or ``auto``: by the number of :data:`COLUMNS`.
         axes: axes of the file: ``camera`` (x right, y down, z forward) or ``ned`` (x forward,
             y right, z down; converted to camera axes). ``auto`` is NED for TartanAir's format.
 
@@ -161,9 +146,8 @@ def read_trajectory(
         frame numbers as stamps.
 
     Raises:
-        InputError: no such file, an unknown option.
-        FormatError: a wrong number of columns, text, NaN, a quaternion that is not of unit length,
-            a matrix that is no rotation, stamps that do not increase; names file and line.
+        InputError: no such file, an unknown option. FormatError: a damaged row, a pose that is not
+            finite or no rotation, stamps that do not increase; names file and line.
     """
     if format not in ("auto", *COLUMNS):
         raise InputError(f"format: expected auto, {', '.join(COLUMNS)}, got {format!r}.")
@@ -200,11 +184,8 @@ def read_trajectory(
 def read_poses(path: Path, columns: str) -> tuple[list[Row], np.ndarray]:
     """Rows of a list of poses, and (N, 4, 4) what they hold, NaN where that is not finite.
 
-    The last ``columns`` are ``tx ty tz qx qy qz qw``, or the first three rows of the matrix.
-
-    Raises:
-        FormatError: a damaged row, a quaternion that is not of unit length, a matrix that is no
-            rotation; names file and line.
+    The last ``columns`` are ``tx ty tz qx qy qz qw``, or the first three rows of the matrix. A
+    damaged row or what is no rotation is a FormatError with file and line.
     """
     rows = read_rows(path, columns)
     is_matrix = columns == COLUMNS["kitti"]

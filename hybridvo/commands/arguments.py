@@ -31,41 +31,41 @@ def input(required: bool = True) -> argparse.ArgumentParser:
     where = given.add_mutually_exclusive_group(required=required)
     where.add_argument("path", nargs="?", metavar="DIR", help="folder of the sequence")
     where.add_argument("--sequence", metavar="DIR", help="the same, by name")
-    given.add_argument(
-        "--dataset", metavar="KIND", help=f"one of {', '.join(KINDS)} (default: detected)"
-    )
-    given.add_argument(
-        "--camera", metavar="FILE|fx,fy,cx,cy", help="camera.yaml, ROS camera_info, or numbers"
-    )
-    given.add_argument(
-        "--depth-scale", type=float, metavar="N", help="depth units per metre, 1000: millimetres"
-    )
-    given.add_argument("--mask", metavar="DIR", help="images that are 0 where pixels do not count")
+    add = given.add_argument
+    add("--dataset", metavar="KIND", help=f"one of {', '.join(KINDS)} (default: detected)")
+    camera = "camera.yaml, ROS camera_info, or numbers"
+    add("--camera", metavar="FILE|fx,fy,cx,cy", help=camera)
+    scale = "depth units per metre, 1000: millimetres"
+    add("--depth-scale", type=float, metavar="N", help=scale)
+    add("--mask", metavar="DIR", help="images that are 0 where pixels do not count")
     return given
+
+
+def _add_existing(command: argparse.ArgumentParser) -> None:
+    exists = command.add_mutually_exclusive_group()
+    exists.add_argument("--resume", action="store_true", help="go on where it was cut off")
+    exists.add_argument("--overwrite", action="store_true", help="replace the results in --out")
+
+
+def _add_weights(command: argparse.ArgumentParser) -> None:
+    own = "network weights instead of the pretrained ones, as in pwvo=mine.safetensors"
+    command.add_argument("--weights", action="append", default=[], metavar="NAME=FILE", help=own)
 
 
 def add_run(run: argparse.ArgumentParser) -> None:
     """Options of ``hybridvo run``."""
-    run.add_argument("--out", metavar="DIR", help="output folder (default: runs/NAME)")
-    run.add_argument(
-        "--method", metavar="NAME", help=f"one of {', '.join(METHODS)} (default: hybrid)"
-    )
-    run.add_argument(
-        "--flow", metavar="WHAT", help="auto, file or dis (default: files where there are, or dis)"
-    )
-    run.add_argument("--start", type=int, metavar="N", help="first frame (default 0)")
-    run.add_argument("--stop", type=int, metavar="N", help="the one after the last frame")
-    run.add_argument("--stride", type=int, metavar="N", help="step between frames (default 1)")
-    run.add_argument(
-        "--weights",
-        action="append",
-        default=[],
-        metavar="NAME=FILE",
-        help="network weights instead of the pretrained ones, as in pwvo=mine.safetensors",
-    )
-    run.add_argument("--device", metavar="NAME", help="auto (default), cpu or cuda")
-    run.add_argument("--config", metavar="FILE", help="YAML file of options")
-    run.add_argument(
+    add = run.add_argument
+    add("--out", metavar="DIR", help="output folder (default: runs/NAME)")
+    add("--method", metavar="NAME", help=f"one of {', '.join(METHODS)} (default: hybrid)")
+    flow = "auto, file or dis (default: files where there are, or dis)"
+    add("--flow", metavar="WHAT", help=flow)
+    add("--start", type=int, metavar="N", help="first frame (default 0)")
+    add("--stop", type=int, metavar="N", help="the one after the last frame")
+    add("--stride", type=int, metavar="N", help="step between frames (default 1)")
+    _add_weights(run)
+    add("--device", metavar="NAME", help="auto (default), cpu or cuda")
+    add("--config", metavar="FILE", help="YAML file of options")
+    add(
         "--set",
         action=_KeysInHelp,
         default=[],
@@ -73,22 +73,12 @@ def add_run(run: argparse.ArgumentParser) -> None:
         metavar="KEY=VALUE",
         help="one option, as in refine.cutoff=2.5; may be repeated; --set help lists the keys",
     )
-    exists = run.add_mutually_exclusive_group()
-    exists.add_argument("--resume", action="store_true", help="go on with a run that was cut off")
-    exists.add_argument("--overwrite", action="store_true", help="replace the results in --out")
-    run.add_argument(
-        "--max-failed", type=float, metavar="X", help="fraction of failed motions (default 0.2)"
-    )
-    run.add_argument(
-        "--strict", action="store_true", default=None, help="a broken frame ends the run"
-    )
-    run.add_argument(
-        "--rrd",
-        nargs="?",
-        const="",
-        metavar="FILE",
-        help="write a Rerun recording (extra 'viz'; default: recording.rrd in the output folder)",
-    )
+    _add_existing(run)
+    failed = "fraction of failed motions (default 0.2)"
+    add("--max-failed", type=float, metavar="X", help=failed)
+    add("--strict", action="store_true", default=None, help="a broken frame ends the run")
+    recording = "Rerun recording (extra 'viz'; default: recording.rrd in the output folder)"
+    add("--rrd", nargs="?", const="", metavar="FILE", help=recording)
 
 
 class _KeysInHelp(argparse.Action):
@@ -120,43 +110,58 @@ def add_compare(compare: argparse.ArgumentParser) -> None:
     add("--stride", type=int, default=1)
     add("--seed", type=int, default=0)
     add("--device", choices=("auto", "cpu", "cuda"), default="auto")
-    own = "network weights instead of the pretrained ones; repeatable"
-    add("--weights", action="append", default=[], metavar="NAME=FILE", help=own)
+    _add_weights(compare)
     paper = "MPI Sintel as others score it: PWVO's 992 pairs, or fourteen trajectories"
     add("--protocol", choices=("paper", "trajectory14"), help=paper)
     add("--worst", type=int, default=3, help="worst pairs shown for each method")
     add("--jobs", type=int, default=1, metavar="N", help="sequences at a time, a process each")
-    exists = compare.add_mutually_exclusive_group()
-    exists.add_argument("--resume", action="store_true", help="keep the finished sequences")
-    exists.add_argument("--overwrite", action="store_true", help="replace results in --out")
+    _add_existing(compare)
 
 
 def add_show(show: argparse.ArgumentParser) -> None:
     """Options of ``hybridvo show``."""
-    show.add_argument("--pair", type=int, default=0, metavar="N", help="first frame (default 0)")
-    show.add_argument("--out", default="pair.png", metavar="FILE", help="default: pair.png")
-    show.add_argument("--method", metavar="NAME", help="estimator (default: hybrid)")
-    show.add_argument("--flow", choices=("auto", "file", "dis"), default="auto")
-    show.add_argument("--weights", action="append", default=[], metavar="FILE", help="a network")
-    show.add_argument("--steps", type=int, default=32, help="of the integrated gradients")
-    show.add_argument("--overwrite", action="store_true", help="replace the image")
+    add = show.add_argument
+    add("--pair", type=int, default=0, metavar="N", help="first frame (default 0)")
+    add("--out", default="pair.png", metavar="FILE", help="default: pair.png")
+    add("--method", metavar="NAME", help="estimator (default: hybrid)")
+    add("--flow", choices=("auto", "file", "dis"), default="auto")
+    add("--weights", action="append", default=[], metavar="FILE", help="a network")
+    add("--steps", type=int, default=32, help="of the integrated gradients")
+    add("--overwrite", action="store_true", help="replace the image")
 
 
 def add_evaluate(evaluate: argparse.ArgumentParser) -> None:
     """Options of ``hybridvo evaluate``."""
-    evaluate.add_argument("estimate", metavar="EST", help="estimated trajectory")
-    evaluate.add_argument("gt", metavar="GT", help="true trajectory")
-    evaluate.add_argument(
-        "--alignment", choices=("se3", "sim3", "origin", "none"), default="se3", help="of the ATE"
-    )
-    evaluate.add_argument(
-        "--delta", type=float, default=1, metavar="X", help="span of the RPE (default 1)"
-    )
-    evaluate.add_argument(
-        "--delta-unit", choices=("frames", "s"), default="frames", help="unit of --delta"
-    )
-    evaluate.add_argument("--max-diff", type=float, metavar="S", help="seconds between matches")
-    formats = ("auto", "tum", "kitti", "tartanair")
+    add = evaluate.add_argument
+    add("estimate", metavar="EST", help="estimated trajectory")
+    add("gt", metavar="GT", help="true trajectory")
+    kinds = ("se3", "sim3", "origin", "none")
+    add("--alignment", choices=kinds, default="se3", help="of the ATE")
+    add("--delta", type=float, default=1, metavar="X", help="span of the RPE (default 1)")
+    add("--delta-unit", choices=("frames", "s"), default="frames", help="unit of --delta")
+    add("--max-diff", type=float, metavar="S", help="seconds between matches")
     for name in ("est", "gt"):
-        evaluate.add_argument(f"--format-{name}", choices=formats, default="auto")
-        evaluate.add_argument(f"--axes-{name}", choices=("auto", "camera", "ned"), default="auto")
+        add(f"--format-{name}", choices=("auto", "tum", "kitti", "tartanair"), default="auto")
+        add(f"--axes-{name}", choices=("auto", "camera", "ned"), default="auto")
+
+
+def add_demo(demo: argparse.ArgumentParser) -> None:
+    """Options of ``hybridvo demo``."""
+    add = demo.add_argument
+    add("--out", default="runs/demo", metavar="DIR", help="default: runs/demo")
+    add("--overwrite", action="store_true", help="replace the results in --out")
+    add("--frames", type=int, default=20, metavar="N", help="default: 20")
+    add("--seed", type=int, default=0, metavar="N", help="of the scene")
+
+
+def add_generate(generate: argparse.ArgumentParser) -> None:
+    """Options of ``hybridvo generate``."""
+    which = generate.add_mutually_exclusive_group(required=True)
+    which.add_argument("path", nargs="?", metavar="PRESET", help="paper, diverse or a YAML file")
+    which.add_argument("--preset", metavar="PRESET", help="the same, by name")
+    add = generate.add_argument
+    add("--out", required=True, metavar="DIR", help="folder of the samples")
+    add("--count", type=int, default=1000, metavar="N", help="default: 1000")
+    add("--seed", type=int, default=0, metavar="N")
+    add("--size", type=int, nargs=2, metavar=("H", "W"), help="pixels")
+    add("--workers", type=int, default=1, metavar="N", help="processes")

@@ -1,4 +1,4 @@
-"""Options from a YAML file and from ``--set group.key=value``; the command line wins."""
+"""Options from a YAML file and from ``--set group.key=value``, and ``--weights NAME=FILE``."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typing import Any
 from hybridvo.errors import FormatError, InputError
 from hybridvo.files import parse_yaml, read_text
 from hybridvo.options import Options
+from hybridvo.pipeline import networks_of
 
 
 def option_defaults() -> dict[str, Any]:
@@ -29,14 +30,8 @@ def load_options(
 ) -> Options:
     """Options from a file, then from ``group.key=value`` texts, then from named values.
 
-    Args:
-        path: YAML file, or None for the defaults.
-        assignments: such as ``refine.cutoff=2.5``; values are YAML.
-        given: such as ``{"run.method": "refine"}``; values that are None are left out.
-
-    Raises:
-        InputError: no such file, an unknown key (the nearest known one is named), a value that is
-            out of bounds. FormatError: the file is no YAML mapping.
+    ``path`` is a YAML file, or None for the defaults; the values of ``assignments`` are YAML;
+    those of ``given``, such as ``{"run.method": "refine"}``, are left out where they are None.
 
     Example:
         >>> load_options(assignments=["refine.cutoff=2.5"]).refine.cutoff
@@ -101,3 +96,20 @@ def _known(key: str, where: str) -> str:
         hint = f" (did you mean '{near[0]}'?)" if near else f"; known: {', '.join(known)}"
         raise InputError(f"{where}: unknown key '{key}'{hint}.")
     return key
+
+
+def weight_files(weights: Iterable[str], methods: Iterable[str]) -> dict[str, str]:
+    """Network -> file of the ``NAME=FILE`` that ``--weights`` was given."""
+    files = {}
+    known = sorted({name for method in methods for name in networks_of(method)})
+    for text in weights:
+        name, sign, path = text.partition("=")
+        if not sign or name not in known:
+            raise InputError(
+                f"--weights: expected NAME=FILE with {' or '.join(known) or 'no name'} for these "
+                f"methods, got {text!r}."
+            )
+        if not Path(path).is_file():
+            raise InputError(f"--weights {name}: {path}: no such file.")
+        files[name] = path
+    return files

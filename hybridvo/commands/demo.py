@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from hybridvo.commands.configuration import load_options
 from hybridvo.commands.run import EXIT_INTERRUPTED, RunResult, run
@@ -16,7 +17,8 @@ from hybridvo.data.sequence import open_sequence
 from hybridvo.errors import InputError, OutputError
 from hybridvo.evaluation.plots import plot_trajectories
 from hybridvo.files import make_folder, write_json
-from hybridvo.synthetic.render import make_scene, write_sintel
+from hybridvo.synthetic.render import write_sintel
+from hybridvo.synthetic.scenes import make_scene
 
 METHODS = {
     "hybrid": "hybridvo (hybrid)",
@@ -41,15 +43,11 @@ def demo(
     overwrite: bool = False,
     command: Iterable[str] = (),
     quiet: bool = False,
-) -> dict[str, Any] | None:
-    """Render, run and compare; JSON-ready, None where it was interrupted.
+) -> dict[str, Any]:
+    """Render, run and compare; JSON-ready.
 
     The scene is written in Sintel's layout under ``out/data``; flow comes from OpenCV DIS, never
     from the true flow that is written beside it. Depth is the renderer's.
-
-    Raises:
-        InputError: too few frames, or a folder that holds something already.
-        OutputError: a file that cannot be written.
     """
     if frames < 2:
         raise InputError(f"demo: expected at least 2 frames, got {frames}.")
@@ -72,7 +70,7 @@ def demo(
             quiet=quiet,
         )
         if results[method].exit_code == EXIT_INTERRUPTED:
-            return None
+            raise KeyboardInterrupt
     moving = float(np.median([(scene.object_id(i) > 0).mean() for i in range(scene.frames)]))
     content: dict[str, Any] = {
         "command": list(command),
@@ -94,29 +92,18 @@ def demo(
 
 def demo_text(content: dict[str, Any]) -> str:
     """The table for people, and what to do next."""
-    scene, lines = content["scene"], []
-    lines.append(
+    scene = content["scene"]
+    table = pd.DataFrame(content["rows"]).to_string(index=False, float_format="{:.4g}".format)
+    return (
         f"{scene['frames']} rendered frames of {scene['width']}x{scene['height']}, "
         f"{100 * content['moving_fraction']:.0f} % of the pixels move by themselves; flow: OpenCV "
-        f"DIS on the images; depth: the renderer's (true)."
+        f"DIS on the images; depth: the renderer's (true).\n"
+        f"ATE after aligning the first pose, the other errors are means a pair.\n\n"
+        f"{table}\n\n"
+        f"image: {content['image']}\n"
+        f"next:  hybridvo run DIR       your own sequence (hybridvo init DIR writes camera.yaml)\n"
+        f"       hybridvo doctor DIR    what is wrong with it"
     )
-    lines.append("ATE after aligning the first pose, the other errors are means a pair.\n")
-    lines.append(
-        f"{'method':26}{'ATE cm':>10}{'RPE cm':>10}{'rotation deg':>14}{'ego-flow px':>13}"
-        f"{'failed':>8}{'ms/frame':>10}"
-    )
-    for row in content["rows"]:
-        lines.append(
-            f"{row['method']:26}{row['ate_cm']:10.3f}{row['rpe_cm']:10.3f}"
-            f"{row['rotation_deg']:14.4f}{row['epe_px']:13.3f}{row['failed']:8}"
-            f"{row['frame_ms']:10.1f}"
-        )
-    lines += [
-        f"\nimage: {content['image']}",
-        "next:  hybridvo run DIR       your own sequence (hybridvo init DIR writes camera.yaml)",
-        "       hybridvo doctor DIR    what is wrong with it",
-    ]
-    return "\n".join(lines)
 
 
 def _prepare(out: Path, overwrite: bool) -> None:

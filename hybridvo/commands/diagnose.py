@@ -1,7 +1,6 @@
 """``hybridvo doctor DIR``: what the frames of a sequence say about their own consistency.
 
-Five questions: units of depth, scale of depth from frame to frame, depth against colour, exposure,
-and images against flow. A question that the frames cannot answer is reported as such.
+A question that the frames cannot answer is reported as such.
 """
 
 from __future__ import annotations
@@ -12,10 +11,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 
-from hybridvo.commands.depth_shift import REACH_PX, minimum, shift_costs
-from hybridvo.commands.inputs import is_dark
 from hybridvo.data.lists import shown
 from hybridvo.data.sequence import Sequence
 from hybridvo.errors import InputError
@@ -24,6 +22,7 @@ from hybridvo.evaluation.pair_errors import true_motion
 from hybridvo.flow import contradiction, dis_flow, file_flow
 from hybridvo.geometry import ego_flow
 from hybridvo.refinement.depth import depth_ratio, is_step
+from hybridvo.results import RelativePose
 from hybridvo.types import Frame, FramePair
 from hybridvo.units import depth_advice, typical_depth
 
@@ -42,6 +41,13 @@ MAX_GREY_STEP = 0.15
 """Change of the logarithm of the mean brightness between neighbours that is called a step."""
 MAX_CONTRADICTED = 0.2
 """Fraction of the pairs whose flow may contradict their images."""
+DARK_LEVEL = 20.0
+"""Grey levels (of 255) below which nine tenths of a dark image lie; lit rooms and night streets
+have a tenth above 60."""
+REACH_PX = 4
+"""Largest shift of the depth map that is tried."""
+MIN_PIXELS, MAX_PIXELS = 100, 3000
+"""Pixels at depth edges that a pair needs, and that are looked at."""
 
 Pair = dict[str, Any]
 """Measurements of a pair of frames; what could not be measured is absent."""
@@ -59,19 +65,10 @@ class Finding:
 
 
 def diagnose(sequence: Sequence, *, pairs: int = 40) -> dict[str, Any]:
-    """Look for systematic disagreement in a sequence.
+    """Look for systematic disagreement in a sequence; JSON-ready.
 
-    Args:
-        sequence: an open one. Its true poses serve for nothing but the scale of depth.
-        pairs: most pairs of neighbouring frames looked at, spread evenly.
-
-    Returns:
-        JSON-ready: ``sequence``, ``frames``, ``pairs``, ``unreadable`` (messages), ``findings`` and
-        ``ok`` (nothing differs). A finding has ``name``, ``state`` (``agrees``, ``differs`` or
-        ``cannot_tell``), ``value``, ``standard_error``, ``unit`` and ``message``.
-
-    Raises:
-        InputError: fewer than two frames, or ``pairs`` below 1.
+    At most ``pairs`` pairs of neighbouring frames are looked at, spread evenly. The true poses of
+    the sequence serve for nothing but the scale of depth. ``ok``: nothing differs.
     """
     if pairs < 1 or len(sequence) < 2:
         raise InputError(
@@ -150,10 +147,91 @@ def _measure(sequence: Sequence, prev: Frame, curr: Frame) -> Pair:
         rigid = FramePair(prev, curr, ego.astype(np.float32), None, motion.weights > 0.5, "motion")
         pair["contradiction"] = contradiction(rigid)
     ratio = depth_ratio(prev, curr, field.flow, motion.T_curr_prev)
-    costs = shift_costs(by_dis, motion)
+    costs = _shift_costs(by_dis, motion)
     pair |= {} if ratio is None else {"depth_ratio": ratio}
     pair |= {} if costs is None else {"shift_costs": costs}
     return pair
+
+
+def is_dark(rgb: np.ndarray | None) -> bool:
+    """Whether an image (H, W, 3) uint8 is too dark to see anything in."""
+    return rgb is not None and float(np.percentile(rgb[::4, ::4].max(axis=2), 90)) < DARK_LEVEL
+
+
+# -- where the depth map stands against its image -------------------------------------------------
+
+
+def _shift_costs(pair: FramePair, motion: RelativePose) -> np.ndarray | None:
+    """(9, 9) mean image cost, 0 to 1, of the pixels at depth edges under shifts of the depth map.
+
+    A depth map that is shifted against its image gives pixels at the edges of near things the depth
+    of what lies beside them, which the motion moves to the wrong place. None: too few edges.
+    """
+    prev, curr, weights = pair.prev, pair.curr, motion.weights
+    if weights is None or weights.shape != prev.camera.shape or prev.depth is None:
+        return None
+    first, second = (
+        cv2.GaussianBlur(cv2.cvtColor(f.rgb, cv2.COLOR_RGB2GRAY), (0, 0), 1.0).astype(np.float32)
+        for f in (prev, curr)
+        if f.rgb is not None
+    )
+    rows, columns = _edge_pixels(first, prev.depth, weights)
+    if len(rows) < MIN_PIXELS:
+        return None
+    R, t = motion.T_curr_prev[:3, :3], motion.T_curr_prev[:3, 3]
+    rays = np.stack([columns, rows, np.ones_like(rows)], axis=1) @ np.linalg.inv(prev.camera.K).T
+
+    def difference(down: int, right: int) -> np.ndarray:
+        z = prev.depth[rows + down, columns + right]  # type: ignore[index]
+        points = (z[:, None] * rays @ R.T + t) @ curr.camera.K.T
+        place = (points[:, :2] / np.maximum(points[:, 2:], 1e-6)).astype(np.float32)
+        there = cv2.remap(second, place[:, :1], place[:, 1:], cv2.INTER_LINEAR)[:, 0]
+        return there - first[rows, columns]
+
+    shifts = range(-REACH_PX, REACH_PX + 1)
+    residuals = np.array([[difference(down, right) for right in shifts] for down in shifts])
+    residuals -= np.median(residuals, axis=2, keepdims=True)  # a change of brightness
+    scale = max(1.4826 * float(np.median(np.abs(residuals))), 1.0)
+    return (residuals**2 / (residuals**2 + scale**2)).mean(axis=2)
+
+
+def _edge_pixels(
+    grey: np.ndarray, depth: np.ndarray, weights: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and columns of textured static pixels near edges of 5 % in depth."""
+    valid = np.isfinite(depth) & (depth > 0)
+    log = np.log(np.where(valid, depth, 1.0)).astype(np.float32)
+    reach = np.ones((2 * REACH_PX + 1,) * 2, np.uint8)
+    usable = cv2.dilate(log, reach) - cv2.erode(log, reach) > 0.05
+    usable &= cv2.erode(valid.astype(np.uint8), reach) > 0
+    usable &= cv2.blur(weights.astype(np.float32), (15, 15)) > 0.5
+    inside = np.zeros_like(usable)
+    inside[REACH_PX + 1 : -REACH_PX - 1, REACH_PX + 1 : -REACH_PX - 1] = True
+    gradient = cv2.magnitude(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1))
+    rows, columns = np.nonzero(usable & inside)
+    if len(rows):
+        strong = gradient[rows, columns] > max(float(np.median(gradient[rows, columns])), 16.0)
+        rows, columns = rows[strong], columns[strong]
+    step = max(1, len(rows) // MAX_PIXELS)
+    return rows[::step], columns[::step]
+
+
+def _minimum(cost: np.ndarray) -> np.ndarray:
+    """(right, down) px of the minimum of a cost over shifts, between the pixels by parabolas.
+
+    The depth of a pixel is found at x + shift: so far it stands from its image.
+    """
+    row, column = np.unravel_index(np.argmin(cost), cost.shape)
+
+    def vertex(values: np.ndarray, k: int) -> float:
+        if not 0 < k < len(values) - 1:
+            return k - REACH_PX
+        before, here, after = values[k - 1 : k + 2]
+        bend = before - 2 * here + after
+        offset = np.clip(0.5 * (before - after) / bend, -0.5, 0.5) if bend > 0 else 0.0
+        return k + float(offset) - REACH_PX
+
+    return np.array([vertex(cost[row], int(column)), vertex(cost[:, column], int(row))])
 
 
 # -- findings -----------------------------------------------------------------------------------
@@ -216,8 +294,8 @@ def _depth_against_colour(pairs: list[Pair]) -> Finding:
         text = f"{n} pairs with depth edges in textured places, {MIN_PAIRS} needed"
         return Finding("cannot_tell", text)
     total = costs.mean(axis=0)
-    value = minimum(total)
-    left_out = np.array([minimum((n * total - cost) / (n - 1)) for cost in costs])
+    value = _minimum(total)
+    left_out = np.array([_minimum((n * total - cost) / (n - 1)) for cost in costs])
     error = np.sqrt((n - 1) * left_out.var(axis=0))  # jackknife
     size, spread = float(np.linalg.norm(value)), float(np.linalg.norm(error))
     gain = float(total[REACH_PX, REACH_PX] - total.min())

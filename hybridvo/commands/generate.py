@@ -13,9 +13,8 @@ import numpy as np
 from hybridvo.errors import InputError
 from hybridvo.evaluation.maps import flow_colours
 from hybridvo.files import atomic_write
-from hybridvo.synthetic.dataset import read_sample, write_samples
+from hybridvo.synthetic.dataset import PRESETS, Preset, load_preset, read_sample, write_samples
 from hybridvo.synthetic.layered import Sample
-from hybridvo.synthetic.presets import PRESETS, Preset, load_preset
 
 TITLES = (
     "1 rays of K",
@@ -51,10 +50,6 @@ def generate(
         size: (height, width) in pixels instead of the preset's.
         workers: processes.
         report: called with the samples done and asked for.
-
-    Raises:
-        InputError: an unknown preset, a value that cannot be meant, or a folder of other samples.
-        OutputError: a file that cannot be written.
     """
     for done in write_samples(_preset(preset, size), count, out, seed, workers):
         if report is not None:
@@ -81,9 +76,6 @@ def write_sheet(samples: Sequence[Sample], path: str | Path) -> None:
 
     Flow is coloured by direction, and the more the longer up to the sample's 98 % quantile; depth
     is bright where near.
-
-    Raises:
-        OutputError: it cannot be written.
     """
     width = samples[0].moving.shape[1]
     header = np.full((LINE_PX, len(TITLES) * width, 3), 255, np.uint8)

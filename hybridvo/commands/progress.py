@@ -6,8 +6,9 @@ import contextlib
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from types import FrameType
+from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
@@ -15,10 +16,11 @@ from rich.progress import Progress as Bar
 
 
 @contextlib.contextmanager
-def interruptible() -> Iterator[threading.Event]:
+def interruptible(stop: Callable[[], Any] | None = None) -> Iterator[threading.Event]:
     """An event that the first SIGINT or SIGTERM sets; a second one raises KeyboardInterrupt.
 
-    Outside the main thread, where Python delivers no signals, the event stays unset.
+    The first one also calls ``stop``. Outside the main thread, where Python delivers no signals,
+    the event stays unset.
     """
     event = threading.Event()
 
@@ -26,6 +28,8 @@ def interruptible() -> Iterator[threading.Event]:
         if event.is_set():
             raise KeyboardInterrupt
         event.set()
+        if stop is not None:
+            stop()
 
     if threading.current_thread() is not threading.main_thread():
         yield event

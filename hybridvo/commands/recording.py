@@ -24,11 +24,7 @@ MAX_SIDE = 480
 
 
 def check_recording(path: str | os.PathLike[str]) -> None:
-    """Refuse what cannot become a recording, before a run is started.
-
-    Raises:
-        InputError: Rerun is not installed, or the name does not end in ``.rrd``.
-    """
+    """Refuse what cannot become a recording, before a run is started."""
     if Path(path).suffix != ".rrd" or Path(path).is_dir():
         raise InputError(f"--rrd {os.fspath(path)}: expected the name of a file that ends in .rrd.")
     if find_spec("rerun") is None:
@@ -38,14 +34,10 @@ def check_recording(path: str | os.PathLike[str]) -> None:
 class Recording:
     """Writes a recording as the frames come in; use as a context manager.
 
-    Args:
-        path: file to write; where it exists, as after ``--resume``, a part is written beside it
-            that the viewer shows together with it.
-        name: of the sequence.
-        identity: the same for all parts of one run.
-        frames: expected number of frames; decides the stride of the images.
-        first: number of the first frame that will be recorded.
-        poses: (N, 4, 4) ground truth T_world_cam, or None.
+    ``identity`` is the same for all parts of one run: where the file exists, as after ``--resume``,
+    a part is written beside it that the viewer shows together with it. The number of ``frames``
+    decides the stride of the images, ``first`` is that of the first one, ``poses`` (N, 4, 4) are
+    the ground truth T_world_cam.
     """
 
     def __init__(
@@ -117,13 +109,6 @@ class Recording:
             text = f"frame {step.index}: {step.status} {step.status.message}"
             level = "WARN" if state is State.DEGRADED else "ERROR"
             log("status/messages", rr.TextLog(text, level=level))
-        # the covariance of the motion, in the camera where it lies
-        values, axes = np.linalg.eigh(motion.covariance[:3, :3])
-        if np.linalg.det(axes) < 0:
-            axes[:, 0] *= -1
-        sizes = 3.0 * np.sqrt(np.maximum(values, 0.0))  # standard deviations
-        log("world/camera/covariance", rr.Transform3D(mat3x3=axes))
-        log("world/camera/covariance", rr.Ellipsoids3D(half_sizes=[sizes], colors=[213, 94, 0]))
 
     def _images(self, frame: Frame, step: Step, flow: np.ndarray | None) -> None:
         rr, log = self._rr, self._stream.log

@@ -32,11 +32,8 @@ def write_motions(folder: Path, rows: list[dict[str, Any]]) -> Trajectory:
 
 
 def summarise(rows: list[dict[str, Any]], sequence: Sequence, method: str) -> dict[str, Any]:
-    """Counts, sources, oracles, times and warnings of a run, JSON-ready.
-
-    The first frame has no motion: a run of n frames has n - 1.
-    """
-    motions = rows[1:]
+    """Counts, sources, oracles, times and warnings of a run, JSON-ready."""
+    motions = rows[1:]  # the first frame has none
     failed = [row for row in motions if row["status"] == "failed"]
     timed = [row for row in motions if row["reason"] != "missing_frame"]
 
@@ -108,40 +105,36 @@ def _scale_warning(rows: Iterable[Row]) -> list[str]:
 # -- texts --------------------------------------------------------------------------------------
 
 
-def _number(value: Any, factor: float = 1.0) -> str:
-    return "-" if value is None else f"{factor * value:.4g}"
+Errors = tuple[tuple[str, str, float, str], ...]
+"""Label, name in the report, factor, and what follows the number."""
+PATH_ERRORS: Errors = (
+    ("ATE", "ate_rmse", 100, "cm RMSE ({alignment})"),
+    ("RPE translation", "rpe_trans_rmse", 100, "cm RMSE over {delta:g} {delta_unit}"),
+    ("RPE rotation", "rpe_rot_rmse_deg", 1, "deg RMSE over {delta:g} {delta_unit}"),
+)
+PAIR_ERRORS: Errors = (
+    ("rotation error", "rot_err_deg_median", 1, "deg, median of the pairs"),
+    ("translation error", "trans_err_median", 100, "cm, median of the pairs"),
+    ("ego-flow error", "epe_l2_px", 1, "px, mean of the pairs"),
+)
+OTHER_ALIGNMENTS: Errors = (
+    ("ATE unaligned", "ate_rmse_unaligned", 100, "cm RMSE"),
+    ("ATE with scale", "ate_rmse_sim3", 100, "cm RMSE (sim3)"),
+)
+
+
+def _facts(report: Row, errors: Errors) -> list[tuple[str, str]]:
+    """Labels and numbers, or why there are none."""
+    return [
+        (label, f"- ({report['reasons'].get(key, 'unknown')})")
+        if report[key] is None
+        else (label, f"{factor * report[key]:.4g} {text.format(**report)}")
+        for label, key, factor, text in errors
+    ]
 
 
 def _lines(facts: Iterable[tuple[str, str]]) -> str:
     return "\n".join(f"{name:17}  {value}" for name, value in facts)
-
-
-def _trajectory_errors(report: Row) -> list[tuple[str, str]]:
-    """ATE and RPE, or why they could not be computed."""
-    span = f"over {report['delta']:g} {report['delta_unit']}"
-    span = "a frame" if span == "over 1 frames" else span
-    facts = []
-    for label, key, factor, unit, of in (
-        ("ATE", "ate_rmse", 100.0, "cm", f"({report['alignment']})"),
-        ("RPE translation", "rpe_trans_rmse", 100.0, "cm", span),
-        ("RPE rotation", "rpe_rot_rmse_deg", 1.0, "deg", span),
-    ):
-        text = f"{_number(report[key], factor)} {unit} RMSE {of}"
-        if report[key] is None:
-            text = f"- ({report['reasons'].get(key, 'unknown')})"
-        facts.append((label, text))
-    return facts
-
-
-def _pair_errors(report: Row) -> list[tuple[str, str]]:
-    facts = []
-    for label, key, factor, unit in (
-        ("rotation error", "rot_err_deg", 1.0, "deg"),
-        ("translation error", "trans_err", 100.0, "cm"),
-    ):
-        median, mean = (_number(report[f"{key}_{kind}"], factor) for kind in ("median", "mean"))
-        facts.append((label, f"{median} median, {mean} mean {unit} a pair"))
-    return [*facts, ("ego-flow error", f"{_number(report['epe_l2_px'])} px mean")]
 
 
 def summary_text(summary: Row) -> str:
@@ -162,7 +155,7 @@ def summary_text(summary: Row) -> str:
         times = (summary[f"{part}_ms_median"] for part in ("frame", "flow", "motion"))
         facts.append(("time", "{:.1f} ms a frame: flow {:.1f}, motion {:.1f}".format(*times)))
     if metrics := summary.get("metrics"):
-        facts += _trajectory_errors(metrics) + _pair_errors(metrics)
+        facts += _facts(metrics, PATH_ERRORS + PAIR_ERRORS)
     facts.append(("results", str(summary["out"])))
     if "recording" in summary:
         facts.append(("recording", f"{summary['recording']} (open it with: rerun FILE)"))
@@ -173,13 +166,12 @@ def evaluation_text(report: Row) -> str:
     """Errors between two trajectory files."""
     facts = [
         ("matched", f"{report['matched']} of {report['total']} poses, by {report['matched_by']}"),
-        *_trajectory_errors(report),
-        ("ATE unaligned", f"{_number(report['ate_rmse_unaligned'], 100.0)} cm RMSE"),
-        ("ATE with scale", f"{_number(report['ate_rmse_sim3'], 100.0)} cm RMSE (sim3)"),
+        *_facts(report, PATH_ERRORS + OTHER_ALIGNMENTS),
     ]
     for label, key in (("KITTI drift", "kitti_drift"), ("drift 5 to 40 m", "kitti_drift_short")):
-        drift = report.get(key) or {}
-        translation, rotation = drift.get("translation"), drift.get("rotation_deg_per_m")
-        facts.append((label, f"{_number(translation, 100.0)} %, {_number(rotation)} deg/m"))
+        drift = report[key]
+        if drift is not None and drift["translation"] is not None:
+            rotation = f"{drift['rotation_deg_per_m']:.4g} deg/m"
+            facts.append((label, f"{100 * drift['translation']:.4g} %, {rotation}"))
     facts.append(("evo", str(report["evo_version"])))
     return _lines(facts + [("warning", text) for text in report["warnings"]])

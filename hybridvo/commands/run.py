@@ -19,7 +19,7 @@ from typing import Any
 
 import hybridvo
 from hybridvo.commands import results
-from hybridvo.commands.inputs import flow_provider, is_dark
+from hybridvo.commands.diagnose import is_dark
 from hybridvo.commands.progress import Progress, interruptible
 from hybridvo.commands.recording import Recording, check_recording
 from hybridvo.commands.run_folder import RESULTS, STATE, Mode, RunFolder
@@ -27,7 +27,14 @@ from hybridvo.data.sequence import Sequence
 from hybridvo.errors import InputError
 from hybridvo.evaluation.pair_errors import pair_errors, true_motion, true_trajectory
 from hybridvo.files import fingerprint, versions
-from hybridvo.flow import FlowField, MeasuredFlow
+from hybridvo.flow import (
+    FlowField,
+    FlowProvider,
+    MeasuredFlow,
+    dis_flow,
+    fallback,
+    file_flow,
+)
 from hybridvo.geometry import se3_log
 from hybridvo.network.models import Models
 from hybridvo.odometry import Odometry
@@ -49,13 +56,9 @@ SAVE_EVERY = 50
 
 @dataclass(frozen=True, eq=False)
 class RunResult:
-    """Outcome of a run.
+    """Exit code 0, 3 (too many failed frames) or 130 (interrupted); a summary, JSON-ready; poses.
 
-    Args:
-        exit_code: 0, 3 (too many failed frames) or 130 (interrupted).
-        summary: JSON-ready: state, counts, oracles, times, metrics, files.
-        trajectory: the poses so far; None where no frame was finished, or all before a resume.
-        gt: true poses, or None.
+    There is no trajectory where no frame was finished, or all before a resume.
     """
 
     exit_code: int
@@ -77,15 +80,8 @@ def run(
 ) -> RunResult:
     """Estimate, chain, write and score a sequence.
 
-    Args:
-        sequence: an open one, see :func:`hybridvo.data.sequence.open_sequence`.
-        out: output folder, default ``runs/NAME``.
-        options: see :class:`hybridvo.options.Options`.
-        models: networks instead of the pretrained ones.
-        mode: ``new``, ``resume`` or ``overwrite``.
-        command: for ``run.json``.
-        quiet: no progress.
-        rrd: file of a Rerun recording; empty for ``recording.rrd`` in the output folder.
+    ``out`` is by default ``runs/NAME``, ``command`` stands in ``run.json``; ``rrd`` is the file of
+    a Rerun recording, empty for ``recording.rrd`` in the output folder.
 
     Raises:
         InputError: input or options that cannot be used, or a broken frame with ``strict``.
@@ -97,7 +93,7 @@ def run(
     if rrd is not None:
         check_recording(rrd or RECORDING)
     frames = _frames(sequence, options)
-    flow = MeasuredFlow(flow_provider(sequence, options))
+    flow = MeasuredFlow(_flow_provider(sequence, options))
     out = _folder(out, sequence)
     vo = Odometry(models, flow=flow, method=method, options=options, seed=options.run.seed)
     vo.warm_up()  # before the folder is taken: it may last
@@ -107,7 +103,21 @@ def run(
         "weights": weights_hash(method, models),
         "hybridvo": hybridvo.__version__,
     }
-    header = _header(sequence, frames, options, command) | {"input_hash": identity["input_hash"]}
+    header = {
+        "command": list(command),
+        "versions": versions(),
+        "machine": {"platform": platform.platform(), "cpus": os.cpu_count()},
+        "options": dataclasses.asdict(options),
+        "sequence": {
+            "name": sequence.name,
+            "kind": sequence.kind,
+            "path": os.fspath(sequence.root),
+            "frames": len(frames),
+            "depth_source": sequence.depth_source,
+            "warnings": list(sequence.warnings),
+        },
+        "input_hash": identity["input_hash"],
+    }
     with RunFolder(out, identity, header, mode) as folder, contextlib.ExitStack() as stack:
         if folder.finished:
             summary = folder.read_json(STATE)["summary"]
@@ -265,7 +275,7 @@ class _Job:
         results.draw(path / "trajectory.png", trajectory, gt, summary)
         written = (path / name for name in (*RESULTS, STATE))
         summary["files"] = [os.fspath(file) for file in written if file.exists()]
-        folder.finish(summary=summary)
+        folder.write_state("done", summary=summary)
         return RunResult(exit_code, summary | {"state": "done", "metrics": metrics}, trajectory, gt)
 
 
@@ -281,6 +291,20 @@ def _frames(sequence: Sequence, options: Options) -> range:
     return frames
 
 
+def _flow_provider(sequence: Sequence, options: Options) -> FlowProvider:
+    """Provider of the flow that the options ask for."""
+    source, stride = options.flow.source, options.run.stride
+    from_files = file_flow(sequence, strict=options.run.strict)
+    if source == "file":
+        sequence.check_flow(stride)
+        return from_files
+    dis = dis_flow(options.flow.dis_preset)
+    if source == "auto" and sequence.has_flow and stride == 1:
+        # a damaged file is no reason to stop where DIS can stand in
+        return fallback(from_files, dis)
+    return dis
+
+
 def _folder(out: str | os.PathLike[str] | None, sequence: Sequence) -> Path:
     """The output folder; never that of the frames: the next run would read what is drawn."""
     name = re.sub(r"[^\w.-]+", "_", sequence.name).strip("._") or "sequence"
@@ -293,26 +317,6 @@ def _folder(out: str | os.PathLike[str] | None, sequence: Sequence) -> Path:
             f"input. Choose another --out."
         )
     return out
-
-
-def _header(
-    sequence: Sequence, frames: range, options: Options, command: Iterable[str]
-) -> dict[str, Any]:
-    """What ``run.json`` says of a run beside its state."""
-    return {
-        "command": list(command),
-        "versions": versions(),
-        "machine": {"platform": platform.platform(), "cpus": os.cpu_count()},
-        "options": dataclasses.asdict(options),
-        "sequence": {
-            "name": sequence.name,
-            "kind": sequence.kind,
-            "path": os.fspath(sequence.root),
-            "frames": len(frames),
-            "depth_source": sequence.depth_source,
-            "warnings": list(sequence.warnings),
-        },
-    }
 
 
 def _deciding(options: Options) -> dict[str, Any]:

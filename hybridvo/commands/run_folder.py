@@ -41,8 +41,7 @@ class RunFolder:
 
     Args:
         path: the folder; created where absent.
-        identity: what must be equal for a run to be resumed (options, input, weights, version);
-            JSON-ready.
+        identity: what must be equal for a run to be resumed; JSON-ready.
         header: what else ``run.json`` says.
         mode: ``new`` refuses a folder with results, ``overwrite`` removes those of a run (and no
             other files), ``resume`` goes on.
@@ -100,19 +99,20 @@ class RunFolder:
         present = [name for name in (STATE, *RESULTS) if os.path.lexists(self.path / name)]
         if present and mode == "new":
             raise InputError(
-                f"{self.path}: holds results of a run already ({', '.join(present[:3])}"
-                f"{', ...' if len(present) > 3 else ''}). Pass --overwrite to replace them, "
-                f"--resume to go on, or another --out."
+                f"{self.path}: holds results of a run already ({', '.join(present[:3])}). Pass "
+                f"--overwrite to replace them, --resume to go on, or another --out."
             )
-        if present and mode == "resume":
-            self._load()
-            if self.finished:
-                return
-        elif present and "identity" not in self.read_json(STATE):
-            raise InputError(
-                f"{self.path}: holds {', '.join(present[:3])} and no {STATE} of a run: not "
-                f"replaced. Move the files away, or choose another --out."
-            )
+        if present:
+            before = self.read_json(STATE)
+            if "identity" not in before:
+                raise InputError(
+                    f"{self.path}: holds {', '.join(present[:3])} and no {STATE} of a run: neither "
+                    f"--resume nor --overwrite can go on. Choose another --out."
+                )
+            if mode == "resume":
+                self._load(before)
+        if self.finished:
+            return
         # before the old results go: without it nothing would say that what is left is a run's
         self.write_state("running")
         if self.rows:  # what follows the checkpoint is computed again
@@ -120,48 +120,30 @@ class RunFolder:
         else:
             self._remove(CHECKPOINT, *RESULTS)
 
-    def _load(self) -> None:
+    def _load(self, before: Mapping[str, Any]) -> None:
         """Rows and tracker of an earlier run of the same identity."""
-        state = self.read_json(STATE)
-        if "identity" not in state:
-            raise InputError(
-                f"{self.path / STATE}: cannot be read, so the run cannot be resumed. "
-                f"Pass --overwrite to start anew."
-            )
-        then, now = _flat(state["identity"]), _flat(self._identity)
+        then, now = _flat(before["identity"]), _flat(self._identity)
         for key in sorted({*then, *now}):
             if then.get(key) != now.get(key):
                 raise InputError(
                     f"{self.path}: cannot be resumed: {key} differs ({str(then.get(key))[:40]} "
                     f"then, {str(now.get(key))[:40]} now). Pass --overwrite to start anew."
                 )
-        self.finished = state["state"] == "done"
-        if self.finished or not (self.path / CHECKPOINT).is_file():
-            return
-        try:
+        self.finished = before["state"] == "done"
+        if not self.finished and (self.path / CHECKPOINT).is_file():
             with np.load(self.path / CHECKPOINT, allow_pickle=False) as stored:
                 arrays = dict(stored)
             self.rows, self.tracker = json.loads(arrays.pop("rows").tobytes()), arrays
-        except (OSError, ValueError, KeyError) as error:
-            raise InputError(
-                f"{self.path / CHECKPOINT}: cannot be read ({error}), so the run cannot be "
-                f"resumed. Pass --overwrite to start anew."
-            ) from None
 
     def read_json(self, name: str) -> dict[str, Any]:
         """Content of a JSON file of the folder; empty where it is absent or damaged."""
         try:
-            content = json.loads((self.path / name).read_text(encoding="utf-8"))
+            return json.loads((self.path / name).read_text(encoding="utf-8"))
         except (OSError, ValueError):
             return {}
-        return content if isinstance(content, dict) else {}
 
     def append(self, row: dict[str, Any]) -> None:
-        """Keep the row of a finished frame, and write its line of ``steps.csv``.
-
-        Raises:
-            OutputError: it cannot be written; lines written before stay valid.
-        """
+        """Keep the row of a finished frame, and write its line of ``steps.csv``."""
         path = self.path / STEPS
         try:
             with path.open("a", encoding="utf-8", newline="") as file:
@@ -186,20 +168,15 @@ class RunFolder:
         """Write ``run.json``; ``state`` is ``running``, ``interrupted`` or ``done``."""
         content = {"identity": self._identity, "state": state, "frames_done": len(self.rows)}
         write_json(self.path / STATE, {**self._header, **more, **content})
-
-    def finish(self, **more: Any) -> None:
-        """The results are written: the checkpoint is not needed any more."""
-        self.write_state("done", **more)
-        self._remove(CHECKPOINT)
+        if state == "done":  # the results are written
+            self._remove(CHECKPOINT)
 
     def _remove(self, *names: str) -> None:
         for name in names:
             try:
                 (self.path / name).unlink(missing_ok=True)
             except OSError as error:
-                raise OutputError(
-                    f"{self.path / name}: cannot be replaced: {error.strerror or error}."
-                ) from error
+                raise OutputError(f"{self.path / name}: cannot be replaced: {error}.") from error
 
 
 def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -20,7 +20,6 @@ import json
 import math
 import os
 import shlex
-import signal
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -33,7 +32,7 @@ def add_train(train: argparse.ArgumentParser, common: argparse.ArgumentParser) -
     train.formatter_class = argparse.RawDescriptionHelpFormatter
     commands = train.add_subparsers(required=True, metavar="WHAT")
 
-    def command(name: str, call: Callable[..., None], help: str) -> argparse.ArgumentParser:
+    def command(name: str, call: Callable[..., Any], help: str) -> argparse.ArgumentParser:
         made = commands.add_parser(name, help=help, parents=[common])
         made.set_defaults(train=call)
         return made
@@ -72,11 +71,11 @@ def add_train(train: argparse.ArgumentParser, common: argparse.ArgumentParser) -
     data.add_argument("--propose", metavar="NETWORK", help="ask these weights about the samples")
 
 
-def train(args: argparse.Namespace, command: list[str]) -> int:
-    """Run the command."""
+def train(args: argparse.Namespace, command: list[str]) -> tuple[Any, str, int]:
+    """Run the command; what it gives, JSON-ready and for people, and the exit code."""
     with _processes():
-        args.train(args, shlex.join(command))
-    return 0
+        content = args.train(args, shlex.join(command))
+    return content, json.dumps(content, indent=1), 0
 
 
 @contextlib.contextmanager
@@ -97,7 +96,7 @@ def _processes() -> Iterator[None]:
         dist.destroy_process_group()
 
 
-def _pwvo(args: argparse.Namespace, command: str) -> None:
+def _pwvo(args: argparse.Namespace, command: str) -> dict[str, Any]:
     from hybridvo.network.models import torch_device
     from hybridvo.training.options import load_pwvo_options
     from hybridvo.training.pwvo_task import PwvoTask
@@ -107,10 +106,11 @@ def _pwvo(args: argparse.Namespace, command: str) -> None:
     changes = {n: getattr(args, n) for n in names if getattr(args, n) is not None}
     options = dataclasses.replace(options, **changes)
     device = torch_device(args.device)
-    _train(args, command, PwvoTask(options, mixture), device, args.workers)
+    trainer = _train(args, command, PwvoTask(options, mixture), device, args.workers)
+    return {"updates": trainer.step}
 
 
-def _selector(args: argparse.Namespace, command: str) -> None:
+def _selector(args: argparse.Namespace, command: str) -> dict[str, Any]:
     from hybridvo.errors import InputError
     from hybridvo.training.export import export_selector
     from hybridvo.training.options import load_selector_options
@@ -120,15 +120,16 @@ def _selector(args: argparse.Namespace, command: str) -> None:
         raise InputError("--export: needs --held-out, samples for the figures of the card.")
     task = SelectorTask(load_selector_options(args.config), args.data)
     trainer = _train(args, command, task, "cpu", 0)
-    if args.export is not None:
-        card = export_selector(trainer, args.held_out, args.export)
-        print(json.dumps(card["held_out"], indent=1))
+    if args.export is None:
+        return {"updates": trainer.step}
+    return export_selector(trainer, args.held_out, args.export)["held_out"]
 
 
 def _train(args: argparse.Namespace, command: str, task: Any, device: str, workers: int) -> Any:
     import cv2
     import torch
 
+    from hybridvo.commands.progress import interruptible
     from hybridvo.errors import InputError
     from hybridvo.files import write_json
     from hybridvo.training.export import RUN, source_commit
@@ -157,35 +158,21 @@ def _train(args: argparse.Namespace, command: str, task: Any, device: str, worke
         if trainer.rank == 0:
             about = {"command": command, "commit": source_commit(), "torch": torch.__version__}
             write_json(args.out / RUN, about)
-    with _clean_stop(trainer):
+    # the update at hand ends, with a checkpoint
+    with interruptible(lambda: setattr(trainer, "stop_requested", True)):
         why = trainer.run(60 * args.time_limit)
     say(f"ended by {why} at update {trainer.step}, {trainer.samples} samples")
     return trainer
 
 
-@contextlib.contextmanager
-def _clean_stop(trainer: Any) -> Iterator[None]:
-    """The signals that ask to stop end the run after the update at hand, with a checkpoint."""
-
-    def request(number: int, frame: object) -> None:
-        trainer.stop_requested = True
-
-    before = {s: signal.signal(s, request) for s in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-def _export(args: argparse.Namespace, command: str) -> None:
+def _export(args: argparse.Namespace, command: str) -> dict[str, Any]:
     from hybridvo.training.export import export_pwvo
 
     card = export_pwvo(args.out, args.export, args.count, args.calibrate)
-    print(json.dumps({"file": str(args.export), "held_out": card["held_out"]}, indent=1))
+    return {"file": str(args.export), "held_out": card["held_out"]}
 
 
-def _selector_data(args: argparse.Namespace, command: str) -> None:
+def _selector_data(args: argparse.Namespace, command: str) -> dict[str, Any]:
     from hybridvo.errors import InputError
     from hybridvo.synthetic.semi_real import load_split
     from hybridvo.training.selector_data import PER_SHARD, write_proposals, write_shard
@@ -196,9 +183,11 @@ def _selector_data(args: argparse.Namespace, command: str) -> None:
     recordings = () if args.recordings is None else load_split(args.recordings, args.split)
     for seed in range(args.first_seed, args.first_seed + args.seeds, PER_SHARD):
         count = write_shard(args.data, seed, recordings=recordings)
-        print(f"seeds from {seed}: {count} samples", flush=True)
+        print(f"seeds from {seed}: {count} samples", file=sys.stderr, flush=True)
+    asked = 0
     if args.propose is not None:
-        print(f"asked about {write_proposals(args.data, _network(args.propose))} samples")
+        asked = write_proposals(args.data, _network(args.propose))
+    return {"asked": asked}
 
 
 def _network(name: str) -> Any:

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from hybridvo.data.camera_file import IMAGES, Calibration, Lens, parse_camera, units_per_metre
-from hybridvo.data.image_io import image_size, read_depth, read_flow, read_mask_png, read_rgb
-from hybridvo.data.lists import check_increasing, gap_warning, shown, sorted_files
+from hybridvo.data.image_io import read_depth, read_flow, read_mask_png, read_rgb
+from hybridvo.data.lists import check_increasing, shown, sorted_files, warn_of_gaps
 from hybridvo.errors import FormatError, InputError
 from hybridvo.types import Camera, Frame
 from hybridvo.units import depth_advice, typical_depth
@@ -20,10 +21,7 @@ from hybridvo.units import depth_advice, typical_depth
 
 @dataclass(frozen=True)
 class Given:
-    """What a user says about a sequence beyond its folder.
-
-    See :func:`hybridvo.data.sequence.open_sequence`.
-    """
+    """What a user says of a sequence: see :func:`hybridvo.data.sequence.open_sequence`."""
 
     camera: str | os.PathLike[str] | Camera | Calibration | None = None
     depth_scale: float | None = None
@@ -66,8 +64,8 @@ def numbered_listing(
         depth=[depth.get(n) for n in numbers],
         flow=[flow.get(n) if n + 1 in frames else None for n in numbers],  # none across a gap
         timestamps=(np.array(numbers) - min(numbers, default=0)) / frames_per_second,
-        warnings=gap_warning(name, numbers),
     )
+    warn_of_gaps(name, numbers, listing.warnings)
     return numbers, listing
 
 
@@ -109,13 +107,12 @@ class Sequence:
         if count == 0:
             raise InputError(f"{root}: no frames. Looked for {self.looks_for}")
         check_increasing(self.timestamps, str(root))
+        self._given_scale = units_per_metre(given.depth_scale, self.name, self.warnings)
         self.height, self.width = self._find_size()
         if given.camera is None:
             calibration = self._calibration()
         else:
             calibration = parse_camera(given.camera, (self.height, self.width))
-        scale, told = units_per_metre(given.depth_scale, self.name)
-        self.warnings += told
         self._camera = self._lens = None
         if calibration is not None:
             self._camera = camera = calibration.camera
@@ -128,8 +125,7 @@ class Sequence:
             self.warnings += calibration.warnings
             if any(calibration.distortion):
                 self._lens = Lens(calibration.camera, calibration.distortion)
-            scale = scale or calibration.depth_scale
-        self._given_scale = scale
+            self._given_scale = self._given_scale or calibration.depth_scale
         self.mask_files = self._find_masks(given.mask)
         self._warn_of_missing_files()
         self._warn_of_depth_unit()
@@ -138,6 +134,16 @@ class Sequence:
     def has_flow(self) -> bool:
         """Whether there is at least one flow file."""
         return any(path is not None for path in self.flow_files)
+
+    def check_flow(self, stride: int = 1) -> None:
+        """Refuse to take flow files that are not there, or that do not lead over a stride."""
+        if self.has_flow and stride == 1:
+            return
+        why = "there are no flow files"
+        if self.has_flow:
+            why = f"flow files lead from one frame to the next, not over a stride of {stride}"
+        remedy = "compute it: --flow dis, or iter_pairs(sequence, hybridvo.dis_flow())"
+        raise InputError(f"{self.name}: {why}; {remedy}.")
 
     def __len__(self) -> int:
         return len(self.timestamps)
@@ -256,12 +262,24 @@ class Sequence:
 
     def _find_size(self) -> tuple[int, int]:
         """(height, width) of the first image that can be read, which its depth must have too."""
-        rgb, problem = _first_size(self.rgb_files)
-        depth, no_depth = _first_size(self.depth_files)
+        problems: list[Exception] = []
+
+        def first(paths: list[Path | None], read: Callable[[Path, int], np.ndarray]) -> Any:
+            for index, path in enumerate(paths):
+                try:
+                    if path is not None:
+                        return read(path, index).shape[:2]
+                except (FormatError, OSError) as error:
+                    problems.append(error)
+            return None
+
+        # a right image of a stereo pair is no depth: frames check its size
+        depth_files = [] if self.depth_source == "stereo" else self.depth_files
+        rgb = first(self.rgb_files, lambda path, _: read_rgb(path))
+        depth = first(depth_files, lambda path, index: self._read_depth(path, index, None))
         if rgb is None and depth is None:
-            raise FormatError(
-                f"{self.root}: no frames: none can be read. First problem: {problem or no_depth}"
-            )
+            why = problems[0] if problems else "no file is listed"
+            raise FormatError(f"{self.root}: no frames: none can be read. First problem: {why}")
         if rgb is not None and depth is not None and rgb != depth:
             raise InputError(
                 f"{self.root}: depth images are {depth[1]}x{depth[0]}, colour images {rgb[1]}x"
@@ -269,7 +287,7 @@ class Sequence:
                 f"both have one size and camera (RealSense: rs.align(rs.stream.color); ROS: "
                 f"depth_registered or aligned_depth_to_color). Resizing does not register it."
             )
-        return rgb or depth  # type: ignore[return-value]
+        return rgb or depth
 
     def _find_masks(self, folder: str | os.PathLike[str] | None) -> list[Path | None]:
         """Mask of each frame: by equal names, else by order where the counts agree."""
@@ -319,16 +337,3 @@ class Sequence:
                     f"Probable remedy: {advice} (by --depth-scale, or depth_scale in camera.yaml)."
                 )
             return
-
-
-def _first_size(paths: list[Path | None]) -> tuple[tuple[int, int] | None, Exception | None]:
-    """(height, width) of the first readable file, and the first problem met on the way."""
-    problem: Exception | None = None
-    for path in paths:
-        if path is None:
-            continue
-        try:
-            return image_size(path), problem
-        except (FormatError, OSError) as error:
-            problem = problem or error
-    return None, problem

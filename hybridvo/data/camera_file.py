@@ -11,7 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from hybridvo.data.image_io import image_size
+from hybridvo.data.image_io import read_rgb
 from hybridvo.data.lists import sorted_files
 from hybridvo.errors import FormatError, InputError
 from hybridvo.files import atomic_write, parse_yaml, read_text
@@ -90,11 +90,7 @@ class Lens:
 def parse_camera(
     camera: str | os.PathLike[str] | Camera | Calibration, shape: tuple[int, int]
 ) -> Calibration:
-    """Calibration that a user gives: ``fx,fy,cx,cy`` for images of a shape, a file, or a camera.
-
-    Raises:
-        InputError: neither numbers nor a file. FormatError: a damaged file.
-    """
+    """Calibration that a user gives: ``fx,fy,cx,cy`` for images of a shape, a file, or a camera."""
     if isinstance(camera, Calibration):
         return camera
     if isinstance(camera, Camera):
@@ -118,16 +114,13 @@ def read_camera_file(path: Path) -> Calibration:
     Three vocabularies are read: ours (fx, fy, cx, cy, width, height, and optionally ``distortion:
     [k1, k2, p1, p2, k3]``, ``depth_scale`` in units per metre, ``fps``), ROS's ``camera_info``
     (calibration file or message), RealSense's intrinsics (ppx, ppy, coeffs).
-
-    Raises:
-        FormatError: not YAML, a key that is missing or unknown, a value that cannot be.
-        FileNotFoundError: no such file.
     """
     text = read_text(path).removesuffix("---\n")  # as ROS prints it
     content = parse_yaml(text, str(path))
     if not isinstance(content, dict):
         raise FormatError(f"{path}: expected 'key: value' lines, got a {type(content).__name__}.")
-    content, warnings = _in_our_words(content, path)
+    told: list[str] = []
+    content = _in_our_words(content, path, told)
     missing = [key for key in REQUIRED if content.get(key) is None]
     if missing:
         raise FormatError(
@@ -141,39 +134,34 @@ def read_camera_file(path: Path) -> Calibration:
     }
     try:
         camera = Camera(**{key: numbers[key] for key in REQUIRED})  # type: ignore[arg-type]
-        scale, told = units_per_metre(numbers.get("depth_scale"), str(path))
+        scale = units_per_metre(numbers.get("depth_scale"), str(path), told)
     except InputError as error:
         raise FormatError(f"{path}: {error}") from None
     fps = numbers.get("fps")
     if fps is not None and fps <= 0:
         raise FormatError(f"{path}: fps: expected a number above 0, got {fps}.")
     distortion = _distortion(content.get("distortion"), path)
-    x, y = (camera.cx + 0.5) / camera.width, (camera.cy + 0.5) / camera.height
-    if abs(x - 0.5) > 0.25 or abs(y - 0.5) > 0.25:
-        told.append(
-            f"{path}: the principal point {camera.cx:g} {camera.cy:g} is far from the middle of "
-            f"{camera.width}x{camera.height} pixels: are the intrinsics those of another size?"
-        )
-    return Calibration(camera, distortion, scale, fps, tuple(warnings + told))
+    return Calibration(camera, distortion, scale, fps, tuple(told))
 
 
-def units_per_metre(scale: float | None, where: str) -> tuple[float | None, list[str]]:
+def units_per_metre(scale: float | None, where: str, told: list[str]) -> float | None:
     """Stored units per metre, and a warning where the inverse was given.
 
     A value below 1 is RealSense's number of the same name, metres per unit: no depth is stored in
     units longer than a metre.
     """
     if scale is None:
-        return None, []
+        return None
     if not (np.isfinite(scale) and scale > 0):
         raise InputError(f"{where}: depth_scale: expected units per metre above 0, got {scale}.")
     if scale >= 1:
-        return float(scale), []
+        return float(scale)
     units = float(f"{1 / scale:.6g}")  # 0.001 as single precision prints it is 1000
-    return units, [
+    told.append(
         f"{where}: depth_scale {scale:g} is taken as metres per unit (as RealSense gives it): "
         f"{units:g} units per metre."
-    ]
+    )
+    return units
 
 
 def write_camera_template(directory: str | os.PathLike[str]) -> Path:
@@ -183,7 +171,7 @@ def write_camera_template(directory: str | os.PathLike[str]) -> Path:
     if path.exists():
         raise InputError(f"{path}: exists already; remove it first, or edit it.")
     images = sorted_files(folder / "rgb", IMAGES)
-    height, width = image_size(images[0]) if images else ("", "")
+    height, width = read_rgb(images[0]).shape[:2] if images else ("", "")
     comment = "# " if sorted_files(folder / "depth", (".npy", ".dpt")) else ""
     folder.mkdir(parents=True, exist_ok=True)
     with atomic_write(path) as file:
@@ -191,7 +179,7 @@ def write_camera_template(directory: str | os.PathLike[str]) -> Path:
     return path
 
 
-def _in_our_words(content: dict[Any, Any], path: Path) -> tuple[dict[str, Any], list[str]]:
+def _in_our_words(content: dict[Any, Any], path: Path, told: list[str]) -> dict[str, Any]:
     """The content with our keys: those of ROS and RealSense renamed, unknown ones refused."""
     matrix = _first_of(content, "camera_matrix", "K", "k")
     if matrix is not None:  # ROS
@@ -214,18 +202,18 @@ def _in_our_words(content: dict[Any, Any], path: Path) -> tuple[dict[str, Any], 
                 raise FormatError(
                     f"{path}: unknown key '{str(key)[:40]}'{hint}; known: {', '.join(KNOWN)}."
                 )
-        return content, []
+        return content
     renamed |= {key: content[key] for key in ("depth_scale", "fps") if key in content}
     if not any(_distortion(lens, path)):
-        return renamed, []
+        return renamed
     model = str(_first_of(content, "distortion_model", "model"))[:40]
     if any(word in model.lower() for word in ("fish", "equidist", "kannala", "ftheta")):
         raise FormatError(
             f"{path}: distortion model '{model}': expected Brown's (plumb_bob, "
             f"rational_polynomial). Rectify the images first."
         )
-    told = f"{path}: lens distortion is taken out; use a camera file without it if the images are "
-    return renamed | {"distortion": lens}, [told + "rectified already."]
+    told.append(f"{path}: lens distortion is taken out; state none if the images are rectified.")
+    return renamed | {"distortion": lens}
 
 
 def _first_of(content: dict[Any, Any], *keys: str) -> Any:

@@ -13,13 +13,13 @@ from hybridvo.data.camera_file import CAMERA_FILE, IMAGES, Calibration, read_cam
 from hybridvo.data.lists import (
     depth_at,
     poses_at,
+    read_stamps,
     read_timed_poses,
     shown,
     sorted_files,
     to_seconds,
 )
 from hybridvo.errors import InputError
-from hybridvo.files import read_rows
 from hybridvo.units import stamp_unit
 
 INNER_FOLDERS = ("rgb", "depth", "flow")
@@ -31,9 +31,6 @@ class FolderSequence(Sequence):
     Stamps come from ``timestamps.txt``, else from ``poses.txt`` where it has a line for each frame,
     else from file names that are stamps, else from ``fps``. Colour and depth go together by equal
     names, else by stamps within 0.02 s (colour without depth is left out), else by order.
-
-    Raises:
-        InputError: no frames, no depth, lists that do not fit together. FormatError: damaged files.
     """
 
     kind = "folder"
@@ -139,8 +136,7 @@ def _match_depth(
     stamps = _own_stamps(root / "timestamps.txt", frames, told)
     depth_stamps = _own_stamps(root / "depth_timestamps.txt", files, told)
     if stamps is not None and depth_stamps is not None:
-        pairs, left_out = depth_at(stamps, depth_stamps, root)
-        told += left_out
+        pairs = depth_at(stamps, depth_stamps, root, told)
         return {i: files[j] for i, j in pairs}
     if len(files) == len(frames):
         return dict(enumerate(files))
@@ -192,8 +188,7 @@ def _stamps_and_poses(
     pose_stamps = np.zeros(0)
     stamps = _listed_stamps(root / "timestamps.txt", frames, told)
     if pose_file.exists():
-        pose_stamps, poses, converted = read_timed_poses(pose_file)
-        told += converted
+        pose_stamps, poses = read_timed_poses(pose_file, told)
         if stamps is None and len(poses) == len(frames):
             return pose_stamps, poses
     if stamps is None:
@@ -206,8 +201,7 @@ def _stamps_and_poses(
             )
         stamps = np.arange(len(frames)) / (fps or 30.0)
     if poses is not None:
-        poses, missing = poses_at(stamps, pose_stamps, poses, str(pose_file))
-        told += missing
+        poses = poses_at(stamps, pose_stamps, poses, str(pose_file), told)
     return stamps, poses
 
 
@@ -220,10 +214,9 @@ def _own_stamps(path: Path, files: list[Path], told: list[str]) -> np.ndarray | 
 def _listed_stamps(path: Path, files: list[Path], told: list[str]) -> np.ndarray | None:
     if not path.exists():
         return None
-    stamps, converted = to_seconds([r.numbers[0] for r in read_rows(path, "stamp")], path.name)
+    stamps = read_stamps(path, told)
     if len(stamps) != len(files):
         raise InputError(f"{path}: {len(stamps)} stamps for {len(files)} files.")
-    told += converted
     return stamps
 
 
@@ -236,6 +229,4 @@ def _stamps_in_names(files: list[Path], told: list[str]) -> np.ndarray | None:
     is_stamp = all("." in path.stem for path in files) or stamp_unit(values)[0] != 1
     if not is_stamp or not np.isfinite(values).all():
         return None
-    stamps, converted = to_seconds(values, f"{files[0].parent.name}/ (file names)")
-    told += converted
-    return stamps
+    return to_seconds(values, f"{files[0].parent.name}/ (file names)", told)

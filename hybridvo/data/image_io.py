@@ -135,17 +135,6 @@ def read_npy(path: str | os.PathLike[str], *, channels: int | None = None) -> np
         return np.array(array, dtype=target, order="C", subok=False)
 
 
-def image_size(path: str | os.PathLike[str]) -> tuple[int, int]:
-    """(height, width) from the header of a PNG, JPEG, ``.npy``, ``.flo`` or ``.dpt`` file."""
-    if Path(path).suffix.lower() == ".npy":
-        height, width = _map_npy(path).shape[:2]
-        return height, width
-    data = _read_bytes(path)
-    if data.startswith(TAG_BYTES):
-        return _tagged_size(data, path, Path(path).suffix)
-    return _encoded_size(data, path)
-
-
 def write_flo(path: str | os.PathLike[str], flow: np.ndarray) -> None:
     """Write (H, W, 2) flow in pixels as ``.flo``; InputError for another shape."""
     _write_tagged(path, np.asarray(flow), 2)
@@ -242,52 +231,28 @@ def _map_npy(path: str | os.PathLike[str]) -> np.memmap:
     return array
 
 
-def _encoded_size(data: bytes, path: object) -> tuple[int, int]:
-    """(height, width) from the first bytes of a PNG or JPEG."""
-    if data.startswith(PNG_MAGIC) and len(data) >= 33:
+def _decode(path: str | os.PathLike[str], flags: int) -> np.ndarray:
+    """Decoded PNG or JPEG in OpenCV's channel order, after a look at its two ends."""
+    data = _read_bytes(path)
+    is_png = data.startswith(PNG_MAGIC) and len(data) >= 33
+    if is_png:
         width, height = struct.unpack(">II", data[16:24])
-    elif data.startswith(JPEG_MAGIC):
-        height, width = _jpeg_size(data, path)
-    else:
+        _check_pixels(path, width, height)
+    elif not data.startswith(JPEG_MAGIC):
         raise FormatError(
             f"{path}: expected a whole PNG or JPEG image, got bytes that start with {data[:8]!r}. "
             f"Convert the image to PNG."
         )
-    _check_pixels(path, width, height)
-    return height, width
-
-
-def _jpeg_size(data: bytes, path: object) -> tuple[int, int]:
-    """(height, width) from the frame header, which stands after other segments."""
-    position = 2
-    while position + 9 <= len(data) and data[position] == 0xFF:
-        marker = data[position + 1]
-        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
-            return struct.unpack(">HH", data[position + 5 : position + 9])
-        is_fill_byte = marker == 0xFF
-        length = struct.unpack(">H", data[position + 2 : position + 4])[0]
-        position += 1 if is_fill_byte else 2 + length
-    raise FormatError(f"{path}: truncated or damaged JPEG: no image header. {COPY_AGAIN}")
-
-
-def _decode(path: str | os.PathLike[str], flags: int) -> np.ndarray:
-    """Decoded PNG or JPEG in OpenCV's channel order, after a look at its two ends."""
-    data = _read_bytes(path)
-    height, width = _encoded_size(data, path)
     # OpenCV fills what is missing of a JPEG with grey: look for the closing marker after the pixels
-    is_png = data.startswith(PNG_MAGIC)
     pixels, closing = (b"IDAT", b"IEND") if is_png else (b"\xff\xda", b"\xff\xd9")
     if data.rfind(closing) <= data.rfind(pixels):
-        raise FormatError(
-            f"{path}: truncated: {width}x{height} pixels were expected, and {len(data)} bytes end "
-            f"too early. {COPY_AGAIN}"
-        )
+        raise FormatError(f"{path}: truncated: {len(data)} bytes end too early. {COPY_AGAIN}")
     try:
         # Ignore EXIF rotation: the intrinsics belong to the pixels as they are stored.
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error as error:
         raise FormatError(f"{path}: the image cannot be decoded ({error.err}).") from None
-    if image is None or image.shape[:2] != (height, width):
+    if image is None:
         raise FormatError(f"{path}: damaged: the image cannot be decoded. {COPY_AGAIN}")
     return image
 

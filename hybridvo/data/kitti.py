@@ -10,9 +10,9 @@ import numpy as np
 from hybridvo.data.base import Given, Listing, Sequence
 from hybridvo.data.camera_file import Calibration
 from hybridvo.data.image_io import read_rgb
-from hybridvo.data.lists import gap_warning, numbered_files, poses_of, to_seconds
+from hybridvo.data.lists import numbered_files, numbered_poses, read_stamps, warn_of_gaps
 from hybridvo.errors import FormatError, InputError
-from hybridvo.files import read_rows, read_text
+from hybridvo.files import read_text
 from hybridvo.geometry import invert
 from hybridvo.trajectory import COLUMNS, read_poses
 from hybridvo.types import Camera
@@ -72,18 +72,23 @@ class KittiSequence(Sequence):
                     f"{calibration}: expected the camera of {right_name} to the right of the one "
                     f"of {left_name}."
                 )
-        stamps, told = _read_times(root / "times.txt", numbers, self.frames_per_second)
+        times = root / "times.txt"
+        told: list[str] = []
+        warn_of_gaps(root.name, numbers, told)
         listing = Listing(
             rgb=[left[n] for n in numbers],
             depth=[depth.get(n) for n in numbers],
-            timestamps=stamps,
-            sources=[calibration, root / "times.txt"],
-            warnings=gap_warning(root.name, numbers) + told,
+            timestamps=_read_times(times, numbers, self.frames_per_second, told),
+            sources=[calibration, times],
+            warnings=told,
         )
         if (pose_file := _pose_file(root)) is not None:
             listing.sources.append(pose_file)
-            listing.poses, told = _read_poses(pose_file, numbers, self._P_left)
-            listing.warnings += told
+            # the file holds the poses of camera 0
+            T_cam_cam0 = np.eye(4)
+            T_cam_cam0[:3, 3] = np.linalg.solve(self._P_left[:, :3], self._P_left[:, 3])
+            poses = read_poses(pose_file, COLUMNS["kitti"])[1] @ invert(T_cam_cam0)
+            listing.poses = numbered_poses(numbers, poses, pose_file, told)
         super().__init__(root, root.name, listing, given)
 
     @staticmethod
@@ -177,30 +182,20 @@ def _projection(matrices: dict[str, np.ndarray], number: str, path: Path) -> np.
     return matrices[name]
 
 
-def _read_times(path: Path, numbers: list[int], per_second: float) -> tuple[np.ndarray, list[str]]:
+def _read_times(path: Path, numbers: list[int], per_second: float, told: list[str]) -> np.ndarray:
     """Line i belongs to image number i."""
     if not path.exists():
-        told = f"{path}: not there; stamps count {per_second:g} frames a second."
-        return (np.array(numbers) - numbers[0]) / per_second, [told]
-    times, warnings = to_seconds([row.numbers[0] for row in read_rows(path, "seconds")], path.name)
+        told.append(f"{path}: not there; stamps count {per_second:g} frames a second.")
+        return (np.array(numbers) - numbers[0]) / per_second
+    times = read_stamps(path, told)
     if numbers[-1] >= len(times):
         raise FormatError(
             f"{path}: expected a line for image {numbers[-1]}, got {len(times)} lines."
         )
-    return times[numbers], warnings
+    return times[numbers]
 
 
 def _pose_file(root: Path) -> Path | None:
     name = f"{root.name}.txt"
     beside = (root / "poses" / name, root / "poses.txt", root.parent / "poses" / name)
     return next((p for p in (*beside, root.parent.parent / "poses" / name) if p.is_file()), None)
-
-
-def _read_poses(path: Path, numbers: list[int], P_left: np.ndarray) -> tuple[np.ndarray, list[str]]:
-    """(N, 4, 4) T_world_cam of the left camera that is read; the file holds those of camera 0."""
-    T_cam_cam0 = np.eye(4)
-    T_cam_cam0[:3, 3] = np.linalg.solve(P_left[:, :3], P_left[:, 3])
-    stored = read_poses(path, COLUMNS["kitti"])[1] @ invert(T_cam_cam0)
-    poses, missing = poses_of(numbers, stored)
-    told = f"{path}: {len(stored)} poses; {missing} of {len(numbers)} have no ground truth."
-    return poses, [told] if missing else []

@@ -10,6 +10,7 @@ from pathlib import Path, PurePath
 import numpy as np
 
 from hybridvo.errors import FormatError, InputError
+from hybridvo.files import read_rows
 from hybridvo.geometry import pose_matrix
 from hybridvo.trajectory import COLUMNS, read_poses
 from hybridvo.types import as_rigid
@@ -55,15 +56,15 @@ def _one_each(files: Many[Path], keys: Many) -> dict:
     return found
 
 
-def gap_warning(name: str, numbers: Many[int]) -> list[str]:
-    """Warning of frame numbers that are missing between the first and the last."""
+def warn_of_gaps(name: str, numbers: Many[int], told: list[str]) -> None:
+    """Name the frame numbers that are missing between the first and the last."""
     spans = [
         f"{a + 1}" if b - a == 2 else f"{a + 1} to {b - 1}"
         for a, b in itertools.pairwise(numbers)
         if b - a > 1
     ]
-    told = f"{name}: frame numbers {shown(spans)} are missing; the time stamps keep the gap."
-    return [told] if spans else []
+    if spans:
+        told.append(f"{name}: frame numbers {shown(spans)} are missing; the stamps keep the gap.")
 
 
 def shown(names: Many[object], most: int = 8) -> str:
@@ -78,13 +79,19 @@ def listed_path(root: Path, name: str, where: str) -> Path:
     return root / name
 
 
-def to_seconds(stamps: Many[float] | np.ndarray, name: str) -> tuple[np.ndarray, list[str]]:
+def to_seconds(stamps: Many[float] | np.ndarray, name: str, told: list[str]) -> np.ndarray:
     """Stamps in seconds, other units converted with a warning; what is not finite becomes NaN."""
     values = np.array(stamps, dtype=np.float64)
     values[~np.isfinite(values)] = np.nan
     factor, unit = stamp_unit(values)
-    told = [f"{name}: stamps are {unit}; converted to seconds."]
-    return values / factor, told if factor != 1 else []
+    if factor != 1:
+        told.append(f"{name}: stamps are {unit}; converted to seconds.")
+    return values / factor
+
+
+def read_stamps(path: Path, told: list[str]) -> np.ndarray:
+    """Stamps in seconds of a list, one a line."""
+    return to_seconds([row.numbers[0] for row in read_rows(path, "stamp")], path.name, told)
 
 
 def check_increasing(stamps: np.ndarray, where: str) -> None:
@@ -102,53 +109,48 @@ def check_increasing(stamps: np.ndarray, where: str) -> None:
 
 
 def rigid(pose: np.ndarray, where: str) -> np.ndarray:
-    """(4, 4) of the (3, 4) pose of a file, its rotation brought onto the manifold.
-
-    Raises:
-        FormatError: values that are not finite, or a matrix that is no rotation to 1 %.
-    """
+    """(4, 4) of the (3, 4) pose of a file, its rotation brought onto the manifold."""
     try:
         return pose_matrix(as_rigid(np.vstack([pose, (0, 0, 0, 1)]), where, 1e-2)[:3])
     except InputError as error:
         raise FormatError(str(error)) from None
 
 
-def poses_of(numbers: Many[int], stored: np.ndarray) -> tuple[np.ndarray, int]:
-    """(N, 4, 4) stored pose of each frame number, NaN beyond the last; how many are unknown."""
+def numbered_poses(
+    numbers: Many[int], stored: np.ndarray, path: Path, told: list[str]
+) -> np.ndarray:
+    """(N, 4, 4) stored pose of each frame number, NaN beyond the last."""
     poses = np.full((len(numbers), 4, 4), np.nan)
     known = np.array(numbers) < len(stored)
     poses[known] = stored[np.array(numbers)[known]]
-    return poses, int(np.isnan(poses[:, 0, 0]).sum())
+    if lost := int(np.isnan(poses[:, 0, 0]).sum()):
+        told.append(f"{path}: {len(stored)} poses: {lost} frames have no ground truth.")
+    return poses
 
 
-def read_timed_poses(path: Path) -> tuple[np.ndarray, np.ndarray, list[str]]:
-    """Stamps (N,) in seconds, poses (N, 4, 4) and warnings of a list ``timestamp tx .. qw``."""
+def read_timed_poses(path: Path, told: list[str]) -> tuple[np.ndarray, np.ndarray]:
+    """Stamps (N,) in seconds and poses (N, 4, 4) of a list ``timestamp tx .. qw``."""
     rows, poses = read_poses(path, COLUMNS["tum"])
-    stamps, told = to_seconds([row.numbers[0] for row in rows], path.name)
-    return stamps, poses, told
+    return to_seconds([row.numbers[0] for row in rows], path.name, told), poses
 
 
 def poses_at(
-    stamps: np.ndarray, pose_stamps: np.ndarray, poses: np.ndarray, name: str
-) -> tuple[np.ndarray, list[str]]:
-    """(N, 4, 4) pose of the nearest stamp in seconds, NaN where none is near, and warnings."""
+    stamps: np.ndarray, pose_stamps: np.ndarray, poses: np.ndarray, name: str, told: list[str]
+) -> np.ndarray:
+    """(N, 4, 4) pose of the nearest stamp in seconds, NaN where none is near."""
     matched = np.full((len(stamps), 4, 4), np.nan)
     for i, j in associate(stamps, pose_stamps):
         matched[i] = poses[j]
-    missing = int(np.isnan(matched[:, 0, 0]).sum())
-    limit = MAX_STAMP_DIFFERENCE_S
-    told = f"{name}: {missing} of {len(stamps)} frames have no pose within {limit} s."
-    return matched, [told] if missing else []
+    if missing := int(np.isnan(matched[:, 0, 0]).sum()):
+        limit = MAX_STAMP_DIFFERENCE_S
+        told.append(f"{name}: {missing} of {len(stamps)} frames have no pose within {limit} s.")
+    return matched
 
 
 def depth_at(
-    stamps: np.ndarray, depth_stamps: np.ndarray, where: Path
-) -> tuple[list[tuple[int, int]], list[str]]:
-    """Pairs (i, j) of colour and depth of one time, and a warning of colour that is left out.
-
-    Raises:
-        InputError: colour stamps that do not increase, or none with depth near.
-    """
+    stamps: np.ndarray, depth_stamps: np.ndarray, where: Path, told: list[str]
+) -> list[tuple[int, int]]:
+    """Pairs (i, j) of colour and depth of one time; colour without depth is left out."""
     check_increasing(stamps[np.isfinite(stamps)], str(where))
     pairs = associate(stamps, depth_stamps)
     count, limit = len(stamps), MAX_STAMP_DIFFERENCE_S
@@ -157,11 +159,10 @@ def depth_at(
             f"{where}: no frames: none of {count} colour stamps has a depth stamp within {limit} "
             f"s. Are both in the same unit and of the same clock?"
         )
-    told = (
-        f"{where.name}: {count - len(pairs)} of {count} colour images have no depth within {limit} "
-        f"s and are left out."
-    )
-    return pairs, [told] if len(pairs) < count else []
+    if len(pairs) < count:
+        left_out = f"{count - len(pairs)} of {count} colour images have no depth within {limit} s"
+        told.append(f"{where.name}: {left_out} and are left out.")
+    return pairs
 
 
 def associate(

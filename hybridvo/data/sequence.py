@@ -141,14 +141,8 @@ def iter_pairs(
     stop = len(sequence) if stop is None else min(stop, len(sequence))
     if stride < 1 or start < 0:
         raise InputError(f"iter_pairs: expected start >= 0 and stride >= 1, got {start}, {stride}.")
-    remedy = "compute it: iter_pairs(sequence, hybridvo.dis_flow()), or --flow dis"
-    if flow is None and not sequence.has_flow:
-        raise InputError(f"{sequence.name}: there are no flow files; {remedy}.")
-    if flow is None and stride > 1:
-        raise InputError(
-            f"{sequence.name}: flow files lead from one frame to the next, not over a stride of "
-            f"{stride}; {remedy}."
-        )
+    if flow is None:
+        sequence.check_flow(stride)
     frames = (sequence.frame(index) for index in range(start, stop, stride))
     return (_pair(sequence, flow, prev, curr) for prev, curr in itertools.pairwise(frames))
 

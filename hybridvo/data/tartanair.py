@@ -15,7 +15,7 @@ from hybridvo.data.image_io import (
     read_mask_png,
     read_npy,
 )
-from hybridvo.data.lists import numbered_files, poses_of
+from hybridvo.data.lists import numbered_files, numbered_poses
 from hybridvo.errors import InputError
 from hybridvo.geometry import ned_to_camera
 from hybridvo.trajectory import COLUMNS, read_poses
@@ -54,8 +54,14 @@ class TartanAirSequence(Sequence):
         pose_file = root / f"pose_{camera}.txt"
         name = "_".join(root.parts[-3:]) if root.parent.name in ("Easy", "Hard") else root.name
         numbers, listing = numbered_listing(name, rgb, depth, self.frames_per_second, flow)
-        listing.poses, told = _read_poses(pose_file, numbers)
-        listing.warnings += told
+        if pose_file.exists() and numbers:
+            poses = ned_to_camera(read_poses(pose_file, COLUMNS["tartanair"])[1])
+            if min(numbers) >= len(poses) == len(numbers):
+                listing.poses = poses
+                at = f"frames start at {numbers[0]}; pose lines are taken in order"
+                listing.warnings.append(f"{pose_file}: {at}.")
+            else:
+                listing.poses = numbered_poses(numbers, poses, pose_file, listing.warnings)
         masks = [_mask_file(path) for path in flow.values()]
         listing.sources = [pose_file, *(path for path in masks if path is not None)]
         super().__init__(root, name, listing, given)
@@ -105,15 +111,3 @@ def _mask_file(flow: Path) -> Path | None:
     stem = flow.name.removesuffix("_flow.npy")
     paths = (flow.with_name(f"{stem}_mask.npy"), flow.with_name(f"{stem}_mask.png"))
     return next((p for p in paths if p.exists()), None)
-
-
-def _read_poses(path: Path, numbers: list[int]) -> tuple[np.ndarray | None, list[str]]:
-    """Poses in camera axes of the frames with these numbers: line i belongs to frame i."""
-    if not path.exists() or not numbers:
-        return None, []
-    stored = ned_to_camera(read_poses(path, COLUMNS["tartanair"])[1])
-    if min(numbers) >= len(stored) == len(numbers):
-        return stored, [f"{path}: frames start at {numbers[0]}; pose lines are taken in order."]
-    poses, lost = poses_of(numbers, stored)
-    told = f"{path}: {len(stored)} poses: {lost} frames have no ground truth."
-    return poses, [told] if lost else []

@@ -101,7 +101,8 @@ class TumSequence(Sequence):
 
     def _add_poses(self, path: Path, listing: Listing, is_bonn: bool) -> None:
         """Poses of the nearest stamps of the ground truth, in camera axes."""
-        stamps, poses, told = read_timed_poses(path)
+        told = listing.warnings
+        stamps, poses = read_timed_poses(path, told)
         if self._is_icl:
             stamps = stamps / self.frames_per_second
             reflection = np.diag([1.0, -1.0, 1.0, 1.0])
@@ -110,30 +111,28 @@ class TumSequence(Sequence):
         elif is_bonn:
             poses = invert(BONN_ROS) @ poses @ BONN_ROS @ pose_matrix(BONN_MARKER)
             told.append(f"{path.name}: Bonn's poses are moved from the tracked body to the camera.")
-        listing.poses, missing = poses_at(listing.timestamps, stamps, poses, path.name)
-        listing.warnings += told + missing
+        listing.poses = poses_at(listing.timestamps, stamps, poses, path.name, told)
         listing.sources.append(path)
 
 
 def _read_lists(root: Path) -> Listing:
     """Colour images and the depth of the nearest stamp."""
-    warnings: list[str] = []
+    told: list[str] = []
     columns: list[tuple[np.ndarray, list[Path]]] = []
     lists = [root / "rgb.txt", root / "depth.txt"]
     for path in lists:
         rows = read_rows(path, "timestamp filename", words=1)
-        stamps, told = to_seconds([row.numbers[0] for row in rows], path.name)
-        warnings += told
+        stamps = to_seconds([row.numbers[0] for row in rows], path.name, told)
         files = [listed_path(root, row.words[0], f"{path}:{row.line}") for row in rows]
         columns.append((stamps, files))
     (stamps, rgb), (depth_stamps, depth) = columns
-    pairs, left_out = depth_at(stamps, depth_stamps, lists[0])
+    pairs = depth_at(stamps, depth_stamps, lists[0], told)
     return Listing(
         rgb=[rgb[i] for i, _ in pairs],
         depth=[depth[j] for _, j in pairs],
         timestamps=stamps[[i for i, _ in pairs]],
         sources=lists,
-        warnings=warnings + left_out,
+        warnings=told,
     )
 
 
@@ -149,5 +148,6 @@ def _read_pairs(root: Path) -> Listing:
         depth_first = "depth" in names[0].lower()
         depth.append(first if depth_first else second)
         rgb.append(second if depth_first else first)
-    stamps, told = to_seconds([row.numbers[0] for row in rows], path.name)
+    told: list[str] = []
+    stamps = to_seconds([row.numbers[0] for row in rows], path.name, told)
     return Listing(rgb, depth, stamps, sources=[path], warnings=told)

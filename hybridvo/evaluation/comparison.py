@@ -8,12 +8,14 @@ resume: what it gave is one file in ``parts/`` until the comparison is done.
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import multiprocessing
 import os
 import platform
 import shutil
 from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Sequence as Several
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict
@@ -25,10 +27,11 @@ import filelock
 import numpy as np
 import pandas as pd
 
+import hybridvo
+from hybridvo.data.sequence import Sequence, open_sequence
 from hybridvo.errors import HybridVOError, InputError, LockedError
 from hybridvo.evaluation.drawing import draw_worst
-from hybridvo.evaluation.plan import methods_to_run, plan
-from hybridvo.evaluation.protocols import Protocol, protocol_summary
+from hybridvo.evaluation.protocols import Protocol, check_protocol, protocol_summary
 from hybridvo.evaluation.scores import ROW_COLUMNS, breakdown, total_row, worst_pairs
 from hybridvo.evaluation.sequence_job import (
     PAIR_COLUMNS,
@@ -37,13 +40,15 @@ from hybridvo.evaluation.sequence_job import (
     pair_table,
     run_sequence,
 )
-from hybridvo.files import make_folder, versions, write_csv, write_json
+from hybridvo.files import fingerprint, make_folder, versions, write_csv, write_json
 from hybridvo.network.models import Models
-from hybridvo.pipeline import weights_hash
+from hybridvo.pipeline import METHODS, check_method, weights_hash
 from hybridvo.trajectory import Trajectory
 
 WRITTEN = ("results.json", "results.csv", "pairs.csv", "report.md", "report.html")
 """What a finished comparison leaves, beside ``trajectories/`` and ``worst/``."""
+SINTEL_FOLDERS = ("camdata_left", "depth", "flow", "clean", "final")
+"""Folders of MPI Sintel that hold a folder per scene; the images of the last one are read."""
 Mode = Literal["new", "resume", "overwrite"]
 ReportProgress = Callable[[str, int, int], None]
 """Called with a message (or the empty string), pairs done and pairs in all."""
@@ -74,7 +79,7 @@ def compare(
     started = datetime.now(UTC).isoformat(timespec="seconds")
     models = Models(options.device, options.weights)
     methods, missing = methods_to_run(options.methods, models)
-    jobs, protocol = plan(options, methods)
+    jobs, protocol = _plan(options, methods)
     total = sum(job.pairs for job in jobs)
     with _folder(out, mode):
         for name, reason in missing.items():
@@ -107,6 +112,119 @@ def compare(
     return [out / name for name in WRITTEN]
 
 
+# -- what there is to do --------------------------------------------------------------------------
+
+
+def methods_to_run(
+    names: Several[str], models: Models | None = None
+) -> tuple[tuple[str, ...], dict[str, str]]:
+    """Methods to run, and of those that ``all`` leaves out the reason with its remedy."""
+    if not names:
+        raise InputError(f"--methods: expected names, got none; known: {', '.join(METHODS)}.")
+    is_all = list(names) == ["all"]
+    runnable: dict[str, None] = {}
+    missing: dict[str, str] = {}
+    for name in METHODS if is_all else names:
+        try:
+            check_method(name, models)
+            runnable[name] = None
+        except InputError as error:
+            if not is_all:
+                raise
+            missing[name] = str(error)
+    return tuple(runnable), missing
+
+
+def expand(path: str | os.PathLike[str], dataset: str | None = None) -> list[Path]:
+    """Sequence folders that a path stands for: itself, or all sequences that it holds.
+
+    A folder that is no sequence is searched one level down; MPI Sintel may be given as it was
+    unpacked, as its folder ``training``, or as one of its passes.
+    """
+    folder = Path(path)
+    if not folder.is_dir():
+        return [folder]
+    if dataset in (None, "sintel"):
+        absolute = folder.absolute()
+        if absolute.name in SINTEL_FOLDERS and (absolute.parent / "camdata_left").is_dir():
+            return [child for child in sorted(absolute.iterdir()) if child.is_dir()]
+        for base in (absolute, absolute / "training", *sorted(absolute.glob("*/training"))):
+            if (base / "camdata_left").is_dir():
+                scenes = {}
+                for name in SINTEL_FOLDERS:
+                    for child in sorted((base / name).glob("*/")):
+                        scenes[child.name] = child
+                return [scenes[name] for name in sorted(scenes)]
+    if _opens(folder, dataset):
+        return [folder]
+    inside = [child for child in sorted(folder.iterdir()) if child.is_dir()]
+    return [child for child in inside if _opens(child, dataset)] or [folder]
+
+
+def _opens(folder: Path, dataset: str | None) -> bool:
+    try:
+        open_sequence(folder, dataset)
+    except HybridVOError:
+        return False
+    return True
+
+
+def _plan(
+    options: ComparisonOptions, methods: tuple[str, ...]
+) -> tuple[list[Job], Protocol | None]:
+    """A job for each sequence, and the protocol."""
+    if not options.sequences:
+        raise InputError("compare: expected at least one folder of a sequence, got none.")
+    paths = [path for given in options.sequences for path in expand(given, options.dataset)]
+    opened = {path: open_sequence(path, options.dataset) for path in paths}
+    protocol = None
+    if options.protocol is not None:
+        if options.stride != 1 or options.start or options.stop is not None:
+            raise InputError(
+                f"--protocol {options.protocol} is defined on whole sequences: leave out --start, "
+                f"--stop and --stride."
+            )
+        protocol = check_protocol(options.protocol, list(opened.values()))
+        opened = {path: s for path, s in opened.items() if s.name in protocol.sequences}
+        if not opened:
+            known = ", ".join(protocol.sequences)
+            raise InputError(f"--protocol {protocol.name}: expected some of {known}, got none.")
+    names = [sequence.name for sequence in opened.values()]
+    models = Models(options.device, options.weights)
+    hashes = {name: weights_hash(name, models) for name in methods}
+    jobs: list[Job] = []
+    for path, sequence in opened.items():
+        name = sequence.name
+        if names.count(name) > 1:
+            name = f"{path.absolute().parent.name}/{name}"
+        if name in [job.name for job in jobs]:
+            raise InputError(f"--sequence: two sequences are called {name}; give each once.")
+        frames = range(*slice(options.start, options.stop, options.stride).indices(len(sequence)))
+        if not frames:
+            raise InputError(f"{name}: no frames from {options.start} on: it has {len(sequence)}.")
+        flows = _flows(sequence, options)
+        same_camera_only = protocol is not None and protocol.same_camera_only
+        deciding = [name, fingerprint(sequence.files()), list(frames), flows, options.seed]
+        deciding += [same_camera_only, options.device, hashes, hybridvo.__version__]
+        digest = hashlib.sha256(json.dumps(deciding).encode()).hexdigest()
+        jobs.append(Job(str(path), name, options, flows, methods, frames, same_camera_only, digest))
+    return jobs, protocol
+
+
+def _flows(sequence: Sequence, options: ComparisonOptions) -> tuple[str, ...]:
+    """Sources of flow: both side by side where the sequence has both."""
+    if options.flow == "file":
+        sequence.check_flow(options.stride)
+    if options.flow != "auto":
+        return (options.flow,)
+    usable = sequence.has_flow and options.stride == 1
+    images = any(path is not None for path in sequence.rgb_files)
+    return (*(("dis",) if images or not usable else ()), *(("file",) if usable else ()))
+
+
+# -- work -----------------------------------------------------------------------------------------
+
+
 @contextlib.contextmanager
 def _folder(out: Path, mode: Mode) -> Iterator[None]:
     """Hold the output folder; refuse or remove what is in it."""
@@ -127,16 +245,13 @@ def _folder(out: Path, mode: Mode) -> Iterator[None]:
         raise LockedError(f"{out}: another run holds this folder.") from None
 
 
-# -- work -----------------------------------------------------------------------------------------
-
-
 def _work(
     jobs: list[Job], processes: int, folder: Path, report: ReportProgress
 ) -> list[dict[str, Any]]:
     """What every job gave, in order; kept from an earlier try where that is finished."""
     make_folder(folder)
-    paths = {job.name: folder / f"{number:03d}.json" for number, job in enumerate(jobs)}
-    todo = [job for job in jobs if not _is_finished(job, paths[job.name])]
+    paths = {job.name: folder / f"{job.fingerprint}.json" for job in jobs}
+    todo = [job for job in jobs if not paths[job.name].exists()]
     total = sum(job.pairs for job in jobs)
     done = total - sum(job.pairs for job in todo)
     if len(todo) < len(jobs):
@@ -168,17 +283,6 @@ def _work(
                 done += job.pairs
                 report(f"{job.name} is finished", done, total)
     return [json.loads(paths[job.name].read_text(encoding="utf-8")) for job in jobs]
-
-
-def _is_finished(job: Job, path: Path) -> bool:
-    if not path.exists():
-        return False
-    if json.loads(path.read_text(encoding="utf-8"))["fingerprint"] != job.fingerprint:
-        raise InputError(
-            f"{path}: was made of other frames, options, methods or weights; pass --overwrite, "
-            f"or another --out."
-        )
-    return True
 
 
 def _start_worker(threads: int) -> None:

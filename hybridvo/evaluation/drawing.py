@@ -49,15 +49,9 @@ def draw(
 ) -> list[Path]:
     """Draw the maps of one pair: flow and its parts, error, weights, and what networks look at.
 
-    Args:
-        sequence: an open one.
-        pair: its first frame.
-        out: image to write, .png; the numbers stand beside it as .json.
-        flow: ``auto`` (files where there are some), ``file`` or ``dis``.
-        method: estimate that is looked at; None: the default of ``hybridvo run``.
-        weights: networks to look through; empty: the pretrained ones.
-        steps: of the integrated gradients.
-        overwrite: replace what is there.
+    ``pair`` is its first frame, ``out`` a .png beside which the numbers stand as .json; ``flow`` is
+    ``auto`` (files where there are some), ``file`` or ``dis``; ``weights`` are networks to look
+    through, by default the pretrained ones; ``steps`` those of the integrated gradients.
 
     Raises:
         InputError: unknown pair or weights, or an image that exists or is no PNG.
@@ -152,11 +146,7 @@ def _read_pair(sequence: Sequence, index: int, flow: str) -> FramePair:
 
 
 def networks(files: Iterable[str | Path] = ()) -> list[tuple[str, Any]]:
-    """(name, network) of the given files, or of all pretrained ones that predict a motion.
-
-    Raises:
-        InputError: a file that cannot be read, or a network that predicts no motion.
-    """
+    """(name, network) of the given files, or of all pretrained ones that predict a motion."""
     found = []
     paths = [Path(file) for file in files]
     for path in paths or [pretrained(name) for name in pretrained_names()]:

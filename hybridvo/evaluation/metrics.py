@@ -269,7 +269,7 @@ def kitti_drift(
 
     Returns:
         ``translation`` (fraction) and ``rotation_deg_per_m``, None with ``reasons`` where the path
-        is shorter than every length; ``segments``, ``path_length_m``.
+        is shorter than every length; ``segments``.
     """
     est, gt = np.asarray(T_world_cam_est), np.asarray(T_world_cam_gt)
     steps = np.linalg.norm(np.diff(gt[:, :3, 3], axis=0), axis=1)
@@ -292,7 +292,6 @@ def kitti_drift(
     return {
         **found,
         "segments": segments,
-        "path_length_m": float(distance[-1]) if np.isfinite(distance[-1]) else None,
         "reasons": {n: NOT_FINITE if means else short for n in names if found[n] is None},
     }
 
@@ -401,9 +400,6 @@ def evaluate_files(
 
     Formats and axes are those of :func:`hybridvo.trajectory.read_trajectory`, ``options`` those of
     :func:`evaluate`; its report also has ``estimate``, ``gt`` (paths) and ``warnings``.
-
-    Raises:
-        InputError: a file that is missing or malformed, or an unknown option.
     """
     est = read_trajectory(est_path, format_est, axes=axes_est)
     gt = read_trajectory(gt_path, format_gt, axes=axes_gt)

@@ -56,17 +56,6 @@ def true_trajectory(sequence: Sequence, indices: Iterable[int]) -> Trajectory | 
     return Trajectory(sequence.timestamps[known], T)
 
 
-def _check(poses: Mapping[str, Any], depth: Any, prev: Camera, curr: Camera) -> None:
-    for name, pose in poses.items():
-        if np.shape(pose) != (4, 4) or not np.isfinite(pose).all():
-            raise InputError(f"{name}: expected a finite (4, 4) transform, got {np.shape(pose)}.")
-    if np.shape(depth) != prev.shape or curr.shape != prev.shape:
-        raise InputError(
-            f"depth: expected shape {prev.shape} of both cameras, got {np.shape(depth)} and "
-            f"a current camera of {curr.shape}."
-        )
-
-
 def _native_epe(
     T_est: np.ndarray, T_gt: np.ndarray, depth: np.ndarray, prev: Camera, curr: Camera
 ) -> float | None:
@@ -122,11 +111,15 @@ def pair_errors(
         valid pixels at native size; a pixel that the estimate puts behind the camera counts with
         the image diagonal. ``rot_err_deg``: geodesic angle. ``trans_err``: norm of the translation
         difference, m. ``epe`` and ``epe_l2_px`` are None where no pixel is valid.
-
-    Raises:
-        InputError: poses that are not finite, shapes that do not match.
     """
-    _check({"T_est": T_est, "T_gt": T_gt}, depth_prev, camera_prev, camera_curr)
+    for name, pose in (("T_est", T_est), ("T_gt", T_gt)):
+        if np.shape(pose) != (4, 4) or not np.isfinite(pose).all():
+            raise InputError(f"{name}: expected a finite (4, 4) transform, got {np.shape(pose)}.")
+    if np.shape(depth_prev) != camera_prev.shape or camera_curr.shape != camera_prev.shape:
+        raise InputError(
+            f"depth: expected shape {camera_prev.shape} of both cameras, got "
+            f"{np.shape(depth_prev)} and a current camera of {camera_curr.shape}."
+        )
     T_est, T_gt = np.asarray(T_est, dtype=np.float64), np.asarray(T_gt, dtype=np.float64)
     depth = np.asarray(depth_prev)
     euler = matrix_to_euler_deg(T_est[:3, :3]) - matrix_to_euler_deg(T_gt[:3, :3])

@@ -189,7 +189,8 @@ def draw_panels(
     which are shown in it.
     """
     rows = -(-len(panels) // columns)
-    figure = _figure(columns * inches, rows * (inches / aspect * 0.92 + 0.42) + 0.45)
+    height = rows * (inches / aspect * 0.92 + 0.42) + (0.45 if heading else 0.0)
+    figure = _figure(columns * inches, height)
     grid = figure.add_gridspec(rows, columns)
     tops = _shared_tops(panels)
     shape: dict[str, Any] = {"extent": (0.0, aspect, 1.0, 0.0), "interpolation": "nearest"}
@@ -204,10 +205,11 @@ def draw_panels(
         colours = colormaps["magma"].with_extremes(bad="#9a9a9a")
         drawn = axes.imshow(panel.values, cmap=colours, vmin=0.0, vmax=tops[panel.unit], **shape)
         if panel.outline is not None and panel.outline.any() and not panel.outline.all():
-            height, width = panel.outline.shape
-            x, y = (np.arange(width) + 0.5) * aspect / width, (np.arange(height) + 0.5) / height
+            h, w = panel.outline.shape
+            x, y = (np.arange(w) + 0.5) * aspect / w, (np.arange(h) + 0.5) / h
             axes.contour(x, y, panel.outline, levels=[0.5], colors="#4fd1ff", linewidths=0.8)
-        bar = figure.colorbar(drawn, ax=axes, fraction=0.04, pad=0.02, label=panel.unit)
+        bar = figure.colorbar(drawn, ax=axes, fraction=0.04, pad=0.02)
+        bar.set_label(panel.unit, fontsize=8)
         bar.ax.tick_params(labelsize=8)
     figure.suptitle(heading, fontsize=11, x=0.01, ha="left", parse_math=False)
     stream = io.BytesIO()

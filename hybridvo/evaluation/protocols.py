@@ -1,10 +1,4 @@
-"""Ways of scoring MPI Sintel that published tables use; ``protocols.yaml`` holds their figures.
-
-``paper``: PWVO's 992 pairs with unchanged intrinsics, R_err, T_err and EPE at 128x256.
-``trajectory14``: the fourteen sequences of ParticleSfM, LEAP-VO, MonST3R and CUT3R: ATE and RPE
-over one frame, plain means over the sequences, after a similarity (theirs) and after a rigid
-alignment (for methods that know metres).
-"""
+"""Ways of scoring MPI Sintel that published tables use; ``protocols.yaml`` holds them."""
 
 from __future__ import annotations
 
@@ -22,13 +16,10 @@ from hybridvo.types import Camera
 
 @dataclass(frozen=True)
 class Protocol:
-    """A way of scoring.
+    """A way of scoring: its complete set, its columns, and the lines that others published.
 
-    Args:
-        name: option value. title: for people. sequences: name -> frames of the complete set.
-        pairs: of the complete set. same_camera_only: pairs whose intrinsics change do not count.
-        metrics: ``key``, ``label``, ``unit`` of each column. over: what the means are taken over,
-            ``pairs`` or ``sequences``. published: lines of others; ``method``: our name of it.
+    ``sequences`` maps names to frames; ``same_camera_only``: pairs whose intrinsics change do not
+    count; ``over``: what the means are taken over, ``pairs`` or ``sequences``.
     """
 
     name: str
@@ -63,11 +54,7 @@ def same_intrinsics(first: Camera, second: Camera) -> bool:
 
 
 def check_protocol(name: str, sequences: Sequence[Any]) -> Protocol:
-    """Protocol of this name, for these open sequences.
-
-    Raises:
-        InputError: an unknown protocol; a sequence that is not one of Sintel's training set.
-    """
+    """Protocol of this name, for these open sequences."""
     known = protocols()
     if name not in known:
         raise InputError(f"protocol: '{name}' is unknown; known: {', '.join(known)}.")
@@ -84,12 +71,10 @@ def check_protocol(name: str, sequences: Sequence[Any]) -> Protocol:
 def protocol_summary(
     protocol: Protocol, totals: Sequence[Mapping[str, Any]], pairs: Mapping[str, int]
 ) -> dict[str, Any]:
-    """What stands under ``protocol`` in ``results.json``.
+    """What stands under ``protocol`` in ``results.json``: what was scored, beside the published.
 
     ``totals`` has a line per method and flow source over all sequences, ``pairs`` those scored of
-    each sequence. Beside the protocol's fields stand ``complete`` (every pair of every sequence is
-    there), ``note`` (what is missing), ``missing_sequences``, ``pairs``, ``pairs_expected`` and
-    ``table``, whose lines hold the authors' own line of the same method under ``published``.
+    each sequence; ``note`` says what of the complete set is missing.
     """
     absent = [name for name in protocol.sequences if name not in pairs]
     count = sum(pairs.values())

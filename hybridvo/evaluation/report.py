@@ -27,10 +27,6 @@ from hybridvo.files import atomic_write
 
 MISSING = "-"
 """What a table shows where there is no number."""
-PEERS = (
-    *("pnp-ransac", "pnp-ransac-tuned", "usac-magsac", "poselib", "opencv-rgbd", "open3d-rgbd"),
-)
-"""Methods of other projects."""
 EMBEDDED_BYTES = 2_000_000
 """Images that the page holds, so that it stays below 8 MB with plotly's 5 MB."""
 
@@ -64,15 +60,9 @@ NO_MERIT = ("pairs", "moving [%]", "time [ms]", "+ flow [ms]")
 
 
 def write_report(folder: Path, result: Mapping[str, Any], pairs: pd.DataFrame) -> None:
-    """Write ``report.html`` and ``report.md`` beside the trajectories and images of a comparison.
+    """Write ``report.html`` and ``report.md`` into the folder of a comparison.
 
-    Args:
-        folder: output of :func:`hybridvo.evaluation.comparison.compare`.
-        result: what ``results.json`` holds.
-        pairs: the table of all pairs.
-
-    Raises:
-        OutputError: a file cannot be written.
+    ``result`` is what ``results.json`` holds, ``pairs`` the table of all pairs.
     """
     import jinja2
     from plotly.offline import get_plotlyjs
@@ -140,13 +130,10 @@ def headline(result: Mapping[str, Any]) -> str:
         f"{number(best)} px (error of the ego flow), {first['failures']} of {first['pairs']} pairs "
         f"failed (above 1 px, or given up)"
     )
-    peers = [row for row in order[2:] if row["method"] in PEERS]
-    named = [("next is", row) for row in order[1:2]]
-    named += [("the best of other projects is", row) for row in peers[:1]]
-    for label, row in named:
+    for row in order[1:2]:
         error = row["epe_l2_px_median"]
         times = f" ({number(error / best, 2)} times)" if best else ""
-        text += f"; {label} {row['method']}: {number(error)} px{times}, {row['failures']} failed"
+        text += f"; next is {row['method']}: {number(error)} px{times}, {row['failures']} failed"
     for entry in result["worst_pairs"]:
         if (entry["method"], entry["flow_source"]) == (first["method"], flow):
             if entry["epe_l2_px"] is not None:
@@ -175,13 +162,9 @@ def number(value: float | None, digits: int = 3) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """Rows under the names that people read.
+    """Rows under the names that people read: ``named`` columns of texts, then numbers or NaN.
 
-    Args:
-        frame: texts of ``named`` first, then numbers, NaN where there is none.
-        named: how many columns are texts.
-        reasons: why numbers are missing.
-        ranked: whether the best number of a column is marked.
+    ``reasons`` say why numbers are missing; ``ranked``: the best number of a column is marked.
     """
 
     frame: pd.DataFrame

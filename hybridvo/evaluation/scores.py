@@ -7,7 +7,7 @@ carries, which is none, in every mean and median.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -34,10 +34,9 @@ ROW_COLUMNS = (
     *("epe", "epe_l2_px", "rot_err_deg_mean", "rot_err_deg_median", "trans_err_mean"),
     *("trans_err_median", "ate_rmse", "rpe_trans_rmse", "rpe_rot_rmse_deg", "alignment"),
     *("ms_per_pair_median", "dynamic_fraction"),
-    *("pairs_scored", "pairs_scored_epe", "epe_l2_px_median", "failures", "failure_rate"),
+    *("pairs_scored", "epe_l2_px_median", "failures", "failure_rate"),
     *("failure_rate_low", "failure_rate_high", "ate_rmse_sim3", "scale_sim3"),
-    *("rpe_trans_rmse_sim3", "rpe_rot_rmse_deg_sim3", "ms_per_pair_p95", "flow_ms_median"),
-    "ms_with_flow_median",
+    *("rpe_trans_rmse_sim3", "rpe_rot_rmse_deg_sim3", "flow_ms_median", "ms_with_flow_median"),
 )
 """Columns of ``results.csv``."""
 NO_PAIRS = "no pair was estimated"
@@ -76,8 +75,8 @@ def is_failed(pairs: pd.DataFrame) -> pd.Series:
     return pairs["status"].str.startswith("failed")
 
 
-def _statistic(values: pd.Series, q: float = 0.5) -> float | None:
-    return float(values.quantile(q)) if values.notna().any() else None
+def _median(values: pd.Series) -> float | None:
+    return float(values.median()) if values.notna().any() else None
 
 
 def pair_scores(pairs: pd.DataFrame) -> dict[str, Any]:
@@ -95,12 +94,10 @@ def pair_scores(pairs: pd.DataFrame) -> dict[str, Any]:
         "pairs": len(pairs),
         "failed": int(is_failed(pairs).sum()),
         "pairs_scored": len(scored),
-        "pairs_scored_epe": int(pairs["epe_l2_px"].notna().sum()),
-        "epe_l2_px_median": _statistic(pairs["epe_l2_px"]),
-        "ms_per_pair_median": _statistic(pairs["ms"]),
-        "ms_per_pair_p95": _statistic(pairs["ms"], 0.95),
-        "flow_ms_median": _statistic(flow_ms),
-        "ms_with_flow_median": _statistic(pairs["ms"] + flow_ms),
+        "epe_l2_px_median": _median(pairs["epe_l2_px"]),
+        "ms_per_pair_median": _median(pairs["ms"]),
+        "flow_ms_median": _median(flow_ms),
+        "ms_with_flow_median": _median(pairs["ms"] + flow_ms),
         "dynamic_fraction": float(moving.mean()) if moving.notna().any() else None,
     }
     for name, value in scores.items():
@@ -111,18 +108,14 @@ def pair_scores(pairs: pd.DataFrame) -> dict[str, Any]:
 
 
 def trajectory_scores(est: Trajectory | None, gt: Trajectory | None) -> dict[str, Any]:
-    """Errors of a trajectory: :data:`PATH_KEYS`, ``scale_sim3``, ``kitti_drift``, ``reasons``."""
-    names = (*PATH_KEYS, "scale_sim3", "kitti_drift")
+    """Errors of a trajectory: :data:`PATH_KEYS`, ``scale_sim3``, ``reasons``."""
+    names = (*PATH_KEYS, "scale_sim3")
     scores: dict[str, Any] = {"alignment": "se3", **dict.fromkeys(names)}
     if est is None or gt is None:
         return scores | {"reasons": dict.fromkeys(names, NO_PAIRS if est is None else NO_TRUTH)}
     report = evaluate(est, gt)
     scores |= {name: report[name] for name in names}
     reasons = {name: report["reasons"][name] for name in names if name in report["reasons"]}
-    drift = scores["kitti_drift"]
-    if drift is not None and drift["translation"] is None:
-        scores["kitti_drift"] = None
-        reasons["kitti_drift"] = drift["reasons"]["translation"]
     return scores | {"reasons": reasons}
 
 
@@ -162,26 +155,6 @@ def total_row(pairs: pd.DataFrame, rows: Sequence[Mapping[str, Any]]) -> dict[st
         "alignment": "se3",
         **scores,
     }
-
-
-def scale_warning(rows: Iterable[Mapping[str, Any]]) -> list[str]:
-    """Warning of a ground truth whose unit is not that of the depth, from rows of one sequence.
-
-    Where all methods are wrong by about the same large factor, the ground truth is.
-    """
-    scales = [
-        float(row["scale_sim3"])
-        for row in rows
-        if row.get("scale_sim3") and row["method"] != "identity" and row["failed"] < row["pairs"]
-    ]
-    agree = len(scales) > 1 and min(scales) > 0 and max(scales) <= 1.5 * min(scales)
-    if not agree or (max(scales) >= 1 / 3 and min(scales) <= 3):
-        return []
-    return [
-        f"the true path is {min(scales):.3g} to {max(scales):.3g} times as long as every estimate: "
-        f"the unit of the ground truth or of the depth is wrong, and so are the errors in metres "
-        f"and pixels"
-    ]
 
 
 def breakdown(pairs: pd.DataFrame) -> dict[str, Any]:

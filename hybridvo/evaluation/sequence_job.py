@@ -14,7 +14,7 @@ from hybridvo.data.sequence import Sequence, open_sequence
 from hybridvo.errors import InputError
 from hybridvo.evaluation.pair_errors import pair_errors, pair_facts, true_motion, true_trajectory
 from hybridvo.evaluation.protocols import same_intrinsics
-from hybridvo.evaluation.scores import FACTORS, scale_warning, sequence_row
+from hybridvo.evaluation.scores import FACTORS, sequence_row
 from hybridvo.flow import MeasuredFlow, dis_flow, file_flow
 from hybridvo.geometry import invert
 from hybridvo.network.models import Models
@@ -40,13 +40,13 @@ class ComparisonOptions:
     Args:
         sequences: folders; a folder of sequences stands for all of them.
         methods: names, or ``("all",)`` for all that can run.
-        flow: ``auto`` (every source that a sequence has, side by side), ``file`` or ``dis``.
+        flow: ``auto``: every source that a sequence has, side by side.
         dataset: kind of the sequences; None detects it.
         start, stop, stride: range of frames.
         seed: of everything drawn at random.
         protocol: ``paper`` or ``trajectory14`` (MPI Sintel as others score it), or None.
         weights: name of a network -> its file; the pretrained one where absent.
-        device: ``auto``, ``cpu`` or ``cuda``.
+        device: of the networks.
         jobs: sequences at a time, a process each.
         worst: pairs shown for each method and flow.
     """
@@ -68,13 +68,9 @@ class ComparisonOptions:
 
 @dataclass(frozen=True)
 class Job:
-    """All methods and flows on one sequence; plain data, for another process.
+    """All methods and flows (``dis``, ``file``) on one sequence; plain data, for another process.
 
-    Args:
-        path: of the sequence. name: in the results. options: what is compared.
-        flows: ``dis``, ``file``. methods: names. indices: of the frames.
-        same_camera_only: leave pairs unscored whose intrinsics change.
-        fingerprint: what decides the result.
+    ``fingerprint`` stands for all that decides the result.
     """
 
     path: str
@@ -136,9 +132,8 @@ class _Run:
 def run_sequence(job: Job, progress: Callable[[int], None] | None = None) -> dict[str, Any]:
     """Estimate and score every pair of a sequence.
 
-    Returns:
-        JSON-ready: ``fingerprint``, ``sequence`` (facts), ``rows`` (a line per method and flow),
-        ``pairs``, ``timestamps`` and ``trajectories`` (T_world_cam by ``method|flow``).
+    JSON-ready: ``rows`` has a line per method and flow, ``trajectories`` T_world_cam by
+    ``method|flow``.
     """
     sequence, models, flows = job.open()
     runs = [
@@ -243,11 +238,10 @@ def _result(
         "left_out": left_out,
         "depth_source": sequence.depth_source,
         "flow_sources": list(dict.fromkeys(row["flow_source"] for row in rows)),
-        "warnings": [*sequence.warnings, *scale_warning(rows)],
+        "warnings": list(sequence.warnings),
     }
     true_stamps = [] if gt is None else gt.timestamps.tolist()
     return {
-        "fingerprint": job.fingerprint,
         "sequence": facts,
         "rows": rows,
         "pairs": pairs,

@@ -34,14 +34,14 @@ def test_steps_are_on_disk_as_they_are_appended(tmp_path):
             folder.append({"index": i})
             assert len((out / STEPS).read_text().splitlines()) == i + 2  # and the header
         assert state(out)["state"] == "running"
-        folder.finish(summary={"n": 3})
+        folder.write_state("done", summary={"n": 3})
     assert state(out)["frames_done"] == 3 and state(out)["summary"] == {"n": 3}
     assert sorted(path.name for path in out.iterdir()) == [STATE, STEPS]
 
 
 def test_results_are_replaced_only_when_asked_and_only_those_of_a_run(tmp_path):
     with start(tmp_path) as folder:
-        folder.finish()
+        folder.write_state("done")
     with pytest.raises(InputError, match=r"--overwrite.*--resume"):
         start(tmp_path)
     (tmp_path / "trajectory.tum").write_text("old")
@@ -59,7 +59,7 @@ def test_results_are_replaced_only_when_asked_and_only_those_of_a_run(tmp_path):
 
 def test_overwrite_removes_a_link_and_not_what_it_points_to(tmp_path):
     with start(tmp_path / "out") as folder:
-        folder.finish()
+        folder.write_state("done")
     sentinel = tmp_path / "sentinel"
     sentinel.write_text("untouched")
     (tmp_path / "out" / "trajectory.tum").symlink_to(sentinel)
@@ -90,7 +90,7 @@ def test_resume_without_a_checkpoint_or_of_nothing_starts_anew(tmp_path):
         folder.append({"index": 0})
     with start(tmp_path, "resume") as folder:
         assert folder.rows == [] and not folder.finished
-        folder.finish()
+        folder.write_state("done")
     with start(tmp_path, "resume") as folder:
         assert folder.finished
 

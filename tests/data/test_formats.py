@@ -131,11 +131,10 @@ def test_flipped_bytes_raise_nothing_else(name, tmp_path, data):
     for _ in range(data.draw(st.integers(1, 3))):
         broken[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
     path = written(tmp_path, name, bytes(broken))
-    for read in (reader, io.image_size):
-        try:
-            read(path)
-        except FormatError as error:
-            assert name in str(error)
+    try:
+        reader(path)
+    except FormatError as error:
+        assert name in str(error)
 
 
 @pytest.mark.parametrize(("width", "height"), [(0, 2), (2, 0), (-1, 5), (50_000, 50_000)])
@@ -189,11 +188,8 @@ def test_arrays_of_other_types_are_converted(tmp_path):
 def test_sizes_names_and_what_is_no_file(tmp_path):
     folder = tmp_path / "with space \N{CAMERA}"
     folder.mkdir()
-    expected = {"flow.flo": (2, 3), "depth.dpt": (2, 3), "flow.npy": (2, 3), "rgba.png": (4, 5)}
-    for name, (content, _) in FILES.items():
-        if name != "camera.cam":
-            path = written(folder, name, content)
-            assert io.image_size(path) == expected.get(name, (20, 24))
+    for name, (content, reader) in FILES.items():
+        reader(written(folder, name, content))
     path = written(folder, "\udcff.png", FILES["image.png"][0])  # a name that is not UTF-8
     assert io.read_rgb(path).shape == (20, 24, 3)
     with pytest.raises(FileNotFoundError):
