@@ -5,13 +5,10 @@ last weight is the offset. ``python tools/calibrate.py`` fits them on the develo
 :mod:`hybridvo.synthetic.semi_real` and on the heavy development scenes, with DIS flow.
 """
 
-CUES_RIGHT = (4.4, 0.0)
-"""Of the difference of the two best cue scores: 119 pairs of the heavy development scenes, seeds
-900-905, 92 right. On semi-real development pairs the gap says little (AUROC .66)."""
-SELECTOR_RIGHT = (1.0, 0.0, 0.0)
-"""Of :func:`hybridvo.hypotheses.selector.evidence_of`: the confidence as it is stated. Semi-real
-development pairs (158 answers, 148 right) ask for (0.43, 0.58, 2.11), calibration error .05 and not
-.5; with these the four wrong answers of the heavy scenes would count as sure."""
+CUES_RIGHT = (0.26, 1.26)
+"""Of the gap between the two best cue scores."""
+SELECTOR_RIGHT = (0.76, 0.23)
+"""Of the gap between the best score of the selector and that of another motion."""
 CLEAR_RIGHT = 0.99
 """Share of right answers where the first motion explains nearly all that is usable."""
 CUE_WEIGHTS = {
@@ -26,7 +23,7 @@ CUE_WEIGHTS = {
 """Weights of the cues of :mod:`hybridvo.hypotheses.cues`, dimensionless. Chosen by hand on seeds
 900-905 of the heavy development scenes and the scenario ``one60``;
 ``python tools/golden.py --only /refine`` shows what they give."""
-MIN_CONFIDENCE = 0.65
+MIN_CONFIDENCE = 0.85
 """Probability of being right below which a motion is degraded. Of the 120 pairs of the heavy
 development scenes, seeds 900-905, with DIS flow, the 3 wrong ones have 0.1 to 0.44, the others 0.65
 to 1; ``python tools/golden.py --only heavy_ --seeds 3``. It is too strict on semi-real pairs."""

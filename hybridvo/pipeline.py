@@ -112,7 +112,7 @@ def hybrid_flow(pair: FramePair, ctx: Context) -> RelativePose:
         return found
     selector = ctx.selector()
     chosen = selector.select(found, ctx.prior)
-    if found.is_ambiguous and chosen.confidence < ctx.options.select.consult_below:
+    if found.is_ambiguous and chosen.probability < ctx.options.select.consult_below:
         prediction = ctx.predict(pair)
         if prediction is not None:
             chosen = selector.select(found, ctx.prior, prediction)

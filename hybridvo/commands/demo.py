@@ -17,7 +17,8 @@ from hybridvo.data.sequence import open_sequence
 from hybridvo.errors import InputError, OutputError
 from hybridvo.evaluation.plots import plot_trajectories
 from hybridvo.files import make_folder, write_json
-from hybridvo.synthetic.render import make_scene, write_sintel
+from hybridvo.synthetic.render import write_sintel
+from hybridvo.synthetic.scenes import make_scene
 
 METHODS = {
     "hybrid": "hybridvo (hybrid)",

@@ -115,9 +115,8 @@ class Selection:
         noise: (flow px, log depth) standard deviations found with it.
         mask: (h, w) weights on the coarse grid that it was fitted with, or None for all.
         coverage: share of the usable pixels' weight that the mask leaves.
-        confidence: the selector's own probability, 0 to 1, that it is right.
-        evidence: what the calibrated probability is computed from, see :func:`evidence_of`.
-        probability: that the motion is right, calibrated.
+        gap: by how much its score exceeds that of any other motion.
+        probability: that the motion is right, calibrated in the gap.
         hypotheses: all candidates, the one selected first.
         iterations: Gauss-Newton steps spent on it.
     """
@@ -126,8 +125,7 @@ class Selection:
     noise: tuple[float, float]
     mask: np.ndarray | None
     coverage: float
-    confidence: float
-    evidence: np.ndarray
+    gap: float
     probability: float
     hypotheses: tuple[Hypothesis, ...]
     iterations: int
@@ -170,12 +168,9 @@ class CueSelector:
         scores = seen if prior is None else cue_scores(found, motions, prior)
         # a prior may say which motion; that it is right the image has to say
         best = int(np.argmax(scores))
-        others = np.delete(seen, best)
-        evidence = np.array([min(seen[best] - others.max(initial=-np.inf), NO_RIVAL)])
-        probability = _probability(evidence, CUES_RIGHT) if found.is_ambiguous else CLEAR_RIGHT
-        return _selection(
-            found, candidates, scores, [None] * len(scores), (probability, evidence, probability)
-        )
+        gap = min(seen[best] - np.delete(seen, best).max(initial=-np.inf), NO_RIVAL)
+        probability = right(gap, CUES_RIGHT) if found.is_ambiguous else CLEAR_RIGHT
+        return _selection(found, candidates, scores, [None] * len(scores), gap, probability)
 
 
 class MaskSelector:
@@ -198,8 +193,7 @@ class MaskSelector:
         """See :class:`Selector`."""
         candidates = _searched(found)
         if not found.is_ambiguous:
-            sure = CLEAR_RIGHT, np.zeros(0), CLEAR_RIGHT
-            return _selection(found, candidates, np.zeros(1), [None], sure)
+            return _selection(found, candidates, np.zeros(1), [None], NO_RIVAL, CLEAR_RIGHT)
         maps, limits = found.maps(), self.options.select
         masks: list[np.ndarray | None] = [None] * candidates.searched
         static = None
@@ -222,9 +216,10 @@ class MaskSelector:
             scores = look.score(candidates, 1)
             if int(np.argmax(scores.score)) < known:
                 break
-        evidence = evidence_of(found, candidates, scores)
-        trust = scores.confidence, evidence, _probability(evidence, SELECTOR_RIGHT)
-        return _selection(found, candidates, scores.score, masks, trust)
+        gap = gap_of(found, candidates, scores.score)
+        return _selection(
+            found, candidates, scores.score, masks, gap, right(gap, SELECTOR_RIGHT)
+        )
 
     def _refit(
         self,
@@ -259,20 +254,16 @@ class MaskSelector:
         )
 
 
-def evidence_of(found: HypothesisSet, candidates: Candidates, scores: Scores) -> np.ndarray:
-    """(2,) The logit of a scorer's confidence, and the gap to the best score of another motion."""
-    best = int(np.argmax(scores.score))
+def gap_of(found: HypothesisSet, candidates: Candidates, score: np.ndarray) -> float:
+    """By how much the best score exceeds that of any other motion."""
+    best = int(np.argmax(score))
     apart = search.distances(found.grid, candidates.poses, best) > search.OTHER_PX
-    gap = NO_RIVAL
-    if apart.any():
-        gap = min(NO_RIVAL, float(scores.score[best] - scores.score[apart].max()))
-    confidence = float(np.clip(np.nan_to_num(scores.confidence), 1e-3, 1 - 1e-3))
-    return np.array([np.log(confidence / (1 - confidence)), gap])
+    return min(NO_RIVAL, float(score[best] - score[apart].max(initial=-np.inf)))
 
 
-def _probability(evidence: np.ndarray, weights: tuple[float, ...]) -> float:
-    """Of being right: logistic in the evidence; the last weight is the offset."""
-    return float(1 / (1 + np.exp(-evidence @ weights[:-1] - weights[-1])))
+def right(gap: float, weights: tuple[float, float]) -> float:
+    """Probability that a motion is right: logistic in the gap of the scores, slope and offset."""
+    return float(1 / (1 + np.exp(-weights[0] * gap - weights[1])))
 
 
 def mask_weights(probability: np.ndarray, ramp: tuple[float, float] = MASK_RAMP) -> np.ndarray:
@@ -326,9 +317,10 @@ def _selection(
     candidates: Candidates,
     scores: np.ndarray,
     masks: Sequence[np.ndarray | None],
-    trust: tuple[float, np.ndarray, float],
+    gap: float,
+    probability: float,
 ) -> Selection:
-    """The candidate with the largest score; ``trust``: confidence, evidence, probability."""
+    """The candidate with the largest score."""
     scores = np.nan_to_num(scores, nan=-np.inf)
     order = np.argsort(-scores, kind="stable")
     best = int(order[0])
@@ -339,9 +331,8 @@ def _selection(
         noise=(float(fact[search.FLOW_NOISE]), float(fact[search.DEPTH_NOISE])),
         mask=mask,
         coverage=1.0 if mask is None else _coverage(found, mask),
-        confidence=float(np.nan_to_num(trust[0])),
-        evidence=trust[1],
-        probability=float(np.nan_to_num(trust[2])),
+        gap=gap,
+        probability=float(np.nan_to_num(probability)),
         hypotheses=tuple(replace(motions[k], score=float(scores[k])) for k in order),
         iterations=int(fact[search.ITERATIONS]),
     )
