@@ -1,14 +1,17 @@
 """Numbers fitted on data: value, unit, data, and how they are found again.
 
-The probabilities of being right are logistic in what a selector has seen, all without a unit; the
-last weight is the offset. ``python tools/calibrate.py`` fits them on the development recordings of
-:mod:`hybridvo.synthetic.semi_real` and on the heavy development scenes, with DIS flow.
+The probabilities of being right are logistic in the gap between the best score and that of another
+motion, without a unit: slope and offset. ``python tools/calibrate.py`` fits them on 200 pairs of
+the development recordings of :mod:`hybridvo.synthetic.semi_real` and on the heavy development
+scenes, seeds 900 to 905, with DIS flow.
 """
 
 CUES_RIGHT = (0.26, 1.26)
-"""Of the gap between the two best cue scores."""
+"""Of the cue scores: 259 of 316 answers right. The gap says little (AUROC .68, calibration error
+.05), so that a motion with a rival is hardly ever sure."""
 SELECTOR_RIGHT = (0.76, 0.23)
-"""Of the gap between the best score of the selector and that of another motion."""
+"""Of the selector's scores: 293 of 316 answers right, AUROC .92, calibration error .014. The
+network's own confidence adds nothing to the gap."""
 CLEAR_RIGHT = 0.99
 """Share of right answers where the first motion explains nearly all that is usable."""
 CUE_WEIGHTS = {
@@ -24,9 +27,9 @@ CUE_WEIGHTS = {
 900-905 of the heavy development scenes and the scenario ``one60``;
 ``python tools/golden.py --only /refine`` shows what they give."""
 MIN_CONFIDENCE = 0.85
-"""Probability of being right below which a motion is degraded. Of the 120 pairs of the heavy
-development scenes, seeds 900-905, with DIS flow, the 3 wrong ones have 0.1 to 0.44, the others 0.65
-to 1; ``python tools/golden.py --only heavy_ --seeds 3``. It is too strict on semi-real pairs."""
+"""Probability of being right below which a motion is degraded. Of the same answers of the selector
+it flags 24 % of the right ones on real surfaces, none of the rendered scenes, and leaves 4 of 23
+wrong ones."""
 CLEAR_COHERENCE = 0.5
 """Spatial correlation of the residuals above which even a motion that most of the image follows may
 be a compromise: 0.02 for independent noise, 0.25 to 0.4 for DIS flow of static scenes, above 0.6

@@ -21,7 +21,7 @@ from hybridvo.baselines import pnp, rgbd
 from hybridvo.errors import CheckpointError, InputError
 from hybridvo.flow import contradiction
 from hybridvo.hypotheses.generate import HypothesisSet, generate
-from hybridvo.hypotheses.selector import CueSelector, MaskSelector, Selection, Selector
+from hybridvo.hypotheses.selector import CueSelector, MaskSelector, Selection
 from hybridvo.network.models import SELECTION, Models, default_models, one_thread
 from hybridvo.options import Options
 from hybridvo.refinement import refine as refinement
@@ -72,12 +72,18 @@ class Context:
         starts = [np.eye(4)] + ([] if self.prior is None else [self.prior.T_curr_prev])
         return generate(pair, np.stack(starts), self.options, self.seed, self.weights)
 
-    def selector(self) -> Selector:
-        """The learned selector."""
+    def select(self, pair: FramePair, found: HypothesisSet) -> Selection:
+        """The camera's motion by the learned selector, which asks PWVO where it is in doubt."""
         from hybridvo.network.selector_net import NetworkScorer
 
         scorer = NetworkScorer(self.models.network("selector"), self.models.device)
-        return MaskSelector(scorer, self.options)
+        selector = MaskSelector(scorer, self.options)
+        chosen = selector.select(found, self.prior)
+        if found.is_ambiguous and chosen.confidence < self.options.select.consult_below:
+            prediction = self.predict(pair)
+            if prediction is not None:
+                chosen = selector.select(found, self.prior, prediction)
+        return chosen
 
     def refine(self, pair: FramePair, found: HypothesisSet, chosen: Selection) -> RelativePose:
         """The motion selected, refined inside its static mask, with covariance and status."""
@@ -110,13 +116,7 @@ def hybrid_flow(pair: FramePair, ctx: Context) -> RelativePose:
     found = ctx.search(pair)
     if isinstance(found, RelativePose):
         return found
-    selector = ctx.selector()
-    chosen = selector.select(found, ctx.prior)
-    if found.is_ambiguous and chosen.probability < ctx.options.select.consult_below:
-        prediction = ctx.predict(pair)
-        if prediction is not None:
-            chosen = selector.select(found, ctx.prior, prediction)
-    return ctx.refine(pair, found, chosen)
+    return ctx.refine(pair, found, ctx.select(pair, found))
 
 
 def hybrid(pair: FramePair, ctx: Context) -> RelativePose:

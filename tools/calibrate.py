@@ -1,6 +1,6 @@
 """Fits the probabilities of being right: prints the numbers of hybridvo/calibration.py.
 
-    python tools/calibrate.py --pairs 240 --data ../shared/data
+    python tools/calibrate.py --data ../shared/data
 
 Pairs of the development recordings (tools/benchmark_semi_real.py) and of the heavy development
 scenes, seeds 900 to 905, with DIS flow. Right is what those benchmarks call so.
@@ -23,15 +23,15 @@ from scipy.optimize import minimize
 
 HEAVY_SEEDS = range(900, 906)
 RIDGE = 0.02
-"""Penalty on the squared weights, times the number of answers."""
+"""Penalty on the squared slope, times the number of answers."""
 
 
 def build_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="calibrate.py", description=(__doc__ or "").splitlines()[0]
     )
-    parser.add_argument("--pairs", type=int, default=240, help="semi-real pairs")
-    parser.add_argument("--heavy", type=int, default=1, help="rendered scenes of each kind")
+    parser.add_argument("--pairs", type=int, default=200, help="semi-real pairs")
+    parser.add_argument("--heavy", type=int, default=6, help="rendered scenes of each kind")
     parser.add_argument("--selector", metavar="FILE", help="weights instead of the shipped ones")
     parser.add_argument("--data", type=Path, default=Path("../shared/data"), metavar="DIR")
     return parser
@@ -39,18 +39,18 @@ def build_parser() -> argparse.ArgumentParser:
 
 def main(argv: list[str] | None = None) -> int:
     args = build_parser().parse_args(argv)
-    rows: dict[str, list[tuple[np.ndarray, bool]]] = {"cues": [], "selector": [], "clear": []}
+    rows: dict[str, list[tuple[float, bool]]] = {"cues": [], "selector": [], "clear": []}
     for pair, T, depth, limit in pairs(args):
-        for name, evidence, error in answers(pair, T, depth, args.selector):
-            rows[name].append((evidence, error <= max(WRONG_PX, WRONG_FACTOR * limit)))
+        for name, gap, error in answers(pair, T, depth, args.selector):
+            rows[name].append((gap, error <= max(WRONG_PX, WRONG_FACTOR * limit)))
     for name, some in rows.items():
         right = np.array([r for _, r in some])
         print(f"{name}: {len(right)} answers, {right.sum()} right")
         if name != "clear" and 0 < right.sum() < len(right):
-            X = np.stack([e for e, _ in some])
-            weights = fit(X, right)
-            p = 1 / (1 + np.exp(-X @ weights[:-1] - weights[-1]))
-            print(f"  {tuple(np.round(weights, 3).tolist())}")
+            gaps = np.array([gap for gap, _ in some])
+            slope, offset = fit(gaps, right)
+            p = 1 / (1 + np.exp(-slope * gaps - offset))
+            print(f"  ({slope:.2f}, {offset:.2f})")
             print(f"  AUROC {auroc(p, right)}, calibration error {calibration_error(p, right)}")
     return 0
 
@@ -76,8 +76,8 @@ def pairs(args: argparse.Namespace) -> Iterator[tuple[Any, np.ndarray, np.ndarra
 
 def answers(
     pair: Any, T: np.ndarray, depth: np.ndarray, selector: str | None
-) -> Iterator[tuple[str, np.ndarray, float]]:
-    """(which probability, its evidence, error in px) of both selectors."""
+) -> Iterator[tuple[str, float, float]]:
+    """(which probability, the gap it is computed from, error in px) of both selectors."""
     from hybridvo.hypotheses.selector import CueSelector
     from hybridvo.network.models import Models
     from hybridvo.pipeline import Context
@@ -88,26 +88,26 @@ def answers(
     found = ctx.search(pair)
     if isinstance(found, RelativePose):
         return
-    chosen = {"cues": CueSelector().select(found), "selector": ctx.selector().select(found)}
+    chosen = {"cues": CueSelector().select(found), "selector": ctx.select(pair, found)}
     if not found.is_ambiguous:
         chosen = {"clear": chosen["selector"]}
     for name, selection in chosen.items():
         motion = ctx.refine(pair, found, selection)
-        yield name, selection.evidence, ego_flow_error(motion.T_curr_prev, T, depth, pair)
+        yield name, selection.gap, ego_flow_error(motion.T_curr_prev, T, depth, pair)
 
 
 MODELS: dict[str | None, Any] = {}
 
 
-def fit(X: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Weights and offset of a logistic regression."""
-    X = np.column_stack([X, np.ones(len(X))])
+def fit(gaps: np.ndarray, right: np.ndarray) -> tuple[float, float]:
+    """Slope and offset of a logistic regression."""
     sign = np.where(right, 1.0, -1.0)
 
     def cost(w: np.ndarray) -> float:
-        return float(np.logaddexp(0, -sign * (X @ w)).mean() + RIDGE * (w[:-1] @ w[:-1]) / 2)
+        return float(np.logaddexp(0, -sign * (w[0] * gaps + w[1])).mean() + RIDGE * w[0] ** 2 / 2)
 
-    return np.asarray(minimize(cost, np.zeros(X.shape[1]), method="BFGS").x)
+    slope, offset = minimize(cost, np.zeros(2), method="BFGS").x
+    return float(slope), float(offset)
 
 
 if __name__ == "__main__":

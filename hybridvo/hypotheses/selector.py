@@ -115,6 +115,7 @@ class Selection:
         noise: (flow px, log depth) standard deviations found with it.
         mask: (h, w) weights on the coarse grid that it was fitted with, or None for all.
         coverage: share of the usable pixels' weight that the mask leaves.
+        confidence: the scorer's own, 0 to 1, that it is right; low where no motion may be.
         gap: by how much its score exceeds that of any other motion.
         probability: that the motion is right, calibrated in the gap.
         hypotheses: all candidates, the one selected first.
@@ -125,6 +126,7 @@ class Selection:
     noise: tuple[float, float]
     mask: np.ndarray | None
     coverage: float
+    confidence: float
     gap: float
     probability: float
     hypotheses: tuple[Hypothesis, ...]
@@ -170,7 +172,8 @@ class CueSelector:
         best = int(np.argmax(scores))
         gap = min(seen[best] - np.delete(seen, best).max(initial=-np.inf), NO_RIVAL)
         probability = right(gap, CUES_RIGHT) if found.is_ambiguous else CLEAR_RIGHT
-        return _selection(found, candidates, scores, [None] * len(scores), gap, probability)
+        masks = [None] * len(scores)
+        return _selection(found, candidates, scores, masks, probability, gap, probability)
 
 
 class MaskSelector:
@@ -193,7 +196,8 @@ class MaskSelector:
         """See :class:`Selector`."""
         candidates = _searched(found)
         if not found.is_ambiguous:
-            return _selection(found, candidates, np.zeros(1), [None], NO_RIVAL, CLEAR_RIGHT)
+            sure = CLEAR_RIGHT, NO_RIVAL, CLEAR_RIGHT
+            return _selection(found, candidates, np.zeros(1), [None], *sure)
         maps, limits = found.maps(), self.options.select
         masks: list[np.ndarray | None] = [None] * candidates.searched
         static = None
@@ -217,9 +221,8 @@ class MaskSelector:
             if int(np.argmax(scores.score)) < known:
                 break
         gap = gap_of(found, candidates, scores.score)
-        return _selection(
-            found, candidates, scores.score, masks, gap, right(gap, SELECTOR_RIGHT)
-        )
+        trust = scores.confidence, gap, right(gap, SELECTOR_RIGHT)
+        return _selection(found, candidates, scores.score, masks, *trust)
 
     def _refit(
         self,
@@ -317,6 +320,7 @@ def _selection(
     candidates: Candidates,
     scores: np.ndarray,
     masks: Sequence[np.ndarray | None],
+    confidence: float,
     gap: float,
     probability: float,
 ) -> Selection:
@@ -331,6 +335,7 @@ def _selection(
         noise=(float(fact[search.FLOW_NOISE]), float(fact[search.DEPTH_NOISE])),
         mask=mask,
         coverage=1.0 if mask is None else _coverage(found, mask),
+        confidence=float(np.nan_to_num(confidence)),
         gap=gap,
         probability=float(np.nan_to_num(probability)),
         hypotheses=tuple(replace(motions[k], score=float(scores[k])) for k in order),
