@@ -134,7 +134,7 @@ def _run(args: argparse.Namespace, command: list[str]) -> Result:
     }
     options = load_options(args.config, args.assignments, given | {"flow.source": args.flow})
     files = weight_files(args.weights, [options.run.method])
-    result = run(
+    summary, code = run(
         _open(args),
         args.out,
         options,
@@ -145,9 +145,9 @@ def _run(args: argparse.Namespace, command: list[str]) -> Result:
         rrd=args.rrd,
     )
     if not args.quiet:
-        for warning in result.summary.get("warnings", []):
+        for warning in summary.get("warnings", []):
             print(f"hybridvo: warning: {warning}", file=sys.stderr)
-    return result.summary, summary_text(result.summary), result.exit_code
+    return summary, summary_text(summary), code
 
 
 def _show(args: argparse.Namespace, command: list[str]) -> Result:
