@@ -19,7 +19,7 @@ import dataclasses
 import json
 import signal
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -39,19 +39,19 @@ CLAIMS = (
 """(better, worse) in EPE as the paper has it."""
 MILESTONES = (6_000, 12_000, 25_000, 50_000, 100_000)
 """Samples at which a row is scored, and at its end."""
-HELD_OUT = ("data_paper.yaml", "data_diverse.yaml")
+PRESETS = ("data_paper", "data_diverse")
+"""Of the held-out pairs."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the tool; returns its exit code (2 bad input, 5 no output, 130 interrupted)."""
-    args = _parse(argv)
-    from hybridvo.errors import HybridVOError, OutputError
+    from hybridvo.errors import HybridVOError
 
     try:
-        return _run(args)
+        return _run(_parse(argv))
     except HybridVOError as error:
         print(f"ablation.py: {error}", file=sys.stderr)
-        return 5 if isinstance(error, OutputError) else 2
+        return error.exit_code
 
 
 def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
@@ -120,7 +120,7 @@ def _train(
     options = task.options
     folder = args.out / f"{name}-seed{seed}"
     folder.mkdir(parents=True, exist_ok=True)
-    trainer = Trainer(task, folder, args.device, args.workers, _Progress(f"{name} seed {seed}"))
+    trainer = Trainer(task, folder, args.device, args.workers, _progress(f"{name} seed {seed}"))
     trainer.resume()
 
     def stop(number: int, frame: object) -> None:
@@ -177,7 +177,8 @@ def _store(
     runs[name, seed] = result
     write_json(args.out / f"{name}-seed{seed}" / "result.json", result)
     write_json(args.out / "ablation.json", _summary(args, runs))
-    short = _short(result["curve"][str(samples)])
+    scores = result["curve"][str(samples)]
+    short = ", ".join(f"{preset} EPE {scores[preset]['epe']:.3f} px" for preset in PRESETS)
     print(f"{name} seed {seed}, {samples}: {short}", file=sys.stderr, flush=True)
 
 
@@ -205,35 +206,31 @@ def _scores(
 ) -> dict[str, Any]:
     """Figures on held-out pairs of each preset; at the end by every rule of the selection."""
     from hybridvo.network.selection import SELECTION_METHODS
-    from hybridvo.synthetic.presets import load_preset
+    from hybridvo.synthetic.dataset import load_preset
     from hybridvo.training.validation import FIGURES, PUBLISHED_SEED, evaluate_network
 
     scores: dict[str, Any] = {}
-    for file in HELD_OUT:
-        preset = load_preset(ROWS.parent / file, size=None if size is None else tuple(size))
-
-        def evaluate(rule: str, preset: Any = preset) -> dict[str, Any]:
-            return evaluate_network(network, preset, PUBLISHED_SEED, args.count, selection=rule)
-
-        figures = scores[Path(file).stem] = evaluate(selection)
+    for name in PRESETS:
+        path = ROWS.parent / f"{name}.yaml"
+        preset = load_preset(path, size=None if size is None else tuple(size))
+        asked = preset, PUBLISHED_SEED, args.count
+        figures = scores[name] = evaluate_network(network, *asked, selection=selection)
         if last and figures["auroc_rotation"] is not None:
-            rules = {r: figures if r == selection else evaluate(r) for r in SELECTION_METHODS}
-            scores[f"rules_{Path(file).stem}"] = {
-                rule: {key: found[key] for key in FIGURES} for rule, found in rules.items()
-            }
+            rules = scores[f"rules_{name}"] = {}
+            for rule in SELECTION_METHODS:
+                found = figures
+                if rule != selection:
+                    found = evaluate_network(network, *asked, selection=rule)
+                rules[rule] = {key: found[key] for key in FIGURES}
     return scores
 
 
 def _summary(args: argparse.Namespace, runs: Mapping[tuple[str, int], Any]) -> dict[str, Any]:
     """What stands in ablation.json: every curve, and the paper's claims by paired differences."""
-    presets = [Path(file).stem for file in HELD_OUT]
-    results = [
-        {**run, "curve": {k: _without_pairs(v) for k, v in run["curve"].items()}}
-        for run in runs.values()
-    ]
+    results = [_without_pairs(run) for run in runs.values()]
     claims = [
         {"preset": preset, "samples": samples, **claim}
-        for preset in presets
+        for preset in PRESETS
         for samples in sorted({int(k) for run in runs.values() for k in run["curve"]})
         for better, worse in CLAIMS
         if (claim := _claim(runs, better, worse, preset, str(samples))) is not None
@@ -241,7 +238,7 @@ def _summary(args: argparse.Namespace, runs: Mapping[tuple[str, int], Any]) -> d
     return {
         **provenance("ablation.py", None),
         "samples": args.samples,
-        "held_out": {"count": args.count, "presets": presets},
+        "held_out": {"count": args.count, "presets": list(PRESETS)},
         "epe": "component mean, px at the size of the samples",
         "claims": claims,
         "runs": results,
@@ -254,23 +251,19 @@ def _claim(
     """Difference in EPE of two rows over common seeds, and over the pairs; None if not there."""
     import numpy as np
 
-    common = [
-        seed
-        for name, seed in runs
-        if name == better
-        and samples in runs[better, seed]["curve"]
-        and samples in runs.get((worse, seed), {"curve": {}})["curve"]
-    ]
+    def epe_of_pairs(row: str) -> dict[int, Any]:
+        """By seed, of the runs that were scored there."""
+        return {
+            seed: np.array(run["curve"][samples][preset]["epe_of_pairs"])
+            for (name, seed), run in runs.items()
+            if name == row and samples in run["curve"]
+        }
+
+    ours, others = epe_of_pairs(better), epe_of_pairs(worse)
+    common = [seed for seed in ours if seed in others]
     if not common:
         return None
-    differences = np.array(
-        [
-            np.subtract(
-                *(runs[row, s]["curve"][samples][preset]["epe_of_pairs"] for row in (better, worse))
-            )
-            for s in common
-        ]
-    )
+    differences = np.array([ours[seed] - others[seed] for seed in common])
     of_seeds = differences.mean(axis=1)
     over_pairs = differences.mean(axis=0)
     return {
@@ -283,39 +276,27 @@ def _claim(
     }
 
 
-def _without_pairs(scores: Mapping[str, Any]) -> dict[str, Any]:
-    return {
-        name: {k: v for k, v in value.items() if k != "epe_of_pairs"}
-        if isinstance(value, dict)
-        else value
-        for name, value in scores.items()
-    }
-
-
-def _short(scores: Mapping[str, Any]) -> str:
-    presets = [Path(file).stem for file in HELD_OUT]
-    return ", ".join(f"{preset} EPE {scores[preset]['epe']:.3f} px" for preset in presets)
+def _without_pairs(value: Any) -> Any:
+    """The figures without those of each pair."""
+    if not isinstance(value, dict):
+        return value
+    return {k: _without_pairs(v) for k, v in value.items() if k != "epe_of_pairs"}
 
 
 def _read(path: Path) -> dict[str, Any] | None:
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
+    return json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
 
 
-class _Progress:
-    """A line on stderr for every twentieth entry of the log."""
+def _progress(label: str) -> Callable[[dict[str, Any]], None]:
+    """A line on stderr every thousand updates."""
 
-    def __init__(self, label: str) -> None:
-        self.label, self.entries = label, 0
-
-    def __call__(self, entry: dict[str, Any]) -> None:
-        self.entries += 1
-        if self.entries % 20 == 1 and "loss" in entry:
+    def report(entry: dict[str, Any]) -> None:
+        if "loss" in entry and entry["step"] % 1000 == 0:
             rate = f"{entry['samples_per_s']:.1f} samples/s"
-            line = f"{self.label}: {entry['samples']} samples, loss {entry['loss']:.3f}, {rate}"
+            line = f"{label}: {entry['samples']} samples, loss {entry['loss']:.3f}, {rate}"
             print(line, file=sys.stderr, flush=True)
+
+    return report
 
 
 if __name__ == "__main__":

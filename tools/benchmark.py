@@ -21,8 +21,9 @@ from typing import Any
 
 import numpy as np
 from benchmark_costs import costs
-from golden_inputs import HEAVY, REAL, SIZE, scene_flow
-from measuring import able, digits, provenance, score, summarise, timed
+from golden_inputs import HEAVY, HEAVY_AT, HEAVY_FRAMES, REAL, SIZE, rendered
+from golden_inputs import heavy_pairs as heavy_inputs
+from measuring import able, digits, provenance, score, summarise, timed, write_result
 
 FLOW_ONLY = (
     "hybrid-flow", "refine", "pwvo", "pnp-ransac-tuned", "pnp-ransac", "usac-magsac", "poselib",
@@ -33,7 +34,6 @@ HEAVY_METHODS = ("hybrid", "hybrid-flow", "refine", "pwvo", "pnp-ransac-tuned", 
 REAL_METHODS = ("hybrid", "refine", "pnp-ransac-tuned", "pnp-ransac", "opencv-rgbd", "identity")
 ORACLE = "refine-oracle-static-mask"
 """``refine`` told by the ground truth which pixels are static: what a perfect mask would give."""
-HEAVY_FRAMES, HEAVY_PAIRS = 20, 5
 REAL_PAIRS = 40
 """Pairs of a recorded sequence, from its start: a chain without holes has an error at its end."""
 
@@ -57,30 +57,22 @@ def build_parser() -> argparse.ArgumentParser:
 
 def main(argv: list[str] | None = None) -> int:
     args = build_parser().parse_args(argv)
-    from hybridvo.errors import HybridVOError, OutputError
-    from hybridvo.files import write_json
-
     unknown = sorted(set(args.parts.split(",")) - set(PARTS))
     if unknown:
         return usage(f"unknown part {', '.join(unknown)}; known: {', '.join(PARTS)}.")
     for name, least in (("pairs", 1), ("sequences", 1), ("model_pairs", 1), ("seed0", 0)):
         if getattr(args, name) < least:
             return usage(f"--{name.replace('_', '-')}: expected at least {least}.")
-    if args.out.exists() and not args.overwrite:
-        return usage(f"{args.out} exists; pass --overwrite to replace it.")
-    # parts that are measured anew replace those of the file; the others stay
-    result = json.loads(args.out.read_text(encoding="utf-8")) if args.out.exists() else {}
-    try:
+
+    def measure() -> dict[str, Any]:
+        # parts that are measured anew replace those of the file; the others stay
+        result = json.loads(args.out.read_text(encoding="utf-8")) if args.out.exists() else {}
         for part in args.parts.split(","):
             result[part] = provenance("benchmark.py", argv) | PARTS[part](args)
             print(f"{part}: done", file=sys.stderr, flush=True)
-        args.out.parent.mkdir(parents=True, exist_ok=True)
-        write_json(args.out, result)
-    except HybridVOError as error:
-        print(f"benchmark.py: {error}", file=sys.stderr)
-        return 5 if isinstance(error, OutputError) else 2
-    print(args.out)
-    return 0
+        return result
+
+    return write_result("benchmark.py", args.out, args.overwrite, measure)
 
 
 def usage(message: str) -> int:
@@ -169,23 +161,11 @@ def heavy(args: argparse.Namespace) -> dict[str, Any]:
 
 def heavy_pairs(kind: str, seed: int) -> Iterator[tuple[str, Any, np.ndarray, np.ndarray]]:
     """(flow, pair, true motion, static pixels): pairs spread over a scene, each with both flows."""
-    from hybridvo import FramePair
-    from hybridvo.flow import dis_flow
-    from hybridvo.synthetic.render import SyntheticSequence, make_scene
-
-    scene = make_scene(kind, seed, height=SIZE[0], width=SIZE[1], frames=HEAVY_FRAMES)
-    sequence = SyntheticSequence(scene, name=kind)
-    providers = {"dis": dis_flow(), "true": scene_flow(sequence)}
-    for i in np.linspace(0, HEAVY_FRAMES - 2, HEAVY_PAIRS).round().astype(int).tolist():
-        prev, curr = sequence.frame(i), sequence.frame(i + 1)
-        T = np.linalg.inv(sequence.poses[i + 1]) @ sequence.poses[i]
+    sequence = rendered(kind, seed, SIZE, HEAVY_FRAMES)
+    for i, (pairs, T, _) in zip(HEAVY_AT, heavy_inputs(sequence), strict=True):
         static = (~sequence.moving(i)).astype(np.float32)
-        for flow, provider in providers.items():
-            field = provider(prev, curr)
-            yield flow, FramePair(
-                prev, curr, field.flow, field.variance, field.valid, flow_source=flow,
-                flow_is_true=field.is_true, depth_source="true",
-            ), T, static  # fmt: skip
+        for flow in ("dis", "true"):
+            yield flow, pairs[flow], T, static
 
 
 def masked(static: np.ndarray) -> Estimator:

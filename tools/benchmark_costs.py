@@ -10,6 +10,7 @@ import tracemalloc
 from typing import Any
 
 import numpy as np
+from golden_inputs import rendered
 from measuring import able, digits, timed
 
 METHODS = ("hybrid", "hybrid-flow", "refine", "pwvo", "pnp-ransac-tuned", "poselib")
@@ -28,7 +29,7 @@ print(json.dumps({"import_s": imported - begin, "warm_up_s": time.perf_counter()
 
 def costs(args: argparse.Namespace) -> dict[str, Any]:
     """Everything that is timed on one scene of moderate motion, flow from DIS, depth true."""
-    frames = {size: scene_frames(*size) for size in SIZES}
+    frames = {size: list(rendered("light", 0, size, 8)) for size in SIZES}
     methods, missing = able(METHODS)
     return {
         "missing": missing,
@@ -38,14 +39,6 @@ def costs(args: argparse.Namespace) -> dict[str, Any]:
         "first_call": first_call(),
         "batch": batches(args.seed0),
     }
-
-
-def scene_frames(height: int, width: int, count: int = 8) -> list[Any]:
-    from hybridvo.synthetic.render import SyntheticSequence, make_scene
-
-    scene = make_scene("light", 0, height=height, width=width, frames=count)
-    sequence = SyntheticSequence(scene)
-    return [sequence.frame(i) for i in range(count)]
 
 
 def pair_of(frames: list[Any]) -> Any:

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from measuring import digits, ego_flow_error, proportion, provenance, timed
+from measuring import auroc, digits, ego_flow_error, proportion, provenance, timed
 
 METHODS = ("refine", "hybrid-flow", "poselib")
 WRONG_PX, WRONG_FACTOR = 1.0, 3.0
@@ -146,16 +146,6 @@ def summarise(rows: list[dict[str, Any]], method: str) -> dict[str, Any]:
         "ms": digits(np.median([row["ms"] for row in of])),
         "reliability": reliability(probability, ~wrong),
     }
-
-
-def auroc(score: np.ndarray, positive: np.ndarray) -> float | None:
-    """Chance that a positive has the larger score; None without both kinds."""
-    from scipy.stats import rankdata
-
-    n, m = int(positive.sum()), int((~positive).sum())
-    if not n or not m:
-        return None
-    return digits((rankdata(score)[positive].sum() - n * (n + 1) / 2) / (n * m))
 
 
 def reliability(probability: np.ndarray, right: np.ndarray) -> list[dict[str, Any]]:

@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 from benchmark import heavy_pairs
-from benchmark_semi_real import WRONG_FACTOR, WRONG_PX, auroc, calibration_error, draw
+from benchmark_semi_real import WRONG_FACTOR, WRONG_PX, calibration_error, draw
 from golden_inputs import HEAVY
-from measuring import ego_flow_error
+from measuring import auroc, ego_flow_error
 from scipy.optimize import minimize
 
 HEAVY_SEEDS = range(900, 906)

@@ -17,10 +17,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from golden_inputs import HEAVY, SIZE, scene_flow
-from measuring import able, digits, proportion, provenance, score, summarise, timed
+from golden_inputs import HEAVY, SIZE, rendered, scene_flow
+from measuring import (
+    able,
+    auroc,
+    digits,
+    proportion,
+    provenance,
+    score,
+    summarise,
+    timed,
+    write_result,
+)
 from scipy.spatial.transform import Rotation
-from scipy.stats import rankdata
 
 METHODS = {
     "dis": ("hybrid", "hybrid-flow", "refine", "pwvo", "pnp-ransac-tuned", "poselib"),
@@ -50,26 +59,11 @@ def build_parser() -> argparse.ArgumentParser:
 
 def main(argv: list[str] | None = None) -> int:
     args = build_parser().parse_args(argv)
-    from hybridvo.errors import HybridVOError, OutputError
-    from hybridvo.files import write_json
 
-    problem = ""
-    if args.out.exists() and not args.overwrite:
-        problem = f"{args.out} exists; pass --overwrite to replace it."
-    if args.sequences < 1 or args.frames < 3 or args.seed0 < 0:
-        problem = "expected --sequences >= 1, --frames >= 3 and --seed0 >= 0."
-    if problem:
-        print(f"evaluate.py: {problem}", file=sys.stderr)
-        return 2
-    try:
-        result = provenance("evaluate.py", argv) | measure(args)
-        args.out.parent.mkdir(parents=True, exist_ok=True)
-        write_json(args.out, result)
-    except HybridVOError as error:
-        print(f"evaluate.py: {error}", file=sys.stderr)
-        return 5 if isinstance(error, OutputError) else 2
-    print(args.out)
-    return 0
+    def work() -> dict[str, Any]:
+        return provenance("evaluate.py", argv) | measure(args)
+
+    return write_result("evaluate.py", args.out, args.overwrite, work)
 
 
 def measure(args: argparse.Namespace) -> dict[str, Any]:
@@ -80,7 +74,7 @@ def measure(args: argparse.Namespace) -> dict[str, Any]:
     methods = {flow: able(names)[0] for flow, names in METHODS.items()}
     for kind in args.kinds.split(","):
         for seed in range(args.seed0, args.seed0 + args.sequences):
-            sequence = rendered(kind, seed, args.frames)
+            sequence = rendered(kind, seed, SIZE, args.frames)
             for (flow, method), (some, path) in track(sequence, methods).items():
                 records[flow].setdefault(method, []).extend(some)
                 paths[flow].setdefault(method, {}).setdefault(kind, []).append(path)
@@ -108,13 +102,6 @@ def measure(args: argparse.Namespace) -> dict[str, Any]:
         },
         "network": over_sequences(scales),
     }  # fmt: skip
-
-
-def rendered(kind: str, seed: int, frames: int) -> Any:
-    from hybridvo.synthetic.render import SyntheticSequence, make_scene
-
-    scene = make_scene(kind, seed, height=SIZE[0], width=SIZE[1], frames=frames)
-    return SyntheticSequence(scene, name=kind)
 
 
 def track(
@@ -239,12 +226,10 @@ def over_sequences(scales: list[dict[str, Any]]) -> dict[str, Any]:
         ratio = np.concatenate([some[name]["ratio"].ravel() for some in scales])
         doubt = np.concatenate([some[name]["doubt"] for some in scales])
         moving = np.concatenate([some[name]["moving"] for some in scales])
-        n = int(moving.sum())
-        rank_sum = rankdata(doubt)[moving].sum()
         result[name] = {
             "mean_ratio": digits(ratio.mean()),
             "below": {f"{p:g}": digits(np.mean(ratio < -np.log(1 - p))) for p in LEVELS},
-            "auroc": digits((rank_sum - n * (n + 1) / 2) / (n * (len(moving) - n))),
+            "auroc": auroc(doubt, moving),
         }
     return result
 

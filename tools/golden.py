@@ -172,10 +172,6 @@ def pairs(files: list[Path], flow: str, method: str, seeds: int) -> dict[str, An
 
 def prior_cases(inputs: Path) -> dict[str, Callable[[], dict[str, Any]]]:
     """The heavy pairs with the true motion, the one before and a wrong one as prior."""
-    import hybridvo
-
-    if not hasattr(hybridvo, "MotionPrior"):
-        return {}
     runs: dict[str, Callable[[], dict[str, Any]]] = {}
     for group in HEAVY:
         files = sorted((inputs / group).glob("*.npz"))[:PRIOR_PAIRS]

@@ -18,7 +18,8 @@ import numpy as np
 
 HEAVY = ("heavy_rigid", "heavy_deforming", "heavy_two", "heavy_ten")
 HEAVY_SEEDS = range(900, 906)
-HEAVY_FRAMES, HEAVY_PAIRS = 20, 5
+HEAVY_FRAMES, HEAVY_AT = 20, [0, 4, 9, 14, 18]
+"""Frames of a scene, and those from which pairs are taken."""
 SIZE = (218, 512)
 UNDETERMINED = ("line", "patch", "every_pixel_its_own", "five_motions")
 """Pictures that do not determine the camera's motion; the other degenerate kinds are scenarios."""
@@ -121,17 +122,26 @@ def read_pair(path: Path, flow: str) -> tuple[Any, np.ndarray, np.ndarray, np.nd
 
 def heavy(kind: str) -> Cases:
     """Development scenes in which most of the image moves: true and DIS flow, true depth."""
-    from hybridvo.flow import dis_flow
-    from hybridvo.synthetic.render import SyntheticSequence, make_scene
-
-    height, width = SIZE
     for seed in HEAVY_SEEDS:
-        scene = make_scene(kind, seed, height=height, width=width, frames=HEAVY_FRAMES)
-        sequence = SyntheticSequence(scene, name=kind)
-        wanted = np.linspace(0, HEAVY_FRAMES - 2, HEAVY_PAIRS).round().astype(int).tolist()
-        yield from from_sequence(
-            sequence, {"true": scene_flow(sequence), "dis": dis_flow()}, wanted
-        )
+        yield from heavy_pairs(rendered(kind, seed, SIZE, HEAVY_FRAMES))
+
+
+def rendered(kind: str, seed: int, size: tuple[int, int], frames: int) -> Any:
+    """A rendered scene as a sequence."""
+    from hybridvo.synthetic.render import SyntheticSequence
+    from hybridvo.synthetic.scenes import make_scene
+
+    height, width = size
+    return SyntheticSequence(
+        make_scene(kind, seed, height=height, width=width, frames=frames), name=kind
+    )
+
+
+def heavy_pairs(sequence: Any) -> Cases:
+    """Pairs spread over a scene, each with true and with DIS flow."""
+    from hybridvo.flow import dis_flow
+
+    return from_sequence(sequence, {"true": scene_flow(sequence), "dis": dis_flow()}, HEAVY_AT)
 
 
 def scene_flow(sequence: Any) -> Any:
@@ -238,11 +248,9 @@ def undetermined(kind: str, pair: Any, truth: dict[str, Any], rng: np.random.Gen
 
 def walk(folder: Path) -> None:
     """A sequence to track at 640x480 as arrays, and one on disk for the command line."""
-    from hybridvo.synthetic.render import SyntheticSequence, make_scene, write_sintel
+    from hybridvo.synthetic.render import write_sintel
 
-    height, width = WALK_SIZE
-    scene = make_scene("light", 0, height=height, width=width, frames=WALK_FRAMES)
-    sequence = SyntheticSequence(scene, name="walk")
+    sequence = rendered("light", 0, WALK_SIZE, WALK_FRAMES)
     frames = [sequence.frame(i) for i in range(WALK_FRAMES)]
     np.savez(
         folder / "walk.npz",
@@ -252,6 +260,6 @@ def walk(folder: Path) -> None:
         time=np.array([frame.timestamp for frame in frames]),
         poses=sequence.poses,
     )
-    scene = make_scene("light", 0, height=SIZE[0], width=SIZE[1], frames=20)
-    write_sintel(scene, folder / "demo", "light")
-    np.savez(folder / "demo.npz", poses=SyntheticSequence(scene, name="demo").poses)
+    sequence = rendered("light", 0, SIZE, 20)
+    write_sintel(sequence.scene, folder / "demo", "light")
+    np.savez(folder / "demo.npz", poses=sequence.poses)

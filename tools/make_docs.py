@@ -71,7 +71,7 @@ def fill(text: str, results: Results) -> str:
     """The text with every marked part made anew; empty where its figures are missing."""
 
     def part(match: re.Match[str]) -> str:
-        lines = TABLES[match.group(2)](results)
+        lines = lines_of(match.group(2), results)
         return match.group(1) + ("\n" + "\n".join(lines) + "\n\n" if lines else "") + match.group(4)
 
     return PART.sub(part, text)
@@ -87,10 +87,12 @@ def page(results: Results) -> str:
         f"{FAILURES}. Times are wall times on a shared machine.",
         "",
     ]
-    for title, name in PAGE:
-        table_lines = TABLES[name](results)
-        if table_lines:
-            lines += [f"## {title}", "", *table_lines, ""]
+    for title, *names in PAGE:
+        tables = [made for name in names if (made := lines_of(name, results))]
+        if tables:
+            lines += [f"## {title}", ""]
+        for made in tables:
+            lines += [*made, ""]
     return "\n".join(lines).rstrip() + "\n"
 
 
@@ -110,12 +112,8 @@ def source(content: dict[str, Any]) -> str:
     )
 
 
-def heavy(results: Results) -> list[str]:
+def heavy(part: dict[str, Any]) -> list[str]:
     """Scenes in which most of the image moves: median error in px, and failures."""
-    content = results.get("benchmark", {})
-    if "heavy" not in content:
-        return []
-    part = content["heavy"]
     kinds = [kind for kind in part["summary"] if kind != "total"]
     rows = []
     for flow in ("dis", "true"):
@@ -133,13 +131,11 @@ def heavy(results: Results) -> list[str]:
     ]
 
 
-def peers(results: Results) -> list[str]:
+def peers(part: dict[str, Any]) -> list[str]:
     """The README's one table: every method on estimated flow."""
-    content = results.get("benchmark", {})
-    if "heavy" not in content:
-        return []
+    total = part["summary"]["total"]["dis"]
     rows = []
-    for method, row in content["heavy"]["summary"]["total"]["dis"].items():
+    for method, row in total.items():
         if "oracle" in method:
             continue
         share = f"{100 * row['failures']['count'] / row['pairs']:.0f} %"
@@ -147,8 +143,7 @@ def peers(results: Results) -> list[str]:
             [f"`{method}`", number(row["epe_px"]["median"]), number(row["translation_cm"]),
              number(row["rotation_deg"]), share, number(row["ms"])]
         )  # fmt: skip
-    part = content["heavy"]
-    pairs = part["summary"]["total"]["dis"][next(iter(part["summary"]["total"]["dis"]))]["pairs"]
+    pairs = next(iter(total.values()))["pairs"]
     return [
         *table(["method", "error, px", "cm", "deg", "wrong by more than 1 px", "ms a pair"], rows),
         "",
@@ -157,40 +152,34 @@ def peers(results: Results) -> list[str]:
     ]
 
 
-def scenarios(results: Results) -> list[str]:
+def scenarios(part: dict[str, Any]) -> list[str]:
     """Pairs with known noise: median error in px of every method in every scenario."""
-    content = results.get("benchmark", {})
-    if "scenarios" not in content:
-        return []
-    part = content["scenarios"]
     names = list(part["summary"])
     methods = list(part["summary"][names[0]])
     rows = [[name, *(error(part["summary"][name][method]) for method in methods)] for name in names]
     means = [number(part["geometric_mean_px"][method]) for method in methods]
     rows.append([f"geometric mean of the first {len(part['main'])}", *means])
-    lines = [
+    return [
         *table(["scenario", *(f"`{method}`" for method in methods)], rows),
         "",
         f"Median error of the ego flow, px; seeds {part['seeds'][0]} to {part['seeds'][1]}. "
         f"{source(part)}",
     ]
-    if "model_noise" in content:
-        row = content["model_noise"]["refine"]
-        lines += [
-            "",
-            f"Covariance of `refine` under the noise that it assumes: mean normalised error "
-            f"{row['nees_mean']:.2f} +- {row['nees_standard_error']:.2f} over {row['pairs']} pairs "
-            f"(right: 6), {row['overconfident']} outside of 3 sigma (right: 0.3 %).",
-        ]
-    return lines
 
 
-def real(results: Results) -> list[str]:
+def model_noise(part: dict[str, Any]) -> list[str]:
+    """The covariance under the noise that the refinement assumes."""
+    row = part["refine"]
+    return [
+        f"Covariance of `refine` under the noise that it assumes: mean normalised error "
+        f"{row['nees_mean']:.2f} +- {row['nees_standard_error']:.2f} over {row['pairs']} pairs "
+        f"(right: 6), {row['overconfident']} outside of 3 sigma (right: 0.3 %).",
+    ]
+
+
+def real(part: dict[str, Any]) -> list[str]:
     """Recorded sequences: medians over the pairs, and the error at the end of the chain."""
-    content = results.get("benchmark", {})
-    if "real" not in content:
-        return []
-    part, rows = content["real"], []
+    rows = []
     for name, sequence in part["summary"].items():
         for flow, by_method in sequence["flows"].items():
             for k, (method, row) in enumerate(by_method.items()):
@@ -204,11 +193,8 @@ def real(results: Results) -> list[str]:
     return [*table(header, rows), "", f"Medians over the pairs. {source(part)}"]
 
 
-def sequences(results: Results) -> list[str]:
+def sequences(content: dict[str, Any]) -> list[str]:
     """Paths of whole rendered sequences, and how often the stated probability comes true."""
-    content = results.get("sequences")
-    if content is None:
-        return []
     kinds = content["kinds"]
     rows = []
     for flow, by_method in content["paths"].items():
@@ -239,12 +225,8 @@ def sequences(results: Results) -> list[str]:
     return lines
 
 
-def costs(results: Results) -> list[str]:
+def costs(part: dict[str, Any]) -> list[str]:
     """Wall time of a pair and of a whole frame, memory, batches."""
-    content = results.get("benchmark", {})
-    if "costs" not in content:
-        return []
-    part = content["costs"]
     sizes = list(part["pair_ms"])
     rows = [
         [f"`{method}`", *(number(part[key][size][method]) for key in ("pair_ms", "frame_ms")
@@ -264,12 +246,8 @@ def costs(results: Results) -> list[str]:
     ]
 
 
-def speed(results: Results) -> list[str]:
+def speed(part: dict[str, Any]) -> list[str]:
     """Frames a second of a whole tracked frame, its flow included."""
-    content = results.get("benchmark", {})
-    if "costs" not in content:
-        return []
-    part = content["costs"]
     rows = [
         [f"`{method}`", number(1e3 / ms), number(ms)]
         for method, ms in part["frame_ms"]["640x480"].items()
@@ -281,11 +259,8 @@ def speed(results: Results) -> list[str]:
     ]
 
 
-def demo(results: Results) -> list[str]:
+def demo(content: dict[str, Any]) -> list[str]:
     """What ``hybridvo demo`` measures."""
-    content = results.get("benchmark", {}).get("demo")
-    if content is None:
-        return []
     keys = ("ate_cm", "rotation_deg", "epe_px")
     rows = [[row["method"], *(number(row[key]) for key in keys)] for row in content["rows"]]
     scene = content["scene"]
@@ -298,20 +273,31 @@ def demo(results: Results) -> list[str]:
     ]
 
 
-TABLES: dict[str, Callable[[Results], list[str]]] = {
-    "demo": demo,
-    "speed": speed,
-    "peers": peers,
-    "heavy": heavy,
-    "scenarios": scenarios,
-    "real": real,
-    "sequences": sequences,
-    "costs": costs,
-    **paper_tables.TABLES,
+def lines_of(name: str, results: Results) -> list[str]:
+    """Lines of a table; none where its figures are missing."""
+    if name in paper_tables.TABLES:
+        return paper_tables.TABLES[name](results)
+    if name == "sequences":
+        return sequences(results[name]) if name in results else []
+    key, make = TABLES[name]
+    content = results.get("benchmark", {})
+    return make(content[key]) if key in content else []
+
+
+TABLES: dict[str, tuple[str, Callable[[dict[str, Any]], list[str]]]] = {
+    "demo": ("demo", demo),
+    "speed": ("costs", speed),
+    "peers": ("heavy", peers),
+    "heavy": ("heavy", heavy),
+    "scenarios": ("scenarios", scenarios),
+    "model_noise": ("model_noise", model_noise),
+    "real": ("real", real),
+    "costs": ("costs", costs),
 }
+"""Tables by name: the part of docs/results/benchmark.json, and what makes lines of it."""
 PAGE = (
     ("Most of the image moves", "heavy"),
-    ("Known noise", "scenarios"),
+    ("Known noise", "scenarios", "model_noise"),
     ("Recorded sequences", "real"),
     ("Whole sequences", "sequences"),
     ("Time and memory", "costs"),

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from golden_inputs import SIZE, rendered
 
 BLUE, ORANGE, GREY = "#0072B2", "#D55E00", "#222222"
 """Okabe and Ito: told apart by colour-blind readers."""
@@ -38,10 +39,8 @@ def track(kind: str, seed: int, shown: int) -> dict[str, Any]:
     """Two methods over a scene, and the inputs and weights of one pair."""
     from hybridvo import Odometry
     from hybridvo.flow import dis_flow
-    from hybridvo.synthetic.render import SyntheticSequence, make_scene
 
-    scene = make_scene(kind, seed, height=218, width=512)
-    sequence, flow = SyntheticSequence(scene), dis_flow()
+    sequence, flow = rendered(kind, seed, SIZE, 20), dis_flow()
     trackers = {name: Odometry(method=name) for name in ("hybrid", "pnp-ransac")}
     paths: dict[str, list[np.ndarray]] = {name: [] for name in trackers}
     prev, result = None, {}
@@ -63,23 +62,14 @@ def track(kind: str, seed: int, shown: int) -> dict[str, Any]:
     }
 
 
-def flow_colours(flow: np.ndarray) -> np.ndarray:
-    """(H, W, 3) uint8: hue is the direction, saturation the length up to its 99th percentile."""
-    import cv2
-
-    length = np.linalg.norm(flow, axis=2)
-    hue = (np.degrees(np.arctan2(flow[..., 1], flow[..., 0])) % 360).astype(np.float32)
-    saturation = np.clip(length / max(np.percentile(length, 99), 1e-6), 0, 1).astype(np.float32)
-    hsv = np.dstack([hue, saturation, np.ones_like(saturation)])
-    return (255 * cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB)).astype(np.uint8)
-
-
 def draw(drawn: dict[str, Any]) -> bytes:
     """PNG of the four panels, from left to right."""
     import io
 
     import cv2
     from matplotlib.figure import Figure
+
+    from hybridvo.evaluation.maps import flow_colours, longest_flow
 
     figure = Figure(figsize=(12.8, 3.25), dpi=100, layout="constrained")
     grid = figure.add_gridspec(2, 3, width_ratios=(1, 1.62, 1.12))
@@ -88,7 +78,7 @@ def draw(drawn: dict[str, Any]) -> bytes:
     weights = cv2.resize(drawn["weights"], (width, height), interpolation=cv2.INTER_NEAREST)
     panels = {
         f"image ({100 * drawn['share']:.0f} % of it moves by itself)": drawn["rgb"],
-        "optical flow (OpenCV DIS)": flow_colours(drawn["flow"]),
+        "optical flow (OpenCV DIS)": flow_colours(drawn["flow"], longest_flow(drawn["flow"])),
         "weight of each pixel in the camera motion (white outline: what truly moves)": weights,
     }
     for place, (title, image) in zip(places, panels.items(), strict=True):

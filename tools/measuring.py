@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import platform
 import shlex
@@ -15,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+from scipy.stats import binomtest, mannwhitneyu
 
 ROOT = Path(__file__).resolve().parents[1]
 FAILURE_PX = 1.0
@@ -26,15 +25,9 @@ PACKAGES = ("numpy", "numba", "scipy", "torch", "opencv-python-headless", "posel
 
 
 def score(motion: Any, T_true: np.ndarray, depth: np.ndarray, pair: Any) -> dict[str, Any]:
-    """Errors of one answer, its status, and its error in standard deviations.
+    """Errors of one answer about a pair, its status, and its error in standard deviations.
 
-    A failed answer is the identity that it carries.
-
-    Args:
-        motion: the answer.
-        T_true: (4, 4) true ``T_curr_prev``.
-        depth: (H, W) true depth, or the best that is known.
-        pair: what was estimated.
+    A failed answer is the identity that it carries; ``depth``: (H, W) the best that is known.
     """
     state, reason = motion.status.state.value, motion.status.reason.value
     error = ego_flow_error(motion.T_curr_prev, T_true, depth, pair)
@@ -75,14 +68,9 @@ def ego_flow_error(T: np.ndarray, T_true: np.ndarray, depth: np.ndarray, pair: A
 
 def motion_error(T: np.ndarray, T_true: np.ndarray) -> np.ndarray:
     """(6,) left perturbation between two motions, translation first, m and rad."""
-    E = T @ np.linalg.inv(T_true)
-    w = Rotation.from_matrix(E[:3, :3]).as_rotvec()
-    angle = float(np.linalg.norm(w))
-    W = np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]])
-    factor = 1 / 12
-    if angle > 1e-4:
-        factor = 1 / angle**2 - (1 + np.cos(angle)) / (2 * angle * np.sin(angle))
-    return np.concatenate([(np.eye(3) - W / 2 + factor * W @ W) @ E[:3, 3], w])
+    from hybridvo.geometry import se3_log
+
+    return se3_log(T @ np.linalg.inv(T_true))
 
 
 def summarise(records: list[dict[str, Any]]) -> dict[str, Any]:
@@ -101,17 +89,37 @@ def summarise(records: list[dict[str, Any]]) -> dict[str, Any]:
     return row
 
 
-def proportion(count: int, trials: int, z: float = 1.959964) -> dict[str, Any]:
+def proportion(count: int, trials: int) -> dict[str, Any]:
     """A share with its 95 % interval, score method (Wilson, JASA 22, 1927)."""
-    if trials == 0:
-        return {"count": 0, "of": 0, "low": 0.0, "high": 1.0}
-    share, scale = count / trials, 1 + z * z / trials
-    centre = (share + z * z / (2 * trials)) / scale
-    half = z / scale * math.sqrt(share * (1 - share) / trials + z * z / (4 * trials * trials))
-    # exact at the ends, where the formula is off by a rounding error
-    low = 0.0 if count == 0 else centre - half
-    high = 1.0 if count == trials else centre + half
+    low, high = 0.0, 1.0
+    if trials:
+        low, high = binomtest(count, trials).proportion_ci(method="wilson")
     return {"count": count, "of": trials, "low": digits(low), "high": digits(high)}
+
+
+def auroc(score: np.ndarray, positive: np.ndarray) -> float | None:
+    """Chance that a positive has the larger score; None without both kinds."""
+    if positive.all() or not positive.any():
+        return None
+    wins = mannwhitneyu(score[positive], score[~positive], method="asymptotic").statistic
+    return digits(wins / (positive.sum() * (~positive).sum()))
+
+
+def write_result(tool: str, out: Path, overwrite: bool, measure: Callable[[], Any]) -> int:
+    """Measure and write the figures as JSON; returns the exit code of the tool."""
+    from hybridvo.errors import HybridVOError, InputError, OutputError
+    from hybridvo.files import make_folder, write_json
+
+    try:
+        if out.exists() and not overwrite:
+            raise InputError(f"{out} exists; pass --overwrite to replace it.")
+        make_folder(out.parent)
+        write_json(out, measure())
+    except HybridVOError as error:
+        print(f"{tool}: {error}", file=sys.stderr)
+        return 5 if isinstance(error, OutputError) else 2
+    print(out)
+    return 0
 
 
 def digits(value: Any) -> float:

@@ -33,8 +33,8 @@ from hybridvo.network.losses import reconstruct
 from hybridvo.network.models import load_weights
 from hybridvo.network.selection import select_motion
 from hybridvo.network.weights import PRETRAINED, save_weights
+from hybridvo.synthetic.dataset import load_preset
 from hybridvo.synthetic.draws import sample_generator
-from hybridvo.synthetic.presets import load_preset
 from hybridvo.training.stream import collate
 from hybridvo.training.validation import PUBLISHED_SEED
 

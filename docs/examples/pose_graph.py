@@ -118,7 +118,7 @@ def optimise_gtsam(poses: list[np.ndarray], factors: list[Between]) -> list[np.n
 
 def round_trip(count: int, height: int, width: int) -> tuple[list[hvo.Frame], list[np.ndarray]]:
     """A rendered walk forth and back, ending beside its start, with the true poses."""
-    from hybridvo.synthetic.render import make_scene
+    from hybridvo.synthetic.scenes import make_scene
 
     scene = make_scene("static", 3, height=height, width=width, frames=count // 2 + 1)
     path = [*range(count // 2 + 1), *range(count // 2 - 1, 0, -1)]

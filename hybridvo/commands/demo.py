@@ -18,7 +18,8 @@ from hybridvo.errors import InputError, OutputError
 from hybridvo.evaluation.pair_errors import true_trajectory
 from hybridvo.evaluation.plots import plot_trajectories
 from hybridvo.files import make_folder, write_json
-from hybridvo.synthetic.render import make_scene, write_sintel
+from hybridvo.synthetic.render import write_sintel
+from hybridvo.synthetic.scenes import make_scene
 from hybridvo.trajectory import read_trajectory
 
 METHODS = {

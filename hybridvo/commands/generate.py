@@ -13,9 +13,8 @@ import numpy as np
 from hybridvo.errors import InputError
 from hybridvo.evaluation.maps import flow_colours
 from hybridvo.files import atomic_write
-from hybridvo.synthetic.dataset import read_sample, write_samples
+from hybridvo.synthetic.dataset import PRESETS, Preset, load_preset, read_sample, write_samples
 from hybridvo.synthetic.layered import Sample
-from hybridvo.synthetic.presets import PRESETS, Preset, load_preset
 
 TITLES = (
     "1 rays of K",

@@ -1,8 +1,8 @@
-"""Drawn samples on disk: reading one costs far less than drawing it.
+"""What training samples are drawn from: presets in YAML files, and samples drawn before on disk.
 
-A folder holds ``samples.json`` (what was drawn) and ``shard_0000/FIELD.npy`` with the fields of
-:class:`~hybridvo.synthetic.layered.Sample` stacked, float32, little-endian. The ego flow is left
-out: it follows from depth, intrinsics and motion; so are fields that repeat another one.
+A folder of samples holds ``samples.json`` (what was drawn) and ``shard_0000/FIELD.npy`` with the
+fields of :class:`~hybridvo.synthetic.layered.Sample` stacked. The ego flow is left out: it follows
+from depth, intrinsics and motion; so are fields that repeat another one.
 """
 
 from __future__ import annotations
@@ -15,42 +15,103 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Protocol, TypeVar, cast
 
 import numpy as np
 
 from hybridvo.errors import FormatError, InputError, OutputError
-from hybridvo.files import write_json
+from hybridvo.files import make_folder, parse_yaml, read_text, write_json
+from hybridvo.synthetic.diverse import DiverseOptions
 from hybridvo.synthetic.draws import STORED, sample_generator
-from hybridvo.synthetic.layered import Sample, normalized_grid, rigid_flow
-from hybridvo.synthetic.presets import Preset
+from hybridvo.synthetic.layered import Layers, PaperOptions, Sample
+
+PRESETS: dict[str, type] = {"paper": PaperOptions, "diverse": DiverseOptions}
+"""Generators by the name that a file gives under ``preset``."""
 
 MANIFEST = "samples.json"
 PER_SHARD = 500
 """Samples of a shard: 270 MB at 128x256."""
-
 REPEATS = {"depth_true": "depth_prev", "depth_target": "depth_curr"}
 """Field -> the one that it equals in data without noise; stored where it does not."""
-FIELDS = (
-    *("flow", "depth_prev", "depth_curr", "depth_true", "depth_target", "K", "T_curr_prev"),
-    *("rotation_deg", "translation", "moving"),
-)
+FIELDS = [f.name for f in dataclasses.fields(Sample) if f.name not in ("ego_flow", "rays")]
+
+OptionsT = TypeVar("OptionsT")
+
+
+class Preset(Protocol):
+    """What training samples are drawn from."""
+
+    def sample(self, rng: np.random.Generator) -> Sample:
+        """One pair; depends on the generator alone."""
+
+
+def read_yaml(path: str | Path) -> dict[str, Any]:
+    """Mapping that a YAML file holds, over the one of the file that it ``extends``.
+
+    Raises:
+        InputError: no such file. FormatError: not YAML, or not a mapping.
+    """
+    try:
+        mapping = parse_yaml(read_text(path), str(path))
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; those of the project are in configs/.") from None
+    if not isinstance(mapping, dict):
+        raise FormatError(f"{path}: expected a mapping of keys, got {type(mapping).__name__}.")
+    if "extends" in mapping:
+        base = read_yaml(Path(path).parent / str(mapping.pop("extends")))
+        mapping = _merged(base, mapping)
+    return mapping
+
+
+def _merged(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
+    """Base with changes, mapping by mapping."""
+    inner = {
+        key: _merged(base[key], value)
+        for key, value in changes.items()
+        if isinstance(value, dict) and isinstance(base.get(key), dict)
+    }
+    return base | changes | inner
+
+
+def build_options(cls: type[OptionsT], mapping: dict[str, Any], where: str) -> OptionsT:
+    """Options of a class from plain values; keys that are left out keep their default.
+
+    Raises:
+        InputError: an unknown key or a value out of bounds, with its place.
+    """
+    try:
+        return cls(**mapping)
+    except (InputError, TypeError) as error:
+        raise InputError(f"{where}: {error}") from None
+
+
+def load_preset(
+    path: str | Path,
+    kinds: dict[str, type] = PRESETS,
+    size: tuple[int, int] | None = None,
+) -> Preset:
+    """Generator of ``kinds`` that a file such as ``configs/data_paper.yaml`` describes.
+
+    ``size``: (height, width) of the samples instead of the file's own.
+
+    Raises:
+        InputError: no such file, an unknown kind or key, or a value that cannot be meant.
+    """
+    mapping = read_yaml(path)
+    kind = mapping.pop("preset", None)
+    if kind not in kinds:
+        raise InputError(f"{path}: preset: expected one of {', '.join(kinds)}, got {kind!r}.")
+    if size is not None:
+        mapping |= dict(zip(("height", "width"), size, strict=True))
+    return build_options(kinds[kind], mapping, str(path))
 
 
 def write_samples(
     preset: Preset, count: int, folder: str | Path, seed: int = 0, workers: int = 1
 ) -> Iterator[int]:
-    """Draw samples into a folder; shards that are there already are kept.
+    """Draw samples into a folder; yields the number written so far, after each shard.
 
-    Args:
-        preset: what to draw.
-        count: number of samples.
-        folder: is made; may hold an interrupted call of the same arguments.
-        seed: of the samples.
-        workers: processes.
-
-    Yields:
-        Number of samples written so far, after each shard.
+    The folder is made; it may hold an interrupted call of the same arguments, which goes on.
 
     Raises:
         InputError: a count below 1, or a folder with other samples.
@@ -62,21 +123,19 @@ def write_samples(
             f"{workers} and {seed}."
         )
     folder = Path(folder)
-    options = dataclasses.asdict(cast(Any, preset))
+    make_folder(folder)
     manifest = {
         "preset": type(preset).__name__,
-        "options": json.loads(json.dumps(options)),
+        "options": json.loads(json.dumps(dataclasses.asdict(cast(Any, preset)))),
         "seed": seed,
         "count": count,
         "per_shard": PER_SHARD,
     }
+    if not (folder / MANIFEST).exists():
+        write_json(folder / MANIFEST, manifest)
+    elif _manifest(folder) != manifest:
+        raise InputError(f"{folder}: holds other samples. Choose another folder.")
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        if (folder / MANIFEST).exists():
-            if _manifest(folder) != manifest:
-                raise InputError(f"{folder}: holds other samples. Choose another folder.")
-        else:
-            write_json(folder / MANIFEST, manifest)
         shards = range(-(-count // PER_SHARD))
         jobs = [(preset, seed, count, folder, number) for number in shards]
         done = 0
@@ -91,8 +150,7 @@ def write_samples(
 def _write_shard(job: tuple[Preset, int, int, Path, int]) -> int:
     """Draw one shard under a hidden name and give it its own at the end."""
     preset, seed, count, folder, number = job
-    first = number * PER_SHARD
-    indices = range(first, min(first + PER_SHARD, count))
+    indices = range(number * PER_SHARD, min((number + 1) * PER_SHARD, count))
     target = _shard(folder, number)
     if target.is_dir():
         return len(indices)
@@ -126,6 +184,9 @@ def _manifest(folder: Path) -> dict[str, Any]:
     return manifest
 
 
+_read_manifest = functools.cache(_manifest)
+
+
 @functools.cache
 def _open_shard(path: Path) -> dict[str, np.ndarray]:
     """Memory-mapped fields of a shard."""
@@ -157,26 +218,18 @@ def read_sample(folder: str | Path, index: int) -> Sample:
         raise FormatError(f"{_shard(folder, number)}: damaged shard of samples: {error}.") from None
 
 
-_read_manifest = functools.cache(_manifest)
-
-
 def _ego_flow(fields: dict[str, np.ndarray]) -> np.ndarray:
     """(H, W, 2) flow of the camera motion alone."""
-    depth, K, T = (fields[name] for name in ("depth_true", "K", "T_curr_prev"))
-    known = depth > 0
-    rho = np.where(known, 1.0 / np.where(known, depth, 1.0), 0.0).astype(np.float32)
-    focal = (float(K[0, 0]), float(K[1, 1]))
-    u, v, _ = rigid_flow(*normalized_grid(K, *depth.shape), rho, T[:3, :3], T[:3, 3], focal)
-    return np.stack([u, v], axis=-1).astype(np.float32)
+    depth = fields["depth_true"]
+    rho = np.where(depth > 0, 1.0 / np.where(depth > 0, depth, 1.0), 0.0).astype(np.float32)
+    return Layers(fields["K"], rho).flows(fields["T_curr_prev"], added=False)[0]
 
 
 @dataclass(frozen=True)
 class StoredSamples:
-    """Samples of a folder as data of a training: ``preset: folder``.
+    """Samples of a folder, named from the current one, as data of a training: ``preset: folder``.
 
-    Args:
-        folder: that :func:`write_samples` filled, from the current folder.
-        held_out: one of another seed for evaluations; empty: none.
+    ``held_out``: a folder of another seed for evaluations; empty: none.
     """
 
     folder: str
@@ -188,11 +241,7 @@ class StoredSamples:
         return read_sample(self.folder, int(rng.integers(count)))
 
     def for_evaluation(self) -> StoredSamples:
-        """The same of the held-out folder.
-
-        Raises:
-            InputError: none is named.
-        """
+        """The same of the held-out folder."""
         if not self.held_out:
             raise InputError("StoredSamples.held_out: no folder of held-out samples is named.")
         return StoredSamples(self.held_out)

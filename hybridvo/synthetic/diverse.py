@@ -1,9 +1,8 @@
 """Training pairs with what the real world adds to the paper's five steps.
 
-Rooms, streets and slanted planes with relief instead of one constant plane; static occluders at all
-depths; movers that are articulated or bend, one of which may cover most of the picture; motions
-**composed** (T_cam T_object) instead of added; sky; hidden points; cameras of any lens and crop;
-cameras that follow an actor; inputs as a flow estimator and a depth sensor deliver them.
+Rooms, streets and slanted planes with relief; static occluders; movers that are articulated or
+bend, one of which may cover most of the image; motions **composed** (T_cam T_object); sky; hidden
+points; any lens and crop; cameras that follow a mover; inputs as sensors deliver them.
 """
 
 from __future__ import annotations
@@ -17,10 +16,18 @@ from pydantic import Field
 from hybridvo.errors import InputError
 from hybridvo.geometry import euler_deg_to_matrix, make_transform
 from hybridvo.options import Positive, Share, option_group
-from hybridvo.synthetic.draws import Range, about, direction, log_uniform, smooth_field
+from hybridvo.synthetic.draws import (
+    Range,
+    Silhouette,
+    about,
+    direction,
+    log_uniform,
+    outline,
+    random_silhouette,
+    smooth_field,
+)
 from hybridvo.synthetic.layered import Layers, Sample, normalized_grid, visibility
 from hybridvo.synthetic.sensors import SensorOptions, degrade_depth, degrade_flow, sample_at
-from hybridvo.synthetic.silhouettes import Silhouette, outline, random_silhouette
 
 SKY_INVERSE_DEPTH = 1.0 / 2000.0
 """Surfaces farther than two kilometres are sky."""
@@ -33,13 +40,7 @@ Law = tuple[Positive, Positive, Positive]
 
 @option_group
 class DiverseOptions:
-    """Options of the diverse preset; pairs are drawn uniformly in the logarithm unless said.
-
-    Units and reasons stand in ``configs/data_diverse.yaml``.
-
-    Raises:
-        InputError: sizes, ranges or probabilities that cannot be meant.
-    """
+    """Options of the diverse preset; units and reasons stand in ``configs/data_diverse.yaml``."""
 
     height: Pixels = 128
     width: Pixels = 256
@@ -84,8 +85,8 @@ class DiverseOptions:
             raise InputError("room and outdoor probabilities add up to more than 1")
 
     def sample(self, rng: np.random.Generator) -> Sample:
-        """One pair: :func:`diverse_sample`."""
-        return diverse_sample(rng, self)
+        """One pair."""
+        return _diverse_sample(rng, self)
 
 
 class _Scene(Layers):
@@ -148,15 +149,9 @@ class _Scene(Layers):
         in_front: bool,
         inverse_depth: float | None = None,
     ) -> tuple[int, np.ndarray] | None:
-        """Lay a curved, slanted piece of surface over the image.
+        """Lay a curved, slanted piece of surface over the image, in front of everything or not.
 
-        Args:
-            mask: (H, W) uint8.
-            in_front: nearer than everything under it; else at any depth, possibly hidden.
-            inverse_depth: 1 / metres, or None to draw it.
-
-        Returns:
-            Its number and the point (3,) in metres at its middle, or None if nothing of it is seen.
+        Returns its number and the point (3,) in metres at its middle, or None if nothing is seen.
         """
         rng = self.rng
         left, top, width, height = cv2.boundingRect(mask)
@@ -228,9 +223,8 @@ def _add_mover(
 ) -> None:
     """Lay a mover over the scene and give it, its limbs and its bending a motion.
 
-    ``mask`` (H, W) uint8 and ``radius`` in px: where its outline is painted, and how large;
-    ``T_cam``: the camera's; ``follow``: factor on the motion that is left in the image where the
-    camera follows it, 0 for a free mover.
+    ``follow``: factor on the motion that is left in the image where the camera follows it, 0 for a
+    free mover.
     """
     o, rng = scene.options, scene.rng
     added = scene.add(mask, in_front=True)
@@ -309,14 +303,7 @@ def _populate(scene: _Scene) -> tuple[np.ndarray, np.ndarray]:
     return angles, translation
 
 
-def diverse_sample(rng: np.random.Generator, options: DiverseOptions) -> Sample:
-    """One pair of the diverse preset.
-
-    Args:
-        rng: source of randomness; the sample depends on nothing else.
-        options: sizes and distributions.
-    """
-    o = options
+def _diverse_sample(rng: np.random.Generator, o: DiverseOptions) -> Sample:
     while True:
         scene = _Scene(rng, o)
         angles, translation = _populate(scene)

@@ -1,7 +1,12 @@
-"""What every generator of scenes draws and builds with."""
+"""What every generator of scenes draws with: numbers, turns, smooth paths and fields, silhouettes.
+
+Silhouettes stand in for the chair photographs that the paper cut its object masks from: unions and
+differences of superellipses, polygons, stars and thin bars, of every degree of concavity.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Annotated
 
 import cv2
@@ -29,11 +34,7 @@ HELD_OUT, TRAINING, STORED = range(3)
 
 
 def sample_generator(seed: int, index: int, use: int = HELD_OUT) -> np.random.Generator:
-    """Generator of sample ``index`` of a seed, the same on every machine and in every process.
-
-    Raises:
-        InputError: a seed or an index that is negative or does not fit.
-    """
+    """Generator of sample ``index`` of a seed, the same on every machine and in every process."""
     if not (0 <= seed < 1 << 32 and 0 <= index < 1 << 63):
         raise InputError(
             f"sample_generator: expected 0 <= seed < 2^32 and 0 <= index < 2^63, got seed {seed} "
@@ -75,6 +76,52 @@ def affine(half: ArrayLike, centre: ArrayLike, R: np.ndarray | None = None) -> n
     return np.column_stack([axes, np.asarray(centre, float)])
 
 
+def camera_path(
+    rng: np.random.Generator, frames: int, step: float, turn_deg: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """(N, 4, 4) smooth, bounded T_world_cam that never rests, with and without hand shake.
+
+    Position runs on an ellipse and orientation on another, so that neither speed passes through
+    zero; ``step`` and ``turn_deg``: about how many metres and degrees a frame.
+    """
+    t = np.arange(frames)
+
+    def wave(rate: float, low: float, high: float) -> tuple[np.ndarray, np.ndarray]:
+        """Two sinusoids in quadrature that change by ``rate`` per frame at their fastest."""
+        period = rng.uniform(low, high)
+        phase = 2 * np.pi * (t / period + rng.uniform())
+        sign, amplitude = rng.choice([-1.0, 1.0]), rate * period / (2 * np.pi)
+        return amplitude * np.cos(phase), sign * amplitude * np.sin(phase)
+
+    x, z = wave(step * rng.uniform(0.8, 1.2), 50, 80)
+    y = wave(0.35 * step, 30, 60)[0]
+    yaw, pitch = wave(turn_deg, 45, 75)
+    roll = wave(0.25 * turn_deg, 30, 60)[0]
+    position = np.stack([x, y, rng.uniform(0.6, 1.0) * z], axis=1)
+    angles = np.stack([0.5 * pitch, yaw, roll], axis=1)
+    shake = np.stack([wave(0.1 * step, 7, 13)[0] for _ in range(3)], axis=1)
+    shake_deg = np.stack([wave(0.15 * turn_deg, 7, 13)[0] for _ in range(3)], axis=1)
+    return poses(angles + shake_deg, position + shake), poses(angles, position)
+
+
+def poses(angles_deg: np.ndarray, position: np.ndarray) -> np.ndarray:
+    """(N, 4, 4) from (N, 3) Euler angles about x, y, z and (N, 3) positions."""
+    R = Rotation.from_euler("XYZ", angles_deg, degrees=True).as_matrix()
+    return np.stack([make_transform(r, p) for r, p in zip(R, position, strict=True)])
+
+
+def sway(rng: np.random.Generator, frames: int, rate: float) -> np.ndarray:
+    """(N, 3) smooth oscillation that changes by about ``rate`` per frame and never rests."""
+    t = np.arange(frames)
+    direction = rng.normal(size=(2, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    period = rng.uniform(22, 40)
+    phase = 2 * np.pi * (t / period + rng.uniform())
+    amplitude = rate * period / (2 * np.pi)
+    circle = np.outer(np.cos(phase), direction[0]) + np.outer(np.sin(phase), direction[1])
+    return amplitude * circle
+
+
 def smooth_field(
     rng: np.random.Generator, height: int, width: int, cells: int, channels: int = 1
 ) -> np.ndarray:
@@ -84,3 +131,127 @@ def smooth_field(
     coarse = rng.standard_normal((rows, columns, channels), dtype=np.float32)
     field = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
     return field.reshape(height, width, channels) if channels > 1 else field.reshape(height, width)
+
+
+KINDS = ("superellipse", "polygon", "star", "bar")
+
+
+def outline(rng: np.random.Generator, kind: str) -> np.ndarray:
+    """(N, 2) closed outline around the origin, within the unit circle, turned by a random angle.
+
+    ``superellipse``: round to square to pinched; ``polygon``: 3 to 9 corners, convex or not;
+    ``star``: smooth or spiked radial function; ``bar``: thin rectangle.
+    """
+    if kind == "superellipse":
+        angle = np.linspace(0.0, 2 * np.pi, 48, endpoint=False)
+        exponent = 2.0 / np.exp(rng.uniform(np.log(0.7), np.log(6.0)))
+        cos, sin = np.cos(angle), np.sin(angle)
+        points = np.stack(
+            [np.sign(cos) * np.abs(cos) ** exponent, np.sign(sin) * np.abs(sin) ** exponent], axis=1
+        )
+        points[:, 1] *= rng.uniform(0.3, 1.0)
+    elif kind == "polygon":
+        corners = int(rng.integers(3, 10))
+        angle = 2 * np.pi * (np.arange(corners) + rng.uniform(-0.35, 0.35, corners)) / corners
+        points = rng.uniform(0.45, 1.0, corners)[:, None] * np.stack(
+            [np.cos(angle), np.sin(angle)], axis=1
+        )
+    elif kind == "star":
+        angle = np.linspace(0.0, 2 * np.pi, 64, endpoint=False)
+        radius = np.ones_like(angle)
+        for k in range(2, 8):
+            amplitude = rng.uniform(0.0, 0.7) / k
+            radius += amplitude * np.cos(k * angle + rng.uniform(0.0, 2 * np.pi))
+        radius = np.maximum(radius, 0.15)
+        points = radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    else:
+        half = rng.uniform(0.03, 0.18)
+        points = np.array([[-1.0, -half], [1.0, -half], [1.0, half], [-1.0, half]])
+    points /= np.sqrt((points**2).sum(axis=1).max())
+    heading = rng.uniform(0.0, 2 * np.pi)
+    c, s = np.cos(heading), np.sin(heading)
+    return points @ np.array([[c, s], [-s, c]])
+
+
+@dataclass(frozen=True, eq=False)
+class Silhouette:
+    """Filled outlines (N, 2) in unit coordinates; one that does not add cuts a hole."""
+
+    parts: tuple[tuple[np.ndarray, bool], ...]
+
+    def draw(
+        self,
+        mask: np.ndarray,
+        centre: tuple[float, float],
+        radius: float,
+        stretch: float = 1.0,
+    ) -> None:
+        """Paint into an (H, W) uint8 mask of its own: ``centre`` (u, v) and ``radius`` of one unit
+        in px, ``stretch`` horizontal over vertical scale.
+        """
+        limit = 8 * max(mask.shape)
+        scale = np.array([radius * np.sqrt(stretch), radius / np.sqrt(stretch)])
+        for points, adds in self.parts:
+            pixels = np.clip(points * scale + centre, -limit, limit)
+            sixteenths = np.round(pixels * 16).astype(np.int32)
+            cv2.fillPoly(mask, [sixteenths], int(adds), cv2.LINE_8, 4)
+
+    def draw_coverage(
+        self,
+        height: int,
+        width: int,
+        centre: tuple[float, float],
+        share: float,
+        stretch: float = 1.0,
+    ) -> tuple[np.ndarray, float]:
+        """(H, W) uint8 mask and radius in px at which a share of the image is covered to about 1 %,
+        or the largest share below it that the shape can reach.
+        """
+        low, high = 0.0, 4.0 * float(np.hypot(height, width))
+        best = np.zeros((height, width), np.uint8)
+        radius = low
+        for _ in range(12):
+            middle = 0.5 * (low + high)
+            mask = np.zeros((height, width), np.uint8)
+            self.draw(mask, centre, middle, stretch)
+            covered = cv2.countNonZero(mask) / mask.size
+            if covered <= share:
+                low = radius = middle
+                best = mask
+                if covered > share - 0.01:
+                    break
+            else:
+                high = middle
+        return best, radius
+
+
+def random_silhouette(rng: np.random.Generator, hole_probability: float = 0.4) -> Silhouette:
+    """Union of one to four outlines, from which one or two smaller ones may be cut."""
+    first = KINDS[int(rng.choice(4, p=[0.35, 0.3, 0.3, 0.05]))]
+    parts: list[tuple[np.ndarray, bool]] = [(outline(rng, first), True)]
+    for _ in range(int(rng.integers(0, 4))):
+        kind = KINDS[int(rng.integers(4))]
+        size = rng.uniform(0.7, 1.3) if kind == "bar" else rng.uniform(0.3, 0.8)
+        parts.append((size * outline(rng, kind) + rng.uniform(-0.6, 0.6, 2), True))
+    if rng.random() < hole_probability:
+        for _ in range(int(rng.integers(1, 3))):
+            kind = KINDS[int(rng.integers(3))]
+            points = rng.uniform(0.12, 0.4) * outline(rng, kind) + rng.uniform(-0.6, 0.6, 2)
+            parts.append((points, False))
+    return Silhouette(tuple(parts))
+
+
+def silhouette_mask(rng: np.random.Generator, size: int) -> np.ndarray:
+    """(h, w) bool mask of a random silhouette that fills a square of ``size`` px, cropped to it."""
+    while True:
+        shape = random_silhouette(rng)
+        added = np.concatenate([points for points, adds in shape.parts if adds])
+        low, high = added.min(axis=0), added.max(axis=0)
+        radius = size / float((high - low).max())
+        centre = (size - 1) / 2 - radius * (low + high) / 2
+        mask = np.zeros((size, size), np.uint8)
+        shape.draw(mask, (float(centre[0]), float(centre[1])), radius)
+        left, top, width, height = cv2.boundingRect(mask)
+        # A hole can swallow a small shape; a mover without pixels would be none.
+        if width * height and cv2.countNonZero(mask) > 0.02 * mask.size:
+            return mask[top : top + height, left : left + width].astype(bool)

@@ -1,15 +1,25 @@
-"""Surfaces laid over each other in inverse depth: what every generator of training pairs builds on.
+"""Training pairs of surfaces laid over each other, and the paper's five steps of drawing them.
 
 Everything is computed in inverse depth on normalised rays, so that sky is exact (0) and single
-precision suffices.
+precision suffices. The paper (section 3.4; samplers as published): 1. intrinsics; 2. depth, a
+constant background and five constant objects; 3. motions of camera and objects; 4. the rigid flow
+of each; 5. composition, nearest in front, **adding** an object's own flow to the camera's.
+Silhouettes are procedural: the published photographs are a download of a third party.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import cv2
 import numpy as np
+from pydantic import Field
+
+from hybridvo.errors import InputError
+from hybridvo.geometry import euler_deg_to_matrix, make_transform
+from hybridvo.options import Positive, Share, option_group
+from hybridvo.synthetic.draws import silhouette_mask
 
 MIN_RATIO = np.float32(1e-6)
 """Added to |z' / z|: the flow of a point in the image plane stays finite."""
@@ -54,9 +64,7 @@ class Sample:
 class Layers:
     """Inverse depth, owner and motion of every pixel while surfaces are laid over each other.
 
-    Args:
-        K: (3, 3) intrinsics of the sample.
-        rho: (H, W) float32 inverse depth of the background, 0 for sky; is changed in place.
+    ``rho``: (H, W) float32 inverse depth of the background, 0 for sky; is changed in place.
     """
 
     def __init__(self, K: np.ndarray, rho: np.ndarray) -> None:
@@ -70,15 +78,9 @@ class Layers:
     def lay(
         self, box: tuple[slice, slice], inside: np.ndarray, rho: np.ndarray | float
     ) -> np.ndarray:
-        """Add a surface that does not move yet; its number is that of the layers before it.
+        """Add a surface that does not move yet; returns where it is in front of what was there.
 
-        Args:
-            box: rows and columns of the image that it may touch.
-            inside: (h, w) bool, its outline in the box.
-            rho: inverse depth there.
-
-        Returns:
-            (h, w) bool, where it is in front of what was there.
+        ``inside``: (h, w) bool, its outline in the box of rows and columns; ``rho``: inverse depth.
         """
         shown = inside & (rho > self.rho[box])
         self.owner[box][shown] = len(self.motions)
@@ -90,15 +92,10 @@ class Layers:
     def flows(
         self, T_curr_prev: np.ndarray, added: bool
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Flow of the camera alone, and with the motions of the layers.
+        """(H, W, 2) ego flow, (H, W) its ratio of new depth to old, total flow and its ratio.
 
-        Args:
-            T_curr_prev: (4, 4) motion of the camera.
-            added: layers' motions are their own, and their flow is added to the camera's (as the
-                paper does); else they contain the camera's and replace it.
-
-        Returns:
-            (H, W, 2) ego flow and (H, W) its ratio of new depth to old, total flow and its ratio.
+        ``added``: layers' motions are their own, and their flow is added to the camera's (as the
+        paper does); else they contain the camera's and replace it.
         """
         focal = (float(self.K[0, 0]), float(self.K[1, 1]))
         T = T_curr_prev
@@ -140,26 +137,15 @@ def normalized_grid(K: np.ndarray, height: int, width: int) -> tuple[np.ndarray,
 def rigid_flow(
     x: np.ndarray,
     y: np.ndarray,
-    inverse_depth: np.ndarray | float,
+    inverse_depth: np.ndarray,
     R: np.ndarray,
-    t: tuple[np.ndarray | float, np.ndarray | float, np.ndarray | float] | np.ndarray,
+    t: np.ndarray,
     focal: tuple[float, float],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Flow of a rigid motion from normalised coordinates and inverse depth (paper, equation 8).
+    """Flow (u, v) of a rigid motion in px and the ratio of the new depth to the old, (H, W) each.
 
-    Written as differences, so that single precision suffices, and in inverse depth, so that a
-    point at infinity (0) is exact.
-
-    Args:
-        x: (W,) normalised horizontal coordinates of the pixels (or any shape that broadcasts).
-        y: (H, 1) normalised vertical coordinates.
-        inverse_depth: (H, W) 1/metres, or one number for a constant depth.
-        R: (3, 3) rotation of the points.
-        t: their translation in metres: three numbers or (H, W) arrays.
-        focal: fx, fy in pixels.
-
-    Returns:
-        u and v flow in pixels and the ratio of the new depth to the old, each (H, W).
+    Paper, equation 8, written as differences, so that single precision suffices: ``x`` (W,) and
+    ``y`` (H, 1) normalised coordinates, ``inverse_depth`` (H, W) or one number, ``t`` metres.
     """
     R = np.asarray(R, dtype=np.float32)
     ratio = (R[2, 0] * x + (R[2, 1] * y + R[2, 2])) + t[2] * inverse_depth
@@ -173,16 +159,10 @@ def rigid_flow(
 def visibility(
     flow: np.ndarray, rho_curr: np.ndarray, solid: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Who is hidden in the next frame, and the depth that is seen at x + flow.
+    """Who is hidden in the next frame or outside, and the depth of t+1 on the grid of t.
 
-    Args:
-        flow: (H, W, 2) px, true.
-        rho_curr: (H, W) inverse depth of each moved point.
-        solid: (H, W) bool, not sky.
-
-    Returns:
-        (H, W) bool, hidden behind something nearer or outside of the picture, and (H, W) float32
-        metres of t+1 on the grid of t; 0 outside and for sky.
+    From the true flow, inverse depths of the moved points and where there is no sky; the depth is
+    0 outside and for sky.
     """
     height, width = rho_curr.shape
     u = np.rint(flow[..., 0] + np.arange(width, dtype=np.float32)).astype(np.int32)
@@ -198,3 +178,188 @@ def visibility(
     known = inside & (solid | covered)
     depth = np.where(known, 1.0 / np.maximum(inverse, np.float32(1e-5)), 0.0)
     return covered | ~inside, depth.astype(np.float32)
+
+
+@option_group
+class TailSampler:
+    """Normal core with a heavy tail, truncated to an interval by rejection.
+
+    With ``tail_probability`` the value is sign(g) |g|^power, g ~ N(mean, tail_std), otherwise
+    N(mean, core_std); the branch is chosen once, then values outside [low, high] are drawn again.
+    """
+
+    mean: float
+    tail_std: Positive
+    power: Positive
+    tail_probability: Share
+    low: float
+    high: float
+    core_std: Positive
+
+    def __post_init__(self) -> None:
+        if not self.low < self.high:
+            raise InputError(f"expected low < high, got {self.low} and {self.high}")
+
+    def draw(self, rng: np.random.Generator, low: float | None = None) -> float:
+        """One value; ``low`` replaces the lower limit where the scene demands it."""
+        low = self.low if low is None else low
+        tail = rng.random() < self.tail_probability
+        spread = self.tail_std if tail else self.core_std
+        for _ in range(10_000):
+            value = self.mean + spread * rng.standard_normal()
+            if tail:
+                value = np.sign(value) * abs(value) ** self.power
+            if low <= value <= self.high:
+                return float(value)
+        raise InputError(
+            f"TailSampler: none of 10 000 draws of {self} fell into [{low}, {self.high}]."
+        )
+
+
+ThreeSamplers = tuple[TailSampler, TailSampler, TailSampler]
+ROTATION: ThreeSamplers = (
+    TailSampler(0.0, 1.5, 2.5, 0.15, -9.0, 9.0, 0.2),
+    TailSampler(0.0, 2.0, 2.0, 0.15, -9.0, 9.0, 0.2),
+    TailSampler(0.0, 1.5, 2.5, 0.15, -8.0, 8.0, 0.2),
+)
+TRANSLATION: ThreeSamplers = (
+    TailSampler(0.0, 0.4, 2.5, 0.15, -0.7, 0.7, 0.03),
+    TailSampler(0.0, 0.25, 2.0, 0.2, -0.4, 0.4, 0.025),
+    TailSampler(0.0, 1.8, 2.5, 0.15, -5.0, 5.0, 0.02),
+)
+
+
+@option_group
+class MotionSamplers:
+    """Samplers of one rigid motion (step 3), of the camera or an object.
+
+    Euler angles X, Y, Z in degrees, R = Rx Ry Rz, and metres; the Z translation is at least minus
+    ``backward_share`` of the depth that moves, so that nothing is carried through the image plane.
+    """
+
+    rotation_deg: ThreeSamplers = ROTATION
+    translation: ThreeSamplers = TRANSLATION
+    backward_share: Share = 0.2
+
+    def draw(self, rng: np.random.Generator, depth: float) -> tuple[np.ndarray, np.ndarray]:
+        """Euler angles (3,) in degrees and translation (3,) in metres of a thing at this depth."""
+        angles = np.array([sampler.draw(rng) for sampler in self.rotation_deg])
+        x, y, z = self.translation
+        low = max(z.low, -self.backward_share * depth)
+        return angles, np.array([x.draw(rng), y.draw(rng), z.draw(rng, low)])
+
+
+Pixels = Annotated[int, Field(ge=2)]
+
+
+@option_group
+class PaperOptions:
+    """Options of the five steps, as published; units and reasons: ``configs/data_paper.yaml``."""
+
+    height: Pixels = 128
+    width: Pixels = 256
+    full_height: Pixels = 436
+    full_width: Pixels = 1024
+    focal: TailSampler = TailSampler(0.03, 0.5, 2.0, 0.4, 0.0, 1.0, 0.08)
+    focal_low: Positive = 576.0
+    focal_high: Positive = 3200.0
+    background_depth: TailSampler = TailSampler(0.6, 0.2, 2.0, 0.5, 0.0, 1.0, 0.1)
+    background_low: Positive = 1.0
+    background_high: Positive = 80.0
+    background_far_probability: Share = 0.1
+    background_far: Positive = 3200.0
+    object_depth: TailSampler = TailSampler(0.6, 0.6, 1.5, 0.4, 0.0, 1.0, 0.2)
+    object_near_divisor: Positive = 5200.0
+    objects: Annotated[int, Field(ge=0, le=64)] = 5
+    move_probability: Share = 0.6
+    object_size: tuple[float, Positive, Positive, Share] = (0.55, 0.2, 0.25, 0.7)
+    canvas_margin: Annotated[float, Field(ge=0, le=4)] = 0.25
+    motion: MotionSamplers = MotionSamplers()
+
+    def __post_init__(self) -> None:
+        if not self.focal_low <= self.focal_high:
+            raise InputError("expected focal_low <= focal_high")
+        if not self.background_low < self.background_high <= self.background_far:
+            raise InputError("expected background_low < background_high <= background_far")
+        mean, spread, low, high = self.object_size
+        if not (low < high and low - 3 * spread < mean < high + 3 * spread):
+            raise InputError(
+                f"object_size: expected (mean, spread, low, high) with low < high, got "
+                f"{self.object_size}"
+            )
+
+    def sample(self, rng: np.random.Generator) -> Sample:
+        """One pair by the five steps."""
+        return _paper_sample(rng, self)
+
+
+def _paper_sample(rng: np.random.Generator, o: PaperOptions) -> Sample:
+    # Step 1. The published code resizes corner to corner, hence fx != fy at 128x256.
+    f = o.focal_low + o.focal.draw(rng) * (o.focal_high - o.focal_low)
+    fx = f * (o.width - 1) / (o.full_width - 1)
+    fy = f * (o.height - 1) / (o.full_height - 1)
+    K = np.array([[fx, 0, (o.width - 1) / 2], [0, fy, (o.height - 1) / 2], [0, 0, 1]])
+
+    # Step 2.
+    if rng.random() < o.background_far_probability:
+        background = rng.uniform(o.background_high, o.background_far)
+    else:
+        span = o.background_high - o.background_low
+        background = o.background_low + o.background_depth.draw(rng) * span
+    near = f / o.object_near_divisor
+    depths = [
+        near + o.object_depth.draw(rng) * (background - near) if background > near else background
+        for _ in range(o.objects)
+    ]
+    layers = Layers(K, np.full((o.height, o.width), 1.0 / background, np.float32))
+    for depth in depths:
+        box, mask = _place(rng, o)
+        layers.lay(box, mask, float(np.float32(1.0 / depth)))
+
+    # Step 3.
+    angles, t = o.motion.draw(rng, min(depths, default=background))
+    T = make_transform(euler_deg_to_matrix(angles), t)
+    for number, depth in enumerate(depths):
+        if rng.random() < o.move_probability:
+            own_angles, own_t = o.motion.draw(rng, depth)
+            layers.motions[number] = make_transform(euler_deg_to_matrix(own_angles), own_t)
+
+    # Steps 4 and 5.
+    ego_flow, _, flow, ratio = layers.flows(T, added=True)
+    moving = [number for number, motion in enumerate(layers.motions) if motion is not None]
+    depth_prev = 1.0 / layers.rho
+    depth_curr = np.maximum(depth_prev * ratio, 0.0)
+    return Sample(
+        flow=flow,
+        ego_flow=ego_flow,
+        depth_prev=depth_prev,
+        depth_curr=depth_curr,
+        depth_true=depth_prev,
+        depth_target=depth_curr,
+        K=K.astype(np.float32),
+        T_curr_prev=T.astype(np.float32),
+        rotation_deg=angles.astype(np.float32),
+        translation=t.astype(np.float32),
+        moving=np.isin(layers.owner, moving),
+    )
+
+
+def _place(rng: np.random.Generator, o: PaperOptions) -> tuple[tuple[slice, slice], np.ndarray]:
+    """A silhouette at a uniform position of the canvas: its box in the picture and its mask."""
+    mean, spread, low, high = o.object_size
+    share = low - 1.0
+    while not low <= share <= high:
+        share = mean + spread * rng.standard_normal()
+    mask = silhouette_mask(rng, max(int(o.width * share), 2))
+    if rng.random() < 0.5:
+        mask = mask[:, ::-1]
+    margins = int(o.height * o.canvas_margin), int(o.width * o.canvas_margin)
+    box = []
+    crop = []
+    for size, margin, extent in zip((o.height, o.width), margins, mask.shape, strict=True):
+        start = int(rng.integers(0, max(size + 2 * margin - extent, 0) + 1)) - margin
+        first, last = max(start, 0), min(start + extent, size)
+        last = max(first, last)
+        box.append(slice(first, last))
+        crop.append(slice(first - start, last - start))
+    return (box[0], box[1]), mask[crop[0], crop[1]]

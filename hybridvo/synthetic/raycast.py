@@ -1,11 +1,9 @@
 """Ray casting of textured boxes, ellipsoids and cylinders: exact depth, flow and visibility.
 
-Every solid is a unit shape under an affine map, so that one intersection routine per shape serves
-rigid and deforming bodies alike. A ray is (x, y, 1) t in the camera frame: its parameter t *is* the
-depth, and an affine map leaves it unchanged. Compiled with numba, one thread, float64 throughout.
-
-P solids are given by ``shapes`` (P,) int64, ``A`` (P, 3, 4) maps from the unit shape to the camera
-frame in metres, their inverses ``B``, and ``bounds`` (P, 4) of :func:`screen_bounds`; K: (3, 3).
+A ray is (x, y, 1) t in the camera frame: its parameter t *is* the depth, and an affine map leaves
+it unchanged. P solids are given by ``shapes`` (P,) int64, ``A`` (P, 3, 4) maps from the unit shape
+to the camera frame in metres, their inverses ``B``, and ``bounds`` (P, 4) of
+:func:`screen_bounds`; K: (3, 3).
 """
 
 from __future__ import annotations
@@ -118,11 +116,7 @@ def cast(shapes, B_body_cam, bounds, K, height, width):  # pragma: no cover - co
 def motion(  # pragma: no cover - compiled
     depth, index, B_prev, K_prev, shapes, A_curr, B_curr, bounds_curr, K_curr
 ):
-    """Exact optical flow and visibility of every pixel in the next frame.
-
-    The visible point of a pixel is carried by its solid from t to t+1 and projected into the next
-    camera; a ray cast exactly there says whether it is seen. ``depth`` and ``index`` are those of
-    :func:`cast` in the previous frame.
+    """Exact optical flow and visibility in the next frame, from depth and index of :func:`cast`.
 
     Returns:
         (H, W, 2) float64 flow in pixels, NaN where there is no surface or it ends behind the next
@@ -245,11 +239,10 @@ def _texture(body, scale, offset, pixels):  # pragma: no cover - compiled
 def shade(  # pragma: no cover - compiled
     depth, index, shapes, B_body_cam, K, scale, offset, colours, light_cam
 ):
-    """Colour of every ray: solid multi-octave noise fixed to the body, times diffuse light.
+    """(H, W, 3) float64 in [0, 1]: multi-octave noise fixed to the body, times diffuse light.
 
     ``scale`` (P, 3): lattice steps of the coarsest octave per unit of the unit shape; ``offset``
-    (P, 3): place in the noise; ``colours`` (P, 2, 3) in [0, 1]; ``light_cam`` (3,): unit direction
-    towards the light. (H, W, 3) float64 in [0, 1], 0 where nothing is hit.
+    (P, 3): place in the noise; ``light_cam`` (3,): unit direction towards the light.
     """
     height, width = depth.shape
     image = np.zeros((height, width, 3))

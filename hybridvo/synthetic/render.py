@@ -1,4 +1,4 @@
-"""Rendered sequences with exact depth, flow, visibility, camera path and moving objects.
+"""Scenes of textured solids, rendered with exact depth, flow, visibility and moving objects.
 
 Everything here is ground truth by construction: an oracle, and named so wherever it is used.
 """
@@ -6,6 +6,7 @@ Everything here is ground truth by construction: an oracle, and named so whereve
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence as Items
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,115 +18,203 @@ from hybridvo.data.image_io import write_cam, write_dpt, write_flo
 from hybridvo.errors import InputError, OutputError
 from hybridvo.files import make_folder
 from hybridvo.geometry import invert
-from hybridvo.synthetic.scene import Scene
-from hybridvo.synthetic.scenes import BANDS, draw_scene
+from hybridvo.synthetic.raycast import cast, motion, screen_bounds, shade
 from hybridvo.types import Camera, Frame
-
-MAX_FRAMES = 100_000
-"""Of a scene: an hour at 30 frames a second. Its cameras are drawn at once, in memory."""
-ATTEMPTS = 200
-"""Draws of a family before a share is given up."""
-
-
-def make_scene(
-    kind: str,
-    seed: int,
-    *,
-    height: int = 218,
-    width: int = 512,
-    frames: int | None = None,
-    moving: float | None = None,
-    zoom: float = 0.0,
-    noise: float = 0.0,
-) -> Scene:
-    """Scene of a family, drawn from a seed.
-
-    Args:
-        kind: ``static``; ``light`` (several movers, about 30 % of the pixels); ``pair`` (small
-            random); ``heavy_rigid``, ``heavy_deforming``, ``heavy_two``, ``heavy_ten``: 46 to 75 %
-            of the pixels on movers in every frame, and at least 46 % whose flow differs from the
-            camera's by over 1/512 of the width.
-        seed: not negative; the same seed gives the same images.
-        height: pixels.
-        width: pixels.
-        frames: default 20, for ``pair`` 2; at most :data:`MAX_FRAMES`.
-        moving: median share of the pixels on movers; None for the family's own (light 0.3,
-            heavy 0.6, pair random).
-        zoom: relative amplitude of a slow change of focal length.
-        noise: sensor noise, standard deviation in grey levels.
-
-    Raises:
-        InputError: an unknown kind, a value out of range, or a share that the family cannot keep.
-
-    Example:
-        >>> scene = make_scene("static", 0, height=16, width=32, frames=2)
-        >>> scene.render(0).rgb.shape
-        (16, 32, 3)
-    """
-    if frames is None:
-        frames = 2 if kind == "pair" else 20
-    if kind not in BANDS:
-        raise InputError(f"scene kind: expected one of {', '.join(BANDS)}, got {kind!r}.")
-    for name, value, least in (("seed", seed, 0), ("frames", frames, 2), ("height", height, 8),
-                               ("width", width, 8)):  # fmt: skip
-        if isinstance(value, bool) or int(value) != value or value < least:
-            raise InputError(f"{name}: expected an integer of at least {least}, got {value!r}.")
-    if frames > MAX_FRAMES:
-        raise InputError(f"frames: expected at most {MAX_FRAMES}, got {frames}.")
-    if not 0.0 <= zoom <= 0.3:
-        raise InputError(f"zoom: expected 0 to 0.3, got {zoom}.")
-    low, high = BANDS[kind]
-    if moving is not None and (kind == "static" or not low < moving < high):
-        raise InputError(
-            f"moving: a {kind!r} scene can have {low} to {high} of its pixels moving, got {moving}."
-        )
-    for attempt in range(ATTEMPTS):
-        rng = np.random.default_rng([list(BANDS).index(kind), seed, attempt])
-        scene = draw_scene(rng, kind, (height, width), frames, moving, zoom, noise)
-        if scene is not None:
-            return scene
-    raise InputError(
-        f"scene {kind!r}, seed {seed}: no draw of {ATTEMPTS} kept {moving} of the pixels moving "
-        f"over {frames} frames; ask for another share or seed."
-    )
 
 
 @dataclass(frozen=True, eq=False)
-class SyntheticSequence(Sequence):
-    """A scene as a sequence, rendered on the fly.
+class Solid:
+    """One textured BOX, ELLIPSOID or CYLINDER of :mod:`hybridvo.synthetic.raycast`.
 
     Args:
-        scene: the scene. name: of the sequence. fps: frames per second.
+        A_world_body: (3, 4), or (N, 3, 4) for one that moves or deforms; metres. The columns are
+            the half axes and the centre.
+        object_id: 0 for static solids; solids of one mover share a positive number.
+        wavelength: metres of the coarsest texture octave.
+        colours: (2, 3) in [0, 1], mixed by the texture.
     """
 
-    scene: Scene
-    name: str = "synthetic"
-    fps: float = 24.0
+    shape: int
+    A_world_body: np.ndarray
+    object_id: int = 0
+    wavelength: float = 1.6
+    colours: tuple[Items[float], Items[float]] = ((0.9, 0.8, 0.7), (0.6, 0.8, 0.9))
+
+
+@dataclass(frozen=True, eq=False)
+class RenderedFrame:
+    """(H, W, 3) uint8 image, (H, W) float32 depth in metres, inf where nothing is hit, and (H, W)
+    int32 object number: 0 static, 1.. movers, -1 where nothing is hit.
+    """
+
+    rgb: np.ndarray
+    depth: np.ndarray
+    object_id: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Cameras of one size, camera path and solids of N frames.
+
+    Args:
+        T_world_cam: (N, 4, 4) metres.
+        seed: of the texture and the noise.
+        light: direction towards the light, world frame.
+        noise: standard deviation of the sensor noise, grey levels.
+    """
+
+    cameras: tuple[Camera, ...]
+    T_world_cam: np.ndarray
+    solids: tuple[Solid, ...]
+    seed: int = 0
+    light: tuple[float, float, float] = (0.4, -0.8, -0.45)
+    noise: float = 0.0
+
+    @property
+    def frames(self) -> int:
+        """Number of frames."""
+        return len(self.cameras)
+
+    @property
+    def shapes(self) -> np.ndarray:
+        """(P,) int64 shape of every solid."""
+        return np.array([s.shape for s in self.solids], dtype=np.int64)
+
+    @property
+    def object_ids(self) -> np.ndarray:
+        """(P,) int32 object number of every solid; 0 is static."""
+        return np.array([s.object_id for s in self.solids], dtype=np.int32)
+
+    def camera(self, index: int) -> Camera:
+        """Intrinsics of one frame."""
+        return self.cameras[self._check(index)]
+
+    def _check(self, index: int, last: int = 0) -> int:
+        if not 0 <= index < self.frames - last:
+            what = "pair" if last else "frame"
+            raise InputError(
+                f"Scene: {what} {index} of {self.frames - last}; "
+                f"expected 0 to {self.frames - last - 1}."
+            )
+        return int(index)
+
+    def _maps(
+        self, index: int, camera_index: int, size: tuple[int, int], K: np.ndarray
+    ) -> tuple[np.ndarray, ...]:
+        """Maps (P, 3, 4) of the solids of a frame to a camera, their inverses, and their bounds."""
+        solids = [s.A_world_body for s in self.solids]
+        A = np.stack([A if A.ndim == 2 else A[index] for A in solids])
+        E = invert(self.T_world_cam[camera_index])[:3]
+        A_cam = E[:, :3] @ A
+        A_cam[:, :, 3] += E[:, 3]
+        inverse = np.linalg.inv(A_cam[:, :, :3])
+        B = np.concatenate([inverse, -inverse @ A_cam[:, :, 3:]], axis=2)
+        return A_cam, B, screen_bounds(A_cam, K, *size)
+
+    def _cast(
+        self, index: int, size: tuple[int, int], K: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Maps to unit shapes, depth and index of the solid of each pixel of a frame."""
+        _, B, bounds = self._maps(index, index, size, K)
+        return B, *cast(self.shapes, B, bounds, K, *size)
+
+    def _motion(
+        self, index: int, moved: tuple[int, int], size: tuple[int, int], K: Items[np.ndarray]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Flow of a frame, what is hidden, and the solid of each pixel.
+
+        ``moved`` says which frame's solids are seen by which frame's camera in the end.
+        """
+        B, depth, solid = self._cast(index, size, K[0])
+        A1, B1, bounds1 = self._maps(*moved, size, K[1])
+        return *motion(depth, solid, B, K[0], self.shapes, A1, B1, bounds1, K[1]), solid
+
+    def _object_id(self, solid: np.ndarray) -> np.ndarray:
+        return np.where(solid < 0, np.int32(-1), self.object_ids[solid])
+
+    def render(self, index: int) -> RenderedFrame:
+        """One frame: depth and object of the ray through a centre, colour of four rays a pixel."""
+        camera = self.camera(index)
+        height, width = camera.shape
+        _, depth, solid = self._cast(index, camera.shape, camera.K)
+        # twice the resolution: u' = 2 u + 0.5 puts the four rays at +-0.25 px of the centre
+        K2 = np.array([[2.0, 0.0, 0.5], [0.0, 2.0, 0.5], [0.0, 0.0, 1.0]]) @ camera.K
+        B, depth2, solid2 = self._cast(index, (2 * height, 2 * width), K2)
+        scale, offset, colours = self._texture()
+        light = self.T_world_cam[index][:3, :3].T @ np.asarray(self.light, dtype=float)
+        light /= np.linalg.norm(light)
+        fine = shade(depth2, solid2, self.shapes, B, K2, scale, offset, colours, light)
+        image = 255.0 * fine.reshape(height, 2, width, 2, 3).mean(axis=(1, 3))
+        if self.noise > 0:
+            rng = np.random.default_rng([self.seed, index])
+            image = image + self.noise * rng.standard_normal(image.shape)
+        rgb = np.clip(np.rint(image), 0, 255).astype(np.uint8)
+        return RenderedFrame(rgb, depth.astype(np.float32), self._object_id(solid))
+
+    def _texture(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Lattice scale (P, 3), offset (P, 3) and colours (P, 2, 3) of all solids."""
+        first = np.stack([np.reshape(s.A_world_body, (-1, 3, 4))[0, :, :3] for s in self.solids])
+        wavelength = np.array([s.wavelength for s in self.solids])
+        scale = np.linalg.norm(first, axis=1) / wavelength[:, None]
+        offset = np.random.default_rng([self.seed, 1]).uniform(0, 500, (len(self.solids), 3))
+        return scale, offset, np.array([s.colours for s in self.solids], dtype=float)
+
+    def flow(self, index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(H, W, 2) float32 px exact flow from a frame to the next one, NaN where nothing is hit;
+        (H, W) bool, True where the point is hidden or outside in the next frame; (H, W) bool,
+        True on moving objects.
+        """
+        index = self._check(index, last=1)
+        pair = self.cameras[index : index + 2]
+        moved = (index + 1, index + 1)
+        flow, hidden, solid = self._motion(index, moved, pair[0].shape, [c.K for c in pair])
+        return flow.astype(np.float32), hidden, self._object_id(solid) > 0
+
+    def object_id(self, index: int) -> np.ndarray:
+        """(H, W) int32 object numbers of a frame, without rendering colour."""
+        camera = self.camera(index)
+        return self._object_id(self._cast(index, camera.shape, camera.K)[-1])
+
+    def moving_share(self, index: int, width: int = 96) -> tuple[float, float]:
+        """Share of the pixels of a frame on movers, and the smallest depth; in a small image."""
+        _, depth, hit = self._cast(index, *_small_view(self.cameras[index], width))
+        return float(np.mean((self.object_ids[hit] > 0) & (hit >= 0))), float(depth.min())
+
+    def dynamic_share(self, index: int, width: int = 96, threshold_px: float = 1.0) -> float:
+        """Share of the pixels whose flow differs from the camera's own by more than a threshold.
+
+        In a small image; the threshold is in px of the full one. A mover may stand nearly still.
+        """
+        views = [_small_view(camera, width) for camera in self.cameras[index : index + 2]]
+        size = views[0][0]
+        flows = [
+            self._motion(index, (moved, index + 1), size, [K for _, K in views])[0]
+            for moved in (index + 1, index)
+        ]
+        difference = np.linalg.norm(flows[0] - flows[1], axis=-1)
+        return float(np.mean(difference > threshold_px * size[1] / self.cameras[index].width))
+
+
+def _small_view(camera: Camera, width: int) -> tuple[tuple[int, int], np.ndarray]:
+    """Size and intrinsics of an image of at most ``width`` columns."""
+    ratio = min(1.0, width / camera.width)
+    small_width, small_height = round(camera.width * ratio), max(1, round(camera.height * ratio))
+    scale = np.diag([small_width / camera.width, small_height / camera.height, 1.0])
+    return (small_height, small_width), scale @ camera.K
+
+
+class SyntheticSequence(Sequence):
+    """A scene as a sequence, rendered on the fly; there is no folder, the name stands for it."""
 
     kind = "synthetic"
     depth_source = "true"
     has_flow = True
     flow_is_true = True
 
-    @property
-    def root(self) -> Path:  # type: ignore[override]
-        """There is no folder; the name stands for it."""
-        return Path(self.name)
-
-    @property
-    def timestamps(self) -> np.ndarray:  # type: ignore[override]
-        """(N,) float64 seconds."""
-        return np.arange(len(self)) / self.fps
-
-    @property
-    def poses(self) -> np.ndarray:  # type: ignore[override]
-        """(N, 4, 4) true T_world_cam."""
-        return self.scene.T_world_cam
-
-    @property
-    def warnings(self) -> list[str]:  # type: ignore[override]
-        """Nothing was mended."""
-        return []
+    def __init__(self, scene: Scene, name: str = "synthetic", fps: float = 24.0) -> None:
+        self.scene, self.name, self.root = scene, name, Path(name)
+        self.timestamps = np.arange(scene.frames) / fps
+        self.poses, self.warnings = scene.T_world_cam, []
 
     def __len__(self) -> int:
         return self.scene.frames
@@ -161,13 +250,7 @@ def write_sintel(scene: Scene, root: str | os.PathLike[str], name: str) -> None:
     """Writes a scene in the layout of MPI Sintel.
 
     ``root/training/{clean,depth,camdata_left,invalid}/NAME/frame_0001.*`` for each frame,
-    ``{flow,occlusions}`` for each frame but the last, and ``moving`` (ours: 255 on moving objects)
-    for each frame.
-
-    Args:
-        scene: what to write.
-        root: created where absent.
-        name: of the sequence, one path part.
+    ``{flow,occlusions}`` for each but the last, and ``moving`` (ours: 255 on moving objects).
 
     Raises:
         InputError: a name that is not a plain folder name.

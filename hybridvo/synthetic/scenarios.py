@@ -1,9 +1,7 @@
 """Synthetic pairs of the solver benchmark: exact geometry, known noise, moving objects, no images.
 
-These are the cells on which the published solvers were measured: 436x1024 pixels, fx 1120, depth
-1-30 m with structure, rotation 0-3 degrees, translation 0-0.3 m, a share of the pixels on
-independently moving rigid objects, noise on flow and depth. A pair depends on (cell, seed) alone.
-The images that a method would see are not rendered: ``Frame.rgb`` is None.
+A pair depends on (cell, seed) alone. Seeds 0-999 are for development, 1000 and up for published
+figures.
 """
 
 from __future__ import annotations
@@ -80,20 +78,15 @@ SCENARIOS: dict[str, Scenario] = {
 def make_pair(
     cell: str | Scenario, seed: int, height: int = 436, width: int = 1024
 ) -> tuple[FramePair, dict[str, Any]]:
-    """A pair of the cell and its truth.
+    """A pair of a row of :data:`SCENARIOS`, or of conditions of one's own, and its truth.
 
-    Args:
-        cell: name of a row of :data:`SCENARIOS`, or conditions of one's own.
-        seed: development uses 0-999, published figures 1000 and up.
-        height: image height in pixels.
-        width: image width in pixels; the focal length scales with it (1120 px at 1024).
+    The focal length scales with the width: 1120 px at 1024.
 
     Returns:
-        The pair (float32 contiguous arrays; the current depth is NaN where the previous frame saw
-        nothing) and the truth: ``T_curr_prev`` (4, 4), ``depth_true`` (H, W) float32 metres on the
-        previous grid, ``moving`` (H, W) bool, ``object``
-        (H, W) uint8 label (0 is the world), ``outlier`` (H, W) bool, ``flow_true`` (H, W, 2)
-        float32 of the surface, objects included.
+        The pair (the current depth is NaN where the previous frame saw nothing) and the truth:
+        ``T_curr_prev`` (4, 4), ``depth_true`` (H, W) float32 metres on the previous grid,
+        ``moving`` (H, W) bool, ``object`` (H, W) uint8 label (0 is the world), ``outlier`` (H, W)
+        bool, ``flow_true`` (H, W, 2) float32 of the surface, objects included.
 
     Raises:
         InputError: unknown cell, negative seed, or an image below 16 pixels.
@@ -151,27 +144,9 @@ def make_model_pair(
 
     Smooth depth of 3-13 m with one step; Gaussian flow noise and log-normal depth noise, both
     independent per pixel; no outliers, no second depth. Under this noise the normalised error of a
-    right covariance is chi-square with six degrees of freedom.
-
-    Args:
-        seed: development uses 0-999, published figures 1000 and up.
-        height: image height in pixels.
-        width: image width in pixels; the focal lengths scale with it (350 and 340 px at 320).
-        flow_noise_px: standard deviation of each flow component.
-        depth_noise: standard deviation of log depth.
-
-    Returns:
-        The pair (float32), and ``T_curr_prev`` (4, 4), ``depth_true`` (H, W) float64 metres and
-        ``flow_true`` (H, W, 2) float64 px.
-
-    Raises:
-        InputError: negative seed or noise, or an image below 16 pixels.
+    right covariance is chi-square with six degrees of freedom. The truth: ``T_curr_prev`` (4, 4),
+    ``depth_true`` (H, W) float64 metres and ``flow_true`` (H, W, 2) float64 px.
     """
-    if seed < 0 or min(height, width) < 16 or not (flow_noise_px >= 0 and depth_noise >= 0):
-        raise InputError(
-            f"make_model_pair: expected seed >= 0, at least 16x16 pixels and noise >= 0, got seed "
-            f"{seed}, {height}x{width}, flow noise {flow_noise_px} and depth noise {depth_noise}."
-        )
     rng = np.random.default_rng([zlib.crc32(b"model"), int(seed)])
     camera = Camera(
         350 / 320 * width, 340 / 320 * width, (width - 2) / 2, (height + 4) / 2, height, width

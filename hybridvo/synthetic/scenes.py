@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hybridvo.geometry import make_transform
-from hybridvo.synthetic.draws import affine, any_turn
+from hybridvo.errors import InputError
+from hybridvo.synthetic.draws import affine, any_turn, camera_path, poses, sway
 from hybridvo.synthetic.raycast import BOX, CYLINDER, ELLIPSOID
-from hybridvo.synthetic.scene import Scene, Solid
+from hybridvo.synthetic.render import Scene, Solid
 from hybridvo.types import Camera
 
 BANDS = {
@@ -25,68 +25,13 @@ BANDS = {
     **dict.fromkeys(("heavy_rigid", "heavy_deforming", "heavy_two", "heavy_ten"), (0.48, 0.73)),
 }
 """Share of the pixels on movers in every frame of each family."""
+ATTEMPTS = 200
+"""Draws of a family before a share is given up."""
 LAG = 6
 """Most frames by which the path of a mover runs before or after the camera's, which it follows."""
 
 Parts = list[tuple[int, np.ndarray]]
 """Unit shapes with their (3, 4) or (N, 3, 4) maps into the object frame, metres."""
-
-
-def camera_path(
-    rng: np.random.Generator, frames: int, step: float, turn_deg: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Smooth, bounded camera path that never rests, with a faster hand shake on top.
-
-    Position runs on an ellipse and orientation on another (yaw against pitch), so that neither
-    speed passes through zero, however many frames are asked for.
-
-    ``step`` and ``turn_deg``: about how many metres and degrees a frame. Returns (N, 4, 4)
-    T_world_cam, and the same path without the shake.
-    """
-    t = np.arange(frames)
-
-    def wave(rate: float, low: float, high: float) -> tuple[np.ndarray, np.ndarray]:
-        """Two sinusoids in quadrature that change by ``rate`` per frame at their fastest."""
-        period = rng.uniform(low, high)
-        phase = 2 * np.pi * (t / period + rng.uniform())
-        sign = rng.choice([-1.0, 1.0])
-        return rate * period / (2 * np.pi) * np.cos(phase), (
-            sign * rate * period / (2 * np.pi) * np.sin(phase)
-        )
-
-    x, z = wave(step * rng.uniform(0.8, 1.2), 50, 80)
-    y = wave(0.35 * step, 30, 60)[0]
-    yaw, pitch = wave(turn_deg, 45, 75)
-    roll = wave(0.25 * turn_deg, 30, 60)[0]
-    position = np.stack([x, y, rng.uniform(0.6, 1.0) * z], axis=1)
-    angles = np.stack([0.5 * pitch, yaw, roll], axis=1)
-    shake = np.stack([wave(0.1 * step, 7, 13)[0] for _ in range(3)], axis=1)
-    shake_deg = np.stack([wave(0.15 * turn_deg, 7, 13)[0] for _ in range(3)], axis=1)
-    return _poses(angles + shake_deg, position + shake), _poses(angles, position)
-
-
-def _poses(angles_deg: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """(N, 4, 4) from (N, 3) Euler angles about x, y, z and (N, 3) positions."""
-    R = Rotation.from_euler("XYZ", angles_deg, degrees=True).as_matrix()
-    return np.stack([make_transform(r, p) for r, p in zip(R, position, strict=True)])
-
-
-def _sway(rng: np.random.Generator, frames: int, rate: float) -> np.ndarray:
-    """(N, 3) smooth oscillation that changes by about ``rate`` per frame and never rests."""
-    t = np.arange(frames)
-    direction = rng.normal(size=(2, 3))
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    period = rng.uniform(22, 40)
-    phase = 2 * np.pi * (t / period + rng.uniform())
-    amplitude = rate * period / (2 * np.pi)
-    return amplitude * (
-        np.outer(np.cos(phase), direction[0]) + np.outer(np.sin(phase), direction[1])
-    )
-
-
-def _at(angle: float, slope: float, depth: float) -> np.ndarray:
-    """Point at a depth along the direction with these horizontal and vertical tangents."""
-    return np.array([angle * depth, slope * depth, depth])
 
 
 def draw_look(rng: np.random.Generator) -> dict[str, Any]:
@@ -101,12 +46,7 @@ def draw_look(rng: np.random.Generator) -> dict[str, Any]:
 
 @dataclass(frozen=True, eq=False)
 class Mover:
-    """One moving object, before its size is fixed.
-
-    Args:
-        parts: unit shapes with their (3, 4) or (N, 3, 4) maps in the object frame.
-        T_world_object: (N, 4, 4).
-    """
+    """One moving object, before its size is fixed."""
 
     parts: Parts
     T_world_object: np.ndarray
@@ -137,10 +77,8 @@ def cluster(rng: np.random.Generator, half: np.ndarray, count: int) -> Parts:
 
 
 def cloud(rng: np.random.Generator, frames: int, half: np.ndarray, rate: float) -> Parts:
-    """A deforming sheet of ellipsoids, carried and sheared by two travelling waves.
-
-    Each part moves with the displacement field at its centre and deforms with the field's
-    gradient, so that the body bends and breathes as one while every point's motion stays exact.
+    """A deforming sheet of ellipsoids, carried and sheared by two travelling waves: each moves with
+    the field at its centre and deforms with its gradient, so that every point's motion is exact.
     """
     columns, rows = 11, 7
     x = np.linspace(-1, 1, columns) * half[0]
@@ -172,16 +110,16 @@ def cloud(rng: np.random.Generator, frames: int, half: np.ndarray, rate: float) 
 
 
 def _furnish(rng: np.random.Generator, spread: float, rise: float) -> list[Solid]:
-    """Room with boxes, spheres and poles at all depths; some stand close to the camera.
-
-    ``spread`` and ``rise``: tangents of half the horizontal and vertical field of view.
-    """
+    """Room with boxes, spheres and poles at all depths; some stand close to the camera."""
     floor, ceiling = rng.uniform(1.5, 2.6), -rng.uniform(3.5, 7.0)
     left, right = -rng.uniform(7, 12), rng.uniform(7, 12)
     back, far = -6.0, rng.uniform(20, 27)
     low, high = np.array([left, ceiling, back]), np.array([right, floor, far])
     look = draw_look(rng) | {"wavelength": 2.4}
     solids = [Solid(BOX, affine((high - low) / 2, (high + low) / 2), **look)]
+
+    def put(shape: int, half: np.ndarray, centre: np.ndarray, R: np.ndarray) -> None:
+        solids.append(Solid(shape, affine(half, centre, R), **draw_look(rng)))
 
     def upright(depth: float, angle: float, thin: bool) -> None:
         x = angle * depth
@@ -196,43 +134,36 @@ def _furnish(rng: np.random.Generator, spread: float, rise: float) -> list[Solid
             half = rng.uniform(0.2, 0.55, 3) * (0.5 + depth / 9)
             half[1] *= rng.uniform(0.8, 2.0)
             y, shape = floor - half[1], int(rng.choice([BOX, BOX, CYLINDER]))
-        solids.append(
-            Solid(shape, affine(half, np.array([x, y, depth]), R.as_matrix()), **draw_look(rng))
-        )
+        put(shape, half, np.array([x, y, depth]), R.as_matrix())
 
     for depth in rng.uniform(4, far - 1.5, 8):
         upright(depth, rng.uniform(-1.3, 1.3) * spread, thin=False)
     for depth in rng.uniform(3.6, far - 2, 4):
         upright(depth, rng.uniform(-1.2, 1.2) * spread, thin=True)
     for depth in rng.uniform(4, far - 3, 6):
-        centre = _at(rng.uniform(-1.2, 1.2) * spread, rng.uniform(-1.2, 0.8) * rise, depth)
+        at = rng.uniform(-1.2, 1.2) * spread, rng.uniform(-1.2, 0.8) * rise, 1.0
+        centre = np.array(at) * depth
         half = rng.uniform(0.2, 0.6) * (0.5 + depth / 9) * rng.uniform(0.7, 1.3, 3)
         R = any_turn(rng)
-        shape = int(rng.choice([ELLIPSOID, ELLIPSOID, BOX]))
-        solids.append(Solid(shape, affine(half, centre, R), **draw_look(rng)))
+        put(int(rng.choice([ELLIPSOID, ELLIPSOID, BOX])), half, centre, R)
     for side in rng.permutation([-1.0, 1.0, 0.0]):
         depth = rng.uniform(2.8, 3.6)
         angle = side * rng.uniform(0.75, 1.1) * spread + rng.normal(0, 0.05)
-        centre = _at(angle, rng.choice([-1, 1]) * rise * rng.uniform(0.8, 1.3), depth)
+        slope = rng.choice([-1, 1]) * rise * rng.uniform(0.8, 1.3)
         if side == 0.0:
             upright(depth, rng.uniform(-0.8, 0.8) * spread, thin=True)
         else:
-            half = rng.uniform(0.12, 0.3, 3)
-            R = any_turn(rng)
-            solids.append(Solid(ELLIPSOID if side < 0 else BOX, affine(half, centre, R),
-                                **draw_look(rng)))  # fmt: skip
+            shape, half = ELLIPSOID if side < 0 else BOX, rng.uniform(0.12, 0.3, 3)
+            put(shape, half, np.array([angle, slope, 1.0]) * depth, any_turn(rng))
     return solids
 
 
 @dataclass(frozen=True, eq=False)
 class _Movers:
-    """Draws the movers of one scene.
+    """Draws the movers of one scene of N frames.
 
-    Args:
-        rng: source of all choices.
-        guide: (N + 2 LAG, 4, 4) camera path without shake, padded on both sides.
-        frames: N.
-        view: tangents of half the horizontal and vertical field of view.
+    ``guide``: (N + 2 LAG, 4, 4) camera path without shake, padded on both sides; ``view``: tangents
+    of half the horizontal and vertical field of view.
     """
 
     rng: np.random.Generator
@@ -249,8 +180,8 @@ class _Movers:
         self, parts: Parts, centre: np.ndarray, speed: float, spin_deg: float, path: np.ndarray
     ) -> Mover:
         """A body that sways about a place in the frame of a path."""
-        sway = _sway(self.rng, self.frames, spin_deg)
-        place = _poses(sway, centre + _sway(self.rng, self.frames, speed))
+        angles = sway(self.rng, self.frames, spin_deg)
+        place = poses(angles, centre + sway(self.rng, self.frames, speed))
         return Mover(parts, path @ place, [draw_look(self.rng) for _ in parts])
 
     def blob(
@@ -262,16 +193,15 @@ class _Movers:
         spin_deg: float,
         path: np.ndarray,
     ) -> Mover:
-        """Rigid body of some parts whose outline covers about ``share`` of the view.
-
-        ``at``: how far right and down as shares of the half view, and depth in metres.
+        """Rigid body whose outline covers about ``share`` of the view; ``at``: right and down as
+        shares of the half view, and depth in metres.
         """
         (spread, rise), depth = self.view, at[2]
         area = share * spread * rise * depth**2
         aspect = self.rng.uniform(0.7, 1.8)
         half = np.array([np.sqrt(area * aspect), np.sqrt(area / aspect), 0.0])
         half[2] = self.rng.uniform(0.5, 0.9) * half[:2].min()
-        centre = _at(at[0] * spread, at[1] * rise, depth)
+        centre = np.array([at[0] * spread, at[1] * rise, 1.0]) * depth
         return self.mover(cluster(self.rng, half, count), centre, speed, spin_deg, path)
 
     def single(self, deforming: bool) -> list[Mover]:
@@ -280,7 +210,7 @@ class _Movers:
         depth = rng.uniform(4.5, 9.0)
         side = rng.choice([-1.0, 1.0]) * rng.uniform(0.15, 0.4)
         half = np.array([0.55 * spread, 1.1 * rise, 0.2 * spread]) * depth
-        centre = _at(side * spread, rng.uniform(-0.2, 0.2) * rise, depth)
+        centre = np.array([side * spread, rng.uniform(-0.2, 0.2) * rise, 1.0]) * depth
         speed, spin_deg = rng.uniform(0.03, 0.09), rng.uniform(0.4, 1.6)
         if deforming:
             parts = cloud(rng, self.frames, half * (1.2, 1.0, 0.6), rng.uniform(0.03, 0.06))
@@ -291,10 +221,8 @@ class _Movers:
 
     def draw(self, kind: str) -> list[Mover]:
         """Movers of one family."""
-        uniform, integers, blob, follow = (
-            *(self.rng.uniform, self.rng.integers),
-            *(self.blob, self.follow),
-        )
+        uniform, integers = self.rng.uniform, self.rng.integers
+        blob, follow = self.blob, self.follow
         if kind in ("heavy_rigid", "heavy_deforming"):
             return self.single(deforming=kind == "heavy_deforming")
         if kind == "heavy_two":
@@ -332,26 +260,69 @@ class _Movers:
         ]  # fmt: skip
 
 
-def draw_scene(
+def make_scene(
+    kind: str,
+    seed: int,
+    *,
+    height: int = 218,
+    width: int = 512,
+    frames: int | None = None,
+    zoom: float = 0.0,
+    noise: float = 0.0,
+) -> Scene:
+    """Scene of a family, drawn from a seed.
+
+    Args:
+        kind: ``static``; ``light`` (several movers, about 30 % of the pixels); ``pair`` (small
+            random); ``heavy_rigid``, ``heavy_deforming``, ``heavy_two``, ``heavy_ten``: 46 to 75 %
+            of the pixels on movers in every frame, and at least 46 % whose flow differs from the
+            camera's by over 1/512 of the width.
+        seed: not negative; the same seed gives the same images.
+        height: pixels.
+        width: pixels.
+        frames: default 20, for ``pair`` 2.
+        zoom: relative amplitude of a slow change of focal length.
+        noise: sensor noise, standard deviation in grey levels.
+
+    Raises:
+        InputError: an unknown kind, or a value out of range.
+
+    Example:
+        >>> scene = make_scene("static", 0, height=16, width=32, frames=2)
+        >>> scene.render(0).rgb.shape
+        (16, 32, 3)
+    """
+    if frames is None:
+        frames = 2 if kind == "pair" else 20
+    if kind not in BANDS:
+        raise InputError(f"scene kind: expected one of {', '.join(BANDS)}, got {kind!r}.")
+    for name, value, least in (("seed", seed, 0), ("frames", frames, 2), ("height", height, 8),
+                               ("width", width, 8)):  # fmt: skip
+        if isinstance(value, bool) or int(value) != value or value < least:
+            raise InputError(f"{name}: expected an integer of at least {least}, got {value!r}.")
+    for name, amount, most in (("zoom", zoom, 0.3), ("noise", noise, 255.0)):
+        if not 0.0 <= amount <= most:
+            raise InputError(f"{name}: expected 0 to {most:g}, got {amount}.")
+    for attempt in range(ATTEMPTS):
+        rng = np.random.default_rng([list(BANDS).index(kind), seed, attempt])
+        scene = _draw_scene(rng, kind, (height, width), frames, zoom, noise)
+        if scene is not None:
+            return scene
+    raise InputError(
+        f"scene {kind!r}, seed {seed}: no draw of {ATTEMPTS} kept its share of moving pixels over "
+        f"{frames} frames; ask for another seed."
+    )
+
+
+def _draw_scene(
     rng: np.random.Generator,
     kind: str,
     size: tuple[int, int],
     frames: int,
-    moving: float | None,
     zoom: float,
     noise: float,
 ) -> Scene | None:
-    """One draw of a family, or None where it leaves its band or a surface comes too close.
-
-    Args:
-        rng: source of all choices.
-        kind: of ``BANDS``.
-        size: (height, width) in pixels.
-        frames: N.
-        moving: median share of the pixels on movers; None for the family's own.
-        zoom: amplitude of a slow change of focal length, relative.
-        noise: of the sensor, grey levels.
-    """
+    """One draw of a family, or None where it leaves its band or a surface comes too close."""
     height, width = size
     focal = rng.uniform(1.0, 1.2) * width
     period, phase = rng.uniform(40, 80), rng.uniform(0, 2 * np.pi)
@@ -366,16 +337,17 @@ def draw_scene(
     scene = Scene(cameras, path[LAG : LAG + frames], furniture, seed, noise=noise)
     movers = [] if kind == "static" else _Movers(rng, guide, frames, view).draw(kind)
     if movers:
-        own = {"light": 0.30, "pair": rng.uniform(0.05, 0.5)}.get(kind, 0.60)
-        sized = _sized(scene, movers, own if moving is None else moving)
-        if sized is None:
+        share = {"light": 0.30, "pair": rng.uniform(0.05, 0.5)}.get(kind, 0.60)
+        scene, found = _sized(scene, movers, share)
+        if abs(found - share) > 0.04:
             return None
-        scene = sized
-    return scene if _keeps_band(scene, kind, moving) else None
+    return scene if _keeps_band(scene, kind) else None
 
 
-def _sized(scene: Scene, movers: list[Mover], share: float) -> Scene | None:
-    """The scene with movers of the size at which they cover a share of most frames, if there is."""
+def _sized(scene: Scene, movers: list[Mover], share: float) -> tuple[Scene, float]:
+    """The scene with movers of the size at which they cover a share of most frames, and which they
+    cover.
+    """
     last = scene.frames - 1
     samples = np.unique(np.linspace(0, last, min(last + 1, 9)).round().astype(int))
     small, large = 0.4, 2.0
@@ -385,14 +357,12 @@ def _sized(scene: Scene, movers: list[Mover], share: float) -> Scene | None:
         sized = replace(scene, solids=(*scene.solids, *solids))
         found = np.median([sized.moving_share(int(i), 64)[0] for i in samples])
         small, large = (size, large) if found < share else (small, size)
-    return sized if abs(found - share) <= 0.04 else None
+    return sized, float(found)
 
 
-def _keeps_band(scene: Scene, kind: str, moving: float | None) -> bool:
+def _keeps_band(scene: Scene, kind: str) -> bool:
     """Whether every frame has the family's share of movers, and no surface is nearer than 1.2 m."""
     low, high = BANDS[kind]
-    if moving is not None:
-        low, high = max(low, moving - 0.15), min(high, moving + 0.15)
     for index in range(scene.frames):
         share, nearest = scene.moving_share(index)
         if nearest < 1.2 or not low <= share <= high:

@@ -1,10 +1,8 @@
 """Pairs whose surfaces are real: recordings as the world, cuts from other recordings as movers.
 
 The world is two frames of a static recording, or one frame seen from two places. Movers are cut
-out of RGB-D frames along irregular outlines, placed in front of the world or partly behind it with
-a z-buffer, and each moves by itself. Both images get noise, blur and a change of light, both depth
-maps noise, holes and ragged borders, the movers no less than the world. Nothing is stored: a pair
-is drawn from its seed.
+out along irregular outlines, placed in front of the world or partly behind it, and each moves by
+itself. Both images and depth maps then get a sensor's errors, the movers no less than the world.
 """
 
 from __future__ import annotations
@@ -21,9 +19,9 @@ from hybridvo.data.resize import resize_frame
 from hybridvo.data.sequence import open_sequence
 from hybridvo.errors import InputError
 from hybridvo.flow import dis_flow
-from hybridvo.geometry import invert, make_transform, rotation_angle, se3_exp
+from hybridvo.geometry import invert, rotation_angle, se3_exp
 from hybridvo.refinement.refine import refine_pair
-from hybridvo.synthetic.draws import log_uniform, smooth_field
+from hybridvo.synthetic.draws import about, log_uniform, silhouette_mask, smooth_field
 from hybridvo.synthetic.meshes import (
     TEAR,
     Canvas,
@@ -33,7 +31,6 @@ from hybridvo.synthetic.meshes import (
     surface_of,
     transformed,
 )
-from hybridvo.synthetic.silhouettes import silhouette_mask
 from hybridvo.types import Camera, Frame, FramePair
 
 PIXELS = 76_800
@@ -48,12 +45,10 @@ STILL_PX = 0.5
 
 @dataclass(frozen=True)
 class Source:
-    """Frames of a recording below the data folder.
+    """Frames ``start`` to ``stop`` of a recording below the data folder.
 
-    Args:
-        path: of its folder. start, stop: frames used, the second exclusive; None: to the end.
-        strides: frames between the two of a pair; none: its frames are seen from two places only.
-        world: whether it serves as a world; all serve as movers.
+    ``strides``: frames between the two of a pair; none: its frames are seen from two places only.
+    ``world``: whether it serves as a world; all serve as movers.
     """
 
     path: str
@@ -88,12 +83,8 @@ SPLITS = {
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """A source's frames, small, and the pairs of them whose motion is known.
-
-    Args:
-        source: which.
-        frames: of about :data:`PIXELS` / :data:`MARGIN` ** 2 pixels.
-        pairs: (first, second, T_curr_prev) of the frames.
+    """A source's frames, of about :data:`PIXELS` / :data:`MARGIN` ** 2 pixels, and (first, second,
+    T_curr_prev) of those whose motion is known.
     """
 
     source: Source
@@ -103,14 +94,11 @@ class Recording:
 
 @dataclass(frozen=True, eq=False)
 class SemiRealPair:
-    """A pair and its ground truth.
+    """A pair with DIS flow and its ground truth.
 
-    Args:
-        pair: two frames with DIS flow.
-        T_curr_prev: (4, 4) true motion of the camera.
-        depth: (H, W) metres of the previous frame before the sensor's errors, 0 where unknown.
-        moving: (H, W) bool, points that do not follow the camera's motion.
-        world: path of the recording. movers: how many were placed.
+    ``depth``: (H, W) metres of the previous frame before the sensor's errors, 0 where unknown;
+    ``moving``: (H, W) bool, points that do not follow the camera's motion; ``world``: path of the
+    recording; ``movers``: how many were placed.
     """
 
     pair: FramePair
@@ -178,13 +166,7 @@ def _measured_motion(prev: Frame, curr: Frame, T_stated: np.ndarray) -> np.ndarr
 def draw_pair(
     rng: np.random.Generator, recordings: Sequence[Recording], movers: int | None = None
 ) -> SemiRealPair:
-    """One pair, drawn from recordings.
-
-    Args:
-        rng: source of randomness.
-        recordings: of one part of :data:`SPLITS`.
-        movers: how many; None: drawn, 1 to 4 and sometimes none.
-    """
+    """One pair, drawn from recordings; ``movers``: how many; None: 1 to 4 and sometimes none."""
     worlds = [r for r in recordings if r.source.world]
     share = np.array([np.sqrt(len(r.frames)) for r in worlds])
     world = worlds[int(rng.choice(len(worlds), p=share / share.sum()))]
@@ -212,15 +194,8 @@ def draw_pair(
         canvases[1].draw(mover, points, goes, camera)
     prev, curr = (_sensed(rng, canvas, camera) for canvas in canvases)
     field = dis_flow()(prev, curr)
-    pair = FramePair(
-        prev,
-        curr,
-        field.flow,
-        field.variance,
-        field.valid,
-        flow_source="dis",
-        depth_source="sensor",
-    )
+    flow = field.flow, field.variance, field.valid
+    pair = FramePair(prev, curr, *flow, flow_source="dis", depth_source="sensor")
     first = canvases[0]
     depth = np.where(first.measured > 0.5, first.depth, 0).astype(np.float32)
     return SemiRealPair(pair, T, depth, first.moving > 0.5, world.source.path, movers)
@@ -230,13 +205,10 @@ def _elsewhere(
     rng: np.random.Generator, recordings: Sequence[Recording], world: Recording, at: int
 ) -> Frame:
     """A frame of another recording, or of the same one from another place."""
-    frames = [
-        frame
-        for r in recordings
-        for k, frame in enumerate(r.frames)
-        if r is not world or abs(k - at) > APART
-    ]
-    return frames[int(rng.integers(len(frames)))]
+    frames = [(r, k) for r in recordings for k in range(len(r.frames))]
+    frames = [(r, k) for r, k in frames if r is not world or abs(k - at) > APART]
+    recording, k = frames[int(rng.integers(len(frames)))]
+    return recording.frames[k]
 
 
 def _world(
@@ -268,13 +240,9 @@ def _world(
     half = se3_exp(np.clip(step / 2, -0.3 * near, 0.3 * near))
     canvases = []
     for pose in (invert(half), half):
-        shape = (height, width)
-        canvas = Canvas(
-            np.full((*shape, 3), 8, np.float32),
-            np.full(shape, 1e3, np.float32),
-            np.zeros(shape, np.float32),
-            np.zeros(shape, np.float32),
-        )
+        nothing = np.zeros((height, width), np.float32)
+        image = np.full((height, width, 3), 8, np.float32)
+        canvas = Canvas(image, np.full_like(nothing, 1e3), nothing, nothing)
         points = transformed(surface.points, pose)
         canvas.draw(surface, points, np.zeros(points.shape[:2]), camera)
         canvases.append(canvas)
@@ -339,7 +307,7 @@ def _own_motion(
         step[3:] = rng.standard_normal(3) * log_uniform(rng, (0.02, 0.2))
     if kind == "approach":
         step[:3] = centre * rng.uniform(-0.12, 0.12)
-    own = _about(centre, step)
+    own = about(_turned(step[3:]), centre, step[:3])
     return (own if kind == "follow" else T @ own), kind
 
 
@@ -354,8 +322,8 @@ def _moved(
     centre = points[mover.inside].mean(axis=0) if mover.inside.any() else points.mean((0, 1))
     if rng.random() < 0.2:
         side = (points[..., :2] - centre[:2]) @ rng.standard_normal(2) > 0
-        swing = rng.standard_normal(6) * log_uniform(rng, (0.03, 0.25)) * (0, 0, 0, 1, 1, 1)
-        other = motion @ _about(centre, swing)
+        swing = rng.standard_normal(6) * log_uniform(rng, (0.03, 0.25))
+        other = motion @ about(_turned(swing[3:]), centre)
         out = np.where(side[..., None], transformed(points, other), out)
     if rng.random() < 0.4:
         height, width = points.shape[:2]
@@ -364,10 +332,9 @@ def _moved(
     return out
 
 
-def _about(centre: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """(4, 4) motion whose rotation is about a point."""
-    to = make_transform(np.eye(3), centre)
-    return make_transform(np.eye(3), step[:3]) @ to @ se3_exp(np.r_[0, 0, 0, step[3:]]) @ invert(to)
+def _turned(axis: np.ndarray) -> np.ndarray:
+    """(3, 3) rotation about an axis by its length, rad."""
+    return se3_exp(np.r_[0, 0, 0, axis])[:3, :3]
 
 
 def _sensed(rng: np.random.Generator, canvas: Canvas, camera: Camera) -> Frame:

@@ -1,9 +1,7 @@
 """What measuring does to flow and depth: errors with the structure of a real estimator and sensor.
 
-Flow: the errors that OpenCV's DIS makes at these sizes. Its patches average across motion
-boundaries (motion bleeds over silhouettes), fail block by block where there is no texture, lag
-behind large motions, and have no answer where the point is hidden or leaves the picture. Depth:
-noise that grows with distance, a smooth bias, edges in the wrong place and holes.
+Flow like OpenCV's DIS: motion bleeds over silhouettes, fails block by block, lags behind large
+motions. Depth: noise that grows with distance, a smooth bias, edges in the wrong place and holes.
 """
 
 from __future__ import annotations
@@ -20,9 +18,6 @@ class SensorOptions:
     """How strongly inputs are damaged; a range is drawn log-uniformly once per sample.
 
     Units and reasons stand in ``configs/data_diverse.yaml`` under ``degradation``.
-
-    Raises:
-        InputError: a range in the wrong order or a share outside [0, 1].
     """
 
     exact_flow_probability: Share = 0.35

@@ -1,9 +1,7 @@
-"""Rendered two-frame scenes for the selector's training; many kinds, not the benchmark's.
+"""Rendered two-frame scenes for the selector's training, none of the families that are measured on.
 
-Streets, halls, hills, walls and tables with static things at all depths, some of them close enough
-to fill the image; vehicles, walkers, chains, hinged panels, swarms, breathing and twisting bodies,
-alone or together, free or followed by the camera. The scenes of :mod:`hybridvo.synthetic.scenes`
-are kept aside for measuring: no family of theirs is used here.
+Streets, halls, hills, walls and tables, in which vehicles, walkers, chains, panels, swarms and
+breathing bodies move, alone or together, free or followed by the camera.
 """
 
 from __future__ import annotations
@@ -18,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from hybridvo.geometry import make_transform
 from hybridvo.synthetic.draws import about, affine, any_turn, log_uniform, turn
 from hybridvo.synthetic.raycast import BOX, CYLINDER, ELLIPSOID
-from hybridvo.synthetic.scene import Scene, Solid
+from hybridvo.synthetic.render import Scene, Solid
 from hybridvo.types import Camera
 
 SHAPES = (BOX, ELLIPSOID, CYLINDER)
@@ -39,12 +37,9 @@ def _rotation(axes: str, angles_deg: ArrayLike) -> np.ndarray:
 
 
 class _Builder:
-    """Solids of one scene, with its palette and texture scale.
+    """Solids of one scene of size ``s`` (1: a street in metres), its palette and texture scale.
 
-    Args:
-        rng: source of all choices.
-        view: tangents of half the horizontal and vertical field of view.
-        s: size of the scene, 1 for a street in metres.
+    ``view``: tangents of half the horizontal and vertical field of view.
     """
 
     def __init__(self, rng: np.random.Generator, view: np.ndarray, s: float) -> None:
@@ -191,11 +186,9 @@ def _vehicle(rng: np.random.Generator) -> list[Part]:
     parts = [(BOX, affine((length, height, width), (0, 0, 0)))]
     cabin = (rng.uniform(0.3, 0.7), rng.uniform(0.15, 0.35), 0.9 * width)
     parts.append((BOX, affine(cabin, (rng.uniform(-0.4, 0.4), -height - cabin[1], 0))))
-    R = _rotation("x", 90)
-    wheel = rng.uniform(0.15, 0.3)
-    for x in (-0.65, 0.65):
-        for z in (-width, width):
-            parts.append((CYLINDER, affine((wheel, 0.08, wheel), (x, height, z), R)))
+    R, wheel = _rotation("x", 90), rng.uniform(0.15, 0.3)
+    places = [(x, height, z) for x in (-0.65, 0.65) for z in (-width, width)]
+    parts += [(CYLINDER, affine((wheel, 0.08, wheel), at, R)) for at in places]
     return [(shape, A, A) for shape, A in parts]
 
 
@@ -348,13 +341,7 @@ def _movers(b: _Builder, T_world_cam: np.ndarray, grow: float) -> None:
 
 
 def training_scene(seed: int, height: int, width: int) -> Scene:
-    """Scene of two frames.
-
-    Args:
-        seed: not negative; the same seed gives the same images.
-        height: pixels.
-        width: pixels.
-    """
+    """Scene of two frames; the same seed gives the same images."""
     rng = np.random.default_rng([0x6A75, seed])
     spread = np.tan(np.radians(rng.uniform(34, 100) / 2))
     focal = width / 2 / spread

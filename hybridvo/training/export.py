@@ -57,11 +57,7 @@ def run_card(trainer: Trainer) -> dict[str, Any]:
 
 
 def open_run(folder: str | Path) -> Trainer:
-    """A PWVO run as its checkpoint describes it.
-
-    Raises:
-        CheckpointError: no checkpoint, or a damaged one.
-    """
+    """A PWVO run as its checkpoint describes it."""
     folder = Path(folder)
     path = folder / CHECKPOINT
     record = read_checkpoint(path)["record"]
@@ -79,16 +75,9 @@ def export_pwvo(
 ) -> dict[str, Any]:
     """Write a run's weights as float16 safetensors, and its card beside them as JSON.
 
-    Args:
-        folder: of the run.
-        path: of the weights.
-        count: held-out pairs of each preset for the figures of the card.
-        calibrate: development pairs over which the scales of the translation are calibrated;
-            0: as trained.
-        say: takes lines of progress.
-
-    Returns:
-        The card. Its figures are those of the stored, rounded weights, as a user gets them.
+    The figures of the card are those of the stored, rounded weights, over ``count`` held-out pairs
+    of each preset; ``calibrate``: development pairs over which the scales of the translation are
+    calibrated; 0: as trained; ``say`` takes lines of progress.
 
     Raises:
         CheckpointError, InputError: not the folder of a run.
@@ -120,11 +109,7 @@ def export_pwvo(
 
 
 def export_selector(trainer: Trainer, held_out: str | Path, path: str | Path) -> dict[str, Any]:
-    """Write the selector's weights and card; ``held_out`` is a folder of held-out shards.
-
-    Raises:
-        InputError: no held-out shards.
-    """
+    """Write the selector's weights and card; ``held_out`` is a folder of held-out shards."""
     path = Path(path)
     files = sorted(Path(held_out).glob("*.npz"))
     if not files:

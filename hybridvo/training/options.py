@@ -15,9 +15,15 @@ from hybridvo.network.losses import LossOptions
 from hybridvo.network.selection import SELECTION_METHODS
 from hybridvo.network.selector_net import SelectorNetworkOptions
 from hybridvo.options import Count, Positive, Share, option_group
-from hybridvo.synthetic.dataset import StoredSamples
-from hybridvo.synthetic.presets import PRESETS, Preset, build_options, load_preset, read_yaml
-from hybridvo.training.rendered import RenderedOptions
+from hybridvo.synthetic.dataset import (
+    PRESETS,
+    Preset,
+    StoredSamples,
+    build_options,
+    load_preset,
+    read_yaml,
+)
+from hybridvo.training.shards import RenderedOptions
 from hybridvo.training.stream import Mixture
 
 KINDS = PRESETS | {"rendered": RenderedOptions, "folder": StoredSamples}
@@ -29,14 +35,7 @@ NotNegative = Annotated[float, Field(ge=0)]
 
 @option_group
 class OptimizerOptions:
-    """AdamW; the defaults are the published Adam.
-
-    Args:
-        learning_rate: at its peak.
-        betas: moments' decay.
-        weight_decay: decoupled; 0 is Adam.
-        clip_norm: largest global norm of the gradient.
-    """
+    """AdamW, decoupled weight decay and the gradient's largest norm; as published: Adam."""
 
     learning_rate: Positive = 1e-4
     betas: tuple[Below1, Below1] = (0.5, 0.999)
@@ -82,20 +81,11 @@ class RunOptions:
     """What every training has; the defaults are the paper's.
 
     Args:
-        seed: of the weights and the samples.
-        steps: updates.
-        batch_size: samples an update and process.
+        steps: updates. batch_size: samples an update and process.
         precision: of the network's forward pass (``bfloat16`` by autocast).
-        channels_last: memory format of the network.
         ema_decay: of a running average of the weights, which is then what is exported; 0 = none.
-        optimizer, schedule: see there.
-        checkpoint_minutes: between checkpoints.
-        log_every: updates between lines of the log.
         evaluate_every: updates between evaluations on development seeds; 0 = none.
         evaluate_count: held-out samples of each preset.
-
-    Raises:
-        InputError: a value out of bounds, here and in every class of options.
     """
 
     seed: int = 0
@@ -182,11 +172,7 @@ class SelectorOptions(RunOptions):
 
 
 def load_pwvo_options(path: str | Path) -> tuple[PwvoOptions, Mixture]:
-    """Options of a ``configs/train_*.yaml`` and the mixture of the data that it names.
-
-    Raises:
-        InputError: a missing file, an unknown key, or a value that cannot be meant.
-    """
+    """Options of a ``configs/train_*.yaml`` and the mixture of the data that it names."""
     path = Path(path)
     options = build_options(PwvoOptions, read_yaml(path), str(path))
     return options, load_mixture(options, path.parent)
@@ -205,11 +191,7 @@ def described(preset: Preset) -> dict[str, Any]:
 
 
 def recorded_run(record: dict[str, Any], where: str) -> tuple[PwvoOptions, Mixture]:
-    """Options and data of a run from the record in its checkpoint.
-
-    Raises:
-        InputError: not the record of such a run; named by ``where``.
-    """
+    """Options and data of a run from the record in its checkpoint ``where``."""
     options = build_options(PwvoOptions, record["options"], where)
     presets: list[Any] = []
     for mapping in record["data"]:

@@ -25,12 +25,7 @@ is charged, also behind the camera."""
 
 
 class PwvoTask:
-    """One of the paper's networks, its data and its loss; see ``trainer.Task``.
-
-    Args:
-        options: of the run. The weights are drawn from its seed.
-        mixture: what samples are drawn from.
-    """
+    """One of the paper's networks, its data and its loss; see ``trainer.Task``."""
 
     def __init__(self, options: PwvoOptions, mixture: Mixture) -> None:
         self.options, self.mixture = options, mixture
@@ -80,15 +75,9 @@ class PwvoTask:
     def evaluate(self, network: nn.Module) -> dict[str, Any]:
         """Figures on development pairs of each preset."""
         options = self.options
+        how = {"selection": options.selection, "precision": options.precision}
         return {
-            Path(name).stem: evaluate_network(
-                network,
-                preset,
-                0,
-                options.evaluate_count,
-                selection=options.selection,
-                precision=options.precision,
-            )
+            Path(name).stem: evaluate_network(network, preset, 0, options.evaluate_count, **how)
             for name, preset in zip(options.data, self.mixture.presets, strict=True)
         }
 

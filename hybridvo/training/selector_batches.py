@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,7 +10,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from hybridvo.errors import FormatError
 from hybridvo.geometry import pose_matrix, se3_exp
 from hybridvo.hypotheses.generate import GridMaps, fit_in_mask
 from hybridvo.hypotheses.selector import mask_weights, nearest_motion
@@ -20,6 +18,7 @@ from hybridvo.network.selector_net import SelectorOutput
 from hybridvo.options import RefineOptions
 from hybridvo.refinement import kernels
 from hybridvo.synthetic.draws import log_uniform
+from hybridvo.training.shards import read_shards
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,9 +26,8 @@ class SelectorBatch:
     """B samples of one grid shape, their motions as N candidates, and ground truth.
 
     Args:
-        inputs: what the selector sees.
         samples: (B, 8, n) float32 pixel buffers of the solver.
-        depth_true: (B, h, w) metres, 0 where unknown. label: (B, h, w) of ``rendered``.
+        depth_true: (B, h, w) metres, 0 where unknown. label: (B, h, w) of ``shards``.
         T: (B, 3, 4) true T_curr_prev.
         source: (B,) 0 layered, 1 rendered with true (or noisy) flow, 2 rendered with DIS flow.
         static: (B, h, w) probability to be static world that a pixel-wise network states.
@@ -136,63 +134,39 @@ def _collate(p: dict[str, np.ndarray]) -> SelectorBatch:
     )
 
 
-def _read_shard(path: Path) -> dict[str, np.ndarray]:
-    """Arrays of a shard; where no network was asked about it, what counts as no answer."""
-    try:
-        with np.load(path) as file:
-            arrays = dict(file)
-            shape = arrays["label"].shape
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
-        raise FormatError(f"{path}: not a shard of samples ({error}).") from None
-    arrays.setdefault("proposal", np.full((shape[0], 3, 4), np.nan))
-    arrays.setdefault("static", np.full(shape, 0.5, np.float16))
-    return arrays
-
-
 def read_batches(
     files: list[Path], batch_size: int, rng: np.random.Generator | None
 ) -> Iterator[SelectorBatch]:
     """Batches of the samples of some shards, mixed if ``rng`` is given."""
-    by_shape: dict[str, list[Path]] = {}
-    for file in files:
-        by_shape.setdefault(file.stem.split("_")[-1], []).append(file)
     jobs = []
-    samples: dict[str, dict[str, np.ndarray]] = {}
-    for shape, members in by_shape.items():
-        loaded = [_read_shard(member) for member in members]
-        samples[shape] = {key: np.concatenate([x[key] for x in loaded]) for key in loaded[0]}
-        order = np.arange(len(samples[shape]["count"]))
+    for samples in read_shards(files):
+        order = np.arange(len(samples["count"]))
         if rng is not None:
             rng.shuffle(order)
-        jobs += [(shape, order[k : k + batch_size]) for k in range(0, len(order), batch_size)]
+        for k in range(0, len(order), batch_size):
+            jobs.append((samples, order[k : k + batch_size]))
     if rng is not None:
         rng.shuffle(jobs)
-    for shape, index in jobs:
-        yield _collate({key: value[index] for key, value in samples[shape].items()})
+    for samples, index in jobs:
+        yield _collate({key: value[index] for key, value in samples.items()})
 
 
 def ego_flow_error(pose: torch.Tensor, owner: torch.Tensor, batch: SelectorBatch) -> torch.Tensor:
     """(N,) mean distance of the ego flows of pose and truth, px at a width of 1024."""
-    pick = (slice(None), slice(None, None, 2), slice(None, None, 2))
-    z = batch.depth_true[pick]
-    ray = batch.inputs.ray[:, :, ::2, ::2]
-    K = batch.inputs.K
+    z = batch.depth_true[:, ::2, ::2].flatten(1)
+    ray = batch.inputs.ray[:, :, ::2, ::2].flatten(2)
+    points = torch.cat([ray, torch.ones_like(ray[:, :1])], 1) * z[:, None]
+    focal = batch.inputs.K[:, :2, None]
 
-    def project(P: torch.Tensor, of: torch.Tensor) -> torch.Tensor:
-        P = P[:, :, :, None, None]
-        x, y, depth = ray[of, 0], ray[of, 1], z[of]
-        X, Y, Z = (
-            depth * (P[:, i, 0] * x + P[:, i, 1] * y + P[:, i, 2]) + P[:, i, 3] for i in range(3)
-        )
-        Z = Z.clamp(min=1e-3)
-        fx, fy = K[of, 0, None, None], K[of, 1, None, None]
-        return torch.stack([fx * X / Z, fy * Y / Z], 1)
+    def seen(P: torch.Tensor, of: torch.Tensor) -> torch.Tensor:
+        moved = P[:, :, :3] @ points[of] + P[:, :, 3:]
+        return focal[of] * moved[:, :2] / moved[:, 2:].clamp(min=1e-3)
 
-    truth = project(batch.T, torch.arange(len(batch.T)))
-    distance = (project(pose, owner) - truth[owner]).norm(dim=1)
+    truth = seen(batch.T, torch.arange(len(batch)))
+    distance = (seen(pose, owner) - truth[owner]).norm(dim=1)
     known = (z > 0)[owner]
-    total = torch.where(known, distance.clamp(max=1e3), 0.0).sum((1, 2))
-    error = total / known.sum((1, 2)).clamp(min=1)
+    total = torch.where(known, distance.clamp(max=1e3), 0.0).sum(1)
+    error = total / known.sum(1).clamp(min=1)
     return error * 1024.0 / batch.inputs.image_width[owner]
 
 

@@ -27,12 +27,12 @@ from hybridvo.network.selection import fitted_motion, on_grid_of
 from hybridvo.options import Options
 from hybridvo.refinement import kernels
 from hybridvo.results import PixelwisePrediction, RelativePose
-from hybridvo.synthetic.diverse import DiverseOptions, diverse_sample
+from hybridvo.synthetic.diverse import DiverseOptions
 from hybridvo.synthetic.draws import log_uniform
 from hybridvo.synthetic.semi_real import Recording, draw_pair
 from hybridvo.synthetic.sensors import SensorOptions, degrade_depth
 from hybridvo.synthetic.training_scenes import training_scene
-from hybridvo.training.rendered import MOVING, STATIC, UNKNOWN, grid_sample
+from hybridvo.training.shards import MOVING, STATIC, UNKNOWN, grid_sample
 from hybridvo.training.stream import collate
 from hybridvo.types import Camera, Frame, FramePair
 
@@ -119,7 +119,7 @@ def _noisy(rng: np.random.Generator, flow: np.ndarray) -> np.ndarray:
 
 
 def _diverse_pair(rng: np.random.Generator, height: int, width: int) -> _Drawn:
-    sample = diverse_sample(rng, DiverseOptions(height=height, width=width))
+    sample = DiverseOptions(height=height, width=width).sample(rng)
     K = sample.K.astype(float)
     camera = Camera(K[0, 0], K[1, 1], K[0, 2], K[1, 2], height, width)
     flow = np.ascontiguousarray(sample.flow)

@@ -18,13 +18,13 @@ from hybridvo.errors import InputError
 from hybridvo.network.selector_inputs import SelectorInputs
 from hybridvo.network.selector_net import SelectorNetwork, SelectorOutput
 from hybridvo.training.options import SelectorOptions
-from hybridvo.training.rendered import MOVING, STATIC
 from hybridvo.training.selector_batches import (
     SelectorBatch,
     ego_flow_error,
     read_batches,
     refits_of,
 )
+from hybridvo.training.shards import MOVING, STATIC
 
 RIGHT_PX = 1.0
 """px at a width of 1024: mean error of the ego flow up to which a motion is right."""

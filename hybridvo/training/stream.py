@@ -15,9 +15,9 @@ from torch.utils.data import IterableDataset, get_worker_info
 from hybridvo.errors import InputError
 from hybridvo.network.inputs import NetworkInputs, assemble_aligned
 from hybridvo.network.losses import LossTargets
+from hybridvo.synthetic.dataset import Preset
 from hybridvo.synthetic.draws import TRAINING, sample_generator
 from hybridvo.synthetic.layered import Sample
-from hybridvo.synthetic.presets import Preset
 
 
 @dataclass(frozen=True)
@@ -49,13 +49,7 @@ class Mixture:
 
 @dataclass(frozen=True, eq=False)
 class TrainingBatch:
-    """Inputs and ground truth of B samples at the network's size.
-
-    Args:
-        inputs: what the network reads.
-        targets: ground truth.
-        moving: (B, h, w) bool, pixels with a motion of their own.
-    """
+    """Inputs and ground truth of B samples; ``moving``: (B, h, w) bool, pixels that move."""
 
     inputs: NetworkInputs
     targets: LossTargets
@@ -95,20 +89,12 @@ def collate(samples: Sequence[Sample]) -> TrainingBatch:
 
 
 class SampleStream(IterableDataset):
-    """Endless batches of a preset.
+    """Endless batches of a preset, from the sample ``start`` of a seed.
 
     Batch b of rank r holds the samples ``start + (b world + r) batch_size`` and those that follow:
     all ranks together see what one process with a batch ``world`` times as large would see. Workers
     of a ``DataLoader(stream, batch_size=None)`` take batches in turn, and the loader hands them
     over in order, so that their number changes nothing.
-
-    Args:
-        preset: what to draw.
-        seed: of the samples.
-        start: index of the first sample, to resume.
-        batch_size: samples in a batch.
-        rank: of this process, of ``world``.
-        world: number of processes.
     """
 
     def __init__(

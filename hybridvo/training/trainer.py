@@ -1,7 +1,6 @@
 """One training loop for every task: updates, running average, checkpoints, many processes.
 
-Two runs with the same options take the same updates on the same machine, whether or not they were
-interrupted, as long as the schedule counts updates.
+An interrupted run takes the same updates as one that was not, if the schedule counts updates.
 """
 
 from __future__ import annotations
@@ -63,15 +62,15 @@ class Task(Protocol):
 class Trainer:
     """A run: task, optimiser, and their state on disk.
 
+    Under ``torch.distributed`` (``torchrun``) every process makes its own Trainer; gradients are
+    averaged, and only rank 0 writes.
+
     Args:
         task: what is trained.
         folder: of ``checkpoint.pt`` and ``log.jsonl``; must exist. None writes nothing.
         device: of the network.
         workers: processes that draw samples; 0 draws them in this one.
-        report: called with every entry of the log, for a progress display.
-
-    Under ``torch.distributed`` (``torchrun``) every process makes its own Trainer; gradients are
-    averaged, and only rank 0 writes.
+        report: called with every entry of the log.
     """
 
     def __init__(
@@ -118,14 +117,7 @@ class Trainer:
         return json.loads(json.dumps(record))
 
     def update(self, batch: Any, progress: float) -> dict[str, float]:
-        """One step of the optimiser.
-
-        Args:
-            batch: samples of this process.
-            progress: share of the run that is done, for the learning rate.
-
-        Returns:
-            ``loss``, its parts, ``grad_norm`` and ``lr``.
+        """One step of the optimiser when ``progress`` of the run is done; returns its figures.
 
         Raises:
             DegenerateError: the loss or the gradient was not finite 50 times in a row.
@@ -170,14 +162,11 @@ class Trainer:
                 ours.lerp_(theirs, 1 - decay)
 
     def run(self, time_limit_s: float = math.inf, until: int | None = None) -> str:
-        """Train until the options' steps, a time limit or a request to stop.
+        """Train until the options' steps, a time limit or a request to stop, and save.
 
-        Args:
-            time_limit_s: seconds of training, over all interruptions; ends with a checkpoint.
-            until: pause at this update, with the schedule of the whole run.
-
-        Returns:
-            Why it ended: ``steps``, ``time`` or ``signal`` (``stop_requested`` was set).
+        ``time_limit_s`` counts over all interruptions; ``until``: pause at this update, with the
+        schedule of the whole run. Returns why it ended: ``steps``, ``time`` or ``signal``
+        (``stop_requested`` was set).
         """
         options = self.options
         last = options.steps if until is None else min(until, options.steps)
@@ -239,11 +228,7 @@ class Trainer:
             self.report(entry)
 
     def save(self) -> None:
-        """Write ``checkpoint.pt``: everything that a later process needs to go on.
-
-        Raises:
-            OutputError: it cannot be written; the checkpoint before stays.
-        """
+        """Write ``checkpoint.pt``: everything that a later process needs to go on."""
         if self.folder is None or self.rank != 0:
             return
         state = {
@@ -257,11 +242,7 @@ class Trainer:
             torch.save(state, file)
 
     def start_from(self, weights: dict[str, torch.Tensor], name: str) -> None:
-        """Take the weights of another network of the same shapes; everything else starts anew.
-
-        Raises:
-            CheckpointError: weights of other shapes; names them by ``name``.
-        """
+        """Take the weights of another network of the same shapes; everything else starts anew."""
         with _fits(name):
             self.network.load_state_dict(weights)
             if self.ema is not None:

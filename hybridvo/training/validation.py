@@ -18,8 +18,8 @@ from hybridvo.network.losses import NetworkOutput, reconstruct
 from hybridvo.network.normalization import predict
 from hybridvo.network.selection import select_pose
 from hybridvo.results import PixelwisePrediction
+from hybridvo.synthetic.dataset import Preset
 from hybridvo.synthetic.draws import sample_generator
-from hybridvo.synthetic.presets import Preset
 from hybridvo.torch_geometry import euler_transform
 from hybridvo.training.stream import TrainingBatch, collate
 
@@ -53,16 +53,9 @@ def evaluate_network(
     batch_size: int = 20,
     precision: str = "float32",
 ) -> dict[str, Any]:
-    """Errors of a network's selected pose on ``count`` held-out pairs.
+    """Errors of a network's selected pose on samples 0 to ``count`` - 1 of a seed.
 
-    Args:
-        network: of ``build_network``; stays in the mode that it is in when the call ends.
-        preset: what to draw; held-out data of its own (``for_evaluation``) are used where it has.
-        seed: below 1000 for development, from 1000 for published figures.
-        count: number of pairs, samples 0 to count - 1 of the seed.
-        selection: one of ``SELECTION_METHODS``; VONets have none.
-        batch_size: pairs at once.
-        precision: ``float32`` or ``bfloat16`` (autocast).
+    Held-out data of the preset's own (``for_evaluation``) are used where it has them.
 
     Returns:
         ``r_err_deg``, ``t_err`` (metres) and ``epe`` (px at the sample's size), the paper's
@@ -72,9 +65,6 @@ def evaluate_network(
         pixels, ``spearman_*`` with the pixel's own error, ``laplace_ratio_*`` and
         ``median_ratio_*``, the mean and the median of |error| / exp(s) in degrees and metres: 1
         and 0.69 for calibrated Laplace scales.
-
-    Raises:
-        InputError: a count that is not positive.
     """
     if count < 1 or batch_size < 1:
         raise InputError(f"evaluate_network: expected count >= 1, got {count}.")
@@ -174,18 +164,11 @@ def _uncertainty_figures(pixels: list[np.ndarray], index: int, name: str) -> dic
 def calibrate_scales(
     network: torch.nn.Module, preset: Preset, count: int, seed: int = 0
 ) -> dict[str, float]:
-    """Add to s of the translation what makes the mean of |error| / exp(s) one; the errors stay.
-
-    The scales of the rotation are left alone: they are the weights of the fit as well.
-
-    Args:
-        network: a PWVO with uncertainty; its last bias is changed.
-        preset: whose pairs count.
-        count: of development pairs.
-        seed: of them.
+    """Add to s of the translation what makes the mean of |error| / exp(s) one, over ``count``
+    development pairs. The scales of the rotation are left alone: they are the weights of the fit.
 
     Returns:
-        ``translation``, what was added.
+        ``translation``, what was added to the network's last bias.
 
     Raises:
         InputError: a network without uncertainty.

@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from hybridvo.synthetic.render import make_scene, write_sintel
+from hybridvo.synthetic.render import write_sintel
+from hybridvo.synthetic.scenes import make_scene
 
 FRAMES = 6
 

@@ -12,7 +12,8 @@ from hybridvo.commands.diagnose import diagnose, diagnosis_text
 from hybridvo.commands.doctor import doctor, doctor_text
 from hybridvo.data.image_io import read_flo
 from hybridvo.errors import FormatError, InputError
-from hybridvo.synthetic.render import SyntheticSequence, make_scene
+from hybridvo.synthetic.render import SyntheticSequence
+from hybridvo.synthetic.scenes import make_scene
 from hybridvo.types import Frame
 
 

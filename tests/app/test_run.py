@@ -15,7 +15,7 @@ import pytest
 import hybridvo as hvo
 from hybridvo.cli import main
 from hybridvo.commands.run_folder import CHECKPOINT, STATE
-from hybridvo.synthetic.render import make_scene
+from hybridvo.synthetic.scenes import make_scene
 from hybridvo.trajectory import read_trajectory
 
 FRAMES = 6

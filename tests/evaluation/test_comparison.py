@@ -21,7 +21,8 @@ from hybridvo.network.models import Models
 from hybridvo.odometry import Odometry
 from hybridvo.pipeline import METHODS, weights_hash
 from hybridvo.results import RelativePose
-from hybridvo.synthetic.render import make_scene, write_sintel
+from hybridvo.synthetic.render import write_sintel
+from hybridvo.synthetic.scenes import make_scene
 from hybridvo.trajectory import read_trajectory
 
 ROWS = (  # what other programs rely on

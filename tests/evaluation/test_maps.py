@@ -30,7 +30,8 @@ from hybridvo.network.pwvo import NetworkOptions, build_network
 from hybridvo.network.selection import select_motion
 from hybridvo.network.weights import save_weights
 from hybridvo.results import PixelwisePrediction
-from hybridvo.synthetic.render import SyntheticSequence, make_scene, write_sintel
+from hybridvo.synthetic.render import SyntheticSequence, write_sintel
+from hybridvo.synthetic.scenes import make_scene
 from hybridvo.types import FramePair
 
 

@@ -18,7 +18,8 @@ from hybridvo.flow import (
     file_flow,
     forward_backward_check,
 )
-from hybridvo.synthetic.render import SyntheticSequence, make_scene
+from hybridvo.synthetic.render import SyntheticSequence
+from hybridvo.synthetic.scenes import make_scene
 from hybridvo.types import Camera, Frame, FramePair
 
 HEIGHT, WIDTH = 96, 128

@@ -23,8 +23,9 @@ from hybridvo.hypotheses.selector import (
 from hybridvo.options import Options, SelectOptions
 from hybridvo.pipeline import Context
 from hybridvo.results import MotionPrediction, MotionPrior, RelativePose, State
-from hybridvo.synthetic.render import SyntheticSequence, make_scene
+from hybridvo.synthetic.render import SyntheticSequence
 from hybridvo.synthetic.scenarios import Scenario, make_pair
+from hybridvo.synthetic.scenes import make_scene
 from hybridvo.types import FramePair
 
 SCENARIO = Scenario(moving=0.6, objects=1, flow_noise_px=0.3, depth_noise=0.01)

@@ -13,7 +13,8 @@ from hybridvo.flow import dis_flow
 from hybridvo.geometry import ego_flow, invert
 from hybridvo.refinement.image_factor import correlation
 from hybridvo.refinement.photometric import refine_photometric
-from hybridvo.synthetic.render import SyntheticSequence, make_scene
+from hybridvo.synthetic.render import SyntheticSequence
+from hybridvo.synthetic.scenes import make_scene
 from hybridvo.types import Frame, FramePair
 
 HEIGHT, WIDTH = 160, 256

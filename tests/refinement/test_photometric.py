@@ -15,7 +15,8 @@ from hybridvo.refinement import photometric_kernels as kernels
 from hybridvo.refinement.image_factor import ImageFactor
 from hybridvo.refinement.photometric import blurred, refine_photometric
 from hybridvo.results import RelativePose
-from hybridvo.synthetic.render import SyntheticSequence, make_scene
+from hybridvo.synthetic.render import SyntheticSequence
+from hybridvo.synthetic.scenes import make_scene
 from hybridvo.types import FramePair
 
 MEASURED = range(300, 306)

@@ -13,7 +13,7 @@ from hybridvo.errors import FormatError, InputError
 from hybridvo.synthetic import dataset
 from hybridvo.synthetic.diverse import DiverseOptions
 from hybridvo.synthetic.draws import STORED, sample_generator
-from hybridvo.synthetic.paper import PaperOptions
+from hybridvo.synthetic.layered import PaperOptions
 
 SIZE = {"height": 32, "width": 64}
 

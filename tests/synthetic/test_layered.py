@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from hybridvo import geometry
 from hybridvo.errors import InputError
-from hybridvo.synthetic import diverse, layered, paper, sensors, silhouettes
+from hybridvo.synthetic import diverse, layered, sensors
+from hybridvo.synthetic import draws as drawing
 from hybridvo.types import Camera
 
 
@@ -17,14 +18,14 @@ def generator(index: int, seed: int = 3) -> np.random.Generator:
     return np.random.Generator(np.random.Philox(key=[seed, index]))
 
 
-def draws(sampler: paper.TailSampler, count: int = 20_000) -> np.ndarray:
+def draws(sampler: layered.TailSampler, count: int = 20_000) -> np.ndarray:
     rng = generator(0)
     return np.array([sampler.draw(rng) for _ in range(count)])
 
 
 @pytest.mark.parametrize(("axis", "expected"), [(0, 0.397), (1, 0.467), (2, 0.372)])
 def test_rotation_samplers_have_the_published_statistics(axis, expected):
-    values = np.abs(draws(paper.MotionSamplers().rotation_deg[axis]))
+    values = np.abs(draws(layered.MotionSamplers().rotation_deg[axis]))
     # Four standard errors of the mean; the reference was drawn too, 200 000 times.
     assert values.mean() == pytest.approx(expected, abs=4 * values.std() / np.sqrt(values.size))
     assert np.median(values) == pytest.approx(0.15, abs=0.02)
@@ -34,7 +35,7 @@ def test_rotation_samplers_have_the_published_statistics(axis, expected):
 
 @pytest.mark.parametrize(("axis", "expected", "median"), [(0, 0.035, 0.021), (1, 0.027, 0.018)])
 def test_translation_samplers_have_the_published_statistics(axis, expected, median):
-    values = np.abs(draws(paper.MotionSamplers().translation[axis]))
+    values = np.abs(draws(layered.MotionSamplers().translation[axis]))
     # The reference is rounded to 0.001.
     bound = 4 * values.std() / np.sqrt(values.size) + 5e-4
     assert values.mean() == pytest.approx(expected, abs=bound)
@@ -42,7 +43,7 @@ def test_translation_samplers_have_the_published_statistics(axis, expected, medi
 
 
 def test_focal_and_background_have_the_published_statistics():
-    o = paper.PaperOptions()
+    o = layered.PaperOptions()
     focal = o.focal_low + draws(o.focal) * (o.focal_high - o.focal_low)
     assert focal.mean() == pytest.approx(906, abs=4 * focal.std() / np.sqrt(focal.size))
     assert np.median(focal) == pytest.approx(771, abs=10)
@@ -55,11 +56,11 @@ def test_focal_and_background_have_the_published_statistics():
 
 
 def test_sampler_stays_within_its_limits_and_tells_when_it_cannot():
-    sampler = paper.TailSampler(0.0, 1.8, 2.5, 0.15, -5.0, 5.0, 0.02)
+    sampler = layered.TailSampler(0.0, 1.8, 2.5, 0.15, -5.0, 5.0, 0.02)
     values = np.array([sampler.draw(generator(i), low=-0.01) for i in range(300)])
     assert values.min() >= -0.01 and values.max() <= 5.0
     with pytest.raises(InputError, match="fell into"):
-        paper.TailSampler(0.0, 1e-3, 1.0, 0.0, 50.0, 51.0, 1e-3).draw(generator(0))
+        layered.TailSampler(0.0, 1e-3, 1.0, 0.0, 50.0, 51.0, 1e-3).draw(generator(0))
 
 
 @pytest.mark.parametrize(
@@ -69,15 +70,15 @@ def test_sampler_refuses_nonsense(change):
     good = {"mean": 0.0, "tail_std": 1.0, "power": 2.0, "tail_probability": 0.1}
     good |= {"low": -1.0, "high": 1.0, "core_std": 0.1}
     with pytest.raises(InputError, match="TailSampler"):
-        paper.TailSampler(**(good | change))
+        layered.TailSampler(**(good | change))
 
 
 def test_paper_zero_motion_figures():
     """R_err 0.412 deg, T_err 0.074; EPE 2.4 px, median 0.93, of the background plane."""
-    o = paper.PaperOptions(height=32, width=64)
+    o = layered.PaperOptions(height=32, width=64)
     rotation, translation, flow = [], [], []
     for i in range(300):
-        sample = paper.paper_sample(generator(i, seed=5), o)
+        sample = o.sample(generator(i, seed=5))
         rotation.append(np.abs(sample.rotation_deg).mean())
         translation.append(np.abs(sample.translation).mean())
         # The reference figure is of the plane without the objects in front of it. Flow scales with
@@ -100,10 +101,10 @@ def test_paper_zero_motion_figures():
 
 
 def test_paper_sample_obeys_its_equations():
-    o = paper.PaperOptions()
+    o = layered.PaperOptions()
     moved = 0
     for i in range(12):
-        s = paper.paper_sample(generator(i), o)
+        s = o.sample(generator(i))
         camera = Camera.from_matrix(s.K, o.height, o.width)
         exact = geometry.ego_flow(s.depth_true, s.T_curr_prev.astype(np.float64), camera, camera)
         ok = np.isfinite(exact).all(axis=-1) & (np.abs(exact).max(axis=-1) < 300)
@@ -134,7 +135,7 @@ def test_rigid_flow_by_hand():
     assert abs(u[0, 0]) < 1e-3 and ratio[0, 0] == 1.0
 
 
-@pytest.mark.parametrize("preset", [paper.PaperOptions(), diverse.DiverseOptions()])
+@pytest.mark.parametrize("preset", [layered.PaperOptions(), diverse.DiverseOptions()])
 def test_a_sample_depends_on_its_generator_alone(preset):
     first, _, again = (preset.sample(generator(i)) for i in (7, 8, 7))
     for field in dataclasses.fields(first):
@@ -142,7 +143,7 @@ def test_a_sample_depends_on_its_generator_alone(preset):
 
 
 @pytest.mark.parametrize("size", [(128, 256), (64, 96), (37, 61)])
-@pytest.mark.parametrize("kind", [paper.PaperOptions, diverse.DiverseOptions])
+@pytest.mark.parametrize("kind", [layered.PaperOptions, diverse.DiverseOptions])
 def test_samples_of_any_size_are_finite_and_complete(kind, size):
     options = kind(height=size[0], width=size[1])
     for i in range(8):
@@ -171,7 +172,7 @@ def exact_diverse() -> diverse.DiverseOptions:
 def test_diverse_ego_flow_and_target_depth_are_those_of_the_camera():
     o = exact_diverse()
     for i in range(15):
-        s = diverse.diverse_sample(generator(i), o)
+        s = o.sample(generator(i))
         camera = Camera.from_matrix(s.K, o.height, o.width)
         T = s.T_curr_prev.astype(np.float64)
         exact = geometry.ego_flow(s.depth_true, T, camera, camera)
@@ -186,7 +187,7 @@ def test_diverse_ego_flow_and_target_depth_are_those_of_the_camera():
 def test_diverse_has_large_movers_sky_and_still_scenes():
     o = diverse.DiverseOptions(height=64, width=128)
     count = 100
-    samples = [diverse.diverse_sample(generator(i, seed=11), o) for i in range(count)]
+    samples = [o.sample(generator(i, seed=11)) for i in range(count)]
     moving = np.array([s.moving.mean() for s in samples])
     large = ((moving > 0.4) & (moving <= 0.87)).mean()
     # about 0.37 over thousands of samples; four standard errors of a share are 0.19 here
@@ -252,9 +253,9 @@ def test_diverse_refuses_nonsense(change):
 
 
 @settings(max_examples=40, deadline=None)
-@given(seed=st.integers(0, 2**32 - 1), kind=st.sampled_from(silhouettes.KINDS))
+@given(seed=st.integers(0, 2**32 - 1), kind=st.sampled_from(drawing.KINDS))
 def test_outlines_lie_in_the_unit_circle(seed, kind):
-    points = silhouettes.outline(np.random.default_rng(seed), kind)
+    points = drawing.outline(np.random.default_rng(seed), kind)
     assert np.linalg.norm(points, axis=1).max() == pytest.approx(1.0)
     assert points.ndim == 2 and points.shape[1] == 2 and len(points) >= 3
 
@@ -262,14 +263,14 @@ def test_outlines_lie_in_the_unit_circle(seed, kind):
 @settings(max_examples=30, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), size=st.integers(8, 180))
 def test_silhouettes_are_cropped_to_their_box(seed, size):
-    mask = silhouettes.silhouette_mask(np.random.default_rng(seed), size)
+    mask = drawing.silhouette_mask(np.random.default_rng(seed), size)
     assert mask.dtype == bool and max(mask.shape) <= size
     assert mask[0].any() and mask[-1].any() and mask[:, 0].any() and mask[:, -1].any()
 
 
 def test_coverage_is_met():
     square = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
-    shape = silhouettes.Silhouette(((square, True),))
+    shape = drawing.Silhouette(((square, True),))
     mask, radius = shape.draw_coverage(128, 256, (127.5, 63.5), 0.25)
     assert mask.mean() == pytest.approx(0.25, abs=0.01)
     # (2 r)^2 = 0.25 * 128 * 256 gives r = 45.3; a border pixel more or less.

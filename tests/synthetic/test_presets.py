@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 
 from hybridvo.errors import FormatError, InputError
+from hybridvo.synthetic.dataset import PRESETS, load_preset, read_yaml
 from hybridvo.synthetic.diverse import DiverseOptions
-from hybridvo.synthetic.paper import PaperOptions
-from hybridvo.synthetic.presets import PRESETS, load_preset, read_yaml
+from hybridvo.synthetic.layered import PaperOptions
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 

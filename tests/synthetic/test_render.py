@@ -13,9 +13,8 @@ from hybridvo.data.sequence import Sequence
 from hybridvo.errors import InputError, OutputError
 from hybridvo.geometry import ego_flow, invert, pixel_grid, rotation_angle
 from hybridvo.synthetic.raycast import BOX, CYLINDER, ELLIPSOID
-from hybridvo.synthetic.render import SyntheticSequence, make_scene, write_sintel
-from hybridvo.synthetic.scene import Scene, Solid
-from hybridvo.synthetic.scenes import BANDS
+from hybridvo.synthetic.render import Scene, Solid, SyntheticSequence, write_sintel
+from hybridvo.synthetic.scenes import BANDS, make_scene
 from hybridvo.types import Camera
 
 HEAVY = [kind for kind in BANDS if kind.startswith("heavy")]
@@ -332,8 +331,6 @@ def test_every_draw_is_finite_and_repeatable(seed, kind):
         ({"frames": 1}, "frames"),
         ({"height": 0}, "height"),
         ({"width": 2.5}, "width"),
-        ({"moving": 0.9}, "moving"),
-        ({"kind": "static", "moving": 0.1}, "moving"),
         ({"zoom": 2.0}, "zoom"),
         ({"noise": -1.0}, "noise"),
         ({"noise": float("nan")}, "noise"),

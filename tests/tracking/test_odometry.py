@@ -16,7 +16,7 @@ from hybridvo.odometry import Odometry
 from hybridvo.options import Options, TrackOptions
 from hybridvo.pipeline import DEFAULT_METHOD
 from hybridvo.results import Reason, State
-from hybridvo.synthetic.render import make_scene
+from hybridvo.synthetic.scenes import make_scene
 from hybridvo.types import Camera, Frame
 
 HEIGHT, WIDTH = 48, 64

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from hybridvo.synthetic.diverse import DiverseOptions
-from hybridvo.synthetic.paper import PaperOptions
+from hybridvo.synthetic.layered import PaperOptions
 from hybridvo.training.stream import Mixture
 
 SIZE = {"height": 32, "width": 64}

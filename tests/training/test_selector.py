@@ -14,7 +14,8 @@ from hybridvo.network.models import load_weights
 from hybridvo.network.selector_net import SelectorNetworkOptions
 from hybridvo.network.weights import pretrained
 from hybridvo.synthetic.draws import sample_generator
-from hybridvo.training import rendered, selector_data
+from hybridvo.training import selector_data
+from hybridvo.training import shards as stored
 from hybridvo.training.options import SelectorOptions, load_selector_options
 from hybridvo.training.selector_batches import SelectorBatch, ego_flow_error, read_batches
 from hybridvo.training.selector_task import SelectorTask, evaluate_selector
@@ -49,8 +50,8 @@ def test_ground_truth_explains_the_static_pixels(shards):
             v = K[1] * Y / Z + K[3] - inputs.target[b, 1]
             distance = torch.sqrt(u * u + v * v) * 1024 / inputs.image_width[b]
             usable = inputs.usable[b] & (z > 0)
-            static = usable & (batch.label[b] == rendered.STATIC)
-            moving = usable & (batch.label[b] == rendered.MOVING)
+            static = usable & (batch.label[b] == stored.STATIC)
+            moving = usable & (batch.label[b] == stored.MOVING)
             if moving.sum() > 50 and static.sum() > 50:
                 assert distance[static].median() < distance[moving].median()
 
@@ -102,7 +103,7 @@ def test_a_file_that_is_no_shard_is_refused(tmp_path, content):
 
 
 def test_rendered_samples_train_the_pixel_wise_networks(shards, tmp_path):
-    options = rendered.RenderedOptions(str(shards), str(shards))
+    options = stored.RenderedOptions(str(shards), str(shards))
     sample = options.sample(sample_generator(0, 1))
     assert sample.flow.shape == (128, 256, 2) and sample.rays is not None
     assert options.for_evaluation().folder == str(shards)
@@ -111,6 +112,6 @@ def test_rendered_samples_train_the_pixel_wise_networks(shards, tmp_path):
     error = np.linalg.norm(sample.flow - sample.ego_flow, axis=-1)[ok]
     assert np.median(error) < 2.0
     with pytest.raises(InputError, match="no shards"):
-        rendered.RenderedOptions(str(tmp_path)).sample(sample_generator(0, 0))
+        stored.RenderedOptions(str(tmp_path)).sample(sample_generator(0, 0))
     with pytest.raises(InputError, match="held_out"):
-        rendered.RenderedOptions(str(shards)).for_evaluation()
+        stored.RenderedOptions(str(shards)).for_evaluation()

@@ -9,7 +9,7 @@ import torch
 from hybridvo.errors import InputError
 from hybridvo.synthetic.dataset import StoredSamples, write_samples
 from hybridvo.synthetic.draws import HELD_OUT, STORED, TRAINING, sample_generator
-from hybridvo.synthetic.paper import PaperOptions
+from hybridvo.synthetic.layered import PaperOptions
 from hybridvo.training.stream import Mixture, SampleStream, collate
 
 

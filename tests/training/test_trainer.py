@@ -16,7 +16,7 @@ import torch
 from hybridvo.errors import CheckpointError, DegenerateError, InputError
 from hybridvo.network.layers import NetworkOptions
 from hybridvo.network.losses import LossOptions
-from hybridvo.synthetic.paper import PaperOptions
+from hybridvo.synthetic.layered import PaperOptions
 from hybridvo.training.options import OptimizerOptions, PwvoOptions, ScheduleOptions
 from hybridvo.training.pwvo_task import PwvoTask
 from hybridvo.training.stream import Mixture, SampleStream
@@ -184,7 +184,7 @@ RANKS = """
 import sys, torch, torch.distributed as dist
 sys.path.insert(0, sys.argv[1])
 from tests.training.test_trainer import TINY, changed
-from hybridvo.synthetic.paper import PaperOptions
+from hybridvo.synthetic.layered import PaperOptions
 from hybridvo.training.pwvo_task import PwvoTask
 from hybridvo.training.stream import Mixture
 from hybridvo.training.trainer import Trainer
