@@ -1,8 +1,4 @@
-"""Camera geometry and rotations: each fact once.
-
-Numpy functions work on single images in float64; the differentiable torch twins of the projection
-live in :mod:`hybridvo.refinement.torch_factors`, on kornia and pypose.
-"""
+"""Camera geometry and rotations in numpy, on single images in float64: each fact once."""
 
 from __future__ import annotations
 
@@ -11,26 +7,6 @@ from scipy.spatial.transform import Rotation
 
 from hybridvo.errors import InputError
 from hybridvo.types import Camera
-
-__all__ = [
-    "NED_TO_CAMERA",
-    "backproject",
-    "ego_flow",
-    "euler_deg_to_matrix",
-    "invert",
-    "make_transform",
-    "matrix_to_euler_deg",
-    "ned_to_camera",
-    "pixel_grid",
-    "pose_matrix",
-    "project",
-    "rotation_angle",
-    "se3_exp",
-    "se3_log",
-    "to_gtsam_covariance",
-    "wxyz_to_xyzw",
-    "xyzw_to_wxyz",
-]
 
 NED_TO_CAMERA = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
 """Maps north-east-down coordinates (x forward, y right, z down) to camera axes."""
@@ -96,7 +72,8 @@ def invert(T: np.ndarray) -> np.ndarray:
     return out
 
 
-def _skew(w: np.ndarray) -> np.ndarray:
+def skew(w: np.ndarray) -> np.ndarray:
+    """(3, 3) matrix of the cross product with ``w``."""
     return np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
 
 
@@ -139,7 +116,7 @@ def se3_log(T: np.ndarray) -> np.ndarray:
     else:  # near a half turn the sines are lost
         phi = Rotation.from_matrix(R).as_rotvec()
     theta2 = float(phi @ phi)
-    W = _skew(phi)
+    W = skew(phi)
     if theta2 < 1e-8:
         c = 1 / 12 + theta2 / 720
     else:
@@ -152,16 +129,9 @@ def se3_log(T: np.ndarray) -> np.ndarray:
 def rotation_angle(R: np.ndarray) -> np.ndarray:
     """Geodesic angle in radians of (..., 3, 3) rotation matrices; exact near 0 and pi."""
     R = np.asarray(R, dtype=np.float64)
-    axis = np.stack(
-        [
-            R[..., 2, 1] - R[..., 1, 2],
-            R[..., 0, 2] - R[..., 2, 0],
-            R[..., 1, 0] - R[..., 0, 1],
-        ],
-        axis=-1,
-    )
-    trace = np.trace(R, axis1=-2, axis2=-1)
-    return np.arctan2(np.linalg.norm(axis, axis=-1), trace - 1.0)
+    # each entry of the axis times twice the sine stands there two times
+    sine2 = np.linalg.norm(R - np.swapaxes(R, -1, -2), axis=(-2, -1)) / np.sqrt(2)
+    return np.arctan2(sine2, np.trace(R, axis1=-2, axis2=-1) - 1.0)
 
 
 def euler_deg_to_matrix(angles_deg: np.ndarray) -> np.ndarray:
@@ -200,13 +170,7 @@ def to_gtsam_covariance(covariance: np.ndarray) -> np.ndarray:
 
     Ours is of ``Exp(d) T_curr_prev``, d = (translation, rotation). Its inverse is
     ``T_prev_curr Exp(-d)``: the same covariance, now of a right perturbation, which is GTSAM's
-    side. Only the order changes, to (rotation, translation).
-
-    Args:
-        covariance: (6, 6) or (N, 6, 6), as ``motion.covariance`` and ``steps.npz`` hold them.
-
-    Raises:
-        InputError: another shape.
+    side. Only the order changes, to (rotation, translation). Takes (6, 6) or (N, 6, 6).
     """
     covariance = _covariances(covariance, "to_gtsam_covariance")
     order = [3, 4, 5, 0, 1, 2]
@@ -218,13 +182,7 @@ def to_ros_covariance(covariance: np.ndarray, T_prev_curr: np.ndarray) -> np.nda
 
     ROS keeps (x, y, z, rotation about x, y, z) about the axes of the parent frame, which is the
     previous camera: ``T_prev_curr Exp(-d)`` turned into them by the rotation of ``T_prev_curr``.
-
-    Args:
-        covariance: (6, 6) or (N, 6, 6), as ``motion.covariance`` and ``steps.npz`` hold them.
-        T_prev_curr: (4, 4) or (N, 4, 4), as ``motion.T_prev_curr``.
-
-    Raises:
-        InputError: other shapes.
+    Takes (6, 6) and (4, 4), or (N, 6, 6) and (N, 4, 4).
     """
     covariance = _covariances(covariance, "to_ros_covariance")
     T = np.asarray(T_prev_curr)

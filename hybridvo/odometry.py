@@ -30,7 +30,7 @@ from hybridvo.refinement.refine import widened
 from hybridvo.results import MotionPrior, Reason, RelativePose, State, Status, Step
 from hybridvo.tracking.keyframes import KeyFrame
 from hybridvo.tracking.pose_graph import Edge
-from hybridvo.tracking.state import IMAGES, TrackerState
+from hybridvo.tracking.state import TrackerState
 from hybridvo.tracking.window import STANDSTILL, Window, locate
 from hybridvo.trajectory import chain
 from hybridvo.types import Frame, FramePair, as_number, as_rigid, as_seed
@@ -115,16 +115,7 @@ class Odometry:
 
     @classmethod
     def from_pretrained(cls, name: str = "default", **options: Any) -> Odometry:
-        """Tracker with the pretrained weights of a selector.
-
-        Args:
-            name: ``default``, a name of :func:`hybridvo.network.weights.pretrained_names`, or a
-                file.
-            options: of the tracker.
-
-        Raises:
-            CheckpointError: no such weights (the message lists those known), or damaged ones.
-        """
+        """Tracker with the weights of a selector: ``default``, another name, or a file."""
         return cls(name, **options)
 
     @property
@@ -138,14 +129,7 @@ class Odometry:
         self._flow_fits = False
 
     def set_pose(self, T_world_cam: np.ndarray) -> None:
-        """Say where the camera is now (or where it starts), as after a loop closure.
-
-        Args:
-            T_world_cam: (4, 4) camera to world of the last frame, or of the first one to come.
-
-        Raises:
-            InputError: no finite rigid transform.
-        """
+        """Say where the camera is now (or where it starts), as after a loop closure."""
         T = as_rigid(T_world_cam, "Odometry.set_pose")
         state = self._state
         # the frame that the next pair starts from keeps its place relative to the last pose
@@ -156,11 +140,7 @@ class Odometry:
         self._state = replace(state, T_world_cam=T_state, T_world_last=T, window=window)
 
     def resume(self, state: TrackerState) -> None:
-        """Go on where another tracker stopped.
-
-        Raises:
-            InputError: no state.
-        """
+        """Go on where another tracker stopped."""
         if not isinstance(state, TrackerState):
             got = type(state).__name__
             raise InputError(f"Odometry.resume: expected a TrackerState, got {got}.")
@@ -180,16 +160,9 @@ class Odometry:
         return () if window is None else window.found
 
     def predict(self, frames: int = 1) -> MotionPrior | None:
-        """The motion from the last frame to the next, before it is seen; None before the first one.
+        """The motion to the frame so many ahead, at constant velocity; None before the first one.
 
-        Args:
-            frames: how far ahead.
-
-        Returns:
-            Constant velocity, with a covariance from how the last motions changed.
-
-        Raises:
-            InputError: no number of frames from 1 to 10^6.
+        Its covariance follows from how the last motions changed.
         """
         if as_number(frames) % 1 or not 1 <= frames <= MAX_FRAMES:
             raise InputError(
@@ -231,19 +204,18 @@ class Odometry:
         T_world_cam, motion = chain(state.T_world_cam, found.T_curr_prev), found
         if not found.usable:
             T_world_cam, motion = self._instead(state, found)
-        # without an image nothing can be matched from here: the next pair spans this frame
         if frame.rgb is None and pair.flow is None:
-            return self._step(frame, T_world_cam, motion, self._passed(state, T_world_cam))
+            # nothing can be matched from here: the next pair spans this frame
+            self._pass(T_world_cam)
+            return _step(frame, T_world_cam, motion)
         own, window = _own(frame), state.window
         if window is None:
             window = self._first_key(own, T_world_cam)
         else:
-            located = locate(
+            window, T, motion, used = locate(
                 window, motion, prev, own, self._register, self.window, self.options.track
             )
-            window, motion = located.window, located.motion
-            if located.used:
-                T_world_cam = located.T_world_cam
+            T_world_cam = T if used else T_world_cam
         if found.status.reason is Reason.AMBIGUOUS_MOTION:
             # a registration that started from this motion confirms it whichever it is
             motion = widened(motion)
@@ -255,21 +227,17 @@ class Odometry:
                 T = se3_exp(se3_log(T) / (state.gap + 1))
             model = model.observed(T, neighbours=not state.gap and not state.failed)
         failed = 0 if motion.usable else state.failed + 1
-        after = TrackerState(
+        self._state = TrackerState(
             own, T_world_cam, T_world_cam, model, 0, failed, state.count + 1, window
         )
-        return self._step(frame, T_world_cam, motion, after)
+        return _step(frame, T_world_cam, motion)
 
-    def _step(
-        self, frame: Frame, T_world_cam: np.ndarray, motion: RelativePose, after: TrackerState
-    ) -> Step:
-        self._state = after
-        assert frame.index is not None  # set by track
-        return Step(frame.index, frame.timestamp, T_world_cam.copy(), motion)
-
-    def _passed(self, state: TrackerState, T_world_cam: np.ndarray) -> TrackerState:
-        """The state after a frame that nothing can be matched from."""
-        return replace(state, T_world_last=T_world_cam, gap=state.gap + 1, count=state.count + 1)
+    def _pass(self, T_world_last: np.ndarray) -> None:
+        """After a frame that nothing can be matched from."""
+        state = self._state
+        self._state = replace(
+            state, T_world_last=T_world_last, gap=state.gap + 1, count=state.count + 1
+        )
 
     def _estimate(self, pair: FramePair, prior: MotionPrior | None) -> RelativePose:
         # the images are asked whether a flow can be theirs until one is
@@ -307,16 +275,7 @@ class Odometry:
         return found
 
     def skip(self, index: int, timestamp: float, message: str = "") -> Step:
-        """A frame that could not be read: a failed step; the next pair, and its flow, span it.
-
-        Args:
-            index: of the frame.
-            timestamp: seconds.
-            message: why.
-
-        Raises:
-            InputError: a stamp that is not finite, or an index that is no whole number.
-        """
+        """A frame that could not be read: a failed step; the next pair, and its flow, span it."""
         if as_number(index) % 1 or not np.isfinite(as_number(timestamp)):
             raise InputError(
                 f"Odometry.skip: expected an index and finite seconds, got {index!r}, "
@@ -330,22 +289,22 @@ class Odometry:
             self._state = replace(state, count=state.count + 1)
             return Step(int(index), timestamp, state.T_world_last.copy(), failed)
         T_world_cam, motion = self._instead(state, failed)
-        self._state = self._passed(state, T_world_cam)
+        self._pass(T_world_cam)
         return Step(int(index), timestamp, T_world_cam.copy(), motion)
 
     def _start(self, frame: Frame, state: TrackerState) -> Step:
-        T = state.T_world_last
-        own = _own(frame)
+        T, own = state.T_world_last, _own(frame)
         # no motion precedes the first frame
         first = RelativePose(covariance=STANDSTILL.copy(), method=self.method)
-        after = TrackerState(own, T, T, count=state.count + 1, window=self._first_key(own, T))
-        return self._step(frame, T, first, after)
+        window = self._first_key(own, T)
+        self._state = TrackerState(own, T, T, count=state.count + 1, window=window)
+        return _step(frame, T, first)
 
     def _first_key(self, frame: Frame, T_world_cam: np.ndarray) -> Window | None:
         """A window that begins with a frame, where one is kept and the frame has depth."""
         if self.window == 1 or frame.depth is None:
             return None
-        return Window.start(frame, T_world_cam)
+        return Window((KeyFrame(frame, T_world_cam),))
 
     def _pair(self, prev: Frame, curr: Frame, flow: Any) -> FramePair:
         if curr.camera.shape != prev.camera.shape:
@@ -377,10 +336,14 @@ class Odometry:
         return T_world_cam, failed.replace(T_curr_prev=T_curr_prev, covariance=covariance)
 
 
+def _step(frame: Frame, T_world_cam: np.ndarray, motion: RelativePose) -> Step:
+    return Step(frame.index, frame.timestamp, T_world_cam.copy(), motion)
+
+
 def _own(frame: Frame) -> Frame:
     """Copy whose arrays nobody else can change."""
     images: dict[str, Any] = {
-        name: image.copy() for name in IMAGES if (image := getattr(frame, name)) is not None
+        name: x.copy() for name, x in vars(frame).items() if isinstance(x, np.ndarray)
     }
     return replace(frame, **images)
 

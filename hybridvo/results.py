@@ -174,7 +174,7 @@ class RelativePose:
         residual_scale_px: estimated standard deviation of the flow noise, px, where variances were
             handed in at a pixel of the typical one.
         depth_noise: of the log depth, likewise.
-        weights: (h, w) float32 robust weight of each pixel on the grid of ``weights_stride``.
+        weights: (H, W) float32 robust weight of each pixel.
         translation_direction_valid: whether the translation is longer than three of its own
             standard deviations; its direction means nothing otherwise.
         information_eigenvalues: (6,) ascending, of the information matrix scaled to pixels.
@@ -196,7 +196,6 @@ class RelativePose:
     residual_scale_px: float = 0.0
     depth_noise: float = 0.0
     weights: np.ndarray | None = None
-    weights_stride: int = 1
     translation_direction_valid: bool = False
     information_eigenvalues: np.ndarray = field(default_factory=lambda: np.zeros(6))
     probability: float = 1.0

@@ -142,11 +142,10 @@ def missing() -> dict[str, str]:
         ("poselib", "poselib", "pip install 'hybridvo[baselines]'"),
         ("open3d-rgbd", "open3d", "pip install open3d"),
     ):
-        if importlib.util.find_spec(library) is None:
-            absent[name] = f"{library} is not installed; {remedy}"
-            continue
         try:
             importlib.import_module(library)
+        except ModuleNotFoundError:
+            absent[name] = f"{library} is not installed; {remedy}"
         except ImportError as error:  # Open3D without its system libraries
             absent[name] = f"{library} is installed but cannot be imported: {error}; {remedy}"
     if not hasattr(cv2, "Odometry"):

@@ -20,8 +20,10 @@ import numpy as np
 
 from hybridvo.calibration import DOUBTFUL_SPREAD, NO_SPREAD
 from hybridvo.compilation import njit
+from hybridvo.refinement.covariance import symmetric
 from hybridvo.refinement.kernels import (
     BLOCK,
+    COST,
     FASTMATH,
     MAX_SHIFT,
     MU,
@@ -33,8 +35,11 @@ from hybridvo.refinement.kernels import (
     YN,
     W,
     Z,
+    new_work,
     project_block,
 )
+from hybridvo.refinement.pixels import PixelGrid
+from hybridvo.refinement.solver import Linearization
 from hybridvo.types import Frame
 
 SURFACE = 0.05
@@ -180,6 +185,47 @@ def sum_depth(
                     q += 1
                 sums[at, 21 + p] += w * e * row[p]
     return cost
+
+
+class DepthFactor:
+    """The current frame's depth, given the flow, see :class:`hybridvo.refinement.solver.Factor`.
+
+    Args:
+        image: the pixels of the pair.
+        curr: (H, W) current depth.
+        stride: px between the pixels compared.
+        sigma: standard deviation of the conditional residual.
+        noise: (3,) float32, of flow and depth.
+        tile: side of the tiles, px.
+    """
+
+    def __init__(
+        self,
+        image: PixelGrid,
+        curr: np.ndarray,
+        stride: int,
+        sigma: float,
+        noise: np.ndarray,
+        tile: int,
+    ) -> None:
+        self._samples, height, self._width = image.strided(stride)
+        self._log_depth = np.empty(height * self._width, np.float32)
+        look_up(self._samples, height * self._width, 1, curr, *image.origin, self._log_depth)
+        self._image, self._stride, self._sigma = image, stride, sigma
+        self._noise, self._tile = noise, tile
+
+    def linearize(self, T: np.ndarray) -> Linearization:
+        """The sums over each tile and the meat stay as attributes."""
+        rows, columns = (-(-n // self._tile) for n in self._image.shape)
+        tiles, self.meat = np.zeros((rows * columns, COST)), np.zeros(21)
+        cost = sum_depth(
+            self._samples, len(self._log_depth), self._log_depth, T[:3], self._image.K,
+            self._noise, self._sigma, self._stride, self._tile, columns, self._width,
+            new_work(), tiles, self.meat,
+        )  # fmt: skip
+        self.tiles = tiles.reshape(rows, columns, COST)
+        sums = tiles.sum(axis=0)
+        return Linearization(symmetric(sums[:21]), sums[21:], cost)
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,11 @@ from hybridvo.geometry import pose_matrix
 from hybridvo.options import RefineOptions
 from hybridvo.refinement import coarse_fit, depth, kernels
 from hybridvo.refinement.covariance import sandwich_covariance, score_sums, symmetric
+from hybridvo.refinement.depth import DepthAgreement, DepthFactor
 from hybridvo.refinement.noise import estimate_noise
 from hybridvo.refinement.pixels import CoarseGrid, PixelGrid, as_contiguous
 from hybridvo.refinement.solver import Linearization, SolverOptions, gauss_newton
+from hybridvo.results import RelativePose
 from hybridvo.types import FramePair
 
 SOLVER = SolverOptions(iterations=5, tolerance=0.5)
@@ -58,77 +60,21 @@ class FlowFactor:
         return Linearization(symmetric(sums[:21]), sums[21:], float(self.rest[0]), curvature)
 
 
-class DepthFactor:
-    """The current frame's depth, given the flow, see :mod:`hybridvo.refinement.depth`.
-
-    Args:
-        image: the pixels of the pair.
-        samples: those that are compared, on a grid ``width`` pixels wide, ``stride`` apart.
-        log_depth: (N,) of the current frame, NaN where unknown.
-        width: of the grid.
-        stride: px.
-        sigma: standard deviation of the conditional residual.
-        noise: (3,) float32, of flow and depth.
-        tile: side of the tiles, px.
-    """
-
-    def __init__(
-        self,
-        image: PixelGrid,
-        samples: np.ndarray,
-        log_depth: np.ndarray,
-        width: int,
-        stride: int,
-        sigma: float,
-        noise: np.ndarray,
-        tile: int,
-    ) -> None:
-        self._image, self._samples, self._log_depth = image, samples, log_depth
-        self._width, self._stride, self._sigma = width, stride, sigma
-        self._noise, self._tile = noise, tile
-
-    def linearize(self, T: np.ndarray) -> Linearization:
-        """See :class:`hybridvo.refinement.solver.Factor`; the sums stay as attributes."""
-        rows, columns = (-(-n // self._tile) for n in self._image.shape)
-        tiles, self.meat = np.zeros((rows * columns, kernels.COST)), np.zeros(21)
-        cost = depth.sum_depth(
-            self._samples, len(self._log_depth), self._log_depth, T[:3], self._image.K,
-            self._noise, self._sigma, self._stride, self._tile, columns, self._width,
-            kernels.new_work(), tiles, self.meat,
-        )  # fmt: skip
-        self.tiles = tiles.reshape(rows, columns, kernels.COST)
-        sums = tiles.sum(axis=0)
-        return Linearization(symmetric(sums[:21]), sums[21:], cost)
-
-
 @dataclass(frozen=True, eq=False)
 class FullFit:
-    """Outcome of :func:`fit_full_grid`.
+    """A motion that looks ok, and what speaks against it.
 
     Args:
-        T: (4, 4) T_curr_prev. covariance: (6, 6). eigenvalues: (6,) of the information, m scaled
-            by the typical depth. definite: whether every direction is determined.
-        weights: (H, W) robust weights. weight: their sum. share: of the pixels that follow.
-        cost: per usable pixel. flow_noise: px. depth_noise: of log depth, both at a pixel of the
-            typical variance handed in. uses_current_depth: whether the third residual took part.
+        motion: with its covariance.
+        definite: whether every direction is determined.
         tiles: of the image, in which pixels were used.
         depths: how the current depth agrees with the first, moved; None where it cannot be told.
     """
 
-    T: np.ndarray
-    covariance: np.ndarray
-    eigenvalues: np.ndarray
+    motion: RelativePose
     definite: bool
-    weights: np.ndarray
-    weight: float
-    share: float
-    cost: float
-    flow_noise: float
-    depth_noise: float
-    iterations: int
-    uses_current_depth: bool
     tiles: int
-    depths: depth.DepthAgreement | None
+    depths: DepthAgreement | None
 
 
 class PairNoise(NamedTuple):
@@ -182,21 +128,18 @@ def fit_full_grid(
     sf, sd, share, _, sigma = found_noise
     noise = np.empty(3, np.float32)
     coarse_fit.set_noise(sf, sd, options.cutoff, noise)
-    total = float(samples[kernels.W, :n].sum(dtype=np.float64))
+    total = float(grid.weight.sum(dtype=np.float64))
     iterations, _, _ = coarse_fit.gauss_newton(
         samples, n, total, image.K, noise, 4, 1e-3 * sf, pose, kernels.new_work()
     )
-    term = None
-    if asks_depth and sigma > 0:
-        term = _depth_factor(pair, grid, pose, sigma, noise, options)
-    per_weight = score_sums(samples, n, pose, image.K, noise)
-    flow = FlowFactor(image, noise, tile, per_weight)
+    flow = FlowFactor(image, noise, tile, score_sums(samples, n, pose, image.K, noise))
+    term = _depth_factor(pair, grid, pose, sigma, noise, options) if sigma > 0 else None
     found = gauss_newton([flow] if term is None else [flow, term], pose_matrix(pose), SOLVER)
     T = pose_matrix(found.T[:3])
     tiles, meat = flow.tiles, flow.meat
     if term is not None:
         tiles, meat = tiles + term.tiles, meat + term.meat
-    _, followers, usable = flow.rest
+    cost, followers, usable = flow.rest
     # rounding is the same for neighbours, so that an average over n pixels is no better than one
     parallax = image.K[0] * np.linalg.norm(T[:3, 3]) * depth_scale
     rounding = usable * FLOW_ROUNDING**2 / (sf**2 + (parallax * sd) ** 2)
@@ -211,41 +154,40 @@ def fit_full_grid(
     # whether depth errs about its log, its value or its inverse is not known: the translation's
     # length is uncertain by half the variance of log depth
     covariance[:3, :3] += (0.5 * sd**2) ** 2 * np.outer(T[:3, 3], T[:3, 3])
-    return FullFit(
-        T=T,
+    weights = np.zeros(grid.size, np.float32)
+    v0, v1, u0, u1 = grid.box
+    weights[v0:v1, u0:u1] = flow.weights
+    motion = RelativePose(
+        T_curr_prev=T,
         covariance=covariance,
-        eigenvalues=eigenvalues,
-        definite=definite,
-        weights=flow.weights,
-        weight=float(followers),
-        share=float(share),
-        cost=float(flow.rest[0] / max(usable, 1e-12)),
-        flow_noise=float(sf),
-        depth_noise=float(sd),
+        method="refine",
+        terms=("flow",) if term is None else ("flow", "depth"),
+        inlier_ratio=float(share) if followers >= 6 else 0.0,
         iterations=int(iterations + found.iterations),
-        uses_current_depth=term is not None,
-        tiles=_tiles_used(image, samples, n, pair.prev.camera.shape, options.tiles),
-        depths=_compare_depths(pair, image, samples, n, T, noise) if asks_depth else None,
+        cost=float(cost / max(usable, 1e-12)),
+        residual_scale_px=float(sf),
+        depth_noise=float(sd),
+        weights=weights,
+        information_eigenvalues=eigenvalues,
+    )
+    return FullFit(
+        motion,
+        definite and bool(np.isfinite(T).all()),
+        _tiles_used(grid, options.tiles),
+        _compare_depths(pair, image, samples, n, T, noise) if asks_depth else None,
     )
 
 
-def _tiles_used(
-    image: PixelGrid, samples: np.ndarray, n: int, shape: tuple[int, int], tiles: int
-) -> int:
-    """Tiles of an image of ``shape`` that hold one of the usable samples.
-
-    :data:`MIN_TILES` where the image itself has few.
-    """
-    tile = tile_size(shape, tiles)
-    columns = -(-shape[1] // tile)
-    if shape[0] * shape[1] < 2 * MIN_TILES * tile**2:
+def _tiles_used(grid: CoarseGrid, tiles: int) -> int:
+    """Tiles of the whole image that hold a usable pixel; enough where the image has few."""
+    tile, (h, w, stride) = tile_size(grid.size, tiles), grid.shape
+    if grid.size[0] * grid.size[1] < 2 * MIN_TILES * tile**2:
         return MIN_TILES
-    ifx, ify, cx, cy = image.camera
-    x, y = samples[kernels.XN : kernels.YN + 1, :n][:, samples[kernels.W, :n] > 0]
-    # the rays are of pixel centres: half a pixel keeps the rounding off the border of the tile
-    u = ((x / ifx + (cx + image.origin[0] + 0.5)) / tile).astype(np.intp)
-    v = ((y / ify + (cy + image.origin[1] + 0.5)) / tile).astype(np.intp)
-    return int(np.count_nonzero(np.bincount(v * columns + u)))
+    v, u = (
+        (np.arange(n) * stride + stride // 2 + grid.box[k]) // tile for n, k in ((h, 0), (w, 2))
+    )
+    numbers = v[:, None] * grid.size[1] + u
+    return len(np.unique(numbers[grid.weight.reshape(h, w) > 0]))
 
 
 def pair_noise(
@@ -326,33 +268,25 @@ def _depth_factor(
     options: RefineOptions,
 ) -> DepthFactor | None:
     """The current depth as a factor, or None where it is not asked for or adds too little."""
-    image, coarse, n = grid.pixels, grid.samples, grid.count
-    _, columns, stride = grid.shape
+    image, (_, _, stride) = grid.pixels, grid.shape
     curr, tile = as_contiguous(np.asarray(pair.curr.depth)), tile_size(image.shape, options.tiles)
-    sums = np.zeros(kernels.SUMS)
-    coarse_fit.evaluate(coarse, n, pose, image.K, noise, kernels.new_work(), sums)
-    H_flow = symmetric(sums[:21])
-    if options.current_depth == "auto":
-        scale = np.repeat([1 / coarse_fit.translation_scale(coarse, n), 1.0], 3)
-        eigenvalues = np.linalg.eigvalsh(H_flow * np.outer(scale, scale))
-        if eigenvalues[0] > WELL_CONDITIONED * eigenvalues[-1]:
-            return None
-    log_depth = np.empty(n, np.float32)
-    depth.look_up(coarse, n, 1, curr, *image.origin, log_depth)
-    term = DepthFactor(image, coarse, log_depth, columns, stride, sigma, noise, tile)
     # on the full fit the flow has every pixel, the depth every second one of both axes
     fine = min(2, stride)
     if options.current_depth == "auto":
-        H_depth = term.linearize(pose).H / fine**2
-        gain = np.linalg.eigvals(np.linalg.pinv(H_flow) @ H_depth).real.max()
-        if not gain > CURRENT_DEPTH_GAIN:
+        sums = np.zeros(kernels.SUMS)
+        work = kernels.new_work()
+        coarse_fit.evaluate(grid.samples, grid.count, pose, image.K, noise, work, sums)
+        H_flow = symmetric(sums[:21])
+        unit = 1 / coarse_fit.translation_scale(grid.samples, grid.count)
+        units = np.repeat([unit, 1.0], 3)
+        eigenvalues = np.linalg.eigvalsh(H_flow * np.outer(units, units))
+        if eigenvalues[0] > WELL_CONDITIONED * eigenvalues[-1]:
             return None
-    if fine < stride:
-        samples, h, w = image.strided(fine)
-        log_depth = np.empty(h * w, np.float32)
-        depth.look_up(samples, h * w, 1, curr, *image.origin, log_depth)
-        term = DepthFactor(image, samples, log_depth, w, fine, sigma, noise, tile)
-    return term
+        coarse = DepthFactor(image, curr, stride, sigma, noise, tile)
+        gain = np.linalg.eigvals(np.linalg.pinv(H_flow) @ coarse.linearize(pose).H / fine**2)
+        if not gain.real.max() > CURRENT_DEPTH_GAIN:
+            return None
+    return DepthFactor(image, curr, fine, sigma, noise, tile)
 
 
 def _compare_depths(
@@ -362,7 +296,7 @@ def _compare_depths(
     n: int,
     T: np.ndarray,
     noise: np.ndarray,
-) -> depth.DepthAgreement | None:
+) -> DepthAgreement | None:
     """Whether the current depth is that of the points which follow the motion."""
     robust = np.empty(n, np.float32)
     coarse_fit.robust_weights(samples, n, T[:3], image.K, noise, kernels.new_work(), robust)

@@ -201,11 +201,11 @@ class ImageFactor:
 
     def _even_light(self, least: float) -> bool:
         """Put fields of gain and offset into the grey values where they explain enough."""
-        buffer, (gain, _) = self._buffer, self._light
-        data = np.stack([buffer[kernels.GREY], self._r, self._w])
-        if least > 0 and light_fields(self._to_nodes[::4], *data[:, ::4], least=least) is None:
+        buffer, (gain, _), r, w = self._buffer, self._light, self._r, self._w
+        grey, few = buffer[kernels.GREY], self._to_nodes[::4]
+        if least > 0 and light_fields(few, grey[::4], r[::4], w[::4], least) is None:
             return False
-        fields = light_fields(self._to_nodes, *data)
+        fields = light_fields(self._to_nodes, grey, r, w)
         if fields is None:
             return False
         more, shift = (self._to_nodes @ field for field in fields)

@@ -120,7 +120,7 @@ def _refine(pair: FramePair, pose: RelativePose, options: PhotometricOptions) ->
     prev, curr = pair.prev, pair.curr
     if prev.rgb is None or curr.rgb is None:
         return _unchanged(pose, "", "an image of the pair is missing")
-    if not pose.usable or pose.weights is None or pose.weights_stride != 1 or prev.depth is None:
+    if not pose.usable or pose.weights is None or prev.depth is None:
         return _unchanged(pose, "", "there is no weighted estimate to start from")
     if pose.weights.shape != prev.camera.shape:
         raise InputError(

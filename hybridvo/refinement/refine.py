@@ -8,7 +8,6 @@ both noise scales are estimated from the pair.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -16,7 +15,7 @@ from hybridvo.calibration import MIN_TILES, WEAK_RATIO
 from hybridvo.geometry import invert, se3_log
 from hybridvo.options import RefineOptions
 from hybridvo.refinement.coarse_fit import fit_coarse
-from hybridvo.refinement.covariance import direction_is_known
+from hybridvo.refinement.covariance import NOTHING, direction_is_known
 from hybridvo.refinement.full_fit import FullFit, fit_full_grid
 from hybridvo.refinement.pixels import CoarseGrid, coarse_grid
 from hybridvo.results import Hypothesis, Reason, RelativePose, Status
@@ -35,8 +34,7 @@ class Context:
     Args:
         noise: (flow px, log depth) standard deviations found with it, or None.
         coverage: share of the usable pixels' weight that the static mask leaves.
-        probability: that it is the camera's motion.
-        min_probability: below which the motion is degraded.
+        probability, min_probability: of being the camera's motion; below which it is degraded.
         hypotheses: every motion found, the selected one first.
         iterations: Gauss-Newton steps spent so far.
     """
@@ -81,34 +79,19 @@ def refine_pair(
         )
         noise = sf, sd
     fit = fit_full_grid(pair, grid, pose, noise, options)
-    share = min(1.0, fit.share * context.coverage)
-    weights = np.zeros(grid.size, np.float32)
-    v0, v1, u0, u1 = grid.box
-    weights[v0:v1, u0:u1] = fit.weights
-    common: dict[str, Any] = {
-        "method": "refine",
-        "terms": ("flow", "depth") if fit.uses_current_depth else ("flow",),
-        "inlier_ratio": share,
-        "iterations": iterations + fit.iterations,
-        "cost": fit.cost,
-        "residual_scale_px": fit.flow_noise,
-        "depth_noise": fit.depth_noise,
-        "weights": weights,
-        "information_eigenvalues": fit.eigenvalues,
-        "hypotheses": context.hypotheses,
-    }
-    status = _status(fit, share, context)
-    if not status.usable:
-        return RelativePose.failed(status.reason, status.message, **common)
-    covariance = _with_doubt(fit)
-    return RelativePose(
-        T_curr_prev=fit.T,
-        covariance=covariance,
-        status=status,
-        translation_direction_valid=direction_is_known(fit.T, covariance),
+    motion = fit.motion.replace(
+        inlier_ratio=min(1.0, fit.motion.inlier_ratio * context.coverage),
+        iterations=iterations + fit.motion.iterations,
+        hypotheses=context.hypotheses,
         probability=context.probability,
-        **common,
     )
+    status = _status(fit, motion.inlier_ratio, context)
+    if not status.usable:
+        nothing = {"T_curr_prev": np.eye(4), "covariance": NOTHING.copy(), "probability": 0.0}
+        return motion.replace(status=status, **nothing)
+    covariance = _with_doubt(fit)
+    valid = direction_is_known(motion.T_curr_prev, covariance)
+    return motion.replace(status=status, covariance=covariance, translation_direction_valid=valid)
 
 
 def _status(fit: FullFit, share: float, context: Context) -> Status:
@@ -116,16 +99,16 @@ def _status(fit: FullFit, share: float, context: Context) -> Status:
     agreement, depth, weak = fit.depths, None, None
     if agreement is not None and agreement.doubt:
         depth = Reason.NO_VALID_DEPTH, agreement.doubt
-    if fit.eigenvalues[0] < WEAK_RATIO * fit.eigenvalues[-1]:
+    eigenvalues = fit.motion.information_eigenvalues
+    if eigenvalues[0] < WEAK_RATIO * eigenvalues[-1]:
         weak = Reason.DEGENERATE_GEOMETRY, "a direction of the motion is barely determined"
     elif fit.tiles < MIN_TILES:
         weak = (
             Reason.DEGENERATE_GEOMETRY,
             "the pixels cover too little of the image to tell how far their errors agree",
         )
-    definite = fit.definite and bool(np.isfinite(fit.T).all())
-    share = share if fit.weight >= 6 else 0.0
-    status = status_of(definite, share, depth, context.probability, context.min_probability, weak)
+    sure = context.probability, context.min_probability
+    status = status_of(fit.definite, share, depth, *sure, weak)
     if status.usable and agreement is not None and agreement.is_none:
         return Status.failed(Reason.NO_VALID_DEPTH, agreement.doubt)
     return status
@@ -170,9 +153,9 @@ def _with_doubt(fit: FullFit) -> np.ndarray:
     Where few tiles hold pixels, errors that agree within them are averaged over as many readings
     only. Where the two depths differ, the length of the translation is wrong by as much.
     """
-    covariance = fit.covariance * max(1.0, MIN_TILES / max(fit.tiles, 1))
+    covariance = fit.motion.covariance * max(1.0, MIN_TILES / max(fit.tiles, 1))
     if fit.depths is not None and fit.depths.doubt:
-        t = fit.T[:3, 3]
+        t = fit.motion.T_curr_prev[:3, 3]
         share = np.log(fit.depths.ratio) ** 2 + fit.depths.spread**2
         covariance[:3, :3] += share * np.outer(t, t)
     return covariance

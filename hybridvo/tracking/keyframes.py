@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hybridvo.geometry import project
 from hybridvo.results import RelativePose
 from hybridvo.types import Frame
 
@@ -37,7 +38,7 @@ def static_cells(frame: Frame, motion: RelativePose) -> np.ndarray:
     """(h, w) bool on the coarse grid of a frame: where the pixels follow the motion from it."""
     height, width = frame.camera.shape
     cell = _cell(width)
-    if motion.weights is None or motion.weights_stride != 1:
+    if motion.weights is None:
         return np.ones((-(-height // cell), -(-width // cell)), np.bool_)
     return np.asarray(_cells(motion.weights, cell) > 0.5)
 
@@ -61,18 +62,18 @@ class View:
         self.cell = cell = _cell(width)
         rows = np.minimum(np.arange(-(-height // cell)) * cell + cell // 2, height - 1)
         columns = np.minimum(np.arange(-(-width // cell)) * cell + cell // 2, width - 1)
-        assert key.frame.depth is not None
-        z = key.frame.depth[np.ix_(rows, columns)].astype(np.float64)
+        z = np.asarray(key.frame.depth)[np.ix_(rows, columns)].astype(np.float64)
         valid = np.isfinite(z) & (z > 0)
         if key.static is not None:
             valid &= key.static
-        a, b = key.frame.camera, curr.camera
+        camera = key.frame.camera
         u, v = np.meshgrid(columns.astype(np.float64), rows.astype(np.float64))
-        z = np.where(valid, z, 1.0)
-        points = np.stack([(u - a.cx) / a.fx * z, (v - a.cy) / a.fy * z, z], axis=-1)
-        moved = points @ T[:3, :3].T + T[:3, 3]
-        depth = np.where(moved[..., 2] > 1e-6, moved[..., 2], np.nan)
-        x, y = b.fx * moved[..., 0] / depth + b.cx, b.fy * moved[..., 1] / depth + b.cy
+        ray = np.stack(
+            [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], -1
+        )
+        moved = ray * np.where(valid, z, 1.0)[..., None] @ T[:3, :3].T + T[:3, 3]
+        depth = moved[..., 2]
+        x, y = np.moveaxis(project(moved, curr.camera), -1, 0)
         with np.errstate(invalid="ignore"):
             seen = (x > -0.5) & (x < width - 0.5) & (y > -0.5) & (y < height - 0.5) & valid
         i = np.clip(np.where(seen, np.rint(y), 0).astype(np.intp), 0, height - 1)
@@ -101,14 +102,8 @@ def spread_px(key: KeyFrame, covariance: np.ndarray) -> float:
 
     Root mean square over both axes, at the median depth.
     """
-    camera = key.frame.camera
-    depth = _middle_depth(key.frame)
+    camera, z = key.frame.camera, np.asarray(key.frame.depth)[::8, ::8]
+    z = z[np.isfinite(z) & (z > 0)]
+    depth = float(np.median(z)) if z.size else 1.0
     variance = np.trace(covariance[:3, :3]) / depth**2 + np.trace(covariance[3:, 3:])
     return float(0.5 * (camera.fx + camera.fy) * np.sqrt(max(variance, 0.0)))
-
-
-def _middle_depth(frame: Frame) -> float:
-    assert frame.depth is not None
-    z = frame.depth[::8, ::8]
-    z = z[np.isfinite(z) & (z > 0)]
-    return float(np.median(z)) if z.size else 1.0

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
-from hybridvo.geometry import invert, pose_matrix, se3_log
+from hybridvo.geometry import invert, pose_matrix, se3_log, skew
 from hybridvo.refinement.solver import Linearization, SolverOptions, gauss_newton, student
 from hybridvo.results import Status
 
@@ -22,7 +23,7 @@ class Edge:
     """A motion between two frames of the graph.
 
     Args:
-        prev: index of one frame. curr: index of the other one.
+        prev, curr: indices of the frames.
         T: (4, 4) T_curr_prev.
         covariance: (6, 6) of ``Exp(delta) T``, translation first.
         status: of its estimate; a failed one has no weight.
@@ -46,13 +47,8 @@ class Edge:
         return self.status.usable and self.weight > 0
 
 
-@dataclass(frozen=True, eq=False)
-class Solution:
-    """Poses of a graph.
-
-    Args:
-        T_world_cam: (4, 4) of each frame. edges: with their weights. cost: robust cost.
-    """
+class Solution(NamedTuple):
+    """Poses (4, 4) of each frame of a graph, its edges with their weights, robust cost."""
 
     T_world_cam: dict[int, np.ndarray]
     edges: tuple[Edge, ...]
@@ -64,8 +60,7 @@ def adjoint(T: np.ndarray) -> np.ndarray:
     R, t = T[:3, :3], T[:3, 3]
     out = np.zeros((6, 6))
     out[:3, :3] = out[3:, 3:] = R
-    skew = np.array([[0.0, -t[2], t[1]], [t[2], 0.0, -t[0]], [-t[1], t[0], 0.0]])
-    out[:3, 3:] = skew @ R
+    out[:3, 3:] = skew(t) @ R
     return out
 
 
@@ -84,13 +79,7 @@ def chi2(T_error: np.ndarray, covariance: np.ndarray) -> float:
 def solve_graph(
     T_world_cam: Mapping[int, np.ndarray], edges: Sequence[Edge], free: Sequence[int]
 ) -> Solution:
-    """Gauss-Newton with Student's weights.
-
-    Args:
-        T_world_cam: (4, 4) of each frame to start from.
-        edges: between them.
-        free: frames that may move; the others are held.
-    """
+    """Gauss-Newton with Student's weights; only the ``free`` frames move."""
     names = list(free)
     graph = _EdgeFactor({k: invert(T) for k, T in T_world_cam.items()}, names, edges)
     found = gauss_newton([graph], np.stack([graph.held[k] for k in names]), SolverOptions())

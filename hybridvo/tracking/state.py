@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, fields, is_dataclass
+from enum import Enum
+from typing import Any, cast, get_args, get_type_hints
 
 import numpy as np
 
 from hybridvo.errors import InputError
-from hybridvo.results import Reason, State, Status
-from hybridvo.tracking.keyframes import KeyFrame
+from hybridvo.results import Reason, State
 from hybridvo.tracking.motion_model import MotionModel
-from hybridvo.tracking.pose_graph import Edge
 from hybridvo.tracking.window import Window
-from hybridvo.types import Camera, Frame
-
-IMAGES = ("rgb", "depth", "depth_variance", "mask")
+from hybridvo.types import Frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,36 +52,17 @@ class TrackerState:
         """The state as named arrays, for ``numpy.savez`` (no pickles): images, one JSON text."""
         arrays: dict[str, np.ndarray] = {}
 
-        def frame(name: str, value: Frame | None) -> dict[str, Any] | None:
-            if value is None:
-                return None
-            for part in IMAGES:
-                if (image := getattr(value, part)) is not None:
-                    arrays[f"{name}_{part}"] = image
-            camera = asdict(value.camera)
-            return {"camera": camera, "timestamp": value.timestamp, "index": value.index}
+        def plain(value: Any) -> Any:
+            if isinstance(value, np.ndarray):
+                arrays[name := f"array{len(arrays)}"] = value
+                return {"array": name}
+            if isinstance(value, tuple):
+                return [plain(x) for x in value]
+            if is_dataclass(value):
+                return {f.name: plain(getattr(value, f.name)) for f in fields(value)}
+            return value.value if isinstance(value, Enum) else value
 
-        def key(name: str, value: KeyFrame) -> dict[str, Any]:
-            if value.static is not None:
-                arrays[f"{name}_static"] = value.static
-            return {"frame": frame(name, value.frame)} | _plain(value, "T_world_cam", "depth_noise")
-
-        names = ("T_world_cam", "T_world_last", "gap", "failed", "count")
-        state = _plain(self, *names) | {
-            "frame": frame("frame", self.frame),
-            "motion_model": _plain(self.motion_model, "T_last", "spread", "weight", "changes"),
-        }
-        if self.window is not None:
-            state["window"] = _plain(self.window, "T_last_key", "covariance") | {
-                "keys": [key(f"key{k}", value) for k, value in enumerate(self.window.keys)],
-                "edges": [
-                    _plain(edge, "prev", "curr", "T", "covariance", "kind", "weight")
-                    | {"status": [edge.status.state.value, edge.status.reason.value]}
-                    | {"message": edge.status.message}
-                    for edge in self.window.edges
-                ],
-            }
-        return arrays | {"state": np.array(json.dumps(state))}
+        return {"state": np.array(json.dumps(plain(self))), **arrays}
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> TrackerState:
@@ -93,54 +71,22 @@ class TrackerState:
         Raises:
             InputError: an array is missing or has another shape.
         """
+
+        def build(kind: Any, value: Any) -> Any:
+            if isinstance(value, dict) and "array" in value:
+                return arrays[value["array"]]
+            kind = next((k for k in get_args(kind) if k is not type(None)), kind)
+            if isinstance(value, list):
+                return tuple(build(kind, x) for x in value)
+            if is_dataclass(kind) and value is not None:
+                made, hints = cast(Any, kind), get_type_hints(kind)
+                return made(**{name: build(hints[name], x) for name, x in value.items()})
+            return kind(value) if kind in (State, Reason) else value
+
         try:
-            return cls._read(dict(arrays))
+            return build(cls, json.loads(str(arrays["state"])))
         except (KeyError, ValueError, IndexError, TypeError) as error:
             raise InputError(
                 f"TrackerState.from_arrays: expected the arrays of to_arrays(), got {error!r}. "
                 f"Start the run anew."
             ) from None
-
-    @classmethod
-    def _read(cls, arrays: dict[str, np.ndarray]) -> TrackerState:
-        state = json.loads(str(arrays["state"]))
-
-        def frame(name: str, value: dict[str, Any] | None) -> Frame | None:
-            if value is None:
-                return None
-            images = {part: arrays.get(f"{name}_{part}") for part in IMAGES}
-            camera = Camera(**value["camera"])
-            return Frame(
-                camera=camera, timestamp=value["timestamp"], index=value["index"], **images
-            )
-
-        def key(name: str, value: dict[str, Any]) -> KeyFrame:
-            own = frame(name, value["frame"])
-            if own is None:
-                raise ValueError(f"{name}: no frame")
-            T, static = np.array(value["T_world_cam"]), arrays.get(f"{name}_static")
-            return KeyFrame(own, T, static, value["depth_noise"])
-
-        window = state.pop("window", None)
-        if window is not None:
-            keys = tuple(key(f"key{k}", value) for k, value in enumerate(window.pop("keys")))
-            edges = []
-            for value in window.pop("edges"):
-                kind, reason = value.pop("status")
-                status = Status(State(kind), Reason(reason), value.pop("message"))
-                edges.append(Edge(status=status, **_arrays(value)))
-            window = Window(keys, tuple(edges), **_arrays(window))
-        model = MotionModel(**_arrays(state.pop("motion_model")))
-        last = frame("frame", state.pop("frame"))
-        return cls(frame=last, motion_model=model, window=window, **_arrays(state))
-
-
-def _plain(value: Any, *names: str) -> dict[str, Any]:
-    """Attributes for JSON, arrays as lists: numbers come back as they were."""
-    found = {name: getattr(value, name) for name in names}
-    return {n: v.tolist() if isinstance(v, np.ndarray) else v for n, v in found.items()}
-
-
-def _arrays(values: dict[str, Any]) -> dict[str, Any]:
-    """The other way: lists as arrays."""
-    return {n: np.array(v) if isinstance(v, list) else v for n, v in values.items()}

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -53,26 +54,15 @@ class Window:
     covariance: np.ndarray = field(default_factory=lambda: STANDSTILL)
     found: tuple[Edge, ...] = ()
 
-    @classmethod
-    def start(cls, frame: Frame, T_world_cam: np.ndarray) -> Window:
-        """A window whose only key frame is ``frame``."""
-        return cls((KeyFrame(frame, T_world_cam),))
-
     def moved(self, D: np.ndarray) -> Window:
         """The same window in a world moved by (4, 4) ``D``."""
         keys = tuple(replace(key, T_world_cam=D @ key.T_world_cam) for key in self.keys)
         return replace(self, keys=keys)
 
 
-@dataclass(frozen=True, eq=False)
-class Located:
-    """A frame placed by the window.
-
-    Args:
-        window: the window after it.
-        T_world_cam: (4, 4) its pose.
-        motion: from the pose before to this one.
-        used: whether a motion over a longer stride took part.
+class Located(NamedTuple):
+    """The window after a frame, the frame's pose (4, 4), its motion from the pose before, and
+    whether a motion over a longer stride took part.
     """
 
     window: Window
@@ -100,7 +90,7 @@ def locate(
         curr: the new frame.
         register: motion from a key frame, near a predicted one where there is one.
         size: most key frames.
-        options: see :class:`TrackOptions`.
+        options: of the tracker.
     """
     window = _with_static(window, motion, prev)
     key, before = window.keys[-1], window.covariance
@@ -209,12 +199,10 @@ def _placed(window: Window, edges: Sequence[Edge]) -> tuple[np.ndarray, list[Edg
     if best is None:
         T = held[edges[0].prev] @ invert(edges[0].T)
         return T, [replace(e, weight=0.0) for e in edges]
-    kept = [e for e in best.edges if e.ok]
+    T, kept = best.T_world_cam[curr], [e for e in best.edges if e.ok]
     if kept and len(kept) < len(usable):
-        best = replace(
-            best, T_world_cam=solve_graph(best.T_world_cam, kept, free=(curr,)).T_world_cam
-        )
-    return best.T_world_cam[curr], list(best.edges)
+        T = solve_graph(best.T_world_cam, kept, free=(curr,)).T_world_cam[curr]
+    return T, list(best.edges)
 
 
 def _joint(edges: Sequence[Edge], key: int) -> np.ndarray:

@@ -62,7 +62,7 @@ def walk(
     options: TrackOptions = OPTIONS,
 ) -> list[Located]:
     """Every frame of a walk, ``motion(k)`` being what was found from k - 1 to k."""
-    window, out = Window.start(frame(0), np.eye(4)), []
+    window, out = Window((KeyFrame(frame(0), np.eye(4)),)), []
     for k in range(1, frames):
         located = locate(window, motion(k), frame(k - 1), frame(k), register, size, options)
         out.append(located)
