@@ -72,12 +72,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         args = build_parser().parse_args(given)
     except SystemExit as end:  # argparse: 0 after --help and --version, 2 for wrong usage
         return int(end.code or 0)
-    command = ["hybridvo", *given]
-    try:
-        return _guarded(args, command)
-    except BrokenPipeError:  # the reader of stdout has gone (`| head`)
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
+    return _guarded(args, ["hybridvo", *given])
 
 
 def _guarded(args: argparse.Namespace, command: list[str]) -> int:
@@ -98,8 +93,9 @@ def _guarded(args: argparse.Namespace, command: list[str]) -> int:
     except KeyboardInterrupt:
         print("hybridvo: interrupted.", file=sys.stderr)
         return 130
-    except BrokenPipeError:
-        raise
+    except BrokenPipeError:  # the reader of stdout has gone (`| head`)
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
     except HybridVOError as error:
         if args.verbose:
             traceback.print_exc()
@@ -107,10 +103,7 @@ def _guarded(args: argparse.Namespace, command: list[str]) -> int:
         return error.exit_code
     except Exception:
         traceback.print_exc()
-        print(
-            "hybridvo: this is a bug in hybridvo; please report it with the lines above.",
-            file=sys.stderr,
-        )
+        print("hybridvo: this is a bug; please report it with the lines above.", file=sys.stderr)
         return 1
     finally:
         logger.removeHandler(handler)
@@ -141,7 +134,7 @@ def _run(args: argparse.Namespace, command: list[str]) -> Result:
     }
     options = load_options(args.config, args.assignments, given | {"flow.source": args.flow})
     files = weight_files(args.weights, [options.run.method])
-    result = run(
+    summary, code = run(
         _open(args),
         args.out,
         options,
@@ -152,9 +145,9 @@ def _run(args: argparse.Namespace, command: list[str]) -> Result:
         rrd=args.rrd,
     )
     if not args.quiet:
-        for warning in result.summary.get("warnings", []):
+        for warning in summary.get("warnings", []):
             print(f"hybridvo: warning: {warning}", file=sys.stderr)
-    return result.summary, summary_text(result.summary), result.exit_code
+    return summary, summary_text(summary), code
 
 
 def _show(args: argparse.Namespace, command: list[str]) -> Result:

@@ -20,13 +20,10 @@ UNITS_PER_METRE = {1000: "millimetres", 5000: "TUM's unit", 100: "centimetres", 
 def stamp_unit(stamps: np.ndarray) -> tuple[float, str]:
     """How many of the unit of some stamps make a second, and its name.
 
-    Milliseconds and microseconds are told by two things together: every stamp is one of today's
-    clocks (2001 to 2103), and neighbours are typically less than a second apart, which in the finer
-    units of a clock that counts from another moment (nanoseconds since the machine was started)
-    would be more than 1000 images a second. Else stamps above 1e14 are nanoseconds.
-
-    Args:
-        stamps: (N,) numbers in the order of the frames; those that are not finite say nothing.
+    Milliseconds and microseconds are told by two things together: every stamp (N,) that is finite
+    is one of today's clocks (2001 to 2103), and neighbours are typically less than a second apart,
+    which for a clock that counts nanoseconds since the machine was started would be more than 1000
+    images a second. Else stamps above 1e14 are nanoseconds.
     """
     known = np.abs(stamps[np.isfinite(stamps)])
     with np.errstate(over="ignore"):  # between numbers that are no times anyway
@@ -46,41 +43,27 @@ def typical_depth(depth: np.ndarray) -> float | None:
     return float(np.median(values)) if values.size else None
 
 
-def depth_factor(median: float, usual: float | None = None) -> float | None:
-    """Factor that probably turns depths of this median into metres; None where they can be metres.
+def depth_advice(median: float, usual: float | None = None) -> str:
+    """What probably turns depths of this median into metres; empty where they can be metres.
 
     A guess: no image knows its scale. The first unit is taken that brings the median to everyday
-    depths, the data set's own before the others.
-
-    Args:
-        median: of the valid depths, as :func:`typical_depth` gives it.
-        usual: units per metre of the data set, where it has any.
+    depths, the data set's own (``usual``, units per metre) before the others.
 
     Example:
-        >>> depth_factor(974.0)  # millimetres read as metres
-        0.001
+        >>> depth_advice(974.0)
+        'divide by 1000 (millimetres)'
     """
     low, high = PLAUSIBLE_DEPTH_M
     if low <= median <= high:
-        return None
-    too_large = median > high
-    if usual and too_large and low <= median / usual <= high:
-        return 1 / usual
-    factors = [1 / unit if too_large else float(unit) for unit in UNITS_PER_METRE]
-    low, high = EVERYDAY_DEPTH_M
-    centre = np.sqrt(low * high)
-    inside = (factor for factor in factors if low <= median * factor <= high)
-    return next(inside, min(factors, key=lambda factor: abs(np.log(median * factor / centre))))
-
-
-def depth_advice(median: float, usual: float | None = None) -> str:
-    """What to do about depths of this median, such as ``divide by 1000 (millimetres)``.
-
-    Empty where they can be metres.
-    """
-    factor = depth_factor(median, usual)
-    if factor is None:
         return ""
+    too_large = median > high
+    units = [1 / unit if too_large else float(unit) for unit in UNITS_PER_METRE]
+    inside = [f for f in units if EVERYDAY_DEPTH_M[0] <= median * f <= EVERYDAY_DEPTH_M[1]]
+    if usual and too_large and low <= median / usual <= high:
+        inside = [1 / usual]
+    centre = np.sqrt(np.prod(EVERYDAY_DEPTH_M))
+    nearest = min(units, key=lambda factor: abs(np.log(median * factor / centre)))
+    factor = inside[0] if inside else nearest
     if factor > 1:
         return f"multiply by {factor:g}"
     unit = UNITS_PER_METRE.get(round(1 / factor))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -33,69 +34,44 @@ def load_options(
     ``path`` is a YAML file, or None for the defaults; the values of ``assignments`` are YAML;
     those of ``given``, such as ``{"run.method": "refine"}``, are left out where they are None.
 
+    Raises:
+        InputError: no such file, an unknown key (the nearest known one is named), a value that is
+            out of bounds. FormatError: the file is no YAML mapping.
+
     Example:
         >>> load_options(assignments=["refine.cutoff=2.5"]).refine.cutoff
         2.5
     """
-    values = _from_file(Path(path)) if path is not None else {}
-    texts = list(assignments)
-    for text in texts:
+    groups: dict[str, Any] = {}
+    where = [] if path is None else [str(path)]
+    if path is not None:
+        try:
+            groups = parse_yaml(read_text(path), str(path)) or {}
+        except FileNotFoundError:
+            raise InputError(f"{path}: no such file.") from None
+        if not isinstance(groups, dict):
+            raise FormatError(f"{path}: expected 'group:' lines, got a {type(groups).__name__}.")
+    values: dict[str, Any] = {}
+    for text in assignments:
+        where = [str(path), "--set"] if path is not None else ["--set"]
         key, sign, value = text.partition("=")
-        if not sign or not key.strip():
+        if not sign or "." not in key:
             raise InputError(
                 f"--set: expected group.key=value, as in refine.cutoff=3, got {text!r}."
             )
-        values[_known(key.strip(), "--set")] = parse_yaml(value, f"--set {key}")
+        values[key.strip()] = parse_yaml(value, f"--set {key}")
     values |= {key: value for key, value in (given or {}).items() if value is not None}
-    groups: dict[str, dict[str, Any]] = {}
     for key, value in values.items():
-        group, name = key.split(".")
-        groups.setdefault(group, {})[name] = value
-    where = " and ".join(
-        [*([str(path)] if path is not None else []), *(["--set"] if texts else [])]
-    )
+        group, _, name = key.partition(".")
+        if isinstance(entries := groups.setdefault(group, {}), dict):
+            entries[name] = value
     try:
-        return Options(
-            **{
-                field.name: type(getattr(Options(), field.name))(**groups.get(field.name, {}))
-                for field in dataclasses.fields(Options)
-            }
-        )
+        return Options(**groups)
     except InputError as error:
-        raise InputError(f"{where}: {error}" if where else str(error)) from None
-
-
-def _from_file(path: Path) -> dict[str, Any]:
-    """Content of an options file as ``group.key`` and value."""
-    try:
-        content = parse_yaml(read_text(path), str(path)) or {}
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file.") from None
-    if not isinstance(content, dict):
-        raise FormatError(f"{path}: expected 'group:' lines, got a {type(content).__name__}.")
-    values = {}
-    for group, entries in content.items():
-        if not isinstance(entries, dict):
-            groups = ", ".join(field.name for field in dataclasses.fields(Options))
-            raise InputError(
-                f"{path}: '{group}': expected a group ({groups}) with indented keys, "
-                f"got {entries!r}."
-            )
-        for name, value in entries.items():
-            values[_known(f"{group}.{name}", str(path))] = value
-    return values
-
-
-def _known(key: str, where: str) -> str:
-    known = list(option_defaults())
-    if key not in known:
-        last = key.rsplit(".", 1)[-1]
-        near = difflib.get_close_matches(key, known, n=1) or [
-            other for other in known if other.endswith(f".{last}")
-        ]
-        hint = f" (did you mean '{near[0]}'?)" if near else f"; known: {', '.join(known)}"
-        raise InputError(f"{where}: unknown key '{key}'{hint}.")
-    return key
+        found = re.match(r"Options\.([\w.]+): unexpected", str(error))
+        near = difflib.get_close_matches(found[1], option_defaults(), n=1) if found else []
+        hint = f" Did you mean '{near[0]}'?" if near else ""
+        raise InputError(f"{' and '.join(where)}: {error}{hint}") from None
 
 
 def weight_files(weights: Iterable[str], methods: Iterable[str]) -> dict[str, str]:

@@ -12,13 +12,15 @@ import numpy as np
 import pandas as pd
 
 from hybridvo.commands.configuration import load_options
-from hybridvo.commands.run import EXIT_INTERRUPTED, RunResult, run
+from hybridvo.commands.run import EXIT_INTERRUPTED, run
 from hybridvo.data.sequence import open_sequence
 from hybridvo.errors import InputError, OutputError
+from hybridvo.evaluation.pair_errors import true_trajectory
 from hybridvo.evaluation.plots import plot_trajectories
 from hybridvo.files import make_folder, write_json
 from hybridvo.synthetic.render import write_sintel
 from hybridvo.synthetic.scenes import make_scene
+from hybridvo.trajectory import read_trajectory
 
 METHODS = {
     "hybrid": "hybridvo (hybrid)",
@@ -56,12 +58,12 @@ def demo(
     scene = make_scene(SCENE, seed, height=HEIGHT, width=WIDTH, frames=frames)
     write_sintel(scene, out / "data", SCENE)
     sequence = open_sequence(out / "data" / "training" / "clean" / SCENE, "sintel")
-    results: dict[str, RunResult] = {}
+    summaries: dict[str, dict[str, Any]] = {}
     for method in METHODS:
         options = load_options(
             given={"run.method": method, "flow.source": "dis", "run.max_failed": 1.0}
         )
-        results[method] = run(
+        summaries[method], code = run(
             sequence,
             out / method,
             options,
@@ -69,7 +71,7 @@ def demo(
             command=command,
             quiet=quiet,
         )
-        if results[method].exit_code == EXIT_INTERRUPTED:
+        if code == EXIT_INTERRUPTED:
             raise KeyboardInterrupt
     moving = float(np.median([(scene.object_id(i) > 0).mean() for i in range(scene.frames)]))
     content: dict[str, Any] = {
@@ -79,12 +81,12 @@ def demo(
         "flow_source": "dis",
         "depth_source": "true",
         "alignment": "origin",
-        "rows": [_row(method, result.summary) for method, result in results.items()],
+        "rows": [_row(method, summary) for method, summary in summaries.items()],
         "image": os.fspath(out / "trajectory.png"),
     }
-    paths = {METHODS[m]: path for m in DRAWN if (path := results[m].trajectory) is not None}
+    paths = {METHODS[m]: read_trajectory(out / m / "trajectory.tum") for m in DRAWN}
     title = f"{100 * moving:.0f} % of the pixels move by themselves"
-    truth = results["hybrid"].gt
+    truth = true_trajectory(sequence, range(frames))
     plot_trajectories(paths, content["image"], truth=truth, alignment="origin", title=title)
     write_json(out / MARK, content)
     return content

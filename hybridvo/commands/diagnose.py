@@ -60,8 +60,6 @@ class Finding:
     state: str
     message: str
     value: Any = None
-    standard_error: Any = None
-    unit: str = ""
 
 
 def diagnose(sequence: Sequence, *, pairs: int = 40) -> dict[str, Any]:
@@ -258,19 +256,19 @@ def _units(pairs: list[Pair]) -> Finding:
     if len(scales) < MIN_PAIRS:
         if advice:
             text += f", which cannot be metres; probable remedy: {advice}"
-            return Finding("differs", text, median, unit="m")
+            return Finding("differs", text, median)
         # all depths and all translations times s project to the same pixels: no pair can tell
         text += f"; {len(scales)} pairs with a true motion on file, {MIN_PAIRS} needed"
-        return Finding("cannot_tell", text, median, unit="m")
+        return Finding("cannot_tell", text, median)
     logs = np.log(np.maximum(scales, 1e-6))
     value = float(np.exp(np.median(logs)))
     deviation = 1.4826 * float(np.median(np.abs(logs - np.median(logs))))
     error = value * deviation * math.sqrt(math.pi / 2 / len(logs))
     text += f"; motions are {value:.4g} (+- {error:.2g}) times as long as the poses on file say"
     if abs(value - 1) <= max(MIN_SCALE_ERROR, SIGMAS * error):
-        return Finding("agrees", text, value, error, "ratio")
+        return Finding("agrees", text, value)
     remedy = f"divide by {value:.4g}" if value > 1 else f"multiply by {1 / value:.4g}"
-    return Finding("differs", f"{text}: depth: {advice or remedy}", value, error, "ratio")
+    return Finding("differs", f"{text}: depth: {advice or remedy}", value)
 
 
 def _depth_steps(pairs: list[Pair]) -> Finding:
@@ -284,36 +282,32 @@ def _depth_steps(pairs: list[Pair]) -> Finding:
     )
     if steps:
         text += ": files of several units, or a scale of its own in every frame"
-    return Finding("differs" if steps else "agrees", text, ratios[k], unit="ratio")
+    return Finding("differs" if steps else "agrees", text, ratios[k])
 
 
 def _depth_against_colour(pairs: list[Pair]) -> Finding:
     costs = np.array(_known(pairs, "shift_costs")[1])
     n = len(costs)
     if n < MIN_PAIRS:
-        text = f"{n} pairs with depth edges in textured places, {MIN_PAIRS} needed"
+        text = f"{n} pairs with textured depth edges, {MIN_PAIRS} needed"
         return Finding("cannot_tell", text)
     total = costs.mean(axis=0)
     value = _minimum(total)
     left_out = np.array([_minimum((n * total - cost) / (n - 1)) for cost in costs])
-    error = np.sqrt((n - 1) * left_out.var(axis=0))  # jackknife
-    size, spread = float(np.linalg.norm(value)), float(np.linalg.norm(error))
+    spread = float(np.sqrt((n - 1) * left_out.var(axis=0).sum()))  # jackknife
+    size = float(np.linalg.norm(value))
     gain = float(total[REACH_PX, REACH_PX] - total.min())
     is_shifted = size > max(MIN_SHIFT_PX, SIGMAS * spread)
     if spread > MIN_SHIFT_PX or (is_shifted and gain <= MIN_SHIFT_GAIN):
-        text = "the images at depth edges do not show whether depth is shifted"
-        return Finding("cannot_tell", text, value.tolist(), error.tolist(), "px")
+        return Finding("cannot_tell", "the images do not show whether depth is shifted")
     text = (
         f"the depth map stands {value[0]:+.1f} px right, {value[1]:+.1f} px down "
         f"(+- {spread:.1f}, searched to {REACH_PX}) of the image"
     )
     if is_shifted:
-        text += (
-            ": colour and depth look unregistered; register depth to colour, or give the "
-            "intrinsics of the colour camera"
-        )
+        text += ": register depth to colour, or give the intrinsics of the colour camera"
     state = "differs" if is_shifted else "agrees"
-    return Finding(state, text, value.tolist(), error.tolist(), "px")
+    return Finding(state, text, value.tolist())
 
 
 def _exposure(pairs: list[Pair]) -> Finding:
@@ -329,7 +323,7 @@ def _exposure(pairs: list[Pair]) -> Finding:
     if dark:
         text += f"; {len(dark)} frames are dark: {shown(dark)}"
     state = "differs" if steps or dark else "agrees"
-    return Finding(state, text, steps / len(greys), unit="fraction of pairs")
+    return Finding(state, text, steps / len(greys))
 
 
 def _images_against_flow(pairs: list[Pair]) -> Finding:
@@ -340,9 +334,9 @@ def _images_against_flow(pairs: list[Pair]) -> Finding:
     share = len(against) / len(reasons)
     text = f"the flow contradicts the images in {len(against)} of {len(reasons)} pairs"
     if share <= MAX_CONTRADICTED:
-        return Finding("agrees", text, share, unit="fraction of pairs")
+        return Finding("agrees", text, share)
     index, why = against[0]
-    return Finding("differs", f"{text}; frame {index}: {why}", share, unit="fraction of pairs")
+    return Finding("differs", f"{text}; frame {index}: {why}", share)
 
 
 QUESTIONS: dict[str, Callable[[list[Pair]], Finding]] = {

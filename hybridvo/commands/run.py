@@ -43,7 +43,6 @@ from hybridvo.pipeline import check_method, weights_hash
 from hybridvo.refinement.depth import depth_ratio
 from hybridvo.results import State, Step
 from hybridvo.tracking.state import TrackerState
-from hybridvo.trajectory import Trajectory
 from hybridvo.types import Frame
 
 EXIT_DONE, EXIT_FAILED_FRAMES, EXIT_INTERRUPTED = 0, 3, 130
@@ -52,19 +51,6 @@ RECORDING = "recording.rrd"
 """Name of a Rerun recording within the output folder."""
 SAVE_EVERY = 50
 """Frames after which the run can be resumed."""
-
-
-@dataclass(frozen=True, eq=False)
-class RunResult:
-    """Exit code 0, 3 (too many failed frames) or 130 (interrupted); a summary, JSON-ready; poses.
-
-    There is no trajectory where no frame was finished, or all before a resume.
-    """
-
-    exit_code: int
-    summary: dict[str, Any]
-    trajectory: Trajectory | None = None
-    gt: Trajectory | None = None
 
 
 def run(
@@ -77,8 +63,8 @@ def run(
     command: Iterable[str] = (),
     quiet: bool = False,
     rrd: str | os.PathLike[str] | None = None,
-) -> RunResult:
-    """Estimate, chain, write and score a sequence.
+) -> tuple[dict[str, Any], int]:
+    """Estimate, chain, write and score a sequence: a summary, JSON-ready, and the exit code.
 
     ``out`` is by default ``runs/NAME``, ``command`` stands in ``run.json``; ``rrd`` is the file of
     a Rerun recording, empty for ``recording.rrd`` in the output folder.
@@ -122,7 +108,7 @@ def run(
         if folder.finished:
             summary = folder.read_json(STATE)["summary"]
             summary |= {"state": "done", "metrics": folder.read_json("metrics.json") or None}
-            return RunResult(_exit_code(summary, options), summary)
+            return summary, _exit_code(summary, options)
         recording = None
         if rrd is not None:
             poses = None if sequence.poses is None else sequence.poses[list(frames)]
@@ -135,10 +121,11 @@ def run(
                 poses=poses,
             )
             stack.enter_context(recording)
-        result = _Job(sequence, frames, options, vo, flow, folder, recording).run(quiet)
+        job = _Job(sequence, frames, options, vo, flow, folder, recording)
+        summary, exit_code = job.run(quiet)
         if recording is not None:
-            result.summary["recording"] = os.fspath(recording.path)
-        return result
+            summary["recording"] = os.fspath(recording.path)
+        return summary, exit_code
 
 
 @dataclass
@@ -153,7 +140,7 @@ class _Job:
     folder: RunFolder
     recording: Recording | None
 
-    def run(self, quiet: bool) -> RunResult:
+    def run(self, quiet: bool) -> tuple[dict[str, Any], int]:
         label = f"{self.sequence.name} [{self.options.run.method}]"
         rows, total = self.folder.rows, len(self.frames)
         with (
@@ -251,19 +238,19 @@ class _Job:
         camera = self.sequence.camera(step.index)
         return pair_errors(step.T_curr_prev, T_true, prev.depth, prev.camera, camera)
 
-    def _write(self, interrupted: bool) -> RunResult:
+    def _write(self, interrupted: bool) -> tuple[dict[str, Any], int]:
         """Results of the rows kept so far, and the scores where the run is complete."""
         folder, path, rows = self.folder, self.folder.path, self.folder.rows
         if not rows:  # interrupted before the first frame
             folder.write_state("interrupted")
-            return RunResult(EXIT_INTERRUPTED, {"state": "interrupted", "frames": 0})
+            return {"state": "interrupted", "frames": 0}, EXIT_INTERRUPTED
         trajectory = results.write_motions(path, rows)
         gt = true_trajectory(self.sequence, self.frames)
         summary = results.summarise(rows, self.sequence, self.options.run.method)
         summary["out"] = os.fspath(path)
         if interrupted:
             folder.write_state("interrupted", summary=summary)
-            return RunResult(EXIT_INTERRUPTED, summary | {"state": "interrupted"}, trajectory, gt)
+            return summary | {"state": "interrupted"}, EXIT_INTERRUPTED
         exit_code = _exit_code(summary, self.options)
         if exit_code == EXIT_FAILED_FRAMES:
             allowed = self.options.run.max_failed
@@ -276,7 +263,7 @@ class _Job:
         written = (path / name for name in (*RESULTS, STATE))
         summary["files"] = [os.fspath(file) for file in written if file.exists()]
         folder.write_state("done", summary=summary)
-        return RunResult(exit_code, summary | {"state": "done", "metrics": metrics}, trajectory, gt)
+        return summary | {"state": "done", "metrics": metrics}, exit_code
 
 
 def _frames(sequence: Sequence, options: Options) -> range:

@@ -13,7 +13,7 @@ import numpy as np
 
 from hybridvo.data.camera_file import IMAGES, Calibration, Lens, parse_camera, units_per_metre
 from hybridvo.data.image_io import read_depth, read_flow, read_mask_png, read_rgb
-from hybridvo.data.lists import check_increasing, shown, sorted_files, warn_of_gaps
+from hybridvo.data.lists import check_increasing, match_files, shown, sorted_files, warn_of_gaps
 from hybridvo.errors import FormatError, InputError
 from hybridvo.types import Camera, Frame
 from hybridvo.units import depth_advice, typical_depth
@@ -290,21 +290,12 @@ class Sequence:
         return rgb or depth
 
     def _find_masks(self, folder: str | os.PathLike[str] | None) -> list[Path | None]:
-        """Mask of each frame: by equal names, else by order where the counts agree."""
+        """Mask of each frame."""
         if folder is None:
             return [None] * len(self)
-        masks = sorted_files(Path(folder), IMAGES)
         frames = [rgb or depth for rgb, depth in zip(self.rgb_files, self.depth_files, strict=True)]
-        by_stem = {path.stem: path for path in masks}
-        found = [by_stem.get(path.stem) if path else None for path in frames]
-        if not any(found) and len(masks) == len(frames):
-            found = [*masks]
-        if not any(found):
-            raise InputError(
-                f"{folder}: {len(masks)} masks (PNG or JPEG, 0 where pixels must not be used) for "
-                f"{len(frames)} frames, and no name agrees. Name them like the images."
-            )
-        return found
+        hint = "Expected PNG or JPEG, 0 where pixels must not be used, named like the images."
+        return match_files(frames, sorted_files(Path(folder), IMAGES), Path(folder), hint)
 
     def _warn_of_missing_files(self) -> None:
         listed = {"image": self.rgb_files, "depth": self.depth_files, "mask": self.mask_files}

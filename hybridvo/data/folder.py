@@ -12,6 +12,7 @@ from hybridvo.data.base import Given, Listing, Sequence
 from hybridvo.data.camera_file import CAMERA_FILE, IMAGES, Calibration, read_camera_file
 from hybridvo.data.lists import (
     depth_at,
+    match_files,
     poses_at,
     read_stamps,
     read_timed_poses,
@@ -123,44 +124,33 @@ def _match_depth(
     frames: list[Path], files: list[Path], root: Path, told: list[str]
 ) -> dict[int, Path | None]:
     """Index of each frame that is kept -> its depth."""
-    by_stem = {path.stem: path for path in files}
-    by_name = {i: by_stem.get(frame.stem) for i, frame in enumerate(frames)}
-    if any(by_name.values()):
-        stray = [path.name for path in files if path not in by_name.values()]
-        if stray:
-            told.append(
-                f"{root.name}: {len(stray)} depth files without an image are left out: "
-                f"{shown(stray, 4)}."
-            )
-        return by_name
-    stamps = _own_stamps(root / "timestamps.txt", frames, told)
-    depth_stamps = _own_stamps(root / "depth_timestamps.txt", files, told)
-    if stamps is not None and depth_stamps is not None:
-        pairs = depth_at(stamps, depth_stamps, root, told)
-        return {i: files[j] for i, j in pairs}
-    if len(files) == len(frames):
-        return dict(enumerate(files))
-    raise InputError(
-        f"{root / 'depth'}: {len(files)} files for {len(frames)} images, and no file name agrees "
-        f"({files[0].name} against {frames[0].name}). Give both the same names, or their stamps: "
-        f"as file names, or one a line in timestamps.txt and depth_timestamps.txt."
-    )
+    stems = {path.stem for path in frames}
+    stray = [path.name for path in files if path.stem not in stems]
+    if len(stray) == len(files):
+        stamps = _own_stamps(root / "timestamps.txt", frames, told)
+        depth_stamps = _own_stamps(root / "depth_timestamps.txt", files, told)
+        if stamps is not None and depth_stamps is not None:
+            pairs = depth_at(stamps, depth_stamps, root, told)
+            return {i: files[j] for i, j in pairs}
+    elif stray:
+        left_out = f"{len(stray)} depth files without an image are left out"
+        told.append(f"{root.name}: {left_out}: {shown(stray, 4)}.")
+    hint = "Give both the same names, or their stamps: as names, or in (depth_)timestamps.txt."
+    return dict(enumerate(match_files(frames, files, root / "depth", hint)))
 
 
 def _match_flow(
     frames: list[Path], files: list[Path], root: Path, told: list[str]
 ) -> list[Path | None]:
     """Flow by equal names, else by order; one that led to a missing image is left out."""
-    by_stem = {path.stem: path for path in files}
-    matched = [by_stem.get(frame.stem) for frame in frames]
-    if not any(matched):
-        if files and len(files) not in (len(frames), len(frames) - 1):
-            raise InputError(
-                f"{root / 'flow'}: {len(files)} files for {len(frames)} images, and no file name "
-                f"agrees ({files[0].name} against {frames[0].name}). Give both the same names."
-            )
-        return [*files, *[None] * (len(frames) - len(files))]
-    if not all(path.stem.isascii() and path.stem.isdigit() for path in (*frames, *files)):
+    if not files:
+        return [None] * len(frames)
+    last = len(frames) - (len(files) == len(frames) - 1)  # none starts at the last image
+    hint = "Give both the same names."
+    matched = match_files(frames[:last], files, root / "flow", hint)
+    matched += [None] * (len(frames) - last)
+    is_numbered = all(path.stem.isascii() and path.stem.isdigit() for path in (*frames, *files))
+    if not is_numbered or not {path.stem for path in frames} & {path.stem for path in files}:
         return matched
     numbers = np.array([int(path.stem) for path in frames])
     steps = np.diff(numbers)

@@ -56,6 +56,21 @@ def _one_each(files: Many[Path], keys: Many) -> dict:
     return found
 
 
+def match_files(
+    frames: Many[Path | None], files: list[Path], where: Path, hint: str
+) -> list[Path | None]:
+    """File of each frame: by equal names, else by order where the counts agree."""
+    by_stem = {path.stem: path for path in files}
+    found = [by_stem.get(frame.stem) if frame is not None else None for frame in frames]
+    if not any(found) and len(files) == len(frames):
+        found = [*files]
+    if not any(found):
+        raise InputError(
+            f"{where}: {len(files)} files for {len(frames)} frames, and no name agrees. {hint}"
+        )
+    return found
+
+
 def warn_of_gaps(name: str, numbers: Many[int], told: list[str]) -> None:
     """Name the frame numbers that are missing between the first and the last."""
     spans = [

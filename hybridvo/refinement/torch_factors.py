@@ -141,14 +141,11 @@ def jacobian(pixels: Pixels, at: Residuals) -> tuple[torch.Tensor, ...]:
 
 @dataclass(frozen=True, eq=False)
 class Weighted:
-    """Residuals under their covariance and the robust kernel.
+    """Residuals at the likely depths under their covariance and the robust kernel.
 
-    Args:
-        at: at the likely depths.
-        D: (B, R, N) and kappa (B, N) of the information.
-        right: (B, R, N) Sigma^-1 r.
-        distance2: (B, N) squared Mahalanobis distances.
-        robust: (B, N) robust weights without the external ones, 0 where unusable.
+    cost = how.kernel(torch.where(at.front, found.distance2, behind)).cost
+    cost = (pixels.weight * cost).sum(dim=1)
+    return Linearization(0.5 * (H + H.transpose(2, 3)), g, cost, w.sum(dim=1), found)
     """
 
     at: Residuals
@@ -184,17 +181,15 @@ class Linearization:
     Args:
         H: (B, C, 6, 6) sum of w J^T Sigma^-1 J. g: (B, C, 6) sum of w J^T Sigma^-1 r.
         cost: (B,) robust cost, pixels behind the camera at the full one.
-        weights: (B, N) robust weights without the external ones, 0 where unusable.
         weight_sum: (B,) sum of robust times external weights.
-        distance2: (B, N) squared Mahalanobis distances.
+        at: the residuals.
     """
 
     H: torch.Tensor
     g: torch.Tensor
     cost: torch.Tensor
-    weights: torch.Tensor
     weight_sum: torch.Tensor
-    distance2: torch.Tensor
+    at: Weighted
 
     def total(self) -> tuple[torch.Tensor, torch.Tensor]:
         """(H (B, 6, 6), g (B, 6)) in float64: a float32 sum over an image loses its fifth digit."""
@@ -220,14 +215,8 @@ def linearize(
     g = (G[..., : right.shape[2]] @ right[..., None])[..., 0]
     behind = torch.full_like(found.distance2, BEHIND_DISTANCE2)
     cost = how.kernel(torch.where(at.front, found.distance2, behind)).cost
-    return Linearization(
-        H=0.5 * (H + H.transpose(2, 3)),
-        g=g,
-        cost=(pixels.weight * cost).sum(dim=1),
-        weights=found.robust,
-        weight_sum=w.sum(dim=1),
-        distance2=found.distance2,
-    )
+    cost = (pixels.weight * cost).sum(dim=1)
+    return Linearization(0.5 * (H + H.transpose(2, 3)), g, cost, w.sum(dim=1), found)
 
 
 def scores(pixels: Pixels, T: pp.LieTensor, how: RobustNoise) -> tuple[torch.Tensor, Weighted]:

@@ -46,11 +46,7 @@ class Preset(Protocol):
 
 
 def read_yaml(path: str | Path) -> dict[str, Any]:
-    """Mapping that a YAML file holds, over the one of the file that it ``extends``.
-
-    Raises:
-        InputError: no such file. FormatError: not YAML, or not a mapping.
-    """
+    """Mapping that a YAML file holds, over the one of the file that it ``extends``."""
     try:
         mapping = parse_yaml(read_text(path), str(path))
     except FileNotFoundError:
@@ -74,11 +70,7 @@ def _merged(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
 
 
 def build_options(cls: type[OptionsT], mapping: dict[str, Any], where: str) -> OptionsT:
-    """Options of a class from plain values; keys that are left out keep their default.
-
-    Raises:
-        InputError: an unknown key or a value out of bounds, with its place.
-    """
+    """Options of a class from plain values; what is wrong is named with its place."""
     try:
         return cls(**mapping)
     except (InputError, TypeError) as error:
@@ -90,12 +82,8 @@ def load_preset(
     kinds: dict[str, type] = PRESETS,
     size: tuple[int, int] | None = None,
 ) -> Preset:
-    """Generator of ``kinds`` that a file such as ``configs/data_paper.yaml`` describes.
-
-    ``size``: (height, width) of the samples instead of the file's own.
-
-    Raises:
-        InputError: no such file, an unknown kind or key, or a value that cannot be meant.
+    """Generator of ``kinds`` that a file such as ``configs/data_paper.yaml`` describes, for samples
+    of its own ``size`` (height, width) or another.
     """
     mapping = read_yaml(path)
     kind = mapping.pop("preset", None)
@@ -198,11 +186,7 @@ def _open_shard(path: Path) -> dict[str, np.ndarray]:
 
 
 def read_sample(folder: str | Path, index: int) -> Sample:
-    """Sample ``index`` of a folder that :func:`write_samples` filled.
-
-    Raises:
-        InputError: no such sample. FormatError: a damaged shard.
-    """
+    """Sample ``index`` of a folder that :func:`write_samples` filled."""
     folder = Path(folder)
     manifest = _read_manifest(folder)
     if not 0 <= index < manifest["count"]:

@@ -35,8 +35,7 @@ CHECKPOINT, LOG = "checkpoint.pt", "log.jsonl"
 class Task(Protocol):
     """What is trained: a network, its samples and its loss.
 
-    ``data`` describes the samples in plain values: with the options it is the record of a run.
-    ``all_parameters_used`` says whether every parameter takes part in every loss.
+    ``data`` describes the samples in plain values; ``all_parameters_used``: in every loss.
     """
 
     network: nn.Module
@@ -93,13 +92,10 @@ class Trainer:
             self.model = DistributedDataParallel(
                 self.network, find_unused_parameters=not task.all_parameters_used
             )
-        average = self.options.ema_decay > 0
+        average, how = self.options.ema_decay > 0, self.options.optimizer
         self.ema = copy.deepcopy(self.network).requires_grad_(False) if average else None
         self.optimizer = torch.optim.AdamW(
-            self.network.parameters(),
-            lr=self.options.optimizer.learning_rate,
-            betas=self.options.optimizer.betas,
-            weight_decay=self.options.optimizer.weight_decay,
+            self.network.parameters(), how.learning_rate, how.betas, weight_decay=how.weight_decay
         )
         self.step = self.samples = self.skipped = self.skipped_in_a_row = 0
         self.elapsed_s = 0.0
@@ -155,11 +151,9 @@ class Trainer:
             return
         # A young average follows quickly: it must forget the random start.
         decay = min(self.options.ema_decay, (1 + self.step) / (10 + self.step))
-        with torch.no_grad():
-            for ours, theirs in zip(
-                self.ema.state_dict().values(), self.network.state_dict().values(), strict=True
-            ):
-                ours.lerp_(theirs, 1 - decay)
+        states = (network.state_dict().values() for network in (self.ema, self.network))
+        for ours, theirs in zip(*states, strict=True):
+            ours.lerp_(theirs, 1 - decay)
 
     def run(self, time_limit_s: float = math.inf, until: int | None = None) -> str:
         """Train until the options' steps, a time limit or a request to stop, and save.
@@ -201,12 +195,10 @@ class Trainer:
 
     def _agree(self, signalled: bool, late: bool) -> int:
         """2 = a process was told to stop, 1 = time is up on one, 0 = go on; equal on all ranks."""
-        stop = 2 if signalled else int(late)
+        flag = torch.tensor(2 if signalled else int(late), device=self.device)
         if self.world > 1:
-            flag = torch.tensor(stop, device=self.device)
             dist.all_reduce(flag, dist.ReduceOp.MAX)
-            stop = int(flag)
-        return stop
+        return int(flag)
 
     def evaluate(self) -> dict[str, Any]:
         """Figures of the exported network on development samples, also into the log."""
@@ -249,11 +241,10 @@ class Trainer:
                 self.ema.load_state_dict(weights)
 
     def resume(self) -> bool:
-        """Go on where the folder's checkpoint ended, if there is one.
+        """Go on where the folder's checkpoint ended, if there is one of the same options and data.
 
         Raises:
-            CheckpointError: a damaged file.
-            InputError: a run of other options or other data.
+            CheckpointError: a damaged file. InputError: of a run of other options or other data.
         """
         if self.folder is None or not (self.folder / CHECKPOINT).exists():
             return False
@@ -285,11 +276,7 @@ def _fits(name: str) -> Iterator[None]:
 
 
 def read_checkpoint(path: Path, device: torch.device | str = "cpu") -> dict[str, Any]:
-    """Content of a ``checkpoint.pt``; nothing in it can run.
-
-    Raises:
-        CheckpointError: no such file, or a damaged one.
-    """
+    """Content of a ``checkpoint.pt``; nothing in it can run."""
     try:
         state = torch.load(path, map_location=device, weights_only=True)
         return {**state, "record": state["record"]}

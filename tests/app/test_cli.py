@@ -104,7 +104,7 @@ def test_exit_codes_1_4_5_and_130(dataset, tmp_path, monkeypatch, capsys):
 
         monkeypatch.setattr("hybridvo.data.sequence.open_sequence", broken)
         assert main([*arguments, str(tmp_path / "out")]) == code
-    assert "bug in hybridvo" in capsys.readouterr().err
+    assert "this is a bug" in capsys.readouterr().err
 
 
 def test_data_on_stdout_and_progress_on_stderr(dataset, tmp_path, capsys):

@@ -18,7 +18,7 @@ from hybridvo.hypotheses.selector import (
     CueSelector,
     MaskSelector,
     Scores,
-    evidence_of,
+    gap_of,
 )
 from hybridvo.options import Options, SelectOptions
 from hybridvo.pipeline import Context
@@ -220,15 +220,11 @@ def test_only_another_motion_is_a_rival(case) -> None:
     found, _, _ = case
     poses = np.concatenate([found.poses, found.poses[:1]])  # the first one found twice
     candidates = Candidates(poses, found.facts, np.arange(len(poses)), len(found.poses))
-    masks = np.zeros((0, 1, 1))
     score = np.zeros(len(poses))
     score[[0, -1]] = 3.0
-    evidence = evidence_of(found, candidates, Scores(score, np.zeros(0), masks, 0.9))
-    np.testing.assert_allclose(evidence, [np.log(9), 3.0])
+    assert gap_of(found, candidates, score) == 3.0
     # a rival that looks as good leaves less to believe
     score[1] = 2.9
-    doubted = evidence_of(found, candidates, Scores(score, np.zeros(0), masks, 0.9))
-    np.testing.assert_allclose(doubted[1], 0.1)
+    assert gap_of(found, candidates, score) == pytest.approx(0.1)
     alone = replace(candidates, poses=poses[[0, -1]])
-    one = Scores(score[[0, -1]], np.zeros(0), masks, 0.9)
-    assert evidence_of(found, alone, one)[1] == NO_RIVAL
+    assert gap_of(found, alone, score[[0, -1]]) == NO_RIVAL
