@@ -47,7 +47,6 @@ class ComparisonOptions:
         protocol: ``paper`` or ``trajectory14`` (MPI Sintel as others score it), or None.
         weights: name of a network -> its file; the pretrained one where absent.
         device: of the networks.
-        jobs: sequences at a time, a process each.
         worst: pairs shown for each method and flow.
     """
 
@@ -62,13 +61,12 @@ class ComparisonOptions:
     protocol: str | None = None
     weights: Mapping[str, str] = field(default_factory=dict)
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    jobs: Count = 1
     worst: Natural = 3
 
 
 @dataclass(frozen=True)
 class Job:
-    """All methods and flows (``dis``, ``file``) on one sequence; plain data, for another process.
+    """All methods and flows (``dis``, ``file``) on one sequence.
 
     ``fingerprint`` stands for all that decides the result.
     """
