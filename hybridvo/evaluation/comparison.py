@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import filelock
-import numpy as np
 import pandas as pd
 
 import hybridvo
@@ -40,7 +39,6 @@ from hybridvo.evaluation.sequence_job import (
 from hybridvo.files import fingerprint, make_folder, versions, write_csv, write_json
 from hybridvo.network.models import Models
 from hybridvo.pipeline import METHODS, check_method, weights_hash
-from hybridvo.trajectory import Trajectory
 
 WRITTEN = ("results.json", "results.csv", "pairs.csv", "report.md", "report.html")
 """What a finished comparison leaves, beside ``trajectories/`` and ``worst/``."""
@@ -78,12 +76,17 @@ def compare(
     with _folder(out, mode):
         for name, reason in missing.items():
             report(f"not run: {name}: {reason}", 0, total)
-        parts = _work(jobs, out / "parts", report)
+        parts = _work(jobs, out, report)
         report("scores and report", total, total)
         for part in parts:
             for warning in part["sequence"]["warnings"]:
                 report(f"{part['sequence']['name']}: {warning}", total, total)
-        table = pair_table(row for part in parts for row in part["pairs"])
+        pairs = [row for part in parts for row in part["pairs"]]
+        table = pair_table(pairs)
+        worst = worst_pairs(table, options.worst)
+        for job, part in zip(jobs, parts, strict=True):
+            mine = [entry for entry in worst if entry["sequence"] == job.name]
+            draw_worst(out, job, mine, part["pairs"])
         result = {
             "command": list(command),
             "versions": versions(),
@@ -95,9 +98,10 @@ def compare(
             "finished": datetime.now(UTC).isoformat(timespec="seconds"),
             "missing": missing,
             **_scores(table, parts, protocol),
-            **_write_sequences(out, jobs, parts, worst_pairs(table, options.worst)),
+            "trajectories": [path for part in parts for path in part["trajectories"]],
+            "worst_pairs": worst,
         }
-        write_csv(out / "pairs.csv", PAIR_COLUMNS, (r for part in parts for r in part["pairs"]))
+        write_csv(out / "pairs.csv", PAIR_COLUMNS, pairs)
         write_json(out / "results.json", result)
         write_csv(out / "results.csv", ROW_COLUMNS, result["rows"])
         write_report(out, result, table)
@@ -189,7 +193,9 @@ def _plan(
         deciding = [name, fingerprint(sequence.files()), list(frames), flows, options.seed]
         deciding += [same_camera_only, options.device, hashes, hybridvo.__version__]
         digest = hashlib.sha256(json.dumps(deciding).encode()).hexdigest()
-        jobs.append(Job(str(path), name, options, flows, methods, frames, same_camera_only, digest))
+        plain = "".join(c if c.isalnum() or c in "-_." else "_" for c in name)[:60]
+        named = (str(path), name, f"{len(jobs):03d}_{plain}")
+        jobs.append(Job(*named, options, flows, methods, frames, same_camera_only, digest))
     return jobs, protocol
 
 
@@ -227,10 +233,11 @@ def _folder(out: Path, mode: Mode) -> Iterator[None]:
         raise LockedError(f"{out}: another run holds this folder.") from None
 
 
-def _work(jobs: list[Job], folder: Path, report: ReportProgress) -> list[dict[str, Any]]:
+def _work(jobs: list[Job], out: Path, report: ReportProgress) -> list[dict[str, Any]]:
     """What every job gave, in order; kept from an earlier try where that is finished."""
-    make_folder(folder)
-    paths = {job.name: folder / f"{job.fingerprint}.json" for job in jobs}
+    for name in ("parts", "trajectories", "worst"):
+        make_folder(out / name)
+    paths = {job.name: out / "parts" / f"{job.fingerprint}.json" for job in jobs}
     todo = [job for job in jobs if not paths[job.name].exists()]
     total = sum(job.pairs for job in jobs)
     done = total - sum(job.pairs for job in todo)
@@ -242,7 +249,7 @@ def _work(jobs: list[Job], folder: Path, report: ReportProgress) -> list[dict[st
         def report_pairs(pairs: int, before: int = done) -> None:
             report("", before + pairs, total)
 
-        write_json(paths[job.name], run_sequence(job, report_pairs))
+        write_json(paths[job.name], run_sequence(job, out, report_pairs))
         done += job.pairs
     return [json.loads(paths[job.name].read_text(encoding="utf-8")) for job in jobs]
 
@@ -267,27 +274,3 @@ def _scores(
         "breakdown": breakdown(table),
         "protocol": protocol and protocol_summary(protocol, totals, counts),
     }
-
-
-def _write_sequences(
-    out: Path, jobs: list[Job], parts: list[dict[str, Any]], worst: list[dict[str, Any]]
-) -> dict[str, Any]:
-    """Write the paths of every sequence and the images of its worst pairs, and say where."""
-    trajectories = []
-    for folder in ("trajectories", "worst"):
-        make_folder(out / folder)
-    for number, (job, part) in enumerate(zip(jobs, parts, strict=True)):
-        plain = "".join(c if c.isalnum() or c in "-_." else "_" for c in job.name)[:60]
-        stem = f"{number:03d}_{plain}"
-        for key, poses in part["trajectories"].items():
-            if poses is None:
-                continue
-            method, _, flow = key.partition("|")
-            stamps = part["timestamps"]["estimate" if flow else "ground_truth"]
-            path = "_".join([f"trajectories/{stem}", method, *flow.split()[:1]]) + ".tum"
-            Trajectory(np.array(stamps), np.array(poses)).save(out / path)
-            named = {"method": method if flow else None, "flow_source": flow or None}
-            trajectories.append({"sequence": job.name, **named, "path": path})
-        mine = [entry for entry in worst if entry["sequence"] == job.name]
-        draw_worst(out, f"worst/{stem}", job, mine, part["pairs"])
-    return {"trajectories": trajectories, "worst_pairs": worst}
