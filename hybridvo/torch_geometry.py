@@ -92,15 +92,12 @@ def reproject(
     Args:
         depth: (B, H, W) metres.
         T: T_curr_prev, (B, 4, 4) or pypose SE3 (B, 7).
-        K_prev: (B, 3, 3) intrinsics of the previous camera.
-        K_curr: (B, 3, 3) of the current one.
+        K_prev: (B, 3, 3).
+        K_curr: (B, 3, 3).
 
     Returns:
         (B, H, W, 2) px on the current image and (B, H, W) bool, False where the depth is invalid
         or the point is not in front of the camera; these pixels hold finite values without meaning.
-
-    Raises:
-        InputError: shapes that do not fit together.
     """
     if isinstance(T, pp.LieTensor):
         T = T.matrix()
@@ -127,15 +124,7 @@ def reproject(
 
 
 def euler_transform(rotation_deg: torch.Tensor, translation: torch.Tensor) -> torch.Tensor:
-    """Rigid transform of Euler angles and a translation, differentiable everywhere.
-
-    Args:
-        rotation_deg: (B, 3) Euler angles X-Y-Z in degrees, R = Rx Ry Rz.
-        translation: (B, 3) metres.
-
-    Returns:
-        (B, 4, 4), of the wider of the two types.
-    """
+    """(B, 4, 4) of Euler angles X-Y-Z in degrees and metres (B, 3), differentiable everywhere."""
     # Written out, not multiplied: a matrix product would run in bfloat16 under autocast.
     (cx, cy, cz), (sx, sy, sz) = (
         f(torch.deg2rad(rotation_deg)).unbind(1) for f in (torch.cos, torch.sin)

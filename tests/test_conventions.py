@@ -258,10 +258,12 @@ def test_current_depth_is_sampled_at_x_plus_flow():
         depth_curr=1 + u,
     )
     inputs = assemble_inputs(batch, (height, width))
-    np.testing.assert_allclose(inputs.depth_curr[0, 2, :7], [4, 5, 6, 7, 8, 9, 10])
+    np.testing.assert_allclose(
+        1 / inputs.inverse_depth[0, 1, 2, :7], [4, 5, 6, 7, 8, 9, 10], rtol=1e-6
+    )
     np.testing.assert_allclose(inputs.inverse_depth[0, 1, 2, 0], 0.25)
-    assert (inputs.depth_curr[0, 2, 7:] == 0).all()  # x + F is outside
-    assert (inputs.depth_curr[0, 5] == 0).all()
+    assert (inputs.inverse_depth[0, 1, 2, 7:] == 0).all()  # x + F is outside
+    assert (inputs.inverse_depth[0, 1, 5] == 0).all()
 
 
 # Angles, tangents, covariance

@@ -45,12 +45,7 @@ FOUND_NOTHING = (cv2.error, ValueError, RuntimeError, ArithmeticError)
 
 @dataclass(frozen=True, eq=False)
 class Correspondences:
-    """Sampled pixels of a pair.
-
-    Args:
-        xyz: (n, 3) float64 metres in the previous camera.
-        uv: (n, 2) float64 px in the current image: pixel plus flow.
-    """
+    """Sampled pixels: (n, 3) metres in the previous camera, (n, 2) px in the current image."""
 
     xyz: np.ndarray
     uv: np.ndarray
@@ -117,13 +112,7 @@ SOLVERS: dict[str, tuple[Solver, float]] = {
 
 
 def estimate_by_points(method: str, pair: FramePair, seed: int = 0) -> RelativePose:
-    """Motion of a pair by one of :data:`SOLVERS`.
-
-    Args:
-        method: which.
-        pair: depth of the previous frame (metres), flow (px) and both cameras are read.
-        seed: chooses the sampled pixels; OpenCV's own generator is fixed.
-    """
+    """Motion of a pair by one of :data:`SOLVERS`; OpenCV's own generator is fixed."""
     solve, threshold_px = SOLVERS[method]
     data = sample(pair, seed)
     if isinstance(data, Status):
@@ -222,14 +211,6 @@ def check(
     Covariance sigma^2 (J^T J)^-1 over them, sigma^2 = |r|^2 / (2 n - 6) unless ``sigma_px`` is
     given, J by the left perturbation, translation first. With a solver that stops short of the
     least-squares optimum of its inliers this is the covariance of the optimum, thus optimistic.
-
-    Args:
-        method: name for the result and its messages.
-        T: (4, 4) the solver's ``T_curr_prev``, or None where it found none.
-        data: what the solver was given.
-        camera: of the current frame.
-        threshold_px: largest residual of an inlier.
-        sigma_px: standard deviation of the residuals where it is known.
     """
     diverged = RelativePose.failed(
         Reason.SOLVER_DIVERGED, f"{method}: the solver found no finite rigid motion", method

@@ -92,13 +92,7 @@ ALIGNERS: dict[str, Callable[[RgbdFrames], np.ndarray | None]] = {
 
 
 def estimate_by_images(method: str, pair: FramePair, seed: int = 0) -> RelativePose:
-    """Motion of a pair by one of :data:`ALIGNERS`; its status is failed without images.
-
-    Args:
-        method: which.
-        pair: both frames with images and depth.
-        seed: of the pixels on which the motion is checked.
-    """
+    """Motion of a pair by one of :data:`ALIGNERS`; its status is failed without images."""
     frames = rgbd_frames(pair)
     if isinstance(frames, Status):
         return RelativePose.failed(frames.reason, frames.message, method)

@@ -63,12 +63,10 @@ class NetworkInputs(TensorBatch):
 
     Args:
         flow: (B, 2, h, w) flow in pixels of this size divided by ``FLOW_SCALE_PX``, 0 if invalid.
-        inverse_depth: (B, 2, h, w) 1 / metres, 0 if invalid. Channel 0 is the previous depth,
-            channel 1 the current depth sampled at x + F: both stand on the grid of the previous
-            frame, as in the paper's training data.
+        inverse_depth: (B, 2, h, w) 1 / metres, 0 if invalid: of the previous depth, and of the
+            current one sampled at x + F, both on the grid of the previous frame.
         rays: (B, 2, h, w) first two components of K^-1 x.
         valid: (B, h, w) bool, flow and previous depth are both usable.
-        depth_prev, depth_curr: (B, h, w) metres, the depths of ``inverse_depth``; 0 if invalid.
         K_prev, K_curr: (B, 3, 3) intrinsics scaled to (h, w), pixel-centre convention.
     """
 
@@ -76,8 +74,6 @@ class NetworkInputs(TensorBatch):
     inverse_depth: torch.Tensor
     rays: torch.Tensor
     valid: torch.Tensor
-    depth_prev: torch.Tensor
-    depth_curr: torch.Tensor
     K_prev: torch.Tensor
     K_curr: torch.Tensor
 
@@ -113,14 +109,7 @@ def assemble_inputs(
     """Inputs of one pair, of a batch, or of several pairs (of any sizes).
 
     Missing or damaged values (no flow, no depth, NaN, inf, depth <= 0, masked pixels) become 0 and
-    are marked in ``valid``; a pair that has nothing to offer is all invalid and disturbs no other.
-
-    Args:
-        pair: numpy pair or pairs, or a :class:`~hybridvo.types.PairBatch` of tensors.
-        size: (height, width) of the network's input.
-
-    Returns:
-        Float32 tensors (the type of the batch for a PairBatch) on the CPU or the batch's device.
+    are marked in ``valid``. Float32 tensors on the CPU; for a batch, its type and device.
 
     Raises:
         InputError: another type, or shapes that do not fit each other.
@@ -236,8 +225,6 @@ def _normalize(batch: PairBatch, rays: torch.Tensor) -> NetworkInputs:
         inverse_depth=torch.stack(inverse, dim=1),
         rays=rays,
         valid=flow_ok & prev_ok,
-        depth_prev=torch.where(prev_ok, prev, 0.0),
-        depth_curr=torch.where(curr_ok, curr, 0.0),
         K_prev=batch.K_prev,
         K_curr=batch.K_curr,
     )

@@ -31,28 +31,20 @@ KINDS = get_args(Kind)
 
 @option_group
 class NetworkOptions:
-    """What decides the shapes of a network's weights.
+    """What decides the shapes of a network's weights, and how it is used.
 
     Args:
-        kind: ``pwvo`` (also PWVO naive and the pixel-wise network: same shapes, other losses),
-            ``vonet`` or ``vonet-attention``.
+        kind: ``pwvo`` (also PWVO naive and the pixel-wise network), ``vonet``, ``vonet-attention``.
         width: factor on all channel counts; 0.5 has about a quarter of the parameters.
-        decoders: 1 = one decoder shared by both heads (published code), 2 = one for the pose and
-            one for the uncertainty (the paper's text).
-        head_stride: 1 = predictions at the resolution of the input, 2 = at half of it, without the
-            decoder's last stage: the same pose at about half the time on a CPU.
+        decoders: 1, shared by both heads (published code), or 2 (the paper's text).
+        head_stride: 1 = predictions at the resolution of the input, 2 = at half of it.
         uncertainty: whether the pixel-wise network has an uncertainty head.
-        scale_free: divide the inputs by the pair's own scales and multiply the outputs by them, see
-            :mod:`hybridvo.network.normalization`. Off as published.
+        scale_free: inputs without units, see :mod:`hybridvo.network.normalization`.
         passes: how often a scale-free network is used: each later pass looks at what the motion
             that the trusted pixels of the one before agree on leaves unexplained.
         input_stride: the network reads every n-th pixel of its inputs.
-        later_quantile: quantile of the lengths of the unexplained flow that scales the inputs of a
-            later pass; 0.4 in the first one. After a good start what is left of the static scene
-            is short and the flow of moving objects long, whatever their share.
-
-    Raises:
-        InputError: a value out of bounds, or two that exclude each other.
+        later_quantile: of the lengths of the unexplained flow, scales the inputs of a later pass;
+            0.4 in the first one. After a good start what is left of the static scene is short.
     """
 
     kind: Kind = "pwvo"

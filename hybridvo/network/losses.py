@@ -34,21 +34,14 @@ class LossOptions:
     """Which terms are on, and how.
 
     Args:
-        pose_uncertainty: weigh L^R and L^T by U^R and U^T (distribution learning); off for VONet
-            and for the paper's "pixel-wise" row.
-        flow, depth: L^F and L^D.
-        flow_uncertainty, depth_uncertainty: weigh them by U^F and U^D, which are exp of 0.1 and
-            0.25 times s, as published.
-        flow_weight: factor of L^F.
+        pose_uncertainty: weigh L^R and L^T by U^R and U^T (distribution learning).
+        flow_uncertainty, depth_uncertainty: weigh L^F and L^D by U^F and U^D, which are exp of 0.1
+            and 0.25 times s, as published.
         translation_form: ``direction`` (the paper's: direction and length) or ``laplace`` (L1 of
             each component in metres with its own s, so that exp(s) is in metres).
         flow_limit_px: flow errors of a component at or above this do not count.
         direction_floor: metres; below this length of the translation its direction fades out.
-            1e-6 as published; larger values calm the gradient near zero translation, which grows
-            with 1 / length.
-
-    Raises:
-        InputError: a value out of bounds.
+            1e-6 as published; larger values calm the gradient near zero translation.
     """
 
     pose_uncertainty: bool = True
@@ -76,9 +69,6 @@ class LossOptions:
 @dataclass(frozen=True, eq=False)
 class LossTargets(TensorBatch):
     """Ground truth of a batch, at the network's input size (h, w).
-
-    ``subsample`` gives a cheap form of L^F and L^D: they fix six numbers a pair, which need not all
-    of its pixels.
 
     Args:
         rotation_deg: (B, 3) Euler angles X-Y-Z in degrees of T_curr_prev.

@@ -28,9 +28,7 @@ def load_weights(path: str | Path) -> tuple[Any, dict[str, Any]]:
     The network's ``options`` attribute says what it is.
 
     Raises:
-        CheckpointError: missing, truncated, no safetensors file (a pickle, text), of another
-            program or architecture, or with values that are not finite; names the file and what
-            does not match.
+        CheckpointError: no whole weights file, or one of another program or architecture.
     """
     from hybridvo.network.layers import NetworkOptions
     from hybridvo.network.pwvo import build_network
@@ -62,11 +60,7 @@ class Models:
         self._networks: dict[str, Any] = {}
 
     def path(self, name: str) -> Path:
-        """File of the weights of a network.
-
-        Raises:
-            CheckpointError: there are none (the message lists those known).
-        """
+        """File of the weights of a network."""
         from hybridvo.network.weights import pretrained
 
         return self.weights.get(name) or pretrained(name)
@@ -100,10 +94,8 @@ def default_models(device: str = "cpu") -> Models:
 
 @contextlib.contextmanager
 def one_thread() -> Iterator[None]:
-    """Run torch's CPU kernels on one thread, and as before afterwards.
-
-    A pair at 128x256 is too little work for several threads, which wait for each other: on a busy
-    machine that takes ten times as long.
+    """Run torch's CPU kernels on one thread: a pair is too little work for several, which wait for
+    each other.
     """
     import torch
 
@@ -116,11 +108,7 @@ def one_thread() -> Iterator[None]:
 
 
 def torch_device(device: str) -> str:
-    """``cpu`` or ``cuda`` for a device asked for.
-
-    Raises:
-        InputError: ``cuda`` on a machine, or with a build of torch, that has none.
-    """
+    """``cpu`` or ``cuda`` for a device asked for; refuses ``cuda`` where there is none."""
     if device == "cpu":
         return device
     import torch

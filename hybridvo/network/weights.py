@@ -56,17 +56,11 @@ class Weights:
 def save_weights(
     path: str | Path, network: nn.Module, card: Mapping[str, Any], dtype: str = "float32"
 ) -> Path:
-    """Write a network's weights; a half-written file never stands under ``path``.
-
-    Args:
-        path: of the file, by custom ``*.safetensors``; its folder must exist.
-        network: with its options as the attribute ``options``, which are stored in the header.
-        card: model card, JSON values only: preset, samples seen, seed, command, commit, figures.
-        dtype: ``float32``, or ``float16`` for half the size.
+    """Write a network's weights, its ``options`` and a model card of JSON values.
 
     Raises:
-        InputError: weights that are not finite or not representable in ``dtype``, a card that is
-            not JSON, an unknown ``dtype``.
+        InputError: weights that are not finite or not representable in ``dtype`` (float32 or
+            float16), a card that is not JSON.
         OutputError: the file cannot be written.
     """
     if dtype not in DTYPES:
@@ -90,8 +84,7 @@ def read_weights(path: str | Path) -> Weights:
     """Content of a file of :func:`save_weights`, on the CPU.
 
     Raises:
-        CheckpointError: missing, truncated, no safetensors file (a pickle, text), of another
-            program, or with values that are not finite.
+        CheckpointError: missing, truncated, of another program, or with values that are not finite.
     """
     path = Path(path)
     if not os.path.isfile(path):  # where Path.is_file() raises: a name that is too long

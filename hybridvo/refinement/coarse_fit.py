@@ -250,14 +250,7 @@ def translation_scale(samples: np.ndarray, n: int) -> float:
 def fit_coarse(
     samples: np.ndarray, n: int, K: np.ndarray, pose: np.ndarray, cutoff: float
 ) -> tuple[np.ndarray, float, float, float, int]:
-    """One motion on gathered pixels, by graduated non-convexity from a start.
-
-    Args:
-        samples: pixel buffer; its first ``n`` pixels count.
-        n: pixels.
-        K: (4,) float32 fx, fy, cx, cy of the current camera.
-        pose: (3, 4) start; left as it is.
-        cutoff: of the robust kernel.
+    """One motion on the first ``n`` pixels, by graduated non-convexity from a (3, 4) start.
 
     Returns:
         Pose (3, 4), flow noise px, depth noise, inlier ratio of the weight, iterations.

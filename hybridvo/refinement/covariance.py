@@ -63,9 +63,7 @@ def score_block(o, n, c2, external, work, rows, factors):
     """Write w s = w J^T Sigma^-1 r of each pixel to ``rows`` (6, N), and to ``factors`` (N,) what
     makes its outer product the curvature of the robust weights, ``-2 (dw / dd^2) s s^T``.
 
-    Subtracted from the Gauss-Newton Hessian the curvature gives the derivative of the estimating
-    equation, the "bread" of the sandwich covariance; the plain outer products are its "meat" under
-    independent errors.
+    The Gauss-Newton Hessian less the curvature is the derivative of the estimating equation.
     """
     keep_apart()  # type: ignore[call-arg]
     A, B, IZ, N0, N1, S = work[0], work[1], work[2], work[6], work[7], work[8]
@@ -106,13 +104,6 @@ def score_sums(
     """(42,) curvature of the robust weights and meat of independent errors, per unit of weight.
 
     From a coarse grid: both are averages over many pixels and enter the result at second order.
-
-    Args:
-        samples: pixel buffer; its first ``n`` pixels count.
-        n: pixels.
-        pose: (3, 4) T_curr_prev.
-        K: (4,) float32 fx, fy, cx, cy of the current camera.
-        noise: (3,) float32, see :func:`hybridvo.refinement.coarse_fit.set_noise`.
     """
     rows, factors, used = np.empty((6, n), np.float32), np.empty(n), np.zeros(SUMS)
     score_pixels(samples, n, pose, K, noise, new_work(), rows, factors, used)
@@ -128,10 +119,6 @@ def block_sums(tiles: np.ndarray, inverse: np.ndarray) -> tuple[np.ndarray, np.n
     them cover a tile, and each counts for that share. Under independent errors of the model's size
     a block with information H_b has scores of covariance H_b - H_b H^-1 H_b about the estimate: the
     second term in units of the first, averaged over the directions, is what the fit took.
-
-    Args:
-        tiles: (rows, columns, 27) information and scores.
-        inverse: (6, 6) of the whole information.
 
     Returns:
         (S, 6, 6), (S,), number of tiles with a score.
@@ -154,10 +141,8 @@ def block_sums(tiles: np.ndarray, inverse: np.ndarray) -> tuple[np.ndarray, np.n
 def long_range(growth: float, tiles: int) -> float:
     """Factor on the variance of blocks two tiles wide for errors that reach beyond them.
 
-    Args:
-        growth: variance of the scores of blocks four tiles wide over that of single tiles, in units
-            of independent errors.
-        tiles: how many there are.
+    ``growth``: variance of the scores of blocks four tiles wide over that of single tiles, in units
+    of independent errors.
     """
     if not (growth > LONG_GROWTH[0] and np.isfinite(growth)):
         return 1.0
@@ -231,15 +216,10 @@ def tile_sums(scores: np.ndarray, tile: np.ndarray, count: int) -> np.ndarray:
 
 
 def dispersion(sums: np.ndarray, meat: np.ndarray, model: np.ndarray) -> float | None:
-    """How many times larger the sandwich covariance over tiles is than that of the model.
+    """How many times larger the sandwich covariance over tiles is than the ``model`` (6, 6).
 
-    Args:
-        sums: (n, 6) sums of the scores of each tile.
-        meat: (6, 6) outer products of the scores of all pixels, added up.
-        model: (6, 6) covariance if the pixels' errors are independent and of the stated size.
-
-    Returns:
-        Ratio of the traces, at least 1; None where the scores leave a direction open.
+    From the scores (n, 6) of the tiles and the meat (6, 6) of all pixels; None where the scores
+    leave a direction open.
     """
     independent = positive_inverse(meat)
     if independent is None:

@@ -188,15 +188,10 @@ def sum_depth(
 
 
 class DepthFactor:
-    """The current frame's depth, given the flow, see :class:`hybridvo.refinement.solver.Factor`.
+    """The current frame's depth (H, W), given the flow, at every ``stride``-th pixel of a pair.
 
-    Args:
-        image: the pixels of the pair.
-        curr: (H, W) current depth.
-        stride: px between the pixels compared.
-        sigma: standard deviation of the conditional residual.
-        noise: (3,) float32, of flow and depth.
-        tile: side of the tiles, px.
+    ``sigma`` is the standard deviation of the conditional residual, ``noise`` (3,) that of flow and
+    depth as in the kernels.
     """
 
     def __init__(
@@ -230,11 +225,8 @@ class DepthFactor:
 
 @dataclass(frozen=True)
 class DepthAgreement:
-    """Second depth over the depth of the first frame's points, moved.
-
-    Args:
-        ratio: its median; 1 where both frames have one scale.
-        spread: median distance of its log from that of the median.
+    """Median ratio of the second depth to that of the first frame's points, moved, and the median
+    distance of its log from that of the median.
     """
 
     ratio: float
@@ -264,17 +256,8 @@ def depth_agreement(
 ) -> DepthAgreement | None:
     """Compare the depth of a frame with that of points of another one, moved into it.
 
-    It asks the nearest pixel, whatever its neighbours are: in noise none agree.
-
-    Args:
-        curr: frame with depth, metres.
-        u: (N,) columns that the points are seen at, px.
-        v: (N,) rows.
-        moved: (N,) their depth in this frame, metres.
-        least: pixels that can tell.
-
-    Returns:
-        None where fewer are known.
+    It asks the nearest pixel, whatever its neighbours are: in noise none agree. Points (N,) are
+    seen at ``u``, ``v`` px with the depth ``moved``, metres; None where fewer than ``least`` tell.
     """
     assert curr.depth is not None  # asked by the caller
     height, width = curr.depth.shape
@@ -299,17 +282,7 @@ def depth_ratio(
     """Median depth of the current frame over what the previous one and the motion predict.
 
     The scale of a whole sequence cannot be seen: all depths and all translations times s project to
-    the same pixels. A scale that changes on the way can.
-
-    Args:
-        prev: frame with depth, metres.
-        curr: the next one with depth.
-        flow: (H, W, 2) px from ``prev`` to ``curr``, or None.
-        T_curr_prev: (4, 4) motion between them, metres.
-
-    Returns:
-        1 where both have the same scale and the motion is right; None where too few pixels can be
-        compared.
+    the same pixels. A scale that changes on the way can. None where too few pixels can be compared.
     """
     if flow is None or prev.depth is None or curr.depth is None:
         return None

@@ -15,14 +15,14 @@ from hybridvo.refinement.covariance import sandwich_covariance, score_sums, symm
 from hybridvo.refinement.depth import DepthAgreement, DepthFactor
 from hybridvo.refinement.noise import estimate_noise
 from hybridvo.refinement.pixels import CoarseGrid, PixelGrid, as_contiguous
-from hybridvo.refinement.solver import Linearization, SolverOptions, gauss_newton
+from hybridvo.refinement.solver import Factor, Linearization, gauss_newton
 from hybridvo.results import RelativePose
 from hybridvo.types import FramePair
 
-SOLVER = SolverOptions(iterations=5, tolerance=0.5)
-"""The coarse fit is about sqrt(6 x 60) of the full fit's standard deviations away (60 times fewer
-pixels), and a step is wrong by some 2 % of its length, the statistical error of the curvature: the
-second step is the last."""
+STEPS, LAST_STEP = 5, 0.5
+"""Most steps, and length in standard deviations of the last one. The coarse fit is about
+sqrt(6 x 60) of the full fit's standard deviations away (60 times fewer pixels), and a step is wrong
+by some 2 % of its length, the statistical error of the curvature: the second step is the last."""
 WELL_CONDITIONED = 0.005
 """Ratio of the extreme eigenvalues of the flow's information above which it needs no help."""
 CURRENT_DEPTH_GAIN = 0.5
@@ -37,12 +37,7 @@ FLOW_ROUNDING = 2e-5
 class FlowFactor:
     """Flow and depth of every pixel of a grid, see :mod:`hybridvo.refinement.kernels`.
 
-    Args:
-        image: the pixels.
-        noise: (3,) float32, see :func:`hybridvo.refinement.coarse_fit.set_noise`.
-        tile: side of the tiles, px.
-        per_weight: (42,) curvature of the robust weights and meat of independent errors, per unit
-            of external weight, see :func:`hybridvo.refinement.covariance.score_sums`.
+    ``per_weight`` (42,) is that of :func:`hybridvo.refinement.covariance.score_sums`.
     """
 
     def __init__(
@@ -107,15 +102,7 @@ def fit_full_grid(
     noise_start: tuple[float, float],
     options: RefineOptions,
 ) -> FullFit:
-    """Fit one motion on the full grid, from its fit on the coarse one.
-
-    Args:
-        pair: the input.
-        grid: its coarse grid.
-        pose: (3, 4) start.
-        noise_start: (sf, sd) found with it.
-        options: of the refinement.
-    """
+    """Fit one motion on the full grid, from its pose (3, 4) and noise there on the coarse one."""
     image, pose = grid.pixels, pose.copy()
     tile = tile_size(image.shape, options.tiles)
     depth_scale = coarse_fit.translation_scale(grid.samples, grid.count)
@@ -134,7 +121,8 @@ def fit_full_grid(
     )
     flow = FlowFactor(image, noise, tile, score_sums(samples, n, pose, image.K, noise))
     term = _depth_factor(pair, grid, pose, sigma, noise, options) if sigma > 0 else None
-    found = gauss_newton([flow] if term is None else [flow, term], pose_matrix(pose), SOLVER)
+    factors: list[Factor] = [flow] if term is None else [flow, term]
+    found = gauss_newton(factors, pose_matrix(pose), STEPS, LAST_STEP)
     T = pose_matrix(found.T[:3])
     tiles, meat = flow.tiles, flow.meat
     if term is not None:
@@ -200,19 +188,10 @@ def pair_noise(
     curr: np.ndarray | None = None,
     origin: tuple[int, int] = (0, 0),
 ) -> PairNoise:
-    """Noise of the pixels that follow a motion.
+    """Noise of the pixels that follow a motion, from the noise (sf, sd) found before.
 
-    The current depth bounds the noise of the first, and tells it where the flow cannot.
-
-    Args:
-        samples: buffer of pixels; its first ``n`` count.
-        n: pixels.
-        K: (4,) float32 fx, fy, cx, cy of the current camera.
-        pose: (3, 4) T_curr_prev.
-        start: (sf, sd) found before.
-        cutoff: of the robust kernel.
-        curr: (H, W) current depth, or None.
-        origin: (u, v) of its pixel at which the samples' coordinates begin.
+    The current depth (H, W) bounds the noise of the first, and tells it where the flow cannot;
+    ``origin`` is its pixel at which the coordinates of the samples begin.
     """
     sf, sd = start
     sf, sd, share, spread = estimate_noise(

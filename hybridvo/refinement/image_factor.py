@@ -46,14 +46,10 @@ SMOOTH = 0.01
 
 
 class ImageFactor:
-    """The images of a pair under one blur after another, see
-    :class:`hybridvo.refinement.solver.Factor`.
+    """The images of a pair under one blur after another, at the pixels (N, 2) ``index``.
 
-    Args:
-        pair: with two images.
-        pose: weighted motion of the pair, on the full grid.
-        index: (N, 2) int32 rows and columns of the pixels to use.
-        inflation: factor on the covariance beyond the tiles.
+    ``pose`` holds the weights of the pixels, ``inflation`` is a factor on the covariance beyond the
+    tiles.
     """
 
     def __init__(
@@ -289,12 +285,7 @@ def light_fields(
 ) -> np.ndarray | None:
     """Smooth changes of gain and offset (2, nodes) that explain the residuals best.
 
-    Args:
-        to_nodes: (N, nodes) bilinear weights.
-        grey: (N,) grey values.
-        r: (N,) residuals.
-        w: (N,) their weights, 0 where not seen.
-        least: share of the squared residuals that they must explain, else None.
+    None where they explain less than the share ``least`` of the squared residuals.
     """
     r = np.where(w > 0, r, 0)
     design = hstack([to_nodes.multiply(grey[:, None]), to_nodes], format="csr")
@@ -315,11 +306,7 @@ def correlation(
 ) -> float:
     """Weighted correlation of two sets of grey values (N,); 0 where one of them is constant.
 
-    Args:
-        a: (N,) one set.
-        b: (N,) the other.
-        weight: (N,) not negative.
-        cell: (N,) groups about whose own means the values are taken; None: one.
+    ``cell`` (N,): groups about whose own means the values are taken.
     """
     cell = np.zeros(len(a), np.intp) if cell is None else cell
     total = np.maximum(np.bincount(cell, weight), 1e-12)

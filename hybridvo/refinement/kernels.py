@@ -40,7 +40,7 @@ robust weights, sum of external weights."""
 COST = 27
 """Place of the cost in it."""
 
-HAS_FLOW_VARIANCE, HAS_DEPTH_VARIANCE, HAS_WEIGHTS, HAS_VALID = 1, 2, 4, 8
+HAS_FLOW_VARIANCE, HAS_DEPTH_VARIANCE, HAS_WEIGHTS = 1, 2, 4
 
 MIN_DEPTH = np.float32(1e-6)
 MAX_VALUE = np.float32(1e9)
@@ -73,13 +73,13 @@ def keep_apart(typing_context):
 def gather_row(v, u0, u1, data, camera, flags, scale, buf):
     """Fill ``buf`` with columns ``u0 .. u1 - 1`` of row ``v`` of the image.
 
-    ``data`` = (depth, flow, flow_variance, depth_variance, weights, valid), each (H, W) but the
+    ``data`` = (depth, flow, flow_variance, depth_variance, weights), each (H, W) but the
     flow, (H, W, 2); absent ones are dummies, as ``flags`` says. ``camera`` = (1/fx, 1/fy, cx, cy)
     of the previous frame. ``scale`` = (typical flow variance, typical depth variance). Unusable
     pixels get weight 0 and harmless values.
     """
     keep_apart()  # type: ignore[call-arg]
-    depth, flow, flow_variance, depth_variance, weights, valid = data
+    depth, flow, flow_variance, depth_variance, weights = data
     ifx, ify, cx, cy = camera[0], camera[1], camera[2], camera[3]
     vf = np.float32(v)
     yn = (vf - cy) * ify
@@ -128,10 +128,6 @@ def gather_row(v, u0, u1, data, camera, flags, scale, buf):
         for k in range(n):
             p = row[k]
             b_w[k] = b_w[k] * (p if (p > ZERO) & (p < MAX_VALUE) else ZERO)
-    if flags & HAS_VALID:
-        vrow = valid[v, u0:u1]
-        for k in range(n):
-            b_w[k] = b_w[k] if vrow[k] else ZERO
 
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)

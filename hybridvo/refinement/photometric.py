@@ -28,7 +28,6 @@ from hybridvo.refinement.plane_factor import PlaneFactor
 from hybridvo.refinement.solver import (
     Factor,
     PriorFactor,
-    SolverOptions,
     gauss_newton,
     positive_inverse,
 )
@@ -148,7 +147,7 @@ def _refine(pair: FramePair, pose: RelativePose, options: PhotometricOptions) ->
         factor.use(blurred(prev, blur), blurred(curr, blur), T)
         half = (options.iterations + 1) // 2
         for steps in (half, options.iterations - half):
-            T = gauss_newton(factors, T, SolverOptions(steps, tolerance=0.1)).T
+            T = gauss_newton(factors, T, steps, tolerance=0.1).T
             factor.estimate(T)
             if depth is not None:
                 depth.estimate(T)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
-import threading
-from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,7 +17,7 @@ from hybridvo.types import Camera, FramePair
 MIN_USABLE = 0.1
 """Share of usable grid pixels below which the grid is drawn anew, finer, where they are."""
 MIN_USABLE_PIXELS = 400
-PARALLEL_PIXELS = 100_000
+PARALLEL_PIXELS, THREADS = 100_000, 2
 """Below this many pixels one thread is as fast, and steadier under load."""
 
 
@@ -29,30 +27,26 @@ class PixelGrid:
     def __init__(self, pair: FramePair, weights: np.ndarray | None) -> None:
         prev, curr = pair.prev, pair.curr
         assert pair.flow is not None and prev.depth is not None
-        flags = 0
         dummy = as_contiguous(np.ones((1, 1), np.float32))
-        depth = as_contiguous(prev.depth)
-        flow = as_contiguous(pair.flow)
         flow_variance = depth_variance = external = dummy
-        scale = np.ones(2, np.float32)
+        self.flags, self.scale = 0, np.ones(2, np.float32)
         if pair.flow_variance is not None:
             flow_variance = as_contiguous(pair.flow_variance)
-            flags |= kernels.HAS_FLOW_VARIANCE
-            scale[0] = typical(flow_variance)
+            self.flags |= kernels.HAS_FLOW_VARIANCE
+            self.scale[0] = typical(flow_variance)
         if prev.depth_variance is not None:
             depth_variance = as_contiguous(prev.depth_variance)
-            flags |= kernels.HAS_DEPTH_VARIANCE
-            scale[1] = typical(depth_variance)
-        if weights is not None:
-            external = as_contiguous(weights, np.float32)
-            flags |= kernels.HAS_WEIGHTS
-        valid = as_contiguous(np.ones((1, 1), np.bool_))
-        masks = [m for m in (prev.mask, pair.flow_valid) if m is not None]
-        if masks:
-            valid = as_contiguous(masks[0] if len(masks) == 1 else masks[0] & masks[1])
-            flags |= kernels.HAS_VALID
-        self.data: tuple[Any, ...] = (depth, flow, flow_variance, depth_variance, external, valid)
-        self.flags, self.scale = flags, scale
+            self.flags |= kernels.HAS_DEPTH_VARIANCE
+            self.scale[1] = typical(depth_variance)
+        for factor in (weights, prev.mask, pair.flow_valid):
+            if factor is not None:
+                first = not self.flags & kernels.HAS_WEIGHTS
+                external = np.asarray(factor, np.float32) if first else external * factor
+                self.flags |= kernels.HAS_WEIGHTS
+        self.data: tuple[Any, ...] = (
+            as_contiguous(prev.depth), as_contiguous(pair.flow), flow_variance, depth_variance,
+            as_contiguous(external),
+        )  # fmt: skip
         self.set_cameras(prev.camera, curr.camera, 0, 0)
 
     def set_cameras(self, prev: Camera, curr: Camera, u0: int, v0: int) -> None:
@@ -115,38 +109,18 @@ class PixelGrid:
         totals = np.zeros((bands, kernels.SUMS))
         weights = np.empty((height, width), np.float32)
 
-        arguments: tuple[Any, ...] = (self.data, self.camera, self.flags, self.scale)
+        inputs: tuple[Any, ...] = (self.data, self.camera, self.flags, self.scale)
 
         def work(band: int) -> None:
-            kernels.sum_tiles(
-                *arguments, pose, self.K, noise, band, tile, weights, sums, totals[band]
-            )
-
-        self._run(work, bands)
-        return sums, totals[:, kernels.COST :].sum(axis=0), weights
-
-    def _run(self, work: Callable[[int], None], count: int) -> None:
-        """Do ``work(0) .. work(count - 1)`` on two threads where the image is large.
-
-        Plain threads over kernels that release the GIL: each band has its own sum, so the result
-        does not depend on who did what, several trackers may run at once, and on a busy machine
-        the calling thread does what the other one does not get to. (numba's own parallel loops
-        wait for every thread, and one of its backends aborts when two threads enter it.)
-        """
-        height, width = self.shape
-        todo = itertools.count()
-
-        def take() -> None:
-            while (band := next(todo)) < count:
-                work(band)
+            kernels.sum_tiles(*inputs, pose, self.K, noise, band, tile, weights, sums, totals[band])
 
         if height * width < PARALLEL_PIXELS:
-            take()
-            return
-        helper = threading.Thread(target=take)
-        helper.start()
-        take()
-        helper.join()
+            for band in range(bands):
+                work(band)
+        else:  # kernels release the GIL; each band has its own sum, whoever does it
+            with ThreadPoolExecutor(THREADS) as pool:
+                list(pool.map(work, range(bands)))
+        return sums, totals[:, kernels.COST :].sum(axis=0), weights
 
 
 def grid_stride(shape: tuple[int, int], pixels: int) -> int:
@@ -224,13 +198,7 @@ class CoarseGrid:
 def coarse_grid(
     pair: FramePair, weights: np.ndarray | None, options: RefineOptions
 ) -> CoarseGrid | RelativePose:
-    """The pixels of a pair on a coarse grid, or the failure that says what is missing.
-
-    Args:
-        pair: two frames and their flow.
-        weights: (H, W) factors on the information of each pixel, or None.
-        options: of the refinement.
-    """
+    """The pixels of a pair on a coarse grid, or the failure that says what is missing."""
     if pair.flow is None:
         return RelativePose.failed(Reason.NO_FLOW, "no optical flow for this pair", "refine")
     if pair.prev.depth is None:

@@ -38,13 +38,9 @@ MIN_PIXELS = 300
 
 
 class PlaneFactor:
-    """The two depth maps of a pair, see :class:`hybridvo.refinement.solver.Factor`.
+    """The two depth maps of a pair, at the pixels whose weight is at least ``least``.
 
-    Args:
-        pair: both frames with depth.
-        weights: (H, W) of the motion in [0, 1].
-        least: weight below which a pixel is not used.
-        inflation: factor on the covariance beyond the tiles: a sensor is bent over the whole image.
+    ``inflation`` is a factor on the covariance beyond the tiles: a sensor is bent over the image.
     """
 
     def __init__(
@@ -63,8 +59,7 @@ class PlaneFactor:
         self._tile = (v // tile) * -(-prev.width // tile) + u // tile
         self._camera = pair.curr.camera
         self._depth = np.asarray(pair.curr.depth)
-        self._at: np.ndarray | None = None
-        self._inflation = inflation
+        self._inflation, self._at = inflation, np.empty(0)
         self._law, self._scale = np.array([0.0, 0.0, 1.0]), 1.0
 
     @classmethod
@@ -78,11 +73,7 @@ class PlaneFactor:
         return factor if len(factor._points) >= MIN_PIXELS else None
 
     def estimate(self, T: np.ndarray) -> bool:
-        """Fit the law of the noise and the scale of the information at a motion.
-
-        Returns:
-            Whether enough points are seen to be used.
-        """
+        """Fit the noise and the scale of the information; whether enough points are seen."""
         r, _, z, seen = self._residuals(T)
         if seen.sum() < MIN_PIXELS:
             self._scale = 0.0
@@ -119,7 +110,7 @@ class PlaneFactor:
         cost = 0.5 * self._weight @ np.where(seen, robust * d2, c2)
         return J, r, self._weight * robust**2 / sigma**2, float(cost)
 
-    def _residuals(self, T: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def _residuals(self, T: np.ndarray) -> tuple[np.ndarray, ...]:
         """What :meth:`_measure` finds at a motion; the last one's is kept."""
         if T is not self._at:
             self._found, self._at = self._measure(T), T

@@ -55,11 +55,11 @@ def refine_pair(
     options: RefineOptions | None = None,
     context: Context | None = None,
 ) -> RelativePose:
-    """The motion of a pair near a start.
+    """The motion of a pair near its only start (4, 4).
 
     Args:
         pair: two frames and their flow.
-        T_init: (4, 4) the only start.
+        T_init: the start.
         grid: coarse grid of the pair, with the weights; None: it is made.
         weights: (H, W) factors on the information of each pixel, for the grid that is made.
         options: of the refinement.

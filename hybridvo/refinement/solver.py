@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from scipy.linalg.lapack import dpotrf, dpotri
@@ -51,47 +51,22 @@ class Factor(Protocol):
         """At ``T``, (4, 4) or (n, 4, 4)."""
 
 
-@dataclass(frozen=True)
-class SolverOptions:
-    """When :func:`gauss_newton` ends.
-
-    Args:
-        iterations: most steps.
-        tolerance: length, in standard deviations, of a step that is the last.
-    """
-
-    iterations: int = 10
-    tolerance: float = 1e-3
-
-
-@dataclass(frozen=True, eq=False)
-class Solution:
-    """Where :func:`gauss_newton` ended.
-
-    Args:
-        T: as the start.
-        at: normal equations before the last step.
-        iterations: steps tried.
-    """
+class Solution(NamedTuple):
+    """Last motion kept, normal equations before the last step, steps tried."""
 
     T: np.ndarray
     at: Linearization
     iterations: int
 
 
-def gauss_newton(factors: Sequence[Factor], T_init: np.ndarray, options: SolverOptions) -> Solution:
+def gauss_newton(
+    factors: Sequence[Factor], T_init: np.ndarray, iterations: int = 10, tolerance: float = 1e-3
+) -> Solution:
     """Minimise the sum of the factors' costs by damped Newton or Gauss-Newton steps.
 
     A step is kept where the cost falls or the next step is half as long: noise may move the root of
-    the equations off the minimum of the cost.
-
-    Args:
-        factors: parts of the cost.
-        T_init: (4, 4) or (n, 4, 4) start.
-        options: when to end.
-
-    Returns:
-        The last motion kept; the start where no step can be had.
+    the equations off the minimum of the cost. The start is one motion (4, 4), or (n, 4, 4); a step
+    shorter than ``tolerance`` standard deviations is the last.
     """
 
     def linearize(T: np.ndarray) -> Linearization:
@@ -101,11 +76,11 @@ def gauss_newton(factors: Sequence[Factor], T_init: np.ndarray, options: SolverO
     T, damping = T_init, 0.0
     now = linearize(T)
     step, length = _step(now, damping)
-    for iteration in range(options.iterations):
+    for iteration in range(iterations):
         if not np.isfinite(length):
             return Solution(T, now, iteration)
         moved = left_update(step, T)
-        if length < options.tolerance**2:
+        if length < tolerance**2:
             return Solution(moved, now, iteration)
         then = linearize(moved)
         following, left = _step(then, 0.1 * damping)
@@ -115,7 +90,7 @@ def gauss_newton(factors: Sequence[Factor], T_init: np.ndarray, options: SolverO
         else:
             damping = max(10 * damping, 1e-2)
             step, length = _step(now, damping)
-    return Solution(T, now, options.iterations)
+    return Solution(T, now, iterations)
 
 
 def _step(at: Linearization, damping: float) -> tuple[np.ndarray, float]:

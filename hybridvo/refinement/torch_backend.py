@@ -32,7 +32,7 @@ from hybridvo.refinement.batch import (
 )
 from hybridvo.refinement.coarse_fit import DAMPING
 from hybridvo.refinement.covariance import NOTHING, UPPER, sandwich_covariance
-from hybridvo.refinement.full_fit import FLOW_ROUNDING, SOLVER, pair_noise, tile_size
+from hybridvo.refinement.full_fit import FLOW_ROUNDING, LAST_STEP, pair_noise, tile_size
 from hybridvo.refinement.pixels import grid_stride, too_few
 from hybridvo.refinement.refine import status_of
 from hybridvo.refinement.torch_factors import (
@@ -43,6 +43,7 @@ from hybridvo.refinement.torch_factors import (
     residuals,
     scores,
     solve_small,
+    weigh,
 )
 from hybridvo.results import Reason, Status
 from hybridvo.torch_geometry import left_update, pp, weighted_median
@@ -154,7 +155,7 @@ class _Solver:
         T, noise = self._fit_subset(T, given)
         curvature, meat = self._curvature(T, self.how(noise))
         T, last, converged, iterations = self._fit_all(T, self.how(noise), curvature, tight)
-        near = (last.weights > 0) & (last.distance2 <= INLIER_DISTANCE2)
+        near = (last.at.robust > 0) & (last.at.distance2 <= INLIER_DISTANCE2)
         weight = self.pixels.weight
         total = weight.sum(dim=1).clamp(min=1e-30)
         ratio = torch.nan_to_num((weight * near).sum(dim=1) / total)
@@ -177,7 +178,7 @@ class _Solver:
             iterations=iterations,
             cost=torch.nan_to_num(last.cost / total),
             weights=torch.nan_to_num(
-                from_tiles(last.weights, self.tile, *self.batch.depth_prev.shape[1:])
+                from_tiles(last.at.robust, self.tile, *self.batch.depth_prev.shape[1:])
             ),
             noise=torch.where(torch.isfinite(noise), noise, torch.ones_like(noise)),
             inlier_ratio=ratio,
@@ -223,11 +224,11 @@ class _Solver:
         much noise is granted to it afterwards.
         """
         pixels = self.few
-        own = linearize(pixels, T, self._isotropic(3 * end)).weights
+        own = weigh(pixels, T, self._isotropic(3 * end)).robust
         rest = replace(pixels, weight=pixels.weight * (own < 0.25))
         identity = pp.identity_SE3(len(T), dtype=T.dtype, device=T.device)
         other = self._shrink_scale(rest, identity, end)
-        theirs = linearize(rest, other, self._isotropic(3 * end)).weights
+        theirs = weigh(rest, other, self._isotropic(3 * end)).robust
         total = pixels.weight.double().sum(dim=1).clamp(min=1e-30)
         found = ((pixels.weight, own), (rest.weight, theirs))
         shares = [(w * (follow > 0.25)).double().sum(dim=1) / total for w, follow in found]
@@ -315,7 +316,7 @@ class _Solver:
             length2 = _energy(step, H)
             moved = (length2 / now.weight_sum.double().clamp(min=1e-12)).sqrt()
             T, iterations = left_update(step, T), iterations + (~done).long()
-            last = moved < rounding if tight else length2 < SOLVER.tolerance**2
+            last = moved < rounding if tight else length2 < LAST_STEP**2
             last |= (moved > 0.5 * best) & (moved < ROUNDED_STEP) & ((good & (k > 3)) | (not tight))
             converged = converged | (~done & solved & last)
             best = torch.where(done, best, torch.minimum(best, moved))

@@ -95,14 +95,10 @@ def jacobian(pixels: Pixels, at: Residuals) -> tuple[torch.Tensor, torch.Tensor]
 
 @dataclass(frozen=True, eq=False)
 class Weighted:
-    """Residuals under their covariance and the robust kernel.
+    """Residuals at the likely depths under their covariance and the robust kernel.
 
-    Args:
-        at: at the likely depths.
-        p, kappa: (B, N) of the information.
-        right: (B, 2, N) Sigma^-1 r.
-        distance2: (B, N) squared Mahalanobis distances.
-        robust: (B, N) robust weights without the external ones, 0 where unusable.
+    Information p, kappa (B, N), Sigma^-1 r (B, 2, N), squared Mahalanobis distances (B, N), robust
+    weights (B, N) without the external ones, 0 where unusable.
     """
 
     at: Residuals
@@ -132,17 +128,15 @@ class Linearization:
     Args:
         H: (B, C, 6, 6) sum of w J^T Sigma^-1 J. g: (B, C, 6) sum of w J^T Sigma^-1 r.
         cost: (B,) robust cost, pixels behind the camera at the full one.
-        weights: (B, N) robust weights without the external ones, 0 where unusable.
         weight_sum: (B,) sum of robust times external weights.
-        distance2: (B, N) squared Mahalanobis distances.
+        at: the residuals.
     """
 
     H: torch.Tensor
     g: torch.Tensor
     cost: torch.Tensor
-    weights: torch.Tensor
     weight_sum: torch.Tensor
-    distance2: torch.Tensor
+    at: Weighted
 
     def total(self) -> tuple[torch.Tensor, torch.Tensor]:
         """(H (B, 6, 6), g (B, 6)) in float64: a float32 sum over an image loses its fifth digit."""
@@ -170,14 +164,8 @@ def linearize(
     g = (G[..., : right.shape[2]] @ right[..., None])[..., 0]
     behind = torch.full_like(found.distance2, BEHIND_DISTANCE2)
     cost = how.kernel(torch.where(at.front, found.distance2, behind))[0]
-    return Linearization(
-        H=0.5 * (H + H.transpose(2, 3)),
-        g=g,
-        cost=(pixels.weight * cost).sum(dim=1),
-        weights=found.robust,
-        weight_sum=w.sum(dim=1),
-        distance2=found.distance2,
-    )
+    cost = (pixels.weight * cost).sum(dim=1)
+    return Linearization(0.5 * (H + H.transpose(2, 3)), g, cost, w.sum(dim=1), found)
 
 
 def scores(pixels: Pixels, T: pp.LieTensor, how: RobustNoise) -> tuple[torch.Tensor, Weighted]:

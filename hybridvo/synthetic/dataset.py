@@ -12,15 +12,15 @@ import functools
 import json
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, Protocol, TypeVar, cast
+from typing import Any, Protocol, Self, TypeVar, cast
 
 import numpy as np
 
 from hybridvo.errors import FormatError, InputError, OutputError
 from hybridvo.files import make_folder, parse_yaml, read_text, write_json
+from hybridvo.options import option_group
 from hybridvo.synthetic.diverse import DiverseOptions
 from hybridvo.synthetic.draws import STORED, sample_generator
 from hybridvo.synthetic.layered import Layers, PaperOptions, Sample
@@ -46,11 +46,7 @@ class Preset(Protocol):
 
 
 def read_yaml(path: str | Path) -> dict[str, Any]:
-    """Mapping that a YAML file holds, over the one of the file that it ``extends``.
-
-    Raises:
-        InputError: no such file. FormatError: not YAML, or not a mapping.
-    """
+    """Mapping that a YAML file holds, over the one of the file that it ``extends``."""
     try:
         mapping = parse_yaml(read_text(path), str(path))
     except FileNotFoundError:
@@ -74,11 +70,7 @@ def _merged(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
 
 
 def build_options(cls: type[OptionsT], mapping: dict[str, Any], where: str) -> OptionsT:
-    """Options of a class from plain values; keys that are left out keep their default.
-
-    Raises:
-        InputError: an unknown key or a value out of bounds, with its place.
-    """
+    """Options of a class from plain values; what is wrong is named with its place."""
     try:
         return cls(**mapping)
     except (InputError, TypeError) as error:
@@ -90,12 +82,8 @@ def load_preset(
     kinds: dict[str, type] = PRESETS,
     size: tuple[int, int] | None = None,
 ) -> Preset:
-    """Generator of ``kinds`` that a file such as ``configs/data_paper.yaml`` describes.
-
-    ``size``: (height, width) of the samples instead of the file's own.
-
-    Raises:
-        InputError: no such file, an unknown kind or key, or a value that cannot be meant.
+    """Generator of ``kinds`` that a file such as ``configs/data_paper.yaml`` describes, for samples
+    of its own ``size`` (height, width) or another.
     """
     mapping = read_yaml(path)
     kind = mapping.pop("preset", None)
@@ -198,11 +186,7 @@ def _open_shard(path: Path) -> dict[str, np.ndarray]:
 
 
 def read_sample(folder: str | Path, index: int) -> Sample:
-    """Sample ``index`` of a folder that :func:`write_samples` filled.
-
-    Raises:
-        InputError: no such sample. FormatError: a damaged shard.
-    """
+    """Sample ``index`` of a folder that :func:`write_samples` filled."""
     folder = Path(folder)
     manifest = _read_manifest(folder)
     if not 0 <= index < manifest["count"]:
@@ -225,7 +209,7 @@ def _ego_flow(fields: dict[str, np.ndarray]) -> np.ndarray:
     return Layers(fields["K"], rho).flows(fields["T_curr_prev"], added=False)[0]
 
 
-@dataclass(frozen=True)
+@option_group
 class StoredSamples:
     """Samples of a folder, named from the current one, as data of a training: ``preset: folder``.
 
@@ -240,8 +224,8 @@ class StoredSamples:
         count = _read_manifest(Path(self.folder))["count"]
         return read_sample(self.folder, int(rng.integers(count)))
 
-    def for_evaluation(self) -> StoredSamples:
+    def for_evaluation(self) -> Self:
         """The same of the held-out folder."""
         if not self.held_out:
-            raise InputError("StoredSamples.held_out: no folder of held-out samples is named.")
-        return StoredSamples(self.held_out)
+            raise InputError("held_out: no folder of held-out samples is named.")
+        return dataclasses.replace(cast(Any, self), folder=self.held_out)

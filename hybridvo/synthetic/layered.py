@@ -27,24 +27,21 @@ MIN_RATIO = np.float32(1e-6)
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """One training pair on the pixel grid of t.
+    """One training pair on the pixel grid of t; float32, px and metres, depth 0 is invalid.
 
     Args:
-        flow: (H, W, 2) float32 px, total flow as the network is given it.
-        ego_flow: (H, W, 2) float32 px, flow of the camera motion alone, without noise.
-        depth_prev: (H, W) float32 metres as the network is given it; 0 is invalid.
-        depth_curr: (H, W) float32 metres of t+1 **on the grid of t** (what lies at x + flow); 0 is
-            invalid.
-        depth_true: (H, W) float32 metres of t without noise or holes; 0 where there is none (sky).
-        depth_target: (H, W) float32 metres, what L^D compares with; 0 where there is none. It
-            includes the object's own motion in the paper's five steps, not in the diverse preset.
-        K: (3, 3) float32 intrinsics of both frames.
-        T_curr_prev: (4, 4) float32, points of the previous camera into the current one.
-        rotation_deg, translation: (3,) float32, the same motion as Euler angles X-Y-Z in degrees
-            (R = Rx Ry Rz) and metres.
+        flow: (H, W, 2) total flow as the network is given it.
+        ego_flow: (H, W, 2) flow of the camera motion alone, without noise.
+        depth_prev: (H, W) as the network is given it.
+        depth_curr: (H, W) depth of t+1 **on the grid of t** (what lies at x + flow).
+        depth_true: (H, W) depth of t without noise or holes; 0 for sky.
+        depth_target: (H, W) what L^D compares with. It includes the object's own motion in the
+            paper's five steps, not in the diverse preset.
+        K: (3, 3) intrinsics of both frames.
+        rotation_deg, translation: (3,) T_curr_prev (4, 4) as Euler angles X-Y-Z, R = Rx Ry Rz.
         moving: (H, W) bool, pixels whose true flow differs from the ego flow.
-        rays: (H, W, 2) float32, first two components of K^-1 x of the points that were measured,
-            where they are not the pixels' centres; or None.
+        rays: (H, W, 2) first two components of K^-1 x of the points that were measured, where they
+            are not the pixels' centres; or None.
     """
 
     flow: np.ndarray
@@ -347,7 +344,7 @@ def _paper_sample(rng: np.random.Generator, o: PaperOptions) -> Sample:
 def _place(rng: np.random.Generator, o: PaperOptions) -> tuple[tuple[slice, slice], np.ndarray]:
     """A silhouette at a uniform position of the canvas: its box in the picture and its mask."""
     mean, spread, low, high = o.object_size
-    share = low - 1.0
+    share = -np.inf
     while not low <= share <= high:
         share = mean + spread * rng.standard_normal()
     mask = silhouette_mask(rng, max(int(o.width * share), 2))

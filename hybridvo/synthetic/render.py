@@ -12,11 +12,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy.typing import ArrayLike
 
 from hybridvo.data.base import Sequence
 from hybridvo.data.image_io import write_cam, write_dpt, write_flo
-from hybridvo.errors import InputError, OutputError
-from hybridvo.files import make_folder
+from hybridvo.errors import InputError
+from hybridvo.files import atomic_write, make_folder
 from hybridvo.geometry import invert
 from hybridvo.synthetic.raycast import cast, motion, screen_bounds, shade
 from hybridvo.types import Camera, Frame
@@ -38,7 +39,7 @@ class Solid:
     A_world_body: np.ndarray
     object_id: int = 0
     wavelength: float = 1.6
-    colours: tuple[Items[float], Items[float]] = ((0.9, 0.8, 0.7), (0.6, 0.8, 0.9))
+    colours: tuple[ArrayLike, ArrayLike] = ((0.9, 0.8, 0.7), (0.6, 0.8, 0.9))
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,8 +77,7 @@ class Scene:
         return len(self.cameras)
 
     @property
-    def shapes(self) -> np.ndarray:
-        """(P,) int64 shape of every solid."""
+    def _shapes(self) -> np.ndarray:
         return np.array([s.shape for s in self.solids], dtype=np.int64)
 
     @property
@@ -116,7 +116,7 @@ class Scene:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Maps to unit shapes, depth and index of the solid of each pixel of a frame."""
         _, B, bounds = self._maps(index, index, size, K)
-        return B, *cast(self.shapes, B, bounds, K, *size)
+        return B, *cast(self._shapes, B, bounds, K, *size)
 
     def _motion(
         self, index: int, moved: tuple[int, int], size: tuple[int, int], K: Items[np.ndarray]
@@ -127,7 +127,7 @@ class Scene:
         """
         B, depth, solid = self._cast(index, size, K[0])
         A1, B1, bounds1 = self._maps(*moved, size, K[1])
-        return *motion(depth, solid, B, K[0], self.shapes, A1, B1, bounds1, K[1]), solid
+        return *motion(depth, solid, B, K[0], self._shapes, A1, B1, bounds1, K[1]), solid
 
     def _object_id(self, solid: np.ndarray) -> np.ndarray:
         return np.where(solid < 0, np.int32(-1), self.object_ids[solid])
@@ -143,7 +143,7 @@ class Scene:
         scale, offset, colours = self._texture()
         light = self.T_world_cam[index][:3, :3].T @ np.asarray(self.light, dtype=float)
         light /= np.linalg.norm(light)
-        fine = shade(depth2, solid2, self.shapes, B, K2, scale, offset, colours, light)
+        fine = shade(depth2, solid2, self._shapes, B, K2, scale, offset, colours, light)
         image = 255.0 * fine.reshape(height, 2, width, 2, 3).mean(axis=(1, 3))
         if self.noise > 0:
             rng = np.random.default_rng([self.seed, index])
@@ -273,23 +273,16 @@ def write_sintel(scene: Scene, root: str | os.PathLike[str], name: str) -> None:
         write_dpt(folders["depth"] / f"{stem}.dpt", rendered.depth)
         extrinsic = invert(scene.T_world_cam[index])
         write_cam(folders["camdata_left"] / f"{stem}.cam", camera.K, extrinsic)
-        _write_mask(folders["moving"] / f"{stem}.png", rendered.object_id > 0)
-        _write_mask(folders["invalid"] / f"{stem}.png", rendered.object_id < 0)
+        _write_png(folders["moving"] / f"{stem}.png", rendered.object_id > 0)
+        _write_png(folders["invalid"] / f"{stem}.png", rendered.object_id < 0)
         if index + 1 < scene.frames:
             flow, occlusion, _ = scene.flow(index)
             write_flo(folders["flow"] / f"{stem}.flo", flow)
-            _write_mask(folders["occlusions"] / f"{stem}.png", occlusion)
-
-
-def _write_mask(path: Path, mask: np.ndarray) -> None:
-    _write_png(path, np.where(mask, 255, 0).astype(np.uint8))
+            _write_png(folders["occlusions"] / f"{stem}.png", occlusion)
 
 
 def _write_png(path: Path, image: np.ndarray) -> None:
-    done, data = cv2.imencode(".png", np.ascontiguousarray(image))
-    if not done:
-        raise OutputError(f"{path}: cannot encode an image of shape {image.shape}.")
-    try:
-        path.write_bytes(data.tobytes())
-    except OSError as error:
-        raise OutputError(f"{path}: cannot write: {error}.") from error
+    if image.dtype == bool:
+        image = np.where(image, 255, 0).astype(np.uint8)
+    with atomic_write(path, "wb") as file:
+        file.write(cv2.imencode(".png", np.ascontiguousarray(image))[1].tobytes())

@@ -24,15 +24,12 @@ class Scenario:
     """One row of conditions.
 
     Args:
-        moving: share of the pixels on independently moving objects.
-        objects: number of these objects.
+        moving: share of the pixels on ``objects`` that move by themselves.
         flow_noise_px: standard deviation of each flow component, independent per pixel.
         depth_noise: standard deviation of log depth; half of its variance is correlated in space.
-        outliers: share of the pixels whose flow is replaced by a gross error of up to 60 px.
-        rotation_deg: largest rotation angle. translation_m: largest length of the translation.
-        min_translation_m: smallest length.
-        scene: ``structured``, ``plane`` (one oblique plane) or ``far`` (structured, 60 times nearer
-            to infinity: 60-200 m).
+        outliers: share of the pixels whose flow has a gross error of up to 60 px.
+        rotation_deg, translation_m: largest angle and length.
+        scene: ``structured`` (1-30 m), ``plane`` (one oblique plane) or ``far`` (60-200 m).
     """
 
     moving: float = 0.3
@@ -115,13 +112,7 @@ def make_pair(
     flow_true[..., 1] = target_y - np.arange(height)[:, None]
     flow, outlier = _measured(rng, cell, flow_true)
     depth_curr = _splat(target_x, target_y, z)
-    pair = FramePair(
-        prev=Frame(None, _with_noise(rng, cell, depth), camera, timestamp=0.0, index=0),
-        curr=Frame(None, _with_noise(rng, cell, depth_curr), camera, timestamp=0.1, index=1),
-        flow=flow,
-        flow_source="synthetic",
-        depth_source="synthetic",
-    )
+    depths = _with_noise(rng, cell, depth), _with_noise(rng, cell, depth_curr)
     truth = {
         "T_curr_prev": T,
         "depth_true": depth,
@@ -130,7 +121,16 @@ def make_pair(
         "outlier": outlier,
         "flow_true": flow_true,
     }
-    return pair, truth
+    return _pair(*depths, camera, flow), truth
+
+
+def _pair(
+    depth_prev: np.ndarray, depth_curr: np.ndarray | None, camera: Camera, flow: np.ndarray
+) -> FramePair:
+    """A pair of frames without images, a tenth of a second apart."""
+    prev = Frame(None, depth_prev, camera, timestamp=0.0, index=0)
+    curr = Frame(None, depth_curr, camera, timestamp=0.1, index=1)
+    return FramePair(prev, curr, flow, flow_source="synthetic", depth_source="synthetic")
 
 
 def make_model_pair(
@@ -159,21 +159,14 @@ def make_model_pair(
     flow_true = ego_flow(depth, T, camera, camera)
     flow = flow_true + flow_noise_px * rng.standard_normal(flow_true.shape)
     measured = depth * np.exp(depth_noise * rng.standard_normal(depth.shape))
-    pair = FramePair(
-        prev=Frame(None, measured.astype(np.float32), camera, timestamp=0.0, index=0),
-        curr=Frame(None, None, camera, timestamp=0.1, index=1),
-        flow=flow.astype(np.float32),
-        flow_source="synthetic",
-        depth_source="synthetic",
-    )
+    pair = _pair(measured.astype(np.float32), None, camera, flow.astype(np.float32))
     return pair, {"T_curr_prev": T, "depth_true": depth, "flow_true": flow_true}
 
 
 def _motion(rng: np.random.Generator, cell: Scenario) -> np.ndarray:
     angle_deg = rng.uniform(0, cell.rotation_deg)
     length = rng.uniform(cell.min_translation_m, cell.translation_m)
-    R = turn(rng, angle_deg)
-    return make_transform(R, length * direction(rng))
+    return make_transform(turn(rng, angle_deg), length * direction(rng))
 
 
 def _moved(

@@ -63,9 +63,8 @@ def degrade_flow(
     out = _look_up(flow, wander)
     side = 2 * int(rng.integers(0, 1 + max(1, round(bleed)))) + 1
     if side > 1:
-        out = (
-            cv2.medianBlur(out, min(side, 5)) if rng.random() < 0.5 else cv2.blur(out, (side,) * 2)
-        )
+        median = rng.random() < 0.5
+        out = cv2.medianBlur(out, min(side, 5)) if median else cv2.blur(out, (side,) * 2)
     lag = np.float32(1.0) - np.float32(o.flow_lag * rng.random() ** 2) * np.abs(
         smooth_field(rng, height, width, 6)
     )

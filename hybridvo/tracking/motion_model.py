@@ -40,10 +40,7 @@ class MotionModel:
     def observed(self, T_curr_prev: np.ndarray, neighbours: bool = True) -> MotionModel:
         """The model after one more motion.
 
-        Args:
-            T_curr_prev: (4, 4).
-            neighbours: whether it follows the last one directly: both are motions over one frame
-                and nothing lies between them.
+        ``neighbours``: whether it follows the last one directly, both over one frame.
         """
         # a step hands its motion out as well: its array may change
         T_curr_prev = np.array(T_curr_prev)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hybridvo.geometry import invert, pose_matrix, se3_log, skew
-from hybridvo.refinement.solver import Linearization, SolverOptions, gauss_newton, student
+from hybridvo.refinement.solver import Linearization, gauss_newton, student
 from hybridvo.results import Status
 
 CHI2_LIMIT = 22.5
@@ -82,7 +82,7 @@ def solve_graph(
     """Gauss-Newton with Student's weights; only the ``free`` frames move."""
     names = list(free)
     graph = _EdgeFactor({k: invert(T) for k, T in T_world_cam.items()}, names, edges)
-    found = gauss_newton([graph], np.stack([graph.held[k] for k in names]), SolverOptions())
+    found = gauss_newton([graph], np.stack([graph.held[k] for k in names]))
     d2 = graph.distances(graph.errors(found.T))
     rated = []
     for k, edge in enumerate(edges):

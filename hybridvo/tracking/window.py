@@ -38,13 +38,10 @@ STRIDES = (2, 4)
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """State of the window: key frames, the edges among them, and the last frame's place.
+    """Key frames (oldest first), the edges among them, and the last frame's place.
 
     Args:
-        keys: oldest first, at most the window's length.
-        edges: among the key frames.
-        T_last_key: (4, 4) newest key frame to the last frame.
-        covariance: (6, 6) of it.
+        T_last_key, covariance: newest key frame to the last frame.
         found: edges of the last frame, with their status.
     """
 
@@ -82,15 +79,8 @@ def locate(
 ) -> Located:
     """Place a frame among the key frames.
 
-    Args:
-        window: the state before it.
-        motion: from ``prev``, the last frame, to ``curr``; a failed one holds what the tracker put
-            in its place, with its covariance.
-        prev: the last frame.
-        curr: the new frame.
-        register: motion from a key frame, near a predicted one where there is one.
-        size: most key frames.
-        options: of the tracker.
+    ``motion`` leads from ``prev``, the last frame, to ``curr``; a failed one holds what the tracker
+    put in its place, with its covariance.
     """
     window = _with_static(window, motion, prev)
     key, before = window.keys[-1], window.covariance

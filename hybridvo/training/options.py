@@ -45,18 +45,13 @@ class OptimizerOptions:
 
 @option_group
 class ScheduleOptions:
-    """Factor on the learning rate over the run, of which p in [0, 1] is done.
+    """Factor on the learning rate over the run, whose progress is counted by steps or by time.
 
-    Args:
-        kind: ``halving`` (the paper's staircase), ``cosine`` or ``constant``.
-        warmup: share of the run over which the rate grows from 0.
-        halvings: shares of the run at which ``halving`` halves.
-        final_share: share of the peak at which ``cosine`` ends.
-        by: ``steps`` = p counts updates (the same however often the run is cut), ``time`` = p is
-            the larger of that and the share of the time limit that is spent.
+    ``warmup``: share of the run over which the rate grows from 0; ``halvings``: shares at which it
+    halves (the paper's staircase); ``final_share``: of the peak, at which ``cosine`` ends.
     """
 
-    kind: Literal["halving", "cosine", "constant"] = "halving"
+    kind: Literal["halving", "cosine"] = "halving"
     warmup: Share = 0.0
     halvings: tuple[Share, ...] = (0.25, 0.5, 0.75)
     final_share: Share = 0.0
@@ -69,11 +64,9 @@ class ScheduleOptions:
             return max(progress / self.warmup, 1e-3)
         if self.kind == "halving":
             return 0.5 ** sum(progress >= p for p in self.halvings)
-        if self.kind == "cosine":
-            done = (progress - self.warmup) / max(1.0 - self.warmup, 1e-9)
-            share = 0.5 * (1 + math.cos(math.pi * done))
-            return self.final_share + (1 - self.final_share) * share
-        return 1.0
+        done = (progress - self.warmup) / max(1.0 - self.warmup, 1e-9)
+        share = 0.5 * (1 + math.cos(math.pi * done))
+        return self.final_share + (1 - self.final_share) * share
 
 
 @option_group
@@ -107,18 +100,14 @@ class PwvoOptions(RunOptions):
     """A training of PWVO or of a baseline; the defaults are the paper's.
 
     Args:
-        network: kind and shapes.
-        loss: terms and switches.
-        moving_weight: weight of a term that the paper does not have: s of the rotation should be
-            larger on moving pixels than on static ones. 0 = none, as in the paper.
-        fit_weight: weight of the error of the motion that the trusted pixels agree on, with the
-            gradient through the fit into s; 0 = none, as in the paper.
-        selection: rule by which L^F and L^D see one motion of the pixels, and by which the network
-            is used.
+        moving_weight: of a term that the paper does not have: s of the rotation should be larger on
+            moving pixels than on static ones.
+        fit_weight: of the error of the motion that the trusted pixels agree on, with the gradient
+            through the fit into s; the paper has none.
+        selection: rule by which L^F and L^D see one motion, and by which the network is used.
         loss_stride: L^F and L^D, without uncertainty, look at every n-th pixel of every n-th row,
-            in pixels of that smaller image. 1 as published.
-        data: preset files, beside the file that names them.
-        data_weights: share of each.
+            in pixels of that smaller image.
+        data: preset files, beside the file that names them, with the share of each.
         data_size: (height, width) of the drawn samples instead of the presets' own, or None.
     """
 
@@ -129,7 +118,7 @@ class PwvoOptions(RunOptions):
     selection: Literal[SELECTION_METHODS] = "softmax"  # type: ignore[valid-type]
     loss_stride: Count = 1
     data: Annotated[tuple[str, ...], Field(min_length=1)] = ("data_paper.yaml",)
-    data_weights: tuple[float, ...] = (1.0,)
+    data_weights: tuple[NotNegative, ...] = (1.0,)
     data_size: tuple[Count, Count] | None = None
 
     def __post_init__(self) -> None:
@@ -143,24 +132,13 @@ class PwvoOptions(RunOptions):
             raise InputError(
                 "fit_weight and the *_uncertainty of the loss need a pwvo network with uncertainty"
             )
-        if len(self.data) != len(self.data_weights):
-            raise InputError("expected one of data_weights for each of data")
+        if len(self.data) != len(self.data_weights) or not sum(self.data_weights):
+            raise InputError("data_weights: expected a share for each of data, not all of them 0")
 
 
 @option_group
 class SelectorOptions(RunOptions):
-    """A training of the selector.
-
-    Args:
-        network: shapes.
-        second_look_from: share of the run after which fits inside the masks take part.
-        refits: candidates of a sample that are fitted inside their masks.
-        mask_weight: of the loss of the masks beside that of the choice.
-        trust_weight: of the loss of the probability that the choice is right.
-        asked_share: share of the samples in which the pixel-wise network's static world is shown
-            and its motion takes part, as where the selector alone is in doubt.
-        files: shards from which the samples of a round are mixed.
-    """
+    """A training of the selector; ``configs/train_selector.yaml`` says what each option is."""
 
     network: SelectorNetworkOptions = SelectorNetworkOptions()
     second_look_from: Share = 0.1
@@ -201,5 +179,5 @@ def recorded_run(record: dict[str, Any], where: str) -> tuple[PwvoOptions, Mixtu
 
 
 def load_selector_options(path: str | Path) -> SelectorOptions:
-    """Options of a ``configs/train_selector.yaml``; raises as :func:`load_pwvo_options`."""
+    """Options of a ``configs/train_selector.yaml``."""
     return build_options(SelectorOptions, read_yaml(path), str(path))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -86,12 +86,11 @@ class SelectorBatch:
 
 def _collate(p: dict[str, np.ndarray]) -> SelectorBatch:
     """Stacked arrays of samples -> batch."""
-    size, _, h, w = p["exact"].shape
-    coarse = p["coarse"].astype(np.float32)
-    samples = np.empty((size, kernels.BUFFER_ROWS, h * w), np.float32)
-    order = [kernels.XN, kernels.YN, kernels.Z, kernels.MU, kernels.MV]
-    samples[:, order] = p["exact"].reshape(size, 5, -1)
-    samples[:, [kernels.PF, kernels.PD, kernels.W]] = coarse.reshape(size, 3, -1)
+    size = len(p["count"])
+    rows = [p["ray"], p["depth"][:, None], p["target"], 1 / p["flow_variance"][:, None]]
+    rows += [p["depth_variance"][:, None], p["usable"][:, None]]
+    # in the order of the solver's buffers
+    samples = np.concatenate(rows, axis=1, dtype=np.float32).reshape(size, kernels.BUFFER_ROWS, -1)
     owner = np.repeat(np.arange(size), p["count"])
     picks = [(b, k) for b in range(size) for k in range(p["count"][b])]
     pose = np.stack([p["poses"][i] for i in picks])
@@ -100,22 +99,7 @@ def _collate(p: dict[str, np.ndarray]) -> SelectorBatch:
     def tensor(x: Any, kind: torch.dtype = torch.float32) -> torch.Tensor:
         return torch.as_tensor(np.ascontiguousarray(x)).to(kind)
 
-    maps: dict[str, Any] = dict(
-        ray=p["exact"][:, 0:2],
-        depth=p["exact"][:, 2],
-        target=p["exact"][:, 3:5],
-        flow_variance=1.0 / np.maximum(coarse[:, 0], np.float32(1e-6)),
-        depth_variance=coarse[:, 1],
-        usable=coarse[:, 2] > 0,
-        log_depth_curr=p["log_depth"],
-        K=p["K"],
-        width=p["width"],
-        stride=p["stride"],
-        seen=p["seen"],
-        image_prev=p["images"][:, 0],
-        image_curr=p["images"][:, 1],
-        log_depth_seen=p["log_depth_seen"],
-    )
+    maps: dict[str, Any] = {field.name: p[field.name] for field in fields(GridMaps)}
     inputs = replace(
         stacked_inputs(GridMaps(**maps), torch.device("cpu")),
         T_prior=tensor(p["T_prior"]),

@@ -8,7 +8,7 @@ training can read them while others are being made.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,6 @@ from hybridvo.network.normalization import predict
 from hybridvo.network.prediction import static_probability
 from hybridvo.network.selection import fitted_motion, on_grid_of
 from hybridvo.options import Options
-from hybridvo.refinement import kernels
 from hybridvo.results import PixelwisePrediction, RelativePose
 from hybridvo.synthetic.diverse import DiverseOptions
 from hybridvo.synthetic.draws import log_uniform
@@ -180,28 +179,17 @@ def _moving(
 
 
 def _record(drawn: _Drawn, found: HypothesisSet, T_prior: np.ndarray | None) -> dict[str, Any]:
-    """Everything about a sample, as small arrays."""
-    h, w, stride = found.grid.shape
+    """Everything about a sample: the maps of its grid, the motions found, and ground truth."""
+    stride, maps = found.grid.shape[2], found.maps()
     pick = np.s_[stride // 2 :: stride, stride // 2 :: stride]
-    maps = found.maps()
-    log_depth = maps.log_depth_curr
     if drawn.log_depth_curr is not None:
-        log_depth = drawn.log_depth_curr[pick]
+        maps = replace(maps, log_depth_curr=drawn.log_depth_curr[pick])
     label = np.where(drawn.moving, MOVING, STATIC)
     label = np.where(drawn.known, label, UNKNOWN)[pick]
-    n = found.grid.count
-    rows = found.grid.samples[:, :n]
     poses = np.zeros((MAX_MOTIONS, 3, 4))
     facts = np.zeros((MAX_MOTIONS, found.facts.shape[1]))
     poses[: len(found.poses)], facts[: len(found.poses)] = found.poses, found.facts
-    exact = [kernels.XN, kernels.YN, kernels.Z, kernels.MU, kernels.MV]
-    return {
-        "exact": rows[exact].reshape(5, h, w),
-        "coarse": rows[[kernels.PF, kernels.PD, kernels.W]].reshape(3, h, w).astype(np.float16),
-        "log_depth": log_depth.astype(np.float16),
-        "images": np.stack([maps.image_prev, maps.image_curr]).astype(np.uint8),
-        "log_depth_seen": maps.log_depth_seen.astype(np.float16),
-        "seen": maps.seen,
+    return vars(maps) | {
         "depth_true": np.minimum(drawn.depth[pick], 6e4).astype(np.float16),
         "label": label.astype(np.uint8),
         "poses": poses,
@@ -210,9 +198,6 @@ def _record(drawn: _Drawn, found: HypothesisSet, T_prior: np.ndarray | None) -> 
         "T": drawn.T_curr_prev[:3],
         "T_prior": (np.eye(4) if T_prior is None else T_prior)[:3],
         "has_prior": T_prior is not None,
-        "K": found.grid.pixels.K,
-        "width": drawn.pair.prev.camera.width,
-        "stride": stride,
         "source": ("diverse", "true", "dis", "semi-real").index(drawn.source),
     }
 

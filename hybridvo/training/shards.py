@@ -9,7 +9,6 @@ from __future__ import annotations
 import functools
 import zipfile
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -19,32 +18,26 @@ from pydantic import Field
 from hybridvo.errors import FormatError, InputError
 from hybridvo.geometry import matrix_to_euler_deg
 from hybridvo.options import option_group
+from hybridvo.synthetic.dataset import StoredSamples
 from hybridvo.synthetic.layered import Layers, Sample
 
 MOVING, STATIC, UNKNOWN = 0, 1, 255
 """Labels of the pixels in a shard."""
 FIRST_RENDERED = 1
 """Sources from this number on are rendered; 0 is the diverse preset, which is drawn afresh."""
-NAMES = ("exact", "coarse", "log_depth", "depth_true", "label", "T", "K", "stride", "source")
+NAMES = (
+    *("ray", "depth", "target", "usable", "log_depth_curr", "K", "stride"),
+    *("depth_true", "label", "T", "source"),
+)
+"""What a sample of the pixel-wise networks is made of."""
 
 
 @option_group
-class RenderedOptions:
-    """Samples of a folder of shards as samples of one size, mirrored at random.
+class RenderedOptions(StoredSamples):
+    """Rendered samples of a folder of shards as samples of one size, mirrored at random."""
 
-    ``held_out``: a folder of held-out seeds, for evaluations.
-    """
-
-    folder: str
-    held_out: str = ""
     height: Annotated[int, Field(ge=2)] = 128
     width: Annotated[int, Field(ge=2)] = 256
-
-    def for_evaluation(self) -> RenderedOptions:
-        """The same of the held-out samples."""
-        if not self.held_out:
-            raise InputError("RenderedOptions.held_out: no folder of held-out samples is named.")
-        return replace(self, folder=self.held_out)
 
     def sample(self, rng: np.random.Generator) -> Sample:
         """One sample, mirrored or not."""
@@ -119,12 +112,10 @@ def grid_sample(
     def take(x: np.ndarray) -> np.ndarray:
         return x[..., rows[:, None], columns]
 
-    ray_x, ray_y, z, mu, mv = take(p["exact"])
-    usable = take(p["coarse"][2]) > 0
-    T = p["T"].astype(np.float64)
-    ray = np.stack([ray_x, ray_y], axis=-1)
-    flow = (np.stack([(mu - cx) / fx, (mv - cy) / fy], axis=-1) - ray) * focal
-    planes = [take(p["log_depth"]).astype(np.float32), take(p["depth_true"]).astype(np.float32)]
+    z, usable, T = take(p["depth"]), take(p["usable"]), p["T"].astype(np.float64)
+    ray, target = (np.moveaxis(take(p[name]), 0, -1) for name in ("ray", "target"))
+    flow = ((target - (cx, cy)) / (fx, fy) - ray) * focal
+    planes = [take(p["log_depth_curr"]), take(p["depth_true"]).astype(np.float32)]
     moving = take(p["label"]) == MOVING
     for axis, (turn, side) in enumerate(zip(mirrored, (1, 0), strict=True)):
         if not turn:

@@ -12,7 +12,6 @@ import numpy as np
 import torch
 from torch.utils.data import IterableDataset, get_worker_info
 
-from hybridvo.errors import InputError
 from hybridvo.network.inputs import NetworkInputs, assemble_aligned
 from hybridvo.network.losses import LossTargets
 from hybridvo.synthetic.dataset import Preset
@@ -22,23 +21,10 @@ from hybridvo.synthetic.layered import Sample
 
 @dataclass(frozen=True)
 class Mixture:
-    """Presets with the share of each; shares need not add up to one.
-
-    Raises:
-        InputError: no preset, another number of shares, or shares that cannot be meant.
-    """
+    """Presets with the share of each; shares need not add up to one."""
 
     presets: tuple[Preset, ...]
     weights: tuple[float, ...]
-
-    def __post_init__(self) -> None:
-        weights = np.asarray(self.weights, dtype=np.float64)
-        good = np.isfinite(weights).all() and (weights >= 0).all() and weights.sum() > 0
-        if not good or len(self.presets) != len(self.weights):
-            raise InputError(
-                f"Mixture: expected a share >= 0 for each of {len(self.presets)} presets, got "
-                f"{self.weights}."
-            )
 
     def sample(self, rng: np.random.Generator) -> Sample:
         """One pair of one of the presets."""

@@ -14,7 +14,7 @@ import pickle
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 import torch.distributed as dist
@@ -24,6 +24,8 @@ from torch.nn.parallel import DistributedDataParallel
 from hybridvo.errors import CheckpointError, DegenerateError, InputError
 from hybridvo.files import atomic_write
 from hybridvo.training.options import RunOptions
+from hybridvo.training.pwvo_task import PwvoTask
+from hybridvo.training.selector_task import SelectorTask
 
 FREE_TO_CHANGE = ("checkpoint_minutes", "log_every", "evaluate_every", "evaluate_count")
 """Options in which a resumed run may differ: they do not touch what is learned."""
@@ -32,31 +34,8 @@ PROGRESS = ("step", "samples", "skipped", "elapsed_s")
 CHECKPOINT, LOG = "checkpoint.pt", "log.jsonl"
 
 
-class Task(Protocol):
-    """What is trained: a network, its samples and its loss.
-
-    ``data`` describes the samples in plain values: with the options it is the record of a run.
-    ``all_parameters_used`` says whether every parameter takes part in every loss.
-    """
-
-    network: nn.Module
-    data: Any
-    all_parameters_used: bool
-
-    @property
-    def options(self) -> RunOptions:
-        """Options of the run."""
-
-    def batches(self, samples: int, workers: int, rank: int, world: int) -> Iterator[Any]:
-        """Endless batches, after ``samples`` samples that all ranks together have seen."""
-
-    def loss(
-        self, model: nn.Module, batch: Any, step: int, progress: float
-    ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        """Loss of a batch and its parts, without gradient."""
-
-    def evaluate(self, network: nn.Module) -> dict[str, Any]:
-        """Figures of a network on development samples."""
+Task = PwvoTask | SelectorTask
+"""What is trained: a network, its data, options, batches, loss and figures."""
 
 
 class Trainer:
@@ -65,12 +44,8 @@ class Trainer:
     Under ``torch.distributed`` (``torchrun``) every process makes its own Trainer; gradients are
     averaged, and only rank 0 writes.
 
-    Args:
-        task: what is trained.
-        folder: of ``checkpoint.pt`` and ``log.jsonl``; must exist. None writes nothing.
-        device: of the network.
-        workers: processes that draw samples; 0 draws them in this one.
-        report: called with every entry of the log.
+    ``folder``: of ``checkpoint.pt`` and ``log.jsonl``; None writes nothing. ``workers``: processes
+    that draw samples; 0 draws them in this one. ``report`` is called with every entry of the log.
     """
 
     def __init__(
@@ -81,7 +56,8 @@ class Trainer:
         workers: int = 0,
         report: Callable[[dict[str, Any]], None] | None = None,
     ) -> None:
-        self.task, self.options, self.folder = task, task.options, folder
+        self.task, self.folder = task, folder
+        self.options: RunOptions = task.options
         self.device, self.workers, self.report = torch.device(device), workers, report
         self.world = dist.get_world_size() if dist.is_initialized() else 1
         self.rank = dist.get_rank() if dist.is_initialized() else 0
@@ -93,13 +69,10 @@ class Trainer:
             self.model = DistributedDataParallel(
                 self.network, find_unused_parameters=not task.all_parameters_used
             )
-        average = self.options.ema_decay > 0
+        average, how = self.options.ema_decay > 0, self.options.optimizer
         self.ema = copy.deepcopy(self.network).requires_grad_(False) if average else None
         self.optimizer = torch.optim.AdamW(
-            self.network.parameters(),
-            lr=self.options.optimizer.learning_rate,
-            betas=self.options.optimizer.betas,
-            weight_decay=self.options.optimizer.weight_decay,
+            self.network.parameters(), how.learning_rate, how.betas, weight_decay=how.weight_decay
         )
         self.step = self.samples = self.skipped = self.skipped_in_a_row = 0
         self.elapsed_s = 0.0
@@ -155,11 +128,9 @@ class Trainer:
             return
         # A young average follows quickly: it must forget the random start.
         decay = min(self.options.ema_decay, (1 + self.step) / (10 + self.step))
-        with torch.no_grad():
-            for ours, theirs in zip(
-                self.ema.state_dict().values(), self.network.state_dict().values(), strict=True
-            ):
-                ours.lerp_(theirs, 1 - decay)
+        states = (network.state_dict().values() for network in (self.ema, self.network))
+        for ours, theirs in zip(*states, strict=True):
+            ours.lerp_(theirs, 1 - decay)
 
     def run(self, time_limit_s: float = math.inf, until: int | None = None) -> str:
         """Train until the options' steps, a time limit or a request to stop, and save.
@@ -201,12 +172,10 @@ class Trainer:
 
     def _agree(self, signalled: bool, late: bool) -> int:
         """2 = a process was told to stop, 1 = time is up on one, 0 = go on; equal on all ranks."""
-        stop = 2 if signalled else int(late)
+        flag = torch.tensor(2 if signalled else int(late), device=self.device)
         if self.world > 1:
-            flag = torch.tensor(stop, device=self.device)
             dist.all_reduce(flag, dist.ReduceOp.MAX)
-            stop = int(flag)
-        return stop
+        return int(flag)
 
     def evaluate(self) -> dict[str, Any]:
         """Figures of the exported network on development samples, also into the log."""
@@ -249,11 +218,10 @@ class Trainer:
                 self.ema.load_state_dict(weights)
 
     def resume(self) -> bool:
-        """Go on where the folder's checkpoint ended, if there is one.
+        """Go on where the folder's checkpoint ended, if there is one of the same options and data.
 
         Raises:
-            CheckpointError: a damaged file.
-            InputError: a run of other options or other data.
+            CheckpointError: a damaged file. InputError: of a run of other options or other data.
         """
         if self.folder is None or not (self.folder / CHECKPOINT).exists():
             return False
@@ -285,11 +253,7 @@ def _fits(name: str) -> Iterator[None]:
 
 
 def read_checkpoint(path: Path, device: torch.device | str = "cpu") -> dict[str, Any]:
-    """Content of a ``checkpoint.pt``; nothing in it can run.
-
-    Raises:
-        CheckpointError: no such file, or a damaged one.
-    """
+    """Content of a ``checkpoint.pt``; nothing in it can run."""
     try:
         state = torch.load(path, map_location=device, weights_only=True)
         return {**state, "record": state["record"]}

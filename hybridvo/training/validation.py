@@ -33,10 +33,7 @@ FIGURES = ("r_err_deg", "t_err", "epe")
 
 
 def area_under_curve(score: np.ndarray, label: np.ndarray) -> float | None:
-    """Area under the ROC curve of a score (N,) as a detector of a label (N,) bool.
-
-    Ties count one half. None if one class is absent.
-    """
+    """Area under the ROC curve of a score (N,) for a label (N,) bool; None if a class is absent."""
     if label.all() or not label.any():
         return None
     wins = mannwhitneyu(score[label], score[~label], method="asymptotic").statistic

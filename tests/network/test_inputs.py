@@ -40,7 +40,7 @@ def test_values_at_native_size_by_hand():
     assert inputs.inverse_depth[0, 1, 3, 3].item() == pytest.approx(1 / pair.curr.depth[3, 3])
     assert inputs.rays[0, :, 1, 2].tolist() == pytest.approx([(2 - 3.5) / 20, (1 - 1.5) / 25])
     assert inputs.valid.all()
-    assert inputs.depth_curr[0, 1, 2].item() == pytest.approx(pair.curr.depth[2, 5])
+    assert 1 / inputs.inverse_depth[0, 1, 1, 2].item() == pytest.approx(pair.curr.depth[2, 5])
     np.testing.assert_allclose(inputs.K_prev[0], CAMERA.K)
 
 
@@ -84,7 +84,7 @@ def test_a_rigid_scene_keeps_its_equation_after_resizing():
     pair = FramePair(Frame(None, depth, camera_prev), Frame(None, depth, camera_curr), flow)
     inputs = assemble_inputs(pair, (128, 256))
     # F = pi(K', M D ray) - K ray, with the ray of the pixel that was taken: exact to float32.
-    X = torch.cat([inputs.rays, torch.ones(1, 1, 128, 256)], dim=1) * inputs.depth_prev[:, None]
+    X = torch.cat([inputs.rays, torch.ones(1, 1, 128, 256)], dim=1) / inputs.inverse_depth[:, :1]
     R, t = (torch.tensor(x, dtype=torch.float32) for x in (T[:3, :3], T[:3, 3]))
     moved = torch.einsum("ij,bjhw->bihw", R, X) + t[None, :, None, None]
 
@@ -182,7 +182,7 @@ def test_aligned_depth_is_taken_as_it_is():
     prev, curr = 1 + torch.rand(2, 2, 4, 8, generator=generator)
     K = torch.tensor(CAMERA.K, dtype=torch.float32).repeat(2, 1, 1)
     inputs = assemble_aligned(flow, prev, curr, K)
-    assert torch.equal(inputs.depth_curr, curr)
+    torch.testing.assert_close(1 / inputs.inverse_depth[:, 1], curr)
     torch.testing.assert_close(inputs.flow_px, flow.permute(0, 3, 1, 2))
     assert torch.equal(inputs.K_curr, K)
     still = assemble_inputs(PairBatch(0 * flow, prev, K, K, depth_curr=curr), (4, 8))
@@ -244,5 +244,5 @@ def test_a_real_pair(shared_data):
     # Within 5 % where x + F is visible: measured 98.4 % of the pixels, but 90.5 % without the flow
     # and 59.0 % with u and v swapped.
     both = inputs.valid & (inputs.inverse_depth[:, 1] > 0)
-    ratio = (inputs.depth_curr / inputs.depth_prev)[both]
+    ratio = (inputs.inverse_depth[:, 0] / inputs.inverse_depth[:, 1])[both]
     assert ((ratio - 1).abs() < 0.05).float().mean() > 0.97

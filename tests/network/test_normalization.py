@@ -149,8 +149,8 @@ def test_the_truth_has_no_flow_loss_on_fewer_pixels():
         rotation_deg=euler_deg(T[:, :3, :3]),
         translation=T[:, :3, 3],
         ego_flow=inputs.flow_px,
-        depth_prev=inputs.depth_prev,
-        depth_curr=inputs.depth_curr,
+        depth_prev=1 / inputs.inverse_depth[:, 0],
+        depth_curr=1 / inputs.inverse_depth[:, 1],
         K_prev=inputs.K_prev,
         K_curr=inputs.K_curr,
     ).subsample(4)

@@ -9,7 +9,7 @@ import pytest
 
 from hybridvo.geometry import se3_exp
 from hybridvo.refinement.plane_factor import PlaneFactor
-from hybridvo.refinement.solver import SolverOptions, gauss_newton
+from hybridvo.refinement.solver import gauss_newton
 from tests import worlds
 
 SIZE = (192, 256)
@@ -39,7 +39,7 @@ def test_exact_depth_alone_gives_the_motion():
     start = se3_exp(np.array([0.01, -0.01, 0.02, 0.003, -0.002, 0.004])) @ T
     for _ in range(3):
         assert factor.estimate(start)
-        start = gauss_newton((factor,), start, SolverOptions(20, 1e-3)).T
+        start = gauss_newton((factor,), start, 20, 1e-3).T
     worlds.assert_pose_close(start, T, rad=2e-4, m=1e-3)
 
 

@@ -65,9 +65,6 @@ def test_mixture_keeps_its_shares():
     [
         lambda: sample_generator(-1, 0),
         lambda: sample_generator(0, -1),
-        lambda: Mixture((PaperOptions(),), (0.5, 0.5)),
-        lambda: Mixture((PaperOptions(),), (-1.0,)),
-        lambda: Mixture((), ()),
     ],
 )
 def test_refuses_nonsense(call):

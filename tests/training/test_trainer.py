@@ -132,7 +132,7 @@ def test_loss_falls(mixture):
     options = changed(
         network=NetworkOptions(width=0.25, head_stride=2),
         optimizer=OptimizerOptions(learning_rate=5e-3, betas=(0.9, 0.999)),
-        schedule=ScheduleOptions(kind="constant"),
+        schedule=ScheduleOptions(halvings=()),
         loss=LossOptions(translation_form="laplace"),
     )
     trainer = Trainer(PwvoTask(options, mixture))
