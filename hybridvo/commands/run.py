@@ -40,8 +40,7 @@ from hybridvo.network.models import Models
 from hybridvo.odometry import Odometry
 from hybridvo.options import Options
 from hybridvo.pipeline import check_method, weights_hash
-from hybridvo.refinement.depth import depth_ratio
-from hybridvo.results import State, Step
+from hybridvo.results import Step
 from hybridvo.tracking.state import TrackerState
 from hybridvo.types import Frame
 
@@ -202,9 +201,6 @@ class _Job:
         message = " ".join(step.status.message.split())
         if frame is not None and not step.ok and is_dark(frame.rgb):
             message = f"the image is dark; {message}"
-        ratio = None
-        if prev is not None and frame is not None and step.status.state is not State.FAILED:
-            ratio = depth_ratio(prev, frame, field.flow, step.T_curr_prev)
         values = [*motion.T_curr_prev[:3, 3].tolist(), *se3_log(motion.T_curr_prev)[3:].tolist()]
         return {
             "index": step.index,
@@ -227,7 +223,6 @@ class _Job:
             "covariance": motion.covariance.tolist(),
             "flow_is_true": field.flow is not None and field.is_true,
             "errors": self._errors(prev, step),
-            "depth_ratio": ratio,
         }
 
     def _errors(self, prev: Frame | None, step: Step) -> dict[str, Any] | None:
