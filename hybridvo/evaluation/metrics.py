@@ -319,19 +319,12 @@ def evaluate(
 
     _check(estimate, gt, alignment, delta, delta_unit, max_diff)
     match = associate(estimate, gt, max_diff=max_diff)
-    report: dict[str, Any] = {
-        "alignment": alignment,
-        "delta": float(delta),
-        "delta_unit": delta_unit,
-        "matched": len(match.est_indices),
-        "total": match.total,
-        "matched_by": match.by,
-        "evo_version": str(evo.__version__).lstrip("v"),
-    }
+    report: dict[str, Any] = {"alignment": alignment, "delta": float(delta)}
+    report |= {"delta_unit": delta_unit, "matched": len(match.est_indices), "total": match.total}
+    report |= {"matched_by": match.by, "evo_version": str(evo.__version__).lstrip("v")}
     reasons: dict[str, str] = {}
 
     def put(names: Sequence[str], compute: Callable[[], Iterable[float | None]]) -> None:
-        """Put the first computed values under the names, or None with the reason."""
         try:
             values = compute()
         except DegenerateError as error:
