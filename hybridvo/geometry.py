@@ -38,6 +38,16 @@ def project(points: np.ndarray, camera: Camera) -> np.ndarray:
     return np.where((z > 0)[..., None], uv, np.nan)
 
 
+def projection_rows(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Derivatives (N, 6) of u and v of points (N, 3) in the left tangent, px."""
+    x, y, i = points[:, 0] / points[:, 2], points[:, 1] / points[:, 2], 1 / points[:, 2]
+    zero = np.zeros_like(i)
+    return (
+        camera.fx * np.stack([i, zero, -x * i, -x * y, 1 + x * x, -y], axis=-1),
+        camera.fy * np.stack([zero, i, -y * i, -1 - y * y, x * y, x], axis=-1),
+    )
+
+
 def ego_flow(
     depth: np.ndarray, T_curr_prev: np.ndarray, camera_prev: Camera, camera_curr: Camera
 ) -> np.ndarray:

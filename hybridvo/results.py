@@ -90,22 +90,15 @@ class MotionPrior:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "T_curr_prev", as_rigid(self.T_curr_prev, "MotionPrior"))
-        covariance = to_numpy(self.covariance, "MotionPrior.covariance")
-        if covariance.shape != (6, 6) or covariance.dtype.kind not in "fiu":
+        C = to_numpy(self.covariance, "MotionPrior.covariance")
+        fits = C.shape == (6, 6) and C.dtype.kind in "fiu" and bool(np.isfinite(C).all())
+        if not fits or not np.allclose(C, C.T) or not np.linalg.eigvalsh(C)[0] > 0:
             raise InputError(
-                f"MotionPrior.covariance: expected numbers of shape (6, 6), got "
-                f"{covariance.dtype} of shape {covariance.shape}. A prior needs one: how far may "
-                f"the motion be from it?"
+                f"MotionPrior.covariance: expected a positive definite matrix of shape (6, 6), "
+                f"symmetric and finite, got {C.tolist()}. A prior needs one: how far may the "
+                f"motion be from it?"
             )
-        covariance = covariance.astype(np.float64)
-        if not (np.isfinite(covariance).all() and np.allclose(covariance, covariance.T)):
-            raise InputError("MotionPrior.covariance: expected a finite, symmetric matrix.")
-        if not np.linalg.eigvalsh(covariance)[0] > 0:
-            raise InputError(
-                "MotionPrior.covariance: expected a positive definite matrix, got one with the "
-                f"smallest eigenvalue {np.linalg.eigvalsh(covariance)[0]:.3g}."
-            )
-        object.__setattr__(self, "covariance", covariance)
+        object.__setattr__(self, "covariance", C.astype(np.float64))
 
     def __repr__(self) -> str:
         sigma = np.sqrt(np.diag(self.covariance))
@@ -114,13 +107,8 @@ class MotionPrior:
 
 @dataclass(frozen=True, eq=False)
 class MotionPrediction:
-    """A network's prediction for one pair.
-
-    Args:
-        T_curr_prev: (4, 4) metres.
-        static_probability: (h, w) of every pixel of being static, 0 to 1, over the whole image at
-            any resolution.
-        covariance: (6, 6) of ``Exp(delta) T_curr_prev``, or None.
+    """A network's prediction for one pair; ``static_probability`` (h, w), 0 to 1, covers the whole
+    image at any resolution.
     """
 
     T_curr_prev: np.ndarray
@@ -246,12 +234,9 @@ class RelativePose:
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """One tracked frame of :class:`hybridvo.Odometry`.
+    """One tracked frame: camera to world (4, 4), and its motion from the frame before.
 
-    Args:
-        index, timestamp: of the current frame.
-        T_world_cam: (4, 4) camera to world; world = first camera unless set.
-        motion: relative pose from the previous frame; identity with status ok for the first frame.
+    The world is the first camera unless set; the first motion is the identity with status ok.
     """
 
     index: int

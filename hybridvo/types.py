@@ -28,11 +28,7 @@ FOCAL_RANGE = (1e-3, 1e9)
 
 
 def to_numpy(value: Any, name: str) -> np.ndarray:
-    """Numpy view of an array, a tensor or nested lists; masked floats become NaN.
-
-    Raises:
-        InputError: no array: ragged lists, or a tensor that records gradients or holds no values.
-    """
+    """Numpy view of an array, a tensor or nested lists; masked floats become NaN."""
     if isinstance(value, np.ma.MaskedArray) and value.dtype.kind == "f":
         return np.asarray(value.filled(np.nan))
     try:
@@ -42,11 +38,7 @@ def to_numpy(value: Any, name: str) -> np.ndarray:
 
 
 def as_float_image(value: Any, name: str, channels: int | None) -> np.ndarray:
-    """Numpy view (or native-endian float32 copy) of an (H, W[, channels]) image of real numbers.
-
-    Raises:
-        InputError: another shape, or no floating-point numbers.
-    """
+    """Numpy view (or native-endian float32 copy) of an (H, W[, channels]) image of real numbers."""
     array = to_numpy(value, name)
     expected = "(H, W)" if channels is None else f"(H, W, {channels})"
     if array.ndim == 3 and channels is None and array.shape[2] == 1:
@@ -71,11 +63,7 @@ def as_number(value: Any) -> float:
 
 
 def as_seed(seed: Any, where: str) -> int:
-    """A seed that every generator takes.
-
-    Raises:
-        InputError: no whole number from 0 to 2^31 - 1.
-    """
+    """A seed that every generator takes."""
     whole = isinstance(seed, Integral) and not isinstance(seed, bool)
     if not whole or not 0 <= seed < 2**31:
         raise InputError(f"{where}: expected a whole number from 0 to 2^31 - 1, got {seed!r}.")
@@ -83,11 +71,8 @@ def as_seed(seed: Any, where: str) -> int:
 
 
 def as_rigid(T: Any, where: str, tolerance: float = 1e-6, *, many: bool = False) -> np.ndarray:
-    """Float64 copy of a rigid transform (4, 4), or of ``many`` (N, 4, 4).
-
-    Raises:
-        InputError: another shape, values that are not finite, no rotation (to ``tolerance``) in the
-            upper left, or another last row than (0, 0, 0, 1); names the first bad one.
+    """Float64 copy of a rigid transform (4, 4), or of ``many`` (N, 4, 4), rotations to
+    ``tolerance``; the error names the first bad one.
     """
     T = to_numpy(T, where)
     if T.dtype.kind not in "fiu" or T.ndim != 2 + many or T.shape[-2:] != (4, 4):
@@ -131,18 +116,13 @@ class Camera:
     width: int
 
     def __post_init__(self) -> None:
-        for name in ("fx", "fy", "cx", "cy"):
-            number = as_number(getattr(self, name))
-            if not np.isfinite(number):
-                got = getattr(self, name)
-                raise InputError(f"Camera.{name}: expected a finite number, got {got!r}.")
-            object.__setattr__(self, name, number)
-        for name in ("height", "width"):
-            value = getattr(self, name)
-            number = as_number(value)
-            if isinstance(value, bool) or not 0 < number < np.inf or number % 1:
-                raise InputError(f"Camera.{name}: expected a positive integer, got {value!r}.")
-            object.__setattr__(self, name, int(number))
+        for name, value in vars(self).items():
+            number, whole = as_number(value), name in ("height", "width")
+            positive = not isinstance(value, bool) and number > 0 and not number % 1
+            if not np.isfinite(number) or (whole and not positive):
+                expected = "a positive integer" if whole else "a finite number"
+                raise InputError(f"Camera.{name}: expected {expected}, got {value!r}.")
+            object.__setattr__(self, name, int(number) if whole else number)
         if self.height * self.width > MAX_PIXELS:
             raise InputError(
                 f"Camera: {self.width}x{self.height} pixels is above the limit of {MAX_PIXELS}."
@@ -163,11 +143,7 @@ class Camera:
 
     @classmethod
     def from_matrix(cls, K: np.ndarray, height: int, width: int) -> Camera:
-        """Camera from a 3x3 intrinsic matrix without skew.
-
-        Raises:
-            InputError: not 3x3, not finite, skewed, or with a last row other than (0, 0, 1).
-        """
+        """Camera from a 3x3 intrinsic matrix without skew."""
         K = to_numpy(K, "Camera")
         if K.shape != (3, 3) or K.dtype.kind not in "fiu" or not np.isfinite(K).all():
             raise InputError(f"Camera: expected a finite 3x3 intrinsic matrix, got {K.tolist()}.")
@@ -190,12 +166,22 @@ class Camera:
         return self.height, self.width
 
 
-def _check_size(name: str, array: np.ndarray, camera: Camera) -> None:
+def _as_mask(value: Any, name: str) -> np.ndarray:
+    mask = to_numpy(value, name)
+    if mask.dtype != np.bool_ or mask.ndim != 2:
+        raise InputError(f"{name}: expected a boolean (H, W) array, got {mask.dtype} {mask.shape}.")
+    return mask
+
+
+def _set(of: Frame | FramePair, name: str, array: np.ndarray, camera: Camera) -> None:
+    """Set an image of the camera's size."""
     if array.shape[:2] != camera.shape:
         raise InputError(
-            f"{name}: expected {camera.shape} (height, width) as the camera has, got "
-            f"{array.shape[:2]}. Resize with hybridvo.data.resize, which also scales the camera."
+            f"{type(of).__name__}.{name}: expected {camera.shape} (height, width) as the camera "
+            f"has, got {array.shape[:2]}. Resize with hybridvo.data.resize, which also scales the "
+            f"camera."
         )
+    object.__setattr__(of, name, array)
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,17 +226,13 @@ class Frame:
                     f"Frame.rgb: expected shape (H, W, 3), got {rgb.shape}. "
                     f"Images are height, width, channels, in RGB order."
                 )
-            self._set("rgb", rgb)
+            _set(self, "rgb", rgb, self.camera)
         for name in ("depth", "depth_variance"):
             if getattr(self, name) is not None:
-                self._set(name, as_float_image(getattr(self, name), f"Frame.{name}", None))
+                image = as_float_image(getattr(self, name), f"Frame.{name}", None)
+                _set(self, name, image, self.camera)
         if self.mask is not None:
-            mask = to_numpy(self.mask, "Frame.mask")
-            if mask.dtype != np.bool_ or mask.ndim != 2:
-                raise InputError(
-                    f"Frame.mask: expected a boolean (H, W) array, got {mask.dtype} {mask.shape}."
-                )
-            self._set("mask", mask)
+            _set(self, "mask", _as_mask(self.mask, "Frame.mask"), self.camera)
         stamp = as_number(self.timestamp)
         if not np.isfinite(stamp):
             raise InputError(f"Frame.timestamp: expected finite seconds, got {self.timestamp!r}.")
@@ -259,10 +241,6 @@ class Frame:
             if as_number(self.index) % 1:
                 raise InputError(f"Frame.index: expected a whole number, got {self.index!r}.")
             object.__setattr__(self, "index", int(self.index))
-
-    def _set(self, name: str, array: np.ndarray) -> None:
-        _check_size(f"Frame.{name}", array, self.camera)
-        object.__setattr__(self, name, array)
 
 
 @dataclass(frozen=True, eq=False)
@@ -309,16 +287,10 @@ class FramePair:
         for name, channels in (("flow", 2), ("flow_variance", None)):
             if getattr(self, name) is not None:
                 array = as_float_image(getattr(self, name), f"FramePair.{name}", channels)
-                self._set(name, array)
+                _set(self, name, array, self.prev.camera)
         if self.flow_valid is not None:
-            valid = to_numpy(self.flow_valid, "FramePair.flow_valid")
-            if valid.dtype != np.bool_:
-                raise InputError(f"FramePair.flow_valid: expected bool, got dtype {valid.dtype}.")
-            self._set("flow_valid", valid)
-
-    def _set(self, name: str, array: np.ndarray) -> None:
-        _check_size(f"FramePair.{name}", array, self.prev.camera)
-        object.__setattr__(self, name, array)
+            valid = _as_mask(self.flow_valid, "FramePair.flow_valid")
+            _set(self, "flow_valid", valid, self.prev.camera)
 
 
 @dataclass(frozen=True, eq=False)
@@ -349,16 +321,7 @@ class PairBatch:
         device: torch.device | str | None = None,
         dtype: torch.dtype | None = None,
     ) -> PairBatch:
-        """A batch of numpy pairs of one size; what a pair lacks is NaN, that is, invalid.
-
-        Args:
-            pairs: at least one.
-            device: of the tensors; the CPU by default.
-            dtype: their type; float32 by default.
-
-        Raises:
-            InputError: no pair, or pairs of several sizes.
-        """
+        """A batch of numpy pairs of one size; what a pair lacks is NaN, that is, invalid."""
         import torch
 
         sizes = {pair.prev.camera.shape for pair in pairs}

@@ -4,8 +4,7 @@
 
 Each method tracks rendered sequences in which about 60 % of every image moves, from the first frame
 to the last, as a user would; depth is the renderer's, flow is DIS and, as an oracle, the true one.
-Then: how often the stated probability of a motion comes true, and whether the scales that the
-pixel-wise network states are those of its errors.
+Then: how often the stated probability of a motion comes true.
 """
 
 from __future__ import annotations
@@ -20,7 +19,6 @@ import numpy as np
 from golden_inputs import HEAVY, SIZE, rendered, scene_flow
 from measuring import (
     able,
-    auroc,
     digits,
     proportion,
     provenance,
@@ -29,7 +27,6 @@ from measuring import (
     timed,
     write_result,
 )
-from scipy.spatial.transform import Rotation
 
 METHODS = {
     "dis": ("hybrid", "hybrid-flow", "refine", "pwvo", "pnp-ransac-tuned", "poselib"),
@@ -39,9 +36,6 @@ METHODS = {
 ASKED = ("hybrid", "hybrid-flow")
 """Methods that state a probability."""
 BINS = (0.0, 0.2, 0.4, 0.6, 0.8, 0.9, 0.95, 0.99, 1.0)
-LEVELS = (0.25, 0.5, 0.75, 0.9)
-NETWORK_PAIRS = 10
-"""Pairs of each sequence on which the network's scales are compared with its errors."""
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -67,10 +61,9 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def measure(args: argparse.Namespace) -> dict[str, Any]:
-    """Figures by flow, method and family, the probability's reliability, the network's scales."""
-    paths: dict[str, dict[str, dict[str, list[Any]]]] = {flow: {} for flow in METHODS}
+    """Figures by flow, method and family, and the probability's reliability."""
+    paths: dict[str, dict[str, dict[str, list[float]]]] = {flow: {} for flow in METHODS}
     records: dict[str, dict[str, list[Any]]] = {flow: {} for flow in METHODS}
-    scales: list[dict[str, Any]] = []
     methods = {flow: able(names)[0] for flow, names in METHODS.items()}
     for kind in args.kinds.split(","):
         for seed in range(args.seed0, args.seed0 + args.sequences):
@@ -78,7 +71,6 @@ def measure(args: argparse.Namespace) -> dict[str, Any]:
             for (flow, method), (some, path) in track(sequence, methods).items():
                 records[flow].setdefault(method, []).extend(some)
                 paths[flow].setdefault(method, {}).setdefault(kind, []).append(path)
-            scales.append(network_scales(sequence))
             print(f"{kind}, seed {seed}", file=sys.stderr, flush=True)
     return {
         "kinds": args.kinds.split(","),
@@ -88,8 +80,8 @@ def measure(args: argparse.Namespace) -> dict[str, Any]:
         "depth": "true (oracle)",
         "missing": able(METHODS["dis"])[1],
         "paths": {
-            flow: {method: {kind: mean_path(some) for kind, some in by_kind.items()}
-                   for method, by_kind in by_method.items()}
+            flow: {m: {kind: {"rmse_cm": digits(np.mean(some))} for kind, some in by_kind.items()}
+                   for m, by_kind in by_method.items()}
             for flow, by_method in paths.items()
         },
         "pairs": {
@@ -100,13 +92,12 @@ def measure(args: argparse.Namespace) -> dict[str, Any]:
             flow: {m: reliability(by_method[m]) for m in ASKED if m in by_method}
             for flow, by_method in records.items()
         },
-        "network": over_sequences(scales),
     }  # fmt: skip
 
 
 def track(
     sequence: Any, methods: dict[str, list[str]]
-) -> dict[tuple[str, str], tuple[list[dict[str, Any]], dict[str, float]]]:
+) -> dict[tuple[str, str], tuple[list[dict[str, Any]], float]]:
     """By flow and method: the score of every step, and the error of the path."""
     from hybridvo import FramePair, Odometry
     from hybridvo.flow import dis_flow
@@ -136,21 +127,9 @@ def track(
     return {key: (records[key], path_error(np.array(places[key]), truth)) for key in trackers}
 
 
-def path_error(places: np.ndarray, truth: np.ndarray) -> dict[str, float]:
-    """Root mean square and last error of the position, cm, and the length of the path, m.
-
-    Both paths begin at the same pose, nothing is aligned afterwards.
-    """
-    error = np.linalg.norm(places - truth, axis=1)
-    return {
-        "rmse_cm": 100 * float(np.sqrt(np.mean(error**2))),
-        "end_cm": 100 * float(error[-1]),
-        "length_m": float(np.linalg.norm(np.diff(truth, axis=0), axis=1).sum()),
-    }
-
-
-def mean_path(paths: list[dict[str, float]]) -> dict[str, float]:
-    return {name: digits(np.mean([path[name] for path in paths])) for name in paths[0]}
+def path_error(places: np.ndarray, truth: np.ndarray) -> float:
+    """Root mean square error of the position, cm, both paths from the same pose."""
+    return 100 * float(np.sqrt(np.mean(np.square(places - truth).sum(axis=1))))
 
 
 def reliability(records: list[dict[str, Any]]) -> dict[str, Any]:
@@ -166,72 +145,10 @@ def reliability(records: list[dict[str, Any]]) -> dict[str, Any]:
     flagged = np.array([not record["status"].startswith("ok") for record in records])
     return {
         "bins": rows,
-        "brier": digits(np.mean((stated - right) ** 2)),
         "failures": int((~right).sum()),
         "failures_flagged": int((~right & flagged).sum()),
         "right_flagged": int((right & flagged).sum()),
     }
-
-
-def network_scales(sequence: Any) -> dict[str, Any]:
-    """Errors of the pixel-wise network in units of its stated Laplace scale U, on the true flow.
-
-    e / U of a calibrated network is an exponential variable of mean 1.
-    """
-    import torch
-
-    from hybridvo import PWVO, FramePair, PairBatch
-
-    network, flow = PWVO.from_pretrained(), scene_flow(sequence)
-    ratios: dict[str, list[np.ndarray]] = {name: [] for name in ("rotation", "translation")}
-    doubt: dict[str, list[np.ndarray]] = {name: [] for name in ratios}
-    moving = []
-    for i in np.linspace(0, len(sequence) - 2, NETWORK_PAIRS).round().astype(int).tolist():
-        frames = sequence.frame(i), sequence.frame(i + 1)
-        pair = FramePair(*frames, flow(*frames).flow, flow_is_true=True, depth_source="true")
-        with torch.inference_mode():
-            maps = network(PairBatch.from_pairs([pair]))
-        T = np.linalg.inv(sequence.poses[i + 1]) @ sequence.poses[i]
-        target = {
-            "rotation": Rotation.from_matrix(T[:3, :3]).as_euler("XYZ", degrees=True),
-            "translation": T[:3, 3],
-        }
-        shape = maps.rotation.shape[2:]
-        rows, columns = (
-            np.linspace(0, n - 1, m).astype(int) for n, m in zip(SIZE, shape, strict=True)
-        )
-        moving.append(sequence.moving(i)[np.ix_(rows, columns)].ravel())
-        for name in ratios:
-            value = getattr(maps, name)[0].double().numpy()
-            log_scale = getattr(maps, f"log_scale_{name}")[0].double().numpy()
-            ratio = np.abs(value - target[name][:, None, None]) / np.exp(log_scale)
-            ratios[name].append(ratio.reshape(3, -1))
-            doubt[name].append(log_scale.mean(axis=0).ravel())
-    return {
-        name: {
-            "ratio": np.concatenate(ratios[name], axis=1),
-            "doubt": np.concatenate(doubt[name]),
-            "moving": np.concatenate(moving),
-        }
-        for name in ratios
-    }  # fmt: skip
-
-
-def over_sequences(scales: list[dict[str, Any]]) -> dict[str, Any]:
-    """Over all sequences: mean of e / U, share of errors below its quantiles, and how well the
-    scale tells moving pixels from static ones (area under the ROC curve).
-    """
-    result = {}
-    for name in ("rotation", "translation"):
-        ratio = np.concatenate([some[name]["ratio"].ravel() for some in scales])
-        doubt = np.concatenate([some[name]["doubt"] for some in scales])
-        moving = np.concatenate([some[name]["moving"] for some in scales])
-        result[name] = {
-            "mean_ratio": digits(ratio.mean()),
-            "below": {f"{p:g}": digits(np.mean(ratio < -np.log(1 - p))) for p in LEVELS},
-            "auroc": auroc(doubt, moving),
-        }
-    return result
 
 
 if __name__ == "__main__":

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 
 def table(header: list[str], rows: list[list[str]]) -> list[str]:
-    """A Markdown table, names left and numbers right."""
+    """Lines of a Markdown table, names left and numbers right; none without rows."""
+    if not rows:
+        return []
     ruler = "|---" * 1 + "|---:" * (len(header) - 1) + "|"
     return [line(header), ruler, *map(line, rows)]
 

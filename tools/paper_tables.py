@@ -116,30 +116,22 @@ def claims_table(results: Results) -> list[str]:
              f"{claim['error_over_pairs_px']:.3f}", "-" if spread is None else f"{spread:.3f}",
              claim["as_claimed"]]
         )  # fmt: skip
-    header = [
-        "claim (EPE)",
-        "difference, px",
-        "standard error over pairs",
-        "spread of seeds",
-        "seeds as claimed",
-    ]
-    return table(header, rows) if rows else []
+    header = ["claim (EPE)", "difference, px", "standard error over pairs", "spread of seeds"]
+    header += ["seeds as claimed"]
+    return table(header, rows)
 
 
 def curve_table(results: Results) -> list[str]:
     """EPE of every row while it learns."""
-    rows, steps = [], set()
-    for row in ROWS:
-        for curve in runs_of(results, row):
-            steps |= {int(k) for k in curve}
-    order = sorted(steps)
+    rows = []
+    order = sorted({int(k) for row in ROWS for curve in runs_of(results, row) for k in curve})
     for row, title in ROWS.items():
         curves = runs_of(results, row)
         if curves:
             means = [[c[str(k)]["data_paper"]["epe"] for c in curves] for k in order]
             rows.append([title, *(number(float(np.mean(x))) for x in means)])
     header = ["EPE, px, after samples", *(f"{k // 1000} k" for k in order)]
-    return table(header, rows) if rows else []
+    return table(header, rows)
 
 
 def selection_table(results: Results) -> list[str]:
@@ -147,15 +139,11 @@ def selection_table(results: Results) -> list[str]:
     curves = runs_of(results, "pwvo-paper")
     if not curves:
         return []
-    last = str(results["ablation"]["samples"])
+    ends = [curve[str(results["ablation"]["samples"])] for curve in curves]
     rows = []
-    for rule in curves[0][last]["rules_data_paper"]:
-        cells = []
-        for preset in PRESETS:
-            for key in FIGURES:
-                values = [curve[last][f"rules_{preset}"][rule][key] for curve in curves]
-                cells.append(number(float(np.mean(values))))
-        rows.append([f"`{rule}`", *cells])
+    for rule in ends[0]["rules_data_paper"]:
+        found = [[end[f"rules_{p}"][rule][k] for p in PRESETS for k in FIGURES] for end in ends]
+        rows.append([f"`{rule}`", *(number(float(x)) for x in np.mean(found, axis=0))])
     header = [f"{name}, {title}" for title in PRESETS.values() for name in FIGURES.values()]
     return table(["rule", *header], rows)
 
@@ -167,13 +155,10 @@ def uncertainty_table(results: Results) -> list[str]:
         if not runs_of(results, row):
             continue
         for preset, title in PRESETS.items():
-            cells = [
-                " / ".join(
-                    final(results, row, preset, f"{figure}_{half}")
-                    for half in ("rotation", "translation")
-                )
-                for figure in ("auroc", "spearman", "median_ratio")
-            ]
+            cells = []
+            for figure in ("auroc", "spearman", "median_ratio"):
+                halves = (f"{figure}_{half}" for half in ("rotation", "translation"))
+                cells.append(" / ".join(final(results, row, preset, name) for name in halves))
             rows.append([f"{ROWS[row]}, {title}", *cells])
     header = [
         "row",
@@ -181,7 +166,7 @@ def uncertainty_table(results: Results) -> list[str]:
         "Spearman with the error, R / T",
         "median error / U, R / T (right: 0.69)",
     ]
-    return table(header, rows) if rows else []
+    return table(header, rows)
 
 
 def saliency_table(results: Results) -> list[str]:
@@ -195,7 +180,7 @@ def saliency_table(results: Results) -> list[str]:
         ]
         rows.append([ROWS[row], *cells, f"{100 * shares['median_part_missed']:.1f} %"])
     header = ["row", "rotation", "translation", "part of the answer that the integral misses"]
-    return table(header, rows) if rows else []
+    return table(header, rows)
 
 
 TABLES = {

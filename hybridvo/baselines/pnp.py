@@ -12,14 +12,16 @@ import importlib
 import importlib.util
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import cv2
 import numpy as np
 
-from hybridvo.geometry import make_transform, project
+from hybridvo.errors import InputError
+from hybridvo.geometry import make_transform, project, projection_rows
 from hybridvo.results import Reason, RelativePose, Status
-from hybridvo.types import Camera, FramePair
+from hybridvo.types import Camera, FramePair, as_rigid
 
 POINTS = 10_000
 """Random valid pixels handed to a solver; all pixels cost 50 times more for no accuracy."""
@@ -55,27 +57,17 @@ Solver = Callable[[Correspondences, Camera, int], np.ndarray | None]
 """(correspondences, current camera, seed) -> (4, 4) T_curr_prev, or None."""
 
 
-def solve_default(data: Correspondences, camera: Camera, seed: int) -> np.ndarray | None:
-    """``cv2.solvePnPRansac`` with its defaults: 8 px, 100 iterations, confidence 0.99, EPnP."""
-    found, rvec, tvec, _ = cv2.solvePnPRansac(data.xyz, data.uv, camera.K, None)
-    return _opencv_pose(found, rvec, tvec)
-
-
-def solve_tuned(data: Correspondences, camera: Camera, seed: int) -> np.ndarray | None:
-    """``cv2.solvePnPRansac`` at 2 px, 1000 iterations, 0.999, then LM on the inliers."""
-    found, rvec, tvec, inliers = cv2.solvePnPRansac(data.xyz, data.uv, camera.K, None, **TUNED)
-    if found and inliers is not None and len(inliers) >= MIN_POINTS:
+def solve_opencv(
+    data: Correspondences, camera: Camera, seed: int, *, polish: bool = False, **options: Any
+) -> np.ndarray | None:
+    """``cv2.solvePnPRansac``, whose generator is fixed; ``polish``: then LM on the inliers."""
+    found, rvec, tvec, inliers = cv2.solvePnPRansac(data.xyz, data.uv, camera.K, None, **options)
+    if polish and found and inliers is not None and len(inliers) >= MIN_POINTS:
         xyz, uv = data.xyz[inliers[:, 0]], data.uv[inliers[:, 0]]
         rvec, tvec = cv2.solvePnPRefineLM(xyz, uv, camera.K, None, rvec, tvec)
-    return _opencv_pose(found, rvec, tvec)
-
-
-def solve_magsac(data: Correspondences, camera: Camera, seed: int) -> np.ndarray | None:
-    """``cv2.solvePnPRansac`` with ``cv2.USAC_MAGSAC`` at 2 px, 1000 iterations, 0.999."""
-    found, rvec, tvec, _ = cv2.solvePnPRansac(
-        data.xyz, data.uv, camera.K, None, **TUNED, flags=cv2.USAC_MAGSAC
-    )
-    return _opencv_pose(found, rvec, tvec)
+    if not found or not np.isfinite(rvec).all() or not np.isfinite(tvec).all():
+        return None
+    return make_transform(cv2.Rodrigues(rvec)[0], tvec[:, 0])
 
 
 def solve_poselib(data: Correspondences, camera: Camera, seed: int) -> np.ndarray | None:
@@ -103,9 +95,9 @@ def solve_poselib(data: Correspondences, camera: Camera, seed: int) -> np.ndarra
 
 
 SOLVERS: dict[str, tuple[Solver, float]] = {
-    "pnp-ransac": (solve_default, DEFAULT_PX),
-    "pnp-ransac-tuned": (solve_tuned, TUNED_PX),
-    "usac-magsac": (solve_magsac, TUNED_PX),
+    "pnp-ransac": (solve_opencv, DEFAULT_PX),
+    "pnp-ransac-tuned": (partial(solve_opencv, polish=True, **TUNED), TUNED_PX),
+    "usac-magsac": (partial(solve_opencv, flags=cv2.USAC_MAGSAC, **TUNED), TUNED_PX),
     "poselib": (solve_poselib, TUNED_PX),
 }
 """Solver and largest residual of an inlier, px, by method."""
@@ -258,10 +250,10 @@ def check(
 
 def is_rigid(T: np.ndarray) -> bool:
     """Whether ``T`` is a finite (4, 4) rigid transform of a length that can be metres."""
-    if T.shape != (4, 4) or not np.isfinite(T).all() or np.abs(T[:3, 3]).max() > DEPTH_RANGE_M[1]:
+    try:
+        return bool(np.abs(as_rigid(T, "T")[:3, 3]).max() <= DEPTH_RANGE_M[1])
+    except InputError:
         return False
-    R = T[:3, :3]
-    return bool(np.abs(R @ R.T - np.eye(3)).max() < 1e-6 and np.linalg.det(R) > 0)
 
 
 def _information(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -269,13 +261,7 @@ def _information(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.nda
     z = points[:, 2]
     # both halves of the tangent are then in radians
     scale = np.array([float(np.median(z))] * 3 + [1.0] * 3)
-    x, y, zero = points[:, 0] / z, points[:, 1] / z, np.zeros_like(z)
-    J = np.concatenate(
-        [
-            camera.fx * np.stack([1 / z, zero, -x / z, -x * y, 1 + x * x, -y], axis=-1),
-            camera.fy * np.stack([zero, 1 / z, -y / z, -1 - y * y, x * y, x], axis=-1),
-        ]
-    )
+    J = np.concatenate(projection_rows(points, camera))
     J *= scale
     values, vectors = np.linalg.eigh(J.T @ J)
     return values, vectors, scale
@@ -284,9 +270,8 @@ def _information(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.nda
 def _degenerate(method: str, data: Correspondences, camera: Camera) -> RelativePose | None:
     """The failure where no solver could have found the motion: the points are degenerate."""
     values, _, _ = _information(data.xyz, camera)
-    if values[0] > SINGULAR_RATIO * values[-1]:
-        return None
-    return _undetermined(method, len(data.uv), values)
+    weak = values[0] <= SINGULAR_RATIO * values[-1]
+    return _undetermined(method, len(data.uv), values) if weak else None
 
 
 def _undetermined(method: str, count: int, values: np.ndarray, ratio: float = 0.0) -> RelativePose:
@@ -297,9 +282,3 @@ def _undetermined(method: str, count: int, values: np.ndarray, ratio: float = 0.
         inlier_ratio=ratio,
         information_eigenvalues=np.maximum(values, 0.0),
     )
-
-
-def _opencv_pose(found: bool, rvec: np.ndarray, tvec: np.ndarray) -> np.ndarray | None:
-    if not found or not np.isfinite(rvec).all() or not np.isfinite(tvec).all():
-        return None
-    return make_transform(cv2.Rodrigues(rvec)[0], tvec[:, 0])

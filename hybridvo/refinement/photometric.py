@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 from hybridvo.errors import InputError
-from hybridvo.geometry import pose_matrix
+from hybridvo.geometry import pose_matrix, projection_rows
 from hybridvo.options import PhotometricOptions
 from hybridvo.refinement.covariance import direction_is_known
 from hybridvo.refinement.image_factor import ImageFactor
@@ -184,12 +184,9 @@ def _spread_px(pair: FramePair, index: np.ndarray, covariance: np.ndarray) -> fl
     """How far a covariance (6, 6) lets the pixels move in the image, root mean square, px."""
     v, u = index[:: max(1, len(index) // 200)].T
     K, z = pair.prev.camera, np.asarray(pair.prev.depth)[v, u].astype(np.float64)
-    x, y, i, zero = (u - K.cx) / K.fx, (v - K.cy) / K.fy, 1 / z, np.zeros_like(z)
-    rows = (
-        pair.curr.camera.fx * np.array([i, zero, -x * i, -x * y, 1 + x * x, -y]),
-        pair.curr.camera.fy * np.array([zero, i, -y * i, -(1 + y * y), x * y, x]),
-    )
-    return float(np.sqrt(np.einsum("cpn,pq,cqn->", rows, covariance, rows) / len(z)))
+    points = np.stack([(u - K.cx) / K.fx * z, (v - K.cy) / K.fy * z, z], axis=1)
+    J = np.stack(projection_rows(points, pair.curr.camera))
+    return float(np.sqrt(np.einsum("cnp,pq,cnq->", J, covariance, J) / len(z)))
 
 
 def _judged(

@@ -12,15 +12,15 @@ import functools
 import json
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, Protocol, TypeVar, cast
+from typing import Any, Protocol, Self, TypeVar, cast
 
 import numpy as np
 
 from hybridvo.errors import FormatError, InputError, OutputError
 from hybridvo.files import make_folder, parse_yaml, read_text, write_json
+from hybridvo.options import option_group
 from hybridvo.synthetic.diverse import DiverseOptions
 from hybridvo.synthetic.draws import STORED, sample_generator
 from hybridvo.synthetic.layered import Layers, PaperOptions, Sample
@@ -209,7 +209,7 @@ def _ego_flow(fields: dict[str, np.ndarray]) -> np.ndarray:
     return Layers(fields["K"], rho).flows(fields["T_curr_prev"], added=False)[0]
 
 
-@dataclass(frozen=True)
+@option_group
 class StoredSamples:
     """Samples of a folder, named from the current one, as data of a training: ``preset: folder``.
 
@@ -224,8 +224,8 @@ class StoredSamples:
         count = _read_manifest(Path(self.folder))["count"]
         return read_sample(self.folder, int(rng.integers(count)))
 
-    def for_evaluation(self) -> StoredSamples:
+    def for_evaluation(self) -> Self:
         """The same of the held-out folder."""
         if not self.held_out:
-            raise InputError("StoredSamples.held_out: no folder of held-out samples is named.")
-        return StoredSamples(self.held_out)
+            raise InputError("held_out: no folder of held-out samples is named.")
+        return dataclasses.replace(cast(Any, self), folder=self.held_out)

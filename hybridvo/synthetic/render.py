@@ -12,6 +12,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy.typing import ArrayLike
 
 from hybridvo.data.base import Sequence
 from hybridvo.data.image_io import write_cam, write_dpt, write_flo
@@ -38,7 +39,7 @@ class Solid:
     A_world_body: np.ndarray
     object_id: int = 0
     wavelength: float = 1.6
-    colours: tuple[Items[float], Items[float]] = ((0.9, 0.8, 0.7), (0.6, 0.8, 0.9))
+    colours: tuple[ArrayLike, ArrayLike] = ((0.9, 0.8, 0.7), (0.6, 0.8, 0.9))
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,10 +232,6 @@ class SyntheticSequence(Sequence):
     def flow(self, index: int) -> tuple[np.ndarray, None]:
         """True flow from frame ``index`` to the next, (H, W, 2) float32, and no variance."""
         return self.scene.flow(index)[0], None
-
-    def occlusion(self, index: int) -> np.ndarray:
-        """(H, W) bool, True where a pixel of frame ``index`` is not visible in the next."""
-        return self.scene.flow(index)[1]
 
     def moving(self, index: int) -> np.ndarray:
         """(H, W) bool, True on moving objects."""

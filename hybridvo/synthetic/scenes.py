@@ -38,10 +38,7 @@ def draw_look(rng: np.random.Generator) -> dict[str, Any]:
     """Texture of one solid."""
     base = rng.uniform(0.35, 1.0, 3)
     other = np.clip(base + rng.normal(0, 0.3, 3), 0.25, 1.0)
-    return {
-        "wavelength": float(rng.uniform(1.0, 2.2)),
-        "colours": (tuple(base.tolist()), tuple(other.tolist())),
-    }
+    return {"wavelength": rng.uniform(1.0, 2.2), "colours": (base, other)}
 
 
 @dataclass(frozen=True, eq=False)

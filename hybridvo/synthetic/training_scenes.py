@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from hybridvo.geometry import make_transform
-from hybridvo.synthetic.draws import about, affine, any_turn, log_uniform, turn
+from hybridvo.synthetic.draws import about, affine, any_turn, direction, log_uniform, turn
 from hybridvo.synthetic.raycast import BOX, CYLINDER, ELLIPSOID
 from hybridvo.synthetic.render import Scene, Solid
 from hybridvo.types import Camera
@@ -61,9 +61,8 @@ class _Builder:
         rng = self.rng
         first = np.clip(self.base + rng.normal(0, self.variety, 3), 0.1, 1.0)
         second = np.clip(first + rng.normal(0, self.contrast, 3), 0.05, 1.0)
-        colours = (tuple(first.tolist()), tuple(second.tolist()))
         wavelength = stretch * self.wavelength * log_uniform(rng, (0.6, 1.7))
-        self.solids.append(Solid(shape, A, object_id, wavelength=wavelength, colours=colours))
+        self.solids.append(Solid(shape, A, object_id, wavelength, (first, second)))
 
     def any_shape(self) -> int:
         """One of the three shapes."""
@@ -224,7 +223,7 @@ def _chain(rng: np.random.Generator) -> list[Part]:
     before, after = np.eye(4), np.eye(4)
     parts = []
     for k in range(count):
-        local = make_transform(turn(rng, rng.normal(0, 25)), np.array([0.85 * 2 * length, 0, 0]))
+        local = make_transform(turn(rng, rng.normal(0, 25)), np.array([1.7 * length, 0, 0]))
         if k == 0:
             local = make_transform(np.eye(3), np.array([-1.0, 0, 0]))
         before = before @ local
@@ -263,9 +262,9 @@ def _breathing(rng: np.random.Generator) -> list[Part]:
     squash = rng.uniform(0.35, 1.0, 3)
     parts = []
     for k in range(count):
-        towards = rng.standard_normal(3)
+        towards = direction(rng)
         radius = 0.0 if k == 0 else rng.uniform(0.3, 0.85)
-        centre = squash * towards / np.linalg.norm(towards) * radius
+        centre = squash * towards * radius
         half = (0.6 if k == 0 else rng.uniform(0.12, 0.35)) * squash * rng.uniform(0.7, 1.2, 3)
         A = affine(half, centre, any_turn(rng) if k else None)
         angle = np.zeros(3)
@@ -345,10 +344,10 @@ def training_scene(seed: int, height: int, width: int) -> Scene:
     rng = np.random.default_rng([0x6A75, seed])
     spread = np.tan(np.radians(rng.uniform(34, 100) / 2))
     focal = width / 2 / spread
-    centre = rng.normal(0, 0.03, 2) * width
+    shift = rng.normal(0, 0.03, 2) * width
     aspect = log_uniform(rng, (0.8, 1.25)) if rng.random() < 0.3 else 1.0
-    cx, cy = (width - 1) / 2 + centre[0], (height - 1) / 2 + centre[1]
-    camera = Camera(focal, aspect * focal, cx, cy, height, width)
+    centre = (width - 1) / 2 + shift[0], (height - 1) / 2 + shift[1]
+    camera = Camera(focal, aspect * focal, *centre, height, width)
     s = log_uniform(rng, (0.2, 3.0))
     size = min(log_uniform(rng, (0.1, 8.0)), 6.0)
     rotation = np.zeros(3)

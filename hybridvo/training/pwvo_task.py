@@ -25,7 +25,7 @@ is charged, also behind the camera."""
 
 
 class PwvoTask:
-    """One of the paper's networks, its data and its loss; see ``trainer.Task``."""
+    """One of the paper's networks, its data and its loss."""
 
     def __init__(self, options: PwvoOptions, mixture: Mixture) -> None:
         self.options, self.mixture = options, mixture

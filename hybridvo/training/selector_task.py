@@ -119,7 +119,7 @@ class Looks:
 
 
 class SelectorTask:
-    """The selector, shards of samples and the losses; see ``trainer.Task``.
+    """The selector, shards of samples and the losses.
 
     Args:
         options: of the run. The weights are drawn from its seed.

@@ -9,7 +9,6 @@ from __future__ import annotations
 import functools
 import zipfile
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -19,6 +18,7 @@ from pydantic import Field
 from hybridvo.errors import FormatError, InputError
 from hybridvo.geometry import matrix_to_euler_deg
 from hybridvo.options import option_group
+from hybridvo.synthetic.dataset import StoredSamples
 from hybridvo.synthetic.layered import Layers, Sample
 
 MOVING, STATIC, UNKNOWN = 0, 1, 255
@@ -33,22 +33,11 @@ NAMES = (
 
 
 @option_group
-class RenderedOptions:
-    """Samples of a folder of shards as samples of one size, mirrored at random.
+class RenderedOptions(StoredSamples):
+    """Rendered samples of a folder of shards as samples of one size, mirrored at random."""
 
-    ``held_out``: a folder of held-out seeds, for evaluations.
-    """
-
-    folder: str
-    held_out: str = ""
     height: Annotated[int, Field(ge=2)] = 128
     width: Annotated[int, Field(ge=2)] = 256
-
-    def for_evaluation(self) -> RenderedOptions:
-        """The same of the held-out samples."""
-        if not self.held_out:
-            raise InputError("RenderedOptions.held_out: no folder of held-out samples is named.")
-        return replace(self, folder=self.held_out)
 
     def sample(self, rng: np.random.Generator) -> Sample:
         """One sample, mirrored or not."""

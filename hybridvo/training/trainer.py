@@ -14,7 +14,7 @@ import pickle
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 import torch.distributed as dist
@@ -24,6 +24,8 @@ from torch.nn.parallel import DistributedDataParallel
 from hybridvo.errors import CheckpointError, DegenerateError, InputError
 from hybridvo.files import atomic_write
 from hybridvo.training.options import RunOptions
+from hybridvo.training.pwvo_task import PwvoTask
+from hybridvo.training.selector_task import SelectorTask
 
 FREE_TO_CHANGE = ("checkpoint_minutes", "log_every", "evaluate_every", "evaluate_count")
 """Options in which a resumed run may differ: they do not touch what is learned."""
@@ -32,30 +34,8 @@ PROGRESS = ("step", "samples", "skipped", "elapsed_s")
 CHECKPOINT, LOG = "checkpoint.pt", "log.jsonl"
 
 
-class Task(Protocol):
-    """What is trained: a network, its samples and its loss.
-
-    ``data`` describes the samples in plain values; ``all_parameters_used``: in every loss.
-    """
-
-    network: nn.Module
-    data: Any
-    all_parameters_used: bool
-
-    @property
-    def options(self) -> RunOptions:
-        """Options of the run."""
-
-    def batches(self, samples: int, workers: int, rank: int, world: int) -> Iterator[Any]:
-        """Endless batches, after ``samples`` samples that all ranks together have seen."""
-
-    def loss(
-        self, model: nn.Module, batch: Any, step: int, progress: float
-    ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        """Loss of a batch and its parts, without gradient."""
-
-    def evaluate(self, network: nn.Module) -> dict[str, Any]:
-        """Figures of a network on development samples."""
+Task = PwvoTask | SelectorTask
+"""What is trained: a network, its data, options, batches, loss and figures."""
 
 
 class Trainer:
@@ -64,12 +44,8 @@ class Trainer:
     Under ``torch.distributed`` (``torchrun``) every process makes its own Trainer; gradients are
     averaged, and only rank 0 writes.
 
-    Args:
-        task: what is trained.
-        folder: of ``checkpoint.pt`` and ``log.jsonl``; must exist. None writes nothing.
-        device: of the network.
-        workers: processes that draw samples; 0 draws them in this one.
-        report: called with every entry of the log.
+    ``folder``: of ``checkpoint.pt`` and ``log.jsonl``; None writes nothing. ``workers``: processes
+    that draw samples; 0 draws them in this one. ``report`` is called with every entry of the log.
     """
 
     def __init__(
@@ -80,7 +56,8 @@ class Trainer:
         workers: int = 0,
         report: Callable[[dict[str, Any]], None] | None = None,
     ) -> None:
-        self.task, self.options, self.folder = task, task.options, folder
+        self.task, self.folder = task, folder
+        self.options: RunOptions = task.options
         self.device, self.workers, self.report = torch.device(device), workers, report
         self.world = dist.get_world_size() if dist.is_initialized() else 1
         self.rank = dist.get_rank() if dist.is_initialized() else 0

@@ -414,7 +414,7 @@ def test_covariance_contains_the_error_of_independent_noise():
     for seed in range(60):
         noise = np.random.default_rng(seed).normal(0, 0.3, exact.flow.shape).astype(np.float32)
         data = sample(_pair(flow=exact.flow + noise), seed, points=400)
-        found = pnp.solve_tuned(data, CAMERA, seed)
+        found = pnp.SOLVERS["pnp-ransac-tuned"][0](data, CAMERA, seed)
         result = check("tuned", found, data, CAMERA, 2.0)
         delta = se3_log(result.T_curr_prev @ invert(T))
         nees.append(delta @ np.linalg.solve(result.covariance, delta))
