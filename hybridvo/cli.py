@@ -172,7 +172,7 @@ def _compare(args: argparse.Namespace, command: list[str]) -> Result:
         sequences=(*args.paths, *args.sequence),
         methods=methods,
         weights=weight_files(args.weights, METHODS if methods == ("all",) else methods),
-        **{name: getattr(args, name) for name in [*names, "jobs"]},
+        **{name: getattr(args, name) for name in names},
     )
     with Progress(0, "compare", quiet=args.quiet, unit="pairs") as progress:
 

@@ -75,11 +75,7 @@ def write_csv(
 
 
 def fingerprint(paths: Iterable[str | os.PathLike[str]]) -> str:
-    """Hash of the names, sizes and times of files: tells whether input has changed since.
-
-    Returns:
-        Hexadecimal SHA-256; a file that cannot be looked at counts by its name alone.
-    """
+    """SHA-256 over the names, sizes and times of files: tells whether input has changed since."""
     digest = hashlib.sha256()
     for path in map(Path, paths):
         size, time = -1, -1

@@ -19,6 +19,7 @@ Positive = Annotated[float, Field(gt=0)]
 Count = Annotated[int, Field(ge=1)]
 Natural = Annotated[int, Field(ge=0)]
 Share = Annotated[float, Field(ge=0, le=1)]
+Blur = Annotated[float, Field(gt=0, lt=100)]
 
 
 def describe(error: ValidationError, where: str) -> str:
@@ -97,14 +98,13 @@ class RefineOptions:
     """The refinement on flow and depth.
 
     Args:
-        cutoff: c of the Geman-McClure kernel, in standard deviations. The influence of a pixel
-            falls from c / sqrt(3), 1.7 standard deviations, on.
+        cutoff: c of the Geman-McClure kernel, in standard deviations.
         coarse_pixels: pixels of the grid on which motions are fitted before the full one.
-        current_depth: use the current frame's depth as a third residual: ``on``, ``off``, or
-            ``auto``, where it adds more than half of what the flow knows in some direction.
+        current_depth: the current frame's depth as a third residual: ``on``, ``off``, or ``auto``,
+            where it adds more than half of what the flow knows in some direction.
         min_pixels: fewer usable pixels are a failure.
-        tiles: about how many tiles (of 8 to 64 px) the image is cut into for the covariance: errors
-            may be correlated over two of them.
+        tiles: about how many (of 8 to 64 px) the covariance cuts the image into: errors may be
+            correlated over two of them.
     """
 
     cutoff: Positive = 3.0
@@ -123,19 +123,14 @@ class PhotometricOptions:
         blur_px: standard deviations of the Gaussian blur, px, coarse to fine.
         iterations: most Gauss-Newton steps under each of them.
         pixels: about how many pixels are used: the strongest gradients of evenly spread cells.
-        prior_inflation: factor on the covariance of the flow's motion. The errors of estimated flow
-            are alike far beyond the tiles: with DIS the squared error in units of that covariance
-            has a median of 8 to 10 where 5.4 is expected, and a long tail.
-        image_inflation: the same for the images and the depth maps, beyond their tiles
-            (interpolation, shading, a bent sensor).
+        prior_inflation: factor on the covariance of the flow's motion: the errors of estimated flow
+            are alike far beyond the tiles.
+        image_inflation: the same for the images and the depth maps.
         min_correlation: of the two images over the pixels used; below it they do not match.
     """
 
     mode: Literal["auto", "on", "off"] = "auto"
-    blur_px: Annotated[tuple[Annotated[float, Field(gt=0, lt=100)], ...], Field(min_length=1)] = (
-        2.0,
-        1.0,
-    )
+    blur_px: Annotated[tuple[Blur, ...], Field(min_length=1)] = (2.0, 1.0)
     iterations: Count = 5
     pixels: Count = 16000
     prior_inflation: Positive = 8.0
@@ -150,15 +145,13 @@ class TrackOptions:
     Args:
         window: most key frames that a frame is registered to, 1 for none; None: 3 where the images
             refine the motion, else 1.
-        keyframe_overlap: share of a key frame's static pixels that must still be seen; below it the
+        keyframe_overlap: share of a key frame's static pixels that are still seen, below which the
             frame becomes a key frame.
         keyframe_motion: median shift of these pixels, as a share of the image's width, above which
             the frame becomes a key frame.
         min_overlap: share below which no motion is sought between two key frames.
-        inflation: factor on every covariance: errors of flow, depth and texture are alike from
-            frame to frame.
-        motion_prior: let the motion predicted by constant velocity take part, as one start and as a
-            cue.
+        inflation: factor on every covariance: errors are alike from frame to frame.
+        motion_prior: let the motion predicted by constant velocity take part.
         on_failure: pose after a failed motion: ``hold``, or ``constant_velocity``.
     """
 
@@ -200,9 +193,6 @@ class RunOptions:
 @option_group
 class Options:
     """The option tree.
-
-    Args:
-        flow, search, select, refine, photometric, track, run: see their classes.
 
     Raises:
         InputError: an unknown name or a value out of bounds, with its place.

@@ -114,7 +114,6 @@ def add_compare(compare: argparse.ArgumentParser) -> None:
     paper = "MPI Sintel as others score it: PWVO's 992 pairs, or fourteen trajectories"
     add("--protocol", choices=("paper", "trajectory14"), help=paper)
     add("--worst", type=int, default=3, help="worst pairs shown for each method")
-    add("--jobs", type=int, default=1, metavar="N", help="sequences at a time, a process each")
     _add_existing(compare)
 
 

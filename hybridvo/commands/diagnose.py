@@ -110,12 +110,7 @@ def diagnosis_text(report: Mapping[str, Any]) -> str:
 
 
 def _measure(sequence: Sequence, prev: Frame, curr: Frame) -> Pair:
-    """Measurements of one pair.
-
-    ``depth`` (median, metres), ``grey`` (ratio of the mean brightness), ``dark`` (frames),
-    ``contradiction`` (sentence or None), ``depth_ratio`` (of the current frame over the predicted),
-    ``scale`` (estimated translation over the true one) and ``shift_costs``.
-    """
+    """Measurements of one pair: median depth (m), ratio of the brightness, dark frames, ..."""
     pair: Pair = {"index": prev.index, "dark": []}
     if prev.depth is not None and (median := typical_depth(prev.depth)) is not None:
         pair["depth"] = median

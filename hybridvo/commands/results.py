@@ -12,7 +12,6 @@ from hybridvo.data.sequence import Sequence
 from hybridvo.evaluation.metrics import Alignment, evaluate
 from hybridvo.evaluation.pair_errors import mean_pair_errors
 from hybridvo.files import atomic_write, write_json
-from hybridvo.refinement.depth import is_step
 from hybridvo.trajectory import Trajectory
 
 Row = Mapping[str, Any]
@@ -58,7 +57,7 @@ def summarise(rows: list[dict[str, Any]], sequence: Sequence, method: str) -> di
         "flow_ms_median": median("flow_ms"),
         "motion_ms_median": median("motion_ms"),
         "frame_ms_median": median("frame_ms"),
-        "warnings": _scale_warning(rows),
+        "warnings": [],
     }
 
 
@@ -88,18 +87,6 @@ def draw(path: Path, trajectory: Trajectory, gt: Trajectory | None, summary: Row
     if summary["oracle"]:
         title += f" (oracle: {', '.join(summary['oracle'])})"
     plot_trajectories({summary["method"]: trajectory}, path, truth=gt, title=title)
-
-
-def _scale_warning(rows: Iterable[Row]) -> list[str]:
-    steps = [row for row in rows if is_step(row["depth_ratio"])]
-    if not steps:
-        return []
-    first, more = steps[0], f", and {len(steps) - 1} more" if len(steps) > 1 else ""
-    return [
-        f"the depth of frame {first['index']} is {first['depth_ratio']:.3g} times what frame "
-        f"{first['prev_index']} and the motion between them say{more}: its unit or scale changes "
-        f"within the sequence, and the trajectory's with it"
-    ]
 
 
 # -- texts --------------------------------------------------------------------------------------

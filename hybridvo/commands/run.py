@@ -40,8 +40,7 @@ from hybridvo.network.models import Models
 from hybridvo.odometry import Odometry
 from hybridvo.options import Options
 from hybridvo.pipeline import check_method, weights_hash
-from hybridvo.refinement.depth import depth_ratio
-from hybridvo.results import State, Step
+from hybridvo.results import Step
 from hybridvo.tracking.state import TrackerState
 from hybridvo.types import Frame
 
@@ -66,8 +65,8 @@ def run(
 ) -> tuple[dict[str, Any], int]:
     """Estimate, chain, write and score a sequence: a summary, JSON-ready, and the exit code.
 
-    ``out`` is by default ``runs/NAME``, ``command`` stands in ``run.json``; ``rrd`` is the file of
-    a Rerun recording, empty for ``recording.rrd`` in the output folder.
+    ``out`` is by default ``runs/NAME``; ``rrd`` is the file of a Rerun recording, empty for
+    ``recording.rrd`` in the output folder.
 
     Raises:
         InputError: input or options that cannot be used, or a broken frame with ``strict``.
@@ -83,27 +82,17 @@ def run(
     out = _folder(out, sequence)
     vo = Odometry(models, flow=flow, method=method, options=options, seed=options.run.seed)
     vo.warm_up()  # before the folder is taken: it may last
-    identity = {
+    deciding = dataclasses.asdict(options)
+    for name in ("max_failed", "strict", "device"):
+        del deciding["run"][name]
+    identity = {  # what a resumed run must share
         "input_hash": fingerprint(sequence.files()),
-        "options": _deciding(options),
+        "options": deciding,
         "weights": weights_hash(method, models),
         "hybridvo": hybridvo.__version__,
     }
-    header = {
-        "command": list(command),
-        "versions": versions(),
-        "machine": {"platform": platform.platform(), "cpus": os.cpu_count()},
-        "options": dataclasses.asdict(options),
-        "sequence": {
-            "name": sequence.name,
-            "kind": sequence.kind,
-            "path": os.fspath(sequence.root),
-            "frames": len(frames),
-            "depth_source": sequence.depth_source,
-            "warnings": list(sequence.warnings),
-        },
-        "input_hash": identity["input_hash"],
-    }
+    header = _header(sequence, len(frames), options) | {"command": list(command)}
+    header["input_hash"] = identity["input_hash"]
     with RunFolder(out, identity, header, mode) as folder, contextlib.ExitStack() as stack:
         if folder.finished:
             summary = folder.read_json(STATE)["summary"]
@@ -112,14 +101,9 @@ def run(
         recording = None
         if rrd is not None:
             poses = None if sequence.poses is None else sequence.poses[list(frames)]
-            recording = Recording(
-                rrd or out / RECORDING,
-                sequence.name,
-                str(identity["input_hash"]),
-                len(frames),
-                first=len(folder.rows),
-                poses=poses,
-            )
+            named = (rrd or out / RECORDING, sequence.name, str(identity["input_hash"]))
+            first = len(folder.rows)
+            recording = Recording(*named, len(frames), first=first, poses=poses)
             stack.enter_context(recording)
         job = _Job(sequence, frames, options, vo, flow, folder, recording)
         summary, exit_code = job.run(quiet)
@@ -202,9 +186,6 @@ class _Job:
         message = " ".join(step.status.message.split())
         if frame is not None and not step.ok and is_dark(frame.rgb):
             message = f"the image is dark; {message}"
-        ratio = None
-        if prev is not None and frame is not None and step.status.state is not State.FAILED:
-            ratio = depth_ratio(prev, frame, field.flow, step.T_curr_prev)
         values = [*motion.T_curr_prev[:3, 3].tolist(), *se3_log(motion.T_curr_prev)[3:].tolist()]
         return {
             "index": step.index,
@@ -227,7 +208,6 @@ class _Job:
             "covariance": motion.covariance.tolist(),
             "flow_is_true": field.flow is not None and field.is_true,
             "errors": self._errors(prev, step),
-            "depth_ratio": ratio,
         }
 
     def _errors(self, prev: Frame | None, step: Step) -> dict[str, Any] | None:
@@ -306,12 +286,21 @@ def _folder(out: str | os.PathLike[str] | None, sequence: Sequence) -> Path:
     return out
 
 
-def _deciding(options: Options) -> dict[str, Any]:
-    """The options that decide the result: what a resumed run must share."""
-    values = dataclasses.asdict(options)
-    for name in ("max_failed", "strict", "device"):
-        del values["run"][name]
-    return values
+def _header(sequence: Sequence, frames: int, options: Options) -> dict[str, Any]:
+    """What ``run.json`` says of a run beside its state."""
+    return {
+        "versions": versions(),
+        "machine": {"platform": platform.platform(), "cpus": os.cpu_count()},
+        "options": dataclasses.asdict(options),
+        "sequence": {
+            "name": sequence.name,
+            "kind": sequence.kind,
+            "path": os.fspath(sequence.root),
+            "frames": frames,
+            "depth_source": sequence.depth_source,
+            "warnings": list(sequence.warnings),
+        },
+    }
 
 
 def _exit_code(summary: dict[str, Any], options: Options) -> int:

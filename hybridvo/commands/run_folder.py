@@ -39,12 +39,9 @@ Mode = Literal["new", "resume", "overwrite"]
 class RunFolder:
     """An output folder that one run holds; use as a context manager.
 
-    Args:
-        path: the folder; created where absent.
-        identity: what must be equal for a run to be resumed; JSON-ready.
-        header: what else ``run.json`` says.
-        mode: ``new`` refuses a folder with results, ``overwrite`` removes those of a run (and no
-            other files), ``resume`` goes on.
+    ``identity`` (JSON-ready) is what must be equal for a run to be resumed, ``header`` what else
+    ``run.json`` says. ``new`` refuses a folder with results, ``overwrite`` removes those of a run
+    (and no other files), ``resume`` goes on.
 
     Attributes:
         rows: of the finished frames, JSON-ready, in order.
@@ -52,10 +49,8 @@ class RunFolder:
         finished: whether the run that is resumed was complete already.
 
     Raises:
-        LockedError: another run holds the folder.
-        InputError: results are there and ``mode`` is ``new``; ``resume`` of another run; or
-            ``overwrite`` of files that no run has written.
-        OutputError: the folder cannot be written.
+        LockedError: another run holds the folder. OutputError: it cannot be written.
+        InputError: results that ``mode`` does not allow, or those of another run.
     """
 
     def __init__(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -155,14 +154,7 @@ class Sequence:
         return self.frame(index + len(self) if index < 0 else index)
 
     def __iter__(self) -> Iterator[Frame]:
-        """Frames that can be read; one that cannot be is left out with a Python warning."""
-        for index in range(len(self)):
-            try:
-                frame = self.frame(index)
-            except (InputError, OSError) as error:
-                warnings.warn(f"frame {index} is left out: {error}", stacklevel=2)
-                continue
-            yield frame
+        return map(self.frame, range(len(self)))
 
     def camera(self, index: int) -> Camera:
         """Pinhole camera of frame ``index``."""

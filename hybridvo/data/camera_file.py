@@ -22,30 +22,6 @@ IMAGES = (".png", ".jpg", ".jpeg")
 REQUIRED = ("fx", "fy", "cx", "cy", "width", "height")
 KNOWN = (*REQUIRED, "distortion", "depth_scale", "fps")
 
-TEMPLATE = """\
-# The camera of the images in rgb/, in pixels; (0, 0) is the centre of the top-left pixel.
-# ROS (ros2 topic echo /camera/color/camera_info): K = [fx 0 cx 0 fy cy 0 0 1]; RealSense: ppx = cx.
-fx:
-fy:
-cx:
-cy:
-width: {width}
-height: {height}
-# Units per metre of the depth images: 1000 for millimetres (RealSense, Kinect, ZED), 5000 for TUM.
-# Leave it out where depth/ holds .npy or .dpt in metres.
-{comment}depth_scale: 1000
-# Lens distortion k1, k2, p1, p2, k3 (OpenCV's order); leave it out for rectified images.
-# distortion: [0, 0, 0, 0, 0]
-# Images a second, where neither file names nor timestamps.txt give time stamps.
-# fps: 30
-#
-# rgb/    PNG or JPEG. depth/  16-bit PNG, .npy or .dpt, registered to the colour image, same size.
-#         Files go together by equal names, else by stamps (names such as 1305031102.1753.png, or
-#         timestamps.txt and depth_timestamps.txt, a stamp a line), else by order.
-# mask/   optional: 0 where pixels must not be used.  flow/  optional: .flo, .npy or KITTI's PNG.
-# poses.txt  optional ground truth: timestamp tx ty tz qx qy qz qw, camera to world.
-"""
-
 
 @dataclass(frozen=True)
 class Calibration:
@@ -175,7 +151,8 @@ def write_camera_template(directory: str | os.PathLike[str]) -> Path:
     comment = "# " if sorted_files(folder / "depth", (".npy", ".dpt")) else ""
     folder.mkdir(parents=True, exist_ok=True)
     with atomic_write(path) as file:
-        file.write(TEMPLATE.format(width=width, height=height, comment=comment))
+        template = Path(__file__).with_name("camera_template.yaml").read_text(encoding="utf-8")
+        file.write(template.format(width=width, height=height, comment=comment))
     return path
 
 

@@ -186,19 +186,14 @@ def _check_tag(path: object, data: bytes, suffix: str) -> None:
         )
 
 
-def _tagged_size(data: bytes, path: object, suffix: str) -> tuple[int, int]:
-    """(height, width) from the 12-byte header of .flo and .dpt."""
+def _read_tagged(path: str | os.PathLike[str], suffix: str, channels: int) -> np.ndarray:
+    """(H, W, channels) of .flo and .dpt: tag, width, height, values."""
+    data = _read_bytes(path)
     _check_tag(path, data, suffix)
     if len(data) < 12:
         raise FormatError(f"{path}: truncated: expected a header of 12 bytes, got {len(data)}.")
     width, height = struct.unpack("<ii", data[4:12])
     _check_pixels(path, width, height)
-    return height, width
-
-
-def _read_tagged(path: str | os.PathLike[str], suffix: str, channels: int) -> np.ndarray:
-    data = _read_bytes(path)
-    height, width = _tagged_size(data, path, suffix)
     _check_size(path, 12 + 4 * channels * height * width, len(data), f"{suffix} {width}x{height}")
     array = np.frombuffer(data, dtype="<f4", offset=12).reshape(height, width, channels)
     return array.astype(np.float32)

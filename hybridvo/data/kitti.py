@@ -61,11 +61,10 @@ class KittiSequence(Sequence):
                 f"or .npy in metres) or the right images {right_name}."
             )
         calibration = root / "calib.txt"
-        P = _read_projections(calibration)
-        self._P_left = _projection(P, left_name[-1], calibration)
+        self._P_left = _read_projection(calibration, left_name[-1])
         self._disparity_at_1m = 0.0  # px: focal length times baseline
         if self.depth_source == "stereo":
-            P_right = _projection(P, right_name[-1], calibration)
+            P_right = _read_projection(calibration, right_name[-1])
             self._disparity_at_1m = float(self._P_left[0, 3] - P_right[0, 3])
             if not self._disparity_at_1m > 0:
                 raise FormatError(
@@ -154,9 +153,9 @@ def _sequence_folder(path: Path) -> Path | None:
     return None
 
 
-def _read_projections(path: Path) -> dict[str, np.ndarray]:
-    """Name -> (3, 4) projection of a rectified camera: fx 0 cx tx, 0 fy cy ty, 0 0 1 tz."""
-    matrices = {}
+def _read_projection(path: Path, number: str) -> np.ndarray:
+    """(3, 4) projection of a rectified camera: fx 0 cx tx, 0 fy cy ty, 0 0 1 tz."""
+    found = None
     for line, text in enumerate(read_text(path).split("\n"), start=1):
         name, _, rest = text.partition(":")
         if not name.startswith("P"):
@@ -167,19 +166,13 @@ def _read_projections(path: Path) -> dict[str, np.ndarray]:
             P = np.zeros((3, 4))
         is_rectified = P[1, 0] == 0 and np.allclose(P[2, :3], (0, 0, 1)) and P[0, 0] * P[1, 1] > 0
         if not (is_rectified and np.isfinite(P).all()):
-            raise FormatError(
-                f"{path}:{line}: expected {name}: fx 0 cx tx 0 fy cy ty 0 0 1 tz, got "
-                f"{rest[:200]!r}."
-            )
-        matrices[name] = P
-    return matrices
-
-
-def _projection(matrices: dict[str, np.ndarray], number: str, path: Path) -> np.ndarray:
-    name = next((n for n in (f"P{number}", f"P_rect_0{number}") if n in matrices), None)
-    if name is None:
-        raise FormatError(f"{path}: expected a line 'P{number}: ...', found {sorted(matrices)}.")
-    return matrices[name]
+            expected = f"{name}: fx 0 cx tx 0 fy cy ty 0 0 1 tz"
+            raise FormatError(f"{path}:{line}: expected {expected}, got {rest[:200]!r}.")
+        if name in (f"P{number}", f"P_rect_0{number}"):
+            found = P
+    if found is None:
+        raise FormatError(f"{path}: expected a line 'P{number}: ...', found none.")
+    return found
 
 
 def _read_times(path: Path, numbers: list[int], per_second: float, told: list[str]) -> np.ndarray:

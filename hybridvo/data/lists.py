@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import re
 from collections.abc import Sequence as Many
-from pathlib import Path, PurePath
+from pathlib import Path
 
 import numpy as np
 
@@ -85,13 +85,6 @@ def warn_of_gaps(name: str, numbers: Many[int], told: list[str]) -> None:
 def shown(names: Many[object], most: int = 8) -> str:
     """The first names of a list, for a message."""
     return ", ".join(map(str, names[:most])) + (", ..." if len(names) > most else "")
-
-
-def listed_path(root: Path, name: str, where: str) -> Path:
-    """Path of a file that a list names: below the sequence's own folder, else FormatError."""
-    if PurePath(name).is_absolute() or ".." in PurePath(name).parts or "\0" in name:
-        raise FormatError(f"{where}: expected a file below {root}, got {name[:200]!r}.")
-    return root / name
 
 
 def to_seconds(stamps: Many[float] | np.ndarray, name: str, told: list[str]) -> np.ndarray:

@@ -10,7 +10,6 @@ from hybridvo.data.base import Given, Listing, Sequence
 from hybridvo.data.camera_file import Calibration
 from hybridvo.data.lists import (
     depth_at,
-    listed_path,
     poses_at,
     read_timed_poses,
     to_seconds,
@@ -123,8 +122,7 @@ def _read_lists(root: Path) -> Listing:
     for path in lists:
         rows = read_rows(path, "timestamp filename", words=1)
         stamps = to_seconds([row.numbers[0] for row in rows], path.name, told)
-        files = [listed_path(root, row.words[0], f"{path}:{row.line}") for row in rows]
-        columns.append((stamps, files))
+        columns.append((stamps, [root / row.words[0] for row in rows]))
     (stamps, rgb), (depth_stamps, depth) = columns
     pairs = depth_at(stamps, depth_stamps, lists[0], told)
     return Listing(
@@ -139,15 +137,10 @@ def _read_lists(root: Path) -> Listing:
 def _read_pairs(root: Path) -> Listing:
     """``stamp depth stamp rgb`` (ICL-NUIM), or ``stamp rgb stamp depth``; told by the folder."""
     path = root / "associations.txt"
-    rgb: list[Path | None] = []
-    depth: list[Path | None] = []
     rows = read_rows(path, "timestamp file timestamp file", words=3)
-    for row in rows:
-        names = (row.words[0], row.words[2])
-        first, second = (listed_path(root, name, f"{path}:{row.line}") for name in names)
-        depth_first = "depth" in names[0].lower()
-        depth.append(first if depth_first else second)
-        rgb.append(second if depth_first else first)
     told: list[str] = []
     stamps = to_seconds([row.numbers[0] for row in rows], path.name, told)
-    return Listing(rgb, depth, stamps, sources=[path], warnings=told)
+    rgb, depth = ([root / row.words[k] for row in rows] for k in (0, 2))
+    if any("depth" in row.words[0].lower() for row in rows):
+        rgb, depth = depth, rgb
+    return Listing([*rgb], [*depth], stamps, sources=[path], warnings=told)

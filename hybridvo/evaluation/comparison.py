@@ -10,21 +10,17 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-import multiprocessing
 import os
 import platform
 import shutil
 from collections.abc import Callable, Iterable, Iterator
 from collections.abc import Sequence as Several
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
 
 import filelock
-import numpy as np
 import pandas as pd
 
 import hybridvo
@@ -43,12 +39,9 @@ from hybridvo.evaluation.sequence_job import (
 from hybridvo.files import fingerprint, make_folder, versions, write_csv, write_json
 from hybridvo.network.models import Models
 from hybridvo.pipeline import METHODS, check_method, weights_hash
-from hybridvo.trajectory import Trajectory
 
 WRITTEN = ("results.json", "results.csv", "pairs.csv", "report.md", "report.html")
 """What a finished comparison leaves, beside ``trajectories/`` and ``worst/``."""
-SINTEL_FOLDERS = ("camdata_left", "depth", "flow", "clean", "final")
-"""Folders of MPI Sintel that hold a folder per scene; the images of the last one are read."""
 Mode = Literal["new", "resume", "overwrite"]
 ReportProgress = Callable[[str, int, int], None]
 """Called with a message (or the empty string), pairs done and pairs in all."""
@@ -65,12 +58,11 @@ def compare(
     """Run every method on every sequence and write the results; returns paths of :data:`WRITTEN`.
 
     ``new`` refuses a folder with results, ``resume`` keeps finished sequences, ``overwrite`` starts
-    anew. ``command`` is for ``results.json``; ``progress`` is told of every pair (of every
-    sequence, where several run at a time).
+    anew. ``command`` is for ``results.json``; ``progress`` is told of every pair.
 
     Raises:
         InputError: options, sequences or methods that cannot be used. LockedError: another run
-            holds the folder. OutputError: a result cannot be written. HybridVOError: a worker died.
+            holds the folder. OutputError: a result cannot be written.
         KeyboardInterrupt: finished sequences are kept for ``resume``.
     """
     from hybridvo.evaluation.report import write_report
@@ -84,27 +76,32 @@ def compare(
     with _folder(out, mode):
         for name, reason in missing.items():
             report(f"not run: {name}: {reason}", 0, total)
-        parts = _work(jobs, options.jobs, out / "parts", report)
+        parts = _work(jobs, out, report)
         report("scores and report", total, total)
         for part in parts:
             for warning in part["sequence"]["warnings"]:
                 report(f"{part['sequence']['name']}: {warning}", total, total)
-        table = pair_table(row for part in parts for row in part["pairs"])
-        at_a_time = "up to {} estimates at the same time: times are upper bounds"
+        pairs = [row for part in parts for row in part["pairs"]]
+        table = pair_table(pairs)
+        worst = worst_pairs(table, options.worst)
+        for job, part in zip(jobs, parts, strict=True):
+            mine = [entry for entry in worst if entry["sequence"] == job.name]
+            draw_worst(out, job, mine, part["pairs"])
         result = {
             "command": list(command),
             "versions": versions(),
             "machine": {"platform": platform.platform(), "cpus": os.cpu_count()},
             "options": asdict(options),
             "weights": {name: weights_hash(name, models) for name in methods},
-            "timing": at_a_time.format(options.jobs) if options.jobs > 1 else "one at a time",
+            "timing": "one estimate at a time",
             "started": started,
             "finished": datetime.now(UTC).isoformat(timespec="seconds"),
             "missing": missing,
             **_scores(table, parts, protocol),
-            **_write_sequences(out, jobs, parts, worst_pairs(table, options.worst)),
+            "trajectories": [path for part in parts for path in part["trajectories"]],
+            "worst_pairs": worst,
         }
-        write_csv(out / "pairs.csv", PAIR_COLUMNS, (r for part in parts for r in part["pairs"]))
+        write_csv(out / "pairs.csv", PAIR_COLUMNS, pairs)
         write_json(out / "results.json", result)
         write_csv(out / "results.csv", ROW_COLUMNS, result["rows"])
         write_report(out, result, table)
@@ -138,26 +135,15 @@ def methods_to_run(
 def expand(path: str | os.PathLike[str], dataset: str | None = None) -> list[Path]:
     """Sequence folders that a path stands for: itself, or all sequences that it holds.
 
-    A folder that is no sequence is searched one level down; MPI Sintel may be given as it was
-    unpacked, as its folder ``training``, or as one of its passes.
+    A folder that is no sequence is searched one level down; of MPI Sintel its final or clean pass.
     """
     folder = Path(path)
-    if not folder.is_dir():
+    if not folder.is_dir() or _opens(folder, dataset):
         return [folder]
-    if dataset in (None, "sintel"):
-        absolute = folder.absolute()
-        if absolute.name in SINTEL_FOLDERS and (absolute.parent / "camdata_left").is_dir():
-            return [child for child in sorted(absolute.iterdir()) if child.is_dir()]
-        for base in (absolute, absolute / "training", *sorted(absolute.glob("*/training"))):
-            if (base / "camdata_left").is_dir():
-                scenes = {}
-                for name in SINTEL_FOLDERS:
-                    for child in sorted((base / name).glob("*/")):
-                        scenes[child.name] = child
-                return [scenes[name] for name in sorted(scenes)]
-    if _opens(folder, dataset):
-        return [folder]
-    inside = [child for child in sorted(folder.iterdir()) if child.is_dir()]
+    inner = folder
+    for names in (("training",), ("final", "clean")):
+        inner = next((inner / name for name in names if (inner / name).is_dir()), inner)
+    inside = [child for child in sorted(inner.iterdir()) if child.is_dir()]
     return [child for child in inside if _opens(child, dataset)] or [folder]
 
 
@@ -207,7 +193,9 @@ def _plan(
         deciding = [name, fingerprint(sequence.files()), list(frames), flows, options.seed]
         deciding += [same_camera_only, options.device, hashes, hybridvo.__version__]
         digest = hashlib.sha256(json.dumps(deciding).encode()).hexdigest()
-        jobs.append(Job(str(path), name, options, flows, methods, frames, same_camera_only, digest))
+        plain = "".join(c if c.isalnum() or c in "-_." else "_" for c in name)[:60]
+        named = (str(path), name, f"{len(jobs):03d}_{plain}")
+        jobs.append(Job(*named, options, flows, methods, frames, same_camera_only, digest))
     return jobs, protocol
 
 
@@ -245,53 +233,25 @@ def _folder(out: Path, mode: Mode) -> Iterator[None]:
         raise LockedError(f"{out}: another run holds this folder.") from None
 
 
-def _work(
-    jobs: list[Job], processes: int, folder: Path, report: ReportProgress
-) -> list[dict[str, Any]]:
+def _work(jobs: list[Job], out: Path, report: ReportProgress) -> list[dict[str, Any]]:
     """What every job gave, in order; kept from an earlier try where that is finished."""
-    make_folder(folder)
-    paths = {job.name: folder / f"{job.fingerprint}.json" for job in jobs}
+    for name in ("parts", "trajectories", "worst"):
+        make_folder(out / name)
+    paths = {job.name: out / "parts" / f"{job.fingerprint}.json" for job in jobs}
     todo = [job for job in jobs if not paths[job.name].exists()]
     total = sum(job.pairs for job in jobs)
     done = total - sum(job.pairs for job in todo)
     if len(todo) < len(jobs):
         text = f"resumed: {len(jobs) - len(todo)} of {len(jobs)} sequences are finished"
         report(text, done, total)
-    if min(processes, len(todo)) <= 1:
-        for job in todo:
+    for job in todo:
 
-            def report_pairs(pairs: int, before: int = done) -> None:
-                report("", before + pairs, total)
+        def report_pairs(pairs: int, before: int = done) -> None:
+            report("", before + pairs, total)
 
-            write_json(paths[job.name], run_sequence(job, report_pairs))
-            done += job.pairs
-    else:
-        # a fork would copy the threads' locks of numba and OpenCV in whatever state they are
-        context = multiprocessing.get_context("spawn")
-        threads = max(1, (os.cpu_count() or 1) // processes)
-        with ProcessPoolExecutor(processes, context, _start_worker, (threads,)) as executor:
-            futures = {executor.submit(run_sequence, job): job for job in todo}
-            for future in as_completed(futures):
-                job = futures[future]
-                try:
-                    write_json(paths[job.name], future.result())
-                except BrokenProcessPool as error:
-                    raise HybridVOError(
-                        "a worker died, perhaps for want of memory. Finished sequences are kept: "
-                        "go on with --resume and fewer --jobs."
-                    ) from error
-                done += job.pairs
-                report(f"{job.name} is finished", done, total)
+        write_json(paths[job.name], run_sequence(job, out, report_pairs))
+        done += job.pairs
     return [json.loads(paths[job.name].read_text(encoding="utf-8")) for job in jobs]
-
-
-def _start_worker(threads: int) -> None:
-    """A worker's share of the cores."""
-    import cv2
-    import numba
-
-    cv2.setNumThreads(threads)
-    numba.set_num_threads(min(threads, numba.get_num_threads()))
 
 
 # -- results --------------------------------------------------------------------------------------
@@ -314,27 +274,3 @@ def _scores(
         "breakdown": breakdown(table),
         "protocol": protocol and protocol_summary(protocol, totals, counts),
     }
-
-
-def _write_sequences(
-    out: Path, jobs: list[Job], parts: list[dict[str, Any]], worst: list[dict[str, Any]]
-) -> dict[str, Any]:
-    """Write the paths of every sequence and the images of its worst pairs, and say where."""
-    trajectories = []
-    for folder in ("trajectories", "worst"):
-        make_folder(out / folder)
-    for number, (job, part) in enumerate(zip(jobs, parts, strict=True)):
-        plain = "".join(c if c.isalnum() or c in "-_." else "_" for c in job.name)[:60]
-        stem = f"{number:03d}_{plain}"
-        for key, poses in part["trajectories"].items():
-            if poses is None:
-                continue
-            method, _, flow = key.partition("|")
-            stamps = part["timestamps"]["estimate" if flow else "ground_truth"]
-            path = "_".join([f"trajectories/{stem}", method, *flow.split()[:1]]) + ".tum"
-            Trajectory(np.array(stamps), np.array(poses)).save(out / path)
-            named = {"method": method if flow else None, "flow_source": flow or None}
-            trajectories.append({"sequence": job.name, **named, "path": path})
-        mine = [entry for entry in worst if entry["sequence"] == job.name]
-        draw_worst(out, f"worst/{stem}", job, mine, part["pairs"])
-    return {"trajectories": trajectories, "worst_pairs": worst}

@@ -90,15 +90,14 @@ def draw(
 
 def draw_worst(
     out: Path,
-    stem: str,
     job: Job,
     entries: Iterable[dict[str, Any]],
     rows: Iterable[Mapping[str, Any]],
 ) -> None:
     """Draw worst pairs of one sequence of a comparison, with the motion that it found.
 
-    Each of ``entries`` gets ``picture`` (a path below ``out`` that begins with ``stem``), or None
-    and ``picture_reason``. ``rows`` are the pairs of the sequence.
+    Each of ``entries`` gets ``picture`` (a path below ``out``), or None and ``picture_reason``.
+    ``rows`` are the pairs of the sequence.
     """
     sequence, models, flows = job.open()
     found = {(row["index"], row["method"], row["flow_source"]): row for row in rows}
@@ -123,7 +122,8 @@ def draw_worst(
         T_est = np.array(row["T_curr_prev"]).reshape(4, 4)
         panels = _pair_panels(pair, T_est, weights, T_gt, None)[0]
         aspect = prev.camera.width / prev.camera.height
-        entry["picture"] = f"{stem}_{entry['index']:06d}_{method}_{label.split()[0]}.jpg"
+        name = f"{job.stem}_{entry['index']:06d}_{method}_{label.split()[0]}"
+        entry["picture"] = f"worst/{name}.jpg"
         with atomic_write(out / entry["picture"], "wb") as file:
             file.write(
                 draw_panels(panels, "", aspect, columns=len(panels), inches=2.2, format="jpeg")

@@ -307,15 +307,10 @@ def evaluate(
 ) -> dict[str, Any]:
     """Every trajectory error of one estimate, JSON-ready.
 
-    ``alignment`` is that of ``ate_rmse``, ``delta`` that of the relative error, ``max_diff`` (s)
-    the largest difference of matched timestamps.
-
-    Returns:
-        ``ate_rmse`` (m, after ``alignment``) with ``scale``, ``ate_rmse_unaligned``,
-        ``ate_rmse_origin``, ``ate_rmse_sim3`` with ``scale_sim3``; ``rpe_trans_rmse``,
-        ``rpe_trans_mean`` (m), ``rpe_rot_rmse_deg``, and the three with the suffix ``_sim3``
-        after a similarity; ``kitti_drift`` (100 to 800 m) and ``kitti_drift_short`` (5 to
-        40 m); ``matched``, ``total``, ``matched_by``; ``reasons`` for every None.
+    ``alignment`` is that of ``ate_rmse`` (m), ``delta`` that of the relative error, ``max_diff``
+    (s) the largest difference of matched timestamps. The suffix ``_sim3`` is after a similarity,
+    ``kitti_drift`` over 100 to 800 m, ``kitti_drift_short`` over 5 to 40 m; ``reasons`` holds why
+    a value is None.
 
     Raises:
         InputError: no trajectory, or an unknown option.
@@ -324,19 +319,12 @@ def evaluate(
 
     _check(estimate, gt, alignment, delta, delta_unit, max_diff)
     match = associate(estimate, gt, max_diff=max_diff)
-    report: dict[str, Any] = {
-        "alignment": alignment,
-        "delta": float(delta),
-        "delta_unit": delta_unit,
-        "matched": len(match.est_indices),
-        "total": match.total,
-        "matched_by": match.by,
-        "evo_version": str(evo.__version__).lstrip("v"),
-    }
+    report: dict[str, Any] = {"alignment": alignment, "delta": float(delta)}
+    report |= {"delta_unit": delta_unit, "matched": len(match.est_indices), "total": match.total}
+    report |= {"matched_by": match.by, "evo_version": str(evo.__version__).lstrip("v")}
     reasons: dict[str, str] = {}
 
     def put(names: Sequence[str], compute: Callable[[], Iterable[float | None]]) -> None:
-        """Put the first computed values under the names, or None with the reason."""
         try:
             values = compute()
         except DegenerateError as error:

@@ -171,11 +171,8 @@ def pair_facts(
     ``flow_gt`` (H, W, 2) is the true flow of everything, px, NaN or beyond 1e9 where unknown; None
     where there is none, or where it holds the motion of the camera alone.
 
-    Returns:
-        ``dynamic_fraction``: share of valid pixels whose true flow differs from the true ego flow
-        by more than 1 px; ``flow_magnitude_px``: median length of the true ego flow;
-        ``rotation_deg`` and ``translation_m`` of the true motion; ``depth_spread``: 90th over 10th
-        percentile of the valid depth.
+    ``dynamic_fraction``: share of valid pixels whose true flow differs from the true ego flow by
+    more than 1 px; ``depth_spread``: 90th over 10th percentile of the valid depth.
     """
     names = ("dynamic_fraction", "flow_magnitude_px", "rotation_deg", "translation_m")
     facts: dict[str, float | None] = dict.fromkeys((*names, "depth_spread"))

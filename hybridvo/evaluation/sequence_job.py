@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -47,7 +48,6 @@ class ComparisonOptions:
         protocol: ``paper`` or ``trajectory14`` (MPI Sintel as others score it), or None.
         weights: name of a network -> its file; the pretrained one where absent.
         device: of the networks.
-        jobs: sequences at a time, a process each.
         worst: pairs shown for each method and flow.
     """
 
@@ -62,19 +62,19 @@ class ComparisonOptions:
     protocol: str | None = None
     weights: Mapping[str, str] = field(default_factory=dict)
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    jobs: Count = 1
     worst: Natural = 3
 
 
 @dataclass(frozen=True)
 class Job:
-    """All methods and flows (``dis``, ``file``) on one sequence; plain data, for another process.
+    """All methods and flows (``dis``, ``file``) on one sequence.
 
-    ``fingerprint`` stands for all that decides the result.
+    ``stem`` begins the names of its files, ``fingerprint`` stands for all that decides the result.
     """
 
     path: str
     name: str
+    stem: str
     options: ComparisonOptions
     flows: tuple[str, ...]
     methods: tuple[str, ...]
@@ -129,11 +129,10 @@ class _Run:
         return {"status": status, "message": message, "ms": ms}
 
 
-def run_sequence(job: Job, progress: Callable[[int], None] | None = None) -> dict[str, Any]:
+def run_sequence(job: Job, out: Path, progress: Callable[[int], None]) -> dict[str, Any]:
     """Estimate and score every pair of a sequence.
 
-    JSON-ready: ``rows`` has a line per method and flow, ``trajectories`` T_world_cam by
-    ``method|flow``.
+    JSON-ready: ``rows`` has a line per method and flow; paths are written to ``out``.
     """
     sequence, models, flows = job.open()
     runs = [
@@ -183,11 +182,11 @@ def run_sequence(job: Job, progress: Callable[[int], None] | None = None) -> dic
                     }
                 )
         prev = prev if frame is None else frame
-        if progress is not None and done:
+        if done:
             progress(done)
     order = {(run.method, run.flow_source): k for k, run in enumerate(runs)}
     pairs.sort(key=lambda row: (row["index"], order[row["method"], row["flow_source"]]))
-    return _result(job, sequence, runs, pairs, left_out)
+    return _result(job, out, sequence, runs, pairs, left_out)
 
 
 def _facts(sequence: Sequence, prev: Frame, curr: Frame) -> dict[str, Any]:
@@ -212,6 +211,7 @@ def _errors(sequence: Sequence, prev: Frame, curr: Frame, T: np.ndarray) -> dict
 
 def _result(
     job: Job,
+    out: Path,
     sequence: Sequence,
     runs: Iterable[_Run],
     pairs: list[dict[str, Any]],
@@ -220,15 +220,24 @@ def _result(
     table = pair_table(pairs)
     gt = true_trajectory(sequence, job.indices)
     stamps = sequence.timestamps[list(job.indices)]
-    paths: dict[str, Any] = {"ground_truth": None if gt is None else gt.T_world_cam.tolist()}
-    rows = []
+    rows, written = [], []
+
+    def write(path: Trajectory, method: str | None = None, flow: str | None = None) -> None:
+        words = [job.stem, method or "ground_truth", *(flow or "").split()[:1]]
+        name = f"trajectories/{'_'.join(words)}.tum"
+        path.save(out / name)
+        named = {"sequence": job.name, "method": method, "flow_source": flow}
+        written.append({**named, "path": name})
+
+    if gt is not None:
+        write(gt)
     for run in runs:
         est = Trajectory(stamps, np.stack([run.poses[i] for i in job.indices]))
+        write(est, run.method, run.flow_source)
         named = {"method": run.method, "flow_source": run.flow_source}
         mine = table[(table[list(named)] == pd.Series(named)).all(axis=1)]
         named |= {"sequence": job.name, "depth_source": sequence.depth_source}
         rows.append(sequence_row(mine, est if len(est) > 1 else None, gt, named))
-        paths[f"{run.method}|{run.flow_source}"] = est.T_world_cam.tolist()
     facts = {
         "name": job.name,
         "kind": sequence.kind,
@@ -240,14 +249,7 @@ def _result(
         "flow_sources": list(dict.fromkeys(row["flow_source"] for row in rows)),
         "warnings": list(sequence.warnings),
     }
-    true_stamps = [] if gt is None else gt.timestamps.tolist()
-    return {
-        "sequence": facts,
-        "rows": rows,
-        "pairs": pairs,
-        "timestamps": {"estimate": stamps.tolist(), "ground_truth": true_stamps},
-        "trajectories": paths,
-    }
+    return {"sequence": facts, "rows": rows, "pairs": pairs, "trajectories": written}
 
 
 def pair_table(pairs: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
