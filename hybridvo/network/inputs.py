@@ -6,7 +6,6 @@ of one and the same measured point together.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -104,9 +103,9 @@ def _scaled_intrinsics(
 
 
 def assemble_inputs(
-    pair: FramePair | PairBatch | Sequence[FramePair], size: tuple[int, int] = NETWORK_SIZE
+    pair: FramePair | PairBatch, size: tuple[int, int] = NETWORK_SIZE
 ) -> NetworkInputs:
-    """Inputs of one pair, of a batch, or of several pairs (of any sizes).
+    """Inputs of one pair or of a batch.
 
     Missing or damaged values (no flow, no depth, NaN, inf, depth <= 0, masked pixels) become 0 and
     are marked in ``valid``. Float32 tensors on the CPU; for a batch, its type and device.
@@ -114,16 +113,12 @@ def assemble_inputs(
     Raises:
         InputError: another type, or shapes that do not fit each other.
     """
-    if isinstance(pair, PairBatch):
-        return _from_batch(checked_batch(pair, where="assemble_inputs")[0], size)
-    pairs = [pair] if isinstance(pair, FramePair) else pair
-    if isinstance(pairs, Sequence) and pairs and all(isinstance(p, FramePair) for p in pairs):
-        parts = [vars(_from_batch(PairBatch.from_pairs([p]), size)) for p in pairs]
-        return NetworkInputs(*map(torch.cat, zip(*(p.values() for p in parts), strict=True)))
-    raise InputError(
-        f"assemble_inputs: expected a FramePair, a PairBatch or a non-empty sequence of "
-        f"FramePairs, got {type(pair).__name__}."
-    )
+    if isinstance(pair, FramePair):
+        return _from_batch(PairBatch.from_pairs([pair]), size)
+    if not isinstance(pair, PairBatch):
+        got = type(pair).__name__
+        raise InputError(f"assemble_inputs: expected a FramePair or a PairBatch, got {got}.")
+    return _from_batch(checked_batch(pair, where="assemble_inputs")[0], size)
 
 
 def assemble_aligned(

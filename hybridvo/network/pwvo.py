@@ -7,7 +7,6 @@ decoder with two heads of two convolutions. ``decoders=2`` builds the two of the
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -132,7 +131,7 @@ class PWVO(nn.Module):
 
     def forward(
         self,
-        inputs: NetworkInputs | FramePair | PairBatch | Sequence[FramePair],
+        inputs: NetworkInputs | FramePair | PairBatch,
         T_start: torch.Tensor | None = None,
     ) -> PixelwisePrediction:
         """Pose and log scale at every pixel: of assembled inputs in one pass, of pairs in all.
@@ -171,17 +170,15 @@ class PWVO(nn.Module):
         log_scale = torch.where(seen > 0, log_scale, log_scale.clamp(min=INVALID_LOG_SCALE))
         return PixelwisePrediction(motion[:, :3], motion[:, 3:], log_scale[:, :3], log_scale[:, 3:])
 
-    def _predict(self, pairs: FramePair | PairBatch | Sequence[FramePair]) -> PixelwisePrediction:
+    def _predict(self, pairs: FramePair | PairBatch) -> PixelwisePrediction:
         """Maps of pairs after all passes."""
         own = next(self.parameters())
         inputs = assemble_inputs(pairs).to(device=own.device, dtype=own.dtype)
         output = predict(self, inputs)
         assert isinstance(output, PixelwisePrediction)
-        if isinstance(pairs, PairBatch):
-            size = pairs.flow.shape[1], pairs.flow.shape[2]
-        else:
-            size = (pairs if isinstance(pairs, FramePair) else pairs[0]).prev.camera.shape
-        return replace(output, image_size=size)
+        if isinstance(pairs, FramePair):
+            return replace(output, image_size=pairs.prev.camera.shape)
+        return replace(output, image_size=(pairs.flow.shape[1], pairs.flow.shape[2]))
 
 
 class _PoseHead(nn.Sequential):

@@ -220,15 +220,10 @@ def candidate_channels(
     channels = torch.stack([*(x * usable for x in by_flow), *by_images], 1)
     # areas of the whole image, not of what has flow
     best = rivals[:, 1] * (texture > 0)
-    areas = [
-        agreement.clamp(min=0).mean((1, 2)),
-        (texture - agreement).mean((1, 2)),
-        (agreement - best).mean((1, 2)),
-        ((gap.abs() < SAME_DEPTH) * met).mean((1, 2)),
-        ((gap > SAME_DEPTH) * met).mean((1, 2)),
-    ]
+    areas = [agreement.clamp(min=0), texture - agreement, agreement - best]
+    areas += [(gap.abs() < SAME_DEPTH) * met, (gap > SAME_DEPTH) * met]
     scalars = _scalars(inputs, support, wide, first is not None)
-    return channels, torch.cat([scalars, 2.0 * torch.stack(areas, 1)], 1), evidence
+    return channels, torch.cat([scalars, 2.0 * torch.stack(areas, 1).mean((2, 3))], 1), evidence
 
 
 def _look(
@@ -328,10 +323,8 @@ def _small_step(pose: torch.Tensor, start: torch.Tensor) -> torch.Tensor:
     """(N, 6) delta with pose = Exp(delta) start, translation first, to first order."""
     R = pose[:, :, :3] @ start[:, :, :3].transpose(1, 2)
     shift = pose[:, :, 3] - torch.einsum("nij,nj->ni", R, start[:, :, 3])
-    turn = torch.stack(
-        [R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], dim=1
-    )
-    return torch.cat([shift, turn / 2], dim=1)
+    S = (R - R.transpose(1, 2)) / 2
+    return torch.cat([shift, torch.stack([S[:, 2, 1], S[:, 0, 2], S[:, 1, 0]], dim=1)], dim=1)
 
 
 def shared_channels(inputs: SelectorInputs) -> torch.Tensor:
@@ -345,13 +338,11 @@ def shared_channels(inputs: SelectorInputs) -> torch.Tensor:
     typical = _median(size, usable).clamp(min=1e-5)
     inverse = torch.where(usable, 1.0 / inputs.depth.clamp(min=1e-6), 0.0)
     near = inverse / _median(inverse, usable).clamp(min=1e-9)
-    h, w = usable.shape[1:]
-    rows = torch.arange(h, device=u.device, dtype=u.dtype)
-    columns = torch.arange(w, device=u.device, dtype=u.dtype)
-    to_border = torch.minimum(
-        torch.minimum(rows, h - 1 - rows)[:, None], torch.minimum(columns, w - 1 - columns)[None]
-    )
-    border = torch.exp(-to_border / (0.06 * min(h, w))).expand(usable.shape)
+    sizes = usable.shape[1:]
+    steps = (torch.arange(n, device=u.device, dtype=u.dtype) for n in sizes)
+    rows, columns = (torch.minimum(x, n - 1 - x) for x, n in zip(steps, sizes, strict=True))
+    to_border = torch.minimum(rows[:, None], columns)
+    border = torch.exp(-to_border / (0.06 * min(sizes))).expand(usable.shape)
     asked = inputs.has_static[:, None, None].to(u.dtype)
     channels = torch.stack(
         [

@@ -196,12 +196,10 @@ class SelectorNetwork(nn.Module):
         """
         out = []
         for b in range(images):
-            mine = owner == b
-            share = torch.softmax(score[mine], 0)
-            best = hidden[mine]
-            mean = (share[:, None] * best).sum(0)
-            extra = torch.stack([share.max(), torch.logsumexp(score[mine], 0).clamp(-20, 20) / 10])
-            out.append(torch.cat([mean, best[share.argmax()], extra]))
+            own, mine = score[owner == b], hidden[owner == b]
+            share = torch.softmax(own, 0)
+            extra = torch.stack([share.max(), torch.logsumexp(own, 0).clamp(-20, 20) / 10])
+            out.append(torch.cat([share @ mine, mine[share.argmax()], extra]))
         return self.trust(F.relu(self.doubt(torch.stack(out))))[:, 0]
 
 

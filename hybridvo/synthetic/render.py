@@ -233,10 +233,6 @@ class SyntheticSequence(Sequence):
         """True flow from frame ``index`` to the next, (H, W, 2) float32, and no variance."""
         return self.scene.flow(index)[0], None
 
-    def occlusion(self, index: int) -> np.ndarray:
-        """(H, W) bool, True where a pixel of frame ``index`` is not visible in the next."""
-        return self.scene.flow(index)[1]
-
     def moving(self, index: int) -> np.ndarray:
         """(H, W) bool, True on moving objects."""
         return self.scene.object_id(index) > 0

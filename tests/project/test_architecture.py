@@ -83,12 +83,12 @@ ONLY_IN = {
 
 # Ceilings of today; they only fall. The aims: 400 lines a file, 60 a function, 15 files a folder,
 # 300 constants; 24 000, 15 000 and 3 000 lines
-MAX_FILE_LINES = 520
-MAX_FUNCTION_LINES = 90
-MAX_FOLDER_FILES = 17
-MAX_CONSTANTS = 270
+MAX_FILE_LINES = 440
+MAX_FUNCTION_LINES = 70
+MAX_FOLDER_FILES = 16
+MAX_CONSTANTS = 220
 """Module-level names in capitals that hold numbers, outside ``calibration.py``."""
-MAX_LINES = {"hybridvo": 27_900, "tests": 14_700, "tools": 3_200}
+MAX_LINES = {"hybridvo": 24_500, "tests": 14_400, "tools": 3_000}
 MAX_PUBLIC_NAMES = 24
 
 

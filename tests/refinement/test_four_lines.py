@@ -133,7 +133,9 @@ def test_one_training_step_of_a_narrow_network_in_channels_last() -> None:
     torch.manual_seed(0)
     network = build_network(NetworkOptions(width=0.25)).to(memory_format=torch.channels_last)
     optimizer = torch.optim.SGD(network.parameters(), 1e-3)
-    inputs = assemble_inputs([make_pair("moving30", k, 128, 256)[0] for k in (0, 1)])
+    inputs = assemble_inputs(
+        hvo.PairBatch.from_pairs([make_pair("moving30", k, 128, 256)[0] for k in (0, 1)])
+    )
     before = [p.detach().clone() for p in network.parameters()]
     network(inputs).rotation.square().mean().backward()
     optimizer.step()
