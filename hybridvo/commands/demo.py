@@ -14,7 +14,7 @@ import pandas as pd
 from hybridvo.commands.configuration import load_options
 from hybridvo.commands.run import EXIT_INTERRUPTED, run
 from hybridvo.data.sequence import open_sequence
-from hybridvo.errors import InputError, OutputError
+from hybridvo.errors import InputError
 from hybridvo.evaluation.pair_errors import true_trajectory
 from hybridvo.evaluation.plots import plot_trajectories
 from hybridvo.files import make_folder, write_json
@@ -110,19 +110,13 @@ def demo_text(content: dict[str, Any]) -> str:
 
 def _prepare(out: Path, overwrite: bool) -> None:
     """An empty folder, or one that an earlier demo left and that may be replaced."""
-    try:
-        if out.exists() and any(out.iterdir()):
-            if not (out / MARK).is_file():
-                raise InputError(
-                    f"{out}: is not empty and holds no finished demo. Choose another --out, or "
-                    f"remove the folder."
-                )
-            if not overwrite:
-                raise InputError(f"{out}: holds a demo already. Pass --overwrite to replace it.")
-            shutil.rmtree(out / "data", ignore_errors=True)
-    except OSError as error:
-        raise OutputError(f"{out}: cannot be written: {error.strerror or error}.") from error
     make_folder(out)
+    if (out / MARK).is_file():
+        if not overwrite:
+            raise InputError(f"{out}: holds a demo already. Pass --overwrite to replace it.")
+        shutil.rmtree(out / "data", ignore_errors=True)
+    elif any(out.iterdir()):
+        raise InputError(f"{out}: is not empty and holds no demo. Choose another --out.")
     write_json(out / MARK, {})
 
 

@@ -56,12 +56,7 @@ class TartanAirSequence(Sequence):
         numbers, listing = numbered_listing(name, rgb, depth, self.frames_per_second, flow)
         if pose_file.exists() and numbers:
             poses = ned_to_camera(read_poses(pose_file, COLUMNS["tartanair"])[1])
-            if min(numbers) >= len(poses) == len(numbers):
-                listing.poses = poses
-                at = f"frames start at {numbers[0]}; pose lines are taken in order"
-                listing.warnings.append(f"{pose_file}: {at}.")
-            else:
-                listing.poses = numbered_poses(numbers, poses, pose_file, listing.warnings)
+            listing.poses = numbered_poses(numbers, poses, pose_file, listing.warnings)
         masks = [_mask_file(path) for path in flow.values()]
         listing.sources = [pose_file, *(path for path in masks if path is not None)]
         super().__init__(root, name, listing, given)
