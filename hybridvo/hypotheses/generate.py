@@ -11,7 +11,7 @@ from hybridvo.calibration import CLEAR_BEND_PX, CLEAR_COHERENCE
 from hybridvo.hypotheses import search
 from hybridvo.options import Options
 from hybridvo.refinement import kernels
-from hybridvo.refinement.coarse_fit import fit_coarse
+from hybridvo.refinement.coarse_fit import fit_coarse, residual_coherence
 from hybridvo.refinement.depth import look_up
 from hybridvo.refinement.pixels import CoarseGrid, as_contiguous, coarse_grid
 from hybridvo.results import Reason, RelativePose
@@ -173,7 +173,7 @@ def _is_rigid(grid: CoarseGrid, pose: np.ndarray, fact: np.ndarray, width: int) 
     """Whether the residuals of a motion look like noise, not like a bent compromise of two."""
     h, w, _ = grid.shape
     noise = fact[search.FLOW_NOISE], fact[search.DEPTH_NOISE]
-    coherence = search.residual_coherence(grid.samples, h, w, pose, grid.pixels.K, *noise)
+    coherence = residual_coherence(grid.samples, h, w, pose, grid.pixels.K, *noise)
     excess = max(coherence - CHANCE_COHERENCE, 0.0)
     bend_px = np.sqrt(excess * grid.pixels.scale[0]) * noise[0] * search.REFERENCE_WIDTH / width
     return bool(coherence < CLEAR_COHERENCE and bend_px < CLEAR_BEND_PX)

@@ -264,3 +264,46 @@ def fit_coarse(
         FINAL_NOISE_PIXELS, pose, work,
     )  # fmt: skip
     return pose, sf, sd, share, steps + more
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def residual_coherence(samples, h, w, pose, K, sf, sd):
+    """How alike neighbouring residuals are: 0 for independent noise, 1 for equal residuals.
+
+    Of whitened residuals in 8 x 8 blocks, from the variance of the block means. A compromise
+    between two motions leaves residuals that agree with their neighbours.
+    """
+    between = pixels = blocks = 0.0
+    for r0 in range(0, h - 7, 8):
+        for c0 in range(0, w - 7, 8):
+            m = s0 = s1 = squares = 0.0
+            for r in range(r0, r0 + 8):
+                for c in range(c0, c0 + 8):
+                    k = r * w + c
+                    if not samples[W, k] > 0:
+                        continue
+                    ru, rv, qu, qv, front = residual(samples, k, pose, K)
+                    if not front:
+                        continue
+                    ip = samples[PF, k] / (sf * sf)
+                    g = sd * sd * samples[PD, k] * ip
+                    q2 = qu * qu + qv * qv
+                    root = math.sqrt(1.0 + g * q2)
+                    beta = g / (root * (1.0 + root))
+                    dot = beta * (qu * ru + qv * rv)
+                    e0 = (ru - dot * qu) * math.sqrt(ip)
+                    e1 = (rv - dot * qv) * math.sqrt(ip)
+                    if e0 * e0 + e1 * e1 > 16.0:
+                        continue
+                    m += 1.0
+                    s0 += e0
+                    s1 += e1
+                    squares += e0 * e0 + e1 * e1
+            if m >= 16:
+                # pairs of different pixels: sum of products over the number of pairs
+                between += (s0 * s0 + s1 * s1 - squares) / (m - 1.0)
+                pixels += squares
+                blocks += 1.0
+    if blocks < 4 or pixels <= 0:
+        return 1.0
+    return between / pixels
