@@ -15,6 +15,8 @@ from hybridvo.refinement.kernels import (
     BLOCK,
     MU,
     MV,
+    PD,
+    PF,
     SUMS,
     XN,
     YN,
