@@ -50,23 +50,20 @@ class Odometry:
 
     A step's pose is the best one at its time; no pose is revised later, and the motions of the
     steps chain to their poses. Memory is that of the last frame and of the key frames.
-
     Two trackers share no state and may run in two threads; one tracker belongs to one thread.
 
     Args:
         network: ``default`` for the pretrained weights, None for the classical refinement alone,
             the name or file of other selector weights, or :class:`hybridvo.network.models.Models`.
-        flow: provider ``(prev, curr) -> FlowField or (H, W, 2) array``; default: OpenCV DIS.
-            A network of one's own: ``lambda prev, curr: net(prev.rgb, curr.rgb)``. After
-            :meth:`skip` the two are no neighbours.
+        flow: provider ``(prev, curr) -> FlowField or (H, W, 2) array``; default: OpenCV DIS. After
+            :meth:`skip` the two frames are no neighbours.
         method: one of :data:`hybridvo.pipeline.METHODS`; by default ``hybrid``, or ``refine``
             without a network.
         options: the option tree; all groups but ``run`` are read, and of that ``run.device``.
         seed: of everything drawn at random.
 
     Raises:
-        InputError: an unknown method, a network that is none or that the method lacks, a window
-            that the method cannot use, options of another kind, or no seed.
+        InputError: an argument that cannot be used, or a window with a method that has none.
 
     Example:
         >>> import numpy as np
@@ -172,17 +169,12 @@ class Odometry:
         return self._state.motion_model.predict(frames)
 
     def track(self, frame: Frame, flow: FlowField | np.ndarray | None = None) -> Step:
-        """Pose of the next frame.
+        """Pose of the next frame; the first one has the identity as motion, status ok.
 
         Args:
             frame: the next frame. Its arrays are copied: a driver may reuse its buffers.
-            flow: (H, W, 2) px from the previous frame to this one, or a FlowField, where it is
-                known already; by default the tracker's own provider is asked. The previous frame
-                is ``state.frame``: after :meth:`skip` the last one that was tracked. A flow from
-                the skipped one is of another pair, which its numbers do not tell: leave it away.
-
-        Returns:
-            The step. The first frame has the identity as motion, status ok.
+            flow: (H, W, 2) px from ``state.frame``, the last one tracked, to this one, or a
+                FlowField, where it is known already; by default the tracker's provider is asked.
 
         Raises:
             InputError: ``frame`` is no Frame, has another size than the one before, or the flow

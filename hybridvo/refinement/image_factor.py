@@ -15,7 +15,9 @@ the fields leave the motion alone.
 from __future__ import annotations
 
 from functools import cache
+from weakref import WeakKeyDictionary
 
+import cv2
 import numpy as np
 from scipy.sparse import csr_array, hstack
 
@@ -25,11 +27,19 @@ from hybridvo.refinement import photometric_kernels as kernels
 from hybridvo.refinement.covariance import dispersion, tile_sums
 from hybridvo.refinement.full_fit import tile_size
 from hybridvo.refinement.kernels import MAX_VALUE
-from hybridvo.refinement.pixels import typical
+from hybridvo.refinement.pixels import as_contiguous, typical
 from hybridvo.refinement.solver import Linearization, positive_inverse
 from hybridvo.results import RelativePose
-from hybridvo.types import FramePair
+from hybridvo.types import Frame, FramePair
 
+MID_GREY = 128.0
+"""Taken off every grey value, so that gain and offset are nearly independent."""
+GREY = np.array([[0.299, 0.587, 0.114, -MID_GREY]])
+_IMAGES: WeakKeyDictionary[Frame, dict[float, np.ndarray]] = WeakKeyDictionary()
+"""Blurred images by blur, as long as the frame is kept."""
+PER_CELL = 4
+MIN_WEIGHT = 0.25
+"""Robust weight in the refinement on the flow below which a pixel is not used."""
 CUTOFF = 3.0
 """c of the Geman-McClure kernel, in standard deviations."""
 NOISE_FLOOR = 0.1
@@ -43,6 +53,32 @@ ROWS, COLUMNS = 5, 7
 """Nodes of the fields."""
 SMOOTH = 0.01
 """Weight of the differences between neighbouring nodes, in shares of a node's typical weight."""
+
+
+def blurred(frame: Frame, px: float) -> np.ndarray:
+    """(H, W) float32 grey values less :data:`MID_GREY` under a Gaussian blur."""
+    images = _IMAGES.setdefault(frame, {})
+    if 0.0 not in images:
+        # not rounded: 8 bits of grey would add as much noise as the camera's own rounding
+        images[0.0] = cv2.transform(np.ascontiguousarray(frame.rgb).astype(np.float32), GREY)
+    if px not in images:
+        images[px] = cv2.GaussianBlur(images[0.0], (0, 0), px)
+    return images[px]
+
+
+def choose_pixels(
+    grey: np.ndarray, depth: np.ndarray, weights: np.ndarray, count: int
+) -> np.ndarray:
+    """(N, 2) int32 rows and columns of the pixels to use: strong gradients, evenly spread."""
+    height, width = grey.shape
+    cell = max(2, round(np.sqrt(height * width * PER_CELL / count)))
+    cells = (height // cell + 1) * (width // cell + 1)
+    index = np.empty((cells * PER_CELL, 2), np.int32)
+    n = kernels.select_pixels(
+        grey, as_contiguous(depth), as_contiguous(weights, np.float32),
+        np.float32(MIN_WEIGHT), cell, PER_CELL, index,
+    )  # fmt: skip
+    return index[:n]
 
 
 class ImageFactor:

@@ -229,6 +229,13 @@ def project_block(buf, o, n, pose, K, noise, work, robust, acc):
     acc[29] += count
 
 
+@njit(error_model="numpy", cache=True, nogil=True)
+def add(acc, start, values):
+    """Add numbers to those of ``acc`` from ``start`` on."""
+    for q in range(len(values)):
+        acc[start + q] += values[q]
+
+
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
 def sum_translation(o, n, work, acc):
     """Second stage, pixels ``o .. o + n - 1`` of the block: the rows of H and g that belong to the
@@ -280,24 +287,8 @@ def sum_translation(o, n, work, acc):
         g0 += x
         g1 += y
         g2 -= a * x + b * y
-    acc[0] += h00
-    acc[1] += h01
-    acc[2] += h02
-    acc[3] += h03
-    acc[4] += h04
-    acc[5] += h05
-    acc[6] += h11
-    acc[7] += h12
-    acc[8] += h13
-    acc[9] += h14
-    acc[10] += h15
-    acc[11] += h22
-    acc[12] += h23
-    acc[13] += h24
-    acc[14] += h25
-    acc[21] += g0
-    acc[22] += g1
-    acc[23] += g2
+    add(acc, 0, (h00, h01, h02, h03, h04, h05, h11, h12, h13, h14, h15, h22, h23, h24, h25))
+    add(acc, 21, (g0, g1, g2))
 
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
@@ -335,15 +326,8 @@ def sum_rotation(o, n, work, acc):
         g3 -= ab * x + bb * y
         g4 += aa * x + ab * y
         g5 += a * y - b * x
-    acc[15] += h33
-    acc[16] += h34
-    acc[17] += h35
-    acc[18] += h44
-    acc[19] += h45
-    acc[20] += h55
-    acc[24] += g3
-    acc[25] += g4
-    acc[26] += g5
+    add(acc, 15, (h33, h34, h35, h44, h45, h55))
+    add(acc, 24, (g3, g4, g5))
 
 
 @njit(error_model="numpy", cache=True, nogil=True)

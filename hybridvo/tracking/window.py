@@ -160,14 +160,12 @@ def _older(
     if len(window.keys) < stride or window.keys[-stride].static is None:
         return None
     key = window.keys[-stride]
-    T = invert(T_world_cam) @ key.T_world_cam
-    view = View(key, T, curr)
+    prior = MotionPrior(invert(T_world_cam) @ key.T_world_cam, covariance)
+    view = View(key, prior.T_curr_prev, curr)
     if view.overlap < options.min_overlap:
         return None
-    weights = view.weights(key.frame.camera.shape)
-    return _edge(
-        key, curr, register(key, curr, MotionPrior(T, covariance), weights), "stride", options
-    )
+    found = register(key, curr, prior, view.weights(key.frame.camera.shape))
+    return _edge(key, curr, found, "stride", options)
 
 
 def _placed(window: Window, edges: Sequence[Edge]) -> tuple[np.ndarray, list[Edge]]:
@@ -211,9 +209,8 @@ def _corrected(
 ) -> RelativePose:
     """The motion of a step whose pose comes from the key frames, with covariance and status.
 
-    Where it holds a correction of the pose before, which the motion between the two frames
-    contradicts, it is no measurement of that motion: its covariance takes the correction in, and
-    its status says so.
+    Where it holds a correction of the pose before, it is no measurement of the motion between the
+    two frames: its covariance takes the correction in, and its status says so.
     """
     key = next(e.prev for e in edges if e.ok and e.kind != "chain")
     status, reason = motion.status, Reason.AMBIGUOUS_MOTION
