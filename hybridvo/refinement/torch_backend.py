@@ -84,7 +84,7 @@ def refine_batch(
         weights: (B, H, W) factors on the information; what is not positive and finite switches a
             pixel off.
         noise: flow noise in px and noise of log depth, as (2,) or (B, 2); None: estimated.
-        options: of the refinement.
+        options: of the refinement; the current depth bounds the depth noise, it is no residual.
 
     Returns:
         Poses with covariance and a status per sample. Bad data give a failed status for that very
