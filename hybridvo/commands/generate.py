@@ -41,15 +41,8 @@ def generate(
 ) -> Path:
     """Draw samples, and a contact sheet of the first; goes on where it was interrupted.
 
-    Args:
-        preset: ``paper``, ``diverse`` or a YAML file such as ``configs/data_paper.yaml``, which
-            names every range with its default.
-        count: number of samples.
-        out: folder; gets the shards, ``samples.json`` and ``contact_sheet.png``.
-        seed: of the samples.
-        size: (height, width) in pixels instead of the preset's.
-        workers: processes.
-        report: called with the samples done and asked for.
+    ``preset`` is ``paper``, ``diverse`` or a file such as ``configs/data_paper.yaml``, ``size``
+    (height, width) instead of its own; ``report`` is called with the samples done and asked for.
     """
     for done in write_samples(_preset(preset, size), count, out, seed, workers):
         if report is not None:

@@ -31,11 +31,8 @@ class Given:
 class Listing:
     """What a reader has found on disk; lists hold an entry for each frame, None where none is.
 
-    Args:
-        rgb, depth: image and depth files. flow: from each frame to the next.
-        timestamps: (N,) seconds. poses: (N, 4, 4) T_world_cam, NaN rows unknown, or None.
-        sources: further files that were read (lists, calibration, ground truth).
-        warnings: what the user should know.
+    Stamps are seconds, ``poses`` (N, 4, 4) T_world_cam with NaN where unknown; ``sources`` are the
+    other files that were read (lists, calibration, ground truth).
     """
 
     rgb: list[Path | None]

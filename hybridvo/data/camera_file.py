@@ -25,14 +25,10 @@ KNOWN = (*REQUIRED, "distortion", "depth_scale", "fps")
 
 @dataclass(frozen=True)
 class Calibration:
-    """A camera and what is known beside it.
+    """A pinhole camera (pixels) and what is known beside it.
 
-    Args:
-        camera: pinhole intrinsics, in pixels.
-        distortion: Brown coefficients k1 k2 p1 p2 [k3 [k4 k5 k6]]; empty for rectified images.
-        depth_scale: stored units per metre of depth, or None.
-        fps: frames a second, or None.
-        warnings: what the user should know.
+    ``distortion`` holds Brown's k1 k2 p1 p2 [k3 [k4 k5 k6]], nothing for rectified images;
+    ``depth_scale`` the stored units per metre of depth.
     """
 
     camera: Camera
@@ -87,9 +83,8 @@ def parse_camera(
 def read_camera_file(path: Path) -> Calibration:
     """Calibration of a YAML or JSON file.
 
-    Three vocabularies are read: ours (fx, fy, cx, cy, width, height, and optionally ``distortion:
-    [k1, k2, p1, p2, k3]``, ``depth_scale`` in units per metre, ``fps``), ROS's ``camera_info``
-    (calibration file or message), RealSense's intrinsics (ppx, ppy, coeffs).
+    Three vocabularies are read: ours (:data:`KNOWN`), ROS's ``camera_info`` (calibration file or
+    message), RealSense's intrinsics (ppx, ppy, coeffs).
     """
     text = read_text(path).removesuffix("---\n")  # as ROS prints it
     content = parse_yaml(text, str(path))

@@ -125,14 +125,9 @@ def iter_pairs(
 ) -> Iterator[FramePair]:
     """Consecutive pairs of a sequence; each frame is read once, two are in memory.
 
-    Args:
-        sequence: where the frames come from.
-        flow: None takes the flow files (where one of many is missing, the pair's flow is None); a
-            callable (prev, curr), such as ``hybridvo.dis_flow()``, gives an object with the
-            attributes flow, variance, valid, source and is_true.
-        start: first frame.
-        stop: the one after the last frame.
-        stride: step between frames.
+    ``flow`` None takes the flow files (where one of many is missing, the pair's flow is None); a
+    callable (prev, curr), such as ``hybridvo.dis_flow()``, gives an object with the attributes
+    flow, variance, valid, source and is_true.
 
     Raises:
         InputError: a negative range; flow files asked for where there are none, or with a stride

@@ -159,12 +159,8 @@ def _draw_view(axes: Any, lines: Sequence[_Line], plane: tuple[int, int]) -> Non
 class Panel:
     """An image (H, W, 3) uint8, or a map (h, w) with a bar; NaN is grey.
 
-    Args:
-        title: above it.
-        values: the image, or the map.
-        unit: beside the bar of a map; panels of one unit share its ends.
-        high: value at the upper end of the bar; default: the 99th percentile.
-        outline: (H, W) bool, whose border is drawn, or None.
+    Bars of one ``unit`` share their ends: 0 and ``high``, by default the 99th percentile. The
+    border of the ``outline`` (H, W) bool is drawn.
     """
 
     title: str

@@ -29,9 +29,8 @@ FLOW_NOISE_FLOOR = 2e-3
 USUAL_DEPTH_NOISE = 0.01
 DOUBTFUL_DEPTH_NOISE = 0.03
 """Noise of log depth up to whose square the standard error of the square goes where the flow cannot
-tell it (stereo and learned depth; with 0.01 instead the errors of far scenes came
-out at 1.7 times their standard deviation: the slope of the flow in inverse depth is
-shortened by the share of the noise in its variance)."""
+tell it (stereo and learned depth; with 0.01 instead the errors of far scenes came out at 1.7 times
+their standard deviation)."""
 
 SETTLED = 1e-3
 """Change of both variances, relative, below which they are found."""
