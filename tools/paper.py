@@ -34,8 +34,7 @@ from hybridvo.network.selection import select_motion
 from hybridvo.network.weights import PRETRAINED, save_weights
 from hybridvo.synthetic.dataset import load_preset
 from hybridvo.synthetic.draws import sample_generator
-from hybridvo.training.stream import collate
-from hybridvo.training.validation import PUBLISHED_SEED
+from hybridvo.training.validation import PUBLISHED_SEED, collate
 
 COMPARED = ("vonet", "pwvo-paper")
 """Rows whose saliency the paper sets beside each other."""
