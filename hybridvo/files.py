@@ -14,9 +14,14 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import IO, Any, Literal, NamedTuple
 
+import filelock
 import yaml
 
-from hybridvo.errors import FormatError, OutputError
+from hybridvo.errors import FormatError, LockedError, OutputError
+
+Mode = Literal["new", "resume", "overwrite"]
+"""What to do with the results that a folder holds already."""
+LOCK = ".run.lock"
 
 
 @contextlib.contextmanager
@@ -55,6 +60,26 @@ def make_folder(path: Path) -> None:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"{path}: cannot be created: {error.strerror or error}.") from error
+
+
+@contextlib.contextmanager
+def held(folder: Path) -> Iterator[None]:
+    """Make a folder for results and hold it; a LockedError where another run does."""
+    make_folder(folder)
+    lock = filelock.FileLock(folder / LOCK)
+    try:
+        lock.acquire(timeout=0)
+    except filelock.Timeout:
+        text = f"{folder}: held by another run. Wait for it, or choose another --out."
+        raise LockedError(text) from None
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be written: {error.strerror}.") from error
+    try:
+        yield
+    finally:
+        # removed before it is released: afterwards it may be another run's
+        (folder / LOCK).unlink(missing_ok=True)
+        lock.release()
 
 
 def write_json(path: str | os.PathLike[str], value: Any) -> None:

@@ -27,6 +27,8 @@ DIS_PRESETS = {
     "medium": cv2.DISOPTICAL_FLOW_PRESET_MEDIUM,
 }
 _logger = logging.getLogger(__name__)
+# a DIS object that two threads use at once ends the process
+_of_thread = threading.local()
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,20 +72,8 @@ def dis_flow(preset: str = "medium") -> FlowProvider:
     """
     if preset not in DIS_PRESETS:
         raise InputError(f"DIS preset: expected {', '.join(DIS_PRESETS)}, got {preset!r}.")
-    return _Dis(preset)
 
-
-# a DIS object that two threads use at once ends the process
-_of_thread = threading.local()
-
-
-@dataclass(frozen=True)
-class _Dis:
-    """See :func:`dis_flow`."""
-
-    preset: str
-
-    def __call__(self, prev: Frame, curr: Frame) -> FlowField:
+    def provide(prev: Frame, curr: Frame) -> FlowField:
         none = FlowField(None, source="dis")
         if prev.rgb is None or curr.rgb is None or prev.rgb.shape != curr.rgb.shape:
             return none
@@ -91,13 +81,15 @@ class _Dis:
         second = cv2.cvtColor(curr.rgb, cv2.COLOR_RGB2GRAY)
         if not (_textured(first) and _textured(second)):
             return none
-        if not hasattr(_of_thread, self.preset):
-            setattr(_of_thread, self.preset, cv2.DISOpticalFlow.create(DIS_PRESETS[self.preset]))
-        dis = getattr(_of_thread, self.preset)
+        if not hasattr(_of_thread, preset):
+            setattr(_of_thread, preset, cv2.DISOpticalFlow.create(DIS_PRESETS[preset]))
+        dis = getattr(_of_thread, preset)
         forward, backward = _calc_dis(dis, first, second), _calc_dis(dis, second, first)
         if forward is None or backward is None:
             return none
         return FlowField(forward, *forward_backward_check(forward, backward), "dis")
+
+    return provide
 
 
 def _calc_dis(dis: Any, first: np.ndarray, second: np.ndarray) -> np.ndarray | None:
@@ -131,12 +123,9 @@ def forward_backward_check(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Variance and validity from the disagreement of the flows (H, W, 2) in both directions, px.
 
-    The error is e(x) = |F(x) + B(x + F(x))| with B sampled bilinearly.
-
-    Returns:
-        variance (H, W) float32 px^2 per component, base^2 + (factor e)^2 of ``DIS_NOISE`` and at
-        most (5 px)^2; valid (H, W) bool: False where the error exceeds 1.5 px and 5 % of the flow,
-        or where the flow leaves the image or is not finite.
+    The error is e(x) = |F(x) + B(x + F(x))|. The variance (H, W), px^2 per component, is base^2 +
+    (factor e)^2 of ``DIS_NOISE``, at most (5 px)^2; valid (H, W) is False where e exceeds 1.5 px
+    and 5 % of the flow, or where the flow leaves the image or is not finite.
     """
     height, width = forward.shape[:2]
     du, dv = cv2.split(np.nan_to_num(forward, nan=1e9, posinf=1e9, neginf=-1e9))

@@ -155,11 +155,7 @@ def is_dark(rgb: np.ndarray | None) -> bool:
 
 
 def _shift_costs(pair: FramePair, motion: RelativePose) -> np.ndarray | None:
-    """(9, 9) mean image cost, 0 to 1, of the pixels at depth edges under shifts of the depth map.
-
-    A depth map that is shifted against its image gives pixels at the edges of near things the depth
-    of what lies beside them, which the motion moves to the wrong place. None: too few edges.
-    """
+    """(9, 9) mean image cost, 0 to 1, of pixels at depth edges under shifts of the depth map."""
     prev, curr, weights = pair.prev, pair.curr, motion.weights
     if weights is None or weights.shape != prev.camera.shape or prev.depth is None:
         return None
@@ -210,10 +206,7 @@ def _edge_pixels(
 
 
 def _minimum(cost: np.ndarray) -> np.ndarray:
-    """(right, down) px of the minimum of a cost over shifts, between the pixels by parabolas.
-
-    The depth of a pixel is found at x + shift: so far it stands from its image.
-    """
+    """(right, down) px of the minimum of a cost over shifts, between the pixels by parabolas."""
     row, column = np.unravel_index(np.argmin(cost), cost.shape)
 
     def vertex(values: np.ndarray, k: int) -> float:

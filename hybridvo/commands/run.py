@@ -22,11 +22,11 @@ from hybridvo.commands import results
 from hybridvo.commands.diagnose import is_dark
 from hybridvo.commands.progress import Progress, interruptible
 from hybridvo.commands.recording import Recording, check_recording
-from hybridvo.commands.run_folder import RESULTS, STATE, Mode, RunFolder
+from hybridvo.commands.run_folder import RESULTS, STATE, RunFolder
 from hybridvo.data.sequence import Sequence
 from hybridvo.errors import InputError
 from hybridvo.evaluation.pair_errors import pair_errors, true_motion, true_trajectory
-from hybridvo.files import fingerprint, versions
+from hybridvo.files import Mode, fingerprint, versions
 from hybridvo.flow import (
     FlowField,
     FlowProvider,
