@@ -28,12 +28,8 @@ LOCK = ".run.lock"
 def atomic_write(path: str | os.PathLike[str], mode: Literal["w", "wb"] = "w") -> Iterator[IO[Any]]:
     """Open a file whose content appears under its name completely or not at all.
 
-    The content goes into a new file of the same folder, is flushed to the disk and renamed over
-    ``path``. A symbolic link at ``path`` is replaced, never followed. Text is UTF-8 with Unix line
-    ends.
-
-    Raises:
-        OutputError: the file cannot be created, written or renamed; ``path`` is then unchanged.
+    A symbolic link at ``path`` is replaced, never followed. Text is UTF-8 with Unix line ends. With
+    an OutputError ``path`` is unchanged.
     """
     path = Path(path)
     if path.exists() and not (path.is_file() or path.is_dir()):
@@ -135,9 +131,6 @@ def read_rows(path: str | os.PathLike[str], columns: str, *, words: int = 0) -> 
     """Rows of a list file: a number for each of ``columns``, the last ``words`` of them text.
 
     ``#`` starts a comment; the last word may contain spaces. Commas separate numbers too.
-
-    Raises:
-        FormatError: a row of another length or a number that cannot be read, with its line.
     """
     count = len(columns.split())
     rows = []

@@ -1,8 +1,7 @@
 """Optical flow for a pair of frames: from files, from OpenCV's DIS, or from any callable.
 
-A provider is a callable ``(prev: Frame, curr: Frame) -> FlowField``. It never raises on bad images:
-pixels without a match are invalid, and where no flow can be had at all it is None, for which the
-estimators return ``failed(no_flow)``.
+A provider never raises on bad images: pixels without a match are invalid, and where no flow can be
+had at all it is None, for which the estimators return ``failed(no_flow)``.
 """
 
 from __future__ import annotations
@@ -64,11 +63,7 @@ def dis_flow(preset: str = "medium") -> FlowProvider:
     may serve several trackers and threads. Where an image has no texture (a covered lens, a dropped
     frame, parallel stripes) there is no flow: DIS would return zero there, in both directions.
 
-    Args:
-        preset: effort: ``ultrafast``, ``fast`` or ``medium``.
-
-    Raises:
-        InputError: an unknown preset.
+    ``preset`` is the effort: ``ultrafast``, ``fast`` or ``medium``.
     """
     if preset not in DIS_PRESETS:
         raise InputError(f"DIS preset: expected {', '.join(DIS_PRESETS)}, got {preset!r}.")
@@ -254,10 +249,9 @@ def check_field(result: Any, prev: Frame, source: str) -> FlowField:
 def contradiction(pair: FramePair) -> str | None:
     """Why the flow of a pair cannot be that of its images, as a sentence, or None.
 
-    A flow with the wrong sign, direction, unit, channel order or of another pair is a flawless flow
-    of another motion; only the images show it: such a flow warps one image onto the other no better
-    than no flow does. None also where the flow was computed from the images (source ``dis``), where
-    one of them is missing, or where there is too little texture.
+    A flow with the wrong sign, direction, unit or pair warps one image onto the other no better
+    than no flow does. None also where the flow was computed from the images (``dis``), where one of
+    them is missing, or where there is too little texture.
     """
     rgb_prev, rgb_curr, flow = pair.prev.rgb, pair.curr.rgb, pair.flow
     if rgb_prev is None or rgb_curr is None or flow is None or pair.flow_source == "dis":

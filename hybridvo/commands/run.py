@@ -67,10 +67,6 @@ def run(
 
     ``out`` is by default ``runs/NAME``; ``rrd`` is the file of a Rerun recording, empty for
     ``recording.rrd`` in the output folder.
-
-    Raises:
-        InputError: input or options that cannot be used, or a broken frame with ``strict``.
-        LockedError: another run holds the folder. OutputError: a result cannot be written.
     """
     method = options.run.method
     models = models or Models(options.run.device)

@@ -1,8 +1,6 @@
 """The output folder of one run: lock, refusal to overwrite, frames kept as they finish.
 
-``run.json`` says what the run is and how far it came, ``steps.csv`` gets a line as each frame
-finishes. ``checkpoint.npz`` holds the rows and the tracker's state after every fiftieth: a run that
-was killed goes on from there.
+``checkpoint.npz`` holds the rows and the tracker's state: a run that was killed goes on from there.
 """
 
 from __future__ import annotations
@@ -45,10 +43,6 @@ class RunFolder:
         rows: of the finished frames, JSON-ready, in order.
         tracker: arrays of the tracker's state after them where the run is resumed, or None.
         finished: whether the run that is resumed was complete already.
-
-    Raises:
-        LockedError: another run holds the folder. OutputError: it cannot be written.
-        InputError: results that ``mode`` does not allow, or those of another run.
     """
 
     def __init__(

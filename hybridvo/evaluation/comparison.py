@@ -1,7 +1,6 @@
 """Methods beside each other on sequences: same frames, same flow, same clock, scored against truth.
 
-Every method runs as :class:`hybridvo.odometry.Odometry`, exactly as in ``hybridvo run``: for the
-same frames and the same flow both give the same motions. One sequence is the unit of work and of
+Every method runs as in ``hybridvo run`` and gives the same motions. One sequence is the unit of
 resume: what it gave is one file in ``parts/`` until the comparison is done.
 """
 
