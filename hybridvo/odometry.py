@@ -28,10 +28,9 @@ from hybridvo.pipeline import (
 from hybridvo.refinement.photometric import refine_photometric
 from hybridvo.refinement.refine import widened
 from hybridvo.results import MotionPrior, Reason, RelativePose, State, Status, Step
-from hybridvo.tracking.keyframes import KeyFrame
 from hybridvo.tracking.pose_graph import Edge
 from hybridvo.tracking.state import TrackerState
-from hybridvo.tracking.window import STANDSTILL, Window, locate
+from hybridvo.tracking.window import STANDSTILL, KeyFrame, Window, locate
 from hybridvo.trajectory import chain
 from hybridvo.types import Frame, FramePair, as_number, as_rigid, as_seed
 
