@@ -159,10 +159,7 @@ class Encoder(nn.Module):
 
 
 class SelfAttention(nn.Module):
-    """Self-attention over all positions, ``x + gain * attended``, with a gain that starts at zero.
-
-    Of the paper's "VONet + self-att.": unscaled dot products, an eighth of the channels.
-    """
+    """Self-attention of the paper's "VONet + self-att.", with a gain that starts at zero."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()

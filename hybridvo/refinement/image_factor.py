@@ -283,10 +283,7 @@ class ImageFactor:
 
 
 def parts_dispersion(scores: np.ndarray, model: np.ndarray) -> float:
-    """Dispersion of the scores (rows, columns, 6) of tiles, summed over each of :data:`PARTS`.
-
-    1 where the parts are independent and the ``model`` covariance (6, 6) is right.
-    """
+    """Dispersion of the scores (rows, columns, 6) of tiles, summed over each of :data:`PARTS`."""
     found = []
     for shape in PARTS:
         rows, columns = (
