@@ -184,10 +184,7 @@ def plain_torch() -> Iterator[None]:
 
 
 def initialize(network: nn.Module, uniform: tuple[nn.Module, ...] = ()) -> None:
-    """Glorot-normal weights and zero biases; Glorot-uniform weights inside ``uniform`` (the heads).
-
-    Draws from torch's global generator: seed it to get the same network again.
-    """
+    """Glorot-normal weights (uniform inside ``uniform``, the heads) by torch's global generator."""
     heads = {id(m) for head in uniform for m in head.modules()}
     for module in network.modules():
         if isinstance(module, nn.Conv2d | nn.ConvTranspose2d | nn.Linear):

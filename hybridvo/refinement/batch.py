@@ -113,11 +113,7 @@ class Pixels:
         return Pixels(**changed)
 
     def subset(self, count: int) -> Pixels:
-        """About ``count`` usable pixels of each sample, spread evenly in their order.
-
-        One pixel is taken from each of ``count`` equal runs, at a place in the run that follows the
-        golden section, so that no regular structure of the image is met in step.
-        """
+        """About ``count`` usable pixels of each sample, spread by the golden section."""
         order = (self.weight > 0).long().cumsum(dim=1)
         total = order[:, -1:]
         count = min(count, order.shape[1])

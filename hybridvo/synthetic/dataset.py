@@ -96,7 +96,7 @@ def load_preset(
     kinds: dict[str, type] = PRESETS,
     size: tuple[int, int] | None = None,
 ) -> Preset:
-    """Generator that a file such as ``configs/data_paper.yaml`` describes, of its or a given size."""
+    """Generator that a file such as ``configs/data_paper.yaml`` describes; ``size``: or its own."""
     mapping = read_yaml(path)
     kind = mapping.pop("preset", None)
     if kind not in kinds:

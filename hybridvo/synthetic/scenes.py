@@ -267,6 +267,8 @@ def make_scene(
             of the pixels on movers in every frame, and at least 46 % whose flow differs from the
             camera's by over 1/512 of the width.
         seed: not negative; the same seed gives the same images.
+        height: pixels.
+        width: pixels.
         frames: default 20, for ``pair`` 2.
         zoom: relative amplitude of a slow change of focal length.
         noise: sensor noise, standard deviation in grey levels.
