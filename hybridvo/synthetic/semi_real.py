@@ -15,8 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from hybridvo.data.resize import resize_frame
-from hybridvo.data.sequence import open_sequence
+from hybridvo.data.sequence import open_sequence, resize_frame
 from hybridvo.errors import InputError
 from hybridvo.flow import dis_flow
 from hybridvo.geometry import invert, rotation_angle, se3_exp
