@@ -123,7 +123,6 @@ def _open(args: argparse.Namespace) -> Any:
 
 
 def _run(args: argparse.Namespace, command: list[str]) -> Result:
-    from hybridvo.commands.configuration import load_options, weight_files
     from hybridvo.commands.results import summary_text
     from hybridvo.commands.run import run
     from hybridvo.network.models import Models
@@ -132,8 +131,10 @@ def _run(args: argparse.Namespace, command: list[str]) -> Result:
         f"run.{name}": getattr(args, name)
         for name in ("method", "start", "stop", "stride", "device", "max_failed", "strict")
     }
-    options = load_options(args.config, args.assignments, given | {"flow.source": args.flow})
-    files = weight_files(args.weights, [options.run.method])
+    options = arguments.load_options(
+        args.config, args.assignments, given | {"flow.source": args.flow}
+    )
+    files = arguments.weight_files(args.weights, [options.run.method])
     summary, code = run(
         _open(args),
         args.out,
@@ -160,18 +161,18 @@ def _show(args: argparse.Namespace, command: list[str]) -> Result:
 
 
 def _compare(args: argparse.Namespace, command: list[str]) -> Result:
-    from hybridvo.commands.configuration import weight_files
     from hybridvo.commands.progress import Progress
     from hybridvo.evaluation.comparison import compare
     from hybridvo.evaluation.sequence_job import ComparisonOptions
     from hybridvo.pipeline import METHODS
 
     methods = tuple(name.strip() for name in args.methods.split(",") if name.strip())
+    known = METHODS if methods == ("all",) else methods
     names = ["flow", "dataset", "start", "stop", "stride", "seed", "device", "protocol", "worst"]
     options = ComparisonOptions(
         sequences=(*args.paths, *args.sequence),
         methods=methods,
-        weights=weight_files(args.weights, METHODS if methods == ("all",) else methods),
+        weights=arguments.weight_files(args.weights, known),
         **{name: getattr(args, name) for name in names},
     )
     with Progress(0, "compare", quiet=args.quiet, unit="pairs") as progress:

@@ -242,10 +242,7 @@ class Odometry:
     def _register(
         self, key: KeyFrame, curr: Frame, prior: MotionPrior | None, weights: np.ndarray
     ) -> RelativePose:
-        """Motion from a key frame: by the images from a start, without one as between neighbours.
-
-        Key frames hold the trajectory together: a motion in doubt counts as failed.
-        """
+        """Motion from a key frame, from a start or without; one in doubt counts as failed."""
         if prior is not None and self._by_images:
             start = RelativePose(
                 T_curr_prev=prior.T_curr_prev,

@@ -18,8 +18,7 @@ import torch
 
 import hybridvo
 from hybridvo import torch_geometry
-from hybridvo.data.resize import resize_camera
-from hybridvo.data.sequence import iter_pairs, open_sequence
+from hybridvo.data.sequence import iter_pairs, open_sequence, resize_camera
 from hybridvo.geometry import (
     backproject,
     ego_flow,

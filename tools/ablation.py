@@ -186,10 +186,9 @@ def _store(
 
 
 def _task(args: argparse.Namespace, name: str, seed: int) -> Any:
-    from hybridvo.synthetic.dataset import StoredSamples
+    from hybridvo.synthetic.dataset import Mixture, StoredSamples
     from hybridvo.training.options import load_pwvo_options
     from hybridvo.training.pwvo_task import PwvoTask
-    from hybridvo.training.stream import Mixture
 
     options, mixture = load_pwvo_options(args.configs / f"{name}.yaml")
     steps = -(-args.samples // options.batch_size)

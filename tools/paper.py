@@ -24,9 +24,8 @@ from measuring import ROOT, provenance, without_folders
 from paper_tables import ROWS
 
 from hybridvo.commands.generate import write_sheet
-from hybridvo.evaluation.drawing import flow_panel
-from hybridvo.evaluation.maps import longest_flow, prediction_errors, uncertainty_maps
-from hybridvo.evaluation.plots import Panel, draw_panels
+from hybridvo.evaluation.drawing import flow_panel, prediction_errors, uncertainty_maps
+from hybridvo.evaluation.plots import Panel, draw_panels, longest_flow
 from hybridvo.evaluation.saliency import saliencies
 from hybridvo.files import atomic_write, write_json
 from hybridvo.network.losses import reconstruct
@@ -35,8 +34,7 @@ from hybridvo.network.selection import select_motion
 from hybridvo.network.weights import PRETRAINED, save_weights
 from hybridvo.synthetic.dataset import load_preset
 from hybridvo.synthetic.draws import sample_generator
-from hybridvo.training.stream import collate
-from hybridvo.training.validation import PUBLISHED_SEED
+from hybridvo.training.validation import PUBLISHED_SEED, collate
 
 COMPARED = ("vonet", "pwvo-paper")
 """Rows whose saliency the paper sets beside each other."""

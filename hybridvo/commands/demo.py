@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from hybridvo.commands.configuration import load_options
 from hybridvo.commands.run import EXIT_INTERRUPTED, run
 from hybridvo.data.sequence import open_sequence
 from hybridvo.errors import InputError
 from hybridvo.evaluation.pair_errors import true_trajectory
 from hybridvo.evaluation.plots import plot_trajectories
 from hybridvo.files import make_folder, write_json
+from hybridvo.options import FlowOptions, Options, RunOptions
 from hybridvo.synthetic.render import write_sintel
 from hybridvo.synthetic.scenes import make_scene
 from hybridvo.trajectory import read_trajectory
@@ -60,13 +60,11 @@ def demo(
     sequence = open_sequence(out / "data" / "training" / "clean" / SCENE, "sintel")
     summaries: dict[str, dict[str, Any]] = {}
     for method in METHODS:
-        options = load_options(
-            given={"run.method": method, "flow.source": "dis", "run.max_failed": 1.0}
-        )
+        wanted = RunOptions(method=method, max_failed=1.0)
         summaries[method], code = run(
             sequence,
             out / method,
-            options,
+            Options(flow=FlowOptions(source="dis"), run=wanted),
             mode="overwrite" if overwrite else "new",
             command=command,
             quiet=quiet,

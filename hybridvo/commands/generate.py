@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from hybridvo.errors import InputError
-from hybridvo.evaluation.maps import flow_colours
+from hybridvo.evaluation.plots import flow_colours
 from hybridvo.files import atomic_write
 from hybridvo.synthetic.dataset import PRESETS, Preset, load_preset, read_sample, write_samples
 from hybridvo.synthetic.layered import Sample

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from hybridvo.errors import InputError, OutputError
-from hybridvo.evaluation.maps import flow_colours, longest_flow
+from hybridvo.evaluation.plots import flow_colours, longest_flow
 from hybridvo.results import State, Step
 from hybridvo.types import Frame
 

@@ -39,6 +39,7 @@ def summarise(rows: list[dict[str, Any]], sequence: Sequence, method: str) -> di
     def median(name: str) -> float | None:
         return float(np.median([row[name] for row in timed])) if timed else None
 
+    doubts = [row for row in motions if row["status"] == "ok" and row["message"]]
     # what the estimate was given that no sensor gives
     oracle = ["true flow"] if any(row["flow_is_true"] for row in rows) else []
     oracle += ["true depth"] if sequence.depth_source == "true" else []
@@ -57,7 +58,7 @@ def summarise(rows: list[dict[str, Any]], sequence: Sequence, method: str) -> di
         "flow_ms_median": median("flow_ms"),
         "motion_ms_median": median("motion_ms"),
         "frame_ms_median": median("frame_ms"),
-        "warnings": [],
+        "warnings": [f"frame {row['index']}: {row['message']}" for row in doubts[:1]],
     }
 
 

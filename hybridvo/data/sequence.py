@@ -1,4 +1,4 @@
-"""Sequences of RGB-D frames: how a folder finds its reader, and frames become pairs."""
+"""Sequences of RGB-D frames: a folder finds its reader, frames become pairs or another size."""
 
 from __future__ import annotations
 
@@ -6,8 +6,12 @@ import difflib
 import itertools
 import os
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
+import cv2
+import numpy as np
 
 from hybridvo.data.base import Given, Sequence
 from hybridvo.data.camera_file import Calibration
@@ -155,3 +159,39 @@ def _pair(
     except FileNotFoundError:
         return FramePair(prev, curr, None, depth_source=depth_source)
     return FramePair(prev, curr, vectors, None, valid, "file", sequence.flow_is_true, depth_source)
+
+
+def resize_camera(camera: Camera, height: int, width: int) -> Camera:
+    """Camera of the same view with another image size in pixels.
+
+    Pixel (0, 0) is a centre: u' = s (u + 0.5) - 0.5, for the principal point too.
+    """
+    sx, sy = width / camera.width, height / camera.height
+    cx, cy = sx * (camera.cx + 0.5) - 0.5, sy * (camera.cy + 0.5) - 0.5
+    return Camera(camera.fx * sx, camera.fy * sy, cx, cy, height, width)
+
+
+def resize_frame(frame: Frame, height: int, width: int) -> Frame:
+    """Frame of another size: image by area (or bilinear when it grows), the rest by nearest."""
+    # source pixels whose centres are nearest (cv2's INTER_NEAREST takes corners, and no bool)
+    rows, columns = (
+        ((np.arange(size) + 0.5) * (old / size)).astype(np.intp).clip(0, old - 1)
+        for size, old in zip((height, width), frame.camera.shape, strict=True)
+    )
+
+    def nearest(array: np.ndarray | None) -> np.ndarray | None:
+        return None if array is None else array[np.ix_(rows, columns)]
+
+    rgb = frame.rgb
+    if rgb is not None:
+        shrinks = height <= rgb.shape[0] and width <= rgb.shape[1]
+        mode = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+        rgb = cv2.resize(rgb, (width, height), interpolation=mode)
+    return replace(
+        frame,
+        rgb=rgb,
+        depth=nearest(frame.depth),
+        camera=resize_camera(frame.camera, height, width),
+        depth_variance=nearest(frame.depth_variance),
+        mask=nearest(frame.mask),
+    )

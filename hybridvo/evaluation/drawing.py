@@ -12,28 +12,19 @@ import numpy as np
 from hybridvo.data.sequence import Sequence, iter_pairs
 from hybridvo.errors import InputError
 from hybridvo.estimation import estimate
-from hybridvo.evaluation.maps import (
-    error_map,
-    flow_colours,
-    longest_flow,
-    moving_pixels,
-    object_flow,
-    prediction_errors,
-    uncertainty_maps,
-)
-from hybridvo.evaluation.pair_errors import pair_errors, true_motion
-from hybridvo.evaluation.plots import Panel, draw_panels
+from hybridvo.evaluation.pair_errors import MOVING_PX, pair_errors, true_motion
+from hybridvo.evaluation.plots import Panel, draw_panels, flow_colours, longest_flow
 from hybridvo.evaluation.saliency import last_pass, saliencies
 from hybridvo.evaluation.sequence_job import Job
 from hybridvo.files import atomic_write, make_folder, write_json
 from hybridvo.flow import dis_flow
-from hybridvo.geometry import matrix_to_euler_deg
+from hybridvo.geometry import ego_flow, matrix_to_euler_deg
 from hybridvo.network.layers import KINDS
 from hybridvo.network.models import load_weights
 from hybridvo.network.weights import pretrained, pretrained_names
 from hybridvo.pipeline import DEFAULT_METHOD
 from hybridvo.results import PixelwisePrediction
-from hybridvo.types import FramePair
+from hybridvo.types import Camera, FramePair
 
 
 def draw(
@@ -240,3 +231,51 @@ def _network_panels(
             f"{name}: part of the {what} that the saliency misses": saliency.completeness_error,
         }
     return panels, numbers
+
+
+# -- maps: arrays in, arrays out ------------------------------------------------------------------
+
+
+def object_flow(pair: FramePair, T_curr_prev: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(ego flow, object flow) of a pair with flow and depth, (H, W, 2) px, NaN where unknown."""
+    depth = np.asarray(pair.prev.depth)
+    ego = ego_flow(depth, T_curr_prev, pair.prev.camera, pair.curr.camera)
+    return ego, np.asarray(pair.flow) - ego
+
+
+def moving_pixels(objects: np.ndarray) -> np.ndarray:
+    """(H, W) bool: pixels whose object flow (H, W, 2) is longer than a pixel."""
+    with np.errstate(invalid="ignore"):
+        return np.hypot(objects[..., 0], objects[..., 1]) > MOVING_PX
+
+
+def error_map(
+    T_est: np.ndarray, T_true: np.ndarray, depth: np.ndarray, prev: Camera, curr: Camera
+) -> np.ndarray:
+    """(H, W) distance of the ego flows of two motions ``T_curr_prev``, px; NaN without depth."""
+    difference = ego_flow(depth, T_est, prev, curr) - ego_flow(depth, T_true, prev, curr)
+    return np.hypot(difference[..., 0], difference[..., 1])
+
+
+def uncertainty_maps(prediction: PixelwisePrediction) -> list[np.ndarray]:
+    """Predicted uncertainty of rotation (degrees) and translation (m) of the first pair.
+
+    Two (h, w) maps: the geometric mean of the three Laplace scales U at every pixel.
+    """
+    scales = (prediction.log_scale_rotation, prediction.log_scale_translation)
+    return [s[0].detach().float().mean(0).exp().cpu().numpy() for s in scales if s is not None]
+
+
+def prediction_errors(
+    prediction: PixelwisePrediction, euler_deg: np.ndarray, translation: np.ndarray
+) -> list[np.ndarray]:
+    """Error of the predicted motion at every pixel of the first pair: the paper's error maps.
+
+    Two (h, w) maps: mean absolute difference from the true Euler angles X-Y-Z (3,) of T_curr_prev,
+    degrees, and from its translation (3,), metres.
+    """
+    parts = ((prediction.rotation, euler_deg), (prediction.translation, translation))
+    return [
+        np.abs(value[0].detach().cpu().double().numpy() - np.reshape(true, (3, 1, 1))).mean(axis=0)
+        for value, true in parts
+    ]

@@ -15,7 +15,7 @@ import numpy as np
 
 from hybridvo.data.base import Sequence
 from hybridvo.data.image_io import UNKNOWN_FLOW
-from hybridvo.data.resize import resize_camera
+from hybridvo.data.sequence import resize_camera
 from hybridvo.errors import InputError
 from hybridvo.geometry import (
     backproject,

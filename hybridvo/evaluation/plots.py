@@ -224,3 +224,37 @@ def _shared_tops(panels: Sequence[Panel]) -> dict[str, float]:
                 top = float(np.percentile(known, 99)) if known.size else 1e-12
             tops[panel.unit] = max(tops.get(panel.unit, 1e-12), top)
     return tops
+
+
+# -- flow in colours ------------------------------------------------------------------------------
+
+# Baker et al., "A Database and Evaluation Methodology for Optical Flow" (IJCV 2011): hues between
+# six corners of the colour circle, as many steps as the eye tells apart in each part
+_HUE_STEPS = np.cumsum([0, 15, 6, 4, 11, 13, 6])
+_HUES = 255 * np.array(
+    [[1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 1, 1], [0, 0, 1], [1, 0, 1], [1, 0, 0]]
+)
+
+
+def flow_colours(flow: np.ndarray, longest: float | None = None) -> np.ndarray:
+    """(H, W, 3) uint8 RGB of a flow (H, W, 2) in the standard colours of Middlebury.
+
+    Hue is the direction (red to the right, yellow-green downwards), saturation the length. Vectors
+    of ``longest`` px have full saturation (default: the 99th percentile), longer ones are darker;
+    no motion is white, NaN and inf are black.
+    """
+    flow = np.asarray(flow)
+    known = np.isfinite(flow).all(axis=2)
+    u, v = np.moveaxis(np.where(known[..., None], flow, 0.0), 2, 0)
+    radius = (np.hypot(u, v) / (longest or longest_flow(flow)))[..., None]
+    step = (np.arctan2(-v, -u) / np.pi + 1) / 2 * (_HUE_STEPS[-1] - 1)
+    colour = np.stack([np.interp(step, _HUE_STEPS, channel) for channel in _HUES.T], axis=-1)
+    colour = np.where(radius <= 1, 255 - radius * (255 - colour), 0.75 * colour)
+    return (np.where(known[..., None], colour, 0.0) + 0.5).astype(np.uint8)
+
+
+def longest_flow(flow: np.ndarray) -> float:
+    """99th percentile of the lengths of a flow, px; 1 where nothing is known."""
+    length = np.hypot(flow[..., 0], flow[..., 1])
+    length = length[np.isfinite(length)]
+    return max(float(np.percentile(length, 99)), 1e-6) if length.size else 1.0

@@ -185,10 +185,7 @@ def _nearest(native: int, target: int) -> torch.Tensor:
 def _sample_at_flow(
     depth_curr: torch.Tensor, flow: torch.Tensor, rows: torch.Tensor, cols: torch.Tensor
 ) -> torch.Tensor:
-    """(B, h, w) current depth (B, H, W) at x + F, nearest pixel; NaN where that is not inside.
-
-    ``flow`` in native pixels, at native rows (h,) and columns (w,).
-    """
+    """(B, h, w) current depth (B, H, W) at x + F, nearest pixel; NaN where that is not inside."""
     height, width = depth_curr.shape[1:]
     u = cols.to(flow.dtype) + flow[..., 0]
     v = rows.to(flow.dtype)[:, None] + flow[..., 1]

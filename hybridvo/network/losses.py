@@ -170,11 +170,7 @@ def _direction(x: torch.Tensor, floor: float) -> torch.Tensor:
 def _pose_losses(
     output: PixelwisePrediction, targets: LossTargets, s: torch.Tensor | None, options: LossOptions
 ) -> dict[str, torch.Tensor]:
-    """L^R and L^T of pixel maps, weighed by s (B, 6, ..) unless it is None.
-
-    As published, both halves of the rotation's term are halved, of the paper's translation term
-    only that of the data, and the one error of a pixel stands against three channels of s.
-    """
+    """L^R and L^T of pixel maps, weighed by s (B, 6, ..) unless it is None; as published."""
     error_r = (targets.rotation_deg[:, :, None, None] - output.rotation).abs()
     true_t = targets.translation[:, :, None, None]
     if options.translation_form == "laplace":
@@ -202,10 +198,7 @@ def _flow_error(
     known: torch.Tensor,
     options: LossOptions,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """(B, 2, h, w) errors of L^F that count, 0 elsewhere, and (B, h, w) where the target is known.
-
-    A point that the motion brings behind the camera is charged the limit.
-    """
+    """(B, 2, h, w) errors of L^F that count, else 0, and (B, h, w) where the target is known."""
     known = known & torch.isfinite(target).all(dim=1)
     error = (flow - torch.where(known[:, None], target, 0.0)).abs()
     counts = (defined & known)[:, None] & (error < options.flow_limit_px)
@@ -214,10 +207,7 @@ def _flow_error(
 
 
 def _flow_loss(error: torch.Tensor, known: torch.Tensor, s: torch.Tensor | None) -> torch.Tensor:
-    """L^F; with s (B, 6, ..) weighed by 1 / U^F = exp(-0.1 s).
-
-    s of rx, ry, rz and tz weighs both components of the error; tx and ty one each.
-    """
+    """L^F; with s (B, 6, ..) weighed by 1 / U^F = exp(-0.1 s)."""
     count = known.sum().clamp(min=1)
     if s is None:
         return 0.5 * error.sum() / count
@@ -236,11 +226,7 @@ def _flow_loss(error: torch.Tensor, known: torch.Tensor, s: torch.Tensor | None)
 def _depth_error(
     depth: torch.Tensor, target: torch.Tensor, known: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """(B, h, w) errors of inverse depth, and where the target is known.
-
-    Behind the camera the error goes on as its tangent at the target: it stays finite, and its
-    gradient brings the point back.
-    """
+    """(B, h, w) errors of inverse depth, finite behind the camera, and where a target is known."""
     known = known & torch.isfinite(target) & (target >= MIN_DEPTH)
     target = torch.where(known, target, 1.0)
     front = depth >= MIN_DEPTH
@@ -250,9 +236,7 @@ def _depth_error(
 
 
 def _depth_loss(error: torch.Tensor, known: torch.Tensor, s: torch.Tensor | None) -> torch.Tensor:
-    """L^D; with s (B, 6, ..) weighed by 1 / U^D = exp(-0.25 s) of rx, ry and tz, which change the
-    depth of a point.
-    """
+    """L^D; with s (B, 6, ..) weighed by 1 / U^D = exp(-0.25 s) of what changes a depth."""
     count = known.sum().clamp(min=1)
     if s is None:
         return error.sum() / count

@@ -42,11 +42,7 @@ def load_weights(path: str | Path) -> tuple[Any, dict[str, Any]]:
 
 
 class Models:
-    """Networks by name, read on first use.
-
-    Args:
-        device: ``cpu``, ``cuda``, or ``auto`` for cuda where there is one.
-        weights: files to be read instead of the pretrained weights of a name.
+    """Networks by name, read on first use; ``weights``: files instead of the pretrained ones.
 
     Raises:
         InputError: a device that is not there.
@@ -94,9 +90,7 @@ def default_models(device: str = "cpu") -> Models:
 
 @contextlib.contextmanager
 def one_thread() -> Iterator[None]:
-    """Run torch's CPU kernels on one thread: a pair is too little work for several, which wait for
-    each other.
-    """
+    """Run torch's CPU kernels on one thread: several wait for each other on a single pair."""
     import torch
 
     before = torch.get_num_threads()

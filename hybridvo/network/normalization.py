@@ -138,9 +138,7 @@ def remove_scale(
 def _ego_motion(
     inputs: NetworkInputs, inverse: torch.Tensor, T: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """((B, 2, h, w) px, (B, 1, h, w)) flow and change of log depth that a motion causes; zero where
-    the moved point is behind the camera.
-    """
+    """((B, 2, h, w) px, (B, 1, h, w)) flow and change of log depth; zero behind the camera."""
     # Over its depth, a point is ray + translation * inverse depth: finite for the farthest.
     rays, inverse = inputs.rays.flatten(2), inverse.flatten(1)[:, None]
     moved = T[:, :3, :2] @ rays + T[:, :3, 2:3] + T[:, :3, 3:] * inverse

@@ -113,10 +113,7 @@ class PWVO(nn.Module):
 
     @classmethod
     def from_pretrained(cls, name_or_path: str | Path = "pwvo") -> PWVO:
-        """A trained network, in evaluation mode on the CPU.
-
-        Args:
-            name_or_path: name of pretrained weights, or a file of one's own training.
+        """A network in evaluation mode on the CPU, by the name or file of its weights.
 
         Raises:
             CheckpointError: no such weights, damaged ones, or another network's.

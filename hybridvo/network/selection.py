@@ -323,11 +323,7 @@ def _step(
     T: pp.LieTensor,
     attached: bool = False,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """((B, 6) Gauss-Newton step (translation, rotation), (B,) scale of the residuals).
-
-    ``attached``: the step that carries the gradient: pixels far away pull with constant strength,
-    and the gradient is that of the right-hand side alone.
-    """
+    """((B, 6) Gauss-Newton step, (B,) scale of the residuals); ``attached``: with the gradient."""
     M = T.matrix()
     moved = M[:, :3, :2] @ ray + M[:, :3, 2:3] + M[:, :3, 3:] * inverse[:, None]
     front = moved[:, 2] > MIN_DEPTH_RATIO

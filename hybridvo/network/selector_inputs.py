@@ -230,11 +230,7 @@ def candidate_channels(
 def _look(
     inputs: SelectorInputs, u: torch.Tensor, v: torch.Tensor, z: torch.Tensor, front: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-    """What the current frame shows where candidates say that pixels go, (N, h, w) each: texture,
-    0 where nothing can be told to 1; it times the correlation of the patches; log of the depth that
-    is seen there over the one expected, positive where the candidate's point should hide it; and
-    whether both are known.
-    """
+    """(N, h, w) each: texture, it times correlation, log of the depths' ratio, both known."""
     own = inputs.owner
     planes = inputs.planes_curr
     height, width = planes.shape[2:]

@@ -96,11 +96,7 @@ class _Block(nn.Module):
 
 
 class SelectorNetwork(nn.Module):
-    """Scores and static masks of candidate motions.
-
-    Args:
-        options: width.
-    """
+    """Scores and static masks of candidate motions."""
 
     def __init__(self, options: SelectorNetworkOptions | None = None) -> None:
         super().__init__()
@@ -217,12 +213,7 @@ def _mirrored(x: torch.Tensor, mirror: torch.Tensor, signed: tuple[int, ...]) ->
 
 
 class NetworkScorer:
-    """A :class:`hybridvo.hypotheses.selector.Scorer`.
-
-    Args:
-        network: of :func:`hybridvo.network.models.load_weights`.
-        device: where it runs.
-    """
+    """A :class:`hybridvo.hypotheses.selector.Scorer`."""
 
     def __init__(self, network: SelectorNetwork, device: str = "cpu") -> None:
         self.device = torch.device(device)

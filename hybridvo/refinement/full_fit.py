@@ -225,10 +225,7 @@ def _slope_in_depth_variance(
     found: PairNoise,
     options: RefineOptions,
 ) -> np.ndarray:
-    """(6,) derivative of the estimating equation in the depth's variance, per unit of weight.
-
-    What is not known of that variance moves the answer, through the correction of the depth.
-    """
+    """(6,) derivative of the estimating equation in the depth's variance, per unit of weight."""
     sums, noise = np.zeros((2, kernels.SUMS)), np.empty(3, np.float32)
     variances = 0.9 * found.depth**2, 1.1 * found.depth**2 + 1e-8
     for row, variance in zip(sums, variances, strict=True):

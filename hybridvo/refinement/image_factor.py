@@ -259,11 +259,7 @@ class ImageFactor:
         return H[:6, :6] - light @ H[6:, :6], light
 
     def _estimate_scale(self) -> None:
-        """Share of the information that is left under errors alike in a region.
-
-        Trace ratio of the sandwich covariance over tiles to that of the model, at least 1; beyond
-        the tiles by ``inflation``, and by ``agreement`` where that is not enough.
-        """
+        """Share of the information that is left under errors alike in a region, at most 1."""
         H, light = self._marginal()
         model = positive_inverse(H)
         if model is None:

@@ -107,11 +107,8 @@ def refine_photometric(
 ) -> RelativePose:
     """The motion of a pair, sharpened by its two images.
 
-    Args:
-        pair: the two frames; both with images.
-        pose: what :func:`hybridvo.refinement.refine.refine_pair` found for them, with its weights
-            and covariance.
-        options: of the refinement.
+    ``pose``: what :func:`hybridvo.refinement.refine.refine_pair` found, with its weights and
+    covariance.
 
     Returns:
         The motion with its covariance, ``terms`` and report (``photometric``). Where images are

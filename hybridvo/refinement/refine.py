@@ -57,13 +57,8 @@ def refine_pair(
 ) -> RelativePose:
     """The motion of a pair near its only start (4, 4).
 
-    Args:
-        pair: two frames and their flow.
-        T_init: the start.
-        grid: coarse grid of the pair, with the weights; None: it is made.
-        weights: (H, W) factors on the information of each pixel, for the grid that is made.
-        options: of the refinement.
-        context: what the selection knows.
+    ``grid``: coarse grid of the pair, with the weights; None: it is made, with ``weights`` (H, W),
+    factors on the information of each pixel.
     """
     options, context = options or RefineOptions(), context or Context()
     if grid is None:
@@ -148,11 +143,7 @@ def status_of(
 
 
 def _with_doubt(fit: FullFit) -> np.ndarray:
-    """(6, 6) covariance that covers what the sums of one pair cannot know.
-
-    Where few tiles hold pixels, errors that agree within them are averaged over as many readings
-    only. Where the two depths differ, the length of the translation is wrong by as much.
-    """
+    """(6, 6) covariance with what few tiles, and two depths that differ, leave unknown."""
     covariance = fit.motion.covariance * max(1.0, MIN_TILES / max(fit.tiles, 1))
     if fit.depths is not None and fit.depths.doubt:
         t = fit.motion.T_curr_prev[:3, 3]

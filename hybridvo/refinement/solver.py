@@ -94,11 +94,7 @@ def gauss_newton(
 
 
 def _step(at: Linearization, damping: float) -> tuple[np.ndarray, float]:
-    """(step, its squared length in standard deviations); infinite where there is none.
-
-    Newton's, where the curvature leaves the equations definite: Gauss-Newton alone takes back only
-    two thirds of an error per step under a redescending kernel.
-    """
+    """(Newton step, its squared length in standard deviations); infinite where there is none."""
     for H in (at.H - at.curvature, at.H):
         inverse = positive_inverse(H + damping * np.diag(np.diag(H)))
         if inverse is None:

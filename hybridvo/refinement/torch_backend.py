@@ -224,10 +224,7 @@ class _Solver:
         return RobustNoise(torch.stack([scale, torch.zeros_like(scale)], dim=1), 1.0)
 
     def _shrink_scale(self, pixels: Pixels, T: pp.LieTensor, end: torch.Tensor) -> pp.LieTensor:
-        """One Gauss-Newton step for each scale of the kernel from the residuals' down to ``end``.
-
-        A sample whose scale has come to the end stands still, whatever the others do.
-        """
+        """One Gauss-Newton step for each scale of the kernel, down to ``end``."""
         at = residuals(pixels, T)
         scale = 1.5 * weighted_median(at.r[:, :2].norm(dim=1), pixels.weight * at.front, 1.0)
         scale = torch.maximum(scale.clamp(1.0, LARGEST_PX), end)
@@ -241,11 +238,7 @@ class _Solver:
         return T
 
     def _shares(self, T: pp.LieTensor, end: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """(B,) shares of the external weight that follow this motion, and another but not this.
-
-        Both within the same few pixels: a compromise between two motions explains neither, however
-        much noise is granted to it afterwards.
-        """
+        """(B,) shares of the weight that follow this motion, and another near by but not this."""
         pixels = self.flow_only
         own = weigh(pixels, T, self._isotropic(3 * end)).robust
         rest = replace(pixels, weight=pixels.weight * (own < 0.25))
@@ -295,11 +288,7 @@ class _Solver:
         return self._with_depth_noise(T, noise.new_tensor([row[:2] for row in out]))
 
     def _with_depth_noise(self, T: pp.LieTensor, noise: torch.Tensor) -> torch.Tensor:
-        """The noise of log D_curr beside (B, 2): the spread of r_z that sd does not explain.
-
-        sd may explain half of the variance at most: the two depths come from one sensor, and the
-        flow of a slow camera says next to nothing of sd.
-        """
+        """The noise of log D_curr beside (B, 2): the spread of r_z that sd does not explain."""
         few = self.few
         if few.has_depth_curr is None:
             return noise
@@ -308,15 +297,13 @@ class _Solver:
         used = few.weight * few.has_depth_curr * at.front * near
         spread = 1.4826 * weighted_median(at.r[:, 2].abs(), used, 0.02)
         h = weighted_median(at.u[:, 2].abs(), used, 1.0).clamp(min=1e-3)
+        # at most half of the variance: the flow of a slow camera says next to nothing of sd
         sd = torch.minimum(noise[:, 1], 0.5**0.5 * spread / h)
         sz = (spread.square() - (sd * h).square()).clamp(min=DEPTH_NOISE_FLOOR**2).sqrt()
         return torch.stack([noise[:, 0], sd, sz], dim=1)
 
     def _curvature(self, T: pp.LieTensor, how: RobustNoise) -> tuple[torch.Tensor, torch.Tensor]:
-        """(B, 6, 6) curvature of the robust weights and scores' outer products, per unit of weight.
-
-        From the subset: both are averages over many pixels and enter the result at second order.
-        """
+        """(B, 6, 6) curvature of the robust weights and scores' outer products, from the subset."""
         each, at = scores(self.few, T, how)
         s, w = each.double(), (self.few.weight * at.robust).double()
         slope = how.kernel(at.distance2).slope
@@ -327,12 +314,7 @@ class _Solver:
     def _fit_all(
         self, T: pp.LieTensor, how: RobustNoise, curvature: torch.Tensor, tight: bool
     ) -> tuple[pp.LieTensor, Linearization, torch.Tensor, torch.Tensor]:
-        """Newton steps on all pixels: (pose, last equations, converged, steps).
-
-        Ends as the numba refinement does; ``tight``: at the precision of the numbers, which a
-        gradient needs, from the third step on with the full derivative of the equations in place of
-        the curvature of the subset.
-        """
+        """Newton steps on all pixels: (pose, last equations, converged, steps)."""
         pixels = self.pixels
         weight = pixels.weight.double().sum(dim=1)[:, None, None]
         rounding = 8 * torch.finfo(pixels.weight.dtype).eps

@@ -45,6 +45,20 @@ class Preset(Protocol):
         """One pair; depends on the generator alone."""
 
 
+@dataclasses.dataclass(frozen=True)
+class Mixture:
+    """Presets with the share of each; shares need not add up to one."""
+
+    presets: tuple[Preset, ...]
+    weights: tuple[float, ...]
+
+    def sample(self, rng: np.random.Generator) -> Sample:
+        """One pair of one of the presets."""
+        limits = np.cumsum(self.weights)
+        choice = int(np.searchsorted(limits, rng.random() * limits[-1], side="right"))
+        return self.presets[min(choice, len(self.presets) - 1)].sample(rng)
+
+
 def read_yaml(path: str | Path) -> dict[str, Any]:
     """Mapping that a YAML file holds, over the one of the file that it ``extends``."""
     try:

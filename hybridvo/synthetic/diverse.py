@@ -221,11 +221,7 @@ def _add_mover(
     T_cam: np.ndarray,
     follow: float,
 ) -> None:
-    """Lay a mover over the scene and give it, its limbs and its bending a motion.
-
-    ``follow``: factor on the motion that is left in the image where the camera follows it, 0 for a
-    free mover.
-    """
+    """Lay a mover over the scene; ``follow``: motion left where the camera follows it, else 0."""
     o, rng = scene.options, scene.rng
     added = scene.add(mask, in_front=True)
     if added is None:

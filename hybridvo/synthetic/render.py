@@ -121,10 +121,7 @@ class Scene:
     def _motion(
         self, index: int, moved: tuple[int, int], size: tuple[int, int], K: Items[np.ndarray]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Flow of a frame, what is hidden, and the solid of each pixel.
-
-        ``moved`` says which frame's solids are seen by which frame's camera in the end.
-        """
+        """Flow of a frame to what ``moved`` says, what is hidden, and the solid of each pixel."""
         B, depth, solid = self._cast(index, size, K[0])
         A1, B1, bounds1 = self._maps(*moved, size, K[1])
         return *motion(depth, solid, B, K[0], self._shapes, A1, B1, bounds1, K[1]), solid

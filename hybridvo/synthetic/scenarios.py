@@ -177,11 +177,7 @@ def _moved(
     depth: np.ndarray,
     label: np.ndarray,
 ) -> list[np.ndarray]:
-    """Coordinates of each pixel's point in the current camera, three float64 planes.
-
-    An object moves rigidly about its centre: 8-70 px sideways (at 1024 columns), some depth, up to
-    5 degrees; its motion is composed with the camera's.
-    """
+    """Coordinates of each pixel's point in the current camera, three float64 planes."""
     u = (np.arange(camera.width) - camera.cx) / camera.fx
     v = (np.arange(camera.height)[:, None] - camera.cy) / camera.fx
     moved = _apply(T, u, v, depth)
@@ -255,10 +251,7 @@ def _scene(rng: np.random.Generator, cell: Scenario, height: int, width: int) ->
 
 
 def _objects(rng: np.random.Generator, cell: Scenario, depth: np.ndarray) -> np.ndarray:
-    """(H, W) uint8 object label, 0 = static; writes the objects' own surfaces into ``depth``.
-
-    Ellipses grow from random centres until together they cover the wanted share.
-    """
+    """(H, W) uint8 object label, 0 = static; writes the objects' surfaces into ``depth``."""
     height, width = depth.shape
     if cell.moving <= 0:
         return np.zeros((height, width), dtype=np.uint8)
@@ -301,10 +294,7 @@ def _with_noise(rng: np.random.Generator, cell: Scenario, depth: np.ndarray) -> 
 
 
 def _splat(target_x: np.ndarray, target_y: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """(H, W) float32 depth on the current grid: nearest surface that lands on each pixel.
-
-    The half pixel between landing point and pixel centre is made good with the local slope.
-    """
+    """(H, W) float32 depth on the current grid: nearest surface that lands on each pixel."""
     height, width = z.shape
     column, row = np.rint(target_x), np.rint(target_y)
     value = z.copy()

@@ -342,9 +342,7 @@ def _draw_scene(
 
 
 def _sized(scene: Scene, movers: list[Mover], share: float) -> tuple[Scene, float]:
-    """The scene with movers of the size at which they cover a share of most frames, and which they
-    cover.
-    """
+    """The scene with movers of the size at which they cover a share, and which they cover."""
     last = scene.frames - 1
     samples = np.unique(np.linspace(0, last, min(last + 1, 9)).round().astype(int))
     small, large = 0.4, 2.0

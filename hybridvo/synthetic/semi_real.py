@@ -15,8 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from hybridvo.data.resize import resize_frame
-from hybridvo.data.sequence import open_sequence
+from hybridvo.data.sequence import open_sequence, resize_frame
 from hybridvo.errors import InputError
 from hybridvo.flow import dis_flow
 from hybridvo.geometry import invert, rotation_angle, se3_exp
@@ -147,10 +146,7 @@ def _load(folder: Path, source: Source) -> Recording:
 
 
 def _measured_motion(prev: Frame, curr: Frame, T_stated: np.ndarray) -> np.ndarray | None:
-    """The motion refined from the recorded one on the static pair; None where they disagree.
-
-    Recorded motions are often wrong by 1 to 3 px: the labels need more.
-    """
+    """The recorded motion, often wrong by pixels, refined on the pair; None if they disagree."""
     field = dis_flow()(prev, curr)
     pair = FramePair(prev, curr, field.flow, field.variance, field.valid)
     found = refine_pair(pair, T_stated)

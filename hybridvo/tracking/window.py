@@ -169,11 +169,7 @@ def _older(
 
 
 def _placed(window: Window, edges: Sequence[Edge]) -> tuple[np.ndarray, list[Edge]]:
-    """(pose of the new frame with the key frames held, its edges with their weights).
-
-    The pose of the smallest robust cost, sought from each edge in turn. An edge that the chi-square
-    test rules out there has weight 0 and no say.
-    """
+    """(pose of least robust cost with the key frames held, its edges with their weights)."""
     held = {key.frame.index: key.T_world_cam for key in window.keys}
     curr, usable = edges[0].curr, [e for e in edges if e.status.usable]
     best = None
@@ -207,11 +203,7 @@ def _joint(edges: Sequence[Edge], key: int) -> np.ndarray:
 def _corrected(
     motion: RelativePose, T_curr_prev: np.ndarray, covariance: np.ndarray, edges: Sequence[Edge]
 ) -> RelativePose:
-    """The motion of a step whose pose comes from the key frames, with covariance and status.
-
-    Where it holds a correction of the pose before, it is no measurement of the motion between the
-    two frames: its covariance takes the correction in, and its status says so.
-    """
+    """The motion of a step whose pose comes from the key frames, with covariance and status."""
     key = next(e.prev for e in edges if e.ok and e.kind != "chain")
     status, reason = motion.status, Reason.AMBIGUOUS_MOTION
     between = T_curr_prev @ invert(motion.T_curr_prev)

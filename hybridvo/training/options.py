@@ -17,6 +17,7 @@ from hybridvo.network.selector_net import SelectorNetworkOptions
 from hybridvo.options import Count, Positive, Share, option_group
 from hybridvo.synthetic.dataset import (
     PRESETS,
+    Mixture,
     Preset,
     StoredSamples,
     build_options,
@@ -24,7 +25,6 @@ from hybridvo.synthetic.dataset import (
     read_yaml,
 )
 from hybridvo.training.shards import RenderedOptions
-from hybridvo.training.stream import Mixture
 
 KINDS = PRESETS | {"rendered": RenderedOptions, "folder": StoredSamples}
 """Data that a training can name."""

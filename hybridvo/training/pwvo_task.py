@@ -9,19 +9,48 @@ from typing import Any
 import torch
 import torch.nn.functional as F
 from torch import nn
+from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
 from hybridvo.network.losses import NetworkOutput, reconstruct, total_loss
 from hybridvo.network.normalization import first_motions
 from hybridvo.network.pwvo import build_network
 from hybridvo.network.selection import fitted_motion, select_motion
 from hybridvo.results import PixelwisePrediction
+from hybridvo.synthetic.dataset import Mixture, Preset
+from hybridvo.synthetic.draws import TRAINING, sample_generator
 from hybridvo.training.options import PwvoOptions, described
-from hybridvo.training.stream import Mixture, SampleStream, TrainingBatch
-from hybridvo.training.validation import evaluate_network
+from hybridvo.training.validation import TrainingBatch, collate, evaluate_network
 
 FIT_FLOOR_PX, FIT_LIMIT_PX = 0.05, 100.0
 """px of the inputs: error of the fit below which their noise decides it, and the most that a pixel
 is charged, also behind the camera."""
+
+
+class SampleStream(IterableDataset):
+    """Endless batches of a preset, from the sample ``start`` of a seed.
+
+    Batch b of rank r holds the samples ``start + (b world + r) batch_size`` and those that follow:
+    all ranks together see what one process with a batch ``world`` times as large would see. Workers
+    of a ``DataLoader(stream, batch_size=None)`` take batches in turn, and the loader hands them
+    over in order, so that their number changes nothing.
+    """
+
+    def __init__(
+        self, preset: Preset, seed: int, start: int, batch_size: int, rank: int = 0, world: int = 1
+    ) -> None:
+        super().__init__()
+        self.preset, self.seed, self.start, self.batch_size = preset, seed, start, batch_size
+        self.rank, self.world = rank, world
+
+    def __iter__(self) -> Iterator[TrainingBatch]:
+        worker = get_worker_info()
+        turn, turns = (0, 1) if worker is None else (worker.id, worker.num_workers)
+        while True:
+            first = self.start + (turn * self.world + self.rank) * self.batch_size
+            numbers = range(first, first + self.batch_size)
+            draws = (sample_generator(self.seed, i, TRAINING) for i in numbers)
+            yield collate([self.preset.sample(rng) for rng in draws])
+            turn += turns
 
 
 class PwvoTask:
@@ -40,7 +69,7 @@ class PwvoTask:
         stream = SampleStream(self.mixture, options.seed, samples, options.batch_size, rank, world)
         context = "fork" if workers else None
         return iter(
-            torch.utils.data.DataLoader(
+            DataLoader(
                 stream, batch_size=None, num_workers=workers, multiprocessing_context=context
             )
         )
@@ -56,10 +85,7 @@ class PwvoTask:
         return training_loss(output, batch, self.options)
 
     def _starts(self, batch: TrainingBatch, step: int) -> torch.Tensor | None:
-        """(B, 4, 4) first motions: none for one half of the batch, the network's own for the rest.
-
-        The later passes of a network learn from the errors that the earlier ones really make.
-        """
+        """(B, 4, 4) first motions: none for half of the batch, the network's own for the rest."""
         passes = self.options.network.passes
         first = len(batch) // 2
         if passes == 1 or first == 0:

@@ -32,7 +32,7 @@ from hybridvo.synthetic.semi_real import Recording, draw_pair
 from hybridvo.synthetic.sensors import SensorOptions, degrade_depth
 from hybridvo.synthetic.training_scenes import training_scene
 from hybridvo.training.shards import MOVING, STATIC, UNKNOWN, grid_sample
-from hybridvo.training.stream import collate
+from hybridvo.training.validation import collate
 from hybridvo.types import Camera, Frame, FramePair
 
 PER_SHARD, AT_ONCE = 64, 16
@@ -60,13 +60,9 @@ class _Drawn:
 
 
 def draw_samples(seed: int, recordings: Sequence[Recording] = ()) -> list[dict[str, Any]]:
-    """Samples of one seed: semi-real ones, or one of the diverse preset, or two of a rendered pair.
+    """Samples of one seed: semi-real, one of the diverse preset, or two of a rendered pair.
 
     Pairs that the search settles alone are left out: the selector is never asked about them.
-
-    Args:
-        seed: of everything drawn at random.
-        recordings: for semi-real pairs; none: the others.
     """
     rng = np.random.default_rng([0x6A64, seed])
     height, width = SIZES[int(rng.integers(len(SIZES)))]
@@ -169,10 +165,7 @@ def _rendered_pairs(rng: np.random.Generator, seed: int, height: int, width: int
 def _moving(
     flow: np.ndarray, T: np.ndarray, camera: Camera, depth: np.ndarray, mover: np.ndarray
 ) -> np.ndarray:
-    """(H, W) bool, pixels of movers whose flow the camera alone does not explain.
-
-    A mover that happens to stand still helps the fit; half a pixel at a width of 1024 counts.
-    """
+    """(H, W) bool, pixels of movers whose flow the camera alone does not explain."""
     with np.errstate(invalid="ignore"):
         own = np.nan_to_num(flow) - np.nan_to_num(ego_flow(depth, T, camera, camera))
     return mover & (np.square(own).sum(axis=2) > (0.5 * camera.width / 1024) ** 2)

@@ -119,12 +119,7 @@ class Looks:
 
 
 class SelectorTask:
-    """The selector, shards of samples and the losses.
-
-    Args:
-        options: of the run. The weights are drawn from its seed.
-        folder: of the shards; more may appear while training.
-    """
+    """The selector, a folder of shards (more may appear while training) and the losses."""
 
     all_parameters_used = False
 

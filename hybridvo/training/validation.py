@@ -1,4 +1,4 @@
-"""Figures of a network on held-out synthetic pairs: the paper's three, and what its doubt is worth.
+"""Batches of samples, and figures of a network on held-out synthetic pairs.
 
 Seeds 0 to 999 are for development, 1000 and up for published figures; no training run has seen
 either.
@@ -6,6 +6,8 @@ either.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,14 +16,15 @@ import torch.nn.functional as F
 from scipy.stats import mannwhitneyu, spearmanr
 
 from hybridvo.errors import InputError
-from hybridvo.network.losses import NetworkOutput, reconstruct
+from hybridvo.network.inputs import NetworkInputs, assemble_aligned
+from hybridvo.network.losses import LossTargets, NetworkOutput, reconstruct
 from hybridvo.network.normalization import predict
 from hybridvo.network.selection import select_pose
 from hybridvo.results import PixelwisePrediction
 from hybridvo.synthetic.dataset import Preset
 from hybridvo.synthetic.draws import sample_generator
+from hybridvo.synthetic.layered import Sample
 from hybridvo.torch_geometry import euler_transform
-from hybridvo.training.stream import TrainingBatch, collate
 
 PUBLISHED_SEED = 1000
 """First seed of published figures; smaller ones are for development."""
@@ -30,6 +33,47 @@ EPE_LIMIT_PX = 400.0
 """Pixels with a true ego flow of this length or more count as 0 in EPE, as published."""
 
 FIGURES = ("r_err_deg", "t_err", "epe")
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingBatch:
+    """Inputs and ground truth of B samples; ``moving``: (B, h, w) bool, pixels that move."""
+
+    inputs: NetworkInputs
+    targets: LossTargets
+    moving: torch.Tensor
+
+    def __len__(self) -> int:
+        return len(self.inputs)
+
+    def to(self, device: torch.device | str) -> TrainingBatch:
+        """Copy on another device."""
+        return TrainingBatch(
+            self.inputs.to(device), self.targets.to(device), self.moving.to(device)
+        )
+
+
+def collate(samples: Sequence[Sample]) -> TrainingBatch:
+    """Batch of at least one sample, all of one size."""
+
+    def stack(name: str) -> torch.Tensor:
+        return torch.from_numpy(np.stack([getattr(sample, name) for sample in samples]))
+
+    K = stack("K")
+    inputs = assemble_aligned(stack("flow"), stack("depth_prev"), stack("depth_curr"), K)
+    for b, sample in enumerate(samples):
+        if sample.rays is not None:
+            inputs.rays[b] = torch.from_numpy(sample.rays).permute(2, 0, 1)
+    targets = LossTargets(
+        rotation_deg=stack("rotation_deg"),
+        translation=stack("translation"),
+        ego_flow=stack("ego_flow").permute(0, 3, 1, 2),
+        depth_prev=stack("depth_true"),
+        depth_curr=stack("depth_target"),
+        K_prev=K,
+        K_curr=K,
+    )
+    return TrainingBatch(inputs, targets, stack("moving"))
 
 
 def area_under_curve(score: np.ndarray, label: np.ndarray) -> float | None:
@@ -120,9 +164,7 @@ def _errors(output: NetworkOutput, batch: TrainingBatch, selection: str) -> np.n
 
 
 def _uncertainty(output: PixelwisePrediction, batch: TrainingBatch) -> list[np.ndarray]:
-    """Per pair (N, 11) of its valid pixels: moving; of both halves mean s, mean |error|, and
-    |error| / U of each of the three numbers.
-    """
+    """Per pair (N, 11) of its pixels: moving; of both halves mean s, mean |error|, |error| / U."""
     gt = batch.targets
     pick = np.s_[..., ::4, ::4]  # enough for the figures
     valid = batch.inputs.valid[pick]

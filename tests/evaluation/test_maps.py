@@ -12,17 +12,18 @@ import torch
 from hybridvo.cli import main
 from hybridvo.data.sequence import open_sequence
 from hybridvo.errors import InputError
-from hybridvo.evaluation.drawing import draw, flow_panel, networks
-from hybridvo.evaluation.maps import (
+from hybridvo.evaluation.drawing import (
+    draw,
     error_map,
-    flow_colours,
+    flow_panel,
     moving_pixels,
+    networks,
     object_flow,
     prediction_errors,
     uncertainty_maps,
 )
 from hybridvo.evaluation.pair_errors import pair_errors, pair_facts
-from hybridvo.evaluation.plots import Panel, draw_panels
+from hybridvo.evaluation.plots import Panel, draw_panels, flow_colours
 from hybridvo.evaluation.saliency import Saliency, integrated_gradients, saliencies
 from hybridvo.geometry import invert, se3_exp
 from hybridvo.network.inputs import assemble_inputs

@@ -14,7 +14,6 @@ from hybridvo.geometry import invert, se3_exp, se3_log
 from hybridvo.options import TrackOptions
 from hybridvo.results import Reason, RelativePose, State, Status
 from hybridvo.tracking.keyframes import KeyFrame, View
-from hybridvo.tracking.motion_model import MotionModel
 from hybridvo.tracking.pose_graph import (
     FREEDOM,
     Edge,
@@ -23,7 +22,7 @@ from hybridvo.tracking.pose_graph import (
     compose_covariance,
     solve_graph,
 )
-from hybridvo.tracking.state import TrackerState
+from hybridvo.tracking.state import MotionModel, TrackerState
 from hybridvo.tracking.window import Located, Window, locate
 from hybridvo.types import Camera, Frame
 

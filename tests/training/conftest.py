@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
+from hybridvo.synthetic.dataset import Mixture
 from hybridvo.synthetic.diverse import DiverseOptions
 from hybridvo.synthetic.layered import PaperOptions
-from hybridvo.training.stream import Mixture
 
 SIZE = {"height": 32, "width": 64}
 

@@ -7,10 +7,11 @@ import pytest
 import torch
 
 from hybridvo.errors import InputError
-from hybridvo.synthetic.dataset import StoredSamples, write_samples
+from hybridvo.synthetic.dataset import Mixture, StoredSamples, write_samples
 from hybridvo.synthetic.draws import HELD_OUT, STORED, TRAINING, sample_generator
 from hybridvo.synthetic.layered import PaperOptions
-from hybridvo.training.stream import Mixture, SampleStream, collate
+from hybridvo.training.pwvo_task import SampleStream
+from hybridvo.training.validation import collate
 
 
 def flows(loader, count: int) -> list[torch.Tensor]:

@@ -16,10 +16,10 @@ import torch
 from hybridvo.errors import CheckpointError, DegenerateError, InputError
 from hybridvo.network.layers import NetworkOptions
 from hybridvo.network.losses import LossOptions
+from hybridvo.synthetic.dataset import Mixture
 from hybridvo.synthetic.layered import PaperOptions
 from hybridvo.training.options import OptimizerOptions, PwvoOptions, ScheduleOptions
-from hybridvo.training.pwvo_task import PwvoTask
-from hybridvo.training.stream import Mixture, SampleStream
+from hybridvo.training.pwvo_task import PwvoTask, SampleStream
 from hybridvo.training.trainer import Trainer
 
 TINY = PwvoOptions(
@@ -186,7 +186,7 @@ sys.path.insert(0, sys.argv[1])
 from tests.training.test_trainer import TINY, changed
 from hybridvo.synthetic.layered import PaperOptions
 from hybridvo.training.pwvo_task import PwvoTask
-from hybridvo.training.stream import Mixture
+from hybridvo.synthetic.dataset import Mixture
 from hybridvo.training.trainer import Trainer
 dist.init_process_group("gloo")
 torch.set_num_threads(1)

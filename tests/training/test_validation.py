@@ -11,7 +11,7 @@ from hybridvo.results import PixelwisePrediction
 from hybridvo.synthetic.draws import sample_generator
 from hybridvo.synthetic.layered import PaperOptions
 from hybridvo.training import validation
-from hybridvo.training.stream import TrainingBatch, collate
+from hybridvo.training.validation import TrainingBatch, collate
 
 PRESET = PaperOptions(height=32, width=64)
 
