@@ -107,9 +107,7 @@ class MotionPrior:
 
 @dataclass(frozen=True, eq=False)
 class MotionPrediction:
-    """A network's prediction for one pair; ``static_probability`` (h, w), 0 to 1, covers the whole
-    image at any resolution.
-    """
+    """A network's prediction; ``static_probability`` (h, w), 0 to 1, covers the whole image."""
 
     T_curr_prev: np.ndarray
     static_probability: np.ndarray
@@ -122,7 +120,7 @@ class Hypothesis:
 
     Args:
         T_curr_prev: (4, 4).
-        source: which start led here (``identity``, ``prior``, ``window``, ``minimal``, ``refit``).
+        source: what led here (``start``, ``window``, ``minimal``, ``runner-up``, ``refit``).
         inlier_ratio: share of the valid pixels that follow this motion.
         flow_noise_px: standard deviation of the flow about it, px. depth_noise: of log depth.
         inliers: (h, w) float32 in [0, 1], robust weight of each pixel under this motion, on the

@@ -138,7 +138,10 @@ def _train(
             scores = _scores(args, trainer.exported, options.selection, options.data_size, last)
             result["curve"][str(samples)] = {"seconds": round(trainer.elapsed_s), **scores}
         _store(args, name, seed, runs, result, samples)
-    card = {"row": name, **trainer.record, "curve": result["curve"]}
+    trained = {
+        k: v for k, v in provenance("ablation.py", None).items() if k in ("command", "commit")
+    }
+    card = {"row": name, **trained, **trainer.record, "curve": result["curve"]}
     save_weights(folder / "weights.safetensors", trainer.exported, card, "float16")
     return True
 
@@ -255,7 +258,7 @@ def _claim(
         return {
             seed: np.array(run["curve"][samples][preset]["epe_of_pairs"])
             for (name, seed), run in runs.items()
-            if name == row and samples in run["curve"]
+            if name == row and "epe_of_pairs" in run["curve"].get(samples, {}).get(preset, {})
         }
 
     ours, others = epe_of_pairs(better), epe_of_pairs(worse)

@@ -97,15 +97,14 @@ def main(argv: list[str] | None = None) -> int:
     if args.install:
         for name, path in rows.items():
             if path.is_file():
-                install(name, path, content)
+                install(name, path)
     return 0
 
 
-def install(name: str, path: Path, ablation: dict[str, Any]) -> None:
+def install(name: str, path: Path) -> None:
     """Put a row into the package; there it reads every second pixel of the usual 128x256 inputs."""
     network, card = load_weights(path)
     card = without_folders(card)
-    card |= {"command": ablation["command"], "commit": ablation["commit"]}
     network.options = dataclasses.replace(network.options, input_stride=2)
     curve = card.pop("curve")
     scores = curve[max(curve, key=int)]
