@@ -40,6 +40,8 @@ def summarise(rows: list[dict[str, Any]], sequence: Sequence, method: str) -> di
         return float(np.median([row[name] for row in timed])) if timed else None
 
     doubts = [row for row in motions if row["status"] == "ok" and row["message"]]
+    if any("the median depth" in text for text in sequence.warnings):  # said before the run
+        doubts = []
     # what the estimate was given that no sensor gives
     oracle = ["true flow"] if any(row["flow_is_true"] for row in rows) else []
     oracle += ["true depth"] if sequence.depth_source == "true" else []
