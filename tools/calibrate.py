@@ -55,9 +55,8 @@ def main(argv: list[str] | None = None) -> int:
             print(f"  ({slope:.2f}, {offset:.2f})")
             print(f"  AUROC {auroc(p, right)}, calibration error {calibration_error(p, right)}")
             sure = p >= MIN_CONFIDENCE
-            print(
-                f"  right but degraded {(right & ~sure).sum()}, wrong but ok {(~right & sure).sum()}"
-            )
+            flagged, missed = (right & ~sure).sum(), (~right & sure).sum()
+            print(f"  {flagged} right ones degraded, {missed} wrong ones ok")
     return 0
 
 
