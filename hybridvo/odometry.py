@@ -28,10 +28,9 @@ from hybridvo.pipeline import (
 from hybridvo.refinement.photometric import refine_photometric
 from hybridvo.refinement.refine import widened
 from hybridvo.results import MotionPrior, Reason, RelativePose, State, Status, Step
-from hybridvo.tracking.keyframes import KeyFrame
 from hybridvo.tracking.pose_graph import Edge
 from hybridvo.tracking.state import TrackerState
-from hybridvo.tracking.window import STANDSTILL, Window, locate
+from hybridvo.tracking.window import STANDSTILL, KeyFrame, Window, locate
 from hybridvo.trajectory import chain
 from hybridvo.types import Frame, FramePair, as_number, as_rigid, as_seed
 
@@ -149,18 +148,12 @@ class Odometry:
 
     @property
     def edges(self) -> tuple[Edge, ...]:
-        """Motions between key frames and the last frame, each with its covariance and status.
-
-        For a pose graph of one's own; empty without a window.
-        """
+        """Motions between key frames and the last frame, for a graph of one's own; may be empty."""
         window = self._state.window
         return () if window is None else window.found
 
     def predict(self, frames: int = 1) -> MotionPrior | None:
-        """The motion to the frame so many ahead, at constant velocity; None before the first one.
-
-        Its covariance follows from how the last motions changed.
-        """
+        """The motion to the frame so many ahead, at constant velocity; None before the first."""
         if as_number(frames) % 1 or not 1 <= frames <= MAX_FRAMES:
             raise InputError(
                 f"Odometry.predict: expected a number of frames from 1 to {MAX_FRAMES}, "

@@ -107,9 +107,7 @@ class MotionPrior:
 
 @dataclass(frozen=True, eq=False)
 class MotionPrediction:
-    """A network's prediction for one pair; ``static_probability`` (h, w), 0 to 1, covers the whole
-    image at any resolution.
-    """
+    """A network's prediction; ``static_probability`` (h, w), 0 to 1, covers the whole image."""
 
     T_curr_prev: np.ndarray
     static_probability: np.ndarray

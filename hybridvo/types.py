@@ -71,9 +71,7 @@ def as_seed(seed: Any, where: str) -> int:
 
 
 def as_rigid(T: Any, where: str, tolerance: float = 1e-6, *, many: bool = False) -> np.ndarray:
-    """Float64 copy of a rigid transform (4, 4), or of ``many`` (N, 4, 4), rotations to
-    ``tolerance``; the error names the first bad one.
-    """
+    """Float64 copy of a rigid transform (4, 4), or of ``many`` (N, 4, 4), to ``tolerance``."""
     T = to_numpy(T, where)
     if T.dtype.kind not in "fiu" or T.ndim != 2 + many or T.shape[-2:] != (4, 4):
         shape = "(N, 4, 4)" if many else "(4, 4)"

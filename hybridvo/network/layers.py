@@ -159,10 +159,7 @@ class Encoder(nn.Module):
 
 
 class SelfAttention(nn.Module):
-    """Self-attention over all positions, ``x + gain * attended``, with a gain that starts at zero.
-
-    Of the paper's "VONet + self-att.": unscaled dot products, an eighth of the channels.
-    """
+    """Self-attention of the paper's "VONet + self-att.", with a gain that starts at zero."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -187,10 +184,7 @@ def plain_torch() -> Iterator[None]:
 
 
 def initialize(network: nn.Module, uniform: tuple[nn.Module, ...] = ()) -> None:
-    """Glorot-normal weights and zero biases; Glorot-uniform weights inside ``uniform`` (the heads).
-
-    Draws from torch's global generator: seed it to get the same network again.
-    """
+    """Glorot-normal weights (uniform inside ``uniform``, the heads) by torch's global generator."""
     heads = {id(m) for head in uniform for m in head.modules()}
     for module in network.modules():
         if isinstance(module, nn.Conv2d | nn.ConvTranspose2d | nn.Linear):

@@ -62,11 +62,7 @@ class Models:
         return self.weights.get(name) or pretrained(name)
 
     def network(self, name: str) -> Any:
-        """A network, in the form that is fastest on its device.
-
-        Raises:
-            CheckpointError: no such weights, damaged ones, or those of another network.
-        """
+        """A network, in the form that is fastest on its device."""
         import torch
 
         if name not in self._networks:

@@ -42,10 +42,7 @@ class MotionScale:
     start: torch.Tensor
 
     def motion(self, raw: torch.Tensor) -> torch.Tensor:
-        """Motions of raw outputs (B, 6) or (B, 6, h, w), in their type.
-
-        The sum of two small motions: of second order, and the next pass sees what it misses.
-        """
+        """Motions of raw outputs (B, 6) or (B, 6, h, w): the sum of two small ones."""
         shape = (-1, 6) + (1,) * (raw.ndim - 2)
         factor, start = (x.to(raw.dtype).view(shape) for x in (self.factor, self.start))
         return start + factor * raw

@@ -33,19 +33,14 @@ MIN_PIXELS = 64
 
 
 def static_probability(log_scale: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
-    """(B, h, w) probability of being static from log scales (B, 3, h, w) of the rotation.
-
-    Logistic in how far s lies above that of the pixels with weight in the fit; 0 where not valid.
-    """
+    """(B, h, w) logistic in how far log scales (B, 3, h, w) lie above the trusted pixels'."""
     s = log_scale.mean(dim=1)
     trusted = (pixel_weights(log_scale, valid) * s).flatten(1).sum(dim=1)[:, None, None]
     return ((STATIC_AT - (s - trusted)) * STATIC_SLOPE).sigmoid() * valid
 
 
 def propose_motion(network: nn.Module, pair: FramePair) -> MotionPrediction | None:
-    """The motion that a PWVO's trusted pixels agree on after the last pass, and its static world;
-    None where too little is valid, or the answer is not finite.
-    """
+    """The motion that a PWVO's trusted pixels agree on, and its static world; None without."""
     with plain_torch():
         inputs = assemble_inputs(pair)
         if int(inputs.valid.sum()) < MIN_PIXELS:

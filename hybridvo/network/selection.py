@@ -82,10 +82,6 @@ class PoseSeed:
 def select(maps: PixelwisePrediction, method: str = "softmax") -> PoseSeed:
     """The paper's selection as the start of a refinement, with weights from the uncertainty.
 
-    Args:
-        maps: of a :class:`~hybridvo.network.pwvo.PWVO` that was given pairs.
-        method: one of ``SELECTION_METHODS``.
-
     Raises:
         InputError: no prediction, an unknown method.
 
@@ -107,10 +103,7 @@ def select(maps: PixelwisePrediction, method: str = "softmax") -> PoseSeed:
 
 
 def seed_weights(log_scale: torch.Tensor) -> torch.Tensor:
-    """Weights (B, h, w) of the pixels in (0, 1] from log scales (B, C, h, w): exp(-4 (s - min s)).
-
-    Of all log scales those of the rotation tell moving objects best.
-    """
+    """Weights (B, h, w) in (0, 1] from log scales (B, C, h, w): exp(-4 (s - min s))."""
     s = _doubt(log_scale)
     least = s.flatten(1).amin(dim=1)[:, None, None]
     return torch.exp(-SHARPNESS * (s - least)).clamp(min=MIN_WEIGHT)

@@ -302,9 +302,7 @@ def _scalars(
 def prior_information_of(
     depth: torch.Tensor, usable: torch.Tensor, covariance: torch.Tensor | None
 ) -> torch.Tensor:
-    """(B, 6, 6) inverse covariances of the motions expected, translation first; where nobody knows
-    :data:`USUAL_CHANGE` of the image, and of the typical depth.
-    """
+    """(B, 6, 6) inverse covariances of the motions expected; unknown: :data:`USUAL_CHANGE`."""
     inverse = torch.where(usable, 1.0 / depth.clamp(min=1e-6), 0.0).sum((1, 2))
     inverse = (inverse / usable.sum((1, 2)).clamp(min=1)).clamp(min=1e-6)
     usual = torch.stack([inverse] * 3 + [torch.ones_like(inverse)] * 3, dim=1) / USUAL_CHANGE

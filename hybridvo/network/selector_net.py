@@ -187,9 +187,7 @@ class SelectorNetwork(nn.Module):
     def confidence(
         self, score: torch.Tensor, hidden: torch.Tensor, owner: torch.Tensor, images: int
     ) -> torch.Tensor:
-        """(B,) logit of the probability that the best candidate of an image is right, from the
-        scores (N,) of all of its candidates, refits included, and what is ``hidden`` of them.
-        """
+        """(B,) logit of the probability that the best of all candidates of an image is right."""
         out = []
         for b in range(images):
             own, mine = score[owner == b], hidden[owner == b]

@@ -33,12 +33,7 @@ class Weights:
     tensors: dict[str, torch.Tensor]
 
     def build(self, kind: Callable[..., Any], network_of: Callable[[Any], nn.Module]) -> nn.Module:
-        """The network of the file in evaluation mode, by the class of its options and its maker.
-
-        Raises:
-            CheckpointError: options that are not of this kind, or names or shapes of the weights
-                that are not those of the network.
-        """
+        """The network of the file in evaluation mode, by the class of its options and its maker."""
         try:
             network = network_of(kind(**self.options))
         except (InputError, TypeError) as error:

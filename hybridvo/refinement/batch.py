@@ -113,11 +113,7 @@ class Pixels:
         return Pixels(**changed)
 
     def subset(self, count: int) -> Pixels:
-        """About ``count`` usable pixels of each sample, spread evenly in their order.
-
-        One pixel is taken from each of ``count`` equal runs, at a place in the run that follows the
-        golden section, so that no regular structure of the image is met in step.
-        """
+        """About ``count`` usable pixels of each sample, spread by the golden section."""
         order = (self.weight > 0).long().cumsum(dim=1)
         total = order[:, -1:]
         count = min(count, order.shape[1])
@@ -216,10 +212,7 @@ def sample_depth(depth: torch.Tensor, at: torch.Tensor) -> tuple[torch.Tensor, t
 
 
 def to_tiles(x: torch.Tensor, tile: int | None, fill: float = 0.0) -> torch.Tensor:
-    """(..., H, W) -> (..., N): the pixels of each tile side by side, tiles row by row.
-
-    Tiles at the border are completed with ``fill``; without a tile it is the raster order.
-    """
+    """(..., H, W) -> (..., N): tile by tile, borders completed with ``fill``; or raster order."""
     if tile is None:
         return x.flatten(-2)
     x = F.pad(x, (0, -x.shape[-1] % tile, 0, -x.shape[-2] % tile), value=fill)

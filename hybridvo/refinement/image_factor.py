@@ -283,10 +283,7 @@ class ImageFactor:
 
 
 def parts_dispersion(scores: np.ndarray, model: np.ndarray) -> float:
-    """Dispersion of the scores (rows, columns, 6) of tiles, summed over each of :data:`PARTS`.
-
-    1 where the parts are independent and the ``model`` covariance (6, 6) is right.
-    """
+    """Dispersion of the scores (rows, columns, 6) of tiles, summed over each of :data:`PARTS`."""
     found = []
     for shape in PARTS:
         rows, columns = (
@@ -315,10 +312,7 @@ def interpolation(places: np.ndarray) -> csr_array:
 def light_fields(
     to_nodes: csr_array, grey: np.ndarray, r: np.ndarray, w: np.ndarray, least: float = 0.0
 ) -> np.ndarray | None:
-    """Smooth changes of gain and offset (2, nodes) that explain the residuals best.
-
-    None where they explain less than the share ``least`` of the squared residuals.
-    """
+    """Smooth changes of gain and offset (2, nodes) that explain the residuals best, or None."""
     r = np.where(w > 0, r, 0)
     design = hstack([to_nodes.multiply(grey[:, None]), to_nodes], format="csr")
     weighted = design.multiply(w[:, None]).T

@@ -141,12 +141,7 @@ def jacobian(pixels: Pixels, at: Residuals) -> tuple[torch.Tensor, ...]:
 
 @dataclass(frozen=True, eq=False)
 class Weighted:
-    """Residuals at the likely depths under their covariance and the robust kernel.
-
-    cost = how.kernel(torch.where(at.front, found.distance2, behind)).cost
-    cost = (pixels.weight * cost).sum(dim=1)
-    return Linearization(0.5 * (H + H.transpose(2, 3)), g, cost, w.sum(dim=1), found)
-    """
+    """Residuals at the likely depths; ``right`` (B, R, N): their inverse covariance times them."""
 
     at: Residuals
     D: torch.Tensor
@@ -220,10 +215,7 @@ def linearize(
 
 
 def scores(pixels: Pixels, T: pp.LieTensor, how: RobustNoise) -> tuple[torch.Tensor, Weighted]:
-    """(B, 6, N) w J^T Sigma^-1 r of each pixel; their sum is zero at the estimate.
-
-    It is not the gradient of the cost, since Sigma moves with the pose.
-    """
+    """(B, 6, N) w J^T Sigma^-1 r of each pixel; their sum is zero at the estimate."""
     found = weigh(pixels, T, how)
     right = (pixels.weight * found.robust)[:, None] * found.right
     return _along(jacobian(pixels, found.at), right), found

@@ -96,9 +96,7 @@ def load_preset(
     kinds: dict[str, type] = PRESETS,
     size: tuple[int, int] | None = None,
 ) -> Preset:
-    """Generator of ``kinds`` that a file such as ``configs/data_paper.yaml`` describes, for samples
-    of its own ``size`` (height, width) or another.
-    """
+    """Generator that a file such as ``configs/data_paper.yaml`` describes; ``size``: or its own."""
     mapping = read_yaml(path)
     kind = mapping.pop("preset", None)
     if kind not in kinds:

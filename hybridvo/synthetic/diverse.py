@@ -149,10 +149,7 @@ class _Scene(Layers):
         in_front: bool,
         inverse_depth: float | None = None,
     ) -> tuple[int, np.ndarray] | None:
-        """Lay a curved, slanted piece of surface over the image, in front of everything or not.
-
-        Returns its number and the point (3,) in metres at its middle, or None if nothing is seen.
-        """
+        """Lay a curved, slanted surface over the image; its number and middle (3,), or None."""
         rng = self.rng
         left, top, width, height = cv2.boundingRect(mask)
         if not width * height:

@@ -137,11 +137,7 @@ KINDS = ("superellipse", "polygon", "star", "bar")
 
 
 def outline(rng: np.random.Generator, kind: str) -> np.ndarray:
-    """(N, 2) closed outline around the origin, within the unit circle, turned by a random angle.
-
-    ``superellipse``: round to square to pinched; ``polygon``: 3 to 9 corners, convex or not;
-    ``star``: smooth or spiked radial function; ``bar``: thin rectangle.
-    """
+    """(N, 2) closed outline around the origin, within the unit circle, turned by a random angle."""
     if kind == "superellipse":
         angle = np.linspace(0.0, 2 * np.pi, 48, endpoint=False)
         exponent = 2.0 / np.exp(rng.uniform(np.log(0.7), np.log(6.0)))
@@ -204,9 +200,7 @@ class Silhouette:
         share: float,
         stretch: float = 1.0,
     ) -> tuple[np.ndarray, float]:
-        """(H, W) uint8 mask and radius in px at which a share of the image is covered to about 1 %,
-        or the largest share below it that the shape can reach.
-        """
+        """(H, W) uint8 mask and radius in px at which about ``share`` of the image is covered."""
         low, high = 0.0, 4.0 * float(np.hypot(height, width))
         best = np.zeros((height, width), np.uint8)
         radius = low

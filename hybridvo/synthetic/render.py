@@ -178,10 +178,7 @@ class Scene:
         return float(np.mean((self.object_ids[hit] > 0) & (hit >= 0))), float(depth.min())
 
     def dynamic_share(self, index: int, width: int = 96, threshold_px: float = 1.0) -> float:
-        """Share of the pixels whose flow differs from the camera's own by more than a threshold.
-
-        In a small image; the threshold is in px of the full one. A mover may stand nearly still.
-        """
+        """Share of the pixels whose flow differs from the camera's, in px of the full image."""
         views = [_small_view(camera, width) for camera in self.cameras[index : index + 2]]
         size = views[0][0]
         flows = [

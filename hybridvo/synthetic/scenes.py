@@ -74,9 +74,7 @@ def cluster(rng: np.random.Generator, half: np.ndarray, count: int) -> Parts:
 
 
 def cloud(rng: np.random.Generator, frames: int, half: np.ndarray, rate: float) -> Parts:
-    """A deforming sheet of ellipsoids, carried and sheared by two travelling waves: each moves with
-    the field at its centre and deforms with its gradient, so that every point's motion is exact.
-    """
+    """A sheet of ellipsoids, carried and sheared by two travelling waves; exact at every point."""
     columns, rows = 11, 7
     x = np.linspace(-1, 1, columns) * half[0]
     y = np.linspace(-1, 1, rows) * half[1]
@@ -157,11 +155,7 @@ def _furnish(rng: np.random.Generator, spread: float, rise: float) -> list[Solid
 
 @dataclass(frozen=True, eq=False)
 class _Movers:
-    """Draws the movers of one scene of N frames.
-
-    ``guide``: (N + 2 LAG, 4, 4) camera path without shake, padded on both sides; ``view``: tangents
-    of half the horizontal and vertical field of view.
-    """
+    """Draws the movers of a scene along ``guide``, the camera path without shake, padded by LAG."""
 
     rng: np.random.Generator
     guide: np.ndarray
@@ -190,9 +184,7 @@ class _Movers:
         spin_deg: float,
         path: np.ndarray,
     ) -> Mover:
-        """Rigid body whose outline covers about ``share`` of the view; ``at``: right and down as
-        shares of the half view, and depth in metres.
-        """
+        """Rigid body over a ``share`` of the view; ``at``: shares of the half view, and metres."""
         (spread, rise), depth = self.view, at[2]
         area = share * spread * rise * depth**2
         aspect = self.rng.uniform(0.7, 1.8)

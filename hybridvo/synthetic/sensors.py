@@ -101,10 +101,7 @@ def sample_at(depth: np.ndarray, offset: np.ndarray) -> np.ndarray:
 def degrade_depth(
     rng: np.random.Generator, depths: list[np.ndarray], options: SensorOptions
 ) -> list[np.ndarray]:
-    """Depths (H, W) float32 in metres as one sensor would have measured them; 0 is invalid.
-
-    The same strengths for all frames, noise of their own.
-    """
+    """Depths (H, W) float32 in metres as one sensor would have measured them; 0 is invalid."""
     o = options
     quadratic = rng.random() < 0.5
     strength = log_uniform(rng, o.depth_quadratic if quadratic else o.depth_relative)

@@ -73,12 +73,8 @@ class ScheduleOptions:
 class RunOptions:
     """What every training has; the defaults are the paper's.
 
-    Args:
-        steps: updates. batch_size: samples an update and process.
-        precision: of the network's forward pass (``bfloat16`` by autocast).
-        ema_decay: of a running average of the weights, which is then what is exported; 0 = none.
-        evaluate_every: updates between evaluations on development seeds; 0 = none.
-        evaluate_count: held-out samples of each preset.
+    ``ema_decay``: of a running average of the weights, which is then what is exported; 0 = none.
+    ``evaluate_every``: updates between evaluations over ``evaluate_count`` samples of each preset.
     """
 
     seed: int = 0

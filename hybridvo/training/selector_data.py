@@ -215,11 +215,7 @@ def _write(path: Path, arrays: dict[str, Any]) -> None:
 
 
 def write_proposals(folder: Path, network: torch.nn.Module) -> int:
-    """Ask a PWVO about the samples of all shards of a folder: a motion, and where nothing moves.
-
-    The answers stand in the shards; asked again, a network that has learned more replaces them.
-    Returns the number of samples.
-    """
+    """Write a PWVO's answers (motion, static world) into all shards; the number of samples."""
     total = 0
     for path in sorted(folder.glob("*.npz")):
         with np.load(path) as file:

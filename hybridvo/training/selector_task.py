@@ -40,10 +40,7 @@ recordings with movers cut from others."""
 def choice_loss(
     score: torch.Tensor, error: torch.Tensor, owner: torch.Tensor, samples: int
 ) -> torch.Tensor:
-    """Cross entropy against a soft target: motions nearly as good as the best share it.
-
-    Samples in which all motions are far off count little: there the choice does not matter.
-    """
+    """Cross entropy against a soft target: motions nearly as good as the best share it."""
     losses = []
     for b in range(samples):
         mine = owner == b

@@ -203,11 +203,9 @@ def _uncertainty_figures(pixels: list[np.ndarray], index: int, name: str) -> dic
 def calibrate_scales(
     network: torch.nn.Module, preset: Preset, count: int, seed: int = 0
 ) -> dict[str, float]:
-    """Add to s of the translation what makes the mean of |error| / exp(s) one, over ``count``
-    development pairs. The scales of the rotation are left alone: they are the weights of the fit.
+    """Add to s of the translation what makes the mean of |error| / exp(s) one; says how much.
 
-    Returns:
-        ``translation``, what was added to the network's last bias.
+    The scales of the rotation are left alone: they are the weights of the fit.
 
     Raises:
         InputError: a network without uncertainty.

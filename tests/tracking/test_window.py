@@ -13,7 +13,6 @@ from hybridvo.errors import InputError
 from hybridvo.geometry import invert, se3_exp, se3_log
 from hybridvo.options import TrackOptions
 from hybridvo.results import Reason, RelativePose, State, Status
-from hybridvo.tracking.keyframes import KeyFrame, View
 from hybridvo.tracking.pose_graph import (
     FREEDOM,
     Edge,
@@ -23,7 +22,7 @@ from hybridvo.tracking.pose_graph import (
     solve_graph,
 )
 from hybridvo.tracking.state import MotionModel, TrackerState
-from hybridvo.tracking.window import Located, Window, locate
+from hybridvo.tracking.window import KeyFrame, Located, View, Window, locate
 from hybridvo.types import Camera, Frame
 
 HEIGHT, WIDTH = 48, 64
