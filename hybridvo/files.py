@@ -14,21 +14,22 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import IO, Any, Literal, NamedTuple
 
+import filelock
 import yaml
 
-from hybridvo.errors import FormatError, OutputError
+from hybridvo.errors import FormatError, LockedError, OutputError
+
+Mode = Literal["new", "resume", "overwrite"]
+"""What to do with the results that a folder holds already."""
+LOCK = ".run.lock"
 
 
 @contextlib.contextmanager
 def atomic_write(path: str | os.PathLike[str], mode: Literal["w", "wb"] = "w") -> Iterator[IO[Any]]:
     """Open a file whose content appears under its name completely or not at all.
 
-    The content goes into a new file of the same folder, is flushed to the disk and renamed over
-    ``path``. A symbolic link at ``path`` is replaced, never followed. Text is UTF-8 with Unix line
-    ends.
-
-    Raises:
-        OutputError: the file cannot be created, written or renamed; ``path`` is then unchanged.
+    A symbolic link at ``path`` is replaced, never followed. Text is UTF-8 with Unix line ends. With
+    an OutputError ``path`` is unchanged.
     """
     path = Path(path)
     if path.exists() and not (path.is_file() or path.is_dir()):
@@ -55,6 +56,26 @@ def make_folder(path: Path) -> None:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"{path}: cannot be created: {error.strerror or error}.") from error
+
+
+@contextlib.contextmanager
+def held(folder: Path) -> Iterator[None]:
+    """Make a folder for results and hold it; a LockedError where another run does."""
+    make_folder(folder)
+    lock = filelock.FileLock(folder / LOCK)
+    try:
+        lock.acquire(timeout=0)
+    except filelock.Timeout:
+        text = f"{folder}: held by another run. Wait for it, or choose another --out."
+        raise LockedError(text) from None
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be written: {error.strerror}.") from error
+    try:
+        yield
+    finally:
+        # removed before it is released: afterwards it may be another run's
+        (folder / LOCK).unlink(missing_ok=True)
+        lock.release()
 
 
 def write_json(path: str | os.PathLike[str], value: Any) -> None:
@@ -110,9 +131,6 @@ def read_rows(path: str | os.PathLike[str], columns: str, *, words: int = 0) -> 
     """Rows of a list file: a number for each of ``columns``, the last ``words`` of them text.
 
     ``#`` starts a comment; the last word may contain spaces. Commas separate numbers too.
-
-    Raises:
-        FormatError: a row of another length or a number that cannot be read, with its line.
     """
     count = len(columns.split())
     rows = []

@@ -1,8 +1,7 @@
 """Optical flow for a pair of frames: from files, from OpenCV's DIS, or from any callable.
 
-A provider is a callable ``(prev: Frame, curr: Frame) -> FlowField``. It never raises on bad images:
-pixels without a match are invalid, and where no flow can be had at all it is None, for which the
-estimators return ``failed(no_flow)``.
+A provider never raises on bad images: pixels without a match are invalid, and where no flow can be
+had at all it is None, for which the estimators return ``failed(no_flow)``.
 """
 
 from __future__ import annotations
@@ -27,6 +26,8 @@ DIS_PRESETS = {
     "medium": cv2.DISOPTICAL_FLOW_PRESET_MEDIUM,
 }
 _logger = logging.getLogger(__name__)
+# a DIS object that two threads use at once ends the process
+_of_thread = threading.local()
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,28 +63,12 @@ def dis_flow(preset: str = "medium") -> FlowProvider:
     may serve several trackers and threads. Where an image has no texture (a covered lens, a dropped
     frame, parallel stripes) there is no flow: DIS would return zero there, in both directions.
 
-    Args:
-        preset: effort: ``ultrafast``, ``fast`` or ``medium``.
-
-    Raises:
-        InputError: an unknown preset.
+    ``preset`` is the effort: ``ultrafast``, ``fast`` or ``medium``.
     """
     if preset not in DIS_PRESETS:
         raise InputError(f"DIS preset: expected {', '.join(DIS_PRESETS)}, got {preset!r}.")
-    return _Dis(preset)
 
-
-# a DIS object that two threads use at once ends the process
-_of_thread = threading.local()
-
-
-@dataclass(frozen=True)
-class _Dis:
-    """See :func:`dis_flow`."""
-
-    preset: str
-
-    def __call__(self, prev: Frame, curr: Frame) -> FlowField:
+    def provide(prev: Frame, curr: Frame) -> FlowField:
         none = FlowField(None, source="dis")
         if prev.rgb is None or curr.rgb is None or prev.rgb.shape != curr.rgb.shape:
             return none
@@ -91,13 +76,15 @@ class _Dis:
         second = cv2.cvtColor(curr.rgb, cv2.COLOR_RGB2GRAY)
         if not (_textured(first) and _textured(second)):
             return none
-        if not hasattr(_of_thread, self.preset):
-            setattr(_of_thread, self.preset, cv2.DISOpticalFlow.create(DIS_PRESETS[self.preset]))
-        dis = getattr(_of_thread, self.preset)
+        if not hasattr(_of_thread, preset):
+            setattr(_of_thread, preset, cv2.DISOpticalFlow.create(DIS_PRESETS[preset]))
+        dis = getattr(_of_thread, preset)
         forward, backward = _calc_dis(dis, first, second), _calc_dis(dis, second, first)
         if forward is None or backward is None:
             return none
         return FlowField(forward, *forward_backward_check(forward, backward), "dis")
+
+    return provide
 
 
 def _calc_dis(dis: Any, first: np.ndarray, second: np.ndarray) -> np.ndarray | None:
@@ -131,12 +118,9 @@ def forward_backward_check(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Variance and validity from the disagreement of the flows (H, W, 2) in both directions, px.
 
-    The error is e(x) = |F(x) + B(x + F(x))| with B sampled bilinearly.
-
-    Returns:
-        variance (H, W) float32 px^2 per component, base^2 + (factor e)^2 of ``DIS_NOISE`` and at
-        most (5 px)^2; valid (H, W) bool: False where the error exceeds 1.5 px and 5 % of the flow,
-        or where the flow leaves the image or is not finite.
+    The error is e(x) = |F(x) + B(x + F(x))|. The variance (H, W), px^2 per component, is base^2 +
+    (factor e)^2 of ``DIS_NOISE``, at most (5 px)^2; valid (H, W) is False where e exceeds 1.5 px
+    and 5 % of the flow, or where the flow leaves the image or is not finite.
     """
     height, width = forward.shape[:2]
     du, dv = cv2.split(np.nan_to_num(forward, nan=1e9, posinf=1e9, neginf=-1e9))
@@ -265,10 +249,9 @@ def check_field(result: Any, prev: Frame, source: str) -> FlowField:
 def contradiction(pair: FramePair) -> str | None:
     """Why the flow of a pair cannot be that of its images, as a sentence, or None.
 
-    A flow with the wrong sign, direction, unit, channel order or of another pair is a flawless flow
-    of another motion; only the images show it: such a flow warps one image onto the other no better
-    than no flow does. None also where the flow was computed from the images (source ``dis``), where
-    one of them is missing, or where there is too little texture.
+    A flow with the wrong sign, direction, unit or pair warps one image onto the other no better
+    than no flow does. None also where the flow was computed from the images (``dis``), where one of
+    them is missing, or where there is too little texture.
     """
     rgb_prev, rgb_curr, flow = pair.prev.rgb, pair.curr.rgb, pair.flow
     if rgb_prev is None or rgb_curr is None or flow is None or pair.flow_source == "dis":

@@ -196,10 +196,6 @@ def load_options(
     ``path`` is a YAML file, or None for the defaults; the values of ``assignments`` are YAML;
     those of ``given``, such as ``{"run.method": "refine"}``, are left out where they are None.
 
-    Raises:
-        InputError: no such file, an unknown key (the nearest known one is named), a value that is
-            out of bounds. FormatError: the file is no YAML mapping.
-
     Example:
         >>> load_options(assignments=["refine.cutoff=2.5"]).refine.cutoff
         2.5

@@ -31,19 +31,16 @@ MIN_PAIRS = 6
 SIGMAS = 4.0
 """Standard errors from which on a difference is reported."""
 MIN_SCALE_ERROR = 0.2
-"""Wrong units err by more; ground truth with noise of millimetres by half of that over short
-motions."""
+"""Wrong units err by more, noisy ground truth over short motions by half of that."""
 MIN_SHIFT_PX = 1.0
 MIN_SHIFT_GAIN = 0.0015
-"""Shift and fall of the cost from which on depth is reported as shifted. Five registered sequences,
-rendered and real, give up to 0.9 px and 0.0008; shifted by 2 and 3 px 0.0022 to 0.02."""
+"""Fall of the cost: registered sequences give up to 0.0008, shifted by 2 and 3 px over 0.0022."""
 MAX_GREY_STEP = 0.15
 """Change of the logarithm of the mean brightness between neighbours that is called a step."""
 MAX_CONTRADICTED = 0.2
 """Fraction of the pairs whose flow may contradict their images."""
 DARK_LEVEL = 20.0
-"""Grey levels (of 255) below which nine tenths of a dark image lie; lit rooms and night streets
-have a tenth above 60."""
+"""Grey levels (of 255) below which nine tenths of a dark image lie; of a street at night, 60."""
 REACH_PX = 4
 """Largest shift of the depth map that is tried."""
 MIN_PIXELS, MAX_PIXELS = 100, 3000
@@ -155,11 +152,7 @@ def is_dark(rgb: np.ndarray | None) -> bool:
 
 
 def _shift_costs(pair: FramePair, motion: RelativePose) -> np.ndarray | None:
-    """(9, 9) mean image cost, 0 to 1, of the pixels at depth edges under shifts of the depth map.
-
-    A depth map that is shifted against its image gives pixels at the edges of near things the depth
-    of what lies beside them, which the motion moves to the wrong place. None: too few edges.
-    """
+    """(9, 9) mean image cost, 0 to 1, of pixels at depth edges under shifts of the depth map."""
     prev, curr, weights = pair.prev, pair.curr, motion.weights
     if weights is None or weights.shape != prev.camera.shape or prev.depth is None:
         return None
@@ -210,10 +203,7 @@ def _edge_pixels(
 
 
 def _minimum(cost: np.ndarray) -> np.ndarray:
-    """(right, down) px of the minimum of a cost over shifts, between the pixels by parabolas.
-
-    The depth of a pixel is found at x + shift: so far it stands from its image.
-    """
+    """(right, down) px of the minimum of a cost over shifts, between the pixels by parabolas."""
     row, column = np.unravel_index(np.argmin(cost), cost.shape)
 
     def vertex(values: np.ndarray, k: int) -> float:

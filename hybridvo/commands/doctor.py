@@ -21,14 +21,9 @@ _OPTIONAL = {
 
 
 def doctor() -> dict[str, Any]:
-    """What a bug report should hold, JSON-ready.
+    """What a bug report should hold, JSON-ready; ``usable``: whether ``hybridvo run`` can work.
 
-    Returns:
-        ``hybridvo``, ``python``, ``platform``; ``packages`` (name: version or None); ``missing``
-        (required packages, each with its pip command); ``optional`` (name: empty or the command);
-        ``devices`` (name: ``works`` or the error); ``threads``; ``warm_up_s`` (cost of the first
-        call); ``methods`` (name: empty or why it cannot run); ``usable`` (whether ``hybridvo run``
-        can work).
+    ``missing``, ``optional`` and ``methods`` map names to the remedy, empty where all is well.
     """
     try:
         lines = [line for line in requires("hybridvo") or [] if "extra ==" not in line]

@@ -45,9 +45,7 @@ def interruptible(stop: Callable[[], Any] | None = None) -> Iterator[threading.E
 class Progress:
     """Work done, on stderr: a bar on a terminal, a line every few seconds elsewhere.
 
-    Args:
-        total: units of work. label: what is run. quiet: show nothing. unit: name of the units.
-        done: units finished before, which do not count for the speed. console: where to write.
+    ``done`` units of the ``total`` were finished before and do not count for the speed.
     """
 
     def __init__(

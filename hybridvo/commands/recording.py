@@ -35,9 +35,8 @@ class Recording:
     """Writes a recording as the frames come in; use as a context manager.
 
     ``identity`` is the same for all parts of one run: where the file exists, as after ``--resume``,
-    a part is written beside it that the viewer shows together with it. The number of ``frames``
-    decides the stride of the images, ``first`` is that of the first one, ``poses`` (N, 4, 4) are
-    the ground truth T_world_cam.
+    a part is written beside it that the viewer shows with it. ``frames`` is their number, ``first``
+    that of the first one, ``poses`` (N, 4, 4) the true T_world_cam.
     """
 
     def __init__(
@@ -123,11 +122,9 @@ class Recording:
             log("flow", self._jpeg(flow_colours(flow, longest_flow(flow)), size))
         if step.motion.weights is not None:
             weights = (255 * np.clip(step.motion.weights, 0.0, 1.0)).astype(np.uint8)
-            log("weights", self._jpeg(np.repeat(weights[..., None], 3, axis=2), size))
+            log("weights", self._jpeg(weights, size))
 
     def _jpeg(self, rgb: np.ndarray, size: tuple[int, int]) -> Any:
         enlarged = rgb.shape[1] < size[0]  # weights may stand on a coarser grid
         method = cv2.INTER_NEAREST if enlarged else cv2.INTER_AREA
-        bgr = cv2.resize(np.ascontiguousarray(rgb[..., ::-1]), size, interpolation=method)
-        _, content = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, 70])
-        return self._rr.EncodedImage(contents=content.tobytes(), media_type="image/jpeg")
+        return self._rr.Image(cv2.resize(rgb, size, interpolation=method)).compress(70)

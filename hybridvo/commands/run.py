@@ -22,11 +22,11 @@ from hybridvo.commands import results
 from hybridvo.commands.diagnose import is_dark
 from hybridvo.commands.progress import Progress, interruptible
 from hybridvo.commands.recording import Recording, check_recording
-from hybridvo.commands.run_folder import RESULTS, STATE, Mode, RunFolder
+from hybridvo.commands.run_folder import RESULTS, STATE, RunFolder
 from hybridvo.data.sequence import Sequence
 from hybridvo.errors import InputError
 from hybridvo.evaluation.pair_errors import pair_errors, true_motion, true_trajectory
-from hybridvo.files import fingerprint, versions
+from hybridvo.files import Mode, fingerprint, versions
 from hybridvo.flow import (
     FlowField,
     FlowProvider,
@@ -67,10 +67,6 @@ def run(
 
     ``out`` is by default ``runs/NAME``; ``rrd`` is the file of a Rerun recording, empty for
     ``recording.rrd`` in the output folder.
-
-    Raises:
-        InputError: input or options that cannot be used, or a broken frame with ``strict``.
-        LockedError: another run holds the folder. OutputError: a result cannot be written.
     """
     method = options.run.method
     models = models or Models(options.run.device)

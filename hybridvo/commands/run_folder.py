@@ -1,39 +1,35 @@
 """The output folder of one run: lock, refusal to overwrite, frames kept as they finish.
 
-``run.json`` says what the run is and how far it came, ``steps.csv`` gets a line as each frame
-finishes. ``checkpoint.npz`` holds the rows and the tracker's state after every fiftieth: a run that
-was killed goes on from there.
+``checkpoint.npz`` holds the rows and the tracker's state: a run that was killed goes on from there.
 """
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-import filelock
 import numpy as np
 
-from hybridvo.errors import InputError, LockedError, OutputError
-from hybridvo.files import atomic_write, make_folder, write_csv, write_json
+from hybridvo.errors import InputError, OutputError
+from hybridvo.files import Mode, atomic_write, held, write_csv, write_json
 
 RESULTS = (
     *("trajectory.tum", "trajectory.kitti", "trajectory.png"),
     *("steps.csv", "steps.npz", "metrics.json", "recording.rrd"),
 )
 """Files that a finished run may leave beside ``run.json``."""
-STATE, STEPS, CHECKPOINT, LOCK = "run.json", "steps.csv", "checkpoint.npz", ".run.lock"
+STATE, STEPS, CHECKPOINT = "run.json", "steps.csv", "checkpoint.npz"
 STEP_COLUMNS = (
     *("index", "timestamp", "status", "reason", "probability"),
     *("tx", "ty", "tz", "rx", "ry", "rz"),
     *("inlier_ratio", "iterations", "cost", "flow_ms", "motion_ms", "frame_ms"),
     *("prev_index", "flow_source", "message"),
 )
-
-Mode = Literal["new", "resume", "overwrite"]
 
 
 class RunFolder:
@@ -47,10 +43,6 @@ class RunFolder:
         rows: of the finished frames, JSON-ready, in order.
         tracker: arrays of the tracker's state after them where the run is resumed, or None.
         finished: whether the run that is resumed was complete already.
-
-    Raises:
-        LockedError: another run holds the folder. OutputError: it cannot be written.
-        InputError: results that ``mode`` does not allow, or those of another run.
     """
 
     def __init__(
@@ -66,29 +58,16 @@ class RunFolder:
         self.finished = False
         self._identity = json.loads(json.dumps(identity))
         self._header = dict(header)
-        make_folder(self.path)
-        self._lock = filelock.FileLock(self.path / LOCK)
-        try:
-            self._lock.acquire(timeout=0)
-        except filelock.Timeout:
-            raise LockedError(
-                f"{self.path}: held by another run. Wait for it, or choose another --out."
-            ) from None
-        except OSError as error:
-            raise OutputError(f"{self.path}: cannot be written: {error.strerror}.") from error
-        try:
+        with contextlib.ExitStack() as stack:
+            stack.enter_context(held(self.path))
             self._prepare(mode)
-        except BaseException:
-            self.__exit__()
-            raise
+            self._held = stack.pop_all()
 
     def __enter__(self) -> RunFolder:
         return self
 
     def __exit__(self, *_: object) -> None:
-        # removed before it is released: afterwards it may be another run's
-        (self.path / LOCK).unlink(missing_ok=True)
-        self._lock.release()
+        self._held.close()
 
     def _prepare(self, mode: Mode) -> None:
         present = [name for name in (STATE, *RESULTS) if os.path.lexists(self.path / name)]

@@ -81,11 +81,7 @@ def parse_camera(
 
 
 def read_camera_file(path: Path) -> Calibration:
-    """Calibration of a YAML or JSON file.
-
-    Three vocabularies are read: ours (:data:`KNOWN`), ROS's ``camera_info`` (calibration file or
-    message), RealSense's intrinsics (ppx, ppy, coeffs).
-    """
+    """Calibration of a YAML or JSON file in our words (:data:`KNOWN`), ROS's or RealSense's."""
     text = read_text(path).removesuffix("---\n")  # as ROS prints it
     content = parse_yaml(text, str(path))
     if not isinstance(content, dict):
@@ -116,11 +112,7 @@ def read_camera_file(path: Path) -> Calibration:
 
 
 def units_per_metre(scale: float | None, where: str, told: list[str]) -> float | None:
-    """Stored units per metre, and a warning where the inverse was given.
-
-    A value below 1 is RealSense's number of the same name, metres per unit: no depth is stored in
-    units longer than a metre.
-    """
+    """Stored units per metre; below 1 it is RealSense's number, metres per unit, with a warning."""
     if scale is None:
         return None
     if not (np.isfinite(scale) and scale > 0):

@@ -1,8 +1,7 @@
 """Readers and writers of image, depth, flow and camera files.
 
 Every reader compares the size that a header declares with that of the file before it decodes
-anything. A file that does not fit its format is a :class:`FormatError` with path, expected and
-found; none is a ``FileNotFoundError``.
+anything. A file that does not fit its format is a FormatError; none is a ``FileNotFoundError``.
 """
 
 from __future__ import annotations

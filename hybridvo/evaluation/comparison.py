@@ -1,7 +1,6 @@
 """Methods beside each other on sequences: same frames, same flow, same clock, scored against truth.
 
-Every method runs as :class:`hybridvo.odometry.Odometry`, exactly as in ``hybridvo run``: for the
-same frames and the same flow both give the same motions. One sequence is the unit of work and of
+Every method runs as in ``hybridvo run`` and gives the same motions. One sequence is the unit of
 resume: what it gave is one file in ``parts/`` until the comparison is done.
 """
 
@@ -18,14 +17,13 @@ from collections.abc import Sequence as Several
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-import filelock
 import pandas as pd
 
 import hybridvo
 from hybridvo.data.sequence import Sequence, open_sequence
-from hybridvo.errors import HybridVOError, InputError, LockedError
+from hybridvo.errors import HybridVOError, InputError
 from hybridvo.evaluation.drawing import draw_worst
 from hybridvo.evaluation.protocols import Protocol, check_protocol, protocol_summary
 from hybridvo.evaluation.scores import ROW_COLUMNS, breakdown, total_row, worst_pairs
@@ -36,13 +34,12 @@ from hybridvo.evaluation.sequence_job import (
     pair_table,
     run_sequence,
 )
-from hybridvo.files import fingerprint, make_folder, versions, write_csv, write_json
+from hybridvo.files import Mode, fingerprint, held, make_folder, versions, write_csv, write_json
 from hybridvo.network.models import Models
 from hybridvo.pipeline import METHODS, check_method, weights_hash
 
 WRITTEN = ("results.json", "results.csv", "pairs.csv", "report.md", "report.html")
 """What a finished comparison leaves, beside ``trajectories/`` and ``worst/``."""
-Mode = Literal["new", "resume", "overwrite"]
 ReportProgress = Callable[[str, int, int], None]
 """Called with a message (or the empty string), pairs done and pairs in all."""
 
@@ -63,7 +60,6 @@ def compare(
     Raises:
         InputError: options, sequences or methods that cannot be used. LockedError: another run
             holds the folder. OutputError: a result cannot be written.
-        KeyboardInterrupt: finished sequences are kept for ``resume``.
     """
     from hybridvo.evaluation.report import write_report
 
@@ -222,15 +218,11 @@ def _folder(out: Path, mode: Mode) -> Iterator[None]:
             f"{out}: holds {', '.join(present)}; pass --resume to go on, --overwrite to replace "
             f"them, or another --out."
         )
-    make_folder(out)
-    try:
-        with filelock.FileLock(out / ".lock", timeout=0):
-            if mode == "overwrite":
-                for name in ("parts", "trajectories", "worst"):
-                    shutil.rmtree(out / name, ignore_errors=True)
-            yield
-    except filelock.Timeout:
-        raise LockedError(f"{out}: another run holds this folder.") from None
+    with held(out):
+        if mode == "overwrite":
+            for name in ("parts", "trajectories", "worst"):
+                shutil.rmtree(out / name, ignore_errors=True)
+        yield
 
 
 def _work(jobs: list[Job], out: Path, report: ReportProgress) -> list[dict[str, Any]]:

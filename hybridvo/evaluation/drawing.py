@@ -43,10 +43,6 @@ def draw(
     ``pair`` is its first frame, ``out`` a .png beside which the numbers stand as .json; ``flow`` is
     ``auto`` (files where there are some), ``file`` or ``dis``; ``weights`` are networks to look
     through, by default the pretrained ones; ``steps`` those of the integrated gradients.
-
-    Raises:
-        InputError: unknown pair or weights, or an image that exists or is no PNG.
-        OutputError: the image cannot be written.
     """
     out = Path(out)
     if out.suffix.lower() != ".png":

@@ -37,8 +37,8 @@ NOT_FINITE = "the error is not a finite number: positions are too large"
 class Association:
     """Poses of two trajectories that belong together: (M,) indices into each.
 
-    ``total`` counts the poses of the shorter one, ``by`` is ``time`` or ``index``, ``max_diff`` the
-    largest time difference allowed (s), ``reason`` why no error can be computed from the matches.
+    ``total`` counts the poses of the shorter one, ``by`` is ``time`` or ``index``, ``reason`` says
+    why no error can be computed from the matches, ``max_diff`` is in seconds.
     """
 
     est_indices: np.ndarray
@@ -264,12 +264,8 @@ def kitti_drift(
     """Drift of (N, 4, 4) poses as KITTI's odometry benchmark defines it (Geiger et al., CVPR 2012).
 
     From every frame and for every length L (m), the sub-path ends at the first frame whose distance
-    along the true path exceeds L; translation and angle of its relative error are divided by L and
-    averaged within each length, then over the lengths. Nothing is aligned or scaled.
-
-    Returns:
-        ``translation`` (fraction) and ``rotation_deg_per_m``, None with ``reasons`` where the path
-        is shorter than every length; ``segments``.
+    along the true path exceeds L; translation (a fraction) and angle of its relative error are
+    divided by L and averaged within each length, then over the lengths. Nothing is aligned.
     """
     est, gt = np.asarray(T_world_cam_est), np.asarray(T_world_cam_gt)
     steps = np.linalg.norm(np.diff(gt[:, :3, 3], axis=0), axis=1)
@@ -312,8 +308,6 @@ def evaluate(
     ``kitti_drift`` over 100 to 800 m, ``kitti_drift_short`` over 5 to 40 m; ``reasons`` holds why
     a value is None.
 
-    Raises:
-        InputError: no trajectory, or an unknown option.
     """
     import evo
 

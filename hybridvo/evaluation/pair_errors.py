@@ -1,9 +1,4 @@
-"""Errors of one relative pose against the true one: the paper's three, and metric ones beside them.
-
-``epe`` is the paper's: the mean over pixels *and components* of the absolute difference of ego
-flows at 128x256, with invalid pixels set to zero but counted. ``epe_l2_px`` is the usual end-point
-error: the mean L2 distance over valid pixels at native size.
-"""
+"""Errors of one relative pose against the true one: the paper's three, and metric ones."""
 
 from __future__ import annotations
 
@@ -71,7 +66,7 @@ def _native_epe(
 def _paper_epe(
     T_est: np.ndarray, T_gt: np.ndarray, depth: np.ndarray, prev: Camera, curr: Camera
 ) -> float | None:
-    """Component mean of |F_ego - F~_ego| at 128x256; None where no pixel has a depth."""
+    """Mean over pixels *and components* of |F_ego - F~_ego| at 128x256; invalid ones count as 0."""
     # nearest at pixel centres: centre i of the small grid lies at (i + 0.5) / s - 0.5
     rows, columns = (
         ((np.arange(small) + 0.5) * size / small).astype(int)

@@ -53,10 +53,6 @@ def plot_trajectories(
     Everything is drawn in the first camera of the truth (or of each trajectory without truth):
     x right, y down, z forward. Estimates are aligned as ``alignment`` says, or by their first pose
     where a path does not determine it (the legend says which).
-
-    Raises:
-        InputError: no trajectory, or a name that does not end in .png, .pdf or .svg.
-        OutputError: it cannot be written.
     """
     path = Path(path)
     if not trajectories:

@@ -60,10 +60,7 @@ NO_MERIT = ("pairs", "moving [%]", "time [ms]", "+ flow [ms]")
 
 
 def write_report(folder: Path, result: Mapping[str, Any], pairs: pd.DataFrame) -> None:
-    """Write ``report.html`` and ``report.md`` into the folder of a comparison.
-
-    ``result`` is what ``results.json`` holds, ``pairs`` the table of all pairs.
-    """
+    """Write both reports; ``result`` is what ``results.json`` holds, ``pairs`` all pairs."""
     import jinja2
     from plotly.offline import get_plotlyjs
 

@@ -92,11 +92,10 @@ def last_pass(network: Any, pair: FramePair) -> tuple[Any, Any, Any]:
 def saliencies(network: Any, inputs: Any, T_start: Any, steps: int) -> dict[str, Saliency]:
     """Integrated gradients of rotation and translation over flow and inverse depth.
 
-    The answer is the length of the predicted rotation (or translation) along its own direction. Of
-    a pixel-wise network it is that of the pixels and weights that the selection chose for the real
-    input: with the choice itself inside, the answer would jump along the path. The path starts at
-    zero flow and zero inverse depth; for scale-free networks, which see the logarithm of the
-    depth, at zero flow. What earlier passes found is held fixed.
+    The answer is the length of the predicted rotation (or translation) along its own direction; of
+    a pixel-wise network with the pixels and weights chosen for the real input: the choice would
+    make it jump. The path starts at zero; scale-free networks see the logarithm of the depth, which
+    is held fixed, as is what earlier passes found.
     """
     names = ("flow",) if network.options.scale_free else ("flow", "inverse_depth")
     given = tuple(getattr(inputs, name) for name in names)

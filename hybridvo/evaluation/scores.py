@@ -75,10 +75,6 @@ def is_failed(pairs: pd.DataFrame) -> pd.Series:
     return pairs["status"].str.startswith("failed")
 
 
-def _median(values: pd.Series) -> float | None:
-    return float(values.median()) if values.notna().any() else None
-
-
 def pair_scores(pairs: pd.DataFrame) -> dict[str, Any]:
     """Everything that is a mean, median or count over the pairs of one method and flow."""
     scored = pairs[pairs["rot_err_deg"].notna()]
@@ -89,16 +85,15 @@ def pair_scores(pairs: pd.DataFrame) -> dict[str, Any]:
     rates = failure_rate(pairs)
     rates.pop("pairs")
     flow_ms = pairs["flow_ms"].where(~pairs["method"].isin(READS_NO_FLOW), 0.0)
-    moving = pairs["dynamic_fraction"]
     scores |= rates | {
         "pairs": len(pairs),
         "failed": int(is_failed(pairs).sum()),
         "pairs_scored": len(scored),
-        "epe_l2_px_median": _median(pairs["epe_l2_px"]),
-        "ms_per_pair_median": _median(pairs["ms"]),
-        "flow_ms_median": _median(flow_ms),
-        "ms_with_flow_median": _median(pairs["ms"] + flow_ms),
-        "dynamic_fraction": float(moving.mean()) if moving.notna().any() else None,
+        "epe_l2_px_median": known_number(pairs["epe_l2_px"].median()),
+        "ms_per_pair_median": known_number(pairs["ms"].median()),
+        "flow_ms_median": known_number(flow_ms.median()),
+        "ms_with_flow_median": known_number((pairs["ms"] + flow_ms).median()),
+        "dynamic_fraction": known_number(pairs["dynamic_fraction"].mean()),
     }
     for name, value in scores.items():
         if value is None and name not in reasons:

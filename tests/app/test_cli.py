@@ -13,7 +13,7 @@ from hybridvo import __version__
 from hybridvo.cli import main
 from hybridvo.commands.arguments import KINDS
 from hybridvo.commands.arguments import METHODS as NAMED
-from hybridvo.commands.run_folder import LOCK
+from hybridvo.files import LOCK
 
 
 def write_tum(path: Path, noise: float = 0.0) -> str:

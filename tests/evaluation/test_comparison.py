@@ -17,6 +17,7 @@ from hybridvo.data.sequence import open_sequence
 from hybridvo.errors import InputError, LockedError
 from hybridvo.evaluation.comparison import WRITTEN, compare, expand, methods_to_run
 from hybridvo.evaluation.sequence_job import PAIR_COLUMNS, ComparisonOptions
+from hybridvo.files import LOCK
 from hybridvo.network.models import Models
 from hybridvo.odometry import Odometry
 from hybridvo.pipeline import METHODS, weights_hash
@@ -189,7 +190,7 @@ def test_a_bug_of_a_method_costs_its_pairs(tiny: Path, tmp_path: Path, monkeypat
 
 def test_refused_folders(tiny: Path, tmp_path: Path) -> None:
     (tmp_path / "held").mkdir()
-    with filelock.FileLock(tmp_path / "held" / ".lock"), pytest.raises(LockedError):
+    with filelock.FileLock(tmp_path / "held" / LOCK), pytest.raises(LockedError):
         compare(make_options(tiny), tmp_path / "held")
 
 
