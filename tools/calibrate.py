@@ -21,6 +21,8 @@ from golden_inputs import HEAVY
 from measuring import auroc, ego_flow_error
 from scipy.optimize import minimize
 
+from hybridvo.calibration import MIN_CONFIDENCE
+
 HEAVY_SEEDS = range(900, 906)
 RIDGE = 0.02
 """Penalty on the squared slope, times the number of answers."""
@@ -52,6 +54,9 @@ def main(argv: list[str] | None = None) -> int:
             p = 1 / (1 + np.exp(-slope * gaps - offset))
             print(f"  ({slope:.2f}, {offset:.2f})")
             print(f"  AUROC {auroc(p, right)}, calibration error {calibration_error(p, right)}")
+            sure = p >= MIN_CONFIDENCE
+            flagged, missed = (right & ~sure).sum(), (~right & sure).sum()
+            print(f"  {flagged} right ones degraded, {missed} wrong ones ok")
     return 0
 
 
