@@ -21,7 +21,13 @@ from golden_inputs import HEAVY
 from measuring import auroc, ego_flow_error
 from scipy.optimize import minimize
 
+from hybridvo import refine
 from hybridvo.calibration import MIN_CONFIDENCE
+from hybridvo.hypotheses.selector import CueSelector
+from hybridvo.network.models import Models
+from hybridvo.pipeline import Context
+from hybridvo.results import RelativePose
+from hybridvo.synthetic.semi_real import load_split
 
 HEAVY_SEEDS = range(900, 906)
 RIDGE = 0.02
@@ -33,7 +39,6 @@ def build_parser() -> argparse.ArgumentParser:
         prog="calibrate.py", description=(__doc__ or "").splitlines()[0]
     )
     parser.add_argument("--pairs", type=int, default=200, help="semi-real pairs")
-    parser.add_argument("--heavy", type=int, default=6, help="rendered scenes of each kind")
     parser.add_argument("--selector", metavar="FILE", help="weights instead of the shipped ones")
     parser.add_argument("--data", type=Path, default=Path("../shared/data"), metavar="DIR")
     return parser
@@ -41,9 +46,10 @@ def build_parser() -> argparse.ArgumentParser:
 
 def main(argv: list[str] | None = None) -> int:
     args = build_parser().parse_args(argv)
+    models = Models(weights={"selector": args.selector} if args.selector else None)
     rows: dict[str, list[tuple[float, bool]]] = {"cues": [], "selector": [], "clear": []}
     for pair, T, depth, limit in pairs(args):
-        for name, gap, error in answers(pair, T, depth, args.selector):
+        for name, gap, error in answers(pair, T, depth, models):
             rows[name].append((gap, error <= max(WRONG_PX, WRONG_FACTOR * limit)))
     for name, some in rows.items():
         right = np.array([r for _, r in some])
@@ -62,9 +68,6 @@ def main(argv: list[str] | None = None) -> int:
 
 def pairs(args: argparse.Namespace) -> Iterator[tuple[Any, np.ndarray, np.ndarray, float]]:
     """(pair, true motion, depth of the static pixels, error inside the true mask)."""
-    from hybridvo import refine
-    from hybridvo.synthetic.semi_real import load_split
-
     recordings = load_split(args.data, "development")
     for k in range(args.pairs):
         drawn = draw("development", k, recordings)
@@ -73,23 +76,17 @@ def pairs(args: argparse.Namespace) -> Iterator[tuple[Any, np.ndarray, np.ndarra
         limit = ego_flow_error(told.T_curr_prev, drawn.T_curr_prev, depth, drawn.pair)
         yield drawn.pair, drawn.T_curr_prev, depth, limit
     for kind in HEAVY:
-        for seed in list(HEAVY_SEEDS)[: args.heavy]:
+        for seed in HEAVY_SEEDS:
             for flow, pair, T, _ in heavy_pairs(kind, seed):
                 if flow == "dis":
                     yield pair, T, pair.prev.depth, 0.0
 
 
 def answers(
-    pair: Any, T: np.ndarray, depth: np.ndarray, selector: str | None
+    pair: Any, T: np.ndarray, depth: np.ndarray, models: Models
 ) -> Iterator[tuple[str, float, float]]:
     """(which probability, the gap it is computed from, error in px) of both selectors."""
-    from hybridvo.hypotheses.selector import CueSelector
-    from hybridvo.network.models import Models
-    from hybridvo.pipeline import Context
-    from hybridvo.results import RelativePose
-
-    weights = {"selector": selector} if selector else None
-    ctx = Context(models=MODELS.setdefault(selector, Models(weights=weights)))
+    ctx = Context(models=models)
     found = ctx.search(pair)
     if isinstance(found, RelativePose):
         return
@@ -99,9 +96,6 @@ def answers(
     for name, selection in chosen.items():
         motion = ctx.refine(pair, found, selection)
         yield name, selection.gap, ego_flow_error(motion.T_curr_prev, T, depth, pair)
-
-
-MODELS: dict[str | None, Any] = {}
 
 
 def fit(gaps: np.ndarray, right: np.ndarray) -> tuple[float, float]:

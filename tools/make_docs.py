@@ -225,6 +225,23 @@ def sequences(content: dict[str, Any]) -> list[str]:
     return lines
 
 
+def semi_real(content: dict[str, Any]) -> list[str]:
+    """Real surfaces: wrong choices, and whether the stated probability tells them."""
+    shares = ("wrong", "wrong_world_majority", "wrong_ok", "right_not_ok", "right_not_ok_static")
+    rows = [
+        [f"`{name}`", *(f"{row[k]['count']} of {row[k]['of']}" for k in shares)]
+        + [number(row[k]) for k in ("auroc", "ece", "median_px_right")]
+        for name, row in content["summary"].items()
+    ]
+    header = ["wrong", "world in the majority", "wrong but ok", "right, not ok", "static, not ok"]
+    names = ["method", *header, "AUROC", "calibration error", "median px"]
+    return [
+        *table(names, rows),
+        "",
+        f"Recordings of the {content['split']} part. {source(content)}",
+    ]
+
+
 def costs(part: dict[str, Any]) -> list[str]:
     """Wall time of a pair and of a whole frame, memory, batches."""
     sizes = list(part["pair_ms"])
@@ -277,8 +294,8 @@ def lines_of(name: str, results: Results) -> list[str]:
     """Lines of a table; none where its figures are missing."""
     if name in paper_tables.TABLES:
         return paper_tables.TABLES[name](results)
-    if name == "sequences":
-        return sequences(results[name]) if name in results else []
+    if name in ALONE:
+        return ALONE[name](results[name]) if name in results else []
     key, make = TABLES[name]
     content = results.get("benchmark", {})
     return make(content[key]) if key in content else []
@@ -295,8 +312,11 @@ TABLES: dict[str, tuple[str, Callable[[dict[str, Any]], list[str]]]] = {
     "costs": ("costs", costs),
 }
 """Tables by name: the part of docs/results/benchmark.json, and what makes lines of it."""
+ALONE = {"sequences": sequences, "semi_real": semi_real}
+"""Tables of a JSON file of their own."""
 PAGE = (
     ("Most of the image moves", "heavy"),
+    ("Real surfaces with movers", "semi_real"),
     ("Known noise", "scenarios", "model_noise"),
     ("Recorded sequences", "real"),
     ("Whole sequences", "sequences"),
