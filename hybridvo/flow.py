@@ -6,6 +6,7 @@ had at all it is None, for which the estimators return ``failed(no_flow)``.
 
 from __future__ import annotations
 
+import functools
 import logging
 import threading
 import time
@@ -68,23 +69,25 @@ def dis_flow(preset: str = "medium") -> FlowProvider:
     if preset not in DIS_PRESETS:
         raise InputError(f"DIS preset: expected {', '.join(DIS_PRESETS)}, got {preset!r}.")
 
-    def provide(prev: Frame, curr: Frame) -> FlowField:
-        none = FlowField(None, source="dis")
-        if prev.rgb is None or curr.rgb is None or prev.rgb.shape != curr.rgb.shape:
-            return none
-        first = cv2.cvtColor(prev.rgb, cv2.COLOR_RGB2GRAY)
-        second = cv2.cvtColor(curr.rgb, cv2.COLOR_RGB2GRAY)
-        if not (_textured(first) and _textured(second)):
-            return none
-        if not hasattr(_of_thread, preset):
-            setattr(_of_thread, preset, cv2.DISOpticalFlow.create(DIS_PRESETS[preset]))
-        dis = getattr(_of_thread, preset)
-        forward, backward = _calc_dis(dis, first, second), _calc_dis(dis, second, first)
-        if forward is None or backward is None:
-            return none
-        return FlowField(forward, *forward_backward_check(forward, backward), "dis")
+    return functools.partial(_dis, preset)
 
-    return provide
+
+def _dis(preset: str, prev: Frame, curr: Frame) -> FlowField:
+    """See :func:`dis_flow`."""
+    none = FlowField(None, source="dis")
+    if prev.rgb is None or curr.rgb is None or prev.rgb.shape != curr.rgb.shape:
+        return none
+    first = cv2.cvtColor(prev.rgb, cv2.COLOR_RGB2GRAY)
+    second = cv2.cvtColor(curr.rgb, cv2.COLOR_RGB2GRAY)
+    if not (_textured(first) and _textured(second)):
+        return none
+    if not hasattr(_of_thread, preset):
+        setattr(_of_thread, preset, cv2.DISOpticalFlow.create(DIS_PRESETS[preset]))
+    dis = getattr(_of_thread, preset)
+    forward, backward = _calc_dis(dis, first, second), _calc_dis(dis, second, first)
+    if forward is None or backward is None:
+        return none
+    return FlowField(forward, *forward_backward_check(forward, backward), "dis")
 
 
 def _calc_dis(dis: Any, first: np.ndarray, second: np.ndarray) -> np.ndarray | None:

@@ -26,10 +26,10 @@ def test_ranking_and_calibration_of_a_probability() -> None:
 
 def test_the_fit_finds_the_weights_that_made_the_answers() -> None:
     rng = np.random.default_rng(0)
-    X = rng.standard_normal((4000, 2))
-    right = rng.random(4000) < 1 / (1 + np.exp(-(1.5 * X[:, 0] - 0.5 * X[:, 1] + 1)))
-    weights = calibrate.fit(X, right)
-    # the penalty draws them a little towards zero
-    np.testing.assert_allclose(weights, [1.5, -0.5, 1.0], atol=0.35)
-    stated = 1 / (1 + np.exp(-X @ weights[:2] - weights[2]))
+    gaps = rng.standard_normal(4000)
+    right = rng.random(4000) < 1 / (1 + np.exp(-(1.5 * gaps + 1)))
+    slope, offset = calibrate.fit(gaps, right)
+    # the penalty draws the slope a little towards zero
+    np.testing.assert_allclose([slope, offset], [1.5, 1.0], atol=0.35)
+    stated = 1 / (1 + np.exp(-slope * gaps - offset))
     assert benchmark.calibration_error(stated, right) < 0.05

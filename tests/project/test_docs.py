@@ -97,7 +97,7 @@ def test_generated_tables_are_those_of_the_tool():
     assert made.fill(paper, results) == paper, "run python tools/make_docs.py"
     page = (ROOT / "docs/results.md").read_text(encoding="utf-8")
     assert made.page(results) == page, "run python tools/make_docs.py"
-    assert page.count("\n## ") <= 5
+    assert page.count("\n## ") <= 6
 
 
 def test_results_say_how_they_were_made_and_stay_small():
