@@ -10,8 +10,7 @@ CUES_RIGHT = (0.26, 1.26)
 """Of the cue scores: 259 of 316 answers right. The gap says little (AUROC .68, calibration error
 .05), so that a motion with a rival is hardly ever sure."""
 SELECTOR_RIGHT = (0.71, 0.40)
-"""Of the selector's scores: 293 of 316 answers right, AUROC .91, calibration error .02. The
-network's own confidence adds nothing to the gap."""
+"""Of the selector's scores: 293 of 316 answers right, AUROC .91, calibration error .02."""
 CLEAR_RIGHT = 0.99
 """Share of right answers where the first motion explains nearly all that is usable."""
 CUE_WEIGHTS = {
@@ -28,7 +27,7 @@ CUE_WEIGHTS = {
 ``python tools/golden.py --only /refine`` shows what they give."""
 MIN_CONFIDENCE = 0.85
 """Probability of being right below which a motion is degraded: a choice between flags on right
-answers and wrong ones without; the same command prints how many of each."""
+answers and wrong ones without; ``python tools/calibrate.py`` prints how many of each."""
 CLEAR_COHERENCE = 0.5
 """Spatial correlation of the residuals above which even a motion that most of the image follows may
 be a compromise: 0.02 for independent noise, 0.25 to 0.4 for DIS flow of static scenes, above 0.6

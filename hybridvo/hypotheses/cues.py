@@ -26,9 +26,7 @@ MIN_NOISE_PX = 0.05
 """Noise of the flow below which motions are equally sharp."""
 
 
-def cue_scores(
-    found: HypothesisSet, motions: Sequence[Hypothesis], prior: MotionPrior | None = None
-) -> np.ndarray:
+def cue_scores(found: HypothesisSet, motions: Sequence[Hypothesis]) -> np.ndarray:
     """Score of each motion, larger is more likely the camera's.
 
     Objects are compact and mostly inside the image: their share of the image exceeds their share of
@@ -64,7 +62,6 @@ def cue_scores(
             "spread": spread,
             "behind": behind,
             "noise": np.log(max(motion.flow_noise_px, MIN_NOISE_PX) / sharpest),
-            "prior": agreement(motion.T_curr_prev, prior),
             "dominant": share > DOMINANT,
         }
         scores[k] = sum(CUE_WEIGHTS[name] * value for name, value in cues.items())

@@ -13,10 +13,10 @@ from typing import Protocol
 
 import numpy as np
 
-from hybridvo.calibration import CLEAR_RIGHT, CUES_RIGHT, SELECTOR_RIGHT
+from hybridvo.calibration import CLEAR_RIGHT, CUE_WEIGHTS, CUES_RIGHT, SELECTOR_RIGHT
 from hybridvo.geometry import invert, pose_matrix, se3_log
 from hybridvo.hypotheses import search
-from hybridvo.hypotheses.cues import cue_scores
+from hybridvo.hypotheses.cues import agreement, cue_scores
 from hybridvo.hypotheses.generate import (
     SOURCE_REFIT,
     GridMaps,
@@ -167,7 +167,8 @@ class CueSelector:
         candidates = _searched(found)
         motions = hypotheses(found, candidates)
         seen = cue_scores(found, motions)
-        scores = seen if prior is None else cue_scores(found, motions, prior)
+        expected = np.array([agreement(motion.T_curr_prev, prior) for motion in motions])
+        scores = seen + CUE_WEIGHTS["prior"] * expected
         # a prior may say which motion; that it is right the image has to say
         best = int(np.argmax(scores))
         gap = min(seen[best] - np.delete(seen, best).max(initial=-np.inf), NO_RIVAL)
