@@ -19,7 +19,6 @@ from weakref import WeakKeyDictionary
 
 import cv2
 import numpy as np
-from scipy.sparse import csr_array, hstack
 
 from hybridvo.calibration import EVEN_PARTS, UNEVEN_LIGHT
 from hybridvo.options import RefineOptions
@@ -111,7 +110,6 @@ class ImageFactor:
         self._r, self._w = np.empty(n, np.float32), np.empty(n, np.float32)
         self._light = np.array([1.0, 0.0], np.float32)
         self._places = index * [(ROWS - 1) / prev.height, (COLUMNS - 1) / prev.width]
-        self._to_nodes = interpolation(self._places)
         tile = tile_size(prev.shape, RefineOptions().tiles)
         self._tiles = -(-prev.height // tile), -(-prev.width // tile)
         self._tile = rows // tile * self._tiles[1] + columns // tile
@@ -193,17 +191,21 @@ class ImageFactor:
         self._at = T
 
     def _weigh(self) -> float:
-        """Weights, H and g of the last projection under the light that fits best; the cost."""
-        self._sum()
+        """Weights, H and g of the last projection; then the light that fits best is taken.
+
+        Returns the cost under that light, to second order.
+        """
+        cost = self._sum()
         (a, b), (_, c) = self._H[6:, 6:]
-        gain, determinant = float(self._light[0]), a * c - b * b
+        g, determinant = self._g[6:], a * c - b * b
+        gain = float(self._light[0])
         if determinant > 1e-9 * a * c > 0:
-            gain += (c * self._g[6] - b * self._g[7]) / determinant
+            gain += (c * g[0] - b * g[1]) / determinant
         more = np.float32(min(max(gain, GAINS[0]), GAINS[1])) - self._light[0]
-        shift = np.float32((self._g[7] - b * more) / c if c > 0 else 0.0)
+        shift = np.float32((g[1] - b * more) / c if c > 0 else 0.0)
         self._r -= more * self._buffer[kernels.GREY] + shift
         self._light += more, shift
-        return self._sum()
+        return cost - 0.5 * float(g @ (more, shift))
 
     def _sum(self) -> float:
         """Weights, H (8, 8) and g (8,) of motion, gain and offset; the cost."""
@@ -220,28 +222,22 @@ class ImageFactor:
 
     def _settle(self) -> None:
         """Noise of the last projection, and the light under it."""
-        step = max(1, len(self._index) // 2000)  # enough for 3 %
-        lengths, weight = np.abs(self._r[::step]), self._buffer[kernels.W, ::step]
-        seen = lengths >= 0  # not NaN
-        if seen.any():
-            order = np.argsort(lengths[seen])
-            reached = np.cumsum(weight[seen][order])
-            middle = np.searchsorted(reached, 0.5 * reached[-1])
-            self.noise = 1.4826 * float(lengths[seen][order[min(middle, len(order) - 1)]])
-        self.noise = max(self.noise, NOISE_FLOOR)
+        lengths = np.abs(self._r[~np.isnan(self._r)])
+        if len(lengths):
+            self.noise = max(1.4826 * float(np.median(lengths)), NOISE_FLOOR)
         self._weigh()
 
     def _even_light(self, least: float) -> bool:
         """Put fields of gain and offset into the grey values where they explain enough."""
-        buffer, (gain, _), r, w = self._buffer, self._light, self._r, self._w
-        grey, few = buffer[kernels.GREY], self._to_nodes[::4]
-        if least > 0 and light_fields(few, grey[::4], r[::4], w[::4], least) is None:
+        buffer, (gain, _), r, w, places = self._buffer, self._light, self._r, self._w, self._places
+        grey, few = buffer[kernels.GREY], np.s_[::4]
+        if least > 0 and light_fields(places[few], grey[few], r[few], w[few], least) is None:
             return False
-        fields = light_fields(self._to_nodes, grey, r, w)
+        fields = light_fields(places, grey, r, w)
         if fields is None:
             return False
-        more, shift = (self._to_nodes @ field for field in fields)
-        self._r -= more * buffer[kernels.GREY] + shift
+        more, shift = (kernels.read_field(places, COLUMNS, field) for field in fields)
+        self._r -= more * grey + shift
         factor = 1 + more / gain
         buffer[[kernels.GREY, kernels.GX, kernels.GY]] *= factor
         buffer[kernels.GREY] += shift / gain
@@ -297,27 +293,17 @@ def parts_dispersion(scores: np.ndarray, model: np.ndarray) -> float:
     return float(np.mean(found))
 
 
-def interpolation(places: np.ndarray) -> csr_array:
-    """(N, ROWS x COLUMNS) bilinear weights of the nodes at places (N, 2) in cells of the fields."""
-    whole = places.astype(np.intp)
-    f, first = places - whole, whole[:, 0] * COLUMNS + whole[:, 1]
-    v, u = f.T
-    weights = np.stack([(1 - v) * (1 - u), (1 - v) * u, v * (1 - u), v * u], axis=1)
-    nodes = first[:, None] + [0, 1, COLUMNS, COLUMNS + 1]
-    starts = np.arange(0, weights.size + 1, 4)
-    shape = len(places), ROWS * COLUMNS
-    return csr_array((weights.ravel().astype(np.float32), nodes.ravel(), starts), shape)
-
-
 def light_fields(
-    to_nodes: csr_array, grey: np.ndarray, r: np.ndarray, w: np.ndarray, least: float = 0.0
+    places: np.ndarray, grey: np.ndarray, r: np.ndarray, w: np.ndarray, least: float = 0.0
 ) -> np.ndarray | None:
-    """Smooth changes of gain and offset (2, nodes) that explain the residuals best, or None."""
-    r = np.where(w > 0, r, 0)
-    design = hstack([to_nodes.multiply(grey[:, None]), to_nodes], format="csr")
-    weighted = design.multiply(w[:, None]).T
-    H, g = (weighted @ design).toarray().astype(np.float64), weighted @ r.astype(np.float64)
-    nodes = ROWS * COLUMNS
+    """Smooth changes of gain and offset (2, nodes) that explain the residuals best, or None.
+
+    ``places`` (N, 2): rows and columns in cells of the fields.
+    """
+    r, nodes = np.where(w > 0, r, np.float32(0)), ROWS * COLUMNS
+    H, g = np.zeros((2 * nodes, 2 * nodes)), np.zeros(2 * nodes)
+    kernels.add_fields(places, COLUMNS, grey, r, w, H, g)
+    H += np.triu(H, 1).T
     scale = np.repeat([np.trace(H[:nodes, :nodes]), np.trace(H[nodes:, nodes:])], nodes) / nodes
     H += SMOOTH * scale * np.kron(np.eye(2), _differences())
     # and a weak pull to no change, for nodes that no pixel is near to

@@ -224,3 +224,51 @@ def weigh_pixels(buf, noise, J, r, w):
             cost += costs[j]
         total += cost
     return total
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def bilinear(row, column, columns, node, share):
+    """The four nodes around a place, and their shares of it."""
+    i, j = int(row), int(column)
+    v, u = row - i, column - j
+    for a in range(4):
+        di, dj = a // 2, a % 2
+        node[a] = (i + di) * columns + j + dj
+        share[a] = (v if di else 1 - v) * (u if dj else 1 - u)
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def add_fields(places, columns, grey, r, w, H, g):
+    """Add to the normal equations (upper triangle of ``H``, ``g``) of fields of gain and offset.
+
+    ``places`` (N, 2) rows and columns among the nodes, read bilinearly; first the nodes of the
+    gain, then those of the offset.
+    """
+    nodes = len(g) // 2
+    node, share = np.empty(8, np.int64), np.empty(8)
+    for k in range(len(r)):
+        if not w[k] > 0:
+            continue
+        bilinear(places[k, 0], places[k, 1], columns, node, share)
+        for a in range(4):
+            node[4 + a], share[4 + a] = nodes + node[a], share[a]
+            share[a] *= grey[k]
+        for a in range(8):
+            g[node[a]] += w[k] * share[a] * r[k]
+            for b in range(8):
+                if node[b] >= node[a]:
+                    H[node[a], node[b]] += w[k] * share[a] * share[b]
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def read_field(places, columns, field):
+    """Values (N,) float32 of a field between its nodes."""
+    out = np.empty(len(places), np.float32)
+    node, share = np.empty(4, np.int64), np.empty(4)
+    for k in range(len(places)):
+        bilinear(places[k, 0], places[k, 1], columns, node, share)
+        value = 0.0
+        for a in range(4):
+            value += share[a] * field[node[a]]
+        out[k] = value
+    return out

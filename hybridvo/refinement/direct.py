@@ -1,0 +1,127 @@
+"""A motion from the images and depth maps alone, coarse to fine: no flow is needed.
+
+Where the motion explains nearly all of the image, nothing else moves: it is the answer. Where it
+does not, something moves, or the images are too far apart: it is one start among others.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from weakref import WeakKeyDictionary
+
+import cv2
+import numpy as np
+
+from hybridvo.calibration import DIRECT_RIGHT
+from hybridvo.options import Options
+from hybridvo.refinement.image_factor import ImageFactor, blurred, choose_pixels
+from hybridvo.refinement.photometric import refine_photometric
+from hybridvo.refinement.plane_factor import PlaneFactor
+from hybridvo.refinement.solver import Factor, gauss_newton
+from hybridvo.results import RelativePose
+from hybridvo.types import Camera, Frame, FramePair
+
+REDUCTIONS = (8, 4, 2)
+"""Of the image, coarse to fine, before the image itself."""
+MIN_SIDE = 24
+"""Of a reduced image, px."""
+PIXELS, STEPS = 4000, 8
+"""Pixels used and Gauss-Newton steps on a reduced image, at most."""
+SPREAD = np.repeat([0.3, 0.15], 3)
+"""Standard deviation of the motion before the images are seen, m and rad: it decides nothing."""
+SHIFT_PX, GREY = 0.25, 1.0
+"""A residual is noise where so small a shift of the image, and grey levels, explain it."""
+NEIGHBOURS = 3
+"""Side, in points of the grid, of the squares whose mean residual is taken for light."""
+_REDUCED: WeakKeyDictionary[Frame, dict[int, Frame]] = WeakKeyDictionary()
+"""Reduced frames by reduction, as long as the frame is kept."""
+
+
+def direct_start(
+    pair: FramePair, T_start: np.ndarray | None = None, options: Options | None = None
+) -> RelativePose | None:
+    """The motion that the images and depth maps agree on, from a start (4, 4) or the identity.
+
+    Its ``inlier_ratio`` is the share of the pixels in view of both that it explains, its
+    ``probability`` of being the camera's follows from that. None where the images do not match.
+    """
+    images = (options or Options()).photometric
+    prev, curr = pair.prev, pair.curr
+    if any(x is None for x in (prev.rgb, prev.depth, curr.rgb, curr.depth)):
+        return None
+    ones = np.ones(prev.camera.shape, np.float32)
+    planes = PlaneFactor.of(pair, ones, 1.0, images.image_inflation)
+    if planes is None:
+        return None
+    start = RelativePose(covariance=np.diag(SPREAD**2), weights=ones, method="direct")
+    T = np.eye(4) if T_start is None else T_start
+    for by in REDUCTIONS:
+        if min(prev.camera.shape) < by * MIN_SIDE:
+            continue
+        small = FramePair(reduced(prev, by), reduced(curr, by), None)
+        weights = np.ones(small.prev.camera.shape, np.float32)
+        grey = [blurred(frame, images.blur_px[-1]) for frame in (small.prev, small.curr)]
+        index = choose_pixels(grey[0], small.prev.depth, weights, min(PIXELS, weights.size // 4))
+        if not len(index):
+            continue
+        factor = ImageFactor(small, start.replace(weights=weights), index, images.image_inflation)
+        factor.use(*grey, T)
+        factors: list[Factor] = [factor, planes] if planes.estimate(T) else [factor]
+        T = gauss_newton(factors, T, STEPS, tolerance=0.1).T
+    finest = replace(images, blur_px=images.blur_px[-1:], prior_inflation=1.0)
+    found = refine_photometric(pair, start.replace(T_curr_prev=T), finest)
+    if found.photometric is None or not found.photometric.taken:
+        return None
+    return _explained(pair, planes, found)
+
+
+def reduced(frame: Frame, by: int) -> Frame:
+    """The frame at 1 / ``by`` of its size: the image averaged, depth picked."""
+    known = _REDUCED.setdefault(frame, {})
+    if by not in known:
+        K, height, width = frame.camera, frame.camera.height // by, frame.camera.width // by
+        whole = np.s_[: height * by, : width * by]
+        assert frame.rgb is not None and frame.depth is not None
+        rgb = cv2.resize(frame.rgb[whole], (width, height), interpolation=cv2.INTER_AREA)
+        depth = frame.depth[whole][by // 2 :: by, by // 2 :: by]
+        cx, cy = ((c - (by - 1) / 2) / by for c in (K.cx, K.cy))
+        camera = Camera(K.fx / by, K.fy / by, cx, cy, height, width)
+        known[by] = Frame(rgb, np.ascontiguousarray(depth), camera)
+    return known[by]
+
+
+def _explained(pair: FramePair, planes: PlaneFactor, found: RelativePose) -> RelativePose:
+    """The motion with the pixels that follow it, and its probability."""
+    T, report = found.T_curr_prev, found.photometric
+    assert report is not None
+    planes.estimate(T)
+    at = planes.residuals(T)
+    (height, width), (v, u) = pair.prev.camera.shape, planes.index.T
+    x, y = at.at.T
+    inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
+    before, after = (blurred(frame, 1.0) for frame in (pair.prev, pair.curr))
+    now = cv2.remap(after, at.at.astype(np.float32)[:, None], None, cv2.INTER_LINEAR)[:, 0]
+    residual = planes.on_grid(np.where(inside, now - report.gain * before[v, u], 0))
+    count = planes.on_grid(inside.astype(np.float32))
+    square = NEIGHBOURS, NEIGHBOURS
+    light = cv2.blur(residual, square) / np.maximum(cv2.blur(count, square), 1e-6)
+    d2 = (residual - light)[planes.cells] ** 2
+    right, below = np.minimum(u + 1, width - 1), np.minimum(v + 1, height - 1)
+    slope2 = (before[v, right] - before[v, np.maximum(u - 1, 0)]) ** 2
+    slope2 += (before[below, u] - before[np.maximum(v - 1, 0), u]) ** 2
+    usual = 9 * (GREY**2 + (SHIFT_PX / 2) ** 2 * slope2)
+    depth = np.where(at.seen, planes.robust(T), 1.0)
+    follows = inside & (usual / (usual + d2) * depth > 0.5)
+    share = float(np.count_nonzero(follows)) / max(int(np.count_nonzero(inside)), 1)
+    slope, offset = DIRECT_RIGHT
+    z = at.z[at.seen]
+    weights = cv2.resize(
+        planes.on_grid(follows.astype(np.float32)), (width, height), interpolation=cv2.INTER_NEAREST
+    )
+    return found.replace(
+        inlier_ratio=share,
+        probability=float(1 / (1 + np.exp(-slope * share - offset))),
+        weights=weights,
+        depth_noise=float(np.median(planes.noise(z) / z)) / np.sqrt(2),
+        terms=("images", "depth"),
+    )
