@@ -141,7 +141,7 @@ def _rendered_pairs(rng: np.random.Generator, seed: int, height: int, width: int
     scene = training_scene(seed, height, width)
     frames = [scene.render(k) for k in (0, 1)]
     flow, _, _ = scene.flow(0)
-    camera = scene.camera(0)
+    camera = scene.cameras[0]
     T = invert(scene.T_world_cam[1]) @ scene.T_world_cam[0]
     depth = [np.where(np.isfinite(f.depth), f.depth, 0).astype(np.float32) for f in frames]
     known = frames[0].object_id >= 0
