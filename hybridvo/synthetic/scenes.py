@@ -253,7 +253,7 @@ def make_scene(
 ) -> Scene:
     """Scene of a family, drawn from a seed.
 
-    Kinds: ``static``; ``light`` (several movers, about 30 % of the pixels); ``pair`` (small random);
+    Kinds: ``static``; ``light`` (several movers, about 30 % of the pixels); ``pair`` (small, any);
     ``heavy_rigid``, ``heavy_deforming``, ``heavy_two``, ``heavy_ten``: 46 to 75 % of the pixels on
     movers in every frame, and at least 46 % whose flow differs from the camera's by over 1/512 of
     the width. ``frames``: default 20, for ``pair`` 2; ``zoom``: relative amplitude of a slow change

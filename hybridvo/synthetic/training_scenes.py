@@ -96,8 +96,8 @@ def _hall(b: _Builder) -> None:
         shape = BOX if radius > 0.22 else CYLINDER
         for x in np.arange(low[0] + pitch, high[0] - 0.3 * pitch, pitch):
             for z in np.arange(3.2, high[2] - 0.5 * pitch, 1.3 * pitch):
-                half = (radius, (high[1] - low[1]) / 2, radius)
-                b.add(shape, half, (x, (high[1] + low[1]) / 2, z))
+                column = (radius, (high[1] - low[1]) / 2, radius)
+                b.add(shape, column, (x, (high[1] + low[1]) / 2, z))
     for _ in range(int(rng.integers(2, 12))):
         z, half = rng.uniform(2.5, high[2] - 0.5), rng.uniform(0.15, 0.7, 3)
         x = np.clip(rng.uniform(-1.1, 1.1) * b.view[0] * z, low[0] + half[0], high[0] - half[0])
