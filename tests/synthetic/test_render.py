@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hybridvo.data.image_io import read_cam, read_dpt, read_flo, read_mask_png, read_rgb
+from hybridvo.data.image_io import read_cam, read_depth, read_flow, read_mask_png, read_rgb
 from hybridvo.data.sequence import Sequence
 from hybridvo.errors import InputError, OutputError
 from hybridvo.geometry import ego_flow, invert, pixel_grid, rotation_angle
@@ -382,7 +382,7 @@ def test_write_sintel_sizes_and_round_trip(tmp_path):
         camera = base / "camdata_left/demo" / f"{stem}.cam"
         assert os.path.getsize(depth) == 12 + 4 * 32 * 64
         assert os.path.getsize(camera) == 172
-        np.testing.assert_array_equal(read_dpt(depth), rendered.depth)
+        np.testing.assert_array_equal(read_depth(depth), rendered.depth)
         K, T_cam_world = read_cam(camera)
         np.testing.assert_array_equal(K, scene.cameras[index].K)
         np.testing.assert_allclose(invert(T_cam_world), scene.T_world_cam[index], atol=1e-12)
@@ -395,7 +395,7 @@ def test_write_sintel_sizes_and_round_trip(tmp_path):
             flow, occlusion, _ = scene.flow(index)
             path = base / "flow/demo" / f"{stem}.flo"
             assert os.path.getsize(path) == 12 + 8 * 32 * 64
-            np.testing.assert_array_equal(read_flo(path), flow)
+            np.testing.assert_array_equal(read_flow(path)[0], flow)
             mask = read_mask_png(base / "occlusions/demo" / f"{stem}.png")
             np.testing.assert_array_equal(mask, occlusion)
 
