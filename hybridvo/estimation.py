@@ -64,11 +64,15 @@ def estimate(
     _check_kind("estimate.options", options, Options)
     _check_kind("estimate.prior", prior, MotionPrior, type(None))
     seed = as_seed(seed, "estimate.seed")
+    flow = None
     if curr is not None or isinstance(pair, Frame):
-        pair = _pair_of(pair, curr, options)
+        for name, frame in (("first of two", pair), ("second of two", curr)):
+            _check_kind(f"estimate, {name}", frame, Frame)
+        pair, flow = FramePair(pair, curr, None), dis_flow(options.flow.dis_preset)
     _check_kind("estimate, a pair", pair, FramePair)
     models = models or default_models(options.run.device if networks_of(method) else "cpu")
-    return widened(run_method(pair, method, Context(options, prior, seed, None, models)))
+    context = Context(options, prior, seed, None, models, flow=flow)
+    return widened(run_method(pair, method, context))
 
 
 @overload
@@ -166,14 +170,6 @@ def warm_up(method: str = DEFAULT_METHOD, models: Models | None = None) -> float
         run_method(FramePair(frame, frame, flow, variance, flow[..., 0] < 1e3), method, context)
         run_method(FramePair(frame, frame, flow), method, context)
     return time.perf_counter() - started
-
-
-def _pair_of(prev: Any, curr: Any, options: Options) -> FramePair:
-    """A pair of two frames with DIS flow between them."""
-    for name, frame in (("first of two", prev), ("second of two", curr)):
-        _check_kind(f"estimate, {name}", frame, Frame)
-    flow = dis_flow(options.flow.dis_preset)(prev, curr)
-    return FramePair(prev, curr, flow.flow, flow.variance, flow.valid, flow.source, flow.is_true)
 
 
 def _check_kind(what: str, value: Any, *kinds: type) -> None:

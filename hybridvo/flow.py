@@ -6,12 +6,11 @@ had at all it is None, for which the estimators return ``failed(no_flow)``.
 
 from __future__ import annotations
 
-import functools
 import logging
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -73,8 +72,16 @@ def dis_flow(preset: str = "medium") -> FlowProvider:
     """
     if preset not in DIS_PRESETS:
         raise InputError(f"DIS preset: expected {', '.join(DIS_PRESETS)}, got {preset!r}.")
+    return _Dis(preset)
 
-    return functools.partial(_dis, preset)
+
+@dataclass(frozen=True)
+class _Dis:
+    preset: str
+    source = "dis"
+
+    def __call__(self, prev: Frame, curr: Frame) -> FlowField:
+        return _dis(self.preset, prev, curr)
 
 
 def _dis(preset: str, prev: Frame, curr: Frame) -> FlowField:
@@ -195,6 +202,7 @@ class MeasuredFlow:
 
     def __init__(self, provider: FlowProvider) -> None:
         self._provider = provider
+        self.source = getattr(provider, "source", "")
         self.reset()
 
     def reset(self) -> None:
@@ -210,6 +218,21 @@ class MeasuredFlow:
             self.fields[key] = self._provider(prev, curr)
             self.ms += 1e3 * (time.perf_counter() - started)
         return self.fields[key]
+
+
+def with_flow(
+    pair: FramePair, provider: Callable[[Frame, Frame], Any], source: str = "callable"
+) -> FramePair:
+    """The pair with the flow of a provider, or of any callable, which is checked."""
+    field = check_field(provider(pair.prev, pair.curr), pair.prev, source)
+    return replace(
+        pair,
+        flow=field.flow,
+        flow_variance=field.variance,
+        flow_valid=field.valid,
+        flow_source=field.source,
+        flow_is_true=field.is_true,
+    )
 
 
 def fallback(first: FlowProvider, second: FlowProvider) -> FlowProvider:

@@ -11,7 +11,7 @@ import numpy as np
 
 from hybridvo.errors import InputError
 from hybridvo.estimation import warm_up
-from hybridvo.flow import FlowField, FlowProvider, check_field, dis_flow
+from hybridvo.flow import FlowField, FlowProvider, dis_flow, with_flow
 from hybridvo.geometry import invert, se3_exp, se3_log
 from hybridvo.network.models import Models, default_models
 from hybridvo.options import Options
@@ -227,7 +227,9 @@ class Odometry:
     def _estimate(self, pair: FramePair, prior: MotionPrior | None) -> RelativePose:
         # the images are asked whether a flow can be theirs until one is
         check_flow = not self._flow_fits
-        context = Context(self.options, prior, self.seed, None, self._models, check_flow)
+        context = Context(
+            self.options, prior, self.seed, None, self._models, check_flow, self._flow
+        )
         found = run_method(pair, self.method, context)
         self._flow_fits |= found.usable
         return found
@@ -251,7 +253,7 @@ class Odometry:
                 return found
             status = Status.failed(Reason.SOLVER_DIVERGED, found.photometric.message)
             return found.replace(status=status)
-        found = self._estimate(self._pair(key.frame, curr, None), prior)
+        found = self._estimate(self._pair(key.frame, curr), prior)
         if found.status.state is State.DEGRADED:
             return found.replace(status=Status.failed(found.status.reason, found.status.message))
         return found
@@ -288,18 +290,18 @@ class Odometry:
             return None
         return Window((KeyFrame(frame, T_world_cam),))
 
-    def _pair(self, prev: Frame, curr: Frame, flow: Any) -> FramePair:
+    def _pair(self, prev: Frame, curr: Frame, flow: Any = None) -> FramePair:
         if curr.camera.shape != prev.camera.shape:
             raise InputError(
                 f"Odometry.track: expected a frame of {prev.camera.shape} (height, width) as "
                 f"before, got {curr.camera.shape}. Resize it with "
                 f"hybridvo.data.resize.resize_frame, or reset() the tracker."
             )
-        given = self._flow(prev, curr) if flow is None else flow
-        field = check_field(given, prev, "given" if flow is not None else "callable")
-        return FramePair(
-            prev, curr, field.flow, field.variance, field.valid, field.source, field.is_true
-        )
+        pair = FramePair(prev, curr, None)
+        if flow is not None:
+            return with_flow(pair, lambda *_: flow, "given")
+        # the method asks for it where it needs one
+        return pair if curr.rgb is not None else with_flow(pair, self._flow)
 
     def _instead(
         self, state: TrackerState, failed: RelativePose

@@ -61,6 +61,18 @@ class FlowOptions:
 
 
 @option_group
+class DirectOptions:
+    """The motion from images and depth maps alone, before any flow is computed.
+
+    Args:
+        mode: ``on``, ``off``, or ``auto``: with the method ``hybrid``, where the flow would be
+            computed from the same images (``dis``).
+    """
+
+    mode: Literal["auto", "on", "off"] = "auto"
+
+
+@option_group
 class SearchOptions:
     """The search for every strong motion of a pair.
 
@@ -203,6 +215,7 @@ class Options:
     """
 
     flow: FlowOptions = FlowOptions()
+    direct: DirectOptions = DirectOptions()
     search: SearchOptions = SearchOptions()
     select: SelectOptions = SelectOptions()
     refine: RefineOptions = RefineOptions()

@@ -19,12 +19,13 @@ import numpy as np
 
 from hybridvo.baselines import pnp, rgbd
 from hybridvo.errors import CheckpointError, InputError
-from hybridvo.flow import contradiction
+from hybridvo.flow import FlowProvider, contradiction, with_flow
 from hybridvo.hypotheses.generate import HypothesisSet, generate
 from hybridvo.hypotheses.selector import CueSelector, MaskSelector, Selection
 from hybridvo.network.models import SELECTION, Models, default_models, one_thread
 from hybridvo.options import Options
 from hybridvo.refinement import refine as refinement
+from hybridvo.refinement.direct import direct_start, sharper
 from hybridvo.refinement.photometric import refine_photometric
 from hybridvo.results import MotionPrediction, MotionPrior, Reason, RelativePose
 from hybridvo.types import FramePair, PairBatch, depth_advice, typical_depth
@@ -51,6 +52,7 @@ class Context:
         weights: (H, W) factors on the information of each pixel, for the search, or None.
         models: the networks.
         check_flow: ask the images whether the flow can be theirs.
+        flow: provider of the flow where a pair comes without, or None.
     """
 
     options: Options = field(default_factory=Options)
@@ -59,6 +61,34 @@ class Context:
     weights: np.ndarray | None = None
     models: Models = field(default_factory=default_models)
     check_flow: bool = True
+    flow: FlowProvider | None = None
+
+    def with_flow(self, pair: FramePair) -> FramePair:
+        """The pair with its flow, computed where it is not there."""
+        return pair if pair.flow is not None or self.flow is None else with_flow(pair, self.flow)
+
+    def direct(self, pair: FramePair) -> RelativePose | None:
+        """The motion by images and depth maps alone, or None; surest where they explain all.
+
+        Asked where the flow is computed from the same images: another one knows more than they.
+        """
+        mode, source = self.options.direct.mode, getattr(self.flow, "source", "")
+        if pair.flow is not None:
+            source = pair.flow_source
+        if mode == "off" or (mode == "auto" and source != "dis"):
+            return None
+        best = None
+        for T in (None if self.prior is None else self.prior.T_curr_prev, None):
+            found = direct_start(pair, T, self.options)
+            if found is not None and (best is None or found.probability > best.probability):
+                best = found
+            if self.prior is None or (best is not None and self.is_sure(best)):
+                break
+        return best
+
+    def is_sure(self, motion: RelativePose) -> bool:
+        """Whether its probability is high enough for a motion that is not degraded."""
+        return motion.probability >= self.options.select.min_confidence
 
     def predict(self, pair: FramePair) -> MotionPrediction | None:
         """PWVO's motion and static probability; None where it has too little to see."""
@@ -119,9 +149,18 @@ def hybrid_flow(pair: FramePair, ctx: Context) -> RelativePose:
 
 
 def hybrid(pair: FramePair, ctx: Context) -> RelativePose:
-    """The same where the images agree with the flow; :func:`run_method` then refines on them."""
+    """By images and depth alone where that explains them; else on flow, then on the images."""
+    direct = ctx.direct(pair)
+    if direct is not None and ctx.is_sure(direct):
+        return direct
+    pair = ctx.with_flow(pair)
     wrong = contradiction(pair) if ctx.check_flow else None
-    return RelativePose.failed(Reason.NO_FLOW, wrong) if wrong else hybrid_flow(pair, ctx)
+    if wrong:
+        return RelativePose.failed(Reason.NO_FLOW, wrong)
+    found = hybrid_flow(pair, ctx)
+    if refines_images("hybrid", ctx.options):
+        found = refine_photometric(pair, found, ctx.options.photometric)
+    return sharper(pair, found, direct)
 
 
 def pwvo_refine(pair: FramePair, ctx: Context) -> RelativePose:
@@ -174,9 +213,11 @@ def run_method(pair: FramePair, method: str, ctx: Context) -> RelativePose:
     """
     check_method(method, ctx.models)
     started = time.perf_counter()
+    if method != "hybrid":
+        pair = ctx.with_flow(pair)
     with one_thread() if networks_of(method) else contextlib.nullcontext():
         found = METHODS[method](pair, ctx)
-    if refines_images(method, ctx.options):
+    if refines_images(method, ctx.options) and found.photometric is None:
         found = refine_photometric(pair, found, ctx.options.photometric)
     if found.status.ok and not found.status.message and pair.prev.depth is not None:
         median = typical_depth(pair.prev.depth[::8, ::8])
