@@ -175,7 +175,7 @@ class Odometry:
         """
         if not isinstance(frame, Frame):
             raise InputError(f"Odometry.track: expected a Frame, got {type(frame).__name__}.")
-        state = self._state
+        state, frame = self._state, _own(frame)
         if frame.index is None:
             frame = replace(frame, index=state.count)
         if state.frame is None:
@@ -193,12 +193,12 @@ class Odometry:
             # nothing can be matched from here: the next pair spans this frame
             self._pass(T_world_cam)
             return _step(frame, T_world_cam, motion)
-        own, window = _own(frame), state.window
+        window = state.window
         if window is None:
-            window = self._first_key(own, T_world_cam)
+            window = self._first_key(frame, T_world_cam)
         else:
             window, T, motion, used = locate(
-                window, motion, prev, own, self._register, self.window, self.options.track
+                window, motion, prev, frame, self._register, self.window, self.options.track
             )
             T_world_cam = T if used else T_world_cam
         if found.status.reason is Reason.AMBIGUOUS_MOTION:
@@ -213,7 +213,7 @@ class Odometry:
             model = model.observed(T, neighbours=not state.gap and not state.failed)
         failed = 0 if motion.usable else state.failed + 1
         self._state = TrackerState(
-            own, T_world_cam, T_world_cam, model, 0, failed, state.count + 1, window
+            frame, T_world_cam, T_world_cam, model, 0, failed, state.count + 1, window
         )
         return _step(frame, T_world_cam, motion)
 
@@ -277,11 +277,11 @@ class Odometry:
         return Step(int(index), timestamp, T_world_cam.copy(), motion)
 
     def _start(self, frame: Frame, state: TrackerState) -> Step:
-        T, own = state.T_world_last, _own(frame)
+        T = state.T_world_last
         # no motion precedes the first frame
         first = RelativePose(covariance=STANDSTILL.copy(), method=self.method)
-        window = self._first_key(own, T)
-        self._state = TrackerState(own, T, T, count=state.count + 1, window=window)
+        window = self._first_key(frame, T)
+        self._state = TrackerState(frame, T, T, count=state.count + 1, window=window)
         return _step(frame, T, first)
 
     def _first_key(self, frame: Frame, T_world_cam: np.ndarray) -> Window | None:

@@ -30,6 +30,11 @@ from hybridvo.results import RelativePose
 from hybridvo.synthetic.semi_real import load_split
 
 HEAVY_SEEDS = range(900, 906)
+STATIC = (
+    "tum/rgbd_dataset_freiburg1_xyz_first10",
+    "tum/redwood_livingroom_5",
+    "real_static/rooms_110",
+)
 RIDGE = 0.02
 """Penalty on the squared slope, times the number of answers."""
 
@@ -47,16 +52,26 @@ def build_parser() -> argparse.ArgumentParser:
 def main(argv: list[str] | None = None) -> int:
     args = build_parser().parse_args(argv)
     models = Models(weights={"selector": args.selector} if args.selector else None)
-    rows: dict[str, list[tuple[float, bool]]] = {"cues": [], "selector": [], "clear": []}
+    rows: dict[str, list[tuple[float, bool, bool]]] = {}
     for pair, T, depth, limit in pairs(args):
         for name, gap, error in answers(pair, T, depth, models):
-            rows[name].append((gap, error <= max(WRONG_PX, WRONG_FACTOR * limit)))
+            is_right = error <= max(WRONG_PX, WRONG_FACTOR * limit)
+            rows.setdefault(name, []).append((gap, is_right, False))
+    for pair, T, depth, limit in static_pairs(args.data):
+        found = direct_start(pair)
+        if found is not None:
+            error = ego_flow_error(found.T_curr_prev, T, depth, pair)
+            is_right = error <= max(WRONG_PX, WRONG_FACTOR * limit)
+            rows["direct"].append((100 * found.inlier_ratio, is_right, True))
     for name, some in rows.items():
-        right = np.array([r for _, r in some])
+        right, still = (np.array([row[k] for row in some]) for k in (1, 2))
         print(f"{name}: {len(right)} answers, {right.sum()} right")
         if name != "clear" and 0 < right.sum() < len(right):
-            gaps = np.array([gap for gap, _ in some])
-            slope, offset = fit(gaps, right)
+            gaps = np.array([row[0] for row in some])
+            share = max(still.mean(), 1e-9)
+            # static scenes and those with movers count alike
+            weights = np.where(still, 0.5 / share, 0.5 / (1 - share)) if still.any() else 1.0
+            slope, offset = fit(gaps, right, weights)
             p = 1 / (1 + np.exp(-slope * gaps - offset))
             print(f"  ({slope:.2f}, {offset:.2f})")
             print(f"  AUROC {auroc(p, right)}, calibration error {calibration_error(p, right)}")
@@ -82,11 +97,25 @@ def pairs(args: argparse.Namespace) -> Iterator[tuple[Any, np.ndarray, np.ndarra
                     yield pair, T, pair.prev.depth, 0.0
 
 
+def static_pairs(data: Path) -> Iterator[tuple[Any, np.ndarray, np.ndarray, float]]:
+    """The same of neighbouring frames of static recordings, which no test is made on."""
+    for name in STATIC:
+        sequence = open_sequence(data / name)
+        for pair, T in zip(iter_pairs(sequence, dis_flow()), true_motions(sequence), strict=True):
+            if T is not None:
+                limit = ego_flow_error(refine(pair).T_curr_prev, T, pair.prev.depth, pair)
+                yield pair, T, pair.prev.depth, limit
+
+
 def answers(
     pair: Any, T: np.ndarray, depth: np.ndarray, models: Models
 ) -> Iterator[tuple[str, float, float]]:
     """(which probability, the gap it is computed from, error in px) of both selectors."""
     ctx = Context(models=models)
+    direct = direct_start(pair)
+    if direct is not None:
+        error = ego_flow_error(direct.T_curr_prev, T, depth, pair)
+        yield "direct", 100 * direct.inlier_ratio, error
     found = ctx.search(pair)
     if isinstance(found, RelativePose):
         return
@@ -98,15 +127,17 @@ def answers(
         yield name, selection.gap, ego_flow_error(motion.T_curr_prev, T, depth, pair)
 
 
-def fit(gaps: np.ndarray, right: np.ndarray) -> tuple[float, float]:
+def fit(gaps: np.ndarray, right: np.ndarray, weights: Any = 1.0) -> tuple[float, float]:
     """Slope and offset of a logistic regression."""
+    middle = gaps.mean()
     sign = np.where(right, 1.0, -1.0)
 
     def cost(w: np.ndarray) -> float:
-        return float(np.logaddexp(0, -sign * (w[0] * gaps + w[1])).mean() + RIDGE * w[0] ** 2 / 2)
+        loss = np.logaddexp(0, -sign * (w[0] * (gaps - middle) + w[1]))
+        return float((weights * loss).mean() + RIDGE * w[0] ** 2 / 2)
 
     slope, offset = minimize(cost, np.zeros(2), method="BFGS").x
-    return float(slope), float(offset)
+    return float(slope), float(offset - slope * middle)
 
 
 if __name__ == "__main__":

@@ -25,8 +25,8 @@ REDUCTIONS = (8, 4, 2)
 """Of the image, coarse to fine, before the image itself."""
 MIN_SIDE = 24
 """Of a reduced image, px."""
-PIXELS, STEPS = 4000, 8
-"""Pixels used and Gauss-Newton steps on a reduced image, at most."""
+PIXELS, POINTS, STEPS = 2500, 1250, 6
+"""Pixels and points used and Gauss-Newton steps on a reduced image, at most."""
 SPREAD = np.repeat([0.3, 0.15], 3)
 """Standard deviation of the motion before the images are seen, m and rad: it decides nothing."""
 SHIFT_PX, GREY = 0.25, 1.0
@@ -52,7 +52,7 @@ def direct_start(
     if any(x is None for x in (prev.rgb, prev.depth, curr.rgb, curr.depth)):
         return None
     ones = np.ones(prev.camera.shape, np.float32)
-    planes = PlaneFactor.of(pair, ones, 1.0, images.image_inflation)
+    planes = PlaneFactor.of(pair, ones, 1.0, images.image_inflation, POINTS)
     if planes is None:
         return None
     start = RelativePose(covariance=np.diag(SPREAD**2), weights=ones, method="direct")
@@ -67,13 +67,13 @@ def direct_start(
         if not len(index):
             continue
         factor = ImageFactor(small, start.replace(weights=weights), index, images.image_inflation)
-        factor.use(*grey, T)
+        factor.use(*grey, T, uneven_light=False)
         factors: list[Factor] = [factor, planes] if planes.estimate(T) else [factor]
         T = gauss_newton(factors, T, STEPS, tolerance=0.1).T
     found = refine_photometric(pair, start.replace(T_curr_prev=T), _finest(images))
     if found.photometric is None or not found.photometric.taken:
         return None
-    return _answer(pair, planes, found)
+    return _answer(pair, found)
 
 
 def reduced(frame: Frame, by: int) -> Frame:
@@ -123,9 +123,10 @@ def _finest(images: PhotometricOptions) -> PhotometricOptions:
     return replace(images, blur_px=images.blur_px[-1:], prior_inflation=1.0)
 
 
-def _answer(pair: FramePair, planes: PlaneFactor, found: RelativePose) -> RelativePose:
+def _answer(pair: FramePair, found: RelativePose) -> RelativePose:
     """The motion with the pixels that follow it, and its probability."""
-    assert found.photometric is not None
+    assert found.photometric is not None and found.weights is not None
+    planes = PlaneFactor(pair, found.weights, 1.0)
     planes.estimate(found.T_curr_prev)
     follows, inside = _explained(pair, planes, found.T_curr_prev, found.photometric.gain)
     share = np.count_nonzero(follows) / max(np.count_nonzero(inside), 1)
@@ -135,7 +136,7 @@ def _answer(pair: FramePair, planes: PlaneFactor, found: RelativePose) -> Relati
     size = pair.prev.camera.shape[::-1]
     return found.replace(
         inlier_ratio=share,
-        probability=float(1 / (1 + np.exp(-slope * share - offset))),
+        probability=float(1 / (1 + np.exp(-slope * 100 * share - offset))),
         weights=cv2.resize(planes.on_grid(follows), size, interpolation=cv2.INTER_NEAREST),
         depth_noise=float(np.median(planes.noise(z) / z)) / np.sqrt(2),
         terms=("images", "depth"),

@@ -138,7 +138,9 @@ class ImageFactor:
         weight = self._buffer[kernels.W]
         return float(weight[self._w > 0].sum() / max(weight.sum(), 1e-12))
 
-    def use(self, prev: np.ndarray, curr: np.ndarray, T: np.ndarray) -> None:
+    def use(
+        self, prev: np.ndarray, curr: np.ndarray, T: np.ndarray, uneven_light: bool = True
+    ) -> None:
         """Take two images (H, W) and estimate noise and light at a motion."""
         rows, columns = self._index.T
         self._buffer[kernels.GREY] = prev[rows, columns]
@@ -148,7 +150,7 @@ class ImageFactor:
         self._project(T)
         for _ in range(2):
             self._settle()
-        self._uneven_here = self._even_light(UNEVEN_LIGHT)
+        self._uneven_here = uneven_light and self._even_light(UNEVEN_LIGHT)
         self.uneven_light |= self._uneven_here
         self._settle()
 

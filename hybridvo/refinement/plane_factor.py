@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import nnls
@@ -17,7 +17,7 @@ from hybridvo.refinement.solver import Linearization, positive_inverse
 from hybridvo.types import FramePair
 
 POINTS = 5000
-"""Used at most, on a regular grid."""
+"""On a regular grid, at most."""
 REACH = 3
 """Pixels from one of the four neighbours that span a plane to the other's middle: the steps of a
 structured-light sensor are wider than one."""
@@ -66,13 +66,19 @@ class PlaneFactor:
         weights: (H, W) external weights of the pixels.
         least: weight below which a pixel is not used.
         inflation: factor on the covariance beyond the tiles: a sensor is bent over the image.
+        points: of a regular grid, at most.
     """
 
     def __init__(
-        self, pair: FramePair, weights: np.ndarray, least: float, inflation: float = 1.0
+        self,
+        pair: FramePair,
+        weights: np.ndarray,
+        least: float,
+        inflation: float = 1.0,
+        points: int = POINTS,
     ) -> None:
         prev = pair.prev.camera
-        step = max(1, round(np.sqrt(prev.height * prev.width / POINTS)))
+        step = max(1, round(np.sqrt(prev.height * prev.width / points)))
         v, u = np.mgrid[step // 2 : prev.height : step, step // 2 : prev.width : step]
         z = np.asarray(pair.prev.depth)[v, u].astype(np.float64)
         weight = np.asarray(weights)[v, u]
@@ -93,13 +99,11 @@ class PlaneFactor:
         self._law, self._scale = np.array([0.0, 0.0, 1.0]), 1.0
 
     @classmethod
-    def of(
-        cls, pair: FramePair, weights: np.ndarray, least: float, inflation: float = 1.0
-    ) -> PlaneFactor | None:
-        """None where a depth map is missing or has too few pixels."""
+    def of(cls, pair: FramePair, *how: Any, **options: Any) -> PlaneFactor | None:
+        """The factor, or None where a depth map is missing or has too few pixels."""
         if pair.prev.depth is None or pair.curr.depth is None:
             return None
-        factor = cls(pair, weights, least, inflation)
+        factor = cls(pair, *how, **options)
         return factor if len(factor.points) >= MIN_POINTS else None
 
     def on_grid(self, values: np.ndarray) -> np.ndarray:
