@@ -49,6 +49,11 @@ class FlowField:
     source: str = "unknown"
     is_true: bool = False
 
+    def pair(self, prev: Frame, curr: Frame, depth_source: str = "unknown") -> FramePair:
+        """The two frames with this flow between them."""
+        flow = self.flow, self.variance, self.valid, self.source, self.is_true
+        return FramePair(prev, curr, *flow, depth_source)
+
 
 FlowProvider = Callable[[Frame, Frame], FlowField]
 """Computes or reads the flow from the first frame to the second."""

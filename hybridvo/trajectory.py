@@ -19,7 +19,6 @@ from hybridvo.errors import FormatError, InputError
 from hybridvo.files import Row, atomic_write, read_rows, read_text
 from hybridvo.geometry import invert, ned_to_camera, xyzw_to_wxyz
 from hybridvo.types import as_rigid, to_numpy
-from hybridvo.units import MAX_SECONDS, stamp_unit
 
 Format = Literal["auto", "tum", "kitti", "tartanair"]
 Axes = Literal["auto", "camera", "ned"]
@@ -31,6 +30,11 @@ COLUMNS = {
 }
 FILE_TOLERANCE = 1e-2
 """Files carry six digits or so: a rotation may be off by that much, a wrong column is far more."""
+
+EPOCH_S = (1e9, 4.2e9)
+"""Seconds since 1970 from 2001 to 2103: where the stamps of today's clocks lie."""
+MAX_SECONDS = 1e14
+"""Stamps above this (three million years) cannot be seconds and are taken as nanoseconds."""
 
 _logger = logging.getLogger(__name__)
 
@@ -142,7 +146,7 @@ def read_trajectory(
 
     Returns:
         The trajectory in camera axes. Stamps in other units than seconds are converted
-        (:mod:`hybridvo.units`), which ``warnings`` and the log say. KITTI and TartanAir files get
+        (:func:`stamp_unit`), which ``warnings`` and the log say. KITTI and TartanAir files get
         frame numbers as stamps.
 
     Raises:
@@ -231,3 +235,21 @@ def _format_of(path: Path) -> str:
                 f"by spaces, got {count}."
             )
     raise FormatError(f"{path}: expected at least one pose, got none.")
+
+
+def stamp_unit(stamps: np.ndarray) -> tuple[float, str]:
+    """How many of the unit of some stamps make a second, and its name.
+
+    Milliseconds and microseconds are told by two things together: every stamp (N,) that is finite
+    is one of today's clocks (2001 to 2103), and neighbours are typically less than a second apart,
+    which for a clock that counts nanoseconds since the machine was started would be more than 1000
+    images a second. Else stamps above 1e14 are nanoseconds.
+    """
+    known = np.abs(stamps[np.isfinite(stamps)])
+    with np.errstate(over="ignore"):  # between numbers that are no times anyway
+        step = np.median(np.abs(np.diff(known))) if len(known) > 1 else np.inf
+    for factor, name in ((1e3, "milliseconds"), (1e6, "microseconds")):
+        first, last = factor * EPOCH_S[0], factor * EPOCH_S[1]
+        if step < factor and first <= known.min() and known.max() <= last:
+            return factor, name
+    return (1e9, "nanoseconds") if (known > MAX_SECONDS).any() else (1.0, "seconds")

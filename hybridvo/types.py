@@ -25,6 +25,12 @@ MAX_PIXELS = 2**28
 """Largest image, in pixels, that a frame or a file header may declare."""
 FOCAL_RANGE = (1e-3, 1e9)
 """Focal lengths in pixels whose inverses and squares single precision can hold."""
+PLAUSIBLE_DEPTH_M = (0.1, 200.0)
+"""Metres; a depth map whose median lies outside is not in metres."""
+EVERYDAY_DEPTH_M = (0.3, 8.0)
+"""Metres; where the median of an indoor depth map usually lies."""
+UNITS_PER_METRE = {1000: "millimetres", 5000: "TUM's unit", 100: "centimetres", 256: "KITTI's unit"}
+"""Depth units in use, the most frequent first."""
 
 
 def to_numpy(value: Any, name: str) -> np.ndarray:
@@ -358,3 +364,38 @@ class PairBatch:
             depth_variance=stack([p.prev.depth_variance for p in pairs], 1.0),
             valid=torch.as_tensor(valid, device=device),
         )
+
+
+def typical_depth(depth: np.ndarray) -> float | None:
+    """Median of the valid depths without the sky, in the map's unit; None where there are none."""
+    values = depth[np.isfinite(depth) & (depth > 0)].astype(np.float64)
+    near = values[values <= 1000.0]  # renderers mark the sky with larger values
+    values = near if near.size > 0.1 * values.size else values
+    return float(np.median(values)) if values.size else None
+
+
+def depth_advice(median: float, usual: float | None = None) -> str:
+    """What probably turns depths of this median into metres; empty where they can be metres.
+
+    A guess: no image knows its scale. The first unit is taken that brings the median to everyday
+    depths, the data set's own (``usual``, units per metre) before the others.
+
+    Example:
+        >>> depth_advice(974.0)
+        'divide by 1000 (millimetres)'
+    """
+    low, high = PLAUSIBLE_DEPTH_M
+    if low <= median <= high:
+        return ""
+    too_large = median > high
+    units = [1 / unit if too_large else float(unit) for unit in UNITS_PER_METRE]
+    inside = [f for f in units if EVERYDAY_DEPTH_M[0] <= median * f <= EVERYDAY_DEPTH_M[1]]
+    if usual and too_large and low <= median / usual <= high:
+        inside = [1 / usual]
+    centre = np.sqrt(np.prod(EVERYDAY_DEPTH_M))
+    nearest = min(units, key=lambda factor: abs(np.log(median * factor / centre)))
+    factor = inside[0] if inside else nearest
+    if factor > 1:
+        return f"multiply by {factor:g}"
+    unit = UNITS_PER_METRE.get(round(1 / factor))
+    return f"divide by {1 / factor:g}" + (f" ({unit})" if unit else "")

@@ -7,7 +7,7 @@ points; any lens and crop; cameras that follow a mover; inputs as sensors delive
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 import cv2
 import numpy as np
@@ -73,6 +73,7 @@ class DiverseOptions:
     moving_threshold_px: Positive = 0.5
     flow_limit: Positive = 0.35
     degradation: SensorOptions = SensorOptions()
+    preset: Literal["diverse"] = "diverse"
 
     def __post_init__(self) -> None:
         for name in ("static_layers", "movers"):

@@ -76,6 +76,13 @@ def affine(half: ArrayLike, centre: ArrayLike, R: np.ndarray | None = None) -> n
     return np.column_stack([axes, np.asarray(centre, float)])
 
 
+def carried(T: np.ndarray, A: np.ndarray) -> np.ndarray:
+    """Maps (..., 3, 4) of unit shapes after (..., 4, 4) affine ones; either may be one for all."""
+    out = T[..., :3, :3] @ A
+    out[..., 3] += T[..., :3, 3]
+    return out
+
+
 def camera_path(
     rng: np.random.Generator, frames: int, step: float, turn_deg: float
 ) -> tuple[np.ndarray, np.ndarray]:

@@ -10,7 +10,7 @@ Silhouettes are procedural: the published photographs are a download of a third 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Literal
 
 import cv2
 import numpy as np
@@ -272,6 +272,7 @@ class PaperOptions:
     object_size: tuple[float, Positive, Positive, Share] = (0.55, 0.2, 0.25, 0.7)
     canvas_margin: Annotated[float, Field(ge=0, le=4)] = 0.25
     motion: MotionSamplers = MotionSamplers()
+    preset: Literal["paper"] = "paper"
 
     def __post_init__(self) -> None:
         if not self.focal_low <= self.focal_high:

@@ -92,20 +92,20 @@ class Recording:
 
 
 @dataclass(frozen=True, eq=False)
-class SemiRealPair:
-    """A pair with DIS flow and its ground truth.
+class KnownPair:
+    """A pair and its ground truth.
 
     ``depth``: (H, W) metres of the previous frame before the sensor's errors, 0 where unknown;
     ``moving``: (H, W) bool, points that do not follow the camera's motion; ``world``: path of the
-    recording; ``movers``: how many were placed.
+    recording; ``log_depth_curr``: (H, W) of the current frame at x + F where it has no depth map.
     """
 
     pair: FramePair
     T_curr_prev: np.ndarray
     depth: np.ndarray
     moving: np.ndarray
-    world: str
-    movers: int
+    world: str = ""
+    log_depth_curr: np.ndarray | None = None
 
 
 @functools.cache
@@ -161,8 +161,8 @@ def _measured_motion(prev: Frame, curr: Frame, T_stated: np.ndarray) -> np.ndarr
 
 def draw_pair(
     rng: np.random.Generator, recordings: Sequence[Recording], movers: int | None = None
-) -> SemiRealPair:
-    """One pair, drawn from recordings; ``movers``: how many; None: 1 to 4 and sometimes none."""
+) -> KnownPair:
+    """A pair with DIS flow; ``movers``: how many are placed; None: 1 to 4 and sometimes none."""
     worlds = [r for r in recordings if r.source.world]
     share = np.array([np.sqrt(len(r.frames)) for r in worlds])
     world = worlds[int(rng.choice(len(worlds), p=share / share.sum()))]
@@ -194,7 +194,7 @@ def draw_pair(
     pair = FramePair(prev, curr, *flow, flow_source="dis", depth_source="sensor")
     first = canvases[0]
     depth = np.where(first.measured > 0.5, first.depth, 0).astype(np.float32)
-    return SemiRealPair(pair, T, depth, first.moving > 0.5, world.source.path, movers)
+    return KnownPair(pair, T, depth, first.moving > 0.5, world.source.path)
 
 
 def _elsewhere(
