@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from hybridvo.compilation import njit
-from hybridvo.geometry import backproject
+from hybridvo.geometry import backproject, njit
 from hybridvo.types import Camera, Frame
 
 TEAR = 0.06
