@@ -62,9 +62,8 @@ FlowProvider = Callable[[Frame, Frame], FlowField]
 def dis_flow(preset: str = "medium") -> FlowProvider:
     """Provider of OpenCV's DIS flow on grey images (Kroeger et al., ECCV 2016).
 
-    It is computed in both directions, whose disagreement gives variance and validity. A provider
-    may serve several trackers and threads. Where an image has no texture (a covered lens, a dropped
-    frame, parallel stripes) there is no flow: DIS would return zero there, in both directions.
+    It is computed in both directions, whose disagreement gives variance and validity. Where an
+    image has no texture (a covered lens, a dropped frame, parallel stripes) there is no flow.
 
     ``preset`` is the effort: ``ultrafast``, ``fast`` or ``medium``.
     """
@@ -146,11 +145,10 @@ def _targets(du: np.ndarray, dv: np.ndarray) -> tuple[np.ndarray, np.ndarray, np
 
 
 def file_flow(sequence: Any, *, strict: bool = True) -> FlowProvider:
-    """Provider of the flow files of an open sequence.
+    """Provider of the flow files of an open sequence, which lead from one frame to the next.
 
-    Flow files lead from one frame to the next: for any other two frames, and where the file of a
-    pair is missing, the flow is None. A damaged file raises what the reader raises if ``strict``,
-    else it gives None and a line in the log.
+    Where there is none the flow is None. A damaged file raises what the reader raises if
+    ``strict``, else it gives None and a line in the log.
     """
 
     def provide(prev: Frame, curr: Frame) -> FlowField:

@@ -75,13 +75,7 @@ class Trajectory:
                 f"{stamps.shape}."
             )
         stamps = stamps.astype(np.float64)
-        good = np.isfinite(stamps) & (np.diff(stamps, prepend=-np.inf) > 0)
-        if not good.all():
-            k = int(np.argmin(good))
-            raise InputError(
-                f"Trajectory.timestamps[{k}]: expected a finite number above the one before, got "
-                f"{stamps[max(k - 1, 0) : k + 1].tolist()}. Sort the poses, drop duplicates."
-            )
+        check_increasing(stamps, "Trajectory")
         T = as_rigid(self.T_world_cam, "Trajectory.T_world_cam", many=True)
         if len(T) == 0 or len(stamps) != len(T):
             raise InputError(
@@ -230,6 +224,18 @@ def _format_of(path: Path) -> str:
                 f"by spaces, got {count}."
             )
     raise FormatError(f"{path}: expected at least one pose, got none.")
+
+
+def check_increasing(stamps: np.ndarray, where: str) -> None:
+    """Refuse stamps that are not finite, go back or stand still: InputError with the frame."""
+    good = np.isfinite(stamps) & (np.diff(stamps, prepend=-np.inf) > 0)
+    if not good.all():
+        k = int(np.argmin(good))
+        after = f" after {float(stamps[k - 1])!r}" if k else ""
+        raise InputError(
+            f"{where}: timestamps must be finite and increase: frame {k} has {float(stamps[k])!r}"
+            f"{after}. Sort them and remove duplicates."
+        )
 
 
 def stamp_unit(stamps: np.ndarray) -> tuple[float, str]:

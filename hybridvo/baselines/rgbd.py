@@ -7,6 +7,7 @@ give it a covariance; without flow that of one pixel of noise at every sampled p
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -22,10 +23,18 @@ from hybridvo.baselines.pnp import (
 )
 from hybridvo.geometry import pose_matrix, project
 from hybridvo.results import Reason, RelativePose, Status
-from hybridvo.types import Frame, FramePair
+from hybridvo.types import Camera, FramePair
 
 
-def align_opencv(prev: Frame, curr: Frame) -> np.ndarray | None:
+class Rgbd(NamedTuple):
+    """An image and its depth, NaN where that is invalid."""
+
+    rgb: np.ndarray
+    depth: np.ndarray
+    camera: Camera
+
+
+def align_opencv(prev: Rgbd, curr: Rgbd) -> np.ndarray | None:
     """OpenCV 5's ``cv2.Odometry`` with image and depth."""
     settings = cv2.OdometrySettings()
     settings.setCameraMatrix(prev.camera.K.astype(np.float32))
@@ -36,7 +45,7 @@ def align_opencv(prev: Frame, curr: Frame) -> np.ndarray | None:
     return np.asarray(T, dtype=np.float64) if found else None
 
 
-def align_open3d(prev: Frame, curr: Frame) -> np.ndarray | None:
+def align_open3d(prev: Rgbd, curr: Rgbd) -> np.ndarray | None:
     """Open3D's ``compute_rgbd_odometry`` with the hybrid term."""
     import open3d
 
@@ -64,16 +73,16 @@ def align_open3d(prev: Frame, curr: Frame) -> np.ndarray | None:
     return np.asarray(T, dtype=np.float64) if found else None
 
 
-def _deepest(frame: Frame) -> float:
+def _deepest(frame: Rgbd) -> float:
     """Metres beyond every depth: the default limits of both libraries are opened to it."""
     return float(np.nanmax(frame.depth)) + 1.0
 
 
-ALIGNERS: dict[str, Callable[[Frame, Frame], np.ndarray | None]] = {
+ALIGNERS: dict[str, Callable[[Rgbd, Rgbd], np.ndarray | None]] = {
     "opencv-rgbd": align_opencv,
     "open3d-rgbd": align_open3d,
 }
-"""(4, 4) T_curr_prev of two RGB-D frames under one camera, invalid depth NaN; or None."""
+"""(4, 4) T_curr_prev of two RGB-D images under one camera, or None."""
 
 
 def estimate_by_images(method: str, pair: FramePair, seed: int = 0) -> RelativePose:
@@ -102,7 +111,7 @@ def estimate_by_images(method: str, pair: FramePair, seed: int = 0) -> RelativeP
     return check(method, T, data, camera, DEFAULT_PX, sigma_px)
 
 
-def _prepared(pair: FramePair) -> tuple[Frame, Frame] | Status:
+def _prepared(pair: FramePair) -> tuple[Rgbd, Rgbd] | Status:
     """Both frames as OpenCV and Open3D take them, the current one resampled to the previous K."""
     frames = []
     camera, size = pair.prev.camera, pair.prev.camera.shape[::-1]
@@ -120,5 +129,5 @@ def _prepared(pair: FramePair) -> tuple[Frame, Frame] | Status:
             depth = np.asarray(
                 cv2.warpAffine(depth, A, size, flags=cv2.INTER_NEAREST, borderValue=float("nan"))
             )
-        frames.append(Frame(rgb, depth, camera))
+        frames.append(Rgbd(rgb, depth, camera))
     return frames[0], frames[1]
