@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from hybridvo.compilation import njit
-from hybridvo.geometry import backproject
+from hybridvo.geometry import backproject, njit
 from hybridvo.synthetic.sensors import depth_jump
 from hybridvo.types import Camera, Frame
 
