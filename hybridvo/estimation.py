@@ -41,8 +41,7 @@ def estimate(
         curr: then the current frame; the flow is OpenCV's DIS.
         method: one of :data:`hybridvo.pipeline.METHODS` that can run here.
         prior: what is known of the motion: one more start, and a cue for the selection.
-        options: the option tree; ``search``, ``select``, ``refine``, ``photometric``, and
-            ``run.device`` and ``flow`` are read.
+        options: the option tree, of which ``track`` and ``run`` (but its device) are not read.
         models: networks of one's own; by default the pretrained ones.
         seed: of everything that is drawn at random.
 
@@ -66,9 +65,10 @@ def estimate(
     seed = as_seed(seed, "estimate.seed")
     flow = None
     if curr is not None or isinstance(pair, Frame):
-        for name, frame in (("first of two", pair), ("second of two", curr)):
-            _check_kind(f"estimate, {name}", frame, Frame)
-        pair, flow = FramePair(pair, curr, None), dis_flow(options.flow.dis_preset)
+        two: Any = pair, curr
+        _check_kind("estimate, first of two", pair, Frame)
+        _check_kind("estimate, second of two", curr, Frame)
+        pair, flow = FramePair(two[0], two[1], None), dis_flow(options.flow.dis_preset)
     _check_kind("estimate, a pair", pair, FramePair)
     models = models or default_models(options.run.device if networks_of(method) else "cpu")
     context = Context(options, prior, seed, None, models, flow=flow)

@@ -25,7 +25,7 @@ from hybridvo.hypotheses.selector import CueSelector, MaskSelector, Selection
 from hybridvo.network.models import SELECTION, Models, default_models, one_thread
 from hybridvo.options import Options
 from hybridvo.refinement import refine as refinement
-from hybridvo.refinement.direct import direct_start, sharper
+from hybridvo.refinement.direct import direct_start
 from hybridvo.refinement.photometric import refine_photometric
 from hybridvo.results import MotionPrediction, MotionPrior, Reason, RelativePose
 from hybridvo.types import FramePair, PairBatch, depth_advice, typical_depth
@@ -149,7 +149,10 @@ def hybrid_flow(pair: FramePair, ctx: Context) -> RelativePose:
 
 
 def hybrid(pair: FramePair, ctx: Context) -> RelativePose:
-    """By images and depth alone where that explains them; else on flow, then on the images."""
+    """By images and depth alone where that explains them; else on flow, if that can be theirs.
+
+    :func:`run_method` then refines on the images.
+    """
     direct = ctx.direct(pair)
     if direct is not None and ctx.is_sure(direct):
         return direct
@@ -157,10 +160,7 @@ def hybrid(pair: FramePair, ctx: Context) -> RelativePose:
     wrong = contradiction(pair) if ctx.check_flow else None
     if wrong:
         return RelativePose.failed(Reason.NO_FLOW, wrong)
-    found = hybrid_flow(pair, ctx)
-    if refines_images("hybrid", ctx.options):
-        found = refine_photometric(pair, found, ctx.options.photometric)
-    return sharper(pair, found, direct)
+    return hybrid_flow(pair, ctx)
 
 
 def pwvo_refine(pair: FramePair, ctx: Context) -> RelativePose:

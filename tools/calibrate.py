@@ -21,11 +21,13 @@ from golden_inputs import HEAVY
 from measuring import auroc, ego_flow_error
 from scipy.optimize import minimize
 
-from hybridvo import refine
+from hybridvo import dis_flow, iter_pairs, open_sequence, refine
 from hybridvo.calibration import MIN_CONFIDENCE
+from hybridvo.evaluation.pair_errors import true_motion
 from hybridvo.hypotheses.selector import CueSelector
 from hybridvo.network.models import Models
 from hybridvo.pipeline import Context
+from hybridvo.refinement.direct import direct_start
 from hybridvo.results import RelativePose
 from hybridvo.synthetic.semi_real import load_split
 
@@ -101,8 +103,9 @@ def static_pairs(data: Path) -> Iterator[tuple[Any, np.ndarray, np.ndarray, floa
     """The same of neighbouring frames of static recordings, which no test is made on."""
     for name in STATIC:
         sequence = open_sequence(data / name)
-        for pair, T in zip(iter_pairs(sequence, dis_flow()), true_motions(sequence), strict=True):
-            if T is not None:
+        for k, pair in enumerate(iter_pairs(sequence, dis_flow())):
+            T = true_motion(sequence, k, k + 1)
+            if T is not None and pair.flow is not None:
                 limit = ego_flow_error(refine(pair).T_curr_prev, T, pair.prev.depth, pair)
                 yield pair, T, pair.prev.depth, limit
 

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from hybridvo.calibration import DIRECT_RIGHT
-from hybridvo.options import Options, PhotometricOptions
+from hybridvo.options import Options
 from hybridvo.refinement.image_factor import ImageFactor, blurred, choose_pixels
 from hybridvo.refinement.photometric import refine_photometric
 from hybridvo.refinement.plane_factor import PlaneFactor
@@ -31,8 +31,6 @@ SPREAD = np.repeat([0.3, 0.15], 3)
 """Standard deviation of the motion before the images are seen, m and rad: it decides nothing."""
 SHIFT_PX, GREY = 0.25, 1.0
 """A residual is noise where so small a shift of the image, and grey levels, explain it."""
-OTHER_PX = 3.0
-"""Two motions that lead the pixels so far apart in the median are two."""
 NEIGHBOURS = 3
 """Side, in points of the grid, of the squares whose mean residual is taken for light."""
 _REDUCED: WeakKeyDictionary[Frame, dict[int, Frame]] = WeakKeyDictionary()
@@ -56,24 +54,30 @@ def direct_start(
     if planes is None:
         return None
     start = RelativePose(covariance=np.diag(SPREAD**2), weights=ones, method="direct")
-    T = np.eye(4) if T_start is None else T_start
+    T, gain = np.eye(4) if T_start is None else T_start, 1.0
     for by in REDUCTIONS:
         if min(prev.camera.shape) < by * MIN_SIDE:
             continue
         small = FramePair(reduced(prev, by), reduced(curr, by), None)
         weights = np.ones(small.prev.camera.shape, np.float32)
-        grey = [blurred(frame, images.blur_px[-1]) for frame in (small.prev, small.curr)]
-        index = choose_pixels(grey[0], small.prev.depth, weights, min(PIXELS, weights.size // 4))
+        before, after = (blurred(frame, images.blur_px[-1]) for frame in (small.prev, small.curr))
+        depth = np.asarray(small.prev.depth)
+        index = choose_pixels(before, depth, weights, min(PIXELS, weights.size // 4))
         if not len(index):
             continue
         factor = ImageFactor(small, start.replace(weights=weights), index, images.image_inflation)
-        factor.use(*grey, T, uneven_light=False)
+        factor.use(before, after, T, uneven_light=False)
         factors: list[Factor] = [factor, planes] if planes.estimate(T) else [factor]
         T = gauss_newton(factors, T, STEPS, tolerance=0.1).T
-    found = refine_photometric(pair, start.replace(T_curr_prev=T), _finest(images))
+        gain = factor.gain
+    fine = PlaneFactor(pair, ones, 1.0)
+    fine.estimate(T)
+    weights = fine.image_of(_explained(pair, fine, T, gain)[0])
+    finest = replace(images, blur_px=images.blur_px[-1:], prior_inflation=1.0)
+    found = refine_photometric(pair, start.replace(T_curr_prev=T, weights=weights), finest)
     if found.photometric is None or not found.photometric.taken:
         return None
-    return _answer(pair, found)
+    return _answer(pair, fine, found)
 
 
 def reduced(frame: Frame, by: int) -> Frame:
@@ -91,53 +95,18 @@ def reduced(frame: Frame, by: int) -> Frame:
     return known[by]
 
 
-def sharper(pair: FramePair, found: RelativePose, direct: RelativePose | None) -> RelativePose:
-    """The direct motion where it is the one found on flow and explains more of the images.
-
-    Which motion is the camera's was decided on the flow: status and probability are that one's.
-    """
-    if direct is None or not found.usable:
-        return found
-    planes = PlaneFactor.of(pair, np.ones_like(direct.weights), 1.0)
-    if planes is None:
-        return found
-    planes.estimate(direct.T_curr_prev)
-    apart = np.linalg.norm(
-        planes.residuals(direct.T_curr_prev).at - planes.residuals(found.T_curr_prev).at, axis=1
-    )
-    if np.median(apart) > OTHER_PX:
-        return found
-    assert direct.photometric is not None
-    shares = []
-    for motion in (direct, found):
-        follows, inside = _explained(pair, planes, motion.T_curr_prev, direct.photometric.gain)
-        shares.append(np.count_nonzero(follows) / max(np.count_nonzero(inside), 1))
-    if shares[0] <= shares[1]:
-        return found
-    known = {name: getattr(found, name) for name in ("status", "probability", "hypotheses")}
-    return direct.replace(**known)
-
-
-def _finest(images: PhotometricOptions) -> PhotometricOptions:
-    """Of a start that the images alone have found."""
-    return replace(images, blur_px=images.blur_px[-1:], prior_inflation=1.0)
-
-
-def _answer(pair: FramePair, found: RelativePose) -> RelativePose:
+def _answer(pair: FramePair, planes: PlaneFactor, found: RelativePose) -> RelativePose:
     """The motion with the pixels that follow it, and its probability."""
-    assert found.photometric is not None and found.weights is not None
-    planes = PlaneFactor(pair, found.weights, 1.0)
+    assert found.photometric is not None
     planes.estimate(found.T_curr_prev)
-    follows, inside = _explained(pair, planes, found.T_curr_prev, found.photometric.gain)
-    share = np.count_nonzero(follows) / max(np.count_nonzero(inside), 1)
+    follows, share = _explained(pair, planes, found.T_curr_prev, found.photometric.gain)
     slope, offset = DIRECT_RIGHT
     at = planes.residuals(found.T_curr_prev)
     z = at.z[at.seen]
-    size = pair.prev.camera.shape[::-1]
     return found.replace(
         inlier_ratio=share,
         probability=float(1 / (1 + np.exp(-slope * 100 * share - offset))),
-        weights=cv2.resize(planes.on_grid(follows), size, interpolation=cv2.INTER_NEAREST),
+        weights=planes.image_of(follows),
         depth_noise=float(np.median(planes.noise(z) / z)) / np.sqrt(2),
         terms=("images", "depth"),
     )
@@ -145,13 +114,14 @@ def _answer(pair: FramePair, found: RelativePose) -> RelativePose:
 
 def _explained(
     pair: FramePair, planes: PlaneFactor, T: np.ndarray, gain: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """(N,) bool, which of the points follow a motion, in both images, and which are in view."""
+) -> tuple[np.ndarray, float]:
+    """(N,) bool, which of the points follow a motion, and their share of those in view of both."""
     (height, width), (v, u), at = pair.prev.camera.shape, planes.index.T, planes.residuals(T)
     x, y = at.at.T
     inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
     before, after = (blurred(frame, 1.0) for frame in (pair.prev, pair.curr))
-    now = cv2.remap(after, at.at.astype(np.float32)[:, None], None, cv2.INTER_LINEAR)[:, 0]
+    columns, rows = at.at.T[..., None].astype(np.float32)
+    now = cv2.remap(after, columns, rows, cv2.INTER_LINEAR)[:, 0]
     residual = planes.on_grid(np.where(inside, now - gain * before[v, u], 0))
     square = NEIGHBOURS, NEIGHBOURS
     light = cv2.blur(residual, square) / np.maximum(cv2.blur(planes.on_grid(inside), square), 1e-6)
@@ -161,4 +131,5 @@ def _explained(
     slope2 += (before[below, u] - before[np.maximum(v - 1, 0), u]) ** 2
     usual = 9 * (GREY**2 + (SHIFT_PX / 2) ** 2 * slope2)
     depth = np.where(at.seen, planes.robust(T), 1.0)
-    return inside & (usual / (usual + d2) * depth > 0.5), inside
+    follows = inside & (usual / (usual + d2) * depth > 0.5)
+    return follows, float(np.count_nonzero(follows) / (np.count_nonzero(inside) or 1))

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 from scipy.optimize import nnls
 
-from hybridvo.compilation import njit
+from hybridvo.geometry import njit
 from hybridvo.options import RefineOptions
 from hybridvo.refinement.covariance import dispersion, tile_sums
 from hybridvo.refinement.full_fit import tile_size
@@ -83,7 +84,7 @@ class PlaneFactor:
         z = np.asarray(pair.prev.depth)[v, u].astype(np.float64)
         weight = np.asarray(weights)[v, u]
         used = (z > 0) & np.isfinite(z) & (weight >= least)
-        self.cells, self._grid = np.nonzero(used), used.shape
+        self.cells, self._grid, self._shape = np.nonzero(used), used.shape, prev.shape
         """Rows and columns of the points, on their grid."""
         self.index = np.stack([v[used], u[used]], 1)
         """(N, 2) rows and columns of the points, px."""
@@ -94,7 +95,7 @@ class PlaneFactor:
         self._tile = (v // tile) * -(-prev.width // tile) + u // tile
         camera = pair.curr.camera
         self._K = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-        self._depth = as_contiguous(pair.curr.depth)
+        self._depth = as_contiguous(np.asarray(pair.curr.depth))
         self._inflation, self._at = inflation, np.empty(0)
         self._law, self._scale = np.array([0.0, 0.0, 1.0]), 1.0
 
@@ -111,6 +112,11 @@ class PlaneFactor:
         out = np.zeros(self._grid, np.float32)
         out[self.cells] = values
         return out
+
+    def image_of(self, values: np.ndarray) -> np.ndarray:
+        """(H, W) float32: each pixel has the value of the nearest place of the grid."""
+        size = self._shape[::-1]
+        return cv2.resize(self.on_grid(values), size, interpolation=cv2.INTER_NEAREST)
 
     def estimate(self, T: np.ndarray) -> bool:
         """Fit the noise and the scale of the information; whether enough points are seen."""

@@ -14,13 +14,12 @@ import pytest
 
 from tests.project import source_tree as source
 
-BASE = {"errors", "compilation", "files"}
+BASE = {"errors", "files"}
 """Files without a notion of cameras: everything may import them."""
 NOUNS = BASE | {"types", "geometry", "results", "calibration", "options"}
 IMPORTS: dict[str, set[str]] = {
     # data walk from left to right
     "errors": set(),
-    "compilation": {"errors"},
     "files": {"errors"},
     "calibration": set(),
     "options": {"errors", "calibration"},

@@ -1,0 +1,105 @@
+"""The motion by images and depth maps alone: where it holds, and where it says that it does not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hybridvo.estimation import estimate
+from hybridvo.flow import FlowField, dis_flow
+from hybridvo.geometry import project
+from hybridvo.options import DirectOptions, Options
+from hybridvo.pipeline import Context, run_method
+from hybridvo.refinement.direct import direct_start, reduced
+from hybridvo.types import FramePair
+from tests.refinement.test_photometric import error_px, made_pair
+
+SIZE = {"height": 240, "width": 320}
+
+
+@pytest.fixture(scope="module")
+def static():
+    """(pair without flow, true motion) of a scene in which nothing moves."""
+    pair, T, _ = made_pair("static", 303, **SIZE)
+    return FramePair(pair.prev, pair.curr, None), T
+
+
+@pytest.fixture(scope="module")
+def moving():
+    """The same of a scene in which most of the image moves."""
+    pair, T, _ = made_pair("heavy_two", 900, **SIZE)
+    return FramePair(pair.prev, pair.curr, None), T
+
+
+def test_a_reduced_camera_sees_a_point_where_the_pixels_are_averaged(static):
+    frame = static[0].prev
+    small = reduced(frame, 4)
+    assert small is reduced(frame, 4)  # kept with the frame
+    assert small.camera.shape == (60, 80)
+    # the middle of the block of pixels 8..11 is 9.5, and block 2 of the small image
+    X = np.array([0.3, -0.2, 2.0])
+    large, fine = project(X, frame.camera), project(X, small.camera)
+    np.testing.assert_allclose(fine, (large - 1.5) / 4, atol=1e-12)
+
+
+def test_static_scene_needs_no_flow(static):
+    pair, T = static
+    assert error_px(pair, np.eye(4), T) > 1.0
+    found = direct_start(pair)
+    assert error_px(pair, found.T_curr_prev, T) < 0.05
+    assert found.probability > 0.9 and found.inlier_ratio > 0.85
+    assert np.linalg.eigvalsh(found.covariance)[0] > 0
+    assert found.weights.shape == pair.prev.camera.shape
+
+
+def test_where_most_moves_it_is_not_sure(moving):
+    found = direct_start(moving[0])
+    assert found is None or found.probability < 0.5
+
+
+def test_a_start_leads_over_a_motion_that_is_too_far():
+    pair, T, _ = made_pair("static", 305, **SIZE)
+    far = replace(pair.curr, rgb=np.roll(pair.curr.rgb, 90, axis=1))
+    assert direct_start(FramePair(pair.prev, far, None)) is None or (
+        direct_start(FramePair(pair.prev, far, None)).probability < 0.5
+    )
+    found = direct_start(FramePair(pair.prev, pair.curr, None), T)
+    assert error_px(pair, found.T_curr_prev, T) < 0.05
+
+
+@pytest.mark.parametrize("missing", ["rgb", "depth"])
+def test_an_image_without_depth_or_colour_gives_no_motion(static, missing):
+    pair = static[0]
+    assert direct_start(replace(pair, curr=replace(pair.curr, **{missing: None}))) is None
+
+
+def test_hybrid_asks_for_flow_only_where_the_images_do_not_suffice(static, moving):
+    asked = []
+
+    class Counted:
+        source = "dis"
+
+        def __call__(self, prev, curr) -> FlowField:
+            asked.append(prev)
+            return dis_flow()(prev, curr)
+
+    found = run_method(static[0], "hybrid", Context(flow=Counted()))
+    assert found.terms == ("images", "depth") and not asked
+    run_method(moving[0], "hybrid", Context(flow=Counted()))
+    assert len(asked) == 1
+    run_method(static[0], "hybrid-flow", Context(flow=Counted()))
+    assert len(asked) == 2
+
+
+def test_a_flow_from_elsewhere_is_used_and_the_mode_decides(static):
+    pair, _ = static
+    field = dis_flow()(pair.prev, pair.curr)
+    given = replace(field, source="file").pair(pair.prev, pair.curr)
+    assert "flow" in estimate(given).terms
+    on = Options(direct=DirectOptions(mode="on"))
+    assert "flow" not in estimate(given, options=on).terms
+    off = Options(direct=DirectOptions(mode="off"))
+    assert "flow" in estimate(pair.prev, pair.curr, options=off).terms
+    assert "flow" not in estimate(pair.prev, pair.curr).terms
