@@ -1,7 +1,6 @@
 """Camera trajectories: chained from relative poses, read from and written to text files.
 
-A trajectory holds ``T_world_cam`` (camera to world) in camera axes. evo writes the files. They are
-read here: evo names neither the line of a mistake nor accepts tabs and Windows line ends.
+evo writes the files. They are read here: evo names neither the line of a mistake nor accepts tabs.
 """
 
 from __future__ import annotations
@@ -36,13 +35,10 @@ _logger = logging.getLogger(__name__)
 
 
 def chain(T_world_prev: np.ndarray, T_curr_prev: np.ndarray) -> np.ndarray:
-    """Next camera pose: ``T_world_curr = T_world_prev @ inv(T_curr_prev)``.
-
-    Both are (4, 4) and orthonormal to 1e-6, the result to 1e-12: one Newton step of the polar
-    decomposition, so that rounding does not accumulate over long sequences.
-    """
+    """Next camera pose: ``T_world_curr = T_world_prev @ inv(T_curr_prev)``, (4, 4)."""
     T_world_curr = T_world_prev @ invert(T_curr_prev)
     R = T_world_curr[:3, :3]
+    # one step of the polar decomposition, so that rounding does not accumulate
     T_world_curr[:3, :3] = R @ (1.5 * np.eye(3) - 0.5 * (R.T @ R))
     return T_world_curr
 
@@ -58,8 +54,8 @@ class Trajectory:
         warnings: what a reader changed, in sentences.
 
     Raises:
-        InputError: no pose, shapes that do not match, values that are not finite, rotations that
-            are not orthonormal to 1e-6, stamps that do not increase.
+        InputError: no pose, shapes that do not match, rotations that are not orthonormal to 1e-6,
+            stamps that do not increase.
     """
 
     timestamps: np.ndarray

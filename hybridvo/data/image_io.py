@@ -21,8 +21,7 @@ from hybridvo.types import MAX_PIXELS, as_rigid
 TAG_BYTES = struct.pack("<f", 202021.25)
 PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 JPEG_MAGIC = b"\xff\xd8"
-UNKNOWN_FLOW = 1e9
-"""Middlebury's mark: flow beyond this is unknown."""
+UNKNOWN_FLOW = 1e9  # Middlebury's mark: flow beyond this is unknown
 COPY_AGAIN = "Copy or download the file again."
 PathLike = str | os.PathLike[str]
 

@@ -16,16 +16,13 @@ from hybridvo.results import MotionPrior, Reason, State
 from hybridvo.tracking.window import Window
 from hybridvo.types import Frame
 
-MEMORY = 10
-"""Motions after which a change counts 1 / e of a new one."""
-MIN_CHANGES = 3
-"""Changes between motions to be seen before their spread means anything."""
+MEMORY = 10  # motions after which a change counts 1 / e of a new one
+MIN_CHANGES = 3  # changes between motions to be seen before their spread means anything
 INFLATION = 2.0
 """Factor on the mean square of the last changes, which tell little of the next, larger one."""
 FLOOR_M, FLOOR_RAD = 1e-3, 1e-3
 """Smallest standard deviations of a prediction: no camera repeats its motion exactly."""
-UNKNOWN_M, UNKNOWN_RAD = 1.0, 0.3
-"""Standard deviations where too little is known."""
+UNKNOWN_M, UNKNOWN_RAD = 1.0, 0.3  # standard deviations where too little is known
 
 
 @dataclass(frozen=True, eq=False)
