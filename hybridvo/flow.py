@@ -33,15 +33,7 @@ _of_thread = threading.local()
 
 @dataclass(frozen=True, eq=False)
 class FlowField:
-    """Optical flow of one pair.
-
-    Args:
-        flow: (H, W, 2) float32 px, previous to current, on the previous grid, or None.
-        variance: (H, W) float32 px^2 per component, or None.
-        valid: (H, W) bool, False where the flow is known to be wrong, or None.
-        source: ``file``, ``dis`` or the name of a callable.
-        is_true: whether the flow is ground truth (an oracle).
-    """
+    """Optical flow of one pair, as in a :class:`hybridvo.types.FramePair`."""
 
     flow: np.ndarray | None
     variance: np.ndarray | None = None

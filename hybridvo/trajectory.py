@@ -210,16 +210,14 @@ def _refuse(path: Path, rows: list[Row], bad: np.ndarray, expected: str) -> None
 
 def _format_of(path: Path) -> str:
     """Format by the number of columns of the first pose."""
+    kinds = {len(columns.split()): kind for kind, columns in COLUMNS.items()}
     for line, text in enumerate(read_text(path).split("\n"), start=1):
         if count := len(text.partition("#")[0].split()):
-            for name, columns in COLUMNS.items():
-                if len(columns.split()) == count:
-                    return name
-            raise FormatError(
-                f"{path}:{line}: expected 8 numbers (TUM), 12 (KITTI) or 7 (TartanAir) separated "
-                f"by spaces, got {count}."
-            )
-    raise FormatError(f"{path}: expected at least one pose, got none.")
+            if count in kinds:
+                return kinds[count]
+            expected = "8 numbers (TUM), 12 (KITTI) or 7 (TartanAir) separated by spaces"
+            raise FormatError(f"{path}:{line}: expected {expected}, got {count}.")
+    return "tum"
 
 
 def check_increasing(stamps: np.ndarray, where: str) -> None:

@@ -351,17 +351,13 @@ def depth_advice(median: float, usual: float | None = None) -> str:
     low, high = PLAUSIBLE_DEPTH_M
     if low <= median <= high:
         return ""
-    if median < low:
-        factors = [float(unit) for unit in UNITS_PER_METRE]
-    elif usual and low <= median / usual <= high:
+    factors = [1 / unit if median > high else float(unit) for unit in UNITS_PER_METRE]
+    if usual and median > high and low <= median / usual <= high:
         factors = [1 / usual]
-    else:
-        factors = [1 / unit for unit in UNITS_PER_METRE]
     # how far each leads from the middle of everyday depths, which are all as good
     nearest, farthest = EVERYDAY_DEPTH_M
-    reach = np.log(farthest / nearest) / 2
-    off = [abs(np.log(median * f / np.sqrt(nearest * farthest))) for f in factors]
-    factor = factors[int(np.argmin(np.maximum(off, reach)))]
+    off = np.abs(np.log(median * np.array(factors) / np.sqrt(nearest * farthest)))
+    factor = factors[int(np.argmin(off.clip(np.log(farthest / nearest) / 2)))]
     if factor > 1:
         return f"multiply by {factor:g}"
     unit = UNITS_PER_METRE.get(round(1 / factor))

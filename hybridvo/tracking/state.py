@@ -74,7 +74,7 @@ class TrackerState:
 
     Args:
         frame: the last frame that could be read; None before the first one.
-        T_world_cam: (4, 4) its pose; read-only.
+        T_world_cam: (4, 4) its pose.
         T_world_last: (4, 4) pose last handed out: another one after frames that could not be read.
         gap: frames that could not be read since ``frame``. failed: motions since the last found.
         count: frames seen.
@@ -89,12 +89,6 @@ class TrackerState:
     failed: int = 0
     count: int = 0
     window: Window | None = None
-
-    def __post_init__(self) -> None:
-        for name in ("T_world_cam", "T_world_last"):
-            own = np.array(getattr(self, name))
-            own.flags.writeable = False
-            object.__setattr__(self, name, own)
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """The state as named arrays, for ``numpy.savez`` (no pickles): images, one JSON text."""
