@@ -189,11 +189,15 @@ def _compare(args: argparse.Namespace, command: list[str]) -> Result:
 
 def _evaluate(args: argparse.Namespace, command: list[str]) -> Result:
     from hybridvo.commands.results import evaluation_text
-    from hybridvo.evaluation.metrics import evaluate_files
+    from hybridvo.evaluation.metrics import evaluate
+    from hybridvo.trajectory import read_trajectory
 
-    names = ["alignment", "delta", "delta_unit", "max_diff"]
-    names += ["format_est", "format_gt", "axes_est", "axes_gt"]
-    report = evaluate_files(args.estimate, args.gt, **{name: getattr(args, name) for name in names})
+    est = read_trajectory(args.estimate, args.format_est, axes=args.axes_est)
+    gt = read_trajectory(args.gt, args.format_gt, axes=args.axes_gt)
+    names = ("alignment", "delta", "delta_unit", "max_diff")
+    report = evaluate(est, gt, **{name: getattr(args, name) for name in names})
+    report |= {"estimate": args.estimate, "gt": args.gt}
+    report["warnings"] = [*est.warnings, *gt.warnings]
     # not one figure: the files do not belong together
     code = 2 if report["ate_rmse_unaligned"] is None else 0
     if code:

@@ -19,7 +19,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from hybridvo.errors import InputError
-from hybridvo.evaluation.metrics import Alignment, TrajectoryError, aligned
+from hybridvo.evaluation.metrics import Alignment, PathError, aligned
 from hybridvo.files import atomic_write
 from hybridvo.geometry import invert
 from hybridvo.trajectory import Trajectory
@@ -37,7 +37,7 @@ class _Line(NamedTuple):
     label: str
     positions: np.ndarray
     style: dict[str, Any]
-    error: TrajectoryError | None = None
+    error: PathError | None = None
 
 
 def plot_trajectories(
@@ -74,7 +74,7 @@ def plot_trajectories(
         axes = _axes(figure, grid[1, :], "Position error", label, "error [cm]")
         for line in lines:
             if line.error is not None:
-                stamps = line.error.timestamps
+                stamps = line.error.stamps
                 start = truth.timestamps[0] if truth is not None and is_timed else 0.0
                 axes.plot(stamps - start, 100 * line.error.translation, **line.style)
         axes.set_ylim(bottom=0.0)
