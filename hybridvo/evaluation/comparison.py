@@ -6,13 +6,12 @@ resume: what it gave is one file in ``parts/`` until the comparison is done.
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
 import os
 import platform
 import shutil
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Mapping
 from collections.abc import Sequence as Several
 from dataclasses import asdict
 from datetime import UTC, datetime
@@ -26,80 +25,103 @@ from hybridvo.data.sequence import Sequence, open_sequence
 from hybridvo.errors import HybridVOError, InputError
 from hybridvo.evaluation.drawing import draw_worst
 from hybridvo.evaluation.protocols import Protocol, check_protocol, protocol_summary
-from hybridvo.evaluation.scores import ROW_COLUMNS, breakdown, total_row, worst_pairs
-from hybridvo.evaluation.sequence_job import (
+from hybridvo.evaluation.scores import (
     PAIR_COLUMNS,
-    ComparisonOptions,
-    Job,
+    breakdown,
     pair_table,
-    run_sequence,
+    sequence_row,
+    total_row,
+    worst_pairs,
 )
+from hybridvo.evaluation.sequence_job import Job, run_sequence
 from hybridvo.files import Mode, fingerprint, held, make_folder, versions, write_csv, write_json
+from hybridvo.flow import MeasuredFlow, dis_flow, file_flow
 from hybridvo.network.models import Models
+from hybridvo.options import Options
 from hybridvo.pipeline import METHODS, check_method, weights_hash
+from hybridvo.trajectory import read_trajectory
 
 WRITTEN = ("results.json", "results.csv", "pairs.csv", "report.md", "report.html")
 """What a finished comparison leaves, beside ``trajectories/`` and ``worst/``."""
-ReportProgress = Callable[[str, int, int], None]
-"""Called with a message (or the empty string), pairs done and pairs in all."""
 
 
 def compare(
-    options: ComparisonOptions,
+    sequences: Several[str | os.PathLike[str]],
     out: str | os.PathLike[str],
     *,
+    methods: Several[str] = ("all",),
+    options: Options | None = None,
+    dataset: str | None = None,
+    protocol: str | None = None,
+    weights: Mapping[str, str] | None = None,
+    worst: int = 3,
     mode: Mode = "new",
     command: Iterable[str] = (),
-    progress: ReportProgress | None = None,
+    say: Callable[[str], None] = lambda text: None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[Path]:
     """Run every method on every sequence and write the results; returns paths of :data:`WRITTEN`.
 
-    ``new`` refuses a folder with results, ``resume`` keeps finished sequences, ``overwrite`` starts
-    anew. ``command`` is for ``results.json``; ``progress`` is told of every pair.
-
-    Raises:
-        InputError: options, sequences or methods that cannot be used. LockedError: another run
-            holds the folder. OutputError: a result cannot be written.
+    A folder of ``sequences`` stands for all that it holds; the method ``all`` for all that can run,
+    the flow ``auto`` for every source that a sequence has, side by side. ``protocol`` is ``paper``
+    or ``trajectory14`` (MPI Sintel as others score it), ``weights`` names files of networks,
+    ``worst`` counts the pairs shown for each method and flow. ``resume`` keeps finished sequences.
+    ``progress`` is told of the pairs done and in all.
     """
     from hybridvo.evaluation.report import write_report
 
-    out, report = Path(out), progress or (lambda message, done, total: None)
+    out, options = Path(out), options or Options()
+    if worst < 0:
+        raise InputError(f"--worst: expected 0 or more, got {worst}.")
     started = datetime.now(UTC).isoformat(timespec="seconds")
-    models = Models(options.device, options.weights)
-    methods, missing = methods_to_run(options.methods, models)
-    jobs, protocol = _plan(options, methods)
-    total = sum(job.pairs for job in jobs)
-    with _folder(out, mode):
+    models = Models(options.run.device, weights)
+    names, missing = methods_to_run(methods, models)
+    hashes = {name: weights_hash(name, models) for name in names}
+    chosen, opened = _open(sequences, options, dataset, protocol)
+    jobs = [_job(path, opened, names, options, chosen, k) for k, path in enumerate(opened)]
+    if doubled := [job.name for job in jobs if [j.name for j in jobs].count(job.name) > 1]:
+        raise InputError(f"--sequence: two sequences are called {doubled[0]}; give each once.")
+    present = [name for name in (*WRITTEN, "parts") if (out / name).exists()]
+    if present and mode == "new":
+        raise InputError(
+            f"{out}: holds {', '.join(present)}; pass --resume to go on, --overwrite to replace "
+            f"them, or another --out."
+        )
+    with held(out):
+        for name in ("parts", "trajectories", "worst"):
+            if mode == "overwrite":
+                shutil.rmtree(out / name, ignore_errors=True)
+            make_folder(out / name)
         for name, reason in missing.items():
-            report(f"not run: {name}: {reason}", 0, total)
-        parts = _work(jobs, out, report)
-        report("scores and report", total, total)
+            say(f"not run: {name}: {reason}")
+        parts = _work(jobs, options, models, hashes, out, say, progress)
+        say("scores and report")
         for part in parts:
             for warning in part["sequence"]["warnings"]:
-                report(f"{part['sequence']['name']}: {warning}", total, total)
+                say(f"{part['sequence']['name']}: {warning}")
         pairs = [row for part in parts for row in part["pairs"]]
         table = pair_table(pairs)
-        worst = worst_pairs(table, options.worst)
-        for job, part in zip(jobs, parts, strict=True):
-            mine = [entry for entry in worst if entry["sequence"] == job.name]
-            draw_worst(out, job, mine, part["pairs"])
+        shown = worst_pairs(table, worst)
+        for job in jobs:
+            mine = [entry for entry in shown if entry["sequence"] == job.name]
+            draw_worst(out, job, options, models, mine, table[table["sequence"] == job.name])
         result = {
             "command": list(command),
             "versions": versions(),
             "machine": {"platform": platform.platform(), "cpus": os.cpu_count()},
             "options": asdict(options),
-            "weights": {name: weights_hash(name, models) for name in methods},
+            "weights": hashes,
             "timing": "one estimate at a time",
             "started": started,
             "finished": datetime.now(UTC).isoformat(timespec="seconds"),
             "missing": missing,
-            **_scores(table, parts, protocol),
-            "trajectories": [path for part in parts for path in part["trajectories"]],
-            "worst_pairs": worst,
+            **_scores(table, parts, chosen, out),
+            "worst_pairs": shown,
         }
         write_csv(out / "pairs.csv", PAIR_COLUMNS, pairs)
         write_json(out / "results.json", result)
-        write_csv(out / "results.csv", ROW_COLUMNS, result["rows"])
+        columns = [name for name in result["rows"][0] if name != "reasons"]
+        write_csv(out / "results.csv", columns, result["rows"])
         write_report(out, result, table)
         shutil.rmtree(out / "parts", ignore_errors=True)
     return [out / name for name in WRITTEN]
@@ -115,17 +137,16 @@ def methods_to_run(
     if not names:
         raise InputError(f"--methods: expected names, got none; known: {', '.join(METHODS)}.")
     is_all = list(names) == ["all"]
-    runnable: dict[str, None] = {}
     missing: dict[str, str] = {}
     for name in METHODS if is_all else names:
         try:
             check_method(name, models)
-            runnable[name] = None
         except InputError as error:
             if not is_all:
                 raise
             missing[name] = str(error)
-    return tuple(runnable), missing
+    wanted = dict.fromkeys(METHODS if is_all else names)
+    return tuple(name for name in wanted if name not in missing), missing
 
 
 def expand(path: str | os.PathLike[str], dataset: str | None = None) -> list[Path]:
@@ -133,127 +154,132 @@ def expand(path: str | os.PathLike[str], dataset: str | None = None) -> list[Pat
 
     A folder that is no sequence is searched one level down; of MPI Sintel its final or clean pass.
     """
+
+    def opens(folder: Path) -> bool:
+        try:
+            open_sequence(folder, dataset)
+        except HybridVOError:
+            return False
+        return True
+
     folder = Path(path)
-    if not folder.is_dir() or _opens(folder, dataset):
+    if not folder.is_dir() or opens(folder):
         return [folder]
     inner = folder
     for names in (("training",), ("final", "clean")):
         inner = next((inner / name for name in names if (inner / name).is_dir()), inner)
     inside = [child for child in sorted(inner.iterdir()) if child.is_dir()]
-    return [child for child in inside if _opens(child, dataset)] or [folder]
+    return [child for child in inside if opens(child)] or [folder]
 
 
-def _opens(folder: Path, dataset: str | None) -> bool:
-    try:
-        open_sequence(folder, dataset)
-    except HybridVOError:
-        return False
-    return True
-
-
-def _plan(
-    options: ComparisonOptions, methods: tuple[str, ...]
-) -> tuple[list[Job], Protocol | None]:
-    """A job for each sequence, and the protocol."""
-    if not options.sequences:
+def _open(
+    sequences: Several[str | os.PathLike[str]],
+    options: Options,
+    dataset: str | None,
+    protocol: str | None,
+) -> tuple[Protocol | None, dict[Path, Sequence]]:
+    """The protocol, and the sequences by their folders."""
+    if not sequences:
         raise InputError("compare: expected at least one folder of a sequence, got none.")
-    paths = [path for given in options.sequences for path in expand(given, options.dataset)]
-    opened = {path: open_sequence(path, options.dataset) for path in paths}
-    protocol = None
-    if options.protocol is not None:
-        if options.stride != 1 or options.start or options.stop is not None:
-            raise InputError(
-                f"--protocol {options.protocol} is defined on whole sequences: leave out --start, "
-                f"--stop and --stride."
-            )
-        protocol = check_protocol(options.protocol, list(opened.values()))
-        opened = {path: s for path, s in opened.items() if s.name in protocol.sequences}
-        if not opened:
-            known = ", ".join(protocol.sequences)
-            raise InputError(f"--protocol {protocol.name}: expected some of {known}, got none.")
-    names = [sequence.name for sequence in opened.values()]
-    models = Models(options.device, options.weights)
-    hashes = {name: weights_hash(name, models) for name in methods}
-    jobs: list[Job] = []
-    for path, sequence in opened.items():
-        name = sequence.name
-        if names.count(name) > 1:
-            name = f"{path.absolute().parent.name}/{name}"
-        if name in [job.name for job in jobs]:
-            raise InputError(f"--sequence: two sequences are called {name}; give each once.")
-        frames = range(*slice(options.start, options.stop, options.stride).indices(len(sequence)))
-        if not frames:
-            raise InputError(f"{name}: no frames from {options.start} on: it has {len(sequence)}.")
-        flows = _flows(sequence, options)
-        same_camera_only = protocol is not None and protocol.same_camera_only
-        deciding = [name, fingerprint(sequence.files()), list(frames), flows, options.seed]
-        deciding += [same_camera_only, options.device, hashes, hybridvo.__version__]
-        digest = hashlib.sha256(json.dumps(deciding).encode()).hexdigest()
-        plain = "".join(c if c.isalnum() or c in "-_." else "_" for c in name)[:60]
-        named = (str(path), name, f"{len(jobs):03d}_{plain}")
-        jobs.append(Job(*named, options, flows, methods, frames, same_camera_only, digest))
-    return jobs, protocol
+    paths = [path for given in sequences for path in expand(given, dataset)]
+    opened = {path: open_sequence(path, dataset) for path in paths}
+    if protocol is None:
+        return None, opened
+    if options.run.stride != 1 or options.run.start or options.run.stop is not None:
+        raise InputError(
+            f"--protocol {protocol} is defined on whole sequences: leave out --start, --stop and "
+            f"--stride."
+        )
+    chosen = check_protocol(protocol, list(opened.values()))
+    opened = {path: s for path, s in opened.items() if s.name in chosen.sequences}
+    if not opened:
+        known = ", ".join(chosen.sequences)
+        raise InputError(f"--protocol {protocol}: expected some of {known}, got none.")
+    return chosen, opened
 
 
-def _flows(sequence: Sequence, options: ComparisonOptions) -> tuple[str, ...]:
-    """Sources of flow: both side by side where the sequence has both."""
-    if options.flow == "file":
-        sequence.check_flow(options.stride)
-    if options.flow != "auto":
-        return (options.flow,)
-    usable = sequence.has_flow and options.stride == 1
-    images = any(path is not None for path in sequence.rgb_files)
-    return (*(("dis",) if images or not usable else ()), *(("file",) if usable else ()))
+def _job(
+    path: Path,
+    opened: Mapping[Path, Sequence],
+    methods: tuple[str, ...],
+    options: Options,
+    protocol: Protocol | None,
+    number: int,
+) -> Job:
+    """What is to be done on the sequence of a folder; both flows where it has both."""
+    sequence, run, source = opened[path], options.run, options.flow.source
+    name = sequence.name
+    if [other.name for other in opened.values()].count(name) > 1:
+        name = f"{path.absolute().parent.name}/{name}"
+    frames = range(*slice(run.start, run.stop, run.stride).indices(len(sequence)))
+    if not frames:
+        raise InputError(f"{name}: no frames from {run.start} on: it has {len(sequence)}.")
+    if source == "file":
+        sequence.check_flow(run.stride)
+    from_files = source == "file" or (source == "auto" and sequence.has_flow and run.stride == 1)
+    images = any(file is not None for file in sequence.rgb_files)
+    flows = {}
+    if source == "dis" or (source == "auto" and (images or not from_files)):
+        flows["dis"] = MeasuredFlow(dis_flow(options.flow.dis_preset))
+    if from_files:  # an oracle is named
+        label = "file (true)" if sequence.flow_is_true else "file"
+        flows[label] = MeasuredFlow(file_flow(sequence, strict=False))
+    plain = "".join(c if c.isalnum() or c in "-_." else "_" for c in name)[:60]
+    same_camera_only = protocol is not None and protocol.same_camera_only
+    return Job(sequence, name, f"{number:03d}_{plain}", frames, methods, flows, same_camera_only)
 
 
 # -- work -----------------------------------------------------------------------------------------
 
 
-@contextlib.contextmanager
-def _folder(out: Path, mode: Mode) -> Iterator[None]:
-    """Hold the output folder; refuse or remove what is in it."""
-    present = [name for name in (*WRITTEN, "parts") if (out / name).exists()]
-    if present and mode == "new":
-        raise InputError(
-            f"{out}: holds {', '.join(present)}; pass --resume to go on, --overwrite to replace "
-            f"them, or another --out."
-        )
-    with held(out):
-        if mode == "overwrite":
-            for name in ("parts", "trajectories", "worst"):
-                shutil.rmtree(out / name, ignore_errors=True)
-        yield
-
-
-def _work(jobs: list[Job], out: Path, report: ReportProgress) -> list[dict[str, Any]]:
+def _work(
+    jobs: list[Job],
+    options: Options,
+    models: Models,
+    hashes: Mapping[str, str | None],
+    out: Path,
+    say: Callable[[str], None],
+    progress: Callable[[int, int], None],
+) -> list[dict[str, Any]]:
     """What every job gave, in order; kept from an earlier try where that is finished."""
-    for name in ("parts", "trajectories", "worst"):
-        make_folder(out / name)
-    paths = {job.name: out / "parts" / f"{job.fingerprint}.json" for job in jobs}
-    todo = [job for job in jobs if not paths[job.name].exists()]
+    parts = []
+    for job in jobs:
+        deciding = [job.name, fingerprint(job.sequence.files()), list(job.frames), list(job.flows)]
+        deciding += [job.same_camera_only, asdict(options), hashes, hybridvo.__version__]
+        digest = hashlib.sha256(json.dumps(deciding).encode()).hexdigest()
+        parts.append(out / "parts" / f"{digest}.json")
+    todo = [k for k, part in enumerate(parts) if not part.exists()]
     total = sum(job.pairs for job in jobs)
-    done = total - sum(job.pairs for job in todo)
+    done = total - sum(jobs[k].pairs for k in todo)
     if len(todo) < len(jobs):
-        text = f"resumed: {len(jobs) - len(todo)} of {len(jobs)} sequences are finished"
-        report(text, done, total)
-    for job in todo:
+        say(f"resumed: {len(jobs) - len(todo)} of {len(jobs)} sequences are finished")
+    for k in todo:
 
-        def report_pairs(pairs: int, before: int = done) -> None:
-            report("", before + pairs, total)
+        def report(pairs: int, before: int = done) -> None:
+            progress(before + pairs, total)
 
-        write_json(paths[job.name], run_sequence(job, out, report_pairs))
-        done += job.pairs
-    return [json.loads(paths[job.name].read_text(encoding="utf-8")) for job in jobs]
-
-
-# -- results --------------------------------------------------------------------------------------
+        write_json(parts[k], run_sequence(jobs[k], options, models, out, report))
+        done += jobs[k].pairs
+    return [json.loads(part.read_text(encoding="utf-8")) for part in parts]
 
 
 def _scores(
-    table: pd.DataFrame, parts: list[dict[str, Any]], protocol: Protocol | None
+    table: pd.DataFrame, parts: list[dict[str, Any]], protocol: Protocol | None, out: Path
 ) -> dict[str, Any]:
     """Lines and tables of all sequences."""
-    rows = [row for part in parts for row in part["rows"]]
+    rows = []
+    for part in parts:
+        facts = part["sequence"]
+        paths = {
+            (entry["method"], entry["flow_source"]): read_trajectory(out / entry["path"], "tum")
+            for entry in part["trajectories"]
+        }
+        gt = paths.pop((None, None), None)
+        for (method, flow), est in paths.items():
+            named = {"sequence": facts["name"], "method": method, "flow_source": flow}
+            mine = table[(table[list(named)] == pd.Series(named)).all(axis=1)]
+            named["depth_source"] = facts["depth_source"]
+            rows.append(sequence_row(mine, est if len(est) > 1 else None, gt, named))
     totals = [
         total_row(group, [row for row in rows if (row["method"], row["flow_source"]) == key])
         for key, group in table.groupby(["method", "flow_source"], sort=False)
@@ -265,4 +291,5 @@ def _scores(
         "sequences": [part["sequence"] for part in parts],
         "breakdown": breakdown(table),
         "protocol": protocol and protocol_summary(protocol, totals, counts),
+        "trajectories": [path for part in parts for path in part["trajectories"]],
     }

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from hybridvo.data.sequence import Sequence, iter_pairs
 from hybridvo.errors import InputError
@@ -20,8 +21,9 @@ from hybridvo.files import atomic_write, make_folder, write_json
 from hybridvo.flow import dis_flow
 from hybridvo.geometry import ego_flow, matrix_to_euler_deg
 from hybridvo.network.layers import KINDS
-from hybridvo.network.models import load_weights
+from hybridvo.network.models import Models, load_weights
 from hybridvo.network.weights import pretrained, pretrained_names
+from hybridvo.options import Options
 from hybridvo.pipeline import DEFAULT_METHOD
 from hybridvo.results import PixelwisePrediction
 from hybridvo.types import Camera, FramePair
@@ -78,43 +80,41 @@ def draw(
 def draw_worst(
     out: Path,
     job: Job,
+    options: Options,
+    models: Models,
     entries: Iterable[dict[str, Any]],
-    rows: Iterable[Mapping[str, Any]],
+    pairs: pd.DataFrame,
 ) -> None:
     """Draw worst pairs of one sequence of a comparison, with the motion that it found.
 
     Each of ``entries`` gets ``picture`` (a path below ``out``), or None and ``picture_reason``.
-    ``rows`` are the pairs of the sequence.
     """
-    sequence, models, flows = job.open()
-    found = {(row["index"], row["method"], row["flow_source"]): row for row in rows}
+    found = pairs.set_index(["index", "method", "flow_source"])
     for entry in entries:
         method, label = entry["method"], entry["flow_source"]
-        row = found[entry["index"], method, label]
+        row = found.loc[(entry["index"], method, label)]
         entry |= {"picture": None, "picture_reason": None}
         try:
-            prev, curr = sequence.frame(row["prev"]), sequence.frame(row["next"])
+            prev, curr = (job.sequence.frame(int(row[name])) for name in ("prev", "next"))
         except (InputError, OSError) as error:
             entry["picture_reason"] = f"the pair cannot be read: {error}"
             continue
-        field = flows[label](prev, curr)
+        field = job.flows[label](prev, curr)
         if field.flow is None or prev.depth is None:
             entry["picture_reason"] = "the pair has no flow, or no depth"
             continue
         pair = FramePair(prev, curr, field.flow, field.variance, field.valid)
         weights = None
         if not entry["status"].startswith("failed"):  # of the pair on its own, without a tracker
-            weights = estimate(pair, method=method, models=models).weights
-        T_gt = true_motion(sequence, prev.index, curr.index)
-        T_est = np.array(row["T_curr_prev"]).reshape(4, 4)
-        panels = _pair_panels(pair, T_est, weights, T_gt, None)[0]
+            weights = estimate(pair, method=method, options=options, models=models).weights
+        T_gt = true_motion(job.sequence, prev.index, curr.index)
+        panels = _pair_panels(pair, np.array(row["T_curr_prev"]), weights, T_gt, None)[0]
         aspect = prev.camera.width / prev.camera.height
         name = f"{job.stem}_{entry['index']:06d}_{method}_{label.split()[0]}"
         entry["picture"] = f"worst/{name}.jpg"
+        size: dict[str, Any] = {"columns": len(panels), "inches": 2.2, "format": "jpeg"}
         with atomic_write(out / entry["picture"], "wb") as file:
-            file.write(
-                draw_panels(panels, "", aspect, columns=len(panels), inches=2.2, format="jpeg")
-            )
+            file.write(draw_panels(panels, "", aspect, **size))
 
 
 def _read_pair(sequence: Sequence, index: int, flow: str) -> FramePair:

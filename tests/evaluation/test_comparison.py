@@ -16,10 +16,11 @@ from hybridvo.cli import main
 from hybridvo.data.sequence import open_sequence
 from hybridvo.errors import InputError, LockedError
 from hybridvo.evaluation.comparison import WRITTEN, compare, expand, methods_to_run
-from hybridvo.evaluation.sequence_job import PAIR_COLUMNS, ComparisonOptions
+from hybridvo.evaluation.scores import PAIR_COLUMNS
 from hybridvo.files import LOCK
 from hybridvo.network.models import Models
 from hybridvo.odometry import Odometry
+from hybridvo.options import FlowOptions, Options
 from hybridvo.pipeline import METHODS, weights_hash
 from hybridvo.results import RelativePose
 from hybridvo.synthetic.render import write_sintel
@@ -53,8 +54,9 @@ def tiny(tree: Path) -> Path:
     return tree / "training" / "clean" / "tiny"
 
 
-def make_options(*paths: Path, methods: tuple[str, ...] = FAST, **more: Any) -> ComparisonOptions:
-    return ComparisonOptions(tuple(map(str, paths)), methods=methods, **more)
+def run(*paths: Path, out: Path, flow: str = "auto", **more: Any) -> None:
+    options = Options(flow=FlowOptions(source=flow))
+    compare(paths, out, options=options, **{"methods": FAST} | more)
 
 
 def rows_of(path: Path) -> list[dict[str, str]]:
@@ -115,7 +117,7 @@ def test_results_hold_what_the_interface_promises(tiny, tmp_path, capsys) -> Non
 def test_a_method_gives_what_it_gives_alone(tree: Path, tmp_path: Path, method: str) -> None:
     """Beside others, and with flow that they share, as a tracker of its own: the same motions."""
     path = tree / "training" / "clean" / "longer"
-    compare(make_options(path, methods=("identity", method), flow="dis"), tmp_path / "out")
+    run(path, out=tmp_path / "out", methods=("identity", method), flow="dis")
     sequence = open_sequence(path)
     vo = Odometry(method=method)
     poses = [vo.track(sequence.frame(i)).T_world_cam for i in range(len(sequence))]
@@ -127,21 +129,21 @@ def test_a_method_gives_what_it_gives_alone(tree: Path, tmp_path: Path, method: 
 
 def test_resume_keeps_finished_sequences(tree: Path, tmp_path: Path) -> None:
     paths = [tree / "training" / "clean" / name for name in ("tiny", "longer")]
-    options = functools.partial(make_options, flow="file")
-    compare(options(*paths), tmp_path / "whole")
+    files = functools.partial(run, *paths, flow="file")
+    files(out=tmp_path / "whole")
     # as after an interruption: the first sequence is finished, the second is not
     read: list[str] = []
 
-    def interrupt(message: str, done: int, total: int) -> None:
+    def interrupt(done: int, total: int) -> None:
         if done > 3:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        compare(options(*paths), tmp_path / "cut", progress=interrupt)
+        files(out=tmp_path / "cut", progress=interrupt)
     assert len(list((tmp_path / "cut" / "parts").iterdir())) == 1
     with pytest.raises(InputError, match="--resume"):
-        compare(options(*paths), tmp_path / "cut")
-    compare(options(*paths), tmp_path / "cut", mode="resume", progress=lambda m, *_: read.append(m))
+        files(out=tmp_path / "cut")
+    files(out=tmp_path / "cut", mode="resume", say=read.append)
     assert any("1 of 2 sequences" in message for message in read)
     assert outcome(tmp_path / "cut") == outcome(tmp_path / "whole")
 
@@ -152,7 +154,7 @@ def test_a_broken_frame_is_a_failed_pair_and_the_next_spans_it(tiny: Path, tmp_p
     sequence = root / "clean" / "tiny"
     sorted(sequence.glob("*.png"))[1].write_bytes(b"no image")
     out = tmp_path / "out"
-    compare(make_options(sequence, methods=("refine", "identity"), flow="dis"), out)
+    run(sequence, out=out, methods=("refine", "identity"), flow="dis")
     rows = [row for row in rows_of(out / "pairs.csv") if row["method"] == "refine"]
     assert [row["index"] for row in rows] == ["0", "1", "2"]
     assert rows[0]["status"].startswith("failed") and rows[0]["epe_l2_px"] == ""
@@ -167,7 +169,7 @@ def test_a_broken_frame_is_a_failed_pair_and_the_next_spans_it(tiny: Path, tmp_p
 def test_without_ground_truth_there_are_reasons(walk: Path, tmp_path: Path) -> None:
     shutil.copytree(walk, tmp_path / "walk")
     (tmp_path / "walk" / "poses.txt").unlink()
-    compare(make_options(tmp_path / "walk", flow="file"), tmp_path / "out")
+    run(tmp_path / "walk", out=tmp_path / "out", flow="file")
     result = json.loads((tmp_path / "out" / "results.json").read_text())
     for row in result["rows"]:
         for key in ("epe", "epe_l2_px", "ate_rmse", "rot_err_deg_mean", "failure_rate"):
@@ -181,7 +183,7 @@ def test_a_bug_of_a_method_costs_its_pairs(tiny: Path, tmp_path: Path, monkeypat
         raise ZeroDivisionError("a bug")
 
     monkeypatch.setitem(METHODS, "pnp-ransac", broken)
-    compare(make_options(tiny, flow="file"), tmp_path / "out")
+    run(tiny, out=tmp_path / "out", flow="file")
     rows = rows_of(tmp_path / "out" / "pairs.csv")
     status = {row["method"]: (row["status"], row["message"]) for row in rows}
     assert status["pnp-ransac"] == ("failed(raised)", "ZeroDivisionError: a bug")
@@ -191,7 +193,7 @@ def test_a_bug_of_a_method_costs_its_pairs(tiny: Path, tmp_path: Path, monkeypat
 def test_refused_folders(tiny: Path, tmp_path: Path) -> None:
     (tmp_path / "held").mkdir()
     with filelock.FileLock(tmp_path / "held" / LOCK), pytest.raises(LockedError):
-        compare(make_options(tiny), tmp_path / "held")
+        run(tiny, out=tmp_path / "held")
 
 
 @pytest.mark.parametrize(

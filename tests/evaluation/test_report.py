@@ -19,8 +19,13 @@ from hybridvo.evaluation.charts import (
 )
 from hybridvo.evaluation.protocols import protocol_summary, protocols
 from hybridvo.evaluation.report import headline, number, write_report
-from hybridvo.evaluation.scores import breakdown, sequence_row, total_row, worst_pairs
-from hybridvo.evaluation.sequence_job import pair_table
+from hybridvo.evaluation.scores import (
+    breakdown,
+    pair_table,
+    sequence_row,
+    total_row,
+    worst_pairs,
+)
 from hybridvo.geometry import se3_exp
 from hybridvo.trajectory import Trajectory
 

@@ -12,11 +12,11 @@ import pytest
 from hybridvo.evaluation.scores import (
     breakdown,
     failure_rate,
+    pair_table,
     sequence_row,
     total_row,
     worst_pairs,
 )
-from hybridvo.evaluation.sequence_job import pair_table
 from hybridvo.geometry import se3_exp
 from hybridvo.trajectory import Trajectory
 
