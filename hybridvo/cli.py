@@ -155,16 +155,15 @@ def _show(args: argparse.Namespace, command: list[str]) -> Result:
 
 
 def _compare(args: argparse.Namespace, command: list[str]) -> Result:
-    from hybridvo.commands.progress import Progress
-    from hybridvo.evaluation.comparison import compare
+    from hybridvo.commands.compare import compare
     from hybridvo.pipeline import METHODS
 
     methods = tuple(name.strip() for name in args.methods.split(",") if name.strip())
     weights = arguments.weight_files(args.weights, METHODS if methods == ("all",) else methods)
     given = {"methods": methods, "weights": weights, "options": arguments.run_options(args)}
     given |= {"sequences": (*args.paths, *args.sequence), "command": command}
-    with Progress(0, "compare", quiet=args.quiet, unit="pairs") as bar:
-        return _files(_call(compare, args, **given, say=bar.say, progress=bar.update))
+    say = (lambda text: None) if args.quiet else (lambda text: print(text, file=sys.stderr))
+    return _files(_call(compare, args, **given, say=say))
 
 
 def _evaluate(args: argparse.Namespace, command: list[str]) -> Result:
@@ -186,15 +185,13 @@ def _evaluate(args: argparse.Namespace, command: list[str]) -> Result:
 
 
 def _doctor(args: argparse.Namespace, command: list[str]) -> Result:
-    if args.path or args.sequence:
-        from hybridvo.commands.diagnose import diagnose, diagnosis_text
+    from hybridvo.commands.doctor import diagnose, diagnosis_text, doctor, doctor_text
 
+    if args.path or args.sequence:
         found = diagnose(_open(args), pairs=args.pairs)
         return found, diagnosis_text(found), 0 if found["ok"] else 1
-    from hybridvo.commands.doctor import doctor, doctor_text
-
     report = doctor()
-    return report, doctor_text(report), 0 if report["usable"] else 2
+    return report, doctor_text(report), 0
 
 
 def _demo(args: argparse.Namespace, command: list[str]) -> Result:

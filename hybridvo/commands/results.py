@@ -73,7 +73,7 @@ def write_metrics(
 ) -> dict[str, Any]:
     """Write ``metrics.json``: errors against the ground truth, and what went in."""
     report = evaluate(trajectory, gt, alignment=alignment)
-    pairs = mean_pair_errors(row["errors"] for row in rows if row["errors"] is not None)
+    pairs = mean_pair_errors(row for row in rows if "rot_err_deg" in row)
     reasons = report.pop("reasons") | pairs.pop("reasons")
     named = ("method", "failed", "degraded", "flow_source", "depth_source", "oracle", "sequence")
     metrics = report | pairs | {"reasons": reasons} | {key: summary[key] for key in named}

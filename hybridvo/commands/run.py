@@ -17,9 +17,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 import hybridvo
 from hybridvo.commands import results
-from hybridvo.commands.diagnose import is_dark
 from hybridvo.commands.progress import Progress, interruptible
 from hybridvo.commands.recording import Recording, check_recording
 from hybridvo.commands.run_folder import RESULTS, STATE, RunFolder
@@ -41,6 +42,8 @@ RECORDING = "recording.rrd"
 """Name of a Rerun recording within the output folder."""
 SAVE_EVERY = 50
 """Frames after which the run can be resumed."""
+DARK_LEVEL = 20.0
+"""Grey levels (of 255) below which nine tenths of a dark image lie; of a street at night, 60."""
 
 
 def run(
@@ -53,22 +56,24 @@ def run(
     command: Iterable[str] = (),
     quiet: bool = False,
     rrd: str | os.PathLike[str] | None = None,
+    quick: bool = False,
 ) -> tuple[dict[str, Any], int]:
     """Estimate, chain, write and score a sequence: a summary, JSON-ready, and the exit code.
 
     ``out`` is by default ``runs/NAME``; ``rrd`` is the file of a Rerun recording, empty for
-    ``recording.rrd`` in the output folder.
+    ``recording.rrd`` in the output folder; ``quick``: no warming up and no picture.
     """
     method = options.run.method
     models = models or Models(options.run.device)
     check_method(method, models)
     if rrd is not None:
         check_recording(rrd or RECORDING)
-    frames = _frames(sequence, options)
-    flow = MeasuredFlow(_flow_provider(sequence, options))
+    frames = frames_of(sequence, options)
+    flow = MeasuredFlow(flow_provider(sequence, options))
     out = _folder(out, sequence)
     vo = Odometry(models, flow=flow, method=method, options=options, seed=options.run.seed)
-    vo.warm_up()  # before the folder is taken: it may last
+    if not quick:
+        vo.warm_up()  # before the folder is taken: it may last
     header = _header(sequence, len(frames), options, weights_hash(method, models))
     header["command"] = list(command)
     with held(out), contextlib.ExitStack() as stack:
@@ -84,7 +89,7 @@ def run(
             first = len(folder.rows)
             recording = Recording(*named, len(frames), first=first, poses=poses)
             stack.enter_context(recording)
-        job = _Job(sequence, frames, options, vo, flow, folder, recording)
+        job = _Job(sequence, frames, options, vo, flow, folder, recording, quick)
         summary, exit_code = job.run(quiet)
         if recording is not None:
             summary["recording"] = os.fspath(recording.path)
@@ -102,6 +107,7 @@ class _Job:
     flow: MeasuredFlow
     folder: RunFolder
     recording: Recording | None
+    quick: bool
 
     def run(self, quiet: bool) -> tuple[dict[str, Any], int]:
         label = f"{self.sequence.name} [{self.options.run.method}]"
@@ -172,7 +178,7 @@ class _Job:
             "T_world_cam": step.T_world_cam.tolist(),
             "covariance": motion.covariance.tolist(),
             "flow_is_true": field.flow is not None and field.is_true,
-            "errors": step_errors(self.sequence, prev, step.index, step.T_curr_prev),
+            **step_errors(self.sequence, prev, step.index, step.T_curr_prev),
         }
 
     def _write(self, interrupted: bool) -> tuple[dict[str, Any], int]:
@@ -196,7 +202,8 @@ class _Job:
         if (gt := true_trajectory(self.sequence, self.frames)) is not None:
             alignment = self.options.run.alignment
             metrics = results.write_metrics(path, rows, trajectory, gt, summary, alignment)
-        results.draw(path / "trajectory.png", trajectory, gt, summary)
+        if not self.quick:
+            results.draw(path / "trajectory.png", trajectory, gt, summary)
         written = (path / name for name in (*RESULTS, STATE))
         summary["files"] = [os.fspath(file) for file in written if file.exists()]
         folder.save("done", summary=summary)
@@ -228,7 +235,12 @@ def _header(
     }
 
 
-def _frames(sequence: Sequence, options: Options) -> range:
+def is_dark(rgb: np.ndarray | None) -> bool:
+    """Whether an image (H, W, 3) uint8 is too dark to see anything in."""
+    return rgb is not None and float(np.percentile(rgb[::4, ::4].max(axis=2), 90)) < DARK_LEVEL
+
+
+def frames_of(sequence: Sequence, options: Options) -> range:
     """Indices of the frames that the options ask for."""
     stop = min(options.run.stop or len(sequence), len(sequence))
     frames = range(options.run.start, stop, options.run.stride)
@@ -240,7 +252,7 @@ def _frames(sequence: Sequence, options: Options) -> range:
     return frames
 
 
-def _flow_provider(sequence: Sequence, options: Options) -> FlowProvider:
+def flow_provider(sequence: Sequence, options: Options) -> FlowProvider:
     """Provider of the flow that the options ask for."""
     source, stride = options.flow.source, options.run.stride
     from_files = file_flow(sequence, strict=options.run.strict)

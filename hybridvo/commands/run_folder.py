@@ -28,6 +28,7 @@ STEP_COLUMNS = (
     *("tx", "ty", "tz", "rx", "ry", "rz"),
     *("inlier_ratio", "iterations", "cost", "flow_ms", "motion_ms", "frame_ms"),
     *("prev_index", "flow_source", "message"),
+    *("r_err_deg", "t_err", "epe", "epe_l2_px", "rot_err_deg", "trans_err"),
 )
 
 

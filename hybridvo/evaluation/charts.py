@@ -102,8 +102,9 @@ def factor_charts(breakdown: Mapping[str, Any], methods: Sequence[str]) -> list[
     """Median error over the bins of each factor; a factor with one bin tells nothing."""
     if not breakdown["cells"]:
         return []
-    cells = pd.DataFrame(breakdown["cells"]).dropna(subset=["epe_l2_px_median"])
+    cells = pd.DataFrame(breakdown["cells"])
     cells = cells[cells["flow_source"] == flow_sources(cells)[0]]
+    cells = cells.dropna(subset=["epe_l2_px_median"])
     figures = []
     for factor in breakdown["factors"]:
         mine = cells[cells["factor"] == factor["name"]].sort_values("bin")
@@ -142,12 +143,16 @@ def path_charts(
     methods: Sequence[str],
 ) -> list[Figure]:
     """Path from above, error of every pair and path in space, of the first source of flow."""
-    entries = pd.DataFrame(result["trajectories"])
-    entries = entries[entries["sequence"] == sequence]
-    flow = flow_sources(entries)[0]
+    (truth,) = (s["ground_truth"] for s in result["sequences"] if s["name"] == sequence)
+    rows = pd.DataFrame([row for row in result["rows"] if row["sequence"] == sequence])
+    flow = flow_sources(rows)[0]
     mine = pairs[(pairs["sequence"] == sequence) & (pairs["flow_source"] == flow)]
-    entries = entries[entries["flow_source"].isna() | entries["flow_source"].eq(flow)]
-    paths = _positions(folder, entries).assign(flow_source=flow)
+    rows = rows[rows["flow_source"] == flow]
+    files = ({TRUTH: truth} if truth else {}) | dict(
+        zip(rows["method"], rows["trajectory"], strict=True)
+    )
+    paths = _positions({name: folder / file for name, file in files.items()})
+    paths["flow_source"] = flow
     above = _chart(px.line, paths, "right", "forward", methods, title=f"From above, {flow} flow")
     above.update_yaxes(scaleanchor="x")
     titled = {"z": "up", "title": f"Path in space, {flow} flow"}
@@ -166,11 +171,9 @@ def path_charts(
     return figures
 
 
-def _positions(folder: Path, entries: pd.DataFrame) -> pd.DataFrame:
+def _positions(files: Mapping[str, Path]) -> pd.DataFrame:
     """``method, right, forward, up`` of every path in the first true camera, metres."""
-    names = entries["method"].fillna(TRUTH)
-    files = (read_trajectory(folder / path, "tum") for path in entries["path"])
-    paths = dict(zip(names, files, strict=True))
+    paths = {name: read_trajectory(file, "tum") for name, file in files.items()}
     gt = paths.get(TRUTH)
     tables = []
     for method, path in paths.items():

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import re
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +16,8 @@ from hybridvo.estimation import estimate
 from hybridvo.evaluation.pair_errors import MOVING_PX, pair_errors, true_motion
 from hybridvo.evaluation.plots import Panel, draw_panels, flow_panel, longest_flow
 from hybridvo.evaluation.saliency import last_pass, saliencies
-from hybridvo.evaluation.sequence_job import Job
 from hybridvo.files import atomic_write, make_folder, write_json
-from hybridvo.flow import dis_flow
+from hybridvo.flow import FlowProvider, dis_flow
 from hybridvo.geometry import ego_flow, matrix_to_euler_deg
 from hybridvo.network.layers import KINDS
 from hybridvo.network.models import Models, load_weights
@@ -86,7 +86,8 @@ def draw(
 
 def draw_worst(
     out: Path,
-    job: Job,
+    sequence: Sequence,
+    flows: Mapping[str, FlowProvider],
     options: Options,
     models: Models,
     entries: Iterable[dict[str, Any]],
@@ -102,11 +103,11 @@ def draw_worst(
         row = found.loc[(entry["index"], method, label)]
         entry |= {"picture": None, "picture_reason": None}
         try:
-            prev, curr = (job.sequence.frame(int(row[name])) for name in ("prev", "next"))
+            prev, curr = (sequence.frame(int(row[name])) for name in ("prev", "next"))
         except (InputError, OSError) as error:
             entry["picture_reason"] = f"the pair cannot be read: {error}"
             continue
-        field = job.flows[label](prev, curr)
+        field = flows[label](prev, curr)
         if field.flow is None or prev.depth is None:
             entry["picture_reason"] = "the pair has no flow, or no depth"
             continue
@@ -114,11 +115,11 @@ def draw_worst(
         weights = None
         if not entry["status"].startswith("failed"):  # of the pair on its own, without a tracker
             weights = estimate(pair, method=method, options=options, models=models).weights
-        T_gt = true_motion(job.sequence, prev.index, curr.index)
-        panels = _pair_panels(pair, np.array(row["T_curr_prev"]), weights, T_gt, None)[0]
+        T_gt = true_motion(sequence, prev.index, curr.index)
+        panels = _pair_panels(pair, row["T_curr_prev"], weights, T_gt, None)[0]
         aspect = prev.camera.width / prev.camera.height
-        name = f"{job.stem}_{entry['index']:06d}_{method}_{label.split()[0]}"
-        entry["picture"] = f"worst/{name}.jpg"
+        name = "_".join([entry["sequence"], f"{entry['index']:06d}", method, label.split()[0]])
+        entry["picture"] = "worst/" + re.sub(r"[^\w.-]", "_", name) + ".jpg"
         size: dict[str, Any] = {"columns": len(panels), "inches": 2.2, "format": "jpeg"}
         with atomic_write(out / entry["picture"], "wb") as file:
             file.write(draw_panels(panels, "", aspect, **size))

@@ -18,14 +18,14 @@ from matplotlib import colormaps
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from hybridvo.evaluation.metrics import Alignment, aligned
+from hybridvo.evaluation.metrics import Alignment, PathError, aligned
 from hybridvo.files import atomic_write
 from hybridvo.geometry import invert
 from hybridvo.trajectory import Trajectory
 
 # Okabe and Ito's palette without yellow: told apart by colour-blind readers, in print too
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
-_TRUTH = {"label": "ground truth", "color": "#222222", "linewidth": 2.6, "alpha": 0.55}
+_BLACK = "#222222"
 _VIEWS = {
     "Top view": ("x right [m]", "z forward [m]", [0, 2]),
     "Side view": ("z forward [m]", "y down [m]", [2, 1]),
@@ -46,7 +46,10 @@ def plot_trajectories(
     x right, y down, z forward. Estimates are aligned as ``alignment`` says, or by their first pose
     where a path does not determine it (the legend says which). ``path`` ends in ``.png``.
     """
-    lines = [] if truth is None else [(truth, truth, None, dict(_TRUTH))]
+    lines: list[tuple[Trajectory, Trajectory, PathError | None, dict[str, Any]]] = []
+    if truth is not None:
+        bold = {"label": "ground truth", "color": _BLACK, "linewidth": 2.6, "alpha": 0.55}
+        lines.append((truth, truth, None, bold))
     for (name, est), colour in zip(trajectories.items(), itertools.cycle(_COLOURS), strict=False):
         style: dict[str, Any] = {"label": name, "color": colour, "linewidth": 1.4}
         if truth is None:
@@ -59,7 +62,7 @@ def plot_trajectories(
         lines.append((est, truth, error, style | {"label": f"{name} ({told})"}))
     errors = [(error, style) for *_, error, style in lines if error is not None]
     figure = _figure(10.0, 7.4 if errors else 4.8, dpi=130)
-    rows = [[*_VIEWS], *([["Position error"] * 2] if errors else [])]
+    rows: Any = [[*_VIEWS], *([["Position error"] * 2] if errors else [])]
     axes = figure.subplot_mosaic(rows, height_ratios=[2.0, 1.0][: len(rows)])
     for view, (x, y, plane) in _VIEWS.items():
         _style(axes[view], view, x, y)
@@ -69,7 +72,7 @@ def plot_trajectories(
         ]
         for place, (*_, style) in zip(places, lines, strict=True):
             axes[view].plot(*place.T, **style)
-        axes[view].plot(*places[0][0], "o", color=_TRUTH["color"], markersize=5, zorder=5)
+        axes[view].plot(*places[0][0], "o", color=_BLACK, markersize=5, zorder=5)
         centre = np.concatenate(places).mean(axis=0)
         axes[view].update_datalim([centre - 5e-4, centre + 5e-4])  # a camera that does not move
         axes[view].margins(0.06)

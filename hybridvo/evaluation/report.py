@@ -156,7 +156,7 @@ class Table:
     @property
     def frame(self) -> pd.DataFrame:
         """Texts, then numbers or NaN, under the names that people read."""
-        cells = {
+        cells: dict[str, list[Any]] = {
             name.replace("_", " "): [str(row[name]) for row in self.rows] for name in self.named
         }
         for key, label, factor in self.columns:

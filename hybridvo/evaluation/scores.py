@@ -14,9 +14,7 @@ import numpy as np
 import pandas as pd
 from scipy.stats import binomtest
 
-from hybridvo.evaluation.metrics import evaluate
 from hybridvo.evaluation.pair_errors import mean_pair_errors
-from hybridvo.trajectory import Trajectory
 
 FAILURE_PX = 1.0
 """Error of the ego flow at native size above which an estimate has failed, px."""
@@ -110,20 +108,25 @@ def pair_scores(pairs: pd.DataFrame) -> dict[str, Any]:
 
 
 def sequence_row(
-    pairs: pd.DataFrame,
-    est: Trajectory | None,
-    gt: Trajectory | None,
-    named: Mapping[str, Any],
+    pairs: pd.DataFrame, path: Mapping[str, Any] | None, named: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Line of one method on one sequence; ``named`` says which."""
+    """Line of one method on one sequence; ``path`` is what ``evaluate`` says, where it can."""
     scores, names = pair_scores(pairs), (*PATH_KEYS, "scale_sim3")
-    reasons = dict.fromkeys(names, NO_PAIRS if est is None else NO_TRUTH)
-    path: dict[str, Any] = dict.fromkeys(names)
-    if est is not None and gt is not None:
-        report = evaluate(est, gt)
-        path, reasons = {name: report[name] for name in names}, report["reasons"]
-    scores["reasons"] |= {name: reasons[name] for name in names if name in reasons}
-    return {**named, "alignment": "se3", **scores, **path}
+    if path is None or pairs.empty:
+        reason = NO_PAIRS if pairs.empty else NO_TRUTH
+        path = {"alignment": "se3", "reasons": dict.fromkeys(names, reason)}
+    scores["reasons"] |= {k: v for k, v in path["reasons"].items() if k in names}
+    scores |= {name: path.get(name) for name in ("alignment", *names)}
+    return {**named, **scores}
+
+
+def summary(table: pd.DataFrame, rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """``rows`` of single sequences, ``totals`` over all of them, and the ``breakdown``."""
+    totals = [
+        total_row(group, [row for row in rows if (row["method"], row["flow_source"]) == key])
+        for key, group in table.groupby(["method", "flow_source"], sort=False)
+    ]
+    return {"rows": rows, "totals": totals, "breakdown": breakdown(table)}
 
 
 def total_row(pairs: pd.DataFrame, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
