@@ -27,8 +27,7 @@ from hybridvo.options import Options
 from hybridvo.refinement import refine as refinement
 from hybridvo.refinement.photometric import refine_photometric
 from hybridvo.results import MotionPrediction, MotionPrior, Reason, RelativePose
-from hybridvo.types import FramePair, PairBatch
-from hybridvo.units import depth_advice, typical_depth
+from hybridvo.types import FramePair, PairBatch, depth_advice, typical_depth
 
 DEFAULT_METHOD = "hybrid"
 NETWORKS = tuple(SELECTION)

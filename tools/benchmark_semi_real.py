@@ -111,8 +111,9 @@ def draw(split: str, number: int, recordings: Any) -> Any:
 
     for attempt in itertools.count():
         rng = np.random.default_rng([SEEDS[split], number, attempt])
-        drawn = draw_pair(rng, recordings, 0 if number % 8 == 0 else int(rng.integers(1, 5)))
-        if drawn.movers == 0 or drawn.moving.mean() > LEAST_MOVING:
+        movers = 0 if number % 8 == 0 else int(rng.integers(1, 5))
+        drawn = draw_pair(rng, recordings, movers)
+        if movers == 0 or drawn.moving.mean() > LEAST_MOVING:
             return drawn
 
 

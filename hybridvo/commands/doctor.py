@@ -29,8 +29,7 @@ from hybridvo.flow import contradiction, dis_flow, file_flow
 from hybridvo.geometry import ego_flow
 from hybridvo.refinement.depth import depth_ratio, is_step
 from hybridvo.results import RelativePose
-from hybridvo.types import Frame, FramePair
-from hybridvo.units import depth_advice, typical_depth
+from hybridvo.types import Frame, FramePair, depth_advice, typical_depth
 
 OPTIONAL = {
     "poselib": "pip install 'hybridvo[baselines]', for --method poselib",

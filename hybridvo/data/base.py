@@ -2,74 +2,32 @@
 
 from __future__ import annotations
 
+import itertools
 import os
+import re
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from hybridvo.data.camera_file import IMAGES, Calibration, Lens, parse_camera, units_per_metre
 from hybridvo.data.image_io import read_depth, read_flow, read_mask_png, read_rgb
-from hybridvo.data.lists import check_increasing, match_files, shown, sorted_files, warn_of_gaps
+from hybridvo.data.lists import match_files, shown, sorted_files
 from hybridvo.errors import FormatError, InputError
-from hybridvo.types import Camera, Frame
-from hybridvo.units import depth_advice, typical_depth
+from hybridvo.trajectory import check_increasing
+from hybridvo.types import Camera, Frame, depth_advice, typical_depth
 
-
-@dataclass(frozen=True)
-class Given:
-    """What a user says of a sequence: see :func:`hybridvo.data.sequence.open_sequence`."""
-
-    camera: str | os.PathLike[str] | Camera | Calibration | None = None
-    depth_scale: float | None = None
-    mask: str | os.PathLike[str] | None = None
-
-
-@dataclass
-class Listing:
-    """What a reader has found on disk; lists hold an entry for each frame, None where none is.
-
-    Stamps are seconds, ``poses`` (N, 4, 4) T_world_cam with NaN where unknown; ``sources`` are the
-    other files that were read (lists, calibration, ground truth).
-    """
-
-    rgb: list[Path | None]
-    depth: list[Path | None]
-    timestamps: np.ndarray
-    flow: list[Path | None] = field(default_factory=list)
-    poses: np.ndarray | None = None
-    sources: list[Path] = field(default_factory=list)
-    warnings: list[str] = field(default_factory=list)
-
-
-def numbered_listing(
-    name: str,
-    rgb: dict[int, Path],
-    depth: dict[int, Path],
-    frames_per_second: float,
-    flow: dict[int, Path] | None = None,
-) -> tuple[list[int], Listing]:
-    """Numbers of all frames with an image or depth, and their listing; stamps count from 0."""
-    frames = {*rgb, *depth}
-    numbers = sorted(frames)
-    flow = flow or {}
-    listing = Listing(
-        rgb=[rgb.get(n) for n in numbers],
-        depth=[depth.get(n) for n in numbers],
-        flow=[flow.get(n) if n + 1 in frames else None for n in numbers],  # none across a gap
-        timestamps=(np.array(numbers) - min(numbers, default=0)) / frames_per_second,
-    )
-    warn_of_gaps(name, numbers, listing.warnings)
-    return numbers, listing
+INNER_FOLDER = re.compile(r"(rgb|depth|flow|image)(_\w+)?")
+"""Names of the folders inside a sequence, for which all of it may be meant."""
+Files = list[Path | None]
+"""A file for each frame, None where it has none."""
 
 
 class Sequence:
     """Frames in time order, read when asked for: ``len``, ``sequence[i]``, ``for frame in``.
 
-    A reader fills in a :class:`Listing` and says which camera belongs to it; where its files need
-    more than their ending says, it overrides ``_read_depth`` and ``_read_flow``.
+    A reader overrides ``_list_files``, which fills in files and stamps, and ``_calibration``; where
+    its files need more than their ending says, ``_read_depth`` and ``_read_flow``.
 
     Attributes:
         kind: sintel, tartanair, tum, 7scenes, kitti or folder.
@@ -79,52 +37,65 @@ class Sequence:
         depth_source: ``true`` (synthetic, an oracle), ``sensor``, ``stereo`` or ``file``.
         flow_is_true: whether its flow files are ground truth (an oracle).
         warnings: what the user should know: converted stamps, gaps, missing files, doubtful units.
-
-    Raises:
-        InputError: no frames, stamps that do not increase, depth of another size than colour.
-        FormatError: no image can be read at all.
     """
 
     kind = "sequence"
-    looks_for = ""
+    markers: tuple[tuple[str, ...], ...] = ()
+    """Groups of names (``glob``); a folder with all of one group is of this kind."""
     depth_source = "sensor"
     flow_is_true = False
     depth_scale: float | None = None
     """Stored units per metre of the data set's depth; None: metres."""
+    frames_per_second = 30.0
+    """Where the files have no stamps."""
 
-    def __init__(self, root: Path, name: str, listing: Listing, given: Given) -> None:
-        self.root, self.name = root, name
-        self.rgb_files, self.depth_files = listing.rgb, listing.depth
-        count = len(listing.rgb)
-        self.flow_files = (listing.flow + [None] * count)[:count]
-        self.timestamps = np.asarray(listing.timestamps, dtype=np.float64)
-        self.poses, self._sources = listing.poses, listing.sources
-        self.warnings = listing.warnings
-        if count == 0:
-            raise InputError(f"{root}: no frames. Looked for {self.looks_for}")
+    def __init__(
+        self,
+        root: Path,
+        camera: str | os.PathLike[str] | Camera | Calibration | None = None,
+        depth_scale: float | None = None,
+        mask: str | os.PathLike[str] | None = None,
+    ) -> None:
+        self.root, self.name = root, root.name
+        self.rgb_files: Files = []
+        self.depth_files: Files = []
+        self.flow_files: Files = []
+        self.timestamps = np.zeros(0)
+        self.poses: np.ndarray | None = None
+        self.warnings: list[str] = []
+        self._sources: list[Path | None] = []  # the other files that were read
+        self._mask_folder = None if mask is None else Path(mask)
+        self._given_camera = camera
+        self._given_scale = units_per_metre(depth_scale, self.name, self.warnings)
+        self._list_files()
+        if not self.rgb_files:
+            raise InputError(f"{root}: no frames. Looked for {self.looks_for()}")
         check_increasing(self.timestamps, str(root))
-        self._given_scale = units_per_metre(given.depth_scale, self.name, self.warnings)
-        self.height, self.width = self._find_size()
-        if given.camera is None:
-            calibration = self._calibration()
-        else:
-            calibration = parse_camera(given.camera, (self.height, self.width))
-        self._camera = self._lens = None
-        if calibration is not None:
-            self._camera = camera = calibration.camera
-            if camera.shape != (self.height, self.width):
-                raise InputError(
-                    f"{root}: images are {self.width}x{self.height}, the camera is for "
-                    f"{camera.width}x{camera.height} pixels. Intrinsics belong to one image size: "
-                    f"give those of these images (--camera fx,fy,cx,cy or --camera FILE)."
-                )
-            self.warnings += calibration.warnings
-            if any(calibration.distortion):
-                self._lens = Lens(calibration.camera, calibration.distortion)
-            self._given_scale = self._given_scale or calibration.depth_scale
-        self.mask_files = self._find_masks(given.mask)
+        self.flow_files = (self.flow_files + [None] * len(self))[: len(self)]
+        self.mask_files: Files = [None] * len(self)
+        if self._mask_folder is not None:
+            frames = [a or b for a, b in zip(self.rgb_files, self.depth_files, strict=True)]
+            hint = "Expected PNG or JPEG, 0 where pixels must not be used, named like the images."
+            masks = sorted_files(self._mask_folder, IMAGES)
+            self.mask_files = match_files(frames, masks, self._mask_folder, hint)
+        self._camera: Camera | None = None
+        self._lens: Lens | None = None
+        self._look_at_first_images()
         self._warn_of_missing_files()
-        self._warn_of_depth_unit()
+
+    @classmethod
+    def root_of(cls, folder: Path) -> Path | None:
+        """The sequence that a folder is, or is a part of; None where it is of another kind."""
+        inner = INNER_FOLDER.fullmatch(folder.name)
+        for place in (folder, folder.parent) if inner else (folder,):
+            if any(all(any(place.glob(name)) for name in group) for group in cls.markers):
+                return place.absolute()
+        return None
+
+    @classmethod
+    def looks_for(cls) -> str:
+        """What a folder of this kind holds."""
+        return f"{cls.kind}: " + ", or ".join(" and ".join(group) for group in cls.markers)
 
     @property
     def has_flow(self) -> bool:
@@ -133,13 +104,11 @@ class Sequence:
 
     def check_flow(self, stride: int = 1) -> None:
         """Refuse to take flow files that are not there, or that do not lead over a stride."""
-        if self.has_flow and stride == 1:
-            return
-        why = "there are no flow files"
-        if self.has_flow:
-            why = f"flow files lead from one frame to the next, not over a stride of {stride}"
-        remedy = "compute it: --flow dis, or iter_pairs(sequence, hybridvo.dis_flow())"
-        raise InputError(f"{self.name}: {why}; {remedy}.")
+        over = f"flow files lead from one frame to the next, not over a stride of {stride}"
+        if not self.has_flow or stride != 1:
+            why = over if self.has_flow else "there are no flow files"
+            remedy = "compute it: --flow dis, or iter_pairs(sequence, hybridvo.dis_flow())"
+            raise InputError(f"{self.name}: {why}; {remedy}.")
 
     def __len__(self) -> int:
         return len(self.timestamps)
@@ -155,40 +124,29 @@ class Sequence:
 
     def camera(self, index: int) -> Camera:
         """Pinhole camera of frame ``index``."""
-        self._check_index(index)
-        if self._camera is None:
-            raise InputError(f"{self.name}: no camera is known for frame {index}.")
+        assert self._camera is not None  # else this is overridden
         return self._camera
 
     def frame(self, index: int) -> Frame:
         """Frame ``index``; ``rgb`` or ``depth`` is None where its file is missing.
 
         Raises:
-            IndexError: no such index. FileNotFoundError: neither image nor depth is there.
-            FormatError: a file cannot be decoded or has another size.
+            FileNotFoundError: neither is there. FormatError: a file that cannot be decoded or has
+                another size.
         """
         index = self._check_index(index)
         camera = self.camera(index)
-        rgb_path, depth_path = self.rgb_files[index], self.depth_files[index]
-        rgb = depth = mask = None
-        if rgb_path is not None and rgb_path.exists():
-            rgb = read_rgb(rgb_path)
-            self._check_shape(rgb, rgb_path, "an image")
-        if depth_path is not None and depth_path.exists():
-            depth = self._read_depth(depth_path, index, rgb)
-            self._check_shape(depth, depth_path, "depth")
+        files = self.rgb_files[index], self.depth_files[index]
+        rgb = self._read(files[0], "an image", read_rgb)
+        depth = self._read(files[1], "depth", lambda path: self._read_depth(path, rgb))
+        mask = self._read(self.mask_files[index], "a mask", read_mask_png)
         if rgb is None and depth is None:
+            there = ", ".join(str(path) for path in files if path is not None)
             raise FileNotFoundError(
-                f"{self.name}: frame {index}: neither image nor depth is there "
-                f"({rgb_path or 'no image path'}, {depth_path or 'no depth path'})."
+                f"{self.name}: frame {index}: neither image nor depth is there ({there})."
             )
-        if (path := self.mask_files[index]) is not None:
-            mask = read_mask_png(path)
-            self._check_shape(mask, path, "a mask")
         if self._lens is not None:
-            rgb = None if rgb is None else self._lens.smooth(rgb)
-            depth = None if depth is None else self._lens.nearest(depth)
-            mask = self._lens.mask & (mask is None or self._lens.nearest(mask.view(np.uint8)) > 0)
+            rgb, depth, mask = self._lens.straighten(rgb, depth, mask)
         variance = None if depth is None else self._depth_variance(depth)
         return Frame(rgb, depth, camera, float(self.timestamps[index]), index, variance, mask)
 
@@ -196,8 +154,7 @@ class Sequence:
         """Flow from frame ``index`` to the next: (H, W, 2) float32 px, and (H, W) bool or None.
 
         Raises:
-            IndexError: no such pair. FileNotFoundError: no flow file for it.
-            FormatError: the file cannot be decoded or has another size.
+            FileNotFoundError: no flow file for it. FormatError: as :meth:`frame`.
         """
         index = self._check_index(index)
         if index == len(self) - 1:
@@ -208,7 +165,8 @@ class Sequence:
                 f"{self.name}: there is no flow file from frame {index} to {index + 1}."
             )
         flow, valid = self._read_flow(path, index)
-        self._check_shape(flow, path, "flow")
+        for array in (flow,) if valid is None else (flow, valid):
+            self._check_shape(array, path, "flow")
         return flow, valid
 
     def files(self) -> list[Path]:
@@ -217,18 +175,17 @@ class Sequence:
         found = {path for paths in (self._sources, *frames) for path in paths if path is not None}
         return sorted(path for path in found if path.is_file())
 
+    def _list_files(self) -> None:
+        """Fill in files, stamps, poses, name and sources."""
+        raise NotImplementedError
+
     def _calibration(self) -> Calibration | None:
         """Camera of all frames; None where each frame has its own (``camera`` is overridden)."""
         raise NotImplementedError
 
-    def _read_depth(self, path: Path, index: int, rgb: np.ndarray | None) -> np.ndarray:
+    def _read_depth(self, path: Path, rgb: np.ndarray | None) -> np.ndarray:
         """(H, W) float32 metres; 0, negative and not finite are invalid."""
         return self._metres(read_depth(path))
-
-    def _metres(self, stored: np.ndarray) -> np.ndarray:
-        """Stored depth in metres. Unless a scale is given, only integers are in the set's unit."""
-        usual = self.depth_scale if stored.dtype.kind == "u" else None
-        return stored.astype(np.float32) / np.float32(self._given_scale or usual or 1.0)
 
     def _read_flow(self, path: Path, index: int) -> tuple[np.ndarray, np.ndarray | None]:
         return read_flow(path)
@@ -236,6 +193,38 @@ class Sequence:
     def _depth_variance(self, depth: np.ndarray) -> np.ndarray | None:
         """Variance of log depth, where the source allows to state one."""
         return None
+
+    def _metres(self, stored: np.ndarray) -> np.ndarray:
+        """Stored depth in metres. Unless a scale is given, only integers are in the set's unit."""
+        usual = self.depth_scale if stored.dtype.kind == "u" else None
+        return stored.astype(np.float32) / np.float32(self._given_scale or usual or 1.0)
+
+    def _list_numbered(
+        self, rgb: dict[int, Path], depth: dict[int, Path], flow: dict[int, Path] | None = None
+    ) -> list[int]:
+        """Take files by frame number, stamped from 0; the numbers with an image or depth."""
+        frames, flow = {*rgb, *depth}, flow or {}
+        numbers = sorted(frames)
+        self.rgb_files = [rgb.get(n) for n in numbers]
+        self.depth_files = [depth.get(n) for n in numbers]
+        self.flow_files = [flow.get(n) if n + 1 in frames else None for n in numbers]
+        self.timestamps = (np.array(numbers) - min(numbers, default=0)) / self.frames_per_second
+        gaps = [(a + 1, b - 1) for a, b in itertools.pairwise(numbers) if b - a > 1]
+        if spans := [f"{a}" if a == b else f"{a} to {b}" for a, b in gaps]:
+            self.warnings.append(
+                f"{self.name}: frame numbers {shown(spans)} are missing; the stamps keep the gap."
+            )
+        return numbers
+
+    def _read(
+        self, path: Path | None, what: str, read: Callable[[Path], np.ndarray]
+    ) -> np.ndarray | None:
+        """An image of the right size, None where its file is missing."""
+        if path is None or not path.exists():
+            return None
+        array = read(path)
+        self._check_shape(array, path, what)
+        return array
 
     def _check_shape(self, array: np.ndarray, path: Path, what: str) -> None:
         if array.shape[:2] != (self.height, self.width):
@@ -249,71 +238,75 @@ class Sequence:
             raise IndexError(f"{self.name}: expected a frame 0 to {len(self) - 1}, got {index}.")
         return int(index)
 
-    def _find_size(self) -> tuple[int, int]:
-        """(height, width) of the first image that can be read, which its depth must have too."""
-        problems: list[Exception] = []
+    def _first(
+        self, files: Files, read: Callable[[Path], np.ndarray]
+    ) -> tuple[Path | None, np.ndarray | None, object]:
+        """The first file that can be read, and what it holds; else why the first cannot."""
+        problem = None
+        for path in files:
+            try:
+                if path is not None:
+                    return path, read(path), None
+            except (InputError, OSError) as error:
+                problem = problem or error
+        return None, None, problem
 
-        def first(paths: list[Path | None], read: Callable[[Path, int], np.ndarray]) -> Any:
-            for index, path in enumerate(paths):
-                try:
-                    if path is not None:
-                        return read(path, index).shape[:2]
-                except (FormatError, OSError) as error:
-                    problems.append(error)
-            return None
-
+    def _look_at_first_images(self) -> None:
+        """Take the size of the images, and the camera; look at the size and the unit of depth."""
+        _, image, why = self._first(self.rgb_files, read_rgb)
         # a right image of a stereo pair is no depth: frames check its size
-        depth_files = [] if self.depth_source == "stereo" else self.depth_files
-        rgb = first(self.rgb_files, lambda path, _: read_rgb(path))
-        depth = first(depth_files, lambda path, index: self._read_depth(path, index, None))
-        if rgb is None and depth is None:
-            why = problems[0] if problems else "no file is listed"
+        files = [] if self.depth_source == "stereo" else self.depth_files
+        if image is None:
+            _, image, other = self._first(files, lambda path: self._read_depth(path, None))
+            why = why or other or "no file is listed"
+        if image is None:
             raise FormatError(f"{self.root}: no frames: none can be read. First problem: {why}")
-        if rgb is not None and depth is not None and rgb != depth:
+        self.height, self.width = size = image.shape[:2]
+        self._calibrate()
+        path, depth, _ = self._first(files, lambda path: self._read_depth(path, None))
+        if depth is None:
+            return
+        if depth.shape != size:
             raise InputError(
-                f"{self.root}: depth images are {depth[1]}x{depth[0]}, colour images {rgb[1]}x"
-                f"{rgb[0]} pixels (width x height): depth must be registered to colour, so that "
-                f"both have one size and camera (RealSense: rs.align(rs.stream.color); ROS: "
-                f"depth_registered or aligned_depth_to_color). Resizing does not register it."
+                f"{self.root}: depth images are {depth.shape[1]}x{depth.shape[0]}, colour images "
+                f"{size[1]}x{size[0]} pixels: depth must be registered to colour, not resized "
+                f"(RealSense: rs.align(rs.stream.color); ROS: aligned_depth_to_color)."
             )
-        return rgb or depth
+        median = typical_depth(depth)
+        if median is None:
+            self.warnings.append(f"{path}: the first depth map has no valid value.")
+        elif advice := depth_advice(median, self.depth_scale):
+            self.warnings.append(
+                f"{path}: the median depth is {median:.4g} m, which cannot be metres. Probable "
+                f"remedy: {advice} (by --depth-scale, or depth_scale in camera.yaml)."
+            )
 
-    def _find_masks(self, folder: str | os.PathLike[str] | None) -> list[Path | None]:
-        """Mask of each frame."""
-        if folder is None:
-            return [None] * len(self)
-        frames = [rgb or depth for rgb, depth in zip(self.rgb_files, self.depth_files, strict=True)]
-        hint = "Expected PNG or JPEG, 0 where pixels must not be used, named like the images."
-        return match_files(frames, sorted_files(Path(folder), IMAGES), Path(folder), hint)
+    def _calibrate(self) -> None:
+        """Take the camera that is given, else that of the data set."""
+        size = self.height, self.width
+        given = self._given_camera
+        calibration = self._calibration() if given is None else parse_camera(given, size)
+        if calibration is None:
+            return
+        self._camera = camera = calibration.camera
+        if camera.shape != size:
+            raise InputError(
+                f"{self.root}: images are {self.width}x{self.height}, the camera is for "
+                f"{camera.width}x{camera.height} pixels. Give the intrinsics of these images "
+                f"(--camera fx,fy,cx,cy or --camera FILE)."
+            )
+        self.warnings += calibration.warnings
+        if any(calibration.distortion):
+            self._lens = Lens(camera, calibration.distortion)
+        self._given_scale = self._given_scale or calibration.depth_scale
 
     def _warn_of_missing_files(self) -> None:
         listed = {"image": self.rgb_files, "depth": self.depth_files, "mask": self.mask_files}
         for what, paths in listed.items():
             missing = [i for i, path in enumerate(paths) if path is None or not path.exists()]
+            text = f"{len(missing)} frames without {what}: {shown(missing)}"
             if len(missing) == len(paths) and what != "mask":
                 like = next((f", such as {path}" for path in paths if path is not None), "")
-                self.warnings.append(f"{self.name}: there are no {what} files{like}.")
-            elif missing and any(paths):
-                self.warnings.append(
-                    f"{self.name}: {len(missing)} frames without {what}: {shown(missing)}."
-                )
-
-    def _warn_of_depth_unit(self) -> None:
-        """Look at the first depth map that can be read, and say so if its unit is doubtful."""
-        if self.depth_source == "stereo":
-            return
-        for index, path in enumerate(self.depth_files):
-            try:
-                if path is None:
-                    continue
-                median = typical_depth(self._read_depth(path, index, None))
-            except (InputError, OSError):
-                continue
-            if median is None:
-                self.warnings.append(f"{path}: the first depth map has no valid value.")
-            elif advice := depth_advice(median, self.depth_scale):
-                self.warnings.append(
-                    f"{path}: the median depth is {median:.4g} m, which cannot be metres. "
-                    f"Probable remedy: {advice} (by --depth-scale, or depth_scale in camera.yaml)."
-                )
-            return
+                text = f"there are no {what} files{like}"
+            if missing and (any(paths) or what != "mask"):
+                self.warnings.append(f"{self.name}: {text}.")

@@ -21,6 +21,19 @@ CAMERA_FILE = "camera.yaml"
 IMAGES = (".png", ".jpg", ".jpeg")
 REQUIRED = ("fx", "fy", "cx", "cy", "width", "height")
 KNOWN = (*REQUIRED, "distortion", "depth_scale", "fps")
+ALIASES = {
+    # ROS: a calibration file, or a message
+    **dict.fromkeys(("camera_matrix", "K", "k"), "K"),
+    **dict.fromkeys(("distortion_coefficients", "D", "d"), "distortion"),
+    "image_width": "width",
+    "image_height": "height",
+    "distortion_model": "model",
+    # RealSense
+    "ppx": "cx",
+    "ppy": "cy",
+    "coeffs": "distortion",
+}
+"""What others call it -> what we do; K holds fx 0 cx 0 fy cy 0 0 1."""
 
 
 @dataclass(frozen=True)
@@ -47,16 +60,21 @@ class Lens:
             camera.K, np.array(distortion), np.eye(3), camera.K, size, cv2.CV_32FC1
         )
         inside = (self._u >= 0) & (self._u <= camera.width - 1)
-        self.mask: np.ndarray = inside & (self._v >= 0) & (self._v <= camera.height - 1)
-        """(H, W) bool, False where the pinhole image sees beyond the distorted one."""
+        # False where the pinhole image sees beyond the distorted one
+        self._inside: np.ndarray = inside & (self._v >= 0) & (self._v <= camera.height - 1)
 
-    def smooth(self, image: np.ndarray) -> np.ndarray:
-        """(H, W, 3) uint8 image, bilinear; black outside."""
-        return cv2.remap(image, self._u, self._v, cv2.INTER_LINEAR)
-
-    def nearest(self, array: np.ndarray) -> np.ndarray:
-        """(H, W) depth or mask, nearest value (no mixing across edges); 0 outside."""
-        return cv2.remap(array, self._u, self._v, cv2.INTER_NEAREST)
+    def straighten(
+        self, rgb: np.ndarray | None, depth: np.ndarray | None, mask: np.ndarray | None
+    ) -> tuple[np.ndarray | None, np.ndarray | None, np.ndarray]:
+        """Image (bilinear), depth and mask (nearest: no mixing across edges) of the pinhole."""
+        if rgb is not None:
+            rgb = cv2.remap(rgb, self._u, self._v, cv2.INTER_LINEAR)
+        if depth is not None:
+            depth = cv2.remap(depth, self._u, self._v, cv2.INTER_NEAREST)
+        if mask is None:
+            return rgb, depth, self._inside
+        kept = cv2.remap(mask.view(np.uint8), self._u, self._v, cv2.INTER_NEAREST)
+        return rgb, depth, self._inside & (kept > 0)
 
 
 def parse_camera(
@@ -81,33 +99,38 @@ def parse_camera(
 
 
 def read_camera_file(path: Path) -> Calibration:
-    """Calibration of a YAML or JSON file in our words (:data:`KNOWN`), ROS's or RealSense's."""
+    """Calibration of a YAML or JSON file with our keys (:data:`KNOWN`), ROS's or RealSense's."""
     text = read_text(path).removesuffix("---\n")  # as ROS prints it
     content = parse_yaml(text, str(path))
     if not isinstance(content, dict):
         raise FormatError(f"{path}: expected 'key: value' lines, got a {type(content).__name__}.")
-    told: list[str] = []
-    content = _in_our_words(content, path, told)
-    missing = [key for key in REQUIRED if content.get(key) is None]
-    if missing:
+    is_foreign = any(key in ALIASES for key in content)
+    content = _in_our_words(content, path) if is_foreign else _only_known(content, path)
+    if missing := [key for key in REQUIRED if content.get(key) is None]:
         raise FormatError(
-            f"{path}: missing: {', '.join(missing)}. Expected fx, fy, cx, cy, width, height in "
-            f"pixels."
+            f"{path}: missing: {', '.join(missing)}. Expected {', '.join(REQUIRED)} in pixels."
         )
-    numbers = {
-        key: _number(content[key], f"{path}: {key}")
-        for key in KNOWN
-        if key != "distortion" and content.get(key) is not None
-    }
-    try:
-        camera = Camera(**{key: numbers[key] for key in REQUIRED})  # type: ignore[arg-type]
-        scale = units_per_metre(numbers.get("depth_scale"), str(path), told)
-    except InputError as error:
-        raise FormatError(f"{path}: {error}") from None
-    fps = numbers.get("fps")
-    if fps is not None and fps <= 0:
-        raise FormatError(f"{path}: fps: expected a number above 0, got {fps}.")
     distortion = _distortion(content.get("distortion"), path)
+    told: list[str] = []
+    if is_foreign and any(distortion):
+        model = str(content.get("model"))[:40]
+        if any(word in model.lower() for word in ("fish", "equidist", "kannala", "ftheta")):
+            raise FormatError(
+                f"{path}: distortion model '{model}': expected Brown's (plumb_bob, "
+                f"rational_polynomial). Rectify the images first."
+            )
+        told.append(f"{path}: lens distortion is taken out; state none if images are rectified.")
+    fps, scale = (
+        None if content.get(key) is None else as_number(content[key])
+        for key in ("fps", "depth_scale")
+    )
+    if fps is not None and not 0 < fps < np.inf:
+        raise FormatError(f"{path}: fps: expected a number above 0, got {fps}.")
+    try:
+        camera = Camera(**{key: content[key] for key in REQUIRED})
+        scale = units_per_metre(scale, str(path), told)
+    except InputError as error:
+        raise FormatError(f"{path}: {str(error)[:800]}") from None
     return Calibration(camera, distortion, scale, fps, tuple(told))
 
 
@@ -143,59 +166,28 @@ def write_camera_template(directory: str | os.PathLike[str]) -> Path:
     return path
 
 
-def _in_our_words(content: dict[Any, Any], path: Path, told: list[str]) -> dict[str, Any]:
-    """The content with our keys: those of ROS and RealSense renamed, unknown ones refused."""
-    matrix = _first_of(content, "camera_matrix", "K", "k")
-    if matrix is not None:  # ROS
-        K = _data(matrix)
+def _in_our_words(content: dict[Any, Any], path: Path) -> dict[Any, Any]:
+    """The content of a file of ROS or RealSense with our keys."""
+    # ROS writes a matrix as {rows, cols, data}
+    plain = {k: v.get("data") if isinstance(v, dict) else v for k, v in content.items()}
+    renamed = {ALIASES.get(key, key): value for key, value in plain.items()}
+    if "K" in renamed:
+        K = renamed["K"]
         if not isinstance(K, list) or len(K) != 9:
             raise FormatError(f"{path}: camera matrix: expected 9 numbers, row by row.")
-        renamed = {"fx": K[0], "cx": K[2], "fy": K[4], "cy": K[5]}
-        for key in ("width", "height"):
-            renamed[key] = _first_of(content, f"image_{key}", key)
-        lens = _data(_first_of(content, "distortion_coefficients", "D", "d"))
-    elif "ppx" in content or "ppy" in content:  # RealSense
-        renamed = {key: content.get(key) for key in ("fx", "fy", "width", "height")}
-        renamed |= {"cx": content.get("ppx"), "cy": content.get("ppy")}
-        lens = content.get("coeffs")
-    else:
-        for key in content:
-            if key not in KNOWN:
-                close = difflib.get_close_matches(str(key)[:40], KNOWN, n=1)
-                hint = f" (did you mean '{close[0]}'?)" if close else ""
-                raise FormatError(
-                    f"{path}: unknown key '{str(key)[:40]}'{hint}; known: {', '.join(KNOWN)}."
-                )
-        return content
-    renamed |= {key: content[key] for key in ("depth_scale", "fps") if key in content}
-    if not any(_distortion(lens, path)):
-        return renamed
-    model = str(_first_of(content, "distortion_model", "model"))[:40]
-    if any(word in model.lower() for word in ("fish", "equidist", "kannala", "ftheta")):
-        raise FormatError(
-            f"{path}: distortion model '{model}': expected Brown's (plumb_bob, "
-            f"rational_polynomial). Rectify the images first."
-        )
-    told.append(f"{path}: lens distortion is taken out; state none if the images are rectified.")
-    return renamed | {"distortion": lens}
+        renamed |= {"fx": K[0], "cx": K[2], "fy": K[4], "cy": K[5]}
+    return renamed
 
 
-def _first_of(content: dict[Any, Any], *keys: str) -> Any:
-    """Value of the first key that is there, else None."""
-    return next((content[key] for key in keys if key in content), None)
-
-
-def _data(value: Any) -> Any:
-    """The numbers of a matrix that ROS writes as {rows, cols, data}."""
-    return value.get("data") if isinstance(value, dict) else value
-
-
-def _number(value: Any, where: str) -> float:
-    """A finite number of a file."""
-    number = as_number(value)
-    if isinstance(value, bool) or not np.isfinite(number):
-        raise FormatError(f"{where}: expected a finite number, got {str(value)[:40]!r}.")
-    return number
+def _only_known(content: dict[Any, Any], path: Path) -> dict[Any, Any]:
+    for key in content:
+        if key not in KNOWN:
+            close = difflib.get_close_matches(str(key)[:40], KNOWN, n=1)
+            hint = f" (did you mean '{close[0]}'?)" if close else ""
+            raise FormatError(
+                f"{path}: unknown key '{str(key)[:40]}'{hint}; known: {', '.join(KNOWN)}."
+            )
+    return content
 
 
 def _distortion(value: Any, path: Path) -> tuple[float, ...]:
@@ -205,4 +197,7 @@ def _distortion(value: Any, path: Path) -> tuple[float, ...]:
         raise FormatError(
             f"{path}: distortion: expected a list of 4, 5 or 8 numbers [k1, k2, p1, p2, k3, ...]."
         )
-    return tuple(_number(item, f"{path}: distortion") for item in value)
+    numbers = tuple(map(as_number, value))
+    if not np.isfinite(numbers).all():
+        raise FormatError(f"{path}: distortion: expected a finite number, got {str(value)[:80]}.")
+    return numbers

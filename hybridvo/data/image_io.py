@@ -13,10 +13,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from hybridvo.data.lists import rigid
 from hybridvo.errors import FormatError, InputError
 from hybridvo.files import atomic_write
-from hybridvo.types import MAX_PIXELS
+from hybridvo.geometry import pose_matrix
+from hybridvo.types import MAX_PIXELS, as_rigid
 
 TAG_BYTES = struct.pack("<f", 202021.25)
 PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
@@ -24,28 +24,39 @@ JPEG_MAGIC = b"\xff\xd8"
 UNKNOWN_FLOW = 1e9
 """Middlebury's mark: flow beyond this is unknown."""
 COPY_AGAIN = "Copy or download the file again."
+PathLike = str | os.PathLike[str]
 
 
-def read_rgb(path: str | os.PathLike[str]) -> np.ndarray:
-    """(H, W, 3) uint8 RGB from a PNG or JPEG; grey is repeated, alpha is dropped.
-
-    EXIF orientation is not applied: the intrinsics belong to the stored pixels.
-    """
+def read_rgb(path: PathLike) -> np.ndarray:
+    """(H, W, 3) uint8 RGB from a PNG or JPEG; grey is repeated, alpha is dropped."""
     return cv2.cvtColor(_decode(path, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
 
 
-def read_mask_png(path: str | os.PathLike[str]) -> np.ndarray:
+def read_mask_png(path: PathLike) -> np.ndarray:
     """(H, W) bool, True where an 8-bit PNG or JPEG is not zero."""
     return np.asarray(_decode(path, cv2.IMREAD_GRAYSCALE) > 0)
 
 
-def read_depth(path: str | os.PathLike[str]) -> np.ndarray:
+def read_png(path: PathLike, dtype: type, channels: int, what: str) -> np.ndarray:
+    """Image in OpenCV's channel order, whose dtype and number of channels must be these."""
+    # IMREAD_UNCHANGED is -1: it leaves orientation alone and cannot be combined with other flags
+    image = _decode(path, cv2.IMREAD_UNCHANGED)
+    got = 1 if image.ndim == 2 else image.shape[2]
+    if image.dtype != dtype or got != channels:
+        raise FormatError(
+            f"{path}: expected {what} ({np.dtype(dtype)}, {channels} channels), got {image.dtype} "
+            f"with {got} channels."
+        )
+    return image
+
+
+def read_depth(path: PathLike) -> np.ndarray:
     """(H, W) depth as stored: float32 (``.dpt``, ``.npy``) or unsigned (16-bit PNG, ``.npy``)."""
     suffix = Path(path).suffix.lower()
     if suffix == ".dpt":
-        return read_dpt(path)
+        return _read_tagged(path, suffix, 1)[:, :, 0]
     if suffix != ".npy":
-        return _decode_exact(path, np.uint16, 1, "a 16-bit depth PNG")
+        return read_png(path, np.uint16, 1, "a 16-bit depth PNG")
     depth = read_npy(path)
     if depth.dtype.kind not in "fu":
         raise FormatError(
@@ -54,7 +65,7 @@ def read_depth(path: str | os.PathLike[str]) -> np.ndarray:
     return depth
 
 
-def read_flow(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray | None]:
+def read_flow(path: PathLike) -> tuple[np.ndarray, np.ndarray | None]:
     """(H, W, 2) float32 flow in pixels and (H, W) bool valid, or None where all of it is.
 
     Formats by the ending: ``.flo`` (beyond 1e9: unknown), ``.npy``, else KITTI's 16-bit PNG:
@@ -62,7 +73,7 @@ def read_flow(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray | No
     """
     suffix = Path(path).suffix.lower()
     if suffix == ".flo":
-        flow = read_flo(path)
+        flow = _read_tagged(path, suffix, 2)
         with np.errstate(invalid="ignore"):
             known = (np.abs(flow) < UNKNOWN_FLOW).all(axis=2)
         return flow, None if known.all() else known
@@ -71,87 +82,81 @@ def read_flow(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray | No
         if flow.dtype != np.float32:
             raise FormatError(f"{path}: expected flow as floating point, got {flow.dtype}.")
         return flow, None
-    image = _decode_exact(path, np.uint16, 3, "a 16-bit flow PNG")
-    flow = _from_16_bits(image[:, :, 2:0:-1])
-    valid: np.ndarray = image[:, :, 0] > 0
+    flow, image = read_flow_png(path, (2, 1, 0))
+    valid: np.ndarray = image > 0
     flow[~valid] = np.nan
     return flow, valid
 
 
-def read_depth_rgba_png(path: str | os.PathLike[str]) -> np.ndarray:
-    """(H, W) float32 metres from a TartanAir V2 depth PNG (four bytes of a little-endian float)."""
-    image = _decode_exact(path, np.uint8, 4, "a float32 depth PNG of TartanAir V2")
-    return np.ascontiguousarray(image).view("<f4")[:, :, 0].astype(np.float32)
+def read_flow_png(path: PathLike, order: tuple[int, int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Flow (H, W, 2) in px and mask (H, W) of a 16-bit PNG, which holds 64 u + 32768 and so v.
 
-
-def read_flow_tartanair_png(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray]:
-    """TartanAir V2 flow PNG: (H, W, 2) float32 px and (H, W) bool valid.
-
-    The channels u, v, mask stand in OpenCV's order (not in KITTI's); mask 0 means valid.
+    ``order``: of u, v and the mask among OpenCV's channels.
     """
-    image = _decode_exact(path, np.uint16, 3, "a 16-bit flow PNG")
-    return _from_16_bits(image[:, :, :2]), np.asarray(image[:, :, 2] == 0)
+    u, v, mask = np.moveaxis(read_png(path, np.uint16, 3, "a 16-bit flow PNG"), 2, 0)[[*order]]
+    return (np.dstack([u, v]).astype(np.float32) - np.float32(32768)) / np.float32(64), mask
 
 
-def _from_16_bits(stored: np.ndarray) -> np.ndarray:
-    """Flow in px of a 16-bit PNG, which holds 64 u + 32768."""
-    return (stored.astype(np.float32) - np.float32(32768)) / np.float32(64)
-
-
-def read_flo(path: str | os.PathLike[str]) -> np.ndarray:
-    """(H, W, 2) float32 flow in pixels from a Middlebury or Sintel ``.flo`` file."""
-    return _read_tagged(path, ".flo", 2)
-
-
-def read_dpt(path: str | os.PathLike[str]) -> np.ndarray:
-    """(H, W) float32 depth from a Sintel ``.dpt`` file, in the units of the file."""
-    return _read_tagged(path, ".dpt", 1)[:, :, 0]
-
-
-def read_cam(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray]:
-    """Intrinsics K (3, 3) and extrinsic T_cam_world (4, 4), float64, from a Sintel ``.cam`` file.
-
-    The file stores x ~ K [R|t] X_world: the extrinsic maps the world into the camera.
-    """
-    data = _read_bytes(path)
-    _check_tag(path, data, ".cam")
+def read_cam(path: PathLike) -> tuple[np.ndarray, np.ndarray]:
+    """Intrinsics K (3, 3) and extrinsic T_cam_world (4, 4) of a Sintel ``.cam`` file."""
+    data = _tagged_bytes(path, ".cam")
     _check_size(path, 4 + 21 * 8, len(data), ".cam")
     values = np.frombuffer(data, dtype="<f8", offset=4).astype(np.float64)
     if not np.isfinite(values[:9]).all():
         raise FormatError(f"{path}: expected finite intrinsics, got {values[:9].tolist()}.")
-    return values[:9].reshape(3, 3), rigid(values[9:].reshape(3, 4), str(path))
+    return values[:9].reshape(3, 3), as_pose(values[9:].reshape(3, 4), str(path))
 
 
-def read_npy(path: str | os.PathLike[str], *, channels: int | None = None) -> np.ndarray:
+def as_pose(stored: np.ndarray, where: str) -> np.ndarray:
+    """(4, 4) of the (3, 4) pose of a file, its rotation brought onto the manifold."""
+    try:
+        return pose_matrix(as_rigid(np.vstack([stored, (0, 0, 0, 1)]), where, 1e-2)[:3])
+    except InputError as error:
+        raise FormatError(str(error)) from None
+
+
+def read_npy(path: PathLike, *, channels: int | None = None) -> np.ndarray:
     """(H, W) or (H, W, channels) of a ``.npy`` file, floating point as float32; never unpickles."""
-    array = _map_npy(path)
-    if array.ndim != (2 if channels is None else 3) or array.shape[2:] not in ((), (channels,)):
-        expected = "(H, W)" if channels is None else f"(H, W, {channels})"
-        raise FormatError(f"{path}: expected an array of shape {expected}, got {array.shape}.")
+    try:
+        array = np.load(path, mmap_mode="r", allow_pickle=False)  # reads the header alone
+        trailing = os.path.getsize(path) - array.offset - array.nbytes
+    except FileNotFoundError:
+        raise
+    except Exception as error:  # numpy raises errors of many kinds for a damaged header
+        reason = " ".join(str(error).split())[:200]
+        raise FormatError(f"{path}: expected a whole .npy file of one array ({reason}).") from None
+    expected = "(H, W)" if channels is None else f"(H, W, {channels})"
+    shaped = array.ndim == expected.count(",") + 1 and array.shape[2:] in ((), (channels,))
     kind = array.dtype
+    if kind.kind not in "fiub" or not shaped or trailing:
+        raise FormatError(
+            f"{path}: expected an array of numbers of shape {expected}, got {kind} {array.shape} "
+            f"and {trailing} trailing bytes."
+        )
+    _check_pixels(path, array.shape[1], array.shape[0])
     target = np.dtype(np.float32) if kind.kind == "f" else kind.newbyteorder("=")
     with np.errstate(over="ignore", invalid="ignore"):  # float64 beyond float32 becomes inf
         return np.array(array, dtype=target, order="C", subok=False)
 
 
-def write_flo(path: str | os.PathLike[str], flow: np.ndarray) -> None:
+def write_flo(path: PathLike, flow: np.ndarray) -> None:
     """Write (H, W, 2) flow in pixels as ``.flo``; InputError for another shape."""
     _write_tagged(path, np.asarray(flow), 2)
 
 
-def write_dpt(path: str | os.PathLike[str], depth: np.ndarray) -> None:
+def write_dpt(path: PathLike, depth: np.ndarray) -> None:
     """Write (H, W) depth as ``.dpt``; InputError for another shape."""
     _write_tagged(path, np.asarray(depth)[..., None], 1)
 
 
-def write_cam(path: str | os.PathLike[str], K: np.ndarray, T_cam_world: np.ndarray) -> None:
+def write_cam(path: PathLike, K: np.ndarray, T_cam_world: np.ndarray) -> None:
     """Write intrinsics (3, 3) and the extrinsic T_cam_world (4, 4) as ``.cam``."""
     with atomic_write(path, "wb") as file:
         file.write(TAG_BYTES + np.asarray(K, "<f8").tobytes())
         file.write(np.asarray(T_cam_world, "<f8")[:3].tobytes())
 
 
-def _read_bytes(path: str | os.PathLike[str]) -> bytes:
+def _read_bytes(path: PathLike) -> bytes:
     try:
         return Path(path).read_bytes()
     except FileNotFoundError:
@@ -161,12 +166,11 @@ def _read_bytes(path: str | os.PathLike[str]) -> bytes:
 
 
 def _check_size(path: object, expected: int, got: int, what: str) -> None:
-    if got == expected:
-        return
-    problem = "truncated" if got < expected else f"{got - expected} trailing bytes"
-    raise FormatError(
-        f"{path}: {problem}: expected {expected} bytes ({what}), got {got}. {COPY_AGAIN}"
-    )
+    if got != expected:
+        problem = "truncated" if got < expected else f"{got - expected} trailing bytes"
+        raise FormatError(
+            f"{path}: {problem}: expected {expected} bytes ({what}), got {got}. {COPY_AGAIN}"
+        )
 
 
 def _check_pixels(path: object, width: int, height: int) -> None:
@@ -177,18 +181,19 @@ def _check_pixels(path: object, width: int, height: int) -> None:
         )
 
 
-def _check_tag(path: object, data: bytes, suffix: str) -> None:
+def _tagged_bytes(path: PathLike, suffix: str) -> bytes:
+    data = _read_bytes(path)
     if not data.startswith(TAG_BYTES):
         raise FormatError(
             f"{path}: not a little-endian {suffix} file: expected the first bytes {TAG_BYTES!r}, "
             f"got {data[:4]!r}."
         )
+    return data
 
 
-def _read_tagged(path: str | os.PathLike[str], suffix: str, channels: int) -> np.ndarray:
+def _read_tagged(path: PathLike, suffix: str, channels: int) -> np.ndarray:
     """(H, W, channels) of .flo and .dpt: tag, width, height, values."""
-    data = _read_bytes(path)
-    _check_tag(path, data, suffix)
+    data = _tagged_bytes(path, suffix)
     if len(data) < 12:
         raise FormatError(f"{path}: truncated: expected a header of 12 bytes, got {len(data)}.")
     width, height = struct.unpack("<ii", data[4:12])
@@ -198,7 +203,7 @@ def _read_tagged(path: str | os.PathLike[str], suffix: str, channels: int) -> np
     return array.astype(np.float32)
 
 
-def _write_tagged(path: str | os.PathLike[str], array: np.ndarray, channels: int) -> None:
+def _write_tagged(path: PathLike, array: np.ndarray, channels: int) -> None:
     if array.ndim != 3 or array.shape[2] != channels or array.size == 0:
         raise InputError(f"{path}: expected (H, W) and {channels} channels, got {array.shape}.")
     size = struct.pack("<ii", array.shape[1], array.shape[0])
@@ -206,26 +211,7 @@ def _write_tagged(path: str | os.PathLike[str], array: np.ndarray, channels: int
         file.write(TAG_BYTES + size + array.astype("<f4").tobytes())
 
 
-def _map_npy(path: str | os.PathLike[str]) -> np.memmap:
-    """Image stored as .npy, mapped: its header is checked, no value is read."""
-    try:
-        array = np.load(path, mmap_mode="r", allow_pickle=False)
-        trailing = os.path.getsize(path) - array.offset - array.nbytes
-    except FileNotFoundError:
-        raise
-    except Exception as error:  # numpy raises errors of many kinds for a damaged header
-        reason = " ".join(str(error).split())[:200]
-        raise FormatError(f"{path}: expected a whole .npy file of one array ({reason}).") from None
-    if array.dtype.kind not in "fiub" or array.ndim not in (2, 3) or trailing:
-        raise FormatError(
-            f"{path}: expected a .npy image of numbers (H, W) or (H, W, C), got {array.dtype} "
-            f"{array.shape} and {trailing} trailing bytes."
-        )
-    _check_pixels(path, array.shape[1], array.shape[0])
-    return array
-
-
-def _decode(path: str | os.PathLike[str], flags: int) -> np.ndarray:
+def _decode(path: PathLike, flags: int) -> np.ndarray:
     """Decoded PNG or JPEG in OpenCV's channel order, after a look at its two ends."""
     data = _read_bytes(path)
     is_png = data.startswith(PNG_MAGIC) and len(data) >= 33
@@ -241,26 +227,10 @@ def _decode(path: str | os.PathLike[str], flags: int) -> np.ndarray:
     pixels, closing = (b"IDAT", b"IEND") if is_png else (b"\xff\xda", b"\xff\xd9")
     if data.rfind(closing) <= data.rfind(pixels):
         raise FormatError(f"{path}: truncated: {len(data)} bytes end too early. {COPY_AGAIN}")
-    try:
-        # Ignore EXIF rotation: the intrinsics belong to the pixels as they are stored.
+    try:  # orientation is ignored: the intrinsics belong to the pixels as they are stored
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error as error:
         raise FormatError(f"{path}: the image cannot be decoded ({error.err}).") from None
     if image is None:
         raise FormatError(f"{path}: damaged: the image cannot be decoded. {COPY_AGAIN}")
-    return image
-
-
-def _decode_exact(
-    path: str | os.PathLike[str], dtype: type, channels: int, what: str
-) -> np.ndarray:
-    """Decoded image whose dtype and number of channels must be these."""
-    # IMREAD_UNCHANGED is -1: it leaves orientation alone and cannot be combined with other flags
-    image = _decode(path, cv2.IMREAD_UNCHANGED)
-    got = 1 if image.ndim == 2 else image.shape[2]
-    if image.dtype != dtype or got != channels:
-        raise FormatError(
-            f"{path}: expected {what} ({np.dtype(dtype)}, {channels} channels), got {image.dtype} "
-            f"with {got} channels."
-        )
     return image

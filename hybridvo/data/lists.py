@@ -2,54 +2,45 @@
 
 from __future__ import annotations
 
-import itertools
 import re
+from collections.abc import Iterable
 from collections.abc import Sequence as Many
 from pathlib import Path
 
 import numpy as np
 
-from hybridvo.errors import FormatError, InputError
+from hybridvo.errors import InputError
 from hybridvo.files import read_rows
-from hybridvo.geometry import pose_matrix
-from hybridvo.trajectory import COLUMNS, read_poses
-from hybridvo.types import as_rigid
-from hybridvo.units import stamp_unit
+from hybridvo.trajectory import COLUMNS, check_increasing, read_poses, stamp_unit
 
 MAX_STAMP_DIFFERENCE_S = 0.02
 """Largest difference in seconds between stamps that belong together (the TUM tools' value)."""
 
 
-def natural_key(path: Path) -> list[str | int]:
-    """Sort key under which ``frame_9`` comes before ``frame_10``."""
-    parts = re.split(r"([0-9]+)", path.name)  # text, digits, text, ...
-    return [int(part) if k % 2 else part for k, part in enumerate(parts)]
-
-
 def sorted_files(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
-    """Files of a folder with one of the suffixes, in natural order; empty if there is no folder."""
+    """Files of a folder with one of the suffixes, ``frame_9`` before ``frame_10``."""
     if not folder.is_dir():
         return []
     found = [p for p in folder.iterdir() if p.suffix.lower() in suffixes and p.is_file()]
-    files = sorted((p for p in found if not p.name.startswith(".")), key=natural_key)
-    return list(_one_each(files, [path.stem for path in files]).values())
+    # text, digits, text, ...
+    parts = {p: re.split(r"([0-9]+)", p.name) for p in found if not p.name.startswith(".")}
+    key = {p: [int(x) if k % 2 else x for k, x in enumerate(split)] for p, split in parts.items()}
+    return list(_one_each((path.stem, path) for path in sorted(key, key=lambda p: key[p])).values())
 
 
 def numbered_files(folder: Path | None, pattern: str) -> dict[int, Path]:
     """Files whose whole name matches a regular expression, by the number in its first group."""
     if folder is None or not folder.is_dir():
         return {}
-    names = ((path, re.fullmatch(pattern, path.name)) for path in sorted(folder.iterdir()))
-    found = [(path, int(match[1])) for path, match in names if match]
-    return _one_each([path for path, _ in found], [number for _, number in found])
+    names = ((re.fullmatch(pattern, path.name), path) for path in sorted(folder.iterdir()))
+    return _one_each((int(match[1]), path) for match, path in names if match)
 
 
-def _one_each(files: Many[Path], keys: Many) -> dict:
+def _one_each(files: Iterable[tuple]) -> dict:
     """Key -> file, where each key may have one file only."""
     found: dict = {}
-    for path, key in zip(files, keys, strict=True):
-        other = found.setdefault(key, path)
-        if other is not path:
+    for key, path in files:
+        if (other := found.setdefault(key, path)) is not path:
             raise InputError(
                 f"{path.parent}: {other.name} and {path.name} are two files of one frame. Keep one."
             )
@@ -71,17 +62,6 @@ def match_files(
     return found
 
 
-def warn_of_gaps(name: str, numbers: Many[int], told: list[str]) -> None:
-    """Name the frame numbers that are missing between the first and the last."""
-    spans = [
-        f"{a + 1}" if b - a == 2 else f"{a + 1} to {b - 1}"
-        for a, b in itertools.pairwise(numbers)
-        if b - a > 1
-    ]
-    if spans:
-        told.append(f"{name}: frame numbers {shown(spans)} are missing; the stamps keep the gap.")
-
-
 def shown(names: Many[object], most: int = 8) -> str:
     """The first names of a list, for a message."""
     return ", ".join(map(str, names[:most])) + (", ..." if len(names) > most else "")
@@ -97,40 +77,21 @@ def to_seconds(stamps: Many[float] | np.ndarray, name: str, told: list[str]) -> 
     return values / factor
 
 
-def read_stamps(path: Path, told: list[str]) -> np.ndarray:
-    """Stamps in seconds of a list, one a line."""
-    return to_seconds([row.numbers[0] for row in read_rows(path, "stamp")], path.name, told)
-
-
-def check_increasing(stamps: np.ndarray, where: str) -> None:
-    """Refuse stamps that are not finite, go back or stand still: InputError with the frames."""
-    if not np.isfinite(stamps).all():
-        bad = int(np.flatnonzero(~np.isfinite(stamps))[0])
-        raise InputError(f"{where}: expected a finite timestamp, frame {bad} has {stamps[bad]}.")
-    back = np.flatnonzero(np.diff(stamps) <= 0)
-    if back.size:
-        i = int(back[0])
-        raise InputError(
-            f"{where}: timestamps must increase: frame {i} has {float(stamps[i])!r}, frame {i + 1} "
-            f"has {float(stamps[i + 1])!r}. Sort the list and remove duplicates."
-        )
-
-
-def rigid(pose: np.ndarray, where: str) -> np.ndarray:
-    """(4, 4) of the (3, 4) pose of a file, its rotation brought onto the manifold."""
-    try:
-        return pose_matrix(as_rigid(np.vstack([pose, (0, 0, 0, 1)]), where, 1e-2)[:3])
-    except InputError as error:
-        raise FormatError(str(error)) from None
+def read_stamps(
+    path: Path, told: list[str], columns: str = "stamp", words: int = 0
+) -> tuple[np.ndarray, list[tuple[str, ...]]]:
+    """Stamps in seconds of a list, and the words after each."""
+    rows = read_rows(path, columns, words=words)
+    stamps = to_seconds([row.numbers[0] for row in rows], path.name, told)
+    return stamps, [row.words for row in rows]
 
 
 def numbered_poses(
     numbers: Many[int], stored: np.ndarray, path: Path, told: list[str]
 ) -> np.ndarray:
     """(N, 4, 4) stored pose of each frame number, NaN beyond the last."""
-    poses = np.full((len(numbers), 4, 4), np.nan)
-    known = np.array(numbers) < len(stored)
-    poses[known] = stored[np.array(numbers)[known]]
+    rows, poses = np.array(numbers, int), np.full((len(numbers), 4, 4), np.nan)
+    poses[rows < len(stored)] = stored[rows[rows < len(stored)]]
     if lost := int(np.isnan(poses[:, 0, 0]).sum()):
         told.append(f"{path}: {len(stored)} poses: {lost} frames have no ground truth.")
     return poses

@@ -1,4 +1,4 @@
-"""Sequences of RGB-D frames: a folder finds its reader, frames become pairs or another size."""
+"""Opening a sequence: a folder finds its reader; frames become pairs, or another size."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from hybridvo.data.base import Given, Sequence
+from hybridvo.data.base import Sequence
 from hybridvo.data.camera_file import Calibration
 from hybridvo.data.folder import FolderSequence
 from hybridvo.data.kitti import KittiSequence
@@ -22,18 +22,22 @@ from hybridvo.data.sintel import SintelSequence
 from hybridvo.data.tartanair import TartanAirSequence
 from hybridvo.data.tum import TumSequence
 from hybridvo.errors import InputError
+from hybridvo.flow import check_field, file_flow
 from hybridvo.types import Camera, Frame, FramePair
 
-READERS = (
-    SintelSequence,
-    TartanAirSequence,
-    SevenScenesSequence,
-    FolderSequence,
-    KittiSequence,
-    TumSequence,
-)
-"""In the order in which a folder is tried."""
-DATASETS = tuple(reader.kind for reader in READERS)
+READERS: dict[str, type[Sequence]] = {
+    reader.kind: reader
+    for reader in (
+        SintelSequence,
+        TartanAirSequence,
+        SevenScenesSequence,
+        FolderSequence,
+        KittiSequence,
+        TumSequence,
+    )
+}
+"""Kind -> reader, in the order in which a folder is tried."""
+DATASETS = tuple(READERS)
 OWN_DATA = (
     "Own data: put images into rgb/, depth registered to them into depth/, and describe the camera "
     "with 'hybridvo init DIR' (kind 'folder')."
@@ -58,11 +62,10 @@ def open_sequence(
         mask: folder of PNG or JPEG masks, 0 where pixels must not be used.
 
     Raises:
-        InputError: no such folder, one that cannot be read, an unknown data set, a layout that no
-            reader knows (with what was looked for), or a sequence without frames.
-        FormatError: a list or calibration file that is damaged.
+        InputError: a folder that is not there, of no known layout, or without frames.
+            FormatError: a list or calibration file that is damaged.
     """
-    if dataset is not None and dataset not in DATASETS:
+    if dataset is not None and dataset not in READERS:
         close = difflib.get_close_matches(dataset, DATASETS, n=1)
         hint = f" (did you mean '{close[0]}'?)" if close else ""
         raise InputError(
@@ -70,49 +73,41 @@ def open_sequence(
         )
     folder = Path(path)
     try:
-        reader = _reader(folder, dataset)
-        sequence = reader(folder, Given(camera, depth_scale, mask))
+        kind, root = _detect(folder, DATASETS if dataset is None else (dataset,))
+        sequence = READERS[kind](root, camera, depth_scale, mask)
     except FileNotFoundError as error:
         raise InputError(f"{folder}: {error.filename or error} is missing.") from None
     except OSError as error:  # a name that is too long, a folder that may not be read
         reason = error.strerror or str(error)
         raise InputError(f"{str(folder)[:200]}: cannot be read: {reason}.") from None
-    if reader is not SintelSequence and sequence.root.resolve() != folder.resolve():
-        sequence.warnings.append(
-            f"{folder}: one folder of a sequence; all of {sequence.root} is read."
-        )
+    if root.resolve() != folder.resolve():
+        sequence.warnings.append(f"{folder}: one folder of a sequence; all of {root} is read.")
     return sequence
 
 
-def _reader(folder: Path, dataset: str | None) -> Any:
-    """The named reader, or the first that knows the folder."""
-    # Sintel may be opened through an image folder that was never downloaded.
-    if dataset == SintelSequence.kind or (dataset is None and SintelSequence.matches(folder)):
-        return SintelSequence
+def _detect(folder: Path, kinds: tuple[str, ...]) -> tuple[str, Path]:
+    """The first of the kinds that knows a folder, and the sequence that this is a part of."""
+    for kind in kinds:
+        if root := READERS[kind].root_of(folder):
+            return kind, root
     if not folder.exists():
         raise InputError(f"{folder}: no such folder.")
     if not folder.is_dir():
         raise InputError(f"{folder}: expected a sequence folder, got a file.")
-    if dataset is not None:
-        return next(reader for reader in READERS if reader.kind == dataset)
-    found = next((reader for reader in READERS if reader.matches(folder)), None)
-    if found is not None:
-        return found
-    if (folder / "rgb").is_dir() and (folder / "depth").is_dir():
-        return FolderSequence
-    raise InputError(_nothing_found(folder))
-
-
-def _nothing_found(folder: Path) -> str:
+    if len(kinds) == 1:
+        return kinds[0], folder.absolute()
+    has_images = (folder / "rgb").is_dir()
+    if has_images and (folder / "depth").is_dir():
+        return FolderSequence.kind, folder.absolute()
     inside = sorted(path.name for path in folder.iterdir())
     content = ", ".join(inside[:8]) + (", ..." if len(inside) > 8 else "")
-    if (folder / "rgb").is_dir() or any(n.lower().endswith((".png", ".jpg")) for n in inside):
-        return (
+    if has_images or any(name.lower().endswith((".png", ".jpg")) for name in inside):
+        raise InputError(
             f"{folder}: images without depth ({content}): hybridvo needs metric depth for each "
             f"image, from a sensor, stereo or a network. {OWN_DATA}"
         )
-    looked = "".join(f"\n  {reader.looks_for}" for reader in READERS)
-    return (
+    looked = "".join(f"\n  {reader.looks_for()}" for reader in READERS.values())
+    raise InputError(
         f"{folder}: no frames: no known data set. It holds: {content or 'nothing'}. "
         f"Looked for:{looked}\nSay which with dataset=... (--dataset) if the names differ. "
         f"{OWN_DATA}"
@@ -130,35 +125,22 @@ def iter_pairs(
     """Consecutive pairs of a sequence; each frame is read once, two are in memory.
 
     ``flow`` None takes the flow files (where one of many is missing, the pair's flow is None); a
-    callable (prev, curr), such as ``hybridvo.dis_flow()``, gives an object with the attributes
-    flow, variance, valid, source and is_true.
+    callable (prev, curr), such as ``hybridvo.dis_flow()``, gives a FlowField or (H, W, 2) px.
 
     Raises:
-        InputError: a negative range; flow files asked for where there are none, or with a stride
-            above 1. The iterator raises what reading a frame raises.
+        InputError: a negative range; flow files asked for where there are none, or with a stride.
     """
     stop = len(sequence) if stop is None else min(stop, len(sequence))
     if stride < 1 or start < 0:
         raise InputError(f"iter_pairs: expected start >= 0 and stride >= 1, got {start}, {stride}.")
     if flow is None:
         sequence.check_flow(stride)
+        flow = file_flow(sequence)
     frames = (sequence.frame(index) for index in range(start, stop, stride))
-    return (_pair(sequence, flow, prev, curr) for prev, curr in itertools.pairwise(frames))
-
-
-def _pair(
-    sequence: Sequence, flow: Callable[[Frame, Frame], Any] | None, prev: Frame, curr: Frame
-) -> FramePair:
-    depth_source = sequence.depth_source
-    if flow is not None:
-        found = flow(prev, curr)
-        values = (found.flow, found.variance, found.valid, found.source, found.is_true)
-        return FramePair(prev, curr, *values, depth_source)
-    try:
-        vectors, valid = sequence.flow(prev.index)
-    except FileNotFoundError:
-        return FramePair(prev, curr, None, depth_source=depth_source)
-    return FramePair(prev, curr, vectors, None, valid, "file", sequence.flow_is_true, depth_source)
+    return (
+        check_field(flow(*two), two[0], "callable").pair(*two, sequence.depth_source)
+        for two in itertools.pairwise(frames)
+    )
 
 
 def resize_camera(camera: Camera, height: int, width: int) -> Camera:

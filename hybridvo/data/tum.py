@@ -2,19 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 
-from hybridvo.data.base import Given, Listing, Sequence
+from hybridvo.data.base import Sequence
 from hybridvo.data.camera_file import Calibration
-from hybridvo.data.lists import (
-    depth_at,
-    poses_at,
-    read_timed_poses,
-    to_seconds,
-)
-from hybridvo.files import read_rows
+from hybridvo.data.lists import depth_at, poses_at, read_stamps, read_timed_poses
 from hybridvo.geometry import invert, pose_matrix
 from hybridvo.types import Camera
 
@@ -59,30 +51,58 @@ class TumSequence(Sequence):
     """
 
     kind = "tum"
-    frames_per_second = 30.0  # of ICL-NUIM, which has frame numbers
     depth_scale = 5000.0
-    looks_for = "tum: rgb.txt and depth.txt (or associations.txt)"
+    markers = (("rgb.txt", "depth.txt"), ("associations.txt",))
 
-    def __init__(self, path: Path, given: Given) -> None:
-        root = path.absolute()
-        if root.name in ("rgb", "depth") and self.matches(root.parent):
-            root = root.parent
+    def _list_files(self) -> None:
+        root, told = self.root, self.warnings
+        if (root / "rgb.txt").exists():
+            self._read_two_lists()
+        else:
+            self._read_pairs()
         icl = next(iter(sorted(root.glob("*.gt.freiburg"))), None)
         self._is_icl = icl is not None
-        listing = _read_lists(root) if (root / "rgb.txt").exists() else _read_pairs(root)
-        if self._is_icl:
-            listing.timestamps = listing.timestamps / self.frames_per_second
         pose_file = icl or root / "groundtruth.txt"
+        stamps, poses = np.zeros(0), np.zeros((0, 4, 4))
         if pose_file.exists():
-            self._add_poses(pose_file, listing, is_bonn="bonn" in root.name.lower())
-        super().__init__(root, root.name, listing, given)
+            stamps, poses = read_timed_poses(pose_file, told)
+            self._sources.append(pose_file)
+        if self._is_icl:  # has frame numbers
+            self.timestamps, stamps = (
+                t / self.frames_per_second for t in (self.timestamps, stamps)
+            )
+            reflection = np.diag([1.0, -1.0, 1.0, 1.0])
+            poses = reflection @ poses @ reflection
+            told.append(f"{pose_file.name}: ICL-NUIM poses (y upwards) are reflected.")
+        elif "bonn" in root.name.lower():
+            poses = invert(BONN_ROS) @ poses @ BONN_ROS @ pose_matrix(BONN_MARKER)
+            told.append(f"{root.name}: Bonn's poses are moved from the tracked body to the camera.")
+        if pose_file.exists():
+            self.poses = poses_at(self.timestamps, stamps, poses, pose_file.name, told)
 
-    @staticmethod
-    def matches(path: Path) -> bool:
-        """Whether the folder looks like a TUM recording."""
-        lists = (path / "rgb.txt").is_file() and (path / "depth.txt").is_file()
-        inner = path.name in ("rgb", "depth") and (path.parent / "rgb.txt").is_file()
-        return lists or (path / "associations.txt").is_file() or inner
+    def _read_two_lists(self) -> None:
+        """Colour images and the depth of the nearest stamp."""
+        root, told = self.root, self.warnings
+        lists = [root / "rgb.txt", root / "depth.txt"]
+        (stamps, rgb), (depth_stamps, depth) = (
+            read_stamps(path, told, "timestamp filename", words=1) for path in lists
+        )
+        pairs = depth_at(stamps, depth_stamps, lists[0], told)
+        self.rgb_files = [root / rgb[i][0] for i, _ in pairs]
+        self.depth_files = [root / depth[j][0] for _, j in pairs]
+        self.timestamps = stamps[[i for i, _ in pairs]]
+        self._sources += lists
+
+    def _read_pairs(self) -> None:
+        """``stamp depth stamp rgb`` (ICL-NUIM), or ``stamp rgb stamp depth``."""
+        path = self.root / "associations.txt"
+        columns = "timestamp file timestamp file"
+        self.timestamps, words = read_stamps(path, self.warnings, columns, words=3)
+        is_depth_first = any("depth" in row[0].lower() for row in words)
+        rgb, depth = (2, 0) if is_depth_first else (0, 2)
+        self.rgb_files = [self.root / row[rgb] for row in words]
+        self.depth_files = [self.root / row[depth] for row in words]
+        self._sources.append(path)
 
     def _calibration(self) -> Calibration:
         name = self.name.lower()
@@ -97,50 +117,3 @@ class TumSequence(Sequence):
             f"--camera FILE."
         )
         return Calibration(Camera(*intrinsics, 480, 640), warnings=(told,))
-
-    def _add_poses(self, path: Path, listing: Listing, is_bonn: bool) -> None:
-        """Poses of the nearest stamps of the ground truth, in camera axes."""
-        told = listing.warnings
-        stamps, poses = read_timed_poses(path, told)
-        if self._is_icl:
-            stamps = stamps / self.frames_per_second
-            reflection = np.diag([1.0, -1.0, 1.0, 1.0])
-            poses = reflection @ poses @ reflection
-            told.append(f"{path.name}: ICL-NUIM poses (y upwards) are reflected to camera axes.")
-        elif is_bonn:
-            poses = invert(BONN_ROS) @ poses @ BONN_ROS @ pose_matrix(BONN_MARKER)
-            told.append(f"{path.name}: Bonn's poses are moved from the tracked body to the camera.")
-        listing.poses = poses_at(listing.timestamps, stamps, poses, path.name, told)
-        listing.sources.append(path)
-
-
-def _read_lists(root: Path) -> Listing:
-    """Colour images and the depth of the nearest stamp."""
-    told: list[str] = []
-    columns: list[tuple[np.ndarray, list[Path]]] = []
-    lists = [root / "rgb.txt", root / "depth.txt"]
-    for path in lists:
-        rows = read_rows(path, "timestamp filename", words=1)
-        stamps = to_seconds([row.numbers[0] for row in rows], path.name, told)
-        columns.append((stamps, [root / row.words[0] for row in rows]))
-    (stamps, rgb), (depth_stamps, depth) = columns
-    pairs = depth_at(stamps, depth_stamps, lists[0], told)
-    return Listing(
-        rgb=[rgb[i] for i, _ in pairs],
-        depth=[depth[j] for _, j in pairs],
-        timestamps=stamps[[i for i, _ in pairs]],
-        sources=lists,
-        warnings=told,
-    )
-
-
-def _read_pairs(root: Path) -> Listing:
-    """``stamp depth stamp rgb`` (ICL-NUIM), or ``stamp rgb stamp depth``; told by the folder."""
-    path = root / "associations.txt"
-    rows = read_rows(path, "timestamp file timestamp file", words=3)
-    told: list[str] = []
-    stamps = to_seconds([row.numbers[0] for row in rows], path.name, told)
-    rgb, depth = ([root / row.words[k] for row in rows] for k in (0, 2))
-    if any("depth" in row.words[0].lower() for row in rows):
-        rgb, depth = depth, rgb
-    return Listing([*rgb], [*depth], stamps, sources=[path], warnings=told)

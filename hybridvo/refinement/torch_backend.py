@@ -36,14 +36,20 @@ from hybridvo.refinement.full_fit import FLOW_ROUNDING, LAST_STEP, pair_noise, t
 from hybridvo.refinement.pixels import grid_stride, too_few
 from hybridvo.refinement.refine import status_of
 from hybridvo.refinement.torch_factors import (
+    CUTOFF,
     KERNELS,
     Linearization,
     RobustNoise,
+    attached,
+    flow_noise,
     linearize,
     newton_matrix,
     residuals,
     scores,
+    sensitivity,
     solve_small,
+    stepped,
+    typical_residual,
     weigh,
 )
 from hybridvo.results import Reason, Status
@@ -128,9 +134,8 @@ def refine_batch(
         # a Newton step of value zero, and with the gradient A^-1 dg
         T = result.SE3.detach()
         A = newton_matrix(pixels.map(torch.Tensor.detach), T, how)
-        step, solved = solve_small(A, scores(pixels, T, how)[0].sum(dim=2))
-        step = torch.where((solved & ~result.failed)[:, None], step, torch.zeros_like(step))
-        return replace(result, SE3=left_update(step - step.detach(), T))
+        g = scores(pixels, residuals(pixels, T), how)[0].sum(dim=2)
+        return replace(result, SE3=attached(T, A, g, ~result.failed))
 
 
 def _given_noise(noise: Any, like: torch.Tensor, with_depth: bool) -> torch.Tensor | None:
@@ -215,24 +220,18 @@ class _Solver:
         T = self._shrink_scale(pixels, pp.SE3(starts.tensor().flatten(0, 1)), ends)
         if count == 1:
             return T
-        cost = linearize(pixels, T, self._isotropic(ends)).cost.reshape(batch, count)
+        cost = linearize(pixels, residuals(pixels, T), flow_noise(ends)).cost.reshape(batch, count)
         best = torch.nan_to_num(cost, nan=torch.inf).argmin(dim=1)
         index = torch.arange(batch, device=best.device)
         return pp.SE3(T.tensor().reshape(batch, count, 7)[index, best])
 
-    def _isotropic(self, scale: torch.Tensor) -> RobustNoise:
-        return RobustNoise(torch.stack([scale, torch.zeros_like(scale)], dim=1), 1.0)
-
     def _shrink_scale(self, pixels: Pixels, T: pp.LieTensor, end: torch.Tensor) -> pp.LieTensor:
         """One Gauss-Newton step for each scale of the kernel, down to ``end``."""
         at = residuals(pixels, T)
-        scale = 1.5 * weighted_median(at.r[:, :2].norm(dim=1), pixels.weight * at.front, 1.0)
-        scale = torch.maximum(scale.clamp(1.0, LARGEST_PX), end)
+        scale = torch.maximum((CUTOFF * typical_residual(pixels, at)).clamp(1.0, LARGEST_PX), end)
         going = torch.ones_like(scale, dtype=torch.bool)
         while bool(going.any()):
-            H, g = linearize(pixels, T, self._isotropic(scale)).total()
-            step, _ = solve_small(H, g, DAMPING)
-            T = left_update(torch.where(going[:, None], step, torch.zeros_like(step)), T)
+            T = stepped(pixels, T, residuals(pixels, T), flow_noise(scale), going)
             going = going & (scale > end)
             scale = torch.maximum(scale * GNC_RATIO, end)
         return T
@@ -240,11 +239,11 @@ class _Solver:
     def _shares(self, T: pp.LieTensor, end: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """(B,) shares of the weight that follow this motion, and another near by but not this."""
         pixels = self.flow_only
-        own = weigh(pixels, T, self._isotropic(3 * end)).robust
+        own = weigh(pixels, residuals(pixels, T), flow_noise(3 * end)).robust
         rest = replace(pixels, weight=pixels.weight * (own < 0.25))
         identity = pp.identity_SE3(len(T), dtype=T.dtype, device=T.device)
         other = self._shrink_scale(rest, identity, end)
-        theirs = weigh(rest, other, self._isotropic(3 * end)).robust
+        theirs = weigh(rest, residuals(rest, other), flow_noise(3 * end)).robust
         total = pixels.weight.double().sum(dim=1).clamp(min=1e-30)
         found = ((pixels.weight, own), (rest.weight, theirs))
         shares = [(w * (follow > 0.25)).double().sum(dim=1) / total for w, follow in found]
@@ -259,8 +258,7 @@ class _Solver:
         for steps in (2, 3, 3):
             noise = given.detach() if given is not None else self._noise(samples, T, noise)
             for _ in range(steps):
-                H, g = linearize(self.few, T, self.how(noise)).total()
-                T = left_update(solve_small(H, g, DAMPING)[0], T)
+                T = stepped(self.few, T, residuals(self.few, T), self.how(noise))
         return T, noise if given is not None else self._noise(samples, T, noise)
 
     def _samples(self) -> np.ndarray:
@@ -296,7 +294,7 @@ class _Solver:
         near = at.r[:, :2].square().sum(dim=1) <= (8 * noise[:, :1]).clamp(min=4.0).square()
         used = few.weight * few.has_depth_curr * at.front * near
         spread = 1.4826 * weighted_median(at.r[:, 2].abs(), used, 0.02)
-        h = weighted_median(at.u[:, 2].abs(), used, 1.0).clamp(min=1e-3)
+        h = weighted_median(sensitivity(few, at)[:, 2].abs(), used, 1.0).clamp(min=1e-3)
         # at most half of the variance: the flow of a slow camera says next to nothing of sd
         sd = torch.minimum(noise[:, 1], 0.5**0.5 * spread / h)
         sz = (spread.square() - (sd * h).square()).clamp(min=DEPTH_NOISE_FLOOR**2).sqrt()
@@ -304,7 +302,7 @@ class _Solver:
 
     def _curvature(self, T: pp.LieTensor, how: RobustNoise) -> tuple[torch.Tensor, torch.Tensor]:
         """(B, 6, 6) curvature of the robust weights and scores' outer products, from the subset."""
-        each, at = scores(self.few, T, how)
+        each, at = scores(self.few, residuals(self.few, T), how)
         s, w = each.double(), (self.few.weight * at.robust).double()
         slope = how.kernel(at.distance2).slope
         factor = torch.where(w > 1e-12, slope / w.clamp(min=1e-12), torch.zeros_like(w))
@@ -322,7 +320,7 @@ class _Solver:
         done, converged = best < 0, best < 0
         iterations, matrix = done.long(), None
         for k in range(STEPS):
-            now = linearize(pixels, T, how, self.tile**2)
+            now = linearize(pixels, residuals(pixels, T), how, self.tile**2)
             H, g = now.total()
             if tight and k % 3 == 2:  # anew, for samples that were far when it was made
                 matrix = newton_matrix(pixels, T, how).double()

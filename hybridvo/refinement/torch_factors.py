@@ -6,6 +6,7 @@ With the current frame's depth a third row joins, ``r_z = log D_curr(x + F) - lo
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import reduce
 from typing import NamedTuple
@@ -13,9 +14,20 @@ from typing import NamedTuple
 import torch
 
 from hybridvo.refinement.batch import Pixels
+from hybridvo.refinement.coarse_fit import DAMPING
 from hybridvo.refinement.kernels import MAX_SHIFT
-from hybridvo.torch_geometry import MIN_DEPTH, left_update, move, pp, project, projection_rows
+from hybridvo.torch_geometry import (
+    MIN_DEPTH,
+    left_update,
+    move,
+    pp,
+    project,
+    projection_rows,
+    weighted_median,
+)
 
+CUTOFF, FIT_STEPS = 1.5, 6
+"""Scale of the kernel in typical residuals while these set it; Newton steps of a fit to pixels."""
 BEHIND_DISTANCE2 = 1e4
 """Squared Mahalanobis distance at which a pixel behind the camera is charged."""
 
@@ -53,7 +65,10 @@ KERNELS = {"geman-mcclure": _geman_mcclure, "cauchy": _cauchy, "huber": _huber, 
 
 
 class RobustNoise(NamedTuple):
-    """How residuals are weighed: (B, 2) noise sf px, sd, or (B, 3) with sz; kernel and cutoff."""
+    """How residuals are weighed: (B, n) noise sf px, then sd, then sz; kernel and its cutoff.
+
+    With sf alone the depths count as exact.
+    """
 
     noise: torch.Tensor
     cutoff: float = 3.0
@@ -64,24 +79,21 @@ class RobustNoise(NamedTuple):
         return KERNELS[self.name](distance2, self.cutoff**2)
 
 
-@dataclass(frozen=True, eq=False)
-class Residuals:
-    """What a pose says of every pixel: a, b, i (B, N), r and its sensitivity u (B, R, N).
+class Residuals(NamedTuple):
+    """What a pose says of every pixel: X'/Z' and Y'/Z' (B, 2, N), 1/Z' (B, N), r (B, R, N).
 
-    R is 2, the flow, or 3 with the log depth of the current frame.
+    R is 2, the flow, or 3 with the log depth of the current frame; t (B, 3, 1) of the pose.
     """
 
-    a: torch.Tensor
-    b: torch.Tensor
+    ab: torch.Tensor
     i: torch.Tensor
     r: torch.Tensor
-    u: torch.Tensor
     t: torch.Tensor
     front: torch.Tensor
 
 
 def residuals(pixels: Pixels, T: pp.LieTensor) -> Residuals:
-    """Residuals and their sensitivity to the log depth at pypose SE3 poses (B, 7)."""
+    """Residuals at pypose SE3 poses (B, 7)."""
     matrix = T.matrix().to(pixels.points.dtype)
     moved = move(matrix, pixels.points)
     front = moved[:, 2] > MIN_DEPTH
@@ -89,81 +101,81 @@ def residuals(pixels: Pixels, T: pp.LieTensor) -> Residuals:
     r, i = pixels.target - project(moved, pixels.K), 1 / moved[:, 2]
     if pixels.log_depth_curr is not None:
         r = torch.cat([r, (pixels.log_depth_curr + i.log())[:, None]], 1)
-    a, b, t = moved[:, 0] * i, moved[:, 1] * i, matrix[:, :3, 3, None]
-    return Residuals(a, b, i, r, _sensitivity(pixels, a, b, i, t), t, front)
+    return Residuals(moved[:, :2] * i[:, None], i, r, matrix[:, :3, 3:], front)
 
 
 def _focal(pixels: Pixels) -> torch.Tensor:
     return pixels.K.diagonal(dim1=1, dim2=2)[:, :2, None]
 
 
-def _sensitivity(
-    pixels: Pixels, a: torch.Tensor, b: torch.Tensor, i: torch.Tensor, t: torch.Tensor
-) -> torch.Tensor:
-    """U = d prediction / d log Z: d pi(X') / d log Z, and d log Z' / d log Z."""
-    q = [i * (a * t[:, 2] - t[:, 0]), i * (b * t[:, 2] - t[:, 1])]
-    u = _focal(pixels) * torch.stack(q, 1)
-    return u if pixels.log_depth_curr is None else torch.cat([u, (1 - t[:, 2] * i)[:, None]], 1)
-
-
-def _information(
-    pixels: Pixels, at: Residuals, noise: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """(D (B, R, N), kappa (B, N)) of Sigma^-1 = diag(D) - kappa (D u)(D u)^T."""
-    flow = 1 / (noise[:, 0, None].square() * pixels.flow_variance)
-    rows = [flow, flow]
-    if pixels.has_depth_curr is not None:
-        rows.append(pixels.has_depth_curr / noise[:, 2, None].square())
-    D = torch.stack(rows, 1)
-    depth = noise[:, 1, None].square() * pixels.depth_variance
-    return D, depth / (1 + depth * (D * at.u.square()).sum(dim=1))
-
-
-def at_likely_depth(pixels: Pixels, at: Residuals, noise: torch.Tensor) -> Residuals:
-    """The same at the depths that the residuals make most likely; the residuals stay."""
-    D, kappa = _information(pixels, at, noise)
-    e = (kappa * (D * at.u * at.r).sum(dim=1)).clamp(-float(MAX_SHIFT), float(MAX_SHIFT))
-    a, b = (torch.stack([at.a, at.b], 1) + at.u[:, :2] * e[:, None] / _focal(pixels)).unbind(1)
-    i = at.i * (1 - (1 - at.t[:, 2] * at.i) * e)
-    return replace(at, a=a, b=b, i=i, u=_sensitivity(pixels, a, b, i, at.t))
-
-
-def jacobian(pixels: Pixels, at: Residuals) -> tuple[torch.Tensor, ...]:
-    """Rows (B, 6, N) of d pi(X') / d delta and, with the current depth, d log Z' / d delta."""
-    u, v = projection_rows(at.a, at.b, at.i)
-    f = _focal(pixels)
-    rows = f[:, :1] * u, f[:, 1:] * v
+def sensitivity(pixels: Pixels, at: Residuals) -> torch.Tensor:
+    """U = d prediction / d log Z (B, R, N): d pi(X') / d log Z, and d log Z' / d log Z."""
+    u = _focal(pixels) * at.i[:, None] * (at.ab * at.t[:, 2:] - at.t[:, :2])
     if pixels.log_depth_curr is None:
-        return rows
-    zero = torch.zeros_like(at.a)
-    return (*rows, torch.stack([zero, zero, at.i, at.b, -at.a, zero], dim=1))
+        return u
+    return torch.cat([u, (1 - at.t[:, 2] * at.i)[:, None]], 1)
+
+
+def jacobian(pixels: Pixels, at: Residuals) -> list[torch.Tensor]:
+    """Rows (B, 6, N) of d pi(X') / d delta and, with the current depth, d log Z' / d delta."""
+    a, b = at.ab.unbind(1)
+    rows = [
+        f[:, None] * row
+        for f, row in zip(_focal(pixels).unbind(1), projection_rows(a, b, at.i), strict=True)
+    ]
+    if pixels.log_depth_curr is not None:
+        zero = torch.zeros_like(a)
+        rows.append(torch.stack([zero, zero, at.i, b, -a, zero], dim=1))
+    return rows
 
 
 @dataclass(frozen=True, eq=False)
 class Weighted:
-    """Residuals at the likely depths; ``right`` (B, R, N): their inverse covariance times them."""
+    """Residuals at the depths that they make most likely, and what they weigh.
+
+    Their inverse covariance is diag(D) - kappa (D u)(D u)^T, without u diag(D); ``right``
+    (B, R, N): it times the residuals.
+    """
 
     at: Residuals
     D: torch.Tensor
-    kappa: torch.Tensor
+    u: torch.Tensor | None
+    kappa: torch.Tensor | None
     right: torch.Tensor
     distance2: torch.Tensor
     robust: torch.Tensor
 
 
-def weigh(pixels: Pixels, T: pp.LieTensor, how: RobustNoise) -> Weighted:
-    """Residuals at pypose SE3 poses (B, 7), weighed."""
-    at = at_likely_depth(pixels, residuals(pixels, T), how.noise)
-    D, kappa = _information(pixels, at, how.noise)
-    along = kappa * (D * at.u * at.r).sum(dim=1)
-    right = D * (at.r - along[:, None] * at.u)
+def weigh(pixels: Pixels, at: Residuals, how: RobustNoise) -> Weighted:
+    """Residuals, weighed."""
+    u, kappa, noise = None, None, how.noise[:, :, None]
+    flow = 1 / (noise[:, 0].square() * pixels.flow_variance)
+    D = torch.stack([flow, flow], 1)
+    if pixels.has_depth_curr is not None:
+        D = torch.cat([D, (pixels.has_depth_curr / noise[:, 2].square())[:, None]], 1)
+    right = D * at.r
+    if noise.shape[1] > 1:
+        depth = noise[:, 1].square() * pixels.depth_variance
+
+        def shift(u: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+            """Kappa, and how far the log depth that the residuals make most likely lies away."""
+            kappa = depth / (1 + depth * (D * u.square()).sum(dim=1))
+            return kappa, kappa * (D * u * at.r).sum(dim=1)
+
+        u = sensitivity(pixels, at)
+        e = shift(u)[1].clamp(-float(MAX_SHIFT), float(MAX_SHIFT))
+        ab = at.ab + u[:, :2] * e[:, None] / _focal(pixels)
+        at = at._replace(ab=ab, i=at.i * (1 - (1 - at.t[:, 2] * at.i) * e))
+        u = sensitivity(pixels, at)
+        kappa, along = shift(u)
+        right = D * (at.r - along[:, None] * u)
     distance2 = (right * at.r).sum(dim=1).clamp(min=0)
     usable = at.front & (pixels.weight > 0)
     robust = torch.where(usable, how.kernel(distance2).weight, torch.zeros_like(distance2))
-    return Weighted(at, D, kappa, right, distance2, robust)
+    return Weighted(at, D, u, kappa, right, distance2, robust)
 
 
-def _along(rows: tuple[torch.Tensor, ...], values: torch.Tensor) -> torch.Tensor:
+def _along(rows: list[torch.Tensor], values: torch.Tensor) -> torch.Tensor:
     """(B, 6, N) sum of rows (B, 6, N) times values (B, R, N)."""
     each = (row * value[:, None] for row, value in zip(rows, values.unbind(1), strict=True))
     return reduce(torch.add, each)
@@ -192,21 +204,24 @@ class Linearization:
 
 
 def linearize(
-    pixels: Pixels, T: pp.LieTensor, how: RobustNoise, run: int | None = None
+    pixels: Pixels, at: Residuals, how: RobustNoise, run: int | None = None
 ) -> Linearization:
-    """Normal equations at pypose SE3 poses (B, 7), summed over runs of ``run`` pixels or all."""
-    found = weigh(pixels, T, how)
+    """Normal equations of residuals, summed over runs of ``run`` pixels or all."""
+    found = weigh(pixels, at, how)
     at, w, length = found.at, pixels.weight * found.robust, run or pixels.weight.shape[1]
 
-    def runs(x: list[torch.Tensor], axis: int) -> torch.Tensor:
+    def runs(x: Iterable[torch.Tensor]) -> torch.Tensor:
         """Values (B, N) or rows (B, 6, N) side by side, run by run."""
-        return torch.cat([v.unflatten(-1, (-1, length)) for v in x], dim=axis)
+        return torch.cat([v.unflatten(-1, (-1, length)) for v in x], dim=-1)
 
     rows = jacobian(pixels, at)
-    G = runs([*rows, _along(rows, found.D * at.u)], 3).transpose(1, 2)  # (B, C, 6, (R + 1) L)
-    information = runs([*(w[:, None] * found.D).unbind(1), -w * found.kappa], 2)
-    H = (G * information[:, :, None]) @ G.transpose(2, 3)
-    right = runs(list((w[:, None] * found.right).unbind(1)), 2)
+    right = runs((w[:, None] * found.right).unbind(1))
+    information = list((w[:, None] * found.D).unbind(1))
+    if found.u is not None and found.kappa is not None:
+        rows.append(_along(rows, found.D * found.u))
+        information.append(-w * found.kappa)
+    G = runs(rows).transpose(1, 2)  # (B, C, 6, (R + 1) run)
+    H = (G * runs(information)[:, :, None]) @ G.transpose(2, 3)
     g = (G[..., : right.shape[2]] @ right[..., None])[..., 0]
     behind = torch.full_like(found.distance2, BEHIND_DISTANCE2)
     cost = how.kernel(torch.where(at.front, found.distance2, behind)).cost
@@ -214,9 +229,9 @@ def linearize(
     return Linearization(0.5 * (H + H.transpose(2, 3)), g, cost, w.sum(dim=1), found)
 
 
-def scores(pixels: Pixels, T: pp.LieTensor, how: RobustNoise) -> tuple[torch.Tensor, Weighted]:
+def scores(pixels: Pixels, at: Residuals, how: RobustNoise) -> tuple[torch.Tensor, Weighted]:
     """(B, 6, N) w J^T Sigma^-1 r of each pixel; their sum is zero at the estimate."""
-    found = weigh(pixels, T, how)
+    found = weigh(pixels, at, how)
     right = (pixels.weight * found.robust)[:, None] * found.right
     return _along(jacobian(pixels, found.at), right), found
 
@@ -227,7 +242,7 @@ def newton_matrix(pixels: Pixels, T: pp.LieTensor, how: RobustNoise) -> torch.Te
     pixels = replace(pixels, K=pixels.K.detach())
     with torch.enable_grad():
         xi = torch.zeros(len(T), 6, dtype=T.dtype, device=T.device, requires_grad=True)
-        g = scores(pixels, left_update(xi, T), how)[0].sum(dim=2)
+        g = scores(pixels, residuals(pixels, left_update(xi, T)), how)[0].sum(dim=2)
         rows = [torch.autograd.grad(g[:, k].sum(), xi, retain_graph=True)[0] for k in range(6)]
     return -torch.stack(rows, dim=1)
 
@@ -252,3 +267,60 @@ def solve_small(
     x = x / scale
     good = good & (info == 0) & (x.abs() < 1e6).all(dim=1)
     return torch.where(good[:, None], x, torch.zeros_like(x)), good
+
+
+def attached(
+    T: pp.LieTensor, A: torch.Tensor, g: torch.Tensor, wanted: torch.Tensor | bool = True
+) -> pp.LieTensor:
+    """The same poses with the gradient A^-1 dg: a Newton step whose value is zero."""
+    step, solved = solve_small(A, g)
+    step = torch.where((solved & wanted)[:, None], step, torch.zeros_like(step))
+    return left_update(step - step.detach(), T)
+
+
+def stepped(
+    pixels: Pixels,
+    T: pp.LieTensor,
+    at: Residuals,
+    how: RobustNoise,
+    going: torch.Tensor | bool = True,
+) -> pp.LieTensor:
+    """Poses after a Gauss-Newton step of those that are ``going``; ``at``: their residuals."""
+    step, solved = solve_small(*linearize(pixels, at, how).total(), DAMPING)
+    return left_update(torch.where((solved & going)[:, None], step, torch.zeros_like(step)), T)
+
+
+def flow_noise(scale: torch.Tensor, kernel: str = "geman-mcclure") -> RobustNoise:
+    """A kernel of this width (B,) px around exact depths."""
+    return RobustNoise(scale[:, None], 1.0, kernel)
+
+
+def typical_residual(pixels: Pixels, at: Residuals) -> torch.Tensor:
+    """(B,) weighted median of the length of the flow residuals of every third pixel."""
+    r, weight = at.r[:, :2, ::3], (pixels.weight * at.front)[:, ::3]
+    return weighted_median(r.norm(dim=1), weight, 1.0)
+
+
+def fit_pixels(pixels: Pixels, start: pp.LieTensor, smallest: float) -> pp.LieTensor:
+    """The motion (B, 7) that pixels agree on under their weights: no noise, covariance or status.
+
+    The scale of the kernel follows the residuals, down to ``smallest``. Where the fit explains the
+    weighted median pixel no better than the start, the answer is the start. The gradient goes into
+    the weights alone; pixels far away pull with constant strength there, since a network that has
+    settled on a mover would never learn of the world.
+    """
+    with torch.no_grad():
+        T, fixed = start, pixels.map(torch.Tensor.detach)
+        at = residuals(fixed, T)
+        first = scale = typical_residual(fixed, at)
+        for _ in range(FIT_STEPS):
+            T = stepped(fixed, T, at, flow_noise((CUTOFF * scale).clamp(min=smallest)))
+            at = residuals(fixed, T)
+            scale = typical_residual(fixed, at)
+        good = torch.isfinite(T.tensor()).all(dim=1) & (scale <= first)
+        T = pp.SE3(torch.where(good[:, None], T.tensor(), start.tensor()))
+        width = (CUTOFF * torch.where(good, scale, first)).clamp(min=smallest)
+    if not pixels.weight.requires_grad:
+        return T
+    H, g = linearize(pixels, residuals(pixels, T), flow_noise(width, "huber")).total()
+    return attached(T, H.detach(), g)

@@ -1,9 +1,8 @@
-"""Ray casting of textured boxes, ellipsoids and cylinders: exact depth, flow and visibility.
+"""Ray casting of textured boxes, ellipsoids and cylinders: exact depth at any place of an image.
 
 A ray is (x, y, 1) t in the camera frame: its parameter t *is* the depth, and an affine map leaves
 it unchanged. P solids are given by ``shapes`` (P,) int64, ``A`` (P, 3, 4) maps from the unit shape
-to the camera frame in metres, their inverses ``B``, and ``bounds`` (P, 4) of
-:func:`screen_bounds`; K: (3, 3).
+to the camera frame in metres and their inverses ``B``; K: (3, 3).
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ import math
 
 import numpy as np
 
-from hybridvo.compilation import njit
+from hybridvo.geometry import njit
 
 BOX, ELLIPSOID, CYLINDER = range(3)
 """Cube [-1, 1]^3 (seen from inside it is a room); unit sphere; radius 1 about the y axis,
@@ -22,27 +21,40 @@ NEAR = 0.05
 """Nothing closer than this depth (metres) is seen."""
 
 
-def screen_bounds(A_cam_body: np.ndarray, K: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Pixel rectangles that surely contain each solid.
-
-    (P, 4) int64 inclusive (u0, u1, v0, v1), clipped to the image; u0 > u1 where unseen.
+def cast(
+    shapes: np.ndarray, A: np.ndarray, B: np.ndarray, K: np.ndarray, uv: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Nearest solid at each place (H, W, 2) of an image: its depth (H, W) float64, inf where
+    nothing is hit, and its index (H, W) int32, -1 there.
     """
-    cube = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
-    corners = np.einsum("pij,cj->pci", A_cam_body[:, :, :3], cube) + A_cam_body[:, None, :, 3]
-    z = corners[..., 2]
-    safe = np.maximum(z, NEAR)
-    u = K[0, 0] * corners[..., 0] / safe + K[0, 2]
-    v = K[1, 1] * corners[..., 1] / safe + K[1, 2]
-    bounds = np.stack([u.min(1) - 1, u.max(1) + 1, v.min(1) - 1, v.max(1) + 1], axis=1)
-    bounds[(z <= NEAR).any(axis=1)] = (0, width - 1, 0, height - 1)
-    bounds[:, :2] = np.clip(bounds[:, :2], -1, width)
-    bounds[:, 2:] = np.clip(bounds[:, 2:], -1, height)
-    out = np.empty(bounds.shape, dtype=np.int64)
-    out[:, [0, 2]] = np.maximum(np.floor(bounds[:, [0, 2]]), 0)
-    out[:, 1] = np.minimum(np.ceil(bounds[:, 1]), width - 1)
-    out[:, 3] = np.minimum(np.ceil(bounds[:, 3]), height - 1)
-    out[(z <= NEAR).all(axis=1)] = (1, 0, 1, 0)
-    return out
+    cube = np.array(list(itertools.product((-1.0, 1.0), repeat=3))).T
+    corners = A[:, :, :3] @ cube + A[:, :, 3:]
+    z = corners[:, 2]
+    seen = K[:2] @ (corners / np.maximum(z, NEAR)[:, None])  # a box around each solid, px
+    low, high = seen.min(axis=2) - 1, seen.max(axis=2) + 1
+    reaches = (z <= NEAR).any(axis=1)
+    low[reaches], high[reaches] = -np.inf, np.inf
+    return _cast(shapes, B, np.hstack([low, high]), K, uv)
+
+
+@njit(cache=True, nogil=True)
+def _cast(shapes, B_body_cam, bounds, K, uv):  # pragma: no cover - compiled
+    height, width = uv.shape[:2]
+    depth = np.full((height, width), np.inf)
+    index = np.full((height, width), -1, dtype=np.int32)
+    for p in range(shapes.shape[0]):
+        left, top, right, bottom = bounds[p]
+        for i in range(height):
+            for j in range(width):
+                u, v = uv[i, j]
+                if not (left <= u <= right and top <= v <= bottom):
+                    continue
+                x, y = (u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]
+                t = _hit(shapes[p], B_body_cam[p], x, y)
+                if t < depth[i, j]:
+                    depth[i, j] = t
+                    index[i, j] = p
+    return depth, index
 
 
 @njit(cache=True, nogil=True)
@@ -92,75 +104,6 @@ def _hit(shape, B, x, y):  # pragma: no cover - compiled
     if first > last or last <= NEAR:
         return np.inf
     return first if first > NEAR else last
-
-
-@njit(cache=True, nogil=True)
-def cast(shapes, B_body_cam, bounds, K, height, width):  # pragma: no cover - compiled
-    """Nearest solid of every pixel: its depth (H, W) float64, inf where nothing is hit, and its
-    index (H, W) int32, -1 there.
-    """
-    depth = np.full((height, width), np.inf)
-    index = np.full((height, width), -1, dtype=np.int32)
-    for p in range(shapes.shape[0]):
-        for v in range(bounds[p, 2], bounds[p, 3] + 1):
-            y = (v - K[1, 2]) / K[1, 1]
-            for u in range(bounds[p, 0], bounds[p, 1] + 1):
-                t = _hit(shapes[p], B_body_cam[p], (u - K[0, 2]) / K[0, 0], y)
-                if t < depth[v, u]:
-                    depth[v, u] = t
-                    index[v, u] = p
-    return depth, index
-
-
-@njit(cache=True, nogil=True)
-def motion(  # pragma: no cover - compiled
-    depth, index, B_prev, K_prev, shapes, A_curr, B_curr, bounds_curr, K_curr
-):
-    """Exact optical flow and visibility in the next frame, from depth and index of :func:`cast`.
-
-    Returns:
-        (H, W, 2) float64 flow in pixels, NaN where there is no surface or it ends behind the next
-        camera; (H, W) bool, True where the point is hidden or outside the next image.
-    """
-    height, width = depth.shape
-    flow = np.full((height, width, 2), np.nan)
-    hidden = np.ones((height, width), dtype=np.bool_)
-    point = np.empty(3)
-    for v in range(height):
-        y = (v - K_prev[1, 2]) / K_prev[1, 1]
-        for u in range(width):
-            p = index[v, u]
-            if p < 0:
-                continue
-            x = (u - K_prev[0, 2]) / K_prev[0, 0]
-            z = depth[v, u]
-            for i in range(3):
-                B = B_prev[p, i]
-                point[i] = (B[0] * x + B[1] * y + B[2]) * z + B[3]
-            A = A_curr[p]
-            X = A[0, 0] * point[0] + A[0, 1] * point[1] + A[0, 2] * point[2] + A[0, 3]
-            Y = A[1, 0] * point[0] + A[1, 1] * point[1] + A[1, 2] * point[2] + A[1, 3]
-            Z = A[2, 0] * point[0] + A[2, 1] * point[1] + A[2, 2] * point[2] + A[2, 3]
-            if Z <= NEAR:
-                continue
-            x1, y1 = X / Z, Y / Z
-            u1 = K_curr[0, 0] * x1 + K_curr[0, 2]
-            v1 = K_curr[1, 1] * y1 + K_curr[1, 2]
-            flow[v, u, 0] = u1 - u
-            flow[v, u, 1] = v1 - v
-            if not (-0.5 <= u1 <= width - 0.5 and -0.5 <= v1 <= height - 0.5):
-                continue
-            limit = Z * (1.0 - 1e-6)  # a surface does not hide itself
-            seen = True
-            for q in range(shapes.shape[0]):
-                b = bounds_curr[q]
-                if u1 < b[0] - 1 or u1 > b[1] + 1 or v1 < b[2] - 1 or v1 > b[3] + 1:
-                    continue
-                if _hit(shapes[q], B_curr[q], x1, y1) < limit:
-                    seen = False
-                    break
-            hidden[v, u] = not seen
-    return flow, hidden
 
 
 @njit(cache=True, nogil=True)

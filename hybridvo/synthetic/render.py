@@ -6,7 +6,6 @@ Everything here is ground truth by construction: an oracle, and named so whereve
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence as Items
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,10 +15,12 @@ from numpy.typing import ArrayLike
 
 from hybridvo.data.base import Sequence
 from hybridvo.data.image_io import write_cam, write_dpt, write_flo
+from hybridvo.data.sequence import resize_camera
 from hybridvo.errors import InputError
 from hybridvo.files import atomic_write, make_folder
-from hybridvo.geometry import invert
-from hybridvo.synthetic.raycast import cast, motion, screen_bounds, shade
+from hybridvo.geometry import backproject, invert, pixel_grid, project
+from hybridvo.synthetic.draws import carried
+from hybridvo.synthetic.raycast import NEAR, cast, shade
 from hybridvo.types import Camera, Frame
 
 
@@ -77,71 +78,58 @@ class Scene:
         return len(self.cameras)
 
     @property
-    def _shapes(self) -> np.ndarray:
-        return np.array([s.shape for s in self.solids], dtype=np.int64)
-
-    @property
     def object_ids(self) -> np.ndarray:
         """(P,) int32 object number of every solid; 0 is static."""
         return np.array([s.object_id for s in self.solids], dtype=np.int32)
 
-    def camera(self, index: int) -> Camera:
-        """Intrinsics of one frame."""
-        return self.cameras[self._check(index)]
+    @property
+    def _shapes(self) -> np.ndarray:
+        return np.array([s.shape for s in self.solids], dtype=np.int64)
 
-    def _check(self, index: int, last: int = 0) -> int:
-        if not 0 <= index < self.frames - last:
-            what = "pair" if last else "frame"
-            raise InputError(
-                f"Scene: {what} {index} of {self.frames - last}; "
-                f"expected 0 to {self.frames - last - 1}."
-            )
-        return int(index)
-
-    def _maps(
-        self, index: int, camera_index: int, size: tuple[int, int], K: np.ndarray
-    ) -> tuple[np.ndarray, ...]:
-        """Maps (P, 3, 4) of the solids of a frame to a camera, their inverses, and their bounds."""
+    def _maps(self, index: int, camera_index: int) -> tuple[np.ndarray, np.ndarray]:
+        """Maps (P, 3, 4) of the solids of a frame to a camera, and their inverses."""
         solids = [s.A_world_body for s in self.solids]
         A = np.stack([A if A.ndim == 2 else A[index] for A in solids])
-        E = invert(self.T_world_cam[camera_index])[:3]
-        A_cam = E[:, :3] @ A
-        A_cam[:, :, 3] += E[:, 3]
-        inverse = np.linalg.inv(A_cam[:, :, :3])
-        B = np.concatenate([inverse, -inverse @ A_cam[:, :, 3:]], axis=2)
-        return A_cam, B, screen_bounds(A_cam, K, *size)
+        A = carried(invert(self.T_world_cam[camera_index]), A)
+        inverse = np.linalg.inv(A[:, :, :3])
+        return A, np.concatenate([inverse, -inverse @ A[:, :, 3:]], axis=2)
 
-    def _cast(
-        self, index: int, size: tuple[int, int], K: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _cast(self, index: int, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Maps to unit shapes, depth and index of the solid of each pixel of a frame."""
-        _, B, bounds = self._maps(index, index, size, K)
-        return B, *cast(self._shapes, B, bounds, K, *size)
+        A, B = self._maps(index, index)
+        return B, *cast(self._shapes, A, B, camera.K, pixel_grid(*camera.shape))
 
     def _motion(
-        self, index: int, moved: tuple[int, int], size: tuple[int, int], K: Items[np.ndarray]
+        self, index: int, moved: tuple[int, int], prev: Camera, curr: Camera
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Flow of a frame to what ``moved`` says, what is hidden, and the solid of each pixel."""
-        B, depth, solid = self._cast(index, size, K[0])
-        A1, B1, bounds1 = self._maps(*moved, size, K[1])
-        return *motion(depth, solid, B, K[0], self._shapes, A1, B1, bounds1, K[1]), solid
+        B, depth, solid = self._cast(index, prev)
+        A1, B1 = self._maps(*moved)
+        points = backproject(np.where(solid >= 0, depth, np.nan), prev)
+        change = carried(A1, B)[solid]
+        points = (change[..., :3] @ points[..., None])[..., 0] + change[..., 3]
+        z = points[..., 2]
+        points[~(z > NEAR)] = np.nan
+        target = project(points, curr)
+        inside = ((target >= -0.5) & (target <= np.array(prev.shape[::-1]) - 0.5)).all(axis=-1)
+        nearest, _ = cast(self._shapes, A1, B1, curr.K, target)
+        seen = inside & (nearest >= z * (1.0 - 1e-6))  # a surface does not hide itself
+        return target - pixel_grid(*prev.shape), ~seen, solid
 
     def _object_id(self, solid: np.ndarray) -> np.ndarray:
         return np.where(solid < 0, np.int32(-1), self.object_ids[solid])
 
     def render(self, index: int) -> RenderedFrame:
         """One frame: depth and object of the ray through a centre, colour of four rays a pixel."""
-        camera = self.camera(index)
-        height, width = camera.shape
-        _, depth, solid = self._cast(index, camera.shape, camera.K)
-        # twice the resolution: u' = 2 u + 0.5 puts the four rays at +-0.25 px of the centre
-        K2 = np.array([[2.0, 0.0, 0.5], [0.0, 2.0, 0.5], [0.0, 0.0, 1.0]]) @ camera.K
-        B, depth2, solid2 = self._cast(index, (2 * height, 2 * width), K2)
+        camera = self.cameras[index]
+        _, depth, solid = self._cast(index, camera)
+        fine = resize_camera(camera, 2 * camera.height, 2 * camera.width)
+        B, depth2, solid2 = self._cast(index, fine)
         scale, offset, colours = self._texture()
         light = self.T_world_cam[index][:3, :3].T @ np.asarray(self.light, dtype=float)
         light /= np.linalg.norm(light)
-        fine = shade(depth2, solid2, self._shapes, B, K2, scale, offset, colours, light)
-        image = 255.0 * fine.reshape(height, 2, width, 2, 3).mean(axis=(1, 3))
+        colour = shade(depth2, solid2, self._shapes, B, fine.K, scale, offset, colours, light)
+        image = 255.0 * colour.reshape(camera.height, 2, camera.width, 2, 3).mean(axis=(1, 3))
         if self.noise > 0:
             rng = np.random.default_rng([self.seed, index])
             image = image + self.noise * rng.standard_normal(image.shape)
@@ -161,40 +149,34 @@ class Scene:
         (H, W) bool, True where the point is hidden or outside in the next frame; (H, W) bool,
         True on moving objects.
         """
-        index = self._check(index, last=1)
-        pair = self.cameras[index : index + 2]
-        moved = (index + 1, index + 1)
-        flow, hidden, solid = self._motion(index, moved, pair[0].shape, [c.K for c in pair])
+        cameras = self.cameras[index], self.cameras[index + 1]
+        flow, hidden, solid = self._motion(index, (index + 1, index + 1), *cameras)
         return flow.astype(np.float32), hidden, self._object_id(solid) > 0
 
     def object_id(self, index: int) -> np.ndarray:
         """(H, W) int32 object numbers of a frame, without rendering colour."""
-        camera = self.camera(index)
-        return self._object_id(self._cast(index, camera.shape, camera.K)[-1])
+        return self._object_id(self._cast(index, self.cameras[index])[-1])
 
     def moving_share(self, index: int, width: int = 96) -> tuple[float, float]:
         """Share of the pixels of a frame on movers, and the smallest depth; in a small image."""
-        _, depth, hit = self._cast(index, *_small_view(self.cameras[index], width))
-        return float(np.mean((self.object_ids[hit] > 0) & (hit >= 0))), float(depth.min())
+        _, depth, solid = self._cast(index, _small(self.cameras[index], width))
+        return float(np.mean(self._object_id(solid) > 0)), float(depth.min())
 
     def dynamic_share(self, index: int, width: int = 96, threshold_px: float = 1.0) -> float:
         """Share of the pixels whose flow differs from the camera's, in px of the full image."""
-        views = [_small_view(camera, width) for camera in self.cameras[index : index + 2]]
-        size = views[0][0]
-        flows = [
-            self._motion(index, (moved, index + 1), size, [K for _, K in views])[0]
-            for moved in (index + 1, index)
-        ]
+        small = [_small(camera, width) for camera in self.cameras[index : index + 2]]
+        flows = [self._motion(index, (at, index + 1), *small)[0] for at in (index + 1, index)]
         difference = np.linalg.norm(flows[0] - flows[1], axis=-1)
-        return float(np.mean(difference > threshold_px * size[1] / self.cameras[index].width))
+        ratio = small[0].width / self.cameras[index].width
+        return float(np.mean(difference > threshold_px * ratio))
 
 
-def _small_view(camera: Camera, width: int) -> tuple[tuple[int, int], np.ndarray]:
-    """Size and intrinsics of an image of at most ``width`` columns."""
-    ratio = min(1.0, width / camera.width)
-    small_width, small_height = round(camera.width * ratio), max(1, round(camera.height * ratio))
-    scale = np.diag([small_width / camera.width, small_height / camera.height, 1.0])
-    return (small_height, small_width), scale @ camera.K
+def _small(camera: Camera, columns: int) -> Camera:
+    """The camera of an image of at most so many columns."""
+    width = min(camera.width, columns)
+    height = max(1, round(camera.height * width / camera.width))
+    u, v = width / camera.width, height / camera.height
+    return Camera(u * camera.fx, v * camera.fy, u * camera.cx, v * camera.cy, height, width)
 
 
 class SyntheticSequence(Sequence):
@@ -215,16 +197,16 @@ class SyntheticSequence(Sequence):
 
     def camera(self, index: int) -> Camera:
         """Intrinsics of one frame."""
-        return self.scene.camera(index)
+        return self.scene.cameras[self._check_index(index)]
 
     def frame(self, index: int) -> Frame:
         """Image and true depth."""
-        rendered = self.scene.render(index)
-        stamp = float(self.timestamps[index])
+        rendered, stamp = self.scene.render(self._check_index(index)), float(self.timestamps[index])
         return Frame(rendered.rgb, rendered.depth, self.camera(index), stamp, int(index))
 
     def flow(self, index: int) -> tuple[np.ndarray, None]:
         """True flow from frame ``index`` to the next, (H, W, 2) float32, and no variance."""
+        self._check_index(index + 1)
         return self.scene.flow(index)[0], None
 
     def moving(self, index: int) -> np.ndarray:
@@ -237,7 +219,7 @@ class SyntheticSequence(Sequence):
 
 
 def write_sintel(scene: Scene, root: str | os.PathLike[str], name: str) -> None:
-    """Writes a scene in the layout of MPI Sintel.
+    """Write a scene in the layout of MPI Sintel.
 
     ``root/training/{clean,depth,camdata_left,invalid}/NAME/frame_0001.*`` for each frame,
     ``{flow,occlusions}`` for each but the last, and ``moving`` (ours: 255 on moving objects).
@@ -246,33 +228,28 @@ def write_sintel(scene: Scene, root: str | os.PathLike[str], name: str) -> None:
         InputError: a name that is not a plain folder name.
         OutputError: a file that cannot be written.
     """
-    if not name or Path(name).name != name or name in (".", ".."):
+    if Path(name).name != name or name in ("", ".."):
         raise InputError(f"sequence name: expected a plain folder name, got {name!r}.")
-    base = Path(root) / "training"
-    folders = {
-        part: base / part / name
-        for part in ("clean", "flow", "depth", "camdata_left", "occlusions", "invalid", "moving")
-    }
-    for folder in folders.values():
+
+    def place(part: str, ending: str) -> Path:
+        folder = Path(root) / "training" / part / name
         make_folder(folder)
+        return folder / f"frame_{index + 1:04d}.{ending}"
+
+    def write_png(part: str, image: np.ndarray) -> None:
+        image = np.where(image, np.uint8(255), np.uint8(0)) if image.dtype == bool else image
+        with atomic_write(place(part, "png"), "wb") as file:
+            file.write(cv2.imencode(".png", np.ascontiguousarray(image))[1].tobytes())
+
     for index in range(scene.frames):
-        stem = f"frame_{index + 1:04d}"
         rendered = scene.render(index)
-        camera = scene.camera(index)
-        _write_png(folders["clean"] / f"{stem}.png", rendered.rgb[:, :, ::-1])
-        write_dpt(folders["depth"] / f"{stem}.dpt", rendered.depth)
+        write_png("clean", rendered.rgb[:, :, ::-1])
+        write_dpt(place("depth", "dpt"), rendered.depth)
         extrinsic = invert(scene.T_world_cam[index])
-        write_cam(folders["camdata_left"] / f"{stem}.cam", camera.K, extrinsic)
-        _write_png(folders["moving"] / f"{stem}.png", rendered.object_id > 0)
-        _write_png(folders["invalid"] / f"{stem}.png", rendered.object_id < 0)
+        write_cam(place("camdata_left", "cam"), scene.cameras[index].K, extrinsic)
+        write_png("moving", rendered.object_id > 0)
+        write_png("invalid", rendered.object_id < 0)
         if index + 1 < scene.frames:
             flow, occlusion, _ = scene.flow(index)
-            write_flo(folders["flow"] / f"{stem}.flo", flow)
-            _write_png(folders["occlusions"] / f"{stem}.png", occlusion)
-
-
-def _write_png(path: Path, image: np.ndarray) -> None:
-    if image.dtype == bool:
-        image = np.where(image, 255, 0).astype(np.uint8)
-    with atomic_write(path, "wb") as file:
-        file.write(cv2.imencode(".png", np.ascontiguousarray(image))[1].tobytes())
+            write_flo(place("flow", "flo"), flow)
+            write_png("occlusions", occlusion)

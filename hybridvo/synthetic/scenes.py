@@ -6,6 +6,7 @@ moving pixels is inside the family's band in every frame.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hybridvo.errors import InputError
-from hybridvo.synthetic.draws import affine, any_turn, camera_path, poses, sway
+from hybridvo.synthetic.draws import affine, any_turn, camera_path, carried, poses, sway
 from hybridvo.synthetic.raycast import BOX, CYLINDER, ELLIPSOID
 from hybridvo.synthetic.render import Scene, Solid
 from hybridvo.types import Camera
@@ -32,6 +33,8 @@ LAG = 6
 
 Parts = list[tuple[int, np.ndarray]]
 """Unit shapes with their (3, 4) or (N, 3, 4) maps into the object frame, metres."""
+Mover = Callable[[int, float], list[Solid]]
+"""Number and size of a moving object -> its solids."""
 
 
 def draw_look(rng: np.random.Generator) -> dict[str, Any]:
@@ -39,25 +42,6 @@ def draw_look(rng: np.random.Generator) -> dict[str, Any]:
     base = rng.uniform(0.35, 1.0, 3)
     other = np.clip(base + rng.normal(0, 0.3, 3), 0.25, 1.0)
     return {"wavelength": rng.uniform(1.0, 2.2), "colours": (base, other)}
-
-
-@dataclass(frozen=True, eq=False)
-class Mover:
-    """One moving object, before its size is fixed."""
-
-    parts: Parts
-    T_world_object: np.ndarray
-    looks: list[dict[str, Any]]
-
-    def solids(self, object_id: int, size: float) -> list[Solid]:
-        """Solids of the mover, scaled about its own origin."""
-        T = self.T_world_object
-        out = []
-        for (shape, local), look in zip(self.parts, self.looks, strict=True):
-            A = T[:, :3, :3] @ (size * local)
-            A[:, :, 3] += T[:, :3, 3]
-            out.append(Solid(shape, A, object_id, **look))
-        return out
 
 
 def cluster(rng: np.random.Generator, half: np.ndarray, count: int) -> Parts:
@@ -172,8 +156,16 @@ class _Movers:
     ) -> Mover:
         """A body that sways about a place in the frame of a path."""
         angles = sway(self.rng, self.frames, spin_deg)
-        place = poses(angles, centre + sway(self.rng, self.frames, speed))
-        return Mover(parts, path @ place, [draw_look(self.rng) for _ in parts])
+        place = path @ poses(angles, centre + sway(self.rng, self.frames, speed))
+        looks = [draw_look(self.rng) for _ in parts]
+
+        def solids(number: int, size: float) -> list[Solid]:
+            return [
+                Solid(shape, carried(place, size * local), number, **look)
+                for (shape, local), look in zip(parts, looks, strict=True)
+            ]
+
+        return solids
 
     def blob(
         self,
@@ -261,17 +253,11 @@ def make_scene(
 ) -> Scene:
     """Scene of a family, drawn from a seed.
 
-    Args:
-        kind: ``static``; ``light`` (several movers, about 30 % of the pixels); ``pair`` (small
-            random); ``heavy_rigid``, ``heavy_deforming``, ``heavy_two``, ``heavy_ten``: 46 to 75 %
-            of the pixels on movers in every frame, and at least 46 % whose flow differs from the
-            camera's by over 1/512 of the width.
-        seed: not negative; the same seed gives the same images.
-        height: pixels.
-        width: pixels.
-        frames: default 20, for ``pair`` 2.
-        zoom: relative amplitude of a slow change of focal length.
-        noise: sensor noise, standard deviation in grey levels.
+    Kinds: ``static``; ``light`` (several movers, about 30 % of the pixels); ``pair`` (small, any);
+    ``heavy_rigid``, ``heavy_deforming``, ``heavy_two``, ``heavy_ten``: 46 to 75 % of the pixels on
+    movers in every frame, and at least 46 % whose flow differs from the camera's by over 1/512 of
+    the width. ``frames``: default 20, for ``pair`` 2; ``zoom``: relative amplitude of a slow change
+    of focal length; ``noise``: standard deviation of the sensor noise in grey levels.
 
     Raises:
         InputError: an unknown kind, or a value out of range.
@@ -285,13 +271,12 @@ def make_scene(
         frames = 2 if kind == "pair" else 20
     if kind not in BANDS:
         raise InputError(f"scene kind: expected one of {', '.join(BANDS)}, got {kind!r}.")
-    for name, value, least in (("seed", seed, 0), ("frames", frames, 2), ("height", height, 8),
-                               ("width", width, 8)):  # fmt: skip
-        if isinstance(value, bool) or int(value) != value or value < least:
-            raise InputError(f"{name}: expected an integer of at least {least}, got {value!r}.")
-    for name, amount, most in (("zoom", zoom, 0.3), ("noise", noise, 255.0)):
-        if not 0.0 <= amount <= most:
-            raise InputError(f"{name}: expected 0 to {most:g}, got {amount}.")
+    for name, value, low, high in (
+        ("seed", seed, 0, np.inf), ("frames", frames, 2, np.inf), ("height", height, 8, np.inf),
+        ("width", width, 8, np.inf), ("zoom", zoom, 0, 0.3), ("noise", noise, 0, 255),
+    ):  # fmt: skip
+        if not low <= value <= high or (high == np.inf and value % 1):
+            raise InputError(f"{name}: expected {low} to {high}, got {value!r}.")
     for attempt in range(ATTEMPTS):
         rng = np.random.default_rng([list(BANDS).index(kind), seed, attempt])
         scene = _draw_scene(rng, kind, (height, width), frames, zoom, noise)
@@ -340,7 +325,7 @@ def _sized(scene: Scene, movers: list[Mover], share: float) -> tuple[Scene, floa
     small, large = 0.4, 2.0
     for _ in range(9):
         size = np.sqrt(small * large)
-        solids = [solid for n, mover in enumerate(movers, 1) for solid in mover.solids(n, size)]
+        solids = [solid for n, mover in enumerate(movers, 1) for solid in mover(n, size)]
         sized = replace(scene, solids=(*scene.solids, *solids))
         found = np.median([sized.moving_share(int(i), 64)[0] for i in samples])
         small, large = (size, large) if found < share else (small, size)

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from pathlib import Path
-from typing import Annotated, Any, Literal, cast
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
@@ -16,18 +15,12 @@ from hybridvo.network.selection import SELECTION_METHODS
 from hybridvo.network.selector_net import SelectorNetworkOptions
 from hybridvo.options import Count, Positive, Share, option_group
 from hybridvo.synthetic.dataset import (
-    PRESETS,
     Mixture,
-    Preset,
-    StoredSamples,
     build_options,
     load_preset,
+    make_preset,
     read_yaml,
 )
-from hybridvo.training.shards import RenderedOptions
-
-KINDS = PRESETS | {"rendered": RenderedOptions, "folder": StoredSamples}
-"""Data that a training can name."""
 
 Below1 = Annotated[float, Field(ge=0, lt=1)]
 NotNegative = Annotated[float, Field(ge=0)]
@@ -149,28 +142,14 @@ def load_pwvo_options(path: str | Path) -> tuple[PwvoOptions, Mixture]:
     """Options of a ``configs/train_*.yaml`` and the mixture of the data that it names."""
     path = Path(path)
     options = build_options(PwvoOptions, read_yaml(path), str(path))
-    return options, load_mixture(options, path.parent)
-
-
-def load_mixture(options: PwvoOptions, folder: Path) -> Mixture:
-    """Data of a training, whose files are named from ``folder``; see :func:`load_pwvo_options`."""
-    presets = [load_preset(folder / name, KINDS, options.data_size) for name in options.data]
-    return Mixture(tuple(presets), options.data_weights)
-
-
-def described(preset: Preset) -> dict[str, Any]:
-    """Kind and options of a preset as plain values; :func:`recorded_run` reads them back."""
-    kind = next(name for name, cls in KINDS.items() if type(preset) is cls)
-    return {"preset": kind} | dataclasses.asdict(cast(Any, preset))
+    presets = [load_preset(path.parent / name, options.data_size) for name in options.data]
+    return options, Mixture(tuple(presets), options.data_weights)
 
 
 def recorded_run(record: dict[str, Any], where: str) -> tuple[PwvoOptions, Mixture]:
     """Options and data of a run from the record in its checkpoint ``where``."""
     options = build_options(PwvoOptions, record["options"], where)
-    presets: list[Any] = []
-    for mapping in record["data"]:
-        values = {key: value for key, value in mapping.items() if key != "preset"}
-        presets.append(build_options(KINDS[mapping["preset"]], values, where))
+    presets = [make_preset(mapping, where) for mapping in record["data"]]
     return options, Mixture(tuple(presets), options.data_weights)
 
 

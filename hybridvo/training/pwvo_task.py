@@ -18,7 +18,7 @@ from hybridvo.network.selection import fitted_motion, select_motion
 from hybridvo.results import PixelwisePrediction
 from hybridvo.synthetic.dataset import Mixture, Preset
 from hybridvo.synthetic.draws import TRAINING, sample_generator
-from hybridvo.training.options import PwvoOptions, described
+from hybridvo.training.options import PwvoOptions
 from hybridvo.training.validation import TrainingBatch, collate, evaluate_network
 
 FIT_FLOOR_PX, FIT_LIMIT_PX = 0.05, 100.0
@@ -60,7 +60,7 @@ class PwvoTask:
         self.options, self.mixture = options, mixture
         torch.manual_seed(options.seed)
         self.network = build_network(options.network)
-        self.data = [described(preset) for preset in mixture.presets]
+        self.data = mixture.record
         self.all_parameters_used = options.loss.needs_uncertainty
 
     def batches(self, samples: int, workers: int, rank: int, world: int) -> Iterator[TrainingBatch]:

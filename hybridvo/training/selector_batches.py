@@ -17,8 +17,8 @@ from hybridvo.network.selector_inputs import SelectorInputs, stacked_inputs
 from hybridvo.network.selector_net import SelectorOutput
 from hybridvo.options import RefineOptions
 from hybridvo.refinement import kernels
+from hybridvo.synthetic.dataset import read_shards
 from hybridvo.synthetic.draws import log_uniform
-from hybridvo.training.shards import read_shards
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,11 +27,10 @@ class SelectorBatch:
 
     Args:
         samples: (B, 8, n) float32 pixel buffers of the solver.
-        depth_true: (B, h, w) metres, 0 where unknown. label: (B, h, w) of ``shards``.
-        T: (B, 3, 4) true T_curr_prev.
-        source: (B,) 0 layered, 1 rendered with true (or noisy) flow, 2 rendered with DIS flow.
+        depth_true: (B, h, w) metres, 0 where unknown. label: (B, h, w) of ``synthetic.dataset``.
+        T: (B, 3, 4) true T_curr_prev. source: (B,) number in ``SOURCES``.
         static: (B, h, w) probability to be static world that a pixel-wise network states.
-        proposal: (B, 3, 4) its motion. proposed: (B,) bool, whether it was asked.
+        proposal: (B, 3, 4) float64 its motion, NaN where it was not asked.
     """
 
     inputs: SelectorInputs
@@ -39,10 +38,9 @@ class SelectorBatch:
     depth_true: torch.Tensor
     label: torch.Tensor
     T: torch.Tensor
-    source: np.ndarray
+    source: torch.Tensor
     static: torch.Tensor
-    proposal: np.ndarray
-    proposed: torch.Tensor
+    proposal: torch.Tensor
 
     def __len__(self) -> int:
         return len(self.T)
@@ -53,7 +51,7 @@ class SelectorBatch:
 
     def shown(self, asked: torch.Tensor) -> SelectorBatch:
         """The same with the static world of the other network shown for ``asked`` (B,) bool."""
-        asked = asked & self.proposed
+        asked = asked & torch.isfinite(self.proposal).all(dim=(1, 2))
         logit = torch.logit(self.static, eps=1e-4)
         return replace(self, inputs=replace(self.inputs, static=logit, has_static=asked))
 
@@ -91,31 +89,18 @@ def _collate(p: dict[str, np.ndarray]) -> SelectorBatch:
     rows += [p["depth_variance"][:, None], p["usable"][:, None]]
     # in the order of the solver's buffers
     samples = np.concatenate(rows, axis=1, dtype=np.float32).reshape(size, kernels.BUFFER_ROWS, -1)
-    owner = np.repeat(np.arange(size), p["count"])
-    picks = [(b, k) for b in range(size) for k in range(p["count"][b])]
-    pose = np.stack([p["poses"][i] for i in picks])
-    facts = np.stack([p["facts"][i] for i in picks])
-
-    def tensor(x: Any, kind: torch.dtype = torch.float32) -> torch.Tensor:
-        return torch.as_tensor(np.ascontiguousarray(x)).to(kind)
-
     maps: dict[str, Any] = {field.name: p[field.name] for field in fields(GridMaps)}
+    there = np.arange(p["poses"].shape[1]) < p["count"][:, None]
+    owner = np.nonzero(there)[0]
     inputs = replace(
         stacked_inputs(GridMaps(**maps), torch.device("cpu")),
-        T_prior=tensor(p["T_prior"]),
-        has_prior=tensor(p["has_prior"], torch.bool),
-    ).asking(pose, facts, np.arange(len(owner)), owner)
-    return SelectorBatch(
-        inputs,
-        samples,
-        tensor(p["depth_true"]),
-        tensor(p["label"], torch.int64),
-        tensor(p["T"]),
-        np.asarray(p["source"]),
-        tensor(p["static"]),
-        p["proposal"].astype(np.float64),
-        tensor(np.isfinite(p["proposal"]).all((1, 2)), torch.bool),
-    )
+        T_prior=torch.as_tensor(p["T_prior"].astype(np.float32)),
+        has_prior=torch.as_tensor(p["has_prior"]),
+    ).asking(p["poses"][there], p["facts"][there], np.arange(len(owner)), owner)
+    truth = {"depth_true": np.float32, "label": np.int64, "T": np.float32, "source": np.int64}
+    truth |= {"static": np.float32, "proposal": np.float64}
+    tensors = {name: torch.as_tensor(p[name].astype(kind)) for name, kind in truth.items()}
+    return SelectorBatch(inputs, samples, **tensors)
 
 
 def read_batches(
@@ -162,36 +147,32 @@ def refits_of(
     Where the selector is shown another network's static world, that network's motion takes part.
     ``extra`` draws one of them anew at times (training), so that more than the best is seen.
     """
-    inputs = batch.inputs
-    cutoff = RefineOptions().cutoff
+    inputs, cutoff = batch.inputs, RefineOptions().cutoff
     assert out.mask is not None
     probability = torch.sigmoid(out.mask).numpy()
-    poses, found, parents = [], [], []
-    for b in range(len(batch.T)):
+    poses, facts, parents = [], [], []
+    for b in range(len(batch)):
         mine = torch.nonzero(inputs.owner == b)[:, 0]
         order = mine[out.score[mine].argsort(descending=True)].tolist()
         if extra is not None and len(order) > count and torch.rand((), generator=extra) < 0.3:
             swap = int(torch.randint(count, len(order), (), generator=extra))
             order[count - 1], order[swap] = order[swap], order[count - 1]
-        entries = [
-            (inputs.pose[k].numpy().astype(np.float64), mask_weights(probability[k]), k)
-            for k in order[:count]
-        ]
+        starts = [(inputs.pose[k].numpy().astype(np.float64), k) for k in order[:count]]
+        masks = [probability[k] for k in order[:count]]
         if inputs.has_static[b]:
-            weights = mask_weights(batch.static[b].numpy())
-            z = inputs.depth[b][inputs.usable[b]]
-            start = batch.proposal[b]
+            start, z = batch.proposal[b].numpy(), inputs.depth[b][inputs.usable[b]]
             near = nearest_motion(inputs.pose[mine].numpy(), start, 1.0 / float(z.median()))
-            entries.append((start, weights, int(mine[near])))
-        for start, weights, k in entries:
+            starts.append((start, int(mine[near])))
+            masks.append(batch.static[b].numpy())
+        for (start, k), mask in zip(starts, masks, strict=True):
+            weights, K = mask_weights(mask), inputs.K[b].numpy()
             if weights.max() <= 0:
                 continue
-            pose, fact = fit_in_mask(batch.samples[b], weights, inputs.K[b].numpy(), start, cutoff)
+            pose, fact = fit_in_mask(batch.samples[b], weights, K, start, cutoff)
             if np.isfinite(pose).all():
                 poses.append(pose)
-                found.append(fact)
+                facts.append(fact)
                 parents.append(k)
     if not poses:
         return None
-    owner = inputs.owner[torch.tensor(parents)]
-    return inputs.asking(np.stack(poses), np.stack(found), parents, owner)
+    return inputs.asking(np.stack(poses), np.stack(facts), parents, inputs.owner[parents])

@@ -8,7 +8,7 @@ training can read them while others are being made.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,37 +26,21 @@ from hybridvo.network.prediction import static_probability
 from hybridvo.network.selection import fitted_motion, on_grid_of
 from hybridvo.options import Options
 from hybridvo.results import PixelwisePrediction, RelativePose
+from hybridvo.synthetic.dataset import MOVING, SOURCES, STATIC, UNKNOWN, grid_sample
 from hybridvo.synthetic.diverse import DiverseOptions
 from hybridvo.synthetic.draws import log_uniform
-from hybridvo.synthetic.semi_real import Recording, draw_pair
+from hybridvo.synthetic.semi_real import KnownPair, Recording, draw_pair
 from hybridvo.synthetic.sensors import SensorOptions, degrade_depth
 from hybridvo.synthetic.training_scenes import training_scene
-from hybridvo.training.shards import MOVING, STATIC, UNKNOWN, grid_sample
 from hybridvo.training.validation import collate
 from hybridvo.types import Camera, Frame, FramePair
 
-PER_SHARD, AT_ONCE = 64, 16
-"""Seeds of a shard, and samples that a network is asked about together."""
+PER_SHARD = 64
+"""Seeds of a shard."""
 MAX_MOTIONS = 5
 """Motions of a sample."""
 SIZES = ((160, 320), (160, 320), (128, 256), (192, 256), (120, 400), (218, 512))
 """(height, width) of the samples."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Drawn:
-    """A pair and its ground truth: T_curr_prev (4, 4), depth, moving and known (H, W).
-
-    ``log_depth_curr``: (H, W) log depth of the current frame at x + F where it has no depth map.
-    """
-
-    pair: FramePair
-    source: str
-    T_curr_prev: np.ndarray
-    depth: np.ndarray
-    moving: np.ndarray
-    known: np.ndarray
-    log_depth_curr: np.ndarray | None = None
 
 
 def draw_samples(seed: int, recordings: Sequence[Recording] = ()) -> list[dict[str, Any]]:
@@ -67,24 +51,22 @@ def draw_samples(seed: int, recordings: Sequence[Recording] = ()) -> list[dict[s
     rng = np.random.default_rng([0x6A64, seed])
     height, width = SIZES[int(rng.integers(len(SIZES)))]
     if recordings:
-        pairs = [_semi_real_pair(rng, recordings)]
+        pairs = {"semi-real": draw_pair(rng, recordings)}
     elif rng.random() < 0.5:
-        pairs = [_diverse_pair(rng, min(height, 160), min(width, 320))]
+        pairs = {"diverse": _diverse_pair(rng, min(height, 160), min(width, 320))}
     else:
         pairs = _rendered_pairs(rng, seed, height, width)
     samples = []
-    for drawn in pairs:
+    for source, drawn in pairs.items():
         T_prior = _last_motion(rng, drawn.T_curr_prev)
         starts = [np.eye(4)]
         if T_prior is not None and rng.random() < 0.7:
             starts.append(T_prior)
         found = generate(drawn.pair, np.stack(starts), Options(), int(rng.integers(1 << 30)))
-        height, width = drawn.pair.prev.camera.shape
-        if isinstance(found, RelativePose) or not found.is_ambiguous:
+        whole = (0, drawn.depth.shape[0], 0, drawn.depth.shape[1])
+        if isinstance(found, RelativePose) or not found.is_ambiguous or found.grid.box != whole:
             continue
-        if found.grid.box != (0, height, 0, width):
-            continue
-        samples.append(_record(drawn, found, T_prior))
+        samples.append(_record(drawn, found, T_prior) | {"source": SOURCES.index(source)})
     return samples
 
 
@@ -113,40 +95,34 @@ def _noisy(rng: np.random.Generator, flow: np.ndarray) -> np.ndarray:
     return flow
 
 
-def _diverse_pair(rng: np.random.Generator, height: int, width: int) -> _Drawn:
+def _diverse_pair(rng: np.random.Generator, height: int, width: int) -> KnownPair:
     sample = DiverseOptions(height=height, width=width).sample(rng)
-    K = sample.K.astype(float)
-    camera = Camera(K[0, 0], K[1, 1], K[0, 2], K[1, 2], height, width)
+    camera = Camera.from_matrix(sample.K, height, width)
     flow = np.ascontiguousarray(sample.flow)
     if rng.random() < 0.15:
         flow = _noisy(rng, flow)
     prev = Frame(None, np.ascontiguousarray(sample.depth_prev), camera)
     pair = FramePair(prev, Frame(None, None, camera), flow)
-    with np.errstate(divide="ignore"):
-        log_depth = np.where(sample.depth_curr > 0, np.log(sample.depth_curr), np.nan)
-    if rng.random() < 0.1:
-        log_depth = np.full_like(log_depth, np.nan)
-    T, depth = sample.T_curr_prev.astype(float), sample.depth_true
-    log_depth = log_depth.astype(np.float32)
-    return _Drawn(pair, "diverse", T, depth, sample.moving, depth > 0, log_depth)
+    known = (sample.depth_curr > 0) & (rng.random() >= 0.1)
+    log_depth = np.log(np.where(known, sample.depth_curr, np.float32(np.nan)))
+    T = sample.T_curr_prev.astype(float)
+    return KnownPair(pair, T, sample.depth_true, sample.moving, log_depth_curr=log_depth)
 
 
-def _semi_real_pair(rng: np.random.Generator, recordings: Sequence[Recording]) -> _Drawn:
-    drawn = draw_pair(rng, recordings)
-    truth = drawn.T_curr_prev, drawn.depth, drawn.moving, drawn.depth > 0
-    return _Drawn(drawn.pair, "semi-real", *truth)
-
-
-def _rendered_pairs(rng: np.random.Generator, seed: int, height: int, width: int) -> list[_Drawn]:
+def _rendered_pairs(
+    rng: np.random.Generator, seed: int, height: int, width: int
+) -> dict[str, KnownPair]:
+    """The same scene with true and with DIS flow."""
     scene = training_scene(seed, height, width)
     frames = [scene.render(k) for k in (0, 1)]
-    flow, _, _ = scene.flow(0)
-    camera = scene.camera(0)
+    flow, _, moving = scene.flow(0)
+    camera = scene.cameras[0]
     T = invert(scene.T_world_cam[1]) @ scene.T_world_cam[0]
     depth = [np.where(np.isfinite(f.depth), f.depth, 0).astype(np.float32) for f in frames]
-    known = frames[0].object_id >= 0
-    moving = _moving(flow, T, camera, depth[0], frames[0].object_id > 0)
-    truth = T, depth[0], moving, known
+    # of the movers' pixels those whose flow the camera alone does not explain
+    own = np.nan_to_num(flow) - np.nan_to_num(ego_flow(depth[0], T, camera, camera))
+    moving &= np.square(own).sum(axis=2) > (0.5 * camera.width / 1024) ** 2
+    truth = T, depth[0], moving
     if rng.random() < 0.5:
         depth = degrade_depth(rng, depth, SensorOptions())
     second = rng.random() > 0.1
@@ -154,44 +130,33 @@ def _rendered_pairs(rng: np.random.Generator, seed: int, height: int, width: int
         flow = _noisy(rng, flow)
     prev = Frame(frames[0].rgb, depth[0], camera)
     curr = Frame(frames[1].rgb, depth[1] if second else None, camera)
-    pairs = [_Drawn(FramePair(prev, curr, np.ascontiguousarray(flow)), "true", *truth)]
+    pairs = {"rendered": KnownPair(FramePair(prev, curr, np.ascontiguousarray(flow)), *truth)}
     field = dis_flow()(prev, curr)
     if field.flow is not None:
         estimated = FramePair(prev, curr, field.flow, field.variance, field.valid)
-        pairs.append(_Drawn(estimated, "dis", *truth))
+        pairs["dis"] = KnownPair(estimated, *truth)
     return pairs
 
 
-def _moving(
-    flow: np.ndarray, T: np.ndarray, camera: Camera, depth: np.ndarray, mover: np.ndarray
-) -> np.ndarray:
-    """(H, W) bool, pixels of movers whose flow the camera alone does not explain."""
-    with np.errstate(invalid="ignore"):
-        own = np.nan_to_num(flow) - np.nan_to_num(ego_flow(depth, T, camera, camera))
-    return mover & (np.square(own).sum(axis=2) > (0.5 * camera.width / 1024) ** 2)
-
-
-def _record(drawn: _Drawn, found: HypothesisSet, T_prior: np.ndarray | None) -> dict[str, Any]:
+def _record(drawn: KnownPair, found: HypothesisSet, T_prior: np.ndarray | None) -> dict[str, Any]:
     """Everything about a sample: the maps of its grid, the motions found, and ground truth."""
     stride, maps = found.grid.shape[2], found.maps()
     pick = np.s_[stride // 2 :: stride, stride // 2 :: stride]
     if drawn.log_depth_curr is not None:
         maps = replace(maps, log_depth_curr=drawn.log_depth_curr[pick])
     label = np.where(drawn.moving, MOVING, STATIC)
-    label = np.where(drawn.known, label, UNKNOWN)[pick]
-    poses = np.zeros((MAX_MOTIONS, 3, 4))
-    facts = np.zeros((MAX_MOTIONS, found.facts.shape[1]))
-    poses[: len(found.poses)], facts[: len(found.poses)] = found.poses, found.facts
+    label = np.where(drawn.depth > 0, label, UNKNOWN)[pick]
+    count = min(len(found.poses), MAX_MOTIONS)
+    empty = (0, MAX_MOTIONS - count)
     return vars(maps) | {
         "depth_true": np.minimum(drawn.depth[pick], 6e4).astype(np.float16),
         "label": label.astype(np.uint8),
-        "poses": poses,
-        "facts": facts,
-        "count": len(found.poses),
+        "poses": np.pad(found.poses[:count], (empty, (0, 0), (0, 0))),
+        "facts": np.pad(found.facts[:count], (empty, (0, 0))),
+        "count": count,
         "T": drawn.T_curr_prev[:3],
         "T_prior": (np.eye(4) if T_prior is None else T_prior)[:3],
         "has_prior": T_prior is not None,
-        "source": ("diverse", "true", "dis", "semi-real").index(drawn.source),
     }
 
 
@@ -220,31 +185,22 @@ def write_proposals(folder: Path, network: torch.nn.Module) -> int:
     for path in sorted(folder.glob("*.npz")):
         with np.load(path) as file:
             shard = dict(file)
-        numbers = np.arange(len(shard["source"]))
-        said = [
-            _proposals({name: x[some] for name, x in shard.items()}, network)
-            for some in np.array_split(numbers, -(-len(numbers) // AT_ONCE))
-        ]
-        proposal, static = (np.concatenate(x) for x in zip(*said, strict=True))
-        _write(path, shard | {"proposal": proposal, "static": static.astype(np.float16)})
-        total += len(numbers)
+        count = len(shard["source"])
+        said = [_proposal({k: x[i] for k, x in shard.items()}, network) for i in range(count)]
+        proposal, static = (np.stack(x) for x in zip(*said, strict=True))
+        _write(path, shard | {"proposal": proposal, "static": static})
+        total += count
     return total
 
 
-def _proposals(
-    shard: dict[str, np.ndarray], network: torch.nn.Module
-) -> tuple[np.ndarray, np.ndarray]:
-    """Motions (n, 3, 4) and static probabilities (n, h, w) of some samples."""
-    count, *size = shard["label"].shape
-    samples = [
-        grid_sample({name: x[i] for name, x in shard.items()}, NETWORK_SIZE) for i in range(count)
-    ]
-    with torch.inference_mode():
-        inputs = collate(samples).inputs
-        output = predict(network, inputs)
-        assert isinstance(output, PixelwisePrediction) and output.log_scale_rotation is not None
-        scale = output.log_scale_rotation
-        static = static_probability(scale, on_grid_of(scale, inputs).valid)[:, None]
-        static = F.interpolate(static, size, mode="bilinear", align_corners=False)[:, 0]
-        motion = fitted_motion(output, inputs)[:, :3]
-    return motion.double().numpy(), static.numpy()
+@torch.inference_mode()
+def _proposal(p: dict[str, np.ndarray], network: torch.nn.Module) -> tuple[np.ndarray, np.ndarray]:
+    """Motion (3, 4) and static probability (h, w) of a sample."""
+    inputs = collate([grid_sample(p, NETWORK_SIZE)]).inputs
+    output = predict(network, inputs)
+    assert isinstance(output, PixelwisePrediction) and output.log_scale_rotation is not None
+    scale = output.log_scale_rotation
+    static = static_probability(scale, on_grid_of(scale, inputs).valid)[:, None]
+    static = F.interpolate(static, p["label"].shape, mode="bilinear", align_corners=False)
+    motion = fitted_motion(output, inputs)[0, :3]
+    return motion.double().numpy(), static[0, 0].half().numpy()

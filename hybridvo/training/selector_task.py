@@ -17,6 +17,7 @@ import torch.nn.functional as F
 from hybridvo.errors import InputError
 from hybridvo.network.selector_inputs import SelectorInputs
 from hybridvo.network.selector_net import SelectorNetwork, SelectorOutput
+from hybridvo.synthetic.dataset import MOVING, SOURCES, STATIC
 from hybridvo.training.options import SelectorOptions
 from hybridvo.training.selector_batches import (
     SelectorBatch,
@@ -24,7 +25,6 @@ from hybridvo.training.selector_batches import (
     read_batches,
     refits_of,
 )
-from hybridvo.training.shards import MOVING, STATIC
 
 RIGHT_PX = 1.0
 """px at a width of 1024: mean error of the ego flow up to which a motion is right."""
@@ -32,9 +32,6 @@ WORST_RIGHT_PX = 3.0
 """The same where flow allows no better: three times the error of the best motion, at most this."""
 RIGHT_SLOPE = 0.15
 """Softness of that limit as a target, of itself."""
-SOURCES = ("diverse", "rendered", "dis", "semi-real")
-"""Where samples come from: the layered generator, rendered scenes with true flow and with DIS, and
-recordings with movers cut from others."""
 
 
 def choice_loss(

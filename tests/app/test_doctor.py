@@ -9,7 +9,7 @@ import pytest
 
 from hybridvo.cli import main
 from hybridvo.commands.doctor import diagnose, diagnosis_text, doctor, doctor_text
-from hybridvo.data.image_io import read_flo
+from hybridvo.data.image_io import read_flow
 from hybridvo.errors import FormatError, InputError
 from hybridvo.synthetic.render import SyntheticSequence
 from hybridvo.synthetic.scenes import make_scene
@@ -107,7 +107,7 @@ def test_a_broken_frame_does_not_end_the_diagnosis(recorded):
 def test_exit_codes(dataset, own):
     assert main(["doctor", str(dataset), "--pairs", "2"]) == 0
     for path in (own.parents[1] / "flow" / "static").iterdir():
-        flow = read_flo(path)
+        flow = read_flow(path)[0]
         header = path.read_bytes()[:12]
         path.write_bytes(header + (-flow).astype("<f4").tobytes())
     assert main(["doctor", str(own)]) == 1

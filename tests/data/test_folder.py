@@ -15,8 +15,8 @@ from hybridvo.data.image_io import write_flo
 from hybridvo.data.lists import associate, to_seconds
 from hybridvo.data.sequence import open_sequence
 from hybridvo.errors import FormatError, InputError
-from hybridvo.types import Camera
-from hybridvo.units import depth_advice, stamp_unit, typical_depth
+from hybridvo.trajectory import stamp_unit
+from hybridvo.types import Camera, depth_advice, typical_depth
 from tests import sequences as write
 
 CAMERA = "fx: 20\nfy: 20\ncx: 15.5\ncy: 11.5\nwidth: 32\nheight: 24\ndepth_scale: 1000\n"

@@ -45,8 +45,8 @@ def encoded(extension: str, array: np.ndarray) -> bytes:
 RGB = np.dstack([GRID % 251] * 3).astype(np.uint8)
 FLOW = np.arange(12, dtype=np.float32).reshape(2, 3, 2) / 4
 FILES = {
-    "flow.flo": (tagged(FLOW), io.read_flo),
-    "depth.dpt": (tagged(FLOW[..., 0]), io.read_dpt),
+    "flow.flo": (tagged(FLOW), io.read_flow),
+    "depth.dpt": (tagged(FLOW[..., 0]), io.read_depth),
     "camera.cam": (cam_bytes(), io.read_cam),
     "flow.npy": (npy_bytes(FLOW), lambda p: io.read_npy(p, channels=2)),
     "image.png": (encoded(".png", RGB), io.read_rgb),
@@ -58,7 +58,7 @@ FILES = {
     ),
     "rgba.png": (
         encoded(".png", np.ones((4, 5), "<f4").view(np.uint8).reshape(4, 5, 4)),
-        io.read_depth_rgba_png,
+        lambda p: io.read_png(p, np.uint8, 4, "a float32 depth PNG"),
     ),
 }
 """File name -> whole content and its reader."""
@@ -70,10 +70,10 @@ def written(folder: Path, name: str, data: bytes) -> Path:
 
 
 def test_layouts_by_hand(tmp_path):
-    flow = io.read_flo(written(tmp_path, "a.flo", FILES["flow.flo"][0]))
+    flow, _ = io.read_flow(written(tmp_path, "a.flo", FILES["flow.flo"][0]))
     assert flow.shape == (2, 3, 2) and flow.dtype == np.float32
     assert flow[1, 2].tolist() == [10 / 4, 11 / 4]
-    depth = io.read_dpt(written(tmp_path, "a.dpt", tagged(np.arange(6.0).reshape(2, 3))))
+    depth = io.read_depth(written(tmp_path, "a.dpt", tagged(np.arange(6.0).reshape(2, 3))))
     assert depth.tolist() == [[0, 1, 2], [3, 4, 5]]
     K, T = io.read_cam(written(tmp_path, "a.cam", cam_bytes()))
     assert (K[0, 0], K[0, 2], K[1, 2]) == (1120, 511.5, 217.5)
@@ -84,10 +84,10 @@ def test_layouts_by_hand(tmp_path):
 def test_write_then_read(shape, tmp_path, rng):
     flow = rng.normal(size=(*shape, 2)).astype(np.float32)
     io.write_flo(tmp_path / "a.flo", flow)
-    np.testing.assert_array_equal(io.read_flo(tmp_path / "a.flo"), flow)
+    np.testing.assert_array_equal(io.read_flow(tmp_path / "a.flo")[0], flow)
     np.testing.assert_array_equal(cv2.readOpticalFlow(str(tmp_path / "a.flo")), flow)
     io.write_dpt(tmp_path / "a.dpt", flow[..., 0])
-    np.testing.assert_array_equal(io.read_dpt(tmp_path / "a.dpt"), flow[..., 0])
+    np.testing.assert_array_equal(io.read_depth(tmp_path / "a.dpt"), flow[..., 0])
     io.write_cam(tmp_path / "a.cam", np.diag([2.0, 3.0, 1.0]), np.eye(4))
     K, T = io.read_cam(tmp_path / "a.cam")
     assert K.tolist() == np.diag([2.0, 3.0, 1.0]).tolist() and T.tolist() == np.eye(4).tolist()
@@ -160,19 +160,20 @@ def test_wrong_tags_types_and_shapes(tmp_path):
     flo = FILES["flow.flo"][0]
     eight = encoded(".png", (GRID % 200).astype(np.uint8))
     cases = [
-        (io.read_flo, TAG[::-1] + flo[4:], "little-endian"),
-        (io.read_flo, b"JUNK" + flo[4:], "expected the first bytes"),
-        (io.read_flo, FILES["depth.dpt"][0], "truncated"),  # half the bytes
-        (io.read_dpt, flo, "trailing"),
-        (io.read_depth, eight, "16-bit depth PNG"),
-        (io.read_flow, eight, "3 channels"),
-        (io.read_npy, npy_bytes(np.array([{}], dtype=object), allow_pickle=True), "objects"),
-        (io.read_npy, npy_bytes(np.zeros((2, 4, 5), np.float32)), "shape"),
-        (io.read_npy, npy_bytes(np.zeros((0, 5), np.float32)), "expected"),
+        ("x.flo", TAG[::-1] + flo[4:], "little-endian"),
+        ("x.flo", b"JUNK" + flo[4:], "expected the first bytes"),
+        ("x.flo", FILES["depth.dpt"][0], "truncated"),  # half the bytes
+        ("x.dpt", flo, "trailing"),
+        ("depth.png", eight, "16-bit depth PNG"),
+        ("kitti.png", eight, "3 channels"),
+        ("x.npy", npy_bytes(np.array([{}], dtype=object), allow_pickle=True), "objects"),
+        ("x.npy", npy_bytes(np.zeros((2, 4, 5), np.float32)), "shape"),
+        ("x.npy", npy_bytes(np.zeros((0, 5), np.float32)), "expected"),
     ]
-    for reader, content, message in cases:
+    for name, content, message in cases:
+        reader = io.read_flow if name in ("x.flo", "kitti.png") else io.read_depth
         with pytest.raises(FormatError, match=message):
-            reader(written(tmp_path, "x.bin", content))
+            reader(written(tmp_path, name, content))
 
 
 def test_arrays_of_other_types_are_converted(tmp_path):
@@ -193,10 +194,10 @@ def test_sizes_names_and_what_is_no_file(tmp_path):
     path = written(folder, "\udcff.png", FILES["image.png"][0])  # a name that is not UTF-8
     assert io.read_rgb(path).shape == (20, 24, 3)
     with pytest.raises(FileNotFoundError):
-        io.read_flo(folder / "none.flo")
+        io.read_flow(folder / "none.flo")
     for odd in (folder, folder / ("x" * 300), "a\0b"):
         with pytest.raises(FormatError, match="cannot be read"):
-            io.read_flo(odd)
+            io.read_flow(odd)
 
 
 def test_rgb_order_grey_and_mask(tmp_path):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
@@ -11,6 +9,7 @@ from hybridvo.data.sequence import DATASETS, iter_pairs, open_sequence
 from hybridvo.data.tum import BONN_MARKER, BONN_ROS
 from hybridvo.errors import FormatError, InputError
 from hybridvo.files import fingerprint
+from hybridvo.flow import FlowField
 from hybridvo.geometry import ego_flow, invert
 from hybridvo.types import Camera
 from tests import sequences as write
@@ -237,7 +236,7 @@ def test_pairs_from_a_callable(tmp_path):
 
     def flow(prev, curr):
         field = np.full((*prev.camera.shape, 2), curr.index, np.float32)
-        return SimpleNamespace(flow=field, variance=None, valid=None, source="mine", is_true=False)
+        return FlowField(field, source="mine")
 
     pairs = list(iter_pairs(sequence, flow, stride=2))
     assert [(p.prev.index, p.curr.index, p.flow_source) for p in pairs] == [(0, 2, "mine")]

@@ -14,14 +14,12 @@ import pytest
 
 from tests.project import source_tree as source
 
-BASE = {"errors", "compilation", "units", "files"}
+BASE = {"errors", "files"}
 """Files without a notion of cameras: everything may import them."""
 NOUNS = BASE | {"types", "geometry", "results", "calibration", "options"}
 IMPORTS: dict[str, set[str]] = {
     # data walk from left to right
     "errors": set(),
-    "compilation": {"errors"},
-    "units": {"errors"},
     "files": {"errors"},
     "calibration": set(),
     "options": {"errors", "calibration"},
@@ -31,7 +29,7 @@ IMPORTS: dict[str, set[str]] = {
     "torch_geometry": BASE | {"types"},
     "flow": NOUNS,
     "trajectory": NOUNS,
-    "data": NOUNS | {"trajectory"},
+    "data": NOUNS | {"trajectory", "flow"},
     "refinement": NOUNS | {"torch_geometry"},
     "baselines": NOUNS,
     "hypotheses": NOUNS | {"refinement"},

@@ -18,6 +18,7 @@ from hybridvo.refinement.torch_factors import (
     RobustNoise,
     linearize,
     newton_matrix,
+    residuals,
     scores,
     solve_small,
 )
@@ -114,7 +115,7 @@ def test_against_an_unrolled_solve() -> None:
     how = RobustNoise(values["noise"])
     T = pp.mat2SE3(implicit.detach(), check=False)
     for _ in range(40):  # a contraction of about 0.4
-        H, g = linearize(pixels, T, how).total()
+        H, g = linearize(pixels, residuals(pixels, T), how).total()
         T = left_update(torch.linalg.solve(H, g), T)
     assert (T.matrix() - implicit).abs().max() < 1e-11
     (unrolled,) = torch.autograd.grad((C * T.matrix()).sum(), flow)
@@ -133,7 +134,8 @@ def test_matrix_of_the_newton_step_against_differences(kernel: str) -> None:
         step = torch.zeros(2, 6, dtype=F64)
         step[:, k] = 1e-6
         ahead, behind = (
-            scores(pixels, left_update(s * step, T), how)[0].sum(dim=2) for s in (1, -1)
+            scores(pixels, residuals(pixels, left_update(s * step, T)), how)[0].sum(dim=2)
+            for s in (1, -1)
         )
         assert ((behind - ahead) / 2e-6 - A[:, :, k]).abs().max() < 1e-6 * A.abs().max()
 

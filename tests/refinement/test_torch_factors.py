@@ -18,12 +18,13 @@ from hybridvo.refinement.pixels import PixelGrid
 from hybridvo.refinement.torch_factors import (
     KERNELS,
     RobustNoise,
-    at_likely_depth,
     jacobian,
     linearize,
     residuals,
     scores,
+    sensitivity,
     solve_small,
+    weigh,
 )
 from hybridvo.torch_geometry import left_update, pp, reproject, se3
 from hybridvo.types import Camera, Frame, FramePair, PairBatch
@@ -42,7 +43,7 @@ def test_one_pixel_by_hand() -> None:
     assert pixels.weight.sum() == 1
     terms, at = residuals(pixels, T), 5
     # a = 0.048, so the pixel lands at 5.8: residual 7 - 5.8; q = 100/2.5 (0.048 0.5 - 0.1)
-    found = [float(x) for x in (*terms.r[0, :, at], *terms.u[0, :, at])]
+    found = [float(x) for x in (*terms.r[0, :, at], *sensitivity(pixels, terms)[0, :, at])]
     assert found == pytest.approx([1.2, 1.0, 40 * (0.024 - 0.1), 0.0], abs=1e-12)
     rows = torch.stack(jacobian(pixels, terms), dim=1)[0]
     expected = 100 * np.array([0.4, 0, -0.048 * 0.4, 0, 1 + 0.048**2, 0])
@@ -52,11 +53,11 @@ def test_one_pixel_by_hand() -> None:
     q = -40 * 0.076
     e = 0.01 * q * 1.2 / (0.25 + 0.01 * q * q)
     how = RobustNoise(torch.tensor([[0.5, 0.1]], dtype=F64), 1e9)
-    moved = at_likely_depth(pixels, terms, how.noise)
-    assert moved.a[0, at] == pytest.approx(0.048 + q * e / 100, rel=1e-12)
+    moved = weigh(pixels, terms, how).at
+    assert moved.ab[0, 0, at] == pytest.approx(0.048 + q * e / 100, rel=1e-12)
     assert moved.i[0, at] == pytest.approx(0.4 * (1 - 0.8 * e), rel=1e-12)  # 1 - tz i = 0.8
-    q = float(100 * moved.i[0, at] * (moved.a[0, at] * 0.5 - 0.1))
-    found = linearize(pixels, T, how)
+    q = float(100 * moved.i[0, at] * (moved.ab[0, 0, at] * 0.5 - 0.1))
+    found = linearize(pixels, terms, how)
     variance = 0.25 + 0.01 * q * q
     assert found.at.distance2[0, at] == pytest.approx(1.44 / variance + 1 / 0.25, rel=1e-12)
     assert found.g[0, 0, 1] == pytest.approx(100 * float(moved.i[0, at]) / 0.25, rel=1e-12)
@@ -106,7 +107,7 @@ def test_derivatives_against_autograd() -> None:
         scale = torch.ones_like(pixels.weight).requires_grad_()
         r = residuals(replace(pixels, points=pixels.points * scale[:, None]), pose).r[:, k]
         (slope,) = torch.autograd.grad(-r.sum(), scale)  # at 1: the derivative in log Z
-        assert (slope - terms.u[:, k]).abs().max() < 1e-10
+        assert (slope - sensitivity(pixels, terms)[:, k]).abs().max() < 1e-10
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
@@ -120,10 +121,10 @@ def test_normal_equations_against_dense_algebra(kernel: str) -> None:
     pixels = gather_pixels(batch, weights, with_depth=True)
     present = pixels.has_depth_curr
     assert present is not None and 0 < present.sum() < present.numel()
-    found = linearize(pixels, se3(T), how, run=10)
     terms = residuals(pixels, se3(T))
-    moved = at_likely_depth(pixels, terms, how.noise)
-    rows = torch.stack(jacobian(pixels, moved), 1)
+    found = linearize(pixels, terms, how, run=10)
+    moved = weigh(pixels, terms, how)
+    rows = torch.stack(jacobian(pixels, moved.at), 1)
     for b in range(2):
         H, g, cost = np.zeros((6, 6)), np.zeros(6), 0.0
         for k in range(30):
@@ -143,7 +144,9 @@ def test_normal_equations_against_dense_algebra(kernel: str) -> None:
         assert float(found.cost[b]) == pytest.approx(cost, rel=1e-10)
     assert found.H.shape == (2, 3, 6, 6)
     g = found.total()[1]
-    assert (scores(pixels, se3(T), how)[0].sum(dim=2) - g).abs().max() < 1e-9 * g.abs().max()
+    assert (
+        scores(pixels, residuals(pixels, se3(T)), how)[0].sum(dim=2) - g
+    ).abs().max() < 1e-9 * g.abs().max()
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
@@ -204,7 +207,8 @@ def test_step_equals_the_numba_kernels(case: str, dtype: torch.dtype) -> None:
     expected = numba_step(pair, weights, start, (0.35, 0.04))
     pixels = gather_pixels(pair, weights, tile=24)
     how = RobustNoise(torch.tensor([[0.35, 0.04]], dtype=dtype))
-    found = linearize(pixels, se3(torch.as_tensor(start)[None]), how, run=24 * 24)
+    terms = residuals(pixels, se3(torch.as_tensor(start)[None]))
+    found = linearize(pixels, terms, how, run=24 * 24)
     step, good = solve_small(*found.total())
     assert good.all() and found.H.shape[1] == 3 * 4
     # in units of the step along each of translation and rotation
@@ -235,7 +239,7 @@ def test_unusable_values_leave_no_trace_in_gradients() -> None:
         inputs = [v.clone().requires_grad_() for v in (batch.flow, batch.depth_prev, batch.K_prev)]
         pixels = gather_pixels(PairBatch(*inputs, batch.K_curr))
         how = RobustNoise(torch.tensor([[0.3, 0.03]] * 2, dtype=F64))
-        g = scores(pixels, se3(T), how)[0]
+        g = scores(pixels, residuals(pixels, se3(T)), how)[0]
         gradients = torch.autograd.grad(g.sum(), inputs)
         assert all(torch.isfinite(gradient).all() for gradient in gradients)
         assert gradients[1][0, 0, 0] == 0

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hybridvo.data.image_io import read_flo
+from hybridvo.data.image_io import read_flow
 from hybridvo.synthetic.scenes import make_scene
 from tests.scripts import load_script
 
@@ -27,7 +27,7 @@ def test_writes_every_scene_and_seed(tool, tmp_path, capsys):
     assert [Path(row["sequence"]).name for row in rows] == names
     assert rows[0]["moving_share_min"] > 0.1
     assert rows[3]["moving_share_max"] == 0
-    flow = read_flo(tmp_path / "training/flow/light_0005/frame_0002.flo")
+    flow = read_flow(tmp_path / "training/flow/light_0005/frame_0002.flo")[0]
     scene = make_scene("light", 5, height=32, width=64, frames=3)
     np.testing.assert_array_equal(flow, scene.flow(1)[0])
 

@@ -23,7 +23,7 @@ def test_preset_files_equal_the_defaults():
 @pytest.mark.parametrize("name", ["paper", "diverse"])
 def test_preset_files_name_every_option(name):
     mapping = read_yaml(CONFIGS / f"data_{name}.yaml")
-    kind = PRESETS[mapping.pop("preset")]
+    kind = PRESETS[mapping["preset"]]
     assert set(mapping) == {field.name for field in dataclasses.fields(kind)}
 
 

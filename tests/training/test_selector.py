@@ -13,9 +13,9 @@ from hybridvo.errors import FormatError, InputError
 from hybridvo.network.models import load_weights
 from hybridvo.network.selector_net import SelectorNetworkOptions
 from hybridvo.network.weights import pretrained
+from hybridvo.synthetic import dataset as stored
 from hybridvo.synthetic.draws import sample_generator
 from hybridvo.training import selector_data
-from hybridvo.training import shards as stored
 from hybridvo.training.options import SelectorOptions, load_selector_options
 from hybridvo.training.selector_batches import SelectorBatch, ego_flow_error, read_batches
 from hybridvo.training.selector_task import SelectorTask, evaluate_selector
