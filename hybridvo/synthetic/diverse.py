@@ -180,7 +180,7 @@ class _Scene(Layers):
             # A single surface has no sky: it bends away instead.
             np.maximum(rho, np.float32(0.05 / size), out=rho)
         relief = o.relief * rng.random() ** 2
-        rho *= np.exp(relief * smooth_field(rng, o.height, o.width, int(rng.integers(3, 12))))
+        rho *= np.exp(relief * smooth_field(rng, (o.height, o.width), int(rng.integers(3, 12))))
         rho[rho < SKY_INVERSE_DEPTH] = 0.0
         return np.minimum(rho, np.float32(5.0))
 
@@ -264,7 +264,7 @@ class _Scene(Layers):
         if rng.random() < o.nonrigid_probability:
             amplitude = np.float32(log_uniform(rng, o.bend) * depth)
             cells = int(rng.integers(3, 8))
-            self.bends[number] = amplitude * smooth_field(rng, o.height, o.width, cells, 3)
+            self.bends[number] = amplitude * smooth_field(rng, (o.height, o.width), cells, 3)
         if rng.random() < o.articulated_probability:
             points = shape.parts[0][0]
             ray = centre / depth

@@ -137,14 +137,14 @@ def sway(rng: np.random.Generator, frames: int, rate: float) -> np.ndarray:
 
 
 def smooth_field(
-    rng: np.random.Generator, height: int, width: int, cells: int, channels: int = 1
+    rng: np.random.Generator, size: tuple[int, ...], cells: int, channels: int = 1
 ) -> np.ndarray:
     """(H, W[, C]) float32 Gaussian field of about unit spread with ``cells`` knots per height."""
-    rows = max(cells, 2)
-    columns = max(round(cells * width / max(height, 1)), 2)
+    height, width = size
+    rows, columns = max(cells, 2), max(round(cells * width / max(height, 1)), 2)
     coarse = rng.standard_normal((rows, columns, channels), dtype=np.float32)
     field = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
-    return field.reshape(height, width, channels) if channels > 1 else field.reshape(height, width)
+    return field.reshape(height, width, channels) if channels > 1 else field.reshape(size)
 
 
 KINDS = ("superellipse", "polygon", "star", "bar")

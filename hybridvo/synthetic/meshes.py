@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from hybridvo.geometry import backproject, njit
+from hybridvo.synthetic.sensors import depth_jump
 from hybridvo.types import Camera, Frame
 
 TEAR = 0.06
@@ -125,8 +126,7 @@ def surface_of(frame: Frame) -> Surface:
     """Everything that a frame shows, as a mesh that is torn nowhere but measured only on planes."""
     assert frame.depth is not None and frame.rgb is not None
     depth, known = filled_depth(frame.depth)
-    jump = cv2.dilate(depth, np.ones((3, 3))) - cv2.erode(depth, np.ones((3, 3)))
-    measured = known & (jump < 2 * TEAR * depth)
+    measured = known & (depth_jump(depth) < 2 * TEAR * depth)
     points = backproject(depth, frame.camera).astype(np.float32)
     inside = np.ones(depth.shape, np.bool_)
     return Surface(points, frame.rgb.astype(np.float32), measured.astype(np.float32), inside)

@@ -7,6 +7,7 @@ figures.
 from __future__ import annotations
 
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -135,15 +136,12 @@ def make_pair(
         "outlier": outlier,
         "flow_true": flow_true,
     }
-    return _pair(*depths, camera, flow), truth
+    return _pair(depths, camera, flow), truth
 
 
-def _pair(
-    depth_prev: np.ndarray, depth_curr: np.ndarray | None, camera: Camera, flow: np.ndarray
-) -> FramePair:
+def _pair(depths: Sequence[np.ndarray | None], camera: Camera, flow: np.ndarray) -> FramePair:
     """A pair of frames without images, a tenth of a second apart."""
-    prev = Frame(None, depth_prev, camera, timestamp=0.0, index=0)
-    curr = Frame(None, depth_curr, camera, timestamp=0.1, index=1)
+    prev, curr = (Frame(None, d, camera, 0.1 * i, i) for i, d in enumerate(depths))
     return FramePair(prev, curr, flow, flow_source="synthetic", depth_source="synthetic")
 
 
@@ -173,7 +171,7 @@ def make_model_pair(
     flow_true = ego_flow(depth, T, camera, camera)
     flow = flow_true + flow_noise_px * rng.standard_normal(flow_true.shape)
     measured = depth * np.exp(depth_noise * rng.standard_normal(depth.shape))
-    pair = _pair(measured.astype(np.float32), None, camera, flow.astype(np.float32))
+    pair = _pair([measured.astype(np.float32), None], camera, flow.astype(np.float32))
     return pair, {"T_curr_prev": T, "depth_true": depth, "flow_true": flow_true}
 
 

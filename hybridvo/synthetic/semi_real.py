@@ -30,6 +30,7 @@ from hybridvo.synthetic.meshes import (
     surface_of,
     transformed,
 )
+from hybridvo.synthetic.sensors import depth_jump
 from hybridvo.types import Camera, Frame, FramePair
 
 PIXELS = 76_800
@@ -263,7 +264,7 @@ def _cut(
     middle = float(np.median(z[mask & (measured > 0)]))
     mask &= np.abs(z - middle) < rng.uniform(0.15, 0.8) * middle
     if rng.random() < 0.5:  # ragged, as what a sensor sees of hair and leaves
-        mask &= smooth_field(rng, *mask.shape, 12) > -1.3
+        mask &= smooth_field(rng, mask.shape, 12) > -1.3
     # rays turned to where it goes; any scaling of a rigid thing is one
     centre = points[h // 2, min(w, mask.shape[1]) // 2]
     to = rng.uniform(0.0, 1.0, 2) * (camera.width - 1, camera.height - 1)
@@ -308,7 +309,7 @@ def _moved(
         other = motion @ about(_turned(swing[3:]), centre)
         out = np.where(side[..., None], transformed(points, other), out)
     if moves and rng.random() < 0.4:
-        wobble = smooth_field(rng, *points.shape[:2], 5, 3)
+        wobble = smooth_field(rng, points.shape[:2], 5, 3)
         out = out + wobble * np.float32(rng.uniform(0, 0.5) * centre[2] / camera.fx)
     return out
 
@@ -329,24 +330,23 @@ def _sensed(rng: np.random.Generator, canvas: Canvas, camera: Camera) -> Frame:
     image = image + noise * np.float32(log_uniform(rng, (0.7, 4.0)))
     rgb = np.clip(image, 0, 255).astype(np.uint8)
     depth = canvas.depth.copy()
-    kernel = np.ones((3, 3), np.uint8)
     lost = canvas.measured < 0.5
     if rng.random() < 0.6:  # silhouettes
-        jump = cv2.dilate(depth, kernel) - cv2.erode(depth, kernel)
-        edge = (jump > TEAR * depth) & (smooth_field(rng, *shape, 30) > rng.uniform(-1.5, 0.5))
-        lost |= cv2.dilate(edge.astype(np.uint8), kernel) > 0
+        edge = depth_jump(depth) > TEAR * depth
+        edge &= smooth_field(rng, shape, 30) > rng.uniform(-1.5, 0.5)
+        lost |= cv2.dilate(edge.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     if rng.random() < 0.5:  # holes, on movers as in the world
-        field = smooth_field(rng, *shape, int(rng.integers(4, 24)))
+        field = smooth_field(rng, shape, int(rng.integers(4, 24)))
         lost |= field > rng.uniform(0.8, 2.5)
     if rng.random() < 0.4:  # beyond its range
         middle, far = np.quantile(depth[::5, ::5], (0.5, 0.98))
         reach = rng.uniform(middle, max(far, middle + 1e-3))
-        lost |= depth > reach * (1 + 0.2 * smooth_field(rng, *shape, 16))
+        lost |= depth > reach * (1 + 0.2 * smooth_field(rng, shape, 16))
     if rng.random() < 0.3:  # the sensor's field of view ends before the image
         cut = rng.integers(0, (shape[0] // 8, shape[0] // 8, shape[1] // 8, shape[1] // 8))
         lost[: cut[0]] = lost[shape[0] - cut[1] :] = True
         lost[:, : cut[2]] = lost[:, shape[1] - cut[3] :] = True
-    error = smooth_field(rng, *shape, 24) + 0.5 * rng.standard_normal(shape, dtype=np.float32)
+    error = smooth_field(rng, shape, 24) + 0.5 * rng.standard_normal(shape, dtype=np.float32)
     depth *= 1 + np.float32(log_uniform(rng, (0.0005, 0.006))) * error
     depth[lost] = 0
     return Frame(rgb, depth, camera)
