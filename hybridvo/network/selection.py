@@ -79,8 +79,9 @@ def select(maps: PixelwisePrediction, method: str = "softmax") -> PoseSeed:
     least = s.flatten(1).amin(dim=1)[:, None, None]
     weights = torch.exp(-SHARPNESS * (s - least)).clamp(min=MIN_WEIGHT)
     if maps.image_size is not None and maps.image_size != tuple(weights.shape[1:]):
-        how = {"mode": "bilinear", "align_corners": False}
-        weights = F.interpolate(weights[:, None], maps.image_size, **how)[:, 0]
+        weights = F.interpolate(
+            weights[:, None], maps.image_size, mode="bilinear", align_corners=False
+        )[:, 0]
     return PoseSeed(T, weights)
 
 
