@@ -41,8 +41,7 @@ def estimate(
         curr: then the current frame; the flow is OpenCV's DIS.
         method: one of :data:`hybridvo.pipeline.METHODS` that can run here.
         prior: what is known of the motion: one more start, and a cue for the selection.
-        options: the option tree; ``search``, ``select``, ``refine``, ``photometric``, and
-            ``run.device`` and ``flow`` are read.
+        options: the option tree, of which ``track`` and ``run`` (but its device) are not read.
         models: networks of one's own; by default the pretrained ones.
         seed: of everything that is drawn at random.
 
@@ -65,7 +64,10 @@ def estimate(
     _check_kind("estimate.prior", prior, MotionPrior, type(None))
     seed = as_seed(seed, "estimate.seed")
     if curr is not None or isinstance(pair, Frame):
-        pair = _pair_of(pair, curr, options)
+        two: Any = pair, curr
+        _check_kind("estimate, first of two", pair, Frame)
+        _check_kind("estimate, second of two", curr, Frame)
+        pair = dis_flow(options.flow.dis_preset)(*two).pair(*two)
     _check_kind("estimate, a pair", pair, FramePair)
     models = models or default_models(options.run.device if networks_of(method) else "cpu")
     return widened(run_method(pair, method, Context(options, prior, seed, None, models)))
@@ -166,14 +168,6 @@ def warm_up(method: str = DEFAULT_METHOD, models: Models | None = None) -> float
         run_method(FramePair(frame, frame, flow, variance, flow[..., 0] < 1e3), method, context)
         run_method(FramePair(frame, frame, flow), method, context)
     return time.perf_counter() - started
-
-
-def _pair_of(prev: Any, curr: Any, options: Options) -> FramePair:
-    """A pair of two frames with DIS flow between them."""
-    for name, frame in (("first of two", prev), ("second of two", curr)):
-        _check_kind(f"estimate, {name}", frame, Frame)
-    flow = dis_flow(options.flow.dis_preset)(prev, curr)
-    return FramePair(prev, curr, flow.flow, flow.variance, flow.valid, flow.source, flow.is_true)
 
 
 def _check_kind(what: str, value: Any, *kinds: type) -> None:

@@ -59,21 +59,16 @@ FlowProvider = Callable[[Frame, Frame], FlowField]
 """Computes or reads the flow from the first frame to the second."""
 
 
-# -- DIS ------------------------------------------------------------------------------------------
-
-
 def dis_flow(preset: str = "medium") -> FlowProvider:
     """Provider of OpenCV's DIS flow on grey images (Kroeger et al., ECCV 2016).
 
-    It is computed in both directions, whose disagreement gives variance and validity. A provider
-    may serve several trackers and threads. Where an image has no texture (a covered lens, a dropped
-    frame, parallel stripes) there is no flow: DIS would return zero there, in both directions.
+    It is computed in both directions, whose disagreement gives variance and validity. Where an
+    image has no texture (a covered lens, a dropped frame, parallel stripes) there is no flow.
 
     ``preset`` is the effort: ``ultrafast``, ``fast`` or ``medium``.
     """
     if preset not in DIS_PRESETS:
         raise InputError(f"DIS preset: expected {', '.join(DIS_PRESETS)}, got {preset!r}.")
-
     return functools.partial(_dis, preset)
 
 
@@ -86,24 +81,23 @@ def _dis(preset: str, prev: Frame, curr: Frame) -> FlowField:
     second = cv2.cvtColor(curr.rgb, cv2.COLOR_RGB2GRAY)
     if not (_textured(first) and _textured(second)):
         return none
-    if not hasattr(_of_thread, preset):
-        setattr(_of_thread, preset, cv2.DISOpticalFlow.create(DIS_PRESETS[preset]))
-    dis = getattr(_of_thread, preset)
-    forward, backward = _calc_dis(dis, first, second), _calc_dis(dis, second, first)
+    forward, backward = _calc_dis(preset, first, second), _calc_dis(preset, second, first)
     if forward is None or backward is None:
         return none
     return FlowField(forward, *forward_backward_check(forward, backward), "dis")
 
 
-def _calc_dis(dis: Any, first: np.ndarray, second: np.ndarray) -> np.ndarray | None:
+def _calc_dis(preset: str, first: np.ndarray, second: np.ndarray) -> np.ndarray | None:
     """(H, W, 2) flow between grey images, or None where they are too small."""
     height, width = first.shape
     # below 32 rows DIS chooses its coarsest level by the width alone; where fewer rows than a patch
     # are left it would end the process
     if height < 32 and width > 2 * height:
         return None
+    if not hasattr(_of_thread, preset):
+        setattr(_of_thread, preset, cv2.DISOpticalFlow.create(DIS_PRESETS[preset]))
     try:
-        return np.asarray(dis.calc(first, second, None))
+        return np.asarray(getattr(_of_thread, preset).calc(first, second, None))
     except cv2.error:  # smaller than its patches
         return None
 
@@ -130,13 +124,11 @@ def forward_backward_check(
     (factor e)^2 of ``DIS_NOISE``, at most (5 px)^2; valid (H, W) is False where e exceeds 1.5 px
     and 5 % of the flow, or where the flow leaves the image or is not finite.
     """
-    height, width = forward.shape[:2]
     du, dv = cv2.split(np.nan_to_num(forward, nan=1e9, posinf=1e9, neginf=-1e9))
-    u, v = _targets(du, dv)
+    u, v, inside = _targets(du, dv)
     back = cv2.remap(backward, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     squared = (du + back[..., 0]) ** 2 + (dv + back[..., 1]) ** 2
-    limit = np.maximum(1.5**2, 0.05**2 * (du * du + dv * dv))
-    valid = (squared <= limit) & (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)
+    valid = (squared <= np.maximum(1.5**2, 0.05**2 * (du * du + dv * dv))) & inside
     base, factor = (np.float32(value) for value in DIS_NOISE)
     variance = base**2 + factor**2 * squared
     np.clip(variance, None, np.float32(5.0**2), out=variance)
@@ -144,29 +136,19 @@ def forward_backward_check(
     return variance, valid
 
 
-def _targets(du: np.ndarray, dv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Columns and rows, each (H, W) float32, to which a flow leads."""
+def _targets(du: np.ndarray, dv: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Columns and rows, each (H, W) float32, to which a flow leads; whether within the image."""
     height, width = du.shape
-    columns, rows = np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)
-    return du + columns, dv + rows[:, None]
-
-
-def _lands_inside(flow: np.ndarray) -> np.ndarray:
-    """(H, W) bool, True where the flow ends within the image; False for NaN."""
-    height, width = flow.shape[:2]
-    u, v = _targets(flow[..., 0], flow[..., 1])
-    return (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)
-
-
-# -- other providers ------------------------------------------------------------------------------
+    u = du + np.arange(width, dtype=np.float32)
+    v = dv + np.arange(height, dtype=np.float32)[:, None]
+    return u, v, (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)
 
 
 def file_flow(sequence: Any, *, strict: bool = True) -> FlowProvider:
-    """Provider of the flow files of an open sequence.
+    """Provider of the flow files of an open sequence, which lead from one frame to the next.
 
-    Flow files lead from one frame to the next: for any other two frames, and where the file of a
-    pair is missing, the flow is None. A damaged file raises what the reader raises if ``strict``,
-    else it gives None and a line in the log.
+    Where there is none the flow is None. A damaged file raises what the reader raises if
+    ``strict``, else it gives None and a line in the log.
     """
 
     def provide(prev: Frame, curr: Frame) -> FlowField:
@@ -186,11 +168,9 @@ def file_flow(sequence: Any, *, strict: bool = True) -> FlowProvider:
 
 
 class MeasuredFlow:
-    """A provider that keeps its fields until the next reset, and the time that they took.
+    """A provider that keeps its fields, by the indices of both frames, until the next reset.
 
-    Attributes:
-        fields: by the indices of both frames; the first is that of the frame before.
-        ms: spent since the last reset, milliseconds.
+    ``ms`` is the time spent since then, in milliseconds.
     """
 
     def __init__(self, provider: FlowProvider) -> None:
@@ -245,13 +225,8 @@ def check_field(result: Any, prev: Frame, source: str) -> FlowField:
     with np.errstate(over="ignore"):  # beyond float32 is inf: no flow
         flow = array.astype(np.float32)
     finite = np.asarray(np.isfinite(flow).all(axis=2))
-    if finite.all():
-        return FlowField(flow, source=source)
     flow[~finite] = np.nan
-    return FlowField(flow, None, finite, source)
-
-
-# -- a given flow against the images --------------------------------------------------------------
+    return FlowField(flow, None, None if finite.all() else finite, source)
 
 
 def contradiction(pair: FramePair) -> str | None:
@@ -267,29 +242,30 @@ def contradiction(pair: FramePair) -> str | None:
     height, width = flow.shape[:2]
     factor = max(1, min(height, width) // 100)  # at 100 pixels and more, details do not matter
     size = (width // factor, height // factor)
-
-    def shrunk(rgb: np.ndarray) -> np.ndarray:
-        gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
-        return cv2.blur(cv2.resize(gray, size, interpolation=cv2.INTER_AREA), (3, 3))
-
-    first, second = shrunk(rgb_prev), shrunk(rgb_curr)
-    own = _calc_dis(cv2.DISOpticalFlow.create(DIS_PRESETS["fast"]), first, second)
+    first, second = (
+        cv2.blur(cv2.resize(gray, size, interpolation=cv2.INTER_AREA), (3, 3))
+        for gray in (cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY) for rgb in (rgb_prev, rgb_curr))
+    )
+    own = _calc_dis("fast", first, second)
     if own is None:
         return None
-    small, seen = _shrunk_flow(flow, pair.flow_valid, factor, size)
+    # the flow on the coarser grid, in its pixels, smoothed: single wrong pixels do not matter
+    rows, columns = (slice(factor // 2, factor * n, factor) for n in (size[1], size[0]))
+    small = flow[rows, columns] / np.float32(factor)
+    seen = np.asarray(np.isfinite(small).all(axis=2))
+    if pair.flow_valid is not None:
+        seen &= pair.flow_valid[rows, columns]
+    small = np.where(seen[..., None], small, np.float32(0))
+    small = np.dstack([cv2.blur(cv2.medianBlur(x, 5), (5, 5)) for x in cv2.split(small)])
     du, dv = cv2.Sobel(first, cv2.CV_32F, 1, 0) / 8, cv2.Sobel(first, cv2.CV_32F, 0, 1) / 8
     seen &= cv2.magnitude(du, dv) > 2.0  # grey levels a pixel: where a shift can be seen
-    seen &= _lands_inside(small) & _lands_inside(own)
+    ways = [_targets(x[..., 0], x[..., 1]) for x in (small, own, np.zeros_like(own))]
+    seen &= ways[0][2] & ways[1][2]
     if np.count_nonzero(seen) < 200:
         return None
-
-    def difference(flow: np.ndarray) -> float:
-        """Median grey levels between the first image and the second one warped onto it."""
-        u, v = _targets(flow[..., 0], flow[..., 1])
-        warped = cv2.remap(second.astype(np.float32), u, v, cv2.INTER_LINEAR)
-        return float(np.median(np.abs(warped - first)[seen]))
-
-    given, best, still = map(difference, (small, own, np.zeros_like(own)))
+    # median grey levels between the first image and the second one warped onto it
+    warped = (cv2.remap(second.astype(np.float32), u, v, cv2.INTER_LINEAR) for u, v, _ in ways)
+    given, best, still = (float(np.median(np.abs(image - first)[seen])) for image in warped)
     fits, is_decidable = FLOW_CONTRADICTION
     if given < fits * still or still < is_decidable * best + 1:
         return None
@@ -299,19 +275,3 @@ def contradiction(pair: FramePair) -> str | None:
         f"pixels, (u, v), from the previous frame to the current one: check its sign, its "
         f"direction, its unit and which pair it belongs to."
     )
-
-
-def _shrunk_flow(
-    flow: np.ndarray, valid: np.ndarray | None, factor: int, size: tuple[int, int]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Smoothed flow on a coarser grid of (width, height), in its pixels, and where it is known."""
-    width, height = size
-    rows = slice(factor // 2, factor * height, factor)
-    middle = rows, slice(factor // 2, factor * width, factor)
-    small = flow[middle] / np.float32(factor)
-    seen = np.asarray(np.isfinite(small).all(axis=2))
-    if valid is not None:
-        seen &= valid[middle]
-    small = np.where(seen[..., None], small, np.float32(0))
-    # single wrong pixels do not matter
-    return np.dstack([cv2.blur(cv2.medianBlur(x, 5), (5, 5)) for x in cv2.split(small)]), seen

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -20,11 +23,8 @@ def pixel_grid(height: int, width: int) -> np.ndarray:
 
 def backproject(depth: np.ndarray, camera: Camera) -> np.ndarray:
     """(H, W, 3) points in metres in the camera frame from an (H, W) depth map (z, metres)."""
-    uv = pixel_grid(*camera.shape)
-    if depth.shape != camera.shape:
-        raise InputError(f"backproject: expected depth of {camera.shape}, got {depth.shape}.")
-    x = (uv[..., 0] - camera.cx) / camera.fx * depth
-    y = (uv[..., 1] - camera.cy) / camera.fy * depth
+    u, v = np.moveaxis(pixel_grid(*camera.shape), -1, 0)
+    x, y = (u - camera.cx) / camera.fx * depth, (v - camera.cy) / camera.fy * depth
     return np.stack([x, y, depth.astype(np.float64)], axis=-1)
 
 
@@ -69,6 +69,12 @@ def make_transform(R: np.ndarray, t: np.ndarray) -> np.ndarray:
     T[:3, :3] = R
     T[:3, 3] = t
     return T
+
+
+def pose_matrix(pose: np.ndarray) -> np.ndarray:
+    """(4, 4) transform from a (3, 4) one, its rotation made orthonormal (polar decomposition)."""
+    U, _, Vt = np.linalg.svd(pose[:, :3])
+    return make_transform(U @ Vt, pose[:, 3])
 
 
 def invert(T: np.ndarray) -> np.ndarray:
@@ -118,13 +124,7 @@ def se3_exp(delta: np.ndarray) -> np.ndarray:
 def se3_log(T: np.ndarray) -> np.ndarray:
     """6-vector (translation, rotation) with ``se3_exp(se3_log(T)) == T``."""
     T = np.asarray(T, dtype=np.float64)
-    R = T[:3, :3]
-    phi = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    sine, cosine = float(np.sqrt(phi @ phi)), 0.5 * (R[0, 0] + R[1, 1] + R[2, 2] - 1)
-    if cosine > 0:
-        phi *= np.arctan2(sine, cosine) / sine if sine > 1e-12 else 1.0
-    else:  # near a half turn the sines are lost
-        phi = Rotation.from_matrix(R).as_rotvec()
+    phi = Rotation.from_matrix(T[:3, :3]).as_rotvec()
     theta2 = float(phi @ phi)
     W = skew(phi)
     if theta2 < 1e-8:
@@ -165,22 +165,11 @@ def ned_to_camera(T_world_cam_ned: np.ndarray) -> np.ndarray:
     return C @ np.asarray(T_world_cam_ned, dtype=np.float64) @ C.T
 
 
-def xyzw_to_wxyz(quaternion: np.ndarray) -> np.ndarray:
-    """(..., 4) pypose and TUM order -> kornia and evo order."""
-    return np.roll(np.asarray(quaternion), 1, axis=-1)
-
-
-def wxyz_to_xyzw(quaternion: np.ndarray) -> np.ndarray:
-    """(..., 4) kornia and evo order -> pypose and TUM order."""
-    return np.roll(np.asarray(quaternion), -1, axis=-1)
-
-
 def to_gtsam_covariance(covariance: np.ndarray) -> np.ndarray:
     """Covariances for a GTSAM ``BetweenFactorPose3`` whose measurement is ``T_prev_curr``.
 
-    Ours is of ``Exp(d) T_curr_prev``, d = (translation, rotation). Its inverse is
-    ``T_prev_curr Exp(-d)``: the same covariance, now of a right perturbation, which is GTSAM's
-    side. Only the order changes, to (rotation, translation). Takes (6, 6) or (N, 6, 6).
+    The inverse of ``Exp(d) T_curr_prev`` is ``T_prev_curr Exp(-d)``: the same covariance, now on
+    GTSAM's side. The order changes to (rotation, translation). Takes (6, 6) or (N, 6, 6).
     """
     covariance = _covariances(covariance, "to_gtsam_covariance")
     order = [3, 4, 5, 0, 1, 2]
@@ -195,12 +184,9 @@ def to_ros_covariance(covariance: np.ndarray, T_prev_curr: np.ndarray) -> np.nda
     Takes (6, 6) and (4, 4), or (N, 6, 6) and (N, 4, 4).
     """
     covariance = _covariances(covariance, "to_ros_covariance")
-    T = np.asarray(T_prev_curr)
-    if T.shape != (*covariance.shape[:-2], 4, 4):
-        raise InputError(
-            f"to_ros_covariance: expected T_prev_curr of shape "
-            f"{(*covariance.shape[:-2], 4, 4)}, got {T.shape}."
-        )
+    T, expected = np.asarray(T_prev_curr), (*covariance.shape[:-2], 4, 4)
+    if T.shape != expected:
+        raise InputError(f"to_ros_covariance: expected T_prev_curr {expected}, got {T.shape}.")
     A = np.zeros_like(covariance, dtype=np.float64)
     A[..., :3, :3] = A[..., 3:, 3:] = T[..., :3, :3]
     return A @ covariance @ np.swapaxes(A, -1, -2)
@@ -213,7 +199,18 @@ def _covariances(value: np.ndarray, where: str) -> np.ndarray:
     return array
 
 
-def pose_matrix(pose: np.ndarray) -> np.ndarray:
-    """(4, 4) transform from a (3, 4) one, its rotation made orthonormal (polar decomposition)."""
-    U, _, Vt = np.linalg.svd(pose[:, :3])
-    return make_transform(U @ Vt, pose[:, 3])
+def njit(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """``numba.njit`` whose cache on disk may fail: each process then compiles for itself.
+
+    numba looks at the age of a function's own file only: after a change in a kernel that others
+    call, remove ``__pycache__``.
+    """
+    import numba
+
+    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
+        try:
+            return numba.njit(**options)(function)
+        except RuntimeError:  # neither the package nor the user's cache folder can be written
+            return numba.njit(**options | {"cache": False})(function)
+
+    return decorate

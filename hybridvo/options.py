@@ -1,6 +1,7 @@
 """Every option of the program, in one tree: ``Options().refine.cutoff`` and the like.
 
-The classes are frozen and check their values; ``configs/odometry.yaml`` shows the same tree.
+The classes are frozen and check their values; ``configs/odometry.yaml`` shows and explains the same
+tree.
 """
 
 from __future__ import annotations
@@ -49,12 +50,7 @@ def option_group(cls: type[T]) -> type[T]:
 
 @option_group
 class FlowOptions:
-    """Where the optical flow comes from.
-
-    Args:
-        source: ``file``, ``dis``, or ``auto``: files where the sequence has them, else DIS.
-        dis_preset: effort of OpenCV's DIS.
-    """
+    """Where the optical flow comes from: ``auto`` is files where there are some, else DIS."""
 
     source: Literal["auto", "file", "dis"] = "auto"
     dis_preset: Literal["ultrafast", "fast", "medium"] = "medium"
@@ -62,130 +58,77 @@ class FlowOptions:
 
 @option_group
 class SearchOptions:
-    """The search for every strong motion of a pair.
-
-    Args:
-        grid_pixels: pixels of the grid on which starts are made and scored.
-        max_hypotheses: largest number of motions.
-        min_inlier_ratio: smallest share of the usable pixels that a further motion must hold.
-        unambiguous_ratio: share of the usable pixels above which the first motion stands alone.
-    """
+    """The search for every strong motion of a pair; ratios are of the usable pixels."""
 
     grid_pixels: Count = 1800
     max_hypotheses: Annotated[int, Field(ge=1, le=16)] = 8
-    min_inlier_ratio: Share = 0.08
-    unambiguous_ratio: Share = 0.85
+    min_inlier_ratio: Share = 0.08  # of a further motion
+    unambiguous_ratio: Share = 0.85  # above which the first motion stands alone
 
 
 @option_group
 class SelectOptions:
-    """Which of the motions is the camera's.
+    """Which of the motions is the camera's."""
 
-    Args:
-        consult_below: confidence of the selector (0 to 1) below which PWVO is asked as well; 1: in
-            every ambiguous pair.
-        refits: motions that are fitted again inside their masks, in each round.
-        min_confidence: probability of being right (0 to 1) below which a motion is degraded.
-    """
-
-    consult_below: Share = 0.8
-    refits: Annotated[int, Field(ge=0, le=16)] = 2
-    min_confidence: Share = MIN_CONFIDENCE
+    consult_below: Share = 0.8  # confidence of the selector below which PWVO is asked; 1: always
+    refits: Annotated[int, Field(ge=0, le=16)] = 2  # motions fitted again, in each round
+    min_confidence: Share = MIN_CONFIDENCE  # probability below which a motion is degraded
 
 
 @option_group
 class RefineOptions:
-    """The refinement on flow and depth.
+    """The refinement on flow and depth."""
 
-    Args:
-        cutoff: c of the Geman-McClure kernel, in standard deviations.
-        coarse_pixels: pixels of the grid on which motions are fitted before the full one.
-        current_depth: the current frame's depth as a third residual: ``on``, ``off``, or ``auto``,
-            where it adds more than half of what the flow knows in some direction.
-        min_pixels: fewer usable pixels are a failure.
-        tiles: about how many (of 8 to 64 px) the covariance cuts the image into: errors may be
-            correlated over two of them.
-    """
-
-    cutoff: Positive = 3.0
-    coarse_pixels: Count = 7500
+    cutoff: Positive = 3.0  # c of the Geman-McClure kernel, in standard deviations
+    coarse_pixels: Count = 7500  # of the grid on which motions are fitted before the full one
+    # the current frame's depth as a third residual; auto: where it adds more than half of what the
+    # flow knows in some direction
     current_depth: Literal["auto", "on", "off"] = "auto"
-    min_pixels: Count = 24
-    tiles: Count = 110
+    min_pixels: Count = 24  # fewer usable ones are a failure
+    tiles: Count = 110  # of 8 to 64 px, of the covariance: errors may be correlated over two
 
 
 @option_group
 class PhotometricOptions:
-    """The refinement on the two images, which follows that on the flow.
+    """The refinement on the two images, which follows that on the flow."""
 
-    Args:
-        mode: ``on``, ``off``, or ``auto``: with the method ``hybrid``.
-        blur_px: standard deviations of the Gaussian blur, px, coarse to fine.
-        iterations: most Gauss-Newton steps under each of them.
-        pixels: about how many pixels are used: the strongest gradients of evenly spread cells.
-        prior_inflation: factor on the covariance of the flow's motion: the errors of estimated flow
-            are alike far beyond the tiles.
-        image_inflation: the same for the images and the depth maps.
-        min_correlation: of the two images over the pixels used; below it they do not match.
-    """
-
-    mode: Literal["auto", "on", "off"] = "auto"
-    blur_px: Annotated[tuple[Blur, ...], Field(min_length=1)] = (2.0, 1.0)
-    iterations: Count = 5
-    pixels: Count = 16000
+    mode: Literal["auto", "on", "off"] = "auto"  # auto: with the method hybrid
+    blur_px: Annotated[tuple[Blur, ...], Field(min_length=1)] = (2.0, 1.0)  # coarse to fine
+    iterations: Count = 5  # most Gauss-Newton steps under each of them
+    pixels: Count = 16_000  # about how many: the strongest gradients of evenly spread cells
+    # factors on the covariances of the flow's motion, and of the images and depth maps: errors are
+    # alike far beyond the tiles
     prior_inflation: Positive = 8.0
     image_inflation: Positive = 4.0
-    min_correlation: Annotated[float, Field(ge=-1, le=1)] = 0.5
+    min_correlation: Annotated[float, Field(ge=-1, le=1)] = (
+        0.5  # of the two images; below it they do not match
+    )
 
 
 @option_group
 class TrackOptions:
-    """The tracker: motion model, and the window of key frames.
+    """The tracker: motion model, and the window of key frames."""
 
-    Args:
-        window: most key frames that a frame is registered to, 1 for none; None: 3 where the images
-            refine the motion, else 1.
-        keyframe_overlap: share of a key frame's static pixels that are still seen, below which the
-            frame becomes a key frame.
-        keyframe_motion: median shift of these pixels, as a share of the image's width, above which
-            the frame becomes a key frame.
-        min_overlap: share below which no motion is sought between two key frames.
-        inflation: factor on every covariance: errors are alike from frame to frame.
-        motion_prior: let the motion predicted by constant velocity take part.
-        on_failure: pose after a failed motion: ``hold``, or ``constant_velocity``.
-    """
-
-    window: Count | None = None
-    keyframe_overlap: Annotated[float, Field(gt=0, lt=1)] = 0.85
-    keyframe_motion: Positive = 0.08
-    min_overlap: Annotated[float, Field(gt=0, lt=1)] = 0.5
-    inflation: Positive = 4.0
-    motion_prior: bool = True
+    window: Count | None = None  # most key frames; None: 3 where the images refine, else 1
+    keyframe_overlap: Annotated[float, Field(gt=0, lt=1)] = 0.85  # still seen of a key frame
+    keyframe_motion: Positive = 0.08  # median shift, in widths, that makes a key frame
+    min_overlap: Annotated[float, Field(gt=0, lt=1)] = 0.5  # below which no motion is sought
+    inflation: Positive = 4.0  # factor on every covariance: errors are alike from frame to frame
+    motion_prior: bool = True  # the motion predicted by constant velocity takes part
     on_failure: Literal["hold", "constant_velocity"] = "hold"
 
 
 @option_group
 class RunOptions:
-    """A run over a sequence.
-
-    Args:
-        method: one of :data:`hybridvo.pipeline.METHODS`.
-        start: first frame. stop: the one after the last, None: all. stride: frames from one image
-            of a pair to the other.
-        device: where the networks run: ``auto`` (cuda where there is one), ``cpu`` or ``cuda``.
-        max_failed: share of the motions that may fail before the exit code is 3.
-        strict: a broken frame ends the run.
-        alignment: of the absolute trajectory error.
-        seed: of everything drawn at random.
-    """
+    """A run over a sequence."""
 
     method: str = "hybrid"
     start: Natural = 0
-    stop: Count | None = None
+    stop: Count | None = None  # the frame after the last; None: all
     stride: Count = 1
-    device: Literal["auto", "cpu", "cuda"] = "auto"
-    max_failed: Share = 0.2
-    strict: bool = False
+    device: Literal["auto", "cpu", "cuda"] = "auto"  # of the networks
+    max_failed: Share = 0.2  # of the motions, before the exit code is 3
+    strict: bool = False  # a broken frame ends the run
     alignment: Literal["se3", "sim3", "origin", "none"] = "se3"
     seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
 

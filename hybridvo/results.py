@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import enum
 from dataclasses import dataclass, field, replace
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -100,10 +101,6 @@ class MotionPrior:
             )
         object.__setattr__(self, "covariance", C.astype(np.float64))
 
-    def __repr__(self) -> str:
-        sigma = np.sqrt(np.diag(self.covariance))
-        return f"MotionPrior({_motion(self.T_curr_prev)}, sigma {_sizes(sigma[:3], sigma[3:])})"
-
 
 @dataclass(frozen=True, eq=False)
 class MotionPrediction:
@@ -123,9 +120,8 @@ class Hypothesis:
         source: what led here (``start``, ``window``, ``minimal``, ``runner-up``, ``refit``).
         inlier_ratio: share of the valid pixels that follow this motion.
         flow_noise_px: standard deviation of the flow about it, px. depth_noise: of log depth.
-        inliers: (h, w) float32 in [0, 1], robust weight of each pixel under this motion, on the
-            grid of ``stride``.
-        stride: px of the full image per step of that grid.
+        inliers: (h, w) float32 in [0, 1], robust weight of each pixel under this motion, on a grid
+            with a step of ``stride`` px.
         score: by which the camera's motion was chosen; larger is better.
     """
 
@@ -158,8 +154,7 @@ class RelativePose:
         iterations: Gauss-Newton steps spent (or RANSAC iterations).
         cost: final robust cost per valid pixel, dimensionless.
         residual_scale_px: estimated standard deviation of the flow noise, px, where variances were
-            handed in at a pixel of the typical one.
-        depth_noise: of the log depth, likewise.
+            handed in at a pixel of the typical one. depth_noise: of the log depth, likewise.
         weights: (H, W) float32 robust weight of each pixel.
         translation_direction_valid: whether the translation is longer than three of its own
             standard deviations; its direction means nothing otherwise.
@@ -169,8 +164,7 @@ class RelativePose:
         method: name of the estimator. ms: time spent, milliseconds.
         terms: what carried the motion: ``flow``, ``depth`` (of the current frame), ``images``,
             ``window`` (key frames).
-        photometric: :class:`hybridvo.refinement.photometric.PhotometricReport` where the images
-            took part or were refused, or None.
+        photometric: what came of the images, where they were asked.
     """
 
     T_curr_prev: np.ndarray = field(default_factory=lambda: np.eye(4))
@@ -223,10 +217,11 @@ class RelativePose:
 
     def __repr__(self) -> str:
         sigma = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+        metres, radians = np.linalg.norm(sigma[:3]), np.linalg.norm(sigma[3:])
         return (
             f"RelativePose({self.method or 'motion'}: {self.status}, {_motion(self.T_curr_prev)}, "
-            f"sigma {_sizes(sigma[:3], sigma[3:])}, inliers {100 * self.inlier_ratio:.0f} %, "
-            f"probability {self.probability:.2f})"
+            f"sigma {metres:.3g} m {np.rad2deg(radians):.3g} deg, inliers "
+            f"{100 * self.inlier_ratio:.0f} %, probability {self.probability:.2f})"
         )
 
 
@@ -234,7 +229,8 @@ class RelativePose:
 class Step:
     """One tracked frame: camera to world (4, 4), and its motion from the frame before.
 
-    The world is the first camera unless set; the first motion is the identity with status ok.
+    The world is the first camera unless set; the first motion is the identity with status ok. What
+    users ask a motion most can be asked of its step.
     """
 
     index: int
@@ -242,40 +238,13 @@ class Step:
     T_world_cam: np.ndarray
     motion: RelativePose
 
-    @property
-    def ok(self) -> bool:
-        """Whether the motion is neither degraded nor failed."""
-        return self.motion.ok
-
-    @property
-    def usable(self) -> bool:
-        """Whether the motion did not fail."""
-        return self.motion.usable
-
-    @property
-    def probability(self) -> float:
-        """That the motion is the camera's, 0 to 1."""
-        return self.motion.probability
-
-    @property
-    def status(self) -> Status:
-        """Status of the motion."""
-        return self.motion.status
-
-    @property
-    def T_curr_prev(self) -> np.ndarray:
-        """(4, 4) points of the previous camera into the current one."""
-        return self.motion.T_curr_prev
-
-    @property
-    def T_prev_curr(self) -> np.ndarray:
-        """(4, 4) pose of the current camera in the previous one."""
-        return self.motion.T_prev_curr
-
-    @property
-    def covariance(self) -> np.ndarray:
-        """(6, 6) covariance of the motion."""
-        return self.motion.covariance
+    ok = property(attrgetter("motion.ok"))
+    usable = property(attrgetter("motion.usable"))
+    probability = property(attrgetter("motion.probability"))
+    status = property(attrgetter("motion.status"))
+    covariance = property(attrgetter("motion.covariance"))
+    T_curr_prev = property(attrgetter("motion.T_curr_prev"))
+    T_prev_curr = property(attrgetter("motion.T_prev_curr"))
 
     def __repr__(self) -> str:
         x, y, z = self.T_world_cam[:3, 3]
@@ -302,10 +271,6 @@ class PixelwisePrediction:
     log_scale_rotation: torch.Tensor | None = None
     log_scale_translation: torch.Tensor | None = None
     image_size: tuple[int, int] | None = None
-
-
-def _sizes(metres: np.ndarray, radians: np.ndarray) -> str:
-    return f"{np.linalg.norm(metres):.3g} m {np.rad2deg(np.linalg.norm(radians)):.3g} deg"
 
 
 def _motion(T: np.ndarray) -> str:

@@ -10,18 +10,14 @@ import logging
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hybridvo.errors import FormatError, InputError
 from hybridvo.files import Row, atomic_write, read_rows, read_text
-from hybridvo.geometry import invert, ned_to_camera, xyzw_to_wxyz
+from hybridvo.geometry import invert, ned_to_camera
 from hybridvo.types import as_rigid, to_numpy
-
-Format = Literal["auto", "tum", "kitti", "tartanair"]
-Axes = Literal["auto", "camera", "ned"]
 
 COLUMNS = {
     "tum": "timestamp tx ty tz qx qy qz qw",
@@ -79,13 +75,7 @@ class Trajectory:
                 f"{stamps.shape}."
             )
         stamps = stamps.astype(np.float64)
-        good = np.isfinite(stamps) & (np.diff(stamps, prepend=-np.inf) > 0)
-        if not good.all():
-            k = int(np.argmin(good))
-            raise InputError(
-                f"Trajectory.timestamps[{k}]: expected a finite number above the one before, got "
-                f"{stamps[max(k - 1, 0) : k + 1].tolist()}. Sort the poses, drop duplicates."
-            )
+        check_increasing(stamps, "Trajectory")
         T = as_rigid(self.T_world_cam, "Trajectory.T_world_cam", many=True)
         if len(T) == 0 or len(stamps) != len(T):
             raise InputError(
@@ -120,43 +110,44 @@ class Trajectory:
         from evo.core.trajectory import PosePath3D, PoseTrajectory3D
         from evo.tools import file_interface
 
-        if Path(path).suffix == ".kitti":
-            with atomic_write(path) as file:
+        with atomic_write(path) as file:
+            if Path(path).suffix == ".kitti":
                 poses = PosePath3D(poses_se3=list(self.T_world_cam))
                 file_interface.write_kitti_poses_file(file, poses)
-            return
-        xyzw = Rotation.from_matrix(self.T_world_cam[:, :3, :3]).as_quat(canonical=True)
-        with atomic_write(path) as file:
-            stamped = PoseTrajectory3D(self.positions, xyzw_to_wxyz(xyzw), self.timestamps)
+                return
+            R = Rotation.from_matrix(self.T_world_cam[:, :3, :3])
+            wxyz = R.as_quat(canonical=True, scalar_first=True)
+            stamped = PoseTrajectory3D(self.positions, wxyz, self.timestamps)
             file_interface.write_tum_trajectory_file(file, stamped)
 
 
 def read_trajectory(
-    path: str | os.PathLike[str], format: Format = "auto", *, axes: Axes = "auto"
+    path: str | os.PathLike[str], format: str = "auto", *, axes: str = "auto"
 ) -> Trajectory:
-    """Read a trajectory of camera-to-world poses from a text file.
+    """Read a trajectory of camera-to-world poses from a text file, one pose a line.
 
     ``#`` comments, empty lines, tabs, Windows line ends and a byte-order mark are accepted.
 
     Args:
-        path: text file, one pose a line.
+        path: the file.
         format: ``tum``, ``kitti``, ``tartanair``, or ``auto``: by the number of :data:`COLUMNS`.
         axes: axes of the file: ``camera`` (x right, y down, z forward) or ``ned`` (x forward,
             y right, z down; converted to camera axes). ``auto`` is NED for TartanAir's format.
 
     Returns:
-        The trajectory in camera axes. Stamps in other units than seconds are converted
-        (:func:`stamp_unit`), which ``warnings`` and the log say. KITTI and TartanAir files get
-        frame numbers as stamps.
+        The trajectory in camera axes. Stamps in other units than seconds are converted, which
+        ``warnings`` and the log say. KITTI and TartanAir files get frame numbers as stamps.
 
     Raises:
         InputError: no such file, an unknown option. FormatError: a damaged row, a pose that is not
             finite or no rotation, stamps that do not increase; names file and line.
     """
-    if format not in ("auto", *COLUMNS):
-        raise InputError(f"format: expected auto, {', '.join(COLUMNS)}, got {format!r}.")
-    if axes not in ("auto", "camera", "ned"):
-        raise InputError(f"axes: expected auto, camera or ned, got {axes!r}.")
+    for name, value, known in (
+        ("format", format, ("auto", *COLUMNS)),
+        ("axes", axes, ("auto", "camera", "ned")),
+    ):
+        if value not in known:
+            raise InputError(f"{name}: expected {', '.join(known)}, got {value!r}.")
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path}: trajectory file cannot be read: no such file.")
@@ -164,25 +155,23 @@ def read_trajectory(
     rows, T = read_poses(path, COLUMNS[kind])
     if not rows:
         raise FormatError(f"{path}: expected at least one pose, got none.")
-    first = np.array([row.numbers[0] for row in rows])
+    stamps = np.array([row.numbers[0] for row in rows])
     finite = "finite numbers; a pose that is not known must not be in the file"
-    _refuse(path, rows, ~np.isfinite(first) | np.isnan(T[:, 0, 0]), finite)
-    stamps = np.arange(len(rows), dtype=np.float64)
-    warnings: tuple[str, ...] = ()
-    if kind == "tum":
-        far = np.abs(first) > MAX_SECONDS
-        unmixed = f"timestamps that do not mix units ({first[0]} before)"
-        _refuse(path, rows, far != far[0], unmixed)
-        late = np.diff(first, prepend=-np.inf) <= 0
-        _refuse(path, rows, late, "increasing timestamps: sort the file, drop duplicates")
-        factor, unit = stamp_unit(first)
-        stamps = first / factor
-        if factor != 1:
-            warnings = (f"{path}: timestamps are {unit}; converted to seconds.",)
-            _logger.warning(warnings[0])
+    _refuse(path, rows, ~np.isfinite(stamps) | np.isnan(T[:, 0, 0]), finite)
+    factor, unit = stamp_unit(stamps)
+    if kind != "tum":
+        stamps, factor = np.arange(len(rows)), 1.0
+    far = np.abs(stamps) > MAX_SECONDS
+    unmixed = f"timestamps that do not mix units ({stamps[0]} before)"
+    _refuse(path, rows, far != far[0], unmixed)
+    late = np.diff(stamps, prepend=-np.inf) <= 0
+    _refuse(path, rows, late, "increasing timestamps: sort the file, drop duplicates")
+    warnings = [f"{path}: timestamps are {unit}; converted to seconds."] if factor != 1 else []
+    for warning in warnings:
+        _logger.warning(warning)
     if axes == "ned" or (axes == "auto" and kind == "tartanair"):
         T = ned_to_camera(T)
-    return Trajectory(stamps, T, has_timestamps=kind == "tum", warnings=warnings)
+    return Trajectory(stamps / factor, T, kind == "tum", tuple(warnings))
 
 
 def read_poses(path: Path, columns: str) -> tuple[list[Row], np.ndarray]:
@@ -227,9 +216,9 @@ def _format_of(path: Path) -> str:
     """Format by the number of columns of the first pose."""
     for line, text in enumerate(read_text(path).split("\n"), start=1):
         if count := len(text.partition("#")[0].split()):
-            found = [name for name, columns in COLUMNS.items() if len(columns.split()) == count]
-            if found:
-                return found[0]
+            for name, columns in COLUMNS.items():
+                if len(columns.split()) == count:
+                    return name
             raise FormatError(
                 f"{path}:{line}: expected 8 numbers (TUM), 12 (KITTI) or 7 (TartanAir) separated "
                 f"by spaces, got {count}."
@@ -237,13 +226,24 @@ def _format_of(path: Path) -> str:
     raise FormatError(f"{path}: expected at least one pose, got none.")
 
 
+def check_increasing(stamps: np.ndarray, where: str) -> None:
+    """Refuse stamps that are not finite, go back or stand still: InputError with the frame."""
+    good = np.isfinite(stamps) & (np.diff(stamps, prepend=-np.inf) > 0)
+    if not good.all():
+        k = int(np.argmin(good))
+        after = f" after {float(stamps[k - 1])!r}" if k else ""
+        raise InputError(
+            f"{where}: timestamps must be finite and increase: frame {k} has {float(stamps[k])!r}"
+            f"{after}. Sort them and remove duplicates."
+        )
+
+
 def stamp_unit(stamps: np.ndarray) -> tuple[float, str]:
     """How many of the unit of some stamps make a second, and its name.
 
     Milliseconds and microseconds are told by two things together: every stamp (N,) that is finite
-    is one of today's clocks (2001 to 2103), and neighbours are typically less than a second apart,
-    which for a clock that counts nanoseconds since the machine was started would be more than 1000
-    images a second. Else stamps above 1e14 are nanoseconds.
+    is one of today's clocks (2001 to 2103), and neighbours are typically less than a second apart.
+    Else stamps above 1e14 are nanoseconds.
     """
     known = np.abs(stamps[np.isfinite(stamps)])
     with np.errstate(over="ignore"):  # between numbers that are no times anyway

@@ -43,23 +43,6 @@ def to_numpy(value: Any, name: str) -> np.ndarray:
         raise InputError(f"{name}: expected an array, got {error}.") from None
 
 
-def as_float_image(value: Any, name: str, channels: int | None) -> np.ndarray:
-    """Numpy view (or native-endian float32 copy) of an (H, W[, channels]) image of real numbers."""
-    array = to_numpy(value, name)
-    expected = "(H, W)" if channels is None else f"(H, W, {channels})"
-    if array.ndim == 3 and channels is None and array.shape[2] == 1:
-        array = array[:, :, 0]
-    if array.ndim < 2 or array.shape[2:] != (() if channels is None else (channels,)):
-        raise InputError(f"{name}: expected shape {expected}, got {array.shape}.")
-    if array.dtype.kind != "f":
-        raise InputError(
-            f"{name}: expected a floating-point array, got dtype {array.dtype}. "
-            f"Convert to metres (depth) or pixels (flow) as float32 first."
-        )
-    with np.errstate(over="ignore"):  # beyond float32 is inf, which is invalid
-        return array.astype(np.float32, copy=False)
-
-
 def as_number(value: Any) -> float:
     """A value as float; NaN where it is no number."""
     try:
@@ -102,10 +85,7 @@ def as_rigid(T: Any, where: str, tolerance: float = 1e-6, *, many: bool = False)
 class Camera:
     """Pinhole camera without distortion.
 
-    Args:
-        fx, fy: focal lengths in pixels, positive.
-        cx, cy: principal point in pixels; (0, 0) is the centre of the top-left pixel.
-        height, width: image size in pixels.
+    Focal lengths and principal point are in pixels of this image size.
 
     Raises:
         InputError: a value that is not finite, a focal length outside ``FOCAL_RANGE``, an image
@@ -132,16 +112,16 @@ class Camera:
                 f"Camera: {self.width}x{self.height} pixels is above the limit of {MAX_PIXELS}."
             )
         low, high = FOCAL_RANGE
-        for name, focal in (("fx", self.fx), ("fy", self.fy)):
+        for axis, size in (("x", self.width), ("y", self.height)):
+            focal, centre = getattr(self, f"f{axis}"), getattr(self, f"c{axis}")
             if not low <= focal <= high:
                 raise InputError(
-                    f"Camera.{name}: expected a positive focal length in pixels ({low:g} to "
+                    f"Camera.f{axis}: expected a positive focal length in pixels ({low:g} to "
                     f"{high:g}), got {focal}."
                 )
-        for name, value, size in (("cx", self.cx, self.width), ("cy", self.cy, self.height)):
-            if not -size <= value <= 2 * size:
+            if not -size <= centre <= 2 * size:
                 raise InputError(
-                    f"Camera.{name}: {value} lies far outside an image of {size} pixels. "
+                    f"Camera.c{axis}: {centre} lies far outside an image of {size} pixels. "
                     f"Are the intrinsics those of this image size?"
                 )
 
@@ -152,8 +132,8 @@ class Camera:
         if K.shape != (3, 3) or K.dtype.kind not in "fiu" or not np.isfinite(K).all():
             raise InputError(f"Camera: expected a finite 3x3 intrinsic matrix, got {K.tolist()}.")
         K = K.astype(np.float64)
-        tolerance = 1e-6 * max(abs(K[0, 0]), abs(K[1, 1]), 1.0)
-        if not np.allclose(K[2], (0, 0, 1)) or abs(K[0, 1]) > tolerance or abs(K[1, 0]) > tolerance:
+        skew = np.abs([K[0, 1], K[1, 0]]).max() / max(abs(K[0, 0]), abs(K[1, 1]), 1.0)
+        if not np.allclose(K[2], (0, 0, 1)) or skew > 1e-6:
             raise InputError(
                 f"Camera: expected K = [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], got {K.tolist()}."
             )
@@ -170,21 +150,33 @@ class Camera:
         return self.height, self.width
 
 
-def _as_mask(value: Any, name: str) -> np.ndarray:
-    mask = to_numpy(value, name)
-    if mask.dtype != np.bool_ or mask.ndim != 2:
-        raise InputError(f"{name}: expected a boolean (H, W) array, got {mask.dtype} {mask.shape}.")
-    return mask
+KINDS = {"f": "a floating-point array", "u1": "uint8 values 0..255", "b": "a boolean array"}
 
 
-def _set(of: Frame | FramePair, name: str, array: np.ndarray, camera: Camera) -> None:
-    """Set an image of the camera's size."""
-    if array.shape[:2] != camera.shape:
+def _take_image(of: Frame | FramePair, camera: Camera, name: str, kind: str, *more: int) -> None:
+    """Check an image of an object, if it has one, and keep it: (H, W) or (H, W, channels)."""
+    value, where = getattr(of, name), f"{type(of).__name__}.{name}"
+    if value is None:
+        return
+    array = to_numpy(value, where)
+    if kind not in (array.dtype.kind, array.dtype.str[1:]):
         raise InputError(
-            f"{type(of).__name__}.{name}: expected {camera.shape} (height, width) as the camera "
-            f"has, got {array.shape[:2]}. Resize with hybridvo.data.resize, which also scales the "
-            f"camera."
+            f"{where}: expected {KINDS[kind]}, got {array.dtype} {array.shape}. Convert depth to "
+            f"metres, flow to pixels, as float32 first."
         )
+    if array.ndim == 3 and array.shape[2] == 1:
+        array = array[:, :, 0]
+    if kind == "u1" and array.ndim == 2:  # gray
+        array = np.repeat(array[:, :, None], 3, axis=2)
+    if array.shape[2:] != more or array.shape[:2] != camera.shape:
+        raise InputError(
+            f"{where}: expected shape {(*camera.shape, *more)} (height, width, ...) as the camera "
+            f"has, got {array.shape}. Resize with hybridvo.data.sequence.resize_frame, which also "
+            f"scales the camera."
+        )
+    if kind == "f":
+        with np.errstate(over="ignore"):  # beyond float32 is inf, which is invalid
+            array = array.astype(np.float32, copy=False)
     object.__setattr__(of, name, array)
 
 
@@ -198,14 +190,13 @@ class Frame:
         depth: (H, W) float metres along the optical axis; NaN, inf, 0 and negative are invalid.
             None where the sensor delivered none: the pair then ends as ``failed(no_valid_depth)``.
         camera: pinhole intrinsics of this very image size.
-        timestamp: seconds. Values above 1e14 are nanoseconds and are converted by the readers.
+        timestamp: seconds.
         index: position in its sequence; None: the tracker counts.
         depth_variance: (H, W) float, variance of log depth (relative variance), or None.
         mask: (H, W) bool, True where pixels may be used, or None.
 
     Raises:
-        InputError: shapes that do not match the camera, wrong dtypes, a stamp that is not finite,
-            an index that is no whole number.
+        InputError: shapes that do not match the camera, wrong dtypes, a stamp that is not finite.
     """
 
     rgb: np.ndarray | None
@@ -219,24 +210,9 @@ class Frame:
     def __post_init__(self) -> None:
         if not isinstance(self.camera, Camera):
             raise InputError(f"Frame.camera: expected a Camera, got {type(self.camera).__name__}.")
-        if self.rgb is not None:
-            rgb = to_numpy(self.rgb, "Frame.rgb")
-            if rgb.dtype != np.uint8:
-                raise InputError(f"Frame.rgb: expected uint8 values 0..255, got dtype {rgb.dtype}.")
-            if rgb.ndim == 2 or (rgb.ndim == 3 and rgb.shape[2] == 1):
-                rgb = np.repeat(rgb.reshape(*rgb.shape[:2], 1), 3, axis=2)
-            if rgb.ndim != 3 or rgb.shape[2] != 3:
-                raise InputError(
-                    f"Frame.rgb: expected shape (H, W, 3), got {rgb.shape}. "
-                    f"Images are height, width, channels, in RGB order."
-                )
-            _set(self, "rgb", rgb, self.camera)
-        for name in ("depth", "depth_variance"):
-            if getattr(self, name) is not None:
-                image = as_float_image(getattr(self, name), f"Frame.{name}", None)
-                _set(self, name, image, self.camera)
-        if self.mask is not None:
-            _set(self, "mask", _as_mask(self.mask, "Frame.mask"), self.camera)
+        _take_image(self, self.camera, "rgb", "u1", 3)
+        for name, kind in (("depth", "f"), ("depth_variance", "f"), ("mask", "b")):
+            _take_image(self, self.camera, name, kind)
         stamp = as_number(self.timestamp)
         if not np.isfinite(stamp):
             raise InputError(f"Frame.timestamp: expected finite seconds, got {self.timestamp!r}.")
@@ -251,11 +227,10 @@ class Frame:
 class FramePair:
     """Two frames with the optical flow between them: what every estimator takes.
 
-    Ground-truth motion is no part of it. ``flow_source`` and ``depth_source`` name where the inputs
-    come from; ``file`` flow of a synthetic data set is true flow, and every report says so.
+    Ground-truth motion is no part of it.
 
     Args:
-        prev, curr: frames t and t+1, each with its own camera.
+        prev, curr: frames t and t+1 of one size, each with its own camera.
         flow: (H, W, 2) float pixels, previous to current, on the previous grid; NaN is invalid.
             None where no flow could be had: the pair then ends as ``failed(no_flow)``.
         flow_variance: (H, W) float px^2 per component, relative or absolute, or None.
@@ -278,23 +253,20 @@ class FramePair:
     depth_source: str = "unknown"
 
     def __post_init__(self) -> None:
-        for name in ("prev", "curr"):
-            if not isinstance(getattr(self, name), Frame):
-                got = type(getattr(self, name)).__name__
+        for name, frame in (("prev", self.prev), ("curr", self.curr)):
+            if not isinstance(frame, Frame):
+                got = type(frame).__name__
                 raise InputError(f"FramePair.{name}: expected a Frame, got {got}.")
-        if self.curr.camera.shape != self.prev.camera.shape:
+        camera = self.prev.camera
+        if self.curr.camera.shape != camera.shape:
             raise InputError(
-                f"FramePair: the previous frame is {self.prev.camera.shape}, the current one "
+                f"FramePair: the previous frame is {camera.shape}, the current one "
                 f"{self.curr.camera.shape} (height, width). All frames must have one size; resize "
-                f"with hybridvo.data.resize.resize_frame."
+                f"with hybridvo.data.sequence.resize_frame."
             )
-        for name, channels in (("flow", 2), ("flow_variance", None)):
-            if getattr(self, name) is not None:
-                array = as_float_image(getattr(self, name), f"FramePair.{name}", channels)
-                _set(self, name, array, self.prev.camera)
-        if self.flow_valid is not None:
-            valid = _as_mask(self.flow_valid, "FramePair.flow_valid")
-            _set(self, "flow_valid", valid, self.prev.camera)
+        _take_image(self, camera, "flow", "f", 2)
+        _take_image(self, camera, "flow_variance", "f")
+        _take_image(self, camera, "flow_valid", "b")
 
 
 @dataclass(frozen=True, eq=False)
@@ -343,22 +315,22 @@ class PairBatch:
             array = np.stack([absent if value is None else value for value in values])
             return torch.as_tensor(array, device=device).to(dtype or torch.float32)
 
+        def masked(frame: Frame) -> np.ndarray | None:
+            if frame.depth is None or frame.mask is None:
+                return frame.depth
+            return np.where(frame.mask, frame.depth, np.float32(np.nan))
+
         valid = np.ones((len(pairs), *size), np.bool_)
-        depth_curr = []
         for k, pair in enumerate(pairs):
             for mask in (pair.prev.mask, pair.flow_valid):
                 valid[k] &= True if mask is None else mask
-            depth = pair.curr.depth
-            if depth is not None and pair.curr.mask is not None:
-                depth = np.where(pair.curr.mask, depth, np.float32(np.nan))
-            depth_curr.append(depth)
         no_flow, no_depth = np.full((*size, 2), np.nan), np.full(size, np.nan)
         return cls(
             flow=stack([no_flow if p.flow is None else p.flow for p in pairs]),
             depth_prev=stack([no_depth if p.prev.depth is None else p.prev.depth for p in pairs]),
             K_prev=stack([p.prev.camera.K for p in pairs]),
             K_curr=stack([p.curr.camera.K for p in pairs]),
-            depth_curr=stack(depth_curr),
+            depth_curr=stack([masked(p.curr) for p in pairs]),
             # a pair without variances beside one with them has those of a typical pixel
             flow_variance=stack([p.flow_variance for p in pairs], 1.0),
             depth_variance=stack([p.prev.depth_variance for p in pairs], 1.0),
@@ -377,24 +349,23 @@ def typical_depth(depth: np.ndarray) -> float | None:
 def depth_advice(median: float, usual: float | None = None) -> str:
     """What probably turns depths of this median into metres; empty where they can be metres.
 
-    A guess: no image knows its scale. The first unit is taken that brings the median to everyday
-    depths, the data set's own (``usual``, units per metre) before the others.
-
-    Example:
-        >>> depth_advice(974.0)
-        'divide by 1000 (millimetres)'
+    The first unit that brings the median to everyday depths, the data set's own (``usual``, units
+    per metre) before the others: ``divide by 1000 (millimetres)`` for a median of 974.
     """
     low, high = PLAUSIBLE_DEPTH_M
     if low <= median <= high:
         return ""
-    too_large = median > high
-    units = [1 / unit if too_large else float(unit) for unit in UNITS_PER_METRE]
-    inside = [f for f in units if EVERYDAY_DEPTH_M[0] <= median * f <= EVERYDAY_DEPTH_M[1]]
-    if usual and too_large and low <= median / usual <= high:
-        inside = [1 / usual]
-    centre = np.sqrt(np.prod(EVERYDAY_DEPTH_M))
-    nearest = min(units, key=lambda factor: abs(np.log(median * factor / centre)))
-    factor = inside[0] if inside else nearest
+    if median < low:
+        factors = [float(unit) for unit in UNITS_PER_METRE]
+    elif usual and low <= median / usual <= high:
+        factors = [1 / usual]
+    else:
+        factors = [1 / unit for unit in UNITS_PER_METRE]
+    # how far each leads from the middle of everyday depths, which are all as good
+    nearest, farthest = EVERYDAY_DEPTH_M
+    reach = np.log(farthest / nearest) / 2
+    off = [abs(np.log(median * f / np.sqrt(nearest * farthest))) for f in factors]
+    factor = factors[int(np.argmin(np.maximum(off, reach)))]
     if factor > 1:
         return f"multiply by {factor:g}"
     unit = UNITS_PER_METRE.get(round(1 / factor))

@@ -1,9 +1,8 @@
 """Point solvers of OpenCV and PoseLib: sample, solve, check.
 
 3-D points come from the previous depth and camera, 2-D points from the flow, seen by the current
-camera. A solver's own "success" is not believed: the motion must be finite, keep its inliers in
-front of the camera, have enough of them, and they must determine all six degrees of freedom. The
-check is the same for every baseline, so that "ok" means one thing in a comparison.
+camera. A solver's own "success" is not believed: the check is the same for every baseline, so that
+"ok" means one thing in a comparison.
 """
 
 from __future__ import annotations
@@ -71,26 +70,22 @@ def solve_opencv(
 
 
 def solve_poselib(data: Correspondences, camera: Camera, seed: int) -> np.ndarray | None:
-    """PoseLib's LO-RANSAC at 2 px, 100 to 1000 iterations, 0.999, bundle adjustment included.
-
-    Its default of at least 1000 iterations takes three times as long and is no more accurate here.
-    """
+    """PoseLib's LO-RANSAC, bundle adjustment included."""
     import poselib
 
-    model = {
-        "model": "PINHOLE",
-        "width": camera.width,
-        "height": camera.height,
-        "params": [camera.fx, camera.fy, camera.cx, camera.cy],
-    }
+    size = {"width": camera.width, "height": camera.height}
+    params = [camera.fx, camera.fy, camera.cx, camera.cy]
     options = {
         "max_reproj_error": TUNED_PX,
+        # its default of at least 1000 takes three times as long and is no more accurate here
         "min_iterations": 100,
         "max_iterations": TUNED["iterationsCount"],
         "success_prob": TUNED["confidence"],
         "seed": seed,
     }
-    pose, _ = poselib.estimate_absolute_pose(data.uv, data.xyz, model, options, {})
+    pose, _ = poselib.estimate_absolute_pose(
+        data.uv, data.xyz, {"model": "PINHOLE", "params": params} | size, options, {}
+    )
     return make_transform(np.asarray(pose.R), np.asarray(pose.t))
 
 
@@ -130,19 +125,13 @@ def missing() -> dict[str, str]:
         except ImportError as error:  # Open3D without its system libraries
             absent[name] = f"{library} is installed but cannot be imported: {error}; {remedy}"
     if not hasattr(cv2, "Odometry"):
-        absent["opencv-rgbd"] = (
-            "this OpenCV has no cv2.Odometry (it came with 5.0); "
-            "pip install 'opencv-python-headless>=5'"
-        )
+        remedy = "pip install 'opencv-python-headless>=5'"
+        absent["opencv-rgbd"] = f"this OpenCV has no cv2.Odometry (it came with 5.0); {remedy}"
     return absent
 
 
 def sample(pair: FramePair, seed: int, points: int = POINTS) -> Correspondences | Status:
-    """Random valid pixels as correspondences, or the reason why there are fewer than six.
-
-    Candidates are drawn first and checked after, so that a large image is not read as a whole for
-    ten thousand of its pixels; only where too many of them are invalid is the full mask made.
-    """
+    """Random valid pixels as correspondences, or the reason why there are fewer than six."""
     depth, flow, camera = pair.prev.depth, pair.flow, pair.prev.camera
     if flow is None:
         return Status.failed(Reason.NO_FLOW, "the pair has no flow")
@@ -161,21 +150,18 @@ def sample(pair: FramePair, seed: int, points: int = POINTS) -> Correspondences 
         inside = (x > -0.5) & (x < camera.width - 0.5) & (y > -0.5) & (y < camera.height - 0.5)
         return index[inside]
 
-    keep = np.arange(depth.size)
-    if depth.size > 4 * points:
+    keep = np.zeros(0, np.intp)
+    if depth.size > 4 * points:  # only where too many of a draw are invalid is all of it looked at
         keep = usable(rng.choice(depth.size, 2 * points, replace=False))
-    if len(keep) < points or depth.size <= 4 * points:
+    if len(keep) < points:
         keep = usable(np.arange(depth.size))
     if len(keep) < MIN_POINTS:
+        why = Reason.LOW_INLIERS, f"{len(keep)} pixels with valid depth and flow, need {MIN_POINTS}"
         if not depth_valid(depth).any():
-            return Status.failed(
-                Reason.NO_VALID_DEPTH, "the previous depth has no finite positive value (metres)"
-            )
-        if not np.isfinite(flow).all(axis=-1).any():
-            return Status.failed(Reason.NO_FLOW, "the flow has no finite value")
-        return Status.failed(
-            Reason.LOW_INLIERS, f"{len(keep)} pixels with valid depth and flow, need {MIN_POINTS}"
-        )
+            why = Reason.NO_VALID_DEPTH, "the previous depth has no finite positive value (metres)"
+        elif not np.isfinite(flow).all(axis=-1).any():
+            why = Reason.NO_FLOW, "the flow has no finite value"
+        return Status.failed(*why)
     if len(keep) > points:
         keep = rng.choice(keep, points, replace=False)
     v, u = np.divmod(keep, camera.width)
@@ -199,36 +185,45 @@ def check(
 ) -> RelativePose:
     """A solver's motion with covariance and status; failed with the identity where it is none.
 
-    Inliers are counted again: in front of the camera after the motion and within ``threshold_px``.
-    Covariance sigma^2 (J^T J)^-1 over them, sigma^2 = |r|^2 / (2 n - 6) unless ``sigma_px`` is
-    given, J by the left perturbation, translation first. With a solver that stops short of the
-    least-squares optimum of its inliers this is the covariance of the optimum, thus optimistic.
+    The motion must be finite and have enough inliers (in front of the camera, and within
+    ``threshold_px``), and they must determine all six degrees of freedom. Covariance sigma^2
+    (J^T J)^-1 over them, sigma^2 = |r|^2 / (2 n - 6) unless ``sigma_px`` is given: that of the
+    least-squares optimum, thus optimistic for a solver that stops short of it.
     """
-    diverged = RelativePose.failed(
-        Reason.SOLVER_DIVERGED, f"{method}: the solver found no finite rigid motion", method
-    )
+
+    def failed(reason: Reason, what: str, **facts: Any) -> RelativePose:
+        return RelativePose.failed(reason, f"{method}: {what}", method, **facts)
+
+    def undetermined(points: np.ndarray, **facts: Any) -> RelativePose | None:
+        """The failure where points leave a direction of the motion free."""
+        values, _, _ = _information(points, camera)
+        if values[0] > SINGULAR_RATIO * values[-1]:
+            return None
+        facts |= {"information_eigenvalues": np.maximum(values, 0.0)}
+        what = f"the {len(points)} points leave a direction of the motion undetermined"
+        return failed(Reason.DEGENERATE_GEOMETRY, what, **facts)
+
     if T is None or not is_rigid(T):
-        return _degenerate(method, data, camera) or diverged
+        diverged = failed(Reason.SOLVER_DIVERGED, "the solver found no finite rigid motion")
+        return undetermined(data.xyz) or diverged
     moved = data.xyz @ T[:3, :3].T + T[:3, 3]
     squared = ((project(moved, camera) - data.uv) ** 2).sum(axis=-1)  # NaN behind the camera
     inlier = (moved[:, 2] > DEPTH_RANGE_M[0]) & (squared < threshold_px**2)
     count, ratio = int(inlier.sum()), float(inlier.mean())
     if count < MIN_POINTS or ratio < MIN_INLIER_RATIO:
-        message = f"{method}: {count} of {len(inlier)} sampled pixels follow the motion"
-        few = RelativePose.failed(Reason.LOW_INLIERS, message, method, inlier_ratio=ratio)
-        return _degenerate(method, data, camera) or few
+        what = f"{count} of {len(inlier)} sampled pixels follow the motion"
+        few = failed(Reason.LOW_INLIERS, what, inlier_ratio=ratio)
+        return undetermined(data.xyz) or few
+    if (free := undetermined(moved[inlier], inlier_ratio=ratio)) is not None:
+        return free
     values, vectors, scale = _information(moved[inlier], camera)
-    if values[0] <= SINGULAR_RATIO * values[-1]:
-        return _undetermined(method, count, values, ratio)
     status = Status()
     if values[0] <= WEAK_RATIO * values[-1]:
-        status = Status.degraded(
-            Reason.DEGENERATE_GEOMETRY, f"{method}: a direction of the motion is barely determined"
-        )
+        what = f"{method}: a direction of the motion is barely determined"
+        status = Status.degraded(Reason.DEGENERATE_GEOMETRY, what)
     elif ratio < LOW_INLIER_RATIO:
-        status = Status.degraded(
-            Reason.LOW_INLIERS, f"{method}: only {ratio:.0%} of the pixels follow the motion"
-        )
+        what = f"{method}: only {ratio:.0%} of the pixels follow the motion"
+        status = Status.degraded(Reason.LOW_INLIERS, what)
     cost = float(squared[inlier].sum())
     sigma = np.sqrt(cost / (2 * count - 6)) if sigma_px is None else sigma_px
     half = vectors * scale[:, None] / np.sqrt(values)
@@ -265,20 +260,3 @@ def _information(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.nda
     J *= scale
     values, vectors = np.linalg.eigh(J.T @ J)
     return values, vectors, scale
-
-
-def _degenerate(method: str, data: Correspondences, camera: Camera) -> RelativePose | None:
-    """The failure where no solver could have found the motion: the points are degenerate."""
-    values, _, _ = _information(data.xyz, camera)
-    weak = values[0] <= SINGULAR_RATIO * values[-1]
-    return _undetermined(method, len(data.uv), values) if weak else None
-
-
-def _undetermined(method: str, count: int, values: np.ndarray, ratio: float = 0.0) -> RelativePose:
-    return RelativePose.failed(
-        Reason.DEGENERATE_GEOMETRY,
-        f"{method}: the {count} points leave a direction of the motion undetermined",
-        method,
-        inlier_ratio=ratio,
-        information_eigenvalues=np.maximum(values, 0.0),
-    )

@@ -7,7 +7,7 @@ give it a covariance; without flow that of one pixel of noise at every sampled p
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -26,54 +26,43 @@ from hybridvo.results import Reason, RelativePose, Status
 from hybridvo.types import Camera, FramePair
 
 
-@dataclass(frozen=True, eq=False)
-class RgbdFrames:
-    """Both RGB-D frames under one camera; invalid depth is NaN."""
+class Rgbd(NamedTuple):
+    """An image and its depth, NaN where that is invalid."""
 
-    rgb_prev: np.ndarray
-    depth_prev: np.ndarray
-    rgb_curr: np.ndarray
-    depth_curr: np.ndarray
+    rgb: np.ndarray
+    depth: np.ndarray
     camera: Camera
 
-    @property
-    def deepest(self) -> float:
-        """Metres beyond every depth: the default limits of both libraries are opened to it."""
-        return float(np.nanmax(self.depth_prev)) + 1.0
 
-
-def align_opencv(frames: RgbdFrames) -> np.ndarray | None:
+def align_opencv(prev: Rgbd, curr: Rgbd) -> np.ndarray | None:
     """OpenCV 5's ``cv2.Odometry`` with image and depth."""
     settings = cv2.OdometrySettings()
-    settings.setCameraMatrix(frames.camera.K.astype(np.float32))
+    settings.setCameraMatrix(prev.camera.K.astype(np.float32))
     settings.setMinDepth(1e-3)
-    settings.setMaxDepth(frames.deepest)
+    settings.setMaxDepth(_deepest(prev))
     odometry = cv2.Odometry(cv2.ODOMETRY_TYPE_RGB_DEPTH, settings, cv2.ODOMETRY_ALGO_TYPE_COMMON)
-    found, T = odometry.compute(
-        frames.depth_prev, frames.rgb_prev, frames.depth_curr, frames.rgb_curr
-    )
+    found, T = odometry.compute(prev.depth, prev.rgb, curr.depth, curr.rgb)
     return np.asarray(T, dtype=np.float64) if found else None
 
 
-def align_open3d(frames: RgbdFrames) -> np.ndarray | None:
+def align_open3d(prev: Rgbd, curr: Rgbd) -> np.ndarray | None:
     """Open3D's ``compute_rgbd_odometry`` with the hybrid term."""
     import open3d
 
-    camera = frames.camera
-
-    def image(rgb: np.ndarray, depth: np.ndarray) -> object:
-        return open3d.geometry.RGBDImage.create_from_color_and_depth(
-            open3d.geometry.Image(np.ascontiguousarray(rgb)),
-            open3d.geometry.Image(np.nan_to_num(depth, nan=0.0)),
+    images = [
+        open3d.geometry.RGBDImage.create_from_color_and_depth(
+            open3d.geometry.Image(np.ascontiguousarray(frame.rgb)),
+            open3d.geometry.Image(np.nan_to_num(frame.depth)),  # 0 is unknown to Open3D
             depth_scale=1.0,
-            depth_trunc=frames.deepest,
+            depth_trunc=_deepest(prev),
         )
-
+        for frame in (prev, curr)
+    ]
+    camera = prev.camera
     option = open3d.pipelines.odometry.OdometryOption()
-    option.depth_max = frames.deepest
+    option.depth_max = _deepest(prev)
     found, T, _ = open3d.pipelines.odometry.compute_rgbd_odometry(
-        image(frames.rgb_prev, frames.depth_prev),
-        image(frames.rgb_curr, frames.depth_curr),
+        *images,
         open3d.camera.PinholeCameraIntrinsic(
             camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy
         ),
@@ -84,20 +73,25 @@ def align_open3d(frames: RgbdFrames) -> np.ndarray | None:
     return np.asarray(T, dtype=np.float64) if found else None
 
 
-ALIGNERS: dict[str, Callable[[RgbdFrames], np.ndarray | None]] = {
+def _deepest(frame: Rgbd) -> float:
+    """Metres beyond every depth: the default limits of both libraries are opened to it."""
+    return float(np.nanmax(frame.depth)) + 1.0
+
+
+ALIGNERS: dict[str, Callable[[Rgbd, Rgbd], np.ndarray | None]] = {
     "opencv-rgbd": align_opencv,
     "open3d-rgbd": align_open3d,
 }
-"""(4, 4) T_curr_prev of two RGB-D frames, or None, by method."""
+"""(4, 4) T_curr_prev of two RGB-D images under one camera, or None."""
 
 
 def estimate_by_images(method: str, pair: FramePair, seed: int = 0) -> RelativePose:
     """Motion of a pair by one of :data:`ALIGNERS`; its status is failed without images."""
-    frames = rgbd_frames(pair)
+    frames = _prepared(pair)
     if isinstance(frames, Status):
         return RelativePose.failed(frames.reason, frames.message, method)
     try:
-        T = ALIGNERS[method](frames)
+        T = ALIGNERS[method](*frames)
     except FOUND_NOTHING:
         T = None
     if T is not None and np.isfinite(T).all():
@@ -117,24 +111,23 @@ def estimate_by_images(method: str, pair: FramePair, seed: int = 0) -> RelativeP
     return check(method, T, data, camera, DEFAULT_PX, sigma_px)
 
 
-def rgbd_frames(pair: FramePair) -> RgbdFrames | Status:
+def _prepared(pair: FramePair) -> tuple[Rgbd, Rgbd] | Status:
     """Both frames as OpenCV and Open3D take them, the current one resampled to the previous K."""
-    if pair.prev.rgb is None or pair.curr.rgb is None:
-        return Status.failed(Reason.MISSING_FRAME, "this method aligns images; the pair has none")
-    depths: list[np.ndarray] = []
+    frames = []
+    camera, size = pair.prev.camera, pair.prev.camera.shape[::-1]
     for name, frame in (("previous", pair.prev), ("current", pair.curr)):
-        if frame.depth is None or not depth_valid(frame.depth).any():
+        rgb, depth = frame.rgb, frame.depth
+        if rgb is None:
+            return Status.failed(Reason.MISSING_FRAME, "this method aligns images: none is there")
+        if depth is None or not depth_valid(depth).any():
             return Status.failed(Reason.NO_VALID_DEPTH, f"the {name} frame has no valid depth")
-        keep = depth_valid(frame.depth)
-        if frame.mask is not None:
-            keep &= frame.mask
-        depths.append(np.where(keep, frame.depth, np.nan).astype(np.float32))
-    camera, rgb_curr = pair.prev.camera, pair.curr.rgb
-    if not np.allclose(camera.K, pair.curr.camera.K):
-        A = (camera.K @ np.linalg.inv(pair.curr.camera.K))[:2]
-        size = (camera.width, camera.height)
-        rgb_curr = np.asarray(cv2.warpAffine(rgb_curr, A, size, flags=cv2.INTER_LINEAR))
-        depths[1] = cv2.warpAffine(
-            depths[1], A, size, flags=cv2.INTER_NEAREST, borderValue=float("nan")
-        )
-    return RgbdFrames(pair.prev.rgb, depths[0], rgb_curr, depths[1], camera)
+        keep = depth_valid(depth) & (True if frame.mask is None else frame.mask)
+        depth = np.where(keep, depth, np.nan).astype(np.float32)
+        if not np.allclose(camera.K, frame.camera.K):
+            A = (camera.K @ np.linalg.inv(frame.camera.K))[:2]
+            rgb = np.asarray(cv2.warpAffine(rgb, A, size, flags=cv2.INTER_LINEAR))
+            depth = np.asarray(
+                cv2.warpAffine(depth, A, size, flags=cv2.INTER_NEAREST, borderValue=float("nan"))
+            )
+        frames.append(Rgbd(rgb, depth, camera))
+    return frames[0], frames[1]

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from hybridvo.data.camera_file import IMAGES, Calibration, Lens, parse_camera, units_per_metre
 from hybridvo.data.image_io import read_depth, read_flow, read_mask_png, read_rgb
-from hybridvo.data.lists import check_increasing, match_files, shown, sorted_files, warn_of_gaps
+from hybridvo.data.lists import match_files, shown, sorted_files
 from hybridvo.errors import FormatError, InputError
+from hybridvo.trajectory import check_increasing
 from hybridvo.types import Camera, Frame, depth_advice, typical_depth
 
 INNER_FOLDER = re.compile(r"(rgb|depth|flow|image)(_\w+)?")
@@ -25,9 +26,8 @@ Files = list[Path | None]
 class Sequence:
     """Frames in time order, read when asked for: ``len``, ``sequence[i]``, ``for frame in``.
 
-    A reader overrides :meth:`_list_files`, which fills in the files and stamps, and says by
-    :meth:`_calibration` which camera belongs to them; where its files need more than their ending
-    says, it overrides ``_read_depth`` and ``_read_flow``.
+    A reader overrides ``_list_files``, which fills in files and stamps, and ``_calibration``; where
+    its files need more than their ending says, ``_read_depth`` and ``_read_flow``.
 
     Attributes:
         kind: sintel, tartanair, tum, 7scenes, kitti or folder.
@@ -78,12 +78,10 @@ class Sequence:
             hint = "Expected PNG or JPEG, 0 where pixels must not be used, named like the images."
             masks = sorted_files(self._mask_folder, IMAGES)
             self.mask_files = match_files(frames, masks, self._mask_folder, hint)
-        self.height, self.width = self._find_size()
         self._camera: Camera | None = None
         self._lens: Lens | None = None
-        self._calibrate()
+        self._look_at_first_images()
         self._warn_of_missing_files()
-        self._warn_of_depth_unit()
 
     @classmethod
     def root_of(cls, folder: Path) -> Path | None:
@@ -96,7 +94,7 @@ class Sequence:
 
     @classmethod
     def looks_for(cls) -> str:
-        """What a folder of this kind holds, for messages."""
+        """What a folder of this kind holds."""
         return f"{cls.kind}: " + ", or ".join(" and ".join(group) for group in cls.markers)
 
     @property
@@ -106,13 +104,11 @@ class Sequence:
 
     def check_flow(self, stride: int = 1) -> None:
         """Refuse to take flow files that are not there, or that do not lead over a stride."""
-        if self.has_flow and stride == 1:
-            return
-        why = "there are no flow files"
-        if self.has_flow:
-            why = f"flow files lead from one frame to the next, not over a stride of {stride}"
-        remedy = "compute it: --flow dis, or iter_pairs(sequence, hybridvo.dis_flow())"
-        raise InputError(f"{self.name}: {why}; {remedy}.")
+        over = f"flow files lead from one frame to the next, not over a stride of {stride}"
+        if not self.has_flow or stride != 1:
+            why = over if self.has_flow else "there are no flow files"
+            remedy = "compute it: --flow dis, or iter_pairs(sequence, hybridvo.dis_flow())"
+            raise InputError(f"{self.name}: {why}; {remedy}.")
 
     def __len__(self) -> int:
         return len(self.timestamps)
@@ -128,27 +124,26 @@ class Sequence:
 
     def camera(self, index: int) -> Camera:
         """Pinhole camera of frame ``index``."""
-        self._check_index(index)
-        assert self._camera is not None
+        assert self._camera is not None  # else this is overridden
         return self._camera
 
     def frame(self, index: int) -> Frame:
         """Frame ``index``; ``rgb`` or ``depth`` is None where its file is missing.
 
         Raises:
-            IndexError: no such index. FileNotFoundError: neither image nor depth is there.
-            FormatError: a file cannot be decoded or has another size.
+            FileNotFoundError: neither is there. FormatError: a file that cannot be decoded or has
+                another size.
         """
         index = self._check_index(index)
         camera = self.camera(index)
-        rgb_path, depth_path = self.rgb_files[index], self.depth_files[index]
-        rgb = self._read(rgb_path, "an image", read_rgb)
-        depth = self._read(depth_path, "depth", lambda path: self._read_depth(path, rgb))
+        files = self.rgb_files[index], self.depth_files[index]
+        rgb = self._read(files[0], "an image", read_rgb)
+        depth = self._read(files[1], "depth", lambda path: self._read_depth(path, rgb))
         mask = self._read(self.mask_files[index], "a mask", read_mask_png)
         if rgb is None and depth is None:
+            there = ", ".join(str(path) for path in files if path is not None)
             raise FileNotFoundError(
-                f"{self.name}: frame {index}: neither image nor depth is there "
-                f"({rgb_path or 'no image path'}, {depth_path or 'no depth path'})."
+                f"{self.name}: frame {index}: neither image nor depth is there ({there})."
             )
         if self._lens is not None:
             rgb, depth, mask = self._lens.straighten(rgb, depth, mask)
@@ -159,8 +154,7 @@ class Sequence:
         """Flow from frame ``index`` to the next: (H, W, 2) float32 px, and (H, W) bool or None.
 
         Raises:
-            IndexError: no such pair. FileNotFoundError: no flow file for it.
-            FormatError: the file cannot be decoded or has another size.
+            FileNotFoundError: no flow file for it. FormatError: as :meth:`frame`.
         """
         index = self._check_index(index)
         if index == len(self) - 1:
@@ -180,8 +174,6 @@ class Sequence:
         frames = (self.rgb_files, self.depth_files, self.flow_files[:-1], self.mask_files)
         found = {path for paths in (self._sources, *frames) for path in paths if path is not None}
         return sorted(path for path in found if path.is_file())
-
-    # -- what a reader says of its data set ------------------------------------------------------
 
     def _list_files(self) -> None:
         """Fill in files, stamps, poses, name and sources."""
@@ -217,10 +209,12 @@ class Sequence:
         self.depth_files = [depth.get(n) for n in numbers]
         self.flow_files = [flow.get(n) if n + 1 in frames else None for n in numbers]
         self.timestamps = (np.array(numbers) - min(numbers, default=0)) / self.frames_per_second
-        warn_of_gaps(self.name, numbers, self.warnings)
+        gaps = [(a + 1, b - 1) for a, b in itertools.pairwise(numbers) if b - a > 1]
+        if spans := [f"{a}" if a == b else f"{a} to {b}" for a, b in gaps]:
+            self.warnings.append(
+                f"{self.name}: frame numbers {shown(spans)} are missing; the stamps keep the gap."
+            )
         return numbers
-
-    # -- checks ----------------------------------------------------------------------------------
 
     def _read(
         self, path: Path | None, what: str, read: Callable[[Path], np.ndarray]
@@ -245,39 +239,47 @@ class Sequence:
         return int(index)
 
     def _first(
-        self, files: Files, read: Callable[[Path], Any], problems: list[Exception]
-    ) -> tuple[Path, Any] | None:
-        """The first file that can be read, and what it holds."""
+        self, files: Files, read: Callable[[Path], np.ndarray]
+    ) -> tuple[Path | None, np.ndarray | None, object]:
+        """The first file that can be read, and what it holds; else why the first cannot."""
+        problem = None
         for path in files:
             try:
                 if path is not None:
-                    return path, read(path)
+                    return path, read(path), None
             except (InputError, OSError) as error:
-                problems.append(error)
-        return None
+                problem = problem or error
+        return None, None, problem
 
-    def _first_depth(self, problems: list[Exception]) -> tuple[Path, Any] | None:
+    def _look_at_first_images(self) -> None:
+        """Take the size of the images, and the camera; look at the size and the unit of depth."""
+        _, image, why = self._first(self.rgb_files, read_rgb)
         # a right image of a stereo pair is no depth: frames check its size
         files = [] if self.depth_source == "stereo" else self.depth_files
-        return self._first(files, lambda path: self._read_depth(path, None), problems)
-
-    def _find_size(self) -> tuple[int, int]:
-        """(height, width) of the first image that can be read, which its depth must have too."""
-        problems: list[Exception] = []
-        found = self._first(self.rgb_files, read_rgb, problems), self._first_depth(problems)
-        sizes = [first[1].shape[:2] for first in found if first is not None]
-        if not sizes:
-            why = problems[0] if problems else "no file is listed"
+        if image is None:
+            _, image, other = self._first(files, lambda path: self._read_depth(path, None))
+            why = why or other or "no file is listed"
+        if image is None:
             raise FormatError(f"{self.root}: no frames: none can be read. First problem: {why}")
-        if sizes[0] != sizes[-1]:
-            rgb, depth = sizes
+        self.height, self.width = size = image.shape[:2]
+        self._calibrate()
+        path, depth, _ = self._first(files, lambda path: self._read_depth(path, None))
+        if depth is None:
+            return
+        if depth.shape != size:
             raise InputError(
-                f"{self.root}: depth images are {depth[1]}x{depth[0]}, colour images {rgb[1]}x"
-                f"{rgb[0]} pixels (width x height): depth must be registered to colour, so that "
-                f"both have one size and camera (RealSense: rs.align(rs.stream.color); ROS: "
-                f"depth_registered or aligned_depth_to_color). Resizing does not register it."
+                f"{self.root}: depth images are {depth.shape[1]}x{depth.shape[0]}, colour images "
+                f"{size[1]}x{size[0]} pixels: depth must be registered to colour, not resized "
+                f"(RealSense: rs.align(rs.stream.color); ROS: aligned_depth_to_color)."
             )
-        return sizes[0]
+        median = typical_depth(depth)
+        if median is None:
+            self.warnings.append(f"{path}: the first depth map has no valid value.")
+        elif advice := depth_advice(median, self.depth_scale):
+            self.warnings.append(
+                f"{path}: the median depth is {median:.4g} m, which cannot be metres. Probable "
+                f"remedy: {advice} (by --depth-scale, or depth_scale in camera.yaml)."
+            )
 
     def _calibrate(self) -> None:
         """Take the camera that is given, else that of the data set."""
@@ -290,8 +292,8 @@ class Sequence:
         if camera.shape != size:
             raise InputError(
                 f"{self.root}: images are {self.width}x{self.height}, the camera is for "
-                f"{camera.width}x{camera.height} pixels. Intrinsics belong to one image size: "
-                f"give those of these images (--camera fx,fy,cx,cy or --camera FILE)."
+                f"{camera.width}x{camera.height} pixels. Give the intrinsics of these images "
+                f"(--camera fx,fy,cx,cy or --camera FILE)."
             )
         self.warnings += calibration.warnings
         if any(calibration.distortion):
@@ -302,24 +304,9 @@ class Sequence:
         listed = {"image": self.rgb_files, "depth": self.depth_files, "mask": self.mask_files}
         for what, paths in listed.items():
             missing = [i for i, path in enumerate(paths) if path is None or not path.exists()]
+            text = f"{len(missing)} frames without {what}: {shown(missing)}"
             if len(missing) == len(paths) and what != "mask":
                 like = next((f", such as {path}" for path in paths if path is not None), "")
-                self.warnings.append(f"{self.name}: there are no {what} files{like}.")
-            elif missing and any(paths):
-                self.warnings.append(
-                    f"{self.name}: {len(missing)} frames without {what}: {shown(missing)}."
-                )
-
-    def _warn_of_depth_unit(self) -> None:
-        """Look at the first depth map that can be read, and say so if its unit is doubtful."""
-        first = self._first_depth([])
-        if first is None:
-            return
-        median = typical_depth(first[1])
-        if median is None:
-            self.warnings.append(f"{first[0]}: the first depth map has no valid value.")
-        elif advice := depth_advice(median, self.depth_scale):
-            self.warnings.append(
-                f"{first[0]}: the median depth is {median:.4g} m, which cannot be metres. "
-                f"Probable remedy: {advice} (by --depth-scale, or depth_scale in camera.yaml)."
-            )
+                text = f"there are no {what} files{like}"
+            if missing and (any(paths) or what != "mask"):
+                self.warnings.append(f"{self.name}: {text}.")

@@ -110,26 +110,27 @@ def read_camera_file(path: Path) -> Calibration:
         raise FormatError(
             f"{path}: missing: {', '.join(missing)}. Expected {', '.join(REQUIRED)} in pixels."
         )
-    numbers = {
-        key: _number(content[key], f"{path}: {key}")
-        for key in KNOWN
-        if key != "distortion" and content.get(key) is not None
-    }
     distortion = _distortion(content.get("distortion"), path)
     told: list[str] = []
     if is_foreign and any(distortion):
-        _check_model(str(content.get("model")), path)
-        told.append(
-            f"{path}: lens distortion is taken out; state none if the images are rectified."
-        )
-    try:
-        camera = Camera(**{key: numbers[key] for key in REQUIRED})  # type: ignore[arg-type]
-        scale = units_per_metre(numbers.get("depth_scale"), str(path), told)
-    except InputError as error:
-        raise FormatError(f"{path}: {error}") from None
-    fps = numbers.get("fps")
-    if fps is not None and fps <= 0:
+        model = str(content.get("model"))[:40]
+        if any(word in model.lower() for word in ("fish", "equidist", "kannala", "ftheta")):
+            raise FormatError(
+                f"{path}: distortion model '{model}': expected Brown's (plumb_bob, "
+                f"rational_polynomial). Rectify the images first."
+            )
+        told.append(f"{path}: lens distortion is taken out; state none if images are rectified.")
+    fps, scale = (
+        None if content.get(key) is None else as_number(content[key])
+        for key in ("fps", "depth_scale")
+    )
+    if fps is not None and not 0 < fps < np.inf:
         raise FormatError(f"{path}: fps: expected a number above 0, got {fps}.")
+    try:
+        camera = Camera(**{key: content[key] for key in REQUIRED})
+        scale = units_per_metre(scale, str(path), told)
+    except InputError as error:
+        raise FormatError(f"{path}: {str(error)[:800]}") from None
     return Calibration(camera, distortion, scale, fps, tuple(told))
 
 
@@ -189,21 +190,6 @@ def _only_known(content: dict[Any, Any], path: Path) -> dict[Any, Any]:
     return content
 
 
-def _check_model(model: str, path: Path) -> None:
-    if any(word in model.lower() for word in ("fish", "equidist", "kannala", "ftheta")):
-        raise FormatError(
-            f"{path}: distortion model '{model[:40]}': expected Brown's (plumb_bob, "
-            f"rational_polynomial). Rectify the images first."
-        )
-
-
-def _number(value: Any, where: str) -> float:
-    number = as_number(value)
-    if isinstance(value, bool) or not np.isfinite(number):
-        raise FormatError(f"{where}: expected a finite number, got {str(value)[:40]!r}.")
-    return number
-
-
 def _distortion(value: Any, path: Path) -> tuple[float, ...]:
     if value is None or value == []:
         return ()
@@ -211,4 +197,7 @@ def _distortion(value: Any, path: Path) -> tuple[float, ...]:
         raise FormatError(
             f"{path}: distortion: expected a list of 4, 5 or 8 numbers [k1, k2, p1, p2, k3, ...]."
         )
-    return tuple(_number(item, f"{path}: distortion") for item in value)
+    numbers = tuple(map(as_number, value))
+    if not np.isfinite(numbers).all():
+        raise FormatError(f"{path}: distortion: expected a finite number, got {str(value)[:80]}.")
+    return numbers

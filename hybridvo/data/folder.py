@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections import Counter
+import itertools
 from pathlib import Path
+from statistics import mode
 
 import numpy as np
 
@@ -119,14 +120,16 @@ class FolderSequence(Sequence):
         is_numbered = all(path.stem.isascii() and path.stem.isdigit() for path in (*frames, *files))
         if not is_numbered or not {path.stem for path in frames} & {path.stem for path in files}:
             return matched
-        numbers = np.array([int(path.stem) for path in frames])
-        steps = np.diff(numbers)
-        usual = Counter(steps.tolist()).most_common(1)[0][0] if len(steps) else 1
+        numbers = [int(path.stem) for path in frames]
+        usual = mode([b - a for a, b in itertools.pairwise(numbers)] or [1])
         # a flow file between two images, or an unusual step: an image is missing there
-        flow_numbers = np.sort([int(path.stem) for path in files])
-        first = np.searchsorted(flow_numbers, numbers[:-1], side="right")
-        is_gap = (first != np.searchsorted(flow_numbers, numbers[1:])) | (steps != usual)
-        lost = [k for k in np.flatnonzero(is_gap) if matched[k] is not None]
+        known = sorted({*numbers, *(int(path.stem) for path in files)})
+        follows = dict(itertools.pairwise(known))
+        lost = [
+            k
+            for k, (a, b) in enumerate(itertools.pairwise(numbers))
+            if matched[k] is not None and not follows[a] == b == a + usual
+        ]
         for k in lost:
             matched[k] = None
         if lost:

@@ -28,10 +28,7 @@ PathLike = str | os.PathLike[str]
 
 
 def read_rgb(path: PathLike) -> np.ndarray:
-    """(H, W, 3) uint8 RGB from a PNG or JPEG; grey is repeated, alpha is dropped.
-
-    EXIF orientation is not applied: the intrinsics belong to the stored pixels.
-    """
+    """(H, W, 3) uint8 RGB from a PNG or JPEG; grey is repeated, alpha is dropped."""
     return cv2.cvtColor(_decode(path, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
 
 
@@ -101,12 +98,8 @@ def read_flow_png(path: PathLike, order: tuple[int, int, int]) -> tuple[np.ndarr
 
 
 def read_cam(path: PathLike) -> tuple[np.ndarray, np.ndarray]:
-    """Intrinsics K (3, 3) and extrinsic T_cam_world (4, 4), float64, from a Sintel ``.cam`` file.
-
-    The file stores x ~ K [R|t] X_world: the extrinsic maps the world into the camera.
-    """
-    data = _read_bytes(path)
-    _check_tag(path, data, ".cam")
+    """Intrinsics K (3, 3) and extrinsic T_cam_world (4, 4) of a Sintel ``.cam`` file."""
+    data = _tagged_bytes(path, ".cam")
     _check_size(path, 4 + 21 * 8, len(data), ".cam")
     values = np.frombuffer(data, dtype="<f8", offset=4).astype(np.float64)
     if not np.isfinite(values[:9]).all():
@@ -188,18 +181,19 @@ def _check_pixels(path: object, width: int, height: int) -> None:
         )
 
 
-def _check_tag(path: object, data: bytes, suffix: str) -> None:
+def _tagged_bytes(path: PathLike, suffix: str) -> bytes:
+    data = _read_bytes(path)
     if not data.startswith(TAG_BYTES):
         raise FormatError(
             f"{path}: not a little-endian {suffix} file: expected the first bytes {TAG_BYTES!r}, "
             f"got {data[:4]!r}."
         )
+    return data
 
 
 def _read_tagged(path: PathLike, suffix: str, channels: int) -> np.ndarray:
     """(H, W, channels) of .flo and .dpt: tag, width, height, values."""
-    data = _read_bytes(path)
-    _check_tag(path, data, suffix)
+    data = _tagged_bytes(path, suffix)
     if len(data) < 12:
         raise FormatError(f"{path}: truncated: expected a header of 12 bytes, got {len(data)}.")
     width, height = struct.unpack("<ii", data[4:12])
@@ -233,7 +227,7 @@ def _decode(path: PathLike, flags: int) -> np.ndarray:
     pixels, closing = (b"IDAT", b"IEND") if is_png else (b"\xff\xda", b"\xff\xd9")
     if data.rfind(closing) <= data.rfind(pixels):
         raise FormatError(f"{path}: truncated: {len(data)} bytes end too early. {COPY_AGAIN}")
-    try:
+    try:  # orientation is ignored: the intrinsics belong to the pixels as they are stored
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error as error:
         raise FormatError(f"{path}: the image cannot be decoded ({error.err}).") from None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import re
 from collections.abc import Iterable
 from collections.abc import Sequence as Many
@@ -12,7 +11,7 @@ import numpy as np
 
 from hybridvo.errors import InputError
 from hybridvo.files import read_rows
-from hybridvo.trajectory import COLUMNS, read_poses, stamp_unit
+from hybridvo.trajectory import COLUMNS, check_increasing, read_poses, stamp_unit
 
 MAX_STAMP_DIFFERENCE_S = 0.02
 """Largest difference in seconds between stamps that belong together (the TUM tools' value)."""
@@ -63,17 +62,6 @@ def match_files(
     return found
 
 
-def warn_of_gaps(name: str, numbers: Many[int], told: list[str]) -> None:
-    """Name the frame numbers that are missing between the first and the last."""
-    spans = [
-        f"{a + 1}" if b - a == 2 else f"{a + 1} to {b - 1}"
-        for a, b in itertools.pairwise(numbers)
-        if b - a > 1
-    ]
-    if spans:
-        told.append(f"{name}: frame numbers {shown(spans)} are missing; the stamps keep the gap.")
-
-
 def shown(names: Many[object], most: int = 8) -> str:
     """The first names of a list, for a message."""
     return ", ".join(map(str, names[:most])) + (", ..." if len(names) > most else "")
@@ -96,20 +84,6 @@ def read_stamps(
     rows = read_rows(path, columns, words=words)
     stamps = to_seconds([row.numbers[0] for row in rows], path.name, told)
     return stamps, [row.words for row in rows]
-
-
-def check_increasing(stamps: np.ndarray, where: str) -> None:
-    """Refuse stamps that are not finite, go back or stand still: InputError with the frames."""
-    if not np.isfinite(stamps).all():
-        bad = int(np.flatnonzero(~np.isfinite(stamps))[0])
-        raise InputError(f"{where}: expected a finite timestamp, frame {bad} has {stamps[bad]}.")
-    back = np.flatnonzero(np.diff(stamps) <= 0)
-    if back.size:
-        i = int(back[0])
-        raise InputError(
-            f"{where}: timestamps must increase: frame {i} has {float(stamps[i])!r}, frame {i + 1} "
-            f"has {float(stamps[i + 1])!r}. Sort the list and remove duplicates."
-        )
 
 
 def numbered_poses(

@@ -62,9 +62,8 @@ def open_sequence(
         mask: folder of PNG or JPEG masks, 0 where pixels must not be used.
 
     Raises:
-        InputError: no such folder, one that cannot be read, an unknown data set, a layout that no
-            reader knows (with what was looked for), or a sequence without frames.
-        FormatError: a list or calibration file that is damaged.
+        InputError: a folder that is not there, of no known layout, or without frames.
+            FormatError: a list or calibration file that is damaged.
     """
     if dataset is not None and dataset not in READERS:
         close = difflib.get_close_matches(dataset, DATASETS, n=1)
@@ -129,8 +128,7 @@ def iter_pairs(
     callable (prev, curr), such as ``hybridvo.dis_flow()``, gives a FlowField or (H, W, 2) px.
 
     Raises:
-        InputError: a negative range; flow files asked for where there are none, or with a stride
-            above 1. The iterator raises what reading a frame raises.
+        InputError: a negative range; flow files asked for where there are none, or with a stride.
     """
     stop = len(sequence) if stop is None else min(stop, len(sequence))
     if stride < 1 or start < 0:

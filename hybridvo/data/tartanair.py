@@ -8,7 +8,7 @@ import numpy as np
 
 from hybridvo.data.base import Sequence
 from hybridvo.data.camera_file import Calibration
-from hybridvo.data.image_io import read_flow, read_flow_png, read_mask_png, read_npy, read_png
+from hybridvo.data.image_io import read_flow, read_flow_png, read_npy, read_png
 from hybridvo.data.lists import numbered_files, numbered_poses
 from hybridvo.geometry import ned_to_camera
 from hybridvo.trajectory import COLUMNS, read_poses
@@ -69,14 +69,10 @@ class TartanAirSequence(Sequence):
             flow, occluded = read_flow_png(path, (0, 1, 2))
             return flow, occluded == 0
         mask = _mask_file(path)
-        if mask is None:
-            return read_flow(path)
-        occluded = read_mask_png(mask) if mask.suffix == ".png" else read_npy(mask)
-        return read_flow(path)[0], occluded == 0
+        return read_flow(path)[0], None if mask is None else read_npy(mask) == 0
 
 
 def _mask_file(flow: Path) -> Path | None:
     """Mask beside a V1 flow file (000000_000001_mask.npy; 0 is valid)."""
-    stem = flow.name.removesuffix("_flow.npy")
-    paths = (flow.with_name(f"{stem}_mask.npy"), flow.with_name(f"{stem}_mask.png"))
-    return next((p for p in paths if p.exists()), None)
+    path = flow.with_name(flow.name.removesuffix("_flow.npy") + "_mask.npy")
+    return path if path.exists() else None

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from hybridvo.calibration import ASIDE, SETTLED_COHERENCE
-from hybridvo.compilation import njit
+from hybridvo.geometry import njit
 from hybridvo.options import Options
 from hybridvo.refinement.coarse_fit import (
     DEPTH_NOISE_CAP,

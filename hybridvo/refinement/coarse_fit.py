@@ -9,8 +9,7 @@ import math
 
 import numpy as np
 
-from hybridvo.compilation import njit
-from hybridvo.geometry import se3_exp
+from hybridvo.geometry import njit, se3_exp
 from hybridvo.refinement.kernels import (
     BLOCK,
     MU,

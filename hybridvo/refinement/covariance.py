@@ -18,7 +18,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from hybridvo.calibration import ABSORBED, CLUSTERED, FEW_TILES, LONG_GROWTH
-from hybridvo.compilation import njit
+from hybridvo.geometry import njit
 from hybridvo.refinement.kernels import (
     BLOCK,
     FASTMATH,

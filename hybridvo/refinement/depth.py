@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hybridvo.calibration import DOUBTFUL_SPREAD, NO_SPREAD
-from hybridvo.compilation import njit
+from hybridvo.geometry import njit
 from hybridvo.refinement.covariance import symmetric
 from hybridvo.refinement.kernels import (
     BLOCK,

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from hybridvo.compilation import njit
+from hybridvo.geometry import njit
 from hybridvo.refinement.kernels import (
     FASTMATH,
     MIN_DEPTH,

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hybridvo.compilation import njit
+from hybridvo.geometry import njit
 from hybridvo.refinement.kernels import (
     BLOCK,
     FASTMATH,

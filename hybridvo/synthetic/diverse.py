@@ -13,7 +13,6 @@ import cv2
 import numpy as np
 from pydantic import Field
 
-from hybridvo.errors import InputError
 from hybridvo.geometry import euler_deg_to_matrix, make_transform
 from hybridvo.options import Positive, Share, option_group
 from hybridvo.synthetic.draws import (
@@ -22,6 +21,7 @@ from hybridvo.synthetic.draws import (
     about,
     direction,
     log_uniform,
+    ordered,
     outline,
     random_silhouette,
     smooth_field,
@@ -76,18 +76,58 @@ class DiverseOptions:
     preset: Literal["diverse"] = "diverse"
 
     def __post_init__(self) -> None:
-        for name in ("static_layers", "movers"):
-            low, high = getattr(self, name)
-            if low > high:
-                raise InputError(f"{name}: expected low <= high, got {low} and {high}")
-        if not self.field_of_view_deg[1] < 175 or not self.large_coverage[1] < 1:
-            raise InputError("expected a field of view < 175 deg and a coverage < 1")
-        if self.room_probability + self.outdoor_probability > 1:
-            raise InputError("room and outdoor probabilities add up to more than 1")
+        ordered(
+            static_layers=self.static_layers,
+            movers=self.movers,
+            field_of_view_deg=(*self.field_of_view_deg, 175),
+            large_coverage=(*self.large_coverage, 1),
+            probabilities=(self.room_probability + self.outdoor_probability, 1),
+        )
 
     def sample(self, rng: np.random.Generator) -> Sample:
         """One pair."""
-        return _diverse_sample(rng, self)
+        while True:
+            scene = _Scene(rng, self)
+            angles, translation = scene.populate()
+            T = make_transform(euler_deg_to_matrix(angles), translation)
+            ego_flow, ego_ratio, flow, ratio = scene.flows(T, added=False)
+            if self._plausible(flow, ratio) and self._plausible(ego_flow, ego_ratio):
+                break
+        rho = scene.rho
+        depth = np.where(rho > 0, 1.0 / np.maximum(rho, SKY_INVERSE_DEPTH / 10), 0.0)
+        depth = depth.astype(np.float32)
+        own = np.square(flow - ego_flow)
+        hidden, depth_curr = visibility(flow, rho / ratio, rho > 0)
+        measured, depth_prev = flow, depth
+        if rng.random() < self.sky_far_probability and not rho.all():
+            far = np.float32(rng.uniform(1e3, 1e4))
+            depth_prev = np.where(rho > 0, depth, far)
+            depth_curr = np.where((rho > 0) | hidden | (depth_curr > 0), depth_curr, far)
+        if rng.random() >= self.degradation.exact_flow_probability:
+            measured = degrade_flow(rng, flow, hidden, self.degradation)
+            depth_curr = sample_at(depth_curr, measured - flow)
+        if rng.random() >= self.degradation.exact_depth_probability:
+            depth_prev, depth_curr = degrade_depth(rng, [depth_prev, depth_curr], self.degradation)
+        return Sample(
+            flow=measured,
+            ego_flow=ego_flow,
+            depth_prev=depth_prev,
+            depth_curr=depth_curr,
+            depth_true=depth,
+            depth_target=np.maximum(depth * ego_ratio, 0.0),
+            K=scene.K.astype(np.float32),
+            T_curr_prev=T.astype(np.float32),
+            rotation_deg=angles.astype(np.float32),
+            translation=translation.astype(np.float32),
+            moving=own[..., 0] + own[..., 1] > self.moving_threshold_px**2,
+        )
+
+    def _plausible(self, flow: np.ndarray, ratio: np.ndarray) -> bool:
+        """Nothing is swept through the image plane, and flow could follow the motion."""
+        limit = self.flow_limit * self.width
+        # Component by component: numpy reduces an axis of two values very slowly.
+        large = (np.abs(flow[..., 0]) > limit) | (np.abs(flow[..., 1]) > limit)
+        return bool(ratio.min() > 0.15) and np.count_nonzero(large) <= 0.01 * large.size
 
 
 class _Scene(Layers):
@@ -140,15 +180,12 @@ class _Scene(Layers):
             # A single surface has no sky: it bends away instead.
             np.maximum(rho, np.float32(0.05 / size), out=rho)
         relief = o.relief * rng.random() ** 2
-        rho *= np.exp(relief * smooth_field(rng, o.height, o.width, int(rng.integers(3, 12))))
+        rho *= np.exp(relief * smooth_field(rng, (o.height, o.width), int(rng.integers(3, 12))))
         rho[rho < SKY_INVERSE_DEPTH] = 0.0
         return np.minimum(rho, np.float32(5.0))
 
     def add(
-        self,
-        mask: np.ndarray,
-        in_front: bool,
-        inverse_depth: float | None = None,
+        self, mask: np.ndarray, in_front: bool, inverse_depth: float | None = None
     ) -> tuple[int, np.ndarray] | None:
         """Lay a curved, slanted surface over the image; its number and middle (3,), or None."""
         rng = self.rng
@@ -156,8 +193,7 @@ class _Scene(Layers):
         if not width * height:
             return None
         box = np.s_[top : top + height, left : left + width]
-        inside = mask[box] > 0
-        under = self.rho[box]
+        inside, under = mask[box] > 0, self.rho[box]
         if inverse_depth is None:
             most = max(float(np.quantile(under[::2, ::2], 0.9)), 0.1 / self.scale)
             factor = rng.uniform(0.05, 1.2) if in_front else rng.uniform(-0.9, 1.4)
@@ -171,177 +207,119 @@ class _Scene(Layers):
         if np.count_nonzero(inside & (rho > under)) < 4:
             return None
         number = len(self.motions)
-        shown = self.lay(box, inside, rho)
-        rows, columns = np.nonzero(shown)
+        rows, columns = np.nonzero(self.lay(box, inside, rho))
         return number, self.ray(left + columns.mean(), top + rows.mean()) / inverse_depth
-
-    def new_mask(self) -> np.ndarray:
-        """Empty (H, W) uint8 mask."""
-        return np.zeros((self.options.height, self.options.width), np.uint8)
 
     def ray(self, u: float, v: float) -> np.ndarray:
         """(3,) K^-1 (u, v, 1)."""
         return np.array([(u - self.cx) / self.fx, (v - self.cy) / self.fy, 1.0])
 
+    def magnitude(self, law: Law) -> float:
+        """One draw of a log-normal law."""
+        median, spread, largest = law
+        return min(median * float(np.exp(spread * self.rng.standard_normal())), largest)
 
-def _magnitude(rng: np.random.Generator, law: Law) -> float:
-    median, spread, largest = law
-    return min(median * float(np.exp(spread * rng.standard_normal())), largest)
+    def turn(self, law: Law) -> np.ndarray:
+        """(3, 3) rotation of a drawn size about a drawn axis (small angles: as Euler angles)."""
+        return euler_deg_to_matrix(self.magnitude(law) * direction(self.rng))
 
+    def camera(self, follow: bool) -> tuple[np.ndarray, np.ndarray]:
+        """Euler angles in degrees and translation in metres of the camera's T_curr_prev."""
+        o, rng = self.options, self.rng
+        angles = self.magnitude(o.camera_rotation_deg) * direction(rng)
+        seen = self.rho[::2, ::2]
+        seen = seen[seen > 0]
+        if not seen.size:
+            seen = np.array([1.0 / self.scale])
+        nearest, near = float(seen.max()), 1.0 / float(np.quantile(seen, 0.8))
+        towards = direction(rng)
+        if rng.random() < o.forward_probability:
+            towards = towards * 0.2 + np.array([0.0, 0.0, rng.choice([-1.0, -1.0, -1.0, 1.0])])
+            towards /= np.linalg.norm(towards)
+        size = self.magnitude(o.camera_translation) * near * (1.5 if follow else 1.0)
+        size = min(size, o.camera_translation_limit, 0.4 / nearest)
+        return angles, size * towards
 
-def _random_turn(rng: np.random.Generator, law: Law) -> np.ndarray:
-    """(3, 3) rotation of a drawn size about a drawn axis (small angles: Euler angles serve)."""
-    return euler_deg_to_matrix(_magnitude(rng, law) * direction(rng))
-
-
-def _camera(scene: _Scene, follow: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Euler angles in degrees and translation in metres of the camera's T_curr_prev."""
-    o, rng = scene.options, scene.rng
-    angles = _magnitude(rng, o.camera_rotation_deg) * direction(rng)
-    seen = scene.rho[::2, ::2]
-    seen = seen[seen > 0]
-    nearest = float(seen.max()) if seen.size else 1.0 / scene.scale
-    near = 1.0 / (float(np.quantile(seen, 0.8)) if seen.size else 1.0 / scene.scale)
-    towards = direction(rng)
-    if rng.random() < o.forward_probability:
-        towards = towards * 0.2 + np.array([0.0, 0.0, rng.choice([-1.0, -1.0, -1.0, 1.0])])
-        towards /= np.linalg.norm(towards)
-    size = _magnitude(rng, o.camera_translation) * near * (1.5 if follow else 1.0)
-    size = min(size, o.camera_translation_limit, 0.4 / nearest)
-    return angles, size * towards
-
-
-def _add_mover(
-    scene: _Scene,
-    shape: Silhouette,
-    mask: np.ndarray,
-    radius: float,
-    T_cam: np.ndarray,
-    follow: float,
-) -> None:
-    """Lay a mover over the scene; ``follow``: motion left where the camera follows it, else 0."""
-    o, rng = scene.options, scene.rng
-    added = scene.add(mask, in_front=True)
-    if added is None:
-        return
-    number, centre = added
-    depth = float(centre[2])
-    R = _random_turn(rng, o.object_rotation_deg)
-    t = _magnitude(rng, o.object_translation) * depth * direction(rng) * np.array([1.0, 0.6, 0.8])
-    if follow:
-        total = about(euler_deg_to_matrix(follow * 3.0 * direction(rng)), centre, follow * t)
-    else:
-        total = T_cam @ about(R, centre, t)
-    scene.motions[number] = total
-    if rng.random() < o.nonrigid_probability:
-        amplitude = np.float32(log_uniform(rng, o.bend) * depth)
-        cells = int(rng.integers(3, 8))
-        scene.bends[number] = amplitude * smooth_field(rng, o.height, o.width, cells, 3)
-    if rng.random() < o.articulated_probability:
-        points = shape.parts[0][0]
-        ray = centre / depth
-        middle = np.array([ray[0] * scene.fx + scene.cx, ray[1] * scene.fy + scene.cy])
-        for _ in range(int(rng.integers(1, 6))):
-            limb_radius = radius * rng.uniform(0.3, 0.8)
-            limb = outline(rng, "bar" if rng.random() < 0.6 else "superellipse")
-            joint = middle + radius * points[int(rng.integers(len(points)))] * 0.8
-            place = joint + limb_radius * limb[int(rng.integers(len(limb)))]
-            limb_mask = scene.new_mask()
-            Silhouette(((limb, True),)).draw(limb_mask, tuple(place.tolist()), limb_radius)
-            part = scene.add(limb_mask, True, 1.02 / depth)
-            if part is not None:
-                own = _random_turn(rng, o.limb_rotation_deg)
-                scene.motions[part[0]] = total @ about(own, scene.ray(*joint) * depth)
-
-
-def _populate(scene: _Scene) -> tuple[np.ndarray, np.ndarray]:
-    """Occluders and movers; returns the camera's Euler angles and translation."""
-    o, rng = scene.options, scene.rng
-    still = rng.random() < o.still_probability
-    large = not still and rng.random() < o.large_mover_probability
-    follow = 0.0
-    if not still and rng.random() < o.follow_probability:
-        follow = log_uniform(rng, o.follow_residual)
-
-    def random_place() -> tuple[float, float]:
-        return rng.uniform(0, o.width), rng.uniform(0, o.height)
-
-    def occluders(count: int) -> None:
-        for _ in range(count):
-            mask = scene.new_mask()
-            radius = o.width * log_uniform(rng, o.mover_radius)
-            random_silhouette(rng).draw(mask, random_place(), radius, log_uniform(rng, (0.4, 2.5)))
-            scene.add(mask, in_front=False)
-
-    occluders(int(rng.integers(o.static_layers[0], o.static_layers[1] + 1)))
-    angles, translation = _camera(scene, follow > 0)
-    T_cam = make_transform(euler_deg_to_matrix(angles), translation)
-    if large:
-        centre = rng.uniform(-0.1, 1.1) * o.width, rng.uniform(0.1, 1.1) * o.height
-        share = rng.uniform(*o.large_coverage)
-        shape = random_silhouette(rng, hole_probability=0.15)
-        mask, radius = shape.draw_coverage(
-            o.height, o.width, centre, share, log_uniform(rng, (0.5, 1.6))
+    def add_mover(
+        self, shape: Silhouette, mask: np.ndarray, radius: float, T_cam: np.ndarray, follow: float
+    ) -> None:
+        """Lay a mover over the scene; ``follow``: motion left where the camera follows, else 0."""
+        o, rng = self.options, self.rng
+        added = self.add(mask, in_front=True)
+        if added is None:
+            return
+        number, centre = added
+        depth = float(centre[2])
+        R = self.turn(o.object_rotation_deg)
+        t = (
+            self.magnitude(o.object_translation)
+            * depth
+            * direction(rng)
+            * np.array([1.0, 0.6, 0.8])
         )
-        _add_mover(scene, shape, mask, radius, T_cam, follow)
-    if not still:
-        count = int(rng.integers(o.movers[0], o.movers[1] + 1))
-        for index in range(count if large else max(count, 1)):
-            shape, mask = random_silhouette(rng), scene.new_mask()
-            radius = o.width * log_uniform(rng, o.mover_radius)
-            shape.draw(mask, random_place(), radius, log_uniform(rng, (0.4, 2.0)))
-            main = index == 0 and not large
-            _add_mover(scene, shape, mask, radius, T_cam, follow if main else 0.0)
-    if rng.random() < 0.4:
-        occluders(int(rng.integers(1, 3)))
-    return angles, translation
+        total = T_cam @ about(R, centre, t)
+        if follow:
+            total = about(euler_deg_to_matrix(follow * 3.0 * direction(rng)), centre, follow * t)
+        self.motions[number] = total
+        if rng.random() < o.nonrigid_probability:
+            amplitude = np.float32(log_uniform(rng, o.bend) * depth)
+            cells = int(rng.integers(3, 8))
+            self.bends[number] = amplitude * smooth_field(rng, (o.height, o.width), cells, 3)
+        if rng.random() < o.articulated_probability:
+            points = shape.parts[0][0]
+            ray = centre / depth
+            middle = np.array([ray[0] * self.fx + self.cx, ray[1] * self.fy + self.cy])
+            for _ in range(int(rng.integers(1, 6))):
+                limb_radius = radius * rng.uniform(0.3, 0.8)
+                limb = outline(rng, "bar" if rng.random() < 0.6 else "superellipse")
+                joint = middle + radius * points[int(rng.integers(len(points)))] * 0.8
+                place = joint + limb_radius * limb[int(rng.integers(len(limb)))]
+                limb_mask = Silhouette(((limb, True),)).draw(self.rho.shape, place, limb_radius)
+                part = self.add(limb_mask, True, 1.02 / depth)
+                if part is not None:
+                    own = self.turn(o.limb_rotation_deg)
+                    self.motions[part[0]] = total @ about(own, self.ray(*joint) * depth)
 
+    def radius(self) -> float:
+        """Size of an occluder or a mover in px."""
+        return self.options.width * log_uniform(self.rng, self.options.mover_radius)
 
-def _diverse_sample(rng: np.random.Generator, o: DiverseOptions) -> Sample:
-    while True:
-        scene = _Scene(rng, o)
-        angles, translation = _populate(scene)
+    def placed(self, shape: Silhouette, radius: float, highest: float) -> np.ndarray:
+        """Mask of an outline somewhere, stretched by 0.4 to ``highest``."""
+        o, rng = self.options, self.rng
+        place = rng.uniform(0, o.width), rng.uniform(0, o.height)
+        return shape.draw(self.rho.shape, place, radius, log_uniform(rng, (0.4, highest)))
+
+    def occlude(self, count: int) -> None:
+        """Lay things that stand still over the scene."""
+        for _ in range(count):
+            radius = self.radius()
+            self.add(self.placed(random_silhouette(self.rng), radius, 2.5), in_front=False)
+
+    def populate(self) -> tuple[np.ndarray, np.ndarray]:
+        """Occluders and movers; returns the camera's Euler angles and translation."""
+        o, rng = self.options, self.rng
+        still = rng.random() < o.still_probability
+        large = not still and rng.random() < o.large_mover_probability
+        follow = 0.0
+        if not still and rng.random() < o.follow_probability:
+            follow = log_uniform(rng, o.follow_residual)
+        self.occlude(int(rng.integers(o.static_layers[0], o.static_layers[1] + 1)))
+        angles, translation = self.camera(follow > 0)
         T_cam = make_transform(euler_deg_to_matrix(angles), translation)
-        ego_flow, ego_ratio, flow, ratio = scene.flows(T_cam, added=False)
-        if _plausible(flow, ratio, o) and _plausible(ego_flow, ego_ratio, o):
-            break
-    rho = scene.rho
-    depth = np.where(rho > 0, 1.0 / np.maximum(rho, SKY_INVERSE_DEPTH / 10), 0.0)
-    depth = depth.astype(np.float32)
-    own = np.square(flow - ego_flow)
-    moving = own[..., 0] + own[..., 1] > o.moving_threshold_px**2
-    hidden, depth_curr = visibility(flow, rho / ratio, rho > 0)
-
-    measured, depth_prev = flow, depth
-    if rng.random() < o.sky_far_probability and not rho.all():
-        far = np.float32(rng.uniform(1e3, 1e4))
-        depth_prev = np.where(rho > 0, depth, far)
-        depth_curr = np.where((rho > 0) | hidden | (depth_curr > 0), depth_curr, far)
-    if rng.random() >= o.degradation.exact_flow_probability:
-        measured = degrade_flow(rng, flow, hidden, o.degradation)
-        depth_curr = sample_at(depth_curr, measured - flow)
-    if rng.random() >= o.degradation.exact_depth_probability:
-        depth_prev, depth_curr = degrade_depth(rng, [depth_prev, depth_curr], o.degradation)
-    return Sample(
-        flow=measured,
-        ego_flow=ego_flow,
-        depth_prev=depth_prev,
-        depth_curr=depth_curr,
-        depth_true=depth,
-        depth_target=np.maximum(depth * ego_ratio, 0.0),
-        K=scene.K.astype(np.float32),
-        T_curr_prev=T_cam.astype(np.float32),
-        rotation_deg=angles.astype(np.float32),
-        translation=translation.astype(np.float32),
-        moving=moving,
-    )
-
-
-def _plausible(flow: np.ndarray, ratio: np.ndarray, o: DiverseOptions) -> bool:
-    """Nothing is swept through the image plane, and a flow estimator could follow the motion."""
-    if not ratio.min() > 0.15:
-        return False
-    # Component by component: numpy reduces an axis of two values very slowly.
-    limit = o.flow_limit * o.width
-    large = (np.abs(flow[..., 0]) > limit) | (np.abs(flow[..., 1]) > limit)
-    return np.count_nonzero(large) <= 0.01 * large.size
+        if large:
+            centre = rng.uniform(-0.1, 1.1) * o.width, rng.uniform(0.1, 1.1) * o.height
+            share = rng.uniform(*o.large_coverage)
+            shape, stretch = random_silhouette(rng, 0.15), log_uniform(rng, (0.5, 1.6))
+            mask, radius = shape.draw_coverage(self.rho.shape, centre, share, stretch)
+            self.add_mover(shape, mask, radius, T_cam, follow)
+        if not still:
+            count = int(rng.integers(o.movers[0], o.movers[1] + 1))
+            for index in range(count if large else max(count, 1)):
+                shape, radius = random_silhouette(rng), self.radius()
+                main = index == 0 and not large
+                mask = self.placed(shape, radius, 2.0)
+                self.add_mover(shape, mask, radius, T_cam, follow if main else 0.0)
+        if rng.random() < 0.4:
+            self.occlude(int(rng.integers(1, 3)))
+        return angles, translation

@@ -29,6 +29,13 @@ Range = Annotated[tuple[float, float], AfterValidator(_ordered)]
 """Two positive limits of an option."""
 
 
+def ordered(**limits: tuple[float, ...]) -> None:
+    """Refuse numbers of an option that do not grow."""
+    for name, values in limits.items():
+        if list(values) != sorted(values):
+            raise InputError(f"{name}: expected growing values, got {values}")
+
+
 HELD_OUT, TRAINING, STORED = range(3)
 """What samples are drawn for; none of one kind is one of another, whatever the seeds."""
 
@@ -130,14 +137,14 @@ def sway(rng: np.random.Generator, frames: int, rate: float) -> np.ndarray:
 
 
 def smooth_field(
-    rng: np.random.Generator, height: int, width: int, cells: int, channels: int = 1
+    rng: np.random.Generator, size: tuple[int, ...], cells: int, channels: int = 1
 ) -> np.ndarray:
     """(H, W[, C]) float32 Gaussian field of about unit spread with ``cells`` knots per height."""
-    rows = max(cells, 2)
-    columns = max(round(cells * width / max(height, 1)), 2)
+    height, width = size
+    rows, columns = max(cells, 2), max(round(cells * width / max(height, 1)), 2)
     coarse = rng.standard_normal((rows, columns, channels), dtype=np.float32)
     field = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
-    return field.reshape(height, width, channels) if channels > 1 else field.reshape(height, width)
+    return field.reshape(height, width, channels) if channels > 1 else field.reshape(size)
 
 
 KINDS = ("superellipse", "polygon", "star", "bar")
@@ -145,35 +152,33 @@ KINDS = ("superellipse", "polygon", "star", "bar")
 
 def outline(rng: np.random.Generator, kind: str) -> np.ndarray:
     """(N, 2) closed outline around the origin, within the unit circle, turned by a random angle."""
-    if kind == "superellipse":
-        angle = np.linspace(0.0, 2 * np.pi, 48, endpoint=False)
-        exponent = 2.0 / np.exp(rng.uniform(np.log(0.7), np.log(6.0)))
-        cos, sin = np.cos(angle), np.sin(angle)
-        points = np.stack(
-            [np.sign(cos) * np.abs(cos) ** exponent, np.sign(sin) * np.abs(sin) ** exponent], axis=1
-        )
+    if kind == "bar":
+        half = rng.uniform(0.03, 0.18)
+        points = np.array([[-1.0, -half], [1.0, -half], [1.0, half], [-1.0, half]])
+    elif kind == "superellipse":
+        exponent = 2.0 / log_uniform(rng, (0.7, 6.0))
+        points = _unit(np.linspace(0.0, 2 * np.pi, 48, endpoint=False))
+        points = np.sign(points) * np.abs(points) ** exponent
         points[:, 1] *= rng.uniform(0.3, 1.0)
     elif kind == "polygon":
         corners = int(rng.integers(3, 10))
         angle = 2 * np.pi * (np.arange(corners) + rng.uniform(-0.35, 0.35, corners)) / corners
-        points = rng.uniform(0.45, 1.0, corners)[:, None] * np.stack(
-            [np.cos(angle), np.sin(angle)], axis=1
-        )
-    elif kind == "star":
+        points = rng.uniform(0.45, 1.0, corners)[:, None] * _unit(angle)
+    else:
         angle = np.linspace(0.0, 2 * np.pi, 64, endpoint=False)
         radius = np.ones_like(angle)
         for k in range(2, 8):
             amplitude = rng.uniform(0.0, 0.7) / k
             radius += amplitude * np.cos(k * angle + rng.uniform(0.0, 2 * np.pi))
-        radius = np.maximum(radius, 0.15)
-        points = radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    else:
-        half = rng.uniform(0.03, 0.18)
-        points = np.array([[-1.0, -half], [1.0, -half], [1.0, half], [-1.0, half]])
+        points = np.maximum(radius, 0.15)[:, None] * _unit(angle)
     points /= np.sqrt((points**2).sum(axis=1).max())
     heading = rng.uniform(0.0, 2 * np.pi)
     c, s = np.cos(heading), np.sin(heading)
     return points @ np.array([[c, s], [-s, c]])
+
+
+def _unit(angle: np.ndarray) -> np.ndarray:
+    return np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,46 +188,37 @@ class Silhouette:
     parts: tuple[tuple[np.ndarray, bool], ...]
 
     def draw(
-        self,
-        mask: np.ndarray,
-        centre: tuple[float, float],
-        radius: float,
-        stretch: float = 1.0,
-    ) -> None:
-        """Paint into an (H, W) uint8 mask of its own: ``centre`` (u, v) and ``radius`` of one unit
-        in px, ``stretch`` horizontal over vertical scale.
+        self, size: tuple[int, int], centre: ArrayLike, radius: float, stretch: float = 1.0
+    ) -> np.ndarray:
+        """(H, W) uint8 mask of a size: ``centre`` (u, v) and ``radius`` of one unit in px,
+        ``stretch`` horizontal over vertical scale.
         """
-        limit = 8 * max(mask.shape)
+        mask = np.zeros(size, np.uint8)
+        limit = 8 * max(size)
         scale = np.array([radius * np.sqrt(stretch), radius / np.sqrt(stretch)])
         for points, adds in self.parts:
             pixels = np.clip(points * scale + centre, -limit, limit)
             sixteenths = np.round(pixels * 16).astype(np.int32)
             cv2.fillPoly(mask, [sixteenths], int(adds), cv2.LINE_8, 4)
+        return mask
 
     def draw_coverage(
-        self,
-        height: int,
-        width: int,
-        centre: tuple[float, float],
-        share: float,
-        stretch: float = 1.0,
+        self, size: tuple[int, int], centre: ArrayLike, share: float, stretch: float = 1.0
     ) -> tuple[np.ndarray, float]:
-        """(H, W) uint8 mask and radius in px at which about ``share`` of the image is covered."""
-        low, high = 0.0, 4.0 * float(np.hypot(height, width))
-        best = np.zeros((height, width), np.uint8)
-        radius = low
+        """Mask and radius in px at which about ``share`` of the image is covered."""
+        low, high = 0.0, 4.0 * float(np.hypot(*size))
+        best, radius = np.zeros(size, np.uint8), 0.0
         for _ in range(12):
             middle = 0.5 * (low + high)
-            mask = np.zeros((height, width), np.uint8)
-            self.draw(mask, centre, middle, stretch)
+            mask = self.draw(size, centre, middle, stretch)
             covered = cv2.countNonZero(mask) / mask.size
-            if covered <= share:
-                low = radius = middle
-                best = mask
-                if covered > share - 0.01:
-                    break
-            else:
+            if covered > share:
                 high = middle
+                continue
+            low = radius = middle
+            best = mask
+            if covered > share - 0.01:
+                break
         return best, radius
 
 
@@ -250,8 +246,7 @@ def silhouette_mask(rng: np.random.Generator, size: int) -> np.ndarray:
         low, high = added.min(axis=0), added.max(axis=0)
         radius = size / float((high - low).max())
         centre = (size - 1) / 2 - radius * (low + high) / 2
-        mask = np.zeros((size, size), np.uint8)
-        shape.draw(mask, (float(centre[0]), float(centre[1])), radius)
+        mask = shape.draw((size, size), centre, radius)
         left, top, width, height = cv2.boundingRect(mask)
         # A hole can swallow a small shape; a mover without pixels would be none.
         if width * height and cv2.countNonZero(mask) > 0.02 * mask.size:

@@ -19,7 +19,7 @@ from pydantic import Field
 from hybridvo.errors import InputError
 from hybridvo.geometry import euler_deg_to_matrix, make_transform
 from hybridvo.options import Positive, Share, option_group
-from hybridvo.synthetic.draws import silhouette_mask
+from hybridvo.synthetic.draws import ordered, silhouette_mask
 
 MIN_RATIO = np.float32(1e-6)
 """Added to |z' / z|: the flow of a point in the image plane stays finite."""
@@ -95,9 +95,8 @@ class Layers:
         paper does); else they contain the camera's and replace it.
         """
         focal = (float(self.K[0, 0]), float(self.K[1, 1]))
-        T = T_curr_prev
-        t = T[:3, 3].astype(np.float32)
-        u, v, ego_ratio = rigid_flow(self.x, self.y, self.rho, T[:3, :3], t, focal)
+        R, t = T_curr_prev[:3, :3], T_curr_prev[:3, 3].astype(np.float32)
+        u, v, ego_ratio = rigid_flow(self.x, self.y, self.rho, R, t, focal)
         ego_flow = np.stack([u, v], axis=-1)
         flow, ratio = ego_flow.copy(), ego_ratio.copy()
         for number, motion in enumerate(self.motions):
@@ -107,20 +106,18 @@ class Layers:
                 continue
             box = np.s_[top : top + height, left : left + width]
             inside = mask[box] > 0
-            t = motion[:3, 3].astype(np.float32)
+            R, t = motion[:3, :3], motion[:3, 3].astype(np.float32)
             bend = self.bends[number]
             if bend is not None:
                 t = np.moveaxis(t + bend[box], -1, 0)
-            u, v, change = rigid_flow(
-                self.x[box[1]], self.y[box[0]], self.rho[box], motion[:3, :3], t, focal
-            )
-            own = np.stack([u, v], axis=-1)
+            x, y = self.x[box[1]], self.y[box[0]]
+            u, v, change = rigid_flow(x, y, self.rho[box], R, t, focal)
+            own = np.stack([u, v], axis=-1)[inside]
             if added:
-                flow[box][inside] += own[inside]
+                flow[box][inside] += own
                 ratio[box][inside] += change[inside] - 1.0
             else:
-                flow[box][inside] = own[inside]
-                ratio[box][inside] = change[inside]
+                flow[box][inside], ratio[box][inside] = own, change[inside]
         return ego_flow, ego_ratio, flow, ratio
 
 
@@ -194,8 +191,7 @@ class TailSampler:
     core_std: Positive
 
     def __post_init__(self) -> None:
-        if not self.low < self.high:
-            raise InputError(f"expected low < high, got {self.low} and {self.high}")
+        ordered(limits=(self.low, self.high))
 
     def draw(self, rng: np.random.Generator, low: float | None = None) -> float:
         """One value; ``low`` replaces the lower limit where the scene demands it."""
@@ -208,9 +204,7 @@ class TailSampler:
                 value = np.sign(value) * abs(value) ** self.power
             if low <= value <= self.high:
                 return float(value)
-        raise InputError(
-            f"TailSampler: none of 10 000 draws of {self} fell into [{low}, {self.high}]."
-        )
+        raise InputError(f"None of 10 000 draws of {self} fell into [{low}, {self.high}].")
 
 
 ThreeSamplers = tuple[TailSampler, TailSampler, TailSampler]
@@ -275,16 +269,13 @@ class PaperOptions:
     preset: Literal["paper"] = "paper"
 
     def __post_init__(self) -> None:
-        if not self.focal_low <= self.focal_high:
-            raise InputError("expected focal_low <= focal_high")
-        if not self.background_low < self.background_high <= self.background_far:
-            raise InputError("expected background_low < background_high <= background_far")
         mean, spread, low, high = self.object_size
-        if not (low < high and low - 3 * spread < mean < high + 3 * spread):
-            raise InputError(
-                f"object_size: expected (mean, spread, low, high) with low < high, got "
-                f"{self.object_size}"
-            )
+        ordered(
+            focal=(self.focal_low, self.focal_high),
+            background=(self.background_low, self.background_high, self.background_far),
+            object_size=(mean - 3 * spread, high),
+            object_sizes=(low, min(high, mean + 3 * spread)),
+        )
 
     def sample(self, rng: np.random.Generator) -> Sample:
         """One pair by the five steps."""
@@ -351,13 +342,11 @@ def _place(rng: np.random.Generator, o: PaperOptions) -> tuple[tuple[slice, slic
     mask = silhouette_mask(rng, max(int(o.width * share), 2))
     if rng.random() < 0.5:
         mask = mask[:, ::-1]
-    margins = int(o.height * o.canvas_margin), int(o.width * o.canvas_margin)
-    box = []
-    crop = []
-    for size, margin, extent in zip((o.height, o.width), margins, mask.shape, strict=True):
+    box, crop = [], []
+    for size, extent in zip((o.height, o.width), mask.shape, strict=True):
+        margin = int(size * o.canvas_margin)
         start = int(rng.integers(0, max(size + 2 * margin - extent, 0) + 1)) - margin
-        first, last = max(start, 0), min(start + extent, size)
-        last = max(first, last)
+        first, last = np.clip((start, start + extent), 0, size).tolist()
         box.append(slice(first, last))
         crop.append(slice(first - start, last - start))
     return (box[0], box[1]), mask[crop[0], crop[1]]

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from hybridvo.compilation import njit
-from hybridvo.geometry import backproject
+from hybridvo.geometry import backproject, njit
+from hybridvo.synthetic.sensors import depth_jump
 from hybridvo.types import Camera, Frame
 
 TEAR = 0.06
@@ -25,6 +25,11 @@ class Surface:
     measured: np.ndarray
     inside: np.ndarray
 
+    @property
+    def centre(self) -> np.ndarray:
+        """(3,) mean of the points inside."""
+        return (self.points[self.inside] if self.inside.any() else self.points[0]).mean(axis=0)
+
 
 @dataclass(eq=False)
 class Canvas:
@@ -39,13 +44,9 @@ class Canvas:
         self, surface: Surface, points: np.ndarray, moving: np.ndarray, camera: Camera
     ) -> None:
         """Add a surface with its points where they are now, nearest wins."""
-        marks = surface.measured, moving
-        mesh = np.empty((*surface.measured.shape, 5), np.float32)
-        mesh[..., :3], mesh[..., 3], mesh[..., 4] = surface.image, *marks
-        out = np.empty((*self.depth.shape, 5), np.float32)
-        out[..., :3], out[..., 3], out[..., 4] = self.image, self.measured, self.moving
-        before = self.depth.copy()
-        z = np.ascontiguousarray(points[..., 2], np.float32)
+        mesh = np.dstack([surface.image, surface.measured, moving]).astype(np.float32)
+        out = np.dstack([self.image, self.measured, self.moving]).astype(np.float32)
+        before, z = self.depth.copy(), np.ascontiguousarray(points[..., 2], np.float32)
         _rasterise(image_points(points, camera), z, mesh, surface.inside, self.depth, out)
         # silhouettes are mixed pixels
         drawn = (self.depth != before).astype(np.float32)
@@ -59,10 +60,8 @@ def image_points(points: np.ndarray, camera: Camera) -> np.ndarray:
     z = points[..., 2]
     front = z > 1e-3
     inverse = 1.0 / np.where(front, z, 1.0)
-    uv = np.empty((*z.shape, 2), np.float32)
-    uv[..., 0] = np.where(front, camera.fx * points[..., 0] * inverse + camera.cx, -1e4)
-    uv[..., 1] = camera.fy * points[..., 1] * inverse + camera.cy
-    return uv
+    u = np.where(front, camera.fx * points[..., 0] * inverse + camera.cx, -1e4)
+    return np.dstack([u, camera.fy * points[..., 1] * inverse + camera.cy]).astype(np.float32)
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
@@ -127,8 +126,7 @@ def surface_of(frame: Frame) -> Surface:
     """Everything that a frame shows, as a mesh that is torn nowhere but measured only on planes."""
     assert frame.depth is not None and frame.rgb is not None
     depth, known = filled_depth(frame.depth)
-    jump = cv2.dilate(depth, np.ones((3, 3))) - cv2.erode(depth, np.ones((3, 3)))
-    measured = known & (jump < 2 * TEAR * depth)
+    measured = known & (depth_jump(depth) < 2 * TEAR * depth)
     points = backproject(depth, frame.camera).astype(np.float32)
     inside = np.ones(depth.shape, np.bool_)
     return Surface(points, frame.rgb.astype(np.float32), measured.astype(np.float32), inside)

@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from hybridvo.compilation import njit
+from hybridvo.geometry import njit
 
 BOX, ELLIPSOID, CYLINDER = range(3)
 """Cube [-1, 1]^3 (seen from inside it is a room); unit sphere; radius 1 about the y axis,

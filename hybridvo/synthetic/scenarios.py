@@ -7,6 +7,7 @@ figures.
 from __future__ import annotations
 
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,7 +15,7 @@ import cv2
 import numpy as np
 
 from hybridvo.errors import InputError
-from hybridvo.geometry import ego_flow, make_transform, se3_exp
+from hybridvo.geometry import ego_flow, make_transform, pixel_grid, se3_exp
 from hybridvo.synthetic.draws import about, direction, turn
 from hybridvo.types import Camera, Frame, FramePair
 
@@ -30,6 +31,10 @@ class Scenario:
         outliers: share of the pixels whose flow has a gross error of up to 60 px.
         rotation_deg, translation_m: largest angle and length.
         scene: ``structured`` (1-30 m), ``plane`` (one oblique plane) or ``far`` (60-200 m).
+        depth_quadratic: c of a further error of depth with the standard deviation c z^2, 1/m.
+        baseline_m: of a depth sensor of two eyes, or of an eye and a projector, the second one on
+            the right: what only one of them sees has no depth. 0: all has. At a width of 1024:
+        disparity_step_px: of the disparities that it states; 0: exact.
     """
 
     moving: float = 0.3
@@ -41,6 +46,9 @@ class Scenario:
     translation_m: float = 0.3
     min_translation_m: float = 0.0
     scene: str = "structured"
+    depth_quadratic: float = 0.0
+    baseline_m: float = 0.0
+    disparity_step_px: float = 0.0
 
 
 MAIN_SCENARIOS: dict[str, Scenario] = {
@@ -64,9 +72,17 @@ DEGENERATE_SCENARIOS: dict[str, Scenario] = {
 }
 """Motions and scenes in which some direction of the motion is weak."""
 
+SENSOR_SCENARIOS: dict[str, Scenario] = {
+    "structured_light": Scenario(depth_noise=0.0, depth_quadratic=0.0015, baseline_m=0.075),
+    "stereo": Scenario(depth_noise=0.0, disparity_step_px=0.125, baseline_m=0.12),
+    "shadows": Scenario(baseline_m=0.25),
+}
+"""Depth as Kinect's projector and stereo cameras measure it; wide borders and strips without."""
+
 SCENARIOS: dict[str, Scenario] = {
     **MAIN_SCENARIOS,
     **DEGENERATE_SCENARIOS,
+    **SENSOR_SCENARIOS,
     "one60": Scenario(moving=0.6, objects=1),
 }
 """Every cell by name."""
@@ -95,24 +111,23 @@ def make_pair(
         cell = SCENARIOS[cell]
     if seed < 0 or min(height, width) < 16:
         raise InputError(
-            f"make_pair: expected seed >= 0 and at least 16x16 pixels, "
-            f"got seed {seed} and {height}x{width}."
+            f"make_pair: expected seed >= 0 and at least 16x16 pixels, got seed {seed} and "
+            f"{height}x{width}."
         )
     rng = np.random.default_rng([zlib.crc32(name.encode()), int(seed)])
     focal = 1120.0 * width / 1024
     camera = Camera(focal, focal, (width - 1) / 2, (height - 1) / 2, height, width)
-    T = _motion(rng, cell)
+    angle_deg = rng.uniform(0, cell.rotation_deg)
+    length = rng.uniform(cell.min_translation_m, cell.translation_m)
+    T = make_transform(turn(rng, angle_deg), length * direction(rng))
     depth = _scene(rng, cell, height, width)
     label = _objects(rng, cell, depth)
     x, y, z = _moved(rng, cell, T, camera, depth, label)
-    target_x = focal * x / z + camera.cx
-    target_y = focal * y / z + camera.cy
-    flow_true = np.empty((height, width, 2), dtype=np.float32)
-    flow_true[..., 0] = target_x - np.arange(width)
-    flow_true[..., 1] = target_y - np.arange(height)[:, None]
+    target = np.stack([focal * x / z + camera.cx, focal * y / z + camera.cy], axis=-1)
+    flow_true = (target - pixel_grid(height, width)).astype(np.float32)
     flow, outlier = _measured(rng, cell, flow_true)
-    depth_curr = _splat(target_x, target_y, z)
-    depths = _with_noise(rng, cell, depth), _with_noise(rng, cell, depth_curr)
+    depth_curr = _splat(target, z)
+    depths = [_sensed(rng, cell, d, focal) for d in (depth, depth_curr)]
     truth = {
         "T_curr_prev": T,
         "depth_true": depth,
@@ -121,15 +136,12 @@ def make_pair(
         "outlier": outlier,
         "flow_true": flow_true,
     }
-    return _pair(*depths, camera, flow), truth
+    return _pair(depths, camera, flow), truth
 
 
-def _pair(
-    depth_prev: np.ndarray, depth_curr: np.ndarray | None, camera: Camera, flow: np.ndarray
-) -> FramePair:
+def _pair(depths: Sequence[np.ndarray | None], camera: Camera, flow: np.ndarray) -> FramePair:
     """A pair of frames without images, a tenth of a second apart."""
-    prev = Frame(None, depth_prev, camera, timestamp=0.0, index=0)
-    curr = Frame(None, depth_curr, camera, timestamp=0.1, index=1)
+    prev, curr = (Frame(None, d, camera, 0.1 * i, i) for i, d in enumerate(depths))
     return FramePair(prev, curr, flow, flow_source="synthetic", depth_source="synthetic")
 
 
@@ -159,14 +171,8 @@ def make_model_pair(
     flow_true = ego_flow(depth, T, camera, camera)
     flow = flow_true + flow_noise_px * rng.standard_normal(flow_true.shape)
     measured = depth * np.exp(depth_noise * rng.standard_normal(depth.shape))
-    pair = _pair(measured.astype(np.float32), None, camera, flow.astype(np.float32))
+    pair = _pair([measured.astype(np.float32), None], camera, flow.astype(np.float32))
     return pair, {"T_curr_prev": T, "depth_true": depth, "flow_true": flow_true}
-
-
-def _motion(rng: np.random.Generator, cell: Scenario) -> np.ndarray:
-    angle_deg = rng.uniform(0, cell.rotation_deg)
-    length = rng.uniform(cell.min_translation_m, cell.translation_m)
-    return make_transform(turn(rng, angle_deg), length * direction(rng))
 
 
 def _moved(
@@ -283,28 +289,45 @@ def _objects(rng: np.random.Generator, cell: Scenario, depth: np.ndarray) -> np.
     return np.ascontiguousarray(label)
 
 
-def _with_noise(rng: np.random.Generator, cell: Scenario, depth: np.ndarray) -> np.ndarray:
-    if cell.depth_noise == 0:
-        return np.ascontiguousarray(depth, dtype=np.float32)
+def _sensed(
+    rng: np.random.Generator, cell: Scenario, depth: np.ndarray, focal: float
+) -> np.ndarray:
+    """(H, W) float32 depth as it is measured, NaN where it is not."""
     height, width = depth.shape
-    noise = rng.standard_normal(depth.shape, dtype=np.float32)
-    noise += _smooth(rng, height, width, 24)
-    noise *= np.float32(cell.depth_noise * np.sqrt(0.5))
-    return np.ascontiguousarray(depth * np.exp(noise), dtype=np.float32)
+    out = depth.astype(np.float32)
+    if cell.depth_noise:
+        noise = rng.standard_normal(depth.shape, dtype=np.float32)
+        noise += _smooth(rng, height, width, 24)
+        noise *= np.float32(cell.depth_noise * np.sqrt(0.5))
+        out = (depth * np.exp(noise)).astype(np.float32)
+    if cell.depth_quadratic:
+        error = rng.standard_normal(depth.shape) * cell.depth_quadratic * depth
+        out *= np.clip(1 + error, 0.1, None).astype(np.float32)
+    if cell.baseline_m:
+        disparity = focal * cell.baseline_m / depth
+        seen_at = np.where(np.isnan(disparity), np.inf, np.arange(width) - disparity)
+        # what is farther to the right and yet seen at the same place there stands in front
+        cover = np.minimum.accumulate(seen_at[:, ::-1], axis=1)[:, ::-1]
+        out[(seen_at > cover) | (seen_at < 0)] = np.nan
+        if cell.disparity_step_px:
+            step = cell.disparity_step_px * width / 1024
+            steps = np.maximum(np.rint(focal * cell.baseline_m / out / step), 1.0)
+            out = (focal * cell.baseline_m / (steps * step)).astype(np.float32)
+    return np.ascontiguousarray(out)
 
 
-def _splat(target_x: np.ndarray, target_y: np.ndarray, z: np.ndarray) -> np.ndarray:
+def _splat(target: np.ndarray, z: np.ndarray) -> np.ndarray:
     """(H, W) float32 depth on the current grid: nearest surface that lands on each pixel."""
     height, width = z.shape
-    column, row = np.rint(target_x), np.rint(target_y)
+    place = np.rint(target)
     value = z.copy()
-    for axis, offset in ((1, column - target_x), (0, row - target_y)):
-        slope = np.gradient(z, axis=axis)
+    for axis in (0, 1):
+        slope = np.gradient(z, axis=1 - axis)
         # a depth edge is no slope
         slope[np.abs(slope) > 0.02 * z] = 0.0
-        value += slope * offset
-    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height) & (z > 0)
-    index = (row[inside] * width + column[inside]).astype(np.intp)
+        value += slope * (place - target)[..., axis]
+    inside = ((place >= 0) & (place < (width, height))).all(axis=-1) & (z > 0)
+    index = (place[inside] @ (1, width)).astype(np.intp)
     depth = np.full(height * width, np.inf, dtype=np.float32)
     np.minimum.at(depth, index, value[inside].astype(np.float32))
     depth[np.isinf(depth)] = np.nan

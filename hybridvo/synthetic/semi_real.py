@@ -30,6 +30,7 @@ from hybridvo.synthetic.meshes import (
     surface_of,
     transformed,
 )
+from hybridvo.synthetic.sensors import depth_jump
 from hybridvo.types import Camera, Frame, FramePair
 
 PIXELS = 76_800
@@ -168,6 +169,17 @@ def draw_pair(
     world = worlds[int(rng.choice(len(worlds), p=share / share.sum()))]
     at = int(rng.integers(len(world.frames)))
     canvases, T, camera = _world(rng, world, at)
+    # distance and darkness take contrast
+    contrast = rng.uniform(0.25, 1.0) if rng.random() < 0.5 else 1.0
+    for canvas in canvases:
+        canvas.image = canvas.image * np.float32(contrast) + np.float32(90 * (1 - contrast))
+    # movers show other recordings, or other places of the same one
+    frames = [
+        frame
+        for r in recordings
+        for k, frame in enumerate(r.frames)
+        if r is not world or abs(k - at) > APART
+    ]
     if movers is None:
         movers = int(rng.choice(5, p=(0.12, 0.4, 0.24, 0.14, 0.1)))
     coverage = rng.uniform(0.1, 0.8)
@@ -175,7 +187,7 @@ def draw_pair(
     for tried in range(movers + 4 if movers else 0):
         if tried >= movers and canvases[0].moving.mean() > 0.7 * coverage:
             break
-        frame = _elsewhere(rng, recordings, world, at)
+        frame = frames[int(rng.integers(len(frames)))]
         side = 1.6 * np.sqrt(coverage / movers * camera.height * camera.width)
         mover = _cut(rng, frame, int(side), canvases[0], camera)
         if mover is None:
@@ -197,60 +209,40 @@ def draw_pair(
     return KnownPair(pair, T, depth, first.moving > 0.5, world.source.path)
 
 
-def _elsewhere(
-    rng: np.random.Generator, recordings: Sequence[Recording], world: Recording, at: int
-) -> Frame:
-    """A frame of another recording, or of the same one from another place."""
-    frames = [(r, k) for r in recordings for k in range(len(r.frames))]
-    frames = [(r, k) for r, k in frames if r is not world or abs(k - at) > APART]
-    recording, k = frames[int(rng.integers(len(frames)))]
-    return recording.frames[k]
-
-
 def _world(
     rng: np.random.Generator, recording: Recording, at: int
 ) -> tuple[list[Canvas], np.ndarray, Camera]:
     """Two views of a recording about a frame, the motion between them and their camera."""
-    height, width = (round(MARGIN * side) for side in recording.frames[0].camera.shape)
     full = recording.frames[0].camera
+    height, width = (round(MARGIN * side) for side in full.shape)
     v0, u0 = (full.height - height) // 2, (full.width - width) // 2
     camera = Camera(full.fx, full.fy, full.cx - u0, full.cy - v0, height, width)
     pairs = [pair for pair in recording.pairs if pair[0] == at]
+    canvases = []
     if pairs and rng.random() < 0.65:
         i, j, T = pairs[int(rng.integers(len(pairs)))]
         if rng.random() < 0.5:
             i, j, T = j, i, invert(T)
         window = np.s_[v0 : v0 + height, u0 : u0 + width]
-        canvases = []
         for frame in (recording.frames[i], recording.frames[j]):
             assert frame.depth is not None and frame.rgb is not None
             depth, known = (x[window].copy() for x in filled_depth(frame.depth))
             image = frame.rgb[window].astype(np.float32)
             canvases.append(Canvas(image, depth, known.astype(np.float32), np.zeros_like(depth)))
-        _paler(rng, canvases)
         return canvases, T, camera
     surface = surface_of(recording.frames[at])
     near = float(np.median(surface.points[..., 2]))
     shift_px, turn_px = log_uniform(rng, (0.5, 16)), log_uniform(rng, (0.5, 16))
     step = rng.standard_normal(6) * np.repeat([near * shift_px, turn_px], 3) / camera.fx / 1.5
     half = se3_exp(np.clip(step / 2, -0.3 * near, 0.3 * near))
-    canvases = []
+    nothing = np.zeros((height, width), np.float32)
     for pose in (invert(half), half):
-        nothing = np.zeros((height, width), np.float32)
         image = np.full((height, width, 3), 8, np.float32)
         canvas = Canvas(image, np.full_like(nothing, 1e3), nothing, nothing)
         points = transformed(surface.points, pose)
         canvas.draw(surface, points, np.zeros(points.shape[:2]), camera)
         canvases.append(canvas)
-    _paler(rng, canvases)
     return canvases, half @ half, camera
-
-
-def _paler(rng: np.random.Generator, canvases: list[Canvas]) -> None:
-    """Take contrast from a world at times, as distance and darkness do."""
-    contrast = rng.uniform(0.25, 1.0) if rng.random() < 0.5 else 1.0
-    for canvas in canvases:
-        canvas.image = canvas.image * np.float32(contrast) + np.float32(90 * (1 - contrast))
 
 
 def _cut(
@@ -272,8 +264,7 @@ def _cut(
     middle = float(np.median(z[mask & (measured > 0)]))
     mask &= np.abs(z - middle) < rng.uniform(0.15, 0.8) * middle
     if rng.random() < 0.5:  # ragged, as what a sensor sees of hair and leaves
-        height, width = mask.shape
-        mask &= smooth_field(rng, height, width, 12) > -1.3
+        mask &= smooth_field(rng, mask.shape, 12) > -1.3
     # rays turned to where it goes; any scaling of a rigid thing is one
     centre = points[h // 2, min(w, mask.shape[1]) // 2]
     to = rng.uniform(0.0, 1.0, 2) * (camera.width - 1, camera.height - 1)
@@ -289,12 +280,11 @@ def _cut(
 
 def _own_motion(
     rng: np.random.Generator, mover: Surface, T: np.ndarray, camera: Camera
-) -> tuple[np.ndarray, str]:
-    """(4, 4) from the first view to the second, and its kind."""
-    centre = mover.points[mover.inside].mean(axis=0) if mover.inside.any() else mover.points[0, 0]
+) -> tuple[np.ndarray, bool]:
+    """(4, 4) from the first view to the second, and whether the mover does move."""
     kind = str(rng.choice(["slide", "turn", "both", "approach", "follow", "stand"],
                           p=(0.32, 0.12, 0.24, 0.1, 0.16, 0.06)))  # fmt: skip
-    step = np.zeros(6)
+    centre, step = mover.centre, np.zeros(6)
     if kind in ("slide", "both", "follow"):
         reach = (0.05, 2.0) if kind == "follow" else (1.5, 25.0)
         px = log_uniform(rng, reach) / camera.fx
@@ -304,26 +294,22 @@ def _own_motion(
     if kind == "approach":
         step[:3] = centre * rng.uniform(-0.12, 0.12)
     own = about(_turned(step[3:]), centre, step[:3])
-    return (own if kind == "follow" else T @ own), kind
+    return (own if kind == "follow" else T @ own), kind != "stand"
 
 
 def _moved(
-    rng: np.random.Generator, mover: Surface, motion: np.ndarray, kind: str, camera: Camera
+    rng: np.random.Generator, mover: Surface, motion: np.ndarray, moves: bool, camera: Camera
 ) -> np.ndarray:
     """(h, w, 3) where a mover's points are in the second view: on a hinge, or not quite rigid."""
-    points = mover.points
+    points, centre = mover.points, mover.centre
     out = transformed(points, motion)
-    if kind == "stand":
-        return out
-    centre = points[mover.inside].mean(axis=0) if mover.inside.any() else points.mean((0, 1))
-    if rng.random() < 0.2:
+    if moves and rng.random() < 0.2:
         side = (points[..., :2] - centre[:2]) @ rng.standard_normal(2) > 0
         swing = rng.standard_normal(6) * log_uniform(rng, (0.03, 0.25))
         other = motion @ about(_turned(swing[3:]), centre)
         out = np.where(side[..., None], transformed(points, other), out)
-    if rng.random() < 0.4:
-        height, width = points.shape[:2]
-        wobble = smooth_field(rng, height, width, 5, 3)
+    if moves and rng.random() < 0.4:
+        wobble = smooth_field(rng, points.shape[:2], 5, 3)
         out = out + wobble * np.float32(rng.uniform(0, 0.5) * centre[2] / camera.fx)
     return out
 
@@ -344,24 +330,23 @@ def _sensed(rng: np.random.Generator, canvas: Canvas, camera: Camera) -> Frame:
     image = image + noise * np.float32(log_uniform(rng, (0.7, 4.0)))
     rgb = np.clip(image, 0, 255).astype(np.uint8)
     depth = canvas.depth.copy()
-    kernel = np.ones((3, 3), np.uint8)
     lost = canvas.measured < 0.5
     if rng.random() < 0.6:  # silhouettes
-        jump = cv2.dilate(depth, kernel) - cv2.erode(depth, kernel)
-        edge = (jump > TEAR * depth) & (smooth_field(rng, *shape, 30) > rng.uniform(-1.5, 0.5))
-        lost |= cv2.dilate(edge.astype(np.uint8), kernel) > 0
+        edge = depth_jump(depth) > TEAR * depth
+        edge &= smooth_field(rng, shape, 30) > rng.uniform(-1.5, 0.5)
+        lost |= cv2.dilate(edge.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     if rng.random() < 0.5:  # holes, on movers as in the world
-        field = smooth_field(rng, *shape, int(rng.integers(4, 24)))
+        field = smooth_field(rng, shape, int(rng.integers(4, 24)))
         lost |= field > rng.uniform(0.8, 2.5)
     if rng.random() < 0.4:  # beyond its range
         middle, far = np.quantile(depth[::5, ::5], (0.5, 0.98))
         reach = rng.uniform(middle, max(far, middle + 1e-3))
-        lost |= depth > reach * (1 + 0.2 * smooth_field(rng, *shape, 16))
+        lost |= depth > reach * (1 + 0.2 * smooth_field(rng, shape, 16))
     if rng.random() < 0.3:  # the sensor's field of view ends before the image
         cut = rng.integers(0, (shape[0] // 8, shape[0] // 8, shape[1] // 8, shape[1] // 8))
         lost[: cut[0]] = lost[shape[0] - cut[1] :] = True
         lost[:, : cut[2]] = lost[:, shape[1] - cut[3] :] = True
-    error = smooth_field(rng, *shape, 24) + 0.5 * rng.standard_normal(shape, dtype=np.float32)
+    error = smooth_field(rng, shape, 24) + 0.5 * rng.standard_normal(shape, dtype=np.float32)
     depth *= 1 + np.float32(log_uniform(rng, (0.0005, 0.006))) * error
     depth[lost] = 0
     return Frame(rgb, depth, camera)

@@ -56,37 +56,36 @@ def degrade_flow(
 
     ``hidden`` (H, W) bool: points that are covered in the next frame or leave it.
     """
-    height, width = flow.shape[:2]
-    o = options
+    o, size = options, flow.shape[:2]
     bleed = log_uniform(rng, o.bleed_px)
-    wander = smooth_field(rng, height, width, 16, 2) * np.float32(bleed / 2)
+    wander = smooth_field(rng, size, 16, 2) * np.float32(bleed / 2)
     out = _look_up(flow, wander)
     side = 2 * int(rng.integers(0, 1 + max(1, round(bleed)))) + 1
     if side > 1:
         median = rng.random() < 0.5
         out = cv2.medianBlur(out, min(side, 5)) if median else cv2.blur(out, (side,) * 2)
     lag = np.float32(1.0) - np.float32(o.flow_lag * rng.random() ** 2) * np.abs(
-        smooth_field(rng, height, width, 6)
+        smooth_field(rng, size, 6)
     )
     out *= lag[..., None]
     if rng.random() < o.textureless_probability:
-        field = smooth_field(rng, height, width, int(rng.integers(3, 8)))
+        field = smooth_field(rng, size, int(rng.integers(3, 8)))
         area = field > np.float32(rng.uniform(0.5, 1.6))
         spread = 2 * int(rng.integers(4, 17)) + 1
         guess = cv2.blur(out, (spread, spread)) * np.float32(rng.uniform(0.3, 1.0))
         np.copyto(out, guess, where=area[..., None])
     block = int(rng.integers(3, 9))
-    rows, columns = -(-height // block), -(-width // block)
+    rows, columns = (-(-side // block) for side in size)
     bad = rng.random((rows, columns), dtype=np.float32) < log_uniform(rng, o.block_share)
     if bad.any():
         offsets = np.zeros((rows, columns, 2), np.float32)
         offsets[bad] = log_uniform(rng, o.block_px) * rng.standard_normal((int(bad.sum()), 2))
-        out += np.repeat(np.repeat(offsets, block, 0), block, 1)[:height, :width]
+        out += np.repeat(np.repeat(offsets, block, 0), block, 1)[: size[0], : size[1]]
     if hidden.any():
         around = cv2.blur(out, (9, 9))
-        error = smooth_field(rng, height, width, 24, 2) * np.float32(log_uniform(rng, o.hidden_px))
+        error = smooth_field(rng, size, 24, 2) * np.float32(log_uniform(rng, o.hidden_px))
         np.copyto(out, around + error, where=hidden[..., None])
-    smooth = smooth_field(rng, height, width, int(rng.integers(4, 17)), 2)
+    smooth = smooth_field(rng, size, int(rng.integers(4, 17)), 2)
     out += smooth * np.float32(log_uniform(rng, o.flow_smooth_px))
     white = rng.standard_normal(flow.shape, dtype=np.float32)
     out += white * np.float32(log_uniform(rng, o.flow_white_px))
@@ -96,6 +95,12 @@ def degrade_flow(
 def sample_at(depth: np.ndarray, offset: np.ndarray) -> np.ndarray:
     """(H, W) depth looked up at x + offset, nearest pixel; 0 outside."""
     return _look_up(depth, offset, cv2.BORDER_CONSTANT)
+
+
+def depth_jump(depth: np.ndarray) -> np.ndarray:
+    """(H, W) largest difference of depth among a pixel and its neighbours."""
+    kernel = np.ones((3, 3), np.uint8)
+    return cv2.dilate(depth, kernel) - cv2.erode(depth, kernel)
 
 
 def degrade_depth(
@@ -114,25 +119,23 @@ def degrade_depth(
         valid = depths[0][depths[0] > 0]
         if valid.size:
             limit = float(np.quantile(valid[::7], rng.uniform(0.5, 0.98)))
-    height, width = depths[0].shape
+    size = depths[0].shape
     # Most of a sensor's bias stays from one frame to the next; its change is what misleads.
-    common = smooth_field(rng, height, width, 4)
+    common = smooth_field(rng, size, 4)
     out = []
     for depth in depths:
-        wander = smooth_field(rng, height, width, 24, 2) * np.float32(bleed / 2)
+        wander = smooth_field(rng, size, 24, 2) * np.float32(bleed / 2)
         noisy = _look_up(depth, wander) if bleed else depth.copy()
-        error = bias * (0.9 * common + 0.3 * smooth_field(rng, height, width, 4))
+        error = bias * (0.9 * common + 0.3 * smooth_field(rng, size, 4))
         white = rng.standard_normal(depth.shape, dtype=np.float32) * np.float32(strength)
         error += np.clip(white * noisy, -0.5, 0.5) if quadratic else white
         noisy *= np.clip(1.0 + error, 0.3, 3.0)
         lost = noisy > limit
         if hole_share:
-            field = smooth_field(rng, height, width, int(rng.integers(4, 20)))
+            field = smooth_field(rng, size, int(rng.integers(4, 20)))
             lost |= field > np.quantile(field[::3, ::3], 1.0 - hole_share)
         if edges:
-            kernel = np.ones((3, 3), np.uint8)
-            jump = cv2.dilate(depth, kernel) - cv2.erode(depth, kernel)
-            lost |= jump > 0.15 * depth
+            lost |= depth_jump(depth) > 0.15 * depth
         noisy[lost] = 0.0
         out.append(noisy)
     return out

@@ -20,13 +20,9 @@ FREEDOM = 4.0
 
 @dataclass(frozen=True, eq=False)
 class Edge:
-    """A motion between two frames of the graph.
+    """A motion T_curr_prev between two frames, by their indices, and its covariance.
 
     Args:
-        prev, curr: indices of the frames.
-        T: (4, 4) T_curr_prev.
-        covariance: (6, 6) of ``Exp(delta) T``, translation first.
-        status: of its estimate; a failed one has no weight.
         kind: ``chain``, through the frames between; ``stride``, found directly; ``search``, found
             without a start.
         weight: that the graph gave it: above 1 for one that fits well, 0 where the chi-square test
@@ -48,7 +44,7 @@ class Edge:
 
 
 class Solution(NamedTuple):
-    """Poses (4, 4) of each frame of a graph, its edges with their weights, robust cost."""
+    """Poses of all frames, the edges with their weights, robust cost."""
 
     T_world_cam: dict[int, np.ndarray]
     edges: tuple[Edge, ...]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from enum import Enum
 from typing import Any, cast, get_args, get_type_hints
 
@@ -30,38 +30,26 @@ UNKNOWN_M, UNKNOWN_RAD = 1.0, 0.3
 
 @dataclass(frozen=True, eq=False)
 class MotionModel:
-    """Constant velocity: the last motion, and the spread of the changes from motion to motion.
+    """Constant velocity: the last motion between neighbours, and how motions change.
 
-    Args:
-        T_last: (4, 4) last motion found between neighbours, or None.
-        spread: (6, 6) decaying sum of squared changes.
-        weight: decaying number of changes.
-        changes: how many were seen.
+    ``spread`` (6, 6) is a decaying sum of squared changes, ``weight`` their decaying number.
     """
 
     T_last: np.ndarray | None = None
-    spread: np.ndarray | None = None
+    spread: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
     weight: float = 0.0
     changes: int = 0
 
     def observed(self, T_curr_prev: np.ndarray, neighbours: bool = True) -> MotionModel:
-        """The model after one more motion.
-
-        ``neighbours``: whether it follows the last one directly, both over one frame.
-        """
+        """The model after one more motion, which follows the last one directly (``neighbours``)."""
         # a step hands its motion out as well: its array may change
         T_curr_prev = np.array(T_curr_prev)
         if self.T_last is None or not neighbours:
-            return MotionModel(T_curr_prev, self.spread, self.weight, self.changes)
+            return replace(self, T_last=T_curr_prev)
         change = se3_log(T_curr_prev @ invert(self.T_last))
         keep = 1.0 - 1.0 / MEMORY
-        before = np.zeros((6, 6)) if self.spread is None else self.spread
-        return MotionModel(
-            T_curr_prev,
-            keep * before + np.outer(change, change),
-            keep * self.weight + 1.0,
-            self.changes + 1,
-        )
+        spread = keep * self.spread + np.outer(change, change)
+        return MotionModel(T_curr_prev, spread, keep * self.weight + 1.0, self.changes + 1)
 
     def predict(self, frames: int = 1) -> MotionPrior | None:
         """The motion to the frame ``frames`` ahead; None before the first motion.
@@ -74,15 +62,13 @@ class MotionModel:
         n = int(frames)
         grown = n * (n + 1) * (2 * n + 1) / 6
         T = pose_matrix(np.linalg.matrix_power(self.T_last, n)[:3])
-        if self.spread is None or self.changes < MIN_CHANGES:
-            one = np.diag([UNKNOWN_M**2] * 3 + [UNKNOWN_RAD**2] * 3)
-        else:
-            # ten changes are few for 21 numbers: half of it is even in all directions
-            mean = self.spread / self.weight
-            even = np.repeat([np.trace(mean[:3, :3]) / 3, np.trace(mean[3:, 3:]) / 3], 3)
-            one = INFLATION * 0.5 * (mean + np.diag(even))
-            one += np.diag([FLOOR_M**2] * 3 + [FLOOR_RAD**2] * 3)
-        return MotionPrior(T, grown * one)
+        if self.changes < MIN_CHANGES:
+            return MotionPrior(T, grown * np.diag([UNKNOWN_M**2] * 3 + [UNKNOWN_RAD**2] * 3))
+        # ten changes are few for 21 numbers: half of it is even in all directions
+        mean = self.spread / self.weight
+        even = np.repeat([np.trace(mean[:3, :3]) / 3, np.trace(mean[3:, 3:]) / 3], 3)
+        one = INFLATION * 0.5 * (mean + np.diag(even))
+        return MotionPrior(T, grown * (one + np.diag([FLOOR_M**2] * 3 + [FLOOR_RAD**2] * 3)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,11 +78,8 @@ class TrackerState:
     Args:
         frame: the last frame that could be read; None before the first one.
         T_world_cam: (4, 4) its pose; read-only.
-        T_world_last: (4, 4) pose last handed out: another one than ``T_world_cam`` after frames
-            that could not be read.
-        motion_model: of the motions found so far.
-        gap: frames that could not be read since ``frame``.
-        failed: motions that failed since the last one found.
+        T_world_last: (4, 4) pose last handed out: another one after frames that could not be read.
+        gap: frames that could not be read since ``frame``. failed: motions since the last found.
         count: frames seen.
         window: key frames and their graph; None where the tracker keeps none.
     """
@@ -134,11 +117,7 @@ class TrackerState:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> TrackerState:
-        """The state that :meth:`to_arrays` wrote.
-
-        Raises:
-            InputError: an array is missing or has another shape.
-        """
+        """The state that :meth:`to_arrays` wrote; InputError where an array is missing."""
 
         def build(kind: Any, value: Any) -> Any:
             if isinstance(value, dict) and "array" in value:

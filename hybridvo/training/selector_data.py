@@ -146,13 +146,13 @@ def _record(drawn: KnownPair, found: HypothesisSet, T_prior: np.ndarray | None) 
         maps = replace(maps, log_depth_curr=drawn.log_depth_curr[pick])
     label = np.where(drawn.moving, MOVING, STATIC)
     label = np.where(drawn.depth > 0, label, UNKNOWN)[pick]
-    count = len(found.poses)
+    count = min(len(found.poses), MAX_MOTIONS)
     empty = (0, MAX_MOTIONS - count)
     return vars(maps) | {
         "depth_true": np.minimum(drawn.depth[pick], 6e4).astype(np.float16),
         "label": label.astype(np.uint8),
-        "poses": np.pad(found.poses, (empty, (0, 0), (0, 0))),
-        "facts": np.pad(found.facts, (empty, (0, 0))),
+        "poses": np.pad(found.poses[:count], (empty, (0, 0), (0, 0))),
+        "facts": np.pad(found.facts[:count], (empty, (0, 0))),
         "count": count,
         "T": drawn.T_curr_prev[:3],
         "T_prior": (np.eye(4) if T_prior is None else T_prior)[:3],

@@ -212,7 +212,7 @@ def test_tum_lists_written_backwards(tmp_path):
     root = write.write_tum(tmp_path).path
     lines = (root / "rgb.txt").read_text().splitlines()
     (root / "rgb.txt").write_text("\n".join(reversed(lines)) + "\n")
-    with pytest.raises(InputError, match=r"rgb\.txt: timestamps must increase: frame 0 has \d+\."):
+    with pytest.raises(InputError, match=r"rgb\.txt: timestamps must be .*: frame 1 has \d+\."):
         open_sequence(root)
     (root / "rgb.txt").write_text("\n".join(lines).replace("rgb/", "rgb\\"))  # as Windows writes it
     warnings = "\n".join(open_sequence(root).warnings)

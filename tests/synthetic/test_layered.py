@@ -271,7 +271,7 @@ def test_silhouettes_are_cropped_to_their_box(seed, size):
 def test_coverage_is_met():
     square = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
     shape = drawing.Silhouette(((square, True),))
-    mask, radius = shape.draw_coverage(128, 256, (127.5, 63.5), 0.25)
+    mask, radius = shape.draw_coverage((128, 256), (127.5, 63.5), 0.25)
     assert mask.mean() == pytest.approx(0.25, abs=0.01)
     # (2 r)^2 = 0.25 * 128 * 256 gives r = 45.3; a border pixel more or less.
     assert radius == pytest.approx(45.3, abs=1.5)

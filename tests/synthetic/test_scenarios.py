@@ -34,9 +34,11 @@ def test_pair_keeps_the_conditions_of_its_cell(cell):
     noise = (pair.flow - truth["flow_true"])[clean]
     # relative standard deviation of a sample deviation is 1 / sqrt(2 n) ~ 8e-4
     assert noise.std() == pytest.approx(conditions.flow_noise_px, rel=5e-3)
-    log_ratio = np.log(pair.prev.depth / truth["depth_true"])
-    # half of the variance is correlated over 24 px: about 800 independent draws
-    assert log_ratio.std() == pytest.approx(conditions.depth_noise, rel=0.15, abs=1e-9)
+    if cell not in ("structured_light", "stereo"):
+        log_ratio = np.log(pair.prev.depth / truth["depth_true"])
+        # half of the variance is correlated over 24 px: about 800 independent draws
+        spread = np.nanstd(log_ratio)
+        assert spread == pytest.approx(conditions.depth_noise, rel=0.15, abs=1e-9)
 
 
 def test_static_pixels_follow_the_camera_and_moving_ones_do_not():
@@ -95,6 +97,24 @@ def test_pair_depends_on_cell_and_seed_alone():
     assert first.flow.tobytes() == second.flow.tobytes()
     assert first.flow.tobytes() != other_seed.flow.tobytes()
     assert first.flow.tobytes() != other_cell.flow.tobytes()
+
+
+def test_depth_is_that_of_its_sensor():
+    pair, truth = make_pair("structured_light", 0)
+    measured, z = pair.prev.depth, truth["depth_true"]
+    known = np.isfinite(measured)
+    error = (measured - z)[known] / (0.0015 * z[known] ** 2)
+    assert error.std() == pytest.approx(1.0, rel=0.02)
+    pair, truth = make_pair("stereo", 0)
+    steps = 8 * 1120 * 0.12 / pair.prev.depth
+    known = np.isfinite(steps)
+    np.testing.assert_allclose(steps[known], np.rint(steps[known]), atol=1e-3)
+    disparity = 1120 * 0.12 / truth["depth_true"]
+    # left of the second eye's image, and just behind what stands in front
+    assert not known[np.arange(1024) - disparity < 0].any()
+    assert 0.03 < (~known).mean() < 0.2
+    nearer = np.diff(disparity[:, 200:]) > 5
+    assert (~known[:, 200:-1])[nearer].mean() > 0.9
 
 
 @pytest.mark.parametrize("arguments", [("moving31", 0), ("moving30", -1), ("moving30", 0, 8, 8)])

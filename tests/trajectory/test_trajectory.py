@@ -64,9 +64,9 @@ def test_arrays_are_copied_and_read_only():
 @pytest.mark.parametrize(
     ("stamps", "match"),
     [
-        ([0.0, 2.0, 1.0], r"timestamps\[2\]: expected"),
-        ([0.0, 1.0, 1.0], r"timestamps\[2\]: expected"),
-        ([0.0, np.nan, 2.0], r"timestamps\[1\]: expected"),
+        ([0.0, 2.0, 1.0], "frame 2 has"),
+        ([0.0, 1.0, 1.0], "frame 2 has"),
+        ([0.0, np.nan, 2.0], "frame 1 has"),
         ([0.0, 1.0], "2 timestamps for 3 poses"),
         ([[0.0, 1.0, 2.0]], r"expected seconds of shape"),
         (["a", "b", "c"], "expected seconds"),
