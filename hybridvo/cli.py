@@ -9,13 +9,14 @@ cannot be written, 130 interrupted.
 from __future__ import annotations
 
 import argparse
+import inspect
 import json
 import logging
 import os
 import sys
 import traceback
-from collections.abc import Callable, Sequence
-from typing import Any, Literal
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
 
 from hybridvo import __version__
 from hybridvo.commands import arguments
@@ -110,8 +111,10 @@ def _guarded(args: argparse.Namespace, command: list[str]) -> int:
         logger.setLevel(before)
 
 
-def _mode(args: argparse.Namespace) -> Literal["new", "resume", "overwrite"]:
-    return "resume" if args.resume else "overwrite" if args.overwrite else "new"
+def _call(function: Callable[..., Any], args: argparse.Namespace, **more: Any) -> Any:
+    """The function, with those arguments of the command line that it has, and others."""
+    names = inspect.signature(function).parameters
+    return function(**{name: v for name, v in vars(args).items() if name in names} | more)
 
 
 def _open(args: argparse.Namespace) -> Any:
@@ -127,73 +130,52 @@ def _run(args: argparse.Namespace, command: list[str]) -> Result:
     from hybridvo.commands.run import run
     from hybridvo.network.models import Models
 
-    given = {
-        f"run.{name}": getattr(args, name)
-        for name in ("method", "start", "stop", "stride", "device", "max_failed", "strict")
-    }
-    options = arguments.load_options(
-        args.config, args.assignments, given | {"flow.source": args.flow}
-    )
+    if "help" in args.given:
+        defaults = arguments.option_defaults()
+        return defaults, "\n".join(f"{key}={value}" for key, value in defaults.items()), 0
+    options = arguments.run_options(args)
     files = arguments.weight_files(args.weights, [options.run.method])
-    summary, code = run(
-        _open(args),
-        args.out,
-        options,
-        models=Models(options.run.device, files),
-        mode=_mode(args),
-        command=command,
-        quiet=args.quiet,
-        rrd=args.rrd,
-    )
+    given = {"options": options, "models": Models(options.run.device, files), "command": command}
+    summary, code = _call(run, args, sequence=_open(args), **given)
     if not args.quiet:
         for warning in summary.get("warnings", []):
             print(f"hybridvo: warning: {warning}", file=sys.stderr)
     return summary, summary_text(summary), code
 
 
-def _show(args: argparse.Namespace, command: list[str]) -> Result:
-    from hybridvo.evaluation.drawing import draw
-
-    given = ("flow", "method", "weights", "steps", "overwrite")
-    options = {name: getattr(args, name) for name in given}
-    written = [str(path) for path in draw(_open(args), args.pair, args.out, **options)]
-    return {"files": written}, "\n".join(written), 0
-
-
-def _compare(args: argparse.Namespace, command: list[str]) -> Result:
-    from hybridvo.commands.progress import Progress
-    from hybridvo.evaluation.comparison import compare
-    from hybridvo.evaluation.sequence_job import ComparisonOptions
-    from hybridvo.pipeline import METHODS
-
-    methods = tuple(name.strip() for name in args.methods.split(",") if name.strip())
-    known = METHODS if methods == ("all",) else methods
-    names = ["flow", "dataset", "start", "stop", "stride", "seed", "device", "protocol", "worst"]
-    options = ComparisonOptions(
-        sequences=(*args.paths, *args.sequence),
-        methods=methods,
-        weights=arguments.weight_files(args.weights, known),
-        **{name: getattr(args, name) for name in names},
-    )
-    with Progress(0, "compare", quiet=args.quiet, unit="pairs") as progress:
-
-        def report(message: str, done: int, total: int) -> None:
-            if message:
-                progress.say(message)
-            progress.update(done, total=total)
-
-        paths = compare(options, args.out, mode=_mode(args), command=command, progress=report)
+def _files(paths: Iterable[Any]) -> Result:
     written = [str(path) for path in paths]
     return {"files": written}, "\n".join(written), 0
 
 
+def _show(args: argparse.Namespace, command: list[str]) -> Result:
+    from hybridvo.evaluation.drawing import draw
+
+    return _files(_call(draw, args, sequence=_open(args)))
+
+
+def _compare(args: argparse.Namespace, command: list[str]) -> Result:
+    from hybridvo.commands.compare import compare
+    from hybridvo.pipeline import METHODS
+
+    methods = tuple(name.strip() for name in args.methods.split(",") if name.strip())
+    weights = arguments.weight_files(args.weights, METHODS if methods == ("all",) else methods)
+    given = {"methods": methods, "weights": weights, "options": arguments.run_options(args)}
+    given |= {"sequences": (*args.paths, *args.sequence), "command": command}
+    say = (lambda text: None) if args.quiet else (lambda text: print(text, file=sys.stderr))
+    return _files(_call(compare, args, **given, say=say))
+
+
 def _evaluate(args: argparse.Namespace, command: list[str]) -> Result:
     from hybridvo.commands.results import evaluation_text
-    from hybridvo.evaluation.metrics import evaluate_files
+    from hybridvo.evaluation.metrics import evaluate
+    from hybridvo.trajectory import read_trajectory
 
-    names = ["alignment", "delta", "delta_unit", "max_diff"]
-    names += ["format_est", "format_gt", "axes_est", "axes_gt"]
-    report = evaluate_files(args.estimate, args.gt, **{name: getattr(args, name) for name in names})
+    est = read_trajectory(args.estimate, args.format_est, axes=args.axes_est)
+    gt = read_trajectory(args.gt, args.format_gt, axes=args.axes_gt)
+    report = _call(evaluate, args, estimate=est, gt=gt)
+    report |= {"estimate": args.estimate, "gt": args.gt}
+    report["warnings"] = [*est.warnings, *gt.warnings]
     # not one figure: the files do not belong together
     code = 2 if report["ate_rmse_unaligned"] is None else 0
     if code:
@@ -203,22 +185,19 @@ def _evaluate(args: argparse.Namespace, command: list[str]) -> Result:
 
 
 def _doctor(args: argparse.Namespace, command: list[str]) -> Result:
-    if args.path or args.sequence:
-        from hybridvo.commands.diagnose import diagnose, diagnosis_text
+    from hybridvo.commands.doctor import diagnose, diagnosis_text, doctor, doctor_text
 
+    if args.path or args.sequence:
         found = diagnose(_open(args), pairs=args.pairs)
         return found, diagnosis_text(found), 0 if found["ok"] else 1
-    from hybridvo.commands.doctor import doctor, doctor_text
-
     report = doctor()
-    return report, doctor_text(report), 0 if report["usable"] else 2
+    return report, doctor_text(report), 0
 
 
 def _demo(args: argparse.Namespace, command: list[str]) -> Result:
     from hybridvo.commands.demo import demo, demo_text
 
-    options = {name: getattr(args, name) for name in ("frames", "seed", "overwrite", "quiet")}
-    content = demo(args.out, **options, command=command)
+    content = _call(demo, args, command=command)
     return content, demo_text(content), 0
 
 
@@ -226,17 +205,8 @@ def _generate(args: argparse.Namespace, command: list[str]) -> Result:
     from hybridvo.commands.generate import generate
     from hybridvo.commands.progress import Progress
 
-    size = tuple(args.size) if args.size else None
-    with Progress(args.count, "generate", quiet=args.quiet, unit="samples") as progress:
-        sheet = generate(
-            args.path or args.preset,
-            args.count,
-            args.out,
-            seed=args.seed,
-            size=size,
-            workers=args.workers,
-            report=lambda done, total: progress.update(done, total=total),
-        )
+    with Progress(args.count, "generate", quiet=args.quiet, unit="samples") as bar:
+        sheet = _call(generate, args, preset=args.path or args.preset, report=bar.update)
     return {"contact_sheet": str(sheet)}, str(sheet), 0
 
 

@@ -24,8 +24,8 @@ from measuring import ROOT, provenance, without_folders
 from paper_tables import ROWS
 
 from hybridvo.commands.generate import write_sheet
-from hybridvo.evaluation.drawing import flow_panel, prediction_errors, uncertainty_maps
-from hybridvo.evaluation.plots import Panel, draw_panels, longest_flow
+from hybridvo.evaluation.drawing import prediction_errors, uncertainty_maps
+from hybridvo.evaluation.plots import Panel, draw_panels, flow_panel, longest_flow
 from hybridvo.evaluation.saliency import saliencies
 from hybridvo.files import atomic_write, write_json
 from hybridvo.network.losses import reconstruct

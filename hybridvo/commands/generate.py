@@ -35,7 +35,7 @@ def generate(
     out: str | Path,
     *,
     seed: int = 0,
-    size: tuple[int, int] | None = None,
+    size: Sequence[int] | None = None,
     workers: int = 1,
     report: Callable[[int, int], None] | None = None,
 ) -> Path:
@@ -52,7 +52,7 @@ def generate(
     return sheet
 
 
-def _preset(name: str, size: tuple[int, int] | None) -> Preset:
+def _preset(name: str, size: Sequence[int] | None) -> Preset:
     if name in PRESETS:
         options = PRESETS[name]()
         if size is None:
@@ -61,7 +61,7 @@ def _preset(name: str, size: tuple[int, int] | None) -> Preset:
     if not Path(name).is_file():
         known = ", ".join(PRESETS)
         raise InputError(f"--preset: expected {known} or a YAML file, got {name!r}.")
-    return load_preset(name, size=size)
+    return load_preset(name, size=None if size is None else (size[0], size[1]))
 
 
 def write_sheet(samples: Sequence[Sample], path: str | Path) -> None:

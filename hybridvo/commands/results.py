@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from hybridvo.data.sequence import Sequence
 from hybridvo.evaluation.metrics import Alignment, evaluate
@@ -32,35 +33,33 @@ def write_motions(folder: Path, rows: list[dict[str, Any]]) -> Trajectory:
 
 def summarise(rows: list[dict[str, Any]], sequence: Sequence, method: str) -> dict[str, Any]:
     """Counts, sources, oracles, times and warnings of a run, JSON-ready."""
-    motions = rows[1:]  # the first frame has none
-    failed = [row for row in motions if row["status"] == "failed"]
-    timed = [row for row in motions if row["reason"] != "missing_frame"]
-
-    def median(name: str) -> float | None:
-        return float(np.median([row[name] for row in timed])) if timed else None
-
-    doubts = [row for row in motions if row["status"] == "ok" and row["message"]]
+    table = pd.DataFrame(rows)
+    motions = table[1:]  # the first frame has none
+    timed = motions[motions["reason"] != "missing_frame"]
+    failed = int((motions["status"] == "failed").sum())
+    doubts = motions[(motions["status"] == "ok") & (motions["message"] != "")]
     if any("the median depth" in text for text in sequence.warnings):  # said before the run
-        doubts = []
+        doubts = doubts[:0]
     # what the estimate was given that no sensor gives
-    oracle = ["true flow"] if any(row["flow_is_true"] for row in rows) else []
+    oracle = ["true flow"] if table["flow_is_true"].any() else []
     oracle += ["true depth"] if sequence.depth_source == "true" else []
     return {
         "sequence": sequence.name,
         "method": method,
-        "frames": len(rows),
+        "frames": len(table),
         "motions": len(motions),
-        "failed": len(failed),
-        "failed_fraction": len(failed) / max(len(motions), 1),
-        "degraded": sum(row["status"] == "degraded" for row in motions),
-        "missing_frames": [row["index"] for row in rows if row["reason"] == "missing_frame"],
-        "flow_source": sorted({row["flow_source"] for row in rows if row["flow_source"]}),
+        "failed": failed,
+        "failed_fraction": failed / max(len(motions), 1),
+        "degraded": int((motions["status"] == "degraded").sum()),
+        "missing_frames": table["index"][table["reason"] == "missing_frame"].tolist(),
+        "flow_source": sorted(set(table["flow_source"]) - {""}),
         "depth_source": sequence.depth_source,
         "oracle": oracle,
-        "flow_ms_median": median("flow_ms"),
-        "motion_ms_median": median("motion_ms"),
-        "frame_ms_median": median("frame_ms"),
-        "warnings": [f"frame {row['index']}: {row['message']}" for row in doubts[:1]],
+        **{
+            f"{name}_median": float(timed[name].median()) if len(timed) else None
+            for name in ("flow_ms", "motion_ms", "frame_ms")
+        },
+        "warnings": [f"frame {row['index']}: {row['message']}" for _, row in doubts[:1].iterrows()],
     }
 
 
@@ -74,7 +73,7 @@ def write_metrics(
 ) -> dict[str, Any]:
     """Write ``metrics.json``: errors against the ground truth, and what went in."""
     report = evaluate(trajectory, gt, alignment=alignment)
-    pairs = mean_pair_errors(row["errors"] for row in rows if row["errors"] is not None)
+    pairs = mean_pair_errors(row for row in rows if "rot_err_deg" in row)
     reasons = report.pop("reasons") | pairs.pop("reasons")
     named = ("method", "failed", "degraded", "flow_source", "depth_source", "oracle", "sequence")
     metrics = report | pairs | {"reasons": reasons} | {key: summary[key] for key in named}

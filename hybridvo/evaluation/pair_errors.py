@@ -11,7 +11,6 @@ import numpy as np
 from hybridvo.data.base import Sequence
 from hybridvo.data.image_io import UNKNOWN_FLOW
 from hybridvo.data.sequence import resize_camera
-from hybridvo.errors import InputError
 from hybridvo.geometry import (
     backproject,
     ego_flow,
@@ -22,7 +21,7 @@ from hybridvo.geometry import (
     rotation_angle,
 )
 from hybridvo.trajectory import Trajectory
-from hybridvo.types import Camera
+from hybridvo.types import Camera, Frame
 
 PAPER_SIZE = (128, 256)
 """(height, width) at which the paper measures its EPE."""
@@ -49,6 +48,17 @@ def true_trajectory(sequence: Sequence, indices: Iterable[int]) -> Trajectory | 
     # text files carry six digits: made orthonormal as the trajectory demands
     T = np.stack([pose_matrix(sequence.poses[i][:3]) for i in known])
     return Trajectory(sequence.timestamps[known], T)
+
+
+def step_errors(
+    sequence: Sequence, prev: Frame | None, curr: int, T_curr_prev: np.ndarray
+) -> dict[str, float | None]:
+    """:func:`pair_errors` of a motion from a frame to frame ``curr``; none without a true one."""
+    T_gt = None if prev is None else true_motion(sequence, prev.index, curr)
+    if prev is None or T_gt is None:
+        return {}
+    depth = prev.depth if prev.depth is not None else np.full(prev.camera.shape, np.nan)
+    return pair_errors(T_curr_prev, T_gt, depth, prev.camera, sequence.camera(curr))
 
 
 def _native_epe(
@@ -107,15 +117,6 @@ def pair_errors(
         the image diagonal. ``rot_err_deg``: geodesic angle. ``trans_err``: norm of the translation
         difference, m. ``epe`` and ``epe_l2_px`` are None where no pixel is valid.
     """
-    for name, pose in (("T_est", T_est), ("T_gt", T_gt)):
-        if np.shape(pose) != (4, 4) or not np.isfinite(pose).all():
-            raise InputError(f"{name}: expected a finite (4, 4) transform, got {np.shape(pose)}.")
-    if np.shape(depth_prev) != camera_prev.shape or camera_curr.shape != camera_prev.shape:
-        raise InputError(
-            f"depth: expected shape {camera_prev.shape} of both cameras, got "
-            f"{np.shape(depth_prev)} and a current camera of {camera_curr.shape}."
-        )
-    T_est, T_gt = np.asarray(T_est, dtype=np.float64), np.asarray(T_gt, dtype=np.float64)
     depth = np.asarray(depth_prev)
     euler = matrix_to_euler_deg(T_est[:3, :3]) - matrix_to_euler_deg(T_gt[:3, :3])
     euler = (euler + 180.0) % 360.0 - 180.0
