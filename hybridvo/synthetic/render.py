@@ -209,10 +209,6 @@ class SyntheticSequence(Sequence):
         self._check_index(index + 1)
         return self.scene.flow(index)[0], None
 
-    def moving(self, index: int) -> np.ndarray:
-        """(H, W) bool, True on moving objects."""
-        return self.scene.object_id(index) > 0
-
     def files(self) -> list[Path]:
         """No file is read."""
         return []
