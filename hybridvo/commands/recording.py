@@ -15,7 +15,7 @@ import numpy as np
 
 from hybridvo.errors import InputError, OutputError
 from hybridvo.evaluation.plots import flow_colours, longest_flow
-from hybridvo.results import State, Step
+from hybridvo.results import Step
 from hybridvo.types import Frame
 
 MAX_IMAGES = 300
@@ -91,23 +91,18 @@ class Recording:
         self._stream.set_time("time", **{clock: step.timestamp})
         T = step.T_world_cam
         log("world/camera", rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]))
-        self._numbers(step)
-        if len(self._positions) % self._stride == 0:
-            self._images(frame, step, flow)
-        self._positions.append(T[:3, 3].astype(np.float32))
-
-    def _numbers(self, step: Step) -> None:
-        rr, log, motion = self._rr, self._stream.log, step.motion
+        motion = step.motion
         std = np.sqrt(np.maximum(np.diag(motion.covariance), 0.0))
         log("covariance/translation_std_mm", rr.Scalars(1e3 * std[:3]))
         log("covariance/rotation_std_mdeg", rr.Scalars(1e3 * np.degrees(std[3:])))
         log("status/inlier_ratio", rr.Scalars(motion.inlier_ratio))
         log("status/probability", rr.Scalars(motion.probability))
-        state = step.status.state
-        if state is not State.OK:
+        if not step.ok:
             text = f"frame {step.index}: {step.status} {step.status.message}"
-            level = "WARN" if state is State.DEGRADED else "ERROR"
-            log("status/messages", rr.TextLog(text, level=level))
+            log("status/messages", rr.TextLog(text, level="WARN" if step.usable else "ERROR"))
+        if len(self._positions) % self._stride == 0:
+            self._images(frame, step, flow)
+        self._positions.append(T[:3, 3].astype(np.float32))
 
     def _images(self, frame: Frame, step: Step, flow: np.ndarray | None) -> None:
         rr, log = self._rr, self._stream.log

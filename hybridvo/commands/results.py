@@ -128,8 +128,8 @@ def _lines(facts: Iterable[tuple[str, str]]) -> str:
 
 def summary_text(summary: Row) -> str:
     """Summary of a run, a line a fact; oracles are named."""
-    if not summary.get("frames"):
-        return "no frame was finished"
+    if summary["state"] == "interrupted":
+        return f"interrupted after {summary['frames']} frames"
     flow = ", ".join(summary["flow_source"]) or "none"
     failed = f"failed {summary['failed']} of {summary['motions']} motions"
     facts = [

@@ -114,7 +114,7 @@ class _Job:
         folder, rows, total = self.folder, self.folder.rows, len(self.frames)
         with (
             interruptible() as interrupted,
-            Progress(total, label, quiet=quiet, done=len(rows)) as progress,
+            Progress(label, total, "frames", quiet=quiet, done=len(rows)) as progress,
         ):
             for warning in self.sequence.warnings:
                 progress.say(f"warning: {warning}")
@@ -128,8 +128,7 @@ class _Job:
                 if row["status"] != "ok":
                     text = f"frame {index}: {row['status']} ({row['reason']}), probability "
                     progress.say(f"{text}{row['probability']:.2f}: {row['message']}")
-                failed = sum(row["status"] == "failed" for row in rows)
-                progress.update(len(rows), failed=failed)
+                progress.update(len(rows), sum(row["status"] == "failed" for row in rows))
                 if len(rows) % SAVE_EVERY == 0:
                     folder.save_rows(self.vo.state.to_arrays())
             if interrupted.is_set():
@@ -182,18 +181,16 @@ class _Job:
         }
 
     def _write(self, interrupted: bool) -> tuple[dict[str, Any], int]:
-        """Results of the rows kept so far, and the scores where the run is complete."""
+        """The results, or where the run was interrupted what a resumed one needs."""
         folder, path, rows = self.folder, self.folder.path, self.folder.rows
-        if not rows:  # interrupted before the first frame
+        if interrupted:
+            folder.save_rows(self.vo.state.to_arrays() if rows else None)
             folder.save("interrupted")
-            return {"state": "interrupted", "frames": 0}, EXIT_INTERRUPTED
-        folder.save_rows(self.vo.state.to_arrays() if interrupted else None)
+            return {"state": "interrupted", "frames": len(rows)}, EXIT_INTERRUPTED
+        folder.save_rows()
         trajectory = results.write_motions(path, rows)
         summary = results.summarise(rows, self.sequence, self.options.run.method)
         summary["out"] = os.fspath(path)
-        if interrupted:
-            folder.save("interrupted", summary=summary)
-            return summary | {"state": "interrupted"}, EXIT_INTERRUPTED
         exit_code = _exit_code(summary, self.options)
         if exit_code == EXIT_FAILED_FRAMES:
             allowed = self.options.run.max_failed

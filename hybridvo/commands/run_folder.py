@@ -15,6 +15,7 @@ import numpy as np
 import pandas as pd
 
 from hybridvo.errors import InputError, OutputError
+from hybridvo.evaluation.pair_errors import ERRORS
 from hybridvo.files import Mode, atomic_write, write_csv, write_json
 
 RESULTS = (
@@ -28,7 +29,7 @@ STEP_COLUMNS = (
     *("tx", "ty", "tz", "rx", "ry", "rz"),
     *("inlier_ratio", "iterations", "cost", "flow_ms", "motion_ms", "frame_ms"),
     *("prev_index", "flow_source", "message"),
-    *("r_err_deg", "t_err", "epe", "epe_l2_px", "rot_err_deg", "trans_err"),
+    *ERRORS,
 )
 
 
