@@ -59,29 +59,23 @@ def normalize(
     return inputs, MotionScale(factor, torch.zeros_like(factor))
 
 
-def predict(
-    network: nn.Module,
-    inputs: NetworkInputs,
-    selection: str = "softmax",
-    passes: int | None = None,
-) -> NetworkOutput:
-    """Output of the last of several passes, each on what the one before left unexplained.
+def predict(network: nn.Module, inputs: NetworkInputs, selection: str = "softmax") -> NetworkOutput:
+    """Output of the last of the network's passes, each on what the one before left unexplained.
 
-    ``selection``: how one pose comes out of the pixels of a pass; ``passes``: by default as many as
-    the network's options name.
+    ``selection``: how one pose comes out of the pixels of a pass.
     """
-    count = int(network.options.passes) if passes is None else passes  # type: ignore[union-attr, arg-type]
-    return network(inputs, first_motions(network, inputs, selection, count - 1))
+    passes: int = network.options.passes  # type: ignore[union-attr, assignment]
+    return network(inputs, first_motions(network, inputs, selection, passes - 1))
 
 
+@torch.no_grad()
 def first_motions(
     network: nn.Module, inputs: NetworkInputs, selection: str, passes: int
 ) -> torch.Tensor | None:
     """(B, 4, 4) motions after a number of passes, without gradient; None for no pass at all."""
     T = None
-    with torch.no_grad():
-        for _ in range(passes):
-            T = fitted_motion(network(inputs, T), inputs, selection)
+    for _ in range(passes):
+        T = fitted_motion(network(inputs, T), inputs, selection)
     return T
 
 

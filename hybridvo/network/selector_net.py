@@ -132,11 +132,8 @@ class SelectorNetwork(nn.Module):
     ) -> SelectorOutput:
         """Answers about every candidate, masks included.
 
-        Args:
-            inputs: images and candidates.
-            first: for refits, the motions of the search and the answers about them.
-            mirror: (B,) bool, images to look at in a mirror (training); the masks come back
-                unmirrored.
+        ``first``: for refits, the motions of the search and the answers about them; ``mirror``:
+        (B,) bool, images to look at in a mirror (training); the masks come back unmirrored.
         """
         output = self.encode(inputs, first, mirror)
         mask = self.decode(output.levels, output.evidence.shape[2:])
@@ -156,13 +153,13 @@ class SelectorNetwork(nn.Module):
         if mirror is not None:
             channels = _mirrored(channels, mirror[inputs.owner], MIRRORED_CANDIDATE)
         channels = _padded(channels)
-        if first is not None:
-            common = first[1].common
-        else:
+        if first is None:
             shared = shared_channels(inputs)
             if mirror is not None:
                 shared = _mirrored(shared, mirror, MIRRORED_SHARED)
             common = self.shared(_padded(shared))
+        else:
+            common = first[1].common
         x1 = F.relu_(self.candidate(channels) + common[inputs.owner])
         x2 = self.block2(F.relu_(self.down2(x1)))
         x3 = self.block3(F.relu_(self.down3(x2)))

@@ -91,20 +91,17 @@ def refine_batch(
     Args:
         batch: see :class:`~hybridvo.types.PairBatch`.
         T_init: (B, 4, 4) or (B, S, 4, 4) T_curr_prev to start from, in place of one that is not
-            finite the identity. Without weights the identity is one more start; with weights only
-            what is handed in is.
+            finite the identity. Without weights the identity is one more start.
         weights: (B, H, W) factors on the information; what is not positive and finite switches a
             pixel off.
         noise: flow noise in px and noise of log depth, as (2,) or (B, 2), and with the current
             frame's depth that of its log; None: estimated.
         kernel: ``geman-mcclure``, with the cutoff of the options, ``cauchy``, ``huber`` or ``l2``.
-        options: of the refinement; the current frame's depth is a third residual where
-            ``current_depth`` is ``on``.
+        options: the current frame's depth is a third residual where ``current_depth`` is ``on``.
 
     Returns:
-        Poses with covariance and a status per sample. Bad data give a failed status for that very
-        sample, never an exception and never a pose that is not finite. The gradient of a failed
-        sample is zero.
+        Poses with covariance and a status per sample. Bad data give a failed status and a zero
+        gradient for that very sample, never an exception and never a pose that is not finite.
 
     Raises:
         InputError: shapes, types or options that cannot be used.
@@ -318,18 +315,21 @@ class _Solver:
         rounding = 8 * torch.finfo(pixels.weight.dtype).eps
         best = torch.full((len(T),), torch.inf, dtype=torch.float64, device=T.device)
         done, converged = best < 0, best < 0
-        iterations, matrix = done.long(), None
+        iterations = done.long()
         for k in range(STEPS):
             now = linearize(pixels, residuals(pixels, T), how, self.tile**2)
             H, g = now.total()
-            if tight and k % 3 == 2:  # anew, for samples that were far when it was made
-                matrix = newton_matrix(pixels, T, how).double()
-            newton = H - curvature * weight if matrix is None else matrix
-            step, good = solve_small(newton, g)
+            if tight and k % 3 == 2:  # the full derivative, also of residual and Jacobian
+                few = linearize(self.few, residuals(self.few, T), how).total()[0]
+                few = few - newton_matrix(self.few, T, how).double()
+                curvature = (
+                    few / self.few.weight.double().sum(dim=1).clamp(min=1e-12)[:, None, None]
+                )
+            step, good = solve_small(H - curvature * weight, g)
             ahead = (step * g).sum(dim=1)
             # under a kernel that turns over the equations may be far from definite: Gauss-Newton
             # (near the solution the full derivative may be much flatter than H, and is right)
-            longest = 4 if matrix is None else 100
+            longest = 100 if tight and k > 1 else 4
             good = good & (ahead > 0) & (_energy(step, H) <= longest * ahead)
             plain, solved = solve_small(H, g, DAMPING)
             step = torch.where(good[:, None], step, plain)
