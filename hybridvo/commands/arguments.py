@@ -36,7 +36,7 @@ def build_parser(calls: Mapping[str, Any]) -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
     def command(name: str, help: str, *parents: argparse.ArgumentParser) -> argparse.ArgumentParser:
-        described = {"help": help, "description": help[0].upper() + help[1:] + "."}
+        described: dict[str, Any] = {"help": help, "description": help[0].upper() + help[1:] + "."}
         made = commands.add_parser(name, parents=[_common(), *parents], **described)
         made.set_defaults(call=calls[name])
         return made

@@ -10,11 +10,10 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from hybridvo.errors import InputError, OutputError
-from hybridvo.evaluation.plots import flow_colours, longest_flow
+from hybridvo.evaluation.plots import flow_colours
 from hybridvo.results import Step
 from hybridvo.types import Frame
 
@@ -106,20 +105,17 @@ class Recording:
 
     def _images(self, frame: Frame, step: Step, flow: np.ndarray | None) -> None:
         rr, log = self._rr, self._stream.log
-        height, width = frame.camera.shape
-        scale = min(1.0, MAX_SIDE / max(height, width))
-        size = max(1, round(width * scale)), max(1, round(height * scale))
-        K = np.diag([size[0] / width, size[1] / height, 1.0]) @ frame.camera.K
-        log("world/camera/image", rr.Pinhole(image_from_camera=K, width=size[0], height=size[1]))
-        if frame.rgb is not None:
-            log("world/camera/image", self._jpeg(frame.rgb, size))
-        if flow is not None:
-            log("flow", self._jpeg(flow_colours(flow, longest_flow(flow)), size))
-        if step.motion.weights is not None:
-            weights = (255 * np.clip(step.motion.weights, 0.0, 1.0)).astype(np.uint8)
-            log("weights", self._jpeg(weights, size))
+        stride = -(-max(frame.camera.shape) // MAX_SIDE)
 
-    def _jpeg(self, rgb: np.ndarray, size: tuple[int, int]) -> Any:
-        enlarged = rgb.shape[1] < size[0]  # weights may stand on a coarser grid
-        method = cv2.INTER_NEAREST if enlarged else cv2.INTER_AREA
-        return self._rr.Image(cv2.resize(rgb, size, interpolation=method)).compress(70)
+        def shrunk(image: np.ndarray) -> Any:
+            return rr.Image(np.ascontiguousarray(image[::stride, ::stride])).compress(70)
+
+        height, width = (-(-size // stride) for size in frame.camera.shape)
+        K = np.diag([1 / stride, 1 / stride, 1.0]) @ frame.camera.K
+        log("world/camera/image", rr.Pinhole(image_from_camera=K, width=width, height=height))
+        if frame.rgb is not None:
+            log("world/camera/image", shrunk(frame.rgb))
+        if flow is not None:
+            log("flow", shrunk(flow_colours(flow)))
+        if step.motion.weights is not None:
+            log("weights", shrunk((255 * np.clip(step.motion.weights, 0, 1)).astype(np.uint8)))

@@ -23,10 +23,10 @@ import hybridvo
 from hybridvo.commands import results
 from hybridvo.commands.progress import Progress, interruptible
 from hybridvo.commands.recording import Recording, check_recording
-from hybridvo.commands.run_folder import RESULTS, STATE, RunFolder
+from hybridvo.commands.run_folder import RunFolder
 from hybridvo.data.sequence import Sequence
 from hybridvo.errors import InputError
-from hybridvo.evaluation.pair_errors import step_errors, true_trajectory
+from hybridvo.evaluation.pair_errors import step_errors
 from hybridvo.files import Mode, fingerprint, held, versions
 from hybridvo.flow import FlowField, FlowProvider, MeasuredFlow, dis_flow, fallback, file_flow
 from hybridvo.geometry import se3_log
@@ -78,10 +78,8 @@ def run(
     header["command"] = list(command)
     with held(out), contextlib.ExitStack() as stack:
         folder = RunFolder(out, header, mode)
-        if folder.finished:
-            summary = folder.read_json(STATE)["summary"]
-            summary |= {"state": "done", "metrics": folder.read_json("metrics.json") or None}
-            return summary, _exit_code(summary, options)
+        if folder.summary is not None:
+            return folder.summary, _exit_code(folder.summary, options)
         recording = None
         if rrd is not None:
             poses = None if sequence.poses is None else sequence.poses[list(frames)]
@@ -133,7 +131,14 @@ class _Job:
                     folder.save_rows(self.vo.state.to_arrays())
             if interrupted.is_set():
                 progress.say(f"interrupted: {len(rows)} frames are kept; go on with --resume")
-            return self._write(interrupted.is_set())
+                folder.save_rows(self.vo.state.to_arrays() if rows else None)
+                folder.save("interrupted")
+                return {"state": "interrupted", "frames": len(rows)}, EXIT_INTERRUPTED
+            folder.save_rows()
+            given = (folder.path, rows, self.sequence, self.frames, self.options.run)
+            summary = results.write_results(*given, picture=not self.quick)
+            folder.save("done", summary=summary)
+            return summary, _exit_code(summary, self.options)
 
     def _track(self, index: int) -> dict[str, Any]:
         """What is kept of a frame, JSON-ready: the columns of ``steps.csv`` and more."""
@@ -179,32 +184,6 @@ class _Job:
             "flow_is_true": field.flow is not None and field.is_true,
             **step_errors(self.sequence, prev, step.index, step.T_curr_prev),
         }
-
-    def _write(self, interrupted: bool) -> tuple[dict[str, Any], int]:
-        """The results, or where the run was interrupted what a resumed one needs."""
-        folder, path, rows = self.folder, self.folder.path, self.folder.rows
-        if interrupted:
-            folder.save_rows(self.vo.state.to_arrays() if rows else None)
-            folder.save("interrupted")
-            return {"state": "interrupted", "frames": len(rows)}, EXIT_INTERRUPTED
-        folder.save_rows()
-        trajectory = results.write_motions(path, rows)
-        summary = results.summarise(rows, self.sequence, self.options.run.method)
-        summary["out"] = os.fspath(path)
-        exit_code = _exit_code(summary, self.options)
-        if exit_code == EXIT_FAILED_FRAMES:
-            allowed = self.options.run.max_failed
-            summary["warnings"].append(f"more motions failed than --max-failed {allowed:g} allows")
-        metrics = None
-        if (gt := true_trajectory(self.sequence, self.frames)) is not None:
-            alignment = self.options.run.alignment
-            metrics = results.write_metrics(path, rows, trajectory, gt, summary, alignment)
-        if not self.quick:
-            results.draw(path / "trajectory.png", trajectory, gt, summary)
-        written = (path / name for name in (*RESULTS, STATE))
-        summary["files"] = [os.fspath(file) for file in written if file.exists()]
-        folder.save("done", summary=summary)
-        return summary | {"state": "done", "metrics": metrics}, exit_code
 
 
 def _header(

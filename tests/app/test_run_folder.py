@@ -85,11 +85,11 @@ def test_resume_goes_on_from_the_checkpoint(tmp_path):
 def test_resume_without_a_checkpoint_or_of_nothing_starts_anew(tmp_path):
     for _ in range(2):
         with start(tmp_path, "resume") as folder:
-            assert folder.rows == [] and not folder.finished
+            assert folder.rows == [] and folder.summary is None
     with start(tmp_path, "resume") as folder:
-        folder.save("done")
+        folder.save("done", summary={"frames": 2})
     with start(tmp_path, "resume") as folder:
-        assert folder.finished
+        assert folder.summary == {"frames": 2}
 
 
 def test_resume_of_another_run_or_a_damaged_state_is_refused(tmp_path):
