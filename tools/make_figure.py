@@ -15,15 +15,14 @@ from typing import Any
 
 import numpy as np
 from golden_inputs import SIZE, rendered
+from measuring import parser_of
 
 BLUE, ORANGE, GREY = "#0072B2", "#D55E00", "#222222"
 """Okabe and Ito: told apart by colour-blind readers."""
 
 
 def build_parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="make_figure.py", description=(__doc__ or "").splitlines()[0]
-    )
+    parser = parser_of(__file__, __doc__)
     parser.add_argument("--out", type=Path, default=Path("docs/teaser.png"), metavar="FILE")
     return parser
 
