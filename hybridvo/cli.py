@@ -18,59 +18,18 @@ import traceback
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
-from hybridvo import __version__
 from hybridvo.commands import arguments
-from hybridvo.commands.train import add_train, train
+from hybridvo.commands.train import train
 
 Result = tuple[Any, str, int]
 """What a command gives: JSON-ready, for people, and the exit code."""
-Call = Callable[[argparse.Namespace, list[str]], Result]
-
-
-def build_parser() -> argparse.ArgumentParser:
-    """Parser of the whole command line."""
-    parser = argparse.ArgumentParser(
-        prog="hybridvo",
-        description="Metric camera motion with covariance from optical flow, depth and intrinsics.",
-    )
-    parser.add_argument("--version", action="version", version=f"hybridvo {__version__}")
-    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-
-    def add(name: str, call: Call, help: str, *parents: argparse.ArgumentParser) -> Any:
-        command = commands.add_parser(
-            name,
-            help=help,
-            description=help[0].upper() + help[1:] + ".",
-            parents=[arguments.common(), *parents],
-            formatter_class=argparse.RawDescriptionHelpFormatter,
-        )
-        command.set_defaults(call=call)
-        return command
-
-    sequence = arguments.input()
-    arguments.add_run(add("run", _run, "estimate the camera motion of a sequence", sequence))
-    arguments.add_compare(add("compare", _compare, "run methods side by side and write a report"))
-    arguments.add_show(add("show", _show, "draw the maps of one pair of a sequence", sequence))
-    errors = "errors of a trajectory file against ground truth"
-    arguments.add_evaluate(add("evaluate", _evaluate, errors))
-    wrong, optional = "what is missing here, or wrong with a sequence", arguments.input(False)
-    doctor = add("doctor", _doctor, wrong, optional)
-    doctor.add_argument("--pairs", type=int, default=40, metavar="N", help="pairs (default 40)")
-    arguments.add_demo(add("demo", _demo, "render a scene with moving objects and run on it"))
-    arguments.add_generate(add("generate", _generate, "draw training samples into a folder"))
-    training = commands.add_parser("train", help="train a network")
-    training.set_defaults(call=train)
-    add_train(training, arguments.common())
-    init = add("init", _init, "write a camera.yaml to fill in, for a recording of your own")
-    init.add_argument("directory", metavar="DIR", help="folder with rgb/ and depth/")
-    return parser
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     given = sys.argv[1:] if argv is None else list(argv)
     try:
-        args = build_parser().parse_args(given)
+        args = arguments.build_parser(CALLS).parse_args(given)
     except SystemExit as end:  # argparse: 0 after --help and --version, 2 for wrong usage
         return int(end.code or 0)
     return _guarded(args, ["hybridvo", *given])
@@ -205,7 +164,7 @@ def _generate(args: argparse.Namespace, command: list[str]) -> Result:
     from hybridvo.commands.generate import generate
     from hybridvo.commands.progress import Progress
 
-    with Progress(args.count, "generate", quiet=args.quiet, unit="samples") as bar:
+    with Progress("generate", args.count, "samples", quiet=args.quiet) as bar:
         sheet = _call(generate, args, preset=args.path or args.preset, report=bar.update)
     return {"contact_sheet": str(sheet)}, str(sheet), 0
 
@@ -216,6 +175,19 @@ def _init(args: argparse.Namespace, command: list[str]) -> Result:
     path = write_camera_template(args.directory)
     next_step = f"fill it in, then: hybridvo run {args.directory}"
     return {"file": str(path)}, f"{path}\n{next_step}", 0
+
+
+CALLS = {
+    "run": _run,
+    "compare": _compare,
+    "show": _show,
+    "evaluate": _evaluate,
+    "doctor": _doctor,
+    "demo": _demo,
+    "train": train,
+    "generate": _generate,
+    "init": _init,
+}
 
 
 if __name__ == "__main__":

@@ -2,14 +2,12 @@
 
     hybridvo generate paper --size 64 128 --count 100000 --out runs/paper_samples
     python tools/ablation.py --out runs/ablation --data runs/paper_samples --seeds 3
-    python tools/ablation.py --out runs/ablation --seeds 3 --score
 
 A row is a file of configs/ablation. The rows that decide the paper's order have several seeds, the
 others one; every row is scored on held-out pairs at 6, 12, 25, 50 and 100 thousand samples, so that
 a reader sees whether an order is settled. Started again with the same ``--out`` it goes on where it
 was: each row's state is ``OUT/ROW-seedN`` (checkpoint.pt, log.jsonl, result.json, and at the end
 weights.safetensors). ``OUT/ablation.json`` is written after every score, with what is there.
-``--score`` trains nothing: finished rows are scored anew from their weights.
 """
 
 from __future__ import annotations
@@ -71,7 +69,6 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     add("--threads", type=int, default=1, help="threads of torch")
     add("--workers", type=int, default=0, help="processes that draw samples (0: this one)")
     add("--device", choices=("cpu", "cuda"), default="cpu")
-    add("--score", action="store_true", help="score finished rows again, without training")
     return parser.parse_args(argv)
 
 
@@ -101,9 +98,7 @@ def _run(args: argparse.Namespace) -> int:
     cv2.setNumThreads(0)  # samples are small: threads inside OpenCV cost more than they give
     runs: dict[tuple[str, int], dict[str, Any]] = {}
     for name, seed in plan(names, args.seeds):
-        if args.score:
-            _score(args, name, seed, runs)
-        elif not _train(args, name, seed, runs):
+        if not _train(args, name, seed, runs):
             print("ablation.py: interrupted; start again to go on.", file=sys.stderr)
             return 130
     return 0
@@ -144,26 +139,6 @@ def _train(
     card = {"row": name, **trained, **trainer.record, "curve": result["curve"]}
     save_weights(folder / "weights.safetensors", trainer.exported, card, "float16")
     return True
-
-
-def _score(
-    args: argparse.Namespace, name: str, seed: int, runs: dict[tuple[str, int], dict[str, Any]]
-) -> None:
-    """Score a finished row anew from its weights; one that is not finished is passed over."""
-    from hybridvo.network.models import load_weights
-
-    folder = args.out / f"{name}-seed{seed}"
-    if not (folder / "weights.safetensors").exists():
-        print(f"{name} seed {seed}: not finished", file=sys.stderr)
-        return
-    network, card = load_weights(folder / "weights.safetensors")
-    curve = (_read(folder / "result.json") or {}).get("curve", card["curve"])
-    result = {"row": name, "seed": seed, "curve": curve}
-    result["parameters"] = sum(p.numel() for p in network.parameters())
-    samples = max(curve, key=int)
-    recipe = card["options"]
-    curve[samples] |= _scores(args, network, recipe["selection"], recipe["data_size"], last=True)
-    _store(args, name, seed, runs, result, int(samples))
 
 
 def _store(

@@ -10,6 +10,9 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from hybridvo import __version__
+from hybridvo.commands.train import add_train
+
 if TYPE_CHECKING:
     from hybridvo.options import Options
 
@@ -23,7 +26,51 @@ METHODS = (
 KINDS = ("sintel", "tartanair", "7scenes", "folder", "kitti", "tum")
 
 
-def common() -> argparse.ArgumentParser:
+def build_parser(calls: Mapping[str, Any]) -> argparse.ArgumentParser:
+    """Parser of the whole command line; ``calls`` has the function of every command."""
+    parser = argparse.ArgumentParser(
+        prog="hybridvo",
+        description="Metric camera motion with covariance from optical flow, depth and intrinsics.",
+    )
+    parser.add_argument("--version", action="version", version=f"hybridvo {__version__}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    def command(name: str, help: str, *parents: argparse.ArgumentParser) -> argparse.ArgumentParser:
+        described: dict[str, Any] = {"help": help, "description": help[0].upper() + help[1:] + "."}
+        made = commands.add_parser(name, parents=[_common(), *parents], **described)
+        made.set_defaults(call=calls[name])
+        return made
+
+    sequence = _input()
+    _add_run(command("run", "estimate the camera motion of a sequence", sequence))
+    _add_compare(command("compare", "run methods side by side and write a report"))
+    _add_show(command("show", "draw the maps of one pair of a sequence", sequence))
+    _add_evaluate(command("evaluate", "errors of a trajectory file against ground truth"))
+    wrong = "what is missing here, or wrong with a sequence"
+    add = command("doctor", wrong, _input(required=False)).add_argument
+    add("--pairs", type=int, default=40, metavar="N", help="pairs (default 40)")
+    add = command("demo", "render a scene with moving objects and run on it").add_argument
+    add("--out", default="runs/demo", metavar="DIR", help="default: runs/demo")
+    add("--overwrite", action="store_true", help="replace the results in --out")
+    add("--frames", type=int, default=20, metavar="N", help="default: 20")
+    add("--seed", type=int, default=0, metavar="N", help="of the scene")
+    generate = command("generate", "draw training samples into a folder")
+    which = generate.add_mutually_exclusive_group(required=True)
+    which.add_argument("path", nargs="?", metavar="PRESET", help="paper, diverse or a YAML file")
+    which.add_argument("--preset", metavar="PRESET", help="the same, by name")
+    add = generate.add_argument
+    add("--out", required=True, metavar="DIR", help="folder of the samples")
+    add("--count", type=int, default=1000, metavar="N", help="default: 1000")
+    add("--seed", type=int, default=0, metavar="N")
+    add("--size", type=int, nargs=2, metavar=("H", "W"), help="pixels")
+    add("--workers", type=int, default=1, metavar="N", help="processes")
+    add_train(commands.add_parser("train", help="train a network"), _common(), calls["train"])
+    init = command("init", "write a camera.yaml to fill in, for a recording of your own")
+    init.add_argument("directory", metavar="DIR", help="folder with rgb/ and depth/")
+    return parser
+
+
+def _common() -> argparse.ArgumentParser:
     """Options of every command."""
     common = argparse.ArgumentParser(add_help=False)
     common.add_argument("--json", action="store_true", help="print the result as JSON on stdout")
@@ -33,7 +80,7 @@ def common() -> argparse.ArgumentParser:
     return common
 
 
-def input(required: bool = True) -> argparse.ArgumentParser:
+def _input(required: bool = True) -> argparse.ArgumentParser:
     """Which sequence, and what its folder does not say."""
     given = argparse.ArgumentParser(add_help=False)
     where = given.add_mutually_exclusive_group(required=required)
@@ -70,8 +117,7 @@ def _add_selection(command: argparse.ArgumentParser) -> None:
         exists.add_argument(f"--{name}", dest="mode", help=help, **kind)
 
 
-def add_run(run: argparse.ArgumentParser) -> None:
-    """Options of ``hybridvo run``."""
+def _add_run(run: argparse.ArgumentParser) -> None:
     add = run.add_argument
     add("--out", metavar="DIR", help="output folder (default: runs/NAME)")
     add("--method", metavar="NAME", help=f"one of {', '.join(METHODS)} (default: hybrid)")
@@ -82,8 +128,7 @@ def add_run(run: argparse.ArgumentParser) -> None:
     add("--rrd", nargs="?", const="", metavar="FILE", help=recording)
 
 
-def add_compare(compare: argparse.ArgumentParser) -> None:
-    """Options of ``hybridvo compare``."""
+def _add_compare(compare: argparse.ArgumentParser) -> None:
     add = compare.add_argument
     many = "sequences, or folders of sequences (MPI Sintel as it was unpacked)"
     add("paths", nargs="*", metavar="DIR", help=many)
@@ -98,8 +143,7 @@ def add_compare(compare: argparse.ArgumentParser) -> None:
     add("--worst", type=int, default=3, help="worst pairs shown for each method")
 
 
-def add_show(show: argparse.ArgumentParser) -> None:
-    """Options of ``hybridvo show``."""
+def _add_show(show: argparse.ArgumentParser) -> None:
     add = show.add_argument
     add("--pair", type=int, default=0, metavar="N", help="first frame (default 0)")
     add("--out", default="pair.png", metavar="FILE", help="default: pair.png")
@@ -110,8 +154,7 @@ def add_show(show: argparse.ArgumentParser) -> None:
     add("--overwrite", action="store_true", help="replace the image")
 
 
-def add_evaluate(evaluate: argparse.ArgumentParser) -> None:
-    """Options of ``hybridvo evaluate``."""
+def _add_evaluate(evaluate: argparse.ArgumentParser) -> None:
     add = evaluate.add_argument
     add("estimate", metavar="EST", help="estimated trajectory")
     add("gt", metavar="GT", help="true trajectory")
@@ -123,28 +166,6 @@ def add_evaluate(evaluate: argparse.ArgumentParser) -> None:
     for name in ("est", "gt"):
         add(f"--format-{name}", choices=("auto", "tum", "kitti", "tartanair"), default="auto")
         add(f"--axes-{name}", choices=("auto", "camera", "ned"), default="auto")
-
-
-def add_demo(demo: argparse.ArgumentParser) -> None:
-    """Options of ``hybridvo demo``."""
-    add = demo.add_argument
-    add("--out", default="runs/demo", metavar="DIR", help="default: runs/demo")
-    add("--overwrite", action="store_true", help="replace the results in --out")
-    add("--frames", type=int, default=20, metavar="N", help="default: 20")
-    add("--seed", type=int, default=0, metavar="N", help="of the scene")
-
-
-def add_generate(generate: argparse.ArgumentParser) -> None:
-    """Options of ``hybridvo generate``."""
-    which = generate.add_mutually_exclusive_group(required=True)
-    which.add_argument("path", nargs="?", metavar="PRESET", help="paper, diverse or a YAML file")
-    which.add_argument("--preset", metavar="PRESET", help="the same, by name")
-    add = generate.add_argument
-    add("--out", required=True, metavar="DIR", help="folder of the samples")
-    add("--count", type=int, default=1000, metavar="N", help="default: 1000")
-    add("--seed", type=int, default=0, metavar="N")
-    add("--size", type=int, nargs=2, metavar=("H", "W"), help="pixels")
-    add("--workers", type=int, default=1, metavar="N", help="processes")
 
 
 # -- options --------------------------------------------------------------------------------------

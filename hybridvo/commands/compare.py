@@ -29,7 +29,7 @@ from hybridvo.errors import HybridVOError, InputError
 from hybridvo.estimation import warm_up
 from hybridvo.evaluation import scores
 from hybridvo.evaluation.drawing import draw_worst
-from hybridvo.evaluation.pair_errors import pair_facts, true_motion, true_trajectory
+from hybridvo.evaluation.pair_errors import ERRORS, pair_facts, true_motion, true_trajectory
 from hybridvo.evaluation.protocols import (
     Protocol,
     check_protocol,
@@ -295,7 +295,7 @@ def _pairs(job: _Job, run: tuple[str, str], folder: Path) -> pd.DataFrame:
         steps["T_curr_prev"] = list(arrays["T_curr_prev"])
     steps = steps[steps["prev_index"].notna()].fillna({"reason": "", "message": ""})
     missing = steps["reason"] == "missing_frame"
-    steps.loc[missing, [*scores.PAIR_ERRORS, "motion_ms", "flow_ms"]] = np.nan
+    steps.loc[missing, [*ERRORS, "motion_ms", "flow_ms"]] = np.nan
     return steps.assign(
         sequence=job.name,
         method=run[0],

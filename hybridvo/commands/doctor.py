@@ -7,10 +7,8 @@ is ``agrees``, ``differs`` or ``cannot_tell``, with a sentence and a value.
 from __future__ import annotations
 
 import math
-import os
 import platform
 from collections.abc import Callable, Mapping
-from importlib.util import find_spec
 from typing import Any
 
 import cv2
@@ -22,7 +20,7 @@ from hybridvo.commands.run import is_dark
 from hybridvo.data.lists import shown
 from hybridvo.data.sequence import Sequence
 from hybridvo.errors import InputError
-from hybridvo.estimation import estimate, warm_up
+from hybridvo.estimation import estimate
 from hybridvo.evaluation.pair_errors import true_motion
 from hybridvo.files import versions
 from hybridvo.flow import contradiction, dis_flow, file_flow
@@ -31,12 +29,6 @@ from hybridvo.refinement.depth import depth_ratio, is_step
 from hybridvo.results import RelativePose
 from hybridvo.types import Frame, FramePair, depth_advice, typical_depth
 
-OPTIONAL = {
-    "poselib": "pip install 'hybridvo[baselines]', for --method poselib",
-    "open3d": "pip install open3d, for --method open3d-rgbd",
-    "rerun": "pip install 'hybridvo[viz]', for --rrd",
-}
-"""Import name: command, and what needs it."""
 MIN_PAIRS = 6
 """Fewer pairs give no usable standard error."""
 SIGMAS = 4.0
@@ -71,43 +63,26 @@ MEASURED = (
 
 
 def doctor() -> dict[str, Any]:
-    """What a bug report should hold, JSON-ready; what is not there has a remedy."""
-    import numba
+    """What a bug report should hold, JSON-ready; methods that cannot run have a remedy."""
     import torch
 
-    devices = {}
-    for name in ("cpu", *(f"cuda:{k}" for k in range(torch.cuda.device_count()))):
-        label = name if name == "cpu" else f"{name} ({torch.cuda.get_device_name(name)})"
-        try:
-            ones = torch.ones(64, 64, device=name)
-            works = float((ones @ ones)[0, 0]) == 64.0
-            devices[label] = "works" if works else "computes wrongly"
-        except RuntimeError as error:
-            devices[label] = f"fails: {str(error).splitlines()[0]}"
-    threads = {"cpus": os.cpu_count(), "torch": torch.get_num_threads()}
-    threads |= {"opencv": cv2.getNumThreads(), "numba": numba.get_num_threads()}
     ready, absent = methods_to_run(("all",))
     return {
         "platform": platform.platform(),
         "packages": versions(),
-        "optional": {k: "" if find_spec(k) is not None else how for k, how in OPTIONAL.items()},
-        "devices": devices,
-        "threads": threads,
-        "warm_up_s": warm_up(),
+        "cuda": [torch.cuda.get_device_name(k) for k in range(torch.cuda.device_count())],
         "methods": {**dict.fromkeys(ready, ""), **absent},
     }
 
 
 def doctor_text(report: Mapping[str, Any]) -> str:
     """The report for people."""
-    lines = [str(report["platform"])]
-    for name in ("packages", "devices", "threads"):
-        lines.append(f"{name:11}" + ", ".join(f"{k} {v}" for k, v in report[name].items()))
-    lines.append(f"warm-up    {report['warm_up_s']:.2f} s before the first frame")
-    ready = [name for name, problem in report["methods"].items() if not problem]
+    versions = ", ".join(f"{name} {version}" for name, version in report["packages"].items())
+    lines = [f"platform   {report['platform']}", f"packages   {versions}"]
+    lines.append("cuda       " + (", ".join(report["cuda"]) or "none"))
+    ready = (name for name, problem in report["methods"].items() if not problem)
     lines.append("methods    " + ", ".join(ready))
-    for name, how in report["optional"].items():
-        lines.append(f"optional   {name}: {(how and f'not installed; {how}') or 'installed'}")
+    lines += [f"not ready  {problem}" for problem in report["methods"].values() if problem]
     return "\n".join(lines)
 
 

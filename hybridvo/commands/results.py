@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -9,31 +10,63 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from hybridvo.commands.run_folder import RESULTS, STATE
 from hybridvo.data.sequence import Sequence
-from hybridvo.evaluation.metrics import Alignment, evaluate
-from hybridvo.evaluation.pair_errors import mean_pair_errors
+from hybridvo.evaluation.metrics import evaluate
+from hybridvo.evaluation.pair_errors import mean_pair_errors, true_trajectory
+from hybridvo.evaluation.plots import plot_trajectories
 from hybridvo.files import atomic_write, write_json
+from hybridvo.options import RunOptions
 from hybridvo.trajectory import Trajectory
 
 Row = Mapping[str, Any]
 
 
-def write_motions(folder: Path, rows: list[dict[str, Any]]) -> Trajectory:
-    """Write both trajectories and ``steps.npz`` (motions with their covariances)."""
-    stamps = np.array([row["timestamp"] for row in rows])
-    trajectory = Trajectory(stamps, np.array([row["T_world_cam"] for row in rows]))
+def write_results(
+    folder: Path,
+    rows: list[dict[str, Any]],
+    sequence: Sequence,
+    frames: range,
+    options: RunOptions,
+    *,
+    picture: bool,
+) -> dict[str, Any]:
+    """Write what a finished run leaves beside its steps; its summary, JSON-ready."""
+    trajectory = Trajectory(
+        np.array([row["timestamp"] for row in rows]), np.array([row["T_world_cam"] for row in rows])
+    )
     trajectory.save(folder / "trajectory.tum")
     trajectory.save(folder / "trajectory.kitti")
     names = ("index", "timestamp", "status", "probability", "T_curr_prev", "covariance")
     with atomic_write(folder / "steps.npz", "wb") as file:
         arrays: dict[str, Any] = {name: np.array([row[name] for row in rows]) for name in names}
         np.savez(file, **arrays)
-    return trajectory
+    summary = _summarise(pd.DataFrame(rows), sequence, options.method)
+    if summary["failed_fraction"] > options.max_failed:
+        text = f"more motions failed than --max-failed {options.max_failed:g} allows"
+        summary["warnings"].append(text)
+    metrics, gt = None, true_trajectory(sequence, frames)
+    if gt is not None:
+        report = evaluate(trajectory, gt, alignment=options.alignment)
+        pairs = mean_pair_errors(row for row in rows if "rot_err_deg" in row)
+        reasons = report["reasons"] | pairs["reasons"]
+        named = ("method", "failed", "degraded", "flow_source", "depth_source", "oracle")
+        metrics = report | pairs | {key: summary[key] for key in (*named, "sequence")}
+        metrics["reasons"] = reasons
+        write_json(folder / "metrics.json", metrics)
+    if picture:
+        title = f"{sequence.name}, flow: {', '.join(summary['flow_source']) or 'none'}"
+        if summary["oracle"]:
+            title += f" (oracle: {', '.join(summary['oracle'])})"
+        path = folder / "trajectory.png"
+        plot_trajectories({options.method: trajectory}, path, truth=gt, title=title)
+    files = [os.fspath(folder / name) for name in RESULTS if (folder / name).exists()]
+    files.append(os.fspath(folder / STATE))
+    return summary | {"state": "done", "out": os.fspath(folder), "files": files, "metrics": metrics}
 
 
-def summarise(rows: list[dict[str, Any]], sequence: Sequence, method: str) -> dict[str, Any]:
-    """Counts, sources, oracles, times and warnings of a run, JSON-ready."""
-    table = pd.DataFrame(rows)
+def _summarise(table: pd.DataFrame, sequence: Sequence, method: str) -> dict[str, Any]:
+    """Counts, sources, oracles, times and warnings of a run."""
     motions = table[1:]  # the first frame has none
     timed = motions[motions["reason"] != "missing_frame"]
     failed = int((motions["status"] == "failed").sum())
@@ -61,34 +94,6 @@ def summarise(rows: list[dict[str, Any]], sequence: Sequence, method: str) -> di
         },
         "warnings": [f"frame {row['index']}: {row['message']}" for _, row in doubts[:1].iterrows()],
     }
-
-
-def write_metrics(
-    folder: Path,
-    rows: list[dict[str, Any]],
-    trajectory: Trajectory,
-    gt: Trajectory,
-    summary: Row,
-    alignment: Alignment,
-) -> dict[str, Any]:
-    """Write ``metrics.json``: errors against the ground truth, and what went in."""
-    report = evaluate(trajectory, gt, alignment=alignment)
-    pairs = mean_pair_errors(row for row in rows if "rot_err_deg" in row)
-    reasons = report.pop("reasons") | pairs.pop("reasons")
-    named = ("method", "failed", "degraded", "flow_source", "depth_source", "oracle", "sequence")
-    metrics = report | pairs | {"reasons": reasons} | {key: summary[key] for key in named}
-    write_json(folder / "metrics.json", metrics)
-    return metrics
-
-
-def draw(path: Path, trajectory: Trajectory, gt: Trajectory | None, summary: Row) -> None:
-    """Draw the trajectory, with the ground truth where there is one."""
-    from hybridvo.evaluation.plots import plot_trajectories
-
-    title = f"{summary['sequence']}, flow: {', '.join(summary['flow_source']) or 'none'}"
-    if summary["oracle"]:
-        title += f" (oracle: {', '.join(summary['oracle'])})"
-    plot_trajectories({summary["method"]: trajectory}, path, truth=gt, title=title)
 
 
 # -- texts --------------------------------------------------------------------------------------
@@ -128,8 +133,8 @@ def _lines(facts: Iterable[tuple[str, str]]) -> str:
 
 def summary_text(summary: Row) -> str:
     """Summary of a run, a line a fact; oracles are named."""
-    if not summary.get("frames"):
-        return "no frame was finished"
+    if summary["state"] == "interrupted":
+        return f"interrupted after {summary['frames']} frames"
     flow = ", ".join(summary["flow_source"]) or "none"
     failed = f"failed {summary['failed']} of {summary['motions']} motions"
     facts = [

@@ -23,10 +23,10 @@ import hybridvo
 from hybridvo.commands import results
 from hybridvo.commands.progress import Progress, interruptible
 from hybridvo.commands.recording import Recording, check_recording
-from hybridvo.commands.run_folder import RESULTS, STATE, RunFolder
+from hybridvo.commands.run_folder import RunFolder
 from hybridvo.data.sequence import Sequence
 from hybridvo.errors import InputError
-from hybridvo.evaluation.pair_errors import step_errors, true_trajectory
+from hybridvo.evaluation.pair_errors import step_errors
 from hybridvo.files import Mode, fingerprint, held, versions
 from hybridvo.flow import FlowField, FlowProvider, MeasuredFlow, dis_flow, fallback, file_flow
 from hybridvo.geometry import se3_log
@@ -78,10 +78,8 @@ def run(
     header["command"] = list(command)
     with held(out), contextlib.ExitStack() as stack:
         folder = RunFolder(out, header, mode)
-        if folder.finished:
-            summary = folder.read_json(STATE)["summary"]
-            summary |= {"state": "done", "metrics": folder.read_json("metrics.json") or None}
-            return summary, _exit_code(summary, options)
+        if folder.summary is not None:
+            return folder.summary, _exit_code(folder.summary, options)
         recording = None
         if rrd is not None:
             poses = None if sequence.poses is None else sequence.poses[list(frames)]
@@ -114,7 +112,7 @@ class _Job:
         folder, rows, total = self.folder, self.folder.rows, len(self.frames)
         with (
             interruptible() as interrupted,
-            Progress(total, label, quiet=quiet, done=len(rows)) as progress,
+            Progress(label, total, "frames", quiet=quiet, done=len(rows)) as progress,
         ):
             for warning in self.sequence.warnings:
                 progress.say(f"warning: {warning}")
@@ -128,13 +126,19 @@ class _Job:
                 if row["status"] != "ok":
                     text = f"frame {index}: {row['status']} ({row['reason']}), probability "
                     progress.say(f"{text}{row['probability']:.2f}: {row['message']}")
-                failed = sum(row["status"] == "failed" for row in rows)
-                progress.update(len(rows), failed=failed)
+                progress.update(len(rows), sum(row["status"] == "failed" for row in rows))
                 if len(rows) % SAVE_EVERY == 0:
                     folder.save_rows(self.vo.state.to_arrays())
             if interrupted.is_set():
                 progress.say(f"interrupted: {len(rows)} frames are kept; go on with --resume")
-            return self._write(interrupted.is_set())
+                folder.save_rows(self.vo.state.to_arrays() if rows else None)
+                folder.save("interrupted")
+                return {"state": "interrupted", "frames": len(rows)}, EXIT_INTERRUPTED
+            folder.save_rows()
+            given = (folder.path, rows, self.sequence, self.frames, self.options.run)
+            summary = results.write_results(*given, picture=not self.quick)
+            folder.save("done", summary=summary)
+            return summary, _exit_code(summary, self.options)
 
     def _track(self, index: int) -> dict[str, Any]:
         """What is kept of a frame, JSON-ready: the columns of ``steps.csv`` and more."""
@@ -180,34 +184,6 @@ class _Job:
             "flow_is_true": field.flow is not None and field.is_true,
             **step_errors(self.sequence, prev, step.index, step.T_curr_prev),
         }
-
-    def _write(self, interrupted: bool) -> tuple[dict[str, Any], int]:
-        """Results of the rows kept so far, and the scores where the run is complete."""
-        folder, path, rows = self.folder, self.folder.path, self.folder.rows
-        if not rows:  # interrupted before the first frame
-            folder.save("interrupted")
-            return {"state": "interrupted", "frames": 0}, EXIT_INTERRUPTED
-        folder.save_rows(self.vo.state.to_arrays() if interrupted else None)
-        trajectory = results.write_motions(path, rows)
-        summary = results.summarise(rows, self.sequence, self.options.run.method)
-        summary["out"] = os.fspath(path)
-        if interrupted:
-            folder.save("interrupted", summary=summary)
-            return summary | {"state": "interrupted"}, EXIT_INTERRUPTED
-        exit_code = _exit_code(summary, self.options)
-        if exit_code == EXIT_FAILED_FRAMES:
-            allowed = self.options.run.max_failed
-            summary["warnings"].append(f"more motions failed than --max-failed {allowed:g} allows")
-        metrics = None
-        if (gt := true_trajectory(self.sequence, self.frames)) is not None:
-            alignment = self.options.run.alignment
-            metrics = results.write_metrics(path, rows, trajectory, gt, summary, alignment)
-        if not self.quick:
-            results.draw(path / "trajectory.png", trajectory, gt, summary)
-        written = (path / name for name in (*RESULTS, STATE))
-        summary["files"] = [os.fspath(file) for file in written if file.exists()]
-        folder.save("done", summary=summary)
-        return summary | {"state": "done", "metrics": metrics}, exit_code
 
 
 def _header(

@@ -15,6 +15,7 @@ import numpy as np
 import pandas as pd
 
 from hybridvo.errors import InputError, OutputError
+from hybridvo.evaluation.pair_errors import ERRORS
 from hybridvo.files import Mode, atomic_write, write_csv, write_json
 
 RESULTS = (
@@ -28,7 +29,7 @@ STEP_COLUMNS = (
     *("tx", "ty", "tz", "rx", "ry", "rz"),
     *("inlier_ratio", "iterations", "cost", "flow_ms", "motion_ms", "frame_ms"),
     *("prev_index", "flow_source", "message"),
-    *("r_err_deg", "t_err", "epe", "epe_l2_px", "rot_err_deg", "trans_err"),
+    *ERRORS,
 )
 
 
@@ -42,14 +43,14 @@ class RunFolder:
     Attributes:
         rows: of the finished frames, JSON-ready, in order.
         tracker: arrays of the tracker's state after them where the run is resumed, or None.
-        finished: whether the run that is resumed was complete already.
+        summary: of the run that is resumed where it was complete already, or None.
     """
 
     def __init__(self, path: Path, header: Mapping[str, Any], mode: Mode = "new") -> None:
         self.path, self.header = path, json.loads(json.dumps(header))
         self.rows: list[dict[str, Any]] = []
         self.tracker: dict[str, np.ndarray] | None = None
-        self.finished = False
+        self.summary: dict[str, Any] | None = None
         present = [name for name in (STATE, *RESULTS) if os.path.lexists(path / name)]
         if present and mode == "new":
             raise InputError(
@@ -57,7 +58,10 @@ class RunFolder:
                 f"--overwrite to replace them, --resume to go on, or another --out."
             )
         if present:
-            before = self.read_json(STATE)
+            try:
+                before = json.loads((path / STATE).read_text(encoding="utf-8"))
+            except (OSError, ValueError):  # absent or damaged
+                before = {}
             if "identity" not in before:
                 raise InputError(
                     f"{path}: holds {', '.join(present[:3])} and no {STATE} of a run: neither "
@@ -65,7 +69,7 @@ class RunFolder:
                 )
             if mode == "resume":
                 self._load(before)
-        if not self.finished:
+        if self.summary is None:
             # before the old results go: without it nothing would say that what is left is a run's
             self.save("running")
             if not self.rows:
@@ -80,18 +84,11 @@ class RunFolder:
                     f"{self.path}: cannot be resumed: {key} differs ({then[:40]} then, {now[:40]} "
                     f"now). Pass --overwrite to start anew."
                 )
-        self.finished = before["state"] == "done"
-        if not self.finished and (self.path / CHECKPOINT).is_file():
+        self.summary = before.get("summary")
+        if self.summary is None and (self.path / CHECKPOINT).is_file():
             with np.load(self.path / CHECKPOINT, allow_pickle=False) as stored:
                 arrays = dict(stored)
             self.rows, self.tracker = json.loads(arrays.pop("rows").tobytes()), arrays
-
-    def read_json(self, name: str) -> dict[str, Any]:
-        """Content of a JSON file of the folder; empty where it is absent or damaged."""
-        try:
-            return json.loads((self.path / name).read_text(encoding="utf-8"))
-        except (OSError, ValueError):
-            return {}
 
     def save(self, state: str, **more: Any) -> None:
         """Write ``run.json``; ``state`` is ``running``, ``interrupted`` or ``done``."""

@@ -15,7 +15,7 @@ from hybridvo.errors import InputError
 from hybridvo.estimation import estimate
 from hybridvo.evaluation.pair_errors import MOVING_PX, pair_errors, true_motion
 from hybridvo.evaluation.plots import Panel, draw_panels, flow_panel, longest_flow
-from hybridvo.evaluation.saliency import last_pass, saliencies
+from hybridvo.evaluation.saliency import Saliency, last_pass, saliencies
 from hybridvo.files import atomic_write, make_folder, write_json
 from hybridvo.flow import FlowProvider, dis_flow
 from hybridvo.geometry import ego_flow, matrix_to_euler_deg
@@ -69,8 +69,12 @@ def draw(
     T_gt = true_motion(sequence, pair, pair + 1)
     motion = estimate(given, method=method)
     panels, numbers, moving = _pair_panels(given, motion.T_curr_prev, motion.weights, T_gt, flow_gt)
+    true = None if T_gt is None else (matrix_to_euler_deg(T_gt[:3, :3]), T_gt[:3, 3])
     for name, network in found:
-        more, values = _network_panels(name, network, given, T_gt, moving, steps)
+        output, inputs, T_start = last_pass(network, given)
+        if isinstance(output, PixelwisePrediction):
+            panels += prediction_panels(name, output, true, moving)
+        more, values = saliency_panels(name, saliencies(network, inputs, T_start, steps), moving)
         panels += more
         numbers |= values
     source = f"{given.flow_source} (true)" if given.flow_is_true else given.flow_source
@@ -178,60 +182,47 @@ def _pair_panels(
     return panels, numbers, moving
 
 
-def _network_panels(
+def prediction_panels(
     name: str,
-    network: Any,
-    pair: FramePair,
-    T_gt: np.ndarray | None,
+    prediction: PixelwisePrediction,
+    true: tuple[np.ndarray, np.ndarray] | None,
     moving: np.ndarray,
-    steps: int,
+) -> list[Panel]:
+    """The paper's maps of the first pair of a prediction: uncertainty, and errors where known.
+
+    Uncertainty is the geometric mean of the three Laplace scales U at every pixel, the error the
+    mean absolute difference from the ``true`` Euler angles X-Y-Z (3,) of T_curr_prev, degrees, and
+    translation (3,), metres. ``moving`` (H, W) is outlined.
+    """
+    panels = []
+    for k, (what, unit) in enumerate((("rotation", "deg"), ("translation", "m"))):
+        scale = getattr(prediction, f"log_scale_{what}")
+        if scale is not None:  # beside its own scale: the paper compares where they are large
+            U = scale[0].detach().float().mean(0).exp().cpu().numpy()
+            panels.append(
+                Panel(f"{name}: uncertainty of the {what}", U, f"{unit}, U", None, moving)
+            )
+        if true is not None:
+            found = getattr(prediction, what)[0].detach().cpu().double().numpy()
+            error = np.abs(found - np.reshape(true[k], (3, 1, 1))).mean(axis=0)
+            panels.append(Panel(f"{name}: error of the {what}", error, unit, None, moving))
+    return panels
+
+
+def saliency_panels(
+    name: str, found: Mapping[str, Saliency], moving: np.ndarray
 ) -> tuple[list[Panel], Numbers]:
-    """Panels and numbers of one network: uncertainty, errors, saliency of its last pass."""
-    output, inputs, T_start = last_pass(network, pair)
+    """Where a network looks, and how much of that lies on what moves."""
     panels: list[Panel] = []
     numbers: Numbers = {}
-    if isinstance(output, PixelwisePrediction):
-        halves = (("rotation", "deg"), ("translation", "m"))
-        for (what, unit), values in zip(halves, uncertainty_maps(output), strict=False):
-            title = f"{name}: uncertainty of the {what}"
-            panels.append(Panel(title, values, f"{unit} (1 sigma)", None, moving))
-        if T_gt is not None:
-            true = matrix_to_euler_deg(T_gt[:3, :3]), T_gt[:3, 3]
-            for (what, unit), values in zip(halves, prediction_errors(output, *true), strict=True):
-                panels.append(Panel(f"{name}: error of the {what}", values, unit))
-    for what, saliency in saliencies(network, inputs, T_start, steps).items():
+    for what, saliency in found.items():
         n = 4  # summed over blocks: networks read one of some pixels only
         h, w = (size // n for size in saliency.magnitude.shape)
         shown = saliency.magnitude[: n * h, : n * w].reshape(h, n, w, n).sum(axis=(1, 3))
         relative = shown / max(float(np.percentile(shown, 99)), 1e-30)
-        title = f"{name}: saliency of the {what} (last pass)"
-        panels.append(Panel(title, relative, "relative", 1.0, moving))
+        panels.append(Panel(f"{name}: saliency, {what}", relative, "relative", 1.0, moving))
         numbers |= {
             f"{name}: saliency of the {what} on moving pixels": saliency.share_on(moving),
             f"{name}: part of the {what} that the saliency misses": saliency.completeness_error,
         }
     return panels, numbers
-
-
-def uncertainty_maps(prediction: PixelwisePrediction) -> list[np.ndarray]:
-    """Predicted uncertainty of rotation (degrees) and translation (m) of the first pair.
-
-    Two (h, w) maps: the geometric mean of the three Laplace scales U at every pixel.
-    """
-    scales = (prediction.log_scale_rotation, prediction.log_scale_translation)
-    return [s[0].detach().float().mean(0).exp().cpu().numpy() for s in scales if s is not None]
-
-
-def prediction_errors(
-    prediction: PixelwisePrediction, euler_deg: np.ndarray, translation: np.ndarray
-) -> list[np.ndarray]:
-    """Error of the predicted motion at every pixel of the first pair: the paper's error maps.
-
-    Two (h, w) maps: mean absolute difference from the true Euler angles X-Y-Z (3,) of T_curr_prev,
-    degrees, and from its translation (3,), metres.
-    """
-    parts = ((prediction.rotation, euler_deg), (prediction.translation, translation))
-    return [
-        np.abs(value[0].detach().cpu().double().numpy() - np.reshape(true, (3, 1, 1))).mean(axis=0)
-        for value, true in parts
-    ]

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from hybridvo.data.base import Sequence
 from hybridvo.data.image_io import UNKNOWN_FLOW
@@ -27,6 +27,8 @@ PAPER_SIZE = (128, 256)
 """(height, width) at which the paper measures its EPE."""
 MOVING_PX = 1.0
 """A pixel whose true flow differs by more than this from the true ego flow moves by itself."""
+ERRORS = ("r_err_deg", "t_err", "epe", "epe_l2_px", "rot_err_deg", "trans_err")
+"""Of a pair, see :func:`pair_errors`."""
 NO_DEPTH = "no pixel has a valid depth and a true motion that stays in front of the camera"
 
 
@@ -136,23 +138,18 @@ def mean_pair_errors(pairs: Iterable[Mapping[str, float | None]]) -> dict[str, A
 
     ``pairs`` is their number; ``reasons`` name every value that is None or leaves pairs out.
     """
-    pairs = list(pairs)
-    report: dict[str, Any] = {"pairs": len(pairs)}
-    reasons: dict[str, str] = {}
-    for key in (
-        *("r_err_deg", "t_err", "epe", "epe_l2_px"),
-        *("rot_err_deg_mean", "rot_err_deg_median", "trans_err_mean", "trans_err_median"),
-    ):
-        name = key.removesuffix("_mean").removesuffix("_median")
-        known = [v for pair in pairs if (v := pair.get(name)) is not None and not math.isnan(v)]
-        statistic = np.median if key.endswith("_median") else np.mean
-        report[key] = float(statistic(known)) if known else None
-        if not pairs:
-            reasons[key] = "no pair with ground truth"
-        elif len(known) < len(pairs):
-            missing = len(pairs) - len(known)
-            reasons[key] = f"unknown for {missing} of {len(pairs)} pairs: {NO_DEPTH}"
-    return report | {"reasons": reasons}
+    figures = {name: (name, "mean") for name in ERRORS[:4]}
+    for name in ERRORS[4:]:
+        figures |= {f"{name}_{how}": (name, how) for how in ("mean", "median")}
+    table = pd.DataFrame(list(pairs), columns=list(ERRORS), dtype=float)
+    report: dict[str, Any] = {"pairs": len(table), "reasons": {}}
+    for key, (name, how) in figures.items():
+        known = table[name].dropna()
+        report[key] = float(known.agg(how)) if len(known) else None
+        if len(known) < max(len(table), 1):
+            missing = f"unknown for {len(table) - len(known)} of {len(table)} pairs: {NO_DEPTH}"
+            report["reasons"][key] = missing if len(table) else "no pair with ground truth"
+    return report
 
 
 def pair_facts(

@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 from scipy.stats import binomtest
 
-from hybridvo.evaluation.pair_errors import mean_pair_errors
+from hybridvo.evaluation.pair_errors import ERRORS, mean_pair_errors
 
 FAILURE_PX = 1.0
 """Error of the ego flow at native size above which an estimate has failed, px."""
@@ -26,7 +26,6 @@ PATH_KEYS = (
     *("ate_rmse_sim3", "rpe_trans_rmse_sim3", "rpe_rot_rmse_deg_sim3"),
 )
 """Errors of a whole trajectory; those without a suffix are after a rigid alignment."""
-PAIR_ERRORS = ("r_err_deg", "t_err", "epe", "epe_l2_px", "rot_err_deg", "trans_err")
 NO_PAIRS = "no pair was estimated"
 NO_TRUTH = "the sequence has no ground truth for these frames"
 NO_MOVING = "needs true flow of the whole scene (moving objects included) and ground truth"
@@ -84,7 +83,7 @@ def known_number(value: float) -> float | None:
 def pair_scores(pairs: pd.DataFrame) -> dict[str, Any]:
     """Everything that is a mean, median or count over the pairs of one method and flow."""
     scored = pairs[pairs["rot_err_deg"].notna()]
-    scores = mean_pair_errors(scored[list(PAIR_ERRORS)].to_dict("records"))
+    scores = mean_pair_errors(scored[list(ERRORS)].to_dict("records"))
     reasons = scores["reasons"]
     if pairs.empty:
         reasons |= dict.fromkeys(reasons, NO_PAIRS)
@@ -191,7 +190,7 @@ def worst_pairs(pairs: pd.DataFrame, count: int = 3) -> list[dict[str, Any]]:
 
     Pairs without a known error come last, and only if their estimate failed.
     """
-    columns = ["sequence", "index", "status", "message", *PAIR_ERRORS, *FACTORS]
+    columns = ["sequence", "index", "status", "message", *ERRORS, *FACTORS]
     found = []
     for (method, flow), group in pairs.groupby(["method", "flow_source"], sort=False):
         known = group[group["epe_l2_px"].notna() | is_failed(group)]

@@ -18,9 +18,8 @@ from hybridvo.types import Frame
 
 def test_what_is_installed():
     report = doctor()
-    assert report["warm_up_s"] > 0 and "numpy" in report["packages"]
-    assert report["devices"]["cpu"] == "works" and report["methods"]["refine"] == ""
-    assert "numpy" in doctor_text(report)
+    assert "numpy" in report["packages"] and report["methods"]["refine"] == ""
+    assert "refine" in doctor_text(report)
 
 
 @dataclass

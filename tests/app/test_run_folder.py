@@ -85,11 +85,11 @@ def test_resume_goes_on_from_the_checkpoint(tmp_path):
 def test_resume_without_a_checkpoint_or_of_nothing_starts_anew(tmp_path):
     for _ in range(2):
         with start(tmp_path, "resume") as folder:
-            assert folder.rows == [] and not folder.finished
+            assert folder.rows == [] and folder.summary is None
     with start(tmp_path, "resume") as folder:
-        folder.save("done")
+        folder.save("done", summary={"frames": 2})
     with start(tmp_path, "resume") as folder:
-        assert folder.finished
+        assert folder.summary == {"frames": 2}
 
 
 def test_resume_of_another_run_or_a_damaged_state_is_refused(tmp_path):
@@ -140,9 +140,9 @@ def test_progress_on_a_terminal_is_a_bar():
 
     text = io.StringIO()
     console = Console(file=text, force_terminal=True, width=120)
-    with Progress(4, "static [x]", console=console) as progress:
+    with Progress("static [x]", 4, "frames", console=console) as progress:
         progress.say("a line")
-        progress.update(4, failed=1)
+        progress.update(4, 1)
     assert "static [x]" in text.getvalue() and "4/4" in text.getvalue()
     assert "1 failed" in text.getvalue() and "a line" in text.getvalue()
 

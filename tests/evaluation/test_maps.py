@@ -11,7 +11,7 @@ import torch
 from hybridvo.cli import main
 from hybridvo.data.sequence import open_sequence
 from hybridvo.errors import InputError
-from hybridvo.evaluation.drawing import draw, networks, prediction_errors, uncertainty_maps
+from hybridvo.evaluation.drawing import draw, networks, prediction_panels
 from hybridvo.evaluation.pair_errors import pair_facts
 from hybridvo.evaluation.plots import Panel, draw_panels, flow_colours, flow_panel
 from hybridvo.evaluation.saliency import Saliency, integrated_gradients, saliencies
@@ -67,13 +67,12 @@ def test_uncertainty_and_error_maps_by_hand() -> None:
     maps[1] += 7.0  # the second pair is not looked at
     log_rotation = torch.tensor([0.0, 1.0, 2.0])[None, :, None, None].expand(2, 3, 4, 5)
     prediction = PixelwisePrediction(maps, maps + 2.0, log_rotation, log_rotation - 1.0)
-    rotation, translation = uncertainty_maps(prediction)
-    np.testing.assert_allclose(rotation, np.full((4, 5), np.e), rtol=1e-6)
-    np.testing.assert_allclose(translation, np.ones((4, 5)), rtol=1e-6)
-    errors = prediction_errors(prediction, np.array([1.0, 2.0, 3.0]), np.array([2.0, 2.0, 0.5]))
-    np.testing.assert_allclose(errors[0], np.full((4, 5), 2.0))
-    np.testing.assert_allclose(errors[1], np.full((4, 5), 0.5))
-    assert uncertainty_maps(PixelwisePrediction(maps, maps)) == []
+    true = np.array([1.0, 2.0, 3.0]), np.array([2.0, 2.0, 0.5])
+    panels = prediction_panels("a", prediction, true, np.ones((4, 5), bool))
+    expected = (np.e, 2.0, 1.0, 0.5)  # uncertainty and error of the rotation, of the translation
+    for panel, value in zip(panels, expected, strict=True):
+        np.testing.assert_allclose(panel.values, np.full((4, 5), value), rtol=1e-6)
+    assert prediction_panels("a", PixelwisePrediction(maps, maps), None, true[0]) == []
 
 
 def test_gradients_of_a_linear_answer_are_its_terms() -> None:
