@@ -84,7 +84,7 @@ def _calc_dis(preset: str, first: np.ndarray, second: np.ndarray) -> np.ndarray 
     if height < 32 and width > 2 * height:
         return None
     # one for each call: two threads may not share one, and it keeps the scales of a small image
-    dis = cv2.DISOpticalFlow.create(DIS_PRESETS[preset])
+    dis: Any = cv2.DISOpticalFlow.create(DIS_PRESETS[preset])
     try:
         return np.asarray(dis.calc(first, second, None))
     except cv2.error:  # smaller than its patches
