@@ -161,7 +161,7 @@ def heavy_pairs(kind: str, seed: int) -> Iterator[tuple[str, Any, np.ndarray, np
     """(flow, pair, true motion, static pixels): pairs spread over a scene, each with both flows."""
     sequence = rendered(kind, seed, SIZE, HEAVY_FRAMES)
     for i, (pairs, T, _) in zip(HEAVY_AT, heavy_inputs(sequence), strict=True):
-        static = (~sequence.moving(i)).astype(np.float32)
+        static = (sequence.scene.object_id(i) <= 0).astype(np.float32)
         for flow in ("dis", "true"):
             yield flow, pairs[flow], T, static
 

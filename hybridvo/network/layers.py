@@ -164,8 +164,7 @@ class SelfAttention(nn.Module):
     def __init__(self, channels: int) -> None:
         super().__init__()
         inner = max(1, channels // 8)
-        self.query = nn.Conv2d(channels, inner, 1)
-        self.key = nn.Conv2d(channels, inner, 1)
+        self.query, self.key = nn.Conv2d(channels, inner, 1), nn.Conv2d(channels, inner, 1)
         self.value = nn.Conv2d(channels, channels, 1)
         self.gain = nn.Parameter(torch.zeros(()))
 
@@ -193,9 +192,7 @@ def initialize(network: nn.Module, uniform: tuple[nn.Module, ...] = ()) -> None:
         if isinstance(module, nn.Conv2d | nn.ConvTranspose2d | nn.Linear):
             if module.weight.is_meta:  # no memory to fill, and torch would load its compiler for it
                 continue
-            if id(module) in heads:
-                nn.init.xavier_uniform_(module.weight)
-            else:
-                nn.init.xavier_normal_(module.weight)
+            fill = nn.init.xavier_uniform_ if id(module) in heads else nn.init.xavier_normal_
+            fill(module.weight)
             if module.bias is not None:
                 nn.init.zeros_(module.bias)

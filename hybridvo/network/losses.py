@@ -1,10 +1,8 @@
-"""Losses of PWVO and its baselines (paper, sections 3.2.2 and 3.4) in log form.
+"""Losses of PWVO and its baselines (paper, sections 3.2.2 and 3.4) in log form, s = log U.
 
-Four terms, each plain or weighed by uncertainty, with s = log U:
-
-* rotation L^R and translation L^T: every pixel must name the pair's motion (distribution learning);
-* ego flow L^F and depth L^D: the *selected* motion, applied to the true depth, must reproduce the
-  flow and the next depth that the camera motion alone causes.
+Four terms, each plain or weighed by uncertainty: rotation L^R and translation L^T, every pixel must
+name the pair's motion (distribution learning); ego flow L^F and depth L^D, the *selected* motion,
+applied to the true depth, must reproduce what the camera motion alone causes.
 
 They are those of the published code, but pixels without depth are left out, a point that the motion
 brings behind the camera is charged, and s may have a coarser grid than the flow.

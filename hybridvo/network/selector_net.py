@@ -196,8 +196,8 @@ class SelectorNetwork(nn.Module):
 
 def _padded(x: torch.Tensor) -> torch.Tensor:
     """Zeros below and on the right, up to a multiple of what the network divides by."""
-    pad = (0, -x.shape[3] % 16, 0, -x.shape[2] % 16)
-    return F.pad(x, pad).contiguous(memory_format=torch.channels_last)
+    x = F.pad(x, (0, -x.shape[3] % 16, 0, -x.shape[2] % 16))
+    return x.contiguous(memory_format=torch.channels_last)
 
 
 def _mirrored(x: torch.Tensor, mirror: torch.Tensor, signed: tuple[int, ...]) -> torch.Tensor:
@@ -208,7 +208,7 @@ def _mirrored(x: torch.Tensor, mirror: torch.Tensor, signed: tuple[int, ...]) ->
 
 
 class NetworkScorer:
-    """A :class:`hybridvo.hypotheses.selector.Scorer`."""
+    """A :class:`hybridvo.hypotheses.selector.Scorer` on a device."""
 
     def __init__(self, network: SelectorNetwork, device: str = "cpu") -> None:
         self.device = torch.device(device)

@@ -25,8 +25,7 @@ class BatchedPose:
     Args:
         SE3: (B, 7) pypose SE3, ``T_curr_prev``; the identity where failed. Carries the gradient.
         covariance: (B, 6, 6) of the left perturbation (translation, rotation); no gradient.
-        converged: (B,) bool. failed: (B,) bool.
-        status: one per sample, with its reason.
+        converged, failed: (B,) bool. status: one per sample, with its reason.
         probability: (B,) of the motion being the camera's, by the weight of the motion that
             contradicts it most; 0 where failed.
         iterations: (B,) Newton steps on all pixels.
@@ -108,8 +107,8 @@ class Pixels:
 
     def map(self, change: Callable[[torch.Tensor], torch.Tensor]) -> Pixels:
         """The same with every tensor changed."""
-        there = {f.name: getattr(self, f.name) for f in fields(self)}
-        changed: dict[str, Any] = {name: change(x) for name, x in there.items() if x is not None}
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        changed: dict[str, Any] = {k: x if x is None else change(x) for k, x in values.items()}
         return Pixels(**changed)
 
     def subset(self, count: int) -> Pixels:
@@ -140,11 +139,9 @@ def gather_pixels(
 ) -> Pixels:
     """The pixels of a batch in raster order, or tile by tile where a tile's side is given.
 
-    ``with_depth`` joins the current frame's depth.
-
-    Invalid values are replaced before anything is computed from them, so that neither they nor
-    their gradients spread. Variances are divided by the typical one of their sample, which is held
-    constant.
+    ``with_depth`` joins the current frame's depth. Invalid values are replaced before anything is
+    computed from them, so that neither they nor their gradients spread. Variances are divided by
+    the typical one of their sample, which is held constant.
     """
     flow, depth = batch.flow, batch.depth_prev
     height, width = depth.shape[1:]
@@ -189,8 +186,8 @@ def sample_depth(depth: torch.Tensor, at: torch.Tensor) -> tuple[torch.Tensor, t
     """Bilinear depth (B, H, W) at (B, h, w, 2) px, where the four neighbours lie on one surface.
 
     Returns:
-        (B, h, w) metres and (B, h, w) bool. False (and depth 1) outside the image, next to an
-        invalid depth, and at edges. Differentiable in both arguments.
+        (B, h, w) metres and (B, h, w) bool: False, and depth 1, outside the image, next to an
+        invalid depth, and at edges.
     """
     height, width = depth.shape[1:]
     u, v = at.unbind(-1)

@@ -2,13 +2,11 @@
 
 Every start is refined on a subset of the pixels under a kernel whose scale shrinks (graduated
 non-convexity); the start of least cost is fitted to the noise found there, and then to all pixels.
-Poses are pypose SE3 in float64, pixels keep their type. Samples never see each other: damping,
-convergence and failure are per sample.
+Poses are pypose SE3 in float64. Samples never see each other.
 
 The gradient is that of the implicit function theorem: the estimate solves g(T, inputs) = 0 with
-g = sum of w J^T Sigma^-1 r, so d xi = A^-1 dg with A = -dg / d xi, the full derivative (residual,
-Jacobian, robust weights and covariance). It is attached by one Newton step whose value is zero;
-noise and covariance come from the numpy functions and carry no gradient.
+g = sum of w J^T Sigma^-1 r, so d xi = A^-1 dg with A = -dg / d xi, the full derivative. It is
+attached by one Newton step of value zero; noise and covariance carry none.
 """
 
 from __future__ import annotations
@@ -141,8 +139,8 @@ def _given_noise(noise: Any, like: torch.Tensor, with_depth: bool) -> torch.Tens
         return None
     value = torch.as_tensor(noise, device=like.device).to(like.dtype)
     known, sizes = value.detach(), (2, 3) if with_depth else (2,)
-    shapes = [shape for n in sizes for shape in ((n,), (len(like), n))]
-    if value.shape not in shapes or not bool(
+    fits = value.shape in [shape for n in sizes for shape in ((n,), (len(like), n))]
+    if not fits or not bool(
         (torch.isfinite(known) & (known >= 0)).all() & (known[..., ::2] > 0).all()
     ):
         raise InputError(
@@ -385,13 +383,13 @@ class _Solver:
         batch, usable = self.batch, int((self.pixels.weight[k] > 0).sum())
         if usable < self.options.min_pixels:
             for name, K in (("K_prev", batch.K_prev[k]), ("K_curr", batch.K_curr[k])):
-                if not bool(torch.isfinite(K).all()) or not bool((K.diagonal() > 0).all()):
+                if not bool(torch.isfinite(K).all() & (K.diagonal() > 0).all()):
                     return Status.failed(Reason.NAN_INPUT, f"{name} is no camera matrix")
             depth, flow = (x[k].detach().cpu().numpy() for x in (batch.depth_prev, batch.flow))
             return Status.failed(*too_few(depth, flow, usable, self.options.min_pixels))
-        open_end = Reason.SOLVER_DIVERGED, f"not converged after {STEPS} steps"
+        doubt = Reason.SOLVER_DIVERGED, f"not converged after {STEPS} steps"
         return status_of(
-            definite, share, None if converged else open_end, probability, MIN_PROBABILITY
+            definite, share, None if converged else doubt, probability, MIN_PROBABILITY
         )
 
 
