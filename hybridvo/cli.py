@@ -15,7 +15,8 @@ import logging
 import os
 import sys
 import traceback
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from hybridvo.commands import arguments
@@ -70,6 +71,18 @@ def _guarded(args: argparse.Namespace, command: list[str]) -> int:
         logger.setLevel(before)
 
 
+def text_of(name: str, content: Mapping[str, Any]) -> str:
+    """The result of a command for people."""
+    import jinja2
+
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(Path(__file__).parent / "commands" / "templates"),
+        autoescape=jinja2.select_autoescape(["html"]),
+        trim_blocks=True,
+    )
+    return environment.get_template(f"{name}.txt").render(content, report=content).rstrip()
+
+
 def _call(function: Callable[..., Any], args: argparse.Namespace, **more: Any) -> Any:
     """The function, with those arguments of the command line that it has, and others."""
     names = inspect.signature(function).parameters
@@ -85,7 +98,6 @@ def _open(args: argparse.Namespace) -> Any:
 
 
 def _run(args: argparse.Namespace, command: list[str]) -> Result:
-    from hybridvo.commands.results import summary_text
     from hybridvo.commands.run import run
     from hybridvo.network.models import Models
 
@@ -99,7 +111,7 @@ def _run(args: argparse.Namespace, command: list[str]) -> Result:
     if not args.quiet:
         for warning in summary.get("warnings", []):
             print(f"hybridvo: warning: {warning}", file=sys.stderr)
-    return summary, summary_text(summary), code
+    return summary, text_of("run", summary), code
 
 
 def _files(paths: Iterable[Any]) -> Result:
@@ -126,7 +138,6 @@ def _compare(args: argparse.Namespace, command: list[str]) -> Result:
 
 
 def _evaluate(args: argparse.Namespace, command: list[str]) -> Result:
-    from hybridvo.commands.results import evaluation_text
     from hybridvo.evaluation.metrics import evaluate
     from hybridvo.trajectory import read_trajectory
 
@@ -140,24 +151,24 @@ def _evaluate(args: argparse.Namespace, command: list[str]) -> Result:
     if code:
         reason = report["reasons"]["ate_rmse_unaligned"]
         print(f"hybridvo: nothing could be compared: {reason}.", file=sys.stderr)
-    return report, evaluation_text(report), code
+    return report, text_of("evaluate", report), code
 
 
 def _doctor(args: argparse.Namespace, command: list[str]) -> Result:
-    from hybridvo.commands.doctor import diagnose, diagnosis_text, doctor, doctor_text
+    from hybridvo.commands.doctor import diagnose, doctor
 
     if args.path or args.sequence:
         found = diagnose(_open(args), pairs=args.pairs)
-        return found, diagnosis_text(found), 0 if found["ok"] else 1
+        return found, text_of("diagnosis", found), 0 if found["ok"] else 1
     report = doctor()
-    return report, doctor_text(report), 0
+    return report, text_of("doctor", report), 0
 
 
 def _demo(args: argparse.Namespace, command: list[str]) -> Result:
-    from hybridvo.commands.demo import demo, demo_text
+    from hybridvo.commands.demo import demo
 
     content = _call(demo, args, command=command)
-    return content, demo_text(content), 0
+    return content, text_of("demo", content), 0
 
 
 def _generate(args: argparse.Namespace, command: list[str]) -> Result:

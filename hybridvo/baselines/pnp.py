@@ -28,10 +28,8 @@ MIN_POINTS = 6
 """Fewest correspondences and inliers: four always fit some pose, so they prove nothing."""
 DEPTH_RANGE_M = (1e-6, 1e6)
 """Open interval of depths that can be metres; outside it squares leave the floating-point range."""
-MIN_INLIER_RATIO = 0.05
-"""Below this share of the sampled pixels a consensus is chance: failed."""
-LOW_INLIER_RATIO = 0.25
-"""Below this share the largest motion need not be the camera's: degraded."""
+MIN_INLIER_RATIO = 0.05  # below this share of the sampled pixels a consensus is chance: failed
+LOW_INLIER_RATIO = 0.25  # below this share the largest motion need not be the camera's: degraded
 SINGULAR_RATIO = 1e-10
 """Eigenvalue ratio of the scaled information at which a direction is free: failed."""
 WEAK_RATIO = 1e-6

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from hybridvo.commands.run import EXIT_INTERRUPTED, run
 from hybridvo.data.sequence import open_sequence
@@ -101,19 +100,3 @@ def demo(
     plot_trajectories(drawn, content["image"], truth=truth, alignment="origin", title=title)
     write_json(out / MARK, content)
     return content
-
-
-def demo_text(content: dict[str, Any]) -> str:
-    """The table for people, and what to do next."""
-    scene = content["scene"]
-    table = pd.DataFrame(content["rows"]).to_string(index=False, float_format="{:.4g}".format)
-    return (
-        f"{scene['frames']} rendered frames of {scene['width']}x{scene['height']}, "
-        f"{100 * content['moving_fraction']:.0f} % of the pixels move by themselves; flow: OpenCV "
-        f"DIS on the images; depth: the renderer's (true).\n"
-        f"ATE after aligning the first pose, the other errors are means a pair.\n\n"
-        f"{table}\n\n"
-        f"image: {content['image']}\n"
-        f"next:  hybridvo run DIR       your own sequence (hybridvo init DIR writes camera.yaml)\n"
-        f"       hybridvo doctor DIR    what is wrong with it"
-    )

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import platform
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import cv2
@@ -75,17 +75,6 @@ def doctor() -> dict[str, Any]:
     }
 
 
-def doctor_text(report: Mapping[str, Any]) -> str:
-    """The report for people."""
-    versions = ", ".join(f"{name} {version}" for name, version in report["packages"].items())
-    lines = [f"platform   {report['platform']}", f"packages   {versions}"]
-    lines.append("cuda       " + (", ".join(report["cuda"]) or "none"))
-    ready = (name for name, problem in report["methods"].items() if not problem)
-    lines.append("methods    " + ", ".join(ready))
-    lines += [f"not ready  {problem}" for problem in report["methods"].values() if problem]
-    return "\n".join(lines)
-
-
 def diagnose(sequence: Sequence, *, pairs: int = 40) -> dict[str, Any]:
     """Look for systematic disagreement in a sequence; JSON-ready.
 
@@ -119,19 +108,6 @@ def diagnose(sequence: Sequence, *, pairs: int = 40) -> dict[str, Any]:
         ],
         "ok": all(state != "differs" for state, _, _ in answers.values()),
     }
-
-
-def diagnosis_text(report: Mapping[str, Any]) -> str:
-    """The report for people."""
-    signs = {"agrees": "ok          ", "differs": "DIFFERS     ", "cannot_tell": "cannot tell "}
-    lines = [f"{report['sequence']}: {report['frames']} frames, {report['pairs']} pairs looked at"]
-    lines += [f"{signs[f['state']]}{f['name']}: {f['message']}" for f in report["findings"]]
-    lines += [f"unreadable  {message}" for message in report["unreadable"][:5]]
-    unanswered = sum(finding["state"] == "cannot_tell" for finding in report["findings"])
-    end = "nothing differs" if report["ok"] else "something differs: see above"
-    if unanswered:
-        end += f"; {unanswered} of {len(report['findings'])} questions could not be answered"
-    return "\n".join([*lines, end])
 
 
 def _measure(sequence: Sequence, prev: Frame, curr: Frame) -> dict[str, Any]:

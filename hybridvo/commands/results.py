@@ -1,9 +1,8 @@
-"""Files and texts of a run, from the rows of its frames."""
+"""Files of a run, from the rows of its frames."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +17,6 @@ from hybridvo.evaluation.plots import plot_trajectories
 from hybridvo.files import atomic_write, write_json
 from hybridvo.options import RunOptions
 from hybridvo.trajectory import Trajectory
-
-Row = Mapping[str, Any]
 
 
 def write_results(
@@ -94,78 +91,3 @@ def _summarise(table: pd.DataFrame, sequence: Sequence, method: str) -> dict[str
         },
         "warnings": [f"frame {row['index']}: {row['message']}" for _, row in doubts[:1].iterrows()],
     }
-
-
-# -- texts --------------------------------------------------------------------------------------
-
-
-Errors = tuple[tuple[str, str, float, str], ...]
-"""Label, name in the report, factor, and what follows the number."""
-PATH_ERRORS: Errors = (
-    ("ATE", "ate_rmse", 100, "cm RMSE ({alignment})"),
-    ("RPE translation", "rpe_trans_rmse", 100, "cm RMSE over {delta:g} {delta_unit}"),
-    ("RPE rotation", "rpe_rot_rmse_deg", 1, "deg RMSE over {delta:g} {delta_unit}"),
-)
-PAIR_ERRORS: Errors = (
-    ("rotation error", "rot_err_deg_median", 1, "deg, median of the pairs"),
-    ("translation error", "trans_err_median", 100, "cm, median of the pairs"),
-    ("ego-flow error", "epe_l2_px", 1, "px, mean of the pairs"),
-)
-OTHER_ALIGNMENTS: Errors = (
-    ("ATE unaligned", "ate_rmse_unaligned", 100, "cm RMSE"),
-    ("ATE with scale", "ate_rmse_sim3", 100, "cm RMSE (sim3)"),
-)
-
-
-def _facts(report: Row, errors: Errors) -> list[tuple[str, str]]:
-    """Labels and numbers, or why there are none."""
-    return [
-        (label, f"- ({report['reasons'].get(key, 'unknown')})")
-        if report[key] is None
-        else (label, f"{factor * report[key]:.4g} {text.format(**report)}")
-        for label, key, factor, text in errors
-    ]
-
-
-def _lines(facts: Iterable[tuple[str, str]]) -> str:
-    return "\n".join(f"{name:17}  {value}" for name, value in facts)
-
-
-def summary_text(summary: Row) -> str:
-    """Summary of a run, a line a fact; oracles are named."""
-    if summary["state"] == "interrupted":
-        return f"interrupted after {summary['frames']} frames"
-    flow = ", ".join(summary["flow_source"]) or "none"
-    failed = f"failed {summary['failed']} of {summary['motions']} motions"
-    facts = [
-        ("sequence", f"{summary['sequence']}, {summary['frames']} frames"),
-        ("method", str(summary["method"])),
-        ("inputs", f"flow: {flow}; depth: {summary['depth_source']}"),
-    ]
-    if summary["oracle"]:
-        facts.append(("ORACLE", f"uses {' and '.join(summary['oracle'])} (ground truth)"))
-    facts.append(("status", f"{failed}, {summary['degraded']} degraded"))
-    if summary["frame_ms_median"] is not None:
-        times = (summary[f"{part}_ms_median"] for part in ("frame", "flow", "motion"))
-        facts.append(("time", "{:.1f} ms a frame: flow {:.1f}, motion {:.1f}".format(*times)))
-    if metrics := summary.get("metrics"):
-        facts += _facts(metrics, PATH_ERRORS + PAIR_ERRORS)
-    facts.append(("results", str(summary["out"])))
-    if "recording" in summary:
-        facts.append(("recording", f"{summary['recording']} (open it with: rerun FILE)"))
-    return _lines(facts)
-
-
-def evaluation_text(report: Row) -> str:
-    """Errors between two trajectory files."""
-    facts = [
-        ("matched", f"{report['matched']} of {report['total']} poses, by {report['matched_by']}"),
-        *_facts(report, PATH_ERRORS + OTHER_ALIGNMENTS),
-    ]
-    for label, key in (("KITTI drift", "kitti_drift"), ("drift 5 to 40 m", "kitti_drift_short")):
-        drift = report[key]
-        if drift is not None and drift["translation"] is not None:
-            rotation = f"{drift['rotation_deg_per_m']:.4g} deg/m"
-            facts.append((label, f"{100 * drift['translation']:.4g} %, {rotation}"))
-    facts.append(("evo", str(report["evo_version"])))
-    return _lines(facts + [("warning", text) for text in report["warnings"]])

@@ -8,7 +8,6 @@ from __future__ import annotations
 import base64
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -76,12 +75,14 @@ def write_report(folder: Path, result: Mapping[str, Any], pairs: pd.DataFrame) -
         "result": result,
         "pairs": len(pairs.drop_duplicates(["sequence", "index"])),
         "methods": methods,
-        "tables": [(flow, Table(rows, RESULT_COLUMNS)) for flow, rows in by_flow(result)],
+        "tables": [(flow, (rows, RESULT_COLUMNS, ("method",))) for flow, rows in by_flow(result)],
         "worst": _gallery(folder, result),
         "sections": [(name, _json(some)) for name, some in sections.items() if some],
         "sequences": [(name, _json(some)) for name, some in paths.items()],
         "protocol": _protocol_tables(result.get("protocol")),
-        "numbers": Table(every, SEQUENCE_COLUMNS, ("sequence", "method", "flow_source"), False),
+        "numbers": (every, SEQUENCE_COLUMNS, ("sequence", "method", "flow_source")),
+        "number": number,
+        "no_merit": NO_MERIT,
     }
     for name in ("report.html", "report.md"):
         text = environment.get_template(name).render(content, plotly=get_plotlyjs())
@@ -141,72 +142,16 @@ def number(value: float | None, digits: int = 3) -> str:
     return f"{value:.{digits}g}"
 
 
-@dataclass(frozen=True, eq=False)
-class Table:
-    """Rows of ``results.json`` for people: ``named`` columns of texts, then numbers.
-
-    ``ranked``: the best number of a column is marked.
-    """
-
-    rows: Sequence[Mapping[str, Any]]
-    columns: Sequence[Column]
-    named: Sequence[str] = ("method",)
-    ranked: bool = True
-
-    @property
-    def frame(self) -> pd.DataFrame:
-        """Texts, then numbers or NaN, under the names that people read."""
-        cells: dict[str, list[Any]] = {
-            name.replace("_", " "): [str(row[name]) for row in self.rows] for name in self.named
-        }
-        for key, label, factor in self.columns:
-            cells[label] = [
-                math.nan if row.get(key) is None else factor * row[key] for row in self.rows
-            ]
-        return pd.DataFrame(cells)
-
-    @property
-    def reasons(self) -> list[str]:
-        """Why numbers are missing."""
-        found = (
-            f"{row['method']}: {label}: {row['reasons'][key]}"
-            for row in self.rows
-            for key, label, _ in self.columns
-            if row.get(key) is None and key in row.get("reasons", {})
-        )
-        return list(dict.fromkeys(found))
-
-    def html(self) -> str:
-        """A table element; every text is escaped."""
-        frame = self.frame
-        texts, labels = frame.columns[: len(self.named)], frame.columns[len(self.named) :]
-        style = frame.style.format(number, subset=labels).format(escape="html", subset=texts)
-        style = style.format_index(escape="html", axis="columns").hide(axis="index")
-        if self.ranked and len(frame) > 1:
-            merits = [label for label in labels if label not in NO_MERIT]
-            style = style.highlight_min(subset=merits, props="font-weight: 700; color: #0072b2")
-        return style.set_properties(subset=texts, **{"text-align": "left"}).to_html()
-
-    def markdown(self) -> str:
-        """The table in Markdown."""
-        named, columns = len(self.named), self.frame.columns
-        lines = [list(columns), ["---"] * named + ["---:"] * (len(columns) - named)]
-        for row in self.frame.itertuples(index=False):
-            lines.append([*row[:named], *map(number, row[named:])])
-        cells = ([text.replace("|", "\\|") for text in line] for line in lines)
-        return "".join("| " + " | ".join(line) + " |\n" for line in cells)
-
-
-def _protocol_tables(protocol: Mapping[str, Any] | None) -> list[tuple[str, Table]]:
-    """Measured here, and what others published."""
+def _protocol_tables(protocol: Mapping[str, Any] | None) -> list[tuple[str, Any]]:
+    """Measured here, and what others published: rows, columns, names."""
     if protocol is None:
         return []
     columns = [(m["key"], f"{m['label']} [{m['unit']}]", 1.0) for m in protocol["metrics"]]
     here = [*columns, ("pairs", "pairs", 1.0)]
     others = ("name", "inputs", "source", "note")
     return [
-        ("Measured here", Table(protocol["table"], here, ("method", "flow_source"))),
-        ("Published by others", Table(protocol["published"], columns, others, ranked=False)),
+        ("Measured here", (protocol["table"], here, ("method", "flow_source"))),
+        ("Published by others", (protocol["published"], columns, others)),
     ]
 
 
