@@ -9,67 +9,28 @@ cannot be written, 130 interrupted.
 from __future__ import annotations
 
 import argparse
+import inspect
 import json
 import logging
 import os
 import sys
 import traceback
-from collections.abc import Callable, Sequence
-from typing import Any, Literal
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
 
-from hybridvo import __version__
 from hybridvo.commands import arguments
-from hybridvo.commands.train import add_train, train
+from hybridvo.commands.train import train
 
 Result = tuple[Any, str, int]
 """What a command gives: JSON-ready, for people, and the exit code."""
-Call = Callable[[argparse.Namespace, list[str]], Result]
-
-
-def build_parser() -> argparse.ArgumentParser:
-    """Parser of the whole command line."""
-    parser = argparse.ArgumentParser(
-        prog="hybridvo",
-        description="Metric camera motion with covariance from optical flow, depth and intrinsics.",
-    )
-    parser.add_argument("--version", action="version", version=f"hybridvo {__version__}")
-    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-
-    def add(name: str, call: Call, help: str, *parents: argparse.ArgumentParser) -> Any:
-        command = commands.add_parser(
-            name,
-            help=help,
-            description=help[0].upper() + help[1:] + ".",
-            parents=[arguments.common(), *parents],
-            formatter_class=argparse.RawDescriptionHelpFormatter,
-        )
-        command.set_defaults(call=call)
-        return command
-
-    sequence = arguments.input()
-    arguments.add_run(add("run", _run, "estimate the camera motion of a sequence", sequence))
-    arguments.add_compare(add("compare", _compare, "run methods side by side and write a report"))
-    arguments.add_show(add("show", _show, "draw the maps of one pair of a sequence", sequence))
-    errors = "errors of a trajectory file against ground truth"
-    arguments.add_evaluate(add("evaluate", _evaluate, errors))
-    wrong, optional = "what is missing here, or wrong with a sequence", arguments.input(False)
-    doctor = add("doctor", _doctor, wrong, optional)
-    doctor.add_argument("--pairs", type=int, default=40, metavar="N", help="pairs (default 40)")
-    arguments.add_demo(add("demo", _demo, "render a scene with moving objects and run on it"))
-    arguments.add_generate(add("generate", _generate, "draw training samples into a folder"))
-    training = commands.add_parser("train", help="train a network")
-    training.set_defaults(call=train)
-    add_train(training, arguments.common())
-    init = add("init", _init, "write a camera.yaml to fill in, for a recording of your own")
-    init.add_argument("directory", metavar="DIR", help="folder with rgb/ and depth/")
-    return parser
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     given = sys.argv[1:] if argv is None else list(argv)
     try:
-        args = build_parser().parse_args(given)
+        args = arguments.build_parser(CALLS).parse_args(given)
     except SystemExit as end:  # argparse: 0 after --help and --version, 2 for wrong usage
         return int(end.code or 0)
     return _guarded(args, ["hybridvo", *given])
@@ -110,8 +71,22 @@ def _guarded(args: argparse.Namespace, command: list[str]) -> int:
         logger.setLevel(before)
 
 
-def _mode(args: argparse.Namespace) -> Literal["new", "resume", "overwrite"]:
-    return "resume" if args.resume else "overwrite" if args.overwrite else "new"
+def text_of(name: str, content: Mapping[str, Any]) -> str:
+    """The result of a command for people."""
+    import jinja2
+
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(Path(__file__).parent / "commands" / "templates"),
+        autoescape=jinja2.select_autoescape(["html"]),
+        trim_blocks=True,
+    )
+    return environment.get_template(f"{name}.txt").render(content, report=content).rstrip()
+
+
+def _call(function: Callable[..., Any], args: argparse.Namespace, **more: Any) -> Any:
+    """The function, with those arguments of the command line that it has, and others."""
+    names = inspect.signature(function).parameters
+    return function(**{name: v for name, v in vars(args).items() if name in names} | more)
 
 
 def _open(args: argparse.Namespace) -> Any:
@@ -123,120 +98,85 @@ def _open(args: argparse.Namespace) -> Any:
 
 
 def _run(args: argparse.Namespace, command: list[str]) -> Result:
-    from hybridvo.commands.results import summary_text
     from hybridvo.commands.run import run
     from hybridvo.network.models import Models
 
-    given = {
-        f"run.{name}": getattr(args, name)
-        for name in ("method", "start", "stop", "stride", "device", "max_failed", "strict")
-    }
-    options = arguments.load_options(
-        args.config, args.assignments, given | {"flow.source": args.flow}
-    )
+    if "help" in args.given:
+        defaults = arguments.option_defaults()
+        return defaults, "\n".join(f"{key}={value}" for key, value in defaults.items()), 0
+    options = arguments.run_options(args)
     files = arguments.weight_files(args.weights, [options.run.method])
-    summary, code = run(
-        _open(args),
-        args.out,
-        options,
-        models=Models(options.run.device, files),
-        mode=_mode(args),
-        command=command,
-        quiet=args.quiet,
-        rrd=args.rrd,
-    )
+    given = {"options": options, "models": Models(options.run.device, files), "command": command}
+    summary, code = _call(run, args, sequence=_open(args), **given)
     if not args.quiet:
         for warning in summary.get("warnings", []):
             print(f"hybridvo: warning: {warning}", file=sys.stderr)
-    return summary, summary_text(summary), code
+    return summary, text_of("run", summary), code
+
+
+def _files(paths: Iterable[Any]) -> Result:
+    written = [str(path) for path in paths]
+    return {"files": written}, "\n".join(written), 0
 
 
 def _show(args: argparse.Namespace, command: list[str]) -> Result:
     from hybridvo.evaluation.drawing import draw
 
-    given = ("flow", "method", "weights", "steps", "overwrite")
-    options = {name: getattr(args, name) for name in given}
-    written = [str(path) for path in draw(_open(args), args.pair, args.out, **options)]
-    return {"files": written}, "\n".join(written), 0
+    return _files(_call(draw, args, sequence=_open(args)))
 
 
 def _compare(args: argparse.Namespace, command: list[str]) -> Result:
-    from hybridvo.commands.progress import Progress
-    from hybridvo.evaluation.comparison import compare
-    from hybridvo.evaluation.sequence_job import ComparisonOptions
+    from hybridvo.commands.compare import compare
     from hybridvo.pipeline import METHODS
 
     methods = tuple(name.strip() for name in args.methods.split(",") if name.strip())
-    known = METHODS if methods == ("all",) else methods
-    names = ["flow", "dataset", "start", "stop", "stride", "seed", "device", "protocol", "worst"]
-    options = ComparisonOptions(
-        sequences=(*args.paths, *args.sequence),
-        methods=methods,
-        weights=arguments.weight_files(args.weights, known),
-        **{name: getattr(args, name) for name in names},
-    )
-    with Progress(0, "compare", quiet=args.quiet, unit="pairs") as progress:
-
-        def report(message: str, done: int, total: int) -> None:
-            if message:
-                progress.say(message)
-            progress.update(done, total=total)
-
-        paths = compare(options, args.out, mode=_mode(args), command=command, progress=report)
-    written = [str(path) for path in paths]
-    return {"files": written}, "\n".join(written), 0
+    weights = arguments.weight_files(args.weights, METHODS if methods == ("all",) else methods)
+    given = {"methods": methods, "weights": weights, "options": arguments.run_options(args)}
+    given |= {"sequences": (*args.paths, *args.sequence), "command": command}
+    say = (lambda text: None) if args.quiet else (lambda text: print(text, file=sys.stderr))
+    return _files(_call(compare, args, **given, say=say))
 
 
 def _evaluate(args: argparse.Namespace, command: list[str]) -> Result:
-    from hybridvo.commands.results import evaluation_text
-    from hybridvo.evaluation.metrics import evaluate_files
+    from hybridvo.evaluation.metrics import evaluate
+    from hybridvo.trajectory import read_trajectory
 
-    names = ["alignment", "delta", "delta_unit", "max_diff"]
-    names += ["format_est", "format_gt", "axes_est", "axes_gt"]
-    report = evaluate_files(args.estimate, args.gt, **{name: getattr(args, name) for name in names})
+    est = read_trajectory(args.estimate, args.format_est, axes=args.axes_est)
+    gt = read_trajectory(args.gt, args.format_gt, axes=args.axes_gt)
+    report = _call(evaluate, args, estimate=est, gt=gt)
+    report |= {"estimate": args.estimate, "gt": args.gt}
+    report["warnings"] = [*est.warnings, *gt.warnings]
     # not one figure: the files do not belong together
     code = 2 if report["ate_rmse_unaligned"] is None else 0
     if code:
         reason = report["reasons"]["ate_rmse_unaligned"]
         print(f"hybridvo: nothing could be compared: {reason}.", file=sys.stderr)
-    return report, evaluation_text(report), code
+    return report, text_of("evaluate", report), code
 
 
 def _doctor(args: argparse.Namespace, command: list[str]) -> Result:
+    from hybridvo.commands.doctor import diagnose, doctor
+
     if args.path or args.sequence:
-        from hybridvo.commands.diagnose import diagnose, diagnosis_text
-
         found = diagnose(_open(args), pairs=args.pairs)
-        return found, diagnosis_text(found), 0 if found["ok"] else 1
-    from hybridvo.commands.doctor import doctor, doctor_text
-
+        return found, text_of("diagnosis", found), 0 if found["ok"] else 1
     report = doctor()
-    return report, doctor_text(report), 0 if report["usable"] else 2
+    return report, text_of("doctor", report), 0
 
 
 def _demo(args: argparse.Namespace, command: list[str]) -> Result:
-    from hybridvo.commands.demo import demo, demo_text
+    from hybridvo.commands.demo import demo
 
-    options = {name: getattr(args, name) for name in ("frames", "seed", "overwrite", "quiet")}
-    content = demo(args.out, **options, command=command)
-    return content, demo_text(content), 0
+    content = _call(demo, args, command=command)
+    return content, text_of("demo", content), 0
 
 
 def _generate(args: argparse.Namespace, command: list[str]) -> Result:
     from hybridvo.commands.generate import generate
     from hybridvo.commands.progress import Progress
 
-    size = tuple(args.size) if args.size else None
-    with Progress(args.count, "generate", quiet=args.quiet, unit="samples") as progress:
-        sheet = generate(
-            args.path or args.preset,
-            args.count,
-            args.out,
-            seed=args.seed,
-            size=size,
-            workers=args.workers,
-            report=lambda done, total: progress.update(done, total=total),
-        )
+    with Progress("generate", args.count, "samples", quiet=args.quiet) as bar:
+        sheet = _call(generate, args, preset=args.path or args.preset, report=bar.update)
     return {"contact_sheet": str(sheet)}, str(sheet), 0
 
 
@@ -246,6 +186,19 @@ def _init(args: argparse.Namespace, command: list[str]) -> Result:
     path = write_camera_template(args.directory)
     next_step = f"fill it in, then: hybridvo run {args.directory}"
     return {"file": str(path)}, f"{path}\n{next_step}", 0
+
+
+CALLS = {
+    "run": _run,
+    "compare": _compare,
+    "show": _show,
+    "evaluate": _evaluate,
+    "doctor": _doctor,
+    "demo": _demo,
+    "train": train,
+    "generate": _generate,
+    "init": _init,
+}
 
 
 if __name__ == "__main__":

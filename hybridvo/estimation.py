@@ -51,13 +51,6 @@ def estimate(
 
     Raises:
         InputError: an unknown method, or one that cannot run here; an argument of another kind.
-
-    Example:
-        >>> import numpy as np
-        >>> from hybridvo.types import Camera, Frame, FramePair
-        >>> frame = Frame(None, np.ones((24, 32)), Camera(30, 30, 15.5, 11.5, 24, 32))
-        >>> estimate(FramePair(frame, frame, None)).status.reason.value
-        'no_flow'
     """
     options = Options() if options is None else options
     _check_kind("estimate.options", options, Options)
@@ -77,23 +70,13 @@ def estimate(
 
 @overload
 def refine(
-    pair: FramePair,
-    T_init: np.ndarray | None = None,
-    weights: np.ndarray | None = None,
-    *,
-    options: Options | None = None,
-    seed: int = 0,
+    pair: FramePair, T_init: Any = ..., weights: Any = ..., *, options: Any = ..., seed: int = ...
 ) -> RelativePose: ...
 
 
 @overload
 def refine(
-    pair: PairBatch,
-    T_init: Any = None,
-    weights: Any = None,
-    *,
-    options: Options | None = None,
-    seed: int = 0,
+    pair: PairBatch, T_init: Any = ..., weights: Any = ..., *, options: Any = ..., seed: int = ...
 ) -> BatchedPose: ...
 
 
@@ -109,8 +92,8 @@ def refine(
 
     Args:
         pair: a :class:`FramePair` (numpy), or a :class:`PairBatch` (torch) for the batched,
-            differentiable path, see :func:`hybridvo.refinement.torch_backend.refine_batch`: that
-            one draws nothing at random, and follows the largest motion where nothing is handed in.
+            differentiable path, which follows the largest motion where nothing is handed in: see
+            :func:`hybridvo.refinement.torch_backend.refine_batch`.
         T_init: (4, 4) T_curr_prev, the only start, from which the fit may leave for a larger motion
             unless weights hold it; None: every strong motion is searched, and hand-made cues say
             which is the camera's.
@@ -121,9 +104,6 @@ def refine(
     Returns:
         The motion with covariance and status (for a :class:`PairBatch` a ``BatchedPose``). Bad data
         give a failed status, never an exception and never a value that is not finite.
-
-    Raises:
-        InputError: an argument of another kind or shape, or a start that is no rigid transform.
     """
     options = Options() if options is None else options
     _check_kind("refine.options", options, Options)
@@ -147,10 +127,9 @@ def refine(
 
 
 def warm_up(method: str = DEFAULT_METHOD, models: Models | None = None) -> float:
-    """Compile the kernels (or read them from numba's cache) and the networks before a first pair.
+    """Compile and load everything before a first pair; seconds spent.
 
-    Returns:
-        Seconds spent: a minute on the first call after an installation, a second after that.
+    A minute on the first call after an installation, a second after that.
     """
     started = time.perf_counter()
     if method in BASELINES:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import csv
 import hashlib
+import io
 import json
 import os
 import platform
@@ -107,16 +108,22 @@ def fingerprint(paths: Iterable[str | os.PathLike[str]]) -> str:
     return digest.hexdigest()
 
 
+def read_bytes(path: str | os.PathLike[str]) -> bytes:
+    """Content of a file; FileNotFoundError where there is none."""
+    try:
+        return Path(path).read_bytes()
+    except FileNotFoundError:
+        raise
+    except (OSError, ValueError) as error:
+        raise FormatError(f"{str(path)[:200]!r}: cannot be read: {error}.") from None
+
+
 def read_text(path: str | os.PathLike[str]) -> str:
     """Text of a UTF-8 file, without a byte-order mark."""
     try:
-        return Path(path).read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise
+        return io.TextIOWrapper(io.BytesIO(read_bytes(path)), encoding="utf-8-sig").read()
     except UnicodeDecodeError:
         raise FormatError(f"{path}: expected a text file, got binary data.") from None
-    except (OSError, ValueError) as error:
-        raise FormatError(f"{str(path)[:200]!r}: cannot be read: {error}.") from None
 
 
 class Row(NamedTuple):
@@ -154,8 +161,7 @@ def read_rows(path: str | os.PathLike[str], columns: str, *, words: int = 0) -> 
 def versions() -> dict[str, str]:
     """Versions of Python and of the packages that decide numbers; absent ones are left out."""
     found = {"python": platform.python_version()}
-    names = ("hybridvo", "numpy", "scipy", "opencv-python-headless", "numba", "torch", "evo")
-    for name in (*names, "poselib"):
+    for name in "hybridvo numpy scipy opencv-python-headless numba torch evo poselib".split():
         with contextlib.suppress(PackageNotFoundError):
             found[name] = version(name)
     return found

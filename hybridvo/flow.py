@@ -7,7 +7,6 @@ had at all it is None, for which the estimators return ``failed(no_flow)``.
 from __future__ import annotations
 
 import logging
-import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -26,21 +25,11 @@ DIS_PRESETS = {
     "medium": cv2.DISOPTICAL_FLOW_PRESET_MEDIUM,
 }
 _logger = logging.getLogger(__name__)
-# a DIS object that two threads use at once ends the process
-_of_thread = threading.local()
 
 
 @dataclass(frozen=True, eq=False)
 class FlowField:
-    """Optical flow of one pair.
-
-    Args:
-        flow: (H, W, 2) float32 px, previous to current, on the previous grid, or None.
-        variance: (H, W) float32 px^2 per component, or None.
-        valid: (H, W) bool, False where the flow is known to be wrong, or None.
-        source: ``file``, ``dis`` or the name of a callable.
-        is_true: whether the flow is ground truth (an oracle).
-    """
+    """Optical flow of one pair, as in a :class:`hybridvo.types.FramePair`."""
 
     flow: np.ndarray | None
     variance: np.ndarray | None = None
@@ -102,10 +91,10 @@ def _calc_dis(preset: str, first: np.ndarray, second: np.ndarray) -> np.ndarray 
     # are left it would end the process
     if height < 32 and width > 2 * height:
         return None
-    if not hasattr(_of_thread, preset):
-        setattr(_of_thread, preset, cv2.DISOpticalFlow.create(DIS_PRESETS[preset]))
+    # one for each call: two threads may not share one, and it keeps the scales of a small image
+    dis: Any = cv2.DISOpticalFlow.create(DIS_PRESETS[preset])
     try:
-        return np.asarray(getattr(_of_thread, preset).calc(first, second, None))
+        return np.asarray(dis.calc(first, second, None))
     except cv2.error:  # smaller than its patches
         return None
 

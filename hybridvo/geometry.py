@@ -53,8 +53,8 @@ def ego_flow(
 ) -> np.ndarray:
     """(H, W, 2) flow in pixels that the camera motion alone causes (paper, equation 8).
 
-    F_ego = pi(K_curr, T_curr_prev D K_prev^-1 x) - x. NaN where depth is invalid or the moved point
-    is not in front of the camera.
+    F_ego = pi(K_curr, T_curr_prev D K_prev^-1 x) - x; NaN where depth is invalid or the moved point
+    is behind the camera.
     """
     depth = np.asarray(depth, dtype=np.float64)
     valid = np.isfinite(depth) & (depth > 0)

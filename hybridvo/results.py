@@ -77,13 +77,10 @@ class Status:
 class MotionPrior:
     """What is known of a motion before the pair is seen: one start among others, and a cue.
 
-    Args:
-        T_curr_prev: (4, 4) rigid transform, metres.
-        covariance: (6, 6) positive definite, of ``Exp(delta) T_curr_prev``, delta = (translation,
-            rotation) in the current camera; m^2, m rad, rad^2.
+    The covariance (6, 6) is that of a :class:`RelativePose`.
 
     Raises:
-        InputError: no rigid transform, or no positive definite covariance.
+        InputError: no rigid transform (4, 4), or no positive definite covariance.
     """
 
     T_curr_prev: np.ndarray
@@ -192,7 +189,7 @@ class RelativePose:
 
     @property
     def usable(self) -> bool:
-        """Whether this is a measurement: not failed. The covariance of a degraded one is wider."""
+        """Whether this is a measurement: not failed."""
         return self.status.usable
 
     @property

@@ -20,8 +20,6 @@ with warnings.catch_warnings():
     from kornia.geometry.camera import project_points
     from kornia.geometry.depth import unproject_meshgrid
 
-from hybridvo.errors import InputError
-
 MIN_DEPTH = 1e-6
 MAX_DEPTH = 1e9
 """Metres between which a depth counts as measured, as in the numba kernels."""
@@ -85,42 +83,35 @@ def projection_rows(
 
 
 def reproject(
-    depth: torch.Tensor, T: torch.Tensor, K_prev: torch.Tensor, K_curr: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
+    depth: torch.Tensor,
+    T: torch.Tensor,
+    K_prev: torch.Tensor,
+    K_curr: torch.Tensor,
+    min_depth: float = MIN_DEPTH,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Where the pixels of the previous frame are seen by the current one: x + ego flow.
 
-    Args:
-        depth: (B, H, W) metres.
-        T: T_curr_prev, (B, 4, 4) or pypose SE3 (B, 7).
-        K_prev: (B, 3, 3).
-        K_curr: (B, 3, 3).
+    ``depth`` (B, H, W) metres; ``T`` T_curr_prev, (B, 4, 4) or pypose SE3 (B, 7); intrinsics
+    (B, 3, 3); a point that moves nearer than ``min_depth`` metres counts as behind the camera.
 
     Returns:
-        (B, H, W, 2) px on the current image and (B, H, W) bool, False where the depth is invalid
-        or the point is not in front of the camera; these pixels hold finite values without meaning.
+        (B, H, W, 2) px on the current image; (B, H, W) bool: the depth is valid and the point in
+        front of the camera (elsewhere the pixels are finite and mean nothing); (B, H, W) depth of
+        the moved point, 1 where there is none.
     """
     if isinstance(T, pp.LieTensor):
         T = T.matrix()
-    batch = len(depth)
-    for name, value, shape in (
-        ("depth", depth, (batch, *depth.shape[-2:])),
-        ("T", T, (batch, 4, 4)),
-        ("K_prev", K_prev, (batch, 3, 3)),
-        ("K_curr", K_curr, (batch, 3, 3)),
-    ):
-        if tuple(value.shape) != shape:
-            got = tuple(value.shape)
-            raise InputError(f"reproject: expected {name} of shape {shape}, got {got}.")
-    valid = (depth > MIN_DEPTH) & (depth < MAX_DEPTH)
+    valid = (depth > 0) & (depth < MAX_DEPTH)
     safe = torch.where(valid, depth, torch.ones_like(depth))
-    points = rays(depth.shape[1], depth.shape[2], K_prev) * safe[..., None]
-    moved = move(T, points.flatten(1, 2).transpose(1, 2))
-    front = moved[:, 2:] > MIN_DEPTH
-    pixels = project(torch.where(front, moved, torch.ones_like(moved)), K_curr)
-    return (
-        pixels.transpose(1, 2).reshape(*depth.shape, 2),
-        valid & front.reshape(depth.shape),
-    )
+    with torch.autocast(depth.device.type, enabled=False):
+        points = rays(depth.shape[1], depth.shape[2], K_prev) * safe[..., None]
+        moved = move(T, points.flatten(1, 2).transpose(1, 2))
+        z = torch.where(valid, moved[:, 2].unflatten(1, depth.shape[1:]), torch.ones_like(safe))
+        front = z >= min_depth
+        # before the division: a masked quotient would still give NaN gradients
+        ahead = torch.where(front, z, torch.ones_like(z)).flatten(1)[:, None]
+        pixels = project(torch.cat([moved[:, :2], ahead], dim=1), K_curr)
+    return pixels.transpose(1, 2).unflatten(1, depth.shape[1:]), valid & front, z
 
 
 def euler_transform(rotation_deg: torch.Tensor, translation: torch.Tensor) -> torch.Tensor:

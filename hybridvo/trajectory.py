@@ -1,7 +1,6 @@
 """Camera trajectories: chained from relative poses, read from and written to text files.
 
-A trajectory holds ``T_world_cam`` (camera to world) in camera axes. evo writes the files. They are
-read here: evo names neither the line of a mistake nor accepts tabs and Windows line ends.
+evo writes the files. They are read here: evo names neither the line of a mistake nor accepts tabs.
 """
 
 from __future__ import annotations
@@ -36,13 +35,10 @@ _logger = logging.getLogger(__name__)
 
 
 def chain(T_world_prev: np.ndarray, T_curr_prev: np.ndarray) -> np.ndarray:
-    """Next camera pose: ``T_world_curr = T_world_prev @ inv(T_curr_prev)``.
-
-    Both are (4, 4) and orthonormal to 1e-6, the result to 1e-12: one Newton step of the polar
-    decomposition, so that rounding does not accumulate over long sequences.
-    """
+    """Next camera pose: ``T_world_curr = T_world_prev @ inv(T_curr_prev)``, (4, 4)."""
     T_world_curr = T_world_prev @ invert(T_curr_prev)
     R = T_world_curr[:3, :3]
+    # one step of the polar decomposition, so that rounding does not accumulate
     T_world_curr[:3, :3] = R @ (1.5 * np.eye(3) - 0.5 * (R.T @ R))
     return T_world_curr
 
@@ -58,8 +54,8 @@ class Trajectory:
         warnings: what a reader changed, in sentences.
 
     Raises:
-        InputError: no pose, shapes that do not match, values that are not finite, rotations that
-            are not orthonormal to 1e-6, stamps that do not increase.
+        InputError: no pose, shapes that do not match, rotations that are not orthonormal to 1e-6,
+            stamps that do not increase.
     """
 
     timestamps: np.ndarray
@@ -152,7 +148,7 @@ def read_trajectory(
     if not path.is_file():
         raise InputError(f"{path}: trajectory file cannot be read: no such file.")
     kind = _format_of(path) if format == "auto" else format
-    rows, T = read_poses(path, COLUMNS[kind])
+    rows, T = read_poses(path, kind)
     if not rows:
         raise FormatError(f"{path}: expected at least one pose, got none.")
     stamps = np.array([row.numbers[0] for row in rows])
@@ -174,14 +170,13 @@ def read_trajectory(
     return Trajectory(stamps / factor, T, kind == "tum", tuple(warnings))
 
 
-def read_poses(path: Path, columns: str) -> tuple[list[Row], np.ndarray]:
-    """Rows of a list of poses, and (N, 4, 4) what they hold, NaN where that is not finite.
+def read_poses(path: Path, kind: str) -> tuple[list[Row], np.ndarray]:
+    """Rows of a list of a kind of :data:`COLUMNS`, and (N, 4, 4) their poses, NaN if not finite.
 
-    The last ``columns`` are ``tx ty tz qx qy qz qw``, or the first three rows of the matrix. A
-    damaged row or what is no rotation is a FormatError with file and line.
+    A damaged row or what is no rotation is a FormatError with file and line.
     """
-    rows = read_rows(path, columns)
-    is_matrix = columns == COLUMNS["kitti"]
+    rows = read_rows(path, COLUMNS[kind])
+    is_matrix = kind == "kitti"
     width = 12 if is_matrix else 7
     values = np.array([row.numbers[-width:] for row in rows]).reshape(-1, width)
     known = np.isfinite(values).all(axis=1)
@@ -214,16 +209,14 @@ def _refuse(path: Path, rows: list[Row], bad: np.ndarray, expected: str) -> None
 
 def _format_of(path: Path) -> str:
     """Format by the number of columns of the first pose."""
+    kinds = {len(columns.split()): kind for kind, columns in COLUMNS.items()}
     for line, text in enumerate(read_text(path).split("\n"), start=1):
         if count := len(text.partition("#")[0].split()):
-            for name, columns in COLUMNS.items():
-                if len(columns.split()) == count:
-                    return name
-            raise FormatError(
-                f"{path}:{line}: expected 8 numbers (TUM), 12 (KITTI) or 7 (TartanAir) separated "
-                f"by spaces, got {count}."
-            )
-    raise FormatError(f"{path}: expected at least one pose, got none.")
+            if count in kinds:
+                return kinds[count]
+            expected = "8 numbers (TUM), 12 (KITTI) or 7 (TartanAir) separated by spaces"
+            raise FormatError(f"{path}:{line}: expected {expected}, got {count}.")
+    return "tum"
 
 
 def check_increasing(stamps: np.ndarray, where: str) -> None:

@@ -21,14 +21,11 @@ from hybridvo.errors import InputError
 if TYPE_CHECKING:
     import torch
 
-MAX_PIXELS = 2**28
-"""Largest image, in pixels, that a frame or a file header may declare."""
+MAX_PIXELS = 2**28  # largest image, in pixels, that a frame or a file header may declare
 FOCAL_RANGE = (1e-3, 1e9)
 """Focal lengths in pixels whose inverses and squares single precision can hold."""
-PLAUSIBLE_DEPTH_M = (0.1, 200.0)
-"""Metres; a depth map whose median lies outside is not in metres."""
-EVERYDAY_DEPTH_M = (0.3, 8.0)
-"""Metres; where the median of an indoor depth map usually lies."""
+PLAUSIBLE_DEPTH_M = (0.1, 200.0)  # metres; a depth map whose median lies outside is not in metres
+EVERYDAY_DEPTH_M = (0.3, 8.0)  # metres; where the median of an indoor depth map usually lies
 UNITS_PER_METRE = {1000: "millimetres", 5000: "TUM's unit", 100: "centimetres", 256: "KITTI's unit"}
 """Depth units in use, the most frequent first."""
 
@@ -88,8 +85,7 @@ class Camera:
     Focal lengths and principal point are in pixels of this image size.
 
     Raises:
-        InputError: a value that is not finite, a focal length outside ``FOCAL_RANGE``, an image
-            size that is not positive, or a principal point farther than one image size outside.
+        InputError: values of no camera; a principal point farther than one image size outside.
     """
 
     fx: float
@@ -355,17 +351,13 @@ def depth_advice(median: float, usual: float | None = None) -> str:
     low, high = PLAUSIBLE_DEPTH_M
     if low <= median <= high:
         return ""
-    if median < low:
-        factors = [float(unit) for unit in UNITS_PER_METRE]
-    elif usual and low <= median / usual <= high:
+    factors = [1 / unit if median > high else float(unit) for unit in UNITS_PER_METRE]
+    if usual and median > high and low <= median / usual <= high:
         factors = [1 / usual]
-    else:
-        factors = [1 / unit for unit in UNITS_PER_METRE]
     # how far each leads from the middle of everyday depths, which are all as good
     nearest, farthest = EVERYDAY_DEPTH_M
-    reach = np.log(farthest / nearest) / 2
-    off = [abs(np.log(median * f / np.sqrt(nearest * farthest))) for f in factors]
-    factor = factors[int(np.argmin(np.maximum(off, reach)))]
+    off = np.abs(np.log(median * np.array(factors) / np.sqrt(nearest * farthest)))
+    factor = factors[int(np.argmin(off.clip(np.log(farthest / nearest) / 2)))]
     if factor > 1:
         return f"multiply by {factor:g}"
     unit = UNITS_PER_METRE.get(round(1 / factor))

@@ -23,7 +23,7 @@ import numpy as np
 from benchmark_costs import costs
 from golden_inputs import HEAVY, HEAVY_AT, HEAVY_FRAMES, REAL, SIZE, rendered
 from golden_inputs import heavy_pairs as heavy_inputs
-from measuring import able, digits, provenance, score, summarise, timed, write_result
+from measuring import able, digits, parser_of, provenance, score, summarise, timed, write_result
 
 FLOW_ONLY = (
     "hybrid-flow", "refine", "pwvo", "pnp-ransac-tuned", "pnp-ransac", "usac-magsac", "poselib",
@@ -41,9 +41,7 @@ Estimator = Callable[[Any], Any]
 
 
 def build_parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="benchmark.py", description=(__doc__ or "").splitlines()[0]
-    )
+    parser = parser_of(__file__, __doc__)
     parser.add_argument("--parts", default=",".join(PARTS), help="of " + ", ".join(PARTS))
     parser.add_argument("--pairs", type=int, default=20, help="pairs of each scenario")
     parser.add_argument("--sequences", type=int, default=6, help="rendered scenes of each kind")
@@ -163,7 +161,7 @@ def heavy_pairs(kind: str, seed: int) -> Iterator[tuple[str, Any, np.ndarray, np
     """(flow, pair, true motion, static pixels): pairs spread over a scene, each with both flows."""
     sequence = rendered(kind, seed, SIZE, HEAVY_FRAMES)
     for i, (pairs, T, _) in zip(HEAVY_AT, heavy_inputs(sequence), strict=True):
-        static = (~sequence.moving(i)).astype(np.float32)
+        static = (sequence.scene.object_id(i) <= 0).astype(np.float32)
         for flow in ("dis", "true"):
             yield flow, pairs[flow], T, static
 

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from measuring import auroc, digits, ego_flow_error, proportion, provenance, timed
+from measuring import auroc, digits, ego_flow_error, parser_of, proportion, provenance, timed
 
 METHODS = ("refine", "hybrid-flow", "poselib")
 WRONG_PX, WRONG_FACTOR = 1.0, 3.0
@@ -31,9 +31,7 @@ SEEDS = {"train": 1, "development": 2, "test": 3}
 
 
 def build_parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="benchmark_semi_real.py", description=(__doc__ or "").splitlines()[0]
-    )
+    parser = parser_of(__file__, __doc__)
     parser.add_argument("--pairs", type=int, default=160)
     parser.add_argument("--first", type=int, default=0, help="number of the first pair")
     parser.add_argument("--split", default="test", choices=SEEDS)

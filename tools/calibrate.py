@@ -18,7 +18,7 @@ import numpy as np
 from benchmark import heavy_pairs
 from benchmark_semi_real import WRONG_FACTOR, WRONG_PX, calibration_error, draw
 from golden_inputs import HEAVY
-from measuring import auroc, ego_flow_error
+from measuring import auroc, ego_flow_error, parser_of
 from scipy.optimize import minimize
 
 from hybridvo import dis_flow, iter_pairs, open_sequence, refine
@@ -42,9 +42,7 @@ RIDGE = 0.02
 
 
 def build_parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="calibrate.py", description=(__doc__ or "").splitlines()[0]
-    )
+    parser = parser_of(__file__, __doc__)
     parser.add_argument("--pairs", type=int, default=200, help="semi-real pairs")
     parser.add_argument("--selector", metavar="FILE", help="weights instead of the shipped ones")
     parser.add_argument("--data", type=Path, default=Path("../shared/data"), metavar="DIR")

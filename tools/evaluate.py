@@ -20,6 +20,7 @@ from golden_inputs import HEAVY, SIZE, rendered, scene_flow
 from measuring import (
     able,
     digits,
+    parser_of,
     proportion,
     provenance,
     score,
@@ -39,9 +40,7 @@ BINS = (0.0, 0.2, 0.4, 0.6, 0.8, 0.9, 0.95, 0.99, 1.0)
 
 
 def build_parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="evaluate.py", description=(__doc__ or "").splitlines()[0]
-    )
+    parser = parser_of(__file__, __doc__)
     parser.add_argument("--kinds", default=",".join(HEAVY), help="families of scenes")
     parser.add_argument("--sequences", type=int, default=1, help="of each family")
     parser.add_argument("--frames", type=int, default=100, help="of a sequence")

@@ -1,22 +1,17 @@
 """Golden figures: what an earlier revision estimated on kept inputs, and what has moved since.
 
     python tools/golden.py --against docs/golden.json     # the frozen figures
-    python tools/golden.py --against main~5               # another revision, measured now
     python tools/golden.py --seeds 3 --out docs/golden.json --overwrite    # freeze
 
-Only public names and the command line are called. The exit code is 1 where something got worse by
+Only public names are called. The exit code is 1 where something got worse by
 more than the spread over random seeds that the frozen figures carry, 0 otherwise.
 """
 
 from __future__ import annotations
 
 import argparse
-import csv
 import json
-import os
-import subprocess
 import sys
-import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -26,7 +21,7 @@ from typing import Any
 import numpy as np
 from golden_compare import compare
 from golden_inputs import HEAVY, read_pair, write_inputs
-from measuring import ROOT, digits, processor, revision, score
+from measuring import ROOT, digits, parser_of, processor, revision, score
 from scipy.spatial.transform import Rotation
 
 TIMED_PAIRS, REPEATS = 3, 3
@@ -44,16 +39,13 @@ def main(argv: list[str] | None = None) -> int:
         return 2
     if not (args.inputs / "index.json").is_file():
         write_inputs(args.inputs, args.data)
-    old = None
-    if args.against is not None:
-        old = reference(args.against, args)
     new = measure(args.inputs, args.only, args.seeds)
     if args.out is not None:
         args.out.parent.mkdir(parents=True, exist_ok=True)
         args.out.write_text(to_text(new), encoding="utf-8")
-    if old is None:
+    if args.against is None:
         return 0
-    findings = compare(old, new)
+    findings = compare(json.loads(args.against.read_text(encoding="utf-8")), new)
     for finding in findings:
         print(finding)
     worse = sum(finding.startswith("WORSE") for finding in findings)
@@ -62,9 +54,9 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def build_parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="golden.py", description=(__doc__ or "").splitlines()[0])
+    parser = parser_of(__file__, __doc__)
     parser.add_argument("--out", type=Path, metavar="FILE", help="write the figures here")
-    parser.add_argument("--against", metavar="FILE|REV", help="figures or revision to compare with")
+    parser.add_argument("--against", type=Path, metavar="FILE", help="figures to compare with")
     parser.add_argument("--inputs", type=Path, default=ROOT / "runs/golden/inputs", metavar="DIR")
     parser.add_argument("--data", type=Path, default=ROOT / "../shared/data", metavar="DIR")
     parser.add_argument(
@@ -73,24 +65,6 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--seeds", type=int, default=1, help="random seeds; more give the spread")
     parser.add_argument("--overwrite", action="store_true", help="replace --out")
     return parser
-
-
-def reference(against: str, args: argparse.Namespace) -> dict[str, Any]:
-    """Figures from a file, or measured now by this program with the package of a revision."""
-    if Path(against).is_file():
-        return json.loads(Path(against).read_text(encoding="utf-8"))
-    with tempfile.TemporaryDirectory() as folder:
-        tree, out = Path(folder) / "tree", Path(folder) / "golden.json"
-        git = ["git", "-C", str(ROOT), "worktree"]
-        subprocess.run([*git, "add", "--detach", str(tree), against], check=True)
-        try:
-            environment = dict(os.environ, PYTHONPATH=str(tree))
-            command = [sys.executable, __file__, "--inputs", args.inputs, "--out", out]
-            command += ["--seeds", str(max(args.seeds, 3)), "--only", args.only]
-            subprocess.run([str(word) for word in command], env=environment, check=True)
-        finally:
-            subprocess.run([*git, "remove", "--force", str(tree)], check=True)
-        return json.loads(out.read_text(encoding="utf-8"))
 
 
 def to_text(result: dict[str, Any]) -> str:
@@ -114,8 +88,6 @@ def measure(inputs: Path, only: str, seeds: int) -> dict[str, Any]:
     runs |= prior_cases(inputs)
     runs["track/dis/hybrid"] = lambda: track(inputs, "hybrid", seeds)
     runs["track/dis/refine"] = lambda: track(inputs, "refine", seeds)
-    for method in ("hybrid", "refine"):
-        runs[f"command_line/dis/{method}"] = lambda m=method: command_line(inputs, m)
     for name, run in runs.items():
         if any(word in name for word in only.split(",")):
             cases[name] = run()
@@ -261,30 +233,6 @@ def along_path(T: np.ndarray, T_true: np.ndarray, status: str) -> dict[str, Any]
     failed = status.startswith("failed")
     record = {"error": float(np.linalg.norm(T[:3, 3] - T_true[:3, 3])), "status": status}
     return record | {"failed": failed, "unflagged": False, "overconfident": False, "nees": None}
-
-
-def command_line(inputs: Path, method: str) -> dict[str, Any]:
-    """``hybridvo run`` on a sequence on disk: errors of position, exit code, files, columns."""
-    poses = np.load(inputs / "demo.npz")["poses"]
-    poses = np.linalg.inv(poses[0]) @ poses
-    sequence = inputs / "demo/training/clean/light"
-    with tempfile.TemporaryDirectory() as folder:
-        out = Path(folder) / "run"
-        command = [str(Path(sys.executable).parent / "hybridvo"), "run", "--sequence", sequence]
-        command += ["--flow", "dis", "--method", method, "--out", out, "--quiet"]
-        done = subprocess.run(list(map(str, command)), stdout=subprocess.DEVNULL, check=False)
-        files = sorted(str(path.relative_to(out)) for path in out.rglob("*") if path.is_file())
-        with open(out / "steps.csv", encoding="utf-8", newline="") as file:
-            steps = list(csv.DictReader(file))
-        path = np.loadtxt(out / "trajectory.tum")
-    records = []
-    for step, row, pose in zip(steps, path, poses, strict=True):
-        T = np.eye(4)
-        T[:3, 3] = row[1:4] - path[0, 1:4]
-        status = step["status"] + (f"({step['reason']})" if step["reason"] else "")
-        records.append(along_path(T, pose, status))
-    found = {"unit": "m", "exit_code": done.returncode, "files": files, "columns": list(steps[0])}
-    return summarise(records[1:]) | found
 
 
 def least_ms(work: Callable[[], Any]) -> float:

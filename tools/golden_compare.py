@@ -15,11 +15,6 @@ NEES_FACTOR = 1.5
 MEDIAN_FACTOR, ELSEWHERE_FACTOR, WORST_FACTOR, TIME_FACTOR = 1.05, 1.2, 1.5, 1.25
 TOLERANCE = {"px": 1e-5, "m": 1e-6}
 """Differences that say nothing: below the last digits of the inputs."""
-OWED = {
-    "files": "metrics.json run.json steps.csv steps.npz trajectory.kitti trajectory.tum",
-    "columns": "index timestamp status reason tx ty tz rx ry rz inlier_ratio iterations cost",
-}
-"""Files of ``hybridvo run`` and columns of ``steps.csv`` that other programs read."""
 STATUS_SHARE = 0.1
 """Share of the pairs of a case, one pair at least, whose status or reason may change."""
 
@@ -84,18 +79,6 @@ def judge_beside(old: dict[str, Any], new: dict[str, Any], factor: float) -> lis
         found.append(("WORSE", f"normalised error {old['nees']:.3g} -> {new['nees']:.3g}"))
     if old.get("ms") and new.get("ms", 0) > TIME_FACTOR * old["ms"]:
         found.append(("WARNING", f"{old['ms']:.3g} -> {new['ms']:.3g} ms of processor time"))
-    return found + contract(old, new)
-
-
-def contract(old: dict[str, Any], new: dict[str, Any]) -> list[tuple[str, str]]:
-    """What the command line owes: its exit code, and what other programs read."""
-    found = []
-    if old.get("exit_code") != new.get("exit_code"):
-        found.append(("WORSE", f"exit code {old.get('exit_code')} -> {new.get('exit_code')}"))
-    for key, owed in OWED.items():
-        lost = sorted(set(owed.split()) & set(old.get(key, ())) - set(new.get(key, ())))
-        if lost:
-            found.append(("WORSE", f"{key} lost: {', '.join(lost)}"))
     return found
 
 

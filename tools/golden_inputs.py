@@ -247,9 +247,7 @@ def undetermined(kind: str, pair: Any, truth: dict[str, Any], rng: np.random.Gen
 
 
 def walk(folder: Path) -> None:
-    """A sequence to track at 640x480 as arrays, and one on disk for the command line."""
-    from hybridvo.synthetic.render import write_sintel
-
+    """A sequence to track at 640x480 as arrays."""
     sequence = rendered("light", 0, WALK_SIZE, WALK_FRAMES)
     frames = [sequence.frame(i) for i in range(WALK_FRAMES)]
     np.savez(
@@ -260,6 +258,3 @@ def walk(folder: Path) -> None:
         time=np.array([frame.timestamp for frame in frames]),
         poses=sequence.poses,
     )
-    sequence = rendered("light", 0, SIZE, 20)
-    write_sintel(sequence.scene, folder / "demo", "light")
-    np.savez(folder / "demo.npz", poses=sequence.poses)

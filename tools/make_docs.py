@@ -19,7 +19,7 @@ from typing import Any
 
 import paper_tables
 from markdown_table import number, table
-from measuring import ROOT
+from measuring import ROOT, parser_of
 
 PART = re.compile(r"(<!-- table:(\w+) -->\n)(.*?)(<!-- end:\2 -->)", re.DOTALL)
 FAILURES = "[n]: pairs that are wrong by more than a pixel, or without an answer"
@@ -28,9 +28,7 @@ Results = dict[str, dict[str, Any]]
 
 
 def build_parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="make_docs.py", description=(__doc__ or "").splitlines()[0]
-    )
+    parser = parser_of(__file__, __doc__)
     parser.add_argument("--readme", type=Path, default=ROOT / "README.md")
     parser.add_argument("--paper", type=Path, default=ROOT / "docs" / "paper.md")
     parser.add_argument("--page", type=Path, default=ROOT / "docs" / "results.md")

@@ -15,15 +15,14 @@ from typing import Any
 
 import numpy as np
 from golden_inputs import SIZE, rendered
+from measuring import parser_of
 
 BLUE, ORANGE, GREY = "#0072B2", "#D55E00", "#222222"
 """Okabe and Ito: told apart by colour-blind readers."""
 
 
 def build_parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="make_figure.py", description=(__doc__ or "").splitlines()[0]
-    )
+    parser = parser_of(__file__, __doc__)
     parser.add_argument("--out", type=Path, default=Path("docs/teaser.png"), metavar="FILE")
     return parser
 
@@ -53,9 +52,9 @@ def track(kind: str, seed: int, shown: int) -> dict[str, Any]:
             if prev is not None and prev.index == shown and name == "hybrid":
                 result = {"rgb": prev.rgb, "flow": field.flow, "weights": step.motion.weights}
         prev = frame
-    moving = [float(sequence.moving(i).mean()) for i in range(len(sequence))]
+    moving = [float((sequence.scene.object_id(i) > 0).mean()) for i in range(len(sequence))]
     return result | {
-        "mover": sequence.moving(shown),
+        "mover": sequence.scene.object_id(shown) > 0,
         "paths": {name: np.array(path) for name, path in paths.items()},
         "truth": (np.linalg.inv(sequence.poses[0]) @ sequence.poses)[:, :3, 3],
         "share": float(np.median(moving)),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import os
 import platform
 import shlex
@@ -22,6 +23,11 @@ FAILURE_PX = 1.0
 OUTSIDE = 20.062
 """Quantile 0.9973 of chi-square with six degrees of freedom: the ellipsoid of 3 sigma."""
 PACKAGES = ("numpy", "numba", "scipy", "torch", "opencv-python-headless", "poselib", "open3d")
+
+
+def parser_of(file: str, doc: str | None) -> argparse.ArgumentParser:
+    """Parser of a tool, described by the first line of its docstring."""
+    return argparse.ArgumentParser(prog=Path(file).name, description=(doc or "").splitlines()[0])
 
 
 def score(motion: Any, T_true: np.ndarray, depth: np.ndarray, pair: Any) -> dict[str, Any]:
@@ -136,17 +142,11 @@ def timed(work: Callable[[], Any]) -> tuple[Any, float]:
 
 def able(methods: Iterable[str]) -> tuple[list[str], dict[str, str]]:
     """The methods that can run here, and the reason for each other one."""
-    from hybridvo.errors import InputError
-    from hybridvo.pipeline import check_method
+    from hybridvo.commands.compare import methods_to_run
 
-    found, missing = [], {}
-    for method in methods:
-        try:
-            check_method(method)
-            found.append(method)
-        except InputError as error:
-            missing[method] = str(error)
-    return found, missing
+    ready, missing = methods_to_run(("all",))
+    wanted = list(methods)
+    return [m for m in wanted if m in ready], {m: missing[m] for m in wanted if m in missing}
 
 
 def provenance(tool: str, argv: list[str] | None) -> dict[str, Any]:

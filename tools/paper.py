@@ -24,8 +24,8 @@ from measuring import ROOT, provenance, without_folders
 from paper_tables import ROWS
 
 from hybridvo.commands.generate import write_sheet
-from hybridvo.evaluation.drawing import flow_panel, prediction_errors, uncertainty_maps
-from hybridvo.evaluation.plots import Panel, draw_panels, longest_flow
+from hybridvo.evaluation.drawing import prediction_panels, saliency_panels
+from hybridvo.evaluation.plots import Panel, draw_panels, flow_panel, longest_flow
 from hybridvo.evaluation.saliency import saliencies
 from hybridvo.files import atomic_write, write_json
 from hybridvo.network.losses import reconstruct
@@ -126,12 +126,8 @@ def predict(network: Any, sample: Any) -> tuple[Any, Any]:
 
 def saliency(name: str, network: Any, sample: Any) -> list[Panel]:
     """What decides rotation and translation, with the outline of what moves."""
-    inputs = collate([sample]).inputs
-    panels: list[Panel] = []
-    for what, found in saliencies(network, inputs, None, STEPS).items():
-        relative = found.magnitude / max(float(np.percentile(found.magnitude, 99)), 1e-30)
-        panels.append(Panel(f"{name}: {what}", relative, "relative", 1.0, sample.moving))
-    return panels
+    found = saliencies(network, collate([sample]).inputs, None, STEPS)
+    return saliency_panels(name, found, sample.moving)[0]
 
 
 def saliency_on_movers(network: Any, samples: list[Any]) -> dict[str, Any]:
@@ -160,18 +156,12 @@ def saliency_on_movers(network: Any, samples: list[Any]) -> dict[str, Any]:
 def uncertainty(network: Any, sample: Any) -> list[Panel]:
     """Uncertainty of both halves, their errors, and the objects' flow."""
     _, output = predict(network, sample)
-    panels: list[Panel] = []
-    errors = prediction_errors(output, sample.rotation_deg, sample.translation)
-    for what, unit, U, error in zip(
-        ("rotation", "translation"), ("deg", "m"), uncertainty_maps(output), errors, strict=True
-    ):
-        # each beside its own scale: the paper compares where they are large, not how large
-        panels.append(Panel(f"uncertainty of the {what}", U, f"{unit}, U", None, sample.moving))
-        panels.append(Panel(f"error of the {what}", error, unit, None, sample.moving))
+    true = sample.rotation_deg, sample.translation
     objects = sample.flow - sample.ego_flow
     longest = longest_flow(sample.flow)
     total = flow_panel("total flow", sample.flow, longest)
-    return [total, flow_panel("flow of the objects", objects, longest), *panels]
+    flows = [total, flow_panel("flow of the objects", objects, longest)]
+    return [*flows, *prediction_panels("PWVO", output, true, sample.moving)]
 
 
 def factorised(network: Any, sample: Any) -> list[Panel]:

@@ -10,6 +10,9 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from hybridvo import __version__
+from hybridvo.commands.train import add_train
+
 if TYPE_CHECKING:
     from hybridvo.options import Options
 
@@ -23,7 +26,51 @@ METHODS = (
 KINDS = ("sintel", "tartanair", "7scenes", "folder", "kitti", "tum")
 
 
-def common() -> argparse.ArgumentParser:
+def build_parser(calls: Mapping[str, Any]) -> argparse.ArgumentParser:
+    """Parser of the whole command line; ``calls`` has the function of every command."""
+    parser = argparse.ArgumentParser(
+        prog="hybridvo",
+        description="Metric camera motion with covariance from optical flow, depth and intrinsics.",
+    )
+    parser.add_argument("--version", action="version", version=f"hybridvo {__version__}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    def command(name: str, help: str, *parents: argparse.ArgumentParser) -> argparse.ArgumentParser:
+        described: dict[str, Any] = {"help": help, "description": help[0].upper() + help[1:] + "."}
+        made = commands.add_parser(name, parents=[_common(), *parents], **described)
+        made.set_defaults(call=calls[name])
+        return made
+
+    sequence = _input()
+    _add_run(command("run", "estimate the camera motion of a sequence", sequence))
+    _add_compare(command("compare", "run methods side by side and write a report"))
+    _add_show(command("show", "draw the maps of one pair of a sequence", sequence))
+    _add_evaluate(command("evaluate", "errors of a trajectory file against ground truth"))
+    wrong = "what is missing here, or wrong with a sequence"
+    add = command("doctor", wrong, _input(required=False)).add_argument
+    add("--pairs", type=int, default=40, metavar="N", help="pairs (default 40)")
+    add = command("demo", "render a scene with moving objects and run on it").add_argument
+    add("--out", default="runs/demo", metavar="DIR", help="default: runs/demo")
+    add("--overwrite", action="store_true", help="replace the results in --out")
+    add("--frames", type=int, default=20, metavar="N", help="default: 20")
+    add("--seed", type=int, default=0, metavar="N", help="of the scene")
+    generate = command("generate", "draw training samples into a folder")
+    which = generate.add_mutually_exclusive_group(required=True)
+    which.add_argument("path", nargs="?", metavar="PRESET", help="paper, diverse or a YAML file")
+    which.add_argument("--preset", metavar="PRESET", help="the same, by name")
+    add = generate.add_argument
+    add("--out", required=True, metavar="DIR", help="folder of the samples")
+    add("--count", type=int, default=1000, metavar="N", help="default: 1000")
+    add("--seed", type=int, default=0, metavar="N")
+    add("--size", type=int, nargs=2, metavar=("H", "W"), help="pixels")
+    add("--workers", type=int, default=1, metavar="N", help="processes")
+    add_train(commands.add_parser("train", help="train a network"), _common(), calls["train"])
+    init = command("init", "write a camera.yaml to fill in, for a recording of your own")
+    init.add_argument("directory", metavar="DIR", help="folder with rgb/ and depth/")
+    return parser
+
+
+def _common() -> argparse.ArgumentParser:
     """Options of every command."""
     common = argparse.ArgumentParser(add_help=False)
     common.add_argument("--json", action="store_true", help="print the result as JSON on stdout")
@@ -33,7 +80,7 @@ def common() -> argparse.ArgumentParser:
     return common
 
 
-def input(required: bool = True) -> argparse.ArgumentParser:
+def _input(required: bool = True) -> argparse.ArgumentParser:
     """Which sequence, and what its folder does not say."""
     given = argparse.ArgumentParser(add_help=False)
     where = given.add_mutually_exclusive_group(required=required)
@@ -49,94 +96,65 @@ def input(required: bool = True) -> argparse.ArgumentParser:
     return given
 
 
-def _add_existing(command: argparse.ArgumentParser) -> None:
-    exists = command.add_mutually_exclusive_group()
-    exists.add_argument("--resume", action="store_true", help="go on where it was cut off")
-    exists.add_argument("--overwrite", action="store_true", help="replace the results in --out")
-
-
-def _add_weights(command: argparse.ArgumentParser) -> None:
-    own = "network weights instead of the pretrained ones, as in pwvo=mine.safetensors"
-    command.add_argument("--weights", action="append", default=[], metavar="NAME=FILE", help=own)
-
-
-def add_run(run: argparse.ArgumentParser) -> None:
-    """Options of ``hybridvo run``."""
-    add = run.add_argument
-    add("--out", metavar="DIR", help="output folder (default: runs/NAME)")
-    add("--method", metavar="NAME", help=f"one of {', '.join(METHODS)} (default: hybrid)")
-    flow = "auto, file or dis (default: files where there are, or dis)"
-    add("--flow", metavar="WHAT", help=flow)
+def _add_selection(command: argparse.ArgumentParser) -> None:
+    """What ``run`` and ``compare`` share."""
+    add = command.add_argument
+    flow = "default auto: the sequence's files, else DIS; compare: side by side"
+    add("--flow", choices=("auto", "file", "dis"), help=flow)
     add("--start", type=int, metavar="N", help="first frame (default 0)")
     add("--stop", type=int, metavar="N", help="the one after the last frame")
     add("--stride", type=int, metavar="N", help="step between frames (default 1)")
-    _add_weights(run)
-    add("--device", metavar="NAME", help="auto (default), cpu or cuda")
+    add("--seed", type=int, metavar="N", help="of everything drawn at random")
+    add("--device", choices=("auto", "cpu", "cuda"), help="of the networks (default auto)")
+    own = "network weights instead of the pretrained ones, as in pwvo=mine.safetensors"
+    add("--weights", action="append", default=[], metavar="NAME=FILE", help=own)
     add("--config", metavar="FILE", help="YAML file of options")
-    add(
-        "--set",
-        action=_KeysInHelp,
-        default=[],
-        dest="assignments",
-        metavar="KEY=VALUE",
-        help="one option, as in refine.cutoff=2.5; may be repeated; --set help lists the keys",
-    )
-    _add_existing(run)
-    failed = "fraction of failed motions (default 0.2)"
-    add("--max-failed", type=float, metavar="X", help=failed)
+    keys = "one option, as in refine.cutoff=2.5; may be repeated; --set help lists the keys"
+    add("--set", action="append", default=[], dest="given", metavar="KEY=VALUE", help=keys)
+    exists = command.add_mutually_exclusive_group()
+    for name, help in (("resume", "go on where it was cut off"), ("overwrite", "start anew")):
+        kind: dict[str, Any] = {"action": "store_const", "const": name, "default": "new"}
+        exists.add_argument(f"--{name}", dest="mode", help=help, **kind)
+
+
+def _add_run(run: argparse.ArgumentParser) -> None:
+    add = run.add_argument
+    add("--out", metavar="DIR", help="output folder (default: runs/NAME)")
+    add("--method", metavar="NAME", help=f"one of {', '.join(METHODS)} (default: hybrid)")
+    _add_selection(run)
+    add("--max-failed", type=float, metavar="X", help="fraction of failed motions (default 0.2)")
     add("--strict", action="store_true", default=None, help="a broken frame ends the run")
     recording = "Rerun recording (extra 'viz'; default: recording.rrd in the output folder)"
     add("--rrd", nargs="?", const="", metavar="FILE", help=recording)
 
 
-class _KeysInHelp(argparse.Action):
-    """Collects assignments; ``--set help`` prints every key with its default."""
-
-    def __call__(self, parser: Any, namespace: Any, values: Any, option: Any = None) -> None:
-        if values == "help":
-            print("\n".join(f"{key}={value}" for key, value in option_defaults().items()))
-            parser.exit()
-        setattr(namespace, self.dest, [*getattr(namespace, self.dest), values])
-
-
-def add_compare(compare: argparse.ArgumentParser) -> None:
-    """Options of ``hybridvo compare``."""
+def _add_compare(compare: argparse.ArgumentParser) -> None:
     add = compare.add_argument
     many = "sequences, or folders of sequences (MPI Sintel as it was unpacked)"
     add("paths", nargs="*", metavar="DIR", help=many)
     named = "the same, by name; repeatable"
     add("--sequence", action="extend", nargs="+", default=[], metavar="DIR", help=named)
+    add("--dataset", help="kind of the sequences (default: detected)")
     add("--out", default="runs/compare", metavar="DIR", help="default: runs/compare")
     add("--methods", default="all", help="comma-separated; default: all that run here")
-    flow = "auto: the sequence's flow files and DIS, side by side"
-    add("--flow", choices=("auto", "file", "dis"), default="auto", help=flow)
-    add("--dataset", help="kind of the sequences (default: detected)")
-    add("--start", type=int, default=0)
-    add("--stop", type=int)
-    add("--stride", type=int, default=1)
-    add("--seed", type=int, default=0)
-    add("--device", choices=("auto", "cpu", "cuda"), default="auto")
-    _add_weights(compare)
+    _add_selection(compare)
     paper = "MPI Sintel as others score it: PWVO's 992 pairs, or fourteen trajectories"
     add("--protocol", choices=("paper", "trajectory14"), help=paper)
     add("--worst", type=int, default=3, help="worst pairs shown for each method")
-    _add_existing(compare)
 
 
-def add_show(show: argparse.ArgumentParser) -> None:
-    """Options of ``hybridvo show``."""
+def _add_show(show: argparse.ArgumentParser) -> None:
     add = show.add_argument
     add("--pair", type=int, default=0, metavar="N", help="first frame (default 0)")
     add("--out", default="pair.png", metavar="FILE", help="default: pair.png")
-    add("--method", metavar="NAME", help="estimator (default: hybrid)")
+    add("--method", default="hybrid", metavar="NAME", help="estimator (default: hybrid)")
     add("--flow", choices=("auto", "file", "dis"), default="auto")
     add("--weights", action="append", default=[], metavar="FILE", help="a network")
     add("--steps", type=int, default=32, help="of the integrated gradients")
     add("--overwrite", action="store_true", help="replace the image")
 
 
-def add_evaluate(evaluate: argparse.ArgumentParser) -> None:
-    """Options of ``hybridvo evaluate``."""
+def _add_evaluate(evaluate: argparse.ArgumentParser) -> None:
     add = evaluate.add_argument
     add("estimate", metavar="EST", help="estimated trajectory")
     add("gt", metavar="GT", help="true trajectory")
@@ -148,28 +166,6 @@ def add_evaluate(evaluate: argparse.ArgumentParser) -> None:
     for name in ("est", "gt"):
         add(f"--format-{name}", choices=("auto", "tum", "kitti", "tartanair"), default="auto")
         add(f"--axes-{name}", choices=("auto", "camera", "ned"), default="auto")
-
-
-def add_demo(demo: argparse.ArgumentParser) -> None:
-    """Options of ``hybridvo demo``."""
-    add = demo.add_argument
-    add("--out", default="runs/demo", metavar="DIR", help="default: runs/demo")
-    add("--overwrite", action="store_true", help="replace the results in --out")
-    add("--frames", type=int, default=20, metavar="N", help="default: 20")
-    add("--seed", type=int, default=0, metavar="N", help="of the scene")
-
-
-def add_generate(generate: argparse.ArgumentParser) -> None:
-    """Options of ``hybridvo generate``."""
-    which = generate.add_mutually_exclusive_group(required=True)
-    which.add_argument("path", nargs="?", metavar="PRESET", help="paper, diverse or a YAML file")
-    which.add_argument("--preset", metavar="PRESET", help="the same, by name")
-    add = generate.add_argument
-    add("--out", required=True, metavar="DIR", help="folder of the samples")
-    add("--count", type=int, default=1000, metavar="N", help="default: 1000")
-    add("--seed", type=int, default=0, metavar="N")
-    add("--size", type=int, nargs=2, metavar=("H", "W"), help="pixels")
-    add("--workers", type=int, default=1, metavar="N", help="processes")
 
 
 # -- options --------------------------------------------------------------------------------------
@@ -186,15 +182,22 @@ def option_defaults() -> dict[str, Any]:
     }
 
 
+def run_options(args: argparse.Namespace) -> Options:
+    """Options from the arguments of ``run`` or ``compare``."""
+    names = ("method", "start", "stop", "stride", "device", "max_failed", "strict", "seed")
+    named = {f"run.{name}": getattr(args, name, None) for name in names}
+    return load_options(args.config, args.given, named | {"flow.source": args.flow})
+
+
 def load_options(
     path: str | Path | None = None,
     assignments: Iterable[str] = (),
     given: Mapping[str, Any] | None = None,
 ) -> Options:
-    """Options from a file, then from ``group.key=value`` texts, then from named values.
+    """Options from a YAML file, then from ``group.key=value`` texts, then from named values.
 
-    ``path`` is a YAML file, or None for the defaults; the values of ``assignments`` are YAML;
-    those of ``given``, such as ``{"run.method": "refine"}``, are left out where they are None.
+    The values of ``assignments`` are YAML; those of ``given``, such as ``{"run.method":
+    "refine"}``, are left out where they are None.
 
     Example:
         >>> load_options(assignments=["refine.cutoff=2.5"]).refine.cutoff
@@ -205,7 +208,6 @@ def load_options(
     from hybridvo.options import Options
 
     groups: dict[str, Any] = {}
-    where = [] if path is None else [str(path)]
     if path is not None:
         try:
             groups = parse_yaml(read_text(path), str(path)) or {}
@@ -215,7 +217,6 @@ def load_options(
             raise FormatError(f"{path}: expected 'group:' lines, got a {type(groups).__name__}.")
     values: dict[str, Any] = {}
     for text in assignments:
-        where = [str(path), "--set"] if path is not None else ["--set"]
         key, sign, value = text.partition("=")
         if not sign or "." not in key:
             raise InputError(
@@ -233,7 +234,8 @@ def load_options(
         found = re.match(r"Options\.([\w.]+): unexpected", str(error))
         near = difflib.get_close_matches(found[1], option_defaults(), n=1) if found else []
         hint = f" Did you mean '{near[0]}'?" if near else ""
-        raise InputError(f"{' and '.join(where)}: {error}{hint}") from None
+        where = " and ".join([*([str(path)] if path else []), *(["--set"] if assignments else [])])
+        raise InputError(f"{where or 'options'}: {error}{hint}") from None
 
 
 def weight_files(weights: Iterable[str], methods: Iterable[str]) -> dict[str, str]:

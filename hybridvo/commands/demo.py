@@ -9,14 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from hybridvo.commands.run import EXIT_INTERRUPTED, run
 from hybridvo.data.sequence import open_sequence
 from hybridvo.errors import InputError
 from hybridvo.evaluation.pair_errors import true_trajectory
 from hybridvo.evaluation.plots import plot_trajectories
-from hybridvo.files import make_folder, write_json
+from hybridvo.files import Mode, make_folder, write_json
 from hybridvo.options import FlowOptions, Options, RunOptions
 from hybridvo.synthetic.render import write_sintel
 from hybridvo.synthetic.scenes import make_scene
@@ -33,8 +32,7 @@ METHODS = {
 DRAWN = ("pnp-ransac-tuned", "hybrid")
 MARK = "hybridvo_demo.json"
 """File by which a folder is known as a demo's own, and may be replaced."""
-SCENE = "light"
-HEIGHT, WIDTH = 218, 512
+SCENE, HEIGHT, WIDTH = "light", 218, 512
 
 
 def demo(
@@ -54,23 +52,37 @@ def demo(
     if frames < 2:
         raise InputError(f"demo: expected at least 2 frames, got {frames}.")
     out = Path(out)
-    _prepare(out, overwrite)
+    make_folder(out)
+    if any(out.iterdir()) and not (overwrite and (out / MARK).is_file()):
+        raise InputError(f"{out}: is not empty. Pass --overwrite to replace a demo, or --out.")
+    shutil.rmtree(out / "data", ignore_errors=True)
+    write_json(out / MARK, {})
     scene = make_scene(SCENE, seed, height=HEIGHT, width=WIDTH, frames=frames)
     write_sintel(scene, out / "data", SCENE)
     sequence = open_sequence(out / "data" / "training" / "clean" / SCENE, "sintel")
-    summaries: dict[str, dict[str, Any]] = {}
-    for method in METHODS:
+    rows, paths = [], {}
+    for method, name in METHODS.items():
         wanted = RunOptions(method=method, max_failed=1.0)
-        summaries[method], code = run(
-            sequence,
-            out / method,
-            Options(flow=FlowOptions(source="dis"), run=wanted),
-            mode="overwrite" if overwrite else "new",
-            command=command,
-            quiet=quiet,
+        options = Options(flow=FlowOptions(source="dis"), run=wanted)
+        mode: Mode = "overwrite" if overwrite else "new"
+        summary, code = run(
+            sequence, out / method, options, mode=mode, command=command, quiet=quiet
         )
         if code == EXIT_INTERRUPTED:
             raise KeyboardInterrupt
+        metrics = summary["metrics"]
+        rows.append(
+            {
+                "method": name,
+                "ate_cm": 100.0 * metrics["ate_rmse_origin"],
+                "rpe_cm": 100.0 * metrics["rpe_trans_mean"],
+                "rotation_deg": metrics["rot_err_deg_mean"],
+                "epe_px": metrics["epe_l2_px"],
+                "failed": summary["failed"],
+                "frame_ms": summary["frame_ms_median"],
+            }
+        )
+        paths[method] = read_trajectory(out / method / "trajectory.tum")
     moving = float(np.median([(scene.object_id(i) > 0).mean() for i in range(scene.frames)]))
     content: dict[str, Any] = {
         "command": list(command),
@@ -79,54 +91,12 @@ def demo(
         "flow_source": "dis",
         "depth_source": "true",
         "alignment": "origin",
-        "rows": [_row(method, summary) for method, summary in summaries.items()],
+        "rows": rows,
         "image": os.fspath(out / "trajectory.png"),
     }
-    paths = {METHODS[m]: read_trajectory(out / m / "trajectory.tum") for m in DRAWN}
+    drawn = {METHODS[method]: paths[method] for method in DRAWN}
     title = f"{100 * moving:.0f} % of the pixels move by themselves"
     truth = true_trajectory(sequence, range(frames))
-    plot_trajectories(paths, content["image"], truth=truth, alignment="origin", title=title)
+    plot_trajectories(drawn, content["image"], truth=truth, alignment="origin", title=title)
     write_json(out / MARK, content)
     return content
-
-
-def demo_text(content: dict[str, Any]) -> str:
-    """The table for people, and what to do next."""
-    scene = content["scene"]
-    table = pd.DataFrame(content["rows"]).to_string(index=False, float_format="{:.4g}".format)
-    return (
-        f"{scene['frames']} rendered frames of {scene['width']}x{scene['height']}, "
-        f"{100 * content['moving_fraction']:.0f} % of the pixels move by themselves; flow: OpenCV "
-        f"DIS on the images; depth: the renderer's (true).\n"
-        f"ATE after aligning the first pose, the other errors are means a pair.\n\n"
-        f"{table}\n\n"
-        f"image: {content['image']}\n"
-        f"next:  hybridvo run DIR       your own sequence (hybridvo init DIR writes camera.yaml)\n"
-        f"       hybridvo doctor DIR    what is wrong with it"
-    )
-
-
-def _prepare(out: Path, overwrite: bool) -> None:
-    """An empty folder, or one that an earlier demo left and that may be replaced."""
-    make_folder(out)
-    if (out / MARK).is_file():
-        if not overwrite:
-            raise InputError(f"{out}: holds a demo already. Pass --overwrite to replace it.")
-        shutil.rmtree(out / "data", ignore_errors=True)
-    elif any(out.iterdir()):
-        raise InputError(f"{out}: is not empty and holds no demo. Choose another --out.")
-    write_json(out / MARK, {})
-
-
-def _row(method: str, summary: dict[str, Any]) -> dict[str, Any]:
-    """Line of the table."""
-    metrics = summary["metrics"]
-    return {
-        "method": METHODS[method],
-        "ate_cm": 100.0 * metrics["ate_rmse_origin"],
-        "rpe_cm": 100.0 * metrics["rpe_trans_mean"],
-        "rotation_deg": metrics["rot_err_deg_mean"],
-        "epe_px": metrics["epe_l2_px"],
-        "failed": summary["failed"],
-        "frame_ms": summary["frame_ms_median"],
-    }

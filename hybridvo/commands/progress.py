@@ -50,11 +50,11 @@ class Progress:
 
     def __init__(
         self,
-        total: int,
         label: str,
+        total: int,
+        unit: str,
         *,
         quiet: bool = False,
-        unit: str = "frames",
         done: int = 0,
         console: Console | None = None,
     ) -> None:
@@ -79,17 +79,13 @@ class Progress:
     def __exit__(self, *_: object) -> None:
         self._bar.stop()
 
-    def update(self, done: int, failed: int = 0, total: int | None = None) -> None:
+    def update(self, done: int, failed: int = 0) -> None:
         """``done`` units are finished, ``failed`` of them have failed."""
-        if total is not None:
-            self._total = total
-            self._bar.update(self._task, total=total)
         now = time.monotonic()
         speed = (done - self._before) / max(now - self._started, 1e-9)
         rate = f"{speed:.1f} {self._unit}/s" + (f", {failed} failed" if failed else "")
-        if self._console.is_terminal:
-            self._bar.update(self._task, completed=done, rate=rate)
-        elif now - self._last >= 5.0 or done == self._total:
+        self._bar.update(self._task, completed=done, rate=rate)
+        if not self._console.is_terminal and (now - self._last >= 5.0 or done == self._total):
             self._last = now
             self.say(f"{self._label}: {done}/{self._total} {self._unit}, {rate}")
 

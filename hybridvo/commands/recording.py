@@ -10,12 +10,11 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from hybridvo.errors import InputError, OutputError
-from hybridvo.evaluation.plots import flow_colours, longest_flow
-from hybridvo.results import State, Step
+from hybridvo.evaluation.plots import flow_colours
+from hybridvo.results import Step
 from hybridvo.types import Frame
 
 MAX_IMAGES = 300
@@ -91,40 +90,32 @@ class Recording:
         self._stream.set_time("time", **{clock: step.timestamp})
         T = step.T_world_cam
         log("world/camera", rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]))
-        self._numbers(step)
-        if len(self._positions) % self._stride == 0:
-            self._images(frame, step, flow)
-        self._positions.append(T[:3, 3].astype(np.float32))
-
-    def _numbers(self, step: Step) -> None:
-        rr, log, motion = self._rr, self._stream.log, step.motion
+        motion = step.motion
         std = np.sqrt(np.maximum(np.diag(motion.covariance), 0.0))
         log("covariance/translation_std_mm", rr.Scalars(1e3 * std[:3]))
         log("covariance/rotation_std_mdeg", rr.Scalars(1e3 * np.degrees(std[3:])))
         log("status/inlier_ratio", rr.Scalars(motion.inlier_ratio))
         log("status/probability", rr.Scalars(motion.probability))
-        state = step.status.state
-        if state is not State.OK:
+        if not step.ok:
             text = f"frame {step.index}: {step.status} {step.status.message}"
-            level = "WARN" if state is State.DEGRADED else "ERROR"
-            log("status/messages", rr.TextLog(text, level=level))
+            log("status/messages", rr.TextLog(text, level="WARN" if step.usable else "ERROR"))
+        if len(self._positions) % self._stride == 0:
+            self._images(frame, step, flow)
+        self._positions.append(T[:3, 3].astype(np.float32))
 
     def _images(self, frame: Frame, step: Step, flow: np.ndarray | None) -> None:
         rr, log = self._rr, self._stream.log
-        height, width = frame.camera.shape
-        scale = min(1.0, MAX_SIDE / max(height, width))
-        size = max(1, round(width * scale)), max(1, round(height * scale))
-        K = np.diag([size[0] / width, size[1] / height, 1.0]) @ frame.camera.K
-        log("world/camera/image", rr.Pinhole(image_from_camera=K, width=size[0], height=size[1]))
-        if frame.rgb is not None:
-            log("world/camera/image", self._jpeg(frame.rgb, size))
-        if flow is not None:
-            log("flow", self._jpeg(flow_colours(flow, longest_flow(flow)), size))
-        if step.motion.weights is not None:
-            weights = (255 * np.clip(step.motion.weights, 0.0, 1.0)).astype(np.uint8)
-            log("weights", self._jpeg(weights, size))
+        stride = -(-max(frame.camera.shape) // MAX_SIDE)
 
-    def _jpeg(self, rgb: np.ndarray, size: tuple[int, int]) -> Any:
-        enlarged = rgb.shape[1] < size[0]  # weights may stand on a coarser grid
-        method = cv2.INTER_NEAREST if enlarged else cv2.INTER_AREA
-        return self._rr.Image(cv2.resize(rgb, size, interpolation=method)).compress(70)
+        def shrunk(image: np.ndarray) -> Any:
+            return rr.Image(np.ascontiguousarray(image[::stride, ::stride])).compress(70)
+
+        height, width = (-(-size // stride) for size in frame.camera.shape)
+        K = np.diag([1 / stride, 1 / stride, 1.0]) @ frame.camera.K
+        log("world/camera/image", rr.Pinhole(image_from_camera=K, width=width, height=height))
+        if frame.rgb is not None:
+            log("world/camera/image", shrunk(frame.rgb))
+        if flow is not None:
+            log("flow", shrunk(flow_colours(flow)))
+        if step.motion.weights is not None:
+            log("weights", shrunk((255 * np.clip(step.motion.weights, 0, 1)).astype(np.uint8)))

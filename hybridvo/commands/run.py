@@ -17,32 +17,24 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 import hybridvo
 from hybridvo.commands import results
-from hybridvo.commands.diagnose import is_dark
 from hybridvo.commands.progress import Progress, interruptible
 from hybridvo.commands.recording import Recording, check_recording
-from hybridvo.commands.run_folder import RESULTS, STATE, RunFolder
+from hybridvo.commands.run_folder import RunFolder
 from hybridvo.data.sequence import Sequence
 from hybridvo.errors import InputError
-from hybridvo.evaluation.pair_errors import pair_errors, true_motion, true_trajectory
-from hybridvo.files import Mode, fingerprint, versions
-from hybridvo.flow import (
-    FlowField,
-    FlowProvider,
-    MeasuredFlow,
-    dis_flow,
-    fallback,
-    file_flow,
-)
+from hybridvo.evaluation.pair_errors import step_errors
+from hybridvo.files import Mode, fingerprint, held, versions
+from hybridvo.flow import FlowField, FlowProvider, MeasuredFlow, dis_flow, fallback, file_flow
 from hybridvo.geometry import se3_log
 from hybridvo.network.models import Models
 from hybridvo.odometry import Odometry
 from hybridvo.options import Options
 from hybridvo.pipeline import check_method, weights_hash
-from hybridvo.results import Step
 from hybridvo.tracking.state import TrackerState
-from hybridvo.types import Frame
 
 EXIT_DONE, EXIT_FAILED_FRAMES, EXIT_INTERRUPTED = 0, 3, 130
 
@@ -50,6 +42,8 @@ RECORDING = "recording.rrd"
 """Name of a Rerun recording within the output folder."""
 SAVE_EVERY = 50
 """Frames after which the run can be resumed."""
+DARK_LEVEL = 20.0
+"""Grey levels (of 255) below which nine tenths of a dark image lie; of a street at night, 60."""
 
 
 def run(
@@ -62,46 +56,38 @@ def run(
     command: Iterable[str] = (),
     quiet: bool = False,
     rrd: str | os.PathLike[str] | None = None,
+    quick: bool = False,
 ) -> tuple[dict[str, Any], int]:
     """Estimate, chain, write and score a sequence: a summary, JSON-ready, and the exit code.
 
     ``out`` is by default ``runs/NAME``; ``rrd`` is the file of a Rerun recording, empty for
-    ``recording.rrd`` in the output folder.
+    ``recording.rrd`` in the output folder; ``quick``: no warming up and no picture.
     """
     method = options.run.method
     models = models or Models(options.run.device)
     check_method(method, models)
     if rrd is not None:
         check_recording(rrd or RECORDING)
-    frames = _frames(sequence, options)
-    flow = MeasuredFlow(_flow_provider(sequence, options))
+    frames = frames_of(sequence, options)
+    flow = MeasuredFlow(flow_provider(sequence, options))
     out = _folder(out, sequence)
     vo = Odometry(models, flow=flow, method=method, options=options, seed=options.run.seed)
-    vo.warm_up()  # before the folder is taken: it may last
-    deciding = dataclasses.asdict(options)
-    for name in ("max_failed", "strict", "device"):
-        del deciding["run"][name]
-    identity = {  # what a resumed run must share
-        "input_hash": fingerprint(sequence.files()),
-        "options": deciding,
-        "weights": weights_hash(method, models),
-        "hybridvo": hybridvo.__version__,
-    }
-    header = _header(sequence, len(frames), options) | {"command": list(command)}
-    header["input_hash"] = identity["input_hash"]
-    with RunFolder(out, identity, header, mode) as folder, contextlib.ExitStack() as stack:
-        if folder.finished:
-            summary = folder.read_json(STATE)["summary"]
-            summary |= {"state": "done", "metrics": folder.read_json("metrics.json") or None}
-            return summary, _exit_code(summary, options)
+    if not quick:
+        vo.warm_up()  # before the folder is taken: it may last
+    header = _header(sequence, len(frames), options, weights_hash(method, models))
+    header["command"] = list(command)
+    with held(out), contextlib.ExitStack() as stack:
+        folder = RunFolder(out, header, mode)
+        if folder.summary is not None:
+            return folder.summary, _exit_code(folder.summary, options)
         recording = None
         if rrd is not None:
             poses = None if sequence.poses is None else sequence.poses[list(frames)]
-            named = (rrd or out / RECORDING, sequence.name, str(identity["input_hash"]))
+            named = (rrd or out / RECORDING, sequence.name, header["input_hash"])
             first = len(folder.rows)
             recording = Recording(*named, len(frames), first=first, poses=poses)
             stack.enter_context(recording)
-        job = _Job(sequence, frames, options, vo, flow, folder, recording)
+        job = _Job(sequence, frames, options, vo, flow, folder, recording, quick)
         summary, exit_code = job.run(quiet)
         if recording is not None:
             summary["recording"] = os.fspath(recording.path)
@@ -119,67 +105,60 @@ class _Job:
     flow: MeasuredFlow
     folder: RunFolder
     recording: Recording | None
+    quick: bool
 
     def run(self, quiet: bool) -> tuple[dict[str, Any], int]:
         label = f"{self.sequence.name} [{self.options.run.method}]"
-        rows, total = self.folder.rows, len(self.frames)
+        folder, rows, total = self.folder, self.folder.rows, len(self.frames)
         with (
             interruptible() as interrupted,
-            Progress(total, label, quiet=quiet, done=len(rows)) as progress,
+            Progress(label, total, "frames", quiet=quiet, done=len(rows)) as progress,
         ):
             for warning in self.sequence.warnings:
                 progress.say(f"warning: {warning}")
-            if self.folder.tracker is not None:
-                self.vo.resume(TrackerState.from_arrays(self.folder.tracker))
+            if folder.tracker is not None:
+                self.vo.resume(TrackerState.from_arrays(folder.tracker))
                 progress.say(f"resumed after {len(rows)} of {total} frames")
-            failed = sum(row["status"] == "failed" for row in rows)
             for index in self.frames[len(rows) :]:
                 if interrupted.is_set():
                     break
-                row = self._track(index, progress)
-                failed += row["status"] == "failed"
-                self.folder.append(row)
-                progress.update(len(rows), failed)
+                rows.append(row := self._track(index))
+                if row["status"] != "ok":
+                    text = f"frame {index}: {row['status']} ({row['reason']}), probability "
+                    progress.say(f"{text}{row['probability']:.2f}: {row['message']}")
+                progress.update(len(rows), sum(row["status"] == "failed" for row in rows))
                 if len(rows) % SAVE_EVERY == 0:
-                    self.folder.save_checkpoint(self.vo.state.to_arrays())
+                    folder.save_rows(self.vo.state.to_arrays())
             if interrupted.is_set():
-                if rows:
-                    self.folder.save_checkpoint(self.vo.state.to_arrays())
                 progress.say(f"interrupted: {len(rows)} frames are kept; go on with --resume")
-            return self._write(interrupted.is_set())
+                folder.save_rows(self.vo.state.to_arrays() if rows else None)
+                folder.save("interrupted")
+                return {"state": "interrupted", "frames": len(rows)}, EXIT_INTERRUPTED
+            folder.save_rows()
+            given = (folder.path, rows, self.sequence, self.frames, self.options.run)
+            summary = results.write_results(*given, picture=not self.quick)
+            folder.save("done", summary=summary)
+            return summary, _exit_code(summary, self.options)
 
-    def _track(self, index: int, progress: Progress) -> dict[str, Any]:
-        """Row of one frame; says so on the screen where its motion is not ok."""
-        stamp = float(self.sequence.timestamps[index])
-        prev = self.vo.state.frame
-        frame, ms = None, 0.0
+    def _track(self, index: int) -> dict[str, Any]:
+        """What is kept of a frame, JSON-ready: the columns of ``steps.csv`` and more."""
+        prev, frame, ms = self.vo.state.frame, None, 0.0
         self.flow.reset()
         try:
             frame = self.sequence.frame(index)
         except (InputError, OSError) as error:
             if self.options.run.strict:
                 raise InputError(f"frame {index}: {error}") from error
-            step = self.vo.skip(index, stamp, str(error))
+            step = self.vo.skip(index, float(self.sequence.timestamps[index]), str(error))
         else:
             started = time.perf_counter()
             step = self.vo.track(frame)
             ms = 1e3 * (time.perf_counter() - started)
         # the window may have asked for more, from its key frames
         field = next(iter(self.flow.fields.values()), FlowField(None, source=""))
-        row = self._row(step, prev, frame, field, ms)
         if frame is not None and self.recording is not None:
             self.recording.add(frame, step, field.flow)
-        if row["status"] != "ok":
-            text = f"frame {index}: {row['status']} ({row['reason']}), probability "
-            progress.say(f"{text}{row['probability']:.2f}: {row['message']}")
-        return row
-
-    def _row(
-        self, step: Step, prev: Frame | None, frame: Frame | None, field: FlowField, ms: float
-    ) -> dict[str, Any]:
-        """What is kept of a frame, JSON-ready: the columns of ``steps.csv`` and more."""
-        motion = step.motion
-        message = " ".join(step.status.message.split())
+        motion, message = step.motion, " ".join(step.status.message.split())
         if frame is not None and not step.ok and is_dark(frame.rgb):
             message = f"the image is dark; {message}"
         values = [*motion.T_curr_prev[:3, 3].tolist(), *se3_log(motion.T_curr_prev)[3:].tolist()]
@@ -203,46 +182,41 @@ class _Job:
             "T_world_cam": step.T_world_cam.tolist(),
             "covariance": motion.covariance.tolist(),
             "flow_is_true": field.flow is not None and field.is_true,
-            "errors": self._errors(prev, step),
+            **step_errors(self.sequence, prev, step.index, step.T_curr_prev),
         }
 
-    def _errors(self, prev: Frame | None, step: Step) -> dict[str, Any] | None:
-        """Errors of a step against the ground truth, or None where there is none."""
-        T_true = None if prev is None else true_motion(self.sequence, prev.index, step.index)
-        if T_true is None or prev is None or prev.depth is None:
-            return None
-        camera = self.sequence.camera(step.index)
-        return pair_errors(step.T_curr_prev, T_true, prev.depth, prev.camera, camera)
 
-    def _write(self, interrupted: bool) -> tuple[dict[str, Any], int]:
-        """Results of the rows kept so far, and the scores where the run is complete."""
-        folder, path, rows = self.folder, self.folder.path, self.folder.rows
-        if not rows:  # interrupted before the first frame
-            folder.write_state("interrupted")
-            return {"state": "interrupted", "frames": 0}, EXIT_INTERRUPTED
-        trajectory = results.write_motions(path, rows)
-        gt = true_trajectory(self.sequence, self.frames)
-        summary = results.summarise(rows, self.sequence, self.options.run.method)
-        summary["out"] = os.fspath(path)
-        if interrupted:
-            folder.write_state("interrupted", summary=summary)
-            return summary | {"state": "interrupted"}, EXIT_INTERRUPTED
-        exit_code = _exit_code(summary, self.options)
-        if exit_code == EXIT_FAILED_FRAMES:
-            allowed = self.options.run.max_failed
-            summary["warnings"].append(f"more motions failed than --max-failed {allowed:g} allows")
-        metrics = None
-        if gt is not None:
-            alignment = self.options.run.alignment
-            metrics = results.write_metrics(path, rows, trajectory, gt, summary, alignment)
-        results.draw(path / "trajectory.png", trajectory, gt, summary)
-        written = (path / name for name in (*RESULTS, STATE))
-        summary["files"] = [os.fspath(file) for file in written if file.exists()]
-        folder.write_state("done", summary=summary)
-        return summary | {"state": "done", "metrics": metrics}, exit_code
+def _header(
+    sequence: Sequence, frames: int, options: Options, weights: str | None
+) -> dict[str, Any]:
+    """What ``run.json`` says of a run beside its state; ``identity``: what a resumed one shares."""
+    tree, input_hash = dataclasses.asdict(options), fingerprint(sequence.files())
+    free = ("max_failed", "strict", "device")
+    deciding = tree | {"run": {k: v for k, v in tree["run"].items() if k not in free}}
+    identity = {"input_hash": input_hash, "options": deciding}
+    return {
+        "identity": identity | {"weights": weights, "hybridvo": hybridvo.__version__},
+        "input_hash": input_hash,
+        "versions": versions(),
+        "machine": {"platform": platform.platform(), "cpus": os.cpu_count()},
+        "options": tree,
+        "sequence": {
+            "name": sequence.name,
+            "kind": sequence.kind,
+            "path": os.fspath(sequence.root),
+            "frames": frames,
+            "depth_source": sequence.depth_source,
+            "warnings": list(sequence.warnings),
+        },
+    }
 
 
-def _frames(sequence: Sequence, options: Options) -> range:
+def is_dark(rgb: np.ndarray | None) -> bool:
+    """Whether an image (H, W, 3) uint8 is too dark to see anything in."""
+    return rgb is not None and float(np.percentile(rgb[::4, ::4].max(axis=2), 90)) < DARK_LEVEL
+
+
+def frames_of(sequence: Sequence, options: Options) -> range:
     """Indices of the frames that the options ask for."""
     stop = min(options.run.stop or len(sequence), len(sequence))
     frames = range(options.run.start, stop, options.run.stride)
@@ -254,7 +228,7 @@ def _frames(sequence: Sequence, options: Options) -> range:
     return frames
 
 
-def _flow_provider(sequence: Sequence, options: Options) -> FlowProvider:
+def flow_provider(sequence: Sequence, options: Options) -> FlowProvider:
     """Provider of the flow that the options ask for."""
     source, stride = options.flow.source, options.run.stride
     from_files = file_flow(sequence, strict=options.run.strict)
@@ -280,23 +254,6 @@ def _folder(out: str | os.PathLike[str] | None, sequence: Sequence) -> Path:
             f"input. Choose another --out."
         )
     return out
-
-
-def _header(sequence: Sequence, frames: int, options: Options) -> dict[str, Any]:
-    """What ``run.json`` says of a run beside its state."""
-    return {
-        "versions": versions(),
-        "machine": {"platform": platform.platform(), "cpus": os.cpu_count()},
-        "options": dataclasses.asdict(options),
-        "sequence": {
-            "name": sequence.name,
-            "kind": sequence.kind,
-            "path": os.fspath(sequence.root),
-            "frames": frames,
-            "depth_source": sequence.depth_source,
-            "warnings": list(sequence.warnings),
-        },
-    }
 
 
 def _exit_code(summary: dict[str, Any], options: Options) -> int:

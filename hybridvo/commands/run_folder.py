@@ -1,12 +1,10 @@
-"""The output folder of one run: lock, refusal to overwrite, frames kept as they finish.
+"""The output folder of one run: refusal to overwrite, and what is kept until the run is done.
 
 ``checkpoint.npz`` holds the rows and the tracker's state: a run that was killed goes on from there.
 """
 
 from __future__ import annotations
 
-import contextlib
-import csv
 import json
 import os
 from collections.abc import Mapping
@@ -14,9 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from hybridvo.errors import InputError, OutputError
-from hybridvo.files import Mode, atomic_write, held, write_csv, write_json
+from hybridvo.evaluation.pair_errors import ERRORS
+from hybridvo.files import Mode, atomic_write, write_csv, write_json
 
 RESULTS = (
     *("trajectory.tum", "trajectory.kitti", "trajectory.png"),
@@ -29,121 +29,82 @@ STEP_COLUMNS = (
     *("tx", "ty", "tz", "rx", "ry", "rz"),
     *("inlier_ratio", "iterations", "cost", "flow_ms", "motion_ms", "frame_ms"),
     *("prev_index", "flow_source", "message"),
+    *ERRORS,
 )
 
 
 class RunFolder:
-    """An output folder that one run holds; use as a context manager.
+    """An output folder that is held by one run.
 
-    ``identity`` (JSON-ready) is what must be equal for a run to be resumed, ``header`` what else
-    ``run.json`` says. ``new`` refuses a folder with results, ``overwrite`` removes those of a run
-    (and no other files), ``resume`` goes on.
+    ``header`` (JSON-ready) is what ``run.json`` says; its ``identity`` must be equal for a run to
+    be resumed. ``new`` refuses a folder with results, ``overwrite`` removes those of a run (and no
+    other files), ``resume`` goes on.
 
     Attributes:
         rows: of the finished frames, JSON-ready, in order.
         tracker: arrays of the tracker's state after them where the run is resumed, or None.
-        finished: whether the run that is resumed was complete already.
+        summary: of the run that is resumed where it was complete already, or None.
     """
 
-    def __init__(
-        self,
-        path: str | os.PathLike[str],
-        identity: Mapping[str, Any],
-        header: Mapping[str, Any],
-        mode: Mode = "new",
-    ) -> None:
-        self.path = Path(path)
+    def __init__(self, path: Path, header: Mapping[str, Any], mode: Mode = "new") -> None:
+        self.path, self.header = path, json.loads(json.dumps(header))
         self.rows: list[dict[str, Any]] = []
         self.tracker: dict[str, np.ndarray] | None = None
-        self.finished = False
-        self._identity = json.loads(json.dumps(identity))
-        self._header = dict(header)
-        with contextlib.ExitStack() as stack:
-            stack.enter_context(held(self.path))
-            self._prepare(mode)
-            self._held = stack.pop_all()
-
-    def __enter__(self) -> RunFolder:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._held.close()
-
-    def _prepare(self, mode: Mode) -> None:
-        present = [name for name in (STATE, *RESULTS) if os.path.lexists(self.path / name)]
+        self.summary: dict[str, Any] | None = None
+        present = [name for name in (STATE, *RESULTS) if os.path.lexists(path / name)]
         if present and mode == "new":
             raise InputError(
-                f"{self.path}: holds results of a run already ({', '.join(present[:3])}). Pass "
+                f"{path}: holds results of a run already ({', '.join(present[:3])}). Pass "
                 f"--overwrite to replace them, --resume to go on, or another --out."
             )
         if present:
-            before = self.read_json(STATE)
+            try:
+                before = json.loads((path / STATE).read_text(encoding="utf-8"))
+            except (OSError, ValueError):  # absent or damaged
+                before = {}
             if "identity" not in before:
                 raise InputError(
-                    f"{self.path}: holds {', '.join(present[:3])} and no {STATE} of a run: neither "
+                    f"{path}: holds {', '.join(present[:3])} and no {STATE} of a run: neither "
                     f"--resume nor --overwrite can go on. Choose another --out."
                 )
             if mode == "resume":
                 self._load(before)
-        if self.finished:
-            return
-        # before the old results go: without it nothing would say that what is left is a run's
-        self.write_state("running")
-        if self.rows:  # what follows the checkpoint is computed again
-            write_csv(self.path / STEPS, STEP_COLUMNS, self.rows)
-        else:
-            self._remove(CHECKPOINT, *RESULTS)
+        if self.summary is None:
+            # before the old results go: without it nothing would say that what is left is a run's
+            self.save("running")
+            if not self.rows:
+                self._remove(CHECKPOINT, *RESULTS)
 
     def _load(self, before: Mapping[str, Any]) -> None:
         """Rows and tracker of an earlier run of the same identity."""
-        then, now = _flat(before["identity"]), _flat(self._identity)
-        for key in sorted({*then, *now}):
-            if then.get(key) != now.get(key):
+        both = pd.json_normalize([before["identity"], self.header["identity"]]).map(str)
+        for key, (then, now) in both.items():
+            if then != now:
                 raise InputError(
-                    f"{self.path}: cannot be resumed: {key} differs ({str(then.get(key))[:40]} "
-                    f"then, {str(now.get(key))[:40]} now). Pass --overwrite to start anew."
+                    f"{self.path}: cannot be resumed: {key} differs ({then[:40]} then, {now[:40]} "
+                    f"now). Pass --overwrite to start anew."
                 )
-        self.finished = before["state"] == "done"
-        if not self.finished and (self.path / CHECKPOINT).is_file():
+        self.summary = before.get("summary")
+        if self.summary is None and (self.path / CHECKPOINT).is_file():
             with np.load(self.path / CHECKPOINT, allow_pickle=False) as stored:
                 arrays = dict(stored)
             self.rows, self.tracker = json.loads(arrays.pop("rows").tobytes()), arrays
 
-    def read_json(self, name: str) -> dict[str, Any]:
-        """Content of a JSON file of the folder; empty where it is absent or damaged."""
-        try:
-            return json.loads((self.path / name).read_text(encoding="utf-8"))
-        except (OSError, ValueError):
-            return {}
-
-    def append(self, row: dict[str, Any]) -> None:
-        """Keep the row of a finished frame, and write its line of ``steps.csv``."""
-        path = self.path / STEPS
-        try:
-            with path.open("a", encoding="utf-8", newline="") as file:
-                writer = csv.DictWriter(
-                    file, STEP_COLUMNS, extrasaction="ignore", lineterminator="\n"
-                )
-                if not self.rows:
-                    writer.writeheader()
-                writer.writerow(row)
-        except OSError as error:
-            raise OutputError(f"{path}: cannot be written: {error.strerror or error}.") from error
-        self.rows.append(row)
-
-    def save_checkpoint(self, tracker: Mapping[str, np.ndarray]) -> None:
-        """Keep the rows and the tracker's state after them."""
-        rows = np.frombuffer(json.dumps(self.rows).encode(), np.uint8)
-        content: dict[str, Any] = {"rows": rows, **tracker}
-        with atomic_write(self.path / CHECKPOINT, "wb") as file:
-            np.savez(file, **content)
-
-    def write_state(self, state: str, **more: Any) -> None:
+    def save(self, state: str, **more: Any) -> None:
         """Write ``run.json``; ``state`` is ``running``, ``interrupted`` or ``done``."""
-        content = {"identity": self._identity, "state": state, "frames_done": len(self.rows)}
-        write_json(self.path / STATE, {**self._header, **more, **content})
+        content = {**self.header, **more, "state": state, "frames_done": len(self.rows)}
+        write_json(self.path / STATE, content)
         if state == "done":  # the results are written
             self._remove(CHECKPOINT)
+
+    def save_rows(self, tracker: Mapping[str, np.ndarray] | None = None) -> None:
+        """Write ``steps.csv``, and with the tracker's state after the rows the checkpoint."""
+        write_csv(self.path / STEPS, STEP_COLUMNS, self.rows)
+        if tracker is not None:
+            rows = np.frombuffer(json.dumps(self.rows).encode(), np.uint8)
+            content: dict[str, Any] = {"rows": rows, **tracker}
+            with atomic_write(self.path / CHECKPOINT, "wb") as file:
+                np.savez(file, **content)
 
     def _remove(self, *names: str) -> None:
         for name in names:
@@ -151,12 +112,3 @@ class RunFolder:
                 (self.path / name).unlink(missing_ok=True)
             except OSError as error:
                 raise OutputError(f"{self.path / name}: cannot be replaced: {error}.") from error
-
-
-def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """``{"options.run.seed": 0}`` of ``{"options": {"run": {"seed": 0}}}``."""
-    found: dict[str, Any] = {}
-    for key, value in values.items():
-        inner = isinstance(value, dict)
-        found |= _flat(value, f"{prefix}{key}.") if inner else {f"{prefix}{key}": value}
-    return found

@@ -25,50 +25,54 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+CHANGES = ("steps", "batch_size", "seed")
+"""Options of a configuration that the command line changes."""
 
-def add_train(train: argparse.ArgumentParser, common: argparse.ArgumentParser) -> None:
+
+def add_train(
+    train: argparse.ArgumentParser, common: argparse.ArgumentParser, call: Callable[..., Any]
+) -> None:
     """Commands of ``hybridvo train`` and their options; ``common`` are those of every command."""
+    train.set_defaults(call=call)
     train.description = __doc__
     train.formatter_class = argparse.RawDescriptionHelpFormatter
     commands = train.add_subparsers(required=True, metavar="WHAT")
 
-    def command(name: str, call: Callable[..., Any], help: str) -> argparse.ArgumentParser:
+    def command(name: str, call: Callable[..., Any], help: str) -> Callable[..., Any]:
         made = commands.add_parser(name, help=help, parents=[common])
-        made.set_defaults(train=call)
-        return made
+        made.set_defaults(train=call, workers=0, device="cpu")
+        return made.add_argument
 
     pwvo = command("pwvo", _pwvo, "train a network of the paper")
     selector = command("selector", _selector, "train the selector")
-    for part in (pwvo, selector):
-        add = part.add_argument
+    for add in (pwvo, selector):
         add("--out", type=Path, required=True, help="folder of the run; goes on where it was")
         add("--time-limit", type=float, default=math.inf, metavar="MIN", help="minutes in all")
         add("--threads", type=int, help="threads of torch; by default torch's own choice")
         add("--overwrite", action="store_true", help="start anew where --out has a training")
         add("--init", metavar="FILE", help="start from these weights: a file, or a pretrained name")
-    pwvo.add_argument("--config", type=Path, required=True, help="configs/train_*.yaml")
-    pwvo.add_argument("--workers", type=int, default=0, help="processes that draw samples")
-    pwvo.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda"))
-    for name, kind in (("steps", int), ("batch-size", int), ("seed", int)):
-        pwvo.add_argument(f"--{name}", type=kind, help="instead of the configuration's")
-    selector.add_argument("--config", type=Path, default=Path("configs/train_selector.yaml"))
-    selector.add_argument("--data", type=Path, required=True, help="folder of the shards")
-    selector.add_argument("--export", type=Path, metavar="FILE", help="write weights when done")
-    selector.add_argument("--held-out", type=Path, help="shards of held-out samples, for --export")
+    pwvo("--config", type=Path, required=True, help="configs/train_*.yaml")
+    pwvo("--workers", type=int, default=0, help="processes that draw samples")
+    pwvo("--device", default="auto", choices=("auto", "cpu", "cuda"))
+    for name in CHANGES:
+        pwvo(f"--{name.replace('_', '-')}", type=int, help="instead of the configuration's")
+    selector("--config", type=Path, default=Path("configs/train_selector.yaml"))
+    selector("--data", type=Path, required=True, help="folder of the shards")
+    selector("--export", type=Path, metavar="FILE", help="write weights when done")
+    selector("--held-out", type=Path, help="shards of held-out samples, for --export")
     export = command("export", _export, "write a network's weights for users (float16)")
-    export.add_argument("--out", type=Path, required=True, help="folder of the run")
-    export.add_argument("--export", type=Path, required=True, metavar="FILE", help="*.safetensors")
-    export.add_argument("--count", type=int, default=1000, help="held-out pairs of each preset")
-    export.add_argument("--calibrate", type=int, default=0, metavar="N", help="shift s by N pairs")
+    export("--out", type=Path, required=True, help="folder of the run")
+    export("--export", type=Path, required=True, metavar="FILE", help="*.safetensors")
+    export("--count", type=int, default=1000, help="held-out pairs of each preset")
+    export("--calibrate", type=int, default=0, metavar="N", help="shift s by N pairs")
     data = command("selector-data", _selector_data, "draw samples for the selector")
-    data.add_argument("--data", type=Path, required=True, help="folder of the shards")
-    data.add_argument("--first-seed", type=int, default=1_000_000, help="below 1000: held out")
-    data.add_argument("--seeds", type=int, default=0, help="about as many samples")
-    data.add_argument(
-        "--recordings", type=Path, metavar="DIR", help="semi-real pairs of the recordings below it"
-    )
-    data.add_argument("--split", default="train", help="which of these recordings")
-    data.add_argument("--propose", metavar="NETWORK", help="ask these weights about the samples")
+    data("--data", type=Path, required=True, help="folder of the shards")
+    data("--first-seed", type=int, default=1_000_000, help="below 1000: held out")
+    data("--seeds", type=int, default=0, help="about as many samples")
+    recordings = "semi-real pairs of the recordings below it"
+    data("--recordings", type=Path, metavar="DIR", help=recordings)
+    data("--split", default="train", help="which of these recordings")
+    data("--propose", metavar="NETWORK", help="ask these weights about the samples")
 
 
 def train(args: argparse.Namespace, command: list[str]) -> tuple[Any, str, int]:
@@ -102,12 +106,10 @@ def _pwvo(args: argparse.Namespace, command: str) -> dict[str, Any]:
     from hybridvo.training.pwvo_task import PwvoTask
 
     options, mixture = load_pwvo_options(args.config)
-    names = ("steps", "batch_size", "seed")
-    changes = {n: getattr(args, n) for n in names if getattr(args, n) is not None}
+    changes = {n: getattr(args, n) for n in CHANGES if getattr(args, n) is not None}
     options = dataclasses.replace(options, **changes)
-    device = torch_device(args.device)
-    trainer = _train(args, command, PwvoTask(options, mixture), device, args.workers)
-    return {"updates": trainer.step}
+    args.device = torch_device(args.device)
+    return {"updates": _train(args, command, PwvoTask(options, mixture)).step}
 
 
 def _selector(args: argparse.Namespace, command: str) -> dict[str, Any]:
@@ -119,13 +121,13 @@ def _selector(args: argparse.Namespace, command: str) -> dict[str, Any]:
     if args.export is not None and args.held_out is None:
         raise InputError("--export: needs --held-out, samples for the figures of the card.")
     task = SelectorTask(load_selector_options(args.config), args.data)
-    trainer = _train(args, command, task, "cpu", 0)
+    trainer = _train(args, command, task)
     if args.export is None:
         return {"updates": trainer.step}
     return export_selector(trainer, args.held_out, args.export)["held_out"]
 
 
-def _train(args: argparse.Namespace, command: str, task: Any, device: str, workers: int) -> Any:
+def _train(args: argparse.Namespace, command: str, task: Any) -> Any:
     import cv2
     import torch
 
@@ -144,7 +146,7 @@ def _train(args: argparse.Namespace, command: str, task: Any, device: str, worke
     if args.overwrite:
         for name in (CHECKPOINT, LOG, RUN):
             (args.out / name).unlink(missing_ok=True)
-    trainer = Trainer(task, args.out, device, workers, report=_report)
+    trainer = Trainer(task, args.out, args.device, args.workers, report=_report)
 
     def say(text: str) -> None:
         if trainer.rank == 0:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,19 +14,17 @@ from hybridvo.data.image_io import read_rgb
 from hybridvo.data.lists import sorted_files
 from hybridvo.errors import FormatError, InputError
 from hybridvo.files import atomic_write, parse_yaml, read_text
+from hybridvo.options import Positive, option_group
 from hybridvo.types import Camera, as_number
 
 CAMERA_FILE = "camera.yaml"
 IMAGES = (".png", ".jpg", ".jpeg")
-REQUIRED = ("fx", "fy", "cx", "cy", "width", "height")
-KNOWN = (*REQUIRED, "distortion", "depth_scale", "fps")
 ALIASES = {
     # ROS: a calibration file, or a message
     **dict.fromkeys(("camera_matrix", "K", "k"), "K"),
     **dict.fromkeys(("distortion_coefficients", "D", "d"), "distortion"),
     "image_width": "width",
     "image_height": "height",
-    "distortion_model": "model",
     # RealSense
     "ppx": "cx",
     "ppy": "cy",
@@ -36,9 +33,27 @@ ALIASES = {
 """What others call it -> what we do; K holds fx 0 cx 0 fy cy 0 0 1."""
 
 
+@option_group
+class CameraFile:
+    """What ``camera.yaml`` may hold; ``docs/own-data.md`` explains it."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+    distortion: tuple[float, ...] = ()
+    depth_scale: Positive | None = None
+    fps: Positive | None = None
+
+
+KNOWN = ("fx", "fy", "cx", "cy", "width", "height", "distortion", "depth_scale", "fps")
+
+
 @dataclass(frozen=True)
 class Calibration:
-    """A pinhole camera (pixels) and what is known beside it.
+    """A pinhole camera and what is known beside it.
 
     ``distortion`` holds Brown's k1 k2 p1 p2 [k3 [k4 k5 k6]], nothing for rectified images;
     ``depth_scale`` the stored units per metre of depth.
@@ -99,39 +114,37 @@ def parse_camera(
 
 
 def read_camera_file(path: Path) -> Calibration:
-    """Calibration of a YAML or JSON file with our keys (:data:`KNOWN`), ROS's or RealSense's."""
+    """Calibration of a YAML or JSON file like :class:`CameraFile`, or of ROS or RealSense."""
     text = read_text(path).removesuffix("---\n")  # as ROS prints it
     content = parse_yaml(text, str(path))
     if not isinstance(content, dict):
         raise FormatError(f"{path}: expected 'key: value' lines, got a {type(content).__name__}.")
     is_foreign = any(key in ALIASES for key in content)
-    content = _in_our_words(content, path) if is_foreign else _only_known(content, path)
-    if missing := [key for key in REQUIRED if content.get(key) is None]:
-        raise FormatError(
-            f"{path}: missing: {', '.join(missing)}. Expected {', '.join(REQUIRED)} in pixels."
-        )
-    distortion = _distortion(content.get("distortion"), path)
+    model = str(content.get("distortion_model", content.get("model")))[:40]
+    if is_foreign:
+        content = _in_our_words(content, path)
+    if missing := [key for key in KNOWN[:6] if content.get(key) is None]:
+        raise FormatError(f"{path}: missing: {', '.join(missing)}.")
     told: list[str] = []
-    if is_foreign and any(distortion):
-        model = str(content.get("model"))[:40]
+    try:
+        found = CameraFile(**{str(k)[:40]: v for k, v in content.items() if v is not None})
+        camera = Camera(found.fx, found.fy, found.cx, found.cy, found.height, found.width)
+        scale = units_per_metre(found.depth_scale, str(path), told)
+    except InputError as error:
+        known = ", ".join(KNOWN)
+        raise FormatError(f"{path}: {str(error)[:400]} Known are {known}.") from None
+    if len(found.distortion) not in (0, 4, 5, 8):
+        raise FormatError(
+            f"{path}: distortion: expected a list of 4, 5 or 8 numbers [k1, k2, p1, p2, k3, ...]."
+        )
+    if is_foreign and any(found.distortion):
         if any(word in model.lower() for word in ("fish", "equidist", "kannala", "ftheta")):
             raise FormatError(
                 f"{path}: distortion model '{model}': expected Brown's (plumb_bob, "
                 f"rational_polynomial). Rectify the images first."
             )
         told.append(f"{path}: lens distortion is taken out; state none if images are rectified.")
-    fps, scale = (
-        None if content.get(key) is None else as_number(content[key])
-        for key in ("fps", "depth_scale")
-    )
-    if fps is not None and not 0 < fps < np.inf:
-        raise FormatError(f"{path}: fps: expected a number above 0, got {fps}.")
-    try:
-        camera = Camera(**{key: content[key] for key in REQUIRED})
-        scale = units_per_metre(scale, str(path), told)
-    except InputError as error:
-        raise FormatError(f"{path}: {str(error)[:800]}") from None
-    return Calibration(camera, distortion, scale, fps, tuple(told))
+    return Calibration(camera, found.distortion, scale, found.fps, tuple(told))
 
 
 def units_per_metre(scale: float | None, where: str, told: list[str]) -> float | None:
@@ -167,7 +180,7 @@ def write_camera_template(directory: str | os.PathLike[str]) -> Path:
 
 
 def _in_our_words(content: dict[Any, Any], path: Path) -> dict[Any, Any]:
-    """The content of a file of ROS or RealSense with our keys."""
+    """What a file of ROS or RealSense holds, with our keys; the rest is left out."""
     # ROS writes a matrix as {rows, cols, data}
     plain = {k: v.get("data") if isinstance(v, dict) else v for k, v in content.items()}
     renamed = {ALIASES.get(key, key): value for key, value in plain.items()}
@@ -176,28 +189,4 @@ def _in_our_words(content: dict[Any, Any], path: Path) -> dict[Any, Any]:
         if not isinstance(K, list) or len(K) != 9:
             raise FormatError(f"{path}: camera matrix: expected 9 numbers, row by row.")
         renamed |= {"fx": K[0], "cx": K[2], "fy": K[4], "cy": K[5]}
-    return renamed
-
-
-def _only_known(content: dict[Any, Any], path: Path) -> dict[Any, Any]:
-    for key in content:
-        if key not in KNOWN:
-            close = difflib.get_close_matches(str(key)[:40], KNOWN, n=1)
-            hint = f" (did you mean '{close[0]}'?)" if close else ""
-            raise FormatError(
-                f"{path}: unknown key '{str(key)[:40]}'{hint}; known: {', '.join(KNOWN)}."
-            )
-    return content
-
-
-def _distortion(value: Any, path: Path) -> tuple[float, ...]:
-    if value is None or value == []:
-        return ()
-    if not isinstance(value, list) or len(value) not in (4, 5, 8):
-        raise FormatError(
-            f"{path}: distortion: expected a list of 4, 5 or 8 numbers [k1, k2, p1, p2, k3, ...]."
-        )
-    numbers = tuple(map(as_number, value))
-    if not np.isfinite(numbers).all():
-        raise FormatError(f"{path}: distortion: expected a finite number, got {str(value)[:80]}.")
-    return numbers
+    return {key: value for key, value in renamed.items() if key in KNOWN}

@@ -14,15 +14,14 @@ import cv2
 import numpy as np
 
 from hybridvo.errors import FormatError, InputError
-from hybridvo.files import atomic_write
+from hybridvo.files import atomic_write, read_bytes
 from hybridvo.geometry import pose_matrix
 from hybridvo.types import MAX_PIXELS, as_rigid
 
 TAG_BYTES = struct.pack("<f", 202021.25)
 PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 JPEG_MAGIC = b"\xff\xd8"
-UNKNOWN_FLOW = 1e9
-"""Middlebury's mark: flow beyond this is unknown."""
+UNKNOWN_FLOW = 1e9  # Middlebury's mark: flow beyond this is unknown
 COPY_AGAIN = "Copy or download the file again."
 PathLike = str | os.PathLike[str]
 
@@ -140,13 +139,13 @@ def read_npy(path: PathLike, *, channels: int | None = None) -> np.ndarray:
 
 
 def write_flo(path: PathLike, flow: np.ndarray) -> None:
-    """Write (H, W, 2) flow in pixels as ``.flo``; InputError for another shape."""
-    _write_tagged(path, np.asarray(flow), 2)
+    """Write (H, W, 2) flow in pixels as ``.flo``, or (H, W) depth as ``.dpt``: they look alike."""
+    size = struct.pack("<ii", flow.shape[1], flow.shape[0])
+    with atomic_write(path, "wb") as file:
+        file.write(TAG_BYTES + size + flow.astype("<f4").tobytes())
 
 
-def write_dpt(path: PathLike, depth: np.ndarray) -> None:
-    """Write (H, W) depth as ``.dpt``; InputError for another shape."""
-    _write_tagged(path, np.asarray(depth)[..., None], 1)
+write_dpt = write_flo
 
 
 def write_cam(path: PathLike, K: np.ndarray, T_cam_world: np.ndarray) -> None:
@@ -154,15 +153,6 @@ def write_cam(path: PathLike, K: np.ndarray, T_cam_world: np.ndarray) -> None:
     with atomic_write(path, "wb") as file:
         file.write(TAG_BYTES + np.asarray(K, "<f8").tobytes())
         file.write(np.asarray(T_cam_world, "<f8")[:3].tobytes())
-
-
-def _read_bytes(path: PathLike) -> bytes:
-    try:
-        return Path(path).read_bytes()
-    except FileNotFoundError:
-        raise
-    except (OSError, ValueError) as error:
-        raise FormatError(f"{str(path)[:200]!r}: cannot be read: {error}.") from None
 
 
 def _check_size(path: object, expected: int, got: int, what: str) -> None:
@@ -182,7 +172,7 @@ def _check_pixels(path: object, width: int, height: int) -> None:
 
 
 def _tagged_bytes(path: PathLike, suffix: str) -> bytes:
-    data = _read_bytes(path)
+    data = read_bytes(path)
     if not data.startswith(TAG_BYTES):
         raise FormatError(
             f"{path}: not a little-endian {suffix} file: expected the first bytes {TAG_BYTES!r}, "
@@ -203,17 +193,9 @@ def _read_tagged(path: PathLike, suffix: str, channels: int) -> np.ndarray:
     return array.astype(np.float32)
 
 
-def _write_tagged(path: PathLike, array: np.ndarray, channels: int) -> None:
-    if array.ndim != 3 or array.shape[2] != channels or array.size == 0:
-        raise InputError(f"{path}: expected (H, W) and {channels} channels, got {array.shape}.")
-    size = struct.pack("<ii", array.shape[1], array.shape[0])
-    with atomic_write(path, "wb") as file:
-        file.write(TAG_BYTES + size + array.astype("<f4").tobytes())
-
-
 def _decode(path: PathLike, flags: int) -> np.ndarray:
     """Decoded PNG or JPEG in OpenCV's channel order, after a look at its two ends."""
-    data = _read_bytes(path)
+    data = read_bytes(path)
     is_png = data.startswith(PNG_MAGIC) and len(data) >= 33
     if is_png:
         width, height = struct.unpack(">II", data[16:24])

@@ -155,25 +155,19 @@ def resize_camera(camera: Camera, height: int, width: int) -> Camera:
 
 def resize_frame(frame: Frame, height: int, width: int) -> Frame:
     """Frame of another size: image by area (or bilinear when it grows), the rest by nearest."""
-    # source pixels whose centres are nearest (cv2's INTER_NEAREST takes corners, and no bool)
-    rows, columns = (
-        ((np.arange(size) + 0.5) * (old / size)).astype(np.intp).clip(0, old - 1)
-        for size, old in zip((height, width), frame.camera.shape, strict=True)
-    )
+    shrinks = height <= frame.camera.height and width <= frame.camera.width
 
-    def nearest(array: np.ndarray | None) -> np.ndarray | None:
-        return None if array is None else array[np.ix_(rows, columns)]
+    def resized(image: np.ndarray | None, mode: int = cv2.INTER_NEAREST_EXACT) -> np.ndarray | None:
+        if image is None:
+            return None
+        plain = image.view(np.uint8) if image.dtype == bool else image
+        return cv2.resize(plain, (width, height), interpolation=mode).astype(image.dtype)
 
-    rgb = frame.rgb
-    if rgb is not None:
-        shrinks = height <= rgb.shape[0] and width <= rgb.shape[1]
-        mode = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
-        rgb = cv2.resize(rgb, (width, height), interpolation=mode)
     return replace(
         frame,
-        rgb=rgb,
-        depth=nearest(frame.depth),
+        rgb=resized(frame.rgb, cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR),
+        depth=resized(frame.depth),
         camera=resize_camera(frame.camera, height, width),
-        depth_variance=nearest(frame.depth_variance),
-        mask=nearest(frame.mask),
+        depth_variance=resized(frame.depth_variance),
+        mask=resized(frame.mask),
     )

@@ -42,18 +42,34 @@ def is_oracle(flow: str) -> bool:
     return "(true)" in flow
 
 
-def _style(methods: Sequence[str], **orders: Sequence[str]) -> dict[str, Any]:
-    """What all charts share: a colour for each method, black for the ground truth; orders."""
+def _chart(
+    kind: Any, rows: pd.DataFrame, x: str, y: str, methods: Sequence[str], **more: Any
+) -> Figure:
+    """A chart with a colour for each method, black for the truth, and a line at one pixel."""
     palette = px.colors.qualitative.Dark24
     colours = {method: palette[k % len(palette)] for k, method in enumerate(methods)}
-    return {
-        "labels": LABELS,
-        "template": "plotly_white",
-        "height": 420,
-        "category_orders": {"method": [TRUTH, *methods], **orders},
-        "color": "method",
-        "color_discrete_map": colours | {TRUTH: "#000"},
-    }
+    orders = {"method": [TRUTH, *methods], "flow_source": flow_sources(rows)}
+    if not pd.api.types.is_numeric_dtype(rows[x]):
+        orders[x] = list(rows[x].unique())
+    errors = [name for name in (x, y) if name.startswith("epe")]
+    rows = rows.assign(**{name: rows[name].clip(lower=FLOOR_PX) for name in errors})
+    figure = kind(
+        rows,
+        x=x,
+        y=y,
+        color="method",
+        color_discrete_map=colours | {TRUTH: "#000"},
+        category_orders=orders,
+        labels=LABELS,
+        template="plotly_white",
+        height=420,
+        **{f"log_{'x' if name == x else 'y'}": True for name in errors},
+        **more,
+    )
+    for name in errors:
+        line = figure.add_vline if name == x else figure.add_hline
+        line(FAILURE_PX, line_dash="dot")
+    return figure
 
 
 def error_distribution(pairs: pd.DataFrame, methods: Sequence[str]) -> list[Figure]:
@@ -61,20 +77,11 @@ def error_distribution(pairs: pd.DataFrame, methods: Sequence[str]) -> list[Figu
     known = pairs.dropna(subset=["epe_l2_px"])
     if known.empty:
         return []
-    share = np.linspace(0, 1, 201)
     groups = known.groupby(["flow_source", "method"])["epe_l2_px"]
-    curves = groups.quantile(share).clip(lower=FLOOR_PX)
+    curves = groups.quantile(np.linspace(0, 1, 201))
     curves = curves.rename_axis(["flow_source", "method", "below"]).reset_index()
     curves["below"] *= 100
-    figure = px.line(
-        curves,
-        x="epe_l2_px",
-        y="below",
-        facet_col="flow_source",
-        log_x=True,
-        **_style(methods, flow_source=flow_sources(known)),
-    )
-    return [figure.add_vline(FAILURE_PX, line_dash="dot")]
+    return [_chart(px.line, curves, "epe_l2_px", "below", methods, facet_col="flow_source")]
 
 
 def failure_chart(breakdown: Mapping[str, Any], methods: Sequence[str]) -> list[Figure]:
@@ -82,19 +89,12 @@ def failure_chart(breakdown: Mapping[str, Any], methods: Sequence[str]) -> list[
     rates = pd.DataFrame(breakdown["failure_rates"]).dropna(subset=["failure_rate"])
     if rates.empty:
         return []
-    names = ["failure_rate", "failure_rate_low", "failure_rate_high"]
-    rates[names] = 100 * rates[names].astype(float)
-    rates["above"] = rates["failure_rate_high"] - rates["failure_rate"]
-    rates["under"] = rates["failure_rate"] - rates["failure_rate_low"]
-    figure = px.scatter(
-        rates,
-        x="failure_rate",
-        y="method",
-        error_x="above",
-        error_x_minus="under",
-        facet_col="flow_source",
-        **_style(methods, flow_source=flow_sources(rates)),
+    low, rate, high = (
+        100 * rates[f"failure_rate{end}"].astype(float) for end in ("_low", "", "_high")
     )
+    rates = rates.assign(failure_rate=rate, above=high - rate, under=rate - low)
+    bars = {"error_x": "above", "error_x_minus": "under", "facet_col": "flow_source"}
+    figure = _chart(px.scatter, rates, "failure_rate", "method", methods, **bars)
     return [figure.update_layout(showlegend=False)]
 
 
@@ -103,21 +103,16 @@ def factor_charts(breakdown: Mapping[str, Any], methods: Sequence[str]) -> list[
     if not breakdown["cells"]:
         return []
     cells = pd.DataFrame(breakdown["cells"])
-    cells = cells[cells["flow_source"] == flow_sources(cells)[0]].dropna(
-        subset=["epe_l2_px_median"]
-    )
-    cells["epe_l2_px_median"] = cells["epe_l2_px_median"].clip(lower=FLOOR_PX)
+    cells = cells[cells["flow_source"] == flow_sources(cells)[0]]
+    cells = cells.dropna(subset=["epe_l2_px_median"])
     figures = []
     for factor in breakdown["factors"]:
         mine = cells[cells["factor"] == factor["name"]].sort_values("bin")
-        if mine["bin"].nunique() < 2:
-            continue
-        unit = f" [{factor['unit']}]" if factor["unit"] else ""
-        column = f"{factor['label']}{unit}"
-        mine = mine.assign(**{column: mine.apply(_bin, axis=1)})
-        style = _style(methods, **{column: list(mine[column].unique())})
-        figure = px.line(mine, x=column, y="epe_l2_px_median", markers=True, log_y=True, **style)
-        figures.append(figure.add_hline(FAILURE_PX, line_dash="dot"))
+        if mine["bin"].nunique() > 1:
+            column = factor["label"] + (f" [{factor['unit']}]" if factor["unit"] else "")
+            mine = mine.assign(**{column: mine.apply(_bin, axis=1)})
+            figure = _chart(px.line, mine, column, "epe_l2_px_median", methods, markers=True)
+            figures.append(figure)
     return figures
 
 
@@ -135,14 +130,9 @@ def time_chart(totals: Sequence[Mapping[str, Any]], methods: Sequence[str]) -> l
     if len(rows) < 2:
         return []
     rows = rows[rows["flow_source"] == flow_sources(rows)[0]]
-    rows["epe_l2_px_median"] = rows["epe_l2_px_median"].clip(lower=FLOOR_PX)
-    x, y = "ms_per_pair_median", "epe_l2_px_median"
-    figure = px.scatter(rows, x=x, y=y, text="method", log_x=True, log_y=True, **_style(methods))
-    figure.update_traces(textposition="top center", showlegend=False)
-    return [figure.add_hline(FAILURE_PX, line_dash="dot")]
-
-
-# -- paths ----------------------------------------------------------------------------------------
+    names = ("ms_per_pair_median", "epe_l2_px_median")
+    figure = _chart(px.scatter, rows, *names, methods, text="method", log_x=True)
+    return [figure.update_traces(textposition="top center", showlegend=False)]
 
 
 def path_charts(
@@ -153,25 +143,25 @@ def path_charts(
     methods: Sequence[str],
 ) -> list[Figure]:
     """Path from above, error of every pair and path in space, of the first source of flow."""
-    entries = pd.DataFrame(result["trajectories"])
-    entries = entries[entries["sequence"] == sequence]
-    flow = flow_sources(entries)[0]
+    (truth,) = (s["ground_truth"] for s in result["sequences"] if s["name"] == sequence)
+    rows = pd.DataFrame([row for row in result["rows"] if row["sequence"] == sequence])
+    flow = flow_sources(rows)[0]
     mine = pairs[(pairs["sequence"] == sequence) & (pairs["flow_source"] == flow)]
-    wanted = entries["flow_source"].isna() | entries["flow_source"].eq(flow)
-    paths = _positions(folder, entries[wanted])
-    style = _style(methods)
-    above = px.line(paths, x="right", y="forward", title=f"Path from above, {flow} flow", **style)
+    rows = rows[rows["flow_source"] == flow]
+    files = ({TRUTH: truth} if truth else {}) | dict(
+        zip(rows["method"], rows["trajectory"], strict=True)
+    )
+    paths = _positions({name: folder / file for name, file in files.items()})
+    paths["flow_source"] = flow
+    above = _chart(px.line, paths, "right", "forward", methods, title=f"From above, {flow} flow")
     above.update_yaxes(scaleanchor="x")
-    axes = {"x": "right", "y": "forward", "z": "up"}
-    space = px.line_3d(paths, **axes, title=f"Path in space, {flow} flow", **style)
-    space.update_layout(scene_aspectmode="data")
-    figures = [above, space]
+    titled = {"z": "up", "title": f"Path in space, {flow} flow"}
+    space = _chart(px.line_3d, paths, "right", "forward", methods, **titled)
+    figures = [above, space.update_layout(scene_aspectmode="data")]
     known = mine.dropna(subset=["epe_l2_px"])
     if len(known):
-        known = known.assign(epe_l2_px=known["epe_l2_px"].clip(lower=FLOOR_PX))
         title = f"Error of every pair, {flow} flow"
-        error = px.line(known, x="index", y="epe_l2_px", log_y=True, title=title, **style)
-        figures.insert(1, error.add_hline(FAILURE_PX, line_dash="dot"))
+        figures.insert(1, _chart(px.line, known, "index", "epe_l2_px", methods, title=title))
     medians = mine.groupby("method")["epe_l2_px"].median().sort_values()
     shown = {TRUTH, *medians.index[:5]}  # the legend turns on the others
     for figure in figures:
@@ -181,14 +171,9 @@ def path_charts(
     return figures
 
 
-def _positions(folder: Path, entries: pd.DataFrame) -> pd.DataFrame:
+def _positions(files: Mapping[str, Path]) -> pd.DataFrame:
     """``method, right, forward, up`` of every path in the first true camera, metres."""
-    paths = {
-        entry["method"] if pd.notna(entry["method"]) else TRUTH: read_trajectory(
-            folder / entry["path"], "tum"
-        )
-        for entry in entries.to_dict("records")
-    }
+    paths = {name: read_trajectory(file, "tum") for name, file in files.items()}
     gt = paths.get(TRUTH)
     tables = []
     for method, path in paths.items():

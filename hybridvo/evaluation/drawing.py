@@ -2,29 +2,32 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from hybridvo.data.sequence import Sequence, iter_pairs
 from hybridvo.errors import InputError
 from hybridvo.estimation import estimate
 from hybridvo.evaluation.pair_errors import MOVING_PX, pair_errors, true_motion
-from hybridvo.evaluation.plots import Panel, draw_panels, flow_colours, longest_flow
-from hybridvo.evaluation.saliency import last_pass, saliencies
-from hybridvo.evaluation.sequence_job import Job
+from hybridvo.evaluation.plots import Panel, draw_panels, flow_panel, longest_flow
+from hybridvo.evaluation.saliency import Saliency, last_pass, saliencies
 from hybridvo.files import atomic_write, make_folder, write_json
-from hybridvo.flow import dis_flow
+from hybridvo.flow import FlowProvider, dis_flow
 from hybridvo.geometry import ego_flow, matrix_to_euler_deg
 from hybridvo.network.layers import KINDS
-from hybridvo.network.models import load_weights
+from hybridvo.network.models import Models, load_weights
 from hybridvo.network.weights import pretrained, pretrained_names
+from hybridvo.options import Options
 from hybridvo.pipeline import DEFAULT_METHOD
 from hybridvo.results import PixelwisePrediction
-from hybridvo.types import Camera, FramePair
+from hybridvo.types import FramePair
+
+Numbers = dict[str, float | None]
 
 
 def draw(
@@ -33,7 +36,7 @@ def draw(
     out: str | Path,
     *,
     flow: str = "auto",
-    method: str | None = None,
+    method: str = DEFAULT_METHOD,
     weights: Iterable[str | Path] = (),
     steps: int = 32,
     overwrite: bool = False,
@@ -51,17 +54,27 @@ def draw(
         raise InputError(f"{out}: exists; pass --overwrite.")
     if steps < 1:
         raise InputError(f"steps: expected at least 1, got {steps}.")
-    given = _read_pair(sequence, pair, flow)
+    if not 0 <= pair < len(sequence) - 1:
+        raise InputError(f"--pair: {sequence.name} has pairs 0 to {len(sequence) - 2}, got {pair}.")
+    from_files = flow == "file" or (flow == "auto" and sequence.has_flow)
+    provider = None if from_files else dis_flow()
+    given = next(iter_pairs(sequence, provider, start=pair, stop=pair + 2))
+    if given.flow is None or given.prev.depth is None:
+        missing = "flow" if given.flow is None else "depth"
+        raise InputError(f"{sequence.name}, pair {pair}: there is no {missing} to look at.")
     found = networks(weights)
     flow_gt = None
     if sequence.has_flow and sequence.flow_is_true:
         flow_gt = given.flow if given.flow_is_true else sequence.flow(pair)[0]
     T_gt = true_motion(sequence, pair, pair + 1)
-    method = method or DEFAULT_METHOD
     motion = estimate(given, method=method)
     panels, numbers, moving = _pair_panels(given, motion.T_curr_prev, motion.weights, T_gt, flow_gt)
+    true = None if T_gt is None else (matrix_to_euler_deg(T_gt[:3, :3]), T_gt[:3, 3])
     for name, network in found:
-        more, values = _network_panels(name, network, given, T_gt, moving, steps)
+        output, inputs, T_start = last_pass(network, given)
+        if isinstance(output, PixelwisePrediction):
+            panels += prediction_panels(name, output, true, moving)
+        more, values = saliency_panels(name, saliencies(network, inputs, T_start, steps), moving)
         panels += more
         numbers |= values
     source = f"{given.flow_source} (true)" if given.flow_is_true else given.flow_source
@@ -77,23 +90,24 @@ def draw(
 
 def draw_worst(
     out: Path,
-    job: Job,
+    sequence: Sequence,
+    flows: Mapping[str, FlowProvider],
+    options: Options,
+    models: Models,
     entries: Iterable[dict[str, Any]],
-    rows: Iterable[Mapping[str, Any]],
+    pairs: pd.DataFrame,
 ) -> None:
     """Draw worst pairs of one sequence of a comparison, with the motion that it found.
 
     Each of ``entries`` gets ``picture`` (a path below ``out``), or None and ``picture_reason``.
-    ``rows`` are the pairs of the sequence.
     """
-    sequence, models, flows = job.open()
-    found = {(row["index"], row["method"], row["flow_source"]): row for row in rows}
+    found = pairs.set_index(["index", "method", "flow_source"])
     for entry in entries:
         method, label = entry["method"], entry["flow_source"]
-        row = found[entry["index"], method, label]
+        row = found.loc[(entry["index"], method, label)]
         entry |= {"picture": None, "picture_reason": None}
         try:
-            prev, curr = sequence.frame(row["prev"]), sequence.frame(row["next"])
+            prev, curr = (sequence.frame(int(row[name])) for name in ("prev", "next"))
         except (InputError, OSError) as error:
             entry["picture_reason"] = f"the pair cannot be read: {error}"
             continue
@@ -104,32 +118,15 @@ def draw_worst(
         pair = FramePair(prev, curr, field.flow, field.variance, field.valid)
         weights = None
         if not entry["status"].startswith("failed"):  # of the pair on its own, without a tracker
-            weights = estimate(pair, method=method, models=models).weights
+            weights = estimate(pair, method=method, options=options, models=models).weights
         T_gt = true_motion(sequence, prev.index, curr.index)
-        T_est = np.array(row["T_curr_prev"]).reshape(4, 4)
-        panels = _pair_panels(pair, T_est, weights, T_gt, None)[0]
+        panels = _pair_panels(pair, row["T_curr_prev"], weights, T_gt, None)[0]
         aspect = prev.camera.width / prev.camera.height
-        name = f"{job.stem}_{entry['index']:06d}_{method}_{label.split()[0]}"
-        entry["picture"] = f"worst/{name}.jpg"
+        name = "_".join([entry["sequence"], f"{entry['index']:06d}", method, label.split()[0]])
+        entry["picture"] = "worst/" + re.sub(r"[^\w.-]", "_", name) + ".jpg"
+        size: dict[str, Any] = {"columns": len(panels), "inches": 2.2, "format": "jpeg"}
         with atomic_write(out / entry["picture"], "wb") as file:
-            file.write(
-                draw_panels(panels, "", aspect, columns=len(panels), inches=2.2, format="jpeg")
-            )
-
-
-def _read_pair(sequence: Sequence, index: int, flow: str) -> FramePair:
-    """Pair of a sequence that has flow and depth."""
-    if not 0 <= index < len(sequence) - 1:
-        raise InputError(
-            f"--pair: {sequence.name} has pairs 0 to {len(sequence) - 2}, got {index}."
-        )
-    from_files = flow == "file" or (flow == "auto" and sequence.has_flow)
-    provider = None if from_files else dis_flow()
-    pair = next(iter_pairs(sequence, provider, start=index, stop=index + 2))
-    if pair.flow is None or pair.prev.depth is None:
-        missing = "flow" if pair.flow is None else "depth"
-        raise InputError(f"{sequence.name}, pair {index}: there is no {missing} to look at.")
-    return pair
+            file.write(draw_panels(panels, "", aspect, **size))
 
 
 def networks(files: Iterable[str | Path] = ()) -> list[tuple[str, Any]]:
@@ -149,39 +146,31 @@ def networks(files: Iterable[str | Path] = ()) -> list[tuple[str, Any]]:
 # -- panels ---------------------------------------------------------------------------------------
 
 
-def flow_panel(title: str, flow: np.ndarray, longest: float) -> Panel:
-    """A flow (H, W, 2) in colours, of full saturation at ``longest`` px."""
-    return Panel(f"{title} (full colour: {longest:.3g} px)", flow_colours(flow, longest))
-
-
 def _pair_panels(
     pair: FramePair,
     T_est: np.ndarray,
     weights: np.ndarray | None,
     T_gt: np.ndarray | None,
     flow_gt: np.ndarray | None,
-) -> tuple[list[Panel], dict[str, float | None], np.ndarray]:
+) -> tuple[list[Panel], Numbers, np.ndarray]:
     """Panels and numbers that need no network, and (H, W) which pixels move by themselves."""
     flow, depth = np.asarray(pair.flow), np.asarray(pair.prev.depth)
-    ego, objects = object_flow(pair, T_est)
-    real, whose = objects, "this flow and the estimate"
-    if T_gt is not None and flow_gt is not None:
-        real = object_flow(replace(pair, flow=flow_gt), T_gt)[1]
-        whose = "true flow and motion"
-    moving = moving_pixels(real)
+    cameras = pair.prev.camera, pair.curr.camera
+    ego = ego_flow(depth, T_est, *cameras)
+    ego_gt = None if T_gt is None else ego_flow(depth, T_gt, *cameras)
+    objects, whose = flow - ego, "this flow and the estimate"
+    if ego_gt is not None and flow_gt is not None:
+        objects, whose = flow_gt - ego_gt, "true flow and motion"
+    with np.errstate(invalid="ignore"):
+        moving = np.linalg.norm(objects, axis=2) > MOVING_PX
     # one scale for all three: the parts are to be seen beside the whole
     longest = longest_flow(flow)
     panels = [] if pair.prev.rgb is None else [Panel("previous image", pair.prev.rgb)]
-    panels += [
-        flow_panel("flow F", flow, longest),
-        flow_panel("ego flow", ego, longest),
-        flow_panel("F minus ego flow", objects, longest),
-    ]
-    numbers: dict[str, float | None] = {f"moving share, {whose}": float(moving.mean())}
-    if T_gt is not None:
-        cameras = pair.prev.camera, pair.curr.camera
-        error = error_map(T_est, T_gt, depth, *cameras)
-        panels.append(Panel("error of the ego flow", error, "px"))
+    parts = {"flow F": flow, "ego flow": ego, "F minus ego flow": flow - ego}
+    panels += [flow_panel(title, part, longest) for title, part in parts.items()]
+    numbers: Numbers = {f"moving share, {whose}": float(moving.mean())}
+    if T_gt is not None and ego_gt is not None:
+        panels.append(Panel("error of the ego flow", np.linalg.norm(ego - ego_gt, axis=2), "px"))
         errors = pair_errors(T_est, T_gt, depth, *cameras)
         numbers |= {
             "EPE, px": errors["epe_l2_px"],
@@ -189,89 +178,51 @@ def _pair_panels(
             "translation error, m": errors["trans_err"],
         }
     if weights is not None:
-        title = "weights (outline: moving)"
-        panels.append(Panel(title, weights, "weight", 1.0, moving))
+        panels.append(Panel("weights (outline: moving)", weights, "weight", 1.0, moving))
     return panels, numbers, moving
 
 
-def _network_panels(
+def prediction_panels(
     name: str,
-    network: Any,
-    pair: FramePair,
-    T_gt: np.ndarray | None,
+    prediction: PixelwisePrediction,
+    true: tuple[np.ndarray, np.ndarray] | None,
     moving: np.ndarray,
-    steps: int,
-) -> tuple[list[Panel], dict[str, float | None]]:
-    """Panels and numbers of one network: uncertainty, errors, saliency of its last pass."""
-    output, inputs, T_start = last_pass(network, pair)
+) -> list[Panel]:
+    """The paper's maps of the first pair of a prediction: uncertainty, and errors where known.
+
+    Uncertainty is the geometric mean of the three Laplace scales U at every pixel, the error the
+    mean absolute difference from the ``true`` Euler angles X-Y-Z (3,) of T_curr_prev, degrees, and
+    translation (3,), metres. ``moving`` (H, W) is outlined.
+    """
+    panels = []
+    for k, (what, unit) in enumerate((("rotation", "deg"), ("translation", "m"))):
+        scale = getattr(prediction, f"log_scale_{what}")
+        if scale is not None:  # beside its own scale: the paper compares where they are large
+            U = scale[0].detach().float().mean(0).exp().cpu().numpy()
+            panels.append(
+                Panel(f"{name}: uncertainty of the {what}", U, f"{unit}, U", None, moving)
+            )
+        if true is not None:
+            found = getattr(prediction, what)[0].detach().cpu().double().numpy()
+            error = np.abs(found - np.reshape(true[k], (3, 1, 1))).mean(axis=0)
+            panels.append(Panel(f"{name}: error of the {what}", error, unit, None, moving))
+    return panels
+
+
+def saliency_panels(
+    name: str, found: Mapping[str, Saliency], moving: np.ndarray
+) -> tuple[list[Panel], Numbers]:
+    """Where a network looks, and how much of that lies on what moves."""
     panels: list[Panel] = []
-    numbers: dict[str, float | None] = {}
-    if isinstance(output, PixelwisePrediction):
-        halves = (("rotation", "deg"), ("translation", "m"))
-        for (what, unit), values in zip(halves, uncertainty_maps(output), strict=False):
-            title = f"{name}: uncertainty of the {what}"
-            panels.append(Panel(title, values, f"{unit} (1 sigma)", None, moving))
-        if T_gt is not None:
-            true = matrix_to_euler_deg(T_gt[:3, :3]), T_gt[:3, 3]
-            for (what, unit), values in zip(halves, prediction_errors(output, *true), strict=True):
-                panels.append(Panel(f"{name}: error of the {what}", values, unit))
-    for what, saliency in saliencies(network, inputs, T_start, steps).items():
+    numbers: Numbers = {}
+    for what, saliency in found.items():
         n = 4  # summed over blocks: networks read one of some pixels only
         h, w = (size // n for size in saliency.magnitude.shape)
         shown = saliency.magnitude[: n * h, : n * w].reshape(h, n, w, n).sum(axis=(1, 3))
         relative = shown / max(float(np.percentile(shown, 99)), 1e-30)
-        title = f"{name}: saliency of the {what} (last pass)"
-        panels.append(Panel(title, relative, "relative", 1.0, moving))
+        panels.append(Panel(f"{name}: saliency, {what}", relative, "relative", 1.0, moving))
         numbers |= {
             f"{name}: saliency of the {what} on moving pixels": saliency.share_on(moving),
             f"{name}: part of the {what} that the saliency misses": saliency.completeness_error,
         }
     return panels, numbers
-
-
-# -- maps: arrays in, arrays out ------------------------------------------------------------------
-
-
-def object_flow(pair: FramePair, T_curr_prev: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(ego flow, object flow) of a pair with flow and depth, (H, W, 2) px, NaN where unknown."""
-    depth = np.asarray(pair.prev.depth)
-    ego = ego_flow(depth, T_curr_prev, pair.prev.camera, pair.curr.camera)
-    return ego, np.asarray(pair.flow) - ego
-
-
-def moving_pixels(objects: np.ndarray) -> np.ndarray:
-    """(H, W) bool: pixels whose object flow (H, W, 2) is longer than a pixel."""
-    with np.errstate(invalid="ignore"):
-        return np.hypot(objects[..., 0], objects[..., 1]) > MOVING_PX
-
-
-def error_map(
-    T_est: np.ndarray, T_true: np.ndarray, depth: np.ndarray, prev: Camera, curr: Camera
-) -> np.ndarray:
-    """(H, W) distance of the ego flows of two motions ``T_curr_prev``, px; NaN without depth."""
-    difference = ego_flow(depth, T_est, prev, curr) - ego_flow(depth, T_true, prev, curr)
-    return np.hypot(difference[..., 0], difference[..., 1])
-
-
-def uncertainty_maps(prediction: PixelwisePrediction) -> list[np.ndarray]:
-    """Predicted uncertainty of rotation (degrees) and translation (m) of the first pair.
-
-    Two (h, w) maps: the geometric mean of the three Laplace scales U at every pixel.
-    """
-    scales = (prediction.log_scale_rotation, prediction.log_scale_translation)
-    return [s[0].detach().float().mean(0).exp().cpu().numpy() for s in scales if s is not None]
-
-
-def prediction_errors(
-    prediction: PixelwisePrediction, euler_deg: np.ndarray, translation: np.ndarray
-) -> list[np.ndarray]:
-    """Error of the predicted motion at every pixel of the first pair: the paper's error maps.
-
-    Two (h, w) maps: mean absolute difference from the true Euler angles X-Y-Z (3,) of T_curr_prev,
-    degrees, and from its translation (3,), metres.
-    """
-    parts = ((prediction.rotation, euler_deg), (prediction.translation, translation))
-    return [
-        np.abs(value[0].detach().cpu().double().numpy() - np.reshape(true, (3, 1, 1))).mean(axis=0)
-        for value, true in parts
-    ]

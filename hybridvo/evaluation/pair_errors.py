@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from hybridvo.data.base import Sequence
 from hybridvo.data.image_io import UNKNOWN_FLOW
 from hybridvo.data.sequence import resize_camera
-from hybridvo.errors import InputError
 from hybridvo.geometry import (
     backproject,
     ego_flow,
@@ -22,12 +21,14 @@ from hybridvo.geometry import (
     rotation_angle,
 )
 from hybridvo.trajectory import Trajectory
-from hybridvo.types import Camera
+from hybridvo.types import Camera, Frame
 
 PAPER_SIZE = (128, 256)
 """(height, width) at which the paper measures its EPE."""
 MOVING_PX = 1.0
 """A pixel whose true flow differs by more than this from the true ego flow moves by itself."""
+ERRORS = ("r_err_deg", "t_err", "epe", "epe_l2_px", "rot_err_deg", "trans_err")
+"""Of a pair, see :func:`pair_errors`."""
 NO_DEPTH = "no pixel has a valid depth and a true motion that stays in front of the camera"
 
 
@@ -49,6 +50,17 @@ def true_trajectory(sequence: Sequence, indices: Iterable[int]) -> Trajectory | 
     # text files carry six digits: made orthonormal as the trajectory demands
     T = np.stack([pose_matrix(sequence.poses[i][:3]) for i in known])
     return Trajectory(sequence.timestamps[known], T)
+
+
+def step_errors(
+    sequence: Sequence, prev: Frame | None, curr: int, T_curr_prev: np.ndarray
+) -> dict[str, float | None]:
+    """:func:`pair_errors` of a motion from a frame to frame ``curr``; none without a true one."""
+    T_gt = None if prev is None else true_motion(sequence, prev.index, curr)
+    if prev is None or T_gt is None:
+        return {}
+    depth = prev.depth if prev.depth is not None else np.full(prev.camera.shape, np.nan)
+    return pair_errors(T_curr_prev, T_gt, depth, prev.camera, sequence.camera(curr))
 
 
 def _native_epe(
@@ -107,15 +119,6 @@ def pair_errors(
         the image diagonal. ``rot_err_deg``: geodesic angle. ``trans_err``: norm of the translation
         difference, m. ``epe`` and ``epe_l2_px`` are None where no pixel is valid.
     """
-    for name, pose in (("T_est", T_est), ("T_gt", T_gt)):
-        if np.shape(pose) != (4, 4) or not np.isfinite(pose).all():
-            raise InputError(f"{name}: expected a finite (4, 4) transform, got {np.shape(pose)}.")
-    if np.shape(depth_prev) != camera_prev.shape or camera_curr.shape != camera_prev.shape:
-        raise InputError(
-            f"depth: expected shape {camera_prev.shape} of both cameras, got "
-            f"{np.shape(depth_prev)} and a current camera of {camera_curr.shape}."
-        )
-    T_est, T_gt = np.asarray(T_est, dtype=np.float64), np.asarray(T_gt, dtype=np.float64)
     depth = np.asarray(depth_prev)
     euler = matrix_to_euler_deg(T_est[:3, :3]) - matrix_to_euler_deg(T_gt[:3, :3])
     euler = (euler + 180.0) % 360.0 - 180.0
@@ -135,23 +138,18 @@ def mean_pair_errors(pairs: Iterable[Mapping[str, float | None]]) -> dict[str, A
 
     ``pairs`` is their number; ``reasons`` name every value that is None or leaves pairs out.
     """
-    pairs = list(pairs)
-    report: dict[str, Any] = {"pairs": len(pairs)}
-    reasons: dict[str, str] = {}
-    for key in (
-        *("r_err_deg", "t_err", "epe", "epe_l2_px"),
-        *("rot_err_deg_mean", "rot_err_deg_median", "trans_err_mean", "trans_err_median"),
-    ):
-        name = key.removesuffix("_mean").removesuffix("_median")
-        known = [v for pair in pairs if (v := pair.get(name)) is not None and not math.isnan(v)]
-        statistic = np.median if key.endswith("_median") else np.mean
-        report[key] = float(statistic(known)) if known else None
-        if not pairs:
-            reasons[key] = "no pair with ground truth"
-        elif len(known) < len(pairs):
-            missing = len(pairs) - len(known)
-            reasons[key] = f"unknown for {missing} of {len(pairs)} pairs: {NO_DEPTH}"
-    return report | {"reasons": reasons}
+    figures = {name: (name, "mean") for name in ERRORS[:4]}
+    for name in ERRORS[4:]:
+        figures |= {f"{name}_{how}": (name, how) for how in ("mean", "median")}
+    table = pd.DataFrame(list(pairs), columns=list(ERRORS), dtype=float)
+    report: dict[str, Any] = {"pairs": len(table), "reasons": {}}
+    for key, (name, how) in figures.items():
+        known = table[name].dropna()
+        report[key] = float(known.agg(how)) if len(known) else None
+        if len(known) < max(len(table), 1):
+            missing = f"unknown for {len(table) - len(known)} of {len(table)} pairs: {NO_DEPTH}"
+            report["reasons"][key] = missing if len(table) else "no pair with ground truth"
+    return report
 
 
 def pair_facts(

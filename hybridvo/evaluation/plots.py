@@ -6,38 +6,30 @@ Uses the object interface with the Agg canvas: no window, no pyplot, no global s
 from __future__ import annotations
 
 import io
+import itertools
 import os
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from hybridvo.errors import InputError
-from hybridvo.evaluation.metrics import Alignment, TrajectoryError, aligned
+from hybridvo.evaluation.metrics import Alignment, PathError, aligned
 from hybridvo.files import atomic_write
 from hybridvo.geometry import invert
 from hybridvo.trajectory import Trajectory
 
 # Okabe and Ito's palette without yellow: told apart by colour-blind readers, in print too
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
-_STYLES = ("-", "--", "-.", ":")
-_TRUTH_COLOUR = "#222222"
-_FORMATS = (".png", ".pdf", ".svg")
-
-
-class _Line(NamedTuple):
-    """A path of the figure: positions (N, 3) in the first camera, and its errors."""
-
-    label: str
-    positions: np.ndarray
-    style: dict[str, Any]
-    error: TrajectoryError | None = None
+_BLACK = "#222222"
+_VIEWS = {
+    "Top view": ("x right [m]", "z forward [m]", [0, 2]),
+    "Side view": ("z forward [m]", "y down [m]", [2, 1]),
+}
 
 
 def plot_trajectories(
@@ -52,69 +44,57 @@ def plot_trajectories(
 
     Everything is drawn in the first camera of the truth (or of each trajectory without truth):
     x right, y down, z forward. Estimates are aligned as ``alignment`` says, or by their first pose
-    where a path does not determine it (the legend says which).
+    where a path does not determine it (the legend says which). ``path`` ends in ``.png``.
     """
-    path = Path(path)
-    if not trajectories:
-        raise InputError("plot_trajectories: expected at least one trajectory, got none.")
-    if path.suffix.lower() not in _FORMATS:
-        raise InputError(f"{path}: expected a picture name ending in {', '.join(_FORMATS)}.")
-    lines = _lines(trajectories, truth, alignment)
-    heights = [2.0, 1.0] if any(line.error is not None for line in lines) else [1.0]
-    figure = _figure(10.0, 2.2 + 2.6 * len(heights), dpi=130)
-    grid = figure.add_gridspec(len(heights), 2, height_ratios=heights)
-    above = _axes(figure, grid[0, 0], "Top view", "x right [m]", "z forward [m]")
-    _draw_view(above, lines, (0, 2))
-    aside = _axes(figure, grid[0, 1], "Side view", "z forward [m]", "y down [m]")
-    _draw_view(aside, lines, (2, 1))
-    aside.invert_yaxis()  # y points down in the camera: down on the page as well
-    if len(heights) > 1:
-        is_timed = truth is not None and truth.has_timestamps
-        label = "time [s]" if is_timed else "frame"
-        axes = _axes(figure, grid[1, :], "Position error", label, "error [cm]")
-        for line in lines:
-            if line.error is not None:
-                stamps = line.error.timestamps
-                start = truth.timestamps[0] if truth is not None and is_timed else 0.0
-                axes.plot(stamps - start, 100 * line.error.translation, **line.style)
-        axes.set_ylim(bottom=0.0)
-        axes.margins(x=0.01)
-    labels, columns = [line.label for line in lines], min(3, len(lines))
+    lines: list[tuple[Trajectory, Trajectory, PathError | None, dict[str, Any]]] = []
+    if truth is not None:
+        bold = {"label": "ground truth", "color": _BLACK, "linewidth": 2.6, "alpha": 0.55}
+        lines.append((truth, truth, None, bold))
+    for (name, est), colour in zip(trajectories.items(), itertools.cycle(_COLOURS), strict=False):
+        style: dict[str, Any] = {"label": name, "color": colour, "linewidth": 1.4}
+        if truth is None:
+            lines.append((est, est, None, style))
+            continue
+        est, error, kind = aligned(est, truth, alignment)
+        told = "no error: poses do not match"
+        if error is not None:
+            told = f"ATE {100 * error.rmse:.3g} cm, {kind}"
+        lines.append((est, truth, error, style | {"label": f"{name} ({told})"}))
+    errors = [(error, style) for *_, error, style in lines if error is not None]
+    figure = _figure(10.0, 7.4 if errors else 4.8, dpi=130)
+    rows: Any = [[*_VIEWS], *([["Position error"] * 2] if errors else [])]
+    axes = figure.subplot_mosaic(rows, height_ratios=[2.0, 1.0][: len(rows)])
+    for view, (x, y, plane) in _VIEWS.items():
+        _style(axes[view], view, x, y)
+        places = [
+            est.transformed(invert(first.T_world_cam[0])).positions[:, plane]
+            for est, first, *_ in lines
+        ]
+        for place, (*_, style) in zip(places, lines, strict=True):
+            axes[view].plot(*place.T, **style)
+        axes[view].plot(*places[0][0], "o", color=_BLACK, markersize=5, zorder=5)
+        centre = np.concatenate(places).mean(axis=0)
+        axes[view].update_datalim([centre - 5e-4, centre + 5e-4])  # a camera that does not move
+        axes[view].margins(0.06)
+        axes[view].set_aspect("equal", adjustable="datalim")
+        axes[view].autoscale_view()
+    axes["Side view"].invert_yaxis()  # y points down in the camera: down on the page as well
+    for error, style in errors:
+        start = error.stamps[0] if truth is not None and truth.has_timestamps else 0.0
+        axes["Position error"].plot(error.stamps - start, 100 * error.translation, **style)
+        label = "time [s]" if truth is not None and truth.has_timestamps else "frame"
+        _style(axes["Position error"], "Position error", label, "error [cm]")
+        axes["Position error"].set_ylim(bottom=0.0)
+        axes["Position error"].margins(x=0.01)
     legend: dict[str, Any] = {"loc": "outside lower center", "frameon": False, "fontsize": 9}
-    figure.legend(above.lines[: len(lines)], labels, ncols=columns, **legend)
+    figure.legend(handles=axes["Top view"].lines[:-1], ncols=min(3, len(lines)), **legend)
     # a folder's name: bytes that are no UTF-8 cannot be drawn, dollars in it are no formula
     title = title.encode("utf-8", "replace").decode("utf-8")
     figure.suptitle(title, fontsize=11, parse_math=False)
     # a name in letters that the font lacks is drawn as boxes, without a word on stderr for each
     quiet = warnings.catch_warnings(action="ignore", category=UserWarning)
     with atomic_write(path, "wb") as file, quiet:
-        figure.savefig(file, format=path.suffix.lower()[1:])
-
-
-def _lines(
-    trajectories: Mapping[str, Trajectory], truth: Trajectory | None, alignment: Alignment
-) -> list[_Line]:
-    """The truth and every estimate, aligned to it, in the first camera."""
-
-    def positions(path: Trajectory, first: Trajectory) -> np.ndarray:
-        return path.transformed(invert(first.T_world_cam[0])).positions
-
-    found = []
-    if truth is not None:
-        style: dict[str, Any] = {"color": _TRUTH_COLOUR, "linewidth": 2.6, "alpha": 0.55}
-        found.append(_Line("ground truth", positions(truth, truth), style))
-    for k, (name, path) in enumerate(trajectories.items()):
-        line = _STYLES[k // len(_COLOURS) % len(_STYLES)]
-        style = {"color": _COLOURS[k % len(_COLOURS)], "linestyle": line, "linewidth": 1.4}
-        if truth is None:
-            found.append(_Line(name, positions(path, path), style))
-            continue
-        fitted, error, kind = aligned(path, truth, alignment)
-        told = "no error: poses do not match"
-        if error is not None:
-            told = f"ATE {100 * error.rmse:.3g} cm, {kind}"
-        found.append(_Line(f"{name} ({told})", positions(fitted, truth), style, error))
-    return found
+        figure.savefig(file, format="png")
 
 
 def _figure(width: float, height: float, dpi: int = 100) -> Figure:
@@ -124,8 +104,7 @@ def _figure(width: float, height: float, dpi: int = 100) -> Figure:
     return figure
 
 
-def _axes(figure: Figure, place: Any, title: str, x: str, y: str) -> Any:
-    axes = figure.add_subplot(place)
+def _style(axes: Any, title: str, x: str, y: str) -> None:
     axes.set_title(title, fontsize=10, loc="left")
     axes.set_xlabel(x, fontsize=9)
     axes.set_ylabel(y, fontsize=9)
@@ -133,19 +112,6 @@ def _axes(figure: Figure, place: Any, title: str, x: str, y: str) -> Any:
     axes.grid(True, color="#e4e4e4", linewidth=0.8)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
-    return axes
-
-
-def _draw_view(axes: Any, lines: Sequence[_Line], plane: tuple[int, int]) -> None:
-    """Paths in a plane of the first camera, with the same metres per inch on both axes."""
-    for line in lines:
-        axes.plot(*line.positions[:, plane].T, **line.style)
-    axes.plot(*lines[0].positions[0, plane], "o", color=_TRUTH_COLOUR, markersize=5, zorder=5)
-    centre = np.concatenate([line.positions for line in lines])[:, plane].mean(axis=0)
-    axes.update_datalim([centre - 5e-4, centre + 5e-4])  # for a camera that does not move
-    axes.margins(0.06)
-    axes.set_aspect("equal", adjustable="datalim")
-    axes.autoscale_view()
 
 
 # -- maps of a pair -------------------------------------------------------------------------------
@@ -165,6 +131,18 @@ class Panel:
     high: float | None = None
     outline: np.ndarray | None = None
 
+    @property
+    def top(self) -> float:
+        """Upper end of the bar."""
+        known = self.values[np.isfinite(self.values)]
+        top = float(np.percentile(known, 99)) if known.size and self.high is None else self.high
+        return max(top or 0.0, 1e-12)
+
+
+def flow_panel(title: str, flow: np.ndarray, longest: float) -> Panel:
+    """A flow (H, W, 2) in colours, of full saturation at ``longest`` px."""
+    return Panel(f"{title} (full colour: {longest:.3g} px)", flow_colours(flow, longest))
+
 
 def draw_panels(
     panels: Sequence[Panel],
@@ -183,19 +161,19 @@ def draw_panels(
     rows = -(-len(panels) // columns)
     height = rows * (inches / aspect * 0.92 + 0.42) + (0.45 if heading else 0.0)
     figure = _figure(columns * inches, height)
-    grid = figure.add_gridspec(rows, columns)
-    tops = _shared_tops(panels)
     shape: dict[str, Any] = {"extent": (0.0, aspect, 1.0, 0.0), "interpolation": "nearest"}
     for k, panel in enumerate(panels):
-        axes = figure.add_subplot(grid[k // columns, k % columns])
+        axes = figure.add_subplot(rows, columns, k + 1)
         axes.set_title(panel.title, fontsize=min(10, 2 + 1.5 * inches), loc="left")
         axes.set_xticks([])
         axes.set_yticks([])
         if panel.values.ndim == 3:
             axes.imshow(panel.values, **shape)
             continue
+        # what stands side by side has one scale
+        top = max(p.top for p in panels if p.values.ndim == 2 and p.unit == panel.unit)
         colours = colormaps["magma"].with_extremes(bad="#9a9a9a")
-        drawn = axes.imshow(panel.values, cmap=colours, vmin=0.0, vmax=tops[panel.unit], **shape)
+        drawn = axes.imshow(panel.values, cmap=colours, vmin=0.0, vmax=top, **shape)
         if panel.outline is not None and panel.outline.any() and not panel.outline.all():
             h, w = panel.outline.shape
             x, y = (np.arange(w) + 0.5) * aspect / w, (np.arange(h) + 0.5) / h
@@ -207,19 +185,6 @@ def draw_panels(
     stream = io.BytesIO()
     figure.savefig(stream, format=format)
     return stream.getvalue()
-
-
-def _shared_tops(panels: Sequence[Panel]) -> dict[str, float]:
-    """Unit -> upper end of the bars: what stands side by side has one scale."""
-    tops: dict[str, float] = {}
-    for panel in panels:
-        if panel.values.ndim == 2:
-            known = panel.values[np.isfinite(panel.values)]
-            top = panel.high
-            if top is None:
-                top = float(np.percentile(known, 99)) if known.size else 1e-12
-            tops[panel.unit] = max(tops.get(panel.unit, 1e-12), top)
-    return tops
 
 
 # -- flow in colours ------------------------------------------------------------------------------

@@ -11,6 +11,7 @@ from typing import Any
 import yaml
 
 from hybridvo.errors import InputError
+from hybridvo.options import RunOptions
 from hybridvo.types import Camera
 
 
@@ -27,9 +28,9 @@ class Protocol:
     sequences: Mapping[str, int]
     pairs: int
     same_camera_only: bool
-    metrics: tuple[Mapping[str, str], ...]
+    metrics: Sequence[Mapping[str, str]]
     over: str
-    published: tuple[Mapping[str, Any], ...]
+    published: Sequence[Mapping[str, Any]]
 
 
 @functools.cache
@@ -37,13 +38,11 @@ def protocols() -> dict[str, Protocol]:
     """Option value of ``--protocol`` -> protocol."""
     text = (Path(__file__).parent / "protocols.yaml").read_text(encoding="utf-8")
     content = yaml.safe_load(text)
-    found = {}
+    frames, found = content["frames"], {}
     for name, fields in content["protocols"].items():
         names = fields.pop("sequences")
-        frames = content["frames"]
         sequences = frames if names == "all" else {key: frames[key] for key in names}
-        lists: dict[str, Any] = {key: tuple(fields.pop(key)) for key in ("metrics", "published")}
-        found[name] = Protocol(name=name, sequences=sequences, **lists, **fields)
+        found[name] = Protocol(name=name, sequences=sequences, **fields)
     return found
 
 
@@ -53,11 +52,18 @@ def same_intrinsics(first: Camera, second: Camera) -> bool:
     return first.shape == second.shape and all(abs(a - b) <= 1e-9 * first.fx for a, b in pairs)
 
 
-def check_protocol(name: str, sequences: Sequence[Any]) -> Protocol:
-    """Protocol of this name, for these open sequences."""
+def check_protocol(
+    name: str, sequences: Sequence[Any], run: RunOptions
+) -> tuple[Protocol, list[Any]]:
+    """Protocol of this name, and those of the open sequences that it scores."""
     known = protocols()
     if name not in known:
         raise InputError(f"protocol: '{name}' is unknown; known: {', '.join(known)}.")
+    if run.stride != 1 or run.start or run.stop is not None:
+        raise InputError(
+            f"--protocol {name} is defined on whole sequences: leave out --start, --stop and "
+            f"--stride."
+        )
     for sequence in sequences:
         if sequence.kind != "sintel" or sequence.name not in known["paper"].sequences:
             raise InputError(
@@ -65,19 +71,23 @@ def check_protocol(name: str, sequences: Sequence[Any]) -> Protocol:
                 f"sequences of MPI Sintel. Pass the folder 'training' of the data set, or leave "
                 f"--protocol out."
             )
-    return known[name]
+    scored = [sequence for sequence in sequences if sequence.name in known[name].sequences]
+    if not scored:
+        names = ", ".join(known[name].sequences)
+        raise InputError(f"--protocol {name}: expected some of {names}, got none.")
+    return known[name], scored
 
 
 def protocol_summary(
-    protocol: Protocol, totals: Sequence[Mapping[str, Any]], pairs: Mapping[str, int]
+    protocol: Protocol, totals: Sequence[Mapping[str, Any]], scored: Sequence[Mapping[str, Any]]
 ) -> dict[str, Any]:
     """What stands under ``protocol`` in ``results.json``: what was scored, beside the published.
 
-    ``totals`` has a line per method and flow source over all sequences, ``pairs`` those scored of
-    each sequence; ``note`` says what of the complete set is missing.
+    ``totals`` has a line per method and flow source over all sequences, ``scored`` the ``name`` and
+    ``pairs_scored`` of each sequence; ``note`` says what of the complete set is missing.
     """
-    absent = [name for name in protocol.sequences if name not in pairs]
-    count = sum(pairs.values())
+    names, count = [s["name"] for s in scored], sum(s["pairs_scored"] for s in scored)
+    absent = [name for name in protocol.sequences if name not in names]
     notes = []
     if absent:
         what = f"{len(absent)} of {len(protocol.sequences)} sequences are missing"
@@ -86,22 +96,12 @@ def protocol_summary(
         notes.append(f"{count} pairs, the complete set has {protocol.pairs}")
     if notes:
         notes.append("these figures and the published ones are not over the same pairs")
-    by_method = {line["method"]: line for line in protocol.published if line["method"]}
-    keys = [metric["key"] for metric in protocol.metrics]
-    named = ("method", "flow_source", "depth_source", "pairs", "failed", "sequences")
-    table = [
-        {
-            **{name: row.get(name) for name in (*named, *keys)},
-            "reasons": {key: row["reasons"][key] for key in keys if key in row["reasons"]},
-            "published": by_method.get(row["method"]),
-        }
-        for row in totals
-    ]
+    published = {line["method"]: line for line in protocol.published if line["method"]}
     return asdict(protocol) | {
         "complete": not notes,
         "note": "; ".join(notes),
         "missing_sequences": absent,
         "pairs": count,
         "pairs_expected": protocol.pairs,
-        "table": table,
+        "table": [{**row, "published": published.get(row["method"])} for row in totals],
     }

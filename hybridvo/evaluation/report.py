@@ -8,25 +8,15 @@ from __future__ import annotations
 import base64
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
-from plotly.graph_objects import Figure
 
-from hybridvo.evaluation.charts import (
-    error_distribution,
-    factor_charts,
-    failure_chart,
-    is_oracle,
-    path_charts,
-    time_chart,
-)
+from hybridvo.evaluation import charts
+from hybridvo.evaluation.charts import is_oracle
 from hybridvo.files import atomic_write
 
-MISSING = "-"
-"""What a table shows where there is no number."""
 EMBEDDED_BYTES = 2_000_000
 """Images that the page holds, so that it stays below 8 MB with plotly's 5 MB."""
 
@@ -72,29 +62,27 @@ def write_report(folder: Path, result: Mapping[str, Any], pairs: pd.DataFrame) -
     )
     methods = list(dict.fromkeys(row["method"] for row in result["totals"]))
     sections = {
-        "How the errors are distributed": error_distribution(pairs, methods),
-        "How often an estimate fails": failure_chart(result["breakdown"], methods),
-        "What makes it fail": factor_charts(result["breakdown"], methods),
-        "Error against time": time_chart(result["totals"], methods),
+        "How the errors are distributed": charts.error_distribution(pairs, methods),
+        "How often an estimate fails": charts.failure_chart(result["breakdown"], methods),
+        "What makes it fail": charts.factor_charts(result["breakdown"], methods),
+        "Error against time": charts.time_chart(result["totals"], methods),
     }
     names = dict.fromkeys(row["sequence"] for row in result["rows"])
-    paths = {name: path_charts(folder, result, pairs, name, methods) for name in names}
+    paths = {name: charts.path_charts(folder, result, pairs, name, methods) for name in names}
+    every = [row for _, rows in by_flow(result, "rows") for row in rows]
     content = {
         "headline": headline(result),
         "result": result,
         "pairs": len(pairs.drop_duplicates(["sequence", "index"])),
         "methods": methods,
-        "tables": [(flow, make_table(rows, RESULT_COLUMNS)) for flow, rows in by_flow(result)],
+        "tables": [(flow, (rows, RESULT_COLUMNS, ("method",))) for flow, rows in by_flow(result)],
         "worst": _gallery(folder, result),
-        "sections": [(name, _json(charts)) for name, charts in sections.items() if charts],
-        "sequences": [(name, _json(charts)) for name, charts in paths.items()],
-        "protocol": _protocol_tables(result),
-        "numbers": make_table(
-            [row for _, rows in by_flow(result, "rows") for row in rows],
-            SEQUENCE_COLUMNS,
-            ("sequence", "method", "flow_source"),
-            ranked=False,
-        ),
+        "sections": [(name, _json(some)) for name, some in sections.items() if some],
+        "sequences": [(name, _json(some)) for name, some in paths.items()],
+        "protocol": _protocol_tables(result.get("protocol")),
+        "numbers": (every, SEQUENCE_COLUMNS, ("sequence", "method", "flow_source")),
+        "number": number,
+        "no_merit": NO_MERIT,
     }
     for name in ("report.html", "report.md"):
         text = environment.get_template(name).render(content, plotly=get_plotlyjs())
@@ -148,105 +136,45 @@ def number(value: float | None, digits: int = 3) -> str:
         ('1234', '0.0123', '0', '-')
     """
     if value is None or not math.isfinite(value):
-        return MISSING
+        return "-"
     if value == 0 or abs(value) >= 10**digits:
         return f"{value:.0f}"
     return f"{value:.{digits}g}"
 
 
-# -- tables ---------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, eq=False)
-class Table:
-    """Rows under the names that people read: ``named`` columns of texts, then numbers or NaN.
-
-    ``reasons`` say why numbers are missing; ``ranked``: the best number of a column is marked.
-    """
-
-    frame: pd.DataFrame
-    named: int
-    reasons: list[str]
-    ranked: bool = True
-
-    def html(self) -> str:
-        """A table element; every text is escaped."""
-        texts, labels = self.frame.columns[: self.named], self.frame.columns[self.named :]
-        style = self.frame.style.format(number, subset=labels).format(escape="html", subset=texts)
-        style = style.format_index(escape="html", axis="columns").hide(axis="index")
-        if self.ranked and len(self.frame) > 1:
-            merits = [label for label in labels if label not in NO_MERIT]
-            style = style.highlight_min(subset=merits, props="font-weight: 700; color: #0072b2")
-        return style.set_properties(subset=texts, **{"text-align": "left"}).to_html()
-
-    def markdown(self) -> str:
-        """The table in Markdown."""
-        lines = [[str(label) for label in self.frame.columns]]
-        lines.append(["---"] * self.named + ["---:"] * (len(lines[0]) - self.named))
-        for row in self.frame.itertuples(index=False):
-            lines.append([*map(str, row[: self.named]), *map(number, row[self.named :])])
-        cells = ([text.replace("|", "\\|") for text in line] for line in lines)
-        return "".join("| " + " | ".join(line) + " |\n" for line in cells)
-
-
-def make_table(
-    rows: Sequence[Mapping[str, Any]],
-    columns: Sequence[Column],
-    named: Sequence[str] = ("method",),
-    ranked: bool = True,
-) -> Table:
-    """Table of rows of ``results.json``."""
-    texts = {name.replace("_", " "): [str(row[name]) for row in rows] for name in named}
-    numbers = {
-        label: [math.nan if row.get(key) is None else factor * row[key] for row in rows]
-        for key, label, factor in columns
-    }
-    reasons = dict.fromkeys(
-        f"{row['method']}: {label}: {row['reasons'][key]}"
-        for row in rows
-        for key, label, _ in columns
-        if row.get(key) is None and key in row.get("reasons", {})
-    )
-    return Table(pd.DataFrame(texts | numbers), len(named), list(reasons), ranked)
-
-
-def _protocol_tables(result: Mapping[str, Any]) -> list[tuple[str, Table]]:
-    """Measured here, and what others published."""
-    protocol = result.get("protocol")
-    if not protocol:
+def _protocol_tables(protocol: Mapping[str, Any] | None) -> list[tuple[str, Any]]:
+    """Measured here, and what others published: rows, columns, names."""
+    if protocol is None:
         return []
     columns = [(m["key"], f"{m['label']} [{m['unit']}]", 1.0) for m in protocol["metrics"]]
     here = [*columns, ("pairs", "pairs", 1.0)]
     others = ("name", "inputs", "source", "note")
     return [
-        ("Measured here", make_table(protocol["table"], here, ("method", "flow_source"))),
-        ("Published by others", make_table(protocol["published"], columns, others, ranked=False)),
+        ("Measured here", (protocol["table"], here, ("method", "flow_source"))),
+        ("Published by others", (protocol["published"], columns, others)),
     ]
-
-
-# -- page -----------------------------------------------------------------------------------------
 
 
 def _gallery(folder: Path, result: Mapping[str, Any]) -> list[tuple[str, list[dict[str, Any]]]]:
     """Worst pairs by method, estimated flow first and the best method first, with images."""
     budget = EMBEDDED_BYTES
+    order = [
+        (method, flow)
+        for flow, rows in by_flow(result)
+        for method in dict.fromkeys(row["method"] for row in [*ranking(rows), *rows])
+    ]
     groups: dict[str, list[dict[str, Any]]] = {}
-    for flow, rows in by_flow(result):
-        order = dict.fromkeys(row["method"] for row in [*ranking(rows), *rows])
-        for method in order:
-            for entry in result["worst_pairs"]:
-                if (entry["method"], entry["flow_source"]) != (method, flow):
-                    continue
-                source, path = None, entry["picture"] and folder / entry["picture"]
-                if path and path.is_file() and path.stat().st_size <= budget:
-                    budget -= path.stat().st_size
-                    encoded = base64.b64encode(path.read_bytes()).decode()
-                    source = f"data:image/jpeg;base64,{encoded}"
-                shown = {**entry, "source": source, "error": number(entry["epe_l2_px"])}
-                groups.setdefault(f"{method}, {flow} flow", []).append(shown)
+    key = lambda entry: order.index((entry["method"], entry["flow_source"]))  # noqa: E731
+    for entry in sorted(result["worst_pairs"], key=key):
+        source, path = None, entry["picture"] and folder / entry["picture"]
+        if path and path.is_file() and path.stat().st_size <= budget:
+            budget -= path.stat().st_size
+            source = f"data:image/jpeg;base64,{base64.b64encode(path.read_bytes()).decode()}"
+        shown = {**entry, "source": source, "error": number(entry["epe_l2_px"])}
+        groups.setdefault(f"{entry['method']}, {entry['flow_source']} flow", []).append(shown)
     return list(groups.items())
 
 
-def _json(charts: Sequence[Figure]) -> list[str]:
+def _json(figures: Sequence[Any]) -> list[str]:
     """JSON that may stand inside of a script element."""
-    return [chart.to_json().replace("<", "\\u003c") for chart in charts]
+    return [figure.to_json().replace("<", "\\u003c") for figure in figures]

@@ -58,12 +58,12 @@ class TensorBatch:
 
 @dataclass(frozen=True, eq=False)
 class NetworkInputs(TensorBatch):
-    """Inputs of a batch of pairs at the network's size (h, w).
+    """Inputs of a batch of pairs at the network's size (h, w); what is invalid is 0.
 
     Args:
-        flow: (B, 2, h, w) flow in pixels of this size divided by ``FLOW_SCALE_PX``, 0 if invalid.
-        inverse_depth: (B, 2, h, w) 1 / metres, 0 if invalid: of the previous depth, and of the
-            current one sampled at x + F, both on the grid of the previous frame.
+        flow: (B, 2, h, w) flow in pixels of this size divided by ``FLOW_SCALE_PX``.
+        inverse_depth: (B, 2, h, w) 1 / metres of the previous depth, and of the current one sampled
+            at x + F, both on the grid of the previous frame.
         rays: (B, 2, h, w) first two components of K^-1 x.
         valid: (B, h, w) bool, flow and previous depth are both usable.
         K_prev, K_curr: (B, 3, 3) intrinsics scaled to (h, w), pixel-centre convention.
@@ -114,32 +114,11 @@ def assemble_inputs(
         InputError: another type, or shapes that do not fit each other.
     """
     if isinstance(pair, FramePair):
-        return _from_batch(PairBatch.from_pairs([pair]), size)
+        pair = PairBatch.from_pairs([pair])
     if not isinstance(pair, PairBatch):
         got = type(pair).__name__
         raise InputError(f"assemble_inputs: expected a FramePair or a PairBatch, got {got}.")
-    return _from_batch(checked_batch(pair, where="assemble_inputs")[0], size)
-
-
-def assemble_aligned(
-    flow: torch.Tensor, depth_prev: torch.Tensor, depth_curr: torch.Tensor, K: torch.Tensor
-) -> NetworkInputs:
-    """Inputs from tensors of the network's size, both depths on the previous grid.
-
-    This is the form of the paper's training data: flow (B, h, w, 2) px, depths (B, h, w) metres of
-    the same scene points one step apart, K (B, 3, 3) of both frames.
-
-    Raises:
-        InputError: shapes that do not fit each other.
-    """
-    batch = PairBatch(flow, depth_prev, K, K, depth_curr=depth_curr)
-    batch, _ = checked_batch(batch, where="assemble_aligned")
-    rows, cols = (torch.arange(n, device=flow.device) for n in flow.shape[1:3])
-    return _normalize(batch, _rays(rows, cols, batch.K_prev))
-
-
-def _from_batch(batch: PairBatch, size: tuple[int, int]) -> NetworkInputs:
-    """Resize, bring the current depth onto the previous grid, normalise."""
+    batch = checked_batch(pair, where="assemble_inputs")[0]
     height, width = batch.flow.shape[1:3]
     rows, cols = (
         _nearest(native, target).to(batch.flow.device)
@@ -158,15 +137,24 @@ def _from_batch(batch: PairBatch, size: tuple[int, int]) -> NetworkInputs:
     K_prev, K_curr = (
         _scaled_intrinsics(K, scale, 0.5 * scale - 0.5) for K in (batch.K_prev, batch.K_curr)
     )
-    resized = PairBatch(
-        flow * scale,
-        pick(batch.depth_prev),
-        K_prev,
-        K_curr,
-        depth_curr=depth_curr,
-        valid=None if batch.valid is None else pick(batch.valid),
-    )
+    valid = None if batch.valid is None else pick(batch.valid)
+    depth = pick(batch.depth_prev)
+    resized = PairBatch(flow * scale, depth, K_prev, K_curr, depth_curr=depth_curr, valid=valid)
     return _normalize(resized, _rays(rows, cols, batch.K_prev))
+
+
+def assemble_aligned(
+    flow: torch.Tensor, depth_prev: torch.Tensor, depth_curr: torch.Tensor, K: torch.Tensor
+) -> NetworkInputs:
+    """Inputs from tensors of the network's size, both depths on the previous grid.
+
+    The form of the paper's training data: flow (B, h, w, 2) px, depths (B, h, w) metres of the same
+    scene points one step apart, K (B, 3, 3) of both frames.
+    """
+    batch = PairBatch(flow, depth_prev, K, K, depth_curr=depth_curr)
+    batch = checked_batch(batch, where="assemble_aligned")[0]
+    rows, cols = (torch.arange(n, device=flow.device) for n in flow.shape[1:3])
+    return _normalize(batch, _rays(rows, cols, batch.K_prev))
 
 
 def _rays(rows: torch.Tensor, cols: torch.Tensor, K: torch.Tensor) -> torch.Tensor:

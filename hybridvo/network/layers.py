@@ -164,8 +164,7 @@ class SelfAttention(nn.Module):
     def __init__(self, channels: int) -> None:
         super().__init__()
         inner = max(1, channels // 8)
-        self.query = nn.Conv2d(channels, inner, 1)
-        self.key = nn.Conv2d(channels, inner, 1)
+        self.query, self.key = nn.Conv2d(channels, inner, 1), nn.Conv2d(channels, inner, 1)
         self.value = nn.Conv2d(channels, channels, 1)
         self.gain = nn.Parameter(torch.zeros(()))
 
@@ -179,7 +178,10 @@ class SelfAttention(nn.Module):
 @contextlib.contextmanager
 def plain_torch() -> Iterator[None]:
     """Inference in float32 on the CPU, whatever the caller set for networks of its own."""
-    with torch.inference_mode(), torch.autocast("cpu", enabled=False), torch.device("cpu"):
+    # entering a default device costs every operation some microseconds
+    elsewhere = torch.get_default_device().type != "cpu"
+    device = torch.device("cpu") if elsewhere else contextlib.nullcontext()
+    with torch.inference_mode(), torch.autocast("cpu", enabled=False), device:
         yield
 
 
@@ -190,9 +192,7 @@ def initialize(network: nn.Module, uniform: tuple[nn.Module, ...] = ()) -> None:
         if isinstance(module, nn.Conv2d | nn.ConvTranspose2d | nn.Linear):
             if module.weight.is_meta:  # no memory to fill, and torch would load its compiler for it
                 continue
-            if id(module) in heads:
-                nn.init.xavier_uniform_(module.weight)
-            else:
-                nn.init.xavier_normal_(module.weight)
+            fill = nn.init.xavier_uniform_ if id(module) in heads else nn.init.xavier_normal_
+            fill(module.weight)
             if module.bias is not None:
                 nn.init.zeros_(module.bias)

@@ -1,10 +1,8 @@
-"""Losses of PWVO and its baselines (paper, sections 3.2.2 and 3.4) in log form.
+"""Losses of PWVO and its baselines (paper, sections 3.2.2 and 3.4) in log form, s = log U.
 
-Four terms, each plain or weighed by uncertainty, with s = log U:
-
-* rotation L^R and translation L^T: every pixel must name the pair's motion (distribution learning);
-* ego flow L^F and depth L^D: the *selected* motion, applied to the true depth, must reproduce the
-  flow and the next depth that the camera motion alone causes.
+Four terms, each plain or weighed by uncertainty: rotation L^R and translation L^T, every pixel must
+name the pair's motion (distribution learning); ego flow L^F and depth L^D, the *selected* motion,
+applied to the true depth, must reproduce what the camera motion alone causes.
 
 They are those of the published code, but pixels without depth are left out, a point that the motion
 brings behind the camera is charged, and s may have a coarser grid than the flow.
@@ -23,7 +21,7 @@ from hybridvo.network.inputs import MIN_DEPTH, TensorBatch
 from hybridvo.network.selection import NetworkOutput
 from hybridvo.options import Positive, option_group
 from hybridvo.results import PixelwisePrediction
-from hybridvo.torch_geometry import move, pixel_grid, project, rays
+from hybridvo.torch_geometry import pixel_grid, reproject
 
 MAX_EXPONENT = 30.0
 """exp(-s) goes on as a straight line beyond this."""
@@ -93,27 +91,15 @@ def reconstruct(
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Flow and depth that a camera motion causes (paper, equation 8), differentiable.
 
-    F_ego = pi(K_curr, T_curr_prev D K_prev^-1 x) - x, and the depth of the moved point, on the grid
-    of the previous frame (B, h, w).
-
     Returns:
-        (B, 2, h, w) ego flow in px, (B, h, w) depth in metres (below ``MIN_DEPTH`` behind the
-        camera, 1 where ``depth_prev`` is invalid), and (B, h, w) bool: valid depth, and the moved
-        point in front of the camera. Elsewhere the flow is finite and means nothing.
+        On the grid of the previous frame: (B, 2, h, w) ego flow pi(K_curr, T D K_prev^-1 x) - x in
+        px; (B, h, w) depth of the moved point, below ``MIN_DEPTH`` behind the camera, 1 where
+        ``depth_prev`` is invalid; (B, h, w) bool: valid and in front of the camera. Elsewhere the
+        flow is finite and means nothing.
     """
-    valid = torch.isfinite(depth_prev) & (depth_prev > 0)
-    depth = torch.where(valid, depth_prev, 1.0)
-    height, width = depth.shape[1:]
-    with torch.autocast(depth.device.type, enabled=False):
-        points = rays(height, width, K_prev) * depth[..., None]
-        moved = move(T_curr_prev, points.flatten(1, 2).transpose(1, 2))
-        z = torch.where(valid, moved[:, 2].unflatten(1, (height, width)), 1.0)
-        front = z >= MIN_DEPTH
-        # Replaced before the division: a masked quotient would still give NaN gradients.
-        safe = torch.where(front, z, 1.0).flatten(1)[:, None]
-        pixels = project(torch.cat([moved[:, :2], safe], dim=1), K_curr)
-    grid = pixel_grid(height, width, depth).permute(2, 0, 1)
-    return pixels.unflatten(2, (height, width)) - grid, z, valid & front
+    pixels, valid, z = reproject(depth_prev, T_curr_prev, K_prev, K_curr, MIN_DEPTH)
+    grid = pixel_grid(depth_prev.shape[1], depth_prev.shape[2], depth_prev)
+    return (pixels - grid).permute(0, 3, 1, 2), z, valid
 
 
 def total_loss(
@@ -139,15 +125,16 @@ def total_loss(
         parts = {"rotation": rotation, "translation": translation}
     if options.reconstructs:
         assert T_curr_prev is not None
-        K = targets.K_prev, targets.K_curr
-        flow, depth, defined = reconstruct(targets.depth_prev, T_curr_prev, *K)
+        flow, depth, defined = reconstruct(
+            targets.depth_prev, T_curr_prev, targets.K_prev, targets.K_curr
+        )
         known = torch.isfinite(targets.depth_prev) & (targets.depth_prev > 0)
         if options.flow:
-            error, known_flow = _flow_error(flow, targets.ego_flow, defined, known, options)
-            parts["flow"] = _flow_loss(error, known_flow, s if options.flow_uncertainty else None)
+            s_flow = s if options.flow_uncertainty else None
+            parts["flow"] = _flow_loss(flow, targets.ego_flow, defined, known, s_flow, options)
         if options.depth:
-            error, known = _depth_error(depth, targets.depth_curr, known)
-            parts["depth"] = _depth_loss(error, known, s if options.depth_uncertainty else None)
+            s_depth = s if options.depth_uncertainty else None
+            parts["depth"] = _depth_loss(depth, targets.depth_curr, known, s_depth)
     loss = sum((options.flow_weight if k == "flow" else 1.0) * x for k, x in parts.items())
     return torch.as_tensor(loss), {name: part.detach() for name, part in parts.items()}
 
@@ -191,59 +178,51 @@ def _pose_losses(
     }
 
 
-def _flow_error(
+def _flow_loss(
     flow: torch.Tensor,
     target: torch.Tensor,
     defined: torch.Tensor,
     known: torch.Tensor,
+    s: torch.Tensor | None,
     options: LossOptions,
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """(B, 2, h, w) errors of L^F that count, else 0, and (B, h, w) where the target is known."""
+) -> torch.Tensor:
+    """L^F; with s (B, 6, ..) weighed by 1 / U^F = exp(-0.1 s)."""
     known = known & torch.isfinite(target).all(dim=1)
     error = (flow - torch.where(known[:, None], target, 0.0)).abs()
     counts = (defined & known)[:, None] & (error < options.flow_limit_px)
     behind = (known & ~defined)[:, None]
-    return torch.where(counts, error, 0.0) + behind * options.flow_limit_px, known
-
-
-def _flow_loss(error: torch.Tensor, known: torch.Tensor, s: torch.Tensor | None) -> torch.Tensor:
-    """L^F; with s (B, 6, ..) weighed by 1 / U^F = exp(-0.1 s)."""
+    error = torch.where(counts, error, 0.0) + behind * options.flow_limit_px
     count = known.sum().clamp(min=1)
     if s is None:
         return 0.5 * error.sum() / count
-    both = [0, 1, 2, 5]
+    # rx, ry, rz and tz move both components, tx and ty one of them
     a, b = (_to_cells(e, s.shape[2:]) for e in error.unbind(1))
-    pixels = _to_cells(known.to(s.dtype), s.shape[2:])
+    each = torch.stack([a + b, a + b, a + b, a, b, a + b], dim=1)
+    pixels = _to_cells(known.to(s.dtype), s.shape[2:])[:, None]
     s = 0.1 * s
-    inverse = _inverse_scale(s)
-    data = (inverse[:, both] * (a + b)[:, None]).sum()
-    data = data + (inverse[:, 3] * a + inverse[:, 4] * b).sum()
-    scale = (s[:, both] * pixels[:, None]).sum()
-    scale = scale + 0.5 * ((s[:, 3] + s[:, 4]) * pixels).sum()
-    return (0.5 * data + scale) / count
+    share = s.new_tensor([1.0, 1.0, 1.0, 0.5, 0.5, 1.0])[:, None, None]
+    return (0.5 * _inverse_scale(s) * each + share * s * pixels).sum() / count
 
 
-def _depth_error(
-    depth: torch.Tensor, target: torch.Tensor, known: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """(B, h, w) errors of inverse depth, finite behind the camera, and where a target is known."""
+def _depth_loss(
+    depth: torch.Tensor, target: torch.Tensor, known: torch.Tensor, s: torch.Tensor | None
+) -> torch.Tensor:
+    """L^D of inverse depths; with s (B, 6, ..) weighed by 1 / U^D = exp(-0.25 s).
+
+    Only what changes a depth counts there: rx, ry, tz.
+    """
     known = known & torch.isfinite(target) & (target >= MIN_DEPTH)
     target = torch.where(known, target, 1.0)
     front = depth >= MIN_DEPTH
     exact = 1.0 / target - 1.0 / torch.where(front, depth, 1.0)
+    # finite behind the camera
     error = torch.where(front, exact, (target - depth) / target.square()).abs()
-    return torch.where(known, error, 0.0), known
-
-
-def _depth_loss(error: torch.Tensor, known: torch.Tensor, s: torch.Tensor | None) -> torch.Tensor:
-    """L^D; with s (B, 6, ..) weighed by 1 / U^D = exp(-0.25 s) of what changes a depth."""
-    count = known.sum().clamp(min=1)
+    error, count = torch.where(known, error, 0.0), known.sum().clamp(min=1)
     if s is None:
         return error.sum() / count
-    pixels = _to_cells(known.to(s.dtype), s.shape[2:])
     s = 0.25 * s[:, [0, 1, 5]]
-    weighed = _inverse_scale(s) * _to_cells(error, s.shape[2:])[:, None]
-    return 0.5 * (weighed + s * pixels[:, None]).sum() / count
+    cells = [_to_cells(x.to(s.dtype), s.shape[2:])[:, None] for x in (error, known)]
+    return 0.5 * (_inverse_scale(s) * cells[0] + s * cells[1]).sum() / count
 
 
 def _to_cells(x: torch.Tensor, cells: torch.Size) -> torch.Tensor:

@@ -8,7 +8,8 @@ own scale looks like any other pair: the network refines its own answer in sever
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from torch import nn
@@ -29,13 +30,10 @@ LIMIT = 10.0
 """Magnitude that squashed values approach; values of the order of one stay as they are."""
 
 
-@dataclass(frozen=True, eq=False)
-class MotionScale:
-    """What turns a network's raw outputs into motions.
+class MotionScale(NamedTuple):
+    """What turns a network's raw outputs into motions: rx, ry, rz (degrees), tx, ty, tz (metres).
 
-    Args:
-        factor: (B, 6) scales of rx, ry, rz (degrees) and tx, ty, tz (metres).
-        start: (B, 6) the motion that was taken out of the inputs, in the same units.
+    ``factor`` (B, 6): their scales; ``start`` (B, 6): the motion taken out of the inputs.
     """
 
     factor: torch.Tensor
@@ -44,7 +42,7 @@ class MotionScale:
     def motion(self, raw: torch.Tensor) -> torch.Tensor:
         """Motions of raw outputs (B, 6) or (B, 6, h, w): the sum of two small ones."""
         shape = (-1, 6) + (1,) * (raw.ndim - 2)
-        factor, start = (x.to(raw.dtype).view(shape) for x in (self.factor, self.start))
+        factor, start = (x.to(raw.dtype).view(shape) for x in self)
         return start + factor * raw
 
 
@@ -59,29 +57,23 @@ def normalize(
     return inputs, MotionScale(factor, torch.zeros_like(factor))
 
 
-def predict(
-    network: nn.Module,
-    inputs: NetworkInputs,
-    selection: str = "softmax",
-    passes: int | None = None,
-) -> NetworkOutput:
-    """Output of the last of several passes, each on what the one before left unexplained.
+def predict(network: nn.Module, inputs: NetworkInputs, selection: str = "softmax") -> NetworkOutput:
+    """Output of the last of the network's passes, each on what the one before left unexplained.
 
-    ``selection``: how one pose comes out of the pixels of a pass; ``passes``: by default as many as
-    the network's options name.
+    ``selection``: how one pose comes out of the pixels of a pass.
     """
-    count = int(network.options.passes) if passes is None else passes  # type: ignore[union-attr, arg-type]
-    return network(inputs, first_motions(network, inputs, selection, count - 1))
+    passes: int = network.options.passes  # type: ignore[union-attr, assignment]
+    return network(inputs, first_motions(network, inputs, selection, passes - 1))
 
 
+@torch.no_grad()
 def first_motions(
     network: nn.Module, inputs: NetworkInputs, selection: str, passes: int
 ) -> torch.Tensor | None:
     """(B, 4, 4) motions after a number of passes, without gradient; None for no pass at all."""
     T = None
-    with torch.no_grad():
-        for _ in range(passes):
-            T = fitted_motion(network(inputs, T), inputs, selection)
+    for _ in range(passes):
+        T = fitted_motion(network(inputs, T), inputs, selection)
     return T
 
 
@@ -94,12 +86,11 @@ def remove_scale(
     motion is not the identity.
 
     Returns:
-        Inputs whose ``flow`` is what the flow leaves unexplained, over the focal length and over
-        its own typical length m, ``inverse_depth[:, 0]`` the inverse depth over that of the near
-        things, ``inverse_depth[:, 1]`` what the second depth leaves unexplained, in log depth over
-        m (0 where either depth is missing), all squashed at 10; and the scales: m as an angle, and
-        m times the depth of the near things. Pixels without depth count as infinitely far. Finite
-        for any input.
+        Inputs, and the scales: m as an angle, and m times the depth of the near things. ``flow`` is
+        what the flow leaves unexplained, over the focal length and its own typical length m;
+        ``inverse_depth[:, 0]`` is over that of the near things (pixels without depth count as
+        infinitely far), ``inverse_depth[:, 1]`` what the second depth leaves unexplained, in log
+        depth over m (0 where either is missing); all squashed at 10, finite for any input.
     """
     inverse = torch.nan_to_num(inputs.inverse_depth, 0.0, 0.0, 0.0)
     flow = torch.nan_to_num(inputs.flow_px, 0.0, 0.0, 0.0)

@@ -80,15 +80,10 @@ class Decoder(nn.Module):
         return self.out(x)
 
 
-class _MapHead(nn.Sequential):
+def _map_head(channels: int) -> nn.Sequential:
     """Two 3x3 convolutions to six channels: rx, ry, rz, tx, ty, tz."""
-
-    def __init__(self, channels: int) -> None:
-        super().__init__(
-            nn.Conv2d(channels, channels, 3, 1, 1),
-            nn.ELU(inplace=True),
-            nn.Conv2d(channels, 6, 3, 1, 1),
-        )
+    first, last = nn.Conv2d(channels, channels, 3, 1, 1), nn.Conv2d(channels, 6, 3, 1, 1)
+    return nn.Sequential(first, nn.ELU(inplace=True), last)
 
 
 class PWVO(nn.Module):
@@ -106,8 +101,8 @@ class PWVO(nn.Module):
             Decoder(self.encoder.channels, width, stride) if options.decoders == 2 else None
         )
         channels = scaled(32, width)
-        self.head_motion = _MapHead(channels)
-        self.head_uncertainty = _MapHead(channels) if options.uncertainty else None
+        self.head_motion = _map_head(channels)
+        self.head_uncertainty = _map_head(channels) if options.uncertainty else None
         heads = [h for h in (self.head_motion, self.head_uncertainty) if h is not None]
         initialize(self, uniform=tuple(heads))
 
@@ -145,46 +140,36 @@ class PWVO(nn.Module):
             Maps of (ceil(h / n), ceil(w / n)), n = input_stride * head_stride; float32 (float64 for
             a float64 network), also under autocast. Finite for any input.
         """
-        options = self.options
+        options, own = self.options, next(self.parameters())
         if not isinstance(inputs, NetworkInputs):
-            return self._predict(inputs)
+            batch = PairBatch.from_pairs([inputs]) if isinstance(inputs, FramePair) else inputs
+            output = predict(self, assemble_inputs(batch).to(device=own.device, dtype=own.dtype))
+            assert isinstance(output, PixelwisePrediction)
+            height, width = batch.flow.shape[1:3]
+            return replace(output, image_size=(height, width))
         inputs, scale = normalize(inputs, options, T_start)
         x = self.branches(inputs)
         features = self.encoder(x)
-        dtype = next(self.parameters()).dtype
         shared = self.decoder(x, features)
-        motion = scale.motion(self.head_motion(shared).to(dtype))
+        motion = scale.motion(self.head_motion(shared).to(own.dtype))
         if self.head_uncertainty is None:
             return PixelwisePrediction(motion[:, :3], motion[:, 3:])
         if self.decoder_uncertainty is not None:
             shared = self.decoder_uncertainty(x, features)
-        log_scale = self.head_uncertainty(shared).to(dtype)
+        log_scale = self.head_uncertainty(shared).to(own.dtype)
         if options.scale_free:
-            log_scale = log_scale + scale.factor.to(dtype).log()[:, :, None, None]
-        seen = inputs.valid[:, None].to(dtype)
+            log_scale = log_scale + scale.factor.to(own.dtype).log()[:, :, None, None]
+        seen = inputs.valid[:, None].to(own.dtype)
         if options.head_stride > 1:
             seen = F.max_pool2d(seen, options.head_stride, ceil_mode=True)
         log_scale = torch.where(seen > 0, log_scale, log_scale.clamp(min=INVALID_LOG_SCALE))
         return PixelwisePrediction(motion[:, :3], motion[:, 3:], log_scale[:, :3], log_scale[:, 3:])
 
-    def _predict(self, pairs: FramePair | PairBatch) -> PixelwisePrediction:
-        """Maps of pairs after all passes."""
-        own = next(self.parameters())
-        inputs = assemble_inputs(pairs).to(device=own.device, dtype=own.dtype)
-        output = predict(self, inputs)
-        assert isinstance(output, PixelwisePrediction)
-        if isinstance(pairs, FramePair):
-            return replace(output, image_size=pairs.prev.camera.shape)
-        return replace(output, image_size=(pairs.flow.shape[1], pairs.flow.shape[2]))
 
-
-class _PoseHead(nn.Sequential):
+def _pose_head(features: int) -> nn.Sequential:
     """Fully connected 128-32-3."""
-
-    def __init__(self, features: int) -> None:
-        super().__init__(
-            nn.Linear(features, 128), nn.ELU(), nn.Linear(128, 32), nn.ELU(), nn.Linear(32, 3)
-        )
+    sizes = nn.Linear(features, 128), nn.Linear(128, 32), nn.Linear(32, 3)
+    return nn.Sequential(sizes[0], nn.ELU(), sizes[1], nn.ELU(), sizes[2])
 
 
 class VONet(nn.Module):
@@ -207,8 +192,8 @@ class VONet(nn.Module):
             SelfAttention(channels) if options.kind == "vonet-attention" else nn.Identity()
         )
         features = channels * math.prod(self.grid)
-        self.head_rotation = _PoseHead(features)
-        self.head_translation = _PoseHead(features)
+        self.head_rotation = _pose_head(features)
+        self.head_translation = _pose_head(features)
         initialize(self, uniform=(self.head_rotation, self.head_translation))
 
     def forward(
@@ -231,12 +216,6 @@ def build_network(options: NetworkOptions | None = None) -> nn.Module:
     """A :class:`PWVO` or :class:`VONet` with fresh weights (Glorot, from torch's global generator).
 
     PWVO at full width by default; the attribute ``options`` keeps the options.
-
-    Example:
-        >>> from hybridvo.network.pwvo import NetworkOptions, build_network
-        >>> network = build_network(NetworkOptions(width=0.5, head_stride=2))
-        >>> round(sum(p.numel() for p in network.parameters()) / 1e6, 1)
-        4.3
     """
     options = NetworkOptions() if options is None else options
     network: Any = PWVO(options) if options.kind == "pwvo" else VONet(options)

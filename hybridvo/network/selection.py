@@ -3,20 +3,15 @@
 In each patch the pixel of least uncertainty is chosen; the patches are then weighed. With
 s = log U, U the Laplace scale that the network predicts:
 
-==============  ===================================================================================
-``softmax``     weights softmax(-s), that is 1/U: what the published code computes. Default: one
-                over-confident patch cannot silence the rest as it does with 1/U^2.
+``softmax``     weights softmax(-s), that is 1/U, as the published code: one over-confident patch
+                cannot silence the rest as it does with 1/U^2.
 ``argmin``      the chosen pixels of all patches weigh alike.
 ``mean``        plain mean of all pixels, no patches: PWVO (naive), pixel-wise.
-``exp_plus_u``  softmax(+U), as the paper prints it. It prefers the most uncertain of the chosen
-                pixels; kept for the record.
-``joint``       softmax(-s) with one s for all six numbers, their mean: one pixel a patch and one
-                weight for rotation and translation.
-==============  ===================================================================================
+``exp_plus_u``  softmax(+U), as the paper prints it: it prefers the most uncertain pixels.
+``joint``       softmax(-s) with one s for all six numbers, their mean: one pixel a patch.
 
-A pixel-wise network tells better where the world is than how it moves: :func:`fitted_motion` solves
-the ego-flow equation (paper, equation 8), weighed by s, from the selected motion. It is
-differentiable in s: the network learns the doubt that the fit needs.
+A network tells better where the world is than how it moves: :func:`fitted_motion` solves the
+ego-flow equation (paper, equation 8), weighed by s, and teaches s the doubt that the fit needs.
 """
 
 from __future__ import annotations
@@ -37,18 +32,16 @@ SELECTION_METHODS = ("softmax", "argmin", "mean", "exp_plus_u", "joint")
 
 PATCH_ROWS = 4
 """Rows of patches when no patch size is given: the paper has 4x8 patches of 32 in 128x256."""
-MAX_LOG_SCALE = 60.0
+MAX_LOG_SCALE = 50.0
 """Log scales are clipped to this magnitude, so that exp stays finite in float32."""
 SHARPNESS = 4.0
-"""Weights of pixels go with exp(-4 s), the fourth power of 1 / U. The variance of independent
-errors would ask for the second; errors of the pixels of a moving object are not independent, and
-one on two thirds of the image must not outvote what is left. On development pairs 2 left twice the
-error, 8 the same as 4."""
+"""Weights of pixels go with exp(-4 s), the fourth power of 1 / U: errors of the pixels of a mover
+are not independent, and one on two thirds of the image must not outvote what is left. On
+development pairs 2 left twice the error, 8 the same as 4."""
 MIN_WEIGHT = 1e-4
 """Of a pixel, in units of the most certain one's: the refinement hears it where no other speaks."""
-
 MIN_SCALE = 1e-4
-"""Least scale of the kernel in units of the focal length: 0.1 px at a focal length of 1000."""
+"""Least scale of the fit's kernel in focal lengths: 0.1 px at a focal length of 1000."""
 
 NetworkOutput = PixelwisePrediction | tuple[torch.Tensor, torch.Tensor]
 
@@ -82,7 +75,9 @@ def select(maps: PixelwisePrediction, method: str = "softmax") -> PoseSeed:
     T = select_motion(maps, method)
     if maps.log_scale_rotation is None:
         return PoseSeed(T, None)
-    weights = seed_weights(maps.log_scale_rotation)
+    s = _doubt(maps.log_scale_rotation)
+    least = s.flatten(1).amin(dim=1)[:, None, None]
+    weights = torch.exp(-SHARPNESS * (s - least)).clamp(min=MIN_WEIGHT)
     if maps.image_size is not None and maps.image_size != tuple(weights.shape[1:]):
         weights = F.interpolate(
             weights[:, None], maps.image_size, mode="bilinear", align_corners=False
@@ -90,16 +85,10 @@ def select(maps: PixelwisePrediction, method: str = "softmax") -> PoseSeed:
     return PoseSeed(T, weights)
 
 
-def seed_weights(log_scale: torch.Tensor) -> torch.Tensor:
-    """Weights (B, h, w) in (0, 1] from log scales (B, C, h, w): exp(-4 (s - min s))."""
-    s = _doubt(log_scale)
-    least = s.flatten(1).amin(dim=1)[:, None, None]
-    return torch.exp(-SHARPNESS * (s - least)).clamp(min=MIN_WEIGHT)
-
-
 def _doubt(log_scale: torch.Tensor) -> torch.Tensor:
     """(B, h, w) mean log scale of a pixel, finite."""
-    return torch.nan_to_num(log_scale.mean(dim=1), 50.0, 50.0, -50.0).clamp(-50.0, 50.0)
+    limit = MAX_LOG_SCALE
+    return torch.nan_to_num(log_scale.mean(dim=1), limit, limit, -limit).clamp(-limit, limit)
 
 
 def select_motion(output: NetworkOutput, method: str = "softmax") -> torch.Tensor:
@@ -112,7 +101,7 @@ def select_pose(
     method: str = "softmax",
     patch: int | None = None,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """One rotation and one translation per pair from the output of any network.
+    """One motion of each pair: (B, 3) Euler angles X-Y-Z in degrees, (B, 3) translation in metres.
 
     Each of the six numbers has its own pixels and weights; those of ``joint`` share theirs.
     Differentiable in the predictions and, through the weights, in the log scales. Values that are
@@ -124,11 +113,8 @@ def select_pose(
         patch: side of the square patches in cells of the maps; a quarter of the height by default:
             32 at 128x256 (the paper).
 
-    Returns:
-        (B, 3) Euler angles X-Y-Z in degrees and (B, 3) translation in metres, of T_curr_prev.
-
     Raises:
-        InputError: unknown method, patch below 1, what is no prediction, or maps of other shapes.
+        InputError: an unknown method, or maps of other shapes.
     """
     if isinstance(output, tuple):
         return output
@@ -136,11 +122,11 @@ def select_pose(
         raise InputError(
             f"select: method {method!r} unknown; known: {', '.join(SELECTION_METHODS)}."
         )
-    if patch is not None and patch < 1:
-        raise InputError(f"select: expected a patch side of at least 1 cell, got {patch!r}.")
     value, log_scale = _joined(output)
     if log_scale is None or method == "mean":
-        motion = _mean(value)
+        finite = torch.isfinite(value)
+        total = torch.where(finite, value, 0.0).sum(dim=(2, 3))
+        motion = total / finite.sum(dim=(2, 3)).clamp(min=1)
     else:
         height, width = value.shape[2:]
         patch = min(patch or -(-height // PATCH_ROWS), max(height, width))
@@ -150,28 +136,18 @@ def select_pose(
 
 def _joined(prediction: PixelwisePrediction) -> tuple[torch.Tensor, torch.Tensor | None]:
     """(B, 6, h, w) values and log scales; refuses maps that do not belong to each other."""
-    if not isinstance(prediction, PixelwisePrediction):
-        got = type(prediction).__name__
-        raise InputError(f"select: expected a PixelwisePrediction, got {got}.")
-    shape = tuple(prediction.rotation.shape)
+    shape = prediction.rotation.shape
     for name, value in vars(prediction).items():
         if isinstance(value, torch.Tensor) and (value.shape != shape or len(shape) != 4):
             raise InputError(
-                f"select: expected {name} of shape (B, 3, h, w), like the rotation's {shape}, got "
-                f"{tuple(value.shape)}."
+                f"select: expected {name} of shape (B, 3, h, w), like the rotation's "
+                f"{tuple(shape)}, got {tuple(value.shape)}."
             )
     motion = torch.cat([prediction.rotation, prediction.translation], dim=1)
     s_rotation, s_translation = prediction.log_scale_rotation, prediction.log_scale_translation
     if s_rotation is None or s_translation is None:
         return motion, None
     return motion, torch.cat([s_rotation, s_translation], dim=1)
-
-
-def _mean(value: torch.Tensor) -> torch.Tensor:
-    """(B, 6, h, w) -> (B, 6), over the finite pixels."""
-    finite = torch.isfinite(value)
-    total = torch.where(finite, value, 0.0).sum(dim=(2, 3))
-    return total / finite.sum(dim=(2, 3)).clamp(min=1)
 
 
 def _vote(value: torch.Tensor, log_scale: torch.Tensor, method: str, patch: int) -> torch.Tensor:
@@ -216,10 +192,7 @@ def fitted_motion(
     """(B, 4, 4) motion that the pixels agree on which a prediction of these inputs trusts.
 
     The selected pose is the start; the log scales of the rotation are the weights, and carry the
-    gradient.
-
-    Raises:
-        InputError: a prediction without uncertainty.
+    gradient. Refuses a prediction without uncertainty.
     """
     if not isinstance(output, PixelwisePrediction) or output.log_scale_rotation is None:
         raise InputError("fitted_motion: expected a prediction with uncertainty.")

@@ -1,9 +1,8 @@
 """What the selector network sees: an image, and what each candidate motion leaves unexplained.
 
-Of every candidate the residuals of flow and second depth, measured against the noise that the
-candidate itself found, how well the current image and its depth look where the candidate says that
-the pixels go (also where there is no flow), and what its rivals explain; beside them the image's
-flow, depth and rays, each over the pair's own scale.
+Residuals of flow and second depth against the candidate's own noise, how well the current image and
+its depth look where the candidate says that the pixels go (also where there is no flow), what its
+rivals explain; beside them the image's flow, depth and rays, each over the pair's own scale.
 """
 
 from __future__ import annotations
@@ -40,23 +39,17 @@ MAX_LOGIT = 6.0
 class SelectorInputs:
     """B images on their coarse grid (h, w) and N candidate motions of theirs.
 
-    The maps are those of :class:`hybridvo.hypotheses.generate.GridMaps`, with a first axis.
+    Beside the maps of :class:`hybridvo.hypotheses.generate.GridMaps`, with a first axis:
 
     Args:
-        K: (B, 4) fx, fy, cx, cy of the current camera, px.
-        image_width: (B,) px, of the whole image. stride: (B,) px between the grid's pixels.
-        static: (B, h, w) logit of the probability to be static world that another network states.
-        has_static: (B,) bool, whether it was asked.
-        T_prior: (B, 3, 4) motion that is expected from those before.
-        prior_information: (B, 6, 6) inverse of the covariance of ``Exp(delta) T_prior``,
-            translation first.
-        has_prior: (B,) bool, whether it is known.
-        planes_curr: (B, 3, h, w) of the current frame on its own grid: grey levels, log metres (0
-            where unknown), whether these are known.
+        static: (B, h, w) logit of the probability to be static world, if ``has_static`` (B,).
+        T_prior: (B, 3, 4) motion expected from those before, if ``has_prior`` (B,).
+        prior_information: (B, 6, 6) inverse covariance of ``Exp(delta) T_prior``.
+        planes_curr: (B, 3, h, w) grey levels, log metres (0 where unknown), whether these are known
+            of the current frame on its own grid.
         owner: (N,) int64, image of each candidate.
         parent: (N,) int64, for refits: the motion of the search it came from; for those: itself.
-        pose: (N, 3, 4) T_curr_prev.
-        flow_noise: (N,) px. depth_noise: (N,) of log depth, both found with the candidate.
+        pose: (N, 3, 4) T_curr_prev, with flow_noise (N,) px and depth_noise (N,) of log depth.
     """
 
     ray: torch.Tensor
@@ -105,62 +98,41 @@ def selector_inputs(
     """A batch of one image, without candidates yet; ``static``: probabilities, or None."""
     stacked: dict[str, Any] = {name: np.asarray(value)[None] for name, value in vars(maps).items()}
     inputs = stacked_inputs(GridMaps(**stacked), device)
+    told: dict[str, torch.Tensor] = {}
     if static is not None:
-        told = torch.as_tensor(static, dtype=torch.float32, device=device)[None]
-        inputs = replace(
-            inputs,
-            static=torch.logit(told, eps=1e-4),
-            has_static=torch.ones_like(inputs.has_static),
-        )
+        probability = torch.as_tensor(static, dtype=torch.float32, device=device)[None]
+        told["static"] = torch.logit(probability, eps=1e-4)
+        told["has_static"] = torch.ones_like(inputs.has_static)
     if prior is not None:
         expected, covariance = (
             torch.as_tensor(x, device=device)[None] for x in (prior.T_curr_prev, prior.covariance)
         )
-        inputs = replace(
-            inputs,
-            T_prior=expected[:, :3].float(),
-            prior_information=prior_information_of(inputs.depth, inputs.usable, covariance),
-            has_prior=torch.ones_like(inputs.has_prior),
-        )
-    return inputs
+        told["T_prior"] = expected[:, :3].float()
+        told["prior_information"] = prior_information_of(inputs.depth, inputs.usable, covariance)
+        told["has_prior"] = torch.ones_like(inputs.has_prior)
+    return replace(inputs, **told)
 
 
 def stacked_inputs(maps: GridMaps, device: torch.device) -> SelectorInputs:
     """Images whose maps have a first axis, of which nothing is known beforehand."""
-
-    def tensor(x: Any, dtype: torch.dtype = torch.float32) -> torch.Tensor:
-        return torch.as_tensor(np.ascontiguousarray(x)).to(device, dtype)
-
-    depth, usable = tensor(maps.depth), tensor(maps.usable, torch.bool)
-    log_depth = tensor(maps.log_depth_seen)
-    known = torch.isfinite(log_depth)
-    planes = [tensor(maps.image_curr), torch.nan_to_num(log_depth), known.float()]
+    values: dict[str, torch.Tensor] = {}
+    for name, x in vars(maps).items():
+        dtype = torch.bool if name in ("usable", "seen") else torch.float32
+        values[name] = torch.as_tensor(np.ascontiguousarray(x)).to(device, dtype)
+    values["image_width"] = values.pop("width")
+    log_depth, image = values.pop("log_depth_seen"), values.pop("image_curr")
+    planes = [image, torch.nan_to_num(log_depth), torch.isfinite(log_depth).float()]
+    depth, none = values["depth"], torch.zeros(0, device=device)
     nothing = torch.zeros(len(depth), dtype=torch.bool, device=device)
-    none = torch.zeros(0, device=device)
     return SelectorInputs(
-        ray=tensor(maps.ray),
-        depth=depth,
-        target=tensor(maps.target),
-        flow_variance=tensor(maps.flow_variance),
-        depth_variance=tensor(maps.depth_variance),
-        usable=usable,
-        log_depth_curr=tensor(maps.log_depth_curr),
-        seen=tensor(maps.seen, torch.bool),
-        image_prev=tensor(maps.image_prev),
+        **values,
         planes_curr=torch.stack(planes, dim=1),
-        K=tensor(maps.K),
-        image_width=tensor(maps.width),
-        stride=tensor(maps.stride),
         static=torch.zeros_like(depth),
         has_static=nothing,
         T_prior=torch.eye(3, 4, device=device).repeat(len(depth), 1, 1),
-        prior_information=prior_information_of(depth, usable, None),
+        prior_information=prior_information_of(depth, values["usable"], None),
         has_prior=nothing,
-        owner=none,
-        parent=none,
-        pose=none,
-        flow_noise=none,
-        depth_noise=none,
+        **dict.fromkeys(("owner", "parent", "pose", "flow_noise", "depth_noise"), none),
     )
 
 

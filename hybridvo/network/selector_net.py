@@ -1,9 +1,8 @@
 """The selector network: which of the motions found is the camera's, and where is the static world.
 
-A small convolutional network looks at every candidate motion of a pair through what it leaves
-unexplained, see :mod:`hybridvo.network.selector_inputs`. It answers with a score and a mask: the
-probability of each pixel to be static world. Choosing among few exact motions is a far easier
-question than segmenting motion from raw flow.
+A small convolutional network looks at what every candidate motion leaves unexplained
+(:mod:`hybridvo.network.selector_inputs`) and answers with a score and a mask: the probability of
+each pixel to be static. Choosing among few exact motions is easier than segmenting raw flow.
 """
 
 from __future__ import annotations
@@ -132,11 +131,8 @@ class SelectorNetwork(nn.Module):
     ) -> SelectorOutput:
         """Answers about every candidate, masks included.
 
-        Args:
-            inputs: images and candidates.
-            first: for refits, the motions of the search and the answers about them.
-            mirror: (B,) bool, images to look at in a mirror (training); the masks come back
-                unmirrored.
+        ``first``: for refits, the motions of the search and the answers about them; ``mirror``:
+        (B,) bool, images to look at in a mirror (training); the masks come back unmirrored.
         """
         output = self.encode(inputs, first, mirror)
         mask = self.decode(output.levels, output.evidence.shape[2:])
@@ -156,13 +152,13 @@ class SelectorNetwork(nn.Module):
         if mirror is not None:
             channels = _mirrored(channels, mirror[inputs.owner], MIRRORED_CANDIDATE)
         channels = _padded(channels)
-        if first is not None:
-            common = first[1].common
-        else:
+        if first is None:
             shared = shared_channels(inputs)
             if mirror is not None:
                 shared = _mirrored(shared, mirror, MIRRORED_SHARED)
             common = self.shared(_padded(shared))
+        else:
+            common = first[1].common
         x1 = F.relu_(self.candidate(channels) + common[inputs.owner])
         x2 = self.block2(F.relu_(self.down2(x1)))
         x3 = self.block3(F.relu_(self.down3(x2)))
@@ -199,8 +195,8 @@ class SelectorNetwork(nn.Module):
 
 def _padded(x: torch.Tensor) -> torch.Tensor:
     """Zeros below and on the right, up to a multiple of what the network divides by."""
-    pad = (0, -x.shape[3] % 16, 0, -x.shape[2] % 16)
-    return F.pad(x, pad).contiguous(memory_format=torch.channels_last)
+    x = F.pad(x, (0, -x.shape[3] % 16, 0, -x.shape[2] % 16))
+    return x.contiguous(memory_format=torch.channels_last)
 
 
 def _mirrored(x: torch.Tensor, mirror: torch.Tensor, signed: tuple[int, ...]) -> torch.Tensor:
@@ -211,7 +207,7 @@ def _mirrored(x: torch.Tensor, mirror: torch.Tensor, signed: tuple[int, ...]) ->
 
 
 class NetworkScorer:
-    """A :class:`hybridvo.hypotheses.selector.Scorer`."""
+    """A :class:`hybridvo.hypotheses.selector.Scorer` on a device."""
 
     def __init__(self, network: SelectorNetwork, device: str = "cpu") -> None:
         self.device = torch.device(device)

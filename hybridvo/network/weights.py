@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -23,8 +23,7 @@ PRETRAINED = Path(__file__).parent / "pretrained"
 DTYPES = {"float16": torch.float16, "float32": torch.float32}
 
 
-@dataclass(frozen=True, eq=False)
-class Weights:
+class Weights(NamedTuple):
     """Content of a weights file: the network's options, its model card, float32 tensors by name."""
 
     path: Path
@@ -36,14 +35,11 @@ class Weights:
         """The network of the file in evaluation mode, by the class of its options and its maker."""
         try:
             network = network_of(kind(**self.options))
-        except (InputError, TypeError) as error:
-            raise CheckpointError(f"{self.path}: {error}") from None
-        try:
-            network.load_state_dict(self.tensors, strict=True)
-        except RuntimeError as error:
-            text = str(error).replace("\n\t", " ")[:600]
+            network.load_state_dict(self.tensors)
+        except (InputError, TypeError, RuntimeError) as error:
             raise CheckpointError(
-                f"{self.path}: the weights do not fit their own options {self.options}: {text}"
+                f"{self.path}: the weights do not fit their own options {self.options}: "
+                + str(error).replace("\n\t", " ")[:600]
             ) from None
         return network.eval()
 
@@ -83,29 +79,21 @@ def read_weights(path: str | Path) -> Weights:
     """
     path = Path(path)
     if not os.path.isfile(path):  # where Path.is_file() raises: a name that is too long
-        raise CheckpointError(f"{path}: no such weights file. {_known()}")
+        known = ", ".join(pretrained_names())
+        raise CheckpointError(f"{path}: no such weights file. Pretrained weights: {known}.")
     try:
         # older safetensors makes its tensors on torch's default device
         with torch.device("cpu"), safe_open(path, framework="pt") as file:
             header = file.metadata() or {}
-            if header.get("format") != FORMAT:
-                raise CheckpointError(
-                    f"{path}: a safetensors file, but not hybridvo's: expected format {FORMAT!r} "
-                    f"in its header, got {str(header.get('format'))[:80]!r}."
-                )
             tensors = {name: file.get_tensor(name).float() for name in file.keys()}
-    except SafetensorError as error:
-        raise CheckpointError(
-            f"{path}: not a whole safetensors file ({str(error)[:200]}). Pickled checkpoints (.pt, "
-            f".pth) are refused on purpose; if this was a weights file, copy or download it again."
-        ) from None
-    except OSError as error:
-        raise CheckpointError(f"{path}: cannot be read: {error.strerror or error}.") from None
-    try:
+        if (found := str(header.get("format"))) != FORMAT:
+            raise ValueError(f"the header's format is {found[:80]!r}")
         options, card = (dict(json.loads(header[key])) for key in ("options", "card"))
-    except (KeyError, ValueError, TypeError) as error:
+    except (SafetensorError, OSError, KeyError, ValueError, TypeError) as error:
         raise CheckpointError(
-            f"{path}: expected the header's options and card as JSON objects: {error}."
+            f"{path}: expected a whole safetensors file of the format {FORMAT!r} with JSON options "
+            f"and card in its header: {str(error)[:200]}. Pickled checkpoints (.pt, .pth) are "
+            f"refused on purpose."
         ) from None
     _check_finite(str(path), tensors, CheckpointError)
     return Weights(path, options, card, tensors)
@@ -116,10 +104,6 @@ def pretrained_names() -> tuple[str, ...]:
     return tuple(sorted(p.stem for p in PRETRAINED.glob("*.safetensors")))
 
 
-def _known() -> str:
-    return f"Pretrained weights: {', '.join(pretrained_names())}."
-
-
 def pretrained(name: str | Path) -> Path:
     """File of pretrained weights.
 
@@ -127,7 +111,8 @@ def pretrained(name: str | Path) -> Path:
         CheckpointError: not one of :func:`pretrained_names`; the message lists them.
     """
     if name not in pretrained_names():
-        raise CheckpointError(f"weights {str(name)!r} unknown. {_known()}")
+        known = ", ".join(pretrained_names())
+        raise CheckpointError(f"weights {str(name)!r} unknown. Pretrained weights: {known}.")
     return PRETRAINED / f"{name}.safetensors"
 
 

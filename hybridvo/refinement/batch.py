@@ -25,8 +25,7 @@ class BatchedPose:
     Args:
         SE3: (B, 7) pypose SE3, ``T_curr_prev``; the identity where failed. Carries the gradient.
         covariance: (B, 6, 6) of the left perturbation (translation, rotation); no gradient.
-        converged: (B,) bool. failed: (B,) bool.
-        status: one per sample, with its reason.
+        converged, failed: (B,) bool. status: one per sample, with its reason.
         probability: (B,) of the motion being the camera's, by the weight of the motion that
             contradicts it most; 0 where failed.
         iterations: (B,) Newton steps on all pixels.
@@ -108,8 +107,8 @@ class Pixels:
 
     def map(self, change: Callable[[torch.Tensor], torch.Tensor]) -> Pixels:
         """The same with every tensor changed."""
-        there = {f.name: getattr(self, f.name) for f in fields(self)}
-        changed: dict[str, Any] = {name: change(x) for name, x in there.items() if x is not None}
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        changed: dict[str, Any] = {k: x if x is None else change(x) for k, x in values.items()}
         return Pixels(**changed)
 
     def subset(self, count: int) -> Pixels:
@@ -140,11 +139,9 @@ def gather_pixels(
 ) -> Pixels:
     """The pixels of a batch in raster order, or tile by tile where a tile's side is given.
 
-    ``with_depth`` joins the current frame's depth.
-
-    Invalid values are replaced before anything is computed from them, so that neither they nor
-    their gradients spread. Variances are divided by the typical one of their sample, which is held
-    constant.
+    ``with_depth`` joins the current frame's depth. Invalid values are replaced before anything is
+    computed from them, so that neither they nor their gradients spread. Variances are divided by
+    the typical one of their sample, which is held constant.
     """
     flow, depth = batch.flow, batch.depth_prev
     height, width = depth.shape[1:]
@@ -167,30 +164,24 @@ def gather_pixels(
         usable = usable & batch.valid
     depth = torch.where(usable, depth, one)
     target = torch.where(usable[..., None], target, torch.zeros_like(target))
-    log_depth = present = None
+    points = (rays(height, width, K_prev) * depth[..., None]).permute(0, 3, 1, 2)
+    maps = {"points": points, "target": target.permute(0, 3, 1, 2)}
+    maps |= {"flow_variance": flow_variance, "depth_variance": depth_variance}
+    maps["weight"] = torch.where(usable, weight, zero)
     if with_depth and batch.depth_curr is not None:
         sampled, good = sample_depth(batch.depth_curr, target)
-        log_depth = to_tiles(sampled.log(), tile)
-        present = to_tiles((good & usable).to(depth.dtype), tile)
-    points = (rays(height, width, K_prev) * depth[..., None]).permute(0, 3, 1, 2)
-    return Pixels(
-        points=to_tiles(points, tile, 1.0),
-        target=to_tiles(target.permute(0, 3, 1, 2), tile),
-        flow_variance=to_tiles(flow_variance, tile, 1.0),
-        depth_variance=to_tiles(depth_variance, tile, 1.0),
-        weight=to_tiles(torch.where(usable, weight, zero), tile),
-        K=K_curr,
-        log_depth_curr=log_depth,
-        has_depth_curr=present,
-    )
+        maps |= {"log_depth_curr": sampled.log(), "has_depth_curr": (good & usable).to(depth.dtype)}
+    fill = {"points": 1.0, "flow_variance": 1.0, "depth_variance": 1.0}
+    tiles = {name: to_tiles(x, tile, fill.get(name, 0.0)) for name, x in maps.items()}
+    return Pixels(**tiles, K=K_curr)
 
 
 def sample_depth(depth: torch.Tensor, at: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Bilinear depth (B, H, W) at (B, h, w, 2) px, where the four neighbours lie on one surface.
 
     Returns:
-        (B, h, w) metres and (B, h, w) bool. False (and depth 1) outside the image, next to an
-        invalid depth, and at edges. Differentiable in both arguments.
+        (B, h, w) metres and (B, h, w) bool: False, and depth 1, outside the image, next to an
+        invalid depth, and at edges.
     """
     height, width = depth.shape[1:]
     u, v = at.unbind(-1)

@@ -2,13 +2,11 @@
 
 Every start is refined on a subset of the pixels under a kernel whose scale shrinks (graduated
 non-convexity); the start of least cost is fitted to the noise found there, and then to all pixels.
-Poses are pypose SE3 in float64, pixels keep their type. Samples never see each other: damping,
-convergence and failure are per sample.
+Poses are pypose SE3 in float64. Samples never see each other.
 
 The gradient is that of the implicit function theorem: the estimate solves g(T, inputs) = 0 with
-g = sum of w J^T Sigma^-1 r, so d xi = A^-1 dg with A = -dg / d xi, the full derivative (residual,
-Jacobian, robust weights and covariance). It is attached by one Newton step whose value is zero;
-noise and covariance come from the numpy functions and carry no gradient.
+g = sum of w J^T Sigma^-1 r, so d xi = A^-1 dg with A = -dg / d xi, the full derivative. It is
+attached by one Newton step of value zero; noise and covariance carry none.
 """
 
 from __future__ import annotations
@@ -91,20 +89,17 @@ def refine_batch(
     Args:
         batch: see :class:`~hybridvo.types.PairBatch`.
         T_init: (B, 4, 4) or (B, S, 4, 4) T_curr_prev to start from, in place of one that is not
-            finite the identity. Without weights the identity is one more start; with weights only
-            what is handed in is.
+            finite the identity. Without weights the identity is one more start.
         weights: (B, H, W) factors on the information; what is not positive and finite switches a
             pixel off.
         noise: flow noise in px and noise of log depth, as (2,) or (B, 2), and with the current
             frame's depth that of its log; None: estimated.
         kernel: ``geman-mcclure``, with the cutoff of the options, ``cauchy``, ``huber`` or ``l2``.
-        options: of the refinement; the current frame's depth is a third residual where
-            ``current_depth`` is ``on``.
+        options: the current frame's depth is a third residual where ``current_depth`` is ``on``.
 
     Returns:
-        Poses with covariance and a status per sample. Bad data give a failed status for that very
-        sample, never an exception and never a pose that is not finite. The gradient of a failed
-        sample is zero.
+        Poses with covariance and a status per sample. Bad data give a failed status and a zero
+        gradient for that very sample, never an exception and never a pose that is not finite.
 
     Raises:
         InputError: shapes, types or options that cannot be used.
@@ -144,8 +139,8 @@ def _given_noise(noise: Any, like: torch.Tensor, with_depth: bool) -> torch.Tens
         return None
     value = torch.as_tensor(noise, device=like.device).to(like.dtype)
     known, sizes = value.detach(), (2, 3) if with_depth else (2,)
-    shapes = [shape for n in sizes for shape in ((n,), (len(like), n))]
-    if value.shape not in shapes or not bool(
+    fits = value.shape in [shape for n in sizes for shape in ((n,), (len(like), n))]
+    if not fits or not bool(
         (torch.isfinite(known) & (known >= 0)).all() & (known[..., ::2] > 0).all()
     ):
         raise InputError(
@@ -255,11 +250,11 @@ class _Solver:
         """Noise and pose, in turn; the noise by the function of the numba refinement."""
         noise = self.few.weight.new_tensor([0.5, 0.01]).repeat(len(T), 1)
         samples = None if given is not None else self._samples()
-        for steps in (2, 3, 3):
+        for steps in (2, 3, 3, 0):
             noise = given.detach() if given is not None else self._noise(samples, T, noise)
             for _ in range(steps):
                 T = stepped(self.few, T, residuals(self.few, T), self.how(noise))
-        return T, noise if given is not None else self._noise(samples, T, noise)
+        return T, noise
 
     def _samples(self) -> np.ndarray:
         """(B, 8, n) the coarse grid of the numba refinement, as a buffer of its kernels."""
@@ -318,18 +313,21 @@ class _Solver:
         rounding = 8 * torch.finfo(pixels.weight.dtype).eps
         best = torch.full((len(T),), torch.inf, dtype=torch.float64, device=T.device)
         done, converged = best < 0, best < 0
-        iterations, matrix = done.long(), None
+        iterations = done.long()
         for k in range(STEPS):
             now = linearize(pixels, residuals(pixels, T), how, self.tile**2)
             H, g = now.total()
-            if tight and k % 3 == 2:  # anew, for samples that were far when it was made
-                matrix = newton_matrix(pixels, T, how).double()
-            newton = H - curvature * weight if matrix is None else matrix
-            step, good = solve_small(newton, g)
+            if tight and k % 3 == 2:  # the full derivative, also of residual and Jacobian
+                few = linearize(self.few, residuals(self.few, T), how).total()[0]
+                few = few - newton_matrix(self.few, T, how).double()
+                curvature = (
+                    few / self.few.weight.double().sum(dim=1).clamp(min=1e-12)[:, None, None]
+                )
+            step, good = solve_small(H - curvature * weight, g)
             ahead = (step * g).sum(dim=1)
             # under a kernel that turns over the equations may be far from definite: Gauss-Newton
             # (near the solution the full derivative may be much flatter than H, and is right)
-            longest = 4 if matrix is None else 100
+            longest = 100 if tight and k > 1 else 4
             good = good & (ahead > 0) & (_energy(step, H) <= longest * ahead)
             plain, solved = solve_small(H, g, DAMPING)
             step = torch.where(good[:, None], step, plain)
@@ -385,13 +383,13 @@ class _Solver:
         batch, usable = self.batch, int((self.pixels.weight[k] > 0).sum())
         if usable < self.options.min_pixels:
             for name, K in (("K_prev", batch.K_prev[k]), ("K_curr", batch.K_curr[k])):
-                if not bool(torch.isfinite(K).all()) or not bool((K.diagonal() > 0).all()):
+                if not bool(torch.isfinite(K).all() & (K.diagonal() > 0).all()):
                     return Status.failed(Reason.NAN_INPUT, f"{name} is no camera matrix")
             depth, flow = (x[k].detach().cpu().numpy() for x in (batch.depth_prev, batch.flow))
             return Status.failed(*too_few(depth, flow, usable, self.options.min_pixels))
-        open_end = Reason.SOLVER_DIVERGED, f"not converged after {STEPS} steps"
+        doubt = Reason.SOLVER_DIVERGED, f"not converged after {STEPS} steps"
         return status_of(
-            definite, share, None if converged else open_end, probability, MIN_PROBABILITY
+            definite, share, None if converged else doubt, probability, MIN_PROBABILITY
         )
 
 

@@ -19,11 +19,13 @@ from hybridvo.synthetic.draws import (
     Range,
     Silhouette,
     about,
+    covering_mask,
     direction,
     log_uniform,
     ordered,
     outline,
     random_silhouette,
+    silhouette_mask,
     smooth_field,
 )
 from hybridvo.synthetic.layered import Layers, Sample, normalized_grid, visibility
@@ -266,7 +268,7 @@ class _Scene(Layers):
             cells = int(rng.integers(3, 8))
             self.bends[number] = amplitude * smooth_field(rng, (o.height, o.width), cells, 3)
         if rng.random() < o.articulated_probability:
-            points = shape.parts[0][0]
+            points = shape[0][0]
             ray = centre / depth
             middle = np.array([ray[0] * self.fx + self.cx, ray[1] * self.fy + self.cy])
             for _ in range(int(rng.integers(1, 6))):
@@ -274,7 +276,7 @@ class _Scene(Layers):
                 limb = outline(rng, "bar" if rng.random() < 0.6 else "superellipse")
                 joint = middle + radius * points[int(rng.integers(len(points)))] * 0.8
                 place = joint + limb_radius * limb[int(rng.integers(len(limb)))]
-                limb_mask = Silhouette(((limb, True),)).draw(self.rho.shape, place, limb_radius)
+                limb_mask = silhouette_mask([(limb, True)], self.rho.shape, place, limb_radius)
                 part = self.add(limb_mask, True, 1.02 / depth)
                 if part is not None:
                     own = self.turn(o.limb_rotation_deg)
@@ -288,7 +290,8 @@ class _Scene(Layers):
         """Mask of an outline somewhere, stretched by 0.4 to ``highest``."""
         o, rng = self.options, self.rng
         place = rng.uniform(0, o.width), rng.uniform(0, o.height)
-        return shape.draw(self.rho.shape, place, radius, log_uniform(rng, (0.4, highest)))
+        stretch = log_uniform(rng, (0.4, highest))
+        return silhouette_mask(shape, self.rho.shape, place, radius, stretch)
 
     def occlude(self, count: int) -> None:
         """Lay things that stand still over the scene."""
@@ -311,7 +314,7 @@ class _Scene(Layers):
             centre = rng.uniform(-0.1, 1.1) * o.width, rng.uniform(0.1, 1.1) * o.height
             share = rng.uniform(*o.large_coverage)
             shape, stretch = random_silhouette(rng, 0.15), log_uniform(rng, (0.5, 1.6))
-            mask, radius = shape.draw_coverage(self.rho.shape, centre, share, stretch)
+            mask, radius = covering_mask(shape, self.rho.shape, centre, share, stretch)
             self.add_mover(shape, mask, radius, T_cam, follow)
         if not still:
             count = int(rng.integers(o.movers[0], o.movers[1] + 1))

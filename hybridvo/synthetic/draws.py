@@ -6,7 +6,6 @@ differences of superellipses, polygons, stars and thin bars, of every degree of 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Annotated
 
 import cv2
@@ -120,8 +119,10 @@ def camera_path(
 
 def poses(angles_deg: np.ndarray, position: np.ndarray) -> np.ndarray:
     """(N, 4, 4) from (N, 3) Euler angles about x, y, z and (N, 3) positions."""
-    R = Rotation.from_euler("XYZ", angles_deg, degrees=True).as_matrix()
-    return np.stack([make_transform(r, p) for r, p in zip(R, position, strict=True)])
+    T = np.tile(np.eye(4), (len(position), 1, 1))
+    T[:, :3, :3] = Rotation.from_euler("XYZ", angles_deg, degrees=True).as_matrix()
+    T[:, :3, 3] = position
+    return T
 
 
 def sway(rng: np.random.Generator, frames: int, rate: float) -> np.ndarray:
@@ -148,6 +149,8 @@ def smooth_field(
 
 
 KINDS = ("superellipse", "polygon", "star", "bar")
+Silhouette = list[tuple[np.ndarray, bool]]
+"""Filled outlines (N, 2) in unit coordinates; one that does not add cuts a hole."""
 
 
 def outline(rng: np.random.Generator, kind: str) -> np.ndarray:
@@ -181,51 +184,44 @@ def _unit(angle: np.ndarray) -> np.ndarray:
     return np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
-@dataclass(frozen=True, eq=False)
-class Silhouette:
-    """Filled outlines (N, 2) in unit coordinates; one that does not add cuts a hole."""
+def silhouette_mask(
+    shape: Silhouette, size: tuple[int, int], centre: ArrayLike, radius: float, stretch: float = 1.0
+) -> np.ndarray:
+    """(H, W) uint8 mask: ``centre`` (u, v) and ``radius`` of one unit in px, ``stretch`` horizontal
+    over vertical scale.
+    """
+    mask, limit = np.zeros(size, np.uint8), 8 * max(size)
+    scale = np.array([radius * np.sqrt(stretch), radius / np.sqrt(stretch)])
+    for points, adds in shape:
+        pixels = np.clip(points * scale + centre, -limit, limit)
+        sixteenths = np.round(pixels * 16).astype(np.int32)
+        cv2.fillPoly(mask, [sixteenths], int(adds), cv2.LINE_8, 4)
+    return mask
 
-    parts: tuple[tuple[np.ndarray, bool], ...]
 
-    def draw(
-        self, size: tuple[int, int], centre: ArrayLike, radius: float, stretch: float = 1.0
-    ) -> np.ndarray:
-        """(H, W) uint8 mask of a size: ``centre`` (u, v) and ``radius`` of one unit in px,
-        ``stretch`` horizontal over vertical scale.
-        """
-        mask = np.zeros(size, np.uint8)
-        limit = 8 * max(size)
-        scale = np.array([radius * np.sqrt(stretch), radius / np.sqrt(stretch)])
-        for points, adds in self.parts:
-            pixels = np.clip(points * scale + centre, -limit, limit)
-            sixteenths = np.round(pixels * 16).astype(np.int32)
-            cv2.fillPoly(mask, [sixteenths], int(adds), cv2.LINE_8, 4)
-        return mask
-
-    def draw_coverage(
-        self, size: tuple[int, int], centre: ArrayLike, share: float, stretch: float = 1.0
-    ) -> tuple[np.ndarray, float]:
-        """Mask and radius in px at which about ``share`` of the image is covered."""
-        low, high = 0.0, 4.0 * float(np.hypot(*size))
-        best, radius = np.zeros(size, np.uint8), 0.0
-        for _ in range(12):
-            middle = 0.5 * (low + high)
-            mask = self.draw(size, centre, middle, stretch)
-            covered = cv2.countNonZero(mask) / mask.size
-            if covered > share:
-                high = middle
-                continue
-            low = radius = middle
-            best = mask
-            if covered > share - 0.01:
-                break
-        return best, radius
+def covering_mask(
+    shape: Silhouette, size: tuple[int, int], centre: ArrayLike, share: float, stretch: float = 1.0
+) -> tuple[np.ndarray, float]:
+    """Mask and radius in px at which about ``share`` of the image is covered."""
+    low, high = 0.0, 4.0 * float(np.hypot(*size))
+    best, radius = np.zeros(size, np.uint8), 0.0
+    for _ in range(12):
+        middle = 0.5 * (low + high)
+        mask = silhouette_mask(shape, size, centre, middle, stretch)
+        covered = cv2.countNonZero(mask) / mask.size
+        if covered > share:
+            high = middle
+            continue
+        low, radius, best = middle, middle, mask
+        if covered > share - 0.01:
+            break
+    return best, radius
 
 
 def random_silhouette(rng: np.random.Generator, hole_probability: float = 0.4) -> Silhouette:
     """Union of one to four outlines, from which one or two smaller ones may be cut."""
     first = KINDS[int(rng.choice(4, p=[0.35, 0.3, 0.3, 0.05]))]
-    parts: list[tuple[np.ndarray, bool]] = [(outline(rng, first), True)]
+    parts = [(outline(rng, first), True)]
     for _ in range(int(rng.integers(0, 4))):
         kind = KINDS[int(rng.integers(4))]
         size = rng.uniform(0.7, 1.3) if kind == "bar" else rng.uniform(0.3, 0.8)
@@ -235,18 +231,17 @@ def random_silhouette(rng: np.random.Generator, hole_probability: float = 0.4) -
             kind = KINDS[int(rng.integers(3))]
             points = rng.uniform(0.12, 0.4) * outline(rng, kind) + rng.uniform(-0.6, 0.6, 2)
             parts.append((points, False))
-    return Silhouette(tuple(parts))
+    return parts
 
 
-def silhouette_mask(rng: np.random.Generator, size: int) -> np.ndarray:
+def cut_out(rng: np.random.Generator, size: int) -> np.ndarray:
     """(h, w) bool mask of a random silhouette that fills a square of ``size`` px, cropped to it."""
     while True:
         shape = random_silhouette(rng)
-        added = np.concatenate([points for points, adds in shape.parts if adds])
+        added = np.concatenate([points for points, adds in shape if adds])
         low, high = added.min(axis=0), added.max(axis=0)
         radius = size / float((high - low).max())
-        centre = (size - 1) / 2 - radius * (low + high) / 2
-        mask = shape.draw((size, size), centre, radius)
+        mask = silhouette_mask(shape, (size, size), (size - 1 - radius * (low + high)) / 2, radius)
         left, top, width, height = cv2.boundingRect(mask)
         # A hole can swallow a small shape; a mover without pixels would be none.
         if width * height and cv2.countNonZero(mask) > 0.02 * mask.size:

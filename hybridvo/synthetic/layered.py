@@ -19,7 +19,7 @@ from pydantic import Field
 from hybridvo.errors import InputError
 from hybridvo.geometry import euler_deg_to_matrix, make_transform
 from hybridvo.options import Positive, Share, option_group
-from hybridvo.synthetic.draws import ordered, silhouette_mask
+from hybridvo.synthetic.draws import cut_out, ordered
 
 MIN_RATIO = np.float32(1e-6)
 """Added to |z' / z|: the flow of a point in the image plane stays finite."""
@@ -339,7 +339,7 @@ def _place(rng: np.random.Generator, o: PaperOptions) -> tuple[tuple[slice, slic
     share = -np.inf
     while not low <= share <= high:
         share = mean + spread * rng.standard_normal()
-    mask = silhouette_mask(rng, max(int(o.width * share), 2))
+    mask = cut_out(rng, max(int(o.width * share), 2))
     if rng.random() < 0.5:
         mask = mask[:, ::-1]
     box, crop = [], []

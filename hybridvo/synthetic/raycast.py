@@ -139,19 +139,16 @@ def _noise(x, y, z):  # pragma: no cover - compiled
 @njit(cache=True, nogil=True)
 def _normal(shape, body, normal):  # pragma: no cover - compiled
     """Direction outwards at a point of a unit shape, into ``normal``."""
+    x, y, z = abs(body[0]), abs(body[1]), abs(body[2])
     normal[:] = body
-    if shape == BOX:
-        axis = 0
-        for i in range(1, 3):
-            if abs(body[i]) > abs(body[axis]):
-                axis = i
-        for i in range(3):
-            normal[i] = body[i] if i == axis else 0.0
+    if shape == BOX:  # the face of the largest coordinate
+        normal[0] *= x >= y and x >= z
+        normal[1] *= y > x and y >= z
+        normal[2] *= z > x and z > y
+    elif shape == CYLINDER and y * y > x * x + z * z:
+        normal[0] = normal[2] = 0.0
     elif shape == CYLINDER:
-        if body[1] * body[1] > body[0] * body[0] + body[2] * body[2]:
-            normal[0] = normal[2] = 0.0
-        else:
-            normal[1] = 0.0
+        normal[1] = 0.0
 
 
 @njit(cache=True, nogil=True)

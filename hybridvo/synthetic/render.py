@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -43,8 +44,7 @@ class Solid:
     colours: tuple[ArrayLike, ArrayLike] = ((0.9, 0.8, 0.7), (0.6, 0.8, 0.9))
 
 
-@dataclass(frozen=True, eq=False)
-class RenderedFrame:
+class RenderedFrame(NamedTuple):
     """(H, W, 3) uint8 image, (H, W) float32 depth in metres, inf where nothing is hit, and (H, W)
     int32 object number: 0 static, 1.. movers, -1 where nothing is hit.
     """
@@ -208,10 +208,6 @@ class SyntheticSequence(Sequence):
         """True flow from frame ``index`` to the next, (H, W, 2) float32, and no variance."""
         self._check_index(index + 1)
         return self.scene.flow(index)[0], None
-
-    def moving(self, index: int) -> np.ndarray:
-        """(H, W) bool, True on moving objects."""
-        return self.scene.object_id(index) > 0
 
     def files(self) -> list[Path]:
         """No file is read."""

@@ -20,7 +20,7 @@ from hybridvo.errors import InputError
 from hybridvo.flow import dis_flow
 from hybridvo.geometry import invert, rotation_angle, se3_exp
 from hybridvo.refinement.refine import refine_pair
-from hybridvo.synthetic.draws import about, log_uniform, silhouette_mask, smooth_field
+from hybridvo.synthetic.draws import about, cut_out, log_uniform, smooth_field
 from hybridvo.synthetic.meshes import (
     TEAR,
     Canvas,
@@ -251,7 +251,7 @@ def _cut(
     """A piece of a frame, placed in the first view; None where the frame has no depth there."""
     assert frame.depth is not None
     height, width = frame.camera.shape
-    mask = silhouette_mask(rng, max(24, min(side, height - 2)))
+    mask = cut_out(rng, max(24, min(side, height - 2)))
     h, w = mask.shape
     v0, u0 = int(rng.integers(height - h + 1)), int(rng.integers(max(width - w, 0) + 1))
     window = np.s_[v0 : v0 + h, u0 : u0 + w]

@@ -14,8 +14,7 @@ from hybridvo.results import Status
 
 CHI2_LIMIT = 22.5
 """Squared Mahalanobis distance that 0.1 % of right motions exceed (chi-square, 6 degrees)."""
-FREEDOM = 4.0
-"""Of Student's kernel: covariances are estimates, and some motions are wrong."""
+FREEDOM = 4.0  # of Student's kernel: covariances are estimates, and some motions are wrong
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,16 +16,13 @@ from hybridvo.results import MotionPrior, Reason, State
 from hybridvo.tracking.window import Window
 from hybridvo.types import Frame
 
-MEMORY = 10
-"""Motions after which a change counts 1 / e of a new one."""
-MIN_CHANGES = 3
-"""Changes between motions to be seen before their spread means anything."""
+MEMORY = 10  # motions after which a change counts 1 / e of a new one
+MIN_CHANGES = 3  # changes between motions to be seen before their spread means anything
 INFLATION = 2.0
 """Factor on the mean square of the last changes, which tell little of the next, larger one."""
 FLOOR_M, FLOOR_RAD = 1e-3, 1e-3
 """Smallest standard deviations of a prediction: no camera repeats its motion exactly."""
-UNKNOWN_M, UNKNOWN_RAD = 1.0, 0.3
-"""Standard deviations where too little is known."""
+UNKNOWN_M, UNKNOWN_RAD = 1.0, 0.3  # standard deviations where too little is known
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +74,7 @@ class TrackerState:
 
     Args:
         frame: the last frame that could be read; None before the first one.
-        T_world_cam: (4, 4) its pose; read-only.
+        T_world_cam: (4, 4) its pose.
         T_world_last: (4, 4) pose last handed out: another one after frames that could not be read.
         gap: frames that could not be read since ``frame``. failed: motions since the last found.
         count: frames seen.
@@ -92,12 +89,6 @@ class TrackerState:
     failed: int = 0
     count: int = 0
     window: Window | None = None
-
-    def __post_init__(self) -> None:
-        for name in ("T_world_cam", "T_world_last"):
-            own = np.array(getattr(self, name))
-            own.flags.writeable = False
-            object.__setattr__(self, name, own)
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """The state as named arrays, for ``numpy.savez`` (no pickles): images, one JSON text."""

@@ -8,9 +8,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from hybridvo.errors import InputError
 from hybridvo.files import write_json
-from hybridvo.network.models import load_weights
 from hybridvo.network.weights import save_weights
 from hybridvo.training.options import recorded_run
 from hybridvo.training.pwvo_task import PwvoTask
@@ -20,11 +21,6 @@ from hybridvo.training.validation import PUBLISHED_SEED, calibrate_scales, evalu
 
 RUN = "run.json"
 """Command, commit and versions of a training, beside its checkpoint."""
-
-SCALE_OF = {
-    "laplace": "s of the translation is the log scale of a Laplace error in metres",
-    "direction": "s of the translation is the log scale of the paper's direction-and-length error",
-}
 
 
 def source_commit() -> str | None:
@@ -50,20 +46,24 @@ def run_card(trainer: Trainer) -> dict[str, Any]:
         **trainer.record,
     }
     try:
-        card |= json.loads((Path(str(trainer.folder)) / RUN).read_text(encoding="utf-8"))
+        return card | json.loads((Path(str(trainer.folder)) / RUN).read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise InputError(f"{trainer.folder}: no {RUN} of a training: {error}.") from None
-    return card
 
 
 def open_run(folder: str | Path) -> Trainer:
     """A PWVO run as its checkpoint describes it."""
-    folder = Path(folder)
-    path = folder / CHECKPOINT
+    path = Path(folder) / CHECKPOINT
     record = read_checkpoint(path)["record"]
-    trainer = Trainer(PwvoTask(*recorded_run(record, str(path))), folder)
+    trainer = Trainer(PwvoTask(*recorded_run(record, str(path))), Path(folder))
     trainer.resume()
     return trainer
+
+
+def _write(path: Path, network: Any, card: dict[str, Any]) -> dict[str, Any]:
+    save_weights(path, network, card, "float16")
+    write_json(path.with_suffix(".json"), card)
+    return card
 
 
 def export_pwvo(
@@ -83,34 +83,26 @@ def export_pwvo(
         CheckpointError, InputError: not the folder of a run.
     """
     trainer = open_run(folder)
-    path, task = Path(path), trainer.task
-    assert isinstance(task, PwvoTask)
-    options, presets = task.options, task.mixture.presets
+    assert isinstance(trainer.task, PwvoTask)
+    options, presets = trainer.task.options, trainer.task.mixture.presets
     card = run_card(trainer)
-    card["translation_scale"] = SCALE_OF[options.loss.translation_form]
     if calibrate:
-        shares = list(options.data_weights)
-        main = presets[shares.index(max(shares))]
+        main = presets[int(np.argmax(options.data_weights))]
         shift = calibrate_scales(trainer.exported, main, calibrate)
         card["calibration"] = {"pairs": calibrate, "seed": 0, "added_to_s": shift}
-    save_weights(path, trainer.exported, card, "float16")
-    network, _ = load_weights(path)
+    network = trainer.exported.half().float()
     card["held_out"] = {}
     for name, preset in zip(options.data, presets, strict=True):
         say(f"{Path(name).stem}: {count} held-out pairs")
-        figures = evaluate_network(
-            network, preset, PUBLISHED_SEED, count, selection=options.selection
-        )
+        how = {"selection": options.selection}
+        figures = evaluate_network(network, preset, PUBLISHED_SEED, count, **how)
         del figures["epe_of_pairs"]
         card["held_out"][Path(name).stem] = figures
-    save_weights(path, network, card, "float16")
-    write_json(path.with_suffix(".json"), card)
-    return card
+    return _write(Path(path), network, card)
 
 
 def export_selector(trainer: Trainer, held_out: str | Path, path: str | Path) -> dict[str, Any]:
     """Write the selector's weights and card; ``held_out`` is a folder of held-out shards."""
-    path = Path(path)
     files = sorted(Path(held_out).glob("*.npz"))
     if not files:
         raise InputError(f"{held_out}: no shards; make some with seeds below 1000.")
@@ -121,6 +113,4 @@ def export_selector(trainer: Trainer, held_out: str | Path, path: str | Path) ->
         "held_out_with_proposals": evaluate_selector(network, files, asked=True),
         "network": trainer.record["options"]["network"],
     }
-    save_weights(path, network, card, dtype="float16")
-    write_json(path.with_suffix(".json"), card)
-    return card
+    return _write(Path(path), network, card)

@@ -88,16 +88,9 @@ class RunOptions:
 class PwvoOptions(RunOptions):
     """A training of PWVO or of a baseline; the defaults are the paper's.
 
-    Args:
-        moving_weight: of a term that the paper does not have: s of the rotation should be larger on
-            moving pixels than on static ones.
-        fit_weight: of the error of the motion that the trusted pixels agree on, with the gradient
-            through the fit into s; the paper has none.
-        selection: rule by which L^F and L^D see one motion, and by which the network is used.
-        loss_stride: L^F and L^D, without uncertainty, look at every n-th pixel of every n-th row,
-            in pixels of that smaller image.
-        data: preset files, beside the file that names them, with the share of each.
-        data_size: (height, width) of the drawn samples instead of the presets' own, or None.
+    ``configs/train_pwvo.yaml`` says what each option is. ``fit_weight`` and ``moving_weight``: of
+    terms that the paper does not have; ``data``: preset files, beside the file that names them;
+    ``data_size``: (height, width) of the drawn samples instead of the presets' own.
     """
 
     network: NetworkOptions = NetworkOptions()

@@ -29,10 +29,9 @@ is charged, also behind the camera."""
 class SampleStream(IterableDataset):
     """Endless batches of a preset, from the sample ``start`` of a seed.
 
-    Batch b of rank r holds the samples ``start + (b world + r) batch_size`` and those that follow:
-    all ranks together see what one process with a batch ``world`` times as large would see. Workers
-    of a ``DataLoader(stream, batch_size=None)`` take batches in turn, and the loader hands them
-    over in order, so that their number changes nothing.
+    Batch b of rank r holds the samples ``start + (b world + r) batch_size`` and those that follow.
+    Workers of a ``DataLoader(stream, batch_size=None)`` take batches in turn, and the loader hands
+    them over in order, so that their number changes nothing.
     """
 
     def __init__(
@@ -91,9 +90,8 @@ class PwvoTask:
         if passes == 1 or first == 0:
             return None
         T = torch.eye(4, device=batch.moving.device).repeat(len(batch), 1, 1)
-        made = first_motions(
-            self.network, batch.inputs[first:], self.options.selection, 1 + step % (passes - 1)
-        )
+        some, count = batch.inputs[first:], 1 + step % (passes - 1)
+        made = first_motions(self.network, some, self.options.selection, count)
         assert made is not None
         T[first:] = made
         return T

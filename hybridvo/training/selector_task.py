@@ -6,7 +6,7 @@ The fits are those of the pipeline: the final choice is learned on what it will 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,16 +15,16 @@ import torch
 import torch.nn.functional as F
 
 from hybridvo.errors import InputError
-from hybridvo.network.selector_inputs import SelectorInputs
+from hybridvo.geometry import pose_matrix, se3_exp
+from hybridvo.hypotheses.generate import GridMaps, fit_in_mask
+from hybridvo.hypotheses.selector import mask_weights, nearest_motion
+from hybridvo.network.selector_inputs import SelectorInputs, stacked_inputs
 from hybridvo.network.selector_net import SelectorNetwork, SelectorOutput
-from hybridvo.synthetic.dataset import MOVING, SOURCES, STATIC
+from hybridvo.options import RefineOptions
+from hybridvo.refinement import kernels
+from hybridvo.synthetic.dataset import MOVING, SOURCES, STATIC, read_shards
+from hybridvo.synthetic.draws import log_uniform
 from hybridvo.training.options import SelectorOptions
-from hybridvo.training.selector_batches import (
-    SelectorBatch,
-    ego_flow_error,
-    read_batches,
-    refits_of,
-)
 
 RIGHT_PX = 1.0
 """px at a width of 1024: mean error of the ego flow up to which a motion is right."""
@@ -34,42 +34,161 @@ RIGHT_SLOPE = 0.15
 """Softness of that limit as a target, of itself."""
 
 
-def choice_loss(
-    score: torch.Tensor, error: torch.Tensor, owner: torch.Tensor, samples: int
-) -> torch.Tensor:
-    """Cross entropy against a soft target: motions nearly as good as the best share it."""
-    losses = []
-    for b in range(samples):
-        mine = owner == b
-        wrong = error[mine]
-        best = wrong.min()
-        target = torch.softmax(-(wrong - best) / (0.1 + 0.3 * best), 0)
-        weight = 1.0 / (1.0 + (best / 4.0) ** 2)
-        losses.append(-weight * (target * torch.log_softmax(score[mine], 0)).sum())
-    return torch.stack(losses).mean()
+@dataclass(frozen=True, eq=False)
+class SelectorBatch:
+    """B samples of one grid shape, their motions as N candidates, and ground truth.
+
+    Args:
+        samples: (B, 8, n) float32 pixel buffers of the solver.
+        depth_true: (B, h, w) metres, 0 where unknown. label: (B, h, w) of ``synthetic.dataset``.
+        T: (B, 3, 4) true T_curr_prev. source: (B,) number in ``SOURCES``.
+        static: (B, h, w) probability to be static world that a pixel-wise network states.
+        proposal: (B, 3, 4) float64 its motion, NaN where it was not asked.
+    """
+
+    inputs: SelectorInputs
+    samples: np.ndarray
+    depth_true: torch.Tensor
+    label: torch.Tensor
+    T: torch.Tensor
+    source: torch.Tensor
+    static: torch.Tensor
+    proposal: torch.Tensor
+
+    def __len__(self) -> int:
+        return len(self.T)
+
+    def to(self, device: torch.device) -> SelectorBatch:
+        """The same: the solver that fits inside masks runs on the CPU."""
+        return self
+
+    def shown(self, asked: torch.Tensor) -> SelectorBatch:
+        """The same with the static world of the other network shown for ``asked`` (B,) bool."""
+        asked = asked & torch.isfinite(self.proposal).all(dim=(1, 2))
+        logit = torch.logit(self.static, eps=1e-4)
+        return replace(self, inputs=replace(self.inputs, static=logit, has_static=asked))
+
+    def expecting(self, rng: np.random.Generator) -> SelectorBatch:
+        """The same with motions expected by histories of all kinds: none, good, wrong, too sure."""
+        count = len(self.T)
+        truth = self.T.numpy().astype(np.float64)
+        last = np.tile(np.eye(4), (count, 1, 1))
+        information = self.inputs.prior_information.clone()
+        known = rng.random(count) < 0.6
+        for b in np.flatnonzero(known):
+            length = max(float(np.linalg.norm(truth[b, :, 3])), 1e-3)
+            spread = np.repeat([log_uniform(rng, (0.02, 0.6)) * length, 0.0], 3)
+            spread[3:] = log_uniform(rng, (3e-4, 1e-2))
+            spread *= np.exp(0.5 * rng.standard_normal(6))
+            stated = spread * log_uniform(rng, (0.5, 2.0))
+            if rng.random() < 0.12:  # the camera was pushed: the history knows nothing of it
+                spread = np.array([2 * length] * 3 + [0.04] * 3)
+            last[b] = se3_exp(spread * rng.standard_normal(6)) @ pose_matrix(truth[b])
+            if rng.random() < 0.6:
+                information[b] = torch.diag(torch.as_tensor(1.0 / stated**2).float())
+        inputs = replace(
+            self.inputs,
+            T_prior=torch.as_tensor(last[:, :3], dtype=torch.float32),
+            prior_information=information,
+            has_prior=torch.as_tensor(known),
+        )
+        return replace(self, inputs=inputs)
 
 
-def mask_loss(out: SelectorOutput, inputs: SelectorInputs, label: torch.Tensor) -> torch.Tensor:
-    """Binary cross entropy of the masks over usable pixels of known kind."""
-    label = label[inputs.owner]
-    known = inputs.usable[inputs.owner] & ((label == STATIC) | (label == MOVING))
-    static = (label == STATIC).float()
+def _collate(p: dict[str, np.ndarray]) -> SelectorBatch:
+    """Stacked arrays of samples -> batch."""
+    size = len(p["count"])
+    rows = [p["ray"], p["depth"][:, None], p["target"], 1 / p["flow_variance"][:, None]]
+    rows += [p["depth_variance"][:, None], p["usable"][:, None]]
+    # in the order of the solver's buffers
+    samples = np.concatenate(rows, axis=1, dtype=np.float32).reshape(size, kernels.BUFFER_ROWS, -1)
+    maps: dict[str, Any] = {field.name: p[field.name] for field in fields(GridMaps)}
+    there = np.arange(p["poses"].shape[1]) < p["count"][:, None]
+    owner = np.nonzero(there)[0]
+    inputs = replace(
+        stacked_inputs(GridMaps(**maps), torch.device("cpu")),
+        T_prior=torch.as_tensor(p["T_prior"].astype(np.float32)),
+        has_prior=torch.as_tensor(p["has_prior"]),
+    ).asking(p["poses"][there], p["facts"][there], np.arange(len(owner)), owner)
+    truth = {"depth_true": np.float32, "label": np.int64, "T": np.float32, "source": np.int64}
+    truth |= {"static": np.float32, "proposal": np.float64}
+    tensors = {name: torch.as_tensor(p[name].astype(kind)) for name, kind in truth.items()}
+    return SelectorBatch(inputs, samples, **tensors)
+
+
+def read_batches(
+    files: list[Path], batch_size: int, rng: np.random.Generator | None
+) -> Iterator[SelectorBatch]:
+    """Batches of the samples of some shards, mixed if ``rng`` is given."""
+    jobs = []
+    for samples in read_shards(files):
+        order = np.arange(len(samples["count"]))
+        if rng is not None:
+            rng.shuffle(order)
+        for k in range(0, len(order), batch_size):
+            jobs.append((samples, order[k : k + batch_size]))
+    if rng is not None:
+        rng.shuffle(jobs)
+    for samples, index in jobs:
+        yield _collate({key: value[index] for key, value in samples.items()})
+
+
+def ego_flow_error(pose: torch.Tensor, owner: torch.Tensor, batch: SelectorBatch) -> torch.Tensor:
+    """(N,) mean distance of the ego flows of pose and truth, px at a width of 1024."""
+    z = batch.depth_true[:, ::2, ::2].flatten(1)
+    ray = batch.inputs.ray[:, :, ::2, ::2].flatten(2)
+    points = torch.cat([ray, torch.ones_like(ray[:, :1])], 1) * z[:, None]
+    focal = batch.inputs.K[:, :2, None]
+
+    def seen(P: torch.Tensor, of: torch.Tensor) -> torch.Tensor:
+        moved = P[:, :, :3] @ points[of] + P[:, :, 3:]
+        return focal[of] * moved[:, :2] / moved[:, 2:].clamp(min=1e-3)
+
+    truth = seen(batch.T, torch.arange(len(batch)))
+    distance = (seen(pose, owner) - truth[owner]).norm(dim=1)
+    known = (z > 0)[owner]
+    total = torch.where(known, distance.clamp(max=1e3), 0.0).sum(1)
+    error = total / known.sum(1).clamp(min=1)
+    return error * 1024.0 / batch.inputs.image_width[owner]
+
+
+def refits_of(
+    batch: SelectorBatch, out: SelectorOutput, count: int, extra: torch.Generator | None = None
+) -> SelectorInputs | None:
+    """The ``count`` best motions of every sample, fitted inside their masks, as new candidates.
+
+    Where the selector is shown another network's static world, that network's motion takes part.
+    ``extra`` draws one of them anew at times (training), so that more than the best is seen.
+    """
+    inputs, cutoff = batch.inputs, RefineOptions().cutoff
     assert out.mask is not None
-    loss = F.binary_cross_entropy_with_logits(out.mask, static, reduction="none")
-    return ((loss * known).sum((1, 2)) / known.sum((1, 2)).clamp(min=1)).mean()
-
-
-def trust_loss(
-    logit: torch.Tensor, score: torch.Tensor, error: torch.Tensor, owner: torch.Tensor
-) -> torch.Tensor:
-    """Binary cross entropy of the probability that the chosen motion is right."""
-    target = []
-    for b in range(len(logit)):
-        mine = owner == b
-        chosen = error[mine][score[mine].argmax()]
-        limit = (3 * error[mine].min()).clamp(RIGHT_PX, WORST_RIGHT_PX)
-        target.append(torch.sigmoid((1 - chosen / limit) / RIGHT_SLOPE))
-    return F.binary_cross_entropy_with_logits(logit, torch.stack(target))
+    probability = torch.sigmoid(out.mask).numpy()
+    poses, facts, parents = [], [], []
+    for b in range(len(batch)):
+        mine = torch.nonzero(inputs.owner == b)[:, 0]
+        order = mine[out.score[mine].argsort(descending=True)].tolist()
+        if extra is not None and len(order) > count and torch.rand((), generator=extra) < 0.3:
+            swap = int(torch.randint(count, len(order), (), generator=extra))
+            order[count - 1], order[swap] = order[swap], order[count - 1]
+        starts = [(inputs.pose[k].numpy().astype(np.float64), k) for k in order[:count]]
+        masks = [probability[k] for k in order[:count]]
+        if inputs.has_static[b]:
+            start, z = batch.proposal[b].numpy(), inputs.depth[b][inputs.usable[b]]
+            near = nearest_motion(inputs.pose[mine].numpy(), start, 1.0 / float(z.median()))
+            starts.append((start, int(mine[near])))
+            masks.append(batch.static[b].numpy())
+        for (start, k), mask in zip(starts, masks, strict=True):
+            weights, K = mask_weights(mask), inputs.K[b].numpy()
+            if weights.max() <= 0:
+                continue
+            pose, fact = fit_in_mask(batch.samples[b], weights, K, start, cutoff)
+            if np.isfinite(pose).all():
+                poses.append(pose)
+                facts.append(fact)
+                parents.append(k)
+    if not poses:
+        return None
+    return inputs.asking(np.stack(poses), np.stack(facts), parents, inputs.owner[parents])
 
 
 class Looks:
@@ -83,10 +202,8 @@ class Looks:
         half: bool = False,
     ) -> None:
         self.model, self.batch, self.mirror, self.half = model, batch, mirror, half
+        self.asked: list[tuple[torch.Tensor, ...]] = []
         self.first = self._ask(batch.inputs, None)
-        self.owner, self.score = batch.inputs.owner, self.first.score
-        self.hidden = self.first.hidden
-        self.error = ego_flow_error(batch.inputs.pose, self.owner, batch)
 
     def _ask(
         self, inputs: SelectorInputs, first: tuple[SelectorInputs, SelectorOutput] | None
@@ -94,6 +211,11 @@ class Looks:
         with torch.autocast("cpu", torch.bfloat16, enabled=self.half):
             out = self.model(inputs, first, self.mirror)
         single = {name: getattr(out, name).float() for name in ("score", "hidden", "mask")}
+        error = ego_flow_error(inputs.pose, inputs.owner, self.batch)
+        self.asked.append((inputs.owner, single["score"], single["hidden"], error))
+        self.owner, self.score, self.hidden, self.error = map(
+            torch.cat, zip(*self.asked, strict=True)
+        )
         return replace(out, **single)
 
     def again(
@@ -102,14 +224,45 @@ class Looks:
         """Fit the best inside their masks and add the answers about these; None without a fit."""
         with torch.no_grad():
             more = refits_of(self.batch, self.first, refits, draw)
-        if more is None:
-            return None
-        out = self._ask(more, (self.batch.inputs, self.first))
-        self.owner = torch.cat([self.owner, more.owner])
-        self.score = torch.cat([self.score, out.score])
-        self.hidden = torch.cat([self.hidden, out.hidden])
-        self.error = torch.cat([self.error, ego_flow_error(more.pose, more.owner, self.batch)])
-        return out, more
+        return None if more is None else (self._ask(more, (self.batch.inputs, self.first)), more)
+
+    def motions(self) -> list[torch.Tensor]:
+        """Numbers of the motions of each sample."""
+        return [torch.nonzero(self.owner == b)[:, 0] for b in range(len(self.batch))]
+
+    def trust(self, network: Any) -> torch.Tensor:
+        """(B,) logit of the probability that the chosen motion is right."""
+        return network.confidence(self.score, self.hidden, self.owner, len(self.batch))
+
+    def choice_loss(self) -> torch.Tensor:
+        """Cross entropy against a soft target: motions nearly as good as the best share it."""
+        losses = []
+        for mine in self.motions():
+            wrong = self.error[mine]
+            best = wrong.min()
+            target = torch.softmax(-(wrong - best) / (0.1 + 0.3 * best), 0)
+            weight = 1.0 / (1.0 + (best / 4.0) ** 2)
+            losses.append(-weight * (target * torch.log_softmax(self.score[mine], 0)).sum())
+        return torch.stack(losses).mean()
+
+    def mask_loss(self, out: SelectorOutput, inputs: SelectorInputs) -> torch.Tensor:
+        """Binary cross entropy of masks over usable pixels of known kind."""
+        label = self.batch.label[inputs.owner]
+        known = inputs.usable[inputs.owner] & ((label == STATIC) | (label == MOVING))
+        assert out.mask is not None
+        static = (label == STATIC).float()
+        loss = F.binary_cross_entropy_with_logits(out.mask, static, reduction="none")
+        return ((loss * known).sum((1, 2)) / known.sum((1, 2)).clamp(min=1)).mean()
+
+    def trust_loss(self, network: Any) -> torch.Tensor:
+        """Binary cross entropy of the probability that the chosen motion is right."""
+        target = []
+        for mine in self.motions():
+            error = self.error[mine]
+            limit = (3 * error.min()).clamp(RIGHT_PX, WORST_RIGHT_PX)
+            chosen = error[self.score[mine].argmax()]
+            target.append(torch.sigmoid((1 - chosen / limit) / RIGHT_SLOPE))
+        return F.binary_cross_entropy_with_logits(self.trust(network), torch.stack(target))
 
 
 class SelectorTask:
@@ -145,27 +298,23 @@ class SelectorTask:
         mirror = torch.rand(count, generator=draw) < 0.5
         looks = Looks(model, batch, mirror, o.precision == "bfloat16")
         losses = {
-            "choice": choice_loss(looks.score, looks.error, looks.owner, count),
-            "mask": o.mask_weight * mask_loss(looks.first, batch.inputs, batch.label),
+            "choice": looks.choice_loss(),
+            "mask": o.mask_weight * looks.mask_loss(looks.first, batch.inputs),
         }
         if progress >= o.second_look_from:
             # one fit less in half of the updates: cheaper, and the best one is seen most
             fewer = o.refits > 1 and bool(torch.rand((), generator=draw) < 0.5)
             again = looks.again(o.refits - fewer, draw)
             if again is not None:
-                losses["second"] = choice_loss(looks.score, looks.error, looks.owner, count)
-                losses["second_mask"] = 0.5 * o.mask_weight * mask_loss(*again, batch.label)
-        trust = self.network.confidence(looks.score, looks.hidden, looks.owner, count)
-        losses["trust"] = o.trust_weight * trust_loss(
-            trust, looks.score.detach(), looks.error, looks.owner
-        )
+                losses["second"] = looks.choice_loss()
+                losses["second_mask"] = 0.5 * o.mask_weight * looks.mask_loss(*again)
+        losses["trust"] = o.trust_weight * looks.trust_loss(self.network)
         total = torch.stack(list(losses.values())).sum()
         return total, {name: value.detach() for name, value in losses.items()}
 
     def evaluate(self, network: torch.nn.Module) -> dict[str, Any]:
         """Figures on the held-out shards beside the training's, ``FOLDER_held_out``."""
-        folder = self.folder.with_name(f"{self.folder.name}_held_out")
-        files = sorted(folder.glob("*.npz"))
+        files = sorted(Path(f"{self.folder}_held_out").glob("*.npz"))
         return evaluate_selector(network, files, self.options.refits) if files else {}
 
 
@@ -186,10 +335,8 @@ def evaluate_selector(
         looks = Looks(network, batch)
         first_look = len(looks.owner)
         looks.again(refits)
-        score, error = looks.score, looks.error
-        trust = network.confidence(score, looks.hidden, looks.owner, len(batch)).sigmoid()
-        for b in range(len(batch)):
-            mine = torch.nonzero(looks.owner == b)[:, 0]
+        score, error, trust = looks.score, looks.error, looks.trust(network).sigmoid()
+        for b, mine in enumerate(looks.motions()):
             first = mine[mine < first_look]
             picks = (first[0], first[score[first].argmax()], mine[score[mine].argmax()])
             wrong = [float(error[k]) for k in picks] + [float(error[mine].min()), float(trust[b])]

@@ -11,6 +11,7 @@ import dataclasses
 import json
 import math
 import pickle
+import statistics
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -39,10 +40,7 @@ Task = PwvoTask | SelectorTask
 
 
 class Trainer:
-    """A run: task, optimiser, and their state on disk.
-
-    Under ``torch.distributed`` (``torchrun``) every process makes its own Trainer; gradients are
-    averaged, and only rank 0 writes.
+    """A run: task, optimiser, and their state on disk; under torchrun one in every process.
 
     ``folder``: of ``checkpoint.pt`` and ``log.jsonl``; None writes nothing. ``workers``: processes
     that draw samples; 0 draws them in this one. ``report`` is called with every entry of the log.
@@ -107,30 +105,24 @@ class Trainer:
         if math.isfinite(float(norm)):
             self.optimizer.step()
             self.skipped_in_a_row = 0
-            self._average()
+            if self.ema is not None:
+                # A young average follows quickly: it must forget the random start.
+                decay = min(self.options.ema_decay, (1 + self.step) / (10 + self.step))
+                ours, theirs = self.ema.state_dict(), self.network.state_dict()
+                for name, value in ours.items():
+                    value.lerp_(theirs[name], 1 - decay)
         else:
             self.skipped += 1
             self.skipped_in_a_row += 1
             if self.skipped_in_a_row >= 50:
                 raise DegenerateError(
                     f"training: loss or gradient not finite 50 times in a row at update "
-                    f"{self.step}. Lower optimizer.learning_rate or loss weights; the last "
-                    f"checkpoint is sound."
+                    f"{self.step}. Lower the learning rate; the last checkpoint is sound."
                 )
         self.step += 1
         self.samples += len(batch) * self.world
         figures = {"loss": float(loss.detach()), "grad_norm": float(norm), "lr": rate}
         return figures | {name: float(part) for name, part in parts.items()}
-
-    def _average(self) -> None:
-        """Let the running average of the weights follow."""
-        if self.ema is None:
-            return
-        # A young average follows quickly: it must forget the random start.
-        decay = min(self.options.ema_decay, (1 + self.step) / (10 + self.step))
-        states = (network.state_dict().values() for network in (self.ema, self.network))
-        for ours, theirs in zip(*states, strict=True):
-            ours.lerp_(theirs, 1 - decay)
 
     def run(self, time_limit_s: float = math.inf, until: int | None = None) -> str:
         """Train until the options' steps, a time limit or a request to stop, and save.
@@ -160,7 +152,12 @@ class Trainer:
                 seen, logged = [], now
             if options.evaluate_every and self.step % options.evaluate_every == 0:
                 self.evaluate()
-            stop = self._agree(self.stop_requested, self.elapsed_s >= time_limit_s)
+            # what one process is told ends all
+            stop = 2 if self.stop_requested else int(self.elapsed_s >= time_limit_s)
+            if self.world > 1:
+                flag = torch.tensor(stop, device=self.device)
+                dist.all_reduce(flag, dist.ReduceOp.MAX)
+                stop = int(flag)
             if stop:
                 why = ("steps", "time", "signal")[stop]
                 break
@@ -169,13 +166,6 @@ class Trainer:
                 saved = now
         self.save()
         return why
-
-    def _agree(self, signalled: bool, late: bool) -> int:
-        """2 = a process was told to stop, 1 = time is up on one, 0 = go on; equal on all ranks."""
-        flag = torch.tensor(2 if signalled else int(late), device=self.device)
-        if self.world > 1:
-            dist.all_reduce(flag, dist.ReduceOp.MAX)
-        return int(flag)
 
     def evaluate(self) -> dict[str, Any]:
         """Figures of the exported network on development samples, also into the log."""
@@ -188,34 +178,33 @@ class Trainer:
     def _log(self, entry: dict[str, Any]) -> None:
         if self.rank != 0:
             return
-        progress = {key: getattr(self, key) for key in PROGRESS}
-        entry = progress | {"elapsed_s": round(self.elapsed_s, 1)} | entry
+        entry = {key: getattr(self, key) for key in PROGRESS} | entry
         if self.folder is not None:
             with (self.folder / LOG).open("a", encoding="utf-8") as file:
                 file.write(json.dumps(entry) + "\n")
         if self.report is not None:
             self.report(entry)
 
+    @property
+    def _parts(self) -> dict[str, Any]:
+        """What has a state beside the progress."""
+        parts = {"network": self.network, "optimizer": self.optimizer, "ema": self.ema}
+        return {name: part for name, part in parts.items() if part is not None}
+
     def save(self) -> None:
         """Write ``checkpoint.pt``: everything that a later process needs to go on."""
         if self.folder is None or self.rank != 0:
             return
-        state = {
-            "record": self.record,
-            "network": self.network.state_dict(),
-            "optimizer": self.optimizer.state_dict(),
-            "ema": None if self.ema is None else self.ema.state_dict(),
-            "progress": {key: getattr(self, key) for key in PROGRESS},
-        }
+        state = {name: part.state_dict() for name, part in self._parts.items()}
+        progress = {key: getattr(self, key) for key in PROGRESS}
         with atomic_write(self.folder / CHECKPOINT, "wb") as file:
-            torch.save(state, file)
+            torch.save(state | {"record": self.record, "progress": progress}, file)
 
     def start_from(self, weights: dict[str, torch.Tensor], name: str) -> None:
         """Take the weights of another network of the same shapes; everything else starts anew."""
-        with _fits(name):
-            self.network.load_state_dict(weights)
-            if self.ema is not None:
-                self.ema.load_state_dict(weights)
+        with _reading(name):
+            for network in filter(None, (self.network, self.ema)):
+                network.load_state_dict(weights)
 
     def resume(self) -> bool:
         """Go on where the folder's checkpoint ended, if there is one of the same options and data.
@@ -233,54 +222,51 @@ class Trainer:
                 f"{path}: is of a run with other options: {changed}. Choose another folder, or "
                 f"train anew with --overwrite."
             )
-        with _fits(str(path)):
-            self.network.load_state_dict(state["network"])
-            self.optimizer.load_state_dict(state["optimizer"])
-            if self.ema is not None:
-                self.ema.load_state_dict(state["ema"])
+        with _reading(str(path)):
+            for name, part in self._parts.items():
+                part.load_state_dict(state[name])
             for key in PROGRESS:
                 setattr(self, key, state["progress"][key])
         return True
 
 
 @contextlib.contextmanager
-def _fits(name: str) -> Iterator[None]:
-    """Say of what does not fit a network where it comes from."""
+def _reading(name: str) -> Iterator[None]:
+    """Say of weights that cannot be read or do not fit where they come from."""
+    wrong = (OSError, RuntimeError, EOFError, LookupError, TypeError, ValueError)
     try:
         yield
-    except (RuntimeError, ValueError, KeyError, TypeError) as error:
-        raise CheckpointError(f"{name}: does not fit this network: {error}") from None
+    except (*wrong, pickle.UnpicklingError) as error:
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+        raise CheckpointError(f"{name}: not a checkpoint of this network: {reason}.") from None
 
 
 def read_checkpoint(path: Path, device: torch.device | str = "cpu") -> dict[str, Any]:
     """Content of a ``checkpoint.pt``; nothing in it can run."""
-    try:
+    with _reading(str(path)):
         state = torch.load(path, map_location=device, weights_only=True)
         return {**state, "record": state["record"]}
-    except (OSError, RuntimeError, EOFError, KeyError, TypeError, pickle.UnpicklingError) as error:
-        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
-        raise CheckpointError(f"{path}: not a checkpoint of a training: {reason}.") from None
 
 
-def difference(before: Any, now: Any, where: str = "") -> str:
+def difference(before: dict[str, Any], now: dict[str, Any]) -> str:
     """First key in which two records differ, with both values; empty if they agree."""
-    if isinstance(before, dict) and isinstance(now, dict):
-        for key in before | now:
-            if where == "options" and key in FREE_TO_CHANGE:
-                continue
-            name = f"{where}.{key}" if where else key
-            found = difference(before.get(key), now.get(key), name)
-            if found:
-                return found
-        return ""
-    return "" if before == now else f"{where} was {before!r}, now {now!r}"
+    free = {f"options.{name}" for name in FREE_TO_CHANGE}
+    old, new = _flat("", before), _flat("", now)
+    for key in old | new:
+        if key not in free and old.get(key) != new.get(key):
+            return f"{key} was {old.get(key)!r}, now {new.get(key)!r}"
+    return ""
+
+
+def _flat(place: str, value: Any) -> dict[str, Any]:
+    """Values of nested mappings by their keys, joined with dots."""
+    if not isinstance(value, dict):
+        return {place.strip("."): value}
+    return {k: v for key, x in value.items() for k, v in _flat(f"{place}.{key}", x).items()}
 
 
 def _means(entries: list[dict[str, float]]) -> dict[str, float]:
     """Mean of each figure over the entries in which all figures are finite."""
     good = [e for e in entries if all(math.isfinite(value) for value in e.values())]
     names = dict.fromkeys(name for entry in good for name in entry)
-    return {
-        name: sum(e[name] for e in good if name in e) / sum(name in e for e in good)
-        for name in names
-    }
+    return {name: statistics.fmean(e[name] for e in good if name in e) for name in names}

@@ -28,10 +28,8 @@ from hybridvo.torch_geometry import euler_transform
 
 PUBLISHED_SEED = 1000
 """First seed of published figures; smaller ones are for development."""
-
 EPE_LIMIT_PX = 400.0
 """Pixels with a true ego flow of this length or more count as 0 in EPE, as published."""
-
 FIGURES = ("r_err_deg", "t_err", "epe")
 
 
@@ -107,19 +105,17 @@ def evaluate_network(
         ``median_ratio_*``, the mean and the median of |error| / exp(s) in degrees and metres: 1
         and 0.69 for calibrated Laplace scales.
     """
-    if count < 1 or batch_size < 1:
+    if count < 1:
         raise InputError(f"evaluate_network: expected count >= 1, got {count}.")
     preset = preset.for_evaluation() if hasattr(preset, "for_evaluation") else preset
     device = next(network.parameters()).device
-    errors, pixels = [], []
-    was_training = network.training
+    errors, pixels, was_training = [], [], network.training
     network.eval()
     for first in range(0, count, batch_size):
         numbers = range(first, min(first + batch_size, count))
         batch = collate([preset.sample(sample_generator(seed, i)) for i in numbers]).to(device)
-        half = precision == "bfloat16"
         with torch.inference_mode():
-            with torch.autocast(device.type, torch.bfloat16, enabled=half):
+            with torch.autocast(device.type, torch.bfloat16, enabled=precision == "bfloat16"):
                 output = predict(network, batch.inputs, selection)
             errors.append(_errors(output, batch, selection))
             if isinstance(output, PixelwisePrediction) and output.log_scale_rotation is not None:
@@ -152,22 +148,17 @@ def _errors(output: NetworkOutput, batch: TrainingBatch, selection: str) -> np.n
         error = torch.where(counts[:, None], difference.abs(), 0.0).mean(dim=1)
         return error.flatten(1).sum(1) / total
 
-    columns = [
-        (rotation - gt.rotation_deg).abs().mean(1),
-        (translation - gt.translation).abs().mean(1),
-        epe(flow - gt.ego_flow),
-        gt.rotation_deg.abs().mean(1),
-        gt.translation.abs().mean(1),
-        epe(gt.ego_flow),
-    ]
-    return torch.stack(columns, dim=1).float().cpu().numpy()
+    def errors(r: torch.Tensor, t: torch.Tensor, f: torch.Tensor) -> list[torch.Tensor]:
+        return [r.abs().mean(1), t.abs().mean(1), epe(f)]
+
+    ours = errors(rotation - gt.rotation_deg, translation - gt.translation, flow - gt.ego_flow)
+    zero = errors(gt.rotation_deg, gt.translation, gt.ego_flow)
+    return torch.stack(ours + zero, dim=1).float().cpu().numpy()
 
 
 def _uncertainty(output: PixelwisePrediction, batch: TrainingBatch) -> list[np.ndarray]:
     """Per pair (N, 11) of its pixels: moving; of both halves mean s, mean |error|, |error| / U."""
-    gt = batch.targets
-    pick = np.s_[..., ::4, ::4]  # enough for the figures
-    valid = batch.inputs.valid[pick]
+    gt, size = batch.targets, batch.moving.shape[1:]
     maps = [batch.moving[:, None].float()]
     for value, s, target in (
         (output.rotation, output.log_scale_rotation, gt.rotation_deg),
@@ -175,10 +166,10 @@ def _uncertainty(output: PixelwisePrediction, batch: TrainingBatch) -> list[np.n
     ):
         assert s is not None
         error = (value - target[:, :, None, None]).abs()
-        means = [x.mean(1, keepdim=True) for x in (s, error)]
-        half = torch.cat([*means, error * (-s).exp()], dim=1)
-        maps.append(F.interpolate(half.float(), size=batch.moving.shape[1:], mode="nearest"))
-    table = torch.cat(maps, dim=1)[pick].permute(0, 2, 3, 1)
+        half = [s.mean(1, keepdim=True), error.mean(1, keepdim=True), error * (-s).exp()]
+        maps.append(F.interpolate(torch.cat(half, dim=1).float(), size=size, mode="nearest"))
+    pick = np.s_[..., ::4, ::4]  # enough for the figures
+    table, valid = torch.cat(maps, dim=1)[pick].permute(0, 2, 3, 1), batch.inputs.valid[pick]
     return [table[b][valid[b]].cpu().numpy() for b in range(len(batch))]
 
 
@@ -187,13 +178,11 @@ def _uncertainty_figures(pixels: list[np.ndarray], index: int, name: str) -> dic
     keys = [f"{key}_{name}" for key in ("auroc", "spearman", "laplace_ratio", "median_ratio")]
     if not pixels:
         return dict.fromkeys(keys)
-    table = np.concatenate(pixels)
-    first = 1 + 5 * index
+    table, first = np.concatenate(pixels), 1 + 5 * index
     ratio = table[:, first + 2 : first + 5]
-    half = [p[:, first : first + 2] for p in pixels if len(p)]
     # where s or the error is constant there is no rank correlation
-    varied = [x for x in half if np.ptp(x, axis=0).all()]
-    ranks = [spearmanr(x).statistic for x in varied]
+    halves = [p[:, first : first + 2] for p in pixels if len(p)]
+    ranks = [spearmanr(x).statistic for x in halves if np.ptp(x, axis=0).all()]
     spearman = float(np.mean(ranks)) if ranks else None
     auroc = area_under_curve(table[:, first], table[:, 0] > 0.5)
     values = (auroc, spearman, float(ratio.mean()), float(np.median(ratio)))

@@ -3,7 +3,6 @@ from __future__ import annotations
 import functools
 import importlib
 import importlib.util
-from concurrent.futures import ThreadPoolExecutor
 
 import cv2
 import numpy as np
@@ -21,18 +20,12 @@ from hybridvo.synthetic.scenarios import Scenario, make_pair
 from hybridvo.types import Camera, Frame, FramePair
 
 POINT_SOLVERS = ["pnp-ransac", "pnp-ransac-tuned", "usac-magsac", "poselib"]
-ALL = [*POINT_SOLVERS, "opencv-rgbd", "open3d-rgbd", "identity"]
 HEIGHT, WIDTH = 96, 160
 CAMERA = Camera(150.0, 155.0, 80.5, 46.0, HEIGHT, WIDTH)
 
 
 @pytest.fixture(params=POINT_SOLVERS)
 def solver(request):
-    return _available(request.param)
-
-
-@pytest.fixture(params=ALL)
-def any_method(request):
     return _available(request.param)
 
 
@@ -82,18 +75,6 @@ def _assert_close(result: RelativePose, T: np.ndarray, rad: float, metres: float
     assert np.linalg.norm(result.T_curr_prev[:3, 3] - T[:3, 3]) < metres
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
-def test_exact_static_pair(solver, seed):
-    rng = np.random.default_rng(seed)
-    T = _motion(rng.uniform(-0.15, 0.15, 3), rng.uniform(-0.03, 0.03, 3))
-    result = solver(_pair(_depth(seed), T), seed=seed)
-    _assert_sane(result)
-    # float32 flow is exact to 1e-6 px at f = 150; OpenCV stops at 1e-5 or so of its own
-    _assert_close(result, T, 1e-4, 1e-3)
-    assert result.inlier_ratio > 0.999
-    assert result.ms > 0
-
-
 def test_noisy_pair_with_moving_objects(solver):
     pair, truth = make_pair(Scenario(moving=0.2), 1, height=218, width=512)
     # the peers' medians are 0.05-0.2 px at f = 1120: 0.2 mrad; ten times that is a gross error
@@ -135,7 +116,7 @@ def test_swapped_frames_give_the_inverse_motion(solver):
     np.testing.assert_allclose(forward.T_prev_curr, backward.T_curr_prev, atol=1e-3)
 
 
-# Degenerate geometry and bad data: rows F6-F14 of the fault table, each solver
+# Degenerate geometry; what holds of every method is in tests/contract
 
 
 def test_f8_five_motions_and_no_world(solver):
@@ -150,23 +131,6 @@ def test_f8_five_motions_and_no_world(solver):
     result = solver(_pair(depth, flow=flow))
     _assert_sane(result)
     assert result.status.state is not State.OK
-
-
-def test_f9_zero_motion(solver):
-    result = solver(_pair(T=np.eye(4)))
-    _assert_sane(result)
-    # F9 asks 1e-6 rad and 1e-4 m of exact data
-    _assert_close(result, np.eye(4), 1e-6, 1e-4)
-
-
-@pytest.mark.parametrize("axis", range(3))
-def test_f10_pure_rotation(solver, axis):
-    rotation = np.zeros(3)
-    rotation[axis] = 0.04
-    T = _motion((0, 0, 0), rotation)
-    result = solver(_pair(T=T))
-    _assert_sane(result)
-    _assert_close(result, T, np.deg2rad(0.05), 1e-3)
 
 
 @pytest.mark.parametrize("slope", [0.0, 0.4])
@@ -232,15 +196,6 @@ def test_f13_too_few_points(solver, count):
     assert str(by_depth.status) == ("failed(low_inliers)" if count else "failed(no_valid_depth)")
 
 
-def test_f13_six_exact_points_are_enough_or_refused(solver):
-    keep = np.zeros((HEIGHT, WIDTH), bool)
-    keep[[10, 20, 80, 85, 50, 40], [10, 140, 20, 130, 75, 30]] = True
-    result = solver(_pair(_only(keep)))
-    _assert_sane(result)
-    if result.ok:
-        _assert_close(result, _motion(), 1e-3, 1e-2)
-
-
 def test_f14_points_behind_the_camera(solver):
     exact = _pair()
     result = solver(_pair(-_depth(), flow=exact.flow))
@@ -262,48 +217,6 @@ def test_f14_answer_that_puts_its_points_behind_the_camera_is_refused():
     assert result.inlier_ratio == 0.0
 
 
-@pytest.mark.parametrize("fill", [np.nan, np.inf, 0.0, -3.0])
-@pytest.mark.parametrize("share", [0.1, 0.5, 0.99, 1.0])
-def test_f6_invalid_depth_is_masked(solver, fill, share):
-    bad = np.random.default_rng(0).random((HEIGHT, WIDTH)) < share
-    result = solver(_pair(np.where(bad, fill, _depth()).astype(np.float32), flow=_pair().flow))
-    _assert_sane(result)
-    if share == 1.0:
-        assert str(result.status) == "failed(no_valid_depth)"
-    else:
-        _assert_close(result, _motion(), 1e-4, 1e-3)
-
-
-@pytest.mark.parametrize("fill", [np.nan, np.inf, -np.inf, 1e38, 500.0])
-@pytest.mark.parametrize("share", [0.5, 1.0])
-def test_f7_invalid_flow_is_masked(solver, fill, share):
-    bad = np.random.default_rng(0).random((HEIGHT, WIDTH)) < share
-    flow = _pair().flow.copy()
-    flow[bad, 0] = fill
-    result = solver(_pair(flow=flow))
-    _assert_sane(result)
-    if share == 1.0:
-        assert result.status.state is State.FAILED
-        assert result.status.reason in (Reason.NO_FLOW, Reason.LOW_INLIERS)
-    else:
-        _assert_close(result, _motion(), 1e-4, 1e-3)
-
-
-@pytest.mark.parametrize("metres", [1e-38, 1e-7, 1e-5, 1e5, 1e7, 3e38])
-def test_f37_depth_at_the_ends_of_the_range(any_method, metres):
-    depth = np.full((HEIGHT, WIDTH), metres, np.float32)
-    result = any_method(_pair(depth, flow=_pair().flow))
-    _assert_sane(result)
-
-
-def test_f37_random_garbage(any_method):
-    rng = np.random.default_rng(0)
-    for scale in (1e-30, 1.0, 1e30):
-        flow = (scale * rng.standard_normal((HEIGHT, WIDTH, 2))).astype(np.float32)
-        depth = np.abs(scale * rng.standard_normal((HEIGHT, WIDTH))).astype(np.float32)
-        _assert_sane(any_method(_pair(depth, flow=flow)))
-
-
 @pytest.mark.parametrize("error", [cv2.error, np.linalg.LinAlgError, RuntimeError])
 def test_a_library_that_raises_is_a_failed_status(monkeypatch, error):
     def boom(*args, **kwargs):
@@ -314,48 +227,6 @@ def test_a_library_that_raises_is_a_failed_status(monkeypatch, error):
         result = estimate(_pair(), method=name)
         _assert_sane(result)
         assert str(result.status) == "failed(solver_diverged)"
-
-
-def test_missing_inputs_have_their_reason(solver):
-    pair = _pair()
-    no_flow = FramePair(pair.prev, pair.curr, None)
-    assert str(solver(no_flow).status) == "failed(no_flow)"
-    no_depth = FramePair(Frame(None, None, CAMERA), pair.curr, pair.flow)
-    assert str(solver(no_depth).status) == "failed(no_valid_depth)"
-
-
-def test_masked_garbage_changes_nothing_but_the_draw(solver):
-    pair = _pair()
-    bad = np.zeros((HEIGHT, WIDTH), bool)
-    bad[:, :40] = True
-    flow = pair.flow.copy()
-    flow[bad] = 7.0
-    result = solver(FramePair(pair.prev, pair.curr, flow, flow_valid=~bad))
-    _assert_close(result, _motion(), 1e-4, 1e-3)
-    assert result.inlier_ratio > 0.999
-
-
-def test_f23_dtypes(solver):
-    pair = _pair()
-    depth = pair.prev.depth
-    for dtype in (np.float64, ">f4"):
-        cast = solver(_pair(depth.astype(dtype), flow=pair.flow.astype(dtype)))
-        _assert_close(cast, _motion(), 1e-4, 1e-3)
-    # float16 keeps 11 bits: flow of up to 8 px to 0.004 px, depth to 0.05 %
-    half = solver(_pair(depth.astype(np.float16), flow=pair.flow.astype(np.float16)))
-    _assert_close(half, _motion(), 1e-3, 1e-2)
-    for dtype in (np.uint8, np.uint16, np.int32):
-        with pytest.raises(InputError, match="floating-point"):
-            solver(_pair(depth.astype(dtype), flow=pair.flow))
-
-
-def test_non_contiguous_arrays(solver):
-    pair = _pair()
-    depth = np.asfortranarray(pair.prev.depth)
-    flow = np.asfortranarray(pair.flow)
-    expected = solver(pair)
-    result = solver(_pair(depth, flow=flow))
-    np.testing.assert_array_equal(result.T_curr_prev, expected.T_curr_prev)
 
 
 # Determinism and independence
@@ -371,14 +242,6 @@ def test_same_seed_same_bytes_whatever_the_global_generators(solver):
     assert a.T_curr_prev.tobytes() == b.T_curr_prev.tobytes()
     assert a.covariance.tobytes() == b.covariance.tobytes()
     assert solver(pair, seed=6).T_curr_prev.tobytes() != a.T_curr_prev.tobytes()
-
-
-def test_f42_two_threads_give_what_one_gives(solver):
-    pairs = [make_pair(Scenario(moving=0.3), s, height=109, width=256)[0] for s in range(4)]
-    serial = [solver(p).T_curr_prev.tobytes() for p in pairs]
-    with ThreadPoolExecutor(2) as pool:
-        threaded = [r.T_curr_prev.tobytes() for r in pool.map(solver, pairs)]
-    assert serial == threaded
 
 
 # Covariance

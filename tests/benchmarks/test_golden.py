@@ -25,7 +25,6 @@ CASE = {
     "ms": 20.0,
     "spread": {"median": 0.002},
 }
-RUN = CASE | {"exit_code": 0, "files": ["run.json", "steps.csv"], "columns": ["index", "status"]}
 PRIOR = CASE | {"without": {"median": 0.06, "failed": 0, "unflagged": 0}}
 
 
@@ -80,11 +79,6 @@ def test_the_covariance_under_the_model_s_noise_is_judged_without_earlier_figure
     assert words(figures(CASE), new) == ["WORSE"]
 
 
-@pytest.mark.parametrize("change", [{"exit_code": 3}, {"files": ["run.json"]}, {"columns": []}])
-def test_the_command_line_keeps_what_it_owes(change):
-    assert words(figures(RUN), figures(RUN | change)) == ["WORSE"]
-
-
 def test_a_true_prior_never_makes_an_answer_worse():
     name = "prior_true/heavy/refine"
     assert compare(figures(CASE), figures(PRIOR, name)) == []
@@ -111,5 +105,5 @@ def test_the_frozen_figures_hold_every_kind_of_case():
 
     frozen = json.loads((ROOT / "docs/golden.json").read_text(encoding="utf-8"))
     kinds = {name.split("/")[0].split("_")[0] for name in frozen["cases"]}
-    assert {"heavy", "scenario", "degenerate", "model", "track", "command"} <= kinds
+    assert {"heavy", "scenario", "degenerate", "model", "track"} <= kinds
     assert compare(frozen, frozen) == []

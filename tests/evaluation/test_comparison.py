@@ -13,13 +13,14 @@ import numpy as np
 import pytest
 
 from hybridvo.cli import main
+from hybridvo.commands.compare import WRITTEN, compare, methods_to_run, open_all
 from hybridvo.data.sequence import open_sequence
 from hybridvo.errors import InputError, LockedError
-from hybridvo.evaluation.comparison import WRITTEN, compare, expand, methods_to_run
-from hybridvo.evaluation.sequence_job import PAIR_COLUMNS, ComparisonOptions
+from hybridvo.evaluation.scores import PAIR_COLUMNS
 from hybridvo.files import LOCK
 from hybridvo.network.models import Models
 from hybridvo.odometry import Odometry
+from hybridvo.options import FlowOptions, Options
 from hybridvo.pipeline import METHODS, weights_hash
 from hybridvo.results import RelativePose
 from hybridvo.synthetic.render import write_sintel
@@ -53,8 +54,9 @@ def tiny(tree: Path) -> Path:
     return tree / "training" / "clean" / "tiny"
 
 
-def make_options(*paths: Path, methods: tuple[str, ...] = FAST, **more: Any) -> ComparisonOptions:
-    return ComparisonOptions(tuple(map(str, paths)), methods=methods, **more)
+def run(*paths: Path, out: Path, flow: str = "auto", **more: Any) -> None:
+    options = Options(flow=FlowOptions(source=flow))
+    compare(paths, out, options=options, **{"methods": FAST} | more)
 
 
 def rows_of(path: Path) -> list[dict[str, str]]:
@@ -105,8 +107,7 @@ def test_results_hold_what_the_interface_promises(tiny, tmp_path, capsys) -> Non
         ]
         assert row["epe_l2_px"] == pytest.approx(np.mean(mine))
         assert float(line["epe_l2_px"]) == row["epe_l2_px"]
-    assert not (out / "parts").exists()
-    assert all((out / entry["path"]).exists() for entry in result["trajectories"])
+    assert all((out / row["trajectory"]).exists() for row in result["rows"])
     images = {e["method"]: cv2.imread(str(out / e["picture"])) for e in result["worst_pairs"]}
     assert images["refine"].shape[1] > images["identity"].shape[1]  # with the pixels' weights
 
@@ -115,35 +116,41 @@ def test_results_hold_what_the_interface_promises(tiny, tmp_path, capsys) -> Non
 def test_a_method_gives_what_it_gives_alone(tree: Path, tmp_path: Path, method: str) -> None:
     """Beside others, and with flow that they share, as a tracker of its own: the same motions."""
     path = tree / "training" / "clean" / "longer"
-    compare(make_options(path, methods=("identity", method), flow="dis"), tmp_path / "out")
+    run(path, out=tmp_path / "out", methods=("identity", method), flow="dis")
     sequence = open_sequence(path)
     vo = Odometry(method=method)
     poses = [vo.track(sequence.frame(i)).T_world_cam for i in range(len(sequence))]
     result = json.loads((tmp_path / "out" / "results.json").read_text())
-    (entry,) = (e for e in result["trajectories"] if e["method"] == method)
-    found = read_trajectory(tmp_path / "out" / entry["path"], "tum")
+    (row,) = (row for row in result["rows"] if row["method"] == method)
+    found = read_trajectory(tmp_path / "out" / row["trajectory"], "tum")
     np.testing.assert_allclose(found.T_world_cam, poses, atol=1e-6)
 
 
-def test_resume_keeps_finished_sequences(tree: Path, tmp_path: Path) -> None:
+def test_resume_keeps_finished_runs(tree: Path, tmp_path: Path, monkeypatch) -> None:
     paths = [tree / "training" / "clean" / name for name in ("tiny", "longer")]
-    options = functools.partial(make_options, flow="file")
-    compare(options(*paths), tmp_path / "whole")
-    # as after an interruption: the first sequence is finished, the second is not
-    read: list[str] = []
+    files = functools.partial(run, *paths, flow="file")
+    files(out=tmp_path / "whole")
+    # as after an interruption: the first two runs are finished, the third is not
+    cut, track, count = tmp_path / "cut", Odometry.track, 0
 
-    def interrupt(message: str, done: int, total: int) -> None:
-        if done > 3:
+    def interrupted(self: Odometry, *arguments: Any) -> Any:
+        nonlocal count
+        count += 1
+        if count == 11:
             raise KeyboardInterrupt
+        return track(self, *arguments)
 
-    with pytest.raises(KeyboardInterrupt):
-        compare(options(*paths), tmp_path / "cut", progress=interrupt)
-    assert len(list((tmp_path / "cut" / "parts").iterdir())) == 1
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(Odometry, "track", interrupted)
+        files(out=cut)
+    states = [json.loads(path.read_text())["state"] for path in cut.rglob("run.json")]
+    assert sorted(states) == ["done", "done", "running"]
     with pytest.raises(InputError, match="--resume"):
-        compare(options(*paths), tmp_path / "cut")
-    compare(options(*paths), tmp_path / "cut", mode="resume", progress=lambda m, *_: read.append(m))
-    assert any("1 of 2 sequences" in message for message in read)
-    assert outcome(tmp_path / "cut") == outcome(tmp_path / "whole")
+        files(out=cut)
+    kept = (cut / "runs" / "tiny" / "identity-file" / "steps.csv").stat().st_mtime_ns
+    files(out=cut, mode="resume")
+    assert (cut / "runs" / "tiny" / "identity-file" / "steps.csv").stat().st_mtime_ns == kept
+    assert outcome(cut) == outcome(tmp_path / "whole")
 
 
 def test_a_broken_frame_is_a_failed_pair_and_the_next_spans_it(tiny: Path, tmp_path: Path) -> None:
@@ -152,7 +159,7 @@ def test_a_broken_frame_is_a_failed_pair_and_the_next_spans_it(tiny: Path, tmp_p
     sequence = root / "clean" / "tiny"
     sorted(sequence.glob("*.png"))[1].write_bytes(b"no image")
     out = tmp_path / "out"
-    compare(make_options(sequence, methods=("refine", "identity"), flow="dis"), out)
+    run(sequence, out=out, methods=("refine", "identity"), flow="dis")
     rows = [row for row in rows_of(out / "pairs.csv") if row["method"] == "refine"]
     assert [row["index"] for row in rows] == ["0", "1", "2"]
     assert rows[0]["status"].startswith("failed") and rows[0]["epe_l2_px"] == ""
@@ -167,7 +174,7 @@ def test_a_broken_frame_is_a_failed_pair_and_the_next_spans_it(tiny: Path, tmp_p
 def test_without_ground_truth_there_are_reasons(walk: Path, tmp_path: Path) -> None:
     shutil.copytree(walk, tmp_path / "walk")
     (tmp_path / "walk" / "poses.txt").unlink()
-    compare(make_options(tmp_path / "walk", flow="file"), tmp_path / "out")
+    run(tmp_path / "walk", out=tmp_path / "out", flow="file")
     result = json.loads((tmp_path / "out" / "results.json").read_text())
     for row in result["rows"]:
         for key in ("epe", "epe_l2_px", "ate_rmse", "rot_err_deg_mean", "failure_rate"):
@@ -176,22 +183,21 @@ def test_without_ground_truth_there_are_reasons(walk: Path, tmp_path: Path) -> N
     assert "Nothing is scored" in text
 
 
-def test_a_bug_of_a_method_costs_its_pairs(tiny: Path, tmp_path: Path, monkeypatch) -> None:
+def test_a_bug_of_a_method_costs_its_run(tiny: Path, tmp_path: Path, monkeypatch) -> None:
     def broken(pair: Any, context: Any) -> RelativePose:
         raise ZeroDivisionError("a bug")
 
     monkeypatch.setitem(METHODS, "pnp-ransac", broken)
-    compare(make_options(tiny, flow="file"), tmp_path / "out")
-    rows = rows_of(tmp_path / "out" / "pairs.csv")
-    status = {row["method"]: (row["status"], row["message"]) for row in rows}
-    assert status["pnp-ransac"] == ("failed(raised)", "ZeroDivisionError: a bug")
-    assert status["identity"][0] == "ok"
+    run(tiny, out=tmp_path / "out", flow="file")
+    result = json.loads((tmp_path / "out" / "results.json").read_text())
+    assert result["missing"] == {"pnp-ransac on tiny": "ZeroDivisionError: a bug"}
+    assert [row["method"] for row in result["rows"]] == ["identity"]
 
 
 def test_refused_folders(tiny: Path, tmp_path: Path) -> None:
     (tmp_path / "held").mkdir()
     with filelock.FileLock(tmp_path / "held" / LOCK), pytest.raises(LockedError):
-        compare(make_options(tiny), tmp_path / "held")
+        run(tiny, out=tmp_path / "held")
 
 
 @pytest.mark.parametrize(
@@ -215,12 +221,11 @@ def test_bad_options(tiny, tmp_path, arguments, field, capsys) -> None:
 
 
 def test_a_folder_stands_for_its_sequences(tree: Path, walk: Path) -> None:
-    found = [tree / "training" / "clean" / name for name in ("longer", "tiny")]
     for path in (tree, tree / "training", tree / "training" / "clean"):
-        assert expand(path) == found
-    assert expand(found[0]) == [found[0]]
-    assert expand(walk) == [walk] and expand(walk.parent)[-1] == walk
-    assert expand(tree / "nothing") == [tree / "nothing"]
+        assert [sequence.name for sequence in open_all(path)] == ["longer", "tiny"]
+    assert [sequence.root for sequence in open_all(walk)] == [walk]
+    with pytest.raises(InputError, match="nothing"):
+        open_all(tree / "nothing")
 
 
 def test_weights_of_a_method_are_all_that_it_reads(tmp_path: Path) -> None:

@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 import pytest
 
+from hybridvo.commands.compare import compare
 from hybridvo.errors import InputError
-from hybridvo.evaluation.comparison import compare
 from hybridvo.evaluation.protocols import protocol_summary, protocols, same_intrinsics
-from hybridvo.evaluation.sequence_job import ComparisonOptions
 from hybridvo.geometry import ego_flow, make_transform
+from hybridvo.options import FlowOptions, Options, RunOptions
 from hybridvo.types import Camera
 
 TAG = struct.pack("<f", 202021.25)
@@ -60,8 +60,8 @@ def sintel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def compared(sintel: Path, out: Path, name: str) -> dict:
-    options = ComparisonOptions((str(sintel),), ("identity",), flow="file", protocol=name, worst=1)
-    compare(options, out)
+    options = Options(flow=FlowOptions(source="file"))
+    compare((sintel,), out, methods=("identity",), options=options, protocol=name, worst=1)
     return json.loads((out / "results.json").read_text())
 
 
@@ -74,7 +74,8 @@ def test_the_complete_sets_have_the_published_numbers_of_pairs() -> None:
     frames = {name: frames - 1 for name, frames in paper.sequences.items()}
     frames["ambush_4"] -= 23
     frames["shaman_2"] -= 26
-    summary = protocol_summary(paper, totals, frames)
+    scored = [{"name": name, "pairs_scored": count} for name, count in frames.items()]
+    summary = protocol_summary(paper, totals, scored)
     assert summary["complete"] and not summary["note"]
     assert summary["table"][0]["published"]["epe"] == 0.626
     for protocol in protocols().values():
@@ -113,14 +114,13 @@ def test_trajectories_are_means_over_sequences(sintel: Path, tmp_path: Path) -> 
 
 def test_other_ranges_and_sequences_are_refused(sintel: Path, walk: Path, tmp_path: Path) -> None:
     for path, more, field in (
-        (sintel, {"stop": 3}, "--stop"),
+        (sintel, {"options": Options(run=RunOptions(stop=3))}, "--stop"),
         (walk, {}, "walk"),
         (sintel / "training" / "final" / "alley_1", {"protocol": "trajectory14"}, "alley_2"),
         (sintel, {"protocol": "other"}, "other"),
     ):
-        options = ComparisonOptions((str(path),), ("identity",), **{"protocol": "paper"} | more)
         with pytest.raises(InputError, match=field):
-            compare(options, tmp_path / "out")
+            compare((path,), tmp_path / "out", **{"protocol": "paper"} | more)
 
 
 def test_cameras_are_the_same_to_rounding() -> None:

@@ -17,10 +17,16 @@ from hybridvo.evaluation.charts import (
     failure_chart,
     path_charts,
 )
+from hybridvo.evaluation.metrics import evaluate
 from hybridvo.evaluation.protocols import protocol_summary, protocols
 from hybridvo.evaluation.report import headline, number, write_report
-from hybridvo.evaluation.scores import breakdown, sequence_row, total_row, worst_pairs
-from hybridvo.evaluation.sequence_job import pair_table
+from hybridvo.evaluation.scores import (
+    breakdown,
+    pair_table,
+    sequence_row,
+    total_row,
+    worst_pairs,
+)
 from hybridvo.geometry import se3_exp
 from hybridvo.trajectory import Trajectory
 
@@ -55,21 +61,18 @@ def results(tmp_path: Path) -> tuple[Path, dict[str, Any], pd.DataFrame]:
     rows, totals = [], []
     for (method, flow), group in table.groupby(["method", "flow_source"], sort=False):
         named = dict(sequence=NAME, method=method, flow_source=flow, depth_source="true")
-        rows.append(sequence_row(group, gt, gt, named))
+        rows.append(sequence_row(group, evaluate(gt, gt), named))
+        rows[-1]["trajectory"] = "trajectories/gt.tum"
         totals.append(total_row(group, rows[-1:]))
     worst = [{**e, "picture": "worst/a.jpg", "picture_reason": None} for e in worst_pairs(table, 1)]
-    drawn = [(None, None), *((row["method"], row["flow_source"]) for row in rows)]
-    paths = [
-        {"sequence": NAME, "path": "trajectories/gt.tum", "method": m, "flow_source": f}
-        for m, f in drawn
-    ]
+    gt_path, scored = {"ground_truth": "trajectories/gt.tum"}, {"name": NAME, "pairs_scored": 6}
     result: dict[str, Any] = {
         **{"command": ["compare"], "versions": {}, "machine": {"cpus": 2}, "weights": {}},
-        **{"options": {}, "timing": "one at a time", "started": "", "finished": ""},
+        **{"options": {}, "timing": "one at a time"},
         **{"missing": {"open3d-rgbd": "pip install open3d"}, "rows": rows, "totals": totals},
-        "sequences": [{"name": NAME, "warnings": ["<script>"], "left_out": []}],
-        **{"trajectories": paths, "breakdown": breakdown(table), "worst_pairs": worst},
-        "protocol": protocol_summary(protocols()["paper"], totals, {NAME: 6}),
+        "sequences": [{"name": NAME, "warnings": ["<script>"], "left_out": []} | gt_path],
+        **{"breakdown": breakdown(table), "worst_pairs": worst},
+        "protocol": protocol_summary(protocols()["paper"], totals, [scored]),
     }
     return tmp_path, result, table
 

@@ -9,14 +9,15 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from hybridvo.evaluation.metrics import evaluate
 from hybridvo.evaluation.scores import (
     breakdown,
     failure_rate,
+    pair_table,
     sequence_row,
     total_row,
     worst_pairs,
 )
-from hybridvo.evaluation.sequence_job import pair_table
 from hybridvo.geometry import se3_exp
 from hybridvo.trajectory import Trajectory
 
@@ -64,7 +65,8 @@ def test_a_line_of_results_by_hand() -> None:
     poses = np.stack([se3_exp(np.array([0.1 * k, 0.02 * k**2, 0, 0, 0, 0])) for k in range(4)])
     gt = Trajectory(np.arange(4) / 10, poses)
     named = {"sequence": "walk", "method": "a", "flow_source": "dis", "depth_source": "true"}
-    line = sequence_row(pairs, gt.transformed(se3_exp(np.full(6, 0.3))), gt, named)
+    moved = gt.transformed(se3_exp(np.full(6, 0.3)))
+    line = sequence_row(pairs, evaluate(moved, gt), named)
     expected = {
         **{"pairs": 3, "pairs_scored": 2, "failed": 1, "failures": 3, "epe_l2_px": 3.0},
         **{"epe": 0.4, "rot_err_deg_mean": 2.0, "trans_err_median": 0.1, "ms_per_pair_median": 20},
@@ -73,7 +75,7 @@ def test_a_line_of_results_by_hand() -> None:
     assert {key: line[key] for key in expected} == pytest.approx(expected)
     assert line["ate_rmse"] == pytest.approx(0, abs=1e-12)
     assert None not in line.values()
-    other = sequence_row(pairs, gt, None, named | {"sequence": "b"})
+    other = sequence_row(pairs, None, named | {"sequence": "b"})
     assert other["ate_rmse"] is None
     total = total_row(pd.concat([pairs, pairs]), [line, other])
     assert total["pairs"] == 6 and total["ate_rmse"] == line["ate_rmse"]
@@ -83,7 +85,7 @@ def test_a_line_of_results_by_hand() -> None:
 def test_methods_without_flow_do_not_wait_for_it() -> None:
     pairs = table(row(0, 1.0, "identity", rot_err_deg=1.0, ms=1.0, flow_ms=50.0))
     named = {"sequence": "s", "method": "identity", "flow_source": "dis", "depth_source": "true"}
-    assert sequence_row(pairs, None, None, named)["ms_with_flow_median"] == 1.0
+    assert sequence_row(pairs, None, named)["ms_with_flow_median"] == 1.0
 
 
 def test_bins_hold_their_lower_edge_and_the_last_one_both() -> None:

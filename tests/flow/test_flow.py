@@ -65,6 +65,18 @@ def test_images_smaller_than_a_patch_do_not_raise() -> None:
     assert field.flow is None or np.isfinite(field.flow).all()
 
 
+def test_a_small_image_leaves_nothing_behind() -> None:
+    images = np.random.default_rng(1).integers(0, 255, (2, 120, 160, 3), dtype=np.uint8)
+    small, large = (
+        Frame(images[0][:h, :w].copy(), None, Camera(50, 50, w / 2, h / 2, h, w))
+        for h, w in ((20, 30), (120, 160))
+    )
+    provide, rolled = dis_flow("fast"), replace(large, rgb=np.roll(large.rgb, 1, axis=1))
+    before = provide(large, rolled).flow
+    provide(small, small)
+    np.testing.assert_array_equal(provide(large, rolled).flow, before)
+
+
 def test_unknown_preset_is_named() -> None:
     with pytest.raises(InputError, match="ultrafast, fast, medium, got 'slow'"):
         dis_flow("slow")

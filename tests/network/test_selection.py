@@ -216,9 +216,6 @@ def test_bad_arguments_are_refused():
     prediction = random_prediction(0)
     with pytest.raises(InputError, match="known: softmax"):
         select_pose(prediction, "best")
-    for patch in (0, -1):
-        with pytest.raises(InputError, match="patch"):
-            select_pose(prediction, patch=patch)
     bare = PixelwisePrediction(prediction.rotation, prediction.translation)
     for method in ("mean", "softmax"):  # without uncertainty there is only the mean
         assert torch.equal(select_pose(bare, method)[0], prediction.rotation.mean(dim=(2, 3)))

@@ -66,7 +66,7 @@ ONLY_IN = {
     "evo": {"trajectory.py", "evaluation/metrics.py"},
     "matplotlib": {"evaluation/plots.py"},
     "plotly": {"evaluation/"},
-    "pandas": {"evaluation/", "commands/demo.py"},
+    "pandas": {"evaluation/", "commands/"},
     "rerun": {"commands/recording.py"},
     "rich": {"commands/"},
     "yaml": {"files.py", "evaluation/protocols.py", "commands/", "options.py"},

@@ -11,7 +11,11 @@ import torch
 import hybridvo as hvo
 from hybridvo import torch_geometry
 from hybridvo.results import PixelwisePrediction
+from hybridvo.synthetic.dataset import Mixture
+from hybridvo.synthetic.diverse import DiverseOptions
 from hybridvo.synthetic.scenarios import make_pair
+from hybridvo.training.options import PwvoOptions
+from hybridvo.training.pwvo_task import PwvoTask
 
 SIZE = (120, 160)
 
@@ -87,13 +91,15 @@ def test_gradients_reach_flow_depth_weights_and_maps(pairs) -> None:
         assert float((gradient * d).sum()) == pytest.approx(slope, rel=1e-3), name
 
 
-def test_kornia_and_pypose_carry_the_method(pairs, monkeypatch) -> None:
-    calls = {"project": 0, "Exp": 0}
+@pytest.fixture
+def calls(monkeypatch) -> dict[str, int]:
+    """Counts calls of kornia's projection and pypose's exponential."""
+    counts = {"project": 0, "Exp": 0}
     project, exp = torch_geometry.project_points, pp.LieTensor.Exp
 
     def counted(name, function):
         def call(*arguments, **named):
-            calls[name] += 1
+            counts[name] += 1
             return function(*arguments, **named)
 
         return call
@@ -101,28 +107,30 @@ def test_kornia_and_pypose_carry_the_method(pairs, monkeypatch) -> None:
     assert project is kornia.geometry.camera.project_points
     monkeypatch.setattr(torch_geometry, "project_points", counted("project", project))
     monkeypatch.setattr(pp.LieTensor, "Exp", counted("Exp", exp))
+    return counts
+
+
+def test_kornia_and_pypose_carry_the_method(pairs, calls) -> None:
     motion = hvo.estimate(pairs[0][0], method="pwvo-refine")
     assert motion.usable and motion.method == "pwvo-refine"
     assert calls["project"] > motion.iterations and calls["Exp"] > motion.iterations
 
 
-def test_the_numba_path_gives_the_same_motion(pairs) -> None:
-    """With the same noise, start and weights, on pairs without a current depth."""
-    from dataclasses import replace
-
-    from hybridvo.refinement.torch_backend import refine_batch
-
-    for pair, truth in pairs:
-        pair = replace(pair, curr=replace(pair.curr, depth=None))
-        start = truth["T_curr_prev"]
-        weights = np.random.default_rng(0).uniform(0.2, 1.0, SIZE).astype(np.float32)
-        ours = hvo.refine(pair, start, weights)
-        noise = (ours.residual_scale_px, ours.depth_noise)
-        batch = hvo.PairBatch.from_pairs([pair])
-        other = refine_batch(batch, torch.as_tensor(start)[None], weights[None], noise=noise)
-        difference = np.abs(other.T_curr_prev[0].numpy() - ours.T_curr_prev).max()
-        # metres; the numba path stops one Newton step after the coarse fit: 9e-6 and 5e-5 here
-        assert difference < 1e-4
+def test_kornia_and_pypose_carry_the_training(calls) -> None:
+    """A step of PWVO's training: a pass, the fit and its gradient, the reconstructed flow."""
+    size = {"width": 0.1, "scale_free": True, "passes": 2, "input_stride": 2, "head_stride": 2}
+    options = PwvoOptions(
+        network=size, loss={"flow_uncertainty": False, "depth_uncertainty": False},
+        fit_weight=1.0, batch_size=4, data_size=(64, 128),
+    )  # fmt: skip
+    task = PwvoTask(options, Mixture((DiverseOptions(height=64, width=128),), (1.0,)))
+    loss, parts = task.loss(task.network, next(task.batches(0, 0, 0, 1)), 0, 0.0)
+    loss.backward()
+    assert torch.isfinite(loss) and parts["fit"] > 0
+    # two fits of six steps and one attached
+    assert calls["Exp"] == 13 and calls["project"] > 13
+    head = task.network.head_uncertainty[-1]
+    assert head.weight.grad[:3].abs().max() > 0
 
 
 def test_one_training_step_of_a_narrow_network_in_channels_last() -> None:

@@ -159,7 +159,7 @@ def test_handed_in_start_wins_where_the_identity_is_lost() -> None:
     far = T @ turned
     grid = pixel_grid(40, 56, pair.K_prev)
     K = pair.K_prev.clone()
-    pixels, seen = reproject(pair.depth_prev, far, K, K)
+    pixels, seen, _ = reproject(pair.depth_prev, far, K, K)
     noise = 0.2 * torch.randn(pixels.shape, dtype=F64, generator=torch.Generator().manual_seed(1))
     pair = replace(pair, flow=pixels - grid + noise, valid=seen, K_curr=K)
     starts = torch.stack([torch.full((2, 4, 4), math.nan, dtype=F64), far], dim=1)

@@ -263,15 +263,14 @@ def test_outlines_lie_in_the_unit_circle(seed, kind):
 @settings(max_examples=30, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), size=st.integers(8, 180))
 def test_silhouettes_are_cropped_to_their_box(seed, size):
-    mask = drawing.silhouette_mask(np.random.default_rng(seed), size)
+    mask = drawing.cut_out(np.random.default_rng(seed), size)
     assert mask.dtype == bool and max(mask.shape) <= size
     assert mask[0].any() and mask[-1].any() and mask[:, 0].any() and mask[:, -1].any()
 
 
 def test_coverage_is_met():
     square = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
-    shape = drawing.Silhouette(((square, True),))
-    mask, radius = shape.draw_coverage((128, 256), (127.5, 63.5), 0.25)
+    mask, radius = drawing.covering_mask([(square, True)], (128, 256), (127.5, 63.5), 0.25)
     assert mask.mean() == pytest.approx(0.25, abs=0.01)
     # (2 r)^2 = 0.25 * 128 * 256 gives r = 45.3; a border pixel more or less.
     assert radius == pytest.approx(45.3, abs=1.5)

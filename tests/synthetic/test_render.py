@@ -359,7 +359,7 @@ def test_sequence(scenes):
     assert variance is None
     truth, _, moving = scene.flow(2)
     np.testing.assert_array_equal(flow, truth)
-    np.testing.assert_array_equal(sequence.moving(2), moving)
+    np.testing.assert_array_equal(scene.object_id(2) > 0, moving)
     assert sequence.files() == []
     assert isinstance(sequence, Sequence)
     with pytest.raises(IndexError):

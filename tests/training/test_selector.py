@@ -17,8 +17,13 @@ from hybridvo.synthetic import dataset as stored
 from hybridvo.synthetic.draws import sample_generator
 from hybridvo.training import selector_data
 from hybridvo.training.options import SelectorOptions, load_selector_options
-from hybridvo.training.selector_batches import SelectorBatch, ego_flow_error, read_batches
-from hybridvo.training.selector_task import SelectorTask, evaluate_selector
+from hybridvo.training.selector_task import (
+    SelectorBatch,
+    SelectorTask,
+    ego_flow_error,
+    evaluate_selector,
+    read_batches,
+)
 from hybridvo.training.trainer import Trainer
 
 CONFIG = Path(__file__).parents[2] / "configs" / "train_selector.yaml"

@@ -1,0 +1,335 @@
+"""``hybridvo compare``: methods beside each other on sequences, scored against ground truth.
+
+Every method and source of flow is a ``hybridvo run`` of its own below ``runs/``, which is also what
+is resumed; their steps become one table of pairs, and that the scores and the report.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import itertools
+import json
+import os
+import platform
+import re
+import shutil
+from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Sequence as Several
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from hybridvo.commands.run import EXIT_INTERRUPTED, flow_provider, frames_of, run
+from hybridvo.data.sequence import Sequence, open_sequence
+from hybridvo.errors import HybridVOError, InputError
+from hybridvo.estimation import warm_up
+from hybridvo.evaluation import scores
+from hybridvo.evaluation.drawing import draw_worst
+from hybridvo.evaluation.pair_errors import ERRORS, pair_facts, true_motion, true_trajectory
+from hybridvo.evaluation.protocols import (
+    Protocol,
+    check_protocol,
+    protocol_summary,
+    same_intrinsics,
+)
+from hybridvo.evaluation.report import write_report
+from hybridvo.files import Mode, atomic_write, held, make_folder, versions, write_csv, write_json
+from hybridvo.flow import FlowProvider
+from hybridvo.network.models import Models
+from hybridvo.options import Options
+from hybridvo.pipeline import METHODS, check_method, weights_hash
+
+WRITTEN = ("results.json", "results.csv", "pairs.csv", "report.md", "report.html")
+"""What a finished comparison leaves, beside ``runs/`` and ``worst/``."""
+CAMERA_FLOW_KINDS = ("tartanair",)
+"""Data sets whose true flow is that of the camera alone: it does not show what moves by itself."""
+
+
+def compare(
+    sequences: Several[str | os.PathLike[str]],
+    out: str | os.PathLike[str],
+    *,
+    methods: Several[str] = ("all",),
+    options: Options | None = None,
+    dataset: str | None = None,
+    protocol: str | None = None,
+    weights: Mapping[str, str] | None = None,
+    worst: int = 3,
+    mode: Mode = "new",
+    command: Iterable[str] = (),
+    say: Callable[[str], None] = lambda text: None,
+    quiet: bool = True,
+) -> list[Path]:
+    """Run every method on every sequence and write the results; returns paths of :data:`WRITTEN`.
+
+    A folder of ``sequences`` stands for all that it holds; the method ``all`` for all that can run,
+    the flow ``auto`` for every source that a sequence has, side by side. ``protocol`` is ``paper``
+    or ``trajectory14`` (MPI Sintel as others score it), ``weights`` names files of networks,
+    ``worst`` counts the pairs shown for each method and flow. ``resume`` keeps finished runs.
+    """
+    out, options, command = Path(out), options or Options(), list(command)
+    if worst < 0:
+        raise InputError(f"--worst: expected 0 or more, got {worst}.")
+    models = Models(options.run.device, weights)
+    names, missing = methods_to_run(methods, models)
+    chosen, jobs = _jobs(sequences, dataset, protocol, options, out)
+    present = [name for name in (*WRITTEN, "runs") if (out / name).exists()]
+    if present and mode == "new":
+        raise InputError(
+            f"{out}: holds {', '.join(present)}; pass --resume to go on, --overwrite to replace "
+            f"them, or another --out."
+        )
+    with held(out):
+        for name in ("runs", "worst"):
+            if mode == "overwrite":
+                shutil.rmtree(out / name, ignore_errors=True)
+            make_folder(out / name)
+        for name, reason in missing.items():
+            say(f"not run: {name}: {reason}")
+        for name in names:
+            warm_up(name, models)
+        tables, rows, facts = [], [], []
+        for job in jobs:
+            missing |= job.run(names, options, models, command, quiet)
+            table, about = _read(job, chosen)
+            tables.append(table)
+            facts.append(about)
+            rows += _rows(job, table, out)
+        say("scores and report")
+        table = pd.concat(tables, ignore_index=True)
+        result = {
+            "command": command,
+            "versions": versions(),
+            "machine": {"platform": platform.platform(), "cpus": os.cpu_count()},
+            "options": dataclasses.asdict(options),
+            "weights": {name: weights_hash(name, models) for name in names},
+            "timing": "one estimate at a time",
+            "missing": missing,
+            **scores.summary(table, rows),
+            "sequences": facts,
+            "worst_pairs": scores.worst_pairs(table, worst),
+        }
+        result["protocol"] = chosen and protocol_summary(chosen, result["totals"], facts)
+        for job, mine in zip(jobs, tables, strict=True):
+            entries = [entry for entry in result["worst_pairs"] if entry["sequence"] == job.name]
+            draw_worst(out, job.sequence, job.flows, options, models, entries, mine)
+        _write(out, result, table)
+    return [out / name for name in WRITTEN]
+
+
+def _write(out: Path, result: dict[str, Any], table: pd.DataFrame) -> None:
+    """Write :data:`WRITTEN`."""
+    with atomic_write(out / "pairs.csv") as file:
+        table[list(scores.PAIR_COLUMNS)].to_csv(file, index=False, lineterminator="\n")
+    write_json(out / "results.json", result)
+    columns = [name for name in result["rows"][0] if name != "reasons"]
+    write_csv(out / "results.csv", columns, result["rows"])
+    write_report(out, result, table)
+
+
+def methods_to_run(
+    names: Several[str], models: Models | None = None
+) -> tuple[tuple[str, ...], dict[str, str]]:
+    """Methods to run, and of those that ``all`` leaves out the reason with its remedy."""
+    if not names:
+        raise InputError(f"--methods: expected names, got none; known: {', '.join(METHODS)}.")
+    is_all = list(names) == ["all"]
+    missing: dict[str, str] = {}
+    wanted = dict.fromkeys(METHODS if is_all else names)
+    for name in wanted:
+        try:
+            check_method(name, models)
+        except InputError as error:
+            if not is_all:
+                raise
+            missing[name] = str(error)
+    return tuple(name for name in wanted if name not in missing), missing
+
+
+def open_all(path: str | os.PathLike[str], dataset: str | None = None) -> list[Sequence]:
+    """Sequences that a path stands for: the one of this folder, or all that it holds.
+
+    A folder that is no sequence is searched one level down; of MPI Sintel its final or clean pass.
+    """
+    try:
+        return [open_sequence(path, dataset)]
+    except HybridVOError:
+        inner, found = Path(path), []
+        for names in (("training",), ("final", "clean")):
+            inner = next((inner / name for name in names if (inner / name).is_dir()), inner)
+        for child in sorted(inner.iterdir()) if inner.is_dir() else ():
+            with contextlib.suppress(HybridVOError):
+                found += [open_sequence(child, dataset)] if child.is_dir() else []
+        if not found:
+            raise
+        return found
+
+
+@dataclass
+class _Job:
+    """One sequence: providers of its flows, and the runs that are done, by method and flow."""
+
+    sequence: Sequence
+    name: str
+    folder: Path
+    flows: dict[str, FlowProvider]
+    runs: dict[tuple[str, str], Path] = field(default_factory=dict)
+
+    def run(
+        self,
+        methods: Iterable[str],
+        options: Options,
+        models: Models,
+        command: list[str],
+        quiet: bool,
+    ) -> dict[str, str]:
+        """Every method on every flow; a bug of one costs its run, and is told."""
+        raised = {}
+        for flow, method in itertools.product(self.flows, methods):
+            source = flow.split()[0]
+            folder = self.folder / f"{method}-{source}"
+            single = {"method": method, "max_failed": 1.0}
+            asked = _with(options, run=single, flow={"source": source})
+            given: dict[str, Any] = {"models": models, "command": command, "quiet": quiet}
+            try:
+                code = run(self.sequence, folder, asked, mode="resume", quick=True, **given)[1]
+            except HybridVOError:
+                raise
+            except Exception as error:
+                raised[f"{method} on {self.name}"] = f"{type(error).__name__}: {error}"
+                continue
+            if code == EXIT_INTERRUPTED:
+                raise KeyboardInterrupt
+            self.runs[method, flow] = folder
+        return raised
+
+
+def _with(options: Options, **groups: dict[str, Any]) -> Options:
+    """The options with other values in some groups."""
+    return replace(options, **{k: replace(getattr(options, k), **v) for k, v in groups.items()})
+
+
+def _jobs(
+    paths: Several[str | os.PathLike[str]],
+    dataset: str | None,
+    protocol: str | None,
+    options: Options,
+    out: Path,
+) -> tuple[Protocol | None, list[_Job]]:
+    """The protocol, and what is to be done on every sequence; both flows where it has both."""
+    opened = [sequence for path in paths for sequence in open_all(path, dataset)]
+    if not opened:
+        raise InputError("compare: expected at least one folder of a sequence, got none.")
+    chosen: Protocol | None = None
+    jobs: list[_Job] = []
+    if protocol is not None:
+        chosen, opened = check_protocol(protocol, opened, options.run)
+    for sequence in opened:
+        frames_of(sequence, options)
+        name = sequence.name
+        if [other.name for other in opened].count(name) > 1:
+            name = f"{Path(sequence.root).absolute().parent.name}/{name}"
+        sources: list[str] = [options.flow.source]
+        if sources == ["auto"]:
+            usable = sequence.has_flow and options.run.stride == 1
+            images = any(file is not None for file in sequence.rgb_files)
+            sources = ["dis"] * (images or not usable) + ["file"] * usable
+        flows = {}
+        for source in sources:  # an oracle is named
+            label = "file (true)" if source == "file" and sequence.flow_is_true else source
+            flows[label] = flow_provider(sequence, _with(options, flow={"source": source}))
+        folder = out / "runs" / re.sub(r"[^\w.-]", "_", name)
+        if folder in [job.folder for job in jobs]:
+            raise InputError(f"--sequence: {name} is given twice.")
+        jobs.append(_Job(sequence, name, folder, flows))
+    return chosen, jobs
+
+
+def _read(job: _Job, protocol: Protocol | None) -> tuple[pd.DataFrame, dict[str, Any]]:
+    """Pairs of all runs as one table, and what is said of the sequence."""
+    sequence = job.sequence
+    table = pd.concat([_pairs(job, *run) for run in job.runs.items()])
+    first = table.drop_duplicates("next")
+    missing = first[first["missing"]]
+    left_out = [
+        {"index": row.next, "reason": f"frame cannot be read: {row.message}"}
+        for row in missing.itertuples()
+    ]
+    if protocol is not None and protocol.same_camera_only:
+        cameras = first[["prev", "next"]].map(sequence.camera)
+        changed = first[~cameras.apply(lambda pair: same_intrinsics(*pair), axis=1)]
+        left_out += [{"index": i, "reason": "the intrinsics change"} for i in changed["prev"]]
+        table = table[~table["next"].isin(changed["next"])]
+        first = table.drop_duplicates("next")
+    facts = [
+        {"next": row.next} | _facts(sequence, row.prev, row.next)
+        for row in first[~first["missing"]].itertuples()
+    ]
+    table = table.merge(pd.DataFrame(facts, columns=["next", *scores.FACTORS]), "left", "next")
+    table = scores.pair_table(table.sort_values("index", kind="stable").to_dict("records"))
+    gt = true_trajectory(sequence, range(len(sequence)))
+    if gt is not None:
+        gt.save(job.folder / "ground_truth.tum")
+    return table, {
+        "name": job.name,
+        "kind": sequence.kind,
+        "path": str(sequence.root),
+        "pairs_scored": len(first),
+        "left_out": left_out,
+        "depth_source": sequence.depth_source,
+        "flow_sources": list(job.flows),
+        "warnings": list(sequence.warnings),
+        "ground_truth": gt and f"runs/{job.folder.name}/ground_truth.tum",
+    }
+
+
+def _pairs(job: _Job, run: tuple[str, str], folder: Path) -> pd.DataFrame:
+    """Motions of one run."""
+    steps = pd.read_csv(folder / "steps.csv", dtype={"reason": str, "message": str})
+    stride = int(np.diff(steps["index"][:2]).sum())
+    with np.load(folder / "steps.npz") as arrays:
+        steps["T_curr_prev"] = list(arrays["T_curr_prev"])
+    steps = steps[steps["prev_index"].notna()].fillna({"reason": "", "message": ""})
+    missing = steps["reason"] == "missing_frame"
+    steps.loc[missing, [*ERRORS, "motion_ms", "flow_ms"]] = np.nan
+    return steps.assign(
+        sequence=job.name,
+        method=run[0],
+        flow_source=run[1],
+        status=steps["status"] + steps["reason"].map(lambda why: f"({why})" if why else ""),
+        ms=steps["motion_ms"],
+        prev=steps["prev_index"].astype(int),
+        next=steps["index"],
+        index=steps["index"] - stride,
+        missing=missing,
+    )
+
+
+def _rows(job: _Job, table: pd.DataFrame, out: Path) -> list[dict[str, Any]]:
+    """Lines of the results: one a run."""
+    rows = []
+    for (method, flow), folder in job.runs.items():
+        mine = table[(table["method"] == method) & (table["flow_source"] == flow)]
+        named = {"sequence": job.name, "method": method, "flow_source": flow}
+        named |= {"depth_source": job.sequence.depth_source}
+        report = None
+        if (folder / "metrics.json").exists():
+            report = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
+        path = (folder / "trajectory.tum").relative_to(out).as_posix()
+        rows.append(scores.sequence_row(mine, report, named) | {"trajectory": path})
+    return rows
+
+
+def _facts(sequence: Sequence, prev: int, curr: int) -> dict[str, Any]:
+    """What may explain an error. The true flow serves for this alone: no estimate ever sees it."""
+    T_gt, flow_gt = true_motion(sequence, prev, curr), None
+    whole = sequence.flow_is_true and sequence.kind not in CAMERA_FLOW_KINDS
+    if whole and curr == prev + 1:
+        with contextlib.suppress(InputError, OSError):
+            flow_gt = sequence.flow(prev)[0]
+    cameras = sequence.camera(prev), sequence.camera(curr)
+    return pair_facts(T_gt, sequence.frame(prev).depth, *cameras, flow_gt)
