@@ -74,7 +74,7 @@ def run(
     vo = Odometry(models, flow=flow, method=method, options=options, seed=options.run.seed)
     if not quick:
         vo.warm_up()  # before the folder is taken: it may last
-    header = _header(sequence, len(frames), options, weights_hash(method, models))
+    header = _header(sequence, options, weights_hash(method, models))
     header["command"] = list(command)
     with held(out), contextlib.ExitStack() as stack:
         folder = RunFolder(out, header, mode)
@@ -186,9 +186,7 @@ class _Job:
         }
 
 
-def _header(
-    sequence: Sequence, frames: int, options: Options, weights: str | None
-) -> dict[str, Any]:
+def _header(sequence: Sequence, options: Options, weights: str | None) -> dict[str, Any]:
     """What ``run.json`` says of a run beside its state; ``identity``: what a resumed one shares."""
     tree, input_hash = dataclasses.asdict(options), fingerprint(sequence.files())
     free = ("max_failed", "strict", "device")
@@ -200,14 +198,7 @@ def _header(
         "versions": versions(),
         "machine": {"platform": platform.platform(), "cpus": os.cpu_count()},
         "options": tree,
-        "sequence": {
-            "name": sequence.name,
-            "kind": sequence.kind,
-            "path": os.fspath(sequence.root),
-            "frames": frames,
-            "depth_source": sequence.depth_source,
-            "warnings": list(sequence.warnings),
-        },
+        "sequence": os.fspath(sequence.root),
     }
 
 
