@@ -148,7 +148,7 @@ def read_trajectory(
     if not path.is_file():
         raise InputError(f"{path}: trajectory file cannot be read: no such file.")
     kind = _format_of(path) if format == "auto" else format
-    rows, T = read_poses(path, COLUMNS[kind])
+    rows, T = read_poses(path, kind)
     if not rows:
         raise FormatError(f"{path}: expected at least one pose, got none.")
     stamps = np.array([row.numbers[0] for row in rows])
@@ -170,14 +170,13 @@ def read_trajectory(
     return Trajectory(stamps / factor, T, kind == "tum", tuple(warnings))
 
 
-def read_poses(path: Path, columns: str) -> tuple[list[Row], np.ndarray]:
-    """Rows of a list of poses, and (N, 4, 4) what they hold, NaN where that is not finite.
+def read_poses(path: Path, kind: str) -> tuple[list[Row], np.ndarray]:
+    """Rows of a list of a kind of :data:`COLUMNS`, and (N, 4, 4) their poses, NaN if not finite.
 
-    The last ``columns`` are ``tx ty tz qx qy qz qw``, or the first three rows of the matrix. A
-    damaged row or what is no rotation is a FormatError with file and line.
+    A damaged row or what is no rotation is a FormatError with file and line.
     """
-    rows = read_rows(path, columns)
-    is_matrix = columns == COLUMNS["kitti"]
+    rows = read_rows(path, COLUMNS[kind])
+    is_matrix = kind == "kitti"
     width = 12 if is_matrix else 7
     values = np.array([row.numbers[-width:] for row in rows]).reshape(-1, width)
     known = np.isfinite(values).all(axis=1)

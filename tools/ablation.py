@@ -17,11 +17,24 @@ import dataclasses
 import json
 import signal
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
+import torch
 from measuring import provenance
+
+from hybridvo.errors import HybridVOError, InputError
+from hybridvo.files import write_json
+from hybridvo.network.selection import SELECTION_METHODS
+from hybridvo.network.weights import save_weights
+from hybridvo.synthetic.dataset import Mixture, StoredSamples, load_preset
+from hybridvo.training.options import PwvoOptions, load_pwvo_options
+from hybridvo.training.pwvo_task import PwvoTask
+from hybridvo.training.trainer import Trainer
+from hybridvo.training.validation import FIGURES, PUBLISHED_SEED, evaluate_network
 
 ROWS = Path(__file__).resolve().parents[1] / "configs" / "ablation"
 DECIDING = ("pwvo-paper", "pwvo-naive", "vonet", "pwvo-uncertain")
@@ -43,8 +56,6 @@ PRESETS = ("data_paper", "data_diverse")
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the tool; returns its exit code (2 bad input, 5 no output, 130 interrupted)."""
-    from hybridvo.errors import HybridVOError
-
     try:
         return _run(_parse(argv))
     except HybridVOError as error:
@@ -81,11 +92,6 @@ def plan(names: Sequence[str], seeds: int) -> list[tuple[str, int]]:
 
 
 def _run(args: argparse.Namespace) -> int:
-    import cv2
-    import torch
-
-    from hybridvo.errors import InputError
-
     known = sorted(path.stem for path in args.configs.glob("*.yaml") if path.stem != "base")
     names = known if args.rows is None else args.rows.split(",")
     unknown = sorted(set(names) - set(known))
@@ -96,175 +102,146 @@ def _run(args: argparse.Namespace) -> int:
             raise InputError(f"--{name}: expected 1 or more, got {getattr(args, name)}.")
     torch.set_num_threads(args.threads)
     cv2.setNumThreads(0)  # samples are small: threads inside OpenCV cost more than they give
-    runs: dict[tuple[str, int], dict[str, Any]] = {}
+    ablation = Ablation(args)
     for name, seed in plan(names, args.seeds):
-        if not _train(args, name, seed, runs):
+        if not ablation.train(name, seed):
             print("ablation.py: interrupted; start again to go on.", file=sys.stderr)
             return 130
     return 0
 
 
-def _train(
-    args: argparse.Namespace, name: str, seed: int, runs: dict[tuple[str, int], dict[str, Any]]
-) -> bool:
-    """Train and score one row; False if the training was interrupted."""
-    from hybridvo.network.weights import save_weights
-    from hybridvo.training.trainer import Trainer
+class Ablation:
+    """The rows so far, by name and seed."""
 
-    task = _task(args, name, seed)
-    options = task.options
-    folder = args.out / f"{name}-seed{seed}"
-    folder.mkdir(parents=True, exist_ok=True)
-    trainer = Trainer(task, folder, args.device, args.workers, _progress(f"{name} seed {seed}"))
-    trainer.resume()
+    def __init__(self, args: argparse.Namespace) -> None:
+        self.args = args
+        self.runs: dict[tuple[str, int], dict[str, Any]] = {}
 
-    def stop(number: int, frame: object) -> None:
-        trainer.stop_requested = True
+    def train(self, name: str, seed: int) -> bool:
+        """Train and score one row; False if the training was interrupted."""
+        args, task = self.args, self.task(name, seed)
+        folder = args.out / f"{name}-seed{seed}"
+        folder.mkdir(parents=True, exist_ok=True)
+        trainer = Trainer(task, folder, args.device, args.workers, progress(f"{name} seed {seed}"))
+        trainer.resume()
 
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, stop)
-    result = _read(folder / "result.json") or {"row": name, "seed": seed, "curve": {}}
-    result["parameters"] = sum(p.numel() for p in trainer.network.parameters())
-    for samples in sorted({m for m in MILESTONES if m < args.samples} | {args.samples}):
-        if trainer.run(until=-(-samples // options.batch_size)) == "signal":
-            return False
-        if str(samples) not in result["curve"]:
-            last = samples == args.samples
-            scores = _scores(args, trainer.exported, options.selection, options.data_size, last)
-            result["curve"][str(samples)] = {"seconds": round(trainer.elapsed_s), **scores}
-        _store(args, name, seed, runs, result, samples)
-    trained = {
-        k: v for k, v in provenance("ablation.py", None).items() if k in ("command", "commit")
-    }
-    card = {"row": name, **trained, **trainer.record, "curve": result["curve"]}
-    save_weights(folder / "weights.safetensors", trainer.exported, card, "float16")
-    return True
+        def stop(number: int, frame: object) -> None:
+            trainer.stop_requested = True
 
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, stop)
+        result = read(folder / "result.json") or {"row": name, "seed": seed, "curve": {}}
+        result["parameters"] = sum(p.numel() for p in trainer.network.parameters())
+        for samples in sorted({m for m in MILESTONES if m < args.samples} | {args.samples}):
+            if trainer.run(until=-(-samples // task.options.batch_size)) == "signal":
+                return False
+            if str(samples) not in result["curve"]:
+                scores = self.scores(trainer.exported, task.options, samples == args.samples)
+                result["curve"][str(samples)] = {"seconds": round(trainer.elapsed_s), **scores}
+            self.store(result, samples)
+        made = provenance("ablation.py", None)
+        card = {"row": name, "command": made["command"], "commit": made["commit"]}
+        card |= trainer.record | {"curve": result["curve"]}
+        save_weights(folder / "weights.safetensors", trainer.exported, card, "float16")
+        return True
 
-def _store(
-    args: argparse.Namespace,
-    name: str,
-    seed: int,
-    runs: dict[tuple[str, int], dict[str, Any]],
-    result: dict[str, Any],
-    samples: int,
-) -> None:
-    """Write the figures of a row, and those of all rows so far."""
-    from hybridvo.files import write_json
+    def store(self, result: dict[str, Any], samples: int) -> None:
+        """Write the figures of a row, and those of all rows so far."""
+        name, seed, out = result["row"], result["seed"], self.args.out
+        self.runs[name, seed] = result
+        write_json(out / f"{name}-seed{seed}" / "result.json", result)
+        write_json(out / "ablation.json", self.summary())
+        scores = result["curve"][str(samples)]
+        short = ", ".join(f"{preset} EPE {scores[preset]['epe']:.3f} px" for preset in PRESETS)
+        print(f"{name} seed {seed}, {samples}: {short}", file=sys.stderr, flush=True)
 
-    runs[name, seed] = result
-    write_json(args.out / f"{name}-seed{seed}" / "result.json", result)
-    write_json(args.out / "ablation.json", _summary(args, runs))
-    scores = result["curve"][str(samples)]
-    short = ", ".join(f"{preset} EPE {scores[preset]['epe']:.3f} px" for preset in PRESETS)
-    print(f"{name} seed {seed}, {samples}: {short}", file=sys.stderr, flush=True)
+    def task(self, name: str, seed: int) -> PwvoTask:
+        """The training of a row."""
+        args = self.args
+        options, mixture = load_pwvo_options(args.configs / f"{name}.yaml")
+        steps = -(-args.samples // options.batch_size)
+        options = dataclasses.replace(options, seed=seed, steps=steps)
+        if args.data is not None:
+            mixture = Mixture((StoredSamples(str(args.data.resolve())),), (1.0,))
+            options = dataclasses.replace(options, data=("folder",), data_weights=(1.0,))
+        return PwvoTask(options, mixture)
 
+    def scores(self, network: Any, recipe: PwvoOptions, last: bool) -> dict[str, Any]:
+        """Figures on held-out pairs of each preset; at the end by every rule of the selection."""
+        scores: dict[str, Any] = {}
+        selection = recipe.selection
+        for name in PRESETS:
+            preset = load_preset(ROWS.parent / f"{name}.yaml", recipe.data_size)
+            asked = preset, PUBLISHED_SEED, self.args.count
+            figures = scores[name] = evaluate_network(network, *asked, selection=selection)
+            if last and figures["auroc_rotation"] is not None:
+                rules = scores[f"rules_{name}"] = {}
+                for rule in SELECTION_METHODS:
+                    found = figures
+                    if rule != selection:
+                        found = evaluate_network(network, *asked, selection=rule)
+                    rules[rule] = {key: found[key] for key in FIGURES}
+        return scores
 
-def _task(args: argparse.Namespace, name: str, seed: int) -> Any:
-    from hybridvo.synthetic.dataset import Mixture, StoredSamples
-    from hybridvo.training.options import load_pwvo_options
-    from hybridvo.training.pwvo_task import PwvoTask
-
-    options, mixture = load_pwvo_options(args.configs / f"{name}.yaml")
-    steps = -(-args.samples // options.batch_size)
-    options = dataclasses.replace(options, seed=seed, steps=steps)
-    if args.data is not None:
-        mixture = Mixture((StoredSamples(str(args.data.resolve())),), (1.0,))
-        options = dataclasses.replace(options, data=("folder",), data_weights=(1.0,))
-    return PwvoTask(options, mixture)
-
-
-def _scores(
-    args: argparse.Namespace,
-    network: Any,
-    selection: str,
-    size: Sequence[int] | None,
-    last: bool,
-) -> dict[str, Any]:
-    """Figures on held-out pairs of each preset; at the end by every rule of the selection."""
-    from hybridvo.network.selection import SELECTION_METHODS
-    from hybridvo.synthetic.dataset import load_preset
-    from hybridvo.training.validation import FIGURES, PUBLISHED_SEED, evaluate_network
-
-    scores: dict[str, Any] = {}
-    for name in PRESETS:
-        path = ROWS.parent / f"{name}.yaml"
-        preset = load_preset(path, size=None if size is None else tuple(size))
-        asked = preset, PUBLISHED_SEED, args.count
-        figures = scores[name] = evaluate_network(network, *asked, selection=selection)
-        if last and figures["auroc_rotation"] is not None:
-            rules = scores[f"rules_{name}"] = {}
-            for rule in SELECTION_METHODS:
-                found = figures
-                if rule != selection:
-                    found = evaluate_network(network, *asked, selection=rule)
-                rules[rule] = {key: found[key] for key in FIGURES}
-    return scores
-
-
-def _summary(args: argparse.Namespace, runs: Mapping[tuple[str, int], Any]) -> dict[str, Any]:
-    """What stands in ablation.json: every curve, and the paper's claims by paired differences."""
-    results = [_without_pairs(run) for run in runs.values()]
-    claims = [
-        {"preset": preset, "samples": samples, **claim}
-        for preset in PRESETS
-        for samples in sorted({int(k) for run in runs.values() for k in run["curve"]})
-        for better, worse in CLAIMS
-        if (claim := _claim(runs, better, worse, preset, str(samples))) is not None
-    ]
-    return {
-        **provenance("ablation.py", None),
-        "samples": args.samples,
-        "held_out": {"count": args.count, "presets": list(PRESETS)},
-        "epe": "component mean, px at the size of the samples",
-        "claims": claims,
-        "runs": results,
-    }
-
-
-def _claim(
-    runs: Mapping[tuple[str, int], Any], better: str, worse: str, preset: str, samples: str
-) -> dict[str, Any] | None:
-    """Difference in EPE of two rows over common seeds, and over the pairs; None if not there."""
-    import numpy as np
-
-    def epe_of_pairs(row: str) -> dict[int, Any]:
-        """By seed, of the runs that were scored there."""
+    def summary(self) -> dict[str, Any]:
+        """What stands in ablation.json: every curve, and the paper's claims by differences."""
+        counts = sorted({int(k) for run in self.runs.values() for k in run["curve"]})
+        claims = [
+            {"preset": preset, "samples": samples, **claim}
+            for preset in PRESETS
+            for samples in counts
+            for better, worse in CLAIMS
+            if (claim := self.claim(better, worse, preset, str(samples))) is not None
+        ]
         return {
-            seed: np.array(run["curve"][samples][preset]["epe_of_pairs"])
-            for (name, seed), run in runs.items()
-            if name == row and "epe_of_pairs" in run["curve"].get(samples, {}).get(preset, {})
+            **provenance("ablation.py", None),
+            "samples": self.args.samples,
+            "held_out": {"count": self.args.count, "presets": list(PRESETS)},
+            "epe": "component mean, px at the size of the samples",
+            "claims": claims,
+            "runs": [without_pairs(run) for run in self.runs.values()],
         }
 
-    ours, others = epe_of_pairs(better), epe_of_pairs(worse)
-    common = [seed for seed in ours if seed in others]
-    if not common:
-        return None
-    differences = np.array([ours[seed] - others[seed] for seed in common])
-    of_seeds = differences.mean(axis=1)
-    over_pairs = differences.mean(axis=0)
-    return {
-        "better": better,
-        "worse": worse,
-        "difference_px": round(float(of_seeds.mean()), 4),
-        "spread_of_seeds_px": round(float(of_seeds.std(ddof=1)), 4) if len(common) > 1 else None,
-        "error_over_pairs_px": round(float(over_pairs.std() / np.sqrt(over_pairs.size)), 4),
-        "as_claimed": f"{int((of_seeds < 0).sum())} of {len(common)}",
-    }
+    def claim(self, better: str, worse: str, preset: str, samples: str) -> dict[str, Any] | None:
+        """Difference in EPE of two rows over common seeds and over pairs; None if not there."""
+
+        def epe_of_pairs(row: str) -> dict[int, Any]:
+            """By seed, of the runs that were scored there."""
+            return {
+                seed: np.array(run["curve"][samples][preset]["epe_of_pairs"])
+                for (name, seed), run in self.runs.items()
+                if name == row and "epe_of_pairs" in run["curve"].get(samples, {}).get(preset, {})
+            }
+
+        ours, others = epe_of_pairs(better), epe_of_pairs(worse)
+        common = [seed for seed in ours if seed in others]
+        if not common:
+            return None
+        differences = np.array([ours[seed] - others[seed] for seed in common])
+        of_seeds, over_pairs = differences.mean(axis=1), differences.mean(axis=0)
+        spread = round(float(of_seeds.std(ddof=1)), 4) if len(common) > 1 else None
+        return {
+            "better": better,
+            "worse": worse,
+            "difference_px": round(float(of_seeds.mean()), 4),
+            "spread_of_seeds_px": spread,
+            "error_over_pairs_px": round(float(over_pairs.std() / np.sqrt(over_pairs.size)), 4),
+            "as_claimed": f"{int((of_seeds < 0).sum())} of {len(common)}",
+        }
 
 
-def _without_pairs(value: Any) -> Any:
+def without_pairs(value: Any) -> Any:
     """The figures without those of each pair."""
     if not isinstance(value, dict):
         return value
-    return {k: _without_pairs(v) for k, v in value.items() if k != "epe_of_pairs"}
+    return {k: without_pairs(v) for k, v in value.items() if k != "epe_of_pairs"}
 
 
-def _read(path: Path) -> dict[str, Any] | None:
+def read(path: Path) -> dict[str, Any] | None:
     return json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
 
 
-def _progress(label: str) -> Callable[[dict[str, Any]], None]:
+def progress(label: str) -> Callable[[dict[str, Any]], None]:
     """A line on stderr every thousand updates."""
 
     def report(entry: dict[str, Any]) -> None:

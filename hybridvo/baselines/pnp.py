@@ -7,6 +7,7 @@ camera. A solver's own "success" is not believed: the check is the same for ever
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import importlib.util
 from collections.abc import Callable
@@ -99,13 +100,10 @@ SOLVERS: dict[str, tuple[Solver, float]] = {
 def estimate_by_points(method: str, pair: FramePair, seed: int = 0) -> RelativePose:
     """Motion of a pair by one of :data:`SOLVERS`; OpenCV's own generator is fixed."""
     solve, threshold_px = SOLVERS[method]
-    data = sample(pair, seed)
-    if isinstance(data, Status):
-        return RelativePose.failed(data.reason, data.message, method)
-    try:
-        T = solve(data, pair.curr.camera, seed)
-    except FOUND_NOTHING:
-        T = None
+    data, T = sample(pair, seed), None
+    if not isinstance(data, Status):
+        with contextlib.suppress(*FOUND_NOTHING):
+            T = solve(data, pair.curr.camera, seed)
     return check(method, T, data, pair.curr.camera, threshold_px)
 
 
@@ -176,7 +174,7 @@ def depth_valid(depth: np.ndarray) -> np.ndarray:
 def check(
     method: str,
     T: np.ndarray | None,
-    data: Correspondences,
+    data: Correspondences | Status,
     camera: Camera,
     threshold_px: float,
     sigma_px: float | None = None,
@@ -188,6 +186,8 @@ def check(
     (J^T J)^-1 over them, sigma^2 = |r|^2 / (2 n - 6) unless ``sigma_px`` is given: that of the
     least-squares optimum, thus optimistic for a solver that stops short of it.
     """
+    if isinstance(data, Status):
+        return RelativePose.failed(data.reason, data.message, method)
 
     def failed(reason: Reason, what: str, **facts: Any) -> RelativePose:
         return RelativePose.failed(reason, f"{method}: {what}", method, **facts)

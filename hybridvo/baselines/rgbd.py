@@ -6,6 +6,7 @@ give it a covariance; without flow that of one pixel of noise at every sampled p
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -87,13 +88,11 @@ ALIGNERS: dict[str, Callable[[Rgbd, Rgbd], np.ndarray | None]] = {
 
 def estimate_by_images(method: str, pair: FramePair, seed: int = 0) -> RelativePose:
     """Motion of a pair by one of :data:`ALIGNERS`; its status is failed without images."""
-    frames = _prepared(pair)
+    frames, T = _prepared(pair), None
     if isinstance(frames, Status):
         return RelativePose.failed(frames.reason, frames.message, method)
-    try:
+    with contextlib.suppress(*FOUND_NOTHING):
         T = ALIGNERS[method](*frames)
-    except FOUND_NOTHING:
-        T = None
     if T is not None and np.isfinite(T).all():
         # both libraries chain small updates into not quite a rotation
         T = pose_matrix(T[:3])
@@ -102,9 +101,7 @@ def estimate_by_images(method: str, pair: FramePair, seed: int = 0) -> RelativeP
     if isinstance(data, Status):
         still = FramePair(pair.prev, pair.curr, np.zeros((*camera.shape, 2), np.float32))
         data, sigma_px = sample(still, seed), 1.0
-        if isinstance(data, Status):
-            return RelativePose.failed(data.reason, data.message, method)
-        if T is not None and is_rigid(T):
+        if T is not None and is_rigid(T) and not isinstance(data, Status):
             uv = project(data.xyz @ T[:3, :3].T + T[:3, 3], camera)
             data = Correspondences(data.xyz, uv)
     # wide, for these methods never saw the flow

@@ -11,7 +11,7 @@ import numpy as np
 
 from hybridvo.errors import InputError
 from hybridvo.files import read_rows
-from hybridvo.trajectory import COLUMNS, check_increasing, read_poses, stamp_unit
+from hybridvo.trajectory import check_increasing, read_poses, stamp_unit
 
 MAX_STAMP_DIFFERENCE_S = 0.02
 """Largest difference in seconds between stamps that belong together (the TUM tools' value)."""
@@ -99,7 +99,7 @@ def numbered_poses(
 
 def read_timed_poses(path: Path, told: list[str]) -> tuple[np.ndarray, np.ndarray]:
     """Stamps (N,) in seconds and poses (N, 4, 4) of a list ``timestamp tx .. qw``."""
-    rows, poses = read_poses(path, COLUMNS["tum"])
+    rows, poses = read_poses(path, "tum")
     return to_seconds([row.numbers[0] for row in rows], path.name, told), poses
 
 

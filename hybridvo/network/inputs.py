@@ -58,12 +58,12 @@ class TensorBatch:
 
 @dataclass(frozen=True, eq=False)
 class NetworkInputs(TensorBatch):
-    """Inputs of a batch of pairs at the network's size (h, w).
+    """Inputs of a batch of pairs at the network's size (h, w); what is invalid is 0.
 
     Args:
-        flow: (B, 2, h, w) flow in pixels of this size divided by ``FLOW_SCALE_PX``, 0 if invalid.
-        inverse_depth: (B, 2, h, w) 1 / metres, 0 if invalid: of the previous depth, and of the
-            current one sampled at x + F, both on the grid of the previous frame.
+        flow: (B, 2, h, w) flow in pixels of this size divided by ``FLOW_SCALE_PX``.
+        inverse_depth: (B, 2, h, w) 1 / metres of the previous depth, and of the current one sampled
+            at x + F, both on the grid of the previous frame.
         rays: (B, 2, h, w) first two components of K^-1 x.
         valid: (B, h, w) bool, flow and previous depth are both usable.
         K_prev, K_curr: (B, 3, 3) intrinsics scaled to (h, w), pixel-centre convention.

@@ -25,8 +25,6 @@ SELECTION = {
 def load_weights(path: str | Path) -> tuple[Any, dict[str, Any]]:
     """Network of a weights file, in evaluation mode and float32 on the CPU, and its model card.
 
-    The network's ``options`` attribute says what it is.
-
     Raises:
         CheckpointError: no whole weights file, or one of another program or architecture.
     """

@@ -101,7 +101,7 @@ def select_pose(
     method: str = "softmax",
     patch: int | None = None,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """One rotation and one translation per pair from the output of any network.
+    """One motion of each pair: (B, 3) Euler angles X-Y-Z in degrees, (B, 3) translation in metres.
 
     Each of the six numbers has its own pixels and weights; those of ``joint`` share theirs.
     Differentiable in the predictions and, through the weights, in the log scales. Values that are
@@ -113,11 +113,8 @@ def select_pose(
         patch: side of the square patches in cells of the maps; a quarter of the height by default:
             32 at 128x256 (the paper).
 
-    Returns:
-        (B, 3) Euler angles X-Y-Z in degrees and (B, 3) translation in metres, of T_curr_prev.
-
     Raises:
-        InputError: unknown method, patch below 1, what is no prediction, or maps of other shapes.
+        InputError: an unknown method, or maps of other shapes.
     """
     if isinstance(output, tuple):
         return output
@@ -195,10 +192,7 @@ def fitted_motion(
     """(B, 4, 4) motion that the pixels agree on which a prediction of these inputs trusts.
 
     The selected pose is the start; the log scales of the rotation are the weights, and carry the
-    gradient.
-
-    Raises:
-        InputError: a prediction without uncertainty.
+    gradient. Refuses a prediction without uncertainty.
     """
     if not isinstance(output, PixelwisePrediction) or output.log_scale_rotation is None:
         raise InputError("fitted_motion: expected a prediction with uncertainty.")

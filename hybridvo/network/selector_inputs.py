@@ -1,9 +1,8 @@
 """What the selector network sees: an image, and what each candidate motion leaves unexplained.
 
-Of every candidate the residuals of flow and second depth, measured against the noise that the
-candidate itself found, how well the current image and its depth look where the candidate says that
-the pixels go (also where there is no flow), and what its rivals explain; beside them the image's
-flow, depth and rays, each over the pair's own scale.
+Residuals of flow and second depth against the candidate's own noise, how well the current image and
+its depth look where the candidate says that the pixels go (also where there is no flow), what its
+rivals explain; beside them the image's flow, depth and rays, each over the pair's own scale.
 """
 
 from __future__ import annotations

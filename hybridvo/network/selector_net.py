@@ -1,9 +1,8 @@
 """The selector network: which of the motions found is the camera's, and where is the static world.
 
-A small convolutional network looks at every candidate motion of a pair through what it leaves
-unexplained, see :mod:`hybridvo.network.selector_inputs`. It answers with a score and a mask: the
-probability of each pixel to be static world. Choosing among few exact motions is a far easier
-question than segmenting motion from raw flow.
+A small convolutional network looks at what every candidate motion leaves unexplained
+(:mod:`hybridvo.network.selector_inputs`) and answers with a score and a mask: the probability of
+each pixel to be static. Choosing among few exact motions is easier than segmenting raw flow.
 """
 
 from __future__ import annotations

@@ -85,23 +85,15 @@ def read_weights(path: str | Path) -> Weights:
         # older safetensors makes its tensors on torch's default device
         with torch.device("cpu"), safe_open(path, framework="pt") as file:
             header = file.metadata() or {}
-            if (found := str(header.get("format"))) != FORMAT:
-                raise CheckpointError(
-                    f"{path}: expected the format {FORMAT!r} in its header, got {found[:80]!r}."
-                )
             tensors = {name: file.get_tensor(name).float() for name in file.keys()}
-    except SafetensorError as error:
-        raise CheckpointError(
-            f"{path}: not a whole safetensors file ({str(error)[:200]}). Pickled checkpoints (.pt, "
-            f".pth) are refused on purpose; if this was a weights file, copy or download it again."
-        ) from None
-    except OSError as error:
-        raise CheckpointError(f"{path}: cannot be read: {error.strerror or error}.") from None
-    try:
+        if (found := str(header.get("format"))) != FORMAT:
+            raise ValueError(f"the header's format is {found[:80]!r}")
         options, card = (dict(json.loads(header[key])) for key in ("options", "card"))
-    except (KeyError, ValueError, TypeError) as error:
+    except (SafetensorError, OSError, KeyError, ValueError, TypeError) as error:
         raise CheckpointError(
-            f"{path}: expected the header's options and card as JSON objects: {error}."
+            f"{path}: expected a whole safetensors file of the format {FORMAT!r} with JSON options "
+            f"and card in its header: {str(error)[:200]}. Pickled checkpoints (.pt, .pth) are "
+            f"refused on purpose."
         ) from None
     _check_finite(str(path), tensors, CheckpointError)
     return Weights(path, options, card, tensors)

@@ -164,22 +164,16 @@ def gather_pixels(
         usable = usable & batch.valid
     depth = torch.where(usable, depth, one)
     target = torch.where(usable[..., None], target, torch.zeros_like(target))
-    log_depth = present = None
+    points = (rays(height, width, K_prev) * depth[..., None]).permute(0, 3, 1, 2)
+    maps = {"points": points, "target": target.permute(0, 3, 1, 2)}
+    maps |= {"flow_variance": flow_variance, "depth_variance": depth_variance}
+    maps["weight"] = torch.where(usable, weight, zero)
     if with_depth and batch.depth_curr is not None:
         sampled, good = sample_depth(batch.depth_curr, target)
-        log_depth = to_tiles(sampled.log(), tile)
-        present = to_tiles((good & usable).to(depth.dtype), tile)
-    points = (rays(height, width, K_prev) * depth[..., None]).permute(0, 3, 1, 2)
-    return Pixels(
-        points=to_tiles(points, tile, 1.0),
-        target=to_tiles(target.permute(0, 3, 1, 2), tile),
-        flow_variance=to_tiles(flow_variance, tile, 1.0),
-        depth_variance=to_tiles(depth_variance, tile, 1.0),
-        weight=to_tiles(torch.where(usable, weight, zero), tile),
-        K=K_curr,
-        log_depth_curr=log_depth,
-        has_depth_curr=present,
-    )
+        maps |= {"log_depth_curr": sampled.log(), "has_depth_curr": (good & usable).to(depth.dtype)}
+    fill = {"points": 1.0, "flow_variance": 1.0, "depth_variance": 1.0}
+    tiles = {name: to_tiles(x, tile, fill.get(name, 0.0)) for name, x in maps.items()}
+    return Pixels(**tiles, K=K_curr)
 
 
 def sample_depth(depth: torch.Tensor, at: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

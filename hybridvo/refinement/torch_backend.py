@@ -250,11 +250,11 @@ class _Solver:
         """Noise and pose, in turn; the noise by the function of the numba refinement."""
         noise = self.few.weight.new_tensor([0.5, 0.01]).repeat(len(T), 1)
         samples = None if given is not None else self._samples()
-        for steps in (2, 3, 3):
+        for steps in (2, 3, 3, 0):
             noise = given.detach() if given is not None else self._noise(samples, T, noise)
             for _ in range(steps):
                 T = stepped(self.few, T, residuals(self.few, T), self.how(noise))
-        return T, noise if given is not None else self._noise(samples, T, noise)
+        return T, noise
 
     def _samples(self) -> np.ndarray:
         """(B, 8, n) the coarse grid of the numba refinement, as a buffer of its kernels."""

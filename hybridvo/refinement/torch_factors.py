@@ -306,8 +306,8 @@ def fit_pixels(pixels: Pixels, start: pp.LieTensor, smallest: float) -> pp.LieTe
 
     The scale of the kernel follows the residuals, down to ``smallest``. Where the fit explains the
     weighted median pixel no better than the start, the answer is the start. The gradient goes into
-    the weights alone; pixels far away pull with constant strength there, since a network that has
-    settled on a mover would never learn of the world.
+    the weights alone, from pixels far away with constant strength: a network that has settled on a
+    mover would else never learn of the world.
     """
     with torch.no_grad():
         T, fixed = start, pixels.map(torch.Tensor.detach)

@@ -119,8 +119,10 @@ def camera_path(
 
 def poses(angles_deg: np.ndarray, position: np.ndarray) -> np.ndarray:
     """(N, 4, 4) from (N, 3) Euler angles about x, y, z and (N, 3) positions."""
-    R = Rotation.from_euler("XYZ", angles_deg, degrees=True).as_matrix()
-    return np.stack([make_transform(r, p) for r, p in zip(R, position, strict=True)])
+    T = np.tile(np.eye(4), (len(position), 1, 1))
+    T[:, :3, :3] = Rotation.from_euler("XYZ", angles_deg, degrees=True).as_matrix()
+    T[:, :3, 3] = position
+    return T
 
 
 def sway(rng: np.random.Generator, frames: int, rate: float) -> np.ndarray:

@@ -22,11 +22,6 @@ from hybridvo.training.validation import PUBLISHED_SEED, calibrate_scales, evalu
 RUN = "run.json"
 """Command, commit and versions of a training, beside its checkpoint."""
 
-SCALE_OF = {
-    "laplace": "s of the translation is the log scale of a Laplace error in metres",
-    "direction": "s of the translation is the log scale of the paper's direction-and-length error",
-}
-
 
 def source_commit() -> str | None:
     """Commit of the working tree, with a mark if it was changed; None outside of a repository."""
@@ -90,7 +85,7 @@ def export_pwvo(
     trainer = open_run(folder)
     assert isinstance(trainer.task, PwvoTask)
     options, presets = trainer.task.options, trainer.task.mixture.presets
-    card = run_card(trainer) | {"translation_scale": SCALE_OF[options.loss.translation_form]}
+    card = run_card(trainer)
     if calibrate:
         main = presets[int(np.argmax(options.data_weights))]
         shift = calibrate_scales(trainer.exported, main, calibrate)

@@ -185,26 +185,26 @@ class Trainer:
         if self.report is not None:
             self.report(entry)
 
+    @property
+    def _parts(self) -> dict[str, Any]:
+        """What has a state beside the progress."""
+        parts = {"network": self.network, "optimizer": self.optimizer, "ema": self.ema}
+        return {name: part for name, part in parts.items() if part is not None}
+
     def save(self) -> None:
         """Write ``checkpoint.pt``: everything that a later process needs to go on."""
         if self.folder is None or self.rank != 0:
             return
-        state = {
-            "record": self.record,
-            "network": self.network.state_dict(),
-            "optimizer": self.optimizer.state_dict(),
-            "ema": None if self.ema is None else self.ema.state_dict(),
-            "progress": {key: getattr(self, key) for key in PROGRESS},
-        }
+        state = {name: part.state_dict() for name, part in self._parts.items()}
+        progress = {key: getattr(self, key) for key in PROGRESS}
         with atomic_write(self.folder / CHECKPOINT, "wb") as file:
-            torch.save(state, file)
+            torch.save(state | {"record": self.record, "progress": progress}, file)
 
     def start_from(self, weights: dict[str, torch.Tensor], name: str) -> None:
         """Take the weights of another network of the same shapes; everything else starts anew."""
-        with _fits(name):
-            self.network.load_state_dict(weights)
-            if self.ema is not None:
-                self.ema.load_state_dict(weights)
+        with _reading(name):
+            for network in filter(None, (self.network, self.ema)):
+                network.load_state_dict(weights)
 
     def resume(self) -> bool:
         """Go on where the folder's checkpoint ended, if there is one of the same options and data.
@@ -222,33 +222,30 @@ class Trainer:
                 f"{path}: is of a run with other options: {changed}. Choose another folder, or "
                 f"train anew with --overwrite."
             )
-        with _fits(str(path)):
-            self.network.load_state_dict(state["network"])
-            self.optimizer.load_state_dict(state["optimizer"])
-            if self.ema is not None:
-                self.ema.load_state_dict(state["ema"])
+        with _reading(str(path)):
+            for name, part in self._parts.items():
+                part.load_state_dict(state[name])
             for key in PROGRESS:
                 setattr(self, key, state["progress"][key])
         return True
 
 
 @contextlib.contextmanager
-def _fits(name: str) -> Iterator[None]:
-    """Say of what does not fit a network where it comes from."""
+def _reading(name: str) -> Iterator[None]:
+    """Say of weights that cannot be read or do not fit where they come from."""
+    wrong = (OSError, RuntimeError, EOFError, LookupError, TypeError, ValueError)
     try:
         yield
-    except (RuntimeError, ValueError, KeyError, TypeError) as error:
-        raise CheckpointError(f"{name}: does not fit this network: {error}") from None
+    except (*wrong, pickle.UnpicklingError) as error:
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+        raise CheckpointError(f"{name}: not a checkpoint of this network: {reason}.") from None
 
 
 def read_checkpoint(path: Path, device: torch.device | str = "cpu") -> dict[str, Any]:
     """Content of a ``checkpoint.pt``; nothing in it can run."""
-    try:
+    with _reading(str(path)):
         state = torch.load(path, map_location=device, weights_only=True)
         return {**state, "record": state["record"]}
-    except (OSError, RuntimeError, EOFError, KeyError, TypeError, pickle.UnpicklingError) as error:
-        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
-        raise CheckpointError(f"{path}: not a checkpoint of a training: {reason}.") from None
 
 
 def difference(before: dict[str, Any], now: dict[str, Any]) -> str:
