@@ -133,8 +133,7 @@ def _compare(args: argparse.Namespace, command: list[str]) -> Result:
     weights = arguments.weight_files(args.weights, METHODS if methods == ("all",) else methods)
     given = {"methods": methods, "weights": weights, "options": arguments.run_options(args)}
     given |= {"sequences": (*args.paths, *args.sequence), "command": command}
-    say = (lambda text: None) if args.quiet else (lambda text: print(text, file=sys.stderr))
-    return _files(_call(compare, args, **given, say=say))
+    return _files(_call(compare, args, **given))
 
 
 def _evaluate(args: argparse.Namespace, command: list[str]) -> Result:

@@ -234,7 +234,7 @@ def load_options(
         found = re.match(r"Options\.([\w.]+): unexpected", str(error))
         near = difflib.get_close_matches(found[1], option_defaults(), n=1) if found else []
         hint = f" Did you mean '{near[0]}'?" if near else ""
-        where = " and ".join([*([str(path)] if path else []), *(["--set"] if assignments else [])])
+        where = " and ".join(str(x) for x in (path, assignments and "--set") if x)
         raise InputError(f"{where or 'options'}: {error}{hint}") from None
 
 

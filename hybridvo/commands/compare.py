@@ -10,11 +10,12 @@ import contextlib
 import dataclasses
 import itertools
 import json
+import logging
 import os
 import platform
 import re
 import shutil
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from collections.abc import Sequence as Several
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -43,6 +44,7 @@ from hybridvo.network.models import Models
 from hybridvo.options import Options
 from hybridvo.pipeline import METHODS, check_method, weights_hash
 
+_logger = logging.getLogger(__name__)
 WRITTEN = ("results.json", "results.csv", "pairs.csv", "report.md", "report.html")
 """What a finished comparison leaves, beside ``runs/`` and ``worst/``."""
 CAMERA_FLOW_KINDS = ("tartanair",)
@@ -61,7 +63,6 @@ def compare(
     worst: int = 3,
     mode: Mode = "new",
     command: Iterable[str] = (),
-    say: Callable[[str], None] = lambda text: None,
     quiet: bool = True,
 ) -> list[Path]:
     """Run every method on every sequence and write the results; returns paths of :data:`WRITTEN`.
@@ -89,7 +90,7 @@ def compare(
                 shutil.rmtree(out / name, ignore_errors=True)
             make_folder(out / name)
         for name, reason in missing.items():
-            say(f"not run: {name}: {reason}")
+            _logger.warning("not run: %s: %s", name, reason)
         for name in names:
             warm_up(name, models)
         tables, rows, facts = [], [], []
@@ -99,7 +100,6 @@ def compare(
             tables.append(table)
             facts.append(about)
             rows += _rows(job, table, out)
-        say("scores and report")
         table = pd.concat(tables, ignore_index=True)
         result = {
             "command": command,
@@ -201,6 +201,7 @@ class _Job:
                 raise
             except Exception as error:
                 raised[f"{method} on {self.name}"] = f"{type(error).__name__}: {error}"
+                _logger.exception("%s on %s", method, self.name)
                 continue
             if code == EXIT_INTERRUPTED:
                 raise KeyboardInterrupt

@@ -18,23 +18,26 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 import hybridvo
-from hybridvo.commands import results
 from hybridvo.commands.progress import Progress, interruptible
 from hybridvo.commands.recording import Recording, check_recording
-from hybridvo.commands.run_folder import RunFolder
+from hybridvo.commands.run_folder import RESULTS, STATE, RunFolder
 from hybridvo.data.sequence import Sequence
 from hybridvo.errors import InputError
-from hybridvo.evaluation.pair_errors import step_errors
-from hybridvo.files import Mode, fingerprint, held, versions
+from hybridvo.evaluation.metrics import evaluate
+from hybridvo.evaluation.pair_errors import mean_pair_errors, step_errors, true_trajectory
+from hybridvo.evaluation.plots import plot_trajectories
+from hybridvo.files import Mode, atomic_write, fingerprint, held, versions, write_json
 from hybridvo.flow import FlowField, FlowProvider, MeasuredFlow, dis_flow, fallback, file_flow
 from hybridvo.geometry import se3_log
 from hybridvo.network.models import Models
 from hybridvo.odometry import Odometry
-from hybridvo.options import Options
+from hybridvo.options import Options, RunOptions
 from hybridvo.pipeline import check_method, weights_hash
 from hybridvo.tracking.state import TrackerState
+from hybridvo.trajectory import Trajectory
 
 EXIT_DONE, EXIT_FAILED_FRAMES, EXIT_INTERRUPTED = 0, 3, 130
 
@@ -74,7 +77,7 @@ def run(
     vo = Odometry(models, flow=flow, method=method, options=options, seed=options.run.seed)
     if not quick:
         vo.warm_up()  # before the folder is taken: it may last
-    header = _header(sequence, len(frames), options, weights_hash(method, models))
+    header = _header(sequence, options, weights_hash(method, models))
     header["command"] = list(command)
     with held(out), contextlib.ExitStack() as stack:
         folder = RunFolder(out, header, mode)
@@ -136,7 +139,7 @@ class _Job:
                 return {"state": "interrupted", "frames": len(rows)}, EXIT_INTERRUPTED
             folder.save_rows()
             given = (folder.path, rows, self.sequence, self.frames, self.options.run)
-            summary = results.write_results(*given, picture=not self.quick)
+            summary = _write_results(*given, picture=not self.quick)
             folder.save("done", summary=summary)
             return summary, _exit_code(summary, self.options)
 
@@ -186,9 +189,81 @@ class _Job:
         }
 
 
-def _header(
-    sequence: Sequence, frames: int, options: Options, weights: str | None
+def _write_results(
+    folder: Path,
+    rows: list[dict[str, Any]],
+    sequence: Sequence,
+    frames: range,
+    options: RunOptions,
+    *,
+    picture: bool,
 ) -> dict[str, Any]:
+    """Write what a finished run leaves beside its steps; its summary, JSON-ready."""
+    trajectory = Trajectory(
+        np.array([row["timestamp"] for row in rows]), np.array([row["T_world_cam"] for row in rows])
+    )
+    trajectory.save(folder / "trajectory.tum")
+    trajectory.save(folder / "trajectory.kitti")
+    names = ("index", "timestamp", "status", "probability", "T_curr_prev", "covariance")
+    with atomic_write(folder / "steps.npz", "wb") as file:
+        arrays: dict[str, Any] = {name: np.array([row[name] for row in rows]) for name in names}
+        np.savez(file, **arrays)
+    summary = _summarise(pd.DataFrame(rows), sequence, options.method)
+    if summary["failed_fraction"] > options.max_failed:
+        text = f"more motions failed than --max-failed {options.max_failed:g} allows"
+        summary["warnings"].append(text)
+    metrics, gt = None, true_trajectory(sequence, frames)
+    if gt is not None:
+        report = evaluate(trajectory, gt, alignment=options.alignment)
+        pairs = mean_pair_errors(row for row in rows if "rot_err_deg" in row)
+        reasons = report["reasons"] | pairs["reasons"]
+        named = ("method", "failed", "degraded", "flow_source", "depth_source", "oracle")
+        metrics = report | pairs | {key: summary[key] for key in (*named, "sequence")}
+        metrics["reasons"] = reasons
+        write_json(folder / "metrics.json", metrics)
+    if picture:
+        title = f"{sequence.name}, flow: {', '.join(summary['flow_source']) or 'none'}"
+        if summary["oracle"]:
+            title += f" (oracle: {', '.join(summary['oracle'])})"
+        path = folder / "trajectory.png"
+        plot_trajectories({options.method: trajectory}, path, truth=gt, title=title)
+    files = [os.fspath(folder / name) for name in RESULTS if (folder / name).exists()]
+    files.append(os.fspath(folder / STATE))
+    return summary | {"state": "done", "out": os.fspath(folder), "files": files, "metrics": metrics}
+
+
+def _summarise(table: pd.DataFrame, sequence: Sequence, method: str) -> dict[str, Any]:
+    """Counts, sources, oracles, times and warnings of a run."""
+    motions = table[1:]  # the first frame has none
+    timed = motions[motions["reason"] != "missing_frame"]
+    failed = int((motions["status"] == "failed").sum())
+    doubts = motions[(motions["status"] == "ok") & (motions["message"] != "")]
+    if any("the median depth" in text for text in sequence.warnings):  # said before the run
+        doubts = doubts[:0]
+    # what the estimate was given that no sensor gives
+    oracle = ["true flow"] if table["flow_is_true"].any() else []
+    oracle += ["true depth"] if sequence.depth_source == "true" else []
+    return {
+        "sequence": sequence.name,
+        "method": method,
+        "frames": len(table),
+        "motions": len(motions),
+        "failed": failed,
+        "failed_fraction": failed / max(len(motions), 1),
+        "degraded": int((motions["status"] == "degraded").sum()),
+        "missing_frames": table["index"][table["reason"] == "missing_frame"].tolist(),
+        "flow_source": sorted(set(table["flow_source"]) - {""}),
+        "depth_source": sequence.depth_source,
+        "oracle": oracle,
+        **{
+            f"{name}_median": float(timed[name].median()) if len(timed) else None
+            for name in ("flow_ms", "motion_ms", "frame_ms")
+        },
+        "warnings": [f"frame {row['index']}: {row['message']}" for _, row in doubts[:1].iterrows()],
+    }
+
+
+def _header(sequence: Sequence, options: Options, weights: str | None) -> dict[str, Any]:
     """What ``run.json`` says of a run beside its state; ``identity``: what a resumed one shares."""
     tree, input_hash = dataclasses.asdict(options), fingerprint(sequence.files())
     free = ("max_failed", "strict", "device")
@@ -200,14 +275,7 @@ def _header(
         "versions": versions(),
         "machine": {"platform": platform.platform(), "cpus": os.cpu_count()},
         "options": tree,
-        "sequence": {
-            "name": sequence.name,
-            "kind": sequence.kind,
-            "path": os.fspath(sequence.root),
-            "frames": frames,
-            "depth_source": sequence.depth_source,
-            "warnings": list(sequence.warnings),
-        },
+        "sequence": os.fspath(sequence.root),
     }
 
 
