@@ -13,6 +13,7 @@ from hybridvo.errors import InputError
 from hybridvo.estimation import warm_up
 from hybridvo.flow import FlowField, FlowProvider, dis_flow, with_flow
 from hybridvo.geometry import invert, se3_exp, se3_log
+from hybridvo.images.photometric import refine_photometric
 from hybridvo.network.models import Models, default_models
 from hybridvo.options import Options
 from hybridvo.pipeline import (
@@ -25,7 +26,6 @@ from hybridvo.pipeline import (
     refines_images,
     run_method,
 )
-from hybridvo.refinement.photometric import refine_photometric
 from hybridvo.refinement.refine import widened
 from hybridvo.results import MotionPrior, Reason, RelativePose, State, Status, Step
 from hybridvo.tracking.pose_graph import Edge

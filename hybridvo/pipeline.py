@@ -22,11 +22,11 @@ from hybridvo.errors import CheckpointError, InputError
 from hybridvo.flow import FlowProvider, contradiction, with_flow
 from hybridvo.hypotheses.generate import HypothesisSet, generate
 from hybridvo.hypotheses.selector import CueSelector, MaskSelector, Selection
+from hybridvo.images.direct import direct_start
+from hybridvo.images.photometric import refine_photometric
 from hybridvo.network.models import SELECTION, Models, default_models, one_thread
 from hybridvo.options import Options
 from hybridvo.refinement import refine as refinement
-from hybridvo.refinement.direct import direct_start
-from hybridvo.refinement.photometric import refine_photometric
 from hybridvo.results import MotionPrediction, MotionPrior, Reason, RelativePose
 from hybridvo.types import FramePair, PairBatch, depth_advice, typical_depth
 

@@ -16,7 +16,7 @@ from hybridvo.types import as_rigid, to_numpy
 if TYPE_CHECKING:
     import torch
 
-    from hybridvo.refinement.photometric import PhotometricReport
+    from hybridvo.images.photometric import PhotometricReport
 
 
 class State(enum.Enum):

@@ -25,9 +25,9 @@ from hybridvo import dis_flow, iter_pairs, open_sequence, refine
 from hybridvo.calibration import MIN_CONFIDENCE
 from hybridvo.evaluation.pair_errors import true_motion
 from hybridvo.hypotheses.selector import CueSelector
+from hybridvo.images.direct import direct_start
 from hybridvo.network.models import Models
 from hybridvo.pipeline import Context
-from hybridvo.refinement.direct import direct_start
 from hybridvo.results import RelativePose
 from hybridvo.synthetic.semi_real import load_split
 

@@ -13,10 +13,10 @@ import cv2
 import numpy as np
 
 from hybridvo.calibration import DIRECT_RIGHT
+from hybridvo.images.image_factor import ImageFactor, blurred, choose_pixels
+from hybridvo.images.photometric import refine_photometric
+from hybridvo.images.plane_factor import PlaneFactor
 from hybridvo.options import Options
-from hybridvo.refinement.image_factor import ImageFactor, blurred, choose_pixels
-from hybridvo.refinement.photometric import refine_photometric
-from hybridvo.refinement.plane_factor import PlaneFactor
 from hybridvo.refinement.solver import Factor, gauss_newton
 from hybridvo.results import RelativePose
 from hybridvo.types import Camera, Frame, FramePair

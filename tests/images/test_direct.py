@@ -10,11 +10,11 @@ import pytest
 from hybridvo.estimation import estimate
 from hybridvo.flow import FlowField, dis_flow
 from hybridvo.geometry import project
+from hybridvo.images.direct import direct_start, reduced
 from hybridvo.options import DirectOptions, Options
 from hybridvo.pipeline import Context, run_method
-from hybridvo.refinement.direct import direct_start, reduced
 from hybridvo.types import FramePair
-from tests.refinement.test_photometric import error_px, made_pair
+from tests.images.test_photometric import error_px, made_pair
 
 SIZE = {"height": 240, "width": 320}
 

@@ -11,9 +11,9 @@ from hybridvo.errors import InputError
 from hybridvo.estimation import refine
 from hybridvo.flow import dis_flow
 from hybridvo.geometry import ego_flow, invert, se3_exp, se3_log
-from hybridvo.refinement import photometric_kernels as kernels
-from hybridvo.refinement.image_factor import ImageFactor
-from hybridvo.refinement.photometric import blurred, refine_photometric
+from hybridvo.images import photometric_kernels as kernels
+from hybridvo.images.image_factor import ImageFactor
+from hybridvo.images.photometric import blurred, refine_photometric
 from hybridvo.results import RelativePose, Status
 from hybridvo.synthetic.render import SyntheticSequence
 from hybridvo.synthetic.scenes import make_scene

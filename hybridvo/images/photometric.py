@@ -17,16 +17,16 @@ import numpy as np
 
 from hybridvo.errors import InputError
 from hybridvo.geometry import pose_matrix, projection_rows
-from hybridvo.options import PhotometricOptions
-from hybridvo.refinement.covariance import direction_is_known
-from hybridvo.refinement.image_factor import (
+from hybridvo.images.image_factor import (
     MID_GREY,
     MIN_WEIGHT,
     ImageFactor,
     blurred,
     choose_pixels,
 )
-from hybridvo.refinement.plane_factor import PlaneFactor
+from hybridvo.images.plane_factor import PlaneFactor
+from hybridvo.options import PhotometricOptions
+from hybridvo.refinement.covariance import direction_is_known
 from hybridvo.refinement.solver import (
     Factor,
     PriorFactor,

@@ -1,7 +1,7 @@
 """The images of a pair as a factor of its motion.
 
 The residual of a weighted static pixel is ``I_curr(pi(T X)) - gain I_prev - offset``; its
-definition is in :mod:`hybridvo.refinement.photometric_kernels`. Gain and offset follow the motion,
+definition is in :mod:`hybridvo.images.photometric_kernels`. Gain and offset follow the motion,
 so that the cost is one of the motion alone; the noise is estimated from the residuals, and the
 information is scaled by what errors that neighbours share leave of it.
 
@@ -21,8 +21,8 @@ import cv2
 import numpy as np
 
 from hybridvo.calibration import EVEN_PARTS, UNEVEN_LIGHT
+from hybridvo.images import photometric_kernels as kernels
 from hybridvo.options import RefineOptions
-from hybridvo.refinement import photometric_kernels as kernels
 from hybridvo.refinement.covariance import dispersion, tile_sums
 from hybridvo.refinement.full_fit import tile_size
 from hybridvo.refinement.kernels import MAX_VALUE

@@ -11,8 +11,8 @@ import pytest
 from hybridvo.estimation import refine
 from hybridvo.flow import dis_flow
 from hybridvo.geometry import ego_flow, invert
-from hybridvo.refinement.image_factor import correlation
-from hybridvo.refinement.photometric import refine_photometric
+from hybridvo.images.image_factor import correlation
+from hybridvo.images.photometric import refine_photometric
 from hybridvo.synthetic.render import SyntheticSequence
 from hybridvo.synthetic.scenes import make_scene
 from hybridvo.types import Frame, FramePair

@@ -1,0 +1,1 @@
+"""The images and depth maps of a pair as factors of its motion."""
