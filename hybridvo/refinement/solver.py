@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from scipy.linalg.lapack import dpotrf, dpotri
 
 from hybridvo.geometry import invert, se3_exp, se3_log
 
@@ -118,12 +117,13 @@ def positive_inverse(matrix: np.ndarray) -> np.ndarray | None:
     if not (np.isfinite(matrix).all() and (diagonal > 0).all()):
         return None
     scale = 1 / np.sqrt(diagonal)
-    root, failed = dpotrf(matrix * np.outer(scale, scale), lower=1)
-    if failed:
+    scaled = matrix * np.outer(scale, scale)
+    try:
+        np.linalg.cholesky(scaled)
+    except np.linalg.LinAlgError:
         return None
-    lower = np.tril(dpotri(root, lower=1)[0]) * np.outer(scale, scale)
-    inverse = lower + lower.T - np.diag(np.diag(lower))
-    return inverse if np.isfinite(inverse).all() else None
+    inverse = np.linalg.inv(scaled) * np.outer(scale, scale)
+    return 0.5 * (inverse + inverse.T) if np.isfinite(inverse).all() else None
 
 
 class PriorFactor:
