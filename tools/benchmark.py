@@ -26,12 +26,16 @@ from golden_inputs import heavy_pairs as heavy_inputs
 from measuring import able, digits, parser_of, provenance, score, summarise, timed, write_result
 
 FLOW_ONLY = (
-    "hybrid-flow", "refine", "pwvo", "pnp-ransac-tuned", "pnp-ransac", "usac-magsac", "poselib",
-    "identity",
+    "hybrid-flow", "pwvo-refine", "refine", "pwvo", "pnp-ransac-tuned", "pnp-ransac", "usac-magsac",
+    "poselib", "identity",
 )  # fmt: skip
 """Methods that need no images."""
-HEAVY_METHODS = ("hybrid", "hybrid-flow", "refine", "pwvo", "pnp-ransac-tuned", "poselib")
-REAL_METHODS = ("hybrid", "refine", "pnp-ransac-tuned", "pnp-ransac", "opencv-rgbd", "identity")
+HEAVY_METHODS = (
+    "hybrid", "hybrid-flow", "pwvo-refine", "refine", "pwvo", "pnp-ransac-tuned", "poselib",
+)  # fmt: skip
+REAL_METHODS = (
+    "hybrid", "pwvo-refine", "refine", "poselib", "pnp-ransac-tuned", "opencv-rgbd", "identity",
+)  # fmt: skip
 ORACLE = "refine-oracle-static-mask"
 """``refine`` told by the ground truth which pixels are static: what a perfect mask would give."""
 REAL_PAIRS = 40
