@@ -77,14 +77,8 @@ class Context:
             source = pair.flow_source
         if mode == "off" or (mode == "auto" and source != "dis"):
             return None
-        best = None
-        for T in (None if self.prior is None else self.prior.T_curr_prev, None):
-            found = direct_start(pair, T, self.options)
-            if found is not None and (best is None or found.probability > best.probability):
-                best = found
-            if self.prior is None or (best is not None and self.is_sure(best)):
-                break
-        return best
+        T_start = None if self.prior is None else self.prior.T_curr_prev
+        return direct_start(pair, T_start, self.options)
 
     def is_sure(self, motion: RelativePose) -> bool:
         """Whether its probability is high enough for a motion that is not degraded."""

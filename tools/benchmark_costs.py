@@ -7,6 +7,7 @@ import json
 import subprocess
 import sys
 import tracemalloc
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,8 @@ from measuring import able, digits, timed
 METHODS = ("hybrid", "hybrid-flow", "refine", "pwvo", "pnp-ransac-tuned", "poselib")
 SIZES = ((218, 512), (480, 640), (436, 1024))
 BATCHES, BATCH_SHAPE = (1, 8, 32), (128, 256)
-REPEATS = 5
+RECORDED = ("tum/rgbd_dataset_freiburg1_xyz_first10", "tum/rgbd_dataset_freiburg1_rpy_100")
+RECORDED_FRAMES, REPEATS = 30, 5
 FRESH_PROCESS = """
 import json, time
 begin = time.perf_counter()
@@ -35,6 +37,7 @@ def costs(args: argparse.Namespace) -> dict[str, Any]:
         "missing": missing,
         "pair_ms": {f"{w}x{h}": pair_times(frames[h, w], methods) for h, w in SIZES},
         "frame_ms": {f"{w}x{h}": frame_times(frames[h, w], methods) for h, w in SIZES},
+        "recorded_frame_ms": {name: recorded(args.data / name) for name in RECORDED},
         "memory_mib": memory(frames[SIZES[-1]], methods),
         "first_call": first_call(),
         "batch": batches(args.seed0),
@@ -71,6 +74,20 @@ def frame_times(frames: list[Any], methods: list[str]) -> dict[str, float]:
         times = [timed(lambda frame=frame, o=odometry: o.track(frame))[1] for frame in frames[2:]]
         rows[method] = digits(np.median(times))
     return rows
+
+
+def recorded(folder: Path) -> dict[str, float]:
+    """Median wall time of a tracked frame of a static scene, ms, beside that of its DIS flow."""
+    from hybridvo import Odometry, dis_flow, open_sequence
+
+    if not folder.is_dir():
+        return {}
+    sequence, flow, odometry = open_sequence(folder), dis_flow(), Odometry()
+    frames = [sequence[i] for i in range(min(len(sequence), RECORDED_FRAMES))]
+    odometry.track(frames[0])
+    times = [timed(lambda frame=frame: odometry.track(frame))[1] for frame in frames[1:]]
+    alone = [timed(lambda k=k: flow(frames[k], frames[k + 1]))[1] for k in range(REPEATS)]
+    return {"hybrid": digits(np.median(times)), "dis alone": digits(np.median(alone))}
 
 
 def memory(frames: list[Any], methods: list[str]) -> dict[str, float]:

@@ -254,6 +254,14 @@ def costs(part: dict[str, Any]) -> list[str]:
     return [
         *table(["method", *header, "MiB"], rows),
         "",
+        "Tracked frames of static recordings, "
+        + "; ".join(
+            f"{name.rpartition('/')[2]}: "
+            + ", ".join(f"{what} {number(ms)} ms" for what, ms in row.items())
+            for name, row in part.get("recorded_frame_ms", {}).items()
+        )
+        + ".",
+        "",
         "Milliseconds of an estimate with the flow given, and of a tracked frame with its flow "
         f"(OpenCV DIS). MiB: most that one estimate allocates at {sizes[-1]}. Import and first "
         f"call: {number(first.get('import_s'))} s and {number(first.get('warm_up_s'))} s. Batched "
