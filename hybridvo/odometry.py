@@ -92,7 +92,7 @@ class Odometry:
         if method is None:
             method = "refine" if network is None else DEFAULT_METHOD
         self._models = _models(network, method, options)
-        check_method(method, self._models)
+        check_method(method)
         if method not in SEARCHING and (options.track.window or 1) > 1:
             raise InputError(
                 f"Odometry: method {method!r} has no window of key frames; set track.window to "

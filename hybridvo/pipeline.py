@@ -18,7 +18,7 @@ from functools import partial
 import numpy as np
 
 from hybridvo.baselines import pnp, rgbd
-from hybridvo.errors import CheckpointError, InputError
+from hybridvo.errors import InputError
 from hybridvo.flow import FlowProvider, contradiction, with_flow
 from hybridvo.hypotheses.generate import HypothesisSet, generate
 from hybridvo.hypotheses.selector import CueSelector, MaskSelector, Selection
@@ -205,7 +205,7 @@ def run_method(pair: FramePair, method: str, ctx: Context) -> RelativePose:
 
     The covariance of an ambiguous motion is that of the motion itself, should it be the camera's.
     """
-    check_method(method, ctx.models)
+    check_method(method)
     started = time.perf_counter()
     if method != "hybrid":
         pair = ctx.with_flow(pair)
@@ -244,24 +244,16 @@ def weights_hash(method: str, models: Models | None = None) -> str | None:
     return digest.hexdigest() if networks_of(method) else None
 
 
-def check_method(method: str, models: Models | None = None) -> None:
+def check_method(method: str) -> None:
     """Refuse a method that cannot run here.
 
     Raises:
-        InputError: an unknown name (the nearest known one is named), a method whose network has no
-            weights yet, or a baseline whose package is missing (with the command that installs it).
+        InputError: an unknown name (the nearest known one is named), or a baseline whose package is
+            missing (with the command that installs it).
     """
     if method not in METHODS:
         near = difflib.get_close_matches(str(method), METHODS, n=1, cutoff=0.4)
         hint = f" (did you mean '{near[0]}'?)" if near else ""
         raise InputError(f"method: '{method}' is unknown{hint}; known: {', '.join(METHODS)}.")
-    for name in networks_of(method):
-        try:
-            (models or default_models()).path(name)
-        except CheckpointError:
-            raise InputError(
-                f"method '{method}' needs the weights '{name}', which this version does not have; "
-                f"use --method refine (the classical refinement), or --weights {name}=FILE."
-            ) from None
     if method in BASELINES and method in (absent := pnp.missing()):
         raise InputError(f"method '{method}' cannot run here: {absent[method]}.")

@@ -142,7 +142,7 @@ def methods_to_run(
     wanted = dict.fromkeys(METHODS if is_all else names)
     for name in wanted:
         try:
-            check_method(name, models)
+            check_method(name)
         except InputError as error:
             if not is_all:
                 raise

@@ -68,7 +68,7 @@ def run(
     """
     method = options.run.method
     models = models or Models(options.run.device)
-    check_method(method, models)
+    check_method(method)
     if rrd is not None:
         check_recording(rrd or RECORDING)
     frames = frames_of(sequence, options)

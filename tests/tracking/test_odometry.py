@@ -198,7 +198,6 @@ def test_a_frame_of_another_size_is_refused_and_changes_nothing() -> None:
         ({"network": object()}, "expected .default.*got object"),
         ({"flow": 3}, "expected a callable"),
         ({"method": "refin"}, "did you mean 'refine'"),
-        ({"method": "pixelwise"}, "needs the weights.*--method refine"),
         ({"method": "hybrid", "network": None}, "needs a network"),
         ({"options": {"track": 3}}, "expected Options, got dict"),
         ({"options": Options(track=TrackOptions(window=4)), "method": "identity"}, "no window"),
