@@ -43,7 +43,8 @@ def direct_start(
     """The motion that the images and depth maps agree on, from a start (4, 4) or the identity.
 
     Its ``inlier_ratio`` is the share of the pixels in view of both that it explains, its
-    ``probability`` of being the camera's follows from that. None where the images do not match.
+    ``probability`` of being the camera's follows from that. None where the images do not match, or
+    where it is more likely another's.
     """
     images = (options or Options()).photometric
     prev, curr = pair.prev, pair.curr
@@ -72,7 +73,10 @@ def direct_start(
         gain = factor.gain
     fine = PlaneFactor(pair, ones, 1.0)
     fine.estimate(T)
-    weights = fine.image_of(_explained(pair, fine, T, gain)[0])
+    follows, share = _explained(pair, fine, T, gain)
+    if _probability(share) < 0.5:
+        return None
+    weights = fine.image_of(follows)
     finest = replace(images, blur_px=images.blur_px[-1:], prior_inflation=1.0)
     found = refine_photometric(pair, start.replace(T_curr_prev=T, weights=weights), finest)
     if found.photometric is None or not found.photometric.taken:
@@ -100,16 +104,21 @@ def _answer(pair: FramePair, planes: PlaneFactor, found: RelativePose) -> Relati
     assert found.photometric is not None
     planes.estimate(found.T_curr_prev)
     follows, share = _explained(pair, planes, found.T_curr_prev, found.photometric.gain)
-    slope, offset = DIRECT_RIGHT
     at = planes.residuals(found.T_curr_prev)
     z = at.z[at.seen]
     return found.replace(
         inlier_ratio=share,
-        probability=float(1 / (1 + np.exp(-slope * 100 * share - offset))),
+        probability=_probability(share),
         weights=planes.image_of(follows),
         depth_noise=float(np.median(planes.noise(z) / z)) / np.sqrt(2),
         terms=("images", "depth"),
     )
+
+
+def _probability(share: float) -> float:
+    """Of being the camera's motion, by the share of the image that it explains."""
+    slope, offset = DIRECT_RIGHT
+    return float(1 / (1 + np.exp(-slope * 100 * share - offset)))
 
 
 def _explained(

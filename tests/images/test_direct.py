@@ -55,16 +55,13 @@ def test_static_scene_needs_no_flow(static):
 
 
 def test_where_most_moves_it_is_not_sure(moving):
-    found = direct_start(moving[0])
-    assert found is None or found.probability < 0.5
+    assert direct_start(moving[0]) is None
 
 
 def test_a_start_leads_over_a_motion_that_is_too_far():
     pair, T, _ = made_pair("static", 305, **SIZE)
     far = replace(pair.curr, rgb=np.roll(pair.curr.rgb, 90, axis=1))
-    assert direct_start(FramePair(pair.prev, far, None)) is None or (
-        direct_start(FramePair(pair.prev, far, None)).probability < 0.5
-    )
+    assert direct_start(FramePair(pair.prev, far, None)) is None
     found = direct_start(FramePair(pair.prev, pair.curr, None), T)
     assert error_px(pair, found.T_curr_prev, T) < 0.05
 
