@@ -24,6 +24,7 @@ WITHOUT_FLOW = {  # the paper's Table 3: EPE px, R_err deg, T_err m
     "vonet": (1.276, 0.113, 0.069),
     "vonet-attention": (1.312, 0.118, 0.065),
     "pwvo-naive": (1.241, 0.144, 0.095),
+    "pwvo-paper": (None, None, None),
 }
 """The line that the paper calls PWVO there has the figures of its PWVO (naive)."""
 FIGURES = {"epe": "EPE", "r_err_deg": "R_err", "t_err": "T_err"}
