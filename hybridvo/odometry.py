@@ -295,7 +295,7 @@ class Odometry:
             raise InputError(
                 f"Odometry.track: expected a frame of {prev.camera.shape} (height, width) as "
                 f"before, got {curr.camera.shape}. Resize it with "
-                f"hybridvo.data.resize.resize_frame, or reset() the tracker."
+                f"hybridvo.data.sequence.resize_frame, or reset() the tracker."
             )
         pair = FramePair(prev, curr, None)
         if flow is not None:
