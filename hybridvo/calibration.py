@@ -6,6 +6,8 @@ the development recordings of :mod:`hybridvo.synthetic.semi_real` and on the hea
 scenes, seeds 900 to 905, with DIS flow.
 """
 
+from math import exp
+
 CUES_RIGHT = (0.26, 1.26)
 """Of the cue scores: 259 of 316 answers right. The gap says little (AUROC .68, calibration error
 .05), so that a motion with a rival is hardly ever sure."""
@@ -108,3 +110,8 @@ WEAK_RATIO = 2e-5
 """Ratio of the information's extreme eigenvalues below which errors that neighbours share, and that
 the covariance of one small patch cannot know of, decide a direction: degraded. A frontal plane over
 a field of view of 20 degrees has 1e-4, a patch of 20 px at fx = 1120 has 1e-5."""
+
+
+def right(value: float, weights: tuple[float, float]) -> float:
+    """Probability that a motion is right: logistic in one number, by slope and offset."""
+    return 1 / (1 + exp(min(-weights[0] * value - weights[1], 700.0)))  # exp(700) is finite

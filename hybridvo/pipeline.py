@@ -78,7 +78,7 @@ class Context:
         if mode == "off" or (mode == "auto" and source != "dis"):
             return None
         T_start = None if self.prior is None else self.prior.T_curr_prev
-        return direct_start(pair, T_start, self.options)
+        return direct_start(pair, T_start, self.options.photometric)
 
     def is_sure(self, motion: RelativePose) -> bool:
         """Whether its probability is high enough for a motion that is not degraded."""

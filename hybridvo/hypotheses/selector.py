@@ -13,7 +13,7 @@ from typing import Protocol
 
 import numpy as np
 
-from hybridvo.calibration import CLEAR_RIGHT, CUE_WEIGHTS, CUES_RIGHT, SELECTOR_RIGHT
+from hybridvo.calibration import CLEAR_RIGHT, CUE_WEIGHTS, CUES_RIGHT, SELECTOR_RIGHT, right
 from hybridvo.geometry import invert, pose_matrix, se3_log
 from hybridvo.hypotheses import search
 from hybridvo.hypotheses.cues import agreement, cue_scores
@@ -263,11 +263,6 @@ def gap_of(found: HypothesisSet, candidates: Candidates, score: np.ndarray) -> f
     best = int(np.argmax(score))
     apart = search.distances(found.grid, candidates.poses, best) > search.OTHER_PX
     return min(NO_RIVAL, float(score[best] - score[apart].max(initial=-np.inf)))
-
-
-def right(gap: float, weights: tuple[float, float]) -> float:
-    """Probability that a motion is right: logistic in the gap of the scores, slope and offset."""
-    return float(1 / (1 + np.exp(-weights[0] * gap - weights[1])))
 
 
 def mask_weights(probability: np.ndarray, ramp: tuple[float, float] = MASK_RAMP) -> np.ndarray:

@@ -1,7 +1,7 @@
 """A motion from the images and depth maps alone, coarse to fine: no flow is needed.
 
 Where the motion explains nearly all of the image, nothing else moves: it is the answer. Where it
-does not, something moves, or the images are too far apart: it is one start among others.
+does not, something moves, or the images are too far apart, and the flow has to be asked.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from weakref import WeakKeyDictionary
 import cv2
 import numpy as np
 
-from hybridvo.calibration import DIRECT_RIGHT
+from hybridvo.calibration import DIRECT_RIGHT, right
 from hybridvo.images.image_factor import ImageFactor, blurred, choose_pixels
 from hybridvo.images.photometric import refine_photometric
 from hybridvo.images.plane_factor import PlaneFactor
-from hybridvo.options import Options
+from hybridvo.options import PhotometricOptions
 from hybridvo.refinement.solver import Factor, gauss_newton
 from hybridvo.results import RelativePose
 from hybridvo.types import Camera, Frame, FramePair
@@ -38,7 +38,7 @@ _REDUCED: WeakKeyDictionary[Frame, dict[int, Frame]] = WeakKeyDictionary()
 
 
 def direct_start(
-    pair: FramePair, T_start: np.ndarray | None = None, options: Options | None = None
+    pair: FramePair, T_start: np.ndarray | None = None, options: PhotometricOptions | None = None
 ) -> RelativePose | None:
     """The motion that the images and depth maps agree on, from a start (4, 4) or the identity.
 
@@ -46,7 +46,7 @@ def direct_start(
     ``probability`` of being the camera's follows from that. None where the images do not match, or
     where it is more likely another's.
     """
-    images = (options or Options()).photometric
+    images = options or PhotometricOptions()
     prev, curr = pair.prev, pair.curr
     if any(x is None for x in (prev.rgb, prev.depth, curr.rgb, curr.depth)):
         return None
@@ -74,7 +74,7 @@ def direct_start(
     fine = PlaneFactor(pair, ones, 1.0)
     fine.estimate(T)
     follows, share = _explained(pair, fine, T, gain)
-    if _probability(share) < 0.5:
+    if right(100 * share, DIRECT_RIGHT) < 0.5:
         return None
     weights = fine.image_of(follows)
     finest = replace(images, blur_px=images.blur_px[-1:], prior_inflation=1.0)
@@ -108,17 +108,11 @@ def _answer(pair: FramePair, planes: PlaneFactor, found: RelativePose) -> Relati
     z = at.z[at.seen]
     return found.replace(
         inlier_ratio=share,
-        probability=_probability(share),
+        probability=right(100 * share, DIRECT_RIGHT),
         weights=planes.image_of(follows),
         depth_noise=float(np.median(planes.noise(z) / z)) / np.sqrt(2),
         terms=("images", "depth"),
     )
-
-
-def _probability(share: float) -> float:
-    """Of being the camera's motion, by the share of the image that it explains."""
-    slope, offset = DIRECT_RIGHT
-    return float(1 / (1 + np.exp(-slope * 100 * share - offset)))
 
 
 def _explained(
