@@ -90,37 +90,39 @@ def compare(
             _logger.warning("not run: %s: %s", name, reason)
         for name in names:
             warm_up(name, models)
+        given = list(command)
+        for job in jobs:
+            missing |= job.run(names, options, models, given, quiet)
         result: dict[str, Any] = {
-            "command": list(command),
+            "command": given,
             "versions": versions(),
             "machine": {"platform": platform.platform(), "cpus": os.cpu_count()},
             "options": dataclasses.asdict(options),
             "weights": {name: weights_hash(name, models) for name in names},
             "timing": "one estimate at a time",
             "missing": missing,
-            **{"rows": [], "sequences": []},
         }
-        tables = {}
-        for job in jobs:
-            missing |= job.run(names, options, models, result["command"], quiet)
-            tables[job.name], about = _read(job, protocol is not None)
-            result["rows"] += _rows(job, tables[job.name], out)
-            result["sequences"].append(about)
-        table = pd.concat(tables.values(), ignore_index=True)
-        result["totals"] = scores.totals(table, result["rows"])
-        result["worst_pairs"] = scores.worst_pairs(table, worst)
-        for job in jobs:
-            entries = [e for e in result["worst_pairs"] if e["sequence"] == job.name]
-            draw_worst(out, job.sequence, job.flows, options, models, entries, tables[job.name])
-        scored = result["totals"], result["sequences"]
-        result["protocol"] = None if protocol is None else protocol_summary(*scored)
-        with atomic_write(out / "pairs.csv") as file:
-            table[list(scores.PAIR_COLUMNS)].to_csv(file, index=False, lineterminator="\n")
-        write_json(out / "results.json", result)
-        columns = [name for name in result["rows"][0] if name != "reasons"]
-        write_csv(out / "results.csv", columns, result["rows"])
-        write_report(out, result, table)
+        tables, facts = zip(*(_read(job, protocol is not None) for job in jobs), strict=True)
+        table = pd.concat(tables, ignore_index=True)
+        rows = [row for two in zip(jobs, tables, strict=True) for row in _rows(*two, out)]
+        totals, entries = scores.totals(table, rows), scores.worst_pairs(table, worst)
+        for job, mine in zip(jobs, tables, strict=True):
+            here = [entry for entry in entries if entry["sequence"] == job.name]
+            draw_worst(out, job.sequence, job.flows, options, models, here, mine)
+        result |= {"rows": rows, "totals": totals, "sequences": facts, "worst_pairs": entries}
+        result["protocol"] = None if protocol is None else protocol_summary(totals, facts)
+        _write(out, result, table)
     return [out / name for name in WRITTEN]
+
+
+def _write(out: Path, result: dict[str, Any], table: pd.DataFrame) -> None:
+    """Write :data:`WRITTEN`."""
+    with atomic_write(out / "pairs.csv") as file:
+        table[list(scores.PAIR_COLUMNS)].to_csv(file, index=False, lineterminator="\n")
+    write_json(out / "results.json", result)
+    columns = [name for name in result["rows"][0] if name != "reasons"]
+    write_csv(out / "results.csv", columns, result["rows"])
+    write_report(out, result, table)
 
 
 def methods_to_run(

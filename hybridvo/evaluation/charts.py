@@ -21,7 +21,6 @@ TRUTH = "ground truth"
 LABELS = {
     "epe_l2_px": "EPE [px]",
     "epe_l2_px_median": "median EPE [px]",
-    "percent": "pairs below it [%]",
     "failure_rate": "share of failures",
     "ms_per_pair_median": "time per pair, flow not included [ms]",
     "index": "pair",
@@ -73,7 +72,10 @@ def error_distribution(pairs: pd.DataFrame, methods: Sequence[str]) -> list[Figu
     """Share of the pairs below an error, the sources of flow side by side."""
     known = pairs.dropna(subset=["epe_l2_px"])
     axes = {"x": "epe_l2_px", "ecdfnorm": "percent", "facet_col": "flow_source"}
-    return [_chart(px.ecdf, known, methods, **axes)] if len(known) else []
+    if known.empty:
+        return []
+    figure = _chart(px.ecdf, known, methods, **axes)
+    return [figure.update_yaxes(title="pairs below it [%]", col=1)]
 
 
 def failure_chart(totals: Sequence[Mapping[str, Any]], methods: Sequence[str]) -> list[Figure]:
