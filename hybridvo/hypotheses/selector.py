@@ -172,7 +172,7 @@ class CueSelector:
         # a prior may say which motion; that it is right the image has to say
         best = int(np.argmax(scores))
         gap = min(seen[best] - np.delete(seen, best).max(initial=-np.inf), NO_RIVAL)
-        probability = right(gap, CUES_RIGHT) if found.is_ambiguous else CLEAR_RIGHT
+        probability = right((gap,), CUES_RIGHT) if found.is_ambiguous else CLEAR_RIGHT
         masks = [None] * len(scores)
         return _selection(found, candidates, scores, masks, probability, gap, probability)
 
@@ -222,7 +222,7 @@ class MaskSelector:
             if int(np.argmax(scores.score)) < known:
                 break
         gap = gap_of(found, candidates, scores.score)
-        trust = scores.confidence, gap, right(gap, SELECTOR_RIGHT)
+        trust = scores.confidence, gap, right((gap,), SELECTOR_RIGHT)
         return _selection(found, candidates, scores.score, masks, *trust)
 
     def _refit(
