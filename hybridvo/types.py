@@ -56,6 +56,13 @@ def as_seed(seed: Any, where: str) -> int:
     return int(seed)
 
 
+def rotation_error(R: np.ndarray) -> np.ndarray:
+    """Largest deviation of (..., 3, 3) from a rotation; infinite where it is none at all."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        error = np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)).max(axis=(-1, -2))
+        return np.where((np.linalg.det(R) > 0) & np.isfinite(error), error, np.inf)
+
+
 def as_rigid(T: Any, where: str, tolerance: float = 1e-6, *, many: bool = False) -> np.ndarray:
     """Float64 copy of a rigid transform (4, 4), or of ``many`` (N, 4, 4), to ``tolerance``."""
     T = to_numpy(T, where)
@@ -63,11 +70,9 @@ def as_rigid(T: Any, where: str, tolerance: float = 1e-6, *, many: bool = False)
         shape = "(N, 4, 4)" if many else "(4, 4)"
         raise InputError(f"{where}: expected shape {shape}, got {T.dtype} {T.shape}.")
     T = T.astype(np.float64)
-    R = T[..., :3, :3]
-    with np.errstate(over="ignore", invalid="ignore"):
-        error = np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)).max(axis=(-1, -2))
-        error = np.maximum(error, np.abs(T[..., 3, :] - (0.0, 0.0, 0.0, 1.0)).max(axis=-1))
-        good = (error <= tolerance) & (np.linalg.det(R) > 0) & np.isfinite(T).all(axis=(-1, -2))
+    last = np.abs(T[..., 3, :] - (0.0, 0.0, 0.0, 1.0)).max(axis=-1)
+    good = np.maximum(rotation_error(T[..., :3, :3]), last) <= tolerance
+    good &= np.isfinite(T).all(axis=(-1, -2))
     if not good.all():
         k = int(np.argmin(good))
         place, bad = (f"{where}[{k}]", T[k]) if many else (where, T)
@@ -96,30 +101,22 @@ class Camera:
     width: int
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            number, whole = as_number(value), name in ("height", "width")
-            positive = not isinstance(value, bool) and number > 0 and not number % 1
-            if not np.isfinite(number) or (whole and not positive):
-                expected = "a positive integer" if whole else "a finite number"
-                raise InputError(f"Camera.{name}: expected {expected}, got {value!r}.")
-            object.__setattr__(self, name, int(number) if whole else number)
+        for name in ("height", "width"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or as_number(value) % 1 != 0 or value <= 0:
+                raise InputError(f"Camera.{name}: expected a positive integer, got {value!r}.")
+            object.__setattr__(self, name, int(value))
+        size = f"an image of {self.width}x{self.height}"
         if self.height * self.width > MAX_PIXELS:
-            raise InputError(
-                f"Camera: {self.width}x{self.height} pixels is above the limit of {MAX_PIXELS}."
-            )
-        low, high = FOCAL_RANGE
-        for axis, size in (("x", self.width), ("y", self.height)):
-            focal, centre = getattr(self, f"f{axis}"), getattr(self, f"c{axis}")
-            if not low <= focal <= high:
-                raise InputError(
-                    f"Camera.f{axis}: expected a positive focal length in pixels ({low:g} to "
-                    f"{high:g}), got {focal}."
-                )
-            if not -size <= centre <= 2 * size:
-                raise InputError(
-                    f"Camera.c{axis}: {centre} lies far outside an image of {size} pixels. "
-                    f"Are the intrinsics those of this image size?"
-                )
+            raise InputError(f"Camera: {size} pixels is above the limit of {MAX_PIXELS}.")
+        x_range, y_range = (-self.width, 2 * self.width), (-self.height, 2 * self.height)
+        limits = {"fx": FOCAL_RANGE, "fy": FOCAL_RANGE, "cx": x_range, "cy": y_range}
+        for name, (low, high) in limits.items():
+            value, what = getattr(self, name), "focal length" if name[0] == "f" else "centre"
+            if not low <= as_number(value) <= high:
+                expected = f"a {what} of {low:g} to {high:g} pixels for {size}"
+                raise InputError(f"Camera.{name}: expected {expected}, got {value!r}.")
+            object.__setattr__(self, name, float(value))
 
     @classmethod
     def from_matrix(cls, K: np.ndarray, height: int, width: int) -> Camera:
@@ -345,20 +342,14 @@ def typical_depth(depth: np.ndarray) -> float | None:
 def depth_advice(median: float, usual: float | None = None) -> str:
     """What probably turns depths of this median into metres; empty where they can be metres.
 
-    The first unit that brings the median to everyday depths, the data set's own (``usual``, units
-    per metre) before the others: ``divide by 1000 (millimetres)`` for a median of 974.
+    The data set's own unit (``usual``, per metre), else the first that makes them everyday depths.
     """
     low, high = PLAUSIBLE_DEPTH_M
     if low <= median <= high:
         return ""
-    factors = [1 / unit if median > high else float(unit) for unit in UNITS_PER_METRE]
-    if usual and median > high and low <= median / usual <= high:
-        factors = [1 / usual]
-    # how far each leads from the middle of everyday depths, which are all as good
-    nearest, farthest = EVERYDAY_DEPTH_M
-    off = np.abs(np.log(median * np.array(factors) / np.sqrt(nearest * farthest)))
-    factor = factors[int(np.argmin(off.clip(np.log(farthest / nearest) / 2)))]
-    if factor > 1:
-        return f"multiply by {factor:g}"
-    unit = UNITS_PER_METRE.get(round(1 / factor))
-    return f"divide by {1 / factor:g}" + (f" ({unit})" if unit else "")
+    if median < low:
+        return "multiply by 1000"
+    near, far = EVERYDAY_DEPTH_M
+    units = [unit for unit in UNITS_PER_METRE if near <= median / unit <= far] or [1000]
+    unit = round(usual) if usual and low <= median / usual <= high else units[0]
+    return f"divide by {unit}" + (f" ({UNITS_PER_METRE[unit]})" if unit in UNITS_PER_METRE else "")
