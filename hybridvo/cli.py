@@ -122,7 +122,7 @@ def _files(paths: Iterable[Any]) -> Result:
 def _show(args: argparse.Namespace, command: list[str]) -> Result:
     from hybridvo.evaluation.drawing import draw
 
-    return _files(_call(draw, args, sequence=_open(args)))
+    return _files([_call(draw, args, sequence=_open(args))])
 
 
 def _compare(args: argparse.Namespace, command: list[str]) -> Result:

@@ -149,7 +149,6 @@ def _add_show(show: argparse.ArgumentParser) -> None:
     add("--method", default="hybrid", metavar="NAME", help="estimator (default: hybrid)")
     add("--flow", choices=("auto", "file", "dis"), default="auto")
     add("--weights", action="append", default=[], metavar="FILE", help="a network")
-    add("--steps", type=int, default=32, help="of the integrated gradients")
     add("--overwrite", action="store_true", help="replace the image")
 
 

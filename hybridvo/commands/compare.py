@@ -24,7 +24,7 @@ from typing import Any, Literal
 import numpy as np
 import pandas as pd
 
-from hybridvo.commands.run import EXIT_INTERRUPTED, flow_provider, frames_of, run
+from hybridvo.commands.run import flow_provider, frames_of, run
 from hybridvo.data.sequence import Sequence, open_sequence
 from hybridvo.errors import HybridVOError, InputError
 from hybridvo.estimation import warm_up
@@ -190,15 +190,13 @@ class _Job:
             asked = _with(options, run=single, flow={"source": source})
             given: dict[str, Any] = {"models": models, "command": command, "quiet": quiet}
             try:
-                code = run(self.sequence, folder, asked, mode="resume", quick=True, **given)[1]
+                run(self.sequence, folder, asked, mode="resume", quick=True, **given)
             except HybridVOError:
                 raise
             except Exception as error:
                 raised[f"{method} on {self.name}"] = f"{type(error).__name__}: {error}"
                 _logger.exception("%s on %s", method, self.name)
                 continue
-            if code == EXIT_INTERRUPTED:
-                raise KeyboardInterrupt
             self.runs[method, flow] = folder
         return raised
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from hybridvo.commands.run import EXIT_INTERRUPTED, run
+from hybridvo.commands.run import run
 from hybridvo.data.sequence import open_sequence
 from hybridvo.errors import InputError
 from hybridvo.evaluation.pair_errors import true_trajectory
@@ -65,11 +65,8 @@ def demo(
         wanted = RunOptions(method=method, max_failed=1.0)
         options = Options(flow=FlowOptions(source="dis"), run=wanted)
         mode: Mode = "overwrite" if overwrite else "new"
-        summary, code = run(
-            sequence, out / method, options, mode=mode, command=command, quiet=quiet
-        )
-        if code == EXIT_INTERRUPTED:
-            raise KeyboardInterrupt
+        given: dict[str, Any] = {"mode": mode, "command": command, "quiet": quiet}
+        summary, _ = run(sequence, out / method, options, **given)
         metrics = summary["metrics"]
         rows.append(
             {
