@@ -1,8 +1,8 @@
 """A motion from the images and depth maps alone, coarse to fine: no flow is needed.
 
-Where the motion leaves no region of the image unexplained, with depth as exact as its sensor's and
-all parts of the image of one mind, nothing else moves: it is the answer. Where it does, something
-moves, or the images are too far apart, and the flow has to be asked.
+Where the motion leaves no region of the image unexplained, and the parts of the image agree about
+it, nothing else moves: it is the answer. Where it does, something moves, or the images are too far
+apart, and the flow has to be asked.
 """
 
 from __future__ import annotations
@@ -37,18 +37,23 @@ NEIGHBOURS = 3
 REGION, UNEXPLAINED = 5, 0.6
 """Side, in points of the grid, of the squares in which more than this share is unexplained: a
 region that moves, where single points are noise."""
+SMALL_REGION = 0.01
+"""Share of the image far below which smaller is no better."""
 _REDUCED: WeakKeyDictionary[Frame, dict[int, Frame]] = WeakKeyDictionary()
 """Reduced frames by reduction, as long as the frame is kept."""
 
 
 def direct_start(
-    pair: FramePair, T_start: np.ndarray | None = None, options: PhotometricOptions | None = None
+    pair: FramePair,
+    T_start: np.ndarray | None = None,
+    options: PhotometricOptions | None = None,
+    least: float = 0.5,
 ) -> RelativePose | None:
     """The motion that the images and depth maps agree on, from a start (4, 4) or the identity.
 
     Its ``inlier_ratio`` is the share of the pixels in view of both that it explains, its
     ``probability`` of being the camera's follows from that. None where the images do not match, or
-    where it is more likely another's.
+    where that is below ``least``.
     """
     images = options or PhotometricOptions()
     prev, curr = pair.prev, pair.curr
@@ -78,14 +83,15 @@ def direct_start(
     fine = PlaneFactor(pair, ones, 1.0)
     fine.estimate(T)
     follows, _, evidence = _explained(pair, fine, T, gain, agreement=1.0)
-    if right(evidence, DIRECT_RIGHT) < 0.5:
+    if right(evidence, DIRECT_RIGHT) < least:
         return None
     weights = fine.image_of(follows)
     finest = replace(images, blur_px=images.blur_px[-1:], prior_inflation=1.0)
     found = refine_photometric(pair, start.replace(T_curr_prev=T, weights=weights), finest)
     if found.photometric is None or not found.photometric.taken:
         return None
-    return _answer(pair, fine, found)
+    answer = _answer(pair, fine, found)
+    return answer if answer.probability >= least else None
 
 
 def reduced(frame: Frame, by: int) -> Frame:
@@ -108,21 +114,22 @@ def _answer(pair: FramePair, planes: PlaneFactor, found: RelativePose) -> Relati
     T, images = found.T_curr_prev, found.photometric
     assert images is not None
     planes.estimate(T)
+    at = planes.residuals(T)
+    z = at.z[at.seen]
     follows, share, evidence = _explained(pair, planes, T, images.gain, images.agreement)
     return found.replace(
         inlier_ratio=share,
         probability=right(evidence, DIRECT_RIGHT),
         weights=planes.image_of(follows),
-        depth_noise=_noise(planes, T) / np.sqrt(2),
+        depth_noise=float(np.median(planes.noise(z) / z)) / np.sqrt(2),
         terms=("images", "depth"),
     )
 
 
-def evidence_of(pair: FramePair, motion: RelativePose) -> tuple[float, float, float]:
+def evidence_of(pair: FramePair, motion: RelativePose) -> tuple[float, float]:
     """What the probability of a motion of :func:`direct_start` is logistic in.
 
-    Log of the depth's relative noise, agreement of the image's parts, and log of the share of the
-    image in unexplained regions.
+    Agreement of the image's parts, and log of the share of the image in unexplained regions.
     """
     planes = PlaneFactor(pair, np.ones(pair.prev.camera.shape, np.float32), 1.0)
     planes.estimate(motion.T_curr_prev)
@@ -131,15 +138,9 @@ def evidence_of(pair: FramePair, motion: RelativePose) -> tuple[float, float, fl
     return _explained(pair, planes, motion.T_curr_prev, images.gain, images.agreement)[2]
 
 
-def _noise(planes: PlaneFactor, T: np.ndarray) -> float:
-    at = planes.residuals(T)
-    z = at.z[at.seen]
-    return float(np.median(planes.noise(z) / z)) if len(z) else 1.0
-
-
 def _explained(
     pair: FramePair, planes: PlaneFactor, T: np.ndarray, gain: float, agreement: float
-) -> tuple[np.ndarray, float, tuple[float, float, float]]:
+) -> tuple[np.ndarray, float, tuple[float, float]]:
     """(N,) bool, which of the points follow a motion, their share of those in view of both, and
     the evidence of :func:`evidence_of`.
     """
@@ -165,10 +166,7 @@ def _explained(
     depth = np.where(at.seen, planes.robust(T), 1.0)
     follows = inside & (usual / (usual + d2) * depth > 0.5)
     unexplained = inside & (mean_around(~follows, REGION) > UNEXPLAINED)
-    count = max(np.count_nonzero(inside), 1)
-    evidence = (
-        float(np.log(_noise(planes, T) + 1e-4)),
-        agreement,
-        float(np.log(np.count_nonzero(unexplained) / count + 0.01)),
-    )
+    count = max(int(np.count_nonzero(inside)), 1)
+    region = np.count_nonzero(unexplained) / count
+    evidence = agreement, float(np.log(region + SMALL_REGION))
     return follows, float(np.count_nonzero(follows) / count), evidence
