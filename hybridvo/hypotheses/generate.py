@@ -91,8 +91,7 @@ class HypothesisSet:
 
         log_depth = np.full(n, np.nan, np.float32)
         if pair.curr.depth is not None:
-            u0, v0 = grid.pixels.origin
-            look_up(grid.samples, n, 1, as_contiguous(pair.curr.depth), u0, v0, log_depth)
+            look_up(grid.samples, n, as_contiguous(pair.curr.depth), log_depth)
         return GridMaps(
             ray=map_of(kernels.XN, kernels.YN),
             depth=map_of(kernels.Z)[0],
@@ -111,25 +110,19 @@ class HypothesisSet:
         )
 
 
-def _pick(grid: CoarseGrid) -> tuple[slice, slice]:
-    """The grid's pixels of a whole image."""
-    stride, (v0, v1, u0, u1) = grid.shape[2], grid.box
-    return slice(v0 + stride // 2, v1, stride), slice(u0 + stride // 2, u1, stride)
-
-
 def _grey(frame: Frame, grid: CoarseGrid) -> np.ndarray:
     """(h, w) float32 grey levels, each the mean of what it stands for; 0 without an image."""
     if frame.rgb is None:
         return np.zeros(grid.shape[:2], np.float32)
     grey = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
-    return cv2.blur(grey, (grid.shape[2],) * 2)[_pick(grid)].astype(np.float32)
+    return cv2.blur(grey, (grid.shape[2],) * 2)[grid.places].astype(np.float32)
 
 
 def _log_depth(frame: Frame, grid: CoarseGrid) -> np.ndarray:
     """(h, w) float32 log metres; NaN where unknown."""
     if frame.depth is None:
         return np.full(grid.shape[:2], np.nan, np.float32)
-    depth = frame.depth[_pick(grid)]
+    depth = frame.depth[grid.places]
     known = (depth > kernels.MIN_DEPTH) & (depth < kernels.MAX_VALUE)
     return np.log(np.where(known, depth, np.float32(np.nan)))
 

@@ -234,7 +234,7 @@ def finish(coarse, n, K, cutoff, pose, facts, work):
     """Refine a pose on ``coarse``, in place, and fill in its facts."""
     facts[ITERATIONS] += anneal(coarse, n, K, 0.7, 0.5, 0.4, 3, pose, work)
     candidate = pose.copy()
-    sf, sd, share, more, _, _ = reestimate(
+    sf, sd, share, more = reestimate(
         coarse, n, K, 0.5, 0.01, FLOW_NOISE_CAP, DEPTH_NOISE_CAP, cutoff, 2, 4, NOISE_PIXELS,
         candidate, work,
     )  # fmt: skip

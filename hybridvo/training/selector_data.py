@@ -25,6 +25,7 @@ from hybridvo.network.normalization import predict
 from hybridvo.network.prediction import static_probability
 from hybridvo.network.selection import fitted_motion, on_grid_of
 from hybridvo.options import Options
+from hybridvo.refinement.pixels import grid_stride
 from hybridvo.results import PixelwisePrediction, RelativePose
 from hybridvo.synthetic.dataset import MOVING, SOURCES, STATIC, UNKNOWN, grid_sample
 from hybridvo.synthetic.diverse import DiverseOptions
@@ -63,8 +64,12 @@ def draw_samples(seed: int, recordings: Sequence[Recording] = ()) -> list[dict[s
         if T_prior is not None and rng.random() < 0.7:
             starts.append(T_prior)
         found = generate(drawn.pair, np.stack(starts), Options(), int(rng.integers(1 << 30)))
-        whole = (0, drawn.depth.shape[0], 0, drawn.depth.shape[1])
-        if isinstance(found, RelativePose) or not found.is_ambiguous or found.grid.box != whole:
+        usual = grid_stride(drawn.depth.shape, Options().refine.coarse_pixels)
+        if (
+            isinstance(found, RelativePose)
+            or not found.is_ambiguous
+            or found.grid.shape[2] != usual
+        ):
             continue
         samples.append(_record(drawn, found, T_prior) | {"source": SOURCES.index(source)})
     return samples
