@@ -138,8 +138,7 @@ def _add_compare(compare: argparse.ArgumentParser) -> None:
     add("--out", default="runs/compare", metavar="DIR", help="default: runs/compare")
     add("--methods", default="all", help="comma-separated; default: all that run here")
     _add_selection(compare)
-    paper = "MPI Sintel as others score it: PWVO's 992 pairs, or fourteen trajectories"
-    add("--protocol", choices=("paper", "trajectory14"), help=paper)
+    add("--protocol", choices=("paper",), help="MPI Sintel as PWVO's paper scores it: 992 pairs")
     add("--worst", type=int, default=3, help="worst pairs shown for each method")
 
 

@@ -17,9 +17,6 @@ from hybridvo.evaluation import charts
 from hybridvo.evaluation.charts import is_oracle
 from hybridvo.files import atomic_write
 
-EMBEDDED_BYTES = 2_000_000
-"""Images that the page holds, so that it stays below 8 MB with plotly's 5 MB."""
-
 Column = tuple[str, str, float]
 RESULT_COLUMNS: tuple[Column, ...] = (
     ("epe_l2_px_median", "EPE, median [px]", 1.0),
@@ -63,8 +60,8 @@ def write_report(folder: Path, result: Mapping[str, Any], pairs: pd.DataFrame) -
     methods = list(dict.fromkeys(row["method"] for row in result["totals"]))
     sections = {
         "How the errors are distributed": charts.error_distribution(pairs, methods),
-        "How often an estimate fails": charts.failure_chart(result["breakdown"], methods),
-        "What makes it fail": charts.factor_charts(result["breakdown"], methods),
+        "How often an estimate fails": charts.failure_chart(result["totals"], methods),
+        "What makes it fail": charts.factor_charts(pairs, methods),
         "Error against time": charts.time_chart(result["totals"], methods),
     }
     names = dict.fromkeys(row["sequence"] for row in result["rows"])
@@ -103,28 +100,20 @@ def ranking(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
 
 
 def headline(result: Mapping[str, Any]) -> str:
-    """One sentence: who won, by how much, under which flow; and where the winner is worst."""
+    """One sentence: who won, by how much, under which flow."""
     flow, rows = by_flow(result)[0]
     order = ranking(rows)
     if not order:
         return "Nothing is scored: no pair has ground truth and depth."
-    first, best = order[0], order[0]["epe_l2_px_median"]
-    oracle = ", an oracle" if is_oracle(flow) else ""
+    first, oracle = order[0], ", an oracle" if is_oracle(flow) else ""
     text = (
         f"With {flow} flow{oracle}, {first['method']} has the smallest errors: median "
-        f"{number(best)} px (error of the ego flow), {first['failures']} of {first['pairs']} pairs "
-        f"failed (above 1 px, or given up)"
+        f"{number(first['epe_l2_px_median'])} px (error of the ego flow), {first['failures']} of "
+        f"{first['pairs']} pairs failed (above 1 px, or given up)"
     )
     for row in order[1:2]:
-        error = row["epe_l2_px_median"]
-        times = f" ({number(error / best, 2)} times)" if best else ""
-        text += f"; next is {row['method']}: {number(error)} px{times}, {row['failures']} failed"
-    for entry in result["worst_pairs"]:
-        if (entry["method"], entry["flow_source"]) == (first["method"], flow):
-            if entry["epe_l2_px"] is not None:
-                place = f"{entry['sequence']}, pair {entry['index']}"
-                text += f". Its worst pair is {place}: {number(entry['epe_l2_px'])} px"
-            break
+        error = number(row["epe_l2_px_median"])
+        text += f"; next is {row['method']}: {error} px, {row['failures']} failed"
     return text + "."
 
 
@@ -157,22 +146,18 @@ def _protocol_tables(protocol: Mapping[str, Any] | None) -> list[tuple[str, Any]
 
 def _gallery(folder: Path, result: Mapping[str, Any]) -> list[tuple[str, list[dict[str, Any]]]]:
     """Worst pairs by method, estimated flow first and the best method first, with images."""
-    budget = EMBEDDED_BYTES
-    order = [
-        (method, flow)
-        for flow, rows in by_flow(result)
-        for method in dict.fromkeys(row["method"] for row in [*ranking(rows), *rows])
-    ]
     groups: dict[str, list[dict[str, Any]]] = {}
-    key = lambda entry: order.index((entry["method"], entry["flow_source"]))  # noqa: E731
-    for entry in sorted(result["worst_pairs"], key=key):
-        source, path = None, entry["picture"] and folder / entry["picture"]
-        if path and path.is_file() and path.stat().st_size <= budget:
-            budget -= path.stat().st_size
-            source = f"data:image/jpeg;base64,{base64.b64encode(path.read_bytes()).decode()}"
+    for flow, rows in by_flow(result):
+        for method in dict.fromkeys(row["method"] for row in [*ranking(rows), *rows]):
+            groups[f"{method}, {flow} flow"] = []
+    for entry in result["worst_pairs"]:
+        source = None
+        if entry["picture"]:
+            image = base64.b64encode((folder / entry["picture"]).read_bytes()).decode()
+            source = f"data:image/jpeg;base64,{image}"
         shown = {**entry, "source": source, "error": number(entry["epe_l2_px"])}
-        groups.setdefault(f"{entry['method']}, {entry['flow_source']} flow", []).append(shown)
-    return list(groups.items())
+        groups[f"{entry['method']}, {entry['flow_source']} flow"].append(shown)
+    return [(title, entries) for title, entries in groups.items() if entries]
 
 
 def _json(figures: Sequence[Any]) -> list[str]:

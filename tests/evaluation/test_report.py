@@ -18,10 +18,9 @@ from hybridvo.evaluation.charts import (
     path_charts,
 )
 from hybridvo.evaluation.metrics import evaluate
-from hybridvo.evaluation.protocols import protocol_summary, protocols
+from hybridvo.evaluation.protocols import protocol_summary
 from hybridvo.evaluation.report import headline, number, write_report
 from hybridvo.evaluation.scores import (
-    breakdown,
     pair_table,
     sequence_row,
     total_row,
@@ -71,8 +70,7 @@ def results(tmp_path: Path) -> tuple[Path, dict[str, Any], pd.DataFrame]:
         **{"options": {}, "timing": "one at a time"},
         **{"missing": {"open3d-rgbd": "pip install open3d"}, "rows": rows, "totals": totals},
         "sequences": [{"name": NAME, "warnings": ["<script>"], "left_out": []} | gt_path],
-        **{"breakdown": breakdown(table), "worst_pairs": worst},
-        "protocol": protocol_summary(protocols()["paper"], totals, [scored]),
+        **{"worst_pairs": worst, "protocol": protocol_summary(totals, [scored])},
     }
     return tmp_path, result, table
 
@@ -115,17 +113,16 @@ def test_charts_show_every_method_and_no_single_bins(results) -> None:
     methods = list(ERRORS)
     (spread,) = error_distribution(pairs, methods)
     assert {trace.name for trace in spread.data} == set(ERRORS) and len(spread.data) == 6
-    assert len({trace.line.color for trace in spread.data}) == 3
+    assert len({trace.marker.color for trace in spread.data}) == 3
     curve = next(trace for trace in spread.data if trace.name == "pnp-ransac")
     assert curve.y[-1] == 100 and list(curve.x) == sorted(curve.x)
-    (factor,) = factor_charts(result["breakdown"], methods)  # the rotation has one bin
+    (factor,) = factor_charts(pairs, methods)  # the rotation has one bin
     assert "share of pixels" in factor.layout.xaxis.title.text
-    assert len(failure_chart(result["breakdown"], methods)[0].data) == 6
-    above, errors, space = path_charts(folder, result, pairs, NAME, methods)
+    assert len(failure_chart(result["totals"], methods)[0].data) == 6
+    above, errors = path_charts(folder, result, pairs, NAME, methods)
     gt, *paths = above.data
     assert gt.name == "ground truth" and len(paths) == len(errors.data) == 3
     np.testing.assert_allclose(paths[0].x, gt.x, atol=1e-6)  # aligned: the same path
-    assert {trace.type for trace in space.data} == {"scatter3d"}
 
 
 def test_nothing_scored(results) -> None:
