@@ -49,7 +49,7 @@ from hybridvo.types import FramePair
 
 SURFACE = 0.05
 """Largest relative difference between the four neighbours that are interpolated."""
-MIN_COMPARED, COMPARED = 100, 16_000
+MIN_COMPARED, COMPARED = 100, 4000
 """Fewest points whose depths are compared, and about how many are looked at."""
 
 
@@ -225,11 +225,11 @@ def compare_depths(
     if flow is None or prev.depth is None or curr.depth is None or weights is None:
         return None
     (height, width), step = prev.depth.shape, max(1, math.isqrt(prev.depth.size // COMPARED))
-    followers = np.argwhere(weights[step // 2 :: step, step // 2 :: step] > 0.5)
-    v, u = (followers * step + step // 2).T
+    first = step // 2
+    v, u = (first + step * k for k in np.nonzero(weights[first::step, first::step] > 0.5))
     K, (a, b, c), t = prev.camera, T_curr_prev[2, :3], T_curr_prev[2, 3]
     moved = prev.depth[v, u] * (a * (u - K.cx) / K.fx + b * (v - K.cy) / K.fy + c) + t
-    column, row = np.rint(flow[v, u] + np.stack([u, v], axis=1)).T
+    column, row = np.rint(u + flow[v, u, 0]), np.rint(v + flow[v, u, 1])
     inside = (row >= 0) & (column >= 0) & (row < height) & (column < width) & (moved > MIN_DEPTH)
     at = row[inside].astype(np.intp), column[inside].astype(np.intp)
     seen = curr.depth[at].astype(np.float64)
