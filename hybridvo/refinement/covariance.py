@@ -132,13 +132,14 @@ def motion_covariance(
     shows: the rounding of the pixels' ``weight``, and the law of the depth's errors.
     """
     # rounding is the same for neighbours, so that an average over n pixels is no better than one
-    parallax = focal * np.linalg.norm(t) * depth_scale
+    parallax = focal * float(np.linalg.norm(t)) * depth_scale
     rounding = weight * FLOW_ROUNDING**2 / (noise[0] ** 2 + (parallax * noise[1]) ** 2)
-    covariance, *more = sandwich_covariance(tiles, curvature, meat, depth_scale, rounding)
+    sandwich = sandwich_covariance(tiles, curvature, meat, depth_scale, rounding)
+    covariance, eigenvalues, occupied = sandwich
     # whether depth errs about its log, its value or its inverse is not known: the translation's
     # length is uncertain by half the variance of log depth
     covariance[:3, :3] += (0.5 * noise[1] ** 2) ** 2 * np.outer(t, t)
-    return covariance, *more
+    return covariance, eigenvalues, occupied
 
 
 def sandwich_covariance(

@@ -46,9 +46,9 @@ class PixelGrid:
             as_contiguous(prev.depth), as_contiguous(pair.flow), flow_variance, depth_variance,
             as_contiguous(external),
         )  # fmt: skip
-        first, second = prev.camera, curr.camera
-        self.camera = np.array([1 / first.fx, 1 / first.fy, first.cx, first.cy], np.float32)
-        self.K = np.array([second.fx, second.fy, second.cx, second.cy], np.float32)
+        a, b = prev.camera, curr.camera
+        self.camera = np.array([1 / a.fx, 1 / a.fy, a.cx, a.cy], np.float32)
+        self.K = np.array([b.fx, b.fy, b.cx, b.cy], np.float32)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -185,9 +185,9 @@ def coarse_grid(
     if pair.prev.depth is None:
         return RelativePose.failed(Reason.NO_VALID_DEPTH, "no depth for this frame", "refine")
     pixels = PixelGrid(pair, weights)
-    samples, *shape = pixels.samples(options.coarse_pixels)
-    grid = CoarseGrid(pixels, samples, tuple(shape))
-    usable = np.count_nonzero(grid.weight > 0)
+    samples, h, w, stride = pixels.samples(options.coarse_pixels)
+    grid = CoarseGrid(pixels, samples, (h, w, stride))
+    usable = int(np.count_nonzero(grid.weight > 0))
     if usable < options.min_pixels:
         why = too_few(pair.prev.depth, pair.flow, usable, options.min_pixels)
         return RelativePose.failed(*why, "refine")
