@@ -145,7 +145,8 @@ class _Scene(Layers):
         self.cy = (o.height - 1) / 2 + shift[1] * o.height
         K = np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]])
         self.scale = log_uniform(rng, o.scene_depth)
-        super().__init__(K, self._background(*normalized_grid(K, o.height, o.width)))
+        x, y = normalized_grid(K, o.height, o.width)
+        super().__init__(K, self._background(x.astype(np.float32), y.astype(np.float32)))
 
     def _background(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """(H, W) inverse depth of walls, ground or one slanted surface; 0 is sky."""

@@ -17,12 +17,13 @@ import numpy as np
 from pydantic import Field
 
 from hybridvo.errors import InputError
-from hybridvo.geometry import euler_deg_to_matrix, make_transform
+from hybridvo.geometry import euler_deg_to_matrix, make_transform, pixel_grid
 from hybridvo.options import Positive, Share, option_group
 from hybridvo.synthetic.draws import cut_out, ordered
+from hybridvo.types import FramePair
 
-MIN_RATIO = np.float32(1e-6)
-"""Added to |z' / z|: the flow of a point in the image plane stays finite."""
+MIN_RATIO = 1e-6
+"""Least |z' / z|: the flow of a point in the image plane stays finite."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,8 +41,6 @@ class Sample:
         K: (3, 3) intrinsics of both frames.
         rotation_deg, translation: (3,) T_curr_prev (4, 4) as Euler angles X-Y-Z, R = Rx Ry Rz.
         moving: (H, W) bool, pixels whose true flow differs from the ego flow.
-        rays: (H, W, 2) first two components of K^-1 x of the points that were measured, where they
-            are not the pixels' centres; or None.
     """
 
     flow: np.ndarray
@@ -55,19 +54,36 @@ class Sample:
     rotation_deg: np.ndarray
     translation: np.ndarray
     moving: np.ndarray
-    rays: np.ndarray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class KnownPair:
+    """A pair and its ground truth.
+
+    ``depth``: (H, W) metres of the previous frame before the sensor's errors, 0 where unknown;
+    ``moving``: (H, W) bool, points that do not follow the camera's motion; ``world``: path of the
+    recording; ``log_depth_curr``: (H, W) of the current frame at x + F where it has no depth map.
+    """
+
+    pair: FramePair
+    T_curr_prev: np.ndarray
+    depth: np.ndarray
+    moving: np.ndarray
+    world: str = ""
+    log_depth_curr: np.ndarray | None = None
 
 
 class Layers:
     """Inverse depth, owner and motion of every pixel while surfaces are laid over each other.
 
-    ``rho``: (H, W) float32 inverse depth of the background, 0 for sky; is changed in place.
+    ``rho``: (H, W) inverse depth of the background, 0 for sky; is changed in place, and its type
+    is that of the flows.
     """
 
     def __init__(self, K: np.ndarray, rho: np.ndarray) -> None:
         height, width = rho.shape
         self.K, self.rho = K, rho
-        self.x, self.y = normalized_grid(K, height, width)
+        self.x, self.y = (x.astype(rho.dtype) for x in normalized_grid(K, height, width))
         self.owner = np.full((height, width), -1, np.int16)
         self.motions: list[np.ndarray | None] = []
         self.bends: list[np.ndarray | None] = []
@@ -95,7 +111,7 @@ class Layers:
         paper does); else they contain the camera's and replace it.
         """
         focal = (float(self.K[0, 0]), float(self.K[1, 1]))
-        R, t = T_curr_prev[:3, :3], T_curr_prev[:3, 3].astype(np.float32)
+        R, t = T_curr_prev[:3, :3], T_curr_prev[:3, 3]
         u, v, ego_ratio = rigid_flow(self.x, self.y, self.rho, R, t, focal)
         ego_flow = np.stack([u, v], axis=-1)
         flow, ratio = ego_flow.copy(), ego_ratio.copy()
@@ -106,7 +122,7 @@ class Layers:
                 continue
             box = np.s_[top : top + height, left : left + width]
             inside = mask[box] > 0
-            R, t = motion[:3, :3], motion[:3, 3].astype(np.float32)
+            R, t = motion[:3, :3], motion[:3, 3]
             bend = self.bends[number]
             if bend is not None:
                 t = np.moveaxis(t + bend[box], -1, 0)
@@ -121,10 +137,15 @@ class Layers:
         return ego_flow, ego_ratio, flow, ratio
 
 
+def camera_flow(K: np.ndarray, depth: np.ndarray, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(H, W, 2) flow of the camera motion alone, and (H, W) ratio of the new depth to the old."""
+    inverse = np.divide(1.0, depth, out=np.zeros(depth.shape), where=depth > 0).astype(np.float32)
+    return Layers(K, inverse).flows(T, added=False)[:2]
+
+
 def normalized_grid(K: np.ndarray, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
-    """(W,) and (H, 1) float32: first two components of K^-1 x of the pixels."""
-    x = ((np.arange(width) - K[0, 2]) / K[0, 0]).astype(np.float32)
-    y = ((np.arange(height) - K[1, 2]) / K[1, 1]).astype(np.float32)
+    """(W,) and (H, 1): first two components of K^-1 x of the pixels."""
+    x, y = (np.arange(width) - K[0, 2]) / K[0, 0], (np.arange(height) - K[1, 2]) / K[1, 1]
     return x, y[:, None]
 
 
@@ -141,13 +162,38 @@ def rigid_flow(
     Paper, equation 8, written as differences, so that single precision suffices: ``x`` (W,) and
     ``y`` (H, 1) normalised coordinates, ``inverse_depth`` (H, W) or one number, ``t`` metres.
     """
-    R = np.asarray(R, dtype=np.float32)
+    R, t = R.astype(x.dtype), np.asarray(t, x.dtype)
     ratio = (R[2, 0] * x + (R[2, 1] * y + R[2, 2])) + t[2] * inverse_depth
     # The published code takes |z'|: a point behind the camera keeps a bounded flow.
-    scale = 1.0 / (np.abs(ratio) + MIN_RATIO)
+    scale = 1.0 / np.maximum(np.abs(ratio), MIN_RATIO)
     u = (((R[0, 0] * x + (R[0, 1] * y + R[0, 2])) + t[0] * inverse_depth) * scale - x) * focal[0]
     v = (((R[1, 0] * x + (R[1, 1] * y + R[1, 2])) + t[1] * inverse_depth) * scale - y) * focal[1]
     return u, v, ratio
+
+
+def landing(flow: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Flat index of the pixel of the next frame that each point comes to, and whether it does."""
+    height, width = flow.shape[:2]
+    place = np.rint(flow + pixel_grid(height, width)).astype(np.int64)
+    inside = ((place >= 0) & (place < (width, height))).all(axis=-1)
+    return np.where(inside, place @ (1, width), 0), inside
+
+
+def splat(flow: np.ndarray, rho_curr: np.ndarray) -> np.ndarray:
+    """(H, W) inverse depth of the next frame, nearest in front; 0 where nothing lands.
+
+    ``rho_curr``: (H, W) of the moved points on their own grid.
+    """
+    index, inside = landing(flow)
+    value = rho_curr.copy()
+    off = np.rint(flow) - flow
+    for axis in (0, 1):
+        slope = np.gradient(rho_curr, axis=1 - axis)
+        slope[np.abs(slope) > 0.02 * rho_curr] = 0.0  # a depth edge is no slope
+        value += slope * off[..., axis]
+    front = np.zeros(rho_curr.size, rho_curr.dtype)
+    np.maximum.at(front, index[inside], value[inside])
+    return front.reshape(rho_curr.shape)
 
 
 def visibility(
@@ -158,14 +204,8 @@ def visibility(
     From the true flow, inverse depths of the moved points and where there is no sky; the depth is
     0 outside and for sky.
     """
-    height, width = rho_curr.shape
-    u = np.rint(flow[..., 0] + np.arange(width, dtype=np.float32)).astype(np.int32)
-    v = np.rint(flow[..., 1] + np.arange(height, dtype=np.float32)[:, None]).astype(np.int32)
-    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
-    index = np.where(inside, v * width + u, 0)
-    front = np.zeros(height * width, np.float32)
-    np.maximum.at(front, index[inside], rho_curr[inside])
-    seen = front[index]
+    index, inside = landing(flow)
+    seen = splat(flow, rho_curr).ravel()[index]
     # A tenth: neighbours on a slanted surface share a pixel of the next frame.
     covered = inside & (seen > np.float32(1.1) * rho_curr)
     inverse = np.where(covered, seen, rho_curr)

@@ -1,4 +1,4 @@
-"""One training loop for every task: updates, running average, checkpoints, many processes.
+"""One training loop for every task: updates, running average, checkpoints.
 
 An interrupted run takes the same updates as one that was not, if the schedule counts updates.
 """
@@ -18,9 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import torch.distributed as dist
 from torch import nn
-from torch.nn.parallel import DistributedDataParallel
 
 from hybridvo.errors import CheckpointError, DegenerateError, InputError
 from hybridvo.files import atomic_write
@@ -40,7 +38,7 @@ Task = PwvoTask | SelectorTask
 
 
 class Trainer:
-    """A run: task, optimiser, and their state on disk; under torchrun one in every process.
+    """A run: task, optimiser, and their state on disk.
 
     ``folder``: of ``checkpoint.pt`` and ``log.jsonl``; None writes nothing. ``workers``: processes
     that draw samples; 0 draws them in this one. ``report`` is called with every entry of the log.
@@ -57,16 +55,9 @@ class Trainer:
         self.task, self.folder = task, folder
         self.options: RunOptions = task.options
         self.device, self.workers, self.report = torch.device(device), workers, report
-        self.world = dist.get_world_size() if dist.is_initialized() else 1
-        self.rank = dist.get_rank() if dist.is_initialized() else 0
         self.network = task.network.to(self.device)
         if self.options.channels_last:
             self.network = self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self.model: nn.Module = self.network
-        if self.world > 1:
-            self.model = DistributedDataParallel(
-                self.network, find_unused_parameters=not task.all_parameters_used
-            )
         average, how = self.options.ema_decay > 0, self.options.optimizer
         self.ema = copy.deepcopy(self.network).requires_grad_(False) if average else None
         self.optimizer = torch.optim.AdamW(
@@ -98,10 +89,9 @@ class Trainer:
         for group in self.optimizer.param_groups:
             group["lr"] = rate
         self.optimizer.zero_grad(set_to_none=True)
-        loss, parts = self.task.loss(self.model, batch.to(self.device), self.step, progress)
+        loss, parts = self.task.loss(self.network, batch.to(self.device), self.step, progress)
         loss.backward()
         norm = nn.utils.clip_grad_norm_(self.network.parameters(), optimizer.clip_norm)
-        # The averaged gradient is the same on all ranks, and not finite where any loss was not.
         if math.isfinite(float(norm)):
             self.optimizer.step()
             self.skipped_in_a_row = 0
@@ -120,7 +110,7 @@ class Trainer:
                     f"{self.step}. Lower the learning rate; the last checkpoint is sound."
                 )
         self.step += 1
-        self.samples += len(batch) * self.world
+        self.samples += len(batch)
         figures = {"loss": float(loss.detach()), "grad_norm": float(norm), "lr": rate}
         return figures | {name: float(part) for name, part in parts.items()}
 
@@ -133,7 +123,7 @@ class Trainer:
         """
         options = self.options
         last = options.steps if until is None else min(until, options.steps)
-        batches = self.task.batches(self.samples, self.workers, self.rank, self.world)
+        batches = self.task.batches(self.samples, self.workers)
         self.network.train()
         before, started = self.elapsed_s, time.monotonic()
         saved = logged = started
@@ -147,19 +137,13 @@ class Trainer:
             now = time.monotonic()
             self.elapsed_s = before + now - started
             if self.step % options.log_every == 0:
-                rate = options.batch_size * self.world * len(seen) / (now - logged)
+                rate = options.batch_size * len(seen) / (now - logged)
                 self._log({"event": "train", **_means(seen), "samples_per_s": rate})
                 seen, logged = [], now
             if options.evaluate_every and self.step % options.evaluate_every == 0:
                 self.evaluate()
-            # what one process is told ends all
-            stop = 2 if self.stop_requested else int(self.elapsed_s >= time_limit_s)
-            if self.world > 1:
-                flag = torch.tensor(stop, device=self.device)
-                dist.all_reduce(flag, dist.ReduceOp.MAX)
-                stop = int(flag)
-            if stop:
-                why = ("steps", "time", "signal")[stop]
+            if self.stop_requested or self.elapsed_s >= time_limit_s:
+                why = "signal" if self.stop_requested else "time"
                 break
             if now - saved > 60 * options.checkpoint_minutes:
                 self.save()
@@ -169,15 +153,11 @@ class Trainer:
 
     def evaluate(self) -> dict[str, Any]:
         """Figures of the exported network on development samples, also into the log."""
-        if self.rank != 0:
-            return {}
         results = self.task.evaluate(self.exported)
         self._log({"event": "evaluation", "results": results})
         return results
 
     def _log(self, entry: dict[str, Any]) -> None:
-        if self.rank != 0:
-            return
         entry = {key: getattr(self, key) for key in PROGRESS} | entry
         if self.folder is not None:
             with (self.folder / LOG).open("a", encoding="utf-8") as file:
@@ -193,7 +173,7 @@ class Trainer:
 
     def save(self) -> None:
         """Write ``checkpoint.pt``: everything that a later process needs to go on."""
-        if self.folder is None or self.rank != 0:
+        if self.folder is None:
             return
         state = {name: part.state_dict() for name, part in self._parts.items()}
         progress = {key: getattr(self, key) for key in PROGRESS}
@@ -216,12 +196,13 @@ class Trainer:
             return False
         path = self.folder / CHECKPOINT
         state = read_checkpoint(path, self.device)
-        changed = difference(state["record"], self.record)
-        if changed:
-            raise InputError(
-                f"{path}: is of a run with other options: {changed}. Choose another folder, or "
-                f"train anew with --overwrite."
-            )
+        before, now = ({**r["options"], "data": r["data"]} for r in (state["record"], self.record))
+        for name in sorted((before | now).keys() - set(FREE_TO_CHANGE)):
+            if before.get(name) != now.get(name):
+                raise InputError(
+                    f"{path}: is of a run with another {name}: it was {before.get(name)!r}, now "
+                    f"{now.get(name)!r}. Choose another folder, or train anew with --overwrite."
+                )
         with _reading(str(path)):
             for name, part in self._parts.items():
                 part.load_state_dict(state[name])
@@ -246,23 +227,6 @@ def read_checkpoint(path: Path, device: torch.device | str = "cpu") -> dict[str,
     with _reading(str(path)):
         state = torch.load(path, map_location=device, weights_only=True)
         return {**state, "record": state["record"]}
-
-
-def difference(before: dict[str, Any], now: dict[str, Any]) -> str:
-    """First key in which two records differ, with both values; empty if they agree."""
-    free = {f"options.{name}" for name in FREE_TO_CHANGE}
-    old, new = _flat("", before), _flat("", now)
-    for key in old | new:
-        if key not in free and old.get(key) != new.get(key):
-            return f"{key} was {old.get(key)!r}, now {new.get(key)!r}"
-    return ""
-
-
-def _flat(place: str, value: Any) -> dict[str, Any]:
-    """Values of nested mappings by their keys, joined with dots."""
-    if not isinstance(value, dict):
-        return {place.strip("."): value}
-    return {k: v for key, x in value.items() for k, v in _flat(f"{place}.{key}", x).items()}
 
 
 def _means(entries: list[dict[str, float]]) -> dict[str, float]:

@@ -246,7 +246,7 @@ def test_input_errors() -> None:
 @pytest.mark.parametrize("name", ["moving30", "noisy", "low_noise"])
 def test_both_backends_give_the_same_motion(name: str) -> None:
     """From the same start under the same weights, and under the same noise as well."""
-    pair, truth = make_pair(name, 3, 218, 512)
+    pair, truth = make_pair(name, 4, 218, 512)
     T = truth["T_curr_prev"]
     cameras = pair.prev.camera, pair.curr.camera
     apart = np.linalg.norm(pair.flow - ego_flow(pair.prev.depth, T, *cameras), axis=2)

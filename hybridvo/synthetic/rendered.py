@@ -1,4 +1,4 @@
-"""Rendered two-frame scenes for the selector's training, none of the families that are measured on.
+"""Rendered pairs for trainings, of none of the families that are measured on.
 
 Streets, halls, hills, walls and tables, in which the bodies of :mod:`hybridvo.synthetic.bodies`
 move, alone or together, free or followed by the camera.
@@ -7,18 +7,24 @@ move, alone or together, free or followed by the camera.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pydantic import Field
 from scipy.spatial.transform import Rotation
 
-from hybridvo.geometry import make_transform, se3_exp
+from hybridvo.flow import dis_flow
+from hybridvo.geometry import invert, make_transform, matrix_to_euler_deg, se3_exp
+from hybridvo.options import option_group
 from hybridvo.synthetic.bodies import BODIES, SHAPES, Mover, draw_look, mover
 from hybridvo.synthetic.draws import about, affine, any_turn, carried, log_uniform, turn
+from hybridvo.synthetic.layered import KnownPair, Sample, camera_flow
 from hybridvo.synthetic.raycast import BOX, CYLINDER, ELLIPSOID
 from hybridvo.synthetic.render import Scene, Solid
 from hybridvo.synthetic.scenes import sized
-from hybridvo.types import Camera
+from hybridvo.synthetic.sensors import SensorOptions, degrade_depth, noisy_flow, sample_at
+from hybridvo.types import Camera, Frame, FramePair
 
 
 class _Surroundings:
@@ -45,7 +51,7 @@ class _Surroundings:
         high: ArrayLike,
         depths: tuple[float, float],
         floor: float | None = None,
-        reach: ArrayLike | None = None,
+        reach: tuple[float, float] | np.ndarray | None = None,
         T: np.ndarray | None = None,
     ) -> None:
         """Add things of half axes ``low`` to ``high``, over the view or over ``reach`` (x, y).
@@ -56,7 +62,7 @@ class _Surroundings:
         for _ in range(round(count)):
             half = np.exp(rng.uniform(np.log(low), np.log(high), 3))
             z, R = rng.uniform(*depths) + half.max(), any_turn(rng)
-            x, y = rng.uniform(-1.1, 1.1, 2) * (self.view * z if reach is None else reach)
+            x, y = rng.uniform(-1.1, 1.1, 2) * np.asarray(self.view * z if reach is None else reach)
             if floor is not None:
                 y, R = floor - half[1], Rotation.from_euler("y", rng.uniform(0, 1.5)).as_matrix()
             A = affine(half, (x, y, z), R)
@@ -140,9 +146,8 @@ def _movers(rng: np.random.Generator, view: np.ndarray, T_world_cam: np.ndarray)
     return movers
 
 
-def training_scene(seed: int, height: int, width: int) -> Scene:
-    """Scene of two frames; the same seed gives the same images."""
-    rng = np.random.default_rng([0x6A75, seed])
+def training_scene(rng: np.random.Generator, height: int, width: int) -> Scene:
+    """Scene of two frames."""
     spread = np.tan(np.radians(rng.uniform(34, 100) / 2))
     aspect = log_uniform(rng, (0.8, 1.25)) if rng.random() < 0.3 else 1.0
     u, v = np.array([width - 1, height - 1]) / 2 + rng.normal(0, 0.03, 2) * width
@@ -169,3 +174,71 @@ def training_scene(seed: int, height: int, width: int) -> Scene:
         for x in scene.solids
     )
     return replace(scene, solids=solids)
+
+
+def any_noise(rng: np.random.Generator, flow: np.ndarray) -> np.ndarray:
+    """White noise and gross errors, as in the benchmark's cells but of any strength."""
+    share = rng.uniform(0, 0.3) if rng.random() < 0.5 else 0.0
+    return noisy_flow(rng, flow, log_uniform(rng, (0.02, 1.0)), share, 0.06 * flow.shape[1])[0]
+
+
+def rendered_pairs(rng: np.random.Generator, height: int, width: int) -> dict[str, KnownPair]:
+    """The same scene with true and with DIS flow."""
+    scene = training_scene(rng, height, width)
+    camera, T = scene.cameras[0], invert(scene.T_world_cam[1]) @ scene.T_world_cam[0]
+    frames = [scene.render(k) for k in (0, 1)]
+    flow, _, moving = scene.flow(0)
+    depth = [np.where(np.isfinite(f.depth), f.depth, 0).astype(np.float32) for f in frames]
+    # of the movers' pixels those whose flow the camera alone does not explain
+    own = np.nan_to_num(flow) - camera_flow(camera.K, depth[0], T)[0]
+    moving &= np.square(own).sum(axis=2) > (0.5 * camera.width / 1024) ** 2
+    truth = T, depth[0], moving
+    if rng.random() < 0.5:
+        depth = degrade_depth(rng, depth, SensorOptions())
+    second = rng.random() > 0.1
+    if rng.random() < 0.3:
+        flow = any_noise(rng, flow)
+    prev = Frame(frames[0].rgb, depth[0], camera)
+    curr = Frame(frames[1].rgb, depth[1] if second else None, camera)
+    field = dis_flow()(prev, curr)
+    estimated = FramePair(prev, curr, field.flow, field.variance, field.valid)
+    return {
+        "rendered": KnownPair(FramePair(prev, curr, np.ascontiguousarray(flow)), *truth),
+        "dis": KnownPair(estimated, *truth),
+    }
+
+
+@option_group
+class RenderedOptions:
+    """Rendered scenes with movers of every kind; the flow is true, noisy or of DIS."""
+
+    height: Annotated[int, Field(ge=32)] = 128
+    width: Annotated[int, Field(ge=32)] = 256
+    preset: Literal["rendered"] = "rendered"
+
+    def sample(self, rng: np.random.Generator) -> Sample:
+        """One pair."""
+        known = rendered_pairs(rng, self.height, self.width)[
+            "dis" if rng.random() < 0.5 else "rendered"
+        ]
+        pair, K, T = known.pair, known.pair.prev.camera.K, known.T_curr_prev
+        assert pair.flow is not None and pair.prev.depth is not None
+        valid = np.isfinite(pair.flow).all(axis=-1)
+        if pair.flow_valid is not None:
+            valid &= pair.flow_valid
+        flow = np.where(valid[..., None], pair.flow, 0)
+        ego_flow, ratio = camera_flow(K, known.depth, T)
+        curr = np.zeros_like(known.depth) if pair.curr.depth is None else pair.curr.depth
+        return Sample(
+            flow=np.where(valid[..., None], flow, np.nan).astype(np.float32),
+            ego_flow=ego_flow,
+            depth_prev=pair.prev.depth,
+            depth_curr=sample_at(curr, flow),
+            depth_true=known.depth,
+            depth_target=np.maximum(known.depth * ratio, 0),
+            K=K.astype(np.float32),
+            T_curr_prev=T.astype(np.float32),
+            rotation_deg=matrix_to_euler_deg(T[:3, :3]).astype(np.float32),
+            translation=T[:3, 3].astype(np.float32),
+            moving=known.moving,
+        )
