@@ -12,12 +12,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-import cv2
 import numpy as np
 from pydantic import Field
 
 from hybridvo.errors import InputError
-from hybridvo.geometry import euler_deg_to_matrix, make_transform, pixel_grid
+from hybridvo.geometry import euler_deg_to_matrix, make_transform, matrix_to_euler_deg, pixel_grid
 from hybridvo.options import Positive, Share, option_group
 from hybridvo.synthetic.draws import cut_out, ordered
 from hybridvo.types import FramePair
@@ -39,7 +38,6 @@ class Sample:
         depth_target: (H, W) what L^D compares with. It includes the object's own motion in the
             paper's five steps, not in the diverse preset.
         K: (3, 3) intrinsics of both frames.
-        rotation_deg, translation: (3,) T_curr_prev (4, 4) as Euler angles X-Y-Z, R = Rx Ry Rz.
         moving: (H, W) bool, pixels whose true flow differs from the ego flow.
     """
 
@@ -51,9 +49,17 @@ class Sample:
     depth_target: np.ndarray
     K: np.ndarray
     T_curr_prev: np.ndarray
-    rotation_deg: np.ndarray
-    translation: np.ndarray
     moving: np.ndarray
+
+    @property
+    def rotation_deg(self) -> np.ndarray:
+        """(3,) Euler angles X-Y-Z of T_curr_prev, R = Rx Ry Rz."""
+        return matrix_to_euler_deg(self.T_curr_prev[:3, :3]).astype(np.float32)
+
+    @property
+    def translation(self) -> np.ndarray:
+        """(3,) metres, of T_curr_prev."""
+        return self.T_curr_prev[:3, 3]
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,24 +122,17 @@ class Layers:
         ego_flow = np.stack([u, v], axis=-1)
         flow, ratio = ego_flow.copy(), ego_ratio.copy()
         for number, motion in enumerate(self.motions):
-            mask = (self.owner == number).astype(np.uint8)
-            left, top, width, height = cv2.boundingRect(mask)
-            if motion is None or not width * height:
+            if motion is None:
                 continue
-            box = np.s_[top : top + height, left : left + width]
-            inside = mask[box] > 0
-            R, t = motion[:3, :3], motion[:3, 3]
-            bend = self.bends[number]
+            mine = rows, columns = np.nonzero(self.owner == number)
+            t, bend = motion[:3, 3], self.bends[number]
             if bend is not None:
-                t = np.moveaxis(t + bend[box], -1, 0)
-            x, y = self.x[box[1]], self.y[box[0]]
-            u, v, change = rigid_flow(x, y, self.rho[box], R, t, focal)
-            own = np.stack([u, v], axis=-1)[inside]
-            if added:
-                flow[box][inside] += own
-                ratio[box][inside] += change[inside] - 1.0
-            else:
-                flow[box][inside], ratio[box][inside] = own, change[inside]
+                t = (t + bend[mine]).T
+            x, y = self.x[columns], self.y[rows, 0]
+            u, v, change = rigid_flow(x, y, self.rho[mine], motion[:3, :3], t, focal)
+            own = np.stack([u, v], axis=-1)
+            flow[mine] = flow[mine] + own if added else own
+            ratio[mine] = ratio[mine] + change - 1.0 if added else change
         return ego_flow, ego_ratio, flow, ratio
 
 
@@ -157,10 +156,10 @@ def rigid_flow(
     t: np.ndarray,
     focal: tuple[float, float],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Flow (u, v) of a rigid motion in px and the ratio of the new depth to the old, (H, W) each.
+    """Flow (u, v) of a rigid motion in px and the ratio of the new depth to the old.
 
-    Paper, equation 8, written as differences, so that single precision suffices: ``x`` (W,) and
-    ``y`` (H, 1) normalised coordinates, ``inverse_depth`` (H, W) or one number, ``t`` metres.
+    Paper, equation 8, written as differences, so that single precision suffices: ``x`` and ``y``
+    normalised coordinates, ``inverse_depth`` and ``t`` (3,) or (3, N) metres, that broadcast.
     """
     R, t = R.astype(x.dtype), np.asarray(t, x.dtype)
     ratio = (R[2, 0] * x + (R[2, 1] * y + R[2, 2])) + t[2] * inverse_depth
@@ -171,20 +170,16 @@ def rigid_flow(
     return u, v, ratio
 
 
-def landing(flow: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Flat index of the pixel of the next frame that each point comes to, and whether it does."""
-    height, width = flow.shape[:2]
-    place = np.rint(flow + pixel_grid(height, width)).astype(np.int64)
-    inside = ((place >= 0) & (place < (width, height))).all(axis=-1)
-    return np.where(inside, place @ (1, width), 0), inside
-
-
-def splat(flow: np.ndarray, rho_curr: np.ndarray) -> np.ndarray:
+def splat(flow: np.ndarray, rho_curr: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(H, W) inverse depth of the next frame, nearest in front; 0 where nothing lands.
 
-    ``rho_curr``: (H, W) of the moved points on their own grid.
+    ``rho_curr``: (H, W) of the moved points on their own grid. Also the flat index of the pixel
+    that each of them comes to, and whether it does.
     """
-    index, inside = landing(flow)
+    height, width = rho_curr.shape
+    place = np.rint(flow + pixel_grid(height, width)).astype(np.int64)
+    inside = ((place >= 0) & (place < (width, height))).all(axis=-1)
+    index = np.where(inside, place @ (1, width), 0)
     value = rho_curr.copy()
     off = np.rint(flow) - flow
     for axis in (0, 1):
@@ -193,7 +188,7 @@ def splat(flow: np.ndarray, rho_curr: np.ndarray) -> np.ndarray:
         value += slope * off[..., axis]
     front = np.zeros(rho_curr.size, rho_curr.dtype)
     np.maximum.at(front, index[inside], value[inside])
-    return front.reshape(rho_curr.shape)
+    return front.reshape(rho_curr.shape), index, inside
 
 
 def visibility(
@@ -204,8 +199,8 @@ def visibility(
     From the true flow, inverse depths of the moved points and where there is no sky; the depth is
     0 outside and for sky.
     """
-    index, inside = landing(flow)
-    seen = splat(flow, rho_curr).ravel()[index]
+    front, index, inside = splat(flow, rho_curr)
+    seen = front.ravel()[index]
     # A tenth: neighbours on a slanted surface share a pixel of the next frame.
     covered = inside & (seen > np.float32(1.1) * rho_curr)
     inverse = np.where(covered, seen, rho_curr)
@@ -272,12 +267,13 @@ class MotionSamplers:
     translation: ThreeSamplers = TRANSLATION
     backward_share: Share = 0.2
 
-    def draw(self, rng: np.random.Generator, depth: float) -> tuple[np.ndarray, np.ndarray]:
-        """Euler angles (3,) in degrees and translation (3,) in metres of a thing at this depth."""
+    def draw(self, rng: np.random.Generator, depth: float) -> np.ndarray:
+        """(4, 4) motion of a thing at this depth."""
         angles = np.array([sampler.draw(rng) for sampler in self.rotation_deg])
         x, y, z = self.translation
         low = max(z.low, -self.backward_share * depth)
-        return angles, np.array([x.draw(rng), y.draw(rng), z.draw(rng, low)])
+        t = np.array([x.draw(rng), y.draw(rng), z.draw(rng, low)])
+        return make_transform(euler_deg_to_matrix(angles), t)
 
 
 Pixels = Annotated[int, Field(ge=2)]
@@ -346,12 +342,10 @@ def _paper_sample(rng: np.random.Generator, o: PaperOptions) -> Sample:
         layers.lay(box, mask, float(np.float32(1.0 / depth)))
 
     # Step 3.
-    angles, t = o.motion.draw(rng, min(depths, default=background))
-    T = make_transform(euler_deg_to_matrix(angles), t)
+    T = o.motion.draw(rng, min(depths, default=background))
     for number, depth in enumerate(depths):
         if rng.random() < o.move_probability:
-            own_angles, own_t = o.motion.draw(rng, depth)
-            layers.motions[number] = make_transform(euler_deg_to_matrix(own_angles), own_t)
+            layers.motions[number] = o.motion.draw(rng, depth)
 
     # Steps 4 and 5.
     ego_flow, _, flow, ratio = layers.flows(T, added=True)
@@ -367,8 +361,6 @@ def _paper_sample(rng: np.random.Generator, o: PaperOptions) -> Sample:
         depth_target=depth_curr,
         K=K.astype(np.float32),
         T_curr_prev=T.astype(np.float32),
-        rotation_deg=angles.astype(np.float32),
-        translation=t.astype(np.float32),
         moving=np.isin(layers.owner, moving),
     )
 

@@ -15,7 +15,7 @@ from pydantic import Field
 from scipy.spatial.transform import Rotation
 
 from hybridvo.flow import dis_flow
-from hybridvo.geometry import invert, make_transform, matrix_to_euler_deg, se3_exp
+from hybridvo.geometry import invert, make_transform, se3_exp
 from hybridvo.options import option_group
 from hybridvo.synthetic.bodies import BODIES, SHAPES, Mover, draw_look, mover
 from hybridvo.synthetic.draws import about, affine, any_turn, carried, log_uniform, turn
@@ -238,7 +238,5 @@ class RenderedOptions:
             depth_target=np.maximum(known.depth * ratio, 0),
             K=K.astype(np.float32),
             T_curr_prev=T.astype(np.float32),
-            rotation_deg=matrix_to_euler_deg(T[:3, :3]).astype(np.float32),
-            translation=T[:3, 3].astype(np.float32),
             moving=known.moving,
         )

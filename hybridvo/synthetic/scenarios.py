@@ -126,7 +126,7 @@ def make_pair(
     layers = Layers(camera.K, _surfaces(rng, cell, (height, width)))
     _add_objects(rng, cell, layers, T)
     _, _, flow, ratio = layers.flows(T, added=False)
-    seen = splat(flow, layers.rho / ratio)
+    seen = splat(flow, layers.rho / ratio)[0]
     depths = [(1.0 / np.where(r > 0, r, np.nan)).astype(np.float32) for r in (layers.rho, seen)]
     measured, outlier = noisy_flow(rng, flow, cell.flow_noise_px, cell.outliers, 60.0)
     prev, curr = (
