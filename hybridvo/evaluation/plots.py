@@ -42,9 +42,9 @@ def plot_trajectories(
     Estimates are aligned as ``alignment`` says, or by their first pose where a path does not
     determine it (the legend says which). ``path`` ends in ``.png``.
     """
-    rows = {"height_ratios": [1.0] if truth is None else [2.0, 1.0], "squeeze": False}
+    heights = [1.0] if truth is None else [2.0, 1.0]
     figure = Figure(figsize=(10.0, 7.4), dpi=130, layout="constrained")
-    above, *below = figure.subplots(1 if truth is None else 2, 1, **rows)[:, 0]
+    above, *below = figure.subplots(len(heights), squeeze=False, height_ratios=heights)[:, 0]
     above.set(xlabel="x right [m]", ylabel="z forward [m]")
     start = 0.0
     if truth is not None:

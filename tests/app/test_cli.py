@@ -152,5 +152,5 @@ def test_demo(tmp_path, capsys):
     by_name = {row["method"]: row for row in content["rows"]}
     best = min(by_name.values(), key=lambda row: row["ate_cm"])
     assert best["method"] == "hybridvo (hybrid)" and content["alignment"] == "origin"
-    assert Path(content["image"]).stat().st_size > 10_000
+    assert Path(content["report"]).stat().st_size > 10_000
     assert main(["demo", "--out", str(tmp_path), "--frames", "3", "-q"]) == 2
