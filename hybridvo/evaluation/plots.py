@@ -122,9 +122,8 @@ def draw_panels(
     *,
     columns: int = 2,
     inches: float = 5.4,
-    format: str = "png",
 ) -> bytes:
-    """Encoded image of panels (at least one), ``columns`` in a row, each ``inches`` wide.
+    """PNG of panels (at least one), ``columns`` in a row, each ``inches`` wide.
 
     ``aspect`` is width over height of the pair's images; networks see images of another shape,
     which are shown in it.
@@ -154,7 +153,7 @@ def draw_panels(
         bar.ax.tick_params(labelsize=8)
     figure.suptitle(heading, fontsize=11, x=0.01, ha="left", parse_math=False)
     stream = io.BytesIO()
-    figure.savefig(stream, format=format)
+    figure.savefig(stream, format="png")
     return stream.getvalue()
 
 
