@@ -5,20 +5,22 @@ from __future__ import annotations
 import itertools
 import os
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from hybridvo.data.camera_file import IMAGES, Calibration, Lens, parse_camera, units_per_metre
+from hybridvo.data.camera_file import Calibration, parse_camera, straighten, units_per_metre
 from hybridvo.data.image_io import read_depth, read_flow, read_mask_png, read_rgb
-from hybridvo.data.lists import match_files, shown, sorted_files
+from hybridvo.data.lists import IMAGES, match_files, shown, sorted_files
 from hybridvo.errors import FormatError, InputError
 from hybridvo.trajectory import check_increasing
 from hybridvo.types import Camera, Frame, depth_advice, typical_depth
 
 INNER_FOLDER = re.compile(r"(rgb|depth|flow|image)(_\w+)?")
 """Names of the folders inside a sequence, for which all of it may be meant."""
+SATURATED = 65535  # of 16 bits: no depth
 Files = list[Path | None]
 """A file for each frame, None where it has none."""
 
@@ -26,8 +28,9 @@ Files = list[Path | None]
 class Sequence:
     """Frames in time order, read when asked for: ``len``, ``sequence[i]``, ``for frame in``.
 
-    A reader overrides ``_list_files``, which fills in files and stamps, and ``_calibration``; where
-    its files need more than their ending says, ``_read_depth`` and ``_read_flow``.
+    A reader overrides ``_list_files``, which fills in files, stamps and poses, and
+    ``_calibration``; where its files need more than their ending says, ``_read_depth`` and
+    ``_read_flow``.
 
     Attributes:
         kind: sintel, tartanair, tum, 7scenes, kitti or folder.
@@ -52,7 +55,7 @@ class Sequence:
     def __init__(
         self,
         root: Path,
-        camera: str | os.PathLike[str] | Camera | Calibration | None = None,
+        camera: str | os.PathLike[str] | Camera | None = None,
         depth_scale: float | None = None,
         mask: str | os.PathLike[str] | None = None,
     ) -> None:
@@ -63,25 +66,21 @@ class Sequence:
         self.timestamps = np.zeros(0)
         self.poses: np.ndarray | None = None
         self.warnings: list[str] = []
-        self._sources: list[Path | None] = []  # the other files that were read
+        self._sources: Files = []  # the other files that were read
         self._mask_folder = None if mask is None else Path(mask)
-        self._given_camera = camera
-        self._given_scale = units_per_metre(depth_scale, self.name, self.warnings)
+        self._given_camera, self._given_scale = camera, depth_scale
         self._list_files()
         if not self.rgb_files:
             raise InputError(f"{root}: no frames. Looked for {self.looks_for()}")
         check_increasing(self.timestamps, str(root))
-        self.flow_files = (self.flow_files + [None] * len(self))[: len(self)]
         self.mask_files: Files = [None] * len(self)
         if self._mask_folder is not None:
             frames = [a or b for a, b in zip(self.rgb_files, self.depth_files, strict=True)]
             hint = "Expected PNG or JPEG, 0 where pixels must not be used, named like the images."
             masks = sorted_files(self._mask_folder, IMAGES)
             self.mask_files = match_files(frames, masks, self._mask_folder, hint)
-        self._camera: Camera | None = None
-        self._lens: Lens | None = None
         self._look_at_first_images()
-        self._warn_of_missing_files()
+        self._warn_of_what_is_missing()
 
     @classmethod
     def root_of(cls, folder: Path) -> Path | None:
@@ -104,11 +103,12 @@ class Sequence:
 
     def check_flow(self, stride: int = 1) -> None:
         """Refuse to take flow files that are not there, or that do not lead over a stride."""
-        over = f"flow files lead from one frame to the next, not over a stride of {stride}"
         if not self.has_flow or stride != 1:
-            why = over if self.has_flow else "there are no flow files"
-            remedy = "compute it: --flow dis, or iter_pairs(sequence, hybridvo.dis_flow())"
-            raise InputError(f"{self.name}: {why}; {remedy}.")
+            why = f"flow files do not lead over a stride of {stride}"
+            raise InputError(
+                f"{self.name}: {why if self.has_flow else 'there are no flow files'}; compute it: "
+                f"--flow dis, or iter_pairs(sequence, hybridvo.dis_flow())."
+            )
 
     def __len__(self) -> int:
         return len(self.timestamps)
@@ -117,10 +117,7 @@ class Sequence:
         return f"<{self.kind} sequence {self.name!r}: {len(self)} frames>"
 
     def __getitem__(self, index: int) -> Frame:
-        return self.frame(index + len(self) if index < 0 else index)
-
-    def __iter__(self) -> Iterator[Frame]:
-        return map(self.frame, range(len(self)))
+        return self.frame(range(len(self))[index])
 
     def camera(self, index: int) -> Camera:
         """Pinhole camera of frame ``index``."""
@@ -134,40 +131,37 @@ class Sequence:
             FileNotFoundError: neither is there. FormatError: a file that cannot be decoded or has
                 another size.
         """
-        index = self._check_index(index)
-        camera = self.camera(index)
-        files = self.rgb_files[index], self.depth_files[index]
-        rgb = self._read(files[0], "an image", read_rgb)
-        depth = self._read(files[1], "depth", lambda path: self._read_depth(path, rgb))
-        mask = self._read(self.mask_files[index], "a mask", read_mask_png)
+        files = self.rgb_files[index], self.depth_files[index], self.mask_files[index]
+        readers: tuple[Callable[[Path], Any], ...] = read_rgb, self._read_depth, read_mask_png
+        rgb, depth, mask = (
+            read(path) if path is not None and path.exists() else None
+            for path, read in zip(files, readers, strict=True)
+        )
+        where = f"{self.name}: frame {index} ({files[0]}, {files[1]})"
         if rgb is None and depth is None:
-            there = ", ".join(str(path) for path in files if path is not None)
-            raise FileNotFoundError(
-                f"{self.name}: frame {index}: neither image nor depth is there ({there})."
-            )
-        if self._lens is not None:
-            rgb, depth, mask = self._lens.straighten(rgb, depth, mask)
-        variance = None if depth is None else self._depth_variance(depth)
-        return Frame(rgb, depth, camera, float(self.timestamps[index]), index, variance, mask)
+            raise FileNotFoundError(f"{where}: neither image nor depth is there.")
+        if self._calibrated is not None and any(self._calibrated.distortion):
+            rgb, depth, mask = straighten(self._calibrated, rgb, depth, mask)
+        camera, stamp = self.camera(index), float(self.timestamps[index])
+        try:
+            return Frame(rgb, depth, camera, stamp, index, mask=mask)
+        except InputError as error:
+            raise FormatError(f"{where}: {error}") from None
 
     def flow(self, index: int) -> tuple[np.ndarray, np.ndarray | None]:
         """Flow from frame ``index`` to the next: (H, W, 2) float32 px, and (H, W) bool or None.
 
         Raises:
-            FileNotFoundError: no flow file for it. FormatError: as :meth:`frame`.
+            FileNotFoundError: no flow file for it. FormatError: a damaged one.
         """
-        index = self._check_index(index)
-        if index == len(self) - 1:
-            raise IndexError(f"{self.name}: frame {index} is the last, no flow starts there.")
-        path = self.flow_files[index]
+        if index >= len(self) - 1:
+            raise IndexError(f"{self.name}: no flow starts at frame {index} of {len(self)}.")
+        path = self.flow_files[index] if self.flow_files else None
         if path is None:
             raise FileNotFoundError(
                 f"{self.name}: there is no flow file from frame {index} to {index + 1}."
             )
-        flow, valid = self._read_flow(path, index)
-        for array in (flow,) if valid is None else (flow, valid):
-            self._check_shape(array, path, "flow")
-        return flow, valid
+        return self._read_flow(path, index)
 
     def files(self) -> list[Path]:
         """Every existing file that the sequence reads, sorted: what a fingerprint covers."""
@@ -183,21 +177,17 @@ class Sequence:
         """Camera of all frames; None where each frame has its own (``camera`` is overridden)."""
         raise NotImplementedError
 
-    def _read_depth(self, path: Path, rgb: np.ndarray | None) -> np.ndarray:
+    def _read_depth(self, path: Path) -> np.ndarray:
         """(H, W) float32 metres; 0, negative and not finite are invalid."""
-        return self._metres(read_depth(path))
+        stored = read_depth(path)
+        # unless a scale is given, only integers are in the set's unit
+        usual = self.depth_scale if stored.dtype.kind == "u" else None
+        depth = stored.astype(np.float32) / np.float32(self._given_scale or usual or 1.0)
+        depth[stored == SATURATED] = 0.0
+        return depth
 
     def _read_flow(self, path: Path, index: int) -> tuple[np.ndarray, np.ndarray | None]:
         return read_flow(path)
-
-    def _depth_variance(self, depth: np.ndarray) -> np.ndarray | None:
-        """Variance of log depth, where the source allows to state one."""
-        return None
-
-    def _metres(self, stored: np.ndarray) -> np.ndarray:
-        """Stored depth in metres. Unless a scale is given, only integers are in the set's unit."""
-        usual = self.depth_scale if stored.dtype.kind == "u" else None
-        return stored.astype(np.float32) / np.float32(self._given_scale or usual or 1.0)
 
     def _list_numbered(
         self, rgb: dict[int, Path], depth: dict[int, Path], flow: dict[int, Path] | None = None
@@ -216,91 +206,66 @@ class Sequence:
             )
         return numbers
 
-    def _read(
-        self, path: Path | None, what: str, read: Callable[[Path], np.ndarray]
-    ) -> np.ndarray | None:
-        """An image of the right size, None where its file is missing."""
-        if path is None or not path.exists():
-            return None
-        array = read(path)
-        self._check_shape(array, path, what)
-        return array
-
-    def _check_shape(self, array: np.ndarray, path: Path, what: str) -> None:
-        if array.shape[:2] != (self.height, self.width):
-            raise FormatError(
-                f"{path}: expected {what} of {self.width}x{self.height} pixels as the first frame "
-                f"has, got {array.shape[1]}x{array.shape[0]}."
-            )
-
-    def _check_index(self, index: int) -> int:
-        if not 0 <= int(index) < len(self):
-            raise IndexError(f"{self.name}: expected a frame 0 to {len(self) - 1}, got {index}.")
-        return int(index)
-
-    def _first(
-        self, files: Files, read: Callable[[Path], np.ndarray]
-    ) -> tuple[Path | None, np.ndarray | None, object]:
-        """The first file that can be read, and what it holds; else why the first cannot."""
-        problem = None
-        for path in files:
+    def _each_pose(self, files: Files, read: Callable[[Path], np.ndarray]) -> None:
+        """Take poses of which each frame has a file; a damaged one costs its frame the truth."""
+        self.poses = np.full((len(self), 4, 4), np.nan)
+        for index, path in enumerate(files):
             try:
                 if path is not None:
-                    return path, read(path), None
-            except (InputError, OSError) as error:
-                problem = problem or error
-        return None, None, problem
+                    self.poses[index] = read(path)
+            except FormatError as error:
+                self.warnings.append(f"no true pose for frame {index}: {error}")
 
     def _look_at_first_images(self) -> None:
         """Take the size of the images, and the camera; look at the size and the unit of depth."""
-        _, image, why = self._first(self.rgb_files, read_rgb)
-        # a right image of a stereo pair is no depth: frames check its size
-        files = [] if self.depth_source == "stereo" else self.depth_files
+        problems: list[object] = []
+
+        def first(files: Files, read: Callable[[Path], np.ndarray]) -> tuple[Any, Any]:
+            for path in files:
+                try:
+                    if path is not None:
+                        return path, read(path)
+                except (InputError, OSError) as error:
+                    problems.append(error)
+            return None, None
+
+        _, image = first(self.rgb_files, read_rgb)
         if image is None:
-            _, image, other = self._first(files, lambda path: self._read_depth(path, None))
-            why = why or other or "no file is listed"
+            _, image = first(self.depth_files, read_depth)
         if image is None:
-            raise FormatError(f"{self.root}: no frames: none can be read. First problem: {why}")
+            raise FormatError(f"{self.root}: no frames: none can be read: {problems[0]}")
         self.height, self.width = size = image.shape[:2]
-        self._calibrate()
-        path, depth, _ = self._first(files, lambda path: self._read_depth(path, None))
+        given, told = self._given_camera, self.warnings
+        found = self._calibration() if given is None else parse_camera(given, size, told)
+        if found is not None and (found.height, found.width) != size:
+            raise InputError(
+                f"{self.root}: images are {self.width}x{self.height}, the camera is for "
+                f"{found.width}x{found.height} pixels. Give the intrinsics of these images "
+                f"(--camera fx,fy,cx,cy or --camera FILE)."
+            )
+        if self._given_scale is None and found is not None:
+            self._given_scale = found.depth_scale
+        self._calibrated, self._camera = found, None if found is None else found.camera
+        self._given_scale = units_per_metre(self._given_scale, self.name, told)
+        path, depth = first(self.depth_files, self._read_depth)
         if depth is None:
             return
         if depth.shape != size:
             raise InputError(
-                f"{self.root}: depth images are {depth.shape[1]}x{depth.shape[0]}, colour images "
-                f"{size[1]}x{size[0]} pixels: depth must be registered to colour, not resized "
-                f"(RealSense: rs.align(rs.stream.color); ROS: aligned_depth_to_color)."
+                f"{path}: depth is {depth.shape[1]}x{depth.shape[0]}, colour "
+                f"{self.width}x{self.height} pixels: depth must be registered to colour, not "
+                f"resized (RealSense: rs.align(rs.stream.color); ROS: aligned_depth_to_color)."
             )
         median = typical_depth(depth)
         if median is None:
-            self.warnings.append(f"{path}: the first depth map has no valid value.")
+            told.append(f"{path}: the first depth map has no valid value.")
         elif advice := depth_advice(median, self.depth_scale):
-            self.warnings.append(
+            told.append(
                 f"{path}: the median depth is {median:.4g} m, which cannot be metres. Probable "
                 f"remedy: {advice} (by --depth-scale, or depth_scale in camera.yaml)."
             )
 
-    def _calibrate(self) -> None:
-        """Take the camera that is given, else that of the data set."""
-        size = self.height, self.width
-        given = self._given_camera
-        calibration = self._calibration() if given is None else parse_camera(given, size)
-        if calibration is None:
-            return
-        self._camera = camera = calibration.camera
-        if camera.shape != size:
-            raise InputError(
-                f"{self.root}: images are {self.width}x{self.height}, the camera is for "
-                f"{camera.width}x{camera.height} pixels. Give the intrinsics of these images "
-                f"(--camera fx,fy,cx,cy or --camera FILE)."
-            )
-        self.warnings += calibration.warnings
-        if any(calibration.distortion):
-            self._lens = Lens(camera, calibration.distortion)
-        self._given_scale = self._given_scale or calibration.depth_scale
-
-    def _warn_of_missing_files(self) -> None:
+    def _warn_of_what_is_missing(self) -> None:
         listed = {"image": self.rgb_files, "depth": self.depth_files, "mask": self.mask_files}
         for what, paths in listed.items():
             missing = [i for i, path in enumerate(paths) if path is None or not path.exists()]
@@ -310,3 +275,5 @@ class Sequence:
                 text = f"there are no {what} files{like}"
             if missing and (any(paths) or what != "mask"):
                 self.warnings.append(f"{self.name}: {text}.")
+        if self.poses is not None and (lost := int(np.isnan(self.poses[:, 0, 0]).sum())):
+            self.warnings.append(f"{self.name}: {lost} of {len(self)} frames have no true pose.")

@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 
 from hybridvo.data.base import Sequence
-from hybridvo.data.camera_file import Calibration
 from hybridvo.data.folder import FolderSequence
 from hybridvo.data.kitti import KittiSequence
+from hybridvo.data.lists import shown
 from hybridvo.data.seven_scenes import SevenScenesSequence
 from hybridvo.data.sintel import SintelSequence
 from hybridvo.data.tartanair import TartanAirSequence
@@ -25,29 +25,24 @@ from hybridvo.errors import InputError
 from hybridvo.flow import check_field, file_flow
 from hybridvo.types import Camera, Frame, FramePair
 
-READERS: dict[str, type[Sequence]] = {
-    reader.kind: reader
-    for reader in (
-        SintelSequence,
-        TartanAirSequence,
-        SevenScenesSequence,
-        FolderSequence,
-        KittiSequence,
-        TumSequence,
-    )
-}
+_READERS: tuple[type[Sequence], ...] = (
+    *(SintelSequence, TartanAirSequence, SevenScenesSequence),
+    *(FolderSequence, KittiSequence, TumSequence),
+)
+READERS = {reader.kind: reader for reader in _READERS}
 """Kind -> reader, in the order in which a folder is tried."""
 DATASETS = tuple(READERS)
 OWN_DATA = (
-    "Own data: put images into rgb/, depth registered to them into depth/, and describe the camera "
-    "with 'hybridvo init DIR' (kind 'folder')."
+    "Own data: hybridvo needs metric depth for each image, from a sensor, stereo or a network. Put "
+    "images into rgb/, depth registered to them into depth/, and describe the camera with "
+    "'hybridvo init DIR' (kind 'folder')."
 )
 
 
 def open_sequence(
     path: str | os.PathLike[str],
     dataset: str | None = None,
-    camera: str | os.PathLike[str] | Camera | Calibration | None = None,
+    camera: str | os.PathLike[str] | Camera | None = None,
     depth_scale: float | None = None,
     mask: str | os.PathLike[str] | None = None,
 ) -> Sequence:
@@ -90,25 +85,17 @@ def _detect(folder: Path, kinds: tuple[str, ...]) -> tuple[str, Path]:
     for kind in kinds:
         if root := READERS[kind].root_of(folder):
             return kind, root
-    if not folder.exists():
-        raise InputError(f"{folder}: no such folder.")
     if not folder.is_dir():
-        raise InputError(f"{folder}: expected a sequence folder, got a file.")
+        got = "a file" if folder.exists() else "no such folder"
+        raise InputError(f"{folder}: expected a sequence folder, got {got}.")
     if len(kinds) == 1:
         return kinds[0], folder.absolute()
-    has_images = (folder / "rgb").is_dir()
-    if has_images and (folder / "depth").is_dir():
+    if (folder / "rgb").is_dir() and (folder / "depth").is_dir():
         return FolderSequence.kind, folder.absolute()
-    inside = sorted(path.name for path in folder.iterdir())
-    content = ", ".join(inside[:8]) + (", ..." if len(inside) > 8 else "")
-    if has_images or any(name.lower().endswith((".png", ".jpg")) for name in inside):
-        raise InputError(
-            f"{folder}: images without depth ({content}): hybridvo needs metric depth for each "
-            f"image, from a sensor, stereo or a network. {OWN_DATA}"
-        )
+    inside = shown(sorted(path.name for path in folder.iterdir()))
     looked = "".join(f"\n  {reader.looks_for()}" for reader in READERS.values())
     raise InputError(
-        f"{folder}: no frames: no known data set. It holds: {content or 'nothing'}. "
+        f"{folder}: no frames: no known data set. It holds: {inside or 'nothing'}. "
         f"Looked for:{looked}\nSay which with dataset=... (--dataset) if the names differ. "
         f"{OWN_DATA}"
     )
