@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from markdown_table import number, table
 
-from hybridvo.evaluation.protocols import protocols
+from hybridvo.evaluation.protocols import paper_protocol
 
 Results = dict[str, dict[str, Any]]
 
@@ -54,7 +54,7 @@ def final(results: Results, row: str, preset: str, key: str) -> str:
 
 def published(row: str) -> Mapping[str, Any]:
     """Figures of a row in the paper."""
-    return next(line for line in protocols()["paper"].published if line["method"] == row)
+    return next(line for line in paper_protocol()["published"] if line["method"] == row)
 
 
 def budget(results: Results) -> str:

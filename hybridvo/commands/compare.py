@@ -19,34 +19,27 @@ from collections.abc import Iterable, Mapping
 from collections.abc import Sequence as Several
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
 
-from hybridvo.commands.run import EXIT_INTERRUPTED, flow_provider, frames_of, run
+from hybridvo.commands.run import flow_provider, frames_of, run
 from hybridvo.data.sequence import Sequence, open_sequence
 from hybridvo.errors import HybridVOError, InputError
 from hybridvo.estimation import warm_up
 from hybridvo.evaluation import scores
-from hybridvo.evaluation.drawing import draw_worst
 from hybridvo.evaluation.pair_errors import ERRORS, pair_facts, true_motion, true_trajectory
-from hybridvo.evaluation.protocols import (
-    Protocol,
-    check_protocol,
-    protocol_summary,
-    same_intrinsics,
-)
+from hybridvo.evaluation.protocols import check_protocol, protocol_summary, same_intrinsics
 from hybridvo.evaluation.report import write_report
 from hybridvo.files import Mode, atomic_write, held, make_folder, versions, write_csv, write_json
-from hybridvo.flow import FlowProvider
 from hybridvo.network.models import Models
 from hybridvo.options import Options
 from hybridvo.pipeline import METHODS, check_method, weights_hash
 
 _logger = logging.getLogger(__name__)
 WRITTEN = ("results.json", "results.csv", "pairs.csv", "report.md", "report.html")
-"""What a finished comparison leaves, beside ``runs/`` and ``worst/``."""
+"""What a finished comparison leaves, beside ``runs/``."""
 CAMERA_FLOW_KINDS = ("tartanair",)
 """Data sets whose true flow is that of the camera alone: it does not show what moves by itself."""
 
@@ -58,7 +51,7 @@ def compare(
     methods: Several[str] = ("all",),
     options: Options | None = None,
     dataset: str | None = None,
-    protocol: str | None = None,
+    protocol: Literal["paper"] | None = None,
     weights: Mapping[str, str] | None = None,
     worst: int = 3,
     mode: Mode = "new",
@@ -68,16 +61,18 @@ def compare(
     """Run every method on every sequence and write the results; returns paths of :data:`WRITTEN`.
 
     A folder of ``sequences`` stands for all that it holds; the method ``all`` for all that can run,
-    the flow ``auto`` for every source that a sequence has, side by side. ``protocol`` is ``paper``
-    or ``trajectory14`` (MPI Sintel as others score it), ``weights`` names files of networks,
-    ``worst`` counts the pairs shown for each method and flow. ``resume`` keeps finished runs.
+    the flow ``auto`` for every source that a sequence has, side by side. ``protocol`` scores MPI
+    Sintel as the paper does, ``weights`` names files of networks, ``worst`` counts the pairs
+    listed for each method and flow. ``resume`` keeps finished runs.
     """
-    out, options, command = Path(out), options or Options(), list(command)
+    out, options = Path(out), options or Options()
     if worst < 0:
         raise InputError(f"--worst: expected 0 or more, got {worst}.")
     models = Models(options.run.device, weights)
     names, missing = methods_to_run(methods, models)
-    chosen, jobs = _jobs(sequences, dataset, protocol, options, out)
+    jobs = _jobs(sequences, dataset, options, out)
+    if protocol is not None:
+        check_protocol([job.sequence for job in jobs], options.run)
     present = [name for name in (*WRITTEN, "runs") if (out / name).exists()]
     if present and mode == "new":
         raise InputError(
@@ -85,38 +80,32 @@ def compare(
             f"them, or another --out."
         )
     with held(out):
-        for name in ("runs", "worst"):
-            if mode == "overwrite":
-                shutil.rmtree(out / name, ignore_errors=True)
-            make_folder(out / name)
+        if mode == "overwrite":
+            shutil.rmtree(out / "runs", ignore_errors=True)
+        make_folder(out / "runs")
         for name, reason in missing.items():
             _logger.warning("not run: %s: %s", name, reason)
         for name in names:
             warm_up(name, models)
-        tables, rows, facts = [], [], []
+        given = list(command)
         for job in jobs:
-            missing |= job.run(names, options, models, command, quiet)
-            table, about = _read(job, chosen)
-            tables.append(table)
-            facts.append(about)
-            rows += _rows(job, table, out)
-        table = pd.concat(tables, ignore_index=True)
-        result = {
-            "command": command,
+            missing |= job.run(names, options, models, given, quiet)
+        result: dict[str, Any] = {
+            "command": given,
             "versions": versions(),
             "machine": {"platform": platform.platform(), "cpus": os.cpu_count()},
             "options": dataclasses.asdict(options),
             "weights": {name: weights_hash(name, models) for name in names},
             "timing": "one estimate at a time",
             "missing": missing,
-            **scores.summary(table, rows),
-            "sequences": facts,
-            "worst_pairs": scores.worst_pairs(table, worst),
         }
-        result["protocol"] = chosen and protocol_summary(chosen, result["totals"], facts)
-        for job, mine in zip(jobs, tables, strict=True):
-            entries = [entry for entry in result["worst_pairs"] if entry["sequence"] == job.name]
-            draw_worst(out, job.sequence, job.flows, options, models, entries, mine)
+        tables, facts = zip(*(_read(job, protocol is not None) for job in jobs), strict=True)
+        table = pd.concat(tables, ignore_index=True)
+        rows = [row for two in zip(jobs, tables, strict=True) for row in _rows(*two, out)]
+        totals = scores.totals(table, rows)
+        result |= {"rows": rows, "totals": totals, "sequences": facts}
+        result["worst_pairs"] = scores.worst_pairs(table, worst)
+        result["protocol"] = None if protocol is None else protocol_summary(totals, facts)
         _write(out, result, table)
     return [out / name for name in WRITTEN]
 
@@ -171,12 +160,12 @@ def open_all(path: str | os.PathLike[str], dataset: str | None = None) -> list[S
 
 @dataclass
 class _Job:
-    """One sequence: providers of its flows, and the runs that are done, by method and flow."""
+    """One sequence: its flows by label, and the runs that are done, by method and flow."""
 
     sequence: Sequence
     name: str
     folder: Path
-    flows: dict[str, FlowProvider]
+    flows: tuple[str, ...]
     runs: dict[tuple[str, str], Path] = field(default_factory=dict)
 
     def run(
@@ -196,15 +185,13 @@ class _Job:
             asked = _with(options, run=single, flow={"source": source})
             given: dict[str, Any] = {"models": models, "command": command, "quiet": quiet}
             try:
-                code = run(self.sequence, folder, asked, mode="resume", quick=True, **given)[1]
+                run(self.sequence, folder, asked, mode="resume", quick=True, **given)
             except HybridVOError:
                 raise
             except Exception as error:
                 raised[f"{method} on {self.name}"] = f"{type(error).__name__}: {error}"
                 _logger.exception("%s on %s", method, self.name)
                 continue
-            if code == EXIT_INTERRUPTED:
-                raise KeyboardInterrupt
             self.runs[method, flow] = folder
         return raised
 
@@ -215,20 +202,13 @@ def _with(options: Options, **groups: dict[str, Any]) -> Options:
 
 
 def _jobs(
-    paths: Several[str | os.PathLike[str]],
-    dataset: str | None,
-    protocol: str | None,
-    options: Options,
-    out: Path,
-) -> tuple[Protocol | None, list[_Job]]:
-    """The protocol, and what is to be done on every sequence; both flows where it has both."""
+    paths: Several[str | os.PathLike[str]], dataset: str | None, options: Options, out: Path
+) -> list[_Job]:
+    """What is to be done on every sequence; both flows where it has both."""
     opened = [sequence for path in paths for sequence in open_all(path, dataset)]
     if not opened:
         raise InputError("compare: expected at least one folder of a sequence, got none.")
-    chosen: Protocol | None = None
     jobs: list[_Job] = []
-    if protocol is not None:
-        chosen, opened = check_protocol(protocol, opened, options.run)
     for sequence in opened:
         frames_of(sequence, options)
         name = sequence.name
@@ -239,18 +219,18 @@ def _jobs(
             usable = sequence.has_flow and options.run.stride == 1
             images = any(file is not None for file in sequence.rgb_files)
             sources = ["dis"] * (images or not usable) + ["file"] * usable
-        flows = {}
-        for source in sources:  # an oracle is named
-            label = "file (true)" if source == "file" and sequence.flow_is_true else source
-            flows[label] = flow_provider(sequence, _with(options, flow={"source": source}))
+        for source in sources:
+            flow_provider(sequence, _with(options, flow={"source": source}))
+        is_true = sequence.flow_is_true  # an oracle is named
+        flows = tuple("file (true)" if s == "file" and is_true else s for s in sources)
         folder = out / "runs" / re.sub(r"[^\w.-]", "_", name)
         if folder in [job.folder for job in jobs]:
             raise InputError(f"--sequence: {name} is given twice.")
         jobs.append(_Job(sequence, name, folder, flows))
-    return chosen, jobs
+    return jobs
 
 
-def _read(job: _Job, protocol: Protocol | None) -> tuple[pd.DataFrame, dict[str, Any]]:
+def _read(job: _Job, same_camera_only: bool) -> tuple[pd.DataFrame, dict[str, Any]]:
     """Pairs of all runs as one table, and what is said of the sequence."""
     sequence = job.sequence
     table = pd.concat([_pairs(job, *run) for run in job.runs.items()])
@@ -260,7 +240,7 @@ def _read(job: _Job, protocol: Protocol | None) -> tuple[pd.DataFrame, dict[str,
         {"index": row.next, "reason": f"frame cannot be read: {row.message}"}
         for row in missing.itertuples()
     ]
-    if protocol is not None and protocol.same_camera_only:
+    if same_camera_only:
         cameras = first[["prev", "next"]].map(sequence.camera)
         changed = first[~cameras.apply(lambda pair: same_intrinsics(*pair), axis=1)]
         left_out += [{"index": i, "reason": "the intrinsics change"} for i in changed["prev"]]
@@ -292,8 +272,6 @@ def _pairs(job: _Job, run: tuple[str, str], folder: Path) -> pd.DataFrame:
     """Motions of one run."""
     steps = pd.read_csv(folder / "steps.csv", dtype={"reason": str, "message": str})
     stride = int(np.diff(steps["index"][:2]).sum())
-    with np.load(folder / "steps.npz") as arrays:
-        steps["T_curr_prev"] = list(arrays["T_curr_prev"])
     steps = steps[steps["prev_index"].notna()].fillna({"reason": "", "message": ""})
     missing = steps["reason"] == "missing_frame"
     steps.loc[missing, [*ERRORS, "motion_ms", "flow_ms"]] = np.nan

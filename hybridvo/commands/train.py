@@ -20,6 +20,7 @@ import json
 import math
 import os
 import shlex
+import signal
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -131,7 +132,6 @@ def _train(args: argparse.Namespace, command: str, task: Any) -> Any:
     import cv2
     import torch
 
-    from hybridvo.commands.progress import interruptible
     from hybridvo.errors import InputError
     from hybridvo.files import write_json
     from hybridvo.training.export import RUN, source_commit
@@ -160,9 +160,9 @@ def _train(args: argparse.Namespace, command: str, task: Any) -> Any:
         if trainer.rank == 0:
             about = {"command": command, "commit": source_commit(), "torch": torch.__version__}
             write_json(args.out / RUN, about)
-    # the update at hand ends, with a checkpoint
-    with interruptible(lambda: setattr(trainer, "stop_requested", True)):
-        why = trainer.run(60 * args.time_limit)
+    for number in (signal.SIGINT, signal.SIGTERM):  # the update at hand ends, with a checkpoint
+        signal.signal(number, lambda *_: setattr(trainer, "stop_requested", True))
+    why = trainer.run(60 * args.time_limit)
     say(f"ended by {why} at update {trainer.step}, {trainer.samples} samples")
     return trainer
 

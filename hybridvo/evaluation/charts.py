@@ -6,13 +6,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 import plotly.express as px
 from plotly.graph_objects import Figure
 
 from hybridvo.evaluation.metrics import aligned
-from hybridvo.evaluation.scores import FAILURE_PX
+from hybridvo.evaluation.scores import FACTORS, FAILURE_PX
 from hybridvo.geometry import invert
 from hybridvo.trajectory import read_trajectory
 
@@ -22,19 +21,11 @@ TRUTH = "ground truth"
 LABELS = {
     "epe_l2_px": "EPE [px]",
     "epe_l2_px_median": "median EPE [px]",
-    "below": "pairs below it [%]",
-    "failure_rate": "failures [%]",
-    "ms_per_pair_median": "time per pair, flow not included [ms]",
+    "failure_rate": "share of failures",
     "index": "pair",
     "right": "x, right [m]",
     "forward": "z, forward [m]",
-    "up": "up [m]",
 }
-
-
-def flow_sources(rows: pd.DataFrame) -> list[str]:
-    """Sources of flow, estimated ones first."""
-    return sorted(rows["flow_source"].dropna().unique(), key=is_oracle)
 
 
 def is_oracle(flow: str) -> bool:
@@ -42,32 +33,36 @@ def is_oracle(flow: str) -> bool:
     return "(true)" in flow
 
 
-def _chart(
-    kind: Any, rows: pd.DataFrame, x: str, y: str, methods: Sequence[str], **more: Any
-) -> Figure:
+def flow_sources(rows: pd.DataFrame) -> list[str]:
+    """Sources of flow, estimated ones first."""
+    return sorted(rows["flow_source"].unique(), key=is_oracle)
+
+
+def _first_flow(rows: pd.DataFrame) -> pd.DataFrame:
+    return rows[rows["flow_source"] == flow_sources(rows)[0]]
+
+
+def _chart(kind: Any, rows: pd.DataFrame, methods: Sequence[str], **more: Any) -> Figure:
     """A chart with a colour for each method, black for the truth, and a line at one pixel."""
     palette = px.colors.qualitative.Dark24
     colours = {method: palette[k % len(palette)] for k, method in enumerate(methods)}
-    orders = {"method": [TRUTH, *methods], "flow_source": flow_sources(rows)}
-    if not pd.api.types.is_numeric_dtype(rows[x]):
-        orders[x] = list(rows[x].unique())
-    errors = [name for name in (x, y) if name.startswith("epe")]
-    rows = rows.assign(**{name: rows[name].clip(lower=FLOOR_PX) for name in errors})
+    orders = {"method": [TRUTH, *methods]}
+    if "facet_col" in more:
+        orders["flow_source"] = flow_sources(rows)
+    errors = {axis: more[axis] for axis in "xy" if more.get(axis, "").startswith("epe")}
     figure = kind(
-        rows,
-        x=x,
-        y=y,
+        rows.assign(**{name: rows[name].clip(lower=FLOOR_PX) for name in errors.values()}),
         color="method",
         color_discrete_map=colours | {TRUTH: "#000"},
         category_orders=orders,
         labels=LABELS,
         template="plotly_white",
         height=420,
-        **{f"log_{'x' if name == x else 'y'}": True for name in errors},
+        **{f"log_{axis}": True for axis in errors},
         **more,
     )
-    for name in errors:
-        line = figure.add_vline if name == x else figure.add_hline
+    for axis in errors:
+        line = figure.add_vline if axis == "x" else figure.add_hline
         line(FAILURE_PX, line_dash="dot")
     return figure
 
@@ -75,64 +70,38 @@ def _chart(
 def error_distribution(pairs: pd.DataFrame, methods: Sequence[str]) -> list[Figure]:
     """Share of the pairs below an error, the sources of flow side by side."""
     known = pairs.dropna(subset=["epe_l2_px"])
+    axes = {"x": "epe_l2_px", "ecdfnorm": "percent", "facet_col": "flow_source"}
     if known.empty:
         return []
-    groups = known.groupby(["flow_source", "method"])["epe_l2_px"]
-    curves = groups.quantile(np.linspace(0, 1, 201))
-    curves = curves.rename_axis(["flow_source", "method", "below"]).reset_index()
-    curves["below"] *= 100
-    return [_chart(px.line, curves, "epe_l2_px", "below", methods, facet_col="flow_source")]
+    figure = _chart(px.ecdf, known, methods, **axes)
+    return [figure.update_yaxes(title="pairs below it [%]", col=1)]
 
 
-def failure_chart(breakdown: Mapping[str, Any], methods: Sequence[str]) -> list[Figure]:
+def failure_chart(totals: Sequence[Mapping[str, Any]], methods: Sequence[str]) -> list[Figure]:
     """Failure rate of every method with its 95 % interval, sources of flow side by side."""
-    rates = pd.DataFrame(breakdown["failure_rates"]).dropna(subset=["failure_rate"])
+    rates = pd.DataFrame(totals).dropna(subset=["failure_rate"])
     if rates.empty:
         return []
-    low, rate, high = (
-        100 * rates[f"failure_rate{end}"].astype(float) for end in ("_low", "", "_high")
-    )
-    rates = rates.assign(failure_rate=rate, above=high - rate, under=rate - low)
+    rates["above"] = rates["failure_rate_high"] - rates["failure_rate"]
+    rates["under"] = rates["failure_rate"] - rates["failure_rate_low"]
     bars = {"error_x": "above", "error_x_minus": "under", "facet_col": "flow_source"}
-    figure = _chart(px.scatter, rates, "failure_rate", "method", methods, **bars)
+    figure = _chart(px.scatter, rates, methods, x="failure_rate", y="method", **bars)
     return [figure.update_layout(showlegend=False)]
 
 
-def factor_charts(breakdown: Mapping[str, Any], methods: Sequence[str]) -> list[Figure]:
+def factor_charts(pairs: pd.DataFrame, methods: Sequence[str]) -> list[Figure]:
     """Median error over the bins of each factor; a factor with one bin tells nothing."""
-    if not breakdown["cells"]:
-        return []
-    cells = pd.DataFrame(breakdown["cells"])
-    cells = cells[cells["flow_source"] == flow_sources(cells)[0]]
-    cells = cells.dropna(subset=["epe_l2_px_median"])
     figures = []
-    for factor in breakdown["factors"]:
-        mine = cells[cells["factor"] == factor["name"]].sort_values("bin")
-        if mine["bin"].nunique() > 1:
-            column = factor["label"] + (f" [{factor['unit']}]" if factor["unit"] else "")
-            mine = mine.assign(**{column: mine.apply(_bin, axis=1)})
-            figure = _chart(px.line, mine, column, "epe_l2_px_median", methods, markers=True)
-            figures.append(figure)
+    known = _first_flow(pairs).dropna(subset=["epe_l2_px"])
+    for name, (label, edges) in FACTORS.items():
+        bins = pd.cut(known[name], edges, include_lowest=True)
+        groups = known.groupby(["method", bins], observed=True)["epe_l2_px"]
+        medians = groups.median().rename("epe_l2_px_median").reset_index().sort_values(name)
+        if medians[name].nunique() > 1:
+            medians = medians.assign(**{label: medians[name].astype(str)})
+            axes = {"x": label, "y": "epe_l2_px_median", "markers": True}
+            figures.append(_chart(px.line, medians, methods, **axes))
     return figures
-
-
-def _bin(cell: Any) -> str:
-    pairs = f"<br>{cell['pairs']} pairs"
-    if pd.isna(cell["high"]):
-        return f"≥ {cell['low']:.4g}{pairs}"
-    return f"{cell['low']:.4g} to {cell['high']:.4g}{pairs}"
-
-
-def time_chart(totals: Sequence[Mapping[str, Any]], methods: Sequence[str]) -> list[Figure]:
-    """Median error over median time, of the first source of flow."""
-    rows = pd.DataFrame(totals).dropna(subset=["epe_l2_px_median", "ms_per_pair_median"])
-    rows = rows[rows["method"] != "identity"]
-    if len(rows) < 2:
-        return []
-    rows = rows[rows["flow_source"] == flow_sources(rows)[0]]
-    names = ("ms_per_pair_median", "epe_l2_px_median")
-    figure = _chart(px.scatter, rows, *names, methods, text="method", log_x=True)
-    return [figure.update_traces(textposition="top center", showlegend=False)]
 
 
 def path_charts(
@@ -142,26 +111,20 @@ def path_charts(
     sequence: str,
     methods: Sequence[str],
 ) -> list[Figure]:
-    """Path from above, error of every pair and path in space, of the first source of flow."""
+    """Path from above and error of every pair, of the first source of flow."""
     (truth,) = (s["ground_truth"] for s in result["sequences"] if s["name"] == sequence)
-    rows = pd.DataFrame([row for row in result["rows"] if row["sequence"] == sequence])
-    flow = flow_sources(rows)[0]
-    mine = pairs[(pairs["sequence"] == sequence) & (pairs["flow_source"] == flow)]
-    rows = rows[rows["flow_source"] == flow]
-    files = ({TRUTH: truth} if truth else {}) | dict(
-        zip(rows["method"], rows["trajectory"], strict=True)
-    )
+    rows = _first_flow(pd.DataFrame([r for r in result["rows"] if r["sequence"] == sequence]))
+    flow = rows["flow_source"].iloc[0]
+    files = {TRUTH: truth} if truth else {}
+    files |= dict(zip(rows["method"], rows["trajectory"], strict=True))
     paths = _positions({name: folder / file for name, file in files.items()})
-    paths["flow_source"] = flow
-    above = _chart(px.line, paths, "right", "forward", methods, title=f"From above, {flow} flow")
-    above.update_yaxes(scaleanchor="x")
-    titled = {"z": "up", "title": f"Path in space, {flow} flow"}
-    space = _chart(px.line_3d, paths, "right", "forward", methods, **titled)
-    figures = [above, space.update_layout(scene_aspectmode="data")]
+    axes = {"x": "right", "y": "forward", "title": f"From above, {flow} flow"}
+    figures = [_chart(px.line, paths, methods, **axes).update_yaxes(scaleanchor="x")]
+    mine = _first_flow(pairs[pairs["sequence"] == sequence])
     known = mine.dropna(subset=["epe_l2_px"])
     if len(known):
-        title = f"Error of every pair, {flow} flow"
-        figures.insert(1, _chart(px.line, known, "index", "epe_l2_px", methods, title=title))
+        axes = {"x": "index", "y": "epe_l2_px", "title": f"Error of every pair, {flow} flow"}
+        figures.append(_chart(px.line, known, methods, **axes))
     medians = mine.groupby("method")["epe_l2_px"].median().sort_values()
     shown = {TRUTH, *medians.index[:5]}  # the legend turns on the others
     for figure in figures:
@@ -172,14 +135,16 @@ def path_charts(
 
 
 def _positions(files: Mapping[str, Path]) -> pd.DataFrame:
-    """``method, right, forward, up`` of every path in the first true camera, metres."""
+    """``method, right, forward`` of every path in the first true camera, metres."""
     paths = {name: read_trajectory(file, "tum") for name, file in files.items()}
     gt = paths.get(TRUTH)
     tables = []
     for method, path in paths.items():
+        if gt is not None:
+            path = aligned(path, gt)[0]
         first = path if gt is None else gt
-        path = path if gt is None else aligned(path, gt)[0]
-        places = path.transformed(invert(first.T_world_cam[0])).positions
-        x, y, z = places.T[:, :: len(path) // 1500 + 1]  # long lines are thinned
-        tables.append(pd.DataFrame({"method": method, "right": x, "forward": z, "up": -y}))
+        x, _, z = path.transformed(invert(first.T_world_cam[0])).positions.T
+        thinned = slice(None, None, len(path) // 1500 + 1)
+        rows = {"method": method, "right": x[thinned], "forward": z[thinned]}
+        tables.append(pd.DataFrame(rows))
     return pd.concat(tables)

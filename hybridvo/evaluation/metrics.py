@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -29,21 +28,18 @@ LENGTHS = {
     "kitti_drift_short": (5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0),
 }
 """Sub-paths in metres: of KITTI's odometry benchmark, and for indoor sequences (TartanAir's)."""
-NOT_FINITE = "the error is not a finite number: positions are too large"
 
 
 @dataclass(frozen=True, eq=False)
 class Match:
     """Poses (M, 4, 4) of two trajectories that belong together, at (M,) stamps of the truth.
 
-    ``total`` counts the poses of the shorter one, ``by`` is ``time`` or ``index``, ``reason`` says
-    why no error can be computed from the matches.
+    ``by`` is ``time`` or ``index``, ``reason`` says why no error can be computed from the matches.
     """
 
     est: np.ndarray
     gt: np.ndarray
     stamps: np.ndarray
-    total: int
     by: str
     reason: str = ""
 
@@ -57,9 +53,13 @@ class PathError:
 
     translation: np.ndarray
     stamps: np.ndarray
-    rmse: float
     T_gt_est: np.ndarray
     scale: float
+
+    @property
+    def rmse(self) -> float:
+        """Root mean square of the distances, m."""
+        return _rms(self.translation)
 
 
 def match(est: Trajectory, gt: Trajectory, max_diff: float | None = None) -> Match:
@@ -89,58 +89,13 @@ def match(est: Trajectory, gt: Trajectory, max_diff: float | None = None) -> Mat
             )
             pairs = []
     i, j = np.array(pairs, dtype=int).reshape(-1, 2).T
-    return Match(est.T_world_cam[i], gt.T_world_cam[j], gt.timestamps[j], total, by, reason)
+    return Match(est.T_world_cam[i], gt.T_world_cam[j], gt.timestamps[j], by, reason)
 
 
-@np.errstate(over="ignore", invalid="ignore")
-def _align(found: Match, alignment: Alignment) -> tuple[np.ndarray, float]:
-    """T_gt_est and scale."""
-    from evo import EvoException
-    from evo.core.geometry import umeyama_alignment
-
-    if found.reason:
-        raise DegenerateError(found.reason)
-    if alignment == "none":
-        return np.eye(4), 1.0
-    if alignment == "origin":
-        return found.gt[0] @ invert(found.est[0]), 1.0
-    est, gt = found.est[:, :3, 3], found.gt[:, :3, 3]
-    _check_width(est, gt)
-    try:
-        R, t, scale = umeyama_alignment(est.T, gt.T, with_scale=alignment == "sim3")
-    except (EvoException, np.linalg.LinAlgError) as error:
-        raise DegenerateError(f"evo: {error}") from error
-    if scale <= 0:
-        raise DegenerateError("the paths are not correlated: no positive scale fits")
-    return make_transform(R, t), float(scale)
-
-
-def _check_width(est: np.ndarray, gt: np.ndarray) -> None:
-    """Refuse (M, 3) positions of estimate and truth that determine no alignment."""
-    if len(est) < 3:
-        raise DegenerateError(f"not enough poses: {len(est)} matched, an alignment needs 3")
-    centred = []
-    for name, positions in (("estimate", est), ("ground truth", gt)):
-        moved = positions - positions.mean(axis=0)
-        size = float(np.linalg.norm(moved))
-        if not np.isfinite(size):
-            raise DegenerateError(NOT_FINITE)
-        if size <= 1e-12 * float(np.abs(positions).max()):
-            raise DegenerateError(f"static camera: the positions of the {name} do not move")
-        centred.append(moved / size)
-    if np.linalg.svd(centred[1].T @ centred[0], compute_uv=False)[1] <= MIN_WIDTH:
-        raise DegenerateError("straight line: the camera path leaves the rotation about it open")
-
-
-@np.errstate(over="ignore", invalid="ignore")
 def _rms(errors: np.ndarray) -> float:
-    value = float(np.sqrt(np.mean(errors**2)))
-    if not np.isfinite(value):
-        raise DegenerateError(NOT_FINITE)
-    return value
+    return float(np.sqrt(np.mean(errors**2)))
 
 
-@np.errstate(over="ignore", invalid="ignore")
 def ate(found: Match, alignment: Alignment = "se3") -> PathError:
     """Absolute trajectory error: distances of matched positions after the alignment.
 
@@ -150,10 +105,34 @@ def ate(found: Match, alignment: Alignment = "se3") -> PathError:
     Raises:
         DegenerateError: too few poses match, or they determine no alignment.
     """
-    T, scale = _align(found, alignment)
-    places = scale * found.est[:, :3, 3] @ T[:3, :3].T + T[:3, 3]
-    error = np.linalg.norm(places - found.gt[:, :3, 3], axis=1)
-    return PathError(error, found.stamps, _rms(error), T, scale)
+    if found.reason:
+        raise DegenerateError(found.reason)
+    est, gt = found.est[:, :3, 3], found.gt[:, :3, 3]
+    T, scale = np.eye(4), 1.0
+    if alignment == "origin":
+        T = found.gt[0] @ invert(found.est[0])
+    elif alignment != "none":
+        from evo.core.geometry import umeyama_alignment
+
+        _check_shape(est, gt)
+        R, t, scale = umeyama_alignment(est.T, gt.T, with_scale=alignment == "sim3")
+        T = make_transform(R, t)
+    error = np.linalg.norm(scale * est @ T[:3, :3].T + T[:3, 3] - gt, axis=1)
+    return PathError(error, found.stamps, T, float(scale))
+
+
+def _check_shape(est: np.ndarray, gt: np.ndarray) -> None:
+    """Refuse (M, 3) positions of estimate and truth that determine no alignment."""
+    if len(est) < 3:
+        raise DegenerateError(f"not enough poses: {len(est)} matched, an alignment needs 3")
+    centred = [positions - positions.mean(axis=0) for positions in (est, gt)]
+    sizes = [float(np.linalg.norm(positions)) for positions in centred]
+    for name, positions, size in zip(("estimate", "ground truth"), (est, gt), sizes, strict=True):
+        if size <= 1e-12 * float(np.abs(positions).max()):
+            raise DegenerateError(f"static camera: the positions of the {name} do not move")
+    widths = np.linalg.svd(centred[1].T @ centred[0], compute_uv=False)
+    if widths[1] <= MIN_WIDTH * sizes[0] * sizes[1]:
+        raise DegenerateError("straight line: the camera path leaves the rotation about it open")
 
 
 def aligned(
@@ -173,7 +152,6 @@ def aligned(
     return est.transformed(gt.T_world_cam[0] @ invert(est.T_world_cam[0])), None, "origin"
 
 
-@np.errstate(over="ignore", invalid="ignore")
 def _relative(
     est: np.ndarray, gt: np.ndarray, first: np.ndarray, last: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -183,42 +161,31 @@ def _relative(
 
 
 def rpe(
-    found: Match,
-    delta: float = 1,
-    delta_unit: DeltaUnit = "frames",
-    alignment: Alignment = "se3",
+    found: Match, delta: float = 1, delta_unit: DeltaUnit = "frames"
 ) -> tuple[np.ndarray, np.ndarray]:
     """Relative pose errors, metres and degrees, of all (overlapping) poses ``delta`` apart.
 
-    In seconds the partner is the pose nearest to that time, at most half a frame away. Only
-    ``sim3`` changes the values: its scale is applied to the estimate.
+    In seconds the partner is the pose nearest to that time, at most half a frame away.
 
     Raises:
         DegenerateError: too few poses match, or no two are ``delta`` apart.
     """
-    scale = _align(found, "sim3" if alignment == "sim3" else "none")[1]
-    if delta_unit == "s" and found.by != "time":
-        raise DegenerateError("a distance in seconds needs timestamps in both trajectories")
-    first, last = _pairs(found.stamps, delta, delta_unit)
-    if not len(first):
-        reason = f"not enough poses: of {len(found.est)} no two are {delta:g} {delta_unit} apart"
-        raise DegenerateError(reason)
-    est = found.est.copy()
-    est[:, :3, 3] *= scale
-    return _relative(est, found.gt, first, last)
-
-
-def _pairs(stamps: np.ndarray, delta: float, unit: DeltaUnit) -> tuple[np.ndarray, np.ndarray]:
-    """Indices of the first and last pose of each pair."""
-    first = np.arange(len(stamps))
+    if found.reason:
+        raise DegenerateError(found.reason)
+    first = np.arange(len(found.stamps))
     last = first + int(delta)
-    if unit == "s":
+    if delta_unit == "s":
+        if found.by != "time":
+            raise DegenerateError("a distance in seconds needs timestamps in both trajectories")
         # half a frame, and rounding of the stamps
-        reach = 1.01 * np.median(np.diff(stamps)) / 2 if len(stamps) > 1 else 0.0
+        reach = 1.01 * np.median(np.diff(found.stamps)) / 2 if len(first) > 1 else 0.0
         nearest = {"method": "nearest", "tolerance": reach}
-        last = pd.Index(stamps).get_indexer(stamps + delta, **nearest)  # -1 where there is none
-    inside = (last < len(stamps)) & (last > first)
-    return first[inside], last[inside]
+        last = pd.Index(found.stamps).get_indexer(found.stamps + delta, **nearest)  # -1: none
+    inside = (last < len(first)) & (last > first)
+    if not inside.any():
+        reason = f"not enough poses: of {len(first)} no two are {delta:g} {delta_unit} apart"
+        raise DegenerateError(reason)
+    return _relative(found.est, found.gt, first[inside], last[inside])
 
 
 def kitti_drift(est: np.ndarray, gt: np.ndarray, lengths: Sequence[float]) -> dict[str, Any]:
@@ -228,8 +195,7 @@ def kitti_drift(est: np.ndarray, gt: np.ndarray, lengths: Sequence[float]) -> di
     along the true path exceeds L; translation (a fraction) and angle of its relative error are
     divided by L and averaged within each length, then over the lengths. Nothing is aligned.
     """
-    with np.errstate(over="ignore", invalid="ignore"):
-        steps = np.linalg.norm(np.diff(gt[:, :3, 3], axis=0), axis=1)
+    steps = np.linalg.norm(np.diff(gt[:, :3, 3], axis=0), axis=1)
     distance = np.concatenate([[0.0], np.cumsum(steps)])
     means, segments = [], 0
     for length in lengths:
@@ -238,14 +204,11 @@ def kitti_drift(est: np.ndarray, gt: np.ndarray, lengths: Sequence[float]) -> di
         if len(first):
             means.append([e.mean() / length for e in _relative(est, gt, first, last[first])])
             segments += len(first)
-    values = np.mean(means, axis=0).tolist() if means else [np.nan, np.nan]
+    names = ("translation", "rotation_deg_per_m")
+    values = np.mean(means, axis=0).tolist() if means else [None, None]
     short = f"the true path of {distance[-1]:.4g} m is shorter than {min(lengths):g} m"
-    drift: dict[str, Any] = {"segments": segments, "reasons": {}}
-    for name, value in zip(("translation", "rotation_deg_per_m"), values, strict=True):
-        drift[name] = value if np.isfinite(value) else None
-        if drift[name] is None:
-            drift["reasons"][name] = NOT_FINITE if means else short
-    return drift
+    reasons = {} if means else dict.fromkeys(names, short)
+    return {"segments": segments, "reasons": reasons, **dict(zip(names, values, strict=True))}
 
 
 def evaluate(
@@ -279,15 +242,15 @@ def evaluate(
             raise InputError(f"{name}: expected {expected}, got {value!r}.")
     found = match(estimate, gt, max_diff)
     report: dict[str, Any] = {"alignment": alignment, "delta": float(delta)}
-    report |= {"delta_unit": delta_unit, "matched": len(found.est), "total": found.total}
-    report |= {"matched_by": found.by, "evo_version": str(evo.__version__).lstrip("v")}
+    report |= {"delta_unit": delta_unit, "matched": len(found.est), "matched_by": found.by}
+    report |= {"total": min(len(estimate), len(gt)), "evo_version": evo.__version__.lstrip("v")}
     reasons: dict[str, str] = {}
 
-    def put(names: Sequence[str], compute: Callable[[], Iterable[float | None]]) -> None:
+    def put(names: Sequence[str], compute: Callable[[], Iterable[float]]) -> None:
+        values: Iterable[float | None] = [None] * len(names)
         try:
             values = compute()
         except DegenerateError as error:
-            values = [None] * len(names)
             reasons.update(dict.fromkeys(names, str(error)))
         report.update(zip(names, values, strict=False))
 
@@ -295,17 +258,15 @@ def evaluate(
         error = ate(found, kind)
         return error.rmse, error.scale
 
-    def relative(kind: Alignment) -> tuple[float, float, float]:
-        translation, degrees = rpe(found, delta, delta_unit, kind)
+    def relative() -> tuple[float, float, float]:
+        translation, degrees = rpe(found, delta, delta_unit)
         return _rms(translation), float(translation.mean()), _rms(degrees)
 
     put(["ate_rmse_unaligned"], lambda: absolute("none"))
     put(["ate_rmse_origin"], lambda: absolute("origin"))
-    kinds: tuple[tuple[Alignment, str], ...] = ((alignment, ""), ("sim3", "_sim3"))
-    for kind, suffix in kinds:
-        put([f"ate_rmse{suffix}", f"scale{suffix}"], partial(absolute, kind))
-        names = ("rpe_trans_rmse", "rpe_trans_mean", "rpe_rot_rmse_deg")
-        put([name + suffix for name in names], partial(relative, kind))
+    put(["ate_rmse", "scale"], lambda: absolute(alignment))
+    put(["ate_rmse_sim3", "scale_sim3"], lambda: absolute("sim3"))
+    put(["rpe_trans_rmse", "rpe_trans_mean", "rpe_rot_rmse_deg"], relative)
     for key, lengths in LENGTHS.items():
         report[key] = None if found.reason else kitti_drift(found.est, found.gt, lengths)
         reasons |= {key: found.reason} if found.reason else {}

@@ -5,7 +5,6 @@ Estimated flow stands before true flow (an oracle) everywhere.
 
 from __future__ import annotations
 
-import base64
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -16,9 +15,6 @@ import pandas as pd
 from hybridvo.evaluation import charts
 from hybridvo.evaluation.charts import is_oracle
 from hybridvo.files import atomic_write
-
-EMBEDDED_BYTES = 2_000_000
-"""Images that the page holds, so that it stays below 8 MB with plotly's 5 MB."""
 
 Column = tuple[str, str, float]
 RESULT_COLUMNS: tuple[Column, ...] = (
@@ -63,9 +59,8 @@ def write_report(folder: Path, result: Mapping[str, Any], pairs: pd.DataFrame) -
     methods = list(dict.fromkeys(row["method"] for row in result["totals"]))
     sections = {
         "How the errors are distributed": charts.error_distribution(pairs, methods),
-        "How often an estimate fails": charts.failure_chart(result["breakdown"], methods),
-        "What makes it fail": charts.factor_charts(result["breakdown"], methods),
-        "Error against time": charts.time_chart(result["totals"], methods),
+        "How often an estimate fails": charts.failure_chart(result["totals"], methods),
+        "What makes it fail": charts.factor_charts(pairs, methods),
     }
     names = dict.fromkeys(row["sequence"] for row in result["rows"])
     paths = {name: charts.path_charts(folder, result, pairs, name, methods) for name in names}
@@ -76,7 +71,7 @@ def write_report(folder: Path, result: Mapping[str, Any], pairs: pd.DataFrame) -
         "pairs": len(pairs.drop_duplicates(["sequence", "index"])),
         "methods": methods,
         "tables": [(flow, (rows, RESULT_COLUMNS, ("method",))) for flow, rows in by_flow(result)],
-        "worst": _gallery(folder, result),
+        "worst": [e | {"error": number(e["epe_l2_px"])} for e in result["worst_pairs"]],
         "sections": [(name, _json(some)) for name, some in sections.items() if some],
         "sequences": [(name, _json(some)) for name, some in paths.items()],
         "protocol": _protocol_tables(result.get("protocol")),
@@ -103,28 +98,20 @@ def ranking(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
 
 
 def headline(result: Mapping[str, Any]) -> str:
-    """One sentence: who won, by how much, under which flow; and where the winner is worst."""
+    """One sentence: who won, by how much, under which flow."""
     flow, rows = by_flow(result)[0]
     order = ranking(rows)
     if not order:
         return "Nothing is scored: no pair has ground truth and depth."
-    first, best = order[0], order[0]["epe_l2_px_median"]
-    oracle = ", an oracle" if is_oracle(flow) else ""
+    first, oracle = order[0], ", an oracle" if is_oracle(flow) else ""
     text = (
         f"With {flow} flow{oracle}, {first['method']} has the smallest errors: median "
-        f"{number(best)} px (error of the ego flow), {first['failures']} of {first['pairs']} pairs "
-        f"failed (above 1 px, or given up)"
+        f"{number(first['epe_l2_px_median'])} px (error of the ego flow), {first['failures']} of "
+        f"{first['pairs']} pairs failed (above 1 px, or given up)"
     )
     for row in order[1:2]:
-        error = row["epe_l2_px_median"]
-        times = f" ({number(error / best, 2)} times)" if best else ""
-        text += f"; next is {row['method']}: {number(error)} px{times}, {row['failures']} failed"
-    for entry in result["worst_pairs"]:
-        if (entry["method"], entry["flow_source"]) == (first["method"], flow):
-            if entry["epe_l2_px"] is not None:
-                place = f"{entry['sequence']}, pair {entry['index']}"
-                text += f". Its worst pair is {place}: {number(entry['epe_l2_px'])} px"
-            break
+        error = number(row["epe_l2_px_median"])
+        text += f"; next is {row['method']}: {error} px, {row['failures']} failed"
     return text + "."
 
 
@@ -153,26 +140,6 @@ def _protocol_tables(protocol: Mapping[str, Any] | None) -> list[tuple[str, Any]
         ("Measured here", (protocol["table"], here, ("method", "flow_source"))),
         ("Published by others", (protocol["published"], columns, others)),
     ]
-
-
-def _gallery(folder: Path, result: Mapping[str, Any]) -> list[tuple[str, list[dict[str, Any]]]]:
-    """Worst pairs by method, estimated flow first and the best method first, with images."""
-    budget = EMBEDDED_BYTES
-    order = [
-        (method, flow)
-        for flow, rows in by_flow(result)
-        for method in dict.fromkeys(row["method"] for row in [*ranking(rows), *rows])
-    ]
-    groups: dict[str, list[dict[str, Any]]] = {}
-    key = lambda entry: order.index((entry["method"], entry["flow_source"]))  # noqa: E731
-    for entry in sorted(result["worst_pairs"], key=key):
-        source, path = None, entry["picture"] and folder / entry["picture"]
-        if path and path.is_file() and path.stat().st_size <= budget:
-            budget -= path.stat().st_size
-            source = f"data:image/jpeg;base64,{base64.b64encode(path.read_bytes()).decode()}"
-        shown = {**entry, "source": source, "error": number(entry["epe_l2_px"])}
-        groups.setdefault(f"{entry['method']}, {entry['flow_source']} flow", []).append(shown)
-    return list(groups.items())
 
 
 def _json(figures: Sequence[Any]) -> list[str]:

@@ -18,25 +18,21 @@ from hybridvo.evaluation.pair_errors import ERRORS, mean_pair_errors
 
 FAILURE_PX = 1.0
 """Error of the ego flow at native size above which an estimate has failed, px."""
-CONFIDENCE = 0.95
 READS_NO_FLOW = ("opencv-rgbd", "open3d-rgbd", "identity")
 """Methods whose result is the same whatever the flow."""
-PATH_KEYS = (
-    *("ate_rmse", "rpe_trans_rmse", "rpe_rot_rmse_deg"),
-    *("ate_rmse_sim3", "rpe_trans_rmse_sim3", "rpe_rot_rmse_deg_sim3"),
-)
-"""Errors of a whole trajectory; those without a suffix are after a rigid alignment."""
+PATH_KEYS = ("ate_rmse", "rpe_trans_rmse", "rpe_rot_rmse_deg", "ate_rmse_sim3")
+"""Errors of a whole trajectory; the first three are after a rigid alignment."""
 NO_PAIRS = "no pair was estimated"
 NO_TRUTH = "the sequence has no ground truth for these frames"
 NO_MOVING = "needs true flow of the whole scene (moving objects included) and ground truth"
-FACTORS: Mapping[str, tuple[str, str, tuple[float, ...]]] = {
-    "dynamic_fraction": ("share of pixels that move", "", (0, 0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 1)),
-    "flow_magnitude_px": ("median true ego flow", "px", (0, 1, 2, 5, 10, 20, 50, math.inf)),
-    "rotation_deg": ("true rotation", "deg", (0, 0.1, 0.3, 1, 3, 10, 180)),
-    "translation_m": ("true translation", "m", (0, 0.003, 0.01, 0.03, 0.1, 0.3, 1, math.inf)),
-    "depth_spread": ("90th over 10th percentile of depth", "", (1, 1.5, 2, 4, 8, 16, math.inf)),
+FACTORS: Mapping[str, tuple[str, tuple[float, ...]]] = {
+    "dynamic_fraction": ("share of pixels that move", (0, 0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 1)),
+    "flow_magnitude_px": ("median true ego flow [px]", (0, 1, 2, 5, 10, 20, 50, math.inf)),
+    "rotation_deg": ("true rotation [deg]", (0, 0.1, 0.3, 1, 3, 10, 180)),
+    "translation_m": ("true translation [m]", (0, 0.003, 0.01, 0.03, 0.1, 0.3, 1, math.inf)),
+    "depth_spread": ("90th over 10th percentile of depth", (1, 1.5, 2, 4, 8, 16, math.inf)),
 }
-"""Column of ``pairs.csv`` -> label, unit, edges of the bins (a bin holds its lower edge)."""
+"""What may explain an error, columns of ``pairs.csv`` -> label, edges of the bins."""
 PAIR_COLUMNS = (
     *("sequence", "index", "method", "flow_source", "status"),
     *("epe_l2_px", "rot_err_deg", "trans_err", "ms"),
@@ -47,7 +43,7 @@ PAIR_COLUMNS = (
 
 def pair_table(pairs: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
     """Pairs as a table with every column; unknown numbers are NaN."""
-    table = pd.DataFrame(list(pairs), columns=[*PAIR_COLUMNS, "T_curr_prev"])
+    table = pd.DataFrame(list(pairs), columns=PAIR_COLUMNS)
     text = ("sequence", "method", "flow_source", "status", "message")
     numbers = [name for name in PAIR_COLUMNS if name not in text]
     table[numbers] = table[numbers].apply(pd.to_numeric)
@@ -55,7 +51,7 @@ def pair_table(pairs: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
 
 
 def failure_rate(pairs: pd.DataFrame) -> dict[str, Any]:
-    """``pairs``, ``failures``, ``failure_rate`` and its Wilson interval over a table of pairs.
+    """``pairs``, ``failures``, ``failure_rate`` and its Wilson interval (95 %) over a table.
 
     A failure is a failed estimate or an error of the ego flow above one pixel. Pairs whose error is
     unknown and whose estimate did not fail are left out.
@@ -65,7 +61,7 @@ def failure_rate(pairs: pd.DataFrame) -> dict[str, Any]:
     names = ("failures", "failure_rate", "failure_rate_low", "failure_rate_high")
     if not total:
         return {"pairs": 0, **dict.fromkeys(names)}
-    interval = binomtest(failures, total).proportion_ci(CONFIDENCE, method="wilson")
+    interval = binomtest(failures, total).proportion_ci(0.95, method="wilson")
     values = (failures, failures / total, float(interval.low), float(interval.high))
     return {"pairs": total, **dict(zip(names, values, strict=True))}
 
@@ -119,13 +115,12 @@ def sequence_row(
     return {**named, **scores}
 
 
-def summary(table: pd.DataFrame, rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """``rows`` of single sequences, ``totals`` over all of them, and the ``breakdown``."""
-    totals = [
+def totals(table: pd.DataFrame, rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Lines of all sequences together, from all pairs and the lines of single sequences."""
+    return [
         total_row(group, [row for row in rows if (row["method"], row["flow_source"]) == key])
         for key, group in table.groupby(["method", "flow_source"], sort=False)
     ]
-    return {"rows": rows, "totals": totals, "breakdown": breakdown(table)}
 
 
 def total_row(pairs: pd.DataFrame, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -147,42 +142,6 @@ def total_row(pairs: pd.DataFrame, rows: Sequence[Mapping[str, Any]]) -> dict[st
     named = {"method": rows[0]["method"], "flow_source": rows[0]["flow_source"]}
     named |= {"sequence": "all", "depth_source": depth, "alignment": "se3"}
     return {**named, "sequences": len(rows), **scores}
-
-
-def breakdown(pairs: pd.DataFrame) -> dict[str, Any]:
-    """Errors and failure rates by factor, of a table of all pairs and methods.
-
-    ``cells`` holds for each method, flow source, factor and bin that has a pair: ``low``, ``high``
-    (None where open), failure rate with interval and EPE quartiles. ``factors`` count the pairs
-    that know them.
-    """
-    cells = []
-    for name, (_, _, edges) in FACTORS.items():
-        values = pairs[name].clip(upper=edges[-1] * (1 - 1e-12))  # the last bin holds its end
-        bins = pd.cut(values, edges, right=False, labels=False)
-        for key, group in pairs.groupby(["method", "flow_source", bins], sort=False):
-            k = int(key[2])
-            cell = {"method": key[0], "flow_source": key[1], "factor": name, "bin": k}
-            cell |= {"low": edges[k], "high": edges[k + 1] if edges[k + 1] < math.inf else None}
-            cell |= failure_rate(group)
-            for quantile, part in ((0.25, "q25"), (0.5, "median"), (0.75, "q75")):
-                cell[f"epe_l2_px_{part}"] = known_number(group["epe_l2_px"].quantile(quantile))
-            cells.append(cell)
-    rates = [
-        {"method": method, "flow_source": flow, **failure_rate(group)}
-        for (method, flow), group in pairs.groupby(["method", "flow_source"], sort=False)
-    ]
-    known = pairs.drop_duplicates(["sequence", "index"])
-    return {
-        "failure_px": FAILURE_PX,
-        "confidence": CONFIDENCE,
-        "factors": [
-            {"name": name, "label": label, "unit": unit, "pairs": int(known[name].notna().sum())}
-            for name, (label, unit, _) in FACTORS.items()
-        ],
-        "cells": cells,
-        "failure_rates": rates,
-    }
 
 
 def worst_pairs(pairs: pd.DataFrame, count: int = 3) -> list[dict[str, Any]]:

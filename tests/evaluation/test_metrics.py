@@ -157,12 +157,11 @@ def test_rpe_over_seconds_skips_a_gap():
     assert len(rpe(found, 1)[0]) == 4
 
 
-def test_rpe_with_scale(rng):
+def test_scale(rng):
     truth = random_trajectory(rng)
-    doubled = truth.transformed(np.eye(4), 2.0)
-    report = evaluate(doubled, truth)
+    report = evaluate(truth.transformed(np.eye(4), 2.0), truth)
     assert report["rpe_trans_rmse"] > 0.1 and report["scale_sim3"] == pytest.approx(0.5)
-    assert report["rpe_trans_rmse_sim3"] == pytest.approx(0, abs=1e-12)
+    assert report["ate_rmse_sim3"] == pytest.approx(0, abs=1e-12)
 
 
 # -- what cannot be computed ----------------------------------------------------------------------
@@ -173,7 +172,7 @@ def test_static_camera():
     moving = from_positions(np.random.default_rng(1).normal(size=(10, 3)))
     for est, truth in ((still, moving), (moving, still), (still, still)):
         report = evaluate(est, truth)
-        for key in ("ate_rmse", "scale", "rpe_trans_rmse_sim3"):
+        for key in ("ate_rmse", "scale", "ate_rmse_sim3"):
             assert report[key] is None and "static camera" in report["reasons"][key]
         for key in ("ate_rmse_unaligned", "ate_rmse_origin", "rpe_trans_rmse"):
             assert report[key] is not None
@@ -207,16 +206,6 @@ def test_one_and_two_poses(frames):
         assert report["rpe_trans_rmse"] == 0.0
     assert report["kitti_drift"]["translation"] is None
     assert "shorter than" in report["kitti_drift"]["reasons"]["translation"]
-    json.dumps(report, allow_nan=False)
-
-
-def test_overflow_is_none_with_a_reason():
-    truth = from_positions(np.random.default_rng(3).normal(size=(10, 3)))
-    far = from_positions(truth.positions * 1e200)
-    report = evaluate(far, truth)
-    for key in ("ate_rmse", "ate_rmse_unaligned", "ate_rmse_origin", "rpe_trans_rmse"):
-        assert report[key] is None
-        assert "not a finite number" in report["reasons"][key]
     json.dumps(report, allow_nan=False)
 
 
@@ -254,7 +243,7 @@ def test_association_is_one_to_one_and_nearest():
 
     found = match(est, truth, 0.02)
     # 0.115 and 0.12 both want 0.1: the nearer one gets it
-    assert indices(found) == [[0, 1, 3], [0, 1, 4]] and (found.total, found.by) == (4, "time")
+    assert indices(found) == [[0, 1, 3], [0, 1, 4]] and found.by == "time"
     assert indices(match(truth, est, 0.02)) == [[0, 1, 4], [0, 1, 3]]
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from hybridvo.commands.compare import compare
 from hybridvo.errors import InputError
-from hybridvo.evaluation.protocols import protocol_summary, protocols, same_intrinsics
+from hybridvo.evaluation.protocols import paper_protocol, protocol_summary, same_intrinsics
 from hybridvo.geometry import ego_flow, make_transform
 from hybridvo.options import FlowOptions, Options, RunOptions
 from hybridvo.types import Camera
@@ -59,33 +59,27 @@ def sintel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return training.parent
 
 
-def compared(sintel: Path, out: Path, name: str) -> dict:
-    options = Options(flow=FlowOptions(source="file"))
-    compare((sintel,), out, methods=("identity",), options=options, protocol=name, worst=1)
-    return json.loads((out / "results.json").read_text())
-
-
-def test_the_complete_sets_have_the_published_numbers_of_pairs() -> None:
-    paper, fourteen = protocols()["paper"], protocols()["trajectory14"]
-    assert (paper.pairs, len(paper.sequences)) == (992, 23)
-    assert sum(paper.sequences.values()) - 23 == 1041  # 49 pairs change their intrinsics
-    assert fourteen.pairs == sum(fourteen.sequences.values()) - 14 == 629
+def test_the_complete_set_has_the_published_number_of_pairs() -> None:
+    paper = paper_protocol()
+    assert (paper["pairs"], len(paper["sequences"])) == (992, 23)
+    assert sum(paper["sequences"].values()) - 23 == 1041  # 49 pairs change their intrinsics
     totals = [{"method": "pwvo-paper", "reasons": {}, "epe": 0.5}]
-    frames = {name: frames - 1 for name, frames in paper.sequences.items()}
+    frames = {name: frames - 1 for name, frames in paper["sequences"].items()}
     frames["ambush_4"] -= 23
     frames["shaman_2"] -= 26
     scored = [{"name": name, "pairs_scored": count} for name, count in frames.items()]
-    summary = protocol_summary(paper, totals, scored)
+    summary = protocol_summary(totals, scored)
     assert summary["complete"] and not summary["note"]
     assert summary["table"][0]["published"]["epe"] == 0.626
-    for protocol in protocols().values():
-        keys = {metric["key"] for metric in protocol.metrics}
-        for line in protocol.published:
-            assert line["source"] and keys & set(line)
+    keys = {metric["key"] for metric in paper["metrics"]}
+    assert all(line["source"] and keys <= set(line) for line in paper["published"])
 
 
 def test_the_paper_leaves_out_pairs_whose_intrinsics_change(sintel: Path, tmp_path: Path) -> None:
-    result = compared(sintel, tmp_path, "paper")
+    options = Options(flow=FlowOptions(source="file"))
+    methods = ("identity",)
+    compare((sintel,), tmp_path, methods=methods, options=options, protocol="paper", worst=1)
+    result = json.loads((tmp_path / "results.json").read_text())
     left_out = {s["name"]: [row["index"] for row in s["left_out"]] for s in result["sequences"]}
     assert left_out.pop("ambush_4") == [1, 2] and left_out.pop("shaman_2") == [0, 1]
     assert not any(left_out.values())
@@ -102,25 +96,13 @@ def test_the_paper_leaves_out_pairs_whose_intrinsics_change(sintel: Path, tmp_pa
     assert len(epe) == 12 and line["epe"] == pytest.approx(np.mean(epe))
 
 
-def test_trajectories_are_means_over_sequences(sintel: Path, tmp_path: Path) -> None:
-    result = compared(sintel, tmp_path, "trajectory14")
-    names = [sequence["name"] for sequence in result["sequences"]]
-    assert names == [name for name in SCENES if name in protocols()["trajectory14"].sequences]
-    (line,) = result["protocol"]["table"]
-    assert line["sequences"] == len(names) and line["pairs"] == 4 * len(names)
-    assert line["rpe_trans_rmse"] == pytest.approx(np.linalg.norm(STEP), rel=1e-9)
-    assert line["ate_rmse_sim3"] is None and "static camera" in line["reasons"]["ate_rmse_sim3"]
-
-
 def test_other_ranges_and_sequences_are_refused(sintel: Path, walk: Path, tmp_path: Path) -> None:
     for path, more, field in (
         (sintel, {"options": Options(run=RunOptions(stop=3))}, "--stop"),
         (walk, {}, "walk"),
-        (sintel / "training" / "final" / "alley_1", {"protocol": "trajectory14"}, "alley_2"),
-        (sintel, {"protocol": "other"}, "other"),
     ):
         with pytest.raises(InputError, match=field):
-            compare((path,), tmp_path / "out", **{"protocol": "paper"} | more)
+            compare((path,), tmp_path / "out", protocol="paper", **more)
 
 
 def test_cameras_are_the_same_to_rounding() -> None:

@@ -1,4 +1,4 @@
-"""Scores and breakdown of a table of pairs, by hand."""
+"""Scores of a table of pairs, by hand."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ import pytest
 
 from hybridvo.evaluation.metrics import evaluate
 from hybridvo.evaluation.scores import (
-    breakdown,
     failure_rate,
     pair_table,
     sequence_row,
@@ -86,21 +85,6 @@ def test_methods_without_flow_do_not_wait_for_it() -> None:
     pairs = table(row(0, 1.0, "identity", rot_err_deg=1.0, ms=1.0, flow_ms=50.0))
     named = {"sequence": "s", "method": "identity", "flow_source": "dis", "depth_source": "true"}
     assert sequence_row(pairs, None, named)["ms_with_flow_median"] == 1.0
-
-
-def test_bins_hold_their_lower_edge_and_the_last_one_both() -> None:
-    values = {0.0: 0.0, 0.02: 0.02, 0.0199: 0.0, 0.99: 0.5, 1.0: 0.5}
-    pairs = table(*(row(i, 0.1 * i, dynamic_fraction=v) for i, v in enumerate(values)))
-    found = breakdown(pairs)
-    cells = [cell for cell in found["cells"] if cell["factor"] == "dynamic_fraction"]
-    counts = {cell["low"]: cell["pairs"] for cell in cells}
-    assert counts == {0.0: 2, 0.02: 1, 0.5: 2}
-    (first,) = (cell for cell in cells if cell["low"] == 0.0)
-    assert first["epe_l2_px_median"] == pytest.approx(0.1) and first["high"] == 0.02
-    known = {factor["name"]: factor["pairs"] for factor in found["factors"]}
-    assert known["dynamic_fraction"] == 5 and known["rotation_deg"] == 0
-    (rate,) = found["failure_rates"]
-    assert (rate["method"], rate["pairs"]) == ("a", 5)
 
 
 def test_the_worst_pairs_by_hand() -> None:
