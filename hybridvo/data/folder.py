@@ -36,11 +36,6 @@ class FolderSequence(Sequence):
     depth_source = "file"
     markers = ((CAMERA_FILE,),)
 
-    @classmethod
-    def looks_for(cls) -> str:
-        """What a folder of this kind holds, for messages."""
-        return f"folder: {CAMERA_FILE} (hybridvo init DIR writes one) with rgb/ and depth/"
-
     def _list_files(self) -> None:
         root, settings, told = self.root, self.root / CAMERA_FILE, self.warnings
         self._settings = read_camera_file(settings, told) if settings.exists() else None

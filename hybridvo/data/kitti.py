@@ -40,9 +40,7 @@ class KittiSequence(Sequence):
         root, told = self.root, self.warnings
         images = {n: numbered_files(root / f"image_{n}", r"(\d+)\.(?:png|jpg)") for n in "2301"}
         left, right = ("2", "3") if images["2"] else ("0", "1")
-        folders = (root / name for name in ("depth", "depth_2", "depth_0"))
-        stored = (numbered_files(folder, r"(\d+)\.(?:png|npy)") for folder in folders)
-        depth = next((files for files in stored if files), {})
+        depth = numbered_files(root / "depth", r"(\d+)\.(?:png|npy)")
         calibration, times = root / "calib.txt", root / "times.txt"
         self._sources += [calibration, times]
         self._P_left = _read_projection(calibration, left)
@@ -70,9 +68,7 @@ class KittiSequence(Sequence):
             self.timestamps = stamps[numbers]
         else:
             told.append(f"{times}: not there; {self.frames_per_second:g} frames a second assumed.")
-        name = f"{root.name}.txt"
-        beside = (root / "poses" / name, root / "poses.txt", root.parent / "poses" / name)
-        for path in (*beside, root.parent.parent / "poses" / name):
+        for path in (root / "poses.txt", root.parent.parent / "poses" / f"{root.name}.txt"):
             if path.is_file() and self.poses is None:
                 # the file holds the poses of camera 0
                 T_cam_cam0 = np.eye(4)

@@ -151,7 +151,7 @@ def ego_flow_error(pose: torch.Tensor, owner: torch.Tensor, batch: SelectorBatch
     known = (z > 0)[owner]
     total = torch.where(known, distance.clamp(max=1e3), 0.0).sum(1)
     error = total / known.sum(1).clamp(min=1)
-    return error * 1024.0 / batch.inputs.image_width[owner]
+    return error * 1024.0 / batch.inputs.width[owner]
 
 
 def refits_of(

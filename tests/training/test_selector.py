@@ -51,7 +51,7 @@ def test_ground_truth_explains_the_static_pixels(shards):
             X, Y, Z = (z * (P[i, 0] * x + P[i, 1] * y + P[i, 2]) + P[i, 3] for i in range(3))
             u = K[0] * X / Z + K[2] - inputs.target[b, 0]
             v = K[1] * Y / Z + K[3] - inputs.target[b, 1]
-            distance = torch.sqrt(u * u + v * v) * 1024 / inputs.image_width[b]
+            distance = torch.sqrt(u * u + v * v) * 1024 / inputs.width[b]
             usable = inputs.usable[b] & (z > 0)
             static = usable & (batch.label[b] == selector_data.STATIC)
             moving = usable & (batch.label[b] == selector_data.MOVING)
