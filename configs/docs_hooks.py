@@ -15,7 +15,7 @@ def on_files(files, config):
     names = "".join(f"- [`{name}`]({name}.md)\n" for name in hybridvo._HOME)
     pages = {"index.md": readme, "api/index.md": f"# API reference\n\n{names}"}
     for name, module in hybridvo._HOME.items():
-        pages[f"api/{name}.md"] = f"# {name}\n\n::: {module}.{name}\n"
+        pages[f"api/{name}.md"] = f"# {name}\n\n::: hybridvo.{module}.{name}\n"
     for path, text in pages.items():
         files.append(File.generated(config, path, content=text))
     return files

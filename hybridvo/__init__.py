@@ -12,38 +12,32 @@ from typing import Any
 __version__ = "0.1.0"
 
 _HOME = {
-    "Camera": "hybridvo.types",
-    "Frame": "hybridvo.types",
-    "FramePair": "hybridvo.types",
-    "MotionPrior": "hybridvo.results",
-    "Options": "hybridvo.options",
-    "PWVO": "hybridvo.network.pwvo",
-    "PairBatch": "hybridvo.types",
-    "RelativePose": "hybridvo.results",
-    "Status": "hybridvo.results",
-    "Step": "hybridvo.results",
-    "Odometry": "hybridvo.odometry",
-    "Trajectory": "hybridvo.trajectory",
-    "estimate": "hybridvo.estimation",
-    "open_sequence": "hybridvo.data.sequence",
-    "iter_pairs": "hybridvo.data.sequence",
-    "refine": "hybridvo.estimation",
-    "select": "hybridvo.network.selection",
-    "dis_flow": "hybridvo.flow",
-    "evaluate": "hybridvo.evaluation.metrics",
-    "to_gtsam_covariance": "hybridvo.geometry",
-    "to_ros_covariance": "hybridvo.geometry",
+    name: module
+    for module, names in {
+        "types": "Camera Frame FramePair PairBatch",
+        "results": "MotionPrior RelativePose Status Step",
+        "options": "Options",
+        "network.pwvo": "PWVO",
+        "network.selection": "select",
+        "odometry": "Odometry",
+        "trajectory": "Trajectory",
+        "estimation": "estimate refine",
+        "data.sequence": "open_sequence iter_pairs",
+        "flow": "dis_flow",
+        "evaluation.metrics": "evaluate",
+        "geometry": "to_gtsam_covariance to_ros_covariance",
+    }.items()
+    for name in names.split()
 }
 
 __all__ = ["__version__", *_HOME]
 
 
 def __getattr__(name: str) -> Any:
-    if name in _HOME:
-        value = getattr(importlib.import_module(_HOME[name]), name)
-        globals()[name] = value
-        return value
-    raise AttributeError(f"module 'hybridvo' has no attribute {name!r}")
+    if name not in _HOME:
+        raise AttributeError(f"module 'hybridvo' has no attribute {name!r}")
+    globals()[name] = value = getattr(importlib.import_module(f"hybridvo.{_HOME[name]}"), name)
+    return value
 
 
 def __dir__() -> list[str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING, Any, overload
+from typing import Any, cast
 
 import numpy as np
 
@@ -15,10 +15,7 @@ from hybridvo.options import Options
 from hybridvo.pipeline import BASELINES, DEFAULT_METHOD, Context, classical, networks_of, run_method
 from hybridvo.refinement.refine import refine_pair, widened
 from hybridvo.results import MotionPrior, RelativePose
-from hybridvo.types import Camera, Frame, FramePair, PairBatch, as_rigid, as_seed
-
-if TYPE_CHECKING:
-    from hybridvo.refinement.batch import BatchedPose
+from hybridvo.types import Camera, Frame, FramePair, PairBatch, as_rigid, as_seed, check_kind
 
 WARM_UP_SIZES = ((48, 64), (320, 400))
 """Height and width of the pairs of :func:`warm_up`; the second takes the parallel kernels."""
@@ -53,31 +50,19 @@ def estimate(
         InputError: an unknown method, or one that cannot run here; an argument of another kind.
     """
     options = Options() if options is None else options
-    _check_kind("estimate.options", options, Options)
-    _check_kind("estimate.prior", prior, MotionPrior, type(None))
+    check_kind("estimate.options", options, Options)
+    check_kind("estimate.prior", prior, MotionPrior, type(None))
     seed = as_seed(seed, "estimate.seed")
     flow = None
     if curr is not None or isinstance(pair, Frame):
-        two: Any = pair, curr
-        _check_kind("estimate, first of two", pair, Frame)
-        _check_kind("estimate, second of two", curr, Frame)
-        pair, flow = FramePair(two[0], two[1], None), dis_flow(options.flow.dis_preset)
-    _check_kind("estimate, a pair", pair, FramePair)
+        check_kind("estimate, first of two", pair, Frame)
+        check_kind("estimate, second of two", curr, Frame)
+        pair = FramePair(cast(Frame, pair), cast(Frame, curr), None)
+        flow = dis_flow(options.flow.dis_preset)
+    check_kind("estimate, a pair", pair, FramePair)
     models = models or default_models(options.run.device if networks_of(method) else "cpu")
     context = Context(options, prior, seed, None, models, flow=flow)
     return widened(run_method(pair, method, context))
-
-
-@overload
-def refine(
-    pair: FramePair, T_init: Any = ..., weights: Any = ..., *, options: Any = ..., seed: int = ...
-) -> RelativePose: ...
-
-
-@overload
-def refine(
-    pair: PairBatch, T_init: Any = ..., weights: Any = ..., *, options: Any = ..., seed: int = ...
-) -> BatchedPose: ...
 
 
 def refine(
@@ -87,7 +72,7 @@ def refine(
     *,
     options: Options | None = None,
     seed: int = 0,
-) -> RelativePose | BatchedPose:
+) -> Any:
     """Camera motion by robust dense reprojection, without any network.
 
     Args:
@@ -102,16 +87,16 @@ def refine(
         seed: of the search.
 
     Returns:
-        The motion with covariance and status (for a :class:`PairBatch` a ``BatchedPose``). Bad data
-        give a failed status, never an exception and never a value that is not finite.
+        A ``RelativePose``, for a :class:`PairBatch` a ``BatchedPose``. Bad data give a failed
+        status, never an exception and never a value that is not finite.
     """
     options = Options() if options is None else options
-    _check_kind("refine.options", options, Options)
+    check_kind("refine.options", options, Options)
     if isinstance(pair, PairBatch):
         from hybridvo.refinement.torch_backend import refine_batch
 
         return refine_batch(pair, T_init, weights, options=options.refine)
-    _check_kind("refine, a pair", pair, FramePair)
+    check_kind("refine, a pair", pair, FramePair)
     seed = as_seed(seed, "refine.seed")
     if weights is not None and np.shape(weights) != pair.prev.camera.shape:
         raise InputError(
@@ -149,8 +134,3 @@ def warm_up(method: str = DEFAULT_METHOD, models: Models | None = None) -> float
         run_method(FramePair(frame, frame, flow, variance, flow[..., 0] < 1e3), method, context)
         run_method(FramePair(frame, frame, flow), method, context)
     return time.perf_counter() - started
-
-
-def _check_kind(what: str, value: Any, *kinds: type) -> None:
-    if not isinstance(value, kinds):
-        raise InputError(f"{what}: expected {kinds[0].__name__}, got {type(value).__name__}.")

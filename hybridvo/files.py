@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import IO, Any, Literal, NamedTuple
 
 import filelock
+import numpy as np
 import yaml
 
 from hybridvo.errors import FormatError, LockedError, OutputError
@@ -63,9 +64,9 @@ def make_folder(path: Path) -> None:
 def held(folder: Path) -> Iterator[None]:
     """Make a folder for results and hold it; a LockedError where another run does."""
     make_folder(folder)
-    lock = filelock.FileLock(folder / LOCK)
+    lock = filelock.FileLock(folder / LOCK, timeout=0)
     try:
-        lock.acquire(timeout=0)
+        lock.acquire()
     except filelock.Timeout:
         text = f"{folder}: held by another run. Wait for it, or choose another --out."
         raise LockedError(text) from None
@@ -96,16 +97,10 @@ def write_csv(
         writer.writerows(rows)
 
 
-def fingerprint(paths: Iterable[str | os.PathLike[str]]) -> str:
+def fingerprint(paths: Iterable[Path]) -> str:
     """SHA-256 over the names, sizes and times of files: tells whether input has changed since."""
-    digest = hashlib.sha256()
-    for path in map(Path, paths):
-        size, time = -1, -1
-        with contextlib.suppress(OSError):
-            status = path.stat()
-            size, time = status.st_size, status.st_mtime_ns
-        digest.update(f"{path.name}\0{size}\0{time}\0".encode(errors="surrogateescape"))
-    return digest.hexdigest()
+    facts = [(path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in paths]
+    return hashlib.sha256(repr(facts).encode()).hexdigest()
 
 
 def read_bytes(path: str | os.PathLike[str]) -> bytes:
@@ -126,36 +121,44 @@ def read_text(path: str | os.PathLike[str]) -> str:
         raise FormatError(f"{path}: expected a text file, got binary data.") from None
 
 
-class Row(NamedTuple):
-    """One line of a list: its number in the file, its numbers, then its words."""
+class Rows(NamedTuple):
+    """A list on disk: for each row its line in the file, its numbers (N, C), the words after."""
 
-    line: int
-    numbers: tuple[float, ...]
-    words: tuple[str, ...] = ()
+    path: Path
+    lines: list[int]
+    numbers: np.ndarray
+    words: list[list[str]]
+
+    def refuse(self, bad: np.ndarray, expected: str) -> None:
+        """Name the first of the bad rows, if there is one."""
+        if bad.any():
+            k = int(np.argmax(bad))
+            got = self.numbers[k].tolist()
+            raise FormatError(f"{self.path}:{self.lines[k]}: expected {expected}, got {got}.")
 
 
-def read_rows(path: str | os.PathLike[str], columns: str, *, words: int = 0) -> list[Row]:
+def read_rows(path: Path, columns: str, *, words: int = 0) -> Rows:
     """Rows of a list file: a number for each of ``columns``, the last ``words`` of them text.
 
     ``#`` starts a comment; the last word may contain spaces. Commas separate numbers too.
     """
     count = len(columns.split())
-    rows = []
+    rows = Rows(path, [], np.zeros((0, count - words)), [])
+    numbers = []
     for line, text in enumerate(read_text(path).split("\n"), start=1):
-        if words:
-            parts = [] if text.strip().startswith("#") else text.split(maxsplit=count - 1)
-        else:
-            parts = text.partition("#")[0].replace(",", " ").split()
-        if not parts:
+        plain = text.partition("#")[0].replace(",", " ") if not words else text.strip()
+        parts = plain.split(maxsplit=count - 1 if words else -1)
+        if not parts or plain.startswith("#"):
             continue
         try:
-            numbers = tuple(map(float, parts[: count - words]))
+            numbers.append([float(part) for part in parts[: count - words]])
         except ValueError:
-            numbers = ()
-        if len(parts) != count or len(numbers) != count - words:
+            parts = []
+        if len(parts) != count:
             raise FormatError(f"{path}:{line}: expected '{columns}', got {text.strip()[:80]!r}.")
-        rows.append(Row(line, numbers, tuple(part.strip() for part in parts[count - words :])))
-    return rows
+        rows.lines.append(line)
+        rows.words.append(parts[count - words :])
+    return rows._replace(numbers=np.array(numbers)) if numbers else rows
 
 
 def versions() -> dict[str, str]:

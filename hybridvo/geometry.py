@@ -106,13 +106,7 @@ def se3_exp(delta: np.ndarray) -> np.ndarray:
         b = 2 * np.sin(theta / 2) ** 2 / theta2
         c = (1 - a) / theta2
     W = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    W2 = np.array(
-        [
-            [x * x - theta2, x * y, x * z],
-            [x * y, y * y - theta2, y * z],
-            [x * z, y * z, z * z - theta2],
-        ]
-    )
+    W2 = np.outer(delta[3:], delta[3:]) - theta2 * np.eye(3)
     T = np.eye(4)
     T[:3, :3] += a * W + b * W2
     V = b * W + c * W2
@@ -177,9 +171,11 @@ def to_gtsam_covariance(covariance: np.ndarray) -> np.ndarray:
     The inverse of ``Exp(d) T_curr_prev`` is ``T_prev_curr Exp(-d)``: the same covariance, now on
     GTSAM's side. The order changes to (rotation, translation). Takes (6, 6) or (N, 6, 6).
     """
-    covariance = _covariances(covariance, "to_gtsam_covariance")
-    order = [3, 4, 5, 0, 1, 2]
-    return covariance[..., order, :][..., order]
+    covariance = np.asarray(covariance)
+    if covariance.ndim not in (2, 3) or covariance.shape[-2:] != (6, 6):
+        expected = f"shape (6, 6) or (N, 6, 6), got {covariance.shape}"
+        raise InputError(f"to_gtsam_covariance: expected {expected}.")
+    return np.roll(covariance, 3, axis=(-2, -1))
 
 
 def to_ros_covariance(covariance: np.ndarray, T_prev_curr: np.ndarray) -> np.ndarray:
@@ -187,22 +183,16 @@ def to_ros_covariance(covariance: np.ndarray, T_prev_curr: np.ndarray) -> np.nda
 
     ROS keeps (x, y, z, rotation about x, y, z) about the axes of the parent frame, which is the
     previous camera: ``T_prev_curr Exp(-d)`` turned into them by the rotation of ``T_prev_curr``.
-    Takes (6, 6) and (4, 4), or (N, 6, 6) and (N, 4, 4).
     """
-    covariance = _covariances(covariance, "to_ros_covariance")
-    T, expected = np.asarray(T_prev_curr), (*covariance.shape[:-2], 4, 4)
-    if T.shape != expected:
-        raise InputError(f"to_ros_covariance: expected T_prev_curr {expected}, got {T.shape}.")
-    A = np.zeros_like(covariance, dtype=np.float64)
+    C, T = np.asarray(covariance), np.asarray(T_prev_curr)
+    if C.shape[-2:] != (6, 6) or T.shape != (*C.shape[:-2], 4, 4):
+        raise InputError(
+            f"to_ros_covariance: expected (6, 6) and (4, 4), or (N, 6, 6) and (N, 4, 4), got "
+            f"{C.shape} and {T.shape}."
+        )
+    A = np.zeros_like(C, dtype=np.float64)
     A[..., :3, :3] = A[..., 3:, 3:] = T[..., :3, :3]
-    return A @ covariance @ np.swapaxes(A, -1, -2)
-
-
-def _covariances(value: np.ndarray, where: str) -> np.ndarray:
-    array = np.asarray(value)
-    if array.ndim not in (2, 3) or array.shape[-2:] != (6, 6):
-        raise InputError(f"{where}: expected shape (6, 6) or (N, 6, 6), got {array.shape}.")
-    return array
+    return A @ C @ np.swapaxes(A, -1, -2)
 
 
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:

@@ -1,7 +1,6 @@
 """Every option of the program, in one tree: ``Options().refine.cutoff`` and the like.
 
-The classes are frozen and check their values; ``configs/odometry.yaml`` shows and explains the same
-tree.
+The classes are frozen and check their values; ``configs/odometry.yaml`` explains the same tree.
 """
 
 from __future__ import annotations
@@ -23,14 +22,6 @@ Share = Annotated[float, Field(ge=0, le=1)]
 Blur = Annotated[float, Field(gt=0, lt=100)]
 
 
-def describe(error: ValidationError, where: str) -> str:
-    """One sentence for the first thing that pydantic found wrong, with its place."""
-    first = error.errors()[0]
-    place = ".".join([where, *(str(part) for part in first["loc"])])
-    expected = first["msg"][:1].lower() + first["msg"][1:]
-    return f"{place}: {expected}, got {first['input']!r}."
-
-
 @dataclass_transform(frozen_default=True)
 def option_group(cls: type[T]) -> type[T]:
     """A frozen pydantic dataclass whose errors are :class:`InputError`."""
@@ -42,7 +33,10 @@ def option_group(cls: type[T]) -> type[T]:
         try:
             fill(self, *args, **values)
         except ValidationError as error:
-            raise InputError(describe(error, cls.__name__)) from None
+            first = error.errors()[0]
+            place = ".".join([cls.__name__, *(str(part) for part in first["loc"])])
+            expected = first["msg"][:1].lower() + first["msg"][1:]
+            raise InputError(f"{place}: {expected}, got {first['input']!r}.") from None
 
     made.__init__ = __init__
     return made
@@ -58,13 +52,9 @@ class FlowOptions:
 
 @option_group
 class DirectOptions:
-    """The motion from images and depth maps alone, before any flow is computed.
+    """The motion from images and depth maps alone, before any flow is computed."""
 
-    Args:
-        mode: ``on``, ``off``, or ``auto``: with the method ``hybrid``, where the flow would be
-            computed from the same images (``dis``).
-    """
-
+    # auto: with the method hybrid, where the flow would be computed from the same images (dis)
     mode: Literal["auto", "on", "off"] = "auto"
 
 
@@ -112,9 +102,8 @@ class PhotometricOptions:
     # alike far beyond the tiles
     prior_inflation: Positive = 8.0
     image_inflation: Positive = 4.0
-    min_correlation: Annotated[float, Field(ge=-1, le=1)] = (
-        0.5  # of the two images; below it they do not match
-    )
+    # of the two images; below it they do not match
+    min_correlation: Annotated[float, Field(ge=-1, le=1)] = 0.5
 
 
 @option_group
@@ -148,9 +137,6 @@ class RunOptions:
 @option_group
 class Options:
     """The option tree.
-
-    Raises:
-        InputError: an unknown name or a value out of bounds, with its place.
 
     Example:
         >>> Options(refine=RefineOptions(cutoff=2.5)).refine.cutoff

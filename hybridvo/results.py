@@ -77,10 +77,7 @@ class Status:
 class MotionPrior:
     """What is known of a motion before the pair is seen: one start among others, and a cue.
 
-    The covariance (6, 6) is that of a :class:`RelativePose`.
-
-    Raises:
-        InputError: no rigid transform (4, 4), or no positive definite covariance.
+    The covariance (6, 6), positive definite, is that of a :class:`RelativePose`.
     """
 
     T_curr_prev: np.ndarray
@@ -91,11 +88,8 @@ class MotionPrior:
         C = to_numpy(self.covariance, "MotionPrior.covariance")
         fits = C.shape == (6, 6) and C.dtype.kind in "fiu" and bool(np.isfinite(C).all())
         if not fits or not np.allclose(C, C.T) or not np.linalg.eigvalsh(C)[0] > 0:
-            raise InputError(
-                f"MotionPrior.covariance: expected a positive definite matrix of shape (6, 6), "
-                f"symmetric and finite, got {C.tolist()}. A prior needs one: how far may the "
-                f"motion be from it?"
-            )
+            expected = "a positive definite matrix of shape (6, 6), symmetric and finite"
+            raise InputError(f"MotionPrior.covariance: expected {expected}, got {C.tolist()}.")
         object.__setattr__(self, "covariance", C.astype(np.float64))
 
 
@@ -113,7 +107,6 @@ class Hypothesis:
     """One strong motion found in the image.
 
     Args:
-        T_curr_prev: (4, 4).
         source: what led here (``start``, ``window``, ``minimal``, ``runner-up``, ``refit``).
         inlier_ratio: share of the valid pixels that follow this motion.
         flow_noise_px: standard deviation of the flow about it, px. depth_noise: of log depth.
@@ -131,12 +124,6 @@ class Hypothesis:
     stride: int
     score: float = 0.0
 
-    def __repr__(self) -> str:
-        return (
-            f"Hypothesis({self.source}, {_motion(self.T_curr_prev)}, "
-            f"inliers {100 * self.inlier_ratio:.0f} %, score {self.score:.3g})"
-        )
-
 
 @dataclass(frozen=True, eq=False)
 class RelativePose:
@@ -150,8 +137,8 @@ class RelativePose:
         inlier_ratio: share of the valid pixels that follow the motion.
         iterations: Gauss-Newton steps spent (or RANSAC iterations).
         cost: final robust cost per valid pixel, dimensionless.
-        residual_scale_px: estimated standard deviation of the flow noise, px, where variances were
-            handed in at a pixel of the typical one. depth_noise: of the log depth, likewise.
+        residual_scale_px: standard deviation of the flow noise, px, at a pixel of the typical
+            variance. depth_noise: of the log depth, likewise.
         weights: (H, W) float32 robust weight of each pixel.
         translation_direction_valid: whether the translation is longer than three of its own
             standard deviations; its direction means nothing otherwise.
@@ -214,11 +201,12 @@ class RelativePose:
 
     def __repr__(self) -> str:
         sigma = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
-        metres, radians = np.linalg.norm(sigma[:3]), np.linalg.norm(sigma[3:])
+        x, y, z = self.T_curr_prev[:3, 3]
+        degrees = np.rad2deg(rotation_angle(self.T_curr_prev[:3, :3]))
         return (
-            f"RelativePose({self.method or 'motion'}: {self.status}, {_motion(self.T_curr_prev)}, "
-            f"sigma {metres:.3g} m {np.rad2deg(radians):.3g} deg, inliers "
-            f"{100 * self.inlier_ratio:.0f} %, probability {self.probability:.2f})"
+            f"RelativePose({self.method or 'motion'}: {self.status}, t [{x:.4f} {y:.4f} {z:.4f}] "
+            f"+- {np.linalg.norm(sigma[:3]):.3g} m, {degrees:.3f} +- "
+            f"{np.rad2deg(np.linalg.norm(sigma[3:])):.3g} deg, probability {self.probability:.2f})"
         )
 
 
@@ -243,13 +231,6 @@ class Step:
     T_curr_prev = property(attrgetter("motion.T_curr_prev"))
     T_prev_curr = property(attrgetter("motion.T_prev_curr"))
 
-    def __repr__(self) -> str:
-        x, y, z = self.T_world_cam[:3, 3]
-        return (
-            f"Step({self.index}, t {self.timestamp:.3f} s, at [{x:.3f} {y:.3f} {z:.3f}] m, "
-            f"{self.motion!r})"
-        )
-
 
 @dataclass(frozen=True, eq=False)
 class PixelwisePrediction:
@@ -268,9 +249,3 @@ class PixelwisePrediction:
     log_scale_rotation: torch.Tensor | None = None
     log_scale_translation: torch.Tensor | None = None
     image_size: tuple[int, int] | None = None
-
-
-def _motion(T: np.ndarray) -> str:
-    """Translation and angle of a (4, 4) transform, for a line of print."""
-    x, y, z = T[:3, 3]
-    return f"t [{x:.4f} {y:.4f} {z:.4f}] m, {np.rad2deg(rotation_angle(T[:3, :3])):.3f} deg"

@@ -5,7 +5,6 @@ evo writes the files. They are read here: evo names neither the line of a mistak
 
 from __future__ import annotations
 
-import logging
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,9 +13,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hybridvo.errors import FormatError, InputError
-from hybridvo.files import Row, atomic_write, read_rows, read_text
+from hybridvo.files import Rows, atomic_write, read_rows, read_text
 from hybridvo.geometry import invert, ned_to_camera
-from hybridvo.types import as_rigid, to_numpy
+from hybridvo.types import as_rigid, rotation_error, to_numpy
 
 COLUMNS = {
     "tum": "timestamp tx ty tz qx qy qz qw",
@@ -25,13 +24,6 @@ COLUMNS = {
 }
 FILE_TOLERANCE = 1e-2
 """Files carry six digits or so: a rotation may be off by that much, a wrong column is far more."""
-
-EPOCH_S = (1e9, 4.2e9)
-"""Seconds since 1970 from 2001 to 2103: where the stamps of today's clocks lie."""
-MAX_SECONDS = 1e14
-"""Stamps above this (three million years) cannot be seconds and are taken as nanoseconds."""
-
-_logger = logging.getLogger(__name__)
 
 
 def chain(T_world_prev: np.ndarray, T_curr_prev: np.ndarray) -> np.ndarray:
@@ -120,7 +112,7 @@ class Trajectory:
 def read_trajectory(
     path: str | os.PathLike[str], format: str = "auto", *, axes: str = "auto"
 ) -> Trajectory:
-    """Read a trajectory of camera-to-world poses from a text file, one pose a line.
+    """Read camera-to-world poses from a text file, one pose a line.
 
     ``#`` comments, empty lines, tabs, Windows line ends and a byte-order mark are accepted.
 
@@ -132,7 +124,7 @@ def read_trajectory(
 
     Returns:
         The trajectory in camera axes. Stamps in other units than seconds are converted, which
-        ``warnings`` and the log say. KITTI and TartanAir files get frame numbers as stamps.
+        ``warnings`` say. KITTI and TartanAir files get frame numbers as stamps.
 
     Raises:
         InputError: no such file, an unknown option. FormatError: a damaged row, a pose that is not
@@ -149,73 +141,54 @@ def read_trajectory(
         raise InputError(f"{path}: trajectory file cannot be read: no such file.")
     kind = _format_of(path) if format == "auto" else format
     rows, T = read_poses(path, kind)
-    if not rows:
+    if not len(T):
         raise FormatError(f"{path}: expected at least one pose, got none.")
-    stamps = np.array([row.numbers[0] for row in rows])
-    finite = "finite numbers; a pose that is not known must not be in the file"
-    _refuse(path, rows, ~np.isfinite(stamps) | np.isnan(T[:, 0, 0]), finite)
-    factor, unit = stamp_unit(stamps)
-    if kind != "tum":
-        stamps, factor = np.arange(len(rows)), 1.0
-    far = np.abs(stamps) > MAX_SECONDS
-    unmixed = f"timestamps that do not mix units ({stamps[0]} before)"
-    _refuse(path, rows, far != far[0], unmixed)
-    late = np.diff(stamps, prepend=-np.inf) <= 0
-    _refuse(path, rows, late, "increasing timestamps: sort the file, drop duplicates")
-    warnings = [f"{path}: timestamps are {unit}; converted to seconds."] if factor != 1 else []
-    for warning in warnings:
-        _logger.warning(warning)
+    rows.refuse(~np.isfinite(rows.numbers).all(axis=1), "finite numbers: leave unknown poses out")
+    stamps, factor, unit = np.arange(len(T)), 1.0, ""
+    if kind == "tum":
+        stamps = rows.numbers[:, 0]
+        factor, unit = stamp_unit(stamps)
+    rows.refuse(np.diff(stamps, prepend=-np.inf) <= 0, "increasing timestamps, without duplicates")
+    warnings = (f"{path}: timestamps are {unit}; converted to seconds.",) if factor != 1 else ()
     if axes == "ned" or (axes == "auto" and kind == "tartanair"):
         T = ned_to_camera(T)
-    return Trajectory(stamps / factor, T, kind == "tum", tuple(warnings))
+    return Trajectory(stamps / factor, T, kind == "tum", warnings)
 
 
-def read_poses(path: Path, kind: str) -> tuple[list[Row], np.ndarray]:
+def read_poses(path: Path, kind: str) -> tuple[Rows, np.ndarray]:
     """Rows of a list of a kind of :data:`COLUMNS`, and (N, 4, 4) their poses, NaN if not finite.
 
     A damaged row or what is no rotation is a FormatError with file and line.
     """
     rows = read_rows(path, COLUMNS[kind])
-    is_matrix = kind == "kitti"
-    width = 12 if is_matrix else 7
-    values = np.array([row.numbers[-width:] for row in rows]).reshape(-1, width)
-    known = np.isfinite(values).all(axis=1)
-    values[~known] = np.eye(4)[:3].ravel() if is_matrix else (0, 0, 0, 0, 0, 0, 1)
-    T = np.tile(np.eye(4), (len(rows), 1, 1))
-    if is_matrix:
-        T[:, :3] = values.reshape(-1, 3, 4)
-        R = T[:, :3, :3]
-        with np.errstate(over="ignore", invalid="ignore"):
-            error = np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max(axis=(1, 2))
-            bad = ~(error <= FILE_TOLERANCE) | (np.linalg.det(R) < 0)
-        _refuse(path, rows, bad, "a rotation in columns 1-3, 5-7 and 9-11")
+    known = np.isfinite(rows.numbers).all(axis=1)
+    T = np.tile(np.eye(4), (len(known), 1, 1))
+    if kind == "kitti":
+        T[known, :3] = rows.numbers[known].reshape(-1, 3, 4)
+        error = rotation_error(T[:, :3, :3])
+        rows.refuse(error > FILE_TOLERANCE, "a rotation in columns 1-3, 5-7 and 9-11")
         if error.max(initial=0) > 1e-9:
-            T[:, :3, :3] = Rotation.from_matrix(R).as_matrix()
-    elif rows:
-        norms = np.linalg.norm(values[:, 3:].clip(-2, 2), axis=1)
-        _refuse(path, rows, np.abs(norms - 1) > FILE_TOLERANCE, "a unit quaternion qx qy qz qw")
-        T[:, :3, :3] = Rotation.from_quat(values[:, 3:]).as_matrix()
-        T[:, :3, 3] = values[:, :3]
+            T[:, :3, :3] = Rotation.from_matrix(T[:, :3, :3]).as_matrix()
+    elif known.any():
+        quaternions = rows.numbers[:, -4:]
+        off = known & (np.abs(np.linalg.norm(quaternions.clip(-2, 2), axis=1) - 1) > FILE_TOLERANCE)
+        rows.refuse(off, "a unit quaternion qx qy qz qw")
+        T[known, :3, :3] = Rotation.from_quat(quaternions[known]).as_matrix()
+        T[known, :3, 3] = rows.numbers[known, -7:-4]
     T[~known] = np.nan
     return rows, T
-
-
-def _refuse(path: Path, rows: list[Row], bad: np.ndarray, expected: str) -> None:
-    """Name the first bad row."""
-    if bad.any():
-        row = rows[int(np.argmax(bad))]
-        raise FormatError(f"{path}:{row.line}: expected {expected}, got {list(row.numbers)}.")
 
 
 def _format_of(path: Path) -> str:
     """Format by the number of columns of the first pose."""
     kinds = {len(columns.split()): kind for kind, columns in COLUMNS.items()}
     for line, text in enumerate(read_text(path).split("\n"), start=1):
-        if count := len(text.partition("#")[0].split()):
-            if count in kinds:
-                return kinds[count]
+        count = len(text.partition("#")[0].split())
+        if count and count not in kinds:
             expected = "8 numbers (TUM), 12 (KITTI) or 7 (TartanAir) separated by spaces"
             raise FormatError(f"{path}:{line}: expected {expected}, got {count}.")
+        if count:
+            return kinds[count]
     return "tum"
 
 
@@ -234,15 +207,12 @@ def check_increasing(stamps: np.ndarray, where: str) -> None:
 def stamp_unit(stamps: np.ndarray) -> tuple[float, str]:
     """How many of the unit of some stamps make a second, and its name.
 
-    Milliseconds and microseconds are told by two things together: every stamp (N,) that is finite
-    is one of today's clocks (2001 to 2103), and neighbours are typically less than a second apart.
-    Else stamps above 1e14 are nanoseconds.
+    Stamps that today's clocks (2001 to 2103) would show in milli- or microseconds are those;
+    other stamps above 1e14, which is three million years, are nanoseconds.
     """
     known = np.abs(stamps[np.isfinite(stamps)])
-    with np.errstate(over="ignore"):  # between numbers that are no times anyway
-        step = np.median(np.abs(np.diff(known))) if len(known) > 1 else np.inf
+    typical = np.median(known) if known.size else 0.0
     for factor, name in ((1e3, "milliseconds"), (1e6, "microseconds")):
-        first, last = factor * EPOCH_S[0], factor * EPOCH_S[1]
-        if step < factor and first <= known.min() and known.max() <= last:
+        if 1e9 <= typical / factor <= 4.2e9:
             return factor, name
-    return (1e9, "nanoseconds") if (known > MAX_SECONDS).any() else (1.0, "seconds")
+    return (1e9, "nanoseconds") if typical > 1e14 else (1.0, "seconds")

@@ -48,12 +48,25 @@ def as_number(value: Any) -> float:
         return float("nan")
 
 
+def check_kind(what: str, value: Any, *kinds: type) -> None:
+    """Refuse an argument of another type."""
+    if not isinstance(value, kinds):
+        raise InputError(f"{what}: expected {kinds[0].__name__}, got {type(value).__name__}.")
+
+
 def as_seed(seed: Any, where: str) -> int:
     """A seed that every generator takes."""
     whole = isinstance(seed, Integral) and not isinstance(seed, bool)
     if not whole or not 0 <= seed < 2**31:
         raise InputError(f"{where}: expected a whole number from 0 to 2^31 - 1, got {seed!r}.")
     return int(seed)
+
+
+def rotation_error(R: np.ndarray) -> np.ndarray:
+    """Largest deviation of (..., 3, 3) from a rotation; infinite where it is none at all."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        error = np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)).max(axis=(-1, -2))
+        return np.where((np.linalg.det(R) > 0) & np.isfinite(error), error, np.inf)
 
 
 def as_rigid(T: Any, where: str, tolerance: float = 1e-6, *, many: bool = False) -> np.ndarray:
@@ -63,11 +76,9 @@ def as_rigid(T: Any, where: str, tolerance: float = 1e-6, *, many: bool = False)
         shape = "(N, 4, 4)" if many else "(4, 4)"
         raise InputError(f"{where}: expected shape {shape}, got {T.dtype} {T.shape}.")
     T = T.astype(np.float64)
-    R = T[..., :3, :3]
-    with np.errstate(over="ignore", invalid="ignore"):
-        error = np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)).max(axis=(-1, -2))
-        error = np.maximum(error, np.abs(T[..., 3, :] - (0.0, 0.0, 0.0, 1.0)).max(axis=-1))
-        good = (error <= tolerance) & (np.linalg.det(R) > 0) & np.isfinite(T).all(axis=(-1, -2))
+    last = np.abs(T[..., 3, :] - (0.0, 0.0, 0.0, 1.0)).max(axis=-1)
+    good = np.maximum(rotation_error(T[..., :3, :3]), last) <= tolerance
+    good &= np.isfinite(T).all(axis=(-1, -2))
     if not good.all():
         k = int(np.argmin(good))
         place, bad = (f"{where}[{k}]", T[k]) if many else (where, T)
@@ -80,12 +91,9 @@ def as_rigid(T: Any, where: str, tolerance: float = 1e-6, *, many: bool = False)
 
 @dataclass(frozen=True)
 class Camera:
-    """Pinhole camera without distortion.
+    """Pinhole camera without distortion; focal lengths and centre in pixels of this image size.
 
-    Focal lengths and principal point are in pixels of this image size.
-
-    Raises:
-        InputError: values of no camera; a principal point farther than one image size outside.
+    An InputError refuses a centre farther than one image size outside.
     """
 
     fx: float
@@ -96,30 +104,22 @@ class Camera:
     width: int
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            number, whole = as_number(value), name in ("height", "width")
-            positive = not isinstance(value, bool) and number > 0 and not number % 1
-            if not np.isfinite(number) or (whole and not positive):
-                expected = "a positive integer" if whole else "a finite number"
-                raise InputError(f"Camera.{name}: expected {expected}, got {value!r}.")
-            object.__setattr__(self, name, int(number) if whole else number)
+        for name in ("height", "width"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or as_number(value) % 1 != 0 or value <= 0:
+                raise InputError(f"Camera.{name}: expected a positive integer, got {value!r}.")
+            object.__setattr__(self, name, int(value))
+        size = f"an image of {self.width}x{self.height}"
         if self.height * self.width > MAX_PIXELS:
-            raise InputError(
-                f"Camera: {self.width}x{self.height} pixels is above the limit of {MAX_PIXELS}."
-            )
-        low, high = FOCAL_RANGE
-        for axis, size in (("x", self.width), ("y", self.height)):
-            focal, centre = getattr(self, f"f{axis}"), getattr(self, f"c{axis}")
-            if not low <= focal <= high:
-                raise InputError(
-                    f"Camera.f{axis}: expected a positive focal length in pixels ({low:g} to "
-                    f"{high:g}), got {focal}."
-                )
-            if not -size <= centre <= 2 * size:
-                raise InputError(
-                    f"Camera.c{axis}: {centre} lies far outside an image of {size} pixels. "
-                    f"Are the intrinsics those of this image size?"
-                )
+            raise InputError(f"Camera: {size} pixels is above the limit of {MAX_PIXELS}.")
+        x_range, y_range = (-self.width, 2 * self.width), (-self.height, 2 * self.height)
+        limits = {"fx": FOCAL_RANGE, "fy": FOCAL_RANGE, "cx": x_range, "cy": y_range}
+        for name, (low, high) in limits.items():
+            value, what = getattr(self, name), "focal length" if name[0] == "f" else "centre"
+            if not low <= as_number(value) <= high:
+                expected = f"a {what} of {low:g} to {high:g} pixels for {size}"
+                raise InputError(f"Camera.{name}: expected {expected}, got {value!r}.")
+            object.__setattr__(self, name, float(value))
 
     @classmethod
     def from_matrix(cls, K: np.ndarray, height: int, width: int) -> Camera:
@@ -164,7 +164,7 @@ def _take_image(of: Frame | FramePair, camera: Camera, name: str, kind: str, *mo
         array = array[:, :, 0]
     if kind == "u1" and array.ndim == 2:  # gray
         array = np.repeat(array[:, :, None], 3, axis=2)
-    if array.shape[2:] != more or array.shape[:2] != camera.shape:
+    if array.shape != (*camera.shape, *more):
         raise InputError(
             f"{where}: expected shape {(*camera.shape, *more)} (height, width, ...) as the camera "
             f"has, got {array.shape}. Resize with hybridvo.data.sequence.resize_frame, which also "
@@ -178,11 +178,10 @@ def _take_image(of: Frame | FramePair, camera: Camera, name: str, kind: str, *mo
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One RGB-D frame.
+    """One RGB-D frame, checked against its camera: an InputError says what does not fit.
 
     Args:
-        rgb: (H, W, 3) uint8, or None where only depth and flow are used. (H, W) and (H, W, 1) gray
-            images are accepted and repeated.
+        rgb: (H, W, 3) uint8, or None where only depth and flow are used. Gray images are repeated.
         depth: (H, W) float metres along the optical axis; NaN, inf, 0 and negative are invalid.
             None where the sensor delivered none: the pair then ends as ``failed(no_valid_depth)``.
         camera: pinhole intrinsics of this very image size.
@@ -190,9 +189,6 @@ class Frame:
         index: position in its sequence; None: the tracker counts.
         depth_variance: (H, W) float, variance of log depth (relative variance), or None.
         mask: (H, W) bool, True where pixels may be used, or None.
-
-    Raises:
-        InputError: shapes that do not match the camera, wrong dtypes, a stamp that is not finite.
     """
 
     rgb: np.ndarray | None
@@ -204,8 +200,7 @@ class Frame:
     mask: np.ndarray | None = None
 
     def __post_init__(self) -> None:
-        if not isinstance(self.camera, Camera):
-            raise InputError(f"Frame.camera: expected a Camera, got {type(self.camera).__name__}.")
+        check_kind("Frame.camera", self.camera, Camera)
         _take_image(self, self.camera, "rgb", "u1", 3)
         for name, kind in (("depth", "f"), ("depth_variance", "f"), ("mask", "b")):
             _take_image(self, self.camera, name, kind)
@@ -221,12 +216,12 @@ class Frame:
 
 @dataclass(frozen=True, eq=False)
 class FramePair:
-    """Two frames with the optical flow between them: what every estimator takes.
+    """Two frames of one size with the optical flow between them: what every estimator takes.
 
-    Ground-truth motion is no part of it.
+    Ground-truth motion is no part of it. An InputError says what does not fit.
 
     Args:
-        prev, curr: frames t and t+1 of one size, each with its own camera.
+        prev, curr: frames t and t+1, each with its own camera.
         flow: (H, W, 2) float pixels, previous to current, on the previous grid; NaN is invalid.
             None where no flow could be had: the pair then ends as ``failed(no_flow)``.
         flow_variance: (H, W) float px^2 per component, relative or absolute, or None.
@@ -234,9 +229,6 @@ class FramePair:
         flow_source: ``file``, ``dis``, or the name of a callable.
         flow_is_true: whether the flow is ground truth (an oracle).
         depth_source: ``sensor``, ``true`` (synthetic, an oracle), ``stereo``.
-
-    Raises:
-        InputError: shapes that do not match.
     """
 
     prev: Frame
@@ -249,10 +241,8 @@ class FramePair:
     depth_source: str = "unknown"
 
     def __post_init__(self) -> None:
-        for name, frame in (("prev", self.prev), ("curr", self.curr)):
-            if not isinstance(frame, Frame):
-                got = type(frame).__name__
-                raise InputError(f"FramePair.{name}: expected a Frame, got {got}.")
+        check_kind("FramePair.prev", self.prev, Frame)
+        check_kind("FramePair.curr", self.curr, Frame)
         camera = self.prev.camera
         if self.curr.camera.shape != camera.shape:
             raise InputError(
@@ -269,12 +259,10 @@ class FramePair:
 class PairBatch:
     """A batch of pairs as torch tensors: the differentiable, batched input.
 
-    Args:
-        flow: (B, H, W, 2) px. depth_prev: (B, H, W) metres; values that are not finite and positive
-            are invalid. K_prev, K_curr: (B, 3, 3).
-        depth_curr: (B, H, W) metres on the current grid, or None.
-        flow_variance: (B, H, W) px^2 or None. depth_variance: (B, H, W) of log depth, or None.
-        valid: (B, H, W) bool or None.
+    ``flow`` (B, H, W, 2) px; ``depth_prev``, ``depth_curr`` (B, H, W) metres, on the grid of their
+    frame, values that are not finite and positive are invalid; ``K_prev``, ``K_curr`` (B, 3, 3);
+    ``flow_variance`` (B, H, W) px^2; ``depth_variance`` (B, H, W) of log depth; ``valid`` (B, H, W)
+    bool.
     """
 
     flow: torch.Tensor
@@ -303,33 +291,29 @@ class PairBatch:
             )
         size = sizes.pop()
 
-        def stack(values: list[Any], lacking: float = np.nan) -> Any:
-            given = [value for value in values if value is not None]
-            if not given:
-                return None
-            absent = np.full(given[0].shape, lacking, np.float32)
-            array = np.stack([absent if value is None else value for value in values])
-            return torch.as_tensor(array, device=device).to(dtype or torch.float32)
+        def stack(values: list[Any], shape: tuple[int, ...] = (), lacking: float = np.nan) -> Any:
+            """One tensor, or None where no pair has a value and no shape asks for one."""
+            shape = next((value.shape for value in values if value is not None), shape)
+            filled = [np.full(shape, lacking) if value is None else value for value in values]
+            array = torch.as_tensor(np.stack(filled), device=device).to(dtype or torch.float32)
+            return array if shape else None
 
-        def masked(frame: Frame) -> np.ndarray | None:
-            if frame.depth is None or frame.mask is None:
-                return frame.depth
-            return np.where(frame.mask, frame.depth, np.float32(np.nan))
-
+        depth_curr: list[Any] = [pair.curr.depth for pair in pairs]
         valid = np.ones((len(pairs), *size), np.bool_)
         for k, pair in enumerate(pairs):
             for mask in (pair.prev.mask, pair.flow_valid):
                 valid[k] &= True if mask is None else mask
-        no_flow, no_depth = np.full((*size, 2), np.nan), np.full(size, np.nan)
+            if depth_curr[k] is not None and pair.curr.mask is not None:
+                depth_curr[k] = np.where(pair.curr.mask, depth_curr[k], np.float32(np.nan))
         return cls(
-            flow=stack([no_flow if p.flow is None else p.flow for p in pairs]),
-            depth_prev=stack([no_depth if p.prev.depth is None else p.prev.depth for p in pairs]),
+            flow=stack([p.flow for p in pairs], (*size, 2)),
+            depth_prev=stack([p.prev.depth for p in pairs], size),
             K_prev=stack([p.prev.camera.K for p in pairs]),
             K_curr=stack([p.curr.camera.K for p in pairs]),
-            depth_curr=stack([masked(p.curr) for p in pairs]),
+            depth_curr=stack(depth_curr),
             # a pair without variances beside one with them has those of a typical pixel
-            flow_variance=stack([p.flow_variance for p in pairs], 1.0),
-            depth_variance=stack([p.prev.depth_variance for p in pairs], 1.0),
+            flow_variance=stack([p.flow_variance for p in pairs], lacking=1.0),
+            depth_variance=stack([p.prev.depth_variance for p in pairs], lacking=1.0),
             valid=torch.as_tensor(valid, device=device),
         )
 
@@ -345,20 +329,14 @@ def typical_depth(depth: np.ndarray) -> float | None:
 def depth_advice(median: float, usual: float | None = None) -> str:
     """What probably turns depths of this median into metres; empty where they can be metres.
 
-    The first unit that brings the median to everyday depths, the data set's own (``usual``, units
-    per metre) before the others: ``divide by 1000 (millimetres)`` for a median of 974.
+    The data set's own unit (``usual``, per metre), else the first that makes them everyday depths.
     """
     low, high = PLAUSIBLE_DEPTH_M
     if low <= median <= high:
         return ""
-    factors = [1 / unit if median > high else float(unit) for unit in UNITS_PER_METRE]
-    if usual and median > high and low <= median / usual <= high:
-        factors = [1 / usual]
-    # how far each leads from the middle of everyday depths, which are all as good
-    nearest, farthest = EVERYDAY_DEPTH_M
-    off = np.abs(np.log(median * np.array(factors) / np.sqrt(nearest * farthest)))
-    factor = factors[int(np.argmin(off.clip(np.log(farthest / nearest) / 2)))]
-    if factor > 1:
-        return f"multiply by {factor:g}"
-    unit = UNITS_PER_METRE.get(round(1 / factor))
-    return f"divide by {1 / factor:g}" + (f" ({unit})" if unit else "")
+    if median < low:
+        return "multiply by 1000"
+    near, far = EVERYDAY_DEPTH_M
+    units = [unit for unit in UNITS_PER_METRE if near <= median / unit <= far] or [1000]
+    unit = round(usual) if usual and low <= median / usual <= high else units[0]
+    return f"divide by {unit}" + (f" ({UNITS_PER_METRE[unit]})" if unit in UNITS_PER_METRE else "")

@@ -6,7 +6,6 @@ thousand roundings of float64 at the size of the numbers; float32 results say so
 
 from __future__ import annotations
 
-import logging
 import re
 from pathlib import Path
 
@@ -363,14 +362,12 @@ def test_identity_row_of_a_tum_file(tmp_path):
 # Time and names
 
 
-def test_stamps_above_1e14_are_nanoseconds_with_a_notice(tmp_path, caplog):
+def test_stamps_above_1e14_are_nanoseconds_with_a_notice(tmp_path):
     path = tmp_path / "ns"
     path.write_text("1700000000500000000 0 0 0 0 0 0 1\n1700000001000000000 0 0 0 0 0 0 1\n")
-    with caplog.at_level(logging.WARNING):
-        trajectory = read_trajectory(path)
+    trajectory = read_trajectory(path)
     assert trajectory.timestamps.tolist() == [1700000000.5, 1700000001.0]
     assert trajectory.timestamps.dtype == np.float64
-    assert "nanoseconds" in caplog.text
     assert "nanoseconds" in trajectory.warnings[0]
 
 

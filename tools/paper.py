@@ -127,7 +127,7 @@ def predict(network: Any, sample: Any) -> tuple[Any, Any]:
 def saliency(name: str, network: Any, sample: Any) -> list[Panel]:
     """What decides rotation and translation, with the outline of what moves."""
     found = saliencies(network, collate([sample]).inputs, None, STEPS)
-    return saliency_panels(name, found, sample.moving)[0]
+    return saliency_panels(name, found, sample.moving)
 
 
 def saliency_on_movers(network: Any, samples: list[Any]) -> dict[str, Any]:

@@ -15,7 +15,6 @@ import pandas as pd
 
 from hybridvo.calibration import DOUBTFUL_SPREAD
 from hybridvo.commands.compare import methods_to_run
-from hybridvo.commands.run import is_dark
 from hybridvo.data.lists import shown
 from hybridvo.data.sequence import Sequence
 from hybridvo.errors import InputError
@@ -35,6 +34,8 @@ MIN_SHIFT_GAIN = 0.0015
 """Fall of the cost: registered sequences give up to 0.0008, shifted by 2 and 3 px over 0.0022."""
 MAX_GREY_STEP = 0.15
 """Change of the logarithm of the mean brightness between neighbours that is called a step."""
+DARK_LEVEL = 20.0
+"""Grey levels (of 255) below which nine tenths of a dark image lie; of a street at night, 60."""
 MAX_CONTRADICTED = 0.2
 """Fraction of the pairs whose flow may contradict their images."""
 REACH_PX = 4
@@ -105,7 +106,7 @@ def _measure(sequence: Sequence, prev: Frame, curr: Frame) -> dict[str, Any]:
     if prev.rgb is None or curr.rgb is None:
         return pair
     ratio = (float(curr.rgb.mean()) + 1.0) / (float(prev.rgb.mean()) + 1.0)
-    pair["light"] = ratio, [frame.index for frame in (prev, curr) if is_dark(frame.rgb)]
+    pair["light"] = ratio, [frame.index for frame in (prev, curr) if _is_dark(frame.rgb)]
     given = file_flow(sequence, strict=False)(prev, curr) if sequence.has_flow else None
     if given is not None and given.flow is not None:
         on_file = FramePair(prev, curr, given.flow, given.variance, given.valid, "file")
@@ -127,6 +128,10 @@ def _measure(sequence: Sequence, prev: Frame, curr: Frame) -> dict[str, Any]:
     pair["depth_ratio"] = None if depths is None else depths.ratio
     pair["shift_costs"] = _shift_costs(by_dis, motion)
     return pair
+
+
+def _is_dark(rgb: np.ndarray | None) -> bool:
+    return rgb is not None and float(np.percentile(rgb[::4, ::4].max(axis=2), 90)) < DARK_LEVEL
 
 
 def _shift_costs(pair: FramePair, motion: RelativePose) -> np.ndarray | None:

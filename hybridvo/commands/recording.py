@@ -44,7 +44,6 @@ class Recording:
         name: str,
         identity: str,
         frames: int,
-        *,
         first: int = 0,
         poses: np.ndarray | None = None,
     ) -> None:

@@ -13,7 +13,6 @@ import platform
 import re
 import time
 from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,7 @@ import numpy as np
 import pandas as pd
 
 import hybridvo
-from hybridvo.commands.progress import Progress, interruptible
+from hybridvo.commands.progress import Progress
 from hybridvo.commands.recording import Recording, check_recording
 from hybridvo.commands.run_folder import RESULTS, STATE, RunFolder
 from hybridvo.data.sequence import Sequence
@@ -39,14 +38,11 @@ from hybridvo.pipeline import check_method, weights_hash
 from hybridvo.tracking.state import TrackerState
 from hybridvo.trajectory import Trajectory
 
-EXIT_DONE, EXIT_FAILED_FRAMES, EXIT_INTERRUPTED = 0, 3, 130
-
+EXIT_DONE, EXIT_FAILED_FRAMES = 0, 3
 RECORDING = "recording.rrd"
 """Name of a Rerun recording within the output folder."""
 SAVE_EVERY = 50
 """Frames after which the run can be resumed."""
-DARK_LEVEL = 20.0
-"""Grey levels (of 255) below which nine tenths of a dark image lie; of a street at night, 60."""
 
 
 def run(
@@ -81,112 +77,96 @@ def run(
     header["command"] = list(command)
     with held(out), contextlib.ExitStack() as stack:
         folder = RunFolder(out, header, mode)
-        if folder.summary is not None:
-            return folder.summary, _exit_code(folder.summary, options)
-        recording = None
-        if rrd is not None:
-            poses = None if sequence.poses is None else sequence.poses[list(frames)]
-            named = (rrd or out / RECORDING, sequence.name, header["input_hash"])
-            first = len(folder.rows)
-            recording = Recording(*named, len(frames), first=first, poses=poses)
-            stack.enter_context(recording)
-        job = _Job(sequence, frames, options, vo, flow, folder, recording, quick)
-        summary, exit_code = job.run(quiet)
-        if recording is not None:
-            summary["recording"] = os.fspath(recording.path)
-        return summary, exit_code
-
-
-@dataclass
-class _Job:
-    """One run under way."""
-
-    sequence: Sequence
-    frames: range
-    options: Options
-    vo: Odometry
-    flow: MeasuredFlow
-    folder: RunFolder
-    recording: Recording | None
-    quick: bool
-
-    def run(self, quiet: bool) -> tuple[dict[str, Any], int]:
-        label = f"{self.sequence.name} [{self.options.run.method}]"
-        folder, rows, total = self.folder, self.folder.rows, len(self.frames)
-        with (
-            interruptible() as interrupted,
-            Progress(label, total, "frames", quiet=quiet, done=len(rows)) as progress,
-        ):
-            for warning in self.sequence.warnings:
-                progress.say(f"warning: {warning}")
-            if folder.tracker is not None:
-                self.vo.resume(TrackerState.from_arrays(folder.tracker))
-                progress.say(f"resumed after {len(rows)} of {total} frames")
-            for index in self.frames[len(rows) :]:
-                if interrupted.is_set():
-                    break
-                rows.append(row := self._track(index))
-                if row["status"] != "ok":
-                    text = f"frame {index}: {row['status']} ({row['reason']}), probability "
-                    progress.say(f"{text}{row['probability']:.2f}: {row['message']}")
-                progress.update(len(rows), sum(row["status"] == "failed" for row in rows))
-                if len(rows) % SAVE_EVERY == 0:
-                    folder.save_rows(self.vo.state.to_arrays())
-            if interrupted.is_set():
-                progress.say(f"interrupted: {len(rows)} frames are kept; go on with --resume")
-                folder.save_rows(self.vo.state.to_arrays() if rows else None)
-                folder.save("interrupted")
-                return {"state": "interrupted", "frames": len(rows)}, EXIT_INTERRUPTED
-            folder.save_rows()
-            given = (folder.path, rows, self.sequence, self.frames, self.options.run)
-            summary = _write_results(*given, picture=not self.quick)
+        summary = folder.summary
+        if summary is None:
+            recording = None
+            if rrd is not None:
+                poses = None if sequence.poses is None else sequence.poses[list(frames)]
+                named = (rrd or out / RECORDING, sequence.name, header["input_hash"])
+                recording = Recording(*named, len(frames), len(folder.rows), poses)
+                stack.enter_context(recording)
+            _estimate(vo, flow, sequence, frames, folder, recording, quiet)
+            given = (out, folder.rows, sequence, frames, options.run)
+            summary = _write_results(*given, picture=not quick)
             folder.save("done", summary=summary)
-            return summary, _exit_code(summary, self.options)
+            if recording is not None:
+                summary["recording"] = os.fspath(recording.path)
+    too_many = summary["failed_fraction"] > options.run.max_failed
+    return summary, EXIT_FAILED_FRAMES if too_many else EXIT_DONE
 
-    def _track(self, index: int) -> dict[str, Any]:
-        """What is kept of a frame, JSON-ready: the columns of ``steps.csv`` and more."""
-        prev, frame, ms = self.vo.state.frame, None, 0.0
-        self.flow.reset()
-        try:
-            frame = self.sequence.frame(index)
-        except (InputError, OSError) as error:
-            if self.options.run.strict:
-                raise InputError(f"frame {index}: {error}") from error
-            step = self.vo.skip(index, float(self.sequence.timestamps[index]), str(error))
-        else:
-            started = time.perf_counter()
-            step = self.vo.track(frame)
-            ms = 1e3 * (time.perf_counter() - started)
-        # the window may have asked for more, from its key frames
-        field = next(iter(self.flow.fields.values()), FlowField(None, source=""))
-        if frame is not None and self.recording is not None:
-            self.recording.add(frame, step, field.flow)
-        motion, message = step.motion, " ".join(step.status.message.split())
-        if frame is not None and not step.ok and is_dark(frame.rgb):
-            message = f"the image is dark; {message}"
-        values = [*motion.T_curr_prev[:3, 3].tolist(), *se3_log(motion.T_curr_prev)[3:].tolist()]
-        return {
-            "index": step.index,
-            "timestamp": step.timestamp,
-            "status": step.status.state.value,
-            "reason": step.status.reason.value,
-            "probability": float(motion.probability),
-            **dict(zip(("tx", "ty", "tz", "rx", "ry", "rz"), values, strict=True)),
-            "inlier_ratio": float(motion.inlier_ratio),
-            "iterations": int(motion.iterations),
-            "cost": float(motion.cost),
-            "flow_ms": round(self.flow.ms, 3),
-            "motion_ms": round(ms - self.flow.ms, 3),
-            "frame_ms": round(ms, 3),
-            "prev_index": None if prev is None else prev.index,
-            "flow_source": field.source,
-            "message": message,
-            "T_curr_prev": motion.T_curr_prev.tolist(),
-            "T_world_cam": step.T_world_cam.tolist(),
-            "covariance": motion.covariance.tolist(),
-            "flow_is_true": field.flow is not None and field.is_true,
-            **step_errors(self.sequence, prev, step.index, step.T_curr_prev),
-        }
+
+def _estimate(
+    vo: Odometry,
+    flow: MeasuredFlow,
+    sequence: Sequence,
+    frames: range,
+    folder: RunFolder,
+    recording: Recording | None,
+    quiet: bool,
+) -> None:
+    """Track the frames that the folder has no rows of yet."""
+    label, rows = f"{sequence.name} [{vo.method}]", folder.rows
+    with Progress(label, len(frames), "frames", quiet=quiet, done=len(rows)) as progress:
+        for warning in sequence.warnings:
+            progress.say(f"warning: {warning}")
+        if folder.tracker is not None:
+            vo.resume(TrackerState.from_arrays(folder.tracker))
+            progress.say(f"resumed after {len(rows)} of {len(frames)} frames")
+        for index in frames[len(rows) :]:
+            rows.append(row := _track(vo, flow, sequence, index, recording))
+            if row["status"] != "ok":
+                text = f"frame {index}: {row['status']} ({row['reason']}), probability "
+                progress.say(f"{text}{row['probability']:.2f}: {row['message']}")
+            progress.update(len(rows), sum(row["status"] == "failed" for row in rows))
+            if len(rows) % SAVE_EVERY == 0:
+                folder.save_rows(vo.state.to_arrays())
+        folder.save_rows()
+
+
+def _track(
+    vo: Odometry, flow: MeasuredFlow, sequence: Sequence, index: int, recording: Recording | None
+) -> dict[str, Any]:
+    """What is kept of a frame, JSON-ready: the columns of ``steps.csv`` and more."""
+    prev, frame, ms = vo.state.frame, None, 0.0
+    flow.reset()
+    try:
+        frame = sequence.frame(index)
+    except (InputError, OSError) as error:
+        if vo.options.run.strict:
+            raise InputError(f"frame {index}: {error}") from error
+        step = vo.skip(index, float(sequence.timestamps[index]), str(error))
+    else:
+        started = time.perf_counter()
+        step = vo.track(frame)
+        ms = 1e3 * (time.perf_counter() - started)
+    # the window may have asked for more, from its key frames
+    field = next(iter(flow.fields.values()), FlowField(None, source=""))
+    if frame is not None and recording is not None:
+        recording.add(frame, step, field.flow)
+    motion = step.motion
+    values = [*motion.T_curr_prev[:3, 3].tolist(), *se3_log(motion.T_curr_prev)[3:].tolist()]
+    return {
+        "index": step.index,
+        "timestamp": step.timestamp,
+        "status": step.status.state.value,
+        "reason": step.status.reason.value,
+        "probability": float(motion.probability),
+        **dict(zip(("tx", "ty", "tz", "rx", "ry", "rz"), values, strict=True)),
+        "inlier_ratio": float(motion.inlier_ratio),
+        "iterations": int(motion.iterations),
+        "cost": float(motion.cost),
+        "flow_ms": round(flow.ms, 3),
+        "motion_ms": round(ms - flow.ms, 3),
+        "frame_ms": round(ms, 3),
+        "prev_index": None if prev is None else prev.index,
+        "flow_source": field.source,
+        "message": " ".join(step.status.message.split()),
+        "T_curr_prev": motion.T_curr_prev.tolist(),
+        "T_world_cam": step.T_world_cam.tolist(),
+        "covariance": motion.covariance.tolist(),
+        "flow_is_true": field.flow is not None and field.is_true,
+        **step_errors(sequence, prev, step.index, step.T_curr_prev),
+    }
 
 
 def _write_results(
@@ -238,8 +218,6 @@ def _summarise(table: pd.DataFrame, sequence: Sequence, method: str) -> dict[str
     timed = motions[motions["reason"] != "missing_frame"]
     failed = int((motions["status"] == "failed").sum())
     doubts = motions[(motions["status"] == "ok") & (motions["message"] != "")]
-    if any("the median depth" in text for text in sequence.warnings):  # said before the run
-        doubts = doubts[:0]
     # what the estimate was given that no sensor gives
     oracle = ["true flow"] if table["flow_is_true"].any() else []
     oracle += ["true depth"] if sequence.depth_source == "true" else []
@@ -277,11 +255,6 @@ def _header(sequence: Sequence, options: Options, weights: str | None) -> dict[s
         "options": tree,
         "sequence": os.fspath(sequence.root),
     }
-
-
-def is_dark(rgb: np.ndarray | None) -> bool:
-    """Whether an image (H, W, 3) uint8 is too dark to see anything in."""
-    return rgb is not None and float(np.percentile(rgb[::4, ::4].max(axis=2), 90)) < DARK_LEVEL
 
 
 def frames_of(sequence: Sequence, options: Options) -> range:
@@ -322,8 +295,3 @@ def _folder(out: str | os.PathLike[str] | None, sequence: Sequence) -> Path:
             f"input. Choose another --out."
         )
     return out
-
-
-def _exit_code(summary: dict[str, Any], options: Options) -> int:
-    too_many = summary["failed_fraction"] > options.run.max_failed
-    return EXIT_FAILED_FRAMES if too_many else EXIT_DONE

@@ -4,24 +4,24 @@ from __future__ import annotations
 
 import itertools
 from pathlib import Path
-from statistics import mode
 
 import numpy as np
 
 from hybridvo.data.base import Files, Sequence
-from hybridvo.data.camera_file import CAMERA_FILE, IMAGES, Calibration, read_camera_file
+from hybridvo.data.camera_file import CAMERA_FILE, Calibration, read_camera_file
 from hybridvo.data.lists import (
+    IMAGES,
     depth_at,
     match_files,
     poses_at,
     read_stamps,
     read_timed_poses,
-    shown,
     sorted_files,
     to_seconds,
 )
 from hybridvo.errors import InputError
 from hybridvo.trajectory import stamp_unit
+from hybridvo.types import as_number
 
 
 class FolderSequence(Sequence):
@@ -36,19 +36,16 @@ class FolderSequence(Sequence):
     depth_source = "file"
     markers = ((CAMERA_FILE,),)
 
-    @classmethod
-    def looks_for(cls) -> str:
-        """What a folder of this kind holds, for messages."""
-        return f"folder: {CAMERA_FILE} (hybridvo init DIR writes one) with rgb/ and depth/"
-
     def _list_files(self) -> None:
-        root, settings = self.root, self.root / CAMERA_FILE
-        self._settings = read_camera_file(settings) if settings.exists() else None
+        root, settings, told = self.root, self.root / CAMERA_FILE, self.warnings
+        self._settings = read_camera_file(settings, told) if settings.exists() else None
         if self._settings is None and self._given_camera is None:
             raise InputError(
                 f"{root}: no {CAMERA_FILE}, and no camera is given. Write one with 'hybridvo init "
                 f"{root}' and fill it in, or give --camera fx,fy,cx,cy or --camera FILE."
             )
+        if self._settings is not None and self._given_scale is None:
+            self._given_scale = self._settings.depth_scale
         rgb = sorted_files(root / "rgb", IMAGES)
         depth = sorted_files(root / "depth", (".png", ".npy", ".dpt"))
         flow = sorted_files(root / "flow", (".flo", ".npy", ".png"))
@@ -56,17 +53,17 @@ class FolderSequence(Sequence):
         if self._mask_folder is None and (root / "mask").is_dir():
             self._mask_folder = root / "mask"
         frames = rgb or depth
-        matched_flow = self._match_flow(frames, flow)
-        matched = self._match_depth(rgb, depth) if rgb else dict(enumerate(depth))
-        kept = list(matched)
-        self.rgb_files = [rgb[i] if rgb else None for i in kept]
-        self.depth_files = [*matched.values()]
-        self.flow_files = [matched_flow[i] if i + 1 in matched else None for i in kept]
+        flow_of = self._match_flow(frames, flow)
         stamps, poses = self._stamps_and_poses(frames)
+        depth_of = self._match_depth(rgb, depth) if rgb else dict(enumerate(depth))
+        kept = list(depth_of)
+        self.rgb_files = [rgb[i] if rgb else None for i in kept]
+        self.depth_files = [*depth_of.values()]
+        self.flow_files = [flow_of[i] if i + 1 in depth_of else None for i in kept]
         self.timestamps, self.poses = stamps[kept], None if poses is None else poses[kept]
         lists = (CAMERA_FILE, "timestamps.txt", "depth_timestamps.txt", "poses.txt")
         self._sources = [root / name for name in lists]
-        self.warnings = list(dict.fromkeys(self.warnings))
+        self.warnings = list(dict.fromkeys(told))
 
     def _calibration(self) -> Calibration | None:
         return self._settings
@@ -75,98 +72,75 @@ class FolderSequence(Sequence):
         """Refuse what no frame can be made of, before anything is matched."""
         root, settings = self.root, self._settings
         if not depth:
-            what = "no depth" if rgb else "no frames"
             raise InputError(
-                f"{root / 'depth'}: {what}: expected a 16-bit PNG, .npy or .dpt for each PNG or "
-                f"JPEG in rgb/. hybridvo needs metric depth, from a sensor, stereo or a network."
+                f"{root / 'depth'}: no {'depth' if rgb else 'frames'}: expected a 16-bit PNG, .npy "
+                f"or .dpt for each image in rgb/. hybridvo needs metric depth, from a sensor, "
+                f"stereo or a network."
             )
-        has_scale = self._given_scale or (settings is not None and settings.depth_scale)
-        if not has_scale and any(path.suffix.lower() == ".png" for path in depth):
+        if self._given_scale is None and any(path.suffix.lower() == ".png" for path in depth):
             raise InputError(
                 f"{root / CAMERA_FILE}: depth/ holds PNG files: 'depth_scale' (units per metre, "
                 f"1000 for millimetres) must be given, there or with --depth-scale."
             )
         if flow and settings is not None and any(settings.distortion):
             raise InputError(
-                f"{root}: flow/ was computed on distorted images, and {CAMERA_FILE} gives a "
-                f"distortion. Undistort the images first and compute flow on those, or remove "
-                f"flow/ and let hybridvo compute it."
+                f"{root}: flow/ was computed on distorted images. Undistort the images first and "
+                f"compute flow on those, or remove flow/ and let hybridvo compute it."
             )
 
     def _match_depth(self, frames: list[Path], files: list[Path]) -> dict[int, Path | None]:
         """Index of each frame that is kept -> its depth."""
-        root, told = self.root, self.warnings
-        stems = {path.stem for path in frames}
-        stray = [path.name for path in files if path.stem not in stems]
-        if len(stray) == len(files):
-            stamps = self._stamps(root / "timestamps.txt", frames)
-            depth_stamps = self._stamps(root / "depth_timestamps.txt", files)
+        if not {path.stem for path in frames} & {path.stem for path in files}:
+            stamps = self._stamps("timestamps.txt", frames)
+            depth_stamps = self._stamps("depth_timestamps.txt", files)
             if stamps is not None and depth_stamps is not None:
-                return {i: files[j] for i, j in depth_at(stamps, depth_stamps, root, told)}
-        elif stray:
-            left_out = f"{len(stray)} depth files without an image are left out"
-            told.append(f"{root.name}: {left_out}: {shown(stray, 4)}.")
+                pairs = depth_at(stamps, depth_stamps, self.root, self.warnings)
+                return {i: files[j] for i, j in pairs}
         hint = "Give both the same names, or their stamps: as names, or in (depth_)timestamps.txt."
-        return dict(enumerate(match_files(frames, files, root / "depth", hint)))
+        return dict(enumerate(match_files(frames, files, self.root / "depth", hint)))
 
     def _match_flow(self, frames: list[Path], files: list[Path]) -> Files:
-        """Flow by equal names, else by order; one that led to a missing image is left out."""
+        """Flow by equal names, else by order; what led to an image that is missing is left out."""
         if not files:
             return [None] * len(frames)
         last = len(frames) - (len(files) == len(frames) - 1)  # none starts at the last image
         hint = "Give both the same names."
         matched = match_files(frames[:last], files, self.root / "flow", hint)
         matched += [None] * (len(frames) - last)
-        is_numbered = all(path.stem.isascii() and path.stem.isdigit() for path in (*frames, *files))
-        if not is_numbered or not {path.stem for path in frames} & {path.stem for path in files}:
-            return matched
-        numbers = [int(path.stem) for path in frames]
-        usual = mode([b - a for a, b in itertools.pairwise(numbers)] or [1])
-        # a flow file between two images, or an unusual step: an image is missing there
-        known = sorted({*numbers, *(int(path.stem) for path in files)})
-        follows = dict(itertools.pairwise(known))
-        lost = [
-            k
-            for k, (a, b) in enumerate(itertools.pairwise(numbers))
-            if matched[k] is not None and not follows[a] == b == a + usual
-        ]
-        for k in lost:
-            matched[k] = None
-        if lost:
-            self.warnings.append(
-                f"{self.name}: images are missing after {shown([frames[k].name for k in lost], 4)}"
-                f": the flow files of these lead to the missing ones and are not used."
-            )
+        known = {path.stem for path in (*frames, *files)}
+        if len(known) < len(frames) + len(files) and all(x.isdecimal() for x in known):
+            step = min(np.diff(sorted(map(int, known))), default=1)
+            for k, (a, b) in enumerate(itertools.pairwise(int(path.stem) for path in frames)):
+                if matched[k] is not None and b - a != step:
+                    matched[k] = None
+                    told = f"the flow from {a} led to a missing image and is not used"
+                    self.warnings.append(f"{self.name}: {told}.")
         return matched
 
     def _stamps_and_poses(self, frames: list[Path]) -> tuple[np.ndarray, np.ndarray | None]:
         """Seconds of all frames and their ground-truth poses, where poses.txt has them."""
-        told, pose_file, listed = self.warnings, self.root / "poses.txt", "timestamps.txt"
+        told, pose_file = self.warnings, self.root / "poses.txt"
         truth = read_timed_poses(pose_file, told) if pose_file.exists() else None
-        if truth and len(truth[1]) == len(frames) and not (self.root / listed).exists():
+        if truth and len(truth[1]) == len(frames) and not (self.root / "timestamps.txt").exists():
             return truth
-        stamps = self._stamps(self.root / listed, frames)
+        stamps = self._stamps("timestamps.txt", frames)
         if stamps is None:
-            fps = self._settings.fps if self._settings else None
-            if fps is None:
-                told.append(
-                    f"{self.name}: no time stamps ({listed}, one a line); "
-                    f"{self.frames_per_second:g} frames a second assumed."
-                )
-            stamps = np.arange(len(frames)) / (fps or self.frames_per_second)
-        return stamps, truth and poses_at(stamps, *truth, str(pose_file), told)
+            fps = self._settings and self._settings.fps
+            if not fps:
+                fps = self.frames_per_second
+                told.append(f"{self.name}: no time stamps; {fps:g} frames a second assumed.")
+            stamps = np.arange(len(frames)) / fps
+        return stamps, truth and poses_at(stamps, *truth)
 
-    def _stamps(self, path: Path, files: list[Path]) -> np.ndarray | None:
+    def _stamps(self, name: str, files: list[Path]) -> np.ndarray | None:
         """Seconds from a list, else from file names that are stamps, where either has them."""
+        path = self.root / name
         if path.exists():
             stamps, _ = read_stamps(path, self.warnings)
             if len(stamps) != len(files):
                 raise InputError(f"{path}: {len(stamps)} stamps for {len(files)} files.")
             return stamps
-        try:
-            values = np.array([float(file.stem) for file in files])
-        except ValueError:
-            return None
+        values = np.array([as_number(file.stem) for file in files])
         # counters are no stamps
         is_stamp = all("." in file.stem for file in files) or stamp_unit(values)[0] != 1
         if not is_stamp or not np.isfinite(values).all():

@@ -22,7 +22,6 @@ TAG_BYTES = struct.pack("<f", 202021.25)
 PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 JPEG_MAGIC = b"\xff\xd8"
 UNKNOWN_FLOW = 1e9  # Middlebury's mark: flow beyond this is unknown
-COPY_AGAIN = "Copy or download the file again."
 PathLike = str | os.PathLike[str]
 
 
@@ -53,14 +52,12 @@ def read_depth(path: PathLike) -> np.ndarray:
     """(H, W) depth as stored: float32 (``.dpt``, ``.npy``) or unsigned (16-bit PNG, ``.npy``)."""
     suffix = Path(path).suffix.lower()
     if suffix == ".dpt":
-        return _read_tagged(path, suffix, 1)[:, :, 0]
+        return _read_tagged(path, 1)[:, :, 0]
     if suffix != ".npy":
         return read_png(path, np.uint16, 1, "a 16-bit depth PNG")
     depth = read_npy(path)
     if depth.dtype.kind not in "fu":
-        raise FormatError(
-            f"{path}: expected depth as floating point or unsigned integers, got {depth.dtype}."
-        )
+        raise FormatError(f"{path}: expected depth as floating point or unsigned integers.")
     return depth
 
 
@@ -72,15 +69,12 @@ def read_flow(path: PathLike) -> tuple[np.ndarray, np.ndarray | None]:
     """
     suffix = Path(path).suffix.lower()
     if suffix == ".flo":
-        flow = _read_tagged(path, suffix, 2)
+        flow = _read_tagged(path, 2)
         with np.errstate(invalid="ignore"):
             known = (np.abs(flow) < UNKNOWN_FLOW).all(axis=2)
         return flow, None if known.all() else known
     if suffix == ".npy":
-        flow = read_npy(path, channels=2)
-        if flow.dtype != np.float32:
-            raise FormatError(f"{path}: expected flow as floating point, got {flow.dtype}.")
-        return flow, None
+        return read_npy(path, channels=2).astype(np.float32, copy=False), None
     flow, image = read_flow_png(path, (2, 1, 0))
     valid: np.ndarray = image > 0
     flow[~valid] = np.nan
@@ -98,8 +92,8 @@ def read_flow_png(path: PathLike, order: tuple[int, int, int]) -> tuple[np.ndarr
 
 def read_cam(path: PathLike) -> tuple[np.ndarray, np.ndarray]:
     """Intrinsics K (3, 3) and extrinsic T_cam_world (4, 4) of a Sintel ``.cam`` file."""
-    data = _tagged_bytes(path, ".cam")
-    _check_size(path, 4 + 21 * 8, len(data), ".cam")
+    data = _tagged_bytes(path)
+    _check_size(path, 4 + 21 * 8, len(data))
     values = np.frombuffer(data, dtype="<f8", offset=4).astype(np.float64)
     if not np.isfinite(values[:9]).all():
         raise FormatError(f"{path}: expected finite intrinsics, got {values[:9].tolist()}.")
@@ -124,13 +118,11 @@ def read_npy(path: PathLike, *, channels: int | None = None) -> np.ndarray:
     except Exception as error:  # numpy raises errors of many kinds for a damaged header
         reason = " ".join(str(error).split())[:200]
         raise FormatError(f"{path}: expected a whole .npy file of one array ({reason}).") from None
-    expected = "(H, W)" if channels is None else f"(H, W, {channels})"
-    shaped = array.ndim == expected.count(",") + 1 and array.shape[2:] in ((), (channels,))
-    kind = array.dtype
-    if kind.kind not in "fiub" or not shaped or trailing:
+    kind, expected = array.dtype, (2, ()) if channels is None else (3, (channels,))
+    if kind.kind not in "fiub" or (array.ndim, array.shape[2:]) != expected or trailing:
         raise FormatError(
-            f"{path}: expected an array of numbers of shape {expected}, got {kind} {array.shape} "
-            f"and {trailing} trailing bytes."
+            f"{path}: expected an array of numbers of shape (H, W{', 2' * bool(channels)}), got "
+            f"{kind} {array.shape} and {trailing} trailing bytes."
         )
     _check_pixels(path, array.shape[1], array.shape[0])
     target = np.dtype(np.float32) if kind.kind == "f" else kind.newbyteorder("=")
@@ -155,40 +147,34 @@ def write_cam(path: PathLike, K: np.ndarray, T_cam_world: np.ndarray) -> None:
         file.write(np.asarray(T_cam_world, "<f8")[:3].tobytes())
 
 
-def _check_size(path: object, expected: int, got: int, what: str) -> None:
+def _check_size(path: object, expected: int, got: int) -> None:
     if got != expected:
         problem = "truncated" if got < expected else f"{got - expected} trailing bytes"
-        raise FormatError(
-            f"{path}: {problem}: expected {expected} bytes ({what}), got {got}. {COPY_AGAIN}"
-        )
+        raise FormatError(f"{path}: {problem}: expected {expected} bytes, got {got}.")
 
 
 def _check_pixels(path: object, width: int, height: int) -> None:
     if width <= 0 or height <= 0 or width * height > MAX_PIXELS:
         raise FormatError(
             f"{path}: expected an image of 1 to {MAX_PIXELS} pixels, the header declares "
-            f"{width}x{height}. The file is damaged or of another format."
+            f"{width}x{height}."
         )
 
 
-def _tagged_bytes(path: PathLike, suffix: str) -> bytes:
+def _tagged_bytes(path: PathLike) -> bytes:
     data = read_bytes(path)
     if not data.startswith(TAG_BYTES):
-        raise FormatError(
-            f"{path}: not a little-endian {suffix} file: expected the first bytes {TAG_BYTES!r}, "
-            f"got {data[:4]!r}."
-        )
+        expected = f"a little-endian file that starts with {TAG_BYTES!r}"
+        raise FormatError(f"{path}: expected {expected}, got {data[:4]!r}.")
     return data
 
 
-def _read_tagged(path: PathLike, suffix: str, channels: int) -> np.ndarray:
+def _read_tagged(path: PathLike, channels: int) -> np.ndarray:
     """(H, W, channels) of .flo and .dpt: tag, width, height, values."""
-    data = _tagged_bytes(path, suffix)
-    if len(data) < 12:
-        raise FormatError(f"{path}: truncated: expected a header of 12 bytes, got {len(data)}.")
-    width, height = struct.unpack("<ii", data[4:12])
+    data = _tagged_bytes(path)
+    width, height = struct.unpack("<ii", data[4:12].ljust(8, b"\0"))
     _check_pixels(path, width, height)
-    _check_size(path, 12 + 4 * channels * height * width, len(data), f"{suffix} {width}x{height}")
+    _check_size(path, 12 + 4 * channels * height * width, len(data))
     array = np.frombuffer(data, dtype="<f4", offset=12).reshape(height, width, channels)
     return array.astype(np.float32)
 
@@ -198,21 +184,17 @@ def _decode(path: PathLike, flags: int) -> np.ndarray:
     data = read_bytes(path)
     is_png = data.startswith(PNG_MAGIC) and len(data) >= 33
     if is_png:
-        width, height = struct.unpack(">II", data[16:24])
-        _check_pixels(path, width, height)
+        _check_pixels(path, *struct.unpack(">II", data[16:24]))
     elif not data.startswith(JPEG_MAGIC):
-        raise FormatError(
-            f"{path}: expected a whole PNG or JPEG image, got bytes that start with {data[:8]!r}. "
-            f"Convert the image to PNG."
-        )
+        raise FormatError(f"{path}: expected a whole PNG or JPEG image, got {data[:8]!r}.")
     # OpenCV fills what is missing of a JPEG with grey: look for the closing marker after the pixels
     pixels, closing = (b"IDAT", b"IEND") if is_png else (b"\xff\xda", b"\xff\xd9")
     if data.rfind(closing) <= data.rfind(pixels):
-        raise FormatError(f"{path}: truncated: {len(data)} bytes end too early. {COPY_AGAIN}")
+        raise FormatError(f"{path}: truncated: {len(data)} bytes end too early.")
     try:  # orientation is ignored: the intrinsics belong to the pixels as they are stored
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
-    except cv2.error as error:
-        raise FormatError(f"{path}: the image cannot be decoded ({error.err}).") from None
+    except cv2.error:
+        image = None
     if image is None:
-        raise FormatError(f"{path}: damaged: the image cannot be decoded. {COPY_AGAIN}")
+        raise FormatError(f"{path}: damaged: the image cannot be decoded.")
     return image

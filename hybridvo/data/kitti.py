@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -15,7 +16,7 @@ from hybridvo.errors import FormatError, InputError
 from hybridvo.files import read_text
 from hybridvo.geometry import invert
 from hybridvo.trajectory import read_poses
-from hybridvo.types import Camera
+from hybridvo.types import Camera, Frame
 
 DISPARITY_SIGMA_PX = 0.5
 """Assumed standard deviation of a block-matched disparity, px: sets the relative depth noise."""
@@ -36,24 +37,20 @@ class KittiSequence(Sequence):
     markers = (("calib.txt", "image_2"), ("calib.txt", "image_0"))
 
     def _list_files(self) -> None:
-        root, calibration = self.root, self.root / "calib.txt"
+        root, told = self.root, self.warnings
         images = {n: numbered_files(root / f"image_{n}", r"(\d+)\.(?:png|jpg)") for n in "2301"}
-        left = "2" if images["2"] else "0"
-        right = {"2": "3", "0": "1"}[left]
-        folders = (root / name for name in ("depth", "depth_2", "depth_0"))
-        stored = (numbered_files(folder, r"(\d+)\.(?:png|npy)") for folder in folders)
-        depth = next((files for files in stored if files), {})
+        left, right = ("2", "3") if images["2"] else ("0", "1")
+        depth = numbered_files(root / "depth", r"(\d+)\.(?:png|npy)")
+        calibration, times = root / "calib.txt", root / "times.txt"
+        self._sources += [calibration, times]
         self._P_left = _read_projection(calibration, left)
-        self._disparity_at_1m = 0.0  # px: focal length times baseline
         if not depth and images[right]:
             self.depth_source, depth = "stereo", images[right]
             P_right = _read_projection(calibration, right)
+            # px: focal length times baseline
             self._disparity_at_1m = float(self._P_left[0, 3] - P_right[0, 3])
             if not self._disparity_at_1m > 0:
-                raise FormatError(
-                    f"{calibration}: expected the camera of image_{right} to the right of the one "
-                    f"of image_{left}."
-                )
+                raise FormatError(f"{calibration}: expected P{right} to the right of P{left}.")
         if images[left] and not depth:
             raise InputError(
                 f"{root}: no source of depth: expected a folder depth (16-bit PNG, 256 per metre, "
@@ -61,33 +58,24 @@ class KittiSequence(Sequence):
             )
         depth = {n: path for n, path in depth.items() if n in images[left]}
         numbers = self._list_numbered(images[left], depth)
-        self._read_times(numbers)
-        self._sources += [calibration, root / "times.txt"]
-        name = f"{root.name}.txt"
-        beside = (root / "poses" / name, root / "poses.txt", root.parent / "poses" / name)
-        for path in (*beside, root.parent.parent / "poses" / name):
-            if path.is_file():
+        self._left = {depth[n]: images[left][n] for n in depth}
+        if times.exists():
+            stamps, _ = read_stamps(times, told)
+            if numbers and numbers[-1] >= len(stamps):
+                raise FormatError(
+                    f"{times}: expected a line for image {numbers[-1]}, got {len(stamps)} lines."
+                )
+            self.timestamps = stamps[numbers]
+        else:
+            told.append(f"{times}: not there; {self.frames_per_second:g} frames a second assumed.")
+        for path in (root / "poses.txt", root.parent.parent / "poses" / f"{root.name}.txt"):
+            if path.is_file() and self.poses is None:
                 # the file holds the poses of camera 0
                 T_cam_cam0 = np.eye(4)
                 T_cam_cam0[:3, 3] = np.linalg.solve(self._P_left[:, :3], self._P_left[:, 3])
                 poses = read_poses(path, "kitti")[1] @ invert(T_cam_cam0)
-                self.poses = numbered_poses(numbers, poses, path, self.warnings)
+                self.poses = numbered_poses(numbers, poses)
                 self._sources.append(path)
-                break
-
-    def _read_times(self, numbers: list[int]) -> None:
-        """Line i belongs to image number i."""
-        path = self.root / "times.txt"
-        if not path.exists():
-            rate = f"{self.frames_per_second:g} frames a second"
-            self.warnings.append(f"{path}: not there; stamps count {rate}.")
-            return
-        times, _ = read_stamps(path, self.warnings)
-        if numbers and numbers[-1] >= len(times):
-            raise FormatError(
-                f"{path}: expected a line for image {numbers[-1]}, got {len(times)} lines."
-            )
-        self.timestamps = times[numbers]
 
     def _calibration(self) -> Calibration:
         """The rectified left camera."""
@@ -95,39 +83,35 @@ class KittiSequence(Sequence):
             camera = Camera.from_matrix(self._P_left[:, :3], self.height, self.width)
         except InputError as error:
             raise FormatError(f"{self.root / 'calib.txt'}: {error}") from None
-        return Calibration(camera)
+        return Calibration(**vars(camera))
 
-    def _read_depth(self, path: Path, rgb: np.ndarray | None) -> np.ndarray:
-        if self.depth_source == "file":
-            return super()._read_depth(path, rgb)
-        if rgb is None:
-            raise FileNotFoundError(f"{path}: the left image for the stereo depth is missing.")
-        right = read_rgb(path)
-        self._check_shape(right, path, "a right image")
-        disparity = _disparity(rgb, right)
-        depth = np.zeros_like(disparity)
+    def frame(self, index: int) -> Frame:
+        """Frame ``index``; the variance of log depth of a stereo pair is (sigma_d z / (f b))^2."""
+        frame = super().frame(index)
+        if self.depth_source != "stereo" or frame.depth is None:
+            return frame
+        sigma = DISPARITY_SIGMA_PX * frame.depth / self._disparity_at_1m
+        return replace(frame, depth_variance=np.square(sigma))
+
+    def _read_depth(self, path: Path) -> np.ndarray:
+        if self.depth_source != "stereo":
+            return super()._read_depth(path)
+        disparity = _disparity(read_rgb(self._left[path]), read_rgb(path), path)
         found = disparity > 0
-        depth[found] = self._disparity_at_1m / disparity[found]
-        return depth
-
-    def _depth_variance(self, depth: np.ndarray) -> np.ndarray | None:
-        """Variance of log depth of a stereo pair: (sigma_d z / (f b))^2."""
-        if self.depth_source == "file":
-            return None
-        return np.square(DISPARITY_SIGMA_PX * depth / self._disparity_at_1m).astype(np.float32)
+        return np.where(found, self._disparity_at_1m / np.where(found, disparity, 1), 0)
 
 
-def _disparity(left: np.ndarray, right: np.ndarray) -> np.ndarray:
+def _disparity(left: np.ndarray, right: np.ndarray, path: Path) -> np.ndarray:
     """(H, W) float32 disparity in pixels of a rectified pair; 0 or less where nothing matches."""
-    # 128 px at KITTI's size: everything beyond 3 m. Narrow images cannot be searched as far.
-    disparities = min(128, max(16, left.shape[1] // 2 // 16 * 16))
-    block = 5
+    if left.shape != right.shape:
+        raise FormatError(f"{path}: expected the size of the left image, got {right.shape}.")
     matcher = cv2.StereoSGBM.create(
         minDisparity=0,
-        numDisparities=disparities,
-        blockSize=block,
-        P1=8 * block * block,
-        P2=32 * block * block,
+        # 128 px at KITTI's size: everything beyond 3 m; narrow images cannot be searched as far
+        numDisparities=min(128, max(16, left.shape[1] // 2 // 16 * 16)),
+        blockSize=5,
+        P1=8 * 5 * 5,
+        P2=32 * 5 * 5,
         disp12MaxDiff=1,
         uniquenessRatio=10,
         speckleWindowSize=100,
@@ -140,21 +124,17 @@ def _disparity(left: np.ndarray, right: np.ndarray) -> np.ndarray:
 
 def _read_projection(path: Path, number: str) -> np.ndarray:
     """(3, 4) projection of a rectified camera: fx 0 cx tx, 0 fy cy ty, 0 0 1 tz."""
-    found = None
     for line, text in enumerate(read_text(path).split("\n"), start=1):
         name, _, rest = text.partition(":")
-        if not name.startswith("P"):
+        if name not in (f"P{number}", f"P_rect_0{number}"):
             continue
         try:
             P = np.array(rest.split(), dtype=np.float64).reshape(3, 4)
         except ValueError:
             P = np.zeros((3, 4))
         is_rectified = P[1, 0] == 0 and np.allclose(P[2, :3], (0, 0, 1)) and P[0, 0] * P[1, 1] > 0
-        if not (is_rectified and np.isfinite(P).all()):
-            expected = f"{name}: fx 0 cx tx 0 fy cy ty 0 0 1 tz"
-            raise FormatError(f"{path}:{line}: expected {expected}, got {rest[:200]!r}.")
-        if name in (f"P{number}", f"P_rect_0{number}"):
-            found = P
-    if found is None:
-        raise FormatError(f"{path}: expected a line 'P{number}: ...', found none.")
-    return found
+        if is_rectified and np.isfinite(P).all():
+            return P
+        expected = f"{name}: fx 0 cx tx 0 fy cy ty 0 0 1 tz"
+        raise FormatError(f"{path}:{line}: expected {expected}, got {rest[:200]!r}.")
+    raise FormatError(f"{path}: expected a line 'P{number}: ...', found none.")

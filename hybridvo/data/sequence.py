@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import itertools
 import os
 from collections.abc import Callable, Iterator
@@ -13,10 +12,10 @@ from typing import Any
 import cv2
 import numpy as np
 
-from hybridvo.data.base import Sequence
-from hybridvo.data.camera_file import Calibration
+from hybridvo.data.base import Sequence, looks_for
 from hybridvo.data.folder import FolderSequence
 from hybridvo.data.kitti import KittiSequence
+from hybridvo.data.lists import shown
 from hybridvo.data.seven_scenes import SevenScenesSequence
 from hybridvo.data.sintel import SintelSequence
 from hybridvo.data.tartanair import TartanAirSequence
@@ -25,36 +24,31 @@ from hybridvo.errors import InputError
 from hybridvo.flow import check_field, file_flow
 from hybridvo.types import Camera, Frame, FramePair
 
-READERS: dict[str, type[Sequence]] = {
-    reader.kind: reader
-    for reader in (
-        SintelSequence,
-        TartanAirSequence,
-        SevenScenesSequence,
-        FolderSequence,
-        KittiSequence,
-        TumSequence,
-    )
-}
+_READERS: tuple[type[Sequence], ...] = (
+    *(SintelSequence, TartanAirSequence, SevenScenesSequence),
+    *(FolderSequence, KittiSequence, TumSequence),
+)
+READERS = {reader.kind: reader for reader in _READERS}
 """Kind -> reader, in the order in which a folder is tried."""
 DATASETS = tuple(READERS)
 OWN_DATA = (
-    "Own data: put images into rgb/, depth registered to them into depth/, and describe the camera "
-    "with 'hybridvo init DIR' (kind 'folder')."
+    "Own data: hybridvo needs metric depth for each image, from a sensor, stereo or a network. Put "
+    "images into rgb/, depth registered to them into depth/, and describe the camera with "
+    "'hybridvo init DIR' (kind 'folder')."
 )
 
 
 def open_sequence(
     path: str | os.PathLike[str],
     dataset: str | None = None,
-    camera: str | os.PathLike[str] | Camera | Calibration | None = None,
+    camera: str | os.PathLike[str] | Camera | None = None,
     depth_scale: float | None = None,
     mask: str | os.PathLike[str] | None = None,
 ) -> Sequence:
     """Open a sequence folder as its data set ships it.
 
     Args:
-        path: the folder, or one of its image, depth or flow folders.
+        path: the folder.
         dataset: one of ``DATASETS``; detected from the files by default.
         camera: ``fx,fy,cx,cy`` in pixels, a camera file (``camera.yaml``, ROS ``camera_info``,
             RealSense intrinsics), or a camera; the data set's by default.
@@ -66,51 +60,33 @@ def open_sequence(
             FormatError: a list or calibration file that is damaged.
     """
     if dataset is not None and dataset not in READERS:
-        close = difflib.get_close_matches(dataset, DATASETS, n=1)
-        hint = f" (did you mean '{close[0]}'?)" if close else ""
-        raise InputError(
-            f"dataset: '{dataset}' is unknown{hint}; known: {', '.join(DATASETS)}. {OWN_DATA}"
-        )
+        known = ", ".join(DATASETS)
+        raise InputError(f"dataset: '{dataset}' is unknown; known: {known}. {OWN_DATA}")
     folder = Path(path)
     try:
-        kind, root = _detect(folder, DATASETS if dataset is None else (dataset,))
-        sequence = READERS[kind](root, camera, depth_scale, mask)
+        return _reader(folder, dataset)(folder.absolute(), camera, depth_scale, mask)
     except FileNotFoundError as error:
         raise InputError(f"{folder}: {error.filename or error} is missing.") from None
     except OSError as error:  # a name that is too long, a folder that may not be read
         reason = error.strerror or str(error)
         raise InputError(f"{str(folder)[:200]}: cannot be read: {reason}.") from None
-    if root.resolve() != folder.resolve():
-        sequence.warnings.append(f"{folder}: one folder of a sequence; all of {root} is read.")
-    return sequence
 
 
-def _detect(folder: Path, kinds: tuple[str, ...]) -> tuple[str, Path]:
-    """The first of the kinds that knows a folder, and the sequence that this is a part of."""
-    for kind in kinds:
-        if root := READERS[kind].root_of(folder):
-            return kind, root
-    if not folder.exists():
-        raise InputError(f"{folder}: no such folder.")
+def _reader(folder: Path, dataset: str | None) -> type[Sequence]:
+    """The reader that is asked for, else the first that knows a folder."""
+    known = (reader for reader in _READERS if reader.knows(folder))
+    if reader := next(known, None) if dataset is None else READERS[dataset]:
+        return reader
     if not folder.is_dir():
-        raise InputError(f"{folder}: expected a sequence folder, got a file.")
-    if len(kinds) == 1:
-        return kinds[0], folder.absolute()
-    has_images = (folder / "rgb").is_dir()
-    if has_images and (folder / "depth").is_dir():
-        return FolderSequence.kind, folder.absolute()
-    inside = sorted(path.name for path in folder.iterdir())
-    content = ", ".join(inside[:8]) + (", ..." if len(inside) > 8 else "")
-    if has_images or any(name.lower().endswith((".png", ".jpg")) for name in inside):
-        raise InputError(
-            f"{folder}: images without depth ({content}): hybridvo needs metric depth for each "
-            f"image, from a sensor, stereo or a network. {OWN_DATA}"
-        )
-    looked = "".join(f"\n  {reader.looks_for()}" for reader in READERS.values())
+        got = "a file" if folder.exists() else "no such folder"
+        raise InputError(f"{folder}: expected a sequence folder, got {got}.")
+    if (folder / "rgb").is_dir() and (folder / "depth").is_dir():
+        return FolderSequence
+    inside = shown(sorted(path.name for path in folder.iterdir()))
     raise InputError(
-        f"{folder}: no frames: no known data set. It holds: {content or 'nothing'}. "
-        f"Looked for:{looked}\nSay which with dataset=... (--dataset) if the names differ. "
-        f"{OWN_DATA}"
+        f"{folder}: no frames: no known data set. It holds: {inside or 'nothing'}. Looked for:"
+        + "".join(f"\n  {looks_for(reader)}" for reader in _READERS)
+        + f"\nSay which with dataset=... (--dataset) if the names differ. {OWN_DATA}"
     )
 
 

@@ -8,19 +8,17 @@ import numpy as np
 
 from hybridvo.data.base import Sequence
 from hybridvo.data.camera_file import Calibration
-from hybridvo.data.image_io import as_pose, read_depth
+from hybridvo.data.image_io import as_pose
 from hybridvo.data.lists import numbered_files
 from hybridvo.errors import FormatError
 from hybridvo.files import read_text
-from hybridvo.types import Camera
 
 
 class SevenScenesSequence(Sequence):
     """One sequence such as ``chess/seq-01``: ``frame-000000.{color.png,depth.png,pose.txt}``.
 
     Depth is in millimetres, 0 and 65535 are invalid. K = 585 585 320 240 is the data set's own
-    convention for colour and depth. The data has no stamps. A frame whose pose file is damaged has
-    no ground truth.
+    convention for colour and depth. The data has no stamps.
     """
 
     kind = "7scenes"
@@ -34,26 +32,13 @@ class SevenScenesSequence(Sequence):
             numbered_files(root, r"frame-(\d+)\.(?:color|rgb)\.(?:png|jpg|jpeg)"),
             numbered_files(root, r"frame-(\d+)\.depth\.png"),
         )
-        pose_files = numbered_files(root, r"frame-(\d+)\.pose\.txt")
-        self._sources = [*pose_files.values()]
-        if not pose_files:
-            return
-        self.poses = np.full((len(numbers), 4, 4), np.nan)
-        for i, number in enumerate(numbers):
-            try:
-                if number in pose_files:
-                    self.poses[i] = _read_pose(pose_files[number])
-            except FormatError as error:
-                self.warnings.append(f"no ground truth for frame {i}: {error}")
+        files = numbered_files(root, r"frame-(\d+)\.pose\.txt")
+        self._sources = [*files.values()]
+        if files:
+            self._each_pose([files.get(number) for number in numbers], _read_pose)
 
     def _calibration(self) -> Calibration:
-        return Calibration(Camera(585.0, 585.0, 320.0, 240.0, 480, 640))
-
-    def _read_depth(self, path: Path, rgb: np.ndarray | None) -> np.ndarray:
-        stored = read_depth(path)
-        depth = self._metres(stored)
-        depth[stored == 65535] = 0.0
-        return depth
+        return Calibration(585, 585, 320, 240, 480, 640)
 
 
 def _read_pose(path: Path) -> np.ndarray:

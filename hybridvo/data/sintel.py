@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 
 from hybridvo.data.base import Sequence
-from hybridvo.data.camera_file import Calibration
 from hybridvo.data.image_io import read_cam, read_flow, read_mask_png
 from hybridvo.data.lists import numbered_files
 from hybridvo.errors import FormatError, InputError
@@ -36,63 +35,50 @@ class SintelSequence(Sequence):
     markers = ((".../{clean,final,flow,depth,camdata_left}/NAME", "frame_0001.*"),)
 
     @classmethod
-    def root_of(cls, folder: Path) -> Path | None:
-        """The path itself, which may be a folder that was never downloaded."""
+    def knows(cls, folder: Path) -> bool:
+        """Whether a folder, which may be one that was never downloaded, stands for a scene."""
         folder = folder.absolute()
-        known = folder.parent.name in ENDINGS
-        return folder if known and any(_files(folder, part) for part in ENDINGS) else None
+        return folder.parent.name in ENDINGS and any(_files(folder, part) for part in ENDINGS)
 
     def _list_files(self) -> None:
         own = self.root.parent.name
         passes = (own,) if own in IMAGE_PASSES else IMAGE_PASSES
         rgb = next((found for p in passes if (found := _files(self.root, p))), {})
-        flow, depth, cameras, invalid = (
-            _files(self.root, part) for part in ("flow", "depth", "camdata_left", "invalid")
-        )
+        parts = ("depth", "flow", "camdata_left", "invalid")
+        depth, flow, cameras, invalid = (_files(self.root, part) for part in parts)
         numbers = self._list_numbered(rgb, depth, flow)
         if not cameras:
             raise InputError(
-                f"{self.root.parent.parent}: no frames matched frame_*.cam in "
-                f"camdata_left/{self.name}. The camera data comes with Sintel's depth download; it "
-                f"exists for the training scenes only."
+                f"{self.root.parent.parent}: no frame_*.cam in camdata_left/{self.name}. The "
+                f"camera data comes with Sintel's depth, for the training scenes only."
             )
         self._cameras = [cameras.get(n) for n in numbers]
         self._invalid = [invalid.get(n) for n in numbers]
         self._sources = [*self._cameras, *self._invalid]
-        self.poses = np.full((len(numbers), 4, 4), np.nan)
-        for index in range(len(numbers)):
-            try:
-                self.poses[index] = invert(self._read_cam(index)[1])
-            except (FormatError, FileNotFoundError) as error:
-                self.warnings.append(f"no camera for frame {index}: {error}")
+        self._each_pose(self._cameras, lambda path: invert(read_cam(path)[1]))
 
-    def _calibration(self) -> Calibration | None:
+    def _calibration(self) -> None:
         return None
 
     def camera(self, index: int) -> Camera:
         """Camera of this very frame (Sintel zooms); FileNotFoundError where it has none."""
         if self._camera is not None:
-            return super().camera(index)
-        index = self._check_index(index)
-        try:
-            return Camera.from_matrix(self._read_cam(index)[0], self.height, self.width)
-        except InputError as error:
-            raise FormatError(f"{self._cameras[index]}: {error}") from None
-
-    def _read_cam(self, index: int) -> tuple[np.ndarray, np.ndarray]:
-        """Intrinsics and T_cam_world of a frame."""
+            return self._camera
         path = self._cameras[index]
         if path is None:
             raise FileNotFoundError(f"{self.name}: frame {index} has no .cam file.")
-        return read_cam(path)
+        try:
+            return Camera.from_matrix(read_cam(path)[0], self.height, self.width)
+        except InputError as error:
+            raise FormatError(f"{path}: {error}") from None
 
     def _read_flow(self, path: Path, index: int) -> tuple[np.ndarray, np.ndarray | None]:
         flow, valid = read_flow(path)
         mask = self._invalid[index]
-        invalid = self._read(mask, "a mask", read_mask_png)
-        if invalid is None or flow.shape[:2] != invalid.shape:
+        if mask is None or not mask.exists():
             return flow, valid
-        return flow, ~invalid if valid is None else valid & ~invalid
+        known = ~read_mask_png(mask)
+        return flow, known if valid is None else valid & known
 
 
 def _files(scene: Path, part: str) -> dict[int, Path]:

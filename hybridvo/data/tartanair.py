@@ -12,7 +12,6 @@ from hybridvo.data.image_io import read_flow, read_flow_png, read_npy, read_png
 from hybridvo.data.lists import numbered_files, numbered_poses
 from hybridvo.geometry import ned_to_camera
 from hybridvo.trajectory import read_poses
-from hybridvo.types import Camera
 
 
 class TartanAirSequence(Sequence):
@@ -45,21 +44,20 @@ class TartanAirSequence(Sequence):
         )
         pose_file = root / f"pose_{camera}.txt"
         if pose_file.exists():
-            poses = ned_to_camera(read_poses(pose_file, "tartanair")[1])
-            self.poses = numbered_poses(numbers, poses, pose_file, self.warnings)
+            self.poses = numbered_poses(
+                numbers, ned_to_camera(read_poses(pose_file, "tartanair")[1])
+            )
         self._sources = [pose_file, *map(_mask_file, flow.values())]
 
     def _calibration(self) -> Calibration:
         # Field of view 90 degrees over the width: 320 px at 640, c = (size - 1) / 2 because our
         # pixel (0, 0) is a centre where TartanAir publishes the corner convention's 320.
         height, width = self.height, self.width
-        camera = Camera(width / 2, width / 2, (width - 1) / 2, (height - 1) / 2, height, width)
-        told = f"{self.name}: images are {width} pixels wide, TartanAir's 640: focal length scaled."
-        return Calibration(camera, warnings=() if width == 640 else (told,))
+        return Calibration(width / 2, width / 2, (width - 1) / 2, (height - 1) / 2, height, width)
 
-    def _read_depth(self, path: Path, rgb: np.ndarray | None) -> np.ndarray:
+    def _read_depth(self, path: Path) -> np.ndarray:
         if path.suffix != ".png":
-            return super()._read_depth(path, rgb)
+            return super()._read_depth(path)
         # the four bytes of a little-endian float
         image = read_png(path, np.uint8, 4, "a float32 depth PNG of TartanAir V2")
         return np.ascontiguousarray(image).view("<f4")[:, :, 0].astype(np.float32)
@@ -69,10 +67,9 @@ class TartanAirSequence(Sequence):
             flow, occluded = read_flow_png(path, (0, 1, 2))
             return flow, occluded == 0
         mask = _mask_file(path)
-        return read_flow(path)[0], None if mask is None else read_npy(mask) == 0
+        return read_flow(path)[0], read_npy(mask) == 0 if mask.exists() else None
 
 
-def _mask_file(flow: Path) -> Path | None:
+def _mask_file(flow: Path) -> Path:
     """Mask beside a V1 flow file (000000_000001_mask.npy; 0 is valid)."""
-    path = flow.with_name(flow.name.removesuffix("_flow.npy") + "_mask.npy")
-    return path if path.exists() else None
+    return flow.with_name(flow.name.removesuffix("_flow.npy") + "_mask.npy")

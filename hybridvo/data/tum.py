@@ -8,7 +8,6 @@ from hybridvo.data.base import Sequence
 from hybridvo.data.camera_file import Calibration
 from hybridvo.data.lists import depth_at, poses_at, read_stamps, read_timed_poses
 from hybridvo.geometry import invert, pose_matrix
-from hybridvo.types import Camera
 
 # Published with the data sets: fx fy cx cy and k1 k2 p1 p2 k3, by what the folder's name holds.
 PUBLISHED = {
@@ -57,63 +56,43 @@ class TumSequence(Sequence):
     def _list_files(self) -> None:
         root, told = self.root, self.warnings
         if (root / "rgb.txt").exists():
-            self._read_two_lists()
-        else:
-            self._read_pairs()
+            lists = [root / "rgb.txt", root / "depth.txt"]
+            (stamps, rgb), (depth_stamps, depth) = (
+                read_stamps(path, told, "timestamp filename", words=1) for path in lists
+            )
+            pairs = depth_at(stamps, depth_stamps, lists[0], told)
+            self.timestamps = stamps[[i for i, _ in pairs]]
+            self.rgb_files = [root / rgb[i][0] for i, _ in pairs]
+            self.depth_files = [root / depth[j][0] for _, j in pairs]
+        else:  # stamp depth stamp rgb (ICL-NUIM), or stamp rgb stamp depth
+            lists, columns = [root / "associations.txt"], "timestamp file timestamp file"
+            self.timestamps, words = read_stamps(lists[0], told, columns, words=3)
+            rgb_at = 2 if any("depth" in row[0].lower() for row in words) else 0
+            self.rgb_files = [root / row[rgb_at] for row in words]
+            self.depth_files = [root / row[2 - rgb_at] for row in words]
         icl = next(iter(sorted(root.glob("*.gt.freiburg"))), None)
         self._is_icl = icl is not None
         pose_file = icl or root / "groundtruth.txt"
-        stamps, poses = np.zeros(0), np.zeros((0, 4, 4))
-        if pose_file.exists():
-            stamps, poses = read_timed_poses(pose_file, told)
-            self._sources.append(pose_file)
-        if self._is_icl:  # has frame numbers
-            self.timestamps, stamps = (
-                t / self.frames_per_second for t in (self.timestamps, stamps)
-            )
-            reflection = np.diag([1.0, -1.0, 1.0, 1.0])
+        self._sources = [*lists, pose_file]
+        if not pose_file.exists():
+            return
+        stamps, poses = read_timed_poses(pose_file, told)
+        if self._is_icl:  # has frame numbers for stamps, and y upwards
+            self.timestamps = self.timestamps / self.frames_per_second
+            stamps, reflection = stamps / self.frames_per_second, np.diag([1.0, -1.0, 1.0, 1.0])
             poses = reflection @ poses @ reflection
-            told.append(f"{pose_file.name}: ICL-NUIM poses (y upwards) are reflected.")
-        elif "bonn" in root.name.lower():
+        elif "bonn" in root.name.lower():  # from the tracked body to the camera
             poses = invert(BONN_ROS) @ poses @ BONN_ROS @ pose_matrix(BONN_MARKER)
-            told.append(f"{root.name}: Bonn's poses are moved from the tracked body to the camera.")
-        if pose_file.exists():
-            self.poses = poses_at(self.timestamps, stamps, poses, pose_file.name, told)
-
-    def _read_two_lists(self) -> None:
-        """Colour images and the depth of the nearest stamp."""
-        root, told = self.root, self.warnings
-        lists = [root / "rgb.txt", root / "depth.txt"]
-        (stamps, rgb), (depth_stamps, depth) = (
-            read_stamps(path, told, "timestamp filename", words=1) for path in lists
-        )
-        pairs = depth_at(stamps, depth_stamps, lists[0], told)
-        self.rgb_files = [root / rgb[i][0] for i, _ in pairs]
-        self.depth_files = [root / depth[j][0] for _, j in pairs]
-        self.timestamps = stamps[[i for i, _ in pairs]]
-        self._sources += lists
-
-    def _read_pairs(self) -> None:
-        """``stamp depth stamp rgb`` (ICL-NUIM), or ``stamp rgb stamp depth``."""
-        path = self.root / "associations.txt"
-        columns = "timestamp file timestamp file"
-        self.timestamps, words = read_stamps(path, self.warnings, columns, words=3)
-        is_depth_first = any("depth" in row[0].lower() for row in words)
-        rgb, depth = (2, 0) if is_depth_first else (0, 2)
-        self.rgb_files = [self.root / row[rgb] for row in words]
-        self.depth_files = [self.root / row[depth] for row in words]
-        self._sources.append(path)
+        self.poses = poses_at(self.timestamps, stamps, poses)
 
     def _calibration(self) -> Calibration:
         name = self.name.lower()
         for keys, (intrinsics, distortion) in PUBLISHED.items():
             if any(key in name for key in keys):
-                return Calibration(Camera(*intrinsics, 480, 640), distortion)
-        published_icl, default = (481.2, 480.0, 319.5, 239.5), (525.0, 525.0, 319.5, 239.5)
-        intrinsics = published_icl if self._is_icl else default
-        told = (
+                return Calibration(*intrinsics, 480, 640, distortion)
+        intrinsics = (481.2, 480.0, 319.5, 239.5) if self._is_icl else (525.0, 525.0, 319.5, 239.5)
+        self.warnings.append(
             f"{self.name}: camera {intrinsics} (fx fy cx cy) is assumed: the folder name says "
-            f"neither fr1, fr2, fr3 nor Bonn. Give another one with --camera fx,fy,cx,cy or "
-            f"--camera FILE."
+            f"neither fr1, fr2, fr3 nor Bonn. Give another one with --camera fx,fy,cx,cy or FILE."
         )
-        return Calibration(Camera(*intrinsics, 480, 640), warnings=(told,))
+        return Calibration(*intrinsics, 480, 640)

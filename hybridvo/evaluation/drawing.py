@@ -1,33 +1,28 @@
-"""Images of one pair: the paper's figures, what networks look at, and the worst of a comparison."""
+"""Images of one pair: its flow and weights, the paper's figures, what networks look at."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from hybridvo.data.sequence import Sequence, iter_pairs
 from hybridvo.errors import InputError
 from hybridvo.estimation import estimate
-from hybridvo.evaluation.pair_errors import MOVING_PX, pair_errors, true_motion
+from hybridvo.evaluation.pair_errors import MOVING_PX, true_motion
 from hybridvo.evaluation.plots import Panel, draw_panels, flow_panel, longest_flow
 from hybridvo.evaluation.saliency import Saliency, last_pass, saliencies
-from hybridvo.files import atomic_write, make_folder, write_json
-from hybridvo.flow import FlowProvider, dis_flow
+from hybridvo.files import atomic_write, make_folder
+from hybridvo.flow import dis_flow
 from hybridvo.geometry import ego_flow, matrix_to_euler_deg
 from hybridvo.network.layers import KINDS
-from hybridvo.network.models import Models, load_weights
+from hybridvo.network.models import load_weights
 from hybridvo.network.weights import pretrained, pretrained_names
-from hybridvo.options import Options
 from hybridvo.pipeline import DEFAULT_METHOD
-from hybridvo.results import PixelwisePrediction
+from hybridvo.results import PixelwisePrediction, RelativePose
 from hybridvo.types import FramePair
-
-Numbers = dict[str, float | None]
 
 
 def draw(
@@ -38,22 +33,18 @@ def draw(
     flow: str = "auto",
     method: str = DEFAULT_METHOD,
     weights: Iterable[str | Path] = (),
-    steps: int = 32,
     overwrite: bool = False,
-) -> list[Path]:
+) -> Path:
     """Draw the maps of one pair: flow and its parts, error, weights, and what networks look at.
 
-    ``pair`` is its first frame, ``out`` a .png beside which the numbers stand as .json; ``flow`` is
-    ``auto`` (files where there are some), ``file`` or ``dis``; ``weights`` are networks to look
-    through, by default the pretrained ones; ``steps`` those of the integrated gradients.
+    ``pair`` is its first frame, ``out`` a .png; ``flow`` is ``auto`` (files where there are some),
+    ``file`` or ``dis``; ``weights`` are networks to look through, by default the pretrained ones.
     """
     out = Path(out)
     if out.suffix.lower() != ".png":
         raise InputError(f"{out}: expected a name that ends in .png.")
     if out.exists() and not overwrite:
         raise InputError(f"{out}: exists; pass --overwrite.")
-    if steps < 1:
-        raise InputError(f"steps: expected at least 1, got {steps}.")
     if not 0 <= pair < len(sequence) - 1:
         raise InputError(f"--pair: {sequence.name} has pairs 0 to {len(sequence) - 2}, got {pair}.")
     from_files = flow == "file" or (flow == "auto" and sequence.has_flow)
@@ -68,65 +59,20 @@ def draw(
         flow_gt = given.flow if given.flow_is_true else sequence.flow(pair)[0]
     T_gt = true_motion(sequence, pair, pair + 1)
     motion = estimate(given, method=method)
-    panels, numbers, moving = _pair_panels(given, motion.T_curr_prev, motion.weights, T_gt, flow_gt)
+    panels, moving = _pair_panels(given, motion, T_gt, flow_gt)
     true = None if T_gt is None else (matrix_to_euler_deg(T_gt[:3, :3]), T_gt[:3, 3])
     for name, network in found:
         output, inputs, T_start = last_pass(network, given)
         if isinstance(output, PixelwisePrediction):
             panels += prediction_panels(name, output, true, moving)
-        more, values = saliency_panels(name, saliencies(network, inputs, T_start, steps), moving)
-        panels += more
-        numbers |= values
+        panels += saliency_panels(name, saliencies(network, inputs, T_start), moving)
     source = f"{given.flow_source} (true)" if given.flow_is_true else given.flow_source
     heading = f"{sequence.name}, pair {pair}; flow: {source}; motion: {method}, {motion.status}"
     height, width = given.prev.camera.shape
     make_folder(out.parent)
     with atomic_write(out, "wb") as file:
         file.write(draw_panels(panels, heading, width / height))
-    record = {"title": heading, "image": out.name, "values": numbers}
-    write_json(out.with_suffix(".json"), record)
-    return [out, out.with_suffix(".json")]
-
-
-def draw_worst(
-    out: Path,
-    sequence: Sequence,
-    flows: Mapping[str, FlowProvider],
-    options: Options,
-    models: Models,
-    entries: Iterable[dict[str, Any]],
-    pairs: pd.DataFrame,
-) -> None:
-    """Draw worst pairs of one sequence of a comparison, with the motion that it found.
-
-    Each of ``entries`` gets ``picture`` (a path below ``out``), or None and ``picture_reason``.
-    """
-    found = pairs.set_index(["index", "method", "flow_source"])
-    for entry in entries:
-        method, label = entry["method"], entry["flow_source"]
-        row = found.loc[(entry["index"], method, label)]
-        entry |= {"picture": None, "picture_reason": None}
-        try:
-            prev, curr = (sequence.frame(int(row[name])) for name in ("prev", "next"))
-        except (InputError, OSError) as error:
-            entry["picture_reason"] = f"the pair cannot be read: {error}"
-            continue
-        field = flows[label](prev, curr)
-        if field.flow is None or prev.depth is None:
-            entry["picture_reason"] = "the pair has no flow, or no depth"
-            continue
-        pair = FramePair(prev, curr, field.flow, field.variance, field.valid)
-        weights = None
-        if not entry["status"].startswith("failed"):  # of the pair on its own, without a tracker
-            weights = estimate(pair, method=method, options=options, models=models).weights
-        T_gt = true_motion(sequence, prev.index, curr.index)
-        panels = _pair_panels(pair, row["T_curr_prev"], weights, T_gt, None)[0]
-        aspect = prev.camera.width / prev.camera.height
-        name = "_".join([entry["sequence"], f"{entry['index']:06d}", method, label.split()[0]])
-        entry["picture"] = "worst/" + re.sub(r"[^\w.-]", "_", name) + ".jpg"
-        size: dict[str, Any] = {"columns": len(panels), "inches": 2.2, "format": "jpeg"}
-        with atomic_write(out / entry["picture"], "wb") as file:
-            file.write(draw_panels(panels, "", aspect, **size))
+    return out
 
 
 def networks(files: Iterable[str | Path] = ()) -> list[tuple[str, Any]]:
@@ -147,20 +93,14 @@ def networks(files: Iterable[str | Path] = ()) -> list[tuple[str, Any]]:
 
 
 def _pair_panels(
-    pair: FramePair,
-    T_est: np.ndarray,
-    weights: np.ndarray | None,
-    T_gt: np.ndarray | None,
-    flow_gt: np.ndarray | None,
-) -> tuple[list[Panel], Numbers, np.ndarray]:
-    """Panels and numbers that need no network, and (H, W) which pixels move by themselves."""
+    pair: FramePair, motion: RelativePose, T_gt: np.ndarray | None, flow_gt: np.ndarray | None
+) -> tuple[list[Panel], np.ndarray]:
+    """Panels that need no network, and (H, W) which pixels move by themselves."""
     flow, depth = np.asarray(pair.flow), np.asarray(pair.prev.depth)
     cameras = pair.prev.camera, pair.curr.camera
-    ego = ego_flow(depth, T_est, *cameras)
+    ego = ego_flow(depth, motion.T_curr_prev, *cameras)
     ego_gt = None if T_gt is None else ego_flow(depth, T_gt, *cameras)
-    objects, whose = flow - ego, "this flow and the estimate"
-    if ego_gt is not None and flow_gt is not None:
-        objects, whose = flow_gt - ego_gt, "true flow and motion"
+    objects = flow - ego if ego_gt is None or flow_gt is None else flow_gt - ego_gt
     with np.errstate(invalid="ignore"):
         moving = np.linalg.norm(objects, axis=2) > MOVING_PX
     # one scale for all three: the parts are to be seen beside the whole
@@ -168,18 +108,11 @@ def _pair_panels(
     panels = [] if pair.prev.rgb is None else [Panel("previous image", pair.prev.rgb)]
     parts = {"flow F": flow, "ego flow": ego, "F minus ego flow": flow - ego}
     panels += [flow_panel(title, part, longest) for title, part in parts.items()]
-    numbers: Numbers = {f"moving share, {whose}": float(moving.mean())}
-    if T_gt is not None and ego_gt is not None:
+    if ego_gt is not None:
         panels.append(Panel("error of the ego flow", np.linalg.norm(ego - ego_gt, axis=2), "px"))
-        errors = pair_errors(T_est, T_gt, depth, *cameras)
-        numbers |= {
-            "EPE, px": errors["epe_l2_px"],
-            "rotation error, deg": errors["rot_err_deg"],
-            "translation error, m": errors["trans_err"],
-        }
-    if weights is not None:
-        panels.append(Panel("weights (outline: moving)", weights, "weight", 1.0, moving))
-    return panels, numbers, moving
+    if motion.weights is not None:
+        panels.append(Panel("weights (outline: moving)", motion.weights, "weight", 1.0, moving))
+    return panels, moving
 
 
 def prediction_panels(
@@ -209,20 +142,13 @@ def prediction_panels(
     return panels
 
 
-def saliency_panels(
-    name: str, found: Mapping[str, Saliency], moving: np.ndarray
-) -> tuple[list[Panel], Numbers]:
-    """Where a network looks, and how much of that lies on what moves."""
-    panels: list[Panel] = []
-    numbers: Numbers = {}
+def saliency_panels(name: str, found: Mapping[str, Saliency], moving: np.ndarray) -> list[Panel]:
+    """Where a network looks; what moves is outlined."""
+    panels = []
     for what, saliency in found.items():
         n = 4  # summed over blocks: networks read one of some pixels only
         h, w = (size // n for size in saliency.magnitude.shape)
         shown = saliency.magnitude[: n * h, : n * w].reshape(h, n, w, n).sum(axis=(1, 3))
         relative = shown / max(float(np.percentile(shown, 99)), 1e-30)
         panels.append(Panel(f"{name}: saliency, {what}", relative, "relative", 1.0, moving))
-        numbers |= {
-            f"{name}: saliency of the {what} on moving pixels": saliency.share_on(moving),
-            f"{name}: part of the {what} that the saliency misses": saliency.completeness_error,
-        }
-    return panels, numbers
+    return panels

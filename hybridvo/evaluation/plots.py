@@ -1,6 +1,6 @@
 """Images of trajectories and of the maps of a pair, by matplotlib.
 
-Uses the object interface with the Agg canvas: no window, no pyplot, no global state.
+Uses the object interface: no window, no pyplot, no global state.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
-from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import hsv_to_rgb
 from matplotlib.figure import Figure
 
-from hybridvo.evaluation.metrics import Alignment, PathError, aligned
+from hybridvo.evaluation.metrics import Alignment, aligned
 from hybridvo.files import atomic_write
 from hybridvo.geometry import invert
 from hybridvo.trajectory import Trajectory
@@ -26,10 +26,6 @@ from hybridvo.trajectory import Trajectory
 # Okabe and Ito's palette without yellow: told apart by colour-blind readers, in print too
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 _BLACK = "#222222"
-_VIEWS = {
-    "Top view": ("x right [m]", "z forward [m]", [0, 2]),
-    "Side view": ("z forward [m]", "y down [m]", [2, 1]),
-}
 
 
 def plot_trajectories(
@@ -40,78 +36,53 @@ def plot_trajectories(
     alignment: Alignment = "se3",
     title: str = "",
 ) -> None:
-    """Draw trajectories from above and from the side, and their errors where truth is given.
+    """Draw trajectories from above, and their errors where truth is given.
 
-    Everything is drawn in the first camera of the truth (or of each trajectory without truth):
-    x right, y down, z forward. Estimates are aligned as ``alignment`` says, or by their first pose
-    where a path does not determine it (the legend says which). ``path`` ends in ``.png``.
+    Everything is drawn in the first camera of the truth (or of each trajectory without truth).
+    Estimates are aligned as ``alignment`` says, or by their first pose where a path does not
+    determine it (the legend says which). ``path`` ends in ``.png``.
     """
-    lines: list[tuple[Trajectory, Trajectory, PathError | None, dict[str, Any]]] = []
+    heights = [1.0] if truth is None else [2.0, 1.0]
+    figure = Figure(figsize=(10.0, 7.4), dpi=130, layout="constrained")
+    above, *below = figure.subplots(len(heights), squeeze=False, height_ratios=heights)[:, 0]
+    above.set(xlabel="x right [m]", ylabel="z forward [m]")
+    start = 0.0
     if truth is not None:
         bold = {"label": "ground truth", "color": _BLACK, "linewidth": 2.6, "alpha": 0.55}
-        lines.append((truth, truth, None, bold))
+        above.plot(*_from_above(truth, truth), **bold)
+        start = truth.timestamps[0] if truth.has_timestamps else 0.0
+        unit = "time [s]" if truth.has_timestamps else "frame"
+        below[0].set(xlabel=unit, ylabel="position error [cm]")
     for (name, est), colour in zip(trajectories.items(), itertools.cycle(_COLOURS), strict=False):
-        style: dict[str, Any] = {"label": name, "color": colour, "linewidth": 1.4}
-        if truth is None:
-            lines.append((est, est, None, style))
-            continue
-        est, error, kind = aligned(est, truth, alignment)
-        told = "no error: poses do not match"
-        if error is not None:
-            told = f"ATE {100 * error.rmse:.3g} cm, {kind}"
-        lines.append((est, truth, error, style | {"label": f"{name} ({told})"}))
-    errors = [(error, style) for *_, error, style in lines if error is not None]
-    figure = _figure(10.0, 7.4 if errors else 4.8, dpi=130)
-    rows: Any = [[*_VIEWS], *([["Position error"] * 2] if errors else [])]
-    axes = figure.subplot_mosaic(rows, height_ratios=[2.0, 1.0][: len(rows)])
-    for view, (x, y, plane) in _VIEWS.items():
-        _style(axes[view], view, x, y)
-        places = [
-            est.transformed(invert(first.T_world_cam[0])).positions[:, plane]
-            for est, first, *_ in lines
-        ]
-        for place, (*_, style) in zip(places, lines, strict=True):
-            axes[view].plot(*place.T, **style)
-        axes[view].plot(*places[0][0], "o", color=_BLACK, markersize=5, zorder=5)
-        centre = np.concatenate(places).mean(axis=0)
-        axes[view].update_datalim([centre - 5e-4, centre + 5e-4])  # a camera that does not move
-        axes[view].margins(0.06)
-        axes[view].set_aspect("equal", adjustable="datalim")
-        axes[view].autoscale_view()
-    axes["Side view"].invert_yaxis()  # y points down in the camera: down on the page as well
-    for error, style in errors:
-        start = error.stamps[0] if truth is not None and truth.has_timestamps else 0.0
-        axes["Position error"].plot(error.stamps - start, 100 * error.translation, **style)
-        label = "time [s]" if truth is not None and truth.has_timestamps else "frame"
-        _style(axes["Position error"], "Position error", label, "error [cm]")
-        axes["Position error"].set_ylim(bottom=0.0)
-        axes["Position error"].margins(x=0.01)
-    legend: dict[str, Any] = {"loc": "outside lower center", "frameon": False, "fontsize": 9}
-    figure.legend(handles=axes["Top view"].lines[:-1], ncols=min(3, len(lines)), **legend)
+        style: dict[str, Any] = {"color": colour, "linewidth": 1.4}
+        if truth is not None:
+            est, error, kind = aligned(est, truth, alignment)
+            told = "no error: poses do not match"
+            if error is not None:
+                below[0].plot(error.stamps - start, 100 * error.translation, **style)
+                told = f"ATE {100 * error.rmse:.3g} cm, {kind}"
+            name = f"{name} ({told})"
+        above.plot(*_from_above(est, est if truth is None else truth), label=name, **style)
+    above.plot(0, 0, "o", color=_BLACK, markersize=5, zorder=5)
+    above.update_datalim([[-5e-4, -5e-4], [5e-4, 5e-4]])  # a camera that does not move
+    above.set_aspect("equal", adjustable="datalim")
+    above.autoscale_view()
+    for axes in (above, *below):
+        axes.grid(True, color="#e4e4e4", linewidth=0.8)
+        axes.set_axisbelow(True)
+    figure.legend(loc="outside lower center", frameon=False, fontsize=9, ncols=3)
     # a folder's name: bytes that are no UTF-8 cannot be drawn, dollars in it are no formula
     title = title.encode("utf-8", "replace").decode("utf-8")
     figure.suptitle(title, fontsize=11, parse_math=False)
     # a name in letters that the font lacks is drawn as boxes, without a word on stderr for each
     quiet = warnings.catch_warnings(action="ignore", category=UserWarning)
-    with atomic_write(path, "wb") as file, quiet:
+    with quiet, atomic_write(path, "wb") as file:
         figure.savefig(file, format="png")
 
 
-def _figure(width: float, height: float, dpi: int = 100) -> Figure:
-    """A figure with a canvas of its own: nothing is registered with pyplot, threads do not meet."""
-    figure = Figure(figsize=(width, height), dpi=dpi, layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
-
-
-def _style(axes: Any, title: str, x: str, y: str) -> None:
-    axes.set_title(title, fontsize=10, loc="left")
-    axes.set_xlabel(x, fontsize=9)
-    axes.set_ylabel(y, fontsize=9)
-    axes.tick_params(labelsize=8)
-    axes.grid(True, color="#e4e4e4", linewidth=0.8)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
+def _from_above(path: Trajectory, first: Trajectory) -> np.ndarray:
+    """(2, N) x and z in the first camera of another path."""
+    return path.transformed(invert(first.T_world_cam[0])).positions[:, [0, 2]].T
 
 
 # -- maps of a pair -------------------------------------------------------------------------------
@@ -151,16 +122,15 @@ def draw_panels(
     *,
     columns: int = 2,
     inches: float = 5.4,
-    format: str = "png",
 ) -> bytes:
-    """Encoded image of panels (at least one), ``columns`` in a row, each ``inches`` wide.
+    """PNG of panels (at least one), ``columns`` in a row, each ``inches`` wide.
 
     ``aspect`` is width over height of the pair's images; networks see images of another shape,
     which are shown in it.
     """
     rows = -(-len(panels) // columns)
     height = rows * (inches / aspect * 0.92 + 0.42) + (0.45 if heading else 0.0)
-    figure = _figure(columns * inches, height)
+    figure = Figure(figsize=(columns * inches, height), layout="constrained")
     shape: dict[str, Any] = {"extent": (0.0, aspect, 1.0, 0.0), "interpolation": "nearest"}
     for k, panel in enumerate(panels):
         axes = figure.add_subplot(rows, columns, k + 1)
@@ -183,35 +153,26 @@ def draw_panels(
         bar.ax.tick_params(labelsize=8)
     figure.suptitle(heading, fontsize=11, x=0.01, ha="left", parse_math=False)
     stream = io.BytesIO()
-    figure.savefig(stream, format=format)
+    figure.savefig(stream, format="png")
     return stream.getvalue()
 
 
 # -- flow in colours ------------------------------------------------------------------------------
 
-# Baker et al., "A Database and Evaluation Methodology for Optical Flow" (IJCV 2011): hues between
-# six corners of the colour circle, as many steps as the eye tells apart in each part
-_HUE_STEPS = np.cumsum([0, 15, 6, 4, 11, 13, 6])
-_HUES = 255 * np.array(
-    [[1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 1, 1], [0, 0, 1], [1, 0, 1], [1, 0, 0]]
-)
-
 
 def flow_colours(flow: np.ndarray, longest: float | None = None) -> np.ndarray:
-    """(H, W, 3) uint8 RGB of a flow (H, W, 2) in the standard colours of Middlebury.
+    """(H, W, 3) uint8 RGB of a flow (H, W, 2).
 
     Hue is the direction (red to the right, yellow-green downwards), saturation the length. Vectors
     of ``longest`` px have full saturation (default: the 99th percentile), longer ones are darker;
     no motion is white, NaN and inf are black.
     """
-    flow = np.asarray(flow)
     known = np.isfinite(flow).all(axis=2)
     u, v = np.moveaxis(np.where(known[..., None], flow, 0.0), 2, 0)
-    radius = (np.hypot(u, v) / (longest or longest_flow(flow)))[..., None]
-    step = (np.arctan2(-v, -u) / np.pi + 1) / 2 * (_HUE_STEPS[-1] - 1)
-    colour = np.stack([np.interp(step, _HUE_STEPS, channel) for channel in _HUES.T], axis=-1)
-    colour = np.where(radius <= 1, 255 - radius * (255 - colour), 0.75 * colour)
-    return (np.where(known[..., None], colour, 0.0) + 0.5).astype(np.uint8)
+    length = np.hypot(u, v) / (longest or longest_flow(flow))
+    value = np.where(known, np.where(length > 1, 0.75, 1.0), 0.0)
+    hsv = np.stack([np.arctan2(v, u) / (2 * np.pi) % 1, np.minimum(length, 1), value], axis=-1)
+    return (255 * hsv_to_rgb(hsv) + 0.5).astype(np.uint8)
 
 
 def longest_flow(flow: np.ndarray) -> float:

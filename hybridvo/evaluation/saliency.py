@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
-from operator import attrgetter, itemgetter
 from typing import Any
 
 import numpy as np
@@ -89,7 +87,9 @@ def last_pass(network: Any, pair: FramePair) -> tuple[Any, Any, Any]:
         return network(inputs, T_start), inputs, T_start
 
 
-def saliencies(network: Any, inputs: Any, T_start: Any, steps: int) -> dict[str, Saliency]:
+def saliencies(
+    network: Any, inputs: Any, T_start: Any = None, steps: int = 32
+) -> dict[str, Saliency]:
     """Integrated gradients of rotation and translation over flow and inverse depth.
 
     The answer is the length of the predicted rotation (or translation) along its own direction; of
@@ -100,25 +100,23 @@ def saliencies(network: Any, inputs: Any, T_start: Any, steps: int) -> dict[str,
     names = ("flow",) if network.options.scale_free else ("flow", "inverse_depth")
     given = tuple(getattr(inputs, name) for name in names)
 
-    def run(tensors: tuple[torch.Tensor, ...]) -> Any:
+    def run(*tensors: torch.Tensor) -> Any:
         return network(replace(inputs, **dict(zip(names, tensors, strict=True))), T_start)
 
+    def part(output: Any, k: int) -> torch.Tensor:
+        is_map = isinstance(output, PixelwisePrediction)
+        return getattr(output, PARTS[k]) if is_map else output[k]
+
     with torch.no_grad():
-        output = run(given)
+        output = run(*given)
     found = {}
     for k, what in enumerate(PARTS):
+        motion = weights = part(output, k).clone().requires_grad_()
         if isinstance(output, PixelwisePrediction):
-            maps = {name: getattr(output, name).clone().requires_grad_() for name in PARTS}
-            motion = select_pose(replace(output, **maps))[k]
-            direction = (motion / motion.norm().clamp(min=1e-12)).detach()
-            (weights,) = torch.autograd.grad((direction * motion).sum(), maps[what])
-            answer = partial(_weighted_sum, run, attrgetter(what), weights)
-        else:
-            direction = output[k] / output[k].norm().clamp(min=1e-12)
-            answer = partial(_weighted_sum, run, itemgetter(k), direction)
-        found[what] = integrated_gradients(answer, given, steps=steps)
+            own: dict[str, Any] = {what: weights}
+            motion = select_pose(replace(output, **own))[k]
+        direction = (motion / motion.norm().clamp(min=1e-12)).detach()
+        (weights,) = torch.autograd.grad((direction * motion).sum(), weights)
+        answer = lambda *x, k=k, w=weights: (w * part(run(*x), k)).sum()  # noqa: E731
+        found[what] = integrated_gradients(answer, given, steps)
     return found
-
-
-def _weighted_sum(run: Any, part: Any, weights: torch.Tensor, *tensors: torch.Tensor) -> Any:
-    return (weights * part(run(tensors))).sum()

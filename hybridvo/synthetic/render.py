@@ -197,16 +197,15 @@ class SyntheticSequence(Sequence):
 
     def camera(self, index: int) -> Camera:
         """Intrinsics of one frame."""
-        return self.scene.cameras[self._check_index(index)]
+        return self.scene.cameras[index]
 
     def frame(self, index: int) -> Frame:
         """Image and true depth."""
-        rendered, stamp = self.scene.render(self._check_index(index)), float(self.timestamps[index])
+        rendered, stamp = self.scene.render(index), float(self.timestamps[index])
         return Frame(rendered.rgb, rendered.depth, self.camera(index), stamp, int(index))
 
     def flow(self, index: int) -> tuple[np.ndarray, None]:
         """True flow from frame ``index`` to the next, (H, W, 2) float32, and no variance."""
-        self._check_index(index + 1)
         return self.scene.flow(index)[0], None
 
     def files(self) -> list[Path]:

@@ -8,7 +8,6 @@ import threading
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 
@@ -119,15 +118,6 @@ def test_a_broken_frame_is_one_failed_row_and_is_spanned(own, tmp_path, capsys):
     assert main([*arguments, "--overwrite", "--max-failed", "0", "-q"]) == 3
     assert main([*arguments, "--overwrite", "--strict", "-q"]) == 2
     assert "frame_0003.png" in capsys.readouterr().err
-
-
-def test_dark_frames_are_called_dark(own, tmp_path, capsys):
-    image = own / "frame_0003.png"
-    cv2.imwrite(str(image), (0.02 * cv2.imread(str(image))).astype(np.uint8))
-    out = tmp_path / "out"
-    main(["run", str(own), "--out", str(out), "--method", "refine", "--flow", "dis"])
-    assert "frame 2: failed" in (said := capsys.readouterr().err) and "dark" in said
-    assert "dark" in rows(out)[2]["message"]
 
 
 def test_auto_flow_falls_back_to_dis_where_a_file_is_missing_or_damaged(own, tmp_path):

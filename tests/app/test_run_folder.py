@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -13,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hybridvo.commands.progress import Progress, interruptible
+from hybridvo.commands.progress import Progress
 from hybridvo.commands.run_folder import STATE, STEPS, RunFolder
 from hybridvo.errors import InputError, LockedError, OutputError
 from hybridvo.files import held
@@ -119,18 +118,6 @@ def test_a_file_in_place_of_the_folder(tmp_path):
     with pytest.raises(OutputError, match="out: cannot be created"):
         with start(tmp_path / "out"):
             pass
-
-
-def test_the_first_signal_sets_the_event_and_the_second_aborts():
-    before = signal.getsignal(signal.SIGTERM)
-    with interruptible() as interrupted:
-        assert not interrupted.is_set()
-        os.kill(os.getpid(), signal.SIGTERM)
-        assert interrupted.wait(5)
-        with pytest.raises(KeyboardInterrupt):
-            os.kill(os.getpid(), signal.SIGTERM)
-            time.sleep(1)
-    assert signal.getsignal(signal.SIGTERM) is before
 
 
 def test_progress_on_a_terminal_is_a_bar():

@@ -108,7 +108,7 @@ def test_damaged_binary_files(kind, originals, data):
         ("tum", "rgb.txt", "100.0 rgb/0.png\nabc rgb/1.png\n", 2),
         ("tum", "rgb.txt", "100.0\n", 1),
         ("tartanair-v2", "pose_lcam_front.txt", "0 0 0 0 0 0 1\n0 0 0\n", 2),
-        ("kitti", "calib.txt", "P0: 1 2\n", 1),
+        ("kitti", "calib.txt", "P2: 1 2\n", 1),
         ("kitti", "calib.txt", "P2: 20 0 4.5 5 0 0 2.5 0 0 0 1 0\n", 1),
         ("kitti", "../../poses/07.txt", "0 0 0 0 0 0 0 0 0 0 0 0\n" * 3, 1),
         ("kitti", "times.txt", "0\n0.1\nx\n", 3),
@@ -146,7 +146,7 @@ def test_missing_depth_is_none_and_missing_both_raises(kind, index, tmp_path):
     assert frame.depth is None and frame.rgb is not None
     reopened = open_sequence(written.path)
     assert len(reopened) == write.N and reopened[index].depth is None
-    assert any("without depth" in told and f": {index}." in told for told in reopened.warnings)
+    assert any("without depth" in told and f": {index}" in told for told in reopened.warnings)
     sequence.rgb_files[index].unlink()
     with pytest.raises(FileNotFoundError, match=f"frame {index}"):
         sequence[index]
@@ -168,7 +168,7 @@ def test_a_frame_of_another_size_is_refused_alone(tmp_path):
     sequence = open_sequence(write.write_kitti(tmp_path).path)
     write.png(sequence.rgb_files[1], write.image(0, 10, 6))  # turned by 90 degrees
     reopened = open_sequence(sequence.root)
-    with pytest.raises(FormatError, match=r"000001\.png: expected an image of 10x6.*got 6x10"):
+    with pytest.raises(FormatError, match=r"000001\.png.*\(6, 10, 3\).*got \(10, 6, 3\)"):
         reopened[1]
     assert reopened[2].rgb is not None
 
@@ -216,7 +216,7 @@ def test_tum_lists_written_backwards(tmp_path):
         open_sequence(root)
     (root / "rgb.txt").write_text("\n".join(lines).replace("rgb/", "rgb\\"))  # as Windows writes it
     warnings = "\n".join(open_sequence(root).warnings)
-    assert "there are no image files, such as" in warnings and "rgb\\" in warnings
+    assert "3 frames without image: 0, 1, 2, such as" in warnings and "rgb\\" in warnings
 
 
 def test_spaces_and_links_in_names(tmp_path):

@@ -158,7 +158,7 @@ def test_wrong_tags_types_and_shapes(tmp_path):
     eight = encoded(".png", (GRID % 200).astype(np.uint8))
     cases = [
         ("x.flo", TAG[::-1] + flo[4:], "little-endian"),
-        ("x.flo", b"JUNK" + flo[4:], "expected the first bytes"),
+        ("x.flo", b"JUNK" + flo[4:], "that starts with"),
         ("x.flo", FILES["depth.dpt"][0], "truncated"),  # half the bytes
         ("x.dpt", flo, "trailing"),
         ("depth.png", eight, "16-bit depth PNG"),

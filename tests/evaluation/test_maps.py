@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import cv2
@@ -12,10 +11,8 @@ from hybridvo.cli import main
 from hybridvo.data.sequence import open_sequence
 from hybridvo.errors import InputError
 from hybridvo.evaluation.drawing import draw, networks, prediction_panels
-from hybridvo.evaluation.pair_errors import pair_facts
 from hybridvo.evaluation.plots import Panel, draw_panels, flow_colours, flow_panel
 from hybridvo.evaluation.saliency import Saliency, integrated_gradients, saliencies
-from hybridvo.geometry import invert
 from hybridvo.network.inputs import assemble_inputs
 from hybridvo.network.pwvo import NetworkOptions, build_network
 from hybridvo.network.selection import select_motion
@@ -38,17 +35,11 @@ def known() -> FramePair:
 
 
 def test_colours_of_directions_by_hand() -> None:
-    # Middlebury's circle: red to the right, yellow downwards, cyan-blue to the left
     flow = np.array([[[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]]])
     white, right, down, left, up = (list(map(int, c)) for c in flow_colours(flow, 1.0)[0])
     assert white == [255, 255, 255]
-    assert right == [255, 0, 0]
-    # a quarter of 54 steps is 13.5; yellow comes after 15: 13.5 / 15 of 255
-    assert down == [255, 230, 0]
-    # half way is step 27, two of eleven from cyan to blue: 255 (1 - 2 / 11)
-    assert left == [0, 209, 255]
-    # three quarters is step 40.5: 4.5 of 13 from blue to magenta
-    assert up == [88, 0, 255]
+    assert right == [255, 0, 0] and left == [0, 255, 255]
+    assert down == [128, 255, 0] and up == [128, 0, 255]
 
 
 def test_colours_of_lengths() -> None:
@@ -175,24 +166,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_tool_draws_a_pair(folder: Path, tmp_path: Path, capsys) -> None:
     sequence = str(folder / "training" / "clean" / "tiny")
     out = tmp_path / "new" / "pair.png"
-    arguments = ["--sequence", sequence, "--pair", "1", "--flow", "dis", "--steps", "4"]
-    arguments += ["--method", "refine"]
+    arguments = ["--sequence", sequence, "--pair", "1", "--flow", "dis", "--method", "refine"]
     arguments += ["--weights", str(folder / "pwvo.safetensors")]
     assert main(["show", *arguments, "--out", str(out)]) == 0
-    assert capsys.readouterr().out.split() == [str(out), str(out.with_suffix(".json"))]
+    assert capsys.readouterr().out.split() == [str(out)]
     # image, three flows, error, weights; four maps and two saliencies of the network
     assert cv2.imread(str(out)).shape[0] > 1200
-    values = json.loads(out.with_suffix(".json").read_text())["values"]
-    for what in ("rotation", "translation"):
-        assert 0 < values[f"pwvo: saliency of the {what} on moving pixels"] < 1
-        # four nodes are few, and enough to see that the numbers are those of the picture
-        assert values[f"pwvo: part of the {what} that the saliency misses"] < 0.15
-    read = open_sequence(sequence)
-    prev, curr = read.frame(1), read.frame(2)
-    T = invert(read.poses[2]) @ read.poses[1]
-    facts = pair_facts(T, prev.depth, prev.camera, curr.camera, read.flow(1)[0])
-    share = values["moving share, true flow and motion"]
-    assert 0.02 < share < 0.9 and share == pytest.approx(facts["dynamic_fraction"], abs=0.005)
     before = out.read_bytes()
     assert main(["show", *arguments, "--out", str(out)]) == 2
     assert "pass --overwrite" in capsys.readouterr().err
@@ -205,7 +184,6 @@ def test_the_tool_draws_a_pair(folder: Path, tmp_path: Path, capsys) -> None:
         (["--pair", "3"], "got 3"),
         (["--pair", "-1"], "got -1"),
         (["--pair", "0", "--weights", "none.safetensors"], "none.safetensors"),
-        (["--pair", "0", "--steps", "0"], "steps"),
         (["--pair", "0", "--method", "refin"], "refine"),
     ],
 )

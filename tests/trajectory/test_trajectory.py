@@ -184,7 +184,6 @@ def test_comments_crlf_tabs_bom_and_blank_lines(tmp_path):
             [f"1 {IDENTITY_TUM}", "", f"1 {IDENTITY_TUM}"],
             r":3: expected increasing",
         ),
-        ([f"1 {IDENTITY_TUM}", f"2e15 {IDENTITY_TUM}"], r":2: expected timestamps that do not mix"),
         (["1 0 0 0 0 1 0 0 0 0 2 0"], r":1: expected a rotation"),
         (["1 0 0 0 0 1 0 0 0 0 -1 0"], r":1: expected a rotation"),
         (["1e200 1e200 0 0 1e200 -1e200 0 0 0 0 1 0"], r":1: expected a rotation"),
@@ -227,20 +226,18 @@ def test_arbitrary_bytes_give_a_trajectory_or_a_format_error(tmp_path_factory, d
     assert np.isfinite(trajectory.T_world_cam).all()
 
 
-def test_nanoseconds_become_seconds_with_a_warning(tmp_path, caplog):
+def test_nanoseconds_become_seconds_with_a_warning(tmp_path):
     path = write(
         tmp_path / "t",
         f"1305031102175304000 {IDENTITY_TUM}",
         f"1305031102211214000 {IDENTITY_TUM}",
     )
-    with caplog.at_level("WARNING", logger="hybridvo"):
-        trajectory = read_trajectory(path)
+    trajectory = read_trajectory(path)
     # float64 keeps 128 ns at this size
     np.testing.assert_allclose(
         trajectory.timestamps, [1305031102.175304, 1305031102.211214], rtol=0, atol=3e-7
     )
     assert "nanoseconds" in trajectory.warnings[0]
-    assert "nanoseconds" in caplog.text
 
 
 def test_slightly_rounded_matrices_become_rotations(tmp_path, rng):
