@@ -15,7 +15,7 @@ from hybridvo.data.lists import numbered_files, numbered_poses, read_stamps
 from hybridvo.errors import FormatError, InputError
 from hybridvo.files import read_text
 from hybridvo.geometry import invert
-from hybridvo.trajectory import read_poses
+from hybridvo.trajectory import COLUMNS, read_poses
 from hybridvo.types import Camera, Frame
 
 DISPARITY_SIGMA_PX = 0.5
@@ -73,7 +73,7 @@ class KittiSequence(Sequence):
                 # the file holds the poses of camera 0
                 T_cam_cam0 = np.eye(4)
                 T_cam_cam0[:3, 3] = np.linalg.solve(self._P_left[:, :3], self._P_left[:, 3])
-                poses = read_poses(path, "kitti")[1] @ invert(T_cam_cam0)
+                poses = read_poses(path, COLUMNS["kitti"])[1] @ invert(T_cam_cam0)
                 self.poses = numbered_poses(numbers, poses)
                 self._sources.append(path)
 
