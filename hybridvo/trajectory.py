@@ -73,9 +73,6 @@ class Trajectory:
     def __len__(self) -> int:
         return len(self.timestamps)
 
-    def __repr__(self) -> str:
-        return f"Trajectory({len(self)} poses)"
-
     @property
     def positions(self) -> np.ndarray:
         """(N, 3) camera centres in the world, metres."""

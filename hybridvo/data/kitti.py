@@ -42,7 +42,6 @@ class KittiSequence(Sequence):
         left, right = ("2", "3") if images["2"] else ("0", "1")
         depth = numbered_files(root / "depth", r"(\d+)\.(?:png|npy)")
         calibration, times = root / "calib.txt", root / "times.txt"
-        self._sources += [calibration, times]
         self._P_left = _read_projection(calibration, left)
         if not depth and images[right]:
             self.depth_source, depth = "stereo", images[right]

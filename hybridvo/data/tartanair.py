@@ -47,7 +47,7 @@ class TartanAirSequence(Sequence):
             self.poses = numbered_poses(
                 numbers, ned_to_camera(read_poses(pose_file, COLUMNS["tartanair"])[1])
             )
-        self._sources = [pose_file, *map(_mask_file, flow.values())]
+        self._sources = [*map(_mask_file, flow.values())]
 
     def _calibration(self) -> Calibration:
         # Field of view 90 degrees over the width: 320 px at 640, c = (size - 1) / 2 because our
