@@ -28,8 +28,8 @@ CUE_WEIGHTS = {
     "prior": 0.3,
     "dominant": 2.0,
 }
-"""Weights of the cues of :mod:`hybridvo.hypotheses.cues`, dimensionless. Chosen by hand on seeds
-900-905 of the heavy development scenes and the scenario ``one60``;
+"""Weights of the cues of :mod:`hybridvo.hypotheses.selector`, dimensionless. Chosen by hand on
+seeds 900-905 of the heavy development scenes and the scenario ``one60``;
 ``python tools/golden.py --only /refine`` shows what they give."""
 MIN_CONFIDENCE = 0.85
 """Probability of being right below which a motion is degraded: a choice between flags on right

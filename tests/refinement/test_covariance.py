@@ -178,7 +178,7 @@ def test_a_narrow_support_is_degraded_and_a_whole_image_is_not() -> None:
 
 def test_depth_noise_that_the_flow_cannot_tell_comes_from_the_second_depth() -> None:
     # 0.3 m at 100 m: a parallax of 3 px, of which 2 % are lost in 0.5 px of flow noise
-    pair, _ = make_pair("far", 5)
+    pair, _ = make_pair("far", 6)
     result = refine(pair)
     # the depths differ by 1.2 to 1.41 times the noise, as much of it as interpolation averages
     assert result.depth_noise == pytest.approx(0.02, rel=0.2)
