@@ -94,7 +94,7 @@ def _open(args: argparse.Namespace) -> Any:
 
     given = {name: getattr(args, name) for name in ("camera", "depth_scale", "mask")}
     given = {name: value for name, value in given.items() if value is not None}
-    return open_sequence(args.path or args.sequence, args.dataset, **given)
+    return open_sequence(args.path, args.dataset, **given)
 
 
 def _run(args: argparse.Namespace, command: list[str]) -> Result:
@@ -132,8 +132,7 @@ def _compare(args: argparse.Namespace, command: list[str]) -> Result:
     methods = tuple(name.strip() for name in args.methods.split(",") if name.strip())
     weights = arguments.weight_files(args.weights, METHODS if methods == ("all",) else methods)
     given = {"methods": methods, "weights": weights, "options": arguments.run_options(args)}
-    given |= {"sequences": (*args.paths, *args.sequence), "command": command}
-    return _files(_call(compare, args, **given))
+    return _files(_call(compare, args, **given, command=command))
 
 
 def _evaluate(args: argparse.Namespace, command: list[str]) -> Result:
@@ -156,7 +155,7 @@ def _evaluate(args: argparse.Namespace, command: list[str]) -> Result:
 def _doctor(args: argparse.Namespace, command: list[str]) -> Result:
     from hybridvo.commands.doctor import diagnose, doctor
 
-    if args.path or args.sequence:
+    if args.path:
         found = diagnose(_open(args), pairs=args.pairs)
         return found, text_of("diagnosis", found), 0 if found["ok"] else 1
     report = doctor()
@@ -175,7 +174,7 @@ def _generate(args: argparse.Namespace, command: list[str]) -> Result:
     from hybridvo.commands.progress import Progress
 
     with Progress("generate", args.count, "samples", quiet=args.quiet) as bar:
-        sheet = _call(generate, args, preset=args.path or args.preset, report=bar.update)
+        sheet = _call(generate, args, report=bar.update)
     return {"contact_sheet": str(sheet)}, str(sheet), 0
 
 

@@ -26,7 +26,7 @@ from hybridvo.calibration import MIN_CONFIDENCE
 from hybridvo.calibration import right as probability
 from hybridvo.evaluation.pair_errors import true_motion
 from hybridvo.geometry import pose_matrix
-from hybridvo.hypotheses.selector import CueSelector
+from hybridvo.hypotheses.selector import select_by_cues
 from hybridvo.images.direct import direct_start, evidence_of
 from hybridvo.network.models import Models
 from hybridvo.pipeline import Context
@@ -57,8 +57,8 @@ def main(argv: list[str] | None = None) -> int:
     rows: dict[str, list[tuple[tuple[float, ...], bool, bool]]] = {}
     for still, some in ((False, pairs(args)), (True, static_pairs(args.data))):
         for pair, T, depth, limit in some:
-            told = direct_answers if still else answers
-            for name, evidence, error in told(pair, T, depth, models):
+            told = () if still else answers(pair, T, depth, models)
+            for name, evidence, error in (*direct_answers(pair, T, depth), *told):
                 is_right = error <= max(WRONG_PX, WRONG_FACTOR * limit)
                 rows.setdefault(name, []).append((evidence, is_right, still))
     for name, some in rows.items():
@@ -110,9 +110,9 @@ Answers = Iterator[tuple[str, tuple[float, ...], float]]
 """(which probability, the evidence it is computed from, error in px)."""
 
 
-def direct_answers(pair: Any, T: np.ndarray, depth: np.ndarray, *starts: Any) -> Answers:
-    """The direct motion from the identity and from other motions (4, 4), sure or not."""
-    for start in (None, *(x for x in starts if isinstance(x, np.ndarray))):
+def direct_answers(pair: Any, T: np.ndarray, depth: np.ndarray, starts: Any = (None,)) -> Answers:
+    """The direct motion from the identity or from other motions (4, 4), sure or not."""
+    for start in starts:
         direct = direct_start(pair, start, least=0.0)
         if direct is not None:
             error = ego_flow_error(direct.T_curr_prev, T, depth, pair)
@@ -124,10 +124,9 @@ def answers(pair: Any, T: np.ndarray, depth: np.ndarray, models: Models) -> Answ
     ctx = Context(models=models)
     found = ctx.search(pair)
     if isinstance(found, RelativePose):
-        yield from direct_answers(pair, T, depth)
         return
-    yield from direct_answers(pair, T, depth, *(pose_matrix(x) for x in found.poses[-2:]))
-    chosen = {"cues": CueSelector().select(found), "selector": ctx.select(pair, found)}
+    yield from direct_answers(pair, T, depth, [pose_matrix(x) for x in found.poses[-2:]])
+    chosen = {"cues": select_by_cues(found), "selector": ctx.select(pair, found)}
     if not found.is_ambiguous:
         chosen = {"clear": chosen["selector"]}
     for name, selection in chosen.items():

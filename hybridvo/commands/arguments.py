@@ -16,14 +16,7 @@ from hybridvo.commands.train import add_train
 if TYPE_CHECKING:
     from hybridvo.options import Options
 
-METHODS = (
-    *("hybrid", "hybrid-flow", "refine", "pwvo-refine"),
-    *("pwvo", "pwvo-paper", "pwvo-uncertain", "pwvo-naive", "pixelwise"),
-    *("vonet", "vonet-attention", "pnp-ransac", "pnp-ransac-tuned", "usac-magsac", "poselib"),
-    *("opencv-rgbd", "open3d-rgbd", "identity"),
-)
-"""For the help alone, which must not load what the methods need."""
-KINDS = ("sintel", "tartanair", "7scenes", "folder", "kitti", "tum")
+FLOWS = ("auto", "file", "dis")
 
 
 def build_parser(calls: Mapping[str, Any]) -> argparse.ArgumentParser:
@@ -34,73 +27,40 @@ def build_parser(calls: Mapping[str, Any]) -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"hybridvo {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-
-    def command(name: str, help: str, *parents: argparse.ArgumentParser) -> argparse.ArgumentParser:
-        described: dict[str, Any] = {"help": help, "description": help[0].upper() + help[1:] + "."}
-        made = commands.add_parser(name, parents=[_common(), *parents], **described)
-        made.set_defaults(call=calls[name])
-        return made
-
-    sequence = _input()
-    _add_run(command("run", "estimate the camera motion of a sequence", sequence))
-    _add_compare(command("compare", "run methods side by side and write a report"))
-    _add_show(command("show", "draw the maps of one pair of a sequence", sequence))
-    _add_evaluate(command("evaluate", "errors of a trajectory file against ground truth"))
-    wrong = "what is missing here, or wrong with a sequence"
-    add = command("doctor", wrong, _input(required=False)).add_argument
-    add("--pairs", type=int, default=40, metavar="N", help="pairs (default 40)")
-    add = command("demo", "render a scene with moving objects and run on it").add_argument
-    add("--out", default="runs/demo", metavar="DIR", help="default: runs/demo")
-    add("--overwrite", action="store_true", help="replace the results in --out")
-    add("--frames", type=int, default=20, metavar="N", help="default: 20")
-    add("--seed", type=int, default=0, metavar="N", help="of the scene")
-    generate = command("generate", "draw training samples into a folder")
-    which = generate.add_mutually_exclusive_group(required=True)
-    which.add_argument("path", nargs="?", metavar="PRESET", help="paper, diverse or a YAML file")
-    which.add_argument("--preset", metavar="PRESET", help="the same, by name")
-    add = generate.add_argument
-    add("--out", required=True, metavar="DIR", help="folder of the samples")
-    add("--count", type=int, default=1000, metavar="N", help="default: 1000")
-    add("--seed", type=int, default=0, metavar="N")
-    add("--size", type=int, nargs=2, metavar=("H", "W"), help="pixels")
-    add("--workers", type=int, default=1, metavar="N", help="processes")
-    add_train(commands.add_parser("train", help="train a network"), _common(), calls["train"])
-    init = command("init", "write a camera.yaml to fill in, for a recording of your own")
-    init.add_argument("directory", metavar="DIR", help="folder with rgb/ and depth/")
-    return parser
-
-
-def _common() -> argparse.ArgumentParser:
-    """Options of every command."""
     common = argparse.ArgumentParser(add_help=False)
     common.add_argument("--json", action="store_true", help="print the result as JSON on stdout")
     loudness = common.add_mutually_exclusive_group()
     loudness.add_argument("-v", "--verbose", action="store_true", help="more, and tracebacks")
     loudness.add_argument("-q", "--quiet", action="store_true", help="errors only")
-    return common
+    for name, (help, add_arguments) in COMMANDS.items():
+        made = commands.add_parser(name, help=help, description=f"{help}.", parents=[common])
+        made.set_defaults(call=calls[name])
+        add_arguments(made)
+    add_train(commands.add_parser("train", help="train a network"), common, calls["train"])
+    return parser
 
 
-def _input(required: bool = True) -> argparse.ArgumentParser:
+def _sequence(command: argparse.ArgumentParser, required: bool = True) -> None:
     """Which sequence, and what its folder does not say."""
-    given = argparse.ArgumentParser(add_help=False)
-    where = given.add_mutually_exclusive_group(required=required)
-    where.add_argument("path", nargs="?", metavar="DIR", help="folder of the sequence")
-    where.add_argument("--sequence", metavar="DIR", help="the same, by name")
-    add = given.add_argument
-    add("--dataset", metavar="KIND", help=f"one of {', '.join(KINDS)} (default: detected)")
+    where = command.add_mutually_exclusive_group(required=required)
+    folder = "folder of the sequence"
+    where.add_argument("path", nargs="?", default=argparse.SUPPRESS, metavar="DIR", help=folder)
+    where.add_argument("--sequence", dest="path", metavar="DIR", help="the same, by name")
+    add = command.add_argument
+    kinds = "sintel, tartanair, 7scenes, folder, kitti or tum (default: detected)"
+    add("--dataset", metavar="KIND", help=kinds)
     camera = "camera.yaml, ROS camera_info, or numbers"
     add("--camera", metavar="FILE|fx,fy,cx,cy", help=camera)
     scale = "depth units per metre, 1000: millimetres"
     add("--depth-scale", type=float, metavar="N", help=scale)
     add("--mask", metavar="DIR", help="images that are 0 where pixels do not count")
-    return given
 
 
-def _add_selection(command: argparse.ArgumentParser) -> None:
+def _options(command: argparse.ArgumentParser) -> None:
     """What ``run`` and ``compare`` share."""
     add = command.add_argument
     flow = "default auto: the sequence's files, else DIS; compare: side by side"
-    add("--flow", choices=("auto", "file", "dis"), help=flow)
+    add("--flow", choices=FLOWS, help=flow)
     add("--start", type=int, metavar="N", help="first frame (default 0)")
     add("--stop", type=int, metavar="N", help="the one after the last frame")
     add("--stride", type=int, metavar="N", help="step between frames (default 1)")
@@ -117,42 +77,44 @@ def _add_selection(command: argparse.ArgumentParser) -> None:
         exists.add_argument(f"--{name}", dest="mode", help=help, **kind)
 
 
-def _add_run(run: argparse.ArgumentParser) -> None:
+def _run(run: argparse.ArgumentParser) -> None:
+    _sequence(run)
     add = run.add_argument
     add("--out", metavar="DIR", help="output folder (default: runs/NAME)")
-    add("--method", metavar="NAME", help=f"one of {', '.join(METHODS)} (default: hybrid)")
-    _add_selection(run)
+    add("--method", metavar="NAME", help="default: hybrid; `hybridvo doctor` lists all")
+    _options(run)
     add("--max-failed", type=float, metavar="X", help="fraction of failed motions (default 0.2)")
     add("--strict", action="store_true", default=None, help="a broken frame ends the run")
     recording = "Rerun recording (extra 'viz'; default: recording.rrd in the output folder)"
     add("--rrd", nargs="?", const="", metavar="FILE", help=recording)
 
 
-def _add_compare(compare: argparse.ArgumentParser) -> None:
+def _compare(compare: argparse.ArgumentParser) -> None:
     add = compare.add_argument
+    named: dict[str, Any] = {"action": "extend", "nargs": "+", "default": [], "metavar": "DIR"}
+    add("--sequence", dest="sequences", help="the same as DIR, by name; repeatable", **named)
     many = "sequences, or folders of sequences (MPI Sintel as it was unpacked)"
-    add("paths", nargs="*", metavar="DIR", help=many)
-    named = "the same, by name; repeatable"
-    add("--sequence", action="extend", nargs="+", default=[], metavar="DIR", help=named)
+    add("sequences", **named | {"nargs": "*", "default": argparse.SUPPRESS}, help=many)
     add("--dataset", help="kind of the sequences (default: detected)")
     add("--out", default="runs/compare", metavar="DIR", help="default: runs/compare")
     add("--methods", default="all", help="comma-separated; default: all that run here")
-    _add_selection(compare)
+    _options(compare)
     add("--protocol", choices=("paper",), help="MPI Sintel as PWVO's paper scores it: 992 pairs")
-    add("--worst", type=int, default=3, help="worst pairs shown for each method")
+    add("--worst", type=int, default=3, help="worst pairs listed for each method")
 
 
-def _add_show(show: argparse.ArgumentParser) -> None:
+def _show(show: argparse.ArgumentParser) -> None:
+    _sequence(show)
     add = show.add_argument
     add("--pair", type=int, default=0, metavar="N", help="first frame (default 0)")
     add("--out", default="pair.png", metavar="FILE", help="default: pair.png")
     add("--method", default="hybrid", metavar="NAME", help="estimator (default: hybrid)")
-    add("--flow", choices=("auto", "file", "dis"), default="auto")
+    add("--flow", choices=FLOWS, default="auto")
     add("--weights", action="append", default=[], metavar="FILE", help="a network")
     add("--overwrite", action="store_true", help="replace the image")
 
 
-def _add_evaluate(evaluate: argparse.ArgumentParser) -> None:
+def _evaluate(evaluate: argparse.ArgumentParser) -> None:
     add = evaluate.add_argument
     add("estimate", metavar="EST", help="estimated trajectory")
     add("gt", metavar="GT", help="true trajectory")
@@ -164,6 +126,48 @@ def _add_evaluate(evaluate: argparse.ArgumentParser) -> None:
     for name in ("est", "gt"):
         add(f"--format-{name}", choices=("auto", "tum", "kitti", "tartanair"), default="auto")
         add(f"--axes-{name}", choices=("auto", "camera", "ned"), default="auto")
+
+
+def _doctor(doctor: argparse.ArgumentParser) -> None:
+    _sequence(doctor, required=False)
+    doctor.add_argument("--pairs", type=int, default=40, metavar="N", help="pairs (default 40)")
+
+
+def _demo(demo: argparse.ArgumentParser) -> None:
+    add = demo.add_argument
+    add("--out", default="runs/demo", metavar="DIR", help="default: runs/demo")
+    add("--overwrite", action="store_true", help="replace the results in --out")
+    add("--frames", type=int, default=20, metavar="N", help="default: 20")
+    add("--seed", type=int, default=0, metavar="N", help="of the scene")
+
+
+def _generate(generate: argparse.ArgumentParser) -> None:
+    which = generate.add_mutually_exclusive_group(required=True)
+    named: dict[str, Any] = {"metavar": "PRESET", "help": "paper, diverse or a YAML file"}
+    which.add_argument("preset", nargs="?", default=argparse.SUPPRESS, **named)
+    which.add_argument("--preset", **named)
+    add = generate.add_argument
+    add("--out", required=True, metavar="DIR", help="folder of the samples")
+    add("--count", type=int, default=1000, metavar="N", help="default: 1000")
+    add("--seed", type=int, default=0, metavar="N")
+    add("--size", type=int, nargs=2, metavar=("H", "W"), help="pixels")
+    add("--workers", type=int, default=1, metavar="N", help="processes")
+
+
+def _init(init: argparse.ArgumentParser) -> None:
+    init.add_argument("directory", metavar="DIR", help="folder with rgb/ and depth/")
+
+
+COMMANDS = {
+    "run": ("Estimate the camera motion of a sequence", _run),
+    "compare": ("Run methods side by side and write a report", _compare),
+    "show": ("Draw the maps of one pair of a sequence", _show),
+    "evaluate": ("Errors of a trajectory file against ground truth", _evaluate),
+    "doctor": ("What is missing here, or wrong with a sequence", _doctor),
+    "demo": ("Render a scene with moving objects and run on it", _demo),
+    "generate": ("Draw training samples into a folder", _generate),
+    "init": ("Write a camera.yaml to fill in, for a recording of your own", _init),
+}
 
 
 # -- options --------------------------------------------------------------------------------------

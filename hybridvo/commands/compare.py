@@ -29,19 +29,17 @@ from hybridvo.data.sequence import Sequence, open_sequence
 from hybridvo.errors import HybridVOError, InputError
 from hybridvo.estimation import warm_up
 from hybridvo.evaluation import scores
-from hybridvo.evaluation.drawing import draw_worst
 from hybridvo.evaluation.pair_errors import ERRORS, pair_facts, true_motion, true_trajectory
 from hybridvo.evaluation.protocols import check_protocol, protocol_summary, same_intrinsics
 from hybridvo.evaluation.report import write_report
 from hybridvo.files import Mode, atomic_write, held, make_folder, versions, write_csv, write_json
-from hybridvo.flow import FlowProvider
 from hybridvo.network.models import Models
 from hybridvo.options import Options
 from hybridvo.pipeline import METHODS, check_method, weights_hash
 
 _logger = logging.getLogger(__name__)
 WRITTEN = ("results.json", "results.csv", "pairs.csv", "report.md", "report.html")
-"""What a finished comparison leaves, beside ``runs/`` and ``worst/``."""
+"""What a finished comparison leaves, beside ``runs/``."""
 CAMERA_FLOW_KINDS = ("tartanair",)
 """Data sets whose true flow is that of the camera alone: it does not show what moves by itself."""
 
@@ -64,8 +62,8 @@ def compare(
 
     A folder of ``sequences`` stands for all that it holds; the method ``all`` for all that can run,
     the flow ``auto`` for every source that a sequence has, side by side. ``protocol`` scores MPI
-    Sintel as the paper does, ``weights`` names files of networks, ``worst`` counts the pairs shown
-    for each method and flow. ``resume`` keeps finished runs.
+    Sintel as the paper does, ``weights`` names files of networks, ``worst`` counts the pairs
+    listed for each method and flow. ``resume`` keeps finished runs.
     """
     out, options = Path(out), options or Options()
     if worst < 0:
@@ -82,10 +80,9 @@ def compare(
             f"them, or another --out."
         )
     with held(out):
-        for name in ("runs", "worst"):
-            if mode == "overwrite":
-                shutil.rmtree(out / name, ignore_errors=True)
-            make_folder(out / name)
+        if mode == "overwrite":
+            shutil.rmtree(out / "runs", ignore_errors=True)
+        make_folder(out / "runs")
         for name, reason in missing.items():
             _logger.warning("not run: %s: %s", name, reason)
         for name in names:
@@ -105,11 +102,9 @@ def compare(
         tables, facts = zip(*(_read(job, protocol is not None) for job in jobs), strict=True)
         table = pd.concat(tables, ignore_index=True)
         rows = [row for two in zip(jobs, tables, strict=True) for row in _rows(*two, out)]
-        totals, entries = scores.totals(table, rows), scores.worst_pairs(table, worst)
-        for job, mine in zip(jobs, tables, strict=True):
-            here = [entry for entry in entries if entry["sequence"] == job.name]
-            draw_worst(out, job.sequence, job.flows, options, models, here, mine)
-        result |= {"rows": rows, "totals": totals, "sequences": facts, "worst_pairs": entries}
+        totals = scores.totals(table, rows)
+        result |= {"rows": rows, "totals": totals, "sequences": facts}
+        result["worst_pairs"] = scores.worst_pairs(table, worst)
         result["protocol"] = None if protocol is None else protocol_summary(totals, facts)
         _write(out, result, table)
     return [out / name for name in WRITTEN]
@@ -165,12 +160,12 @@ def open_all(path: str | os.PathLike[str], dataset: str | None = None) -> list[S
 
 @dataclass
 class _Job:
-    """One sequence: providers of its flows, and the runs that are done, by method and flow."""
+    """One sequence: its flows by label, and the runs that are done, by method and flow."""
 
     sequence: Sequence
     name: str
     folder: Path
-    flows: dict[str, FlowProvider]
+    flows: tuple[str, ...]
     runs: dict[tuple[str, str], Path] = field(default_factory=dict)
 
     def run(
@@ -224,10 +219,10 @@ def _jobs(
             usable = sequence.has_flow and options.run.stride == 1
             images = any(file is not None for file in sequence.rgb_files)
             sources = ["dis"] * (images or not usable) + ["file"] * usable
-        flows = {}
-        for source in sources:  # an oracle is named
-            label = "file (true)" if source == "file" and sequence.flow_is_true else source
-            flows[label] = flow_provider(sequence, _with(options, flow={"source": source}))
+        for source in sources:
+            flow_provider(sequence, _with(options, flow={"source": source}))
+        is_true = sequence.flow_is_true  # an oracle is named
+        flows = tuple("file (true)" if s == "file" and is_true else s for s in sources)
         folder = out / "runs" / re.sub(r"[^\w.-]", "_", name)
         if folder in [job.folder for job in jobs]:
             raise InputError(f"--sequence: {name} is given twice.")
@@ -277,8 +272,6 @@ def _pairs(job: _Job, run: tuple[str, str], folder: Path) -> pd.DataFrame:
     """Motions of one run."""
     steps = pd.read_csv(folder / "steps.csv", dtype={"reason": str, "message": str})
     stride = int(np.diff(steps["index"][:2]).sum())
-    with np.load(folder / "steps.npz") as arrays:
-        steps["T_curr_prev"] = list(arrays["T_curr_prev"])
     steps = steps[steps["prev_index"].notna()].fillna({"reason": "", "message": ""})
     missing = steps["reason"] == "missing_frame"
     steps.loc[missing, [*ERRORS, "motion_ms", "flow_ms"]] = np.nan

@@ -1,7 +1,8 @@
-"""``hybridvo demo``: a rendered scene in which objects move, and the methods on it."""
+"""``hybridvo demo``: a rendered scene in which objects move, and the methods compared on it."""
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 from collections.abc import Iterable
@@ -10,16 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from hybridvo.commands.run import run
-from hybridvo.data.sequence import open_sequence
+from hybridvo.commands.compare import compare
 from hybridvo.errors import InputError
-from hybridvo.evaluation.pair_errors import true_trajectory
-from hybridvo.evaluation.plots import plot_trajectories
-from hybridvo.files import Mode, make_folder, write_json
-from hybridvo.options import FlowOptions, Options, RunOptions
+from hybridvo.files import make_folder, write_json
+from hybridvo.options import FlowOptions, Options
 from hybridvo.synthetic.render import write_sintel
 from hybridvo.synthetic.scenes import make_scene
-from hybridvo.trajectory import read_trajectory
 
 METHODS = {
     "hybrid": "hybridvo (hybrid)",
@@ -29,7 +26,6 @@ METHODS = {
     "identity": "identity (no motion)",
 }
 """Methods of the demo and what its table calls them."""
-DRAWN = ("pnp-ransac-tuned", "hybrid")
 MARK = "hybridvo_demo.json"
 """File by which a folder is known as a demo's own, and may be replaced."""
 SCENE, HEIGHT, WIDTH = "light", 218, 512
@@ -59,29 +55,32 @@ def demo(
     write_json(out / MARK, {})
     scene = make_scene(SCENE, seed, height=HEIGHT, width=WIDTH, frames=frames)
     write_sintel(scene, out / "data", SCENE)
-    sequence = open_sequence(out / "data" / "training" / "clean" / SCENE, "sintel")
-    rows, paths = [], {}
-    for method, name in METHODS.items():
-        wanted = RunOptions(method=method, max_failed=1.0)
-        options = Options(flow=FlowOptions(source="dis"), run=wanted)
-        mode: Mode = "overwrite" if overwrite else "new"
-        given: dict[str, Any] = {"mode": mode, "command": command, "quiet": quiet}
-        summary, _ = run(sequence, out / method, options, **given)
-        metrics = summary["metrics"]
+    compare(
+        [out / "data" / "training" / "clean" / SCENE],
+        out,
+        methods=tuple(METHODS),
+        options=Options(flow=FlowOptions(source="dis")),
+        mode="overwrite" if overwrite else "new",
+        command=command,
+        quiet=quiet,
+    )
+    rows = []
+    for row in json.loads((out / "results.json").read_text(encoding="utf-8"))["rows"]:
+        run = (out / row["trajectory"]).parent
+        metrics = json.loads((run / "metrics.json").read_text(encoding="utf-8"))
         rows.append(
             {
-                "method": name,
+                "method": METHODS[row["method"]],
                 "ate_cm": 100.0 * metrics["ate_rmse_origin"],
                 "rpe_cm": 100.0 * metrics["rpe_trans_mean"],
-                "rotation_deg": metrics["rot_err_deg_mean"],
-                "epe_px": metrics["epe_l2_px"],
-                "failed": summary["failed"],
-                "frame_ms": summary["frame_ms_median"],
+                "rotation_deg": row["rot_err_deg_mean"],
+                "epe_px": row["epe_l2_px"],
+                "failed": row["failed"],
+                "frame_ms": row["ms_with_flow_median"],
             }
         )
-        paths[method] = read_trajectory(out / method / "trajectory.tum")
     moving = float(np.median([(scene.object_id(i) > 0).mean() for i in range(scene.frames)]))
-    content: dict[str, Any] = {
+    content = {
         "command": list(command),
         "scene": {"kind": SCENE, "seed": seed, "frames": frames, "height": HEIGHT, "width": WIDTH},
         "moving_fraction": moving,
@@ -89,11 +88,7 @@ def demo(
         "depth_source": "true",
         "alignment": "origin",
         "rows": rows,
-        "image": os.fspath(out / "trajectory.png"),
+        "report": os.fspath(out / "report.html"),
     }
-    drawn = {METHODS[method]: paths[method] for method in DRAWN}
-    title = f"{100 * moving:.0f} % of the pixels move by themselves"
-    truth = true_trajectory(sequence, range(frames))
-    plot_trajectories(drawn, content["image"], truth=truth, alignment="origin", title=title)
     write_json(out / MARK, content)
     return content

@@ -22,7 +22,6 @@ LABELS = {
     "epe_l2_px": "EPE [px]",
     "epe_l2_px_median": "median EPE [px]",
     "failure_rate": "share of failures",
-    "ms_per_pair_median": "time per pair, flow not included [ms]",
     "index": "pair",
     "right": "x, right [m]",
     "forward": "z, forward [m]",
@@ -103,17 +102,6 @@ def factor_charts(pairs: pd.DataFrame, methods: Sequence[str]) -> list[Figure]:
             axes = {"x": label, "y": "epe_l2_px_median", "markers": True}
             figures.append(_chart(px.line, medians, methods, **axes))
     return figures
-
-
-def time_chart(totals: Sequence[Mapping[str, Any]], methods: Sequence[str]) -> list[Figure]:
-    """Median error over median time, of the first source of flow."""
-    rows = pd.DataFrame(totals).dropna(subset=["epe_l2_px_median", "ms_per_pair_median"])
-    rows = rows[rows["method"] != "identity"]
-    if len(rows) < 2:
-        return []
-    axes = {"x": "ms_per_pair_median", "y": "epe_l2_px_median", "text": "method", "log_x": True}
-    figure = _chart(px.scatter, _first_flow(rows), methods, **axes)
-    return [figure.update_traces(textposition="top center", showlegend=False)]
 
 
 def path_charts(

@@ -1,14 +1,12 @@
-"""Images of one pair: the paper's figures, what networks look at, and the worst of a comparison."""
+"""Images of one pair: its flow and weights, the paper's figures, what networks look at."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from hybridvo.data.sequence import Sequence, iter_pairs
 from hybridvo.errors import InputError
@@ -17,14 +15,13 @@ from hybridvo.evaluation.pair_errors import MOVING_PX, true_motion
 from hybridvo.evaluation.plots import Panel, draw_panels, flow_panel, longest_flow
 from hybridvo.evaluation.saliency import Saliency, last_pass, saliencies
 from hybridvo.files import atomic_write, make_folder
-from hybridvo.flow import FlowProvider, dis_flow
+from hybridvo.flow import dis_flow
 from hybridvo.geometry import ego_flow, matrix_to_euler_deg
 from hybridvo.network.layers import KINDS
-from hybridvo.network.models import Models, load_weights
+from hybridvo.network.models import load_weights
 from hybridvo.network.weights import pretrained, pretrained_names
-from hybridvo.options import Options
 from hybridvo.pipeline import DEFAULT_METHOD
-from hybridvo.results import PixelwisePrediction
+from hybridvo.results import PixelwisePrediction, RelativePose
 from hybridvo.types import FramePair
 
 
@@ -62,7 +59,7 @@ def draw(
         flow_gt = given.flow if given.flow_is_true else sequence.flow(pair)[0]
     T_gt = true_motion(sequence, pair, pair + 1)
     motion = estimate(given, method=method)
-    panels, moving = _pair_panels(given, motion.T_curr_prev, motion.weights, T_gt, flow_gt)
+    panels, moving = _pair_panels(given, motion, T_gt, flow_gt)
     true = None if T_gt is None else (matrix_to_euler_deg(T_gt[:3, :3]), T_gt[:3, 3])
     for name, network in found:
         output, inputs, T_start = last_pass(network, given)
@@ -76,47 +73,6 @@ def draw(
     with atomic_write(out, "wb") as file:
         file.write(draw_panels(panels, heading, width / height))
     return out
-
-
-def draw_worst(
-    out: Path,
-    sequence: Sequence,
-    flows: Mapping[str, FlowProvider],
-    options: Options,
-    models: Models,
-    entries: Iterable[dict[str, Any]],
-    pairs: pd.DataFrame,
-) -> None:
-    """Draw worst pairs of one sequence of a comparison, with the motion that it found.
-
-    Each of ``entries`` gets ``picture`` (a path below ``out``), or None and ``picture_reason``.
-    """
-    found = pairs.set_index(["index", "method", "flow_source"])
-    for entry in entries:
-        method, label = entry["method"], entry["flow_source"]
-        row = found.loc[(entry["index"], method, label)]
-        entry |= {"picture": None, "picture_reason": None}
-        try:
-            prev, curr = (sequence.frame(int(row[name])) for name in ("prev", "next"))
-        except (InputError, OSError) as error:
-            entry["picture_reason"] = f"the pair cannot be read: {error}"
-            continue
-        field = flows[label](prev, curr)
-        if field.flow is None or prev.depth is None:
-            entry["picture_reason"] = "the pair has no flow, or no depth"
-            continue
-        pair = field.pair(prev, curr)
-        weights = None
-        if not entry["status"].startswith("failed"):  # of the pair on its own, without a tracker
-            weights = estimate(pair, method=method, options=options, models=models).weights
-        T_gt = true_motion(sequence, prev.index, curr.index)
-        panels, _ = _pair_panels(pair, row["T_curr_prev"], weights, T_gt, None)
-        aspect = prev.camera.width / prev.camera.height
-        name = "_".join([entry["sequence"], f"{entry['index']:06d}", method, label.split()[0]])
-        entry["picture"] = "worst/" + re.sub(r"[^\w.-]", "_", name) + ".jpg"
-        size: dict[str, Any] = {"columns": len(panels), "inches": 2.2, "format": "jpeg"}
-        with atomic_write(out / entry["picture"], "wb") as file:
-            file.write(draw_panels(panels, "", aspect, **size))
 
 
 def networks(files: Iterable[str | Path] = ()) -> list[tuple[str, Any]]:
@@ -137,16 +93,12 @@ def networks(files: Iterable[str | Path] = ()) -> list[tuple[str, Any]]:
 
 
 def _pair_panels(
-    pair: FramePair,
-    T_est: np.ndarray,
-    weights: np.ndarray | None,
-    T_gt: np.ndarray | None,
-    flow_gt: np.ndarray | None,
+    pair: FramePair, motion: RelativePose, T_gt: np.ndarray | None, flow_gt: np.ndarray | None
 ) -> tuple[list[Panel], np.ndarray]:
     """Panels that need no network, and (H, W) which pixels move by themselves."""
     flow, depth = np.asarray(pair.flow), np.asarray(pair.prev.depth)
     cameras = pair.prev.camera, pair.curr.camera
-    ego = ego_flow(depth, T_est, *cameras)
+    ego = ego_flow(depth, motion.T_curr_prev, *cameras)
     ego_gt = None if T_gt is None else ego_flow(depth, T_gt, *cameras)
     objects = flow - ego if ego_gt is None or flow_gt is None else flow_gt - ego_gt
     with np.errstate(invalid="ignore"):
@@ -158,8 +110,8 @@ def _pair_panels(
     panels += [flow_panel(title, part, longest) for title, part in parts.items()]
     if ego_gt is not None:
         panels.append(Panel("error of the ego flow", np.linalg.norm(ego - ego_gt, axis=2), "px"))
-    if weights is not None:
-        panels.append(Panel("weights (outline: moving)", weights, "weight", 1.0, moving))
+    if motion.weights is not None:
+        panels.append(Panel("weights (outline: moving)", motion.weights, "weight", 1.0, moving))
     return panels, moving
 
 

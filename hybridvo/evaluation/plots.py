@@ -42,9 +42,9 @@ def plot_trajectories(
     Estimates are aligned as ``alignment`` says, or by their first pose where a path does not
     determine it (the legend says which). ``path`` ends in ``.png``.
     """
-    rows = {"height_ratios": [1.0] if truth is None else [2.0, 1.0], "squeeze": False}
+    heights = [1.0] if truth is None else [2.0, 1.0]
     figure = Figure(figsize=(10.0, 7.4), dpi=130, layout="constrained")
-    above, *below = figure.subplots(1 if truth is None else 2, 1, **rows)[:, 0]
+    above, *below = figure.subplots(len(heights), squeeze=False, height_ratios=heights)[:, 0]
     above.set(xlabel="x right [m]", ylabel="z forward [m]")
     start = 0.0
     if truth is not None:
@@ -122,9 +122,8 @@ def draw_panels(
     *,
     columns: int = 2,
     inches: float = 5.4,
-    format: str = "png",
 ) -> bytes:
-    """Encoded image of panels (at least one), ``columns`` in a row, each ``inches`` wide.
+    """PNG of panels (at least one), ``columns`` in a row, each ``inches`` wide.
 
     ``aspect`` is width over height of the pair's images; networks see images of another shape,
     which are shown in it.
@@ -154,7 +153,7 @@ def draw_panels(
         bar.ax.tick_params(labelsize=8)
     figure.suptitle(heading, fontsize=11, x=0.01, ha="left", parse_math=False)
     stream = io.BytesIO()
-    figure.savefig(stream, format=format)
+    figure.savefig(stream, format="png")
     return stream.getvalue()
 
 

@@ -5,7 +5,6 @@ Estimated flow stands before true flow (an oracle) everywhere.
 
 from __future__ import annotations
 
-import base64
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -62,7 +61,6 @@ def write_report(folder: Path, result: Mapping[str, Any], pairs: pd.DataFrame) -
         "How the errors are distributed": charts.error_distribution(pairs, methods),
         "How often an estimate fails": charts.failure_chart(result["totals"], methods),
         "What makes it fail": charts.factor_charts(pairs, methods),
-        "Error against time": charts.time_chart(result["totals"], methods),
     }
     names = dict.fromkeys(row["sequence"] for row in result["rows"])
     paths = {name: charts.path_charts(folder, result, pairs, name, methods) for name in names}
@@ -73,7 +71,7 @@ def write_report(folder: Path, result: Mapping[str, Any], pairs: pd.DataFrame) -
         "pairs": len(pairs.drop_duplicates(["sequence", "index"])),
         "methods": methods,
         "tables": [(flow, (rows, RESULT_COLUMNS, ("method",))) for flow, rows in by_flow(result)],
-        "worst": _gallery(folder, result),
+        "worst": [e | {"error": number(e["epe_l2_px"])} for e in result["worst_pairs"]],
         "sections": [(name, _json(some)) for name, some in sections.items() if some],
         "sequences": [(name, _json(some)) for name, some in paths.items()],
         "protocol": _protocol_tables(result.get("protocol")),
@@ -142,22 +140,6 @@ def _protocol_tables(protocol: Mapping[str, Any] | None) -> list[tuple[str, Any]
         ("Measured here", (protocol["table"], here, ("method", "flow_source"))),
         ("Published by others", (protocol["published"], columns, others)),
     ]
-
-
-def _gallery(folder: Path, result: Mapping[str, Any]) -> list[tuple[str, list[dict[str, Any]]]]:
-    """Worst pairs by method, estimated flow first and the best method first, with images."""
-    groups: dict[str, list[dict[str, Any]]] = {}
-    for flow, rows in by_flow(result):
-        for method in dict.fromkeys(row["method"] for row in [*ranking(rows), *rows]):
-            groups[f"{method}, {flow} flow"] = []
-    for entry in result["worst_pairs"]:
-        source = None
-        if entry["picture"]:
-            image = base64.b64encode((folder / entry["picture"]).read_bytes()).decode()
-            source = f"data:image/jpeg;base64,{image}"
-        shown = {**entry, "source": source, "error": number(entry["epe_l2_px"])}
-        groups[f"{entry['method']}, {entry['flow_source']} flow"].append(shown)
-    return [(title, entries) for title, entries in groups.items() if entries]
 
 
 def _json(figures: Sequence[Any]) -> list[str]:

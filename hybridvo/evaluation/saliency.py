@@ -105,7 +105,7 @@ def saliencies(
 
     def part(output: Any, k: int) -> torch.Tensor:
         is_map = isinstance(output, PixelwisePrediction)
-        return getattr(output, PARTS[k]) if is_map else output[k]  # type: ignore[no-any-return]
+        return getattr(output, PARTS[k]) if is_map else output[k]
 
     with torch.no_grad():
         output = run(*given)
@@ -113,7 +113,8 @@ def saliencies(
     for k, what in enumerate(PARTS):
         motion = weights = part(output, k).clone().requires_grad_()
         if isinstance(output, PixelwisePrediction):
-            motion = select_pose(replace(output, **{what: weights}))[k]
+            own: dict[str, Any] = {what: weights}
+            motion = select_pose(replace(output, **own))[k]
         direction = (motion / motion.norm().clamp(min=1e-12)).detach()
         (weights,) = torch.autograd.grad((direction * motion).sum(), weights)
         answer = lambda *x, k=k, w=weights: (w * part(run(*x), k)).sum()  # noqa: E731

@@ -43,7 +43,7 @@ PAIR_COLUMNS = (
 
 def pair_table(pairs: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
     """Pairs as a table with every column; unknown numbers are NaN."""
-    table = pd.DataFrame(list(pairs), columns=[*PAIR_COLUMNS, "T_curr_prev"])
+    table = pd.DataFrame(list(pairs), columns=PAIR_COLUMNS)
     text = ("sequence", "method", "flow_source", "status", "message")
     numbers = [name for name in PAIR_COLUMNS if name not in text]
     table[numbers] = table[numbers].apply(pd.to_numeric)

@@ -7,7 +7,6 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-import cv2
 import filelock
 import numpy as np
 import pytest
@@ -108,8 +107,6 @@ def test_results_hold_what_the_interface_promises(tiny, tmp_path, capsys) -> Non
         assert row["epe_l2_px"] == pytest.approx(np.mean(mine))
         assert float(line["epe_l2_px"]) == row["epe_l2_px"]
     assert all((out / row["trajectory"]).exists() for row in result["rows"])
-    images = {e["method"]: cv2.imread(str(out / e["picture"])) for e in result["worst_pairs"]}
-    assert images["refine"].shape[1] > images["identity"].shape[1]  # with the pixels' weights
 
 
 @pytest.mark.parametrize("method", ["refine", "pnp-ransac-tuned"])

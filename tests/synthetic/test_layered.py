@@ -11,6 +11,7 @@ from hybridvo import geometry
 from hybridvo.errors import InputError
 from hybridvo.synthetic import diverse, layered, sensors
 from hybridvo.synthetic import draws as drawing
+from hybridvo.synthetic.rendered import RenderedOptions
 from hybridvo.types import Camera
 
 
@@ -154,13 +155,17 @@ def test_samples_of_any_size_are_finite_and_complete(kind, size):
             assert getattr(s, name).shape == size
         for field in dataclasses.fields(s):
             value = getattr(s, field.name)
-            if field.name == "rays":  # those of the pixels' centres
-                assert value is None
-                continue
             assert value.dtype == (bool if field.name == "moving" else np.float32), field.name
             assert np.isfinite(value).all(), field.name
             if field.name.startswith("depth"):
                 assert (value >= 0).all()
+
+
+def test_rendered_samples_obey_the_camera_where_nothing_moves():
+    for i in range(4):
+        s = RenderedOptions(height=64, width=128).sample(generator(i))
+        ok = np.isfinite(s.flow).all(-1) & ~s.moving & (s.depth_true > 0)
+        assert np.median(np.linalg.norm(s.flow - s.ego_flow, axis=-1)[ok]) < 2.0
 
 
 def exact_diverse() -> diverse.DiverseOptions:
@@ -208,9 +213,10 @@ def test_visibility_by_hand():
     flow[0, 0, 0] = 1.0
     flow[0, 3, 0] = 1.0
     rho = np.array([[1.0, 0.1, 0.5, 0.5]], np.float32)
+    flow, rho = np.repeat(flow, 2, axis=0), np.repeat(rho, 2, axis=0)
     hidden, depth = layered.visibility(flow, rho, rho > 0)
-    assert hidden.tolist() == [[False, True, False, True]]
-    np.testing.assert_allclose(depth, [[1.0, 1.0, 2.0, 0.0]])
+    assert hidden.tolist() == [[False, True, False, True]] * 2
+    np.testing.assert_allclose(depth, [[1.0, 1.0, 2.0, 0.0]] * 2)
 
 
 def test_degradation_is_of_the_stated_size_and_keeps_what_is_exact():

@@ -14,10 +14,9 @@ from hybridvo.errors import InputError, OutputError
 from hybridvo.geometry import ego_flow, invert, pixel_grid, rotation_angle
 from hybridvo.synthetic.raycast import BOX, CYLINDER, ELLIPSOID
 from hybridvo.synthetic.render import Scene, Solid, SyntheticSequence, write_sintel
-from hybridvo.synthetic.scenes import BANDS, make_scene
+from hybridvo.synthetic.scenes import FAMILIES, HEAVY, make_scene
 from hybridvo.types import Camera
 
-HEAVY = [kind for kind in BANDS if kind.startswith("heavy")]
 CAMERA = Camera(20.0, 20.0, 10.0, 5.0, 11, 21)
 
 
@@ -33,10 +32,7 @@ def single(solid, *, frames=1, camera=CAMERA, poses=None):
 @pytest.fixture(scope="module")
 def scenes():
     """One small scene of each family, made once."""
-    return {
-        kind: make_scene(kind, 3, height=54, width=128, frames=2 if kind == "pair" else 6)
-        for kind in BANDS
-    }
+    return {kind: make_scene(kind, 3, height=54, width=128, frames=6) for kind in FAMILIES}
 
 
 # ---------------------------------------------------------------- depth, worked by hand
@@ -167,7 +163,7 @@ def test_a_deforming_mover_is_not_rigid(scenes):
 # ---------------------------------------------------------------- pictures
 
 
-@pytest.mark.parametrize("kind", BANDS)
+@pytest.mark.parametrize("kind", FAMILIES)
 def test_brightness_constancy(scenes, kind):
     scene = scenes[kind]
     first, second = scene.render(0).rgb, scene.render(1).rgb
@@ -216,7 +212,7 @@ def moved_points(scene, index):
     return out
 
 
-@pytest.mark.parametrize("kind", [kind for kind in BANDS if kind != "heavy_deforming"])
+@pytest.mark.parametrize("kind", [kind for kind in FAMILIES if kind != "heavy_deforming"])
 def test_occlusion_agrees_with_a_forward_depth_buffer(scenes, kind):
     """Independent test: depth of the moved point against the next rendered depth map."""
     scene = scenes[kind]
@@ -307,7 +303,7 @@ def test_long_paths_stay_bounded_and_never_rest(kind):
 
 
 @settings(max_examples=12, deadline=None)
-@given(seed=st.integers(0, 10**9), kind=st.sampled_from(list(BANDS)))
+@given(seed=st.integers(0, 10**9), kind=st.sampled_from(list(FAMILIES)))
 def test_every_draw_is_finite_and_repeatable(seed, kind):
     first, second = (make_scene(kind, seed, height=32, width=64, frames=2) for _ in range(2))
     a, b = first.render(0), second.render(0)
@@ -325,21 +321,12 @@ def test_every_draw_is_finite_and_repeatable(seed, kind):
 
 @pytest.mark.parametrize(
     ("change", "words"),
-    [
-        ({"kind": "heavy"}, "heavy_rigid"),
-        ({"seed": -1}, "seed"),
-        ({"frames": 1}, "frames"),
-        ({"height": 0}, "height"),
-        ({"width": 2.5}, "width"),
-        ({"zoom": 2.0}, "zoom"),
-        ({"noise": -1.0}, "noise"),
-        ({"noise": float("nan")}, "noise"),
-    ],
+    [({"kind": "heavy"}, "heavy_rigid"), ({"seed": -1}, "seed"), ({"height": 0}, "0x32")],
 )
 def test_bad_arguments_name_themselves(change, words):
-    arguments = {"kind": "light", "seed": 0, "height": 16, "width": 32, "frames": 2} | change
+    arguments = {"kind": "light", "seed": 0, "height": 16, "width": 32} | change
     with pytest.raises(InputError, match=words):
-        make_scene(arguments.pop("kind"), arguments.pop("seed"), **arguments)
+        make_scene(**arguments)
 
 
 # ---------------------------------------------------------------- sequence and files
@@ -403,7 +390,7 @@ def test_write_sintel_sizes_and_round_trip(tmp_path):
 def test_write_sintel_refuses_bad_places(tmp_path, scenes):
     for name in ("", "a/b", "..", "."):
         with pytest.raises(InputError, match="plain folder name"):
-            write_sintel(scenes["pair"], tmp_path, name)
+            write_sintel(scenes["static"], tmp_path, name)
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="cannot be created"):
-        write_sintel(scenes["pair"], tmp_path / "file", "demo")
+        write_sintel(scenes["static"], tmp_path / "file", "demo")
