@@ -164,10 +164,10 @@ def heavy(args: argparse.Namespace) -> dict[str, Any]:
 def heavy_pairs(kind: str, seed: int) -> Iterator[tuple[str, Any, np.ndarray, np.ndarray]]:
     """(flow, pair, true motion, static pixels): pairs spread over a scene, each with both flows."""
     sequence = rendered(kind, seed, SIZE, HEAVY_FRAMES)
-    for i, (pairs, T, _) in zip(HEAVY_AT, heavy_inputs(sequence), strict=True):
+    for i, case in zip(HEAVY_AT, heavy_inputs(sequence), strict=True):
         static = (sequence.scene.object_id(i) <= 0).astype(np.float32)
         for flow in ("dis", "true"):
-            yield flow, pairs[flow], T, static
+            yield flow, case.pairs[flow], case.T_curr_prev, static
 
 
 def masked(static: np.ndarray) -> Estimator:
