@@ -47,7 +47,7 @@ class Case(NamedTuple):
 
 
 def groups(data: Path) -> dict[str, Callable[[], Iterator[Case]]]:
-    """Name of every group -> what makes its cases; recordings that ``data`` holds are among them."""
+    """Name of every group -> what makes its cases; with the recordings that ``data`` holds."""
     from hybridvo.synthetic.scenarios import DEGENERATE_SCENARIOS, MAIN_SCENARIOS
 
     made: dict[str, Callable[[], Iterator[Case]]] = {kind: partial(heavy, kind) for kind in HEAVY}
@@ -92,17 +92,14 @@ def scene_flow(sequence: Any) -> Any:
 
 def from_sequence(sequence: Any, flows: dict[str, Any], wanted: list[int]) -> Iterator[Case]:
     """Pairs of neighbours with each flow."""
-    T_world_cam = np.asarray(sequence.poses)
+    true = lambda i: np.linalg.inv(sequence.poses[i + 1]) @ sequence.poses[i]  # noqa: E731
     for i in wanted:
         prev, curr = sequence.frame(i), sequence.frame(i + 1)
         pairs = {
             name: provider(prev, curr).pair(prev, curr, sequence.depth_source)
             for name, provider in flows.items()
         }
-        T = [
-            np.linalg.inv(T_world_cam[k + 1]) @ T_world_cam[k] for k in range(max(i - 1, 0), i + 1)
-        ]
-        yield Case(pairs, T[-1], prev.depth, T[0] if i > 0 else None)
+        yield Case(pairs, true(i), prev.depth, true(i - 1) if i > 0 else None)
 
 
 def real(data: Path, name: str) -> Iterator[Case]:
