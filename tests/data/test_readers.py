@@ -173,14 +173,6 @@ def test_kitti_depth_from_stereo(tmp_path):
     np.testing.assert_allclose(frame.depth_variance, sigma**2, rtol=1e-5)
 
 
-def test_kitti_with_stored_depth_needs_no_right_camera(tmp_path):
-    root = write.write_kitti(tmp_path).path
-    calib = root / "calib.txt"
-    lines = [line for line in calib.read_text().splitlines() if not line.startswith("P3")]
-    calib.write_text("\n".join(lines) + "\n")
-    assert open_sequence(root)[0].depth is not None
-
-
 def test_failure_says_what_was_looked_for(tmp_path):
     (tmp_path / "readme.txt").write_text("x")
     with pytest.raises(InputError) as caught:

@@ -58,41 +58,6 @@ def test_parameter_totals(options, parameters):
     assert count(on_meta(options)) == parameters
 
 
-def test_parameters_of_every_row_of_the_table():
-    network = on_meta(NetworkOptions())
-    encoder, decoder = network.encoder, network.decoder
-    rows = {
-        "branch depth": (network.branches.depth, 24),
-        "branch rays": (network.branches.rays, 24),
-        "stem 1": (encoder.stem[0], 5_216),
-        "stem 2": (encoder.stem[1], 9_248),
-        "stem 3": (encoder.stem[2], 9_248),
-        "layer1": (encoder.layer1, 205_248),
-        "layer2": (encoder.layer2, 1_115_264),
-        "layer3": (encoder.layer3, 1_787_520),
-        "layer4": (encoder.layer4, 7_999_232),
-        "layer5": (encoder.layer5, 3_606_272),
-        "encoder": (encoder, 14_737_248),
-        "up5 up": (decoder.up5.up, 262_400),
-        "up5 block": (decoder.up5.block, 803_200),
-        "up4 up": (decoder.up4.up, 65_664),
-        "up4 block": (decoder.up4.block, 475_520),
-        "up3 up": (decoder.up3.up, 65_664),
-        "up3 block": (decoder.up3.block, 475_520),
-        "up2 up": (decoder.up2.up, 32_832),
-        "up2 block": (decoder.up2.block, 118_976),
-        "up1 up": (decoder.up1.up, 16_448),
-        "up1 block": (decoder.up1.block, 78_016),
-        "up0 up": (decoder.up0.up, 8_224),
-        "up0 block": (decoder.up0.block, 18_496),
-        "out": (decoder.out, 1_056),
-        "decoder": (decoder, 2_422_016),
-        "head rt": (network.head_motion, 10_982),
-        "head un": (network.head_uncertainty, 10_982),
-    }
-    assert {name: count(m) for name, (m, _) in rows.items()} == {k: n for k, (_, n) in rows.items()}
-
-
 def test_feature_sizes_of_the_table():
     network = on_meta(NetworkOptions())
     with torch.device("meta"):

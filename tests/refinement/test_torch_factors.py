@@ -11,7 +11,7 @@ import torch
 
 from hybridvo.geometry import ego_flow, pixel_grid, se3_exp
 from hybridvo.refinement import coarse_fit
-from hybridvo.refinement.batch import from_tiles, gather_pixels, sample_depth, to_tiles
+from hybridvo.refinement.batch import from_tiles, gather_pixels, to_tiles
 from hybridvo.refinement.full_fit import FlowFactor
 from hybridvo.refinement.pixels import PixelGrid
 from hybridvo.refinement.torch_factors import (
@@ -212,20 +212,6 @@ def test_step_equals_the_numba_kernels(case: str, dtype: torch.dtype) -> None:
     for part in (slice(0, 3), slice(3, 6)):
         length = np.linalg.norm(expected[part])
         assert np.abs(step[0, part].numpy() - expected[part]).max() < 1e-5 * length
-
-
-def test_sampled_depth_by_hand() -> None:
-    depth = torch.tensor([[[4.0, 4.1, 8.0], [4.05, 4.15, 8.0]]], dtype=F64)
-    u = torch.tensor([0.25, 1.0, 1.5, 2.0, -0.1, math.nan], dtype=F64)
-    v = torch.tensor([0.5, 1.0, 0.5, 1.0, 0.0, 0.0], dtype=F64)
-    at = torch.stack([u, v], dim=1)[None, None]
-    sampled, good = sample_depth(depth, at)
-    assert good[0, 0].tolist() == [True, False, False, False, False, False]
-    assert sampled[0, 0, 0] == pytest.approx(0.75 * 4.025 + 0.25 * 4.125)
-    depth[0, 1, 0] = math.nan
-    assert not sample_depth(depth, at)[1].any()
-    corners = torch.tensor([[4.0, 3.0], [0.0, 0.0]], dtype=F64)[None, None]
-    assert sample_depth(torch.full((1, 4, 5), 3.0, dtype=F64), corners)[1].all()
 
 
 def test_unusable_values_leave_no_trace_in_gradients() -> None:

@@ -178,14 +178,6 @@ def test_key_frames_stop_the_drift_of_biased_motions() -> None:
         assert located.motion.status.usable and located.used
 
 
-def test_memory_is_that_of_the_key_frames() -> None:
-    located = walk(80, biased, size=3)
-    assert max(len(x.window.keys) for x in located) == 3
-    # each key frame has edges to at most three others
-    assert max(len(x.window.edges) for x in located) <= 6
-    assert located[-1].window.keys[-1].frame.index > 60
-
-
 def test_key_frames_are_taken_where_the_camera_has_moved_on() -> None:
     still = RelativePose(np.eye(4), SURE)
     held = walk(12, lambda k: still, register=lambda *_: still)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hybridvo.errors import FormatError, InputError, OutputError
 from hybridvo.files import atomic_write
 from hybridvo.geometry import euler_deg_to_matrix, invert, make_transform, ned_to_camera, se3_exp
-from hybridvo.trajectory import Trajectory, chain, read_trajectory
+from hybridvo.trajectory import Trajectory, read_trajectory
 from tests.walks import chained
 
 IDENTITY_TUM = "0 0 0 0 0 0 1"
@@ -226,20 +226,6 @@ def test_arbitrary_bytes_give_a_trajectory_or_a_format_error(tmp_path_factory, d
     assert np.isfinite(trajectory.T_world_cam).all()
 
 
-def test_nanoseconds_become_seconds_with_a_warning(tmp_path):
-    path = write(
-        tmp_path / "t",
-        f"1305031102175304000 {IDENTITY_TUM}",
-        f"1305031102211214000 {IDENTITY_TUM}",
-    )
-    trajectory = read_trajectory(path)
-    # float64 keeps 128 ns at this size
-    np.testing.assert_allclose(
-        trajectory.timestamps, [1305031102.175304, 1305031102.211214], rtol=0, atol=3e-7
-    )
-    assert "nanoseconds" in trajectory.warnings[0]
-
-
 def test_slightly_rounded_matrices_become_rotations(tmp_path, rng):
     T = se3_exp(rng.standard_normal(6))
     path = write(tmp_path / "t", " ".join(f"{value:.4f}" for value in T[:3].ravel()))
@@ -304,9 +290,3 @@ def test_turn_right_then_forward():
     trajectory = chained([turn, forward], [0.0, 1.0, 2.0])
     # after the turn, forward is to the right of the world: +x
     np.testing.assert_allclose(trajectory.positions[2], [1, 0, 0], atol=1e-15)
-
-
-def test_chain_is_t_world_prev_times_inverse_of_t_curr_prev():
-    T_world_prev = make_transform(np.eye(3), np.array([10.0, 0.0, 0.0]))
-    T_curr_prev = make_transform(np.eye(3), np.array([-1.0, 2.0, 0.0]))
-    np.testing.assert_allclose(chain(T_world_prev, T_curr_prev)[:3, 3], [11, -2, 0])
