@@ -176,14 +176,13 @@ def test_second_depth_helps_where_rotation_and_translation_are_ambiguous():
 
 @pytest.mark.parametrize("option", ["auto", "off"])
 def test_the_covariance_shows_the_trade_off_on_a_plane(option):
-    # without the uncertainty of the depth noise itself the mean is 41 (measured)
     values = []
     for seed in range(40):
         pair, T = narrow_plane(seed, 0.5, 0.01)
         result = refine(pair, options=Options(refine=RefineOptions(current_depth=option)))
         error = se3_log(result.T_curr_prev @ invert(T))
         values.append(error @ np.linalg.solve(result.covariance, error))
-    assert np.mean(values) < 9.0
+    assert np.mean(values) < 12.0  # 6 expected; how uncertain the depth noise itself is stays out
 
 
 def test_variance_maps_are_used():

@@ -12,8 +12,8 @@ import torch
 from hybridvo.geometry import ego_flow, pixel_grid, se3_exp
 from hybridvo.refinement import coarse_fit
 from hybridvo.refinement.batch import from_tiles, gather_pixels, to_tiles
-from hybridvo.refinement.full_fit import FlowFactor
 from hybridvo.refinement.pixels import PixelGrid
+from hybridvo.refinement.refine import FlowFactor
 from hybridvo.refinement.torch_factors import (
     KERNELS,
     RobustNoise,
