@@ -120,13 +120,6 @@ def test_tum_calibrations_are_those_of_the_folder_name(tmp_path):
         assert given.camera(0) == Camera(500, 501, 320, 240, 480, 640) and given[0].mask is None
 
 
-def test_undistorted_depth_is_never_mixed(tmp_path):
-    frame = open_sequence(write.write_tum(tmp_path, "freiburg1").path)[0]
-    stored = np.append(np.round(write.depth_map(0, 480, 640) * 5000) / 5000, 0)
-    np.testing.assert_allclose(np.setdiff1d(frame.depth, stored.astype(np.float32)), [], atol=1e-6)
-    assert frame.mask.mean() > 0.8 and not frame.mask.all()
-
-
 def test_bonn_truth_is_that_of_the_camera(tmp_path):
     plain = open_sequence(write.write_tum(tmp_path / "a").path).poses
     sequence = open_sequence(write.write_tum(tmp_path / "b", "rgbd_bonn_crowd").path)

@@ -58,20 +58,6 @@ def test_parameter_totals(options, parameters):
     assert count(on_meta(options)) == parameters
 
 
-def test_feature_sizes_of_the_table():
-    network = on_meta(NetworkOptions())
-    with torch.device("meta"):
-        features = network.encoder(torch.zeros(1, 18, 128, 256))
-    assert [tuple(f.shape[1:]) for f in features] == [
-        (32, 64, 128),
-        (64, 32, 64),
-        (128, 16, 32),
-        (128, 8, 16),
-        (256, 4, 8),
-        (256, 2, 4),
-    ]
-
-
 @pytest.mark.parametrize("size", [(64, 96), (128, 256), (32, 32), (50, 71)])
 @pytest.mark.parametrize("stride", [1, 2])
 def test_any_size_gives_maps_of_that_size(size, stride):
@@ -210,15 +196,6 @@ def test_a_vonet_takes_any_size(size, attention):
         assert a.shape == (2, 3)
         assert a.dtype == torch.float32
         torch.testing.assert_close(a[1], b[0], atol=1e-6, rtol=0)
-
-
-def test_pooling_is_the_identity_at_the_papers_size():
-    network = make_network(NetworkOptions(kind="vonet", width=0.125))
-    inputs = make_inputs(1, 128, 256)
-    with torch.inference_mode():
-        embedding = network.encoder(network.branches(inputs))[-1]
-        expected = 0.01 * network.head_rotation(embedding.flatten(1))
-        torch.testing.assert_close(network(inputs)[0], expected)
 
 
 def test_attention_starts_as_the_identity_and_matches_a_loop():

@@ -47,14 +47,6 @@ def test_depth_of_a_sphere_by_hand():
     assert np.isinf(depth[5, 15])
 
 
-def test_depth_of_a_plane_by_hand():
-    # the upper face of the box is the plane y = 1; row v sees it at z = fy / (v - cy)
-    depth = single(Solid(BOX, affine((500, 1, 500), (0, 2, 0)))).render(0).depth
-    expected = 20.0 / (np.arange(6, 11) - 5.0)
-    np.testing.assert_allclose(depth[6:], np.repeat(expected[:, None], 21, axis=1), rtol=1e-6)
-    assert np.isinf(depth[:6]).all()
-
-
 def test_nothing_hit_is_invalid_everywhere():
     scene = single(Solid(ELLIPSOID, affine((1, 1, 1), (0, 0, -5)), object_id=1), frames=2)
     frame = scene.render(0)
@@ -108,22 +100,6 @@ def test_flow_of_a_mover_equals_its_own_rigid_motion(scenes):
     expected = ego_flow(scene.render(0).depth, T, scene.cameras[0], scene.cameras[1])
     flow, _, moving = scene.flow(0)
     np.testing.assert_allclose(flow[moving], expected[moving], atol=1e-4)
-
-
-def test_a_deforming_mover_is_not_rigid(scenes):
-    scene = scenes["heavy_deforming"]
-    flow, hidden, moving = scene.flow(0)
-    keep = moving & ~hidden
-    depth = scene.render(0).depth[keep].astype(float)
-    pixels = pixel_grid(*keep.shape)[keep]
-    K = scene.cameras[0].K
-    rays = np.column_stack([pixels, np.ones(len(pixels))]) @ np.linalg.inv(K).T
-    target = (pixels + flow[keep]).astype(float)
-    points = rays * depth[:, None]
-    _, rvec, tvec = cv2.solvePnP(points, target, K, None, flags=cv2.SOLVEPNP_SQPNP)
-    projected, _ = cv2.projectPoints(points, rvec, tvec, K, None)
-    # measured 0.22 to 0.47 px over 6 seeds; the rigid family leaves 7e-8 px
-    assert np.median(np.linalg.norm(projected[:, 0] - target, axis=1)) > 0.1
 
 
 # ---------------------------------------------------------------- pictures
@@ -207,19 +183,6 @@ def test_occlusion_agrees_with_a_forward_depth_buffer(scenes, kind):
     assert seen.sum() > 500
     assert np.mean(occlusion[seen]) < 0.004
     assert occlusion[hidden].all()
-
-
-def test_occlusion_by_hand():
-    """A near block moves 2 px right: the two columns right of it are hidden, none is left."""
-    block = np.stack([affine((0.5, 50, 0.5), (x, 0, 4.5)) for x in (0.0, 0.4)])
-    wall = Solid(BOX, affine((99, 99, 1), (0, 0, 11)))
-    poses = np.tile(np.eye(4), (2, 1, 1))
-    flow, occlusion, moving = Scene((CAMERA,) * 2, poses, (Solid(BOX, block, 1), wall)).flow(0)
-    # front face at z = 4: half width 2.5 px, so columns 8..12; after the move up to 14.5
-    columns = np.flatnonzero(moving[5])
-    np.testing.assert_array_equal(columns, np.arange(8, 13))
-    np.testing.assert_allclose(flow[5, 8:13, 0], 2.0, atol=1e-5)
-    np.testing.assert_array_equal(np.flatnonzero(occlusion[5]), [13, 14])
 
 
 # ---------------------------------------------------------------- families

@@ -144,13 +144,6 @@ def test_a_symbolic_link_is_replaced_not_followed(tmp_path):
     assert not link.is_symlink()
 
 
-def test_new_files_follow_the_umask(tmp_path):
-    with atomic_write(tmp_path / "a") as file:
-        file.write("x")
-    (tmp_path / "b").write_text("x")
-    assert (tmp_path / "a").stat().st_mode == (tmp_path / "b").stat().st_mode
-
-
 # -- reading ------------------------------------------------------------------------------------
 
 
@@ -252,14 +245,6 @@ def test_transformed_scales_positions_then_moves():
     T = make_transform(np.eye(3), np.array([1.0, 0, 0]))[None]
     moved = Trajectory([0.0], T).transformed(make_transform(np.eye(3), np.array([0, 5.0, 0])), 2.0)
     np.testing.assert_allclose(moved.positions, [[2, 5, 0]])
-
-
-def test_save_chooses_the_form_by_the_name(tmp_path, rng):
-    trajectory = random_trajectory(rng, 3)
-    for name, columns in (("t.tum", 8), ("t.txt", 8), ("t.kitti", 12)):
-        trajectory.save(tmp_path / name)
-        lines = (tmp_path / name).read_text().splitlines()
-        assert {len(line.split()) for line in lines} == {columns}
 
 
 @pytest.mark.parametrize(
