@@ -21,7 +21,7 @@ from hybridvo.baselines import pnp, rgbd
 from hybridvo.errors import InputError
 from hybridvo.flow import FlowProvider, contradiction, with_flow
 from hybridvo.hypotheses.generate import HypothesisSet, generate
-from hybridvo.hypotheses.selector import CueSelector, MaskSelector, Selection
+from hybridvo.hypotheses.selector import Selection, select_by_cues, select_by_scorer
 from hybridvo.images.direct import direct_start
 from hybridvo.images.photometric import refine_photometric
 from hybridvo.network.models import SELECTION, Models, default_models, one_thread
@@ -99,13 +99,12 @@ class Context:
         """The camera's motion by the learned selector, which asks PWVO where it is in doubt."""
         from hybridvo.network.selector_net import NetworkScorer
 
-        scorer = NetworkScorer(self.models.network("selector"), self.models.device)
-        selector = MaskSelector(scorer, self.options)
-        chosen = selector.select(found, self.prior)
+        look = partial(NetworkScorer, self.models.network("selector"))
+        chosen = select_by_scorer(found, look, self.options, self.prior)
         if found.is_ambiguous and chosen.confidence < self.options.select.consult_below:
             prediction = self.predict(pair)
             if prediction is not None:
-                chosen = selector.select(found, self.prior, prediction)
+                chosen = select_by_scorer(found, look, self.options, self.prior, prediction)
         return chosen
 
     def refine(self, pair: FramePair, found: HypothesisSet, chosen: Selection) -> RelativePose:
@@ -131,7 +130,7 @@ def classical(pair: FramePair, ctx: Context) -> RelativePose:
     found = ctx.search(pair)
     if isinstance(found, RelativePose):
         return found
-    return ctx.refine(pair, found, CueSelector().select(found, ctx.prior))
+    return ctx.refine(pair, found, select_by_cues(found, ctx.prior))
 
 
 def hybrid_flow(pair: FramePair, ctx: Context) -> RelativePose:

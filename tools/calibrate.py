@@ -24,7 +24,7 @@ from scipy.optimize import minimize
 from hybridvo import dis_flow, iter_pairs, open_sequence, refine
 from hybridvo.calibration import MIN_CONFIDENCE
 from hybridvo.evaluation.pair_errors import true_motion
-from hybridvo.hypotheses.selector import CueSelector
+from hybridvo.hypotheses.selector import select_by_cues
 from hybridvo.images.direct import direct_start
 from hybridvo.network.models import Models
 from hybridvo.pipeline import Context
@@ -120,7 +120,7 @@ def answers(
     found = ctx.search(pair)
     if isinstance(found, RelativePose):
         return
-    chosen = {"cues": CueSelector().select(found), "selector": ctx.select(pair, found)}
+    chosen = {"cues": select_by_cues(found), "selector": ctx.select(pair, found)}
     if not found.is_ambiguous:
         chosen = {"clear": chosen["selector"]}
     for name, selection in chosen.items():

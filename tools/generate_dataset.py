@@ -22,7 +22,7 @@ def build_parser() -> argparse.ArgumentParser:
     add("--out", required=True, type=Path, help="folder to write into")
     add("--scene", action="append", help="scene kind, repeatable (default: light)")
     add("--seed", action="append", type=int, help="repeatable (default: 0)")
-    add("--frames", type=int, help="frames per sequence (default: 20, pair 2)")
+    add("--frames", type=int, default=20, help="of a sequence (default: %(default)s)")
     add("--height", type=int, default=218, help="pixels (default: %(default)s)")
     add("--width", type=int, default=512, help="pixels (default: %(default)s)")
     add("--overwrite", action="store_true", help="replace sequences that exist")

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import itertools
+import contextlib
 import os
-import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -18,8 +17,6 @@ from hybridvo.errors import FormatError, InputError
 from hybridvo.trajectory import check_increasing
 from hybridvo.types import Camera, Frame, depth_advice, typical_depth
 
-INNER_FOLDER = re.compile(r"(rgb|depth|flow|image)(_\w+)?")
-"""Names of the folders inside a sequence, for which all of it may be meant."""
 SATURATED = 65535  # of 16 bits: no depth
 Files = list[Path | None]
 """A file for each frame, None where it has none."""
@@ -66,12 +63,12 @@ class Sequence:
         self.timestamps = np.zeros(0)
         self.poses: np.ndarray | None = None
         self.warnings: list[str] = []
-        self._sources: Files = []  # the other files that were read
+        self._sources: Files = []  # other files that were read, beside those of the root itself
         self._mask_folder = None if mask is None else Path(mask)
         self._given_camera, self._given_scale = camera, depth_scale
         self._list_files()
         if not self.rgb_files:
-            raise InputError(f"{root}: no frames. Looked for {self.looks_for()}")
+            raise InputError(f"{root}: no frames. Looked for {looks_for(type(self))}")
         check_increasing(self.timestamps, str(root))
         self.mask_files: Files = [None] * len(self)
         if self._mask_folder is not None:
@@ -83,18 +80,9 @@ class Sequence:
         self._warn_of_what_is_missing()
 
     @classmethod
-    def root_of(cls, folder: Path) -> Path | None:
-        """The sequence that a folder is, or is a part of; None where it is of another kind."""
-        inner = INNER_FOLDER.fullmatch(folder.name)
-        for place in (folder, folder.parent) if inner else (folder,):
-            if any(all(any(place.glob(name)) for name in group) for group in cls.markers):
-                return place.absolute()
-        return None
-
-    @classmethod
-    def looks_for(cls) -> str:
-        """What a folder of this kind holds."""
-        return f"{cls.kind}: " + ", or ".join(" and ".join(group) for group in cls.markers)
+    def knows(cls, folder: Path) -> bool:
+        """Whether a folder is a sequence of this kind."""
+        return any(all(any(folder.glob(name)) for name in group) for group in cls.markers)
 
     @property
     def has_flow(self) -> bool:
@@ -112,9 +100,6 @@ class Sequence:
 
     def __len__(self) -> int:
         return len(self.timestamps)
-
-    def __repr__(self) -> str:
-        return f"<{self.kind} sequence {self.name!r}: {len(self)} frames>"
 
     def __getitem__(self, index: int) -> Frame:
         return self.frame(range(len(self))[index])
@@ -167,7 +152,7 @@ class Sequence:
         """Every existing file that the sequence reads, sorted: what a fingerprint covers."""
         frames = (self.rgb_files, self.depth_files, self.flow_files[:-1], self.mask_files)
         found = {path for paths in (self._sources, *frames) for path in paths if path is not None}
-        return sorted(path for path in found if path.is_file())
+        return sorted(path for path in {*found, *self.root.glob("*")} if path.is_file())
 
     def _list_files(self) -> None:
         """Fill in files, stamps, poses, name and sources."""
@@ -199,11 +184,9 @@ class Sequence:
         self.depth_files = [depth.get(n) for n in numbers]
         self.flow_files = [flow.get(n) if n + 1 in frames else None for n in numbers]
         self.timestamps = (np.array(numbers) - min(numbers, default=0)) / self.frames_per_second
-        gaps = [(a + 1, b - 1) for a, b in itertools.pairwise(numbers) if b - a > 1]
-        if spans := [f"{a}" if a == b else f"{a} to {b}" for a, b in gaps]:
-            self.warnings.append(
-                f"{self.name}: frame numbers {shown(spans)} are missing; the stamps keep the gap."
-            )
+        if missing := sorted({*range(min(numbers, default=0), max(numbers, default=0))} - frames):
+            told = f"frame numbers {shown(missing)} are missing; the stamps keep the gap"
+            self.warnings.append(f"{self.name}: {told}.")
         return numbers
 
     def _each_pose(self, files: Files, read: Callable[[Path], np.ndarray]) -> None:
@@ -218,22 +201,11 @@ class Sequence:
 
     def _look_at_first_images(self) -> None:
         """Take the size of the images, and the camera; look at the size and the unit of depth."""
-        problems: list[object] = []
-
-        def first(files: Files, read: Callable[[Path], np.ndarray]) -> tuple[Any, Any]:
-            for path in files:
-                try:
-                    if path is not None:
-                        return path, read(path)
-                except (InputError, OSError) as error:
-                    problems.append(error)
-            return None, None
-
-        _, image = first(self.rgb_files, read_rgb)
+        _, image = _first(self.rgb_files, read_rgb)
         if image is None:
-            _, image = first(self.depth_files, read_depth)
+            _, image = _first(self.depth_files, read_depth)
         if image is None:
-            raise FormatError(f"{self.root}: no frames: none can be read: {problems[0]}")
+            raise InputError(f"{self.root}: no frames: none of the files is there.")
         self.height, self.width = size = image.shape[:2]
         given, told = self._given_camera, self.warnings
         found = self._calibration() if given is None else parse_camera(given, size, told)
@@ -247,7 +219,7 @@ class Sequence:
             self._given_scale = found.depth_scale
         self._calibrated, self._camera = found, None if found is None else found.camera
         self._given_scale = units_per_metre(self._given_scale, self.name, told)
-        path, depth = first(self.depth_files, self._read_depth)
+        path, depth = _first(self.depth_files, self._read_depth)
         if depth is None:
             return
         if depth.shape != size:
@@ -269,11 +241,23 @@ class Sequence:
         listed = {"image": self.rgb_files, "depth": self.depth_files, "mask": self.mask_files}
         for what, paths in listed.items():
             missing = [i for i, path in enumerate(paths) if path is None or not path.exists()]
-            text = f"{len(missing)} frames without {what}: {shown(missing)}"
-            if len(missing) == len(paths) and what != "mask":
-                like = next((f", such as {path}" for path in paths if path is not None), "")
-                text = f"there are no {what} files{like}"
             if missing and (any(paths) or what != "mask"):
-                self.warnings.append(f"{self.name}: {text}.")
+                such = "" if paths[missing[0]] is None else f", such as {paths[missing[0]]}"
+                told = f"{len(missing)} frames without {what}: {shown(missing)}{such}"
+                self.warnings.append(f"{self.name}: {told}.")
         if self.poses is not None and (lost := int(np.isnan(self.poses[:, 0, 0]).sum())):
             self.warnings.append(f"{self.name}: {lost} of {len(self)} frames have no true pose.")
+
+
+def _first(files: Files, read: Callable[[Path], np.ndarray]) -> tuple[Any, Any]:
+    """The first file that can be read, and what it holds; None where none is there."""
+    there = [path for path in files if path is not None and path.exists()]
+    for path in there:
+        with contextlib.suppress(InputError, OSError):
+            return path, read(path)
+    return (there[0], read(there[0])) if there else (None, None)  # the error of the first
+
+
+def looks_for(kind: type[Sequence]) -> str:
+    """What a folder of a kind holds."""
+    return f"{kind.kind}: " + ", or ".join(" and ".join(group) for group in kind.markers)

@@ -36,11 +36,6 @@ class FolderSequence(Sequence):
     depth_source = "file"
     markers = ((CAMERA_FILE,),)
 
-    @classmethod
-    def looks_for(cls) -> str:
-        """What a folder of this kind holds, for messages."""
-        return f"folder: {CAMERA_FILE} (hybridvo init DIR writes one) with rgb/ and depth/"
-
     def _list_files(self) -> None:
         root, settings, told = self.root, self.root / CAMERA_FILE, self.warnings
         self._settings = read_camera_file(settings, told) if settings.exists() else None
@@ -66,8 +61,6 @@ class FolderSequence(Sequence):
         self.depth_files = [*depth_of.values()]
         self.flow_files = [flow_of[i] if i + 1 in depth_of else None for i in kept]
         self.timestamps, self.poses = stamps[kept], None if poses is None else poses[kept]
-        lists = (CAMERA_FILE, "timestamps.txt", "depth_timestamps.txt", "poses.txt")
-        self._sources = [root / name for name in lists]
         self.warnings = list(dict.fromkeys(told))
 
     def _calibration(self) -> Calibration | None:

@@ -15,7 +15,7 @@ from hybridvo.data.lists import numbered_files, numbered_poses, read_stamps
 from hybridvo.errors import FormatError, InputError
 from hybridvo.files import read_text
 from hybridvo.geometry import invert
-from hybridvo.trajectory import read_poses
+from hybridvo.trajectory import COLUMNS, read_poses
 from hybridvo.types import Camera, Frame
 
 DISPARITY_SIGMA_PX = 0.5
@@ -40,11 +40,8 @@ class KittiSequence(Sequence):
         root, told = self.root, self.warnings
         images = {n: numbered_files(root / f"image_{n}", r"(\d+)\.(?:png|jpg)") for n in "2301"}
         left, right = ("2", "3") if images["2"] else ("0", "1")
-        folders = (root / name for name in ("depth", "depth_2", "depth_0"))
-        stored = (numbered_files(folder, r"(\d+)\.(?:png|npy)") for folder in folders)
-        depth = next((files for files in stored if files), {})
+        depth = numbered_files(root / "depth", r"(\d+)\.(?:png|npy)")
         calibration, times = root / "calib.txt", root / "times.txt"
-        self._sources += [calibration, times]
         self._P_left = _read_projection(calibration, left)
         if not depth and images[right]:
             self.depth_source, depth = "stereo", images[right]
@@ -70,14 +67,12 @@ class KittiSequence(Sequence):
             self.timestamps = stamps[numbers]
         else:
             told.append(f"{times}: not there; {self.frames_per_second:g} frames a second assumed.")
-        name = f"{root.name}.txt"
-        beside = (root / "poses" / name, root / "poses.txt", root.parent / "poses" / name)
-        for path in (*beside, root.parent.parent / "poses" / name):
+        for path in (root / "poses.txt", root.parent.parent / "poses" / f"{root.name}.txt"):
             if path.is_file() and self.poses is None:
                 # the file holds the poses of camera 0
                 T_cam_cam0 = np.eye(4)
                 T_cam_cam0[:3, 3] = np.linalg.solve(self._P_left[:, :3], self._P_left[:, 3])
-                poses = read_poses(path, "kitti")[1] @ invert(T_cam_cam0)
+                poses = read_poses(path, COLUMNS["kitti"])[1] @ invert(T_cam_cam0)
                 self.poses = numbered_poses(numbers, poses)
                 self._sources.append(path)
 

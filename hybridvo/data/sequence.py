@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import itertools
 import os
 from collections.abc import Callable, Iterator
@@ -13,7 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from hybridvo.data.base import Sequence
+from hybridvo.data.base import Sequence, looks_for
 from hybridvo.data.folder import FolderSequence
 from hybridvo.data.kitti import KittiSequence
 from hybridvo.data.lists import shown
@@ -49,7 +48,7 @@ def open_sequence(
     """Open a sequence folder as its data set ships it.
 
     Args:
-        path: the folder, or one of its image, depth or flow folders.
+        path: the folder.
         dataset: one of ``DATASETS``; detected from the files by default.
         camera: ``fx,fy,cx,cy`` in pixels, a camera file (``camera.yaml``, ROS ``camera_info``,
             RealSense intrinsics), or a camera; the data set's by default.
@@ -61,43 +60,33 @@ def open_sequence(
             FormatError: a list or calibration file that is damaged.
     """
     if dataset is not None and dataset not in READERS:
-        close = difflib.get_close_matches(dataset, DATASETS, n=1)
-        hint = f" (did you mean '{close[0]}'?)" if close else ""
-        raise InputError(
-            f"dataset: '{dataset}' is unknown{hint}; known: {', '.join(DATASETS)}. {OWN_DATA}"
-        )
+        known = ", ".join(DATASETS)
+        raise InputError(f"dataset: '{dataset}' is unknown; known: {known}. {OWN_DATA}")
     folder = Path(path)
     try:
-        kind, root = _detect(folder, DATASETS if dataset is None else (dataset,))
-        sequence = READERS[kind](root, camera, depth_scale, mask)
+        return _reader(folder, dataset)(folder.absolute(), camera, depth_scale, mask)
     except FileNotFoundError as error:
         raise InputError(f"{folder}: {error.filename or error} is missing.") from None
     except OSError as error:  # a name that is too long, a folder that may not be read
         reason = error.strerror or str(error)
         raise InputError(f"{str(folder)[:200]}: cannot be read: {reason}.") from None
-    if root.resolve() != folder.resolve():
-        sequence.warnings.append(f"{folder}: one folder of a sequence; all of {root} is read.")
-    return sequence
 
 
-def _detect(folder: Path, kinds: tuple[str, ...]) -> tuple[str, Path]:
-    """The first of the kinds that knows a folder, and the sequence that this is a part of."""
-    for kind in kinds:
-        if root := READERS[kind].root_of(folder):
-            return kind, root
+def _reader(folder: Path, dataset: str | None) -> type[Sequence]:
+    """The reader that is asked for, else the first that knows a folder."""
+    known = (reader for reader in _READERS if reader.knows(folder))
+    if reader := next(known, None) if dataset is None else READERS[dataset]:
+        return reader
     if not folder.is_dir():
         got = "a file" if folder.exists() else "no such folder"
         raise InputError(f"{folder}: expected a sequence folder, got {got}.")
-    if len(kinds) == 1:
-        return kinds[0], folder.absolute()
     if (folder / "rgb").is_dir() and (folder / "depth").is_dir():
-        return FolderSequence.kind, folder.absolute()
+        return FolderSequence
     inside = shown(sorted(path.name for path in folder.iterdir()))
-    looked = "".join(f"\n  {reader.looks_for()}" for reader in READERS.values())
     raise InputError(
-        f"{folder}: no frames: no known data set. It holds: {inside or 'nothing'}. "
-        f"Looked for:{looked}\nSay which with dataset=... (--dataset) if the names differ. "
-        f"{OWN_DATA}"
+        f"{folder}: no frames: no known data set. It holds: {inside or 'nothing'}. Looked for:"
+        + "".join(f"\n  {looks_for(reader)}" for reader in _READERS)
+        + f"\nSay which with dataset=... (--dataset) if the names differ. {OWN_DATA}"
     )
 
 
@@ -113,17 +102,13 @@ def iter_pairs(
 
     ``flow`` None takes the flow files (where one of many is missing, the pair's flow is None); a
     callable (prev, curr), such as ``hybridvo.dis_flow()``, gives a FlowField or (H, W, 2) px.
-
-    Raises:
-        InputError: a negative range; flow files asked for where there are none, or with a stride.
     """
-    stop = len(sequence) if stop is None else min(stop, len(sequence))
     if stride < 1 or start < 0:
         raise InputError(f"iter_pairs: expected start >= 0 and stride >= 1, got {start}, {stride}.")
     if flow is None:
         sequence.check_flow(stride)
         flow = file_flow(sequence)
-    frames = (sequence.frame(index) for index in range(start, stop, stride))
+    frames = map(sequence.frame, range(len(sequence))[start:stop:stride])
     return (
         check_field(flow(*two), two[0], "callable").pair(*two, sequence.depth_source)
         for two in itertools.pairwise(frames)

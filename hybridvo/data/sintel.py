@@ -35,11 +35,10 @@ class SintelSequence(Sequence):
     markers = ((".../{clean,final,flow,depth,camdata_left}/NAME", "frame_0001.*"),)
 
     @classmethod
-    def root_of(cls, folder: Path) -> Path | None:
-        """The path itself, which may be a folder that was never downloaded."""
+    def knows(cls, folder: Path) -> bool:
+        """Whether a folder, which may be one that was never downloaded, stands for a scene."""
         folder = folder.absolute()
-        known = folder.parent.name in ENDINGS
-        return folder if known and any(_files(folder, part) for part in ENDINGS) else None
+        return folder.parent.name in ENDINGS and any(_files(folder, part) for part in ENDINGS)
 
     def _list_files(self) -> None:
         own = self.root.parent.name

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -17,47 +18,40 @@ from hybridvo.refinement.pixels import CoarseGrid, as_contiguous, coarse_grid
 from hybridvo.results import Reason, RelativePose
 from hybridvo.types import Frame, FramePair
 
-SOURCE_REFIT = 102
-"""Source of a motion that was fitted inside a mask, see :mod:`hybridvo.hypotheses.search`."""
 CHANCE_COHERENCE = 0.05
 """Spatial correlation of the residuals that independent noise reaches by chance."""
 
 
 @dataclass(frozen=True, eq=False)
 class GridMaps:
-    """Inputs of a scorer: what is known about each pixel of the coarse grid.
+    """What is known about each pixel of the coarse grid; as arrays, or as tensors of a batch.
 
     Args:
-        ray: (2, h, w) float32, K^-1 x without the one.
-        depth: (h, w) float32 metres, previous frame.
-        target: (2, h, w) float32 px, x + flow in the current image.
-        flow_variance, depth_variance: (h, w) float32 relative to the typical one.
-        usable: (h, w) bool, flow and depth are there.
-        log_depth_curr: (h, w) float32, log metres of the current frame at the target; NaN where
-            unknown or at an edge.
+        ray: (2, h, w) K^-1 x without the one. depth: (h, w) metres, previous frame.
+        target: (2, h, w) px, x + flow in the current image.
+        flow_variance, depth_variance: (h, w) relative to the typical one.
+        usable: (h, w) bool, flow and depth are there. seen: depth is, with or without flow.
+        log_depth_curr: (h, w) log metres of the current frame at the target; NaN where unknown or
+            at an edge. log_depth_seen: the same on the current frame's own grid.
+        image_prev, image_curr: (h, w) grey levels, each frame on its own grid; 0 without.
         K: (4,) fx, fy, cx, cy of the current camera.
-        width: px, of the whole image.
-        stride: px between the grid's pixels.
-        seen: (h, w) bool, depth is there, with or without flow.
-        image_prev, image_curr: (h, w) float32 grey levels, each frame on its own grid; 0 without.
-        log_depth_seen: (h, w) float32, log metres of the current frame on its own grid; NaN where
-            unknown.
+        width: px, of the whole image. stride: px between the grid's pixels.
     """
 
-    ray: np.ndarray
-    depth: np.ndarray
-    target: np.ndarray
-    flow_variance: np.ndarray
-    depth_variance: np.ndarray
-    usable: np.ndarray
-    log_depth_curr: np.ndarray
-    K: np.ndarray
-    width: int
-    stride: int
-    seen: np.ndarray
-    image_prev: np.ndarray
-    image_curr: np.ndarray
-    log_depth_seen: np.ndarray
+    ray: Any
+    depth: Any
+    target: Any
+    flow_variance: Any
+    depth_variance: Any
+    usable: Any
+    log_depth_curr: Any
+    K: Any
+    width: Any
+    stride: Any
+    seen: Any
+    image_prev: Any
+    image_curr: Any
+    log_depth_seen: Any
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,9 +59,7 @@ class HypothesisSet:
     """The motions found, in the order found, and the pixels they were found on.
 
     Args:
-        pair: the input.
-        grid: its coarse grid.
-        depth_scale: 1 / typical depth.
+        pair: the input. grid: its coarse grid.
         poses: (M, 3, 4) T_curr_prev. facts: (M, :data:`hybridvo.hypotheses.search.FACTS`).
         is_ambiguous: False where the first motion explains the image beyond doubt; no other was
             looked for then.
@@ -75,7 +67,6 @@ class HypothesisSet:
 
     pair: FramePair
     grid: CoarseGrid
-    depth_scale: float
     poses: np.ndarray
     facts: np.ndarray
     is_ambiguous: bool
@@ -85,21 +76,17 @@ class HypothesisSet:
         grid, pair = self.grid, self.pair
         h, w, stride = grid.shape
         n = grid.count
-
-        def map_of(*rows: int) -> np.ndarray:
-            return grid.samples[list(rows), :n].reshape(len(rows), h, w)
-
+        maps = grid.samples[:, :n].reshape(-1, h, w)
         log_depth = np.full(n, np.nan, np.float32)
         if pair.curr.depth is not None:
-            u0, v0 = grid.pixels.origin
-            look_up(grid.samples, n, 1, as_contiguous(pair.curr.depth), u0, v0, log_depth)
+            look_up(grid.samples, n, as_contiguous(pair.curr.depth), log_depth)
         return GridMaps(
-            ray=map_of(kernels.XN, kernels.YN),
-            depth=map_of(kernels.Z)[0],
-            target=map_of(kernels.MU, kernels.MV),
-            flow_variance=1.0 / np.maximum(map_of(kernels.PF)[0], np.float32(1e-6)),
-            depth_variance=map_of(kernels.PD)[0],
-            usable=map_of(kernels.W)[0] > 0,
+            ray=maps[[kernels.XN, kernels.YN]],
+            depth=maps[kernels.Z],
+            target=maps[[kernels.MU, kernels.MV]],
+            flow_variance=1.0 / np.maximum(maps[kernels.PF], np.float32(1e-6)),
+            depth_variance=maps[kernels.PD],
+            usable=maps[kernels.W] > 0,
             log_depth_curr=log_depth.reshape(h, w),
             K=grid.pixels.K,
             width=pair.prev.camera.width,
@@ -111,25 +98,19 @@ class HypothesisSet:
         )
 
 
-def _pick(grid: CoarseGrid) -> tuple[slice, slice]:
-    """The grid's pixels of a whole image."""
-    stride, (v0, v1, u0, u1) = grid.shape[2], grid.box
-    return slice(v0 + stride // 2, v1, stride), slice(u0 + stride // 2, u1, stride)
-
-
 def _grey(frame: Frame, grid: CoarseGrid) -> np.ndarray:
     """(h, w) float32 grey levels, each the mean of what it stands for; 0 without an image."""
     if frame.rgb is None:
         return np.zeros(grid.shape[:2], np.float32)
     grey = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
-    return cv2.blur(grey, (grid.shape[2],) * 2)[_pick(grid)].astype(np.float32)
+    return cv2.blur(grey, (grid.shape[2],) * 2)[grid.places].astype(np.float32)
 
 
 def _log_depth(frame: Frame, grid: CoarseGrid) -> np.ndarray:
     """(h, w) float32 log metres; NaN where unknown."""
     if frame.depth is None:
         return np.full(grid.shape[:2], np.nan, np.float32)
-    depth = frame.depth[_pick(grid)]
+    depth = frame.depth[grid.places]
     known = (depth > kernels.MIN_DEPTH) & (depth < kernels.MAX_VALUE)
     return np.log(np.where(known, depth, np.float32(np.nan)))
 
@@ -153,20 +134,14 @@ def generate(
     grid = coarse_grid(pair, weights, options.refine)
     if isinstance(grid, RelativePose):
         return grid
-    decisive = options.search.unambiguous_ratio
-    poses, facts, depth_scale = search.find_motions(
-        grid, np.ascontiguousarray(starts[:, :3]), options, decisive, seed
-    )
+    poses, facts = search.find_motions(grid, np.ascontiguousarray(starts[:, :3]), options, seed)
     if len(poses) == 0:
         return RelativePose.failed(
             Reason.DEGENERATE_GEOMETRY, "the pixels do not determine any motion", "refine"
         )
-    clear = (
-        len(poses) == 1
-        and bool(facts[0, search.SHARE] >= decisive)
-        and _is_rigid(grid, poses[0], facts[0], pair.prev.camera.width)
-    )
-    return HypothesisSet(pair, grid, depth_scale, poses, facts, not clear)
+    clear = len(poses) == 1 and facts[0, search.SHARE] >= options.search.unambiguous_ratio
+    clear = clear and _is_rigid(grid, poses[0], facts[0], pair.prev.camera.width)
+    return HypothesisSet(pair, grid, poses, facts, not clear)
 
 
 def _is_rigid(grid: CoarseGrid, pose: np.ndarray, fact: np.ndarray, width: int) -> bool:
@@ -182,22 +157,16 @@ def _is_rigid(grid: CoarseGrid, pose: np.ndarray, fact: np.ndarray, width: int) 
 def fit_in_mask(
     samples: np.ndarray, mask: np.ndarray, K: np.ndarray, pose: np.ndarray, cutoff: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """One motion, fitted on the coarse grid inside a mask.
+    """A pose (3, 4) fitted on the coarse grid inside a mask, and its facts.
 
     Args:
-        samples: pixel buffer of the grid; left as it is.
+        samples: pixel buffer of the grid.
         mask: (h, w) factors in [0, 1] on the weights of its first h * w pixels.
         K: (4,) float32 fx, fy, cx, cy of the current camera.
-        pose: (3, 4) start; left as it is.
+        pose: (3, 4) start.
         cutoff: of the robust kernel, see :class:`hybridvo.options.RefineOptions`.
-
-    Returns:
-        The pose (3, 4) and its facts, the inlier ratio being that of the masked weight.
     """
     masked = samples.copy()
     masked[kernels.W, : mask.size] *= mask.reshape(-1)
     pose, sf, sd, share, iterations = fit_coarse(masked, mask.size, K, pose, cutoff)
-    facts = np.zeros(search.FACTS)
-    facts[search.SHARE], facts[search.FLOW_NOISE], facts[search.DEPTH_NOISE] = share, sf, sd
-    facts[search.ITERATIONS], facts[search.SOURCE] = iterations, SOURCE_REFIT
-    return pose, facts
+    return pose, np.array([share, sf, sd, search.SOURCE_REFIT, iterations], float)

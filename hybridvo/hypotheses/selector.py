@@ -1,28 +1,22 @@
 """Which of the motions found is the camera's, and which pixels are static.
 
-Two selectors: :class:`CueSelector` by hand-made cues, and :class:`MaskSelector` by a scorer, which
-is handed in (a network; this package knows none): the motions are scored, the best are fitted again
-inside the static masks that the scorer draws about them, and all are scored once more.
+By hand-made cues; or by a scorer, which is handed in (a network; this package knows none): the
+motions are scored, the best are fitted again inside the static masks that the scorer draws about
+them, and all are scored once more.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import NamedTuple
 
 import numpy as np
 
 from hybridvo.calibration import CLEAR_RIGHT, CUE_WEIGHTS, CUES_RIGHT, SELECTOR_RIGHT, right
 from hybridvo.geometry import invert, pose_matrix, se3_log
 from hybridvo.hypotheses import search
-from hybridvo.hypotheses.cues import agreement, cue_scores
-from hybridvo.hypotheses.generate import (
-    SOURCE_REFIT,
-    GridMaps,
-    HypothesisSet,
-    fit_in_mask,
-)
+from hybridvo.hypotheses.generate import GridMaps, HypothesisSet, fit_in_mask
 from hybridvo.options import Options
 from hybridvo.refinement import coarse_fit, kernels
 from hybridvo.results import Hypothesis, MotionPrediction, MotionPrior
@@ -30,7 +24,7 @@ from hybridvo.results import Hypothesis, MotionPrediction, MotionPrior
 SUPPORT_CUTOFF = 3.0
 """Cutoff of the robust kernel by which the inliers of a motion are told, standard deviations."""
 MIN_NOISE_PX = 0.05
-"""The same, least noise of the flow."""
+"""Least noise of the flow there; below it motions are equally sharp."""
 MASK_RAMP = (0.4, 0.9)
 """Probabilities of being static between which the weights of a fit grow from 0 to 1."""
 ROUNDS = 3
@@ -40,70 +34,49 @@ NO_RIVAL = 8.0
 """Gap of the scores where there is no other motion, and the largest that counts."""
 MIN_COVERAGE = 0.02
 """Share of the usable pixels' weight that a mask must leave for a fit inside it."""
+BORDER = 0.06
+"""Width of the border band, as a share of the image's shorter side (at least one cell)."""
+SMALL, DOMINANT = 0.2, 0.8
+"""Inlier ratios up to which a motion's size says nothing against it, and above which a motion is
+the camera's whatever its cues."""
 SOURCES = {
     search.SOURCE_WINDOW: "window",
     search.SOURCE_MINIMAL: "minimal",
     search.RUNNER_UP: "runner-up",
-    SOURCE_REFIT: "refit",
+    search.SOURCE_REFIT: "refit",
 }
 
 
-@dataclass(frozen=True, eq=False)
-class Candidates:
-    """Motions to be scored: those of the search, then those fitted inside masks.
+class Candidate(NamedTuple):
+    """A motion to be scored: of the search, or fitted inside a mask.
 
-    Args:
-        poses: (N, 3, 4) T_curr_prev. facts: (N, :data:`hybridvo.hypotheses.search.FACTS`).
-        parents: (N,) int64, for a refit the motion of the search that it goes back to, else itself.
-        searched: how many are of the search.
+    ``pose`` (3, 4) T_curr_prev; its ``facts``, see :mod:`hybridvo.hypotheses.search`; ``parent``:
+    number of the motion of the search that it goes back to; ``mask`` (h, w): of a refit.
     """
 
-    poses: np.ndarray
+    pose: np.ndarray
     facts: np.ndarray
-    parents: np.ndarray
-    searched: int
+    parent: int
+    mask: np.ndarray | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class Scores:
+class Scores(NamedTuple):
     """A scorer's answer.
 
-    Args:
-        score: (N,) of the candidates; larger is more likely the camera's motion.
-        best: (R,) int64, the candidates worth a fit inside their mask.
-        masks: (R, h, w) for each of them the probability of every pixel of being static.
-        confidence: probability, 0 to 1, that the candidate with the largest score is right.
+    ``score`` (N,): larger is more likely the camera's motion; ``static``: by candidate, the best
+    first, the probability (h, w) of every pixel of being static; ``confidence``: probability that
+    the candidate with the largest score is right.
     """
 
     score: np.ndarray
-    best: np.ndarray
-    masks: np.ndarray
+    static: dict[int, np.ndarray]
     confidence: float
 
 
-class Scorer(Protocol):
-    """Scores the motions of a pair by what they leave unexplained, pixel by pixel."""
-
-    def look(self, maps: GridMaps, prior: MotionPrior | None, static: np.ndarray | None) -> Look:
-        """The pair to be judged.
-
-        Args:
-            maps: the pixels.
-            prior: what is known of the motion, or None.
-            static: (h, w) probability of being static that a network predicts, or None.
-        """
-
-
-class Look(Protocol):
-    """One pair as a scorer sees it."""
-
-    def score(self, candidates: Candidates, masks: int) -> Scores:
-        """Scores of all candidates, and masks for the best of them.
-
-        Args:
-            candidates: the motions; those of an earlier call come first, in the same order.
-            masks: how many masks are wanted at most.
-        """
+Scorer = Callable[[Sequence[Candidate], int], Scores]
+"""(candidates, how many masks at most) -> scores; those of an earlier call come first again."""
+Look = Callable[[GridMaps, MotionPrior | None, np.ndarray | None], Scorer]
+"""(pixels, prior, (h, w) probability of being static that another network states) -> scorer."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,207 +106,187 @@ class Selection:
     iterations: int
 
 
-class Selector(Protocol):
-    """Chooses the camera's motion."""
-
-    def select(
-        self,
-        found: HypothesisSet,
-        prior: MotionPrior | None = None,
-        prediction: MotionPrediction | None = None,
-    ) -> Selection:
-        """The motion selected.
-
-        Args:
-            found: the motions of the search.
-            prior: what is known of the motion, or None.
-            prediction: of a network: one candidate more, and where it sees the static scene.
-        """
+def select_by_cues(found: HypothesisSet, prior: MotionPrior | None = None) -> Selection:
+    """The motion selected by hand-made cues and what is known of the motion."""
+    # the cues compare motions that share no pixels
+    searched = [c for c in _searched(found) if c.facts[search.SOURCE] != search.RUNNER_UP]
+    motions = hypotheses(found, searched)
+    seen = cue_scores(found, motions)
+    expected = np.array([agreement(motion.T_curr_prev, prior) for motion in motions])
+    scores = seen + CUE_WEIGHTS["prior"] * expected
+    # a prior may say which motion; that it is right the image has to say
+    best = int(np.argmax(scores))
+    gap = min(seen[best] - np.delete(seen, best).max(initial=-np.inf), NO_RIVAL)
+    probability = right(gap, CUES_RIGHT) if found.is_ambiguous else CLEAR_RIGHT
+    return _selection(found, searched, Scores(scores, {}, probability), gap, probability)
 
 
-class CueSelector:
-    """By hand-made cues, see :mod:`hybridvo.hypotheses.cues`."""
+def select_by_scorer(
+    found: HypothesisSet,
+    look: Look,
+    options: Options,
+    prior: MotionPrior | None = None,
+    prediction: MotionPrediction | None = None,
+) -> Selection:
+    """The motion selected by a scorer and its masks: score, fit again inside masks, score again.
 
-    def select(
-        self,
-        found: HypothesisSet,
-        prior: MotionPrior | None = None,
-        prediction: MotionPrediction | None = None,
-    ) -> Selection:
-        """See :class:`Selector`; a prediction is not looked at."""
-        # the cues compare motions that share no pixels
-        kept = found.facts[:, search.SOURCE] != search.RUNNER_UP
-        found = replace(found, poses=found.poses[kept], facts=found.facts[kept])
-        candidates = _searched(found)
-        motions = hypotheses(found, candidates)
-        seen = cue_scores(found, motions)
-        expected = np.array([agreement(motion.T_curr_prev, prior) for motion in motions])
-        scores = seen + CUE_WEIGHTS["prior"] * expected
-        # a prior may say which motion; that it is right the image has to say
-        best = int(np.argmax(scores))
-        gap = min(seen[best] - np.delete(seen, best).max(initial=-np.inf), NO_RIVAL)
-        probability = right(gap, CUES_RIGHT) if found.is_ambiguous else CLEAR_RIGHT
-        masks = [None] * len(scores)
-        return _selection(found, candidates, scores, masks, probability, gap, probability)
-
-
-class MaskSelector:
-    """By a scorer and its masks: score, fit again inside masks, score again.
-
-    Args:
-        scorer: of the candidates.
-        options: ``select`` and ``refine`` are read.
+    ``prediction``, of another network: one candidate more, and where it sees the static scene;
+    of the options ``select`` and ``refine`` are read.
     """
-
-    def __init__(self, scorer: Scorer, options: Options | None = None) -> None:
-        self.scorer, self.options = scorer, options or Options()
-
-    def select(
-        self,
-        found: HypothesisSet,
-        prior: MotionPrior | None = None,
-        prediction: MotionPrediction | None = None,
-    ) -> Selection:
-        """See :class:`Selector`."""
-        candidates = _searched(found)
-        if not found.is_ambiguous:
-            sure = CLEAR_RIGHT, NO_RIVAL, CLEAR_RIGHT
-            return _selection(found, candidates, np.zeros(1), [None], *sure)
-        maps, limits = found.maps(), self.options.select
-        masks: list[np.ndarray | None] = [None] * candidates.searched
-        static = None
-        if prediction is not None:
-            static = found.grid.resample(prediction.static_probability)
-            candidates = self._refit(
-                found, candidates, masks, [(prediction.T_curr_prev[:3], mask_weights(static), None)]
-            )
-        look = self.scorer.look(maps, prior, static)
-        scores = look.score(candidates, limits.refits)
-        for _ in range(ROUNDS):
-            known = len(candidates.poses)
-            entries = [
-                (candidates.poses[k], mask_weights(mask), int(candidates.parents[k]))
-                for k, mask in zip(scores.best, scores.masks, strict=True)
-            ]
-            candidates = self._refit(found, candidates, masks, entries)
-            if len(candidates.poses) == known:
-                break
-            scores = look.score(candidates, 1)
-            if int(np.argmax(scores.score)) < known:
-                break
-        gap = gap_of(found, candidates, scores.score)
-        trust = scores.confidence, gap, right(gap, SELECTOR_RIGHT)
-        return _selection(found, candidates, scores.score, masks, *trust)
-
-    def _refit(
-        self,
-        found: HypothesisSet,
-        candidates: Candidates,
-        masks: list[np.ndarray | None],
-        entries: Sequence[tuple[np.ndarray, np.ndarray, int | None]],
-    ) -> Candidates:
-        """The candidates with one fit more for each (start, weights, parent); extends ``masks``."""
-        poses, facts, parents = (
-            [*x] for x in (candidates.poses, candidates.facts, candidates.parents)
-        )
-        cutoff = self.options.refine.cutoff
-        for start, weights, parent in entries:
-            if _coverage(found, weights) < MIN_COVERAGE:
-                continue
-            pose, fact = fit_in_mask(
-                found.grid.samples, weights, found.grid.pixels.K, start, cutoff
-            )
-            if np.isfinite(pose).all() and fact[search.SHARE] > 0:
-                if parent is None:
-                    parent = nearest_motion(found.poses, start, found.depth_scale)
-                poses.append(pose)
-                facts.append(fact)
-                parents.append(parent)
-                masks.append(weights)
-        return replace(
-            candidates,
-            poses=np.stack(poses),
-            facts=np.stack(facts),
-            parents=np.array(parents, np.int64),
-        )
+    candidates, static = _searched(found), None
+    if not found.is_ambiguous:
+        sure = Scores(np.zeros(1), {}, CLEAR_RIGHT)
+        return _selection(found, candidates, sure, NO_RIVAL, CLEAR_RIGHT)
+    cutoff = options.refine.cutoff
+    if prediction is not None:
+        static = found.grid.resample(prediction.static_probability)
+        start = prediction.T_curr_prev[:3]
+        unit = coarse_fit.translation_scale(found.grid.samples, found.grid.count)
+        parent = nearest_motion(found.poses, start, unit)
+        candidates += _refits(found, [(start, parent, static)], cutoff)
+    scorer = look(found.maps(), prior, static)
+    scores = scorer(candidates, options.select.refits)
+    for _ in range(ROUNDS):
+        entries = [(candidates[k].pose, candidates[k].parent, p) for k, p in scores.static.items()]
+        refits = _refits(found, entries, cutoff)
+        if not refits:
+            break
+        candidates += refits
+        scores = scorer(candidates, 1)
+        if int(np.argmax(scores.score)) < len(candidates) - len(refits):
+            break
+    gap = gap_of(found, [c.pose for c in candidates], scores.score)
+    return _selection(found, candidates, scores, gap, right(gap, SELECTOR_RIGHT))
 
 
-def gap_of(found: HypothesisSet, candidates: Candidates, score: np.ndarray) -> float:
+def _searched(found: HypothesisSet) -> list[Candidate]:
+    motions = zip(found.poses, found.facts, strict=True)
+    return [Candidate(pose, facts, k) for k, (pose, facts) in enumerate(motions)]
+
+
+def _refits(
+    found: HypothesisSet, entries: Sequence[tuple[np.ndarray, int, np.ndarray]], cutoff: float
+) -> list[Candidate]:
+    """A fit for each (start, parent, static probability) that leaves enough pixels."""
+    refits = []
+    for start, parent, static in entries:
+        mask = mask_weights(static)
+        if _coverage(found, mask) >= MIN_COVERAGE:
+            grid = found.grid
+            pose, facts = fit_in_mask(grid.samples, mask, grid.pixels.K, start, cutoff)
+            if np.isfinite(pose).all() and facts[search.SHARE] > 0:
+                refits.append(Candidate(pose, facts, parent, mask))
+    return refits
+
+
+def gap_of(found: HypothesisSet, poses: Sequence[np.ndarray], score: np.ndarray) -> float:
     """By how much the best score exceeds that of any other motion."""
     best = int(np.argmax(score))
-    apart = search.distances(found.grid, candidates.poses, best) > search.OTHER_PX
+    apart = search.Probes(found.grid).distances(poses, best) > search.OTHER_PX
     return min(NO_RIVAL, float(score[best] - score[apart].max(initial=-np.inf)))
 
 
-def mask_weights(probability: np.ndarray, ramp: tuple[float, float] = MASK_RAMP) -> np.ndarray:
-    """Weights of a fit from probabilities of being static: 0 below the ramp, 1 above it."""
-    low, high = ramp
+def mask_weights(probability: np.ndarray) -> np.ndarray:
+    """Weights of a fit from probabilities of being static."""
+    low, high = MASK_RAMP
     return np.clip((probability - low) / (high - low), 0.0, 1.0).astype(np.float32)
 
 
 def nearest_motion(poses: np.ndarray, pose: np.ndarray, depth_scale: float) -> int:
     """Index of the motion (N, 3, 4) nearest to another (3, 4); metres count 1 / depth radians."""
-    T = pose_matrix(pose)
-    steps = np.array([se3_log(T @ invert(pose_matrix(P))) for P in poses])
-    length = (steps * np.array([depth_scale] * 3 + [1.0] * 3)) ** 2
-    return int(np.argmin(length.sum(axis=1)))
+    unit = [0.5, 0.5, 0.5, depth_scale**2]  # each angle stands twice in a small rotation
+    return int(np.argmin(((poses - pose) ** 2 * unit).sum(axis=(1, 2))))
 
 
-def hypotheses(found: HypothesisSet, candidates: Candidates) -> list[Hypothesis]:
+def hypotheses(found: HypothesisSet, candidates: Sequence[Candidate]) -> list[Hypothesis]:
     """The candidates with their inliers, in their order."""
     grid = found.grid
     h, w, stride = grid.shape
     work, noise = kernels.new_work(), np.empty(3, np.float32)
     total = max(float(grid.weight.sum()), 1e-9)
     made = []
-    for pose, fact in zip(candidates.poses, candidates.facts, strict=True):
+    for pose, facts, *_ in candidates:
         inliers = np.empty(grid.count, np.float32)
-        flow_noise, depth_noise = float(fact[search.FLOW_NOISE]), float(fact[search.DEPTH_NOISE])
+        flow_noise, depth_noise = float(facts[search.FLOW_NOISE]), float(facts[search.DEPTH_NOISE])
         coarse_fit.set_noise(max(flow_noise, MIN_NOISE_PX), depth_noise, SUPPORT_CUTOFF, noise)
         coarse_fit.robust_weights(
             grid.samples, grid.count, pose, grid.pixels.K, noise, work, inliers
         )
-        name = SOURCES.get(int(fact[search.SOURCE]), "start")
+        name = SOURCES.get(int(facts[search.SOURCE]), "start")
         share = float(np.where(grid.weight > 0, inliers, 0) @ grid.weight) / total
         T, shape = pose_matrix(pose), inliers.reshape(h, w)
         made.append(Hypothesis(T, name, share, flow_noise, depth_noise, shape, stride))
     return made
 
 
-def _searched(found: HypothesisSet) -> Candidates:
-    return Candidates(found.poses, found.facts, np.arange(len(found.poses)), len(found.poses))
-
-
-def _coverage(found: HypothesisSet, weights: np.ndarray) -> float:
+def _coverage(found: HypothesisSet, mask: np.ndarray | None) -> float:
     """Share of the usable pixels' weight that a mask leaves."""
-    return float(found.grid.weight @ weights.reshape(-1)) / max(
-        float(found.grid.weight.sum()), 1e-9
-    )
+    weight = found.grid.weight
+    total = max(float(weight.sum()), 1e-9)
+    return 1.0 if mask is None else float(weight @ mask.reshape(-1)) / total
 
 
 def _selection(
     found: HypothesisSet,
-    candidates: Candidates,
-    scores: np.ndarray,
-    masks: Sequence[np.ndarray | None],
-    confidence: float,
+    candidates: Sequence[Candidate],
+    scores: Scores,
     gap: float,
     probability: float,
 ) -> Selection:
     """The candidate with the largest score."""
-    scores = np.nan_to_num(scores, nan=-np.inf)
-    order = np.argsort(-scores, kind="stable")
-    best = int(order[0])
+    score = np.nan_to_num(scores.score, nan=-np.inf)
+    order = np.argsort(-score, kind="stable")
+    pose, facts, _, mask = candidates[order[0]]
     motions = hypotheses(found, candidates)
-    fact, mask = candidates.facts[best], masks[best]
     return Selection(
-        T_curr_prev=pose_matrix(candidates.poses[best]),
-        noise=(float(fact[search.FLOW_NOISE]), float(fact[search.DEPTH_NOISE])),
+        T_curr_prev=pose_matrix(pose),
+        noise=(float(facts[search.FLOW_NOISE]), float(facts[search.DEPTH_NOISE])),
         mask=mask,
-        coverage=1.0 if mask is None else _coverage(found, mask),
-        confidence=float(np.nan_to_num(confidence)),
+        coverage=_coverage(found, mask),
+        confidence=float(np.nan_to_num(scores.confidence)),
         gap=gap,
         probability=float(np.nan_to_num(probability)),
-        hypotheses=tuple(replace(motions[k], score=float(scores[k])) for k in order),
-        iterations=int(fact[search.ITERATIONS]),
+        hypotheses=tuple(replace(motions[k], score=float(score[k])) for k in order),
+        iterations=int(facts[search.ITERATIONS]),
     )
+
+
+def cue_scores(found: HypothesisSet, motions: Sequence[Hypothesis]) -> np.ndarray:
+    """(N,) scores of motions by hand-made cues, larger is more likely the camera's.
+
+    One rigid object on 60 % of the image holds more pixels than the static scene, so the inlier
+    ratio alone decides wrongly. Objects are compact and mostly inside the image: their share of the
+    image exceeds their share of its border, and they leave parts of it empty. The static scene is
+    behind, reaches the border everywhere and is as sharply rigid as the flow allows (a compromise
+    between two motions is not).
+    """
+    (h, w, _), n = found.grid.shape, found.grid.count
+    usable = found.grid.weight > 0
+    inliers = np.stack([np.where(usable, m.inliers.ravel(), 0.0) for m in motions])
+    held, count = inliers.sum(axis=1), max(np.count_nonzero(usable), 1)
+    share = held / count
+    log_depth = np.log(np.where(usable, found.grid.samples[kernels.Z, :n], 1.0))
+    band = max(1, round(BORDER * min(h, w)))
+    v, u = np.divmod(np.arange(n), w)
+    border = usable & (np.minimum.reduce([v, h - 1 - v, u, w - 1 - u]) < band)
+    cells = np.eye(16)[v * 4 // h * 4 + u * 4 // w]
+    available = usable @ cells
+    filled = (inliers @ cells / np.maximum(available, 1))[:, available > 0]
+    noise = np.array([max(m.flow_noise_px, MIN_NOISE_PX) for m in motions])
+    cues = {
+        "border": inliers[:, border].sum(axis=1) / max(np.count_nonzero(border), 1),
+        "excess": np.maximum(share - SMALL, 0.0),
+        "spread": np.minimum(filled / 0.25, 1.0).mean(axis=1),
+        "behind": inliers @ log_depth / np.maximum(held, 1e-9) - log_depth.sum() / count,
+        "noise": np.log(noise / noise.min()),
+        "dominant": share > DOMINANT,
+    }
+    return np.sum([CUE_WEIGHTS[name] * value for name, value in cues.items()], axis=0)
+
+
+def agreement(T_curr_prev: np.ndarray, prior: MotionPrior | None) -> float:
+    """1 where a motion is the expected one, towards 0 by its distance in standard deviations."""
+    if prior is None:
+        return 0.0
+    delta = se3_log(T_curr_prev @ invert(prior.T_curr_prev))
+    return 1.0 / (1.0 + float(delta @ np.linalg.solve(prior.covariance, delta)) / len(delta))

@@ -7,7 +7,7 @@ rivals explain; beside them the image's flow, depth and rays, each over the pair
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -36,35 +36,20 @@ MAX_LOGIT = 6.0
 
 
 @dataclass(frozen=True, eq=False)
-class SelectorInputs:
-    """B images on their coarse grid (h, w) and N candidate motions of theirs.
+class SelectorInputs(GridMaps):
+    """B images on their coarse grid (h, w), and N candidate motions of theirs.
 
-    Beside the maps of :class:`hybridvo.hypotheses.generate.GridMaps`, with a first axis:
+    The maps have a first axis; beside them:
 
     Args:
         static: (B, h, w) logit of the probability to be static world, if ``has_static`` (B,).
         T_prior: (B, 3, 4) motion expected from those before, if ``has_prior`` (B,).
         prior_information: (B, 6, 6) inverse covariance of ``Exp(delta) T_prior``.
-        planes_curr: (B, 3, h, w) grey levels, log metres (0 where unknown), whether these are known
-            of the current frame on its own grid.
         owner: (N,) int64, image of each candidate.
         parent: (N,) int64, for refits: the motion of the search it came from; for those: itself.
         pose: (N, 3, 4) T_curr_prev, with flow_noise (N,) px and depth_noise (N,) of log depth.
     """
 
-    ray: torch.Tensor
-    depth: torch.Tensor
-    target: torch.Tensor
-    flow_variance: torch.Tensor
-    depth_variance: torch.Tensor
-    usable: torch.Tensor
-    log_depth_curr: torch.Tensor
-    seen: torch.Tensor
-    image_prev: torch.Tensor
-    planes_curr: torch.Tensor
-    K: torch.Tensor
-    image_width: torch.Tensor
-    stride: torch.Tensor
     static: torch.Tensor
     has_static: torch.Tensor
     T_prior: torch.Tensor
@@ -96,21 +81,19 @@ def selector_inputs(
     maps: GridMaps, prior: MotionPrior | None, static: np.ndarray | None, device: torch.device
 ) -> SelectorInputs:
     """A batch of one image, without candidates yet; ``static``: probabilities, or None."""
-    stacked: dict[str, Any] = {name: np.asarray(value)[None] for name, value in vars(maps).items()}
-    inputs = stacked_inputs(GridMaps(**stacked), device)
-    told: dict[str, torch.Tensor] = {}
+    batch = GridMaps(**{name: np.asarray(value)[None] for name, value in vars(maps).items()})
+    inputs = stacked_inputs(batch, device)
+    known = torch.ones(1, dtype=torch.bool, device=device)
     if static is not None:
         probability = torch.as_tensor(static, dtype=torch.float32, device=device)[None]
-        told["static"] = torch.logit(probability, eps=1e-4)
-        told["has_static"] = torch.ones_like(inputs.has_static)
+        inputs = replace(inputs, static=torch.logit(probability, eps=1e-4), has_static=known)
     if prior is not None:
-        expected, covariance = (
-            torch.as_tensor(x, device=device)[None] for x in (prior.T_curr_prev, prior.covariance)
+        T, information = (
+            torch.as_tensor(x, dtype=torch.float32, device=device)[None]
+            for x in (prior.T_curr_prev[:3], np.linalg.inv(prior.covariance))
         )
-        told["T_prior"] = expected[:, :3].float()
-        told["prior_information"] = prior_information_of(inputs.depth, inputs.usable, covariance)
-        told["has_prior"] = torch.ones_like(inputs.has_prior)
-    return replace(inputs, **told)
+        inputs = replace(inputs, T_prior=T, prior_information=information, has_prior=known)
+    return inputs
 
 
 def stacked_inputs(maps: GridMaps, device: torch.device) -> SelectorInputs:
@@ -119,18 +102,18 @@ def stacked_inputs(maps: GridMaps, device: torch.device) -> SelectorInputs:
     for name, x in vars(maps).items():
         dtype = torch.bool if name in ("usable", "seen") else torch.float32
         values[name] = torch.as_tensor(np.ascontiguousarray(x)).to(device, dtype)
-    values["image_width"] = values.pop("width")
-    log_depth, image = values.pop("log_depth_seen"), values.pop("image_curr")
-    planes = [image, torch.nan_to_num(log_depth), torch.isfinite(log_depth).float()]
-    depth, none = values["depth"], torch.zeros(0, device=device)
+    depth, usable, none = values["depth"], values["usable"], torch.zeros(0, device=device)
     nothing = torch.zeros(len(depth), dtype=torch.bool, device=device)
+    # a motion usually differs from the one before by so much of the image, or of the typical depth
+    inverse = torch.where(usable, 1.0 / depth.clamp(min=1e-6), 0.0).sum((1, 2))
+    inverse = (inverse / usable.sum((1, 2)).clamp(min=1)).clamp(min=1e-6)
+    usual = torch.stack([inverse] * 3 + [torch.ones_like(inverse)] * 3, dim=1) / USUAL_CHANGE
     return SelectorInputs(
         **values,
-        planes_curr=torch.stack(planes, dim=1),
         static=torch.zeros_like(depth),
         has_static=nothing,
         T_prior=torch.eye(3, 4, device=device).repeat(len(depth), 1, 1),
-        prior_information=prior_information_of(depth, values["usable"], None),
+        prior_information=torch.diag_embed(usual * usual),
         has_prior=nothing,
         **dict.fromkeys(("owner", "parent", "pose", "flow_noise", "depth_noise"), none),
     )
@@ -149,39 +132,38 @@ def candidate_channels(
     The evidence is the support that the flow gives, and the agreement of the images times their
     texture. ``first``: inputs and evidence of the motions of the search, where these are refits.
     """
-    own = inputs.owner
-    x, y = inputs.ray[own, 0], inputs.ray[own, 1]
-    z, usable = inputs.depth[own], inputs.usable[own]
-    fx, fy, cx, cy = (c[:, None, None] for c in inputs.K[own].unbind(1))
+    maps = GridMaps(**{f.name: getattr(inputs, f.name)[inputs.owner] for f in fields(GridMaps)})
+    (x, y), z, usable = maps.ray.unbind(1), maps.depth, maps.usable
+    fx, fy, cx, cy = (c[:, None, None] for c in maps.K.unbind(1))
     P = inputs.pose[:, :, :, None, None]
     a, b, c = (z * (P[:, i, 0] * x + P[:, i, 1] * y + P[:, i, 2]) + P[:, i, 3] for i in range(3))
     front = c > 1e-6
-    i = 1.0 / torch.where(front, c, torch.ones_like(c))
+    i = 1.0 / torch.where(front, c, 1.0)
     a, b = a * i, b * i
-    ru = inputs.target[own, 0] - (fx * a + cx)
-    rv = inputs.target[own, 1] - (fy * b + cy)
+    u, v = fx * a + cx, fy * b + cy
+    ru, rv = maps.target[:, 0] - u, maps.target[:, 1] - v
     qu = fx * i * (a * P[:, 2, 3] - P[:, 0, 3])
     qv = fy * i * (b * P[:, 2, 3] - P[:, 1, 3])
     # whitened by the symmetric root of sf^2 v_f I + sd^2 v_d q q^T
     sf = inputs.flow_noise.clamp(min=MIN_FLOW_NOISE)[:, None, None]
     sd = inputs.depth_noise[:, None, None]
-    vd = sd * sd * inputs.depth_variance[own]
-    ip = 1.0 / (sf * sf * inputs.flow_variance[own])
+    vd = sd * sd * maps.depth_variance
+    ip = 1.0 / (sf * sf * maps.flow_variance)
     g = vd * ip
     root = torch.sqrt(1.0 + g * (qu * qu + qv * qv))
     shrink = g / (root * (1.0 + root)) * (qu * ru + qv * rv)
-    scale = torch.sqrt(ip)
-    eu, ev = (ru - shrink * qu) * scale, (rv - shrink * qv) * scale
-    ok = usable & front
-    eu, ev = (torch.where(ok, e, torch.full_like(e, 1e3)).clamp(-1e3, 1e3) for e in (eu, ev))
+    scale, ok = torch.sqrt(ip), usable & front
+    eu, ev = (
+        torch.where(ok, (r - shrink * q) * scale, 1e3).clamp(-1e3, 1e3)
+        for r, q in ((ru, qu), (rv, qv))
+    )
     d2 = eu * eu + ev * ev
     support = torch.square(SUPPORT_CUTOFF_SQUARED / (SUPPORT_CUTOFF_SQUARED + d2)) * usable
-    wide = REFERENCE_WIDTH / inputs.image_width[own]
-    size = torch.sqrt(ru * ru + rv * rv) * wide[:, None, None]
-    size = torch.where(ok, size, torch.zeros_like(size))
-    known = ok & torch.isfinite(inputs.log_depth_curr[own])
-    rz = torch.where(known, inputs.log_depth_curr[own] - torch.log(c.clamp(min=1e-6)), 0.0)
-    texture, agreement, gap, met = _look(inputs, fx * a + cx, fy * b + cy, c, front)
+    wide = REFERENCE_WIDTH / maps.width
+    size = torch.where(ok, torch.sqrt(ru * ru + rv * rv) * wide[:, None, None], 0.0)
+    known = ok & torch.isfinite(maps.log_depth_curr)
+    rz = torch.where(known, maps.log_depth_curr - torch.log(c.clamp(min=1e-6)), 0.0)
+    texture, agreement, gap, met = _look(maps, u, v, c, front)
     evidence = torch.stack([support, agreement], 1)
     rivals = _rivals(inputs, *((inputs, evidence) if first is None else first))
     noise = torch.sqrt(2.0 * vd + DEPTH_FLOOR**2)
@@ -200,31 +182,30 @@ def candidate_channels(
 
 
 def _look(
-    inputs: SelectorInputs, u: torch.Tensor, v: torch.Tensor, z: torch.Tensor, front: torch.Tensor
+    maps: GridMaps, u: torch.Tensor, v: torch.Tensor, z: torch.Tensor, front: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
     """(N, h, w) each: texture, it times correlation, log of the depths' ratio, both known."""
-    own = inputs.owner
-    planes = inputs.planes_curr
-    height, width = planes.shape[2:]
-    stride = inputs.stride[own, None, None, None]
+    log_depth, stride = maps.log_depth_seen, maps.stride[:, None, None, None]
+    planes = [maps.image_curr, torch.nan_to_num(log_depth), torch.isfinite(log_depth).float()]
     first = torch.div(stride, 2, rounding_mode="floor")
     cell = (torch.stack([u, v], dim=-1) - first) / stride
-    where = 2 * (cell + 0.5) / cell.new_tensor([width, height]) - 1
-    there = front & inputs.seen[own] & (where.abs() < 1).all(-1)
-    where = torch.where(there[..., None], where, torch.zeros_like(where))
-    warped = F.grid_sample(planes[own], where, align_corners=False, padding_mode="border")
-    there_f = there.to(z.dtype)
-    p, q = inputs.image_prev[own], warped[:, 0]
+    where = 2 * (cell + 0.5) / cell.new_tensor(log_depth.shape[:0:-1]) - 1
+    there = front & maps.seen & (where.abs() < 1).all(-1)
+    where = torch.where(there[..., None], where, 0.0)
+    warped = F.grid_sample(
+        torch.stack(planes, dim=1), where, align_corners=False, padding_mode="border"
+    )
+    p, q, there_f = maps.image_prev, warped[:, 0], there.to(z.dtype)
     terms = torch.stack([torch.ones_like(p), p, q, p * p, q * q, p * q], 1) * there_f[:, None]
     mean = F.avg_pool2d(terms, PATCH, 1, PATCH // 2)
     count = mean[:, 0]
     mean = mean[:, 1:] / count.clamp(min=1e-6)[:, None]
     var_p = (mean[:, 2] - mean[:, 0] ** 2).clamp(min=0)
     var_q = (mean[:, 3] - mean[:, 1] ** 2).clamp(min=0)
-    spread = torch.sqrt(var_p * var_q)
     # a patch must be textured before the motion; whether it still is after it is the question
     texture = var_p / (var_p + PLAIN) * there_f * (count > 0.3)
-    agreement = texture * (mean[:, 4] - mean[:, 0] * mean[:, 1]) / (spread + 0.5 * PLAIN)
+    covariance = mean[:, 4] - mean[:, 0] * mean[:, 1]
+    agreement = texture * covariance / (torch.sqrt(var_p * var_q) + 0.5 * PLAIN)
     known = there & (warped[:, 2] > 0.99)
     gap = torch.where(known, warped[:, 1] - torch.log(z.clamp(min=1e-6)), 0.0)
     return texture, agreement, gap, known.to(z.dtype)
@@ -234,13 +215,11 @@ def _rivals(
     inputs: SelectorInputs, searched: SelectorInputs, evidence: torch.Tensor
 ) -> torch.Tensor:
     """(N, 2, h, w): the largest evidence among the image's other motions of the search."""
-    out = evidence.new_zeros((len(inputs.owner), *evidence.shape[1:]))
     index = torch.arange(len(evidence), device=evidence.device)
-    for k in range(len(out)):
-        rival = (searched.owner == inputs.owner[k]) & (index != inputs.parent[k])
-        if rival.any():
-            out[k] = evidence[rival].amax(0)
-    return out
+    rivals = searched.owner == inputs.owner[:, None]
+    rivals &= index != inputs.parent[:, None]
+    none = torch.zeros_like(evidence[0])
+    return torch.stack([evidence[some].amax(0) if some.any() else none for some in rivals])
 
 
 def _scalars(
@@ -256,34 +235,17 @@ def _scalars(
     away = torch.einsum("ni,nij,nj->n", step, inputs.prior_information[own], step).clamp(0, 1e6) / 6
     seen = torch.sigmoid(inputs.static) * inputs.usable
     agreed = (support * seen[own]).sum((1, 2)) / seen.sum((1, 2)).clamp(min=1e-3)[own]
-    return torch.stack(
-        [
-            share,
-            0.3 * torch.log(inputs.flow_noise.clamp(min=MIN_FLOW_NOISE) * wide),
-            0.2 * torch.log(inputs.depth_noise.clamp(min=1e-4) / 1e-2),
-            torch.full_like(share, float(refits)),
-            known / (1.0 + away),
-            known,
-            0.2 * known * torch.log1p(away),
-            agreed * inputs.has_static[own],
-        ],
-        dim=1,
-    )
-
-
-def prior_information_of(
-    depth: torch.Tensor, usable: torch.Tensor, covariance: torch.Tensor | None
-) -> torch.Tensor:
-    """(B, 6, 6) inverse covariances of the motions expected; unknown: :data:`USUAL_CHANGE`."""
-    inverse = torch.where(usable, 1.0 / depth.clamp(min=1e-6), 0.0).sum((1, 2))
-    inverse = (inverse / usable.sum((1, 2)).clamp(min=1)).clamp(min=1e-6)
-    usual = torch.stack([inverse] * 3 + [torch.ones_like(inverse)] * 3, dim=1) / USUAL_CHANGE
-    usual = torch.diag_embed(usual * usual)
-    if covariance is None:
-        return usual
-    information, failed = torch.linalg.inv_ex(covariance.double())
-    sound = (failed == 0) & torch.isfinite(information).all((1, 2))
-    return torch.where(sound[:, None, None], information.to(usual.dtype), usual)
+    scalars = [
+        share,
+        0.3 * torch.log(inputs.flow_noise.clamp(min=MIN_FLOW_NOISE) * wide),
+        0.2 * torch.log(inputs.depth_noise.clamp(min=1e-4) / 1e-2),
+        torch.full_like(share, float(refits)),
+        known / (1.0 + away),
+        known,
+        0.2 * known * torch.log1p(away),
+        agreed * inputs.has_static[own],
+    ]
+    return torch.stack(scalars, dim=1)
 
 
 def _small_step(pose: torch.Tensor, start: torch.Tensor) -> torch.Tensor:
@@ -310,32 +272,25 @@ def shared_channels(inputs: SelectorInputs) -> torch.Tensor:
     rows, columns = (torch.minimum(x, n - 1 - x) for x, n in zip(steps, sizes, strict=True))
     to_border = torch.minimum(rows[:, None], columns)
     border = torch.exp(-to_border / (0.06 * min(sizes))).expand(usable.shape)
-    asked = inputs.has_static[:, None, None].to(u.dtype)
-    channels = torch.stack(
-        [
-            _squash(u / typical),
-            _squash(v / typical),
-            torch.log1p(near),
-            usable.to(u.dtype),
-            inputs.ray[:, 0],
-            inputs.ray[:, 1],
-            border,
-            0.3 * torch.log(inputs.flow_variance.clamp(1e-3, 1e3)),
-            (0.2 * torch.log(size.clamp(min=1e-6) / 1e-2)),
-            inputs.static.clamp(-MAX_LOGIT, MAX_LOGIT) * asked / 3,
-            asked.expand(usable.shape),
-        ],
-        dim=1,
-    )
-    keep = usable[:, None].expand_as(channels).clone()
-    keep[:, 4:7] = True
-    return torch.where(keep, channels, torch.zeros_like(channels))
+    asked = inputs.has_static[:, None, None].to(u.dtype).expand(usable.shape)
+    seen = [
+        _squash(u / typical),
+        _squash(v / typical),
+        torch.log1p(near),
+        usable.to(u.dtype),
+        0.3 * torch.log(inputs.flow_variance.clamp(1e-3, 1e3)),
+        0.2 * torch.log(size.clamp(min=1e-6) / 1e-2),
+        inputs.static.clamp(-MAX_LOGIT, MAX_LOGIT) * asked / 3,
+        asked,
+    ]
+    seen = [torch.where(usable, x, 0.0) for x in seen]
+    return torch.stack([*seen[:4], *inputs.ray.unbind(1), border, *seen[4:]], dim=1)
 
 
 def _median(x: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
     """(B, 1, 1) median of the masked pixels of a quarter of the image."""
     x, mask = x[:, ::2, ::2].flatten(1), mask[:, ::2, ::2].flatten(1)
-    order = torch.where(mask, x, torch.full_like(x, torch.inf)).sort(1).values
+    order = torch.where(mask, x, torch.inf).sort(1).values
     middle = (mask.sum(1, keepdim=True) // 2).clamp(max=x.shape[1] - 1)
     value = order.gather(1, middle)
-    return torch.where(torch.isfinite(value), value, torch.ones_like(value))[..., None]
+    return torch.where(torch.isfinite(value), value, 1.0)[..., None]

@@ -7,6 +7,7 @@ each pixel to be static. Choosing among few exact motions is easier than segment
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 
@@ -17,7 +18,7 @@ from pydantic import Field
 from torch import nn
 
 from hybridvo.hypotheses.generate import GridMaps
-from hybridvo.hypotheses.selector import Candidates, Scores
+from hybridvo.hypotheses.selector import Candidate, Scores
 from hybridvo.network.layers import plain_torch, scaled
 from hybridvo.network.selector_inputs import (
     SelectorInputs,
@@ -68,16 +69,6 @@ class SelectorOutput:
     common: torch.Tensor
     levels: tuple[torch.Tensor, ...]
     mask: torch.Tensor | None = None
-
-    def and_of(self, other: SelectorOutput) -> SelectorOutput:
-        """The answers about these candidates and about others of the same images."""
-        return SelectorOutput(
-            torch.cat([self.score, other.score]),
-            torch.cat([self.hidden, other.hidden]),
-            torch.cat([self.evidence, other.evidence]),
-            self.common,
-            tuple(torch.cat(pair) for pair in zip(self.levels, other.levels, strict=True)),
-        )
 
 
 class _Block(nn.Module):
@@ -207,57 +198,49 @@ def _mirrored(x: torch.Tensor, mirror: torch.Tensor, signed: tuple[int, ...]) ->
 
 
 class NetworkScorer:
-    """A :class:`hybridvo.hypotheses.selector.Scorer` on a device."""
+    """Scores the motions of one pair by what they leave unexplained; each is encoded once.
 
-    def __init__(self, network: SelectorNetwork, device: str = "cpu") -> None:
-        self.device = torch.device(device)
-        network = network.eval().to(self.device)
-        self.network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    A :data:`hybridvo.hypotheses.selector.Scorer`; with the network given, a ``Look``.
+    """
 
-    def look(
-        self, maps: GridMaps, prior: MotionPrior | None, static: np.ndarray | None
-    ) -> NetworkLook:
-        """See :class:`hybridvo.hypotheses.selector.Scorer`."""
+    def __init__(
+        self,
+        network: SelectorNetwork,
+        maps: GridMaps,
+        prior: MotionPrior | None,
+        static: np.ndarray | None,
+    ) -> None:
+        self.network, device = network, next(network.parameters()).device
         with plain_torch():
-            return NetworkLook(self.network, selector_inputs(maps, prior, static, self.device))
-
-
-class NetworkLook:
-    """The candidates of one pair; each is encoded once."""
-
-    def __init__(self, network: SelectorNetwork, image: SelectorInputs) -> None:
-        self.network, self.image = network, image
+            self.image = selector_inputs(maps, prior, static, device)
         self.first: tuple[SelectorInputs, SelectorOutput] | None = None
-        self.seen: SelectorOutput | None = None
+        self.seen: list[SelectorOutput] = []
 
-    def score(self, candidates: Candidates, masks: int) -> Scores:
-        """See :class:`hybridvo.hypotheses.selector.Look`."""
+    def __call__(self, candidates: Sequence[Candidate], masks: int) -> Scores:
+        """Scores of all candidates, and masks for the best of them."""
         with plain_torch():
-            if self.seen is None:
-                self.first = self._encode(candidates, slice(0, candidates.searched))
-                self.seen = self.first[1]
-            known = len(self.seen.score)
-            if len(candidates.poses) > known:
-                self.seen = self.seen.and_of(self._encode(candidates, slice(known, None))[1])
-            score, size = self.seen.score, self.seen.evidence.shape[2:]
+            known = sum(len(output.score) for output in self.seen)
+            for refits in (False, True):
+                new = [c for c in candidates[known:] if (c.mask is not None) == refits]
+                if new:
+                    self._encode(new)
+            score, hidden = (
+                torch.cat([getattr(output, name) for output in self.seen])
+                for name in ("score", "hidden")
+            )
             best = score.argsort(descending=True, stable=True)[:masks]
             best = best[score[best] > score.max() - MAX_LAG]
-            drawn = torch.zeros(0, *size)
-            if len(best):
-                drawn = torch.sigmoid(
-                    self.network.decode(tuple(x[best] for x in self.seen.levels), size)
-                )
-            owner = torch.zeros(len(score), dtype=torch.int64, device=score.device)
-            logit = self.network.confidence(score, self.seen.hidden, owner, 1)
-        return Scores(
-            score.double().cpu().numpy(),
-            best.cpu().numpy(),
-            drawn.cpu().numpy(),
-            float(torch.sigmoid(logit)),
-        )
+            stages = zip(*(output.levels for output in self.seen), strict=True)
+            levels = tuple(torch.cat(stage)[best] for stage in stages)
+            drawn = self.network.decode(levels, self.image.depth.shape[1:]).sigmoid().cpu().numpy()
+            trust = self.network.confidence(score, hidden, torch.zeros_like(score).long(), 1)
+        static = dict(zip(best.tolist(), drawn, strict=True))
+        return Scores(score.double().cpu().numpy(), static, float(trust.sigmoid()))
 
-    def _encode(self, candidates: Candidates, part: slice) -> tuple[SelectorInputs, SelectorOutput]:
-        inputs = self.image.asking(
-            candidates.poses[part], candidates.facts[part], candidates.parents[part]
-        )
-        return inputs, self.network.encode(inputs, self.first)
+    def _encode(self, candidates: Sequence[Candidate]) -> None:
+        poses = np.stack([c.pose for c in candidates])
+        facts = np.stack([c.facts for c in candidates])
+        inputs = self.image.asking(poses, facts, [c.parent for c in candidates])
+        self.seen.append(self.network.encode(inputs, self.first))
+        if self.first is None:
+            self.first = inputs, self.seen[0]

@@ -120,13 +120,6 @@ def test_tum_calibrations_are_those_of_the_folder_name(tmp_path):
         assert given.camera(0) == Camera(500, 501, 320, 240, 480, 640) and given[0].mask is None
 
 
-def test_undistorted_depth_is_never_mixed(tmp_path):
-    frame = open_sequence(write.write_tum(tmp_path, "freiburg1").path)[0]
-    stored = np.append(np.round(write.depth_map(0, 480, 640) * 5000) / 5000, 0)
-    np.testing.assert_allclose(np.setdiff1d(frame.depth, stored.astype(np.float32)), [], atol=1e-6)
-    assert frame.mask.mean() > 0.8 and not frame.mask.all()
-
-
 def test_bonn_truth_is_that_of_the_camera(tmp_path):
     plain = open_sequence(write.write_tum(tmp_path / "a").path).poses
     sequence = open_sequence(write.write_tum(tmp_path / "b", "rgbd_bonn_crowd").path)
@@ -173,14 +166,6 @@ def test_kitti_depth_from_stereo(tmp_path):
     np.testing.assert_allclose(frame.depth_variance, sigma**2, rtol=1e-5)
 
 
-def test_kitti_with_stored_depth_needs_no_right_camera(tmp_path):
-    root = write.write_kitti(tmp_path).path
-    calib = root / "calib.txt"
-    lines = [line for line in calib.read_text().splitlines() if not line.startswith("P3")]
-    calib.write_text("\n".join(lines) + "\n")
-    assert open_sequence(root)[0].depth is not None
-
-
 def test_failure_says_what_was_looked_for(tmp_path):
     (tmp_path / "readme.txt").write_text("x")
     with pytest.raises(InputError) as caught:
@@ -196,25 +181,14 @@ def test_failure_says_what_was_looked_for(tmp_path):
     ):
         with pytest.raises(InputError, match=words):
             open_sequence(path)
-    for name, hint in (("kiti", "did you mean 'kitti'"), ("euroc", "known: sintel.*hybridvo init")):
-        with pytest.raises(InputError, match=hint):
-            open_sequence(tmp_path, name)
+    with pytest.raises(InputError, match=r"known: sintel.*hybridvo init"):
+        open_sequence(tmp_path, "euroc")
 
 
 @pytest.mark.parametrize("dataset", DATASETS)
 def test_forced_kind_on_a_foreign_folder(dataset, tmp_path):
     with pytest.raises(InputError):
         open_sequence(tmp_path, dataset)
-
-
-@pytest.mark.parametrize("kind", ["tum", "folder", "kitti", "tartanair-v1"])
-def test_one_folder_of_a_sequence_stands_for_all_of_it_and_says_so(kind, tmp_path):
-    written = write.WRITERS[kind](tmp_path)
-    inner = open_sequence(written.path).rgb_files[0].parent
-    sequence = open_sequence(inner)
-    assert len(sequence) == write.N and sequence.root == written.path
-    assert any(str(inner) in told for told in sequence.warnings)
-    assert not any(str(inner) in told for told in open_sequence(written.path).warnings)
 
 
 def test_pairs_from_files_read_each_frame_once(tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,11 +15,11 @@ from hybridvo.geometry import ego_flow, se3_exp
 from hybridvo.hypotheses.generate import HypothesisSet, generate
 from hybridvo.hypotheses.selector import (
     NO_RIVAL,
-    Candidates,
-    CueSelector,
-    MaskSelector,
+    Candidate,
     Scores,
     gap_of,
+    select_by_cues,
+    select_by_scorer,
 )
 from hybridvo.options import Options, SelectOptions
 from hybridvo.pipeline import Context
@@ -46,13 +47,11 @@ class Oracle:
     def look(self, maps, prior, static) -> Oracle:
         return self
 
-    def score(self, candidates: Candidates, masks: int) -> Scores:
-        count = len(candidates.poses)
+    def __call__(self, candidates: list[Candidate], masks: int) -> Scores:
+        count = len(candidates)
         score = np.zeros(count)
         score[-1 if self.refits else 0] = self.margin
-        best = np.arange(min(masks, count))
-        drawn = np.stack([self.static] * len(best)) if masks else np.zeros((0, *self.static.shape))
-        return Scores(score, best, drawn, self.confidence)
+        return Scores(score, dict.fromkeys(range(min(masks, count)), self.static), self.confidence)
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +72,7 @@ def gap(T: np.ndarray, pair: FramePair, truth: dict) -> float:
 
 def refined(case, scorer: Oracle, prediction: MotionPrediction | None = None) -> RelativePose:
     found, pair, _ = case
-    chosen = MaskSelector(scorer).select(found, None, prediction)
+    chosen = select_by_scorer(found, scorer.look, Options(), None, prediction)
     return Context().refine(pair, found, chosen)
 
 
@@ -104,9 +103,10 @@ def test_a_prediction_is_one_candidate_more(case) -> None:
 def test_low_confidence_is_degraded_with_its_probability_and_a_wide_covariance(case) -> None:
     found, pair, _ = case
     nowhere = np.zeros(found.grid.shape[:2], np.float32)
-    sure = MaskSelector(Oracle(nowhere, refits=False, confidence=0.99)).select(found)
-    scorer = Oracle(nowhere, refits=False, confidence=0.05, margin=0.01)
-    chosen = MaskSelector(scorer).select(found)
+    sure, chosen = (
+        select_by_scorer(found, Oracle(nowhere, False, confidence, margin).look, Options())
+        for confidence, margin in ((0.99, 5.0), (0.05, 0.01))
+    )
     assert chosen.probability < MIN_CONFIDENCE < sure.probability and chosen.mask is None
     answer = Context().refine(pair, found, chosen)
     assert answer.status.state is State.DEGRADED and not answer.ok and answer.usable
@@ -134,9 +134,10 @@ def test_the_hybrid_asks_pwvo_below_one_threshold() -> None:
 def test_an_unambiguous_motion_is_taken_as_it_is() -> None:
     pair, _ = make_pair(Scenario(moving=0.0), 1, **SIZE)
     found = generate(pair, IDENTITY, Options())
-    chosen = MaskSelector(Oracle(np.zeros((1, 1)), refits=True, confidence=0.0)).select(found)
+    oracle = Oracle(np.zeros((1, 1)), refits=True, confidence=0.0)
+    chosen = select_by_scorer(found, oracle.look, Options())
     assert not found.is_ambiguous and chosen.probability == CLEAR_RIGHT
-    np.testing.assert_array_equal(chosen.T_curr_prev, CueSelector().select(found).T_curr_prev)
+    np.testing.assert_array_equal(chosen.T_curr_prev, select_by_cues(found).T_curr_prev)
 
 
 def test_slow_objects_under_noise_are_ambiguous() -> None:
@@ -204,27 +205,22 @@ def test_maps_of_any_resolution_are_seen_on_the_grid(case) -> None:
 
 
 def test_masks_grow_to_the_image(case) -> None:
-    grid = replace(case[0].grid, shape=(5, 7, 6), size=(31, 45), box=(0, 31, 0, 45))
+    grid = replace(case[0].grid, shape=(5, 7, 6), pixels=SimpleNamespace(shape=(31, 45)))
     mask = np.zeros((5, 7), np.float32)
     mask[:, 4:] = 1
     whole = grid.upsample(mask)
     assert whole.shape == (31, 45) and not whole[:, :21].any()
     # the first column of ones is the pixel that the grid took, 4 * 6 + 3
     assert whole[15, 27] == pytest.approx(1.0, abs=0.1) and whole[30, 44] == 1
-    small = replace(grid, shape=(2, 2, 4), size=(20, 20), box=(4, 12, 6, 14))
-    inner = small.upsample(np.ones((2, 2), np.float32))
-    assert inner.sum() == 64 and inner[4:12, 6:14].all()
 
 
 def test_only_another_motion_is_a_rival(case) -> None:
     found, _, _ = case
-    poses = np.concatenate([found.poses, found.poses[:1]])  # the first one found twice
-    candidates = Candidates(poses, found.facts, np.arange(len(poses)), len(found.poses))
+    poses = [*found.poses, found.poses[0]]  # the first one found twice
     score = np.zeros(len(poses))
     score[[0, -1]] = 3.0
-    assert gap_of(found, candidates, score) == 3.0
+    assert gap_of(found, poses, score) == 3.0
     # a rival that looks as good leaves less to believe
     score[1] = 2.9
-    assert gap_of(found, candidates, score) == pytest.approx(0.1)
-    alone = replace(candidates, poses=poses[[0, -1]])
-    assert gap_of(found, alone, score[[0, -1]]) == NO_RIVAL
+    assert gap_of(found, poses, score) == pytest.approx(0.1)
+    assert gap_of(found, [poses[0], poses[-1]], score[[0, -1]]) == NO_RIVAL

@@ -16,7 +16,6 @@ from hybridvo.hypotheses.search import FACTS
 from hybridvo.network.selector_inputs import (
     SelectorInputs,
     candidate_channels,
-    prior_information_of,
     selector_inputs,
 )
 from hybridvo.network.selector_net import SelectorNetwork
@@ -137,20 +136,12 @@ def test_what_was_expected_is_weighed_by_its_covariance() -> None:
     assert (unknown[:, 4:8] == 0).all()
 
 
-def test_a_covariance_that_is_none_counts_as_unknown() -> None:
+def test_a_prior_of_usual_changes_where_none_is_told() -> None:
     inputs = inputs_of(1)
-    usual = prior_information_of(inputs.depth, inputs.usable, None)
-    for broken in (torch.zeros(1, 6, 6), torch.full((1, 6, 6), torch.nan)):
-        told = prior_information_of(inputs.depth, inputs.usable, broken)
-        torch.testing.assert_close(told, usual)
-    exact = prior_information_of(
-        inputs.depth, inputs.usable, torch.diag(torch.tensor([4.0] * 3 + [0.25] * 3))[None]
-    )
-    torch.testing.assert_close(exact[0].diagonal(), torch.tensor([0.25] * 3 + [4.0] * 3))
     # 0.01 rad, and as much of the typical depth: its reciprocal is the mean of the reciprocals
     near = (1 / inputs.depth[inputs.usable]).mean()
-    torch.testing.assert_close(usual[0, 0, 0].sqrt(), near / 0.01)
-    torch.testing.assert_close(usual[0, 5, 5].sqrt(), torch.tensor(100.0))
+    root = inputs.prior_information[0].diagonal().sqrt()
+    torch.testing.assert_close(root, torch.tensor([near / 0.01] * 3 + [100.0] * 3))
 
 
 def textured_pair(T: np.ndarray, depth_m: float = 2.0) -> FramePair:
