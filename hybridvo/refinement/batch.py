@@ -222,8 +222,8 @@ def from_tiles(x: torch.Tensor, tile: int, height: int, width: int) -> torch.Ten
 
 def _relative(variance: torch.Tensor, good: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """A variance in units of the typical one of its sample, 1 where not good; what is good."""
-    scale = [typical(one) for one in variance.detach().cpu().numpy()]
-    scale, good = variance.new_tensor(scale)[:, None, None], good & (variance < MAX_DEPTH)
+    scales = [typical(one) for one in variance.detach().cpu().numpy()]
+    scale, good = variance.new_tensor(scales)[:, None, None], good & (variance < MAX_DEPTH)
     return torch.where(good, variance, scale) / scale, good
 
 

@@ -161,7 +161,8 @@ def _solve(
 
     ``how``: the kernel, without noise. ``tight``: to the precision that a gradient needs.
     """
-    size, weight = tuple(batch.depth_prev.shape[1:]), pixels.weight
+    (height, width), weight = batch.depth_prev.shape[1:], pixels.weight
+    size = height, width
     tile, few = tile_size(size, options.tiles), pixels.subset(SUBSET_PIXELS)
     flow_only = replace(few, log_depth_curr=None, has_depth_curr=None)
     end = weight.new_full((len(starts),), SMALLEST_PX)
