@@ -61,23 +61,6 @@ def test_another_scale_is_its_ratio_in_spite_of_holes(pair, scale: float) -> Non
     assert found.ratio == pytest.approx(scale, rel=2e-3) and not found.status.ok
 
 
-def test_nothing_to_compare_is_no_ratio(pair) -> None:
-    prev, curr, flow = pair
-    nothing = np.full(K.shape, np.nan)
-    for a, b, f, weights in (
-        (replace(prev, depth=None), curr, flow, EVERYWHERE),
-        (prev, replace(curr, depth=None), flow, EVERYWHERE),
-        (prev, replace(curr, depth=nothing), flow, EVERYWHERE),
-        (prev, curr, None, EVERYWHERE),
-        (prev, curr, flow + 1000, EVERYWHERE),
-        (prev, curr, flow, 0 * EVERYWHERE),
-        (prev, curr, flow, None),
-    ):
-        assert compare_depths(FramePair(a, b, f), T, weights) is None
-    behind = np.diag([1.0, 1.0, -1.0, 1.0])
-    assert compare_depths(FramePair(*pair), behind, EVERYWHERE) is None
-
-
 def test_a_scale_from_the_start_leaves_no_trace(pair) -> None:
     """All depths times s: the motion's length times s, its covariance with it, and nothing else."""
     prev, curr, flow = pair
