@@ -180,30 +180,19 @@ def _solve(
     total = weight.double().sum(dim=1)
     curvature, meat = (x * total[:, None, None] for x in _curvature(few, T, how))
     T, last, converged, iterations = _fit_all(pixels, few, T, how, curvature, tile, tight)
-    # what the numba refinement does with its sums, sample by sample
-    depth = weighted_median(few.points[:, 2], few.weight, 1.0)
-    tiles = torch.cat([last.H[..., UPPER[0], UPPER[1]], last.g], dim=2)
-    tiles = tiles.unflatten(1, (-(-size[0] // tile), -1))
-    focal, t = pixels.K[:, 0, 0], T.translation()
-    arrays = [
-        x.double().cpu().numpy()
-        for x in (tiles, curvature, meat, 1 / depth, total, focal, t, how.noise[:, :2])
-    ]
+    found = _covariances(pixels, few, T, last, how.noise, (curvature, meat), size, tile)
     near = (last.at.robust > 0) & (last.at.distance2 <= INLIER_DISTANCE2)
     ratio = torch.nan_to_num((weight * near).sum(dim=1) / weight.sum(dim=1).clamp(min=1e-30))
     probability = own**2 / (own**2 + rival**2).clamp(min=1e-12)
     covariances, status = [], []
-    for k, sums in enumerate(zip(*arrays, strict=True)):
-        covariance, definite = NOTHING, 0
-        if all(np.isfinite(x).all() for x in sums):
-            covariance, _, definite = motion_covariance(*sums)
+    for k, (covariance, definite) in enumerate(found):
         doubt = Status.degraded(Reason.SOLVER_DIVERGED, f"not converged after {STEPS} steps")
-        found = _bad_input(batch, pixels, k, options.min_pixels) or status_of(
-            definite > 0, float(ratio[k]), Status() if converged[k] else doubt,
-            float(probability[k]), MIN_PROBABILITY,
-        )  # fmt: skip
-        covariances.append(covariance if found.usable else NOTHING)
-        status.append(found)
+        sure = float(probability[k]), MIN_PROBABILITY
+        judged = _bad_input(batch, pixels, k, options.min_pixels) or status_of(
+            definite, float(ratio[k]), Status() if converged[k] else doubt, *sure
+        )
+        covariances.append(covariance if judged.usable else NOTHING)
+        status.append(judged)
     failed = torch.tensor([not s.usable for s in status], device=T.device)
     identity = pp.identity_SE3(len(T), dtype=T.dtype, device=T.device)
     return BatchedPose(
@@ -219,6 +208,31 @@ def _solve(
         noise=torch.where(torch.isfinite(how.noise), how.noise, torch.ones_like(how.noise)),
         inlier_ratio=ratio,
     )
+
+
+def _covariances(
+    pixels: Pixels,
+    few: Pixels,
+    T: pp.LieTensor,
+    last: Linearization,
+    noise: torch.Tensor,
+    spread: tuple[torch.Tensor, torch.Tensor],
+    size: tuple[int, int],
+    tile: int,
+) -> list[tuple[np.ndarray, bool]]:
+    """Covariance of each sample by the numpy function, and whether it is definite."""
+    depth = weighted_median(few.points[:, 2], few.weight, 1.0)
+    tiles = torch.cat([last.H[..., UPPER[0], UPPER[1]], last.g], dim=2)
+    tiles = tiles.unflatten(1, (-(-size[0] // tile), -1))
+    weight, focal, t = pixels.weight.double().sum(dim=1), pixels.K[:, 0, 0], T.translation()
+    values = (tiles, *spread, 1 / depth, weight, focal, t, noise[:, :2])
+    found = []
+    for sums in zip(*(x.double().cpu().numpy() for x in values), strict=True):
+        covariance, occupied = NOTHING, 0
+        if all(np.isfinite(x).all() for x in sums):
+            covariance, _, occupied = motion_covariance(*sums)
+        found.append((covariance, occupied > 0))
+    return found
 
 
 def _bad_input(batch: PairBatch, pixels: Pixels, k: int, min_pixels: int) -> Status | None:
