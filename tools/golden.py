@@ -269,10 +269,11 @@ def judge_beside(old: dict[str, Any], new: dict[str, Any], factor: float) -> lis
         **dict.fromkeys(("failed", "unflagged"), (1.0, 0.0)),
         "overconfident": (1.0, max(1, 0.05 * old["pairs"])),
         "median": (factor, tolerance),
-        "worst": (math.inf if new["failed"] else WORST_FACTOR, tolerance),
     }
+    if not new["failed"]:  # with failures the worst says nothing
+        bounds["worst"] = WORST_FACTOR, tolerance
     for key, (times, more) in bounds.items():
-        if new[key] > np.nan_to_num(times * old[key], nan=math.inf) + more + spread.get(key, 0):
+        if new[key] > times * old[key] + more + spread.get(key, 0):
             found.append(("WORSE", f"{key} {old[key]:.4g} -> {new[key]:.4g}"))
     if old["median"] > factor * new["median"] + tolerance + spread.get("median", 0):
         found.append(("better", f"median error {old['median']:.4g} -> {new['median']:.4g}"))
@@ -281,7 +282,8 @@ def judge_beside(old: dict[str, Any], new: dict[str, Any], factor: float) -> lis
         found.append(("WORSE", f"status {old['status']} -> {new['status']}"))
     # the covariance of a degraded motion covers its doubt: more of them lower the median
     before, now = (
-        sum(n for s, n in r["status"].items() if s[:8] == "degraded") for r in (old, new)
+        sum(count for status, count in row["status"].items() if status.startswith("degraded"))
+        for row in (old, new)
     )
     doubted = now > before and (new["nees"] or 0) < EXPECTED_NEES
     if not doubted and miss(new["nees"]) > miss(old["nees"]) + math.log(NEES_FACTOR):
