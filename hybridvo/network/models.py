@@ -22,8 +22,8 @@ SELECTION = {
 """Methods that are a network alone, and how one motion is selected from its pixels, if any."""
 
 
-def load_weights(path: str | Path) -> tuple[Any, dict[str, Any]]:
-    """Network of a weights file, in evaluation mode and float32 on the CPU, and its model card.
+def load_weights(name_or_path: str | Path) -> tuple[Any, dict[str, Any]]:
+    """Network of pretrained or other weights, to evaluate on the CPU in float32, and its card.
 
     Raises:
         CheckpointError: no whole weights file, or one of another program or architecture.
@@ -33,7 +33,7 @@ def load_weights(path: str | Path) -> tuple[Any, dict[str, Any]]:
     from hybridvo.network.selector_net import SelectorNetwork, SelectorNetworkOptions
     from hybridvo.network.weights import read_weights
 
-    weights = read_weights(path)
+    weights = read_weights(name_or_path)
     if weights.options.get("kind") == "selector":
         return weights.build(SelectorNetworkOptions, SelectorNetwork), weights.card
     return weights.build(NetworkOptions, build_network), weights.card
@@ -55,9 +55,9 @@ class Models:
 
     def path(self, name: str) -> Path:
         """File of the weights of a network."""
-        from hybridvo.network.weights import pretrained
+        from hybridvo.network.weights import weights_file
 
-        return self.weights.get(name) or pretrained(name)
+        return self.weights.get(name) or weights_file(name)
 
     def network(self, name: str) -> Any:
         """A network, in the form that is fastest on its device."""
@@ -67,12 +67,9 @@ class Models:
             path = self.path(name)
             network, _ = load_weights(path)
             own = name == "selector" or name.startswith("vonet")  # the other names are PWVOs
-            if network.options.kind != (name if own else "pwvo"):
-                raise CheckpointError(
-                    f"{path}: expected the weights of a {name}, got a {network.options.kind}'s."
-                )
-            network = network.to(self.device, memory_format=torch.channels_last)
-            self._networks[name] = network
+            if (kind := network.options.kind) != (name if own else "pwvo"):
+                raise CheckpointError(f"{path}: expected the weights of a {name}, got a {kind}'s.")
+            self._networks[name] = network.to(self.device, memory_format=torch.channels_last)
         return self._networks[name]
 
 

@@ -27,7 +27,7 @@ from hybridvo.network.layers import (
     scaled,
 )
 from hybridvo.network.normalization import normalize, predict
-from hybridvo.network.weights import read_weights, weights_file
+from hybridvo.network.weights import read_weights
 from hybridvo.results import PixelwisePrediction
 from hybridvo.types import FramePair, PairBatch
 
@@ -113,7 +113,7 @@ class PWVO(nn.Module):
         Raises:
             CheckpointError: no such weights, damaged ones, or another network's.
         """
-        weights = read_weights(weights_file(name_or_path))
+        weights = read_weights(name_or_path)
         network = weights.build(NetworkOptions, build_network)
         if not isinstance(network, cls):
             raise CheckpointError(

@@ -12,7 +12,6 @@ import torch
 from hybridvo.errors import FormatError, InputError
 from hybridvo.network.models import load_weights
 from hybridvo.network.selector_net import SelectorNetworkOptions
-from hybridvo.network.weights import pretrained
 from hybridvo.synthetic import dataset as stored
 from hybridvo.synthetic.draws import sample_generator
 from hybridvo.training import selector_data
@@ -90,7 +89,7 @@ def test_training_learns_and_goes_on(shards, tmp_path):
 
 def test_the_configuration_is_that_of_the_pretrained_network():
     options = load_selector_options(CONFIG)
-    network, _ = load_weights(pretrained("selector"))
+    network, _ = load_weights("selector")
     assert options.network == network.options
 
 
