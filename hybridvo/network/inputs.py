@@ -41,7 +41,7 @@ class TensorBatch:
         out = {}
         for name, x in vars(self).items():
             if name.startswith("K_"):
-                x = subsampled_intrinsics(x, stride)
+                x = scaled_intrinsics(x, 1 / stride, -(stride // 2) / stride)
             elif x.ndim > 2:
                 x = x[..., every, every]
             out[name] = x / stride if "flow" in name else x
@@ -82,17 +82,23 @@ class NetworkInputs(TensorBatch):
         return self.flow * FLOW_SCALE_PX
 
     @property
+    def pixels(self) -> torch.Tensor:
+        """(B, 2, h, w) coordinates x of the pixels."""
+        focal, centre = pinhole(self.K_prev)
+        return self.rays * focal + centre
+
+    @property
     def size(self) -> tuple[int, int]:
         """(h, w)."""
         return self.flow.shape[2], self.flow.shape[3]
 
 
-def subsampled_intrinsics(K: torch.Tensor, stride: int) -> torch.Tensor:
-    """(B, 3, 3) intrinsics of the pixels n // 2, n // 2 + n, .. of each axis, n = ``stride``."""
-    return _scaled_intrinsics(K, 1 / stride, -(stride // 2) / stride)
+def pinhole(K: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Focal lengths and principal points (B, 2, 1, 1) of intrinsics (B, 3, 3)."""
+    return K.diagonal(dim1=1, dim2=2)[:, :2, None, None], K[:, :2, 2, None, None]
 
 
-def _scaled_intrinsics(
+def scaled_intrinsics(
     K: torch.Tensor, scale: float | torch.Tensor, offset: float | torch.Tensor
 ) -> torch.Tensor:
     """(B, 3, 3) intrinsics after pixel coordinates x became scale * x + offset, of both axes."""
@@ -120,22 +126,19 @@ def assemble_inputs(
         raise InputError(f"assemble_inputs: expected a FramePair or a PairBatch, got {got}.")
     batch = checked_batch(pair, where="assemble_inputs")[0]
     height, width = batch.flow.shape[1:3]
-    rows, cols = (
-        _nearest(native, target).to(batch.flow.device)
-        for native, target in ((height, size[0]), (width, size[1]))
-    )
+    rows = _nearest(height, size[0]).to(batch.flow.device)
+    cols = _nearest(width, size[1]).to(batch.flow.device)
 
     def pick(x: torch.Tensor) -> torch.Tensor:
         return x.index_select(1, rows).index_select(2, cols)
 
-    flow = pick(batch.flow)
-    depth_curr = None
+    flow, depth_curr = pick(batch.flow), None
     if batch.depth_curr is not None:
         depth_curr = _sample_at_flow(batch.depth_curr, flow, rows, cols)
     scale = flow.new_tensor([size[1] / width, size[0] / height])
     # pixel centres lie at whole coordinates: c' = s (c + 0.5) - 0.5
     K_prev, K_curr = (
-        _scaled_intrinsics(K, scale, 0.5 * scale - 0.5) for K in (batch.K_prev, batch.K_curr)
+        scaled_intrinsics(K, scale, 0.5 * scale - 0.5) for K in (batch.K_prev, batch.K_curr)
     )
     valid = None if batch.valid is None else pick(batch.valid)
     depth = pick(batch.depth_prev)
@@ -146,10 +149,10 @@ def assemble_inputs(
 def assemble_aligned(
     flow: torch.Tensor, depth_prev: torch.Tensor, depth_curr: torch.Tensor, K: torch.Tensor
 ) -> NetworkInputs:
-    """Inputs from tensors of the network's size, both depths on the previous grid.
+    """Inputs from samples of the network's size, as the paper trains on.
 
-    The form of the paper's training data: flow (B, h, w, 2) px, depths (B, h, w) metres of the same
-    scene points one step apart, K (B, 3, 3) of both frames.
+    Flow (B, h, w, 2) px, depths (B, h, w) metres of the same scene points one step apart, both on
+    the previous grid, K (B, 3, 3) of both frames.
     """
     batch = PairBatch(flow, depth_prev, K, K, depth_curr=depth_curr)
     batch = checked_batch(batch, where="assemble_aligned")[0]
@@ -160,8 +163,8 @@ def assemble_aligned(
 def _rays(rows: torch.Tensor, cols: torch.Tensor, K: torch.Tensor) -> torch.Tensor:
     """(B, 2, h, w) first two components of K^-1 x at rows (h,) and columns (w,) of pixels."""
     v, u = torch.meshgrid(rows, cols, indexing="ij")
-    focal = K.diagonal(dim1=1, dim2=2)[:, :2, None, None]
-    return (torch.stack([u, v]).to(K.dtype) - K[:, :2, 2, None, None]) / focal
+    focal, centre = pinhole(K)
+    return (torch.stack([u, v]).to(K.dtype) - centre) / focal
 
 
 def _nearest(native: int, target: int) -> torch.Tensor:

@@ -18,7 +18,7 @@ import torch.nn.functional as F
 from pydantic import Field
 
 from hybridvo.network.inputs import MIN_DEPTH, TensorBatch
-from hybridvo.network.selection import NetworkOutput
+from hybridvo.network.selection import NetworkOutput, joined
 from hybridvo.options import Positive, option_group
 from hybridvo.results import PixelwisePrediction
 from hybridvo.torch_geometry import pixel_grid, reproject
@@ -116,8 +116,7 @@ def total_loss(
     """
     s = None
     if isinstance(output, PixelwisePrediction):
-        if output.log_scale_rotation is not None and output.log_scale_translation is not None:
-            s = torch.cat([output.log_scale_rotation, output.log_scale_translation], dim=1)
+        _, s = joined(output)
         parts = _pose_losses(output, targets, s if options.pose_uncertainty else None, options)
     else:
         pairs = zip(output, (targets.rotation_deg, targets.translation), strict=True)
@@ -125,13 +124,12 @@ def total_loss(
         parts = {"rotation": rotation, "translation": translation}
     if options.reconstructs:
         assert T_curr_prev is not None
-        flow, depth, defined = reconstruct(
-            targets.depth_prev, T_curr_prev, targets.K_prev, targets.K_curr
-        )
+        cameras = targets.K_prev, targets.K_curr
+        flow, depth, defined = reconstruct(targets.depth_prev, T_curr_prev, *cameras)
         known = torch.isfinite(targets.depth_prev) & (targets.depth_prev > 0)
         if options.flow:
-            s_flow = s if options.flow_uncertainty else None
-            parts["flow"] = _flow_loss(flow, targets.ego_flow, defined, known, s_flow, options)
+            s_flow, limit = s if options.flow_uncertainty else None, options.flow_limit_px
+            parts["flow"] = _flow_loss(flow, targets.ego_flow, defined, known, s_flow, limit)
         if options.depth:
             s_depth = s if options.depth_uncertainty else None
             parts["depth"] = _depth_loss(depth, targets.depth_curr, known, s_depth)
@@ -158,24 +156,18 @@ def _pose_losses(
     output: PixelwisePrediction, targets: LossTargets, s: torch.Tensor | None, options: LossOptions
 ) -> dict[str, torch.Tensor]:
     """L^R and L^T of pixel maps, weighed by s (B, 6, ..) unless it is None; as published."""
-    error_r = (targets.rotation_deg[:, :, None, None] - output.rotation).abs()
-    true_t = targets.translation[:, :, None, None]
-    if options.translation_form == "laplace":
-        error_t = (output.translation - true_t).abs()
-    else:
+    true_r, true_t = (x[:, :, None, None] for x in (targets.rotation_deg, targets.translation))
+    laplace = options.translation_form == "laplace"
+    errors = [(true_r - output.rotation).abs(), (output.translation - true_t).abs()]
+    if not laplace:
         floor = options.direction_floor
         length = (_norm(true_t) - _norm(output.translation)).square()
         turn = _direction(true_t, floor) - _direction(output.translation, floor)
-        error_t = length + _norm(turn)
-    if s is None:
-        return {"rotation": error_r.mean(), "translation": error_t.mean()}
-    s_r, s_t = s[:, :3], s[:, 3:]
-    data_r, data_t = (_inverse_scale(s_r) * error_r).mean(), (_inverse_scale(s_t) * error_t).mean()
-    half = 0.5 if options.translation_form == "laplace" else 1.0
-    return {
-        "rotation": 0.5 * (data_r + s_r.mean()),
-        "translation": 0.5 * data_t + half * s_t.mean(),
-    }
+        errors[1] = length + _norm(turn)
+    if s is not None:
+        halves = zip(errors, s.split(3, dim=1), (0.5, 0.5 if laplace else 1.0), strict=True)
+        errors = [0.5 * _inverse_scale(x) * error + half * x for error, x, half in halves]
+    return {"rotation": errors[0].mean(), "translation": errors[1].mean()}
 
 
 def _flow_loss(
@@ -184,24 +176,19 @@ def _flow_loss(
     defined: torch.Tensor,
     known: torch.Tensor,
     s: torch.Tensor | None,
-    options: LossOptions,
+    limit_px: float,
 ) -> torch.Tensor:
     """L^F; with s (B, 6, ..) weighed by 1 / U^F = exp(-0.1 s)."""
     known = known & torch.isfinite(target).all(dim=1)
     error = (flow - torch.where(known[:, None], target, 0.0)).abs()
-    counts = (defined & known)[:, None] & (error < options.flow_limit_px)
-    behind = (known & ~defined)[:, None]
-    error = torch.where(counts, error, 0.0) + behind * options.flow_limit_px
-    count = known.sum().clamp(min=1)
+    counts = (defined & known)[:, None] & (error < limit_px)
+    error = torch.where(counts, error, 0.0) + (known & ~defined)[:, None] * limit_px
     if s is None:
-        return 0.5 * error.sum() / count
+        return 0.5 * error.sum() / known.sum().clamp(min=1)
     # rx, ry, rz and tz move both components, tx and ty one of them
-    a, b = (_to_cells(e, s.shape[2:]) for e in error.unbind(1))
-    each = torch.stack([a + b, a + b, a + b, a, b, a + b], dim=1)
-    pixels = _to_cells(known.to(s.dtype), s.shape[2:])[:, None]
-    s = 0.1 * s
+    a, b = error.unbind(1)
     share = s.new_tensor([1.0, 1.0, 1.0, 0.5, 0.5, 1.0])[:, None, None]
-    return (0.5 * _inverse_scale(s) * each + share * s * pixels).sum() / count
+    return _weighed(torch.stack([a + b, a + b, a + b, a, b, a + b], dim=1), known, 0.1 * s, share)
 
 
 def _depth_loss(
@@ -217,19 +204,27 @@ def _depth_loss(
     exact = 1.0 / target - 1.0 / torch.where(front, depth, 1.0)
     # finite behind the camera
     error = torch.where(front, exact, (target - depth) / target.square()).abs()
-    error, count = torch.where(known, error, 0.0), known.sum().clamp(min=1)
+    error = torch.where(known, error, 0.0)
     if s is None:
-        return error.sum() / count
-    s = 0.25 * s[:, [0, 1, 5]]
-    cells = [_to_cells(x.to(s.dtype), s.shape[2:])[:, None] for x in (error, known)]
-    return 0.5 * (_inverse_scale(s) * cells[0] + s * cells[1]).sum() / count
+        return error.sum() / known.sum().clamp(min=1)
+    return _weighed(error[:, None], known, 0.25 * s[:, [0, 1, 5]], 0.5)
+
+
+def _weighed(
+    error: torch.Tensor, known: torch.Tensor, s: torch.Tensor, share: torch.Tensor | float
+) -> torch.Tensor:
+    """Errors (B, C, h, w) over their scales exp(s), which may have a coarser grid, plus s."""
+    pixels = _to_cells(known[:, None].to(s.dtype), s.shape[2:])
+    error = _to_cells(error, s.shape[2:])
+    total = (0.5 * _inverse_scale(s) * error + share * s * pixels).sum()
+    return total / known.sum().clamp(min=1)
 
 
 def _to_cells(x: torch.Tensor, cells: torch.Size) -> torch.Tensor:
-    """Sum of a (B, h, w) map over the pixels of each cell of a coarser grid ``cells``."""
-    height, width = x.shape[1:]
+    """Sum of (B, C, h, w) maps over the pixels of each cell of a coarser grid ``cells``."""
+    height, width = x.shape[2:]
     side = -(-height // cells[0])
     if side == 1:
         return x
     x = F.pad(x, (0, cells[1] * side - width, 0, cells[0] * side - height))
-    return F.avg_pool2d(x[:, None], side)[:, 0] * side**2
+    return F.avg_pool2d(x, side) * side**2

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import torch
 from torch import nn
 
-from hybridvo.network.inputs import MIN_DEPTH, NetworkInputs
+from hybridvo.network.inputs import MIN_DEPTH, NetworkInputs, pinhole
 from hybridvo.network.layers import NetworkOptions
 from hybridvo.network.selection import NetworkOutput, fitted_motion
 from hybridvo.torch_geometry import euler_deg
@@ -108,7 +108,7 @@ def remove_scale(
         seen = inputs.valid[:, None] | (flow != 0).any(dim=1, keepdim=True)
         flow = torch.where(seen, flow - ego, flow)
         change = change - log_ratio
-    angle = flow / _focal(inputs.K_prev)
+    angle = flow / pinhole(inputs.K_prev)[0]
     length = (angle.square().sum(dim=1) + 1e-20).sqrt()
     motion = _quantile(length, inputs.valid, quantile).clamp(MIN_MOTION, 1.0)
     # near things tell the translation, and set its scale
@@ -128,18 +128,14 @@ def _ego_motion(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """((B, 2, h, w) px, (B, 1, h, w)) flow and change of log depth; zero behind the camera."""
     # Over its depth, a point is ray + translation * inverse depth: finite for the farthest.
-    rays, inverse = inputs.rays.flatten(2), inverse.flatten(1)[:, None]
-    moved = T[:, :3, :2] @ rays + T[:, :3, 2:3] + T[:, :3, 3:] * inverse
+    rays, near = inputs.rays.flatten(2), inverse.flatten(1)[:, None]
+    moved = T[:, :3, :2] @ rays + T[:, :3, 2:3] + T[:, :3, 3:] * near
     moved = moved.unflatten(2, inputs.size)
-    front = moved[:, 2:] > MIN_DEPTH * inverse.unflatten(2, inputs.size).clamp(min=1e-3)
+    front = moved[:, 2:] > MIN_DEPTH * inverse[:, None].clamp(min=1e-3)
     z = torch.where(front, moved[:, 2:], 1.0)
-    now = _focal(inputs.K_curr) * moved[:, :2] / z + inputs.K_curr[:, :2, 2, None, None]
-    before = _focal(inputs.K_prev) * inputs.rays + inputs.K_prev[:, :2, 2, None, None]
-    return torch.where(front, now - before, 0.0), torch.where(front, z.log(), 0.0)
-
-
-def _focal(K: torch.Tensor) -> torch.Tensor:
-    return K.diagonal(dim1=1, dim2=2)[:, :2, None, None]
+    focal, centre = pinhole(inputs.K_curr)
+    flow = focal * moved[:, :2] / z + centre - inputs.pixels
+    return torch.where(front, flow, 0.0), torch.where(front, z.log(), 0.0)
 
 
 def _squash(x: torch.Tensor) -> torch.Tensor:
