@@ -23,20 +23,18 @@ SELECTION = {
 
 
 def load_weights(name_or_path: str | Path) -> tuple[Any, dict[str, Any]]:
-    """Network of pretrained or other weights, to evaluate on the CPU in float32, and its card.
-
-    Raises:
-        CheckpointError: no whole weights file, or one of another program or architecture.
-    """
+    """Network of pretrained or other weights and its card; see ``weights.read_network``."""
     from hybridvo.network.layers import NetworkOptions
     from hybridvo.network.pwvo import build_network
     from hybridvo.network.selector_net import SelectorNetwork, SelectorNetworkOptions
-    from hybridvo.network.weights import read_weights
+    from hybridvo.network.weights import read_network
 
-    weights = read_weights(name_or_path)
-    if weights.options.get("kind") == "selector":
-        return weights.build(SelectorNetworkOptions, SelectorNetwork), weights.card
-    return weights.build(NetworkOptions, build_network), weights.card
+    def make(options: dict[str, Any]) -> Any:
+        if options.get("kind") == "selector":
+            return SelectorNetwork(SelectorNetworkOptions(**options))
+        return build_network(NetworkOptions(**options))
+
+    return read_network(name_or_path, make)
 
 
 class Models:

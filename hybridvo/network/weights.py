@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -20,27 +20,6 @@ from hybridvo.files import atomic_write
 FORMAT = "hybridvo-network-1"
 """Value of the header's ``format`` key."""
 PRETRAINED = Path(__file__).parent / "pretrained"
-
-
-class Weights(NamedTuple):
-    """Content of a weights file: the network's options, its model card, float32 tensors by name."""
-
-    path: Path
-    options: dict[str, Any]
-    card: dict[str, Any]
-    tensors: dict[str, torch.Tensor]
-
-    def build(self, kind: Callable[..., Any], network_of: Callable[[Any], nn.Module]) -> nn.Module:
-        """The network of the file in evaluation mode, by the class of its options and its maker."""
-        try:
-            network = network_of(kind(**self.options))
-            network.load_state_dict(self.tensors)
-        except (InputError, TypeError, RuntimeError) as error:
-            raise CheckpointError(
-                f"{self.path}: the weights do not fit their own options {self.options}: "
-                + str(error).replace("\n\t", " ")[:600]
-            ) from None
-        return network.eval()
 
 
 def save_weights(
@@ -68,11 +47,16 @@ def save_weights(
     return Path(path)
 
 
-def read_weights(name_or_path: str | Path) -> Weights:
-    """Content of a file of :func:`save_weights`, on the CPU.
+def read_network(
+    name_or_path: str | Path, make: Callable[[dict[str, Any]], nn.Module]
+) -> tuple[nn.Module, dict[str, Any]]:
+    """Network of a file of :func:`save_weights`, and its card; ``make`` builds it from options.
+
+    In evaluation mode and float32, on the CPU.
 
     Raises:
-        CheckpointError: missing, truncated, of another program, or with values that are not finite.
+        CheckpointError: missing, truncated, of another program or architecture, or with values that
+            are not finite.
     """
     path = weights_file(name_or_path)
     try:
@@ -91,7 +75,15 @@ def read_weights(name_or_path: str | Path) -> Weights:
         ) from None
     if broken := _broken(tensors):
         raise CheckpointError(f"{path}: {broken}.")
-    return Weights(path, options, card, tensors)
+    try:
+        network = make(options)
+        network.load_state_dict(tensors)
+    except (InputError, TypeError, RuntimeError) as error:
+        what = str(error).replace("\n\t", " ")[:600]
+        raise CheckpointError(
+            f"{path}: the weights do not fit their own options {options}: {what}"
+        ) from None
+    return network.eval(), card
 
 
 def _broken(tensors: Mapping[str, torch.Tensor]) -> str:
