@@ -40,7 +40,7 @@ class _UpStage(nn.Module):
     def __init__(self, in_channels: int, up: int, skip: int, out: int, project: bool = False):
         super().__init__()
         self.up, self.skip = nn.ConvTranspose2d(in_channels, up, 2, 2), skip
-        self.block = ResidualBlock(up + skip, out, project=project)
+        self.block = ResidualBlock(up + skip, out, 1, True, project)
 
     def forward(self, x: torch.Tensor, like: torch.Tensor) -> torch.Tensor:
         # upsampling gives a row or column too many where the encoder met an odd size
@@ -96,7 +96,7 @@ class PWVO(nn.Module):
         self.head_motion = _map_head(channels)
         self.head_uncertainty = _map_head(channels) if options.uncertainty else None
         heads = [h for h in (self.head_motion, self.head_uncertainty) if h is not None]
-        initialize(self, uniform=tuple(heads))
+        initialize(self, tuple(heads))
 
     @classmethod
     def from_pretrained(cls, name_or_path: str | Path = "pwvo") -> PWVO:
@@ -177,7 +177,7 @@ class VONet(nn.Module):
         features = channels * math.prod(self.grid)
         self.head_rotation = _pose_head(features)
         self.head_translation = _pose_head(features)
-        initialize(self, uniform=(self.head_rotation, self.head_translation))
+        initialize(self, (self.head_rotation, self.head_translation))
 
     def forward(
         self, inputs: NetworkInputs, T_start: torch.Tensor | None = None
