@@ -60,13 +60,10 @@ class TensorBatch:
 class NetworkInputs(TensorBatch):
     """Inputs of a batch of pairs at the network's size (h, w); what is invalid is 0.
 
-    Args:
-        flow: (B, 2, h, w) flow in pixels of this size divided by ``FLOW_SCALE_PX``.
-        inverse_depth: (B, 2, h, w) 1 / metres of the previous depth, and of the current one sampled
-            at x + F, both on the grid of the previous frame.
-        rays: (B, 2, h, w) first two components of K^-1 x.
-        valid: (B, h, w) bool, flow and previous depth are both usable.
-        K_prev, K_curr: (B, 3, 3) intrinsics scaled to (h, w), pixel-centre convention.
+    ``flow`` (B, 2, h, w): pixels of this size over ``FLOW_SCALE_PX``; ``inverse_depth``
+    (B, 2, h, w): 1 / metres of the previous depth, and of the current one at x + F; ``rays``
+    (B, 2, h, w): first two components of K^-1 x; ``valid`` (B, h, w): flow and previous depth are
+    both usable; intrinsics (B, 3, 3) of this size.
     """
 
     flow: torch.Tensor
@@ -191,23 +188,17 @@ def _sample_at_flow(
 def _normalize(batch: PairBatch, rays: torch.Tensor) -> NetworkInputs:
     """Inputs of a batch of the network's size, whose pixels have the rays (B, 2, h, w)."""
     flow, prev, curr = batch.flow, batch.depth_prev, batch.depth_curr
-    if curr is None:
-        curr = torch.full_like(prev, torch.nan)
     flow_ok = torch.isfinite(flow).all(-1)
     prev_ok = torch.isfinite(prev) & (prev >= MIN_DEPTH)
     if batch.valid is not None:
         flow_ok, prev_ok = flow_ok & batch.valid, prev_ok & batch.valid
+    curr = torch.full_like(prev, torch.nan) if curr is None else curr
     curr_ok = torch.isfinite(curr) & (curr >= MIN_DEPTH) & flow_ok
+    flow = torch.where(flow_ok[..., None], flow, 0.0).permute(0, 3, 1, 2) / FLOW_SCALE_PX
     inverse = [
         # no 1 / 0 in the gradient of what is not selected
         torch.where(ok, 1.0 / torch.where(ok, depth, 1.0), 0.0)
         for depth, ok in ((prev, prev_ok), (curr, curr_ok))
     ]
-    return NetworkInputs(
-        flow=torch.where(flow_ok[..., None], flow, 0.0).permute(0, 3, 1, 2) / FLOW_SCALE_PX,
-        inverse_depth=torch.stack(inverse, dim=1),
-        rays=rays,
-        valid=flow_ok & prev_ok,
-        K_prev=batch.K_prev,
-        K_curr=batch.K_curr,
-    )
+    depths, valid = torch.stack(inverse, dim=1), flow_ok & prev_ok
+    return NetworkInputs(flow, depths, rays, valid, batch.K_prev, batch.K_curr)

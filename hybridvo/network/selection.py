@@ -16,7 +16,7 @@ ego-flow equation (paper, equation 8), weighed by s, and teaches s the doubt tha
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -46,14 +46,11 @@ MIN_SCALE = 1e-4
 NetworkOutput = PixelwisePrediction | tuple[torch.Tensor, torch.Tensor]
 
 
-@dataclass(frozen=True, eq=False)
-class PoseSeed:
+class PoseSeed(NamedTuple):
     """Where a refinement starts, and how much it heeds each pixel.
 
-    Args:
-        T_curr_prev: (B, 4, 4) the selected motion, metres.
-        weights: (B, H, W) in (0, 1], at the size of the images; carry the gradient of the log
-            scales of the rotation. None where the network predicts no uncertainty.
+    ``T_curr_prev`` (B, 4, 4), metres; ``weights`` (B, H, W) in (0, 1], at the size of the images:
+    they carry the gradient of the log scales of the rotation; None where there is no uncertainty.
     """
 
     T_curr_prev: torch.Tensor
@@ -106,15 +103,8 @@ def select_pose(
     Each of the six numbers has its own pixels and weights; those of ``joint`` share theirs.
     Differentiable in the predictions and, through the weights, in the log scales. Values that are
     not finite are never chosen while their patch has another; a pair without any gives zero motion.
-
-    Args:
-        output: maps of (B, 3, h, w), or the pose itself (VONet).
-        method: one of ``SELECTION_METHODS``; without uncertainty always ``mean``.
-        patch: side of the square patches in cells of the maps; a quarter of the height by default:
-            32 at 128x256 (the paper).
-
-    Raises:
-        InputError: an unknown method.
+    Without uncertainty the method is always ``mean``. ``patch``: side of the square patches in
+    cells of the maps, a quarter of the height by default: 32 at 128x256 (the paper).
     """
     if isinstance(output, tuple):
         return output
