@@ -1,8 +1,7 @@
 """Point solvers of OpenCV and PoseLib: sample, solve, check.
 
-3-D points come from the previous depth and camera, 2-D points from the flow, seen by the current
-camera. A solver's own "success" is not believed: the check is the same for every baseline, so that
-"ok" means one thing in a comparison.
+A solver's own "success" is not believed: the check is the same for every baseline, so that "ok"
+means one thing in a comparison.
 """
 
 from __future__ import annotations
@@ -29,18 +28,13 @@ DEPTH_RANGE_M = (1e-6, 1e6)
 """Open interval of depths that can be metres; outside it squares leave the floating-point range."""
 MIN_INLIER_RATIO = 0.05  # below this share of the sampled pixels a consensus is chance: failed
 LOW_INLIER_RATIO = 0.25  # below this share the largest motion need not be the camera's: degraded
-SINGULAR_RATIO = 1e-10
-"""Eigenvalue ratio of the scaled information at which a direction is free: failed."""
-WEAK_RATIO = 1e-6
-"""Eigenvalue ratio below which a direction is weak: degraded. A frontal plane over a field of view
-of 20 degrees has 1e-4, a patch of 20 px at fx = 1000 has 1e-9."""
+SINGULAR_RATIO, WEAK_RATIO = 1e-10, 1e-6
+"""Eigenvalue ratios of the scaled information below which a direction is free: failed; or weak:
+degraded. A frontal plane over a field of view of 20 degrees has 1e-4, a patch of 20 px at fx = 1000
+has 1e-9."""
 TUNED_PX, DEFAULT_PX = 2.0, 8.0
 """Largest residual of an inlier: of the tuned solvers, and OpenCV's default."""
-TUNED: dict[str, Any] = {
-    "iterationsCount": 1000,
-    "reprojectionError": TUNED_PX,
-    "confidence": 0.999,
-}
+TUNED: Any = {"iterationsCount": 1000, "reprojectionError": TUNED_PX, "confidence": 0.999}
 FOUND_NOTHING = (cv2.error, ValueError, RuntimeError, ArithmeticError)
 """What the libraries raise on data that determine no pose."""
 
@@ -73,12 +67,9 @@ def solve_poselib(data: Correspondences, camera: Camera, seed: int) -> np.ndarra
     """PoseLib's LO-RANSAC, bundle adjustment included."""
     import poselib
 
-    model = {
-        "model": "PINHOLE",
-        "params": [camera.fx, camera.fy, camera.cx, camera.cy],
-        "width": camera.width,
-        "height": camera.height,
-    }
+    size = {"width": camera.width, "height": camera.height}
+    pinhole = [camera.fx, camera.fy, camera.cx, camera.cy]
+    model = size | {"model": "PINHOLE", "params": pinhole}
     options = {
         "max_reproj_error": TUNED_PX,
         # its default of at least 1000 takes three times as long and is no more accurate here
@@ -181,10 +172,9 @@ def check(
 ) -> RelativePose:
     """A solver's motion with covariance and status; failed with the identity where it is none.
 
-    The motion must be finite and have enough inliers (in front of the camera, and within
-    ``threshold_px``), and they must determine all six degrees of freedom. Covariance sigma^2
-    (J^T J)^-1 over them, sigma^2 = |r|^2 / (2 n - 6) unless ``sigma_px`` is given: that of the
-    least-squares optimum, thus optimistic for a solver that stops short of it.
+    It must be finite, with enough inliers (in front of the camera, within ``threshold_px``), which
+    determine all six degrees of freedom. Covariance sigma^2 (J^T J)^-1 over them, sigma^2 =
+    |r|^2 / (2 n - 6) unless ``sigma_px`` is given: optimistic where a solver stops short.
     """
     if isinstance(data, Status):
         return RelativePose.failed(data.reason, data.message, method)

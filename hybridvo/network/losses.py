@@ -1,11 +1,10 @@
 """Losses of PWVO and its baselines (paper, sections 3.2.2 and 3.4) in log form, s = log U.
 
 Four terms, each plain or weighed by uncertainty: rotation L^R and translation L^T, every pixel must
-name the pair's motion (distribution learning); ego flow L^F and depth L^D, the *selected* motion,
-applied to the true depth, must reproduce what the camera motion alone causes.
-
-They are those of the published code, but pixels without depth are left out, a point that the motion
-brings behind the camera is charged, and s may have a coarser grid than the flow.
+name the pair's motion; ego flow L^F and depth L^D, the *selected* motion, applied to the true
+depth, must reproduce what the camera motion alone causes. They are those of the published code, but
+pixels without depth are left out, a point that the motion brings behind the camera is charged, and
+s may have a coarser grid than the flow.
 """
 
 from __future__ import annotations
@@ -68,13 +67,9 @@ class LossOptions:
 class LossTargets(TensorBatch):
     """Ground truth of a batch, at the network's input size (h, w).
 
-    Args:
-        rotation_deg: (B, 3) Euler angles X-Y-Z in degrees of T_curr_prev.
-        translation: (B, 3) metres.
-        ego_flow: (B, 2, h, w) px, flow that the camera motion alone causes; NaN does not count.
-        depth_prev: (B, h, w) metres; not finite or not positive is invalid.
-        depth_curr: (B, h, w) metres, next depth of the same scene point on the grid of t.
-        K_prev, K_curr: (B, 3, 3).
+    ``rotation_deg`` (B, 3) Euler angles X-Y-Z and ``translation`` (B, 3) metres of T_curr_prev;
+    ``ego_flow`` (B, 2, h, w) px that the camera motion alone causes, NaN does not count; depths
+    (B, h, w) metres of the same scene points, both on the previous grid; intrinsics (B, 3, 3).
     """
 
     rotation_deg: torch.Tensor
@@ -92,14 +87,13 @@ def reconstruct(
     """Flow and depth that a camera motion causes (paper, equation 8), differentiable.
 
     Returns:
-        On the grid of the previous frame: (B, 2, h, w) ego flow pi(K_curr, T D K_prev^-1 x) - x in
-        px; (B, h, w) depth of the moved point, below ``MIN_DEPTH`` behind the camera, 1 where
-        ``depth_prev`` is invalid; (B, h, w) bool: valid and in front of the camera. Elsewhere the
-        flow is finite and means nothing.
+        (B, 2, h, w) ego flow pi(K_curr, T D K_prev^-1 x) - x in px; (B, h, w) depth of the moved
+        point, below ``MIN_DEPTH`` behind the camera, 1 where ``depth_prev`` is invalid; (B, h, w)
+        bool: valid and in front of the camera. Elsewhere the flow is finite and means nothing.
     """
     pixels, valid, z = reproject(depth_prev, T_curr_prev, K_prev, K_curr, MIN_DEPTH)
-    grid = pixel_grid(depth_prev.shape[1], depth_prev.shape[2], depth_prev)
-    return (pixels - grid).permute(0, 3, 1, 2), z, valid
+    flow = pixels - pixel_grid(depth_prev.shape[1], depth_prev.shape[2], depth_prev)
+    return flow.permute(0, 3, 1, 2), z, valid
 
 
 def total_loss(
