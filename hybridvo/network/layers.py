@@ -1,7 +1,7 @@
 """What PWVO and the VONet baselines share: options, blocks, the encoder, self-attention.
 
-Stride-2 convolutions pad one pixel on every side (output pixel j is centred on input pixel 2j);
-the published TensorFlow code pads bottom and right only, which matters when weights are ported.
+Stride-2 convolutions pad one pixel on every side; the published TensorFlow code pads bottom and
+right only, which matters when weights are ported.
 """
 
 from __future__ import annotations
@@ -58,13 +58,9 @@ class NetworkOptions:
 
     def __post_init__(self) -> None:
         if self.passes > 1 and not (self.scale_free and self.kind == "pwvo" and self.uncertainty):
-            raise InputError(
-                "passes above 1 need scale_free=True and the uncertainty of kind='pwvo'"
-            )
+            raise InputError("passes above 1 need scale_free=True, kind='pwvo' and uncertainty")
         if self.decoders == 2 and not self.uncertainty:
-            raise InputError(
-                "decoders=2 gives the uncertainty its own decoder; without it set decoders=1"
-            )
+            raise InputError("the second decoder is the uncertainty's; without set decoders=1")
 
 
 def scaled(channels: int, width: float) -> int:

@@ -96,10 +96,7 @@ def torch_device(device: str) -> str:
         return device
     import torch
 
-    if torch.cuda.is_available():
-        return "cuda"
-    if device == "cuda":
-        raise InputError(
-            "device cuda: this machine, or this build of torch, has no CUDA device; use cpu."
-        )
-    return "cpu"
+    there = torch.cuda.is_available()
+    if device == "cuda" and not there:
+        raise InputError("device cuda: this machine, or this torch, has no CUDA device; use cpu.")
+    return "cuda" if there else "cpu"

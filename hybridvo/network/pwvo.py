@@ -1,7 +1,7 @@
 """The paper's networks: PWVO, a pose and its uncertainty at every pixel, and the VONet baselines.
 
-PWVO is that of the published code, layer by layer (reference/pwvo.md, section 2): one shared U-Net
-decoder with two heads of two convolutions. ``decoders=2`` builds the two of the paper's text.
+PWVO is that of the published code, layer by layer: one shared U-Net decoder with two heads of two
+convolutions. ``decoders=2`` builds the two of the paper's text.
 """
 
 from __future__ import annotations
@@ -120,12 +120,11 @@ class PWVO(nn.Module):
 
         Args:
             inputs: pairs of any size; or inputs of size (h, w), multiples of 32 waste no border.
-            T_start: (B, 4, 4) a first motion, for scale-free networks: they look at what it leaves
-                unexplained, see :func:`hybridvo.network.normalization.predict`.
+            T_start: (B, 4, 4) a first motion, for scale-free networks: they look at what it leaves.
 
         Returns:
-            Maps of (ceil(h / n), ceil(w / n)), n = input_stride * head_stride; float32 (float64 for
-            a float64 network), also under autocast. Finite for any input.
+            Maps of (ceil(h / n), ceil(w / n)), n = input_stride * head_stride; in the network's own
+            type, also under autocast. Finite for any input.
         """
         options, own = self.options, next(self.parameters())
         if not isinstance(inputs, NetworkInputs):
@@ -159,13 +158,9 @@ def _pose_head(features: int) -> nn.Sequential:
 
 
 class VONet(nn.Module):
-    """PWVO's encoder with two fully connected heads (the paper's VONet baselines).
+    """PWVO's encoder with two fully connected heads (the paper's VONet baselines)."""
 
-    Inputs of another size than 128x256 are averaged to the same 2x4 grid of features before the
-    heads, so that one set of weights serves every size.
-    """
-
-    grid = (2, 4)  # of the embedding of a 128x256 input
+    grid = (2, 4)  # of the embedding of a 128x256 input; others are averaged to it
 
     def __init__(self, options: NetworkOptions | None = None) -> None:
         super().__init__()
@@ -182,9 +177,7 @@ class VONet(nn.Module):
     def forward(
         self, inputs: NetworkInputs, T_start: torch.Tensor | None = None
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """(B, 3) Euler angles X-Y-Z in degrees (R = Rx Ry Rz) and (B, 3) translation in metres of
-        T_curr_prev; ``T_start``: (B, 4, 4) a first motion, for scale-free networks.
-        """
+        """(B, 3) Euler angles X-Y-Z in degrees and (B, 3) metres of T_curr_prev."""
         inputs, scale = normalize(inputs, self.options, T_start)
         embedding = self.attention(self.encoder(self.branches(inputs))[-1])
         features = F.adaptive_avg_pool2d(embedding, self.grid).flatten(1)
@@ -194,9 +187,6 @@ class VONet(nn.Module):
 
 
 def build_network(options: NetworkOptions | None = None) -> nn.Module:
-    """A :class:`PWVO` or :class:`VONet` with fresh weights (Glorot, from torch's global generator).
-
-    PWVO at full width by default; the attribute ``options`` keeps the options.
-    """
+    """A :class:`PWVO` or :class:`VONet` with fresh weights, from torch's global generator."""
     options = options or NetworkOptions()
     return PWVO(options) if options.kind == "pwvo" else VONet(options)

@@ -61,7 +61,7 @@ def select(maps: PixelwisePrediction, method: str = "softmax") -> PoseSeed:
     """The paper's selection as the start of a refinement, with weights from the uncertainty.
 
     Raises:
-        InputError: no prediction, an unknown method.
+        InputError: an unknown method.
 
     Example:
         >>> import torch
