@@ -20,16 +20,13 @@ STATUS_SHARE = 0.1
 
 
 def compare(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
-    """Findings, a line each: WORSE, WARNING (time, other inputs) or better.
+    """Findings, a line each: WORSE, WARNING (time) or better.
 
-    Bounds are wider where the processor or the inputs differ. A case that the old figures do not
-    have is judged by itself alone; one that the new ones lack is left out.
+    Bounds are wider where the processor differs. A case that the old figures do not have is judged
+    by itself alone; one that the new ones lack is left out.
     """
     findings = []
-    same = old["inputs"] == new["inputs"] and old["processor"] == new["processor"]
-    if old["inputs"] != new["inputs"]:
-        findings.append("WARNING inputs: made by another generator or on other data")
-    factor = MEDIAN_FACTOR if same else ELSEWHERE_FACTOR
+    factor = MEDIAN_FACTOR if old["processor"] == new["processor"] else ELSEWHERE_FACTOR
     for name, row in new["cases"].items():
         if "without" in row:
             lines = [(level, f"than without it: {text}") for level, text in beside_none(name, row)]

@@ -1,4 +1,4 @@
-"""Train the networks: the same as ``hybridvo train``, as a file for torchrun."""
+"""Train the networks: the same as ``hybridvo train``, as a file."""
 
 from __future__ import annotations
 

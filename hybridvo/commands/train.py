@@ -6,23 +6,20 @@
     hybridvo train selector-data --data runs/selector_data --recordings ../shared/data --seeds 2048
     hybridvo train selector --data runs/selector_data --out runs/selector --time-limit 50
 
-Started again with the same ``--out`` a training goes on where it was. Several processes or
-machines: ``torchrun --nproc-per-node 8 tools/train.py pwvo ...``. Seeds of selector-data below 1000
-are held out; ``--propose`` asks PWVO about all samples of a folder.
+Started again with the same ``--out`` a training goes on where it was. Seeds of selector-data below
+1000 are held out; ``--propose`` asks PWVO about the samples.
 """
 
 from __future__ import annotations
 
 import argparse
-import contextlib
 import dataclasses
 import json
 import math
-import os
 import shlex
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -78,27 +75,8 @@ def add_train(
 
 def train(args: argparse.Namespace, command: list[str]) -> tuple[Any, str, int]:
     """Run the command; what it gives, JSON-ready and for people, and the exit code."""
-    with _processes():
-        content = args.train(args, shlex.join(command))
+    content = args.train(args, shlex.join(command))
     return content, json.dumps(content, indent=1), 0
-
-
-@contextlib.contextmanager
-def _processes() -> Iterator[None]:
-    """The process group of torchrun, where it started us."""
-    if "RANK" not in os.environ:
-        yield
-        return
-    import torch
-    import torch.distributed as dist
-
-    if torch.cuda.is_available():
-        torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", "0")))
-    dist.init_process_group("nccl" if torch.cuda.is_available() else "gloo")
-    try:
-        yield
-    finally:
-        dist.destroy_process_group()
 
 
 def _pwvo(args: argparse.Namespace, command: str) -> dict[str, Any]:
@@ -147,23 +125,18 @@ def _train(args: argparse.Namespace, command: str, task: Any) -> Any:
         for name in (CHECKPOINT, LOG, RUN):
             (args.out / name).unlink(missing_ok=True)
     trainer = Trainer(task, args.out, args.device, args.workers, report=_report)
-
-    def say(text: str) -> None:
-        if trainer.rank == 0:
-            print(text, file=sys.stderr)
-
     if trainer.resume():
-        say(f"goes on at update {trainer.step}")
+        print(f"goes on at update {trainer.step}", file=sys.stderr)
     else:
         if args.init is not None:
             trainer.start_from(_network(args.init).state_dict(), args.init)
-        if trainer.rank == 0:
-            about = {"command": command, "commit": source_commit(), "torch": torch.__version__}
-            write_json(args.out / RUN, about)
+        about = {"command": command, "commit": source_commit(), "torch": torch.__version__}
+        write_json(args.out / RUN, about)
     for number in (signal.SIGINT, signal.SIGTERM):  # the update at hand ends, with a checkpoint
         signal.signal(number, lambda *_: setattr(trainer, "stop_requested", True))
     why = trainer.run(60 * args.time_limit)
-    say(f"ended by {why} at update {trainer.step}, {trainer.samples} samples")
+    ended = f"ended by {why} at update {trainer.step}, {trainer.samples} samples"
+    print(ended, file=sys.stderr)
     return trainer
 
 
@@ -177,19 +150,18 @@ def _export(args: argparse.Namespace, command: str) -> dict[str, Any]:
 def _selector_data(args: argparse.Namespace, command: str) -> dict[str, Any]:
     from hybridvo.errors import InputError
     from hybridvo.synthetic.semi_real import load_split
-    from hybridvo.training.selector_data import PER_SHARD, write_proposals, write_shard
+    from hybridvo.training.selector_data import PER_SHARD, write_shard
 
     if args.first_seed < 0 or args.seeds < 0:
         raise InputError(f"expected --first-seed and --seeds >= 0, got {args.first_seed}.")
     args.data.mkdir(parents=True, exist_ok=True)
     recordings = () if args.recordings is None else load_split(args.recordings, args.split)
+    network = None if args.propose is None else _network(args.propose)
+    total = 0
     for seed in range(args.first_seed, args.first_seed + args.seeds, PER_SHARD):
-        count = write_shard(args.data, seed, recordings=recordings)
-        print(f"seeds from {seed}: {count} samples", file=sys.stderr, flush=True)
-    asked = 0
-    if args.propose is not None:
-        asked = write_proposals(args.data, _network(args.propose))
-    return {"asked": asked}
+        total += write_shard(args.data, seed, recordings=recordings, network=network)
+        print(f"seeds to {seed + PER_SHARD}: {total} samples", file=sys.stderr, flush=True)
+    return {"samples": total}
 
 
 def _network(name: str) -> Any:

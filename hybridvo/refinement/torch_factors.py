@@ -253,19 +253,15 @@ def solve_small(
     """Solve ((A + damping diag A) x = b) for (B, 6, 6) systems in float64, each for itself.
 
     Returns:
-        (B, 6) float64 solutions and (B,) bool; where False (singular, or not finite) they are zero.
+        (B, 6) solutions, with a gradient in b, and (B,) bool; where False (singular, or not finite)
+        they are zero.
     """
-    A, b = A.double(), b.double()
-    unit = torch.eye(A.shape[1], dtype=A.dtype, device=A.device)
-    scale = A.diagonal(dim1=1, dim2=2).abs().sqrt()
-    good = torch.isfinite(A).flatten(1).all(dim=1) & torch.isfinite(b).all(dim=1)
-    good = good & (scale > 1e-15).all(dim=1)
-    scale = torch.where(good[:, None], scale, torch.ones_like(scale))
-    b = torch.where(good[:, None], b, torch.zeros_like(b))
-    A = A / (scale[:, :, None] * scale[:, None, :]) + damping * unit
-    x, info = torch.linalg.solve_ex(torch.where(good[:, None, None], A, unit), b / scale)
-    x = x / scale
-    good = good & (info == 0) & (x.abs() < 1e6).all(dim=1)
+    A = A.detach().double()
+    inverse, info = torch.linalg.inv_ex(A + damping * torch.diag_embed(A.diagonal(dim1=1, dim2=2)))
+    good = (info == 0) & torch.isfinite(inverse).flatten(1).all(dim=1)
+    inverse = torch.where(good[:, None, None], inverse, torch.zeros_like(inverse))
+    x = (inverse @ b.double()[..., None])[..., 0]
+    good = good & (x.abs() < 1e6).all(dim=1)
     return torch.where(good[:, None], x, torch.zeros_like(x)), good
 
 

@@ -2,8 +2,6 @@
 
 A folder of samples holds ``samples.json`` (what was drawn) and ``shard_0000/FIELD.npy`` with the
 fields of :class:`~hybridvo.synthetic.layered.Sample` stacked; what others say already is left out.
-The selector's samples (``*.npz``) serve as well: what DIS makes of a crowd of movers cannot be
-imitated by a noise model.
 """
 
 from __future__ import annotations
@@ -11,35 +9,28 @@ from __future__ import annotations
 import dataclasses
 import functools
 import json
-import zipfile
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Annotated, Any, Literal, Protocol, Self, TypeVar, cast
+from typing import Any, Literal, Protocol, Self, TypeVar, cast
 
 import numpy as np
-from pydantic import Field
 
 from hybridvo.errors import FormatError, InputError, OutputError
 from hybridvo.files import make_folder, parse_yaml, read_text, write_json
-from hybridvo.geometry import matrix_to_euler_deg
 from hybridvo.options import option_group
 from hybridvo.synthetic.diverse import DiverseOptions
 from hybridvo.synthetic.draws import STORED, sample_generator
-from hybridvo.synthetic.layered import Layers, PaperOptions, Sample
+from hybridvo.synthetic.layered import PaperOptions, Sample, camera_flow
+from hybridvo.synthetic.rendered import RenderedOptions
 
 MANIFEST = "samples.json"
 PER_SHARD = 500
 """Samples of a shard: 270 MB at 128x256."""
 REPEATS = {"depth_true": "depth_prev", "depth_target": "depth_curr"}
 """Field -> the one that it equals in data without noise; stored where it does not."""
-FIELDS = [f.name for f in dataclasses.fields(Sample) if f.name not in ("ego_flow", "rays")]
-MOVING, STATIC, UNKNOWN = 0, 1, 255
-"""Labels of the pixels in the selector's samples."""
-SOURCES = ("diverse", "rendered", "dis", "semi-real")
-"""Where these come from: the diverse preset, rendered scenes with true flow and with DIS, and
-recordings with movers cut from others."""
+FIELDS = [f.name for f in dataclasses.fields(Sample) if f.name != "ego_flow"]
 
 OptionsT = TypeVar("OptionsT")
 
@@ -174,16 +165,14 @@ def _shard(folder: Path, number: int) -> Path:
 
 @functools.cache
 def _manifest(folder: Path) -> dict[str, Any]:
-    path = folder / MANIFEST
     try:
-        manifest = json.loads(path.read_text(encoding="utf-8"))
-        if not manifest["count"] > 0 or not manifest["per_shard"] > 0:
-            raise ValueError("no samples")
+        return dict(json.loads(read_text(folder / MANIFEST)))
     except FileNotFoundError:
-        raise InputError(f"{path}: no such file; write samples with hybridvo generate.") from None
-    except (ValueError, KeyError, TypeError) as error:
-        raise FormatError(f"{path}: not a description of samples: {error}.") from None
-    return manifest
+        raise InputError(
+            f"{folder}: no {MANIFEST}; write samples with hybridvo generate."
+        ) from None
+    except ValueError as error:
+        raise FormatError(f"{folder}: {MANIFEST} is damaged: {error}.") from None
 
 
 @functools.cache
@@ -203,19 +192,11 @@ def read_sample(folder: str | Path, index: int) -> Sample:
     if not 0 <= index < manifest["count"]:
         raise InputError(f"{folder}: expected a sample 0 to {manifest['count'] - 1}, got {index}.")
     number, row = divmod(index, manifest["per_shard"])
-    shard = _open_shard(_shard(folder, number))
-    try:
-        fields = {name: np.array(array[row]) for name, array in shard.items()}
-    except IndexError as error:
-        raise FormatError(f"{_shard(folder, number)}: damaged shard of samples: {error}.") from None
-    ego_flow, _ = _camera_flow(fields["K"], fields["depth_true"], fields["T_curr_prev"])
+    fields = {
+        name: np.array(array[row]) for name, array in _open_shard(_shard(folder, number)).items()
+    }
+    ego_flow, _ = camera_flow(fields["K"], fields["depth_true"], fields["T_curr_prev"])
     return Sample(ego_flow=ego_flow, **fields)
-
-
-def _camera_flow(K: np.ndarray, depth: np.ndarray, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(H, W, 2) flow of the camera motion alone, and (H, W) ratio of the new depth to the old."""
-    inverse = np.divide(1.0, depth, out=np.zeros(depth.shape), where=depth > 0).astype(np.float32)
-    return Layers(K, inverse).flows(T, added=False)[:2]
 
 
 @option_group
@@ -240,137 +221,9 @@ class StoredSamples:
         return dataclasses.replace(cast(Any, self), folder=self.held_out)
 
 
-# --- samples of the selector ----------------------------------------------------------------------
-
-
-def read_shards(paths: Iterable[Path], names: Sequence[str] = ()) -> list[dict[str, np.ndarray]]:
-    """Samples of the selector's files, one stack for every shape of grid; ``names``: these arrays.
-
-    Raises:
-        FormatError: a file that holds no such samples.
-    """
-    by_shape: dict[tuple[int, ...], list[dict[str, np.ndarray]]] = {}
-    for path in paths:
-        try:
-            with np.load(path) as file:
-                shard = {name: file[name] for name in names or file.files}
-            count, *shape = shard["label"].shape
-        except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
-            raise FormatError(f"{path}: not a shard of samples ({error}).") from None
-        if not names:  # where no network was asked
-            shard.setdefault("proposal", np.full((count, 3, 4), np.nan))
-            shard.setdefault("static", np.full((count, *shape), 0.5, np.float16))
-        by_shape.setdefault(tuple(shape), []).append(shard)
-    return [
-        {name: np.concatenate([shard[name] for shard in some]) for name in some[0]}
-        for some in by_shape.values()
-    ]
-
-
-@option_group
-class RenderedOptions(StoredSamples):
-    """Those of the selector's samples that are rendered, of one size, mirrored at random."""
-
-    preset: Literal["rendered"] = "rendered"  # type: ignore[assignment]
-    height: Annotated[int, Field(ge=2)] = 128
-    width: Annotated[int, Field(ge=2)] = 256
-
-    def sample(self, rng: np.random.Generator) -> Sample:
-        """One sample, mirrored or not."""
-        groups = _rendered(self.folder)
-        sizes = np.cumsum([len(group["source"]) for group in groups])
-        choice = int(rng.integers(sizes[-1]))
-        number = int(np.searchsorted(sizes, choice, side="right"))
-        index = choice - int(sizes[number - 1] if number else 0)
-        arrays = {name: array[index] for name, array in groups[number].items()}
-        sample = grid_sample(arrays, (self.height, self.width))
-        for axis in np.flatnonzero(rng.random(2) < 0.5):
-            sample = mirrored(sample, int(axis))
-        return sample
-
-
-@functools.cache
-def _rendered(folder: str) -> list[dict[str, np.ndarray]]:
-    names = "ray depth target usable log_depth_curr K stride depth_true label T source".split()
-    groups = read_shards(sorted(Path(folder).glob("*.npz")), names)
-    # the diverse preset is drawn afresh
-    keep = [group["source"] != SOURCES.index("diverse") for group in groups]
-    if not any(mask.any() for mask in keep):
-        raise InputError(
-            f"{folder or '(no folder)'}: no shards of rendered samples; make some with "
-            f"hybridvo train selector-data."
-        )
-    return [
-        {name: array[mask] for name, array in group.items()}
-        for group, mask in zip(groups, keep, strict=True)
-    ]
-
-
-def grid_sample(p: Mapping[str, np.ndarray], size: tuple[int, int]) -> Sample:
-    """A sample of a size (height, width) from the arrays of one of the selector's.
-
-    The rays are those of the nearest pixels, which were taken, so that flow and depth stay exact;
-    ground truth belongs to the sample's own pixels.
-    """
-    H, W = size
-    h, w = p["label"].shape
-    stride = int(p["stride"])
-    fx, fy, cx, cy = (float(k) for k in p["K"])
-    scale = np.array([W / (w * stride), H / (h * stride)])
-    focal = scale * (fx, fy)
-    centre = scale * (cx + 0.5, cy + 0.5) - 0.5
-    rows = np.minimum((np.arange(H) + 0.5) * h / H, h - 1).astype(int)
-    columns = np.minimum((np.arange(W) + 0.5) * w / W, w - 1).astype(int)
-
-    def take(x: np.ndarray) -> np.ndarray:
-        return x[..., rows[:, None], columns]
-
-    z, usable, T = take(p["depth"]), take(p["usable"]), p["T"].astype(np.float64)
-    ray, target = (np.moveaxis(take(p[name]), 0, -1) for name in ("ray", "target"))
-    flow = ((target - (cx, cy)) / (fx, fy) - ray) * focal
-    log_depth, depth_true = take(p["log_depth_curr"]), take(p["depth_true"]).astype(np.float32)
-    depth_true = np.where(np.isfinite(depth_true), depth_true, 0.0)
-    K = np.array([[focal[0], 0, centre[0]], [0, focal[1], centre[1]], [0, 0, 1]])
-    ego_flow, ratio = _camera_flow(K, depth_true, T)
-    return Sample(
-        flow=np.where(usable[..., None], flow, np.nan).astype(np.float32),
-        ego_flow=ego_flow,
-        depth_prev=np.where(usable, z, 0.0).astype(np.float32),
-        depth_curr=np.exp(np.nan_to_num(log_depth, nan=-np.inf)).astype(np.float32),
-        depth_true=depth_true,
-        depth_target=np.maximum(depth_true * ratio, 0.0).astype(np.float32),
-        K=K.astype(np.float32),
-        T_curr_prev=np.vstack([T, [0, 0, 0, 1]]).astype(np.float32),
-        rotation_deg=matrix_to_euler_deg(T[:, :3]).astype(np.float32),
-        translation=T[:, 3].astype(np.float32),
-        moving=take(p["label"]) == MOVING,
-        rays=ray.astype(np.float32),
-    )
-
-
-def mirrored(sample: Sample, axis: int) -> Sample:
-    """The sample seen in a mirror: left to right (axis 0), or top to bottom (1)."""
-    sign = np.ones(4, np.float32)
-    sign[axis] = -1
-    fields = dict(vars(sample))
-    for name, x in fields.items():
-        if x is not None and x.shape[:2] == sample.moving.shape:
-            x = np.flip(x, 1 - axis)
-            fields[name] = x * sign[:2] if x.ndim == 3 else x.copy()
-    K = sample.K.copy()
-    K[axis, 2] = sample.moving.shape[1 - axis] - 1 - K[axis, 2]
-    return Sample(
-        **fields
-        | {
-            "K": K,
-            "T_curr_prev": sign[:, None] * sample.T_curr_prev * sign,
-            "rotation_deg": -sign[:3] * sample.rotation_deg,
-            "translation": sign[:3] * sample.translation,
-        }
-    )
-
-
-PRESETS: dict[str, type] = {"paper": PaperOptions, "diverse": DiverseOptions}
+PRESETS: dict[str, type] = {
+    "paper": PaperOptions, "diverse": DiverseOptions, "rendered": RenderedOptions,
+}  # fmt: skip
 """Generators by the name that a file gives under ``preset``."""
-KINDS: dict[str, type] = PRESETS | {"folder": StoredSamples, "rendered": RenderedOptions}
+KINDS: dict[str, type] = PRESETS | {"folder": StoredSamples}
 """These, and samples drawn before."""

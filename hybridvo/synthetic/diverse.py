@@ -90,8 +90,7 @@ class DiverseOptions:
         """One pair."""
         while True:
             scene = _Scene(rng, self)
-            angles, translation = scene.populate()
-            T = make_transform(euler_deg_to_matrix(angles), translation)
+            T = scene.populate()
             ego_flow, ego_ratio, flow, ratio = scene.flows(T, added=False)
             if self._plausible(flow, ratio) and self._plausible(ego_flow, ego_ratio):
                 break
@@ -119,8 +118,6 @@ class DiverseOptions:
             depth_target=np.maximum(depth * ego_ratio, 0.0),
             K=scene.K.astype(np.float32),
             T_curr_prev=T.astype(np.float32),
-            rotation_deg=angles.astype(np.float32),
-            translation=translation.astype(np.float32),
             moving=own[..., 0] + own[..., 1] > self.moving_threshold_px**2,
         )
 
@@ -145,7 +142,8 @@ class _Scene(Layers):
         self.cy = (o.height - 1) / 2 + shift[1] * o.height
         K = np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]])
         self.scale = log_uniform(rng, o.scene_depth)
-        super().__init__(K, self._background(*normalized_grid(K, o.height, o.width)))
+        x, y = normalized_grid(K, o.height, o.width)
+        super().__init__(K, self._background(x.astype(np.float32), y.astype(np.float32)))
 
     def _background(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """(H, W) inverse depth of walls, ground or one slanted surface; 0 is sky."""
@@ -225,8 +223,8 @@ class _Scene(Layers):
         """(3, 3) rotation of a drawn size about a drawn axis (small angles: as Euler angles)."""
         return euler_deg_to_matrix(self.magnitude(law) * direction(self.rng))
 
-    def camera(self, follow: bool) -> tuple[np.ndarray, np.ndarray]:
-        """Euler angles in degrees and translation in metres of the camera's T_curr_prev."""
+    def camera(self, follow: bool) -> np.ndarray:
+        """(4, 4) T_curr_prev."""
         o, rng = self.options, self.rng
         angles = self.magnitude(o.camera_rotation_deg) * direction(rng)
         seen = self.rho[::2, ::2]
@@ -240,7 +238,7 @@ class _Scene(Layers):
             towards /= np.linalg.norm(towards)
         size = self.magnitude(o.camera_translation) * near * (1.5 if follow else 1.0)
         size = min(size, o.camera_translation_limit, 0.4 / nearest)
-        return angles, size * towards
+        return make_transform(euler_deg_to_matrix(angles), size * towards)
 
     def add_mover(
         self, shape: Silhouette, mask: np.ndarray, radius: float, T_cam: np.ndarray, follow: float
@@ -299,8 +297,8 @@ class _Scene(Layers):
             radius = self.radius()
             self.add(self.placed(random_silhouette(self.rng), radius, 2.5), in_front=False)
 
-    def populate(self) -> tuple[np.ndarray, np.ndarray]:
-        """Occluders and movers; returns the camera's Euler angles and translation."""
+    def populate(self) -> np.ndarray:
+        """Occluders and movers; returns the camera's T_curr_prev."""
         o, rng = self.options, self.rng
         still = rng.random() < o.still_probability
         large = not still and rng.random() < o.large_mover_probability
@@ -308,8 +306,7 @@ class _Scene(Layers):
         if not still and rng.random() < o.follow_probability:
             follow = log_uniform(rng, o.follow_residual)
         self.occlude(int(rng.integers(o.static_layers[0], o.static_layers[1] + 1)))
-        angles, translation = self.camera(follow > 0)
-        T_cam = make_transform(euler_deg_to_matrix(angles), translation)
+        T_cam = self.camera(follow > 0)
         if large:
             centre = rng.uniform(-0.1, 1.1) * o.width, rng.uniform(0.1, 1.1) * o.height
             share = rng.uniform(*o.large_coverage)
@@ -325,4 +322,4 @@ class _Scene(Layers):
                 self.add_mover(shape, mask, radius, T_cam, follow if main else 0.0)
         if rng.random() < 0.4:
             self.occlude(int(rng.integers(1, 3)))
-        return angles, translation
+        return T_cam

@@ -12,17 +12,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-import cv2
 import numpy as np
 from pydantic import Field
 
 from hybridvo.errors import InputError
-from hybridvo.geometry import euler_deg_to_matrix, make_transform
+from hybridvo.geometry import euler_deg_to_matrix, make_transform, matrix_to_euler_deg, pixel_grid
 from hybridvo.options import Positive, Share, option_group
 from hybridvo.synthetic.draws import cut_out, ordered
+from hybridvo.types import FramePair
 
-MIN_RATIO = np.float32(1e-6)
-"""Added to |z' / z|: the flow of a point in the image plane stays finite."""
+MIN_RATIO = 1e-6
+"""Least |z' / z|: the flow of a point in the image plane stays finite."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,10 +38,7 @@ class Sample:
         depth_target: (H, W) what L^D compares with. It includes the object's own motion in the
             paper's five steps, not in the diverse preset.
         K: (3, 3) intrinsics of both frames.
-        rotation_deg, translation: (3,) T_curr_prev (4, 4) as Euler angles X-Y-Z, R = Rx Ry Rz.
         moving: (H, W) bool, pixels whose true flow differs from the ego flow.
-        rays: (H, W, 2) first two components of K^-1 x of the points that were measured, where they
-            are not the pixels' centres; or None.
     """
 
     flow: np.ndarray
@@ -52,22 +49,47 @@ class Sample:
     depth_target: np.ndarray
     K: np.ndarray
     T_curr_prev: np.ndarray
-    rotation_deg: np.ndarray
-    translation: np.ndarray
     moving: np.ndarray
-    rays: np.ndarray | None = None
+
+    @property
+    def rotation_deg(self) -> np.ndarray:
+        """(3,) Euler angles X-Y-Z of T_curr_prev, R = Rx Ry Rz."""
+        return matrix_to_euler_deg(self.T_curr_prev[:3, :3]).astype(np.float32)
+
+    @property
+    def translation(self) -> np.ndarray:
+        """(3,) metres, of T_curr_prev."""
+        return self.T_curr_prev[:3, 3]
+
+
+@dataclass(frozen=True, eq=False)
+class KnownPair:
+    """A pair and its ground truth.
+
+    ``depth``: (H, W) metres of the previous frame before the sensor's errors, 0 where unknown;
+    ``moving``: (H, W) bool, points that do not follow the camera's motion; ``world``: path of the
+    recording; ``log_depth_curr``: (H, W) of the current frame at x + F where it has no depth map.
+    """
+
+    pair: FramePair
+    T_curr_prev: np.ndarray
+    depth: np.ndarray
+    moving: np.ndarray
+    world: str = ""
+    log_depth_curr: np.ndarray | None = None
 
 
 class Layers:
     """Inverse depth, owner and motion of every pixel while surfaces are laid over each other.
 
-    ``rho``: (H, W) float32 inverse depth of the background, 0 for sky; is changed in place.
+    ``rho``: (H, W) inverse depth of the background, 0 for sky; is changed in place, and its type
+    is that of the flows.
     """
 
     def __init__(self, K: np.ndarray, rho: np.ndarray) -> None:
         height, width = rho.shape
         self.K, self.rho = K, rho
-        self.x, self.y = normalized_grid(K, height, width)
+        self.x, self.y = (x.astype(rho.dtype) for x in normalized_grid(K, height, width))
         self.owner = np.full((height, width), -1, np.int16)
         self.motions: list[np.ndarray | None] = []
         self.bends: list[np.ndarray | None] = []
@@ -95,36 +117,34 @@ class Layers:
         paper does); else they contain the camera's and replace it.
         """
         focal = (float(self.K[0, 0]), float(self.K[1, 1]))
-        R, t = T_curr_prev[:3, :3], T_curr_prev[:3, 3].astype(np.float32)
+        R, t = T_curr_prev[:3, :3], T_curr_prev[:3, 3]
         u, v, ego_ratio = rigid_flow(self.x, self.y, self.rho, R, t, focal)
         ego_flow = np.stack([u, v], axis=-1)
         flow, ratio = ego_flow.copy(), ego_ratio.copy()
         for number, motion in enumerate(self.motions):
-            mask = (self.owner == number).astype(np.uint8)
-            left, top, width, height = cv2.boundingRect(mask)
-            if motion is None or not width * height:
+            if motion is None:
                 continue
-            box = np.s_[top : top + height, left : left + width]
-            inside = mask[box] > 0
-            R, t = motion[:3, :3], motion[:3, 3].astype(np.float32)
-            bend = self.bends[number]
+            mine = rows, columns = np.nonzero(self.owner == number)
+            t, bend = motion[:3, 3], self.bends[number]
             if bend is not None:
-                t = np.moveaxis(t + bend[box], -1, 0)
-            x, y = self.x[box[1]], self.y[box[0]]
-            u, v, change = rigid_flow(x, y, self.rho[box], R, t, focal)
-            own = np.stack([u, v], axis=-1)[inside]
-            if added:
-                flow[box][inside] += own
-                ratio[box][inside] += change[inside] - 1.0
-            else:
-                flow[box][inside], ratio[box][inside] = own, change[inside]
+                t = (t + bend[mine]).T
+            x, y = self.x[columns], self.y[rows, 0]
+            u, v, change = rigid_flow(x, y, self.rho[mine], motion[:3, :3], t, focal)
+            own = np.stack([u, v], axis=-1)
+            flow[mine] = flow[mine] + own if added else own
+            ratio[mine] = ratio[mine] + change - 1.0 if added else change
         return ego_flow, ego_ratio, flow, ratio
 
 
+def camera_flow(K: np.ndarray, depth: np.ndarray, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(H, W, 2) flow of the camera motion alone, and (H, W) ratio of the new depth to the old."""
+    inverse = np.divide(1.0, depth, out=np.zeros(depth.shape), where=depth > 0).astype(np.float32)
+    return Layers(K, inverse).flows(T, added=False)[:2]
+
+
 def normalized_grid(K: np.ndarray, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
-    """(W,) and (H, 1) float32: first two components of K^-1 x of the pixels."""
-    x = ((np.arange(width) - K[0, 2]) / K[0, 0]).astype(np.float32)
-    y = ((np.arange(height) - K[1, 2]) / K[1, 1]).astype(np.float32)
+    """(W,) and (H, 1): first two components of K^-1 x of the pixels."""
+    x, y = (np.arange(width) - K[0, 2]) / K[0, 0], (np.arange(height) - K[1, 2]) / K[1, 1]
     return x, y[:, None]
 
 
@@ -136,18 +156,39 @@ def rigid_flow(
     t: np.ndarray,
     focal: tuple[float, float],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Flow (u, v) of a rigid motion in px and the ratio of the new depth to the old, (H, W) each.
+    """Flow (u, v) of a rigid motion in px and the ratio of the new depth to the old.
 
-    Paper, equation 8, written as differences, so that single precision suffices: ``x`` (W,) and
-    ``y`` (H, 1) normalised coordinates, ``inverse_depth`` (H, W) or one number, ``t`` metres.
+    Paper, equation 8, written as differences, so that single precision suffices: ``x`` and ``y``
+    normalised coordinates, ``inverse_depth`` and ``t`` (3,) or (3, N) metres, that broadcast.
     """
-    R = np.asarray(R, dtype=np.float32)
+    R, t = R.astype(x.dtype), np.asarray(t, x.dtype)
     ratio = (R[2, 0] * x + (R[2, 1] * y + R[2, 2])) + t[2] * inverse_depth
     # The published code takes |z'|: a point behind the camera keeps a bounded flow.
-    scale = 1.0 / (np.abs(ratio) + MIN_RATIO)
+    scale = 1.0 / np.maximum(np.abs(ratio), MIN_RATIO)
     u = (((R[0, 0] * x + (R[0, 1] * y + R[0, 2])) + t[0] * inverse_depth) * scale - x) * focal[0]
     v = (((R[1, 0] * x + (R[1, 1] * y + R[1, 2])) + t[1] * inverse_depth) * scale - y) * focal[1]
     return u, v, ratio
+
+
+def splat(flow: np.ndarray, rho_curr: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(H, W) inverse depth of the next frame, nearest in front; 0 where nothing lands.
+
+    ``rho_curr``: (H, W) of the moved points on their own grid. Also the flat index of the pixel
+    that each of them comes to, and whether it does.
+    """
+    height, width = rho_curr.shape
+    place = np.rint(flow + pixel_grid(height, width)).astype(np.int64)
+    inside = ((place >= 0) & (place < (width, height))).all(axis=-1)
+    index = np.where(inside, place @ (1, width), 0)
+    value = rho_curr.copy()
+    off = np.rint(flow) - flow
+    for axis in (0, 1):
+        slope = np.gradient(rho_curr, axis=1 - axis)
+        slope[np.abs(slope) > 0.02 * rho_curr] = 0.0  # a depth edge is no slope
+        value += slope * off[..., axis]
+    front = np.zeros(rho_curr.size, rho_curr.dtype)
+    np.maximum.at(front, index[inside], value[inside])
+    return front.reshape(rho_curr.shape), index, inside
 
 
 def visibility(
@@ -158,14 +199,8 @@ def visibility(
     From the true flow, inverse depths of the moved points and where there is no sky; the depth is
     0 outside and for sky.
     """
-    height, width = rho_curr.shape
-    u = np.rint(flow[..., 0] + np.arange(width, dtype=np.float32)).astype(np.int32)
-    v = np.rint(flow[..., 1] + np.arange(height, dtype=np.float32)[:, None]).astype(np.int32)
-    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
-    index = np.where(inside, v * width + u, 0)
-    front = np.zeros(height * width, np.float32)
-    np.maximum.at(front, index[inside], rho_curr[inside])
-    seen = front[index]
+    front, index, inside = splat(flow, rho_curr)
+    seen = front.ravel()[index]
     # A tenth: neighbours on a slanted surface share a pixel of the next frame.
     covered = inside & (seen > np.float32(1.1) * rho_curr)
     inverse = np.where(covered, seen, rho_curr)
@@ -232,12 +267,13 @@ class MotionSamplers:
     translation: ThreeSamplers = TRANSLATION
     backward_share: Share = 0.2
 
-    def draw(self, rng: np.random.Generator, depth: float) -> tuple[np.ndarray, np.ndarray]:
-        """Euler angles (3,) in degrees and translation (3,) in metres of a thing at this depth."""
+    def draw(self, rng: np.random.Generator, depth: float) -> np.ndarray:
+        """(4, 4) motion of a thing at this depth."""
         angles = np.array([sampler.draw(rng) for sampler in self.rotation_deg])
         x, y, z = self.translation
         low = max(z.low, -self.backward_share * depth)
-        return angles, np.array([x.draw(rng), y.draw(rng), z.draw(rng, low)])
+        t = np.array([x.draw(rng), y.draw(rng), z.draw(rng, low)])
+        return make_transform(euler_deg_to_matrix(angles), t)
 
 
 Pixels = Annotated[int, Field(ge=2)]
@@ -306,12 +342,10 @@ def _paper_sample(rng: np.random.Generator, o: PaperOptions) -> Sample:
         layers.lay(box, mask, float(np.float32(1.0 / depth)))
 
     # Step 3.
-    angles, t = o.motion.draw(rng, min(depths, default=background))
-    T = make_transform(euler_deg_to_matrix(angles), t)
+    T = o.motion.draw(rng, min(depths, default=background))
     for number, depth in enumerate(depths):
         if rng.random() < o.move_probability:
-            own_angles, own_t = o.motion.draw(rng, depth)
-            layers.motions[number] = make_transform(euler_deg_to_matrix(own_angles), own_t)
+            layers.motions[number] = o.motion.draw(rng, depth)
 
     # Steps 4 and 5.
     ego_flow, _, flow, ratio = layers.flows(T, added=True)
@@ -327,8 +361,6 @@ def _paper_sample(rng: np.random.Generator, o: PaperOptions) -> Sample:
         depth_target=depth_curr,
         K=K.astype(np.float32),
         T_curr_prev=T.astype(np.float32),
-        rotation_deg=angles.astype(np.float32),
-        translation=t.astype(np.float32),
         moving=np.isin(layers.owner, moving),
     )
 

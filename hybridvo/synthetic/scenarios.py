@@ -7,16 +7,17 @@ figures.
 from __future__ import annotations
 
 import zlib
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
 import numpy as np
 
 from hybridvo.errors import InputError
-from hybridvo.geometry import backproject, ego_flow, make_transform, pixel_grid, project, se3_exp
-from hybridvo.synthetic.draws import about, direction, turn
+from hybridvo.geometry import make_transform
+from hybridvo.synthetic.draws import about, direction, log_uniform, smooth_field, turn
+from hybridvo.synthetic.layered import Layers, splat
+from hybridvo.synthetic.sensors import noisy_flow
 from hybridvo.types import Camera, Frame, FramePair
 
 
@@ -27,7 +28,8 @@ class Scenario:
     Args:
         moving: share of the pixels on ``objects`` that move by themselves.
         flow_noise_px: standard deviation of each flow component, independent per pixel.
-        depth_noise: standard deviation of log depth; half of its variance is correlated in space.
+        depth_noise: standard deviation of log depth; of its variance the share ``depth_smooth`` is
+            correlated in space.
         outliers: share of the pixels whose flow has a gross error of up to 60 px.
         rotation_deg, translation_m: largest angle and length.
         scene: ``structured`` (1-30 m), ``plane`` (one oblique plane) or ``far`` (60-200 m).
@@ -41,6 +43,7 @@ class Scenario:
     objects: int = 5
     flow_noise_px: float = 0.5
     depth_noise: float = 0.02
+    depth_smooth: float = 0.5
     outliers: float = 0.05
     rotation_deg: float = 3.0
     translation_m: float = 0.3
@@ -120,149 +123,91 @@ def make_pair(
     angle_deg = rng.uniform(0, cell.rotation_deg)
     length = rng.uniform(cell.min_translation_m, cell.translation_m)
     T = make_transform(turn(rng, angle_deg), length * direction(rng))
-    depth = _scene(rng, cell, height, width)
-    label = _objects(rng, cell, depth)
-    moved = _moved(rng, T, backproject(depth, camera), label)
-    target = project(moved, camera)
-    flow_true = (target - pixel_grid(height, width)).astype(np.float32)
-    flow, outlier = _measured(rng, cell, flow_true)
-    depth_curr = _splat(target, moved[..., 2])
-    depths = [_sensed(rng, cell, d, focal) for d in (depth, depth_curr)]
-    truth = {
+    layers = Layers(camera.K, _surfaces(rng, cell, (height, width)))
+    _add_objects(rng, cell, layers, T)
+    _, _, flow, ratio = layers.flows(T, added=False)
+    seen = splat(flow, layers.rho / ratio)[0]
+    depths = [(1.0 / np.where(r > 0, r, np.nan)).astype(np.float32) for r in (layers.rho, seen)]
+    measured, outlier = noisy_flow(rng, flow, cell.flow_noise_px, cell.outliers, 60.0)
+    prev, curr = (
+        Frame(None, _sensed(rng, cell, d, focal), camera, 0.1 * i, i) for i, d in enumerate(depths)
+    )
+    pair = FramePair(prev, curr, measured, flow_source="synthetic", depth_source="synthetic")
+    return pair, {
         "T_curr_prev": T,
-        "depth_true": depth,
-        "moving": label > 0,
-        "object": label,
+        "depth_true": depths[0],
+        "moving": layers.owner >= 0,
+        "object": (layers.owner + 1).astype(np.uint8),
         "outlier": outlier,
-        "flow_true": flow_true,
+        "flow_true": flow.astype(np.float32),
     }
-    return _pair(depths, camera, flow), truth
-
-
-def _pair(depths: Sequence[np.ndarray | None], camera: Camera, flow: np.ndarray) -> FramePair:
-    """A pair of frames without images, a tenth of a second apart."""
-    prev, curr = (Frame(None, d, camera, 0.1 * i, i) for i, d in enumerate(depths))
-    return FramePair(prev, curr, flow, flow_source="synthetic", depth_source="synthetic")
 
 
 def make_model_pair(seed: int) -> tuple[FramePair, dict[str, Any]]:
     """A static pair of 160x320 whose noise is exactly what the refinement assumes, and its truth.
 
-    Smooth depth of 3-13 m with one step; noise of half a pixel and of 2 % of depth, independent per
-    pixel; no outliers, no second depth. Under it the normalised error of a right covariance is
-    chi-square with six degrees of freedom. The truth is that of :func:`make_pair` in float64.
+    Noise independent per pixel, no outliers, no second depth: the normalised error of a right
+    covariance is chi-square with six degrees of freedom.
     """
-    rng = np.random.default_rng([zlib.crc32(b"model"), int(seed)])
-    camera = Camera(350, 340, 159, 82, 160, 320)
-    u, v = np.arange(320), np.arange(160)[:, None]
-    depth = 6 + 3 * np.sin(u / 40 + rng.uniform(0, 6)) * np.cos(v / 30 + rng.uniform(0, 6))
-    depth = depth + 4.0 * (u > rng.uniform(80, 240))
-    limit = np.array([0.3] * 3 + [0.03] * 3)
-    T = se3_exp(rng.uniform(-limit, limit))
-    flow_true = ego_flow(depth, T, camera, camera)
-    flow = flow_true + 0.5 * rng.standard_normal(flow_true.shape)
-    measured = depth * np.exp(0.02 * rng.standard_normal(depth.shape))
-    pair = _pair([measured.astype(np.float32), None], camera, flow.astype(np.float32))
-    return pair, {"T_curr_prev": T, "depth_true": depth, "flow_true": flow_true}
+    pair, truth = make_pair(Scenario(moving=0.0, outliers=0.0, depth_smooth=0.0), seed, 160, 320)
+    return replace(pair, curr=replace(pair.curr, depth=None)), truth
 
 
-def _moved(
-    rng: np.random.Generator, T: np.ndarray, points: np.ndarray, label: np.ndarray
-) -> np.ndarray:
-    """(H, W, 3) points after the camera's motion and those of the objects."""
-    moved = points @ T[:3, :3].T + T[:3, 3]
-    for k in range(1, int(label.max()) + 1):
-        mine = points[label == k]
-        if not len(mine):
-            continue
-        centre = mine.mean(axis=0)
-        heading = rng.uniform(0, 2 * np.pi)
-        metres = rng.uniform(8, 70) / 1120 * centre[2]
-        t = metres * np.array([np.cos(heading), np.sin(heading), rng.uniform(-0.5, 0.5)])
-        own = T @ about(turn(rng, rng.uniform(0, 5)), centre, t)
-        moved[label == k] = mine @ own[:3, :3].T + own[:3, 3]
-    return moved
-
-
-def _measured(
-    rng: np.random.Generator, cell: Scenario, flow: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """(H, W, 2) float32 flow with noise and gross errors, and (H, W) bool where these are."""
-    flow = flow.copy()
-    if cell.flow_noise_px > 0:
-        noise = rng.standard_normal(flow.shape, dtype=np.float32)
-        flow += np.float32(cell.flow_noise_px) * noise
-    outlier = np.zeros(flow.shape[:2], dtype=bool)
-    if cell.outliers > 0:
-        outlier = rng.random(flow.shape[:2], dtype=np.float32) < cell.outliers
-        flow[outlier] += rng.uniform(-60, 60, (int(outlier.sum()), 2)).astype(np.float32)
-    return flow, outlier
-
-
-def _smooth(rng: np.random.Generator, height: int, width: int, size: int) -> np.ndarray:
-    """(H, W) float32 smooth noise of about unit variance with a correlation length of ``size``."""
-    rows, columns = height // size + 3, width // size + 3
-    coarse = rng.standard_normal((rows, columns), dtype=np.float32)
-    scale = cv2.resize(coarse, (columns * size, rows * size), interpolation=cv2.INTER_CUBIC)
-    field = scale[size : size + height, size : size + width]
-    return field * np.float32(1.27)  # cubic interpolation keeps 0.62 of the variance
-
-
-def _scene(rng: np.random.Generator, cell: Scenario, height: int, width: int) -> np.ndarray:
-    """(H, W) float32 depth: layers of slanted planes with smooth bumps, 1-30 m."""
-    x = np.linspace(-0.5, 0.5, width, dtype=np.float32)
-    y = np.linspace(-0.5, 0.5, height, dtype=np.float32)[:, None]
+def _surfaces(rng: np.random.Generator, cell: Scenario, size: tuple[int, int]) -> np.ndarray:
+    """(H, W) inverse depth: patches of slanted planes with smooth bumps, 1-30 m."""
+    u, v = _unit_grid(size)
     if cell.scene == "plane":
         slope = rng.uniform(-0.5, 0.5, 2)
-        return np.float32(rng.uniform(3, 12)) / (
-            1 + np.float32(slope[0]) * x + slope[1] * y
-        ).astype(np.float32)
-    layers = 12
-    centre = rng.uniform(-0.5, 0.5, (layers, 2)).astype(np.float32)
-    inverse = np.exp(-rng.uniform(np.log(1.5), np.log(28.0), layers)).astype(np.float32)
-    slope = rng.uniform(-0.8, 0.8, (layers, 2)).astype(np.float32)
-    distance = np.stack([(x[::4] - c[0]) ** 2 + (y[::4] - c[1]) ** 2 for c in centre])
-    owner = np.argmin(distance, axis=0).astype(np.uint8)
-    owner = cv2.resize(owner, (width, height), interpolation=cv2.INTER_NEAREST)
-    across, down = (slope[owner, i] * (p - centre[owner, i]) for i, p in enumerate((x, y)))
-    plane = inverse[owner] * (1 + across + down)
-    bumps = np.exp(np.float32(0.06) * _smooth(rng, height, width, 48))
+        return (1 + slope[0] * u + slope[1] * v) / rng.uniform(3, 12)
+    count = 12
+    centre, slope = rng.uniform(-0.5, 0.5, (count, 2)), rng.uniform(-0.8, 0.8, (count, 2))
+    near = np.exp(-rng.uniform(np.log(1.5), np.log(28.0), count))
+    owner = np.argmin([(u[:, ::4] - a) ** 2 + (v[::4] - b) ** 2 for a, b in centre], axis=0)
+    owner = cv2.resize(owner.astype(np.uint8), size[::-1], interpolation=cv2.INTER_NEAREST)
+    (a, b), (du, dv) = centre[owner].T, slope[owner].T
+    plane = near[owner] * (1 + du.T * (u - a.T) + dv.T * (v - b.T))
+    plane /= np.exp(0.08 * smooth_field(rng, size, max(size[0] // 48, 2)))
     if cell.scene == "far":
-        return np.clip(7 * bumps / plane, 60.0, 200.0)
-    return np.clip(bumps / plane, 1.0, 30.0)
+        return np.clip(plane / 7, 1 / 200, 1 / 60)
+    return np.clip(plane, 1 / 30, 1.0)
 
 
-def _objects(rng: np.random.Generator, cell: Scenario, depth: np.ndarray) -> np.ndarray:
-    """(H, W) uint8 object label, 0 = static; writes the objects' surfaces into ``depth``."""
-    height, width = depth.shape
+def _unit_grid(size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """(1, W) and (H, 1) coordinates from -0.5 to 0.5."""
+    return np.linspace(-0.5, 0.5, size[1])[None], np.linspace(-0.5, 0.5, size[0])[:, None]
+
+
+def _add_objects(rng: np.random.Generator, cell: Scenario, layers: Layers, T: np.ndarray) -> None:
+    """Lay objects of the wanted share over the scene, each with a motion of its own."""
     if cell.moving <= 0:
-        return np.zeros((height, width), dtype=np.uint8)
-    aspect = width / height
-    x = np.linspace(-0.5, 0.5, width, dtype=np.float32)[::2] * aspect
-    y = np.linspace(-0.5, 0.5, height, dtype=np.float32)[::2, None]
+        return
+    height, width = size = layers.rho.shape
+    (u, v), aspect = _unit_grid(size), width / height
     # one object must not rival the scene, or the pair has no right answer; ``one60`` is about that
     largest = np.inf if cell.objects == 1 else 0.8 * (1 - cell.moving)
     for _ in range(50):
         distance = []
         for _ in range(cell.objects):
-            cx, cy = rng.uniform(-0.42, 0.42) * float(x[-1] - x[0]), rng.uniform(-0.35, 0.35)
+            x, y = rng.uniform(-0.42, 0.42) * aspect, rng.uniform(-0.35, 0.35)
             stretch = np.exp(rng.uniform(-0.4, 0.4))
-            distance.append(((x - cx) * stretch) ** 2 + ((y - cy) / stretch) ** 2)
-        stacked = np.stack(distance).astype(np.float32)
-        nearest = stacked.min(axis=0)
+            distance.append(((u * aspect - x) * stretch) ** 2 + ((v - y) / stretch) ** 2)
+        nearest = np.min(distance, axis=0)
         inside = nearest < np.quantile(nearest, cell.moving)
-        coarse = np.where(inside, stacked.argmin(axis=0) + 1, 0).astype(np.uint8)
-        if np.bincount(coarse.ravel())[1:].max(initial=0) <= largest * coarse.size:
+        layers.owner = np.where(inside, np.argmin(distance, axis=0), -1).astype(np.int16)
+        if np.bincount(layers.owner[inside]).max() <= largest * inside.size:
             break
-    label = np.repeat(np.repeat(coarse, 2, axis=0), 2, axis=1)[:height, :width]
-    for k in range(1, cell.objects + 1):
-        rows, columns = np.nonzero(label == k)
-        z = np.float32(np.exp(rng.uniform(np.log(2.0), np.log(12.0))))
-        slope = rng.uniform(-0.5, 0.5, 2).astype(np.float32)
-        depth[rows, columns] = z / (
-            1 + slope[0] * (columns / width - 0.5) + slope[1] * (rows / height - 0.5)
-        )
-    return np.ascontiguousarray(label)
+    for k in range(cell.objects):
+        mine = layers.owner == k
+        slope = rng.uniform(-0.5, 0.5, 2)
+        surface = (1 + slope[0] * u + slope[1] * v) / log_uniform(rng, (2.0, 12.0))
+        layers.rho[mine] = surface[mine]
+        ray = [np.broadcast_to(x, size)[mine].mean() for x in (layers.x, layers.y)]
+        centre = np.array([*ray, 1.0]) / layers.rho[mine].mean()
+        heading = rng.uniform(0, 2 * np.pi)
+        towards = np.array([np.cos(heading), np.sin(heading), rng.uniform(-0.5, 0.5)])
+        t = rng.uniform(8, 70) / 1120 * centre[2] * towards
+        layers.motions.append(T @ about(turn(rng, rng.uniform(0, 5)), centre, t))
+        layers.bends.append(None)
 
 
 def _sensed(
@@ -270,15 +215,12 @@ def _sensed(
 ) -> np.ndarray:
     """(H, W) float32 depth as it is measured, NaN where it is not."""
     height, width = depth.shape
-    out = depth.astype(np.float32)
-    if cell.depth_noise:
-        noise = rng.standard_normal(depth.shape, dtype=np.float32)
-        noise += _smooth(rng, height, width, 24)
-        noise *= np.float32(cell.depth_noise * np.sqrt(0.5))
-        out = (depth * np.exp(noise)).astype(np.float32)
-    if cell.depth_quadratic:
-        error = rng.standard_normal(depth.shape) * cell.depth_quadratic * depth
-        out *= np.clip(1 + error, 0.1, None).astype(np.float32)
+    error = np.sqrt(1 - cell.depth_smooth) * rng.standard_normal(depth.shape, dtype=np.float32)
+    smooth = 1.27 * smooth_field(rng, depth.shape, height // 24)  # of unit variance
+    error += np.sqrt(cell.depth_smooth) * smooth
+    out = depth * np.exp(cell.depth_noise * error)
+    error = cell.depth_quadratic * rng.standard_normal(depth.shape) * depth
+    out *= np.clip(1 + error, 0.1, None)
     if cell.baseline_m:
         disparity = focal * cell.baseline_m / depth
         seen_at = np.where(np.isnan(disparity), np.inf, np.arange(width) - disparity)
@@ -288,23 +230,5 @@ def _sensed(
         if cell.disparity_step_px:
             step = cell.disparity_step_px * width / 1024
             steps = np.maximum(np.rint(focal * cell.baseline_m / out / step), 1.0)
-            out = (focal * cell.baseline_m / (steps * step)).astype(np.float32)
-    return np.ascontiguousarray(out)
-
-
-def _splat(target: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """(H, W) float32 depth on the current grid: nearest surface that lands on each pixel."""
-    height, width = z.shape
-    place = np.rint(target)
-    value = z.copy()
-    for axis in (0, 1):
-        slope = np.gradient(z, axis=1 - axis)
-        # a depth edge is no slope
-        slope[np.abs(slope) > 0.02 * z] = 0.0
-        value += slope * (place - target)[..., axis]
-    inside = ((place >= 0) & (place < (width, height))).all(axis=-1) & (z > 0)
-    index = (place[inside] @ (1, width)).astype(np.intp)
-    depth = np.full(height * width, np.inf, dtype=np.float32)
-    np.minimum.at(depth, index, value[inside].astype(np.float32))
-    depth[np.isinf(depth)] = np.nan
-    return depth.reshape(height, width)
+            out = focal * cell.baseline_m / (steps * step)
+    return np.ascontiguousarray(out, np.float32)

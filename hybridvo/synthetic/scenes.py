@@ -6,86 +6,29 @@ moving pixels is inside the family's band in every frame.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hybridvo.errors import InputError
-from hybridvo.synthetic.draws import affine, any_turn, camera_path, carried, poses, sway
+from hybridvo.synthetic.bodies import Mover, Parts, cloud, cluster, draw_look, mover
+from hybridvo.synthetic.draws import affine, any_turn, camera_path, poses, sway
 from hybridvo.synthetic.raycast import BOX, CYLINDER, ELLIPSOID
 from hybridvo.synthetic.render import Scene, Solid
 from hybridvo.types import Camera
 
-BANDS = {
-    "static": (0.0, 0.0),
-    "light": (0.15, 0.45),
-    "pair": (0.02, 0.7),
-    **dict.fromkeys(("heavy_rigid", "heavy_deforming", "heavy_two", "heavy_ten"), (0.48, 0.73)),
+HEAVY = ("heavy_rigid", "heavy_deforming", "heavy_two", "heavy_ten")
+FAMILIES: dict[str, tuple[int, float, tuple[float, float]]] = {
+    "static": (0, 0.0, (0.0, 0.0)),
+    "light": (1, 0.3, (0.15, 0.45)),
+    **{kind: (number, 0.6, (0.48, 0.73)) for number, kind in enumerate(HEAVY, 3)},
 }
-"""Share of the pixels on movers in every frame of each family."""
+"""Number in the seed, wanted share of the pixels on movers, and its band in every frame."""
 ATTEMPTS = 200
 """Draws of a family before a share is given up."""
 LAG = 6
 """Most frames by which the path of a mover runs before or after the camera's, which it follows."""
-
-Parts = list[tuple[int, np.ndarray]]
-"""Unit shapes with their (3, 4) or (N, 3, 4) maps into the object frame, metres."""
-Mover = Callable[[int, float], list[Solid]]
-"""Number and size of a moving object -> its solids."""
-
-
-def draw_look(rng: np.random.Generator) -> dict[str, Any]:
-    """Texture of one solid."""
-    base = rng.uniform(0.35, 1.0, 3)
-    other = np.clip(base + rng.normal(0, 0.3, 3), 0.25, 1.0)
-    return {"wavelength": rng.uniform(1.0, 2.2), "colours": (base, other)}
-
-
-def cluster(rng: np.random.Generator, half: np.ndarray, count: int) -> Parts:
-    """A rigid body of one large part and smaller ones that stick out of it."""
-    shape = int(rng.choice([BOX, ELLIPSOID]))
-    parts = [(shape, affine(half * (1.15 if shape == ELLIPSOID else 1.0), np.zeros(3)))]
-    for _ in range(count - 1):
-        # mostly on the side that faces the camera: relief, so that no mover is one plane
-        at = rng.uniform((-0.95, -0.95, -1.3), (0.95, 0.95, -0.4)) * half
-        R = any_turn(rng)
-        part = rng.uniform(0.25, 0.55, 3) * half.mean()
-        parts.append((int(rng.choice([BOX, ELLIPSOID, CYLINDER])), affine(part, at, R)))
-    return parts
-
-
-def cloud(rng: np.random.Generator, frames: int, half: np.ndarray, rate: float) -> Parts:
-    """A sheet of ellipsoids, carried and sheared by two travelling waves; exact at every point."""
-    columns, rows = 11, 7
-    x = np.linspace(-1, 1, columns) * half[0]
-    y = np.linspace(-1, 1, rows) * half[1]
-    spacing = np.array([x[1] - x[0], y[1] - y[0]])
-    centres = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    centres = centres + rng.uniform(-0.15, 0.15, centres.shape) * spacing
-    bulge = half[2] * (centres[:, 0] ** 2 / half[0] ** 2 - 0.5)
-    centres = np.column_stack([centres, bulge + rng.normal(0, 0.1 * spacing.mean(), len(centres))])
-    t = np.arange(frames)
-    waves = []
-    for _ in range(2):
-        period, length = rng.uniform(18, 34), rng.uniform(1.6, 2.4) * half[0]
-        heading = rng.uniform(0, 2 * np.pi)
-        k = 2 * np.pi / length * np.array([np.cos(heading), np.sin(heading), 0.0])
-        sway = rng.normal(size=3) * (0.6, 0.6, 1.0)
-        amplitude = min(float(rate * period / (2 * np.pi)), float(0.25 / np.linalg.norm(k)))
-        waves.append((amplitude * sway / np.linalg.norm(sway), k, 2 * np.pi * t / period))
-    parts = []
-    for centre in centres:
-        moved, gradient = np.tile(centre, (frames, 1)), np.tile(np.eye(3), (frames, 1, 1))
-        for sway, k, phase in waves:
-            angle = centre @ k - phase
-            moved = moved + np.outer(np.sin(angle), sway)
-            gradient = gradient + np.cos(angle)[:, None, None] * np.outer(sway, k)
-        radius = rng.uniform(0.62, 0.78, 3) * (spacing[0], spacing[1], spacing.mean())
-        parts.append((ELLIPSOID, np.concatenate([gradient * radius, moved[..., None]], axis=2)))
-    return parts
 
 
 def _furnish(rng: np.random.Generator, spread: float, rise: float) -> list[Solid]:
@@ -157,15 +100,7 @@ class _Movers:
         """A body that sways about a place in the frame of a path."""
         angles = sway(self.rng, self.frames, spin_deg)
         place = path @ poses(angles, centre + sway(self.rng, self.frames, speed))
-        looks = [draw_look(self.rng) for _ in parts]
-
-        def solids(number: int, size: float) -> list[Solid]:
-            return [
-                Solid(shape, carried(place, size * local), number, **look)
-                for (shape, local), look in zip(parts, looks, strict=True)
-            ]
-
-        return solids
+        return mover(self.rng, parts, place)
 
     def blob(
         self,
@@ -220,24 +155,18 @@ class _Movers:
                      0.07, int(integers(1, 4)), uniform(0.02, 0.09), uniform(0.3, 2.5), follow(2))
                 for column in range(-2, 3) for row in (-0.5, 0.5)
             ]  # fmt: skip
-        if kind == "light":
-            still = np.broadcast_to(self.guide[LAG + self.frames // 2], (self.frames, 4, 4))
-            first = self.rng.choice([-1.0, 1.0]) * uniform(0.35, 0.6)
-            side = np.sign(first)
-            return [
-                blob((first, uniform(-0.2, 0.3), uniform(4.5, 7)), 0.19, 4,
-                     uniform(0.04, 0.09), uniform(0.5, 1.5), follow()),
-                blob((-0.7 * side, uniform(-0.4, 0.4), uniform(4, 6)), 0.06, 3,
-                     uniform(0.04, 0.08), uniform(1.0, 2.5), follow()),
-                blob((-0.15 * side, uniform(-0.5, 0.5), uniform(6, 10)), 0.04, 2,
-                     uniform(0.05, 0.1), uniform(0.5, 2.0), still),
-                blob((uniform(-0.8, 0.8), uniform(-0.5, 0.5), uniform(6, 12)), 0.03, 1,
-                     0.006, 0.1, still),
-            ]  # fmt: skip
+        still = np.broadcast_to(self.guide[LAG + self.frames // 2], (self.frames, 4, 4))
+        first = self.rng.choice([-1.0, 1.0]) * uniform(0.35, 0.6)
+        side = np.sign(first)
         return [
-            blob((uniform(-0.8, 0.8), uniform(-0.8, 0.8), uniform(3.5, 12)), uniform(0.03, 0.3),
-                 int(integers(1, 4)), uniform(0.005, 0.1), uniform(0.1, 2.5), follow())
-            for _ in range(int(integers(1, 5)))
+            blob((first, uniform(-0.2, 0.3), uniform(4.5, 7)), 0.19, 4,
+                 uniform(0.04, 0.09), uniform(0.5, 1.5), follow()),
+            blob((-0.7 * side, uniform(-0.4, 0.4), uniform(4, 6)), 0.06, 3,
+                 uniform(0.04, 0.08), uniform(1.0, 2.5), follow()),
+            blob((-0.15 * side, uniform(-0.5, 0.5), uniform(6, 10)), 0.04, 2,
+                 uniform(0.05, 0.1), uniform(0.5, 2.0), still),
+            blob((uniform(-0.8, 0.8), uniform(-0.5, 0.5), uniform(6, 12)), 0.03, 1,
+                 0.006, 0.1, still),
         ]  # fmt: skip
 
 
@@ -247,38 +176,27 @@ def make_scene(
     *,
     height: int = 218,
     width: int = 512,
-    frames: int | None = None,
+    frames: int = 20,
     zoom: float = 0.0,
     noise: float = 0.0,
 ) -> Scene:
     """Scene of a family, drawn from a seed.
 
-    Kinds: ``static``; ``light`` (several movers, about 30 % of the pixels); ``pair`` (small, any);
-    ``heavy_rigid``, ``heavy_deforming``, ``heavy_two``, ``heavy_ten``: 46 to 75 % of the pixels on
-    movers in every frame, and at least 46 % whose flow differs from the camera's by over 1/512 of
-    the width. ``frames``: default 20, for ``pair`` 2; ``zoom``: relative amplitude of a slow change
-    of focal length; ``noise``: standard deviation of the sensor noise in grey levels.
-
-    Raises:
-        InputError: an unknown kind, or a value out of range.
-
-    Example:
-        >>> scene = make_scene("static", 0, height=16, width=32, frames=2)
-        >>> scene.render(0).rgb.shape
-        (16, 32, 3)
+    Kinds: ``static``; ``light`` (several movers, about 30 % of the pixels); ``heavy_rigid``,
+    ``heavy_deforming``, ``heavy_two``, ``heavy_ten``: 46 to 75 % of the pixels on movers in every
+    frame, and at least 46 % whose flow differs from the camera's by over 1/512 of the width.
+    ``zoom``: relative amplitude of a slow change of focal length; ``noise``: standard deviation of
+    the sensor noise in grey levels.
     """
-    if frames is None:
-        frames = 2 if kind == "pair" else 20
-    if kind not in BANDS:
-        raise InputError(f"scene kind: expected one of {', '.join(BANDS)}, got {kind!r}.")
-    for name, value, low, high in (
-        ("seed", seed, 0, np.inf), ("frames", frames, 2, np.inf), ("height", height, 8, np.inf),
-        ("width", width, 8, np.inf), ("zoom", zoom, 0, 0.3), ("noise", noise, 0, 255),
-    ):  # fmt: skip
-        if not low <= value <= high or (high == np.inf and value % 1):
-            raise InputError(f"{name}: expected {low} to {high}, got {value!r}.")
+    if kind not in FAMILIES:
+        raise InputError(f"scene kind: expected one of {', '.join(FAMILIES)}, got {kind!r}.")
+    if seed < 0 or frames < 2 or min(height, width) < 8:
+        raise InputError(
+            f"make_scene: expected seed >= 0, 2 frames and 8x8 px or more, got seed {seed}, "
+            f"{frames} frames and {height}x{width} px."
+        )
     for attempt in range(ATTEMPTS):
-        rng = np.random.default_rng([list(BANDS).index(kind), seed, attempt])
+        rng = np.random.default_rng([FAMILIES[kind][0], seed, attempt])
         scene = _draw_scene(rng, kind, (height, width), frames, zoom, noise)
         if scene is not None:
             return scene
@@ -311,36 +229,38 @@ def _draw_scene(
     scene = Scene(cameras, path[LAG : LAG + frames], furniture, seed, noise=noise)
     movers = [] if kind == "static" else _Movers(rng, guide, frames, view).draw(kind)
     if movers:
-        share = {"light": 0.30, "pair": rng.uniform(0.05, 0.5)}.get(kind, 0.60)
-        scene, found = _sized(scene, movers, share)
+        share = FAMILIES[kind][1]
+        scene, found = sized(scene, movers, share)
         if abs(found - share) > 0.04:
             return None
     return scene if _keeps_band(scene, kind) else None
 
 
-def _sized(scene: Scene, movers: list[Mover], share: float) -> tuple[Scene, float]:
+def sized(
+    scene: Scene, movers: list[Mover], share: float, limits: tuple[float, float] = (0.4, 2.0)
+) -> tuple[Scene, float]:
     """The scene with movers of the size at which they cover a share, and which they cover."""
     last = scene.frames - 1
     samples = np.unique(np.linspace(0, last, min(last + 1, 9)).round().astype(int))
-    small, large = 0.4, 2.0
+    small, large = limits
     for _ in range(9):
         size = np.sqrt(small * large)
         solids = [solid for n, mover in enumerate(movers, 1) for solid in mover(n, size)]
-        sized = replace(scene, solids=(*scene.solids, *solids))
-        found = np.median([sized.moving_share(int(i), 64)[0] for i in samples])
+        made = replace(scene, solids=(*scene.solids, *solids))
+        found = np.median([made.moving_share(int(i), 64)[0] for i in samples])
         small, large = (size, large) if found < share else (small, size)
-    return sized, float(found)
+    return made, float(found)
 
 
 def _keeps_band(scene: Scene, kind: str) -> bool:
     """Whether every frame has the family's share of movers, and no surface is nearer than 1.2 m."""
-    low, high = BANDS[kind]
+    low, high = FAMILIES[kind][2]
     for index in range(scene.frames):
         share, nearest = scene.moving_share(index)
         if nearest < 1.2 or not low <= share <= high:
             return False
     # one pixel of an image 512 wide: small images are judged alike
     threshold = scene.cameras[0].width / 512
-    return not kind.startswith("heavy") or all(
+    return kind not in HEAVY or all(
         scene.dynamic_share(index, 64, threshold) >= 0.47 for index in range(scene.frames - 1)
     )

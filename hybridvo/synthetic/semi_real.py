@@ -21,6 +21,7 @@ from hybridvo.flow import dis_flow
 from hybridvo.geometry import invert, rotation_angle, se3_exp
 from hybridvo.refinement.refine import refine_pair
 from hybridvo.synthetic.draws import about, cut_out, log_uniform, smooth_field
+from hybridvo.synthetic.layered import KnownPair
 from hybridvo.synthetic.meshes import (
     TEAR,
     Canvas,
@@ -90,23 +91,6 @@ class Recording:
     source: Source
     frames: tuple[Frame, ...]
     pairs: tuple[tuple[int, int, np.ndarray], ...]
-
-
-@dataclass(frozen=True, eq=False)
-class KnownPair:
-    """A pair and its ground truth.
-
-    ``depth``: (H, W) metres of the previous frame before the sensor's errors, 0 where unknown;
-    ``moving``: (H, W) bool, points that do not follow the camera's motion; ``world``: path of the
-    recording; ``log_depth_curr``: (H, W) of the current frame at x + F where it has no depth map.
-    """
-
-    pair: FramePair
-    T_curr_prev: np.ndarray
-    depth: np.ndarray
-    moving: np.ndarray
-    world: str = ""
-    log_depth_curr: np.ndarray | None = None
 
 
 @functools.cache

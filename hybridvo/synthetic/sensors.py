@@ -39,6 +39,17 @@ class SensorOptions:
     range_limit_probability: Share = 0.25
 
 
+def noisy_flow(
+    rng: np.random.Generator, flow: np.ndarray, noise_px: float, share: float, reach_px: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """(H, W, 2) float32 flow with white noise and a share of gross errors, and where these are."""
+    white = rng.standard_normal(flow.shape, dtype=np.float32)
+    flow = flow.astype(np.float32) + np.float32(noise_px) * white
+    bad = rng.random(flow.shape[:2], dtype=np.float32) < share
+    flow[bad] += rng.uniform(-reach_px, reach_px, (int(bad.sum()), 2)).astype(np.float32)
+    return flow, bad
+
+
 def _look_up(
     image: np.ndarray, offset: np.ndarray, border: int = cv2.BORDER_REPLICATE
 ) -> np.ndarray:

@@ -29,23 +29,19 @@ is charged, also behind the camera."""
 class SampleStream(IterableDataset):
     """Endless batches of a preset, from the sample ``start`` of a seed.
 
-    Batch b of rank r holds the samples ``start + (b world + r) batch_size`` and those that follow.
     Workers of a ``DataLoader(stream, batch_size=None)`` take batches in turn, and the loader hands
     them over in order, so that their number changes nothing.
     """
 
-    def __init__(
-        self, preset: Preset, seed: int, start: int, batch_size: int, rank: int = 0, world: int = 1
-    ) -> None:
+    def __init__(self, preset: Preset, seed: int, start: int, batch_size: int) -> None:
         super().__init__()
         self.preset, self.seed, self.start, self.batch_size = preset, seed, start, batch_size
-        self.rank, self.world = rank, world
 
     def __iter__(self) -> Iterator[TrainingBatch]:
         worker = get_worker_info()
         turn, turns = (0, 1) if worker is None else (worker.id, worker.num_workers)
         while True:
-            first = self.start + (turn * self.world + self.rank) * self.batch_size
+            first = self.start + turn * self.batch_size
             numbers = range(first, first + self.batch_size)
             draws = (sample_generator(self.seed, i, TRAINING) for i in numbers)
             yield collate([self.preset.sample(rng) for rng in draws])
@@ -60,18 +56,12 @@ class PwvoTask:
         torch.manual_seed(options.seed)
         self.network = build_network(options.network)
         self.data = mixture.record
-        self.all_parameters_used = options.loss.needs_uncertainty
 
-    def batches(self, samples: int, workers: int, rank: int, world: int) -> Iterator[TrainingBatch]:
+    def batches(self, samples: int, workers: int) -> Iterator[TrainingBatch]:
         """Batches of the run's stream from sample number ``samples`` on."""
-        options = self.options
-        stream = SampleStream(self.mixture, options.seed, samples, options.batch_size, rank, world)
-        context = "fork" if workers else None
-        return iter(
-            DataLoader(
-                stream, batch_size=None, num_workers=workers, multiprocessing_context=context
-            )
-        )
+        stream = SampleStream(self.mixture, self.options.seed, samples, self.options.batch_size)
+        how = {"num_workers": workers, "multiprocessing_context": "fork" if workers else None}
+        return iter(DataLoader(stream, batch_size=None, **how))  # type: ignore[arg-type]
 
     def loss(
         self, model: nn.Module, batch: TrainingBatch, step: int, progress: float

@@ -14,25 +14,19 @@ from typing import Any
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 
 from hybridvo.files import atomic_write
-from hybridvo.flow import dis_flow
-from hybridvo.geometry import ego_flow, invert, se3_exp
+from hybridvo.geometry import se3_exp
 from hybridvo.hypotheses.generate import HypothesisSet, generate
-from hybridvo.network.inputs import NETWORK_SIZE
-from hybridvo.network.normalization import predict
-from hybridvo.network.prediction import static_probability
-from hybridvo.network.selection import fitted_motion, on_grid_of
+from hybridvo.network.prediction import propose_motion
 from hybridvo.options import Options
-from hybridvo.results import PixelwisePrediction, RelativePose
-from hybridvo.synthetic.dataset import MOVING, SOURCES, STATIC, UNKNOWN, grid_sample
+from hybridvo.refinement.pixels import grid_stride
+from hybridvo.results import RelativePose
 from hybridvo.synthetic.diverse import DiverseOptions
 from hybridvo.synthetic.draws import log_uniform
-from hybridvo.synthetic.semi_real import KnownPair, Recording, draw_pair
-from hybridvo.synthetic.sensors import SensorOptions, degrade_depth
-from hybridvo.synthetic.training_scenes import training_scene
-from hybridvo.training.validation import collate
+from hybridvo.synthetic.layered import KnownPair
+from hybridvo.synthetic.rendered import any_noise, rendered_pairs
+from hybridvo.synthetic.semi_real import Recording, draw_pair
 from hybridvo.types import Camera, Frame, FramePair
 
 PER_SHARD = 64
@@ -41,12 +35,20 @@ MAX_MOTIONS = 5
 """Motions of a sample."""
 SIZES = ((160, 320), (160, 320), (128, 256), (192, 256), (120, 400), (218, 512))
 """(height, width) of the samples."""
+MOVING, STATIC, UNKNOWN = 0, 1, 255
+"""Labels of the pixels."""
+SOURCES = ("diverse", "rendered", "dis", "semi-real")
+"""Where samples come from: the diverse preset, rendered scenes with true flow and with DIS, and
+recordings with movers cut from others."""
 
 
-def draw_samples(seed: int, recordings: Sequence[Recording] = ()) -> list[dict[str, Any]]:
+def draw_samples(
+    seed: int, recordings: Sequence[Recording] = (), network: torch.nn.Module | None = None
+) -> list[dict[str, Any]]:
     """Samples of one seed: semi-real, one of the diverse preset, or two of a rendered pair.
 
     Pairs that the search settles alone are left out: the selector is never asked about them.
+    ``network``: a PWVO whose motion and static world are kept with the samples.
     """
     rng = np.random.default_rng([0x6A64, seed])
     height, width = SIZES[int(rng.integers(len(SIZES)))]
@@ -55,44 +57,36 @@ def draw_samples(seed: int, recordings: Sequence[Recording] = ()) -> list[dict[s
     elif rng.random() < 0.5:
         pairs = {"diverse": _diverse_pair(rng, min(height, 160), min(width, 320))}
     else:
-        pairs = _rendered_pairs(rng, seed, height, width)
+        pairs = rendered_pairs(rng, height, width)
     samples = []
     for source, drawn in pairs.items():
-        T_prior = _last_motion(rng, drawn.T_curr_prev)
+        T_prior = None
+        if rng.random() < 0.5:
+            T_prior = expected_motion(rng, drawn.T_curr_prev)[0]
         starts = [np.eye(4)]
         if T_prior is not None and rng.random() < 0.7:
             starts.append(T_prior)
         found = generate(drawn.pair, np.stack(starts), Options(), int(rng.integers(1 << 30)))
-        whole = (0, drawn.depth.shape[0], 0, drawn.depth.shape[1])
-        if isinstance(found, RelativePose) or not found.is_ambiguous or found.grid.box != whole:
+        if isinstance(found, RelativePose) or not found.is_ambiguous:
             continue
-        samples.append(_record(drawn, found, T_prior) | {"source": SOURCES.index(source)})
+        if found.grid.shape[2] != grid_stride(found.grid.size, Options().refine.coarse_pixels):
+            continue  # a grid of another size, of pixels that are few
+        sample = _record(drawn, found, T_prior) | {"source": SOURCES.index(source)}
+        if network is not None:
+            sample |= _asked(network, drawn.pair, found)
+        samples.append(sample)
     return samples
 
 
-def _last_motion(rng: np.random.Generator, T: np.ndarray) -> np.ndarray | None:
-    """A motion as it may have been one frame earlier; sometimes quite another one."""
-    kind = rng.random()
-    if kind < 0.5:
-        return None
-    t = max(float(np.linalg.norm(T[:3, 3])), 1e-3)
-    if kind < 0.88:
-        spread = log_uniform(rng, (0.03, 0.6)) * np.array([t, t, t, 0.01, 0.01, 0.01])
-    else:
-        spread = np.array([2 * t, 2 * t, 2 * t, 0.04, 0.04, 0.04])
-    return se3_exp(spread * rng.standard_normal(6)) @ T
-
-
-def _noisy(rng: np.random.Generator, flow: np.ndarray) -> np.ndarray:
-    """White noise and gross errors, as in the benchmark's cells but of any strength."""
-    flow = flow + np.float32(log_uniform(rng, (0.02, 1.0))) * rng.standard_normal(
-        flow.shape, dtype=np.float32
-    )
-    if rng.random() < 0.5:
-        bad = rng.random(flow.shape[:2]) < rng.uniform(0, 0.3)
-        reach = 0.06 * flow.shape[1]
-        flow[bad] += rng.uniform(-reach, reach, (int(bad.sum()), 2)).astype(np.float32)
-    return flow
+def expected_motion(rng: np.random.Generator, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A motion as a history expects it, good, wrong or too sure, and the spread (6,) it states."""
+    length = max(float(np.linalg.norm(T[:3, 3])), 1e-3)
+    about = log_uniform(rng, (0.02, 0.6)) * length, log_uniform(rng, (3e-4, 1e-2))
+    spread = np.repeat(about, 3) * np.exp(0.5 * rng.standard_normal(6))
+    stated = spread * log_uniform(rng, (0.5, 2.0))
+    if rng.random() < 0.12:  # the camera was pushed: the history knows nothing of it
+        spread = np.repeat([2 * length, 0.04], 3)
+    return se3_exp(spread * rng.standard_normal(6)) @ T, stated
 
 
 def _diverse_pair(rng: np.random.Generator, height: int, width: int) -> KnownPair:
@@ -100,42 +94,13 @@ def _diverse_pair(rng: np.random.Generator, height: int, width: int) -> KnownPai
     camera = Camera.from_matrix(sample.K, height, width)
     flow = np.ascontiguousarray(sample.flow)
     if rng.random() < 0.15:
-        flow = _noisy(rng, flow)
+        flow = any_noise(rng, flow)
     prev = Frame(None, np.ascontiguousarray(sample.depth_prev), camera)
     pair = FramePair(prev, Frame(None, None, camera), flow)
     known = (sample.depth_curr > 0) & (rng.random() >= 0.1)
     log_depth = np.log(np.where(known, sample.depth_curr, np.float32(np.nan)))
     T = sample.T_curr_prev.astype(float)
     return KnownPair(pair, T, sample.depth_true, sample.moving, log_depth_curr=log_depth)
-
-
-def _rendered_pairs(
-    rng: np.random.Generator, seed: int, height: int, width: int
-) -> dict[str, KnownPair]:
-    """The same scene with true and with DIS flow."""
-    scene = training_scene(seed, height, width)
-    frames = [scene.render(k) for k in (0, 1)]
-    flow, _, moving = scene.flow(0)
-    camera = scene.cameras[0]
-    T = invert(scene.T_world_cam[1]) @ scene.T_world_cam[0]
-    depth = [np.where(np.isfinite(f.depth), f.depth, 0).astype(np.float32) for f in frames]
-    # of the movers' pixels those whose flow the camera alone does not explain
-    own = np.nan_to_num(flow) - np.nan_to_num(ego_flow(depth[0], T, camera, camera))
-    moving &= np.square(own).sum(axis=2) > (0.5 * camera.width / 1024) ** 2
-    truth = T, depth[0], moving
-    if rng.random() < 0.5:
-        depth = degrade_depth(rng, depth, SensorOptions())
-    second = rng.random() > 0.1
-    if rng.random() < 0.3:
-        flow = _noisy(rng, flow)
-    prev = Frame(frames[0].rgb, depth[0], camera)
-    curr = Frame(frames[1].rgb, depth[1] if second else None, camera)
-    pairs = {"rendered": KnownPair(FramePair(prev, curr, np.ascontiguousarray(flow)), *truth)}
-    field = dis_flow()(prev, curr)
-    if field.flow is not None:
-        estimated = FramePair(prev, curr, field.flow, field.variance, field.valid)
-        pairs["dis"] = KnownPair(estimated, *truth)
-    return pairs
 
 
 def _record(drawn: KnownPair, found: HypothesisSet, T_prior: np.ndarray | None) -> dict[str, Any]:
@@ -160,47 +125,30 @@ def _record(drawn: KnownPair, found: HypothesisSet, T_prior: np.ndarray | None) 
     }
 
 
+def _asked(network: torch.nn.Module, pair: FramePair, found: HypothesisSet) -> dict[str, Any]:
+    """Motion (3, 4) and static probability (h, w) that a PWVO states; NaN and 0.5 where none."""
+    said = propose_motion(network, pair)
+    if said is None:
+        h, w, _ = found.grid.shape
+        return {"proposal": np.full((3, 4), np.nan), "static": np.full((h, w), 0.5, np.float16)}
+    static = found.grid.resample(said.static_probability).astype(np.float16)
+    return {"proposal": said.T_curr_prev[:3], "static": static}
+
+
 def write_shard(
-    folder: Path, first_seed: int, seeds: int = PER_SHARD, recordings: Sequence[Recording] = ()
+    folder: Path,
+    first_seed: int,
+    seeds: int = PER_SHARD,
+    recordings: Sequence[Recording] = (),
+    network: torch.nn.Module | None = None,
 ) -> int:
     """Write the samples of some seeds, in one file for each grid shape; returns their number."""
     by_shape: dict[tuple[int, int], list[dict[str, Any]]] = {}
     for seed in range(first_seed, first_seed + seeds):
-        for sample in draw_samples(seed, recordings):
+        for sample in draw_samples(seed, recordings, network):
             by_shape.setdefault(sample["label"].shape, []).append(sample)
     for (h, w), samples in by_shape.items():
-        arrays = {key: np.stack([p[key] for p in samples]) for key in samples[0]}
-        _write(folder / f"{first_seed:08d}_{h}x{w}.npz", arrays)
+        arrays: dict[str, Any] = {key: np.stack([p[key] for p in samples]) for key in samples[0]}
+        with atomic_write(folder / f"{first_seed:08d}_{h}x{w}.npz", "wb") as file:
+            np.savez(file, **arrays)
     return sum(len(p) for p in by_shape.values())
-
-
-def _write(path: Path, arrays: dict[str, Any]) -> None:
-    with atomic_write(path, "wb") as file:
-        np.savez(file, **arrays)
-
-
-def write_proposals(folder: Path, network: torch.nn.Module) -> int:
-    """Write a PWVO's answers (motion, static world) into all shards; the number of samples."""
-    total = 0
-    for path in sorted(folder.glob("*.npz")):
-        with np.load(path) as file:
-            shard = dict(file)
-        count = len(shard["source"])
-        said = [_proposal({k: x[i] for k, x in shard.items()}, network) for i in range(count)]
-        proposal, static = (np.stack(x) for x in zip(*said, strict=True))
-        _write(path, shard | {"proposal": proposal, "static": static})
-        total += count
-    return total
-
-
-@torch.inference_mode()
-def _proposal(p: dict[str, np.ndarray], network: torch.nn.Module) -> tuple[np.ndarray, np.ndarray]:
-    """Motion (3, 4) and static probability (h, w) of a sample."""
-    inputs = collate([grid_sample(p, NETWORK_SIZE)]).inputs
-    output = predict(network, inputs)
-    assert isinstance(output, PixelwisePrediction) and output.log_scale_rotation is not None
-    scale = output.log_scale_rotation
-    static = static_probability(scale, on_grid_of(scale, inputs).valid)[:, None]
-    static = F.interpolate(static, p["label"].shape, mode="bilinear", align_corners=False)
-    motion = fitted_motion(output, inputs)[0, :3]
-    return motion.double().numpy(), static[0, 0].half().numpy()

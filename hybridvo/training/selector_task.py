@@ -5,7 +5,8 @@ The fits are those of the pipeline: the final choice is learned on what it will 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import zipfile
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -14,17 +15,16 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from hybridvo.errors import InputError
-from hybridvo.geometry import pose_matrix, se3_exp
+from hybridvo.errors import FormatError, InputError
+from hybridvo.geometry import pose_matrix
 from hybridvo.hypotheses.generate import GridMaps, fit_in_mask
 from hybridvo.hypotheses.selector import mask_weights, nearest_motion
 from hybridvo.network.selector_inputs import SelectorInputs, stacked_inputs
 from hybridvo.network.selector_net import SelectorNetwork, SelectorOutput
 from hybridvo.options import RefineOptions
 from hybridvo.refinement import kernels
-from hybridvo.synthetic.dataset import MOVING, SOURCES, STATIC, read_shards
-from hybridvo.synthetic.draws import log_uniform
 from hybridvo.training.options import SelectorOptions
+from hybridvo.training.selector_data import MOVING, SOURCES, STATIC, expected_motion
 
 RIGHT_PX = 1.0
 """px at a width of 1024: mean error of the ego flow up to which a motion is right."""
@@ -40,7 +40,7 @@ class SelectorBatch:
 
     Args:
         samples: (B, 8, n) float32 pixel buffers of the solver.
-        depth_true: (B, h, w) metres, 0 where unknown. label: (B, h, w) of ``synthetic.dataset``.
+        depth_true: (B, h, w) metres, 0 where unknown. label: (B, h, w) of ``selector_data``.
         T: (B, 3, 4) true T_curr_prev. source: (B,) number in ``SOURCES``.
         static: (B, h, w) probability to be static world that a pixel-wise network states.
         proposal: (B, 3, 4) float64 its motion, NaN where it was not asked.
@@ -69,29 +69,16 @@ class SelectorBatch:
         return replace(self, inputs=replace(self.inputs, static=logit, has_static=asked))
 
     def expecting(self, rng: np.random.Generator) -> SelectorBatch:
-        """The same with motions expected by histories of all kinds: none, good, wrong, too sure."""
-        count = len(self.T)
-        truth = self.T.numpy().astype(np.float64)
-        last = np.tile(np.eye(4), (count, 1, 1))
-        information = self.inputs.prior_information.clone()
-        known = rng.random(count) < 0.6
+        """The same with motions expected by histories of all kinds, or by none."""
+        T_prior, information = self.T.clone(), self.inputs.prior_information.clone()
+        known = rng.random(len(self)) < 0.6
         for b in np.flatnonzero(known):
-            length = max(float(np.linalg.norm(truth[b, :, 3])), 1e-3)
-            spread = np.repeat([log_uniform(rng, (0.02, 0.6)) * length, 0.0], 3)
-            spread[3:] = log_uniform(rng, (3e-4, 1e-2))
-            spread *= np.exp(0.5 * rng.standard_normal(6))
-            stated = spread * log_uniform(rng, (0.5, 2.0))
-            if rng.random() < 0.12:  # the camera was pushed: the history knows nothing of it
-                spread = np.array([2 * length] * 3 + [0.04] * 3)
-            last[b] = se3_exp(spread * rng.standard_normal(6)) @ pose_matrix(truth[b])
+            T, spread = expected_motion(rng, pose_matrix(self.T[b].numpy().astype(np.float64)))
+            T_prior[b] = torch.as_tensor(T[:3])
             if rng.random() < 0.6:
-                information[b] = torch.diag(torch.as_tensor(1.0 / stated**2).float())
-        inputs = replace(
-            self.inputs,
-            T_prior=torch.as_tensor(last[:, :3], dtype=torch.float32),
-            prior_information=information,
-            has_prior=torch.as_tensor(known),
-        )
+                information[b] = torch.diag(torch.as_tensor(1.0 / spread**2))
+        told = {"T_prior": T_prior, "prior_information": information}
+        inputs = replace(self.inputs, **told, has_prior=torch.as_tensor(known))
         return replace(self, inputs=inputs)
 
 
@@ -117,16 +104,31 @@ def _collate(p: dict[str, np.ndarray]) -> SelectorBatch:
 
 
 def read_batches(
-    files: list[Path], batch_size: int, rng: np.random.Generator | None
+    files: Sequence[Path], batch_size: int, rng: np.random.Generator | None
 ) -> Iterator[SelectorBatch]:
-    """Batches of the samples of some shards, mixed if ``rng`` is given."""
+    """Batches of the samples of some shards, one grid shape each; mixed if ``rng`` is given.
+
+    Raises:
+        FormatError: a file that holds no such samples.
+    """
+    by_shape: dict[tuple[int, ...], list[dict[str, np.ndarray]]] = {}
+    for path in files:
+        try:
+            with np.load(path) as file:
+                shard = dict(file)
+            count, *shape = shard["label"].shape
+        except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
+            raise FormatError(f"{path}: not a shard of samples ({error}).") from None
+        # where no network was asked
+        shard.setdefault("proposal", np.full((count, 3, 4), np.nan))
+        shard.setdefault("static", np.full((count, *shape), 0.5, np.float16))
+        by_shape.setdefault(tuple(shape), []).append(shard)
     jobs = []
-    for samples in read_shards(files):
-        order = np.arange(len(samples["count"]))
-        if rng is not None:
-            rng.shuffle(order)
-        for k in range(0, len(order), batch_size):
-            jobs.append((samples, order[k : k + batch_size]))
+    for shards in by_shape.values():
+        samples = {name: np.concatenate([s[name] for s in shards]) for name in shards[0]}
+        count = len(samples["count"])
+        order = np.arange(count) if rng is None else rng.permutation(count)
+        jobs += [(samples, order[k : k + batch_size]) for k in range(0, count, batch_size)]
     if rng is not None:
         rng.shuffle(jobs)
     for samples, index in jobs:
@@ -168,19 +170,17 @@ def refits_of(
         mine = torch.nonzero(inputs.owner == b)[:, 0]
         order = mine[out.score[mine].argsort(descending=True)].tolist()
         if extra is not None and len(order) > count and torch.rand((), generator=extra) < 0.3:
-            swap = int(torch.randint(count, len(order), (), generator=extra))
-            order[count - 1], order[swap] = order[swap], order[count - 1]
-        starts = [(inputs.pose[k].numpy().astype(np.float64), k) for k in order[:count]]
-        masks = [probability[k] for k in order[:count]]
+            order[count - 1] = order[int(torch.randint(count, len(order), (), generator=extra))]
+        starts = [(inputs.pose[k].numpy(), probability[k], k) for k in order[:count]]
         if inputs.has_static[b]:
             start, z = batch.proposal[b].numpy(), inputs.depth[b][inputs.usable[b]]
             near = nearest_motion(inputs.pose[mine].numpy(), start, 1.0 / float(z.median()))
-            starts.append((start, int(mine[near])))
-            masks.append(batch.static[b].numpy())
-        for (start, k), mask in zip(starts, masks, strict=True):
+            starts.append((start, batch.static[b].numpy(), int(mine[near])))
+        for start, mask, k in starts:
             weights, K = mask_weights(mask), inputs.K[b].numpy()
             if weights.max() <= 0:
                 continue
+            start = start.astype(np.float64)
             pose, fact = fit_in_mask(batch.samples[b], weights, K, start, cutoff)
             if np.isfinite(pose).all():
                 poses.append(pose)
@@ -192,7 +192,10 @@ def refits_of(
 
 
 class Looks:
-    """What a network answers about the motions of a batch, and about their refits."""
+    """What a network answers about the motions of a batch, and about their refits.
+
+    ``owner``, ``score``, ``hidden`` and ``error`` (px) of all motions so far.
+    """
 
     def __init__(
         self,
@@ -210,13 +213,13 @@ class Looks:
     ) -> SelectorOutput:
         with torch.autocast("cpu", torch.bfloat16, enabled=self.half):
             out = self.model(inputs, first, self.mirror)
-        single = {name: getattr(out, name).float() for name in ("score", "hidden", "mask")}
+        out = replace(out, **{k: getattr(out, k).float() for k in ("score", "hidden", "mask")})
         error = ego_flow_error(inputs.pose, inputs.owner, self.batch)
-        self.asked.append((inputs.owner, single["score"], single["hidden"], error))
+        self.asked.append((inputs.owner, out.score, out.hidden, error))
         self.owner, self.score, self.hidden, self.error = map(
             torch.cat, zip(*self.asked, strict=True)
         )
-        return replace(out, **single)
+        return out
 
     def again(
         self, refits: int, draw: torch.Generator | None = None
@@ -268,21 +271,19 @@ class Looks:
 class SelectorTask:
     """The selector, a folder of shards (more may appear while training) and the losses."""
 
-    all_parameters_used = False
-
     def __init__(self, options: SelectorOptions, folder: Path) -> None:
         self.options, self.folder, self.data = options, Path(folder), str(folder)
         torch.manual_seed(options.seed)
         self.network = SelectorNetwork(options.network)
 
-    def batches(self, samples: int, workers: int, rank: int, world: int) -> Iterator[SelectorBatch]:
+    def batches(self, samples: int, workers: int) -> Iterator[SelectorBatch]:
         """Batches of shards that are picked and mixed anew each round."""
         round_number = 0
         while True:
             files = sorted(self.folder.glob("*.npz"))
             if not files:
                 raise InputError(f"{self.folder}: no shards of samples; make some first.")
-            rng = np.random.default_rng([self.options.seed, samples, rank, round_number])
+            rng = np.random.default_rng([self.options.seed, samples, round_number])
             picked = rng.permutation(len(files))[: self.options.files]
             yield from read_batches([files[k] for k in picked], self.options.batch_size, rng)
             round_number += 1
@@ -325,32 +326,27 @@ def evaluate_selector(
     """Shares of wrong answers on samples of shards, by source; ``asked``: with the other network.
 
     For each source: ``samples``, the share of them whose motion is further from the ground truth
-    than is right for ``support`` (the first motion found), ``chosen`` (the first choice), ``final``
-    (after the second look) and ``best`` (the best of them, an oracle), and ``trust_right`` and
-    ``trust_wrong``, the mean probability given to right and wrong answers.
+    than is right for ``support`` (the first motion found), ``final`` (the answer) and ``best`` (of
+    all, an oracle), and ``trust_right`` and ``trust_wrong``, the mean probability given to right
+    and wrong answers.
     """
-    rows: dict[int, list[list[float]]] = {source: [] for source in range(len(SOURCES))}
+    rows: dict[str, list[list[float]]] = {}
     for batch in read_batches(files, 8, None):
-        batch = batch.shown(torch.full((len(batch),), asked))
-        looks = Looks(network, batch)
-        first_look = len(looks.owner)
+        looks = Looks(network, batch.shown(torch.full((len(batch),), asked)))
         looks.again(refits)
         score, error, trust = looks.score, looks.error, looks.trust(network).sigmoid()
         for b, mine in enumerate(looks.motions()):
-            first = mine[mine < first_look]
-            picks = (first[0], first[score[first].argmax()], mine[score[mine].argmax()])
-            wrong = [float(error[k]) for k in picks] + [float(error[mine].min()), float(trust[b])]
-            rows[int(batch.source[b])].append(wrong)
-    return {name: _shares(np.array(rows[i])) for i, name in enumerate(SOURCES) if rows[i]}
-
-
-def _shares(table: np.ndarray) -> dict[str, Any]:
-    limit = np.clip(3 * table[:, 3], RIGHT_PX, WORST_RIGHT_PX)
-    wrong = table[:, 2] > limit
-    result: dict[str, Any] = {"samples": len(table)}
-    for i, name in enumerate(("support", "chosen", "final", "best")):
-        result[name] = round(float((table[:, i] > limit).mean()), 4)
-    result["median_final_px"] = round(float(np.median(table[:, 2])), 3)
-    for name, rows in (("trust_right", ~wrong), ("trust_wrong", wrong)):
-        result[name] = round(float(table[rows, 4].mean()), 3) if rows.any() else None
-    return result
+            px = error[mine[0]], error[mine[score[mine].argmax()]], error[mine].min(), trust[b]
+            rows.setdefault(SOURCES[int(batch.source[b])], []).append([float(x) for x in px])
+    figures: dict[str, dict[str, Any]] = {}
+    for source, listed in rows.items():
+        table = np.array(listed)
+        limit = np.clip(3 * table[:, 2], RIGHT_PX, WORST_RIGHT_PX)
+        wrong = table[:, :3] > limit[:, None]
+        shares = np.round(wrong.mean(axis=0), 4).tolist()
+        figures[source] = {"samples": len(listed)}
+        figures[source] |= dict(zip(("support", "final", "best"), shares, strict=True))
+        for name, some in (("right", ~wrong[:, 1]), ("wrong", wrong[:, 1])):
+            stated = round(float(table[some, 3].mean()), 3) if some.any() else None
+            figures[source][f"trust_{name}"] = stated
+    return figures

@@ -1,4 +1,4 @@
-"""One training loop for every task: updates, running average, checkpoints, many processes.
+"""One training loop for every task: updates, running average, checkpoints.
 
 An interrupted run takes the same updates as one that was not, if the schedule counts updates.
 """
@@ -11,16 +11,15 @@ import dataclasses
 import json
 import math
 import pickle
-import statistics
 import time
+from collections import defaultdict
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
-import torch.distributed as dist
 from torch import nn
-from torch.nn.parallel import DistributedDataParallel
 
 from hybridvo.errors import CheckpointError, DegenerateError, InputError
 from hybridvo.files import atomic_write
@@ -28,58 +27,48 @@ from hybridvo.training.options import RunOptions
 from hybridvo.training.pwvo_task import PwvoTask
 from hybridvo.training.selector_task import SelectorTask
 
-FREE_TO_CHANGE = ("checkpoint_minutes", "log_every", "evaluate_every", "evaluate_count")
+FREE_TO_CHANGE = {"checkpoint_minutes", "log_every", "evaluate_every", "evaluate_count"}
 """Options in which a resumed run may differ: they do not touch what is learned."""
 PROGRESS = ("step", "samples", "skipped", "elapsed_s")
 """Numbers of a run that its checkpoint keeps."""
 CHECKPOINT, LOG = "checkpoint.pt", "log.jsonl"
-
-
-Task = PwvoTask | SelectorTask
-"""What is trained: a network, its data, options, batches, loss and figures."""
+MAX_SKIPPED = 50
+"""Updates in a row without a finite gradient after which a run is given up."""
 
 
 class Trainer:
-    """A run: task, optimiser, and their state on disk; under torchrun one in every process.
+    """A run: task, optimiser, and their state on disk.
 
     ``folder``: of ``checkpoint.pt`` and ``log.jsonl``; None writes nothing. ``workers``: processes
     that draw samples; 0 draws them in this one. ``report`` is called with every entry of the log.
+    ``stop_requested`` ends :meth:`run` after the update at hand.
     """
 
     def __init__(
         self,
-        task: Task,
+        task: PwvoTask | SelectorTask,
         folder: Path | None = None,
         device: torch.device | str = "cpu",
         workers: int = 0,
-        report: Callable[[dict[str, Any]], None] | None = None,
+        report: Callable[[dict[str, Any]], None] = lambda entry: None,
     ) -> None:
         self.task, self.folder = task, folder
         self.options: RunOptions = task.options
         self.device, self.workers, self.report = torch.device(device), workers, report
-        self.world = dist.get_world_size() if dist.is_initialized() else 1
-        self.rank = dist.get_rank() if dist.is_initialized() else 0
         self.network = task.network.to(self.device)
         if self.options.channels_last:
             self.network = self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self.model: nn.Module = self.network
-        if self.world > 1:
-            self.model = DistributedDataParallel(
-                self.network, find_unused_parameters=not task.all_parameters_used
-            )
-        average, how = self.options.ema_decay > 0, self.options.optimizer
-        self.ema = copy.deepcopy(self.network).requires_grad_(False) if average else None
+        # the network that a user should get: the running average where there is one
+        self.exported = self.network
+        if self.options.ema_decay > 0:
+            self.exported = copy.deepcopy(self.network).requires_grad_(False)
+        how = self.options.optimizer
         self.optimizer = torch.optim.AdamW(
             self.network.parameters(), how.learning_rate, how.betas, weight_decay=how.weight_decay
         )
         self.step = self.samples = self.skipped = self.skipped_in_a_row = 0
         self.elapsed_s = 0.0
         self.stop_requested = False
-
-    @property
-    def exported(self) -> nn.Module:
-        """The network that a user should get: the running average where there is one."""
-        return self.network if self.ema is None else self.ema
 
     @property
     def record(self) -> dict[str, Any]:
@@ -91,36 +80,35 @@ class Trainer:
         """One step of the optimiser when ``progress`` of the run is done; returns its figures.
 
         Raises:
-            DegenerateError: the loss or the gradient was not finite 50 times in a row.
+            DegenerateError: the loss or the gradient was not finite :data:`MAX_SKIPPED` times.
         """
         optimizer = self.options.optimizer
         rate = optimizer.learning_rate * self.options.schedule.factor(progress)
         for group in self.optimizer.param_groups:
             group["lr"] = rate
         self.optimizer.zero_grad(set_to_none=True)
-        loss, parts = self.task.loss(self.model, batch.to(self.device), self.step, progress)
+        loss, parts = self.task.loss(self.network, batch.to(self.device), self.step, progress)
         loss.backward()
         norm = nn.utils.clip_grad_norm_(self.network.parameters(), optimizer.clip_norm)
-        # The averaged gradient is the same on all ranks, and not finite where any loss was not.
         if math.isfinite(float(norm)):
             self.optimizer.step()
             self.skipped_in_a_row = 0
-            if self.ema is not None:
+            if self.exported is not self.network:
                 # A young average follows quickly: it must forget the random start.
                 decay = min(self.options.ema_decay, (1 + self.step) / (10 + self.step))
-                ours, theirs = self.ema.state_dict(), self.network.state_dict()
-                for name, value in ours.items():
+                theirs = self.network.state_dict()
+                for name, value in self.exported.state_dict().items():
                     value.lerp_(theirs[name], 1 - decay)
         else:
             self.skipped += 1
             self.skipped_in_a_row += 1
-            if self.skipped_in_a_row >= 50:
+            if self.skipped_in_a_row >= MAX_SKIPPED:
                 raise DegenerateError(
-                    f"training: loss or gradient not finite 50 times in a row at update "
+                    f"training: loss or gradient not finite {MAX_SKIPPED} times in a row at update "
                     f"{self.step}. Lower the learning rate; the last checkpoint is sound."
                 )
         self.step += 1
-        self.samples += len(batch) * self.world
+        self.samples += len(batch)
         figures = {"loss": float(loss.detach()), "grad_norm": float(norm), "lr": rate}
         return figures | {name: float(part) for name, part in parts.items()}
 
@@ -128,12 +116,11 @@ class Trainer:
         """Train until the options' steps, a time limit or a request to stop, and save.
 
         ``time_limit_s`` counts over all interruptions; ``until``: pause at this update, with the
-        schedule of the whole run. Returns why it ended: ``steps``, ``time`` or ``signal``
-        (``stop_requested`` was set).
+        schedule of the whole run. Returns why it ended: ``steps``, ``time`` or ``signal``.
         """
         options = self.options
         last = options.steps if until is None else min(until, options.steps)
-        batches = self.task.batches(self.samples, self.workers, self.rank, self.world)
+        batches = self.task.batches(self.samples, self.workers)
         self.network.train()
         before, started = self.elapsed_s, time.monotonic()
         saved = logged = started
@@ -147,19 +134,13 @@ class Trainer:
             now = time.monotonic()
             self.elapsed_s = before + now - started
             if self.step % options.log_every == 0:
-                rate = options.batch_size * self.world * len(seen) / (now - logged)
+                rate = options.batch_size * len(seen) / (now - logged)
                 self._log({"event": "train", **_means(seen), "samples_per_s": rate})
                 seen, logged = [], now
             if options.evaluate_every and self.step % options.evaluate_every == 0:
                 self.evaluate()
-            # what one process is told ends all
-            stop = 2 if self.stop_requested else int(self.elapsed_s >= time_limit_s)
-            if self.world > 1:
-                flag = torch.tensor(stop, device=self.device)
-                dist.all_reduce(flag, dist.ReduceOp.MAX)
-                stop = int(flag)
-            if stop:
-                why = ("steps", "time", "signal")[stop]
+            if self.stop_requested or self.elapsed_s >= time_limit_s:
+                why = "signal" if self.stop_requested else "time"
                 break
             if now - saved > 60 * options.checkpoint_minutes:
                 self.save()
@@ -169,42 +150,36 @@ class Trainer:
 
     def evaluate(self) -> dict[str, Any]:
         """Figures of the exported network on development samples, also into the log."""
-        if self.rank != 0:
-            return {}
         results = self.task.evaluate(self.exported)
         self._log({"event": "evaluation", "results": results})
         return results
 
     def _log(self, entry: dict[str, Any]) -> None:
-        if self.rank != 0:
-            return
         entry = {key: getattr(self, key) for key in PROGRESS} | entry
         if self.folder is not None:
             with (self.folder / LOG).open("a", encoding="utf-8") as file:
                 file.write(json.dumps(entry) + "\n")
-        if self.report is not None:
-            self.report(entry)
+        self.report(entry)
 
     @property
     def _parts(self) -> dict[str, Any]:
         """What has a state beside the progress."""
-        parts = {"network": self.network, "optimizer": self.optimizer, "ema": self.ema}
-        return {name: part for name, part in parts.items() if part is not None}
+        parts = {"network": self.network, "optimizer": self.optimizer}
+        return parts | ({} if self.exported is self.network else {"ema": self.exported})
 
     def save(self) -> None:
         """Write ``checkpoint.pt``: everything that a later process needs to go on."""
-        if self.folder is None or self.rank != 0:
-            return
-        state = {name: part.state_dict() for name, part in self._parts.items()}
-        progress = {key: getattr(self, key) for key in PROGRESS}
-        with atomic_write(self.folder / CHECKPOINT, "wb") as file:
-            torch.save(state | {"record": self.record, "progress": progress}, file)
+        if self.folder is not None:
+            state: dict[str, Any] = {name: part.state_dict() for name, part in self._parts.items()}
+            state["progress"] = {key: getattr(self, key) for key in PROGRESS}
+            with atomic_write(self.folder / CHECKPOINT, "wb") as file:
+                torch.save(state | {"record": self.record}, file)
 
     def start_from(self, weights: dict[str, torch.Tensor], name: str) -> None:
         """Take the weights of another network of the same shapes; everything else starts anew."""
         with _reading(name):
-            for network in filter(None, (self.network, self.ema)):
-                network.load_state_dict(weights)
+            self.network.load_state_dict(weights)
+            self.exported.load_state_dict(weights)
 
     def resume(self) -> bool:
         """Go on where the folder's checkpoint ended, if there is one of the same options and data.
@@ -216,12 +191,13 @@ class Trainer:
             return False
         path = self.folder / CHECKPOINT
         state = read_checkpoint(path, self.device)
-        changed = difference(state["record"], self.record)
-        if changed:
-            raise InputError(
-                f"{path}: is of a run with other options: {changed}. Choose another folder, or "
-                f"train anew with --overwrite."
-            )
+        before, now = ({**r["options"], "data": r["data"]} for r in (state["record"], self.record))
+        for name in sorted((before | now).keys() - FREE_TO_CHANGE):
+            if before.get(name) != now.get(name):
+                raise InputError(
+                    f"{path}: is of a run with another {name}: it was {before.get(name)!r}, now "
+                    f"{now.get(name)!r}. Choose another folder, or train anew with --overwrite."
+                )
         with _reading(str(path)):
             for name, part in self._parts.items():
                 part.load_state_dict(state[name])
@@ -248,25 +224,10 @@ def read_checkpoint(path: Path, device: torch.device | str = "cpu") -> dict[str,
         return {**state, "record": state["record"]}
 
 
-def difference(before: dict[str, Any], now: dict[str, Any]) -> str:
-    """First key in which two records differ, with both values; empty if they agree."""
-    free = {f"options.{name}" for name in FREE_TO_CHANGE}
-    old, new = _flat("", before), _flat("", now)
-    for key in old | new:
-        if key not in free and old.get(key) != new.get(key):
-            return f"{key} was {old.get(key)!r}, now {new.get(key)!r}"
-    return ""
-
-
-def _flat(place: str, value: Any) -> dict[str, Any]:
-    """Values of nested mappings by their keys, joined with dots."""
-    if not isinstance(value, dict):
-        return {place.strip("."): value}
-    return {k: v for key, x in value.items() for k, v in _flat(f"{place}.{key}", x).items()}
-
-
 def _means(entries: list[dict[str, float]]) -> dict[str, float]:
-    """Mean of each figure over the entries in which all figures are finite."""
-    good = [e for e in entries if all(math.isfinite(value) for value in e.values())]
-    names = dict.fromkeys(name for entry in good for name in entry)
-    return {name: statistics.fmean(e[name] for e in good if name in e) for name in names}
+    """Mean of each figure over the updates in which it is finite."""
+    values = defaultdict(list)
+    for name, value in (item for entry in entries for item in entry.items()):
+        if math.isfinite(value):
+            values[name].append(value)
+    return {name: float(np.mean(found)) for name, found in values.items()}

@@ -59,18 +59,9 @@ def collate(samples: Sequence[Sample]) -> TrainingBatch:
 
     K = stack("K")
     inputs = assemble_aligned(stack("flow"), stack("depth_prev"), stack("depth_curr"), K)
-    for b, sample in enumerate(samples):
-        if sample.rays is not None:
-            inputs.rays[b] = torch.from_numpy(sample.rays).permute(2, 0, 1)
-    targets = LossTargets(
-        rotation_deg=stack("rotation_deg"),
-        translation=stack("translation"),
-        ego_flow=stack("ego_flow").permute(0, 3, 1, 2),
-        depth_prev=stack("depth_true"),
-        depth_curr=stack("depth_target"),
-        K_prev=K,
-        K_curr=K,
-    )
+    ego_flow = stack("ego_flow").permute(0, 3, 1, 2)
+    depths = stack("depth_true"), stack("depth_target")
+    targets = LossTargets(stack("rotation_deg"), stack("translation"), ego_flow, *depths, K, K)
     return TrainingBatch(inputs, targets, stack("moving"))
 
 
@@ -119,17 +110,17 @@ def evaluate_network(
                 output = predict(network, batch.inputs, selection)
             errors.append(_errors(output, batch, selection))
             if isinstance(output, PixelwisePrediction) and output.log_scale_rotation is not None:
-                pixels += _uncertainty(output, batch)
+                pixels.append(_uncertainty(output, batch))
     network.train(was_training)
-    table = np.concatenate(errors)
+    ours, zero = np.split(np.concatenate(errors), 2, axis=1)
     result: dict[str, Any] = {"seed": seed, "count": count}
     for i, name in enumerate(FIGURES):
-        result[name] = float(table[:, i].mean())
-        result[f"zero_{name}"] = float(table[:, 3 + i].mean())
-        result[f"median_{name}"] = float(np.median(table[:, i]))
-    result["epe_of_pairs"] = [round(float(x), 5) for x in table[:, 2]]
-    for i, half_name in enumerate(("rotation", "translation")):
-        result |= _uncertainty_figures(pixels, i, half_name)
+        result[name], result[f"zero_{name}"] = float(ours[:, i].mean()), float(zero[:, i].mean())
+        result[f"median_{name}"] = float(np.median(ours[:, i]))
+    result["epe_of_pairs"] = [round(float(x), 5) for x in ours[:, 2]]
+    for half, name in enumerate(("rotation", "translation")):
+        figures = _uncertainty_figures([p for batch in pixels for p in batch[half]])
+        result |= {f"{key}_{name}": value for key, value in figures.items()}
     return result
 
 
@@ -143,50 +134,46 @@ def _errors(output: NetworkOutput, batch: TrainingBatch, selection: str) -> np.n
     # Sky has no depth to reproject; a point behind the camera has no flow: neither counts.
     counts = defined & near
     total = (defined | ~near).flatten(1).sum(1).clamp(min=1)
-
-    def epe(difference: torch.Tensor) -> torch.Tensor:
-        error = torch.where(counts[:, None], difference.abs(), 0.0).mean(dim=1)
-        return error.flatten(1).sum(1) / total
-
-    def errors(r: torch.Tensor, t: torch.Tensor, f: torch.Tensor) -> list[torch.Tensor]:
-        return [r.abs().mean(1), t.abs().mean(1), epe(f)]
-
-    ours = errors(rotation - gt.rotation_deg, translation - gt.translation, flow - gt.ego_flow)
-    zero = errors(gt.rotation_deg, gt.translation, gt.ego_flow)
-    return torch.stack(ours + zero, dim=1).float().cpu().numpy()
+    columns = []
+    for r, t, f in ((rotation, translation, flow), (0.0, 0.0, torch.zeros_like(flow))):
+        error = torch.where(counts[:, None], (f - gt.ego_flow).abs(), 0.0).mean(dim=1)
+        columns += [(r - gt.rotation_deg).abs().mean(1), (t - gt.translation).abs().mean(1)]
+        columns.append(error.flatten(1).sum(1) / total)
+    return torch.stack(columns, dim=1).float().cpu().numpy()
 
 
-def _uncertainty(output: PixelwisePrediction, batch: TrainingBatch) -> list[np.ndarray]:
-    """Per pair (N, 11) of its pixels: moving; of both halves mean s, mean |error|, |error| / U."""
+def _uncertainty(output: PixelwisePrediction, batch: TrainingBatch) -> list[list[np.ndarray]]:
+    """Of both halves, each pair's pixels (N, 6): moving, mean s, mean |error|, |error| / U."""
     gt, size = batch.targets, batch.moving.shape[1:]
-    maps = [batch.moving[:, None].float()]
+    pick = np.s_[..., ::4, ::4]  # enough for the figures
+    halves = []
     for value, s, target in (
         (output.rotation, output.log_scale_rotation, gt.rotation_deg),
         (output.translation, output.log_scale_translation, gt.translation),
     ):
         assert s is not None
         error = (value - target[:, :, None, None]).abs()
-        half = [s.mean(1, keepdim=True), error.mean(1, keepdim=True), error * (-s).exp()]
-        maps.append(F.interpolate(torch.cat(half, dim=1).float(), size=size, mode="nearest"))
-    pick = np.s_[..., ::4, ::4]  # enough for the figures
-    table, valid = torch.cat(maps, dim=1)[pick].permute(0, 2, 3, 1), batch.inputs.valid[pick]
-    return [table[b][valid[b]].cpu().numpy() for b in range(len(batch))]
+        maps = [s.mean(1, keepdim=True), error.mean(1, keepdim=True), error * (-s).exp()]
+        table = F.interpolate(torch.cat(maps, dim=1).float(), size=size, mode="nearest")
+        table = torch.cat([batch.moving[:, None].float(), table], dim=1)[pick].permute(0, 2, 3, 1)
+        pairs = zip(table, batch.inputs.valid[pick], strict=True)
+        halves.append([pair[valid].cpu().numpy() for pair, valid in pairs])
+    return halves
 
 
-def _uncertainty_figures(pixels: list[np.ndarray], index: int, name: str) -> dict[str, Any]:
+def _uncertainty_figures(pairs: list[np.ndarray]) -> dict[str, float | None]:
     """Figures of one half; the rank correlation is the mean of that inside each pair."""
-    keys = [f"{key}_{name}" for key in ("auroc", "spearman", "laplace_ratio", "median_ratio")]
-    if not pixels:
-        return dict.fromkeys(keys)
-    table, first = np.concatenate(pixels), 1 + 5 * index
-    ratio = table[:, first + 2 : first + 5]
+    if not pairs:
+        return dict.fromkeys(("auroc", "spearman", "laplace_ratio", "median_ratio"))
+    table = np.concatenate(pairs)
     # where s or the error is constant there is no rank correlation
-    halves = [p[:, first : first + 2] for p in pixels if len(p)]
-    ranks = [spearmanr(x).statistic for x in halves if np.ptp(x, axis=0).all()]
-    spearman = float(np.mean(ranks)) if ranks else None
-    auroc = area_under_curve(table[:, first], table[:, 0] > 0.5)
-    values = (auroc, spearman, float(ratio.mean()), float(np.median(ratio)))
-    return dict(zip(keys, values, strict=True))
+    listed = [p[:, 1:3] for p in pairs if len(p) and np.ptp(p[:, 1:3], axis=0).all()]
+    return {
+        "auroc": area_under_curve(table[:, 1], table[:, 0] > 0.5),
+        "spearman": float(np.mean([spearmanr(x).statistic for x in listed])) if listed else None,
+        "laplace_ratio": float(table[:, 3:].mean()),
+        "median_ratio": float(np.median(table[:, 3:])),
+    }
 
 
 def calibrate_scales(

@@ -29,7 +29,7 @@ PRIOR = CASE | {"without": {"median": 0.06, "failed": 0, "unflagged": 0}}
 
 
 def figures(case: dict[str, Any], name: str = "heavy/dis/hybrid", **head: Any) -> dict[str, Any]:
-    return {"inputs": "a", "processor": "p", "cases": {name: copy.deepcopy(case)}} | head
+    return {"processor": "p", "cases": {name: copy.deepcopy(case)}} | head
 
 
 def words(old: dict[str, Any], new: dict[str, Any]) -> list[str]:

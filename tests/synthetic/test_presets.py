@@ -9,6 +9,7 @@ from hybridvo.errors import FormatError, InputError
 from hybridvo.synthetic.dataset import PRESETS, load_preset, read_yaml
 from hybridvo.synthetic.diverse import DiverseOptions
 from hybridvo.synthetic.layered import PaperOptions
+from hybridvo.synthetic.rendered import RenderedOptions
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 
@@ -16,6 +17,7 @@ CONFIGS = Path(__file__).parents[2] / "configs"
 def test_preset_files_equal_the_defaults():
     assert load_preset(CONFIGS / "data_paper.yaml") == PaperOptions()
     assert load_preset(CONFIGS / "data_diverse.yaml") == DiverseOptions()
+    assert load_preset(CONFIGS / "data_rendered.yaml") == RenderedOptions()
     small = load_preset(CONFIGS / "data_paper.yaml", size=(64, 128))
     assert small == PaperOptions(height=64, width=128)
 

@@ -12,8 +12,6 @@ import torch
 from hybridvo.errors import FormatError, InputError
 from hybridvo.network.models import load_weights
 from hybridvo.network.selector_net import SelectorNetworkOptions
-from hybridvo.synthetic import dataset as stored
-from hybridvo.synthetic.draws import sample_generator
 from hybridvo.training import selector_data
 from hybridvo.training.options import SelectorOptions, load_selector_options
 from hybridvo.training.selector_task import (
@@ -54,8 +52,8 @@ def test_ground_truth_explains_the_static_pixels(shards):
             v = K[1] * Y / Z + K[3] - inputs.target[b, 1]
             distance = torch.sqrt(u * u + v * v) * 1024 / inputs.width[b]
             usable = inputs.usable[b] & (z > 0)
-            static = usable & (batch.label[b] == stored.STATIC)
-            moving = usable & (batch.label[b] == stored.MOVING)
+            static = usable & (batch.label[b] == selector_data.STATIC)
+            moving = usable & (batch.label[b] == selector_data.MOVING)
             if moving.sum() > 50 and static.sum() > 50:
                 assert distance[static].median() < distance[moving].median()
 
@@ -82,7 +80,7 @@ def test_training_learns_and_goes_on(shards, tmp_path):
     expected, got = trainer.update(batch, 0.5), other.update(batch, 0.5)
     assert got == pytest.approx(expected, rel=1e-5)
     with pytest.raises(InputError, match="no shards"):
-        next(SelectorTask(options, tmp_path / "nothing").batches(0, 0, 0, 1))
+        next(SelectorTask(options, tmp_path / "nothing").batches(0, 0))
     figures = evaluate_selector(trainer.exported, sorted(shards.glob("*.npz"))[:1], 1)
     assert all(row["best"] <= row["final"] for row in figures.values())
 
@@ -104,18 +102,3 @@ def test_a_file_that_is_no_shard_is_refused(tmp_path, content):
         np.savez(path, **({} if content == "empty" else {"x": np.zeros(3)}))
     with pytest.raises(FormatError, match="0_8x8"):
         next(read_batches([path], 4, None))
-
-
-def test_rendered_samples_train_the_pixel_wise_networks(shards, tmp_path):
-    options = stored.RenderedOptions(str(shards), str(shards))
-    sample = options.sample(sample_generator(0, 1))
-    assert sample.flow.shape == (128, 256, 2) and sample.rays is not None
-    assert options.for_evaluation().folder == str(shards)
-    # static pixels with true depth and flow obey the true motion, seen in any mirror
-    ok = np.isfinite(sample.flow).all(-1) & ~sample.moving & (sample.depth_true > 0)
-    error = np.linalg.norm(sample.flow - sample.ego_flow, axis=-1)[ok]
-    assert np.median(error) < 2.0
-    with pytest.raises(InputError, match="no shards"):
-        stored.RenderedOptions(str(tmp_path)).sample(sample_generator(0, 0))
-    with pytest.raises(InputError, match="held_out"):
-        stored.RenderedOptions(str(shards)).for_evaluation()

@@ -27,11 +27,8 @@ def test_workers_change_nothing(mixture):
         assert torch.equal(a, b)
 
 
-def test_ranks_share_one_stream_that_resumes_at_an_index(mixture):
+def test_a_stream_goes_on_at_an_index(mixture):
     one = flows(SampleStream(mixture, 1, 0, 4), 2)
-    ranks = [flows(SampleStream(mixture, 1, 0, 2, rank, 2), 2) for rank in (0, 1)]
-    for step in range(2):
-        assert torch.equal(one[step], torch.cat([ranks[0][step], ranks[1][step]]))
     assert torch.equal(flows(SampleStream(mixture, 1, 4, 4), 1)[0], one[1])
 
 

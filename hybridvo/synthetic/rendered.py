@@ -1,0 +1,242 @@
+"""Rendered pairs for trainings, of none of the families that are measured on.
+
+Streets, halls, hills, walls and tables, in which the bodies of :mod:`hybridvo.synthetic.bodies`
+move, alone or together, free or followed by the camera.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydantic import Field
+from scipy.spatial.transform import Rotation
+
+from hybridvo.flow import dis_flow
+from hybridvo.geometry import invert, make_transform, se3_exp
+from hybridvo.options import option_group
+from hybridvo.synthetic.bodies import BODIES, SHAPES, Mover, draw_look, mover
+from hybridvo.synthetic.draws import about, affine, any_turn, carried, log_uniform, turn
+from hybridvo.synthetic.layered import KnownPair, Sample, camera_flow
+from hybridvo.synthetic.raycast import BOX, CYLINDER, ELLIPSOID
+from hybridvo.synthetic.render import Scene, Solid
+from hybridvo.synthetic.scenes import sized
+from hybridvo.synthetic.sensors import SensorOptions, degrade_depth, noisy_flow, sample_at
+from hybridvo.types import Camera, Frame, FramePair
+
+
+class _Surroundings:
+    """What stands still, metres; ``view``: tangents of half the fields of view."""
+
+    def __init__(self, rng: np.random.Generator, view: np.ndarray) -> None:
+        self.rng, self.view = rng, view
+        self.solids: list[Solid] = []
+        kinds = (self.street, self.hall, self.hills, self.wall, self.table)
+        kinds[int(rng.integers(len(kinds)))]()
+        # close to the camera, from a pole to one that fills half of the image
+        self.scatter(4 * rng.random() ** 2, SHAPES, 0.04, 1.0, (1.3, 4.0))
+
+    def add(self, half: ArrayLike, centre: ArrayLike, T: np.ndarray | None = None) -> None:
+        """A box; in a frame."""
+        A = affine(half, centre)
+        self.solids.append(Solid(BOX, A if T is None else carried(T, A), **draw_look(self.rng)))
+
+    def scatter(
+        self,
+        count: float,
+        shapes: tuple[int, ...],
+        low: ArrayLike,
+        high: ArrayLike,
+        depths: tuple[float, float],
+        floor: float | None = None,
+        reach: tuple[float, float] | np.ndarray | None = None,
+        T: np.ndarray | None = None,
+    ) -> None:
+        """Add things of half axes ``low`` to ``high``, over the view or over ``reach`` (x, y).
+
+        Upright on the ``floor``, or turned anyhow in the air; in the frame ``T``.
+        """
+        rng = self.rng
+        for _ in range(round(count)):
+            half = np.exp(rng.uniform(np.log(low), np.log(high), 3))
+            z, R = rng.uniform(*depths) + half.max(), any_turn(rng)
+            x, y = rng.uniform(-1.1, 1.1, 2) * np.asarray(self.view * z if reach is None else reach)
+            if floor is not None:
+                y, R = floor - half[1], Rotation.from_euler("y", rng.uniform(0, 1.5)).as_matrix()
+            A = affine(half, (x, y, z), R)
+            A = A if T is None else carried(T, A)
+            self.solids.append(Solid(int(rng.choice(shapes)), A, **draw_look(rng)))
+
+    def street(self) -> None:
+        """Ground, rows of houses and poles, open to the sky."""
+        floor, side = self.rng.uniform(1.2, 2.2), self.rng.uniform(8, 13)
+        self.add((80, 0.5, 80), (0, floor + 0.5, 60))
+        for x in (-side, side):
+            row = make_transform(np.eye(3), np.array([x, 0, 0]))
+            self.scatter(12, (BOX,), (1.5, 1.5, 1), (3.5, 7, 4), (0, 45), floor, (1.5, 0), row)
+        poles = (0.05, 1.5, 0.05), (0.12, 3.5, 0.12)
+        self.scatter(self.rng.uniform(0, 7), (CYLINDER,), *poles, (0, 25), floor)
+
+    def hall(self) -> None:
+        """A closed room with columns and benches, and lamps in the air."""
+        rng = self.rng
+        low, high = -rng.uniform((3, 2, 4), (9, 5, 4.1)), rng.uniform((3, 1, 7), (9, 2.2, 26))
+        self.add((high - low) / 2, (high + low) / 2)
+        tall, reach = (high[1] - low[1]) / 2, (0.8 * min(high[0], -low[0]), 0.7 * low[1])
+        far, columns = high[2] - tall, ((0.1, tall, 0.1), (0.35, tall, 0.35))
+        self.scatter(rng.uniform(0, 16), (BOX, CYLINDER), *columns, (0, far), high[1], reach)
+        self.scatter(rng.uniform(2, 12), (BOX,), 0.15, 0.7, (2.0, far), high[1], reach)
+        self.scatter(rng.uniform(0, 6), (BOX, ELLIPSOID), 0.1, 0.5, (2.5, far), reach=reach)
+
+    def hills(self) -> None:
+        """Mounds under the sky, with stems and crowns."""
+        rng, floor = self.rng, self.rng.uniform(0.8, 2.5)
+        self.add((90, 0.5, 90), (0, floor + 0.5, 70))
+        self.scatter(rng.uniform(4, 11), (ELLIPSOID,), (2, 0.5, 2), (9, 4, 6), (4, 45), floor + 1)
+        self.scatter(
+            rng.uniform(0, 10), (CYLINDER,), (0.1, 1, 0.1), (0.15, 2, 0.15), (2, 25), floor
+        )
+        self.scatter(rng.uniform(0, 10), (ELLIPSOID,), 0.5, 1.4, (3, 25), floor - 1.5)
+
+    def wall(self) -> None:
+        """One slanted wall with relief, all there is to see."""
+        rng, z = self.rng, self.rng.uniform(3, 12)
+        angles = rng.normal(0, (15, 25, 90))
+        R = Rotation.from_euler("xyz", angles, degrees=True).as_matrix()
+        T = make_transform(R, np.array([0, 0, z]))
+        self.add((25, 25, 0.3), (0, 0, 0.3), T)
+        count, reach = rng.uniform(2, 16), self.view * z
+        self.scatter(count, SHAPES, 0.1, 0.8, (-0.8, 0.0), reach=reach, T=T)
+
+    def table(self) -> None:
+        """Looking down at a table with things on it, a wall behind."""
+        rng, z = self.rng, self.rng.uniform(2, 5)
+        R = Rotation.from_euler("x", rng.uniform(15, 50), degrees=True).as_matrix()
+        T = make_transform(R, np.array([0, 0.35 * z, z]))
+        self.add((12, 0.1, 3), (0, 0.1, 0), T)
+        self.add((20, 12, 0.3), (0, 0, z + rng.uniform(3, 7)))
+        count, reach = rng.uniform(4, 18), (self.view[0] * z, 0)
+        self.scatter(count, SHAPES, 0.08, 0.4, (-1.5, 2.2), 0.0, reach, T)
+
+
+def _movers(rng: np.random.Generator, view: np.ndarray, T_world_cam: np.ndarray) -> list[Mover]:
+    """Bodies, each with a motion of its own or a common one."""
+    many = rng.random() < 0.25
+    count = int(rng.integers(4, 11)) if many else int(rng.integers(1, 4))
+    follow, together, alike = rng.random(3) < (0.45, 0.3, 0.5)
+    kinds = rng.integers(len(BODIES), size=1 if alike else count)
+    own, movers = np.eye(4), []
+    for number in range(count):
+        z = rng.uniform(1.8, 7.0)
+        radius = log_uniform(rng, (0.08 if many or number else 0.3, 0.7)) * np.sqrt(view.prod()) * z
+        centre = np.array([*(rng.uniform(-0.95, 0.95, 2) * view * z), z])
+        # flat enough for a large body not to reach the camera
+        flat = np.diag([radius, radius, min(rng.uniform(0.4, 1.0) * radius, 0.5 * z)])
+        place = make_transform(flat @ any_turn(rng), centre)
+        if not (together and number):
+            # where the camera goes along, what is left of the motion in the image is small
+            left = log_uniform(rng, (0.03, 1.0)) if follow else 1.0
+            t = log_uniform(rng, (0.003, 0.07)) * z * rng.standard_normal(3) * (1, 0.7, 0.7)
+            own = about(turn(rng, left * log_uniform(rng, (0.15, 6.0))), centre, left * t)
+            own = T_world_cam @ own if follow else own
+        parts = BODIES[int(kinds[number % len(kinds)])](rng)
+        movers.append(mover(rng, parts, np.stack([place, own @ place]), nearest=0.4))
+    return movers
+
+
+def training_scene(rng: np.random.Generator, height: int, width: int) -> Scene:
+    """Scene of two frames."""
+    spread = np.tan(np.radians(rng.uniform(34, 100) / 2))
+    aspect = log_uniform(rng, (0.8, 1.25)) if rng.random() < 0.3 else 1.0
+    u, v = np.array([width - 1, height - 1]) / 2 + rng.normal(0, 0.03, 2) * width
+    camera = Camera(width / 2 / spread, aspect * width / 2 / spread, u, v, height, width)
+    view = np.array([spread, spread * height / width / aspect])
+    # some do not turn, some stay where they are, a third goes along its axis
+    moves, turns, ahead = rng.random(3) < (0.95, 0.95, 0.3)
+    angle, length = np.radians(log_uniform(rng, (0.1, 6.0))), log_uniform(rng, (0.005, 0.25))
+    step = np.repeat([length * moves, 0.6 * angle * turns], 3) * rng.standard_normal(6)
+    T = se3_exp(step * (0.3, 0.2, 1, 1, 1, 1) if ahead else step)
+    light = rng.standard_normal(3) * (1, 0.5, 1) - (0, 0.8, 0)
+    noise = float(rng.choice([0.0, rng.uniform(0, 4)]))
+    path, solids = np.stack([np.eye(4), T]), tuple(_Surroundings(rng, view).solids)
+    texture = int(rng.integers(2**31))
+    scene = Scene((camera, camera), path, solids, texture, tuple(light.tolist()), noise)
+    share = rng.choice([0.0, rng.uniform(0, 0.3), rng.uniform(0.3, 0.87)], p=[0.06, 0.3, 0.64])
+    if share:
+        scene = sized(scene, _movers(rng, view, T), float(share), (0.15, 6.0))[0]
+    # from a desk to a street
+    s = log_uniform(rng, (0.2, 3.0))
+    path[:, :3, 3] *= s
+    solids = tuple(
+        replace(x, A_world_body=s * x.A_world_body, wavelength=s * x.wavelength)
+        for x in scene.solids
+    )
+    return replace(scene, solids=solids)
+
+
+def any_noise(rng: np.random.Generator, flow: np.ndarray) -> np.ndarray:
+    """White noise and gross errors, as in the benchmark's cells but of any strength."""
+    share = rng.uniform(0, 0.3) if rng.random() < 0.5 else 0.0
+    return noisy_flow(rng, flow, log_uniform(rng, (0.02, 1.0)), share, 0.06 * flow.shape[1])[0]
+
+
+def rendered_pairs(rng: np.random.Generator, height: int, width: int) -> dict[str, KnownPair]:
+    """The same scene with true and with DIS flow."""
+    scene = training_scene(rng, height, width)
+    camera, T = scene.cameras[0], invert(scene.T_world_cam[1]) @ scene.T_world_cam[0]
+    frames = [scene.render(k) for k in (0, 1)]
+    flow, _, moving = scene.flow(0)
+    depth = [np.where(np.isfinite(f.depth), f.depth, 0).astype(np.float32) for f in frames]
+    # of the movers' pixels those whose flow the camera alone does not explain
+    own = np.nan_to_num(flow) - camera_flow(camera.K, depth[0], T)[0]
+    moving &= np.square(own).sum(axis=2) > (0.5 * camera.width / 1024) ** 2
+    truth = T, depth[0], moving
+    if rng.random() < 0.5:
+        depth = degrade_depth(rng, depth, SensorOptions())
+    second = rng.random() > 0.1
+    if rng.random() < 0.3:
+        flow = any_noise(rng, flow)
+    prev = Frame(frames[0].rgb, depth[0], camera)
+    curr = Frame(frames[1].rgb, depth[1] if second else None, camera)
+    field = dis_flow()(prev, curr)
+    estimated = FramePair(prev, curr, field.flow, field.variance, field.valid)
+    return {
+        "rendered": KnownPair(FramePair(prev, curr, np.ascontiguousarray(flow)), *truth),
+        "dis": KnownPair(estimated, *truth),
+    }
+
+
+@option_group
+class RenderedOptions:
+    """Rendered scenes with movers of every kind; the flow is true, noisy or of DIS."""
+
+    height: Annotated[int, Field(ge=32)] = 128
+    width: Annotated[int, Field(ge=32)] = 256
+    preset: Literal["rendered"] = "rendered"
+
+    def sample(self, rng: np.random.Generator) -> Sample:
+        """One pair."""
+        known = rendered_pairs(rng, self.height, self.width)[
+            "dis" if rng.random() < 0.5 else "rendered"
+        ]
+        pair, K, T = known.pair, known.pair.prev.camera.K, known.T_curr_prev
+        assert pair.flow is not None and pair.prev.depth is not None
+        valid = np.isfinite(pair.flow).all(axis=-1)
+        if pair.flow_valid is not None:
+            valid &= pair.flow_valid
+        flow = np.where(valid[..., None], pair.flow, 0)
+        ego_flow, ratio = camera_flow(K, known.depth, T)
+        curr = np.zeros_like(known.depth) if pair.curr.depth is None else pair.curr.depth
+        return Sample(
+            flow=np.where(valid[..., None], flow, np.nan).astype(np.float32),
+            ego_flow=ego_flow,
+            depth_prev=pair.prev.depth,
+            depth_curr=sample_at(curr, flow),
+            depth_true=known.depth,
+            depth_target=np.maximum(known.depth * ratio, 0),
+            K=K.astype(np.float32),
+            T_curr_prev=T.astype(np.float32),
+            moving=known.moving,
+        )
