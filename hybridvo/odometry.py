@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -392,7 +391,6 @@ def _models(network: Any, method: str, options: Options) -> Models:
         return network
     if network in ("default", None):
         return default_models(options.run.device if networks_of(method) else "cpu")
-    from hybridvo.network.weights import pretrained
+    from hybridvo.network.weights import weights_file
 
-    file = network if Path(network).is_file() else pretrained(network)
-    return Models(options.run.device, {"selector": file})
+    return Models(options.run.device, {"selector": weights_file(network)})

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 from benchmark import heavy_pairs
-from benchmark_semi_real import WRONG_FACTOR, WRONG_PX, calibration_error, draw
+from benchmark_semi_real import WRONG_FACTOR, WRONG_PX, calibration_error, draw, static_part
 from golden_inputs import HEAVY
 from measuring import auroc, ego_flow_error, parser_of
 from scipy.optimize import minimize
@@ -84,10 +84,7 @@ def pairs(args: argparse.Namespace) -> Iterator[tuple[Any, np.ndarray, np.ndarra
     recordings = load_split(args.data, "development")
     for k in range(args.pairs):
         drawn = draw("development", k, recordings)
-        depth = np.where(drawn.moving, 0, drawn.depth)
-        told = refine(drawn.pair, weights=(~drawn.moving).astype(np.float32))
-        limit = ego_flow_error(told.T_curr_prev, drawn.T_curr_prev, depth, drawn.pair)
-        yield drawn.pair, drawn.T_curr_prev, depth, limit
+        yield drawn.pair, drawn.T_curr_prev, *static_part(drawn)
     for kind in HEAVY:
         for seed in HEAVY_SEEDS:
             for flow, pair, T, _ in heavy_pairs(kind, seed):

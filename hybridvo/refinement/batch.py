@@ -139,8 +139,7 @@ def gather_pixels(
     """The pixels of a batch in raster order, or tile by tile where a tile's side is given.
 
     ``with_depth`` joins the current frame's depth. Invalid values are replaced before anything is
-    computed from them, so that neither they nor their gradients spread. Variances are divided by
-    the typical one of their sample, which is held constant.
+    computed from them, so that neither they nor their gradients spread.
     """
     depth = batch.depth_prev
     height, width = depth.shape[1:]

@@ -52,15 +52,12 @@ from hybridvo.results import Reason, Status
 from hybridvo.torch_geometry import left_update, pp, weighted_median
 from hybridvo.types import PairBatch
 
-SUBSET_PIXELS = 2048
-"""Pixels on which starts are refined."""
+SUBSET_PIXELS, STEPS = 2048, 20
+"""Pixels on which starts are refined; most Newton steps on all pixels."""
 LARGEST_PX, SMALLEST_PX, GNC_RATIO = 64.0, 0.4, 0.7
 """Largest and last scale of the graduated kernel, px, and factor from one to the next."""
-STEPS = 20
-"""Most Newton steps on all pixels."""
-ROUNDED_STEP = 0.05
-"""Steps below, in standard deviations of the noise, that no longer shrink are rounding."""
-INLIER_DISTANCE2 = 9.0
+ROUNDED_STEP, INLIER_DISTANCE2 = 0.05, 9.0
+"""Standard deviations below which steps that no longer shrink are rounding; squared, of inliers."""
 CUTOFFS = {"cauchy": 2.385, "huber": 1.345, "l2": 1.0}
 """Standard deviations, 95 % efficient under normal noise (P. J. Huber, Robust Statistics)."""
 DEPTH_NOISE_FLOOR = 2e-3
@@ -80,16 +77,14 @@ def refine_batch(
 ) -> BatchedPose:
     """Camera motion of every pair of a batch by robust dense reprojection.
 
-    Works in the floating type of the flow and depth (half types are raised to float32), outside
-    autocast. Gradients reach flow, depth, intrinsics, variances, weights and noise where one of
-    them requires it; not ``T_init``, on which the estimate does not depend.
+    Works in the floating type of the flow and depth (half types are raised to float32). Gradients
+    reach all but ``T_init``, on which the estimate does not depend.
 
     Args:
         batch: see :class:`~hybridvo.types.PairBatch`.
         T_init: (B, 4, 4) or (B, S, 4, 4) T_curr_prev to start from, in place of one that is not
             finite the identity. Without weights the identity is one more start.
-        weights: (B, H, W) factors on the information; what is not positive and finite switches a
-            pixel off.
+        weights: (B, H, W) factors on the information; not positive or not finite: not used.
         noise: flow noise in px and noise of log depth, as (2,) or (B, 2), and with the current
             frame's depth that of its log; None: estimated.
         kernel: ``geman-mcclure``, with the cutoff of the options, ``cauchy``, ``huber`` or ``l2``.
@@ -127,7 +122,7 @@ def refine_batch(
         T = result.SE3.detach()
         A = newton_matrix(pixels.map(torch.Tensor.detach), T, how)
         g = scores(pixels, residuals(pixels, T), how)[0].sum(dim=2)
-        return replace(result, SE3=attached(T, A, g, ~result.failed))
+        return replace(result, SE3=attached(T, A, g, ~result.failed[:, None]))
 
 
 def _given_noise(noise: Any, like: torch.Tensor, with_depth: bool) -> torch.Tensor | None:
@@ -265,7 +260,7 @@ def _shrink_scale(pixels: Pixels, T: pp.LieTensor, end: torch.Tensor) -> pp.LieT
     scale = torch.maximum((CUTOFF * typical_residual(pixels, at)).clamp(1.0, LARGEST_PX), end)
     going = torch.ones_like(scale, dtype=torch.bool)
     while bool(going.any()):
-        T = stepped(pixels, T, residuals(pixels, T), flow_noise(scale), going)
+        T = stepped(pixels, T, residuals(pixels, T), flow_noise(scale), going[:, None])
         going = going & (scale > end)
         scale = torch.maximum(scale * GNC_RATIO, end)
     return T

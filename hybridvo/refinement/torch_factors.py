@@ -266,11 +266,10 @@ def solve_small(
 
 
 def attached(
-    T: pp.LieTensor, A: torch.Tensor, g: torch.Tensor, wanted: torch.Tensor | bool = True
+    T: pp.LieTensor, A: torch.Tensor, g: torch.Tensor, wanted: torch.Tensor | float = 1.0
 ) -> pp.LieTensor:
     """The same poses with the gradient A^-1 dg: a Newton step whose value is zero."""
-    step, solved = solve_small(A, g)
-    step = torch.where((solved & wanted)[:, None], step, torch.zeros_like(step))
+    step = wanted * solve_small(A, g)[0]
     return left_update(step - step.detach(), T)
 
 
@@ -279,11 +278,10 @@ def stepped(
     T: pp.LieTensor,
     at: Residuals,
     how: RobustNoise,
-    going: torch.Tensor | bool = True,
+    going: torch.Tensor | float = 1.0,
 ) -> pp.LieTensor:
-    """Poses after a Gauss-Newton step of those that are ``going``; ``at``: their residuals."""
-    step, solved = solve_small(*linearize(pixels, at, how).total(), DAMPING)
-    return left_update(torch.where((solved & going)[:, None], step, torch.zeros_like(step)), T)
+    """Poses after a Gauss-Newton step, times ``going``; ``at``: their residuals."""
+    return left_update(going * solve_small(*linearize(pixels, at, how).total(), DAMPING)[0], T)
 
 
 def flow_noise(scale: torch.Tensor, kernel: str = "geman-mcclure") -> RobustNoise:
@@ -301,9 +299,8 @@ def fit_pixels(pixels: Pixels, start: pp.LieTensor, smallest: float) -> pp.LieTe
     """The motion (B, 7) that pixels agree on under their weights: no noise, covariance or status.
 
     The scale of the kernel follows the residuals, down to ``smallest``. Where the fit explains the
-    weighted median pixel no better than the start, the answer is the start. The gradient goes into
-    the weights alone, from pixels far away with constant strength: a network that has settled on a
-    mover would else never learn of the world.
+    median pixel no better than the start, the answer is the start. The gradient goes into the
+    weights alone, from pixels far away with constant strength: they may be the world.
     """
     with torch.no_grad():
         T, fixed = start, pixels.map(torch.Tensor.detach)

@@ -10,7 +10,7 @@ import pytest
 
 from tests.scripts import ROOT, load_script
 
-compare = load_script("tools/golden_compare.py").compare
+compare = load_script("tools/golden.py").compare
 measuring = load_script("tools/measuring.py")
 
 CASE = {
