@@ -237,16 +237,22 @@ class Looks:
         """(B,) logit of the probability that the chosen motion is right."""
         return network.confidence(self.score, self.hidden, self.owner, len(self.batch))
 
-    def choice_loss(self) -> torch.Tensor:
-        """Cross entropy against a soft target: motions nearly as good as the best share it."""
-        losses = []
+    def choice_losses(self, network: Any) -> tuple[torch.Tensor, torch.Tensor]:
+        """Losses of the choice and of the probability stated with it.
+
+        Cross entropies against soft targets: motions nearly as good as the best share the choice.
+        """
+        choice, right = [], []
         for mine in self.motions():
-            wrong = self.error[mine]
-            best = wrong.min()
-            target = torch.softmax(-(wrong - best) / (0.1 + 0.3 * best), 0)
+            error, score = self.error[mine], self.score[mine]
+            best = error.min()
+            target = torch.softmax(-(error - best) / (0.1 + 0.3 * best), 0)
             weight = 1.0 / (1.0 + (best / 4.0) ** 2)
-            losses.append(-weight * (target * torch.log_softmax(self.score[mine], 0)).sum())
-        return torch.stack(losses).mean()
+            choice.append(-weight * (target * torch.log_softmax(score, 0)).sum())
+            limit = (3 * best).clamp(RIGHT_PX, WORST_RIGHT_PX)
+            right.append(torch.sigmoid((1 - error[score.argmax()] / limit) / RIGHT_SLOPE))
+        trust = F.binary_cross_entropy_with_logits(self.trust(network), torch.stack(right))
+        return torch.stack(choice).mean(), trust
 
     def mask_loss(self, out: SelectorOutput, inputs: SelectorInputs) -> torch.Tensor:
         """Binary cross entropy of masks over usable pixels of known kind."""
@@ -256,16 +262,6 @@ class Looks:
         static = (label == STATIC).float()
         loss = F.binary_cross_entropy_with_logits(out.mask, static, reduction="none")
         return ((loss * known).sum((1, 2)) / known.sum((1, 2)).clamp(min=1)).mean()
-
-    def trust_loss(self, network: Any) -> torch.Tensor:
-        """Binary cross entropy of the probability that the chosen motion is right."""
-        target = []
-        for mine in self.motions():
-            error = self.error[mine]
-            limit = (3 * error.min()).clamp(RIGHT_PX, WORST_RIGHT_PX)
-            chosen = error[self.score[mine].argmax()]
-            target.append(torch.sigmoid((1 - chosen / limit) / RIGHT_SLOPE))
-        return F.binary_cross_entropy_with_logits(self.trust(network), torch.stack(target))
 
 
 class SelectorTask:
@@ -298,18 +294,17 @@ class SelectorTask:
         batch = batch.expecting(np.random.default_rng([o.seed, step])).shown(asked)
         mirror = torch.rand(count, generator=draw) < 0.5
         looks = Looks(model, batch, mirror, o.precision == "bfloat16")
-        losses = {
-            "choice": looks.choice_loss(),
-            "mask": o.mask_weight * looks.mask_loss(looks.first, batch.inputs),
-        }
+        choice, trust = looks.choice_losses(self.network)
+        mask = o.mask_weight * looks.mask_loss(looks.first, batch.inputs)
+        losses = {"choice": choice, "mask": mask}
         if progress >= o.second_look_from:
             # one fit less in half of the updates: cheaper, and the best one is seen most
             fewer = o.refits > 1 and bool(torch.rand((), generator=draw) < 0.5)
             again = looks.again(o.refits - fewer, draw)
             if again is not None:
-                losses["second"] = looks.choice_loss()
+                losses["second"], trust = looks.choice_losses(self.network)
                 losses["second_mask"] = 0.5 * o.mask_weight * looks.mask_loss(*again)
-        losses["trust"] = o.trust_weight * looks.trust_loss(self.network)
+        losses["trust"] = o.trust_weight * trust
         total = torch.stack(list(losses.values())).sum()
         return total, {name: value.detach() for name, value in losses.items()}
 
