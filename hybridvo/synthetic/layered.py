@@ -68,7 +68,7 @@ class KnownPair:
 
     ``depth``: (H, W) metres of the previous frame before the sensor's errors, 0 where unknown;
     ``moving``: (H, W) bool, points that do not follow the camera's motion; ``world``: path of the
-    recording; ``log_depth_curr``: (H, W) of the current frame at x + F where it has no depth map.
+    recording.
     """
 
     pair: FramePair
@@ -76,7 +76,6 @@ class KnownPair:
     depth: np.ndarray
     moving: np.ndarray
     world: str = ""
-    log_depth_curr: np.ndarray | None = None
 
 
 class Layers:
