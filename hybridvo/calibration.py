@@ -53,10 +53,9 @@ CORRECTION_LIMIT = 100.0
 where the trajectory holds, 450 and more after a frame of another place (rendered sequences)."""
 DIS_NOISE = (0.035, 1.2)
 """Flow noise of DIS (medium) per component: std^2 = first^2 + (second * e)^2, px, e the difference
-of the flows in both directions. 18 pairs of the synthetic world (light, static and heavy_two
-scenes): among pixels that disagree by 0.015, 0.035, 0.075, 0.15, 0.25, 0.4, 0.6, 0.9, 1.2 px the
-true error has a (median-based) standard deviation of 0.038, 0.046, 0.077, 0.16, 0.32, 0.53, 0.86,
-1.25, 1.8 px; ``tests/flow`` measures it again."""
+of the flows in both directions. 18 pairs of the synthetic world; among pixels that disagree by
+0.015, 0.075, 0.25, 0.6, 1.2 px the true error has a (median-based) standard deviation of 0.038,
+0.077, 0.32, 0.86, 1.8 px; ``tests/flow`` measures it again."""
 
 MIN_TEXTURED = 0.002
 """Smallest fraction of the image with texture across its weakest direction. Real and rendered
@@ -65,9 +64,8 @@ images have 0.4 to 0.8, at a tenth of their brightness 0.006 to 0.28; a covered 
 FLOW_CONTRADICTION = (0.8, 2.0)
 """A flow contradicts its images where the median difference after warping is above the first ratio
 times that without, while DIS reaches less than 1 / the second of it (less one grey level). 27
-pairs, rendered and real: warped over unwarped is 0.04 to 0.2 for the right flow, up to 0.25 with
-noise of 3 px or 30 % of wrong pixels; 1.3 to 1.8 for a negated or backward flow, 1.0 for none, 0.85
-to 1.2 for twice the flow. Half the flow (0.5 to 0.7) passes."""
+pairs, rendered and real: warped over unwarped is at most 0.25 for the right flow, 0.85 and more for
+a negated, backward or doubled one, 1.0 for none. Half the flow (0.5 to 0.7) passes."""
 
 # The numbers below have no unit. They were fitted on the development seeds of the scenarios
 # (``tools/benchmark.py``), on rendered walks with DIS flow, and on the real samples.
@@ -77,28 +75,25 @@ FEW_TILES = 48
 CLUSTERED = 0.6
 """Share of the clustered matrix in the meat, the rest is that of independent errors scaled to the
 same mean. Alone the few blocks make weak directions too certain at times (4 of 420 development
-pairs of cells beyond 3 sigma, 0 with this share); the other makes all directions equally bad,
-though errors of depth leave some of them alone."""
+pairs of cells beyond 3 sigma, 0 with this share); the other makes all directions equally bad."""
 LONG_GROWTH = (1.7, 2.2)
 """Growth of the variance of sums over blocks four tiles wide (kept overlapping) against one tile's,
 in units of independent errors, between which the errors come to count as reaching beyond the
-blocks. Median and 95 % quantile over development pairs: 1.0 and 1.5 of independent noise,
-1.0 to 1.3 and 1.8 to 2.7 of the cells (24 px in tiles of 64 px), 2.2 to 3.1 the median with DIS
-flow. So every tenth to twentieth pair of noisy cells is doubted more than it should."""
+blocks. Medians over development pairs: 1.0 of independent noise, 1.0 to 1.3 of the cells (24 px in
+tiles of 64 px), 2.2 to 3.1 with DIS flow; every tenth pair of noisy cells is doubted too much."""
 ABSORBED = 2.0
 """The exponent of the growth is taken so much larger: what errors have in common over the whole
-image the fit takes into the motion, so that the residuals show less of it than there is. On
-development sequences with DIS flow (240 pairs) the median squared error in units of the covariance,
-5.3 expected, was 12 with 1.5, 7 to 9 with 2 and 6 to 8 with 2.5."""
+image the fit takes into the motion, so that the residuals show less of it than there is. Median
+squared error in units of the covariance, 5.3 expected, on development sequences with DIS flow (240
+pairs): 12 with 1.5, 7 to 9 with 2, 6 to 8 with 2.5."""
 DOUBTFUL_SPREAD, NO_SPREAD = 0.15, 0.35
 """Of the log ratio of two depths: spread from which an answer is degraded, and from which it is
-none. Two depths with independent noise of s differ by 0.95 s, so these are 16 and 37 % of noise in
-every pixel; real sensors and rendered depth with DIS flow measure 0.001 to 0.018, depth that is
-noise from 0.5 to 10 m 0.49 to 0.6, from 2 to 4 m 0.2."""
+none: 16 and 37 % of noise in every pixel. Real sensors and rendered depth with DIS flow measure
+0.001 to 0.018, depth that is noise from 0.5 to 10 m 0.49 to 0.6."""
 MIN_TILES = 24
 """Tiles of the whole image in which usable pixels lie, below which a covariance cannot be
 trusted: depth errs alike over some 50 px, so that a line across the image holds ten to twenty
-independent readings for six unknowns (3 of 59 development lines were beyond 3 sigma, one by 7)."""
+independent readings for six unknowns (3 of 59 development lines were beyond 3 sigma)."""
 EVEN_PARTS = 0.7
 """Dispersion of the parts' scores, as shares of the model's, below which they agree: rendered pairs
 have 0.25 in the median, 0.55 at the 90th percentile; with a rolling shutter 1.0 and 2.0."""

@@ -1,7 +1,4 @@
-"""Exceptions of hybridvo. Bad input raises one of these; a failed estimate never does.
-
-Every message says what is wrong, where, what was found, what was expected and how to mend it.
-"""
+"""Exceptions of hybridvo. Bad input raises one of these; a failed estimate never does."""
 
 from __future__ import annotations
 

@@ -137,28 +137,34 @@ class Rows(NamedTuple):
             raise FormatError(f"{self.path}:{self.lines[k]}: expected {expected}, got {got}.")
 
 
-def read_rows(path: Path, columns: str, *, words: int = 0) -> Rows:
+def read_rows(path: Path, *columns: str, words: int = 0) -> Rows:
     """Rows of a list file: a number for each of ``columns``, the last ``words`` of them text.
 
-    ``#`` starts a comment; the last word may contain spaces. Commas separate numbers too.
+    Of several ``columns`` those of the first row's number are meant. ``#`` starts a comment; the
+    last word may contain spaces. Commas separate numbers too.
     """
-    count = len(columns.split())
-    rows = Rows(path, [], np.zeros((0, count - words)), [])
-    numbers = []
+    lines: list[int] = []
+    numbers, after = [], []
     for line, text in enumerate(read_text(path).split("\n"), start=1):
-        plain = text.partition("#")[0].replace(",", " ") if not words else text.strip()
+        count = len(columns[0].split())
+        plain = text.strip() if words else text.partition("#")[0].replace(",", " ")
         parts = plain.split(maxsplit=count - 1 if words else -1)
         if not parts or plain.startswith("#"):
             continue
+        if not lines:
+            columns = tuple(c for c in columns if len(c.split()) == len(parts)) or columns
+            count = len(columns[0].split())
         try:
             numbers.append([float(part) for part in parts[: count - words]])
         except ValueError:
             parts = []
         if len(parts) != count:
-            raise FormatError(f"{path}:{line}: expected '{columns}', got {text.strip()[:80]!r}.")
-        rows.lines.append(line)
-        rows.words.append(parts[count - words :])
-    return rows._replace(numbers=np.array(numbers)) if numbers else rows
+            expected = "' or '".join(columns)
+            raise FormatError(f"{path}:{line}: expected '{expected}', got {text.strip()[:80]!r}.")
+        lines.append(line)
+        after.append(parts[count - words :])
+    shape = len(lines), len(columns[0].split()) - words
+    return Rows(path, lines, np.array(numbers).reshape(shape), after)
 
 
 def versions() -> dict[str, str]:

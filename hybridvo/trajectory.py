@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hybridvo.errors import FormatError, InputError
-from hybridvo.files import Rows, atomic_write, read_rows, read_text
+from hybridvo.files import Rows, atomic_write, read_rows
 from hybridvo.geometry import invert, ned_to_camera
 from hybridvo.types import as_rigid, rotation_error, to_numpy
 
@@ -37,17 +37,13 @@ def chain(T_world_prev: np.ndarray, T_curr_prev: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Camera poses over time.
+    """Camera poses over time; what does not fit is an InputError.
 
     Args:
         timestamps: (N,) seconds, strictly increasing; frame numbers where a file has no stamps.
         T_world_cam: (N, 4, 4) camera to world, metres, N >= 1; stored as read-only float64.
         has_timestamps: False where ``timestamps`` are frame numbers.
         warnings: what a reader changed, in sentences.
-
-    Raises:
-        InputError: no pose, shapes that do not match, rotations that are not orthonormal to 1e-6,
-            stamps that do not increase.
     """
 
     timestamps: np.ndarray
@@ -76,9 +72,6 @@ class Trajectory:
 
     def __len__(self) -> int:
         return len(self.timestamps)
-
-    def __repr__(self) -> str:
-        return f"Trajectory({len(self)} poses)"
 
     @property
     def positions(self) -> np.ndarray:
@@ -122,13 +115,8 @@ def read_trajectory(
         axes: axes of the file: ``camera`` (x right, y down, z forward) or ``ned`` (x forward,
             y right, z down; converted to camera axes). ``auto`` is NED for TartanAir's format.
 
-    Returns:
-        The trajectory in camera axes. Stamps in other units than seconds are converted, which
-        ``warnings`` say. KITTI and TartanAir files get frame numbers as stamps.
-
-    Raises:
-        InputError: no such file, an unknown option. FormatError: a damaged row, a pose that is not
-            finite or no rotation, stamps that do not increase; names file and line.
+    Stamps in other units than seconds are converted, which ``warnings`` say. KITTI and TartanAir
+    files get frame numbers as stamps. A FormatError names file and line.
     """
     for name, value, known in (
         ("format", format, ("auto", *COLUMNS)),
@@ -139,31 +127,31 @@ def read_trajectory(
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path}: trajectory file cannot be read: no such file.")
-    kind = _format_of(path) if format == "auto" else format
-    rows, T = read_poses(path, kind)
+    rows, T = read_poses(path, *([COLUMNS[format]] if format in COLUMNS else COLUMNS.values()))
     if not len(T):
         raise FormatError(f"{path}: expected at least one pose, got none.")
     rows.refuse(~np.isfinite(rows.numbers).all(axis=1), "finite numbers: leave unknown poses out")
+    columns = rows.numbers.shape[1]
     stamps, factor, unit = np.arange(len(T)), 1.0, ""
-    if kind == "tum":
+    if columns == 8:
         stamps = rows.numbers[:, 0]
         factor, unit = stamp_unit(stamps)
     rows.refuse(np.diff(stamps, prepend=-np.inf) <= 0, "increasing timestamps, without duplicates")
     warnings = (f"{path}: timestamps are {unit}; converted to seconds.",) if factor != 1 else ()
-    if axes == "ned" or (axes == "auto" and kind == "tartanair"):
+    if axes == "ned" or (axes == "auto" and columns == 7):
         T = ned_to_camera(T)
-    return Trajectory(stamps / factor, T, kind == "tum", warnings)
+    return Trajectory(stamps / factor, T, columns == 8, warnings)
 
 
-def read_poses(path: Path, kind: str) -> tuple[Rows, np.ndarray]:
-    """Rows of a list of a kind of :data:`COLUMNS`, and (N, 4, 4) their poses, NaN if not finite.
+def read_poses(path: Path, *columns: str) -> tuple[Rows, np.ndarray]:
+    """Rows of a list of one of :data:`COLUMNS`, and (N, 4, 4) their poses, NaN if not finite.
 
     A damaged row or what is no rotation is a FormatError with file and line.
     """
-    rows = read_rows(path, COLUMNS[kind])
+    rows = read_rows(path, *columns)
     known = np.isfinite(rows.numbers).all(axis=1)
     T = np.tile(np.eye(4), (len(known), 1, 1))
-    if kind == "kitti":
+    if rows.numbers.shape[1] == 12:
         T[known, :3] = rows.numbers[known].reshape(-1, 3, 4)
         error = rotation_error(T[:, :3, :3])
         rows.refuse(error > FILE_TOLERANCE, "a rotation in columns 1-3, 5-7 and 9-11")
@@ -177,19 +165,6 @@ def read_poses(path: Path, kind: str) -> tuple[Rows, np.ndarray]:
         T[known, :3, 3] = rows.numbers[known, -7:-4]
     T[~known] = np.nan
     return rows, T
-
-
-def _format_of(path: Path) -> str:
-    """Format by the number of columns of the first pose."""
-    kinds = {len(columns.split()): kind for kind, columns in COLUMNS.items()}
-    for line, text in enumerate(read_text(path).split("\n"), start=1):
-        count = len(text.partition("#")[0].split())
-        if count and count not in kinds:
-            expected = "8 numbers (TUM), 12 (KITTI) or 7 (TartanAir) separated by spaces"
-            raise FormatError(f"{path}:{line}: expected {expected}, got {count}.")
-        if count:
-            return kinds[count]
-    return "tum"
 
 
 def check_increasing(stamps: np.ndarray, where: str) -> None:

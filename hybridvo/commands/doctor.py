@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pandas as pd
 
+from hybridvo.calibration import DOUBTFUL_SPREAD
 from hybridvo.commands.compare import methods_to_run
 from hybridvo.data.lists import shown
 from hybridvo.data.sequence import Sequence
@@ -21,7 +22,7 @@ from hybridvo.estimation import estimate
 from hybridvo.evaluation.pair_errors import true_motion
 from hybridvo.files import versions
 from hybridvo.flow import contradiction, dis_flow, file_flow
-from hybridvo.refinement.depth import depth_ratio, is_step
+from hybridvo.refinement.depth import compare_depths
 from hybridvo.results import RelativePose
 from hybridvo.types import Frame, FramePair, depth_advice, typical_depth
 
@@ -123,7 +124,8 @@ def _measure(sequence: Sequence, prev: Frame, curr: Frame) -> dict[str, Any]:
         if length > 0.01:  # metres; along the true one: the noise of a length is always positive
             scale = float(motion.T_curr_prev[:3, 3] @ true[:3, 3]) / length**2
             pair["depth"] = pair["depth"][0], scale
-    pair["depth_ratio"] = depth_ratio(prev, curr, field.flow, motion.T_curr_prev)
+    depths = compare_depths(by_dis, motion.T_curr_prev, motion.weights)
+    pair["depth_ratio"] = None if depths is None else depths.ratio
     pair["shift_costs"] = _shift_costs(by_dis, motion)
     return pair
 
@@ -201,7 +203,8 @@ def _depth_steps(known: pd.Series) -> Answer:
     if known.empty:
         return None, "no pair has a motion and depth in both frames", None
     ratios = known.astype(float)
-    steps, k = sum(map(is_step, ratios)), _furthest(ratios)
+    steps = int((np.log(ratios.clip(lower=1e-30)).abs() > DOUBTFUL_SPREAD).sum())
+    k = _furthest(ratios)
     text = (
         f"depth changes its scale in {steps} of {len(ratios)} pairs, most from frame {k} "
         f"to the next (times {ratios[k]:.3g})"

@@ -63,7 +63,7 @@ class Sequence:
         self.timestamps = np.zeros(0)
         self.poses: np.ndarray | None = None
         self.warnings: list[str] = []
-        self._sources: Files = []  # the other files that were read
+        self._sources: Files = []  # other files that were read, beside those of the root itself
         self._mask_folder = None if mask is None else Path(mask)
         self._given_camera, self._given_scale = camera, depth_scale
         self._list_files()
@@ -100,9 +100,6 @@ class Sequence:
 
     def __len__(self) -> int:
         return len(self.timestamps)
-
-    def __repr__(self) -> str:
-        return f"<{self.kind} sequence {self.name!r}: {len(self)} frames>"
 
     def __getitem__(self, index: int) -> Frame:
         return self.frame(range(len(self))[index])
@@ -155,7 +152,7 @@ class Sequence:
         """Every existing file that the sequence reads, sorted: what a fingerprint covers."""
         frames = (self.rgb_files, self.depth_files, self.flow_files[:-1], self.mask_files)
         found = {path for paths in (self._sources, *frames) for path in paths if path is not None}
-        return sorted(path for path in found if path.is_file())
+        return sorted(path for path in {*found, *self.root.glob("*")} if path.is_file())
 
     def _list_files(self) -> None:
         """Fill in files, stamps, poses, name and sources."""

@@ -61,8 +61,6 @@ class FolderSequence(Sequence):
         self.depth_files = [*depth_of.values()]
         self.flow_files = [flow_of[i] if i + 1 in depth_of else None for i in kept]
         self.timestamps, self.poses = stamps[kept], None if poses is None else poses[kept]
-        lists = (CAMERA_FILE, "timestamps.txt", "depth_timestamps.txt", "poses.txt")
-        self._sources = [root / name for name in lists]
         self.warnings = list(dict.fromkeys(told))
 
     def _calibration(self) -> Calibration | None:

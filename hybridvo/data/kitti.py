@@ -15,7 +15,7 @@ from hybridvo.data.lists import numbered_files, numbered_poses, read_stamps
 from hybridvo.errors import FormatError, InputError
 from hybridvo.files import read_text
 from hybridvo.geometry import invert
-from hybridvo.trajectory import read_poses
+from hybridvo.trajectory import COLUMNS, read_poses
 from hybridvo.types import Camera, Frame
 
 DISPARITY_SIGMA_PX = 0.5
@@ -42,7 +42,6 @@ class KittiSequence(Sequence):
         left, right = ("2", "3") if images["2"] else ("0", "1")
         depth = numbered_files(root / "depth", r"(\d+)\.(?:png|npy)")
         calibration, times = root / "calib.txt", root / "times.txt"
-        self._sources += [calibration, times]
         self._P_left = _read_projection(calibration, left)
         if not depth and images[right]:
             self.depth_source, depth = "stereo", images[right]
@@ -73,7 +72,7 @@ class KittiSequence(Sequence):
                 # the file holds the poses of camera 0
                 T_cam_cam0 = np.eye(4)
                 T_cam_cam0[:3, 3] = np.linalg.solve(self._P_left[:, :3], self._P_left[:, 3])
-                poses = read_poses(path, "kitti")[1] @ invert(T_cam_cam0)
+                poses = read_poses(path, COLUMNS["kitti"])[1] @ invert(T_cam_cam0)
                 self.poses = numbered_poses(numbers, poses)
                 self._sources.append(path)
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from hybridvo.errors import InputError
 from hybridvo.files import read_rows
-from hybridvo.trajectory import check_increasing, read_poses, stamp_unit
+from hybridvo.trajectory import COLUMNS, check_increasing, read_poses, stamp_unit
 
 IMAGES = (".png", ".jpg", ".jpeg")
 MAX_STAMP_DIFFERENCE_S = 0.02
@@ -80,7 +80,7 @@ def numbered_poses(numbers: Many[int], stored: np.ndarray) -> np.ndarray:
 
 def read_timed_poses(path: Path, told: list[str]) -> tuple[np.ndarray, np.ndarray]:
     """Stamps (N,) in seconds and poses (N, 4, 4) of a list ``timestamp tx .. qw``."""
-    rows, poses = read_poses(path, "tum")
+    rows, poses = read_poses(path, COLUMNS["tum"])
     return to_seconds(rows.numbers[:, 0], path.name, told), poses
 
 

@@ -102,17 +102,13 @@ def iter_pairs(
 
     ``flow`` None takes the flow files (where one of many is missing, the pair's flow is None); a
     callable (prev, curr), such as ``hybridvo.dis_flow()``, gives a FlowField or (H, W, 2) px.
-
-    Raises:
-        InputError: a negative range; flow files asked for where there are none, or with a stride.
     """
-    stop = len(sequence) if stop is None else min(stop, len(sequence))
     if stride < 1 or start < 0:
         raise InputError(f"iter_pairs: expected start >= 0 and stride >= 1, got {start}, {stride}.")
     if flow is None:
         sequence.check_flow(stride)
         flow = file_flow(sequence)
-    frames = (sequence.frame(index) for index in range(start, stop, stride))
+    frames = map(sequence.frame, range(len(sequence))[start:stop:stride])
     return (
         check_field(flow(*two), two[0], "callable").pair(*two, sequence.depth_source)
         for two in itertools.pairwise(frames)

@@ -33,7 +33,6 @@ class SevenScenesSequence(Sequence):
             numbered_files(root, r"frame-(\d+)\.depth\.png"),
         )
         files = numbered_files(root, r"frame-(\d+)\.pose\.txt")
-        self._sources = [*files.values()]
         if files:
             self._each_pose([files.get(number) for number in numbers], _read_pose)
 

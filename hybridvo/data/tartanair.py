@@ -11,7 +11,7 @@ from hybridvo.data.camera_file import Calibration
 from hybridvo.data.image_io import read_flow, read_flow_png, read_npy, read_png
 from hybridvo.data.lists import numbered_files, numbered_poses
 from hybridvo.geometry import ned_to_camera
-from hybridvo.trajectory import read_poses
+from hybridvo.trajectory import COLUMNS, read_poses
 
 
 class TartanAirSequence(Sequence):
@@ -45,9 +45,9 @@ class TartanAirSequence(Sequence):
         pose_file = root / f"pose_{camera}.txt"
         if pose_file.exists():
             self.poses = numbered_poses(
-                numbers, ned_to_camera(read_poses(pose_file, "tartanair")[1])
+                numbers, ned_to_camera(read_poses(pose_file, COLUMNS["tartanair"])[1])
             )
-        self._sources = [pose_file, *map(_mask_file, flow.values())]
+        self._sources = [*map(_mask_file, flow.values())]
 
     def _calibration(self) -> Calibration:
         # Field of view 90 degrees over the width: 320 px at 640, c = (size - 1) / 2 because our

@@ -56,24 +56,23 @@ class TumSequence(Sequence):
     def _list_files(self) -> None:
         root, told = self.root, self.warnings
         if (root / "rgb.txt").exists():
-            lists = [root / "rgb.txt", root / "depth.txt"]
             (stamps, rgb), (depth_stamps, depth) = (
-                read_stamps(path, told, "timestamp filename", words=1) for path in lists
+                read_stamps(root / name, told, "timestamp filename", words=1)
+                for name in ("rgb.txt", "depth.txt")
             )
-            pairs = depth_at(stamps, depth_stamps, lists[0], told)
+            pairs = depth_at(stamps, depth_stamps, root / "rgb.txt", told)
             self.timestamps = stamps[[i for i, _ in pairs]]
             self.rgb_files = [root / rgb[i][0] for i, _ in pairs]
             self.depth_files = [root / depth[j][0] for _, j in pairs]
         else:  # stamp depth stamp rgb (ICL-NUIM), or stamp rgb stamp depth
-            lists, columns = [root / "associations.txt"], "timestamp file timestamp file"
-            self.timestamps, words = read_stamps(lists[0], told, columns, words=3)
+            columns = "timestamp file timestamp file"
+            self.timestamps, words = read_stamps(root / "associations.txt", told, columns, words=3)
             rgb_at = 2 if any("depth" in row[0].lower() for row in words) else 0
             self.rgb_files = [root / row[rgb_at] for row in words]
             self.depth_files = [root / row[2 - rgb_at] for row in words]
         icl = next(iter(sorted(root.glob("*.gt.freiburg"))), None)
         self._is_icl = icl is not None
         pose_file = icl or root / "groundtruth.txt"
-        self._sources = [*lists, pose_file]
         if not pose_file.exists():
             return
         stamps, poses = read_timed_poses(pose_file, told)

@@ -79,8 +79,7 @@ class HypothesisSet:
         maps = grid.samples[:, :n].reshape(-1, h, w)
         log_depth = np.full(n, np.nan, np.float32)
         if pair.curr.depth is not None:
-            u0, v0 = grid.pixels.origin
-            look_up(grid.samples, n, 1, as_contiguous(pair.curr.depth), u0, v0, log_depth)
+            look_up(grid.samples, n, as_contiguous(pair.curr.depth), log_depth)
         return GridMaps(
             ray=maps[[kernels.XN, kernels.YN]],
             depth=maps[kernels.Z],
@@ -99,25 +98,19 @@ class HypothesisSet:
         )
 
 
-def _on_grid(image: np.ndarray, grid: CoarseGrid) -> np.ndarray:
-    """(h, w) the grid's pixels of a whole image."""
-    stride, (v0, v1, u0, u1) = grid.shape[2], grid.box
-    return image[v0 + stride // 2 : v1 : stride, u0 + stride // 2 : u1 : stride]
-
-
 def _grey(frame: Frame, grid: CoarseGrid) -> np.ndarray:
     """(h, w) float32 grey levels, each the mean of what it stands for; 0 without an image."""
     if frame.rgb is None:
         return np.zeros(grid.shape[:2], np.float32)
     grey = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
-    return _on_grid(cv2.blur(grey, (grid.shape[2],) * 2), grid).astype(np.float32)
+    return cv2.blur(grey, (grid.shape[2],) * 2)[grid.places].astype(np.float32)
 
 
 def _log_depth(frame: Frame, grid: CoarseGrid) -> np.ndarray:
     """(h, w) float32 log metres; NaN where unknown."""
     if frame.depth is None:
         return np.full(grid.shape[:2], np.nan, np.float32)
-    depth = _on_grid(frame.depth, grid)
+    depth = frame.depth[grid.places]
     known = (depth > kernels.MIN_DEPTH) & (depth < kernels.MAX_VALUE)
     return np.log(np.where(known, depth, np.float32(np.nan)))
 

@@ -198,7 +198,7 @@ class _Search:
         pixels = self.samples, self.grid.count, self.K
         steps += anneal(*pixels, 0.7, 0.5, 0.4, 3, pose, self.work)
         final, caps = pose.copy(), (FLOW_NOISE_CAP, DEPTH_NOISE_CAP)
-        sf, sd, share, more, _, _ = reestimate(
+        sf, sd, share, more = reestimate(
             *pixels, 0.5, 0.01, *caps, self.cutoff, 2, 4, NOISE_PIXELS, final, self.work
         )
         if self._score(final) > 0.95 * self._score(pose):

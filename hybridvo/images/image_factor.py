@@ -23,8 +23,7 @@ import numpy as np
 from hybridvo.calibration import EVEN_PARTS, UNEVEN_LIGHT
 from hybridvo.images import photometric_kernels as kernels
 from hybridvo.options import RefineOptions
-from hybridvo.refinement.covariance import dispersion, tile_sums
-from hybridvo.refinement.full_fit import tile_size
+from hybridvo.refinement.covariance import dispersion, tile_size, tile_sums
 from hybridvo.refinement.kernels import MAX_VALUE
 from hybridvo.refinement.pixels import as_contiguous, typical
 from hybridvo.refinement.solver import Linearization, positive_inverse

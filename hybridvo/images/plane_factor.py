@@ -10,8 +10,7 @@ from scipy.optimize import nnls
 
 from hybridvo.geometry import njit
 from hybridvo.options import RefineOptions
-from hybridvo.refinement.covariance import dispersion, tile_sums
-from hybridvo.refinement.full_fit import tile_size
+from hybridvo.refinement.covariance import dispersion, tile_size, tile_sums
 from hybridvo.refinement.kernels import MAX_VALUE, MIN_DEPTH
 from hybridvo.refinement.pixels import as_contiguous
 from hybridvo.refinement.solver import Linearization, positive_inverse

@@ -1,4 +1,5 @@
-"""One motion on gathered pixels: Gauss-Newton under a graduated robust kernel (numba).
+"""One motion on gathered pixels, by Gauss-Newton under a graduated robust kernel, and the noise of
+the pixels that follow it (numba).
 
 Poses inside the kernels are (3, 4) float64 arrays [R | t].
 """
@@ -12,20 +13,21 @@ import numpy as np
 from hybridvo.geometry import njit, se3_exp
 from hybridvo.refinement.kernels import (
     BLOCK,
-    MU,
-    MV,
+    FASTMATH,
+    ONE,
     PD,
     PF,
     SUMS,
-    XN,
-    YN,
+    ZERO,
     W,
     Z,
+    keep_apart,
     new_work,
+    pose_entries,
     project_block,
+    residual,
     sum_samples,
 )
-from hybridvo.refinement.noise import estimate_noise
 
 FLOW_NOISE_CAP = 1.2
 DEPTH_NOISE_CAP = 0.08
@@ -36,29 +38,31 @@ NOISE_PIXELS = 1000
 """Pixels that the noise estimate of the search looks at: flow noise to 2 %."""
 FINAL_NOISE_PIXELS = 4000
 """The same of the last fit of a motion."""
+FLOW_NOISE_FLOOR = 2e-3
+"""Smallest flow noise assumed, px: float32 coordinates of an 8k image are good to 5e-4 px."""
+USUAL_DEPTH_NOISE = 0.01
+SETTLED = 1e-3
+"""Change of both variances, relative, below which they are found."""
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
 def solve6(acc, damping, delta):
     """Solve (H + damping diag H) delta = g by Cholesky; False where H is not positive definite."""
-    L = np.zeros((6, 6))
+    L, scale = np.zeros((7, 6)), np.empty(6)  # the gradient as a last row: forward substitution
     q = 0
     for i in range(6):
+        if not acc[q] > 1e-30:
+            return False
+        scale[i] = 1.0 / math.sqrt(acc[q])
         for j in range(i, 6):
             L[j, i] = acc[q]
             q += 1
-    scale = np.empty(6)
-    for i in range(6):
-        if not L[i, i] > 1e-30:
-            return False
-        scale[i] = 1.0 / math.sqrt(L[i, i])
-    for i in range(6):
-        for j in range(i + 1):
-            L[i, j] *= scale[i] * scale[j]
-        L[i, i] = 1.0 + damping
-    for i in range(6):
-        for j in range(i + 1):
-            s = L[i, j]
+        L[6, i] = acc[21 + i]
+    for i in range(7):
+        for j in range(min(i + 1, 6)):
+            s = L[i, j] * scale[j] * (scale[i] if i < 6 else 1.0)
+            if i == j:
+                s = 1.0 + damping
             for k in range(j):
                 s -= L[i, k] * L[j, k]
             if i == j:
@@ -67,13 +71,8 @@ def solve6(acc, damping, delta):
                 L[i, i] = math.sqrt(s)
             else:
                 L[i, j] = s / L[j, j]
-    for i in range(6):
-        s = acc[21 + i] * scale[i]
-        for k in range(i):
-            s -= L[i, k] * delta[k]
-        delta[i] = s / L[i, i]
     for i in range(5, -1, -1):
-        s = delta[i]
+        s = L[6, i]
         for k in range(i + 1, 6):
             s -= L[k, i] * delta[k]
         delta[i] = s / L[i, i]
@@ -106,13 +105,6 @@ def set_noise(flow_sigma, depth_sigma, cutoff, out):
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
-def evaluate(samples, n, pose, K, noise, work, acc):
-    """Normal equations at ``pose``; returns the cost, pixels behind the camera at the full cost."""
-    sum_samples(samples, n, pose, K, noise, work, acc)
-    return acc[27]
-
-
-@njit(error_model="numpy", cache=True, nogil=True)
 def gauss_newton(samples, n, total, K, noise, steps, tolerance_px, pose, work):
     """Damped Gauss-Newton in place; a step is taken only where the robust cost does not rise.
 
@@ -124,8 +116,8 @@ def gauss_newton(samples, n, total, K, noise, steps, tolerance_px, pose, work):
     delta = np.zeros(6)
     candidate = np.empty((3, 4))
     full = 0.5 * np.float64(noise[2])
-    cost = evaluate(samples, n, pose, K, noise, work, acc)
-    cost += full * max(0.0, total - acc[29])
+    cost = sum_samples(samples, n, pose, K, noise, work, acc)
+    cost += full * max(0.0, total - acc[29])  # pixels behind the camera
     damping = DAMPING
     done = 0
     for _ in range(steps):
@@ -135,7 +127,7 @@ def gauss_newton(samples, n, total, K, noise, steps, tolerance_px, pose, work):
                 return done, cost, False
             continue
         left_update(delta, pose, candidate)
-        new_cost = evaluate(samples, n, candidate, K, noise, work, other)
+        new_cost = sum_samples(samples, n, candidate, K, noise, work, other)
         new_cost += full * max(0.0, total - other[29])
         done += 1
         if new_cost <= cost * (1.0 + 1e-9) + 1e-12:
@@ -158,38 +150,23 @@ def gauss_newton(samples, n, total, K, noise, steps, tolerance_px, pose, work):
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
-def residual_scale(samples, n, pose, K):
-    """Median length of the residual in px over up to about 1000 usable pixels."""
-    step = max(1, n // 1000)
-    values = np.empty(n // step + 1)
-    m = 0
-    for k in range(0, n, step):
-        if samples[W, k] > 0:
-            ru, rv, _, _, front = residual(samples, k, pose, K)
-            if front:
-                values[m] = math.sqrt(ru * ru + rv * rv)
-                m += 1
-    if m == 0:
-        return 1.0
-    return np.median(values[:m])
+def residuals(samples, n, pose, K):
+    """(ru, rv, qu, qv) of ``n`` pixels, (4, n); NaN where a pixel cannot be used."""
+    out, entries = np.full((4, n), np.nan), pose_entries(pose)
+    for k in range(n):
+        ru, rv, qu, qv, front = residual(samples, k, entries, K)
+        if front and samples[W, k] > 0:
+            out[0, k], out[1, k], out[2, k], out[3, k] = ru, rv, qu, qv
+    return out
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
-def residual(samples, k, pose, K):
-    """(ru, rv, qu, qv, in front) of pixel ``k`` in double precision."""
-    x, y, z = samples[XN, k], samples[YN, k], samples[Z, k]
-    X = z * (pose[0, 0] * x + pose[0, 1] * y + pose[0, 2]) + pose[0, 3]
-    Y = z * (pose[1, 0] * x + pose[1, 1] * y + pose[1, 2]) + pose[1, 3]
-    Zc = z * (pose[2, 0] * x + pose[2, 1] * y + pose[2, 2]) + pose[2, 3]
-    if not Zc > 1e-6:
-        return 0.0, 0.0, 0.0, 0.0, False
-    a = X / Zc
-    b = Y / Zc
-    ru = samples[MU, k] - (K[0] * a + K[2])
-    rv = samples[MV, k] - (K[1] * b + K[3])
-    qu = K[0] / Zc * (a * pose[2, 3] - pose[0, 3])
-    qv = K[1] / Zc * (b * pose[2, 3] - pose[1, 3])
-    return ru, rv, qu, qv, True
+def residual_scale(samples, n, pose, K):
+    """Median length of the residual in px over up to about 1000 usable pixels."""
+    found = residuals(samples[:, : n : max(1, n // 1000)], -(-n // max(1, n // 1000)), pose, K)
+    lengths = np.sqrt(found[0] ** 2 + found[1] ** 2)
+    lengths = lengths[~np.isnan(lengths)]
+    return np.median(lengths) if len(lengths) else 1.0
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
@@ -208,28 +185,161 @@ def anneal(samples, n, K, start_px, end_px, ratio, steps, pose, work):
         scale = max(end_px, scale * ratio)
 
 
+@njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
+def gather_noise(samples, n, step, pose, K, radius, terms):
+    """What the noise estimate needs of every ``step``-th pixel, as rows of ``terms`` (6, N).
+
+    Squared residual along q and across it, variance of the flow and of the depth (through q) in
+    units of sf^2 and sd^2, external weight (0 farther away than ``radius``), density of outliers.
+    Returns (number of pixels, their external weight, that of the pixels within the radius).
+    """
+    keep_apart()  # type: ignore[call-arg]
+    entries = pose_entries(pose.astype(np.float32))
+    b_f, b_d, b_w = samples[PF], samples[PD], samples[W]
+    along, across, alpha = terms[0], terms[1], terms[2]
+    beta, weight, outlier = terms[3], terms[4], terms[5]
+    m = (n + step - 1) // step
+    disc = np.float32(1.0 / math.pi) / (radius * radius)
+    total = inside = ZERO
+    for j in range(m):
+        k = j * step
+        ru, rv, qu, qv, front = residual(samples, k, entries, K)
+        q2 = qu * qu + qv * qv
+        pure = q2 < np.float32(1e-20)  # no parallax: any axis will do
+        qu = ONE if pure else qu
+        inverse = ONE / (ONE if pure else q2)
+        dot = ru * qu + rv * qv
+        cross = rv * qu - ru * qv
+        spread = ONE / b_f[k]
+        wide = max(spread, ONE)
+        w = b_w[k]
+        total += w
+        near = front & (ru * ru + rv * rv <= radius * radius * wide) & (q2 < np.float32(1e12))
+        w = w if near else ZERO
+        inside += w
+        along[j] = dot * dot * inverse if near else ZERO
+        across[j] = cross * cross * inverse if near else ZERO
+        alpha[j] = spread
+        beta[j] = min(b_d[k] * q2, np.float32(1e8)) if near else ZERO
+        weight[j] = w
+        outlier[j] = disc / wide
+    return m, total, inside
+
+
+@njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
+def sum_noise(terms, m, vf, vd, share, sums):
+    """One round of expectation-maximisation: set ``sums`` to the weight of the followers, the three
+    entries of the information of (sf^2, sd^2) and the two of its right-hand side.
+    """
+    keep_apart()  # type: ignore[call-arg]
+    along, across, alpha = terms[0], terms[1], terms[2]
+    beta, weight, outlier = terms[3], terms[4], terms[5]
+    density = share * np.float32(0.5 / math.pi)
+    rest = ONE - share
+    hits = a11 = a12 = a22 = b1 = b2 = ZERO
+    for k in range(m):
+        al = alpha[k]
+        be = beta[k]
+        x1 = along[k]
+        x2 = across[k]
+        i2 = ONE / (vf * al)
+        i1 = ONE / (vf * al + vd * be)
+        d2 = x1 * i1 + x2 * i2
+        # exp(-d2 / 2) = exp(-y)^16 by a series that is good to 1e-3 at the limit: no call to a
+        # library function, so that the loop is vectorised
+        y = min(d2, np.float32(60.0)) * np.float32(1 / 32)
+        e = y * np.float32(1 / 5040) + np.float32(1 / 720)
+        e = e * y + np.float32(1 / 120)
+        e = e * y + np.float32(1 / 24)
+        e = e * y + np.float32(1 / 6)
+        e = e * y + np.float32(0.5)
+        e = (e * y + ONE) * y + ONE
+        e = e * e
+        e = e * e
+        e = e * e
+        e = e * e
+        p = density * np.sqrt(i1 * i2)
+        p = weight[k] * p / (p + rest * outlier[k] * e)
+        p = p if d2 < np.float32(60.0) else ZERO
+        j1 = p * i1 * i1
+        j2 = p * i2 * i2
+        hits += p
+        a11 += al * al * (j1 + j2)
+        a12 += al * be * j1
+        a22 += be * be * j1
+        b1 += al * (x1 * j1 + x2 * j2)
+        b2 += be * x1 * j1
+    sums[0], sums[1], sums[2] = hits, a11, a12
+    sums[3], sums[4], sums[5] = a22, b1, b2
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def estimate_noise(samples, n, pose, K, sf, sd, sf_cap, sd_cap, rounds, limit):
+    """Flow noise (px) and depth noise (of log Z) of the pixels that follow ``pose``.
+
+    Expectation-maximisation of a mixture of N(0, sf^2 v_f I + sd^2 v_d q q^T) and a uniform density
+    over a disc; the two variances by Fisher scoring of the components along and across q. Only the
+    shape of the residuals is used, never a given noise level. ``limit`` bounds the number of pixels
+    looked at, ``sf_cap`` and ``sd_cap`` the noise. Returns (sf, sd, share of the weight that
+    follows the pose, whether the flow tells the depth's noise).
+    """
+    step = max(1, n // limit)
+    terms = np.empty((6, ((n // step + 16) // 16 | 1) * 16), np.float32)
+    radius = np.float32(max(4.0, 8.0 * sf))
+    m, total, inside = gather_noise(samples, n, step, pose, K, radius, terms)
+    if m < 8 or not inside > 0:
+        return sf, sd, 0.0, True
+    vf = sf * sf
+    vd = sd * sd
+    share = 0.7
+    spread = 0.0
+    sums = np.empty(6)
+    for _ in range(rounds):
+        sum_noise(terms, m, np.float32(vf), np.float32(vd), np.float32(share), sums)
+        a11, a12, a22, b1, b2 = sums[1], sums[2], sums[3], sums[4], sums[5]
+        before, vd_before = vf, vd
+        share = min(0.999, max(0.01, sums[0] / inside))
+        if not (0 < a11 < np.inf and a22 < np.inf and abs(b1) < np.inf and abs(b2) < np.inf):
+            break
+        determinant = a11 * a22 - a12 * a12
+        if determinant > 1e-9 * a11 * a22 and determinant > 0:
+            vf = (b1 * a22 - b2 * a12) / determinant
+            vd = (b2 * a11 - b1 * a12) / determinant
+            if vd < 0:
+                vd = 0.0
+                vf = b1 / a11
+        else:
+            vf = max(0.0, b1 - a12 * vd) / a11
+        floor = FLOW_NOISE_FLOOR * FLOW_NOISE_FLOOR
+        # standard error of vd: Fisher's information of a variance is half of these sums
+        spread = math.sqrt(2.0 / max(a22 - a12 * a12 / a11, 1e-30))
+        vf = min(max(vf, floor), sf_cap * sf_cap)
+        vd = min(vd, sd_cap * sd_cap)
+        vd = max(vd, 1e-10)  # stays estimable in the next round
+        if abs(vf - before) < SETTLED * before and abs(vd - vd_before) < SETTLED * vd_before:
+            break
+    told = vd >= 2.0 * spread
+    if not told:  # too little parallax: no more than a usual sensor has
+        vd = min(vd, USUAL_DEPTH_NOISE * USUAL_DEPTH_NOISE)
+    return math.sqrt(vf), math.sqrt(vd), share * inside / total, told
+
+
 @njit(error_model="numpy", cache=True, nogil=True)
 def reestimate(samples, n, K, sf, sd, sf_cap, sd_cap, cutoff, rounds, steps, limit, pose, work):
     """Alternate noise estimate and Gauss-Newton with the full covariance, in place.
 
-    Returns (sf, sd, share, iterations, converged, standard error of sd^2).
+    Returns (sf, sd, share, iterations).
     """
     noise = np.empty(3, np.float32)
     total = np.float64(np.sum(samples[W, :n]))
     iterations = 0
-    converged = False
     share = 0.0
-    spread = 0.0
     for _ in range(rounds):
-        sf, sd, share, spread = estimate_noise(
-            samples, n, pose, K, sf, sd, sf_cap, sd_cap, 5, limit
-        )
+        sf, sd, share, _ = estimate_noise(samples, n, pose, K, sf, sd, sf_cap, sd_cap, 5, limit)
         set_noise(sf, sd, cutoff, noise)
-        done, _, converged = gauss_newton(
-            samples, n, total, K, noise, steps, 1e-3 * sf + 1e-5, pose, work
-        )
+        done, _, _ = gauss_newton(samples, n, total, K, noise, steps, 1e-3 * sf + 1e-5, pose, work)
         iterations += done
-    return sf, sd, share, iterations, converged, spread
+    return sf, sd, share, iterations
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
@@ -260,51 +370,34 @@ def fit_coarse(
     pose = np.array(pose, np.float64, order="C")
     scale = min(64.0, max(1.0, 1.5 * residual_scale(samples, n, pose, K)))
     steps = anneal(samples, n, K, scale, 0.4, 0.5, 3, pose, work)
-    sf, sd, share, more, _, _ = reestimate(
+    sf, sd, share, more = reestimate(
         samples, n, K, 0.5, 0.01, FLOW_NOISE_CAP, DEPTH_NOISE_CAP, cutoff, 2, 4,
         FINAL_NOISE_PIXELS, pose, work,
     )  # fmt: skip
     return pose, sf, sd, share, steps + more
 
 
-@njit(error_model="numpy", cache=True, nogil=True)
-def residual_coherence(samples, h, w, pose, K, sf, sd):
+def residual_coherence(
+    samples: np.ndarray, h: int, w: int, pose: np.ndarray, K: np.ndarray, sf: float, sd: float
+) -> float:
     """How alike neighbouring residuals are: 0 for independent noise, 1 for equal residuals.
 
     Of whitened residuals in 8 x 8 blocks, from the variance of the block means. A compromise
     between two motions leaves residuals that agree with their neighbours.
     """
-    between = pixels = blocks = 0.0
-    for r0 in range(0, h - 7, 8):
-        for c0 in range(0, w - 7, 8):
-            m = s0 = s1 = squares = 0.0
-            for r in range(r0, r0 + 8):
-                for c in range(c0, c0 + 8):
-                    k = r * w + c
-                    if not samples[W, k] > 0:
-                        continue
-                    ru, rv, qu, qv, front = residual(samples, k, pose, K)
-                    if not front:
-                        continue
-                    ip = samples[PF, k] / (sf * sf)
-                    g = sd * sd * samples[PD, k] * ip
-                    q2 = qu * qu + qv * qv
-                    root = math.sqrt(1.0 + g * q2)
-                    beta = g / (root * (1.0 + root))
-                    dot = beta * (qu * ru + qv * rv)
-                    e0 = (ru - dot * qu) * math.sqrt(ip)
-                    e1 = (rv - dot * qv) * math.sqrt(ip)
-                    if e0 * e0 + e1 * e1 > 16.0:
-                        continue
-                    m += 1.0
-                    s0 += e0
-                    s1 += e1
-                    squares += e0 * e0 + e1 * e1
-            if m >= 16:
-                # pairs of different pixels: sum of products over the number of pairs
-                between += (s0 * s0 + s1 * s1 - squares) / (m - 1.0)
-                pixels += squares
-                blocks += 1.0
-    if blocks < 4 or pixels <= 0:
+    r, q = np.split(residuals(samples, h * w, pose, K), 2)
+    ip = samples[PF, : h * w] / sf**2
+    g = sd**2 * samples[PD, : h * w] * ip
+    root = np.sqrt(1.0 + g * (q * q).sum(axis=0))
+    e = (r - g / (root * (1.0 + root)) * (q * r).sum(axis=0) * q) * np.sqrt(ip)
+    e = np.where((e * e).sum(axis=0) <= 16.0, e, np.nan).reshape(2, h, w)
+    blocks = e[:, : h // 8 * 8, : w // 8 * 8].reshape(2, h // 8, 8, w // 8, 8)
+    count = np.isfinite(blocks[0]).sum(axis=(1, 3))
+    sums, squares = np.nansum(blocks, axis=(2, 4)), np.nansum(blocks**2, axis=(0, 2, 4))
+    full = count >= 16
+    pixels = squares[full].sum()
+    if np.count_nonzero(full) < 4 or pixels <= 0:
         return 1.0
-    return between / pixels
+    # pairs of different pixels: sum of products over the number of pairs
+    between = ((sums**2).sum(axis=0) - squares)[full] / (count[full] - 1.0)
+    return float(between.sum() / pixels)

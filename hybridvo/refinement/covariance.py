@@ -18,17 +18,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from hybridvo.calibration import ABSORBED, CLUSTERED, FEW_TILES, LONG_GROWTH
-from hybridvo.geometry import njit
-from hybridvo.refinement.kernels import (
-    BLOCK,
-    FASTMATH,
-    SUMS,
-    ZERO,
-    W,
-    keep_apart,
-    new_work,
-    project_block,
-)
+from hybridvo.refinement.kernels import SUMS, WORK_ROWS, W, project_block
 from hybridvo.refinement.solver import positive_inverse
 
 NOTHING = np.diag([1e4] * 3 + [10.0] * 3)
@@ -36,6 +26,9 @@ NOTHING = np.diag([1e4] * 3 + [10.0] * 3)
 
 SMALLEST_REST = 0.25
 """Least share of the scores' variance that the fit is assumed to leave in the blocks."""
+
+FLOW_ROUNDING = 2e-5
+"""Pixels: single precision at a coordinate of 300."""
 
 SIZES = ((1, 1), (2, 1), (4, 2))
 """Width of the blocks and distance between them, in tiles."""
@@ -53,49 +46,14 @@ def direction_is_known(T: np.ndarray, covariance: np.ndarray) -> bool:
     return bool(np.linalg.norm(T[:3, 3]) > 3 * spread)
 
 
+def tile_size(shape: tuple[int, int], tiles: int) -> int:
+    """Side, px, of the tiles that cut an image into about ``tiles``; 8 to 64."""
+    return int(np.clip(round(np.sqrt(shape[0] * shape[1] / tiles)), 8, 64))
+
+
 def symmetric(upper: np.ndarray) -> np.ndarray:
     """(6, 6) from its 21 upper-triangle values, row by row."""
     return upper[ORDER]
-
-
-@njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
-def score_block(o, n, c2, external, work, rows, factors):
-    """Write w s = w J^T Sigma^-1 r of each pixel to ``rows`` (6, N), and to ``factors`` (N,) what
-    makes its outer product the curvature of the robust weights, ``-2 (dw / dd^2) s s^T``.
-
-    The Gauss-Newton Hessian less the curvature is the derivative of the estimating equation.
-    """
-    keep_apart()  # type: ignore[call-arg]
-    A, B, IZ, N0, N1, S = work[0], work[1], work[2], work[6], work[7], work[8]
-    r0, r1, r2, r3, r4, r5 = (
-        rows[0][o:], rows[1][o:], rows[2][o:], rows[3][o:], rows[4][o:], rows[5][o:]
-    )  # fmt: skip
-    f, e = factors[o:], external[o:]
-    for k in range(n):
-        good = S[k] > np.float32(1e-12)  # elsewhere anything may stand, not a number either
-        a = A[k] if good else ZERO
-        b = B[k] if good else ZERO
-        i = IZ[k] if good else ZERO
-        x = N0[k] if good else ZERO
-        y = N1[k] if good else ZERO
-        c = a * x + b * y
-        r0[k] = x * i
-        r1[k] = y * i
-        r2[k] = -c * i
-        r3[k] = -(b * c + y)
-        r4[k] = a * c + x
-        r5[k] = a * y - b * x
-        # row = w s with w = x_w S, S = (c2 / (c2 + d2))^2; wanted 4 w / (c2 + d2) s s^T
-        f[k] = 4.0 / (np.float64(c2) * e[k] * np.sqrt(S[k])) if good else 0.0  # e as small as 1e-38
-
-
-@njit(error_model="numpy", cache=True, nogil=True)
-def score_pixels(samples, n, pose, K, noise, work, rows, factors, acc):
-    """:func:`score_block` of gathered pixels; cost and weights are added to ``acc`` (30,)."""
-    for o in range(0, n, BLOCK):
-        m = min(BLOCK, n - o)
-        project_block(samples, o, m, pose, K, noise, work, work[8], acc)
-        score_block(o, m, noise[2], samples[W], work, rows, factors)
 
 
 def score_sums(
@@ -104,11 +62,17 @@ def score_sums(
     """(42,) curvature of the robust weights and meat of independent errors, per unit of weight.
 
     From a coarse grid: both are averages over many pixels and enter the result at second order.
+    The Gauss-Newton Hessian less the curvature is the derivative of the estimating equation.
     """
-    rows, factors, used = np.empty((6, n), np.float32), np.empty(n), np.zeros(SUMS)
-    score_pixels(samples, n, pose, K, noise, new_work(), rows, factors, used)
-    wide = rows.astype(np.float64)  # squares of large external weights overflow in float32
-    out = np.concatenate([m[UPPER] for m in ((wide * factors) @ wide.T, wide @ wide.T)])
+    work, used = np.empty((WORK_ROWS, n), np.float32), np.zeros(SUMS)
+    project_block(samples, 0, n, pose, K, noise, work, work[8], used)
+    good = work[8] > 1e-12  # elsewhere anything may stand, not a number either
+    a, b, i, _, _, _, x, y, robust = work[:, good].astype(np.float64)
+    c = a * x + b * y
+    rows = np.stack([x * i, y * i, -c * i, -b * c - y, a * c + x, a * y - b * x])
+    # row = w s with w = x_w S, S = (c2 / (c2 + d2))^2; wanted 4 w / (c2 + d2) s s^T
+    factors = 4.0 / (noise[2] * samples[W, :n][good].astype(np.float64) * np.sqrt(robust))
+    out = np.concatenate([m[UPPER] for m in ((rows * factors) @ rows.T, rows @ rows.T)])
     return out / max(used[29], 1e-12)
 
 
@@ -154,14 +118,39 @@ def long_range(growth: float, tiles: int) -> float:
     return float(2.0 ** (exponent * max(0.0, 0.5 * math.log2(tiles / 4))))
 
 
+def motion_covariance(
+    tiles: np.ndarray,
+    curvature: np.ndarray,
+    meat: np.ndarray,
+    depth_scale: float,
+    weight: float,
+    focal: float,
+    t: np.ndarray,
+    noise: tuple[float, float],
+) -> tuple[np.ndarray, np.ndarray, int]:
+    """:func:`sandwich_covariance` of a motion under a noise (px, log depth), with what no residual
+    shows: the rounding of the pixels' ``weight``, and the law of the depth's errors.
+    """
+    # rounding is the same for neighbours, so that an average over n pixels is no better than one
+    parallax = focal * float(np.linalg.norm(t)) * depth_scale
+    rounding = weight * FLOW_ROUNDING**2 / (noise[0] ** 2 + (parallax * noise[1]) ** 2)
+    sandwich = sandwich_covariance(tiles, curvature, meat, depth_scale, rounding)
+    covariance, eigenvalues, occupied = sandwich
+    # whether depth errs about its log, its value or its inverse is not known: the translation's
+    # length is uncertain by half the variance of log depth
+    covariance[:3, :3] += (0.5 * noise[1] ** 2) ** 2 * np.outer(t, t)
+    return covariance, eigenvalues, occupied
+
+
 def sandwich_covariance(
     tiles: np.ndarray,
     curvature: np.ndarray,
     meat: np.ndarray,
     depth_scale: float,
     rounding: float = 0.0,
-) -> tuple[np.ndarray, np.ndarray, bool]:
-    """Covariance of the left perturbation, eigenvalues of the information, whether it is definite.
+) -> tuple[np.ndarray, np.ndarray, int]:
+    """Covariance of the left perturbation, eigenvalues of the information, number of tiles with
+    usable pixels; 0 where the information is not definite.
 
     Bread: the derivative of the estimating equation (Gauss-Newton Hessian less the curvature of the
     robust weights). Meat: :data:`CLUSTERED` from overlapping blocks two tiles wide, the rest from
@@ -183,7 +172,7 @@ def sandwich_covariance(
     H = symmetric(total[:21]) * outer
     eigenvalues = np.linalg.eigvalsh(H) if np.isfinite(H).all() else np.zeros(6)
     if not eigenvalues[0] > max(1e-8 * eigenvalues[-1], 1e-12):
-        return NOTHING.copy(), eigenvalues, False
+        return NOTHING.copy(), eigenvalues, 0
     bread = H - curvature * outer
     if np.linalg.eigvalsh(bread)[0] <= 0.2 * eigenvalues[0]:
         bread = H  # too few inliers for the curvature to be believed
@@ -206,8 +195,8 @@ def sandwich_covariance(
     covariance = inverse @ middle @ inverse + (0.01 + rounding) * model
     covariance = 0.5 * (covariance + covariance.T) * outer
     if not np.isfinite(covariance).all():
-        return NOTHING.copy(), eigenvalues, False
-    return covariance, eigenvalues, True
+        return NOTHING.copy(), eigenvalues, 0
+    return covariance, eigenvalues, occupied
 
 
 def tile_sums(scores: np.ndarray, tile: np.ndarray, count: int) -> np.ndarray:

@@ -14,7 +14,7 @@ It shows where the motion takes each point to a pixel whose depth is known as we
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,7 +25,8 @@ from hybridvo.refinement.kernels import (
     BLOCK,
     COST,
     FASTMATH,
-    MAX_SHIFT,
+    MAX_VALUE,
+    MIN_DEPTH,
     MU,
     MV,
     PD,
@@ -35,33 +36,32 @@ from hybridvo.refinement.kernels import (
     YN,
     W,
     Z,
+    at_likely_depth,
     new_work,
+    pose_entries,
     project_block,
+    see,
 )
 from hybridvo.refinement.pixels import PixelGrid
 from hybridvo.refinement.solver import Linearization
-from hybridvo.types import Frame
+from hybridvo.results import Reason, Status
+from hybridvo.types import FramePair
 
 SURFACE = 0.05
 """Largest relative difference between the four neighbours that are interpolated."""
-MAX_RATIO = 1.25
-"""Of depths that may have one scale: learned depth jitters by 10 %, and where most of the image
-moves towards the camera the median is theirs."""
+MIN_COMPARED, COMPARED = 100, 4000
+"""Fewest points whose depths are compared, and about how many are looked at."""
 
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
-def look_up(samples, n, step, depth, u0, v0, out):
-    """Log of the current depth at the flow target of every ``step``-th pixel; NaN outside, at edges
-    and at holes.
-    """
+def look_up(samples, n, depth, out):
+    """Log of the current depth at the flow target of ``n`` pixels; NaN outside, at edges, holes."""
     H, width = depth.shape
-    for k in range(0, n, step):
+    for k in range(n):
         out[k] = np.nan
-        if not samples[W, k] > 0:
-            continue
-        u = samples[MU, k] + u0
-        v = samples[MV, k] + v0
-        if not (u >= 0 and v >= 0 and u < width - 1 and v < H - 1):
+        u = samples[MU, k]
+        v = samples[MV, k]
+        if not (samples[W, k] > 0 and u >= 0 and v >= 0 and u < width - 1 and v < H - 1):
             continue
         i = int(u)
         j = int(v)
@@ -77,73 +77,41 @@ def look_up(samples, n, step, depth, u0, v0, out):
 
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
-def conditional(samples, k, log_depth, pose, K, noise, row):
-    """(conditional residual, raw residual, in front) of pixel ``k``; its Jacobian in ``row``."""
-    x, y, z = samples[XN, k], samples[YN, k], samples[Z, k]
-    X = z * (pose[0, 0] * x + pose[0, 1] * y + pose[0, 2]) + pose[0, 3]
-    Y = z * (pose[1, 0] * x + pose[1, 1] * y + pose[1, 2]) + pose[1, 3]
-    Zc = z * (pose[2, 0] * x + pose[2, 1] * y + pose[2, 2]) + pose[2, 3]
-    if not Zc > 1e-6:
-        return 0.0, 0.0, False
-    tx, ty, tz = pose[0, 3], pose[1, 3], pose[2, 3]
-    i = 1.0 / Zc
-    a = X * i
-    b = Y * i
-    ru = samples[MU, k] - (K[0] * a + K[2])
-    rv = samples[MV, k] - (K[1] * b + K[3])
-    qu = K[0] * i * (a * tz - tx)
-    qv = K[1] * i * (b * tz - ty)
-    g = noise[1] * samples[PD, k] * noise[0] * samples[PF, k]
-    raw = log_depth[k] - math.log(Zc)
-    # Jacobian and q at the depth that the flow makes most likely, as in the kernels
-    shift = g * (qu * ru + qv * rv) / (1.0 + g * (qu * qu + qv * qv))
-    shift = min(max(shift, -MAX_SHIFT), MAX_SHIFT)
-    a += qu * shift / K[0]
-    b += qv * shift / K[1]
-    i *= 1.0 - (1.0 - tz * i) * shift
-    qu = K[0] * i * (a * tz - tx)
-    qv = K[1] * i * (b * tz - ty)
-    shrink = 1.0 / (1.0 + g * (qu * qu + qv * qv))
-    h = 1.0 - tz * i
-    ku = h * g * shrink * qu
-    kv = h * g * shrink * qv
+def conditional(samples, k, log_depth, entries, K, noise, row):
+    """(conditional residual, raw residual, known and in front) of pixel ``k``; its Jacobian in
+    ``row``.
+    """
+    a, b, i, front = see(samples[XN, k], samples[YN, k], samples[Z, k], entries)
     fx, fy = K[0], K[1]
+    ru = samples[MU, k] - (fx * a + K[2])
+    rv = samples[MV, k] - (fy * b + K[3])
+    g = noise[1] * samples[PD, k] * noise[0] * samples[PF, k]
+    raw = log_depth[k] + math.log(i)
+    a, b, i, qu, qv, kappa = at_likely_depth(a, b, i, ru, rv, g, entries, K)
+    h = 1.0 - entries[11] * i
+    ku = h * kappa * qu
+    kv = h * kappa * qv
     row[0] = -ku * fx * i
     row[1] = -kv * fy * i
     row[2] = i + (ku * fx * a + kv * fy * b) * i
     row[3] = b + ku * fx * a * b + kv * fy * (1.0 + b * b)
     row[4] = -a - ku * fx * (1.0 + a * a) - kv * fy * a * b
     row[5] = ku * fx * b - kv * fy * a
-    return raw - ku * ru - kv * rv, raw, True
+    return raw - ku * ru - kv * rv, raw, front and abs(log_depth[k]) < 1e6
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
-def sparse_step(n):
-    """Distance of the about 1000 pixels that :func:`depth_scale` looks at."""
-    return max(1, n // 1000)
-
-
-@njit(error_model="numpy", cache=True, nogil=True)
-def depth_scale(samples, n, log_depth, robust, pose, K, noise):
+def depth_scale(samples, log_depth, robust, pose, K, noise):
     """Robust standard deviations of (conditional residual, raw residual); 0 if too few pixels."""
-    row = np.empty(6)
-    step = sparse_step(n)
-    size = n // step + 1
-    one = np.empty(size)
-    two = np.empty(size)
-    m = 0
-    for k in range(0, n, step):
-        if not (robust[k] > 0.3 and abs(log_depth[k]) < 1e6):
-            continue
-        e, raw, front = conditional(samples, k, log_depth, pose, K, noise, row)
-        if not front:
-            continue
-        one[m] = abs(e)
-        two[m] = abs(raw)
-        m += 1
+    row, found, entries, m = np.empty(6), np.empty((2, len(robust))), pose_entries(pose), 0
+    for k in range(len(robust)):
+        e, raw, good = conditional(samples, k, log_depth, entries, K, noise, row)
+        if good and robust[k] > 0.3:
+            found[0, m], found[1, m] = abs(e), abs(raw)
+            m += 1
     if m < 50:
         return 0.0, 0.0
-    return 1.4826 * np.median(one[:m]), 1.4826 * np.median(two[:m])
+    return 1.4826 * np.median(found[0, :m]), 1.4826 * np.median(found[1, :m])
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
@@ -156,21 +124,17 @@ def sum_depth(
     k on the grid of ``width`` pixels, ``step`` apart, with ``columns`` tiles in a row; ``meat``
     (21,) gets the sum of w^2 s s^T. Returns the cost.
     """
-    c2 = np.float64(noise[2])
-    dummy = np.zeros(SUMS)
-    row = np.empty(6)
+    c2, v = np.float64(noise[2]), sz * sz
+    dummy, row, entries = np.zeros(SUMS), np.empty(6), pose_entries(pose)
     cost = 0.0
     for o in range(0, n, BLOCK):
         m = min(BLOCK, n - o)
         project_block(samples, o, m, pose, K, noise, work, work[8], dummy)
         for j in range(m):
             k = o + j
-            if not abs(log_depth[k]) < 1e6:
+            e, _, good = conditional(samples, k, log_depth, entries, K, noise, row)
+            if not good:
                 continue
-            e, _, front = conditional(samples, k, log_depth, pose, K, noise, row)
-            if not front:
-                continue
-            v = sz * sz
             d2 = e * e / v
             s = c2 / (c2 + d2)
             trust = samples[W, k] * work[8, j]
@@ -205,7 +169,7 @@ class DepthFactor:
     ) -> None:
         self._samples, height, self._width = image.strided(stride)
         self._log_depth = np.empty(height * self._width, np.float32)
-        look_up(self._samples, height * self._width, 1, curr, *image.origin, self._log_depth)
+        look_up(self._samples, len(self._log_depth), curr, self._log_depth)
         self._image, self._stride, self._sigma = image, stride, sigma
         self._noise, self._tile = noise, tile
 
@@ -223,82 +187,57 @@ class DepthFactor:
         return Linearization(symmetric(sums[:21]), sums[21:], cost)
 
 
-@dataclass(frozen=True)
-class DepthAgreement:
-    """Median ratio of the second depth to that of the first frame's points, moved, and the median
-    distance of its log from that of the median.
+class DepthAgreement(NamedTuple):
+    """Median ratio of the current depth to that of the previous frame's points, moved, and the
+    median distance of its log from that of the median.
     """
 
     ratio: float
     spread: float
 
     @property
-    def is_none(self) -> bool:
-        """Whether the two depths have nothing to do with each other."""
-        return self.spread > NO_SPREAD
-
-    @property
-    def doubt(self) -> str:
-        """What is wrong between the two depths, in words; empty where nothing is."""
+    def status(self) -> Status:
+        """What is wrong between the two depths: failed where they have nothing in common."""
         if self.spread > DOUBTFUL_SPREAD:
             percent = 100 * np.expm1(self.spread)
-            return f"along the motion the depths of the two frames differ by {percent:.0f} %"
+            text = f"along the motion the depths of the two frames differ by {percent:.0f} %"
+            wrong = Status.failed if self.spread > NO_SPREAD else Status.degraded
+            return wrong(Reason.NO_VALID_DEPTH, text)
         if abs(np.log(self.ratio)) > DOUBTFUL_SPREAD:
-            return (
+            return Status.degraded(
+                Reason.NO_VALID_DEPTH,
                 f"the current frame's depth is {self.ratio:.3g} times the previous one's, so the "
-                f"length of the translation is as uncertain"
+                f"length of the translation is as uncertain",
             )
-        return ""
+        return Status()
 
 
-def depth_agreement(
-    curr: Frame, u: np.ndarray, v: np.ndarray, moved: np.ndarray, least: int = 100
+def compare_depths(
+    pair: FramePair, T_curr_prev: np.ndarray, weights: np.ndarray | None
 ) -> DepthAgreement | None:
-    """Compare the depth of a frame with that of points of another one, moved into it.
+    """Compare both depths of a pair where the robust weights (H, W) of a motion exceed one half.
 
-    It asks the nearest pixel, whatever its neighbours are: in noise none agree. Points (N,) are
-    seen at ``u``, ``v`` px with the depth ``moved``, metres; None where fewer than ``least`` tell.
+    The scale of a whole sequence cannot be seen: all depths and all translations times s project to
+    the same pixels. A scale that changes on the way can. It asks the nearest pixel, whatever its
+    neighbours are: in noise none agree. None where too few points tell.
     """
-    assert curr.depth is not None  # asked by the caller
-    height, width = curr.depth.shape
-    with np.errstate(invalid="ignore"):
-        inside = (u > -0.5) & (v > -0.5) & (u < width - 0.5) & (v < height - 0.5)
-        inside &= (moved > 1e-6) & (moved < 1e9)
-    at = np.rint(v[inside]).astype(np.intp), np.rint(u[inside]).astype(np.intp)
+    prev, curr, flow = pair.prev, pair.curr, pair.flow
+    if flow is None or prev.depth is None or curr.depth is None or weights is None:
+        return None
+    (height, width), step = prev.depth.shape, max(1, math.isqrt(prev.depth.size // COMPARED))
+    first = step // 2
+    v, u = (first + step * k for k in np.nonzero(weights[first::step, first::step] > 0.5))
+    K, (a, b, c), t = prev.camera, T_curr_prev[2, :3], T_curr_prev[2, 3]
+    moved = prev.depth[v, u] * (a * (u - K.cx) / K.fx + b * (v - K.cy) / K.fy + c) + t
+    column, row = np.rint(u + flow[v, u, 0]), np.rint(v + flow[v, u, 1])
+    inside = (row >= 0) & (column >= 0) & (row < height) & (column < width) & (moved > MIN_DEPTH)
+    at = row[inside].astype(np.intp), column[inside].astype(np.intp)
     seen = curr.depth[at].astype(np.float64)
-    known = (seen > 1e-6) & (seen < 1e9)
+    known = (seen > MIN_DEPTH) & (seen < MAX_VALUE)
     if curr.mask is not None:
         known &= curr.mask[at]
-    if np.count_nonzero(known) < least:
+    if np.count_nonzero(known) < MIN_COMPARED:
         return None
     log_ratio = np.log(seen[known] / moved[inside][known])
     middle = float(np.median(log_ratio))
     return DepthAgreement(float(np.exp(middle)), float(np.median(np.abs(log_ratio - middle))))
-
-
-def depth_ratio(
-    prev: Frame, curr: Frame, flow: np.ndarray | None, T_curr_prev: np.ndarray
-) -> float | None:
-    """Median depth of the current frame over what the previous one and the motion predict.
-
-    The scale of a whole sequence cannot be seen: all depths and all translations times s project to
-    the same pixels. A scale that changes on the way can. None where too few pixels can be compared.
-    """
-    if flow is None or prev.depth is None or curr.depth is None:
-        return None
-    step = max(1, math.isqrt(prev.depth.size // 1500))
-    rows, columns = (np.arange(step // 2, n, step) for n in prev.depth.shape)
-    v, u = (x.ravel() for x in np.meshgrid(rows, columns, indexing="ij"))
-    usable = prev.depth[v, u] > 0
-    if prev.mask is not None:
-        usable &= prev.mask[v, u]
-    v, u = v[usable], u[usable]
-    K, (a, b, c), t = prev.camera, T_curr_prev[2, :3], T_curr_prev[2, 3]
-    moved = prev.depth[v, u] * (a * (u - K.cx) / K.fx + b * (v - K.cy) / K.fy + c) + t
-    found = depth_agreement(curr, u + flow[v, u, 0], v + flow[v, u, 1], moved, least=50)
-    return None if found is None else found.ratio
-
-
-def is_step(ratio: float | None) -> bool:
-    """Whether depths of one scale would not give this ratio."""
-    return ratio is not None and abs(math.log(max(ratio, 1e-30))) > math.log(MAX_RATIO)

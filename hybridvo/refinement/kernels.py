@@ -150,13 +150,46 @@ def gather_grid(stride, data, camera, flags, scale, out):
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
-def pose_entries(pose):
-    """The twelve numbers of a (3, 4) pose, row by row, in single precision."""
-    p = pose.astype(np.float32)
+def pose_entries(p):
+    """The twelve numbers of a (3, 4) pose, row by row."""
     return (
         p[0, 0], p[0, 1], p[0, 2], p[0, 3], p[1, 0], p[1, 1],
         p[1, 2], p[1, 3], p[2, 0], p[2, 1], p[2, 2], p[2, 3],
     )  # fmt: skip
+
+
+@njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
+def see(x, y, z, entries):
+    """(X'/Z', Y'/Z', 1/Z', whether in front) of a point on the ray (x, y, 1), ``z`` metres deep."""
+    r00, r01, r02, tx, r10, r11, r12, ty, r20, r21, r22, tz = entries
+    Zc = z * (r20 * x + r21 * y + r22) + tz
+    front = Zc > MIN_DEPTH
+    i = ONE / (Zc if front else ONE)
+    a = (z * (r00 * x + r01 * y + r02) + tx) * i
+    b = (z * (r10 * x + r11 * y + r12) + ty) * i
+    return a, b, i, front
+
+
+@njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
+def slope(a, b, i, entries, K):
+    """Derivative q of pi(X') in log Z."""
+    tx, ty, tz = entries[3], entries[7], entries[11]
+    return K[0] * i * (a * tz - tx), K[1] * i * (b * tz - ty)
+
+
+@njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
+def at_likely_depth(a, b, i, ru, rv, g, entries, K):
+    """(a, b, i, qu, qv, kappa) at the depth that the residual makes most likely (see the module's
+    docstring); ``g``: variance of log depth over that of the flow, Sigma^-1 ~ I - kappa q q^T.
+    """
+    qu, qv = slope(a, b, i, entries, K)
+    shift = g * (qu * ru + qv * rv) / (ONE + g * (qu * qu + qv * qv))
+    shift = min(max(shift, -MAX_SHIFT), MAX_SHIFT)
+    a += qu * shift / K[0]
+    b += qv * shift / K[1]
+    i *= ONE - (ONE - entries[11] * i) * shift
+    qu, qv = slope(a, b, i, entries, K)
+    return a, b, i, qu, qv, g / (ONE + g * (qu * qu + qv * qv))
 
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
@@ -170,7 +203,7 @@ def project_block(buf, o, n, pose, K, noise, work, robust, acc):
     """
     keep_apart()  # type: ignore[call-arg]
     fx, fy, cx, cy = K[0], K[1], K[2], K[3]
-    r00, r01, r02, tx, r10, r11, r12, ty, r20, r21, r22, tz = pose_entries(pose)
+    entries = pose_entries(pose.astype(np.float32))
     isf2, sd2, c2 = noise[0], noise[1], noise[2]
     b_x, b_y, b_z, b_u = buf[XN][o:], buf[YN][o:], buf[Z][o:], buf[MU][o:]
     b_v, b_f, b_d, b_w = buf[MV][o:], buf[PF][o:], buf[PD][o:], buf[W][o:]
@@ -178,32 +211,12 @@ def project_block(buf, o, n, pose, K, noise, work, robust, acc):
     N0, N1 = work[6], work[7]
     cost = wsum = count = ZERO
     for k in range(n):
-        xn = b_x[k]
-        yn = b_y[k]
-        z = b_z[k]
-        X = z * (r00 * xn + r01 * yn + r02) + tx
-        Y = z * (r10 * xn + r11 * yn + r12) + ty
-        Zc = z * (r20 * xn + r21 * yn + r22) + tz
-        front = Zc > MIN_DEPTH
-        i = ONE / (Zc if front else ONE)
+        a, b, i, front = see(b_x[k], b_y[k], b_z[k], entries)
         wx = b_w[k] if front else ZERO
-        a = X * i
-        b = Y * i
         ru = b_u[k] - (fx * a + cx)
         rv = b_v[k] - (fy * b + cy)
-        qu = fx * i * (a * tz - tx)
-        qv = fy * i * (b * tz - ty)
         ip = isf2 * b_f[k]
-        g = sd2 * b_d[k] * ip
-        # the depth that the residual makes most likely (see the module's docstring)
-        shift = g * (qu * ru + qv * rv) / (ONE + g * (qu * qu + qv * qv))
-        shift = min(max(shift, -MAX_SHIFT), MAX_SHIFT)
-        a += qu * shift / fx
-        b += qv * shift / fy
-        i *= ONE - (ONE - tz * i) * shift
-        qu = fx * i * (a * tz - tx)
-        qv = fy * i * (b * tz - ty)
-        kap = g / (ONE + g * (qu * qu + qv * qv))
+        a, b, i, qu, qv, kap = at_likely_depth(a, b, i, ru, rv, sd2 * b_d[k] * ip, entries, K)
         dot = kap * (qu * ru + qv * rv)
         n0 = ip * (ru - dot * qu)
         n1 = ip * (rv - dot * qv)
@@ -227,6 +240,14 @@ def project_block(buf, o, n, pose, K, noise, work, robust, acc):
     acc[27] += np.float32(0.5) * cost
     acc[28] += wsum
     acc[29] += count
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def residual(samples, k, entries, K):
+    """(ru, rv, qu, qv, in front) of pixel ``k``."""
+    a, b, i, front = see(samples[XN, k], samples[YN, k], samples[Z, k], entries)
+    qu, qv = slope(a, b, i, entries, K)
+    return samples[MU, k] - (K[0] * a + K[2]), samples[MV, k] - (K[1] * b + K[3]), qu, qv, front
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
@@ -332,13 +353,14 @@ def sum_rotation(o, n, work, acc):
 
 @njit(error_model="numpy", cache=True, nogil=True)
 def sum_samples(samples, n, pose, K, noise, work, acc):
-    """Normal equations of gathered pixels, set in ``acc`` (30,) float64."""
+    """Normal equations of gathered pixels, set in ``acc`` (30,) float64; returns their cost."""
     acc[:] = 0.0
     for o in range(0, n, BLOCK):
         m = min(BLOCK, n - o)
         project_block(samples, o, m, pose, K, noise, work, work[8], acc)
         sum_translation(0, m, work, acc)
         sum_rotation(0, m, work, acc)
+    return acc[COST]
 
 
 @njit(error_model="numpy", cache=True, nogil=True)

@@ -12,17 +12,16 @@ import numpy as np
 from hybridvo.options import RefineOptions
 from hybridvo.refinement import kernels
 from hybridvo.results import Reason, RelativePose
-from hybridvo.types import Camera, FramePair
+from hybridvo.types import FramePair
 
-MIN_USABLE = 0.1
-"""Share of usable grid pixels below which the grid is drawn anew, finer, where they are."""
-MIN_USABLE_PIXELS = 400
+MIN_USABLE = 0.05
+"""Share of the pixels asked for that must be usable, else a grid is drawn anew, finer."""
 PARALLEL_PIXELS, THREADS = 100_000, 2
 """Below this many pixels one thread is as fast, and steadier under load."""
 
 
 class PixelGrid:
-    """The arrays of a pair as the kernels take them; may be cropped to the usable pixels."""
+    """The arrays of a pair as the kernels take them."""
 
     def __init__(self, pair: FramePair, weights: np.ndarray | None) -> None:
         prev, curr = pair.prev, pair.curr
@@ -47,21 +46,9 @@ class PixelGrid:
             as_contiguous(prev.depth), as_contiguous(pair.flow), flow_variance, depth_variance,
             as_contiguous(external),
         )  # fmt: skip
-        self.set_cameras(prev.camera, curr.camera, 0, 0)
-
-    def set_cameras(self, prev: Camera, curr: Camera, u0: int, v0: int) -> None:
-        """Intrinsics for a crop whose top-left pixel is (u0, v0)."""
-        self.origin = (u0, v0)
-        self.camera = np.array([1 / prev.fx, 1 / prev.fy, prev.cx - u0, prev.cy - v0], np.float32)
-        self.K = np.array([curr.fx, curr.fy, curr.cx - u0, curr.cy - v0], np.float32)
-
-    def crop(self, prev: Camera, curr: Camera, box: tuple[int, int, int, int]) -> None:
-        """Restrict to rows v0..v1-1 and columns u0..u1-1."""
-        v0, v1, u0, u1 = box
-        self.data = tuple(
-            as_contiguous(a[v0:v1, u0:u1]) if a.shape[:2] != (1, 1) else a for a in self.data
-        )
-        self.set_cameras(prev, curr, u0, v0)
+        a, b = prev.camera, curr.camera
+        self.camera = np.array([1 / a.fx, 1 / a.fy, a.cx, a.cy], np.float32)
+        self.K = np.array([b.fx, b.fy, b.cx, b.cy], np.float32)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -69,9 +56,14 @@ class PixelGrid:
         return self.data[0].shape
 
     def samples(self, pixels: int) -> tuple[np.ndarray, int, int, int]:
-        """(buffer, h, w, stride) of a regular grid of about ``pixels`` pixels."""
+        """(buffer, h, w, stride) of a grid of about ``pixels`` pixels; finer if few are usable."""
         stride = grid_stride(self.shape, pixels)
-        return *self.strided(stride), stride
+        while True:
+            buffer, h, w = self.strided(stride)
+            usable = np.count_nonzero(buffer[kernels.W, : h * w] > 0)
+            if usable >= MIN_USABLE * pixels or stride == 1:
+                return buffer, h, w, stride
+            stride //= 2
 
     def strided(self, stride: int) -> tuple[np.ndarray, int, int]:
         """(buffer, h, w) of every ``stride``-th pixel of both axes."""
@@ -82,17 +74,6 @@ class PixelGrid:
         buffer = np.empty((kernels.BUFFER_ROWS, ((h * w + 15) // 16 | 1) * 16), np.float32)
         kernels.gather_grid(stride, self.data, self.camera, self.flags, self.scale, buffer)
         return buffer, h, w
-
-    def usable_box(self) -> tuple[int, tuple[int, int, int, int]]:
-        """(number of usable pixels, their bounding box) of the full grid."""
-        buffer, height, width = self.strided(1)
-        usable = buffer[kernels.W, : height * width].reshape(height, width) > 0
-        count = int(np.count_nonzero(usable))
-        if count == 0:
-            return 0, (0, 0, 0, 0)
-        rows = np.flatnonzero(usable.any(axis=1))
-        columns = np.flatnonzero(usable.any(axis=0))
-        return count, (rows[0], rows[-1] + 1, columns[0], columns[-1] + 1)
 
     def full_pass(
         self, pose: np.ndarray, noise: np.ndarray, tile: int
@@ -130,21 +111,22 @@ def grid_stride(shape: tuple[int, int], pixels: int) -> int:
 
 @dataclass(frozen=True, eq=False)
 class CoarseGrid:
-    """Every n-th pixel of both axes, over the part of an image where pixels are usable.
+    """Every n-th pixel of both axes of an image.
 
     Args:
-        pixels: arrays of the pair, cropped to ``box``.
+        pixels: arrays of the pair.
         samples: (rows, n) buffer of the gathered pixels, see :mod:`hybridvo.refinement.kernels`.
         shape: (h, w, stride).
-        size: (height, width) of the image, px.
-        box: (v0, v1, u0, u1) that the grid covers.
     """
 
     pixels: PixelGrid
     samples: np.ndarray
     shape: tuple[int, int, int]
-    size: tuple[int, int]
-    box: tuple[int, int, int, int]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(height, width) of the image, px."""
+        return self.pixels.shape
 
     @property
     def count(self) -> int:
@@ -155,6 +137,12 @@ class CoarseGrid:
     def weight(self) -> np.ndarray:
         """(n,) external weight of each pixel; 0 where it cannot be used."""
         return self.samples[kernels.W, : self.count]
+
+    @property
+    def places(self) -> tuple[slice, slice]:
+        """The grid's pixels of a whole image."""
+        stride = self.shape[2]
+        return (slice(stride // 2, None, stride),) * 2
 
     def masked(self, mask: np.ndarray) -> np.ndarray:
         """A copy of the samples, their weights times a mask (h, w)."""
@@ -167,32 +155,25 @@ class CoarseGrid:
         factors = self.upsample(mask)
         if weights is not None:
             factors = factors * np.asarray(weights, np.float32)
-        pixels = PixelGrid(pair, factors)
-        if self.box != (0, self.size[0], 0, self.size[1]):
-            pixels.crop(pair.prev.camera, pair.curr.camera, self.box)
-        return CoarseGrid(pixels, self.masked(mask), self.shape, self.size, self.box)
+        return CoarseGrid(PixelGrid(pair, factors), self.masked(mask), self.shape)
 
     def resample(self, image: np.ndarray) -> np.ndarray:
         """(h, w) float32: a map over the whole image, of any resolution, at the grid's pixels."""
-        h, w, stride = self.shape
-        height, width = self.size
-        first = stride // 2 + 0.5
-        v = (self.box[0] + first + np.arange(h) * stride) * (image.shape[0] / height) - 0.5
-        u = (self.box[2] + first + np.arange(w) * stride) * (image.shape[1] / width) - 0.5
+        v, u = (
+            (np.arange(n)[at] + 0.5) * (m / n) - 0.5
+            for n, m, at in zip(self.size, image.shape, self.places, strict=True)
+        )
         u, v = np.meshgrid(u.astype(np.float32), v.astype(np.float32))
         source = np.ascontiguousarray(image, np.float32)
         return cv2.remap(source, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
     def upsample(self, mask: np.ndarray) -> np.ndarray:
-        """(H, W) float32 over the whole image from a mask (h, w); 0 outside of the box."""
-        h, w, stride = self.shape
-        v0, v1, u0, u1 = self.box
+        """(H, W) float32 over the whole image from a mask (h, w)."""
+        (h, w, stride), (height, width) = self.shape, self.size
         mask = np.ascontiguousarray(mask, np.float32)
         fine = cv2.resize(mask, (w * stride, h * stride), interpolation=cv2.INTER_LINEAR)
-        missing = (0, max(0, v1 - v0 - h * stride)), (0, max(0, u1 - u0 - w * stride))
-        whole = np.zeros(self.size, np.float32)
-        whole[v0:v1, u0:u1] = np.pad(fine, missing, mode="edge")[: v1 - v0, : u1 - u0]
-        return whole
+        missing = (0, max(0, height - h * stride)), (0, max(0, width - w * stride))
+        return np.pad(fine, missing, mode="edge")[:height, :width]
 
 
 def coarse_grid(
@@ -205,17 +186,12 @@ def coarse_grid(
         return RelativePose.failed(Reason.NO_VALID_DEPTH, "no depth for this frame", "refine")
     pixels = PixelGrid(pair, weights)
     samples, h, w, stride = pixels.samples(options.coarse_pixels)
-    usable = np.count_nonzero(samples[kernels.W, : h * w] > 0)
-    size = pixels.shape
-    box = (0, size[0], 0, size[1])
-    if usable < MIN_USABLE * h * w or usable < MIN_USABLE_PIXELS:
-        count, box = pixels.usable_box()
-        if count < options.min_pixels:
-            why = too_few(pair.prev.depth, pair.flow, count, options.min_pixels)
-            return RelativePose.failed(*why, "refine")
-        pixels.crop(pair.prev.camera, pair.curr.camera, box)
-        samples, h, w, stride = pixels.samples(options.coarse_pixels)
-    return CoarseGrid(pixels, samples, (h, w, stride), size, box)
+    grid = CoarseGrid(pixels, samples, (h, w, stride))
+    usable = int(np.count_nonzero(grid.weight > 0))
+    if usable < options.min_pixels:
+        why = too_few(pair.prev.depth, pair.flow, usable, options.min_pixels)
+        return RelativePose.failed(*why, "refine")
+    return grid
 
 
 def too_few(depth: np.ndarray, flow: np.ndarray, count: int, minimum: int) -> tuple[Reason, str]:

@@ -8,23 +8,42 @@ both noise scales are estimated from the pair.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from hybridvo.calibration import MIN_TILES, WEAK_RATIO
-from hybridvo.geometry import invert, se3_log
+from hybridvo.geometry import invert, pose_matrix, se3_log
 from hybridvo.options import RefineOptions
-from hybridvo.refinement.coarse_fit import fit_coarse
-from hybridvo.refinement.covariance import NOTHING, direction_is_known
-from hybridvo.refinement.full_fit import FullFit, fit_full_grid
-from hybridvo.refinement.pixels import CoarseGrid, coarse_grid
+from hybridvo.refinement import coarse_fit
+from hybridvo.refinement.covariance import (
+    NOTHING,
+    direction_is_known,
+    motion_covariance,
+    score_sums,
+    symmetric,
+    tile_size,
+)
+from hybridvo.refinement.depth import DepthFactor, compare_depths, depth_scale, look_up
+from hybridvo.refinement.kernels import SUMS, new_work, sum_samples
+from hybridvo.refinement.pixels import CoarseGrid, PixelGrid, as_contiguous, coarse_grid
+from hybridvo.refinement.solver import Factor, Linearization, gauss_newton
 from hybridvo.results import Hypothesis, Reason, RelativePose, Status
 from hybridvo.types import FramePair
 
-MIN_INLIER_RATIO = 0.02
-"""Share of the pixels that must follow the motion, else it is none."""
-LOW_INLIER_RATIO = 0.25
-"""Share of the pixels below which the motion is degraded."""
+MIN_INLIER_RATIO, LOW_INLIER_RATIO = 0.02, 0.25
+"""Shares of the pixels that must follow the motion, else it is none, or degraded."""
+STEPS, LAST_STEP = 5, 0.5
+"""Most steps, and length in standard deviations of the last one. The coarse fit is about
+sqrt(6 x 60) of the full fit's standard deviations away (60 times fewer pixels), and a step is wrong
+by some 2 % of its length, the statistical error of the curvature: the second step is the last."""
+WELL_CONDITIONED = 0.005
+"""Ratio of the extreme eigenvalues of the flow's information above which it needs no help."""
+CURRENT_DEPTH_GAIN = 0.5
+"""The current depth is used where it adds this share of the flow's information somewhere."""
+DEPTHS_PER_PAIR = 1.32
+"""The two depths of a pair differ by this many times the noise of one: sqrt(2), less what the
+interpolation of the second one averages away (4/9 remains of independent noise)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,95 +80,76 @@ def refine_pair(
     factors on the information of each pixel.
     """
     options, context = options or RefineOptions(), context or Context()
-    if grid is None:
-        made = coarse_grid(pair, weights, options)
-        if isinstance(made, RelativePose):
-            return made
-        grid = made
-    pose = np.ascontiguousarray(T_init[:3], dtype=np.float64)
-    iterations, noise = context.iterations, context.noise
+    made = grid or coarse_grid(pair, weights, options)
+    if isinstance(made, RelativePose):
+        return made
+    pose = np.array(T_init[:3], np.float64)
+    noise, iterations = context.noise, context.iterations
     if noise is None:
-        pose, sf, sd, _, iterations = fit_coarse(
-            grid.samples, grid.count, grid.pixels.K, pose, options.cutoff
+        pose, sf, sd, _, iterations = coarse_fit.fit_coarse(
+            made.samples, made.count, made.pixels.K, pose, options.cutoff
         )
         noise = sf, sd
-    fit = fit_full_grid(pair, grid, pose, noise, options)
-    motion = fit.motion.replace(
-        inlier_ratio=min(1.0, fit.motion.inlier_ratio * context.coverage),
-        iterations=iterations + fit.motion.iterations,
+    curr = None if options.current_depth == "off" else pair.curr.depth
+    motion, tiles = _fit_full_grid(made, curr, pose, noise, options)
+    depths = None if curr is None else compare_depths(pair, motion.T_curr_prev, motion.weights)
+    share = motion.inlier_ratio
+    motion = motion.replace(
+        inlier_ratio=min(1.0, share * context.coverage),
+        iterations=iterations + motion.iterations,
         hypotheses=context.hypotheses,
         probability=context.probability,
     )
-    status = _status(fit, motion.inlier_ratio, context)
+    weak, eigenvalues = "", motion.information_eigenvalues
+    if eigenvalues[0] < WEAK_RATIO * eigenvalues[-1]:
+        weak = "a direction of the motion is barely determined"
+    elif tiles < MIN_TILES <= 0.5 * np.prod(made.size) / tile_size(made.size, options.tiles) ** 2:
+        weak = "the pixels cover too little of the image to tell how far their errors agree"
+    status = status_of(
+        tiles > 0, share, Status() if depths is None else depths.status,
+        context.probability, context.min_probability, weak,
+    )  # fmt: skip
     if not status.usable:
         nothing = {"T_curr_prev": np.eye(4), "covariance": NOTHING.copy(), "probability": 0.0}
         return motion.replace(status=status, **nothing)
-    covariance = _with_doubt(fit)
+    # what few tiles, and two depths that differ, leave unknown
+    covariance = motion.covariance * max(1.0, MIN_TILES / tiles)
+    if depths is not None and not depths.status.ok:
+        t = motion.T_curr_prev[:3, 3]
+        covariance[:3, :3] += (np.log(depths.ratio) ** 2 + depths.spread**2) * np.outer(t, t)
     valid = direction_is_known(motion.T_curr_prev, covariance)
     return motion.replace(status=status, covariance=covariance, translation_direction_valid=valid)
-
-
-def _status(fit: FullFit, share: float, context: Context) -> Status:
-    """Status of a fit."""
-    agreement, depth, weak = fit.depths, None, None
-    if agreement is not None and agreement.doubt:
-        depth = Reason.NO_VALID_DEPTH, agreement.doubt
-    eigenvalues = fit.motion.information_eigenvalues
-    if eigenvalues[0] < WEAK_RATIO * eigenvalues[-1]:
-        weak = Reason.DEGENERATE_GEOMETRY, "a direction of the motion is barely determined"
-    elif fit.tiles < MIN_TILES:
-        weak = (
-            Reason.DEGENERATE_GEOMETRY,
-            "the pixels cover too little of the image to tell how far their errors agree",
-        )
-    sure = context.probability, context.min_probability
-    status = status_of(fit.definite, share, depth, *sure, weak)
-    if status.usable and agreement is not None and agreement.is_none:
-        return Status.failed(Reason.NO_VALID_DEPTH, agreement.doubt)
-    return status
 
 
 def status_of(
     definite: bool,
     share: float,
-    doubt: tuple[Reason, str] | None,
+    doubt: Status,
     probability: float,
     min_probability: float,
-    weak: tuple[Reason, str] | None = None,
+    weak: str = "",
 ) -> Status:
     """Status of a motion that ``share`` of the pixels follow; the first reason that holds."""
     if not definite:
         what = "the pixels leave a direction of the motion undetermined"
         return Status.failed(Reason.DEGENERATE_GEOMETRY, what)
     if share < MIN_INLIER_RATIO:
-        return Status.failed(
-            Reason.LOW_INLIERS, f"{100 * share:.1f} % of the pixels follow one motion"
-        )
-    if doubt is not None:
-        return Status.degraded(*doubt)
+        what = f"{100 * share:.1f} % of the pixels follow one motion"
+        return Status.failed(Reason.LOW_INLIERS, what)
+    if not doubt.ok:
+        return doubt
     if probability < min_probability:
         return Status.degraded(
             Reason.AMBIGUOUS_MOTION,
             f"another of the motions found could be the camera's (probability of this one "
             f"{100 * probability:.0f} %)",
         )
-    if weak is not None:
-        return Status.degraded(*weak)
+    if weak:
+        return Status.degraded(Reason.DEGENERATE_GEOMETRY, weak)
     if share < LOW_INLIER_RATIO:
-        return Status.degraded(
-            Reason.LOW_INLIERS, f"only {100 * share:.0f} % of the pixels follow the motion"
-        )
+        what = f"only {100 * share:.0f} % of the pixels follow the motion"
+        return Status.degraded(Reason.LOW_INLIERS, what)
     return Status()
-
-
-def _with_doubt(fit: FullFit) -> np.ndarray:
-    """(6, 6) covariance with what few tiles, and two depths that differ, leave unknown."""
-    covariance = fit.motion.covariance * max(1.0, MIN_TILES / max(fit.tiles, 1))
-    if fit.depths is not None and fit.depths.doubt:
-        t = fit.motion.T_curr_prev[:3, 3]
-        share = np.log(fit.depths.ratio) ** 2 + fit.depths.spread**2
-        covariance[:3, :3] += share * np.outer(t, t)
-    return covariance
 
 
 def widened(motion: RelativePose) -> RelativePose:
@@ -166,3 +166,158 @@ def widened(motion: RelativePose) -> RelativePose:
     sizes = [np.max(np.sum(steps[:, part] ** 2, axis=1)) for part in (slice(0, 3), slice(3, 6))]
     doubt = (1 - motion.probability) * np.diag(np.repeat(sizes, 3))
     return motion.replace(covariance=motion.covariance + doubt, translation_direction_valid=False)
+
+
+class FlowFactor:
+    """Flow and depth of every pixel of a grid, see :mod:`hybridvo.refinement.kernels`.
+
+    ``per_weight`` (42,) is that of :func:`hybridvo.refinement.covariance.score_sums`.
+    """
+
+    def __init__(
+        self, image: PixelGrid, noise: np.ndarray, tile: int, per_weight: np.ndarray
+    ) -> None:
+        self.image, self.noise, self.tile, self._per_weight = image, noise, tile, per_weight
+
+    def linearize(self, T: np.ndarray) -> Linearization:
+        """See :class:`hybridvo.refinement.solver.Factor`; the sums stay as attributes."""
+        self.tiles, self.rest, self.weights = self.image.full_pass(T[:3], self.noise, self.tile)
+        """(rows, columns, 27) sums of each tile; cost and sums of the weights; robust weights."""
+        self.meat = self._per_weight[21:] * self.rest[2]
+        sums = self.tiles.sum(axis=(0, 1))
+        curvature = symmetric(self._per_weight[:21] * self.rest[2])
+        return Linearization(symmetric(sums[:21]), sums[21:], float(self.rest[0]), curvature)
+
+
+class PairNoise(NamedTuple):
+    """Noise of the pixels that follow a motion.
+
+    Args:
+        flow: px. depth: of log depth.
+        share: of the weight that follows.
+        difference: standard deviation of the log ratio of both depths, and given_flow: what of it
+            the flow's residual does not tell; 0 where they cannot be compared.
+    """
+
+    flow: float
+    depth: float
+    share: float
+    difference: float = 0.0
+    given_flow: float = 0.0
+
+
+def pair_noise(
+    samples: np.ndarray,
+    n: int,
+    K: np.ndarray,
+    pose: np.ndarray,
+    start: tuple[float, float],
+    cutoff: float,
+    curr: np.ndarray | None,
+) -> PairNoise:
+    """Noise of the pixels that follow a motion, from the noise (sf, sd) found before.
+
+    The current depth (H, W) bounds the noise of the first, and tells it where the flow cannot.
+    """
+    sf, sd = start
+    sf, sd, share, told = coarse_fit.estimate_noise(
+        samples, n, pose, K, sf, sd, 2.5 * sf, max(2.5 * sd, 0.02), 30,
+        coarse_fit.FINAL_NOISE_PIXELS,
+    )  # fmt: skip
+    if curr is None:
+        return PairNoise(sf, sd, share)
+    noise = np.empty(3, np.float32)
+    coarse_fit.set_noise(sf, sd, cutoff, noise)
+    few = np.ascontiguousarray(samples[:, : n : max(1, n // 1000)])
+    log_depth, robust = np.empty((2, few.shape[1]), np.float32)
+    look_up(few, len(robust), as_contiguous(curr), log_depth)
+    coarse_fit.robust_weights(few, len(robust), pose, K, noise, new_work(), robust)
+    sigma, raw = depth_scale(few, log_depth, robust, pose, K, noise)
+    if raw <= 0:
+        return PairNoise(sf, sd, share)
+    # var(rz) = sz^2 + h^2 sd^2: with two depths of one sensor sd is about raw / sqrt(2)
+    if not told:  # errors that both depths share do not show here
+        sd = min(raw / DEPTHS_PER_PAIR, coarse_fit.DEPTH_NOISE_CAP)
+    return PairNoise(sf, min(sd, raw), share, raw, max(sigma, 1e-4))
+
+
+def _fit_full_grid(
+    grid: CoarseGrid,
+    curr: np.ndarray | None,
+    pose: np.ndarray,
+    start: tuple[float, float],
+    options: RefineOptions,
+) -> tuple[RelativePose, int]:
+    """The motion (no status yet) on every pixel, from its pose (3, 4) and noise on the coarse grid.
+
+    The second value is the number of tiles in which pixels were used; 0 where a direction is open.
+    """
+    image, samples, n = grid.pixels, grid.samples, grid.count
+    sf, sd, share, _, sigma = pair_noise(samples, n, image.K, pose, start, options.cutoff, curr)
+    tile, inverse_depth = (
+        tile_size(image.shape, options.tiles),
+        coarse_fit.translation_scale(samples, n),
+    )
+    noise = np.empty(3, np.float32)
+    coarse_fit.set_noise(sf, sd, options.cutoff, noise)
+    total = float(grid.weight.sum(dtype=np.float64))
+    iterations, _, _ = coarse_fit.gauss_newton(
+        samples, n, total, image.K, noise, 4, 1e-3 * sf, pose, new_work()
+    )
+    flow = FlowFactor(image, noise, tile, score_sums(samples, n, pose, image.K, noise))
+    term = None
+    if curr is not None and sigma > 0:
+        term = _depth_factor(grid, curr, pose, sigma, noise, options)
+    factors: list[Factor] = [flow] if term is None else [flow, term]
+    found = gauss_newton(factors, pose_matrix(pose), STEPS, LAST_STEP)
+    T = pose_matrix(found.T[:3])
+    tiles, meat = flow.tiles, flow.meat
+    if term is not None:
+        tiles, meat = tiles + term.tiles, meat + term.meat
+    cost, followers, usable = flow.rest
+    covariance, eigenvalues, occupied = motion_covariance(
+        tiles, np.asarray(found.at.curvature), symmetric(meat), inverse_depth,
+        usable, image.K[0], T[:3, 3], (sf, sd),
+    )  # fmt: skip
+    motion = RelativePose(
+        T_curr_prev=T,
+        covariance=covariance,
+        method="refine",
+        terms=("flow",) if term is None else ("flow", "depth"),
+        inlier_ratio=float(share) if followers >= 6 else 0.0,
+        iterations=int(iterations + found.iterations),
+        cost=float(cost / max(usable, 1e-12)),
+        residual_scale_px=float(sf),
+        depth_noise=float(sd),
+        weights=flow.weights,
+        information_eigenvalues=eigenvalues,
+    )
+    return motion, occupied if np.isfinite(T).all() else 0
+
+
+def _depth_factor(
+    grid: CoarseGrid,
+    curr: np.ndarray,
+    pose: np.ndarray,
+    sigma: float,
+    noise: np.ndarray,
+    options: RefineOptions,
+) -> DepthFactor | None:
+    """The current depth as a factor, or None where it is not asked for or adds too little."""
+    image, samples, n, stride = grid.pixels, grid.samples, grid.count, grid.shape[2]
+    curr, tile = as_contiguous(curr), tile_size(image.shape, options.tiles)
+    # on the full fit the flow has every pixel, the depth every second one of both axes
+    fine = min(2, stride)
+    if options.current_depth == "auto":
+        sums = np.zeros(SUMS)
+        sum_samples(samples, n, pose, image.K, noise, new_work(), sums)
+        H_flow = symmetric(sums[:21])
+        units = np.repeat([1 / coarse_fit.translation_scale(samples, n), 1.0], 3)
+        eigenvalues = np.linalg.eigvalsh(H_flow * np.outer(units, units))
+        if eigenvalues[0] > WELL_CONDITIONED * eigenvalues[-1]:
+            return None
+        coarse = DepthFactor(image, curr, stride, sigma, noise, tile)
+        gain = np.linalg.eigvals(np.linalg.pinv(H_flow) @ coarse.linearize(pose).H / fine**2)
+        if not gain.real.max() > CURRENT_DEPTH_GAIN:
+            return None
+    return DepthFactor(image, curr, fine, sigma, noise, tile)

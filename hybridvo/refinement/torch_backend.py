@@ -29,10 +29,9 @@ from hybridvo.refinement.batch import (
     initial_poses,
 )
 from hybridvo.refinement.coarse_fit import DAMPING
-from hybridvo.refinement.covariance import NOTHING, UPPER, sandwich_covariance
-from hybridvo.refinement.full_fit import FLOW_ROUNDING, LAST_STEP, pair_noise, tile_size
+from hybridvo.refinement.covariance import NOTHING, UPPER, motion_covariance, tile_size
 from hybridvo.refinement.pixels import grid_stride, too_few
-from hybridvo.refinement.refine import status_of
+from hybridvo.refinement.refine import LAST_STEP, pair_noise, status_of
 from hybridvo.refinement.torch_factors import (
     CUTOFF,
     KERNELS,
@@ -356,23 +355,19 @@ class _Solver:
         weight = self.pixels.weight.double().sum(dim=1)
         depth = weighted_median(self.few.points[:, 2], self.few.weight, 1.0)
         tiles = torch.cat([last.H[..., UPPER[0], UPPER[1]], last.g], dim=2).double()
-        parallax = self.pixels.K[:, 0, 0] * T.translation().norm(dim=1) / depth
-        variance = noise[:, 0].square() + (parallax * noise[:, 1]).square()
         arrays = [
             x.double().cpu().numpy()
             for x in (tiles, curvature * weight[:, None, None], meat * weight[:, None, None],
-                      1 / depth, weight * FLOW_ROUNDING**2 / variance, T.matrix()[:, :3], noise)
+                      1 / depth, weight, self.pixels.K[:, 0, 0], T.translation(), noise[:, :2])
         ]  # fmt: skip
         found = []
         rows = -(-self.batch.depth_prev.shape[1] // self.tile)
-        for sums, *more, pose, (_, sd, *_) in zip(*arrays, strict=True):
-            if not all(np.isfinite(x).all() for x in (sums, *more, pose)):
+        for sums, *more in zip(*arrays, strict=True):
+            if not all(np.isfinite(x).all() for x in (sums, *more)):
                 found.append((NOTHING, False))
                 continue
-            covariance, _, definite = sandwich_covariance(sums.reshape(rows, -1, 27), *more)
-            # as in the numba refinement: log depth or depth
-            covariance[:3, :3] += (0.5 * sd**2) ** 2 * np.outer(pose[:, 3], pose[:, 3])
-            found.append((covariance, definite))
+            covariance, _, tiles_used = motion_covariance(sums.reshape(rows, -1, 27), *more)
+            found.append((covariance, tiles_used > 0))
         covariances = torch.as_tensor(np.stack([c for c, _ in found]), device=T.device)
         return covariances, torch.tensor([ok for _, ok in found], device=T.device)
 
@@ -387,10 +382,10 @@ class _Solver:
                     return Status.failed(Reason.NAN_INPUT, f"{name} is no camera matrix")
             depth, flow = (x[k].detach().cpu().numpy() for x in (batch.depth_prev, batch.flow))
             return Status.failed(*too_few(depth, flow, usable, self.options.min_pixels))
-        doubt = Reason.SOLVER_DIVERGED, f"not converged after {STEPS} steps"
-        return status_of(
-            definite, share, None if converged else doubt, probability, MIN_PROBABILITY
-        )
+        doubt = Status.degraded(Reason.SOLVER_DIVERGED, f"not converged after {STEPS} steps")
+        if converged:
+            doubt = Status()
+        return status_of(definite, share, doubt, probability, MIN_PROBABILITY)
 
 
 def _energy(step: torch.Tensor, H: torch.Tensor) -> torch.Tensor:

@@ -19,6 +19,7 @@ from hybridvo.geometry import se3_exp
 from hybridvo.hypotheses.generate import HypothesisSet, generate
 from hybridvo.network.prediction import propose_motion
 from hybridvo.options import Options
+from hybridvo.refinement.pixels import grid_stride
 from hybridvo.results import MotionPrediction, RelativePose
 from hybridvo.synthetic.draws import log_uniform
 from hybridvo.synthetic.layered import KnownPair
@@ -61,9 +62,10 @@ def draw_samples(
         if T_prior is not None and rng.random() < 0.7:
             starts.append(T_prior)
         found = generate(drawn.pair, np.stack(starts), Options(), int(rng.integers(1 << 30)))
-        whole = (0, drawn.depth.shape[0], 0, drawn.depth.shape[1])
-        if isinstance(found, RelativePose) or not found.is_ambiguous or found.grid.box != whole:
+        if isinstance(found, RelativePose) or not found.is_ambiguous:
             continue
+        if found.grid.shape[2] != grid_stride(found.grid.size, Options().refine.coarse_pixels):
+            continue  # a grid of another size, of pixels that are few
         sample = _record(drawn, found, T_prior) | {"source": SOURCES.index(source)}
         if network is not None:
             nothing = MotionPrediction(np.full((4, 4), np.nan), np.full((1, 1), 0.5))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import threading
 from pathlib import Path
 from typing import Any
 
@@ -176,18 +175,6 @@ def test_resume_with_other_options_is_refused(dataset, tmp_path, capsys):
 def test_results_are_not_written_among_the_frames(dataset, capsys):
     assert run(dataset, dataset) == 2
     assert "--out" in capsys.readouterr().err
-
-
-def test_two_threads_give_the_trajectory_of_one(dataset, tmp_path):
-    def work(name: str) -> None:
-        run(dataset, tmp_path / name, "--flow", "dis", "--stop", "4")
-
-    threads = [threading.Thread(target=work, args=(name,)) for name in ("a", "b")]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    np.testing.assert_allclose(poses(tmp_path / "a"), poses(tmp_path / "b"), atol=1e-6)
 
 
 def test_a_recording(dataset, tmp_path):

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import copy
 import pickle
-import threading
 from collections.abc import Callable
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 import torch
@@ -16,7 +14,7 @@ import torch
 import hybridvo as hvo
 from hybridvo.flow import dis_flow
 from hybridvo.geometry import invert
-from hybridvo.results import Reason, State
+from hybridvo.results import Reason
 from tests import worlds
 
 PAIR, T_TRUE = worlds.world()
@@ -96,82 +94,6 @@ def test_an_image_without_texture_has_no_flow(kind: str) -> None:
     assert dis(seen, seen).flow is not None
     for prev, curr in ((seen, covered), (covered, seen), (covered, covered)):
         assert dis(prev, curr).flow is None
-
-
-def test_one_flow_provider_serves_several_threads() -> None:
-    dis = dis_flow()
-    expected = dis(PAIR.prev, PAIR.curr).flow
-    results: list[np.ndarray] = []
-
-    def work() -> None:
-        results.extend(dis(PAIR.prev, PAIR.curr).flow for _ in range(10))
-
-    threads = [threading.Thread(target=work) for _ in range(3)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert len(results) == 30
-    assert all(np.abs(flow - expected).max() < 1e-6 for flow in results)
-
-
-# --- a flow that the images contradict ------------------------------------------------------------
-
-SIZE = (120, 160)
-SHIFT = (6.0, 3.0)
-WRONG_FLOWS = {
-    "negated": lambda flow: -flow,
-    "zero": lambda flow: 0 * flow,
-    "twice": lambda flow: 2.2 * flow,
-    "normalised": lambda flow: flow / [160, 120],
-    "(v, -u)": lambda flow: flow[..., ::-1] * [1, -1],
-}
-
-
-def shifted(change: Callable = lambda flow: flow, **more: object) -> hvo.FramePair:
-    """An image shifted by (6, 3) px beside its true flow, or a wrong one made of it."""
-    wide = cv2.GaussianBlur(np.random.default_rng(3).uniform(0, 255, (140, 180, 3)), (0, 0), 3)
-    wide = ((wide - wide.min()) / np.ptp(wide) * 255).astype(np.uint8)
-    depth = np.full(SIZE, 3.0, np.float32)
-    flow = change(np.broadcast_to(np.float32(SHIFT), (*SIZE, 2)))
-    K = hvo.Camera(130.0, 130.0, 79.5, 59.5, *SIZE)
-    prev, curr = (
-        hvo.Frame(np.ascontiguousarray(rgb), depth, K)
-        for rgb in (wide[10:130, 10:170], wide[7:127, 4:164])
-    )
-    return hvo.FramePair(prev, curr, np.asarray(flow, np.float32), **more)
-
-
-def is_contradicted(pair: hvo.FramePair) -> bool:
-    found = hvo.estimate(pair)
-    worlds.assert_sane(found)
-    return found.status.state is State.FAILED and found.status.reason is Reason.NO_FLOW
-
-
-@pytest.mark.parametrize("kind", WRONG_FLOWS)
-def test_a_flow_of_another_sign_unit_or_order_is_refused(kind: str) -> None:
-    assert is_contradicted(shifted(WRONG_FLOWS[kind]))
-    assert not is_contradicted(shifted(WRONG_FLOWS[kind], flow_source="dis"))
-
-
-@pytest.mark.parametrize("kind", ["right", "noisy", "with holes", "partly wrong"])
-def test_a_right_flow_is_not_refused(kind: str) -> None:
-    rng = np.random.default_rng(0)
-    change = {
-        "right": lambda flow: flow,
-        "noisy": lambda flow: flow + rng.normal(0, 3, flow.shape),
-        "with holes": lambda flow: np.where(rng.random((*SIZE, 1)) < 0.4, np.nan, flow),
-        "partly wrong": lambda flow: np.where(rng.random((*SIZE, 1)) < 0.3, 40.0, flow),
-    }[kind]
-    assert not is_contradicted(shifted(change))
-
-
-def test_images_that_tell_nothing_contradict_nothing() -> None:
-    pair = shifted(WRONG_FLOWS["negated"])
-    black = np.zeros_like(pair.prev.rgb)
-    other = np.random.default_rng(9).integers(0, 255, black.shape, dtype=np.uint8)
-    for rgb in (black, other, pair.prev.rgb, None):
-        assert not is_contradicted(replace(pair, curr=replace(pair.curr, rgb=rgb)))
 
 
 def test_the_callers_torch_settings_change_nothing() -> None:

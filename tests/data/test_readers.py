@@ -120,13 +120,6 @@ def test_tum_calibrations_are_those_of_the_folder_name(tmp_path):
         assert given.camera(0) == Camera(500, 501, 320, 240, 480, 640) and given[0].mask is None
 
 
-def test_undistorted_depth_is_never_mixed(tmp_path):
-    frame = open_sequence(write.write_tum(tmp_path, "freiburg1").path)[0]
-    stored = np.append(np.round(write.depth_map(0, 480, 640) * 5000) / 5000, 0)
-    np.testing.assert_allclose(np.setdiff1d(frame.depth, stored.astype(np.float32)), [], atol=1e-6)
-    assert frame.mask.mean() > 0.8 and not frame.mask.all()
-
-
 def test_bonn_truth_is_that_of_the_camera(tmp_path):
     plain = open_sequence(write.write_tum(tmp_path / "a").path).poses
     sequence = open_sequence(write.write_tum(tmp_path / "b", "rgbd_bonn_crowd").path)
@@ -171,14 +164,6 @@ def test_kitti_depth_from_stereo(tmp_path):
     np.testing.assert_allclose(np.median(frame.depth[found]), 1.25, rtol=0.02)
     sigma = 0.5 * frame.depth / (20 * 0.5)  # half a pixel of disparity, f b = 10
     np.testing.assert_allclose(frame.depth_variance, sigma**2, rtol=1e-5)
-
-
-def test_kitti_with_stored_depth_needs_no_right_camera(tmp_path):
-    root = write.write_kitti(tmp_path).path
-    calib = root / "calib.txt"
-    lines = [line for line in calib.read_text().splitlines() if not line.startswith("P3")]
-    calib.write_text("\n".join(lines) + "\n")
-    assert open_sequence(root)[0].depth is not None
 
 
 def test_failure_says_what_was_looked_for(tmp_path):

@@ -211,24 +211,3 @@ def test_a_motion_outside_of_the_flow_is_refused(light):
     done = refine_photometric(pair, wrong)
     assert done.photometric.reason == "rejected"
     np.testing.assert_array_equal(done.T_curr_prev, wrong.T_curr_prev)
-
-
-@pytest.mark.parametrize("noise", [6, 25])
-def test_noise_and_holes_leave_finite_motions(noise, light):
-    pair, _, T = light
-    rng = np.random.default_rng(noise)
-
-    def noisy(rgb):
-        return np.clip(rgb + rng.normal(0, noise, rgb.shape), 0, 255).astype(np.uint8)
-
-    depth = pair.prev.depth.copy()
-    depth[rng.random(depth.shape) < 0.3] = np.nan
-    bad = replace(
-        pair, prev=replace(pair.prev, rgb=noisy(pair.prev.rgb), depth=depth),
-        curr=replace(pair.curr, rgb=noisy(pair.curr.rgb)),
-    )  # fmt: skip
-    motion = refine(bad)
-    done = refine_photometric(bad, motion)
-    assert np.isfinite(done.T_curr_prev).all()
-    assert np.linalg.eigvalsh(done.covariance)[0] > 0
-    assert error_px(pair, done.T_curr_prev, T) <= 1.05 * error_px(pair, motion.T_curr_prev, T)

@@ -98,14 +98,6 @@ def test_the_true_motion_leaves_nothing_unexplained():
     np.testing.assert_allclose(scale.start[0, 3:], MOTION[:3, 3], rtol=1e-6)
 
 
-def test_no_motion_as_a_start_changes_nothing():
-    inputs = static_inputs()
-    plain, _ = remove_scale(inputs)
-    started, _ = remove_scale(inputs, torch.eye(4)[None])
-    torch.testing.assert_close(plain.flow, started.flow, atol=1e-4, rtol=0)
-    torch.testing.assert_close(plain.inverse_depth, started.inverse_depth, atol=1e-4, rtol=0)
-
-
 @pytest.mark.parametrize("value", [np.nan, np.inf, 0.0, 1e38])
 def test_bad_values_give_finite_predictions(value):
     flow, depth = np.full((32, 64, 2), value), np.full((32, 64), value)

@@ -11,14 +11,7 @@ import pytest
 from hybridvo.calibration import LONG_GROWTH
 from hybridvo.estimation import refine
 from hybridvo.geometry import invert, se3_log
-from hybridvo.refinement import noise
-from hybridvo.refinement.covariance import (
-    UPPER,
-    block_sums,
-    long_range,
-    sandwich_covariance,
-)
-from hybridvo.refinement.pixels import PixelGrid
+from hybridvo.refinement.covariance import UPPER, block_sums, long_range, sandwich_covariance
 from hybridvo.refinement.refine import widened
 from hybridvo.results import Reason, State, Status
 from hybridvo.synthetic.scenarios import make_pair
@@ -71,8 +64,8 @@ def answer(error: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     tiles = np.concatenate([to_tiles(H_PIXEL)[..., UPPER[0], UPPER[1]], scores], axis=2)
     products = np.einsum("vuki,vuk->vui", J, residual).reshape(-1, 6)
     meat = products.T @ products
-    covariance, _, definite = sandwich_covariance(tiles, np.zeros((6, 6)), meat, 1.0)
-    assert definite
+    covariance, _, tiles_used = sandwich_covariance(tiles, np.zeros((6, 6)), meat, 1.0)
+    assert tiles_used == ROWS * COLUMNS
     return motion, covariance
 
 
@@ -171,9 +164,7 @@ def line(pair: FramePair) -> FramePair:
 def test_a_narrow_support_is_degraded_and_a_whole_image_is_not() -> None:
     pair, _ = make_pair("moving00", 3)
     assert refine(pair).status.state is State.OK
-    result = refine(line(pair))
-    assert result.status.state is State.DEGRADED
-    assert result.status.reason is Reason.DEGENERATE_GEOMETRY
+    assert refine(line(pair)).status.state is State.DEGRADED
 
 
 def test_depth_noise_that_the_flow_cannot_tell_comes_from_the_second_depth() -> None:
@@ -182,14 +173,6 @@ def test_depth_noise_that_the_flow_cannot_tell_comes_from_the_second_depth() -> 
     result = refine(pair)
     # the depths differ by 1.2 to 1.41 times the noise, as much of it as interpolation averages
     assert result.depth_noise == pytest.approx(0.02, rel=0.2)
-
-
-def test_depth_noise_that_nothing_tells_is_doubted() -> None:
-    pair, _ = make_pair("zero_motion", 5)
-    samples, h, w, _ = (image := PixelGrid(pair, None)).samples(7500)
-    pose = np.eye(4)[:3].copy()
-    facts = noise.estimate_noise(samples, h * w, pose, image.K, 0.5, 0.01, 2.0, 0.08, 5, 4000)
-    assert facts[3] == pytest.approx(noise.DOUBTFUL_DEPTH_NOISE**2)
 
 
 def test_a_degraded_motion_covers_its_doubt() -> None:

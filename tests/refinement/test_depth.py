@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from hybridvo.estimation import estimate, refine
 from hybridvo.geometry import ego_flow, se3_exp
 from hybridvo.options import Options, RefineOptions
-from hybridvo.refinement.depth import depth_agreement
+from hybridvo.refinement.depth import DepthAgreement, compare_depths
 from hybridvo.results import Reason
 from hybridvo.types import Camera, Frame, FramePair
 
@@ -47,19 +47,26 @@ def with_depths(pair: FramePair, change) -> FramePair:
 
 def test_numbers_by_hand() -> None:
     # 200 points 3 m away
-    u, v, moved = np.arange(200.0), np.full(200, 3.0), np.full(200, 3.0)
+    camera, weights = Camera(9, 9, 0, 0, 10, 300), np.zeros((10, 300))
+    weights[3, :200] = 1.0
     depth = np.full((10, 300), 3.0)
-    depth[3, :50], depth[3, 50:100], depth[3, 100:200] = 3.3, 2.7, 3.0
-    camera = Camera(9, 9, 0, 0, 10, 300)
-    found = depth_agreement(Frame(None, depth, camera), u, v, moved)
+    prev, flow = Frame(None, depth.copy(), camera), np.zeros((10, 300, 2))
+    depth[3, :50], depth[3, 50:100] = 3.3, 2.7
+
+    def compare(depth: np.ndarray, weights: np.ndarray) -> DepthAgreement | None:
+        pair = FramePair(prev, Frame(None, depth, camera), flow)
+        return compare_depths(pair, np.eye(4), weights)
+
+    found = compare(depth, weights)
     assert found is not None
     # a quarter at log 1.1 = 0.0953, a quarter at log 0.9, a half at 0: the middle one is 0
     assert found.ratio == pytest.approx(1.0, abs=1e-6)
-    assert 0 <= found.spread <= 0.106 and not found.doubt
-    twice = depth_agreement(Frame(None, 2 * depth, camera), u, v, moved)
+    assert 0 <= found.spread <= 0.106 and found.status.ok
+    twice = compare(2 * depth, weights)
     assert twice is not None and twice.ratio == pytest.approx(2.0, abs=1e-6)
-    assert "2 times" in twice.doubt and not twice.is_none
-    assert depth_agreement(Frame(None, depth, camera), u[:99], v[:99], moved[:99]) is None
+    assert "2 times" in twice.status.message and twice.status.usable
+    weights[3, 99:] = 0.0
+    assert compare(depth, weights) is None
 
 
 def test_one_world_is_no_doubt() -> None:

@@ -11,7 +11,7 @@ import pytest
 from hybridvo.cli import main
 from hybridvo.estimation import refine
 from hybridvo.geometry import ego_flow, se3_exp
-from hybridvo.refinement.depth import depth_ratio, is_step
+from hybridvo.refinement.depth import compare_depths
 from hybridvo.types import Camera, Frame, FramePair
 from tests.walks import REFINE, command, write_walk
 
@@ -33,43 +33,32 @@ def pair() -> tuple[Frame, Frame, np.ndarray]:
     return Frame(None, prev, K), Frame(None, curr, K, index=1), ego_flow(prev, T, K, K)
 
 
+EVERYWHERE = np.ones(K.shape)
+
+
 def test_exact_depth_has_the_ratio_one(pair) -> None:
-    prev, curr, flow = pair
     # half a pixel to the nearest of a slope of 0.2 % a pixel; the median of both signs
-    assert depth_ratio(prev, curr, flow, T) == pytest.approx(1.0, abs=5e-4)
+    found = compare_depths(FramePair(*pair), T, EVERYWHERE)
+    assert found.ratio == pytest.approx(1.0, abs=5e-4)
     # T moves the points away by 0.4 m, and they are 4 m away
-    assert depth_ratio(prev, curr, flow, np.eye(4)) == pytest.approx(1.1, abs=0.03)
+    found = compare_depths(FramePair(*pair), np.eye(4), EVERYWHERE)
+    assert found.ratio == pytest.approx(1.1, abs=0.03)
 
 
 @pytest.mark.parametrize("scale", [5.0, 1.3, 0.2, 1e-3])
 def test_another_scale_is_its_ratio_in_spite_of_holes(pair, scale: float) -> None:
     prev, curr, flow = pair
     depth = scale * curr.depth
-    depth[::3], flow[:20] = np.nan, np.nan
-    flow[-20:] = 1e30
-    mask = np.ones(K.shape, bool)
+    depth[::3] = np.nan
+    mask, followers = np.ones(K.shape, bool), EVERYWHERE.copy()
     mask[:, :30] = False
     depth[:, :30] = 77.0
-    found = depth_ratio(prev, replace(curr, depth=depth, mask=mask), flow, T)
-    assert found == pytest.approx(scale, rel=2e-3) and is_step(found)
-
-
-def test_nothing_to_compare_is_no_ratio(pair) -> None:
-    prev, curr, flow = pair
-    nothing = np.full(K.shape, np.nan)
-    for a, b, f in (
-        (replace(prev, depth=None), curr, flow),
-        (prev, replace(curr, depth=None), flow),
-        (prev, replace(curr, depth=nothing), flow),
-        (replace(prev, depth=nothing), curr, flow),
-        (prev, curr, None),
-        (prev, curr, flow + 1000),
-        (replace(prev, mask=np.zeros(K.shape, bool)), curr, flow),
-    ):
-        assert depth_ratio(a, b, f, T) is None
-    behind = np.diag([1.0, 1.0, -1.0, 1.0])
-    assert depth_ratio(prev, curr, flow, behind) is None
-    assert not is_step(None) and not is_step(1.2) and not is_step(1 / 1.2)
+    followers[:20] = 0.0
+    flow[:20] = np.nan
+    found = compare_depths(
+        FramePair(prev, replace(curr, depth=depth, mask=mask), flow), T, followers
+    )
+    assert found.ratio == pytest.approx(scale, rel=2e-3) and not found.status.ok
 
 
 def test_a_scale_from_the_start_leaves_no_trace(pair) -> None:
@@ -81,7 +70,8 @@ def test_a_scale_from_the_start_leaves_no_trace(pair) -> None:
         a, b = (replace(f, depth=s * f.depth) for f in (prev, curr))
         motion = refine(FramePair(a, b, flow))
         assert motion.ok
-        found.append((motion, depth_ratio(a, b, flow, motion.T_curr_prev)))
+        depths = compare_depths(FramePair(a, b, flow), motion.T_curr_prev, motion.weights)
+        found.append((motion, depths.ratio))
     (one, ratio), (four, again) = found
     assert again == pytest.approx(ratio, rel=1e-6) == pytest.approx(1.0, abs=0.01)
     np.testing.assert_allclose(four.T_curr_prev[:3, :3], one.T_curr_prev[:3, :3], atol=1e-6)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 
 import pytest
 import torch
@@ -16,11 +15,9 @@ from hybridvo.refinement.torch_backend import refine_batch
 from hybridvo.refinement.torch_factors import (
     KERNELS,
     RobustNoise,
-    linearize,
     newton_matrix,
     residuals,
     scores,
-    solve_small,
 )
 from hybridvo.torch_geometry import left_update, pixel_grid, pp, reproject
 from hybridvo.types import PairBatch
@@ -104,24 +101,6 @@ def test_gradcheck() -> None:
     )  # fmt: skip
 
 
-def test_against_an_unrolled_solve() -> None:
-    values = made(seed=4)
-    flow = values["flow"].clone().requires_grad_()
-    implicit = solve(values | {"flow": flow})
-    C = torch.randn(2, 4, 4, dtype=F64, generator=torch.Generator().manual_seed(5))
-    (expected,) = torch.autograd.grad((C * implicit).sum(), flow)
-    batch = PairBatch(**{k: v for k, v in values.items() if k not in ("weights", "noise")})
-    pixels = gather_pixels(replace(batch, flow=flow), values["weights"])
-    how = RobustNoise(values["noise"])
-    T = pp.mat2SE3(implicit.detach(), check=False)
-    for _ in range(40):  # a contraction of about 0.4
-        H, g = linearize(pixels, residuals(pixels, T), how).total()
-        T = left_update(torch.linalg.solve(H, g), T)
-    assert (T.matrix() - implicit).abs().max() < 1e-11
-    (unrolled,) = torch.autograd.grad((C * T.matrix()).sum(), flow)
-    assert (unrolled - expected).abs().max() < 1e-6 * expected.abs().max()
-
-
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_matrix_of_the_newton_step_against_differences(kernel: str) -> None:
     values = made(seed=6)
@@ -187,17 +166,6 @@ def test_only_on_request() -> None:
         assert not refine_batch(batch).T_curr_prev.requires_grad
 
 
-def test_pypose_tangents_are_ours() -> None:
-    """Translation first, from the left, and the gradient of Exp is that of the matrix."""
-    g = torch.Generator().manual_seed(0)
-    d = torch.randn(3, 6, generator=g, dtype=F64) * torch.tensor([[0.0], [1e-5], [0.7]], dtype=F64)
-    T = pp.se3(torch.randn(3, 6, generator=g, dtype=F64)).Exp()
-    for k in range(3):
-        expected = torch.as_tensor(se3_exp(d[k].numpy())) @ T[k].matrix()
-        assert (left_update(d, T)[k].matrix() - expected).abs().max() < 1e-13
-    assert torch.autograd.gradcheck(lambda x: left_update(x, T).matrix(), d.requires_grad_())
-
-
 def test_a_refined_motion_of_half_a_turn() -> None:
     """About the axis of the lens: the only half turn whose two images show the same things."""
     T = pp.se3(torch.tensor([[0.05, -0.02, 0.1, 0.0, 0.0, math.pi]], dtype=F64)).Exp().matrix()
@@ -211,12 +179,3 @@ def test_a_refined_motion_of_half_a_turn() -> None:
     assert found.converged.all() and (found.T_curr_prev - T).abs().max() < 0.05
     (gradient,) = torch.autograd.grad(found.T_curr_prev.sum(), flow)
     assert torch.isfinite(gradient).all() and 0 < gradient.abs().max() < 1e3
-
-
-def test_small_systems_are_solved_each_for_itself() -> None:
-    good = 2 * torch.eye(6, dtype=F64)
-    A = torch.stack([good, torch.zeros(6, 6, dtype=F64), math.nan * good, -good])
-    step, solved = solve_small(A, torch.ones(4, 6, dtype=F64))
-    assert solved.tolist() == [True, False, False, True]
-    assert step[0].tolist() == pytest.approx([0.5] * 6)
-    assert (step[1:3] == 0).all()

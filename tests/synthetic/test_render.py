@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from hybridvo.data.image_io import read_cam, read_depth, read_flow, read_mask_png, read_rgb
 from hybridvo.data.sequence import Sequence
 from hybridvo.errors import InputError, OutputError
-from hybridvo.geometry import ego_flow, invert, pixel_grid, rotation_angle
-from hybridvo.synthetic.raycast import BOX, CYLINDER, ELLIPSOID
+from hybridvo.geometry import ego_flow, invert, pixel_grid
+from hybridvo.synthetic.raycast import BOX, ELLIPSOID
 from hybridvo.synthetic.render import Scene, Solid, SyntheticSequence, write_sintel
 from hybridvo.synthetic.scenes import FAMILIES, HEAVY, make_scene
 from hybridvo.types import Camera
@@ -47,38 +47,6 @@ def test_depth_of_a_sphere_by_hand():
     assert np.isinf(depth[5, 15])
 
 
-def test_depth_of_a_plane_by_hand():
-    # the upper face of the box is the plane y = 1; row v sees it at z = fy / (v - cy)
-    depth = single(Solid(BOX, affine((500, 1, 500), (0, 2, 0)))).render(0).depth
-    expected = 20.0 / (np.arange(6, 11) - 5.0)
-    np.testing.assert_allclose(depth[6:], np.repeat(expected[:, None], 21, axis=1), rtol=1e-6)
-    assert np.isinf(depth[:6]).all()
-
-
-def test_depth_inside_a_room_is_the_far_wall():
-    scene = single(Solid(BOX, affine((100, 100, 7), (0, 0, 0))))
-    np.testing.assert_allclose(scene.render(0).depth, 7.0, rtol=1e-6)
-
-
-def test_depth_of_a_cylinder_by_hand():
-    depth = single(Solid(CYLINDER, affine((1, 0.5, 1), (0, 0, 5)))).render(0).depth
-    # side: as the sphere in the row through the axis; half height 0.5 at z = 4 is 2.5 px
-    assert depth[5, 14] == pytest.approx(9.6 / 2.08, rel=1e-6)
-    np.testing.assert_allclose(depth[3:8, 10], 4.0)
-    assert np.isinf(depth[:3, 10]).all()
-    assert np.isinf(depth[8:, 10]).all()
-
-
-def test_the_nearer_solid_is_seen_whatever_the_order():
-    near = Solid(BOX, affine((0.5, 0.5, 0.5), (0, 0, 3)), object_id=1)
-    far = Solid(BOX, affine((9, 9, 0.5), (0, 0, 9)))
-    poses = np.eye(4)[None]
-    for solids in ((near, far), (far, near)):
-        frame = Scene((CAMERA,), poses, solids).render(0)
-        assert (frame.object_id[5, 10], frame.depth[5, 10]) == (1, 2.5)
-        assert (frame.object_id[0, 0], frame.depth[0, 0]) == (0, 8.5)
-
-
 def test_nothing_hit_is_invalid_everywhere():
     scene = single(Solid(ELLIPSOID, affine((1, 1, 1), (0, 0, -5)), object_id=1), frames=2)
     frame = scene.render(0)
@@ -104,16 +72,6 @@ def test_flow_of_a_translating_wall_by_hand():
     expected[0], expected[:, 19:] = True, True
     np.testing.assert_array_equal(occlusion, expected)
     assert moving.all()
-
-
-def test_flow_of_a_growing_sphere_by_hand():
-    A = np.stack([affine((1, 1, 1), (0, 0, 5)), affine((1.2, 1.2, 1.2), (0, 0, 5))])
-    flow = single(Solid(ELLIPSOID, A, object_id=1), frames=2).flow(0)[0]
-    np.testing.assert_allclose(flow[5, 10], 0.0, atol=1e-6)
-    # point of pixel (14, 5) relative to the centre: (0.2 t, 0, t - 5), carried outwards by 1.2
-    t = 9.6 / 2.08
-    expected = 20.0 * (1.2 * 0.2 * t) / (5 + 1.2 * (t - 5)) - 4.0
-    assert flow[5, 14, 0] == pytest.approx(expected, abs=1e-5)
 
 
 def test_static_flow_equals_ego_flow(scenes):
@@ -142,22 +100,6 @@ def test_flow_of_a_mover_equals_its_own_rigid_motion(scenes):
     expected = ego_flow(scene.render(0).depth, T, scene.cameras[0], scene.cameras[1])
     flow, _, moving = scene.flow(0)
     np.testing.assert_allclose(flow[moving], expected[moving], atol=1e-4)
-
-
-def test_a_deforming_mover_is_not_rigid(scenes):
-    scene = scenes["heavy_deforming"]
-    flow, hidden, moving = scene.flow(0)
-    keep = moving & ~hidden
-    depth = scene.render(0).depth[keep].astype(float)
-    pixels = pixel_grid(*keep.shape)[keep]
-    K = scene.cameras[0].K
-    rays = np.column_stack([pixels, np.ones(len(pixels))]) @ np.linalg.inv(K).T
-    target = (pixels + flow[keep]).astype(float)
-    points = rays * depth[:, None]
-    _, rvec, tvec = cv2.solvePnP(points, target, K, None, flags=cv2.SOLVEPNP_SQPNP)
-    projected, _ = cv2.projectPoints(points, rvec, tvec, K, None)
-    # measured 0.22 to 0.47 px over 6 seeds; the rigid family leaves 7e-8 px
-    assert np.median(np.linalg.norm(projected[:, 0] - target, axis=1)) > 0.1
 
 
 # ---------------------------------------------------------------- pictures
@@ -243,19 +185,6 @@ def test_occlusion_agrees_with_a_forward_depth_buffer(scenes, kind):
     assert occlusion[hidden].all()
 
 
-def test_occlusion_by_hand():
-    """A near block moves 2 px right: the two columns right of it are hidden, none is left."""
-    block = np.stack([affine((0.5, 50, 0.5), (x, 0, 4.5)) for x in (0.0, 0.4)])
-    wall = Solid(BOX, affine((99, 99, 1), (0, 0, 11)))
-    poses = np.tile(np.eye(4), (2, 1, 1))
-    flow, occlusion, moving = Scene((CAMERA,) * 2, poses, (Solid(BOX, block, 1), wall)).flow(0)
-    # front face at z = 4: half width 2.5 px, so columns 8..12; after the move up to 14.5
-    columns = np.flatnonzero(moving[5])
-    np.testing.assert_array_equal(columns, np.arange(8, 13))
-    np.testing.assert_allclose(flow[5, 8:13, 0], 2.0, atol=1e-5)
-    np.testing.assert_array_equal(np.flatnonzero(occlusion[5]), [13, 14])
-
-
 # ---------------------------------------------------------------- families
 
 
@@ -274,32 +203,6 @@ def test_heavy_families_keep_their_share_in_every_pair(kind):
     assert min(scene.dynamic_share(i) for i in range(19)) >= 0.46
     movers = {"heavy_rigid": 1, "heavy_deforming": 1, "heavy_two": 2, "heavy_ten": 10}[kind]
     assert len(set(scene.object_ids)) == movers + 1
-
-
-def test_static_surfaces_lie_in_front_of_and_behind_heavy_movers():
-    before = 0
-    for seed in range(4):
-        for kind in HEAVY:
-            scene = make_scene(kind, seed, height=54, width=128, frames=2)
-            frame = scene.render(0)
-            on = frame.object_id > 0
-            assert frame.depth[~on].max() > frame.depth[on].max()
-            before += frame.depth[~on].min() < frame.depth[on].min()
-    # near furniture may stand outside the picture; measured: in front in 61 of 64 scenes
-    assert before >= 13
-
-
-@pytest.mark.parametrize("kind", ["static", "light", "heavy_two"])
-def test_long_paths_stay_bounded_and_never_rest(kind):
-    scene = make_scene(kind, 1, height=27, width=64, frames=90)
-    M = invert(scene.T_world_cam[1:]) @ scene.T_world_cam[:-1]
-    angle = np.rad2deg(rotation_angle(M[:, :3, :3]))
-    length = np.linalg.norm(M[:, :3, 3], axis=1)
-    assert 0.15 < angle.min()
-    assert angle.max() < 2.5
-    assert 0.02 < length.min()
-    assert length.max() < 0.25
-    assert np.abs(scene.T_world_cam[:, :3, 3]).max() < 4
 
 
 @settings(max_examples=12, deadline=None)

@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 from scipy.ndimage import label
 
-from hybridvo.errors import InputError
 from hybridvo.geometry import ego_flow, rotation_angle
 from hybridvo.synthetic.scenarios import SCENARIOS, Scenario, make_pair
 
@@ -115,9 +114,3 @@ def test_depth_is_that_of_its_sensor():
     assert 0.03 < (~known).mean() < 0.2
     nearer = np.diff(disparity[:, 200:]) > 5
     assert (~known[:, 200:-1])[nearer].mean() > 0.9
-
-
-@pytest.mark.parametrize("arguments", [("moving31", 0), ("moving30", -1), ("moving30", 0, 8, 8)])
-def test_bad_arguments_are_refused(arguments):
-    with pytest.raises(InputError, match="make_pair"):
-        make_pair(*arguments)

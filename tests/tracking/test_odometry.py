@@ -62,14 +62,6 @@ def tracker(flow: object = None, **track: object) -> Odometry:
     return Odometry(flow=flow or exact_flow(), options=options)
 
 
-def test_first_frame_is_the_identity() -> None:
-    step = tracker().track(frame(3))
-    assert step.ok and step.status.state is State.OK
-    np.testing.assert_array_equal(step.T_world_cam, np.eye(4))
-    np.testing.assert_array_equal(step.T_curr_prev, np.eye(4))
-    assert (step.index, step.timestamp) == (3, pytest.approx(0.3))
-
-
 def test_poses_chain_camera_to_world() -> None:
     vo = tracker()
     steps = [vo.track(frame(i)) for i in range(4)]
@@ -90,12 +82,6 @@ def test_set_pose_before_and_during_the_walk() -> None:
     np.testing.assert_allclose(step.T_world_cam, start @ invert(MOTION), atol=1e-5)
     vo.set_pose(np.eye(4))
     np.testing.assert_allclose(vo.track(frame(2)).T_world_cam, invert(MOTION), atol=1e-5)
-
-
-@pytest.mark.parametrize("T", [np.zeros((4, 4)), np.full((4, 4), np.nan), np.eye(3)])
-def test_set_pose_refuses_what_is_no_pose(T: np.ndarray) -> None:
-    with pytest.raises(InputError, match="set_pose"):
-        tracker().set_pose(T)
 
 
 @pytest.mark.parametrize("policy", ["hold", "constant_velocity"])
@@ -225,15 +211,6 @@ def test_a_frame_without_depth_is_bridged_from_a_key_frame() -> None:
     )
 
 
-def test_the_window_waits_for_a_frame_with_depth() -> None:
-    vo = tracker()
-    vo.track(frame(0, depth=None))
-    assert vo.state.window is None and vo.edges == ()
-    vo.track(frame(1))
-    assert vo.state.window is not None and vo.state.window.keys[0].frame.index == 1
-    assert vo.track(frame(2)).ok and [e.prev for e in vo.edges] == [1]
-
-
 def test_set_pose_moves_the_key_frames_as_well() -> None:
     start = se3_exp(np.array([1.0, 2.0, 3.0, 0.1, 0.2, 0.3]))
     vo = tracker()
@@ -263,18 +240,6 @@ def test_prediction_is_the_last_motion_with_a_covariance() -> None:
     np.testing.assert_allclose(two.covariance, 5 * ahead.covariance)
 
 
-def test_a_failed_motion_under_constant_velocity_has_the_covariance_of_the_history() -> None:
-    vo = tracker(on_failure="constant_velocity", window=1)
-    for i in range(8):
-        vo.track(frame(i))
-    ahead = vo.predict()
-    vo.track(frame(8, depth=None))
-    first, second = vo.track(frame(9, depth=None)), vo.track(frame(10))
-    assert ahead is not None and not first.ok and not second.ok
-    np.testing.assert_allclose(first.covariance, ahead.covariance, rtol=0.2, atol=1e-12)
-    np.testing.assert_allclose(second.covariance, 2 * first.covariance, rtol=1e-6, atol=1e-12)
-
-
 def test_masks_and_depth_variances_of_ones_own_are_used() -> None:
     # the left half of every picture is a body that follows another motion, and masked
     mask = np.ones((HEIGHT, WIDTH), np.bool_)
@@ -296,16 +261,6 @@ def test_from_pretrained_knows_its_weights() -> None:
     assert hybridvo.Odometry.from_pretrained().method == DEFAULT_METHOD
     with pytest.raises(CheckpointError, match="selector"):
         hybridvo.Odometry.from_pretrained("jugde")
-
-
-@pytest.mark.parametrize("bad", [np.nan, 0.0, -1.0, np.inf])
-def test_bad_depth_never_gives_a_pose_that_is_not_finite(bad: float) -> None:
-    vo = tracker(window=1)
-    vo.track(frame(0))
-    vo.track(frame(1, depth=np.full((HEIGHT, WIDTH), bad, np.float32)))
-    step = vo.track(frame(2))
-    assert not step.ok and step.status.reason is Reason.NO_VALID_DEPTH
-    assert np.isfinite(step.T_world_cam).all() and np.isfinite(step.covariance).all()
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hybridvo.errors import FormatError, InputError, OutputError
 from hybridvo.files import atomic_write
 from hybridvo.geometry import euler_deg_to_matrix, invert, make_transform, ned_to_camera, se3_exp
-from hybridvo.trajectory import Trajectory, chain, read_trajectory
+from hybridvo.trajectory import Trajectory, read_trajectory
 from tests.walks import chained
 
 IDENTITY_TUM = "0 0 0 0 0 0 1"
@@ -144,13 +144,6 @@ def test_a_symbolic_link_is_replaced_not_followed(tmp_path):
     assert not link.is_symlink()
 
 
-def test_new_files_follow_the_umask(tmp_path):
-    with atomic_write(tmp_path / "a") as file:
-        file.write("x")
-    (tmp_path / "b").write_text("x")
-    assert (tmp_path / "a").stat().st_mode == (tmp_path / "b").stat().st_mode
-
-
 # -- reading ------------------------------------------------------------------------------------
 
 
@@ -169,7 +162,7 @@ def test_comments_crlf_tabs_bom_and_blank_lines(tmp_path):
 @pytest.mark.parametrize(
     ("lines", "match"),
     [
-        (["1 2 3"], r":1: expected 8 numbers \(TUM\), 12 \(KITTI\) or 7 \(TartanAir\).*got 3"),
+        (["1 2 3"], r":1: expected 'timestamp tx.* or 'r11.* or 'tx.*got '1 2 3'"),
         (
             [f"0 {IDENTITY_TUM}", f"1 {IDENTITY_TUM[:-1]}x"],
             r":2: expected 'timestamp tx .* got '1 0",
@@ -226,20 +219,6 @@ def test_arbitrary_bytes_give_a_trajectory_or_a_format_error(tmp_path_factory, d
     assert np.isfinite(trajectory.T_world_cam).all()
 
 
-def test_nanoseconds_become_seconds_with_a_warning(tmp_path):
-    path = write(
-        tmp_path / "t",
-        f"1305031102175304000 {IDENTITY_TUM}",
-        f"1305031102211214000 {IDENTITY_TUM}",
-    )
-    trajectory = read_trajectory(path)
-    # float64 keeps 128 ns at this size
-    np.testing.assert_allclose(
-        trajectory.timestamps, [1305031102.175304, 1305031102.211214], rtol=0, atol=3e-7
-    )
-    assert "nanoseconds" in trajectory.warnings[0]
-
-
 def test_slightly_rounded_matrices_become_rotations(tmp_path, rng):
     T = se3_exp(rng.standard_normal(6))
     path = write(tmp_path / "t", " ".join(f"{value:.4f}" for value in T[:3].ravel()))
@@ -266,14 +245,6 @@ def test_transformed_scales_positions_then_moves():
     T = make_transform(np.eye(3), np.array([1.0, 0, 0]))[None]
     moved = Trajectory([0.0], T).transformed(make_transform(np.eye(3), np.array([0, 5.0, 0])), 2.0)
     np.testing.assert_allclose(moved.positions, [[2, 5, 0]])
-
-
-def test_save_chooses_the_form_by_the_name(tmp_path, rng):
-    trajectory = random_trajectory(rng, 3)
-    for name, columns in (("t.tum", 8), ("t.txt", 8), ("t.kitti", 12)):
-        trajectory.save(tmp_path / name)
-        lines = (tmp_path / name).read_text().splitlines()
-        assert {len(line.split()) for line in lines} == {columns}
 
 
 @pytest.mark.parametrize(
@@ -304,9 +275,3 @@ def test_turn_right_then_forward():
     trajectory = chained([turn, forward], [0.0, 1.0, 2.0])
     # after the turn, forward is to the right of the world: +x
     np.testing.assert_allclose(trajectory.positions[2], [1, 0, 0], atol=1e-15)
-
-
-def test_chain_is_t_world_prev_times_inverse_of_t_curr_prev():
-    T_world_prev = make_transform(np.eye(3), np.array([10.0, 0.0, 0.0]))
-    T_curr_prev = make_transform(np.eye(3), np.array([-1.0, 2.0, 0.0]))
-    np.testing.assert_allclose(chain(T_world_prev, T_curr_prev)[:3, 3], [11, -2, 0])
