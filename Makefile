@@ -24,7 +24,7 @@ test: $(STAMP)
 test-slow: $(STAMP)
 	$(PYTEST) -n 2 -m "slow or not slow"
 
-golden: $(STAMP)  # what moved against the frozen figures; its inputs are made once, in runs/golden
+golden: $(STAMP)  # what moved against the frozen figures
 	$(BIN)/python tools/golden.py --against docs/golden.json
 
 check: $(STAMP)

@@ -13,7 +13,7 @@ from hybridvo.geometry import ego_flow, se3_exp
 from hybridvo.network.models import Models, default_models
 from hybridvo.options import Options
 from hybridvo.pipeline import BASELINES, DEFAULT_METHOD, Context, classical, networks_of, run_method
-from hybridvo.refinement.refine import refine_pair, widened
+from hybridvo.refinement.refine import refine_pair
 from hybridvo.results import MotionPrior, RelativePose
 from hybridvo.types import Camera, Frame, FramePair, PairBatch, as_rigid, as_seed, check_kind
 
@@ -62,7 +62,7 @@ def estimate(
     check_kind("estimate, a pair", pair, FramePair)
     models = models or default_models(options.run.device if networks_of(method) else "cpu")
     context = Context(options, prior, seed, None, models, flow=flow)
-    return widened(run_method(pair, method, context))
+    return run_method(pair, method, context)
 
 
 def refine(

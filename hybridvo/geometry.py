@@ -11,9 +11,6 @@ from scipy.spatial.transform import Rotation
 from hybridvo.errors import InputError
 from hybridvo.types import Camera
 
-NED_TO_CAMERA = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
-"""Maps north-east-down coordinates (x forward, y right, z down) to camera axes."""
-
 
 def pixel_grid(height: int, width: int) -> np.ndarray:
     """(H, W, 2) float64 pixel coordinates (u, v); (0, 0) is the centre of the top-left pixel."""
@@ -159,10 +156,9 @@ def matrix_to_euler_deg(R: np.ndarray) -> np.ndarray:
 
 
 def ned_to_camera(T_world_cam_ned: np.ndarray) -> np.ndarray:
-    """(..., 4, 4) camera-to-world pose in NED axes -> the same pose in camera axes (both sides)."""
-    C = np.eye(4)
-    C[:3, :3] = NED_TO_CAMERA
-    return C @ np.asarray(T_world_cam_ned, dtype=np.float64) @ C.T
+    """(..., 4, 4) pose in NED axes (x forward, y right, z down) -> in camera axes, both sides."""
+    order = [1, 2, 0, 3]
+    return np.asarray(T_world_cam_ned, dtype=np.float64)[..., order, :][..., order]
 
 
 def to_gtsam_covariance(covariance: np.ndarray) -> np.ndarray:
@@ -198,8 +194,7 @@ def to_ros_covariance(covariance: np.ndarray, T_prev_curr: np.ndarray) -> np.nda
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """``numba.njit`` whose cache on disk may fail: each process then compiles for itself.
 
-    numba looks at the age of a function's own file only: after a change in a kernel that others
-    call, remove ``__pycache__``.
+    After a change in a kernel that others call, remove ``__pycache__``.
     """
     import numba
 

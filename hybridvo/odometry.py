@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
-from pathlib import Path
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -12,44 +11,142 @@ import numpy as np
 from hybridvo.errors import InputError
 from hybridvo.estimation import warm_up
 from hybridvo.flow import FlowField, FlowProvider, dis_flow, with_flow
-from hybridvo.geometry import invert, se3_exp, se3_log
-from hybridvo.images.photometric import refine_photometric
+from hybridvo.geometry import invert, pose_matrix, se3_exp, se3_log
 from hybridvo.network.models import Models, default_models
 from hybridvo.options import Options
 from hybridvo.pipeline import (
     DEFAULT_METHOD,
     IDENTITY_STD,
-    SEARCHING,
     Context,
     check_method,
     networks_of,
-    refines_images,
     run_method,
 )
-from hybridvo.refinement.refine import widened
-from hybridvo.results import MotionPrior, Reason, RelativePose, State, Status, Step
-from hybridvo.tracking.pose_graph import Edge
-from hybridvo.tracking.state import TrackerState
-from hybridvo.tracking.window import STANDSTILL, KeyFrame, Window, locate
+from hybridvo.results import MotionPrior, Reason, RelativePose, Step
 from hybridvo.trajectory import chain
-from hybridvo.types import Frame, FramePair, as_number, as_rigid, as_seed
+from hybridvo.types import Camera, Frame, FramePair, as_number, as_rigid, as_seed
 
-DEFAULT_WINDOW = 3
-"""Key frames kept where the images refine the motion."""
-START_INFLATION = 1000.0
-"""On the covariance of the motion that a registration starts from: the images decide."""
-REGISTRATION_STEPS = 10
-"""Most steps under each blur: a start that was wrong by pixels needs more than a pair's."""
 MAX_FRAMES = 10**6
 """Frames ahead that may be asked for: matrix powers beyond are noise."""
+STANDSTILL = 1e-12 * np.eye(6)
+"""Covariance of no motion at all; a pose graph can still invert it."""
+MEMORY = 10  # motions after which a change counts 1 / e of a new one
+MIN_CHANGES = 3  # changes between motions to be seen before their spread means anything
+INFLATION = 2.0
+"""Factor on the mean square of the last changes, which tell little of the next, larger one."""
+FLOOR_M, FLOOR_RAD = 1e-3, 1e-3
+"""Smallest standard deviations of a prediction: no camera repeats its motion exactly."""
+UNKNOWN_M, UNKNOWN_RAD = 1.0, 0.3  # standard deviations where too little is known
+
+
+@dataclass(frozen=True, eq=False)
+class MotionModel:
+    """Constant velocity: the last motion between neighbours, and how motions change.
+
+    ``spread`` (6, 6) is a decaying sum of squared changes, ``weight`` their decaying number.
+    """
+
+    T_last: np.ndarray | None = None
+    spread: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
+    weight: float = 0.0
+    changes: int = 0
+
+    def observed(self, T_curr_prev: np.ndarray, neighbours: bool = True) -> MotionModel:
+        """The model after one more motion, which follows the last one directly (``neighbours``)."""
+        # a step hands its motion out as well: its array may change
+        T_curr_prev = np.array(T_curr_prev)
+        if self.T_last is None or not neighbours:
+            return replace(self, T_last=T_curr_prev)
+        change = se3_log(T_curr_prev @ invert(self.T_last))
+        keep = 1.0 - 1.0 / MEMORY
+        spread = keep * self.spread + np.outer(change, change)
+        return MotionModel(T_curr_prev, spread, keep * self.weight + 1.0, self.changes + 1)
+
+    def predict(self, frames: int = 1) -> MotionPrior | None:
+        """The motion to the frame ``frames`` ahead; None before the first motion.
+
+        The velocity is taken to wander by as much as it did: over n frames the variance is that of
+        one change times n (n + 1) (2 n + 1) / 6.
+        """
+        if self.T_last is None:
+            return None
+        n = int(frames)
+        grown = n * (n + 1) * (2 * n + 1) / 6
+        T = pose_matrix(np.linalg.matrix_power(self.T_last, n)[:3])
+        if self.changes < MIN_CHANGES:
+            return MotionPrior(T, grown * np.diag([UNKNOWN_M**2] * 3 + [UNKNOWN_RAD**2] * 3))
+        # ten changes are few for 21 numbers: half of it is even in all directions
+        mean = self.spread / self.weight
+        even = np.repeat([np.trace(mean[:3, :3]) / 3, np.trace(mean[3:, 3:]) / 3], 3)
+        one = INFLATION * 0.5 * (mean + np.diag(even))
+        return MotionPrior(T, grown * (one + np.diag([FLOOR_M**2] * 3 + [FLOOR_RAD**2] * 3)))
+
+
+@dataclass(frozen=True, eq=False)
+class TrackerState:
+    """State of a tracker after a frame: all that another one needs to go on.
+
+    Args:
+        frame: the frame that the next one is held against; None before the first one.
+        T_world_cam: (4, 4) its pose.
+        T_world_last: (4, 4) pose last handed out: another one after frames that were passed over.
+        gap: frames passed over since ``frame``. failed: motions since the last found.
+        count: frames seen.
+    """
+
+    frame: Frame | None = None
+    T_world_cam: np.ndarray = field(default_factory=lambda: np.eye(4))
+    T_world_last: np.ndarray = field(default_factory=lambda: np.eye(4))
+    motion_model: MotionModel = field(default_factory=MotionModel)
+    gap: int = 0
+    failed: int = 0
+    count: int = 0
+
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        """The state as named arrays, for ``numpy.savez``: no pickles."""
+        parts = {"": vars(self), "frame.": vars(self.frame) if self.frame is not None else {}}
+        parts["model."] = vars(self.motion_model)
+        if self.frame is not None:
+            parts["camera."] = vars(self.frame.camera)
+        return {
+            prefix + name: np.asarray(value)
+            for prefix, values in parts.items()
+            for name, value in values.items()
+            if isinstance(value, np.ndarray | int | float)
+        }
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> TrackerState:
+        """The state that :meth:`to_arrays` wrote; InputError where an array is missing."""
+
+        def part(kind: Any, prefix: str, **more: Any) -> Any:
+            known = {
+                f.name: arrays[prefix + f.name] for f in fields(kind) if prefix + f.name in arrays
+            }
+            return kind(**{k: v if v.ndim else v.item() for k, v in known.items()}, **more)
+
+        try:
+            if "count" not in arrays:
+                raise KeyError("count")
+            frame = None
+            if "frame.timestamp" in arrays:
+                camera = part(Camera, "camera.")
+                empty = {k: None for k in ("rgb", "depth") if f"frame.{k}" not in arrays}
+                frame = part(Frame, "frame.", camera=camera, **empty)
+            return part(cls, "", frame=frame, motion_model=part(MotionModel, "model."))
+        except (KeyError, TypeError, ValueError) as error:
+            raise InputError(
+                f"TrackerState.from_arrays: expected the arrays of to_arrays(), got {error!r}. "
+                f"Start the run anew."
+            ) from None
 
 
 class Odometry:
-    """Chains the motions of consecutive frames, held together by a window of key frames.
+    """Chains the motions of consecutive frames; no pose is revised later.
 
-    A step's pose is the best one at its time; no pose is revised later, and the motions of the
-    steps chain to their poses. Memory is that of the last frame and of the key frames.
-    Two trackers share no state and may run in two threads; one tracker belongs to one thread.
+    A frame that the next one cannot be held against (without depth, or of no motion) is passed
+    over: the next motion spans it. Memory is that of one frame. Two trackers share no state and may
+    run in two threads; one tracker belongs to one thread.
 
     Args:
         network: ``default`` for the pretrained weights, None for the classical refinement alone,
@@ -62,7 +159,7 @@ class Odometry:
         seed: of everything drawn at random.
 
     Raises:
-        InputError: an argument that cannot be used, or a window with a method that has none.
+        InputError: an argument that cannot be used.
 
     Example:
         >>> import numpy as np
@@ -93,19 +190,8 @@ class Odometry:
             method = "refine" if network is None else DEFAULT_METHOD
         self._models = _models(network, method, options)
         check_method(method)
-        if method not in SEARCHING and (options.track.window or 1) > 1:
-            raise InputError(
-                f"Odometry: method {method!r} has no window of key frames; set track.window to "
-                f"1, or use one of the methods {', '.join(SEARCHING)}."
-            )
         self.method, self.options = method, options
         self.seed = as_seed(seed, "Odometry.seed")
-        self._by_images = refines_images(method, options)
-        self.window = options.track.window or (DEFAULT_WINDOW if self._by_images else 1)
-        # beside a window the prior of a registration is no flow of which errors are known
-        self._registration = replace(
-            options.photometric, prior_inflation=1.0, iterations=REGISTRATION_STEPS
-        )
         self._flow = flow or dis_flow(options.flow.dis_preset)
         self.reset()
 
@@ -130,10 +216,7 @@ class Odometry:
         state = self._state
         # the frame that the next pair starts from keeps its place relative to the last pose
         T_state = T @ invert(state.T_world_last) @ state.T_world_cam if state.gap else T
-        window = state.window
-        if window is not None:
-            window = window.moved(T_state @ invert(state.T_world_cam))
-        self._state = replace(state, T_world_cam=T_state, T_world_last=T, window=window)
+        self._state = replace(state, T_world_cam=T_state, T_world_last=T)
 
     def resume(self, state: TrackerState) -> None:
         """Go on where another tracker stopped."""
@@ -145,12 +228,6 @@ class Odometry:
     def warm_up(self) -> float:
         """Compile and load everything before the first frame; seconds spent."""
         return warm_up(self.method, self._models)
-
-    @property
-    def edges(self) -> tuple[Edge, ...]:
-        """Motions between key frames and the last frame, for a graph of one's own; may be empty."""
-        window = self._state.window
-        return () if window is None else window.found
 
     def predict(self, frames: int = 1) -> MotionPrior | None:
         """The motion to the frame so many ahead, at constant velocity; None before the first."""
@@ -189,39 +266,37 @@ class Odometry:
         T_world_cam, motion = chain(state.T_world_cam, found.T_curr_prev), found
         if not found.usable:
             T_world_cam, motion = self._instead(state, found)
-        if frame.rgb is None and pair.flow is None:
-            # nothing can be matched from here: the next pair spans this frame
-            self._pass(T_world_cam)
-            return _step(frame, T_world_cam, motion)
-        window = state.window
-        if window is None:
-            window = self._first_key(frame, T_world_cam)
-        else:
-            window, T, motion, used = locate(
-                window, motion, prev, frame, self._register, self.window, self.options.track
-            )
-            T_world_cam = T if used else T_world_cam
-        if found.status.reason is Reason.AMBIGUOUS_MOTION:
-            # a registration that started from this motion confirms it whichever it is
-            motion = widened(motion)
         model = state.motion_model
         if found.usable:
-            # the pair's own motion: that of the step holds corrections of the pose before as well
             T = found.T_curr_prev
             if state.gap:
                 T = se3_exp(se3_log(T) / (state.gap + 1))
             model = model.observed(T, neighbours=not state.gap and not state.failed)
         failed = 0 if motion.usable else state.failed + 1
-        self._state = TrackerState(
-            frame, T_world_cam, T_world_cam, model, 0, failed, state.count + 1, window
+        state = replace(
+            state,
+            T_world_last=T_world_cam,
+            motion_model=model,
+            failed=failed,
+            count=state.count + 1,
         )
-        return _step(frame, T_world_cam, motion)
+        if self._leads(frame, pair, found, state.gap):
+            self._state = replace(state, frame=frame, T_world_cam=T_world_cam, gap=0)
+        else:
+            self._state = replace(state, gap=state.gap + 1)
+        return Step(frame.index, frame.timestamp, T_world_cam.copy(), motion)
 
-    def _pass(self, T_world_last: np.ndarray) -> None:
-        """After a frame that nothing can be matched from."""
-        state = self._state
-        self._state = replace(
-            state, T_world_last=T_world_last, gap=state.gap + 1, count=state.count + 1
+    def _leads(self, frame: Frame, pair: FramePair, found: RelativePose, gap: int) -> bool:
+        """Whether the next frame is held against this one: it has depth, and it was matched.
+
+        After two motions that failed it is all the same: the camera may have moved on. Only flow
+        that is computed from the images can span a frame that could not be matched.
+        """
+        if frame.depth is None or (frame.rgb is None and pair.flow is None):
+            return False
+        without_depth = found.status.reason is Reason.NO_VALID_DEPTH
+        return (
+            found.usable or gap > 0 or without_depth or getattr(self._flow, "source", "") != "dis"
         )
 
     def _estimate(self, pair: FramePair, prior: MotionPrior | None) -> RelativePose:
@@ -232,30 +307,6 @@ class Odometry:
         )
         found = run_method(pair, self.method, context)
         self._flow_fits |= found.usable
-        return found
-
-    def _register(
-        self, key: KeyFrame, curr: Frame, prior: MotionPrior | None, weights: np.ndarray
-    ) -> RelativePose:
-        """Motion from a key frame, from a start or without; one in doubt counts as failed."""
-        if prior is not None and self._by_images:
-            start = RelativePose(
-                T_curr_prev=prior.T_curr_prev,
-                covariance=START_INFLATION * prior.covariance,
-                weights=weights,
-                depth_noise=key.depth_noise,
-                method=self.method,
-            )
-            pair = FramePair(key.frame, curr, None)
-            found = refine_photometric(pair, start, self._registration)
-            assert found.photometric is not None
-            if found.photometric.taken:
-                return found
-            status = Status.failed(Reason.SOLVER_DIVERGED, found.photometric.message)
-            return found.replace(status=status)
-        found = self._estimate(self._pair(key.frame, curr), prior)
-        if found.status.state is State.DEGRADED:
-            return found.replace(status=Status.failed(found.status.reason, found.status.message))
         return found
 
     def skip(self, index: int, timestamp: float, message: str = "") -> Step:
@@ -273,22 +324,17 @@ class Odometry:
             self._state = replace(state, count=state.count + 1)
             return Step(int(index), timestamp, state.T_world_last.copy(), failed)
         T_world_cam, motion = self._instead(state, failed)
-        self._pass(T_world_cam)
+        self._state = replace(
+            state, T_world_last=T_world_cam, gap=state.gap + 1, count=state.count + 1
+        )
         return Step(int(index), timestamp, T_world_cam.copy(), motion)
 
     def _start(self, frame: Frame, state: TrackerState) -> Step:
         T = state.T_world_last
         # no motion precedes the first frame
         first = RelativePose(covariance=STANDSTILL.copy(), method=self.method)
-        window = self._first_key(frame, T)
-        self._state = TrackerState(frame, T, T, count=state.count + 1, window=window)
-        return _step(frame, T, first)
-
-    def _first_key(self, frame: Frame, T_world_cam: np.ndarray) -> Window | None:
-        """A window that begins with a frame, where one is kept and the frame has depth."""
-        if self.window == 1 or frame.depth is None:
-            return None
-        return Window((KeyFrame(frame, T_world_cam),))
+        self._state = TrackerState(frame, T, T, count=state.count + 1)
+        return Step(frame.index, frame.timestamp, T.copy(), first)
 
     def _pair(self, prev: Frame, curr: Frame, flow: Any = None) -> FramePair:
         if curr.camera.shape != prev.camera.shape:
@@ -320,10 +366,6 @@ class Odometry:
         return T_world_cam, failed.replace(T_curr_prev=T_curr_prev, covariance=covariance)
 
 
-def _step(frame: Frame, T_world_cam: np.ndarray, motion: RelativePose) -> Step:
-    return Step(frame.index, frame.timestamp, T_world_cam.copy(), motion)
-
-
 def _own(frame: Frame) -> Frame:
     """Copy whose arrays nobody else can change."""
     images: dict[str, Any] = {
@@ -349,7 +391,6 @@ def _models(network: Any, method: str, options: Options) -> Models:
         return network
     if network in ("default", None):
         return default_models(options.run.device if networks_of(method) else "cpu")
-    from hybridvo.network.weights import pretrained
+    from hybridvo.network.weights import weights_file
 
-    file = network if Path(network).is_file() else pretrained(network)
-    return Models(options.run.device, {"selector": file})
+    return Models(options.run.device, {"selector": weights_file(network)})

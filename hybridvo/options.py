@@ -108,13 +108,8 @@ class PhotometricOptions:
 
 @option_group
 class TrackOptions:
-    """The tracker: motion model, and the window of key frames."""
+    """The tracker."""
 
-    window: Count | None = None  # most key frames; None: 3 where the images refine, else 1
-    keyframe_overlap: Annotated[float, Field(gt=0, lt=1)] = 0.85  # still seen of a key frame
-    keyframe_motion: Positive = 0.08  # median shift, in widths, that makes a key frame
-    min_overlap: Annotated[float, Field(gt=0, lt=1)] = 0.5  # below which no motion is sought
-    inflation: Positive = 4.0  # factor on every covariance: errors are alike from frame to frame
     motion_prior: bool = True  # the motion predicted by constant velocity takes part
     on_failure: Literal["hold", "constant_velocity"] = "hold"
 

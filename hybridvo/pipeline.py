@@ -200,10 +200,7 @@ METHODS: dict[str, Callable[[FramePair, Context], RelativePose]] = {
 
 
 def run_method(pair: FramePair, method: str, ctx: Context) -> RelativePose:
-    """:func:`hybridvo.estimation.estimate` for arguments that were checked.
-
-    The covariance of an ambiguous motion is that of the motion itself, should it be the camera's.
-    """
+    """:func:`hybridvo.estimation.estimate` for arguments that were checked."""
     check_method(method)
     started = time.perf_counter()
     if method != "hybrid":
@@ -217,6 +214,7 @@ def run_method(pair: FramePair, method: str, ctx: Context) -> RelativePose:
         if advice := "" if median is None else depth_advice(median):
             doubt = f"the median depth is {median:.4g}; Frame.depth expects metres: {advice}"
             found = found.replace(status=replace(found.status, message=doubt))
+    found = refinement.widened(found)
     return found.replace(method=method, ms=1e3 * (time.perf_counter() - started))
 
 

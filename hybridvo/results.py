@@ -146,8 +146,7 @@ class RelativePose:
         probability: that this is the camera's motion and not an object's, 0 to 1; 0 if failed.
         hypotheses: every strong motion found, the chosen one first.
         method: name of the estimator. ms: time spent, milliseconds.
-        terms: what carried the motion: ``flow``, ``depth`` (of the current frame), ``images``,
-            ``window`` (key frames).
+        terms: what carried the motion: ``flow``, ``depth`` (of the current frame), ``images``.
         photometric: what came of the images, where they were asked.
     """
 

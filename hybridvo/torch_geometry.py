@@ -20,8 +20,7 @@ with warnings.catch_warnings():
     from kornia.geometry.camera import project_points
     from kornia.geometry.depth import unproject_meshgrid
 
-MIN_DEPTH = 1e-6
-MAX_DEPTH = 1e9
+MIN_DEPTH, MAX_DEPTH = 1e-6, 1e9
 """Metres between which a depth counts as measured, as in the numba kernels."""
 MIN_COS2, MAX_SIN = 1e-12, 1 - 1e-6
 """Squared cosine of the middle Euler angle below which it counts as a quarter turn, and the largest
@@ -35,12 +34,8 @@ def rays(height: int, width: int, K: torch.Tensor) -> torch.Tensor:
 
 def pixel_grid(height: int, width: int, like: torch.Tensor) -> torch.Tensor:
     """(H, W, 2) coordinates (u, v) of the pixel centres, of the type and device of ``like``."""
-    v, u = torch.meshgrid(
-        torch.arange(height, dtype=like.dtype, device=like.device),
-        torch.arange(width, dtype=like.dtype, device=like.device),
-        indexing="ij",
-    )
-    return torch.stack([u, v], dim=-1)
+    v, u = (torch.arange(n, dtype=like.dtype, device=like.device) for n in (height, width))
+    return torch.stack(torch.meshgrid(u, v, indexing="xy"), dim=-1)
 
 
 def se3(T: Any) -> pp.LieTensor:
@@ -58,11 +53,7 @@ def left_update(delta: torch.Tensor, T: pp.LieTensor) -> pp.LieTensor:
 
 
 def move(T: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
-    """(B, 3, N) points under (B, 4, 4) transforms.
-
-    A matrix product: pypose's ``Act`` goes through quaternions and takes 20 times as long on the
-    pixels of an image.
-    """
+    """(B, 3, N) points under (B, 4, 4) transforms; pypose's ``Act`` takes 20 times as long."""
     return torch.baddbmm(T[:, :3, 3:], T[:, :3, :3], points)
 
 
@@ -102,14 +93,14 @@ def reproject(
     if isinstance(T, pp.LieTensor):
         T = T.matrix()
     valid = (depth > 0) & (depth < MAX_DEPTH)
-    safe = torch.where(valid, depth, torch.ones_like(depth))
     with torch.autocast(depth.device.type, enabled=False):
+        safe = torch.where(valid, depth, 1.0)
         points = rays(depth.shape[1], depth.shape[2], K_prev) * safe[..., None]
         moved = move(T, points.flatten(1, 2).transpose(1, 2))
-        z = torch.where(valid, moved[:, 2].unflatten(1, depth.shape[1:]), torch.ones_like(safe))
+        z = torch.where(valid, moved[:, 2].unflatten(1, depth.shape[1:]), 1.0)
         front = z >= min_depth
         # before the division: a masked quotient would still give NaN gradients
-        ahead = torch.where(front, z, torch.ones_like(z)).flatten(1)[:, None]
+        ahead = torch.where(front, z, 1.0).flatten(1)[:, None]
         pixels = project(torch.cat([moved[:, :2], ahead], dim=1), K_curr)
     return pixels.transpose(1, 2).unflatten(1, depth.shape[1:]), valid & front, z
 
@@ -117,18 +108,16 @@ def reproject(
 def euler_transform(rotation_deg: torch.Tensor, translation: torch.Tensor) -> torch.Tensor:
     """(B, 4, 4) of Euler angles X-Y-Z in degrees and metres (B, 3), differentiable everywhere."""
     # Written out, not multiplied: a matrix product would run in bfloat16 under autocast.
-    (cx, cy, cz), (sx, sy, sz) = (
-        f(torch.deg2rad(rotation_deg)).unbind(1) for f in (torch.cos, torch.sin)
-    )
-    tx, ty, tz = translation.unbind(1)
-    zero, one = torch.zeros_like(tx), torch.ones_like(tx)
+    angles = torch.deg2rad(rotation_deg)
+    cx, cy, cz, sx, sy, sz = torch.cat([angles.cos(), angles.sin()], dim=1).unbind(1)
     rows = (
-        (cy * cz, -cy * sz, sy, tx),
-        (cx * sz + sx * sy * cz, cx * cz - sx * sy * sz, -sx * cy, ty),
-        (sx * sz - cx * sy * cz, sx * cz + cx * sy * sz, cx * cy, tz),
-        (zero, zero, zero, one),
+        (cy * cz, -cy * sz, sy),
+        (cx * sz + sx * sy * cz, cx * cz - sx * sy * sz, -sx * cy),
+        (sx * sz - cx * sy * cz, sx * cz + cx * sy * sz, cx * cy),
     )
-    return torch.stack([torch.stack(torch.broadcast_tensors(*row), dim=1) for row in rows], dim=1)
+    R = torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)
+    last = R.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(len(R), 1, 4)
+    return torch.cat([torch.cat([R, translation[:, :, None]], dim=2), last], dim=1)
 
 
 def euler_deg(R: torch.Tensor) -> torch.Tensor:
@@ -136,14 +125,12 @@ def euler_deg(R: torch.Tensor) -> torch.Tensor:
     # a quarter turn about y leaves only the sum or difference of the others: rz = 0 there, and no
     # 0 / 0 in the gradient
     locked = R[:, 0, 0] ** 2 + R[:, 0, 1] ** 2 < MIN_COS2
-    one, zero = torch.ones_like(R[:, 0, 0]), torch.zeros_like(R[:, 0, 0])
     angles = (
-        torch.atan2(
-            torch.where(locked, R[:, 2, 1], -R[:, 1, 2]),
-            torch.where(locked, R[:, 1, 1], R[:, 2, 2]),
+        torch.where(locked, R[:, 2, 1], -R[:, 1, 2]).atan2(
+            torch.where(locked, R[:, 1, 1], R[:, 2, 2])
         ),
         torch.asin(R[:, 0, 2].clamp(-MAX_SIN, MAX_SIN)),
-        torch.atan2(torch.where(locked, zero, -R[:, 0, 1]), torch.where(locked, one, R[:, 0, 0])),
+        torch.where(locked, 0.0, -R[:, 0, 1]).atan2(torch.where(locked, 1.0, R[:, 0, 0])),
     )
     return torch.rad2deg(torch.stack(angles, dim=1))
 
@@ -154,4 +141,4 @@ def weighted_median(x: torch.Tensor, weight: torch.Tensor, default: float) -> to
     reached = weight.gather(1, index).cumsum(dim=1)
     middle = (reached < 0.5 * reached[:, -1:]).sum(dim=1, keepdim=True).clamp(max=x.shape[1] - 1)
     value = ordered.gather(1, middle)[:, 0]
-    return torch.where(reached[:, -1] > 0, value, torch.full_like(value, default))
+    return torch.where(reached[:, -1] > 0, value, default)

@@ -53,19 +53,14 @@ class Trajectory:
 
     def __post_init__(self) -> None:
         stamps = to_numpy(self.timestamps, "Trajectory.timestamps")
-        if stamps.ndim != 1 or (stamps.size and stamps.dtype.kind not in "fiu"):
+        T = as_rigid(self.T_world_cam, "Trajectory.T_world_cam", many=True)
+        if not len(T) or stamps.shape != (len(T),) or stamps.dtype.kind not in "fiu":
             raise InputError(
-                f"Trajectory.timestamps: expected seconds of shape (N,), got {stamps.dtype} "
-                f"{stamps.shape}."
+                f"Trajectory: expected at least one pose, and a timestamp in seconds for each; got "
+                f"{stamps.dtype} {stamps.shape} for {len(T)} poses."
             )
         stamps = stamps.astype(np.float64)
         check_increasing(stamps, "Trajectory")
-        T = as_rigid(self.T_world_cam, "Trajectory.T_world_cam", many=True)
-        if len(T) == 0 or len(stamps) != len(T):
-            raise InputError(
-                f"Trajectory: expected at least one pose, and a timestamp for each; got "
-                f"{len(stamps)} timestamps for {len(T)} poses."
-            )
         stamps.flags.writeable = T.flags.writeable = False
         object.__setattr__(self, "timestamps", stamps)
         object.__setattr__(self, "T_world_cam", T)

@@ -24,7 +24,7 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from measuring import provenance
+from measuring import parser_of, provenance
 
 from hybridvo.errors import HybridVOError, InputError
 from hybridvo.files import write_json
@@ -54,21 +54,8 @@ PRESETS = ("data_paper", "data_diverse")
 """Of the held-out pairs."""
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the tool; returns its exit code (2 bad input, 5 no output, 130 interrupted)."""
-    try:
-        return _run(_parse(argv))
-    except HybridVOError as error:
-        print(f"ablation.py: {error}", file=sys.stderr)
-        return error.exit_code
-
-
-def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        prog="ablation.py",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+def _parser() -> argparse.ArgumentParser:
+    parser = parser_of(__file__, __doc__)
     add = parser.add_argument
     add("--out", type=Path, required=True, metavar="DIR", help="a folder for each row, and results")
     add("--configs", type=Path, default=ROWS, metavar="DIR", help="the rows (configs/ablation)")
@@ -80,33 +67,32 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     add("--threads", type=int, default=1, help="threads of torch")
     add("--workers", type=int, default=0, help="processes that draw samples (0: this one)")
     add("--device", choices=("cpu", "cuda"), default="cpu")
-    return parser.parse_args(argv)
+    return parser
 
 
-def plan(names: Sequence[str], seeds: int) -> list[tuple[str, int]]:
-    """(row, seed) in the order of training: deciding rows, the others, further seeds."""
-    first = [name for name in DECIDING if name in names]
-    order = [(name, 0) for name in first]
-    order += [(name, 0) for name in names if name not in first]
-    return order + [(name, seed) for seed in range(1, seeds) for name in first]
-
-
-def _run(args: argparse.Namespace) -> int:
-    known = sorted(path.stem for path in args.configs.glob("*.yaml") if path.stem != "base")
-    names = known if args.rows is None else args.rows.split(",")
-    unknown = sorted(set(names) - set(known))
-    if unknown:
-        raise InputError(f"--rows: unknown {', '.join(unknown)}; known: {', '.join(known)}.")
-    for name in ("seeds", "samples", "count", "threads"):
-        if getattr(args, name) < 1:
-            raise InputError(f"--{name}: expected 1 or more, got {getattr(args, name)}.")
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the tool; returns its exit code (2 bad input, 5 no output, 130 interrupted)."""
+    args = _parser().parse_args(argv)
     torch.set_num_threads(args.threads)
     cv2.setNumThreads(0)  # samples are small: threads inside OpenCV cost more than they give
-    ablation = Ablation(args)
-    for name, seed in plan(names, args.seeds):
-        if not ablation.train(name, seed):
-            print("ablation.py: interrupted; start again to go on.", file=sys.stderr)
-            return 130
+    try:
+        known = sorted(path.stem for path in args.configs.glob("*.yaml") if path.stem != "base")
+        names = known if args.rows is None else args.rows.split(",")
+        unknown = sorted(set(names) - set(known))
+        if unknown:
+            raise InputError(f"--rows: unknown {', '.join(unknown)}; known: {', '.join(known)}.")
+        first = [name for name in DECIDING if name in names]
+        order = [(name, 0) for name in dict.fromkeys([*first, *names])]
+        order += [(name, seed) for seed in range(1, args.seeds) for name in first]
+        ablation = Ablation(args)
+        for name, seed in order:
+            ablation.train(name, seed)
+    except HybridVOError as error:
+        print(f"ablation.py: {error}", file=sys.stderr)
+        return error.exit_code
+    except KeyboardInterrupt:
+        print("ablation.py: interrupted; start again to go on.", file=sys.stderr)
+        return 130
     return 0
 
 
@@ -117,43 +103,34 @@ class Ablation:
         self.args = args
         self.runs: dict[tuple[str, int], dict[str, Any]] = {}
 
-    def train(self, name: str, seed: int) -> bool:
-        """Train and score one row; False if the training was interrupted."""
+    def train(self, name: str, seed: int) -> None:
+        """Train and score one row, from where it was."""
         args, task = self.args, self.task(name, seed)
         folder = args.out / f"{name}-seed{seed}"
         folder.mkdir(parents=True, exist_ok=True)
         trainer = Trainer(task, folder, args.device, args.workers, progress(f"{name} seed {seed}"))
         trainer.resume()
-
-        def stop(number: int, frame: object) -> None:
-            trainer.stop_requested = True
-
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, stop)
-        result = read(folder / "result.json") or {"row": name, "seed": seed, "curve": {}}
+        for number in (signal.SIGINT, signal.SIGTERM):  # the update at hand ends, with a checkpoint
+            signal.signal(number, lambda *_: setattr(trainer, "stop_requested", True))
+        result: dict[str, Any] = {"row": name, "seed": seed, "curve": {}}
+        if (folder / "result.json").exists():
+            result = json.loads((folder / "result.json").read_text(encoding="utf-8"))
         result["parameters"] = sum(p.numel() for p in trainer.network.parameters())
+        self.runs[name, seed] = result
         for samples in sorted({m for m in MILESTONES if m < args.samples} | {args.samples}):
             if trainer.run(until=-(-samples // task.options.batch_size)) == "signal":
-                return False
+                raise KeyboardInterrupt
             if str(samples) not in result["curve"]:
                 scores = self.scores(trainer.exported, task.options, samples == args.samples)
                 result["curve"][str(samples)] = {"seconds": round(trainer.elapsed_s), **scores}
-            self.store(result, samples)
+                short = ", ".join(f"{p} EPE {scores[p]['epe']:.3f} px" for p in PRESETS)
+                print(f"{name} seed {seed}, {samples}: {short}", file=sys.stderr, flush=True)
+            write_json(folder / "result.json", result)
+            write_json(args.out / "ablation.json", self.summary())
         made = provenance("ablation.py", None)
         card = {"row": name, "command": made["command"], "commit": made["commit"]}
         card |= trainer.record | {"curve": result["curve"]}
         save_weights(folder / "weights.safetensors", trainer.exported, card, "float16")
-        return True
-
-    def store(self, result: dict[str, Any], samples: int) -> None:
-        """Write the figures of a row, and those of all rows so far."""
-        name, seed, out = result["row"], result["seed"], self.args.out
-        self.runs[name, seed] = result
-        write_json(out / f"{name}-seed{seed}" / "result.json", result)
-        write_json(out / "ablation.json", self.summary())
-        scores = result["curve"][str(samples)]
-        short = ", ".join(f"{preset} EPE {scores[preset]['epe']:.3f} px" for preset in PRESETS)
-        print(f"{name} seed {seed}, {samples}: {short}", file=sys.stderr, flush=True)
 
     def task(self, name: str, seed: int) -> PwvoTask:
         """The training of a row."""
@@ -235,10 +212,6 @@ def without_pairs(value: Any) -> Any:
     if not isinstance(value, dict):
         return value
     return {k: without_pairs(v) for k, v in value.items() if k != "epe_of_pairs"}
-
-
-def read(path: Path) -> dict[str, Any] | None:
-    return json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
 
 
 def progress(label: str) -> Callable[[dict[str, Any]], None]:

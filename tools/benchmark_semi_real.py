@@ -68,7 +68,7 @@ def main(argv: list[str] | None = None) -> int:
 
 def measure(args: argparse.Namespace, recordings: Any) -> list[dict[str, Any]]:
     """Errors, statuses and probabilities of every method on every pair."""
-    from hybridvo import estimate, refine
+    from hybridvo import estimate
     from hybridvo.network.models import Models
 
     models = Models(weights={"selector": args.selector}) if args.selector else None
@@ -76,10 +76,8 @@ def measure(args: argparse.Namespace, recordings: Any) -> list[dict[str, Any]]:
     for k in range(args.first, args.first + args.pairs):
         drawn = draw(args.split, k, recordings)
         pair, T = drawn.pair, drawn.T_curr_prev
-        depth = np.where(drawn.moving, 0, drawn.depth)
+        depth, limit = static_part(drawn)
         usable = pair.flow_valid & (pair.prev.depth > 0)
-        told = refine(pair, weights=(~drawn.moving).astype(np.float32))
-        limit = ego_flow_error(told.T_curr_prev, T, depth, pair)
         row: dict[str, Any] = {
             "world": drawn.world,
             "moving": digits(drawn.moving.mean()),
@@ -101,6 +99,15 @@ def measure(args: argparse.Namespace, recordings: Any) -> list[dict[str, Any]]:
             }
         rows.append(row)
     return rows
+
+
+def static_part(drawn: Any) -> tuple[np.ndarray, float]:
+    """Depth (H, W) of the static pixels, and the error in px of ``refine`` on them alone."""
+    from hybridvo import refine
+
+    depth = np.where(drawn.moving, 0, drawn.depth)
+    told = refine(drawn.pair, weights=(~drawn.moving).astype(np.float32))
+    return depth, ego_flow_error(told.T_curr_prev, drawn.T_curr_prev, depth, drawn.pair)
 
 
 def draw(split: str, number: int, recordings: Any) -> Any:

@@ -16,16 +16,18 @@ from typing import Any
 
 import numpy as np
 from benchmark import heavy_pairs
-from benchmark_semi_real import WRONG_FACTOR, WRONG_PX, calibration_error, draw
+from benchmark_semi_real import WRONG_FACTOR, WRONG_PX, calibration_error, draw, static_part
 from golden_inputs import HEAVY
 from measuring import auroc, ego_flow_error, parser_of
 from scipy.optimize import minimize
 
 from hybridvo import dis_flow, iter_pairs, open_sequence, refine
 from hybridvo.calibration import MIN_CONFIDENCE
+from hybridvo.calibration import right as probability
 from hybridvo.evaluation.pair_errors import true_motion
+from hybridvo.geometry import pose_matrix
 from hybridvo.hypotheses.selector import select_by_cues
-from hybridvo.images.direct import direct_start
+from hybridvo.images.direct import direct_start, evidence_of
 from hybridvo.network.models import Models
 from hybridvo.pipeline import Context
 from hybridvo.results import RelativePose
@@ -37,8 +39,8 @@ STATIC = (
     "tum/redwood_livingroom_5",
     "real_static/rooms_110",
 )
-RIDGE = 0.02
-"""Penalty on the squared slope, times the number of answers."""
+RIDGE = 1e-3
+"""Penalty on the squared slopes, times the number of answers."""
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -52,28 +54,24 @@ def build_parser() -> argparse.ArgumentParser:
 def main(argv: list[str] | None = None) -> int:
     args = build_parser().parse_args(argv)
     models = Models(weights={"selector": args.selector} if args.selector else None)
-    rows: dict[str, list[tuple[float, bool, bool]]] = {}
-    for pair, T, depth, limit in pairs(args):
-        for name, gap, error in answers(pair, T, depth, models):
-            is_right = error <= max(WRONG_PX, WRONG_FACTOR * limit)
-            rows.setdefault(name, []).append((gap, is_right, False))
-    for pair, T, depth, limit in static_pairs(args.data):
-        found = direct_start(pair)
-        if found is not None:
-            error = ego_flow_error(found.T_curr_prev, T, depth, pair)
-            is_right = error <= max(WRONG_PX, WRONG_FACTOR * limit)
-            rows["direct"].append((100 * found.inlier_ratio, is_right, True))
+    rows: dict[str, list[tuple[tuple[float, ...], bool, bool]]] = {}
+    for still, some in ((False, pairs(args)), (True, static_pairs(args.data))):
+        for pair, T, depth, limit in some:
+            told = () if still else answers(pair, T, depth, models)
+            for name, evidence, error in (*direct_answers(pair, T, depth), *told):
+                is_right = error <= max(WRONG_PX, WRONG_FACTOR * limit)
+                rows.setdefault(name, []).append((evidence, is_right, still))
     for name, some in rows.items():
         right, still = (np.array([row[k] for row in some]) for k in (1, 2))
         print(f"{name}: {len(right)} answers, {right.sum()} right")
         if name != "clear" and 0 < right.sum() < len(right):
-            gaps = np.array([row[0] for row in some])
+            evidence = np.array([row[0] for row in some])
             share = max(still.mean(), 1e-9)
             # static scenes and those with movers count alike
             weights = np.where(still, 0.5 / share, 0.5 / (1 - share)) if still.any() else 1.0
-            slope, offset = fit(gaps, right, weights)
-            p = 1 / (1 + np.exp(-slope * gaps - offset))
-            print(f"  ({slope:.2f}, {offset:.2f})")
+            fitted = fit(evidence, right, weights)
+            p = np.array([probability(x, fitted) for x in evidence])
+            print(f"  ({', '.join(f'{w:.2f}' for w in fitted)})")
             print(f"  AUROC {auroc(p, right)}, calibration error {calibration_error(p, right)}")
             sure = p >= MIN_CONFIDENCE
             flagged, missed = (right & ~sure).sum(), (~right & sure).sum()
@@ -86,10 +84,7 @@ def pairs(args: argparse.Namespace) -> Iterator[tuple[Any, np.ndarray, np.ndarra
     recordings = load_split(args.data, "development")
     for k in range(args.pairs):
         drawn = draw("development", k, recordings)
-        depth = np.where(drawn.moving, 0, drawn.depth)
-        told = refine(drawn.pair, weights=(~drawn.moving).astype(np.float32))
-        limit = ego_flow_error(told.T_curr_prev, drawn.T_curr_prev, depth, drawn.pair)
-        yield drawn.pair, drawn.T_curr_prev, depth, limit
+        yield drawn.pair, drawn.T_curr_prev, *static_part(drawn)
     for kind in HEAVY:
         for seed in HEAVY_SEEDS:
             for flow, pair, T, _ in heavy_pairs(kind, seed):
@@ -108,37 +103,44 @@ def static_pairs(data: Path) -> Iterator[tuple[Any, np.ndarray, np.ndarray, floa
                 yield pair, T, pair.prev.depth, limit
 
 
-def answers(
-    pair: Any, T: np.ndarray, depth: np.ndarray, models: Models
-) -> Iterator[tuple[str, float, float]]:
-    """(which probability, the gap it is computed from, error in px) of both selectors."""
+Answers = Iterator[tuple[str, tuple[float, ...], float]]
+"""(which probability, the evidence it is computed from, error in px)."""
+
+
+def direct_answers(pair: Any, T: np.ndarray, depth: np.ndarray, starts: Any = (None,)) -> Answers:
+    """The direct motion from the identity or from other motions (4, 4), sure or not."""
+    for start in starts:
+        direct = direct_start(pair, start, least=0.0)
+        if direct is not None:
+            error = ego_flow_error(direct.T_curr_prev, T, depth, pair)
+            yield "direct", evidence_of(pair, direct), error
+
+
+def answers(pair: Any, T: np.ndarray, depth: np.ndarray, models: Models) -> Answers:
+    """The same of both selectors, and of the direct motion from the two strongest motions too."""
     ctx = Context(models=models)
-    direct = direct_start(pair)
-    if direct is not None:
-        error = ego_flow_error(direct.T_curr_prev, T, depth, pair)
-        yield "direct", 100 * direct.inlier_ratio, error
     found = ctx.search(pair)
     if isinstance(found, RelativePose):
         return
+    yield from direct_answers(pair, T, depth, [pose_matrix(x) for x in found.poses[-2:]])
     chosen = {"cues": select_by_cues(found), "selector": ctx.select(pair, found)}
     if not found.is_ambiguous:
         chosen = {"clear": chosen["selector"]}
     for name, selection in chosen.items():
         motion = ctx.refine(pair, found, selection)
-        yield name, selection.gap, ego_flow_error(motion.T_curr_prev, T, depth, pair)
+        yield name, (selection.gap,), ego_flow_error(motion.T_curr_prev, T, depth, pair)
 
 
-def fit(gaps: np.ndarray, right: np.ndarray, weights: Any = 1.0) -> tuple[float, float]:
-    """Slope and offset of a logistic regression."""
-    middle = gaps.mean()
-    sign = np.where(right, 1.0, -1.0)
+def fit(evidence: np.ndarray, right: np.ndarray, weights: Any = 1.0) -> np.ndarray:
+    """Weights of a logistic regression on evidence (N, k); the last one stands alone."""
+    middle, sign = evidence.mean(axis=0), np.where(right, 1.0, -1.0)
 
     def cost(w: np.ndarray) -> float:
-        loss = np.logaddexp(0, -sign * (w[0] * (gaps - middle) + w[1]))
-        return float((weights * loss).mean() + RIDGE * w[0] ** 2 / 2)
+        loss = np.logaddexp(0, -sign * ((evidence - middle) @ w[:-1] + w[-1]))
+        return float((weights * loss).mean() + RIDGE * w[:-1] @ w[:-1] / 2)
 
-    slope, offset = minimize(cost, np.zeros(2), method="BFGS").x
-    return float(slope), float(offset - slope * middle)
+    w = minimize(cost, np.zeros(evidence.shape[1] + 1), method="BFGS").x
+    return np.append(w[:-1], w[-1] - middle @ w[:-1])
 
 
 if __name__ == "__main__":

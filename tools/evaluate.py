@@ -53,10 +53,8 @@ def build_parser() -> argparse.ArgumentParser:
 def main(argv: list[str] | None = None) -> int:
     args = build_parser().parse_args(argv)
 
-    def work() -> dict[str, Any]:
-        return provenance("evaluate.py", argv) | measure(args)
-
-    return write_result("evaluate.py", args.out, args.overwrite, work)
+    made = lambda: provenance("evaluate.py", argv) | measure(args)  # noqa: E731
+    return write_result("evaluate.py", args.out, args.overwrite, made)
 
 
 def measure(args: argparse.Namespace) -> dict[str, Any]:
@@ -123,12 +121,8 @@ def track(
                 records[key].append(row | {"ms": ms, "probability": step.motion.probability})
         prev = frame
     truth = (np.linalg.inv(sequence.poses[0]) @ sequence.poses)[:, :3, 3]
-    return {key: (records[key], path_error(np.array(places[key]), truth)) for key in trackers}
-
-
-def path_error(places: np.ndarray, truth: np.ndarray) -> float:
-    """Root mean square error of the position, cm, both paths from the same pose."""
-    return 100 * float(np.sqrt(np.mean(np.square(places - truth).sum(axis=1))))
+    errors = {key: np.linalg.norm(np.array(path) - truth, axis=1) for key, path in places.items()}
+    return {k: (records[k], 100 * float(np.sqrt(np.mean(e**2)))) for k, e in errors.items()}
 
 
 def reliability(records: list[dict[str, Any]]) -> dict[str, Any]:

@@ -6,11 +6,14 @@ python tools/generate_dataset.py --out DIR --scene light --seed 0 --seed 1
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import sys
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+
+from hybridvo.errors import HybridVOError, InputError
+from hybridvo.synthetic.render import write_sintel
+from hybridvo.synthetic.scenes import make_scene
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -22,56 +25,40 @@ def build_parser() -> argparse.ArgumentParser:
     add("--frames", type=int, default=20, help="of a sequence (default: %(default)s)")
     add("--height", type=int, default=218, help="pixels (default: %(default)s)")
     add("--width", type=int, default=512, help="pixels (default: %(default)s)")
-    add("--noise", type=float, default=0.0, help="sensor noise, grey levels")
-    add("--zoom", type=float, default=0.0, help="relative change of focal length")
     add("--overwrite", action="store_true", help="replace sequences that exist")
     return parser
 
 
 def main(argv: list[str] | None = None) -> int:
-    options = build_parser().parse_args(argv)
-    from hybridvo.errors import HybridVOError
-
+    args = build_parser().parse_args(argv)
     try:
-        for summary in generate(options):
-            print(json.dumps(summary))
+        for kind, seed in itertools.product(args.scene or ["light"], args.seed or [0]):
+            print(json.dumps(generate(args, kind, seed)))
     except HybridVOError as error:
         print(f"generate_dataset.py: {error}", file=sys.stderr)
         return error.exit_code
     return 0
 
 
-def generate(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
-    """One summary per sequence, after writing it."""
-    from hybridvo.errors import InputError
-    from hybridvo.synthetic.render import write_sintel
-    from hybridvo.synthetic.scenes import make_scene
-
-    names = ("height", "width", "frames", "zoom", "noise")
-    settings = {name: getattr(options, name) for name in names}
-    jobs = [
-        (kind, seed, f"{kind}_{seed:04d}")
-        for kind in options.scene or ["light"]
-        for seed in options.seed or [0]
-    ]
-    old = [p for *_, name in jobs for p in options.out.glob(f"training/*/{name}/frame_*")]
-    if old and not options.overwrite:
+def generate(args: argparse.Namespace, kind: str, seed: int) -> dict[str, object]:
+    """Write one sequence; what it is."""
+    name = f"{kind}_{seed:04d}"
+    old = list(args.out.glob(f"training/*/{name}/frame_*"))
+    if old and not args.overwrite:
         raise InputError(f"{old[0].parent}: is not empty; add --overwrite to replace it.")
-    for kind, seed, name in jobs:
-        scene = make_scene(kind, seed, **settings)
-        for path in options.out.glob(f"training/*/{name}/frame_*"):
-            path.unlink()
-        print(f"{name}: {scene.frames} frames", file=sys.stderr)
-        write_sintel(scene, options.out, name)
-        shares = [float((scene.object_id(i) > 0).mean()) for i in range(scene.frames - 1)]
-        yield {
-            "sequence": str(options.out / "training" / "clean" / name),
-            "scene": kind,
-            "seed": seed,
-            "frames": scene.frames,
-            "moving_share_min": round(min(shares), 4),
-            "moving_share_max": round(max(shares), 4),
-        }
+    scene = make_scene(kind, seed, height=args.height, width=args.width, frames=args.frames)
+    for path in old:
+        path.unlink()
+    write_sintel(scene, args.out, name)
+    shares = [float((scene.object_id(i) > 0).mean()) for i in range(scene.frames - 1)]
+    return {
+        "sequence": str(args.out / "training" / "clean" / name),
+        "scene": kind,
+        "seed": seed,
+        "frames": scene.frames,
+        "moving_share_min": round(min(shares), 4),
+        "moving_share_max": round(max(shares), 4),
+    }
 
 
 if __name__ == "__main__":

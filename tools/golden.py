@@ -1,9 +1,9 @@
-"""Golden figures: what an earlier revision estimated on kept inputs, and what has moved since.
+"""Golden figures: what an earlier revision estimated, and what has moved since.
 
     python tools/golden.py --against docs/golden.json     # the frozen figures
     python tools/golden.py --seeds 3 --out docs/golden.json --overwrite    # freeze
 
-Only public names are called. The exit code is 1 where something got worse by
+The exit code is 1 where something got worse by
 more than the spread over random seeds that the frozen figures carry, 0 otherwise.
 """
 
@@ -11,16 +11,18 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from golden_compare import compare
-from golden_inputs import HEAVY, read_pair, write_inputs
+from golden_inputs import HEAVY, Case, groups, rendered
 from measuring import ROOT, digits, parser_of, processor, revision, score
 from scipy.spatial.transform import Rotation
 
@@ -29,7 +31,30 @@ PRIORS = {"true": (0.01, 0.003), "before": (0.03, 0.01), "wrong": (0.01, 0.003)}
 """Priors handed in, with their standard deviations in m and rad."""
 WRONG_PRIOR = (np.array([0.3, -0.1, 0.2]), np.array([0.05, 0.08, -0.03]))
 """By how much the wrong prior is off, m and rad: thirty of its standard deviations."""
-PRIOR_PAIRS = 10
+PRIOR_PAIRS, PRIOR_METHODS = 10, ("refine", "hybrid-flow", "hybrid")
+WALK_FRAMES, WALK_SIZE = 12, (480, 640)
+METHODS = {
+    "heavy": {
+        "dis": ("refine", "hybrid-flow", "hybrid", "pwvo"),
+        "true": ("refine", "hybrid-flow"),
+    },
+    "scenario": {"made": ("refine", "hybrid-flow")},
+    "degenerate": {"made": ("refine", "hybrid")},
+    "model": {"made": ("refine",)},
+    "real": {"file": ("refine", "hybrid"), "dis": ("refine", "hybrid")},
+}
+"""First word of a group -> flow -> methods that are measured pair by pair."""
+EXPECTED_NEES = 5.35
+"""Median of chi-square with six degrees of freedom."""
+MODEL_NEES = (4.0, 8.0)
+"""Median under the noise that the refinement assumes, over 60 pairs."""
+NEES_FACTOR = 1.5
+"""By how much more the normalised error may miss its expectation."""
+MEDIAN_FACTOR, ELSEWHERE_FACTOR, WORST_FACTOR, TIME_FACTOR = 1.05, 1.2, 1.5, 1.25
+TOLERANCE = {"px": 1e-5, "m": 1e-6}
+"""Differences that say nothing: below the last digits of the inputs."""
+STATUS_SHARE = 0.1
+"""Share of the pairs of a case, one pair at least, whose status or reason may change."""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -37,9 +62,7 @@ def main(argv: list[str] | None = None) -> int:
     if args.out is not None and args.out.exists() and not args.overwrite:
         print(f"golden.py: {args.out} exists; pass --overwrite.", file=sys.stderr)
         return 2
-    if not (args.inputs / "index.json").is_file():
-        write_inputs(args.inputs, args.data)
-    new = measure(args.inputs, args.only, args.seeds)
+    new = measure(args.data, args.only, args.seeds)
     if args.out is not None:
         args.out.parent.mkdir(parents=True, exist_ok=True)
         args.out.write_text(to_text(new), encoding="utf-8")
@@ -57,7 +80,6 @@ def build_parser() -> argparse.ArgumentParser:
     parser = parser_of(__file__, __doc__)
     parser.add_argument("--out", type=Path, metavar="FILE", help="write the figures here")
     parser.add_argument("--against", type=Path, metavar="FILE", help="figures to compare with")
-    parser.add_argument("--inputs", type=Path, default=ROOT / "runs/golden/inputs", metavar="DIR")
     parser.add_argument("--data", type=Path, default=ROOT / "../shared/data", metavar="DIR")
     parser.add_argument(
         "--only", default="", metavar="A,B", help="cases with one of these in their name"
@@ -75,65 +97,56 @@ def to_text(result: dict[str, Any]) -> str:
     return text + ',\n "cases": {\n' + ",\n".join(lines) + "\n }\n}\n"
 
 
-def measure(inputs: Path, only: str, seeds: int) -> dict[str, Any]:
+def measure(data: Path, only: str, seeds: int) -> dict[str, Any]:
     """Figures of every case whose name holds one of the words in ``only``."""
     started = time.perf_counter()
-    cases: dict[str, Any] = {}
-    runs: dict[str, Callable[[], dict[str, Any]]] = {}
-    for group, flow, method in pair_cases(inputs):
-        files = sorted((inputs / group).glob("*.npz"))
-        if method == "pwvo":
-            files = files[:5]
-        runs[f"{group}/{flow}/{method}"] = lambda f=files, w=flow, m=method: pairs(f, w, m, seeds)
-    runs |= prior_cases(inputs)
-    runs["track/dis/hybrid"] = lambda: track(inputs, "hybrid", seeds)
-    runs["track/dis/refine"] = lambda: track(inputs, "refine", seeds)
-    for name, run in runs.items():
-        if any(word in name for word in only.split(",")):
-            cases[name] = run()
-            print(f"[{time.perf_counter() - started:4.0f} s] {name}", file=sys.stderr, flush=True)
+    found: dict[str, Any] = {}
+
+    def put(name: str, work: Callable[[], dict[str, Any]]) -> None:
+        found[name] = work()
+        print(f"[{time.perf_counter() - started:4.0f} s] {name}", file=sys.stderr, flush=True)
+
+    def is_wanted(name: str) -> bool:
+        return any(word in name for word in only.split(","))
+
+    for group, make in groups(data).items():
+        works: dict[str, Callable[[list[Case]], dict[str, Any]]] = {}
+        for flow, methods in METHODS[group.split("_")[0]].items():
+            for m in methods:
+                works[f"{group}/{flow}/{m}"] = partial(pairs, flow=flow, method=m, seeds=seeds)
+        for m, kind in product(PRIOR_METHODS, PRIORS if group in HEAVY else ()):
+            works[f"prior_{kind}/{group}/{m}"] = partial(with_prior, method=m, kind=kind)
+        wanted = {name: work for name, work in works.items() if is_wanted(name)}
+        cases = list(make()) if wanted else []
+        for name, work in wanted.items():
+            if name.split("/")[1] in (group, *cases[0].pairs):  # not all recordings have flow files
+                put(name, partial(work, cases))
+    for method in ("hybrid", "refine"):
+        if is_wanted(name := f"track/dis/{method}"):
+            put(name, partial(track, method, seeds))
     return {
         "command": "python tools/golden.py " + " ".join(sys.argv[1:]),
         "revision": revision(),
         "processor": processor(),
-        "inputs": json.loads((inputs / "index.json").read_text())["key"],
         "seeds": seeds,
         "seconds": round(time.perf_counter() - started, 1),
-        "cases": cases,
+        "cases": found,
     }
 
 
-def pair_cases(inputs: Path) -> Iterator[tuple[str, str, str]]:
-    """(group, flow, method) of everything that is measured pair by pair."""
-    groups = sorted(path.name for path in inputs.iterdir() if path.is_dir())
-    for group in groups:
-        if group in HEAVY:
-            yield from ((group, "dis", m) for m in ("refine", "hybrid-flow", "hybrid", "pwvo"))
-            yield from ((group, "true", method) for method in ("refine", "hybrid-flow"))
-        elif group.startswith("scenario_"):
-            yield from ((group, "made", method) for method in ("refine", "hybrid-flow"))
-        elif group.startswith("degenerate_"):
-            yield from ((group, "made", method) for method in ("refine", "hybrid"))
-        elif group == "model_noise":
-            yield group, "made", "refine"
-        elif group.startswith("real_"):
-            with np.load(next((inputs / group).glob("*.npz"))) as file:
-                flows = [name.removeprefix("flow.") for name in file.files if name[:5] == "flow."]
-            yield from ((group, flow, m) for flow in flows for m in ("refine", "hybrid"))
-    yield "scenario_moving30", "made", "pwvo"
-
-
-def pairs(files: list[Path], flow: str, method: str, seeds: int) -> dict[str, Any]:
+def pairs(cases: list[Case], flow: str, method: str, seeds: int) -> dict[str, Any]:
     """Figures of a method over pairs; with several seeds also by how much they spread."""
     from hybridvo import estimate
 
-    estimate(read_pair(files[0], flow)[0], method=method)  # what is paid once is not timed
+    estimate(cases[0].pairs[flow], method=method)  # what is paid once is not timed
     records: list[list[dict[str, Any]]] = [[] for _ in range(seeds)]
     times = []
-    for k, file in enumerate(files):
-        pair, *truth, _ = read_pair(file, flow)
+    cases = cases[:5] if method == "pwvo" else cases
+    for k, case in enumerate(cases):
+        pair = case.pairs[flow]
         for seed in range(seeds):
-            records[seed].append(score(estimate(pair, method=method, seed=seed), *truth, pair))
+            motion = estimate(pair, method=method, seed=seed)
+            records[seed].append(score(motion, case.T_curr_prev, case.depth, pair))
         if k < TIMED_PAIRS:
             times.append(least_ms(lambda pair=pair: estimate(pair, method=method)))
     row = summarise(records[0]) | {"ms": round(float(np.median(times)), 2)}
@@ -142,36 +155,24 @@ def pairs(files: list[Path], flow: str, method: str, seeds: int) -> dict[str, An
     return row
 
 
-def prior_cases(inputs: Path) -> dict[str, Callable[[], dict[str, Any]]]:
-    """The heavy pairs with the true motion, the one before and a wrong one as prior."""
-    runs: dict[str, Callable[[], dict[str, Any]]] = {}
-    for group in HEAVY:
-        files = sorted((inputs / group).glob("*.npz"))[:PRIOR_PAIRS]
-        for method in ("refine", "hybrid-flow", "hybrid"):
-            for kind in PRIORS:
-                name = f"prior_{kind}/{group}/{method}"
-                runs[name] = lambda f=files, m=method, k=kind: with_prior(f, m, k)
-    return runs
-
-
-def with_prior(files: list[Path], method: str, kind: str) -> dict[str, Any]:
+def with_prior(cases: list[Case], method: str, kind: str) -> dict[str, Any]:
     """Figures with a prior, and under ``without`` those of the same pairs without one."""
     from hybridvo import MotionPrior, estimate
 
     records, without = [], []
     std_m, std_rad = PRIORS[kind]
     covariance = np.diag([std_m**2] * 3 + [std_rad**2] * 3)
-    for file in files:
-        pair, *truth, T_before = read_pair(file, "dis")
-        T = truth[0].copy() if kind != "before" else T_before
+    for case in cases[:PRIOR_PAIRS]:
+        pair, truth = case.pairs["dis"], (case.T_curr_prev, case.depth, case.pairs["dis"])
+        T = case.T_before if kind == "before" else case.T_curr_prev.copy()
         if T is None:
             continue
         if kind == "wrong":
             T[:3, 3] += WRONG_PRIOR[0]
             T[:3, :3] = Rotation.from_rotvec(WRONG_PRIOR[1]).as_matrix() @ T[:3, :3]
         prior = MotionPrior(T, covariance)
-        records.append(score(estimate(pair, method=method, prior=prior), *truth, pair))
-        without.append(score(estimate(pair, method=method), *truth, pair))
+        records.append(score(estimate(pair, method=method, prior=prior), *truth))
+        without.append(score(estimate(pair, method=method), *truth))
     return summarise(records) | {"without": summarise(without)}
 
 
@@ -200,39 +201,29 @@ def spread(rows: list[dict[str, Any]]) -> dict[str, float]:
     return {key: value for key, value in found.items() if value}
 
 
-def track(inputs: Path, method: str, seeds: int) -> dict[str, Any]:
+def track(method: str, seeds: int) -> dict[str, Any]:
     """A tracker at 640x480: errors of position in metres, time of a whole frame with its flow."""
-    from hybridvo import Camera, Frame, Odometry
+    from hybridvo import Odometry
 
-    with np.load(inputs / "walk.npz") as file:
-        arrays = dict(file)
-    poses = np.linalg.inv(arrays["poses"][0]) @ arrays["poses"]
-    camera = Camera.from_matrix(arrays["K"], *arrays["depth"].shape[1:])
-    images = zip(arrays["rgb"], arrays["depth"], arrays["time"], strict=True)
-    frames = [
-        Frame(rgb, depth, camera, timestamp=float(stamp), index=i)
-        for i, (rgb, depth, stamp) in enumerate(images)
-    ]
+    sequence = rendered("light", 0, WALK_SIZE, WALK_FRAMES)
+    frames = [sequence.frame(i) for i in range(WALK_FRAMES)]
+    truth = (np.linalg.inv(sequence.poses[0]) @ sequence.poses)[:, :3, 3]
     rows, times = [], []
     for seed in range(max(seeds, REPEATS)):
         odometry = Odometry(method=method, seed=seed if seeds > 1 else 0)
         records, spent = [], []
-        for frame, pose in zip(frames, poses, strict=True):
+        for frame, place in zip(frames, truth, strict=True):
             begin = time.process_time()
             step = odometry.track(frame)
             spent.append(1e3 * (time.process_time() - begin))
-            records.append(along_path(step.T_world_cam, pose, str(step.motion.status)))
+            status, error = str(step.status), np.linalg.norm(step.T_world_cam[:3, 3] - place)
+            failed = {"failed": status.startswith("failed"), "nees": None}
+            failed |= dict.fromkeys(("unflagged", "overconfident"), False)
+            records.append({"error": float(error), "status": status} | failed)
         rows.append(summarise(records[1:]))
         times.append(spent[1:])
     row = rows[0] | {"unit": "m", "ms": round(float(np.median(np.min(times, axis=0))), 2)}
     return row | ({"spread": spread(rows)} if seeds > 1 else {})
-
-
-def along_path(T: np.ndarray, T_true: np.ndarray, status: str) -> dict[str, Any]:
-    """A pose of a path as a record: its error is the distance to the true place, in metres."""
-    failed = status.startswith("failed")
-    record = {"error": float(np.linalg.norm(T[:3, 3] - T_true[:3, 3])), "status": status}
-    return record | {"failed": failed, "unflagged": False, "overconfident": False, "nees": None}
 
 
 def least_ms(work: Callable[[], Any]) -> float:
@@ -243,6 +234,81 @@ def least_ms(work: Callable[[], Any]) -> float:
         work()
         times.append(1e3 * (time.process_time() - begin))
     return min(times)
+
+
+# -- what has moved ------------------------------------------------------------------------------
+
+
+def compare(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
+    """Findings, a line each: WORSE, WARNING (time) or better.
+
+    Bounds are wider where the processor differs. A case that the old figures do not have is judged
+    by itself alone; one that the new ones lack is left out.
+    """
+    findings = []
+    factor = MEDIAN_FACTOR if old["processor"] == new["processor"] else ELSEWHERE_FACTOR
+    for name, row in new["cases"].items():
+        if "without" in row:
+            lines = [(level, f"than without it: {text}") for level, text in beside_none(name, row)]
+        else:
+            lines = []
+            if name.startswith("model_noise") and not MODEL_NEES[0] <= row["nees"] <= MODEL_NEES[1]:
+                lines.append(("WORSE", f"normalised error {row['nees']:.3g}, not in {MODEL_NEES}"))
+            if name in old["cases"]:
+                lines += judge_beside(old["cases"][name], row, factor)
+        findings += [f"{level} {name}: {text}" for level, text in lines]
+    return sorted(findings, key=lambda line: line.split(" ")[0] == "better")
+
+
+def judge_beside(old: dict[str, Any], new: dict[str, Any], factor: float) -> list[tuple[str, str]]:
+    """Findings of one case beside its earlier figures."""
+    found = []
+    spread = old.get("spread", {})
+    tolerance = TOLERANCE[new.get("unit", "px")]
+    bounds = {  # factor on the earlier figure, and what may come on top
+        **dict.fromkeys(("failed", "unflagged"), (1.0, 0.0)),
+        "overconfident": (1.0, max(1, 0.05 * old["pairs"])),
+        "median": (factor, tolerance),
+    }
+    if not new["failed"]:  # with failures the worst says nothing
+        bounds["worst"] = WORST_FACTOR, tolerance
+    for key, (times, more) in bounds.items():
+        if new[key] > times * old[key] + more + spread.get(key, 0):
+            found.append(("WORSE", f"{key} {old[key]:.4g} -> {new[key]:.4g}"))
+    if old["median"] > factor * new["median"] + tolerance + spread.get("median", 0):
+        found.append(("better", f"median error {old['median']:.4g} -> {new['median']:.4g}"))
+    changed = (Counter(old["status"]) - Counter(new["status"])).total()
+    if changed > max(1, STATUS_SHARE * old["pairs"]) + spread.get("status", 0):
+        found.append(("WORSE", f"status {old['status']} -> {new['status']}"))
+    # the covariance of a degraded motion covers its doubt: more of them lower the median
+    before, now = (
+        sum(count for status, count in row["status"].items() if status.startswith("degraded"))
+        for row in (old, new)
+    )
+    doubted = now > before and (new["nees"] or 0) < EXPECTED_NEES
+    if not doubted and miss(new["nees"]) > miss(old["nees"]) + math.log(NEES_FACTOR):
+        found.append(("WORSE", f"normalised error {old['nees']:.3g} -> {new['nees']:.3g}"))
+    if old.get("ms") and new.get("ms", 0) > TIME_FACTOR * old["ms"]:
+        found.append(("WARNING", f"{old['ms']:.3g} -> {new['ms']:.3g} ms of processor time"))
+    return found
+
+
+def beside_none(name: str, row: dict[str, Any]) -> list[tuple[str, str]]:
+    """A prior beside none on the same pairs: a true one never makes an answer worse."""
+    without = row["without"]
+    lenient = 0 if name.startswith("prior_true") else 1
+    found = []
+    for key in ("failed", "unflagged"):
+        if row[key] > without[key] + lenient:
+            found.append(("WORSE", f"{key} {without[key]} -> {row[key]} of {row['pairs']}"))
+    if row["median"] > MEDIAN_FACTOR * without["median"] + TOLERANCE["px"]:
+        found.append(("WORSE", f"median error {without['median']:.4g} -> {row['median']:.4g}"))
+    return found
+
+
+def miss(nees: float | None) -> float:
+    """How far, in logarithms, a median normalised error is from what is expected."""
+    return 0.0 if nees is None else abs(math.log(max(nees, 1e-9) / EXPECTED_NEES))
 
 
 if __name__ == "__main__":

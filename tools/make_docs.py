@@ -29,32 +29,23 @@ Results = dict[str, dict[str, Any]]
 
 def build_parser() -> argparse.ArgumentParser:
     parser = parser_of(__file__, __doc__)
-    parser.add_argument("--readme", type=Path, default=ROOT / "README.md")
-    parser.add_argument("--paper", type=Path, default=ROOT / "docs" / "paper.md")
-    parser.add_argument("--page", type=Path, default=ROOT / "docs" / "results.md")
-    parser.add_argument("--results", type=Path, default=ROOT / "docs" / "results", metavar="DIR")
     parser.add_argument("--check", action="store_true", help="write nothing, only compare")
     return parser
 
 
 def main(argv: list[str] | None = None) -> int:
     args = build_parser().parse_args(argv)
-    results = read(args.results)
-    stale = 0
-    for path, text in (
-        (args.readme, fill(args.readme.read_text(encoding="utf-8"), results)),
-        (args.paper, fill(args.paper.read_text(encoding="utf-8"), results)),
-        (args.page, page(results)),
-    ):
-        if path.is_file() and path.read_text(encoding="utf-8") == text:
-            continue
-        stale += 1
-        if args.check:
-            print(f"{path}: differs from {args.results}", file=sys.stderr)
-        else:
-            path.write_text(text, encoding="utf-8")
-            print(path)
-    return int(args.check and stale > 0)
+    docs = ROOT / "docs"
+    results = read(docs / "results")
+    texts = {docs / "results.md": page(results)}
+    for path in (ROOT / "README.md", docs / "paper.md"):
+        texts[path] = fill(path.read_text(encoding="utf-8"), results)
+    stale = [path for path, text in texts.items() if path.read_text(encoding="utf-8") != text]
+    for path in stale:
+        print(f"{path}: not up to date" if args.check else path)
+        if not args.check:
+            path.write_text(texts[path], encoding="utf-8")
+    return int(args.check and bool(stale))
 
 
 def read(folder: Path) -> Results:
@@ -100,6 +91,10 @@ def error(row: dict[str, Any]) -> str:
     return number(row["epe_px"]["median"]) + (f" [{count}]" if count else "")
 
 
+def failed(row: dict[str, Any]) -> str:
+    return f"{100 * row['failures']['count'] / row['pairs']:.0f} %"
+
+
 def source(content: dict[str, Any]) -> str:
     """Where figures come from; times of a loaded machine are to be read as ratios."""
     machine = content["machine"]
@@ -118,8 +113,7 @@ def heavy(part: dict[str, Any]) -> list[str]:
         total = part["summary"]["total"][flow]
         for method, row in total.items():
             cells = [error(part["summary"][kind][flow][method]) for kind in kinds]
-            share = f"{100 * row['failures']['count'] / row['pairs']:.0f} %"
-            rows.append([f"`{method}`, {flow} flow", *cells, share, number(row["ms"])])
+            rows.append([f"`{method}`, {flow} flow", *cells, failed(row), number(row["ms"])])
     height, width = part["size"]
     return [
         *table(["method", *kinds, "failures", "ms"], rows),
@@ -134,13 +128,10 @@ def peers(part: dict[str, Any]) -> list[str]:
     total = part["summary"]["total"]["dis"]
     rows = []
     for method, row in total.items():
-        if "oracle" in method:
-            continue
-        share = f"{100 * row['failures']['count'] / row['pairs']:.0f} %"
-        rows.append(
-            [f"`{method}`", number(row["epe_px"]["median"]), number(row["translation_cm"]),
-             number(row["rotation_deg"]), share, number(row["ms"])]
-        )  # fmt: skip
+        errors = (row["epe_px"]["median"], row["translation_cm"], row["rotation_deg"])
+        if "oracle" not in method:
+            cells = [*map(number, errors), failed(row), number(row["ms"])]
+            rows.append([f"`{method}`", *cells])
     pairs = next(iter(total.values()))["pairs"]
     return [
         *table(["method", "error, px", "cm", "deg", "wrong by more than 1 px", "ms a pair"], rows),

@@ -10,7 +10,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterable
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +21,6 @@ FAILURE_PX = 1.0
 """An answer whose ego flow is wrong by more is a failure."""
 OUTSIDE = 20.062
 """Quantile 0.9973 of chi-square with six degrees of freedom: the ellipsoid of 3 sigma."""
-PACKAGES = ("numpy", "numba", "scipy", "torch", "opencv-python-headless", "poselib", "open3d")
 
 
 def parser_of(file: str, doc: str | None) -> argparse.ArgumentParser:
@@ -151,17 +149,11 @@ def able(methods: Iterable[str]) -> tuple[list[str], dict[str, str]]:
 
 def provenance(tool: str, argv: list[str] | None) -> dict[str, Any]:
     """Command, commit, machine and versions: what every file of figures begins with."""
-    words = sys.argv[1:] if argv is None else argv
-    packages = {}
-    for package in PACKAGES:
-        try:
-            packages[package] = version(package)
-        except PackageNotFoundError:
-            packages[package] = None
+    from hybridvo.files import versions
+
+    words = [str(without_folders(w)) for w in (sys.argv[1:] if argv is None else argv)]
     return {
-        "command": shlex.join(
-            ["python", f"tools/{tool}", *(without_folders(str(word)) for word in words)]
-        ),
+        "command": shlex.join(["python", f"tools/{tool}", *words]),
         "commit": revision(),
         "machine": {
             "processor": processor(),
@@ -169,7 +161,7 @@ def provenance(tool: str, argv: list[str] | None) -> dict[str, Any]:
             "load": list(os.getloadavg()) if hasattr(os, "getloadavg") else None,
             "OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS"),
         },
-        "versions": {"python": platform.python_version()} | packages,
+        "versions": versions(),
     }
 
 

@@ -11,7 +11,6 @@ docs/paper.md from the JSON files.
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import json
 import sys
@@ -20,7 +19,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from measuring import ROOT, provenance, without_folders
+from measuring import ROOT, parser_of, provenance, without_folders
 from paper_tables import ROWS
 
 from hybridvo.commands.generate import write_sheet
@@ -48,14 +47,10 @@ STEPS = 16
 
 def main(argv: list[str] | None = None) -> int:
     """Run the tool."""
-    parser = argparse.ArgumentParser(
-        prog="paper.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__file__, __doc__)
     add = parser.add_argument
     add("--ablation", type=Path, required=True, metavar="DIR", help="of tools/ablation.py")
     add("--pairs", type=int, default=200, help="held-out pairs of the statistics")
-    add("--figures", type=Path, default=ROOT / "docs" / "figures", metavar="DIR")
-    add("--results", type=Path, default=ROOT / "docs" / "results", metavar="DIR")
     add("--install", action="store_true", help="copy the rows' weights into the package")
     args = parser.parse_args(argv)
     rows = {name: args.ablation / f"{name}-seed0" / "weights.safetensors" for name in ROWS}
@@ -64,24 +59,17 @@ def main(argv: list[str] | None = None) -> int:
     samples = [preset.sample(sample_generator(PUBLISHED_SEED, i)) for i in range(args.pairs)]
     shown = [s for s in samples if MIN_MOVING < s.moving.mean() < MAX_MOVING][:SHOWN]
 
-    figures = args.figures
-    figures.mkdir(parents=True, exist_ok=True)
+    figures, docs = ROOT / "docs" / "figures", ROOT / "docs" / "results"
     write_sheet(shown, figures / "paper_workflow.png")
     if set(COMPARED) <= set(networks):
         panels = [p for s in shown for name in COMPARED for p in saliency(name, networks[name], s)]
         write(figures / "paper_saliency.png", panels, "Where the networks look")
     if "pwvo-paper" in networks:
-        network = networks["pwvo-paper"]
-        write(
-            figures / "paper_uncertainty.png",
-            uncertainty(network, shown[0]),
-            "Uncertainty, error and object flow",
-        )
-        write(
-            figures / "paper_flow.png",
-            factorised(network, shown[0]),
-            "Flow in parts beside the ground truth",
-        )
+        two = networks["pwvo-paper"], shown[0]
+        heading = "Uncertainty, error and object flow"
+        write(figures / "paper_uncertainty.png", uncertainty(*two), heading)
+        heading = "Flow in parts beside the ground truth"
+        write(figures / "paper_flow.png", factorised(*two), heading)
     shares = {
         name: saliency_on_movers(networks[name], samples) for name in COMPARED if name in networks
     }
@@ -91,9 +79,9 @@ def main(argv: list[str] | None = None) -> int:
         "saliency": shares,
         **provenance("paper.py", argv),
     }
-    write_json(args.results / "paper.json", record)
+    write_json(docs / "paper.json", record)
     content = json.loads((args.ablation / "ablation.json").read_text(encoding="utf-8"))
-    write_json(args.results / "ablation.json", content)
+    write_json(docs / "ablation.json", content)
     if args.install:
         for name, path in rows.items():
             if path.is_file():

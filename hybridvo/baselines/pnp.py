@@ -1,19 +1,16 @@
 """Point solvers of OpenCV and PoseLib: sample, solve, check.
 
-3-D points come from the previous depth and camera, 2-D points from the flow, seen by the current
-camera. A solver's own "success" is not believed: the check is the same for every baseline, so that
-"ok" means one thing in a comparison.
+A solver's own "success" is not believed: the check is the same for every baseline, so that "ok"
+means one thing in a comparison.
 """
 
 from __future__ import annotations
 
 import contextlib
 import importlib
-import importlib.util
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -31,20 +28,18 @@ DEPTH_RANGE_M = (1e-6, 1e6)
 """Open interval of depths that can be metres; outside it squares leave the floating-point range."""
 MIN_INLIER_RATIO = 0.05  # below this share of the sampled pixels a consensus is chance: failed
 LOW_INLIER_RATIO = 0.25  # below this share the largest motion need not be the camera's: degraded
-SINGULAR_RATIO = 1e-10
-"""Eigenvalue ratio of the scaled information at which a direction is free: failed."""
-WEAK_RATIO = 1e-6
-"""Eigenvalue ratio below which a direction is weak: degraded. A frontal plane over a field of view
-of 20 degrees has 1e-4, a patch of 20 px at fx = 1000 has 1e-9."""
-TUNED: dict[str, Any] = {"iterationsCount": 1000, "reprojectionError": 2.0, "confidence": 0.999}
+SINGULAR_RATIO, WEAK_RATIO = 1e-10, 1e-6
+"""Eigenvalue ratios of the scaled information below which a direction is free: failed; or weak:
+degraded. A frontal plane over a field of view of 20 degrees has 1e-4, a patch of 20 px at fx = 1000
+has 1e-9."""
 TUNED_PX, DEFAULT_PX = 2.0, 8.0
 """Largest residual of an inlier: of the tuned solvers, and OpenCV's default."""
+TUNED: Any = {"iterationsCount": 1000, "reprojectionError": TUNED_PX, "confidence": 0.999}
 FOUND_NOTHING = (cv2.error, ValueError, RuntimeError, ArithmeticError)
 """What the libraries raise on data that determine no pose."""
 
 
-@dataclass(frozen=True, eq=False)
-class Correspondences:
+class Correspondences(NamedTuple):
     """Sampled pixels: (n, 3) metres in the previous camera, (n, 2) px in the current image."""
 
     xyz: np.ndarray
@@ -73,7 +68,8 @@ def solve_poselib(data: Correspondences, camera: Camera, seed: int) -> np.ndarra
     import poselib
 
     size = {"width": camera.width, "height": camera.height}
-    params = [camera.fx, camera.fy, camera.cx, camera.cy]
+    pinhole = [camera.fx, camera.fy, camera.cx, camera.cy]
+    model = size | {"model": "PINHOLE", "params": pinhole}
     options = {
         "max_reproj_error": TUNED_PX,
         # its default of at least 1000 takes three times as long and is no more accurate here
@@ -82,9 +78,7 @@ def solve_poselib(data: Correspondences, camera: Camera, seed: int) -> np.ndarra
         "success_prob": TUNED["confidence"],
         "seed": seed,
     }
-    pose, _ = poselib.estimate_absolute_pose(
-        data.uv, data.xyz, {"model": "PINHOLE", "params": params} | size, options, {}
-    )
+    pose, _ = poselib.estimate_absolute_pose(data.uv, data.xyz, model, options, {})
     return make_transform(np.asarray(pose.R), np.asarray(pose.t))
 
 
@@ -116,10 +110,8 @@ def missing() -> dict[str, str]:
     ):
         try:
             importlib.import_module(library)
-        except ModuleNotFoundError:
-            absent[name] = f"{library} is not installed; {remedy}"
-        except ImportError as error:  # Open3D without its system libraries
-            absent[name] = f"{library} is installed but cannot be imported: {error}; {remedy}"
+        except ImportError as error:  # not installed; or Open3D without its system libraries
+            absent[name] = f"{library} cannot be imported: {error}; {remedy}"
     if not hasattr(cv2, "Odometry"):
         remedy = "pip install 'opencv-python-headless>=5'"
         absent["opencv-rgbd"] = f"this OpenCV has no cv2.Odometry (it came with 5.0); {remedy}"
@@ -152,12 +144,11 @@ def sample(pair: FramePair, seed: int, points: int = POINTS) -> Correspondences 
     if len(keep) < points:
         keep = usable(np.arange(depth.size))
     if len(keep) < MIN_POINTS:
-        why = Reason.LOW_INLIERS, f"{len(keep)} pixels with valid depth and flow, need {MIN_POINTS}"
+        reason = Reason.LOW_INLIERS if np.isfinite(flow).any() else Reason.NO_FLOW
         if not depth_valid(depth).any():
-            why = Reason.NO_VALID_DEPTH, "the previous depth has no finite positive value (metres)"
-        elif not np.isfinite(flow).all(axis=-1).any():
-            why = Reason.NO_FLOW, "the flow has no finite value"
-        return Status.failed(*why)
+            reason = Reason.NO_VALID_DEPTH
+        what = f"{len(keep)} pixels with valid depth (metres) and flow, need {MIN_POINTS}"
+        return Status.failed(reason, what)
     if len(keep) > points:
         keep = rng.choice(keep, points, replace=False)
     v, u = np.divmod(keep, camera.width)
@@ -173,7 +164,7 @@ def depth_valid(depth: np.ndarray) -> np.ndarray:
 
 def check(
     method: str,
-    T: np.ndarray | None,
+    T: Any,
     data: Correspondences | Status,
     camera: Camera,
     threshold_px: float,
@@ -181,40 +172,33 @@ def check(
 ) -> RelativePose:
     """A solver's motion with covariance and status; failed with the identity where it is none.
 
-    The motion must be finite and have enough inliers (in front of the camera, and within
-    ``threshold_px``), and they must determine all six degrees of freedom. Covariance sigma^2
-    (J^T J)^-1 over them, sigma^2 = |r|^2 / (2 n - 6) unless ``sigma_px`` is given: that of the
-    least-squares optimum, thus optimistic for a solver that stops short of it.
+    It must be finite, with enough inliers (in front of the camera, within ``threshold_px``), which
+    determine all six degrees of freedom. Covariance sigma^2 (J^T J)^-1 over them, sigma^2 =
+    |r|^2 / (2 n - 6) unless ``sigma_px`` is given: optimistic where a solver stops short.
     """
     if isinstance(data, Status):
         return RelativePose.failed(data.reason, data.message, method)
-
-    def failed(reason: Reason, what: str, **facts: Any) -> RelativePose:
-        return RelativePose.failed(reason, f"{method}: {what}", method, **facts)
-
-    def undetermined(points: np.ndarray, **facts: Any) -> RelativePose | None:
-        """The failure where points leave a direction of the motion free."""
-        values, _, _ = _information(points, camera)
-        if values[0] > SINGULAR_RATIO * values[-1]:
-            return None
-        facts |= {"information_eigenvalues": np.maximum(values, 0.0)}
+    points, ratio, wrong = data.xyz, 0.0, None
+    if not is_rigid(T):
+        wrong = Reason.SOLVER_DIVERGED, "the solver found no finite rigid motion"
+    else:
+        moved = data.xyz @ T[:3, :3].T + T[:3, 3]
+        squared = ((project(moved, camera) - data.uv) ** 2).sum(axis=-1)  # NaN behind the camera
+        inlier = (moved[:, 2] > DEPTH_RANGE_M[0]) & (squared < threshold_px**2)
+        count, ratio = int(inlier.sum()), float(inlier.mean())
+        if count < MIN_POINTS or ratio < MIN_INLIER_RATIO:
+            what = f"{count} of {len(inlier)} sampled pixels follow the motion"
+            wrong = Reason.LOW_INLIERS, what
+        else:
+            points, cost = moved[inlier], float(squared[inlier].sum())
+    values, vectors, scale = _information(points, camera)
+    if values[0] <= SINGULAR_RATIO * values[-1]:
         what = f"the {len(points)} points leave a direction of the motion undetermined"
-        return failed(Reason.DEGENERATE_GEOMETRY, what, **facts)
-
-    if T is None or not is_rigid(T):
-        diverged = failed(Reason.SOLVER_DIVERGED, "the solver found no finite rigid motion")
-        return undetermined(data.xyz) or diverged
-    moved = data.xyz @ T[:3, :3].T + T[:3, 3]
-    squared = ((project(moved, camera) - data.uv) ** 2).sum(axis=-1)  # NaN behind the camera
-    inlier = (moved[:, 2] > DEPTH_RANGE_M[0]) & (squared < threshold_px**2)
-    count, ratio = int(inlier.sum()), float(inlier.mean())
-    if count < MIN_POINTS or ratio < MIN_INLIER_RATIO:
-        what = f"{count} of {len(inlier)} sampled pixels follow the motion"
-        few = failed(Reason.LOW_INLIERS, what, inlier_ratio=ratio)
-        return undetermined(data.xyz) or few
-    if (free := undetermined(moved[inlier], inlier_ratio=ratio)) is not None:
-        return free
-    values, vectors, scale = _information(moved[inlier], camera)
+        wrong = Reason.DEGENERATE_GEOMETRY, what
+    facts: dict[str, Any] = {"inlier_ratio": ratio, "method": method}
+    facts["information_eigenvalues"] = np.maximum(values, 0.0)
+    if wrong is not None:
+        return RelativePose.failed(wrong[0], f"{method}: {wrong[1]}", **facts)
     status = Status()
     if values[0] <= WEAK_RATIO * values[-1]:
         what = f"{method}: a direction of the motion is barely determined"
@@ -222,26 +206,22 @@ def check(
     elif ratio < LOW_INLIER_RATIO:
         what = f"{method}: only {ratio:.0%} of the pixels follow the motion"
         status = Status.degraded(Reason.LOW_INLIERS, what)
-    cost = float(squared[inlier].sum())
     sigma = np.sqrt(cost / (2 * count - 6)) if sigma_px is None else sigma_px
     half = vectors * scale[:, None] / np.sqrt(values)
     # exact data has no residual; float32 flow near 1000 px is rounded at 6e-5 px all the same
-    covariance = max(sigma, 1e-4) ** 2 * (half @ half.T)
-    t = T[:3, 3]
+    covariance, t = max(sigma, 1e-4) ** 2 * (half @ half.T), T[:3, 3]
     return RelativePose(
         T_curr_prev=T,
         covariance=covariance,
         status=status,
-        inlier_ratio=ratio,
         cost=cost / len(inlier),
         residual_scale_px=float(sigma),
         translation_direction_valid=bool(t @ np.linalg.solve(covariance[:3, :3], t) > 9.0),
-        information_eigenvalues=values,
-        method=method,
+        **facts,
     )
 
 
-def is_rigid(T: np.ndarray) -> bool:
+def is_rigid(T: Any) -> bool:
     """Whether ``T`` is a finite (4, 4) rigid transform of a length that can be metres."""
     try:
         return bool(np.abs(as_rigid(T, "T")[:3, 3]).max() <= DEPTH_RANGE_M[1])
@@ -251,10 +231,8 @@ def is_rigid(T: np.ndarray) -> bool:
 
 def _information(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Ascending eigenvalues and eigenvectors of J^T J with metres in typical depths; the scale."""
-    z = points[:, 2]
     # both halves of the tangent are then in radians
-    scale = np.array([float(np.median(z))] * 3 + [1.0] * 3)
-    J = np.concatenate(projection_rows(points, camera))
-    J *= scale
+    scale = np.repeat([float(np.median(points[:, 2])), 1.0], 3)
+    J = np.concatenate(projection_rows(points, camera)) * scale
     values, vectors = np.linalg.eigh(J.T @ J)
     return values, vectors, scale

@@ -50,27 +50,20 @@ def align_open3d(prev: Rgbd, curr: Rgbd) -> np.ndarray | None:
     """Open3D's ``compute_rgbd_odometry`` with the hybrid term."""
     import open3d
 
+    deepest, c, odometry = _deepest(prev), prev.camera, open3d.pipelines.odometry
     images = [
         open3d.geometry.RGBDImage.create_from_color_and_depth(
             open3d.geometry.Image(np.ascontiguousarray(frame.rgb)),
             open3d.geometry.Image(np.nan_to_num(frame.depth)),  # 0 is unknown to Open3D
             depth_scale=1.0,
-            depth_trunc=_deepest(prev),
+            depth_trunc=deepest,
         )
         for frame in (prev, curr)
     ]
-    camera = prev.camera
-    option = open3d.pipelines.odometry.OdometryOption()
-    option.depth_max = _deepest(prev)
-    found, T, _ = open3d.pipelines.odometry.compute_rgbd_odometry(
-        *images,
-        open3d.camera.PinholeCameraIntrinsic(
-            camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy
-        ),
-        np.eye(4),
-        open3d.pipelines.odometry.RGBDOdometryJacobianFromHybridTerm(),
-        option,
-    )
+    pinhole = open3d.camera.PinholeCameraIntrinsic(c.width, c.height, c.fx, c.fy, c.cx, c.cy)
+    option, term = odometry.OdometryOption(), odometry.RGBDOdometryJacobianFromHybridTerm()
+    option.depth_max = deepest
+    found, T, _ = odometry.compute_rgbd_odometry(*images, pinhole, np.eye(4), term, option)
     return np.asarray(T, dtype=np.float64) if found else None
 
 
@@ -110,8 +103,8 @@ def estimate_by_images(method: str, pair: FramePair, seed: int = 0) -> RelativeP
 
 def _prepared(pair: FramePair) -> tuple[Rgbd, Rgbd] | Status:
     """Both frames as OpenCV and Open3D take them, the current one resampled to the previous K."""
+    camera = pair.prev.camera
     frames = []
-    camera, size = pair.prev.camera, pair.prev.camera.shape[::-1]
     for name, frame in (("previous", pair.prev), ("current", pair.curr)):
         rgb, depth = frame.rgb, frame.depth
         if rgb is None:
@@ -121,10 +114,9 @@ def _prepared(pair: FramePair) -> tuple[Rgbd, Rgbd] | Status:
         keep = depth_valid(depth) & (True if frame.mask is None else frame.mask)
         depth = np.where(keep, depth, np.nan).astype(np.float32)
         if not np.allclose(camera.K, frame.camera.K):
-            A = (camera.K @ np.linalg.inv(frame.camera.K))[:2]
-            rgb = np.asarray(cv2.warpAffine(rgb, A, size, flags=cv2.INTER_LINEAR))
-            depth = np.asarray(
-                cv2.warpAffine(depth, A, size, flags=cv2.INTER_NEAREST, borderValue=float("nan"))
-            )
+            A, size = (camera.K @ np.linalg.inv(frame.camera.K))[:2], camera.shape[::-1]
+            rgb = np.asarray(cv2.warpAffine(rgb, A, size))
+            nearest, nan = cv2.INTER_NEAREST, float("nan")
+            depth = np.asarray(cv2.warpAffine(depth, A, size, flags=nearest, borderValue=nan))
         frames.append(Rgbd(rgb, depth, camera))
     return frames[0], frames[1]

@@ -245,16 +245,12 @@ def weight_files(weights: Iterable[str], methods: Iterable[str]) -> dict[str, st
     from hybridvo.errors import InputError
     from hybridvo.pipeline import networks_of
 
-    files = {}
     known = sorted({name for method in methods for name in networks_of(method)})
-    for text in weights:
-        name, sign, path = text.partition("=")
-        if not sign or name not in known:
+    files = dict(text.partition("=")[::2] for text in weights)
+    for name, path in files.items():
+        if name not in known or not Path(path).is_file():
             raise InputError(
                 f"--weights: expected NAME=FILE with {' or '.join(known) or 'no name'} for these "
-                f"methods, got {text!r}."
+                f"methods and a file that exists, got {name}={path}."
             )
-        if not Path(path).is_file():
-            raise InputError(f"--weights {name}: {path}: no such file.")
-        files[name] = path
     return files

@@ -107,14 +107,12 @@ def _measure(sequence: Sequence, prev: Frame, curr: Frame) -> dict[str, Any]:
         return pair
     ratio = (float(curr.rgb.mean()) + 1.0) / (float(prev.rgb.mean()) + 1.0)
     pair["light"] = ratio, [frame.index for frame in (prev, curr) if _is_dark(frame.rgb)]
-    given = file_flow(sequence, strict=False)(prev, curr) if sequence.has_flow else None
-    if given is not None and given.flow is not None:
-        on_file = FramePair(prev, curr, given.flow, given.variance, given.valid, "file")
-        pair["contradiction"] = contradiction(on_file) or ""
-    field = dis_flow()(prev, curr)
-    if prev.depth is None or field.flow is None:
+    if sequence.has_flow:
+        on_file = file_flow(sequence, strict=False)(prev, curr).pair(prev, curr)
+        pair["contradiction"] = None if on_file.flow is None else contradiction(on_file) or ""
+    by_dis = dis_flow()(prev, curr).pair(prev, curr)
+    if prev.depth is None or by_dis.flow is None:
         return pair
-    by_dis = FramePair(prev, curr, field.flow, field.variance, field.valid, "dis")
     motion = estimate(by_dis, method="refine")
     if not motion.usable:
         return pair

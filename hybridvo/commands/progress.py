@@ -1,8 +1,6 @@
-"""Progress on stderr."""
+"""Progress on stderr: a bar on a terminal, its last state elsewhere."""
 
 from __future__ import annotations
-
-import time
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
@@ -10,10 +8,7 @@ from rich.progress import Progress as Bar
 
 
 class Progress:
-    """Work done, on stderr: a bar on a terminal, a line every few seconds elsewhere.
-
-    ``done`` units of the ``total`` were finished before and do not count for the speed.
-    """
+    """Units of work done, of a total; ``done`` of them were finished before."""
 
     def __init__(
         self,
@@ -25,19 +20,15 @@ class Progress:
         done: int = 0,
         console: Console | None = None,
     ) -> None:
-        self._console = console or Console(stderr=True, quiet=quiet, soft_wrap=True)
         self._bar = Bar(
             TextColumn("{task.description}", markup=False),  # a folder may be named [x]
             BarColumn(),
             MofNCompleteColumn(),
-            TextColumn("{task.fields[rate]}", markup=False),
+            TextColumn(f"{unit}{{task.fields[failed]}}", markup=False),
             TimeRemainingColumn(),
-            console=self._console,
-            disable=not self._console.is_terminal,
+            console=console or Console(stderr=True, quiet=quiet, soft_wrap=True),
         )
-        self._task = self._bar.add_task(label, total=total, completed=done, rate="")
-        self._label, self._total, self._unit, self._before = label, total, unit, done
-        self._started = self._last = time.monotonic()
+        self._task = self._bar.add_task(label, total=total, completed=done, failed="")
 
     def __enter__(self) -> Progress:
         self._bar.start()
@@ -48,14 +39,8 @@ class Progress:
 
     def update(self, done: int, failed: int = 0) -> None:
         """``done`` units are finished, ``failed`` of them have failed."""
-        now = time.monotonic()
-        speed = (done - self._before) / max(now - self._started, 1e-9)
-        rate = f"{speed:.1f} {self._unit}/s" + (f", {failed} failed" if failed else "")
-        self._bar.update(self._task, completed=done, rate=rate)
-        if not self._console.is_terminal and (now - self._last >= 5.0 or done == self._total):
-            self._last = now
-            self.say(f"{self._label}: {done}/{self._total} {self._unit}, {rate}")
+        self._bar.update(self._task, completed=done, failed=f", {failed} failed" if failed else "")
 
     def say(self, text: str) -> None:
         """A line for the user, above the bar."""
-        self._console.print(text, markup=False, highlight=False)
+        self._bar.console.print(text, markup=False, highlight=False)

@@ -33,9 +33,8 @@ def check_recording(path: str | os.PathLike[str]) -> None:
 class Recording:
     """Writes a recording as the frames come in; use as a context manager.
 
-    ``identity`` is the same for all parts of one run: where the file exists, as after ``--resume``,
-    a part is written beside it that the viewer shows with it. ``frames`` is their number, ``first``
-    that of the first one, ``poses`` (N, 4, 4) the true T_world_cam.
+    ``identity`` is the same for all parts of one run: after ``--resume`` (``first`` > 0) a part is
+    written beside the file that the viewer shows with it. ``poses`` are the true T_world_cam.
     """
 
     def __init__(
@@ -90,7 +89,7 @@ class Recording:
         T = step.T_world_cam
         log("world/camera", rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]))
         motion = step.motion
-        std = np.sqrt(np.maximum(np.diag(motion.covariance), 0.0))
+        std = np.sqrt(np.diag(motion.covariance))
         log("covariance/translation_std_mm", rr.Scalars(1e3 * std[:3]))
         log("covariance/rotation_std_mdeg", rr.Scalars(1e3 * np.degrees(std[3:])))
         log("status/inlier_ratio", rr.Scalars(motion.inlier_ratio))

@@ -32,10 +32,9 @@ from hybridvo.files import Mode, atomic_write, fingerprint, held, versions, writ
 from hybridvo.flow import FlowField, FlowProvider, MeasuredFlow, dis_flow, fallback, file_flow
 from hybridvo.geometry import se3_log
 from hybridvo.network.models import Models
-from hybridvo.odometry import Odometry
+from hybridvo.odometry import Odometry, TrackerState
 from hybridvo.options import Options, RunOptions
 from hybridvo.pipeline import check_method, weights_hash
-from hybridvo.tracking.state import TrackerState
 from hybridvo.trajectory import Trajectory
 
 EXIT_DONE, EXIT_FAILED_FRAMES = 0, 3
@@ -139,7 +138,6 @@ def _track(
         started = time.perf_counter()
         step = vo.track(frame)
         ms = 1e3 * (time.perf_counter() - started)
-    # the window may have asked for more, from its key frames
     field = next(iter(flow.fields.values()), FlowField(None, source=""))
     if frame is not None and recording is not None:
         recording.add(frame, step, field.flow)

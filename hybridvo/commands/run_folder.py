@@ -91,7 +91,7 @@ class RunFolder:
             self.rows, self.tracker = json.loads(arrays.pop("rows").tobytes()), arrays
 
     def save(self, state: str, **more: Any) -> None:
-        """Write ``run.json``; ``state`` is ``running``, ``interrupted`` or ``done``."""
+        """Write ``run.json``; ``state`` is ``running`` or ``done``."""
         content = {**self.header, **more, "state": state, "frames_done": len(self.rows)}
         write_json(self.path / STATE, content)
         if state == "done":  # the results are written

@@ -167,9 +167,8 @@ def _selector_data(args: argparse.Namespace, command: str) -> dict[str, Any]:
 def _network(name: str) -> Any:
     """The network of a weights file, or of a pretrained name."""
     from hybridvo.network.models import load_weights
-    from hybridvo.network.weights import weights_file
 
-    return load_weights(weights_file(name))[0]
+    return load_weights(name)[0]
 
 
 def _report(entry: dict[str, Any]) -> None:

@@ -123,17 +123,18 @@ def units_per_metre(scale: float | None, where: str, told: list[str]) -> float |
 
 
 def write_camera_template(directory: str | os.PathLike[str]) -> Path:
-    """Write a ``camera.yaml`` to fill in, with the size of the images in rgb/."""
+    """Write a ``camera.yaml`` to fill in, with what the files in rgb/ and depth/ say."""
     folder = Path(directory)
     path = folder / CAMERA_FILE
     if path.exists():
         raise InputError(f"{path}: exists already; remove it first, or edit it.")
     images = sorted_files(folder / "rgb", IMAGES)
     height, width = read_rgb(images[0]).shape[:2] if images else ("", "")
+    comment = "# " if sorted_files(folder / "depth", (".npy", ".dpt")) else ""  # in metres
     folder.mkdir(parents=True, exist_ok=True)
     with atomic_write(path) as file:
         template = Path(__file__).with_name("camera_template.yaml").read_text(encoding="utf-8")
-        file.write(template.format(width=width, height=height))
+        file.write(template.format(width=width, height=height, comment=comment))
     return path
 
 

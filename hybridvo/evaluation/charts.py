@@ -120,17 +120,10 @@ def path_charts(
     paths = _positions({name: folder / file for name, file in files.items()})
     axes = {"x": "right", "y": "forward", "title": f"From above, {flow} flow"}
     figures = [_chart(px.line, paths, methods, **axes).update_yaxes(scaleanchor="x")]
-    mine = _first_flow(pairs[pairs["sequence"] == sequence])
-    known = mine.dropna(subset=["epe_l2_px"])
+    known = _first_flow(pairs[pairs["sequence"] == sequence]).dropna(subset=["epe_l2_px"])
     if len(known):
         axes = {"x": "index", "y": "epe_l2_px", "title": f"Error of every pair, {flow} flow"}
         figures.append(_chart(px.line, known, methods, **axes))
-    medians = mine.groupby("method")["epe_l2_px"].median().sort_values()
-    shown = {TRUTH, *medians.index[:5]}  # the legend turns on the others
-    for figure in figures:
-        figure.for_each_trace(
-            lambda trace: trace.update(visible=True if trace.name in shown else "legendonly")
-        )
     return figures
 
 

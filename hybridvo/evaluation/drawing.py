@@ -19,7 +19,7 @@ from hybridvo.flow import dis_flow
 from hybridvo.geometry import ego_flow, matrix_to_euler_deg
 from hybridvo.network.layers import KINDS
 from hybridvo.network.models import load_weights
-from hybridvo.network.weights import pretrained, pretrained_names
+from hybridvo.network.weights import pretrained_names, weights_file
 from hybridvo.pipeline import DEFAULT_METHOD
 from hybridvo.results import PixelwisePrediction, RelativePose
 from hybridvo.types import FramePair
@@ -79,7 +79,7 @@ def networks(files: Iterable[str | Path] = ()) -> list[tuple[str, Any]]:
     """(name, network) of the given files, or of all pretrained ones that predict a motion."""
     found = []
     paths = [Path(file) for file in files]
-    for path in paths or [pretrained(name) for name in pretrained_names()]:
+    for path in paths or [weights_file(name) for name in pretrained_names()]:
         network: Any = load_weights(path)[0]
         kind = network.options.kind
         if kind in KINDS:

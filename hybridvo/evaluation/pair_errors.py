@@ -68,8 +68,7 @@ def _native_epe(
 ) -> float | None:
     """Mean L2 distance of the two ego flows over valid pixels, px."""
     est, gt = (ego_flow(depth, T, prev, curr) for T in (T_est, T_gt))
-    valid = np.isfinite(gt).all(axis=2)
-    error = np.linalg.norm(est[valid] - gt[valid], axis=1)
+    error = np.linalg.norm(est - gt, axis=2)[np.isfinite(gt).all(axis=2)]
     error[~np.isfinite(error)] = np.hypot(*prev.shape)
     return float(error.mean()) if len(error) else None
 
@@ -158,8 +157,8 @@ def pair_facts(
     camera_prev: Camera,
     camera_curr: Camera,
     flow_gt: np.ndarray | None = None,
-) -> dict[str, float | None]:
-    """What may explain an error: how much moves, how far, before what. None where unknown.
+) -> dict[str, float]:
+    """What may explain an error: how much moves, how far, before what. What is unknown is absent.
 
     ``flow_gt`` (H, W, 2) is the true flow of everything, px, NaN or beyond 1e9 where unknown; None
     where there is none, or where it holds the motion of the camera alone.
@@ -167,16 +166,15 @@ def pair_facts(
     ``dynamic_fraction``: share of valid pixels whose true flow differs from the true ego flow by
     more than 1 px; ``depth_spread``: 90th over 10th percentile of the valid depth.
     """
-    names = ("dynamic_fraction", "flow_magnitude_px", "rotation_deg", "translation_m")
-    facts: dict[str, float | None] = dict.fromkeys((*names, "depth_spread"))
+    facts: dict[str, float] = {}
     if T_gt is not None:
         facts["rotation_deg"] = float(np.degrees(rotation_angle(T_gt[:3, :3])))
         facts["translation_m"] = float(np.linalg.norm(T_gt[:3, 3]))
     if depth_prev is None:
         return facts
-    known = depth_prev[np.isfinite(depth_prev) & (depth_prev > 0)].astype(np.float64)
+    known = depth_prev[np.isfinite(depth_prev) & (depth_prev > 0)]
     if len(known):
-        low, high = np.quantile(1 / known, [0.1, 0.9])
+        low, high = np.quantile(known, [0.1, 0.9])
         facts["depth_spread"] = float(high / low)
     if T_gt is None:
         return facts
@@ -187,5 +185,5 @@ def pair_facts(
     if flow_gt is not None:
         valid &= (np.abs(flow_gt) < UNKNOWN_FLOW).all(axis=2)
         moving = np.linalg.norm(ego[valid] - flow_gt[valid], axis=1) > MOVING_PX
-        facts["dynamic_fraction"] = float(moving.mean()) if len(moving) else None
+        facts |= {"dynamic_fraction": float(moving.mean())} if len(moving) else {}
     return facts

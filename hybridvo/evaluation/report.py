@@ -16,8 +16,7 @@ from hybridvo.evaluation import charts
 from hybridvo.evaluation.charts import is_oracle
 from hybridvo.files import atomic_write
 
-Column = tuple[str, str, float]
-RESULT_COLUMNS: tuple[Column, ...] = (
+COLUMNS: tuple[tuple[str, str, float], ...] = (
     ("epe_l2_px_median", "EPE, median [px]", 1.0),
     ("epe_l2_px", "EPE, mean [px]", 1.0),
     ("failures", "failures (> 1 px)", 1.0),
@@ -31,9 +30,6 @@ RESULT_COLUMNS: tuple[Column, ...] = (
     ("flow_ms_median", "+ flow [ms]", 1.0),
     ("pairs", "pairs", 1.0),
     ("failed", "given up", 1.0),
-)
-SEQUENCE_COLUMNS: tuple[Column, ...] = (
-    *RESULT_COLUMNS,
     ("rot_err_deg_mean", "rotation, mean [deg]", 1.0),
     ("trans_err_mean", "translation, mean [cm]", 100.0),
     ("epe", "paper's EPE [px]", 1.0),
@@ -70,12 +66,12 @@ def write_report(folder: Path, result: Mapping[str, Any], pairs: pd.DataFrame) -
         "result": result,
         "pairs": len(pairs.drop_duplicates(["sequence", "index"])),
         "methods": methods,
-        "tables": [(flow, (rows, RESULT_COLUMNS, ("method",))) for flow, rows in by_flow(result)],
+        "tables": [(flow, (rows, COLUMNS, ("method",))) for flow, rows in by_flow(result)],
         "worst": [e | {"error": number(e["epe_l2_px"])} for e in result["worst_pairs"]],
         "sections": [(name, _json(some)) for name, some in sections.items() if some],
         "sequences": [(name, _json(some)) for name, some in paths.items()],
         "protocol": _protocol_tables(result.get("protocol")),
-        "numbers": (every, SEQUENCE_COLUMNS, ("sequence", "method", "flow_source")),
+        "numbers": (every, COLUMNS, ("sequence", "method", "flow_source")),
         "number": number,
         "no_merit": NO_MERIT,
     }

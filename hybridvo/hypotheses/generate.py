@@ -122,14 +122,10 @@ def generate(
     seed: int = 0,
     weights: np.ndarray | None = None,
 ) -> HypothesisSet | RelativePose:
-    """Every strong motion of a pair, or the failure that says why there is none.
+    """Every strong motion of a pair with flow, or the failure that says why there is none.
 
-    Args:
-        pair: two frames and their flow.
-        starts: (S, 4, 4) T_curr_prev to start from, beside those that the search makes.
-        options: ``search`` and ``refine`` are read.
-        seed: of the minimal samples.
-        weights: (H, W) factors on the information of each pixel, or None.
+    ``starts`` (S, 4, 4): T_curr_prev to start from, beside those that the search makes; ``seed`` of
+    its minimal samples; ``weights`` (H, W): factors on the information of each pixel.
     """
     grid = coarse_grid(pair, weights, options.refine)
     if isinstance(grid, RelativePose):
@@ -157,14 +153,10 @@ def _is_rigid(grid: CoarseGrid, pose: np.ndarray, fact: np.ndarray, width: int) 
 def fit_in_mask(
     samples: np.ndarray, mask: np.ndarray, K: np.ndarray, pose: np.ndarray, cutoff: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A pose (3, 4) fitted on the coarse grid inside a mask, and its facts.
+    """A pose (3, 4) fitted inside a mask, and its facts.
 
-    Args:
-        samples: pixel buffer of the grid.
-        mask: (h, w) factors in [0, 1] on the weights of its first h * w pixels.
-        K: (4,) float32 fx, fy, cx, cy of the current camera.
-        pose: (3, 4) start.
-        cutoff: of the robust kernel, see :class:`hybridvo.options.RefineOptions`.
+    ``samples``: pixel buffer of a grid; ``mask`` (h, w): factors on their weights; ``K`` (4,)
+    float32: fx, fy, cx, cy; ``cutoff`` of the robust kernel.
     """
     masked = samples.copy()
     masked[kernels.W, : mask.size] *= mask.reshape(-1)

@@ -1,10 +1,9 @@
 """Every strong motion in the image, one after the other.
 
-Starts come from three sources: poses that the caller hands in (identity, the last motion, a
-network's seed), robust dense fits of overlapping windows, and minimal three-pixel samples. They are
-scored at two residual scales at once, the best few are refined, and the pixels that follow the
-winner are set aside before the next round. The winner may be a compromise that takes the pixels of
-a weaker motion with it, so the others of a round are kept, behind all winners.
+Candidates are poses handed in, robust dense fits of overlapping windows and minimal three-pixel
+samples. The best few of a round are refined, and the pixels that follow the winner are set aside
+before the next one. The winner may be a compromise that takes the pixels of a weaker motion with
+it, so the others of a round are kept, behind all winners.
 """
 
 from __future__ import annotations
@@ -35,9 +34,9 @@ from hybridvo.refinement.kernels import FASTMATH, MAX_VALUE, MU, MV, XN, YN, W, 
 from hybridvo.refinement.pixels import CoarseGrid
 
 WINDOW_ROWS, WINDOW_COLUMNS = 3, 4
-MINIMAL_SAMPLES = 384
-"""Samples of three pixels for the first motion; a third of them for every further one."""
-MINIMAL_STEPS = 3
+MINIMAL_SAMPLES, MINIMAL_STEPS = 384, 3
+"""Samples of three pixels for the first motion, a third of them for every further one; and Newton
+steps of each."""
 REFINED = 4
 """Candidates of a round that are refined."""
 WIDE_PX, NEAR_PX = 64.0, 1.5
@@ -72,14 +71,11 @@ class Motion(NamedTuple):
 def find_motions(
     grid: CoarseGrid, starts: np.ndarray, options: Options, seed: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """All strong motions, in the order of their strength.
+    """Poses (N, 3, 4) of all strong motions, the strongest first, and their facts (N, FACTS).
 
     The first is sought from the handed-in starts (S, 3, 4), the first of them seen from afar only;
     where these find none that is settled, and for every further one, windows and minimal samples
     compete as well. ``seed`` draws the samples.
-
-    Returns:
-        Poses (N, 3, 4) and their facts (N, FACTS).
     """
     limits, search = options.search, _Search(grid, options, seed)
     motions: list[Motion] = []
@@ -180,8 +176,7 @@ class _Search:
             r, c = i * (h - rows) // (WINDOW_ROWS - 1), j * (w - columns) // (WINDOW_COLUMNS - 1)
             window = pixels[r : r + rows, c : c + columns].ravel()
             few = self.small.take(window[self.small[W, window] > 0.05], axis=1)
-            m = few.shape[1]
-            if m < 20 or few[W].sum() < 12.0:
+            if (m := few.shape[1]) < 20 or few[W].sum() < 12.0:
                 continue
             pose = np.eye(3, 4)
             scale = min(WIDE_PX, max(1.0, residual_scale(few, m, pose, self.K)))

@@ -48,10 +48,10 @@ SOURCES = {
 
 
 class Candidate(NamedTuple):
-    """A motion to be scored: of the search, or fitted inside a mask.
+    """A motion to be scored: of the search, or a refit made inside a ``mask`` (h, w).
 
     ``pose`` (3, 4) T_curr_prev; its ``facts``, see :mod:`hybridvo.hypotheses.search`; ``parent``:
-    number of the motion of the search that it goes back to; ``mask`` (h, w): of a refit.
+    number of the motion of the search that it goes back to.
     """
 
     pose: np.ndarray
@@ -117,7 +117,7 @@ def select_by_cues(found: HypothesisSet, prior: MotionPrior | None = None) -> Se
     # a prior may say which motion; that it is right the image has to say
     best = int(np.argmax(scores))
     gap = min(seen[best] - np.delete(seen, best).max(initial=-np.inf), NO_RIVAL)
-    probability = right(gap, CUES_RIGHT) if found.is_ambiguous else CLEAR_RIGHT
+    probability = right((gap,), CUES_RIGHT) if found.is_ambiguous else CLEAR_RIGHT
     return _selection(found, searched, Scores(scores, {}, probability), gap, probability)
 
 
@@ -156,7 +156,7 @@ def select_by_scorer(
         if int(np.argmax(scores.score)) < len(candidates) - len(refits):
             break
     gap = gap_of(found, [c.pose for c in candidates], scores.score)
-    return _selection(found, candidates, scores, gap, right(gap, SELECTOR_RIGHT))
+    return _selection(found, candidates, scores, gap, right((gap,), SELECTOR_RIGHT))
 
 
 def _searched(found: HypothesisSet) -> list[Candidate]:
@@ -200,22 +200,18 @@ def nearest_motion(poses: np.ndarray, pose: np.ndarray, depth_scale: float) -> i
 
 def hypotheses(found: HypothesisSet, candidates: Sequence[Candidate]) -> list[Hypothesis]:
     """The candidates with their inliers, in their order."""
-    grid = found.grid
-    h, w, stride = grid.shape
-    work, noise = kernels.new_work(), np.empty(3, np.float32)
-    total = max(float(grid.weight.sum()), 1e-9)
-    made = []
+    grid, K = found.grid, found.grid.pixels.K
+    work, noise, made = kernels.new_work(), np.empty(3, np.float32), []
     for pose, facts, *_ in candidates:
         inliers = np.empty(grid.count, np.float32)
-        flow_noise, depth_noise = float(facts[search.FLOW_NOISE]), float(facts[search.DEPTH_NOISE])
-        coarse_fit.set_noise(max(flow_noise, MIN_NOISE_PX), depth_noise, SUPPORT_CUTOFF, noise)
-        coarse_fit.robust_weights(
-            grid.samples, grid.count, pose, grid.pixels.K, noise, work, inliers
-        )
-        name = SOURCES.get(int(facts[search.SOURCE]), "start")
-        share = float(np.where(grid.weight > 0, inliers, 0) @ grid.weight) / total
-        T, shape = pose_matrix(pose), inliers.reshape(h, w)
-        made.append(Hypothesis(T, name, share, flow_noise, depth_noise, shape, stride))
+        sf, sd = float(facts[search.FLOW_NOISE]), float(facts[search.DEPTH_NOISE])
+        coarse_fit.set_noise(max(sf, MIN_NOISE_PX), sd, SUPPORT_CUTOFF, noise)
+        coarse_fit.robust_weights(grid.samples, grid.count, pose, K, noise, work, inliers)
+        source = SOURCES.get(int(facts[search.SOURCE]), "start")
+        share = _coverage(found, np.where(grid.weight > 0, inliers, 0))
+        h, w, stride = grid.shape
+        T, maps = pose_matrix(pose), inliers.reshape(h, w)
+        made.append(Hypothesis(T, source, share, sf, sd, maps, stride))
     return made
 
 

@@ -1,7 +1,8 @@
 """A motion from the images and depth maps alone, coarse to fine: no flow is needed.
 
-Where the motion explains nearly all of the image, nothing else moves: it is the answer. Where it
-does not, something moves, or the images are too far apart, and the flow has to be asked.
+Where the motion leaves no region of the image unexplained, and the parts of the image agree about
+it, nothing else moves: it is the answer. Where it does, something moves, or the images are too far
+apart, and the flow has to be asked.
 """
 
 from __future__ import annotations
@@ -33,18 +34,26 @@ SHIFT_PX, GREY = 0.25, 1.0
 """A residual is noise where so small a shift of the image, and grey levels, explain it."""
 NEIGHBOURS = 3
 """Side, in points of the grid, of the squares whose mean residual is taken for light."""
+REGION, UNEXPLAINED = 5, 0.6
+"""Side, in points of the grid, of the squares in which more than this share is unexplained: a
+region that moves, where single points are noise."""
+SMALL_REGION = 0.01
+"""Share of the image far below which smaller is no better."""
 _REDUCED: WeakKeyDictionary[Frame, dict[int, Frame]] = WeakKeyDictionary()
 """Reduced frames by reduction, as long as the frame is kept."""
 
 
 def direct_start(
-    pair: FramePair, T_start: np.ndarray | None = None, options: PhotometricOptions | None = None
+    pair: FramePair,
+    T_start: np.ndarray | None = None,
+    options: PhotometricOptions | None = None,
+    least: float = 0.5,
 ) -> RelativePose | None:
     """The motion that the images and depth maps agree on, from a start (4, 4) or the identity.
 
     Its ``inlier_ratio`` is the share of the pixels in view of both that it explains, its
     ``probability`` of being the camera's follows from that. None where the images do not match, or
-    where it is more likely another's.
+    where that is below ``least``.
     """
     images = options or PhotometricOptions()
     prev, curr = pair.prev, pair.curr
@@ -73,15 +82,16 @@ def direct_start(
         gain = factor.gain
     fine = PlaneFactor(pair, ones, 1.0)
     fine.estimate(T)
-    follows, share = _explained(pair, fine, T, gain)
-    if right(100 * share, DIRECT_RIGHT) < 0.5:
+    follows, _, evidence = _explained(pair, fine, T, gain, agreement=1.0)
+    if right(evidence, DIRECT_RIGHT) < least:
         return None
     weights = fine.image_of(follows)
     finest = replace(images, blur_px=images.blur_px[-1:], prior_inflation=1.0)
     found = refine_photometric(pair, start.replace(T_curr_prev=T, weights=weights), finest)
     if found.photometric is None or not found.photometric.taken:
         return None
-    return _answer(pair, fine, found)
+    answer = _answer(pair, fine, found)
+    return answer if answer.probability >= least else None
 
 
 def reduced(frame: Frame, by: int) -> Frame:
@@ -101,38 +111,62 @@ def reduced(frame: Frame, by: int) -> Frame:
 
 def _answer(pair: FramePair, planes: PlaneFactor, found: RelativePose) -> RelativePose:
     """The motion with the pixels that follow it, and its probability."""
-    assert found.photometric is not None
-    planes.estimate(found.T_curr_prev)
-    follows, share = _explained(pair, planes, found.T_curr_prev, found.photometric.gain)
-    at = planes.residuals(found.T_curr_prev)
+    T, images = found.T_curr_prev, found.photometric
+    assert images is not None
+    planes.estimate(T)
+    at = planes.residuals(T)
     z = at.z[at.seen]
+    follows, share, evidence = _explained(pair, planes, T, images.gain, images.agreement)
     return found.replace(
         inlier_ratio=share,
-        probability=right(100 * share, DIRECT_RIGHT),
+        probability=right(evidence, DIRECT_RIGHT),
         weights=planes.image_of(follows),
         depth_noise=float(np.median(planes.noise(z) / z)) / np.sqrt(2),
         terms=("images", "depth"),
     )
 
 
+def evidence_of(pair: FramePair, motion: RelativePose) -> tuple[float, float]:
+    """What the probability of a motion of :func:`direct_start` is logistic in.
+
+    Agreement of the image's parts, and log of the share of the image in unexplained regions.
+    """
+    planes = PlaneFactor(pair, np.ones(pair.prev.camera.shape, np.float32), 1.0)
+    planes.estimate(motion.T_curr_prev)
+    images = motion.photometric
+    assert images is not None
+    return _explained(pair, planes, motion.T_curr_prev, images.gain, images.agreement)[2]
+
+
 def _explained(
-    pair: FramePair, planes: PlaneFactor, T: np.ndarray, gain: float
-) -> tuple[np.ndarray, float]:
-    """(N,) bool, which of the points follow a motion, and their share of those in view of both."""
+    pair: FramePair, planes: PlaneFactor, T: np.ndarray, gain: float, agreement: float
+) -> tuple[np.ndarray, float, tuple[float, float]]:
+    """(N,) bool, which of the points follow a motion, their share of those in view of both, and
+    the evidence of :func:`evidence_of`.
+    """
     (height, width), (v, u), at = pair.prev.camera.shape, planes.index.T, planes.residuals(T)
     x, y = at.at.T
     inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
     before, after = (blurred(frame, 1.0) for frame in (pair.prev, pair.curr))
     columns, rows = at.at.T[..., None].astype(np.float32)
     now = cv2.remap(after, columns, rows, cv2.INTER_LINEAR)[:, 0]
-    residual = planes.on_grid(np.where(inside, now - gain * before[v, u], 0))
-    square = NEIGHBOURS, NEIGHBOURS
-    light = cv2.blur(residual, square) / np.maximum(cv2.blur(planes.on_grid(inside), square), 1e-6)
-    d2 = (residual - light)[planes.cells] ** 2
+
+    def mean_around(values: np.ndarray, side: int) -> np.ndarray:
+        total, count = (
+            cv2.blur(planes.on_grid(x), (side, side)) for x in (np.where(inside, values, 0), inside)
+        )
+        return (total / np.maximum(count, 1e-6))[planes.cells]
+
+    residual = now - gain * before[v, u]
+    d2 = (residual - mean_around(residual, NEIGHBOURS)) ** 2
     right, below = np.minimum(u + 1, width - 1), np.minimum(v + 1, height - 1)
     slope2 = (before[v, right] - before[v, np.maximum(u - 1, 0)]) ** 2
     slope2 += (before[below, u] - before[np.maximum(v - 1, 0), u]) ** 2
     usual = 9 * (GREY**2 + (SHIFT_PX / 2) ** 2 * slope2)
     depth = np.where(at.seen, planes.robust(T), 1.0)
     follows = inside & (usual / (usual + d2) * depth > 0.5)
-    return follows, float(np.count_nonzero(follows) / (np.count_nonzero(inside) or 1))
+    unexplained = inside & (mean_around(~follows, REGION) > UNEXPLAINED)
+    count = max(int(np.count_nonzero(inside)), 1)
+    region = np.count_nonzero(unexplained) / count
+    evidence = agreement, float(np.log(region + SMALL_REGION))
+    return follows, float(np.count_nonzero(follows) / count), evidence

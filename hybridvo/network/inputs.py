@@ -41,7 +41,7 @@ class TensorBatch:
         out = {}
         for name, x in vars(self).items():
             if name.startswith("K_"):
-                x = subsampled_intrinsics(x, stride)
+                x = scaled_intrinsics(x, 1 / stride, -(stride // 2) / stride)
             elif x.ndim > 2:
                 x = x[..., every, every]
             out[name] = x / stride if "flow" in name else x
@@ -60,13 +60,10 @@ class TensorBatch:
 class NetworkInputs(TensorBatch):
     """Inputs of a batch of pairs at the network's size (h, w); what is invalid is 0.
 
-    Args:
-        flow: (B, 2, h, w) flow in pixels of this size divided by ``FLOW_SCALE_PX``.
-        inverse_depth: (B, 2, h, w) 1 / metres of the previous depth, and of the current one sampled
-            at x + F, both on the grid of the previous frame.
-        rays: (B, 2, h, w) first two components of K^-1 x.
-        valid: (B, h, w) bool, flow and previous depth are both usable.
-        K_prev, K_curr: (B, 3, 3) intrinsics scaled to (h, w), pixel-centre convention.
+    ``flow`` (B, 2, h, w): pixels of this size over ``FLOW_SCALE_PX``; ``inverse_depth``
+    (B, 2, h, w): 1 / metres of the previous depth, and of the current one at x + F; ``rays``
+    (B, 2, h, w): first two components of K^-1 x; ``valid`` (B, h, w): flow and previous depth are
+    both usable; intrinsics (B, 3, 3) of this size.
     """
 
     flow: torch.Tensor
@@ -82,17 +79,23 @@ class NetworkInputs(TensorBatch):
         return self.flow * FLOW_SCALE_PX
 
     @property
+    def pixels(self) -> torch.Tensor:
+        """(B, 2, h, w) coordinates x of the pixels."""
+        focal, centre = pinhole(self.K_prev)
+        return self.rays * focal + centre
+
+    @property
     def size(self) -> tuple[int, int]:
         """(h, w)."""
         return self.flow.shape[2], self.flow.shape[3]
 
 
-def subsampled_intrinsics(K: torch.Tensor, stride: int) -> torch.Tensor:
-    """(B, 3, 3) intrinsics of the pixels n // 2, n // 2 + n, .. of each axis, n = ``stride``."""
-    return _scaled_intrinsics(K, 1 / stride, -(stride // 2) / stride)
+def pinhole(K: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Focal lengths and principal points (B, 2, 1, 1) of intrinsics (B, 3, 3)."""
+    return K.diagonal(dim1=1, dim2=2)[:, :2, None, None], K[:, :2, 2, None, None]
 
 
-def _scaled_intrinsics(
+def scaled_intrinsics(
     K: torch.Tensor, scale: float | torch.Tensor, offset: float | torch.Tensor
 ) -> torch.Tensor:
     """(B, 3, 3) intrinsics after pixel coordinates x became scale * x + offset, of both axes."""
@@ -120,22 +123,19 @@ def assemble_inputs(
         raise InputError(f"assemble_inputs: expected a FramePair or a PairBatch, got {got}.")
     batch = checked_batch(pair, where="assemble_inputs")[0]
     height, width = batch.flow.shape[1:3]
-    rows, cols = (
-        _nearest(native, target).to(batch.flow.device)
-        for native, target in ((height, size[0]), (width, size[1]))
-    )
+    rows = _nearest(height, size[0]).to(batch.flow.device)
+    cols = _nearest(width, size[1]).to(batch.flow.device)
 
     def pick(x: torch.Tensor) -> torch.Tensor:
         return x.index_select(1, rows).index_select(2, cols)
 
-    flow = pick(batch.flow)
-    depth_curr = None
+    flow, depth_curr = pick(batch.flow), None
     if batch.depth_curr is not None:
         depth_curr = _sample_at_flow(batch.depth_curr, flow, rows, cols)
     scale = flow.new_tensor([size[1] / width, size[0] / height])
     # pixel centres lie at whole coordinates: c' = s (c + 0.5) - 0.5
     K_prev, K_curr = (
-        _scaled_intrinsics(K, scale, 0.5 * scale - 0.5) for K in (batch.K_prev, batch.K_curr)
+        scaled_intrinsics(K, scale, 0.5 * scale - 0.5) for K in (batch.K_prev, batch.K_curr)
     )
     valid = None if batch.valid is None else pick(batch.valid)
     depth = pick(batch.depth_prev)
@@ -146,10 +146,10 @@ def assemble_inputs(
 def assemble_aligned(
     flow: torch.Tensor, depth_prev: torch.Tensor, depth_curr: torch.Tensor, K: torch.Tensor
 ) -> NetworkInputs:
-    """Inputs from tensors of the network's size, both depths on the previous grid.
+    """Inputs from samples of the network's size, as the paper trains on.
 
-    The form of the paper's training data: flow (B, h, w, 2) px, depths (B, h, w) metres of the same
-    scene points one step apart, K (B, 3, 3) of both frames.
+    Flow (B, h, w, 2) px, depths (B, h, w) metres of the same scene points one step apart, both on
+    the previous grid, K (B, 3, 3) of both frames.
     """
     batch = PairBatch(flow, depth_prev, K, K, depth_curr=depth_curr)
     batch = checked_batch(batch, where="assemble_aligned")[0]
@@ -160,8 +160,8 @@ def assemble_aligned(
 def _rays(rows: torch.Tensor, cols: torch.Tensor, K: torch.Tensor) -> torch.Tensor:
     """(B, 2, h, w) first two components of K^-1 x at rows (h,) and columns (w,) of pixels."""
     v, u = torch.meshgrid(rows, cols, indexing="ij")
-    focal = K.diagonal(dim1=1, dim2=2)[:, :2, None, None]
-    return (torch.stack([u, v]).to(K.dtype) - K[:, :2, 2, None, None]) / focal
+    focal, centre = pinhole(K)
+    return (torch.stack([u, v]).to(K.dtype) - centre) / focal
 
 
 def _nearest(native: int, target: int) -> torch.Tensor:
@@ -188,23 +188,17 @@ def _sample_at_flow(
 def _normalize(batch: PairBatch, rays: torch.Tensor) -> NetworkInputs:
     """Inputs of a batch of the network's size, whose pixels have the rays (B, 2, h, w)."""
     flow, prev, curr = batch.flow, batch.depth_prev, batch.depth_curr
-    if curr is None:
-        curr = torch.full_like(prev, torch.nan)
     flow_ok = torch.isfinite(flow).all(-1)
     prev_ok = torch.isfinite(prev) & (prev >= MIN_DEPTH)
     if batch.valid is not None:
         flow_ok, prev_ok = flow_ok & batch.valid, prev_ok & batch.valid
+    curr = torch.full_like(prev, torch.nan) if curr is None else curr
     curr_ok = torch.isfinite(curr) & (curr >= MIN_DEPTH) & flow_ok
+    flow = torch.where(flow_ok[..., None], flow, 0.0).permute(0, 3, 1, 2) / FLOW_SCALE_PX
     inverse = [
         # no 1 / 0 in the gradient of what is not selected
         torch.where(ok, 1.0 / torch.where(ok, depth, 1.0), 0.0)
         for depth, ok in ((prev, prev_ok), (curr, curr_ok))
     ]
-    return NetworkInputs(
-        flow=torch.where(flow_ok[..., None], flow, 0.0).permute(0, 3, 1, 2) / FLOW_SCALE_PX,
-        inverse_depth=torch.stack(inverse, dim=1),
-        rays=rays,
-        valid=flow_ok & prev_ok,
-        K_prev=batch.K_prev,
-        K_curr=batch.K_curr,
-    )
+    depths, valid = torch.stack(inverse, dim=1), flow_ok & prev_ok
+    return NetworkInputs(flow, depths, rays, valid, batch.K_prev, batch.K_curr)

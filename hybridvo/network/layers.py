@@ -1,7 +1,7 @@
 """What PWVO and the VONet baselines share: options, blocks, the encoder, self-attention.
 
-Stride-2 convolutions pad one pixel on every side (output pixel j is centred on input pixel 2j);
-the published TensorFlow code pads bottom and right only, which matters when weights are ported.
+Stride-2 convolutions pad one pixel on every side; the published TensorFlow code pads bottom and
+right only, which matters when weights are ported.
 """
 
 from __future__ import annotations
@@ -23,7 +23,6 @@ from hybridvo.options import option_group
 INPUT_LIMIT = 100.0
 """Inputs are clipped to this magnitude (20 000 px of flow, a depth of 1 cm): no finite input can
 then overflow the activations, and no measurement that could be meant is touched."""
-
 
 Kind = Literal["pwvo", "vonet", "vonet-attention"]
 KINDS = get_args(Kind)
@@ -59,13 +58,9 @@ class NetworkOptions:
 
     def __post_init__(self) -> None:
         if self.passes > 1 and not (self.scale_free and self.kind == "pwvo" and self.uncertainty):
-            raise InputError(
-                "passes above 1 need scale_free=True and the uncertainty of kind='pwvo'"
-            )
+            raise InputError("passes above 1 need scale_free=True, kind='pwvo' and uncertainty")
         if self.decoders == 2 and not self.uncertainty:
-            raise InputError(
-                "decoders=2 gives the uncertainty its own decoder; without it set decoders=1"
-            )
+            raise InputError("the second decoder is the uncertainty's; without set decoders=1")
 
 
 def scaled(channels: int, width: float) -> int:
@@ -81,24 +76,17 @@ class ResidualBlock(nn.Module):
     """
 
     def __init__(
-        self,
-        in_channels: int,
-        out_channels: int,
-        stride: int = 1,
-        inner_activation: bool = True,
-        project: bool = False,
+        self, before: int, after: int, stride: int, inner_activation: bool, project: bool = False
     ) -> None:
         super().__init__()
-        self.conv1 = nn.Conv2d(in_channels, out_channels, 3, stride, 1)
-        self.conv2 = nn.Conv2d(out_channels, out_channels, 3, 1, 1)
-        self.inner_activation = inner_activation
-        self.stride = stride
-        self.shortcut: nn.Module = nn.Identity()
-        if stride != 1 or in_channels != out_channels or project:
-            self.shortcut = nn.Conv2d(in_channels, out_channels, 1)
+        self.conv1 = nn.Conv2d(before, after, 3, stride, 1)
+        self.conv2 = nn.Conv2d(after, after, 3, 1, 1)
+        self.inner_activation, self.stride = inner_activation, stride
+        project = project or stride != 1 or before != after
+        self.shortcut = nn.Conv2d(before, after, 1) if project else nn.Identity()
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """(B, in_channels, h, w) -> (B, out_channels, ceil(h / stride), ceil(w / stride))."""
+        """(B, before, h, w) -> (B, after, ceil(h / stride), ceil(w / stride))."""
         y = self.conv2(F.elu(self.conv1(x), inplace=True))
         if self.inner_activation:
             y = F.elu(y, inplace=True)
@@ -114,8 +102,7 @@ class InputBranches(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.depth = nn.Conv2d(2, 8, 1)
-        self.rays = nn.Conv2d(2, 8, 1)
+        self.depth, self.rays = nn.Conv2d(2, 8, 1), nn.Conv2d(2, 8, 1)
 
     def forward(self, inputs: NetworkInputs) -> torch.Tensor:
         """Network inputs -> (B, 18, h, w)."""
@@ -123,27 +110,24 @@ class InputBranches(nn.Module):
             torch.nan_to_num(x, 0.0, 0.0, 0.0).clamp(-INPUT_LIMIT, INPUT_LIMIT)
             for x in (inputs.flow, inputs.inverse_depth, inputs.rays)
         )
-        branches = [flow, F.elu(self.depth(depth)), F.elu(self.rays(rays))]
-        return torch.cat([x.to(branches[1].dtype) for x in branches], dim=1)
+        depth, rays = F.elu(self.depth(depth)), F.elu(self.rays(rays))
+        return torch.cat([flow.to(depth.dtype), depth, rays], dim=1)
 
 
 class Encoder(nn.Module):
     """Stem of three convolutions and five stages of residual blocks, each halving the image."""
 
-    def __init__(self, in_channels: int, width: float = 1.0, inner_activation: bool = True) -> None:
+    def __init__(self, in_channels: int, width: float, inner_activation: bool = True) -> None:
         super().__init__()
         stem = scaled(32, width)
         strides = ((in_channels, 2), (stem, 1), (stem, 1))
         self.stem = nn.ModuleList(nn.Conv2d(n, stem, 3, stride, 1) for n, stride in strides)
         self.channels = tuple(scaled(c, width) for c in (64, 128, 128, 256, 256))
-        stages = []
-        for count, (before, after) in zip(
-            (3, 4, 6, 7, 3), pairwise((stem, *self.channels)), strict=True
-        ):
+        sizes = zip((3, 4, 6, 7, 3), pairwise((stem, *self.channels)), strict=True)
+        for k, (count, (before, after)) in enumerate(sizes, start=1):
             blocks = [ResidualBlock(before, after, 2, inner_activation)]
             blocks += [ResidualBlock(after, after, 1, inner_activation) for _ in range(count - 1)]
-            stages.append(nn.Sequential(*blocks))
-        self.layer1, self.layer2, self.layer3, self.layer4, self.layer5 = stages
+            self.add_module(f"layer{k}", nn.Sequential(*blocks))
 
     def forward(self, x: torch.Tensor) -> list[torch.Tensor]:
         """(B, C, h, w) -> features of the stem and of layer1 to layer5, finest first.
@@ -153,8 +137,8 @@ class Encoder(nn.Module):
         for convolution in self.stem:
             x = F.elu(convolution(x), inplace=True)
         features = [x]
-        for layer in (self.layer1, self.layer2, self.layer3, self.layer4, self.layer5):
-            features.append(layer(features[-1]))
+        for k in range(len(self.channels)):
+            features.append(getattr(self, f"layer{k + 1}")(features[-1]))
         return features
 
 
@@ -185,14 +169,14 @@ def plain_torch() -> Iterator[None]:
         yield
 
 
-def initialize(network: nn.Module, uniform: tuple[nn.Module, ...] = ()) -> None:
+def initialize(network: nn.Module, uniform: tuple[nn.Module, ...]) -> None:
     """Glorot-normal weights (uniform inside ``uniform``, the heads) by torch's global generator."""
-    heads = {id(m) for head in uniform for m in head.modules()}
+    heads = {m for head in uniform for m in head.modules()}
     for module in network.modules():
         if isinstance(module, nn.Conv2d | nn.ConvTranspose2d | nn.Linear):
             if module.weight.is_meta:  # no memory to fill, and torch would load its compiler for it
                 continue
-            fill = nn.init.xavier_uniform_ if id(module) in heads else nn.init.xavier_normal_
+            fill = nn.init.xavier_uniform_ if module in heads else nn.init.xavier_normal_
             fill(module.weight)
             if module.bias is not None:
                 nn.init.zeros_(module.bias)

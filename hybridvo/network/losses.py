@@ -1,11 +1,10 @@
 """Losses of PWVO and its baselines (paper, sections 3.2.2 and 3.4) in log form, s = log U.
 
 Four terms, each plain or weighed by uncertainty: rotation L^R and translation L^T, every pixel must
-name the pair's motion (distribution learning); ego flow L^F and depth L^D, the *selected* motion,
-applied to the true depth, must reproduce what the camera motion alone causes.
-
-They are those of the published code, but pixels without depth are left out, a point that the motion
-brings behind the camera is charged, and s may have a coarser grid than the flow.
+name the pair's motion; ego flow L^F and depth L^D, the *selected* motion, applied to the true
+depth, must reproduce what the camera motion alone causes. They are those of the published code, but
+pixels without depth are left out, a point that the motion brings behind the camera is charged, and
+s may have a coarser grid than the flow.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ import torch.nn.functional as F
 from pydantic import Field
 
 from hybridvo.network.inputs import MIN_DEPTH, TensorBatch
-from hybridvo.network.selection import NetworkOutput
+from hybridvo.network.selection import NetworkOutput, joined
 from hybridvo.options import Positive, option_group
 from hybridvo.results import PixelwisePrediction
 from hybridvo.torch_geometry import pixel_grid, reproject
@@ -68,13 +67,9 @@ class LossOptions:
 class LossTargets(TensorBatch):
     """Ground truth of a batch, at the network's input size (h, w).
 
-    Args:
-        rotation_deg: (B, 3) Euler angles X-Y-Z in degrees of T_curr_prev.
-        translation: (B, 3) metres.
-        ego_flow: (B, 2, h, w) px, flow that the camera motion alone causes; NaN does not count.
-        depth_prev: (B, h, w) metres; not finite or not positive is invalid.
-        depth_curr: (B, h, w) metres, next depth of the same scene point on the grid of t.
-        K_prev, K_curr: (B, 3, 3).
+    ``rotation_deg`` (B, 3) Euler angles X-Y-Z and ``translation`` (B, 3) metres of T_curr_prev;
+    ``ego_flow`` (B, 2, h, w) px that the camera motion alone causes, NaN does not count; depths
+    (B, h, w) metres of the same scene points, both on the previous grid; intrinsics (B, 3, 3).
     """
 
     rotation_deg: torch.Tensor
@@ -92,14 +87,13 @@ def reconstruct(
     """Flow and depth that a camera motion causes (paper, equation 8), differentiable.
 
     Returns:
-        On the grid of the previous frame: (B, 2, h, w) ego flow pi(K_curr, T D K_prev^-1 x) - x in
-        px; (B, h, w) depth of the moved point, below ``MIN_DEPTH`` behind the camera, 1 where
-        ``depth_prev`` is invalid; (B, h, w) bool: valid and in front of the camera. Elsewhere the
-        flow is finite and means nothing.
+        (B, 2, h, w) ego flow pi(K_curr, T D K_prev^-1 x) - x in px; (B, h, w) depth of the moved
+        point, below ``MIN_DEPTH`` behind the camera, 1 where ``depth_prev`` is invalid; (B, h, w)
+        bool: valid and in front of the camera. Elsewhere the flow is finite and means nothing.
     """
     pixels, valid, z = reproject(depth_prev, T_curr_prev, K_prev, K_curr, MIN_DEPTH)
-    grid = pixel_grid(depth_prev.shape[1], depth_prev.shape[2], depth_prev)
-    return (pixels - grid).permute(0, 3, 1, 2), z, valid
+    flow = pixels - pixel_grid(depth_prev.shape[1], depth_prev.shape[2], depth_prev)
+    return flow.permute(0, 3, 1, 2), z, valid
 
 
 def total_loss(
@@ -116,8 +110,7 @@ def total_loss(
     """
     s = None
     if isinstance(output, PixelwisePrediction):
-        if output.log_scale_rotation is not None and output.log_scale_translation is not None:
-            s = torch.cat([output.log_scale_rotation, output.log_scale_translation], dim=1)
+        _, s = joined(output)
         parts = _pose_losses(output, targets, s if options.pose_uncertainty else None, options)
     else:
         pairs = zip(output, (targets.rotation_deg, targets.translation), strict=True)
@@ -125,13 +118,12 @@ def total_loss(
         parts = {"rotation": rotation, "translation": translation}
     if options.reconstructs:
         assert T_curr_prev is not None
-        flow, depth, defined = reconstruct(
-            targets.depth_prev, T_curr_prev, targets.K_prev, targets.K_curr
-        )
+        cameras = targets.K_prev, targets.K_curr
+        flow, depth, defined = reconstruct(targets.depth_prev, T_curr_prev, *cameras)
         known = torch.isfinite(targets.depth_prev) & (targets.depth_prev > 0)
         if options.flow:
-            s_flow = s if options.flow_uncertainty else None
-            parts["flow"] = _flow_loss(flow, targets.ego_flow, defined, known, s_flow, options)
+            s_flow, limit = s if options.flow_uncertainty else None, options.flow_limit_px
+            parts["flow"] = _flow_loss(flow, targets.ego_flow, defined, known, s_flow, limit)
         if options.depth:
             s_depth = s if options.depth_uncertainty else None
             parts["depth"] = _depth_loss(depth, targets.depth_curr, known, s_depth)
@@ -158,24 +150,18 @@ def _pose_losses(
     output: PixelwisePrediction, targets: LossTargets, s: torch.Tensor | None, options: LossOptions
 ) -> dict[str, torch.Tensor]:
     """L^R and L^T of pixel maps, weighed by s (B, 6, ..) unless it is None; as published."""
-    error_r = (targets.rotation_deg[:, :, None, None] - output.rotation).abs()
-    true_t = targets.translation[:, :, None, None]
-    if options.translation_form == "laplace":
-        error_t = (output.translation - true_t).abs()
-    else:
+    true_r, true_t = (x[:, :, None, None] for x in (targets.rotation_deg, targets.translation))
+    laplace = options.translation_form == "laplace"
+    errors = [(true_r - output.rotation).abs(), (output.translation - true_t).abs()]
+    if not laplace:
         floor = options.direction_floor
         length = (_norm(true_t) - _norm(output.translation)).square()
         turn = _direction(true_t, floor) - _direction(output.translation, floor)
-        error_t = length + _norm(turn)
-    if s is None:
-        return {"rotation": error_r.mean(), "translation": error_t.mean()}
-    s_r, s_t = s[:, :3], s[:, 3:]
-    data_r, data_t = (_inverse_scale(s_r) * error_r).mean(), (_inverse_scale(s_t) * error_t).mean()
-    half = 0.5 if options.translation_form == "laplace" else 1.0
-    return {
-        "rotation": 0.5 * (data_r + s_r.mean()),
-        "translation": 0.5 * data_t + half * s_t.mean(),
-    }
+        errors[1] = length + _norm(turn)
+    if s is not None:
+        halves = zip(errors, s.split(3, dim=1), (0.5, 0.5 if laplace else 1.0), strict=True)
+        errors = [0.5 * _inverse_scale(x) * error + half * x for error, x, half in halves]
+    return {"rotation": errors[0].mean(), "translation": errors[1].mean()}
 
 
 def _flow_loss(
@@ -184,24 +170,19 @@ def _flow_loss(
     defined: torch.Tensor,
     known: torch.Tensor,
     s: torch.Tensor | None,
-    options: LossOptions,
+    limit_px: float,
 ) -> torch.Tensor:
     """L^F; with s (B, 6, ..) weighed by 1 / U^F = exp(-0.1 s)."""
     known = known & torch.isfinite(target).all(dim=1)
     error = (flow - torch.where(known[:, None], target, 0.0)).abs()
-    counts = (defined & known)[:, None] & (error < options.flow_limit_px)
-    behind = (known & ~defined)[:, None]
-    error = torch.where(counts, error, 0.0) + behind * options.flow_limit_px
-    count = known.sum().clamp(min=1)
+    counts = (defined & known)[:, None] & (error < limit_px)
+    error = torch.where(counts, error, 0.0) + (known & ~defined)[:, None] * limit_px
     if s is None:
-        return 0.5 * error.sum() / count
+        return 0.5 * error.sum() / known.sum().clamp(min=1)
     # rx, ry, rz and tz move both components, tx and ty one of them
-    a, b = (_to_cells(e, s.shape[2:]) for e in error.unbind(1))
-    each = torch.stack([a + b, a + b, a + b, a, b, a + b], dim=1)
-    pixels = _to_cells(known.to(s.dtype), s.shape[2:])[:, None]
-    s = 0.1 * s
+    a, b = error.unbind(1)
     share = s.new_tensor([1.0, 1.0, 1.0, 0.5, 0.5, 1.0])[:, None, None]
-    return (0.5 * _inverse_scale(s) * each + share * s * pixels).sum() / count
+    return _weighed(torch.stack([a + b, a + b, a + b, a, b, a + b], dim=1), known, 0.1 * s, share)
 
 
 def _depth_loss(
@@ -217,19 +198,27 @@ def _depth_loss(
     exact = 1.0 / target - 1.0 / torch.where(front, depth, 1.0)
     # finite behind the camera
     error = torch.where(front, exact, (target - depth) / target.square()).abs()
-    error, count = torch.where(known, error, 0.0), known.sum().clamp(min=1)
+    error = torch.where(known, error, 0.0)
     if s is None:
-        return error.sum() / count
-    s = 0.25 * s[:, [0, 1, 5]]
-    cells = [_to_cells(x.to(s.dtype), s.shape[2:])[:, None] for x in (error, known)]
-    return 0.5 * (_inverse_scale(s) * cells[0] + s * cells[1]).sum() / count
+        return error.sum() / known.sum().clamp(min=1)
+    return _weighed(error[:, None], known, 0.25 * s[:, [0, 1, 5]], 0.5)
+
+
+def _weighed(
+    error: torch.Tensor, known: torch.Tensor, s: torch.Tensor, share: torch.Tensor | float
+) -> torch.Tensor:
+    """Errors (B, C, h, w) over their scales exp(s), which may have a coarser grid, plus s."""
+    pixels = _to_cells(known[:, None].to(s.dtype), s.shape[2:])
+    error = _to_cells(error, s.shape[2:])
+    total = (0.5 * _inverse_scale(s) * error + share * s * pixels).sum()
+    return total / known.sum().clamp(min=1)
 
 
 def _to_cells(x: torch.Tensor, cells: torch.Size) -> torch.Tensor:
-    """Sum of a (B, h, w) map over the pixels of each cell of a coarser grid ``cells``."""
-    height, width = x.shape[1:]
+    """Sum of (B, C, h, w) maps over the pixels of each cell of a coarser grid ``cells``."""
+    height, width = x.shape[2:]
     side = -(-height // cells[0])
     if side == 1:
         return x
     x = F.pad(x, (0, cells[1] * side - width, 0, cells[0] * side - height))
-    return F.avg_pool2d(x[:, None], side)[:, 0] * side**2
+    return F.avg_pool2d(x, side) * side**2

@@ -22,21 +22,19 @@ SELECTION = {
 """Methods that are a network alone, and how one motion is selected from its pixels, if any."""
 
 
-def load_weights(path: str | Path) -> tuple[Any, dict[str, Any]]:
-    """Network of a weights file, in evaluation mode and float32 on the CPU, and its model card.
-
-    Raises:
-        CheckpointError: no whole weights file, or one of another program or architecture.
-    """
+def load_weights(name_or_path: str | Path) -> tuple[Any, dict[str, Any]]:
+    """Network of pretrained or other weights and its card; see ``weights.read_network``."""
     from hybridvo.network.layers import NetworkOptions
     from hybridvo.network.pwvo import build_network
     from hybridvo.network.selector_net import SelectorNetwork, SelectorNetworkOptions
-    from hybridvo.network.weights import read_weights
+    from hybridvo.network.weights import read_network
 
-    weights = read_weights(path)
-    if weights.options.get("kind") == "selector":
-        return weights.build(SelectorNetworkOptions, SelectorNetwork), weights.card
-    return weights.build(NetworkOptions, build_network), weights.card
+    def make(options: dict[str, Any]) -> Any:
+        if options.get("kind") == "selector":
+            return SelectorNetwork(SelectorNetworkOptions(**options))
+        return build_network(NetworkOptions(**options))
+
+    return read_network(name_or_path, make)
 
 
 class Models:
@@ -55,9 +53,9 @@ class Models:
 
     def path(self, name: str) -> Path:
         """File of the weights of a network."""
-        from hybridvo.network.weights import pretrained
+        from hybridvo.network.weights import weights_file
 
-        return self.weights.get(name) or pretrained(name)
+        return self.weights.get(name) or weights_file(name)
 
     def network(self, name: str) -> Any:
         """A network, in the form that is fastest on its device."""
@@ -67,12 +65,9 @@ class Models:
             path = self.path(name)
             network, _ = load_weights(path)
             own = name == "selector" or name.startswith("vonet")  # the other names are PWVOs
-            if network.options.kind != (name if own else "pwvo"):
-                raise CheckpointError(
-                    f"{path}: expected the weights of a {name}, got a {network.options.kind}'s."
-                )
-            network = network.to(self.device, memory_format=torch.channels_last)
-            self._networks[name] = network
+            if (kind := network.options.kind) != (name if own else "pwvo"):
+                raise CheckpointError(f"{path}: expected the weights of a {name}, got a {kind}'s.")
+            self._networks[name] = network.to(self.device, memory_format=torch.channels_last)
         return self._networks[name]
 
 
@@ -101,10 +96,7 @@ def torch_device(device: str) -> str:
         return device
     import torch
 
-    if torch.cuda.is_available():
-        return "cuda"
-    if device == "cuda":
-        raise InputError(
-            "device cuda: this machine, or this build of torch, has no CUDA device; use cpu."
-        )
-    return "cpu"
+    there = torch.cuda.is_available()
+    if device == "cuda" and not there:
+        raise InputError("device cuda: this machine, or this torch, has no CUDA device; use cpu.")
+    return "cuda" if there else "cpu"

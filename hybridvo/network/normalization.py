@@ -1,9 +1,8 @@
 """Inputs without units: one network for a desk and a street, for a slow and a fast camera.
 
-Inputs are divided by the pair's own scales, outputs multiplied by them; to first order in the
-motion nothing is lost: over the focal length, flow is rotation + translation / depth. What flow and
-depth leave unexplained after a first motion is the flow of the motion that is missing, and over its
-own scale looks like any other pair: the network refines its own answer in several passes.
+Inputs are divided by the pair's own scales, outputs multiplied by them. What a first motion leaves
+unexplained looks, over its own scale, like any other pair: the network refines its own answer in
+several passes.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import nn
 
-from hybridvo.network.inputs import MIN_DEPTH, NetworkInputs
+from hybridvo.network.inputs import MIN_DEPTH, NetworkInputs, pinhole
 from hybridvo.network.layers import NetworkOptions
 from hybridvo.network.selection import NetworkOutput, fitted_motion
 from hybridvo.torch_geometry import euler_deg
@@ -31,16 +30,13 @@ LIMIT = 10.0
 
 
 class MotionScale(NamedTuple):
-    """What turns a network's raw outputs into motions: rx, ry, rz (degrees), tx, ty, tz (metres).
-
-    ``factor`` (B, 6): their scales; ``start`` (B, 6): the motion taken out of the inputs.
-    """
+    """Scales (B, 6) of rx, ry, rz (degrees), tx, ty, tz (metres), and the motion taken out."""
 
     factor: torch.Tensor
     start: torch.Tensor
 
     def motion(self, raw: torch.Tensor) -> torch.Tensor:
-        """Motions of raw outputs (B, 6) or (B, 6, h, w): the sum of two small ones."""
+        """Motions of a network's raw outputs (B, 6) or (B, 6, h, w): the sum of two small ones."""
         shape = (-1, 6) + (1,) * (raw.ndim - 2)
         factor, start = (x.to(raw.dtype).view(shape) for x in self)
         return start + factor * raw
@@ -58,10 +54,7 @@ def normalize(
 
 
 def predict(network: nn.Module, inputs: NetworkInputs, selection: str = "softmax") -> NetworkOutput:
-    """Output of the last of the network's passes, each on what the one before left unexplained.
-
-    ``selection``: how one pose comes out of the pixels of a pass.
-    """
+    """Output of the last of the network's passes; ``selection``: of the start of the next one."""
     passes: int = network.options.passes  # type: ignore[union-attr, assignment]
     return network(inputs, first_motions(network, inputs, selection, passes - 1))
 
@@ -106,21 +99,19 @@ def remove_scale(
         ego, log_ratio = _ego_motion(inputs, inverse[:, 0], T_start)
         # No flow was measured where it is exactly zero in both components and the pixel is invalid.
         seen = inputs.valid[:, None] | (flow != 0).any(dim=1, keepdim=True)
-        flow = torch.where(seen, flow - ego, flow)
-        change = change - log_ratio
-    angle = flow / _focal(inputs.K_prev)
+        flow, change = torch.where(seen, flow - ego, flow), change - log_ratio
+    angle = flow / pinhole(inputs.K_prev)[0]
     length = (angle.square().sum(dim=1) + 1e-20).sqrt()
     motion = _quantile(length, inputs.valid, quantile).clamp(MIN_MOTION, 1.0)
     # near things tell the translation, and set its scale
-    near_quantile = torch.full_like(quantile, 0.9)
     known = inputs.valid & (inverse[:, 0] > 0)
-    nearness = _quantile(inverse[:, 0], known, near_quantile).clamp(MIN_NEARNESS, 1e3)
+    nearness = _quantile(inverse[:, 0], known, torch.full_like(quantile, 0.9))
+    nearness = nearness.clamp(MIN_NEARNESS, 1e3)
     m, near = (x[:, None, None, None] for x in (motion, nearness))
-    change = torch.where(both, change / m, 0.0)
-    depth = torch.cat([_squash(inverse[:, :1] / near), _squash(change)], dim=1)
+    depth = torch.cat([inverse[:, :1] / near, torch.where(both, change / m, 0.0)], dim=1)
     factor = torch.stack([torch.rad2deg(motion), motion / nearness], dim=1)
     scale = MotionScale(factor.repeat_interleave(3, dim=1), start)
-    return replace(inputs, flow=_squash(angle / m), inverse_depth=depth), scale
+    return replace(inputs, flow=_squash(angle / m), inverse_depth=_squash(depth)), scale
 
 
 def _ego_motion(
@@ -128,18 +119,14 @@ def _ego_motion(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """((B, 2, h, w) px, (B, 1, h, w)) flow and change of log depth; zero behind the camera."""
     # Over its depth, a point is ray + translation * inverse depth: finite for the farthest.
-    rays, inverse = inputs.rays.flatten(2), inverse.flatten(1)[:, None]
-    moved = T[:, :3, :2] @ rays + T[:, :3, 2:3] + T[:, :3, 3:] * inverse
+    rays, near = inputs.rays.flatten(2), inverse.flatten(1)[:, None]
+    moved = T[:, :3, :2] @ rays + T[:, :3, 2:3] + T[:, :3, 3:] * near
     moved = moved.unflatten(2, inputs.size)
-    front = moved[:, 2:] > MIN_DEPTH * inverse.unflatten(2, inputs.size).clamp(min=1e-3)
+    front = moved[:, 2:] > MIN_DEPTH * inverse[:, None].clamp(min=1e-3)
     z = torch.where(front, moved[:, 2:], 1.0)
-    now = _focal(inputs.K_curr) * moved[:, :2] / z + inputs.K_curr[:, :2, 2, None, None]
-    before = _focal(inputs.K_prev) * inputs.rays + inputs.K_prev[:, :2, 2, None, None]
-    return torch.where(front, now - before, 0.0), torch.where(front, z.log(), 0.0)
-
-
-def _focal(K: torch.Tensor) -> torch.Tensor:
-    return K.diagonal(dim1=1, dim2=2)[:, :2, None, None]
+    focal, centre = pinhole(inputs.K_curr)
+    flow = focal * moved[:, :2] / z + centre - inputs.pixels
+    return torch.where(front, flow, 0.0), torch.where(front, z.log(), 0.0)
 
 
 def _squash(x: torch.Tensor) -> torch.Tensor:

@@ -3,25 +3,25 @@
 from __future__ import annotations
 
 import time
-from typing import Any
 
 import numpy as np
 import torch
 from torch import nn
 
-from hybridvo.network.inputs import NetworkInputs, assemble_inputs
+from hybridvo.network.inputs import assemble_inputs
 from hybridvo.network.layers import plain_torch
 from hybridvo.network.models import SELECTION
 from hybridvo.network.normalization import predict
 from hybridvo.network.selection import (
     NetworkOutput,
     fitted_motion,
+    joined,
     on_grid_of,
     pixel_weights,
-    select_motion,
     select_pose,
 )
 from hybridvo.results import MotionPrediction, PixelwisePrediction, Reason, RelativePose, Status
+from hybridvo.torch_geometry import euler_transform
 from hybridvo.types import FramePair
 
 STATIC_AT, STATIC_SLOPE = 1.64, 1.63
@@ -52,9 +52,8 @@ def propose_motion(network: nn.Module, pair: FramePair) -> MotionPrediction | No
         T = fitted_motion(output, inputs)[0].double().numpy()
         valid = on_grid_of(log_scale, inputs).valid
         static = static_probability(log_scale, valid)[0].numpy()
-    if not (np.isfinite(T).all() and np.isfinite(static).all()):
-        return None
-    return MotionPrediction(T, static)
+    finite = np.isfinite(T).all() and np.isfinite(static).all()
+    return MotionPrediction(T, static) if finite else None
 
 
 def estimate_by_network(pair: FramePair, method: str, network: nn.Module) -> RelativePose:
@@ -64,26 +63,27 @@ def estimate_by_network(pair: FramePair, method: str, network: nn.Module) -> Rel
     (2 U^2). Bad data give a failed status.
     """
     started = time.perf_counter()
+
+    def failed(reason: Reason, message: str) -> RelativePose:
+        return RelativePose.failed(reason, message, method, terms=("flow", "depth"))
+
     if pair.flow is None:
-        return RelativePose.failed(Reason.NO_FLOW, "no optical flow for this pair", method)
+        return failed(Reason.NO_FLOW, "no optical flow for this pair")
     if pair.prev.depth is None:
-        return RelativePose.failed(Reason.NO_VALID_DEPTH, "no depth for this frame", method)
+        return failed(Reason.NO_VALID_DEPTH, "no depth for this frame")
     with plain_torch():
         inputs = assemble_inputs(pair)
-        seen = int(inputs.valid.sum())
-        if seen < MIN_PIXELS:
-            return RelativePose.failed(
+        if (seen := int(inputs.valid.sum())) < MIN_PIXELS:
+            return failed(
                 Reason.NO_VALID_DEPTH,
                 f"{seen} pixels of the network's input have flow and depth, {MIN_PIXELS} needed",
-                method,
             )
-        T, U = _select_with_scale(network, inputs, SELECTION[method])
-    ms = 1e3 * (time.perf_counter() - started)
-    common: dict[str, Any] = {"method": method, "ms": ms, "terms": ("flow", "depth")}
+        how = SELECTION[method]
+        output = predict(network, inputs, how)
+        T = euler_transform(*(x.double() for x in select_pose(output, how)))[0].numpy()
+        U = np.maximum(_stated_scale(output, how), 1e-4)  # half-precision weights know no better
     if not (np.isfinite(T).all() and np.isfinite(U).all()):
-        return RelativePose.failed(
-            Reason.DEGENERATE_GEOMETRY, "the network's answer is not finite", **common
-        )
+        return failed(Reason.DEGENERATE_GEOMETRY, "the network's answer is not finite")
     status = Status()
     if U[3:].max() > 2.0:  # degrees: larger than most motions between frames
         status = Status.degraded(
@@ -95,24 +95,18 @@ def estimate_by_network(pair: FramePair, method: str, network: nn.Module) -> Rel
         covariance=np.diag(sigma**2),
         status=status,
         translation_direction_valid=bool(np.linalg.norm(T[:3, 3]) > 3 * sigma[:3].max()),
-        **common,
+        method=method,
+        ms=1e3 * (time.perf_counter() - started),
+        terms=("flow", "depth"),
     )
 
 
-def _select_with_scale(
-    network: nn.Module, inputs: NetworkInputs, how: str
-) -> tuple[np.ndarray, np.ndarray]:
-    """T_curr_prev (4, 4), and the Laplace scales of its translation (m) and rotation (degrees)."""
-    output: NetworkOutput = predict(network, inputs, how)
-    rotation, translation = (x.double() for x in select_pose(output, how))
-    T = select_motion((rotation, translation), how)[0].numpy()
-    # 0.3 m and 1 degree for networks that state none: the largest usual motions, so nobody trusts
-    U = np.array([0.3] * 3 + [1.0] * 3)
-    if isinstance(output, PixelwisePrediction):
-        log_r, log_t = output.log_scale_rotation, output.log_scale_translation
-        if log_r is not None and log_t is not None:
-            # The scales go the way of the values: same pixels, same weights.
-            stated = PixelwisePrediction(log_r.exp(), log_t.exp(), log_r, log_t)
-            scale_r, scale_t = select_pose(stated, how)
-            U = torch.cat([scale_t, scale_r], dim=1)[0].double().numpy()
-    return T, np.maximum(U, 1e-4)  # half-precision weights know no better
+def _stated_scale(output: NetworkOutput, how: str) -> np.ndarray:
+    """(6,) Laplace scales of a selected motion: of its translation (m) and rotation (degrees)."""
+    if not isinstance(output, PixelwisePrediction) or (s := joined(output)[1]) is None:
+        # the largest usual motions: nobody trusts a network that states none
+        return np.repeat([0.3, 1.0], 3)
+    # The scales go the way of the values: same pixels, same weights.
+    stated = PixelwisePrediction(*s.exp().split(3, dim=1), *s.split(3, dim=1))
+    scale_r, scale_t = select_pose(stated, how)
+    return torch.cat([scale_t, scale_r], dim=1)[0].double().numpy()

@@ -1,7 +1,7 @@
 """The paper's networks: PWVO, a pose and its uncertainty at every pixel, and the VONet baselines.
 
-PWVO is that of the published code, layer by layer (reference/pwvo.md, section 2): one shared U-Net
-decoder with two heads of two convolutions. ``decoders=2`` builds the two of the paper's text.
+PWVO is that of the published code, layer by layer: one shared U-Net decoder with two heads of two
+convolutions. ``decoders=2`` builds the two of the paper's text.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -27,7 +26,7 @@ from hybridvo.network.layers import (
     scaled,
 )
 from hybridvo.network.normalization import normalize, predict
-from hybridvo.network.weights import read_weights, weights_file
+from hybridvo.network.weights import read_network
 from hybridvo.results import PixelwisePrediction
 from hybridvo.types import FramePair, PairBatch
 
@@ -40,15 +39,13 @@ class _UpStage(nn.Module):
 
     def __init__(self, in_channels: int, up: int, skip: int, out: int, project: bool = False):
         super().__init__()
-        self.up = nn.ConvTranspose2d(in_channels, up, 2, 2)
-        self.block = ResidualBlock(up + skip, out, project=project)
+        self.up, self.skip = nn.ConvTranspose2d(in_channels, up, 2, 2), skip
+        self.block = ResidualBlock(up + skip, out, 1, True, project)
 
-    def forward(self, x: torch.Tensor, like: torch.Tensor, skip: bool) -> torch.Tensor:
+    def forward(self, x: torch.Tensor, like: torch.Tensor) -> torch.Tensor:
         # upsampling gives a row or column too many where the encoder met an odd size
         x = self.up(x)[:, :, : like.shape[2], : like.shape[3]]
-        if skip:
-            x = torch.cat([x, like.to(x.dtype)], dim=1)
-        return self.block(x)
+        return self.block(torch.cat([x, like.to(x.dtype)], dim=1) if self.skip else x)
 
 
 class Decoder(nn.Module):
@@ -69,15 +66,11 @@ class Decoder(nn.Module):
 
     def forward(self, inputs: torch.Tensor, features: list[torch.Tensor]) -> torch.Tensor:
         """Inputs (B, 18, h, w) and the encoder's features -> (B, 32, h / stride, w / stride)."""
-        stem, layer1, layer2, layer3, layer4, x = features
-        x = self.up5(x, layer4, True)
-        x = self.up4(x, layer3, True)
-        x = self.up3(x, layer2, True)
-        x = self.up2(x, layer1, True)
-        x = self.up1(x, stem, False)
-        if self.up0 is not None:
-            x = self.up0(x, inputs, False)
-        return self.out(x)
+        *skips, x = features
+        stages = self.up5, self.up4, self.up3, self.up2, self.up1
+        for stage, skip in zip(stages, reversed(skips), strict=True):
+            x = stage(x, skip)
+        return self.out(x if self.up0 is None else self.up0(x, inputs))
 
 
 def _map_head(channels: int) -> nn.Sequential:
@@ -91,9 +84,8 @@ class PWVO(nn.Module):
 
     def __init__(self, options: NetworkOptions | None = None) -> None:
         super().__init__()
-        options = NetworkOptions() if options is None else options
+        self.options = options = options or NetworkOptions()
         width, stride = options.width, options.head_stride
-        self.options = options
         self.branches = InputBranches()
         self.encoder = Encoder(InputBranches.out_channels, width)
         self.decoder = Decoder(self.encoder.channels, width, stride)
@@ -104,7 +96,7 @@ class PWVO(nn.Module):
         self.head_motion = _map_head(channels)
         self.head_uncertainty = _map_head(channels) if options.uncertainty else None
         heads = [h for h in (self.head_motion, self.head_uncertainty) if h is not None]
-        initialize(self, uniform=tuple(heads))
+        initialize(self, tuple(heads))
 
     @classmethod
     def from_pretrained(cls, name_or_path: str | Path = "pwvo") -> PWVO:
@@ -113,32 +105,26 @@ class PWVO(nn.Module):
         Raises:
             CheckpointError: no such weights, damaged ones, or another network's.
         """
-        weights = read_weights(weights_file(name_or_path))
-        network = weights.build(NetworkOptions, build_network)
+        network, _ = read_network(name_or_path, lambda o: build_network(NetworkOptions(**o)))
         if not isinstance(network, cls):
-            raise CheckpointError(
-                f"{weights.path}: expected the weights of a PWVO, got another network's."
-            )
+            raise CheckpointError(f"{name_or_path}: expected the weights of a PWVO, got another's.")
         return network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def forward(
-        self,
-        inputs: NetworkInputs | FramePair | PairBatch,
-        T_start: torch.Tensor | None = None,
+        self, inputs: NetworkInputs | FramePair | PairBatch, T_start: torch.Tensor | None = None
     ) -> PixelwisePrediction:
         """Pose and log scale at every pixel: of assembled inputs in one pass, of pairs in all.
 
-        Where flow or depth is missing (``inputs.valid`` is False) the log scale is at least
-        ``INVALID_LOG_SCALE``: no selection prefers such a pixel.
+        Where flow or depth is missing the log scale is at least ``INVALID_LOG_SCALE``: no selection
+        prefers such a pixel.
 
         Args:
             inputs: pairs of any size; or inputs of size (h, w), multiples of 32 waste no border.
-            T_start: (B, 4, 4) a first motion, for scale-free networks: they look at what it leaves
-                unexplained, see :func:`hybridvo.network.normalization.predict`.
+            T_start: (B, 4, 4) a first motion, for scale-free networks: they look at what it leaves.
 
         Returns:
-            Maps of (ceil(h / n), ceil(w / n)), n = input_stride * head_stride; float32 (float64 for
-            a float64 network), also under autocast. Finite for any input.
+            Maps of (ceil(h / n), ceil(w / n)), n = input_stride * head_stride; in the network's own
+            type, also under autocast. Finite for any input.
         """
         options, own = self.options, next(self.parameters())
         if not isinstance(inputs, NetworkInputs):
@@ -151,19 +137,18 @@ class PWVO(nn.Module):
         x = self.branches(inputs)
         features = self.encoder(x)
         shared = self.decoder(x, features)
-        motion = scale.motion(self.head_motion(shared).to(own.dtype))
+        motion = scale.motion(self.head_motion(shared).to(own.dtype)).split(3, dim=1)
         if self.head_uncertainty is None:
-            return PixelwisePrediction(motion[:, :3], motion[:, 3:])
+            return PixelwisePrediction(*motion)
         if self.decoder_uncertainty is not None:
             shared = self.decoder_uncertainty(x, features)
         log_scale = self.head_uncertainty(shared).to(own.dtype)
         if options.scale_free:
             log_scale = log_scale + scale.factor.to(own.dtype).log()[:, :, None, None]
         seen = inputs.valid[:, None].to(own.dtype)
-        if options.head_stride > 1:
-            seen = F.max_pool2d(seen, options.head_stride, ceil_mode=True)
+        seen = F.max_pool2d(seen, options.head_stride, ceil_mode=True)
         log_scale = torch.where(seen > 0, log_scale, log_scale.clamp(min=INVALID_LOG_SCALE))
-        return PixelwisePrediction(motion[:, :3], motion[:, 3:], log_scale[:, :3], log_scale[:, 3:])
+        return PixelwisePrediction(*motion, *log_scale.split(3, dim=1))
 
 
 def _pose_head(features: int) -> nn.Sequential:
@@ -173,50 +158,35 @@ def _pose_head(features: int) -> nn.Sequential:
 
 
 class VONet(nn.Module):
-    """PWVO's encoder with two fully connected heads (the paper's VONet baselines).
+    """PWVO's encoder with two fully connected heads (the paper's VONet baselines)."""
 
-    Inputs of another size than 128x256 are averaged to the same 2x4 grid of features before the
-    heads, so that one set of weights serves every size.
-    """
-
-    grid = (2, 4)  # of the embedding of a 128x256 input
+    grid = (2, 4)  # of the embedding of a 128x256 input; others are averaged to it
 
     def __init__(self, options: NetworkOptions | None = None) -> None:
         super().__init__()
-        options = NetworkOptions(kind="vonet") if options is None else options
-        self.options = options
+        self.options = options = options or NetworkOptions(kind="vonet")
         self.branches = InputBranches()
         self.encoder = Encoder(InputBranches.out_channels, options.width, inner_activation=False)
-        channels = self.encoder.channels[-1]
-        self.attention = (
-            SelfAttention(channels) if options.kind == "vonet-attention" else nn.Identity()
-        )
+        channels, attends = self.encoder.channels[-1], options.kind == "vonet-attention"
+        self.attention = SelfAttention(channels) if attends else nn.Identity()
         features = channels * math.prod(self.grid)
         self.head_rotation = _pose_head(features)
         self.head_translation = _pose_head(features)
-        initialize(self, uniform=(self.head_rotation, self.head_translation))
+        initialize(self, (self.head_rotation, self.head_translation))
 
     def forward(
         self, inputs: NetworkInputs, T_start: torch.Tensor | None = None
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """(B, 3) Euler angles X-Y-Z in degrees (R = Rx Ry Rz) and (B, 3) translation in metres of
-        T_curr_prev; ``T_start``: (B, 4, 4) a first motion, for scale-free networks.
-        """
+        """(B, 3) Euler angles X-Y-Z in degrees and (B, 3) metres of T_curr_prev."""
         inputs, scale = normalize(inputs, self.options, T_start)
         embedding = self.attention(self.encoder(self.branches(inputs))[-1])
-        if embedding.shape[2:] != self.grid:
-            embedding = F.adaptive_avg_pool2d(embedding, self.grid)
-        features = embedding.flatten(1)
+        features = F.adaptive_avg_pool2d(embedding, self.grid).flatten(1)
         raw = torch.cat([self.head_rotation(features), self.head_translation(features)], dim=1)
-        motion = scale.motion(raw.to(next(self.parameters()).dtype))
-        return motion[:, :3], motion[:, 3:]
+        rotation, translation = scale.motion(raw.to(next(self.parameters()).dtype)).split(3, dim=1)
+        return rotation, translation
 
 
 def build_network(options: NetworkOptions | None = None) -> nn.Module:
-    """A :class:`PWVO` or :class:`VONet` with fresh weights (Glorot, from torch's global generator).
-
-    PWVO at full width by default; the attribute ``options`` keeps the options.
-    """
-    options = NetworkOptions() if options is None else options
-    network: Any = PWVO(options) if options.kind == "pwvo" else VONet(options)
-    return network
+    """A :class:`PWVO` or :class:`VONet` with fresh weights, from torch's global generator."""
+    options = options or NetworkOptions()
+    return PWVO(options) if options.kind == "pwvo" else VONet(options)

@@ -16,13 +16,13 @@ ego-flow equation (paper, equation 8), weighed by s, and teaches s the doubt tha
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
 
 from hybridvo.errors import InputError
-from hybridvo.network.inputs import NetworkInputs
+from hybridvo.network.inputs import NetworkInputs, pinhole
 from hybridvo.refinement.batch import Pixels
 from hybridvo.refinement.torch_factors import fit_pixels
 from hybridvo.results import PixelwisePrediction
@@ -46,14 +46,11 @@ MIN_SCALE = 1e-4
 NetworkOutput = PixelwisePrediction | tuple[torch.Tensor, torch.Tensor]
 
 
-@dataclass(frozen=True, eq=False)
-class PoseSeed:
+class PoseSeed(NamedTuple):
     """Where a refinement starts, and how much it heeds each pixel.
 
-    Args:
-        T_curr_prev: (B, 4, 4) the selected motion, metres.
-        weights: (B, H, W) in (0, 1], at the size of the images; carry the gradient of the log
-            scales of the rotation. None where the network predicts no uncertainty.
+    ``T_curr_prev`` (B, 4, 4), metres; ``weights`` (B, H, W) in (0, 1], at the size of the images:
+    they carry the gradient of the log scales of the rotation; None where there is no uncertainty.
     """
 
     T_curr_prev: torch.Tensor
@@ -64,7 +61,7 @@ def select(maps: PixelwisePrediction, method: str = "softmax") -> PoseSeed:
     """The paper's selection as the start of a refinement, with weights from the uncertainty.
 
     Raises:
-        InputError: no prediction, an unknown method.
+        InputError: an unknown method.
 
     Example:
         >>> import torch
@@ -106,15 +103,8 @@ def select_pose(
     Each of the six numbers has its own pixels and weights; those of ``joint`` share theirs.
     Differentiable in the predictions and, through the weights, in the log scales. Values that are
     not finite are never chosen while their patch has another; a pair without any gives zero motion.
-
-    Args:
-        output: maps of (B, 3, h, w), or the pose itself (VONet).
-        method: one of ``SELECTION_METHODS``; without uncertainty always ``mean``.
-        patch: side of the square patches in cells of the maps; a quarter of the height by default:
-            32 at 128x256 (the paper).
-
-    Raises:
-        InputError: an unknown method, or maps of other shapes.
+    Without uncertainty the method is always ``mean``. ``patch``: side of the square patches in
+    cells of the maps, a quarter of the height by default: 32 at 128x256 (the paper).
     """
     if isinstance(output, tuple):
         return output
@@ -122,7 +112,7 @@ def select_pose(
         raise InputError(
             f"select: method {method!r} unknown; known: {', '.join(SELECTION_METHODS)}."
         )
-    value, log_scale = _joined(output)
+    value, log_scale = joined(output)
     if log_scale is None or method == "mean":
         finite = torch.isfinite(value)
         total = torch.where(finite, value, 0.0).sum(dim=(2, 3))
@@ -134,20 +124,12 @@ def select_pose(
     return motion[:, :3], motion[:, 3:]
 
 
-def _joined(prediction: PixelwisePrediction) -> tuple[torch.Tensor, torch.Tensor | None]:
-    """(B, 6, h, w) values and log scales; refuses maps that do not belong to each other."""
-    shape = prediction.rotation.shape
-    for name, value in vars(prediction).items():
-        if isinstance(value, torch.Tensor) and (value.shape != shape or len(shape) != 4):
-            raise InputError(
-                f"select: expected {name} of shape (B, 3, h, w), like the rotation's "
-                f"{tuple(shape)}, got {tuple(value.shape)}."
-            )
-    motion = torch.cat([prediction.rotation, prediction.translation], dim=1)
-    s_rotation, s_translation = prediction.log_scale_rotation, prediction.log_scale_translation
-    if s_rotation is None or s_translation is None:
+def joined(maps: PixelwisePrediction) -> tuple[torch.Tensor, torch.Tensor | None]:
+    """(B, 6, h, w) values and, where the network predicts them, log scales."""
+    motion = torch.cat([maps.rotation, maps.translation], dim=1)
+    if maps.log_scale_rotation is None or maps.log_scale_translation is None:
         return motion, None
-    return motion, torch.cat([s_rotation, s_translation], dim=1)
+    return motion, torch.cat([maps.log_scale_rotation, maps.log_scale_translation], dim=1)
 
 
 def _vote(value: torch.Tensor, log_scale: torch.Tensor, method: str, patch: int) -> torch.Tensor:
@@ -159,22 +141,18 @@ def _vote(value: torch.Tensor, log_scale: torch.Tensor, method: str, patch: int)
     log_scale = torch.where(usable, log_scale, 0.0).clamp(-MAX_LOG_SCALE, MAX_LOG_SCALE)
     if method == "joint":
         log_scale = log_scale.mean(dim=1, keepdim=True).expand_as(log_scale)
-    # Padding that completes the last patches is infinitely uncertain and unusable: as every patch
-    # holds at least one real pixel, and real ones rank below infinity, padding never wins.
+    # Padding that completes the last patches is infinitely uncertain: as every patch holds at least
+    # one real pixel, and real ones rank below infinity, padding never wins.
     rank = torch.where(usable, log_scale, torch.finfo(log_scale.dtype).max).detach()
     winner = _patches(rank, patch, torch.inf).argmin(dim=-1, keepdim=True)
-    chosen, chosen_scale, known = (
+    chosen, s, known = (
         _patches(x, patch, 0.0).gather(-1, winner)[..., 0]
         for x in (value, log_scale, usable.to(value.dtype))
     )
-    if method == "argmin":
-        logits = torch.zeros_like(chosen_scale)
-    else:
-        logits = chosen_scale.exp() if method == "exp_plus_u" else -chosen_scale
-    # Where no patch is known the weights are uniform over zeros.
-    nothing = ~known.bool().any(dim=-1, keepdim=True)
-    logits = logits.masked_fill(~(known.bool() | nothing), -torch.inf)
-    return (torch.softmax(logits, dim=-1) * chosen).sum(dim=-1)
+    logits = {"argmin": 0 * s, "exp_plus_u": s.exp()}.get(method, -s)
+    # where no patch is known the weights are uniform over zeros
+    known = known.bool() | ~known.bool().any(dim=-1, keepdim=True)
+    return (torch.softmax(logits.masked_fill(~known, -torch.inf), dim=-1) * chosen).sum(dim=-1)
 
 
 def _patches(x: torch.Tensor, patch: int, fill: float) -> torch.Tensor:
@@ -196,16 +174,10 @@ def fitted_motion(
     """
     if not isinstance(output, PixelwisePrediction) or output.log_scale_rotation is None:
         raise InputError("fitted_motion: expected a prediction with uncertainty.")
-    log_scale = output.log_scale_rotation
-    inputs = on_grid_of(log_scale, inputs)
-    if tuple(log_scale.shape[2:]) != inputs.size:
-        log_scale = F.interpolate(log_scale, inputs.size, mode="nearest")
-    focal_prev, focal = (
-        K.diagonal(dim1=1, dim2=2)[:, :2, None, None] for K in (inputs.K_prev, inputs.K_curr)
-    )
-    centre_prev, centre = (K[:, :2, 2, None, None] for K in (inputs.K_prev, inputs.K_curr))
-    target = (inputs.rays * focal_prev + centre_prev + inputs.flow_px - centre) / focal
-    weights = pixel_weights(log_scale, inputs.valid)
+    inputs = on_grid_of(output.log_scale_rotation, inputs)
+    focal, centre = pinhole(inputs.K_curr)
+    target = (inputs.pixels + inputs.flow_px - centre) / focal
+    weights = pixel_weights(output.log_scale_rotation, inputs.valid)
     depth = 1 / torch.where(inputs.valid, inputs.inverse_depth[:, 0], 1.0)[:, None]
     points = torch.cat([inputs.rays * depth, depth], dim=1)
     with torch.autocast(points.device.type, enabled=False):
@@ -226,6 +198,5 @@ def on_grid_of(prediction: torch.Tensor, inputs: NetworkInputs) -> NetworkInputs
 
 def pixel_weights(log_scale: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
     """(B, h, w) weights of a fit from log scales (B, C, h, w): 0 where invalid, their sum one."""
-    s = _doubt(log_scale)
-    s = torch.where(valid, -SHARPNESS * s, torch.full_like(s, -1e4))
+    s = torch.where(valid, -SHARPNESS * _doubt(log_scale), -1e4)
     return torch.softmax(s.flatten(1), dim=1).view_as(s) * valid

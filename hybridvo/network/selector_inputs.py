@@ -1,8 +1,7 @@
 """What the selector network sees: an image, and what each candidate motion leaves unexplained.
 
-Residuals of flow and second depth against the candidate's own noise, how well the current image and
-its depth look where the candidate says that the pixels go (also where there is no flow), what its
-rivals explain; beside them the image's flow, depth and rays, each over the pair's own scale.
+Residuals of flow and second depth, how well the current image and its depth look where the
+candidate says that the pixels go, what its rivals explain; beside them flow, depth and rays.
 """
 
 from __future__ import annotations
@@ -19,14 +18,12 @@ from hybridvo.hypotheses.generate import GridMaps
 from hybridvo.hypotheses.search import REFERENCE_WIDTH
 from hybridvo.results import MotionPrior
 
-MIN_FLOW_NOISE = 0.01
-SUPPORT_CUTOFF_SQUARED = 9.0
-DEPTH_FLOOR = 0.003
-"""Spread of log depth that even exact depths have between neighbouring pixels."""
+MIN_FLOW_NOISE, SUPPORT_CUTOFF_SQUARED = 0.01, 9.0
+DEPTH_FLOOR, SAME_DEPTH = 0.003, 0.05
+"""Of log depth: spread that even exact depths have between neighbouring pixels, and difference up
+to which two readings may be of one surface."""
 USUAL_CHANGE = 0.01
 """rad of the image by which a motion usually differs from the one before."""
-SAME_DEPTH = 0.05
-"""Difference of log depth up to which two readings may be of one surface."""
 PATCH = 5
 """Side of the patches that are correlated, in pixels of the grid."""
 PLAIN = 9.0
@@ -251,27 +248,27 @@ def _scalars(
 def _small_step(pose: torch.Tensor, start: torch.Tensor) -> torch.Tensor:
     """(N, 6) delta with pose = Exp(delta) start, translation first, to first order."""
     R = pose[:, :, :3] @ start[:, :, :3].transpose(1, 2)
-    shift = pose[:, :, 3] - torch.einsum("nij,nj->ni", R, start[:, :, 3])
+    shift = pose[:, :, 3:] - R @ start[:, :, 3:]
     S = (R - R.transpose(1, 2)) / 2
-    return torch.cat([shift, torch.stack([S[:, 2, 1], S[:, 0, 2], S[:, 1, 0]], dim=1)], dim=1)
+    return torch.cat([shift[:, :, 0], torch.stack([S[:, 2, 1], S[:, 0, 2], S[:, 1, 0]], 1)], 1)
 
 
 def shared_channels(inputs: SelectorInputs) -> torch.Tensor:
     """(B, 11, h, w): flow, inverse depth, validity, rays, border, variances, static world."""
     usable = inputs.usable
-    K = inputs.K[:, :, None, None]
     # on the unit plane of the current camera: what is left is motion, whatever the lens
-    u = (inputs.target[:, 0] - K[:, 2]) / K[:, 0] - inputs.ray[:, 0]
-    v = (inputs.target[:, 1] - K[:, 3]) / K[:, 1] - inputs.ray[:, 1]
+    K = inputs.K[:, :, None, None]
+    u, v = ((inputs.target - K[:, 2:]) / K[:, :2] - inputs.ray).unbind(1)
     size = torch.sqrt(u * u + v * v)
     typical = _median(size, usable).clamp(min=1e-5)
     inverse = torch.where(usable, 1.0 / inputs.depth.clamp(min=1e-6), 0.0)
     near = inverse / _median(inverse, usable).clamp(min=1e-9)
-    sizes = usable.shape[1:]
-    steps = (torch.arange(n, device=u.device, dtype=u.dtype) for n in sizes)
-    rows, columns = (torch.minimum(x, n - 1 - x) for x, n in zip(steps, sizes, strict=True))
-    to_border = torch.minimum(rows[:, None], columns)
-    border = torch.exp(-to_border / (0.06 * min(sizes))).expand(usable.shape)
+    h, w = usable.shape[1:]
+    rows, columns = (torch.arange(n, device=u.device, dtype=u.dtype) for n in (h, w))
+    to_border = torch.minimum(
+        torch.minimum(rows, h - 1 - rows)[:, None], torch.minimum(columns, w - 1 - columns)
+    )
+    border = torch.exp(-to_border / (0.06 * min(h, w))).expand(usable.shape)
     asked = inputs.has_static[:, None, None].to(u.dtype).expand(usable.shape)
     seen = [
         _squash(u / typical),

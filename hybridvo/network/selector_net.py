@@ -1,8 +1,7 @@
 """The selector network: which of the motions found is the camera's, and where is the static world.
 
-A small convolutional network looks at what every candidate motion leaves unexplained
-(:mod:`hybridvo.network.selector_inputs`) and answers with a score and a mask: the probability of
-each pixel to be static. Choosing among few exact motions is easier than segmenting raw flow.
+It looks at what every candidate motion leaves unexplained: choosing among few exact motions is
+easier than segmenting raw flow.
 """
 
 from __future__ import annotations
@@ -29,14 +28,9 @@ from hybridvo.network.selector_inputs import (
 from hybridvo.options import option_group
 from hybridvo.results import MotionPrior
 
-CHANNELS = (24, 40, 64, 96)
-CANDIDATE_CHANNELS = 14
-SHARED_CHANNELS = 11
-SCALARS = 13
-HIDDEN = 96
-PIXEL_CHANNELS = 8
-MIRRORED_CANDIDATE = (0,)
-MIRRORED_SHARED = (0, 4)
+CHANNELS, HIDDEN, PIXEL_CHANNELS = (24, 40, 64, 96), 96, 8
+CANDIDATE_CHANNELS, SHARED_CHANNELS, SCALARS = 14, 11, 13
+MIRRORED_CANDIDATE, MIRRORED_SHARED = (0,), (0, 4)
 """Channels that change their sign in a mirror."""
 MAX_LAG = 3.0
 """How far a score may stay behind the best for a mask: at a twentieth of its probability."""
@@ -54,13 +48,10 @@ class SelectorNetworkOptions:
 class SelectorOutput:
     """Answers about N candidates.
 
-    Args:
-        score: (N,) larger is more likely the world; softmax over an image's candidates.
-        hidden: (N, D) what :meth:`SelectorNetwork.confidence` looks at.
-        evidence: (N, 2, h, w) for each candidate, from the flow and from the images.
-        common: (B, C, h', w') the first layer's view of what the candidates of an image share.
-        levels: input channels and features of :meth:`SelectorNetwork.encode`, finest first.
-        mask: (N, h, w) logit of the probability that a pixel is static world, if it was drawn.
+    ``score`` (N,): larger is more likely the world, softmax over an image's candidates; ``hidden``
+    (N, D): what the confidence looks at; ``evidence`` (N, 2, h, w) from flow and images; ``common``
+    (B, C, h', w'): the first layer's view of what they share; ``levels``: channels and features,
+    finest first; ``mask`` (N, h, w): logit of each pixel to be static world, if drawn.
     """
 
     score: torch.Tensor
@@ -138,19 +129,16 @@ class SelectorNetwork(nn.Module):
         mirror: torch.Tensor | None = None,
     ) -> SelectorOutput:
         """Answers without masks; arguments as those of :meth:`forward`."""
+        own = inputs.owner
         rivals = None if first is None else (first[0], first[1].evidence)
         channels, scalars, evidence = candidate_channels(inputs, rivals)
-        if mirror is not None:
-            channels = _mirrored(channels, mirror[inputs.owner], MIRRORED_CANDIDATE)
-        channels = _padded(channels)
+        mirrored = None if mirror is None else mirror[own]
+        channels = _framed(channels, mirrored, MIRRORED_CANDIDATE)
         if first is None:
-            shared = shared_channels(inputs)
-            if mirror is not None:
-                shared = _mirrored(shared, mirror, MIRRORED_SHARED)
-            common = self.shared(_padded(shared))
+            common = self.shared(_framed(shared_channels(inputs), mirror, MIRRORED_SHARED))
         else:
             common = first[1].common
-        x1 = F.relu_(self.candidate(channels) + common[inputs.owner])
+        x1 = F.relu_(self.candidate(channels) + common[own])
         x2 = self.block2(F.relu_(self.down2(x1)))
         x3 = self.block3(F.relu_(self.down3(x2)))
         x4 = self.down4(x3) + self.scalars(scalars)[:, :, None, None]
@@ -184,17 +172,17 @@ class SelectorNetwork(nn.Module):
         return self.trust(F.relu(self.doubt(torch.stack(out))))[:, 0]
 
 
-def _padded(x: torch.Tensor) -> torch.Tensor:
-    """Zeros below and on the right, up to a multiple of what the network divides by."""
+def _framed(x: torch.Tensor, mirror: torch.Tensor | None, signed: tuple[int, ...]) -> torch.Tensor:
+    """Maps (N, C, h, w), those of ``mirror`` (N,) in a mirror, with zeros up to a multiple of 16.
+
+    ``signed``: channels that change their sign there.
+    """
+    if mirror is not None:
+        turned = x.flip(3)
+        turned[:, list(signed)] *= -1
+        x = torch.where(mirror[:, None, None, None], turned, x)
     x = F.pad(x, (0, -x.shape[3] % 16, 0, -x.shape[2] % 16))
     return x.contiguous(memory_format=torch.channels_last)
-
-
-def _mirrored(x: torch.Tensor, mirror: torch.Tensor, signed: tuple[int, ...]) -> torch.Tensor:
-    """Images (N, C, h, w) with those of ``mirror`` (N,) seen in a mirror."""
-    turned = x.flip(3)
-    turned[:, list(signed)] *= -1
-    return torch.where(mirror[:, None, None, None], turned, x)
 
 
 class NetworkScorer:

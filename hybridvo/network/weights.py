@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -20,67 +20,45 @@ from hybridvo.files import atomic_write
 FORMAT = "hybridvo-network-1"
 """Value of the header's ``format`` key."""
 PRETRAINED = Path(__file__).parent / "pretrained"
-DTYPES = {"float16": torch.float16, "float32": torch.float32}
-
-
-class Weights(NamedTuple):
-    """Content of a weights file: the network's options, its model card, float32 tensors by name."""
-
-    path: Path
-    options: dict[str, Any]
-    card: dict[str, Any]
-    tensors: dict[str, torch.Tensor]
-
-    def build(self, kind: Callable[..., Any], network_of: Callable[[Any], nn.Module]) -> nn.Module:
-        """The network of the file in evaluation mode, by the class of its options and its maker."""
-        try:
-            network = network_of(kind(**self.options))
-            network.load_state_dict(self.tensors)
-        except (InputError, TypeError, RuntimeError) as error:
-            raise CheckpointError(
-                f"{self.path}: the weights do not fit their own options {self.options}: "
-                + str(error).replace("\n\t", " ")[:600]
-            ) from None
-        return network.eval()
 
 
 def save_weights(
-    path: str | Path, network: nn.Module, card: Mapping[str, Any], dtype: str = "float32"
+    path: str | Path,
+    network: nn.Module,
+    card: Mapping[str, Any],
+    dtype: Literal["float32", "float16"] = "float32",
 ) -> Path:
     """Write a network's weights, its ``options`` and a model card of JSON values.
 
     Raises:
-        InputError: weights that are not finite or not representable in ``dtype`` (float32 or
-            float16), a card that is not JSON.
+        InputError: weights that are not finite or not representable in ``dtype``.
         OutputError: the file cannot be written.
     """
-    if dtype not in DTYPES:
-        raise InputError(f"save_weights: dtype {dtype!r} unknown; known: {', '.join(DTYPES)}.")
-    try:
-        text = json.dumps(dict(card), sort_keys=True, allow_nan=False)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"save_weights: the card must hold JSON values only: {error}.") from None
-    options = json.dumps(asdict(network.options), sort_keys=True)  # type: ignore[call-overload]
+    header = {"options": asdict(network.options), "card": dict(card)}  # type: ignore[call-overload]
+    texts = {name: json.dumps(x, sort_keys=True, allow_nan=False) for name, x in header.items()}
     tensors = {
-        name: value.detach().cpu().contiguous().to(DTYPES[dtype])
+        name: value.detach().cpu().contiguous().to(getattr(torch, dtype))
         for name, value in network.state_dict().items()
     }
-    _check_finite(f"save_weights ({dtype})", tensors, InputError)
+    if broken := _broken(tensors):
+        raise InputError(f"save_weights ({dtype}): {broken}.")
     with atomic_write(path, "wb") as file:
-        file.write(save(tensors, {"format": FORMAT, "options": options, "card": text}))
+        file.write(save(tensors, {"format": FORMAT, **texts}))
     return Path(path)
 
 
-def read_weights(path: str | Path) -> Weights:
-    """Content of a file of :func:`save_weights`, on the CPU.
+def read_network(
+    name_or_path: str | Path, make: Callable[[dict[str, Any]], nn.Module]
+) -> tuple[nn.Module, dict[str, Any]]:
+    """Network of a file of :func:`save_weights`, and its card; ``make`` builds it from options.
+
+    In evaluation mode and float32, on the CPU.
 
     Raises:
-        CheckpointError: missing, truncated, of another program, or with values that are not finite.
+        CheckpointError: missing, truncated, of another program or architecture, or with values that
+            are not finite.
     """
-    path = Path(path)
-    if not os.path.isfile(path):  # where Path.is_file() raises: a name that is too long
-        known = ", ".join(pretrained_names())
-        raise CheckpointError(f"{path}: no such weights file. Pretrained weights: {known}.")
+    path = weights_file(name_or_path)
     try:
         # older safetensors makes its tensors on torch's default device
         with torch.device("cpu"), safe_open(path, framework="pt") as file:
@@ -95,8 +73,23 @@ def read_weights(path: str | Path) -> Weights:
             f"and card in its header: {str(error)[:200]}. Pickled checkpoints (.pt, .pth) are "
             f"refused on purpose."
         ) from None
-    _check_finite(str(path), tensors, CheckpointError)
-    return Weights(path, options, card, tensors)
+    if broken := _broken(tensors):
+        raise CheckpointError(f"{path}: {broken}.")
+    try:
+        network = make(options)
+        network.load_state_dict(tensors)
+    except (InputError, TypeError, RuntimeError) as error:
+        what = str(error).replace("\n\t", " ")[:600]
+        raise CheckpointError(
+            f"{path}: the weights do not fit their own options {options}: {what}"
+        ) from None
+    return network.eval(), card
+
+
+def _broken(tensors: Mapping[str, torch.Tensor]) -> str:
+    """Says which tensors hold values that are not finite; empty where none does."""
+    names = [name for name, value in tensors.items() if not torch.isfinite(value).all()]
+    return f"values that are not finite in {', '.join(names[:6])}" if names else ""
 
 
 def pretrained_names() -> tuple[str, ...]:
@@ -104,27 +97,10 @@ def pretrained_names() -> tuple[str, ...]:
     return tuple(sorted(p.stem for p in PRETRAINED.glob("*.safetensors")))
 
 
-def pretrained(name: str | Path) -> Path:
-    """File of pretrained weights.
-
-    Raises:
-        CheckpointError: not one of :func:`pretrained_names`; the message lists them.
-    """
-    if name not in pretrained_names():
-        known = ", ".join(pretrained_names())
-        raise CheckpointError(f"weights {str(name)!r} unknown. Pretrained weights: {known}.")
-    return PRETRAINED / f"{name}.safetensors"
-
-
 def weights_file(name_or_path: str | Path) -> Path:
-    """A pretrained name's file, else the path itself."""
-    name = str(name_or_path)
-    return pretrained(name) if name in pretrained_names() else Path(name_or_path)
-
-
-def _check_finite(
-    where: str, tensors: Mapping[str, torch.Tensor], error: type[InputError | CheckpointError]
-) -> None:
-    broken = [name for name, value in tensors.items() if not torch.isfinite(value).all()]
-    if broken:
-        raise error(f"{where}: values that are not finite in {', '.join(broken[:6])}.")
+    """The file of a pretrained name, else the path itself; a CheckpointError where it is none."""
+    known = pretrained_names()
+    path = PRETRAINED / f"{name_or_path}.safetensors" if name_or_path in known else name_or_path
+    if not os.path.isfile(path):  # where Path.is_file() raises: a name that is too long
+        raise CheckpointError(f"{path}: no such weights. Pretrained: {', '.join(known)}.")
+    return Path(path)

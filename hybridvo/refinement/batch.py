@@ -13,6 +13,7 @@ from hybridvo.errors import InputError
 from hybridvo.refinement import kernels
 from hybridvo.refinement.covariance import direction_is_known
 from hybridvo.refinement.depth import SURFACE
+from hybridvo.refinement.pixels import typical
 from hybridvo.results import RelativePose, Status
 from hybridvo.torch_geometry import MAX_DEPTH, MIN_DEPTH, pixel_grid, pp, rays, se3
 from hybridvo.types import PairBatch
@@ -20,16 +21,15 @@ from hybridvo.types import PairBatch
 
 @dataclass(frozen=True, eq=False)
 class BatchedPose:
-    """Camera motions of a batch of pairs.
+    """Camera motions of a batch of pairs, as in :class:`hybridvo.results.RelativePose`.
 
     Args:
         SE3: (B, 7) pypose SE3, ``T_curr_prev``; the identity where failed. Carries the gradient.
-        covariance: (B, 6, 6) of the left perturbation (translation, rotation); no gradient.
+        covariance: (B, 6, 6) of the left perturbation (translation, rotation).
         converged, failed: (B,) bool. status: one per sample, with its reason.
         probability: (B,) of the motion being the camera's, by the weight of the motion that
             contradicts it most; 0 where failed.
-        iterations: (B,) Newton steps on all pixels.
-        cost: (B,) robust cost per unit of external weight.
+        iterations: (B,) Newton steps on all pixels. cost: (B,) robust, per unit of weight.
         weights: (B, H, W) robust weights without the external ones, 0 where unusable.
         noise: (B, 2) flow noise in px and noise of log depth, estimated or as given; (B, 3) with
             that of the current frame's log depth.
@@ -117,9 +117,8 @@ class Pixels:
         total = order[:, -1:]
         count = min(count, order.shape[1])
         k = torch.arange(count, device=order.device, dtype=torch.float64)[None]
-        spread = ((k + (k * 0.6180339887498949).frac()) * total / count).long()
-        place = torch.where(total > count, spread, k.long().expand_as(spread))
-        index = torch.searchsorted(order, place + 1).clamp(max=order.shape[1] - 1)
+        spread = ((k + (k * 0.6180339887498949).frac()) * (total / count).clamp(min=1)).long()
+        index = torch.searchsorted(order, spread + 1).clamp(max=order.shape[1] - 1)
 
         def take(x: torch.Tensor) -> torch.Tensor:
             if x is self.K:
@@ -128,7 +127,7 @@ class Pixels:
             return x.gather(x.ndim - 1, at)
 
         taken = self.map(take)
-        return replace(taken, weight=taken.weight * (place < total))
+        return replace(taken, weight=taken.weight * (spread < total))
 
 
 def gather_pixels(
@@ -140,16 +139,19 @@ def gather_pixels(
     """The pixels of a batch in raster order, or tile by tile where a tile's side is given.
 
     ``with_depth`` joins the current frame's depth. Invalid values are replaced before anything is
-    computed from them, so that neither they nor their gradients spread. Variances are divided by
-    the typical one of their sample, which is held constant.
+    computed from them, so that neither they nor their gradients spread.
     """
-    flow, depth = batch.flow, batch.depth_prev
+    depth = batch.depth_prev
     height, width = depth.shape[1:]
-    K_prev, good_prev = _usable_camera(batch.K_prev)
-    K_curr, good_curr = _usable_camera(batch.K_curr)
-    target = pixel_grid(height, width, depth) + flow
-    usable = (depth > MIN_DEPTH) & (depth < MAX_DEPTH) & (good_prev & good_curr)[:, None, None]
-    usable = usable & (target.abs() < MAX_DEPTH).all(dim=3)
+    target = pixel_grid(height, width, depth) + batch.flow
+    usable = (depth > MIN_DEPTH) & (depth < MAX_DEPTH) & (target.abs() < MAX_DEPTH).all(dim=3)
+    cameras, unit = [], torch.eye(3, dtype=depth.dtype, device=depth.device)
+    for K in (batch.K_prev, batch.K_curr):
+        good = (torch.isfinite(K).flatten(1).all(dim=1) & (K[:, 0, 0] > 0) & (K[:, 1, 1] > 0))[
+            :, None, None
+        ]
+        usable = usable & good
+        cameras.append(torch.where(good, K, unit))
     one, zero = torch.ones_like(depth), torch.zeros_like(depth)
     flow_variance = depth_variance = weight = one
     if batch.flow_variance is not None:
@@ -164,7 +166,7 @@ def gather_pixels(
         usable = usable & batch.valid
     depth = torch.where(usable, depth, one)
     target = torch.where(usable[..., None], target, torch.zeros_like(target))
-    points = (rays(height, width, K_prev) * depth[..., None]).permute(0, 3, 1, 2)
+    points = (rays(height, width, cameras[0]) * depth[..., None]).permute(0, 3, 1, 2)
     maps = {"points": points, "target": target.permute(0, 3, 1, 2)}
     maps |= {"flow_variance": flow_variance, "depth_variance": depth_variance}
     maps["weight"] = torch.where(usable, weight, zero)
@@ -173,7 +175,7 @@ def gather_pixels(
         maps |= {"log_depth_curr": sampled.log(), "has_depth_curr": (good & usable).to(depth.dtype)}
     fill = {"points": 1.0, "flow_variance": 1.0, "depth_variance": 1.0}
     tiles = {name: to_tiles(x, tile, fill.get(name, 0.0)) for name, x in maps.items()}
-    return Pixels(**tiles, K=K_curr)
+    return Pixels(**tiles, K=cameras[1])
 
 
 def sample_depth(depth: torch.Tensor, at: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -219,23 +221,9 @@ def from_tiles(x: torch.Tensor, tile: int, height: int, width: int) -> torch.Ten
 
 def _relative(variance: torch.Tensor, good: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """A variance in units of the typical one of its sample, 1 where not good; what is good."""
-    good, typical = good & (variance < MAX_DEPTH), _typical(variance)
-    return torch.where(good, variance, typical) / typical, good
-
-
-def _typical(variance: torch.Tensor) -> torch.Tensor:
-    """(B, 1, 1) 20 % quantile of the positive finite values on a sparse grid; 1 if none."""
-    sparse = variance.detach()[:, ::7, ::7].flatten(1)
-    good = (sparse > 0) & (sparse < MAX_DEPTH)
-    values = torch.where(good, sparse, torch.full_like(sparse, torch.nan))
-    return torch.nan_to_num(torch.nanquantile(values, 0.2, dim=1), nan=1.0)[:, None, None]
-
-
-def _usable_camera(K: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """K with unusable samples replaced by the unit matrix, and which are usable (B,)."""
-    good = torch.isfinite(K).flatten(1).all(dim=1) & (K[:, 0, 0] > 0) & (K[:, 1, 1] > 0)
-    unit = torch.eye(3, dtype=K.dtype, device=K.device).expand_as(K)
-    return torch.where(good[:, None, None], K, unit), good
+    scales = [typical(one) for one in variance.detach().cpu().numpy()]
+    scale, good = variance.new_tensor(scales)[:, None, None], good & (variance < MAX_DEPTH)
+    return torch.where(good, variance, scale) / scale, good
 
 
 def checked_batch(
@@ -259,21 +247,19 @@ def checked_batch(
     if weights is not None:
         weights = torch.as_tensor(weights, device=flow.device)
         weights = weights[None] if weights.ndim == 2 and len(flow) == 1 else weights
-    shapes = {"flow": tuple(flow.shape), "K_prev": (len(flow), 3, 3), "K_curr": (len(flow), 3, 3)}
-    values = {**vars(batch), "weights": weights}
+    values = {k: v for k, v in {**vars(batch), "weights": weights}.items() if v is not None}
     for name, value in values.items():
-        if value is None and name not in shapes:
-            continue
-        shape = shapes.get(name, tuple(flow.shape[:3]))
-        got = tuple(value.shape) if isinstance(value, torch.Tensor) else type(value).__name__
-        if got != shape:
-            raise InputError(f"{where}: expected {name} of shape {shape}, got {got}.")
-        if value.device != flow.device:
-            raise InputError(f"{where}: {name} is on {value.device}, the flow on {flow.device}.")
+        shape = (len(flow), 3, 3) if name.startswith("K_") else tuple(flow.shape[:3])
+        shape = tuple(flow.shape) if name == "flow" else shape
+        if tuple(value.shape) != shape or value.device != flow.device:
+            raise InputError(
+                f"{where}: expected {name} of shape {shape} on {flow.device}, "
+                f"got {tuple(value.shape)} on {value.device}."
+            )
         if name == "valid" and value.dtype != torch.bool:
             raise InputError(f"{where}: expected PairBatch.valid as bool, got {value.dtype}.")
         values[name] = value if name == "valid" else value.to(dtype)
-    weights = values.pop("weights")
+    weights = values.pop("weights", None)
     return PairBatch(**values), weights
 
 
@@ -287,15 +273,13 @@ def initial_poses(T_init: Any, like: torch.Tensor, alone: bool) -> pp.LieTensor:
     if isinstance(T_init, pp.LieTensor):
         T_init = T_init.matrix()
     T = torch.as_tensor(T_init, device=like.device).detach().double()
-    if T.shape == (4, 4) and batch == 1:
-        T = T[None]
-    if T.ndim == 3:
-        T = T[:, None]
+    if T.ndim == 3 or (T.ndim == 2 and batch == 1):
+        T = T.reshape(-1, 1, *T.shape[-2:])
     if T.ndim != 4 or T.shape[0] != batch or T.shape[2:] != (4, 4):
         raise InputError(
             f"refine_batch: expected T_init of shape ({batch}, 4, 4) or ({batch}, S, 4, 4), "
             f"got {tuple(T.shape)}."
         )
-    good = torch.isfinite(T).flatten(2).all(dim=2) & (T.abs().flatten(2).amax(dim=2) < 1e9)
+    good = (T.abs() < 1e9).flatten(2).all(dim=2)
     T = torch.where(good[:, :, None, None], T, unit)
     return se3(T if alone else torch.cat([identity, T], dim=1))

@@ -34,10 +34,8 @@ DEPTH_NOISE_CAP = 0.08
 """Largest noise (px, log depth) that a motion may claim in the search; beyond it the fit would be a
 compromise between motions. The final fit may claim 2.5 times what the search found."""
 DAMPING = 1e-6
-NOISE_PIXELS = 1000
-"""Pixels that the noise estimate of the search looks at: flow noise to 2 %."""
-FINAL_NOISE_PIXELS = 4000
-"""The same of the last fit of a motion."""
+NOISE_PIXELS, FINAL_NOISE_PIXELS = 1000, 4000
+"""Pixels that the noise estimate looks at in the search (flow noise to 2 %) and in the last fit."""
 FLOW_NOISE_FLOOR = 2e-3
 """Smallest flow noise assumed, px: float32 coordinates of an 8k image are good to 5e-4 px."""
 USUAL_DEPTH_NOISE = 0.01
@@ -108,13 +106,10 @@ def set_noise(flow_sigma, depth_sigma, cutoff, out):
 def gauss_newton(samples, n, total, K, noise, steps, tolerance_px, pose, work):
     """Damped Gauss-Newton in place; a step is taken only where the robust cost does not rise.
 
-    ``total`` is the sum of the external weights. Stops when the step moves the image by less
-    than ``tolerance_px``. Returns (iterations, cost, converged).
+    ``total``: sum of the external weights. Stops when the step moves the image by less than
+    ``tolerance_px``. Returns the number of steps.
     """
-    acc = np.zeros(SUMS)
-    other = np.zeros(SUMS)
-    delta = np.zeros(6)
-    candidate = np.empty((3, 4))
+    acc, other, delta, candidate = np.zeros(SUMS), np.zeros(SUMS), np.zeros(6), np.empty((3, 4))
     full = 0.5 * np.float64(noise[2])
     cost = sum_samples(samples, n, pose, K, noise, work, acc)
     cost += full * max(0.0, total - acc[29])  # pixels behind the camera
@@ -124,7 +119,7 @@ def gauss_newton(samples, n, total, K, noise, steps, tolerance_px, pose, work):
         if not solve6(acc, damping, delta):
             damping = max(damping * 100.0, 1e-3)
             if damping > 1e3:
-                return done, cost, False
+                return done
             continue
         left_update(delta, pose, candidate)
         new_cost = sum_samples(samples, n, candidate, K, noise, work, other)
@@ -141,12 +136,12 @@ def gauss_newton(samples, n, total, K, noise, steps, tolerance_px, pose, work):
             cost = new_cost
             damping = max(damping * 0.1, DAMPING)
             if moved < tolerance_px * tolerance_px:
-                return done, cost, True
+                return done
         else:
             damping = max(damping * 10.0, 1e-3)
             if damping > 1e3:
-                return done, cost, True  # no descent left at the precision of the sums
-    return done, cost, False
+                return done  # no descent left at the precision of the sums
+    return done
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
@@ -178,8 +173,7 @@ def anneal(samples, n, K, start_px, end_px, ratio, steps, pose, work):
     iterations = 0
     while True:
         set_noise(scale, 0.0, 1.0, noise)
-        done, _, _ = gauss_newton(samples, n, total, K, noise, steps, 0.1 * scale, pose, work)
-        iterations += done
+        iterations += gauss_newton(samples, n, total, K, noise, steps, 0.1 * scale, pose, work)
         if scale <= end_px:
             return iterations
         scale = max(end_px, scale * ratio)
@@ -187,17 +181,16 @@ def anneal(samples, n, K, start_px, end_px, ratio, steps, pose, work):
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
 def gather_noise(samples, n, step, pose, K, radius, terms):
-    """What the noise estimate needs of every ``step``-th pixel, as rows of ``terms`` (6, N).
-
-    Squared residual along q and across it, variance of the flow and of the depth (through q) in
-    units of sf^2 and sd^2, external weight (0 farther away than ``radius``), density of outliers.
-    Returns (number of pixels, their external weight, that of the pixels within the radius).
+    """Fill ``terms`` (6, N) of every ``step``-th pixel: squared residual along q and across it,
+    variance of flow and depth in units of sf^2 and sd^2, external weight (0 beyond the ``radius``),
+    density of outliers. Returns (pixels, their external weight, that within the radius).
     """
     keep_apart()  # type: ignore[call-arg]
     entries = pose_entries(pose.astype(np.float32))
     b_f, b_d, b_w = samples[PF], samples[PD], samples[W]
-    along, across, alpha = terms[0], terms[1], terms[2]
-    beta, weight, outlier = terms[3], terms[4], terms[5]
+    along, across, alpha, beta, weight, outlier = (
+        terms[0], terms[1], terms[2], terms[3], terms[4], terms[5]
+    )  # fmt: skip
     m = (n + step - 1) // step
     disc = np.float32(1.0 / math.pi) / (radius * radius)
     total = inside = ZERO
@@ -228,12 +221,13 @@ def gather_noise(samples, n, step, pose, K, radius, terms):
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
 def sum_noise(terms, m, vf, vd, share, sums):
-    """One round of expectation-maximisation: set ``sums`` to the weight of the followers, the three
-    entries of the information of (sf^2, sd^2) and the two of its right-hand side.
+    """One round of expectation-maximisation: ``sums`` = weight of the followers, information of
+    (sf^2, sd^2) (three entries), its right-hand side (two).
     """
     keep_apart()  # type: ignore[call-arg]
-    along, across, alpha = terms[0], terms[1], terms[2]
-    beta, weight, outlier = terms[3], terms[4], terms[5]
+    along, across, alpha, beta, weight, outlier = (
+        terms[0], terms[1], terms[2], terms[3], terms[4], terms[5]
+    )  # fmt: skip
     density = share * np.float32(0.5 / math.pi)
     rest = ONE - share
     hits = a11 = a12 = a22 = b1 = b2 = ZERO
@@ -278,10 +272,9 @@ def estimate_noise(samples, n, pose, K, sf, sd, sf_cap, sd_cap, rounds, limit):
     """Flow noise (px) and depth noise (of log Z) of the pixels that follow ``pose``.
 
     Expectation-maximisation of a mixture of N(0, sf^2 v_f I + sd^2 v_d q q^T) and a uniform density
-    over a disc; the two variances by Fisher scoring of the components along and across q. Only the
-    shape of the residuals is used, never a given noise level. ``limit`` bounds the number of pixels
-    looked at, ``sf_cap`` and ``sd_cap`` the noise. Returns (sf, sd, share of the weight that
-    follows the pose, whether the flow tells the depth's noise).
+    over a disc; the two variances by Fisher scoring of the components along and across q. Looks at
+    ``limit`` pixels. Returns (sf, sd, share of the weight that follows the pose, whether the flow
+    tells the depth's noise).
     """
     step = max(1, n // limit)
     terms = np.empty((6, ((n // step + 16) // 16 | 1) * 16), np.float32)
@@ -289,10 +282,7 @@ def estimate_noise(samples, n, pose, K, sf, sd, sf_cap, sd_cap, rounds, limit):
     m, total, inside = gather_noise(samples, n, step, pose, K, radius, terms)
     if m < 8 or not inside > 0:
         return sf, sd, 0.0, True
-    vf = sf * sf
-    vd = sd * sd
-    share = 0.7
-    spread = 0.0
+    vf, vd, share, spread = sf * sf, sd * sd, 0.7, 0.0
     sums = np.empty(6)
     for _ in range(rounds):
         sum_noise(terms, m, np.float32(vf), np.float32(vd), np.float32(share), sums)
@@ -326,10 +316,7 @@ def estimate_noise(samples, n, pose, K, sf, sd, sf_cap, sd_cap, rounds, limit):
 
 @njit(error_model="numpy", cache=True, nogil=True)
 def reestimate(samples, n, K, sf, sd, sf_cap, sd_cap, cutoff, rounds, steps, limit, pose, work):
-    """Alternate noise estimate and Gauss-Newton with the full covariance, in place.
-
-    Returns (sf, sd, share, iterations).
-    """
+    """Noise and Gauss-Newton in turn, in place; returns (sf, sd, share, iterations)."""
     noise = np.empty(3, np.float32)
     total = np.float64(np.sum(samples[W, :n]))
     iterations = 0
@@ -337,8 +324,7 @@ def reestimate(samples, n, K, sf, sd, sf_cap, sd_cap, cutoff, rounds, steps, lim
     for _ in range(rounds):
         sf, sd, share, _ = estimate_noise(samples, n, pose, K, sf, sd, sf_cap, sd_cap, 5, limit)
         set_noise(sf, sd, cutoff, noise)
-        done, _, _ = gauss_newton(samples, n, total, K, noise, steps, 1e-3 * sf + 1e-5, pose, work)
-        iterations += done
+        iterations += gauss_newton(samples, n, total, K, noise, steps, 1e-3 * sf + 1e-5, pose, work)
     return sf, sd, share, iterations
 
 

@@ -1,13 +1,9 @@
 """Covariance of a robust M-estimate, honest about errors that neighbouring pixels share.
 
-Errors of flow and depth are correlated over tens of pixels, and over whole objects where a flow was
-smoothed. The sandwich of Huber (1967) takes this in through its meat: the scores are summed over
-blocks of the image before their outer products are taken (cluster-robust: Liang and Zeger, 1986),
-and the blocks overlap, which is Bartlett's kernel of the heteroskedasticity- and autocorrelation-
-consistent estimate in two dimensions (Newey and West, 1987; Conley, 1999). How the variance grows
-from one size of block to the next tells whether the errors end within the blocks; where they do
-not, the growth is continued to the size of the image (aggregated variance of processes with long-
-range dependence: Beran, Statistics for Long-Memory Processes, 1994).
+The sandwich of Huber (1967), its scores summed over blocks of the image before their outer products
+are taken (cluster-robust: Liang and Zeger, 1986); the blocks overlap, which is Bartlett's kernel in
+two dimensions (Newey and West, 1987; Conley, 1999). Where the variance still grows from one size of
+block to the next, the growth is continued to the size of the image (Beran, 1994).
 """
 
 from __future__ import annotations
@@ -23,16 +19,12 @@ from hybridvo.refinement.solver import positive_inverse
 
 NOTHING = np.diag([1e4] * 3 + [10.0] * 3)
 """Covariance that carries no information (m^2, rad^2)."""
-
 SMALLEST_REST = 0.25
 """Least share of the scores' variance that the fit is assumed to leave in the blocks."""
-
 FLOW_ROUNDING = 2e-5
 """Pixels: single precision at a coordinate of 300."""
-
 SIZES = ((1, 1), (2, 1), (4, 2))
 """Width of the blocks and distance between them, in tiles."""
-
 UPPER = np.triu_indices(6)
 """Rows and columns of the 21 upper-triangle values of a symmetric matrix."""
 ORDER = np.zeros((6, 6), np.intp)
@@ -79,10 +71,9 @@ def score_sums(
 def block_sums(tiles: np.ndarray, inverse: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
     """Outer products of the scores summed over blocks of tiles, and what the fit took from them.
 
-    Blocks reach over the border, so that every tile lies in as many of them; (width / step)^2 of
-    them cover a tile, and each counts for that share. Under independent errors of the model's size
-    a block with information H_b has scores of covariance H_b - H_b H^-1 H_b about the estimate: the
-    second term in units of the first, averaged over the directions, is what the fit took.
+    Blocks reach over the border; (width / step)^2 of them cover a tile, and each counts for that
+    share. Under independent errors a block with information H_b has scores of covariance H_b - H_b
+    H^-1 H_b about the estimate: the second term, in units of the first, is what the fit took.
 
     Returns:
         (S, 6, 6), (S,), number of tiles with a score.
@@ -152,11 +143,9 @@ def sandwich_covariance(
     """Covariance of the left perturbation, eigenvalues of the information, number of tiles with
     usable pixels; 0 where the information is not definite.
 
-    Bread: the derivative of the estimating equation (Gauss-Newton Hessian less the curvature of the
-    robust weights). Meat: :data:`CLUSTERED` from overlapping blocks two tiles wide, the rest from
-    independent errors, scaled by how much the blocks exceed them on the average; both corrected for
-    what the fit itself takes out of the residuals, and continued to the size of the image where
-    the errors reach beyond the blocks.
+    Bread: Gauss-Newton Hessian less the curvature of the robust weights. Meat: :data:`CLUSTERED`
+    from overlapping blocks two tiles wide, the rest from independent errors, scaled by how much the
+    blocks exceed them; corrected for what the fit takes out of the residuals.
 
     Args:
         tiles: (rows, columns, 27) upper triangle of the Gauss-Newton Hessian and scores, summed

@@ -2,13 +2,9 @@
 
 The residual is rz = log D_curr(x + F) - log Z'. Given the flow residual r it is Gaussian with mean
 k^T r, k = h sd^2 Sigma^-1 q, where h = dlogZ'/dlogZ = 1 - tz/Z' and Sigma, q are those of
-:mod:`hybridvo.refinement.kernels`: both residuals share the error of the previous depth. So the
-full 3x3 covariance enters as one more scalar residual, rz - k^T r, with the Jacobian row
-Jz - k^T J, Jz = (0, 0, i, b, -a, 0), that adds to the same normal equations. Its variance is
-estimated.
-
-Depth that is noise, or of another scale in the current frame, does not show in the flow's residual.
-It shows where the motion takes each point to a pixel whose depth is known as well.
+:mod:`hybridvo.refinement.kernels`: both residuals share the error of the previous depth. So one
+more scalar residual, rz - k^T r, with the Jacobian row Jz - k^T J, Jz = (0, 0, i, b, -a, 0), adds
+to the same normal equations. Its variance is estimated.
 """
 
 from __future__ import annotations
@@ -120,9 +116,8 @@ def sum_depth(
 ):
     """Add the third residual's normal equations to the tiles' ``sums`` (tiles, 27).
 
-    ``sz``: standard deviation of the conditional residual. The tile follows from the place of pixel
-    k on the grid of ``width`` pixels, ``step`` apart, with ``columns`` tiles in a row; ``meat``
-    (21,) gets the sum of w^2 s s^T. Returns the cost.
+    ``sz``: standard deviation of the conditional residual. The grid has ``width`` pixels, ``step``
+    apart, ``columns`` tiles in a row; ``meat`` (21,) gets the sum of w^2 s s^T. Returns the cost.
     """
     c2, v = np.float64(noise[2]), sz * sz
     dummy, row, entries = np.zeros(SUMS), np.empty(6), pose_entries(pose)
@@ -154,19 +149,13 @@ def sum_depth(
 class DepthFactor:
     """The current frame's depth (H, W), given the flow, at every ``stride``-th pixel of a pair.
 
-    ``sigma`` is the standard deviation of the conditional residual, ``noise`` (3,) that of flow and
-    depth as in the kernels.
+    ``sigma``: standard deviation of the conditional residual; ``noise`` (3,) as in the kernels.
     """
 
     def __init__(
-        self,
-        image: PixelGrid,
-        curr: np.ndarray,
-        stride: int,
-        sigma: float,
-        noise: np.ndarray,
+        self, image: PixelGrid, curr: np.ndarray, stride: int, sigma: float, noise: np.ndarray,
         tile: int,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._samples, height, self._width = image.strided(stride)
         self._log_depth = np.empty(height * self._width, np.float32)
         look_up(self._samples, len(self._log_depth), curr, self._log_depth)

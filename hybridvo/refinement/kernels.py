@@ -30,36 +30,26 @@ FASTMATH = {"reassoc", "contract", "arcp", "nsz"}  # not nnan/ninf: invalid valu
 XN, YN, Z, MU, MV, PF, PD, W = range(8)
 """Rows of a pixel buffer: ray x, ray y, depth, flow target u, v, inverse relative flow variance,
 relative depth variance, external weight (0 where the pixel cannot be used)."""
-BUFFER_ROWS = 8
-WORK_ROWS = 9
-BLOCK = 512
+BUFFER_ROWS, WORK_ROWS, BLOCK = 8, 9, 512
 
-SUMS = 30
-"""Length of an accumulator: 21 upper-triangle sums of the Hessian, 6 of the gradient, cost, sum of
-robust weights, sum of external weights."""
-COST = 27
-"""Place of the cost in it."""
+SUMS, COST = 30, 27
+"""Length of an accumulator (21 upper-triangle sums of the Hessian, 6 of the gradient, cost, sum of
+robust weights, sum of external weights), and the place of the cost."""
 
 HAS_FLOW_VARIANCE, HAS_DEPTH_VARIANCE, HAS_WEIGHTS = 1, 2, 4
 
-MIN_DEPTH = np.float32(1e-6)
-MAX_VALUE = np.float32(1e9)
-MAX_TRUST = np.float32(1e6)
-MAX_DOUBT = np.float32(1e9)
-"""Largest inverse flow variance and depth variance of a pixel, relative to the typical ones: what
-is handed in may be anything, and squares of it must stay finite."""
+MIN_DEPTH, MAX_VALUE = np.float32(1e-6), np.float32(1e9)
+MAX_TRUST, MAX_DOUBT = np.float32(1e6), np.float32(1e9)
+"""Largest inverse flow variance and depth variance of a pixel, relative to the typical ones."""
 MAX_SHIFT = np.float32(0.3)
 """Largest correction of log depth that an outlier may cause."""
-ONE = np.float32(1.0)
-ZERO = np.float32(0.0)
+ONE, ZERO = np.float32(1.0), np.float32(0.0)
 
 
 @intrinsic
 def keep_apart(typing_context):
-    """Forbid LLVM to inline the calling function.
-
-    Inlined into a loop over rows its reductions are no longer recognised and the vector code is
-    lost (measured: 27 ns a pixel instead of 4).
+    """Forbid LLVM to inline the calling function: inlined into a loop over rows its reductions are
+    not vectorised (27 ns a pixel instead of 4).
     """
 
     def codegen(context, builder, signature, args):
@@ -259,9 +249,7 @@ def add(acc, start, values):
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
 def sum_translation(o, n, work, acc):
-    """Second stage, pixels ``o .. o + n - 1`` of the block: the rows of H and g that belong to the
-    translation.
-    """
+    """Second stage, pixels ``o .. o + n - 1``: the rows of H and g of the translation."""
     keep_apart()  # type: ignore[call-arg]
     A, B, IZ = work[0][o:], work[1][o:], work[2][o:]
     M0, M1, M2 = work[3][o:], work[4][o:], work[5][o:]
@@ -314,7 +302,7 @@ def sum_translation(o, n, work, acc):
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
 def sum_rotation(o, n, work, acc):
-    """Third stage: the rows of H and g that belong to the rotation."""
+    """Third stage: the rows of H and g of the rotation."""
     keep_apart()  # type: ignore[call-arg]
     A, B = work[0][o:], work[1][o:]
     M0, M1, M2 = work[3][o:], work[4][o:], work[5][o:]

@@ -144,18 +144,13 @@ class CoarseGrid:
         stride = self.shape[2]
         return (slice(stride // 2, None, stride),) * 2
 
-    def masked(self, mask: np.ndarray) -> np.ndarray:
-        """A copy of the samples, their weights times a mask (h, w)."""
-        samples = self.samples.copy()
-        samples[kernels.W, : self.count] *= mask.reshape(-1)
-        return samples
-
     def within(self, pair: FramePair, weights: np.ndarray | None, mask: np.ndarray) -> CoarseGrid:
         """The same grid with weights (H, W) times a mask (h, w) of it, on the full grid as well."""
-        factors = self.upsample(mask)
+        factors, samples = self.upsample(mask), self.samples.copy()
+        samples[kernels.W, : self.count] *= mask.reshape(-1)
         if weights is not None:
             factors = factors * np.asarray(weights, np.float32)
-        return CoarseGrid(PixelGrid(pair, factors), self.masked(mask), self.shape)
+        return CoarseGrid(PixelGrid(pair, factors), samples, self.shape)
 
     def resample(self, image: np.ndarray) -> np.ndarray:
         """(h, w) float32: a map over the whole image, of any resolution, at the grid's pixels."""
@@ -207,22 +202,14 @@ def too_few(depth: np.ndarray, flow: np.ndarray, count: int, minimum: int) -> tu
 
 
 def as_contiguous(array: np.ndarray, dtype: Any = None) -> np.ndarray:
-    """Contiguous view that cannot be written to, whatever the array allows.
-
-    Numba compiles a kernel anew for an array that is read-only (a frame out of a buffer, of a file
-    that was mapped) or not aligned: seconds, in the middle of a walk. So all look the same to it.
-    """
+    """Contiguous read-only view: numba compiles a kernel anew, for seconds, for each other kind."""
     view = np.require(array, dtype, ["C", "A"]).view()
     view.flags.writeable = False
     return view
 
 
 def typical(variance: np.ndarray) -> float:
-    """Variance of the good pixels: the 20 % quantile of the positive finite values; 1 if none.
-
-    The noise that a motion may claim is bounded in units of it, and the good pixels tell the
-    motions apart.
-    """
+    """Variance of the good pixels: the 20 % quantile of the positive finite values; 1 if none."""
     sparse = variance[::7, ::7]
     good = sparse[(sparse > 0) & (sparse < kernels.MAX_VALUE)]
     return float(np.quantile(good, 0.2)) if good.size else 1.0

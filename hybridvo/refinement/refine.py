@@ -8,7 +8,6 @@ both noise scales are estimated from the pair.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -34,9 +33,7 @@ from hybridvo.types import FramePair
 MIN_INLIER_RATIO, LOW_INLIER_RATIO = 0.02, 0.25
 """Shares of the pixels that must follow the motion, else it is none, or degraded."""
 STEPS, LAST_STEP = 5, 0.5
-"""Most steps, and length in standard deviations of the last one. The coarse fit is about
-sqrt(6 x 60) of the full fit's standard deviations away (60 times fewer pixels), and a step is wrong
-by some 2 % of its length, the statistical error of the curvature: the second step is the last."""
+"""Most steps, and length in standard deviations of the last one."""
 WELL_CONDITIONED = 0.005
 """Ratio of the extreme eigenvalues of the flow's information above which it needs no help."""
 CURRENT_DEPTH_GAIN = 0.5
@@ -155,9 +152,8 @@ def status_of(
 def widened(motion: RelativePose) -> RelativePose:
     """An ambiguous motion with a covariance that covers the other motions it may be.
 
-    The second moment of the mixture: with its probability the camera's motion is this one; else it
-    is another of those found, or none of them, taken to be as far away as they or as standing
-    still. Nothing is known of the direction, so it counts alike in all.
+    The second moment of the mixture: with its probability the camera's motion is this one; else as
+    far away as the farthest of the others or as standing still, in any direction.
     """
     if motion.status.reason is not Reason.AMBIGUOUS_MOTION or not motion.usable:
         return motion
@@ -189,23 +185,6 @@ class FlowFactor:
         return Linearization(symmetric(sums[:21]), sums[21:], float(self.rest[0]), curvature)
 
 
-class PairNoise(NamedTuple):
-    """Noise of the pixels that follow a motion.
-
-    Args:
-        flow: px. depth: of log depth.
-        share: of the weight that follows.
-        difference: standard deviation of the log ratio of both depths, and given_flow: what of it
-            the flow's residual does not tell; 0 where they cannot be compared.
-    """
-
-    flow: float
-    depth: float
-    share: float
-    difference: float = 0.0
-    given_flow: float = 0.0
-
-
 def pair_noise(
     samples: np.ndarray,
     n: int,
@@ -214,10 +193,14 @@ def pair_noise(
     start: tuple[float, float],
     cutoff: float,
     curr: np.ndarray | None,
-) -> PairNoise:
+) -> tuple[float, float, float, float, float]:
     """Noise of the pixels that follow a motion, from the noise (sf, sd) found before.
 
     The current depth (H, W) bounds the noise of the first, and tells it where the flow cannot.
+
+    Returns:
+        sf, sd, share of the weight that follows, standard deviation of the log ratio of both
+        depths, and of its part that the flow does not tell; 0 where they cannot be compared.
     """
     sf, sd = start
     sf, sd, share, told = coarse_fit.estimate_noise(
@@ -225,7 +208,7 @@ def pair_noise(
         coarse_fit.FINAL_NOISE_PIXELS,
     )  # fmt: skip
     if curr is None:
-        return PairNoise(sf, sd, share)
+        return sf, sd, share, 0.0, 0.0
     noise = np.empty(3, np.float32)
     coarse_fit.set_noise(sf, sd, cutoff, noise)
     few = np.ascontiguousarray(samples[:, : n : max(1, n // 1000)])
@@ -234,11 +217,11 @@ def pair_noise(
     coarse_fit.robust_weights(few, len(robust), pose, K, noise, new_work(), robust)
     sigma, raw = depth_scale(few, log_depth, robust, pose, K, noise)
     if raw <= 0:
-        return PairNoise(sf, sd, share)
+        return sf, sd, share, 0.0, 0.0
     # var(rz) = sz^2 + h^2 sd^2: with two depths of one sensor sd is about raw / sqrt(2)
     if not told:  # errors that both depths share do not show here
         sd = min(raw / DEPTHS_PER_PAIR, coarse_fit.DEPTH_NOISE_CAP)
-    return PairNoise(sf, min(sd, raw), share, raw, max(sigma, 1e-4))
+    return sf, min(sd, raw), share, raw, max(sigma, 1e-4)
 
 
 def _fit_full_grid(
@@ -261,7 +244,7 @@ def _fit_full_grid(
     noise = np.empty(3, np.float32)
     coarse_fit.set_noise(sf, sd, options.cutoff, noise)
     total = float(grid.weight.sum(dtype=np.float64))
-    iterations, _, _ = coarse_fit.gauss_newton(
+    iterations = coarse_fit.gauss_newton(
         samples, n, total, image.K, noise, 4, 1e-3 * sf, pose, new_work()
     )
     flow = FlowFactor(image, noise, tile, score_sums(samples, n, pose, image.K, noise))

@@ -253,28 +253,23 @@ def solve_small(
     """Solve ((A + damping diag A) x = b) for (B, 6, 6) systems in float64, each for itself.
 
     Returns:
-        (B, 6) float64 solutions and (B,) bool; where False (singular, or not finite) they are zero.
+        (B, 6) solutions, with a gradient in b, and (B,) bool; where False (singular, or not finite)
+        they are zero.
     """
-    A, b = A.double(), b.double()
-    unit = torch.eye(A.shape[1], dtype=A.dtype, device=A.device)
-    scale = A.diagonal(dim1=1, dim2=2).abs().sqrt()
-    good = torch.isfinite(A).flatten(1).all(dim=1) & torch.isfinite(b).all(dim=1)
-    good = good & (scale > 1e-15).all(dim=1)
-    scale = torch.where(good[:, None], scale, torch.ones_like(scale))
-    b = torch.where(good[:, None], b, torch.zeros_like(b))
-    A = A / (scale[:, :, None] * scale[:, None, :]) + damping * unit
-    x, info = torch.linalg.solve_ex(torch.where(good[:, None, None], A, unit), b / scale)
-    x = x / scale
-    good = good & (info == 0) & (x.abs() < 1e6).all(dim=1)
+    A = A.detach().double()
+    inverse, info = torch.linalg.inv_ex(A + damping * torch.diag_embed(A.diagonal(dim1=1, dim2=2)))
+    good = (info == 0) & torch.isfinite(inverse).flatten(1).all(dim=1)
+    inverse = torch.where(good[:, None, None], inverse, torch.zeros_like(inverse))
+    x = (inverse @ b.double()[..., None])[..., 0]
+    good = good & (x.abs() < 1e6).all(dim=1)
     return torch.where(good[:, None], x, torch.zeros_like(x)), good
 
 
 def attached(
-    T: pp.LieTensor, A: torch.Tensor, g: torch.Tensor, wanted: torch.Tensor | bool = True
+    T: pp.LieTensor, A: torch.Tensor, g: torch.Tensor, wanted: torch.Tensor | float = 1.0
 ) -> pp.LieTensor:
     """The same poses with the gradient A^-1 dg: a Newton step whose value is zero."""
-    step, solved = solve_small(A, g)
-    step = torch.where((solved & wanted)[:, None], step, torch.zeros_like(step))
+    step = wanted * solve_small(A, g)[0]
     return left_update(step - step.detach(), T)
 
 
@@ -283,11 +278,10 @@ def stepped(
     T: pp.LieTensor,
     at: Residuals,
     how: RobustNoise,
-    going: torch.Tensor | bool = True,
+    going: torch.Tensor | float = 1.0,
 ) -> pp.LieTensor:
-    """Poses after a Gauss-Newton step of those that are ``going``; ``at``: their residuals."""
-    step, solved = solve_small(*linearize(pixels, at, how).total(), DAMPING)
-    return left_update(torch.where((solved & going)[:, None], step, torch.zeros_like(step)), T)
+    """Poses after a Gauss-Newton step, times ``going``; ``at``: their residuals."""
+    return left_update(going * solve_small(*linearize(pixels, at, how).total(), DAMPING)[0], T)
 
 
 def flow_noise(scale: torch.Tensor, kernel: str = "geman-mcclure") -> RobustNoise:
@@ -305,9 +299,8 @@ def fit_pixels(pixels: Pixels, start: pp.LieTensor, smallest: float) -> pp.LieTe
     """The motion (B, 7) that pixels agree on under their weights: no noise, covariance or status.
 
     The scale of the kernel follows the residuals, down to ``smallest``. Where the fit explains the
-    weighted median pixel no better than the start, the answer is the start. The gradient goes into
-    the weights alone, from pixels far away with constant strength: a network that has settled on a
-    mover would else never learn of the world.
+    median pixel no better than the start, the answer is the start. The gradient goes into the
+    weights alone, from pixels far away with constant strength: they may be the world.
     """
     with torch.no_grad():
         T, fixed = start, pixels.map(torch.Tensor.detach)

@@ -10,7 +10,7 @@ import pytest
 
 from tests.scripts import ROOT, load_script
 
-compare = load_script("tools/golden_compare.py").compare
+compare = load_script("tools/golden.py").compare
 measuring = load_script("tools/measuring.py")
 
 CASE = {
@@ -29,7 +29,7 @@ PRIOR = CASE | {"without": {"median": 0.06, "failed": 0, "unflagged": 0}}
 
 
 def figures(case: dict[str, Any], name: str = "heavy/dis/hybrid", **head: Any) -> dict[str, Any]:
-    return {"inputs": "a", "processor": "p", "cases": {name: copy.deepcopy(case)}} | head
+    return {"processor": "p", "cases": {name: copy.deepcopy(case)}} | head
 
 
 def words(old: dict[str, Any], new: dict[str, Any]) -> list[str]:

@@ -281,15 +281,6 @@ def test_threads_and_repetition_change_nothing(method: str) -> None:
                 worlds.assert_pose_close(one.T_curr_prev, other, rad=1e-6, m=1e-6)
 
 
-@of_methods([*SEARCHING, "pwvo-refine"])
-def test_another_seed_finds_the_same_motion(method: str) -> None:
-    pair, T = noisy()
-    for seed in (0, 1, 2**31 - 1):
-        found = estimate(pair, method=method, seed=seed)
-        assert found.status.state is State.OK
-        worlds.assert_pose_close(found.T_curr_prev, T, rad=1e-3, m=5e-3)
-
-
 @pytest.mark.parametrize("kind", ["true", "before", "wrong"])
 @of_methods([*SEARCHING, "pwvo-refine"])
 def test_no_prior_makes_an_answer_worse(method: str, kind: str) -> None:

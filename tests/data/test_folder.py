@@ -342,6 +342,9 @@ def test_template_is_filled_in_and_read(tmp_path):
     assert open_sequence(root)[0].camera == Camera(16.5, 16.5, 16.5, 16.5, 24, 32)
     with pytest.raises(InputError, match="exists already"):
         write_camera_template(root)
+    (tmp_path / "metres" / "depth").mkdir(parents=True)
+    np.save(tmp_path / "metres" / "depth" / "0.npy", np.ones(SIZE))
+    assert "\n# depth_scale" in write_camera_template(tmp_path / "metres").read_text()
 
 
 @pytest.mark.parametrize(

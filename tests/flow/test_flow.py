@@ -65,11 +65,6 @@ def test_images_smaller_than_a_patch_do_not_raise() -> None:
     assert field.flow is None or np.isfinite(field.flow).all()
 
 
-def test_unknown_preset_is_named() -> None:
-    with pytest.raises(InputError, match="ultrafast, fast, medium, got 'slow'"):
-        dis_flow("slow")
-
-
 def test_forward_backward_by_hand() -> None:
     forward = np.zeros((5, 7, 2), np.float32)
     backward = np.zeros((5, 7, 2), np.float32)

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
@@ -202,16 +199,6 @@ def test_maps_of_any_resolution_are_seen_on_the_grid(case) -> None:
     # a cell of half the resolution stands for four pixels, whose mean it is
     half = ramp.reshape(height // 2, 2, width // 2, 2).mean((1, 3))
     np.testing.assert_allclose(found.grid.resample(half)[1:-1, 1:-1], exact[1:-1, 1:-1], atol=0.1)
-
-
-def test_masks_grow_to_the_image(case) -> None:
-    grid = replace(case[0].grid, shape=(5, 7, 6), pixels=SimpleNamespace(shape=(31, 45)))
-    mask = np.zeros((5, 7), np.float32)
-    mask[:, 4:] = 1
-    whole = grid.upsample(mask)
-    assert whole.shape == (31, 45) and not whole[:, :21].any()
-    # the first column of ones is the pixel that the grid took, 4 * 6 + 3
-    assert whole[15, 27] == pytest.approx(1.0, abs=0.1) and whole[30, 44] == 1
 
 
 def test_only_another_motion_is_a_rival(case) -> None:

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from hybridvo.estimation import estimate
-from hybridvo.flow import FlowField, dis_flow
-from hybridvo.geometry import project
+from hybridvo.flow import FlowField, dis_flow, with_flow
+from hybridvo.geometry import pose_matrix, project
 from hybridvo.images.direct import direct_start, reduced
 from hybridvo.options import DirectOptions, Options
 from hybridvo.pipeline import Context, run_method
@@ -56,6 +56,18 @@ def test_static_scene_needs_no_flow(static):
 
 def test_where_most_moves_it_is_not_sure(moving):
     assert direct_start(moving[0]) is None
+
+
+@pytest.mark.parametrize("seed", [901, 903])
+def test_a_start_on_a_moving_object_is_no_answer(seed):
+    pair, T, _ = made_pair("heavy_rigid", seed, **SIZE)
+    found = Context().search(with_flow(pair, dis_flow()))
+    assert len(found.poses) > 1
+    for pose in found.poses:
+        answer = direct_start(FramePair(pair.prev, pair.curr, None), pose_matrix(pose))
+        assert (
+            answer is None or answer.probability < 0.85 or error_px(pair, answer.T_curr_prev, T) < 1
+        )
 
 
 def test_a_start_leads_over_a_motion_that_is_too_far():

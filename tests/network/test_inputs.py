@@ -8,7 +8,7 @@ import torch
 
 from hybridvo.errors import InputError
 from hybridvo.geometry import ego_flow, euler_deg_to_matrix, make_transform
-from hybridvo.network.inputs import NetworkInputs, assemble_aligned, assemble_inputs
+from hybridvo.network.inputs import NetworkInputs, assemble_inputs
 from hybridvo.types import Camera, Frame, FramePair, PairBatch
 
 CAMERA = Camera(20.0, 25.0, 3.5, 1.5, 4, 8)
@@ -139,20 +139,6 @@ def test_batches_equal_single_pairs():
         alone = assemble_inputs(pair, (8, 16))
         for field in fields(NetworkInputs):
             assert torch.equal(getattr(batched, field.name)[i], getattr(alone, field.name)[0])
-
-
-def test_aligned_depth_is_taken_as_it_is():
-    generator = torch.Generator().manual_seed(0)
-    flow = torch.randn(2, 4, 8, 2, generator=generator)
-    prev, curr = 1 + torch.rand(2, 2, 4, 8, generator=generator)
-    K = torch.tensor(CAMERA.K, dtype=torch.float32).repeat(2, 1, 1)
-    inputs = assemble_aligned(flow, prev, curr, K)
-    torch.testing.assert_close(1 / inputs.inverse_depth[:, 1], curr)
-    torch.testing.assert_close(inputs.flow_px, flow.permute(0, 3, 1, 2))
-    assert torch.equal(inputs.K_curr, K)
-    still = assemble_inputs(PairBatch(0 * flow, prev, K, K, depth_curr=curr), (4, 8))
-    torch.testing.assert_close(still.inverse_depth, inputs.inverse_depth)
-    torch.testing.assert_close(still.rays, inputs.rays)
 
 
 def test_assembling_changes_nothing_in_the_pair():

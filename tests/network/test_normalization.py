@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hybridvo.geometry import ego_flow, se3_exp
-from hybridvo.network.inputs import NetworkInputs, assemble_aligned, subsampled_intrinsics
+from hybridvo.network.inputs import NetworkInputs, assemble_aligned
 from hybridvo.network.losses import LossOptions, LossTargets, total_loss
 from hybridvo.network.normalization import first_motions, predict, remove_scale
 from hybridvo.network.pwvo import NetworkOptions, build_network
@@ -120,17 +120,6 @@ def test_passes_are_the_network_on_what_is_left():
         three = network(inputs, fitted_motion(two, inputs))
         torch.testing.assert_close(predict(network, inputs).rotation, three.rotation)
     assert first_motions(network, inputs, "softmax", 0) is None
-
-
-def test_subsampled_intrinsics_by_hand():
-    # pixels 1, 3, 5, ..: the principal point 31.5 lies 15.25 of them from the first
-    K = subsampled_intrinsics(torch.tensor(CAMERA.K)[None], 2)[0]
-    np.testing.assert_allclose(K, [[30.0, 0, 15.25], [0, 31.0, 7.25], [0, 0, 1]])
-    small = static_inputs().subsample(2)
-    rows, columns = torch.meshgrid(torch.arange(16.0), torch.arange(32.0), indexing="ij")
-    x = (columns - small.K_prev[0, 0, 2]) / small.K_prev[0, 0, 0]
-    y = (rows - small.K_prev[0, 1, 2]) / small.K_prev[0, 1, 1]
-    torch.testing.assert_close(small.rays[0], torch.stack([x, y]), atol=1e-6, rtol=0)
 
 
 def test_the_truth_has_no_flow_loss_on_fewer_pixels():

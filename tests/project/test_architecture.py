@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import graphlib
 import json
 import subprocess
@@ -88,7 +87,7 @@ MAX_FUNCTION_LINES = 70
 MAX_FOLDER_FILES = 16
 MAX_CONSTANTS = 220
 """Module-level names in capitals that hold numbers, outside ``calibration.py``."""
-MAX_LINES = {"hybridvo": 24_000, "tests": 14_400, "tools": 3_000}
+MAX_LINES = {"hybridvo": 24_000, "tests": 12_700, "tools": 3_000}
 MAX_PUBLIC_NAMES = 24
 
 
@@ -140,13 +139,6 @@ def test_the_parts_of_evo_that_act_on_import_are_never_used() -> None:
     for path, tree in source.files().items():
         for name in source.imported(tree):
             assert not name.startswith(("evo.tools.settings", "evo.tools.plot", "evo.main")), path
-
-
-def test_the_reader_of_imports_sees_those_in_functions_and_not_those_of_types() -> None:
-    tree = ast.parse(
-        "def f():\n    import evo.core\nif TYPE_CHECKING:\n    from hybridvo import cli\n"
-    )
-    assert source.imported(tree) == {"evo.core"}
 
 
 # --- sizes ----------------------------------------------------------------------------------------

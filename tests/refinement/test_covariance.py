@@ -98,16 +98,6 @@ def test_errors_that_neighbours_share_are_inflated_by_the_right_factor(width: in
     assert 0.7 < ratio < 1.6
 
 
-def test_the_stated_variance_grows_with_the_correlation() -> None:
-    sizes = []
-    for width in (1, 2, 4):
-        rng = np.random.default_rng([3, width])
-        C = np.mean([answer(smooth(rng, width))[1] for _ in range(20)], axis=0)
-        sizes.append(np.trace(H @ C) / 6)
-    assert sizes[0] == pytest.approx(1.0, abs=0.2)  # 20 draws of 112 tiles
-    assert sizes[1] > 2.5 and sizes[2] > 9  # of 4 and 16, less the borders
-
-
 def test_errors_over_the_whole_image_are_continued_beyond_the_blocks() -> None:
     nees, without = [], []
     for seed in range(60):

@@ -8,7 +8,6 @@ import pytest
 from hybridvo import geometry
 from hybridvo.errors import InputError
 from hybridvo.synthetic import diverse, layered, sensors
-from hybridvo.synthetic import draws as drawing
 from hybridvo.synthetic.rendered import RenderedOptions
 from hybridvo.types import Camera
 
@@ -228,11 +227,3 @@ def test_degradation_is_of_the_stated_size_and_keeps_what_is_exact():
     depth[:8] = 0.0
     for image in sensors.degrade_depth(rng, [depth, depth], sensors.SensorOptions()):
         assert (image[:5] == 0).all() and np.isfinite(image).all() and (image >= 0).all()
-
-
-def test_coverage_is_met():
-    square = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
-    mask, radius = drawing.covering_mask([(square, True)], (128, 256), (127.5, 63.5), 0.25)
-    assert mask.mean() == pytest.approx(0.25, abs=0.01)
-    # (2 r)^2 = 0.25 * 128 * 256 gives r = 45.3; a border pixel more or less.
-    assert radius == pytest.approx(45.3, abs=1.5)

@@ -12,7 +12,6 @@ import torch
 from hybridvo.errors import FormatError, InputError
 from hybridvo.network.models import load_weights
 from hybridvo.network.selector_net import SelectorNetworkOptions
-from hybridvo.network.weights import pretrained
 from hybridvo.training import selector_data
 from hybridvo.training.options import SelectorOptions, load_selector_options
 from hybridvo.training.selector_task import (
@@ -88,7 +87,7 @@ def test_training_learns_and_goes_on(shards, tmp_path):
 
 def test_the_configuration_is_that_of_the_pretrained_network():
     options = load_selector_options(CONFIG)
-    network, _ = load_weights(pretrained("selector"))
+    network, _ = load_weights("selector")
     assert options.network == network.options
 
 

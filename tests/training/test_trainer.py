@@ -162,13 +162,6 @@ def test_a_step_below_half_width_at_the_paper_s_size(kind):
     assert np.isfinite(figures["loss"]) and figures["grad_norm"] > 0
 
 
-def test_halving_is_the_published_staircase():
-    schedule = ScheduleOptions()
-    steps = [0, 24_999, 25_000, 50_000, 75_000, 99_999]
-    rates = [1e-4 * schedule.factor(step / 100_000) for step in steps]
-    assert rates == [1e-4, 1e-4, 5e-5, 2.5e-5, 1.25e-5, 1.25e-5]
-
-
 def test_cosine_by_hand():
     schedule = ScheduleOptions(kind="cosine", warmup=0.2, final_share=0.1)
     # middle of the descent: half way between 1 and 0.1

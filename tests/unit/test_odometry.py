@@ -3,6 +3,7 @@ from __future__ import annotations
 import tracemalloc
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,8 +12,8 @@ import hybridvo
 from hybridvo.errors import CheckpointError, InputError
 from hybridvo.estimation import warm_up
 from hybridvo.flow import FlowField, dis_flow
-from hybridvo.geometry import ego_flow, invert, se3_exp
-from hybridvo.odometry import Odometry
+from hybridvo.geometry import ego_flow, invert, se3_exp, se3_log
+from hybridvo.odometry import MotionModel, Odometry, TrackerState
 from hybridvo.options import Options, TrackOptions
 from hybridvo.pipeline import DEFAULT_METHOD
 from hybridvo.results import Reason, State
@@ -62,6 +63,14 @@ def tracker(flow: object = None, **track: object) -> Odometry:
     return Odometry(flow=flow or exact_flow(), options=options)
 
 
+def test_first_frame_is_the_identity() -> None:
+    step = tracker().track(frame(3))
+    assert step.ok and step.status.state is State.OK
+    np.testing.assert_array_equal(step.T_world_cam, np.eye(4))
+    np.testing.assert_array_equal(step.T_curr_prev, np.eye(4))
+    assert (step.index, step.timestamp) == (3, pytest.approx(0.3))
+
+
 def test_poses_chain_camera_to_world() -> None:
     vo = tracker()
     steps = [vo.track(frame(i)) for i in range(4)]
@@ -84,20 +93,24 @@ def test_set_pose_before_and_during_the_walk() -> None:
     np.testing.assert_allclose(vo.track(frame(2)).T_world_cam, invert(MOTION), atol=1e-5)
 
 
+@pytest.mark.parametrize("T", [np.zeros((4, 4)), np.full((4, 4), np.nan), np.eye(3)])
+def test_set_pose_refuses_what_is_no_pose(T: np.ndarray) -> None:
+    with pytest.raises(InputError, match="set_pose"):
+        tracker().set_pose(T)
+
+
 @pytest.mark.parametrize("policy", ["hold", "constant_velocity"])
 def test_failed_motion_follows_the_policy(policy: str) -> None:
-    vo = tracker(on_failure=policy, window=1)  # a window would find the way from frame 1
+    vo = tracker(on_failure=policy)
     vo.track(frame(0))
     good = vo.track(frame(1))
-    vo.track(frame(2, depth=None))
-    bad = vo.track(frame(3))
-    assert bad.status.state is State.FAILED and bad.status.reason is Reason.NO_VALID_DEPTH
+    bad = vo.track(frame(2), np.full((HEIGHT, WIDTH, 2), np.nan, np.float32))
+    assert bad.status.state is State.FAILED
     expected = np.eye(4) if policy == "hold" else good.T_curr_prev
     np.testing.assert_allclose(bad.T_curr_prev, expected, atol=1e-4)
     # at least a metre and 0.3 rad: no pose graph can take it for a measurement
     assert (np.diag(bad.covariance) >= [1.0] * 3 + [0.09] * 3).all()
-    after = vo.track(frame(4))
-    assert after.ok and np.isfinite(after.T_world_cam).all()
+    assert vo.track(frame(3)).ok
 
 
 def test_a_frame_that_cannot_be_read_is_spanned() -> None:
@@ -186,7 +199,6 @@ def test_a_frame_of_another_size_is_refused_and_changes_nothing() -> None:
         ({"method": "refin"}, "did you mean 'refine'"),
         ({"method": "hybrid", "network": None}, "needs a network"),
         ({"options": {"track": 3}}, "expected Options, got dict"),
-        ({"options": Options(track=TrackOptions(window=4)), "method": "identity"}, "no window"),
     ],
 )
 def test_wrong_options(options: dict[str, object], message: str) -> None:
@@ -194,38 +206,42 @@ def test_wrong_options(options: dict[str, object], message: str) -> None:
         Odometry(**options)
 
 
-def test_a_frame_without_depth_is_bridged_from_a_key_frame() -> None:
+def test_a_frame_without_depth_is_spanned() -> None:
     vo = tracker()
     for i in range(3):
         vo.track(frame(i))
-    lost = vo.track(frame(3, depth=None))
-    assert lost.ok  # its own depth is not needed
-    bridged = vo.track(frame(4))
-    assert bridged.status.state is State.DEGRADED and "key frame" in bridged.status.message
-    assert bridged.status.reason is Reason.NO_VALID_DEPTH and "window" in bridged.motion.terms
+    assert vo.track(frame(3, depth=None)).ok  # its own depth is not needed
+    step = vo.track(frame(4))
+    assert step.ok
+    np.testing.assert_allclose(step.T_curr_prev, MOTION @ MOTION, atol=1e-4)
     expected = invert(np.linalg.matrix_power(MOTION, 4))
-    np.testing.assert_allclose(bridged.T_world_cam, expected, atol=1e-4)
-    # steps chain to poses
-    np.testing.assert_allclose(
-        lost.T_world_cam @ bridged.T_prev_curr, bridged.T_world_cam, atol=1e-12
-    )
+    np.testing.assert_allclose(step.T_world_cam, expected, atol=1e-4)
+    vo.set_pose(np.eye(4))
+    np.testing.assert_allclose(vo.track(frame(5)).T_world_cam, invert(MOTION), atol=1e-4)
 
 
-def test_set_pose_moves_the_key_frames_as_well() -> None:
-    start = se3_exp(np.array([1.0, 2.0, 3.0, 0.1, 0.2, 0.3]))
+def test_the_first_frame_with_depth_is_the_first_that_leads() -> None:
     vo = tracker()
+    vo.track(frame(0, depth=None))
+    assert vo.track(frame(1)).status.reason is Reason.NO_VALID_DEPTH
+    assert vo.track(frame(2)).ok
+
+
+def test_a_frame_that_shows_something_else_is_spanned() -> None:
+    scene = make_scene("static", 3, height=120, width=160, frames=4)
+    vo = Odometry()
+    steps = []
     for i in range(4):
-        vo.track(frame(i))
-    vo.set_pose(start)
-    vo.track(frame(4, depth=None))
-    bridged = vo.track(frame(5))
-    assert "window" in bridged.motion.terms
-    expected = start @ invert(np.linalg.matrix_power(MOTION, 2))
-    np.testing.assert_allclose(bridged.T_world_cam, expected, atol=1e-4)
+        seen = scene.render(i)
+        rgb = np.full_like(seen.rgb, 90) if i == 2 else seen.rgb  # a hand before the lens
+        steps.append(vo.track(Frame(rgb, seen.depth, scene.cameras[i], 0.1 * i, i)))
+    assert [step.usable for step in steps] == [True, True, False, True]
+    true = invert(scene.T_world_cam[0]) @ scene.T_world_cam[3]
+    assert np.linalg.norm(steps[3].T_world_cam[:3, 3] - true[:3, 3]) < 0.01
 
 
 def test_prediction_is_the_last_motion_with_a_covariance() -> None:
-    vo = tracker(window=1)
+    vo = tracker()
     assert vo.predict() is None
     for i in range(8):
         vo.track(frame(i))
@@ -238,6 +254,18 @@ def test_prediction_is_the_last_motion_with_a_covariance() -> None:
     assert two is not None
     np.testing.assert_allclose(two.T_curr_prev, MOTION @ MOTION, atol=1e-5)
     np.testing.assert_allclose(two.covariance, 5 * ahead.covariance)
+
+
+def test_a_failed_motion_under_constant_velocity_has_the_covariance_of_the_history() -> None:
+    vo = tracker(on_failure="constant_velocity")
+    for i in range(8):
+        vo.track(frame(i))
+    ahead = vo.predict()
+    none = np.full((HEIGHT, WIDTH, 2), np.nan, np.float32)
+    first, second = vo.track(frame(8), none), vo.track(frame(9), none)
+    assert ahead is not None and not first.ok and not second.ok
+    np.testing.assert_allclose(first.covariance, ahead.covariance, rtol=0.2, atol=1e-12)
+    np.testing.assert_allclose(second.covariance, 2 * first.covariance, rtol=1e-6, atol=1e-12)
 
 
 def test_masks_and_depth_variances_of_ones_own_are_used() -> None:
@@ -261,6 +289,16 @@ def test_from_pretrained_knows_its_weights() -> None:
     assert hybridvo.Odometry.from_pretrained().method == DEFAULT_METHOD
     with pytest.raises(CheckpointError, match="selector"):
         hybridvo.Odometry.from_pretrained("jugde")
+
+
+@pytest.mark.parametrize("bad", [np.nan, 0.0, -1.0, np.inf])
+def test_bad_depth_never_gives_a_pose_that_is_not_finite(bad: float) -> None:
+    vo = tracker()
+    vo.track(frame(0))
+    vo.track(frame(1, depth=np.full((HEIGHT, WIDTH), bad, np.float32)))
+    step = vo.track(frame(2))
+    assert not step.ok and step.status.reason is Reason.NO_VALID_DEPTH
+    assert np.isfinite(step.T_world_cam).all() and np.isfinite(step.covariance).all()
 
 
 @pytest.mark.slow
@@ -304,7 +342,7 @@ def test_two_trackers_in_two_threads_give_the_poses_of_one_after_the_other() -> 
 
 
 def test_frames_without_an_index_are_counted() -> None:
-    vo = tracker(window=1)
+    vo = tracker()
     flow = ego_flow(depth(0), MOTION, CAMERA, CAMERA)
     steps = [vo.track(replace(frame(i), index=None), flow) for i in range(3)]
     assert [step.index for step in steps] == [0, 1, 2]
@@ -340,3 +378,54 @@ def test_the_motion_model_cannot_hold_the_tracker(kind: str) -> None:
     # recovered within two frames of the change; half a pixel is what DIS flow of this size allows
     assert max(errors[step, True] for step in (5, 6, 7)) < 0.5
     assert max(errors[step, False] for step in (5, 6, 7)) < 0.5
+
+
+def test_the_model_knows_how_well_constant_velocity_held() -> None:
+    rng = np.random.default_rng(2)
+    sigma = np.array([0.02, 0.01, 0.03, 0.004, 0.006, 0.002])
+    for ahead in (1, 3):
+        motion, model, squared = MOTION, MotionModel(), []
+        for k in range(400):
+            prediction = model.predict(ahead)
+            motions = [motion]
+            for _ in range(ahead):
+                motions.append(se3_exp(sigma * rng.standard_normal(6)) @ motions[-1])
+            if prediction is not None and k > 20:
+                true = np.eye(4)
+                for T in motions[1:]:
+                    true = T @ true
+                error = se3_log(true @ invert(prediction.T_curr_prev))
+                squared.append(error @ np.linalg.solve(prediction.covariance, error))
+            motion = motions[1]
+            model = model.observed(motion)
+        # twice the mean square of the last ten changes: a mean of 3 to 6 for six numbers
+        assert 1.5 < np.mean(squared) < 7.0
+
+
+def test_the_model_says_little_before_it_has_seen_changes() -> None:
+    model = MotionModel()
+    assert model.predict() is None
+    prediction = model.observed(MOTION).predict()
+    assert prediction is not None and prediction.covariance[0, 0] == 1.0
+
+
+def test_the_state_goes_through_a_file(tmp_path: Path) -> None:
+    vo = tracker()
+    mask = np.ones((HEIGHT, WIDTH), np.bool_)
+    for i in range(5):
+        vo.track(frame(i, mask=mask))
+    vo.skip(5, 0.5)
+    np.savez(tmp_path / "state.npz", **vo.state.to_arrays())
+    with np.load(tmp_path / "state.npz", allow_pickle=False) as arrays:
+        back = TrackerState.from_arrays(arrays)
+    again = back.to_arrays()
+    for name, array in vo.state.to_arrays().items():
+        np.testing.assert_array_equal(again[name], array)
+    other = tracker()
+    other.resume(back)
+    here, there = vo.track(frame(6)), other.track(frame(6))
+    np.testing.assert_array_equal(here.T_world_cam, there.T_world_cam)
+    assert here.index == there.index and here.ok
+    assert TrackerState.from_arrays(TrackerState().to_arrays()).frame is None
+    with pytest.raises(InputError, match="to_arrays"):
+        TrackerState.from_arrays({})
