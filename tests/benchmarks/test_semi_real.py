@@ -26,10 +26,10 @@ def test_ranking_and_calibration_of_a_probability() -> None:
 
 def test_the_fit_finds_the_weights_that_made_the_answers() -> None:
     rng = np.random.default_rng(0)
-    gaps = rng.standard_normal(4000)
-    right = rng.random(4000) < 1 / (1 + np.exp(-(1.5 * gaps + 1)))
-    slope, offset = calibrate.fit(gaps, right)
-    # the penalty draws the slope a little towards zero
-    np.testing.assert_allclose([slope, offset], [1.5, 1.0], atol=0.35)
-    stated = 1 / (1 + np.exp(-slope * gaps - offset))
+    evidence, weights = rng.standard_normal((4000, 2)), np.array([1.5, -0.5, 1.0])
+    right = rng.random(4000) < 1 / (1 + np.exp(-evidence @ weights[:2] - weights[2]))
+    found = calibrate.fit(evidence, right)
+    # the penalty draws the slopes a little towards zero
+    np.testing.assert_allclose(found, weights, atol=0.2)
+    stated = 1 / (1 + np.exp(-evidence @ found[:2] - found[2]))
     assert benchmark.calibration_error(stated, right) < 0.05
