@@ -78,7 +78,7 @@ class Context:
         if mode == "off" or (mode == "auto" and source != "dis"):
             return None
         T_start = None if self.prior is None else self.prior.T_curr_prev
-        return direct_start(pair, T_start, self.options.photometric)
+        return direct_start(pair, T_start)
 
     def is_sure(self, motion: RelativePose) -> bool:
         """Whether its probability is high enough for a motion that is not degraded."""
@@ -208,7 +208,7 @@ def run_method(pair: FramePair, method: str, ctx: Context) -> RelativePose:
     with one_thread() if networks_of(method) else contextlib.nullcontext():
         found = METHODS[method](pair, ctx)
     if refines_images(method, ctx.options) and found.photometric is None:
-        found = refine_photometric(pair, found, ctx.options.photometric)
+        found = refine_photometric(pair, found)
     if found.status.ok and not found.status.message and pair.prev.depth is not None:
         median = typical_depth(pair.prev.depth[::8, ::8])
         if advice := "" if median is None else depth_advice(median):

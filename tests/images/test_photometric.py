@@ -68,7 +68,7 @@ def test_jacobian_is_that_of_the_residual(light):
     index = np.stack([rng.integers(8, n - 8, 400) for n in image.shape], axis=1).astype(np.int32)
     index = index[np.isfinite(frame.depth[tuple(index.T)])]
     pose = RelativePose(weights=np.ones(image.shape, np.float32))
-    factor = ImageFactor(FramePair(frame, frame, None), pose, index, 1.0)
+    factor = ImageFactor(FramePair(frame, frame, None), pose, index)
     factor.use(image, image, np.eye(4))
 
     def project(T):
