@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from hybridvo.errors import InputError
-from hybridvo.estimation import warm_up
 from hybridvo.flow import FlowField, FlowProvider, dis_flow, with_flow
 from hybridvo.geometry import invert, pose_matrix, se3_exp, se3_log
 from hybridvo.network.models import Models, default_models
@@ -21,6 +20,7 @@ from hybridvo.pipeline import (
     check_method,
     networks_of,
     run_method,
+    warm_up,
 )
 from hybridvo.results import MotionPrior, Reason, RelativePose, Step
 from hybridvo.trajectory import chain

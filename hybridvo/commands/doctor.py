@@ -18,10 +18,11 @@ from hybridvo.commands.compare import methods_to_run
 from hybridvo.data.lists import shown
 from hybridvo.data.sequence import Sequence
 from hybridvo.errors import InputError
-from hybridvo.estimation import estimate
 from hybridvo.evaluation.pair_errors import true_motion
 from hybridvo.files import versions
 from hybridvo.flow import contradiction, dis_flow, file_flow
+from hybridvo.pipeline import estimate
+from hybridvo.refinement.covariance import direction_is_known
 from hybridvo.refinement.depth import compare_depths
 from hybridvo.results import RelativePose
 from hybridvo.types import Frame, FramePair, depth_advice, typical_depth
@@ -117,7 +118,7 @@ def _measure(sequence: Sequence, prev: Frame, curr: Frame) -> dict[str, Any]:
     if not motion.usable:
         return pair
     true = true_motion(sequence, prev.index, curr.index)
-    if true is not None and motion.translation_direction_valid:
+    if true is not None and direction_is_known(motion.T_curr_prev, motion.covariance):
         length = float(np.linalg.norm(true[:3, 3]))
         if length > 0.01:  # metres; along the true one: the noise of a length is always positive
             scale = float(motion.T_curr_prev[:3, 3] @ true[:3, 3]) / length**2

@@ -10,7 +10,6 @@ import numpy as np
 
 from hybridvo.data.sequence import Sequence, iter_pairs
 from hybridvo.errors import InputError
-from hybridvo.estimation import estimate
 from hybridvo.evaluation.pair_errors import MOVING_PX, true_motion
 from hybridvo.evaluation.plots import Panel, draw_panels, flow_panel, longest_flow
 from hybridvo.evaluation.saliency import Saliency, last_pass, saliencies
@@ -20,7 +19,7 @@ from hybridvo.geometry import ego_flow, matrix_to_euler_deg
 from hybridvo.network.layers import KINDS
 from hybridvo.network.models import load_weights
 from hybridvo.network.weights import pretrained_names, weights_file
-from hybridvo.pipeline import DEFAULT_METHOD
+from hybridvo.pipeline import DEFAULT_METHOD, estimate
 from hybridvo.results import PixelwisePrediction, RelativePose
 from hybridvo.types import FramePair
 

@@ -75,6 +75,7 @@ def choose_pixels(
     strength = (gx * gx + gy * gy)[inner, inner]
     z, usable = depth[inner, inner], weights[inner, inner] >= MIN_WEIGHT
     usable &= (z > MIN_DEPTH) & (z < MAX_VALUE) & (strength < MAX_VALUE)
+    # the strongest of every cell
     rows, columns = (-(-n // cell) for n in strength.shape)
     padded = np.zeros((rows * cell, columns * cell), np.float32)
     padded[: height - 2 * off, : width - 2 * off] = np.where(usable, strength, 0)
@@ -148,9 +149,8 @@ class ImageFactor:
         self._buffer[kernels.GX] = 0.5 * (prev[rows, columns + 1] - prev[rows, columns - 1])
         self._buffer[kernels.GY] = 0.5 * (prev[rows + 1, columns] - prev[rows - 1, columns])
         self._curr, self._at = curr, np.empty(0)
-        self._buffer[kernels.GREY] = self._even = prev[
-            rows, columns
-        ]  # before fields of light are put into it
+        # without the fields of light that may be put into the buffer's
+        self._even = self._buffer[kernels.GREY] = prev[rows, columns]
         self._project(T)
         for _ in range(2):
             self._settle()

@@ -128,7 +128,8 @@ def _refine(
         images.use(blurred(prev, blur), blurred(curr, blur), T)
         for steps in STEPS:
             T = gauss_newton((images, flow, *planes), T, steps, tolerance=0.1).T
-            for factor in (images, *planes):
+            images.estimate(T)
+            for factor in planes:
                 factor.estimate(T)
     H = images.linearize(T).H
     joint = sum((factor.linearize(T).H for factor in planes), H + flow.linearize(T).H)

@@ -10,12 +10,11 @@ import pytest
 
 import hybridvo
 from hybridvo.errors import CheckpointError, InputError
-from hybridvo.estimation import warm_up
 from hybridvo.flow import FlowField, dis_flow
 from hybridvo.geometry import ego_flow, invert, se3_exp, se3_log
 from hybridvo.odometry import MotionModel, Odometry, TrackerState
 from hybridvo.options import Options, TrackOptions
-from hybridvo.pipeline import DEFAULT_METHOD
+from hybridvo.pipeline import DEFAULT_METHOD, warm_up
 from hybridvo.results import Reason, State
 from hybridvo.synthetic.scenes import make_scene
 from hybridvo.types import Camera, Frame
