@@ -29,7 +29,7 @@ from hybridvo.evaluation.metrics import evaluate
 from hybridvo.evaluation.pair_errors import mean_pair_errors, step_errors, true_trajectory
 from hybridvo.evaluation.plots import plot_trajectories
 from hybridvo.files import Mode, atomic_write, fingerprint, held, versions, write_json
-from hybridvo.flow import FlowField, FlowProvider, MeasuredFlow, dis_flow, fallback, file_flow
+from hybridvo.flow import FlowProvider, MeasuredFlow, dis_flow, file_flow
 from hybridvo.geometry import se3_log
 from hybridvo.network.models import Models
 from hybridvo.odometry import Odometry, TrackerState
@@ -138,7 +138,7 @@ def _track(
         started = time.perf_counter()
         step = vo.track(frame)
         ms = 1e3 * (time.perf_counter() - started)
-    field = next(iter(flow.fields.values()), FlowField(None, source=""))
+    field = flow.last
     if frame is not None and recording is not None:
         recording.add(frame, step, field.flow)
     motion = step.motion
@@ -270,14 +270,13 @@ def frames_of(sequence: Sequence, options: Options) -> range:
 def flow_provider(sequence: Sequence, options: Options) -> FlowProvider:
     """Provider of the flow that the options ask for."""
     source, stride = options.flow.source, options.run.stride
-    from_files = file_flow(sequence, strict=options.run.strict)
     if source == "file":
         sequence.check_flow(stride)
-        return from_files
+        return file_flow(sequence, strict=options.run.strict)
     dis = dis_flow(options.flow.dis_preset)
     if source == "auto" and sequence.has_flow and stride == 1:
-        # a damaged file is no reason to stop where DIS can stand in
-        return fallback(from_files, dis)
+        # where a file is missing or damaged DIS can stand in
+        return file_flow(sequence, strict=options.run.strict, otherwise=dis)
     return dis
 
 

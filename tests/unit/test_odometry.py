@@ -249,7 +249,7 @@ def test_prediction_is_the_last_motion_with_a_covariance() -> None:
     np.testing.assert_allclose(ahead.T_curr_prev, MOTION, atol=1e-5)
     # a motion that never changed: the floor of a millimetre and a milliradian
     np.testing.assert_allclose(np.sqrt(np.diag(ahead.covariance)), 1e-3, rtol=0.05)
-    two = vo.predict(2)
+    two = vo.state.motion_model.predict(2)
     assert two is not None
     np.testing.assert_allclose(two.T_curr_prev, MOTION @ MOTION, atol=1e-5)
     np.testing.assert_allclose(two.covariance, 5 * ahead.covariance)
@@ -284,10 +284,10 @@ def test_masks_and_depth_variances_of_ones_own_are_used() -> None:
     np.testing.assert_allclose(steps[2].T_curr_prev, MOTION, atol=1e-4)
 
 
-def test_from_pretrained_knows_its_weights() -> None:
-    assert hybridvo.Odometry.from_pretrained().method == DEFAULT_METHOD
+def test_a_tracker_knows_its_weights() -> None:
+    assert hybridvo.Odometry().method == DEFAULT_METHOD
     with pytest.raises(CheckpointError, match="selector"):
-        hybridvo.Odometry.from_pretrained("jugde")
+        hybridvo.Odometry("jugde")
 
 
 @pytest.mark.parametrize("bad", [np.nan, 0.0, -1.0, np.inf])
