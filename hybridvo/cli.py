@@ -1,9 +1,9 @@
 """The command line: ``hybridvo run | compare | show | evaluate | doctor | demo | train | ...``.
 
-Parses, calls, prints. Heavy modules are imported after parsing, so that ``--help`` is instant. Data
-goes to stdout, progress and errors to stderr. Exit codes: 0 done, 1 a bug, 2 bad input or usage (or
-``doctor`` found that something differs: 1), 3 too many failed frames, 4 folder locked, 5 output
-cannot be written, 130 interrupted.
+Heavy modules are imported after parsing, so that ``--help`` is instant. Data goes to stdout,
+progress and errors to stderr. Exit codes: 0 done, 1 a bug, 2 bad input or usage (or ``doctor``
+found that something differs: 1), 3 too many failed frames, 4 folder locked, 5 output cannot be
+written, 130 interrupted.
 """
 
 from __future__ import annotations
@@ -15,41 +15,54 @@ import logging
 import os
 import sys
 import traceback
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from hybridvo import __version__
 from hybridvo.commands import arguments
-from hybridvo.commands.train import train
+from hybridvo.commands.train import add_train, train
 
-Result = tuple[Any, str, int]
-"""What a command gives: JSON-ready, for people, and the exit code."""
+Result = tuple[Any, int]
+"""What a command gives, JSON-ready, and the exit code."""
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """Parser of the whole command line."""
+    parser = argparse.ArgumentParser(
+        prog="hybridvo",
+        description="Metric camera motion with covariance from optical flow, depth and intrinsics.",
+    )
+    parser.add_argument("--version", action="version", version=f"hybridvo {__version__}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    common = argparse.ArgumentParser(add_help=False)
+    common.add_argument("--json", action="store_true", help="print the result as JSON on stdout")
+    loudness = common.add_mutually_exclusive_group()
+    loudness.add_argument("-v", "--verbose", action="store_true", help="tracebacks of errors")
+    loudness.add_argument("-q", "--quiet", action="store_true", help="errors only")
+    for name, (add_arguments, call) in COMMANDS.items():
+        about = add_arguments.__doc__ or ""
+        made = commands.add_parser(name, help=about, description=about, parents=[common])
+        made.set_defaults(call=call)
+        add_arguments(made)
+    add_train(commands.add_parser("train", help="train a network"), common, train)
+    return parser
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit code."""
-    given = sys.argv[1:] if argv is None else list(argv)
-    try:
-        args = arguments.build_parser(CALLS).parse_args(given)
-    except SystemExit as end:  # argparse: 0 after --help and --version, 2 for wrong usage
-        return int(end.code or 0)
-    return _guarded(args, ["hybridvo", *given])
-
-
-def _guarded(args: argparse.Namespace, command: list[str]) -> int:
-    """Exit code of a command; errors become one line on stderr."""
+    """Run the command line; returns the exit code. Errors become one line on stderr."""
     from hybridvo.errors import HybridVOError
 
-    logger, handler = logging.getLogger("hybridvo"), logging.StreamHandler()
-    handler.setLevel(logging.ERROR if args.quiet else logging.NOTSET)
-    before = logger.level
-    logger.addHandler(handler)
-    if args.verbose:
-        logger.setLevel(logging.DEBUG)
+    given = sys.argv[1:] if argv is None else list(argv)
     try:
-        content, text, code = args.call(args, command)
-        # the result on stdout, as JSON or for people
-        print(json.dumps(content, indent=1, allow_nan=False) if args.json else text, flush=True)
+        args = build_parser().parse_args(given)
+    except SystemExit as end:  # argparse: 0 after --help and --version, 2 for wrong usage
+        return int(end.code or 0)
+    logging.getLogger("hybridvo").setLevel(logging.ERROR if args.quiet else logging.NOTSET)
+    try:
+        content, code = args.call(args, ["hybridvo", *given])
+        as_json = json.dumps(content, indent=1, allow_nan=False)
+        print(as_json if args.json else text_of(args.command, content) or as_json, flush=True)
         return code
     except KeyboardInterrupt:
         print("hybridvo: interrupted.", file=sys.stderr)
@@ -66,21 +79,20 @@ def _guarded(args: argparse.Namespace, command: list[str]) -> int:
         traceback.print_exc()
         print("hybridvo: this is a bug; please report it with the lines above.", file=sys.stderr)
         return 1
-    finally:
-        logger.removeHandler(handler)
-        logger.setLevel(before)
 
 
-def text_of(name: str, content: Mapping[str, Any]) -> str:
-    """The result of a command for people."""
+def text_of(command: str, content: Mapping[str, Any]) -> str:
+    """The result of a command for people; empty where JSON serves them too."""
     import jinja2
 
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent / "commands" / "templates"),
-        autoescape=jinja2.select_autoescape(["html"]),
-        trim_blocks=True,
-    )
-    return environment.get_template(f"{name}.txt").render(content, report=content).rstrip()
+    if "files" in content and command != "run":
+        return "\n".join(content["files"])
+    folder = Path(__file__).parent / "commands" / "templates"
+    if not (folder / f"{command}.txt").is_file() or "run.method" in content:
+        return ""
+    loader = jinja2.FileSystemLoader(folder)
+    template = jinja2.Environment(loader=loader, trim_blocks=True).get_template(f"{command}.txt")
+    return template.render(content, report=content).rstrip()
 
 
 def _call(function: Callable[..., Any], args: argparse.Namespace, **more: Any) -> Any:
@@ -102,8 +114,7 @@ def _run(args: argparse.Namespace, command: list[str]) -> Result:
     from hybridvo.network.models import Models
 
     if "help" in args.given:
-        defaults = arguments.option_defaults()
-        return defaults, "\n".join(f"{key}={value}" for key, value in defaults.items()), 0
+        return arguments.option_defaults(), 0
     options = arguments.run_options(args)
     files = arguments.weight_files(args.weights, [options.run.method])
     given = {"options": options, "models": Models(options.run.device, files), "command": command}
@@ -111,18 +122,7 @@ def _run(args: argparse.Namespace, command: list[str]) -> Result:
     if not args.quiet:
         for warning in summary.get("warnings", []):
             print(f"hybridvo: warning: {warning}", file=sys.stderr)
-    return summary, text_of("run", summary), code
-
-
-def _files(paths: Iterable[Any]) -> Result:
-    written = [str(path) for path in paths]
-    return {"files": written}, "\n".join(written), 0
-
-
-def _show(args: argparse.Namespace, command: list[str]) -> Result:
-    from hybridvo.evaluation.drawing import draw
-
-    return _files([_call(draw, args, sequence=_open(args))])
+    return summary, code
 
 
 def _compare(args: argparse.Namespace, command: list[str]) -> Result:
@@ -132,7 +132,13 @@ def _compare(args: argparse.Namespace, command: list[str]) -> Result:
     methods = tuple(name.strip() for name in args.methods.split(",") if name.strip())
     weights = arguments.weight_files(args.weights, METHODS if methods == ("all",) else methods)
     given = {"methods": methods, "weights": weights, "options": arguments.run_options(args)}
-    return _files(_call(compare, args, **given, command=command))
+    return {"files": [str(p) for p in _call(compare, args, **given, command=command)]}, 0
+
+
+def _show(args: argparse.Namespace, command: list[str]) -> Result:
+    from hybridvo.evaluation.drawing import draw
+
+    return {"files": [str(_call(draw, args, sequence=_open(args)))]}, 0
 
 
 def _evaluate(args: argparse.Namespace, command: list[str]) -> Result:
@@ -149,54 +155,49 @@ def _evaluate(args: argparse.Namespace, command: list[str]) -> Result:
     if code:
         reason = report["reasons"]["ate_rmse_unaligned"]
         print(f"hybridvo: nothing could be compared: {reason}.", file=sys.stderr)
-    return report, text_of("evaluate", report), code
+    return report, code
 
 
 def _doctor(args: argparse.Namespace, command: list[str]) -> Result:
     from hybridvo.commands.doctor import diagnose, doctor
 
-    if args.path:
-        found = diagnose(_open(args), pairs=args.pairs)
-        return found, text_of("diagnosis", found), 0 if found["ok"] else 1
-    report = doctor()
-    return report, text_of("doctor", report), 0
+    if not args.path:
+        return doctor(), 0
+    found = diagnose(_open(args), pairs=args.pairs)
+    return found, 0 if found["ok"] else 1
 
 
 def _demo(args: argparse.Namespace, command: list[str]) -> Result:
     from hybridvo.commands.demo import demo
 
-    content = _call(demo, args, command=command)
-    return content, text_of("demo", content), 0
+    return _call(demo, args, command=command), 0
 
 
 def _generate(args: argparse.Namespace, command: list[str]) -> Result:
     from hybridvo.commands.generate import generate
-    from hybridvo.commands.progress import Progress
 
-    with Progress("generate", args.count, "samples", quiet=args.quiet) as bar:
-        sheet = _call(generate, args, report=bar.update)
-    return {"contact_sheet": str(sheet)}, str(sheet), 0
+    return {"files": [str(_call(generate, args))]}, 0
 
 
 def _init(args: argparse.Namespace, command: list[str]) -> Result:
     from hybridvo.data.camera_file import write_camera_template
 
     path = write_camera_template(args.directory)
-    next_step = f"fill it in, then: hybridvo run {args.directory}"
-    return {"file": str(path)}, f"{path}\n{next_step}", 0
+    print(f"fill it in, then: hybridvo run {args.directory}", file=sys.stderr)
+    return {"files": [str(path)]}, 0
 
 
-CALLS = {
-    "run": _run,
-    "compare": _compare,
-    "show": _show,
-    "evaluate": _evaluate,
-    "doctor": _doctor,
-    "demo": _demo,
-    "train": train,
-    "generate": _generate,
-    "init": _init,
+COMMANDS: dict[str, tuple[Callable[..., None], Callable[..., Result]]] = {
+    "run": (arguments.run, _run),
+    "compare": (arguments.compare, _compare),
+    "show": (arguments.show, _show),
+    "evaluate": (arguments.evaluate, _evaluate),
+    "doctor": (arguments.doctor, _doctor),
+    "demo": (arguments.demo, _demo),
+    "generate": (arguments.generate, _generate),
+    "init": (arguments.init, _init),
 }
+"""Name -> what adds its arguments and says what it does, and what runs it; beside ``train``."""
 
 
 if __name__ == "__main__":

@@ -20,7 +20,6 @@ from typing import Any
 import numpy as np
 import torch
 from measuring import ROOT, parser_of, provenance, without_folders
-from paper_tables import ROWS
 
 from hybridvo.commands.generate import write_sheet
 from hybridvo.evaluation.drawing import prediction_panels, saliency_panels
@@ -35,6 +34,15 @@ from hybridvo.synthetic.dataset import load_preset
 from hybridvo.synthetic.draws import sample_generator
 from hybridvo.training.validation import PUBLISHED_SEED, collate
 
+ROWS = {
+    "vonet": "VONet",
+    "vonet-attention": "VONet + self-attention",
+    "pixelwise": "+ pixel-wise",
+    "pwvo-naive": "+ U^R + U^T (PWVO naive)",
+    "pwvo-uncertain": "+ U^D + U^F",
+    "pwvo-paper": "+ selection (PWVO)",
+}
+"""Rows of the paper's tables, and what it calls them."""
 COMPARED = ("vonet", "pwvo-paper")
 """Rows whose saliency the paper sets beside each other."""
 SHOWN = 2

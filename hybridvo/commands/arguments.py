@@ -1,4 +1,7 @@
-"""Arguments of the commands, and options from them. Loads nothing heavy: help must be instant."""
+"""Arguments of the commands, and options from them. Loads nothing heavy: help must be instant.
+
+The docstring of a command is its help.
+"""
 
 from __future__ import annotations
 
@@ -10,34 +13,10 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hybridvo import __version__
-from hybridvo.commands.train import add_train
-
 if TYPE_CHECKING:
     from hybridvo.options import Options
 
 FLOWS = ("auto", "file", "dis")
-
-
-def build_parser(calls: Mapping[str, Any]) -> argparse.ArgumentParser:
-    """Parser of the whole command line; ``calls`` has the function of every command."""
-    parser = argparse.ArgumentParser(
-        prog="hybridvo",
-        description="Metric camera motion with covariance from optical flow, depth and intrinsics.",
-    )
-    parser.add_argument("--version", action="version", version=f"hybridvo {__version__}")
-    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    common = argparse.ArgumentParser(add_help=False)
-    common.add_argument("--json", action="store_true", help="print the result as JSON on stdout")
-    loudness = common.add_mutually_exclusive_group()
-    loudness.add_argument("-v", "--verbose", action="store_true", help="more, and tracebacks")
-    loudness.add_argument("-q", "--quiet", action="store_true", help="errors only")
-    for name, (help, add_arguments) in COMMANDS.items():
-        made = commands.add_parser(name, help=help, description=f"{help}.", parents=[common])
-        made.set_defaults(call=calls[name])
-        add_arguments(made)
-    add_train(commands.add_parser("train", help="train a network"), common, calls["train"])
-    return parser
 
 
 def _sequence(command: argparse.ArgumentParser, required: bool = True) -> None:
@@ -77,20 +56,22 @@ def _options(command: argparse.ArgumentParser) -> None:
         exists.add_argument(f"--{name}", dest="mode", help=help, **kind)
 
 
-def _run(run: argparse.ArgumentParser) -> None:
-    _sequence(run)
-    add = run.add_argument
+def run(command: argparse.ArgumentParser) -> None:
+    """Estimate the camera motion of a sequence."""
+    _sequence(command)
+    add = command.add_argument
     add("--out", metavar="DIR", help="output folder (default: runs/NAME)")
     add("--method", metavar="NAME", help="default: hybrid; `hybridvo doctor` lists all")
-    _options(run)
+    _options(command)
     add("--max-failed", type=float, metavar="X", help="fraction of failed motions (default 0.2)")
     add("--strict", action="store_true", default=None, help="a broken frame ends the run")
     recording = "Rerun recording (extra 'viz'; default: recording.rrd in the output folder)"
     add("--rrd", nargs="?", const="", metavar="FILE", help=recording)
 
 
-def _compare(compare: argparse.ArgumentParser) -> None:
-    add = compare.add_argument
+def compare(command: argparse.ArgumentParser) -> None:
+    """Run methods side by side and write a report."""
+    add = command.add_argument
     named: dict[str, Any] = {"action": "extend", "nargs": "+", "default": [], "metavar": "DIR"}
     add("--sequence", dest="sequences", help="the same as DIR, by name; repeatable", **named)
     many = "sequences, or folders of sequences (MPI Sintel as it was unpacked)"
@@ -98,14 +79,14 @@ def _compare(compare: argparse.ArgumentParser) -> None:
     add("--dataset", help="kind of the sequences (default: detected)")
     add("--out", default="runs/compare", metavar="DIR", help="default: runs/compare")
     add("--methods", default="all", help="comma-separated; default: all that run here")
-    _options(compare)
+    _options(command)
     add("--protocol", choices=("paper",), help="MPI Sintel as PWVO's paper scores it: 992 pairs")
-    add("--worst", type=int, default=3, help="worst pairs listed for each method")
 
 
-def _show(show: argparse.ArgumentParser) -> None:
-    _sequence(show)
-    add = show.add_argument
+def show(command: argparse.ArgumentParser) -> None:
+    """Draw the maps of one pair of a sequence."""
+    _sequence(command)
+    add = command.add_argument
     add("--pair", type=int, default=0, metavar="N", help="first frame (default 0)")
     add("--out", default="pair.png", metavar="FILE", help="default: pair.png")
     add("--method", default="hybrid", metavar="NAME", help="estimator (default: hybrid)")
@@ -114,8 +95,9 @@ def _show(show: argparse.ArgumentParser) -> None:
     add("--overwrite", action="store_true", help="replace the image")
 
 
-def _evaluate(evaluate: argparse.ArgumentParser) -> None:
-    add = evaluate.add_argument
+def evaluate(command: argparse.ArgumentParser) -> None:
+    """Errors of a trajectory against the truth."""
+    add = command.add_argument
     add("estimate", metavar="EST", help="estimated trajectory")
     add("gt", metavar="GT", help="true trajectory")
     kinds = ("se3", "sim3", "origin", "none")
@@ -127,25 +109,25 @@ def _evaluate(evaluate: argparse.ArgumentParser) -> None:
         add(f"--format-{name}", choices=("auto", "tum", "kitti", "tartanair"), default="auto")
 
 
-def _doctor(doctor: argparse.ArgumentParser) -> None:
-    _sequence(doctor, required=False)
-    doctor.add_argument("--pairs", type=int, default=40, metavar="N", help="pairs (default 40)")
+def doctor(command: argparse.ArgumentParser) -> None:
+    """What is missing here, or wrong with a sequence."""
+    _sequence(command, required=False)
+    command.add_argument("--pairs", type=int, default=40, metavar="N", help="pairs (default 40)")
 
 
-def _demo(demo: argparse.ArgumentParser) -> None:
-    add = demo.add_argument
+def demo(command: argparse.ArgumentParser) -> None:
+    """Render a scene with moving objects and run on it."""
+    add = command.add_argument
     add("--out", default="runs/demo", metavar="DIR", help="default: runs/demo")
     add("--overwrite", action="store_true", help="replace the results in --out")
     add("--frames", type=int, default=20, metavar="N", help="default: 20")
     add("--seed", type=int, default=0, metavar="N", help="of the scene")
 
 
-def _generate(generate: argparse.ArgumentParser) -> None:
-    which = generate.add_mutually_exclusive_group(required=True)
-    named: dict[str, Any] = {"metavar": "PRESET", "help": "paper, diverse or a YAML file"}
-    which.add_argument("preset", nargs="?", default=argparse.SUPPRESS, **named)
-    which.add_argument("--preset", **named)
-    add = generate.add_argument
+def generate(command: argparse.ArgumentParser) -> None:
+    """Draw training samples into a folder."""
+    add = command.add_argument
+    add("preset", metavar="PRESET", help="paper, diverse or a YAML file")
     add("--out", required=True, metavar="DIR", help="folder of the samples")
     add("--count", type=int, default=1000, metavar="N", help="default: 1000")
     add("--seed", type=int, default=0, metavar="N")
@@ -153,20 +135,9 @@ def _generate(generate: argparse.ArgumentParser) -> None:
     add("--workers", type=int, default=1, metavar="N", help="processes")
 
 
-def _init(init: argparse.ArgumentParser) -> None:
-    init.add_argument("directory", metavar="DIR", help="folder with rgb/ and depth/")
-
-
-COMMANDS = {
-    "run": ("Estimate the camera motion of a sequence", _run),
-    "compare": ("Run methods side by side and write a report", _compare),
-    "show": ("Draw the maps of one pair of a sequence", _show),
-    "evaluate": ("Errors of a trajectory file against ground truth", _evaluate),
-    "doctor": ("What is missing here, or wrong with a sequence", _doctor),
-    "demo": ("Render a scene with moving objects and run on it", _demo),
-    "generate": ("Draw training samples into a folder", _generate),
-    "init": ("Write a camera.yaml to fill in, for a recording of your own", _init),
-}
+def init(command: argparse.ArgumentParser) -> None:
+    """Write a camera.yaml to fill in for your recording."""
+    command.add_argument("directory", metavar="DIR", help="folder with rgb/ and depth/")
 
 
 # -- options --------------------------------------------------------------------------------------

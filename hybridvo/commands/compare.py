@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import itertools
-import json
 import logging
 import os
 import platform
@@ -17,9 +16,9 @@ import re
 import shutil
 from collections.abc import Iterable, Mapping
 from collections.abc import Sequence as Several
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -31,7 +30,7 @@ from hybridvo.evaluation import scores
 from hybridvo.evaluation.pair_errors import ERRORS, pair_facts, true_motion, true_trajectory
 from hybridvo.evaluation.protocols import check_protocol, protocol_summary, same_intrinsics
 from hybridvo.evaluation.report import write_report
-from hybridvo.files import Mode, atomic_write, held, make_folder, versions, write_csv, write_json
+from hybridvo.files import Mode, atomic_write, held, make_folder, versions, write_json
 from hybridvo.network.models import Models
 from hybridvo.options import Options
 from hybridvo.pipeline import METHODS, check_method, warm_up, weights_hash
@@ -52,7 +51,6 @@ def compare(
     dataset: str | None = None,
     protocol: Literal["paper"] | None = None,
     weights: Mapping[str, str] | None = None,
-    worst: int = 3,
     mode: Mode = "new",
     command: Iterable[str] = (),
     quiet: bool = True,
@@ -61,12 +59,9 @@ def compare(
 
     A folder of ``sequences`` stands for all that it holds; the method ``all`` for all that can run,
     the flow ``auto`` for every source that a sequence has, side by side. ``protocol`` scores MPI
-    Sintel as the paper does, ``weights`` names files of networks, ``worst`` counts the pairs
-    listed for each method and flow. ``resume`` keeps finished runs.
+    Sintel as the paper does, ``weights`` names files of networks. ``resume`` keeps finished runs.
     """
     out, options = Path(out), options or Options()
-    if worst < 0:
-        raise InputError(f"--worst: expected 0 or more, got {worst}.")
     models = Models(options.run.device, weights)
     names, missing = methods_to_run(methods, models)
     jobs = _jobs(sequences, dataset, options, out)
@@ -86,37 +81,37 @@ def compare(
             _logger.warning("not run: %s: %s", name, reason)
         for name in names:
             warm_up(name, models)
-        given = list(command)
+        tables, rows, facts = [], [], []
         for job in jobs:
-            missing |= job.run(names, options, models, given, quiet)
+            given = {"models": models, "command": list(command), "quiet": quiet}
+            runs = _run_all(job, names, options, given, missing)
+            table, fact = _read(job, runs, protocol is not None)
+            rows += [_row(job, table, key, run, out) for key, run in runs.items()]
+            tables.append(table)
+            facts.append(fact)
+        table = pd.concat(tables, ignore_index=True)
+        totals = scores.totals(table, rows)
         result: dict[str, Any] = {
-            "command": given,
+            "command": list(command),
             "versions": versions(),
             "machine": {"platform": platform.platform(), "cpus": os.cpu_count()},
             "options": dataclasses.asdict(options),
             "weights": {name: weights_hash(name, models) for name in names},
             "timing": "one estimate at a time",
             "missing": missing,
+            "rows": rows,
+            "totals": totals,
+            "sequences": facts,
+            "protocol": None if protocol is None else protocol_summary(totals, facts),
         }
-        tables, facts = zip(*(_read(job, protocol is not None) for job in jobs), strict=True)
-        table = pd.concat(tables, ignore_index=True)
-        rows = [row for two in zip(jobs, tables, strict=True) for row in _rows(*two, out)]
-        totals = scores.totals(table, rows)
-        result |= {"rows": rows, "totals": totals, "sequences": facts}
-        result["worst_pairs"] = scores.worst_pairs(table, worst)
-        result["protocol"] = None if protocol is None else protocol_summary(totals, facts)
-        _write(out, result, table)
+        write_json(out / "results.json", result)
+        lines = pd.DataFrame(rows, dtype=object).drop(columns="reasons")
+        pairs = table[list(scores.PAIR_COLUMNS)]
+        for name, data in (("results.csv", lines), ("pairs.csv", pairs)):
+            with atomic_write(out / name) as file:
+                data.to_csv(file, index=False, lineterminator="\n")
+        write_report(out, result, table)
     return [out / name for name in WRITTEN]
-
-
-def _write(out: Path, result: dict[str, Any], table: pd.DataFrame) -> None:
-    """Write :data:`WRITTEN`."""
-    with atomic_write(out / "pairs.csv") as file:
-        table[list(scores.PAIR_COLUMNS)].to_csv(file, index=False, lineterminator="\n")
-    write_json(out / "results.json", result)
-    columns = [name for name in result["rows"][0] if name != "reasons"]
-    write_csv(out / "results.csv", columns, result["rows"])
-    write_report(out, result, table)
 
 
 def methods_to_run(
@@ -157,42 +152,43 @@ def open_all(path: str | os.PathLike[str], dataset: str | None = None) -> list[S
         return found
 
 
-@dataclass
-class _Job:
-    """One sequence: its flows by label, and the runs that are done, by method and flow."""
+class _Job(NamedTuple):
+    """One sequence: its flows by label, and the folder of its runs."""
 
     sequence: Sequence
     name: str
     folder: Path
     flows: tuple[str, ...]
-    runs: dict[tuple[str, str], Path] = field(default_factory=dict)
 
-    def run(
-        self,
-        methods: Iterable[str],
-        options: Options,
-        models: Models,
-        command: list[str],
-        quiet: bool,
-    ) -> dict[str, str]:
-        """Every method on every flow; a bug of one costs its run, and is told."""
-        raised = {}
-        for flow, method in itertools.product(self.flows, methods):
-            source = flow.split()[0]
-            folder = self.folder / f"{method}-{source}"
-            single = {"method": method, "max_failed": 1.0}
-            asked = _with(options, run=single, flow={"source": source})
-            given: dict[str, Any] = {"models": models, "command": command, "quiet": quiet}
-            try:
-                run(self.sequence, folder, asked, mode="resume", quick=True, **given)
-            except HybridVOError:
-                raise
-            except Exception as error:
-                raised[f"{method} on {self.name}"] = f"{type(error).__name__}: {error}"
-                _logger.exception("%s on %s", method, self.name)
-                continue
-            self.runs[method, flow] = folder
-        return raised
+
+Runs = dict[tuple[str, str], dict[str, Any]]
+"""Summaries of the runs of a sequence that are done, by method and flow."""
+
+
+def _run_all(
+    job: _Job,
+    methods: Iterable[str],
+    options: Options,
+    given: dict[str, Any],
+    missing: dict[str, str],
+) -> Runs:
+    """Every method on every flow; a bug of one costs its run, and is told in ``missing``."""
+    runs = {}
+    for flow, method in itertools.product(job.flows, methods):
+        source = flow.split()[0]
+        folder = job.folder / f"{method}-{source}"
+        single = {"method": method, "max_failed": 1.0}
+        asked = _with(options, run=single, flow={"source": source})
+        try:
+            summary, _ = run(job.sequence, folder, asked, mode="resume", quick=True, **given)
+        except HybridVOError:
+            raise
+        except Exception as error:
+            missing[f"{method} on {job.name}"] = f"{type(error).__name__}: {error}"
+            _logger.exception("%s on %s", method, job.name)
+            continue
+        runs[method, flow] = summary | {"out": folder}  # a resumed one may have been elsewhere
+    return runs
 
 
 def _with(options: Options, **groups: dict[str, Any]) -> Options:
@@ -229,10 +225,10 @@ def _jobs(
     return jobs
 
 
-def _read(job: _Job, same_camera_only: bool) -> tuple[pd.DataFrame, dict[str, Any]]:
+def _read(job: _Job, runs: Runs, same_camera_only: bool) -> tuple[pd.DataFrame, dict[str, Any]]:
     """Pairs of all runs as one table, and what is said of the sequence."""
     sequence = job.sequence
-    table = pd.concat([_pairs(job, *run) for run in job.runs.items()])
+    table = pd.concat([_pairs(job.name, *key, run["out"]) for key, run in runs.items()])
     first = table.drop_duplicates("next")
     missing = first[first["missing"]]
     left_out = [
@@ -267,7 +263,7 @@ def _read(job: _Job, same_camera_only: bool) -> tuple[pd.DataFrame, dict[str, An
     }
 
 
-def _pairs(job: _Job, run: tuple[str, str], folder: Path) -> pd.DataFrame:
+def _pairs(name: str, method: str, flow: str, folder: Path) -> pd.DataFrame:
     """Motions of one run."""
     steps = pd.read_csv(folder / "steps.csv", dtype={"reason": str, "message": str})
     stride = int(np.diff(steps["index"][:2]).sum())
@@ -275,9 +271,9 @@ def _pairs(job: _Job, run: tuple[str, str], folder: Path) -> pd.DataFrame:
     missing = steps["reason"] == "missing_frame"
     steps.loc[missing, [*ERRORS, "motion_ms", "flow_ms"]] = np.nan
     return steps.assign(
-        sequence=job.name,
-        method=run[0],
-        flow_source=run[1],
+        sequence=name,
+        method=method,
+        flow_source=flow,
         status=steps["status"] + steps["reason"].map(lambda why: f"({why})" if why else ""),
         ms=steps["motion_ms"],
         prev=steps["prev_index"].astype(int),
@@ -287,19 +283,15 @@ def _pairs(job: _Job, run: tuple[str, str], folder: Path) -> pd.DataFrame:
     )
 
 
-def _rows(job: _Job, table: pd.DataFrame, out: Path) -> list[dict[str, Any]]:
-    """Lines of the results: one a run."""
-    rows = []
-    for (method, flow), folder in job.runs.items():
-        mine = table[(table["method"] == method) & (table["flow_source"] == flow)]
-        named = {"sequence": job.name, "method": method, "flow_source": flow}
-        named |= {"depth_source": job.sequence.depth_source}
-        report = None
-        if (folder / "metrics.json").exists():
-            report = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
-        path = (folder / "trajectory.tum").relative_to(out).as_posix()
-        rows.append(scores.sequence_row(mine, report, named) | {"trajectory": path})
-    return rows
+def _row(
+    job: _Job, table: pd.DataFrame, key: tuple[str, str], run: dict[str, Any], out: Path
+) -> dict[str, Any]:
+    """Line of the results of a run."""
+    mine = table[(table["method"] == key[0]) & (table["flow_source"] == key[1])]
+    named = {"sequence": job.name, "method": key[0], "flow_source": key[1]}
+    named |= {"depth_source": job.sequence.depth_source}
+    path = (run["out"] / "trajectory.tum").relative_to(out).as_posix()
+    return scores.sequence_row(mine, run["metrics"], named) | {"trajectory": path}
 
 
 def _facts(sequence: Sequence, prev: int, curr: int) -> dict[str, Any]:

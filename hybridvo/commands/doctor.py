@@ -1,6 +1,6 @@
 """``hybridvo doctor``: what is installed here, which methods can run, what is wrong with data.
 
-Of a sequence five questions are asked. What the data do not show is said to be unknown: an answer
+Of a sequence four questions are asked. What the data do not show is said to be unknown: an answer
 is ``agrees``, ``differs`` or ``cannot_tell``, with a sentence and a value.
 """
 
@@ -9,7 +9,6 @@ from __future__ import annotations
 import platform
 from typing import Any
 
-import cv2
 import numpy as np
 import pandas as pd
 
@@ -24,28 +23,18 @@ from hybridvo.flow import contradiction, dis_flow, file_flow
 from hybridvo.pipeline import estimate
 from hybridvo.refinement.covariance import direction_is_known
 from hybridvo.refinement.depth import compare_depths
-from hybridvo.results import RelativePose
-from hybridvo.types import Frame, FramePair, depth_advice, typical_depth
+from hybridvo.types import Frame, depth_advice, typical_depth
 
 MIN_PAIRS = 6
-"""Fewer pairs decide neither the scale of depth nor its place in the image."""
+"""Fewer pairs do not decide the scale of depth."""
 MAX_SCALE_ERROR = 0.2
 """Wrong units err by more, noisy ground truth over short motions by half of that."""
-MIN_SHIFT_GAIN = 0.0015
-"""Fall of the cost: registered sequences give up to 0.0008, shifted by 2 and 3 px over 0.0022."""
 MAX_GREY_STEP = 0.15
 """Change of the logarithm of the mean brightness between neighbours that is called a step."""
 DARK_LEVEL = 20.0
 """Grey levels (of 255) below which nine tenths of a dark image lie; of a street at night, 60."""
 MAX_CONTRADICTED = 0.2
 """Fraction of the pairs whose flow may contradict their images."""
-REACH_PX = 4
-"""Largest shift of the depth map that is tried."""
-MIN_PIXELS, MAX_PIXELS = 100, 3000
-"""Pixels at depth edges that a pair needs, and that are looked at."""
-MIN_GRADIENT = 16.0
-"""Of a textured pixel, grey levels by Sobel's filter."""
-
 Answer = tuple[bool | None, str, Any]
 """Whether something differs (None: cannot tell), why, and a value or None."""
 
@@ -125,51 +114,11 @@ def _measure(sequence: Sequence, prev: Frame, curr: Frame) -> dict[str, Any]:
             pair["depth"] = pair["depth"][0], scale
     depths = compare_depths(by_dis, motion.T_curr_prev, motion.weights)
     pair["depth_ratio"] = None if depths is None else depths.ratio
-    pair["shift_costs"] = _shift_costs(by_dis, motion)
     return pair
 
 
 def _is_dark(rgb: np.ndarray | None) -> bool:
     return rgb is not None and float(np.percentile(rgb[::4, ::4].max(axis=2), 90)) < DARK_LEVEL
-
-
-def _shift_costs(pair: FramePair, motion: RelativePose) -> np.ndarray | None:
-    """(9, 9) mean image cost, 0 to 1, of pixels at depth edges under shifts of the depth map."""
-    prev, curr, weights, depth = pair.prev, pair.curr, motion.weights, pair.prev.depth
-    if weights is None or weights.shape != prev.camera.shape or depth is None:
-        return None
-    first, second = (
-        cv2.GaussianBlur(cv2.cvtColor(f.rgb, cv2.COLOR_RGB2GRAY), (0, 0), 1.0).astype(np.float32)
-        for f in (prev, curr)
-        if f.rgb is not None
-    )
-    # textured static pixels near edges of 5 % in depth
-    valid = np.isfinite(depth) & (depth > 0)
-    log = np.log(np.where(valid, depth, 1.0)).astype(np.float32)
-    reach = np.ones((2 * REACH_PX + 1,) * 2, np.uint8)
-    usable = cv2.dilate(log, reach) - cv2.erode(log, reach) > 0.05
-    usable &= cv2.erode(np.pad(valid, 1).astype(np.uint8), reach)[1:-1, 1:-1] > 0
-    usable &= cv2.blur(weights.astype(np.float32), (15, 15)) > 0.5
-    gradient = cv2.magnitude(cv2.Sobel(first, cv2.CV_32F, 1, 0), cv2.Sobel(first, cv2.CV_32F, 0, 1))
-    textured = gradient > max(np.median(gradient[usable]) if usable.any() else 0, MIN_GRADIENT)
-    pixels = np.argwhere(usable & textured)
-    if len(pixels) < MIN_PIXELS:
-        return None
-    rows, columns = pixels[:: max(1, len(pixels) // MAX_PIXELS)].T
-    R, t = motion.T_curr_prev[:3, :3], motion.T_curr_prev[:3, 3]
-    rays = np.stack([columns, rows, np.ones_like(rows)], axis=1) @ np.linalg.inv(prev.camera.K).T
-
-    def difference(down: int, right: int) -> np.ndarray:
-        points = (depth[rows + down, columns + right, None] * rays @ R.T + t) @ curr.camera.K.T
-        place = (points[:, :2] / np.maximum(points[:, 2:], 1e-6)).astype(np.float32)
-        there = cv2.remap(second, place[:, :1], place[:, 1:], cv2.INTER_LINEAR)[:, 0]
-        return there - first[rows, columns]
-
-    shifts = range(-REACH_PX, REACH_PX + 1)
-    residuals = np.array([[difference(down, right) for right in shifts] for down in shifts])
-    residuals -= np.median(residuals, axis=2, keepdims=True)  # a change of brightness
-    scale = max(1.4826 * float(np.median(np.abs(residuals))), 1.0)
-    return (residuals**2 / (residuals**2 + scale**2)).mean(axis=2)
 
 
 # -- answers: of what is known of the pairs, by their first frame ---------------------------------
@@ -213,18 +162,6 @@ def _depth_steps(known: pd.Series) -> Answer:
     return steps > 0, text, float(ratios[k])
 
 
-def _depth_against_colour(known: pd.Series) -> Answer:
-    if len(known) < MIN_PAIRS:
-        return None, f"{len(known)} pairs with textured depth edges, {MIN_PAIRS} needed", None
-    cost = np.mean(known.tolist(), axis=0)
-    down, right = (int(k) - REACH_PX for k in np.unravel_index(np.argmin(cost), cost.shape))
-    text = f"the depth map stands {right:+d} px right, {down:+d} px down of the image"
-    is_shifted = bool(cost[REACH_PX, REACH_PX] - cost.min() > MIN_SHIFT_GAIN)
-    if is_shifted:
-        text += ": register depth to colour, or give the intrinsics of the colour camera"
-    return is_shifted, f"{text} (searched to {REACH_PX})", [right, down]
-
-
 def _exposure(known: pd.Series) -> Answer:
     if known.empty:
         return None, "no pair has two images", None
@@ -253,7 +190,6 @@ def _images_against_flow(known: pd.Series) -> Answer:
 QUESTIONS = {
     "depth units": ("depth", _units),
     "depth from frame to frame": ("depth_ratio", _depth_steps),
-    "depth against colour": ("shift_costs", _depth_against_colour),
     "exposure": ("light", _exposure),
     "images against flow": ("contradiction", _images_against_flow),
 }

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
+from hybridvo.commands.progress import Progress
 from hybridvo.errors import InputError
 from hybridvo.evaluation.plots import Panel, draw_panels, flow_colours, longest_flow
 from hybridvo.files import atomic_write
@@ -22,20 +23,21 @@ def generate(
     seed: int = 0,
     size: Sequence[int] | None = None,
     workers: int = 1,
-    report: Callable[[int], object] = lambda done: None,
+    quiet: bool = True,
 ) -> Path:
     """Draw samples, and a contact sheet of the first; goes on where it was interrupted.
 
     ``preset`` is ``paper``, ``diverse`` or a file such as ``configs/data_paper.yaml``, ``size``
-    (height, width) instead of its own; ``report`` is told of the samples done.
+    (height, width) instead of its own.
     """
     own = {} if size is None else dict(zip(("height", "width"), size, strict=True))
     if not Path(preset).is_file() and preset not in PRESETS:
         known = ", ".join(PRESETS)
-        raise InputError(f"--preset: expected {known} or a YAML file, got {preset!r}.")
+        raise InputError(f"preset: expected {known} or a YAML file, got {preset!r}.")
     values = {"preset": preset} if preset in PRESETS else read_yaml(preset)
-    for done in write_samples(make_preset(values | own, preset), count, out, seed, workers):
-        report(done)
+    with Progress("generate", count, "samples", quiet=quiet) as bar:
+        for done in write_samples(make_preset(values | own, preset), count, out, seed, workers):
+            bar.update(done)
     sheet = Path(out) / "contact_sheet.png"
     write_sheet([read_sample(out, i) for i in range(min(6, count))], sheet)
     return sheet

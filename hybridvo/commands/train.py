@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
 import math
 import shlex
 import signal
@@ -73,10 +72,9 @@ def add_train(
     data("--propose", metavar="NETWORK", help="ask these weights about the samples")
 
 
-def train(args: argparse.Namespace, command: list[str]) -> tuple[Any, str, int]:
-    """Run the command; what it gives, JSON-ready and for people, and the exit code."""
-    content = args.train(args, shlex.join(command))
-    return content, json.dumps(content, indent=1), 0
+def train(args: argparse.Namespace, command: list[str]) -> tuple[Any, int]:
+    """Run the command; what it gives, JSON-ready, and the exit code."""
+    return args.train(args, shlex.join(command)), 0
 
 
 def _pwvo(args: argparse.Namespace, command: str) -> dict[str, Any]:

@@ -5,9 +5,9 @@ What the paths do not determine is a :class:`DegenerateError`; a report holds No
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 import pandas as pd
@@ -30,8 +30,7 @@ LENGTHS = {
 """Sub-paths in metres: of KITTI's odometry benchmark, and for indoor sequences (TartanAir's)."""
 
 
-@dataclass(frozen=True, eq=False)
-class Match:
+class Match(NamedTuple):
     """Poses (M, 4, 4) of two trajectories that belong together, at (M,) stamps of the truth.
 
     ``by`` is ``time`` or ``index``, ``reason`` says why no error can be computed from the matches.
@@ -41,25 +40,20 @@ class Match:
     gt: np.ndarray
     stamps: np.ndarray
     by: str
-    reason: str = ""
+    reason: str
 
 
-@dataclass(frozen=True, eq=False)
-class PathError:
-    """Distances (M,) of matched positions, m, at (M,) stamps of the ground truth.
+class PathError(NamedTuple):
+    """Distances (M,) of matched positions, m, at (M,) stamps, and their root mean square.
 
     An estimated position p was taken as ``T_gt_est @ (scale p)``.
     """
 
     translation: np.ndarray
     stamps: np.ndarray
+    rmse: float
     T_gt_est: np.ndarray
     scale: float
-
-    @property
-    def rmse(self) -> float:
-        """Root mean square of the distances, m."""
-        return _rms(self.translation)
 
 
 def match(est: Trajectory, gt: Trajectory, max_diff: float | None = None) -> Match:
@@ -118,7 +112,7 @@ def ate(found: Match, alignment: Alignment = "se3") -> PathError:
         R, t, scale = umeyama_alignment(est.T, gt.T, with_scale=alignment == "sim3")
         T = make_transform(R, t)
     error = np.linalg.norm(scale * est @ T[:3, :3].T + T[:3, 3] - gt, axis=1)
-    return PathError(error, found.stamps, T, float(scale))
+    return PathError(error, found.stamps, _rms(error), T, float(scale))
 
 
 def _check_shape(est: np.ndarray, gt: np.ndarray) -> None:
@@ -188,13 +182,16 @@ def rpe(
     return _relative(found.est, found.gt, first[inside], last[inside])
 
 
-def kitti_drift(est: np.ndarray, gt: np.ndarray, lengths: Sequence[float]) -> dict[str, Any]:
-    """Drift of (N, 4, 4) poses as KITTI's odometry benchmark defines it (Geiger et al., CVPR 2012).
+def kitti_drift(found: Match, lengths: Sequence[float]) -> dict[str, Any]:
+    """Drift of matched poses as KITTI's odometry benchmark defines it (Geiger et al., CVPR 2012).
 
     From every frame and for every length L (m), the sub-path ends at the first frame whose distance
     along the true path exceeds L; translation (a fraction) and angle of its relative error are
     divided by L and averaged within each length, then over the lengths. Nothing is aligned.
     """
+    if found.reason:
+        raise DegenerateError(found.reason)
+    est, gt = found.est, found.gt
     steps = np.linalg.norm(np.diff(gt[:, :3, 3], axis=0), axis=1)
     distance = np.concatenate([[0.0], np.cumsum(steps)])
     means, segments = [], 0
@@ -204,11 +201,11 @@ def kitti_drift(est: np.ndarray, gt: np.ndarray, lengths: Sequence[float]) -> di
         if len(first):
             means.append([e.mean() / length for e in _relative(est, gt, first, last[first])])
             segments += len(first)
-    names = ("translation", "rotation_deg_per_m")
-    values = np.mean(means, axis=0).tolist() if means else [None, None]
-    short = f"the true path of {distance[-1]:.4g} m is shorter than {min(lengths):g} m"
-    reasons = {} if means else dict.fromkeys(names, short)
-    return {"segments": segments, "reasons": reasons, **dict(zip(names, values, strict=True))}
+    if not means:
+        reason = f"the true path of {distance[-1]:.4g} m is shorter than {min(lengths):g} m"
+        raise DegenerateError(reason)
+    translation, rotation = np.mean(means, axis=0).tolist()
+    return {"segments": segments, "translation": translation, "rotation_deg_per_m": rotation}
 
 
 def evaluate(
@@ -246,8 +243,8 @@ def evaluate(
     report |= {"total": min(len(estimate), len(gt)), "evo_version": evo.__version__.lstrip("v")}
     reasons: dict[str, str] = {}
 
-    def put(names: Sequence[str], compute: Callable[[], Iterable[float]]) -> None:
-        values: Iterable[float | None] = [None] * len(names)
+    def put(names: Sequence[str], compute: Callable[[], Iterable[Any]]) -> None:
+        values: Iterable[Any] = [None] * len(names)
         try:
             values = compute()
         except DegenerateError as error:
@@ -268,6 +265,5 @@ def evaluate(
     put(["ate_rmse_sim3", "scale_sim3"], lambda: absolute("sim3"))
     put(["rpe_trans_rmse", "rpe_trans_mean", "rpe_rot_rmse_deg"], relative)
     for key, lengths in LENGTHS.items():
-        report[key] = None if found.reason else kitti_drift(found.est, found.gt, lengths)
-        reasons |= {key: found.reason} if found.reason else {}
+        put([key], functools.partial(lambda some: [kitti_drift(found, some)], lengths))
     return report | {"reasons": reasons}

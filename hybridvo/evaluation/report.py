@@ -62,12 +62,10 @@ def write_report(folder: Path, result: Mapping[str, Any], pairs: pd.DataFrame) -
     paths = {name: charts.path_charts(folder, result, pairs, name, methods) for name in names}
     every = [row for _, rows in by_flow(result, "rows") for row in rows]
     content = {
-        "headline": headline(result),
         "result": result,
         "pairs": len(pairs.drop_duplicates(["sequence", "index"])),
         "methods": methods,
         "tables": [(flow, (rows, COLUMNS, ("method",))) for flow, rows in by_flow(result)],
-        "worst": [e | {"error": number(e["epe_l2_px"])} for e in result["worst_pairs"]],
         "sections": [(name, _json(some)) for name, some in sections.items() if some],
         "sequences": [(name, _json(some)) for name, some in paths.items()],
         "protocol": _protocol_tables(result.get("protocol")),
@@ -82,33 +80,17 @@ def write_report(folder: Path, result: Mapping[str, Any], pairs: pd.DataFrame) -
 
 
 def by_flow(result: Mapping[str, Any], key: str = "totals") -> list[tuple[str, list[Any]]]:
-    """Rows by source of flow, estimated ones first."""
+    """Rows by source of flow, estimated ones first; in each the fewest failures first."""
+
+    def rank(row: Mapping[str, Any]) -> tuple[float, ...]:
+        errors = row["failure_rate"], row["epe_l2_px_median"]
+        return tuple(math.inf if error is None else error for error in errors)
+
     flows = sorted(dict.fromkeys(row["flow_source"] for row in result[key]), key=is_oracle)
-    return [(flow, [r for r in result[key] if r["flow_source"] == flow]) for flow in flows]
-
-
-def ranking(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
-    """Scored rows of one source of flow: fewest failures first, then the smallest median error."""
-    scored = [r for r in rows if r["epe_l2_px_median"] is not None and r["method"] != "identity"]
-    return sorted(scored, key=lambda row: (row["failure_rate"], row["epe_l2_px_median"]))
-
-
-def headline(result: Mapping[str, Any]) -> str:
-    """One sentence: who won, by how much, under which flow."""
-    flow, rows = by_flow(result)[0]
-    order = ranking(rows)
-    if not order:
-        return "Nothing is scored: no pair has ground truth and depth."
-    first, oracle = order[0], ", an oracle" if is_oracle(flow) else ""
-    text = (
-        f"With {flow} flow{oracle}, {first['method']} has the smallest errors: median "
-        f"{number(first['epe_l2_px_median'])} px (error of the ego flow), {first['failures']} of "
-        f"{first['pairs']} pairs failed (above 1 px, or given up)"
-    )
-    for row in order[1:2]:
-        error = number(row["epe_l2_px_median"])
-        text += f"; next is {row['method']}: {error} px, {row['failures']} failed"
-    return text + "."
+    return [
+        (flow, sorted((r for r in result[key] if r["flow_source"] == flow), key=rank))
+        for flow in flows
+    ]
 
 
 def number(value: float | None, digits: int = 3) -> str:

@@ -142,19 +142,3 @@ def total_row(pairs: pd.DataFrame, rows: Sequence[Mapping[str, Any]]) -> dict[st
     named = {"method": rows[0]["method"], "flow_source": rows[0]["flow_source"]}
     named |= {"sequence": "all", "depth_source": depth, "alignment": "se3"}
     return {**named, "sequences": len(rows), **scores}
-
-
-def worst_pairs(pairs: pd.DataFrame, count: int = 3) -> list[dict[str, Any]]:
-    """The ``count`` worst pairs of each method and flow source, worst first.
-
-    Pairs without a known error come last, and only if their estimate failed.
-    """
-    columns = ["sequence", "index", "status", "message", *ERRORS, *FACTORS]
-    found = []
-    for (method, flow), group in pairs.groupby(["method", "flow_source"], sort=False):
-        known = group[group["epe_l2_px"].notna() | is_failed(group)]
-        worst = known.sort_values("epe_l2_px", ascending=False, kind="stable").head(count)
-        for rank, row in enumerate(worst[columns].to_dict("records"), 1):
-            values = {k: known_number(v) if isinstance(v, float) else v for k, v in row.items()}
-            found.append({"method": method, "flow_source": flow, "rank": rank, **values})
-    return found

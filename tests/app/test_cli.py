@@ -28,7 +28,7 @@ def test_version_and_help(capsys):
     for word in "--camera --depth-scale --mask --weights --config --set --method".split():
         assert word in text
     assert main(["run", "x", "--set", "help"]) == 0
-    assert "refine.cutoff=" in capsys.readouterr().out
+    assert '"refine.cutoff":' in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

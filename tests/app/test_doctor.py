@@ -58,16 +58,9 @@ def changed(recorded: Recorded, change: Callable[[int, Frame], Frame], **more: A
 
 def test_a_clean_sequence_is_not_accused(recorded):
     report = diagnose(recorded)
-    assert report["ok"], text_of("diagnosis", report)
-    assert len(report["findings"]) == 5 and report["pairs"] == 8
+    assert report["ok"], text_of("doctor", report)
+    assert len(report["findings"]) == 4 and report["pairs"] == 8
     assert finding(report, "depth units")["value"] == pytest.approx(1.0, abs=0.05)
-
-
-def test_depth_that_is_shifted_against_colour_is_found(recorded):
-    report = changed(recorded, lambda k, f: replace(f, rgb=np.roll(f.rgb, 3, axis=1)))
-    found = finding(report, "depth against colour")
-    assert found["state"] == "differs" and not report["ok"]
-    assert -4.0 < found["value"][0] < -1.0 < found["value"][1] < 1.0
 
 
 def test_units_and_exposure(recorded):
@@ -93,7 +86,7 @@ def test_a_scale_that_changes_on_the_way(recorded):
 def test_what_cannot_be_seen_is_said(recorded):
     report = changed(recorded, lambda k, f: replace(f, rgb=None), poses=None)
     assert {found["state"] for found in report["findings"]} == {"cannot_tell"}
-    assert report["ok"] and "5 of 5" in text_of("diagnosis", report)
+    assert report["ok"] and "4 of 4" in text_of("doctor", report)
 
 
 def test_a_broken_frame_does_not_end_the_diagnosis(recorded):

@@ -176,8 +176,6 @@ def test_without_ground_truth_there_are_reasons(walk: Path, tmp_path: Path) -> N
     for row in result["rows"]:
         for key in ("epe", "epe_l2_px", "ate_rmse", "rot_err_deg_mean", "failure_rate"):
             assert row[key] is None and row["reasons"][key]
-    text = (tmp_path / "out" / "report.md").read_text()
-    assert "Nothing is scored" in text
 
 
 def test_a_bug_of_a_method_costs_its_run(tiny: Path, tmp_path: Path, monkeypatch) -> None:
@@ -202,7 +200,6 @@ def test_refused_folders(tiny: Path, tmp_path: Path) -> None:
     [
         (["--methods", "pnp-ransak"], "pnp-ransac"),
         (["--methods", ","], "--methods"),
-        (["--worst", "-1"], "worst"),
         (["--start", "9"], "frames"),
         (["--stride", "2", "--flow", "file"], "stride"),
         (["--protocol", "paper"], "tiny"),

@@ -18,12 +18,11 @@ from hybridvo.evaluation.charts import (
 )
 from hybridvo.evaluation.metrics import evaluate
 from hybridvo.evaluation.protocols import protocol_summary
-from hybridvo.evaluation.report import headline, number, write_report
+from hybridvo.evaluation.report import number, write_report
 from hybridvo.evaluation.scores import (
     pair_table,
     sequence_row,
     total_row,
-    worst_pairs,
 )
 from hybridvo.geometry import se3_exp
 from hybridvo.trajectory import Trajectory
@@ -66,7 +65,7 @@ def results(tmp_path: Path) -> tuple[Path, dict[str, Any], pd.DataFrame]:
         **{"options": {}, "timing": "one at a time"},
         **{"missing": {"open3d-rgbd": "pip install open3d"}, "rows": rows, "totals": totals},
         "sequences": [{"name": NAME, "warnings": ["<script>"], "left_out": []} | gt_path],
-        **{"worst_pairs": worst_pairs(table, 1), "protocol": protocol_summary(totals, [scored])},
+        "protocol": protocol_summary(totals, [scored]),
     }
     return tmp_path, result, table
 
@@ -77,18 +76,14 @@ def own_part(page: str) -> str:
 
 
 def test_the_page_opens_with_the_winner_and_estimated_flow(results) -> None:
-    folder, result, _ = results
+    folder = results[0]
     write_report(*results)
     page, text = (folder / "report.html").read_text(), (folder / "report.md").read_text()
-    sentence = headline(result)
-    # refine has no failure with dis flow, hybrid has one: the sentence says whose pair it is
-    assert sentence.startswith("With dis flow, refine") and "hybrid" in sentence
-    for content in (own_part(page), text):
-        start = content.replace("&lt;", "<").replace("&gt;", ">")
-        assert sentence in start
-        assert start.index("dis flow") < start.index("file (true) flow")
     body = own_part(page)
-    assert body.index('<td>7.5</td><td class="text">ok') > body.index('id="worst"')
+    for start in (body, text):
+        assert start.index("dis flow") < start.index("file (true) flow")
+    # refine has no failure with dis flow, hybrid has one
+    assert text.index("| refine") < text.index("| hybrid") < text.index("| pnp-ransac")
     assert "open3d-rgbd" in body and "992" in body and "0.626" in body
 
 
@@ -117,13 +112,6 @@ def test_charts_show_every_method_and_no_single_bins(results) -> None:
     gt, *paths = above.data
     assert gt.name == "ground truth" and len(paths) == len(errors.data) == 3
     np.testing.assert_allclose(paths[0].x, gt.x, atol=1e-6)  # aligned: the same path
-
-
-def test_nothing_scored(results) -> None:
-    result = results[1]
-    for row in result["totals"]:
-        row["epe_l2_px_median"] = None
-    assert "Nothing is scored" in headline(result)
 
 
 @pytest.mark.parametrize(

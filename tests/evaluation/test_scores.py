@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,6 @@ from hybridvo.evaluation.scores import (
     pair_table,
     sequence_row,
     total_row,
-    worst_pairs,
 )
 from hybridvo.geometry import se3_exp
 from hybridvo.trajectory import Trajectory
@@ -85,22 +83,3 @@ def test_methods_without_flow_do_not_wait_for_it() -> None:
     pairs = table(row(0, 1.0, "identity", rot_err_deg=1.0, ms=1.0, flow_ms=50.0))
     named = {"sequence": "s", "method": "identity", "flow_source": "dis", "depth_source": "true"}
     assert sequence_row(pairs, None, named)["ms_with_flow_median"] == 1.0
-
-
-def test_the_worst_pairs_by_hand() -> None:
-    pairs = table(
-        row(0, 0.5),
-        row(1, 7.0),
-        row(2, None),  # unknown, not failed: left out
-        row(3, None, status="failed(no_flow)"),
-        row(4, 2.0),
-        row(0, math.nan, "b"),
-    )
-    worst = worst_pairs(pairs, 3)
-    assert [(entry["method"], entry["rank"], entry["index"]) for entry in worst] == [
-        ("a", 1, 1),
-        ("a", 2, 4),
-        ("a", 3, 0),
-    ]
-    assert worst_pairs(pairs, 4)[3]["epe_l2_px"] is None
-    assert worst_pairs(pairs, 0) == []
