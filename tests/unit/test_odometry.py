@@ -193,7 +193,7 @@ def test_a_frame_of_another_size_is_refused_and_changes_nothing() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"network": object()}, "expected .default.*got object"),
+        ({"network": object()}, "Odometry.network: expected str, got object"),
         ({"flow": 3}, "expected a callable"),
         ({"method": "refin"}, "did you mean 'refine'"),
         ({"method": "hybrid", "network": None}, "needs a network"),
