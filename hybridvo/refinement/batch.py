@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -80,8 +80,7 @@ class BatchedPose:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class Pixels:
+class Pixels(NamedTuple):
     """Pixels of a batch as the solver takes them; unusable ones have weight 0.
 
     Args:
@@ -105,9 +104,7 @@ class Pixels:
 
     def map(self, change: Callable[[torch.Tensor], torch.Tensor]) -> Pixels:
         """The same with every tensor changed."""
-        values = {f.name: getattr(self, f.name) for f in fields(self)}
-        changed: dict[str, Any] = {k: x if x is None else change(x) for k, x in values.items()}
-        return Pixels(**changed)
+        return Pixels._make(x if x is None else change(x) for x in self)
 
     def subset(self, count: int) -> Pixels:
         """About ``count`` usable pixels of each sample, spread by the golden section."""
@@ -125,7 +122,7 @@ class Pixels:
             return x.gather(x.ndim - 1, at)
 
         taken = self.map(take)
-        return replace(taken, weight=taken.weight * (spread < total))
+        return taken._replace(weight=taken.weight * (spread < total))
 
 
 def gather_pixels(

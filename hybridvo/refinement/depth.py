@@ -50,11 +50,10 @@ MIN_COMPARED, COMPARED = 100, 4000
 
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
-def look_up(samples, n, depth, out):
+def look_up(samples, n, depth):
     """Log of the current depth at the flow target of ``n`` pixels; NaN outside, at edges, holes."""
-    H, width = depth.shape
+    (H, width), out = depth.shape, np.full(n, np.nan, np.float32)
     for k in range(n):
-        out[k] = np.nan
         u = samples[MU, k]
         v = samples[MV, k]
         if not (samples[W, k] > 0 and u >= 0 and v >= 0 and u < width - 1 and v < H - 1):
@@ -70,6 +69,7 @@ def look_up(samples, n, depth, out):
             top = a + fu * (b - a)
             bottom = c + fu * (d - c)
             out[k] = math.log(top + fv * (bottom - top))
+    return out
 
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
@@ -111,9 +111,7 @@ def depth_scale(samples, log_depth, robust, pose, K, noise):
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
-def sum_depth(
-    samples, n, log_depth, pose, K, noise, sz, step, tile, columns, width, work, sums, meat
-):
+def sum_depth(samples, n, log_depth, pose, K, noise, sz, step, tile, columns, width, sums, meat):
     """Add the third residual's normal equations to the tiles' ``sums`` (tiles, 27).
 
     ``sz``: standard deviation of the conditional residual. The grid has ``width`` pixels, ``step``
@@ -121,7 +119,7 @@ def sum_depth(
     """
     c2, v = np.float64(noise[2]), sz * sz
     dummy, row, entries = np.zeros(SUMS), np.empty(6), pose_entries(pose)
-    cost = 0.0
+    cost, work = 0.0, new_work()
     for o in range(0, n, BLOCK):
         m = min(BLOCK, n - o)
         project_block(samples, o, m, pose, K, noise, work, work[8], dummy)
@@ -157,8 +155,7 @@ class DepthFactor:
         tile: int,
     ) -> None:  # fmt: skip
         self._samples, height, self._width = image.strided(stride)
-        self._log_depth = np.empty(height * self._width, np.float32)
-        look_up(self._samples, len(self._log_depth), curr, self._log_depth)
+        self._log_depth = look_up(self._samples, height * self._width, curr)
         self._image, self._stride, self._sigma = image, stride, sigma
         self._noise, self._tile = noise, tile
 
@@ -169,7 +166,7 @@ class DepthFactor:
         cost = sum_depth(
             self._samples, len(self._log_depth), self._log_depth, T[:3], self._image.K,
             self._noise, self._sigma, self._stride, self._tile, columns, self._width,
-            new_work(), tiles, self.meat,
+            tiles, self.meat,
         )  # fmt: skip
         self.tiles = tiles.reshape(rows, columns, COST)
         sums = tiles.sum(axis=0)
