@@ -79,7 +79,7 @@ class HypothesisSet:
         maps = grid.samples[:, :n].reshape(-1, h, w)
         log_depth = np.full(n, np.nan, np.float32)
         if pair.curr.depth is not None:
-            look_up(grid.samples, n, as_contiguous(pair.curr.depth), log_depth)
+            log_depth = look_up(grid.samples, n, as_contiguous(pair.curr.depth))
         return GridMaps(
             ray=maps[[kernels.XN, kernels.YN]],
             depth=maps[kernels.Z],

@@ -22,15 +22,15 @@ from hybridvo.refinement.coarse_fit import (
     NOISE_PIXELS,
     anneal,
     left_update,
+    noise_of,
     reestimate,
     residual_coherence,
     residual_scale,
     robust_weights,
-    set_noise,
     solve6,
     translation_scale,
 )
-from hybridvo.refinement.kernels import FASTMATH, MAX_VALUE, MU, MV, XN, YN, W, Z, new_work
+from hybridvo.refinement.kernels import FASTMATH, MAX_VALUE, MU, MV, XN, YN, W, Z
 from hybridvo.refinement.pixels import CoarseGrid
 
 WINDOW_ROWS, WINDOW_COLUMNS = 3, 4
@@ -109,7 +109,7 @@ class _Search:
     def __init__(self, grid: CoarseGrid, options: Options, seed: int) -> None:
         self.grid, self.K, self.cutoff = grid, grid.pixels.K, options.refine.cutoff
         self.small, *self.small_shape, _ = grid.pixels.samples(options.search.grid_pixels)
-        self.samples, self.work, self.probes = grid.samples.copy(), new_work(), Probes(grid)
+        self.samples, self.probes = grid.samples.copy(), Probes(grid)
         self.similar = translation_scale(grid.samples, grid.count)
         self.rng = np.random.default_rng(seed)
         self.seen: list[Motion] = []
@@ -135,7 +135,7 @@ class _Search:
             gaps = np.abs(poses - poses[k]) * [1, 1, 1, self.similar]
             scores[gaps.max(axis=(1, 2)) < SAME_RAD] = 0
             pose = poses[k].copy()
-            steps = anneal(small, n, self.K, 1.5, 0.7, 0.4, 3, pose, self.work)
+            steps = anneal(small, n, self.K, 1.5, 0.7, 0.4, 3, pose)
             refined.append((self._score(pose), pose, sources[k], steps))
         found: list[Motion] = []
         for score, pose, source, steps in sorted(refined, key=lambda each: -each[0]):
@@ -155,7 +155,7 @@ class _Search:
             # would leave even the right motion
             for scale in (far, NEAR_PX)[: 1 + (s > 0)]:
                 pose = start.copy()
-                anneal(small, h * w, self.K, scale, 0.7, 0.4, 2, pose, self.work)
+                anneal(small, h * w, self.K, scale, 0.7, 0.4, 2, pose)
                 poses.append(pose)
                 sources.append(s)
         if samples:
@@ -180,7 +180,7 @@ class _Search:
                 continue
             pose = np.eye(3, 4)
             scale = min(WIDE_PX, max(1.0, residual_scale(few, m, pose, self.K)))
-            anneal(few, m, self.K, scale, 0.7, 0.4, 2, pose, self.work)
+            anneal(few, m, self.K, scale, 0.7, 0.4, 2, pose)
             if (np.abs(pose) < MAX_VALUE).all():
                 poses.append(pose)
         return poses
@@ -191,10 +191,10 @@ class _Search:
     def _finished(self, pose: np.ndarray, source: int, steps: int) -> Motion:
         """The motion fitted on all pixels that are left, with its noise."""
         pixels = self.samples, self.grid.count, self.K
-        steps += anneal(*pixels, 0.7, 0.5, 0.4, 3, pose, self.work)
+        steps += anneal(*pixels, 0.7, 0.5, 0.4, 3, pose)
         final, caps = pose.copy(), (FLOW_NOISE_CAP, DEPTH_NOISE_CAP)
         sf, sd, share, more = reestimate(
-            *pixels, 0.5, 0.01, *caps, self.cutoff, 2, 4, NOISE_PIXELS, final, self.work
+            *pixels, 0.5, 0.01, *caps, self.cutoff, 2, 4, NOISE_PIXELS, final
         )
         if self._score(final) > 0.95 * self._score(pose):
             pose = final
@@ -203,12 +203,10 @@ class _Search:
     def set_aside(self, motion: Motion) -> None:
         """Scale the weights of the pixels that follow a motion down to what it leaves."""
         pose, facts = motion
-        noise = np.empty(3, np.float32)
-        set_noise(max(facts[FLOW_NOISE], 0.05), facts[DEPTH_NOISE], ASIDE * self.cutoff, noise)
+        noise = noise_of(max(facts[FLOW_NOISE], 0.05), facts[DEPTH_NOISE], ASIDE * self.cutoff)
         h, w = self.small_shape
         for samples, n in ((self.samples, self.grid.count), (self.small, h * w)):
-            follows = np.empty(n, np.float32)
-            robust_weights(samples, n, pose, self.K, noise, self.work, follows)
+            follows = robust_weights(samples, n, pose, self.K, noise)
             samples[W, :n] *= np.maximum(0, 1 - FIRMLY * follows)
 
     def is_settled(self, motion: Motion) -> bool:

@@ -201,12 +201,11 @@ def nearest_motion(poses: np.ndarray, pose: np.ndarray, depth_scale: float) -> i
 def hypotheses(found: HypothesisSet, candidates: Sequence[Candidate]) -> list[Hypothesis]:
     """The candidates with their inliers, in their order."""
     grid, K = found.grid, found.grid.pixels.K
-    work, noise, made = kernels.new_work(), np.empty(3, np.float32), []
+    made = []
     for pose, facts, *_ in candidates:
-        inliers = np.empty(grid.count, np.float32)
         sf, sd = float(facts[search.FLOW_NOISE]), float(facts[search.DEPTH_NOISE])
-        coarse_fit.set_noise(max(sf, MIN_NOISE_PX), sd, SUPPORT_CUTOFF, noise)
-        coarse_fit.robust_weights(grid.samples, grid.count, pose, K, noise, work, inliers)
+        noise = coarse_fit.noise_of(max(sf, MIN_NOISE_PX), sd, SUPPORT_CUTOFF)
+        inliers = coarse_fit.robust_weights(grid.samples, grid.count, pose, K, noise)
         source = SOURCES.get(int(facts[search.SOURCE]), "start")
         share = _coverage(found, np.where(grid.weight > 0, inliers, 0))
         h, w, stride = grid.shape

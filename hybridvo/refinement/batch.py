@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -82,8 +82,7 @@ class BatchedPose:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class Pixels:
+class Pixels(NamedTuple):
     """Pixels of a batch as the solver takes them; unusable ones have weight 0.
 
     Args:
@@ -107,9 +106,7 @@ class Pixels:
 
     def map(self, change: Callable[[torch.Tensor], torch.Tensor]) -> Pixels:
         """The same with every tensor changed."""
-        values = {f.name: getattr(self, f.name) for f in fields(self)}
-        changed: dict[str, Any] = {k: x if x is None else change(x) for k, x in values.items()}
-        return Pixels(**changed)
+        return Pixels._make(x if x is None else change(x) for x in self)
 
     def subset(self, count: int) -> Pixels:
         """About ``count`` usable pixels of each sample, spread by the golden section."""
@@ -127,7 +124,7 @@ class Pixels:
             return x.gather(x.ndim - 1, at)
 
         taken = self.map(take)
-        return replace(taken, weight=taken.weight * (spread < total))
+        return taken._replace(weight=taken.weight * (spread < total))
 
 
 def gather_pixels(
@@ -248,17 +245,16 @@ def checked_batch(
         weights = torch.as_tensor(weights, device=flow.device)
         weights = weights[None] if weights.ndim == 2 and len(flow) == 1 else weights
     values = {k: v for k, v in {**vars(batch), "weights": weights}.items() if v is not None}
+    shapes = {"flow": flow.shape} | dict.fromkeys(("K_prev", "K_curr"), (len(flow), 3, 3))
     for name, value in values.items():
-        shape = (len(flow), 3, 3) if name.startswith("K_") else tuple(flow.shape[:3])
-        shape = tuple(flow.shape) if name == "flow" else shape
-        if tuple(value.shape) != shape or value.device != flow.device:
+        shape, is_mask = tuple(shapes.get(name, flow.shape[:3])), name == "valid"
+        fits = tuple(value.shape) == shape and value.device == flow.device
+        if not fits or (is_mask and value.dtype != torch.bool):
             raise InputError(
-                f"{where}: expected {name} of shape {shape} on {flow.device}, "
-                f"got {tuple(value.shape)} on {value.device}."
+                f"{where}: expected {name} of shape {shape} on {flow.device}{', bool' * is_mask}, "
+                f"got {tuple(value.shape)} on {value.device}, {value.dtype}."
             )
-        if name == "valid" and value.dtype != torch.bool:
-            raise InputError(f"{where}: expected PairBatch.valid as bool, got {value.dtype}.")
-        values[name] = value if name == "valid" else value.to(dtype)
+        values[name] = value if is_mask else value.to(dtype)
     weights = values.pop("weights", None)
     return PairBatch(**values), weights
 

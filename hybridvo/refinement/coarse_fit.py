@@ -14,14 +14,11 @@ from hybridvo.geometry import njit, se3_exp
 from hybridvo.refinement.kernels import (
     BLOCK,
     FASTMATH,
-    ONE,
     PD,
     PF,
     SUMS,
-    ZERO,
     W,
     Z,
-    keep_apart,
     new_work,
     pose_entries,
     project_block,
@@ -95,15 +92,14 @@ def left_update(delta, pose, out):
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
-def set_noise(flow_sigma, depth_sigma, cutoff, out):
-    """``out`` (3,) float32 = (1/sf^2, sd^2, c^2)."""
-    out[0] = 1.0 / (flow_sigma * flow_sigma)
-    out[1] = depth_sigma * depth_sigma
-    out[2] = cutoff * cutoff
+def noise_of(flow_sigma, depth_sigma, cutoff):
+    """(3,) float32 of (1/sf^2, sd^2, c^2), as the kernels take the noise."""
+    inverse = 1.0 / (flow_sigma * flow_sigma)
+    return np.array([inverse, depth_sigma * depth_sigma, cutoff * cutoff]).astype(np.float32)
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
-def gauss_newton(samples, n, total, K, noise, steps, tolerance_px, pose, work):
+def gauss_newton(samples, n, total, K, noise, steps, tolerance_px, pose):
     """Damped Gauss-Newton in place; a step is taken only where the robust cost does not rise.
 
     ``total``: sum of the external weights. Stops when the step moves the image by less than
@@ -111,7 +107,7 @@ def gauss_newton(samples, n, total, K, noise, steps, tolerance_px, pose, work):
     """
     acc, other, delta, candidate = np.zeros(SUMS), np.zeros(SUMS), np.zeros(6), np.empty((3, 4))
     full = 0.5 * np.float64(noise[2])
-    cost = sum_samples(samples, n, pose, K, noise, work, acc)
+    cost = sum_samples(samples, n, pose, K, noise, acc)
     cost += full * max(0.0, total - acc[29])  # pixels behind the camera
     damping = DAMPING
     done = 0
@@ -122,7 +118,7 @@ def gauss_newton(samples, n, total, K, noise, steps, tolerance_px, pose, work):
                 return done
             continue
         left_update(delta, pose, candidate)
-        new_cost = sum_samples(samples, n, candidate, K, noise, work, other)
+        new_cost = sum_samples(samples, n, candidate, K, noise, other)
         new_cost += full * max(0.0, total - other[29])
         done += 1
         if new_cost <= cost * (1.0 + 1e-9) + 1e-12:
@@ -165,106 +161,66 @@ def residual_scale(samples, n, pose, K):
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
-def anneal(samples, n, K, start_px, end_px, ratio, steps, pose, work):
+def anneal(samples, n, K, start_px, end_px, ratio, steps, pose):
     """Graduated Geman-McClure with isotropic noise, from ``start_px`` down to ``end_px``."""
-    noise = np.empty(3, np.float32)
     total = np.float64(np.sum(samples[W, :n]))
     scale = max(start_px, end_px)
     iterations = 0
     while True:
-        set_noise(scale, 0.0, 1.0, noise)
-        iterations += gauss_newton(samples, n, total, K, noise, steps, 0.1 * scale, pose, work)
+        noise = noise_of(scale, 0.0, 1.0)
+        iterations += gauss_newton(samples, n, total, K, noise, steps, 0.1 * scale, pose)
         if scale <= end_px:
             return iterations
         scale = max(end_px, scale * ratio)
 
 
-@njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
-def gather_noise(samples, n, step, pose, K, radius, terms):
-    """Fill ``terms`` (6, N) of every ``step``-th pixel: squared residual along q and across it,
-    variance of flow and depth in units of sf^2 and sd^2, external weight (0 beyond the ``radius``),
-    density of outliers. Returns (pixels, their external weight, that within the radius).
+@njit(error_model="numpy", cache=True, nogil=True)
+def gather_noise(samples, n, step, pose, K, radius):
+    """Of every ``step``-th pixel whose residual is within the ``radius`` (px): squared residual
+    along q and across it, variance of flow and depth in units of sf^2 and sd^2, external weight,
+    density of outliers, (6, N). And the share of the weight that these pixels have.
     """
-    keep_apart()  # type: ignore[call-arg]
-    entries = pose_entries(pose.astype(np.float32))
-    b_f, b_d, b_w = samples[PF], samples[PD], samples[W]
-    along, across, alpha, beta, weight, outlier = (
-        terms[0], terms[1], terms[2], terms[3], terms[4], terms[5]
-    )  # fmt: skip
-    m = (n + step - 1) // step
-    disc = np.float32(1.0 / math.pi) / (radius * radius)
-    total = inside = ZERO
-    for j in range(m):
-        k = j * step
+    terms, entries = np.empty((6, n // step + 1)), pose_entries(pose)
+    disc = 1.0 / (math.pi * radius * radius)
+    m, total, inside = 0, 0.0, 0.0
+    for k in range(0, n, step):
         ru, rv, qu, qv, front = residual(samples, k, entries, K)
         q2 = qu * qu + qv * qv
-        pure = q2 < np.float32(1e-20)  # no parallax: any axis will do
-        qu = ONE if pure else qu
-        inverse = ONE / (ONE if pure else q2)
-        dot = ru * qu + rv * qv
-        cross = rv * qu - ru * qv
-        spread = ONE / b_f[k]
-        wide = max(spread, ONE)
-        w = b_w[k]
-        total += w
-        near = front & (ru * ru + rv * rv <= radius * radius * wide) & (q2 < np.float32(1e12))
-        w = w if near else ZERO
-        inside += w
-        along[j] = dot * dot * inverse if near else ZERO
-        across[j] = cross * cross * inverse if near else ZERO
-        alpha[j] = spread
-        beta[j] = min(b_d[k] * q2, np.float32(1e8)) if near else ZERO
-        weight[j] = w
-        outlier[j] = disc / wide
-    return m, total, inside
+        spread, weight = 1.0 / samples[PF, k], samples[W, k]
+        wide = max(spread, 1.0)
+        total += weight
+        if not (front and weight > 0 and ru * ru + rv * rv <= radius * radius * wide and q2 < 1e12):
+            continue
+        inside += weight
+        beta = min(samples[PD, k] * q2, 1e8)
+        if q2 < 1e-20:  # no parallax: any axis will do
+            qu, q2 = 1.0, 1.0
+        dot, cross = ru * qu + rv * qv, rv * qu - ru * qv
+        terms[0, m], terms[1, m], terms[2, m] = dot * dot / q2, cross * cross / q2, spread
+        terms[3, m], terms[4, m], terms[5, m] = beta, weight, disc / wide
+        m += 1
+    return terms[:, :m], inside / max(total, 1e-30)
 
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
-def sum_noise(terms, m, vf, vd, share, sums):
-    """One round of expectation-maximisation: ``sums`` = weight of the followers, information of
-    (sf^2, sd^2) (three entries), its right-hand side (two).
+def sum_noise(terms, vf, vd, share):
+    """One round of expectation-maximisation: weight of the followers, information of (sf^2, sd^2)
+    (three entries), its right-hand side (two).
     """
-    keep_apart()  # type: ignore[call-arg]
-    along, across, alpha, beta, weight, outlier = (
-        terms[0], terms[1], terms[2], terms[3], terms[4], terms[5]
-    )  # fmt: skip
-    density = share * np.float32(0.5 / math.pi)
-    rest = ONE - share
-    hits = a11 = a12 = a22 = b1 = b2 = ZERO
-    for k in range(m):
-        al = alpha[k]
-        be = beta[k]
-        x1 = along[k]
-        x2 = across[k]
-        i2 = ONE / (vf * al)
-        i1 = ONE / (vf * al + vd * be)
-        d2 = x1 * i1 + x2 * i2
-        # exp(-d2 / 2) = exp(-y)^16 by a series that is good to 1e-3 at the limit: no call to a
-        # library function, so that the loop is vectorised
-        y = min(d2, np.float32(60.0)) * np.float32(1 / 32)
-        e = y * np.float32(1 / 5040) + np.float32(1 / 720)
-        e = e * y + np.float32(1 / 120)
-        e = e * y + np.float32(1 / 24)
-        e = e * y + np.float32(1 / 6)
-        e = e * y + np.float32(0.5)
-        e = (e * y + ONE) * y + ONE
-        e = e * e
-        e = e * e
-        e = e * e
-        e = e * e
-        p = density * np.sqrt(i1 * i2)
-        p = weight[k] * p / (p + rest * outlier[k] * e)
-        p = p if d2 < np.float32(60.0) else ZERO
-        j1 = p * i1 * i1
-        j2 = p * i2 * i2
+    hits = a11 = a12 = a22 = b1 = b2 = 0.0
+    for k in range(terms.shape[1]):
+        x1, x2, alpha, beta = terms[0, k], terms[1, k], terms[2, k], terms[3, k]
+        i1, i2 = 1.0 / (vf * alpha + vd * beta), 1.0 / (vf * alpha)
+        p = share * (0.5 / math.pi) * math.sqrt(i1 * i2) * math.exp(-0.5 * (x1 * i1 + x2 * i2))
+        p *= terms[4, k] / (p + (1.0 - share) * terms[5, k])
+        j1, j2 = p * i1 * i1, p * i2 * i2
         hits += p
-        a11 += al * al * (j1 + j2)
-        a12 += al * be * j1
-        a22 += be * be * j1
-        b1 += al * (x1 * j1 + x2 * j2)
-        b2 += be * x1 * j1
-    sums[0], sums[1], sums[2] = hits, a11, a12
-    sums[3], sums[4], sums[5] = a22, b1, b2
+        a11 += alpha * alpha * (j1 + j2)
+        a12 += alpha * beta * j1
+        a22 += beta * beta * j1
+        b1 += alpha * (x1 * j1 + x2 * j2)
+        b2 += beta * x1 * j1
+    return hits, a11, a12, a22, b1, b2
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
@@ -276,19 +232,14 @@ def estimate_noise(samples, n, pose, K, sf, sd, sf_cap, sd_cap, rounds, limit):
     ``limit`` pixels. Returns (sf, sd, share of the weight that follows the pose, whether the flow
     tells the depth's noise).
     """
-    step = max(1, n // limit)
-    terms = np.empty((6, ((n // step + 16) // 16 | 1) * 16), np.float32)
-    radius = np.float32(max(4.0, 8.0 * sf))
-    m, total, inside = gather_noise(samples, n, step, pose, K, radius, terms)
-    if m < 8 or not inside > 0:
+    terms, inside = gather_noise(samples, n, max(1, n // limit), pose, K, max(4.0, 8.0 * sf))
+    if terms.shape[1] < 8:
         return sf, sd, 0.0, True
-    vf, vd, share, spread = sf * sf, sd * sd, 0.7, 0.0
-    sums = np.empty(6)
+    vf, vd, share, spread, weight = sf * sf, sd * sd, 0.7, 0.0, np.sum(terms[4])
     for _ in range(rounds):
-        sum_noise(terms, m, np.float32(vf), np.float32(vd), np.float32(share), sums)
-        a11, a12, a22, b1, b2 = sums[1], sums[2], sums[3], sums[4], sums[5]
+        hits, a11, a12, a22, b1, b2 = sum_noise(terms, vf, vd, share)
         before, vd_before = vf, vd
-        share = min(0.999, max(0.01, sums[0] / inside))
+        share = min(0.999, max(0.01, hits / weight))
         if not (0 < a11 < np.inf and a22 < np.inf and abs(b1) < np.inf and abs(b2) < np.inf):
             break
         determinant = a11 * a22 - a12 * a12
@@ -311,30 +262,30 @@ def estimate_noise(samples, n, pose, K, sf, sd, sf_cap, sd_cap, rounds, limit):
     told = vd >= 2.0 * spread
     if not told:  # too little parallax: no more than a usual sensor has
         vd = min(vd, USUAL_DEPTH_NOISE * USUAL_DEPTH_NOISE)
-    return math.sqrt(vf), math.sqrt(vd), share * inside / total, told
+    return math.sqrt(vf), math.sqrt(vd), share * inside, told
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
-def reestimate(samples, n, K, sf, sd, sf_cap, sd_cap, cutoff, rounds, steps, limit, pose, work):
+def reestimate(samples, n, K, sf, sd, sf_cap, sd_cap, cutoff, rounds, steps, limit, pose):
     """Noise and Gauss-Newton in turn, in place; returns (sf, sd, share, iterations)."""
-    noise = np.empty(3, np.float32)
     total = np.float64(np.sum(samples[W, :n]))
     iterations = 0
     share = 0.0
     for _ in range(rounds):
         sf, sd, share, _ = estimate_noise(samples, n, pose, K, sf, sd, sf_cap, sd_cap, 5, limit)
-        set_noise(sf, sd, cutoff, noise)
-        iterations += gauss_newton(samples, n, total, K, noise, steps, 1e-3 * sf + 1e-5, pose, work)
+        noise = noise_of(sf, sd, cutoff)
+        iterations += gauss_newton(samples, n, total, K, noise, steps, 1e-3 * sf + 1e-5, pose)
     return sf, sd, share, iterations
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
-def robust_weights(samples, n, pose, K, noise, work, out):
+def robust_weights(samples, n, pose, K, noise):
     """Robust weight in [0, 1] of ``n`` pixels, without the external weight; 0 where unusable."""
-    acc = np.zeros(SUMS)
+    out, work, acc = np.empty(n, np.float32), new_work(), np.zeros(SUMS)
     for o in range(0, n, BLOCK):
         m = min(BLOCK, n - o)
         project_block(samples, o, m, pose, K, noise, work, out[o:], acc)
+    return out
 
 
 def translation_scale(samples: np.ndarray, n: int) -> float:
@@ -352,13 +303,12 @@ def fit_coarse(
     Returns:
         Pose (3, 4), flow noise px, depth noise, inlier ratio of the weight, iterations.
     """
-    work = new_work()
     pose = np.array(pose, np.float64, order="C")
     scale = min(64.0, max(1.0, 1.5 * residual_scale(samples, n, pose, K)))
-    steps = anneal(samples, n, K, scale, 0.4, 0.5, 3, pose, work)
+    steps = anneal(samples, n, K, scale, 0.4, 0.5, 3, pose)
     sf, sd, share, more = reestimate(
         samples, n, K, 0.5, 0.01, FLOW_NOISE_CAP, DEPTH_NOISE_CAP, cutoff, 2, 4,
-        FINAL_NOISE_PIXELS, pose, work,
+        FINAL_NOISE_PIXELS, pose,
     )  # fmt: skip
     return pose, sf, sd, share, steps + more
 

@@ -119,27 +119,6 @@ def motion_covariance(
     t: np.ndarray,
     noise: tuple[float, float],
 ) -> tuple[np.ndarray, np.ndarray, int]:
-    """:func:`sandwich_covariance` of a motion under a noise (px, log depth), with what no residual
-    shows: the rounding of the pixels' ``weight``, and the law of the depth's errors.
-    """
-    # rounding is the same for neighbours, so that an average over n pixels is no better than one
-    parallax = focal * float(np.linalg.norm(t)) * depth_scale
-    rounding = weight * FLOW_ROUNDING**2 / (noise[0] ** 2 + (parallax * noise[1]) ** 2)
-    sandwich = sandwich_covariance(tiles, curvature, meat, depth_scale, rounding)
-    covariance, eigenvalues, occupied = sandwich
-    # whether depth errs about its log, its value or its inverse is not known: the translation's
-    # length is uncertain by half the variance of log depth
-    covariance[:3, :3] += (0.5 * noise[1] ** 2) ** 2 * np.outer(t, t)
-    return covariance, eigenvalues, occupied
-
-
-def sandwich_covariance(
-    tiles: np.ndarray,
-    curvature: np.ndarray,
-    meat: np.ndarray,
-    depth_scale: float,
-    rounding: float = 0.0,
-) -> tuple[np.ndarray, np.ndarray, int]:
     """Covariance of the left perturbation, eigenvalues of the information, number of tiles with
     usable pixels; 0 where the information is not definite.
 
@@ -147,13 +126,11 @@ def sandwich_covariance(
     from overlapping blocks two tiles wide, the rest from independent errors, scaled by how much the
     blocks exceed them; corrected for what the fit takes out of the residuals.
 
-    Args:
-        tiles: (rows, columns, 27) upper triangle of the Gauss-Newton Hessian and scores, summed
-            over tiles.
-        curvature: (6, 6) of the robust weights.
-        meat: (6, 6) under independent errors.
-        depth_scale: 1 / m, turns metres of translation into radians of the image.
-        rounding: what the rounding of exact data adds, in units of the model's own covariance.
+    ``tiles`` (rows, columns, 27): upper triangle of the Gauss-Newton Hessian and scores, summed
+    over tiles; ``curvature`` (6, 6) of the robust weights, ``meat`` (6, 6) under independent
+    errors; ``depth_scale`` (1 / m) turns metres of translation into radians of the image. The
+    pixels' ``weight``, the ``focal`` length in px, translation ``t`` and ``noise`` (px, log depth)
+    give what no residual shows: the rounding of the pixels and the law of the depth's errors.
     """
     scaling = np.array([1 / depth_scale] * 3 + [1.0] * 3)
     outer = np.outer(scaling, scaling)
@@ -173,16 +150,19 @@ def sandwich_covariance(
     centred = np.concatenate([tiles[..., :21], scores], axis=2)
     meats, lost, occupied = block_sums(centred, model * outer)
     meats = meats * outer / np.maximum(1 - lost, SMALLEST_REST)[:, None, None]
-    try:
-        inflation = np.trace(np.linalg.solve(alone, meats), axis1=1, axis2=2) / 6
-    except np.linalg.LinAlgError:
-        inflation = np.ones(len(SIZES))  # residuals of zero: no doubt that could be compared
+    inflation = np.trace(np.linalg.pinv(alone) @ meats, axis1=1, axis2=2) / 6
     reach = long_range(inflation[2] / inflation[0], occupied) if inflation[0] > 0 else 1.0
     clustered = CLUSTERED * meats[1] + (1 - CLUSTERED) * max(1.0, inflation[1]) * alone
     middle = reach * clustered + max(0.0, FEW_TILES / max(occupied, 1) - 1) * alone
+    # rounding is the same for neighbours, so that an average over n pixels is no better than one
+    parallax = focal * float(np.linalg.norm(t)) * depth_scale
+    rounding = weight * FLOW_ROUNDING**2 / (noise[0] ** 2 + (parallax * noise[1]) ** 2)
     # exact data leave no residuals to learn from: a hundredth of the model's own covariance stays
     covariance = inverse @ middle @ inverse + (0.01 + rounding) * model
     covariance = 0.5 * (covariance + covariance.T) * outer
+    # whether depth errs about its log, its value or its inverse is not known: the translation's
+    # length is uncertain by half the variance of log depth
+    covariance[:3, :3] += (0.5 * noise[1] ** 2) ** 2 * np.outer(t, t)
     if not np.isfinite(covariance).all():
         return NOTHING.copy(), eigenvalues, 0
     return covariance, eigenvalues, occupied

@@ -36,8 +36,6 @@ SUMS, COST = 30, 27
 """Length of an accumulator (21 upper-triangle sums of the Hessian, 6 of the gradient, cost, sum of
 robust weights, sum of external weights), and the place of the cost."""
 
-HAS_FLOW_VARIANCE, HAS_DEPTH_VARIANCE, HAS_WEIGHTS = 1, 2, 4
-
 MIN_DEPTH, MAX_VALUE = np.float32(1e-6), np.float32(1e9)
 MAX_TRUST, MAX_DOUBT = np.float32(1e6), np.float32(1e9)
 """Largest inverse flow variance and depth variance of a pixel, relative to the typical ones."""
@@ -60,13 +58,12 @@ def keep_apart(typing_context):
 
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
-def gather_row(v, u0, u1, data, camera, flags, scale, buf):
+def gather_row(v, u0, u1, data, camera, scale, buf):
     """Fill ``buf`` with columns ``u0 .. u1 - 1`` of row ``v`` of the image.
 
-    ``data`` = (depth, flow, flow_variance, depth_variance, weights), each (H, W) but the
-    flow, (H, W, 2); absent ones are dummies, as ``flags`` says. ``camera`` = (1/fx, 1/fy, cx, cy)
-    of the previous frame. ``scale`` = (typical flow variance, typical depth variance). Unusable
-    pixels get weight 0 and harmless values.
+    ``data`` = (depth, flow, flow_variance, depth_variance, weights), each (H, W) but the flow,
+    (H, W, 2). ``camera`` = (1/fx, 1/fy, cx, cy) of the previous frame. ``scale`` = (typical flow
+    variance, typical depth variance). Unusable pixels get weight 0 and harmless values.
     """
     keep_apart()  # type: ignore[call-arg]
     depth, flow, flow_variance, depth_variance, weights = data
@@ -93,50 +90,43 @@ def gather_row(v, u0, u1, data, camera, flags, scale, buf):
         b_u[k] = mu if good else ZERO
         b_v[k] = mv if good else ZERO
         b_w[k] = ONE if good else ZERO
-    if flags & HAS_FLOW_VARIANCE:
-        row = flow_variance[v, u0:u1]
-        for k in range(n):
-            p = row[k]
-            good = (p > ZERO) & (p < MAX_VALUE)
-            b_f[k] = min(scale[0] / (p if good else ONE), MAX_TRUST)
-            b_w[k] = b_w[k] if good else ZERO
-    else:
-        for k in range(n):
-            b_f[k] = ONE
-    if flags & HAS_DEPTH_VARIANCE:
-        row = depth_variance[v, u0:u1]
-        for k in range(n):
-            p = row[k]
-            good = (p >= ZERO) & (p < MAX_VALUE)
-            b_d[k] = min((p if good else ONE) / scale[1], MAX_DOUBT)
-            b_w[k] = b_w[k] if good else ZERO
-    else:
-        for k in range(n):
-            b_d[k] = ONE
-    if flags & HAS_WEIGHTS:
-        row = weights[v, u0:u1]
-        for k in range(n):
-            p = row[k]
-            b_w[k] = b_w[k] * (p if (p > ZERO) & (p < MAX_VALUE) else ZERO)
+    row = flow_variance[v, u0:u1]
+    for k in range(n):
+        p = row[k]
+        good = (p > ZERO) & (p < MAX_VALUE)
+        b_f[k] = min(scale[0] / (p if good else ONE), MAX_TRUST)
+        b_w[k] = b_w[k] if good else ZERO
+    row = depth_variance[v, u0:u1]
+    for k in range(n):
+        p = row[k]
+        good = (p >= ZERO) & (p < MAX_VALUE)
+        b_d[k] = min((p if good else ONE) / scale[1], MAX_DOUBT)
+        b_w[k] = b_w[k] if good else ZERO
+    row = weights[v, u0:u1]
+    for k in range(n):
+        p = row[k]
+        b_w[k] = b_w[k] * (p if (p > ZERO) & (p < MAX_VALUE) else ZERO)
 
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
-def gather_grid(stride, data, camera, flags, scale, out):
-    """Gather every ``stride``-th pixel of both axes into ``out`` (BUFFER_ROWS, h w).
+def gather_grid(stride, data, camera, scale):
+    """(buffer (BUFFER_ROWS, h w or more), h, w) of every ``stride``-th pixel of both axes.
 
-    The grid starts half a stride in, so that its centre is that of the image. Returns (h, w).
+    The grid starts half a stride in, so that its centre is that of the image.
     """
     H, width = data[0].shape
     first = stride // 2
     h = (H - first + stride - 1) // stride
     w = (width - first + stride - 1) // stride
+    # an odd number of cache lines keeps the rows out of each other's cache sets
+    out = np.empty((BUFFER_ROWS, ((h * w + 15) // 16 | 1) * 16), np.float32)
     buf = np.empty((BUFFER_ROWS, width), np.float32)
     for r in range(h):
-        gather_row(first + r * stride, 0, width, data, camera, flags, scale, buf)
+        gather_row(first + r * stride, 0, width, data, camera, scale, buf)
         for q in range(BUFFER_ROWS):
             for k in range(w):
                 out[q, r * w + k] = buf[q, first + k * stride]
-    return h, w
+    return out, h, w
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
@@ -240,119 +230,78 @@ def residual(samples, k, entries, K):
     return samples[MU, k] - (K[0] * a + K[2]), samples[MV, k] - (K[1] * b + K[3]), qu, qv, front
 
 
-@njit(error_model="numpy", cache=True, nogil=True)
-def add(acc, start, values):
-    """Add numbers to those of ``acc`` from ``start`` on."""
-    for q in range(len(values)):
-        acc[start + q] += values[q]
-
-
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
-def sum_translation(o, n, work, acc):
-    """Second stage, pixels ``o .. o + n - 1``: the rows of H and g of the translation."""
+def sum_products(o, n, work, acc):
+    """Second stage, pixels ``o .. o + n - 1``: their H and g are added to ``acc``."""
     keep_apart()  # type: ignore[call-arg]
     A, B, IZ = work[0][o:], work[1][o:], work[2][o:]
     M0, M1, M2 = work[3][o:], work[4][o:], work[5][o:]
     N0, N1 = work[6][o:], work[7][o:]
-    h00 = h01 = h02 = h03 = h04 = h05 = ZERO
-    h11 = h12 = h13 = h14 = h15 = ZERO
-    h22 = h23 = h24 = h25 = ZERO
-    g0 = g1 = g2 = ZERO
+    h00 = h01 = h02 = h03 = h04 = h05 = h11 = h12 = h13 = h14 = h15 = h22 = h23 = h24 = h25 = ZERO
+    h33 = h34 = h35 = h44 = h45 = h55 = g0 = g1 = g2 = g3 = g4 = g5 = ZERO
     for k in range(n):
-        a = A[k]
-        b = B[k]
-        i = IZ[k]
-        ab = a * b
-        aa = ONE + a * a
-        bb = ONE + b * b
-        k0 = M0[k] * i
-        k1 = M1[k] * i
-        k2 = M2[k] * i
-        c02 = -(k0 * a + k1 * b)
-        c12 = -(k1 * a + k2 * b)
-        c03 = -(k0 * ab + k1 * bb)
-        c13 = -(k1 * ab + k2 * bb)
-        c04 = k0 * aa + k1 * ab
-        c14 = k1 * aa + k2 * ab
-        c05 = k1 * a - k0 * b
-        c15 = k2 * a - k1 * b
-        h00 += k0 * i
-        h01 += k1 * i
-        h11 += k2 * i
-        h02 += c02 * i
-        h12 += c12 * i
-        h03 += c03
-        h04 += c04
-        h05 += c05
-        h13 += c13
-        h14 += c14
-        h15 += c15
-        h22 -= (a * c02 + b * c12) * i
-        h23 -= a * c03 + b * c13
-        h24 -= a * c04 + b * c14
-        h25 -= a * c05 + b * c15
-        x = N0[k] * i
-        y = N1[k] * i
-        g0 += x
-        g1 += y
-        g2 -= a * x + b * y
-    add(acc, 0, (h00, h01, h02, h03, h04, h05, h11, h12, h13, h14, h15, h22, h23, h24, h25))
-    add(acc, 21, (g0, g1, g2))
-
-
-@njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
-def sum_rotation(o, n, work, acc):
-    """Third stage: the rows of H and g of the rotation."""
-    keep_apart()  # type: ignore[call-arg]
-    A, B = work[0][o:], work[1][o:]
-    M0, M1, M2 = work[3][o:], work[4][o:], work[5][o:]
-    N0, N1 = work[6][o:], work[7][o:]
-    h33 = h34 = h35 = h44 = h45 = h55 = ZERO
-    g3 = g4 = g5 = ZERO
-    for k in range(n):
-        a = A[k]
-        b = B[k]
-        m0 = M0[k]
-        m1 = M1[k]
-        m2 = M2[k]
-        x = N0[k]
-        y = N1[k]
-        ab = a * b
-        aa = ONE + a * a
-        bb = ONE + b * b
-        c03 = m0 * ab + m1 * bb
-        c13 = m1 * ab + m2 * bb
-        c04 = m0 * aa + m1 * ab
-        c14 = m1 * aa + m2 * ab
-        c05 = m1 * a - m0 * b
-        c15 = m2 * a - m1 * b
-        h33 += ab * c03 + bb * c13
+        a, b, i, m0, m1, m2, x, y = A[k], B[k], IZ[k], M0[k], M1[k], M2[k], N0[k], N1[k]
+        ab, aa, bb, ii = a * b, ONE + a * a, ONE + b * b, i * i
+        c02, c12 = -(m0 * a + m1 * b), -(m1 * a + m2 * b)
+        c03, c13 = -(m0 * ab + m1 * bb), -(m1 * ab + m2 * bb)
+        c04, c14 = m0 * aa + m1 * ab, m1 * aa + m2 * ab
+        c05, c15 = m1 * a - m0 * b, m2 * a - m1 * b
+        h00 += m0 * ii
+        h01 += m1 * ii
+        h02 += c02 * ii
+        h03 += c03 * i
+        h04 += c04 * i
+        h05 += c05 * i
+        h11 += m2 * ii
+        h12 += c12 * ii
+        h13 += c13 * i
+        h14 += c14 * i
+        h15 += c15 * i
+        h22 -= (a * c02 + b * c12) * ii
+        h23 -= (a * c03 + b * c13) * i
+        h24 -= (a * c04 + b * c14) * i
+        h25 -= (a * c05 + b * c15) * i
+        h33 -= ab * c03 + bb * c13
         h34 -= ab * c04 + bb * c14
         h35 -= ab * c05 + bb * c15
         h44 += aa * c04 + ab * c14
         h45 += aa * c05 + ab * c15
         h55 += a * c15 - b * c05
+        g0 += x * i
+        g1 += y * i
+        g2 -= (a * x + b * y) * i
         g3 -= ab * x + bb * y
         g4 += aa * x + ab * y
         g5 += a * y - b * x
-    add(acc, 15, (h33, h34, h35, h44, h45, h55))
-    add(acc, 24, (g3, g4, g5))
+    found = (
+        *(h00, h01, h02, h03, h04, h05, h11, h12, h13, h14, h15, h22, h23, h24, h25),
+        *(h33, h34, h35, h44, h45, h55, g0, g1, g2, g3, g4, g5),
+    )
+    for q in range(COST):
+        acc[q] += found[q]
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
-def sum_samples(samples, n, pose, K, noise, work, acc):
+def new_work():
+    """Scratch memory of one solver."""
+    # rows a little longer than a block do not fall into the same sets of the cache
+    return np.empty((WORK_ROWS, BLOCK + 16), np.float32)
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def sum_samples(samples, n, pose, K, noise, acc):
     """Normal equations of gathered pixels, set in ``acc`` (30,) float64; returns their cost."""
     acc[:] = 0.0
+    work = new_work()
     for o in range(0, n, BLOCK):
         m = min(BLOCK, n - o)
         project_block(samples, o, m, pose, K, noise, work, work[8], acc)
-        sum_translation(0, m, work, acc)
-        sum_rotation(0, m, work, acc)
+        sum_products(0, m, work, acc)
     return acc[COST]
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
-def sum_tiles(data, camera, flags, scale, pose, K, noise, band, tile, weights, sums, out):
+def sum_tiles(data, camera, scale, pose, K, noise, band, tile, weights, sums, out):
     """One pass over the rows of one band of tiles of the full grid.
 
     Adds the normal equations of each tile to ``sums`` (rows of tiles, columns of tiles, 27), cost
@@ -367,16 +316,8 @@ def sum_tiles(data, camera, flags, scale, pose, K, noise, band, tile, weights, s
     for v in range(band * tile, min(H, (band + 1) * tile)):
         for u0 in range(0, width, part):
             n = min(part, width - u0)
-            gather_row(v, u0, u0 + n, data, camera, flags, scale, buf)
+            gather_row(v, u0, u0 + n, data, camera, scale, buf)
             project_block(buf, 0, n, pose, K, noise, work, weights[v, u0:], out)
             for o in range(0, n, tile):
                 m = min(tile, n - o)
-                sum_translation(o, m, work, sums[band, (u0 + o) // tile])
-                sum_rotation(o, m, work, sums[band, (u0 + o) // tile])
-
-
-@njit(error_model="numpy", cache=True, nogil=True)
-def new_work():
-    """Scratch memory of one solver."""
-    # rows a little longer than a block do not fall into the same sets of the cache
-    return np.empty((WORK_ROWS, BLOCK + 16), np.float32)
+                sum_products(o, m, work, sums[band, (u0 + o) // tile])

@@ -16,8 +16,7 @@ from hybridvo.types import FramePair
 
 MIN_USABLE = 0.05
 """Share of the pixels asked for that must be usable, else a grid is drawn anew, finer."""
-PARALLEL_PIXELS, THREADS = 100_000, 2
-"""Below this many pixels one thread is as fast, and steadier under load."""
+THREADS = 2
 
 
 class PixelGrid:
@@ -26,26 +25,18 @@ class PixelGrid:
     def __init__(self, pair: FramePair, weights: np.ndarray | None) -> None:
         prev, curr = pair.prev, pair.curr
         assert pair.flow is not None and prev.depth is not None
-        dummy = as_contiguous(np.ones((1, 1), np.float32))
-        flow_variance = depth_variance = external = dummy
-        self.flags, self.scale = 0, np.ones(2, np.float32)
-        if pair.flow_variance is not None:
-            flow_variance = as_contiguous(pair.flow_variance)
-            self.flags |= kernels.HAS_FLOW_VARIANCE
-            self.scale[0] = typical(flow_variance)
-        if prev.depth_variance is not None:
-            depth_variance = as_contiguous(prev.depth_variance)
-            self.flags |= kernels.HAS_DEPTH_VARIANCE
-            self.scale[1] = typical(depth_variance)
+        ones = np.ones(prev.depth.shape, np.float32)
+        maps = [
+            as_contiguous(ones if image is None else image)
+            for image in (pair.flow_variance, prev.depth_variance)
+        ]
+        external = ones
         for factor in (weights, prev.mask, pair.flow_valid):
             if factor is not None:
-                first = not self.flags & kernels.HAS_WEIGHTS
-                external = np.asarray(factor, np.float32) if first else external * factor
-                self.flags |= kernels.HAS_WEIGHTS
-        self.data: tuple[Any, ...] = (
-            as_contiguous(prev.depth), as_contiguous(pair.flow), flow_variance, depth_variance,
-            as_contiguous(external),
-        )  # fmt: skip
+                external = external * np.asarray(factor, np.float32)
+        data = (prev.depth, pair.flow, *maps, external)
+        self.data: tuple[Any, ...] = tuple(map(as_contiguous, data))
+        self.scale = np.array([typical(image) for image in maps], np.float32)
         a, b = prev.camera, curr.camera
         self.camera = np.array([1 / a.fx, 1 / a.fy, a.cx, a.cy], np.float32)
         self.K = np.array([b.fx, b.fy, b.cx, b.cy], np.float32)
@@ -67,12 +58,7 @@ class PixelGrid:
 
     def strided(self, stride: int) -> tuple[np.ndarray, int, int]:
         """(buffer, h, w) of every ``stride``-th pixel of both axes."""
-        height, width = self.shape
-        h = (height - stride // 2 + stride - 1) // stride
-        w = (width - stride // 2 + stride - 1) // stride
-        # an odd number of cache lines keeps the rows out of each other's cache sets
-        buffer = np.empty((kernels.BUFFER_ROWS, ((h * w + 15) // 16 | 1) * 16), np.float32)
-        kernels.gather_grid(stride, self.data, self.camera, self.flags, self.scale, buffer)
+        buffer, h, w = kernels.gather_grid(stride, self.data, self.camera, self.scale)
         return buffer, h, w
 
     def full_pass(
@@ -90,17 +76,13 @@ class PixelGrid:
         totals = np.zeros((bands, kernels.SUMS))
         weights = np.empty((height, width), np.float32)
 
-        inputs: tuple[Any, ...] = (self.data, self.camera, self.flags, self.scale)
+        inputs: tuple[Any, ...] = (self.data, self.camera, self.scale)
 
         def work(band: int) -> None:
             kernels.sum_tiles(*inputs, pose, self.K, noise, band, tile, weights, sums, totals[band])
 
-        if height * width < PARALLEL_PIXELS:
-            for band in range(bands):
-                work(band)
-        else:  # kernels release the GIL; each band has its own sum, whoever does it
-            with ThreadPoolExecutor(THREADS) as pool:
-                list(pool.map(work, range(bands)))
+        with ThreadPoolExecutor(THREADS) as pool:  # the kernels release the GIL
+            list(pool.map(work, range(bands)))
         return sums, totals[:, kernels.COST :].sum(axis=0), weights
 
 

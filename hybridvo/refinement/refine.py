@@ -24,7 +24,7 @@ from hybridvo.refinement.covariance import (
     tile_size,
 )
 from hybridvo.refinement.depth import DepthFactor, compare_depths, depth_scale, look_up
-from hybridvo.refinement.kernels import SUMS, new_work, sum_samples
+from hybridvo.refinement.kernels import SUMS, sum_samples
 from hybridvo.refinement.pixels import CoarseGrid, PixelGrid, as_contiguous, coarse_grid
 from hybridvo.refinement.solver import Factor, Linearization, gauss_newton
 from hybridvo.results import Hypothesis, Reason, RelativePose, Status
@@ -209,12 +209,10 @@ def pair_noise(
     )  # fmt: skip
     if curr is None:
         return sf, sd, share, 0.0, 0.0
-    noise = np.empty(3, np.float32)
-    coarse_fit.set_noise(sf, sd, cutoff, noise)
+    noise = coarse_fit.noise_of(sf, sd, cutoff)
     few = np.ascontiguousarray(samples[:, : n : max(1, n // 1000)])
-    log_depth, robust = np.empty((2, few.shape[1]), np.float32)
-    look_up(few, len(robust), as_contiguous(curr), log_depth)
-    coarse_fit.robust_weights(few, len(robust), pose, K, noise, new_work(), robust)
+    log_depth = look_up(few, few.shape[1], as_contiguous(curr))
+    robust = coarse_fit.robust_weights(few, few.shape[1], pose, K, noise)
     sigma, raw = depth_scale(few, log_depth, robust, pose, K, noise)
     if raw <= 0:
         return sf, sd, share, 0.0, 0.0
@@ -237,16 +235,11 @@ def _fit_full_grid(
     """
     image, samples, n = grid.pixels, grid.samples, grid.count
     sf, sd, share, _, sigma = pair_noise(samples, n, image.K, pose, start, options.cutoff, curr)
-    tile, inverse_depth = (
-        tile_size(image.shape, options.tiles),
-        coarse_fit.translation_scale(samples, n),
-    )
-    noise = np.empty(3, np.float32)
-    coarse_fit.set_noise(sf, sd, options.cutoff, noise)
+    tile = tile_size(image.shape, options.tiles)
+    inverse_depth = coarse_fit.translation_scale(samples, n)
+    noise = coarse_fit.noise_of(sf, sd, options.cutoff)
     total = float(grid.weight.sum(dtype=np.float64))
-    iterations = coarse_fit.gauss_newton(
-        samples, n, total, image.K, noise, 4, 1e-3 * sf, pose, new_work()
-    )
+    iterations = coarse_fit.gauss_newton(samples, n, total, image.K, noise, 4, 1e-3 * sf, pose)
     flow = FlowFactor(image, noise, tile, score_sums(samples, n, pose, image.K, noise))
     term = None
     if curr is not None and sigma > 0:
@@ -293,7 +286,7 @@ def _depth_factor(
     fine = min(2, stride)
     if options.current_depth == "auto":
         sums = np.zeros(SUMS)
-        sum_samples(samples, n, pose, image.K, noise, new_work(), sums)
+        sum_samples(samples, n, pose, image.K, noise, sums)
         H_flow = symmetric(sums[:21])
         units = np.repeat([1 / coarse_fit.translation_scale(samples, n), 1.0], 3)
         eigenvalues = np.linalg.eigvalsh(H_flow * np.outer(units, units))

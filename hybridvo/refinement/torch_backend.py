@@ -41,7 +41,6 @@ from hybridvo.refinement.torch_factors import (
     flow_noise,
     linearize,
     newton_matrix,
-    residuals,
     scores,
     solve_small,
     stepped,
@@ -121,7 +120,7 @@ def refine_batch(
         how = how._replace(noise=result.noise if given is None else given)
         T = result.SE3.detach()
         A = newton_matrix(pixels.map(torch.Tensor.detach), T, how)
-        g = scores(pixels, residuals(pixels, T), how)[0].sum(dim=2)
+        g = scores(pixels, T, how)[0].sum(dim=2)
         return replace(result, SE3=attached(T, A, g, ~result.failed[:, None]))
 
 
@@ -159,7 +158,7 @@ def _solve(
     (height, width), weight = batch.depth_prev.shape[1:], pixels.weight
     size = height, width
     tile, few = tile_size(size, options.tiles), pixels.subset(SUBSET_PIXELS)
-    flow_only = replace(few, log_depth_curr=None, has_depth_curr=None)
+    flow_only = few._replace(log_depth_curr=None, has_depth_curr=None)
     end = weight.new_full((len(starts),), SMALLEST_PX)
     if given is not None:
         end = torch.maximum(end, given[:, 0].detach())
@@ -171,12 +170,12 @@ def _solve(
         noise = _noise(batch, samples, T, how, options) if given is None else given.detach()
         how = how._replace(noise=noise)
         for _ in range(steps):
-            T = stepped(few, T, residuals(few, T), how)
+            T = stepped(few, T, how)
     total = weight.double().sum(dim=1)
     curvature, meat = (x * total[:, None, None] for x in _curvature(few, T, how))
     T, last, converged, iterations = _fit_all(pixels, few, T, how, curvature, tile, tight)
     found = _covariances(pixels, few, T, last, how.noise, (curvature, meat), size, tile)
-    near = (last.at.robust > 0) & (last.at.distance2 <= INLIER_DISTANCE2)
+    near = (last.found.robust > 0) & (last.found.distance2 <= INLIER_DISTANCE2)
     ratio = torch.nan_to_num((weight * near).sum(dim=1) / weight.sum(dim=1).clamp(min=1e-30))
     probability = own**2 / (own**2 + rival**2).clamp(min=1e-12)
     covariances, status = [], []
@@ -199,7 +198,7 @@ def _solve(
         probability=torch.where(failed, torch.zeros_like(own), probability),
         iterations=iterations,
         cost=torch.nan_to_num(last.cost / weight.sum(dim=1).clamp(min=1e-30)),
-        weights=torch.nan_to_num(from_tiles(last.at.robust, tile, *size)),
+        weights=torch.nan_to_num(from_tiles(last.found.robust, tile, *size)),
         noise=torch.where(torch.isfinite(how.noise), how.noise, torch.ones_like(how.noise)),
         inlier_ratio=ratio,
     )
@@ -248,7 +247,7 @@ def _graduate(pixels: Pixels, starts: pp.LieTensor, end: torch.Tensor) -> pp.Lie
     pixels = pixels.map(lambda x: x.repeat_interleave(count, dim=0))
     ends = end.repeat_interleave(count)
     T = _shrink_scale(pixels, pp.SE3(starts.tensor().flatten(0, 1)), ends)
-    cost = linearize(pixels, residuals(pixels, T), flow_noise(ends)).cost.reshape(batch, count)
+    cost = linearize(pixels, T, flow_noise(ends)).cost.reshape(batch, count)
     best = torch.nan_to_num(cost, nan=torch.inf).argmin(dim=1)
     index = torch.arange(batch, device=best.device)
     return pp.SE3(T.tensor().reshape(batch, count, 7)[index, best])
@@ -256,11 +255,10 @@ def _graduate(pixels: Pixels, starts: pp.LieTensor, end: torch.Tensor) -> pp.Lie
 
 def _shrink_scale(pixels: Pixels, T: pp.LieTensor, end: torch.Tensor) -> pp.LieTensor:
     """One Gauss-Newton step for each scale of the kernel, down to ``end``."""
-    at = residuals(pixels, T)
-    scale = torch.maximum((CUTOFF * typical_residual(pixels, at)).clamp(1.0, LARGEST_PX), end)
+    scale = torch.maximum((CUTOFF * typical_residual(pixels, T)).clamp(1.0, LARGEST_PX), end)
     going = torch.ones_like(scale, dtype=torch.bool)
     while bool(going.any()):
-        T = stepped(pixels, T, residuals(pixels, T), flow_noise(scale), going[:, None])
+        T = stepped(pixels, T, flow_noise(scale), going[:, None])
         going = going & (scale > end)
         scale = torch.maximum(scale * GNC_RATIO, end)
     return T
@@ -272,13 +270,13 @@ def _shares(
     """(B,) shares of the weight that follow this motion, and another near by but not this."""
 
     def followed(part: Pixels, T: pp.LieTensor) -> tuple[torch.Tensor, torch.Tensor]:
-        follow = weigh(part, residuals(part, T), flow_noise(3 * end)).robust > 0.25
+        follow = weigh(part, T, flow_noise(3 * end)).robust > 0.25
         share = (part.weight * follow).double().sum(dim=1) / total
         return follow, torch.nan_to_num(share)
 
     total = pixels.weight.double().sum(dim=1).clamp(min=1e-30)
     follow, own = followed(pixels, T)
-    rest = replace(pixels, weight=pixels.weight * ~follow)
+    rest = pixels._replace(weight=pixels.weight * ~follow)
     identity = pp.identity_SE3(len(T), dtype=T.dtype, device=T.device)
     return own, followed(rest, _shrink_scale(rest, identity, end))[1]
 
@@ -323,9 +321,9 @@ def _curvature(
     pixels: Pixels, T: pp.LieTensor, how: RobustNoise
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """(B, 6, 6) curvature of the robust weights and scores' outer products per unit of weight."""
-    each, at = scores(pixels, residuals(pixels, T), how)
+    each, at = scores(pixels, T, how)
     s, w = each.double(), (pixels.weight * at.robust).double()
-    slope = how.kernel(at.distance2).slope
+    slope = how.kernel(at.distance2)[2]
     factor = torch.where(w > 1e-12, slope / w.clamp(min=1e-12), torch.zeros_like(w))
     total = pixels.weight.double().sum(dim=1).clamp(min=1e-12)[:, None, None]
     return (s * factor[:, None]) @ s.transpose(1, 2) / total, s @ s.transpose(1, 2) / total
@@ -347,10 +345,10 @@ def _fit_all(
     done, converged = best < 0, best < 0
     iterations = done.long()
     for k in range(STEPS):
-        now = linearize(pixels, residuals(pixels, T), how, tile**2)
+        now = linearize(pixels, T, how, tile**2)
         H, g = now.total()
         if tight and k % 3 == 2:  # the full derivative, also of residual and Jacobian
-            slope = linearize(few, residuals(few, T), how).total()[0] - newton_matrix(few, T, how)
+            slope = linearize(few, T, how).total()[0] - newton_matrix(few, T, how)
             curvature = slope * total / part.clamp(min=1e-12)
         step, good = solve_small(H - curvature, g)
         ahead = (step * g).sum(dim=1)

@@ -6,9 +6,6 @@ With the current frame's depth a third row joins, ``r_z = log D_curr(x + F) - lo
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
-from functools import reduce
 from typing import NamedTuple
 
 import torch
@@ -32,51 +29,32 @@ BEHIND_DISTANCE2 = 1e4
 """Squared Mahalanobis distance at which a pixel behind the camera is charged."""
 
 
-def _geman_mcclure(d2: torch.Tensor, c2: float) -> Kernel:
-    share = c2 / (c2 + d2)
-    return Kernel(0.5 * share * d2, share.square(), 4 * share / c2)
-
-
-def _cauchy(d2: torch.Tensor, c2: float) -> Kernel:
-    share = c2 / (c2 + d2)
-    return Kernel(0.5 * c2 * torch.log1p(d2 / c2), share, 2 * share / c2)
-
-
-def _huber(d2: torch.Tensor, c2: float) -> Kernel:
-    beyond = d2.clamp(min=c2)
-    cost = torch.where(d2 <= c2, 0.5 * d2, (c2 * beyond).sqrt() - 0.5 * c2)
-    return Kernel(cost, (c2 / beyond).sqrt(), (d2 > c2) / beyond)
-
-
-def _l2(d2: torch.Tensor, c2: float) -> Kernel:
-    return Kernel(0.5 * d2, torch.ones_like(d2), torch.zeros_like(d2))
-
-
-class Kernel(NamedTuple):
-    """Cost rho of squared distances d2, weight 2 rho', slope -2 weight' / weight."""
-
-    cost: torch.Tensor
-    weight: torch.Tensor
-    slope: torch.Tensor
-
-
-KERNELS = {"geman-mcclure": _geman_mcclure, "cauchy": _cauchy, "huber": _huber, "l2": _l2}
-"""Robust kernels of the squared Mahalanobis distance, for a squared cutoff."""
+KERNELS = ("geman-mcclure", "cauchy", "huber", "l2")
+"""Robust kernels of the squared Mahalanobis distance."""
 
 
 class RobustNoise(NamedTuple):
-    """How residuals are weighed: (B, n) noise sf px, then sd, then sz; kernel and its cutoff.
-
-    With sf alone the depths count as exact.
+    """How residuals are weighed: (B, n) noise sf px, sd, and sz with the current frame's depth;
+    kernel and its cutoff.
     """
 
     noise: torch.Tensor
     cutoff: float = 3.0
     name: str = "geman-mcclure"
 
-    def kernel(self, distance2: torch.Tensor) -> Kernel:
-        """The robust kernel at squared Mahalanobis distances."""
-        return KERNELS[self.name](distance2, self.cutoff**2)
+    def kernel(self, d2: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Cost rho of squared distances, weight 2 rho', slope -2 weight' / weight."""
+        c2 = self.cutoff**2
+        share = c2 / (c2 + d2)
+        if self.name == "geman-mcclure":
+            return 0.5 * share * d2, share.square(), 4 * share / c2
+        if self.name == "cauchy":
+            return 0.5 * c2 * torch.log1p(d2 / c2), share, 2 * share / c2
+        if self.name == "l2":
+            return 0.5 * d2, torch.ones_like(d2), torch.zeros_like(d2)
+        beyond = d2.clamp(min=c2)
+        cost = torch.where(d2 <= c2, 0.5 * d2, (c2 * beyond).sqrt() - 0.5 * c2)
+        return cost, (c2 / beyond).sqrt(), (d2 > c2) / beyond
 
 
 class Residuals(NamedTuple):
@@ -116,87 +94,74 @@ def sensitivity(pixels: Pixels, at: Residuals) -> torch.Tensor:
     return torch.cat([u, (1 - at.t[:, 2] * at.i)[:, None]], 1)
 
 
-def jacobian(pixels: Pixels, at: Residuals) -> list[torch.Tensor]:
-    """Rows (B, 6, N) of d pi(X') / d delta and, with the current depth, d log Z' / d delta."""
+def jacobian(pixels: Pixels, at: Residuals) -> torch.Tensor:
+    """(B, R, 6, N): d pi(X') / d delta and, with the current depth, d log Z' / d delta."""
     a, b = at.ab.unbind(1)
-    rows = [
-        f[:, None] * row
-        for f, row in zip(_focal(pixels).unbind(1), projection_rows(a, b, at.i), strict=True)
-    ]
-    if pixels.log_depth_curr is not None:
-        zero = torch.zeros_like(a)
-        rows.append(torch.stack([zero, zero, at.i, b, -a, zero], dim=1))
-    return rows
+    J = _focal(pixels)[:, :, None] * torch.stack([*projection_rows(a, b, at.i)], dim=1)
+    if pixels.log_depth_curr is None:
+        return J
+    zero = torch.zeros_like(a)
+    return torch.cat([J, torch.stack([zero, zero, at.i, b, -a, zero], dim=1)[:, None]], dim=1)
 
 
-@dataclass(frozen=True, eq=False)
-class Weighted:
+class Weighted(NamedTuple):
     """Residuals at the depths that they make most likely, and what they weigh.
 
-    Their inverse covariance is diag(D) - kappa (D u)(D u)^T, without u diag(D); ``right``
-    (B, R, N): it times the residuals.
+    Their inverse covariance is diag(D) - kappa (D u)(D u)^T; ``right`` (B, R, N): it times the
+    residuals.
     """
 
     at: Residuals
     D: torch.Tensor
-    u: torch.Tensor | None
-    kappa: torch.Tensor | None
+    u: torch.Tensor
+    kappa: torch.Tensor
     right: torch.Tensor
     distance2: torch.Tensor
     robust: torch.Tensor
 
 
-def weigh(pixels: Pixels, at: Residuals, how: RobustNoise) -> Weighted:
-    """Residuals, weighed."""
-    u, kappa, noise = None, None, how.noise[:, :, None]
+def weigh(pixels: Pixels, T: pp.LieTensor, how: RobustNoise) -> Weighted:
+    """Residuals at poses (B, 7), weighed."""
+    at, noise = residuals(pixels, T), how.noise[:, :, None]
     flow = 1 / (noise[:, 0].square() * pixels.flow_variance)
     D = torch.stack([flow, flow], 1)
     if pixels.has_depth_curr is not None:
         D = torch.cat([D, (pixels.has_depth_curr / noise[:, 2].square())[:, None]], 1)
-    right = D * at.r
-    if noise.shape[1] > 1:
-        depth = noise[:, 1].square() * pixels.depth_variance
+    depth = noise[:, 1].square() * pixels.depth_variance
 
-        def shift(u: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-            """Kappa, and how far the log depth that the residuals make most likely lies away."""
-            kappa = depth / (1 + depth * (D * u.square()).sum(dim=1))
-            return kappa, kappa * (D * u * at.r).sum(dim=1)
+    def shift(u: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Kappa, and how far the log depth that the residuals make most likely lies away."""
+        kappa = depth / (1 + depth * (D * u.square()).sum(dim=1))
+        return kappa, kappa * (D * u * at.r).sum(dim=1)
 
-        u = sensitivity(pixels, at)
-        e = shift(u)[1].clamp(-float(MAX_SHIFT), float(MAX_SHIFT))
-        ab = at.ab + u[:, :2] * e[:, None] / _focal(pixels)
-        at = at._replace(ab=ab, i=at.i * (1 - (1 - at.t[:, 2] * at.i) * e))
-        u = sensitivity(pixels, at)
-        kappa, along = shift(u)
-        right = D * (at.r - along[:, None] * u)
+    u = sensitivity(pixels, at)
+    e = shift(u)[1].clamp(-float(MAX_SHIFT), float(MAX_SHIFT))
+    ab = at.ab + u[:, :2] * e[:, None] / _focal(pixels)
+    at = at._replace(ab=ab, i=at.i * (1 - (1 - at.t[:, 2] * at.i) * e))
+    u = sensitivity(pixels, at)
+    kappa, along = shift(u)
+    right = D * (at.r - along[:, None] * u)
     distance2 = (right * at.r).sum(dim=1).clamp(min=0)
     usable = at.front & (pixels.weight > 0)
-    robust = torch.where(usable, how.kernel(distance2).weight, torch.zeros_like(distance2))
+    robust = torch.where(usable, how.kernel(distance2)[1], torch.zeros_like(distance2))
     return Weighted(at, D, u, kappa, right, distance2, robust)
 
 
-def _along(rows: list[torch.Tensor], values: torch.Tensor) -> torch.Tensor:
-    """(B, 6, N) sum of rows (B, 6, N) times values (B, R, N)."""
-    each = (row * value[:, None] for row, value in zip(rows, values.unbind(1), strict=True))
-    return reduce(torch.add, each)
-
-
-@dataclass(frozen=True, eq=False)
-class Linearization:
+class Linearization(NamedTuple):
     """Weighted normal equations at a pose, in C runs of pixels (the tiles, where there are tiles).
 
     Args:
         H: (B, C, 6, 6) sum of w J^T Sigma^-1 J. g: (B, C, 6) sum of w J^T Sigma^-1 r.
         cost: (B,) robust cost, pixels behind the camera at the full one.
         weight_sum: (B,) sum of robust times external weights.
-        at: the residuals.
+        found: the residuals.
     """
 
     H: torch.Tensor
     g: torch.Tensor
     cost: torch.Tensor
     weight_sum: torch.Tensor
-    at: Weighted
+    found: Weighted
 
     def total(self) -> tuple[torch.Tensor, torch.Tensor]:
         """(H (B, 6, 6), g (B, 6)) in float64: a float32 sum over an image loses its fifth digit."""
@@ -204,45 +169,40 @@ class Linearization:
 
 
 def linearize(
-    pixels: Pixels, at: Residuals, how: RobustNoise, run: int | None = None
+    pixels: Pixels, T: pp.LieTensor, how: RobustNoise, run: int | None = None
 ) -> Linearization:
-    """Normal equations of residuals, summed over runs of ``run`` pixels or all."""
-    found = weigh(pixels, at, how)
-    at, w, length = found.at, pixels.weight * found.robust, run or pixels.weight.shape[1]
-
-    def runs(x: Iterable[torch.Tensor]) -> torch.Tensor:
-        """Values (B, N) or rows (B, 6, N) side by side, run by run."""
-        return torch.cat([v.unflatten(-1, (-1, length)) for v in x], dim=-1)
-
-    rows = jacobian(pixels, at)
-    right = runs((w[:, None] * found.right).unbind(1))
-    information = list((w[:, None] * found.D).unbind(1))
-    if found.u is not None and found.kappa is not None:
-        rows.append(_along(rows, found.D * found.u))
-        information.append(-w * found.kappa)
-    G = runs(rows).transpose(1, 2)  # (B, C, 6, (R + 1) run)
-    H = (G * runs(information)[:, :, None]) @ G.transpose(2, 3)
-    g = (G[..., : right.shape[2]] @ right[..., None])[..., 0]
+    """Normal equations at poses (B, 7), summed over runs of ``run`` pixels or all."""
+    found = weigh(pixels, T, how)
+    w, runs = pixels.weight * found.robust, (-1, run or pixels.weight.shape[1])
+    J = jacobian(pixels, found.at)
+    g = _scores(J, w, found).unflatten(-1, runs).sum(dim=3).transpose(1, 2)
+    across = (J * (found.D * found.u)[:, :, None]).sum(dim=1, keepdim=True)
+    information = torch.cat([w[:, None] * found.D, (-w * found.kappa)[:, None]], 1)
+    J = torch.cat([J, across], 1).unflatten(-1, runs)
+    H = torch.einsum("brpcn,brqcn->bcpq", J * information.unflatten(-1, runs)[:, :, None], J)
     behind = torch.full_like(found.distance2, BEHIND_DISTANCE2)
-    cost = how.kernel(torch.where(at.front, found.distance2, behind)).cost
+    cost = how.kernel(torch.where(found.at.front, found.distance2, behind))[0]
     cost = (pixels.weight * cost).sum(dim=1)
     return Linearization(0.5 * (H + H.transpose(2, 3)), g, cost, w.sum(dim=1), found)
 
 
-def scores(pixels: Pixels, at: Residuals, how: RobustNoise) -> tuple[torch.Tensor, Weighted]:
+def scores(pixels: Pixels, T: pp.LieTensor, how: RobustNoise) -> tuple[torch.Tensor, Weighted]:
     """(B, 6, N) w J^T Sigma^-1 r of each pixel; their sum is zero at the estimate."""
-    found = weigh(pixels, at, how)
-    right = (pixels.weight * found.robust)[:, None] * found.right
-    return _along(jacobian(pixels, found.at), right), found
+    found = weigh(pixels, T, how)
+    return _scores(jacobian(pixels, found.at), pixels.weight * found.robust, found), found
+
+
+def _scores(J: torch.Tensor, w: torch.Tensor, found: Weighted) -> torch.Tensor:
+    return (J * (w[:, None] * found.right)[:, :, None]).sum(dim=1)
 
 
 def newton_matrix(pixels: Pixels, T: pp.LieTensor, how: RobustNoise) -> torch.Tensor:
     """A = -dg / d xi, g the sum of the scores: (B, 6, 6), not symmetric; A xi = g is the step."""
     how = how._replace(noise=how.noise.detach())
-    pixels = replace(pixels, K=pixels.K.detach())
+    pixels = pixels._replace(K=pixels.K.detach())
     with torch.enable_grad():
         xi = torch.zeros(len(T), 6, dtype=T.dtype, device=T.device, requires_grad=True)
-        g = scores(pixels, residuals(pixels, left_update(xi, T)), how)[0].sum(dim=2)
+        g = scores(pixels, left_update(xi, T), how)[0].sum(dim=2)
         rows = [torch.autograd.grad(g[:, k].sum(), xi, retain_graph=True)[0] for k in range(6)]
     return -torch.stack(rows, dim=1)
 
@@ -274,23 +234,20 @@ def attached(
 
 
 def stepped(
-    pixels: Pixels,
-    T: pp.LieTensor,
-    at: Residuals,
-    how: RobustNoise,
-    going: torch.Tensor | float = 1.0,
+    pixels: Pixels, T: pp.LieTensor, how: RobustNoise, going: torch.Tensor | float = 1.0
 ) -> pp.LieTensor:
-    """Poses after a Gauss-Newton step, times ``going``; ``at``: their residuals."""
-    return left_update(going * solve_small(*linearize(pixels, at, how).total(), DAMPING)[0], T)
+    """Poses after a Gauss-Newton step, times ``going``."""
+    return left_update(going * solve_small(*linearize(pixels, T, how).total(), DAMPING)[0], T)
 
 
 def flow_noise(scale: torch.Tensor, kernel: str = "geman-mcclure") -> RobustNoise:
     """A kernel of this width (B,) px around exact depths."""
-    return RobustNoise(scale[:, None], 1.0, kernel)
+    return RobustNoise(torch.stack([scale, torch.zeros_like(scale)], 1), 1.0, kernel)
 
 
-def typical_residual(pixels: Pixels, at: Residuals) -> torch.Tensor:
+def typical_residual(pixels: Pixels, T: pp.LieTensor) -> torch.Tensor:
     """(B,) weighted median of the length of the flow residuals of every third pixel."""
+    at = residuals(pixels, T)
     r, weight = at.r[:, :2, ::3], (pixels.weight * at.front)[:, ::3]
     return weighted_median(r.norm(dim=1), weight, 1.0)
 
@@ -304,16 +261,14 @@ def fit_pixels(pixels: Pixels, start: pp.LieTensor, smallest: float) -> pp.LieTe
     """
     with torch.no_grad():
         T, fixed = start, pixels.map(torch.Tensor.detach)
-        at = residuals(fixed, T)
-        first = scale = typical_residual(fixed, at)
+        first = scale = typical_residual(fixed, T)
         for _ in range(FIT_STEPS):
-            T = stepped(fixed, T, at, flow_noise((CUTOFF * scale).clamp(min=smallest)))
-            at = residuals(fixed, T)
-            scale = typical_residual(fixed, at)
+            T = stepped(fixed, T, flow_noise((CUTOFF * scale).clamp(min=smallest)))
+            scale = typical_residual(fixed, T)
         good = torch.isfinite(T.tensor()).all(dim=1) & (scale <= first)
         T = pp.SE3(torch.where(good[:, None], T.tensor(), start.tensor()))
         width = (CUTOFF * torch.where(good, scale, first)).clamp(min=smallest)
     if not pixels.weight.requires_grad:
         return T
-    H, g = linearize(pixels, residuals(pixels, T), flow_noise(width, "huber")).total()
+    H, g = linearize(pixels, T, flow_noise(width, "huber")).total()
     return attached(T, H.detach(), g)

@@ -22,13 +22,12 @@ from hybridvo.synthetic.draws import (
     covering_mask,
     direction,
     log_uniform,
-    ordered,
     outline,
     random_silhouette,
     silhouette_mask,
     smooth_field,
 )
-from hybridvo.synthetic.layered import Layers, Sample, normalized_grid, visibility
+from hybridvo.synthetic.layered import Layers, Sample, visibility
 from hybridvo.synthetic.sensors import SensorOptions, degrade_depth, degrade_flow, sample_at
 
 SKY_INVERSE_DEPTH = 1.0 / 2000.0
@@ -77,15 +76,6 @@ class DiverseOptions:
     degradation: SensorOptions = SensorOptions()
     preset: Literal["diverse"] = "diverse"
 
-    def __post_init__(self) -> None:
-        ordered(
-            static_layers=self.static_layers,
-            movers=self.movers,
-            field_of_view_deg=(*self.field_of_view_deg, 175),
-            large_coverage=(*self.large_coverage, 1),
-            probabilities=(self.room_probability + self.outdoor_probability, 1),
-        )
-
     def sample(self, rng: np.random.Generator) -> Sample:
         """One pair."""
         while True:
@@ -95,8 +85,7 @@ class DiverseOptions:
             if self._plausible(flow, ratio) and self._plausible(ego_flow, ego_ratio):
                 break
         rho = scene.rho
-        depth = np.where(rho > 0, 1.0 / np.maximum(rho, SKY_INVERSE_DEPTH / 10), 0.0)
-        depth = depth.astype(np.float32)
+        depth = np.divide(1.0, rho, out=np.zeros_like(rho), where=rho > 0)
         own = np.square(flow - ego_flow)
         hidden, depth_curr = visibility(flow, rho / ratio, rho > 0)
         measured, depth_prev = flow, depth
@@ -134,20 +123,18 @@ class _Scene(Layers):
 
     def __init__(self, rng: np.random.Generator, options: DiverseOptions) -> None:
         o, self.rng, self.options = options, rng, options
-        half_angle = np.deg2rad(log_uniform(rng, o.field_of_view_deg)) / 2
-        self.fx = float(o.width / 2 / np.tan(half_angle))
-        self.fy = self.fx * log_uniform(rng, o.aspect)
-        shift = o.centre_shift * rng.uniform(-1, 1, 2)
-        self.cx = (o.width - 1) / 2 + shift[0] * o.width
-        self.cy = (o.height - 1) / 2 + shift[1] * o.height
-        K = np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]])
+        size = np.array([o.width, o.height])
+        fx = o.width / 2 / np.tan(np.deg2rad(log_uniform(rng, o.field_of_view_deg)) / 2)
+        fy = fx * log_uniform(rng, o.aspect)
+        cx, cy = (size - 1) / 2 + o.centre_shift * rng.uniform(-1, 1, 2) * size
         self.scale = log_uniform(rng, o.scene_depth)
-        x, y = normalized_grid(K, o.height, o.width)
-        super().__init__(K, self._background(x.astype(np.float32), y.astype(np.float32)))
+        K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+        super().__init__(K, np.zeros((o.height, o.width), np.float32))
+        self._build()
 
-    def _background(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """(H, W) inverse depth of walls, ground or one slanted surface; 0 is sky."""
-        o, rng = self.options, self.rng
+    def _build(self) -> None:
+        """Walls, ground or one slanted surface; what is left is sky."""
+        o, rng, rho = self.options, self.rng, self.rho
         kind = rng.random()
         yaw, pitch, roll = rng.uniform(-40, 40), rng.normal(0, 10), rng.normal(0, 4)
         R = euler_deg_to_matrix(np.array([pitch, yaw, roll]))
@@ -172,17 +159,16 @@ class _Scene(Layers):
             normal = np.array([tilt[0], tilt[1], 1.0])
             planes = [(normal / np.linalg.norm(normal), size * rng.uniform(0.6, 1.5))]
             R = np.eye(3)
-        rho = np.zeros((o.height, o.width), np.float32)
         for normal, distance in planes:
             n = (R.T @ normal / distance).astype(np.float32)
-            np.maximum(rho, n[0] * x + (n[1] * y + n[2]), out=rho)
+            np.maximum(rho, n[0] * self.x + (n[1] * self.y + n[2]), out=rho)
         if kind >= o.room_probability + o.outdoor_probability:
             # A single surface has no sky: it bends away instead.
             np.maximum(rho, np.float32(0.05 / size), out=rho)
         relief = o.relief * rng.random() ** 2
-        rho *= np.exp(relief * smooth_field(rng, (o.height, o.width), int(rng.integers(3, 12))))
+        rho *= np.exp(relief * smooth_field(rng, rho.shape, int(rng.integers(3, 12))))
         rho[rho < SKY_INVERSE_DEPTH] = 0.0
-        return np.minimum(rho, np.float32(5.0))
+        np.minimum(rho, 5.0, out=rho)
 
     def add(
         self, mask: np.ndarray, in_front: bool, inverse_depth: float | None = None
@@ -206,13 +192,14 @@ class _Scene(Layers):
         rho = np.float32(inverse_depth) * np.maximum(shape, 0.3)
         if np.count_nonzero(inside & (rho > under)) < 4:
             return None
-        number = len(self.motions)
         rows, columns = np.nonzero(self.lay(box, inside, rho))
-        return number, self.ray(left + columns.mean(), top + rows.mean()) / inverse_depth
+        return len(self.motions) - 1, self.ray(
+            left + columns.mean(), top + rows.mean()
+        ) / inverse_depth
 
     def ray(self, u: float, v: float) -> np.ndarray:
         """(3,) K^-1 (u, v, 1)."""
-        return np.array([(u - self.cx) / self.fx, (v - self.cy) / self.fy, 1.0])
+        return np.linalg.solve(self.K, (u, v, 1.0))
 
     def magnitude(self, law: Law) -> float:
         """One draw of a log-normal law."""
@@ -251,24 +238,18 @@ class _Scene(Layers):
         number, centre = added
         depth = float(centre[2])
         R = self.turn(o.object_rotation_deg)
-        t = (
-            self.magnitude(o.object_translation)
-            * depth
-            * direction(rng)
-            * np.array([1.0, 0.6, 0.8])
-        )
+        t = self.magnitude(o.object_translation) * depth * direction(rng) * (1.0, 0.6, 0.8)
         total = T_cam @ about(R, centre, t)
         if follow:
             total = about(euler_deg_to_matrix(follow * 3.0 * direction(rng)), centre, follow * t)
         self.motions[number] = total
         if rng.random() < o.nonrigid_probability:
             amplitude = np.float32(log_uniform(rng, o.bend) * depth)
-            cells = int(rng.integers(3, 8))
-            self.bends[number] = amplitude * smooth_field(rng, (o.height, o.width), cells, 3)
+            field = smooth_field(rng, self.rho.shape, int(rng.integers(3, 8)), 3)
+            self.bends[number] = amplitude * field
         if rng.random() < o.articulated_probability:
             points = shape[0][0]
-            ray = centre / depth
-            middle = np.array([ray[0] * self.fx + self.cx, ray[1] * self.fy + self.cy])
+            middle = (self.K @ centre)[:2] / depth
             for _ in range(int(rng.integers(1, 6))):
                 limb_radius = radius * rng.uniform(0.3, 0.8)
                 limb = outline(rng, "bar" if rng.random() < 0.6 else "superellipse")
@@ -280,22 +261,17 @@ class _Scene(Layers):
                     own = self.turn(o.limb_rotation_deg)
                     self.motions[part[0]] = total @ about(own, self.ray(*joint) * depth)
 
-    def radius(self) -> float:
-        """Size of an occluder or a mover in px."""
-        return self.options.width * log_uniform(self.rng, self.options.mover_radius)
-
-    def placed(self, shape: Silhouette, radius: float, highest: float) -> np.ndarray:
+    def small(self, shape: Silhouette, radius: float, highest: float) -> np.ndarray:
         """Mask of an outline somewhere, stretched by 0.4 to ``highest``."""
-        o, rng = self.options, self.rng
-        place = rng.uniform(0, o.width), rng.uniform(0, o.height)
-        stretch = log_uniform(rng, (0.4, highest))
+        place = self.rng.uniform(0, self.rho.shape[1]), self.rng.uniform(0, self.rho.shape[0])
+        stretch = log_uniform(self.rng, (0.4, highest))
         return silhouette_mask(shape, self.rho.shape, place, radius, stretch)
 
     def occlude(self, count: int) -> None:
         """Lay things that stand still over the scene."""
         for _ in range(count):
-            radius = self.radius()
-            self.add(self.placed(random_silhouette(self.rng), radius, 2.5), in_front=False)
+            radius = self.rho.shape[1] * log_uniform(self.rng, self.options.mover_radius)
+            self.add(self.small(random_silhouette(self.rng), radius, 2.5), in_front=False)
 
     def populate(self) -> np.ndarray:
         """Occluders and movers; returns the camera's T_curr_prev."""
@@ -316,10 +292,10 @@ class _Scene(Layers):
         if not still:
             count = int(rng.integers(o.movers[0], o.movers[1] + 1))
             for index in range(count if large else max(count, 1)):
-                shape, radius = random_silhouette(rng), self.radius()
-                main = index == 0 and not large
-                mask = self.placed(shape, radius, 2.0)
-                self.add_mover(shape, mask, radius, T_cam, follow if main else 0.0)
+                shape = random_silhouette(rng)
+                radius = o.width * log_uniform(rng, o.mover_radius)
+                followed = 0.0 if index or large else follow
+                self.add_mover(shape, self.small(shape, radius, 2.0), radius, T_cam, followed)
         if rng.random() < 0.4:
             self.occlude(int(rng.integers(1, 3)))
         return T_cam

@@ -14,7 +14,6 @@ from numpy.typing import ArrayLike
 from pydantic import AfterValidator
 from scipy.spatial.transform import Rotation
 
-from hybridvo.errors import InputError
 from hybridvo.geometry import make_transform
 
 
@@ -28,24 +27,12 @@ Range = Annotated[tuple[float, float], AfterValidator(_ordered)]
 """Two positive limits of an option."""
 
 
-def ordered(**limits: tuple[float, ...]) -> None:
-    """Refuse numbers of an option that do not grow."""
-    for name, values in limits.items():
-        if list(values) != sorted(values):
-            raise InputError(f"{name}: expected growing values, got {values}")
-
-
 HELD_OUT, TRAINING, STORED = range(3)
 """What samples are drawn for; none of one kind is one of another, whatever the seeds."""
 
 
 def sample_generator(seed: int, index: int, use: int = HELD_OUT) -> np.random.Generator:
     """Generator of sample ``index`` of a seed, the same on every machine and in every process."""
-    if not (0 <= seed < 1 << 32 and 0 <= index < 1 << 63):
-        raise InputError(
-            f"sample_generator: expected 0 <= seed < 2^32 and 0 <= index < 2^63, got seed {seed} "
-            f"and index {index}."
-        )
     key = np.array([seed + (use << 32), index], dtype=np.uint64)
     return np.random.Generator(np.random.Philox(key=key))
 

@@ -18,7 +18,7 @@ from pydantic import Field
 from hybridvo.errors import InputError
 from hybridvo.geometry import euler_deg_to_matrix, make_transform, matrix_to_euler_deg, pixel_grid
 from hybridvo.options import Positive, Share, option_group
-from hybridvo.synthetic.draws import cut_out, ordered
+from hybridvo.synthetic.draws import cut_out
 from hybridvo.types import FramePair
 
 MIN_RATIO = 1e-6
@@ -68,7 +68,7 @@ class KnownPair:
 
     ``depth``: (H, W) metres of the previous frame before the sensor's errors, 0 where unknown;
     ``moving``: (H, W) bool, points that do not follow the camera's motion; ``world``: path of the
-    recording; ``log_depth_curr``: (H, W) of the current frame at x + F where it has no depth map.
+    recording.
     """
 
     pair: FramePair
@@ -76,7 +76,6 @@ class KnownPair:
     depth: np.ndarray
     moving: np.ndarray
     world: str = ""
-    log_depth_curr: np.ndarray | None = None
 
 
 class Layers:
@@ -88,9 +87,10 @@ class Layers:
 
     def __init__(self, K: np.ndarray, rho: np.ndarray) -> None:
         height, width = rho.shape
-        self.K, self.rho = K, rho
-        self.x, self.y = (x.astype(rho.dtype) for x in normalized_grid(K, height, width))
-        self.owner = np.full((height, width), -1, np.int16)
+        self.K, self.rho, self.owner = K, rho, np.full(rho.shape, -1, np.int16)
+        # (W,) and (H, 1), the first two components of K^-1 x
+        self.x = ((np.arange(width) - K[0, 2]) / K[0, 0]).astype(rho.dtype)
+        self.y = ((np.arange(height)[:, None] - K[1, 2]) / K[1, 1]).astype(rho.dtype)
         self.motions: list[np.ndarray | None] = []
         self.bends: list[np.ndarray | None] = []
 
@@ -140,12 +140,6 @@ def camera_flow(K: np.ndarray, depth: np.ndarray, T: np.ndarray) -> tuple[np.nda
     """(H, W, 2) flow of the camera motion alone, and (H, W) ratio of the new depth to the old."""
     inverse = np.divide(1.0, depth, out=np.zeros(depth.shape), where=depth > 0).astype(np.float32)
     return Layers(K, inverse).flows(T, added=False)[:2]
-
-
-def normalized_grid(K: np.ndarray, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
-    """(W,) and (H, 1): first two components of K^-1 x of the pixels."""
-    x, y = (np.arange(width) - K[0, 2]) / K[0, 0], (np.arange(height) - K[1, 2]) / K[1, 1]
-    return x, y[:, None]
 
 
 def rigid_flow(
@@ -225,9 +219,6 @@ class TailSampler:
     high: float
     core_std: Positive
 
-    def __post_init__(self) -> None:
-        ordered(limits=(self.low, self.high))
-
     def draw(self, rng: np.random.Generator, low: float | None = None) -> float:
         """One value; ``low`` replaces the lower limit where the scene demands it."""
         low = self.low if low is None else low
@@ -303,15 +294,6 @@ class PaperOptions:
     canvas_margin: Annotated[float, Field(ge=0, le=4)] = 0.25
     motion: MotionSamplers = MotionSamplers()
     preset: Literal["paper"] = "paper"
-
-    def __post_init__(self) -> None:
-        mean, spread, low, high = self.object_size
-        ordered(
-            focal=(self.focal_low, self.focal_high),
-            background=(self.background_low, self.background_high, self.background_far),
-            object_size=(mean - 3 * spread, high),
-            object_sizes=(low, min(high, mean + 3 * spread)),
-        )
 
     def sample(self, rng: np.random.Generator) -> Sample:
         """One pair by the five steps."""

@@ -45,9 +45,7 @@ class Solid:
 
 
 class RenderedFrame(NamedTuple):
-    """(H, W, 3) uint8 image, (H, W) float32 depth in metres, inf where nothing is hit, and (H, W)
-    int32 object number: 0 static, 1.. movers, -1 where nothing is hit.
-    """
+    """Image, depth in metres (inf: nothing is hit) and object (0 static, 1.. movers, -1 none)."""
 
     rgb: np.ndarray
     depth: np.ndarray
@@ -125,10 +123,9 @@ class Scene:
         _, depth, solid = self._cast(index, camera)
         fine = resize_camera(camera, 2 * camera.height, 2 * camera.width)
         B, depth2, solid2 = self._cast(index, fine)
-        scale, offset, colours = self._texture()
         light = self.T_world_cam[index][:3, :3].T @ np.asarray(self.light, dtype=float)
         light /= np.linalg.norm(light)
-        colour = shade(depth2, solid2, self._shapes, B, fine.K, scale, offset, colours, light)
+        colour = shade(depth2, solid2, self._shapes, B, fine.K, *self._texture(), light)
         image = 255.0 * colour.reshape(camera.height, 2, camera.width, 2, 3).mean(axis=(1, 3))
         if self.noise > 0:
             rng = np.random.default_rng([self.seed, index])
@@ -154,7 +151,7 @@ class Scene:
         return flow.astype(np.float32), hidden, self._object_id(solid) > 0
 
     def object_id(self, index: int) -> np.ndarray:
-        """(H, W) int32 object numbers of a frame, without rendering colour."""
+        """(H, W) int32 object numbers of a frame."""
         return self._object_id(self._cast(index, self.cameras[index])[-1])
 
     def moving_share(self, index: int, width: int = 96) -> tuple[float, float]:

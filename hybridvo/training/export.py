@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import json
 import subprocess
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from hybridvo.errors import InputError
-from hybridvo.files import write_json
+from hybridvo.files import read_text, write_json
 from hybridvo.network.weights import save_weights
 from hybridvo.training.options import recorded_run
 from hybridvo.training.pwvo_task import PwvoTask
@@ -25,15 +24,14 @@ RUN = "run.json"
 
 def source_commit() -> str | None:
     """Commit of the working tree, with a mark if it was changed; None outside of a repository."""
-    command = ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude", "*"]
-    here = Path(__file__).resolve().parent
+    command = "git describe --always --dirty --abbrev=40 --exclude *".split()
+    here = Path(__file__).parent
     try:
-        done = subprocess.run(
-            command, cwd=here, capture_output=True, text=True, timeout=10, check=True
-        )
+        return subprocess.check_output(
+            command, cwd=here, stderr=subprocess.DEVNULL, text=True
+        ).strip()
     except (OSError, subprocess.SubprocessError):
         return None
-    return done.stdout.strip() or None
 
 
 def run_card(trainer: Trainer) -> dict[str, Any]:
@@ -46,7 +44,7 @@ def run_card(trainer: Trainer) -> dict[str, Any]:
         **trainer.record,
     }
     try:
-        return card | json.loads((Path(str(trainer.folder)) / RUN).read_text(encoding="utf-8"))
+        return card | json.loads(read_text(Path(str(trainer.folder)) / RUN))
     except (OSError, ValueError) as error:
         raise InputError(f"{trainer.folder}: no {RUN} of a training: {error}.") from None
 
@@ -67,17 +65,13 @@ def _write(path: Path, network: Any, card: dict[str, Any]) -> dict[str, Any]:
 
 
 def export_pwvo(
-    folder: str | Path,
-    path: str | Path,
-    count: int = 1000,
-    calibrate: int = 0,
-    say: Callable[[str], None] = print,
+    folder: str | Path, path: str | Path, count: int = 1000, calibrate: int = 0
 ) -> dict[str, Any]:
     """Write a run's weights as float16 safetensors, and its card beside them as JSON.
 
     The figures of the card are those of the stored, rounded weights, over ``count`` held-out pairs
     of each preset; ``calibrate``: development pairs over which the scales of the translation are
-    calibrated; 0: as trained; ``say`` takes lines of progress.
+    calibrated; 0: as trained.
 
     Raises:
         CheckpointError, InputError: not the folder of a run.
@@ -93,7 +87,6 @@ def export_pwvo(
     network = trainer.exported.half().float()
     card["held_out"] = {}
     for name, preset in zip(options.data, presets, strict=True):
-        say(f"{Path(name).stem}: {count} held-out pairs")
         how = {"selection": options.selection}
         figures = evaluate_network(network, preset, PUBLISHED_SEED, count, **how)
         del figures["epe_of_pairs"]

@@ -14,13 +14,8 @@ from hybridvo.network.losses import LossOptions
 from hybridvo.network.selection import SELECTION_METHODS
 from hybridvo.network.selector_net import SelectorNetworkOptions
 from hybridvo.options import Count, Positive, Share, option_group
-from hybridvo.synthetic.dataset import (
-    Mixture,
-    build_options,
-    load_preset,
-    make_preset,
-    read_yaml,
-)
+from hybridvo.synthetic import dataset
+from hybridvo.synthetic.dataset import Mixture, build_options, read_yaml
 
 Below1 = Annotated[float, Field(ge=0, lt=1)]
 NotNegative = Annotated[float, Field(ge=0)]
@@ -58,8 +53,7 @@ class ScheduleOptions:
         if self.kind == "halving":
             return 0.5 ** sum(progress >= p for p in self.halvings)
         done = (progress - self.warmup) / max(1.0 - self.warmup, 1e-9)
-        share = 0.5 * (1 + math.cos(math.pi * done))
-        return self.final_share + (1 - self.final_share) * share
+        return self.final_share + (1 - self.final_share) * 0.5 * (1 + math.cos(math.pi * done))
 
 
 @option_group
@@ -135,14 +129,14 @@ def load_pwvo_options(path: str | Path) -> tuple[PwvoOptions, Mixture]:
     """Options of a ``configs/train_*.yaml`` and the mixture of the data that it names."""
     path = Path(path)
     options = build_options(PwvoOptions, read_yaml(path), str(path))
-    presets = [load_preset(path.parent / name, options.data_size) for name in options.data]
+    presets = [dataset.load_preset(path.parent / name, options.data_size) for name in options.data]
     return options, Mixture(tuple(presets), options.data_weights)
 
 
 def recorded_run(record: dict[str, Any], where: str) -> tuple[PwvoOptions, Mixture]:
     """Options and data of a run from the record in its checkpoint ``where``."""
     options = build_options(PwvoOptions, record["options"], where)
-    presets = [make_preset(mapping, where) for mapping in record["data"]]
+    presets = [dataset.make_preset(mapping, where) for mapping in record["data"]]
     return options, Mixture(tuple(presets), options.data_weights)
 
 

@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from torch import nn
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
-from hybridvo.network.losses import NetworkOutput, reconstruct, total_loss
+from hybridvo.network.losses import reconstruct, total_loss
 from hybridvo.network.normalization import first_motions
 from hybridvo.network.pwvo import build_network
 from hybridvo.network.selection import fitted_motion, select_motion
@@ -64,27 +64,34 @@ class PwvoTask:
         return iter(DataLoader(stream, batch_size=None, **how))  # type: ignore[arg-type]
 
     def loss(
-        self, model: nn.Module, batch: TrainingBatch, step: int, progress: float
+        self, batch: TrainingBatch, step: int, progress: float
     ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         """Loss of a batch and its parts."""
         half = self.options.precision == "bfloat16"
         with torch.autocast(batch.moving.device.type, torch.bfloat16, enabled=half):
             starts = self._starts(batch, step)
-            output = model(batch.inputs, *(() if starts is None else (starts,)))
-        return training_loss(output, batch, self.options)
+            output = self.network(batch.inputs, *(() if starts is None else (starts,)))
+        o, targets = self.options, batch.targets.subsample(self.options.loss_stride)
+        T = select_motion(output, o.selection) if o.loss.reconstructs else None
+        loss, parts = total_loss(output, targets, o.loss, T)
+        extra = {"fit": (o.fit_weight, fit_loss), "moving": (o.moving_weight, separation_loss)}
+        for name, (weight, term) in extra.items():
+            if weight:
+                assert isinstance(output, PixelwisePrediction)
+                value = term(output, batch, o)
+                loss = loss + weight * value
+                parts[name] = value.detach()
+        return loss, parts
 
     def _starts(self, batch: TrainingBatch, step: int) -> torch.Tensor | None:
         """(B, 4, 4) first motions: none for half of the batch, the network's own for the rest."""
-        passes = self.options.network.passes
-        first = len(batch) // 2
+        passes, first = self.options.network.passes, len(batch) // 2
         if passes == 1 or first == 0:
             return None
-        T = torch.eye(4, device=batch.moving.device).repeat(len(batch), 1, 1)
-        some, count = batch.inputs[first:], 1 + step % (passes - 1)
-        made = first_motions(self.network, some, self.options.selection, count)
+        count = 1 + step % (passes - 1)
+        made = first_motions(self.network, batch.inputs[first:], self.options.selection, count)
         assert made is not None
-        T[first:] = made
-        return T
+        return torch.cat([torch.eye(4).to(made).repeat(first, 1, 1), made])
 
     def evaluate(self, network: nn.Module) -> dict[str, Any]:
         """Figures on development pairs of each preset."""
@@ -94,24 +101,6 @@ class PwvoTask:
             Path(name).stem: evaluate_network(network, preset, 0, options.evaluate_count, **how)
             for name, preset in zip(options.data, self.mixture.presets, strict=True)
         }
-
-
-def training_loss(
-    output: NetworkOutput, batch: TrainingBatch, options: PwvoOptions
-) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-    """Loss of a network's output and its parts, see :func:`hybridvo.network.losses.total_loss`."""
-    T = select_motion(output, options.selection) if options.loss.reconstructs else None
-    loss, parts = total_loss(output, batch.targets.subsample(options.loss_stride), options.loss, T)
-    if isinstance(output, PixelwisePrediction):
-        for name, weight, term in (
-            ("fit", options.fit_weight, fit_loss),
-            ("moving", options.moving_weight, separation_loss),
-        ):
-            if weight:
-                value = term(output, batch, options)
-                loss = loss + weight * value
-                parts[name] = value.detach()
-    return loss, parts
 
 
 def fit_loss(

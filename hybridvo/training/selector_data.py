@@ -8,7 +8,6 @@ training can read them while others are being made.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,13 +20,11 @@ from hybridvo.hypotheses.generate import HypothesisSet, generate
 from hybridvo.network.prediction import propose_motion
 from hybridvo.options import Options
 from hybridvo.refinement.pixels import grid_stride
-from hybridvo.results import RelativePose
-from hybridvo.synthetic.diverse import DiverseOptions
+from hybridvo.results import MotionPrediction, RelativePose
 from hybridvo.synthetic.draws import log_uniform
 from hybridvo.synthetic.layered import KnownPair
-from hybridvo.synthetic.rendered import any_noise, rendered_pairs
+from hybridvo.synthetic.rendered import rendered_pairs
 from hybridvo.synthetic.semi_real import Recording, draw_pair
-from hybridvo.types import Camera, Frame, FramePair
 
 PER_SHARD = 64
 """Seeds of a shard."""
@@ -38,14 +35,14 @@ SIZES = ((160, 320), (160, 320), (128, 256), (192, 256), (120, 400), (218, 512))
 MOVING, STATIC, UNKNOWN = 0, 1, 255
 """Labels of the pixels."""
 SOURCES = ("diverse", "rendered", "dis", "semi-real")
-"""Where samples come from: the diverse preset, rendered scenes with true flow and with DIS, and
-recordings with movers cut from others."""
+"""Where samples come from: the diverse preset (no longer drawn), rendered scenes with true flow and
+with DIS, and recordings with movers cut from others."""
 
 
 def draw_samples(
     seed: int, recordings: Sequence[Recording] = (), network: torch.nn.Module | None = None
 ) -> list[dict[str, Any]]:
-    """Samples of one seed: semi-real, one of the diverse preset, or two of a rendered pair.
+    """Samples of one seed: one semi-real, or two of a rendered pair.
 
     Pairs that the search settles alone are left out: the selector is never asked about them.
     ``network``: a PWVO whose motion and static world are kept with the samples.
@@ -54,8 +51,6 @@ def draw_samples(
     height, width = SIZES[int(rng.integers(len(SIZES)))]
     if recordings:
         pairs = {"semi-real": draw_pair(rng, recordings)}
-    elif rng.random() < 0.5:
-        pairs = {"diverse": _diverse_pair(rng, min(height, 160), min(width, 320))}
     else:
         pairs = rendered_pairs(rng, height, width)
     samples = []
@@ -73,7 +68,10 @@ def draw_samples(
             continue  # a grid of another size, of pixels that are few
         sample = _record(drawn, found, T_prior) | {"source": SOURCES.index(source)}
         if network is not None:
-            sample |= _asked(network, drawn.pair, found)
+            nothing = MotionPrediction(np.full((4, 4), np.nan), np.full((1, 1), 0.5))
+            said = propose_motion(network, drawn.pair) or nothing
+            sample["proposal"] = said.T_curr_prev[:3]
+            sample["static"] = found.grid.resample(said.static_probability).astype(np.float16)
         samples.append(sample)
     return samples
 
@@ -89,31 +87,15 @@ def expected_motion(rng: np.random.Generator, T: np.ndarray) -> tuple[np.ndarray
     return se3_exp(spread * rng.standard_normal(6)) @ T, stated
 
 
-def _diverse_pair(rng: np.random.Generator, height: int, width: int) -> KnownPair:
-    sample = DiverseOptions(height=height, width=width).sample(rng)
-    camera = Camera.from_matrix(sample.K, height, width)
-    flow = np.ascontiguousarray(sample.flow)
-    if rng.random() < 0.15:
-        flow = any_noise(rng, flow)
-    prev = Frame(None, np.ascontiguousarray(sample.depth_prev), camera)
-    pair = FramePair(prev, Frame(None, None, camera), flow)
-    known = (sample.depth_curr > 0) & (rng.random() >= 0.1)
-    log_depth = np.log(np.where(known, sample.depth_curr, np.float32(np.nan)))
-    T = sample.T_curr_prev.astype(float)
-    return KnownPair(pair, T, sample.depth_true, sample.moving, log_depth_curr=log_depth)
-
-
 def _record(drawn: KnownPair, found: HypothesisSet, T_prior: np.ndarray | None) -> dict[str, Any]:
     """Everything about a sample: the maps of its grid, the motions found, and ground truth."""
-    stride, maps = found.grid.shape[2], found.maps()
+    stride = found.grid.shape[2]
     pick = np.s_[stride // 2 :: stride, stride // 2 :: stride]
-    if drawn.log_depth_curr is not None:
-        maps = replace(maps, log_depth_curr=drawn.log_depth_curr[pick])
     label = np.where(drawn.moving, MOVING, STATIC)
     label = np.where(drawn.depth > 0, label, UNKNOWN)[pick]
     count = min(len(found.poses), MAX_MOTIONS)
     empty = (0, MAX_MOTIONS - count)
-    return vars(maps) | {
+    return vars(found.maps()) | {
         "depth_true": np.minimum(drawn.depth[pick], 6e4).astype(np.float16),
         "label": label.astype(np.uint8),
         "poses": np.pad(found.poses[:count], (empty, (0, 0), (0, 0))),
@@ -123,16 +105,6 @@ def _record(drawn: KnownPair, found: HypothesisSet, T_prior: np.ndarray | None) 
         "T_prior": (np.eye(4) if T_prior is None else T_prior)[:3],
         "has_prior": T_prior is not None,
     }
-
-
-def _asked(network: torch.nn.Module, pair: FramePair, found: HypothesisSet) -> dict[str, Any]:
-    """Motion (3, 4) and static probability (h, w) that a PWVO states; NaN and 0.5 where none."""
-    said = propose_motion(network, pair)
-    if said is None:
-        h, w, _ = found.grid.shape
-        return {"proposal": np.full((3, 4), np.nan), "static": np.full((h, w), 0.5, np.float16)}
-    static = found.grid.resample(said.static_probability).astype(np.float16)
-    return {"proposal": said.T_curr_prev[:3], "static": static}
 
 
 def write_shard(

@@ -25,6 +25,7 @@ from hybridvo.options import RefineOptions
 from hybridvo.refinement import kernels
 from hybridvo.training.options import SelectorOptions
 from hybridvo.training.selector_data import MOVING, SOURCES, STATIC, expected_motion
+from hybridvo.training.validation import area_under_curve
 
 RIGHT_PX = 1.0
 """px at a width of 1024: mean error of the ego flow up to which a motion is right."""
@@ -59,7 +60,7 @@ class SelectorBatch:
         return len(self.T)
 
     def to(self, device: torch.device) -> SelectorBatch:
-        """The same: the solver that fits inside masks runs on the CPU."""
+        """The same: fits inside masks run on the CPU."""
         return self
 
     def shown(self, asked: torch.Tensor) -> SelectorBatch:
@@ -92,11 +93,8 @@ def _collate(p: dict[str, np.ndarray]) -> SelectorBatch:
     maps: dict[str, Any] = {field.name: p[field.name] for field in fields(GridMaps)}
     there = np.arange(p["poses"].shape[1]) < p["count"][:, None]
     owner = np.nonzero(there)[0]
-    inputs = replace(
-        stacked_inputs(GridMaps(**maps), torch.device("cpu")),
-        T_prior=torch.as_tensor(p["T_prior"].astype(np.float32)),
-        has_prior=torch.as_tensor(p["has_prior"]),
-    ).asking(p["poses"][there], p["facts"][there], np.arange(len(owner)), owner)
+    inputs = stacked_inputs(GridMaps(**maps), torch.device("cpu"))
+    inputs = inputs.asking(p["poses"][there], p["facts"][there], np.arange(len(owner)), owner)
     truth = {"depth_true": np.float32, "label": np.int64, "T": np.float32, "source": np.int64}
     truth |= {"static": np.float32, "proposal": np.float64}
     tensors = {name: torch.as_tensor(p[name].astype(kind)) for name, kind in truth.items()}
@@ -199,7 +197,7 @@ class Looks:
 
     def __init__(
         self,
-        model: torch.nn.Module,
+        model: SelectorNetwork,
         batch: SelectorBatch,
         mirror: torch.Tensor | None = None,
         half: bool = False,
@@ -233,20 +231,26 @@ class Looks:
         """Numbers of the motions of each sample."""
         return [torch.nonzero(self.owner == b)[:, 0] for b in range(len(self.batch))]
 
-    def trust(self, network: Any) -> torch.Tensor:
+    def trust(self) -> torch.Tensor:
         """(B,) logit of the probability that the chosen motion is right."""
-        return network.confidence(self.score, self.hidden, self.owner, len(self.batch))
+        return self.model.confidence(self.score, self.hidden, self.owner, len(self.batch))
 
-    def choice_loss(self) -> torch.Tensor:
-        """Cross entropy against a soft target: motions nearly as good as the best share it."""
-        losses = []
+    def choice_losses(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Losses of the choice and of the probability stated with it.
+
+        Cross entropies against soft targets: motions nearly as good as the best share the choice.
+        """
+        choice, right = [], []
         for mine in self.motions():
-            wrong = self.error[mine]
-            best = wrong.min()
-            target = torch.softmax(-(wrong - best) / (0.1 + 0.3 * best), 0)
+            error, score = self.error[mine], self.score[mine]
+            best = error.min()
+            target = torch.softmax(-(error - best) / (0.1 + 0.3 * best), 0)
             weight = 1.0 / (1.0 + (best / 4.0) ** 2)
-            losses.append(-weight * (target * torch.log_softmax(self.score[mine], 0)).sum())
-        return torch.stack(losses).mean()
+            choice.append(-weight * (target * torch.log_softmax(score, 0)).sum())
+            limit = (3 * best).clamp(RIGHT_PX, WORST_RIGHT_PX)
+            right.append(torch.sigmoid((1 - error[score.argmax()] / limit) / RIGHT_SLOPE))
+        trust = F.binary_cross_entropy_with_logits(self.trust(), torch.stack(right))
+        return torch.stack(choice).mean(), trust
 
     def mask_loss(self, out: SelectorOutput, inputs: SelectorInputs) -> torch.Tensor:
         """Binary cross entropy of masks over usable pixels of known kind."""
@@ -256,16 +260,6 @@ class Looks:
         static = (label == STATIC).float()
         loss = F.binary_cross_entropy_with_logits(out.mask, static, reduction="none")
         return ((loss * known).sum((1, 2)) / known.sum((1, 2)).clamp(min=1)).mean()
-
-    def trust_loss(self, network: Any) -> torch.Tensor:
-        """Binary cross entropy of the probability that the chosen motion is right."""
-        target = []
-        for mine in self.motions():
-            error = self.error[mine]
-            limit = (3 * error.min()).clamp(RIGHT_PX, WORST_RIGHT_PX)
-            chosen = error[self.score[mine].argmax()]
-            target.append(torch.sigmoid((1 - chosen / limit) / RIGHT_SLOPE))
-        return F.binary_cross_entropy_with_logits(self.trust(network), torch.stack(target))
 
 
 class SelectorTask:
@@ -289,7 +283,7 @@ class SelectorTask:
             round_number += 1
 
     def loss(
-        self, model: torch.nn.Module, batch: SelectorBatch, step: int, progress: float
+        self, batch: SelectorBatch, step: int, progress: float
     ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         """Losses of the choice, of the masks and of the stated probability."""
         o, count = self.options, len(batch)
@@ -297,19 +291,18 @@ class SelectorTask:
         asked = torch.rand(count, generator=draw) < o.asked_share
         batch = batch.expecting(np.random.default_rng([o.seed, step])).shown(asked)
         mirror = torch.rand(count, generator=draw) < 0.5
-        looks = Looks(model, batch, mirror, o.precision == "bfloat16")
-        losses = {
-            "choice": looks.choice_loss(),
-            "mask": o.mask_weight * looks.mask_loss(looks.first, batch.inputs),
-        }
+        looks = Looks(self.network, batch, mirror, o.precision == "bfloat16")
+        choice, trust = looks.choice_losses()
+        mask = o.mask_weight * looks.mask_loss(looks.first, batch.inputs)
+        losses = {"choice": choice, "mask": mask}
         if progress >= o.second_look_from:
             # one fit less in half of the updates: cheaper, and the best one is seen most
             fewer = o.refits > 1 and bool(torch.rand((), generator=draw) < 0.5)
             again = looks.again(o.refits - fewer, draw)
             if again is not None:
-                losses["second"] = looks.choice_loss()
+                losses["second"], trust = looks.choice_losses()
                 losses["second_mask"] = 0.5 * o.mask_weight * looks.mask_loss(*again)
-        losses["trust"] = o.trust_weight * looks.trust_loss(self.network)
+        losses["trust"] = o.trust_weight * trust
         total = torch.stack(list(losses.values())).sum()
         return total, {name: value.detach() for name, value in losses.items()}
 
@@ -327,26 +320,24 @@ def evaluate_selector(
 
     For each source: ``samples``, the share of them whose motion is further from the ground truth
     than is right for ``support`` (the first motion found), ``final`` (the answer) and ``best`` (of
-    all, an oracle), and ``trust_right`` and ``trust_wrong``, the mean probability given to right
-    and wrong answers.
+    all, an oracle), and ``auroc`` of the probability as a detector of right answers.
     """
     rows: dict[str, list[list[float]]] = {}
     for batch in read_batches(files, 8, None):
         looks = Looks(network, batch.shown(torch.full((len(batch),), asked)))
         looks.again(refits)
-        score, error, trust = looks.score, looks.error, looks.trust(network).sigmoid()
+        score, error, trust = looks.score, looks.error, looks.trust()
         for b, mine in enumerate(looks.motions()):
             px = error[mine[0]], error[mine[score[mine].argmax()]], error[mine].min(), trust[b]
             rows.setdefault(SOURCES[int(batch.source[b])], []).append([float(x) for x in px])
-    figures: dict[str, dict[str, Any]] = {}
+    figures = {}
     for source, listed in rows.items():
         table = np.array(listed)
-        limit = np.clip(3 * table[:, 2], RIGHT_PX, WORST_RIGHT_PX)
-        wrong = table[:, :3] > limit[:, None]
+        wrong = table[:, :3] > np.clip(3 * table[:, 2:3], RIGHT_PX, WORST_RIGHT_PX)
         shares = np.round(wrong.mean(axis=0), 4).tolist()
-        figures[source] = {"samples": len(listed)}
-        figures[source] |= dict(zip(("support", "final", "best"), shares, strict=True))
-        for name, some in (("right", ~wrong[:, 1]), ("wrong", wrong[:, 1])):
-            stated = round(float(table[some, 3].mean()), 3) if some.any() else None
-            figures[source][f"trust_{name}"] = stated
+        figures[source] = {
+            "samples": len(listed),
+            **dict(zip(("support", "final", "best"), shares, strict=True)),
+            "auroc": area_under_curve(table[:, 3], ~wrong[:, 1]),
+        }
     return figures

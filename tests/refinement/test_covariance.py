@@ -11,7 +11,7 @@ import pytest
 from hybridvo.calibration import LONG_GROWTH
 from hybridvo.estimation import refine
 from hybridvo.geometry import invert, se3_log
-from hybridvo.refinement.covariance import UPPER, block_sums, long_range, sandwich_covariance
+from hybridvo.refinement.covariance import UPPER, block_sums, long_range, motion_covariance
 from hybridvo.refinement.refine import widened
 from hybridvo.results import Reason, State, Status
 from hybridvo.synthetic.scenarios import make_pair
@@ -64,7 +64,9 @@ def answer(error: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     tiles = np.concatenate([to_tiles(H_PIXEL)[..., UPPER[0], UPPER[1]], scores], axis=2)
     products = np.einsum("vuki,vuk->vui", J, residual).reshape(-1, 6)
     meat = products.T @ products
-    covariance, _, tiles_used = sandwich_covariance(tiles, np.zeros((6, 6)), meat, 1.0)
+    covariance, _, tiles_used = motion_covariance(
+        tiles, np.zeros((6, 6)), meat, 1.0, 0.0, 1.0, np.zeros(3), (1.0, 0.0)
+    )
     assert tiles_used == ROWS * COLUMNS
     return motion, covariance
 

@@ -44,7 +44,7 @@ def test_one_pixel_by_hand() -> None:
     # a = 0.048, so the pixel lands at 5.8: residual 7 - 5.8; q = 100/2.5 (0.048 0.5 - 0.1)
     found = [float(x) for x in (*terms.r[0, :, at], *sensitivity(pixels, terms)[0, :, at])]
     assert found == pytest.approx([1.2, 1.0, 40 * (0.024 - 0.1), 0.0], abs=1e-12)
-    rows = torch.stack(jacobian(pixels, terms), dim=1)[0]
+    rows = jacobian(pixels, terms)[0]
     expected = 100 * np.array([0.4, 0, -0.048 * 0.4, 0, 1 + 0.048**2, 0])
     assert rows[0, :, at].numpy() == pytest.approx(expected, abs=1e-12)
     assert rows[1, :, at].numpy() == pytest.approx([0, 40, 0, -100, 0, 4.8], abs=1e-12)
@@ -52,13 +52,13 @@ def test_one_pixel_by_hand() -> None:
     q = -40 * 0.076
     e = 0.01 * q * 1.2 / (0.25 + 0.01 * q * q)
     how = RobustNoise(torch.tensor([[0.5, 0.1]], dtype=F64), 1e9)
-    moved = weigh(pixels, terms, how).at
+    moved = weigh(pixels, T, how).at
     assert moved.ab[0, 0, at] == pytest.approx(0.048 + q * e / 100, rel=1e-12)
     assert moved.i[0, at] == pytest.approx(0.4 * (1 - 0.8 * e), rel=1e-12)  # 1 - tz i = 0.8
     q = float(100 * moved.i[0, at] * (moved.ab[0, 0, at] * 0.5 - 0.1))
-    found = linearize(pixels, terms, how)
+    found = linearize(pixels, T, how)
     variance = 0.25 + 0.01 * q * q
-    assert found.at.distance2[0, at] == pytest.approx(1.44 / variance + 1 / 0.25, rel=1e-12)
+    assert found.found.distance2[0, at] == pytest.approx(1.44 / variance + 1 / 0.25, rel=1e-12)
     assert found.g[0, 0, 1] == pytest.approx(100 * float(moved.i[0, at]) / 0.25, rel=1e-12)
 
 
@@ -95,14 +95,14 @@ def test_derivatives_against_autograd() -> None:
     pose = se3(T)
     terms = residuals(pixels, pose)
     zero = torch.zeros(2, 6, dtype=F64)
-    for k, row in enumerate(jacobian(pixels, terms)):
+    for k, row in enumerate(jacobian(pixels, terms).unbind(1)):
         full = torch.autograd.functional.jacobian(
             lambda d, k=k: -residuals(pixels, left_update(d, pose)).r[:, k], zero
         )
         auto = torch.stack([full[b, :, b] for b in range(2)])
         assert (row.transpose(1, 2) - auto).abs().max() < 1e-10
         scale = torch.ones_like(pixels.weight).requires_grad_()
-        r = residuals(replace(pixels, points=pixels.points * scale[:, None]), pose).r[:, k]
+        r = residuals(pixels._replace(points=pixels.points * scale[:, None]), pose).r[:, k]
         (slope,) = torch.autograd.grad(-r.sum(), scale)  # at 1: the derivative in log Z
         assert (slope - sensitivity(pixels, terms)[:, k]).abs().max() < 1e-10
 
@@ -131,8 +131,7 @@ def numba_step(batch: PairBatch, weights: torch.Tensor | None, T: np.ndarray, no
         Frame(None, None, curr),
         one["flow"], one["flow_variance"], one["valid"],
     )  # fmt: skip
-    three = np.empty(3, np.float32)
-    coarse_fit.set_noise(*noise, 3.0, three)
+    three = coarse_fit.noise_of(*noise, 3.0)
     image = PixelGrid(pair, None if weights is None else weights[0].float().numpy())
     at = FlowFactor(image, three, 24, np.zeros(42)).linearize(T)
     return np.linalg.solve(at.H, at.g)
@@ -165,8 +164,7 @@ def test_step_equals_the_numba_kernels(case: str, dtype: torch.dtype) -> None:
     expected = numba_step(pair, weights, start, (0.35, 0.04))
     pixels = gather_pixels(pair, weights, tile=24)
     how = RobustNoise(torch.tensor([[0.35, 0.04]], dtype=dtype))
-    terms = residuals(pixels, se3(torch.as_tensor(start)[None]))
-    found = linearize(pixels, terms, how, run=24 * 24)
+    found = linearize(pixels, se3(torch.as_tensor(start)[None]), how, run=24 * 24)
     step, good = solve_small(*found.total())
     assert good.all() and found.H.shape[1] == 3 * 4
     # in units of the step along each of translation and rotation
@@ -183,7 +181,7 @@ def test_unusable_values_leave_no_trace_in_gradients() -> None:
         inputs = [v.clone().requires_grad_() for v in (batch.flow, batch.depth_prev, batch.K_prev)]
         pixels = gather_pixels(PairBatch(*inputs, batch.K_curr))
         how = RobustNoise(torch.tensor([[0.3, 0.03]] * 2, dtype=F64))
-        g = scores(pixels, residuals(pixels, se3(T)), how)[0]
+        g = scores(pixels, se3(T), how)[0]
         gradients = torch.autograd.grad(g.sum(), inputs)
         assert all(torch.isfinite(gradient).all() for gradient in gradients)
         assert gradients[1][0, 0, 0] == 0

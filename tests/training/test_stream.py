@@ -58,18 +58,6 @@ def test_mixture_keeps_its_shares():
     assert "b" not in drawn
 
 
-@pytest.mark.parametrize(
-    "call",
-    [
-        lambda: sample_generator(-1, 0),
-        lambda: sample_generator(0, -1),
-    ],
-)
-def test_refuses_nonsense(call):
-    with pytest.raises(InputError, match="got"):
-        call()
-
-
 def test_stored_samples_are_one_stream_for_every_training(tmp_path):
     list(write_samples(PaperOptions(height=32, width=64), 5, tmp_path))
     data = Mixture((StoredSamples(str(tmp_path)),), (1.0,))
