@@ -92,9 +92,7 @@ def read_flow_png(path: PathLike, order: tuple[int, int, int]) -> tuple[np.ndarr
 
 def read_cam(path: PathLike) -> tuple[np.ndarray, np.ndarray]:
     """Intrinsics K (3, 3) and extrinsic T_cam_world (4, 4) of a Sintel ``.cam`` file."""
-    data = _tagged_bytes(path)
-    _check_size(path, 21 * 8, len(data))
-    values = np.frombuffer(data, dtype="<f8").astype(np.float64)
+    values = np.frombuffer(_tagged_bytes(path, 21 * 8), dtype="<f8").astype(np.float64)
     if not np.isfinite(values[:9]).all():
         raise FormatError(f"{path}: expected finite intrinsics, got {values[:9].tolist()}.")
     return values[:9].reshape(3, 3), as_pose(values[9:].reshape(3, 4), str(path))
@@ -147,12 +145,6 @@ def write_cam(path: PathLike, K: np.ndarray, T_cam_world: np.ndarray) -> None:
         file.write(np.asarray(T_cam_world, "<f8")[:3].tobytes())
 
 
-def _check_size(path: object, expected: int, got: int) -> None:
-    if got != expected:
-        problem = "truncated" if got < expected else "trailing bytes"
-        raise FormatError(f"{path}: {problem}: expected {expected} after the tag, got {got}.")
-
-
 def _check_pixels(path: object, width: int, height: int) -> None:
     if width <= 0 or height <= 0 or width * height > MAX_PIXELS:
         raise FormatError(
@@ -161,23 +153,28 @@ def _check_pixels(path: object, width: int, height: int) -> None:
         )
 
 
-def _tagged_bytes(path: PathLike) -> bytes:
-    """What follows the tag."""
+def _tagged_bytes(path: PathLike, size: int | None = None, channels: int = 1) -> bytes:
+    """What follows the tag: ``size`` bytes, or width, height and values of so many channels."""
     data = read_bytes(path)
     if not data.startswith(TAG_BYTES):
         expected = f"a little-endian file that starts with {TAG_BYTES!r}"
         raise FormatError(f"{path}: expected {expected}, got {data[:4]!r}.")
-    return data[4:]
+    data = data[4:]
+    if size is None:
+        width, height = struct.unpack("<ii", data[:8].ljust(8, b"\0"))
+        _check_pixels(path, width, height)
+        size = 8 + 4 * channels * height * width
+    if len(data) != size:
+        problem = "truncated" if len(data) < size else "trailing bytes"
+        raise FormatError(f"{path}: {problem}: expected {size} after the tag, got {len(data)}.")
+    return data
 
 
 def _read_tagged(path: PathLike, channels: int) -> np.ndarray:
     """(H, W, channels) of .flo and .dpt: tag, width, height, values."""
-    data = _tagged_bytes(path)
-    width, height = struct.unpack("<ii", data[:8].ljust(8, b"\0"))
-    _check_pixels(path, width, height)
-    _check_size(path, 8 + 4 * channels * height * width, len(data))
-    array = np.frombuffer(data, dtype="<f4", offset=8).reshape(height, width, channels)
-    return array.astype(np.float32)
+    data = _tagged_bytes(path, channels=channels)
+    width, height = struct.unpack("<ii", data[:8])
+    return np.frombuffer(data, "<f4", offset=8).reshape(height, width, channels).astype(np.float32)
 
 
 def _decode(path: PathLike, flags: int) -> np.ndarray:

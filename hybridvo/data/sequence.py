@@ -24,13 +24,15 @@ from hybridvo.errors import InputError
 from hybridvo.flow import check_field, file_flow
 from hybridvo.types import Camera, Frame, FramePair
 
-_READERS: tuple[type[Sequence], ...] = (
-    *(SintelSequence, TartanAirSequence, SevenScenesSequence),
-    *(FolderSequence, KittiSequence, TumSequence),
-)
-READERS = {reader.kind: reader for reader in _READERS}
+READERS: dict[str, type[Sequence]] = {
+    "sintel": SintelSequence,
+    "tartanair": TartanAirSequence,
+    "7scenes": SevenScenesSequence,
+    "folder": FolderSequence,
+    "kitti": KittiSequence,
+    "tum": TumSequence,
+}
 """Kind -> reader, in the order in which a folder is tried."""
-DATASETS = tuple(READERS)
 OWN_DATA = (
     "Own data: hybridvo needs metric depth for each image, from a sensor, stereo or a network. Put "
     "images into rgb/, depth registered to them into depth/, and describe the camera with "
@@ -49,7 +51,7 @@ def open_sequence(
 
     Args:
         path: the folder.
-        dataset: one of ``DATASETS``; detected from the files by default.
+        dataset: one of ``READERS``; detected from the files by default.
         camera: ``fx,fy,cx,cy`` in pixels, a camera file (``camera.yaml``, ROS ``camera_info``,
             RealSense intrinsics), or a camera; the data set's by default.
         depth_scale: stored units per metre of depth; the data set's by default.
@@ -60,7 +62,7 @@ def open_sequence(
             FormatError: a list or calibration file that is damaged.
     """
     if dataset is not None and dataset not in READERS:
-        known = ", ".join(DATASETS)
+        known = ", ".join(READERS)
         raise InputError(f"dataset: '{dataset}' is unknown; known: {known}. {OWN_DATA}")
     folder = Path(path)
     try:
@@ -74,7 +76,7 @@ def open_sequence(
 
 def _reader(folder: Path, dataset: str | None) -> type[Sequence]:
     """The reader that is asked for, else the first that knows a folder."""
-    known = (reader for reader in _READERS if reader.knows(folder))
+    known = (reader for reader in READERS.values() if reader.knows(folder))
     if reader := next(known, None) if dataset is None else READERS[dataset]:
         return reader
     if not folder.is_dir():
@@ -85,7 +87,7 @@ def _reader(folder: Path, dataset: str | None) -> type[Sequence]:
     inside = shown(sorted(path.name for path in folder.iterdir()))
     raise InputError(
         f"{folder}: no frames: no known data set. It holds: {inside or 'nothing'}. Looked for:"
-        + "".join(f"\n  {looks_for(reader)}" for reader in _READERS)
+        + "".join(f"\n  {looks_for(reader)}" for reader in READERS.values())
         + f"\nSay which with dataset=... (--dataset) if the names differ. {OWN_DATA}"
     )
 

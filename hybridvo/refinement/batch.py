@@ -243,17 +243,16 @@ def checked_batch(
         weights = torch.as_tensor(weights, device=flow.device)
         weights = weights[None] if weights.ndim == 2 and len(flow) == 1 else weights
     values = {k: v for k, v in {**vars(batch), "weights": weights}.items() if v is not None}
+    shapes = {"flow": flow.shape} | dict.fromkeys(("K_prev", "K_curr"), (len(flow), 3, 3))
     for name, value in values.items():
-        shape = (len(flow), 3, 3) if name.startswith("K_") else tuple(flow.shape[:3])
-        shape = tuple(flow.shape) if name == "flow" else shape
-        if tuple(value.shape) != shape or value.device != flow.device:
+        shape, is_mask = tuple(shapes.get(name, flow.shape[:3])), name == "valid"
+        fits = tuple(value.shape) == shape and value.device == flow.device
+        if not fits or (is_mask and value.dtype != torch.bool):
             raise InputError(
-                f"{where}: expected {name} of shape {shape} on {flow.device}, "
-                f"got {tuple(value.shape)} on {value.device}."
+                f"{where}: expected {name} of shape {shape} on {flow.device}{', bool' * is_mask}, "
+                f"got {tuple(value.shape)} on {value.device}, {value.dtype}."
             )
-        if name == "valid" and value.dtype != torch.bool:
-            raise InputError(f"{where}: expected PairBatch.valid as bool, got {value.dtype}.")
-        values[name] = value if name == "valid" else value.to(dtype)
+        values[name] = value if is_mask else value.to(dtype)
     weights = values.pop("weights", None)
     return PairBatch(**values), weights
 

@@ -16,9 +16,9 @@ import numpy as np
 
 from hybridvo.calibration import DOUBTFUL_SPREAD, NO_SPREAD
 from hybridvo.geometry import njit
+from hybridvo.refinement.coarse_fit import robust_weights
 from hybridvo.refinement.covariance import symmetric
 from hybridvo.refinement.kernels import (
-    BLOCK,
     COST,
     FASTMATH,
     MAX_VALUE,
@@ -27,15 +27,12 @@ from hybridvo.refinement.kernels import (
     MV,
     PD,
     PF,
-    SUMS,
     XN,
     YN,
     W,
     Z,
     at_likely_depth,
-    new_work,
     pose_entries,
-    project_block,
     see,
 )
 from hybridvo.refinement.pixels import PixelGrid
@@ -111,36 +108,30 @@ def depth_scale(samples, log_depth, robust, pose, K, noise):
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
-def sum_depth(samples, n, log_depth, pose, K, noise, sz, step, tile, columns, width, sums, meat):
-    """Add the third residual's normal equations to the tiles' ``sums`` (tiles, 27).
+def sum_depth(samples, log_depth, robust, pose, K, noise, sz, tiles, sums, meat):
+    """Add the third residual's normal equations to ``sums`` (tiles, 27); returns the cost.
 
-    ``sz``: standard deviation of the conditional residual. The grid has ``width`` pixels, ``step``
-    apart, ``columns`` tiles in a row; ``meat`` (21,) gets the sum of w^2 s s^T. Returns the cost.
+    ``sz``: standard deviation of the conditional residual. ``tiles`` (n,): tile of each pixel;
+    ``meat`` (21,) gets the sum of w^2 s s^T.
     """
     c2, v = np.float64(noise[2]), sz * sz
-    dummy, row, entries = np.zeros(SUMS), np.empty(6), pose_entries(pose)
-    cost, work = 0.0, new_work()
-    for o in range(0, n, BLOCK):
-        m = min(BLOCK, n - o)
-        project_block(samples, o, m, pose, K, noise, work, work[8], dummy)
-        for j in range(m):
-            k = o + j
-            e, _, good = conditional(samples, k, log_depth, entries, K, noise, row)
-            if not good:
-                continue
-            d2 = e * e / v
-            s = c2 / (c2 + d2)
-            trust = samples[W, k] * work[8, j]
-            w = trust * s * s / v
-            cost += 0.5 * trust * s * d2
-            at = (k // width * step // tile) * columns + k % width * step // tile
-            q = 0
-            for p in range(6):
-                for r in range(p, 6):
-                    sums[at, q] += w * row[p] * row[r]
-                    meat[q] += (w * e) * (w * e) * row[p] * row[r]
-                    q += 1
-                sums[at, 21 + p] += w * e * row[p]
+    row, entries, cost = np.empty(6), pose_entries(pose), 0.0
+    for k in range(len(log_depth)):
+        e, _, good = conditional(samples, k, log_depth, entries, K, noise, row)
+        if not good:
+            continue
+        d2 = e * e / v
+        s = c2 / (c2 + d2)
+        trust = samples[W, k] * robust[k]
+        w = trust * s * s / v
+        cost += 0.5 * trust * s * d2
+        q = 0
+        for p in range(6):
+            for r in range(p, 6):
+                sums[tiles[k], q] += w * row[p] * row[r]
+                meat[q] += (w * e) * (w * e) * row[p] * row[r]
+                q += 1
+            sums[tiles[k], 21 + p] += w * e * row[p]
     return cost
 
 
@@ -154,22 +145,23 @@ class DepthFactor:
         self, image: PixelGrid, curr: np.ndarray, stride: int, sigma: float, noise: np.ndarray,
         tile: int,
     ) -> None:  # fmt: skip
-        self._samples, height, self._width = image.strided(stride)
-        self._log_depth = look_up(self._samples, height * self._width, curr)
-        self._image, self._stride, self._sigma = image, stride, sigma
-        self._noise, self._tile = noise, tile
+        self._samples, height, width = image.strided(stride)
+        self._log_depth = look_up(self._samples, height * width, curr)
+        self._image, self._sigma, self._noise = image, sigma, noise
+        row, column = (np.arange(n) * stride // tile for n in (height, width))
+        self._shape = tuple(-(-n // tile) for n in image.shape)
+        self._tiles = (row[:, None] * self._shape[1] + column).ravel()
 
     def linearize(self, T: np.ndarray) -> Linearization:
         """The sums over each tile and the meat stay as attributes."""
-        rows, columns = (-(-n // self._tile) for n in self._image.shape)
-        tiles, self.meat = np.zeros((rows * columns, COST)), np.zeros(21)
+        where = T[:3], self._image.K, self._noise
+        robust = robust_weights(self._samples, len(self._log_depth), *where)
+        tiles, self.meat = np.zeros((*self._shape, COST)), np.zeros(21)
         cost = sum_depth(
-            self._samples, len(self._log_depth), self._log_depth, T[:3], self._image.K,
-            self._noise, self._sigma, self._stride, self._tile, columns, self._width,
-            tiles, self.meat,
+            self._samples, self._log_depth, robust, *where, self._sigma, self._tiles,
+            tiles.reshape(-1, COST), self.meat,
         )  # fmt: skip
-        self.tiles = tiles.reshape(rows, columns, COST)
-        sums = tiles.sum(axis=0)
+        self.tiles, sums = tiles, tiles.sum(axis=(0, 1))
         return Linearization(symmetric(sums[:21]), sums[21:], cost)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hybridvo.data.sequence import DATASETS, iter_pairs, open_sequence
+from hybridvo.data.sequence import READERS, iter_pairs, open_sequence
 from hybridvo.data.tum import BONN_MARKER, BONN_ROS
 from hybridvo.errors import FormatError, InputError
 from hybridvo.files import fingerprint
@@ -171,7 +171,7 @@ def test_failure_says_what_was_looked_for(tmp_path):
     with pytest.raises(InputError) as caught:
         open_sequence(tmp_path)
     message = str(caught.value)
-    assert all(f"\n  {name}: " in message for name in DATASETS)
+    assert all(f"\n  {name}: " in message for name in READERS)
     assert "readme.txt" in message and str(tmp_path) in message
     for path, words in (
         (tmp_path / "missing", "no such folder"),
@@ -185,7 +185,7 @@ def test_failure_says_what_was_looked_for(tmp_path):
         open_sequence(tmp_path, "euroc")
 
 
-@pytest.mark.parametrize("dataset", DATASETS)
+@pytest.mark.parametrize("dataset", READERS)
 def test_forced_kind_on_a_foreign_folder(dataset, tmp_path):
     with pytest.raises(InputError):
         open_sequence(tmp_path, dataset)
