@@ -145,8 +145,8 @@ def _evaluate(args: argparse.Namespace, command: list[str]) -> Result:
     from hybridvo.evaluation.metrics import evaluate
     from hybridvo.trajectory import read_trajectory
 
-    est = read_trajectory(args.estimate, args.format_est, axes=args.axes_est)
-    gt = read_trajectory(args.gt, args.format_gt, axes=args.axes_gt)
+    est = read_trajectory(args.estimate, args.format_est)
+    gt = read_trajectory(args.gt, args.format_gt)
     report = _call(evaluate, args, estimate=est, gt=gt)
     report |= {"estimate": args.estimate, "gt": args.gt}
     report["warnings"] = [*est.warnings, *gt.warnings]

@@ -62,26 +62,23 @@ def dis_flow(preset: str = "medium") -> FlowProvider:
 
 @dataclass(frozen=True)
 class _Dis:
+    """See :func:`dis_flow`."""
+
     preset: str
     source = "dis"
 
     def __call__(self, prev: Frame, curr: Frame) -> FlowField:
-        return _dis(self.preset, prev, curr)
-
-
-def _dis(preset: str, prev: Frame, curr: Frame) -> FlowField:
-    """See :func:`dis_flow`."""
-    none = FlowField(None, source="dis")
-    if prev.rgb is None or curr.rgb is None or prev.rgb.shape != curr.rgb.shape:
-        return none
-    first = cv2.cvtColor(prev.rgb, cv2.COLOR_RGB2GRAY)
-    second = cv2.cvtColor(curr.rgb, cv2.COLOR_RGB2GRAY)
-    if not (_textured(first) and _textured(second)):
-        return none
-    forward, backward = _calc_dis(preset, first, second), _calc_dis(preset, second, first)
-    if forward is None or backward is None:
-        return none
-    return FlowField(forward, *forward_backward_check(forward, backward), "dis")
+        none = FlowField(None, source="dis")
+        if prev.rgb is None or curr.rgb is None or prev.rgb.shape != curr.rgb.shape:
+            return none
+        first, second = (cv2.cvtColor(x, cv2.COLOR_RGB2GRAY) for x in (prev.rgb, curr.rgb))
+        if not (_textured(first) and _textured(second)):
+            return none
+        forward = _calc_dis(self.preset, first, second)
+        backward = _calc_dis(self.preset, second, first)
+        if forward is None or backward is None:
+            return none
+        return FlowField(forward, *forward_backward_check(forward, backward), "dis")
 
 
 def _calc_dis(preset: str, first: np.ndarray, second: np.ndarray) -> np.ndarray | None:
@@ -141,11 +138,13 @@ def _targets(du: np.ndarray, dv: np.ndarray) -> tuple[np.ndarray, np.ndarray, np
     return u, v, (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)
 
 
-def file_flow(sequence: Any, *, strict: bool = True) -> FlowProvider:
+def file_flow(
+    sequence: Any, *, strict: bool = True, otherwise: FlowProvider | None = None
+) -> FlowProvider:
     """Provider of the flow files of an open sequence, which lead from one frame to the next.
 
-    Where there is none the flow is None. A damaged file raises what the reader raises if
-    ``strict``, else it gives None and a line in the log.
+    Where there is none the flow is that of ``otherwise``, or None. A damaged file raises what the
+    reader raises if ``strict``, else it counts as none, with a line in the log.
     """
 
     def provide(prev: Frame, curr: Frame) -> FlowField:
@@ -159,35 +158,30 @@ def file_flow(sequence: Any, *, strict: bool = True) -> FlowProvider:
                 if strict:
                     raise
                 _logger.warning("flow of frame %d: %s", prev.index, error)
+        if flow is None and otherwise is not None:
+            return otherwise(prev, curr)
         return FlowField(flow, None, valid, "file", sequence.flow_is_true)
 
     return provide
 
 
 class MeasuredFlow:
-    """A provider that keeps its fields, by the indices of both frames, until the next reset.
-
-    ``ms`` is the time spent since then, in milliseconds.
-    """
+    """A provider that keeps the last field and the milliseconds spent since the last reset."""
 
     def __init__(self, provider: FlowProvider) -> None:
-        self._provider = provider
-        self.source = getattr(provider, "source", "")
+        self._provider, self.source = provider, getattr(provider, "source", "")
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything."""
-        self.fields: dict[tuple[int, int], FlowField] = {}
-        self.ms = 0.0
+        """Forget both."""
+        self.last, self.ms = FlowField(None, source=""), 0.0
 
     def __call__(self, prev: Frame, curr: Frame) -> FlowField:
-        """Flow from ``prev`` to ``curr``, computed once."""
-        key = prev.index, curr.index
-        if key not in self.fields:
-            started = time.perf_counter()
-            self.fields[key] = self._provider(prev, curr)
-            self.ms += 1e3 * (time.perf_counter() - started)
-        return self.fields[key]
+        """Flow from ``prev`` to ``curr``."""
+        started = time.perf_counter()
+        self.last = self._provider(prev, curr)
+        self.ms += 1e3 * (time.perf_counter() - started)
+        return self.last
 
 
 def with_flow(
@@ -196,16 +190,6 @@ def with_flow(
     """The pair with the flow of a provider, or of any callable, which is checked."""
     field = check_field(provider(pair.prev, pair.curr), pair.prev, source)
     return field.pair(pair.prev, pair.curr, pair.depth_source)
-
-
-def fallback(first: FlowProvider, second: FlowProvider) -> FlowProvider:
-    """Provider that takes ``second`` where ``first`` has no flow; the field names its source."""
-
-    def provide(prev: Frame, curr: Frame) -> FlowField:
-        field = first(prev, curr)
-        return second(prev, curr) if field.flow is None else field
-
-    return provide
 
 
 def check_field(result: Any, prev: Frame, source: str) -> FlowField:

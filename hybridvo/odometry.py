@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from hybridvo.errors import InputError
-from hybridvo.estimation import warm_up
 from hybridvo.flow import FlowField, FlowProvider, dis_flow, with_flow
 from hybridvo.geometry import invert, pose_matrix, se3_exp, se3_log
 from hybridvo.network.models import Models, default_models
@@ -21,13 +20,12 @@ from hybridvo.pipeline import (
     check_method,
     networks_of,
     run_method,
+    warm_up,
 )
 from hybridvo.results import MotionPrior, Reason, RelativePose, Step
 from hybridvo.trajectory import chain
-from hybridvo.types import Camera, Frame, FramePair, as_number, as_rigid, as_seed
+from hybridvo.types import Camera, Frame, FramePair, as_number, as_rigid, as_seed, check_kind
 
-MAX_FRAMES = 10**6
-"""Frames ahead that may be asked for: matrix powers beyond are noise."""
 STANDSTILL = 1e-12 * np.eye(6)
 """Covariance of no motion at all; a pose graph can still invert it."""
 MEMORY = 10  # motions after which a change counts 1 / e of a new one
@@ -181,9 +179,7 @@ class Odometry:
         seed: int = 0,
     ) -> None:
         options = Options() if options is None else options
-        if not isinstance(options, Options):
-            got = type(options).__name__
-            raise InputError(f"Odometry.options: expected Options, got {got}.")
+        check_kind("Odometry.options", options, Options)
         if flow is not None and not callable(flow):
             raise InputError(f"Odometry.flow: expected a callable (prev, curr), got {flow!r}.")
         if method is None:
@@ -194,11 +190,6 @@ class Odometry:
         self.seed = as_seed(seed, "Odometry.seed")
         self._flow = flow or dis_flow(options.flow.dis_preset)
         self.reset()
-
-    @classmethod
-    def from_pretrained(cls, name: str = "default", **options: Any) -> Odometry:
-        """Tracker with the weights of a selector: ``default``, another name, or a file."""
-        return cls(name, **options)
 
     @property
     def state(self) -> TrackerState:
@@ -220,23 +211,16 @@ class Odometry:
 
     def resume(self, state: TrackerState) -> None:
         """Go on where another tracker stopped."""
-        if not isinstance(state, TrackerState):
-            got = type(state).__name__
-            raise InputError(f"Odometry.resume: expected a TrackerState, got {got}.")
+        check_kind("Odometry.resume", state, TrackerState)
         self._state = state
 
     def warm_up(self) -> float:
         """Compile and load everything before the first frame; seconds spent."""
         return warm_up(self.method, self._models)
 
-    def predict(self, frames: int = 1) -> MotionPrior | None:
-        """The motion to the frame so many ahead, at constant velocity; None before the first."""
-        if as_number(frames) % 1 or not 1 <= frames <= MAX_FRAMES:
-            raise InputError(
-                f"Odometry.predict: expected a number of frames from 1 to {MAX_FRAMES}, "
-                f"got {frames!r}."
-            )
-        return self._state.motion_model.predict(frames)
+    def predict(self) -> MotionPrior | None:
+        """The motion to the next frame, at constant velocity; None before the first motion."""
+        return self._state.motion_model.predict()
 
     def track(self, frame: Frame, flow: FlowField | np.ndarray | None = None) -> Step:
         """Pose of the next frame; the first one has the identity as motion, status ok.
@@ -250,41 +234,35 @@ class Odometry:
             InputError: ``frame`` is no Frame, has another size than the one before, or the flow
                 does not fit it. The tracker is then as it was.
         """
-        if not isinstance(frame, Frame):
-            raise InputError(f"Odometry.track: expected a Frame, got {type(frame).__name__}.")
+        check_kind("Odometry.track", frame, Frame)
         state, frame = self._state, _own(frame)
         if frame.index is None:
             frame = replace(frame, index=state.count)
         if state.frame is None:
             return self._start(frame, state)
-        prev = state.frame
-        pair = self._pair(prev, frame, flow)
-        ahead = None
-        if self.options.track.motion_prior:
-            ahead = state.motion_model.predict(state.gap + 1)
-        found = self._estimate(pair, ahead)
-        T_world_cam, motion = chain(state.T_world_cam, found.T_curr_prev), found
-        if not found.usable:
-            T_world_cam, motion = self._instead(state, found)
-        model = state.motion_model
+        pair = self._pair(state.frame, frame, flow)
+        # the images are asked whether a flow can be theirs until one is
+        wanted, check = self.options.track.motion_prior, not self._flow_fits
+        prior = state.motion_model.predict(state.gap + 1) if wanted else None
+        context = Context(self.options, prior, self.seed, None, self._models, check, self._flow)
+        found = run_method(pair, self.method, context)
+        self._flow_fits |= found.usable
         if found.usable:
-            T = found.T_curr_prev
-            if state.gap:
-                T = se3_exp(se3_log(T) / (state.gap + 1))
-            model = model.observed(T, neighbours=not state.gap and not state.failed)
-        failed = 0 if motion.usable else state.failed + 1
-        state = replace(
-            state,
-            T_world_last=T_world_cam,
-            motion_model=model,
-            failed=failed,
-            count=state.count + 1,
-        )
-        if self._leads(frame, pair, found, state.gap):
-            self._state = replace(state, frame=frame, T_world_cam=T_world_cam, gap=0)
+            T, motion, failed = chain(state.T_world_cam, found.T_curr_prev), found, 0
+            last = found.T_curr_prev
+            if state.gap:  # over frames that were passed over: the share of one
+                last = se3_exp(se3_log(last) / (state.gap + 1))
+            model = state.motion_model.observed(last, not state.gap and not state.failed)
         else:
-            self._state = replace(state, gap=state.gap + 1)
-        return Step(frame.index, frame.timestamp, T_world_cam.copy(), motion)
+            (T, motion), failed = self._instead(state, found), state.failed + 1
+            model = state.motion_model
+        after: dict[str, Any] = {"T_world_last": T, "motion_model": model, "failed": failed}
+        if self._leads(frame, pair, found, state.gap):
+            after |= {"frame": frame, "T_world_cam": T, "gap": 0}
+        else:
+            after["gap"] = state.gap + 1
+        self._state = replace(state, count=state.count + 1, **after)
+        return Step(frame.index, frame.timestamp, T.copy(), motion)
 
     def _leads(self, frame: Frame, pair: FramePair, found: RelativePose, gap: int) -> bool:
         """Whether the next frame is held against this one: it has depth, and it was matched.
@@ -299,16 +277,6 @@ class Odometry:
             found.usable or gap > 0 or without_depth or getattr(self._flow, "source", "") != "dis"
         )
 
-    def _estimate(self, pair: FramePair, prior: MotionPrior | None) -> RelativePose:
-        # the images are asked whether a flow can be theirs until one is
-        check_flow = not self._flow_fits
-        context = Context(
-            self.options, prior, self.seed, None, self._models, check_flow, self._flow
-        )
-        found = run_method(pair, self.method, context)
-        self._flow_fits |= found.usable
-        return found
-
     def skip(self, index: int, timestamp: float, message: str = "") -> Step:
         """A frame that could not be read: a failed step; the next pair, and its flow, span it."""
         if as_number(index) % 1 or not np.isfinite(as_number(timestamp)):
@@ -316,18 +284,13 @@ class Odometry:
                 f"Odometry.skip: expected an index and finite seconds, got {index!r}, "
                 f"{timestamp!r}."
             )
-        state = self._state
-        failed = RelativePose.failed(
-            Reason.MISSING_FRAME, message or "the frame cannot be read", self.method
-        )
-        if state.frame is None:
-            self._state = replace(state, count=state.count + 1)
-            return Step(int(index), timestamp, state.T_world_last.copy(), failed)
-        T_world_cam, motion = self._instead(state, failed)
-        self._state = replace(
-            state, T_world_last=T_world_cam, gap=state.gap + 1, count=state.count + 1
-        )
-        return Step(int(index), timestamp, T_world_cam.copy(), motion)
+        state, message = self._state, message or "the frame cannot be read"
+        motion = RelativePose.failed(Reason.MISSING_FRAME, message, self.method)
+        T, gap = state.T_world_last, state.gap
+        if state.frame is not None:
+            (T, motion), gap = self._instead(state, motion), gap + 1
+        self._state = replace(state, T_world_last=T, gap=gap, count=state.count + 1)
+        return Step(int(index), timestamp, T.copy(), motion)
 
     def _start(self, frame: Frame, state: TrackerState) -> Step:
         T = state.T_world_last
@@ -376,21 +339,16 @@ def _own(frame: Frame) -> Frame:
 
 def _models(network: Any, method: str, options: Options) -> Models:
     """The networks asked for: a name or file of selector weights, or all of them."""
-    if network is not None and not isinstance(network, str | Models):
-        got = type(network).__name__
-        raise InputError(
-            f"Odometry.network: expected 'default', the name or file of weights, Models or None, "
-            f"got {got}."
-        )
+    if isinstance(network, Models):
+        return network
     if network is None and networks_of(method):
         raise InputError(
             f"Odometry: method {method!r} needs a network; leave network='default', or use "
             f"method='refine'."
         )
-    if isinstance(network, Models):
-        return network
     if network in ("default", None):
         return default_models(options.run.device if networks_of(method) else "cpu")
+    check_kind("Odometry.network", network, str)
     from hybridvo.network.weights import weights_file
 
     return Models(options.run.device, {"selector": weights_file(network)})

@@ -19,7 +19,6 @@ Positive = Annotated[float, Field(gt=0)]
 Count = Annotated[int, Field(ge=1)]
 Natural = Annotated[int, Field(ge=0)]
 Share = Annotated[float, Field(ge=0, le=1)]
-Blur = Annotated[float, Field(gt=0, lt=100)]
 
 
 @dataclass_transform(frozen_default=True)
@@ -95,15 +94,6 @@ class PhotometricOptions:
     """The refinement on the two images, which follows that on the flow."""
 
     mode: Literal["auto", "on", "off"] = "auto"  # auto: with the method hybrid
-    blur_px: Annotated[tuple[Blur, ...], Field(min_length=1)] = (2.0, 1.0)  # coarse to fine
-    iterations: Count = 5  # most Gauss-Newton steps under each of them
-    pixels: Count = 16_000  # about how many: the strongest gradients of evenly spread cells
-    # factors on the covariances of the flow's motion, and of the images and depth maps: errors are
-    # alike far beyond the tiles
-    prior_inflation: Positive = 8.0
-    image_inflation: Positive = 4.0
-    # of the two images; below it they do not match
-    min_correlation: Annotated[float, Field(ge=-1, le=1)] = 0.5
 
 
 @option_group

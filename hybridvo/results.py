@@ -140,9 +140,6 @@ class RelativePose:
         residual_scale_px: standard deviation of the flow noise, px, at a pixel of the typical
             variance. depth_noise: of the log depth, likewise.
         weights: (H, W) float32 robust weight of each pixel.
-        translation_direction_valid: whether the translation is longer than three of its own
-            standard deviations; its direction means nothing otherwise.
-        information_eigenvalues: (6,) ascending, of the information matrix scaled to pixels.
         probability: that this is the camera's motion and not an object's, 0 to 1; 0 if failed.
         hypotheses: every strong motion found, the chosen one first.
         method: name of the estimator. ms: time spent, milliseconds.
@@ -159,8 +156,6 @@ class RelativePose:
     residual_scale_px: float = 0.0
     depth_noise: float = 0.0
     weights: np.ndarray | None = None
-    translation_direction_valid: bool = False
-    information_eigenvalues: np.ndarray = field(default_factory=lambda: np.zeros(6))
     probability: float = 1.0
     hypotheses: tuple[Hypothesis, ...] = ()
     method: str = ""

@@ -97,28 +97,18 @@ class Trajectory:
             file_interface.write_tum_trajectory_file(file, stamped)
 
 
-def read_trajectory(
-    path: str | os.PathLike[str], format: str = "auto", *, axes: str = "auto"
-) -> Trajectory:
+def read_trajectory(path: str | os.PathLike[str], format: str = "auto") -> Trajectory:
     """Read camera-to-world poses from a text file, one pose a line.
 
     ``#`` comments, empty lines, tabs, Windows line ends and a byte-order mark are accepted.
 
-    Args:
-        path: the file.
-        format: ``tum``, ``kitti``, ``tartanair``, or ``auto``: by the number of :data:`COLUMNS`.
-        axes: axes of the file: ``camera`` (x right, y down, z forward) or ``ned`` (x forward,
-            y right, z down; converted to camera axes). ``auto`` is NED for TartanAir's format.
-
-    Stamps in other units than seconds are converted, which ``warnings`` say. KITTI and TartanAir
-    files get frame numbers as stamps. A FormatError names file and line.
+    ``format`` is ``tum``, ``kitti``, ``tartanair`` (its NED axes, x forward, y right, z down,
+    become those of a camera), or ``auto``: by the number of :data:`COLUMNS`. Stamps in other units
+    than seconds are converted, which ``warnings`` say. KITTI and TartanAir files get frame numbers
+    as stamps. A FormatError names file and line.
     """
-    for name, value, known in (
-        ("format", format, ("auto", *COLUMNS)),
-        ("axes", axes, ("auto", "camera", "ned")),
-    ):
-        if value not in known:
-            raise InputError(f"{name}: expected {', '.join(known)}, got {value!r}.")
+    if format not in ("auto", *COLUMNS):
+        raise InputError(f"format: expected auto, {', '.join(COLUMNS)}, got {format!r}.")
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path}: trajectory file cannot be read: no such file.")
@@ -133,7 +123,7 @@ def read_trajectory(
         factor, unit = stamp_unit(stamps)
     rows.refuse(np.diff(stamps, prepend=-np.inf) <= 0, "increasing timestamps, without duplicates")
     warnings = (f"{path}: timestamps are {unit}; converted to seconds.",) if factor != 1 else ()
-    if axes == "ned" or (axes == "auto" and columns == 7):
+    if columns == 7:
         T = ned_to_camera(T)
     return Trajectory(stamps / factor, T, columns == 8, warnings)
 

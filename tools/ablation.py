@@ -17,7 +17,7 @@ import dataclasses
 import json
 import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -108,7 +108,7 @@ class Ablation:
         args, task = self.args, self.task(name, seed)
         folder = args.out / f"{name}-seed{seed}"
         folder.mkdir(parents=True, exist_ok=True)
-        trainer = Trainer(task, folder, args.device, args.workers, progress(f"{name} seed {seed}"))
+        trainer = Trainer(task, folder, args.device, args.workers)
         trainer.resume()
         for number in (signal.SIGINT, signal.SIGTERM):  # the update at hand ends, with a checkpoint
             signal.signal(number, lambda *_: setattr(trainer, "stop_requested", True))
@@ -212,18 +212,6 @@ def without_pairs(value: Any) -> Any:
     if not isinstance(value, dict):
         return value
     return {k: without_pairs(v) for k, v in value.items() if k != "epe_of_pairs"}
-
-
-def progress(label: str) -> Callable[[dict[str, Any]], None]:
-    """A line on stderr every thousand updates."""
-
-    def report(entry: dict[str, Any]) -> None:
-        if "loss" in entry and entry["step"] % 1000 == 0:
-            rate = f"{entry['samples_per_s']:.1f} samples/s"
-            line = f"{label}: {entry['samples']} samples, loss {entry['loss']:.3f}, {rate}"
-            print(line, file=sys.stderr, flush=True)
-
-    return report
 
 
 if __name__ == "__main__":

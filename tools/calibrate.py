@@ -27,7 +27,7 @@ from hybridvo.calibration import right as probability
 from hybridvo.evaluation.pair_errors import true_motion
 from hybridvo.geometry import pose_matrix
 from hybridvo.hypotheses.selector import select_by_cues
-from hybridvo.images.direct import direct_start, evidence_of
+from hybridvo.images.direct import direct_start, explained
 from hybridvo.network.models import Models
 from hybridvo.pipeline import Context
 from hybridvo.results import RelativePose
@@ -113,7 +113,7 @@ def direct_answers(pair: Any, T: np.ndarray, depth: np.ndarray, starts: Any = (N
         direct = direct_start(pair, start, least=0.0)
         if direct is not None:
             error = ego_flow_error(direct.T_curr_prev, T, depth, pair)
-            yield "direct", evidence_of(pair, direct), error
+            yield "direct", explained(pair, direct)[1], error
 
 
 def answers(pair: Any, T: np.ndarray, depth: np.ndarray, models: Models) -> Answers:

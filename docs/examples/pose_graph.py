@@ -40,7 +40,7 @@ class Between:
 
 def track(frames: Iterable[hvo.Frame]) -> tuple[list[hvo.Frame], list[np.ndarray], list[Between]]:
     """Frames, their chained poses, and a factor for each motion that was found."""
-    vo = hvo.Odometry.from_pretrained()
+    vo = hvo.Odometry()
     kept, poses, factors = [], [], []
     for frame in frames:
         step = vo.track(frame)

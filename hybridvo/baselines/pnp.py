@@ -196,7 +196,6 @@ def check(
         what = f"the {len(points)} points leave a direction of the motion undetermined"
         wrong = Reason.DEGENERATE_GEOMETRY, what
     facts: dict[str, Any] = {"inlier_ratio": ratio, "method": method}
-    facts["information_eigenvalues"] = np.maximum(values, 0.0)
     if wrong is not None:
         return RelativePose.failed(wrong[0], f"{method}: {wrong[1]}", **facts)
     status = Status()
@@ -209,14 +208,13 @@ def check(
     sigma = np.sqrt(cost / (2 * count - 6)) if sigma_px is None else sigma_px
     half = vectors * scale[:, None] / np.sqrt(values)
     # exact data has no residual; float32 flow near 1000 px is rounded at 6e-5 px all the same
-    covariance, t = max(sigma, 1e-4) ** 2 * (half @ half.T), T[:3, 3]
+    covariance = max(sigma, 1e-4) ** 2 * (half @ half.T)
     return RelativePose(
         T_curr_prev=T,
         covariance=covariance,
         status=status,
         cost=cost / len(inlier),
         residual_scale_px=float(sigma),
-        translation_direction_valid=bool(t @ np.linalg.solve(covariance[:3, :3], t) > 9.0),
         **facts,
     )
 

@@ -107,7 +107,6 @@ def evaluate(command: argparse.ArgumentParser) -> None:
     add("--max-diff", type=float, metavar="S", help="seconds between matches")
     for name in ("est", "gt"):
         add(f"--format-{name}", choices=("auto", "tum", "kitti", "tartanair"), default="auto")
-        add(f"--axes-{name}", choices=("auto", "camera", "ned"), default="auto")
 
 
 def doctor(command: argparse.ArgumentParser) -> None:

@@ -26,7 +26,6 @@ import pandas as pd
 from hybridvo.commands.run import flow_provider, frames_of, run
 from hybridvo.data.sequence import Sequence, open_sequence
 from hybridvo.errors import HybridVOError, InputError
-from hybridvo.estimation import warm_up
 from hybridvo.evaluation import scores
 from hybridvo.evaluation.pair_errors import ERRORS, pair_facts, true_motion, true_trajectory
 from hybridvo.evaluation.protocols import check_protocol, protocol_summary, same_intrinsics
@@ -34,7 +33,7 @@ from hybridvo.evaluation.report import write_report
 from hybridvo.files import Mode, atomic_write, held, make_folder, versions, write_json
 from hybridvo.network.models import Models
 from hybridvo.options import Options
-from hybridvo.pipeline import METHODS, check_method, weights_hash
+from hybridvo.pipeline import METHODS, check_method, warm_up, weights_hash
 
 _logger = logging.getLogger(__name__)
 WRITTEN = ("results.json", "results.csv", "pairs.csv", "report.md", "report.html")

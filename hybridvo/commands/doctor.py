@@ -14,13 +14,13 @@ import pandas as pd
 
 from hybridvo.calibration import DOUBTFUL_SPREAD
 from hybridvo.commands.compare import methods_to_run
-from hybridvo.data.lists import shown
 from hybridvo.data.sequence import Sequence
 from hybridvo.errors import InputError
-from hybridvo.estimation import estimate
 from hybridvo.evaluation.pair_errors import true_motion
 from hybridvo.files import versions
 from hybridvo.flow import contradiction, dis_flow, file_flow
+from hybridvo.pipeline import estimate
+from hybridvo.refinement.covariance import direction_is_known
 from hybridvo.refinement.depth import compare_depths
 from hybridvo.types import Frame, depth_advice, typical_depth
 
@@ -30,8 +30,6 @@ MAX_SCALE_ERROR = 0.2
 """Wrong units err by more, noisy ground truth over short motions by half of that."""
 MAX_GREY_STEP = 0.15
 """Change of the logarithm of the mean brightness between neighbours that is called a step."""
-DARK_LEVEL = 20.0
-"""Grey levels (of 255) below which nine tenths of a dark image lie; of a street at night, 60."""
 MAX_CONTRADICTED = 0.2
 """Fraction of the pairs whose flow may contradict their images."""
 Answer = tuple[bool | None, str, Any]
@@ -94,8 +92,7 @@ def _measure(sequence: Sequence, prev: Frame, curr: Frame) -> dict[str, Any]:
         pair["depth"] = typical_depth(prev.depth), None
     if prev.rgb is None or curr.rgb is None:
         return pair
-    ratio = (float(curr.rgb.mean()) + 1.0) / (float(prev.rgb.mean()) + 1.0)
-    pair["light"] = ratio, [frame.index for frame in (prev, curr) if _is_dark(frame.rgb)]
+    pair["light"] = (float(curr.rgb.mean()) + 1.0) / (float(prev.rgb.mean()) + 1.0)
     if sequence.has_flow:
         on_file = file_flow(sequence, strict=False)(prev, curr).pair(prev, curr)
         pair["contradiction"] = None if on_file.flow is None else contradiction(on_file) or ""
@@ -106,7 +103,7 @@ def _measure(sequence: Sequence, prev: Frame, curr: Frame) -> dict[str, Any]:
     if not motion.usable:
         return pair
     true = true_motion(sequence, prev.index, curr.index)
-    if true is not None and motion.translation_direction_valid:
+    if true is not None and direction_is_known(motion.T_curr_prev, motion.covariance):
         length = float(np.linalg.norm(true[:3, 3]))
         if length > 0.01:  # metres; along the true one: the noise of a length is always positive
             scale = float(motion.T_curr_prev[:3, 3] @ true[:3, 3]) / length**2
@@ -114,10 +111,6 @@ def _measure(sequence: Sequence, prev: Frame, curr: Frame) -> dict[str, Any]:
     depths = compare_depths(by_dis, motion.T_curr_prev, motion.weights)
     pair["depth_ratio"] = None if depths is None else depths.ratio
     return pair
-
-
-def _is_dark(rgb: np.ndarray | None) -> bool:
-    return rgb is not None and float(np.percentile(rgb[::4, ::4].max(axis=2), 90)) < DARK_LEVEL
 
 
 # -- answers: of what is known of the pairs, by their first frame ---------------------------------
@@ -164,15 +157,13 @@ def _depth_steps(known: pd.Series) -> Answer:
 def _exposure(known: pd.Series) -> Answer:
     if known.empty:
         return None, "no pair has two images", None
-    ratios, dark = known.str[0].astype(float), sorted(set(known.str[1].sum()))
+    ratios = known.astype(float)
     steps, k = int((np.log(ratios).abs() > MAX_GREY_STEP).sum()), _furthest(ratios)
     text = (
         f"brightness changes by over 15 % in {steps} of {len(ratios)} pairs, most from frame {k} "
         f"to the next (times {ratios[k]:.2f})"
     )
-    if dark:
-        text += f"; {len(dark)} frames are dark: {shown(dark)}"
-    return bool(steps or dark), text, steps / len(ratios)
+    return steps > 0, text, steps / len(ratios)
 
 
 def _images_against_flow(known: pd.Series) -> Answer:

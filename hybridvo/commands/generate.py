@@ -44,11 +44,7 @@ def generate(
 
 
 def write_sheet(samples: Sequence[Sample], path: str | Path) -> None:
-    """Write a PNG with the five steps of each sample in a row.
-
-    Flow is coloured by direction, and the more the longer up to the sample's 99 % quantile; depth
-    is bright where near.
-    """
+    """Write a PNG with the five steps of each sample in a row; depth is bright where near."""
     panels = [panel for sample in samples for panel in _steps(sample)]
     height, width = samples[0].moving.shape
     with atomic_write(path, "wb") as file:

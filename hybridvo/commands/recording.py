@@ -12,8 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from hybridvo.errors import InputError, OutputError
+from hybridvo.errors import InputError
 from hybridvo.evaluation.plots import flow_colours
+from hybridvo.files import atomic_write
 from hybridvo.results import Step
 from hybridvo.types import Frame
 
@@ -23,7 +24,7 @@ MAX_SIDE = 480
 
 
 def check_recording(path: str | os.PathLike[str]) -> None:
-    """Refuse what cannot become a recording, before a run is started."""
+    """Refuse what cannot become a recording."""
     if Path(path).suffix != ".rrd" or Path(path).is_dir():
         raise InputError(f"--rrd {os.fspath(path)}: expected the name of a file that ends in .rrd.")
     if find_spec("rerun") is None:
@@ -34,7 +35,7 @@ class Recording:
     """Writes a recording as the frames come in; use as a context manager.
 
     ``identity`` is the same for all parts of one run: after ``--resume`` (``first`` > 0) a part is
-    written beside the file that the viewer shows with it. ``poses`` are the true T_world_cam.
+    written beside the file. ``poses`` are the true T_world_cam.
     """
 
     def __init__(
@@ -51,11 +52,8 @@ class Recording:
         self.path = Path(path)
         if first > 0 and self.path.exists():
             self.path = self.path.with_stem(f"{self.path.stem}_from_{first:06d}")
-        try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            self.path.write_bytes(b"")  # Rerun reports a bad path only later, in a thread
-        except OSError as error:
-            raise OutputError(f"{self.path}: cannot be written: {error.strerror}.") from error
+        with atomic_write(self.path, "wb"):
+            pass  # Rerun reports a bad path only later, in a thread
         self._rr = rerun
         self._stride = max(1, -(-frames // MAX_IMAGES))
         self._positions: list[np.ndarray] = []
@@ -83,8 +81,7 @@ class Recording:
         """Record a tracked frame; ``flow`` is (H, W, 2) px from the frame before, or None."""
         rr, log = self._rr, self._stream.log
         self._stream.set_time("frame", sequence=step.index)
-        # stamps of sensors count from 1970, those of rendered sequences from their start
-        clock = "timestamp" if step.timestamp > 1e8 else "duration"
+        clock = "timestamp" if step.timestamp > 1e8 else "duration"  # since 1970, or the start
         self._stream.set_time("time", **{clock: step.timestamp})
         T = step.T_world_cam
         log("world/camera", rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]))

@@ -29,7 +29,7 @@ from hybridvo.evaluation.metrics import evaluate
 from hybridvo.evaluation.pair_errors import mean_pair_errors, step_errors, true_trajectory
 from hybridvo.evaluation.plots import plot_trajectories
 from hybridvo.files import Mode, atomic_write, fingerprint, held, versions, write_json
-from hybridvo.flow import FlowField, FlowProvider, MeasuredFlow, dis_flow, fallback, file_flow
+from hybridvo.flow import FlowProvider, MeasuredFlow, dis_flow, file_flow
 from hybridvo.geometry import se3_log
 from hybridvo.network.models import Models
 from hybridvo.odometry import Odometry, TrackerState
@@ -37,7 +37,6 @@ from hybridvo.options import Options, RunOptions
 from hybridvo.pipeline import check_method, weights_hash
 from hybridvo.trajectory import Trajectory
 
-EXIT_DONE, EXIT_FAILED_FRAMES = 0, 3
 RECORDING = "recording.rrd"
 """Name of a Rerun recording within the output folder."""
 SAVE_EVERY = 50
@@ -68,7 +67,10 @@ def run(
         check_recording(rrd or RECORDING)
     frames = frames_of(sequence, options)
     flow = MeasuredFlow(flow_provider(sequence, options))
-    out = _folder(out, sequence)
+    name = re.sub(r"[^\w.-]+", "_", sequence.name).strip("._") or "sequence"
+    out = Path("runs") / name if out is None else Path(out)
+    if out.resolve() in {path.parent.resolve() for path in sequence.rgb_files if path is not None}:
+        raise InputError(f"{out}: holds frames of the sequence; choose another --out.")
     vo = Odometry(models, flow=flow, method=method, options=options, seed=options.run.seed)
     if not quick:
         vo.warm_up()  # before the folder is taken: it may last
@@ -91,7 +93,7 @@ def run(
             if recording is not None:
                 summary["recording"] = os.fspath(recording.path)
     too_many = summary["failed_fraction"] > options.run.max_failed
-    return summary, EXIT_FAILED_FRAMES if too_many else EXIT_DONE
+    return summary, 3 if too_many else 0
 
 
 def _estimate(
@@ -138,7 +140,7 @@ def _track(
         started = time.perf_counter()
         step = vo.track(frame)
         ms = 1e3 * (time.perf_counter() - started)
-    field = next(iter(flow.fields.values()), FlowField(None, source=""))
+    field = flow.last
     if frame is not None and recording is not None:
         recording.add(frame, step, field.flow)
     motion = step.motion
@@ -270,26 +272,11 @@ def frames_of(sequence: Sequence, options: Options) -> range:
 def flow_provider(sequence: Sequence, options: Options) -> FlowProvider:
     """Provider of the flow that the options ask for."""
     source, stride = options.flow.source, options.run.stride
-    from_files = file_flow(sequence, strict=options.run.strict)
     if source == "file":
         sequence.check_flow(stride)
-        return from_files
+        return file_flow(sequence, strict=options.run.strict)
     dis = dis_flow(options.flow.dis_preset)
     if source == "auto" and sequence.has_flow and stride == 1:
-        # a damaged file is no reason to stop where DIS can stand in
-        return fallback(from_files, dis)
+        # where a file is missing or damaged DIS can stand in
+        return file_flow(sequence, strict=options.run.strict, otherwise=dis)
     return dis
-
-
-def _folder(out: str | os.PathLike[str] | None, sequence: Sequence) -> Path:
-    """The output folder; never that of the frames: the next run would read what is drawn."""
-    name = re.sub(r"[^\w.-]+", "_", sequence.name).strip("._") or "sequence"
-    out = Path("runs") / name if out is None else Path(out)
-    images = (".png", ".jpg", ".jpeg", ".npy", ".dpt", ".flo")
-    folders = {path.parent.resolve() for path in sequence.files() if path.suffix.lower() in images}
-    if out.resolve() in folders:
-        raise InputError(
-            f"{out}: holds frames of the sequence, and results among them would be taken for "
-            f"input. Choose another --out."
-        )
-    return out

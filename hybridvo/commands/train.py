@@ -29,7 +29,7 @@ CHANGES = ("steps", "batch_size", "seed")
 def add_train(
     train: argparse.ArgumentParser, common: argparse.ArgumentParser, call: Callable[..., Any]
 ) -> None:
-    """Commands of ``hybridvo train`` and their options; ``common`` are those of every command."""
+    """Commands of ``hybridvo train`` and their options."""
     train.set_defaults(call=call)
     train.description = __doc__
     train.formatter_class = argparse.RawDescriptionHelpFormatter
@@ -108,15 +108,13 @@ def _train(args: argparse.Namespace, command: str, task: Any) -> Any:
     import cv2
     import torch
 
-    from hybridvo.errors import InputError
     from hybridvo.files import write_json
+    from hybridvo.network.models import load_weights
     from hybridvo.training.export import RUN, source_commit
     from hybridvo.training.trainer import CHECKPOINT, LOG, Trainer
 
     if args.threads is not None:
-        if args.threads < 1:
-            raise InputError(f"--threads: expected 1 or more, got {args.threads}.")
-        torch.set_num_threads(args.threads)
+        torch.set_num_threads(max(1, args.threads))
     cv2.setNumThreads(0)  # samples are small: threads inside OpenCV cost more than they give
     args.out.mkdir(parents=True, exist_ok=True)
     if args.overwrite:
@@ -127,14 +125,13 @@ def _train(args: argparse.Namespace, command: str, task: Any) -> Any:
         print(f"goes on at update {trainer.step}", file=sys.stderr)
     else:
         if args.init is not None:
-            trainer.start_from(_network(args.init).state_dict(), args.init)
+            trainer.start_from(load_weights(args.init)[0].state_dict(), args.init)
         about = {"command": command, "commit": source_commit(), "torch": torch.__version__}
         write_json(args.out / RUN, about)
     for number in (signal.SIGINT, signal.SIGTERM):  # the update at hand ends, with a checkpoint
         signal.signal(number, lambda *_: setattr(trainer, "stop_requested", True))
     why = trainer.run(60 * args.time_limit)
-    ended = f"ended by {why} at update {trainer.step}, {trainer.samples} samples"
-    print(ended, file=sys.stderr)
+    print(f"ended by {why} at update {trainer.step}", file=sys.stderr)
     return trainer
 
 
@@ -147,6 +144,7 @@ def _export(args: argparse.Namespace, command: str) -> dict[str, Any]:
 
 def _selector_data(args: argparse.Namespace, command: str) -> dict[str, Any]:
     from hybridvo.errors import InputError
+    from hybridvo.network.models import load_weights
     from hybridvo.synthetic.semi_real import load_split
     from hybridvo.training.selector_data import PER_SHARD, write_shard
 
@@ -154,7 +152,7 @@ def _selector_data(args: argparse.Namespace, command: str) -> dict[str, Any]:
         raise InputError(f"expected --first-seed and --seeds >= 0, got {args.first_seed}.")
     args.data.mkdir(parents=True, exist_ok=True)
     recordings = () if args.recordings is None else load_split(args.recordings, args.split)
-    network = None if args.propose is None else _network(args.propose)
+    network = None if args.propose is None else load_weights(args.propose)[0]
     total = 0
     for seed in range(args.first_seed, args.first_seed + args.seeds, PER_SHARD):
         total += write_shard(args.data, seed, recordings=recordings, network=network)
@@ -162,18 +160,8 @@ def _selector_data(args: argparse.Namespace, command: str) -> dict[str, Any]:
     return {"samples": total}
 
 
-def _network(name: str) -> Any:
-    """The network of a weights file, or of a pretrained name."""
-    from hybridvo.network.models import load_weights
-
-    return load_weights(name)[0]
-
-
 def _report(entry: dict[str, Any]) -> None:
     """One line a log entry on stderr."""
-    numbers = ((k, v) for k, v in entry.items() if isinstance(v, int | float))
-    line = " ".join(f"{key}={value:.5g}" for key, value in numbers)
-    for name, result in entry.get("results", {}).items():
-        figures = " ".join(f"{k}={v:.4g}" for k, v in result.items() if isinstance(v, float))
-        line += f"\n  {name}: {figures}"
-    print(line, file=sys.stderr)
+    numbers = {k: v for k, v in entry.items() if isinstance(v, int | float)}
+    line = " ".join(f"{key}={value:.5g}" for key, value in numbers.items())
+    print(line, entry.get("results", ""), file=sys.stderr)

@@ -6,11 +6,11 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from hybridvo.data.sequence import Sequence, iter_pairs
 from hybridvo.errors import InputError
-from hybridvo.estimation import estimate
 from hybridvo.evaluation.pair_errors import MOVING_PX, true_motion
 from hybridvo.evaluation.plots import Panel, draw_panels, flow_panel, longest_flow
 from hybridvo.evaluation.saliency import Saliency, last_pass, saliencies
@@ -20,7 +20,7 @@ from hybridvo.geometry import ego_flow, matrix_to_euler_deg
 from hybridvo.network.layers import KINDS
 from hybridvo.network.models import load_weights
 from hybridvo.network.weights import pretrained_names, weights_file
-from hybridvo.pipeline import DEFAULT_METHOD
+from hybridvo.pipeline import DEFAULT_METHOD, estimate
 from hybridvo.results import PixelwisePrediction, RelativePose
 from hybridvo.types import FramePair
 
@@ -51,8 +51,7 @@ def draw(
     provider = None if from_files else dis_flow()
     given = next(iter_pairs(sequence, provider, start=pair, stop=pair + 2))
     if given.flow is None or given.prev.depth is None:
-        missing = "flow" if given.flow is None else "depth"
-        raise InputError(f"{sequence.name}, pair {pair}: there is no {missing} to look at.")
+        raise InputError(f"{sequence.name}, pair {pair}: has no flow or no depth to look at.")
     found = networks(weights)
     flow_gt = None
     if sequence.has_flow and sequence.flow_is_true:
@@ -146,9 +145,7 @@ def saliency_panels(name: str, found: Mapping[str, Saliency], moving: np.ndarray
     """Where a network looks; what moves is outlined."""
     panels = []
     for what, saliency in found.items():
-        n = 4  # summed over blocks: networks read one of some pixels only
-        h, w = (size // n for size in saliency.magnitude.shape)
-        shown = saliency.magnitude[: n * h, : n * w].reshape(h, n, w, n).sum(axis=(1, 3))
+        shown = cv2.blur(saliency.magnitude, (4, 4))  # networks read one of some pixels only
         relative = shown / max(float(np.percentile(shown, 99)), 1e-30)
         panels.append(Panel(f"{name}: saliency, {what}", relative, "relative", 1.0, moving))
     return panels

@@ -63,16 +63,6 @@ def step_errors(
     return pair_errors(T_curr_prev, T_gt, depth, prev.camera, sequence.camera(curr))
 
 
-def _native_epe(
-    T_est: np.ndarray, T_gt: np.ndarray, depth: np.ndarray, prev: Camera, curr: Camera
-) -> float | None:
-    """Mean L2 distance of the two ego flows over valid pixels, px."""
-    est, gt = (ego_flow(depth, T, prev, curr) for T in (T_est, T_gt))
-    error = np.linalg.norm(est - gt, axis=2)[np.isfinite(gt).all(axis=2)]
-    error[~np.isfinite(error)] = np.hypot(*prev.shape)
-    return float(error.mean()) if len(error) else None
-
-
 @np.errstate(divide="ignore", invalid="ignore", over="ignore")
 def _paper_epe(
     T_est: np.ndarray, T_gt: np.ndarray, depth: np.ndarray, prev: Camera, curr: Camera
@@ -122,11 +112,14 @@ def pair_errors(
     euler = matrix_to_euler_deg(T_est[:3, :3]) - matrix_to_euler_deg(T_gt[:3, :3])
     euler = (euler + 180.0) % 360.0 - 180.0
     translation = T_est[:3, 3] - T_gt[:3, 3]
+    est, gt = (ego_flow(depth, T, camera_prev, camera_curr) for T in (T_est, T_gt))
+    native = np.linalg.norm(est - gt, axis=2)[np.isfinite(gt).all(axis=2)]
+    native[~np.isfinite(native)] = np.hypot(*camera_prev.shape)
     return {
         "r_err_deg": float(np.abs(euler).mean()),
         "t_err": float(np.abs(translation).mean()),
         "epe": _paper_epe(T_est, T_gt, depth, camera_prev, camera_curr),
-        "epe_l2_px": _native_epe(T_est, T_gt, depth, camera_prev, camera_curr),
+        "epe_l2_px": float(native.mean()) if len(native) else None,
         "rot_err_deg": float(np.degrees(rotation_angle(T_est[:3, :3] @ T_gt[:3, :3].T))),
         "trans_err": float(np.linalg.norm(translation)),
     }
@@ -160,24 +153,21 @@ def pair_facts(
 ) -> dict[str, float]:
     """What may explain an error: how much moves, how far, before what. What is unknown is absent.
 
-    ``flow_gt`` (H, W, 2) is the true flow of everything, px, NaN or beyond 1e9 where unknown; None
-    where there is none, or where it holds the motion of the camera alone.
+    ``flow_gt`` (H, W, 2) is the true flow of everything, px, NaN or beyond 1e9 where unknown.
 
     ``dynamic_fraction``: share of valid pixels whose true flow differs from the true ego flow by
     more than 1 px; ``depth_spread``: 90th over 10th percentile of the valid depth.
     """
-    facts: dict[str, float] = {}
-    if T_gt is not None:
-        facts["rotation_deg"] = float(np.degrees(rotation_angle(T_gt[:3, :3])))
-        facts["translation_m"] = float(np.linalg.norm(T_gt[:3, 3]))
-    if depth_prev is None:
-        return facts
+    if T_gt is None or depth_prev is None:
+        return {}
+    facts = {
+        "rotation_deg": float(np.degrees(rotation_angle(T_gt[:3, :3]))),
+        "translation_m": float(np.linalg.norm(T_gt[:3, 3])),
+    }
     known = depth_prev[np.isfinite(depth_prev) & (depth_prev > 0)]
     if len(known):
         low, high = np.quantile(known, [0.1, 0.9])
         facts["depth_spread"] = float(high / low)
-    if T_gt is None:
-        return facts
     ego = ego_flow(depth_prev, T_gt, camera_prev, camera_curr)
     valid = np.isfinite(ego).all(axis=2)
     if valid.any():

@@ -57,11 +57,9 @@ def plot_trajectories(
         style: dict[str, Any] = {"color": colour, "linewidth": 1.4}
         if truth is not None:
             est, error, kind = aligned(est, truth, alignment)
-            told = "no error: poses do not match"
             if error is not None:
                 below[0].plot(error.stamps - start, 100 * error.translation, **style)
-                told = f"ATE {100 * error.rmse:.3g} cm, {kind}"
-            name = f"{name} ({told})"
+                name = f"{name} (ATE {100 * error.rmse:.3g} cm, {kind})"
         above.plot(*_from_above(est, est if truth is None else truth), label=name, **style)
     above.plot(0, 0, "o", color=_BLACK, markersize=5, zorder=5)
     above.update_datalim([[-5e-4, -5e-4], [5e-4, 5e-4]])  # a camera that does not move
@@ -71,9 +69,7 @@ def plot_trajectories(
         axes.grid(True, color="#e4e4e4", linewidth=0.8)
         axes.set_axisbelow(True)
     figure.legend(loc="outside lower center", frameon=False, fontsize=9, ncols=3)
-    # a folder's name: bytes that are no UTF-8 cannot be drawn, dollars in it are no formula
-    title = title.encode("utf-8", "replace").decode("utf-8")
-    figure.suptitle(title, fontsize=11, parse_math=False)
+    figure.suptitle(title.encode("utf-8", "replace").decode(), fontsize=11, parse_math=False)
     # a name in letters that the font lacks is drawn as boxes, without a word on stderr for each
     quiet = warnings.catch_warnings(action="ignore", category=UserWarning)
     with quiet, atomic_write(path, "wb") as file:

@@ -31,16 +31,11 @@ def same_intrinsics(first: Camera, second: Camera) -> bool:
 def check_protocol(sequences: Sequence[Any], run: RunOptions) -> None:
     """Refuse frames or sequences that the protocol does not score."""
     if run.stride != 1 or run.start or run.stop is not None:
-        raise InputError(
-            "--protocol paper is defined on whole sequences: leave out --start, --stop and "
-            "--stride."
-        )
+        raise InputError("--protocol paper: needs no --start, --stop or --stride.")
     for sequence in sequences:
         if sequence.kind != "sintel" or sequence.name not in paper_protocol()["sequences"]:
             raise InputError(
-                f"--protocol paper: '{sequence.name}' ({sequence.kind}) is none of the training "
-                f"sequences of MPI Sintel. Pass the folder 'training' of the data set, or leave "
-                f"--protocol out."
+                f"--protocol paper: expected training sequences of MPI Sintel, got {sequence.name}."
             )
 
 
@@ -55,18 +50,14 @@ def protocol_summary(
     protocol = paper_protocol()
     names, count = [s["name"] for s in scored], sum(s["pairs_scored"] for s in scored)
     absent = [name for name in protocol["sequences"] if name not in names]
-    notes = []
-    if absent:
-        what = f"{len(absent)} of {len(protocol['sequences'])} sequences are missing"
-        notes.append(f"{what}: {', '.join(absent)}")
-    if count != protocol["pairs"]:
-        notes.append(f"{count} pairs, the complete set has {protocol['pairs']}")
-    if notes:
-        notes.append("these figures and the published ones are not over the same pairs")
+    note = ""
+    if absent or count != protocol["pairs"]:
+        note = f"{count} pairs, the complete set has {protocol['pairs']}: not those of the "
+        note += f"published figures; missing: {', '.join(absent) or 'no sequence'}"
     published = {line["method"]: line for line in protocol["published"]}
     return protocol | {
-        "complete": not notes,
-        "note": "; ".join(notes),
+        "complete": not note,
+        "note": note,
         "missing_sequences": absent,
         "pairs": count,
         "pairs_expected": protocol["pairs"],

@@ -37,8 +37,6 @@ COLUMNS: tuple[tuple[str, str, float], ...] = (
     ("t_err", "paper's T_err [cm]", 100.0),
     ("dynamic_fraction", "moving [%]", 100.0),
 )
-NO_MERIT = ("pairs", "moving [%]", "time [ms]", "+ flow [ms]")
-"""Columns without a best value: doing nothing takes no time."""
 
 
 def write_report(folder: Path, result: Mapping[str, Any], pairs: pd.DataFrame) -> None:
@@ -71,7 +69,6 @@ def write_report(folder: Path, result: Mapping[str, Any], pairs: pd.DataFrame) -
         "protocol": _protocol_tables(result.get("protocol")),
         "numbers": (every, COLUMNS, ("sequence", "method", "flow_source")),
         "number": number,
-        "no_merit": NO_MERIT,
     }
     for name in ("report.html", "report.md"):
         text = environment.get_template(name).render(content, plotly=get_plotlyjs())

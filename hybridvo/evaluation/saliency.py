@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -43,10 +42,9 @@ class Saliency:
             ((np.arange(small) + 0.5) * size / small).astype(int)
             for small, size in zip(self.magnitude.shape, mask.shape, strict=True)
         )
-        total = float(self.magnitude.sum(dtype=np.float64))
-        if not math.isfinite(total) or total <= 0:
-            return None
-        return float((self.magnitude * mask[np.ix_(rows, cols)]).sum(dtype=np.float64)) / total
+        total = self.magnitude.sum(dtype=np.float64)
+        inside = (self.magnitude * mask[np.ix_(rows, cols)]).sum(dtype=np.float64)
+        return float(inside / total) if total > 0 else None
 
 
 def integrated_gradients(
@@ -80,8 +78,6 @@ def integrated_gradients(
 def last_pass(network: Any, pair: FramePair) -> tuple[Any, Any, Any]:
     """(output, inputs, start) of the last pass of a network on a pair."""
     inputs = assemble_inputs(pair)
-    device = next(network.parameters()).device
-    inputs = inputs.to(device) if device.type != "cpu" else inputs
     T_start = first_motions(network, inputs, "softmax", int(network.options.passes) - 1)
     with torch.no_grad():
         return network(inputs, T_start), inputs, T_start

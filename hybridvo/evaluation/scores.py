@@ -126,17 +126,15 @@ def totals(table: pd.DataFrame, rows: list[dict[str, Any]]) -> list[dict[str, An
 def total_row(pairs: pd.DataFrame, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Line of one method over all sequences: pairs pooled, trajectory errors as plain means.
 
-    A trajectory error that one of its ``rows`` of single sequences lacks is the mean over the
-    others, and ``reasons`` says which are missing.
+    An error that some ``rows`` lack is the mean over the others, and ``reasons`` says so.
     """
     scores = pair_scores(pairs)
     for key in PATH_KEYS:
         known = [row[key] for row in rows if row[key] is not None]
         scores[key] = float(np.mean(known)) if known else None
-        missing = [row for row in rows if row[key] is None]
+        missing = [f"{r['sequence']}: {r['reasons'][key]}" for r in rows if r[key] is None]
         if missing:
-            without = "; ".join(f"{row['sequence']}: {row['reasons'][key]}" for row in missing)
-            text = f"mean over {len(known)} of {len(rows)} sequences; without {without}"
+            text = f"mean over {len(known)} of {len(rows)} sequences; without {'; '.join(missing)}"
             scores["reasons"][key] = text
     depth = ", ".join(dict.fromkeys(row["depth_source"] for row in rows))
     named = {"method": rows[0]["method"], "flow_source": rows[0]["flow_source"]}

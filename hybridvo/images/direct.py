@@ -7,7 +7,6 @@ apart, and the flow has to be asked.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from weakref import WeakKeyDictionary
 
 import cv2
@@ -15,9 +14,8 @@ import numpy as np
 
 from hybridvo.calibration import DIRECT_RIGHT, right
 from hybridvo.images.image_factor import ImageFactor, blurred, choose_pixels
-from hybridvo.images.photometric import refine_photometric
-from hybridvo.images.plane_factor import PlaneFactor
-from hybridvo.options import PhotometricOptions
+from hybridvo.images.photometric import BLURS, PhotometricReport, refine_photometric
+from hybridvo.images.plane_factor import MIN_POINTS, PlaneFactor
 from hybridvo.refinement.solver import Factor, gauss_newton
 from hybridvo.results import RelativePose
 from hybridvo.types import Camera, Frame, FramePair
@@ -46,7 +44,6 @@ _REDUCED: WeakKeyDictionary[Frame, dict[int, Frame]] = WeakKeyDictionary()
 def direct_start(
     pair: FramePair,
     T_start: np.ndarray | None = None,
-    options: PhotometricOptions | None = None,
     least: float = 0.5,
 ) -> RelativePose | None:
     """The motion that the images and depth maps agree on, from a start (4, 4) or the identity.
@@ -55,13 +52,12 @@ def direct_start(
     ``probability`` of being the camera's follows from that. None where the images do not match, or
     where that is below ``least``.
     """
-    images = options or PhotometricOptions()
     prev, curr = pair.prev, pair.curr
     if any(x is None for x in (prev.rgb, prev.depth, curr.rgb, curr.depth)):
         return None
     ones = np.ones(prev.camera.shape, np.float32)
-    planes = PlaneFactor.of(pair, ones, 1.0, images.image_inflation, POINTS)
-    if planes is None:
+    planes = PlaneFactor(pair, ones, 1.0, POINTS)
+    if len(planes.points) < MIN_POINTS:
         return None
     start = RelativePose(covariance=np.diag(SPREAD**2), weights=ones, method="direct")
     T, gain = np.eye(4) if T_start is None else T_start, 1.0
@@ -70,27 +66,25 @@ def direct_start(
             continue
         small = FramePair(reduced(prev, by), reduced(curr, by), None)
         weights = np.ones(small.prev.camera.shape, np.float32)
-        before, after = (blurred(frame, images.blur_px[-1]) for frame in (small.prev, small.curr))
+        before, after = (blurred(frame, BLURS[-1]) for frame in (small.prev, small.curr))
         depth = np.asarray(small.prev.depth)
         index = choose_pixels(before, depth, weights, min(PIXELS, weights.size // 4))
         if not len(index):
             continue
-        factor = ImageFactor(small, start.replace(weights=weights), index, images.image_inflation)
+        factor = ImageFactor(small, start.replace(weights=weights), index)
         factor.use(before, after, T, uneven_light=False)
         factors: list[Factor] = [factor, planes] if planes.estimate(T) else [factor]
         T = gauss_newton(factors, T, STEPS, tolerance=0.1).T
         gain = factor.gain
-    fine = PlaneFactor(pair, ones, 1.0)
-    fine.estimate(T)
-    follows, _, evidence = _explained(pair, fine, T, gain, agreement=1.0)
-    if right(evidence, DIRECT_RIGHT) < least:
+    guess = start.replace(T_curr_prev=T, photometric=PhotometricReport(False, gain=gain))
+    likely, _ = explained(pair, guess)
+    if likely.probability < least:
         return None
-    weights = fine.image_of(follows)
-    finest = replace(images, blur_px=images.blur_px[-1:], prior_inflation=1.0)
-    found = refine_photometric(pair, start.replace(T_curr_prev=T, weights=weights), finest)
+    start = start.replace(T_curr_prev=T, weights=likely.weights)
+    found = refine_photometric(pair, start, BLURS[-1:], prior_inflation=1.0)
     if found.photometric is None or not found.photometric.taken:
         return None
-    answer = _answer(pair, fine, found)
+    answer, _ = explained(pair, found)
     return answer if answer.probability >= least else None
 
 
@@ -109,41 +103,16 @@ def reduced(frame: Frame, by: int) -> Frame:
     return known[by]
 
 
-def _answer(pair: FramePair, planes: PlaneFactor, found: RelativePose) -> RelativePose:
-    """The motion with the pixels that follow it, and its probability."""
-    T, images = found.T_curr_prev, found.photometric
+def explained(pair: FramePair, motion: RelativePose) -> tuple[RelativePose, tuple[float, float]]:
+    """A motion by images and depth maps with the pixels that follow it, and its probability.
+
+    And the evidence that this is logistic in: agreement of the image's parts, and log of the share
+    of the image in unexplained regions.
+    """
+    T, images = motion.T_curr_prev, motion.photometric
+    planes = PlaneFactor(pair, np.ones(pair.prev.camera.shape, np.float32), 1.0)
     assert images is not None
     planes.estimate(T)
-    at = planes.residuals(T)
-    z = at.z[at.seen]
-    follows, share, evidence = _explained(pair, planes, T, images.gain, images.agreement)
-    return found.replace(
-        inlier_ratio=share,
-        probability=right(evidence, DIRECT_RIGHT),
-        weights=planes.image_of(follows),
-        depth_noise=float(np.median(planes.noise(z) / z)) / np.sqrt(2),
-        terms=("images", "depth"),
-    )
-
-
-def evidence_of(pair: FramePair, motion: RelativePose) -> tuple[float, float]:
-    """What the probability of a motion of :func:`direct_start` is logistic in.
-
-    Agreement of the image's parts, and log of the share of the image in unexplained regions.
-    """
-    planes = PlaneFactor(pair, np.ones(pair.prev.camera.shape, np.float32), 1.0)
-    planes.estimate(motion.T_curr_prev)
-    images = motion.photometric
-    assert images is not None
-    return _explained(pair, planes, motion.T_curr_prev, images.gain, images.agreement)[2]
-
-
-def _explained(
-    pair: FramePair, planes: PlaneFactor, T: np.ndarray, gain: float, agreement: float
-) -> tuple[np.ndarray, float, tuple[float, float]]:
-    """(N,) bool, which of the points follow a motion, their share of those in view of both, and
-    the evidence of :func:`evidence_of`.
-    """
     (height, width), (v, u), at = pair.prev.camera.shape, planes.index.T, planes.residuals(T)
     x, y = at.at.T
     inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
@@ -157,10 +126,10 @@ def _explained(
         )
         return (total / np.maximum(count, 1e-6))[planes.cells]
 
-    residual = now - gain * before[v, u]
+    residual = now - images.gain * before[v, u]
     d2 = (residual - mean_around(residual, NEIGHBOURS)) ** 2
-    right, below = np.minimum(u + 1, width - 1), np.minimum(v + 1, height - 1)
-    slope2 = (before[v, right] - before[v, np.maximum(u - 1, 0)]) ** 2
+    beside, below = np.minimum(u + 1, width - 1), np.minimum(v + 1, height - 1)
+    slope2 = (before[v, beside] - before[v, np.maximum(u - 1, 0)]) ** 2
     slope2 += (before[below, u] - before[np.maximum(v - 1, 0), u]) ** 2
     usual = 9 * (GREY**2 + (SHIFT_PX / 2) ** 2 * slope2)
     depth = np.where(at.seen, planes.robust(T), 1.0)
@@ -168,5 +137,13 @@ def _explained(
     unexplained = inside & (mean_around(~follows, REGION) > UNEXPLAINED)
     count = max(int(np.count_nonzero(inside)), 1)
     region = np.count_nonzero(unexplained) / count
-    evidence = agreement, float(np.log(region + SMALL_REGION))
-    return follows, float(np.count_nonzero(follows) / count), evidence
+    evidence = images.agreement, float(np.log(region + SMALL_REGION))
+    z = at.z[at.seen]
+    answer = motion.replace(
+        inlier_ratio=float(np.count_nonzero(follows) / count),
+        probability=right(evidence, DIRECT_RIGHT),
+        weights=planes.image_of(follows),
+        depth_noise=float(np.median(planes.noise(z) / z) / np.sqrt(2)) if len(z) else 0.0,
+        terms=("images", "depth"),
+    )
+    return answer, evidence

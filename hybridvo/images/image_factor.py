@@ -19,13 +19,15 @@ from weakref import WeakKeyDictionary
 
 import cv2
 import numpy as np
+from scipy.sparse import csr_array, hstack
 
 from hybridvo.calibration import EVEN_PARTS, UNEVEN_LIGHT
 from hybridvo.images import photometric_kernels as kernels
+from hybridvo.images.plane_factor import CUTOFF, INFLATION
 from hybridvo.options import RefineOptions
 from hybridvo.refinement.covariance import dispersion, tile_size, tile_sums
-from hybridvo.refinement.kernels import MAX_VALUE
-from hybridvo.refinement.pixels import as_contiguous, typical
+from hybridvo.refinement.kernels import MAX_VALUE, MIN_DEPTH
+from hybridvo.refinement.pixels import typical
 from hybridvo.refinement.solver import Linearization, positive_inverse
 from hybridvo.results import RelativePose
 from hybridvo.types import Frame, FramePair
@@ -38,8 +40,6 @@ _IMAGES: WeakKeyDictionary[Frame, dict[float, np.ndarray]] = WeakKeyDictionary()
 PER_CELL = 4
 MIN_WEIGHT = 0.25
 """Robust weight in the refinement on the flow below which a pixel is not used."""
-CUTOFF = 3.0
-"""c of the Geman-McClure kernel, in standard deviations."""
 NOISE_FLOOR = 0.1
 """Grey levels: rounding to 8 bits leaves 0.08 after the finest blur."""
 GAINS = (0.2, 5.0)
@@ -70,25 +70,30 @@ def choose_pixels(
     """(N, 2) int32 rows and columns of the pixels to use: strong gradients, evenly spread."""
     height, width = grey.shape
     cell = max(2, round(np.sqrt(height * width * PER_CELL / count)))
-    cells = (height // cell + 1) * (width // cell + 1)
-    index = np.empty((cells * PER_CELL, 2), np.int32)
-    n = kernels.select_pixels(
-        grey, as_contiguous(depth), as_contiguous(weights, np.float32),
-        np.float32(MIN_WEIGHT), cell, PER_CELL, index,
-    )  # fmt: skip
-    return index[:n]
+    inner, off = slice(kernels.MARGIN, -kernels.MARGIN), kernels.MARGIN
+    gx, gy = (cv2.Sobel(grey, cv2.CV_32F, *way, ksize=1) for way in ((1, 0), (0, 1)))
+    strength = (gx * gx + gy * gy)[inner, inner]
+    z, usable = depth[inner, inner], weights[inner, inner] >= MIN_WEIGHT
+    usable &= (z > MIN_DEPTH) & (z < MAX_VALUE) & (strength < MAX_VALUE)
+    # the strongest of every cell
+    rows, columns = (-(-n // cell) for n in strength.shape)
+    padded = np.zeros((rows * cell, columns * cell), np.float32)
+    padded[: height - 2 * off, : width - 2 * off] = np.where(usable, strength, 0)
+    cells = padded.reshape(rows, cell, columns, cell).swapaxes(1, 2).reshape(-1, cell * cell)
+    best = np.argpartition(cells, -PER_CELL, axis=1)[:, -PER_CELL:]
+    place, k = np.nonzero(np.take_along_axis(cells, best, 1) > 0)
+    v, u = np.divmod(best[place, k], cell)
+    index = np.stack([place // columns * cell + v, place % columns * cell + u], 1) + off
+    return index.astype(np.int32)
 
 
 class ImageFactor:
     """The images of a pair under one blur after another, at the pixels (N, 2) ``index``.
 
-    ``pose`` holds the weights of the pixels, ``inflation`` is a factor on the covariance beyond the
-    tiles.
+    ``pose`` holds the weights of the pixels.
     """
 
-    def __init__(
-        self, pair: FramePair, pose: RelativePose, index: np.ndarray, inflation: float
-    ) -> None:
+    def __init__(self, pair: FramePair, pose: RelativePose, index: np.ndarray) -> None:
         prev, curr, n = pair.prev.camera, pair.curr.camera, len(index)
         rows, columns = index.T
         buffer = np.ones((kernels.BUFFER_ROWS, n), np.float32)
@@ -102,20 +107,19 @@ class ImageFactor:
             buffer[kernels.PD, good] = variance[good] / typical(pair.prev.depth_variance)
             buffer[kernels.W, ~good] = 0.0
         self._buffer, self._index = buffer, index
-        self._depth_noise, self._inflation = pose.depth_noise, inflation
+        self._depth_noise = float(pose.depth_noise)
         self._scales = np.array([1 / prev.fx, 1 / prev.fy], np.float32)
         self._K = np.array([curr.fx, curr.fy, curr.cx, curr.cy], np.float32)
         self._J = np.empty((kernels.GQ + 1, n), np.float32)
         self._r, self._w = np.empty(n, np.float32), np.empty(n, np.float32)
         self._light = np.array([1.0, 0.0], np.float32)
         self._places = index * [(ROWS - 1) / prev.height, (COLUMNS - 1) / prev.width]
+        self._shares = node_shares(self._places)
         tile = tile_size(prev.shape, RefineOptions().tiles)
         self._tiles = -(-prev.height // tile), -(-prev.width // tile)
         self._tile = rows // tile * self._tiles[1] + columns // tile
-        self._scale = 1.0 / inflation
-        self._uneven_here = False
-        self.noise = 0.0
-        """Standard deviation of the residual, grey levels."""
+        self._scale = 1.0 / INFLATION
+        self._noise = NOISE_FLOOR  # standard deviation of the residual, grey levels
         self.agreement = 1.0
         """Factor in (0, 1] on the information by which the parts of the image lowered it."""
         self.uneven_light = False
@@ -142,10 +146,11 @@ class ImageFactor:
     ) -> None:
         """Take two images (H, W) and estimate noise and light at a motion."""
         rows, columns = self._index.T
-        self._buffer[kernels.GREY] = prev[rows, columns]
         self._buffer[kernels.GX] = 0.5 * (prev[rows, columns + 1] - prev[rows, columns - 1])
         self._buffer[kernels.GY] = 0.5 * (prev[rows + 1, columns] - prev[rows - 1, columns])
-        self._prev, self._curr, self._at = prev, curr, np.empty(0)
+        self._curr, self._at = curr, np.empty(0)
+        # without the fields of light that may be put into the buffer's
+        self._even = self._buffer[kernels.GREY] = prev[rows, columns]
         self._project(T)
         for _ in range(2):
             self._settle()
@@ -179,9 +184,8 @@ class ImageFactor:
         seen = self._r[used] + self.gain * grey + self.offset
         if not self.uneven_light:
             return correlation(grey, seen, weight)
-        rows, columns = self._index[used].T
         v, u = (2 * self._places[used]).astype(np.intp).T  # cells half as wide as the fields'
-        return correlation(self._prev[rows, columns], seen, weight, 2 * (COLUMNS - 1) * v + u)
+        return correlation(self._even[used], seen, weight, 2 * (COLUMNS - 1) * v + u)
 
     def _project(self, T: np.ndarray) -> None:
         if T is self._at:
@@ -192,75 +196,70 @@ class ImageFactor:
         self._at = T
 
     def _weigh(self) -> float:
-        """Weights, H and g of the last projection; then the light that fits best is taken.
+        """Weights, H (8, 8) and g (8,) of the last projection; then the light that fits best.
 
-        Returns the cost under that light, to second order.
+        Returns the cost under that light, to second order. Points unseen cost the most.
         """
-        cost = self._sum()
-        (a, b), (_, c) = self._H[6:, 6:]
-        g, determinant = self._g[6:], a * c - b * b
-        gain = float(self._light[0])
-        if determinant > 1e-9 * a * c > 0:
-            gain += (c * g[0] - b * g[1]) / determinant
+        buffer, J, r, c2 = self._buffer, self._J[: kernels.GQ], self._r, CUTOFF**2
+        # depth_noise belongs to the typical depth variance, the unit of the buffer's
+        depth = buffer[kernels.PD] * (self._depth_noise * self._J[kernels.GQ]) ** 2
+        information = 1 / (self._noise**2 + depth)
+        d2 = r * r * information
+        seen = d2 < MAX_VALUE  # false for NaN
+        robust = c2 / (c2 + np.where(seen, d2, 0))
+        self._w = np.where(seen, buffer[kernels.W] * robust * robust * information, 0)
+        cost = 0.5 * float(buffer[kernels.W].astype(np.float64) @ np.where(seen, robust * d2, c2))
+        weighted = J * self._w
+        self._H = (weighted @ J.T).astype(np.float64)
+        self._g = -(weighted @ np.where(seen, r, 0)).astype(np.float64)
+        g, (b, c) = self._g[6:], self._H[7, 6:]
+        gain = float(self._light[0] + (self._light_inverse() @ g)[0])
         more = np.float32(min(max(gain, GAINS[0]), GAINS[1])) - self._light[0]
         shift = np.float32((g[1] - b * more) / c if c > 0 else 0.0)
-        self._r -= more * self._buffer[kernels.GREY] + shift
+        self._r -= more * buffer[kernels.GREY] + shift
         self._light += more, shift
         return cost - 0.5 * float(g @ (more, shift))
 
-    def _sum(self) -> float:
-        """Weights, H (8, 8) and g (8,) of motion, gain and offset; the cost."""
-        # depth_noise belongs to the typical depth variance, the unit of the buffer's
-        noise = 1 / max(self.noise, NOISE_FLOOR) ** 2, self._depth_noise**2, CUTOFF**2
-        cost = kernels.weigh_pixels(
-            self._buffer, np.array(noise, np.float32), self._J, self._r, self._w
-        )
-        J = self._J[: kernels.GQ]
-        weighted = J * self._w
-        self._H = (weighted @ J.T).astype(np.float64)
-        self._g = -(weighted @ np.where(self._w > 0, self._r, 0)).astype(np.float64)
-        return cost
+    def _light_inverse(self) -> np.ndarray:
+        """Covariance (2, 2) of gain and offset; 0 of a gain that cannot be told from the offset."""
+        (a, b), (_, c) = self._H[6:, 6:]
+        determinant = a * c - b * b
+        if determinant > 1e-9 * a * c > 0:
+            return np.array([[c, -b], [-b, a]]) / determinant
+        return np.diag([0.0, 1 / c if c > 0 else 0.0])
 
     def _settle(self) -> None:
         """Noise of the last projection, and the light under it."""
         lengths = np.abs(self._r[~np.isnan(self._r)])
         if len(lengths):
-            self.noise = max(1.4826 * float(np.median(lengths)), NOISE_FLOOR)
+            self._noise = max(1.4826 * float(np.median(lengths)), NOISE_FLOOR)
         self._weigh()
 
     def _even_light(self, least: float) -> bool:
         """Put fields of gain and offset into the grey values where they explain enough."""
-        buffer, (gain, _), r, w, places = self._buffer, self._light, self._r, self._w, self._places
+        buffer, (gain, _), r, w, shares = self._buffer, self._light, self._r, self._w, self._shares
         grey, few = buffer[kernels.GREY], np.s_[::4]
-        if least > 0 and light_fields(places[few], grey[few], r[few], w[few], least) is None:
+        if least > 0 and light_fields(shares[few], grey[few], r[few], w[few], least) is None:
             return False
-        fields = light_fields(places, grey, r, w)
+        fields = light_fields(shares, grey, r, w)
         if fields is None:
             return False
-        more, shift = (kernels.read_field(places, COLUMNS, field) for field in fields)
+        more, shift = (shares @ fields.T).T
         self._r -= more * grey + shift
-        factor = 1 + more / gain
-        buffer[[kernels.GREY, kernels.GX, kernels.GY]] *= factor
+        buffer[[kernels.GREY, kernels.GX, kernels.GY]] *= 1 + more / gain
         buffer[kernels.GREY] += shift / gain
         return True
 
     def _marginal(self) -> tuple[np.ndarray, np.ndarray]:
         """(H (6, 6) with gain and offset free, what they explain of each column (6, 2))."""
-        H, (a, b, c) = self._H, (self._H[6, 6], self._H[6, 7], self._H[7, 7])
-        determinant = a * c - b * b
-        if determinant > 1e-9 * a * c > 0:
-            inverse = np.array([[c, -b], [-b, a]]) / determinant
-        else:
-            inverse = np.diag([0.0, 1 / c if c > 0 else 0.0])
-        light = H[:6, 6:] @ inverse
-        return H[:6, :6] - light @ H[6:, :6], light
+        light = self._H[:6, 6:] @ self._light_inverse()
+        return self._H[:6, :6] - light @ self._H[6:, :6], light
 
     def _estimate_scale(self) -> None:
         """Share of the information that is left under errors alike in a region, at most 1."""
         H, light = self._marginal()
-        model = positive_inverse(H)
+        model, self._scale = positive_inverse(H), 0.0
         if model is None:
-            self._scale = 0.0
             return
         rows = self._J[:6].astype(np.float64) - light @ self._J[6:8]
         r = np.where(self._w > 0, self._r, 0.0)
@@ -270,9 +269,8 @@ class ImageFactor:
         scores = tile_sums(rows * (self._w * r), self._tile, self._tiles[0] * self._tiles[1])
         factor = dispersion(scores, pull @ pull.T, model)
         if factor is None:
-            self._scale = 0.0
             return
-        scale = 1.0 / (factor * self._inflation)
+        scale = 1.0 / (factor * INFLATION)
         parts = scale * parts_dispersion(scores.reshape(*self._tiles, 6), model)
         # what the parts disagree about is seen; as much again is common to them and is not
         self.agreement = min(1.0, (EVEN_PARTS / max(parts, EVEN_PARTS)) ** 2)
@@ -294,17 +292,24 @@ def parts_dispersion(scores: np.ndarray, model: np.ndarray) -> float:
     return float(np.mean(found))
 
 
-def light_fields(
-    places: np.ndarray, grey: np.ndarray, r: np.ndarray, w: np.ndarray, least: float = 0.0
-) -> np.ndarray | None:
-    """Smooth changes of gain and offset (2, nodes) that explain the residuals best, or None.
+def node_shares(places: np.ndarray) -> csr_array:
+    """(N, nodes) bilinear shares of the nodes in places (N, 2): rows and columns among them."""
+    corner = places.astype(np.intp)
+    v, u = (places - corner).T
+    shares = np.stack([(1 - v) * (1 - u), (1 - v) * u, v * (1 - u), v * u], axis=1)
+    nodes = (corner @ (COLUMNS, 1))[:, None] + (0, 1, COLUMNS, COLUMNS + 1)
+    starts = 4 * np.arange(len(places) + 1)
+    return csr_array((shares.ravel(), nodes.ravel(), starts), (len(places), ROWS * COLUMNS))
 
-    ``places`` (N, 2): rows and columns in cells of the fields.
-    """
+
+def light_fields(
+    shares: csr_array, grey: np.ndarray, r: np.ndarray, w: np.ndarray, least: float = 0.0
+) -> np.ndarray | None:
+    """Smooth changes of gain and offset (2, nodes) that explain the residuals best, or None."""
     r, nodes = np.where(w > 0, r, np.float32(0)), ROWS * COLUMNS
-    H, g = np.zeros((2 * nodes, 2 * nodes)), np.zeros(2 * nodes)
-    kernels.add_fields(places, COLUMNS, grey, r, w, H, g)
-    H += np.triu(H, 1).T
+    A = hstack([shares * grey[:, None], shares], "csr")
+    weighted = (A * w[:, None]).T
+    H, g = (weighted @ A).toarray(), weighted @ r
     scale = np.repeat([np.trace(H[:nodes, :nodes]), np.trace(H[nodes:, nodes:])], nodes) / nodes
     H += SMOOTH * scale * np.kron(np.eye(2), _differences())
     # and a weak pull to no change, for nodes that no pixel is near to

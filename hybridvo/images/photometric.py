@@ -9,9 +9,7 @@ the images do not match along the motion, or lead outside of what the flow allow
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -25,17 +23,20 @@ from hybridvo.images.image_factor import (
     choose_pixels,
 )
 from hybridvo.images.plane_factor import PlaneFactor
-from hybridvo.options import PhotometricOptions
-from hybridvo.refinement.covariance import direction_is_known
-from hybridvo.refinement.solver import (
-    Factor,
-    PriorFactor,
-    gauss_newton,
-    positive_inverse,
-)
+from hybridvo.refinement.solver import PriorFactor, gauss_newton, positive_inverse
 from hybridvo.results import RelativePose
 from hybridvo.types import FramePair
 
+BLURS = (2.0, 1.0)
+"""Standard deviations of the blur, px, coarse to fine."""
+STEPS = (3, 2)
+"""Most Gauss-Newton steps under each blur, between which light, noise and scale are estimated."""
+PIXELS = 16_000
+"""About how many are used: the strongest gradients of evenly spread cells."""
+PRIOR_INFLATION = 8.0
+"""Factor on the covariance of the flow's motion, whose errors are alike far beyond the tiles."""
+MIN_CORRELATION = 0.5
+"""Of the two images along the motion; below it they do not match."""
 MIN_PIXELS = 200
 MIN_SEEN = 0.3
 """Share of the weight that must fall inside the current image."""
@@ -51,18 +52,13 @@ COARSE_SPREAD = 0.3
 
 @dataclass(frozen=True, eq=False)
 class PhotometricReport:
-    """What the images add to the motion of one pair.
+    """What came of the images of one pair.
 
     Args:
         taken: whether the motion was changed.
         reason: of a refusal, in a word: ``no_texture``, ``no_match`` (the images are not of one
             scene along the motion) or ``rejected`` (the flow excludes where they lead); empty where
-            taken, not tried or not needed.
-        message: the same for people.
-        shift: (6,) left tangent from the flow's motion to that of the images and the flow.
-        shift_sigma: its length in standard deviations of the flow (inflated).
-        image_information: (6, 6) of the images alone; flow_information: of the flow alone;
-            depth_information: of both depth maps, 0 without them; all as they were added up.
+            taken, not tried or not needed. message: the same for people.
         gain, offset: of the current image over the previous one; offset in grey levels.
         agreement: factor in (0, 1] on the information of the images by which the parts of the
             image, held against each other, lowered it.
@@ -72,11 +68,6 @@ class PhotometricReport:
     taken: bool
     reason: str = ""
     message: str = ""
-    shift: np.ndarray = field(default_factory=lambda: np.zeros(6))
-    shift_sigma: float = 0.0
-    image_information: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
-    flow_information: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
-    depth_information: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
     gain: float = 1.0
     offset: float = 0.0
     agreement: float = 1.0
@@ -86,7 +77,8 @@ class PhotometricReport:
 def refine_photometric(
     pair: FramePair,
     pose: RelativePose,
-    options: PhotometricOptions | None = None,
+    blurs: tuple[float, ...] = BLURS,
+    prior_inflation: float = PRIOR_INFLATION,
 ) -> RelativePose:
     """The motion of a pair, sharpened by its two images.
 
@@ -101,48 +93,60 @@ def refine_photometric(
     Raises:
         InputError: weights of another shape than the image.
     """
-    started = time.perf_counter()
-    motion = _refine(pair, pose, options or PhotometricOptions())
+    started, shape = time.perf_counter(), pair.prev.camera.shape
+    if pose.weights is not None and pose.weights.shape != shape:
+        got = pose.weights.shape
+        raise InputError(f"refine_photometric: expected weights of shape {shape}, got {got}.")
+    motion = _refine(pair, pose, blurs, pose.covariance * prior_inflation)
     return motion.replace(ms=pose.ms + 1e3 * (time.perf_counter() - started))
 
 
-def _refine(pair: FramePair, pose: RelativePose, options: PhotometricOptions) -> RelativePose:
-    prev, curr = pair.prev, pair.curr
+def _refine(
+    pair: FramePair, pose: RelativePose, blurs: tuple[float, ...], covariance: np.ndarray
+) -> RelativePose:
+    prev, curr, T, weights = pair.prev, pair.curr, pose.T_curr_prev, pose.weights
     if prev.rgb is None or curr.rgb is None:
-        return _unchanged(pose, "", "an image of the pair is missing")
-    if not pose.usable or pose.weights is None or prev.depth is None:
-        return _unchanged(pose, "", "there is no weighted estimate to start from")
-    if pose.weights.shape != prev.camera.shape:
-        raise InputError(
-            f"refine_photometric: expected weights of shape {prev.camera.shape}, "
-            f"got {pose.weights.shape}."
-        )
-    inflated, blurs = pose.covariance * options.prior_inflation, options.blur_px
-    flow_information = positive_inverse(inflated)
+        return _judged(pose, PhotometricReport(False, "", "an image of the pair is missing"))
+    if not pose.usable or weights is None or prev.depth is None:
+        what = "there is no weighted estimate to start from"
+        return _judged(pose, PhotometricReport(False, "", what))
+    flow_information = positive_inverse(covariance)
     if flow_information is None:
-        return _unchanged(pose, "", "the estimate has no usable covariance")
-    index = choose_pixels(blurred(prev, blurs[-1]), prev.depth, pose.weights, options.pixels)
+        what = "the estimate has no usable covariance"
+        return _judged(pose, PhotometricReport(False, "", what))
+    index = choose_pixels(blurred(prev, blurs[-1]), prev.depth, weights, PIXELS)
     if len(index) < MIN_PIXELS:
         what = f"{len(index)} static pixels with texture and depth, {MIN_PIXELS} needed"
-        return _unchanged(pose, "no_texture", what)
-    factor = ImageFactor(pair, pose, index, options.image_inflation)
-    factors: list[Factor] = [factor, PriorFactor(pose.T_curr_prev, flow_information)]
-    depth = PlaneFactor.of(pair, pose.weights, MIN_WEIGHT, options.image_inflation)
-    if depth is not None and depth.estimate(pose.T_curr_prev):
-        factors.append(depth)
+        return _judged(pose, PhotometricReport(False, "no_texture", what))
+    images, flow = ImageFactor(pair, pose, index), PriorFactor(T, flow_information)
+    planes = [] if curr.depth is None else [PlaneFactor(pair, weights, MIN_WEIGHT)]
+    planes = [factor for factor in planes if factor.estimate(T)]
     # where the flow is sure to a fraction of the finest blur, that one is enough
-    if _spread_px(pair, index, inflated) < COARSE_SPREAD * blurs[-1]:
+    if _spread_px(pair, index, covariance) < COARSE_SPREAD * blurs[-1]:
         blurs = blurs[-1:]
-    T = pose.T_curr_prev
     for blur in blurs:
-        factor.use(blurred(prev, blur), blurred(curr, blur), T)
-        half = (options.iterations + 1) // 2
-        for steps in (half, options.iterations - half):
-            T = gauss_newton(factors, T, steps, tolerance=0.1).T
-            factor.estimate(T)
-            if depth is not None:
-                depth.estimate(T)
-    return _judged(pose, factors, T, options)
+        images.use(blurred(prev, blur), blurred(curr, blur), T)
+        for steps in STEPS:
+            T = gauss_newton((images, flow, *planes), T, steps, tolerance=0.1).T
+            images.estimate(T)
+            for factor in planes:
+                factor.estimate(T)
+    H = images.linearize(T).H
+    joint = sum((factor.linearize(T).H for factor in planes), H + flow.linearize(T).H)
+    joint_covariance = positive_inverse(joint)
+    reason, message = "rejected", "the joint information is not definite"
+    if joint_covariance is not None:
+        reason, message = _doubt(images, flow, T, H)
+    report = PhotometricReport(
+        not message,
+        reason,
+        message,
+        gain=images.gain,
+        offset=images.offset + MID_GREY * (1 - images.gain),
+        agreement=images.agreement,
+        uneven_light=images.uneven_light,
+    )
+    return _judged(pose, report, T, joint_covariance)
 
 
 def _spread_px(pair: FramePair, index: np.ndarray, covariance: np.ndarray) -> float:
@@ -154,72 +158,46 @@ def _spread_px(pair: FramePair, index: np.ndarray, covariance: np.ndarray) -> fl
     return float(np.sqrt(np.einsum("cnp,pq,cnq->", J, covariance, J) / len(z)))
 
 
+def _doubt(
+    images: ImageFactor, flow: PriorFactor, T: np.ndarray, information: np.ndarray
+) -> tuple[str, str]:
+    """Why the motion to which the images lead cannot be believed: (in a word, in a sentence)."""
+    if images.seen < MIN_SEEN:
+        return "no_match", f"{100 * images.seen:.0f} % of the pixels are seen by both cameras"
+    correlated = images.correlation()
+    if not correlated >= MIN_CORRELATION:
+        what = f"the two images do not match along the motion ({correlated:.2f} correlated)"
+        return "no_match", what
+    if np.linalg.eigvals(np.linalg.solve(flow.information, information)).real.max() < MIN_GAIN:
+        return "", "the images add little to what the flow already knows"
+    shift = flow.offset(T)
+    away = float(np.sqrt(shift @ flow.information @ shift))
+    if away > MAX_SHIFT:
+        what = f"they lead {away:.1f} standard deviations away from the flow's motion"
+        return "rejected", what
+    return "", ""
+
+
 def _judged(
     pose: RelativePose,
-    factors: Sequence[Any],
-    T: np.ndarray,
-    options: PhotometricOptions,
+    report: PhotometricReport,
+    T: np.ndarray | None = None,
+    covariance: np.ndarray | None = None,
 ) -> RelativePose:
-    """The refined motion ``T``, or that of the flow where the images cannot be believed."""
-    factor: ImageFactor = factors[0]
-    prior: PriorFactor = factors[1]
-    images, flow = factor.linearize(T).H, prior.information
-    shift = prior.offset(T)
-    report = PhotometricReport(
-        True,
-        shift=shift,
-        shift_sigma=float(np.sqrt(shift @ flow @ shift)),
-        image_information=images,
-        flow_information=flow,
-        depth_information=sum((f.linearize(T).H for f in factors[2:]), np.zeros((6, 6))),
-        gain=factor.gain,
-        offset=factor.offset + MID_GREY * (1 - factor.gain),
-        agreement=factor.agreement,
-        uneven_light=factor.uneven_light,
-    )
-    covariance = positive_inverse(images + prior.linearize(T).H + report.depth_information)
-    if covariance is None:
-        return _unchanged(pose, "rejected", "the joint information is not definite", report)
-    if factor.seen < MIN_SEEN:
-        what = f"{100 * factor.seen:.0f} % of the pixels are seen by both cameras"
-        return _unchanged(pose, "no_match", what, report)
-    correlated = factor.correlation()
-    if not correlated >= options.min_correlation:
-        what = f"the two images do not match along the motion ({correlated:.2f} correlated)"
-        return _unchanged(pose, "no_match", what, report)
-    if np.linalg.eigvals(np.linalg.solve(flow, images)).real.max() < MIN_GAIN:
-        return _unchanged(pose, "", "the images add little to what the flow already knows", report)
-    if report.shift_sigma > MAX_SHIFT:
-        what = f"they lead {report.shift_sigma:.1f} standard deviations away from the flow's motion"
-        return _unchanged(pose, "rejected", what, report)
-    T = pose_matrix(T[:3])
-    remarks = []
-    if report.uneven_light:
-        remarks.append("the light changed differently over the image, evened out")
-    if report.agreement < MIN_AGREEMENT:
-        remarks.append(
-            "parts of the image disagree about the motion (rolling shutter, lens, depth?), "
-            "weighed down"
-        )
-    status = pose.status
-    if remarks and not status.message:
-        status = replace(status, message=f"images: {'; '.join(remarks)}")
-    return pose.replace(
-        T_curr_prev=T,
-        covariance=covariance,
-        status=status,
-        translation_direction_valid=direction_is_known(T, covariance),
-        terms=(*pose.terms, "images"),
-        photometric=report,
-    )
-
-
-def _unchanged(
-    pose: RelativePose, reason: str, message: str, report: PhotometricReport | None = None
-) -> RelativePose:
-    report = replace(
-        report or PhotometricReport(False), taken=False, reason=reason, message=message
-    )
-    if reason and not pose.status.message:
-        pose = pose.replace(status=replace(pose.status, message=f"images not used: {message}"))
+    """The refined motion, or that of the flow where the images were not taken; with a remark."""
+    remark = f"images not used: {report.message}" if report.reason else ""
+    if report.taken and T is not None and covariance is not None:
+        remarks = []
+        if report.uneven_light:
+            remarks.append("the light changed differently over the image, evened out")
+        if report.agreement < MIN_AGREEMENT:
+            remarks.append(
+                "parts of the image disagree about the motion (rolling shutter, lens, depth?), "
+                "weighed down"
+            )
+        remark = f"images: {'; '.join(remarks)}" if remarks else ""
+        T, terms = pose_matrix(T[:3]), (*pose.terms, "images")
+        pose = pose.replace(T_curr_prev=T, covariance=covariance, terms=terms)
+    if remark and not pose.status.message:
+        pose = pose.replace(status=replace(pose.status, message=remark))
     return pose.replace(photometric=report)

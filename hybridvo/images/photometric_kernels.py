@@ -1,4 +1,4 @@
-"""Numba kernels of the photometric term: which pixels, and their residuals and Jacobians.
+"""Numba kernels of the photometric term: residuals and Jacobians of its pixels.
 
 Per pixel x of the previous image with grey value A, at a pose T (X' = T X, a = X'/Z', b = Y'/Z',
 i = 1/Z'):
@@ -21,16 +21,7 @@ from __future__ import annotations
 import numpy as np
 
 from hybridvo.geometry import njit
-from hybridvo.refinement.kernels import (
-    BLOCK,
-    FASTMATH,
-    MAX_VALUE,
-    MIN_DEPTH,
-    ONE,
-    ZERO,
-    keep_apart,
-    pose_entries,
-)
+from hybridvo.refinement.kernels import FASTMATH, MIN_DEPTH, ONE, ZERO, pose_entries
 
 XN, YN, Z, GREY, GX, GY, PD, W = range(8)
 """Rows of a pixel buffer: ray x, ray y, depth, grey value, its gradient, relative depth variance,
@@ -46,79 +37,24 @@ HALF = np.float32(0.5)
 
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
-def strength_row(v, grey, depth, weights, least, out):
-    """Squared gradient of the usable pixels of row ``v``, 0 for the others."""
-    keep_apart()  # type: ignore[call-arg]
-    before, here, after = grey[v - 1], grey[v], grey[v + 1]
-    zrow, wrow = depth[v], weights[v]
-    for u in range(MARGIN, here.shape[0] - MARGIN):
-        gx = here[u + 1] - here[u - 1]
-        gy = after[u] - before[u]
-        strength = gx * gx + gy * gy
-        z = zrow[u]
-        usable = (wrow[u] >= least) & (z > MIN_DEPTH) & (z < MAX_VALUE) & (strength < MAX_VALUE)
-        out[u] = strength if usable else ZERO
-
-
-@njit(error_model="numpy", cache=True, nogil=True)
-def select_pixels(grey, depth, weights, least, cell, per_cell, index):
-    """The ``per_cell`` usable pixels of strongest gradient in every cell of ``cell`` px.
-
-    ``index`` (N, 2) int32 gets (v, u); returns how many. Usable: weight of at least ``least``,
-    valid depth, off the border.
-    """
-    H, width = grey.shape
-    cells = (width - 2 * MARGIN + cell - 1) // cell
-    best = np.empty((cells, per_cell), np.float32)
-    place = np.empty((cells, per_cell, 2), np.int32)
-    row = np.empty(width, np.float32)
-    last = per_cell - 1
-    n = 0
-    for v0 in range(MARGIN, H - MARGIN, cell):
-        best[:] = ZERO
-        for v in range(v0, min(v0 + cell, H - MARGIN)):
-            strength_row(v, grey, depth, weights, least, row)
-            for c in range(cells):
-                u0 = MARGIN + c * cell
-                for u in range(u0, min(u0 + cell, width - MARGIN)):
-                    strength = row[u]
-                    if not strength > best[c, last]:
-                        continue
-                    k = last
-                    while k > 0 and best[c, k - 1] < strength:
-                        best[c, k] = best[c, k - 1]
-                        place[c, k] = place[c, k - 1]
-                        k -= 1
-                    best[c, k] = strength
-                    place[c, k, 0] = v
-                    place[c, k, 1] = u
-        for c in range(cells):
-            for k in range(per_cell):
-                if best[c, k] > ZERO and n < index.shape[0]:
-                    index[n] = place[c, k]
-                    n += 1
-    return n
+def cubic(f):
+    """Weights of four neighbours at ``f`` of the way between the inner two."""
+    ff = f * f
+    fff = ff * f
+    return (
+        HALF * (-fff + ff + ff - f),
+        HALF * (fff + fff + fff - (ff + ff + ff + ff + ff)) + ONE,
+        HALF * (-(fff + fff + fff) + (ff + ff + ff + ff) + f),
+        HALF * (fff - ff),
+    )
 
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
 def read_cubic(image, u, v):
     """Value of ``image`` at (u, v) by cubic convolution with a = -1/2 (Keys 1981)."""
-    iu = int(u)
-    iv = int(v)
-    f = u - np.float32(iu)
-    g = v - np.float32(iv)
-    ff = f * f
-    fff = ff * f
-    x0 = HALF * (-fff + ff + ff - f)
-    x1 = HALF * (fff + fff + fff - (ff + ff + ff + ff + ff)) + ONE
-    x2 = HALF * (-(fff + fff + fff) + (ff + ff + ff + ff) + f)
-    x3 = HALF * (fff - ff)
-    gg = g * g
-    ggg = gg * g
-    y0 = HALF * (-ggg + gg + gg - g)
-    y1 = HALF * (ggg + ggg + ggg - (gg + gg + gg + gg + gg)) + ONE
-    y2 = HALF * (-(ggg + ggg + ggg) + (gg + gg + gg + gg) + g)
-    y3 = HALF * (ggg - gg)
+    iu, iv = int(u), int(v)
+    x0, x1, x2, x3 = cubic(u - np.float32(iu))
+    y0, y1, y2, y3 = cubic(v - np.float32(iv))
     a, b, c, d = image[iv - 1], image[iv], image[iv + 1], image[iv + 2]
     j = iu - 1
     return (
@@ -191,84 +127,3 @@ def project_pixels(buf, image, pose, K, scale, light, J, r):
         J[7, k] = -ONE
         J[GQ, k] = gq
         r[k] = e
-
-
-@njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
-def weigh_pixels(buf, noise, J, r, w):
-    """Robust weight x weight / variance in ``w`` (N,), 0 where not seen; returns the robust cost.
-
-    ``noise`` = (1/s^2, sd^2, c^2) float32. Unseen points count at the full cost.
-    """
-    keep_apart()  # type: ignore[call-arg]
-    is2, sd2, c2 = noise[0], noise[1], noise[2]
-    weights, relative, gradient = buf[W], buf[PD], J[GQ]
-    total, n = 0.0, len(r)
-    # no sum in a loop that stores: whether that one runs in vectors, and so the order of the sum,
-    # depends on where its arrays happen to lie in memory
-    costs = np.empty(BLOCK, np.float32)
-    for o in range(0, n, BLOCK):
-        m = min(BLOCK, n - o)
-        for j in range(m):
-            k = o + j
-            gq = gradient[k]
-            e = r[k]
-            information = is2 / (ONE + is2 * sd2 * relative[k] * gq * gq)
-            d2 = e * e * information
-            seen = d2 < MAX_VALUE  # false for NaN
-            d2 = d2 if seen else ZERO
-            robust = c2 / (c2 + d2)
-            w[k] = weights[k] * robust * robust * information if seen else ZERO
-            costs[j] = HALF * weights[k] * (robust * d2 if seen else c2)
-        cost = ZERO
-        for j in range(m):
-            cost += costs[j]
-        total += cost
-    return total
-
-
-@njit(error_model="numpy", cache=True, nogil=True)
-def bilinear(row, column, columns, node, share):
-    """The four nodes around a place, and their shares of it."""
-    i, j = int(row), int(column)
-    v, u = row - i, column - j
-    for a in range(4):
-        di, dj = a // 2, a % 2
-        node[a] = (i + di) * columns + j + dj
-        share[a] = (v if di else 1 - v) * (u if dj else 1 - u)
-
-
-@njit(error_model="numpy", cache=True, nogil=True)
-def add_fields(places, columns, grey, r, w, H, g):
-    """Add to the normal equations (upper triangle of ``H``, ``g``) of fields of gain and offset.
-
-    ``places`` (N, 2) rows and columns among the nodes, read bilinearly; first the nodes of the
-    gain, then those of the offset.
-    """
-    nodes = len(g) // 2
-    node, share = np.empty(8, np.int64), np.empty(8)
-    for k in range(len(r)):
-        if not w[k] > 0:
-            continue
-        bilinear(places[k, 0], places[k, 1], columns, node, share)
-        for a in range(4):
-            node[4 + a], share[4 + a] = nodes + node[a], share[a]
-            share[a] *= grey[k]
-        for a in range(8):
-            g[node[a]] += w[k] * share[a] * r[k]
-            for b in range(8):
-                if node[b] >= node[a]:
-                    H[node[a], node[b]] += w[k] * share[a] * share[b]
-
-
-@njit(error_model="numpy", cache=True, nogil=True)
-def read_field(places, columns, field):
-    """Values (N,) float32 of a field between its nodes."""
-    out = np.empty(len(places), np.float32)
-    node, share = np.empty(4, np.int64), np.empty(4)
-    for k in range(len(places)):
-        bilinear(places[k, 0], places[k, 1], columns, node, share)
-        value = 0.0
-        for a in range(4):
-            value += share[a] * field[node[a]]
-        out[k] = value
-    return out

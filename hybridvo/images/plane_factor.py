@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -29,18 +29,18 @@ CUTOFF = 3.0
 """c of the Geman-McClure kernel, in standard deviations."""
 MEAN_LENGTH = np.sqrt(2 / np.pi)
 """Mean absolute value of a standard normal number."""
+INFLATION = 4.0
+"""Factor on the covariance of images and depth maps beyond the tiles: a sensor is bent over the
+image, errors are alike far beyond them."""
 MIN_POINTS = 300
 
 
 class Residuals(NamedTuple):
     """Points of the previous depth map at a motion.
 
-    Args:
-        r: (N,) m, signed distance to the plane; 0 where not seen.
-        J: (N, 6) its derivative.
-        z: (N,) m, depth of the plane; 1 where not seen.
-        seen: (N,) bool, the current depth map has a surface there.
-        at: (N, 2) px, where the point falls in the current image.
+    ``r`` (N,) m, signed distance to the plane, 0 where not seen; ``J`` (N, 6) its derivative; ``z``
+    (N,) m, depth of the plane, 1 where not seen; ``seen`` (N,) bool, the current depth map has a
+    surface there; ``at`` (N, 2) px, where the point falls in the current image.
     """
 
     r: np.ndarray
@@ -61,21 +61,11 @@ class PlaneFactor:
     stereo, hardly for lidar, not at all where depth is rendered. One law for all,
     ``sigma = a + b z + c z^2`` with no negative term, is fitted to the residuals of the pair.
 
-    Args:
-        pair: with both depth maps.
-        weights: (H, W) external weights of the pixels.
-        least: weight below which a pixel is not used.
-        inflation: factor on the covariance beyond the tiles: a sensor is bent over the image.
-        points: of a regular grid, at most.
+    Used are the pixels with at least the weight ``least`` on a regular grid of at most ``points``.
     """
 
     def __init__(
-        self,
-        pair: FramePair,
-        weights: np.ndarray,
-        least: float,
-        inflation: float = 1.0,
-        points: int = POINTS,
+        self, pair: FramePair, weights: np.ndarray, least: float, points: int = POINTS
     ) -> None:
         prev = pair.prev.camera
         step = max(1, round(np.sqrt(prev.height * prev.width / points)))
@@ -95,16 +85,8 @@ class PlaneFactor:
         camera = pair.curr.camera
         self._K = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
         self._depth = as_contiguous(np.asarray(pair.curr.depth))
-        self._inflation, self._at = inflation, np.empty(0)
+        self._at = np.empty(0)
         self._law, self._scale = np.array([0.0, 0.0, 1.0]), 1.0
-
-    @classmethod
-    def of(cls, pair: FramePair, *how: Any, **options: Any) -> PlaneFactor | None:
-        """The factor, or None where a depth map is missing or has too few pixels."""
-        if pair.prev.depth is None or pair.curr.depth is None:
-            return None
-        factor = cls(pair, *how, **options)
-        return factor if len(factor.points) >= MIN_POINTS else None
 
     def on_grid(self, values: np.ndarray) -> np.ndarray:
         """Values (N,) of the points on their regular grid, float32; 0 where there is no point."""
@@ -118,7 +100,10 @@ class PlaneFactor:
         return cv2.resize(self.on_grid(values), size, interpolation=cv2.INTER_NEAREST)
 
     def estimate(self, T: np.ndarray) -> bool:
-        """Fit the noise and the scale of the information; whether enough points are seen."""
+        """Fit the noise law, and the share of the information that errors alike in a tile leave.
+
+        Whether enough points are seen.
+        """
         found = self.residuals(T)
         if found.seen.sum() < MIN_POINTS:
             self._scale = 0.0
@@ -131,7 +116,12 @@ class PlaneFactor:
             share = 1 / z[near, None]
             self._law = nnls(columns[near] * share, lengths[near] * share[:, 0])[0] / MEAN_LENGTH
             usual = self.noise(z)
-        self._estimate_scale(T)
+        w = self._information(T)
+        scores = found.J * (w * found.r)[:, None]
+        model = positive_inverse((found.J * w[:, None]).T @ found.J)
+        sums = tile_sums(scores.T, self._tile, self._tile.max() + 1)
+        factor = None if model is None else dispersion(sums, scores.T @ scores, model)
+        self._scale = 0.0 if factor is None else 1.0 / (factor * INFLATION)
         return self._scale > 0
 
     def noise(self, z: np.ndarray) -> np.ndarray:
@@ -147,14 +137,10 @@ class PlaneFactor:
 
     def linearize(self, T: np.ndarray) -> Linearization:
         """See :class:`hybridvo.refinement.solver.Factor`; points unseen cost the most."""
-        r, J, z, seen, _ = self.residuals(T)
-        robust, information = self.robust(T), self._information(T)
-        d2 = (r / self.noise(z)) ** 2
-        cost = 0.5 * self._weight @ np.where(seen, robust * d2, CUTOFF**2)
-        weighted = (J * information[:, None]).T
-        return Linearization(
-            self._scale * (weighted @ J), -self._scale * (weighted @ r), self._scale * float(cost)
-        )
+        found, scale = self.residuals(T), self._scale
+        cost = 0.5 * CUTOFF**2 * float(self._weight @ (1 - self.robust(T)))
+        weighted = scale * (found.J * self._information(T)[:, None]).T
+        return Linearization(weighted @ found.J, -(weighted @ found.r), scale * cost)
 
     def residuals(self, T: np.ndarray) -> Residuals:
         """At a motion; the last one's are kept."""
@@ -169,15 +155,6 @@ class PlaneFactor:
     def _information(self, T: np.ndarray) -> np.ndarray:
         """(N,) 1 / m^2."""
         return self._weight * (self.robust(T) / self.noise(self.residuals(T).z)) ** 2
-
-    def _estimate_scale(self, T: np.ndarray) -> None:
-        """Share of the information that is left under errors alike within a tile."""
-        found, w = self.residuals(T), self._information(T)
-        scores = found.J * (w * found.r)[:, None]
-        model = positive_inverse((found.J * w[:, None]).T @ found.J)
-        sums = tile_sums(scores.T, self._tile, self._tile.max() + 1)
-        factor = None if model is None else dispersion(sums, scores.T @ scores, model)
-        self._scale = 0.0 if factor is None else 1.0 / (factor * self._inflation)
 
 
 @njit(cache=True, nogil=True)

@@ -94,7 +94,6 @@ def estimate_by_network(pair: FramePair, method: str, network: nn.Module) -> Rel
         T_curr_prev=T,
         covariance=np.diag(sigma**2),
         status=status,
-        translation_direction_valid=bool(np.linalg.norm(T[:3, 3]) > 3 * sigma[:3].max()),
         method=method,
         ms=1e3 * (time.perf_counter() - started),
         terms=("flow", "depth"),

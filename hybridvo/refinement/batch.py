@@ -11,7 +11,6 @@ import torch.nn.functional as F
 
 from hybridvo.errors import InputError
 from hybridvo.refinement import kernels
-from hybridvo.refinement.covariance import direction_is_known
 from hybridvo.refinement.depth import SURFACE
 from hybridvo.refinement.pixels import typical
 from hybridvo.results import RelativePose, Status
@@ -75,7 +74,6 @@ class BatchedPose:
             residual_scale_px=float(self.noise[index, 0]),
             depth_noise=float(self.noise[index, 1]),
             weights=self.weights[index].detach().float().cpu().numpy(),
-            translation_direction_valid=direction_is_known(T, covariance),
             probability=float(self.probability[index]),
             method=method,
             terms=("flow",),

@@ -17,7 +17,6 @@ from hybridvo.options import RefineOptions
 from hybridvo.refinement import coarse_fit
 from hybridvo.refinement.covariance import (
     NOTHING,
-    direction_is_known,
     motion_covariance,
     score_sums,
     symmetric,
@@ -88,7 +87,7 @@ def refine_pair(
         )
         noise = sf, sd
     curr = None if options.current_depth == "off" else pair.curr.depth
-    motion, tiles = _fit_full_grid(made, curr, pose, noise, options)
+    motion, tiles, eigenvalues = _fit_full_grid(made, curr, pose, noise, options)
     depths = None if curr is None else compare_depths(pair, motion.T_curr_prev, motion.weights)
     share = motion.inlier_ratio
     motion = motion.replace(
@@ -97,7 +96,7 @@ def refine_pair(
         hypotheses=context.hypotheses,
         probability=context.probability,
     )
-    weak, eigenvalues = "", motion.information_eigenvalues
+    weak = ""
     if eigenvalues[0] < WEAK_RATIO * eigenvalues[-1]:
         weak = "a direction of the motion is barely determined"
     elif tiles < MIN_TILES <= 0.5 * np.prod(made.size) / tile_size(made.size, options.tiles) ** 2:
@@ -114,8 +113,7 @@ def refine_pair(
     if depths is not None and not depths.status.ok:
         t = motion.T_curr_prev[:3, 3]
         covariance[:3, :3] += (np.log(depths.ratio) ** 2 + depths.spread**2) * np.outer(t, t)
-    valid = direction_is_known(motion.T_curr_prev, covariance)
-    return motion.replace(status=status, covariance=covariance, translation_direction_valid=valid)
+    return motion.replace(status=status, covariance=covariance)
 
 
 def status_of(
@@ -161,7 +159,7 @@ def widened(motion: RelativePose) -> RelativePose:
     steps = np.array([se3_log(motion.T_curr_prev @ invert(T)) for T in others])
     sizes = [np.max(np.sum(steps[:, part] ** 2, axis=1)) for part in (slice(0, 3), slice(3, 6))]
     doubt = (1 - motion.probability) * np.diag(np.repeat(sizes, 3))
-    return motion.replace(covariance=motion.covariance + doubt, translation_direction_valid=False)
+    return motion.replace(covariance=motion.covariance + doubt)
 
 
 class FlowFactor:
@@ -228,10 +226,11 @@ def _fit_full_grid(
     pose: np.ndarray,
     start: tuple[float, float],
     options: RefineOptions,
-) -> tuple[RelativePose, int]:
+) -> tuple[RelativePose, int, np.ndarray]:
     """The motion (no status yet) on every pixel, from its pose (3, 4) and noise on the coarse grid.
 
-    The second value is the number of tiles in which pixels were used; 0 where a direction is open.
+    And the number of tiles in which pixels were used, 0 where a direction is open; and eigenvalues
+    (6,), ascending, of the information scaled to pixels.
     """
     image, samples, n = grid.pixels, grid.samples, grid.count
     sf, sd, share, _, sigma = pair_noise(samples, n, image.K, pose, start, options.cutoff, curr)
@@ -266,9 +265,8 @@ def _fit_full_grid(
         residual_scale_px=float(sf),
         depth_noise=float(sd),
         weights=flow.weights,
-        information_eigenvalues=eigenvalues,
     )
-    return motion, occupied if np.isfinite(T).all() else 0
+    return motion, occupied if np.isfinite(T).all() else 0, eigenvalues
 
 
 def _depth_factor(

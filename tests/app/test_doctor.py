@@ -71,8 +71,7 @@ def test_units_and_exposure(recorded):
     report = changed(recorded, dim, poses=None)
     assert finding(report, "depth units")["state"] == "differs"
     assert "divide by" in finding(report, "depth units")["message"]
-    exposure = finding(report, "exposure")
-    assert exposure["state"] == "differs" and "dark: 3, 4" in exposure["message"]
+    assert finding(report, "exposure")["state"] == "differs"
     scaled = changed(recorded, lambda k, f: replace(f, depth=5 * f.depth))
     assert finding(scaled, "depth units")["state"] == "differs"
 

@@ -12,9 +12,8 @@ from scipy.spatial.transform import Rotation
 from hybridvo.baselines import pnp
 from hybridvo.baselines.pnp import Correspondences, check, missing, sample
 from hybridvo.errors import InputError
-from hybridvo.estimation import estimate
 from hybridvo.geometry import ego_flow, invert, make_transform, rotation_angle, se3_exp, se3_log
-from hybridvo.pipeline import check_method
+from hybridvo.pipeline import check_method, estimate
 from hybridvo.results import Reason, RelativePose, State
 from hybridvo.synthetic.scenarios import Scenario, make_pair
 from hybridvo.types import Camera, Frame, FramePair
@@ -62,7 +61,6 @@ def _assert_sane(result: RelativePose) -> None:
     np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-6)
     assert np.isfinite(result.covariance).all()
     assert np.linalg.eigvalsh((result.covariance + result.covariance.T) / 2).min() > 0
-    assert np.isfinite(result.information_eigenvalues).all()
     assert np.isfinite([result.inlier_ratio, result.cost, result.residual_scale_px]).all()
     if result.status.state is State.FAILED:
         assert (T == np.eye(4)).all()
@@ -112,7 +110,6 @@ def test_f12_collinear_answer_of_a_solver_that_is_sure_of_itself():
     result = check("line", np.eye(4), Correspondences(xyz, uv), CAMERA, 2.0)
     assert result.status.reason is Reason.DEGENERATE_GEOMETRY
     assert result.inlier_ratio == 1.0
-    assert result.information_eigenvalues[0] < 1e-9 * result.information_eigenvalues[-1]
 
 
 def test_f14_answer_that_puts_its_points_behind_the_camera_is_refused():
@@ -157,9 +154,6 @@ def test_covariance_is_that_of_the_left_perturbation_translation_first(rng):
     uv = project(np.zeros(6)).reshape(2, -1).T
     result = check("exact", T, Correspondences(xyz, uv), CAMERA, 2.0, sigma_px=0.7)
     np.testing.assert_allclose(result.covariance, 0.49 * np.linalg.inv(J.T @ J), rtol=1e-6)
-    assert result.translation_direction_valid == bool(
-        T[:3, 3] @ np.linalg.solve(result.covariance[:3, :3], T[:3, 3]) > 9
-    )
 
 
 def test_covariance_contains_the_error_of_independent_noise():

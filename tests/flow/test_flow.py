@@ -14,7 +14,6 @@ from hybridvo.flow import (
     check_field,
     contradiction,
     dis_flow,
-    fallback,
     file_flow,
     forward_backward_check,
 )
@@ -125,18 +124,18 @@ def test_file_flow_leads_to_the_next_frame_only() -> None:
     assert file_flow(Files(), strict=False)(frame(None, 2), frame(None, 3)).flow is None
 
 
-def test_measured_flow_is_computed_once_until_it_is_reset() -> None:
+def test_measured_flow_keeps_the_last_field_until_it_is_reset() -> None:
     flow = MeasuredFlow(file_flow(Files()))
     first, second = frame(None, 0), frame(None, 1)
-    assert flow(first, second) is flow(first, second) and flow.ms > 0
+    assert flow(first, second) is flow.last and flow.ms > 0
     flow.reset()
-    assert flow.fields == {} and flow.ms == 0
+    assert flow.last.flow is None and flow.ms == 0
 
 
 def test_fallback_names_the_source_that_answered() -> None:
     flow = np.ones((HEIGHT, WIDTH, 2), np.float32)
     second = lambda prev, curr: FlowField(flow, source="second")  # noqa: E731
-    provide = fallback(file_flow(Files()), second)
+    provide = file_flow(Files(), otherwise=second)
     rgb = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     assert provide(frame(rgb, 0), frame(rgb, 1)).source == "file"
     assert provide(frame(rgb, 1), frame(rgb, 2)).source == "second"

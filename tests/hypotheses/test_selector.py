@@ -7,7 +7,6 @@ import pytest
 
 from hybridvo.calibration import CLEAR_RIGHT, MIN_CONFIDENCE
 from hybridvo.errors import InputError
-from hybridvo.estimation import estimate, refine
 from hybridvo.geometry import ego_flow, se3_exp
 from hybridvo.hypotheses.generate import HypothesisSet, generate
 from hybridvo.hypotheses.selector import (
@@ -19,7 +18,7 @@ from hybridvo.hypotheses.selector import (
     select_by_scorer,
 )
 from hybridvo.options import Options, SelectOptions
-from hybridvo.pipeline import Context
+from hybridvo.pipeline import Context, estimate, refine
 from hybridvo.results import MotionPrediction, MotionPrior, RelativePose, State
 from hybridvo.synthetic.render import SyntheticSequence
 from hybridvo.synthetic.scenarios import Scenario, make_pair

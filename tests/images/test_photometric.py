@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from hybridvo.errors import InputError
-from hybridvo.estimation import refine
 from hybridvo.flow import dis_flow
 from hybridvo.geometry import ego_flow, invert, se3_exp
 from hybridvo.images import photometric_kernels as kernels
-from hybridvo.images.image_factor import ImageFactor
-from hybridvo.images.photometric import blurred, refine_photometric
+from hybridvo.images.image_factor import ImageFactor, blurred, choose_pixels
+from hybridvo.images.photometric import refine_photometric
+from hybridvo.pipeline import refine
 from hybridvo.results import RelativePose, Status
 from hybridvo.synthetic.render import SyntheticSequence
 from hybridvo.synthetic.scenes import make_scene
@@ -68,7 +68,7 @@ def test_jacobian_is_that_of_the_residual(light):
     index = np.stack([rng.integers(8, n - 8, 400) for n in image.shape], axis=1).astype(np.int32)
     index = index[np.isfinite(frame.depth[tuple(index.T)])]
     pose = RelativePose(weights=np.ones(image.shape, np.float32))
-    factor = ImageFactor(FramePair(frame, frame, None), pose, index, 1.0)
+    factor = ImageFactor(FramePair(frame, frame, None), pose, index)
     factor.use(image, image, np.eye(4))
 
     def project(T):
@@ -91,9 +91,7 @@ def test_pixels_are_spread_and_strong():
     depth[:, 40:] = np.nan
     weights = np.ones((60, 80), np.float32)
     weights[:30] = 0.1
-    index = np.empty((2000, 2), np.int32)
-    n = kernels.select_pixels(grey, depth, weights, np.float32(0.25), 10, 4, index)
-    rows, columns = index[:n].T
+    rows, columns = choose_pixels(grey, depth, weights, 192).T  # four in each cell of 10 px
     assert rows.min() >= 30  # rows above have too little weight
     assert columns.max() < 40  # no depth to the right
     cells = (rows - kernels.MARGIN) // 10 * 100 + (columns - kernels.MARGIN) // 10

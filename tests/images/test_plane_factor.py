@@ -16,9 +16,7 @@ SIZE = (192, 256)
 
 
 def factor_of(pair) -> PlaneFactor:
-    factor = PlaneFactor.of(pair, np.ones(SIZE, np.float32), 0.25)
-    assert factor is not None
-    return factor
+    return PlaneFactor(pair, np.ones(SIZE, np.float32), 0.25)
 
 
 def noisy(pair, law, seed: int):
@@ -72,8 +70,6 @@ def test_the_noise_follows_the_sensor(law, least, most):
 
 def test_nothing_is_made_of_maps_without_depth():
     pair, T = worlds.world(SIZE)
-    ones = np.ones(SIZE, np.float32)
-    assert PlaneFactor.of(replace(pair, curr=replace(pair.curr, depth=None)), ones, 0.25) is None
-    assert PlaneFactor.of(pair, np.zeros(SIZE, np.float32), 0.25) is None
+    assert not PlaneFactor(pair, np.zeros(SIZE, np.float32), 0.25).estimate(T)
     empty = replace(pair, curr=replace(pair.curr, depth=np.zeros(SIZE, np.float32)))
     assert not factor_of(empty).estimate(T)

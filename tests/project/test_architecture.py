@@ -35,12 +35,10 @@ IMPORTS: dict[str, set[str]] = {
     "hypotheses": NOUNS | {"refinement"},
     "network": NOUNS | {"torch_geometry", "refinement", "hypotheses"},
     "pipeline": NOUNS | {"network", "hypotheses", "refinement", "images", "baselines", "flow"},
-    "estimation": NOUNS | {"network", "refinement", "flow", "pipeline"},
     "tracking": NOUNS | {"refinement"},
     "odometry": NOUNS
     | {
         "pipeline",
-        "estimation",
         "tracking",
         "flow",
         "trajectory",
@@ -52,11 +50,11 @@ IMPORTS: dict[str, set[str]] = {
     # pairs made of recordings are refined before something is moved in them
     "synthetic": NOUNS | {"trajectory", "data", "flow", "refinement"},
     "evaluation": NOUNS
-    | {"trajectory", "data", "pipeline", "estimation", "odometry", "flow", "network", "refinement"}
+    | {"trajectory", "data", "pipeline", "odometry", "flow", "network", "refinement"}
     | {"__init__"},
     "training": NOUNS
     | {"torch_geometry", "data", "synthetic", "network", "hypotheses", "refinement"}
-    | {"flow", "pipeline", "estimation", "trajectory"},
+    | {"flow", "pipeline", "trajectory"},
     "__init__": set(),
 }
 """Room (a folder, or a file at the top) -> rooms it may import."""

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from hybridvo.errors import FormatError, InputError, OutputError
 from hybridvo.files import atomic_write
-from hybridvo.geometry import euler_deg_to_matrix, invert, make_transform, ned_to_camera, se3_exp
+from hybridvo.geometry import euler_deg_to_matrix, invert, make_transform, se3_exp
 from hybridvo.trajectory import Trajectory, read_trajectory
 from tests.walks import chained
 
@@ -201,8 +201,6 @@ def test_missing_binary_and_folder(tmp_path):
     good = write(tmp_path / "t", f"0 {IDENTITY_TUM}")
     with pytest.raises(InputError, match="format: expected auto"):
         read_trajectory(good, "csv")  # type: ignore[arg-type]
-    with pytest.raises(InputError, match="axes: expected auto"):
-        read_trajectory(good, axes="enu")  # type: ignore[arg-type]
     with pytest.raises(FormatError, match=":1: expected 'r11"):
         read_trajectory(good, "kitti")
 
@@ -227,7 +225,7 @@ def test_slightly_rounded_matrices_become_rotations(tmp_path, rng):
     np.testing.assert_allclose(R, T[:3, :3], atol=2e-4)  # four decimals were written
 
 
-def test_tartanair_columns_are_ned_unless_said_otherwise(tmp_path):
+def test_tartanair_columns_are_ned(tmp_path):
     # 1 m north (forward), 2 m east (right), 3 m down; turned 90 deg about the down axis
     path = write(tmp_path / "pose_left.txt", "1 2 3 0 0 0.7071067811865476 0.7071067811865476")
     trajectory = read_trajectory(path)
@@ -236,9 +234,6 @@ def test_tartanair_columns_are_ned_unless_said_otherwise(tmp_path):
     np.testing.assert_allclose(trajectory.positions, [[2, 3, 1]])
     # looking along world z, then turned right: the camera's forward axis is world x
     np.testing.assert_allclose(trajectory.T_world_cam[0, :3, 2], [1, 0, 0], atol=1e-15)
-    as_camera = read_trajectory(path, axes="camera")
-    np.testing.assert_allclose(as_camera.positions, [[1, 2, 3]])
-    np.testing.assert_allclose(ned_to_camera(as_camera.T_world_cam), trajectory.T_world_cam)
 
 
 def test_transformed_scales_positions_then_moves():

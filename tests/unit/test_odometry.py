@@ -10,12 +10,11 @@ import pytest
 
 import hybridvo
 from hybridvo.errors import CheckpointError, InputError
-from hybridvo.estimation import warm_up
 from hybridvo.flow import FlowField, dis_flow
 from hybridvo.geometry import ego_flow, invert, se3_exp, se3_log
 from hybridvo.odometry import MotionModel, Odometry, TrackerState
 from hybridvo.options import Options, TrackOptions
-from hybridvo.pipeline import DEFAULT_METHOD
+from hybridvo.pipeline import DEFAULT_METHOD, warm_up
 from hybridvo.results import Reason, State
 from hybridvo.synthetic.scenes import make_scene
 from hybridvo.types import Camera, Frame
@@ -194,7 +193,7 @@ def test_a_frame_of_another_size_is_refused_and_changes_nothing() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"network": object()}, "expected .default.*got object"),
+        ({"network": object()}, "Odometry.network: expected str, got object"),
         ({"flow": 3}, "expected a callable"),
         ({"method": "refin"}, "did you mean 'refine'"),
         ({"method": "hybrid", "network": None}, "needs a network"),
@@ -250,7 +249,7 @@ def test_prediction_is_the_last_motion_with_a_covariance() -> None:
     np.testing.assert_allclose(ahead.T_curr_prev, MOTION, atol=1e-5)
     # a motion that never changed: the floor of a millimetre and a milliradian
     np.testing.assert_allclose(np.sqrt(np.diag(ahead.covariance)), 1e-3, rtol=0.05)
-    two = vo.predict(2)
+    two = vo.state.motion_model.predict(2)
     assert two is not None
     np.testing.assert_allclose(two.T_curr_prev, MOTION @ MOTION, atol=1e-5)
     np.testing.assert_allclose(two.covariance, 5 * ahead.covariance)
@@ -285,10 +284,10 @@ def test_masks_and_depth_variances_of_ones_own_are_used() -> None:
     np.testing.assert_allclose(steps[2].T_curr_prev, MOTION, atol=1e-4)
 
 
-def test_from_pretrained_knows_its_weights() -> None:
-    assert hybridvo.Odometry.from_pretrained().method == DEFAULT_METHOD
+def test_a_tracker_knows_its_weights() -> None:
+    assert hybridvo.Odometry().method == DEFAULT_METHOD
     with pytest.raises(CheckpointError, match="selector"):
-        hybridvo.Odometry.from_pretrained("jugde")
+        hybridvo.Odometry("jugde")
 
 
 @pytest.mark.parametrize("bad", [np.nan, 0.0, -1.0, np.inf])
