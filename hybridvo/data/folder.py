@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 
 import numpy as np
@@ -97,13 +98,22 @@ class FolderSequence(Sequence):
         return dict(enumerate(match_files(frames, files, self.root / "depth", hint)))
 
     def _match_flow(self, frames: list[Path], files: list[Path]) -> Files:
-        """Flow by equal names, else by order."""
+        """Flow by equal names, else by order; what led to an image that is missing is left out."""
         if not files:
             return [None] * len(frames)
         last = len(frames) - (len(files) == len(frames) - 1)  # none starts at the last image
         hint = "Give both the same names."
         matched = match_files(frames[:last], files, self.root / "flow", hint)
-        return matched + [None] * (len(frames) - last)
+        matched += [None] * (len(frames) - last)
+        known = {path.stem for path in (*frames, *files)}
+        if len(known) < len(frames) + len(files) and all(x.isdecimal() for x in known):
+            step = min(np.diff(sorted(map(int, known))), default=1)
+            for k, (a, b) in enumerate(itertools.pairwise(int(path.stem) for path in frames)):
+                if matched[k] is not None and b - a != step:
+                    matched[k] = None
+                    told = f"the flow from {a} led to a missing image and is not used"
+                    self.warnings.append(f"{self.name}: {told}.")
+        return matched
 
     def _stamps_and_poses(self, frames: list[Path]) -> tuple[np.ndarray, np.ndarray | None]:
         """Seconds of all frames and their ground-truth poses, where poses.txt has them."""

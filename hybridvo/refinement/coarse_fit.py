@@ -14,11 +14,14 @@ from hybridvo.geometry import njit, se3_exp
 from hybridvo.refinement.kernels import (
     BLOCK,
     FASTMATH,
+    ONE,
     PD,
     PF,
     SUMS,
+    ZERO,
     W,
     Z,
+    keep_apart,
     new_work,
     pose_entries,
     project_block,
@@ -180,7 +183,7 @@ def gather_noise(samples, n, step, pose, K, radius):
     along q and across it, variance of flow and depth in units of sf^2 and sd^2, external weight,
     density of outliers, (6, N). And the share of the weight that these pixels have.
     """
-    terms, entries = np.empty((6, n // step + 1)), pose_entries(pose)
+    terms, entries = np.empty((6, n // step + 1), np.float32), pose_entries(pose)
     disc = 1.0 / (math.pi * radius * radius)
     m, total, inside = 0, 0.0, 0.0
     for k in range(0, n, step):
@@ -207,19 +210,32 @@ def sum_noise(terms, vf, vd, share):
     """One round of expectation-maximisation: weight of the followers, information of (sf^2, sd^2)
     (three entries), its right-hand side (two).
     """
-    hits = a11 = a12 = a22 = b1 = b2 = 0.0
-    for k in range(terms.shape[1]):
-        x1, x2, alpha, beta = terms[0, k], terms[1, k], terms[2, k], terms[3, k]
-        i1, i2 = 1.0 / (vf * alpha + vd * beta), 1.0 / (vf * alpha)
-        p = share * (0.5 / math.pi) * math.sqrt(i1 * i2) * math.exp(-0.5 * (x1 * i1 + x2 * i2))
-        p *= terms[4, k] / (p + (1.0 - share) * terms[5, k])
+    keep_apart()  # type: ignore[call-arg]
+    along, across, alpha, beta = terms[0], terms[1], terms[2], terms[3]
+    weight, outlier = terms[4], terms[5]
+    density, rest = share * np.float32(0.5 / math.pi), ONE - share
+    hits = a11 = a12 = a22 = b1 = b2 = ZERO
+    for k in range(len(along)):
+        x1, x2, al, be = along[k], across[k], alpha[k], beta[k]
+        i1, i2 = ONE / (vf * al + vd * be), ONE / (vf * al)
+        d2 = x1 * i1 + x2 * i2
+        # exp(d2 / 2) = exp(y)^32 by a series: a call of the library's would not be vectorised
+        y = min(d2, np.float32(60.0)) * np.float32(1 / 64)
+        e = ONE + y * (ONE + y * (np.float32(1 / 2) + y * (np.float32(1 / 6) + y / np.float32(24))))
+        e *= e
+        e *= e
+        e *= e
+        e *= e
+        e *= e
+        p = density * np.sqrt(i1 * i2)
+        p = weight[k] * p / (p + rest * outlier[k] * e)
         j1, j2 = p * i1 * i1, p * i2 * i2
         hits += p
-        a11 += alpha * alpha * (j1 + j2)
-        a12 += alpha * beta * j1
-        a22 += beta * beta * j1
-        b1 += alpha * (x1 * j1 + x2 * j2)
-        b2 += beta * x1 * j1
+        a11 += al * al * (j1 + j2)
+        a12 += al * be * j1
+        a22 += be * be * j1
+        b1 += al * (x1 * j1 + x2 * j2)
+        b2 += be * x1 * j1
     return hits, a11, a12, a22, b1, b2
 
 
@@ -237,7 +253,8 @@ def estimate_noise(samples, n, pose, K, sf, sd, sf_cap, sd_cap, rounds, limit):
         return sf, sd, 0.0, True
     vf, vd, share, spread, weight = sf * sf, sd * sd, 0.7, 0.0, np.sum(terms[4])
     for _ in range(rounds):
-        hits, a11, a12, a22, b1, b2 = sum_noise(terms, vf, vd, share)
+        noise = np.float32(vf), np.float32(vd), np.float32(share)
+        hits, a11, a12, a22, b1, b2 = sum_noise(terms, *noise)
         before, vd_before = vf, vd
         share = min(0.999, max(0.01, hits / weight))
         if not (0 < a11 < np.inf and a22 < np.inf and abs(b1) < np.inf and abs(b2) < np.inf):

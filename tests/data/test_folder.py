@@ -364,3 +364,31 @@ def test_flow_of_distorted_images_is_refused(tmp_path):
     write_flo(root / "flow" / "0.flo", np.zeros((*SIZE, 2), np.float32))
     with pytest.raises(InputError, match="Undistort"):
         open_sequence(root)
+
+
+@pytest.mark.parametrize(
+    ("images", "flows", "kept"),
+    [
+        ((0, 1, 2, 3), (0, 1, 2), (0, 1, 2)),
+        ((0, 2, 3, 4), (0, 1, 2, 3), (2, 3)),  # one image deleted
+        ((0, 2, 3, 4), (0, 2, 3), (2, 3)),  # and its flow with it
+        ((0, 10, 20, 30), (0, 10, 20), (0, 10, 20)),  # flow over ten frames
+        ((0, 2, 4, 6), (0, 1, 2, 3, 4, 5), ()),  # every second image of a sequence with its flow
+        ((0, 1, 5, 6), (0, 1, 5), (0, 5)),
+    ],
+)
+def test_flow_that_led_to_a_missing_image_is_not_used(tmp_path, images, flows, kept):
+    root = own(tmp_path, [f"{i:04d}" for i in images])
+    (root / "flow").mkdir()
+    for number in flows:
+        write_flo(root / "flow" / f"{number:04d}.flo", np.full((*SIZE, 2), number, np.float32))
+    sequence = open_sequence(root)
+    for index, number in enumerate(images[:-1]):
+        if number in kept:
+            assert sequence.flow(index)[0].max() == number
+        else:
+            with pytest.raises(FileNotFoundError, match="no flow file from frame"):
+                sequence.flow(index)
+    assert sequence.has_flow == bool(kept)
+    is_told = any("is not used" in warning for warning in sequence.warnings)
+    assert is_told == (len(kept) < len(set(flows) & set(images)))
