@@ -379,6 +379,12 @@ def warm_up(method: str = DEFAULT_METHOD, models: Models | None = None) -> float
         rgb = (40 * (2 + np.sin(u / 3.0) + np.cos(v / 2.0)))[..., None].repeat(3, 2)
         frame = Frame(rgb.astype(np.uint8), depth, camera)
         variance = np.full((height, width), 0.01, np.float32)
-        run_method(FramePair(frame, frame, flow, variance, flow[..., 0] < 1e3), method, context)
-        run_method(FramePair(frame, frame, flow), method, context)
+        pair = FramePair(frame, frame, flow)
+        run_method(
+            replace(pair, flow_variance=variance, flow_valid=flow[..., 0] < 1e3), method, context
+        )
+        run_method(pair, method, context)
+        if method in SELECTING:  # what few pairs ask for
+            context.predict(pair)
+            context.direct(replace(pair, flow_source="dis"))
     return time.perf_counter() - started

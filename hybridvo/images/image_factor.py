@@ -26,8 +26,8 @@ from hybridvo.images import photometric_kernels as kernels
 from hybridvo.images.plane_factor import CUTOFF, INFLATION
 from hybridvo.options import RefineOptions
 from hybridvo.refinement.covariance import dispersion, tile_size, tile_sums
-from hybridvo.refinement.kernels import MAX_VALUE, MIN_DEPTH
-from hybridvo.refinement.pixels import typical
+from hybridvo.refinement.kernels import MAX_VALUE
+from hybridvo.refinement.pixels import as_contiguous, typical
 from hybridvo.refinement.solver import Linearization, positive_inverse
 from hybridvo.results import RelativePose
 from hybridvo.types import Frame, FramePair
@@ -70,21 +70,13 @@ def choose_pixels(
     """(N, 2) int32 rows and columns of the pixels to use: strong gradients, evenly spread."""
     height, width = grey.shape
     cell = max(2, round(np.sqrt(height * width * PER_CELL / count)))
-    inner, off = slice(kernels.MARGIN, -kernels.MARGIN), kernels.MARGIN
-    gx, gy = (cv2.Sobel(grey, cv2.CV_32F, *way, ksize=1) for way in ((1, 0), (0, 1)))
-    strength = (gx * gx + gy * gy)[inner, inner]
-    z, usable = depth[inner, inner], weights[inner, inner] >= MIN_WEIGHT
-    usable &= (z > MIN_DEPTH) & (z < MAX_VALUE) & (strength < MAX_VALUE)
-    # the strongest of every cell
-    rows, columns = (-(-n // cell) for n in strength.shape)
-    padded = np.zeros((rows * cell, columns * cell), np.float32)
-    padded[: height - 2 * off, : width - 2 * off] = np.where(usable, strength, 0)
-    cells = padded.reshape(rows, cell, columns, cell).swapaxes(1, 2).reshape(-1, cell * cell)
-    best = np.argpartition(cells, -PER_CELL, axis=1)[:, -PER_CELL:]
-    place, k = np.nonzero(np.take_along_axis(cells, best, 1) > 0)
-    v, u = np.divmod(best[place, k], cell)
-    index = np.stack([place // columns * cell + v, place % columns * cell + u], 1) + off
-    return index.astype(np.int32)
+    cells = (height // cell + 1) * (width // cell + 1)
+    index = np.empty((cells * PER_CELL, 2), np.int32)
+    n = kernels.select_pixels(
+        grey, as_contiguous(depth), as_contiguous(weights, np.float32),
+        np.float32(MIN_WEIGHT), cell, PER_CELL, index,
+    )  # fmt: skip
+    return index[:n]
 
 
 class ImageFactor:

@@ -21,7 +21,15 @@ from __future__ import annotations
 import numpy as np
 
 from hybridvo.geometry import njit
-from hybridvo.refinement.kernels import FASTMATH, MIN_DEPTH, ONE, ZERO, pose_entries
+from hybridvo.refinement.kernels import (
+    FASTMATH,
+    MAX_VALUE,
+    MIN_DEPTH,
+    ONE,
+    ZERO,
+    keep_apart,
+    pose_entries,
+)
 
 XN, YN, Z, GREY, GX, GY, PD, W = range(8)
 """Rows of a pixel buffer: ray x, ray y, depth, grey value, its gradient, relative depth variance,
@@ -34,6 +42,61 @@ MARGIN = 3
 MIN_AREA = np.float32(1e-3)
 """A patch whose area shrinks below this share is seen edge-on."""
 HALF = np.float32(0.5)
+
+
+@njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
+def strength_row(v, grey, depth, weights, least, out):
+    """Squared gradient of the usable pixels of row ``v``, 0 for the others."""
+    keep_apart()  # type: ignore[call-arg]
+    before, here, after = grey[v - 1], grey[v], grey[v + 1]
+    zrow, wrow = depth[v], weights[v]
+    for u in range(MARGIN, here.shape[0] - MARGIN):
+        gx = here[u + 1] - here[u - 1]
+        gy = after[u] - before[u]
+        strength = gx * gx + gy * gy
+        z = zrow[u]
+        usable = (wrow[u] >= least) & (z > MIN_DEPTH) & (z < MAX_VALUE) & (strength < MAX_VALUE)
+        out[u] = strength if usable else ZERO
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def select_pixels(grey, depth, weights, least, cell, per_cell, index):
+    """The ``per_cell`` usable pixels of strongest gradient in every cell of ``cell`` px.
+
+    ``index`` (N, 2) int32 gets (v, u); returns how many. Usable: weight of at least ``least``,
+    valid depth, off the border.
+    """
+    H, width = grey.shape
+    cells = (width - 2 * MARGIN + cell - 1) // cell
+    best = np.empty((cells, per_cell), np.float32)
+    place = np.empty((cells, per_cell, 2), np.int32)
+    row = np.empty(width, np.float32)
+    last = per_cell - 1
+    n = 0
+    for v0 in range(MARGIN, H - MARGIN, cell):
+        best[:] = ZERO
+        for v in range(v0, min(v0 + cell, H - MARGIN)):
+            strength_row(v, grey, depth, weights, least, row)
+            for c in range(cells):
+                u0 = MARGIN + c * cell
+                for u in range(u0, min(u0 + cell, width - MARGIN)):
+                    strength = row[u]
+                    if not strength > best[c, last]:
+                        continue
+                    k = last
+                    while k > 0 and best[c, k - 1] < strength:
+                        best[c, k] = best[c, k - 1]
+                        place[c, k] = place[c, k - 1]
+                        k -= 1
+                    best[c, k] = strength
+                    place[c, k, 0] = v
+                    place[c, k, 1] = u
+        for c in range(cells):
+            for k in range(per_cell):
+                if best[c, k] > ZERO and n < index.shape[0]:
+                    index[n] = place[c, k]
+                    n += 1
+    return n
 
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
