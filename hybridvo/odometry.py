@@ -227,8 +227,9 @@ class Odometry:
 
         Args:
             frame: the next frame. Its arrays are copied: a driver may reuse its buffers.
-            flow: (H, W, 2) px from ``state.frame``, the last one tracked, to this one, or a
-                FlowField, where it is known already; by default the tracker's provider is asked.
+            flow: (H, W, 2) px from ``state.frame`` to this one, or a FlowField, where it is known
+                already; by default the tracker's provider is asked. A frame that comes with its
+                flow is never passed over: the next one's leads from it.
 
         Raises:
             InputError: ``frame`` is no Frame, has another size than the one before, or the flow
@@ -257,7 +258,7 @@ class Odometry:
             (T, motion), failed = self._instead(state, found), state.failed + 1
             model = state.motion_model
         after: dict[str, Any] = {"T_world_last": T, "motion_model": model, "failed": failed}
-        if self._leads(frame, pair, found, state.gap):
+        if flow is not None or self._leads(frame, pair, found, state.gap):
             after |= {"frame": frame, "T_world_cam": T, "gap": 0}
         else:
             after["gap"] = state.gap + 1

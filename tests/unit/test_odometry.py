@@ -173,6 +173,17 @@ def test_flow_can_be_handed_in() -> None:
         vo.track(frame(2), flow[:10])
 
 
+def test_flow_that_is_handed_in_leads_from_the_frame_before() -> None:
+    vo = Odometry()  # its own flow could span frames, the neighbours' flow cannot
+    flows = [ego_flow(depth(i), MOTION, CAMERA, CAMERA) for i in range(5)]
+    vo.track(frame(0))
+    assert not vo.track(frame(1), np.full_like(flows[0], np.nan)).usable
+    np.testing.assert_allclose(vo.track(frame(2), flows[1]).T_curr_prev, MOTION, atol=1e-4)
+    assert vo.track(frame(3, depth=None), flows[2]).ok
+    assert vo.track(frame(4), flows[3]).status.reason is Reason.NO_VALID_DEPTH
+    np.testing.assert_allclose(vo.track(frame(5), flows[4]).T_curr_prev, MOTION, atol=1e-4)
+
+
 def test_a_driver_may_reuse_its_buffers() -> None:
     shared_depth = depth(0)
     vo = tracker()
