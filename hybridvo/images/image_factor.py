@@ -14,7 +14,7 @@ the fields leave the motion alone.
 
 from __future__ import annotations
 
-from functools import cache
+from functools import cache, cached_property
 from weakref import WeakKeyDictionary
 
 import cv2
@@ -106,7 +106,6 @@ class ImageFactor:
         self._r, self._w = np.empty(n, np.float32), np.empty(n, np.float32)
         self._light = np.array([1.0, 0.0], np.float32)
         self._places = index * [(ROWS - 1) / prev.height, (COLUMNS - 1) / prev.width]
-        self._shares = node_shares(self._places)
         tile = tile_size(prev.shape, RefineOptions().tiles)
         self._tiles = -(-prev.height // tile), -(-prev.width // tile)
         self._tile = rows // tile * self._tiles[1] + columns // tile
@@ -116,6 +115,11 @@ class ImageFactor:
         """Factor in (0, 1] on the information by which the parts of the image lowered it."""
         self.uneven_light = False
         """Whether gain and offset had to vary over the image."""
+
+    @cached_property
+    def _shares(self) -> csr_array:
+        """Of the fields' nodes in each pixel: asked for only where the light may be uneven."""
+        return node_shares(self._places)
 
     @property
     def gain(self) -> float:
