@@ -11,8 +11,8 @@ import pytest
 import hybridvo
 from hybridvo.errors import CheckpointError, InputError
 from hybridvo.flow import FlowField, dis_flow
-from hybridvo.geometry import ego_flow, invert, se3_exp, se3_log
-from hybridvo.odometry import MotionModel, Odometry, TrackerState
+from hybridvo.geometry import ego_flow, invert, se3_exp
+from hybridvo.odometry import Odometry, TrackerState
 from hybridvo.options import Options, TrackOptions
 from hybridvo.pipeline import DEFAULT_METHOD, warm_up
 from hybridvo.results import Reason, State
@@ -388,35 +388,6 @@ def test_the_motion_model_cannot_hold_the_tracker(kind: str) -> None:
     # recovered within two frames of the change; half a pixel is what DIS flow of this size allows
     assert max(errors[step, True] for step in (5, 6, 7)) < 0.5
     assert max(errors[step, False] for step in (5, 6, 7)) < 0.5
-
-
-def test_the_model_knows_how_well_constant_velocity_held() -> None:
-    rng = np.random.default_rng(2)
-    sigma = np.array([0.02, 0.01, 0.03, 0.004, 0.006, 0.002])
-    for ahead in (1, 3):
-        motion, model, squared = MOTION, MotionModel(), []
-        for k in range(400):
-            prediction = model.predict(ahead)
-            motions = [motion]
-            for _ in range(ahead):
-                motions.append(se3_exp(sigma * rng.standard_normal(6)) @ motions[-1])
-            if prediction is not None and k > 20:
-                true = np.eye(4)
-                for T in motions[1:]:
-                    true = T @ true
-                error = se3_log(true @ invert(prediction.T_curr_prev))
-                squared.append(error @ np.linalg.solve(prediction.covariance, error))
-            motion = motions[1]
-            model = model.observed(motion)
-        # twice the mean square of the last ten changes: a mean of 3 to 6 for six numbers
-        assert 1.5 < np.mean(squared) < 7.0
-
-
-def test_the_model_says_little_before_it_has_seen_changes() -> None:
-    model = MotionModel()
-    assert model.predict() is None
-    prediction = model.observed(MOTION).predict()
-    assert prediction is not None and prediction.covariance[0, 0] == 1.0
 
 
 def test_the_state_goes_through_a_file(tmp_path: Path) -> None:
