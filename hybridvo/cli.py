@@ -92,7 +92,7 @@ def text_of(command: str, content: Mapping[str, Any]) -> str:
         return ""
     loader = jinja2.FileSystemLoader(folder)
     template = jinja2.Environment(loader=loader, trim_blocks=True).get_template(f"{command}.txt")
-    return template.render(content, report=content).rstrip()
+    return template.render(content, content=content).rstrip()
 
 
 def _call(function: Callable[..., Any], args: argparse.Namespace, **more: Any) -> Any:

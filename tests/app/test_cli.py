@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hybridvo import __version__
-from hybridvo.cli import main
+from hybridvo.cli import main, text_of
 from hybridvo.files import LOCK
 
 
@@ -136,4 +136,5 @@ def test_demo(tmp_path, capsys):
     best = min(by_name.values(), key=lambda row: row["ate_cm"])
     assert best["method"] == "hybridvo (hybrid)" and content["alignment"] == "origin"
     assert Path(content["report"]).stat().st_size > 10_000
+    assert f"report: {content['report']}\n" in text_of("demo", content)
     assert main(["demo", "--out", str(tmp_path), "--frames", "3", "-q"]) == 2
