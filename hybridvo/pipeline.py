@@ -24,7 +24,7 @@ from hybridvo.errors import InputError
 from hybridvo.flow import FlowProvider, contradiction, dis_flow, with_flow
 from hybridvo.geometry import ego_flow, se3_exp
 from hybridvo.hypotheses.generate import HypothesisSet, generate
-from hybridvo.hypotheses.selector import Selection, select_by_cues, select_by_scorer
+from hybridvo.hypotheses.selector import select_by_cues, select_by_scorer
 from hybridvo.images.direct import direct_start
 from hybridvo.images.photometric import refine_photometric
 from hybridvo.network.models import SELECTION, Models, default_models, one_thread
@@ -110,7 +110,7 @@ class Context:
         starts = [np.eye(4)] + ([] if self.prior is None else [self.prior.T_curr_prev])
         return generate(pair, np.stack(starts), self.options, self.seed, self.weights)
 
-    def select(self, pair: FramePair, found: HypothesisSet) -> Selection:
+    def select(self, pair: FramePair, found: HypothesisSet) -> refinement.Selection:
         """The camera's motion by the learned selector, which asks PWVO where it is in doubt."""
         from hybridvo.network.selector_net import NetworkScorer
 
@@ -122,21 +122,16 @@ class Context:
                 chosen = select_by_scorer(found, look, self.options, self.prior, prediction)
         return chosen
 
-    def refine(self, pair: FramePair, found: HypothesisSet, chosen: Selection) -> RelativePose:
+    def refine(
+        self, pair: FramePair, found: HypothesisSet, chosen: refinement.Selection
+    ) -> RelativePose:
         """The motion selected, refined inside its static mask, with covariance and status."""
         grid = found.grid
         if chosen.mask is not None:
             grid = grid.within(pair, self.weights, chosen.mask)
-        context = refinement.Context(
-            noise=chosen.noise,
-            coverage=chosen.coverage,
-            probability=chosen.probability,
-            min_probability=self.options.select.min_confidence,
-            hypotheses=chosen.hypotheses,
-            iterations=chosen.iterations,
-        )
+        sure = self.options.select.min_confidence
         return refinement.refine_pair(
-            pair, chosen.T_curr_prev, grid, options=self.options.refine, context=context
+            pair, chosen, grid, options=self.options.refine, min_probability=sure
         )
 
 
@@ -356,8 +351,8 @@ def refine(
     if T_init is None:
         motion = classical(pair, Context(options, None, seed, weights))
     else:
-        T = as_rigid(T_init, "refine.T_init")
-        motion = refinement.refine_pair(pair, T, weights=weights, options=options.refine)
+        start = refinement.Selection(as_rigid(T_init, "refine.T_init"))
+        motion = refinement.refine_pair(pair, start, weights=weights, options=options.refine)
     return motion.replace(ms=1e3 * (time.perf_counter() - started))
 
 

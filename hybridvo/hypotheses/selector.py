@@ -8,7 +8,7 @@ them, and all are scored once more.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -19,6 +19,7 @@ from hybridvo.hypotheses import search
 from hybridvo.hypotheses.generate import GridMaps, HypothesisSet, fit_in_mask
 from hybridvo.options import Options
 from hybridvo.refinement import coarse_fit, kernels
+from hybridvo.refinement.refine import Selection
 from hybridvo.results import Hypothesis, MotionPrediction, MotionPrior
 
 SUPPORT_CUTOFF = 3.0
@@ -77,33 +78,6 @@ Scorer = Callable[[Sequence[Candidate], int], Scores]
 """(candidates, how many masks at most) -> scores; those of an earlier call come first again."""
 Look = Callable[[GridMaps, MotionPrior | None, np.ndarray | None], Scorer]
 """(pixels, prior, (h, w) probability of being static that another network states) -> scorer."""
-
-
-@dataclass(frozen=True, eq=False)
-class Selection:
-    """The motion selected.
-
-    Args:
-        T_curr_prev: (4, 4).
-        noise: (flow px, log depth) standard deviations found with it.
-        mask: (h, w) weights on the coarse grid that it was fitted with, or None for all.
-        coverage: share of the usable pixels' weight that the mask leaves.
-        confidence: the scorer's own, 0 to 1, that it is right; low where no motion may be.
-        gap: by how much its score exceeds that of any other motion.
-        probability: that the motion is right, calibrated in the gap.
-        hypotheses: all candidates, the one selected first.
-        iterations: Gauss-Newton steps spent on it.
-    """
-
-    T_curr_prev: np.ndarray
-    noise: tuple[float, float]
-    mask: np.ndarray | None
-    coverage: float
-    confidence: float
-    gap: float
-    probability: float
-    hypotheses: tuple[Hypothesis, ...]
-    iterations: int
 
 
 def select_by_cues(found: HypothesisSet, prior: MotionPrior | None = None) -> Selection:

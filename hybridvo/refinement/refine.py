@@ -43,44 +43,51 @@ interpolation of the second one averages away (4/9 remains of independent noise)
 
 
 @dataclass(frozen=True, eq=False)
-class Context:
-    """What the selection knows of the motion to be refined.
+class Selection:
+    """The motion to be refined, and what is known of it.
 
     Args:
+        T_curr_prev: (4, 4).
         noise: (flow px, log depth) standard deviations found with it, or None.
-        coverage: share of the usable pixels' weight that the static mask leaves.
-        probability, min_probability: of being the camera's motion; below which it is degraded.
-        hypotheses: every motion found, the selected one first.
-        iterations: Gauss-Newton steps spent so far.
+        mask: (h, w) weights on the coarse grid that it was fitted with, or None for all.
+        coverage: share of the usable pixels' weight that the mask leaves.
+        confidence: the scorer's own, 0 to 1, that it is right; low where no motion may be.
+        gap: by how much its score exceeds that of any other motion.
+        probability: that the motion is right, calibrated in the gap.
+        hypotheses: all candidates, the one selected first.
+        iterations: Gauss-Newton steps spent on it.
     """
 
+    T_curr_prev: np.ndarray
     noise: tuple[float, float] | None = None
+    mask: np.ndarray | None = None
     coverage: float = 1.0
+    confidence: float = 1.0
+    gap: float = 0.0
     probability: float = 1.0
-    min_probability: float = 0.0
     hypotheses: tuple[Hypothesis, ...] = ()
     iterations: int = 0
 
 
 def refine_pair(
     pair: FramePair,
-    T_init: np.ndarray,
+    start: Selection,
     grid: CoarseGrid | None = None,
     weights: np.ndarray | None = None,
     options: RefineOptions | None = None,
-    context: Context | None = None,
+    min_probability: float = 0.0,
 ) -> RelativePose:
-    """The motion of a pair near its only start (4, 4).
+    """The motion of a pair near its only start; degraded below ``min_probability``.
 
     ``grid``: coarse grid of the pair, with the weights; None: it is made, with ``weights`` (H, W),
     factors on the information of each pixel.
     """
-    options, context = options or RefineOptions(), context or Context()
+    options = options or RefineOptions()
     made = grid or coarse_grid(pair, weights, options)
     if isinstance(made, RelativePose):
         return made
-    pose = np.array(T_init[:3], np.float64)
-    noise, iterations = context.noise, context.iterations
+    pose = np.array(start.T_curr_prev[:3], np.float64)
+    noise, iterations = start.noise, start.iterations
     if noise is None:
         pose, sf, sd, _, iterations = coarse_fit.fit_coarse(
             made.samples, made.count, made.pixels.K, pose, options.cutoff
@@ -91,10 +98,10 @@ def refine_pair(
     depths = None if curr is None else compare_depths(pair, motion.T_curr_prev, motion.weights)
     share = motion.inlier_ratio
     motion = motion.replace(
-        inlier_ratio=min(1.0, share * context.coverage),
+        inlier_ratio=min(1.0, share * start.coverage),
         iterations=iterations + motion.iterations,
-        hypotheses=context.hypotheses,
-        probability=context.probability,
+        hypotheses=start.hypotheses,
+        probability=start.probability,
     )
     weak = ""
     if eigenvalues[0] < WEAK_RATIO * eigenvalues[-1]:
@@ -103,7 +110,7 @@ def refine_pair(
         weak = "the pixels cover too little of the image to tell how far their errors agree"
     status = status_of(
         tiles > 0, share, Status() if depths is None else depths.status,
-        context.probability, context.min_probability, weak,
+        start.probability, min_probability, weak,
     )  # fmt: skip
     if not status.usable:
         nothing = {"T_curr_prev": np.eye(4), "covariance": NOTHING.copy(), "probability": 0.0}

@@ -19,7 +19,7 @@ from hybridvo.data.sequence import open_sequence, resize_frame
 from hybridvo.errors import InputError
 from hybridvo.flow import dis_flow
 from hybridvo.geometry import invert, rotation_angle, se3_exp
-from hybridvo.refinement.refine import refine_pair
+from hybridvo.refinement.refine import Selection, refine_pair
 from hybridvo.synthetic.draws import about, cut_out, log_uniform, smooth_field
 from hybridvo.synthetic.layered import KnownPair
 from hybridvo.synthetic.meshes import (
@@ -134,7 +134,7 @@ def _measured_motion(prev: Frame, curr: Frame, T_stated: np.ndarray) -> np.ndarr
     """The recorded motion, often wrong by pixels, refined on the pair; None if they disagree."""
     field = dis_flow()(prev, curr)
     pair = FramePair(prev, curr, field.flow, field.variance, field.valid)
-    found = refine_pair(pair, T_stated)
+    found = refine_pair(pair, Selection(T_stated))
     gap = invert(T_stated) @ found.T_curr_prev
     far = 0.02 + 0.15 * float(np.linalg.norm(T_stated[:3, 3]))
     if not found.usable or found.inlier_ratio < 0.5:
