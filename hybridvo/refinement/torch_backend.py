@@ -119,7 +119,7 @@ def refine_batch(
         pixels = gather_pixels(batch, weights, tile, with_depth)
         how = how._replace(noise=result.noise if given is None else given)
         T = result.SE3.detach()
-        A = newton_matrix(pixels.map(torch.Tensor.detach), T, how)
+        A = newton_matrix(pixels, T, how)
         g = scores(pixels, T, how)[0].sum(dim=2)
         return replace(result, SE3=attached(T, A, g, ~result.failed[:, None]))
 
@@ -175,7 +175,7 @@ def _solve(
     curvature, meat = (x * total[:, None, None] for x in _curvature(few, T, how))
     T, last, converged, iterations = _fit_all(pixels, few, T, how, curvature, tile, tight)
     found = _covariances(pixels, few, T, last, how.noise, (curvature, meat), size, tile)
-    near = (last.found.robust > 0) & (last.found.distance2 <= INLIER_DISTANCE2)
+    near = (last.robust > 0) & (last.distance2 <= INLIER_DISTANCE2)
     ratio = torch.nan_to_num((weight * near).sum(dim=1) / weight.sum(dim=1).clamp(min=1e-30))
     probability = own**2 / (own**2 + rival**2).clamp(min=1e-12)
     covariances, status = [], []
@@ -198,7 +198,7 @@ def _solve(
         probability=torch.where(failed, torch.zeros_like(own), probability),
         iterations=iterations,
         cost=torch.nan_to_num(last.cost / weight.sum(dim=1).clamp(min=1e-30)),
-        weights=torch.nan_to_num(from_tiles(last.found.robust, tile, *size)),
+        weights=torch.nan_to_num(from_tiles(last.robust, tile, *size)),
         noise=torch.where(torch.isfinite(how.noise), how.noise, torch.ones_like(how.noise)),
         inlier_ratio=ratio,
     )
@@ -339,7 +339,7 @@ def _fit_all(
     tight: bool,
 ) -> tuple[pp.LieTensor, Linearization, torch.Tensor, torch.Tensor]:
     """Newton steps on all pixels: (pose, last equations, converged, steps)."""
-    rounding = 8 * torch.finfo(pixels.weight.dtype).eps
+    rounding = torch.finfo(pixels.weight.dtype).eps ** 0.5
     total, part = (p.weight.double().sum(dim=1)[:, None, None] for p in (pixels, few))
     best = torch.full((len(T),), torch.inf, dtype=torch.float64, device=T.device)
     done, converged = best < 0, best < 0

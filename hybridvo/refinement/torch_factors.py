@@ -154,14 +154,15 @@ class Linearization(NamedTuple):
         H: (B, C, 6, 6) sum of w J^T Sigma^-1 J. g: (B, C, 6) sum of w J^T Sigma^-1 r.
         cost: (B,) robust cost, pixels behind the camera at the full one.
         weight_sum: (B,) sum of robust times external weights.
-        found: the residuals.
+        robust, distance2: (B, N) robust weights and squared distances of the pixels.
     """
 
     H: torch.Tensor
     g: torch.Tensor
     cost: torch.Tensor
     weight_sum: torch.Tensor
-    found: Weighted
+    robust: torch.Tensor
+    distance2: torch.Tensor
 
     def total(self) -> tuple[torch.Tensor, torch.Tensor]:
         """(H (B, 6, 6), g (B, 6)) in float64: a float32 sum over an image loses its fifth digit."""
@@ -171,7 +172,16 @@ class Linearization(NamedTuple):
 def linearize(
     pixels: Pixels, T: pp.LieTensor, how: RobustNoise, run: int | None = None
 ) -> Linearization:
-    """Normal equations at poses (B, 7), summed over runs of ``run`` pixels or all."""
+    """Normal equations at poses (B, 7), summed over runs of ``run`` pixels or of any length."""
+    found = [_linearize(part, T, how, run) for part in pixels.parts(run or 1)]
+    H, g, cost, weight_sum, robust, distance2 = zip(*found, strict=True)
+    sums = sum(cost), sum(weight_sum)
+    return Linearization(
+        *(torch.cat(x, 1) for x in (H, g)), *sums, *(torch.cat(x, 1) for x in (robust, distance2))
+    )
+
+
+def _linearize(pixels: Pixels, T: pp.LieTensor, how: RobustNoise, run: int | None) -> Linearization:
     found = weigh(pixels, T, how)
     w, runs = pixels.weight * found.robust, (-1, run or pixels.weight.shape[1])
     J = jacobian(pixels, found.at)
@@ -183,7 +193,8 @@ def linearize(
     behind = torch.full_like(found.distance2, BEHIND_DISTANCE2)
     cost = how.kernel(torch.where(found.at.front, found.distance2, behind))[0]
     cost = (pixels.weight * cost).sum(dim=1)
-    return Linearization(0.5 * (H + H.transpose(2, 3)), g, cost, w.sum(dim=1), found)
+    H = 0.5 * (H + H.transpose(2, 3))
+    return Linearization(H, g, cost, w.sum(dim=1), found.robust, found.distance2)
 
 
 def scores(pixels: Pixels, T: pp.LieTensor, how: RobustNoise) -> tuple[torch.Tensor, Weighted]:
@@ -199,12 +210,14 @@ def _scores(J: torch.Tensor, w: torch.Tensor, found: Weighted) -> torch.Tensor:
 def newton_matrix(pixels: Pixels, T: pp.LieTensor, how: RobustNoise) -> torch.Tensor:
     """A = -dg / d xi, g the sum of the scores: (B, 6, 6), not symmetric; A xi = g is the step."""
     how = how._replace(noise=how.noise.detach())
-    pixels = pixels._replace(K=pixels.K.detach())
+    A = torch.zeros(len(T), 6, 6, dtype=T.dtype, device=T.device)
     with torch.enable_grad():
         xi = torch.zeros(len(T), 6, dtype=T.dtype, device=T.device, requires_grad=True)
-        g = scores(pixels, left_update(xi, T), how)[0].sum(dim=2)
-        rows = [torch.autograd.grad(g[:, k].sum(), xi, retain_graph=True)[0] for k in range(6)]
-    return -torch.stack(rows, dim=1)
+        for part in pixels.map(torch.Tensor.detach).parts():
+            g = scores(part, left_update(xi, T), how)[0].sum(dim=2)
+            rows = [torch.autograd.grad(g[:, k].sum(), xi, retain_graph=True)[0] for k in range(6)]
+            A -= torch.stack(rows, dim=1)
+    return A
 
 
 def solve_small(

@@ -58,7 +58,7 @@ def test_one_pixel_by_hand() -> None:
     q = float(100 * moved.i[0, at] * (moved.ab[0, 0, at] * 0.5 - 0.1))
     found = linearize(pixels, T, how)
     variance = 0.25 + 0.01 * q * q
-    assert found.found.distance2[0, at] == pytest.approx(1.44 / variance + 1 / 0.25, rel=1e-12)
+    assert found.distance2[0, at] == pytest.approx(1.44 / variance + 1 / 0.25, rel=1e-12)
     assert found.g[0, 0, 1] == pytest.approx(100 * float(moved.i[0, at]) / 0.25, rel=1e-12)
 
 
