@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+import torch
 
 from hybridvo.data.sequence import Sequence, iter_pairs
 from hybridvo.errors import InputError
 from hybridvo.evaluation.pair_errors import MOVING_PX, true_motion
 from hybridvo.evaluation.plots import Panel, draw_panels, flow_panel, longest_flow
-from hybridvo.evaluation.saliency import Saliency, last_pass, saliencies
+from hybridvo.evaluation.saliency import saliencies
 from hybridvo.files import atomic_write, make_folder
 from hybridvo.flow import dis_flow
 from hybridvo.geometry import ego_flow, matrix_to_euler_deg
-from hybridvo.network.layers import KINDS
-from hybridvo.network.models import load_weights
-from hybridvo.network.weights import pretrained_names, weights_file
+from hybridvo.network.inputs import assemble_inputs
+from hybridvo.network.models import Models
+from hybridvo.network.normalization import first_motions
 from hybridvo.pipeline import DEFAULT_METHOD, estimate
 from hybridvo.results import PixelwisePrediction, RelativePose
 from hybridvo.types import FramePair
@@ -32,13 +33,13 @@ def draw(
     *,
     flow: str = "auto",
     method: str = DEFAULT_METHOD,
-    weights: Iterable[str | Path] = (),
+    models: Models | None = None,
     overwrite: bool = False,
 ) -> Path:
-    """Draw the maps of one pair: flow and its parts, error, weights, and what networks look at.
+    """Draw the maps of one pair: flow and its parts, error, weights, and what PWVO looks at.
 
     ``pair`` is its first frame, ``out`` a .png; ``flow`` is ``auto`` (files where there are some),
-    ``file`` or ``dis``; ``weights`` are networks to look through, by default the pretrained ones.
+    ``file`` or ``dis``.
     """
     out = Path(out)
     if out.suffix.lower() != ".png":
@@ -52,19 +53,21 @@ def draw(
     given = next(iter_pairs(sequence, provider, start=pair, stop=pair + 2))
     if given.flow is None or given.prev.depth is None:
         raise InputError(f"{sequence.name}, pair {pair}: has no flow or no depth to look at.")
-    found = networks(weights)
+    models = models or Models()
+    network: Any = models.network("pwvo")
     flow_gt = None
     if sequence.has_flow and sequence.flow_is_true:
         flow_gt = given.flow if given.flow_is_true else sequence.flow(pair)[0]
     T_gt = true_motion(sequence, pair, pair + 1)
-    motion = estimate(given, method=method)
+    motion = estimate(given, method=method, models=models)
     panels, moving = _pair_panels(given, motion, T_gt, flow_gt)
     true = None if T_gt is None else (matrix_to_euler_deg(T_gt[:3, :3]), T_gt[:3, 3])
-    for name, network in found:
-        output, inputs, T_start = last_pass(network, given)
-        if isinstance(output, PixelwisePrediction):
-            panels += prediction_panels(name, output, true, moving)
-        panels += saliency_panels(name, saliencies(network, inputs, T_start), moving)
+    inputs = assemble_inputs(given)
+    T_start = first_motions(network, inputs, "softmax", int(network.options.passes) - 1)
+    with torch.no_grad():
+        output = network(inputs, T_start)
+    panels += prediction_panels("PWVO", output, true, moving)
+    panels += saliency_panels("PWVO", saliencies(network, inputs, T_start), moving)
     source = f"{given.flow_source} (true)" if given.flow_is_true else given.flow_source
     heading = f"{sequence.name}, pair {pair}; flow: {source}; motion: {method}, {motion.status}"
     height, width = given.prev.camera.shape
@@ -72,20 +75,6 @@ def draw(
     with atomic_write(out, "wb") as file:
         file.write(draw_panels(panels, heading, width / height))
     return out
-
-
-def networks(files: Iterable[str | Path] = ()) -> list[tuple[str, Any]]:
-    """(name, network) of the given files, or of all pretrained ones that predict a motion."""
-    found = []
-    paths = [Path(file) for file in files]
-    for path in paths or [weights_file(name) for name in pretrained_names()]:
-        network: Any = load_weights(path)[0]
-        kind = network.options.kind
-        if kind in KINDS:
-            found.append((path.stem, network))
-        elif paths:
-            raise InputError(f"--weights {path}: expected {', '.join(KINDS)}, got a {kind}.")
-    return found
 
 
 # -- panels ---------------------------------------------------------------------------------------
@@ -141,11 +130,11 @@ def prediction_panels(
     return panels
 
 
-def saliency_panels(name: str, found: Mapping[str, Saliency], moving: np.ndarray) -> list[Panel]:
+def saliency_panels(name: str, found: Mapping[str, np.ndarray], moving: np.ndarray) -> list[Panel]:
     """Where a network looks; what moves is outlined."""
     panels = []
-    for what, saliency in found.items():
-        shown = cv2.blur(saliency.magnitude, (4, 4))  # networks read one of some pixels only
+    for what, magnitude in found.items():
+        shown = cv2.blur(magnitude, (4, 4))  # networks read one of some pixels only
         relative = shown / max(float(np.percentile(shown, 99)), 1e-30)
         panels.append(Panel(f"{name}: saliency, {what}", relative, "relative", 1.0, moving))
     return panels
