@@ -21,40 +21,22 @@ TRUTH = "ground truth"
 LABELS = {
     "epe_l2_px": "EPE [px]",
     "epe_l2_px_median": "median EPE [px]",
-    "failure_rate": "share of failures",
     "index": "pair",
     "right": "x, right [m]",
     "forward": "z, forward [m]",
 }
 
 
-def is_oracle(flow: str) -> bool:
-    """Whether a source of flow is ground truth."""
-    return "(true)" in flow
-
-
-def flow_sources(rows: pd.DataFrame) -> list[str]:
-    """Sources of flow, estimated ones first."""
-    return sorted(rows["flow_source"].unique(), key=is_oracle)
-
-
-def _first_flow(rows: pd.DataFrame) -> pd.DataFrame:
-    return rows[rows["flow_source"] == flow_sources(rows)[0]]
-
-
 def _chart(kind: Any, rows: pd.DataFrame, methods: Sequence[str], **more: Any) -> Figure:
     """A chart with a colour for each method, black for the truth, and a line at one pixel."""
     palette = px.colors.qualitative.Dark24
     colours = {method: palette[k % len(palette)] for k, method in enumerate(methods)}
-    orders = {"method": [TRUTH, *methods]}
-    if "facet_col" in more:
-        orders["flow_source"] = flow_sources(rows)
     errors = {axis: more[axis] for axis in "xy" if more.get(axis, "").startswith("epe")}
     figure = kind(
         rows.assign(**{name: rows[name].clip(lower=FLOOR_PX) for name in errors.values()}),
         color="method",
         color_discrete_map=colours | {TRUTH: "#000"},
-        category_orders=orders,
+        category_orders={"method": [TRUTH, *methods]},
         labels=LABELS,
         template="plotly_white",
         height=420,
@@ -68,31 +50,18 @@ def _chart(kind: Any, rows: pd.DataFrame, methods: Sequence[str], **more: Any) -
 
 
 def error_distribution(pairs: pd.DataFrame, methods: Sequence[str]) -> list[Figure]:
-    """Share of the pairs below an error, the sources of flow side by side."""
+    """Share of the pairs below an error."""
     known = pairs.dropna(subset=["epe_l2_px"])
-    axes = {"x": "epe_l2_px", "ecdfnorm": "percent", "facet_col": "flow_source"}
     if known.empty:
         return []
-    figure = _chart(px.ecdf, known, methods, **axes)
-    return [figure.update_yaxes(title="pairs below it [%]", col=1)]
-
-
-def failure_chart(totals: Sequence[Mapping[str, Any]], methods: Sequence[str]) -> list[Figure]:
-    """Failure rate of every method with its 95 % interval, sources of flow side by side."""
-    rates = pd.DataFrame(totals).dropna(subset=["failure_rate"])
-    if rates.empty:
-        return []
-    rates["above"] = rates["failure_rate_high"] - rates["failure_rate"]
-    rates["under"] = rates["failure_rate"] - rates["failure_rate_low"]
-    bars = {"error_x": "above", "error_x_minus": "under", "facet_col": "flow_source"}
-    figure = _chart(px.scatter, rates, methods, x="failure_rate", y="method", **bars)
-    return [figure.update_layout(showlegend=False)]
+    figure = _chart(px.ecdf, known, methods, x="epe_l2_px", ecdfnorm="percent")
+    return [figure.update_yaxes(title="pairs below it [%]")]
 
 
 def factor_charts(pairs: pd.DataFrame, methods: Sequence[str]) -> list[Figure]:
     """Median error over the bins of each factor; a factor with one bin tells nothing."""
     figures = []
-    known = _first_flow(pairs).dropna(subset=["epe_l2_px"])
+    known = pairs.dropna(subset=["epe_l2_px"])
     for name, (label, edges) in FACTORS.items():
         bins = pd.cut(known[name], edges, include_lowest=True)
         groups = known.groupby(["method", bins], observed=True)["epe_l2_px"]
@@ -106,23 +75,21 @@ def factor_charts(pairs: pd.DataFrame, methods: Sequence[str]) -> list[Figure]:
 
 def path_charts(
     folder: Path,
-    result: Mapping[str, Any],
+    facts: Mapping[str, Any],
+    rows: Sequence[Mapping[str, Any]],
     pairs: pd.DataFrame,
-    sequence: str,
     methods: Sequence[str],
 ) -> list[Figure]:
-    """Path from above and error of every pair, of the first source of flow."""
-    (truth,) = (s["ground_truth"] for s in result["sequences"] if s["name"] == sequence)
-    rows = _first_flow(pd.DataFrame([r for r in result["rows"] if r["sequence"] == sequence]))
-    flow = rows["flow_source"].iloc[0]
+    """Path from above and error of every pair of one of the ``sequences`` of a result."""
+    name, truth = facts["name"], facts["ground_truth"]
     files = {TRUTH: truth} if truth else {}
-    files |= dict(zip(rows["method"], rows["trajectory"], strict=True))
-    paths = _positions({name: folder / file for name, file in files.items()})
-    axes = {"x": "right", "y": "forward", "title": f"From above, {flow} flow"}
+    files |= {row["method"]: row["trajectory"] for row in rows if row["sequence"] == name}
+    paths = _positions({method: folder / file for method, file in files.items()})
+    axes = {"x": "right", "y": "forward", "title": "From above"}
     figures = [_chart(px.line, paths, methods, **axes).update_yaxes(scaleanchor="x")]
-    known = _first_flow(pairs[pairs["sequence"] == sequence]).dropna(subset=["epe_l2_px"])
+    known = pairs[pairs["sequence"] == name].dropna(subset=["epe_l2_px"])
     if len(known):
-        axes = {"x": "index", "y": "epe_l2_px", "title": f"Error of every pair, {flow} flow"}
+        axes = {"x": "index", "y": "epe_l2_px", "title": "Error of every pair"}
         figures.append(_chart(px.line, known, methods, **axes))
     return figures
 

@@ -129,14 +129,12 @@ def _check_shape(est: np.ndarray, gt: np.ndarray) -> None:
         raise DegenerateError("straight line: the camera path leaves the rotation about it open")
 
 
-def aligned(
-    est: Trajectory, gt: Trajectory, alignment: Alignment = "se3"
-) -> tuple[Trajectory, PathError | None, Alignment]:
-    """Estimate in the truth's world by the best alignment that the paths determine, and its ATE.
+def aligned(est: Trajectory, gt: Trajectory) -> tuple[Trajectory, PathError | None, Alignment]:
+    """Estimate in the truth's world, rigidly aligned where the paths determine that, and its ATE.
 
     Paths of which nothing matches start at the same place, and their error is None.
     """
-    kinds: tuple[Alignment, ...] = (alignment, "origin")
+    kinds: tuple[Alignment, ...] = ("se3", "origin")
     for kind in kinds:
         try:
             error = ate(match(est, gt), kind)

@@ -10,7 +10,6 @@ from typing import Any
 import yaml
 
 from hybridvo.errors import InputError
-from hybridvo.options import RunOptions
 from hybridvo.types import Camera
 
 
@@ -28,10 +27,8 @@ def same_intrinsics(first: Camera, second: Camera) -> bool:
     return first.shape == second.shape and all(abs(a - b) <= 1e-9 * first.fx for a, b in pairs)
 
 
-def check_protocol(sequences: Sequence[Any], run: RunOptions) -> None:
-    """Refuse frames or sequences that the protocol does not score."""
-    if run.stride != 1 or run.start or run.stop is not None:
-        raise InputError("--protocol paper: needs no --start, --stop or --stride.")
+def check_protocol(sequences: Sequence[Any]) -> None:
+    """Refuse sequences that the protocol does not score."""
     for sequence in sequences:
         if sequence.kind != "sintel" or sequence.name not in paper_protocol()["sequences"]:
             raise InputError(
@@ -39,13 +36,11 @@ def check_protocol(sequences: Sequence[Any], run: RunOptions) -> None:
             )
 
 
-def protocol_summary(
-    totals: Sequence[Mapping[str, Any]], scored: Sequence[Mapping[str, Any]]
-) -> dict[str, Any]:
-    """What stands under ``protocol`` in ``results.json``: what was scored, beside the published.
+def protocol_summary(scored: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """What stands under ``protocol`` in ``results.json``, beside the totals: the published lines.
 
-    ``totals`` has a line per method and flow source over all sequences, ``scored`` the ``name`` and
-    ``pairs_scored`` of each sequence; ``note`` says what of the complete set is missing.
+    ``scored`` has the ``name`` and ``pairs_scored`` of each sequence; ``note`` says what of the
+    complete set is missing.
     """
     protocol = paper_protocol()
     names, count = [s["name"] for s in scored], sum(s["pairs_scored"] for s in scored)
@@ -54,12 +49,4 @@ def protocol_summary(
     if absent or count != protocol["pairs"]:
         note = f"{count} pairs, the complete set has {protocol['pairs']}: not those of the "
         note += f"published figures; missing: {', '.join(absent) or 'no sequence'}"
-    published = {line["method"]: line for line in protocol["published"]}
-    return protocol | {
-        "complete": not note,
-        "note": note,
-        "missing_sequences": absent,
-        "pairs": count,
-        "pairs_expected": protocol["pairs"],
-        "table": [{**row, "published": published.get(row["method"])} for row in totals],
-    }
+    return protocol | {"note": note, "missing_sequences": absent, "pairs": count}

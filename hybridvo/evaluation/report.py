@@ -13,7 +13,6 @@ from typing import Any
 import pandas as pd
 
 from hybridvo.evaluation import charts
-from hybridvo.evaluation.charts import is_oracle
 from hybridvo.files import atomic_write
 
 COLUMNS: tuple[tuple[str, str, float], ...] = (
@@ -50,23 +49,26 @@ def write_report(folder: Path, result: Mapping[str, Any], pairs: pd.DataFrame) -
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
     )
-    methods = list(dict.fromkeys(row["method"] for row in result["totals"]))
+    totals, every = (sorted(result[key], key=_rank) for key in ("totals", "rows"))
+    methods = list(dict.fromkeys(row["method"] for row in result["rows"]))
+    flow = totals[0]["flow_source"]  # an oracle is never pooled with what a sensor gives
+    pooled = pairs[pairs["flow_source"] == flow]
     sections = {
-        "How the errors are distributed": charts.error_distribution(pairs, methods),
-        "How often an estimate fails": charts.failure_chart(result["totals"], methods),
-        "What makes it fail": charts.factor_charts(pairs, methods),
+        f"How the errors are distributed, {flow} flow": charts.error_distribution(pooled, methods),
+        f"What makes it fail, {flow} flow": charts.factor_charts(pooled, methods),
     }
-    names = dict.fromkeys(row["sequence"] for row in result["rows"])
-    paths = {name: charts.path_charts(folder, result, pairs, name, methods) for name in names}
-    every = [row for _, rows in by_flow(result, "rows") for row in rows]
+    paths = {
+        facts["name"]: charts.path_charts(folder, facts, result["rows"], pairs, methods)
+        for facts in result["sequences"]
+    }
     content = {
         "result": result,
         "pairs": len(pairs.drop_duplicates(["sequence", "index"])),
         "methods": methods,
-        "tables": [(flow, (rows, COLUMNS, ("method",))) for flow, rows in by_flow(result)],
+        "totals": (totals, COLUMNS, ("method", "flow_source")),
         "sections": [(name, _json(some)) for name, some in sections.items() if some],
         "sequences": [(name, _json(some)) for name, some in paths.items()],
-        "protocol": _protocol_tables(result.get("protocol")),
+        "protocol": _protocol_tables(result.get("protocol"), totals),
         "numbers": (every, COLUMNS, ("sequence", "method", "flow_source")),
         "number": number,
     }
@@ -76,18 +78,11 @@ def write_report(folder: Path, result: Mapping[str, Any], pairs: pd.DataFrame) -
             file.write(text)
 
 
-def by_flow(result: Mapping[str, Any], key: str = "totals") -> list[tuple[str, list[Any]]]:
-    """Rows by source of flow, estimated ones first; in each the fewest failures first."""
-
-    def rank(row: Mapping[str, Any]) -> tuple[float, ...]:
-        errors = row["failure_rate"], row["epe_l2_px_median"]
-        return tuple(math.inf if error is None else error for error in errors)
-
-    flows = sorted(dict.fromkeys(row["flow_source"] for row in result[key]), key=is_oracle)
-    return [
-        (flow, sorted((r for r in result[key] if r["flow_source"] == flow), key=rank))
-        for flow in flows
-    ]
+def _rank(row: Mapping[str, Any]) -> tuple[float, ...]:
+    """Estimated flow before true flow, then the fewest failures first."""
+    errors = row["failure_rate"], row["epe_l2_px_median"]
+    is_oracle = "(true)" in row["flow_source"]
+    return is_oracle, *(math.inf if error is None else error for error in errors)
 
 
 def number(value: float | None, digits: int = 3) -> str:
@@ -104,7 +99,7 @@ def number(value: float | None, digits: int = 3) -> str:
     return f"{value:.{digits}g}"
 
 
-def _protocol_tables(protocol: Mapping[str, Any] | None) -> list[tuple[str, Any]]:
+def _protocol_tables(protocol: Mapping[str, Any] | None, totals: Any) -> list[tuple[str, Any]]:
     """Measured here, and what others published: rows, columns, names."""
     if protocol is None:
         return []
@@ -112,7 +107,7 @@ def _protocol_tables(protocol: Mapping[str, Any] | None) -> list[tuple[str, Any]
     here = [*columns, ("pairs", "pairs", 1.0)]
     others = ("name", "inputs", "source", "note")
     return [
-        ("Measured here", (protocol["table"], here, ("method", "flow_source"))),
+        ("Measured here", (totals, here, ("method", "flow_source"))),
         ("Published by others", (protocol["published"], columns, others)),
     ]
 

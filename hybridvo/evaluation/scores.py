@@ -7,22 +7,20 @@ carries, which is none, in every mean and median.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from scipy.stats import binomtest
 
-from hybridvo.evaluation.pair_errors import ERRORS, mean_pair_errors
+from hybridvo.evaluation.pair_errors import mean_pair_errors
 
 FAILURE_PX = 1.0
 """Error of the ego flow at native size above which an estimate has failed, px."""
-READS_NO_FLOW = ("opencv-rgbd", "open3d-rgbd", "identity")
-"""Methods whose result is the same whatever the flow."""
 PATH_KEYS = ("ate_rmse", "rpe_trans_rmse", "rpe_rot_rmse_deg", "ate_rmse_sim3")
 """Errors of a whole trajectory; the first three are after a rigid alignment."""
-NO_PAIRS = "no pair was estimated"
+NO_PAIRS = "no pair was estimated, or none has ground truth"
 NO_TRUTH = "the sequence has no ground truth for these frames"
 NO_MOVING = "needs true flow of the whole scene (moving objects included) and ground truth"
 FACTORS: Mapping[str, tuple[str, tuple[float, ...]]] = {
@@ -41,9 +39,9 @@ PAIR_COLUMNS = (
 """Columns of ``pairs.csv``."""
 
 
-def pair_table(pairs: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
-    """Pairs as a table with every column; unknown numbers are NaN."""
-    table = pd.DataFrame(list(pairs), columns=PAIR_COLUMNS)
+def pair_table(pairs: Any) -> pd.DataFrame:
+    """Pairs (dictionaries, or a table) with every column and no other; unknown numbers are NaN."""
+    table = pd.DataFrame(pairs, columns=list(PAIR_COLUMNS))
     text = ("sequence", "method", "flow_source", "status", "message")
     numbers = [name for name in PAIR_COLUMNS if name not in text]
     table[numbers] = table[numbers].apply(pd.to_numeric)
@@ -56,7 +54,7 @@ def failure_rate(pairs: pd.DataFrame) -> dict[str, Any]:
     A failure is a failed estimate or an error of the ego flow above one pixel. Pairs whose error is
     unknown and whose estimate did not fail are left out.
     """
-    failed, epe = is_failed(pairs), pairs["epe_l2_px"]
+    failed, epe = pairs["status"].str.startswith("failed"), pairs["epe_l2_px"]
     total, failures = int((failed | epe.notna()).sum()), int((failed | (epe > FAILURE_PX)).sum())
     names = ("failures", "failure_rate", "failure_rate_low", "failure_rate_high")
     if not total:
@@ -66,39 +64,22 @@ def failure_rate(pairs: pd.DataFrame) -> dict[str, Any]:
     return {"pairs": total, **dict(zip(names, values, strict=True))}
 
 
-def is_failed(pairs: pd.DataFrame) -> pd.Series:
-    """Which estimates failed."""
-    return pairs["status"].str.startswith("failed")
-
-
-def known_number(value: float) -> float | None:
-    """The number, None for NaN."""
-    return None if math.isnan(value) else float(value)
-
-
 def pair_scores(pairs: pd.DataFrame) -> dict[str, Any]:
     """Everything that is a mean, median or count over the pairs of one method and flow."""
     scored = pairs[pairs["rot_err_deg"].notna()]
-    scores = mean_pair_errors(scored[list(ERRORS)].to_dict("records"))
-    reasons = scores["reasons"]
-    if pairs.empty:
-        reasons |= dict.fromkeys(reasons, NO_PAIRS)
-    flow_ms = pairs["flow_ms"].where(~pairs["method"].isin(READS_NO_FLOW), 0.0)
-    medians = {
-        "epe_l2_px_median": pairs["epe_l2_px"],
-        "ms_per_pair_median": pairs["ms"],
-        "flow_ms_median": flow_ms,
-        "ms_with_flow_median": pairs["ms"] + flow_ms,
+    scores = mean_pair_errors(scored) | failure_rate(pairs)
+    figures = {
+        "epe_l2_px_median": pairs["epe_l2_px"].median(),
+        "ms_per_pair_median": pairs["ms"].median(),
+        "flow_ms_median": pairs["flow_ms"].median(),
+        "dynamic_fraction": pairs["dynamic_fraction"].mean(),
     }
-    scores |= failure_rate(pairs)
-    scores |= {name: known_number(values.median()) for name, values in medians.items()}
-    scores["dynamic_fraction"] = known_number(pairs["dynamic_fraction"].mean())
-    counts = {"pairs": len(pairs), "failed": int(is_failed(pairs).sum())}
-    scores |= counts | {"pairs_scored": len(scored)}
-    for name, value in scores.items():
-        if value is None and name not in reasons:
-            missing = NO_PAIRS if "ms" in name else reasons.get("epe_l2_px", NO_PAIRS)
-            reasons[name] = NO_MOVING if name == "dynamic_fraction" else missing
+    scores |= {k: None if math.isnan(value) else float(value) for k, value in figures.items()}
+    failed = int(pairs["status"].str.startswith("failed").sum())
+    scores |= {"pairs": len(pairs), "failed": failed, "pairs_scored": len(scored)}
+    for name in [name for name, value in scores.items() if value is None]:
+        unknown = NO_MOVING if name == "dynamic_fraction" else NO_PAIRS
+        scores["reasons"].setdefault(name, unknown)
     return scores
 
 
@@ -107,9 +88,7 @@ def sequence_row(
 ) -> dict[str, Any]:
     """Line of one method on one sequence; ``path`` is what ``evaluate`` says, where it can."""
     scores, names = pair_scores(pairs), (*PATH_KEYS, "scale_sim3")
-    if path is None or pairs.empty:
-        reason = NO_PAIRS if pairs.empty else NO_TRUTH
-        path = {"alignment": "se3", "reasons": dict.fromkeys(names, reason)}
+    path = path or {"alignment": "se3", "reasons": dict.fromkeys(names, NO_TRUTH)}
     scores["reasons"] |= {k: v for k, v in path["reasons"].items() if k in names}
     scores |= {name: path.get(name) for name in ("alignment", *names)}
     return {**named, **scores}
