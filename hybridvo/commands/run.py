@@ -83,8 +83,7 @@ def run(
             recording = None
             if rrd is not None:
                 poses = None if sequence.poses is None else sequence.poses[list(frames)]
-                named = (rrd or out / RECORDING, sequence.name, header["input_hash"])
-                recording = Recording(*named, len(frames), len(folder.rows), poses)
+                recording = Recording(rrd or out / RECORDING, sequence.name, len(frames), poses)
                 stack.enter_context(recording)
             _estimate(vo, flow, sequence, frames, folder, recording, quiet)
             given = (out, folder.rows, sequence, frames, options.run)
