@@ -23,9 +23,8 @@ import torch
 from measuring import ROOT, parser_of, provenance, without_folders
 
 from hybridvo.commands.generate import write_sheet
-from hybridvo.evaluation.drawing import prediction_panels, saliency_panels
+from hybridvo.evaluation.drawing import prediction_panels, saliencies, saliency_panels
 from hybridvo.evaluation.plots import Panel, draw_panels, flow_panel, longest_flow
-from hybridvo.evaluation.saliency import saliencies
 from hybridvo.files import atomic_write, write_json
 from hybridvo.network.losses import reconstruct
 from hybridvo.network.models import load_weights

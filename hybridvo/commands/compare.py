@@ -28,7 +28,6 @@ from hybridvo.data.sequence import Sequence, open_sequence
 from hybridvo.errors import HybridVOError, InputError
 from hybridvo.evaluation import scores
 from hybridvo.evaluation.pair_errors import ERRORS, pair_facts, true_motion, true_trajectory
-from hybridvo.evaluation.protocols import check_protocol, protocol_summary, same_intrinsics
 from hybridvo.evaluation.report import write_report
 from hybridvo.files import Mode, atomic_write, held, make_folder, versions, write_json
 from hybridvo.network.models import Models
@@ -66,7 +65,7 @@ def compare(
     names, missing = methods_to_run(methods)
     jobs = _jobs(sequences, dataset, options, out)
     if protocol is not None:
-        check_protocol([job.sequence for job in jobs])
+        scores.check_protocol([job.sequence for job in jobs])
     present = [name for name in (*WRITTEN, "runs") if (out / name).exists()]
     if present and mode == "new":
         raise InputError(
@@ -101,7 +100,7 @@ def compare(
             "rows": rows,
             "totals": totals,
             "sequences": facts,
-            "protocol": None if protocol is None else protocol_summary(facts),
+            "protocol": None if protocol is None else scores.protocol_summary(facts),
         }
         write_json(out / "results.json", result)
         lines = pd.DataFrame(rows, dtype=object).drop(columns="reasons")
@@ -205,7 +204,7 @@ def _read(
     table = pd.concat([_pairs(job, method) for method in methods])
     for row in table.drop_duplicates("next").itertuples():
         pair: Any = (row.prev, row.next)
-        if same_camera_only and not same_intrinsics(*map(sequence.camera, pair)):
+        if same_camera_only and not scores.same_intrinsics(*map(sequence.camera, pair)):
             left_out.append({"index": row.prev, "reason": "the intrinsics change"})
             table = table[table["next"] != row.next]
         elif row.missing:

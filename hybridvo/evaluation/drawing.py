@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,16 +15,18 @@ from hybridvo.data.sequence import Sequence, iter_pairs
 from hybridvo.errors import InputError
 from hybridvo.evaluation.pair_errors import MOVING_PX, true_motion
 from hybridvo.evaluation.plots import Panel, draw_panels, flow_panel, longest_flow
-from hybridvo.evaluation.saliency import saliencies
 from hybridvo.files import atomic_write, make_folder
 from hybridvo.flow import dis_flow
 from hybridvo.geometry import ego_flow, matrix_to_euler_deg
 from hybridvo.network.inputs import assemble_inputs
 from hybridvo.network.models import Models
 from hybridvo.network.normalization import first_motions
+from hybridvo.network.selection import select_pose
 from hybridvo.pipeline import DEFAULT_METHOD, estimate
 from hybridvo.results import PixelwisePrediction, RelativePose
 from hybridvo.types import FramePair
+
+PARTS = ("rotation", "translation")
 
 
 def draw(
@@ -138,3 +141,63 @@ def saliency_panels(name: str, found: Mapping[str, np.ndarray], moving: np.ndarr
         relative = shown / max(float(np.percentile(shown, 99)), 1e-30)
         panels.append(Panel(f"{name}: saliency, {what}", relative, "relative", 1.0, moving))
     return panels
+
+
+# -- what a network looks at -----------------------------------------------------------------------
+
+
+def integrated_gradients(
+    answer: Callable[..., torch.Tensor], inputs: tuple[torch.Tensor, ...], steps: int = 32
+) -> list[torch.Tensor]:
+    """Attributions of a scalar answer, like its inputs (Sundararajan, Taly and Yan, ICML 2017).
+
+    Their sum is the answer for the inputs minus that for zeros, up to the error of the integral:
+    ``steps`` Gauss-Legendre nodes, a forward and a backward pass each; for smooth networks 32 of
+    them leave less than a percent unexplained.
+    """
+    nodes, weights = np.polynomial.legendre.leggauss(steps)
+    sums = [torch.zeros_like(x) for x in inputs]
+    for node, weight in zip((nodes + 1) / 2, weights / 2, strict=True):
+        points = [(float(node) * x).detach().requires_grad_() for x in inputs]
+        # an input that the answer does not depend on has no gradient
+        gradients = torch.autograd.grad(answer(*points), points, allow_unused=True)
+        for total, gradient in zip(sums, gradients, strict=True):
+            if gradient is not None:
+                total += float(weight) * gradient
+    return [total * x for total, x in zip(sums, inputs, strict=True)]
+
+
+def saliencies(
+    network: Any, inputs: Any, T_start: Any = None, steps: int = 32
+) -> dict[str, np.ndarray]:
+    """Absolute attributions (h, w) of rotation and translation to flow and inverse depth.
+
+    The answer is the length of the predicted rotation (or translation) along its own direction; of
+    a pixel-wise network with the pixels and weights chosen for the real input: the choice would
+    make it jump. The path starts at zero; scale-free networks see the logarithm of the depth, which
+    is held fixed, as is what earlier passes found.
+    """
+    names = ("flow",) if network.options.scale_free else ("flow", "inverse_depth")
+    given = tuple(getattr(inputs, name) for name in names)
+
+    def run(*tensors: torch.Tensor) -> Any:
+        return network(replace(inputs, **dict(zip(names, tensors, strict=True))), T_start)
+
+    def part(output: Any, k: int) -> torch.Tensor:
+        is_map = isinstance(output, PixelwisePrediction)
+        return getattr(output, PARTS[k]) if is_map else output[k]
+
+    with torch.no_grad():
+        output = run(*given)
+    found = {}
+    for k, what in enumerate(PARTS):
+        motion = weights = part(output, k).clone().requires_grad_()
+        if isinstance(output, PixelwisePrediction):
+            own: dict[str, Any] = {what: weights}
+            motion = select_pose(replace(output, **own))[k]
+        direction = (motion / motion.norm().clamp(min=1e-12)).detach()
+        (weights,) = torch.autograd.grad((direction * motion).sum(), weights)
+        answer = lambda *x, k=k, w=weights: (w * part(run(*x), k)).sum()  # noqa: E731
+        attributions = integrated_gradients(answer, given, steps)
+        found[what] = torch.cat(attributions, dim=1)[0].abs().sum(0).cpu().numpy()
+    return found

@@ -6,15 +6,20 @@ carries, which is none, in every mean and median.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from scipy.stats import binomtest
 
+from hybridvo.errors import InputError
 from hybridvo.evaluation.pair_errors import mean_pair_errors
+from hybridvo.files import parse_yaml
+from hybridvo.types import Camera
 
 FAILURE_PX = 1.0
 """Error of the ego flow at native size above which an estimate has failed, px."""
@@ -119,3 +124,45 @@ def total_row(pairs: pd.DataFrame, rows: Sequence[Mapping[str, Any]]) -> dict[st
     named = {"method": rows[0]["method"], "flow_source": rows[0]["flow_source"]}
     named |= {"sequence": "all", "depth_source": depth, "alignment": "se3"}
     return {**named, "sequences": len(rows), **scores}
+
+
+# -- the paper's way of scoring MPI Sintel ---------------------------------------------------------
+
+
+@functools.cache
+def paper_protocol() -> dict[str, Any]:
+    """The complete set (``sequences`` with their frames, ``pairs``), columns, published lines."""
+    path = Path(__file__).parent / "protocols.yaml"
+    content: dict[str, Any] = parse_yaml(path.read_text(encoding="utf-8"), path.name)
+    return content
+
+
+def same_intrinsics(first: Camera, second: Camera) -> bool:
+    """Whether two cameras are one: the pairs that the paper keeps."""
+    pairs = ((getattr(c, n) for c in (first, second)) for n in ("fx", "fy", "cx", "cy"))
+    return first.shape == second.shape and all(abs(a - b) <= 1e-9 * first.fx for a, b in pairs)
+
+
+def check_protocol(sequences: Sequence[Any]) -> None:
+    """Refuse sequences that the protocol does not score."""
+    for sequence in sequences:
+        if sequence.kind != "sintel" or sequence.name not in paper_protocol()["sequences"]:
+            raise InputError(
+                f"--protocol paper: expected training sequences of MPI Sintel, got {sequence.name}."
+            )
+
+
+def protocol_summary(scored: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """What stands under ``protocol`` in ``results.json``, beside the totals: the published lines.
+
+    ``scored`` has the ``name`` and ``pairs_scored`` of each sequence; ``note`` says what of the
+    complete set is missing.
+    """
+    protocol = paper_protocol()
+    names, count = [s["name"] for s in scored], sum(s["pairs_scored"] for s in scored)
+    absent = [name for name in protocol["sequences"] if name not in names]
+    note = ""
+    if absent or count != protocol["pairs"]:
+        note = f"{count} pairs, the complete set has {protocol['pairs']}: not those of the "
+        note += f"published figures; missing: {', '.join(absent) or 'no sequence'}"
+    return protocol | {"note": note, "missing_sequences": absent, "pairs": count}

@@ -10,9 +10,8 @@ import torch
 from hybridvo.cli import main
 from hybridvo.data.sequence import open_sequence
 from hybridvo.errors import InputError
-from hybridvo.evaluation.drawing import draw, prediction_panels
+from hybridvo.evaluation.drawing import draw, integrated_gradients, prediction_panels, saliencies
 from hybridvo.evaluation.plots import Panel, draw_panels, flow_colours, flow_panel
-from hybridvo.evaluation.saliency import integrated_gradients, saliencies
 from hybridvo.network.inputs import assemble_inputs
 from hybridvo.network.pwvo import NetworkOptions, build_network
 from hybridvo.network.selection import select_motion

@@ -11,7 +11,7 @@ import pytest
 
 from hybridvo.commands.compare import compare
 from hybridvo.errors import InputError
-from hybridvo.evaluation.protocols import paper_protocol, protocol_summary, same_intrinsics
+from hybridvo.evaluation.scores import paper_protocol, protocol_summary, same_intrinsics
 from hybridvo.geometry import ego_flow, make_transform
 from hybridvo.options import FlowOptions, Options
 from hybridvo.types import Camera

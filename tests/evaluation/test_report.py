@@ -10,12 +10,17 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from hybridvo.evaluation.charts import error_distribution, factor_charts, path_charts
 from hybridvo.evaluation.metrics import evaluate
-from hybridvo.evaluation.protocols import protocol_summary
-from hybridvo.evaluation.report import number, write_report
+from hybridvo.evaluation.report import (
+    error_distribution,
+    factor_charts,
+    number,
+    path_charts,
+    write_report,
+)
 from hybridvo.evaluation.scores import (
     pair_table,
+    protocol_summary,
     sequence_row,
     total_row,
 )
