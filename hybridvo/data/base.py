@@ -191,7 +191,8 @@ class Sequence:
     def _each_pose(self, files: Files, read: Callable[[Path], np.ndarray]) -> None:
         """Take poses of which each frame has a file."""
         unknown = np.full((4, 4), np.nan)
-        self.poses = np.stack([unknown if path is None else read(path) for path in files])
+        poses = [unknown if path is None else read(path) for path in files]
+        self.poses = np.array(poses).reshape(-1, 4, 4)
 
     def _look_at_first_images(self) -> None:
         """Take the size of the images, and the camera; look at the size and the unit of depth."""
