@@ -23,7 +23,6 @@ from hybridvo.options import option_group
 from hybridvo.synthetic.diverse import DiverseOptions
 from hybridvo.synthetic.draws import STORED, sample_generator
 from hybridvo.synthetic.layered import PaperOptions, Sample, camera_flow
-from hybridvo.synthetic.rendered import RenderedOptions
 
 MANIFEST = "samples.json"
 PER_SHARD = 500
@@ -221,9 +220,7 @@ class StoredSamples:
         return dataclasses.replace(cast(Any, self), folder=self.held_out)
 
 
-PRESETS: dict[str, type] = {
-    "paper": PaperOptions, "diverse": DiverseOptions, "rendered": RenderedOptions,
-}  # fmt: skip
+PRESETS: dict[str, type] = {"paper": PaperOptions, "diverse": DiverseOptions}
 """Generators by the name that a file gives under ``preset``."""
 KINDS: dict[str, type] = PRESETS | {"folder": StoredSamples}
 """These, and samples drawn before."""
