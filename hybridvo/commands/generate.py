@@ -37,7 +37,7 @@ def generate(
     values = {"preset": preset} if preset in PRESETS else read_yaml(preset)
     with Progress("generate", count, "samples", quiet=quiet) as bar:
         for done in write_samples(make_preset(values | own, preset), count, out, seed, workers):
-            bar.update(done)
+            bar.show(done)
     sheet = Path(out) / "contact_sheet.png"
     write_sheet([read_sample(out, i) for i in range(min(6, count))], sheet)
     return sheet
