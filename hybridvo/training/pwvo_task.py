@@ -19,7 +19,12 @@ from hybridvo.results import PixelwisePrediction
 from hybridvo.synthetic.dataset import Mixture, Preset
 from hybridvo.synthetic.draws import TRAINING, sample_generator
 from hybridvo.training.options import PwvoOptions
-from hybridvo.training.validation import TrainingBatch, collate, evaluate_network
+from hybridvo.training.validation import (
+    PUBLISHED_SEED,
+    TrainingBatch,
+    collate,
+    evaluate_network,
+)
 
 FIT_FLOOR_PX, FIT_LIMIT_PX = 0.05, 100.0
 """px of the inputs: error of the fit below which their noise decides it, and the most that a pixel
@@ -93,14 +98,14 @@ class PwvoTask:
         assert made is not None
         return torch.cat([torch.eye(4).to(made).repeat(first, 1, 1), made])
 
-    def evaluate(self, network: nn.Module) -> dict[str, Any]:
-        """Figures on development pairs of each preset."""
-        options = self.options
-        how = {"selection": options.selection, "precision": options.precision}
-        return {
-            Path(name).stem: evaluate_network(network, preset, 0, options.evaluate_count, **how)
-            for name, preset in zip(options.data, self.mixture.presets, strict=True)
-        }
+    def evaluate(self, network: nn.Module, published: int = 0) -> dict[str, Any]:
+        """Figures on development pairs of each preset, or on so many for publishing."""
+        options, found = self.options, {}
+        seed, count = (PUBLISHED_SEED, published) if published else (0, options.evaluate_count)
+        for name, preset in zip(options.data, self.mixture.presets, strict=True):
+            figures = evaluate_network(network, preset, seed, count, selection=options.selection)
+            found[Path(name).stem] = {k: v for k, v in figures.items() if k != "epe_of_pairs"}
+        return found
 
 
 def fit_loss(

@@ -81,7 +81,6 @@ def evaluate_network(
     *,
     selection: str = "softmax",
     batch_size: int = 20,
-    precision: str = "float32",
 ) -> dict[str, Any]:
     """Errors of a network's selected pose on samples 0 to ``count`` - 1 of a seed.
 
@@ -106,8 +105,7 @@ def evaluate_network(
         numbers = range(first, min(first + batch_size, count))
         batch = collate([preset.sample(sample_generator(seed, i)) for i in numbers]).to(device)
         with torch.inference_mode():
-            with torch.autocast(device.type, torch.bfloat16, enabled=precision == "bfloat16"):
-                output = predict(network, batch.inputs, selection)
+            output = predict(network, batch.inputs, selection)
             errors.append(_errors(output, batch, selection))
             if isinstance(output, PixelwisePrediction) and output.log_scale_rotation is not None:
                 pixels.append(_uncertainty(output, batch))
