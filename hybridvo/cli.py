@@ -137,8 +137,10 @@ def _compare(args: argparse.Namespace, command: list[str]) -> Result:
 
 def _show(args: argparse.Namespace, command: list[str]) -> Result:
     from hybridvo.evaluation.drawing import draw
+    from hybridvo.network.models import Models
 
-    return {"files": [str(_call(draw, args, sequence=_open(args)))]}, 0
+    models = Models(weights=arguments.weight_files(args.weights, [args.method, "pwvo"]))
+    return {"files": [str(_call(draw, args, sequence=_open(args), models=models))]}, 0
 
 
 def _evaluate(args: argparse.Namespace, command: list[str]) -> Result:

@@ -35,18 +35,21 @@ def _sequence(command: argparse.ArgumentParser, required: bool = True) -> None:
     add("--mask", metavar="DIR", help="images that are 0 where pixels do not count")
 
 
+def _weights(command: argparse.ArgumentParser) -> None:
+    own = "network weights instead of the pretrained ones, as in pwvo=mine.safetensors"
+    command.add_argument("--weights", action="append", default=[], metavar="NAME=FILE", help=own)
+
+
 def _options(command: argparse.ArgumentParser) -> None:
     """What ``run`` and ``compare`` share."""
     add = command.add_argument
-    flow = "default auto: the sequence's files, else DIS; compare: side by side"
-    add("--flow", choices=FLOWS, help=flow)
+    add("--flow", choices=FLOWS, help="default auto: the sequence's files, else DIS")
     add("--start", type=int, metavar="N", help="first frame (default 0)")
     add("--stop", type=int, metavar="N", help="the one after the last frame")
     add("--stride", type=int, metavar="N", help="step between frames (default 1)")
     add("--seed", type=int, metavar="N", help="of everything drawn at random")
     add("--device", choices=("auto", "cpu", "cuda"), help="of the networks (default auto)")
-    own = "network weights instead of the pretrained ones, as in pwvo=mine.safetensors"
-    add("--weights", action="append", default=[], metavar="NAME=FILE", help=own)
+    _weights(command)
     add("--config", metavar="FILE", help="YAML file of options")
     keys = "one option, as in refine.cutoff=2.5; may be repeated; --set help lists the keys"
     add("--set", action="append", default=[], dest="given", metavar="KEY=VALUE", help=keys)
@@ -91,7 +94,7 @@ def show(command: argparse.ArgumentParser) -> None:
     add("--out", default="pair.png", metavar="FILE", help="default: pair.png")
     add("--method", default="hybrid", metavar="NAME", help="estimator (default: hybrid)")
     add("--flow", choices=FLOWS, default="auto")
-    add("--weights", action="append", default=[], metavar="FILE", help="a network")
+    _weights(command)
     add("--overwrite", action="store_true", help="replace the image")
 
 

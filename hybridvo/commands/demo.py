@@ -76,7 +76,7 @@ def demo(
                 "rotation_deg": row["rot_err_deg_mean"],
                 "epe_px": row["epe_l2_px"],
                 "failed": row["failed"],
-                "frame_ms": row["ms_with_flow_median"],
+                "frame_ms": row["ms_per_pair_median"] + row["flow_ms_median"],
             }
         )
     moving = float(np.median([(scene.object_id(i) > 0).mean() for i in range(scene.frames)]))

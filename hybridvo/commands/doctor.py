@@ -1,6 +1,6 @@
 """``hybridvo doctor``: what is installed here, which methods can run, what is wrong with data.
 
-Of a sequence four questions are asked. What the data do not show is said to be unknown: an answer
+Of a sequence three questions are asked. What the data do not show is said to be unknown: an answer
 is ``agrees``, ``differs`` or ``cannot_tell``, with a sentence and a value.
 """
 
@@ -28,8 +28,6 @@ MIN_PAIRS = 6
 """Fewer pairs do not decide the scale of depth."""
 MAX_SCALE_ERROR = 0.2
 """Wrong units err by more, noisy ground truth over short motions by half of that."""
-MAX_GREY_STEP = 0.15
-"""Change of the logarithm of the mean brightness between neighbours that is called a step."""
 MAX_CONTRADICTED = 0.2
 """Fraction of the pairs whose flow may contradict their images."""
 Answer = tuple[bool | None, str, Any]
@@ -92,7 +90,6 @@ def _measure(sequence: Sequence, prev: Frame, curr: Frame) -> dict[str, Any]:
         pair["depth"] = typical_depth(prev.depth), None
     if prev.rgb is None or curr.rgb is None:
         return pair
-    pair["light"] = (float(curr.rgb.mean()) + 1.0) / (float(prev.rgb.mean()) + 1.0)
     if sequence.has_flow:
         on_file = file_flow(sequence, strict=False)(prev, curr).pair(prev, curr)
         pair["contradiction"] = None if on_file.flow is None else contradiction(on_file) or ""
@@ -114,11 +111,6 @@ def _measure(sequence: Sequence, prev: Frame, curr: Frame) -> dict[str, Any]:
 
 
 # -- answers: of what is known of the pairs, by their first frame ---------------------------------
-
-
-def _furthest(ratios: pd.Series) -> Any:
-    """Frame whose ratio is furthest from one."""
-    return np.log(ratios.clip(lower=1e-30)).abs().idxmax()
 
 
 def _units(known: pd.Series) -> Answer:
@@ -143,8 +135,8 @@ def _depth_steps(known: pd.Series) -> Answer:
     if known.empty:
         return None, "no pair has a motion and depth in both frames", None
     ratios = known.astype(float)
-    steps = int((np.log(ratios.clip(lower=1e-30)).abs() > DOUBTFUL_SPREAD).sum())
-    k = _furthest(ratios)
+    sizes = np.log(ratios.clip(lower=1e-30)).abs()
+    steps, k = int((sizes > DOUBTFUL_SPREAD).sum()), sizes.idxmax()
     text = (
         f"depth changes its scale in {steps} of {len(ratios)} pairs, most from frame {k} "
         f"to the next (times {ratios[k]:.3g})"
@@ -152,18 +144,6 @@ def _depth_steps(known: pd.Series) -> Answer:
     if steps:
         text += ": files of several units, or a scale of its own in every frame"
     return steps > 0, text, float(ratios[k])
-
-
-def _exposure(known: pd.Series) -> Answer:
-    if known.empty:
-        return None, "no pair has two images", None
-    ratios = known.astype(float)
-    steps, k = int((np.log(ratios).abs() > MAX_GREY_STEP).sum()), _furthest(ratios)
-    text = (
-        f"brightness changes by over 15 % in {steps} of {len(ratios)} pairs, most from frame {k} "
-        f"to the next (times {ratios[k]:.2f})"
-    )
-    return steps > 0, text, steps / len(ratios)
 
 
 def _images_against_flow(known: pd.Series) -> Answer:
@@ -180,7 +160,6 @@ def _images_against_flow(known: pd.Series) -> Answer:
 QUESTIONS = {
     "depth units": ("depth", _units),
     "depth from frame to frame": ("depth_ratio", _depth_steps),
-    "exposure": ("light", _exposure),
     "images against flow": ("contradiction", _images_against_flow),
 }
 """Question -> what is measured of every pair, and what answers it."""

@@ -68,7 +68,7 @@ ONLY_IN = {
     "pandas": {"evaluation/", "commands/"},
     "rerun": {"commands/recording.py"},
     "rich": {"commands/"},
-    "yaml": {"files.py", "evaluation/protocols.py", "commands/", "options.py"},
+    "yaml": {"files.py", "commands/", "options.py"},
     "open3d": {"baselines/"},
     "poselib": {"baselines/"},
     "safetensors": {"network/weights.py"},
