@@ -34,12 +34,11 @@ is charged, also behind the camera."""
 class SampleStream(IterableDataset):
     """Endless batches of a preset, from the sample ``start`` of a seed.
 
-    Workers of a ``DataLoader(stream, batch_size=None)`` take batches in turn, and the loader hands
-    them over in order, so that their number changes nothing.
+    Workers take batches in turn and the loader hands them over in order: their number changes
+    nothing.
     """
 
     def __init__(self, preset: Preset, seed: int, start: int, batch_size: int) -> None:
-        super().__init__()
         self.preset, self.seed, self.start, self.batch_size = preset, seed, start, batch_size
 
     def __iter__(self) -> Iterator[TrainingBatch]:
