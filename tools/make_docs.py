@@ -22,7 +22,7 @@ import numpy as np
 from measuring import ROOT, parser_of
 from paper import ROWS
 
-from hybridvo.evaluation.protocols import paper_protocol
+from hybridvo.evaluation.scores import paper_protocol
 from hybridvo.network.selection import SELECTION_METHODS
 
 PART = re.compile(r"(<!-- table:(\w+) -->\n)(.*?)(<!-- end:\2 -->)", re.DOTALL)

@@ -17,14 +17,14 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
 from measuring import ROOT, parser_of, provenance, without_folders
 
 from hybridvo.commands.generate import write_sheet
-from hybridvo.evaluation.drawing import prediction_panels, saliency_panels
+from hybridvo.evaluation.drawing import prediction_panels, saliencies, saliency_panels
 from hybridvo.evaluation.plots import Panel, draw_panels, flow_panel, longest_flow
-from hybridvo.evaluation.saliency import saliencies
 from hybridvo.files import atomic_write, write_json
 from hybridvo.network.losses import reconstruct
 from hybridvo.network.models import load_weights
@@ -129,16 +129,15 @@ def saliency(name: str, network: Any, sample: Any) -> list[Panel]:
 def saliency_on_movers(network: Any, samples: list[Any]) -> dict[str, Any]:
     """Share of the saliency on moving pixels over their share of the image, mean over pairs."""
     ratios: dict[str, list[float]] = {"rotation": [], "translation": []}
-    missed = []
     for sample in samples:
         moving = float(sample.moving.mean())
         if moving < MIN_MOVING:
             continue
         for what, found in saliencies(network, collate([sample]).inputs, None, STEPS).items():
-            share = found.share_on(sample.moving)
-            if share is not None:
-                ratios[what].append(share / moving)
-                missed.append(found.completeness_error)
+            size, mode = found.shape[::-1], cv2.INTER_NEAREST_EXACT
+            mask = cv2.resize(sample.moving.astype(np.uint8), size, interpolation=mode)
+            if found.sum() > 0:
+                ratios[what].append(float(found[mask > 0].sum() / found.sum()) / moving)
     result: dict[str, Any] = {}
     for what, values in ratios.items():
         result[what] = {
@@ -146,7 +145,7 @@ def saliency_on_movers(network: Any, samples: list[Any]) -> dict[str, Any]:
             "standard_error": float(np.std(values) / np.sqrt(len(values))),
             "pairs": len(values),
         }
-    return result | {"median_part_missed": float(np.median(missed))}
+    return result
 
 
 def uncertainty(network: Any, sample: Any) -> list[Panel]:

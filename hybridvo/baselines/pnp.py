@@ -27,11 +27,9 @@ MIN_POINTS = 6
 DEPTH_RANGE_M = (1e-6, 1e6)
 """Open interval of depths that can be metres; outside it squares leave the floating-point range."""
 MIN_INLIER_RATIO = 0.05  # below this share of the sampled pixels a consensus is chance: failed
-LOW_INLIER_RATIO = 0.25  # below this share the largest motion need not be the camera's: degraded
-SINGULAR_RATIO, WEAK_RATIO = 1e-10, 1e-6
-"""Eigenvalue ratios of the scaled information below which a direction is free: failed; or weak:
-degraded. A frontal plane over a field of view of 20 degrees has 1e-4, a patch of 20 px at fx = 1000
-has 1e-9."""
+SINGULAR_RATIO = 1e-10
+"""Eigenvalue ratio of the scaled information below which a direction is free. A frontal plane over
+a field of view of 20 degrees has 1e-4, a patch of 20 px at fx = 1000 has 1e-9."""
 TUNED_PX, DEFAULT_PX = 2.0, 8.0
 """Largest residual of an inlier: of the tuned solvers, and OpenCV's default."""
 TUNED: Any = {"iterationsCount": 1000, "reprojectionError": TUNED_PX, "confidence": 0.999}
@@ -170,67 +168,53 @@ def check(
     threshold_px: float,
     sigma_px: float | None = None,
 ) -> RelativePose:
-    """A solver's motion with covariance and status; failed with the identity where it is none.
+    """A solver's motion with covariance, or a failure with the identity.
 
-    It must be finite, with enough inliers (in front of the camera, within ``threshold_px``), which
+    It must be rigid, with enough inliers (in front of the camera, within ``threshold_px``), which
     determine all six degrees of freedom. Covariance sigma^2 (J^T J)^-1 over them, sigma^2 =
     |r|^2 / (2 n - 6) unless ``sigma_px`` is given: optimistic where a solver stops short.
     """
     if isinstance(data, Status):
         return RelativePose.failed(data.reason, data.message, method)
-    points, ratio, wrong = data.xyz, 0.0, None
-    if not is_rigid(T):
-        wrong = Reason.SOLVER_DIVERGED, "the solver found no finite rigid motion"
-    else:
-        moved = data.xyz @ T[:3, :3].T + T[:3, 3]
-        squared = ((project(moved, camera) - data.uv) ** 2).sum(axis=-1)  # NaN behind the camera
-        inlier = (moved[:, 2] > DEPTH_RANGE_M[0]) & (squared < threshold_px**2)
-        count, ratio = int(inlier.sum()), float(inlier.mean())
-        if count < MIN_POINTS or ratio < MIN_INLIER_RATIO:
-            what = f"{count} of {len(inlier)} sampled pixels follow the motion"
-            wrong = Reason.LOW_INLIERS, what
-        else:
-            points, cost = moved[inlier], float(squared[inlier].sum())
-    values, vectors, scale = _information(points, camera)
-    if values[0] <= SINGULAR_RATIO * values[-1]:
-        what = f"the {len(points)} points leave a direction of the motion undetermined"
-        wrong = Reason.DEGENERATE_GEOMETRY, what
-    facts: dict[str, Any] = {"inlier_ratio": ratio, "method": method}
-    if wrong is not None:
-        return RelativePose.failed(wrong[0], f"{method}: {wrong[1]}", **facts)
-    status = Status()
-    if values[0] <= WEAK_RATIO * values[-1]:
-        what = f"{method}: a direction of the motion is barely determined"
-        status = Status.degraded(Reason.DEGENERATE_GEOMETRY, what)
-    elif ratio < LOW_INLIER_RATIO:
-        what = f"{method}: only {ratio:.0%} of the pixels follow the motion"
-        status = Status.degraded(Reason.LOW_INLIERS, what)
+    failed = partial(RelativePose.failed, method=method)
+    if _information(data.xyz, camera) is None:
+        what = f"{method}: the {len(data.xyz)} points leave a direction of the motion undetermined"
+        return failed(Reason.DEGENERATE_GEOMETRY, what)
+    try:
+        T = as_rigid(T, "T")
+    except InputError:
+        what = f"{method}: the solver found no finite rigid motion"
+        return failed(Reason.SOLVER_DIVERGED, what)
+    moved = data.xyz @ T[:3, :3].T + T[:3, 3]
+    squared = ((project(moved, camera) - data.uv) ** 2).sum(axis=-1)  # NaN behind the camera
+    inlier = (moved[:, 2] > DEPTH_RANGE_M[0]) & (squared < threshold_px**2)
+    count, ratio = int(inlier.sum()), float(inlier.mean())
+    if count < MIN_POINTS or ratio < MIN_INLIER_RATIO:
+        what = f"{method}: {count} of {len(inlier)} sampled pixels follow the motion"
+        return failed(Reason.LOW_INLIERS, what, inlier_ratio=ratio)
+    half = _information(moved[inlier], camera)
+    if half is None:
+        what = f"{method}: the {count} inliers leave a direction of the motion undetermined"
+        return failed(Reason.DEGENERATE_GEOMETRY, what, inlier_ratio=ratio)
+    cost = float(squared[inlier].sum())
     sigma = np.sqrt(cost / (2 * count - 6)) if sigma_px is None else sigma_px
-    half = vectors * scale[:, None] / np.sqrt(values)
-    # exact data has no residual; float32 flow near 1000 px is rounded at 6e-5 px all the same
-    covariance = max(sigma, 1e-4) ** 2 * (half @ half.T)
     return RelativePose(
         T_curr_prev=T,
-        covariance=covariance,
-        status=status,
+        # exact data has no residual; float32 flow near 1000 px is rounded at 6e-5 px all the same
+        covariance=max(sigma, 1e-4) ** 2 * (half @ half.T),
         cost=cost / len(inlier),
         residual_scale_px=float(sigma),
-        **facts,
+        inlier_ratio=ratio,
+        method=method,
     )
 
 
-def is_rigid(T: Any) -> bool:
-    """Whether ``T`` is a finite (4, 4) rigid transform of a length that can be metres."""
-    try:
-        return bool(np.abs(as_rigid(T, "T")[:3, 3]).max() <= DEPTH_RANGE_M[1])
-    except InputError:
-        return False
-
-
-def _information(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Ascending eigenvalues and eigenvectors of J^T J with metres in typical depths; the scale."""
-    # both halves of the tangent are then in radians
+def _information(points: np.ndarray, camera: Camera) -> np.ndarray | None:
+    """B with (J^T J)^-1 = B B^T, None where that is singular."""
+    # metres in typical depths: both halves of the tangent are then in radians
     scale = np.repeat([float(np.median(points[:, 2])), 1.0], 3)
     J = np.concatenate(projection_rows(points, camera)) * scale
     values, vectors = np.linalg.eigh(J.T @ J)
-    return values, vectors, scale
+    if values[0] <= SINGULAR_RATIO * values[-1]:
+        return None
+    return np.asarray(vectors * scale[:, None] / np.sqrt(values))

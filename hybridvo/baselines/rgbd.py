@@ -19,7 +19,6 @@ from hybridvo.baselines.pnp import (
     Correspondences,
     check,
     depth_valid,
-    is_rigid,
     sample,
 )
 from hybridvo.geometry import pose_matrix, project
@@ -86,15 +85,14 @@ def estimate_by_images(method: str, pair: FramePair, seed: int = 0) -> RelativeP
         return RelativePose.failed(frames.reason, frames.message, method)
     with contextlib.suppress(*FOUND_NOTHING):
         T = ALIGNERS[method](*frames)
-    if T is not None and np.isfinite(T).all():
-        # both libraries chain small updates into not quite a rotation
-        T = pose_matrix(T[:3])
+    # both libraries chain small updates into not quite a rotation
+    T = pose_matrix(T[:3]) if T is not None and np.isfinite(T).all() else None
     camera, sigma_px = pair.curr.camera, None
     data = sample(pair, seed)
     if isinstance(data, Status):
         still = FramePair(pair.prev, pair.curr, np.zeros((*camera.shape, 2), np.float32))
         data, sigma_px = sample(still, seed), 1.0
-        if T is not None and is_rigid(T) and not isinstance(data, Status):
+        if T is not None and not isinstance(data, Status):
             uv = project(data.xyz @ T[:3, :3].T + T[:3, 3], camera)
             data = Correspondences(data.xyz, uv)
     # wide, for these methods never saw the flow

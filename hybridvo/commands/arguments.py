@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import difflib
-import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -35,18 +33,21 @@ def _sequence(command: argparse.ArgumentParser, required: bool = True) -> None:
     add("--mask", metavar="DIR", help="images that are 0 where pixels do not count")
 
 
+def _weights(command: argparse.ArgumentParser) -> None:
+    own = "network weights instead of the pretrained ones, as in pwvo=mine.safetensors"
+    command.add_argument("--weights", action="append", default=[], metavar="NAME=FILE", help=own)
+
+
 def _options(command: argparse.ArgumentParser) -> None:
     """What ``run`` and ``compare`` share."""
     add = command.add_argument
-    flow = "default auto: the sequence's files, else DIS; compare: side by side"
-    add("--flow", choices=FLOWS, help=flow)
+    add("--flow", choices=FLOWS, help="default auto: the sequence's files, else DIS")
     add("--start", type=int, metavar="N", help="first frame (default 0)")
     add("--stop", type=int, metavar="N", help="the one after the last frame")
     add("--stride", type=int, metavar="N", help="step between frames (default 1)")
     add("--seed", type=int, metavar="N", help="of everything drawn at random")
     add("--device", choices=("auto", "cpu", "cuda"), help="of the networks (default auto)")
-    own = "network weights instead of the pretrained ones, as in pwvo=mine.safetensors"
-    add("--weights", action="append", default=[], metavar="NAME=FILE", help=own)
+    _weights(command)
     add("--config", metavar="FILE", help="YAML file of options")
     keys = "one option, as in refine.cutoff=2.5; may be repeated; --set help lists the keys"
     add("--set", action="append", default=[], dest="given", metavar="KEY=VALUE", help=keys)
@@ -78,7 +79,8 @@ def compare(command: argparse.ArgumentParser) -> None:
     add("sequences", **named | {"nargs": "*", "default": argparse.SUPPRESS}, help=many)
     add("--dataset", help="kind of the sequences (default: detected)")
     add("--out", default="runs/compare", metavar="DIR", help="default: runs/compare")
-    add("--methods", default="all", help="comma-separated; default: all that run here")
+    names = "comma-separated; default: all that run here"
+    add("--methods", default="all", type=lambda text: text.replace(" ", "").split(","), help=names)
     _options(command)
     add("--protocol", choices=("paper",), help="MPI Sintel as PWVO's paper scores it: 992 pairs")
 
@@ -91,7 +93,7 @@ def show(command: argparse.ArgumentParser) -> None:
     add("--out", default="pair.png", metavar="FILE", help="default: pair.png")
     add("--method", default="hybrid", metavar="NAME", help="estimator (default: hybrid)")
     add("--flow", choices=FLOWS, default="auto")
-    add("--weights", action="append", default=[], metavar="FILE", help="a network")
+    _weights(command)
     add("--overwrite", action="store_true", help="replace the image")
 
 
@@ -104,9 +106,7 @@ def evaluate(command: argparse.ArgumentParser) -> None:
     add("--alignment", choices=kinds, default="se3", help="of the ATE")
     add("--delta", type=float, default=1, metavar="X", help="span of the RPE (default 1)")
     add("--delta-unit", choices=("frames", "s"), default="frames", help="unit of --delta")
-    add("--max-diff", type=float, metavar="S", help="seconds between matches")
-    for name in ("est", "gt"):
-        add(f"--format-{name}", choices=("auto", "tum", "kitti", "tartanair"), default="auto")
+    add("--max-diff", type=float, default=0.02, metavar="S", help="seconds between matches")
 
 
 def doctor(command: argparse.ArgumentParser) -> None:
@@ -203,24 +203,21 @@ def load_options(
     try:
         return Options(**groups)
     except InputError as error:
-        found = re.match(r"Options\.([\w.]+): unexpected", str(error))
-        near = difflib.get_close_matches(found[1], option_defaults(), n=1) if found else []
-        hint = f" Did you mean '{near[0]}'?" if near else ""
         where = " and ".join(str(x) for x in (path, assignments and "--set") if x)
-        raise InputError(f"{where or 'options'}: {error}{hint}") from None
+        raise InputError(f"{where or 'options'}: {error} --set help lists the keys.") from None
 
 
-def weight_files(weights: Iterable[str], methods: Iterable[str]) -> dict[str, str]:
+def weight_files(weights: Iterable[str]) -> dict[str, str]:
     """Network -> file of the ``NAME=FILE`` that ``--weights`` was given."""
     from hybridvo.errors import InputError
-    from hybridvo.pipeline import networks_of
+    from hybridvo.network.models import SELECTION
 
-    known = sorted({name for method in methods for name in networks_of(method)})
+    known = ("selector", *SELECTION)
     files = dict(text.partition("=")[::2] for text in weights)
     for name, path in files.items():
         if name not in known or not Path(path).is_file():
             raise InputError(
-                f"--weights: expected NAME=FILE with {' or '.join(known) or 'no name'} for these "
-                f"methods and a file that exists, got {name}={path}."
+                f"--weights: expected NAME=FILE with {' or '.join(known)} and a file that exists, "
+                f"got {name}={path}."
             )
     return files

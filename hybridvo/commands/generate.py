@@ -8,10 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from hybridvo.commands.progress import Progress
-from hybridvo.errors import InputError
 from hybridvo.evaluation.plots import Panel, draw_panels, flow_colours, longest_flow
 from hybridvo.files import atomic_write
-from hybridvo.synthetic.dataset import PRESETS, make_preset, read_sample, read_yaml, write_samples
+from hybridvo.synthetic.dataset import load_preset, read_sample, write_samples
 from hybridvo.synthetic.layered import Sample
 
 
@@ -30,14 +29,9 @@ def generate(
     ``preset`` is ``paper``, ``diverse`` or a file such as ``configs/data_paper.yaml``, ``size``
     (height, width) instead of its own.
     """
-    own = {} if size is None else dict(zip(("height", "width"), size, strict=True))
-    if not Path(preset).is_file() and preset not in PRESETS:
-        known = ", ".join(PRESETS)
-        raise InputError(f"preset: expected {known} or a YAML file, got {preset!r}.")
-    values = {"preset": preset} if preset in PRESETS else read_yaml(preset)
     with Progress("generate", count, "samples", quiet=quiet) as bar:
-        for done in write_samples(make_preset(values | own, preset), count, out, seed, workers):
-            bar.update(done)
+        for done in write_samples(load_preset(preset, size), count, out, seed, workers):
+            bar.show(done)
     sheet = Path(out) / "contact_sheet.png"
     write_sheet([read_sample(out, i) for i in range(min(6, count))], sheet)
     return sheet

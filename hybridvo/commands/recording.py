@@ -34,30 +34,21 @@ def check_recording(path: str | os.PathLike[str]) -> None:
 class Recording:
     """Writes a recording as the frames come in; use as a context manager.
 
-    ``identity`` is the same for all parts of one run: after ``--resume`` (``first`` > 0) a part is
-    written beside the file. ``poses`` are the true T_world_cam.
+    ``frames``: how many at most; ``poses`` are the true T_world_cam.
     """
 
     def __init__(
-        self,
-        path: str | os.PathLike[str],
-        name: str,
-        identity: str,
-        frames: int,
-        first: int = 0,
-        poses: np.ndarray | None = None,
+        self, path: str | os.PathLike[str], name: str, frames: int, poses: np.ndarray | None
     ) -> None:
         import rerun
 
         self.path = Path(path)
-        if first > 0 and self.path.exists():
-            self.path = self.path.with_stem(f"{self.path.stem}_from_{first:06d}")
         with atomic_write(self.path, "wb"):
             pass  # Rerun reports a bad path only later, in a thread
         self._rr = rerun
         self._stride = max(1, -(-frames // MAX_IMAGES))
         self._positions: list[np.ndarray] = []
-        self._stream = rerun.RecordingStream(f"hybridvo {name}", recording_id=identity)
+        self._stream = rerun.RecordingStream(f"hybridvo {name}")
         self._stream.save(self.path)
         self._stream.log("world", rerun.ViewCoordinates.RIGHT_HAND_Y_DOWN, static=True)
         known = [] if poses is None else poses[np.isfinite(poses).all(axis=(1, 2))]

@@ -27,7 +27,7 @@ from hybridvo.data.sequence import Sequence
 from hybridvo.errors import InputError
 from hybridvo.evaluation.metrics import evaluate
 from hybridvo.evaluation.pair_errors import mean_pair_errors, step_errors, true_trajectory
-from hybridvo.evaluation.plots import plot_trajectories
+from hybridvo.evaluation.plots import plot_trajectory
 from hybridvo.files import Mode, atomic_write, fingerprint, held, versions, write_json
 from hybridvo.flow import FlowProvider, MeasuredFlow, dis_flow, file_flow
 from hybridvo.geometry import se3_log
@@ -66,7 +66,7 @@ def run(
     if rrd is not None:
         check_recording(rrd or RECORDING)
     frames = frames_of(sequence, options)
-    flow = MeasuredFlow(flow_provider(sequence, options))
+    flow = MeasuredFlow(flow_provider(sequence, options)[0])
     name = re.sub(r"[^\w.-]+", "_", sequence.name).strip("._") or "sequence"
     out = Path("runs") / name if out is None else Path(out)
     if out.resolve() in {path.parent.resolve() for path in sequence.rgb_files if path is not None}:
@@ -83,8 +83,7 @@ def run(
             recording = None
             if rrd is not None:
                 poses = None if sequence.poses is None else sequence.poses[list(frames)]
-                named = (rrd or out / RECORDING, sequence.name, header["input_hash"])
-                recording = Recording(*named, len(frames), len(folder.rows), poses)
+                recording = Recording(rrd or out / RECORDING, sequence.name, len(frames), poses)
                 stack.enter_context(recording)
             _estimate(vo, flow, sequence, frames, folder, recording, quiet)
             given = (out, folder.rows, sequence, frames, options.run)
@@ -118,7 +117,7 @@ def _estimate(
             if row["status"] != "ok":
                 text = f"frame {index}: {row['status']} ({row['reason']}), probability "
                 progress.say(f"{text}{row['probability']:.2f}: {row['message']}")
-            progress.update(len(rows), sum(row["status"] == "failed" for row in rows))
+            progress.show(len(rows), sum(row["status"] == "failed" for row in rows))
             if len(rows) % SAVE_EVERY == 0:
                 folder.save_rows(vo.state.to_arrays())
         folder.save_rows()
@@ -195,7 +194,7 @@ def _write_results(
     metrics, gt = None, true_trajectory(sequence, frames)
     if gt is not None:
         report = evaluate(trajectory, gt, alignment=options.alignment)
-        pairs = mean_pair_errors(row for row in rows if "rot_err_deg" in row)
+        pairs = mean_pair_errors([row for row in rows if "rot_err_deg" in row])
         reasons = report["reasons"] | pairs["reasons"]
         named = ("method", "failed", "degraded", "flow_source", "depth_source", "oracle")
         metrics = report | pairs | {key: summary[key] for key in (*named, "sequence")}
@@ -206,7 +205,7 @@ def _write_results(
         if summary["oracle"]:
             title += f" (oracle: {', '.join(summary['oracle'])})"
         path = folder / "trajectory.png"
-        plot_trajectories({options.method: trajectory}, path, truth=gt, title=title)
+        plot_trajectory(options.method, trajectory, path, truth=gt, title=title)
     files = [os.fspath(folder / name) for name in RESULTS if (folder / name).exists()]
     files.append(os.fspath(folder / STATE))
     return summary | {"state": "done", "out": os.fspath(folder), "files": files, "metrics": metrics}
@@ -269,14 +268,14 @@ def frames_of(sequence: Sequence, options: Options) -> range:
     return frames
 
 
-def flow_provider(sequence: Sequence, options: Options) -> FlowProvider:
-    """Provider of the flow that the options ask for."""
+def flow_provider(sequence: Sequence, options: Options) -> tuple[FlowProvider, str]:
+    """Provider of the flow that the options ask for, and what it is called: an oracle is named."""
     source, stride = options.flow.source, options.run.stride
-    if source == "file":
-        sequence.check_flow(stride)
-        return file_flow(sequence, strict=options.run.strict)
     dis = dis_flow(options.flow.dis_preset)
-    if source == "auto" and sequence.has_flow and stride == 1:
-        # where a file is missing or damaged DIS can stand in
-        return file_flow(sequence, strict=options.run.strict, otherwise=dis)
-    return dis
+    if source == "dis" or (source == "auto" and not (sequence.has_flow and stride == 1)):
+        return dis, "dis"
+    sequence.check_flow(stride)
+    # where a file is missing or damaged DIS can stand in
+    otherwise = dis if source == "auto" else None
+    files = file_flow(sequence, strict=options.run.strict, otherwise=otherwise)
+    return files, "file (true)" if sequence.flow_is_true else "file"

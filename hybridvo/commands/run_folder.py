@@ -37,8 +37,8 @@ class RunFolder:
     """An output folder that is held by one run.
 
     ``header`` (JSON-ready) is what ``run.json`` says; its ``identity`` must be equal for a run to
-    be resumed. ``new`` refuses a folder with results, ``overwrite`` removes those of a run (and no
-    other files), ``resume`` goes on.
+    be resumed. ``new`` refuses a folder with results, ``overwrite`` removes those (and no other
+    files), ``resume`` goes on.
 
     Attributes:
         rows: of the finished frames, JSON-ready, in order.
@@ -57,26 +57,21 @@ class RunFolder:
                 f"{path}: holds results of a run already ({', '.join(present[:3])}). Pass "
                 f"--overwrite to replace them, --resume to go on, or another --out."
             )
-        if present:
-            try:
-                before = json.loads((path / STATE).read_text(encoding="utf-8"))
-            except (OSError, ValueError):  # absent or damaged
-                before = {}
-            if "identity" not in before:
-                raise InputError(
-                    f"{path}: holds {', '.join(present[:3])} and no {STATE} of a run: neither "
-                    f"--resume nor --overwrite can go on. Choose another --out."
-                )
-            if mode == "resume":
-                self._load(before)
+        if present and mode == "resume":
+            self._load()
         if self.summary is None:
-            # before the old results go: without it nothing would say that what is left is a run's
             self.save("running")
             if not self.rows:
                 self._remove(CHECKPOINT, *RESULTS)
 
-    def _load(self, before: Mapping[str, Any]) -> None:
+    def _load(self) -> None:
         """Rows and tracker of an earlier run of the same identity."""
+        try:
+            before = json.loads((self.path / STATE).read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            raise InputError(
+                f"{self.path}: no {STATE} of a run to resume. Pass --overwrite to start anew."
+            ) from None
         both = pd.json_normalize([before["identity"], self.header["identity"]]).map(str)
         for key, (then, now) in both.items():
             if then != now:

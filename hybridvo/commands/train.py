@@ -7,7 +7,7 @@
     hybridvo train selector --data runs/selector_data --out runs/selector --time-limit 50
 
 Started again with the same ``--out`` a training goes on where it was. Seeds of selector-data below
-1000 are held out; ``--propose`` asks PWVO about the samples.
+1000 are for a folder ``DATA_held_out``; ``--propose`` asks PWVO about the samples.
 """
 
 from __future__ import annotations
@@ -55,13 +55,11 @@ def add_train(
         pwvo(f"--{name.replace('_', '-')}", type=int, help="instead of the configuration's")
     selector("--config", type=Path, default=Path("configs/train_selector.yaml"))
     selector("--data", type=Path, required=True, help="folder of the shards")
-    selector("--export", type=Path, metavar="FILE", help="write weights when done")
-    selector("--held-out", type=Path, help="shards of held-out samples, for --export")
     export = command("export", _export, "write a network's weights for users (float16)")
     export("--out", type=Path, required=True, help="folder of the run")
     export("--export", type=Path, required=True, metavar="FILE", help="*.safetensors")
     export("--count", type=int, default=1000, help="held-out pairs of each preset")
-    export("--calibrate", type=int, default=0, metavar="N", help="shift s by N pairs")
+    export("--calibrate", type=int, default=0, metavar="N", help="shift PWVO's s by N pairs")
     data = command("selector-data", _selector_data, "draw samples for the selector")
     data("--data", type=Path, required=True, help="folder of the shards")
     data("--first-seed", type=int, default=1_000_000, help="below 1000: held out")
@@ -90,18 +88,11 @@ def _pwvo(args: argparse.Namespace, command: str) -> dict[str, Any]:
 
 
 def _selector(args: argparse.Namespace, command: str) -> dict[str, Any]:
-    from hybridvo.errors import InputError
-    from hybridvo.training.export import export_selector
     from hybridvo.training.options import load_selector_options
     from hybridvo.training.selector_task import SelectorTask
 
-    if args.export is not None and args.held_out is None:
-        raise InputError("--export: needs --held-out, samples for the figures of the card.")
     task = SelectorTask(load_selector_options(args.config), args.data)
-    trainer = _train(args, command, task)
-    if args.export is None:
-        return {"updates": trainer.step}
-    return export_selector(trainer, args.held_out, args.export)["held_out"]
+    return {"updates": _train(args, command, task).step}
 
 
 def _train(args: argparse.Namespace, command: str, task: Any) -> Any:
@@ -136,9 +127,9 @@ def _train(args: argparse.Namespace, command: str, task: Any) -> Any:
 
 
 def _export(args: argparse.Namespace, command: str) -> dict[str, Any]:
-    from hybridvo.training.export import export_pwvo
+    from hybridvo.training.export import export_run
 
-    card = export_pwvo(args.out, args.export, args.count, args.calibrate)
+    card = export_run(args.out, args.export, args.count, args.calibrate)
     return {"file": str(args.export), "held_out": card["held_out"]}
 
 

@@ -63,7 +63,6 @@ class Sequence:
         self.timestamps = np.zeros(0)
         self.poses: np.ndarray | None = None
         self.warnings: list[str] = []
-        self._sources: Files = []  # other files that were read, beside those of the root itself
         self._mask_folder = None if mask is None else Path(mask)
         self._given_camera, self._given_scale = camera, depth_scale
         self._list_files()
@@ -149,9 +148,9 @@ class Sequence:
         return self._read_flow(path, index)
 
     def files(self) -> list[Path]:
-        """Every existing file that the sequence reads, sorted: what a fingerprint covers."""
+        """Images, depth, flow, masks and the files of the root: what a fingerprint covers."""
         frames = (self.rgb_files, self.depth_files, self.flow_files[:-1], self.mask_files)
-        found = {path for paths in (self._sources, *frames) for path in paths if path is not None}
+        found = {path for paths in frames for path in paths if path is not None}
         return sorted(path for path in {*found, *self.root.glob("*")} if path.is_file())
 
     def _list_files(self) -> None:
@@ -190,14 +189,10 @@ class Sequence:
         return numbers
 
     def _each_pose(self, files: Files, read: Callable[[Path], np.ndarray]) -> None:
-        """Take poses of which each frame has a file; a damaged one costs its frame the truth."""
-        self.poses = np.full((len(self), 4, 4), np.nan)
-        for index, path in enumerate(files):
-            try:
-                if path is not None:
-                    self.poses[index] = read(path)
-            except FormatError as error:
-                self.warnings.append(f"no true pose for frame {index}: {error}")
+        """Take poses of which each frame has a file."""
+        unknown = np.full((4, 4), np.nan)
+        poses = [unknown if path is None else read(path) for path in files]
+        self.poses = np.array(poses).reshape(-1, 4, 4)
 
     def _look_at_first_images(self) -> None:
         """Take the size of the images, and the camera; look at the size and the unit of depth."""

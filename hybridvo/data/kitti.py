@@ -74,7 +74,6 @@ class KittiSequence(Sequence):
                 T_cam_cam0[:3, 3] = np.linalg.solve(self._P_left[:, :3], self._P_left[:, 3])
                 poses = read_poses(path, COLUMNS["kitti"])[1] @ invert(T_cam_cam0)
                 self.poses = numbered_poses(numbers, poses)
-                self._sources.append(path)
 
     def _calibration(self) -> Calibration:
         """The rectified left camera."""

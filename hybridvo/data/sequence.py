@@ -21,7 +21,7 @@ from hybridvo.data.sintel import SintelSequence
 from hybridvo.data.tartanair import TartanAirSequence
 from hybridvo.data.tum import TumSequence
 from hybridvo.errors import InputError
-from hybridvo.flow import check_field, file_flow
+from hybridvo.flow import file_flow, with_flow
 from hybridvo.types import Camera, Frame, FramePair
 
 READERS: dict[str, type[Sequence]] = {
@@ -111,10 +111,11 @@ def iter_pairs(
         sequence.check_flow(stride)
         flow = file_flow(sequence)
     frames = map(sequence.frame, range(len(sequence))[start:stop:stride])
-    return (
-        check_field(flow(*two), two[0], "callable").pair(*two, sequence.depth_source)
+    pairs = (
+        FramePair(*two, None, depth_source=sequence.depth_source)
         for two in itertools.pairwise(frames)
     )
+    return (with_flow(pair, flow) for pair in pairs)
 
 
 def resize_camera(camera: Camera, height: int, width: int) -> Camera:

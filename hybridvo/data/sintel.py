@@ -54,7 +54,6 @@ class SintelSequence(Sequence):
             )
         self._cameras = [cameras.get(n) for n in numbers]
         self._invalid = [invalid.get(n) for n in numbers]
-        self._sources = [*self._cameras, *self._invalid]
         self._each_pose(self._cameras, lambda path: invert(read_cam(path)[1]))
 
     def _calibration(self) -> None:

@@ -36,18 +36,16 @@ class TartanAirSequence(Sequence):
         camera, flow_folder = ("lcam_front", "flow_lcam_front") if is_v2 else ("left", "flow")
         if root.parent.name in ("Easy", "Hard"):
             self.name = "_".join(root.parts[-3:])
-        flow = numbered_files(root / flow_folder, r"(\d+)_\d+_flow\.(?:npy|png)")
         numbers = self._list_numbered(
             numbered_files(root / f"image_{camera}", rf"(\d+)_{camera}\.(?:png|jpg)"),
             numbered_files(root / f"depth_{camera}", rf"(\d+)_{camera}_depth\.(?:npy|png)"),
-            flow,
+            numbered_files(root / flow_folder, r"(\d+)_\d+_flow\.(?:npy|png)"),
         )
         pose_file = root / f"pose_{camera}.txt"
         if pose_file.exists():
             self.poses = numbered_poses(
                 numbers, ned_to_camera(read_poses(pose_file, COLUMNS["tartanair"])[1])
             )
-        self._sources = [*map(_mask_file, flow.values())]
 
     def _calibration(self) -> Calibration:
         # Field of view 90 degrees over the width: 320 px at 640, c = (size - 1) / 2 because our

@@ -2,27 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+import torch
 
 from hybridvo.data.sequence import Sequence, iter_pairs
 from hybridvo.errors import InputError
 from hybridvo.evaluation.pair_errors import MOVING_PX, true_motion
 from hybridvo.evaluation.plots import Panel, draw_panels, flow_panel, longest_flow
-from hybridvo.evaluation.saliency import Saliency, last_pass, saliencies
 from hybridvo.files import atomic_write, make_folder
 from hybridvo.flow import dis_flow
 from hybridvo.geometry import ego_flow, matrix_to_euler_deg
-from hybridvo.network.layers import KINDS
-from hybridvo.network.models import load_weights
-from hybridvo.network.weights import pretrained_names, weights_file
+from hybridvo.network.inputs import assemble_inputs
+from hybridvo.network.models import Models
+from hybridvo.network.normalization import first_motions
+from hybridvo.network.selection import select_pose
 from hybridvo.pipeline import DEFAULT_METHOD, estimate
 from hybridvo.results import PixelwisePrediction, RelativePose
 from hybridvo.types import FramePair
+
+PARTS = ("rotation", "translation")
 
 
 def draw(
@@ -32,13 +36,13 @@ def draw(
     *,
     flow: str = "auto",
     method: str = DEFAULT_METHOD,
-    weights: Iterable[str | Path] = (),
+    models: Models | None = None,
     overwrite: bool = False,
 ) -> Path:
-    """Draw the maps of one pair: flow and its parts, error, weights, and what networks look at.
+    """Draw the maps of one pair: flow and its parts, error, weights, and what PWVO looks at.
 
     ``pair`` is its first frame, ``out`` a .png; ``flow`` is ``auto`` (files where there are some),
-    ``file`` or ``dis``; ``weights`` are networks to look through, by default the pretrained ones.
+    ``file`` or ``dis``.
     """
     out = Path(out)
     if out.suffix.lower() != ".png":
@@ -52,19 +56,21 @@ def draw(
     given = next(iter_pairs(sequence, provider, start=pair, stop=pair + 2))
     if given.flow is None or given.prev.depth is None:
         raise InputError(f"{sequence.name}, pair {pair}: has no flow or no depth to look at.")
-    found = networks(weights)
+    models = models or Models()
+    network: Any = models.network("pwvo")
     flow_gt = None
     if sequence.has_flow and sequence.flow_is_true:
         flow_gt = given.flow if given.flow_is_true else sequence.flow(pair)[0]
     T_gt = true_motion(sequence, pair, pair + 1)
-    motion = estimate(given, method=method)
+    motion = estimate(given, method=method, models=models)
     panels, moving = _pair_panels(given, motion, T_gt, flow_gt)
     true = None if T_gt is None else (matrix_to_euler_deg(T_gt[:3, :3]), T_gt[:3, 3])
-    for name, network in found:
-        output, inputs, T_start = last_pass(network, given)
-        if isinstance(output, PixelwisePrediction):
-            panels += prediction_panels(name, output, true, moving)
-        panels += saliency_panels(name, saliencies(network, inputs, T_start), moving)
+    inputs = assemble_inputs(given)
+    T_start = first_motions(network, inputs, "softmax", int(network.options.passes) - 1)
+    with torch.no_grad():
+        output = network(inputs, T_start)
+    panels += prediction_panels("PWVO", output, true, moving)
+    panels += saliency_panels("PWVO", saliencies(network, inputs, T_start), moving)
     source = f"{given.flow_source} (true)" if given.flow_is_true else given.flow_source
     heading = f"{sequence.name}, pair {pair}; flow: {source}; motion: {method}, {motion.status}"
     height, width = given.prev.camera.shape
@@ -72,20 +78,6 @@ def draw(
     with atomic_write(out, "wb") as file:
         file.write(draw_panels(panels, heading, width / height))
     return out
-
-
-def networks(files: Iterable[str | Path] = ()) -> list[tuple[str, Any]]:
-    """(name, network) of the given files, or of all pretrained ones that predict a motion."""
-    found = []
-    paths = [Path(file) for file in files]
-    for path in paths or [weights_file(name) for name in pretrained_names()]:
-        network: Any = load_weights(path)[0]
-        kind = network.options.kind
-        if kind in KINDS:
-            found.append((path.stem, network))
-        elif paths:
-            raise InputError(f"--weights {path}: expected {', '.join(KINDS)}, got a {kind}.")
-    return found
 
 
 # -- panels ---------------------------------------------------------------------------------------
@@ -141,11 +133,71 @@ def prediction_panels(
     return panels
 
 
-def saliency_panels(name: str, found: Mapping[str, Saliency], moving: np.ndarray) -> list[Panel]:
+def saliency_panels(name: str, found: Mapping[str, np.ndarray], moving: np.ndarray) -> list[Panel]:
     """Where a network looks; what moves is outlined."""
     panels = []
-    for what, saliency in found.items():
-        shown = cv2.blur(saliency.magnitude, (4, 4))  # networks read one of some pixels only
+    for what, magnitude in found.items():
+        shown = cv2.blur(magnitude, (4, 4))  # networks read one of some pixels only
         relative = shown / max(float(np.percentile(shown, 99)), 1e-30)
         panels.append(Panel(f"{name}: saliency, {what}", relative, "relative", 1.0, moving))
     return panels
+
+
+# -- what a network looks at -----------------------------------------------------------------------
+
+
+def integrated_gradients(
+    answer: Callable[..., torch.Tensor], inputs: tuple[torch.Tensor, ...], steps: int = 32
+) -> list[torch.Tensor]:
+    """Attributions of a scalar answer, like its inputs (Sundararajan, Taly and Yan, ICML 2017).
+
+    Their sum is the answer for the inputs minus that for zeros, up to the error of the integral:
+    ``steps`` Gauss-Legendre nodes, a forward and a backward pass each; for smooth networks 32 of
+    them leave less than a percent unexplained.
+    """
+    nodes, weights = np.polynomial.legendre.leggauss(steps)
+    sums = [torch.zeros_like(x) for x in inputs]
+    for node, weight in zip((nodes + 1) / 2, weights / 2, strict=True):
+        points = [(float(node) * x).detach().requires_grad_() for x in inputs]
+        # an input that the answer does not depend on has no gradient
+        gradients = torch.autograd.grad(answer(*points), points, allow_unused=True)
+        for total, gradient in zip(sums, gradients, strict=True):
+            if gradient is not None:
+                total += float(weight) * gradient
+    return [total * x for total, x in zip(sums, inputs, strict=True)]
+
+
+def saliencies(
+    network: Any, inputs: Any, T_start: Any = None, steps: int = 32
+) -> dict[str, np.ndarray]:
+    """Absolute attributions (h, w) of rotation and translation to flow and inverse depth.
+
+    The answer is the length of the predicted rotation (or translation) along its own direction; of
+    a pixel-wise network with the pixels and weights chosen for the real input: the choice would
+    make it jump. The path starts at zero; scale-free networks see the logarithm of the depth, which
+    is held fixed, as is what earlier passes found.
+    """
+    names = ("flow",) if network.options.scale_free else ("flow", "inverse_depth")
+    given = tuple(getattr(inputs, name) for name in names)
+
+    def run(*tensors: torch.Tensor) -> Any:
+        return network(replace(inputs, **dict(zip(names, tensors, strict=True))), T_start)
+
+    def part(output: Any, k: int) -> torch.Tensor:
+        is_map = isinstance(output, PixelwisePrediction)
+        return getattr(output, PARTS[k]) if is_map else output[k]
+
+    with torch.no_grad():
+        output = run(*given)
+    found = {}
+    for k, what in enumerate(PARTS):
+        motion = weights = part(output, k).clone().requires_grad_()
+        if isinstance(output, PixelwisePrediction):
+            own: dict[str, Any] = {what: weights}
+            motion = select_pose(replace(output, **own))[k]
+        direction = (motion / motion.norm().clamp(min=1e-12)).detach()
+        (weights,) = torch.autograd.grad((direction * motion).sum(), weights)
+        answer = lambda *x, k=k, w=weights: (w * part(run(*x), k)).sum()  # noqa: E731
+        attributions = integrated_gradients(answer, given, steps)
+        found[what] = torch.cat(attributions, dim=1)[0].abs().sum(0).cpu().numpy()
+    return found

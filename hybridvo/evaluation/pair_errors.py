@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -125,15 +125,16 @@ def pair_errors(
     }
 
 
-def mean_pair_errors(pairs: Iterable[Mapping[str, float | None]]) -> dict[str, Any]:
-    """Means and medians of :func:`pair_errors` over pairs, under the names of ``results.json``.
+def mean_pair_errors(pairs: Any) -> dict[str, Any]:
+    """Means and medians of :func:`pair_errors` over pairs (dictionaries, or a table).
 
-    ``pairs`` is their number; ``reasons`` name every value that is None or leaves pairs out.
+    The names are those of ``results.json``; ``reasons`` name every value that is None or leaves
+    pairs out.
     """
     figures = {name: (name, "mean") for name in ERRORS[:4]}
     for name in ERRORS[4:]:
         figures |= {f"{name}_{how}": (name, how) for how in ("mean", "median")}
-    table = pd.DataFrame(list(pairs), columns=list(ERRORS), dtype=float)
+    table = pd.DataFrame(pairs, columns=list(ERRORS), dtype=float)
     report: dict[str, Any] = {"pairs": len(table), "reasons": {}}
     for key, (name, how) in figures.items():
         known = table[name].dropna()

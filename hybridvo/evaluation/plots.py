@@ -6,10 +6,9 @@ Uses the object interface: no window, no pyplot, no global state.
 from __future__ import annotations
 
 import io
-import itertools
 import os
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,49 +17,43 @@ from matplotlib import colormaps
 from matplotlib.colors import hsv_to_rgb
 from matplotlib.figure import Figure
 
-from hybridvo.evaluation.metrics import Alignment, aligned
+from hybridvo.evaluation.metrics import aligned
 from hybridvo.files import atomic_write
 from hybridvo.geometry import invert
 from hybridvo.trajectory import Trajectory
 
-# Okabe and Ito's palette without yellow: told apart by colour-blind readers, in print too
-_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
-_BLACK = "#222222"
+_BLUE, _BLACK = "#0072B2", "#222222"
 
 
-def plot_trajectories(
-    trajectories: Mapping[str, Trajectory],
+def plot_trajectory(
+    name: str,
+    est: Trajectory,
     path: str | os.PathLike[str],
     *,
     truth: Trajectory | None = None,
-    alignment: Alignment = "se3",
     title: str = "",
 ) -> None:
-    """Draw trajectories from above, and their errors where truth is given.
+    """Draw a trajectory from above, and its error where the truth is given; ``path``: a ``.png``.
 
-    Everything is drawn in the first camera of the truth (or of each trajectory without truth).
-    Estimates are aligned as ``alignment`` says, or by their first pose where a path does not
-    determine it (the legend says which). ``path`` ends in ``.png``.
+    It is drawn in the first camera of the truth, else in its own, rigidly aligned, or by the first
+    pose where the path does not determine that (the legend says which).
     """
-    heights = [1.0] if truth is None else [2.0, 1.0]
     figure = Figure(figsize=(10.0, 7.4), dpi=130, layout="constrained")
+    heights = [1.0] if truth is None else [2.0, 1.0]
     above, *below = figure.subplots(len(heights), squeeze=False, height_ratios=heights)[:, 0]
     above.set(xlabel="x right [m]", ylabel="z forward [m]")
-    start = 0.0
+    style: dict[str, Any] = {"color": _BLUE, "linewidth": 1.4}
     if truth is not None:
         bold = {"label": "ground truth", "color": _BLACK, "linewidth": 2.6, "alpha": 0.55}
         above.plot(*_from_above(truth, truth), **bold)
         start = truth.timestamps[0] if truth.has_timestamps else 0.0
         unit = "time [s]" if truth.has_timestamps else "frame"
         below[0].set(xlabel=unit, ylabel="position error [cm]")
-    for (name, est), colour in zip(trajectories.items(), itertools.cycle(_COLOURS), strict=False):
-        style: dict[str, Any] = {"color": colour, "linewidth": 1.4}
-        if truth is not None:
-            est, error, kind = aligned(est, truth, alignment)
-            if error is not None:
-                below[0].plot(error.stamps - start, 100 * error.translation, **style)
-                name = f"{name} (ATE {100 * error.rmse:.3g} cm, {kind})"
-        above.plot(*_from_above(est, est if truth is None else truth), label=name, **style)
+        est, error, kind = aligned(est, truth)
+        if error is not None:
+            below[0].plot(error.stamps - start, 100 * error.translation, **style)
+            name = f"{name} (ATE {100 * error.rmse:.3g} cm, {kind})"
+    above.plot(*_from_above(est, truth or est), label=name, **style)
     above.plot(0, 0, "o", color=_BLACK, markersize=5, zorder=5)
     above.update_datalim([[-5e-4, -5e-4], [5e-4, 5e-4]])  # a camera that does not move
     above.set_aspect("equal", adjustable="datalim")

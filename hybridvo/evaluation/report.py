@@ -11,10 +11,14 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
+import plotly.express as px
+from plotly.graph_objects import Figure
 
-from hybridvo.evaluation import charts
-from hybridvo.evaluation.charts import is_oracle
+from hybridvo.evaluation.metrics import aligned
+from hybridvo.evaluation.scores import FACTORS, FAILURE_PX
 from hybridvo.files import atomic_write
+from hybridvo.geometry import invert
+from hybridvo.trajectory import read_trajectory
 
 COLUMNS: tuple[tuple[str, str, float], ...] = (
     ("epe_l2_px_median", "EPE, median [px]", 1.0),
@@ -37,6 +41,16 @@ COLUMNS: tuple[tuple[str, str, float], ...] = (
     ("t_err", "paper's T_err [cm]", 100.0),
     ("dynamic_fraction", "moving [%]", 100.0),
 )
+FLOOR_PX = 1e-4
+"""Smaller errors are drawn here: rounding must not squeeze the logarithmic axis."""
+TRUTH = "ground truth"
+LABELS = {
+    "epe_l2_px": "EPE [px]",
+    "epe_l2_px_median": "median EPE [px]",
+    "index": "pair",
+    "right": "x, right [m]",
+    "forward": "z, forward [m]",
+}
 
 
 def write_report(folder: Path, result: Mapping[str, Any], pairs: pd.DataFrame) -> None:
@@ -50,23 +64,26 @@ def write_report(folder: Path, result: Mapping[str, Any], pairs: pd.DataFrame) -
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
     )
-    methods = list(dict.fromkeys(row["method"] for row in result["totals"]))
+    totals, every = (sorted(result[key], key=_rank) for key in ("totals", "rows"))
+    methods = list(dict.fromkeys(row["method"] for row in result["rows"]))
+    flow = totals[0]["flow_source"]  # an oracle is never pooled with what a sensor gives
+    pooled = pairs[pairs["flow_source"] == flow]
     sections = {
-        "How the errors are distributed": charts.error_distribution(pairs, methods),
-        "How often an estimate fails": charts.failure_chart(result["totals"], methods),
-        "What makes it fail": charts.factor_charts(pairs, methods),
+        f"How the errors are distributed, {flow} flow": error_distribution(pooled, methods),
+        f"What makes it fail, {flow} flow": factor_charts(pooled, methods),
     }
-    names = dict.fromkeys(row["sequence"] for row in result["rows"])
-    paths = {name: charts.path_charts(folder, result, pairs, name, methods) for name in names}
-    every = [row for _, rows in by_flow(result, "rows") for row in rows]
+    paths = {
+        facts["name"]: path_charts(folder, facts, result["rows"], pairs, methods)
+        for facts in result["sequences"]
+    }
     content = {
         "result": result,
         "pairs": len(pairs.drop_duplicates(["sequence", "index"])),
         "methods": methods,
-        "tables": [(flow, (rows, COLUMNS, ("method",))) for flow, rows in by_flow(result)],
+        "totals": (totals, COLUMNS, ("method", "flow_source")),
         "sections": [(name, _json(some)) for name, some in sections.items() if some],
         "sequences": [(name, _json(some)) for name, some in paths.items()],
-        "protocol": _protocol_tables(result.get("protocol")),
+        "protocol": _protocol_tables(result.get("protocol"), totals),
         "numbers": (every, COLUMNS, ("sequence", "method", "flow_source")),
         "number": number,
     }
@@ -76,18 +93,11 @@ def write_report(folder: Path, result: Mapping[str, Any], pairs: pd.DataFrame) -
             file.write(text)
 
 
-def by_flow(result: Mapping[str, Any], key: str = "totals") -> list[tuple[str, list[Any]]]:
-    """Rows by source of flow, estimated ones first; in each the fewest failures first."""
-
-    def rank(row: Mapping[str, Any]) -> tuple[float, ...]:
-        errors = row["failure_rate"], row["epe_l2_px_median"]
-        return tuple(math.inf if error is None else error for error in errors)
-
-    flows = sorted(dict.fromkeys(row["flow_source"] for row in result[key]), key=is_oracle)
-    return [
-        (flow, sorted((r for r in result[key] if r["flow_source"] == flow), key=rank))
-        for flow in flows
-    ]
+def _rank(row: Mapping[str, Any]) -> tuple[float, ...]:
+    """Estimated flow before true flow, then the fewest failures first."""
+    errors = row["failure_rate"], row["epe_l2_px_median"]
+    is_oracle = "(true)" in row["flow_source"]
+    return is_oracle, *(math.inf if error is None else error for error in errors)
 
 
 def number(value: float | None, digits: int = 3) -> str:
@@ -104,7 +114,7 @@ def number(value: float | None, digits: int = 3) -> str:
     return f"{value:.{digits}g}"
 
 
-def _protocol_tables(protocol: Mapping[str, Any] | None) -> list[tuple[str, Any]]:
+def _protocol_tables(protocol: Mapping[str, Any] | None, totals: Any) -> list[tuple[str, Any]]:
     """Measured here, and what others published: rows, columns, names."""
     if protocol is None:
         return []
@@ -112,7 +122,7 @@ def _protocol_tables(protocol: Mapping[str, Any] | None) -> list[tuple[str, Any]
     here = [*columns, ("pairs", "pairs", 1.0)]
     others = ("name", "inputs", "source", "note")
     return [
-        ("Measured here", (protocol["table"], here, ("method", "flow_source"))),
+        ("Measured here", (totals, here, ("method", "flow_source"))),
         ("Published by others", (protocol["published"], columns, others)),
     ]
 
@@ -120,3 +130,89 @@ def _protocol_tables(protocol: Mapping[str, Any] | None) -> list[tuple[str, Any]
 def _json(figures: Sequence[Any]) -> list[str]:
     """JSON that may stand inside of a script element."""
     return [figure.to_json().replace("<", "\\u003c") for figure in figures]
+
+
+# -- charts ----------------------------------------------------------------------------------------
+
+
+def _chart(kind: Any, rows: pd.DataFrame, methods: Sequence[str], **more: Any) -> Figure:
+    """A chart with a colour for each method, black for the truth, and a line at one pixel."""
+    palette = px.colors.qualitative.Dark24
+    colours = {method: palette[k % len(palette)] for k, method in enumerate(methods)}
+    errors = {axis: more[axis] for axis in "xy" if more.get(axis, "").startswith("epe")}
+    figure = kind(
+        rows.assign(**{name: rows[name].clip(lower=FLOOR_PX) for name in errors.values()}),
+        color="method",
+        color_discrete_map=colours | {TRUTH: "#000"},
+        category_orders={"method": [TRUTH, *methods]},
+        labels=LABELS,
+        template="plotly_white",
+        height=420,
+        **{f"log_{axis}": True for axis in errors},
+        **more,
+    )
+    for axis in errors:
+        line = figure.add_vline if axis == "x" else figure.add_hline
+        line(FAILURE_PX, line_dash="dot")
+    return figure
+
+
+def error_distribution(pairs: pd.DataFrame, methods: Sequence[str]) -> list[Figure]:
+    """Share of the pairs below an error."""
+    known = pairs.dropna(subset=["epe_l2_px"])
+    if known.empty:
+        return []
+    figure = _chart(px.ecdf, known, methods, x="epe_l2_px", ecdfnorm="percent")
+    return [figure.update_yaxes(title="pairs below it [%]")]
+
+
+def factor_charts(pairs: pd.DataFrame, methods: Sequence[str]) -> list[Figure]:
+    """Median error over the bins of each factor; a factor with one bin tells nothing."""
+    figures = []
+    known = pairs.dropna(subset=["epe_l2_px"])
+    for name, (label, edges) in FACTORS.items():
+        bins = pd.cut(known[name], edges, include_lowest=True)
+        groups = known.groupby(["method", bins], observed=True)["epe_l2_px"]
+        medians = groups.median().rename("epe_l2_px_median").reset_index().sort_values(name)
+        if medians[name].nunique() > 1:
+            medians = medians.assign(**{label: medians[name].astype(str)})
+            axes = {"x": label, "y": "epe_l2_px_median", "markers": True}
+            figures.append(_chart(px.line, medians, methods, **axes))
+    return figures
+
+
+def path_charts(
+    folder: Path,
+    facts: Mapping[str, Any],
+    rows: Sequence[Mapping[str, Any]],
+    pairs: pd.DataFrame,
+    methods: Sequence[str],
+) -> list[Figure]:
+    """Path from above and error of every pair of one of the ``sequences`` of a result."""
+    name, truth = facts["name"], facts["ground_truth"]
+    files = {TRUTH: truth} if truth else {}
+    files |= {row["method"]: row["trajectory"] for row in rows if row["sequence"] == name}
+    paths = _positions({method: folder / file for method, file in files.items()})
+    axes = {"x": "right", "y": "forward", "title": "From above"}
+    figures = [_chart(px.line, paths, methods, **axes).update_yaxes(scaleanchor="x")]
+    known = pairs[pairs["sequence"] == name].dropna(subset=["epe_l2_px"])
+    if len(known):
+        axes = {"x": "index", "y": "epe_l2_px", "title": "Error of every pair"}
+        figures.append(_chart(px.line, known, methods, **axes))
+    return figures
+
+
+def _positions(files: Mapping[str, Path]) -> pd.DataFrame:
+    """``method, right, forward`` of every path in the first true camera, metres."""
+    paths = {name: read_trajectory(file) for name, file in files.items()}
+    gt = paths.get(TRUTH)
+    tables = []
+    for method, path in paths.items():
+        if gt is not None:
+            path = aligned(path, gt)[0]
+        first = path if gt is None else gt
+        x, _, z = path.transformed(invert(first.T_world_cam[0])).positions.T
+        thinned = slice(None, None, len(path) // 1500 + 1)
+        rows = {"method": method, "right": x[thinned], "forward": z[thinned]}
+        tables.append(pd.DataFrame(rows))
+    return pd.concat(tables)

@@ -6,23 +6,26 @@ carries, which is none, in every mean and median.
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from scipy.stats import binomtest
 
-from hybridvo.evaluation.pair_errors import ERRORS, mean_pair_errors
+from hybridvo.errors import InputError
+from hybridvo.evaluation.pair_errors import mean_pair_errors
+from hybridvo.files import parse_yaml
+from hybridvo.types import Camera
 
 FAILURE_PX = 1.0
 """Error of the ego flow at native size above which an estimate has failed, px."""
-READS_NO_FLOW = ("opencv-rgbd", "open3d-rgbd", "identity")
-"""Methods whose result is the same whatever the flow."""
-PATH_KEYS = ("ate_rmse", "rpe_trans_rmse", "rpe_rot_rmse_deg", "ate_rmse_sim3")
-"""Errors of a whole trajectory; the first three are after a rigid alignment."""
-NO_PAIRS = "no pair was estimated"
+PATH_KEYS = ("ate_rmse", "rpe_trans_rmse", "rpe_rot_rmse_deg", "ate_rmse_origin")
+"""Errors of a whole trajectory; the last one is after aligning the first pose alone."""
+NO_PAIRS = "no pair was estimated, or none has ground truth"
 NO_TRUTH = "the sequence has no ground truth for these frames"
 NO_MOVING = "needs true flow of the whole scene (moving objects included) and ground truth"
 FACTORS: Mapping[str, tuple[str, tuple[float, ...]]] = {
@@ -41,9 +44,9 @@ PAIR_COLUMNS = (
 """Columns of ``pairs.csv``."""
 
 
-def pair_table(pairs: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
-    """Pairs as a table with every column; unknown numbers are NaN."""
-    table = pd.DataFrame(list(pairs), columns=PAIR_COLUMNS)
+def pair_table(pairs: Any) -> pd.DataFrame:
+    """Pairs (dictionaries, or a table) with every column and no other; unknown numbers are NaN."""
+    table = pd.DataFrame(pairs, columns=list(PAIR_COLUMNS))
     text = ("sequence", "method", "flow_source", "status", "message")
     numbers = [name for name in PAIR_COLUMNS if name not in text]
     table[numbers] = table[numbers].apply(pd.to_numeric)
@@ -56,7 +59,7 @@ def failure_rate(pairs: pd.DataFrame) -> dict[str, Any]:
     A failure is a failed estimate or an error of the ego flow above one pixel. Pairs whose error is
     unknown and whose estimate did not fail are left out.
     """
-    failed, epe = is_failed(pairs), pairs["epe_l2_px"]
+    failed, epe = pairs["status"].str.startswith("failed"), pairs["epe_l2_px"]
     total, failures = int((failed | epe.notna()).sum()), int((failed | (epe > FAILURE_PX)).sum())
     names = ("failures", "failure_rate", "failure_rate_low", "failure_rate_high")
     if not total:
@@ -66,39 +69,22 @@ def failure_rate(pairs: pd.DataFrame) -> dict[str, Any]:
     return {"pairs": total, **dict(zip(names, values, strict=True))}
 
 
-def is_failed(pairs: pd.DataFrame) -> pd.Series:
-    """Which estimates failed."""
-    return pairs["status"].str.startswith("failed")
-
-
-def known_number(value: float) -> float | None:
-    """The number, None for NaN."""
-    return None if math.isnan(value) else float(value)
-
-
 def pair_scores(pairs: pd.DataFrame) -> dict[str, Any]:
     """Everything that is a mean, median or count over the pairs of one method and flow."""
     scored = pairs[pairs["rot_err_deg"].notna()]
-    scores = mean_pair_errors(scored[list(ERRORS)].to_dict("records"))
-    reasons = scores["reasons"]
-    if pairs.empty:
-        reasons |= dict.fromkeys(reasons, NO_PAIRS)
-    flow_ms = pairs["flow_ms"].where(~pairs["method"].isin(READS_NO_FLOW), 0.0)
-    medians = {
-        "epe_l2_px_median": pairs["epe_l2_px"],
-        "ms_per_pair_median": pairs["ms"],
-        "flow_ms_median": flow_ms,
-        "ms_with_flow_median": pairs["ms"] + flow_ms,
+    scores = mean_pair_errors(scored) | failure_rate(pairs)
+    figures = {
+        "epe_l2_px_median": pairs["epe_l2_px"].median(),
+        "ms_per_pair_median": pairs["ms"].median(),
+        "flow_ms_median": pairs["flow_ms"].median(),
+        "dynamic_fraction": pairs["dynamic_fraction"].mean(),
     }
-    scores |= failure_rate(pairs)
-    scores |= {name: known_number(values.median()) for name, values in medians.items()}
-    scores["dynamic_fraction"] = known_number(pairs["dynamic_fraction"].mean())
-    counts = {"pairs": len(pairs), "failed": int(is_failed(pairs).sum())}
-    scores |= counts | {"pairs_scored": len(scored)}
-    for name, value in scores.items():
-        if value is None and name not in reasons:
-            missing = NO_PAIRS if "ms" in name else reasons.get("epe_l2_px", NO_PAIRS)
-            reasons[name] = NO_MOVING if name == "dynamic_fraction" else missing
+    scores |= {k: None if math.isnan(value) else float(value) for k, value in figures.items()}
+    failed = int(pairs["status"].str.startswith("failed").sum())
+    scores |= {"pairs": len(pairs), "failed": failed, "pairs_scored": len(scored)}
+    for name in [name for name, value in scores.items() if value is None]:
+        unknown = NO_MOVING if name == "dynamic_fraction" else NO_PAIRS
+        scores["reasons"].setdefault(name, unknown)
     return scores
 
 
@@ -106,12 +92,10 @@ def sequence_row(
     pairs: pd.DataFrame, path: Mapping[str, Any] | None, named: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Line of one method on one sequence; ``path`` is what ``evaluate`` says, where it can."""
-    scores, names = pair_scores(pairs), (*PATH_KEYS, "scale_sim3")
-    if path is None or pairs.empty:
-        reason = NO_PAIRS if pairs.empty else NO_TRUTH
-        path = {"alignment": "se3", "reasons": dict.fromkeys(names, reason)}
-    scores["reasons"] |= {k: v for k, v in path["reasons"].items() if k in names}
-    scores |= {name: path.get(name) for name in ("alignment", *names)}
+    scores = pair_scores(pairs)
+    path = path or {"alignment": "se3", "reasons": dict.fromkeys(PATH_KEYS, NO_TRUTH)}
+    scores["reasons"] |= {k: v for k, v in path["reasons"].items() if k in PATH_KEYS}
+    scores |= {name: path.get(name) for name in ("alignment", *PATH_KEYS)}
     return {**named, **scores}
 
 
@@ -140,3 +124,45 @@ def total_row(pairs: pd.DataFrame, rows: Sequence[Mapping[str, Any]]) -> dict[st
     named = {"method": rows[0]["method"], "flow_source": rows[0]["flow_source"]}
     named |= {"sequence": "all", "depth_source": depth, "alignment": "se3"}
     return {**named, "sequences": len(rows), **scores}
+
+
+# -- the paper's way of scoring MPI Sintel ---------------------------------------------------------
+
+
+@functools.cache
+def paper_protocol() -> dict[str, Any]:
+    """The complete set (``sequences`` with their frames, ``pairs``), columns, published lines."""
+    path = Path(__file__).parent / "protocols.yaml"
+    content: dict[str, Any] = parse_yaml(path.read_text(encoding="utf-8"), path.name)
+    return content
+
+
+def same_intrinsics(first: Camera, second: Camera) -> bool:
+    """Whether two cameras are one: the pairs that the paper keeps."""
+    close = np.allclose(first.K, second.K, rtol=0, atol=1e-9 * first.fx)
+    return first.shape == second.shape and close
+
+
+def check_protocol(sequences: Sequence[Any]) -> None:
+    """Refuse sequences that the protocol does not score."""
+    for sequence in sequences:
+        if sequence.kind != "sintel" or sequence.name not in paper_protocol()["sequences"]:
+            raise InputError(
+                f"--protocol paper: expected training sequences of MPI Sintel, got {sequence.name}."
+            )
+
+
+def protocol_summary(scored: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """What stands under ``protocol`` in ``results.json``, beside the totals: the published lines.
+
+    ``scored`` has the ``name`` and ``pairs_scored`` of each sequence; ``note`` says what of the
+    complete set is missing.
+    """
+    protocol = paper_protocol()
+    names, count = [s["name"] for s in scored], sum(s["pairs_scored"] for s in scored)
+    absent = [name for name in protocol["sequences"] if name not in names]
+    note = ""
+    if absent or count != protocol["pairs"]:
+        note = f"{count} pairs, the complete set has {protocol['pairs']}: not those of the "
+        note += f"published figures; missing: {', '.join(absent) or 'no sequence'}"
+    return protocol | {"note": note, "missing_sequences": absent, "pairs": count}

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
@@ -23,7 +23,6 @@ from hybridvo.options import option_group
 from hybridvo.synthetic.diverse import DiverseOptions
 from hybridvo.synthetic.draws import STORED, sample_generator
 from hybridvo.synthetic.layered import PaperOptions, Sample, camera_flow
-from hybridvo.synthetic.rendered import RenderedOptions
 
 MANIFEST = "samples.json"
 PER_SHARD = 500
@@ -51,9 +50,8 @@ class Mixture:
 
     def sample(self, rng: np.random.Generator) -> Sample:
         """One pair of one of the presets."""
-        limits = np.cumsum(self.weights)
-        choice = int(np.searchsorted(limits, rng.random() * limits[-1], side="right"))
-        return self.presets[min(choice, len(self.presets) - 1)].sample(rng)
+        share = np.divide(self.weights, sum(self.weights))
+        return self.presets[int(rng.choice(len(self.presets), p=share))].sample(rng)
 
     @property
     def record(self) -> list[dict[str, Any]]:
@@ -100,10 +98,14 @@ def make_preset(mapping: dict[str, Any], where: str) -> Preset:
     return build_options(KINDS[kind], mapping, where)
 
 
-def load_preset(path: str | Path, size: tuple[int, int] | None = None) -> Preset:
-    """Generator that a file such as ``configs/data_paper.yaml`` describes; ``size``: or its own."""
-    changes = {} if size is None else dict(zip(("height", "width"), size, strict=True))
-    return make_preset(read_yaml(path) | changes, str(path))
+def load_preset(name: str | Path, size: Sequence[int] | None = None) -> Preset:
+    """Generator of a preset's name, or of a file such as ``configs/data_paper.yaml``.
+
+    ``size``: (height, width) instead of its own.
+    """
+    own = {} if size is None else dict(zip(("height", "width"), size, strict=True))
+    mapping = {"preset": name} if name in PRESETS else read_yaml(name)
+    return make_preset(mapping | own, str(name))
 
 
 # --- samples on disk ------------------------------------------------------------------------------
@@ -221,9 +223,7 @@ class StoredSamples:
         return dataclasses.replace(cast(Any, self), folder=self.held_out)
 
 
-PRESETS: dict[str, type] = {
-    "paper": PaperOptions, "diverse": DiverseOptions, "rendered": RenderedOptions,
-}  # fmt: skip
+PRESETS: dict[str, type] = {"paper": PaperOptions, "diverse": DiverseOptions}
 """Generators by the name that a file gives under ``preset``."""
 KINDS: dict[str, type] = PRESETS | {"folder": StoredSamples}
 """These, and samples drawn before."""

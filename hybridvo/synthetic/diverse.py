@@ -1,301 +1,245 @@
-"""Training pairs with what the real world adds to the paper's five steps.
+"""Training pairs of drawn scenes, of none of the families that are measured on.
 
-Rooms, streets and slanted planes with relief; static occluders; movers that are articulated or
-bend, one of which may cover most of the image; motions **composed** (T_cam T_object); sky; hidden
-points; any lens and crop; cameras that follow a mover; inputs as sensors deliver them.
+Streets, halls, hills, walls and tables, in which the bodies of :mod:`hybridvo.synthetic.bodies`
+move, alone or together, free or followed by the camera; rendered where DIS is to see them.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Annotated, Literal
 
-import cv2
 import numpy as np
+from numpy.typing import ArrayLike
 from pydantic import Field
+from scipy.spatial.transform import Rotation
 
-from hybridvo.geometry import euler_deg_to_matrix, make_transform
-from hybridvo.options import Positive, Share, option_group
-from hybridvo.synthetic.draws import (
-    Range,
-    Silhouette,
-    about,
-    covering_mask,
-    direction,
-    log_uniform,
-    outline,
-    random_silhouette,
-    silhouette_mask,
-    smooth_field,
-)
-from hybridvo.synthetic.layered import Layers, Sample, visibility
-from hybridvo.synthetic.sensors import SensorOptions, degrade_depth, degrade_flow, sample_at
+from hybridvo.flow import dis_flow
+from hybridvo.geometry import invert, make_transform, se3_exp
+from hybridvo.options import Share, option_group
+from hybridvo.synthetic.bodies import BODIES, SHAPES, Mover, draw_look, mover
+from hybridvo.synthetic.draws import about, affine, any_turn, carried, log_uniform, turn
+from hybridvo.synthetic.layered import KnownPair, Sample, camera_flow
+from hybridvo.synthetic.raycast import BOX, CYLINDER, ELLIPSOID
+from hybridvo.synthetic.render import Scene, Solid
+from hybridvo.synthetic.scenes import sized
+from hybridvo.synthetic.sensors import degrade_depth, noisy_flow, sample_at
+from hybridvo.types import Camera, Frame, FramePair
 
-SKY_INVERSE_DEPTH = 1.0 / 2000.0
-"""Surfaces farther than two kilometres are sky."""
 
-Pixels = Annotated[int, Field(ge=16)]
-Counts = tuple[Annotated[int, Field(ge=0)], int]
-Law = tuple[Positive, Positive, Positive]
-"""Median, spread of the logarithm, and largest value of a log-normal distribution."""
+class _Surroundings:
+    """What stands still, metres; ``view``: tangents of half the fields of view."""
+
+    def __init__(self, rng: np.random.Generator, view: np.ndarray) -> None:
+        self.rng, self.view = rng, view
+        self.solids: list[Solid] = []
+        kinds = (self.street, self.hall, self.hills, self.wall, self.table)
+        kinds[int(rng.integers(len(kinds)))]()
+        # close to the camera, from a pole to one that fills half of the image
+        self.scatter(4 * rng.random() ** 2, SHAPES, 0.04, 1.0, (1.3, 4.0))
+
+    def add(self, half: ArrayLike, centre: ArrayLike, T: np.ndarray | None = None) -> None:
+        """A box; in a frame."""
+        A = affine(half, centre)
+        self.solids.append(Solid(BOX, A if T is None else carried(T, A), **draw_look(self.rng)))
+
+    def scatter(
+        self,
+        count: float,
+        shapes: tuple[int, ...],
+        low: ArrayLike,
+        high: ArrayLike,
+        depths: tuple[float, float],
+        floor: float | None = None,
+        reach: tuple[float, float] | np.ndarray | None = None,
+        T: np.ndarray | None = None,
+    ) -> None:
+        """Add things of half axes ``low`` to ``high``, over the view or over ``reach`` (x, y).
+
+        Upright on the ``floor``, or turned anyhow in the air; in the frame ``T``.
+        """
+        rng = self.rng
+        for _ in range(round(count)):
+            half = np.exp(rng.uniform(np.log(low), np.log(high), 3))
+            z, R = rng.uniform(*depths) + half.max(), any_turn(rng)
+            x, y = rng.uniform(-1.1, 1.1, 2) * np.asarray(self.view * z if reach is None else reach)
+            if floor is not None:
+                y, R = floor - half[1], Rotation.from_euler("y", rng.uniform(0, 1.5)).as_matrix()
+            A = affine(half, (x, y, z), R)
+            A = A if T is None else carried(T, A)
+            self.solids.append(Solid(int(rng.choice(shapes)), A, **draw_look(rng)))
+
+    def street(self) -> None:
+        """Ground, rows of houses and poles, open to the sky."""
+        floor, side = self.rng.uniform(1.2, 2.2), self.rng.uniform(8, 13)
+        self.add((80, 0.5, 80), (0, floor + 0.5, 60))
+        for x in (-side, side):
+            row = make_transform(np.eye(3), np.array([x, 0, 0]))
+            self.scatter(12, (BOX,), (1.5, 1.5, 1), (3.5, 7, 4), (0, 45), floor, (1.5, 0), row)
+        poles = (0.05, 1.5, 0.05), (0.12, 3.5, 0.12)
+        self.scatter(self.rng.uniform(0, 7), (CYLINDER,), *poles, (0, 25), floor)
+
+    def hall(self) -> None:
+        """A closed room with columns and benches, and lamps in the air."""
+        rng = self.rng
+        low, high = -rng.uniform((3, 2, 4), (9, 5, 4.1)), rng.uniform((3, 1, 7), (9, 2.2, 26))
+        self.add((high - low) / 2, (high + low) / 2)
+        tall, reach = (high[1] - low[1]) / 2, (0.8 * min(high[0], -low[0]), 0.7 * low[1])
+        far, columns = high[2] - tall, ((0.1, tall, 0.1), (0.35, tall, 0.35))
+        self.scatter(rng.uniform(0, 16), (BOX, CYLINDER), *columns, (0, far), high[1], reach)
+        self.scatter(rng.uniform(2, 12), (BOX,), 0.15, 0.7, (2.0, far), high[1], reach)
+        self.scatter(rng.uniform(0, 6), (BOX, ELLIPSOID), 0.1, 0.5, (2.5, far), reach=reach)
+
+    def hills(self) -> None:
+        """Mounds under the sky, with stems and crowns."""
+        rng, floor = self.rng, self.rng.uniform(0.8, 2.5)
+        self.add((90, 0.5, 90), (0, floor + 0.5, 70))
+        self.scatter(rng.uniform(4, 11), (ELLIPSOID,), (2, 0.5, 2), (9, 4, 6), (4, 45), floor + 1)
+        self.scatter(
+            rng.uniform(0, 10), (CYLINDER,), (0.1, 1, 0.1), (0.15, 2, 0.15), (2, 25), floor
+        )
+        self.scatter(rng.uniform(0, 10), (ELLIPSOID,), 0.5, 1.4, (3, 25), floor - 1.5)
+
+    def wall(self) -> None:
+        """One slanted wall with relief, all there is to see."""
+        rng, z = self.rng, self.rng.uniform(3, 12)
+        angles = rng.normal(0, (15, 25, 90))
+        R = Rotation.from_euler("xyz", angles, degrees=True).as_matrix()
+        T = make_transform(R, np.array([0, 0, z]))
+        self.add((25, 25, 0.3), (0, 0, 0.3), T)
+        count, reach = rng.uniform(2, 16), self.view * z
+        self.scatter(count, SHAPES, 0.1, 0.8, (-0.8, 0.0), reach=reach, T=T)
+
+    def table(self) -> None:
+        """Looking down at a table with things on it, a wall behind."""
+        rng, z = self.rng, self.rng.uniform(2, 5)
+        R = Rotation.from_euler("x", rng.uniform(15, 50), degrees=True).as_matrix()
+        T = make_transform(R, np.array([0, 0.35 * z, z]))
+        self.add((12, 0.1, 3), (0, 0.1, 0), T)
+        self.add((20, 12, 0.3), (0, 0, z + rng.uniform(3, 7)))
+        count, reach = rng.uniform(4, 18), (self.view[0] * z, 0)
+        self.scatter(count, SHAPES, 0.08, 0.4, (-1.5, 2.2), 0.0, reach, T)
+
+
+def _movers(rng: np.random.Generator, view: np.ndarray, T_world_cam: np.ndarray) -> list[Mover]:
+    """Bodies, each with a motion of its own or a common one."""
+    many = rng.random() < 0.25
+    count = int(rng.integers(4, 11)) if many else int(rng.integers(1, 4))
+    follow, together, alike = rng.random(3) < (0.45, 0.3, 0.5)
+    kinds = rng.integers(len(BODIES), size=1 if alike else count)
+    own, movers = np.eye(4), []
+    for number in range(count):
+        z = rng.uniform(1.8, 7.0)
+        radius = log_uniform(rng, (0.08 if many or number else 0.3, 0.7)) * np.sqrt(view.prod()) * z
+        centre = np.array([*(rng.uniform(-0.95, 0.95, 2) * view * z), z])
+        # flat enough for a large body not to reach the camera
+        flat = np.diag([radius, radius, min(rng.uniform(0.4, 1.0) * radius, 0.5 * z)])
+        place = make_transform(flat @ any_turn(rng), centre)
+        if not (together and number):
+            # where the camera goes along, what is left of the motion in the image is small
+            left = log_uniform(rng, (0.03, 1.0)) if follow else 1.0
+            t = log_uniform(rng, (0.003, 0.07)) * z * rng.standard_normal(3) * (1, 0.7, 0.7)
+            own = about(turn(rng, left * log_uniform(rng, (0.15, 6.0))), centre, left * t)
+            own = T_world_cam @ own if follow else own
+        parts = BODIES[int(kinds[number % len(kinds)])](rng)
+        movers.append(mover(rng, parts, np.stack([place, own @ place]), nearest=0.4))
+    return movers
+
+
+def training_scene(rng: np.random.Generator, height: int, width: int) -> Scene:
+    """Scene of two frames."""
+    spread = np.tan(np.radians(rng.uniform(34, 100) / 2))
+    aspect = log_uniform(rng, (0.8, 1.25)) if rng.random() < 0.3 else 1.0
+    u, v = np.array([width - 1, height - 1]) / 2 + rng.normal(0, 0.03, 2) * width
+    camera = Camera(width / 2 / spread, aspect * width / 2 / spread, u, v, height, width)
+    view = np.array([spread, spread * height / width / aspect])
+    # some do not turn, some stay where they are, a third goes along its axis
+    moves, turns, ahead = rng.random(3) < (0.95, 0.95, 0.3)
+    angle, length = np.radians(log_uniform(rng, (0.1, 6.0))), log_uniform(rng, (0.005, 0.25))
+    step = np.repeat([length * moves, 0.6 * angle * turns], 3) * rng.standard_normal(6)
+    T = se3_exp(step * (0.3, 0.2, 1, 1, 1, 1) if ahead else step)
+    light = rng.standard_normal(3) * (1, 0.5, 1) - (0, 0.8, 0)
+    noise = float(rng.choice([0.0, rng.uniform(0, 4)]))
+    path, solids = np.stack([np.eye(4), T]), tuple(_Surroundings(rng, view).solids)
+    texture = int(rng.integers(2**31))
+    scene = Scene((camera, camera), path, solids, texture, tuple(light.tolist()), noise)
+    share = rng.choice([0.0, rng.uniform(0, 0.3), rng.uniform(0.3, 0.87)], p=[0.06, 0.3, 0.64])
+    if share:
+        scene = sized(scene, _movers(rng, view, T), float(share), (0.15, 6.0))[0]
+    # from a desk to a street
+    s = log_uniform(rng, (0.2, 3.0))
+    path[:, :3, 3] *= s
+    solids = tuple(
+        replace(x, A_world_body=s * x.A_world_body, wavelength=s * x.wavelength)
+        for x in scene.solids
+    )
+    return replace(scene, solids=solids)
+
+
+def scene_pairs(
+    rng: np.random.Generator, height: int, width: int, images: bool = True
+) -> dict[str, KnownPair]:
+    """A scene with true flow (``rendered``) and, from its images, with DIS flow (``dis``)."""
+    scene = training_scene(rng, height, width)
+    camera, T = scene.cameras[0], invert(scene.T_world_cam[1]) @ scene.T_world_cam[0]
+    rgb = [scene.render(k).rgb if images else None for k in (0, 1)]
+    depth = [scene.depth(k) for k in (0, 1)]
+    flow, _, moving = scene.flow(0)
+    # of the movers' pixels those whose flow the camera alone does not explain
+    own = np.nan_to_num(flow) - camera_flow(camera.K, depth[0], T)[0]
+    moving &= np.square(own).sum(axis=2) > (0.5 * camera.width / 1024) ** 2
+    truth = T, depth[0], moving
+    if rng.random() < 0.5:
+        depth = degrade_depth(rng, depth)
+    second = rng.random() > 0.1
+    if rng.random() < 0.3:  # as in the benchmark's cells, but of any strength
+        share = rng.uniform(0, 0.3) if rng.random() < 0.5 else 0.0
+        flow = noisy_flow(rng, flow, log_uniform(rng, (0.02, 1.0)), share, 0.06 * width)[0]
+    prev = Frame(rgb[0], depth[0], camera)
+    curr = Frame(rgb[1], depth[1] if second else None, camera)
+    pairs = {}
+    if images:
+        field = dis_flow()(prev, curr)
+        estimated = FramePair(prev, curr, field.flow, field.variance, field.valid)
+        pairs["dis"] = KnownPair(estimated, *truth)
+    if rng.random() < 0.4:  # as where flow and depth are given without images
+        prev, curr = replace(prev, rgb=None), replace(curr, rgb=None)
+    exact = FramePair(prev, curr, np.ascontiguousarray(flow))
+    return {"rendered": KnownPair(exact, *truth)} | pairs
 
 
 @option_group
 class DiverseOptions:
-    """Options of the diverse preset; units and reasons stand in ``configs/data_diverse.yaml``."""
+    """Options of the diverse preset.
 
-    height: Pixels = 128
-    width: Pixels = 256
-    field_of_view_deg: Range = (35.0, 105.0)
-    aspect: Range = (0.45, 1.8)
-    centre_shift: Share = 0.1
-    scene_depth: Range = (1.0, 60.0)
-    room_probability: Share = 0.4
-    outdoor_probability: Share = 0.35
-    relief: Annotated[float, Field(ge=0)] = 0.25
-    sky_far_probability: Share = 0.5
-    static_layers: Counts = (0, 7)
-    movers: Counts = (0, 3)
-    mover_radius: Range = (0.04, 0.25)
-    still_probability: Share = 0.08
-    large_mover_probability: Share = 0.5
-    large_coverage: Range = (0.4, 0.87)
-    articulated_probability: Share = 0.35
-    nonrigid_probability: Share = 0.3
-    bend: Range = (0.002, 0.03)
-    follow_probability: Share = 0.35
-    follow_residual: Range = (0.02, 0.6)
-    camera_rotation_deg: Law = (0.5, 1.1, 12.0)
-    camera_translation: Law = (0.02, 1.1, 0.3)
-    camera_translation_limit: Positive = 3.0
-    forward_probability: Share = 0.3
-    object_rotation_deg: Law = (1.5, 1.0, 15.0)
-    object_translation: Law = (0.03, 0.9, 0.25)
-    limb_rotation_deg: Law = (4.0, 0.7, 25.0)
-    moving_threshold_px: Positive = 0.5
-    flow_limit: Positive = 0.35
-    degradation: SensorOptions = SensorOptions()
+    ``dis_share``: of the pairs, whose images are rendered for the flow of OpenCV's DIS; the flow of
+    the others is true or noisy, and they are drawn about ten times as fast.
+    """
+
+    height: Annotated[int, Field(ge=32)] = 128
+    width: Annotated[int, Field(ge=32)] = 256
+    dis_share: Share = 0.0
     preset: Literal["diverse"] = "diverse"
 
     def sample(self, rng: np.random.Generator) -> Sample:
-        """One pair."""
-        while True:
-            scene = _Scene(rng, self)
-            T = scene.populate()
-            ego_flow, ego_ratio, flow, ratio = scene.flows(T, added=False)
-            if self._plausible(flow, ratio) and self._plausible(ego_flow, ego_ratio):
-                break
-        rho = scene.rho
-        depth = np.divide(1.0, rho, out=np.zeros_like(rho), where=rho > 0)
-        own = np.square(flow - ego_flow)
-        hidden, depth_curr = visibility(flow, rho / ratio, rho > 0)
-        measured, depth_prev = flow, depth
-        if rng.random() < self.sky_far_probability and not rho.all():
-            far = np.float32(rng.uniform(1e3, 1e4))
-            depth_prev = np.where(rho > 0, depth, far)
-            depth_curr = np.where((rho > 0) | hidden | (depth_curr > 0), depth_curr, far)
-        if rng.random() >= self.degradation.exact_flow_probability:
-            measured = degrade_flow(rng, flow, hidden, self.degradation)
-            depth_curr = sample_at(depth_curr, measured - flow)
-        if rng.random() >= self.degradation.exact_depth_probability:
-            depth_prev, depth_curr = degrade_depth(rng, [depth_prev, depth_curr], self.degradation)
+        """One pair; its flow is NaN where there is none."""
+        images = rng.random() < self.dis_share
+        known = scene_pairs(rng, self.height, self.width, images)["dis" if images else "rendered"]
+        pair, K, T = known.pair, known.pair.prev.camera.K, known.T_curr_prev
+        assert pair.flow is not None and pair.prev.depth is not None
+        valid = np.isfinite(pair.flow).all(axis=-1)
+        if pair.flow_valid is not None:
+            valid &= pair.flow_valid
+        ego_flow, ratio = camera_flow(K, known.depth, T)
+        curr = np.zeros_like(known.depth) if pair.curr.depth is None else pair.curr.depth
         return Sample(
-            flow=measured,
+            flow=np.where(valid[..., None], pair.flow, np.nan).astype(np.float32),
             ego_flow=ego_flow,
-            depth_prev=depth_prev,
-            depth_curr=depth_curr,
-            depth_true=depth,
-            depth_target=np.maximum(depth * ego_ratio, 0.0),
-            K=scene.K.astype(np.float32),
+            depth_prev=pair.prev.depth,
+            depth_curr=sample_at(curr, np.where(valid[..., None], pair.flow, 0)),
+            depth_true=known.depth,
+            depth_target=np.maximum(known.depth * ratio, 0),
+            K=K.astype(np.float32),
             T_curr_prev=T.astype(np.float32),
-            moving=own[..., 0] + own[..., 1] > self.moving_threshold_px**2,
+            moving=known.moving,
         )
-
-    def _plausible(self, flow: np.ndarray, ratio: np.ndarray) -> bool:
-        """Nothing is swept through the image plane, and flow could follow the motion."""
-        limit = self.flow_limit * self.width
-        # Component by component: numpy reduces an axis of two values very slowly.
-        large = (np.abs(flow[..., 0]) > limit) | (np.abs(flow[..., 1]) > limit)
-        return bool(ratio.min() > 0.15) and np.count_nonzero(large) <= 0.01 * large.size
-
-
-class _Scene(Layers):
-    """A room, a street or a slanted surface, and what is laid over it."""
-
-    def __init__(self, rng: np.random.Generator, options: DiverseOptions) -> None:
-        o, self.rng, self.options = options, rng, options
-        size = np.array([o.width, o.height])
-        fx = o.width / 2 / np.tan(np.deg2rad(log_uniform(rng, o.field_of_view_deg)) / 2)
-        fy = fx * log_uniform(rng, o.aspect)
-        cx, cy = (size - 1) / 2 + o.centre_shift * rng.uniform(-1, 1, 2) * size
-        self.scale = log_uniform(rng, o.scene_depth)
-        K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-        super().__init__(K, np.zeros((o.height, o.width), np.float32))
-        self._build()
-
-    def _build(self) -> None:
-        """Walls, ground or one slanted surface; what is left is sky."""
-        o, rng, rho = self.options, self.rng, self.rho
-        kind = rng.random()
-        yaw, pitch, roll = rng.uniform(-40, 40), rng.normal(0, 10), rng.normal(0, 4)
-        R = euler_deg_to_matrix(np.array([pitch, yaw, roll]))
-        size = self.scale
-        down, right, forward = np.eye(3)[[1, 0, 2]]
-        planes = [(down, size * rng.uniform(0.25, 0.7))]
-        if kind < o.room_probability:
-            planes += [
-                (-down, size * rng.uniform(0.25, 0.9)),
-                (right, size * rng.uniform(0.3, 2.0)),
-                (-right, size * rng.uniform(0.3, 2.0)),
-                (forward, size * rng.uniform(0.7, 3.0)),
-            ]
-        elif kind < o.room_probability + o.outdoor_probability:
-            for side in (1.0, -1.0):
-                if rng.random() < 0.4:
-                    planes.append((side * right, size * rng.uniform(0.3, 4.0)))
-            if rng.random() < 0.4:
-                planes.append((forward, size * rng.uniform(1.0, 20.0)))
-        else:
-            tilt = rng.uniform(-0.9, 0.9, 2)
-            normal = np.array([tilt[0], tilt[1], 1.0])
-            planes = [(normal / np.linalg.norm(normal), size * rng.uniform(0.6, 1.5))]
-            R = np.eye(3)
-        for normal, distance in planes:
-            n = (R.T @ normal / distance).astype(np.float32)
-            np.maximum(rho, n[0] * self.x + (n[1] * self.y + n[2]), out=rho)
-        if kind >= o.room_probability + o.outdoor_probability:
-            # A single surface has no sky: it bends away instead.
-            np.maximum(rho, np.float32(0.05 / size), out=rho)
-        relief = o.relief * rng.random() ** 2
-        rho *= np.exp(relief * smooth_field(rng, rho.shape, int(rng.integers(3, 12))))
-        rho[rho < SKY_INVERSE_DEPTH] = 0.0
-        np.minimum(rho, 5.0, out=rho)
-
-    def add(
-        self, mask: np.ndarray, in_front: bool, inverse_depth: float | None = None
-    ) -> tuple[int, np.ndarray] | None:
-        """Lay a curved, slanted surface over the image; its number and middle (3,), or None."""
-        rng = self.rng
-        left, top, width, height = cv2.boundingRect(mask)
-        if not width * height:
-            return None
-        box = np.s_[top : top + height, left : left + width]
-        inside, under = mask[box] > 0, self.rho[box]
-        if inverse_depth is None:
-            most = max(float(np.quantile(under[::2, ::2], 0.9)), 0.1 / self.scale)
-            factor = rng.uniform(0.05, 1.2) if in_front else rng.uniform(-0.9, 1.4)
-            inverse_depth = min(most * float(np.exp(factor)), 5.0)
-        dx = np.linspace(-1, 1, width, dtype=np.float32)
-        dy = np.linspace(-1, 1, height, dtype=np.float32)[:, None]
-        slope = rng.uniform(-0.15, 0.15, 2).astype(np.float32)
-        bulge = np.float32(rng.uniform(0, 0.2))
-        shape = 1 + slope[0] * dx + slope[1] * dy + bulge * (1 - dx**2 - dy**2)
-        rho = np.float32(inverse_depth) * np.maximum(shape, 0.3)
-        if np.count_nonzero(inside & (rho > under)) < 4:
-            return None
-        rows, columns = np.nonzero(self.lay(box, inside, rho))
-        return len(self.motions) - 1, self.ray(
-            left + columns.mean(), top + rows.mean()
-        ) / inverse_depth
-
-    def ray(self, u: float, v: float) -> np.ndarray:
-        """(3,) K^-1 (u, v, 1)."""
-        return np.linalg.solve(self.K, (u, v, 1.0))
-
-    def magnitude(self, law: Law) -> float:
-        """One draw of a log-normal law."""
-        median, spread, largest = law
-        return min(median * float(np.exp(spread * self.rng.standard_normal())), largest)
-
-    def turn(self, law: Law) -> np.ndarray:
-        """(3, 3) rotation of a drawn size about a drawn axis (small angles: as Euler angles)."""
-        return euler_deg_to_matrix(self.magnitude(law) * direction(self.rng))
-
-    def camera(self, follow: bool) -> np.ndarray:
-        """(4, 4) T_curr_prev."""
-        o, rng = self.options, self.rng
-        angles = self.magnitude(o.camera_rotation_deg) * direction(rng)
-        seen = self.rho[::2, ::2]
-        seen = seen[seen > 0]
-        if not seen.size:
-            seen = np.array([1.0 / self.scale])
-        nearest, near = float(seen.max()), 1.0 / float(np.quantile(seen, 0.8))
-        towards = direction(rng)
-        if rng.random() < o.forward_probability:
-            towards = towards * 0.2 + np.array([0.0, 0.0, rng.choice([-1.0, -1.0, -1.0, 1.0])])
-            towards /= np.linalg.norm(towards)
-        size = self.magnitude(o.camera_translation) * near * (1.5 if follow else 1.0)
-        size = min(size, o.camera_translation_limit, 0.4 / nearest)
-        return make_transform(euler_deg_to_matrix(angles), size * towards)
-
-    def add_mover(
-        self, shape: Silhouette, mask: np.ndarray, radius: float, T_cam: np.ndarray, follow: float
-    ) -> None:
-        """Lay a mover over the scene; ``follow``: motion left where the camera follows, else 0."""
-        o, rng = self.options, self.rng
-        added = self.add(mask, in_front=True)
-        if added is None:
-            return
-        number, centre = added
-        depth = float(centre[2])
-        R = self.turn(o.object_rotation_deg)
-        t = self.magnitude(o.object_translation) * depth * direction(rng) * (1.0, 0.6, 0.8)
-        total = T_cam @ about(R, centre, t)
-        if follow:
-            total = about(euler_deg_to_matrix(follow * 3.0 * direction(rng)), centre, follow * t)
-        self.motions[number] = total
-        if rng.random() < o.nonrigid_probability:
-            amplitude = np.float32(log_uniform(rng, o.bend) * depth)
-            field = smooth_field(rng, self.rho.shape, int(rng.integers(3, 8)), 3)
-            self.bends[number] = amplitude * field
-        if rng.random() < o.articulated_probability:
-            points = shape[0][0]
-            middle = (self.K @ centre)[:2] / depth
-            for _ in range(int(rng.integers(1, 6))):
-                limb_radius = radius * rng.uniform(0.3, 0.8)
-                limb = outline(rng, "bar" if rng.random() < 0.6 else "superellipse")
-                joint = middle + radius * points[int(rng.integers(len(points)))] * 0.8
-                place = joint + limb_radius * limb[int(rng.integers(len(limb)))]
-                limb_mask = silhouette_mask([(limb, True)], self.rho.shape, place, limb_radius)
-                part = self.add(limb_mask, True, 1.02 / depth)
-                if part is not None:
-                    own = self.turn(o.limb_rotation_deg)
-                    self.motions[part[0]] = total @ about(own, self.ray(*joint) * depth)
-
-    def small(self, shape: Silhouette, radius: float, highest: float) -> np.ndarray:
-        """Mask of an outline somewhere, stretched by 0.4 to ``highest``."""
-        place = self.rng.uniform(0, self.rho.shape[1]), self.rng.uniform(0, self.rho.shape[0])
-        stretch = log_uniform(self.rng, (0.4, highest))
-        return silhouette_mask(shape, self.rho.shape, place, radius, stretch)
-
-    def occlude(self, count: int) -> None:
-        """Lay things that stand still over the scene."""
-        for _ in range(count):
-            radius = self.rho.shape[1] * log_uniform(self.rng, self.options.mover_radius)
-            self.add(self.small(random_silhouette(self.rng), radius, 2.5), in_front=False)
-
-    def populate(self) -> np.ndarray:
-        """Occluders and movers; returns the camera's T_curr_prev."""
-        o, rng = self.options, self.rng
-        still = rng.random() < o.still_probability
-        large = not still and rng.random() < o.large_mover_probability
-        follow = 0.0
-        if not still and rng.random() < o.follow_probability:
-            follow = log_uniform(rng, o.follow_residual)
-        self.occlude(int(rng.integers(o.static_layers[0], o.static_layers[1] + 1)))
-        T_cam = self.camera(follow > 0)
-        if large:
-            centre = rng.uniform(-0.1, 1.1) * o.width, rng.uniform(0.1, 1.1) * o.height
-            share = rng.uniform(*o.large_coverage)
-            shape, stretch = random_silhouette(rng, 0.15), log_uniform(rng, (0.5, 1.6))
-            mask, radius = covering_mask(shape, self.rho.shape, centre, share, stretch)
-            self.add_mover(shape, mask, radius, T_cam, follow)
-        if not still:
-            count = int(rng.integers(o.movers[0], o.movers[1] + 1))
-            for index in range(count if large else max(count, 1)):
-                shape = random_silhouette(rng)
-                radius = o.width * log_uniform(rng, o.mover_radius)
-                followed = 0.0 if index or large else follow
-                self.add_mover(shape, self.small(shape, radius, 2.0), radius, T_cam, followed)
-        if rng.random() < 0.4:
-            self.occlude(int(rng.integers(1, 3)))
-        return T_cam

@@ -6,26 +6,12 @@ differences of superellipses, polygons, stars and thin bars, of every degree of 
 
 from __future__ import annotations
 
-from typing import Annotated
-
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import AfterValidator
 from scipy.spatial.transform import Rotation
 
 from hybridvo.geometry import make_transform
-
-
-def _ordered(limits: tuple[float, float]) -> tuple[float, float]:
-    if not 0 < limits[0] <= limits[1]:
-        raise ValueError("expected 0 < low <= high")
-    return limits
-
-
-Range = Annotated[tuple[float, float], AfterValidator(_ordered)]
-"""Two positive limits of an option."""
-
 
 HELD_OUT, TRAINING, STORED = range(3)
 """What samples are drawn for; none of one kind is one of another, whatever the seeds."""
@@ -37,7 +23,7 @@ def sample_generator(seed: int, index: int, use: int = HELD_OUT) -> np.random.Ge
     return np.random.Generator(np.random.Philox(key=key))
 
 
-def log_uniform(rng: np.random.Generator, limits: Range) -> float:
+def log_uniform(rng: np.random.Generator, limits: tuple[float, float]) -> float:
     """One draw, uniform in the logarithm between two positive limits."""
     return float(np.exp(rng.uniform(np.log(limits[0]), np.log(limits[1]))))
 
@@ -172,40 +158,17 @@ def _unit(angle: np.ndarray) -> np.ndarray:
 
 
 def silhouette_mask(
-    shape: Silhouette, size: tuple[int, int], centre: ArrayLike, radius: float, stretch: float = 1.0
+    shape: Silhouette, size: tuple[int, int], centre: np.ndarray, radius: float
 ) -> np.ndarray:
-    """(H, W) uint8 mask: ``centre`` (u, v) and ``radius`` of one unit in px, ``stretch`` horizontal
-    over vertical scale.
-    """
-    mask, limit = np.zeros(size, np.uint8), 8 * max(size)
-    scale = np.array([radius * np.sqrt(stretch), radius / np.sqrt(stretch)])
+    """(H, W) uint8 mask: ``centre`` (u, v) and ``radius`` of one unit in px."""
+    mask = np.zeros(size, np.uint8)
     for points, adds in shape:
-        pixels = np.clip(points * scale + centre, -limit, limit)
-        sixteenths = np.round(pixels * 16).astype(np.int32)
+        sixteenths = np.round((points * radius + centre) * 16).astype(np.int32)
         cv2.fillPoly(mask, [sixteenths], int(adds), cv2.LINE_8, 4)
     return mask
 
 
-def covering_mask(
-    shape: Silhouette, size: tuple[int, int], centre: ArrayLike, share: float, stretch: float = 1.0
-) -> tuple[np.ndarray, float]:
-    """Mask and radius in px at which about ``share`` of the image is covered."""
-    low, high = 0.0, 4.0 * float(np.hypot(*size))
-    best, radius = np.zeros(size, np.uint8), 0.0
-    for _ in range(12):
-        middle = 0.5 * (low + high)
-        mask = silhouette_mask(shape, size, centre, middle, stretch)
-        covered = cv2.countNonZero(mask) / mask.size
-        if covered > share:
-            high = middle
-            continue
-        low, radius, best = middle, middle, mask
-        if covered > share - 0.01:
-            break
-    return best, radius
-
-
-def random_silhouette(rng: np.random.Generator, hole_probability: float = 0.4) -> Silhouette:
+def random_silhouette(rng: np.random.Generator) -> Silhouette:
     """Union of one to four outlines, from which one or two smaller ones may be cut."""
     first = KINDS[int(rng.choice(4, p=[0.35, 0.3, 0.3, 0.05]))]
     parts = [(outline(rng, first), True)]
@@ -213,7 +176,7 @@ def random_silhouette(rng: np.random.Generator, hole_probability: float = 0.4) -
         kind = KINDS[int(rng.integers(4))]
         size = rng.uniform(0.7, 1.3) if kind == "bar" else rng.uniform(0.3, 0.8)
         parts.append((size * outline(rng, kind) + rng.uniform(-0.6, 0.6, 2), True))
-    if rng.random() < hole_probability:
+    if rng.random() < 0.4:
         for _ in range(int(rng.integers(1, 3))):
             kind = KINDS[int(rng.integers(3))]
             points = rng.uniform(0.12, 0.4) * outline(rng, kind) + rng.uniform(-0.6, 0.6, 2)

@@ -92,21 +92,16 @@ class Layers:
         self.x = ((np.arange(width) - K[0, 2]) / K[0, 0]).astype(rho.dtype)
         self.y = ((np.arange(height)[:, None] - K[1, 2]) / K[1, 1]).astype(rho.dtype)
         self.motions: list[np.ndarray | None] = []
-        self.bends: list[np.ndarray | None] = []
 
-    def lay(
-        self, box: tuple[slice, slice], inside: np.ndarray, rho: np.ndarray | float
-    ) -> np.ndarray:
-        """Add a surface that does not move yet; returns where it is in front of what was there.
+    def lay(self, box: tuple[slice, slice], inside: np.ndarray, rho: float) -> None:
+        """Add a flat surface that does not move yet, where it is in front of what is there.
 
         ``inside``: (h, w) bool, its outline in the box of rows and columns; ``rho``: inverse depth.
         """
         shown = inside & (rho > self.rho[box])
         self.owner[box][shown] = len(self.motions)
-        self.rho[box][shown] = rho[shown] if isinstance(rho, np.ndarray) else rho
+        self.rho[box][shown] = rho
         self.motions.append(None)
-        self.bends.append(None)
-        return shown
 
     def flows(
         self, T_curr_prev: np.ndarray, added: bool
@@ -125,11 +120,8 @@ class Layers:
             if motion is None:
                 continue
             mine = rows, columns = np.nonzero(self.owner == number)
-            t, bend = motion[:3, 3], self.bends[number]
-            if bend is not None:
-                t = (t + bend[mine]).T
-            x, y = self.x[columns], self.y[rows, 0]
-            u, v, change = rigid_flow(x, y, self.rho[mine], motion[:3, :3], t, focal)
+            R, t, x, y = motion[:3, :3], motion[:3, 3], self.x[columns], self.y[rows, 0]
+            u, v, change = rigid_flow(x, y, self.rho[mine], R, t, focal)
             own = np.stack([u, v], axis=-1)
             flow[mine] = flow[mine] + own if added else own
             ratio[mine] = ratio[mine] + change - 1.0 if added else change
@@ -153,9 +145,9 @@ def rigid_flow(
     """Flow (u, v) of a rigid motion in px and the ratio of the new depth to the old.
 
     Paper, equation 8, written as differences, so that single precision suffices: ``x`` and ``y``
-    normalised coordinates, ``inverse_depth`` and ``t`` (3,) or (3, N) metres, that broadcast.
+    normalised coordinates and ``inverse_depth``, which broadcast.
     """
-    R, t = R.astype(x.dtype), np.asarray(t, x.dtype)
+    R, t = R.astype(x.dtype), t.astype(x.dtype)
     ratio = (R[2, 0] * x + (R[2, 1] * y + R[2, 2])) + t[2] * inverse_depth
     # The published code takes |z'|: a point behind the camera keeps a bounded flow.
     scale = 1.0 / np.maximum(np.abs(ratio), MIN_RATIO)
@@ -164,11 +156,10 @@ def rigid_flow(
     return u, v, ratio
 
 
-def splat(flow: np.ndarray, rho_curr: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def splat(flow: np.ndarray, rho_curr: np.ndarray) -> np.ndarray:
     """(H, W) inverse depth of the next frame, nearest in front; 0 where nothing lands.
 
-    ``rho_curr``: (H, W) of the moved points on their own grid. Also the flat index of the pixel
-    that each of them comes to, and whether it does.
+    ``rho_curr``: (H, W) of the moved points on their own grid.
     """
     height, width = rho_curr.shape
     place = np.rint(flow + pixel_grid(height, width)).astype(np.int64)
@@ -182,25 +173,7 @@ def splat(flow: np.ndarray, rho_curr: np.ndarray) -> tuple[np.ndarray, np.ndarra
         value += slope * off[..., axis]
     front = np.zeros(rho_curr.size, rho_curr.dtype)
     np.maximum.at(front, index[inside], value[inside])
-    return front.reshape(rho_curr.shape), index, inside
-
-
-def visibility(
-    flow: np.ndarray, rho_curr: np.ndarray, solid: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Who is hidden in the next frame or outside, and the depth of t+1 on the grid of t.
-
-    From the true flow, inverse depths of the moved points and where there is no sky; the depth is
-    0 outside and for sky.
-    """
-    front, index, inside = splat(flow, rho_curr)
-    seen = front.ravel()[index]
-    # A tenth: neighbours on a slanted surface share a pixel of the next frame.
-    covered = inside & (seen > np.float32(1.1) * rho_curr)
-    inverse = np.where(covered, seen, rho_curr)
-    known = inside & (solid | covered)
-    depth = np.where(known, 1.0 / np.maximum(inverse, np.float32(1e-5)), 0.0)
-    return covered | ~inside, depth.astype(np.float32)
+    return front.reshape(rho_curr.shape)
 
 
 @option_group

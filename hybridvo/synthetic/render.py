@@ -150,6 +150,11 @@ class Scene:
         flow, hidden, solid = self._motion(index, (index + 1, index + 1), *cameras)
         return flow.astype(np.float32), hidden, self._object_id(solid) > 0
 
+    def depth(self, index: int) -> np.ndarray:
+        """(H, W) float32 metres of a frame, 0 where nothing is hit."""
+        depth = self._cast(index, self.cameras[index])[1]
+        return np.where(np.isfinite(depth), depth, 0.0).astype(np.float32)
+
     def object_id(self, index: int) -> np.ndarray:
         """(H, W) int32 object numbers of a frame."""
         return self._object_id(self._cast(index, self.cameras[index])[-1])

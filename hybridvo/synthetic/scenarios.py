@@ -126,7 +126,7 @@ def make_pair(
     layers = Layers(camera.K, _surfaces(rng, cell, (height, width)))
     _add_objects(rng, cell, layers, T)
     _, _, flow, ratio = layers.flows(T, added=False)
-    seen = splat(flow, layers.rho / ratio)[0]
+    seen = splat(flow, layers.rho / ratio)
     depths = [(1.0 / np.where(r > 0, r, np.nan)).astype(np.float32) for r in (layers.rho, seen)]
     measured, outlier = noisy_flow(rng, flow, cell.flow_noise_px, cell.outliers, 60.0)
     prev, curr = (
@@ -207,7 +207,6 @@ def _add_objects(rng: np.random.Generator, cell: Scenario, layers: Layers, T: np
         towards = np.array([np.cos(heading), np.sin(heading), rng.uniform(-0.5, 0.5)])
         t = rng.uniform(8, 70) / 1120 * centre[2] * towards
         layers.motions.append(T @ about(turn(rng, rng.uniform(0, 5)), centre, t))
-        layers.bends.append(None)
 
 
 def _sensed(

@@ -35,8 +35,8 @@ class OptimizerOptions:
 class ScheduleOptions:
     """Factor on the learning rate over the run, whose progress is counted by steps or by time.
 
-    ``warmup``: share of the run over which the rate grows from 0; ``halvings``: shares at which it
-    halves (the paper's staircase); ``final_share``: of the peak, at which ``cosine`` ends.
+    ``warmup`` from 0 and ``halvings`` (the paper's staircase): shares of the run; ``final_share``:
+    of the peak, at which ``cosine`` ends.
     """
 
     kind: Literal["halving", "cosine"] = "halving"
@@ -60,7 +60,7 @@ class ScheduleOptions:
 class RunOptions:
     """What every training has; the defaults are the paper's.
 
-    ``ema_decay``: of a running average of the weights, which is then what is exported; 0 = none.
+    ``ema_decay``: of the running average of the weights, which is what is exported.
     ``evaluate_every``: updates between evaluations over ``evaluate_count`` samples of each preset.
     """
 

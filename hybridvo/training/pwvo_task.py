@@ -19,7 +19,12 @@ from hybridvo.results import PixelwisePrediction
 from hybridvo.synthetic.dataset import Mixture, Preset
 from hybridvo.synthetic.draws import TRAINING, sample_generator
 from hybridvo.training.options import PwvoOptions
-from hybridvo.training.validation import TrainingBatch, collate, evaluate_network
+from hybridvo.training.validation import (
+    PUBLISHED_SEED,
+    TrainingBatch,
+    collate,
+    evaluate_network,
+)
 
 FIT_FLOOR_PX, FIT_LIMIT_PX = 0.05, 100.0
 """px of the inputs: error of the fit below which their noise decides it, and the most that a pixel
@@ -29,12 +34,11 @@ is charged, also behind the camera."""
 class SampleStream(IterableDataset):
     """Endless batches of a preset, from the sample ``start`` of a seed.
 
-    Workers of a ``DataLoader(stream, batch_size=None)`` take batches in turn, and the loader hands
-    them over in order, so that their number changes nothing.
+    Workers take batches in turn and the loader hands them over in order: their number changes
+    nothing.
     """
 
     def __init__(self, preset: Preset, seed: int, start: int, batch_size: int) -> None:
-        super().__init__()
         self.preset, self.seed, self.start, self.batch_size = preset, seed, start, batch_size
 
     def __iter__(self) -> Iterator[TrainingBatch]:
@@ -93,14 +97,14 @@ class PwvoTask:
         assert made is not None
         return torch.cat([torch.eye(4).to(made).repeat(first, 1, 1), made])
 
-    def evaluate(self, network: nn.Module) -> dict[str, Any]:
-        """Figures on development pairs of each preset."""
-        options = self.options
-        how = {"selection": options.selection, "precision": options.precision}
-        return {
-            Path(name).stem: evaluate_network(network, preset, 0, options.evaluate_count, **how)
-            for name, preset in zip(options.data, self.mixture.presets, strict=True)
-        }
+    def evaluate(self, network: nn.Module, published: int = 0) -> dict[str, Any]:
+        """Figures on development pairs of each preset, or on so many for publishing."""
+        options, found = self.options, {}
+        seed, count = (PUBLISHED_SEED, published) if published else (0, options.evaluate_count)
+        for name, preset in zip(options.data, self.mixture.presets, strict=True):
+            figures = evaluate_network(network, preset, seed, count, selection=options.selection)
+            found[Path(name).stem] = {k: v for k, v in figures.items() if k != "epe_of_pairs"}
+        return found
 
 
 def fit_loss(

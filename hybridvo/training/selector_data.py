@@ -21,9 +21,9 @@ from hybridvo.network.prediction import propose_motion
 from hybridvo.options import Options
 from hybridvo.refinement.pixels import grid_stride
 from hybridvo.results import MotionPrediction, RelativePose
+from hybridvo.synthetic.diverse import scene_pairs
 from hybridvo.synthetic.draws import log_uniform
 from hybridvo.synthetic.layered import KnownPair
-from hybridvo.synthetic.rendered import rendered_pairs
 from hybridvo.synthetic.semi_real import Recording, draw_pair
 
 PER_SHARD = 64
@@ -35,8 +35,8 @@ SIZES = ((160, 320), (160, 320), (128, 256), (192, 256), (120, 400), (218, 512))
 MOVING, STATIC, UNKNOWN = 0, 1, 255
 """Labels of the pixels."""
 SOURCES = ("diverse", "rendered", "dis", "semi-real")
-"""Where samples come from: the diverse preset (no longer drawn), rendered scenes with true flow and
-with DIS, and recordings with movers cut from others."""
+"""Where samples come from: drawn scenes (the first kind is no longer made) with true flow and with
+DIS, and recordings with movers cut from others."""
 
 
 def draw_samples(
@@ -52,7 +52,7 @@ def draw_samples(
     if recordings:
         pairs = {"semi-real": draw_pair(rng, recordings)}
     else:
-        pairs = rendered_pairs(rng, height, width)
+        pairs = scene_pairs(rng, height, width)
     samples = []
     for source, drawn in pairs.items():
         T_prior = None

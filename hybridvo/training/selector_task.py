@@ -306,17 +306,15 @@ class SelectorTask:
         total = torch.stack(list(losses.values())).sum()
         return total, {name: value.detach() for name, value in losses.items()}
 
-    def evaluate(self, network: torch.nn.Module) -> dict[str, Any]:
-        """Figures on the held-out shards beside the training's, ``FOLDER_held_out``."""
+    def evaluate(self, network: torch.nn.Module, published: int = 0) -> dict[str, Any]:
+        """Figures on all held-out shards beside the training's, ``FOLDER_held_out``."""
         files = sorted(Path(f"{self.folder}_held_out").glob("*.npz"))
-        return evaluate_selector(network, files, self.options.refits) if files else {}
+        return evaluate_selector(network, files, self.options.refits)
 
 
 @torch.no_grad()
-def evaluate_selector(
-    network: Any, files: list[Path], refits: int = 2, asked: bool = False
-) -> dict[str, dict[str, Any]]:
-    """Shares of wrong answers on samples of shards, by source; ``asked``: with the other network.
+def evaluate_selector(network: Any, files: list[Path], refits: int) -> dict[str, dict[str, Any]]:
+    """Shares of wrong answers on samples of shards, by source; PWVO takes part where it was asked.
 
     For each source: ``samples``, the share of them whose motion is further from the ground truth
     than is right for ``support`` (the first motion found), ``final`` (the answer) and ``best`` (of
@@ -324,7 +322,7 @@ def evaluate_selector(
     """
     rows: dict[str, list[list[float]]] = {}
     for batch in read_batches(files, 8, None):
-        looks = Looks(network, batch.shown(torch.full((len(batch),), asked)))
+        looks = Looks(network, batch.shown(torch.ones(len(batch), dtype=torch.bool)))
         looks.again(refits)
         score, error, trust = looks.score, looks.error, looks.trust()
         for b, mine in enumerate(looks.motions()):

@@ -12,7 +12,6 @@ import json
 import math
 import pickle
 import time
-from collections import defaultdict
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -58,14 +57,15 @@ class Trainer:
         self.network = task.network.to(self.device)
         if self.options.channels_last:
             self.network = self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        # the network that a user should get: the running average where there is one
-        self.exported = self.network
-        if self.options.ema_decay > 0:
-            self.exported = copy.deepcopy(self.network).requires_grad_(False)
+        # the network that a user should get: the running average
+        self.exported = copy.deepcopy(self.network).requires_grad_(False)
         how = self.options.optimizer
         self.optimizer = torch.optim.AdamW(
             self.network.parameters(), how.learning_rate, how.betas, weight_decay=how.weight_decay
         )
+        self._parts: dict[str, Any] = {
+            "network": self.network, "optimizer": self.optimizer, "ema": self.exported,
+        }  # fmt: skip
         self.step = self.samples = self.skipped = self.skipped_in_a_row = 0
         self.elapsed_s = 0.0
         self.stop_requested = False
@@ -93,12 +93,11 @@ class Trainer:
         if math.isfinite(float(norm)):
             self.optimizer.step()
             self.skipped_in_a_row = 0
-            if self.exported is not self.network:
-                # A young average follows quickly: it must forget the random start.
-                decay = min(self.options.ema_decay, (1 + self.step) / (10 + self.step))
-                theirs = self.network.state_dict()
-                for name, value in self.exported.state_dict().items():
-                    value.lerp_(theirs[name], 1 - decay)
+            # A young average follows quickly: it must forget the random start.
+            decay = min(self.options.ema_decay, (1 + self.step) / (10 + self.step))
+            theirs = self.network.state_dict()
+            for name, value in self.exported.state_dict().items():
+                value.lerp_(theirs[name], 1 - decay)
         else:
             self.skipped += 1
             self.skipped_in_a_row += 1
@@ -113,19 +112,17 @@ class Trainer:
         return figures | {name: float(part) for name, part in parts.items()}
 
     def run(self, time_limit_s: float = math.inf, until: int | None = None) -> str:
-        """Train until the options' steps, a time limit or a request to stop, and save.
+        """Train, save, and say why it ended: ``steps``, ``time`` or ``signal``.
 
         ``time_limit_s`` counts over all interruptions; ``until``: pause at this update, with the
-        schedule of the whole run. Returns why it ended: ``steps``, ``time`` or ``signal``.
+        schedule of the whole run.
         """
         options = self.options
-        last = options.steps if until is None else min(until, options.steps)
+        last = min(until or options.steps, options.steps)
         batches = self.task.batches(self.samples, self.workers)
-        self.network.train()
-        before, started = self.elapsed_s, time.monotonic()
-        saved = logged = started
+        before, why = self.elapsed_s, "steps"
+        started = saved = logged = time.monotonic()
         seen: list[dict[str, float]] = []
-        why = "steps"
         while self.step < last:
             progress = self.step / options.steps
             if options.schedule.by == "time" and math.isfinite(time_limit_s):
@@ -160,12 +157,6 @@ class Trainer:
             with (self.folder / LOG).open("a", encoding="utf-8") as file:
                 file.write(json.dumps(entry) + "\n")
         self.report(entry)
-
-    @property
-    def _parts(self) -> dict[str, Any]:
-        """What has a state beside the progress."""
-        parts = {"network": self.network, "optimizer": self.optimizer}
-        return parts | ({} if self.exported is self.network else {"ema": self.exported})
 
     def save(self) -> None:
         """Write ``checkpoint.pt``: everything that a later process needs to go on."""
@@ -226,8 +217,6 @@ def read_checkpoint(path: Path, device: torch.device | str = "cpu") -> dict[str,
 
 def _means(entries: list[dict[str, float]]) -> dict[str, float]:
     """Mean of each figure over the updates in which it is finite."""
-    values = defaultdict(list)
-    for name, value in (item for entry in entries for item in entry.items()):
-        if math.isfinite(value):
-            values[name].append(value)
-    return {name: float(np.mean(found)) for name, found in values.items()}
+    names = dict.fromkeys(name for entry in entries for name in entry)
+    found = {n: [e[n] for e in entries if math.isfinite(e.get(n, math.nan))] for n in names}
+    return {name: float(np.mean(values)) for name, values in found.items() if values}

@@ -31,6 +31,7 @@ PUBLISHED_SEED = 1000
 EPE_LIMIT_PX = 400.0
 """Pixels with a true ego flow of this length or more count as 0 in EPE, as published."""
 FIGURES = ("r_err_deg", "t_err", "epe")
+BATCH = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,9 +47,7 @@ class TrainingBatch:
 
     def to(self, device: torch.device | str) -> TrainingBatch:
         """Copy on another device."""
-        return TrainingBatch(
-            self.inputs.to(device), self.targets.to(device), self.moving.to(device)
-        )
+        return TrainingBatch(*(part.to(device) for part in vars(self).values()))
 
 
 def collate(samples: Sequence[Sample]) -> TrainingBatch:
@@ -80,38 +79,29 @@ def evaluate_network(
     count: int,
     *,
     selection: str = "softmax",
-    batch_size: int = 20,
-    precision: str = "float32",
 ) -> dict[str, Any]:
-    """Errors of a network's selected pose on samples 0 to ``count`` - 1 of a seed.
-
-    Held-out data of the preset's own (``for_evaluation``) are used where it has them.
+    """Errors of a network's selected pose on held-out samples 0 to ``count`` - 1 of a seed.
 
     Returns:
         ``r_err_deg``, ``t_err`` (metres) and ``epe`` (px at the sample's size), the paper's
         component means; the same of zero motion under ``zero_*``, medians under ``median_*``, the
-        EPE of each pair under ``epe_of_pairs``. Of the uncertainty, None without:
-        ``auroc_rotation`` and ``auroc_translation`` of the mean log scale as a detector of moving
-        pixels, ``spearman_*`` with the pixel's own error, ``laplace_ratio_*`` and
-        ``median_ratio_*``, the mean and the median of |error| / exp(s) in degrees and metres: 1
-        and 0.69 for calibrated Laplace scales.
+        EPE of each pair under ``epe_of_pairs``. Of the uncertainty of rotation and translation,
+        None without: ``auroc_*`` of the mean log scale as a detector of moving pixels,
+        ``spearman_*`` with the pixel's own error, ``laplace_ratio_*`` and ``median_ratio_*``, the
+        mean and the median of |error| / exp(s): 1 and 0.69 for calibrated Laplace scales.
     """
     if count < 1:
         raise InputError(f"evaluate_network: expected count >= 1, got {count}.")
     preset = preset.for_evaluation() if hasattr(preset, "for_evaluation") else preset
-    device = next(network.parameters()).device
-    errors, pixels, was_training = [], [], network.training
-    network.eval()
-    for first in range(0, count, batch_size):
-        numbers = range(first, min(first + batch_size, count))
+    device, errors, pixels = next(network.parameters()).device, [], []
+    for first in range(0, count, BATCH):
+        numbers = range(first, min(first + BATCH, count))
         batch = collate([preset.sample(sample_generator(seed, i)) for i in numbers]).to(device)
         with torch.inference_mode():
-            with torch.autocast(device.type, torch.bfloat16, enabled=precision == "bfloat16"):
-                output = predict(network, batch.inputs, selection)
+            output = predict(network, batch.inputs, selection)
             errors.append(_errors(output, batch, selection))
             if isinstance(output, PixelwisePrediction) and output.log_scale_rotation is not None:
                 pixels.append(_uncertainty(output, batch))
-    network.train(was_training)
     ours, zero = np.split(np.concatenate(errors), 2, axis=1)
     result: dict[str, Any] = {"seed": seed, "count": count}
     for i, name in enumerate(FIGURES):
@@ -189,8 +179,7 @@ def calibrate_scales(
     head = getattr(network, "head_uncertainty", None)
     if head is None:
         raise InputError("calibrate_scales: expected a pixel-wise network with uncertainty.")
-    found = evaluate_network(network, preset, seed, count)
-    shift = float(np.log(found["laplace_ratio_translation"]))
+    shift = np.log(evaluate_network(network, preset, seed, count)["laplace_ratio_translation"])
     with torch.no_grad():
-        head[-1].bias[3:] += shift
-    return {"translation": shift}
+        head[-1].bias[3:] += float(shift)
+    return {"translation": float(shift)}

@@ -59,19 +59,14 @@ def changed(recorded: Recorded, change: Callable[[int, Frame], Frame], **more: A
 def test_a_clean_sequence_is_not_accused(recorded):
     report = diagnose(recorded)
     assert report["ok"], text_of("doctor", report)
-    assert len(report["findings"]) == 4 and report["pairs"] == 8
+    assert len(report["findings"]) == 3 and report["pairs"] == 8
     assert finding(report, "depth units")["value"] == pytest.approx(1.0, abs=0.05)
 
 
-def test_units_and_exposure(recorded):
-    def dim(k: int, f: Frame) -> Frame:
-        rgb = (0.02 * f.rgb).astype(np.uint8) if k in (3, 4) else f.rgb
-        return replace(f, rgb=rgb, depth=1000 * f.depth)
-
-    report = changed(recorded, dim, poses=None)
+def test_units(recorded):
+    report = changed(recorded, lambda k, f: replace(f, depth=1000 * f.depth), poses=None)
     assert finding(report, "depth units")["state"] == "differs"
     assert "divide by" in finding(report, "depth units")["message"]
-    assert finding(report, "exposure")["state"] == "differs"
     scaled = changed(recorded, lambda k, f: replace(f, depth=5 * f.depth))
     assert finding(scaled, "depth units")["state"] == "differs"
 
@@ -85,7 +80,7 @@ def test_a_scale_that_changes_on_the_way(recorded):
 def test_what_cannot_be_seen_is_said(recorded):
     report = changed(recorded, lambda k, f: replace(f, rgb=None), poses=None)
     assert {found["state"] for found in report["findings"]} == {"cannot_tell"}
-    assert report["ok"] and "4 of 4" in text_of("doctor", report)
+    assert report["ok"] and "3 of 3" in text_of("doctor", report)
 
 
 def test_a_broken_frame_does_not_end_the_diagnosis(recorded):

@@ -109,7 +109,6 @@ def test_f12_collinear_answer_of_a_solver_that_is_sure_of_itself():
     uv = xyz[:, :2] / 4.0 * (CAMERA.fx, CAMERA.fy) + (CAMERA.cx, CAMERA.cy)
     result = check("line", np.eye(4), Correspondences(xyz, uv), CAMERA, 2.0)
     assert result.status.reason is Reason.DEGENERATE_GEOMETRY
-    assert result.inlier_ratio == 1.0
 
 
 def test_f14_answer_that_puts_its_points_behind_the_camera_is_refused():

@@ -67,7 +67,7 @@ def test_a_line_of_results_by_hand() -> None:
     expected = {
         **{"pairs": 3, "pairs_scored": 2, "failed": 1, "failures": 3, "epe_l2_px": 3.0},
         **{"epe": 0.4, "rot_err_deg_mean": 2.0, "trans_err_median": 0.1, "ms_per_pair_median": 20},
-        **{"ms_with_flow_median": 25.0, "dynamic_fraction": 0.5, "alignment": "se3"},
+        **{"flow_ms_median": 5.0, "dynamic_fraction": 0.5, "alignment": "se3"},
     }
     assert {key: line[key] for key in expected} == pytest.approx(expected)
     assert line["ate_rmse"] == pytest.approx(0, abs=1e-12)
@@ -77,9 +77,3 @@ def test_a_line_of_results_by_hand() -> None:
     total = total_row(pd.concat([pairs, pairs]), [line, other])
     assert total["pairs"] == 6 and total["ate_rmse"] == line["ate_rmse"]
     assert "1 of 2 sequences" in total["reasons"]["ate_rmse"]
-
-
-def test_methods_without_flow_do_not_wait_for_it() -> None:
-    pairs = table(row(0, 1.0, "identity", rot_err_deg=1.0, ms=1.0, flow_ms=50.0))
-    named = {"sequence": "s", "method": "identity", "flow_source": "dis", "depth_source": "true"}
-    assert sequence_row(pairs, None, named)["ms_with_flow_median"] == 1.0

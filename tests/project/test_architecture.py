@@ -62,13 +62,13 @@ APPLICATION = {"cli", "commands"}
 """The command line: may import everything, and nothing imports it."""
 
 ONLY_IN = {
-    "evo": {"trajectory.py", "evaluation/metrics.py"},
+    "evo": {"evaluation/metrics.py"},
     "matplotlib": {"evaluation/plots.py"},
     "plotly": {"evaluation/"},
     "pandas": {"evaluation/", "commands/"},
     "rerun": {"commands/recording.py"},
     "rich": {"commands/"},
-    "yaml": {"files.py", "evaluation/protocols.py", "commands/", "options.py"},
+    "yaml": {"files.py", "commands/", "options.py"},
     "open3d": {"baselines/"},
     "poselib": {"baselines/"},
     "safetensors": {"network/weights.py"},

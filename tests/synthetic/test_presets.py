@@ -9,7 +9,6 @@ from hybridvo.errors import FormatError, InputError
 from hybridvo.synthetic.dataset import PRESETS, load_preset, read_yaml
 from hybridvo.synthetic.diverse import DiverseOptions
 from hybridvo.synthetic.layered import PaperOptions
-from hybridvo.synthetic.rendered import RenderedOptions
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 
@@ -17,7 +16,7 @@ CONFIGS = Path(__file__).parents[2] / "configs"
 def test_preset_files_equal_the_defaults():
     assert load_preset(CONFIGS / "data_paper.yaml") == PaperOptions()
     assert load_preset(CONFIGS / "data_diverse.yaml") == DiverseOptions()
-    assert load_preset(CONFIGS / "data_rendered.yaml") == RenderedOptions()
+    assert load_preset(CONFIGS / "data_rendered.yaml") == DiverseOptions(dis_share=0.5)
     small = load_preset(CONFIGS / "data_paper.yaml", size=(64, 128))
     assert small == PaperOptions(height=64, width=128)
 
@@ -33,10 +32,10 @@ def test_preset_files_name_every_option(name):
     ("text", "said"),
     [
         ("preset: paper\nobject: 5", "object: unexpected"),
-        ("preset: diverse\ndegradation: {blok_px: [1, 2]}", "degradation.blok_px"),
+        ("preset: paper\nmotion: {backwards: 1}", "motion.backwards"),
         ("preset: paper\nheight: tall", "height.*'tall'"),
         ("preset: paper\nheight: 12.5", "height.*12.5"),
-        ("preset: diverse\nmovers: [1, 2, 3]", "movers"),
+        ("preset: diverse\ndis_share: 2", "dis_share"),
         ("preset: paper\nheight: 1", "height"),
         ("preset: small", "paper.*'small'"),
         ("objects: 5", "preset.*None"),

@@ -10,7 +10,7 @@ import pytest
 from hybridvo.errors import CheckpointError
 from hybridvo.network.models import load_weights
 from hybridvo.network.selection import SELECTION_METHODS
-from hybridvo.training.export import export_pwvo, open_run
+from hybridvo.training.export import export_run, open_run
 from hybridvo.training.options import load_pwvo_options, load_selector_options
 from tests.scripts import load_script
 
@@ -88,17 +88,20 @@ def test_the_selector_is_trained_and_exported(shards, tmp_path):
     config, weights = tmp_path / "selector.yaml", tmp_path / "w.safetensors"
     options = {"network": {"width": 0.25}, "steps": 2, "batch_size": 2, "files": 1}
     config.write_text(json.dumps(options))
-    words = ["selector", "--config", str(config), "--data", str(shards)]
-    words += ["--out", str(tmp_path / "run"), "--export", str(weights)]
-    assert tool.main(words) == 2  # --held-out is missing
-    assert tool.main([*words, "--held-out", str(shards)]) == 0
+    data, out = tmp_path / "shards", str(tmp_path / "run")
+    words = ["selector", "--config", str(config), "--data", str(data), "--out", out]
+    export = ["export", "--out", out, "--export", str(weights)]
+    data.symlink_to(shards)
+    (tmp_path / "shards_held_out").symlink_to(shards)
+    assert tool.main(words) == 0 and tool.main(export) == 0
     network, card = load_weights(weights)
     assert network.options.kind == "selector" and card["updates"] == 2
+    assert card["held_out"]["rendered"]["samples"] > 0
 
 
 def test_an_export_needs_a_run(tmp_path):
     with pytest.raises(CheckpointError, match="not a checkpoint"):
-        export_pwvo(tmp_path, tmp_path / "w.safetensors")
+        export_run(tmp_path, tmp_path / "w.safetensors")
 
 
 def test_ablation_scores_milestones_and_goes_on(tmp_path, monkeypatch):

@@ -47,7 +47,7 @@ class Oracle(torch.nn.Module):
 def test_figures_of_an_oracle_and_of_zero_motion(share, rule):
     samples = [PRESET.sample(sample_generator(3, i)) for i in range(6)]
     network = Oracle(collate(samples), share)
-    result = validation.evaluate_network(network, PRESET, 3, 6, selection=rule, batch_size=6)
+    result = validation.evaluate_network(network, PRESET, 3, 6, selection=rule)
     assert result["auroc_rotation"] == 1.0
     for name, exact in (("r_err_deg", 1e-5), ("t_err", 1e-6), ("epe", 1e-2)):
         expected = 0.0 if share else result[f"zero_{name}"]
