@@ -9,6 +9,7 @@ written, 130 interrupted.
 from __future__ import annotations
 
 import argparse
+import importlib
 import inspect
 import json
 import logging
@@ -22,9 +23,6 @@ from typing import Any
 from hybridvo import __version__
 from hybridvo.commands import arguments
 from hybridvo.commands.train import add_train, train
-
-Result = tuple[Any, int]
-"""What a command gives, JSON-ready, and the exit code."""
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -40,10 +38,10 @@ def build_parser() -> argparse.ArgumentParser:
     loudness = common.add_mutually_exclusive_group()
     loudness.add_argument("-v", "--verbose", action="store_true", help="tracebacks of errors")
     loudness.add_argument("-q", "--quiet", action="store_true", help="errors only")
-    for name, (add_arguments, call) in COMMANDS.items():
+    for name, (add_arguments, _) in COMMANDS.items():
         about = add_arguments.__doc__ or ""
         made = commands.add_parser(name, help=about, description=about, parents=[common])
-        made.set_defaults(call=call)
+        made.set_defaults(call=_execute)
         add_arguments(made)
     add_train(commands.add_parser("train", help="train a network"), common, train)
     return parser
@@ -95,111 +93,47 @@ def text_of(command: str, content: Mapping[str, Any]) -> str:
     return template.render(content, content=content).rstrip()
 
 
-def _call(function: Callable[..., Any], args: argparse.Namespace, **more: Any) -> Any:
-    """The function, with those arguments of the command line that it has, and others."""
+def _call(function: Callable[..., Any], given: Mapping[str, Any]) -> Any:
+    """The function, with those of the arguments that it has."""
     names = inspect.signature(function).parameters
-    return function(**{name: v for name, v in vars(args).items() if name in names} | more)
+    return function(**{name: value for name, value in given.items() if name in names})
 
 
-def _open(args: argparse.Namespace) -> Any:
+def _execute(args: argparse.Namespace, command: list[str]) -> tuple[Any, int]:
+    """Call the function of a command; what it gives, JSON-ready, and the exit code."""
     from hybridvo.data.sequence import open_sequence
-
-    given = {name: getattr(args, name) for name in ("camera", "depth_scale", "mask")}
-    given = {name: value for name, value in given.items() if value is not None}
-    return open_sequence(args.path, args.dataset, **given)
-
-
-def _run(args: argparse.Namespace, command: list[str]) -> Result:
-    from hybridvo.commands.run import run
     from hybridvo.network.models import Models
 
-    if "help" in args.given:
-        return arguments.option_defaults(), 0
-    options = arguments.run_options(args)
-    files = arguments.weight_files(args.weights, [options.run.method])
-    given = {"options": options, "models": Models(options.run.device, files), "command": command}
-    summary, code = _call(run, args, sequence=_open(args), **given)
-    if not args.quiet:
-        for warning in summary.get("warnings", []):
-            print(f"hybridvo: warning: {warning}", file=sys.stderr)
-    return summary, code
+    given = vars(args) | {"command": command}
+    if "given" in given:
+        if "help" in args.given:
+            return arguments.option_defaults(), 0
+        given["options"] = arguments.run_options(args)
+    if "weights" in given:
+        device = given["options"].run.device if "options" in given else "cpu"
+        given["models"] = Models(device, arguments.weight_files(args.weights))
+    if "path" in given:
+        given["sequence"] = _call(open_sequence, given)
+    module, _, name = COMMANDS[args.command][1].partition(":")
+    found = _call(getattr(importlib.import_module(f"hybridvo.{module}"), name), given)
+    if isinstance(found, tuple):
+        return found
+    if isinstance(found, Path | list):
+        return {"files": [str(path) for path in (found if isinstance(found, list) else [found])]}, 0
+    return found, 0 if found.get("ok", True) else 1
 
 
-def _compare(args: argparse.Namespace, command: list[str]) -> Result:
-    from hybridvo.commands.compare import compare
-    from hybridvo.pipeline import METHODS
-
-    methods = tuple(name.strip() for name in args.methods.split(",") if name.strip())
-    weights = arguments.weight_files(args.weights, METHODS if methods == ("all",) else methods)
-    given = {"methods": methods, "weights": weights, "options": arguments.run_options(args)}
-    return {"files": [str(p) for p in _call(compare, args, **given, command=command)]}, 0
-
-
-def _show(args: argparse.Namespace, command: list[str]) -> Result:
-    from hybridvo.evaluation.drawing import draw
-    from hybridvo.network.models import Models
-
-    models = Models(weights=arguments.weight_files(args.weights, [args.method, "pwvo"]))
-    return {"files": [str(_call(draw, args, sequence=_open(args), models=models))]}, 0
-
-
-def _evaluate(args: argparse.Namespace, command: list[str]) -> Result:
-    from hybridvo.evaluation.metrics import evaluate
-    from hybridvo.trajectory import read_trajectory
-
-    est = read_trajectory(args.estimate, args.format_est)
-    gt = read_trajectory(args.gt, args.format_gt)
-    report = _call(evaluate, args, estimate=est, gt=gt)
-    report |= {"estimate": args.estimate, "gt": args.gt}
-    report["warnings"] = [*est.warnings, *gt.warnings]
-    # not one figure: the files do not belong together
-    code = 2 if report["ate_rmse_unaligned"] is None else 0
-    if code:
-        reason = report["reasons"]["ate_rmse_unaligned"]
-        print(f"hybridvo: nothing could be compared: {reason}.", file=sys.stderr)
-    return report, code
-
-
-def _doctor(args: argparse.Namespace, command: list[str]) -> Result:
-    from hybridvo.commands.doctor import diagnose, doctor
-
-    if not args.path:
-        return doctor(), 0
-    found = diagnose(_open(args), pairs=args.pairs)
-    return found, 0 if found["ok"] else 1
-
-
-def _demo(args: argparse.Namespace, command: list[str]) -> Result:
-    from hybridvo.commands.demo import demo
-
-    return _call(demo, args, command=command), 0
-
-
-def _generate(args: argparse.Namespace, command: list[str]) -> Result:
-    from hybridvo.commands.generate import generate
-
-    return {"files": [str(_call(generate, args))]}, 0
-
-
-def _init(args: argparse.Namespace, command: list[str]) -> Result:
-    from hybridvo.data.camera_file import write_camera_template
-
-    path = write_camera_template(args.directory)
-    print(f"fill it in, then: hybridvo run {args.directory}", file=sys.stderr)
-    return {"files": [str(path)]}, 0
-
-
-COMMANDS: dict[str, tuple[Callable[..., None], Callable[..., Result]]] = {
-    "run": (arguments.run, _run),
-    "compare": (arguments.compare, _compare),
-    "show": (arguments.show, _show),
-    "evaluate": (arguments.evaluate, _evaluate),
-    "doctor": (arguments.doctor, _doctor),
-    "demo": (arguments.demo, _demo),
-    "generate": (arguments.generate, _generate),
-    "init": (arguments.init, _init),
+COMMANDS: dict[str, tuple[Callable[..., None], str]] = {
+    "run": (arguments.run, "commands.run:run"),
+    "compare": (arguments.compare, "commands.compare:compare"),
+    "show": (arguments.show, "evaluation.drawing:draw"),
+    "evaluate": (arguments.evaluate, "evaluation.metrics:evaluate"),
+    "doctor": (arguments.doctor, "commands.doctor:doctor"),
+    "demo": (arguments.demo, "commands.demo:demo"),
+    "generate": (arguments.generate, "commands.generate:generate"),
+    "init": (arguments.init, "data.camera_file:write_camera_template"),
 }
-"""Name -> what adds its arguments and says what it does, and what runs it; beside ``train``."""
+"""Name -> what adds its arguments and says what it does, and its function; beside ``train``."""
 
 
 if __name__ == "__main__":

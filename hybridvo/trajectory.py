@@ -1,7 +1,4 @@
-"""Camera trajectories: chained from relative poses, read from and written to text files.
-
-evo writes the files. They are read here: evo names neither the line of a mistake nor accepts tabs.
-"""
+"""Camera trajectories: chained from relative poses, read from and written to text files."""
 
 from __future__ import annotations
 
@@ -82,37 +79,26 @@ class Trajectory:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the trajectory: KITTI's form where the name ends in ``.kitti``, else TUM's."""
-        # imported when used: evo takes a second
-        from evo.core.trajectory import PosePath3D, PoseTrajectory3D
-        from evo.tools import file_interface
-
+        rows = self.T_world_cam[:, :3].reshape(-1, 12)
+        if Path(path).suffix != ".kitti":
+            xyzw = Rotation.from_matrix(self.T_world_cam[:, :3, :3]).as_quat(canonical=True)
+            rows = np.column_stack([self.timestamps, self.positions, xyzw])
         with atomic_write(path) as file:
-            if Path(path).suffix == ".kitti":
-                poses = PosePath3D(poses_se3=list(self.T_world_cam))
-                file_interface.write_kitti_poses_file(file, poses)
-                return
-            R = Rotation.from_matrix(self.T_world_cam[:, :3, :3])
-            wxyz = R.as_quat(canonical=True, scalar_first=True)
-            stamped = PoseTrajectory3D(self.positions, wxyz, self.timestamps)
-            file_interface.write_tum_trajectory_file(file, stamped)
+            np.savetxt(file, rows)
 
 
-def read_trajectory(path: str | os.PathLike[str], format: str = "auto") -> Trajectory:
-    """Read camera-to-world poses from a text file, one pose a line.
+def read_trajectory(path: str | os.PathLike[str]) -> Trajectory:
+    """Read camera-to-world poses from a text file, one pose a line; FormatErrors name the line.
 
-    ``#`` comments, empty lines, tabs, Windows line ends and a byte-order mark are accepted.
-
-    ``format`` is ``tum``, ``kitti``, ``tartanair`` (its NED axes, x forward, y right, z down,
-    become those of a camera), or ``auto``: by the number of :data:`COLUMNS`. Stamps in other units
-    than seconds are converted, which ``warnings`` say. KITTI and TartanAir files get frame numbers
-    as stamps. A FormatError names file and line.
+    The number of columns tells the format, see :data:`COLUMNS`. TartanAir's NED axes (x forward, y
+    right, z down) become those of a camera. Stamps in other units than seconds are converted, which
+    ``warnings`` say; KITTI and TartanAir files get frame numbers as stamps. ``#`` comments, empty
+    lines, tabs, Windows line ends and a byte-order mark are accepted.
     """
-    if format not in ("auto", *COLUMNS):
-        raise InputError(f"format: expected auto, {', '.join(COLUMNS)}, got {format!r}.")
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path}: trajectory file cannot be read: no such file.")
-    rows, T = read_poses(path, *([COLUMNS[format]] if format in COLUMNS else COLUMNS.values()))
+    rows, T = read_poses(path, *COLUMNS.values())
     if not len(T):
         raise FormatError(f"{path}: expected at least one pose, got none.")
     rows.refuse(~np.isfinite(rows.numbers).all(axis=1), "finite numbers: leave unknown poses out")

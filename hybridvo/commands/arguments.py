@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import difflib
-import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -81,7 +79,8 @@ def compare(command: argparse.ArgumentParser) -> None:
     add("sequences", **named | {"nargs": "*", "default": argparse.SUPPRESS}, help=many)
     add("--dataset", help="kind of the sequences (default: detected)")
     add("--out", default="runs/compare", metavar="DIR", help="default: runs/compare")
-    add("--methods", default="all", help="comma-separated; default: all that run here")
+    names = "comma-separated; default: all that run here"
+    add("--methods", default="all", type=lambda text: text.replace(" ", "").split(","), help=names)
     _options(command)
     add("--protocol", choices=("paper",), help="MPI Sintel as PWVO's paper scores it: 992 pairs")
 
@@ -107,9 +106,7 @@ def evaluate(command: argparse.ArgumentParser) -> None:
     add("--alignment", choices=kinds, default="se3", help="of the ATE")
     add("--delta", type=float, default=1, metavar="X", help="span of the RPE (default 1)")
     add("--delta-unit", choices=("frames", "s"), default="frames", help="unit of --delta")
-    add("--max-diff", type=float, metavar="S", help="seconds between matches")
-    for name in ("est", "gt"):
-        add(f"--format-{name}", choices=("auto", "tum", "kitti", "tartanair"), default="auto")
+    add("--max-diff", type=float, default=0.02, metavar="S", help="seconds between matches")
 
 
 def doctor(command: argparse.ArgumentParser) -> None:
@@ -206,24 +203,21 @@ def load_options(
     try:
         return Options(**groups)
     except InputError as error:
-        found = re.match(r"Options\.([\w.]+): unexpected", str(error))
-        near = difflib.get_close_matches(found[1], option_defaults(), n=1) if found else []
-        hint = f" Did you mean '{near[0]}'?" if near else ""
         where = " and ".join(str(x) for x in (path, assignments and "--set") if x)
-        raise InputError(f"{where or 'options'}: {error}{hint}") from None
+        raise InputError(f"{where or 'options'}: {error} --set help lists the keys.") from None
 
 
-def weight_files(weights: Iterable[str], methods: Iterable[str]) -> dict[str, str]:
+def weight_files(weights: Iterable[str]) -> dict[str, str]:
     """Network -> file of the ``NAME=FILE`` that ``--weights`` was given."""
     from hybridvo.errors import InputError
-    from hybridvo.pipeline import networks_of
+    from hybridvo.network.models import SELECTION
 
-    known = sorted({name for method in methods for name in networks_of(method)})
+    known = ("selector", *SELECTION)
     files = dict(text.partition("=")[::2] for text in weights)
     for name, path in files.items():
         if name not in known or not Path(path).is_file():
             raise InputError(
-                f"--weights: expected NAME=FILE with {' or '.join(known) or 'no name'} for these "
-                f"methods and a file that exists, got {name}={path}."
+                f"--weights: expected NAME=FILE with {' or '.join(known)} and a file that exists, "
+                f"got {name}={path}."
             )
     return files

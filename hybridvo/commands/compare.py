@@ -49,7 +49,7 @@ def compare(
     options: Options | None = None,
     dataset: str | None = None,
     protocol: Literal["paper"] | None = None,
-    weights: Mapping[str, str] | None = None,
+    models: Models | None = None,
     mode: Mode = "new",
     command: Iterable[str] = (),
     quiet: bool = True,
@@ -57,11 +57,10 @@ def compare(
     """Run every method on every sequence and write the results; returns paths of :data:`WRITTEN`.
 
     A folder of ``sequences`` stands for all that it holds; the method ``all`` for all that can run.
-    ``protocol`` scores MPI Sintel as the paper does, ``weights`` names files of networks.
-    ``resume`` keeps finished runs.
+    ``protocol`` scores MPI Sintel as the paper does; ``resume`` keeps finished runs.
     """
     out, options = Path(out), options or Options()
-    models = Models(options.run.device, weights)
+    models = models or Models(options.run.device)
     names, missing = methods_to_run(methods)
     jobs = _jobs(sequences, dataset, options, out)
     if protocol is not None:
@@ -113,8 +112,6 @@ def compare(
 
 def methods_to_run(names: Several[str]) -> tuple[tuple[str, ...], dict[str, str]]:
     """Methods to run, and of those that ``all`` leaves out the reason with its remedy."""
-    if not names:
-        raise InputError(f"--methods: expected names, got none; known: {', '.join(METHODS)}.")
     is_all = list(names) == ["all"]
     missing: dict[str, str] = {}
     wanted = dict.fromkeys(METHODS if is_all else names)

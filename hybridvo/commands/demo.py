@@ -64,21 +64,17 @@ def demo(
         command=command,
         quiet=quiet,
     )
-    rows = []
-    for row in json.loads((out / "results.json").read_text(encoding="utf-8"))["rows"]:
-        run = (out / row["trajectory"]).parent
-        metrics = json.loads((run / "metrics.json").read_text(encoding="utf-8"))
-        rows.append(
-            {
-                "method": METHODS[row["method"]],
-                "ate_cm": 100.0 * metrics["ate_rmse_origin"],
-                "rpe_cm": 100.0 * metrics["rpe_trans_mean"],
-                "rotation_deg": row["rot_err_deg_mean"],
-                "epe_px": row["epe_l2_px"],
-                "failed": row["failed"],
-                "frame_ms": row["ms_per_pair_median"] + row["flow_ms_median"],
-            }
-        )
+    rows = [
+        {
+            "method": METHODS[row["method"]],
+            "ate_cm": 100.0 * row["ate_rmse_origin"],
+            "rotation_deg": row["rot_err_deg_mean"],
+            "epe_px": row["epe_l2_px"],
+            "failed": row["failed"],
+            "frame_ms": row["ms_per_pair_median"] + row["flow_ms_median"],
+        }
+        for row in json.loads((out / "results.json").read_text(encoding="utf-8"))["rows"]
+    ]
     moving = float(np.median([(scene.object_id(i) > 0).mean() for i in range(scene.frames)]))
     content = {
         "command": list(command),

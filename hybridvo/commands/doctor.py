@@ -30,14 +30,14 @@ MAX_SCALE_ERROR = 0.2
 """Wrong units err by more, noisy ground truth over short motions by half of that."""
 MAX_CONTRADICTED = 0.2
 """Fraction of the pairs whose flow may contradict their images."""
-Answer = tuple[bool | None, str, Any]
-"""Whether something differs (None: cannot tell), why, and a value or None."""
 
 
-def doctor() -> dict[str, Any]:
-    """What a bug report should hold, JSON-ready; methods that cannot run have a remedy."""
+def doctor(sequence: Sequence | None = None, pairs: int = 40) -> dict[str, Any]:
+    """What a bug report should hold, or what is wrong with a sequence; JSON-ready."""
     import torch
 
+    if sequence is not None:
+        return diagnose(sequence, pairs=pairs)
     ready, absent = methods_to_run(("all",))
     return {
         "platform": platform.platform(),
@@ -59,24 +59,21 @@ def diagnose(sequence: Sequence, *, pairs: int = 40) -> dict[str, Any]:
             f"{sequence.name}: expected at least two frames and one pair, got {len(sequence)} "
             f"frames and --pairs {pairs}."
         )
-    measured, unreadable = {}, []
+    rows, unreadable = {}, []
     for index in np.unique(np.linspace(0, last, min(pairs, last + 1)).round().astype(int)).tolist():
         try:
             frames = sequence.frame(index), sequence.frame(index + 1)
         except (InputError, OSError) as error:
             unreadable.append(str(error))
             continue
-        measured[index] = _measure(sequence, *frames)
-    findings = []
-    for name, (key, answer) in QUESTIONS.items():
-        known = {k: pair[key] for k, pair in measured.items() if pair.get(key) is not None}
-        differs, message, value = answer(pd.Series(known, dtype=object))
-        state = "cannot_tell" if differs is None else "differs" if differs else "agrees"
-        findings.append({"name": name, "state": state, "message": message, "value": value})
+        rows[index] = _measure(sequence, *frames)
+    columns = ["depth", "length", "depth_ratio", "contradiction"]
+    table = pd.DataFrame(list(rows.values()), index=list(rows), columns=columns)
+    findings = [question(table) for question in (_units, _depth_steps, _images_against_flow)]
     return {
         "sequence": sequence.name,
         "frames": len(sequence),
-        "pairs": len(measured),
+        "pairs": len(rows),
         "unreadable": list(dict.fromkeys(unreadable)),
         "findings": findings,
         "ok": all(finding["state"] != "differs" for finding in findings),
@@ -84,10 +81,10 @@ def diagnose(sequence: Sequence, *, pairs: int = 40) -> dict[str, Any]:
 
 
 def _measure(sequence: Sequence, prev: Frame, curr: Frame) -> dict[str, Any]:
-    """What could be measured of one pair, by the keys of :data:`QUESTIONS`."""
+    """What could be measured of one pair: a row of the table that the questions are asked."""
     pair: dict[str, Any] = {}
     if prev.depth is not None:
-        pair["depth"] = typical_depth(prev.depth), None
+        pair["depth"] = typical_depth(prev.depth)
     if prev.rgb is None or curr.rgb is None:
         return pair
     if sequence.has_flow:
@@ -103,38 +100,47 @@ def _measure(sequence: Sequence, prev: Frame, curr: Frame) -> dict[str, Any]:
     if true is not None and direction_is_known(motion.T_curr_prev, motion.covariance):
         length = float(np.linalg.norm(true[:3, 3]))
         if length > 0.01:  # metres; along the true one: the noise of a length is always positive
-            scale = float(motion.T_curr_prev[:3, 3] @ true[:3, 3]) / length**2
-            pair["depth"] = pair["depth"][0], scale
+            pair["length"] = float(motion.T_curr_prev[:3, 3] @ true[:3, 3]) / length**2
     depths = compare_depths(by_dis, motion.T_curr_prev, motion.weights)
     pair["depth_ratio"] = None if depths is None else depths.ratio
     return pair
 
 
-# -- answers: of what is known of the pairs, by their first frame ---------------------------------
+# -- questions: of what is known of the pairs, by their first frame -------------------------------
 
 
-def _units(known: pd.Series) -> Answer:
-    if known.empty or known.str[0].isna().all():
-        return None, "no frame has valid depth", None
-    median, scales = float(known.str[0].median()), known.str[1].dropna().astype(float)
+def _finding(name: str, differs: bool | None, message: str, value: Any = None) -> dict[str, Any]:
+    state = "cannot_tell" if differs is None else "differs" if differs else "agrees"
+    return {"name": name, "state": state, "message": message, "value": value}
+
+
+def _units(table: pd.DataFrame) -> dict[str, Any]:
+    name, depths = "depth units", table["depth"].dropna().astype(float)
+    if depths.empty:
+        return _finding(name, None, "no frame has valid depth")
+    median, scales = float(depths.median()), table["length"].dropna().astype(float)
     text, advice = f"median depth {median:.3g} m", depth_advice(median)
     if len(scales) < MIN_PAIRS:
         if advice:
-            return True, f"{text}, which cannot be metres; probable remedy: {advice}", median
+            text += f", which cannot be metres; probable remedy: {advice}"
+            return _finding(name, True, text, median)
         # all depths and all translations times s project to the same pixels: no pair can tell
-        return None, f"{text}; {len(scales)} pairs with a true motion, {MIN_PAIRS} needed", median
-    low, value, high = scales.quantile([0.25, 0.5, 0.75])
+        text += f"; {len(scales)} pairs with a true motion, {MIN_PAIRS} needed"
+        return _finding(name, None, text, median)
+    low, high = scales.quantile([0.25, 0.75])
+    value = float(scales.median())
     text += f"; motions are {value:.4g} times as long as the poses on file say"
-    if abs(value - 1) <= MAX_SCALE_ERROR or low < 1 < high:
-        return False, text, float(value)
-    remedy = f"divide by {value:.4g}" if value > 1 else f"multiply by {1 / value:.4g}"
-    return True, f"{text}: depth: {advice or remedy}", float(value)
+    differs = abs(value - 1) > MAX_SCALE_ERROR and not low < 1 < high
+    if differs:
+        remedy = f"divide by {value:.4g}" if value > 1 else f"multiply by {1 / value:.4g}"
+        text += f": depth: {advice or remedy}"
+    return _finding(name, differs, text, value)
 
 
-def _depth_steps(known: pd.Series) -> Answer:
-    if known.empty:
-        return None, "no pair has a motion and depth in both frames", None
-    ratios = known.astype(float)
+def _depth_steps(table: pd.DataFrame) -> dict[str, Any]:
+    name, ratios = "depth from frame to frame", table["depth_ratio"].dropna().astype(float)
+    if ratios.empty:
+        return _finding(name, None, "no pair has a motion and depth in both frames")
     sizes = np.log(ratios.clip(lower=1e-30)).abs()
     steps, k = int((sizes > DOUBTFUL_SPREAD).sum()), sizes.idxmax()
     text = (
@@ -143,23 +149,16 @@ def _depth_steps(known: pd.Series) -> Answer:
     )
     if steps:
         text += ": files of several units, or a scale of its own in every frame"
-    return steps > 0, text, float(ratios[k])
+    return _finding(name, steps > 0, text, float(ratios[k]))
 
 
-def _images_against_flow(known: pd.Series) -> Answer:
+def _images_against_flow(table: pd.DataFrame) -> dict[str, Any]:
+    name, known = "images against flow", table["contradiction"].dropna()
     if known.empty:
-        return None, "no pair has images and a flow on file", None
+        return _finding(name, None, "no pair has images and a flow on file")
     against = known[known != ""]
     share = len(against) / len(known)
     text = f"the flow contradicts the images in {len(against)} of {len(known)} pairs"
-    if share <= MAX_CONTRADICTED:
-        return False, text, share
-    return True, f"{text}; frame {against.index[0]}: {against.iloc[0]}", share
-
-
-QUESTIONS = {
-    "depth units": ("depth", _units),
-    "depth from frame to frame": ("depth_ratio", _depth_steps),
-    "images against flow": ("contradiction", _images_against_flow),
-}
-"""Question -> what is measured of every pair, and what answers it."""
+    if share > MAX_CONTRADICTED:
+        text += f"; frame {against.index[0]}: {against.iloc[0]}"
+    return _finding(name, share > MAX_CONTRADICTED, text, share)

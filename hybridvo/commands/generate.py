@@ -31,7 +31,7 @@ def generate(
     """
     with Progress("generate", count, "samples", quiet=quiet) as bar:
         for done in write_samples(load_preset(preset, size), count, out, seed, workers):
-            bar.update(done)
+            bar.show(done)
     sheet = Path(out) / "contact_sheet.png"
     write_sheet([read_sample(out, i) for i in range(min(6, count))], sheet)
     return sheet

@@ -117,7 +117,7 @@ def _estimate(
             if row["status"] != "ok":
                 text = f"frame {index}: {row['status']} ({row['reason']}), probability "
                 progress.say(f"{text}{row['probability']:.2f}: {row['message']}")
-            progress.update(len(rows), sum(row["status"] == "failed" for row in rows))
+            progress.show(len(rows), sum(row["status"] == "failed" for row in rows))
             if len(rows) % SAVE_EVERY == 0:
                 folder.save_rows(vo.state.to_arrays())
         folder.save_rows()

@@ -10,10 +10,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from hybridvo.data.image_io import read_rgb
-from hybridvo.data.lists import IMAGES, sorted_files
 from hybridvo.errors import FormatError, InputError
-from hybridvo.files import atomic_write, parse_yaml, read_text
+from hybridvo.files import atomic_write, make_folder, parse_yaml, read_text
 from hybridvo.options import Positive, option_group
 from hybridvo.types import Camera, as_number
 
@@ -123,18 +121,13 @@ def units_per_metre(scale: float | None, where: str, told: list[str]) -> float |
 
 
 def write_camera_template(directory: str | os.PathLike[str]) -> Path:
-    """Write a ``camera.yaml`` to fill in, with what the files in rgb/ and depth/ say."""
-    folder = Path(directory)
-    path = folder / CAMERA_FILE
+    """Write a ``camera.yaml`` to fill in."""
+    path = Path(directory) / CAMERA_FILE
     if path.exists():
         raise InputError(f"{path}: exists already; remove it first, or edit it.")
-    images = sorted_files(folder / "rgb", IMAGES)
-    height, width = read_rgb(images[0]).shape[:2] if images else ("", "")
-    comment = "# " if sorted_files(folder / "depth", (".npy", ".dpt")) else ""  # in metres
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent)
     with atomic_write(path) as file:
-        template = Path(__file__).with_name("camera_template.yaml").read_text(encoding="utf-8")
-        file.write(template.format(width=width, height=height, comment=comment))
+        file.write(Path(__file__).with_name("camera_template.yaml").read_text(encoding="utf-8"))
     return path
 
 

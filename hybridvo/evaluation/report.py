@@ -204,7 +204,7 @@ def path_charts(
 
 def _positions(files: Mapping[str, Path]) -> pd.DataFrame:
     """``method, right, forward`` of every path in the first true camera, metres."""
-    paths = {name: read_trajectory(file, "tum") for name, file in files.items()}
+    paths = {name: read_trajectory(file) for name, file in files.items()}
     gt = paths.get(TRUTH)
     tables = []
     for method, path in paths.items():

@@ -52,7 +52,7 @@ def test_version_and_help(capsys):
         (["run", "{sequence}", "--device", "tpu"], "tpu"),
         (["run", "{sequence}", "--dataset", "sintell"], "sintel"),
         (["run", "{sequence}", "--config", "none.yaml"], "none.yaml"),
-        (["run", "{sequence}", "--set", "refine.cutof=1"], "refine.cutoff"),
+        (["run", "{sequence}", "--set", "refine.cutof=1"], "refine.cutof: unexpected"),
         (["run", "{sequence}", "--rrd", "recording.txt"], ".rrd"),
         (["run", "{sequence}", "--weights", "pwvo=none.safetensors"], "none.safetensors"),
         (["run", "{sequence}", "--weights", "mine"], "NAME=FILE"),

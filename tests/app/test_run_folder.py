@@ -122,7 +122,7 @@ def test_progress_on_a_terminal_is_a_bar():
     console = Console(file=text, force_terminal=True, width=120)
     with Progress("static [x]", 4, "frames", console=console) as progress:
         progress.say("a line")
-        progress.update(4, 1)
+        progress.show(4, 1)
     assert "static [x]" in text.getvalue() and "4/4" in text.getvalue()
     assert "1 failed" in text.getvalue() and "a line" in text.getvalue()
 

@@ -304,19 +304,17 @@ def test_template_is_filled_in_and_read(tmp_path):
     root = own(tmp_path, ["0", "1"])
     (root / "camera.yaml").unlink()
     path = write_camera_template(root)
-    with pytest.raises(FormatError, match=r"camera\.yaml: missing: fx, fy, cx, cy\."):
+    with pytest.raises(FormatError, match=r"camera\.yaml: missing: fx, fy, cx, cy, h"):
         open_sequence(root)
     text = path.read_text()
     assert "\ndepth_scale: 1000" in text
     for key in ("fx", "fy", "cx", "cy"):
         text = text.replace(f"\n{key}:", f"\n{key}: 16.5")
+    text = text.replace("\nwidth:", "\nwidth: 32").replace("\nheight:", "\nheight: 24")
     path.write_text(text)
     assert open_sequence(root)[0].camera == Camera(16.5, 16.5, 16.5, 16.5, 24, 32)
     with pytest.raises(InputError, match="exists already"):
         write_camera_template(root)
-    (tmp_path / "metres" / "depth").mkdir(parents=True)
-    np.save(tmp_path / "metres" / "depth" / "0.npy", np.ones(SIZE))
-    assert "\n# depth_scale" in write_camera_template(tmp_path / "metres").read_text()
 
 
 @pytest.mark.parametrize(

@@ -50,12 +50,13 @@ def official(shared_data):
 
 
 def test_official_evaluator(official):
-    report = evaluate(*map(read_trajectory, official))
+    report = evaluate(*official)
     exact = {"rel": 1e-6}
     assert report["ate_rmse"] == pytest.approx(1.2045074393, **exact)
     assert report["kitti_drift"]["rotation_deg_per_m"] == pytest.approx(0.0229947185, **exact)
     assert report["kitti_drift"]["translation"] == pytest.approx(0.0271438892, **exact)
-    short = report["kitti_drift_short"]
+    # TartanAir's lengths
+    short = kitti_drift(match(*map(read_trajectory, official)), range(5, 45, 5))
     assert short["rotation_deg_per_m"] == pytest.approx(0.0798719448, **exact)
     assert short["translation"] == pytest.approx(0.0749175164, **exact)
     assert report["alignment"] == "se3"
@@ -157,15 +158,6 @@ def test_few_matches_give_no_number():
 # -- association ----------------------------------------------------------------------------------
 
 
-def test_default_time_difference():
-    for spacing, largest in ((0.1, 0.02), (0.01, 0.005)):
-        truth = from_positions(np.zeros((5, 3)), np.arange(5) * spacing)
-        for factor in (0.98, 1.02):
-            late = from_positions(np.zeros((5, 3)), truth.timestamps + factor * largest)
-            first_meets_first = match(late, truth).stamps[:1].tolist() == [0.0]
-            assert first_meets_first == (factor < 1)
-
-
 def test_files_without_stamps_match_by_index():
     stamped = from_positions(np.eye(3))
     plain = Trajectory(np.arange(3), stamped.T_world_cam, has_timestamps=False)
@@ -187,7 +179,7 @@ PATH = from_positions(np.eye(3))
         ((PATH, PATH), {"delta": 1.5}, "delta"),
         ((PATH, PATH), {"delta_unit": "m"}, "delta_unit"),
         ((PATH, PATH), {"max_diff": -1.0}, "max_diff"),
-        (("est.txt", PATH), {}, "estimate"),
+        ((3, PATH), {}, "estimate"),
         ((PATH, np.eye(4)), {}, "gt"),
     ],
 )

@@ -62,7 +62,7 @@ APPLICATION = {"cli", "commands"}
 """The command line: may import everything, and nothing imports it."""
 
 ONLY_IN = {
-    "evo": {"trajectory.py", "evaluation/metrics.py"},
+    "evo": {"evaluation/metrics.py"},
     "matplotlib": {"evaluation/plots.py"},
     "plotly": {"evaluation/"},
     "pandas": {"evaluation/", "commands/"},
