@@ -112,7 +112,7 @@ def _execute(args: argparse.Namespace, command: list[str]) -> tuple[Any, int]:
     if "weights" in given:
         device = given["options"].run.device if "options" in given else "cpu"
         given["models"] = Models(device, arguments.weight_files(args.weights))
-    if "path" in given:
+    if given.get("path") is not None:
         given["sequence"] = _call(open_sequence, given)
     module, _, name = COMMANDS[args.command][1].partition(":")
     found = _call(getattr(importlib.import_module(f"hybridvo.{module}"), name), given)

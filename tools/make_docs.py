@@ -22,6 +22,7 @@ import numpy as np
 from measuring import ROOT, parser_of
 from paper import ROWS
 
+from hybridvo.evaluation.report import number
 from hybridvo.evaluation.scores import paper_protocol
 from hybridvo.network.selection import SELECTION_METHODS
 
@@ -121,13 +122,6 @@ def tables(results: Results) -> Any:
     published = {line["method"]: line for line in paper_protocol()["published"]}
     shared = {"results": results, "at": at, "rows": ROWS, "rules": SELECTION_METHODS}
     return environment.get_template("tables.md").make_module(shared | {"published": published})
-
-
-def number(value: float | None) -> str:
-    """Three significant digits; a dash where there is none."""
-    if value is None:
-        return "-"
-    return f"{value:.3g}" if value < 1000 else f"{value:.0f}"
 
 
 def error(row: dict[str, Any]) -> str:

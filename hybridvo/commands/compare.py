@@ -88,7 +88,10 @@ def compare(
             tables.append(table)
             facts.append(fact)
         table = pd.concat(tables, ignore_index=True)
-        totals = scores.totals(table, rows)
+        totals = [
+            scores.total_row(pairs, [r for r in rows if (r["method"], r["flow_source"]) == key])
+            for key, pairs in table.groupby(["method", "flow_source"], sort=False)
+        ]
         result: dict[str, Any] = {
             "command": list(command),
             "versions": versions(),

@@ -19,14 +19,10 @@ MAX_STAMP_DIFFERENCE_S = 0.02
 
 def sorted_files(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
     """Files of a folder with one of the suffixes, ``frame_9`` before ``frame_10``."""
-
-    def parts(path: Path) -> list[str | int]:  # text, digits, text, ...
-        split = re.split(r"([0-9]+)", path.name)
-        return [int(part) if k % 2 else part for k, part in enumerate(split)]
-
     inside = folder.iterdir() if folder.is_dir() else ()
     found = (p for p in inside if p.suffix.lower() in suffixes and not p.name.startswith("."))
-    return sorted(found, key=parts)
+    padded = lambda path: re.sub(r"[0-9]+", lambda digits: digits[0].zfill(20), path.name)  # noqa: E731
+    return sorted(found, key=padded)
 
 
 def numbered_files(folder: Path, pattern: str) -> dict[int, Path]:

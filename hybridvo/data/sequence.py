@@ -67,11 +67,8 @@ def open_sequence(
     folder = Path(path)
     try:
         return _reader(folder, dataset)(folder.absolute(), camera, depth_scale, mask)
-    except FileNotFoundError as error:
-        raise InputError(f"{folder}: {error.filename or error} is missing.") from None
-    except OSError as error:  # a name that is too long, a folder that may not be read
-        reason = error.strerror or str(error)
-        raise InputError(f"{str(folder)[:200]}: cannot be read: {reason}.") from None
+    except OSError as error:  # a file that is missing, a folder that may not be read
+        raise InputError(f"{str(folder)[:200]}: cannot be read: {str(error)[:200]}.") from None
 
 
 def _reader(folder: Path, dataset: str | None) -> type[Sequence]:

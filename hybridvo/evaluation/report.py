@@ -83,7 +83,7 @@ def write_report(folder: Path, result: Mapping[str, Any], pairs: pd.DataFrame) -
         "totals": (totals, COLUMNS, ("method", "flow_source")),
         "sections": [(name, _json(some)) for name, some in sections.items() if some],
         "sequences": [(name, _json(some)) for name, some in paths.items()],
-        "protocol": _protocol_tables(result.get("protocol"), totals),
+        "published": _published(result["protocol"]),
         "numbers": (every, COLUMNS, ("sequence", "method", "flow_source")),
         "number": number,
     }
@@ -114,17 +114,12 @@ def number(value: float | None, digits: int = 3) -> str:
     return f"{value:.{digits}g}"
 
 
-def _protocol_tables(protocol: Mapping[str, Any] | None, totals: Any) -> list[tuple[str, Any]]:
-    """Measured here, and what others published: rows, columns, names."""
+def _published(protocol: Mapping[str, Any] | None) -> Any:
+    """What others published under a protocol: rows, columns, names."""
     if protocol is None:
-        return []
+        return None
     columns = [(m["key"], f"{m['label']} [{m['unit']}]", 1.0) for m in protocol["metrics"]]
-    here = [*columns, ("pairs", "pairs", 1.0)]
-    others = ("name", "inputs", "source", "note")
-    return [
-        ("Measured here", (totals, here, ("method", "flow_source"))),
-        ("Published by others", (protocol["published"], columns, others)),
-    ]
+    return protocol["published"], columns, ("name", "inputs", "source", "note")
 
 
 def _json(figures: Sequence[Any]) -> list[str]:

@@ -99,14 +99,6 @@ def sequence_row(
     return {**named, **scores}
 
 
-def totals(table: pd.DataFrame, rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Lines of all sequences together, from all pairs and the lines of single sequences."""
-    return [
-        total_row(group, [row for row in rows if (row["method"], row["flow_source"]) == key])
-        for key, group in table.groupby(["method", "flow_source"], sort=False)
-    ]
-
-
 def total_row(pairs: pd.DataFrame, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Line of one method over all sequences: pairs pooled, trajectory errors as plain means.
 

@@ -93,9 +93,9 @@ def build_options(cls: type[OptionsT], mapping: dict[str, Any], where: str) -> O
 def make_preset(mapping: dict[str, Any], where: str) -> Preset:
     """Generator from plain values; ``preset`` says which."""
     kind = mapping.get("preset")
-    if kind not in KINDS:
-        raise InputError(f"{where}: preset: expected one of {', '.join(KINDS)}, got {kind!r}.")
-    return build_options(KINDS[kind], mapping, where)
+    if kind not in PRESETS:
+        raise InputError(f"{where}: preset: expected one of {', '.join(PRESETS)}, got {kind!r}.")
+    return build_options(PRESETS[kind], mapping, where)
 
 
 def load_preset(name: str | Path, size: Sequence[int] | None = None) -> Preset:
@@ -223,7 +223,5 @@ class StoredSamples:
         return dataclasses.replace(cast(Any, self), folder=self.held_out)
 
 
-PRESETS: dict[str, type] = {"paper": PaperOptions, "diverse": DiverseOptions}
-"""Generators by the name that a file gives under ``preset``."""
-KINDS: dict[str, type] = PRESETS | {"folder": StoredSamples}
-"""These, and samples drawn before."""
+PRESETS = {"paper": PaperOptions, "diverse": DiverseOptions, "folder": StoredSamples}
+"""Generators, and samples drawn before, by the name that a file gives under ``preset``."""

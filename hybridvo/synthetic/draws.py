@@ -65,10 +65,10 @@ def carried(T: np.ndarray, A: np.ndarray) -> np.ndarray:
 def camera_path(
     rng: np.random.Generator, frames: int, step: float, turn_deg: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(N, 4, 4) smooth, bounded T_world_cam that never rests, with and without hand shake.
+    """(N, 4, 4) smooth, bounded T_world_cam, with and without hand shake.
 
-    Position runs on an ellipse and orientation on another, so that neither speed passes through
-    zero; ``step`` and ``turn_deg``: about how many metres and degrees a frame.
+    Position and orientation run on ellipses, so that neither speed passes through zero, by about
+    ``step`` metres and ``turn_deg`` degrees a frame.
     """
     t = np.arange(frames)
 
@@ -100,14 +100,12 @@ def poses(angles_deg: np.ndarray, position: np.ndarray) -> np.ndarray:
 
 def sway(rng: np.random.Generator, frames: int, rate: float) -> np.ndarray:
     """(N, 3) smooth oscillation that changes by about ``rate`` per frame and never rests."""
-    t = np.arange(frames)
-    direction = rng.normal(size=(2, 3))
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    axes = rng.normal(size=(2, 3))
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
     period = rng.uniform(22, 40)
-    phase = 2 * np.pi * (t / period + rng.uniform())
-    amplitude = rate * period / (2 * np.pi)
-    circle = np.outer(np.cos(phase), direction[0]) + np.outer(np.sin(phase), direction[1])
-    return amplitude * circle
+    phase = 2 * np.pi * (np.arange(frames) / period + rng.uniform())
+    circle = np.outer(np.cos(phase), axes[0]) + np.outer(np.sin(phase), axes[1])
+    return rate * period / (2 * np.pi) * circle
 
 
 def smooth_field(
@@ -134,7 +132,7 @@ def outline(rng: np.random.Generator, kind: str) -> np.ndarray:
     elif kind == "superellipse":
         exponent = 2.0 / log_uniform(rng, (0.7, 6.0))
         points = _unit(np.linspace(0.0, 2 * np.pi, 48, endpoint=False))
-        points = np.sign(points) * np.abs(points) ** exponent
+        points = np.copysign(np.abs(points) ** exponent, points)
         points[:, 1] *= rng.uniform(0.3, 1.0)
     elif kind == "polygon":
         corners = int(rng.integers(3, 10))

@@ -30,11 +30,9 @@ class Sample:
     """One training pair on the pixel grid of t; float32, px and metres, depth 0 is invalid.
 
     Args:
-        flow: (H, W, 2) total flow as the network is given it.
-        ego_flow: (H, W, 2) flow of the camera motion alone, without noise.
-        depth_prev: (H, W) as the network is given it.
+        flow, depth_prev: (H, W, 2) and (H, W) as the network is given them.
         depth_curr: (H, W) depth of t+1 **on the grid of t** (what lies at x + flow).
-        depth_true: (H, W) depth of t without noise or holes; 0 for sky.
+        ego_flow, depth_true: of the camera motion alone, and of t; without noise or holes.
         depth_target: (H, W) what L^D compares with. It includes the object's own motion in the
             paper's five steps, not in the diverse preset.
         K: (3, 3) intrinsics of both frames.
@@ -64,11 +62,8 @@ class Sample:
 
 @dataclass(frozen=True, eq=False)
 class KnownPair:
-    """A pair and its ground truth.
-
-    ``depth``: (H, W) metres of the previous frame before the sensor's errors, 0 where unknown;
-    ``moving``: (H, W) bool, points that do not follow the camera's motion; ``world``: path of the
-    recording.
+    """A pair and its truth: ``depth`` (H, W) metres of the previous frame without the sensor's
+    errors, 0 where unknown; ``moving`` (H, W) bool; ``world``: path of the recording.
     """
 
     pair: FramePair
@@ -108,8 +103,8 @@ class Layers:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """(H, W, 2) ego flow, (H, W) its ratio of new depth to old, total flow and its ratio.
 
-        ``added``: layers' motions are their own, and their flow is added to the camera's (as the
-        paper does); else they contain the camera's and replace it.
+        ``added``: the flow of a layer's motion is added to the camera's, as the paper does; else it
+        replaces it.
         """
         focal = (float(self.K[0, 0]), float(self.K[1, 1]))
         R, t = T_curr_prev[:3, :3], T_curr_prev[:3, 3]
@@ -245,7 +240,7 @@ Pixels = Annotated[int, Field(ge=2)]
 
 @option_group
 class PaperOptions:
-    """Options of the five steps, as published; units and reasons: ``configs/data_paper.yaml``."""
+    """The five steps, as published; units and reasons: ``configs/data_paper.yaml``."""
 
     height: Pixels = 128
     width: Pixels = 256

@@ -182,11 +182,10 @@ def make_scene(
 ) -> Scene:
     """Scene of a family, drawn from a seed.
 
-    Kinds: ``static``; ``light`` (several movers, about 30 % of the pixels); ``heavy_rigid``,
-    ``heavy_deforming``, ``heavy_two``, ``heavy_ten``: 46 to 75 % of the pixels on movers in every
-    frame, and at least 46 % whose flow differs from the camera's by over 1/512 of the width.
-    ``zoom``: relative amplitude of a slow change of focal length; ``noise``: standard deviation of
-    the sensor noise in grey levels.
+    Families: ``static``; ``light`` (several movers, about 30 % of the pixels); :data:`HEAVY`: 46 to
+    75 % of the pixels on movers in every frame, and at least 46 % whose flow differs from the
+    camera's by over 1/512 of the width. ``zoom``: relative amplitude of a slow change of focal
+    length; ``noise``: standard deviation of the sensor noise in grey levels.
     """
     if kind not in FAMILIES:
         raise InputError(f"scene kind: expected one of {', '.join(FAMILIES)}, got {kind!r}.")

@@ -18,6 +18,7 @@ def flows(loader, count: int) -> list[torch.Tensor]:
     return [batch.inputs.flow for batch in itertools.islice(loader, count)]
 
 
+@pytest.mark.filterwarnings("ignore:This DataLoader will create")  # where there is one core
 def test_workers_change_nothing(mixture):
     stream = SampleStream(mixture, 1, 8, 2)
     loader = torch.utils.data.DataLoader(
