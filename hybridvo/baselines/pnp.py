@@ -65,9 +65,8 @@ def solve_poselib(data: Correspondences, camera: Camera, seed: int) -> np.ndarra
     """PoseLib's LO-RANSAC, bundle adjustment included."""
     import poselib
 
-    size = {"width": camera.width, "height": camera.height}
-    pinhole = [camera.fx, camera.fy, camera.cx, camera.cy]
-    model = size | {"model": "PINHOLE", "params": pinhole}
+    model = {"model": "PINHOLE", "width": camera.width, "height": camera.height}
+    model["params"] = [camera.fx, camera.fy, camera.cx, camera.cy]
     options = {
         "max_reproj_error": TUNED_PX,
         # its default of at least 1000 takes three times as long and is no more accurate here

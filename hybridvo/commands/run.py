@@ -228,7 +228,6 @@ def _summarise(table: pd.DataFrame, sequence: Sequence, method: str) -> dict[str
         "failed": failed,
         "failed_fraction": failed / max(len(motions), 1),
         "degraded": int((motions["status"] == "degraded").sum()),
-        "missing_frames": table["index"][table["reason"] == "missing_frame"].tolist(),
         "flow_source": sorted(set(table["flow_source"]) - {""}),
         "depth_source": sequence.depth_source,
         "oracle": oracle,

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import os
 from collections.abc import Mapping
@@ -16,7 +17,7 @@ import pandas as pd
 
 from hybridvo.errors import InputError, OutputError
 from hybridvo.evaluation.pair_errors import ERRORS
-from hybridvo.files import Mode, atomic_write, write_csv, write_json
+from hybridvo.files import Mode, atomic_write, write_json
 
 RESULTS = (
     *("trajectory.tum", "trajectory.kitti", "trajectory.png"),
@@ -94,7 +95,10 @@ class RunFolder:
 
     def save_rows(self, tracker: Mapping[str, np.ndarray] | None = None) -> None:
         """Write ``steps.csv``, and with the tracker's state after the rows the checkpoint."""
-        write_csv(self.path / STEPS, STEP_COLUMNS, self.rows)
+        with atomic_write(self.path / STEPS) as file:
+            writer = csv.DictWriter(file, STEP_COLUMNS, extrasaction="ignore", lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(self.rows)
         if tracker is not None:
             rows = np.frombuffer(json.dumps(self.rows).encode(), np.uint8)
             content: dict[str, Any] = {"rows": rows, **tracker}
