@@ -18,8 +18,10 @@ from functools import partial
 from typing import Any, cast
 
 import numpy as np
+from scipy.special import logit
 
 from hybridvo.baselines import pnp, rgbd
+from hybridvo.calibration import PWVO_RIGHT, right
 from hybridvo.errors import InputError
 from hybridvo.flow import FlowProvider, contradiction, dis_flow, with_flow
 from hybridvo.geometry import ego_flow, se3_exp
@@ -179,8 +181,13 @@ def pwvo_refine(pair: FramePair, ctx: Context) -> RelativePose:
     with plain_torch():
         batch = PairBatch.from_pairs([pair], device=ctx.models.device)
         seed = select(network(batch))
-        found = refine_batch(batch, seed.T_curr_prev, seed.weights, options=ctx.options.refine)
-        return found.one(0)
+        batched = refine_batch(batch, seed.T_curr_prev, seed.weights, options=ctx.options.refine)
+    found = batched.one(0)
+    odds = float(logit(np.clip(found.probability, 1e-5, 1 - 1e-5)))
+    found = found.replace(probability=right((odds,), PWVO_RIGHT) if found.usable else 0.0)
+    if found.ok and not ctx.is_sure(found):
+        found = found.replace(status=refinement.ambiguous(found.probability))
+    return found
 
 
 def network_alone(name: str, pair: FramePair, ctx: Context) -> RelativePose:

@@ -20,9 +20,10 @@ from benchmark_semi_real import WRONG_FACTOR, WRONG_PX, calibration_error, draw,
 from golden_inputs import HEAVY
 from measuring import auroc, ego_flow_error, parser_of
 from scipy.optimize import minimize
+from scipy.special import logit
 
-from hybridvo import dis_flow, iter_pairs, open_sequence, refine
-from hybridvo.calibration import MIN_CONFIDENCE
+from hybridvo import dis_flow, estimate, iter_pairs, open_sequence, refine
+from hybridvo.calibration import MIN_CONFIDENCE, PWVO_RIGHT
 from hybridvo.calibration import right as probability
 from hybridvo.evaluation.pair_errors import true_motion
 from hybridvo.geometry import pose_matrix
@@ -117,12 +118,16 @@ def direct_answers(pair: Any, T: np.ndarray, depth: np.ndarray, starts: Any = (N
 
 
 def answers(pair: Any, T: np.ndarray, depth: np.ndarray, models: Models) -> Answers:
-    """The same of both selectors, and of the direct motion from the two strongest motions too."""
+    """The same of both selectors, of PWVO refined, of the direct motion from two of the search."""
     ctx = Context(models=models)
     found = ctx.search(pair)
     if isinstance(found, RelativePose):
         return
     yield from direct_answers(pair, T, depth, [pose_matrix(x) for x in found.poses[-2:]])
+    batch = estimate(pair, method="pwvo-refine", models=models)
+    if batch.usable:
+        (slope, offset), error = PWVO_RIGHT, ego_flow_error(batch.T_curr_prev, T, depth, pair)
+        yield "pwvo-refine", (float(logit(batch.probability) - offset) / slope,), error
     chosen = {"cues": select_by_cues(found), "selector": ctx.select(pair, found)}
     if not found.is_ambiguous:
         chosen = {"clear": chosen["selector"]}

@@ -110,7 +110,7 @@ class Pixels(NamedTuple):
         return Pixels._make(x if x is None else change(x) for x in self)
 
     def parts(self, run: int = 1) -> Iterator[Pixels]:
-        """The pixels by and by, in whole runs of ``run``: few enough at once to stay in the cache."""
+        """All pixels, in whole runs of ``run``, few enough at once to stay in the cache."""
         batch, total = self.weight.shape
         step = run * max(1, PART // (batch * run))
         for k in range(0, total, step):

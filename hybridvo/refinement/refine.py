@@ -143,17 +143,22 @@ def status_of(
     if not doubt.ok:
         return doubt
     if probability < min_probability:
-        return Status.degraded(
-            Reason.AMBIGUOUS_MOTION,
-            f"another of the motions found could be the camera's (probability of this one "
-            f"{100 * probability:.0f} %)",
-        )
+        return ambiguous(probability)
     if weak:
         return Status.degraded(Reason.DEGENERATE_GEOMETRY, weak)
     if share < LOW_INLIER_RATIO:
         what = f"only {100 * share:.0f} % of the pixels follow the motion"
         return Status.degraded(Reason.LOW_INLIERS, what)
     return Status()
+
+
+def ambiguous(probability: float) -> Status:
+    """Status of a motion that may be another's than the camera's."""
+    return Status.degraded(
+        Reason.AMBIGUOUS_MOTION,
+        f"another of the motions found could be the camera's (probability of this one "
+        f"{100 * probability:.0f} %)",
+    )
 
 
 def widened(motion: RelativePose) -> RelativePose:
