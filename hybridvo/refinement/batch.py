@@ -114,7 +114,9 @@ class Pixels(NamedTuple):
         batch, total = self.weight.shape
         step = run * max(1, PART // (batch * run))
         for k in range(0, total, step):
-            yield self.map(lambda x, k=k: x if x is self.K else x[..., k : k + step])
+            yield Pixels._make(
+                x if x is None or x is self.K else x[..., k : k + step] for x in self
+            )
 
     def subset(self, count: int) -> Pixels:
         """About ``count`` usable pixels of each sample, spread by the golden section."""

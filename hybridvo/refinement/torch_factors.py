@@ -175,10 +175,9 @@ def linearize(
     """Normal equations at poses (B, 7), summed over runs of ``run`` pixels or of any length."""
     found = [_linearize(part, T, how, run) for part in pixels.parts(run or 1)]
     H, g, cost, weight_sum, robust, distance2 = zip(*found, strict=True)
-    sums = sum(cost), sum(weight_sum)
-    return Linearization(
-        *(torch.cat(x, 1) for x in (H, g)), *sums, *(torch.cat(x, 1) for x in (robust, distance2))
-    )
+    sums = torch.stack(cost).sum(0), torch.stack(weight_sum).sum(0)
+    each = torch.cat(robust, 1), torch.cat(distance2, 1)
+    return Linearization(torch.cat(H, 1), torch.cat(g, 1), *sums, *each)
 
 
 def _linearize(pixels: Pixels, T: pp.LieTensor, how: RobustNoise, run: int | None) -> Linearization:
