@@ -1,6 +1,6 @@
 """The rows of the paper's tables, trained anew under one budget on the same pairs.
 
-    hybridvo generate paper --size 64 128 --count 100000 --out runs/paper_samples
+    hybridvo generate --preset paper --size 64 128 --count 100000 --out runs/paper_samples
     python tools/ablation.py --out runs/ablation --data runs/paper_samples --seeds 3
 
 A row is a file of configs/ablation. The rows that decide the paper's order have several seeds, the

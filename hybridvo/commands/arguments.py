@@ -127,7 +127,7 @@ def demo(command: argparse.ArgumentParser) -> None:
 def generate(command: argparse.ArgumentParser) -> None:
     """Draw training samples into a folder."""
     add = command.add_argument
-    add("preset", metavar="PRESET", help="paper, diverse or a YAML file")
+    add("--preset", default="paper", help="paper, diverse or a YAML file; default: %(default)s")
     add("--out", required=True, metavar="DIR", help="folder of the samples")
     add("--count", type=int, default=1000, metavar="N", help="default: 1000")
     add("--seed", type=int, default=0, metavar="N")

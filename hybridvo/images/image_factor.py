@@ -19,7 +19,6 @@ from weakref import WeakKeyDictionary
 
 import cv2
 import numpy as np
-from scipy.sparse import csr_array, hstack
 
 from hybridvo.calibration import EVEN_PARTS, UNEVEN_LIGHT
 from hybridvo.images import photometric_kernels as kernels
@@ -117,7 +116,7 @@ class ImageFactor:
         """Whether gain and offset had to vary over the image."""
 
     @cached_property
-    def _shares(self) -> csr_array:
+    def _shares(self) -> np.ndarray:
         """Of the fields' nodes in each pixel: asked for only where the light may be uneven."""
         return node_shares(self._places)
 
@@ -288,24 +287,26 @@ def parts_dispersion(scores: np.ndarray, model: np.ndarray) -> float:
     return float(np.mean(found))
 
 
-def node_shares(places: np.ndarray) -> csr_array:
+def node_shares(places: np.ndarray) -> np.ndarray:
     """(N, nodes) bilinear shares of the nodes in places (N, 2): rows and columns among them."""
     corner = places.astype(np.intp)
     v, u = (places - corner).T
-    shares = np.stack([(1 - v) * (1 - u), (1 - v) * u, v * (1 - u), v * u], axis=1)
     nodes = (corner @ (COLUMNS, 1))[:, None] + (0, 1, COLUMNS, COLUMNS + 1)
-    starts = 4 * np.arange(len(places) + 1)
-    return csr_array((shares.ravel(), nodes.ravel(), starts), (len(places), ROWS * COLUMNS))
+    out = np.zeros((len(places), ROWS * COLUMNS), np.float32)
+    out[np.arange(len(places))[:, None], nodes] = np.stack(
+        [(1 - v) * (1 - u), (1 - v) * u, v * (1 - u), v * u], axis=1
+    )
+    return out
 
 
 def light_fields(
-    shares: csr_array, grey: np.ndarray, r: np.ndarray, w: np.ndarray, least: float = 0.0
+    shares: np.ndarray, grey: np.ndarray, r: np.ndarray, w: np.ndarray, least: float = 0.0
 ) -> np.ndarray | None:
     """Smooth changes of gain and offset (2, nodes) that explain the residuals best, or None."""
     r, nodes = np.where(w > 0, r, np.float32(0)), ROWS * COLUMNS
-    A = hstack([shares * grey[:, None], shares], "csr")
+    A = np.concatenate([shares * grey[:, None], shares], axis=1)
     weighted = (A * w[:, None]).T
-    H, g = (weighted @ A).toarray(), weighted @ r
+    H, g = (weighted @ A).astype(np.float64), weighted @ r
     scale = np.repeat([np.trace(H[:nodes, :nodes]), np.trace(H[nodes:, nodes:])], nodes) / nodes
     H += SMOOTH * scale * np.kron(np.eye(2), _differences())
     # and a weak pull to no change, for nodes that no pixel is near to

@@ -114,9 +114,8 @@ class Pixels(NamedTuple):
         batch, total = self.weight.shape
         step = run * max(1, PART // (batch * run))
         for k in range(0, total, step):
-            yield Pixels._make(
-                x if x is None or x is self.K else x[..., k : k + step] for x in self
-            )
+            piece = slice(k, k + step)
+            yield self.map(lambda x, at=piece: x if x is self.K else x[..., at])  # type: ignore[misc]
 
     def subset(self, count: int) -> Pixels:
         """About ``count`` usable pixels of each sample, spread by the golden section."""

@@ -175,9 +175,9 @@ def linearize(
     """Normal equations at poses (B, 7), summed over runs of ``run`` pixels or of any length."""
     found = [_linearize(part, T, how, run) for part in pixels.parts(run or 1)]
     H, g, cost, weight_sum, robust, distance2 = zip(*found, strict=True)
-    sums = torch.stack(cost).sum(0), torch.stack(weight_sum).sum(0)
-    each = torch.cat(robust, 1), torch.cat(distance2, 1)
-    return Linearization(torch.cat(H, 1), torch.cat(g, 1), *sums, *each)
+    joined = [torch.cat(parts, dim=1) for parts in (H, g, robust, distance2)]
+    total = [torch.stack(parts).sum(dim=0) for parts in (cost, weight_sum)]
+    return Linearization(joined[0], joined[1], total[0], total[1], joined[2], joined[3])
 
 
 def _linearize(pixels: Pixels, T: pp.LieTensor, how: RobustNoise, run: int | None) -> Linearization:
