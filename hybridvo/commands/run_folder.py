@@ -69,11 +69,11 @@ class RunFolder:
         """Rows and tracker of an earlier run of the same identity."""
         try:
             before = json.loads((self.path / STATE).read_text(encoding="utf-8"))
-        except (OSError, ValueError):
+            both = pd.json_normalize([before["identity"], self.header["identity"]]).map(str)
+        except (OSError, ValueError, KeyError):
             raise InputError(
                 f"{self.path}: no {STATE} of a run to resume. Pass --overwrite to start anew."
             ) from None
-        both = pd.json_normalize([before["identity"], self.header["identity"]]).map(str)
         for key, (then, now) in both.items():
             if then != now:
                 raise InputError(

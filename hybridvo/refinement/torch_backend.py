@@ -48,7 +48,7 @@ from hybridvo.refinement.torch_factors import (
     weigh,
 )
 from hybridvo.results import Reason, Status
-from hybridvo.torch_geometry import left_update, pp, weighted_median
+from hybridvo.torch_geometry import left_update, pp
 from hybridvo.types import PairBatch
 
 SUBSET_PIXELS, STEPS = 2048, 20
@@ -215,11 +215,13 @@ def _covariances(
     tile: int,
 ) -> list[tuple[np.ndarray, bool]]:
     """Covariance of each sample by the numpy function, and whether it is definite."""
-    depth = weighted_median(few.points[:, 2], few.weight, 1.0)
+    # 1 / typical depth, as of the coarse grid: half of the weight may lie on a sky at 30 km
+    usable, z = few.weight > 0, few.points[:, 2]
+    inverse = ((usable / z**2).sum(dim=1) / usable.sum(dim=1).clamp(min=1)).sqrt().clamp(min=1e-9)
     tiles = torch.cat([last.H[..., UPPER[0], UPPER[1]], last.g], dim=2)
     tiles = tiles.unflatten(1, (-(-size[0] // tile), -1))
     weight, focal, t = pixels.weight.double().sum(dim=1), pixels.K[:, 0, 0], T.translation()
-    values = (tiles, *spread, 1 / depth, weight, focal, t, noise[:, :2])
+    values = (tiles, *spread, inverse, weight, focal, t, noise[:, :2])
     found = []
     for sums in zip(*(x.double().cpu().numpy() for x in values), strict=True):
         covariance, occupied = NOTHING, 0

@@ -90,10 +90,11 @@ def test_resume_of_another_run_or_a_damaged_state_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"options\.seed differs .0 then, 1 now"):
         with start(tmp_path, "resume", options={"seed": 1}):
             pass
-    (tmp_path / STATE).write_text("{")
-    with pytest.raises(InputError, match=r"run\.json.*--overwrite"):
-        with start(tmp_path, "resume"):
-            pass
+    for damaged in ("{", "{}"):
+        (tmp_path / STATE).write_text(damaged)
+        with pytest.raises(InputError, match=r"run\.json.*--overwrite"):
+            with start(tmp_path, "resume"):
+                pass
 
 
 def test_a_second_run_in_the_same_folder_is_refused(tmp_path):

@@ -97,6 +97,14 @@ def test_weights_and_mask_switch_pixels_off() -> None:
     assert torch.equal(by_mask.T_curr_prev, by_nan.T_curr_prev)
 
 
+def test_a_far_sky_on_most_of_the_image_leaves_no_direction_open() -> None:
+    pair, T = scene(1)
+    depth = pair.depth_prev.clone()
+    depth[:, :25] = 3e4
+    flow = reproject(depth, T, pair.K_prev, pair.K_curr)[0] - pixel_grid(40, 56, pair.K_prev)
+    assert refine_batch(replace(pair, depth_prev=depth, flow=flow)).status[0].ok
+
+
 @pytest.mark.parametrize("count", [0, 3, 6, 23])
 def test_too_few_pixels_fail(count: int) -> None:
     pair, _ = scene(2)

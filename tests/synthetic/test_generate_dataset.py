@@ -10,7 +10,6 @@ from hybridvo.data.image_io import read_flow
 from hybridvo.synthetic.scenes import make_scene
 from tests.scripts import load_script
 
-TOOL = Path(__file__).resolve().parents[2] / "tools" / "generate_dataset.py"
 SMALL = ["--height", "32", "--width", "64", "--frames", "3"]
 
 
