@@ -102,6 +102,7 @@ def _call(function: Callable[..., Any], given: Mapping[str, Any]) -> Any:
 def _execute(args: argparse.Namespace, command: list[str]) -> tuple[Any, int]:
     """Call the function of a command; what it gives, JSON-ready, and the exit code."""
     from hybridvo.data.sequence import open_sequence
+    from hybridvo.errors import InputError
     from hybridvo.network.models import Models
 
     given = vars(args) | {"command": command}
@@ -120,6 +121,8 @@ def _execute(args: argparse.Namespace, command: list[str]) -> tuple[Any, int]:
         return found
     if isinstance(found, Path | list):
         return {"files": [str(path) for path in (found if isinstance(found, list) else [found])]}, 0
+    if found.get("matched") == 0:  # the files do not belong together
+        raise InputError(f"nothing could be compared: {found['reasons']['ate_rmse_unaligned']}.")
     return found, 0 if found.get("ok", True) else 1
 
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 
 import numpy as np
 
-from hybridvo.data.base import Sequence
+from hybridvo.data.base import Files, Sequence
 from hybridvo.data.camera_file import CAMERA_FILE, Calibration, read_camera_file
 from hybridvo.data.lists import (
     IMAGES,
@@ -52,11 +53,7 @@ class FolderSequence(Sequence):
         if self._mask_folder is None and (root / "mask").is_dir():
             self._mask_folder = root / "mask"
         frames = rgb or depth
-        # none starts at the last image
-        last = len(frames) - (len(flow) == len(frames) - 1)
-        hint = "Give both the same names."
-        flow_of = match_files(frames[:last], flow, root / "flow", hint) if flow else []
-        flow_of += [None] * (len(frames) - len(flow_of))
+        flow_of = self._match_flow(frames, flow)
         stamps, poses = self._stamps_and_poses(frames)
         depth_of = self._match_depth(rgb, depth) if rgb else dict(enumerate(depth))
         kept = list(depth_of)
@@ -99,6 +96,24 @@ class FolderSequence(Sequence):
                 return {i: files[j] for i, j in pairs}
         hint = "Give both the same names, or their stamps: as names, or in (depth_)timestamps.txt."
         return dict(enumerate(match_files(frames, files, self.root / "depth", hint)))
+
+    def _match_flow(self, frames: list[Path], files: list[Path]) -> Files:
+        """Flow by equal names, else by order; what led to an image that is missing is left out."""
+        if not files:
+            return [None] * len(frames)
+        last = len(frames) - (len(files) == len(frames) - 1)  # none starts at the last image
+        hint = "Give both the same names."
+        matched = match_files(frames[:last], files, self.root / "flow", hint)
+        matched += [None] * (len(frames) - last)
+        known = {path.stem for path in (*frames, *files)}
+        if len(known) < len(frames) + len(files) and all(x.isdecimal() for x in known):
+            step = min(np.diff(sorted(map(int, known))), default=1)
+            for k, (a, b) in enumerate(itertools.pairwise(int(path.stem) for path in frames)):
+                if matched[k] is not None and b - a != step:
+                    matched[k] = None
+                    told = f"the flow from {a} led to a missing image and is not used"
+                    self.warnings.append(f"{self.name}: {told}.")
+        return matched
 
     def _stamps_and_poses(self, frames: list[Path]) -> tuple[np.ndarray, np.ndarray | None]:
         """Seconds of all frames and their ground-truth poses, where poses.txt has them."""

@@ -120,6 +120,9 @@ def test_evaluate(tmp_path, capsys):
     (tmp_path / "bad").write_text("0 1 2 3 4 5 6\n0 1\n")
     assert main(["evaluate", str(tmp_path / "bad"), gt]) == 2
     assert "bad:2" in capsys.readouterr().err
+    (tmp_path / "later").write_text("900 0 0 0 0 0 0 1\n901 1 0 0 0 0 0 1\n")
+    assert main(["evaluate", str(tmp_path / "later"), gt]) == 2
+    assert "nothing could be compared" in capsys.readouterr().err
 
 
 def test_init_writes_a_camera_file(tmp_path, capsys):

@@ -374,3 +374,31 @@ def test_flow_by_equal_names_or_by_order(tmp_path):
         assert sequence.has_flow and sequence.flow(1)[0].max() == len(names) - 1
     with pytest.raises(FileNotFoundError, match="no flow file from frame 0"):
         sequence.flow(0)
+
+
+@pytest.mark.parametrize(
+    ("images", "flows", "kept"),
+    [
+        ((0, 1, 2, 3), (0, 1, 2), (0, 1, 2)),
+        ((0, 2, 3, 4), (0, 1, 2, 3), (2, 3)),  # one image deleted
+        ((0, 2, 3, 4), (0, 2, 3), (2, 3)),  # and its flow with it
+        ((0, 10, 20, 30), (0, 10, 20), (0, 10, 20)),  # flow over ten frames
+        ((0, 2, 4, 6), (0, 1, 2, 3, 4, 5), ()),  # every second image of a sequence with its flow
+        ((0, 1, 5, 6), (0, 1, 5), (0, 5)),
+    ],
+)
+def test_flow_that_led_to_a_missing_image_is_not_used(tmp_path, images, flows, kept):
+    root = own(tmp_path, [f"{i:04d}" for i in images])
+    (root / "flow").mkdir()
+    for number in flows:
+        write_flo(root / "flow" / f"{number:04d}.flo", np.full((*SIZE, 2), number, np.float32))
+    sequence = open_sequence(root)
+    for index, number in enumerate(images[:-1]):
+        if number in kept:
+            assert sequence.flow(index)[0].max() == number
+        else:
+            with pytest.raises(FileNotFoundError, match="no flow file from frame"):
+                sequence.flow(index)
+    assert sequence.has_flow == bool(kept)
+    is_told = any("is not used" in warning for warning in sequence.warnings)
+    assert is_told == (len(kept) < len(set(flows) & set(images)))
