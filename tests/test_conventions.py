@@ -33,7 +33,6 @@ from hybridvo.geometry import (
 from hybridvo.network.inputs import assemble_inputs
 from hybridvo.refinement import coarse_fit
 from hybridvo.results import RelativePose, Step
-from hybridvo.trajectory import read_trajectory
 from hybridvo.types import Camera, Frame, FramePair, PairBatch
 from tests.walks import chained
 
@@ -313,18 +312,6 @@ def test_pypose_and_tum_are_xyzw_kornia_and_evo_wxyz():
     by_evo = PosePath3D(np.zeros((1, 3)), wxyz[None]).poses_se3[0][:3, :3]
     for R in (by_pypose, by_kornia, by_evo):
         np.testing.assert_allclose(R, RIGHT_TURN_ABOUT_Z, atol=1e-12)
-
-
-# Time and names
-
-
-def test_stamps_above_1e14_are_nanoseconds_with_a_notice(tmp_path):
-    path = tmp_path / "ns"
-    path.write_text("1700000000500000000 0 0 0 0 0 0 1\n1700000001000000000 0 0 0 0 0 0 1\n")
-    trajectory = read_trajectory(path)
-    assert trajectory.timestamps.tolist() == [1700000000.5, 1700000001.0]
-    assert trajectory.timestamps.dtype == np.float64
-    assert "nanoseconds" in trajectory.warnings[0]
 
 
 # The group in numpy, numba and torch is pypose's
