@@ -18,7 +18,7 @@ from hybridvo.torch_geometry import MAX_DEPTH, MIN_DEPTH, pixel_grid, pp, rays, 
 from hybridvo.types import PairBatch
 
 PART = 131_072
-"""Pixels that are worked on at once: on a CPU a third of the time of all of them at once."""
+"""Pixels that are worked on at once: on a CPU half the time of all of them at once."""
 
 
 @dataclass(frozen=True, eq=False)
