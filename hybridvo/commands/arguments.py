@@ -106,7 +106,8 @@ def evaluate(command: argparse.ArgumentParser) -> None:
     add("--alignment", choices=kinds, default="se3", help="of the ATE")
     add("--delta", type=float, default=1, metavar="X", help="span of the RPE (default 1)")
     add("--delta-unit", choices=("frames", "s"), default="frames", help="unit of --delta")
-    add("--max-diff", type=float, default=0.02, metavar="S", help="seconds between matches")
+    matched = "seconds between matches (default 0.02)"
+    add("--max-diff", type=float, default=argparse.SUPPRESS, metavar="S", help=matched)
 
 
 def doctor(command: argparse.ArgumentParser) -> None:
