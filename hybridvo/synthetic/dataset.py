@@ -71,15 +71,15 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
     if not isinstance(mapping, dict):
         raise FormatError(f"{path}: expected a mapping of keys, got {type(mapping).__name__}.")
     if "extends" in mapping:
-        mapping = _merged(read_yaml(Path(path).parent / str(mapping.pop("extends"))), mapping)
+        mapping = merged(read_yaml(Path(path).parent / str(mapping.pop("extends"))), mapping)
     return mapping
 
 
-def _merged(base: Any, changes: Any) -> Any:
+def merged(base: Any, changes: Any) -> Any:
     """Base with changes, mapping by mapping."""
     if not (isinstance(base, dict) and isinstance(changes, dict)):
         return changes
-    return base | {key: _merged(base.get(key), value) for key, value in changes.items()}
+    return base | {key: merged(base.get(key), value) for key, value in changes.items()}
 
 
 def build_options(cls: type[OptionsT], mapping: dict[str, Any], where: str) -> OptionsT:

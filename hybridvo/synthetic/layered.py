@@ -10,7 +10,7 @@ Silhouettes are procedural: the published photographs are a download of a third 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -20,6 +20,9 @@ from hybridvo.geometry import euler_deg_to_matrix, make_transform, matrix_to_eul
 from hybridvo.options import Positive, Share, option_group
 from hybridvo.synthetic.draws import cut_out
 from hybridvo.types import FramePair
+
+if TYPE_CHECKING:
+    import torch
 
 MIN_RATIO = 1e-6
 """Least |z' / z|: the flow of a point in the image plane stays finite."""
@@ -99,55 +102,42 @@ class Layers:
         self.motions.append(None)
 
     def flows(
-        self, T_curr_prev: np.ndarray, added: bool
+        self, T_curr_prev: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """(H, W, 2) ego flow, (H, W) its ratio of new depth to old, total flow and its ratio.
-
-        ``added``: the flow of a layer's motion is added to the camera's, as the paper does; else it
-        replaces it.
-        """
+        """(H, W, 2) ego flow, (H, W) its ratio of new depth to old, total flow and its ratio."""
         focal = (float(self.K[0, 0]), float(self.K[1, 1]))
-        R, t = T_curr_prev[:3, :3], T_curr_prev[:3, 3]
-        u, v, ego_ratio = rigid_flow(self.x, self.y, self.rho, R, t, focal)
-        ego_flow = np.stack([u, v], axis=-1)
+        *uv, ego_ratio = rigid_flow(self.x, self.y, self.rho, T_curr_prev, focal)
+        ego_flow = np.stack(uv, axis=-1)
         flow, ratio = ego_flow.copy(), ego_ratio.copy()
         for number, motion in enumerate(self.motions):
-            if motion is None:
-                continue
-            mine = rows, columns = np.nonzero(self.owner == number)
-            R, t, x, y = motion[:3, :3], motion[:3, 3], self.x[columns], self.y[rows, 0]
-            u, v, change = rigid_flow(x, y, self.rho[mine], R, t, focal)
-            own = np.stack([u, v], axis=-1)
-            flow[mine] = flow[mine] + own if added else own
-            ratio[mine] = ratio[mine] + change - 1.0 if added else change
+            if motion is not None:
+                mine = rows, columns = np.nonzero(self.owner == number)
+                x, y = self.x[columns], self.y[rows, 0]
+                *uv, ratio[mine] = rigid_flow(x, y, self.rho[mine], motion, focal)
+                flow[mine] = np.stack(uv, axis=-1)
         return ego_flow, ego_ratio, flow, ratio
 
 
 def camera_flow(K: np.ndarray, depth: np.ndarray, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(H, W, 2) flow of the camera motion alone, and (H, W) ratio of the new depth to the old."""
     inverse = np.divide(1.0, depth, out=np.zeros(depth.shape), where=depth > 0).astype(np.float32)
-    return Layers(K, inverse).flows(T, added=False)[:2]
+    return Layers(K, inverse).flows(T)[:2]
 
 
-def rigid_flow(
-    x: np.ndarray,
-    y: np.ndarray,
-    inverse_depth: np.ndarray,
-    R: np.ndarray,
-    t: np.ndarray,
-    focal: tuple[float, float],
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def rigid_flow(x: Any, y: Any, inverse_depth: Any, T: Any, focal: Any) -> tuple[Any, Any, Any]:
     """Flow (u, v) of a rigid motion in px and the ratio of the new depth to the old.
 
-    Paper, equation 8, written as differences, so that single precision suffices: ``x`` and ``y``
-    normalised coordinates and ``inverse_depth``, which broadcast.
+    Paper, equation 8, written as differences, so that single precision suffices: normalised
+    coordinates, inverse depth, the entries ``T[i, j]`` of the motion and the two focal lengths, all
+    of which broadcast; of numpy or torch.
     """
-    R, t = R.astype(x.dtype), t.astype(x.dtype)
-    ratio = (R[2, 0] * x + (R[2, 1] * y + R[2, 2])) + t[2] * inverse_depth
+    if isinstance(T, np.ndarray):
+        T = T.astype(np.asarray(x).dtype)
+    ratio = (T[2, 0] * x + (T[2, 1] * y + T[2, 2])) + T[2, 3] * inverse_depth
     # The published code takes |z'|: a point behind the camera keeps a bounded flow.
-    scale = 1.0 / np.maximum(np.abs(ratio), MIN_RATIO)
-    u = (((R[0, 0] * x + (R[0, 1] * y + R[0, 2])) + t[0] * inverse_depth) * scale - x) * focal[0]
-    v = (((R[1, 0] * x + (R[1, 1] * y + R[1, 2])) + t[1] * inverse_depth) * scale - y) * focal[1]
+    scale = 1.0 / abs(ratio).clip(MIN_RATIO)
+    u = (((T[0, 0] * x + (T[0, 1] * y + T[0, 2])) + T[0, 3] * inverse_depth) * scale - x) * focal[0]
+    v = (((T[1, 0] * x + (T[1, 1] * y + T[1, 2])) + T[1, 3] * inverse_depth) * scale - y) * focal[1]
     return u, v, ratio
 
 
@@ -263,12 +253,39 @@ class PaperOptions:
     motion: MotionSamplers = MotionSamplers()
     preset: Literal["paper"] = "paper"
 
+    def draw(self, rng: np.random.Generator) -> LayeredPair:
+        """One pair by steps 1 to 3: what :func:`compose` makes its flows of."""
+        return _draw(rng, self)
+
     def sample(self, rng: np.random.Generator) -> Sample:
         """One pair by the five steps."""
-        return _paper_sample(rng, self)
+        import torch
+
+        drawn = {k: torch.from_numpy(x)[None] for k, x in vars(self.draw(rng)).items()}
+        return Sample(**{name: value[0].numpy() for name, value in compose(**drawn).items()})
 
 
-def _paper_sample(rng: np.random.Generator, o: PaperOptions) -> Sample:
+@dataclass(frozen=True, eq=False)
+class LayeredPair:
+    """A background and N flat objects, of which the nearest is seen, and how all of them move.
+
+    Args:
+        K, T_curr_prev: (3, 3) and (4, 4) float32 camera and its motion.
+        owner: (H, W) uint8, 0 for the background, else the number of an object.
+        inverse_depth: (N + 1,) float32, of the background and the objects.
+        motions: (N + 1, 4, 4) float32 of each beside the camera's, the identity where it is still.
+        moves: (N + 1,) bool.
+    """
+
+    K: np.ndarray
+    T_curr_prev: np.ndarray
+    owner: np.ndarray
+    inverse_depth: np.ndarray
+    motions: np.ndarray
+    moves: np.ndarray
+
+
+def _draw(rng: np.random.Generator, o: PaperOptions) -> LayeredPair:
     # Step 1. The published code resizes corner to corner, hence fx != fy at 128x256.
     f = o.focal_low + o.focal.draw(rng) * (o.focal_high - o.focal_low)
     fx = f * (o.width - 1) / (o.full_width - 1)
@@ -286,33 +303,63 @@ def _paper_sample(rng: np.random.Generator, o: PaperOptions) -> Sample:
         near + o.object_depth.draw(rng) * (background - near) if background > near else background
         for _ in range(o.objects)
     ]
-    layers = Layers(K, np.full((o.height, o.width), 1.0 / background, np.float32))
-    for depth in depths:
+    inverse_depth = (1.0 / np.array([background, *depths])).astype(np.float32)
+    layers = Layers(K, np.full((o.height, o.width), inverse_depth[0]))
+    for rho in inverse_depth[1:]:
         box, mask = _place(rng, o)
-        layers.lay(box, mask, float(np.float32(1.0 / depth)))
+        layers.lay(box, mask, float(rho))
 
     # Step 3.
     T = o.motion.draw(rng, min(depths, default=background))
-    for number, depth in enumerate(depths):
+    motions, moves = np.tile(np.eye(4), (1 + len(depths), 1, 1)), np.zeros(1 + len(depths), bool)
+    for number, depth in enumerate(depths, start=1):
         if rng.random() < o.move_probability:
-            layers.motions[number] = o.motion.draw(rng, depth)
+            motions[number], moves[number] = o.motion.draw(rng, depth), True
+    owner, (K32, T32, motions32) = layers.owner + 1, (x.astype(np.float32) for x in (K, T, motions))
+    return LayeredPair(K32, T32, owner.astype(np.uint8), inverse_depth, motions32, moves)
 
-    # Steps 4 and 5.
-    ego_flow, _, flow, ratio = layers.flows(T, added=True)
-    moving = [number for number, motion in enumerate(layers.motions) if motion is not None]
-    depth_prev = 1.0 / layers.rho
-    depth_curr = np.maximum(depth_prev * ratio, 0.0)
-    return Sample(
-        flow=flow,
-        ego_flow=ego_flow,
-        depth_prev=depth_prev,
-        depth_curr=depth_curr,
-        depth_true=depth_prev,
-        depth_target=depth_curr,
-        K=K.astype(np.float32),
-        T_curr_prev=T.astype(np.float32),
-        moving=np.isin(layers.owner, moving),
+
+def compose(
+    K: torch.Tensor,
+    T_curr_prev: torch.Tensor,
+    owner: torch.Tensor,
+    inverse_depth: torch.Tensor,
+    motions: torch.Tensor,
+    moves: torch.Tensor,
+) -> dict[str, torch.Tensor]:
+    """Steps 4 and 5 for a batch of :class:`LayeredPair`, on any device: :class:`Sample`'s fields.
+
+    The rigid flow of each pixel's object is **added** to the camera's, as the paper does.
+    """
+    import torch
+
+    size = owner.shape[1:]
+    pixels, which = owner.flatten(1).long(), torch.arange(len(owner), device=owner.device)[:, None]
+    moving = moves[which, pixels].unflatten(1, size)
+    rho = inverse_depth[which, pixels].unflatten(1, size)
+    focal = [K[:, i, i, None, None] for i in (0, 1)]
+    centre = [K[:, i, 2, None, None] for i in (0, 1)]
+    grid = (torch.arange(n, device=owner.device) for n in reversed(size))
+    x, y = (
+        (g - c) / f
+        for g, c, f in zip(torch.meshgrid(*grid, indexing="xy"), centre, focal, strict=True)
     )
+    *ego, ego_ratio = rigid_flow(x, y, rho, T_curr_prev.permute(1, 2, 0)[..., None, None], focal)
+    own = motions[which, pixels].permute(2, 3, 0, 1).unflatten(3, size)
+    *added, change = rigid_flow(x, y, rho, own, focal)
+    ego_flow, depth_prev = torch.stack(ego, dim=-1), 1.0 / rho
+    depth_curr = (depth_prev * (ego_ratio + change - 1.0)).clip(min=0.0)
+    return {
+        "flow": ego_flow + torch.stack(added, dim=-1) * moving[..., None],
+        "ego_flow": ego_flow,
+        "depth_prev": depth_prev,
+        "depth_curr": depth_curr,
+        "depth_true": depth_prev,
+        "depth_target": depth_curr,
+        "K": K,
+        "T_curr_prev": T_curr_prev,
+        "moving": moving,
+    }
 
 
 def _place(rng: np.random.Generator, o: PaperOptions) -> tuple[tuple[slice, slice], np.ndarray]:

@@ -125,7 +125,7 @@ def make_pair(
     T = make_transform(turn(rng, angle_deg), length * direction(rng))
     layers = Layers(camera.K, _surfaces(rng, cell, (height, width)))
     _add_objects(rng, cell, layers, T)
-    _, _, flow, ratio = layers.flows(T, added=False)
+    _, _, flow, ratio = layers.flows(T)
     seen = splat(flow, layers.rho / ratio)
     depths = [(1.0 / np.where(r > 0, r, np.nan)).astype(np.float32) for r in (layers.rho, seen)]
     measured, outlier = noisy_flow(rng, flow, cell.flow_noise_px, cell.outliers, 60.0)

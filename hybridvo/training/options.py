@@ -125,10 +125,16 @@ class SelectorOptions(RunOptions):
     files: Count = 48
 
 
-def load_pwvo_options(path: str | Path) -> tuple[PwvoOptions, Mixture]:
-    """Options of a ``configs/train_*.yaml`` and the mixture of the data that it names."""
+def load_pwvo_options(
+    path: str | Path, changes: dict[str, Any] | None = None
+) -> tuple[PwvoOptions, Mixture]:
+    """Options of a ``configs/train_*.yaml`` and the mixture of the data that it names.
+
+    ``changes``: laid over those of the file.
+    """
     path = Path(path)
-    options = build_options(PwvoOptions, read_yaml(path), str(path))
+    mapping = dataset.merged(read_yaml(path), changes or {})
+    options = build_options(PwvoOptions, mapping, str(path))
     presets = [dataset.load_preset(path.parent / name, options.data_size) for name in options.data]
     return options, Mixture(tuple(presets), options.data_weights)
 

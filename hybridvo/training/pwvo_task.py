@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import nn
@@ -18,12 +19,15 @@ from hybridvo.network.selection import fitted_motion, select_motion
 from hybridvo.results import PixelwisePrediction
 from hybridvo.synthetic.dataset import Mixture, Preset
 from hybridvo.synthetic.draws import TRAINING, sample_generator
+from hybridvo.synthetic.layered import PaperOptions
 from hybridvo.training.options import PwvoOptions
 from hybridvo.training.validation import (
     PUBLISHED_SEED,
+    DrawnBatch,
     TrainingBatch,
     collate,
     evaluate_network,
+    held_out,
 )
 
 FIT_FLOOR_PX, FIT_LIMIT_PX = 0.05, 100.0
@@ -41,15 +45,21 @@ class SampleStream(IterableDataset):
     def __init__(self, preset: Preset, seed: int, start: int, batch_size: int) -> None:
         self.preset, self.seed, self.start, self.batch_size = preset, seed, start, batch_size
 
-    def __iter__(self) -> Iterator[TrainingBatch]:
+    def __iter__(self) -> Iterator[TrainingBatch | DrawnBatch]:
         worker = get_worker_info()
         turn, turns = (0, 1) if worker is None else (worker.id, worker.num_workers)
         while True:
             first = self.start + turn * self.batch_size
             numbers = range(first, first + self.batch_size)
             draws = (sample_generator(self.seed, i, TRAINING) for i in numbers)
-            yield collate([self.preset.sample(rng) for rng in draws])
+            yield self._batch(list(draws))
             turn += turns
+
+    def _batch(self, draws: list[np.random.Generator]) -> TrainingBatch | DrawnBatch:
+        presets = self.preset.presets if isinstance(self.preset, Mixture) else (self.preset,)
+        if len(presets) == 1 and isinstance(presets[0], PaperOptions):
+            return DrawnBatch([presets[0].draw(rng) for rng in draws])
+        return collate([self.preset.sample(rng) for rng in draws])
 
 
 class PwvoTask:
@@ -61,7 +71,7 @@ class PwvoTask:
         self.network = build_network(options.network)
         self.data = mixture.record
 
-    def batches(self, samples: int, workers: int) -> Iterator[TrainingBatch]:
+    def batches(self, samples: int, workers: int) -> Iterator[TrainingBatch | DrawnBatch]:
         """Batches of the run's stream from sample number ``samples`` on."""
         stream = SampleStream(self.mixture, self.options.seed, samples, self.options.batch_size)
         how = {"num_workers": workers, "multiprocessing_context": "fork" if workers else None}
@@ -102,7 +112,7 @@ class PwvoTask:
         options, found = self.options, {}
         seed, count = (PUBLISHED_SEED, published) if published else (0, options.evaluate_count)
         for name, preset in zip(options.data, self.mixture.presets, strict=True):
-            figures = evaluate_network(network, preset, seed, count, selection=options.selection)
+            figures = evaluate_network(network, held_out(preset, seed, count), options.selection)
             found[Path(name).stem] = {k: v for k, v in figures.items() if k != "epe_of_pairs"}
         return found
 

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import nn
+from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from hybridvo.errors import CheckpointError, DegenerateError, InputError
 from hybridvo.files import atomic_write
@@ -61,13 +62,18 @@ class Trainer:
         self.exported = copy.deepcopy(self.network).requires_grad_(False)
         how = self.options.optimizer
         self.optimizer = torch.optim.AdamW(
-            self.network.parameters(), how.learning_rate, how.betas, weight_decay=how.weight_decay
+            self.network.parameters(),
+            how.learning_rate,
+            how.betas,
+            weight_decay=how.weight_decay,
+            fused=self.device.type == "cuda",
         )
         self._parts: dict[str, Any] = {
             "network": self.network, "optimizer": self.optimizer, "ema": self.exported,
         }  # fmt: skip
         self.step = self.samples = self.skipped = self.skipped_in_a_row = 0
-        self.elapsed_s = 0.0
+        self.elapsed_s = self._saved_s = self._logged_s = 0.0
+        self._seen: list[dict[str, float]] = []
         self.stop_requested = False
 
     @property
@@ -95,9 +101,8 @@ class Trainer:
             self.skipped_in_a_row = 0
             # A young average follows quickly: it must forget the random start.
             decay = min(self.options.ema_decay, (1 + self.step) / (10 + self.step))
-            theirs = self.network.state_dict()
-            for name, value in self.exported.state_dict().items():
-                value.lerp_(theirs[name], 1 - decay)
+            both = list(self.exported.parameters()), list(self.network.parameters())
+            get_ema_multi_avg_fn(decay)(*both, 0)
         else:
             self.skipped += 1
             self.skipped_in_a_row += 1
@@ -120,30 +125,34 @@ class Trainer:
         options = self.options
         last = min(until or options.steps, options.steps)
         batches = self.task.batches(self.samples, self.workers)
-        before, why = self.elapsed_s, "steps"
-        started = saved = logged = time.monotonic()
-        seen: list[dict[str, float]] = []
-        while self.step < last:
-            progress = self.step / options.steps
-            if options.schedule.by == "time" and math.isfinite(time_limit_s):
-                progress = max(progress, self.elapsed_s / time_limit_s)
-            seen.append(self.update(next(batches), progress))
-            now = time.monotonic()
-            self.elapsed_s = before + now - started
-            if self.step % options.log_every == 0:
-                rate = options.batch_size * len(seen) / (now - logged)
-                self._log({"event": "train", **_means(seen), "samples_per_s": rate})
-                seen, logged = [], now
-            if options.evaluate_every and self.step % options.evaluate_every == 0:
-                self.evaluate()
+        why = "steps"
+        while self.step < last and why == "steps":
+            started = time.monotonic()
+            batch = next(batches)
+            self.elapsed_s += time.monotonic() - started
+            self.advance(batch, time_limit_s)
             if self.stop_requested or self.elapsed_s >= time_limit_s:
                 why = "signal" if self.stop_requested else "time"
-                break
-            if now - saved > 60 * options.checkpoint_minutes:
-                self.save()
-                saved = now
         self.save()
         return why
+
+    def advance(self, batch: Any, time_limit_s: float = math.inf) -> None:
+        """One update on a batch, and what is due after it: log, evaluation, checkpoint."""
+        options, started = self.options, time.monotonic()
+        progress = self.step / options.steps
+        if options.schedule.by == "time" and math.isfinite(time_limit_s):
+            progress = max(progress, self.elapsed_s / time_limit_s)
+        self._seen.append(self.update(batch, progress))
+        self.elapsed_s += time.monotonic() - started
+        if self.step % options.log_every == 0:
+            rate = options.batch_size * len(self._seen) / (self.elapsed_s - self._logged_s)
+            self._log({"event": "train", **_means(self._seen), "samples_per_s": rate})
+            self._seen, self._logged_s = [], self.elapsed_s
+        if options.evaluate_every and self.step % options.evaluate_every == 0:
+            self.evaluate()
+        if self.elapsed_s - self._saved_s > 60 * options.checkpoint_minutes:
+            self.save()
+            self._saved_s = self.elapsed_s
 
     def evaluate(self) -> dict[str, Any]:
         """Figures of the exported network on development samples, also into the log."""
@@ -194,6 +203,7 @@ class Trainer:
                 part.load_state_dict(state[name])
             for key in PROGRESS:
                 setattr(self, key, state["progress"][key])
+        self._saved_s = self._logged_s = self.elapsed_s
         return True
 
 

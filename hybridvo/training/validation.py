@@ -7,7 +7,7 @@ either.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -23,8 +23,8 @@ from hybridvo.network.selection import select_pose
 from hybridvo.results import PixelwisePrediction
 from hybridvo.synthetic.dataset import Preset
 from hybridvo.synthetic.draws import sample_generator
-from hybridvo.synthetic.layered import Sample
-from hybridvo.torch_geometry import euler_transform
+from hybridvo.synthetic.layered import LayeredPair, Sample, compose
+from hybridvo.torch_geometry import euler_deg, euler_transform
 
 PUBLISHED_SEED = 1000
 """First seed of published figures; smaller ones are for development."""
@@ -50,18 +50,45 @@ class TrainingBatch:
         return TrainingBatch(*(part.to(device) for part in vars(self).values()))
 
 
+class DrawnBatch:
+    """Pairs of the paper's five steps before their flows: these are computed where they go."""
+
+    def __init__(self, pairs: Sequence[LayeredPair]) -> None:
+        self.parts = _stacked(pairs)
+
+    def __len__(self) -> int:
+        return len(self.parts["K"])
+
+    def to(self, device: torch.device | str) -> TrainingBatch:
+        """The training batch, on a device."""
+        return _assemble(compose(**{name: part.to(device) for name, part in self.parts.items()}))
+
+
 def collate(samples: Sequence[Sample]) -> TrainingBatch:
     """Batch of at least one sample, all of one size."""
+    return _assemble(_stacked(samples))
 
-    def stack(name: str) -> torch.Tensor:
-        return torch.from_numpy(np.stack([getattr(sample, name) for sample in samples]))
 
-    K = stack("K")
-    inputs = assemble_aligned(stack("flow"), stack("depth_prev"), stack("depth_curr"), K)
-    ego_flow = stack("ego_flow").permute(0, 3, 1, 2)
-    depths = stack("depth_true"), stack("depth_target")
-    targets = LossTargets(stack("rotation_deg"), stack("translation"), ego_flow, *depths, K, K)
-    return TrainingBatch(inputs, targets, stack("moving"))
+def _stacked(samples: Sequence[Any]) -> dict[str, torch.Tensor]:
+    """Fields of samples as tensors with a row for each."""
+    names = [field.name for field in fields(samples[0])]
+    return {n: torch.from_numpy(np.stack([getattr(s, n) for s in samples])) for n in names}
+
+
+def _assemble(of: dict[str, torch.Tensor]) -> TrainingBatch:
+    """Batch of the stacked fields of samples."""
+    K, T = of["K"], of["T_curr_prev"]
+    inputs = assemble_aligned(of["flow"], of["depth_prev"], of["depth_curr"], K)
+    truth = euler_deg(T[:, :3, :3]), T[:, :3, 3], of["ego_flow"].permute(0, 3, 1, 2)
+    targets = LossTargets(*truth, of["depth_true"], of["depth_target"], K, K)
+    return TrainingBatch(inputs, targets, of["moving"])
+
+
+def held_out(preset: Preset, seed: int, count: int) -> list[TrainingBatch]:
+    """Batches of the samples 0 to ``count`` - 1 of a seed; of a folder, of its held-out ones."""
+    preset = preset.for_evaluation() if hasattr(preset, "for_evaluation") else preset
+    samples = [preset.sample(sample_generator(seed, i)) for i in range(count)]
+    return [collate(samples[first : first + BATCH]) for first in range(0, count, BATCH)]
 
 
 def area_under_curve(score: np.ndarray, label: np.ndarray) -> float | None:
@@ -73,14 +100,9 @@ def area_under_curve(score: np.ndarray, label: np.ndarray) -> float | None:
 
 
 def evaluate_network(
-    network: torch.nn.Module,
-    preset: Preset,
-    seed: int,
-    count: int,
-    *,
-    selection: str = "softmax",
+    network: torch.nn.Module, batches: Sequence[TrainingBatch], selection: str = "softmax"
 ) -> dict[str, Any]:
-    """Errors of a network's selected pose on held-out samples 0 to ``count`` - 1 of a seed.
+    """Errors of a network's selected pose on :func:`held_out` samples.
 
     Returns:
         ``r_err_deg``, ``t_err`` (metres) and ``epe`` (px at the sample's size), the paper's
@@ -90,20 +112,18 @@ def evaluate_network(
         ``spearman_*`` with the pixel's own error, ``laplace_ratio_*`` and ``median_ratio_*``, the
         mean and the median of |error| / exp(s): 1 and 0.69 for calibrated Laplace scales.
     """
-    if count < 1:
-        raise InputError(f"evaluate_network: expected count >= 1, got {count}.")
-    preset = preset.for_evaluation() if hasattr(preset, "for_evaluation") else preset
+    if not batches:
+        raise InputError("evaluate_network: expected at least one batch of samples, got none.")
     device, errors, pixels = next(network.parameters()).device, [], []
-    for first in range(0, count, BATCH):
-        numbers = range(first, min(first + BATCH, count))
-        batch = collate([preset.sample(sample_generator(seed, i)) for i in numbers]).to(device)
+    for batch in batches:
+        batch = batch.to(device)
         with torch.inference_mode():
             output = predict(network, batch.inputs, selection)
             errors.append(_errors(output, batch, selection))
             if isinstance(output, PixelwisePrediction) and output.log_scale_rotation is not None:
                 pixels.append(_uncertainty(output, batch))
     ours, zero = np.split(np.concatenate(errors), 2, axis=1)
-    result: dict[str, Any] = {"seed": seed, "count": count}
+    result: dict[str, Any] = {"count": len(ours)}
     for i, name in enumerate(FIGURES):
         result[name], result[f"zero_{name}"] = float(ours[:, i].mean()), float(zero[:, i].mean())
         result[f"median_{name}"] = float(np.median(ours[:, i]))
@@ -179,7 +199,8 @@ def calibrate_scales(
     head = getattr(network, "head_uncertainty", None)
     if head is None:
         raise InputError("calibrate_scales: expected a pixel-wise network with uncertainty.")
-    shift = np.log(evaluate_network(network, preset, seed, count)["laplace_ratio_translation"])
+    found = evaluate_network(network, held_out(preset, seed, count))
+    shift = np.log(found["laplace_ratio_translation"])
     with torch.no_grad():
         head[-1].bias[3:] += float(shift)
     return {"translation": float(shift)}

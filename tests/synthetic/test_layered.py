@@ -75,7 +75,7 @@ def test_paper_zero_motion_figures():
         y = ((np.arange(32) - sample.K[1, 2]) / fy)[:, None]
         T = sample.T_curr_prev
         rho = 1.0 / float(sample.depth_prev.max())
-        u, v, _ = layered.rigid_flow(x, y, rho, T[:3, :3], T[:3, 3], (fx, fy))
+        u, v, _ = layered.rigid_flow(x, y, rho, T, (fx, fy))
         flow.append(4 * (np.abs(u).mean() + np.abs(v).mean()) / 2)
     for values, expected, rounding in (
         (rotation, 0.412, 0.0005),
@@ -112,13 +112,17 @@ def test_paper_sample_obeys_its_equations():
 
 def test_rigid_flow_by_hand():
     x, y = np.zeros(1, np.float32), np.zeros((1, 1), np.float32)
+
+    def moved(*t: float) -> np.ndarray:
+        return geometry.make_transform(np.eye(3), np.array(t))
+
     # 0.1 m to the right at 2 m with fx 200: 10 px; 1 m closer: the depth halves.
-    u, v, ratio = layered.rigid_flow(x, y, 0.5, np.eye(3), np.array([0.1, 0, 0]), (200, 100))
+    u, v, ratio = layered.rigid_flow(x, y, 0.5, moved(0.1, 0, 0), (200, 100))
     assert (u[0, 0], v[0, 0], ratio[0, 0]) == pytest.approx((10.0, 0.0, 1.0), rel=1e-5)
-    _, _, ratio = layered.rigid_flow(x, y, 0.5, np.eye(3), np.array([0, 0, -1.0]), (200, 100))
+    _, _, ratio = layered.rigid_flow(x, y, 0.5, moved(0, 0, -1.0), (200, 100))
     assert ratio[0, 0] == pytest.approx(0.5)
     # A point at infinity does not see a translation.
-    u, _, ratio = layered.rigid_flow(x, y, 0.0, np.eye(3), np.array([5.0, 0, 0]), (200, 100))
+    u, _, ratio = layered.rigid_flow(x, y, 0.0, moved(5.0, 0, 0), (200, 100))
     assert abs(u[0, 0]) < 1e-3 and ratio[0, 0] == 1.0
 
 

@@ -11,7 +11,7 @@ from hybridvo.synthetic.dataset import Mixture, StoredSamples, write_samples
 from hybridvo.synthetic.draws import HELD_OUT, STORED, TRAINING, sample_generator
 from hybridvo.synthetic.layered import PaperOptions
 from hybridvo.training.pwvo_task import SampleStream
-from hybridvo.training.validation import collate
+from hybridvo.training.validation import DrawnBatch, collate
 
 
 def flows(loader, count: int) -> list[torch.Tensor]:
@@ -72,5 +72,15 @@ def test_a_batch_holds_its_samples(mixture):
     samples = [mixture.sample(sample_generator(0, i)) for i in range(3)]
     batch = collate(samples)
     assert len(batch) == 3
-    np.testing.assert_array_equal(batch.targets.rotation_deg[1], samples[1].rotation_deg)
+    np.testing.assert_allclose(batch.targets.rotation_deg[1], samples[1].rotation_deg, atol=1e-6)
     np.testing.assert_array_equal(batch.moving[2], samples[2].moving)
+
+
+def test_pairs_composed_later_are_the_samples(mixture):
+    preset = mixture.presets[0]
+    batch = DrawnBatch([preset.draw(sample_generator(0, i)) for i in range(3)]).to("cpu")
+    expected = collate([preset.sample(sample_generator(0, i)) for i in range(3)])
+    for part, other in zip(vars(batch).values(), vars(expected).values(), strict=True):
+        for name in vars(other) if not isinstance(other, torch.Tensor) else ():
+            torch.testing.assert_close(getattr(part, name), getattr(other, name))
+    assert torch.equal(batch.moving, expected.moving)

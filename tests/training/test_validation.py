@@ -47,7 +47,7 @@ class Oracle(torch.nn.Module):
 def test_figures_of_an_oracle_and_of_zero_motion(share, rule):
     samples = [PRESET.sample(sample_generator(3, i)) for i in range(6)]
     network = Oracle(collate(samples), share)
-    result = validation.evaluate_network(network, PRESET, 3, 6, selection=rule)
+    result = validation.evaluate_network(network, validation.held_out(PRESET, 3, 6), rule)
     assert result["auroc_rotation"] == 1.0
     for name, exact in (("r_err_deg", 1e-5), ("t_err", 1e-6), ("epe", 1e-2)):
         expected = 0.0 if share else result[f"zero_{name}"]
@@ -64,9 +64,9 @@ def test_calibrated_scales_state_the_mean_error():
     torch.manual_seed(0)
     network = build_network(NetworkOptions(width=0.1, head_stride=2))
     validation.calibrate_scales(network, PRESET, 8)
-    result = validation.evaluate_network(network, PRESET, 0, 8)
+    result = validation.evaluate_network(network, validation.held_out(PRESET, 0, 8))
     assert result["laplace_ratio_translation"] == pytest.approx(1.0, rel=0.02)
     with pytest.raises(InputError, match="uncertainty"):
         validation.calibrate_scales(build_network(NetworkOptions("vonet", width=0.1)), PRESET, 2)
-    with pytest.raises(InputError, match="count"):
-        validation.evaluate_network(network, PRESET, 0, 0)
+    with pytest.raises(InputError, match="at least one"):
+        validation.evaluate_network(network, [])
