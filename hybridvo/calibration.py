@@ -7,9 +7,6 @@ the best score and that of another motion), without a unit: weights, and one tha
 flow.
 """
 
-from collections.abc import Sequence
-from math import exp
-
 CUES_RIGHT = (0.26, 1.26)
 """Of the cue scores: 259 of 316 answers right. The gap says little (AUROC .68, calibration error
 .05), so that a motion with a rival is hardly ever sure."""
@@ -111,9 +108,3 @@ WEAK_RATIO = 2e-5
 """Ratio of the information's extreme eigenvalues below which errors that neighbours share, and that
 the covariance of one small patch cannot know of, decide a direction: degraded. A frontal plane over
 a field of view of 20 degrees has 1e-4, a patch of 20 px at fx = 1120 has 1e-5."""
-
-
-def right(evidence: Sequence[float], weights: Sequence[float]) -> float:
-    """Probability that a motion is right: logistic in its evidence; the last weight is alone."""
-    value = sum(w * x for w, x in zip(weights, (*evidence, 1.0), strict=True))
-    return 1 / (1 + exp(min(-value, 700.0)))  # exp(700) is finite

@@ -25,6 +25,13 @@ def backproject(depth: np.ndarray, camera: Camera) -> np.ndarray:
     return np.stack([x, y, depth.astype(np.float64)], axis=-1)
 
 
+def points_at(depth: np.ndarray, camera: Camera, index: np.ndarray) -> np.ndarray:
+    """(N, 3) points in metres of the pixels (N, 2), rows and columns, of a depth map."""
+    v, u = index.T
+    z = depth[v, u].astype(np.float64)
+    return np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], axis=1)
+
+
 def project(points: np.ndarray, camera: Camera) -> np.ndarray:
     """(..., 2) pixels of (..., 3) points in the camera frame; NaN for points not in front of it."""
     z = points[..., 2]
@@ -83,6 +90,15 @@ def invert(T: np.ndarray) -> np.ndarray:
     out[..., :3, 3] = -np.einsum("...ij,...j->...i", R, T[..., :3, 3])
     out[..., 3, 3] = 1.0
     return out
+
+
+def chain(T_world_prev: np.ndarray, T_curr_prev: np.ndarray) -> np.ndarray:
+    """Next camera pose: ``T_world_curr = T_world_prev @ inv(T_curr_prev)``, (4, 4)."""
+    T_world_curr = T_world_prev @ invert(T_curr_prev)
+    R = T_world_curr[:3, :3]
+    # one step of the polar decomposition, so that rounding does not accumulate
+    T_world_curr[:3, :3] = R @ (1.5 * np.eye(3) - 0.5 * (R.T @ R))
+    return T_world_curr
 
 
 def skew(w: np.ndarray) -> np.ndarray:
@@ -189,6 +205,13 @@ def to_ros_covariance(covariance: np.ndarray, T_prev_curr: np.ndarray) -> np.nda
     A = np.zeros_like(C, dtype=np.float64)
     A[..., :3, :3] = A[..., 3:, 3:] = T[..., :3, :3]
     return A @ C @ np.swapaxes(A, -1, -2)
+
+
+def as_contiguous(array: np.ndarray, dtype: Any = None) -> np.ndarray:
+    """Contiguous read-only view: numba compiles a kernel anew, for seconds, for each other kind."""
+    view = np.require(array, dtype, ["C", "A"]).view()
+    view.flags.writeable = False
+    return view
 
 
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from hybridvo.errors import InputError
 from hybridvo.flow import FlowField, FlowProvider, dis_flow, with_flow
-from hybridvo.geometry import invert, pose_matrix, se3_exp, se3_log
+from hybridvo.geometry import chain, invert, pose_matrix, se3_exp, se3_log
 from hybridvo.network.models import Models, default_models
 from hybridvo.options import Options
 from hybridvo.pipeline import (
@@ -23,7 +23,6 @@ from hybridvo.pipeline import (
     warm_up,
 )
 from hybridvo.results import MotionPrior, Reason, RelativePose, Step
-from hybridvo.trajectory import chain
 from hybridvo.types import Camera, Frame, FramePair, as_number, as_rigid, as_seed, check_kind
 
 STANDSTILL = 1e-12 * np.eye(6)

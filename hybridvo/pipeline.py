@@ -8,7 +8,6 @@ check their arguments and stand at the end.
 
 from __future__ import annotations
 
-import contextlib
 import difflib
 import hashlib
 import time
@@ -21,18 +20,17 @@ import numpy as np
 from scipy.special import logit
 
 from hybridvo.baselines import pnp, rgbd
-from hybridvo.calibration import PWVO_RIGHT, right
+from hybridvo.calibration import PWVO_RIGHT
 from hybridvo.errors import InputError
 from hybridvo.flow import FlowProvider, contradiction, dis_flow, with_flow
 from hybridvo.geometry import ego_flow, se3_exp
 from hybridvo.hypotheses.generate import HypothesisSet, generate
 from hybridvo.hypotheses.selector import select_by_cues, select_by_scorer
-from hybridvo.images.direct import direct_start
-from hybridvo.images.photometric import refine_photometric
+from hybridvo.images.photometric import direct_start, refine_photometric
 from hybridvo.network.models import SELECTION, Models, default_models, one_thread
 from hybridvo.options import Options
 from hybridvo.refinement import refine as refinement
-from hybridvo.results import MotionPrediction, MotionPrior, Reason, RelativePose
+from hybridvo.results import MotionPrediction, MotionPrior, Reason, RelativePose, right
 from hybridvo.types import (
     Camera,
     Frame,
@@ -145,6 +143,7 @@ def classical(pair: FramePair, ctx: Context) -> RelativePose:
     return ctx.refine(pair, found, select_by_cues(found, ctx.prior))
 
 
+@one_thread()
 def hybrid_flow(pair: FramePair, ctx: Context) -> RelativePose:
     """Search, select by the network, ask PWVO where that is in doubt, refine."""
     found = ctx.search(pair)
@@ -168,6 +167,7 @@ def hybrid(pair: FramePair, ctx: Context) -> RelativePose:
     return hybrid_flow(pair, ctx)
 
 
+@one_thread()
 def pwvo_refine(pair: FramePair, ctx: Context) -> RelativePose:
     """PWVO's selected motion and uncertainty seed and weigh the refinement in torch, on its device.
 
@@ -190,6 +190,7 @@ def pwvo_refine(pair: FramePair, ctx: Context) -> RelativePose:
     return found
 
 
+@one_thread()
 def network_alone(name: str, pair: FramePair, ctx: Context) -> RelativePose:
     """A network alone, by the paper's selection."""
     from hybridvo.network.prediction import estimate_by_network
@@ -222,8 +223,7 @@ def run_method(pair: FramePair, method: str, ctx: Context) -> RelativePose:
     started = time.perf_counter()
     if method != "hybrid":
         pair = ctx.with_flow(pair)
-    with one_thread() if networks_of(method) else contextlib.nullcontext():
-        found = METHODS[method](pair, ctx)
+    found = METHODS[method](pair, ctx)
     if refines_images(method, ctx.options) and found.photometric is None:
         found = refine_photometric(pair, found)
     if found.status.ok and not found.status.message and pair.prev.depth is not None:
@@ -231,7 +231,8 @@ def run_method(pair: FramePair, method: str, ctx: Context) -> RelativePose:
         if advice := "" if median is None else depth_advice(median):
             doubt = f"the median depth is {median:.4g}; Frame.depth expects metres: {advice}"
             found = found.replace(status=replace(found.status, message=doubt))
-    found = refinement.widened(found)
+    if found.status.reason is Reason.AMBIGUOUS_MOTION and found.usable:
+        found = refinement.widened(found)
     return found.replace(method=method, ms=1e3 * (time.perf_counter() - started))
 
 

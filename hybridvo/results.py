@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import enum
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from math import exp
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
@@ -243,3 +245,9 @@ class PixelwisePrediction:
     log_scale_rotation: torch.Tensor | None = None
     log_scale_translation: torch.Tensor | None = None
     image_size: tuple[int, int] | None = None
+
+
+def right(evidence: Sequence[float], weights: Sequence[float]) -> float:
+    """Probability that a motion is right: logistic in its evidence; the last weight is alone."""
+    value = sum(w * x for w, x in zip(weights, (*evidence, 1.0), strict=True))
+    return 1 / (1 + exp(min(-value, 700.0)))  # exp(700) is finite

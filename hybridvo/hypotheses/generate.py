@@ -9,12 +9,13 @@ import cv2
 import numpy as np
 
 from hybridvo.calibration import CLEAR_BEND_PX, CLEAR_COHERENCE
+from hybridvo.geometry import as_contiguous
 from hybridvo.hypotheses import search
 from hybridvo.options import Options
 from hybridvo.refinement import kernels
 from hybridvo.refinement.coarse_fit import fit_coarse, residual_coherence
 from hybridvo.refinement.depth import look_up
-from hybridvo.refinement.pixels import CoarseGrid, as_contiguous, coarse_grid
+from hybridvo.refinement.pixels import CoarseGrid, coarse_grid
 from hybridvo.results import Reason, RelativePose
 from hybridvo.types import Frame, FramePair
 

@@ -13,14 +13,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hybridvo.calibration import CLEAR_RIGHT, CUE_WEIGHTS, CUES_RIGHT, SELECTOR_RIGHT, right
+from hybridvo.calibration import CLEAR_RIGHT, CUE_WEIGHTS, CUES_RIGHT, SELECTOR_RIGHT
 from hybridvo.geometry import invert, pose_matrix, se3_log
 from hybridvo.hypotheses import search
 from hybridvo.hypotheses.generate import GridMaps, HypothesisSet, fit_in_mask
 from hybridvo.options import Options
 from hybridvo.refinement import coarse_fit, kernels
 from hybridvo.refinement.refine import Selection
-from hybridvo.results import Hypothesis, MotionPrediction, MotionPrior
+from hybridvo.results import Hypothesis, MotionPrediction, MotionPrior, right
 
 SUPPORT_CUTOFF = 3.0
 """Cutoff of the robust kernel by which the inliers of a motion are told, standard deviations."""

@@ -15,7 +15,6 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from hybridvo.calibration import ABSORBED, CLUSTERED, FEW_TILES, LONG_GROWTH
 from hybridvo.refinement.kernels import SUMS, WORK_ROWS, W, project_block
-from hybridvo.refinement.solver import positive_inverse
 
 NOTHING = np.diag([1e4] * 3 + [10.0] * 3)
 """Covariance that carries no information (m^2, rad^2)."""
@@ -36,11 +35,6 @@ def direction_is_known(T: np.ndarray, covariance: np.ndarray) -> bool:
     """Whether a translation is longer than three of its own standard deviations."""
     spread = np.sqrt(max(np.linalg.eigvalsh(covariance[:3, :3])[-1], 0.0))
     return bool(np.linalg.norm(T[:3, 3]) > 3 * spread)
-
-
-def tile_size(shape: tuple[int, int], tiles: int) -> int:
-    """Side, px, of the tiles that cut an image into about ``tiles``; 8 to 64."""
-    return int(np.clip(round(np.sqrt(shape[0] * shape[1] / tiles)), 8, 64))
 
 
 def symmetric(upper: np.ndarray) -> np.ndarray:
@@ -166,21 +160,3 @@ def motion_covariance(
     if not np.isfinite(covariance).all():
         return NOTHING.copy(), eigenvalues, 0
     return covariance, eigenvalues, occupied
-
-
-def tile_sums(scores: np.ndarray, tile: np.ndarray, count: int) -> np.ndarray:
-    """(count, 6) sums of (6, N) scores over the tiles that (N,) ``tile`` says."""
-    return np.stack([np.bincount(tile, row, count) for row in scores], axis=1)
-
-
-def dispersion(sums: np.ndarray, meat: np.ndarray, model: np.ndarray) -> float | None:
-    """How many times larger the sandwich covariance over tiles is than the ``model`` (6, 6).
-
-    From the scores (n, 6) of the tiles and the meat (6, 6) of all pixels; None where the scores
-    leave a direction open.
-    """
-    independent = positive_inverse(meat)
-    if independent is None:
-        return None
-    clusters = max(1.0, np.trace(independent @ sums.T @ sums) / 6)
-    return float(max(1.0, clusters * np.trace(model @ meat) / 6))

@@ -9,6 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from hybridvo.geometry import as_contiguous
 from hybridvo.options import RefineOptions
 from hybridvo.refinement import kernels
 from hybridvo.results import Reason, RelativePose
@@ -181,13 +182,6 @@ def too_few(depth: np.ndarray, flow: np.ndarray, count: int, minimum: int) -> tu
     if flows < minimum:
         return Reason.NO_FLOW, f"{flows} pixels with valid flow, {minimum} needed"
     return Reason.LOW_INLIERS, f"{count} usable pixels, {minimum} needed"
-
-
-def as_contiguous(array: np.ndarray, dtype: Any = None) -> np.ndarray:
-    """Contiguous read-only view: numba compiles a kernel anew, for seconds, for each other kind."""
-    view = np.require(array, dtype, ["C", "A"]).view()
-    view.flags.writeable = False
-    return view
 
 
 def typical(variance: np.ndarray) -> float:

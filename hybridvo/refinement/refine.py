@@ -12,20 +12,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from hybridvo.calibration import MIN_TILES, WEAK_RATIO
-from hybridvo.geometry import invert, pose_matrix, se3_log
+from hybridvo.geometry import as_contiguous, invert, pose_matrix, se3_log
 from hybridvo.options import RefineOptions
 from hybridvo.refinement import coarse_fit
-from hybridvo.refinement.covariance import (
-    NOTHING,
-    motion_covariance,
-    score_sums,
-    symmetric,
-    tile_size,
-)
+from hybridvo.refinement.covariance import NOTHING, motion_covariance, score_sums, symmetric
 from hybridvo.refinement.depth import DepthFactor, compare_depths, depth_scale, look_up
 from hybridvo.refinement.kernels import SUMS, sum_samples
-from hybridvo.refinement.pixels import CoarseGrid, PixelGrid, as_contiguous, coarse_grid
-from hybridvo.refinement.solver import Factor, Linearization, gauss_newton
+from hybridvo.refinement.pixels import CoarseGrid, PixelGrid, coarse_grid
+from hybridvo.refinement.solver import Factor, Linearization, gauss_newton, tile_size
 from hybridvo.results import Hypothesis, Reason, RelativePose, Status
 from hybridvo.types import FramePair
 
@@ -162,13 +156,11 @@ def ambiguous(probability: float) -> Status:
 
 
 def widened(motion: RelativePose) -> RelativePose:
-    """An ambiguous motion with a covariance that covers the other motions it may be.
+    """An ambiguous motion, its covariance widened to cover the other motions it may be.
 
     The second moment of the mixture: with its probability the camera's motion is this one; else as
     far away as the farthest of the others or as standing still, in any direction.
     """
-    if motion.status.reason is not Reason.AMBIGUOUS_MOTION or not motion.usable:
-        return motion
     others = [h.T_curr_prev for h in motion.hypotheses[1:]] + [np.eye(4)]
     steps = np.array([se3_log(motion.T_curr_prev @ invert(T)) for T in others])
     sizes = [np.max(np.sum(steps[:, part] ** 2, axis=1)) for part in (slice(0, 3), slice(3, 6))]

@@ -29,9 +29,10 @@ from hybridvo.refinement.batch import (
     initial_poses,
 )
 from hybridvo.refinement.coarse_fit import DAMPING
-from hybridvo.refinement.covariance import NOTHING, UPPER, motion_covariance, tile_size
+from hybridvo.refinement.covariance import NOTHING, UPPER, motion_covariance
 from hybridvo.refinement.pixels import grid_stride, too_few
 from hybridvo.refinement.refine import LAST_STEP, pair_noise, status_of
+from hybridvo.refinement.solver import tile_size
 from hybridvo.refinement.torch_factors import (
     CUTOFF,
     KERNELS,

@@ -10,7 +10,7 @@ import pytest
 
 from hybridvo.flow import dis_flow
 from hybridvo.geometry import ego_flow, invert
-from hybridvo.images.image_factor import correlation
+from hybridvo.images.factors import correlation
 from hybridvo.images.photometric import refine_photometric
 from hybridvo.pipeline import refine
 from hybridvo.synthetic.render import SyntheticSequence

@@ -1,44 +1,38 @@
-"""The images of a pair as a factor of its motion.
+"""The images of a pair, and its two depth maps, as factors of its motion.
 
-The residual of a weighted static pixel is ``I_curr(pi(T X)) - gain I_prev - offset``; its
-definition is in :mod:`hybridvo.images.photometric_kernels`. Gain and offset follow the motion,
-so that the cost is one of the motion alone; the noise is estimated from the residuals, and the
-information is scaled by what errors that neighbours share leave of it.
+Images: the residual of a weighted static pixel is ``I_curr(pi(T X)) - gain I_prev - offset``. Gain
+and offset follow the motion, so that the cost is one of the motion alone. Light that changes over
+the image (vignette, lamps, the camera's tone curve) would pull at the motion: where smooth fields
+of gain and offset, bilinear between the nodes of a coarse grid, explain much of the residual, they
+are put into the grey values of the previous image. Gradients have no preferred sign within a cell,
+so that the fields leave the motion alone.
 
-Light that changes over the image (vignette, lamps, the camera's tone curve) cannot be followed by
-one gain and one offset a pair, and what they leave pulls at the motion. Where smooth fields of gain
-and offset, bilinear between the nodes of a coarse grid, explain much of the residual, they are put
-into the grey values of the previous image. Gradients have no preferred sign within a cell, so that
-the fields leave the motion alone.
+Depth maps: ``r = n . (T X - P)``, P the current depth map's point at the pixel where T X is seen, n
+the normal of its surface there. Depth knows the direction along the axis that flow and images
+hardly see, and needs no feature of the image.
+
+Both estimate their noise from the residuals; their information is scaled by what errors that
+neighbours share leave of it.
 """
 
 from __future__ import annotations
 
 from functools import cache, cached_property
-from weakref import WeakKeyDictionary
+from typing import NamedTuple
 
 import cv2
 import numpy as np
+from scipy.optimize import nnls
 
 from hybridvo.calibration import EVEN_PARTS, UNEVEN_LIGHT
-from hybridvo.images import photometric_kernels as kernels
-from hybridvo.images.plane_factor import CUTOFF, INFLATION
-from hybridvo.options import RefineOptions
-from hybridvo.refinement.covariance import dispersion, tile_size, tile_sums
+from hybridvo.geometry import as_contiguous, points_at
+from hybridvo.images import kernels
 from hybridvo.refinement.kernels import MAX_VALUE
-from hybridvo.refinement.pixels import as_contiguous, typical
-from hybridvo.refinement.solver import Linearization, positive_inverse
+from hybridvo.refinement.pixels import typical
+from hybridvo.refinement.solver import Linearization, positive_inverse, tile_size
 from hybridvo.results import RelativePose
-from hybridvo.types import Frame, FramePair
+from hybridvo.types import FramePair
 
-MID_GREY = 128.0
-"""Taken off every grey value, so that gain and offset are nearly independent."""
-GREY = np.array([[0.299, 0.587, 0.114, -MID_GREY]])
-_IMAGES: WeakKeyDictionary[Frame, dict[float, np.ndarray]] = WeakKeyDictionary()
-"""Blurred images by blur, as long as the frame is kept."""
-PER_CELL = 4
-MIN_WEIGHT = 0.25
-"""Robust weight in the refinement on the flow below which a pixel is not used."""
 NOISE_FLOOR = 0.1
 """Grey levels: rounding to 8 bits leaves 0.08 after the finest blur."""
 GAINS = (0.2, 5.0)
@@ -50,32 +44,42 @@ ROWS, COLUMNS = 5, 7
 """Nodes of the fields."""
 SMOOTH = 0.01
 """Weight of the differences between neighbouring nodes, in shares of a node's typical weight."""
+POINTS, MIN_POINTS = 5000, 300
+"""Of a depth map, on a regular grid: at most, and at least."""
+DEPTH_FLOOR = 1e-4
+"""Least standard deviation of a point's distance, in shares of the depth."""
+CUTOFF = 3.0
+"""c of the Geman-McClure kernels, in standard deviations."""
+INFLATION = 4.0
+"""Factor on the covariance of both beyond the tiles: a sensor is bent over the image, errors are
+alike far beyond them."""
 
 
-def blurred(frame: Frame, px: float) -> np.ndarray:
-    """(H, W) float32 grey values less :data:`MID_GREY` under a Gaussian blur."""
-    images = _IMAGES.setdefault(frame, {})
-    if 0.0 not in images:
-        # not rounded: 8 bits of grey would add as much noise as the camera's own rounding
-        images[0.0] = cv2.transform(np.ascontiguousarray(frame.rgb).astype(np.float32), GREY)
-    if px not in images:
-        images[px] = cv2.GaussianBlur(images[0.0], (0, 0), px)
-    return images[px]
+class Tiles:
+    """The tiles of an image (H, W) that pixels (N, 2), rows and columns, lie in."""
 
+    def __init__(self, shape: tuple[int, int], index: np.ndarray) -> None:
+        size = tile_size(shape)
+        self.shape = -(-shape[0] // size), -(-shape[1] // size)
+        self._number = index[:, 0] // size * self.shape[1] + index[:, 1] // size
 
-def choose_pixels(
-    grey: np.ndarray, depth: np.ndarray, weights: np.ndarray, count: int
-) -> np.ndarray:
-    """(N, 2) int32 rows and columns of the pixels to use: strong gradients, evenly spread."""
-    height, width = grey.shape
-    cell = max(2, round(np.sqrt(height * width * PER_CELL / count)))
-    cells = (height // cell + 1) * (width // cell + 1)
-    index = np.empty((cells * PER_CELL, 2), np.int32)
-    n = kernels.select_pixels(
-        grey, as_contiguous(depth), as_contiguous(weights, np.float32),
-        np.float32(MIN_WEIGHT), cell, PER_CELL, index,
-    )  # fmt: skip
-    return index[:n]
+    def sums(self, scores: np.ndarray) -> np.ndarray:
+        """(rows, columns, 6) sums of (6, N) scores over each."""
+        count = self.shape[0] * self.shape[1]
+        sums = [np.bincount(self._number, row, count) for row in scores]
+        return np.stack(sums, axis=1).reshape(*self.shape, 6)
+
+    def share(self, scores: np.ndarray, meat: np.ndarray, model: np.ndarray) -> float:
+        """Share of the information that errors alike in a tile, and beyond, leave.
+
+        From how many times larger the sandwich covariance over tiles is than the ``model`` (6, 6),
+        with the ``meat`` (6, 6) of all pixels; 0 where that leaves a direction open.
+        """
+        independent, sums = positive_inverse(meat), self.sums(scores).reshape(-1, 6)
+        if independent is None:
+            return 0.0
+        clusters = max(1.0, np.trace(independent @ sums.T @ sums) / 6)
+        return float(1 / (INFLATION * max(1.0, clusters * np.trace(model @ meat) / 6)))
 
 
 class ImageFactor:
@@ -103,11 +107,9 @@ class ImageFactor:
         self._K = np.array([curr.fx, curr.fy, curr.cx, curr.cy], np.float32)
         self._J = np.empty((kernels.GQ + 1, n), np.float32)
         self._r, self._w = np.empty(n, np.float32), np.empty(n, np.float32)
-        self._light = np.array([1.0, 0.0], np.float32)
+        self._light = np.array([1.0, 0.0], np.float32)  # gain and offset
         self._places = index * [(ROWS - 1) / prev.height, (COLUMNS - 1) / prev.width]
-        tile = tile_size(prev.shape, RefineOptions().tiles)
-        self._tiles = -(-prev.height // tile), -(-prev.width // tile)
-        self._tile = rows // tile * self._tiles[1] + columns // tile
+        self._tiles = Tiles(prev.shape, index)
         self._scale = 1.0 / INFLATION
         self._noise = NOISE_FLOOR  # standard deviation of the residual, grey levels
         self.agreement = 1.0
@@ -124,11 +126,6 @@ class ImageFactor:
     def gain(self) -> float:
         """Of the current image over the previous one."""
         return float(self._light[0])
-
-    @property
-    def offset(self) -> float:
-        """The same, grey levels about mid grey."""
-        return float(self._light[1])
 
     @property
     def seen(self) -> float:
@@ -159,7 +156,22 @@ class ImageFactor:
         if self._uneven_here:
             self._even_light(0.0)
         self._settle()
-        self._estimate_scale()
+        H, light = self._marginal()
+        model, self._scale = positive_inverse(H), 0.0
+        if model is None:
+            return
+        rows = self._J[:6].astype(np.float64) - light @ self._J[6:8]
+        r = np.where(self._w > 0, self._r, 0.0)
+        pull = rows * (self._w * r)
+        # as at the optimum of the images alone, to first order: the flow pulls away from it
+        r = r - (model @ pull.sum(axis=1)) @ rows
+        scores = rows * (self._w * r)
+        share = self._tiles.share(scores, pull @ pull.T, model)
+        if share > 0:
+            parts = share * parts_dispersion(self._tiles.sums(scores), model)
+            # what the parts disagree about is seen; as much again is common to them and is not
+            self.agreement = min(1.0, (EVEN_PARTS / max(parts, EVEN_PARTS)) ** 2)
+            self._scale = share * self.agreement
 
     def linearize(self, T: np.ndarray) -> Linearization:
         """See :class:`hybridvo.refinement.solver.Factor`."""
@@ -176,19 +188,17 @@ class ImageFactor:
         """
         used = self._w > 0
         grey, weight = self._buffer[kernels.GREY][used], self._buffer[kernels.W][used]
-        seen = self._r[used] + self.gain * grey + self.offset
+        seen = self._r[used] + self._light[0] * grey + self._light[1]
         if not self.uneven_light:
             return correlation(grey, seen, weight)
         v, u = (2 * self._places[used]).astype(np.intp).T  # cells half as wide as the fields'
         return correlation(self._even[used], seen, weight, 2 * (COLUMNS - 1) * v + u)
 
     def _project(self, T: np.ndarray) -> None:
-        if T is self._at:
-            return
-        kernels.project_pixels(
-            self._buffer, self._curr, T[:3], self._K, self._scales, self._light, self._J, self._r
-        )
-        self._at = T
+        if T is not self._at:
+            where = T[:3], self._K, self._scales, self._light
+            kernels.project_pixels(self._buffer, self._curr, *where, self._J, self._r)
+            self._at = T
 
     def _weigh(self) -> float:
         """Weights, H (8, 8) and g (8,) of the last projection; then the light that fits best.
@@ -249,27 +259,6 @@ class ImageFactor:
         """(H (6, 6) with gain and offset free, what they explain of each column (6, 2))."""
         light = self._H[:6, 6:] @ self._light_inverse()
         return self._H[:6, :6] - light @ self._H[6:, :6], light
-
-    def _estimate_scale(self) -> None:
-        """Share of the information that is left under errors alike in a region, at most 1."""
-        H, light = self._marginal()
-        model, self._scale = positive_inverse(H), 0.0
-        if model is None:
-            return
-        rows = self._J[:6].astype(np.float64) - light @ self._J[6:8]
-        r = np.where(self._w > 0, self._r, 0.0)
-        pull = rows * (self._w * r)
-        # as at the optimum of the images alone, to first order: the flow pulls away from it
-        r = r - (model @ pull.sum(axis=1)) @ rows
-        scores = tile_sums(rows * (self._w * r), self._tile, self._tiles[0] * self._tiles[1])
-        factor = dispersion(scores, pull @ pull.T, model)
-        if factor is None:
-            return
-        scale = 1.0 / (factor * INFLATION)
-        parts = scale * parts_dispersion(scores.reshape(*self._tiles, 6), model)
-        # what the parts disagree about is seen; as much again is common to them and is not
-        self.agreement = min(1.0, (EVEN_PARTS / max(parts, EVEN_PARTS)) ** 2)
-        self._scale = scale * self.agreement
 
 
 def parts_dispersion(scores: np.ndarray, model: np.ndarray) -> float:
@@ -335,3 +324,105 @@ def _differences() -> np.ndarray:
     """Quadratic form of the differences between neighbouring nodes."""
     rows, columns = (np.diff(np.eye(n), axis=0) for n in (ROWS, COLUMNS))
     return np.kron(np.eye(ROWS), columns.T @ columns) + np.kron(rows.T @ rows, np.eye(COLUMNS))
+
+
+class Residuals(NamedTuple):
+    """Points of the previous depth map at a motion, metres."""
+
+    r: np.ndarray  # (N,) signed distance to the plane, 0 where not seen
+    J: np.ndarray  # (N, 6) its derivative
+    z: np.ndarray  # (N,) depth of the plane, 1 where not seen
+    seen: np.ndarray  # (N,) bool, the current depth map has a surface there
+    at: np.ndarray  # (N, 2) px, where the point falls in the current image
+
+
+class PlaneFactor:
+    """A static point of the previous depth map, moved by T, lies on the current one's surface.
+
+    The noise of a sensor grows with its distance: about with the square for structured light and
+    stereo, hardly for lidar, not at all where depth is rendered. One law for all,
+    ``sigma = a + b z + c z^2`` with no negative term, is fitted to the residuals of the pair.
+
+    Used are the pixels with at least the weight ``least`` on a regular grid of at most ``points``.
+    """
+
+    def __init__(
+        self, pair: FramePair, weights: np.ndarray, least: float, points: int = POINTS
+    ) -> None:
+        (height, width), curr = pair.prev.camera.shape, pair.curr.camera
+        self._shape, step = (height, width), max(1, round(np.sqrt(height * width / points)))
+        rows, columns = np.mgrid[step // 2 : height : step, step // 2 : width : step]
+        z, weight = np.asarray(pair.prev.depth)[rows, columns], np.asarray(weights)[rows, columns]
+        used = (z > 0) & np.isfinite(z) & (weight >= least)
+        self.cells, self._grid = np.nonzero(used), used.shape
+        """Rows and columns of the points, on their grid."""
+        self.index = np.stack([rows[used], columns[used]], 1)
+        """(N, 2) rows and columns of the points, px."""
+        self.points = points_at(np.asarray(pair.prev.depth), pair.prev.camera, self.index)
+        self._weight, self._tiles = weight[used].astype(np.float64), Tiles(self._shape, self.index)
+        self._K = np.array([curr.fx, curr.fy, curr.cx, curr.cy])
+        self._depth = as_contiguous(np.asarray(pair.curr.depth))
+        self._at = np.empty(0)
+        self._law, self._scale = np.array([0.0, 0.0, 1.0]), 1.0
+
+    def on_grid(self, values: np.ndarray) -> np.ndarray:
+        """Values (N,) of the points on their regular grid, float32; 0 where there is no point."""
+        out = np.zeros(self._grid, np.float32)
+        out[self.cells] = values
+        return out
+
+    def image_of(self, values: np.ndarray) -> np.ndarray:
+        """(H, W) float32: each pixel has the value of the nearest place of the grid."""
+        size = self._shape[::-1]
+        return cv2.resize(self.on_grid(values), size, interpolation=cv2.INTER_NEAREST)
+
+    def estimate(self, T: np.ndarray) -> bool:
+        """Fit the noise law and the scale of the information; whether enough points are seen."""
+        found = self.residuals(T)
+        if found.seen.sum() < MIN_POINTS:
+            self._scale = 0.0
+            return False
+        z, lengths = found.z[found.seen], np.abs(found.r[found.seen])
+        columns = np.stack([np.ones_like(z), z, z * z], 1)
+        usual = 1.4826 * np.median(lengths / z**2) * z**2
+        mean_length = np.sqrt(2 / np.pi)  # of a standard normal number
+        for _ in range(2):  # the first law says which residuals are outliers of the second
+            near = lengths < CUTOFF * np.maximum(usual, DEPTH_FLOOR * z)
+            share = 1 / z[near, None]
+            self._law = nnls(columns[near] * share, lengths[near] * share[:, 0])[0] / mean_length
+            usual = self.noise(z)
+        w = self._information(T)
+        scores = (found.J * (w * found.r)[:, None]).T
+        model = positive_inverse((found.J * w[:, None]).T @ found.J)
+        share = self._tiles.share
+        self._scale = 0.0 if model is None else share(scores, scores @ scores.T, model)
+        return self._scale > 0
+
+    def noise(self, z: np.ndarray) -> np.ndarray:
+        """Standard deviation (N,) of the residual at depths (N,), metres: the fitted law."""
+        a, b, c = self._law
+        return np.maximum(a + (b + c * z) * z, DEPTH_FLOOR * z)
+
+    def robust(self, T: np.ndarray) -> np.ndarray:
+        """(N,) factors in [0, 1] of the robust kernel, 0 where a point is not seen."""
+        found = self.residuals(T)
+        d2 = (found.r / self.noise(found.z)) ** 2
+        return np.where(found.seen, CUTOFF**2 / (CUTOFF**2 + d2), 0.0)
+
+    def linearize(self, T: np.ndarray) -> Linearization:
+        """See :class:`hybridvo.refinement.solver.Factor`; points unseen cost the most."""
+        found, scale = self.residuals(T), self._scale
+        cost = 0.5 * CUTOFF**2 * float(self._weight @ (1 - self.robust(T)))
+        weighted = scale * (found.J * self._information(T)[:, None]).T
+        return Linearization(weighted @ found.J, -(weighted @ found.r), scale * cost)
+
+    def residuals(self, T: np.ndarray) -> Residuals:
+        """At a motion; the last one's are kept."""
+        if T is not self._at:
+            found = kernels.measure(self.points, T, self._depth, self._K)
+            self._found, self._at = Residuals(*found), T
+        return self._found
+
+    def _information(self, T: np.ndarray) -> np.ndarray:
+        """(N,) 1 / m^2."""
+        return self._weight * (self.robust(T) / self.noise(self.residuals(T).z)) ** 2
