@@ -101,11 +101,6 @@ def chain(T_world_prev: np.ndarray, T_curr_prev: np.ndarray) -> np.ndarray:
     return T_world_curr
 
 
-def skew(w: np.ndarray) -> np.ndarray:
-    """(3, 3) matrix of the cross product with ``w``."""
-    return np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
-
-
 def se3_exp(delta: np.ndarray) -> np.ndarray:
     """(4, 4) exponential of a 6-vector (translation, rotation); also compiled, for the kernels."""
     delta = np.asarray(delta)
@@ -139,14 +134,13 @@ def se3_log(T: np.ndarray) -> np.ndarray:
     else:  # near a half turn the sines are lost
         phi = Rotation.from_matrix(R).as_rotvec()
     theta2 = float(phi @ phi)
-    W = skew(phi)
     if theta2 < 1e-8:
         c = 1 / 12 + theta2 / 720
     else:
         theta = np.sqrt(theta2)
         c = (1 - theta / (2 * np.tan(theta / 2))) / theta2
-    V_inverse = np.eye(3) - 0.5 * W + c * (W @ W)
-    return np.concatenate([V_inverse @ T[:3, 3], phi])
+    across = np.cross(phi, T[:3, 3])
+    return np.concatenate([T[:3, 3] - 0.5 * across + c * np.cross(phi, across), phi])
 
 
 def rotation_angle(R: np.ndarray) -> np.ndarray:

@@ -31,7 +31,7 @@ from hybridvo.refinement.coarse_fit import (
     translation_scale,
 )
 from hybridvo.refinement.kernels import FASTMATH, MAX_VALUE, MU, MV, XN, YN, W, Z
-from hybridvo.refinement.pixels import CoarseGrid
+from hybridvo.refinement.pixels import PixelGrid
 
 WINDOW_ROWS, WINDOW_COLUMNS = 3, 4
 MINIMAL_SAMPLES, MINIMAL_STEPS = 384, 3
@@ -69,13 +69,12 @@ class Motion(NamedTuple):
 
 
 def find_motions(
-    grid: CoarseGrid, starts: np.ndarray, options: Options, seed: int
+    grid: PixelGrid, starts: np.ndarray, options: Options, seed: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Poses (N, 3, 4) of all strong motions, the strongest first, and their facts (N, FACTS).
 
-    The first is sought from the handed-in starts (S, 3, 4), the first of them seen from afar only;
-    where these find none that is settled, and for every further one, windows and minimal samples
-    compete as well. ``seed`` draws the samples.
+    The first is sought from the starts (S, 3, 4); where these find none that is settled, and for
+    every further one, windows and minimal samples, drawn by ``seed``, compete as well.
     """
     limits, search = options.search, _Search(grid, options, seed)
     motions: list[Motion] = []
@@ -106,9 +105,9 @@ def find_motions(
 class _Search:
     """The pixels of a pair, what the motions set aside have ``left`` of them, and all ``seen``."""
 
-    def __init__(self, grid: CoarseGrid, options: Options, seed: int) -> None:
-        self.grid, self.K, self.cutoff = grid, grid.pixels.K, options.refine.cutoff
-        self.small, *self.small_shape, _ = grid.pixels.samples(options.search.grid_pixels)
+    def __init__(self, grid: PixelGrid, options: Options, seed: int) -> None:
+        self.grid, self.K, self.cutoff = grid, grid.K, options.refine.cutoff
+        self.small, *self.small_shape, _ = grid.sampled(options.search.grid_pixels)
         self.samples, self.probes = grid.samples.copy(), Probes(grid)
         self.similar = translation_scale(grid.samples, grid.count)
         self.rng = np.random.default_rng(seed)
@@ -223,16 +222,14 @@ class _Search:
 class Probes:
     """Points of a grid that tell motions apart."""
 
-    def __init__(self, grid: CoarseGrid) -> None:
+    def __init__(self, grid: PixelGrid) -> None:
         samples = grid.samples[:, : grid.count : 7]
         samples = samples[:, samples[W] > 0]
         self.points = np.stack([samples[XN], samples[YN], np.ones_like(samples[Z])]) * samples[Z]
-        self.focal, self.unit = grid.pixels.K[:2, None], REFERENCE_WIDTH / grid.size[1]
+        self.focal, self.unit = grid.K[:2, None], REFERENCE_WIDTH / grid.size[1]
 
     def distances(self, poses: Sequence[np.ndarray], of: int) -> np.ndarray:
-        """(N,) mean distance between where poses (N, 3, 4) bring the points and where one of them
-        does, px at a width of 1024.
-        """
+        """(N,) mean distance between where poses bring the points and one does, px of 1024."""
         P = np.stack(poses).astype(np.float32)
         moved = P[:, :, :3] @ self.points + P[:, :, 3:]
         seen = moved[:, :2] / np.maximum(moved[:, 2:], 1e-3) * self.focal

@@ -49,29 +49,20 @@ SOURCES = {
 
 
 class Candidate(NamedTuple):
-    """A motion to be scored: of the search, or a refit made inside a ``mask`` (h, w).
+    """A motion to be scored: of the search, or a refit made inside a mask (h, w)."""
 
-    ``pose`` (3, 4) T_curr_prev; its ``facts``, see :mod:`hybridvo.hypotheses.search`; ``parent``:
-    number of the motion of the search that it goes back to.
-    """
-
-    pose: np.ndarray
-    facts: np.ndarray
-    parent: int
+    pose: np.ndarray  # (3, 4) T_curr_prev
+    facts: np.ndarray  # see hybridvo.hypotheses.search
+    parent: int  # number of the motion of the search that it goes back to
     mask: np.ndarray | None = None
 
 
 class Scores(NamedTuple):
-    """A scorer's answer.
+    """A scorer's answer."""
 
-    ``score`` (N,): larger is more likely the camera's motion; ``static``: by candidate, the best
-    first, the probability (h, w) of every pixel of being static; ``confidence``: probability that
-    the candidate with the largest score is right.
-    """
-
-    score: np.ndarray
-    static: dict[int, np.ndarray]
-    confidence: float
+    score: np.ndarray  # (N,) larger is more likely the camera's motion
+    static: dict[int, np.ndarray]  # of candidates, best first: probability (h, w) of being static
+    confidence: float  # probability that the candidate with the largest score is right
 
 
 Scorer = Callable[[Sequence[Candidate], int], Scores]
@@ -104,8 +95,7 @@ def select_by_scorer(
 ) -> Selection:
     """The motion selected by a scorer and its masks: score, fit again inside masks, score again.
 
-    ``prediction``, of another network: one candidate more, and where it sees the static scene;
-    of the options ``select`` and ``refine`` are read.
+    ``prediction``, of another network: one candidate more, and where it sees the static scene.
     """
     candidates, static = _searched(found), None
     if not found.is_ambiguous:
@@ -147,7 +137,7 @@ def _refits(
         mask = mask_weights(static)
         if _coverage(found, mask) >= MIN_COVERAGE:
             grid = found.grid
-            pose, facts = fit_in_mask(grid.samples, mask, grid.pixels.K, start, cutoff)
+            pose, facts = fit_in_mask(grid.samples, mask, grid.K, start, cutoff)
             if np.isfinite(pose).all() and facts[search.SHARE] > 0:
                 refits.append(Candidate(pose, facts, parent, mask))
     return refits
@@ -174,7 +164,7 @@ def nearest_motion(poses: np.ndarray, pose: np.ndarray, depth_scale: float) -> i
 
 def hypotheses(found: HypothesisSet, candidates: Sequence[Candidate]) -> list[Hypothesis]:
     """The candidates with their inliers, in their order."""
-    grid, K = found.grid, found.grid.pixels.K
+    grid, K = found.grid, found.grid.K
     made = []
     for pose, facts, *_ in candidates:
         sf, sd = float(facts[search.FLOW_NOISE]), float(facts[search.DEPTH_NOISE])

@@ -34,7 +34,7 @@ from hybridvo.refinement.kernels import (
 )
 
 XN, YN, Z, GREY, GX, GY, PD, W = range(8)
-"""Rows of a pixel buffer: ray x, ray y, depth, grey value, its gradient, relative depth variance,
+"""Rows of a pixel buffer: ray x, y, depth, grey value, its gradient, relative depth variance,
 weight."""
 BUFFER_ROWS = 8
 GQ = 8

@@ -213,11 +213,10 @@ def direct_start(
     T_start: np.ndarray | None = None,
     least: float = 0.5,
 ) -> RelativePose | None:
-    """The motion that the images and depth maps agree on, from a start (4, 4) or the identity.
+    """The motion that images and depth maps agree on, from a start (4, 4) or the identity.
 
-    Its ``inlier_ratio`` is the share of the pixels in view of both that it explains, its
-    ``probability`` of being the camera's follows from that. None where the images do not match, or
-    where that is below ``least``.
+    None where the images do not match, or where its probability of being the camera's is below
+    ``least``.
     """
     prev, curr = pair.prev, pair.curr
     if any(x is None for x in (prev.rgb, prev.depth, curr.rgb, curr.depth)):
@@ -256,10 +255,10 @@ def direct_start(
 
 
 def explained(pair: FramePair, motion: RelativePose) -> tuple[RelativePose, tuple[float, float]]:
-    """A motion by images and depth maps with the pixels that follow it, and its probability.
+    """A motion by images and depth maps with the pixels that follow it and its probability.
 
-    And the evidence that this is logistic in: agreement of the image's parts, and log of the share
-    of the image in unexplained regions.
+    And the evidence for that: agreement of the image's parts, log of the share of the image in
+    unexplained regions.
     """
     T, images = motion.T_curr_prev, motion.photometric
     planes = PlaneFactor(pair, np.ones(pair.prev.camera.shape, np.float32), 1.0)

@@ -84,26 +84,16 @@ class BatchedPose:
 
 
 class Pixels(NamedTuple):
-    """Pixels of a batch as the solver takes them; unusable ones have weight 0.
+    """Pixels of a batch as the solver takes them; variances are relative to the typical one."""
 
-    Args:
-        points: (B, 3, N) metres, in the previous camera.
-        target: (B, 2, N) px, x + F on the current image.
-        flow_variance, depth_variance: (B, N) relative to the typical one of the sample.
-        weight: (B, N) external weight.
-        K: (B, 3, 3) of the current camera.
-        log_depth_curr: (B, N) log D_curr(x + F), 0 where absent; None without that depth.
-        has_depth_curr: (B, N) 1 where it is present, else 0.
-    """
-
-    points: torch.Tensor
-    target: torch.Tensor
-    flow_variance: torch.Tensor
-    depth_variance: torch.Tensor
-    weight: torch.Tensor
-    K: torch.Tensor
-    log_depth_curr: torch.Tensor | None = None
-    has_depth_curr: torch.Tensor | None = None
+    points: torch.Tensor  # (B, 3, N) metres, in the previous camera
+    target: torch.Tensor  # (B, 2, N) px, x + F on the current image
+    flow_variance: torch.Tensor  # (B, N)
+    depth_variance: torch.Tensor  # (B, N)
+    weight: torch.Tensor  # (B, N) external weight, 0 where unusable
+    K: torch.Tensor  # (B, 3, 3) of the current camera
+    log_depth_curr: torch.Tensor | None = None  # (B, N) log D_curr(x + F), 0 where absent
+    has_depth_curr: torch.Tensor | None = None  # (B, N) 1 where it is present, else 0
 
     def map(self, change: Callable[[torch.Tensor], torch.Tensor]) -> Pixels:
         """The same with every tensor changed."""
@@ -144,8 +134,8 @@ def gather_pixels(
 ) -> Pixels:
     """The pixels of a batch in raster order, or tile by tile where a tile's side is given.
 
-    ``with_depth`` joins the current frame's depth. Invalid values are replaced before anything is
-    computed from them, so that neither they nor their gradients spread.
+    Invalid values are replaced before anything is computed from them, so that neither they nor
+    their gradients spread.
     """
     depth = batch.depth_prev
     height, width = depth.shape[1:]
@@ -185,11 +175,8 @@ def gather_pixels(
 
 
 def sample_depth(depth: torch.Tensor, at: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Bilinear depth (B, H, W) at (B, h, w, 2) px, where the four neighbours lie on one surface.
-
-    Returns:
-        (B, h, w) metres and (B, h, w) bool: False, and depth 1, outside the image, next to an
-        invalid depth, and at edges.
+    """Bilinear depth (B, h, w) of (B, H, W) at (B, h, w, 2) px; and bool: False, and depth 1,
+    outside the image, next to an invalid depth, and at edges.
     """
     height, width = depth.shape[1:]
     u, v = at.unbind(-1)

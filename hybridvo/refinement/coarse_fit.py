@@ -1,7 +1,5 @@
 """One motion on gathered pixels, by Gauss-Newton under a graduated robust kernel, and the noise of
-the pixels that follow it (numba).
-
-Poses inside the kernels are (3, 4) float64 arrays [R | t].
+the pixels that follow it (numba). Poses are (3, 4) float64 arrays [R | t].
 """
 
 from __future__ import annotations
@@ -105,8 +103,8 @@ def noise_of(flow_sigma, depth_sigma, cutoff):
 def gauss_newton(samples, n, total, K, noise, steps, tolerance_px, pose):
     """Damped Gauss-Newton in place; a step is taken only where the robust cost does not rise.
 
-    ``total``: sum of the external weights. Stops when the step moves the image by less than
-    ``tolerance_px``. Returns the number of steps.
+    ``total``: sum of the external weights; a step that moves the image by less than
+    ``tolerance_px`` is the last. Returns the number of steps.
     """
     acc, other, delta, candidate = np.zeros(SUMS), np.zeros(SUMS), np.zeros(6), np.empty((3, 4))
     full = 0.5 * np.float64(noise[2])
@@ -181,7 +179,7 @@ def anneal(samples, n, K, start_px, end_px, ratio, steps, pose):
 def gather_noise(samples, n, step, pose, K, radius):
     """Of every ``step``-th pixel whose residual is within the ``radius`` (px): squared residual
     along q and across it, variance of flow and depth in units of sf^2 and sd^2, external weight,
-    density of outliers, (6, N). And the share of the weight that these pixels have.
+    density of outliers, (6, N); and the share of the weight that these pixels have.
     """
     terms, entries = np.empty((6, n // step + 1), np.float32), pose_entries(pose)
     disc = 1.0 / (math.pi * radius * radius)
@@ -315,10 +313,8 @@ def translation_scale(samples: np.ndarray, n: int) -> float:
 def fit_coarse(
     samples: np.ndarray, n: int, K: np.ndarray, pose: np.ndarray, cutoff: float
 ) -> tuple[np.ndarray, float, float, float, int]:
-    """One motion on the first ``n`` pixels, by graduated non-convexity from a (3, 4) start.
-
-    Returns:
-        Pose (3, 4), flow noise px, depth noise, inlier ratio of the weight, iterations.
+    """One motion (3, 4) on ``n`` pixels, by graduated non-convexity from a start; flow noise px,
+    depth noise, inlier ratio of the weight, iterations.
     """
     pose = np.array(pose, np.float64, order="C")
     scale = min(64.0, max(1.0, 1.5 * residual_scale(samples, n, pose, K)))
@@ -333,10 +329,8 @@ def fit_coarse(
 def residual_coherence(
     samples: np.ndarray, h: int, w: int, pose: np.ndarray, K: np.ndarray, sf: float, sd: float
 ) -> float:
-    """How alike neighbouring residuals are: 0 for independent noise, 1 for equal residuals.
-
-    Of whitened residuals in 8 x 8 blocks, from the variance of the block means. A compromise
-    between two motions leaves residuals that agree with their neighbours.
+    """How alike neighbouring residuals are, as a compromise between two motions leaves them: 0 for
+    independent noise, 1 for equal ones. Whitened, from the variance of the means of 8 x 8 blocks.
     """
     r, q = np.split(residuals(samples, h * w, pose, K), 2)
     ip = samples[PF, : h * w] / sf**2

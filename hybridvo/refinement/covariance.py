@@ -48,7 +48,6 @@ def score_sums(
     """(42,) curvature of the robust weights and meat of independent errors, per unit of weight.
 
     From a coarse grid: both are averages over many pixels and enter the result at second order.
-    The Gauss-Newton Hessian less the curvature is the derivative of the estimating equation.
     """
     work, used = np.empty((WORK_ROWS, n), np.float32), np.zeros(SUMS)
     project_block(samples, 0, n, pose, K, noise, work, work[8], used)
@@ -63,14 +62,12 @@ def score_sums(
 
 
 def block_sums(tiles: np.ndarray, inverse: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
-    """Outer products of the scores summed over blocks of tiles, and what the fit took from them.
+    """Outer products (S, 6, 6) of the scores summed over blocks of tiles, what the fit took from
+    them (S,), and the number of tiles with a score.
 
-    Blocks reach over the border; (width / step)^2 of them cover a tile, and each counts for that
-    share. Under independent errors a block with information H_b has scores of covariance H_b - H_b
-    H^-1 H_b about the estimate: the second term, in units of the first, is what the fit took.
-
-    Returns:
-        (S, 6, 6), (S,), number of tiles with a score.
+    Blocks reach over the border; (width / step)^2 of them cover a tile. Under independent errors a
+    block with information H_b has scores of covariance H_b - H_b H^-1 H_b about the estimate: the
+    second term, in units of the first, is what the fit took.
     """
     meats, lost, counts = [], [], []
     for width, step in SIZES:
@@ -88,10 +85,8 @@ def block_sums(tiles: np.ndarray, inverse: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def long_range(growth: float, tiles: int) -> float:
-    """Factor on the variance of blocks two tiles wide for errors that reach beyond them.
-
-    ``growth``: variance of the scores of blocks four tiles wide over that of single tiles, in units
-    of independent errors.
+    """Factor on the variance of blocks two tiles wide for errors that reach beyond them, from the
+    ``growth`` of the scores' variance from single tiles to blocks four tiles wide.
     """
     if not (growth > LONG_GROWTH[0] and np.isfinite(growth)):
         return 1.0
@@ -116,15 +111,14 @@ def motion_covariance(
     """Covariance of the left perturbation, eigenvalues of the information, number of tiles with
     usable pixels; 0 where the information is not definite.
 
-    Bread: Gauss-Newton Hessian less the curvature of the robust weights. Meat: :data:`CLUSTERED`
-    from overlapping blocks two tiles wide, the rest from independent errors, scaled by how much the
-    blocks exceed them; corrected for what the fit takes out of the residuals.
+    Bread: Gauss-Newton Hessian less the curvature of the robust weights (6, 6). Meat:
+    :data:`CLUSTERED` from overlapping blocks two tiles wide, the rest from independent errors,
+    ``meat`` (6, 6), scaled by how much the blocks exceed them.
 
     ``tiles`` (rows, columns, 27): upper triangle of the Gauss-Newton Hessian and scores, summed
-    over tiles; ``curvature`` (6, 6) of the robust weights, ``meat`` (6, 6) under independent
-    errors; ``depth_scale`` (1 / m) turns metres of translation into radians of the image. The
-    pixels' ``weight``, the ``focal`` length in px, translation ``t`` and ``noise`` (px, log depth)
-    give what no residual shows: the rounding of the pixels and the law of the depth's errors.
+    over tiles; ``depth_scale`` (1 / m) turns metres of translation into radians of the image.
+    ``weight``, ``focal`` length in px, ``t`` and ``noise`` (px, log depth) give what no residual
+    shows: the rounding of the pixels and the law of the depth's errors.
     """
     scaling = np.array([1 / depth_scale] * 3 + [1.0] * 3)
     outer = np.outer(scaling, scaling)

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hybridvo.calibration import DOUBTFUL_SPREAD, NO_SPREAD
-from hybridvo.geometry import njit
+from hybridvo.geometry import njit, points_at
 from hybridvo.refinement.coarse_fit import robust_weights
 from hybridvo.refinement.covariance import symmetric
 from hybridvo.refinement.kernels import (
@@ -71,9 +71,7 @@ def look_up(samples, n, depth):
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
 def conditional(samples, k, log_depth, entries, K, noise, row):
-    """(conditional residual, raw residual, known and in front) of pixel ``k``; its Jacobian in
-    ``row``.
-    """
+    """(conditional residual, raw one, known and in front) of pixel ``k``; ``row``: Jacobian."""
     a, b, i, front = see(samples[XN, k], samples[YN, k], samples[Z, k], entries)
     fx, fy = K[0], K[1]
     ru = samples[MU, k] - (fx * a + K[2])
@@ -111,8 +109,7 @@ def depth_scale(samples, log_depth, robust, pose, K, noise):
 def sum_depth(samples, log_depth, robust, pose, K, noise, sz, tiles, sums, meat):
     """Add the third residual's normal equations to ``sums`` (tiles, 27); returns the cost.
 
-    ``sz``: standard deviation of the conditional residual. ``tiles`` (n,): tile of each pixel;
-    ``meat`` (21,) gets the sum of w^2 s s^T.
+    ``sz``: its standard deviation; ``tiles`` (n,) of each pixel; ``meat`` (21,): sum of w^2 s s^T.
     """
     c2, v = np.float64(noise[2]), sz * sz
     row, entries, cost = np.empty(6), pose_entries(pose), 0.0
@@ -136,25 +133,24 @@ def sum_depth(samples, log_depth, robust, pose, K, noise, sz, tiles, sums, meat)
 
 
 class DepthFactor:
-    """The current frame's depth (H, W), given the flow, at every ``stride``-th pixel of a pair.
-
-    ``sigma``: standard deviation of the conditional residual; ``noise`` (3,) as in the kernels.
+    """The current frame's depth (H, W), given the flow, at every ``stride``-th pixel of a pair;
+    ``sigma``: standard deviation of the conditional residual.
     """
 
     def __init__(
-        self, image: PixelGrid, curr: np.ndarray, stride: int, sigma: float, noise: np.ndarray,
+        self, grid: PixelGrid, curr: np.ndarray, stride: int, sigma: float, noise: np.ndarray,
         tile: int,
     ) -> None:  # fmt: skip
-        self._samples, height, width = image.strided(stride)
+        self._samples, height, width = grid.strided(stride)
         self._log_depth = look_up(self._samples, height * width, curr)
-        self._image, self._sigma, self._noise = image, sigma, noise
+        self._K, self._sigma, self._noise = grid.K, sigma, noise
         row, column = (np.arange(n) * stride // tile for n in (height, width))
-        self._shape = tuple(-(-n // tile) for n in image.shape)
+        self._shape = tuple(-(-n // tile) for n in grid.size)
         self._tiles = (row[:, None] * self._shape[1] + column).ravel()
 
     def linearize(self, T: np.ndarray) -> Linearization:
         """The sums over each tile and the meat stay as attributes."""
-        where = T[:3], self._image.K, self._noise
+        where = T[:3], self._K, self._noise
         robust = robust_weights(self._samples, len(self._log_depth), *where)
         tiles, self.meat = np.zeros((*self._shape, COST)), np.zeros(21)
         cost = sum_depth(
@@ -166,9 +162,7 @@ class DepthFactor:
 
 
 class DepthAgreement(NamedTuple):
-    """Median ratio of the current depth to that of the previous frame's points, moved, and the
-    median distance of its log from that of the median.
-    """
+    """Median ratio of the current depth to the previous points', moved; spread of its log."""
 
     ratio: float
     spread: float
@@ -195,9 +189,7 @@ def compare_depths(
 ) -> DepthAgreement | None:
     """Compare both depths of a pair where the robust weights (H, W) of a motion exceed one half.
 
-    The scale of a whole sequence cannot be seen: all depths and all translations times s project to
-    the same pixels. A scale that changes on the way can. It asks the nearest pixel, whatever its
-    neighbours are: in noise none agree. None where too few points tell.
+    At the nearest pixel, whatever its neighbours are: in noise none agree. None where too few tell.
     """
     prev, curr, flow = pair.prev, pair.curr, pair.flow
     if flow is None or prev.depth is None or curr.depth is None or weights is None:
@@ -205,8 +197,8 @@ def compare_depths(
     (height, width), step = prev.depth.shape, max(1, math.isqrt(prev.depth.size // COMPARED))
     first = step // 2
     v, u = (first + step * k for k in np.nonzero(weights[first::step, first::step] > 0.5))
-    K, (a, b, c), t = prev.camera, T_curr_prev[2, :3], T_curr_prev[2, 3]
-    moved = prev.depth[v, u] * (a * (u - K.cx) / K.fx + b * (v - K.cy) / K.fy + c) + t
+    points = points_at(prev.depth, prev.camera, np.stack([v, u], axis=1))
+    moved = points @ T_curr_prev[2, :3] + T_curr_prev[2, 3]
     column, row = np.rint(u + flow[v, u, 0]), np.rint(v + flow[v, u, 1])
     inside = (row >= 0) & (column >= 0) & (row < height) & (column < width) & (moved > MIN_DEPTH)
     at = row[inside].astype(np.intp), column[inside].astype(np.intp)

@@ -18,7 +18,7 @@ from hybridvo.refinement import coarse_fit
 from hybridvo.refinement.covariance import NOTHING, motion_covariance, score_sums, symmetric
 from hybridvo.refinement.depth import DepthFactor, compare_depths, depth_scale, look_up
 from hybridvo.refinement.kernels import SUMS, sum_samples
-from hybridvo.refinement.pixels import CoarseGrid, PixelGrid, coarse_grid
+from hybridvo.refinement.pixels import PixelGrid, coarse_grid
 from hybridvo.refinement.solver import Factor, Linearization, gauss_newton, tile_size
 from hybridvo.results import Hypothesis, Reason, RelativePose, Status
 from hybridvo.types import FramePair
@@ -40,43 +40,31 @@ interpolation of the second one averages away (4/9 remains of independent noise)
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """The motion to be refined, and what is known of it.
-
-    Args:
-        T_curr_prev: (4, 4).
-        noise: (flow px, log depth) standard deviations found with it, or None.
-        mask: (h, w) weights on the coarse grid that it was fitted with, or None for all.
-        coverage: share of the usable pixels' weight that the mask leaves.
-        confidence: the scorer's own, 0 to 1, that it is right; low where no motion may be.
-        gap: by how much its score exceeds that of any other motion.
-        probability: that the motion is right, calibrated in the gap.
-        hypotheses: all candidates, the one selected first.
-        iterations: Gauss-Newton steps spent on it.
-    """
+    """The motion (4, 4) to be refined, and what is known of it."""
 
     T_curr_prev: np.ndarray
-    noise: tuple[float, float] | None = None
-    mask: np.ndarray | None = None
-    coverage: float = 1.0
-    confidence: float = 1.0
-    gap: float = 0.0
-    probability: float = 1.0
-    hypotheses: tuple[Hypothesis, ...] = ()
-    iterations: int = 0
+    noise: tuple[float, float] | None = None  # flow px, log depth: standard deviations found so far
+    mask: np.ndarray | None = None  # (h, w) weights on the coarse grid that it was fitted with
+    coverage: float = 1.0  # share of the usable pixels' weight that the mask leaves
+    confidence: float = 1.0  # the scorer's own, that it is right; low where no motion may be
+    gap: float = 0.0  # by how much its score exceeds that of any other motion
+    probability: float = 1.0  # that the motion is right, calibrated in the gap
+    hypotheses: tuple[Hypothesis, ...] = ()  # all candidates, the one selected first
+    iterations: int = 0  # Gauss-Newton steps spent on it
 
 
 def refine_pair(
     pair: FramePair,
     start: Selection,
-    grid: CoarseGrid | None = None,
+    grid: PixelGrid | None = None,
     weights: np.ndarray | None = None,
     options: RefineOptions | None = None,
     min_probability: float = 0.0,
 ) -> RelativePose:
     """The motion of a pair near its only start; degraded below ``min_probability``.
 
-    ``grid``: coarse grid of the pair, with the weights; None: it is made, with ``weights`` (H, W),
-    factors on the information of each pixel.
+    ``grid``: the pair's, with weights; None: it is made, with ``weights`` (H, W), factors on the
+    information of each pixel.
     """
     options = options or RefineOptions()
     made = grid or coarse_grid(pair, weights, options)
@@ -86,7 +74,7 @@ def refine_pair(
     noise, iterations = start.noise, start.iterations
     if noise is None:
         pose, sf, sd, _, iterations = coarse_fit.fit_coarse(
-            made.samples, made.count, made.pixels.K, pose, options.cutoff
+            made.samples, made.count, made.K, pose, options.cutoff
         )
         noise = sf, sd
     curr = None if options.current_depth == "off" else pair.curr.depth
@@ -156,10 +144,10 @@ def ambiguous(probability: float) -> Status:
 
 
 def widened(motion: RelativePose) -> RelativePose:
-    """An ambiguous motion, its covariance widened to cover the other motions it may be.
+    """An ambiguous motion, its covariance widened to cover the others: the mixture's second moment.
 
-    The second moment of the mixture: with its probability the camera's motion is this one; else as
-    far away as the farthest of the others or as standing still, in any direction.
+    With its probability the camera's motion is this one; else as far away as the farthest of the
+    others or as standing still, in any direction.
     """
     others = [h.T_curr_prev for h in motion.hypotheses[1:]] + [np.eye(4)]
     steps = np.array([se3_log(motion.T_curr_prev @ invert(T)) for T in others])
@@ -169,20 +157,17 @@ def widened(motion: RelativePose) -> RelativePose:
 
 
 class FlowFactor:
-    """Flow and depth of every pixel of a grid, see :mod:`hybridvo.refinement.kernels`.
-
-    ``per_weight`` (42,) is that of :func:`hybridvo.refinement.covariance.score_sums`.
-    """
+    """Flow and depth of every pixel of a pair; ``per_weight`` (42,): of ``score_sums``."""
 
     def __init__(
-        self, image: PixelGrid, noise: np.ndarray, tile: int, per_weight: np.ndarray
+        self, grid: PixelGrid, noise: np.ndarray, tile: int, per_weight: np.ndarray
     ) -> None:
-        self.image, self.noise, self.tile, self._per_weight = image, noise, tile, per_weight
+        self._grid, self._noise, self._tile, self._per_weight = grid, noise, tile, per_weight
 
     def linearize(self, T: np.ndarray) -> Linearization:
-        """See :class:`hybridvo.refinement.solver.Factor`; the sums stay as attributes."""
-        self.tiles, self.rest, self.weights = self.image.full_pass(T[:3], self.noise, self.tile)
-        """(rows, columns, 27) sums of each tile; cost and sums of the weights; robust weights."""
+        """The sums of each tile, of cost and weights, and the robust weights stay as attributes."""
+        found = self._grid.full_pass(T[:3], self._noise, self._tile)
+        self.tiles, self.rest, self.weights = found
         self.meat = self._per_weight[21:] * self.rest[2]
         sums = self.tiles.sum(axis=(0, 1))
         curvature = symmetric(self._per_weight[:21] * self.rest[2])
@@ -198,13 +183,10 @@ def pair_noise(
     cutoff: float,
     curr: np.ndarray | None,
 ) -> tuple[float, float, float, float, float]:
-    """Noise of the pixels that follow a motion, from the noise (sf, sd) found before.
+    """Noise (sf, sd) of the pixels that follow a motion, share of the weight that does, standard
+    deviation of the log ratio of both depths and of its part that the flow does not tell (or 0).
 
     The current depth (H, W) bounds the noise of the first, and tells it where the flow cannot.
-
-    Returns:
-        sf, sd, share of the weight that follows, standard deviation of the log ratio of both
-        depths, and of its part that the flow does not tell; 0 where they cannot be compared.
     """
     sf, sd = start
     sf, sd, share, told = coarse_fit.estimate_noise(
@@ -227,25 +209,23 @@ def pair_noise(
 
 
 def _fit_full_grid(
-    grid: CoarseGrid,
+    grid: PixelGrid,
     curr: np.ndarray | None,
     pose: np.ndarray,
     start: tuple[float, float],
     options: RefineOptions,
 ) -> tuple[RelativePose, int, np.ndarray]:
-    """The motion (no status yet) on every pixel, from its pose (3, 4) and noise on the coarse grid.
-
-    And the number of tiles in which pixels were used, 0 where a direction is open; and eigenvalues
-    (6,), ascending, of the information scaled to pixels.
+    """The motion (no status yet) on every pixel; number of tiles in which pixels were used, 0 where
+    a direction is open; eigenvalues (6,), ascending, of the information scaled to pixels.
     """
-    image, samples, n = grid.pixels, grid.samples, grid.count
-    sf, sd, share, _, sigma = pair_noise(samples, n, image.K, pose, start, options.cutoff, curr)
-    tile = tile_size(image.shape, options.tiles)
+    samples, n, K = grid.samples, grid.count, grid.K
+    sf, sd, share, _, sigma = pair_noise(samples, n, K, pose, start, options.cutoff, curr)
+    tile = tile_size(grid.size, options.tiles)
     inverse_depth = coarse_fit.translation_scale(samples, n)
     noise = coarse_fit.noise_of(sf, sd, options.cutoff)
     total = float(grid.weight.sum(dtype=np.float64))
-    iterations = coarse_fit.gauss_newton(samples, n, total, image.K, noise, 4, 1e-3 * sf, pose)
-    flow = FlowFactor(image, noise, tile, score_sums(samples, n, pose, image.K, noise))
+    iterations = coarse_fit.gauss_newton(samples, n, total, K, noise, 4, 1e-3 * sf, pose)
+    flow = FlowFactor(grid, noise, tile, score_sums(samples, n, pose, K, noise))
     term = None
     if curr is not None and sigma > 0:
         term = _depth_factor(grid, curr, pose, sigma, noise, options)
@@ -258,7 +238,7 @@ def _fit_full_grid(
     cost, followers, usable = flow.rest
     covariance, eigenvalues, occupied = motion_covariance(
         tiles, np.asarray(found.at.curvature), symmetric(meat), inverse_depth,
-        usable, image.K[0], T[:3, 3], (sf, sd),
+        usable, K[0], T[:3, 3], (sf, sd),
     )  # fmt: skip
     motion = RelativePose(
         T_curr_prev=T,
@@ -276,7 +256,7 @@ def _fit_full_grid(
 
 
 def _depth_factor(
-    grid: CoarseGrid,
+    grid: PixelGrid,
     curr: np.ndarray,
     pose: np.ndarray,
     sigma: float,
@@ -284,20 +264,20 @@ def _depth_factor(
     options: RefineOptions,
 ) -> DepthFactor | None:
     """The current depth as a factor, or None where it is not asked for or adds too little."""
-    image, samples, n, stride = grid.pixels, grid.samples, grid.count, grid.shape[2]
-    curr, tile = as_contiguous(curr), tile_size(image.shape, options.tiles)
+    samples, n, stride = grid.samples, grid.count, grid.shape[2]
+    curr, tile = as_contiguous(curr), tile_size(grid.size, options.tiles)
     # on the full fit the flow has every pixel, the depth every second one of both axes
     fine = min(2, stride)
     if options.current_depth == "auto":
         sums = np.zeros(SUMS)
-        sum_samples(samples, n, pose, image.K, noise, sums)
+        sum_samples(samples, n, pose, grid.K, noise, sums)
         H_flow = symmetric(sums[:21])
         units = np.repeat([1 / coarse_fit.translation_scale(samples, n), 1.0], 3)
         eigenvalues = np.linalg.eigvalsh(H_flow * np.outer(units, units))
         if eigenvalues[0] > WELL_CONDITIONED * eigenvalues[-1]:
             return None
-        coarse = DepthFactor(image, curr, stride, sigma, noise, tile)
+        coarse = DepthFactor(grid, curr, stride, sigma, noise, tile)
         gain = np.linalg.eigvals(np.linalg.pinv(H_flow) @ coarse.linearize(pose).H / fine**2)
         if not gain.real.max() > CURRENT_DEPTH_GAIN:
             return None
-    return DepthFactor(image, curr, fine, sigma, noise, tile)
+    return DepthFactor(grid, curr, fine, sigma, noise, tile)

@@ -21,19 +21,12 @@ PRIOR_FREEDOM = 6.0
 
 @dataclass(frozen=True, eq=False)
 class Linearization:
-    """Normal equations of a cost.
+    """Normal equations of a cost."""
 
-    Args:
-        H: (6, 6) Gauss-Newton approximation of its second derivative.
-        g: (6,) its negative gradient, or what else is to become zero.
-        cost: its value, in units of the log likelihood.
-        curvature: (6, 6) of the robust weights: ``H - curvature`` is the derivative of ``-g``.
-    """
-
-    H: np.ndarray
-    g: np.ndarray
-    cost: float
-    curvature: np.ndarray | float = 0.0
+    H: np.ndarray  # (6, 6) Gauss-Newton approximation of its second derivative
+    g: np.ndarray  # (6,) its negative gradient, or what else is to become zero
+    cost: float  # in units of the log likelihood
+    curvature: np.ndarray | float = 0.0  # of the robust weights: H less it is the derivative of -g
 
     def __add__(self, other: Linearization) -> Linearization:
         cost, curvature = self.cost + other.cost, self.curvature + other.curvature

@@ -152,9 +152,8 @@ def _solve(
     options: RefineOptions,
     tight: bool,
 ) -> BatchedPose:
-    """From the starts (B, S, 7) to the pose of every sample, with covariance and status.
-
-    ``how``: the kernel, without noise. ``tight``: to the precision that a gradient needs.
+    """From the starts (B, S, 7) to the pose of every sample; ``how``: the kernel, without noise;
+    ``tight``: to the precision that a gradient needs.
     """
     (height, width), weight = batch.depth_prev.shape[1:], pixels.weight
     size = height, width
