@@ -185,9 +185,11 @@ class MeasuredFlow:
 
 
 def with_flow(
-    pair: FramePair, provider: Callable[[Frame, Frame], Any], source: str = "callable"
+    pair: FramePair, provider: Callable[[Frame, Frame], Any] | None, source: str = "callable"
 ) -> FramePair:
-    """The pair with the flow of a provider, or of any callable, which is checked."""
+    """The pair with the flow of a provider, or of any callable, checked, where it has none."""
+    if pair.flow is not None or provider is None:
+        return pair
     field = check_field(provider(pair.prev, pair.curr), pair.prev, source)
     return field.pair(pair.prev, pair.curr, pair.depth_source)
 

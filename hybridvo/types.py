@@ -323,6 +323,13 @@ def typical_depth(depth: np.ndarray) -> float | None:
     return float(np.median(values)) if values.size else None
 
 
+def depth_doubt(depth: np.ndarray | None) -> str:
+    """Why a depth map cannot be in metres, with the probable remedy; empty where it can."""
+    median = None if depth is None else typical_depth(depth[::8, ::8])
+    advice = "" if median is None else depth_advice(median)
+    return advice and f"the median depth is {median:.4g}; Frame.depth expects metres: {advice}"
+
+
 def depth_advice(median: float, usual: float | None = None) -> str:
     """What probably turns depths of this median into metres; empty where they can be metres.
 
