@@ -1,28 +1,25 @@
 """Numbers fitted on data: value, unit, data, and how they are found again.
 
 The probabilities of being right are logistic in their evidence (for the selectors the gap between
-the best score and that of another motion), without a unit: weights, and one that stands alone.
-``python tools/calibrate.py`` fits them on pairs of the development recordings of
+the best score and that of another motion): weights, and one that stands alone. ``python
+tools/calibrate.py`` fits them on pairs of the development recordings of
 :mod:`hybridvo.synthetic.semi_real` and on the heavy development scenes, seeds 900 to 905, with DIS
-flow.
+flow: "the same pairs" below.
 """
 
 CUES_RIGHT = (0.26, 1.26)
-"""Of the cue scores: 259 of 316 answers right. The gap says little (AUROC .68, calibration error
-.05), so that a motion with a rival is hardly ever sure."""
+"""Of the cue scores: 259 of 316 right, AUROC .68, calibration error .05: with a rival hardly ever
+sure."""
 SELECTOR_RIGHT = (0.51, 0.95)
-"""Of the selector's scores: 244 of 257 answers right, AUROC .83, calibration error .01; 24 right
-ones below :data:`MIN_CONFIDENCE`, 6 wrong ones above (``--pairs 140``)."""
+"""Of the selector's scores: 244 of 257 right, AUROC .83, calibration error .01; 24 right ones below
+:data:`MIN_CONFIDENCE`, 6 wrong ones above (``--pairs 140``)."""
 PWVO_RIGHT = (0.38, -1.65)
-"""Of PWVO's motion, refined: in the log odds that the torch refinement states for it. Those compare
-the weights that follow this motion and another, and PWVO's leave little to what it takes for
-moving. 149 of 180 answers right, AUROC .80, calibration error .02 (``--pairs 60``)."""
+"""Of PWVO's motion, refined, in the log odds that the torch refinement states for it: 149 of 180
+right, AUROC .80, calibration error .02 (``--pairs 60``)."""
 DIRECT_RIGHT = (1.29, -2.18, -5.08)
-"""Of a motion found without flow: in the agreement of the image's parts and the log of the share of
-the image in unexplained regions. 222 of 696 answers right, AUROC .86, calibration error .03, 5
-wrong ones above :data:`MIN_CONFIDENCE`: 100 of the semi-real pairs and the heavy scenes, started
-from no motion and from two of the search, and, weighing as much as both, neighbours of three static
-recordings (``--pairs 100``)."""
+"""Of a motion found without flow, in the agreement of the image's parts and the log of the share of
+the image in unexplained regions: 222 of 696 right, AUROC .86, calibration error .03, 5 wrong ones
+above :data:`MIN_CONFIDENCE` (``--pairs 100``, and neighbours of three static recordings)."""
 CLEAR_RIGHT = 0.99
 """Share of right answers where the first motion explains nearly all that is usable."""
 CUE_WEIGHTS = {
@@ -34,16 +31,14 @@ CUE_WEIGHTS = {
     "prior": 0.3,
     "dominant": 2.0,
 }
-"""Weights of the cues of :mod:`hybridvo.hypotheses.selector`, dimensionless. Chosen by hand on
-seeds 900-905 of the heavy development scenes and the scenario ``one60``;
-``python tools/golden.py --only /refine`` shows what they give."""
+"""Weights of the cues of :mod:`hybridvo.hypotheses.selector`, by hand on seeds 900-905 of the heavy
+scenes and the scenario ``one60``; ``python tools/golden.py --only /refine`` shows the result."""
 MIN_CONFIDENCE = 0.85
-"""Probability of being right below which a motion is degraded: a choice between flags on right
-answers and wrong ones without; ``python tools/calibrate.py`` prints how many of each."""
+"""Probability of being right below which a motion is degraded."""
 CLEAR_COHERENCE = 0.5
-"""Spatial correlation of the residuals above which even a motion that most of the image follows may
-be a compromise: 0.02 for independent noise, 0.25 to 0.4 for DIS flow of static scenes, above 0.6
-where a large moving object bends the flow (the same pairs)."""
+"""Spatial correlation of the residuals above which a motion that most of the image follows may be a
+compromise: 0.02 for independent noise, to 0.4 for DIS flow of static scenes, above 0.6 where a
+large moving object bends the flow (the same pairs)."""
 CLEAR_BEND_PX = 0.15
 """Coherent part of the residuals, px at a width of 1024, above which it may be one as well: noise
 hides slowly moving objects, and they bend the motion (the same pairs)."""
@@ -51,24 +46,18 @@ SETTLED_COHERENCE = 0.35
 """Correlation above which a motion of half the image does not end the search of the first one;
 depth noise that is half correlated in space stays below 0.25 (the same pairs)."""
 ASIDE = 0.8
-"""Factor on the kernel's cutoff within which pixels are set aside with a motion. Wider, a motion
-takes with it much of another that looks like it in places: at 2 the right one is found in 80 % of
-the same pairs, from 0.5 to 1 in 84 %."""
+"""Factor on the kernel's cutoff within which pixels are set aside with a motion: at 2 the right one
+is found in 80 % of the same pairs, from 0.5 to 1 in 84 %."""
 DIS_NOISE = (0.035, 1.2)
 """Flow noise of DIS (medium) per component: std^2 = first^2 + (second * e)^2, px, e the difference
-of the flows in both directions. 18 pairs of the synthetic world; among pixels that disagree by
-0.015, 0.075, 0.25, 0.6, 1.2 px the true error has a (median-based) standard deviation of 0.038,
-0.077, 0.32, 0.86, 1.8 px; ``tests/flow`` measures it again."""
-
+of the flows in both directions. 18 synthetic pairs; ``tests/flow`` measures it again."""
 MIN_TEXTURED = 0.002
 """Smallest fraction of the image with texture across its weakest direction. Real and rendered
 images have 0.4 to 0.8, at a tenth of their brightness 0.006 to 0.28; a covered lens has none."""
-
 FLOW_CONTRADICTION = (0.8, 2.0)
 """A flow contradicts its images where the median difference after warping is above the first ratio
 times that without, while DIS reaches less than 1 / the second of it (less one grey level). 27
-pairs, rendered and real: warped over unwarped is at most 0.25 for the right flow, 0.85 and more for
-a negated, backward or doubled one, 1.0 for none. Half the flow (0.5 to 0.7) passes."""
+pairs: at most 0.25 for the right flow, 0.85 and more for a negated, backward or doubled one."""
 
 # The numbers below have no unit. They were fitted on the development seeds of the scenarios
 # (``tools/benchmark.py``), on rendered walks with DIS flow, and on the real samples.
@@ -77,34 +66,27 @@ FEW_TILES = 48
 """With fewer tiles the correlation between errors is hardly known; more of it is then assumed."""
 CLUSTERED = 0.6
 """Share of the clustered matrix in the meat, the rest is that of independent errors scaled to the
-same mean. Alone the few blocks make weak directions too certain at times (4 of 420 development
-pairs of cells beyond 3 sigma, 0 with this share); the other makes all directions equally bad."""
+same mean. Alone the few blocks make weak directions too certain at times (4 of 420 pairs)."""
 LONG_GROWTH = (1.7, 2.2)
-"""Growth of the variance of sums over blocks four tiles wide (kept overlapping) against one tile's,
-in units of independent errors, between which the errors come to count as reaching beyond the
-blocks. Medians over development pairs: 1.0 of independent noise, 1.0 to 1.3 of the cells (24 px in
-tiles of 64 px), 2.2 to 3.1 with DIS flow; every tenth pair of noisy cells is doubted too much."""
+"""Growth of the variance of sums over blocks four tiles wide against one tile's, in units of
+independent errors, between which errors come to count as reaching beyond the blocks: 1.0 of
+independent noise, 1.0 to 1.3 of the cells, 2.2 to 3.1 with DIS flow."""
 ABSORBED = 2.0
-"""The exponent of the growth is taken so much larger: what errors have in common over the whole
-image the fit takes into the motion, so that the residuals show less of it than there is. Median
-squared error in units of the covariance, 5.3 expected, on development sequences with DIS flow (240
-pairs): 12 with 1.5, 7 to 9 with 2, 6 to 8 with 2.5."""
+"""The exponent of the growth is taken so much larger: what errors have in common over the image the
+fit takes into the motion. Median squared error in units of the covariance, 5.3 expected, on 240
+pairs with DIS flow: 12 with 1.5, 7 to 9 with 2, 6 to 8 with 2.5."""
 DOUBTFUL_SPREAD, NO_SPREAD = 0.15, 0.35
 """Of the log ratio of two depths: spread from which an answer is degraded, and from which it is
-none: 16 and 37 % of noise in every pixel. Real sensors and rendered depth with DIS flow measure
-0.001 to 0.018, depth that is noise from 0.5 to 10 m 0.49 to 0.6."""
+none. Real sensors and rendered depth with DIS flow measure 0.001 to 0.018, noise 0.49 to 0.6."""
 MIN_TILES = 24
 """Tiles of the whole image in which usable pixels lie, below which a covariance cannot be
-trusted: depth errs alike over some 50 px, so that a line across the image holds ten to twenty
-independent readings for six unknowns (3 of 59 development lines were beyond 3 sigma)."""
+trusted: depth errs alike over some 50 px (3 of 59 development lines were beyond 3 sigma)."""
 EVEN_PARTS = 0.7
 """Dispersion of the parts' scores, as shares of the model's, below which they agree: rendered pairs
 have 0.25 in the median, 0.55 at the 90th percentile; with a rolling shutter 1.0 and 2.0."""
 UNEVEN_LIGHT = 0.15
 """Share of the weighted squared grey residuals that fields of gain and offset must explain to
-be used. Of rendered pairs with even light they explain 0.02 to 0.12, with a vignette of 30 % in the
-corners, a lamp or a gamma of 0.6 from 0.26 on."""
+be used: 0.02 to 0.12 with even light, with a vignette, a lamp or a gamma of 0.6 from 0.26 on."""
 WEAK_RATIO = 2e-5
-"""Ratio of the information's extreme eigenvalues below which errors that neighbours share, and that
-the covariance of one small patch cannot know of, decide a direction: degraded. A frontal plane over
-a field of view of 20 degrees has 1e-4, a patch of 20 px at fx = 1120 has 1e-5."""
+"""Ratio of the information's extreme eigenvalues below which a direction is degraded: a frontal
+plane over 20 degrees has 1e-4, a patch of 20 px at fx = 1120 has 1e-5."""

@@ -37,11 +37,6 @@ class FlowField:
     source: str = "unknown"
     is_true: bool = False
 
-    def pair(self, prev: Frame, curr: Frame, depth_source: str = "unknown") -> FramePair:
-        """The two frames with this flow between them."""
-        flow = self.flow, self.variance, self.valid, self.source, self.is_true
-        return FramePair(prev, curr, *flow, depth_source)
-
 
 FlowProvider = Callable[[Frame, Frame], FlowField]
 """Computes or reads the flow from the first frame to the second."""
@@ -185,38 +180,22 @@ class MeasuredFlow:
 
 
 def with_flow(
-    pair: FramePair, provider: Callable[[Frame, Frame], Any], source: str = "callable"
+    pair: FramePair, provider: Callable[[Frame, Frame], Any] | None, source: str = "callable"
 ) -> FramePair:
-    """The pair with the flow of a provider, or of any callable, which is checked."""
-    field = check_field(provider(pair.prev, pair.curr), pair.prev, source)
-    return field.pair(pair.prev, pair.curr, pair.depth_source)
+    """The pair, if it has no flow, with that of a provider, or of a callable that gives an array.
 
-
-def check_field(result: Any, prev: Frame, source: str) -> FlowField:
-    """FlowField from what a provider returns: an array, a FlowField or None.
-
-    Raises:
-        InputError: another shape than the frame's, or values that are not numbers.
+    An InputError refuses another shape than the frame's, or values that are not numbers.
     """
-    expected = (*prev.camera.shape, 2)
-    if isinstance(result, FlowField):
-        if result.flow is None or result.flow.shape == expected:
-            return result
-        result = result.flow
-    if result is None:
-        return FlowField(None, source=source)
-    array = to_numpy(result, f"flow ({source})")
-    if array.shape != expected or array.dtype.kind not in "fiu":
-        raise InputError(
-            f"flow ({source}): expected numbers of shape {expected} = (H, W, 2), pixels on the "
-            f"previous grid, got {array.dtype} {array.shape}."
-            + (" Transpose (2, H, W) first." if array.shape == (2, *expected[:2]) else "")
-        )
-    with np.errstate(over="ignore"):  # beyond float32 is inf: no flow
-        flow = array.astype(np.float32)
-    finite = np.asarray(np.isfinite(flow).all(axis=2))
-    flow[~finite] = np.nan
-    return FlowField(flow, None, None if finite.all() else finite, source)
+    if pair.flow is not None or provider is None:
+        return pair
+    field = provider(pair.prev, pair.curr)
+    if not isinstance(field, FlowField):
+        array = None if field is None else to_numpy(field, f"flow ({source})")
+        if array is not None and array.dtype.kind in "fi" and array.ndim == 3:
+            array = np.where(np.isfinite(array).all(axis=2, keepdims=True), array, np.nan)
+        field = FlowField(array, source=source)
+    known = field.flow, field.variance, field.valid, field.source, field.is_true
+    return FramePair(pair.prev, pair.curr, *known, pair.depth_source)
 
 
 def contradiction(pair: FramePair) -> str | None:

@@ -93,7 +93,7 @@ class RefineOptions:
 class PhotometricOptions:
     """The refinement on the two images, which follows that on the flow."""
 
-    mode: Literal["auto", "on", "off"] = "auto"  # auto: with the method hybrid
+    mode: Literal["auto", "off"] = "auto"  # auto: with the method hybrid
 
 
 @option_group

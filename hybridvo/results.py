@@ -77,13 +77,10 @@ class Status:
 
 @dataclass(frozen=True, eq=False)
 class MotionPrior:
-    """What is known of a motion before the pair is seen: one start among others, and a cue.
-
-    The covariance (6, 6), positive definite, is that of a :class:`RelativePose`.
-    """
+    """What is known of a motion before the pair is seen: one start among others, and a cue."""
 
     T_curr_prev: np.ndarray
-    covariance: np.ndarray
+    covariance: np.ndarray  # (6, 6) positive definite, as that of a RelativePose
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "T_curr_prev", as_rigid(self.T_curr_prev, "MotionPrior"))
@@ -106,74 +103,45 @@ class MotionPrediction:
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """One strong motion found in the image.
-
-    Args:
-        source: what led here (``start``, ``window``, ``minimal``, ``runner-up``, ``refit``).
-        inlier_ratio: share of the valid pixels that follow this motion.
-        flow_noise_px: standard deviation of the flow about it, px. depth_noise: of log depth.
-        inliers: (h, w) float32 in [0, 1], robust weight of each pixel under this motion, on a grid
-            with a step of ``stride`` px.
-        score: by which the camera's motion was chosen; larger is better.
-    """
+    """One strong motion found in the image."""
 
     T_curr_prev: np.ndarray
-    source: str
-    inlier_ratio: float
-    flow_noise_px: float
-    depth_noise: float
-    inliers: np.ndarray
+    source: str  # what led here: start, window, minimal, runner-up, refit
+    inlier_ratio: float  # share of the valid pixels that follow this motion
+    flow_noise_px: float  # standard deviation of the flow about it
+    depth_noise: float  # of log depth
+    inliers: np.ndarray  # (h, w) in [0, 1], robust weight of every ``stride``-th pixel
     stride: int
-    score: float = 0.0
+    score: float = 0.0  # by which the camera's motion was chosen; larger is better
 
 
 @dataclass(frozen=True, eq=False)
 class RelativePose:
     """Camera motion of one pair: the result of every estimator.
 
-    Args:
-        T_curr_prev: (4, 4) float64, points of the previous camera into the current one; metres.
-        covariance: (6, 6) of the left perturbation ``Exp(delta) T_curr_prev``, delta =
-            (translation, rotation) in the current camera; m^2, m rad, rad^2.
-        status: ok, degraded or failed with its reason. A failed motion is the identity.
-        inlier_ratio: share of the valid pixels that follow the motion.
-        iterations: Gauss-Newton steps spent (or RANSAC iterations).
-        cost: final robust cost per valid pixel, dimensionless.
-        residual_scale_px: standard deviation of the flow noise, px, at a pixel of the typical
-            variance. depth_noise: of the log depth, likewise.
-        weights: (H, W) float32 robust weight of each pixel.
-        probability: that this is the camera's motion and not an object's, 0 to 1; 0 if failed.
-        hypotheses: every strong motion found, the chosen one first.
-        method: name of the estimator. ms: time spent, milliseconds.
-        terms: what carried the motion: ``flow``, ``depth`` (of the current frame), ``images``.
-        photometric: what came of the images, where they were asked.
+    ``T_curr_prev`` (4, 4) takes points of the previous camera into the current one, metres; the
+    ``covariance`` (6, 6) is that of ``Exp(delta) T_curr_prev``, delta = (translation, rotation) in
+    the current camera; m^2, m rad, rad^2. A failed motion is the identity.
     """
 
     T_curr_prev: np.ndarray = field(default_factory=lambda: np.eye(4))
     covariance: np.ndarray = field(default_factory=lambda: np.eye(6))
     status: Status = field(default_factory=Status)
-    inlier_ratio: float = 0.0
-    iterations: int = 0
-    cost: float = 0.0
-    residual_scale_px: float = 0.0
-    depth_noise: float = 0.0
-    weights: np.ndarray | None = None
-    probability: float = 1.0
-    hypotheses: tuple[Hypothesis, ...] = ()
+    inlier_ratio: float = 0.0  # share of the valid pixels that follow the motion
+    iterations: int = 0  # Gauss-Newton steps
+    cost: float = 0.0  # final robust cost per valid pixel, dimensionless
+    residual_scale_px: float = 0.0  # standard deviation of the flow at a pixel of typical variance
+    depth_noise: float = 0.0  # of the log depth, likewise
+    weights: np.ndarray | None = None  # (H, W) float32 robust weight of each pixel
+    probability: float = 1.0  # that this is the camera's motion and not an object's; 0 if failed
+    hypotheses: tuple[Hypothesis, ...] = ()  # every strong motion found, the chosen one first
     method: str = ""
-    ms: float = 0.0
-    terms: tuple[str, ...] = ()
-    photometric: PhotometricReport | None = None
+    ms: float = 0.0  # time spent, milliseconds
+    terms: tuple[str, ...] = ()  # what carried it: flow, depth (of the current frame), images
+    photometric: PhotometricReport | None = None  # what came of the images, where asked
 
-    @property
-    def ok(self) -> bool:
-        """Whether the status is OK: neither degraded nor failed."""
-        return self.status.ok
-
-    @property
-    def usable(self) -> bool:
-        """Whether this is a measurement: not failed."""
-        return self.status.usable
+    ok = property(attrgetter("status.ok"))
+    usable = property(attrgetter("status.usable"))
 
     @property
     def T_prev_curr(self) -> np.ndarray:
@@ -232,19 +200,15 @@ class Step:
 class PixelwisePrediction:
     """Raw output of a pixel-wise network for a batch of pairs (paper, section 3.2).
 
-    Args:
-        rotation: (B, 3, h, w) Euler angles X-Y-Z in degrees (R = Rx Ry Rz), of T_curr_prev.
-        translation: (B, 3, h, w) metres, of T_curr_prev.
-        log_scale_rotation, log_scale_translation: (B, 3, h, w), s = log of the Laplace scale U, or
-            None where the network predicts no uncertainty.
-        image_size: (H, W) of the pairs that the network was given, or None.
+    T_curr_prev at every pixel, and s = log of the Laplace scale U of each of its six numbers, None
+    where the network predicts no uncertainty.
     """
 
-    rotation: torch.Tensor
-    translation: torch.Tensor
-    log_scale_rotation: torch.Tensor | None = None
+    rotation: torch.Tensor  # (B, 3, h, w) Euler angles X-Y-Z in degrees, R = Rx Ry Rz
+    translation: torch.Tensor  # (B, 3, h, w) metres
+    log_scale_rotation: torch.Tensor | None = None  # (B, 3, h, w)
     log_scale_translation: torch.Tensor | None = None
-    image_size: tuple[int, int] | None = None
+    image_size: tuple[int, int] | None = None  # (H, W) of the pairs that the network was given
 
 
 def right(evidence: Sequence[float], weights: Sequence[float]) -> float:

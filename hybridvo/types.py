@@ -22,8 +22,7 @@ if TYPE_CHECKING:
     import torch
 
 MAX_PIXELS = 2**28  # largest image, in pixels, that a frame or a file header may declare
-FOCAL_RANGE = (1e-3, 1e9)
-"""Focal lengths in pixels whose inverses and squares single precision can hold."""
+FOCAL_RANGE = (1e-3, 1e9)  # pixels; single precision can hold their inverses and squares
 PLAUSIBLE_DEPTH_M = (0.1, 200.0)  # metres; a depth map whose median lies outside is not in metres
 EVERYDAY_DEPTH_M = (0.3, 8.0)  # metres; where the median of an indoor depth map usually lies
 UNITS_PER_METRE = {1000: "millimetres", 5000: "TUM's unit", 100: "centimetres", 256: "KITTI's unit"}
@@ -175,26 +174,15 @@ def _take_image(of: Frame | FramePair, camera: Camera, name: str, kind: str, *mo
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One RGB-D frame, checked against its camera: an InputError says what does not fit.
+    """One RGB-D frame, checked against its camera: an InputError says what does not fit."""
 
-    Args:
-        rgb: (H, W, 3) uint8, or None where only depth and flow are used. Gray images are repeated.
-        depth: (H, W) float metres along the optical axis; NaN, inf, 0 and negative are invalid.
-            None where the sensor delivered none: the pair then ends as ``failed(no_valid_depth)``.
-        camera: pinhole intrinsics of this very image size.
-        timestamp: seconds.
-        index: position in its sequence; None: the tracker counts.
-        depth_variance: (H, W) float, variance of log depth (relative variance), or None.
-        mask: (H, W) bool, True where pixels may be used, or None.
-    """
-
-    rgb: np.ndarray | None
-    depth: np.ndarray | None
-    camera: Camera
-    timestamp: float = 0.0
+    rgb: np.ndarray | None  # (H, W, 3) uint8, or None where only depth and flow are used
+    depth: np.ndarray | None  # (H, W) metres along z; NaN, inf, 0 and negative are invalid
+    camera: Camera  # of this very image size
+    timestamp: float = 0.0  # seconds
     index: int = None  # type: ignore[assignment]  # None: the tracker counts
-    depth_variance: np.ndarray | None = None
-    mask: np.ndarray | None = None
+    depth_variance: np.ndarray | None = None  # (H, W) of log depth, that is, relative
+    mask: np.ndarray | None = None  # (H, W) bool, True where pixels may be used
 
     def __post_init__(self) -> None:
         check_kind("Frame.camera", self.camera, Camera)
@@ -215,27 +203,18 @@ class Frame:
 class FramePair:
     """Two frames of one size with the optical flow between them: what every estimator takes.
 
-    Ground-truth motion is no part of it. An InputError says what does not fit.
-
-    Args:
-        prev, curr: frames t and t+1, each with its own camera.
-        flow: (H, W, 2) float pixels, previous to current, on the previous grid; NaN is invalid.
-            None where no flow could be had: the pair then ends as ``failed(no_flow)``.
-        flow_variance: (H, W) float px^2 per component, relative or absolute, or None.
-        flow_valid: (H, W) bool, False where the flow is known to be wrong (occluded), or None.
-        flow_source: ``file``, ``dis``, or the name of a callable.
-        flow_is_true: whether the flow is ground truth (an oracle).
-        depth_source: ``sensor``, ``true`` (synthetic, an oracle), ``stereo``.
+    Ground-truth motion is no part of it. An InputError says what does not fit. Without depth or
+    flow a pair ends as ``failed(no_valid_depth)`` or ``failed(no_flow)``.
     """
 
     prev: Frame
     curr: Frame
-    flow: np.ndarray | None
-    flow_variance: np.ndarray | None = None
-    flow_valid: np.ndarray | None = None
-    flow_source: str = "unknown"
-    flow_is_true: bool = False
-    depth_source: str = "unknown"
+    flow: np.ndarray | None  # (H, W, 2) px, previous to current, on the previous grid; or NaN
+    flow_variance: np.ndarray | None = None  # (H, W) px^2 per component, relative or absolute
+    flow_valid: np.ndarray | None = None  # (H, W) bool, False where it is known to be wrong
+    flow_source: str = "unknown"  # file, dis, or the name of a callable
+    flow_is_true: bool = False  # ground truth: an oracle
+    depth_source: str = "unknown"  # sensor, stereo, file, or true: of a renderer, an oracle
 
     def __post_init__(self) -> None:
         check_kind("FramePair.prev", self.prev, Frame)
@@ -254,22 +233,16 @@ class FramePair:
 
 @dataclass(frozen=True, eq=False)
 class PairBatch:
-    """A batch of pairs as torch tensors: the differentiable, batched input.
+    """A batch of pairs as torch tensors: the differentiable, batched input."""
 
-    ``flow`` (B, H, W, 2) px; ``depth_prev``, ``depth_curr`` (B, H, W) metres, on the grid of their
-    frame, values that are not finite and positive are invalid; ``K_prev``, ``K_curr`` (B, 3, 3);
-    ``flow_variance`` (B, H, W) px^2; ``depth_variance`` (B, H, W) of log depth; ``valid`` (B, H, W)
-    bool.
-    """
-
-    flow: torch.Tensor
-    depth_prev: torch.Tensor
-    K_prev: torch.Tensor
-    K_curr: torch.Tensor
-    depth_curr: torch.Tensor | None = None
-    flow_variance: torch.Tensor | None = None
-    depth_variance: torch.Tensor | None = None
-    valid: torch.Tensor | None = None
+    flow: torch.Tensor  # (B, H, W, 2) px
+    depth_prev: torch.Tensor  # (B, H, W) metres; what is not finite and positive is invalid
+    K_prev: torch.Tensor  # (B, 3, 3)
+    K_curr: torch.Tensor  # (B, 3, 3)
+    depth_curr: torch.Tensor | None = None  # (B, H, W) on the current grid
+    flow_variance: torch.Tensor | None = None  # (B, H, W) px^2
+    depth_variance: torch.Tensor | None = None  # (B, H, W) of log depth
+    valid: torch.Tensor | None = None  # (B, H, W) bool
 
     @classmethod
     def from_pairs(
@@ -283,9 +256,7 @@ class PairBatch:
 
         sizes = {pair.prev.camera.shape for pair in pairs}
         if len(sizes) != 1:
-            raise InputError(
-                f"PairBatch.from_pairs: expected pairs of one size, got {sorted(sizes)}."
-            )
+            raise InputError(f"PairBatch: expected pairs of one size, got {sorted(sizes)}.")
         size = sizes.pop()
 
         def stack(values: list[Any], shape: tuple[int, ...] = (), lacking: float = np.nan) -> Any:
@@ -321,6 +292,13 @@ def typical_depth(depth: np.ndarray) -> float | None:
     near = values[values <= 1000.0]  # renderers mark the sky with larger values
     values = near if near.size > 0.1 * values.size else values
     return float(np.median(values)) if values.size else None
+
+
+def depth_doubt(depth: np.ndarray | None) -> str:
+    """Why a depth map cannot be in metres, with the probable remedy; empty where it can."""
+    median = None if depth is None else typical_depth(depth[::8, ::8])
+    advice = "" if median is None else depth_advice(median)
+    return advice and f"the median depth is {median:.4g}; Frame.depth expects metres: {advice}"
 
 
 def depth_advice(median: float, usual: float | None = None) -> str:

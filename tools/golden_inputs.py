@@ -92,14 +92,15 @@ def scene_flow(sequence: Any) -> Any:
 
 def from_sequence(sequence: Any, flows: dict[str, Any], wanted: list[int]) -> Iterator[Case]:
     """Pairs of neighbours with each flow."""
+    from hybridvo.flow import with_flow
+    from hybridvo.types import FramePair
+
     true = lambda i: np.linalg.inv(sequence.poses[i + 1]) @ sequence.poses[i]  # noqa: E731
     for i in wanted:
-        prev, curr = sequence.frame(i), sequence.frame(i + 1)
-        pairs = {
-            name: provider(prev, curr).pair(prev, curr, sequence.depth_source)
-            for name, provider in flows.items()
-        }
-        yield Case(pairs, true(i), prev.depth, true(i - 1) if i > 0 else None)
+        two = sequence.frame(i), sequence.frame(i + 1)
+        bare = FramePair(*two, None, depth_source=sequence.depth_source)
+        pairs = {name: with_flow(bare, flow) for name, flow in flows.items()}
+        yield Case(pairs, true(i), two[0].depth, true(i - 1) if i > 0 else None)
 
 
 def real(data: Path, name: str) -> Iterator[Case]:

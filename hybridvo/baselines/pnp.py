@@ -86,6 +86,11 @@ SOLVERS: dict[str, tuple[Solver, float]] = {
     "poselib": (solve_poselib, TUNED_PX),
 }
 """Solver and largest residual of an inlier, px, by method."""
+NEEDED = {
+    "poselib": ("poselib", "pip install 'hybridvo[baselines]'"),
+    "open3d-rgbd": ("open3d", "pip install open3d"),
+}
+"""Packages that a baseline needs, and how they are installed."""
 
 
 def estimate_by_points(method: str, pair: FramePair, seed: int = 0) -> RelativePose:
@@ -98,21 +103,19 @@ def estimate_by_points(method: str, pair: FramePair, seed: int = 0) -> RelativeP
     return check(method, T, data, pair.curr.camera, threshold_px)
 
 
-def missing() -> dict[str, str]:
-    """Name -> reason and remedy, of every baseline that cannot run here."""
-    absent = {}
-    for name, library, remedy in (
-        ("poselib", "poselib", "pip install 'hybridvo[baselines]'"),
-        ("open3d-rgbd", "open3d", "pip install open3d"),
-    ):
-        try:
-            importlib.import_module(library)
-        except ImportError as error:  # not installed; or Open3D without its system libraries
-            absent[name] = f"{library} cannot be imported: {error}; {remedy}"
-    if not hasattr(cv2, "Odometry"):
+def missing(method: str) -> str:
+    """Why a method cannot run here, with the remedy; empty where nothing is missing."""
+    if method == "opencv-rgbd" and not hasattr(cv2, "Odometry"):
         remedy = "pip install 'opencv-python-headless>=5'"
-        absent["opencv-rgbd"] = f"this OpenCV has no cv2.Odometry (it came with 5.0); {remedy}"
-    return absent
+        return f"this OpenCV has no cv2.Odometry (it came with 5.0); {remedy}"
+    if method not in NEEDED:
+        return ""
+    library, remedy = NEEDED[method]
+    try:
+        importlib.import_module(library)
+    except ImportError as error:  # not installed; or Open3D without its system libraries
+        return f"{library} cannot be imported: {error}; {remedy}"
+    return ""
 
 
 def sample(pair: FramePair, seed: int, points: int = POINTS) -> Correspondences | Status:

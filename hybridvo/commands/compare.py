@@ -23,7 +23,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import pandas as pd
 
-from hybridvo.commands.run import flow_provider, frames_of, run
+from hybridvo.commands.run import flow_provider, frames_of, run, weights_hash
 from hybridvo.data.sequence import Sequence, open_sequence
 from hybridvo.errors import HybridVOError, InputError
 from hybridvo.evaluation import scores
@@ -32,7 +32,7 @@ from hybridvo.evaluation.report import write_report
 from hybridvo.files import Mode, atomic_write, held, make_folder, versions, write_json
 from hybridvo.network.models import Models
 from hybridvo.options import Options
-from hybridvo.pipeline import METHODS, check_method, warm_up, weights_hash
+from hybridvo.pipeline import METHODS, check_method
 
 _logger = logging.getLogger(__name__)
 WRITTEN = ("results.json", "results.csv", "pairs.csv", "report.md", "report.html")
@@ -78,8 +78,6 @@ def compare(
         make_folder(out / "runs")
         for name, reason in missing.items():
             _logger.warning("not run: %s: %s", name, reason)
-        for name in names:
-            warm_up(name, models)
         tables, rows, facts = [], [], []
         for job in jobs:
             runs = _run_all(job, names, options, given, missing)
@@ -187,7 +185,9 @@ def _run_all(
         asked = replace(options, run=replace(options.run, method=method, max_failed=1.0))
         folder = job.folder / method
         try:
-            runs[method], _ = run(job.sequence, folder, asked, mode="resume", quick=True, **given)
+            runs[method], _ = run(
+                job.sequence, folder, asked, mode="resume", picture=False, **given
+            )
         except HybridVOError:
             raise
         except Exception as error:

@@ -12,17 +12,17 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from hybridvo.api import estimate
 from hybridvo.calibration import DOUBTFUL_SPREAD
 from hybridvo.commands.compare import methods_to_run
 from hybridvo.data.sequence import Sequence
 from hybridvo.errors import InputError
 from hybridvo.evaluation.pair_errors import true_motion
 from hybridvo.files import versions
-from hybridvo.flow import contradiction, dis_flow, file_flow
-from hybridvo.pipeline import estimate
+from hybridvo.flow import contradiction, dis_flow, file_flow, with_flow
 from hybridvo.refinement.covariance import direction_is_known
 from hybridvo.refinement.depth import compare_depths
-from hybridvo.types import Frame, depth_advice, typical_depth
+from hybridvo.types import Frame, FramePair, depth_advice, typical_depth
 
 MIN_PAIRS = 6
 """Fewer pairs do not decide the scale of depth."""
@@ -83,14 +83,15 @@ def diagnose(sequence: Sequence, *, pairs: int = 40) -> dict[str, Any]:
 def _measure(sequence: Sequence, prev: Frame, curr: Frame) -> dict[str, Any]:
     """What could be measured of one pair: a row of the table that the questions are asked."""
     pair: dict[str, Any] = {}
+    bare = FramePair(prev, curr, None)
     if prev.depth is not None:
         pair["depth"] = typical_depth(prev.depth)
     if prev.rgb is None or curr.rgb is None:
         return pair
     if sequence.has_flow:
-        on_file = file_flow(sequence, strict=False)(prev, curr).pair(prev, curr)
+        on_file = with_flow(bare, file_flow(sequence, strict=False))
         pair["contradiction"] = None if on_file.flow is None else contradiction(on_file) or ""
-    by_dis = dis_flow()(prev, curr).pair(prev, curr)
+    by_dis = with_flow(bare, dis_flow())
     if prev.depth is None or by_dis.flow is None:
         return pair
     motion = estimate(by_dis, method="refine")

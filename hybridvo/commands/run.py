@@ -13,6 +13,7 @@ import platform
 import re
 import time
 from collections.abc import Iterable
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -32,9 +33,9 @@ from hybridvo.files import Mode, atomic_write, fingerprint, held, versions, writ
 from hybridvo.flow import FlowProvider, MeasuredFlow, dis_flow, file_flow
 from hybridvo.geometry import se3_log
 from hybridvo.network.models import Models
-from hybridvo.odometry import Odometry, TrackerState
+from hybridvo.odometry import MotionModel, Odometry, TrackerState
 from hybridvo.options import Options, RunOptions
-from hybridvo.pipeline import check_method, weights_hash
+from hybridvo.pipeline import NETWORKS, check_method
 from hybridvo.trajectory import Trajectory
 
 RECORDING = "recording.rrd"
@@ -53,12 +54,12 @@ def run(
     command: Iterable[str] = (),
     quiet: bool = False,
     rrd: str | os.PathLike[str] | None = None,
-    quick: bool = False,
+    picture: bool = True,
 ) -> tuple[dict[str, Any], int]:
     """Estimate, chain, write and score a sequence: a summary, JSON-ready, and the exit code.
 
     ``out`` is by default ``runs/NAME``; ``rrd`` is the file of a Rerun recording, empty for
-    ``recording.rrd`` in the output folder; ``quick``: no warming up and no picture.
+    ``recording.rrd`` in the output folder.
     """
     method = options.run.method
     models = models or Models(options.run.device)
@@ -72,8 +73,7 @@ def run(
     if out.resolve() in {path.parent.resolve() for path in sequence.rgb_files if path is not None}:
         raise InputError(f"{out}: holds frames of the sequence; choose another --out.")
     vo = Odometry(models, flow=flow, method=method, options=options, seed=options.run.seed)
-    if not quick:
-        vo.warm_up()  # before the folder is taken: it may last
+    vo.warm_up()  # before the folder is taken: it may last
     header = _header(sequence, options, weights_hash(method, models))
     header["command"] = list(command)
     with held(out), contextlib.ExitStack() as stack:
@@ -87,7 +87,7 @@ def run(
                 stack.enter_context(recording)
             _estimate(vo, flow, sequence, frames, folder, recording, quiet)
             given = (out, folder.rows, sequence, frames, options.run)
-            summary = _write_results(*given, picture=not quick)
+            summary = _write_results(*given, picture=picture)
             folder.save("done", summary=summary)
             if recording is not None:
                 summary["recording"] = os.fspath(recording.path)
@@ -110,7 +110,7 @@ def _estimate(
         for warning in sequence.warnings:
             progress.say(f"warning: {warning}")
         if folder.tracker is not None:
-            vo.resume(TrackerState.from_arrays(folder.tracker))
+            vo.resume(_restored(folder.tracker, sequence))
             progress.say(f"resumed after {len(rows)} of {len(frames)} frames")
         for index in frames[len(rows) :]:
             rows.append(row := _track(vo, flow, sequence, index, recording))
@@ -119,8 +119,25 @@ def _estimate(
                 progress.say(f"{text}{row['probability']:.2f}: {row['message']}")
             progress.show(len(rows), sum(row["status"] == "failed" for row in rows))
             if len(rows) % SAVE_EVERY == 0:
-                folder.save_rows(vo.state.to_arrays())
+                folder.save_rows(_saved(vo.state))
         folder.save_rows()
+
+
+def _saved(state: TrackerState) -> dict[str, Any]:
+    """The state of a tracker, JSON-ready but for its arrays; the frame by its index."""
+    frame = None if state.frame is None else state.frame.index
+    return vars(state) | {"frame": frame, "motion_model": vars(state.motion_model)}
+
+
+def _restored(saved: dict[str, Any], sequence: Sequence) -> TrackerState:
+    """The state that :func:`_saved` gave, from JSON."""
+
+    def arrays(values: dict[str, Any]) -> dict[str, Any]:
+        return {name: np.array(x) if isinstance(x, list) else x for name, x in values.items()}
+
+    frame = None if saved["frame"] is None else sequence.frame(saved["frame"])
+    model = MotionModel(**arrays(saved["motion_model"]))
+    return TrackerState(**arrays(saved) | {"frame": frame, "motion_model": model})
 
 
 def _track(
@@ -253,6 +270,12 @@ def _header(sequence: Sequence, options: Options, weights: str | None) -> dict[s
         "options": tree,
         "sequence": os.fspath(sequence.root),
     }
+
+
+def weights_hash(method: str, models: Models) -> str | None:
+    """SHA-256 over the weights that a method uses; None for a method without a network."""
+    files = [models.path(name) for name in NETWORKS.get(method, ())]
+    return sha256(b"".join(path.read_bytes() for path in files)).hexdigest() if files else None
 
 
 def frames_of(sequence: Sequence, options: Options) -> range:

@@ -1,7 +1,4 @@
-"""The output folder of one run: refusal to overwrite, and what is kept until the run is done.
-
-``checkpoint.npz`` holds the rows and the tracker's state: a run that was killed goes on from there.
-"""
+"""The output folder of one run: refusal to overwrite, and what is kept until the run is done."""
 
 from __future__ import annotations
 
@@ -24,7 +21,7 @@ RESULTS = (
     *("steps.csv", "steps.npz", "metrics.json", "recording.rrd"),
 )
 """Files that a finished run may leave beside ``run.json``."""
-STATE, STEPS, CHECKPOINT = "run.json", "steps.csv", "checkpoint.npz"
+STATE, STEPS, CHECKPOINT = "run.json", "steps.csv", "checkpoint.json"
 STEP_COLUMNS = (
     *("index", "timestamp", "status", "reason", "probability"),
     *("tx", "ty", "tz", "rx", "ry", "rz"),
@@ -43,14 +40,14 @@ class RunFolder:
 
     Attributes:
         rows: of the finished frames, JSON-ready, in order.
-        tracker: arrays of the tracker's state after them where the run is resumed, or None.
+        tracker: the tracker's state after them where the run is resumed, or None.
         summary: of the run that is resumed where it was complete already, or None.
     """
 
     def __init__(self, path: Path, header: Mapping[str, Any], mode: Mode = "new") -> None:
         self.path, self.header = path, json.loads(json.dumps(header))
         self.rows: list[dict[str, Any]] = []
-        self.tracker: dict[str, np.ndarray] | None = None
+        self.tracker: dict[str, Any] | None = None
         self.summary: dict[str, Any] | None = None
         present = [name for name in (STATE, *RESULTS) if os.path.lexists(path / name)]
         if present and mode == "new":
@@ -82,9 +79,7 @@ class RunFolder:
                 )
         self.summary = before.get("summary")
         if self.summary is None and (self.path / CHECKPOINT).is_file():
-            with np.load(self.path / CHECKPOINT, allow_pickle=False) as stored:
-                arrays = dict(stored)
-            self.rows, self.tracker = json.loads(arrays.pop("rows").tobytes()), arrays
+            self.rows, self.tracker = json.loads((self.path / CHECKPOINT).read_bytes())
 
     def save(self, state: str, **more: Any) -> None:
         """Write ``run.json``; ``state`` is ``running`` or ``done``."""
@@ -93,17 +88,15 @@ class RunFolder:
         if state == "done":  # the results are written
             self._remove(CHECKPOINT)
 
-    def save_rows(self, tracker: Mapping[str, np.ndarray] | None = None) -> None:
+    def save_rows(self, tracker: Mapping[str, Any] | None = None) -> None:
         """Write ``steps.csv``, and with the tracker's state after the rows the checkpoint."""
         with atomic_write(self.path / STEPS) as file:
             writer = csv.DictWriter(file, STEP_COLUMNS, extrasaction="ignore", lineterminator="\n")
             writer.writeheader()
             writer.writerows(self.rows)
         if tracker is not None:
-            rows = np.frombuffer(json.dumps(self.rows).encode(), np.uint8)
-            content: dict[str, Any] = {"rows": rows, **tracker}
-            with atomic_write(self.path / CHECKPOINT, "wb") as file:
-                np.savez(file, **content)
+            with atomic_write(self.path / CHECKPOINT) as file:
+                file.write(json.dumps([self.rows, tracker], default=np.ndarray.tolist))
 
     def _remove(self, *names: str) -> None:
         for name in names:

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import torch
 
+from hybridvo.api import estimate
 from hybridvo.data.sequence import Sequence, iter_pairs
 from hybridvo.errors import InputError
 from hybridvo.evaluation.pair_errors import MOVING_PX, true_motion
@@ -22,7 +23,7 @@ from hybridvo.network.inputs import assemble_inputs
 from hybridvo.network.models import Models
 from hybridvo.network.normalization import first_motions
 from hybridvo.network.selection import select_pose
-from hybridvo.pipeline import DEFAULT_METHOD, estimate
+from hybridvo.pipeline import DEFAULT_METHOD
 from hybridvo.results import PixelwisePrediction, RelativePose
 from hybridvo.types import FramePair
 

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from hybridvo.api import estimate
 from hybridvo.baselines import pnp
 from hybridvo.baselines.pnp import Correspondences, check, missing, sample
 from hybridvo.errors import InputError
 from hybridvo.geometry import ego_flow, invert, make_transform, rotation_angle, se3_exp, se3_log
-from hybridvo.pipeline import check_method, estimate
+from hybridvo.pipeline import check_method
 from hybridvo.results import Reason, RelativePose, State
 from hybridvo.synthetic.scenarios import Scenario, make_pair
 from hybridvo.types import Camera, Frame, FramePair
@@ -29,8 +30,8 @@ def solver(request):
 
 
 def _available(name):
-    if name in missing():
-        pytest.skip(missing()[name])
+    if reason := missing(name):
+        pytest.skip(reason)
     return functools.partial(estimate, method=name)
 
 
@@ -220,7 +221,7 @@ def test_an_absent_or_broken_library_is_named_with_its_remedy(monkeypatch):
         raise ModuleNotFoundError(name)
 
     monkeypatch.setattr(importlib, "import_module", absent)
-    assert "pip install" in missing()["poselib"]
+    assert "pip install" in missing("poselib")
     with pytest.raises(InputError, match="pip install open3d"):
         check_method("open3d-rgbd")
 
@@ -228,7 +229,7 @@ def test_an_absent_or_broken_library_is_named_with_its_remedy(monkeypatch):
         raise ImportError("libusb-1.0.so.0: cannot open shared object file")
 
     monkeypatch.setattr(importlib, "import_module", broken)
-    assert "libusb" in missing()["open3d-rgbd"] and "pip install" in missing()["open3d-rgbd"]
+    assert "libusb" in missing("open3d-rgbd") and "pip install" in missing("open3d-rgbd")
 
 
 def test_opencv_4_has_no_rgbd_odometry(monkeypatch):

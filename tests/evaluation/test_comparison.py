@@ -13,6 +13,7 @@ import pytest
 
 from hybridvo.cli import main
 from hybridvo.commands.compare import WRITTEN, compare, methods_to_run, open_all
+from hybridvo.commands.run import weights_hash
 from hybridvo.data.sequence import open_sequence
 from hybridvo.errors import InputError, LockedError
 from hybridvo.evaluation.scores import PAIR_COLUMNS
@@ -20,7 +21,7 @@ from hybridvo.files import LOCK
 from hybridvo.network.models import Models
 from hybridvo.odometry import Odometry
 from hybridvo.options import FlowOptions, Options
-from hybridvo.pipeline import METHODS, weights_hash
+from hybridvo.pipeline import METHODS
 from hybridvo.results import RelativePose
 from hybridvo.synthetic.render import write_sintel
 from hybridvo.synthetic.scenes import make_scene
@@ -229,5 +230,5 @@ def test_weights_of_a_method_are_all_that_it_reads(tmp_path: Path) -> None:
     )
     (tmp_path / "pwvo").write_bytes(b"other weights")
     other = Models(weights={"pwvo": tmp_path / "pwvo"})
-    assert weights_hash("hybrid", other) != weights_hash("hybrid")
-    assert weights_hash("refine") is None
+    assert weights_hash("hybrid", other) != weights_hash("hybrid", Models())
+    assert weights_hash("refine", other) is None

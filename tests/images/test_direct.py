@@ -7,11 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hybridvo.api import estimate
 from hybridvo.flow import FlowField, dis_flow, with_flow
 from hybridvo.geometry import pose_matrix, project
 from hybridvo.images.photometric import direct_start, reduced
 from hybridvo.options import DirectOptions, Options
-from hybridvo.pipeline import Context, estimate, run_method
+from hybridvo.pipeline import Context, run_method
 from hybridvo.types import FramePair
 from tests.images.test_photometric import error_px, made_pair
 
@@ -104,7 +105,7 @@ def test_hybrid_asks_for_flow_only_where_the_images_do_not_suffice(static, movin
 def test_a_flow_from_elsewhere_is_used_and_the_mode_decides(static):
     pair, _ = static
     field = dis_flow()(pair.prev, pair.curr)
-    given = replace(field, source="file").pair(pair.prev, pair.curr)
+    given = with_flow(pair, lambda *_: replace(field, source="file"))
     assert "flow" in estimate(given).terms
     on = Options(direct=DirectOptions(mode="on"))
     assert "flow" not in estimate(given, options=on).terms

@@ -3,18 +3,18 @@ from __future__ import annotations
 import tracemalloc
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 import hybridvo
+from hybridvo.api import warm_up
 from hybridvo.errors import CheckpointError, InputError
 from hybridvo.flow import FlowField, dis_flow
 from hybridvo.geometry import ego_flow, invert, se3_exp
-from hybridvo.odometry import Odometry, TrackerState
+from hybridvo.odometry import Odometry
 from hybridvo.options import Options, TrackOptions
-from hybridvo.pipeline import DEFAULT_METHOD, warm_up
+from hybridvo.pipeline import DEFAULT_METHOD
 from hybridvo.results import Reason, State
 from hybridvo.synthetic.scenes import make_scene
 from hybridvo.types import Camera, Frame
@@ -196,7 +196,7 @@ def test_a_frame_of_another_size_is_refused_and_changes_nothing() -> None:
     vo = tracker()
     vo.track(frame(0))
     small = Frame(None, np.ones((24, 32), np.float32), Camera(30, 30, 15.5, 11.5, 24, 32))
-    with pytest.raises(InputError, match=r"\(48, 64\).*got \(24, 32\)"):
+    with pytest.raises(InputError, match=r"\(48, 64\).*\(24, 32\)"):
         vo.track(small)
     assert vo.track(frame(1)).ok
 
@@ -206,7 +206,7 @@ def test_a_frame_of_another_size_is_refused_and_changes_nothing() -> None:
     [
         ({"network": object()}, "Odometry.network: expected str, got object"),
         ({"flow": 3}, "expected a callable"),
-        ({"method": "refin"}, "did you mean 'refine'"),
+        ({"method": "refin"}, "'refin' is unknown; known: hybrid"),
         ({"method": "hybrid", "network": None}, "needs a network"),
         ({"options": {"track": 3}}, "expected Options, got dict"),
     ],
@@ -390,23 +390,12 @@ def test_the_motion_model_cannot_hold_the_tracker(kind: str) -> None:
     assert max(errors[step, False] for step in (5, 6, 7)) < 0.5
 
 
-def test_the_state_goes_through_a_file(tmp_path: Path) -> None:
-    vo = tracker()
-    mask = np.ones((HEIGHT, WIDTH), np.bool_)
+def test_a_state_can_be_taken_up_by_another_tracker() -> None:
+    vo, other = tracker(), tracker()
     for i in range(5):
-        vo.track(frame(i, mask=mask))
+        vo.track(frame(i, mask=np.ones((HEIGHT, WIDTH), np.bool_)))
     vo.skip(5, 0.5)
-    np.savez(tmp_path / "state.npz", **vo.state.to_arrays())
-    with np.load(tmp_path / "state.npz", allow_pickle=False) as arrays:
-        back = TrackerState.from_arrays(arrays)
-    again = back.to_arrays()
-    for name, array in vo.state.to_arrays().items():
-        np.testing.assert_array_equal(again[name], array)
-    other = tracker()
-    other.resume(back)
+    other.resume(vo.state)
     here, there = vo.track(frame(6)), other.track(frame(6))
     np.testing.assert_array_equal(here.T_world_cam, there.T_world_cam)
     assert here.index == there.index and here.ok
-    assert TrackerState.from_arrays(TrackerState().to_arrays()).frame is None
-    with pytest.raises(InputError, match="to_arrays"):
-        TrackerState.from_arrays({})
