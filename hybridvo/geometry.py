@@ -55,10 +55,8 @@ def projection_rows(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.
 def ego_flow(
     depth: np.ndarray, T_curr_prev: np.ndarray, camera_prev: Camera, camera_curr: Camera
 ) -> np.ndarray:
-    """(H, W, 2) flow in pixels that the camera motion alone causes (paper, equation 8).
-
-    F_ego = pi(K_curr, T_curr_prev D K_prev^-1 x) - x; NaN where depth is invalid or the moved point
-    is behind the camera.
+    """(H, W, 2) flow in pixels that the camera motion alone causes (paper, equation 8): pi(K_curr,
+    T_curr_prev D K_prev^-1 x) - x; NaN where depth is invalid or the moved point behind the camera.
     """
     depth = np.asarray(depth, dtype=np.float64)
     valid = np.isfinite(depth) & (depth > 0)
@@ -209,10 +207,7 @@ def as_contiguous(array: np.ndarray, dtype: Any = None) -> np.ndarray:
 
 
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """``numba.njit`` whose cache on disk may fail: each process then compiles for itself.
-
-    After a change in a kernel that others call, remove ``__pycache__``.
-    """
+    """``numba.njit`` whose cache on disk may fail: each process then compiles for itself."""
     import numba
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:

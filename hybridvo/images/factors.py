@@ -1,15 +1,13 @@
 """The images of a pair, and its two depth maps, as factors of its motion.
 
 Images: the residual of a weighted static pixel is ``I_curr(pi(T X)) - gain I_prev - offset``. Gain
-and offset follow the motion, so that the cost is one of the motion alone. Light that changes over
-the image (vignette, lamps, the camera's tone curve) would pull at the motion: where smooth fields
-of gain and offset, bilinear between the nodes of a coarse grid, explain much of the residual, they
-are put into the grey values of the previous image. Gradients have no preferred sign within a cell,
-so that the fields leave the motion alone.
+and offset follow the motion, so that the cost is one of the motion alone. Where the light changes
+over the image (vignette, lamps, tone curve), smooth fields of both, bilinear between the nodes of a
+coarse grid, are put into the grey values of the previous image. Gradients have no preferred sign
+within a cell, so that the fields leave the motion alone.
 
 Depth maps: ``r = n . (T X - P)``, P the current depth map's point at the pixel where T X is seen, n
-the normal of its surface there. Depth knows the direction along the axis that flow and images
-hardly see, and needs no feature of the image.
+the normal of its surface there.
 
 Both estimate their noise from the residuals; their information is scaled by what errors that
 neighbours share leave of it.
@@ -17,7 +15,7 @@ neighbours share leave of it.
 
 from __future__ import annotations
 
-from functools import cache, cached_property
+from functools import cached_property
 from typing import NamedTuple
 
 import cv2
@@ -38,12 +36,15 @@ NOISE_FLOOR = 0.1
 GAINS = (0.2, 5.0)
 """Limits of the gain between two images."""
 PARTS = ((2, 2), (4, 1))
-"""Rows and columns of parts of the image that are held against each other: a lens errs by
-quadrant, a rolling shutter by row."""
+"""Parts of the image held against each other: a lens errs by quadrant, a rolling shutter by row."""
 ROWS, COLUMNS = 5, 7
 """Nodes of the fields."""
+BETWEEN = [np.diff(np.eye(n), axis=0) for n in (ROWS, COLUMNS)]
+DIFFERENCES = np.kron(np.eye(ROWS), BETWEEN[1].T @ BETWEEN[1])
+DIFFERENCES += np.kron(BETWEEN[0].T @ BETWEEN[0], np.eye(COLUMNS))
 SMOOTH = 0.01
-"""Weight of the differences between neighbouring nodes, in shares of a node's typical weight."""
+"""Quadratic form of the differences between neighbouring nodes, and its weight, in shares of a
+node's typical weight."""
 POINTS, MIN_POINTS = 5000, 300
 """Of a depth map, on a regular grid: at most, and at least."""
 DEPTH_FLOOR = 1e-4
@@ -51,8 +52,7 @@ DEPTH_FLOOR = 1e-4
 CUTOFF = 3.0
 """c of the Geman-McClure kernels, in standard deviations."""
 INFLATION = 4.0
-"""Factor on the covariance of both beyond the tiles: a sensor is bent over the image, errors are
-alike far beyond them."""
+"""Factor on the covariance of both: errors are alike far beyond the tiles."""
 
 
 class Tiles:
@@ -70,10 +70,9 @@ class Tiles:
         return np.stack(sums, axis=1).reshape(*self.shape, 6)
 
     def share(self, scores: np.ndarray, meat: np.ndarray, model: np.ndarray) -> float:
-        """Share of the information that errors alike in a tile, and beyond, leave.
+        """Share of the information that errors alike in a tile, and beyond, leave; 0 if none.
 
-        From how many times larger the sandwich covariance over tiles is than the ``model`` (6, 6),
-        with the ``meat`` (6, 6) of all pixels; 0 where that leaves a direction open.
+        The sandwich covariance over tiles is so much larger than the ``model`` (6, 6).
         """
         independent, sums = positive_inverse(meat), self.sums(scores).reshape(-1, 6)
         if independent is None:
@@ -83,10 +82,7 @@ class Tiles:
 
 
 class ImageFactor:
-    """The images of a pair under one blur after another, at the pixels (N, 2) ``index``.
-
-    ``pose`` holds the weights of the pixels.
-    """
+    """The images of a pair under one blur after another, at pixels (N, 2) of a weighted pose."""
 
     def __init__(self, pair: FramePair, pose: RelativePose, index: np.ndarray) -> None:
         prev, curr, n = pair.prev.camera, pair.curr.camera, len(index)
@@ -112,10 +108,8 @@ class ImageFactor:
         self._tiles = Tiles(prev.shape, index)
         self._scale = 1.0 / INFLATION
         self._noise = NOISE_FLOOR  # standard deviation of the residual, grey levels
-        self.agreement = 1.0
-        """Factor in (0, 1] on the information by which the parts of the image lowered it."""
-        self.uneven_light = False
-        """Whether gain and offset had to vary over the image."""
+        # by how much the parts of the image lowered it; whether gain and offset vary over the image
+        self.agreement, self.uneven_light = 1.0, False
 
     @cached_property
     def _shares(self) -> np.ndarray:
@@ -182,9 +176,8 @@ class ImageFactor:
         return Linearization(self._scale * H, self._scale * g, self._scale * cost)
 
     def correlation(self) -> float:
-        """Of the two images over the pixels seen; within small cells where the light is uneven.
-
-        The fields can bring the means of any two images together, but not what is within a cell.
+        """Of the two images over the pixels seen; within small cells where the light is uneven: the
+        fields can bring the means of any two images together, but not what is within a cell.
         """
         used = self._w > 0
         grey, weight = self._buffer[kernels.GREY][used], self._buffer[kernels.W][used]
@@ -201,9 +194,8 @@ class ImageFactor:
             self._at = T
 
     def _weigh(self) -> float:
-        """Weights, H (8, 8) and g (8,) of the last projection; then the light that fits best.
-
-        Returns the cost under that light, to second order. Points unseen cost the most.
+        """Weights, H (8, 8) and g (8,) of the last projection; then the light that fits best, and
+        the cost under it, to second order. Points unseen cost the most.
         """
         buffer, J, r, c2 = self._buffer, self._J[: kernels.GQ], self._r, CUTOFF**2
         # depth_noise belongs to the typical depth variance, the unit of the buffer's
@@ -265,14 +257,10 @@ def parts_dispersion(scores: np.ndarray, model: np.ndarray) -> float:
     """Dispersion of the scores (rows, columns, 6) of tiles, summed over each of :data:`PARTS`."""
     found = []
     for shape in PARTS:
-        rows, columns = (
-            np.arange(n) * k // n for n, k in zip(scores.shape[:2], shape, strict=True)
-        )
-        sums = np.zeros((*shape, 6))
-        np.add.at(sums, np.ix_(rows, columns), scores)
-        parts = sums.reshape(-1, 6)
-        k = len(parts)
-        found.append(np.einsum("bp,pq,bq->", parts, model, parts) / 6 * k / (k - 1))
+        sums, sizes = np.zeros((*shape, 6)), zip(scores.shape[:2], shape, strict=True)
+        np.add.at(sums, np.ix_(*(np.arange(n) * k // n for n, k in sizes)), scores)
+        count = shape[0] * shape[1]
+        found.append(np.einsum("rcp,pq,rcq->", sums, model, sums) / 6 * count / (count - 1))
     return float(np.mean(found))
 
 
@@ -297,7 +285,7 @@ def light_fields(
     weighted = (A * w[:, None]).T
     H, g = (weighted @ A).astype(np.float64), weighted @ r
     scale = np.repeat([np.trace(H[:nodes, :nodes]), np.trace(H[nodes:, nodes:])], nodes) / nodes
-    H += SMOOTH * scale * np.kron(np.eye(2), _differences())
+    H += SMOOTH * scale * np.kron(np.eye(2), DIFFERENCES)
     # and a weak pull to no change, for nodes that no pixel is near to
     field, power = np.linalg.solve(H + np.diag(1e-4 * scale + 1e-12), g), w @ (r * r)
     if not (np.isfinite(field).all() and field @ g >= least * power and power > 0):
@@ -308,22 +296,12 @@ def light_fields(
 def correlation(
     a: np.ndarray, b: np.ndarray, weight: np.ndarray, cell: np.ndarray | None = None
 ) -> float:
-    """Weighted correlation of two sets of grey values (N,); 0 where one of them is constant.
-
-    ``cell`` (N,): groups about whose own means the values are taken.
-    """
+    """Weighted correlation of grey values (N,) about the means of their cells; 0 if constant."""
     cell = np.zeros(len(a), np.intp) if cell is None else cell
     total = np.maximum(np.bincount(cell, weight), 1e-12)
     a, b = (x - (np.bincount(cell, weight * x) / total)[cell] for x in (a, b))
     power = float(weight @ (a * a)) * float(weight @ (b * b))
     return float(weight @ (a * b)) / np.sqrt(power) if power > 0 else 0.0
-
-
-@cache
-def _differences() -> np.ndarray:
-    """Quadratic form of the differences between neighbouring nodes."""
-    rows, columns = (np.diff(np.eye(n), axis=0) for n in (ROWS, COLUMNS))
-    return np.kron(np.eye(ROWS), columns.T @ columns) + np.kron(rows.T @ rows, np.eye(COLUMNS))
 
 
 class Residuals(NamedTuple):
@@ -339,11 +317,9 @@ class Residuals(NamedTuple):
 class PlaneFactor:
     """A static point of the previous depth map, moved by T, lies on the current one's surface.
 
-    The noise of a sensor grows with its distance: about with the square for structured light and
-    stereo, hardly for lidar, not at all where depth is rendered. One law for all,
-    ``sigma = a + b z + c z^2`` with no negative term, is fitted to the residuals of the pair.
-
-    Used are the pixels with at least the weight ``least`` on a regular grid of at most ``points``.
+    One law for the noise of all sensors, ``sigma = a + b z + c z^2`` with no negative term, is
+    fitted to the residuals of the pair. Used are the pixels with at least the weight ``least`` on a
+    regular grid of at most ``points``.
     """
 
     def __init__(
@@ -354,10 +330,8 @@ class PlaneFactor:
         rows, columns = np.mgrid[step // 2 : height : step, step // 2 : width : step]
         z, weight = np.asarray(pair.prev.depth)[rows, columns], np.asarray(weights)[rows, columns]
         used = (z > 0) & np.isfinite(z) & (weight >= least)
-        self.cells, self._grid = np.nonzero(used), used.shape
-        """Rows and columns of the points, on their grid."""
-        self.index = np.stack([rows[used], columns[used]], 1)
-        """(N, 2) rows and columns of the points, px."""
+        self.cells, self._grid = np.nonzero(used), used.shape  # rows and columns on the grid
+        self.index = np.stack([rows[used], columns[used]], 1)  # (N, 2) the same in px
         self.points = points_at(np.asarray(pair.prev.depth), pair.prev.camera, self.index)
         self._weight, self._tiles = weight[used].astype(np.float64), Tiles(self._shape, self.index)
         self._K = np.array([curr.fx, curr.fy, curr.cx, curr.cy])

@@ -4,8 +4,8 @@ Photometric, per pixel x of the previous image with grey value A, at a pose T (X
 a = X'/Z', b = Y'/Z', i = 1/Z'):
 
 - residual r = B(pi(X')) - gain A - offset, B read by cubic convolution (Catmull-Rom): bilinear
-  reading blurs by an amount that depends on the place between the pixels, which pulls the motion
-  towards places of equal blur (measured: twice the error on clean images);
+  reading blurs by an amount that depends on the place between the pixels (measured: twice the
+  error on clean images);
 - image gradient G of B at pi(X') from the gradient of A at x, carried over by the warp of a patch
   of constant depth (inverse compositional, Baker and Matthews, IJCV 2004): the noise of a central
   difference at x is independent of the noise of A at x, so noise alone moves nothing;

@@ -12,7 +12,6 @@ answer. Where it does, something moves, or the images are too far apart: the flo
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass, replace
 from weakref import WeakKeyDictionary
 
@@ -20,7 +19,6 @@ import cv2
 import numpy as np
 
 from hybridvo.calibration import DIRECT_RIGHT
-from hybridvo.errors import InputError
 from hybridvo.geometry import as_contiguous, points_at, pose_matrix, projection_rows
 from hybridvo.images.factors import MIN_POINTS, ImageFactor, PlaneFactor
 from hybridvo.images.kernels import select_pixels
@@ -48,8 +46,6 @@ MIN_GAIN = 0.1
 """Share of the flow's information that the images must add in some direction."""
 MAX_SHIFT = 9.0
 """Longest shift from the flow's motion, in its inflated standard deviations."""
-MIN_AGREEMENT = 0.5
-"""Agreement of the parts of the image below which the status mentions it."""
 GREY = np.array([[0.299, 0.587, 0.114, -128.0]])
 """The last, mid grey, makes gain and offset nearly independent."""
 
@@ -102,38 +98,20 @@ def refine_photometric(
     """The motion of a pair, sharpened by its two images.
 
     ``pose``: what :func:`hybridvo.refinement.refine.refine_pair` found, with its weights and
-    covariance.
-
-    Returns:
-        The motion with its covariance, ``terms`` and report (``photometric``). Where images are
-        missing or of no use, or the acceptance test refuses them, the motion is that of ``pose``;
-        the report and the status' message give the reason of a refusal.
-
-    Raises:
-        InputError: weights of another shape than the image.
+    covariance. It is the answer, with a report (``photometric``), where images are missing or of no
+    use; where the acceptance test refuses them, report and status say why.
     """
-    started, shape = time.perf_counter(), pair.prev.camera.shape
-    if pose.weights is not None and pose.weights.shape != shape:
-        got = pose.weights.shape
-        raise InputError(f"refine_photometric: expected weights of shape {shape}, got {got}.")
-    motion = _refine(pair, pose, blurs, pose.covariance * prior_inflation)
-    return motion.replace(ms=pose.ms + 1e3 * (time.perf_counter() - started))
-
-
-def _refine(
-    pair: FramePair, pose: RelativePose, blurs: tuple[float, ...], covariance: np.ndarray
-) -> RelativePose:
     prev, curr, T, weights = pair.prev, pair.curr, pose.T_curr_prev, pose.weights
-    images_missing = prev.rgb is None or curr.rgb is None
-    if images_missing or not pose.usable or weights is None or prev.depth is None:
+    no_images = prev.rgb is None or curr.rgb is None
+    if no_images or not pose.usable or weights is None or prev.depth is None:
         return pose.replace(photometric=PhotometricReport())
-    flow_information = positive_inverse(covariance)
-    if flow_information is None:
+    covariance = prior_inflation * pose.covariance
+    if (flow_information := positive_inverse(covariance)) is None:
         return pose.replace(photometric=PhotometricReport())
     index = choose_pixels(blurred(prev, blurs[-1]), prev.depth, weights, PIXELS)
     if len(index) < MIN_PIXELS:
         what = f"{len(index)} static pixels with texture and depth, {MIN_PIXELS} needed"
-        return _judged(pose, PhotometricReport(refusal=what))
+        return _refused(pose, PhotometricReport(refusal=what))
     images, flow = ImageFactor(pair, pose, index), PriorFactor(T, flow_information)
     planes = [] if curr.depth is None else [PlaneFactor(pair, weights, MIN_WEIGHT)]
     planes = [factor for factor in planes if factor.estimate(T)]
@@ -150,12 +128,29 @@ def _refine(
     H = images.linearize(T).H
     joint = sum((factor.linearize(T).H for factor in planes), H + flow.linearize(T).H)
     joint_covariance = positive_inverse(joint)
-    refusal: str | None = "the joint information is not definite"
+    refusal = "the joint information is not definite"
     if joint_covariance is not None:
-        refusal = _doubt(images, flow, T, H)
+        refusal = _doubt(images, flow, T)
     found = images.gain, images.agreement, images.uneven_light
-    report = PhotometricReport(refusal == "", refusal or "", *found)
-    return _judged(pose, report, T, joint_covariance)
+    if refusal:
+        return _refused(pose, PhotometricReport(False, refusal, *found))
+    # the images add little to what the flow already knows
+    if np.linalg.eigvals(np.linalg.solve(flow.information, H)).real.max() < MIN_GAIN:
+        return pose.replace(photometric=PhotometricReport(False, "", *found))
+    return pose.replace(
+        T_curr_prev=pose_matrix(T[:3]),
+        covariance=joint_covariance,
+        terms=(*pose.terms, "images"),
+        photometric=PhotometricReport(True, "", *found),
+    )
+
+
+def _refused(pose: RelativePose, report: PhotometricReport) -> RelativePose:
+    """The motion of the flow, with a remark."""
+    status = pose.status
+    if not status.message:
+        status = replace(status, message=f"images not used: {report.refusal}")
+    return pose.replace(status=status, photometric=report)
 
 
 def _spread_px(pair: FramePair, index: np.ndarray, covariance: np.ndarray) -> float:
@@ -166,46 +161,18 @@ def _spread_px(pair: FramePair, index: np.ndarray, covariance: np.ndarray) -> fl
     return float(np.sqrt(np.einsum("cnp,pq,cnq->", J, covariance, J) / len(few)))
 
 
-def _doubt(
-    images: ImageFactor, flow: PriorFactor, T: np.ndarray, information: np.ndarray
-) -> str | None:
-    """Why the motion of the images cannot be believed, or ""; None where it is not needed."""
+def _doubt(images: ImageFactor, flow: PriorFactor, T: np.ndarray) -> str:
+    """Why the motion to which the images lead cannot be believed, or ""."""
     if images.seen < MIN_SEEN:
         return f"{100 * images.seen:.0f} % of the pixels are seen by both cameras"
     correlated = images.correlation()
     if not correlated >= MIN_CORRELATION:
         return f"the two images do not match along the motion ({correlated:.2f} correlated)"
-    if np.linalg.eigvals(np.linalg.solve(flow.information, information)).real.max() < MIN_GAIN:
-        return None
     shift = flow.offset(T)
     away = float(np.sqrt(shift @ flow.information @ shift))
     if away > MAX_SHIFT:
         return f"they lead {away:.1f} standard deviations away from the flow's motion"
     return ""
-
-
-def _judged(
-    pose: RelativePose,
-    report: PhotometricReport,
-    T: np.ndarray | None = None,
-    covariance: np.ndarray | None = None,
-) -> RelativePose:
-    """The refined motion, or that of the flow where the images were not taken; with a remark."""
-    remarks = [f"images not used: {report.refusal}"] if report.refusal else []
-    if report.taken and T is not None and covariance is not None:
-        if report.uneven_light:
-            remarks.append("the light changed differently over the image, evened out")
-        if report.agreement < MIN_AGREEMENT:
-            remarks.append(
-                "parts of the image disagree about the motion (rolling shutter, lens, depth?), "
-                "weighed down"
-            )
-        remarks = [f"images: {'; '.join(remarks)}"] if remarks else []
-        T, terms = pose_matrix(T[:3]), (*pose.terms, "images")
-        pose = pose.replace(T_curr_prev=T, covariance=covariance, terms=terms)
-    if remarks and not pose.status.message:
-        pose = pose.replace(status=replace(pose.status, message=remarks[0]))
-    return pose.replace(photometric=report)
 
 
 def direct_start(

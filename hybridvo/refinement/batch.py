@@ -23,32 +23,19 @@ PART = 131_072
 
 @dataclass(frozen=True, eq=False)
 class BatchedPose:
-    """Camera motions of a batch of pairs, as in :class:`hybridvo.results.RelativePose`.
+    """Camera motions of a batch of pairs, as in :class:`hybridvo.results.RelativePose`."""
 
-    Args:
-        SE3: (B, 7) pypose SE3, ``T_curr_prev``; the identity where failed. Carries the gradient.
-        covariance: (B, 6, 6) of the left perturbation (translation, rotation).
-        converged, failed: (B,) bool. status: one per sample, with its reason.
-        probability: (B,) of the motion being the camera's, by the weight of the motion that
-            contradicts it most; 0 where failed.
-        iterations: (B,) Newton steps on all pixels. cost: (B,) robust, per unit of weight.
-        weights: (B, H, W) robust weights without the external ones, 0 where unusable.
-        noise: (B, 2) flow noise in px and noise of log depth, estimated or as given; (B, 3) with
-            that of the current frame's log depth.
-        inlier_ratio: (B,) share of the external weight within three standard deviations.
-    """
-
-    SE3: pp.LieTensor
-    covariance: torch.Tensor
-    converged: torch.Tensor
-    failed: torch.Tensor
+    SE3: pp.LieTensor  # (B, 7) T_curr_prev; the identity where failed. Carries the gradient
+    covariance: torch.Tensor  # (B, 6, 6) of the left perturbation (translation, rotation)
+    converged: torch.Tensor  # (B,) bool
+    failed: torch.Tensor  # (B,) bool
     status: list[Status]
-    probability: torch.Tensor
-    iterations: torch.Tensor
-    cost: torch.Tensor
-    weights: torch.Tensor
-    noise: torch.Tensor
-    inlier_ratio: torch.Tensor
+    probability: torch.Tensor  # (B,) by the weight of the motion that contradicts it most
+    iterations: torch.Tensor  # (B,) Newton steps on all pixels
+    cost: torch.Tensor  # (B,) robust, per unit of weight
+    weights: torch.Tensor  # (B, H, W) robust weights without the external ones, 0 where unusable
+    noise: torch.Tensor  # (B, 2) px and log depth; (B, 3) with the current frame's log depth
+    inlier_ratio: torch.Tensor  # (B,) share of the external weight within three standard deviations
 
     def __len__(self) -> int:
         return len(self.status)

@@ -27,10 +27,9 @@ from hybridvo.refinement.kernels import (
     sum_samples,
 )
 
-FLOW_NOISE_CAP = 1.2
-DEPTH_NOISE_CAP = 0.08
+FLOW_NOISE_CAP, DEPTH_NOISE_CAP = 1.2, 0.08
 """Largest noise (px, log depth) that a motion may claim in the search; beyond it the fit would be a
-compromise between motions. The final fit may claim 2.5 times what the search found."""
+compromise between motions."""
 DAMPING = 1e-6
 NOISE_PIXELS, FINAL_NOISE_PIXELS = 1000, 4000
 """Pixels that the noise estimate looks at in the search (flow noise to 2 %) and in the last fit."""
@@ -220,11 +219,8 @@ def sum_noise(terms, vf, vd, share):
         # exp(d2 / 2) = exp(y)^32 by a series: a call of the library's would not be vectorised
         y = min(d2, np.float32(60.0)) * np.float32(1 / 64)
         e = ONE + y * (ONE + y * (np.float32(1 / 2) + y * (np.float32(1 / 6) + y / np.float32(24))))
-        e *= e
-        e *= e
-        e *= e
-        e *= e
-        e *= e
+        for _ in range(5):
+            e *= e
         p = density * np.sqrt(i1 * i2)
         p = weight[k] * p / (p + rest * outlier[k] * e)
         j1, j2 = p * i1 * i1, p * i2 * i2
@@ -239,12 +235,11 @@ def sum_noise(terms, vf, vd, share):
 
 @njit(error_model="numpy", cache=True, nogil=True)
 def estimate_noise(samples, n, pose, K, sf, sd, sf_cap, sd_cap, rounds, limit):
-    """Flow noise (px) and depth noise (of log Z) of the pixels that follow ``pose``.
+    """Noise (sf px, sd of log Z) of the pixels that follow ``pose``, share of the weight that does,
+    and whether the flow tells the depth's noise; from ``limit`` pixels.
 
     Expectation-maximisation of a mixture of N(0, sf^2 v_f I + sd^2 v_d q q^T) and a uniform density
-    over a disc; the two variances by Fisher scoring of the components along and across q. Looks at
-    ``limit`` pixels. Returns (sf, sd, share of the weight that follows the pose, whether the flow
-    tells the depth's noise).
+    over a disc; the two variances by Fisher scoring of the components along and across q.
     """
     terms, inside = gather_noise(samples, n, max(1, n // limit), pose, K, max(4.0, 8.0 * sf))
     if terms.shape[1] < 8:

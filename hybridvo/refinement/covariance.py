@@ -1,9 +1,8 @@
 """Covariance of a robust M-estimate, honest about errors that neighbouring pixels share.
 
-The sandwich of Huber (1967), its scores summed over blocks of the image before their outer products
-are taken (cluster-robust: Liang and Zeger, 1986); the blocks overlap, which is Bartlett's kernel in
-two dimensions (Newey and West, 1987; Conley, 1999). Where the variance still grows from one size of
-block to the next, the growth is continued to the size of the image (Beran, 1994).
+The sandwich of Huber (1967), its scores summed over overlapping blocks of the image before their
+outer products are taken (Liang and Zeger, 1986; Newey and West, 1987; Conley, 1999). Where the
+variance still grows with the size of the blocks, the growth is continued to that of the image.
 """
 
 from __future__ import annotations

@@ -27,15 +27,14 @@ MIN_INLIER_RATIO, LOW_INLIER_RATIO = 0.02, 0.25
 """Shares of the pixels that must follow the motion, else it is none, or degraded."""
 STEPS, LAST_STEP = 5, 4.0
 """Most steps, and length in standard deviations of the last one: what Newton's second order leaves
-behind it is a hundredth of one at most (18 recorded pairs), and another pass over the image costs a
-fifth of the time."""
+behind it is a hundredth of one at most (18 recorded pairs)."""
 WELL_CONDITIONED = 0.005
 """Ratio of the extreme eigenvalues of the flow's information above which it needs no help."""
 CURRENT_DEPTH_GAIN = 0.5
 """The current depth is used where it adds this share of the flow's information somewhere."""
 DEPTHS_PER_PAIR = 1.32
 """The two depths of a pair differ by this many times the noise of one: sqrt(2), less what the
-interpolation of the second one averages away (4/9 remains of independent noise)."""
+interpolation of the second one averages away."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -78,7 +78,8 @@ def refine_batch(
     """Camera motion of every pair of a batch by robust dense reprojection.
 
     Works in the floating type of the flow and depth (half types are raised to float32). Gradients
-    reach all but ``T_init``, on which the estimate does not depend.
+    reach all but ``T_init``, on which the estimate does not depend. Bad data give a failed status
+    and a zero gradient for that very sample; shapes or types that cannot be used an InputError.
 
     Args:
         batch: see :class:`~hybridvo.types.PairBatch`.
@@ -89,13 +90,6 @@ def refine_batch(
             frame's depth that of its log; None: estimated.
         kernel: ``geman-mcclure``, with the cutoff of the options, ``cauchy``, ``huber`` or ``l2``.
         options: the current frame's depth is a third residual where ``current_depth`` is ``on``.
-
-    Returns:
-        Poses with covariance and a status per sample. Bad data give a failed status and a zero
-        gradient for that very sample, never an exception and never a pose that is not finite.
-
-    Raises:
-        InputError: shapes, types or options that cannot be used.
     """
     options = options or RefineOptions()
     if kernel not in KERNELS:
@@ -133,10 +127,8 @@ def _given_noise(noise: Any, like: torch.Tensor, with_depth: bool) -> torch.Tens
     known, sizes = value.detach(), (2, 3) if with_depth else (2,)
     fits = value.shape in [shape for n in sizes for shape in ((n,), (len(like), n))]
     if not fits or not ((known >= 0) & (known < torch.inf)).all() or (known[..., ::2] == 0).any():
-        raise InputError(
-            f"refine_batch: expected noise (sf, sd{', sz' * with_depth}), one or {len(like)} rows, "
-            f"finite, sf positive, sd not negative, got {noise!r}."
-        )
+        expected = f"noise (sf > 0, sd >= 0{', sz > 0' * with_depth}), one or {len(like)} rows"
+        raise InputError(f"refine_batch: expected {expected}, finite, got {noise!r}.")
     value = value.expand(len(like), value.shape[-1])
     if with_depth and value.shape[1] == 2:
         value = torch.cat([value, value[:, 1:].clamp(min=DEPTH_NOISE_FLOOR)], dim=1)
@@ -214,7 +206,7 @@ def _covariances(
     size: tuple[int, int],
     tile: int,
 ) -> list[tuple[np.ndarray, bool]]:
-    """Covariance of each sample by the numpy function, and whether it is definite."""
+    """Covariance of each sample by the numpy function; whether it is definite."""
     # 1 / typical depth, as of the coarse grid: half of the weight may lie on a sky at 30 km
     usable, z = few.weight > 0, few.points[:, 2]
     inverse = ((usable / z**2).sum(dim=1) / usable.sum(dim=1).clamp(min=1)).sqrt().clamp(min=1e-9)
