@@ -5,11 +5,11 @@ from __future__ import annotations
 import enum
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from math import exp
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.special import expit
 
 from hybridvo.errors import InputError
 from hybridvo.geometry import invert, rotation_angle
@@ -213,5 +213,4 @@ class PixelwisePrediction:
 
 def right(evidence: Sequence[float], weights: Sequence[float]) -> float:
     """Probability that a motion is right: logistic in its evidence; the last weight is alone."""
-    value = sum(w * x for w, x in zip(weights, (*evidence, 1.0), strict=True))
-    return 1 / (1 + exp(min(-value, 700.0)))  # exp(700) is finite
+    return float(expit(np.dot(weights, (*evidence, 1.0))))

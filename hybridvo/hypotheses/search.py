@@ -95,15 +95,13 @@ class _Search:
         self.similar = coarse_fit.translation_scale(grid.samples, grid.count)
         self.rng = np.random.default_rng(seed)
         self.seen: list[Motion] = []
-        self.total = self._weight()
-
-    def _weight(self) -> float:
-        return float(self.samples[W, : self.grid.count].sum(dtype=np.float64))
+        self.total = float(grid.weight.sum(dtype=np.float64))
 
     @property
     def left(self) -> float:
         """Share of the weight that is not set aside."""
-        return self._weight() / self.total if self.total > 0 else 0.0
+        n = self.grid.count
+        return float(self.samples[W, :n].sum(dtype=np.float64)) / max(self.total, 1e-12)
 
     def round(self, starts: np.ndarray, samples: int) -> list[Motion]:
         """Motions of the pixels that are left, the strongest first."""
@@ -194,10 +192,9 @@ class _Search:
 
     def is_settled(self, motion: Motion) -> bool:
         """Whether no other motion can hold as much of the image, and this one is no compromise."""
-        pose, facts = motion
+        (pose, facts), (h, w, _) = motion, self.grid.shape
         if facts[SHARE] < SETTLED:
             return False
-        h, w, _ = self.grid.shape
         noise = facts[FLOW_NOISE], facts[DEPTH_NOISE]
         coherence = coarse_fit.residual_coherence(self.samples, h, w, pose, self.K, *noise)
         return bool(coherence < SETTLED_COHERENCE)

@@ -120,8 +120,7 @@ def select_by_scorer(
 
 
 def _searched(found: HypothesisSet) -> list[Candidate]:
-    motions = zip(found.poses, found.facts, strict=True)
-    return [Candidate(pose, facts, k) for k, (pose, facts) in enumerate(motions)]
+    return [Candidate(found.poses[k], found.facts[k], k) for k in range(len(found.poses))]
 
 
 def _refits(

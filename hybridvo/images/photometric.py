@@ -1,13 +1,12 @@
 """The motion of a pair by its images: one that the flow found made sharper, or one without flow.
 
-The flow brings the motion close; the images hold far more than the flow. They join as information:
-the flow's (and the second depth's) covariance becomes a prior of Student's form around the motion
-of the refinement, and the 6x6 normal equations of both add up. The motion of the flow stays where
-the images do not match along the motion, or lead outside of what the flow allows.
+With flow its covariance becomes a prior of Student's form around its motion, and the 6x6 normal
+equations of flow, images and depth maps add up. The motion of the flow stays where the images do
+not match along the motion, or lead outside of what the flow allows.
 
 Without flow images and depth maps are followed coarse to fine. Where the motion leaves no region of
 the image unexplained, and the parts of the image agree about it, nothing else moves: it is the
-answer. Where it does, something moves, or the images are too far apart: the flow has to be asked.
+answer. Else something moves, or the images are too far apart: the flow has to be asked.
 """
 
 from __future__ import annotations
@@ -38,14 +37,12 @@ MIN_WEIGHT = 0.25
 """Robust weight in the refinement on the flow below which a pixel is not used."""
 PRIOR_INFLATION = 8.0
 """Factor on the covariance of the flow's motion, whose errors are alike far beyond the tiles."""
-MIN_CORRELATION = 0.5
-"""Of the two images along the motion; below it they do not match."""
-MIN_SEEN = 0.3
-"""Share of the weight that must fall inside the current image."""
-MIN_GAIN = 0.1
-"""Share of the flow's information that the images must add in some direction."""
-MAX_SHIFT = 9.0
-"""Longest shift from the flow's motion, in its inflated standard deviations."""
+MIN_CORRELATION, MIN_SEEN = 0.5, 0.3
+"""Of the two images along the motion, and share of the weight inside the current image: below
+these they do not match."""
+MIN_GAIN, MAX_SHIFT = 0.1, 9.0
+"""Share of the flow's information that the images must add in some direction, and longest shift
+from the flow's motion, in its inflated standard deviations."""
 GREY = np.array([[0.299, 0.587, 0.114, -128.0]])
 """The last, mid grey, makes gain and offset nearly independent."""
 
@@ -57,11 +54,9 @@ SPREAD = np.repeat([0.3, 0.15], 3)
 """Standard deviation of the motion before the images are seen, m and rad: it decides nothing."""
 SHIFT_PX, GREY_NOISE = 0.25, 1.0
 """A residual is noise where so small a shift of the image, and grey levels, explain it."""
-NEIGHBOURS = 3
-"""Side, in points of the grid, of the squares whose mean residual is taken for light."""
-REGION, UNEXPLAINED = 5, 0.6
-"""Side, in points of the grid, of the squares in which more than this share is unexplained: a
-region that moves, where single points are noise."""
+NEIGHBOURS, REGION, UNEXPLAINED = 3, 5, 0.6
+"""Sides, in points of the grid, of the squares whose mean residual is taken for light, and of those
+in which more than this share is unexplained: a region that moves."""
 SMALL_REGION = 0.01
 """Share of the image far below which smaller is no better."""
 _IMAGES: WeakKeyDictionary[Frame, dict[float, np.ndarray]] = WeakKeyDictionary()
@@ -71,22 +66,13 @@ _REDUCED: WeakKeyDictionary[Frame, dict[int, Frame]] = WeakKeyDictionary()
 
 @dataclass(frozen=True, eq=False)
 class PhotometricReport:
-    """What came of the images of one pair.
+    """What came of the images of one pair."""
 
-    Args:
-        taken: whether the motion was changed.
-        refusal: why the images were refused, in words; empty where taken, not tried or not needed.
-        gain: of the current image over the previous one.
-        agreement: factor in (0, 1] on the information of the images by which the parts of the
-            image, held against each other, lowered it.
-        uneven_light: whether gain and offset had to vary over the image.
-    """
-
-    taken: bool = False
-    refusal: str = ""
-    gain: float = 1.0
-    agreement: float = 1.0
-    uneven_light: bool = False
+    taken: bool = False  # whether the motion was changed
+    refusal: str = ""  # why not, in words; empty where taken, not tried or not needed
+    gain: float = 1.0  # of the current image over the previous one
+    agreement: float = 1.0  # of the parts of the image: factor in (0, 1] on the information
+    uneven_light: bool = False  # whether gain and offset had to vary over the image
 
 
 def refine_photometric(

@@ -45,18 +45,11 @@ class BatchedPose:
         """(B, 4, 4) points of the previous camera into the current one, metres."""
         return self.SE3.matrix().to(self.covariance.dtype)
 
-    @property
-    def T_prev_curr(self) -> torch.Tensor:
-        """(B, 4, 4) inverse of ``T_curr_prev``."""
-        return self.SE3.Inv().matrix().to(self.covariance.dtype)
-
     def one(self, index: int, method: str = "refine") -> RelativePose:
         """The motion of one sample as every estimator gives it, in numpy."""
-        covariance = self.covariance[index].detach().double().cpu().numpy()
-        T = self.SE3[index].detach().matrix().double().cpu().numpy()
         return RelativePose(
-            T_curr_prev=T,
-            covariance=covariance,
+            T_curr_prev=self.SE3[index].detach().matrix().double().cpu().numpy(),
+            covariance=self.covariance[index].detach().double().cpu().numpy(),
             status=self.status[index],
             inlier_ratio=min(1.0, float(self.inlier_ratio[index])),
             iterations=int(self.iterations[index]),
@@ -209,15 +202,10 @@ def _relative(variance: torch.Tensor, good: torch.Tensor) -> tuple[torch.Tensor,
 def checked_batch(
     batch: PairBatch, weights: Any = None, where: str = "refine_batch"
 ) -> tuple[PairBatch, torch.Tensor | None]:
-    """The batch and its weights in one floating type, on one device.
-
-    Raises:
-        InputError: what does not fit, named.
-    """
+    """The batch and its weights in one floating type, on one device, or an InputError."""
     flow, depth = batch.flow, batch.depth_prev
-    for name, value in (("flow", flow), ("depth_prev", depth)):
-        if not isinstance(value, torch.Tensor) or not value.is_floating_point():
-            raise InputError(f"{where}: expected PairBatch.{name} as a floating-point tensor.")
+    if not all(isinstance(x, torch.Tensor) and x.is_floating_point() for x in (flow, depth)):
+        raise InputError(f"{where}: expected flow and depth_prev as floating-point tensors.")
     if flow.ndim != 4 or flow.shape[3] != 2 or flow.numel() == 0:
         raise InputError(
             f"{where}: expected PairBatch.flow of shape (B, H, W, 2), got {tuple(flow.shape)}."

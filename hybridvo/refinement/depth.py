@@ -2,9 +2,8 @@
 
 The residual is rz = log D_curr(x + F) - log Z'. Given the flow residual r it is Gaussian with mean
 k^T r, k = h sd^2 Sigma^-1 q, where h = dlogZ'/dlogZ = 1 - tz/Z' and Sigma, q are those of
-:mod:`hybridvo.refinement.kernels`: both residuals share the error of the previous depth. So one
-more scalar residual, rz - k^T r, with the Jacobian row Jz - k^T J, Jz = (0, 0, i, b, -a, 0), adds
-to the same normal equations. Its variance is estimated.
+:mod:`hybridvo.refinement.kernels`. So rz - k^T r, with the Jacobian row Jz - k^T J,
+Jz = (0, 0, i, b, -a, 0), adds to the same normal equations; its variance is estimated.
 """
 
 from __future__ import annotations

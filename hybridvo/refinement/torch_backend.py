@@ -1,8 +1,7 @@
 """The refinement of a batch of pairs in torch: CPU or GPU, float32 or float64, differentiable.
 
-Every start is refined on a subset of the pixels under a kernel whose scale shrinks (graduated
-non-convexity); the start of least cost is fitted to the noise found there, and then to all pixels.
-Poses are pypose SE3 in float64. Samples never see each other.
+Every start is refined on a subset of the pixels under a kernel whose scale shrinks; that of least
+cost is fitted to the noise found there, and then to all pixels. Samples never see each other.
 
 The gradient is that of the implicit function theorem: the estimate solves g(T, inputs) = 0 with
 g = sum of w J^T Sigma^-1 r, so d xi = A^-1 dg with A = -dg / d xi, the full derivative. It is
