@@ -17,10 +17,9 @@ from hybridvo.data.lists import (
     read_stamps,
     read_timed_poses,
     sorted_files,
-    to_seconds,
 )
 from hybridvo.errors import InputError
-from hybridvo.trajectory import stamp_unit
+from hybridvo.trajectory import stamp_unit, to_seconds
 from hybridvo.types import as_number
 
 
