@@ -110,8 +110,7 @@ class FolderSequence(Sequence):
             for k, (a, b) in enumerate(itertools.pairwise(int(path.stem) for path in frames)):
                 if matched[k] is not None and b - a != step:
                     matched[k] = None
-                    told = f"the flow from {a} led to a missing image and is not used"
-                    self.warnings.append(f"{self.name}: {told}.")
+                    self._warn(f"the flow from {a} led to a missing image and is not used")
         return matched
 
     def _stamps_and_poses(self, frames: list[Path]) -> tuple[np.ndarray, np.ndarray | None]:
@@ -125,7 +124,7 @@ class FolderSequence(Sequence):
             fps = self._settings and self._settings.fps
             if not fps:
                 fps = self.frames_per_second
-                told.append(f"{self.name}: no time stamps; {fps:g} frames a second assumed.")
+                self._warn(f"no time stamps; {fps:g} frames a second assumed")
             stamps = np.arange(len(frames)) / fps
         return stamps, truth and poses_at(stamps, *truth)
 
