@@ -63,11 +63,9 @@ class Trajectory:
         """(N, 3) camera centres in the world, metres."""
         return self.T_world_cam[:, :3, 3]
 
-    def transformed(self, T_new_world: np.ndarray, scale: float = 1.0) -> Trajectory:
-        """The same path in another world: positions times ``scale``, then moved."""
-        T = self.T_world_cam.copy()
-        T[:, :3, 3] *= scale
-        T = as_rigid(T_new_world, "T_new_world") @ T
+    def transformed(self, T_new_world: np.ndarray) -> Trajectory:
+        """The same path in another world."""
+        T = as_rigid(T_new_world, "T_new_world") @ self.T_world_cam
         return Trajectory(self.timestamps, T, self.has_timestamps, self.warnings)
 
     def save(self, path: str | os.PathLike[str]) -> None:
