@@ -167,12 +167,7 @@ def load_options(
     assignments: Iterable[str] = (),
     given: Mapping[str, Any] | None = None,
 ) -> Options:
-    """Options from a YAML file, then from ``group.key=value`` texts, then from named values.
-
-    Example:
-        >>> load_options(assignments=["refine.cutoff=2.5"]).refine.cutoff
-        2.5
-    """
+    """Options from a YAML file, then from ``group.key=value`` texts, then from named values."""
     from hybridvo.errors import FormatError, InputError
     from hybridvo.files import parse_yaml, read_text
     from hybridvo.options import Options

@@ -193,8 +193,7 @@ class Sequence:
         if found is not None and (found.height, found.width) != size:
             raise InputError(
                 f"{self.root}: images are {self.width}x{self.height}, the camera is for "
-                f"{found.width}x{found.height} pixels. Give the intrinsics of these images "
-                f"(--camera fx,fy,cx,cy or --camera FILE)."
+                f"{found.width}x{found.height} pixels: give theirs (--camera fx,fy,cx,cy or FILE)."
             )
         if self._given_scale is None and found is not None:
             self._given_scale = found.depth_scale

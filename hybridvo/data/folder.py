@@ -39,10 +39,8 @@ class FolderSequence(Sequence):
         root, settings, told = self.root, self.root / CAMERA_FILE, self.warnings
         self._settings = read_camera_file(settings, told) if settings.exists() else None
         if self._settings is None and self._given_camera is None:
-            raise InputError(
-                f"{root}: no {CAMERA_FILE}, and no camera is given. Write one with 'hybridvo init "
-                f"{root}' and fill it in, or give --camera fx,fy,cx,cy or --camera FILE."
-            )
+            remedy = f"write one with 'hybridvo init {root}', or give --camera fx,fy,cx,cy or FILE"
+            raise InputError(f"{root}: no {CAMERA_FILE}, and no camera is given: {remedy}.")
         if self._settings is not None and self._given_scale is None:
             self._given_scale = self._settings.depth_scale
         rgb = sorted_files(root / "rgb", IMAGES)
@@ -69,21 +67,16 @@ class FolderSequence(Sequence):
         """Refuse what no frame can be made of, before anything is matched."""
         root, settings = self.root, self._settings
         if not depth:
-            raise InputError(
-                f"{root / 'depth'}: no {'depth' if rgb else 'frames'}: expected a 16-bit PNG, .npy "
-                f"or .dpt for each image in rgb/. hybridvo needs metric depth, from a sensor, "
-                f"stereo or a network."
-            )
+            what = "depth" if rgb else "frames"
+            expected = "a 16-bit PNG, .npy or .dpt of metric depth for each image in rgb/"
+            raise InputError(f"{root / 'depth'}: no {what}: expected {expected}.")
         if self._given_scale is None and any(path.suffix.lower() == ".png" for path in depth):
             raise InputError(
                 f"{root / CAMERA_FILE}: depth/ holds PNG files: 'depth_scale' (units per metre, "
                 f"1000 for millimetres) must be given, there or with --depth-scale."
             )
         if flow and settings is not None and any(settings.distortion):
-            raise InputError(
-                f"{root}: flow/ was computed on distorted images. Undistort the images first and "
-                f"compute flow on those, or remove flow/ and let hybridvo compute it."
-            )
+            raise InputError(f"{root}: flow/ is of distorted images: undistort them, or remove it.")
 
     def _match_depth(self, frames: list[Path], files: list[Path]) -> dict[int, Path | None]:
         """Index of each frame that is kept -> its depth."""

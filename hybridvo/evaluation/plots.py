@@ -59,9 +59,7 @@ def plot_trajectory(
         axes.set_axisbelow(True)
     figure.legend(loc="outside lower center", frameon=False, fontsize=9, ncols=3)
     figure.suptitle(title.encode("utf-8", "replace").decode(), fontsize=11, parse_math=False)
-    # a name in letters that the font lacks is drawn as boxes, without a word on stderr for each
-    quiet = warnings.catch_warnings(action="ignore", category=UserWarning)
-    with quiet, atomic_write(path, "wb") as file:
+    with warnings.catch_warnings(action="ignore"), atomic_write(path, "wb") as file:  # of the font
         figure.savefig(file, format="png")
 
 
