@@ -97,16 +97,16 @@ def table(made: Any, name: str) -> str:
 
 def tables(results: Results) -> Any:
     """The macros of the template, which see the figures."""
-    content = results["ablation"]
 
-    def curves(row: str) -> list[Any]:
+    def curves(rows: str, row: str) -> list[Any]:
         """Of the finished seeds of a row."""
+        content = results[rows]
         every = [run["curve"] for run in content["runs"] if run["row"] == row]
         return [curve for curve in every if str(content["samples"]) in curve]
 
-    def at(row: str, *keys: str) -> str:
+    def at(rows: str, row: str, *keys: str) -> str:
         """Mean of a figure over the seeds, with its spread."""
-        values = [reduce(lambda part, key: part[key], keys, curve) for curve in curves(row)]
+        values = [reduce(lambda part, key: part[key], keys, curve) for curve in curves(rows, row)]
         if not values or None in values:
             return "-"
         spread = f" +- {number(float(np.std(values, ddof=1)))}" if len(values) > 1 else ""
@@ -118,7 +118,7 @@ def tables(results: Results) -> Any:
         trim_blocks=True,
     )
     environment.filters |= {"number": number, "error": error, "failed": failed, "source": source}
-    environment.filters["seeds"] = lambda row: len(curves(row))
+    environment.filters["seeds"] = lambda rows, row: len(curves(rows, row))
     published = {line["method"]: line for line in paper_protocol()["published"]}
     shared = {"results": results, "at": at, "rows": ROWS, "rules": SELECTION_METHODS}
     return environment.get_template("tables.md").make_module(shared | {"published": published})

@@ -67,7 +67,6 @@ class RunOptions:
     seed: int = 0
     steps: Count = 100_000
     batch_size: Count = 100
-    precision: Literal["float32", "bfloat16"] = "float32"
     channels_last: bool = True
     ema_decay: Below1 = 0.0
     optimizer: OptimizerOptions = OptimizerOptions()
@@ -82,13 +81,15 @@ class RunOptions:
 class PwvoOptions(RunOptions):
     """A training of PWVO or of a baseline; the defaults are the paper's.
 
-    ``configs/train_pwvo.yaml`` says what each option is. ``fit_weight`` and ``moving_weight``: of
-    terms that the paper does not have; ``data``: preset files, beside the file that names them;
+    ``configs/train_pwvo.yaml`` says what each option is. ``precision``: of the network's pass;
+    processors without bfloat16 take five times as long with it. ``fit_weight``, ``moving_weight``:
+    of terms that the paper does not have. ``data``: preset files, beside the file that names them.
     ``data_size``: (height, width) of the drawn samples instead of the presets' own.
     """
 
     network: NetworkOptions = NetworkOptions()
     loss: LossOptions = LossOptions()
+    precision: Literal["float32", "bfloat16"] = "float32"
     moving_weight: NotNegative = 0.0
     fit_weight: NotNegative = 0.0
     selection: Literal[SELECTION_METHODS] = "softmax"  # type: ignore[valid-type]

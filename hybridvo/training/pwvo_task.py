@@ -17,7 +17,7 @@ from hybridvo.network.normalization import first_motions
 from hybridvo.network.pwvo import build_network
 from hybridvo.network.selection import fitted_motion, select_motion
 from hybridvo.results import PixelwisePrediction
-from hybridvo.synthetic.dataset import Mixture, Preset
+from hybridvo.synthetic.dataset import Mixture
 from hybridvo.synthetic.draws import TRAINING, sample_generator
 from hybridvo.synthetic.layered import PaperOptions
 from hybridvo.training.options import PwvoOptions
@@ -36,14 +36,14 @@ is charged, also behind the camera."""
 
 
 class SampleStream(IterableDataset):
-    """Endless batches of a preset, from the sample ``start`` of a seed.
+    """Endless batches of a mixture, from the sample ``start`` of a seed.
 
     Workers take batches in turn and the loader hands them over in order: their number changes
     nothing.
     """
 
-    def __init__(self, preset: Preset, seed: int, start: int, batch_size: int) -> None:
-        self.preset, self.seed, self.start, self.batch_size = preset, seed, start, batch_size
+    def __init__(self, mixture: Mixture, seed: int, start: int, batch_size: int) -> None:
+        self.mixture, self.seed, self.start, self.batch_size = mixture, seed, start, batch_size
 
     def __iter__(self) -> Iterator[TrainingBatch | DrawnBatch]:
         worker = get_worker_info()
@@ -56,10 +56,10 @@ class SampleStream(IterableDataset):
             turn += turns
 
     def _batch(self, draws: list[np.random.Generator]) -> TrainingBatch | DrawnBatch:
-        presets = self.preset.presets if isinstance(self.preset, Mixture) else (self.preset,)
-        if len(presets) == 1 and isinstance(presets[0], PaperOptions):
-            return DrawnBatch([presets[0].draw(rng) for rng in draws])
-        return collate([self.preset.sample(rng) for rng in draws])
+        first, *others = self.mixture.presets
+        if isinstance(first, PaperOptions) and not others:
+            return DrawnBatch([first.draw(rng) for rng in draws])
+        return collate([self.mixture.sample(rng) for rng in draws])
 
 
 class PwvoTask:

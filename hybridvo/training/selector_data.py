@@ -55,18 +55,15 @@ def draw_samples(
         pairs = scene_pairs(rng, height, width)
     samples = []
     for source, drawn in pairs.items():
-        T_prior = None
-        if rng.random() < 0.5:
-            T_prior = expected_motion(rng, drawn.T_curr_prev)[0]
         starts = [np.eye(4)]
-        if T_prior is not None and rng.random() < 0.7:
-            starts.append(T_prior)
+        if rng.random() < 0.35:
+            starts.append(expected_motion(rng, drawn.T_curr_prev)[0])
         found = generate(drawn.pair, np.stack(starts), Options(), int(rng.integers(1 << 30)))
         if isinstance(found, RelativePose) or not found.is_ambiguous:
             continue
         if found.grid.shape[2] != grid_stride(found.grid.size, Options().refine.coarse_pixels):
             continue  # a grid of another size, of pixels that are few
-        sample = _record(drawn, found, T_prior) | {"source": SOURCES.index(source)}
+        sample = _record(drawn, found) | {"source": SOURCES.index(source)}
         if network is not None:
             nothing = MotionPrediction(np.full((4, 4), np.nan), np.full((1, 1), 0.5))
             said = propose_motion(network, drawn.pair) or nothing
@@ -87,7 +84,7 @@ def expected_motion(rng: np.random.Generator, T: np.ndarray) -> tuple[np.ndarray
     return se3_exp(spread * rng.standard_normal(6)) @ T, stated
 
 
-def _record(drawn: KnownPair, found: HypothesisSet, T_prior: np.ndarray | None) -> dict[str, Any]:
+def _record(drawn: KnownPair, found: HypothesisSet) -> dict[str, Any]:
     """Everything about a sample: the maps of its grid, the motions found, and ground truth."""
     stride = found.grid.shape[2]
     pick = np.s_[stride // 2 :: stride, stride // 2 :: stride]
@@ -102,8 +99,6 @@ def _record(drawn: KnownPair, found: HypothesisSet, T_prior: np.ndarray | None) 
         "facts": np.pad(found.facts[:count], (empty, (0, 0))),
         "count": count,
         "T": drawn.T_curr_prev[:3],
-        "T_prior": (np.eye(4) if T_prior is None else T_prior)[:3],
-        "has_prior": T_prior is not None,
     }
 
 

@@ -70,11 +70,16 @@ class SelectorBatch:
         return replace(self, inputs=replace(self.inputs, static=logit, has_static=asked))
 
     def expecting(self, rng: np.random.Generator) -> SelectorBatch:
-        """The same with motions expected by histories of all kinds, or by none."""
+        """The same with motions expected by histories of all kinds, or by none.
+
+        At times the history is of any of the motions found: a mover was taken for the world.
+        """
         T_prior, information = self.T.clone(), self.inputs.prior_information.clone()
         known = rng.random(len(self)) < 0.6
         for b in np.flatnonzero(known):
-            T, spread = expected_motion(rng, pose_matrix(self.T[b].numpy().astype(np.float64)))
+            found = self.inputs.pose[self.inputs.owner == b]
+            before = found[int(rng.integers(len(found)))] if rng.random() < 0.2 else self.T[b]
+            T, spread = expected_motion(rng, pose_matrix(before.numpy().astype(np.float64)))
             T_prior[b] = torch.as_tensor(T[:3])
             if rng.random() < 0.6:
                 information[b] = torch.diag(torch.as_tensor(1.0 / spread**2))
@@ -200,18 +205,15 @@ class Looks:
         model: SelectorNetwork,
         batch: SelectorBatch,
         mirror: torch.Tensor | None = None,
-        half: bool = False,
     ) -> None:
-        self.model, self.batch, self.mirror, self.half = model, batch, mirror, half
+        self.model, self.batch, self.mirror = model, batch, mirror
         self.asked: list[tuple[torch.Tensor, ...]] = []
         self.first = self._ask(batch.inputs, None)
 
     def _ask(
         self, inputs: SelectorInputs, first: tuple[SelectorInputs, SelectorOutput] | None
     ) -> SelectorOutput:
-        with torch.autocast("cpu", torch.bfloat16, enabled=self.half):
-            out = self.model(inputs, first, self.mirror)
-        out = replace(out, **{k: getattr(out, k).float() for k in ("score", "hidden", "mask")})
+        out = self.model(inputs, first, self.mirror)
         error = ego_flow_error(inputs.pose, inputs.owner, self.batch)
         self.asked.append((inputs.owner, out.score, out.hidden, error))
         self.owner, self.score, self.hidden, self.error = map(
@@ -291,7 +293,7 @@ class SelectorTask:
         asked = torch.rand(count, generator=draw) < o.asked_share
         batch = batch.expecting(np.random.default_rng([o.seed, step])).shown(asked)
         mirror = torch.rand(count, generator=draw) < 0.5
-        looks = Looks(self.network, batch, mirror, o.precision == "bfloat16")
+        looks = Looks(self.network, batch, mirror)
         choice, trust = looks.choice_losses()
         mask = o.mask_weight * looks.mask_loss(looks.first, batch.inputs)
         losses = {"choice": choice, "mask": mask}
