@@ -1,9 +1,8 @@
 """The command line: ``hybridvo run | compare | show | evaluate | doctor | demo | train | ...``.
 
-Heavy modules are imported after parsing, so that ``--help`` is instant. Data goes to stdout,
-progress and errors to stderr. Exit codes: 0 done, 1 a bug, 2 bad input or usage (or ``doctor``
-found that something differs: 1), 3 too many failed frames, 4 folder locked, 5 output cannot be
-written, 130 interrupted.
+Heavy modules are imported after parsing, so that ``--help`` is instant. Exit codes: 0 done, 1 a bug
+(or ``doctor`` found something), 2 bad input, 3 too many failed frames, 4 folder locked, 5 output
+cannot be written, 130 interrupted.
 """
 
 from __future__ import annotations

@@ -132,8 +132,7 @@ def read_rows(path: Path, *columns: str, words: int = 0) -> Rows:
     Of several ``columns`` those of the first row's number are meant. ``#`` starts a comment; the
     last word may contain spaces. Commas separate numbers too.
     """
-    lines: list[int] = []
-    numbers, after = [], []
+    lines, numbers, after = list[int](), [], []
     for line, text in enumerate(read_text(path).split("\n"), start=1):
         count = len(columns[0].split())
         plain = text.strip() if words else text.partition("#")[0].replace(",", " ")

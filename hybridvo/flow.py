@@ -1,7 +1,6 @@
 """Optical flow for a pair of frames: from files, from OpenCV's DIS, or from any callable.
 
-A provider never raises on bad images: pixels without a match are invalid, and where no flow can be
-had at all it is None, for which the estimators return ``failed(no_flow)``.
+A provider never raises on bad images: where no flow can be had it is None.
 """
 
 from __future__ import annotations
@@ -107,11 +106,9 @@ def _textured(gray: np.ndarray) -> bool:
 def forward_backward_check(
     forward: np.ndarray, backward: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Variance and validity from the disagreement of the flows (H, W, 2) in both directions, px.
+    """Variance (H, W), px^2, and validity from the disagreement of the flows in both directions.
 
-    The error is e(x) = |F(x) + B(x + F(x))|. The variance (H, W), px^2 per component, is base^2 +
-    (factor e)^2 of ``DIS_NOISE``, at most (5 px)^2; valid (H, W) is False where e exceeds 1.5 px
-    and 5 % of the flow, or where the flow leaves the image or is not finite.
+    e(x) = |F(x) + B(x + F(x))| is wrong above 1.5 px and 5 % of the flow, and outside the image.
     """
     du, dv = cv2.split(np.nan_to_num(forward, nan=1e9, posinf=1e9, neginf=-1e9))
     u, v, inside = _targets(du, dv)
@@ -201,9 +198,8 @@ def with_flow(
 def contradiction(pair: FramePair) -> str | None:
     """Why the flow of a pair cannot be that of its images, as a sentence, or None.
 
-    A flow with the wrong sign, direction, unit or pair warps one image onto the other no better
-    than no flow does. None also where the flow was computed from the images (``dis``), where one of
-    them is missing, or where there is too little texture.
+    One with the wrong sign, direction, unit or pair warps one image onto the other no better than
+    no flow does. None also for ``dis``, without images, or where there is too little texture.
     """
     rgb_prev, rgb_curr, flow = pair.prev.rgb, pair.curr.rgb, pair.flow
     if rgb_prev is None or rgb_curr is None or flow is None or pair.flow_source == "dis":

@@ -28,24 +28,18 @@ from hybridvo.types import Frame, FramePair, as_number, as_rigid, as_seed, check
 
 STANDSTILL = 1e-12 * np.eye(6)
 """Covariance of no motion at all; a pose graph can still invert it."""
-MEMORY = 10  # motions after which a change counts 1 / e of a new one
+KEEP = 0.9  # of the weight of a change, with every further one
 MIN_CHANGES = 3  # changes between motions to be seen before their spread means anything
-INFLATION = 2.0
-"""Factor on the mean square of the last changes, which tell little of the next, larger one."""
-FLOOR = 1e-3
-"""Smallest standard deviation of a prediction, m and rad: no camera repeats its motion exactly."""
+INFLATION = 2.0  # of the mean square of the last changes, which tell little of a larger one
+FLOOR = 1e-3  # smallest standard deviation, m and rad: no camera repeats its motion exactly
 
 
 @dataclass(frozen=True, eq=False)
 class MotionModel:
-    """Constant velocity: the last motion between neighbours, and how motions change.
-
-    ``spread`` (6, 6) is a decaying sum of squared changes, ``weight`` their decaying number.
-    """
+    """Constant velocity: the last motion between neighbours, and how motions change."""
 
     T_last: np.ndarray | None = None
-    spread: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
-    weight: float = 0.0
+    spread: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))  # decaying sum of squares
     changes: int = 0
 
     def observed(self, T_curr_prev: np.ndarray, neighbours: bool = True) -> MotionModel:
@@ -55,25 +49,20 @@ class MotionModel:
         if self.T_last is None or not neighbours:
             return replace(self, T_last=T_curr_prev)
         change = se3_log(T_curr_prev @ invert(self.T_last))
-        keep = 1.0 - 1.0 / MEMORY
-        spread = keep * self.spread + np.outer(change, change)
-        return MotionModel(T_curr_prev, spread, keep * self.weight + 1.0, self.changes + 1)
+        spread = KEEP * self.spread + np.outer(change, change)
+        return MotionModel(T_curr_prev, spread, self.changes + 1)
 
     def predict(self, frames: int = 1) -> MotionPrior | None:
-        """The motion to the frame ``frames`` ahead; None before the first motion.
-
-        The velocity is taken to wander by as much as it did: over n frames the variance is that of
-        one change times n (n + 1) (2 n + 1) / 6.
-        """
+        """The motion to the frame ``frames`` ahead; None before the first motion."""
         if self.T_last is None:
             return None
         n = int(frames)
-        grown = n * (n + 1) * (2 * n + 1) / 6
+        grown = n * (n + 1) * (2 * n + 1) / 6  # the velocity wanders on by as much as it did
         T = pose_matrix(np.linalg.matrix_power(self.T_last, n)[:3])
         if self.changes < MIN_CHANGES:
             return MotionPrior(T, grown * np.diag(IDENTITY_STD**2))
         # ten changes are few for 21 numbers: half of it is even in all directions
-        mean = self.spread / self.weight
+        mean = self.spread * (1 - KEEP) / (1 - KEEP**self.changes)
         even = np.repeat([np.trace(mean[:3, :3]) / 3, np.trace(mean[3:, 3:]) / 3], 3)
         one = INFLATION * 0.5 * (mean + np.diag(even))
         return MotionPrior(T, grown * (one + FLOOR**2 * np.eye(6)))
@@ -106,15 +95,6 @@ class Odometry:
             :meth:`skip` the two frames are no neighbours.
         method: by default ``hybrid``, or ``refine`` without a network.
         options: all groups but ``run`` are read, and of that ``run.device``.
-
-    Example:
-        >>> import numpy as np
-        >>> from hybridvo.types import Camera
-        >>> vo = Odometry(method="identity")
-        >>> camera = Camera(30, 30, 15.5, 11.5, 24, 32)
-        >>> step = vo.track(Frame(None, np.ones((24, 32)), camera, timestamp=0.1))
-        >>> step.ok, step.index
-        (True, 0)
     """
 
     def __init__(
@@ -150,28 +130,23 @@ class Odometry:
         self._flow = flow or dis_flow(options.flow.dis_preset)
         self.reset()
 
-    @property
-    def state(self) -> TrackerState:
-        """State after the last frame: hand it to :meth:`resume` to go on later."""
-        return self._state
-
     def reset(self) -> None:
         """Forget everything: the next frame is the first one, at the identity."""
-        self._state = TrackerState()
+        self.state = TrackerState()  # hand it to another one's resume() to go on later
         self._flow_fits = False
 
     def set_pose(self, T_world_cam: np.ndarray) -> None:
         """Say where the camera is now (or where it starts), as after a loop closure."""
         T = as_rigid(T_world_cam, "Odometry.set_pose")
-        state = self._state
+        state = self.state
         # the frame that the next pair starts from keeps its place relative to the last pose
         T_state = T @ invert(state.T_world_last) @ state.T_world_cam if state.gap else T
-        self._state = replace(state, T_world_cam=T_state, T_world_last=T)
+        self.state = replace(state, T_world_cam=T_state, T_world_last=T)
 
     def resume(self, state: TrackerState) -> None:
         """Go on where another tracker stopped."""
         check_kind("Odometry.resume", state, TrackerState)
-        self._state = state
+        self.state = state
 
     def warm_up(self) -> float:
         """Compile and load everything before the first frame; seconds spent."""
@@ -179,7 +154,7 @@ class Odometry:
 
     def predict(self) -> MotionPrior | None:
         """The motion to the next frame, at constant velocity; None before the first motion."""
-        return self._state.motion_model.predict()
+        return self.state.motion_model.predict()
 
     def track(self, frame: Frame, flow: FlowField | np.ndarray | None = None) -> Step:
         """Pose of the next frame; the first one has the identity as motion, status ok.
@@ -190,12 +165,12 @@ class Odometry:
         of another size, or a flow that does not fit) the tracker is as it was.
         """
         check_kind("Odometry.track", frame, Frame)
-        state, frame = self._state, deepcopy(frame)
+        state, frame = self.state, deepcopy(frame)
         if frame.index is None:
             frame = replace(frame, index=state.count)
         if state.frame is None:
             T = state.T_world_last
-            self._state = TrackerState(frame, T, T, count=state.count + 1)
+            self.state = TrackerState(frame, T, T, count=state.count + 1)
             first = RelativePose(covariance=STANDSTILL.copy(), method=self.method)
             return Step(frame.index, frame.timestamp, T.copy(), first)
         pair = FramePair(state.frame, frame, None)
@@ -223,18 +198,15 @@ class Odometry:
             after |= {"frame": frame, "T_world_cam": T, "gap": 0}
         else:
             after["gap"] = state.gap + 1
-        self._state = replace(state, count=state.count + 1, **after)
+        self.state = replace(state, count=state.count + 1, **after)
         return Step(frame.index, frame.timestamp, T.copy(), motion)
 
     def _leads(self, frame: Frame, pair: FramePair, found: RelativePose, gap: int) -> bool:
-        """Whether the next frame is held against this one: it has depth, and it was matched.
-
-        After two motions that failed it is all the same: the camera may have moved on. Only flow
-        that is computed from the images can span a frame that could not be matched.
-        """
+        """Whether the next frame is held against this one: it has depth, and it was matched."""
         if frame.depth is None or (frame.rgb is None and pair.flow is None):
             return False
         matched = found.usable or found.status.reason is Reason.NO_VALID_DEPTH
+        # after two failures the camera may have moved on; flow from files cannot span a frame
         return matched or gap > 0 or getattr(self._flow, "source", "") != "dis"
 
     def skip(self, index: int, timestamp: float, message: str = "") -> Step:
@@ -242,12 +214,12 @@ class Odometry:
         if as_number(index) % 1 or not np.isfinite(as_number(timestamp)):
             got = f"{index!r}, {timestamp!r}"
             raise InputError(f"Odometry.skip: expected an index and finite seconds, got {got}.")
-        state, message = self._state, message or "the frame cannot be read"
+        state, message = self.state, message or "the frame cannot be read"
         motion = RelativePose.failed(Reason.MISSING_FRAME, message, self.method)
         T, gap = state.T_world_last, state.gap
         if state.frame is not None:
             (T, motion), gap = self._instead(state, motion), gap + 1
-        self._state = replace(state, T_world_last=T, gap=gap, count=state.count + 1)
+        self.state = replace(state, T_world_last=T, gap=gap, count=state.count + 1)
         return Step(int(index), timestamp, T.copy(), motion)
 
     def _instead(

@@ -121,12 +121,7 @@ class RunOptions:
 
 @option_group
 class Options:
-    """The option tree.
-
-    Example:
-        >>> Options(refine=RefineOptions(cutoff=2.5)).refine.cutoff
-        2.5
-    """
+    """The option tree, as in ``Options(refine=RefineOptions(cutoff=2.5)).refine.cutoff``."""
 
     flow: FlowOptions = FlowOptions()
     direct: DirectOptions = DirectOptions()

@@ -25,19 +25,12 @@ FILE_TOLERANCE = 1e-2
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Camera poses over time; what does not fit is an InputError.
+    """Camera poses over time, read-only; what does not fit is an InputError."""
 
-    Args:
-        timestamps: (N,) seconds, strictly increasing; frame numbers where a file has no stamps.
-        T_world_cam: (N, 4, 4) camera to world, metres, N >= 1; stored as read-only float64.
-        has_timestamps: False where ``timestamps`` are frame numbers.
-        warnings: what a reader changed, in sentences.
-    """
-
-    timestamps: np.ndarray
-    T_world_cam: np.ndarray
-    has_timestamps: bool = True
-    warnings: tuple[str, ...] = ()
+    timestamps: np.ndarray  # (N,) seconds, strictly increasing, N >= 1
+    T_world_cam: np.ndarray  # (N, 4, 4) camera to world, metres
+    has_timestamps: bool = True  # else they are frame numbers
+    warnings: tuple[str, ...] = ()  # what a reader changed, in sentences
 
     def __post_init__(self) -> None:
         stamps = to_numpy(self.timestamps, "Trajectory.timestamps")
@@ -61,11 +54,9 @@ class Trajectory:
         """(N, 3) camera centres in the world, metres."""
         return self.T_world_cam[:, :3, 3]
 
-    def transformed(self, T_new_world: np.ndarray, scale: float = 1.0) -> Trajectory:
-        """The same path in another world: positions times ``scale``, then moved."""
-        T = self.T_world_cam.copy()
-        T[:, :3, 3] *= scale
-        T = as_rigid(T_new_world, "T_new_world") @ T
+    def transformed(self, T_new_world: np.ndarray) -> Trajectory:
+        """The same path in another world."""
+        T = as_rigid(T_new_world, "T_new_world") @ self.T_world_cam
         return Trajectory(self.timestamps, T, self.has_timestamps, self.warnings)
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -93,16 +84,13 @@ def read_trajectory(path: str | os.PathLike[str]) -> Trajectory:
     if not len(T):
         raise FormatError(f"{path}: expected at least one pose, got none.")
     rows.refuse(~np.isfinite(rows.numbers).all(axis=1), "finite numbers: leave unknown poses out")
-    columns = rows.numbers.shape[1]
-    stamps, factor, unit = np.arange(len(T)), 1.0, ""
+    columns, stamps, told = rows.numbers.shape[1], np.arange(len(T)), list[str]()
     if columns == 8:
-        stamps = rows.numbers[:, 0]
-        factor, unit = stamp_unit(stamps)
+        stamps = to_seconds(rows.numbers[:, 0], str(path), told)
     rows.refuse(np.diff(stamps, prepend=-np.inf) <= 0, "increasing timestamps, without duplicates")
-    warnings = (f"{path}: timestamps are {unit}; converted to seconds.",) if factor != 1 else ()
     if columns == 7:
         T = ned_to_camera(T)
-    return Trajectory(stamps / factor, T, columns == 8, warnings)
+    return Trajectory(stamps, T, columns == 8, tuple(told))
 
 
 def read_poses(path: Path, *columns: str) -> tuple[Rows, np.ndarray]:
@@ -139,6 +127,14 @@ def check_increasing(stamps: np.ndarray, where: str) -> None:
             f"{where}: timestamps must be finite and increase: frame {k} has {float(stamps[k])!r}"
             f"{after}. Sort them and remove duplicates."
         )
+
+
+def to_seconds(stamps: np.ndarray, name: str, told: list[str]) -> np.ndarray:
+    """Stamps in seconds, other units converted with a warning; what is not finite becomes NaN."""
+    factor, unit = stamp_unit(stamps)
+    if factor != 1:
+        told.append(f"{name}: timestamps are {unit}; converted to seconds.")
+    return np.where(np.isfinite(stamps), stamps, np.nan) / factor
 
 
 def stamp_unit(stamps: np.ndarray) -> tuple[float, str]:

@@ -20,12 +20,9 @@ from hybridvo.geometry import make_transform, project, projection_rows
 from hybridvo.results import Reason, RelativePose, Status
 from hybridvo.types import Camera, FramePair, as_rigid
 
-POINTS = 10_000
-"""Random valid pixels handed to a solver; all pixels cost 50 times more for no accuracy."""
-MIN_POINTS = 6
-"""Fewest correspondences and inliers: four always fit some pose, so they prove nothing."""
-DEPTH_RANGE_M = (1e-6, 1e6)
-"""Open interval of depths that can be metres; outside it squares leave the floating-point range."""
+POINTS = 10_000  # random valid pixels for a solver; all cost 50 times more for no accuracy
+MIN_POINTS = 6  # correspondences and inliers: four always fit some pose, so they prove nothing
+DEPTH_RANGE_M = (1e-6, 1e6)  # outside it squares leave the floating-point range
 MIN_INLIER_RATIO = 0.05  # below this share of the sampled pixels a consensus is chance: failed
 SINGULAR_RATIO = 1e-10
 """Eigenvalue ratio of the scaled information below which a direction is free. A frontal plane over

@@ -167,15 +167,7 @@ def load_options(
     assignments: Iterable[str] = (),
     given: Mapping[str, Any] | None = None,
 ) -> Options:
-    """Options from a YAML file, then from ``group.key=value`` texts, then from named values.
-
-    The values of ``assignments`` are YAML; those of ``given``, such as ``{"run.method":
-    "refine"}``, are left out where they are None.
-
-    Example:
-        >>> load_options(assignments=["refine.cutoff=2.5"]).refine.cutoff
-        2.5
-    """
+    """Options from a YAML file, then from ``group.key=value`` texts, then from named values."""
     from hybridvo.errors import FormatError, InputError
     from hybridvo.files import parse_yaml, read_text
     from hybridvo.options import Options
@@ -192,9 +184,7 @@ def load_options(
     for text in assignments:
         key, sign, value = text.partition("=")
         if not sign or "." not in key:
-            raise InputError(
-                f"--set: expected group.key=value, as in refine.cutoff=3, got {text!r}."
-            )
+            raise InputError(f"--set: expected group.key=value, as refine.cutoff=3, got {text!r}.")
         values[key.strip()] = parse_yaml(value, f"--set {key}")
     values |= {key: value for key, value in (given or {}).items() if value is not None}
     for key, value in values.items():
@@ -217,8 +207,6 @@ def weight_files(weights: Iterable[str]) -> dict[str, str]:
     files = dict(text.partition("=")[::2] for text in weights)
     for name, path in files.items():
         if name not in known or not Path(path).is_file():
-            raise InputError(
-                f"--weights: expected NAME=FILE with {' or '.join(known)} and a file that exists, "
-                f"got {name}={path}."
-            )
+            expected = f"NAME=FILE with {' or '.join(known)} and a file that exists"
+            raise InputError(f"--weights: expected {expected}, got {name}={path}.")
     return files

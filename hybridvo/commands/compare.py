@@ -1,7 +1,6 @@
 """``hybridvo compare``: methods beside each other on sequences, scored against ground truth.
 
-Every method is a ``hybridvo run`` of its own below ``runs/``, which is also what is resumed; their
-steps become one table of pairs, and that the scores and the report.
+Every method is a ``hybridvo run`` below ``runs/``; their steps become one table of pairs.
 """
 
 from __future__ import annotations
@@ -13,7 +12,6 @@ import os
 import platform
 import re
 import shutil
-from collections import Counter
 from collections.abc import Iterable, Mapping
 from collections.abc import Sequence as Several
 from dataclasses import replace
@@ -72,6 +70,7 @@ def compare(
             f"them, or another --out."
         )
     given = {"models": models, "command": list(command), "quiet": quiet}
+    given |= {"mode": "resume", "picture": False}
     with held(out):
         if mode == "overwrite":
             shutil.rmtree(out / "runs", ignore_errors=True)
@@ -146,11 +145,11 @@ def open_all(path: str | os.PathLike[str], dataset: str | None = None) -> list[S
 
 
 class _Job(NamedTuple):
-    """One sequence, under a name of its own, with its source of flow and the folder of its runs."""
+    """One sequence, and where its runs are."""
 
     sequence: Sequence
-    name: str
-    flow: str
+    name: str  # of its own
+    flow: str  # where it comes from
     folder: Path
 
 
@@ -158,13 +157,14 @@ def _jobs(
     paths: Several[str | os.PathLike[str]], dataset: str | None, options: Options, out: Path
 ) -> list[_Job]:
     """What is to be done on every sequence; refused before anything is run."""
-    jobs, names = [], Counter[str]()
+    jobs: list[_Job] = []
     for sequence in (sequence for path in paths for sequence in open_all(path, dataset)):
         frames_of(sequence, options)
         flow = flow_provider(sequence, options)[1]
-        names[sequence.name] += 1
-        count = names[sequence.name]
-        name = f"{sequence.name}_{count}" if count > 1 else sequence.name
+        name, count = sequence.name, 1
+        while name in (job.name for job in jobs):
+            count += 1
+            name = f"{sequence.name}_{count}"
         folder = out / "runs" / re.sub(r"[^\w.-]", "_", name)
         jobs.append(_Job(sequence, name, flow, folder))
     if not jobs:
@@ -183,11 +183,8 @@ def _run_all(
     runs = {}
     for method in methods:
         asked = replace(options, run=replace(options.run, method=method, max_failed=1.0))
-        folder = job.folder / method
         try:
-            runs[method], _ = run(
-                job.sequence, folder, asked, mode="resume", picture=False, **given
-            )
+            runs[method], _ = run(job.sequence, job.folder / method, asked, **given)
         except HybridVOError:
             raise
         except Exception as error:

@@ -26,8 +26,7 @@ METHODS = {
     "identity": "identity (no motion)",
 }
 """Methods of the demo and what its table calls them."""
-MARK = "hybridvo_demo.json"
-"""File by which a folder is known as a demo's own, and may be replaced."""
+MARK = "hybridvo_demo.json"  # tells a demo's own folder, which may be replaced
 SCENE, HEIGHT, WIDTH = "light", 218, 512
 
 
@@ -40,10 +39,9 @@ def demo(
     command: Iterable[str] = (),
     quiet: bool = False,
 ) -> dict[str, Any]:
-    """Render, run and compare; JSON-ready.
+    """Render a scene in Sintel's layout under ``out/data``, run and compare; JSON-ready.
 
-    The scene is written in Sintel's layout under ``out/data``; flow comes from OpenCV DIS, never
-    from the true flow that is written beside it. Depth is the renderer's.
+    Flow is OpenCV's DIS, never the true flow that is written beside it; depth is the renderer's.
     """
     if frames < 2:
         raise InputError(f"demo: expected at least 2 frames, got {frames}.")

@@ -1,7 +1,6 @@
 """``hybridvo doctor``: what is installed here, which methods can run, what is wrong with data.
 
-Of a sequence three questions are asked. What the data do not show is said to be unknown: an answer
-is ``agrees``, ``differs`` or ``cannot_tell``, with a sentence and a value.
+Of a sequence three questions are asked; what the data do not show is said to be unknown.
 """
 
 from __future__ import annotations
@@ -24,20 +23,17 @@ from hybridvo.refinement.covariance import direction_is_known
 from hybridvo.refinement.depth import compare_depths
 from hybridvo.types import Frame, FramePair, depth_advice, typical_depth
 
-MIN_PAIRS = 6
-"""Fewer pairs do not decide the scale of depth."""
-MAX_SCALE_ERROR = 0.2
-"""Wrong units err by more, noisy ground truth over short motions by half of that."""
-MAX_CONTRADICTED = 0.2
-"""Fraction of the pairs whose flow may contradict their images."""
+MIN_PAIRS = 6  # fewer do not decide the scale of depth
+MAX_SCALE_ERROR = 0.2  # noisy ground truth over short motions errs by half of that
+MAX_CONTRADICTED = 0.2  # fraction of the pairs whose flow may contradict their images
 
 
 def doctor(sequence: Sequence | None = None, pairs: int = 40) -> dict[str, Any]:
     """What a bug report should hold, or what is wrong with a sequence; JSON-ready."""
-    import torch
-
     if sequence is not None:
         return diagnose(sequence, pairs=pairs)
+    import torch
+
     ready, absent = methods_to_run(("all",))
     return {
         "platform": platform.platform(),
@@ -48,17 +44,14 @@ def doctor(sequence: Sequence | None = None, pairs: int = 40) -> dict[str, Any]:
 
 
 def diagnose(sequence: Sequence, *, pairs: int = 40) -> dict[str, Any]:
-    """Look for systematic disagreement in a sequence; JSON-ready.
+    """Look for systematic disagreement in at most ``pairs`` pairs of neighbours, spread evenly.
 
-    At most ``pairs`` pairs of neighbouring frames are looked at, spread evenly. The true poses of
-    the sequence serve for nothing but the scale of depth. ``ok``: nothing differs.
+    The true poses of the sequence serve for nothing but the scale of depth.
     """
     last = len(sequence) - 2
     if pairs < 1 or last < 0:
-        raise InputError(
-            f"{sequence.name}: expected at least two frames and one pair, got {len(sequence)} "
-            f"frames and --pairs {pairs}."
-        )
+        got = f"{len(sequence)} frames and --pairs {pairs}"
+        raise InputError(f"{sequence.name}: expected two frames and one pair, got {got}.")
     rows, unreadable = {}, []
     for index in np.unique(np.linspace(0, last, min(pairs, last + 1)).round().astype(int)).tolist():
         try:

@@ -1,7 +1,4 @@
-"""A recording of a run for the Rerun viewer: images, flow, weights, path and covariance.
-
-Images are shrunk, compressed and taken every few frames; poses and numbers are kept for all.
-"""
+"""A recording of a run for the Rerun viewer: images, flow, weights, path and covariance."""
 
 from __future__ import annotations
 
@@ -18,9 +15,8 @@ from hybridvo.files import atomic_write
 from hybridvo.results import Step
 from hybridvo.types import Frame
 
-MAX_IMAGES = 300
-"""Images of a kind in a recording: with the sizes below about 15 MB at most."""
-MAX_SIDE = 480
+MAX_IMAGES, MAX_SIDE = 300, 480
+"""Images of a kind in a recording, and their longer side, px: about 15 MB at most."""
 
 
 def check_recording(path: str | os.PathLike[str]) -> None:
@@ -32,10 +28,7 @@ def check_recording(path: str | os.PathLike[str]) -> None:
 
 
 class Recording:
-    """Writes a recording as the frames come in; use as a context manager.
-
-    ``frames``: how many at most; ``poses`` are the true T_world_cam.
-    """
+    """Writes a recording as the frames come in; ``poses`` are the true T_world_cam."""
 
     def __init__(
         self, path: str | os.PathLike[str], name: str, frames: int, poses: np.ndarray | None

@@ -1,7 +1,6 @@
 """``hybridvo run``: a sequence from disk in; trajectory, steps and scores out.
 
-Ground truth is used for scoring alone; what the estimate took from an oracle (true flow, true
-depth) is named in every output.
+Ground truth is used for scoring alone; what comes of an oracle (true flow, true depth) is named.
 """
 
 from __future__ import annotations
@@ -39,9 +38,9 @@ from hybridvo.pipeline import NETWORKS, check_method
 from hybridvo.trajectory import Trajectory
 
 RECORDING = "recording.rrd"
-"""Name of a Rerun recording within the output folder."""
-SAVE_EVERY = 50
-"""Frames after which the run can be resumed."""
+ARRAYS = ("index", "timestamp", "status", "probability", "T_curr_prev", "covariance")
+"""Columns of the steps in ``steps.npz``."""
+SAVE_EVERY = 50  # frames after which the run can be resumed
 
 
 def run(
@@ -167,7 +166,7 @@ def _track(
         "status": step.status.state.value,
         "reason": step.status.reason.value,
         "probability": float(motion.probability),
-        **dict(zip(("tx", "ty", "tz", "rx", "ry", "rz"), values, strict=True)),
+        **dict(zip("tx ty tz rx ry rz".split(), values, strict=True)),
         "inlier_ratio": float(motion.inlier_ratio),
         "iterations": int(motion.iterations),
         "cost": float(motion.cost),
@@ -195,27 +194,20 @@ def _write_results(
     picture: bool,
 ) -> dict[str, Any]:
     """Write what a finished run leaves beside its steps; its summary, JSON-ready."""
-    trajectory = Trajectory(
-        np.array([row["timestamp"] for row in rows]), np.array([row["T_world_cam"] for row in rows])
-    )
+    table, gt = pd.DataFrame(rows), true_trajectory(sequence, frames)
+    columns: dict[str, Any] = {name: np.array(table[name].tolist()) for name in ARRAYS}
+    trajectory = Trajectory(columns["timestamp"], np.array(table["T_world_cam"].tolist()))
     trajectory.save(folder / "trajectory.tum")
     trajectory.save(folder / "trajectory.kitti")
-    names = ("index", "timestamp", "status", "probability", "T_curr_prev", "covariance")
     with atomic_write(folder / "steps.npz", "wb") as file:
-        arrays: dict[str, Any] = {name: np.array([row[name] for row in rows]) for name in names}
-        np.savez(file, **arrays)
-    summary = _summarise(pd.DataFrame(rows), sequence, options.method)
-    if summary["failed_fraction"] > options.max_failed:
-        text = f"more motions failed than --max-failed {options.max_failed:g} allows"
-        summary["warnings"].append(text)
-    metrics, gt = None, true_trajectory(sequence, frames)
+        np.savez(file, **columns)
+    summary, metrics = _summarise(table, sequence, options), None
     if gt is not None:
         report = evaluate(trajectory, gt, alignment=options.alignment)
         pairs = mean_pair_errors([row for row in rows if "rot_err_deg" in row])
-        reasons = report["reasons"] | pairs["reasons"]
         named = ("method", "failed", "degraded", "flow_source", "depth_source", "oracle")
         metrics = report | pairs | {key: summary[key] for key in (*named, "sequence")}
-        metrics["reasons"] = reasons
+        metrics["reasons"] = report["reasons"] | pairs["reasons"]
         write_json(folder / "metrics.json", metrics)
     if picture:
         title = f"{sequence.name}, flow: {', '.join(summary['flow_source']) or 'none'}"
@@ -223,36 +215,37 @@ def _write_results(
             title += f" (oracle: {', '.join(summary['oracle'])})"
         path = folder / "trajectory.png"
         plot_trajectory(options.method, trajectory, path, truth=gt, title=title)
-    files = [os.fspath(folder / name) for name in RESULTS if (folder / name).exists()]
-    files.append(os.fspath(folder / STATE))
+    files = [os.fspath(folder / name) for name in (*RESULTS, STATE) if (folder / name).exists()]
     return summary | {"state": "done", "out": os.fspath(folder), "files": files, "metrics": metrics}
 
 
-def _summarise(table: pd.DataFrame, sequence: Sequence, method: str) -> dict[str, Any]:
+def _summarise(table: pd.DataFrame, sequence: Sequence, options: RunOptions) -> dict[str, Any]:
     """Counts, sources, oracles, times and warnings of a run."""
     motions = table[1:]  # the first frame has none
-    timed = motions[motions["reason"] != "missing_frame"]
-    failed = int((motions["status"] == "failed").sum())
-    doubts = motions[(motions["status"] == "ok") & (motions["message"] != "")]
+    states = motions["status"].value_counts()
+    failed = int(states.get("failed", 0))
+    failed_fraction = failed / max(len(motions), 1)
+    times = motions[motions["reason"] != "missing_frame"][["flow_ms", "motion_ms", "frame_ms"]]
+    doubts = motions[(motions["status"] == "ok") & (motions["message"] != "")][:1]
+    warnings = [f"frame {row['index']}: {row['message']}" for row in doubts.to_dict("records")]
+    if failed_fraction > options.max_failed:
+        warnings.append(f"more motions failed than --max-failed {options.max_failed:g} allows")
     # what the estimate was given that no sensor gives
     oracle = ["true flow"] if table["flow_is_true"].any() else []
     oracle += ["true depth"] if sequence.depth_source == "true" else []
     return {
         "sequence": sequence.name,
-        "method": method,
+        "method": options.method,
         "frames": len(table),
         "motions": len(motions),
         "failed": failed,
-        "failed_fraction": failed / max(len(motions), 1),
-        "degraded": int((motions["status"] == "degraded").sum()),
+        "failed_fraction": failed_fraction,
+        "degraded": int(states.get("degraded", 0)),
         "flow_source": sorted(set(table["flow_source"]) - {""}),
         "depth_source": sequence.depth_source,
         "oracle": oracle,
-        **{
-            f"{name}_median": float(timed[name].median()) if len(timed) else None
-            for name in ("flow_ms", "motion_ms", "frame_ms")
-        },
-        "warnings": [f"frame {row['index']}: {row['message']}" for _, row in doubts[:1].iterrows()],
+        **{f"{k}_median": float(x.median()) if len(x) else None for k, x in times.items()},
+        "warnings": warnings,
     }
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import os
 from collections.abc import Mapping
@@ -32,16 +31,12 @@ STEP_COLUMNS = (
 
 
 class RunFolder:
-    """An output folder that is held by one run.
+    """An output folder that is held by one run: ``rows`` of its finished frames, JSON-ready.
 
-    ``header`` (JSON-ready) is what ``run.json`` says; its ``identity`` must be equal for a run to
-    be resumed. ``new`` refuses a folder with results, ``overwrite`` removes those (and no other
-    files), ``resume`` goes on.
-
-    Attributes:
-        rows: of the finished frames, JSON-ready, in order.
-        tracker: the tracker's state after them where the run is resumed, or None.
-        summary: of the run that is resumed where it was complete already, or None.
+    ``header`` (JSON-ready) is what ``run.json`` says. ``new`` refuses a folder with results,
+    ``overwrite`` removes those (and no other files), ``resume`` goes on where the ``identity`` of
+    the header is the same: ``tracker`` is then the state after the rows, or ``summary`` that of a
+    run that was complete.
     """
 
     def __init__(self, path: Path, header: Mapping[str, Any], mode: Mode = "new") -> None:
@@ -91,9 +86,8 @@ class RunFolder:
     def save_rows(self, tracker: Mapping[str, Any] | None = None) -> None:
         """Write ``steps.csv``, and with the tracker's state after the rows the checkpoint."""
         with atomic_write(self.path / STEPS) as file:
-            writer = csv.DictWriter(file, STEP_COLUMNS, extrasaction="ignore", lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(self.rows)
+            table = pd.DataFrame(self.rows, columns=[*STEP_COLUMNS], dtype=object)
+            table.to_csv(file, index=False, lineterminator="\n")
         if tracker is not None:
             with atomic_write(self.path / CHECKPOINT) as file:
                 file.write(json.dumps([self.rows, tracker], default=np.ndarray.tolist))

@@ -30,26 +30,15 @@ class Sequence:
     A reader overrides ``_list_files``, which fills in files, stamps and poses, and
     ``_calibration``; where its files need more than their ending says, ``_read_depth`` and
     ``_read_flow``.
-
-    Attributes:
-        kind: sintel, tartanair, tum, 7scenes, kitti or folder.
-        name: what reports call it. root: its folder.
-        timestamps: (N,) float64 seconds, strictly increasing.
-        poses: (N, 4, 4) T_world_cam in camera axes, NaN rows where unknown, or None.
-        depth_source: ``true`` (synthetic, an oracle), ``sensor``, ``stereo`` or ``file``.
-        flow_is_true: whether its flow files are ground truth (an oracle).
-        warnings: what the user should know: converted stamps, gaps, missing files, doubtful units.
     """
 
-    kind = "sequence"
+    kind = "sequence"  # the key of READERS
     markers: tuple[tuple[str, ...], ...] = ()
     """Groups of names (``glob``); a folder with all of one group is of this kind."""
-    depth_source = "sensor"
-    flow_is_true = False
-    depth_scale: float | None = None
-    """Stored units per metre of the data set's depth; None: metres."""
-    frames_per_second = 30.0
-    """Where the files have no stamps."""
+    depth_source = "sensor"  # or stereo, file, true: of a renderer, an oracle
+    flow_is_true = False  # whether its flow files are ground truth: an oracle
+    depth_scale: float | None = None  # stored units per metre of the data set's depth; None: 1
+    frames_per_second = 30.0  # where the files have no stamps
 
     def __init__(
         self,
@@ -62,9 +51,9 @@ class Sequence:
         self.rgb_files: Files = []
         self.depth_files: Files = []
         self.flow_files: Files = []
-        self.timestamps = np.zeros(0)
-        self.poses: np.ndarray | None = None
-        self.warnings: list[str] = []
+        self.timestamps = np.zeros(0)  # (N,) seconds, strictly increasing
+        self.poses: np.ndarray | None = None  # (N, 4, 4) T_world_cam, NaN where unknown
+        self.warnings: list[str] = []  # what the user should know, in sentences
         self._mask_folder = None if mask is None else Path(mask)
         self._given_camera, self._given_scale = camera, depth_scale
         self._list_files()
@@ -113,9 +102,7 @@ class Sequence:
     def frame(self, index: int) -> Frame:
         """Frame ``index``; ``rgb`` or ``depth`` is None where its file is missing.
 
-        Raises:
-            FileNotFoundError: neither is there. FormatError: a file that cannot be decoded or has
-                another size.
+        Neither there is a FileNotFoundError, a file that cannot be decoded a FormatError.
         """
         files = self.rgb_files[index], self.depth_files[index], self.mask_files[index]
         readers: tuple[Callable[[Path], Any], ...] = read_rgb, self._read_depth, read_mask_png
@@ -137,16 +124,13 @@ class Sequence:
     def flow(self, index: int) -> tuple[np.ndarray, np.ndarray | None]:
         """Flow from frame ``index`` to the next: (H, W, 2) float32 px, and (H, W) bool or None.
 
-        Raises:
-            FileNotFoundError: no flow file for it. FormatError: a damaged one.
+        A FileNotFoundError where there is no file for it, a FormatError where it is damaged.
         """
         if index >= len(self) - 1:
             raise IndexError(f"{self.name}: no flow starts at frame {index} of {len(self)}.")
         path = self.flow_files[index] if self.flow_files else None
         if path is None:
-            raise FileNotFoundError(
-                f"{self.name}: there is no flow file from frame {index} to {index + 1}."
-            )
+            raise FileNotFoundError(f"{self.name}: there is no flow file from frame {index} on.")
         return self._read_flow(path, index)
 
     def files(self) -> list[Path]:
@@ -186,9 +170,11 @@ class Sequence:
         self.flow_files = [flow.get(n) if n + 1 in frames else None for n in numbers]
         self.timestamps = (np.array(numbers) - min(numbers, default=0)) / self.frames_per_second
         if missing := sorted({*range(min(numbers, default=0), max(numbers, default=0))} - frames):
-            told = f"frame numbers {shown(missing)} are missing; the stamps keep the gap"
-            self.warnings.append(f"{self.name}: {told}.")
+            self._warn(f"frame numbers {shown(missing)} are missing; the stamps keep the gap")
         return numbers
+
+    def _warn(self, text: str) -> None:
+        self.warnings.append(f"{self.name}: {text}.")
 
     def _each_pose(self, files: Files, read: Callable[[Path], np.ndarray]) -> None:
         """Take poses of which each frame has a file."""
@@ -209,8 +195,7 @@ class Sequence:
         if found is not None and (found.height, found.width) != size:
             raise InputError(
                 f"{self.root}: images are {self.width}x{self.height}, the camera is for "
-                f"{found.width}x{found.height} pixels. Give the intrinsics of these images "
-                f"(--camera fx,fy,cx,cy or --camera FILE)."
+                f"{found.width}x{found.height} pixels: give theirs (--camera fx,fy,cx,cy or FILE)."
             )
         if self._given_scale is None and found is not None:
             self._given_scale = found.depth_scale
@@ -240,10 +225,9 @@ class Sequence:
             missing = [i for i, path in enumerate(paths) if path is None or not path.exists()]
             if missing and (any(paths) or what != "mask"):
                 such = "" if paths[missing[0]] is None else f", such as {paths[missing[0]]}"
-                told = f"{len(missing)} frames without {what}: {shown(missing)}{such}"
-                self.warnings.append(f"{self.name}: {told}.")
+                self._warn(f"{len(missing)} frames without {what}: {shown(missing)}{such}")
         if self.poses is not None and (lost := int(np.isnan(self.poses[:, 0, 0]).sum())):
-            self.warnings.append(f"{self.name}: {lost} of {len(self)} frames have no true pose.")
+            self._warn(f"{lost} of {len(self)} frames have no true pose")
 
 
 def _first(files: Files, read: Callable[[Path], np.ndarray]) -> tuple[Any, Any]:

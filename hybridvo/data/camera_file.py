@@ -27,11 +27,7 @@ ALIASES = {
 
 @option_group
 class Calibration:
-    """A camera and what is known beside it: what ``camera.yaml`` may hold.
-
-    ``distortion`` holds Brown's k1 k2 p1 p2 [k3 [k4 k5 k6]], nothing for rectified images;
-    ``depth_scale`` the stored units per metre of depth.
-    """
+    """A camera and what is known beside it: what ``camera.yaml`` may hold."""
 
     fx: float
     fy: float
@@ -39,8 +35,8 @@ class Calibration:
     cy: float
     height: int
     width: int
-    distortion: tuple[float, ...] = ()
-    depth_scale: Positive | None = None
+    distortion: tuple[float, ...] = ()  # Brown's k1 k2 p1 p2 [k3 [k4 k5 k6]]; none if rectified
+    depth_scale: Positive | None = None  # stored units per metre of depth
     fps: Positive | None = None
 
     @property

@@ -17,10 +17,9 @@ from hybridvo.data.lists import (
     read_stamps,
     read_timed_poses,
     sorted_files,
-    to_seconds,
 )
 from hybridvo.errors import InputError
-from hybridvo.trajectory import stamp_unit
+from hybridvo.trajectory import stamp_unit, to_seconds
 from hybridvo.types import as_number
 
 
@@ -40,10 +39,8 @@ class FolderSequence(Sequence):
         root, settings, told = self.root, self.root / CAMERA_FILE, self.warnings
         self._settings = read_camera_file(settings, told) if settings.exists() else None
         if self._settings is None and self._given_camera is None:
-            raise InputError(
-                f"{root}: no {CAMERA_FILE}, and no camera is given. Write one with 'hybridvo init "
-                f"{root}' and fill it in, or give --camera fx,fy,cx,cy or --camera FILE."
-            )
+            remedy = f"write one with 'hybridvo init {root}', or give --camera fx,fy,cx,cy or FILE"
+            raise InputError(f"{root}: no {CAMERA_FILE}, and no camera is given: {remedy}.")
         if self._settings is not None and self._given_scale is None:
             self._given_scale = self._settings.depth_scale
         rgb = sorted_files(root / "rgb", IMAGES)
@@ -70,21 +67,16 @@ class FolderSequence(Sequence):
         """Refuse what no frame can be made of, before anything is matched."""
         root, settings = self.root, self._settings
         if not depth:
-            raise InputError(
-                f"{root / 'depth'}: no {'depth' if rgb else 'frames'}: expected a 16-bit PNG, .npy "
-                f"or .dpt for each image in rgb/. hybridvo needs metric depth, from a sensor, "
-                f"stereo or a network."
-            )
+            what = "depth" if rgb else "frames"
+            expected = "a 16-bit PNG, .npy or .dpt of metric depth for each image in rgb/"
+            raise InputError(f"{root / 'depth'}: no {what}: expected {expected}.")
         if self._given_scale is None and any(path.suffix.lower() == ".png" for path in depth):
             raise InputError(
                 f"{root / CAMERA_FILE}: depth/ holds PNG files: 'depth_scale' (units per metre, "
                 f"1000 for millimetres) must be given, there or with --depth-scale."
             )
         if flow and settings is not None and any(settings.distortion):
-            raise InputError(
-                f"{root}: flow/ was computed on distorted images. Undistort the images first and "
-                f"compute flow on those, or remove flow/ and let hybridvo compute it."
-            )
+            raise InputError(f"{root}: flow/ is of distorted images: undistort them, or remove it.")
 
     def _match_depth(self, frames: list[Path], files: list[Path]) -> dict[int, Path | None]:
         """Index of each frame that is kept -> its depth."""
@@ -111,8 +103,7 @@ class FolderSequence(Sequence):
             for k, (a, b) in enumerate(itertools.pairwise(int(path.stem) for path in frames)):
                 if matched[k] is not None and b - a != step:
                     matched[k] = None
-                    told = f"the flow from {a} led to a missing image and is not used"
-                    self.warnings.append(f"{self.name}: {told}.")
+                    self._warn(f"the flow from {a} led to a missing image and is not used")
         return matched
 
     def _stamps_and_poses(self, frames: list[Path]) -> tuple[np.ndarray, np.ndarray | None]:
@@ -126,7 +117,7 @@ class FolderSequence(Sequence):
             fps = self._settings and self._settings.fps
             if not fps:
                 fps = self.frames_per_second
-                told.append(f"{self.name}: no time stamps; {fps:g} frames a second assumed.")
+                self._warn(f"no time stamps; {fps:g} frames a second assumed")
             stamps = np.arange(len(frames)) / fps
         return stamps, truth and poses_at(stamps, *truth)
 

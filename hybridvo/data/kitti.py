@@ -51,19 +51,16 @@ class KittiSequence(Sequence):
             if not self._disparity_at_1m > 0:
                 raise FormatError(f"{calibration}: expected P{right} to the right of P{left}.")
         if images[left] and not depth:
-            raise InputError(
-                f"{root}: no source of depth: expected a folder depth (16-bit PNG, 256 per metre, "
-                f"or .npy in metres) or the right images image_{right}."
-            )
+            expected = f"depth/ (16-bit PNG, 256 per metre, or .npy, metres) or image_{right}/"
+            raise InputError(f"{root}: no source of depth: expected {expected}.")
         depth = {n: path for n, path in depth.items() if n in images[left]}
         numbers = self._list_numbered(images[left], depth)
         self._left = {depth[n]: images[left][n] for n in depth}
         if times.exists():
             stamps, _ = read_stamps(times, told)
             if numbers and numbers[-1] >= len(stamps):
-                raise FormatError(
-                    f"{times}: expected a line for image {numbers[-1]}, got {len(stamps)} lines."
-                )
+                got = f"got {len(stamps)} lines"
+                raise FormatError(f"{times}: expected a line for image {numbers[-1]}, {got}.")
             self.timestamps = stamps[numbers]
         else:
             told.append(f"{times}: not there; {self.frames_per_second:g} frames a second assumed.")

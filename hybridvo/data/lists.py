@@ -10,7 +10,7 @@ import numpy as np
 
 from hybridvo.errors import InputError
 from hybridvo.files import read_rows
-from hybridvo.trajectory import COLUMNS, check_increasing, read_poses, stamp_unit
+from hybridvo.trajectory import COLUMNS, check_increasing, read_poses, to_seconds
 
 IMAGES = (".png", ".jpg", ".jpeg")
 MAX_STAMP_DIFFERENCE_S = 0.02
@@ -50,14 +50,6 @@ def match_files(
 def shown(names: Many[object], most: int = 8) -> str:
     """The first names of a list, for a message."""
     return ", ".join(map(str, names[:most])) + (", ..." if len(names) > most else "")
-
-
-def to_seconds(stamps: np.ndarray, name: str, told: list[str]) -> np.ndarray:
-    """Stamps in seconds, other units converted with a warning; what is not finite becomes NaN."""
-    factor, unit = stamp_unit(stamps)
-    if factor != 1:
-        told.append(f"{name}: stamps are {unit}; converted to seconds.")
-    return np.where(np.isfinite(stamps), stamps, np.nan) / factor
 
 
 def read_stamps(

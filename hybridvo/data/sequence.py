@@ -49,17 +49,10 @@ def open_sequence(
 ) -> Sequence:
     """Open a sequence folder as its data set ships it.
 
-    Args:
-        path: the folder.
-        dataset: one of ``READERS``; detected from the files by default.
-        camera: ``fx,fy,cx,cy`` in pixels, a camera file (``camera.yaml``, ROS ``camera_info``,
-            RealSense intrinsics), or a camera; the data set's by default.
-        depth_scale: stored units per metre of depth; the data set's by default.
-        mask: folder of PNG or JPEG masks, 0 where pixels must not be used.
-
-    Raises:
-        InputError: a folder that is not there, of no known layout, or without frames.
-            FormatError: a list or calibration file that is damaged.
+    ``dataset``, one of ``READERS``, is detected by default. Instead of the data set's own:
+    ``camera`` is ``fx,fy,cx,cy`` in pixels, a file (``camera.yaml``, ROS ``camera_info``, RealSense
+    intrinsics) or a camera, ``depth_scale`` the stored units per metre; ``mask`` is a folder of
+    images, 0 where pixels must not be used. What cannot be read is an InputError.
     """
     if dataset is not None and dataset not in READERS:
         known = ", ".join(READERS)

@@ -48,10 +48,8 @@ class SintelSequence(Sequence):
         depth, flow, cameras, invalid = (_files(self.root, part) for part in parts)
         numbers = self._list_numbered(rgb, depth, flow)
         if not cameras:
-            raise InputError(
-                f"{self.root.parent.parent}: no frame_*.cam in camdata_left/{self.name}. The "
-                f"camera data comes with Sintel's depth, for the training scenes only."
-            )
+            where = self.root.parent.parent / "camdata_left" / self.name
+            raise InputError(f"{where}: no frame_*.cam; they come with Sintel's training depth.")
         self._cameras = [cameras.get(n) for n in numbers]
         self._invalid = [invalid.get(n) for n in numbers]
         self._each_pose(self._cameras, lambda path: invert(read_cam(path)[1]))

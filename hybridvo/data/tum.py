@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 
 from hybridvo.data.base import Sequence
@@ -9,33 +11,21 @@ from hybridvo.data.camera_file import Calibration
 from hybridvo.data.lists import depth_at, poses_at, read_stamps, read_timed_poses
 from hybridvo.geometry import invert, pose_matrix
 
-# Published with the data sets: fx fy cx cy and k1 k2 p1 p2 k3, by what the folder's name holds.
 PUBLISHED = {
-    ("freiburg1", "fr1_"): (
-        (517.306408, 516.469215, 318.643040, 255.313989),
-        (0.262383, -0.953104, -0.005358, 0.002628, 1.163314),
-    ),
-    ("freiburg2", "fr2_"): (
-        (520.908620, 521.007327, 325.141442, 249.701764),
-        (0.231222, -0.784899, -0.003257, -0.000105, 0.917205),
-    ),
-    ("freiburg3", "fr3_"): ((535.4, 539.2, 320.1, 247.6), ()),
-    ("bonn",): (
-        (542.822841, 542.576870, 315.593520, 237.756098),
-        (0.039903, -0.099343, -0.000730, -0.000144, 0.0),
-    ),
+    "freiburg1": "517.306408 516.469215 318.643040 255.313989 .262383 -.953104 -.005358 .002628 "
+    "1.163314",
+    "freiburg2": "520.908620 521.007327 325.141442 249.701764 .231222 -.784899 -.003257 -.000105 "
+    ".917205",
+    "freiburg3": "535.4 539.2 320.1 247.6",
+    "bonn": "542.822841 542.576870 315.593520 237.756098 .039903 -.099343 -.00073 -.000144 0",
 }
+"""fx fy cx cy and k1 k2 p1 p2 k3 as published, by what the folder's name holds."""
 
 # From Bonn's page: the pose of the camera is T_ROS^-1 T T_ROS T_MARKER, T that of the tracked body.
 BONN_ROS = np.array([[-1.0, 0, 0, 0], [0, 0, 1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
 # The published rotation has a scale of 1.0593, which is taken out; the lever arm (m) stays.
-BONN_MARKER = np.array(
-    [
-        [1.0157, 0.1828, -0.2389, 0.0113],
-        [0.0009, -0.8431, -0.6413, -0.0098],
-        [-0.3009, 0.6147, -0.8085, 0.0111],
-    ]
-)
+_MARKER = "1.0157 .1828 -.2389 .0113 .0009 -.8431 -.6413 -.0098 -.3009 .6147 -.8085 .0111"
+BONN_MARKER = np.array(_MARKER.split(), float).reshape(3, 4)
 
 
 class TumSequence(Sequence):
@@ -85,13 +75,14 @@ class TumSequence(Sequence):
         self.poses = poses_at(self.timestamps, stamps, poses)
 
     def _calibration(self) -> Calibration:
-        name = self.name.lower()
-        for keys, (intrinsics, distortion) in PUBLISHED.items():
-            if any(key in name for key in keys):
-                return Calibration(*intrinsics, 480, 640, distortion)
+        name = re.sub("fr([123])_", r"freiburg\1_", self.name.lower())
+        for key, numbers in PUBLISHED.items():
+            if key in name:
+                fx, fy, cx, cy, *distortion = map(float, numbers.split())
+                return Calibration(fx, fy, cx, cy, 480, 640, tuple(distortion))
         intrinsics = (481.2, 480.0, 319.5, 239.5) if self._is_icl else (525.0, 525.0, 319.5, 239.5)
-        self.warnings.append(
-            f"{self.name}: camera {intrinsics} (fx fy cx cy) is assumed: the folder name says "
-            f"neither fr1, fr2, fr3 nor Bonn. Give another one with --camera fx,fy,cx,cy or FILE."
+        self._warn(
+            f"camera {intrinsics} (fx fy cx cy) is assumed: the folder name says neither fr1, fr2, "
+            f"fr3 nor Bonn; give another one with --camera fx,fy,cx,cy or FILE"
         )
         return Calibration(*intrinsics, 480, 640)

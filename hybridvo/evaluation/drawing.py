@@ -115,9 +115,8 @@ def prediction_panels(
 ) -> list[Panel]:
     """The paper's maps of the first pair of a prediction: uncertainty, and errors where known.
 
-    Uncertainty is the geometric mean of the three Laplace scales U at every pixel, the error the
-    mean absolute difference from the ``true`` Euler angles X-Y-Z (3,) of T_curr_prev, degrees, and
-    translation (3,), metres. ``moving`` (H, W) is outlined.
+    The geometric mean of the three scales U, and the mean absolute difference from the ``true``
+    Euler angles X-Y-Z, degrees, and translation, metres. ``moving`` (H, W) is outlined.
     """
     panels = []
     for k, (what, unit) in enumerate((("rotation", "deg"), ("translation", "m"))):
@@ -152,9 +151,8 @@ def integrated_gradients(
 ) -> list[torch.Tensor]:
     """Attributions of a scalar answer, like its inputs (Sundararajan, Taly and Yan, ICML 2017).
 
-    Their sum is the answer for the inputs minus that for zeros, up to the error of the integral:
-    ``steps`` Gauss-Legendre nodes, a forward and a backward pass each; for smooth networks 32 of
-    them leave less than a percent unexplained.
+    Their sum is the answer for the inputs minus that for zeros, but for the error of the integral:
+    32 ``steps`` leave less than a percent.
     """
     nodes, weights = np.polynomial.legendre.leggauss(steps)
     sums = [torch.zeros_like(x) for x in inputs]

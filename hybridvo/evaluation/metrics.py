@@ -5,8 +5,10 @@ What the paths do not determine is a :class:`DegenerateError`; a report holds No
 
 from __future__ import annotations
 
+import contextlib
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
+from operator import attrgetter
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
@@ -25,28 +27,22 @@ KITTI_LENGTHS = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 
 
 class Match(NamedTuple):
-    """Poses (M, 4, 4) of two trajectories that belong together, at (M,) stamps of the truth.
-
-    ``by`` is ``time`` or ``index``, ``reason`` says why no error can be computed from the matches.
-    """
+    """Poses (M, 4, 4) of two trajectories that belong together, at (M,) stamps of the truth."""
 
     est: np.ndarray
     gt: np.ndarray
     stamps: np.ndarray
-    by: str
-    reason: str
+    by: str  # time or index
+    reason: str  # why no error can be computed from them
 
 
 class PathError(NamedTuple):
-    """Distances (M,) of matched positions, m, at (M,) stamps, and their root mean square.
-
-    An estimated position p was taken as ``T_gt_est @ (scale p)``.
-    """
+    """Distances (M,) of matched positions, m, at (M,) stamps, and their root mean square."""
 
     translation: np.ndarray
     stamps: np.ndarray
     rmse: float
-    T_gt_est: np.ndarray
+    T_gt_est: np.ndarray  # an estimated position p was taken as T_gt_est @ (scale p)
     scale: float
 
 
@@ -81,10 +77,7 @@ def ate(found: Match, alignment: Alignment = "se3") -> PathError:
     """Absolute trajectory error: distances of matched positions after the alignment.
 
     ``se3`` (rigid, least squares) is the rule for metric methods; ``sim3`` has a scale, ``origin``
-    makes the first matched poses equal.
-
-    Raises:
-        DegenerateError: too few poses match, or they determine no alignment.
+    makes the first matched poses equal. A DegenerateError where poses determine no alignment.
     """
     if found.reason:
         raise DegenerateError(found.reason)
@@ -112,11 +105,9 @@ def aligned(est: Trajectory, gt: Trajectory) -> tuple[Trajectory, PathError | No
     """
     kinds: tuple[Alignment, ...] = ("se3", "origin")
     for kind in kinds:
-        try:
+        with contextlib.suppress(DegenerateError):
             error = ate(match(est, gt), kind)
-        except DegenerateError:
-            continue
-        return est.transformed(error.T_gt_est, error.scale), error, kind
+            return est.transformed(error.T_gt_est), error, kind
     return est.transformed(gt.T_world_cam[0] @ invert(est.T_world_cam[0])), None, "origin"
 
 
@@ -134,9 +125,6 @@ def rpe(
     """Relative pose errors, metres and degrees, of all (overlapping) poses ``delta`` apart.
 
     In seconds the partner is the pose nearest to that time, at most half a frame away.
-
-    Raises:
-        DegenerateError: too few poses match, or no two are ``delta`` apart.
     """
     if found.reason:
         raise DegenerateError(found.reason)
@@ -217,25 +205,21 @@ def evaluate(
     report["warnings"] = [*estimate.warnings, *gt.warnings]
     reasons: dict[str, str] = {}
 
-    def put(names: Sequence[str], compute: Callable[[], Iterable[Any]]) -> None:
-        values: Iterable[Any] = [None] * len(names)
-        try:
-            values = compute()
-        except DegenerateError as error:
-            reasons.update(dict.fromkeys(names, str(error)))
-        report.update(zip(names, values, strict=False))
-
-    def absolute(kind: Alignment) -> tuple[float, float]:
-        error = ate(found, kind)
-        return error.rmse, error.scale
-
     def relative() -> tuple[float, float, float]:
         translation, degrees = rpe(found, delta, delta_unit)
         return _rms(translation), float(translation.mean()), _rms(degrees)
 
-    put(["ate_rmse_unaligned"], lambda: absolute("none"))
-    put(["ate_rmse_origin"], lambda: absolute("origin"))
-    put(["ate_rmse", "scale"], lambda: absolute(alignment))
-    put(["rpe_trans_rmse", "rpe_trans_mean", "rpe_rot_rmse_deg"], relative)
-    put(["kitti_drift"], lambda: [kitti_drift(found)])
+    computed: dict[str, Callable[[], Any]] = {
+        "ate_rmse_unaligned": lambda: [ate(found, "none").rmse],
+        "ate_rmse_origin": lambda: [ate(found, "origin").rmse],
+        "ate_rmse scale": lambda: attrgetter("rmse", "scale")(ate(found, alignment)),
+        "rpe_trans_rmse rpe_trans_mean rpe_rot_rmse_deg": relative,
+        "kitti_drift": lambda: [kitti_drift(found)],
+    }
+    for names, compute in computed.items():
+        try:
+            report |= zip(names.split(), compute(), strict=True)
+        except DegenerateError as error:
+            report |= dict.fromkeys(names.split())
+            reasons |= dict.fromkeys(names.split(), str(error))
     return report | {"reasons": reasons}

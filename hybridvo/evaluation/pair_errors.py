@@ -42,13 +42,12 @@ def true_motion(sequence: Sequence, prev: int, curr: int) -> np.ndarray | None:
 
 def true_trajectory(sequence: Sequence, indices: Iterable[int]) -> Trajectory | None:
     """True poses of those frames that have one; None where there are none."""
-    if sequence.poses is None:
-        return None
-    known = [i for i in indices if np.isfinite(sequence.poses[i]).all()]
-    if not known:
+    poses = sequence.poses
+    known = [] if poses is None else [i for i in indices if np.isfinite(poses[i]).all()]
+    if poses is None or not known:
         return None
     # text files carry six digits: made orthonormal as the trajectory demands
-    T = np.stack([pose_matrix(sequence.poses[i][:3]) for i in known])
+    T = np.stack([pose_matrix(poses[i][:3]) for i in known])
     return Trajectory(sequence.timestamps[known], T)
 
 
@@ -98,15 +97,11 @@ def pair_errors(
 ) -> dict[str, float | None]:
     """Errors of one estimated ``T_curr_prev`` (4, 4), metres.
 
-    ``depth_prev`` (H, W) is the true depth, metres; not finite or not positive is invalid.
-
-    Returns:
-        ``r_err_deg``: mean over the axes of the absolute Euler X-Y-Z difference, degrees (wrapped
-        to 180). ``t_err``: mean over the components of the absolute translation difference, m.
-        ``epe``: the paper's, px at 128x256. ``epe_l2_px``: mean L2 distance of the ego flows over
-        valid pixels at native size; a pixel that the estimate puts behind the camera counts with
-        the image diagonal. ``rot_err_deg``: geodesic angle. ``trans_err``: norm of the translation
-        difference, m. ``epe`` and ``epe_l2_px`` are None where no pixel is valid.
+    The paper's: ``r_err_deg``, mean absolute difference of the Euler angles X-Y-Z; ``t_err``, that
+    of the translation's components; ``epe``, px at 128x256. ``epe_l2_px``: mean distance of the ego
+    flows at native size; a pixel that the estimate puts behind the camera counts with the image
+    diagonal. ``rot_err_deg``: geodesic angle; ``trans_err``: norm of the difference. Both EPE are
+    None where no pixel has a valid ``depth_prev`` (H, W), metres.
     """
     depth = np.asarray(depth_prev)
     euler = matrix_to_euler_deg(T_est[:3, :3]) - matrix_to_euler_deg(T_gt[:3, :3])
@@ -155,9 +150,6 @@ def pair_facts(
     """What may explain an error: how much moves, how far, before what. What is unknown is absent.
 
     ``flow_gt`` (H, W, 2) is the true flow of everything, px, NaN or beyond 1e9 where unknown.
-
-    ``dynamic_fraction``: share of valid pixels whose true flow differs from the true ego flow by
-    more than 1 px; ``depth_spread``: 90th over 10th percentile of the valid depth.
     """
     if T_gt is None or depth_prev is None:
         return {}

@@ -33,11 +33,7 @@ def plot_trajectory(
     truth: Trajectory | None = None,
     title: str = "",
 ) -> None:
-    """Draw a trajectory from above, and its error where the truth is given; ``path``: a ``.png``.
-
-    It is drawn in the first camera of the truth, else in its own, rigidly aligned, or by the first
-    pose where the path does not determine that (the legend says which).
-    """
+    """Draw a trajectory from above, aligned to the truth and with its error, as a ``.png``."""
     figure = Figure(figsize=(10.0, 7.4), dpi=130, layout="constrained")
     heights = [1.0] if truth is None else [2.0, 1.0]
     above, *below = figure.subplots(len(heights), squeeze=False, height_ratios=heights)[:, 0]
@@ -63,9 +59,7 @@ def plot_trajectory(
         axes.set_axisbelow(True)
     figure.legend(loc="outside lower center", frameon=False, fontsize=9, ncols=3)
     figure.suptitle(title.encode("utf-8", "replace").decode(), fontsize=11, parse_math=False)
-    # a name in letters that the font lacks is drawn as boxes, without a word on stderr for each
-    quiet = warnings.catch_warnings(action="ignore", category=UserWarning)
-    with quiet, atomic_write(path, "wb") as file:
+    with warnings.catch_warnings(action="ignore"), atomic_write(path, "wb") as file:  # of the font
         figure.savefig(file, format="png")
 
 
@@ -79,17 +73,13 @@ def _from_above(path: Trajectory, first: Trajectory) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """An image (H, W, 3) uint8, or a map (h, w) with a bar; NaN is grey.
-
-    Bars of one ``unit`` share their ends: 0 and ``high``, by default the 99th percentile. The
-    border of the ``outline`` (H, W) bool is drawn.
-    """
+    """An image (H, W, 3) uint8, or a map (h, w) with a bar; NaN is grey."""
 
     title: str
     values: np.ndarray
-    unit: str = ""
-    high: float | None = None
-    outline: np.ndarray | None = None
+    unit: str = ""  # bars of one unit share their ends
+    high: float | None = None  # upper end of the bar; default: the 99th percentile
+    outline: np.ndarray | None = None  # (H, W) bool, whose border is drawn
 
     @property
     def top(self) -> float:
@@ -105,18 +95,9 @@ def flow_panel(title: str, flow: np.ndarray, longest: float) -> Panel:
 
 
 def draw_panels(
-    panels: Sequence[Panel],
-    heading: str,
-    aspect: float,
-    *,
-    columns: int = 2,
-    inches: float = 5.4,
+    panels: Sequence[Panel], heading: str, aspect: float, *, columns: int = 2, inches: float = 5.4
 ) -> bytes:
-    """PNG of panels (at least one), ``columns`` in a row, each ``inches`` wide.
-
-    ``aspect`` is width over height of the pair's images; networks see images of another shape,
-    which are shown in it.
-    """
+    """PNG of panels, all with one ratio of width over height, ``columns`` in a row."""
     rows = -(-len(panels) // columns)
     height = rows * (inches / aspect * 0.92 + 0.42) + (0.45 if heading else 0.0)
     figure = Figure(figsize=(columns * inches, height), layout="constrained")

@@ -41,8 +41,7 @@ COLUMNS: tuple[tuple[str, str, float], ...] = (
     ("t_err", "paper's T_err [cm]", 100.0),
     ("dynamic_fraction", "moving [%]", 100.0),
 )
-FLOOR_PX = 1e-4
-"""Smaller errors are drawn here: rounding must not squeeze the logarithmic axis."""
+FLOOR_PX = 1e-4  # smaller errors are drawn here: rounding must not squeeze the axis
 TRUTH = "ground truth"
 LABELS = {
     "epe_l2_px": "EPE [px]",
@@ -101,12 +100,7 @@ def _rank(row: Mapping[str, Any]) -> tuple[float, ...]:
 
 
 def number(value: float | None, digits: int = 3) -> str:
-    """Significant digits without an exponent where it is readable; a dash for None.
-
-    Example:
-        >>> number(1234.5), number(0.012345), number(0.0), number(None)
-        ('1234', '0.0123', '0', '-')
-    """
+    """Significant digits without an exponent where it is readable; a dash for None."""
     if value is None or not math.isfinite(value):
         return "-"
     if value == 0 or abs(value) >= 10**digits:

@@ -56,8 +56,7 @@ def pair_table(pairs: Any) -> pd.DataFrame:
 def failure_rate(pairs: pd.DataFrame) -> dict[str, Any]:
     """``pairs``, ``failures``, ``failure_rate`` and its Wilson interval (95 %) over a table.
 
-    A failure is a failed estimate or an error of the ego flow above one pixel. Pairs whose error is
-    unknown and whose estimate did not fail are left out.
+    A failure is a failed estimate or an error above one pixel; unknown errors are left out.
     """
     failed, epe = pairs["status"].str.startswith("failed"), pairs["epe_l2_px"]
     total, failures = int((failed | epe.notna()).sum()), int((failed | (epe > FAILURE_PX)).sum())
@@ -145,11 +144,7 @@ def check_protocol(sequences: Sequence[Any]) -> None:
 
 
 def protocol_summary(scored: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """What stands under ``protocol`` in ``results.json``, beside the totals: the published lines.
-
-    ``scored`` has the ``name`` and ``pairs_scored`` of each sequence; ``note`` says what of the
-    complete set is missing.
-    """
+    """What stands under ``protocol`` in ``results.json``: published lines, what is missing."""
     protocol = paper_protocol()
     names, count = [s["name"] for s in scored], sum(s["pairs_scored"] for s in scored)
     absent = [name for name in protocol["sequences"] if name not in names]

@@ -28,7 +28,9 @@ def coloured(path: Path, rgb: tuple[int, int, int]) -> int:
 def test_picture_shows_the_path_beside_the_truth(tmp_path, rng):
     truth = random_trajectory(rng)
     path = tmp_path / "trajectory.png"
-    plot_trajectory("hybrid", truth.transformed(np.eye(4), 1.2), path, truth=truth, title="x")
+    T = truth.T_world_cam.copy()
+    T[:, :3, 3] *= 1.2
+    plot_trajectory("hybrid", Trajectory(truth.timestamps, T), path, truth=truth, title="x")
     image = cv2.imread(str(path))
     assert image.shape[0] > 600 and image.shape[1] > 1000
     assert coloured(path, (0x00, 0x72, 0xB2)) > 500

@@ -231,10 +231,10 @@ def test_tartanair_columns_are_ned(tmp_path):
     np.testing.assert_allclose(trajectory.T_world_cam[0, :3, 2], [1, 0, 0], atol=1e-15)
 
 
-def test_transformed_scales_positions_then_moves():
+def test_transformed_moves():
     T = make_transform(np.eye(3), np.array([1.0, 0, 0]))[None]
-    moved = Trajectory([0.0], T).transformed(make_transform(np.eye(3), np.array([0, 5.0, 0])), 2.0)
-    np.testing.assert_allclose(moved.positions, [[2, 5, 0]])
+    moved = Trajectory([0.0], T).transformed(make_transform(np.eye(3), np.array([0, 5.0, 0])))
+    np.testing.assert_allclose(moved.positions, [[1, 5, 0]])
 
 
 @pytest.mark.parametrize(
