@@ -126,7 +126,8 @@ def _given_noise(noise: Any, like: torch.Tensor, with_depth: bool) -> torch.Tens
     known, sizes = value.detach(), (2, 3) if with_depth else (2,)
     fits = value.shape in [shape for n in sizes for shape in ((n,), (len(like), n))]
     if not fits or not ((known >= 0) & (known < torch.inf)).all() or (known[..., ::2] == 0).any():
-        expected = f"noise (sf > 0, sd >= 0{', sz > 0' * with_depth}), one or {len(like)} rows"
+        wanted = f"sf positive, sd not negative{', sz positive' * with_depth}"
+        expected = f"noise ({wanted}), one or {len(like)} rows"
         raise InputError(f"refine_batch: expected {expected}, finite, got {noise!r}.")
     value = value.expand(len(like), value.shape[-1])
     if with_depth and value.shape[1] == 2:
