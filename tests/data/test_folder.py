@@ -89,7 +89,7 @@ def test_images_without_depth_say_that_depth_is_needed(tmp_path):
     write.png(tmp_path / "a" / "0.png", write.image(0, *SIZE))
     write.png(tmp_path / "b" / "rgb" / "0.png", write.image(0, *SIZE))
     for name in "ab":
-        with pytest.raises(InputError, match="of metric depth"):
+        with pytest.raises(InputError, match="needs metric depth"):
             open_sequence(tmp_path / name)
     with pytest.raises(InputError, match="of metric depth"):
         open_sequence(own(tmp_path / "c", ["0"], []))
