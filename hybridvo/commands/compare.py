@@ -35,8 +35,7 @@ from hybridvo.pipeline import METHODS, check_method
 _logger = logging.getLogger(__name__)
 WRITTEN = ("results.json", "results.csv", "pairs.csv", "report.md", "report.html")
 """What a finished comparison leaves, beside ``runs/``."""
-CAMERA_FLOW_KINDS = ("tartanair",)
-"""Data sets whose true flow is that of the camera alone: it does not show what moves by itself."""
+CAMERA_FLOW_KINDS = ("tartanair",)  # whose true flow does not show what moves by itself
 
 
 def compare(

@@ -13,8 +13,7 @@ from hybridvo.files import read_rows
 from hybridvo.trajectory import COLUMNS, check_increasing, read_poses, to_seconds
 
 IMAGES = (".png", ".jpg", ".jpeg")
-MAX_STAMP_DIFFERENCE_S = 0.02
-"""Largest difference in seconds between stamps that belong together (the TUM tools' value)."""
+MAX_STAMP_DIFFERENCE_S = 0.02  # between stamps that belong together: the TUM tools' value
 
 
 def sorted_files(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
