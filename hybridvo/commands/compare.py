@@ -248,8 +248,8 @@ def _pairs(job: _Job, method: str) -> pd.DataFrame:
 
 def _row(job: _Job, table: pd.DataFrame, method: str, run: Mapping[str, Any]) -> dict[str, Any]:
     """Line of the results of a run."""
-    named = {"sequence": job.name, "method": method, "flow_source": job.flow}
-    named |= {"depth_source": job.sequence.depth_source}
+    source = {"flow_source": job.flow, "depth_source": job.sequence.depth_source}
+    named = {"sequence": job.name, "method": method, **source}
     line = scores.sequence_row(table[table["method"] == method], run["metrics"], named)
     return line | {"trajectory": f"runs/{job.folder.name}/{method}/trajectory.tum"}
 

@@ -276,10 +276,8 @@ def frames_of(sequence: Sequence, options: Options) -> range:
     stop = min(options.run.stop or len(sequence), len(sequence))
     frames = range(options.run.start, stop, options.run.stride)
     if not frames:
-        raise InputError(
-            f"{sequence.name}: no frames from {options.run.start} to {stop}: there are "
-            f"{len(sequence)}."
-        )
+        asked = f"from {options.run.start} to {stop}"
+        raise InputError(f"{sequence.name}: no frames {asked}: there are {len(sequence)}.")
     return frames
 
 

@@ -71,10 +71,8 @@ class FolderSequence(Sequence):
             expected = "a 16-bit PNG, .npy or .dpt of metric depth for each image in rgb/"
             raise InputError(f"{root / 'depth'}: no {what}: expected {expected}.")
         if self._given_scale is None and any(path.suffix.lower() == ".png" for path in depth):
-            raise InputError(
-                f"{root / CAMERA_FILE}: depth/ holds PNG files: 'depth_scale' (units per metre, "
-                f"1000 for millimetres) must be given, there or with --depth-scale."
-            )
+            needed = "'depth_scale' (units per metre) must be given, there or with --depth-scale"
+            raise InputError(f"{root / CAMERA_FILE}: depth/ holds PNG files: {needed}.")
         if flow and settings is not None and any(settings.distortion):
             raise InputError(f"{root}: flow/ is of distorted images: undistort them, or remove it.")
 

@@ -40,9 +40,8 @@ def match_files(
     if not any(found) and len(files) == len(frames):
         return [*files]
     if not any(found):
-        raise InputError(
-            f"{where}: {len(files)} files for {len(frames)} frames, and no name agrees. {hint}"
-        )
+        counts = f"{len(files)} files for {len(frames)} frames"
+        raise InputError(f"{where}: {counts}, and no name agrees. {hint}")
     return found
 
 
@@ -87,10 +86,8 @@ def depth_at(
     pairs = associate(stamps, depth_stamps)
     count, limit = len(stamps), MAX_STAMP_DIFFERENCE_S
     if count and not pairs:
-        raise InputError(
-            f"{where}: no frames: none of {count} colour stamps has a depth stamp within {limit} "
-            f"s. Are both in the same unit and of the same clock?"
-        )
+        what = f"none of {count} colour stamps has a depth stamp within {limit} s"
+        raise InputError(f"{where}: no frames: {what}. Are they of one unit and clock?")
     if len(pairs) < count:
         left_out = f"{count - len(pairs)} of {count} colour images have no depth within {limit} s"
         told.append(f"{where.name}: {left_out} and are left out.")
