@@ -156,10 +156,9 @@ class Odometry:
     def track(self, frame: Frame, flow: FlowField | np.ndarray | None = None) -> Step:
         """Pose of the next frame; the first one has the identity as motion, status ok.
 
-        The arrays of ``frame`` are copied: a driver may reuse its buffers. ``flow``, (H, W, 2) px
-        from ``state.frame`` to this one or a FlowField, is given where it is known already; such a
-        frame is never passed over: the next one's flow leads from it. After an InputError (a frame
-        of another size, or a flow that does not fit) the tracker is as it was.
+        The arrays of ``frame`` are copied. ``flow``, (H, W, 2) px from ``state.frame`` to this one,
+        or a FlowField, is given where it is known; such a frame is never passed over. After an
+        InputError (another size, or a flow that does not fit) the tracker is as it was.
         """
         check_kind("Odometry.track", frame, Frame)
         state, frame = self.state, deepcopy(frame)

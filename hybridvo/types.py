@@ -88,10 +88,7 @@ def as_rigid(T: Any, where: str, tolerance: float = 1e-6, *, many: bool = False)
 
 @dataclass(frozen=True)
 class Camera:
-    """Pinhole camera without distortion; focal lengths and centre in pixels of this image size.
-
-    An InputError refuses a centre farther than one image size outside.
-    """
+    """Pinhole camera without distortion; focal lengths and centre in pixels of this image size."""
 
     fx: float
     fy: float

@@ -57,8 +57,7 @@ def run(
 ) -> tuple[dict[str, Any], int]:
     """Estimate, chain, write and score a sequence: a summary, JSON-ready, and the exit code.
 
-    ``out`` is by default ``runs/NAME``; ``rrd`` is the file of a Rerun recording, empty for
-    ``recording.rrd`` in the output folder.
+    ``out`` is by default ``runs/NAME``; an empty ``rrd`` is ``recording.rrd`` in that folder.
     """
     method = options.run.method
     models = models or Models(options.run.device)

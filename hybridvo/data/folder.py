@@ -24,12 +24,7 @@ from hybridvo.types import as_number
 
 
 class FolderSequence(Sequence):
-    """The layout that is easiest to write; docs/own-data.md describes it.
-
-    Stamps come from ``timestamps.txt``, else from ``poses.txt`` where it has a line for each frame,
-    else from file names that are stamps, else from ``fps``. Colour and depth go together by equal
-    names, else by stamps within 0.02 s (colour without depth is left out), else by order.
-    """
+    """The layout that is easiest to write; docs/own-data.md describes it."""
 
     kind = "folder"
     depth_source = "file"

@@ -1,7 +1,4 @@
-"""Errors of a trajectory against ground truth: ATE, RPE, drift as KITTI measures it.
-
-What the paths do not determine is a :class:`DegenerateError`; a report holds None and its reason.
-"""
+"""Errors of a trajectory against ground truth: ATE, RPE, drift as KITTI measures it."""
 
 from __future__ import annotations
 

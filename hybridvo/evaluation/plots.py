@@ -1,7 +1,4 @@
-"""Images of trajectories and of the maps of a pair, by matplotlib.
-
-Uses the object interface: no window, no pyplot, no global state.
-"""
+"""Images of trajectories and of the maps of a pair, by matplotlib without global state."""
 
 from __future__ import annotations
 

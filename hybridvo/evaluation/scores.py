@@ -96,10 +96,7 @@ def sequence_row(
 
 
 def total_row(pairs: pd.DataFrame, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Line of one method over all sequences: pairs pooled, trajectory errors as plain means.
-
-    An error that some ``rows`` lack is the mean over the others, and ``reasons`` says so.
-    """
+    """Line of one method over all sequences: pairs pooled, trajectory errors as plain means."""
     scores = pair_scores(pairs)
     for key in PATH_KEYS:
         known = [row[key] for row in rows if row[key] is not None]
