@@ -87,7 +87,7 @@ def depth_at(
     count, limit = len(stamps), MAX_STAMP_DIFFERENCE_S
     if count and not pairs:
         what = f"none of {count} colour stamps has a depth stamp within {limit} s"
-        raise InputError(f"{where}: no frames: {what}. Are they of one unit and clock?")
+        raise InputError(f"{where}: no frames: {what}. Of the same unit and the same clock?")
     if len(pairs) < count:
         left_out = f"{count - len(pairs)} of {count} colour images have no depth within {limit} s"
         told.append(f"{where.name}: {left_out} and are left out.")
