@@ -7,9 +7,6 @@ tools/calibrate.py`` fits them on pairs of the development recordings of
 flow: "the same pairs" below.
 """
 
-from collections.abc import Sequence
-from math import exp
-
 CUES_RIGHT = (0.26, 1.26)
 """Of the cue scores: 259 of 316 right, AUROC .68, calibration error .05."""
 SELECTOR_RIGHT = (0.51, 0.95)
@@ -92,9 +89,3 @@ be used: 0.02 to 0.12 with even light, with a vignette, a lamp or a gamma of 0.6
 WEAK_RATIO = 2e-5
 """Ratio of the information's extreme eigenvalues below which a direction is degraded: a frontal
 plane over 20 degrees has 1e-4, a patch of 20 px at fx = 1120 has 1e-5."""
-
-
-def right(evidence: Sequence[float], weights: Sequence[float]) -> float:
-    """Probability that a motion is right: logistic in its evidence; the last weight is alone."""
-    value = sum(w * x for w, x in zip(weights, (*evidence, 1.0), strict=True))
-    return 1 / (1 + exp(min(-value, 700.0)))  # exp(700) is finite

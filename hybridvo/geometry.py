@@ -25,6 +25,13 @@ def backproject(depth: np.ndarray, camera: Camera) -> np.ndarray:
     return np.stack([x, y, depth.astype(np.float64)], axis=-1)
 
 
+def points_at(depth: np.ndarray, camera: Camera, index: np.ndarray) -> np.ndarray:
+    """(N, 3) points in metres of the pixels (N, 2), rows and columns, of a depth map."""
+    v, u = index.T
+    z = depth[v, u].astype(np.float64)
+    return np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], axis=1)
+
+
 def project(points: np.ndarray, camera: Camera) -> np.ndarray:
     """(..., 2) pixels of (..., 3) points in the camera frame; NaN for points not in front of it."""
     z = points[..., 2]
@@ -48,10 +55,8 @@ def projection_rows(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.
 def ego_flow(
     depth: np.ndarray, T_curr_prev: np.ndarray, camera_prev: Camera, camera_curr: Camera
 ) -> np.ndarray:
-    """(H, W, 2) flow in pixels that the camera motion alone causes (paper, equation 8).
-
-    F_ego = pi(K_curr, T_curr_prev D K_prev^-1 x) - x; NaN where depth is invalid or the moved point
-    is behind the camera.
+    """(H, W, 2) flow in pixels that the camera motion alone causes (paper, equation 8): pi(K_curr,
+    T_curr_prev D K_prev^-1 x) - x; NaN where depth is invalid or the moved point behind the camera.
     """
     depth = np.asarray(depth, dtype=np.float64)
     valid = np.isfinite(depth) & (depth > 0)
@@ -85,9 +90,13 @@ def invert(T: np.ndarray) -> np.ndarray:
     return out
 
 
-def skew(w: np.ndarray) -> np.ndarray:
-    """(3, 3) matrix of the cross product with ``w``."""
-    return np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
+def chain(T_world_prev: np.ndarray, T_curr_prev: np.ndarray) -> np.ndarray:
+    """Next camera pose: ``T_world_curr = T_world_prev @ inv(T_curr_prev)``, (4, 4)."""
+    T_world_curr = T_world_prev @ invert(T_curr_prev)
+    R = T_world_curr[:3, :3]
+    # one step of the polar decomposition, so that rounding does not accumulate
+    T_world_curr[:3, :3] = R @ (1.5 * np.eye(3) - 0.5 * (R.T @ R))
+    return T_world_curr
 
 
 def se3_exp(delta: np.ndarray) -> np.ndarray:
@@ -123,14 +132,13 @@ def se3_log(T: np.ndarray) -> np.ndarray:
     else:  # near a half turn the sines are lost
         phi = Rotation.from_matrix(R).as_rotvec()
     theta2 = float(phi @ phi)
-    W = skew(phi)
     if theta2 < 1e-8:
         c = 1 / 12 + theta2 / 720
     else:
         theta = np.sqrt(theta2)
         c = (1 - theta / (2 * np.tan(theta / 2))) / theta2
-    V_inverse = np.eye(3) - 0.5 * W + c * (W @ W)
-    return np.concatenate([V_inverse @ T[:3, 3], phi])
+    across = np.cross(phi, T[:3, 3])
+    return np.concatenate([T[:3, 3] - 0.5 * across + c * np.cross(phi, across), phi])
 
 
 def rotation_angle(R: np.ndarray) -> np.ndarray:
@@ -191,11 +199,15 @@ def to_ros_covariance(covariance: np.ndarray, T_prev_curr: np.ndarray) -> np.nda
     return A @ C @ np.swapaxes(A, -1, -2)
 
 
-def njit(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """``numba.njit`` whose cache on disk may fail: each process then compiles for itself.
+def as_contiguous(array: np.ndarray, dtype: Any = None) -> np.ndarray:
+    """Contiguous read-only view: numba compiles a kernel anew, for seconds, for each other kind."""
+    view = np.require(array, dtype, ["C", "A"]).view()
+    view.flags.writeable = False
+    return view
 
-    After a change in a kernel that others call, remove ``__pycache__``.
-    """
+
+def njit(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """``numba.njit`` whose cache on disk may fail: each process then compiles for itself."""
     import numba
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -12,7 +12,7 @@ import numpy as np
 from hybridvo.api import warm_up
 from hybridvo.errors import InputError
 from hybridvo.flow import FlowField, FlowProvider, dis_flow, with_flow
-from hybridvo.geometry import invert, pose_matrix, se3_exp, se3_log
+from hybridvo.geometry import chain, invert, pose_matrix, se3_exp, se3_log
 from hybridvo.network.models import Models, default_models
 from hybridvo.options import Options
 from hybridvo.pipeline import (
@@ -24,7 +24,6 @@ from hybridvo.pipeline import (
     run_method,
 )
 from hybridvo.results import MotionPrior, Reason, RelativePose, Step
-from hybridvo.trajectory import chain
 from hybridvo.types import Frame, FramePair, as_number, as_rigid, as_seed, check_kind
 
 STANDSTILL = 1e-12 * np.eye(6)

@@ -7,7 +7,6 @@ depth) and *refine photometrically* (on the images).
 
 from __future__ import annotations
 
-import contextlib
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -17,17 +16,16 @@ import numpy as np
 from scipy.special import logit
 
 from hybridvo.baselines import pnp, rgbd
-from hybridvo.calibration import PWVO_RIGHT, right
+from hybridvo.calibration import PWVO_RIGHT
 from hybridvo.errors import InputError
 from hybridvo.flow import FlowProvider, contradiction, with_flow
 from hybridvo.hypotheses.generate import HypothesisSet, generate
 from hybridvo.hypotheses.selector import select_by_cues, select_by_scorer
-from hybridvo.images.direct import direct_start
-from hybridvo.images.photometric import refine_photometric
+from hybridvo.images.photometric import direct_start, refine_photometric
 from hybridvo.network.models import SELECTION, Models, default_models, one_thread
 from hybridvo.options import Options
 from hybridvo.refinement import refine as refinement
-from hybridvo.results import MotionPrediction, MotionPrior, Reason, RelativePose
+from hybridvo.results import MotionPrediction, MotionPrior, Reason, RelativePose, right
 from hybridvo.types import FramePair, PairBatch, depth_doubt
 
 DEFAULT_METHOD = "hybrid"
@@ -99,6 +97,7 @@ def classical(pair: FramePair, ctx: Context) -> RelativePose:
     return ctx.refine(pair, found, select_by_cues(found, ctx.prior))
 
 
+@one_thread()
 def hybrid_flow(pair: FramePair, ctx: Context) -> RelativePose:
     """Search, select by the network, which asks PWVO where it is in doubt, refine."""
     pair = with_flow(pair, ctx.flow)
@@ -120,6 +119,7 @@ def hybrid(pair: FramePair, ctx: Context) -> RelativePose:
     return found if ctx.options.photometric.mode == "off" else refine_photometric(pair, found)
 
 
+@one_thread()
 def pwvo_refine(pair: FramePair, ctx: Context) -> RelativePose:
     """PWVO's selected motion and uncertainty seed and weigh the refinement in torch, on its device.
 
@@ -143,6 +143,7 @@ def pwvo_refine(pair: FramePair, ctx: Context) -> RelativePose:
     return found.replace(probability=probability, status=status)
 
 
+@one_thread()
 def network_alone(name: str, pair: FramePair, ctx: Context) -> RelativePose:
     """A network alone, by the paper's selection."""
     from hybridvo.network.prediction import estimate_by_network
@@ -184,8 +185,9 @@ NETWORKS: dict[str, tuple[str, ...]] = {
 def run_method(pair: FramePair, method: str, ctx: Context) -> RelativePose:
     """The motion of a pair by a method, with its name and the milliseconds it took."""
     started = time.perf_counter()
-    with one_thread() if method in NETWORKS else contextlib.nullcontext():
-        found = refinement.widened(METHODS[method](pair, ctx))
+    found = METHODS[method](pair, ctx)
+    if found.usable and found.status.reason is Reason.AMBIGUOUS_MOTION:
+        found = refinement.widened(found)
     if found.ok and not found.status.message and (doubt := depth_doubt(pair.prev.depth)):
         found = found.replace(status=replace(found.status, message=doubt))
     return found.replace(method=method, ms=1e3 * (time.perf_counter() - started))

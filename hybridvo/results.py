@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import enum
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.special import expit
 
 from hybridvo.errors import InputError
 from hybridvo.geometry import invert, rotation_angle
@@ -206,3 +208,8 @@ class PixelwisePrediction:
     log_scale_rotation: torch.Tensor | None = None  # (B, 3, h, w)
     log_scale_translation: torch.Tensor | None = None
     image_size: tuple[int, int] | None = None  # (H, W) of the pairs that the network was given
+
+
+def right(evidence: Sequence[float], weights: Sequence[float]) -> float:
+    """Probability that a motion is right: logistic in its evidence; the last weight is alone."""
+    return float(expit(np.dot(weights, (*evidence, 1.0))))

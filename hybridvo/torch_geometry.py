@@ -1,8 +1,5 @@
-"""Camera geometry and rigid motions in torch: one definition each, on kornia and pypose.
-
-The torch side of :mod:`hybridvo.geometry`, for the refinement, the networks and their training;
-same conventions: ``T_curr_prev`` takes points of the previous camera into the current one, pixel
-centres lie at whole coordinates, tangents are (translation, rotation) and act from the left.
+"""Camera geometry and rigid motions in torch, on kornia and pypose: see also
+:mod:`hybridvo.geometry`, and :mod:`hybridvo.types` for the conventions.
 """
 
 from __future__ import annotations
@@ -82,13 +79,9 @@ def reproject(
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Where the pixels of the previous frame are seen by the current one: x + ego flow.
 
-    ``depth`` (B, H, W) metres; ``T`` T_curr_prev, (B, 4, 4) or pypose SE3 (B, 7); intrinsics
-    (B, 3, 3); a point that moves nearer than ``min_depth`` metres counts as behind the camera.
-
-    Returns:
-        (B, H, W, 2) px on the current image; (B, H, W) bool: the depth is valid and the point in
-        front of the camera (elsewhere the pixels are finite and mean nothing); (B, H, W) depth of
-        the moved point, 1 where there is none.
+    ``depth`` (B, H, W) metres; ``T`` T_curr_prev, (B, 4, 4) or pypose SE3 (B, 7). Returns (B, H, W,
+    2) px; (B, H, W) bool: the depth is valid and the point farther than ``min_depth`` (elsewhere
+    the pixels are finite and mean nothing); (B, H, W) depth of the moved point, else 1.
     """
     if isinstance(T, pp.LieTensor):
         T = T.matrix()

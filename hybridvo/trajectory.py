@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from hybridvo.errors import FormatError, InputError
 from hybridvo.files import Rows, atomic_write, read_rows
-from hybridvo.geometry import invert, ned_to_camera
+from hybridvo.geometry import ned_to_camera
 from hybridvo.types import as_rigid, rotation_error, to_numpy
 
 COLUMNS = {
@@ -21,15 +21,6 @@ COLUMNS = {
 }
 FILE_TOLERANCE = 1e-2
 """Files carry six digits or so: a rotation may be off by that much, a wrong column is far more."""
-
-
-def chain(T_world_prev: np.ndarray, T_curr_prev: np.ndarray) -> np.ndarray:
-    """Next camera pose: ``T_world_curr = T_world_prev @ inv(T_curr_prev)``, (4, 4)."""
-    T_world_curr = T_world_prev @ invert(T_curr_prev)
-    R = T_world_curr[:3, :3]
-    # one step of the polar decomposition, so that rounding does not accumulate
-    T_world_curr[:3, :3] = R @ (1.5 * np.eye(3) - 0.5 * (R.T @ R))
-    return T_world_curr
 
 
 @dataclass(frozen=True, eq=False)

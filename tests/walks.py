@@ -8,8 +8,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from hybridvo.geometry import ego_flow, se3_exp
-from hybridvo.trajectory import Trajectory, chain
+from hybridvo.geometry import chain, ego_flow, se3_exp
+from hybridvo.trajectory import Trajectory
 from hybridvo.types import Camera
 
 REFINE = ("--method", "refine", "--flow", "file", "-q")

@@ -24,14 +24,14 @@ from scipy.special import logit
 
 from hybridvo import dis_flow, estimate, iter_pairs, open_sequence, refine
 from hybridvo.calibration import MIN_CONFIDENCE, PWVO_RIGHT
-from hybridvo.calibration import right as probability
 from hybridvo.evaluation.pair_errors import true_motion
 from hybridvo.geometry import pose_matrix
 from hybridvo.hypotheses.selector import select_by_cues
-from hybridvo.images.direct import direct_start, explained
+from hybridvo.images.photometric import direct_start, explained
 from hybridvo.network.models import Models
 from hybridvo.pipeline import Context
 from hybridvo.results import RelativePose
+from hybridvo.results import right as probability
 from hybridvo.synthetic.semi_real import load_split
 
 HEAVY_SEEDS = range(900, 906)

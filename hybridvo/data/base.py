@@ -5,12 +5,14 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
-from hybridvo.data.camera_file import Calibration, parse_camera, straighten, units_per_metre
+from hybridvo.data.camera_file import Calibration, parse_camera, units_per_metre
 from hybridvo.data.image_io import read_depth, read_flow, read_mask_png, read_rgb
 from hybridvo.data.lists import IMAGES, match_files, shown, sorted_files
 from hybridvo.errors import FormatError, InputError
@@ -239,3 +241,34 @@ def _first(files: Files, read: Callable[[Path], np.ndarray]) -> tuple[Any, Any]:
 def looks_for(kind: type[Sequence]) -> str:
     """What a folder of a kind holds."""
     return f"{kind.kind}: " + ", or ".join(" and ".join(group) for group in kind.markers)
+
+
+def straighten(
+    calibration: Calibration,
+    rgb: np.ndarray | None,
+    depth: np.ndarray | None,
+    mask: np.ndarray | None,
+) -> tuple[np.ndarray | None, np.ndarray | None, np.ndarray]:
+    """Image (bilinear), depth and mask (nearest: never mixed) of the pinhole with the same K.
+
+    The mask is False where the pinhole sees beyond the distorted image.
+    """
+    u, v = _lens(calibration)
+    height, width = u.shape
+    inside: np.ndarray = (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)
+    if rgb is not None:
+        rgb = cv2.remap(rgb, u, v, cv2.INTER_LINEAR)
+    if depth is not None:
+        depth = cv2.remap(depth, u, v, cv2.INTER_NEAREST)
+    if mask is not None:
+        inside &= cv2.remap(mask.view(np.uint8), u, v, cv2.INTER_NEAREST) > 0
+    return rgb, depth, inside
+
+
+@cache
+def _lens(calibration: Calibration) -> tuple[np.ndarray, np.ndarray]:
+    """Columns and rows in the distorted image of the pixels of the pinhole."""
+    K, size = calibration.camera.K, (calibration.width, calibration.height)
+    distortion = np.array(calibration.distortion)
+    u, v = cv2.initUndistortRectifyMap(K, distortion, np.eye(3), K, size, cv2.CV_32FC1)
+    return u, v

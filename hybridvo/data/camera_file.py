@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import os
-from functools import cache
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from hybridvo.errors import FormatError, InputError
@@ -125,34 +123,3 @@ def write_camera_template(directory: str | os.PathLike[str]) -> Path:
     with atomic_write(path) as file:
         file.write(Path(__file__).with_name("camera_template.yaml").read_text(encoding="utf-8"))
     return path
-
-
-def straighten(
-    calibration: Calibration,
-    rgb: np.ndarray | None,
-    depth: np.ndarray | None,
-    mask: np.ndarray | None,
-) -> tuple[np.ndarray | None, np.ndarray | None, np.ndarray]:
-    """Image (bilinear), depth and mask (nearest: never mixed) of the pinhole with the same K.
-
-    The mask is False where the pinhole sees beyond the distorted image.
-    """
-    u, v = _lens(calibration)
-    height, width = u.shape
-    inside: np.ndarray = (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)
-    if rgb is not None:
-        rgb = cv2.remap(rgb, u, v, cv2.INTER_LINEAR)
-    if depth is not None:
-        depth = cv2.remap(depth, u, v, cv2.INTER_NEAREST)
-    if mask is not None:
-        inside &= cv2.remap(mask.view(np.uint8), u, v, cv2.INTER_NEAREST) > 0
-    return rgb, depth, inside
-
-
-@cache
-def _lens(calibration: Calibration) -> tuple[np.ndarray, np.ndarray]:
-    """Columns and rows in the distorted image of the pixels of the pinhole."""
-    K, size = calibration.camera.K, (calibration.width, calibration.height)
-    distortion = np.array(calibration.distortion)
-    u, v = cv2.initUndistortRectifyMap(K, distortion, np.eye(3), K, size, cv2.CV_32FC1)
-    return u, v

@@ -9,12 +9,13 @@ import cv2
 import numpy as np
 
 from hybridvo.calibration import CLEAR_BEND_PX, CLEAR_COHERENCE
+from hybridvo.geometry import as_contiguous
 from hybridvo.hypotheses import search
 from hybridvo.options import Options
 from hybridvo.refinement import kernels
 from hybridvo.refinement.coarse_fit import fit_coarse, residual_coherence
 from hybridvo.refinement.depth import look_up
-from hybridvo.refinement.pixels import CoarseGrid, as_contiguous, coarse_grid
+from hybridvo.refinement.pixels import PixelGrid, coarse_grid
 from hybridvo.results import Reason, RelativePose
 from hybridvo.types import Frame, FramePair
 
@@ -24,52 +25,33 @@ CHANCE_COHERENCE = 0.05
 
 @dataclass(frozen=True, eq=False)
 class GridMaps:
-    """What is known about each pixel of the coarse grid; as arrays, or as tensors of a batch.
+    """What is known about each pixel (h, w) of the grid; as arrays, or as tensors of a batch."""
 
-    Args:
-        ray: (2, h, w) K^-1 x without the one. depth: (h, w) metres, previous frame.
-        target: (2, h, w) px, x + flow in the current image.
-        flow_variance, depth_variance: (h, w) relative to the typical one.
-        usable: (h, w) bool, flow and depth are there. seen: depth is, with or without flow.
-        log_depth_curr: (h, w) log metres of the current frame at the target; NaN where unknown or
-            at an edge. log_depth_seen: the same on the current frame's own grid.
-        image_prev, image_curr: (h, w) grey levels, each frame on its own grid; 0 without.
-        K: (4,) fx, fy, cx, cy of the current camera.
-        width: px, of the whole image. stride: px between the grid's pixels.
-    """
-
-    ray: Any
-    depth: Any
-    target: Any
-    flow_variance: Any
+    ray: Any  # (2, h, w) K^-1 x without the one
+    depth: Any  # metres, previous frame
+    target: Any  # (2, h, w) px, x + flow in the current image
+    flow_variance: Any  # relative to the typical one
     depth_variance: Any
-    usable: Any
-    log_depth_curr: Any
-    K: Any
-    width: Any
-    stride: Any
-    seen: Any
-    image_prev: Any
+    usable: Any  # bool, flow and depth are there
+    log_depth_curr: Any  # log metres of the current frame at the target; NaN if unknown, at an edge
+    K: Any  # (4,) fx, fy, cx, cy of the current camera
+    width: Any  # px, of the whole image
+    stride: Any  # px between the grid's pixels
+    seen: Any  # bool, depth is there, with or without flow
+    image_prev: Any  # grey levels, each frame on its own grid; 0 without
     image_curr: Any
-    log_depth_seen: Any
+    log_depth_seen: Any  # log metres of the current frame on its own grid
 
 
 @dataclass(frozen=True, eq=False)
 class HypothesisSet:
-    """The motions found, in the order found, and the pixels they were found on.
-
-    Args:
-        pair: the input. grid: its coarse grid.
-        poses: (M, 3, 4) T_curr_prev. facts: (M, :data:`hybridvo.hypotheses.search.FACTS`).
-        is_ambiguous: False where the first motion explains the image beyond doubt; no other was
-            looked for then.
-    """
+    """The motions found, in the order found, and the pixels they were found on."""
 
     pair: FramePair
-    grid: CoarseGrid
-    poses: np.ndarray
-    facts: np.ndarray
-    is_ambiguous: bool
+    grid: PixelGrid
+    poses: np.ndarray  # (M, 3, 4) T_curr_prev
+    facts: np.ndarray  # (M, hybridvo.hypotheses.search.FACTS)
+    is_ambiguous: bool  # False where the first explains the image beyond doubt: it is the only one
 
     def maps(self) -> GridMaps:
         """The pixels of the grid as images."""
@@ -88,7 +70,7 @@ class HypothesisSet:
             depth_variance=maps[kernels.PD],
             usable=maps[kernels.W] > 0,
             log_depth_curr=log_depth.reshape(h, w),
-            K=grid.pixels.K,
+            K=grid.K,
             width=pair.prev.camera.width,
             stride=stride,
             seen=np.isfinite(_log_depth(pair.prev, grid)),
@@ -98,7 +80,7 @@ class HypothesisSet:
         )
 
 
-def _grey(frame: Frame, grid: CoarseGrid) -> np.ndarray:
+def _grey(frame: Frame, grid: PixelGrid) -> np.ndarray:
     """(h, w) float32 grey levels, each the mean of what it stands for; 0 without an image."""
     if frame.rgb is None:
         return np.zeros(grid.shape[:2], np.float32)
@@ -106,7 +88,7 @@ def _grey(frame: Frame, grid: CoarseGrid) -> np.ndarray:
     return cv2.blur(grey, (grid.shape[2],) * 2)[grid.places].astype(np.float32)
 
 
-def _log_depth(frame: Frame, grid: CoarseGrid) -> np.ndarray:
+def _log_depth(frame: Frame, grid: PixelGrid) -> np.ndarray:
     """(h, w) float32 log metres; NaN where unknown."""
     if frame.depth is None:
         return np.full(grid.shape[:2], np.nan, np.float32)
@@ -124,8 +106,8 @@ def generate(
 ) -> HypothesisSet | RelativePose:
     """Every strong motion of a pair with flow, or the failure that says why there is none.
 
-    ``starts`` (S, 4, 4): T_curr_prev to start from, beside those that the search makes; ``seed`` of
-    its minimal samples; ``weights`` (H, W): factors on the information of each pixel.
+    ``starts`` (S, 4, 4) stand beside those that the search makes, ``seed`` draws its samples;
+    ``weights`` (H, W): factors on the information of each pixel.
     """
     grid = coarse_grid(pair, weights, options.refine)
     if isinstance(grid, RelativePose):
@@ -140,24 +122,20 @@ def generate(
     return HypothesisSet(pair, grid, poses, facts, not clear)
 
 
-def _is_rigid(grid: CoarseGrid, pose: np.ndarray, fact: np.ndarray, width: int) -> bool:
+def _is_rigid(grid: PixelGrid, pose: np.ndarray, fact: np.ndarray, width: int) -> bool:
     """Whether the residuals of a motion look like noise, not like a bent compromise of two."""
     h, w, _ = grid.shape
     noise = fact[search.FLOW_NOISE], fact[search.DEPTH_NOISE]
-    coherence = residual_coherence(grid.samples, h, w, pose, grid.pixels.K, *noise)
+    coherence = residual_coherence(grid.samples, h, w, pose, grid.K, *noise)
     excess = max(coherence - CHANCE_COHERENCE, 0.0)
-    bend_px = np.sqrt(excess * grid.pixels.scale[0]) * noise[0] * search.REFERENCE_WIDTH / width
+    bend_px = np.sqrt(excess * grid.scale[0]) * noise[0] * search.REFERENCE_WIDTH / width
     return bool(coherence < CLEAR_COHERENCE and bend_px < CLEAR_BEND_PX)
 
 
 def fit_in_mask(
     samples: np.ndarray, mask: np.ndarray, K: np.ndarray, pose: np.ndarray, cutoff: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A pose (3, 4) fitted inside a mask, and its facts.
-
-    ``samples``: pixel buffer of a grid; ``mask`` (h, w): factors on their weights; ``K`` (4,)
-    float32: fx, fy, cx, cy; ``cutoff`` of the robust kernel.
-    """
+    """A pose (3, 4) fitted to a pixel buffer inside a mask (h, w), and its facts."""
     masked = samples.copy()
     masked[kernels.W, : mask.size] *= mask.reshape(-1)
     pose, sf, sd, share, iterations = fit_coarse(masked, mask.size, K, pose, cutoff)

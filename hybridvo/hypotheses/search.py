@@ -1,9 +1,8 @@
 """Every strong motion in the image, one after the other.
 
 Candidates are poses handed in, robust dense fits of overlapping windows and minimal three-pixel
-samples. The best few of a round are refined, and the pixels that follow the winner are set aside
-before the next one. The winner may be a compromise that takes the pixels of a weaker motion with
-it, so the others of a round are kept, behind all winners.
+samples. The best few of a round are refined, and the pixels that follow the winner, which may be a
+compromise, are set aside before the next one; the others are kept, behind all winners.
 """
 
 from __future__ import annotations
@@ -16,27 +15,13 @@ import numpy as np
 from hybridvo.calibration import ASIDE, SETTLED_COHERENCE
 from hybridvo.geometry import njit
 from hybridvo.options import Options
-from hybridvo.refinement.coarse_fit import (
-    DEPTH_NOISE_CAP,
-    FLOW_NOISE_CAP,
-    NOISE_PIXELS,
-    anneal,
-    left_update,
-    noise_of,
-    reestimate,
-    residual_coherence,
-    residual_scale,
-    robust_weights,
-    solve6,
-    translation_scale,
-)
+from hybridvo.refinement import coarse_fit, kernels
 from hybridvo.refinement.kernels import FASTMATH, MAX_VALUE, MU, MV, XN, YN, W, Z
-from hybridvo.refinement.pixels import CoarseGrid
+from hybridvo.refinement.pixels import PixelGrid
 
 WINDOW_ROWS, WINDOW_COLUMNS = 3, 4
 MINIMAL_SAMPLES, MINIMAL_STEPS = 384, 3
-"""Samples of three pixels for the first motion, a third of them for every further one; and Newton
-steps of each."""
+"""Samples of three pixels for the first motion (a third for further ones); Newton steps of each."""
 REFINED = 4
 """Candidates of a round that are refined."""
 WIDE_PX, NEAR_PX = 64.0, 1.5
@@ -44,11 +29,9 @@ WIDE_PX, NEAR_PX = 64.0, 1.5
 SAME_RAD = 2e-4
 """Entries of two poses up to which they are one motion; translations in typical depths."""
 SETTLED = 0.5
-"""Share of the image above which a motion without coherent residuals is taken as it is: no other
-can hold as much, and further ones are looked for in what it leaves."""
+"""Share of the image above which a motion without coherent residuals is taken as it is."""
 FIRMLY = np.float32(2.5)
-"""Factor on the robust weight that is set aside: nothing is left within 1.5 standard deviations, or
-the same motion would be found again."""
+"""Factor on the robust weight that is set aside: or the same motion would be found again."""
 
 SHARE, FLOW_NOISE, DEPTH_NOISE, SOURCE, ITERATIONS = range(5)
 FACTS = 5
@@ -62,20 +45,19 @@ OTHER_PX = 3.0
 
 
 class Motion(NamedTuple):
-    """A pose T_curr_prev (3, 4) and its facts (FACTS,)."""
+    """A motion found."""
 
-    pose: np.ndarray
-    facts: np.ndarray
+    pose: np.ndarray  # (3, 4) T_curr_prev
+    facts: np.ndarray  # (FACTS,)
 
 
 def find_motions(
-    grid: CoarseGrid, starts: np.ndarray, options: Options, seed: int
+    grid: PixelGrid, starts: np.ndarray, options: Options, seed: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Poses (N, 3, 4) of all strong motions, the strongest first, and their facts (N, FACTS).
 
-    The first is sought from the handed-in starts (S, 3, 4), the first of them seen from afar only;
-    where these find none that is settled, and for every further one, windows and minimal samples
-    compete as well. ``seed`` draws the samples.
+    The first is sought from the starts (S, 3, 4); where these find none that is settled, and for
+    every further one, windows and minimal samples, drawn by ``seed``, compete as well.
     """
     limits, search = options.search, _Search(grid, options, seed)
     motions: list[Motion] = []
@@ -106,22 +88,20 @@ def find_motions(
 class _Search:
     """The pixels of a pair, what the motions set aside have ``left`` of them, and all ``seen``."""
 
-    def __init__(self, grid: CoarseGrid, options: Options, seed: int) -> None:
-        self.grid, self.K, self.cutoff = grid, grid.pixels.K, options.refine.cutoff
-        self.small, *self.small_shape, _ = grid.pixels.samples(options.search.grid_pixels)
+    def __init__(self, grid: PixelGrid, options: Options, seed: int) -> None:
+        self.grid, self.K, self.cutoff = grid, grid.K, options.refine.cutoff
+        self.small, *self.small_shape, _ = grid.sampled(options.search.grid_pixels)
         self.samples, self.probes = grid.samples.copy(), Probes(grid)
-        self.similar = translation_scale(grid.samples, grid.count)
+        self.similar = coarse_fit.translation_scale(grid.samples, grid.count)
         self.rng = np.random.default_rng(seed)
         self.seen: list[Motion] = []
-        self.total = self._weight()
-
-    def _weight(self) -> float:
-        return float(self.samples[W, : self.grid.count].sum(dtype=np.float64))
+        self.total = float(grid.weight.sum(dtype=np.float64))
 
     @property
     def left(self) -> float:
         """Share of the weight that is not set aside."""
-        return self._weight() / self.total if self.total > 0 else 0.0
+        n = self.grid.count
+        return float(self.samples[W, :n].sum(dtype=np.float64)) / max(self.total, 1e-12)
 
     def round(self, starts: np.ndarray, samples: int) -> list[Motion]:
         """Motions of the pixels that are left, the strongest first."""
@@ -135,7 +115,7 @@ class _Search:
             gaps = np.abs(poses - poses[k]) * [1, 1, 1, self.similar]
             scores[gaps.max(axis=(1, 2)) < SAME_RAD] = 0
             pose = poses[k].copy()
-            steps = anneal(small, n, self.K, 1.5, 0.7, 0.4, 3, pose)
+            steps = coarse_fit.anneal(small, n, self.K, 1.5, 0.7, 0.4, 3, pose)
             refined.append((self._score(pose), pose, sources[k], steps))
         found: list[Motion] = []
         for score, pose, source, steps in sorted(refined, key=lambda each: -each[0]):
@@ -150,12 +130,12 @@ class _Search:
         (h, w), small = self.small_shape, self.small
         poses, sources = [], []
         for s, start in enumerate(starts):
-            far = min(WIDE_PX, max(1.0, 1.5 * residual_scale(small, h * w, start, self.K)))
+            far = 1.5 * coarse_fit.residual_scale(small, h * w, start, self.K)
             # what the caller hands in also from nearby: where most of the image moves a wide kernel
             # would leave even the right motion
-            for scale in (far, NEAR_PX)[: 1 + (s > 0)]:
+            for scale in (min(WIDE_PX, max(1.0, far)), NEAR_PX)[: 1 + (s > 0)]:
                 pose = start.copy()
-                anneal(small, h * w, self.K, scale, 0.7, 0.4, 2, pose)
+                coarse_fit.anneal(small, h * w, self.K, scale, 0.7, 0.4, 2, pose)
                 poses.append(pose)
                 sources.append(s)
         if samples:
@@ -179,8 +159,8 @@ class _Search:
             if (m := few.shape[1]) < 20 or few[W].sum() < 12.0:
                 continue
             pose = np.eye(3, 4)
-            scale = min(WIDE_PX, max(1.0, residual_scale(few, m, pose, self.K)))
-            anneal(few, m, self.K, scale, 0.7, 0.4, 2, pose)
+            scale = min(WIDE_PX, max(1.0, coarse_fit.residual_scale(few, m, pose, self.K)))
+            coarse_fit.anneal(few, m, self.K, scale, 0.7, 0.4, 2, pose)
             if (np.abs(pose) < MAX_VALUE).all():
                 poses.append(pose)
         return poses
@@ -191,10 +171,10 @@ class _Search:
     def _finished(self, pose: np.ndarray, source: int, steps: int) -> Motion:
         """The motion fitted on all pixels that are left, with its noise."""
         pixels = self.samples, self.grid.count, self.K
-        steps += anneal(*pixels, 0.7, 0.5, 0.4, 3, pose)
-        final, caps = pose.copy(), (FLOW_NOISE_CAP, DEPTH_NOISE_CAP)
-        sf, sd, share, more = reestimate(
-            *pixels, 0.5, 0.01, *caps, self.cutoff, 2, 4, NOISE_PIXELS, final
+        steps += coarse_fit.anneal(*pixels, 0.7, 0.5, 0.4, 3, pose)
+        final, caps = pose.copy(), (coarse_fit.FLOW_NOISE_CAP, coarse_fit.DEPTH_NOISE_CAP)
+        sf, sd, share, more = coarse_fit.reestimate(
+            *pixels, 0.5, 0.01, *caps, self.cutoff, 2, 4, coarse_fit.NOISE_PIXELS, final
         )
         if self._score(final) > 0.95 * self._score(pose):
             pose = final
@@ -203,36 +183,34 @@ class _Search:
     def set_aside(self, motion: Motion) -> None:
         """Scale the weights of the pixels that follow a motion down to what it leaves."""
         pose, facts = motion
-        noise = noise_of(max(facts[FLOW_NOISE], 0.05), facts[DEPTH_NOISE], ASIDE * self.cutoff)
+        sf, sd = max(facts[FLOW_NOISE], 0.05), facts[DEPTH_NOISE]
+        noise = coarse_fit.noise_of(sf, sd, ASIDE * self.cutoff)
         h, w = self.small_shape
         for samples, n in ((self.samples, self.grid.count), (self.small, h * w)):
-            follows = robust_weights(samples, n, pose, self.K, noise)
+            follows = coarse_fit.robust_weights(samples, n, pose, self.K, noise)
             samples[W, :n] *= np.maximum(0, 1 - FIRMLY * follows)
 
     def is_settled(self, motion: Motion) -> bool:
         """Whether no other motion can hold as much of the image, and this one is no compromise."""
-        pose, facts = motion
+        (pose, facts), (h, w, _) = motion, self.grid.shape
         if facts[SHARE] < SETTLED:
             return False
-        h, w, _ = self.grid.shape
         noise = facts[FLOW_NOISE], facts[DEPTH_NOISE]
-        coherence = residual_coherence(self.samples, h, w, pose, self.K, *noise)
+        coherence = coarse_fit.residual_coherence(self.samples, h, w, pose, self.K, *noise)
         return bool(coherence < SETTLED_COHERENCE)
 
 
 class Probes:
     """Points of a grid that tell motions apart."""
 
-    def __init__(self, grid: CoarseGrid) -> None:
+    def __init__(self, grid: PixelGrid) -> None:
         samples = grid.samples[:, : grid.count : 7]
         samples = samples[:, samples[W] > 0]
         self.points = np.stack([samples[XN], samples[YN], np.ones_like(samples[Z])]) * samples[Z]
-        self.focal, self.unit = grid.pixels.K[:2, None], REFERENCE_WIDTH / grid.size[1]
+        self.focal, self.unit = grid.K[:2, None], REFERENCE_WIDTH / grid.size[1]
 
     def distances(self, poses: Sequence[np.ndarray], of: int) -> np.ndarray:
-        """(N,) mean distance between where poses (N, 3, 4) bring the points and where one of them
-        does, px at a width of 1024.
-        """
+        """(N,) mean distance between where poses bring the points and one does, px of 1024."""
         P = np.stack(poses).astype(np.float32)
         moved = P[:, :, :3] @ self.points + P[:, :, 3:]
         seen = moved[:, :2] / np.maximum(moved[:, 2:], 1e-3) * self.focal
@@ -283,16 +261,12 @@ def fit_minimal(samples, pick, pose, K):
     rows, sums, delta = np.empty((6, 7)), np.empty(27), np.empty(6)
     pose[:] = np.eye(3, 4)
     for _ in range(MINIMAL_STEPS):
+        entries = kernels.pose_entries(pose)
         for m in range(3):
             k = pick[m]
-            x, y, z = samples[XN, k], samples[YN, k], samples[Z, k]
-            X = z * (pose[0, 0] * x + pose[0, 1] * y + pose[0, 2]) + pose[0, 3]
-            Y = z * (pose[1, 0] * x + pose[1, 1] * y + pose[1, 2]) + pose[1, 3]
-            Zc = z * (pose[2, 0] * x + pose[2, 1] * y + pose[2, 2]) + pose[2, 3]
-            if not Zc > 1e-6:
+            a, b, i, front = kernels.see(samples[XN, k], samples[YN, k], samples[Z, k], entries)
+            if not front:
                 return False
-            i = 1.0 / Zc
-            a, b = X * i, Y * i
             u = (samples[MU, k] - K[2]) / K[0] - a
             v = (samples[MV, k] - K[3]) / K[1] - b
             rows[2 * m] = (i, 0.0, -a * i, -a * b, 1.0 + a * a, -b, u)
@@ -305,18 +279,16 @@ def fit_minimal(samples, pick, pose, K):
                     sums[q] += row[i] * row[j]
                     q += 1
                 sums[21 + i] += row[i] * row[6]
-        if not solve6(sums, 0.0, delta):
+        if not coarse_fit.solve6(sums, 0.0, delta):
             return False
-        left_update(delta, pose.copy(), pose)
+        coarse_fit.left_update(delta, pose.copy(), pose)
     return np.all(np.abs(pose) < MAX_VALUE)
 
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
 def score_poses(samples, n, poses, K):
-    """(M,) scores of poses (M, 3, 4): sums of 1 / (1 + (r / 0.15)^2) and 1 / (1 + (r / 0.9)^2)^2.
-
-    The fine scale lets an exact motion win over a vague one, the coarse one keeps noisy flow in
-    play; a wider scale yet makes compromises between two motions win (measured).
+    """(M,) scores of poses (M, 3, 4): sums of 1 / (1 + (r / 0.15)^2) and 1 / (1 + (r / 0.9)^2)^2:
+    an exact motion wins over a vague one, and noisy flow stays in play.
     """
     scores = np.empty(len(poses))
     fx, fy, cx, cy = K[0], K[1], K[2], K[3]

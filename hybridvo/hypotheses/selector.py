@@ -1,8 +1,6 @@
-"""Which of the motions found is the camera's, and which pixels are static.
-
-By hand-made cues; or by a scorer, which is handed in (a network; this package knows none): the
-motions are scored, the best are fitted again inside the static masks that the scorer draws about
-them, and all are scored once more.
+"""Which of the motions found is the camera's, and which pixels are static: by hand-made cues; or by
+a scorer that is handed in (a network): the motions are scored, the best are fitted again inside the
+static masks that the scorer draws about them, and all are scored once more.
 """
 
 from __future__ import annotations
@@ -13,14 +11,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hybridvo.calibration import CLEAR_RIGHT, CUE_WEIGHTS, CUES_RIGHT, SELECTOR_RIGHT, right
+from hybridvo.calibration import CLEAR_RIGHT, CUE_WEIGHTS, CUES_RIGHT, SELECTOR_RIGHT
 from hybridvo.geometry import invert, pose_matrix, se3_log
 from hybridvo.hypotheses import search
 from hybridvo.hypotheses.generate import GridMaps, HypothesisSet, fit_in_mask
 from hybridvo.options import Options
 from hybridvo.refinement import coarse_fit, kernels
 from hybridvo.refinement.refine import Selection
-from hybridvo.results import Hypothesis, MotionPrediction, MotionPrior
+from hybridvo.results import Hypothesis, MotionPrediction, MotionPrior, right
 
 SUPPORT_CUTOFF = 3.0
 """Cutoff of the robust kernel by which the inliers of a motion are told, standard deviations."""
@@ -29,8 +27,7 @@ MIN_NOISE_PX = 0.05
 MASK_RAMP = (0.4, 0.9)
 """Probabilities of being static between which the weights of a fit grow from 0 to 1."""
 ROUNDS = 3
-"""Most rounds of refits; only a refit that is the best goes into another one, inside its own mask.
-On 120 development pairs with DIS flow one round leaves a median error of 0.075 px, three 0.072."""
+"""Most rounds of refits; only a refit that is the best goes into another one."""
 NO_RIVAL = 8.0
 """Gap of the scores where there is no other motion, and the largest that counts."""
 MIN_COVERAGE = 0.02
@@ -38,8 +35,7 @@ MIN_COVERAGE = 0.02
 BORDER = 0.06
 """Width of the border band, as a share of the image's shorter side (at least one cell)."""
 SMALL, DOMINANT = 0.2, 0.8
-"""Inlier ratios up to which a motion's size says nothing against it, and above which a motion is
-the camera's whatever its cues."""
+"""Inlier ratios up to which a motion's size says nothing, and above which it says it all."""
 SOURCES = {
     search.SOURCE_WINDOW: "window",
     search.SOURCE_MINIMAL: "minimal",
@@ -49,29 +45,20 @@ SOURCES = {
 
 
 class Candidate(NamedTuple):
-    """A motion to be scored: of the search, or a refit made inside a ``mask`` (h, w).
+    """A motion to be scored: of the search, or a refit made inside a mask (h, w)."""
 
-    ``pose`` (3, 4) T_curr_prev; its ``facts``, see :mod:`hybridvo.hypotheses.search`; ``parent``:
-    number of the motion of the search that it goes back to.
-    """
-
-    pose: np.ndarray
-    facts: np.ndarray
-    parent: int
+    pose: np.ndarray  # (3, 4) T_curr_prev
+    facts: np.ndarray  # see hybridvo.hypotheses.search
+    parent: int  # number of the motion of the search that it goes back to
     mask: np.ndarray | None = None
 
 
 class Scores(NamedTuple):
-    """A scorer's answer.
+    """A scorer's answer."""
 
-    ``score`` (N,): larger is more likely the camera's motion; ``static``: by candidate, the best
-    first, the probability (h, w) of every pixel of being static; ``confidence``: probability that
-    the candidate with the largest score is right.
-    """
-
-    score: np.ndarray
-    static: dict[int, np.ndarray]
-    confidence: float
+    score: np.ndarray  # (N,) larger is more likely the camera's motion
+    static: dict[int, np.ndarray]  # of candidates, best first: probability (h, w) of being static
+    confidence: float  # probability that the candidate with the largest score is right
 
 
 Scorer = Callable[[Sequence[Candidate], int], Scores]
@@ -104,8 +91,7 @@ def select_by_scorer(
 ) -> Selection:
     """The motion selected by a scorer and its masks: score, fit again inside masks, score again.
 
-    ``prediction``, of another network: one candidate more, and where it sees the static scene;
-    of the options ``select`` and ``refine`` are read.
+    ``prediction``, of another network: one candidate more, and where it sees the static scene.
     """
     candidates, static = _searched(found), None
     if not found.is_ambiguous:
@@ -134,8 +120,7 @@ def select_by_scorer(
 
 
 def _searched(found: HypothesisSet) -> list[Candidate]:
-    motions = zip(found.poses, found.facts, strict=True)
-    return [Candidate(pose, facts, k) for k, (pose, facts) in enumerate(motions)]
+    return [Candidate(found.poses[k], found.facts[k], k) for k in range(len(found.poses))]
 
 
 def _refits(
@@ -147,7 +132,7 @@ def _refits(
         mask = mask_weights(static)
         if _coverage(found, mask) >= MIN_COVERAGE:
             grid = found.grid
-            pose, facts = fit_in_mask(grid.samples, mask, grid.pixels.K, start, cutoff)
+            pose, facts = fit_in_mask(grid.samples, mask, grid.K, start, cutoff)
             if np.isfinite(pose).all() and facts[search.SHARE] > 0:
                 refits.append(Candidate(pose, facts, parent, mask))
     return refits
@@ -174,7 +159,7 @@ def nearest_motion(poses: np.ndarray, pose: np.ndarray, depth_scale: float) -> i
 
 def hypotheses(found: HypothesisSet, candidates: Sequence[Candidate]) -> list[Hypothesis]:
     """The candidates with their inliers, in their order."""
-    grid, K = found.grid, found.grid.pixels.K
+    grid, K = found.grid, found.grid.K
     made = []
     for pose, facts, *_ in candidates:
         sf, sd = float(facts[search.FLOW_NOISE]), float(facts[search.DEPTH_NOISE])
@@ -223,11 +208,8 @@ def _selection(
 def cue_scores(found: HypothesisSet, motions: Sequence[Hypothesis]) -> np.ndarray:
     """(N,) scores of motions by hand-made cues, larger is more likely the camera's.
 
-    One rigid object on 60 % of the image holds more pixels than the static scene, so the inlier
-    ratio alone decides wrongly. Objects are compact and mostly inside the image: their share of the
-    image exceeds their share of its border, and they leave parts of it empty. The static scene is
-    behind, reaches the border everywhere and is as sharply rigid as the flow allows (a compromise
-    between two motions is not).
+    Objects are compact and mostly inside the image. The static scene is behind, reaches the border
+    everywhere and is as sharply rigid as the flow allows (a compromise between two motions is not).
     """
     (h, w, _), n = found.grid.shape, found.grid.count
     usable = found.grid.weight > 0

@@ -1,77 +1,78 @@
-"""Photometric refinement: the motion that the flow found, made sharper by the images themselves.
+"""The motion of a pair by its images: one that the flow found made sharper, or one without flow.
 
-The flow brings the motion close; the images hold far more than the flow. They join as information:
-the flow's (and the second depth's) covariance becomes a prior of Student's form around the motion
-of the refinement, and the 6x6 normal equations of both add up. The motion of the flow stays where
-the images do not match along the motion, or lead outside of what the flow allows.
+With flow its covariance becomes a prior of Student's form around its motion, and the 6x6 normal
+equations of flow, images and depth maps add up. The motion of the flow stays where the images do
+not match along the motion, or lead outside of what the flow allows.
+
+Without flow images and depth maps are followed coarse to fine. Where the motion leaves no region of
+the image unexplained, and the parts of the image agree about it, nothing else moves: it is the
+answer. Else something moves, or the images are too far apart: the flow has to be asked.
 """
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass, replace
+from weakref import WeakKeyDictionary
 
+import cv2
 import numpy as np
 
-from hybridvo.errors import InputError
-from hybridvo.geometry import pose_matrix, projection_rows
-from hybridvo.images.image_factor import (
-    MID_GREY,
-    MIN_WEIGHT,
-    ImageFactor,
-    blurred,
-    choose_pixels,
-)
-from hybridvo.images.plane_factor import PlaneFactor
-from hybridvo.refinement.solver import PriorFactor, gauss_newton, positive_inverse
-from hybridvo.results import RelativePose
-from hybridvo.types import FramePair
+from hybridvo.calibration import DIRECT_RIGHT
+from hybridvo.geometry import as_contiguous, points_at, pose_matrix, projection_rows
+from hybridvo.images.factors import MIN_POINTS, ImageFactor, PlaneFactor
+from hybridvo.images.kernels import select_pixels
+from hybridvo.refinement.solver import Factor, PriorFactor, gauss_newton, positive_inverse
+from hybridvo.results import RelativePose, right
+from hybridvo.types import Camera, Frame, FramePair
 
 BLURS = (2.0, 1.0)
 """Standard deviations of the blur, px, coarse to fine."""
+COARSE_SPREAD = 0.3
+"""The coarser is used where the flow leaves more than this many finest blurs undecided."""
 STEPS = (3, 2)
 """Most Gauss-Newton steps under each blur, between which light, noise and scale are estimated."""
-PIXELS = 16_000
-"""About how many are used: the strongest gradients of evenly spread cells."""
+PIXELS, MIN_PIXELS, PER_CELL = 16_000, 200, 4
+"""About how many are used, at least, and in each of even cells: the strongest gradients."""
+MIN_WEIGHT = 0.25
+"""Robust weight in the refinement on the flow below which a pixel is not used."""
 PRIOR_INFLATION = 8.0
 """Factor on the covariance of the flow's motion, whose errors are alike far beyond the tiles."""
-MIN_CORRELATION = 0.5
-"""Of the two images along the motion; below it they do not match."""
-MIN_PIXELS = 200
-MIN_SEEN = 0.3
-"""Share of the weight that must fall inside the current image."""
-MIN_GAIN = 0.1
-"""Share of the flow's information that the images must add in some direction."""
-MAX_SHIFT = 9.0
-"""Longest shift from the flow's motion, in its inflated standard deviations."""
-MIN_AGREEMENT = 0.5
-"""Agreement of the parts of the image below which the status mentions it."""
-COARSE_SPREAD = 0.3
-"""Coarser blurs are used where the flow leaves more than this many finest blurs undecided."""
+MIN_CORRELATION, MIN_SEEN = 0.5, 0.3
+"""Of the two images along the motion, and share of the weight inside the current image: below
+these they do not match."""
+MIN_GAIN, MAX_SHIFT = 0.1, 9.0
+"""Share of the flow's information that the images must add in some direction, and longest shift
+from the flow's motion, in its inflated standard deviations."""
+GREY = np.array([[0.299, 0.587, 0.114, -128.0]])
+"""The last, mid grey, makes gain and offset nearly independent."""
+
+REDUCTIONS, MIN_SIDE = (8, 4, 2), 24
+"""Of the image, coarse to fine, before the image itself; and least side of a reduced image, px."""
+FEW_PIXELS, FEW_POINTS, FEW_STEPS = 2500, 1250, 6
+"""Pixels and points used and Gauss-Newton steps on a reduced image, at most."""
+SPREAD = np.repeat([0.3, 0.15], 3)
+"""Standard deviation of the motion before the images are seen, m and rad: it decides nothing."""
+SHIFT_PX, GREY_NOISE = 0.25, 1.0
+"""A residual is noise where so small a shift of the image, and grey levels, explain it."""
+NEIGHBOURS, REGION, UNEXPLAINED = 3, 5, 0.6
+"""Sides, in points of the grid, of the squares whose mean residual is taken for light, and of those
+in which more than this share is unexplained: a region that moves."""
+SMALL_REGION = 0.01
+"""Share of the image far below which smaller is no better."""
+_IMAGES: WeakKeyDictionary[Frame, dict[float, np.ndarray]] = WeakKeyDictionary()
+_REDUCED: WeakKeyDictionary[Frame, dict[int, Frame]] = WeakKeyDictionary()
+"""Blurred images by blur, and reduced frames by reduction, as long as the frame is kept."""
 
 
 @dataclass(frozen=True, eq=False)
 class PhotometricReport:
-    """What came of the images of one pair.
+    """What came of the images of one pair."""
 
-    Args:
-        taken: whether the motion was changed.
-        reason: of a refusal, in a word: ``no_texture``, ``no_match`` (the images are not of one
-            scene along the motion) or ``rejected`` (the flow excludes where they lead); empty where
-            taken, not tried or not needed. message: the same for people.
-        gain, offset: of the current image over the previous one; offset in grey levels.
-        agreement: factor in (0, 1] on the information of the images by which the parts of the
-            image, held against each other, lowered it.
-        uneven_light: whether gain and offset had to vary over the image.
-    """
-
-    taken: bool
-    reason: str = ""
-    message: str = ""
-    gain: float = 1.0
-    offset: float = 0.0
-    agreement: float = 1.0
-    uneven_light: bool = False
+    taken: bool = False  # whether the motion was changed
+    refusal: str = ""  # why not, in words; empty where taken, not tried or not needed
+    gain: float = 1.0  # of the current image over the previous one
+    agreement: float = 1.0  # of the parts of the image: factor in (0, 1] on the information
+    uneven_light: bool = False  # whether gain and offset had to vary over the image
 
 
 def refine_photometric(
@@ -83,41 +84,20 @@ def refine_photometric(
     """The motion of a pair, sharpened by its two images.
 
     ``pose``: what :func:`hybridvo.refinement.refine.refine_pair` found, with its weights and
-    covariance.
-
-    Returns:
-        The motion with its covariance, ``terms`` and report (``photometric``). Where images are
-        missing or of no use, or the acceptance test refuses them, the motion is that of ``pose``,
-        and the report and the status' message say why.
-
-    Raises:
-        InputError: weights of another shape than the image.
+    covariance. It is the answer, with a report (``photometric``), where images are missing or of no
+    use; where the acceptance test refuses them, report and status say why.
     """
-    started, shape = time.perf_counter(), pair.prev.camera.shape
-    if pose.weights is not None and pose.weights.shape != shape:
-        got = pose.weights.shape
-        raise InputError(f"refine_photometric: expected weights of shape {shape}, got {got}.")
-    motion = _refine(pair, pose, blurs, pose.covariance * prior_inflation)
-    return motion.replace(ms=pose.ms + 1e3 * (time.perf_counter() - started))
-
-
-def _refine(
-    pair: FramePair, pose: RelativePose, blurs: tuple[float, ...], covariance: np.ndarray
-) -> RelativePose:
     prev, curr, T, weights = pair.prev, pair.curr, pose.T_curr_prev, pose.weights
-    if prev.rgb is None or curr.rgb is None:
-        return _judged(pose, PhotometricReport(False, "", "an image of the pair is missing"))
-    if not pose.usable or weights is None or prev.depth is None:
-        what = "there is no weighted estimate to start from"
-        return _judged(pose, PhotometricReport(False, "", what))
-    flow_information = positive_inverse(covariance)
-    if flow_information is None:
-        what = "the estimate has no usable covariance"
-        return _judged(pose, PhotometricReport(False, "", what))
+    no_images = prev.rgb is None or curr.rgb is None
+    if no_images or not pose.usable or weights is None or prev.depth is None:
+        return pose.replace(photometric=PhotometricReport())
+    covariance = prior_inflation * pose.covariance
+    if (flow_information := positive_inverse(covariance)) is None:
+        return pose.replace(photometric=PhotometricReport())
     index = choose_pixels(blurred(prev, blurs[-1]), prev.depth, weights, PIXELS)
     if len(index) < MIN_PIXELS:
         what = f"{len(index)} static pixels with texture and depth, {MIN_PIXELS} needed"
-        return _judged(pose, PhotometricReport(False, "no_texture", what))
+        return _refused(pose, PhotometricReport(refusal=what))
     images, flow = ImageFactor(pair, pose, index), PriorFactor(T, flow_information)
     planes = [] if curr.depth is None else [PlaneFactor(pair, weights, MIN_WEIGHT)]
     planes = [factor for factor in planes if factor.estimate(T)]
@@ -134,70 +114,181 @@ def _refine(
     H = images.linearize(T).H
     joint = sum((factor.linearize(T).H for factor in planes), H + flow.linearize(T).H)
     joint_covariance = positive_inverse(joint)
-    reason, message = "rejected", "the joint information is not definite"
+    refusal = "the joint information is not definite"
     if joint_covariance is not None:
-        reason, message = _doubt(images, flow, T, H)
-    report = PhotometricReport(
-        not message,
-        reason,
-        message,
-        gain=images.gain,
-        offset=images.offset + MID_GREY * (1 - images.gain),
-        agreement=images.agreement,
-        uneven_light=images.uneven_light,
+        refusal = _doubt(images, flow, T)
+    found = images.gain, images.agreement, images.uneven_light
+    if refusal:
+        return _refused(pose, PhotometricReport(False, refusal, *found))
+    # the images add little to what the flow already knows
+    if np.linalg.eigvals(np.linalg.solve(flow.information, H)).real.max() < MIN_GAIN:
+        return pose.replace(photometric=PhotometricReport(False, "", *found))
+    return pose.replace(
+        T_curr_prev=pose_matrix(T[:3]),
+        covariance=joint_covariance,
+        terms=(*pose.terms, "images"),
+        photometric=PhotometricReport(True, "", *found),
     )
-    return _judged(pose, report, T, joint_covariance)
+
+
+def _refused(pose: RelativePose, report: PhotometricReport) -> RelativePose:
+    """The motion of the flow, with a remark."""
+    status = pose.status
+    if not status.message:
+        status = replace(status, message=f"images not used: {report.refusal}")
+    return pose.replace(status=status, photometric=report)
 
 
 def _spread_px(pair: FramePair, index: np.ndarray, covariance: np.ndarray) -> float:
     """How far a covariance (6, 6) lets the pixels move in the image, root mean square, px."""
-    v, u = index[:: max(1, len(index) // 200)].T
-    K, z = pair.prev.camera, np.asarray(pair.prev.depth)[v, u].astype(np.float64)
-    points = np.stack([(u - K.cx) / K.fx * z, (v - K.cy) / K.fy * z, z], axis=1)
+    few = index[:: max(1, len(index) // 200)]
+    points = points_at(np.asarray(pair.prev.depth), pair.prev.camera, few)
     J = np.stack(projection_rows(points, pair.curr.camera))
-    return float(np.sqrt(np.einsum("cnp,pq,cnq->", J, covariance, J) / len(z)))
+    return float(np.sqrt(np.einsum("cnp,pq,cnq->", J, covariance, J) / len(few)))
 
 
-def _doubt(
-    images: ImageFactor, flow: PriorFactor, T: np.ndarray, information: np.ndarray
-) -> tuple[str, str]:
-    """Why the motion to which the images lead cannot be believed: (in a word, in a sentence)."""
+def _doubt(images: ImageFactor, flow: PriorFactor, T: np.ndarray) -> str:
+    """Why the motion to which the images lead cannot be believed, or ""."""
     if images.seen < MIN_SEEN:
-        return "no_match", f"{100 * images.seen:.0f} % of the pixels are seen by both cameras"
+        return f"{100 * images.seen:.0f} % of the pixels are seen by both cameras"
     correlated = images.correlation()
     if not correlated >= MIN_CORRELATION:
-        what = f"the two images do not match along the motion ({correlated:.2f} correlated)"
-        return "no_match", what
-    if np.linalg.eigvals(np.linalg.solve(flow.information, information)).real.max() < MIN_GAIN:
-        return "", "the images add little to what the flow already knows"
+        return f"the two images do not match along the motion ({correlated:.2f} correlated)"
     shift = flow.offset(T)
     away = float(np.sqrt(shift @ flow.information @ shift))
     if away > MAX_SHIFT:
-        what = f"they lead {away:.1f} standard deviations away from the flow's motion"
-        return "rejected", what
-    return "", ""
+        return f"they lead {away:.1f} standard deviations away from the flow's motion"
+    return ""
 
 
-def _judged(
-    pose: RelativePose,
-    report: PhotometricReport,
-    T: np.ndarray | None = None,
-    covariance: np.ndarray | None = None,
-) -> RelativePose:
-    """The refined motion, or that of the flow where the images were not taken; with a remark."""
-    remark = f"images not used: {report.message}" if report.reason else ""
-    if report.taken and T is not None and covariance is not None:
-        remarks = []
-        if report.uneven_light:
-            remarks.append("the light changed differently over the image, evened out")
-        if report.agreement < MIN_AGREEMENT:
-            remarks.append(
-                "parts of the image disagree about the motion (rolling shutter, lens, depth?), "
-                "weighed down"
-            )
-        remark = f"images: {'; '.join(remarks)}" if remarks else ""
-        T, terms = pose_matrix(T[:3]), (*pose.terms, "images")
-        pose = pose.replace(T_curr_prev=T, covariance=covariance, terms=terms)
-    if remark and not pose.status.message:
-        pose = pose.replace(status=replace(pose.status, message=remark))
-    return pose.replace(photometric=report)
+def direct_start(
+    pair: FramePair,
+    T_start: np.ndarray | None = None,
+    least: float = 0.5,
+) -> RelativePose | None:
+    """The motion that images and depth maps agree on, from a start (4, 4) or the identity.
+
+    None where the images do not match, or where its probability of being the camera's is below
+    ``least``.
+    """
+    prev, curr = pair.prev, pair.curr
+    if any(x is None for x in (prev.rgb, prev.depth, curr.rgb, curr.depth)):
+        return None
+    ones = np.ones(prev.camera.shape, np.float32)
+    planes = PlaneFactor(pair, ones, 1.0, FEW_POINTS)
+    if len(planes.points) < MIN_POINTS:
+        return None
+    start = RelativePose(covariance=np.diag(SPREAD**2), weights=ones, method="direct")
+    T, gain = np.eye(4) if T_start is None else T_start, 1.0
+    for by in REDUCTIONS:
+        if min(prev.camera.shape) < by * MIN_SIDE:
+            continue
+        small = FramePair(reduced(prev, by), reduced(curr, by), None)
+        weights = np.ones(small.prev.camera.shape, np.float32)
+        before, after = (blurred(frame, BLURS[-1]) for frame in (small.prev, small.curr))
+        depth = np.asarray(small.prev.depth)
+        index = choose_pixels(before, depth, weights, min(FEW_PIXELS, weights.size // 4))
+        if not len(index):
+            continue
+        factor = ImageFactor(small, start.replace(weights=weights), index)
+        factor.use(before, after, T, uneven_light=False)
+        factors: list[Factor] = [factor, planes] if planes.estimate(T) else [factor]
+        T = gauss_newton(factors, T, FEW_STEPS, tolerance=0.1).T
+        gain = factor.gain
+    guess = start.replace(T_curr_prev=T, photometric=PhotometricReport(gain=gain))
+    likely, _ = explained(pair, guess)
+    if likely.probability < least:
+        return None
+    start = start.replace(T_curr_prev=T, weights=likely.weights)
+    found = refine_photometric(pair, start, BLURS[-1:], prior_inflation=1.0)
+    if found.photometric is None or not found.photometric.taken:
+        return None
+    answer, _ = explained(pair, found)
+    return answer if answer.probability >= least else None
+
+
+def explained(pair: FramePair, motion: RelativePose) -> tuple[RelativePose, tuple[float, float]]:
+    """A motion by images and depth maps with the pixels that follow it and its probability.
+
+    And the evidence for that: agreement of the image's parts, log of the share of the image in
+    unexplained regions.
+    """
+    T, images = motion.T_curr_prev, motion.photometric
+    planes = PlaneFactor(pair, np.ones(pair.prev.camera.shape, np.float32), 1.0)
+    assert images is not None
+    planes.estimate(T)
+    (height, width), (v, u), at = pair.prev.camera.shape, planes.index.T, planes.residuals(T)
+    x, y = at.at.T
+    inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
+    before, after = (blurred(frame, 1.0) for frame in (pair.prev, pair.curr))
+    columns, rows = at.at.T[..., None].astype(np.float32)
+    now = cv2.remap(after, columns, rows, cv2.INTER_LINEAR)[:, 0]
+
+    def mean_around(values: np.ndarray, side: int) -> np.ndarray:
+        total, count = (
+            cv2.blur(planes.on_grid(x), (side, side)) for x in (np.where(inside, values, 0), inside)
+        )
+        return (total / np.maximum(count, 1e-6))[planes.cells]
+
+    residual = now - images.gain * before[v, u]
+    d2 = (residual - mean_around(residual, NEIGHBOURS)) ** 2
+    beside, below = np.minimum(u + 1, width - 1), np.minimum(v + 1, height - 1)
+    slope2 = (before[v, beside] - before[v, np.maximum(u - 1, 0)]) ** 2
+    slope2 += (before[below, u] - before[np.maximum(v - 1, 0), u]) ** 2
+    usual = 9 * (GREY_NOISE**2 + (SHIFT_PX / 2) ** 2 * slope2)
+    depth = np.where(at.seen, planes.robust(T), 1.0)
+    follows = inside & (usual / (usual + d2) * depth > 0.5)
+    unexplained = inside & (mean_around(~follows, REGION) > UNEXPLAINED)
+    count = max(int(np.count_nonzero(inside)), 1)
+    region = np.count_nonzero(unexplained) / count
+    evidence = images.agreement, float(np.log(region + SMALL_REGION))
+    z = at.z[at.seen]
+    answer = motion.replace(
+        inlier_ratio=float(np.count_nonzero(follows) / count),
+        probability=right(evidence, DIRECT_RIGHT),
+        weights=planes.image_of(follows),
+        depth_noise=float(np.median(planes.noise(z) / z) / np.sqrt(2)) if len(z) else 0.0,
+        terms=("images", "depth"),
+    )
+    return answer, evidence
+
+
+def blurred(frame: Frame, px: float) -> np.ndarray:
+    """(H, W) float32 grey values less mid grey under a Gaussian blur."""
+    images = _IMAGES.setdefault(frame, {})
+    if 0.0 not in images:
+        # not rounded: 8 bits of grey would add as much noise as the camera's own rounding
+        images[0.0] = cv2.transform(np.ascontiguousarray(frame.rgb).astype(np.float32), GREY)
+    if px not in images:
+        images[px] = cv2.GaussianBlur(images[0.0], (0, 0), px)
+    return images[px]
+
+
+def choose_pixels(
+    grey: np.ndarray, depth: np.ndarray, weights: np.ndarray, count: int
+) -> np.ndarray:
+    """(N, 2) int32 rows and columns of the pixels to use: strong gradients, evenly spread."""
+    height, width = grey.shape
+    cell = max(2, round(np.sqrt(height * width * PER_CELL / count)))
+    cells = (height // cell + 1) * (width // cell + 1)
+    index = np.empty((cells * PER_CELL, 2), np.int32)
+    n = select_pixels(
+        grey, as_contiguous(depth), as_contiguous(weights, np.float32),
+        np.float32(MIN_WEIGHT), cell, PER_CELL, index,
+    )  # fmt: skip
+    return index[:n]
+
+
+def reduced(frame: Frame, by: int) -> Frame:
+    """The frame at 1 / ``by`` of its size: the image averaged, depth picked."""
+    known = _REDUCED.setdefault(frame, {})
+    if by not in known:
+        K, height, width = frame.camera, frame.camera.height // by, frame.camera.width // by
+        whole = np.s_[: height * by, : width * by]
+        assert frame.rgb is not None and frame.depth is not None
+        rgb = cv2.resize(frame.rgb[whole], (width, height), interpolation=cv2.INTER_AREA)
+        depth = frame.depth[whole][by // 2 :: by, by // 2 :: by]
+        cx, cy = ((c - (by - 1) / 2) / by for c in (K.cx, K.cy))
+        camera = Camera(K.fx / by, K.fy / by, cx, cy, height, width)
+        known[by] = Frame(rgb, np.ascontiguousarray(depth), camera)
+    return known[by]

@@ -23,32 +23,19 @@ PART = 131_072
 
 @dataclass(frozen=True, eq=False)
 class BatchedPose:
-    """Camera motions of a batch of pairs, as in :class:`hybridvo.results.RelativePose`.
+    """Camera motions of a batch of pairs, as in :class:`hybridvo.results.RelativePose`."""
 
-    Args:
-        SE3: (B, 7) pypose SE3, ``T_curr_prev``; the identity where failed. Carries the gradient.
-        covariance: (B, 6, 6) of the left perturbation (translation, rotation).
-        converged, failed: (B,) bool. status: one per sample, with its reason.
-        probability: (B,) of the motion being the camera's, by the weight of the motion that
-            contradicts it most; 0 where failed.
-        iterations: (B,) Newton steps on all pixels. cost: (B,) robust, per unit of weight.
-        weights: (B, H, W) robust weights without the external ones, 0 where unusable.
-        noise: (B, 2) flow noise in px and noise of log depth, estimated or as given; (B, 3) with
-            that of the current frame's log depth.
-        inlier_ratio: (B,) share of the external weight within three standard deviations.
-    """
-
-    SE3: pp.LieTensor
-    covariance: torch.Tensor
-    converged: torch.Tensor
-    failed: torch.Tensor
+    SE3: pp.LieTensor  # (B, 7) T_curr_prev; the identity where failed. Carries the gradient
+    covariance: torch.Tensor  # (B, 6, 6) of the left perturbation (translation, rotation)
+    converged: torch.Tensor  # (B,) bool
+    failed: torch.Tensor  # (B,) bool
     status: list[Status]
-    probability: torch.Tensor
-    iterations: torch.Tensor
-    cost: torch.Tensor
-    weights: torch.Tensor
-    noise: torch.Tensor
-    inlier_ratio: torch.Tensor
+    probability: torch.Tensor  # (B,) by the weight of the motion that contradicts it most
+    iterations: torch.Tensor  # (B,) Newton steps on all pixels
+    cost: torch.Tensor  # (B,) robust, per unit of weight
+    weights: torch.Tensor  # (B, H, W) robust weights without the external ones, 0 where unusable
+    noise: torch.Tensor  # (B, 2) px and log depth; (B, 3) with the current frame's log depth
+    inlier_ratio: torch.Tensor  # (B,) share of the external weight within three standard deviations
 
     def __len__(self) -> int:
         return len(self.status)
@@ -58,18 +45,11 @@ class BatchedPose:
         """(B, 4, 4) points of the previous camera into the current one, metres."""
         return self.SE3.matrix().to(self.covariance.dtype)
 
-    @property
-    def T_prev_curr(self) -> torch.Tensor:
-        """(B, 4, 4) inverse of ``T_curr_prev``."""
-        return self.SE3.Inv().matrix().to(self.covariance.dtype)
-
     def one(self, index: int, method: str = "refine") -> RelativePose:
         """The motion of one sample as every estimator gives it, in numpy."""
-        covariance = self.covariance[index].detach().double().cpu().numpy()
-        T = self.SE3[index].detach().matrix().double().cpu().numpy()
         return RelativePose(
-            T_curr_prev=T,
-            covariance=covariance,
+            T_curr_prev=self.SE3[index].detach().matrix().double().cpu().numpy(),
+            covariance=self.covariance[index].detach().double().cpu().numpy(),
             status=self.status[index],
             inlier_ratio=min(1.0, float(self.inlier_ratio[index])),
             iterations=int(self.iterations[index]),
@@ -84,26 +64,16 @@ class BatchedPose:
 
 
 class Pixels(NamedTuple):
-    """Pixels of a batch as the solver takes them; unusable ones have weight 0.
+    """Pixels of a batch as the solver takes them; variances are relative to the typical one."""
 
-    Args:
-        points: (B, 3, N) metres, in the previous camera.
-        target: (B, 2, N) px, x + F on the current image.
-        flow_variance, depth_variance: (B, N) relative to the typical one of the sample.
-        weight: (B, N) external weight.
-        K: (B, 3, 3) of the current camera.
-        log_depth_curr: (B, N) log D_curr(x + F), 0 where absent; None without that depth.
-        has_depth_curr: (B, N) 1 where it is present, else 0.
-    """
-
-    points: torch.Tensor
-    target: torch.Tensor
-    flow_variance: torch.Tensor
-    depth_variance: torch.Tensor
-    weight: torch.Tensor
-    K: torch.Tensor
-    log_depth_curr: torch.Tensor | None = None
-    has_depth_curr: torch.Tensor | None = None
+    points: torch.Tensor  # (B, 3, N) metres, in the previous camera
+    target: torch.Tensor  # (B, 2, N) px, x + F on the current image
+    flow_variance: torch.Tensor  # (B, N)
+    depth_variance: torch.Tensor  # (B, N)
+    weight: torch.Tensor  # (B, N) external weight, 0 where unusable
+    K: torch.Tensor  # (B, 3, 3) of the current camera
+    log_depth_curr: torch.Tensor | None = None  # (B, N) log D_curr(x + F), 0 where absent
+    has_depth_curr: torch.Tensor | None = None  # (B, N) 1 where it is present, else 0
 
     def map(self, change: Callable[[torch.Tensor], torch.Tensor]) -> Pixels:
         """The same with every tensor changed."""
@@ -144,8 +114,8 @@ def gather_pixels(
 ) -> Pixels:
     """The pixels of a batch in raster order, or tile by tile where a tile's side is given.
 
-    ``with_depth`` joins the current frame's depth. Invalid values are replaced before anything is
-    computed from them, so that neither they nor their gradients spread.
+    Invalid values are replaced before anything is computed from them, so that neither they nor
+    their gradients spread.
     """
     depth = batch.depth_prev
     height, width = depth.shape[1:]
@@ -185,11 +155,8 @@ def gather_pixels(
 
 
 def sample_depth(depth: torch.Tensor, at: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Bilinear depth (B, H, W) at (B, h, w, 2) px, where the four neighbours lie on one surface.
-
-    Returns:
-        (B, h, w) metres and (B, h, w) bool: False, and depth 1, outside the image, next to an
-        invalid depth, and at edges.
+    """Bilinear depth (B, h, w) of (B, H, W) at (B, h, w, 2) px; and bool: False, and depth 1,
+    outside the image, next to an invalid depth, and at edges.
     """
     height, width = depth.shape[1:]
     u, v = at.unbind(-1)
@@ -235,15 +202,10 @@ def _relative(variance: torch.Tensor, good: torch.Tensor) -> tuple[torch.Tensor,
 def checked_batch(
     batch: PairBatch, weights: Any = None, where: str = "refine_batch"
 ) -> tuple[PairBatch, torch.Tensor | None]:
-    """The batch and its weights in one floating type, on one device.
-
-    Raises:
-        InputError: what does not fit, named.
-    """
+    """The batch and its weights in one floating type, on one device, or an InputError."""
     flow, depth = batch.flow, batch.depth_prev
-    for name, value in (("flow", flow), ("depth_prev", depth)):
-        if not isinstance(value, torch.Tensor) or not value.is_floating_point():
-            raise InputError(f"{where}: expected PairBatch.{name} as a floating-point tensor.")
+    if not all(isinstance(x, torch.Tensor) and x.is_floating_point() for x in (flow, depth)):
+        raise InputError(f"{where}: expected flow and depth_prev as floating-point tensors.")
     if flow.ndim != 4 or flow.shape[3] != 2 or flow.numel() == 0:
         raise InputError(
             f"{where}: expected PairBatch.flow of shape (B, H, W, 2), got {tuple(flow.shape)}."

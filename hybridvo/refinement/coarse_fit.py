@@ -1,7 +1,5 @@
 """One motion on gathered pixels, by Gauss-Newton under a graduated robust kernel, and the noise of
-the pixels that follow it (numba).
-
-Poses inside the kernels are (3, 4) float64 arrays [R | t].
+the pixels that follow it (numba). Poses are (3, 4) float64 arrays [R | t].
 """
 
 from __future__ import annotations
@@ -29,10 +27,9 @@ from hybridvo.refinement.kernels import (
     sum_samples,
 )
 
-FLOW_NOISE_CAP = 1.2
-DEPTH_NOISE_CAP = 0.08
+FLOW_NOISE_CAP, DEPTH_NOISE_CAP = 1.2, 0.08
 """Largest noise (px, log depth) that a motion may claim in the search; beyond it the fit would be a
-compromise between motions. The final fit may claim 2.5 times what the search found."""
+compromise between motions."""
 DAMPING = 1e-6
 NOISE_PIXELS, FINAL_NOISE_PIXELS = 1000, 4000
 """Pixels that the noise estimate looks at in the search (flow noise to 2 %) and in the last fit."""
@@ -105,8 +102,8 @@ def noise_of(flow_sigma, depth_sigma, cutoff):
 def gauss_newton(samples, n, total, K, noise, steps, tolerance_px, pose):
     """Damped Gauss-Newton in place; a step is taken only where the robust cost does not rise.
 
-    ``total``: sum of the external weights. Stops when the step moves the image by less than
-    ``tolerance_px``. Returns the number of steps.
+    ``total``: sum of the external weights; a step that moves the image by less than
+    ``tolerance_px`` is the last. Returns the number of steps.
     """
     acc, other, delta, candidate = np.zeros(SUMS), np.zeros(SUMS), np.zeros(6), np.empty((3, 4))
     full = 0.5 * np.float64(noise[2])
@@ -181,7 +178,7 @@ def anneal(samples, n, K, start_px, end_px, ratio, steps, pose):
 def gather_noise(samples, n, step, pose, K, radius):
     """Of every ``step``-th pixel whose residual is within the ``radius`` (px): squared residual
     along q and across it, variance of flow and depth in units of sf^2 and sd^2, external weight,
-    density of outliers, (6, N). And the share of the weight that these pixels have.
+    density of outliers, (6, N); and the share of the weight that these pixels have.
     """
     terms, entries = np.empty((6, n // step + 1), np.float32), pose_entries(pose)
     disc = 1.0 / (math.pi * radius * radius)
@@ -222,11 +219,8 @@ def sum_noise(terms, vf, vd, share):
         # exp(d2 / 2) = exp(y)^32 by a series: a call of the library's would not be vectorised
         y = min(d2, np.float32(60.0)) * np.float32(1 / 64)
         e = ONE + y * (ONE + y * (np.float32(1 / 2) + y * (np.float32(1 / 6) + y / np.float32(24))))
-        e *= e
-        e *= e
-        e *= e
-        e *= e
-        e *= e
+        for _ in range(5):
+            e *= e
         p = density * np.sqrt(i1 * i2)
         p = weight[k] * p / (p + rest * outlier[k] * e)
         j1, j2 = p * i1 * i1, p * i2 * i2
@@ -241,12 +235,11 @@ def sum_noise(terms, vf, vd, share):
 
 @njit(error_model="numpy", cache=True, nogil=True)
 def estimate_noise(samples, n, pose, K, sf, sd, sf_cap, sd_cap, rounds, limit):
-    """Flow noise (px) and depth noise (of log Z) of the pixels that follow ``pose``.
+    """Noise (sf px, sd of log Z) of the pixels that follow ``pose``, share of the weight that does,
+    and whether the flow tells the depth's noise; from ``limit`` pixels.
 
     Expectation-maximisation of a mixture of N(0, sf^2 v_f I + sd^2 v_d q q^T) and a uniform density
-    over a disc; the two variances by Fisher scoring of the components along and across q. Looks at
-    ``limit`` pixels. Returns (sf, sd, share of the weight that follows the pose, whether the flow
-    tells the depth's noise).
+    over a disc; the two variances by Fisher scoring of the components along and across q.
     """
     terms, inside = gather_noise(samples, n, max(1, n // limit), pose, K, max(4.0, 8.0 * sf))
     if terms.shape[1] < 8:
@@ -315,10 +308,8 @@ def translation_scale(samples: np.ndarray, n: int) -> float:
 def fit_coarse(
     samples: np.ndarray, n: int, K: np.ndarray, pose: np.ndarray, cutoff: float
 ) -> tuple[np.ndarray, float, float, float, int]:
-    """One motion on the first ``n`` pixels, by graduated non-convexity from a (3, 4) start.
-
-    Returns:
-        Pose (3, 4), flow noise px, depth noise, inlier ratio of the weight, iterations.
+    """One motion (3, 4) on ``n`` pixels, by graduated non-convexity from a start; flow noise px,
+    depth noise, inlier ratio of the weight, iterations.
     """
     pose = np.array(pose, np.float64, order="C")
     scale = min(64.0, max(1.0, 1.5 * residual_scale(samples, n, pose, K)))
@@ -333,10 +324,8 @@ def fit_coarse(
 def residual_coherence(
     samples: np.ndarray, h: int, w: int, pose: np.ndarray, K: np.ndarray, sf: float, sd: float
 ) -> float:
-    """How alike neighbouring residuals are: 0 for independent noise, 1 for equal residuals.
-
-    Of whitened residuals in 8 x 8 blocks, from the variance of the block means. A compromise
-    between two motions leaves residuals that agree with their neighbours.
+    """How alike neighbouring residuals are, as a compromise between two motions leaves them: 0 for
+    independent noise, 1 for equal ones. Whitened, from the variance of the means of 8 x 8 blocks.
     """
     r, q = np.split(residuals(samples, h * w, pose, K), 2)
     ip = samples[PF, : h * w] / sf**2

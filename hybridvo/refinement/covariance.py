@@ -1,9 +1,8 @@
 """Covariance of a robust M-estimate, honest about errors that neighbouring pixels share.
 
-The sandwich of Huber (1967), its scores summed over blocks of the image before their outer products
-are taken (cluster-robust: Liang and Zeger, 1986); the blocks overlap, which is Bartlett's kernel in
-two dimensions (Newey and West, 1987; Conley, 1999). Where the variance still grows from one size of
-block to the next, the growth is continued to the size of the image (Beran, 1994).
+The sandwich of Huber (1967), its scores summed over overlapping blocks of the image before their
+outer products are taken (Liang and Zeger, 1986; Newey and West, 1987; Conley, 1999). Where the
+variance still grows with the size of the blocks, the growth is continued to that of the image.
 """
 
 from __future__ import annotations
@@ -15,7 +14,6 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from hybridvo.calibration import ABSORBED, CLUSTERED, FEW_TILES, LONG_GROWTH
 from hybridvo.refinement.kernels import SUMS, WORK_ROWS, W, project_block
-from hybridvo.refinement.solver import positive_inverse
 
 NOTHING = np.diag([1e4] * 3 + [10.0] * 3)
 """Covariance that carries no information (m^2, rad^2)."""
@@ -38,11 +36,6 @@ def direction_is_known(T: np.ndarray, covariance: np.ndarray) -> bool:
     return bool(np.linalg.norm(T[:3, 3]) > 3 * spread)
 
 
-def tile_size(shape: tuple[int, int], tiles: int) -> int:
-    """Side, px, of the tiles that cut an image into about ``tiles``; 8 to 64."""
-    return int(np.clip(round(np.sqrt(shape[0] * shape[1] / tiles)), 8, 64))
-
-
 def symmetric(upper: np.ndarray) -> np.ndarray:
     """(6, 6) from its 21 upper-triangle values, row by row."""
     return upper[ORDER]
@@ -54,7 +47,6 @@ def score_sums(
     """(42,) curvature of the robust weights and meat of independent errors, per unit of weight.
 
     From a coarse grid: both are averages over many pixels and enter the result at second order.
-    The Gauss-Newton Hessian less the curvature is the derivative of the estimating equation.
     """
     work, used = np.empty((WORK_ROWS, n), np.float32), np.zeros(SUMS)
     project_block(samples, 0, n, pose, K, noise, work, work[8], used)
@@ -69,14 +61,12 @@ def score_sums(
 
 
 def block_sums(tiles: np.ndarray, inverse: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
-    """Outer products of the scores summed over blocks of tiles, and what the fit took from them.
+    """Outer products (S, 6, 6) of the scores summed over blocks of tiles, what the fit took from
+    them (S,), and the number of tiles with a score.
 
-    Blocks reach over the border; (width / step)^2 of them cover a tile, and each counts for that
-    share. Under independent errors a block with information H_b has scores of covariance H_b - H_b
-    H^-1 H_b about the estimate: the second term, in units of the first, is what the fit took.
-
-    Returns:
-        (S, 6, 6), (S,), number of tiles with a score.
+    Blocks reach over the border; (width / step)^2 of them cover a tile. Under independent errors a
+    block with information H_b has scores of covariance H_b - H_b H^-1 H_b about the estimate: the
+    second term, in units of the first, is what the fit took.
     """
     meats, lost, counts = [], [], []
     for width, step in SIZES:
@@ -94,10 +84,8 @@ def block_sums(tiles: np.ndarray, inverse: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def long_range(growth: float, tiles: int) -> float:
-    """Factor on the variance of blocks two tiles wide for errors that reach beyond them.
-
-    ``growth``: variance of the scores of blocks four tiles wide over that of single tiles, in units
-    of independent errors.
+    """Factor on the variance of blocks two tiles wide for errors that reach beyond them, from the
+    ``growth`` of the scores' variance from single tiles to blocks four tiles wide.
     """
     if not (growth > LONG_GROWTH[0] and np.isfinite(growth)):
         return 1.0
@@ -122,15 +110,14 @@ def motion_covariance(
     """Covariance of the left perturbation, eigenvalues of the information, number of tiles with
     usable pixels; 0 where the information is not definite.
 
-    Bread: Gauss-Newton Hessian less the curvature of the robust weights. Meat: :data:`CLUSTERED`
-    from overlapping blocks two tiles wide, the rest from independent errors, scaled by how much the
-    blocks exceed them; corrected for what the fit takes out of the residuals.
+    Bread: Gauss-Newton Hessian less the curvature of the robust weights (6, 6). Meat:
+    :data:`CLUSTERED` from overlapping blocks two tiles wide, the rest from independent errors,
+    ``meat`` (6, 6), scaled by how much the blocks exceed them.
 
     ``tiles`` (rows, columns, 27): upper triangle of the Gauss-Newton Hessian and scores, summed
-    over tiles; ``curvature`` (6, 6) of the robust weights, ``meat`` (6, 6) under independent
-    errors; ``depth_scale`` (1 / m) turns metres of translation into radians of the image. The
-    pixels' ``weight``, the ``focal`` length in px, translation ``t`` and ``noise`` (px, log depth)
-    give what no residual shows: the rounding of the pixels and the law of the depth's errors.
+    over tiles; ``depth_scale`` (1 / m) turns metres of translation into radians of the image.
+    ``weight``, ``focal`` length in px, ``t`` and ``noise`` (px, log depth) give what no residual
+    shows: the rounding of the pixels and the law of the depth's errors.
     """
     scaling = np.array([1 / depth_scale] * 3 + [1.0] * 3)
     outer = np.outer(scaling, scaling)
@@ -166,21 +153,3 @@ def motion_covariance(
     if not np.isfinite(covariance).all():
         return NOTHING.copy(), eigenvalues, 0
     return covariance, eigenvalues, occupied
-
-
-def tile_sums(scores: np.ndarray, tile: np.ndarray, count: int) -> np.ndarray:
-    """(count, 6) sums of (6, N) scores over the tiles that (N,) ``tile`` says."""
-    return np.stack([np.bincount(tile, row, count) for row in scores], axis=1)
-
-
-def dispersion(sums: np.ndarray, meat: np.ndarray, model: np.ndarray) -> float | None:
-    """How many times larger the sandwich covariance over tiles is than the ``model`` (6, 6).
-
-    From the scores (n, 6) of the tiles and the meat (6, 6) of all pixels; None where the scores
-    leave a direction open.
-    """
-    independent = positive_inverse(meat)
-    if independent is None:
-        return None
-    clusters = max(1.0, np.trace(independent @ sums.T @ sums) / 6)
-    return float(max(1.0, clusters * np.trace(model @ meat) / 6))

@@ -2,9 +2,8 @@
 
 The residual is rz = log D_curr(x + F) - log Z'. Given the flow residual r it is Gaussian with mean
 k^T r, k = h sd^2 Sigma^-1 q, where h = dlogZ'/dlogZ = 1 - tz/Z' and Sigma, q are those of
-:mod:`hybridvo.refinement.kernels`: both residuals share the error of the previous depth. So one
-more scalar residual, rz - k^T r, with the Jacobian row Jz - k^T J, Jz = (0, 0, i, b, -a, 0), adds
-to the same normal equations. Its variance is estimated.
+:mod:`hybridvo.refinement.kernels`. So rz - k^T r, with the Jacobian row Jz - k^T J,
+Jz = (0, 0, i, b, -a, 0), adds to the same normal equations; its variance is estimated.
 """
 
 from __future__ import annotations
@@ -15,26 +14,11 @@ from typing import NamedTuple
 import numpy as np
 
 from hybridvo.calibration import DOUBTFUL_SPREAD, NO_SPREAD
-from hybridvo.geometry import njit
+from hybridvo.geometry import njit, points_at
+from hybridvo.refinement import kernels
 from hybridvo.refinement.coarse_fit import robust_weights
 from hybridvo.refinement.covariance import symmetric
-from hybridvo.refinement.kernels import (
-    COST,
-    FASTMATH,
-    MAX_VALUE,
-    MIN_DEPTH,
-    MU,
-    MV,
-    PD,
-    PF,
-    XN,
-    YN,
-    W,
-    Z,
-    at_likely_depth,
-    pose_entries,
-    see,
-)
+from hybridvo.refinement.kernels import FASTMATH, MAX_VALUE, MIN_DEPTH, W
 from hybridvo.refinement.pixels import PixelGrid
 from hybridvo.refinement.solver import Linearization
 from hybridvo.results import Reason, Status
@@ -51,39 +35,31 @@ def look_up(samples, n, depth):
     """Log of the current depth at the flow target of ``n`` pixels; NaN outside, at edges, holes."""
     (H, width), out = depth.shape, np.full(n, np.nan, np.float32)
     for k in range(n):
-        u = samples[MU, k]
-        v = samples[MV, k]
+        u, v = samples[kernels.MU, k], samples[kernels.MV, k]
         if not (samples[W, k] > 0 and u >= 0 and v >= 0 and u < width - 1 and v < H - 1):
             continue
-        i = int(u)
-        j = int(v)
+        i, j = int(u), int(v)
         a, b, c, d = depth[j, i], depth[j, i + 1], depth[j + 1, i], depth[j + 1, i + 1]
-        low = min(min(a, b), min(c, d))
-        high = max(max(a, b), max(c, d))
+        low, high = min(min(a, b), min(c, d)), max(max(a, b), max(c, d))
         if low > 1e-6 and high < 1e9 and high < low * (1.0 + SURFACE):
-            fu = u - i
-            fv = v - j
-            top = a + fu * (b - a)
-            bottom = c + fu * (d - c)
-            out[k] = math.log(top + fv * (bottom - top))
+            top, bottom = a + (u - i) * (b - a), c + (u - i) * (d - c)
+            out[k] = math.log(top + (v - j) * (bottom - top))
     return out
 
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
 def conditional(samples, k, log_depth, entries, K, noise, row):
-    """(conditional residual, raw residual, known and in front) of pixel ``k``; its Jacobian in
-    ``row``.
-    """
-    a, b, i, front = see(samples[XN, k], samples[YN, k], samples[Z, k], entries)
+    """(conditional residual, raw one, known and in front) of pixel ``k``; ``row``: Jacobian."""
+    x, y, z = samples[kernels.XN, k], samples[kernels.YN, k], samples[kernels.Z, k]
+    a, b, i, front = kernels.see(x, y, z, entries)
     fx, fy = K[0], K[1]
-    ru = samples[MU, k] - (fx * a + K[2])
-    rv = samples[MV, k] - (fy * b + K[3])
-    g = noise[1] * samples[PD, k] * noise[0] * samples[PF, k]
+    ru = samples[kernels.MU, k] - (fx * a + K[2])
+    rv = samples[kernels.MV, k] - (fy * b + K[3])
+    g = noise[1] * samples[kernels.PD, k] * noise[0] * samples[kernels.PF, k]
     raw = log_depth[k] + math.log(i)
-    a, b, i, qu, qv, kappa = at_likely_depth(a, b, i, ru, rv, g, entries, K)
+    a, b, i, qu, qv, kappa = kernels.at_likely_depth(a, b, i, ru, rv, g, entries, K)
     h = 1.0 - entries[11] * i
-    ku = h * kappa * qu
-    kv = h * kappa * qv
+    ku, kv = h * kappa * qu, h * kappa * qv
     row[0] = -ku * fx * i
     row[1] = -kv * fy * i
     row[2] = i + (ku * fx * a + kv * fy * b) * i
@@ -96,7 +72,7 @@ def conditional(samples, k, log_depth, entries, K, noise, row):
 @njit(error_model="numpy", cache=True, nogil=True)
 def depth_scale(samples, log_depth, robust, pose, K, noise):
     """Robust standard deviations of (conditional residual, raw residual); 0 if too few pixels."""
-    row, found, entries, m = np.empty(6), np.empty((2, len(robust))), pose_entries(pose), 0
+    row, found, entries, m = np.empty(6), np.empty((2, len(robust))), kernels.pose_entries(pose), 0
     for k in range(len(robust)):
         e, raw, good = conditional(samples, k, log_depth, entries, K, noise, row)
         if good and robust[k] > 0.3:
@@ -111,11 +87,10 @@ def depth_scale(samples, log_depth, robust, pose, K, noise):
 def sum_depth(samples, log_depth, robust, pose, K, noise, sz, tiles, sums, meat):
     """Add the third residual's normal equations to ``sums`` (tiles, 27); returns the cost.
 
-    ``sz``: standard deviation of the conditional residual. ``tiles`` (n,): tile of each pixel;
-    ``meat`` (21,) gets the sum of w^2 s s^T.
+    ``sz``: its standard deviation; ``tiles`` (n,) of each pixel; ``meat`` (21,): sum of w^2 s s^T.
     """
     c2, v = np.float64(noise[2]), sz * sz
-    row, entries, cost = np.empty(6), pose_entries(pose), 0.0
+    row, entries, cost = np.empty(6), kernels.pose_entries(pose), 0.0
     for k in range(len(log_depth)):
         e, _, good = conditional(samples, k, log_depth, entries, K, noise, row)
         if not good:
@@ -136,39 +111,36 @@ def sum_depth(samples, log_depth, robust, pose, K, noise, sz, tiles, sums, meat)
 
 
 class DepthFactor:
-    """The current frame's depth (H, W), given the flow, at every ``stride``-th pixel of a pair.
-
-    ``sigma``: standard deviation of the conditional residual; ``noise`` (3,) as in the kernels.
+    """The current frame's depth (H, W), given the flow, at every ``stride``-th pixel of a pair;
+    ``sigma``: standard deviation of the conditional residual.
     """
 
     def __init__(
-        self, image: PixelGrid, curr: np.ndarray, stride: int, sigma: float, noise: np.ndarray,
+        self, grid: PixelGrid, curr: np.ndarray, stride: int, sigma: float, noise: np.ndarray,
         tile: int,
     ) -> None:  # fmt: skip
-        self._samples, height, width = image.strided(stride)
+        self._samples, height, width = grid.strided(stride)
         self._log_depth = look_up(self._samples, height * width, curr)
-        self._image, self._sigma, self._noise = image, sigma, noise
+        self._K, self._sigma, self._noise = grid.K, sigma, noise
         row, column = (np.arange(n) * stride // tile for n in (height, width))
-        self._shape = tuple(-(-n // tile) for n in image.shape)
+        self._shape = tuple(-(-n // tile) for n in grid.size)
         self._tiles = (row[:, None] * self._shape[1] + column).ravel()
 
     def linearize(self, T: np.ndarray) -> Linearization:
         """The sums over each tile and the meat stay as attributes."""
-        where = T[:3], self._image.K, self._noise
+        where = T[:3], self._K, self._noise
         robust = robust_weights(self._samples, len(self._log_depth), *where)
-        tiles, self.meat = np.zeros((*self._shape, COST)), np.zeros(21)
+        tiles, self.meat = np.zeros((*self._shape, kernels.COST)), np.zeros(21)
         cost = sum_depth(
             self._samples, self._log_depth, robust, *where, self._sigma, self._tiles,
-            tiles.reshape(-1, COST), self.meat,
+            tiles.reshape(-1, kernels.COST), self.meat,
         )  # fmt: skip
         self.tiles, sums = tiles, tiles.sum(axis=(0, 1))
         return Linearization(symmetric(sums[:21]), sums[21:], cost)
 
 
 class DepthAgreement(NamedTuple):
-    """Median ratio of the current depth to that of the previous frame's points, moved, and the
-    median distance of its log from that of the median.
-    """
+    """Median ratio of the current depth to the previous points', moved; spread of its log."""
 
     ratio: float
     spread: float
@@ -195,9 +167,7 @@ def compare_depths(
 ) -> DepthAgreement | None:
     """Compare both depths of a pair where the robust weights (H, W) of a motion exceed one half.
 
-    The scale of a whole sequence cannot be seen: all depths and all translations times s project to
-    the same pixels. A scale that changes on the way can. It asks the nearest pixel, whatever its
-    neighbours are: in noise none agree. None where too few points tell.
+    At the nearest pixel, whatever its neighbours are: in noise none agree. None where too few tell.
     """
     prev, curr, flow = pair.prev, pair.curr, pair.flow
     if flow is None or prev.depth is None or curr.depth is None or weights is None:
@@ -205,8 +175,8 @@ def compare_depths(
     (height, width), step = prev.depth.shape, max(1, math.isqrt(prev.depth.size // COMPARED))
     first = step // 2
     v, u = (first + step * k for k in np.nonzero(weights[first::step, first::step] > 0.5))
-    K, (a, b, c), t = prev.camera, T_curr_prev[2, :3], T_curr_prev[2, 3]
-    moved = prev.depth[v, u] * (a * (u - K.cx) / K.fx + b * (v - K.cy) / K.fy + c) + t
+    points = points_at(prev.depth, prev.camera, np.stack([v, u], axis=1))
+    moved = points @ T_curr_prev[2, :3] + T_curr_prev[2, 3]
     column, row = np.rint(u + flow[v, u, 0]), np.rint(v + flow[v, u, 1])
     inside = (row >= 0) & (column >= 0) & (row < height) & (column < width) & (moved > MIN_DEPTH)
     at = row[inside].astype(np.intp), column[inside].astype(np.intp)

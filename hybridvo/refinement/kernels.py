@@ -2,7 +2,7 @@
 
 The same definition as :mod:`hybridvo.refinement.torch_factors`; a test holds both equal. Pixels are
 gathered into short structure-of-arrays buffers that stay in the L1 cache, and branch-free loops sum
-over them in float32 per block, float64 in total. Nothing here changes thread settings.
+over them in float32 per block, float64 in total.
 
 Per pixel, with X' = T X, a = X'/Z', b = Y'/Z', i = 1/Z' (conventions of :mod:`hybridvo.types`):
 
@@ -46,9 +46,7 @@ ONE, ZERO = np.float32(1.0), np.float32(0.0)
 
 @intrinsic
 def keep_apart(typing_context):
-    """Forbid LLVM to inline the calling function: inlined into a loop over rows its reductions are
-    not vectorised (27 ns a pixel instead of 4).
-    """
+    """Forbid LLVM to inline the caller: inlined into a loop its reductions are not vectorised."""
 
     def codegen(context, builder, signature, args):
         builder.function.attributes.add("noinline")
@@ -110,9 +108,8 @@ def gather_row(v, u0, u1, data, camera, scale, buf):
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
 def gather_grid(stride, data, camera, scale):
-    """(buffer (BUFFER_ROWS, h w or more), h, w) of every ``stride``-th pixel of both axes.
-
-    The grid starts half a stride in, so that its centre is that of the image.
+    """(buffer (BUFFER_ROWS, h w or more), h, w) of every ``stride``-th pixel of both axes; the
+    grid's centre is that of the image.
     """
     H, width = data[0].shape
     first = stride // 2
@@ -177,9 +174,8 @@ def project_block(buf, o, n, pose, K, noise, work, robust, acc):
     """First stage, pixels ``o .. o + n - 1``: residuals, robust weights, weighted information.
 
     ``pose`` (3, 4) float64; ``K`` = (fx, fy, cx, cy) of the current frame and ``noise`` =
-    (1/sf^2, sd^2, c^2), float32.
-    ``work`` rows: a, b, i, m00, m01, m11 (information in units of B), n0, n1 (gradient).
-    ``robust`` (N,): robust weight without the external one, 0 where unusable.
+    (1/sf^2, sd^2, c^2), float32; ``work`` rows: a, b, i, m00, m01, m11 (information in units of B),
+    n0, n1 (gradient); ``robust`` (N,): weight without the external one, 0 where unusable.
     """
     keep_apart()  # type: ignore[call-arg]
     fx, fy, cx, cy = K[0], K[1], K[2], K[3]
@@ -302,11 +298,9 @@ def sum_samples(samples, n, pose, K, noise, acc):
 
 @njit(error_model="numpy", cache=True, nogil=True)
 def sum_tiles(data, camera, scale, pose, K, noise, band, tile, weights, sums, out):
-    """One pass over the rows of one band of tiles of the full grid.
-
-    Adds the normal equations of each tile to ``sums`` (rows of tiles, columns of tiles, 27), cost
-    and weights to ``out`` (30,), and writes the robust weights (without the external ones) to
-    ``weights`` (H, W).
+    """One pass over the rows of one band of tiles of the full grid: normal equations of each tile
+    into ``sums`` (rows, columns, 27), cost and sums of weights into ``out`` (30,), robust weights
+    (without the external ones) into ``weights`` (H, W).
     """
     H, width = data[0].shape
     # whole tiles that stay in the L1 cache, in rows that do not fall into the same of its sets

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from typing import Any
 
 import cv2
 import numpy as np
 
+from hybridvo.geometry import as_contiguous
 from hybridvo.options import RefineOptions
 from hybridvo.refinement import kernels
 from hybridvo.results import Reason, RelativePose
@@ -20,17 +20,24 @@ THREADS = 2
 
 
 class PixelGrid:
-    """The arrays of a pair as the kernels take them."""
+    """The arrays of a pair as the kernels take them, and every n-th pixel of both axes.
 
-    def __init__(self, pair: FramePair, weights: np.ndarray | None) -> None:
+    Attributes:
+        size: (height, width) of the image. shape: (h, w, stride) of the grid.
+        samples: (rows, n) buffer of the grid, see :mod:`hybridvo.refinement.kernels`.
+    """
+
+    def __init__(
+        self, pair: FramePair, weights: np.ndarray | None, pixels: int = RefineOptions.coarse_pixels
+    ) -> None:
         prev, curr = pair.prev, pair.curr
         assert pair.flow is not None and prev.depth is not None
-        ones = np.ones(prev.depth.shape, np.float32)
+        self.size = prev.camera.shape
+        external = ones = np.ones(self.size, np.float32)
         maps = [
             as_contiguous(ones if image is None else image)
             for image in (pair.flow_variance, prev.depth_variance)
         ]
-        external = ones
         for factor in (weights, prev.mask, pair.flow_valid):
             if factor is not None:
                 external = external * np.asarray(factor, np.float32)
@@ -40,15 +47,11 @@ class PixelGrid:
         a, b = prev.camera, curr.camera
         self.camera = np.array([1 / a.fx, 1 / a.fy, a.cx, a.cy], np.float32)
         self.K = np.array([b.fx, b.fy, b.cx, b.cy], np.float32)
+        self.samples, *self.shape = self.sampled(pixels)
 
-    @property
-    def shape(self) -> tuple[int, int]:
-        """(height, width)."""
-        return self.data[0].shape
-
-    def samples(self, pixels: int) -> tuple[np.ndarray, int, int, int]:
+    def sampled(self, pixels: int) -> tuple[np.ndarray, int, int, int]:
         """(buffer, h, w, stride) of a grid of about ``pixels`` pixels; finer if few are usable."""
-        stride = grid_stride(self.shape, pixels)
+        stride = grid_stride(self.size, pixels)
         while True:
             buffer, h, w = self.strided(stride)
             usable = np.count_nonzero(buffer[kernels.W, : h * w] > 0)
@@ -70,12 +73,11 @@ class PixelGrid:
             Sums of each tile (rows, columns, 27), cost and the two sums of weights (3,), robust
             weights (H, W).
         """
-        height, width = self.shape
+        height, width = self.size
         bands = -(-height // tile)
         sums = np.zeros((bands, -(-width // tile), kernels.COST))
         totals = np.zeros((bands, kernels.SUMS))
         weights = np.empty((height, width), np.float32)
-
         inputs: tuple[Any, ...] = (self.data, self.camera, self.scale)
 
         def work(band: int) -> None:
@@ -84,31 +86,6 @@ class PixelGrid:
         with ThreadPoolExecutor(THREADS) as pool:  # the kernels release the GIL
             list(pool.map(work, range(bands)))
         return sums, totals[:, kernels.COST :].sum(axis=0), weights
-
-
-def grid_stride(shape: tuple[int, int], pixels: int) -> int:
-    """Distance, px, of the pixels of a grid of about ``pixels``."""
-    return max(1, round(np.sqrt(shape[0] * shape[1] / pixels)))
-
-
-@dataclass(frozen=True, eq=False)
-class CoarseGrid:
-    """Every n-th pixel of both axes of an image.
-
-    Args:
-        pixels: arrays of the pair.
-        samples: (rows, n) buffer of the gathered pixels, see :mod:`hybridvo.refinement.kernels`.
-        shape: (h, w, stride).
-    """
-
-    pixels: PixelGrid
-    samples: np.ndarray
-    shape: tuple[int, int, int]
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """(height, width) of the image, px."""
-        return self.pixels.shape
 
     @property
     def count(self) -> int:
@@ -126,13 +103,15 @@ class CoarseGrid:
         stride = self.shape[2]
         return (slice(stride // 2, None, stride),) * 2
 
-    def within(self, pair: FramePair, weights: np.ndarray | None, mask: np.ndarray) -> CoarseGrid:
-        """The same grid with weights (H, W) times a mask (h, w) of it, on the full grid as well."""
-        factors, samples = self.upsample(mask), self.samples.copy()
-        samples[kernels.W, : self.count] *= mask.reshape(-1)
+    def within(self, pair: FramePair, weights: np.ndarray | None, mask: np.ndarray) -> PixelGrid:
+        """The same grid with weights (H, W) times a mask (h, w) of it, on every pixel as well."""
+        factors = self.upsample(mask)
         if weights is not None:
             factors = factors * np.asarray(weights, np.float32)
-        return CoarseGrid(PixelGrid(pair, factors), samples, self.shape)
+        made = PixelGrid(pair, factors)
+        made.samples, made.shape = self.samples.copy(), self.shape
+        made.weight[:] *= mask.reshape(-1)
+        return made
 
     def resample(self, image: np.ndarray) -> np.ndarray:
         """(h, w) float32: a map over the whole image, of any resolution, at the grid's pixels."""
@@ -153,17 +132,20 @@ class CoarseGrid:
         return np.pad(fine, missing, mode="edge")[:height, :width]
 
 
+def grid_stride(shape: tuple[int, int], pixels: int) -> int:
+    """Distance, px, of the pixels of a grid of about ``pixels``."""
+    return max(1, round(np.sqrt(shape[0] * shape[1] / pixels)))
+
+
 def coarse_grid(
     pair: FramePair, weights: np.ndarray | None, options: RefineOptions
-) -> CoarseGrid | RelativePose:
-    """The pixels of a pair on a coarse grid, or the failure that says what is missing."""
+) -> PixelGrid | RelativePose:
+    """The pixels of a pair, or the failure that says what is missing."""
     if pair.flow is None:
         return RelativePose.failed(Reason.NO_FLOW, "no optical flow for this pair", "refine")
     if pair.prev.depth is None:
         return RelativePose.failed(Reason.NO_VALID_DEPTH, "no depth for this frame", "refine")
-    pixels = PixelGrid(pair, weights)
-    samples, h, w, stride = pixels.samples(options.coarse_pixels)
-    grid = CoarseGrid(pixels, samples, (h, w, stride))
+    grid = PixelGrid(pair, weights, options.coarse_pixels)
     usable = int(np.count_nonzero(grid.weight > 0))
     if usable < options.min_pixels:
         why = too_few(pair.prev.depth, pair.flow, usable, options.min_pixels)
@@ -181,13 +163,6 @@ def too_few(depth: np.ndarray, flow: np.ndarray, count: int, minimum: int) -> tu
     if flows < minimum:
         return Reason.NO_FLOW, f"{flows} pixels with valid flow, {minimum} needed"
     return Reason.LOW_INLIERS, f"{count} usable pixels, {minimum} needed"
-
-
-def as_contiguous(array: np.ndarray, dtype: Any = None) -> np.ndarray:
-    """Contiguous read-only view: numba compiles a kernel anew, for seconds, for each other kind."""
-    view = np.require(array, dtype, ["C", "A"]).view()
-    view.flags.writeable = False
-    return view
 
 
 def typical(variance: np.ndarray) -> float:

@@ -12,20 +12,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from hybridvo.calibration import MIN_TILES, WEAK_RATIO
-from hybridvo.geometry import invert, pose_matrix, se3_log
+from hybridvo.geometry import as_contiguous, invert, pose_matrix, se3_log
 from hybridvo.options import RefineOptions
 from hybridvo.refinement import coarse_fit
-from hybridvo.refinement.covariance import (
-    NOTHING,
-    motion_covariance,
-    score_sums,
-    symmetric,
-    tile_size,
-)
+from hybridvo.refinement.covariance import NOTHING, motion_covariance, score_sums, symmetric
 from hybridvo.refinement.depth import DepthFactor, compare_depths, depth_scale, look_up
 from hybridvo.refinement.kernels import SUMS, sum_samples
-from hybridvo.refinement.pixels import CoarseGrid, PixelGrid, as_contiguous, coarse_grid
-from hybridvo.refinement.solver import Factor, Linearization, gauss_newton
+from hybridvo.refinement.pixels import PixelGrid, coarse_grid
+from hybridvo.refinement.solver import Factor, Linearization, gauss_newton, tile_size
 from hybridvo.results import Hypothesis, Reason, RelativePose, Status
 from hybridvo.types import FramePair
 
@@ -33,56 +27,43 @@ MIN_INLIER_RATIO, LOW_INLIER_RATIO = 0.02, 0.25
 """Shares of the pixels that must follow the motion, else it is none, or degraded."""
 STEPS, LAST_STEP = 5, 4.0
 """Most steps, and length in standard deviations of the last one: what Newton's second order leaves
-behind it is a hundredth of one at most (18 recorded pairs), and another pass over the image costs a
-fifth of the time."""
+behind it is a hundredth of one at most (18 recorded pairs)."""
 WELL_CONDITIONED = 0.005
 """Ratio of the extreme eigenvalues of the flow's information above which it needs no help."""
 CURRENT_DEPTH_GAIN = 0.5
 """The current depth is used where it adds this share of the flow's information somewhere."""
 DEPTHS_PER_PAIR = 1.32
 """The two depths of a pair differ by this many times the noise of one: sqrt(2), less what the
-interpolation of the second one averages away (4/9 remains of independent noise)."""
+interpolation of the second one averages away."""
 
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """The motion to be refined, and what is known of it.
-
-    Args:
-        T_curr_prev: (4, 4).
-        noise: (flow px, log depth) standard deviations found with it, or None.
-        mask: (h, w) weights on the coarse grid that it was fitted with, or None for all.
-        coverage: share of the usable pixels' weight that the mask leaves.
-        confidence: the scorer's own, 0 to 1, that it is right; low where no motion may be.
-        gap: by how much its score exceeds that of any other motion.
-        probability: that the motion is right, calibrated in the gap.
-        hypotheses: all candidates, the one selected first.
-        iterations: Gauss-Newton steps spent on it.
-    """
+    """The motion (4, 4) to be refined, and what is known of it."""
 
     T_curr_prev: np.ndarray
-    noise: tuple[float, float] | None = None
-    mask: np.ndarray | None = None
-    coverage: float = 1.0
-    confidence: float = 1.0
-    gap: float = 0.0
-    probability: float = 1.0
-    hypotheses: tuple[Hypothesis, ...] = ()
-    iterations: int = 0
+    noise: tuple[float, float] | None = None  # flow px, log depth: standard deviations found so far
+    mask: np.ndarray | None = None  # (h, w) weights on the coarse grid that it was fitted with
+    coverage: float = 1.0  # share of the usable pixels' weight that the mask leaves
+    confidence: float = 1.0  # the scorer's own, that it is right; low where no motion may be
+    gap: float = 0.0  # by how much its score exceeds that of any other motion
+    probability: float = 1.0  # that the motion is right, calibrated in the gap
+    hypotheses: tuple[Hypothesis, ...] = ()  # all candidates, the one selected first
+    iterations: int = 0  # Gauss-Newton steps spent on it
 
 
 def refine_pair(
     pair: FramePair,
     start: Selection,
-    grid: CoarseGrid | None = None,
+    grid: PixelGrid | None = None,
     weights: np.ndarray | None = None,
     options: RefineOptions | None = None,
     min_probability: float = 0.0,
 ) -> RelativePose:
     """The motion of a pair near its only start; degraded below ``min_probability``.
 
-    ``grid``: coarse grid of the pair, with the weights; None: it is made, with ``weights`` (H, W),
-    factors on the information of each pixel.
+    ``grid``: the pair's, with weights; None: it is made, with ``weights`` (H, W), factors on the
+    information of each pixel.
     """
     options = options or RefineOptions()
     made = grid or coarse_grid(pair, weights, options)
@@ -92,7 +73,7 @@ def refine_pair(
     noise, iterations = start.noise, start.iterations
     if noise is None:
         pose, sf, sd, _, iterations = coarse_fit.fit_coarse(
-            made.samples, made.count, made.pixels.K, pose, options.cutoff
+            made.samples, made.count, made.K, pose, options.cutoff
         )
         noise = sf, sd
     curr = None if options.current_depth == "off" else pair.curr.depth
@@ -162,13 +143,11 @@ def ambiguous(probability: float) -> Status:
 
 
 def widened(motion: RelativePose) -> RelativePose:
-    """An ambiguous motion with a covariance that covers the other motions it may be.
+    """An ambiguous motion, its covariance widened to cover the others: the mixture's second moment.
 
-    The second moment of the mixture: with its probability the camera's motion is this one; else as
-    far away as the farthest of the others or as standing still, in any direction.
+    With its probability the camera's motion is this one; else as far away as the farthest of the
+    others or as standing still, in any direction.
     """
-    if motion.status.reason is not Reason.AMBIGUOUS_MOTION or not motion.usable:
-        return motion
     others = [h.T_curr_prev for h in motion.hypotheses[1:]] + [np.eye(4)]
     steps = np.array([se3_log(motion.T_curr_prev @ invert(T)) for T in others])
     sizes = [np.max(np.sum(steps[:, part] ** 2, axis=1)) for part in (slice(0, 3), slice(3, 6))]
@@ -177,20 +156,17 @@ def widened(motion: RelativePose) -> RelativePose:
 
 
 class FlowFactor:
-    """Flow and depth of every pixel of a grid, see :mod:`hybridvo.refinement.kernels`.
-
-    ``per_weight`` (42,) is that of :func:`hybridvo.refinement.covariance.score_sums`.
-    """
+    """Flow and depth of every pixel of a pair; ``per_weight`` (42,): of ``score_sums``."""
 
     def __init__(
-        self, image: PixelGrid, noise: np.ndarray, tile: int, per_weight: np.ndarray
+        self, grid: PixelGrid, noise: np.ndarray, tile: int, per_weight: np.ndarray
     ) -> None:
-        self.image, self.noise, self.tile, self._per_weight = image, noise, tile, per_weight
+        self._grid, self._noise, self._tile, self._per_weight = grid, noise, tile, per_weight
 
     def linearize(self, T: np.ndarray) -> Linearization:
-        """See :class:`hybridvo.refinement.solver.Factor`; the sums stay as attributes."""
-        self.tiles, self.rest, self.weights = self.image.full_pass(T[:3], self.noise, self.tile)
-        """(rows, columns, 27) sums of each tile; cost and sums of the weights; robust weights."""
+        """The sums of each tile, of cost and weights, and the robust weights stay as attributes."""
+        found = self._grid.full_pass(T[:3], self._noise, self._tile)
+        self.tiles, self.rest, self.weights = found
         self.meat = self._per_weight[21:] * self.rest[2]
         sums = self.tiles.sum(axis=(0, 1))
         curvature = symmetric(self._per_weight[:21] * self.rest[2])
@@ -206,13 +182,10 @@ def pair_noise(
     cutoff: float,
     curr: np.ndarray | None,
 ) -> tuple[float, float, float, float, float]:
-    """Noise of the pixels that follow a motion, from the noise (sf, sd) found before.
+    """Noise (sf, sd) of the pixels that follow a motion, share of the weight that does, standard
+    deviation of the log ratio of both depths and of its part that the flow does not tell (or 0).
 
     The current depth (H, W) bounds the noise of the first, and tells it where the flow cannot.
-
-    Returns:
-        sf, sd, share of the weight that follows, standard deviation of the log ratio of both
-        depths, and of its part that the flow does not tell; 0 where they cannot be compared.
     """
     sf, sd = start
     sf, sd, share, told = coarse_fit.estimate_noise(
@@ -235,25 +208,23 @@ def pair_noise(
 
 
 def _fit_full_grid(
-    grid: CoarseGrid,
+    grid: PixelGrid,
     curr: np.ndarray | None,
     pose: np.ndarray,
     start: tuple[float, float],
     options: RefineOptions,
 ) -> tuple[RelativePose, int, np.ndarray]:
-    """The motion (no status yet) on every pixel, from its pose (3, 4) and noise on the coarse grid.
-
-    And the number of tiles in which pixels were used, 0 where a direction is open; and eigenvalues
-    (6,), ascending, of the information scaled to pixels.
+    """The motion (no status yet) on every pixel; number of tiles in which pixels were used, 0 where
+    a direction is open; eigenvalues (6,), ascending, of the information scaled to pixels.
     """
-    image, samples, n = grid.pixels, grid.samples, grid.count
-    sf, sd, share, _, sigma = pair_noise(samples, n, image.K, pose, start, options.cutoff, curr)
-    tile = tile_size(image.shape, options.tiles)
+    samples, n, K = grid.samples, grid.count, grid.K
+    sf, sd, share, _, sigma = pair_noise(samples, n, K, pose, start, options.cutoff, curr)
+    tile = tile_size(grid.size, options.tiles)
     inverse_depth = coarse_fit.translation_scale(samples, n)
     noise = coarse_fit.noise_of(sf, sd, options.cutoff)
     total = float(grid.weight.sum(dtype=np.float64))
-    iterations = coarse_fit.gauss_newton(samples, n, total, image.K, noise, 4, 1e-3 * sf, pose)
-    flow = FlowFactor(image, noise, tile, score_sums(samples, n, pose, image.K, noise))
+    iterations = coarse_fit.gauss_newton(samples, n, total, K, noise, 4, 1e-3 * sf, pose)
+    flow = FlowFactor(grid, noise, tile, score_sums(samples, n, pose, K, noise))
     term = None
     if curr is not None and sigma > 0:
         term = _depth_factor(grid, curr, pose, sigma, noise, options)
@@ -266,7 +237,7 @@ def _fit_full_grid(
     cost, followers, usable = flow.rest
     covariance, eigenvalues, occupied = motion_covariance(
         tiles, np.asarray(found.at.curvature), symmetric(meat), inverse_depth,
-        usable, image.K[0], T[:3, 3], (sf, sd),
+        usable, K[0], T[:3, 3], (sf, sd),
     )  # fmt: skip
     motion = RelativePose(
         T_curr_prev=T,
@@ -284,7 +255,7 @@ def _fit_full_grid(
 
 
 def _depth_factor(
-    grid: CoarseGrid,
+    grid: PixelGrid,
     curr: np.ndarray,
     pose: np.ndarray,
     sigma: float,
@@ -292,20 +263,20 @@ def _depth_factor(
     options: RefineOptions,
 ) -> DepthFactor | None:
     """The current depth as a factor, or None where it is not asked for or adds too little."""
-    image, samples, n, stride = grid.pixels, grid.samples, grid.count, grid.shape[2]
-    curr, tile = as_contiguous(curr), tile_size(image.shape, options.tiles)
+    samples, n, stride = grid.samples, grid.count, grid.shape[2]
+    curr, tile = as_contiguous(curr), tile_size(grid.size, options.tiles)
     # on the full fit the flow has every pixel, the depth every second one of both axes
     fine = min(2, stride)
     if options.current_depth == "auto":
         sums = np.zeros(SUMS)
-        sum_samples(samples, n, pose, image.K, noise, sums)
+        sum_samples(samples, n, pose, grid.K, noise, sums)
         H_flow = symmetric(sums[:21])
         units = np.repeat([1 / coarse_fit.translation_scale(samples, n), 1.0], 3)
         eigenvalues = np.linalg.eigvalsh(H_flow * np.outer(units, units))
         if eigenvalues[0] > WELL_CONDITIONED * eigenvalues[-1]:
             return None
-        coarse = DepthFactor(image, curr, stride, sigma, noise, tile)
+        coarse = DepthFactor(grid, curr, stride, sigma, noise, tile)
         gain = np.linalg.eigvals(np.linalg.pinv(H_flow) @ coarse.linearize(pose).H / fine**2)
         if not gain.real.max() > CURRENT_DEPTH_GAIN:
             return None
-    return DepthFactor(image, curr, fine, sigma, noise, tile)
+    return DepthFactor(grid, curr, fine, sigma, noise, tile)

@@ -1,7 +1,7 @@
 """Gauss-Newton over factors: the one loop outside of the compiled kernels.
 
-A factor linearizes its cost about a motion, or about several at once. Perturbations act from the
-left, ``T <- Exp(delta) T``, delta = (translation, rotation) of each motion in turn.
+A factor linearizes its cost about a motion; perturbations act from the left, ``T <- Exp(delta) T``,
+delta = (translation, rotation).
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from hybridvo.geometry import invert, se3_exp, se3_log
+from hybridvo.options import RefineOptions
 
 PRIOR_FREEDOM = 6.0
 """Degrees of freedom of Student's kernel around a motion whose covariance is an estimate."""
@@ -20,34 +21,23 @@ PRIOR_FREEDOM = 6.0
 
 @dataclass(frozen=True, eq=False)
 class Linearization:
-    """Normal equations of a cost.
+    """Normal equations of a cost."""
 
-    Args:
-        H: (n, n) Gauss-Newton approximation of its second derivative.
-        g: (n,) its negative gradient, or what else is to become zero.
-        cost: its value, in units of the log likelihood.
-        curvature: (n, n) of the robust weights: ``H - curvature`` is the derivative of ``-g``.
-    """
-
-    H: np.ndarray
-    g: np.ndarray
-    cost: float
-    curvature: np.ndarray | float = 0.0
+    H: np.ndarray  # (6, 6) Gauss-Newton approximation of its second derivative
+    g: np.ndarray  # (6,) its negative gradient, or what else is to become zero
+    cost: float  # in units of the log likelihood
+    curvature: np.ndarray | float = 0.0  # of the robust weights: H less it is the derivative of -g
 
     def __add__(self, other: Linearization) -> Linearization:
-        return Linearization(
-            self.H + other.H,
-            self.g + other.g,
-            self.cost + other.cost,
-            self.curvature + other.curvature,
-        )
+        cost, curvature = self.cost + other.cost, self.curvature + other.curvature
+        return Linearization(self.H + other.H, self.g + other.g, cost, curvature)
 
 
 class Factor(Protocol):
     """A part of the cost."""
 
     def linearize(self, T: np.ndarray) -> Linearization:
-        """At ``T``, (4, 4) or (n, 4, 4)."""
+        """At a motion (4, 4)."""
 
 
 class Solution(NamedTuple):
@@ -61,11 +51,11 @@ class Solution(NamedTuple):
 def gauss_newton(
     factors: Sequence[Factor], T_init: np.ndarray, iterations: int = 10, tolerance: float = 1e-3
 ) -> Solution:
-    """Minimise the sum of the factors' costs by damped Newton or Gauss-Newton steps.
+    """Minimise the sum of the factors' costs by damped Newton or Gauss-Newton steps from (4, 4).
 
     A step is kept where the cost falls or the next step is half as long: noise may move the root of
-    the equations off the minimum of the cost. The start is one motion (4, 4), or (n, 4, 4); a step
-    shorter than ``tolerance`` standard deviations is the last.
+    the equations off the minimum of the cost. A step shorter than ``tolerance`` standard deviations
+    is the last.
     """
 
     def linearize(T: np.ndarray) -> Linearization:
@@ -78,7 +68,7 @@ def gauss_newton(
     for iteration in range(iterations):
         if not np.isfinite(length):
             return Solution(T, now, iteration)
-        moved = left_update(step, T)
+        moved = se3_exp(step) @ T
         if length < tolerance**2:
             return Solution(moved, now, iteration)
         then = linearize(moved)
@@ -101,14 +91,7 @@ def _step(at: Linearization, damping: float) -> tuple[np.ndarray, float]:
         step = inverse @ at.g
         if step @ at.H @ step <= 4.0 * (step @ at.g):
             return step, float(step @ at.g)
-    return np.zeros(len(at.g)), np.inf
-
-
-def left_update(delta: np.ndarray, T: np.ndarray) -> np.ndarray:
-    """Exp(delta) T for (4, 4) and (6,), or each of (n, 4, 4) and (6 n,)."""
-    if T.ndim == 2:
-        return se3_exp(delta) @ T
-    return np.stack([se3_exp(d) for d in delta.reshape(-1, 6)]) @ T
+    return np.zeros(6), np.inf
 
 
 def positive_inverse(matrix: np.ndarray) -> np.ndarray | None:
@@ -126,8 +109,19 @@ def positive_inverse(matrix: np.ndarray) -> np.ndarray | None:
     return 0.5 * (inverse + inverse.T) if np.isfinite(inverse).all() else None
 
 
+def tile_size(shape: tuple[int, int], tiles: int = RefineOptions.tiles) -> int:
+    """Side, px, of the tiles that cut an image into about ``tiles``; 8 to 64.
+
+    Errors may be correlated within a tile.
+    """
+    return int(np.clip(round(np.sqrt(shape[0] * shape[1] / tiles)), 8, 64))
+
+
 class PriorFactor:
-    """A motion that is known with a covariance, up to outliers."""
+    """A motion that is known with a covariance, up to outliers: Student's kernel in six dimensions.
+
+    ``information``: inverse of the covariance.
+    """
 
     def __init__(self, T: np.ndarray, information: np.ndarray) -> None:
         self._inverse, self.information = invert(T), information
@@ -137,14 +131,8 @@ class PriorFactor:
         return se3_log(T @ self._inverse)
 
     def linearize(self, T: np.ndarray) -> Linearization:
-        """See :class:`hybridvo.refinement.solver.Factor`."""
+        """See :class:`Factor`."""
         xi = self.offset(T)
-        cost, weight = student(float(xi @ self.information @ xi), PRIOR_FREEDOM)
-        H = weight * self.information
-        return Linearization(H, -H @ xi, float(cost))
-
-
-def student(d2: np.ndarray | float, freedom: float) -> tuple[np.ndarray, np.ndarray]:
-    """(cost, weight) of Student's kernel in six dimensions at squared Mahalanobis distances."""
-    d2 = np.asarray(d2)
-    return 0.5 * (freedom + 6) * np.log1p(d2 / freedom), (freedom + 6) / (freedom + d2)
+        d2 = float(xi @ self.information @ xi)
+        H = (PRIOR_FREEDOM + 6) / (PRIOR_FREEDOM + d2) * self.information
+        return Linearization(H, -H @ xi, 0.5 * (PRIOR_FREEDOM + 6) * np.log1p(d2 / PRIOR_FREEDOM))

@@ -1,8 +1,7 @@
 """The refinement of a batch of pairs in torch: CPU or GPU, float32 or float64, differentiable.
 
-Every start is refined on a subset of the pixels under a kernel whose scale shrinks (graduated
-non-convexity); the start of least cost is fitted to the noise found there, and then to all pixels.
-Poses are pypose SE3 in float64. Samples never see each other.
+Every start is refined on a subset of the pixels under a kernel whose scale shrinks; that of least
+cost is fitted to the noise found there, and then to all pixels. Samples never see each other.
 
 The gradient is that of the implicit function theorem: the estimate solves g(T, inputs) = 0 with
 g = sum of w J^T Sigma^-1 r, so d xi = A^-1 dg with A = -dg / d xi, the full derivative. It is
@@ -29,9 +28,10 @@ from hybridvo.refinement.batch import (
     initial_poses,
 )
 from hybridvo.refinement.coarse_fit import DAMPING
-from hybridvo.refinement.covariance import NOTHING, UPPER, motion_covariance, tile_size
+from hybridvo.refinement.covariance import NOTHING, UPPER, motion_covariance
 from hybridvo.refinement.pixels import grid_stride, too_few
 from hybridvo.refinement.refine import LAST_STEP, pair_noise, status_of
+from hybridvo.refinement.solver import tile_size
 from hybridvo.refinement.torch_factors import (
     CUTOFF,
     KERNELS,
@@ -77,7 +77,8 @@ def refine_batch(
     """Camera motion of every pair of a batch by robust dense reprojection.
 
     Works in the floating type of the flow and depth (half types are raised to float32). Gradients
-    reach all but ``T_init``, on which the estimate does not depend.
+    reach all but ``T_init``, on which the estimate does not depend. Bad data give a failed status
+    and a zero gradient for that very sample; shapes or types that cannot be used an InputError.
 
     Args:
         batch: see :class:`~hybridvo.types.PairBatch`.
@@ -88,13 +89,6 @@ def refine_batch(
             frame's depth that of its log; None: estimated.
         kernel: ``geman-mcclure``, with the cutoff of the options, ``cauchy``, ``huber`` or ``l2``.
         options: the current frame's depth is a third residual where ``current_depth`` is ``on``.
-
-    Returns:
-        Poses with covariance and a status per sample. Bad data give a failed status and a zero
-        gradient for that very sample, never an exception and never a pose that is not finite.
-
-    Raises:
-        InputError: shapes, types or options that cannot be used.
     """
     options = options or RefineOptions()
     if kernel not in KERNELS:
@@ -132,10 +126,9 @@ def _given_noise(noise: Any, like: torch.Tensor, with_depth: bool) -> torch.Tens
     known, sizes = value.detach(), (2, 3) if with_depth else (2,)
     fits = value.shape in [shape for n in sizes for shape in ((n,), (len(like), n))]
     if not fits or not ((known >= 0) & (known < torch.inf)).all() or (known[..., ::2] == 0).any():
-        raise InputError(
-            f"refine_batch: expected noise (sf, sd{', sz' * with_depth}), one or {len(like)} rows, "
-            f"finite, sf positive, sd not negative, got {noise!r}."
-        )
+        wanted = f"sf positive, sd not negative{', sz positive' * with_depth}"
+        expected = f"noise ({wanted}), one or {len(like)} rows"
+        raise InputError(f"refine_batch: expected {expected}, finite, got {noise!r}.")
     value = value.expand(len(like), value.shape[-1])
     if with_depth and value.shape[1] == 2:
         value = torch.cat([value, value[:, 1:].clamp(min=DEPTH_NOISE_FLOOR)], dim=1)
@@ -151,9 +144,8 @@ def _solve(
     options: RefineOptions,
     tight: bool,
 ) -> BatchedPose:
-    """From the starts (B, S, 7) to the pose of every sample, with covariance and status.
-
-    ``how``: the kernel, without noise. ``tight``: to the precision that a gradient needs.
+    """From the starts (B, S, 7) to the pose of every sample; ``how``: the kernel, without noise;
+    ``tight``: to the precision that a gradient needs.
     """
     (height, width), weight = batch.depth_prev.shape[1:], pixels.weight
     size = height, width
@@ -214,7 +206,7 @@ def _covariances(
     size: tuple[int, int],
     tile: int,
 ) -> list[tuple[np.ndarray, bool]]:
-    """Covariance of each sample by the numpy function, and whether it is definite."""
+    """Covariance of each sample by the numpy function; whether it is definite."""
     # 1 / typical depth, as of the coarse grid: half of the weight may lie on a sky at 30 km
     usable, z = few.weight > 0, few.points[:, 2]
     inverse = ((usable / z**2).sum(dim=1) / usable.sum(dim=1).clamp(min=1)).sqrt().clamp(min=1e-9)

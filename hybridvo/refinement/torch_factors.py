@@ -30,15 +30,12 @@ BEHIND_DISTANCE2 = 1e4
 
 
 KERNELS = ("geman-mcclure", "cauchy", "huber", "l2")
-"""Robust kernels of the squared Mahalanobis distance."""
 
 
 class RobustNoise(NamedTuple):
-    """How residuals are weighed: (B, n) noise sf px, sd, and sz with the current frame's depth;
-    kernel and its cutoff.
-    """
+    """How residuals are weighed: noise, cutoff and name of the kernel."""
 
-    noise: torch.Tensor
+    noise: torch.Tensor  # (B, n) sf px, sd, and sz with the current frame's depth
     cutoff: float = 3.0
     name: str = "geman-mcclure"
 
@@ -58,15 +55,12 @@ class RobustNoise(NamedTuple):
 
 
 class Residuals(NamedTuple):
-    """What a pose says of every pixel: X'/Z' and Y'/Z' (B, 2, N), 1/Z' (B, N), r (B, R, N).
+    """What a pose says of every pixel."""
 
-    R is 2, the flow, or 3 with the log depth of the current frame; t (B, 3, 1) of the pose.
-    """
-
-    ab: torch.Tensor
-    i: torch.Tensor
-    r: torch.Tensor
-    t: torch.Tensor
+    ab: torch.Tensor  # (B, 2, N) X'/Z' and Y'/Z'
+    i: torch.Tensor  # (B, N) 1/Z'
+    r: torch.Tensor  # (B, R, N): 2 of the flow, or 3 with the log depth of the current frame
+    t: torch.Tensor  # (B, 3, 1) of the pose
     front: torch.Tensor
 
 
@@ -107,8 +101,7 @@ def jacobian(pixels: Pixels, at: Residuals) -> torch.Tensor:
 class Weighted(NamedTuple):
     """Residuals at the depths that they make most likely, and what they weigh.
 
-    Their inverse covariance is diag(D) - kappa (D u)(D u)^T; ``right`` (B, R, N): it times the
-    residuals.
+    Their inverse covariance is diag(D) - kappa (D u)(D u)^T; ``right``: it times the residuals.
     """
 
     at: Residuals
@@ -148,21 +141,14 @@ def weigh(pixels: Pixels, T: pp.LieTensor, how: RobustNoise) -> Weighted:
 
 
 class Linearization(NamedTuple):
-    """Weighted normal equations at a pose, in C runs of pixels (the tiles, where there are tiles).
+    """Weighted normal equations at a pose, in C runs of pixels (the tiles, if there are any)."""
 
-    Args:
-        H: (B, C, 6, 6) sum of w J^T Sigma^-1 J. g: (B, C, 6) sum of w J^T Sigma^-1 r.
-        cost: (B,) robust cost, pixels behind the camera at the full one.
-        weight_sum: (B,) sum of robust times external weights.
-        robust, distance2: (B, N) robust weights and squared distances of the pixels.
-    """
-
-    H: torch.Tensor
-    g: torch.Tensor
-    cost: torch.Tensor
-    weight_sum: torch.Tensor
-    robust: torch.Tensor
-    distance2: torch.Tensor
+    H: torch.Tensor  # (B, C, 6, 6) sum of w J^T Sigma^-1 J
+    g: torch.Tensor  # (B, C, 6) sum of w J^T Sigma^-1 r
+    cost: torch.Tensor  # (B,) robust, pixels behind the camera at the full one
+    weight_sum: torch.Tensor  # (B,) of robust times external weights
+    robust: torch.Tensor  # (B, N) robust weights
+    distance2: torch.Tensor  # (B, N) squared Mahalanobis distances
 
     def total(self) -> tuple[torch.Tensor, torch.Tensor]:
         """(H (B, 6, 6), g (B, 6)) in float64: a float32 sum over an image loses its fifth digit."""
@@ -207,7 +193,7 @@ def _scores(J: torch.Tensor, w: torch.Tensor, found: Weighted) -> torch.Tensor:
 
 
 def newton_matrix(pixels: Pixels, T: pp.LieTensor, how: RobustNoise) -> torch.Tensor:
-    """A = -dg / d xi, g the sum of the scores: (B, 6, 6), not symmetric; A xi = g is the step."""
+    """A = -dg / d xi, g the sum of the scores: (B, 6, 6), not symmetric."""
     how = how._replace(noise=how.noise.detach())
     A = torch.zeros(len(T), 6, 6, dtype=T.dtype, device=T.device)
     with torch.enable_grad():
@@ -222,11 +208,8 @@ def newton_matrix(pixels: Pixels, T: pp.LieTensor, how: RobustNoise) -> torch.Te
 def solve_small(
     A: torch.Tensor, b: torch.Tensor, damping: float = 0.0
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Solve ((A + damping diag A) x = b) for (B, 6, 6) systems in float64, each for itself.
-
-    Returns:
-        (B, 6) solutions, with a gradient in b, and (B,) bool; where False (singular, or not finite)
-        they are zero.
+    """(B, 6) solutions of ((A + damping diag A) x = b) in float64, with a gradient in b; and (B,)
+    bool: where False (singular, or not finite) they are zero.
     """
     A = A.detach().double()
     inverse, info = torch.linalg.inv_ex(A + damping * torch.diag_embed(A.diagonal(dim1=1, dim2=2)))
@@ -265,10 +248,10 @@ def typical_residual(pixels: Pixels, T: pp.LieTensor) -> torch.Tensor:
 
 
 def fit_pixels(pixels: Pixels, start: pp.LieTensor, smallest: float) -> pp.LieTensor:
-    """The motion (B, 7) that pixels agree on under their weights: no noise, covariance or status.
+    """The motion (B, 7) that pixels agree on under their weights, or the start where that explains
+    the median pixel as well.
 
-    The scale of the kernel follows the residuals, down to ``smallest``. Where the fit explains the
-    median pixel no better than the start, the answer is the start. The gradient goes into the
+    The scale of the kernel follows the residuals, down to ``smallest``. The gradient goes into the
     weights alone, from pixels far away with constant strength: they may be the world.
     """
     with torch.no_grad():

@@ -10,7 +10,7 @@ import pytest
 from hybridvo.api import estimate
 from hybridvo.flow import FlowField, dis_flow, with_flow
 from hybridvo.geometry import pose_matrix, project
-from hybridvo.images.direct import direct_start, reduced
+from hybridvo.images.photometric import direct_start, reduced
 from hybridvo.options import DirectOptions, Options
 from hybridvo.pipeline import Context, run_method
 from hybridvo.types import FramePair

@@ -11,7 +11,7 @@ import pytest
 from hybridvo.api import refine
 from hybridvo.flow import dis_flow
 from hybridvo.geometry import ego_flow, invert
-from hybridvo.images.image_factor import correlation
+from hybridvo.images.factors import correlation
 from hybridvo.images.photometric import refine_photometric
 from hybridvo.synthetic.render import SyntheticSequence
 from hybridvo.synthetic.scenes import make_scene
@@ -62,7 +62,7 @@ def test_even_light_is_left_alone(made):
 
 
 @pytest.mark.parametrize("both", [True, False], ids=["vignette", "lamp"])
-def test_uneven_light_is_evened_out_and_said(both, made):
+def test_uneven_light_is_evened_out(both, made):
     prev, curr, T, _ = made
     if both:
         prev, curr = (replace(f, rgb=vignette(f.rgb)) for f in (prev, curr))
@@ -70,7 +70,6 @@ def test_uneven_light_is_evened_out_and_said(both, made):
         curr = replace(curr, rgb=lamp(curr.rgb))
     motion, done = refined(prev, curr)
     assert done.photometric.taken and done.photometric.uneven_light
-    assert "light changed" in done.status.message
     # one gain a pair gave 0.9 to 1.0 in the median of rendered pairs, the fields 0.26 to 0.36
     assert error_px(prev, done.T_curr_prev, T) < 0.7 * error_px(prev, motion.T_curr_prev, T)
 
@@ -101,7 +100,6 @@ def test_rows_taken_one_after_the_other_lower_the_weight(made):
     done = refine_photometric(replace(pair, curr=replace(curr, rgb=rolled)), motion)
     assert plain.agreement > 0.5
     assert done.photometric.agreement < 0.5
-    assert not done.photometric.taken or "parts of the image disagree" in done.status.message
 
 
 def test_correlation_within_cells_forgets_what_a_cell_has_in_common():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hybridvo.geometry import se3_exp
-from hybridvo.images.plane_factor import PlaneFactor
+from hybridvo.images.factors import PlaneFactor
 from hybridvo.refinement.solver import gauss_newton
 from tests import worlds
 

@@ -51,7 +51,6 @@ def test_finds_the_motion_within_its_covariance(dtype: torch.dtype) -> None:
     # q is a pixel or two here, so one pair alone tells little of the depth noise
     assert float(result.noise[:, 1].median()) == pytest.approx(0.02, abs=0.0101)
     assert (result.inlier_ratio > 0.85).all()
-    assert (result.T_prev_curr @ result.T_curr_prev - torch.eye(4, dtype=dtype)).abs().max() < 1e-6
 
 
 def test_a_nan_pair_leaves_the_others_bit_unchanged() -> None:

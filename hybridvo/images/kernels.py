@@ -1,11 +1,11 @@
-"""Numba kernels of the photometric term: residuals and Jacobians of its pixels.
+"""Numba kernels of images and depth maps: residuals and Jacobians of their pixels.
 
-Per pixel x of the previous image with grey value A, at a pose T (X' = T X, a = X'/Z', b = Y'/Z',
-i = 1/Z'):
+Photometric, per pixel x of the previous image with grey value A, at a pose T (X' = T X,
+a = X'/Z', b = Y'/Z', i = 1/Z'):
 
 - residual r = B(pi(X')) - gain A - offset, B read by cubic convolution (Catmull-Rom): bilinear
-  reading blurs by an amount that depends on the place between the pixels, which pulls the motion
-  towards places of equal blur (measured: twice the error on clean images);
+  reading blurs by an amount that depends on the place between the pixels (measured: twice the
+  error on clean images);
 - image gradient G of B at pi(X') from the gradient of A at x, carried over by the warp of a patch
   of constant depth (inverse compositional, Baker and Matthews, IJCV 2004): the noise of a central
   difference at x is independent of the noise of A at x, so noise alone moves nothing;
@@ -29,10 +29,12 @@ from hybridvo.refinement.kernels import (
     ZERO,
     keep_apart,
     pose_entries,
+    see,
+    slope,
 )
 
 XN, YN, Z, GREY, GX, GY, PD, W = range(8)
-"""Rows of a pixel buffer: ray x, ray y, depth, grey value, its gradient, relative depth variance,
+"""Rows of a pixel buffer: ray x, y, depth, grey value, its gradient, relative depth variance,
 weight."""
 BUFFER_ROWS = 8
 GQ = 8
@@ -42,6 +44,11 @@ MARGIN = 3
 MIN_AREA = np.float32(1e-3)
 """A patch whose area shrinks below this share is seen edge-on."""
 HALF = np.float32(0.5)
+REACH = 3
+"""Pixels from one of the four neighbours that span a plane to the other's middle: the steps of a
+structured-light sensor are wider than one."""
+EDGE = 0.1
+"""Relative difference of depth between such neighbours from which on there is an edge between."""
 
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
@@ -140,23 +147,14 @@ def project_pixels(buf, image, pose, K, scale, light, J, r):
     fx, fy, cx, cy = K[0], K[1], K[2], K[3]
     sx, sy = fx * scale[0], fx * scale[1]
     tx_, ty_ = fy * scale[0], fy * scale[1]
-    r00, r01, r02, tx, r10, r11, r12, ty, r20, r21, r22, tz = pose_entries(pose)
+    entries = pose_entries(pose)
+    r00, r01, _, _, r10, r11, _, _, r20, r21, _, _ = entries
     gain, offset = light[0], light[1]
-    low = np.float32(MARGIN - 1)
-    high_u = np.float32(width - MARGIN)
-    high_v = np.float32(H - MARGIN)
+    low, high_u, high_v = np.float32(MARGIN - 1), width - MARGIN, H - MARGIN
     for k in range(len(r)):
-        xn = buf[XN, k]
-        yn = buf[YN, k]
         z = buf[Z, k]
-        X = z * (r00 * xn + r01 * yn + r02) + tx
-        Y = z * (r10 * xn + r11 * yn + r12) + ty
-        Zc = z * (r20 * xn + r21 * yn + r22) + tz
-        i = ONE / (Zc if Zc > MIN_DEPTH else ONE)
-        a = X * i
-        b = Y * i
-        u = fx * a + cx
-        v = fy * b + cy
+        a, b, i, front = see(buf[XN, k], buf[YN, k], z, entries)
+        u, v = fx * a + cx, fy * b + cy
         # d pi / d x for constant depth; the gradient of A is its transpose times that of B
         s = z * i
         w00 = s * sx * (r00 - a * r20)
@@ -164,20 +162,18 @@ def project_pixels(buf, image, pose, K, scale, light, J, r):
         w10 = s * tx_ * (r10 - b * r20)
         w11 = s * ty_ * (r11 - b * r21)
         determinant = w00 * w11 - w01 * w10
-        seen = (Zc > MIN_DEPTH) & (u > low) & (u < high_u) & (v > low) & (v < high_v)
+        seen = front & (u > low) & (u < high_u) & (v > low) & (v < high_v)
         if not (seen and determinant > MIN_AREA):
             for p in range(GQ + 1):
                 J[p, k] = ZERO
             r[k] = np.nan
             continue
         grey = buf[GREY, k]
-        e = read_cubic(image, u, v) - gain * grey - offset
         f = gain / determinant
         gx = f * (w11 * buf[GX, k] - w10 * buf[GY, k])
         gy = f * (w00 * buf[GY, k] - w01 * buf[GX, k])
-        qu = fx * i * (a * tz - tx)
-        qv = fy * i * (b * tz - ty)
-        gq = gx * qu + gy * qv
+        qu, qv = slope(a, b, i, entries, K)
+        J[GQ, k] = gx * qu + gy * qv
         gx *= fx
         gy *= fy
         J[0, k] = gx * i
@@ -188,5 +184,50 @@ def project_pixels(buf, image, pose, K, scale, light, J, r):
         J[5, k] = gy * a - gx * b
         J[6, k] = -grey
         J[7, k] = -ONE
-        J[GQ, k] = gq
-        r[k] = e
+        r[k] = read_cubic(image, u, v) - gain * grey - offset
+
+
+@njit(cache=True, nogil=True)
+def point(depth, u, v, K):
+    """The point of a pixel, metres."""
+    z = np.float64(depth[v, u])
+    return (u - K[2]) / K[0] * z, (v - K[3]) / K[1] * z, z
+
+
+@njit(cache=True, nogil=True)
+def measure(points, T, depth, K):
+    """:class:`hybridvo.images.factors.Residuals` of moved points (N, 3) on a depth map."""
+    (height, width), n = depth.shape, len(points)
+    r, J, z = np.zeros(n), np.zeros((n, 6)), np.ones(n)
+    seen, at = np.zeros(n, np.bool_), np.full((n, 2), -1.0)
+    for k in range(n):
+        a, b, c = points[k]
+        X = T[0, 0] * a + T[0, 1] * b + T[0, 2] * c + T[0, 3]
+        Y = T[1, 0] * a + T[1, 1] * b + T[1, 2] * c + T[1, 3]
+        Z = T[2, 0] * a + T[2, 1] * b + T[2, 2] * c + T[2, 3]
+        if not Z > MIN_DEPTH:
+            continue
+        x, y = K[0] * X / Z + K[2], K[1] * Y / Z + K[3]
+        at[k, 0], at[k, 1] = x, y
+        if not (REACH - 0.5 < x < width - REACH - 0.5 and REACH - 0.5 < y < height - REACH - 0.5):
+            continue
+        u, v = int(np.rint(x)), int(np.rint(y))
+        px, py, pz = point(depth, u, v, K)
+        rx, ry, rz = point(depth, u + REACH, v, K)
+        lx, ly, lz = point(depth, u - REACH, v, K)
+        bx, by, bz = point(depth, u, v + REACH, K)
+        tx, ty, tz = point(depth, u, v - REACH, K)
+        edge = EDGE * pz
+        whole = abs(rz - pz) < edge and abs(lz - pz) < edge  # False where not finite
+        whole = whole and abs(bz - pz) < edge and abs(tz - pz) < edge
+        if not (whole and MIN_DEPTH < pz < MAX_VALUE):
+            continue
+        rx, ry, rz, bx, by, bz = rx - lx, ry - ly, rz - lz, bx - tx, by - ty, bz - tz
+        nx, ny, nz = by * rz - bz * ry, bz * rx - bx * rz, bx * ry - by * rx
+        length = max(np.sqrt(nx * nx + ny * ny + nz * nz), 1e-12)
+        nx, ny, nz = nx / length, ny / length, nz / length
+        r[k] = (X - px) * nx + (Y - py) * ny + (Z - pz) * nz
+        J[k, 0], J[k, 1], J[k, 2] = nx, ny, nz
+        J[k, 3], J[k, 4], J[k, 5] = Y * nz - Z * ny, Z * nx - X * nz, X * ny - Y * nx
+        z[k], seen[k] = pz, True
+    return r, J, z, seen, at
