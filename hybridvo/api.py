@@ -41,8 +41,7 @@ def estimate(
 
     ``pair`` has its flow; or it is the previous frame, ``curr`` the current one, and the flow is
     OpenCV's DIS. A ``prior`` is one more start, and a cue for the selection. Bad data give a failed
-    status, never an exception and never a value that is not finite; an unknown method, or an
-    argument of another kind, is an InputError.
+    status, never an exception and never a value that is not finite.
     """
     options, flow = Options() if options is None else options, None
     check_kind("estimate.options", options, Options)

@@ -8,8 +8,7 @@ flow: "the same pairs" below.
 """
 
 CUES_RIGHT = (0.26, 1.26)
-"""Of the cue scores: 259 of 316 right, AUROC .68, calibration error .05: with a rival hardly ever
-sure."""
+"""Of the cue scores: 259 of 316 right, AUROC .68, calibration error .05."""
 SELECTOR_RIGHT = (0.51, 0.95)
 """Of the selector's scores: 244 of 257 right, AUROC .83, calibration error .01; 24 right ones below
 :data:`MIN_CONFIDENCE`, 6 wrong ones above (``--pairs 140``)."""
@@ -59,8 +58,8 @@ FLOW_CONTRADICTION = (0.8, 2.0)
 times that without, while DIS reaches less than 1 / the second of it (less one grey level). 27
 pairs: at most 0.25 for the right flow, 0.85 and more for a negated, backward or doubled one."""
 
-# The numbers below have no unit. They were fitted on the development seeds of the scenarios
-# (``tools/benchmark.py``), on rendered walks with DIS flow, and on the real samples.
+# Below, without a unit: fitted on the development seeds of the scenarios (``tools/benchmark.py``),
+# on rendered walks with DIS flow, and on the real samples.
 
 FEW_TILES = 48
 """With fewer tiles the correlation between errors is hardly known; more of it is then assumed."""

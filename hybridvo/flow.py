@@ -18,11 +18,7 @@ from hybridvo.calibration import DIS_NOISE, FLOW_CONTRADICTION, MIN_TEXTURED
 from hybridvo.errors import InputError
 from hybridvo.types import Frame, FramePair, to_numpy
 
-DIS_PRESETS = {
-    "ultrafast": cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST,
-    "fast": cv2.DISOPTICAL_FLOW_PRESET_FAST,
-    "medium": cv2.DISOPTICAL_FLOW_PRESET_MEDIUM,
-}
+DIS_PRESETS = ("ultrafast", "fast", "medium")  # in OpenCV's order, from 0
 _logger = logging.getLogger(__name__)
 
 
@@ -83,7 +79,7 @@ def _calc_dis(preset: str, first: np.ndarray, second: np.ndarray) -> np.ndarray 
     if height < 32 and width > 2 * height:
         return None
     # one for each call: two threads may not share one, and it keeps the scales of a small image
-    dis: Any = cv2.DISOpticalFlow.create(DIS_PRESETS[preset])
+    dis: Any = cv2.DISOpticalFlow.create(DIS_PRESETS.index(preset))
     try:
         return np.asarray(dis.calc(first, second, None))
     except cv2.error:  # smaller than its patches

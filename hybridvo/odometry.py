@@ -85,16 +85,12 @@ class Odometry:
     """Chains the motions of consecutive frames; no pose is revised later.
 
     A frame that the next one cannot be held against (without depth, or of no motion) is passed
-    over: the next motion spans it. Memory is that of one frame. Two trackers share no state and may
-    run in two threads; one tracker belongs to one thread.
+    over: the next motion spans it. Memory is that of one frame; a tracker belongs to one thread.
 
-    Args:
-        network: ``default`` for the pretrained weights, None for the classical refinement alone,
-            the name or file of other selector weights, or :class:`hybridvo.network.models.Models`.
-        flow: provider ``(prev, curr) -> FlowField or (H, W, 2) array``; default: OpenCV DIS. After
-            :meth:`skip` the two frames are no neighbours.
-        method: by default ``hybrid``, or ``refine`` without a network.
-        options: all groups but ``run`` are read, and of that ``run.device``.
+    ``network`` is ``default`` (pretrained), None for the classical refinement alone, the name or
+    file of other selector weights, or :class:`hybridvo.network.models.Models`; ``flow`` a provider
+    ``(prev, curr) -> FlowField or (H, W, 2) array``, by default OpenCV's DIS; ``method`` by default
+    ``hybrid``, or ``refine`` without a network.
     """
 
     def __init__(
@@ -159,10 +155,9 @@ class Odometry:
     def track(self, frame: Frame, flow: FlowField | np.ndarray | None = None) -> Step:
         """Pose of the next frame; the first one has the identity as motion, status ok.
 
-        The arrays of ``frame`` are copied: a driver may reuse its buffers. ``flow``, (H, W, 2) px
-        from ``state.frame`` to this one or a FlowField, is given where it is known already; such a
-        frame is never passed over: the next one's flow leads from it. After an InputError (a frame
-        of another size, or a flow that does not fit) the tracker is as it was.
+        The arrays of ``frame`` are copied. ``flow``, (H, W, 2) px from ``state.frame`` to this one,
+        or a FlowField, is given where it is known; such a frame is never passed over. After an
+        InputError (another size, or a flow that does not fit) the tracker is as it was.
         """
         check_kind("Odometry.track", frame, Frame)
         state, frame = self.state, deepcopy(frame)

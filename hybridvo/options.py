@@ -1,7 +1,4 @@
-"""Every option of the program, in one tree: ``Options().refine.cutoff`` and the like.
-
-The classes are frozen and check their values; ``configs/odometry.yaml`` explains the same tree.
-"""
+"""Every option of the program, in one tree, which ``configs/odometry.yaml`` explains."""
 
 from __future__ import annotations
 

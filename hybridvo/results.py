@@ -178,8 +178,7 @@ class RelativePose:
 class Step:
     """One tracked frame: camera to world (4, 4), and its motion from the frame before.
 
-    The world is the first camera unless set; the first motion is the identity with status ok. What
-    users ask a motion most can be asked of its step.
+    The world is the first camera unless set; the first motion is the identity with status ok.
     """
 
     index: int

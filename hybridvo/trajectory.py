@@ -72,10 +72,9 @@ class Trajectory:
 def read_trajectory(path: str | os.PathLike[str]) -> Trajectory:
     """Read camera-to-world poses from a text file, one pose a line; FormatErrors name the line.
 
-    The number of columns tells the format, see :data:`COLUMNS`. TartanAir's NED axes (x forward, y
-    right, z down) become those of a camera. Stamps in other units than seconds are converted, which
-    ``warnings`` say; KITTI and TartanAir files get frame numbers as stamps. ``#`` comments, empty
-    lines, tabs, Windows line ends and a byte-order mark are accepted.
+    The number of columns tells the format, see :data:`COLUMNS`. TartanAir's NED axes become those
+    of a camera; stamps in other units than seconds are converted, which ``warnings`` say; KITTI and
+    TartanAir files get frame numbers as stamps.
     """
     path = Path(path)
     if not path.is_file():

@@ -1,10 +1,8 @@
 """What goes in: camera, frame, pair and batch, with the checks of what users hand in.
 
-Conventions (pinned in ``tests/test_conventions.py``): ``T_target_source`` maps homogeneous points
-of ``source`` into ``target``; camera axes x right, y down, z forward; pixel (0, 0) is the centre of
-the top-left pixel; depth is z in metres with NaN, inf, zero and negative values invalid; flow is in
-pixels from the previous to the current frame, on the previous grid; tangent vectors are
-(translation, rotation) of a left perturbation in the current camera.
+Conventions (``tests/test_conventions.py``): ``T_target_source`` maps points of ``source`` into
+``target``; camera axes x right, y down, z forward; pixel (0, 0) is the centre of the top-left one;
+tangent vectors are (translation, rotation) of a left perturbation in the current camera.
 """
 
 from __future__ import annotations
@@ -90,10 +88,7 @@ def as_rigid(T: Any, where: str, tolerance: float = 1e-6, *, many: bool = False)
 
 @dataclass(frozen=True)
 class Camera:
-    """Pinhole camera without distortion; focal lengths and centre in pixels of this image size.
-
-    An InputError refuses a centre farther than one image size outside.
-    """
+    """Pinhole camera without distortion; focal lengths and centre in pixels of this image size."""
 
     fx: float
     fy: float

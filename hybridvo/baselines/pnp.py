@@ -1,7 +1,6 @@
 """Point solvers of OpenCV and PoseLib: sample, solve, check.
 
-A solver's own "success" is not believed: the check is the same for every baseline, so that "ok"
-means one thing in a comparison.
+The check is the same for every baseline, so that "ok" means one thing in a comparison.
 """
 
 from __future__ import annotations
@@ -24,11 +23,8 @@ POINTS = 10_000  # random valid pixels for a solver; all cost 50 times more for 
 MIN_POINTS = 6  # correspondences and inliers: four always fit some pose, so they prove nothing
 DEPTH_RANGE_M = (1e-6, 1e6)  # outside it squares leave the floating-point range
 MIN_INLIER_RATIO = 0.05  # below this share of the sampled pixels a consensus is chance: failed
-SINGULAR_RATIO = 1e-10
-"""Eigenvalue ratio of the scaled information below which a direction is free. A frontal plane over
-a field of view of 20 degrees has 1e-4, a patch of 20 px at fx = 1000 has 1e-9."""
-TUNED_PX, DEFAULT_PX = 2.0, 8.0
-"""Largest residual of an inlier: of the tuned solvers, and OpenCV's default."""
+SINGULAR_RATIO = 1e-10  # of the information's eigenvalues; a patch of 20 px has 1e-9
+TUNED_PX, DEFAULT_PX = 2.0, 8.0  # residual of an inlier: of the tuned solvers, OpenCV's default
 TUNED: Any = {"iterationsCount": 1000, "reprojectionError": TUNED_PX, "confidence": 0.999}
 FOUND_NOTHING = (cv2.error, ValueError, RuntimeError, ArithmeticError)
 """What the libraries raise on data that determine no pose."""
@@ -169,9 +165,8 @@ def check(
 ) -> RelativePose:
     """A solver's motion with covariance, or a failure with the identity.
 
-    It must be rigid, with enough inliers (in front of the camera, within ``threshold_px``), which
-    determine all six degrees of freedom. Covariance sigma^2 (J^T J)^-1 over them, sigma^2 =
-    |r|^2 / (2 n - 6) unless ``sigma_px`` is given: optimistic where a solver stops short.
+    It must be rigid, with enough inliers within ``threshold_px`` that determine all six degrees of
+    freedom. Covariance sigma^2 (J^T J)^-1, sigma^2 = |r|^2 / (2 n - 6) unless given.
     """
     if isinstance(data, Status):
         return RelativePose.failed(data.reason, data.message, method)

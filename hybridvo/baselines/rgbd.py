@@ -1,7 +1,6 @@
-"""RGB-D odometry of OpenCV and Open3D: dense alignment of two images with their depth.
+"""RGB-D odometry of OpenCV and Open3D: what an RGB-D user would pick today.
 
-What an RGB-D user would pick today. The flow of the pair serves only to check the motion and to
-give it a covariance; without flow that of one pixel of noise at every sampled pixel is given.
+The flow of the pair serves only to check the motion and to give it a covariance.
 """
 
 from __future__ import annotations

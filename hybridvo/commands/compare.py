@@ -35,8 +35,7 @@ from hybridvo.pipeline import METHODS, check_method
 _logger = logging.getLogger(__name__)
 WRITTEN = ("results.json", "results.csv", "pairs.csv", "report.md", "report.html")
 """What a finished comparison leaves, beside ``runs/``."""
-CAMERA_FLOW_KINDS = ("tartanair",)
-"""Data sets whose true flow is that of the camera alone: it does not show what moves by itself."""
+CAMERA_FLOW_KINDS = ("tartanair",)  # whose true flow does not show what moves by itself
 
 
 def compare(
@@ -249,8 +248,8 @@ def _pairs(job: _Job, method: str) -> pd.DataFrame:
 
 def _row(job: _Job, table: pd.DataFrame, method: str, run: Mapping[str, Any]) -> dict[str, Any]:
     """Line of the results of a run."""
-    named = {"sequence": job.name, "method": method, "flow_source": job.flow}
-    named |= {"depth_source": job.sequence.depth_source}
+    source = {"flow_source": job.flow, "depth_source": job.sequence.depth_source}
+    named = {"sequence": job.name, "method": method, **source}
     line = scores.sequence_row(table[table["method"] == method], run["metrics"], named)
     return line | {"trajectory": f"runs/{job.folder.name}/{method}/trajectory.tum"}
 

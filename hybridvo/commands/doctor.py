@@ -121,8 +121,7 @@ def _units(table: pd.DataFrame) -> dict[str, Any]:
         # all depths and all translations times s project to the same pixels: no pair can tell
         text += f"; {len(scales)} pairs with a true motion, {MIN_PAIRS} needed"
         return _finding(name, None, text, median)
-    low, high = scales.quantile([0.25, 0.75])
-    value = float(scales.median())
+    low, value, high = scales.quantile([0.25, 0.5, 0.75]).tolist()
     text += f"; motions are {value:.4g} times as long as the poses on file say"
     differs = abs(value - 1) > MAX_SCALE_ERROR and not low < 1 < high
     if differs:

@@ -24,11 +24,7 @@ def generate(
     workers: int = 1,
     quiet: bool = True,
 ) -> Path:
-    """Draw samples, and a contact sheet of the first; goes on where it was interrupted.
-
-    ``preset`` is ``paper``, ``diverse`` or a file such as ``configs/data_paper.yaml``, ``size``
-    (height, width) instead of its own.
-    """
+    """Draw samples, and a contact sheet of the first; goes on where it was interrupted."""
     with Progress("generate", count, "samples", quiet=quiet) as bar:
         for done in write_samples(load_preset(preset, size), count, out, seed, workers):
             bar.show(done)

@@ -57,8 +57,7 @@ def run(
 ) -> tuple[dict[str, Any], int]:
     """Estimate, chain, write and score a sequence: a summary, JSON-ready, and the exit code.
 
-    ``out`` is by default ``runs/NAME``; ``rrd`` is the file of a Rerun recording, empty for
-    ``recording.rrd`` in the output folder.
+    ``out`` is by default ``runs/NAME``; an empty ``rrd`` is ``recording.rrd`` in that folder.
     """
     method = options.run.method
     models = models or Models(options.run.device)
@@ -276,10 +275,8 @@ def frames_of(sequence: Sequence, options: Options) -> range:
     stop = min(options.run.stop or len(sequence), len(sequence))
     frames = range(options.run.start, stop, options.run.stride)
     if not frames:
-        raise InputError(
-            f"{sequence.name}: no frames from {options.run.start} to {stop}: there are "
-            f"{len(sequence)}."
-        )
+        asked = f"from {options.run.start} to {stop}"
+        raise InputError(f"{sequence.name}: no frames {asked}: there are {len(sequence)}.")
     return frames
 
 

@@ -28,8 +28,7 @@ class Sequence:
     """Frames in time order, read when asked for: ``len``, ``sequence[i]``, ``for frame in``.
 
     A reader overrides ``_list_files``, which fills in files, stamps and poses, and
-    ``_calibration``; where its files need more than their ending says, ``_read_depth`` and
-    ``_read_flow``.
+    ``_calibration``; where its files need it, ``_read_depth`` and ``_read_flow``.
     """
 
     kind = "sequence"  # the key of READERS

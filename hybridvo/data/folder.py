@@ -24,12 +24,7 @@ from hybridvo.types import as_number
 
 
 class FolderSequence(Sequence):
-    """The layout that is easiest to write; docs/own-data.md describes it.
-
-    Stamps come from ``timestamps.txt``, else from ``poses.txt`` where it has a line for each frame,
-    else from file names that are stamps, else from ``fps``. Colour and depth go together by equal
-    names, else by stamps within 0.02 s (colour without depth is left out), else by order.
-    """
+    """The layout that is easiest to write; docs/own-data.md describes it."""
 
     kind = "folder"
     depth_source = "file"
@@ -71,10 +66,8 @@ class FolderSequence(Sequence):
             expected = "a 16-bit PNG, .npy or .dpt of metric depth for each image in rgb/"
             raise InputError(f"{root / 'depth'}: no {what}: expected {expected}.")
         if self._given_scale is None and any(path.suffix.lower() == ".png" for path in depth):
-            raise InputError(
-                f"{root / CAMERA_FILE}: depth/ holds PNG files: 'depth_scale' (units per metre, "
-                f"1000 for millimetres) must be given, there or with --depth-scale."
-            )
+            needed = "'depth_scale' (units per metre) must be given, there or with --depth-scale"
+            raise InputError(f"{root / CAMERA_FILE}: depth/ holds PNG files: {needed}.")
         if flow and settings is not None and any(settings.distortion):
             raise InputError(f"{root}: flow/ is of distorted images: undistort them, or remove it.")
 

@@ -1,7 +1,6 @@
 """Readers and writers of image, depth, flow and camera files.
 
-Every reader compares the size that a header declares with that of the file before it decodes
-anything. A file that does not fit its format is a FormatError; none is a ``FileNotFoundError``.
+A file that does not fit its format is a FormatError; none is a ``FileNotFoundError``.
 """
 
 from __future__ import annotations
@@ -64,8 +63,7 @@ def read_depth(path: PathLike) -> np.ndarray:
 def read_flow(path: PathLike) -> tuple[np.ndarray, np.ndarray | None]:
     """(H, W, 2) float32 flow in pixels and (H, W) bool valid, or None where all of it is.
 
-    Formats by the ending: ``.flo`` (beyond 1e9: unknown), ``.npy``, else KITTI's 16-bit PNG:
-    R = 64 u + 2^15, G = 64 v + 2^15, B = 1 where valid; flow at invalid pixels is NaN.
+    Of ``.flo``, ``.npy``, else KITTI's 16-bit PNG, where flow at invalid pixels is NaN.
     """
     suffix = Path(path).suffix.lower()
     if suffix == ".flo":

@@ -18,16 +18,14 @@ from hybridvo.geometry import invert
 from hybridvo.trajectory import COLUMNS, read_poses
 from hybridvo.types import Camera, Frame
 
-DISPARITY_SIGMA_PX = 0.5
-"""Assumed standard deviation of a block-matched disparity, px: sets the relative depth noise."""
+DISPARITY_SIGMA_PX = 0.5  # standard deviation of a block-matched disparity, assumed
 
 
 class KittiSequence(Sequence):
     """One sequence such as ``sequences/00``: image_2 (or image_0), calib.txt, times.txt.
 
-    Depth comes from a folder ``depth`` (16-bit PNG with 256 units per metre, or ``.npy`` in
-    metres), else from stereo: OpenCV's semi-global matching with the baseline of ``calib.txt``.
-    Poses are those of the colour camera that is read, in KITTI's world (first camera 0).
+    Depth comes from a folder ``depth`` (16-bit PNG, 256 per metre, or ``.npy``, metres), else from
+    stereo by OpenCV's semi-global matching. Poses are those of the camera that is read.
     """
 
     kind = "kitti"

@@ -13,8 +13,7 @@ from hybridvo.files import read_rows
 from hybridvo.trajectory import COLUMNS, check_increasing, read_poses, to_seconds
 
 IMAGES = (".png", ".jpg", ".jpeg")
-MAX_STAMP_DIFFERENCE_S = 0.02
-"""Largest difference in seconds between stamps that belong together (the TUM tools' value)."""
+MAX_STAMP_DIFFERENCE_S = 0.02  # between stamps that belong together: the TUM tools' value
 
 
 def sorted_files(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
@@ -41,9 +40,8 @@ def match_files(
     if not any(found) and len(files) == len(frames):
         return [*files]
     if not any(found):
-        raise InputError(
-            f"{where}: {len(files)} files for {len(frames)} frames, and no name agrees. {hint}"
-        )
+        counts = f"{len(files)} files for {len(frames)} frames"
+        raise InputError(f"{where}: {counts}, and no name agrees. {hint}")
     return found
 
 
@@ -88,10 +86,8 @@ def depth_at(
     pairs = associate(stamps, depth_stamps)
     count, limit = len(stamps), MAX_STAMP_DIFFERENCE_S
     if count and not pairs:
-        raise InputError(
-            f"{where}: no frames: none of {count} colour stamps has a depth stamp within {limit} "
-            f"s. Are both in the same unit and of the same clock?"
-        )
+        what = f"none of {count} colour stamps has a depth stamp within {limit} s"
+        raise InputError(f"{where}: no frames: {what}. Of the same unit and the same clock?")
     if len(pairs) < count:
         left_out = f"{count - len(pairs)} of {count} colour images have no depth within {limit} s"
         told.append(f"{where.name}: {left_out} and are left out.")

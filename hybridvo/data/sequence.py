@@ -34,9 +34,8 @@ READERS: dict[str, type[Sequence]] = {
 }
 """Kind -> reader, in the order in which a folder is tried."""
 OWN_DATA = (
-    "Own data: hybridvo needs metric depth for each image, from a sensor, stereo or a network. Put "
-    "images into rgb/, depth registered to them into depth/, and describe the camera with "
-    "'hybridvo init DIR' (kind 'folder')."
+    "Own data: hybridvo needs metric depth for each image. Put images into rgb/, depth registered "
+    "to them into depth/, and describe the camera with 'hybridvo init DIR' (kind 'folder')."
 )
 
 

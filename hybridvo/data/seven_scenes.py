@@ -17,8 +17,7 @@ from hybridvo.files import read_text
 class SevenScenesSequence(Sequence):
     """One sequence such as ``chess/seq-01``: ``frame-000000.{color.png,depth.png,pose.txt}``.
 
-    Depth is in millimetres, 0 and 65535 are invalid. K = 585 585 320 240 is the data set's own
-    convention for colour and depth. The data has no stamps.
+    K = 585 585 320 240 is the data set's own convention. The data has no stamps.
     """
 
     kind = "7scenes"

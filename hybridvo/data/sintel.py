@@ -23,9 +23,8 @@ ENDINGS = {
 class SintelSequence(Sequence):
     """One Sintel scene, such as ``training/clean/alley_1``, or NAME under a sibling of clean.
 
-    Siblings are found from there, also where the zip files were unpacked into neighbouring folders.
-    Images are those of the path, else of the final pass, else of the clean one. ``flow`` marks the
-    pixels of the ``invalid`` masks; occluded pixels keep their true flow.
+    Siblings are found from there, also where the zip files were unpacked apart. Images are those of
+    the path, else of the final pass, else of the clean one.
     """
 
     kind = "sintel"

@@ -17,8 +17,7 @@ from hybridvo.trajectory import COLUMNS, read_poses
 class TartanAirSequence(Sequence):
     """One TartanAir trajectory, such as ``P000``; the version is seen from the folder names.
 
-    The flow files hold the flow that the camera alone causes. Depth of the sky is about 1e4 m and
-    kept. Poses are turned from north-east-down to camera axes here, once. The data has no stamps.
+    The flow files hold the flow that the camera alone causes. The data has no stamps.
     """
 
     kind = "tartanair"

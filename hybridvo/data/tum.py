@@ -32,11 +32,8 @@ class TumSequence(Sequence):
     """A recording with ``rgb.txt``, ``depth.txt`` and ``groundtruth.txt``.
 
     Colour, depth and poses are associated by nearest stamp within 0.02 s, one to one; colour images
-    without depth are left out. fr1, fr2 and Bonn images are undistorted to a pinhole camera with
-    the same K; depth by nearest value. Bonn's poses are moved from the tracked body to the camera.
-
-    ICL-NUIM as published (``associations.txt`` and ``*.gt.freiburg``) is read too: its poses are
-    those of a renderer with y upwards and are reflected, K = 481.2 480 319.5 239.5.
+    without depth are left out. fr1, fr2 and Bonn images are undistorted. ICL-NUIM as published
+    (``associations.txt`` and ``*.gt.freiburg``) is read too.
     """
 
     kind = "tum"

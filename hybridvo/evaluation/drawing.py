@@ -171,10 +171,9 @@ def saliencies(
 ) -> dict[str, np.ndarray]:
     """Absolute attributions (h, w) of rotation and translation to flow and inverse depth.
 
-    The answer is the length of the predicted rotation (or translation) along its own direction; of
-    a pixel-wise network with the pixels and weights chosen for the real input: the choice would
-    make it jump. The path starts at zero; scale-free networks see the logarithm of the depth, which
-    is held fixed, as is what earlier passes found.
+    The answer is the length of the predicted rotation (or translation) along its own direction,
+    with the pixels and weights chosen for the real input. The path starts at zero; the depth of
+    scale-free networks is held fixed, as is what earlier passes found.
     """
     names = ("flow",) if network.options.scale_free else ("flow", "inverse_depth")
     given = tuple(getattr(inputs, name) for name in names)

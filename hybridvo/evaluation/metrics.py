@@ -1,7 +1,4 @@
-"""Errors of a trajectory against ground truth: ATE, RPE, drift as KITTI measures it.
-
-What the paths do not determine is a :class:`DegenerateError`; a report holds None and its reason.
-"""
+"""Errors of a trajectory against ground truth: ATE, RPE, drift as KITTI measures it."""
 
 from __future__ import annotations
 
@@ -22,8 +19,7 @@ from hybridvo.trajectory import Trajectory, read_trajectory
 Alignment = Literal["se3", "sim3", "origin", "none"]
 DeltaUnit = Literal["frames", "s"]
 
-KITTI_LENGTHS = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
-"""Sub-paths of KITTI's odometry benchmark, metres."""
+KITTI_LENGTHS = tuple(range(100, 801, 100))  # metres: sub-paths of KITTI's odometry benchmark
 
 
 class Match(NamedTuple):

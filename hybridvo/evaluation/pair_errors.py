@@ -23,12 +23,9 @@ from hybridvo.geometry import (
 from hybridvo.trajectory import Trajectory
 from hybridvo.types import Camera, Frame
 
-PAPER_SIZE = (128, 256)
-"""(height, width) at which the paper measures its EPE."""
-MOVING_PX = 1.0
-"""A pixel whose true flow differs by more than this from the true ego flow moves by itself."""
+PAPER_SIZE = (128, 256)  # height and width at which the paper measures its EPE
+MOVING_PX = 1.0  # of the true flow beside the true ego flow: the pixel moves by itself
 ERRORS = ("r_err_deg", "t_err", "epe", "epe_l2_px", "rot_err_deg", "trans_err")
-"""Of a pair, see :func:`pair_errors`."""
 NO_DEPTH = "no pixel has a valid depth and a true motion that stays in front of the camera"
 
 
@@ -123,8 +120,7 @@ def pair_errors(
 def mean_pair_errors(pairs: Any) -> dict[str, Any]:
     """Means and medians of :func:`pair_errors` over pairs (dictionaries, or a table).
 
-    The names are those of ``results.json``; ``reasons`` name every value that is None or leaves
-    pairs out.
+    ``reasons`` name every value that is None or leaves pairs out.
     """
     figures = {name: (name, "mean") for name in ERRORS[:4]}
     for name in ERRORS[4:]:

@@ -1,7 +1,4 @@
-"""Images of trajectories and of the maps of a pair, by matplotlib.
-
-Uses the object interface: no window, no pyplot, no global state.
-"""
+"""Images of trajectories and of the maps of a pair, by matplotlib without global state."""
 
 from __future__ import annotations
 
@@ -131,11 +128,10 @@ def draw_panels(
 
 
 def flow_colours(flow: np.ndarray, longest: float | None = None) -> np.ndarray:
-    """(H, W, 3) uint8 RGB of a flow (H, W, 2).
+    """(H, W, 3) uint8 RGB of a flow (H, W, 2): hue is the direction, saturation the length.
 
-    Hue is the direction (red to the right, yellow-green downwards), saturation the length. Vectors
-    of ``longest`` px have full saturation (default: the 99th percentile), longer ones are darker;
-    no motion is white, NaN and inf are black.
+    Vectors of ``longest`` px are fully saturated (default: the 99th percentile), longer ones dark;
+    no motion is white, unknown is black.
     """
     known = np.isfinite(flow).all(axis=2)
     u, v = np.moveaxis(np.where(known[..., None], flow, 0.0), 2, 0)

@@ -1,7 +1,4 @@
-"""The report of a comparison: ``report.html`` (one file, interactive) and ``report.md``.
-
-Estimated flow stands before true flow (an oracle) everywhere.
-"""
+"""The report of a comparison: ``report.html`` (one file, interactive) and ``report.md``."""
 
 from __future__ import annotations
 

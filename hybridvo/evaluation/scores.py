@@ -1,7 +1,6 @@
 """Lines of ``results.json``: one method on one sequence, and one method on all of them.
 
-``reasons`` says of every value that is None why. A failed estimate counts with the motion it
-carries, which is none, in every mean and median.
+A failed estimate counts with the motion it carries, which is none, in every mean and median.
 """
 
 from __future__ import annotations
@@ -21,10 +20,8 @@ from hybridvo.evaluation.pair_errors import mean_pair_errors
 from hybridvo.files import parse_yaml
 from hybridvo.types import Camera
 
-FAILURE_PX = 1.0
-"""Error of the ego flow at native size above which an estimate has failed, px."""
+FAILURE_PX = 1.0  # error of the ego flow at native size above which an estimate has failed
 PATH_KEYS = ("ate_rmse", "rpe_trans_rmse", "rpe_rot_rmse_deg", "ate_rmse_origin")
-"""Errors of a whole trajectory; the last one is after aligning the first pose alone."""
 NO_PAIRS = "no pair was estimated, or none has ground truth"
 NO_TRUTH = "the sequence has no ground truth for these frames"
 NO_MOVING = "needs true flow of the whole scene (moving objects included) and ground truth"
@@ -99,10 +96,7 @@ def sequence_row(
 
 
 def total_row(pairs: pd.DataFrame, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Line of one method over all sequences: pairs pooled, trajectory errors as plain means.
-
-    An error that some ``rows`` lack is the mean over the others, and ``reasons`` says so.
-    """
+    """Line of one method over all sequences: pairs pooled, trajectory errors as plain means."""
     scores = pair_scores(pairs)
     for key in PATH_KEYS:
         known = [row[key] for row in rows if row[key] is not None]
