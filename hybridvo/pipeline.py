@@ -7,6 +7,7 @@ depth) and *refine photometrically* (on the images).
 
 from __future__ import annotations
 
+import difflib
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -196,6 +197,8 @@ def run_method(pair: FramePair, method: str, ctx: Context) -> RelativePose:
 def check_method(method: str) -> None:
     """Refuse an unknown method, or a baseline whose package is missing, by an InputError."""
     if method not in METHODS:
-        raise InputError(f"method: '{method}' is unknown; known: {', '.join(METHODS)}.")
+        near = difflib.get_close_matches(str(method), METHODS, n=1, cutoff=0.4)
+        hint = f" (did you mean '{near[0]}'?)" if near else ""
+        raise InputError(f"method: '{method}' is unknown{hint}; known: {', '.join(METHODS)}.")
     if reason := pnp.missing(method):
         raise InputError(f"method '{method}' cannot run here: {reason}.")

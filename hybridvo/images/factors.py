@@ -2,15 +2,12 @@
 
 Images: the residual of a weighted static pixel is ``I_curr(pi(T X)) - gain I_prev - offset``. Gain
 and offset follow the motion, so that the cost is one of the motion alone. Where the light changes
-over the image (vignette, lamps, tone curve), smooth fields of both, bilinear between the nodes of a
-coarse grid, are put into the grey values of the previous image. Gradients have no preferred sign
-within a cell, so that the fields leave the motion alone.
+over the image, smooth fields of both, bilinear between the nodes of a coarse grid, are put into the
+grey values of the previous image; gradients have no preferred sign within a cell.
 
-Depth maps: ``r = n . (T X - P)``, P the current depth map's point at the pixel where T X is seen, n
-the normal of its surface there.
+Depth maps: ``r = n . (T X - P)``, P and n point and normal of the current one where T X is seen.
 
-Both estimate their noise from the residuals; their information is scaled by what errors that
-neighbours share leave of it.
+Both estimate their noise from the residuals, and count errors that neighbours share.
 """
 
 from __future__ import annotations
@@ -69,16 +66,17 @@ class Tiles:
         sums = [np.bincount(self._number, row, count) for row in scores]
         return np.stack(sums, axis=1).reshape(*self.shape, 6)
 
-    def share(self, scores: np.ndarray, meat: np.ndarray, model: np.ndarray) -> float:
-        """Share of the information that errors alike in a tile, and beyond, leave; 0 if none.
 
-        The sandwich covariance over tiles is so much larger than the ``model`` (6, 6).
-        """
-        independent, sums = positive_inverse(meat), self.sums(scores).reshape(-1, 6)
-        if independent is None:
-            return 0.0
-        clusters = max(1.0, np.trace(independent @ sums.T @ sums) / 6)
-        return float(1 / (INFLATION * max(1.0, clusters * np.trace(model @ meat) / 6)))
+def independent_share(sums: np.ndarray, meat: np.ndarray, model: np.ndarray) -> float:
+    """Share of the information that errors alike in a tile, and beyond, leave; 0 if none.
+
+    The sandwich covariance over the tiles' sums (.., 6) is so much larger than ``model`` (6, 6).
+    """
+    independent, sums = positive_inverse(meat), sums.reshape(-1, 6)
+    if independent is None:
+        return 0.0
+    clusters = max(1.0, np.trace(independent @ sums.T @ sums) / 6)
+    return float(1 / (INFLATION * max(1.0, clusters * np.trace(model @ meat) / 6)))
 
 
 class ImageFactor:
@@ -159,10 +157,10 @@ class ImageFactor:
         pull = rows * (self._w * r)
         # as at the optimum of the images alone, to first order: the flow pulls away from it
         r = r - (model @ pull.sum(axis=1)) @ rows
-        scores = rows * (self._w * r)
-        share = self._tiles.share(scores, pull @ pull.T, model)
+        sums = self._tiles.sums(rows * (self._w * r))
+        share = independent_share(sums, pull @ pull.T, model)
         if share > 0:
-            parts = share * parts_dispersion(self._tiles.sums(scores), model)
+            parts = share * parts_dispersion(sums, model)
             # what the parts disagree about is seen; as much again is common to them and is not
             self.agreement = min(1.0, (EVEN_PARTS / max(parts, EVEN_PARTS)) ** 2)
             self._scale = share * self.agreement
@@ -368,8 +366,8 @@ class PlaneFactor:
         w = self._information(T)
         scores = (found.J * (w * found.r)[:, None]).T
         model = positive_inverse((found.J * w[:, None]).T @ found.J)
-        share = self._tiles.share
-        self._scale = 0.0 if model is None else share(scores, scores @ scores.T, model)
+        sums, meat = self._tiles.sums(scores), scores @ scores.T
+        self._scale = 0.0 if model is None else independent_share(sums, meat, model)
         return self._scale > 0
 
     def noise(self, z: np.ndarray) -> np.ndarray:

@@ -70,16 +70,11 @@ class SelectorBatch:
         return replace(self, inputs=replace(self.inputs, static=logit, has_static=asked))
 
     def expecting(self, rng: np.random.Generator) -> SelectorBatch:
-        """The same with motions expected by histories of all kinds, or by none.
-
-        At times the history is of any of the motions found: a mover was taken for the world.
-        """
+        """The same with motions expected by histories of all kinds, or by none."""
         T_prior, information = self.T.clone(), self.inputs.prior_information.clone()
         known = rng.random(len(self)) < 0.6
         for b in np.flatnonzero(known):
-            found = self.inputs.pose[self.inputs.owner == b]
-            before = found[int(rng.integers(len(found)))] if rng.random() < 0.2 else self.T[b]
-            T, spread = expected_motion(rng, pose_matrix(before.numpy().astype(np.float64)))
+            T, spread = expected_motion(rng, pose_matrix(self.T[b].numpy().astype(np.float64)))
             T_prior[b] = torch.as_tensor(T[:3])
             if rng.random() < 0.6:
                 information[b] = torch.diag(torch.as_tensor(1.0 / spread**2))
