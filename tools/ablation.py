@@ -15,10 +15,11 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import functools
 import json
 import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -122,13 +123,16 @@ class Row:
         if (self.folder / RESULT).exists():
             self.result = json.loads((self.folder / RESULT).read_text(encoding="utf-8"))
 
-    def score(self, held_out: Callable[..., dict[str, list[TrainingBatch]]]) -> None:
-        """Score the row where it is due, at the end by every rule of the selection; then save."""
+    def score(self) -> bool:
+        """Whether the row was scored, as it is where it is due; at the end by every rule."""
         options, samples, curve = self.options, self.trainer.samples, self.result["curve"]
         due = [m for m in (*MILESTONES, self.args.samples) if m <= samples < m + options.batch_size]
         if not due or str(due[-1]) in curve:
-            return
-        last, pairs = self.trainer.step == options.steps, held_out(options.data_size)
+            return False
+        last, pairs = (
+            self.trainer.step == options.steps,
+            pairs_of(options.data_size, self.args.count),
+        )
         scores: dict[str, Any] = {"seconds": round(self.trainer.elapsed_s)}
         for preset, batches in pairs.items():
             figures = evaluate_network(self.trainer.exported, batches, options.selection)
@@ -136,7 +140,9 @@ class Row:
             if last and figures["auroc_rotation"] is not None:
                 rules = scores[f"rules_{preset}"] = {}
                 for rule in SELECTION_METHODS:
-                    found = evaluate_network(self.trainer.exported, batches, rule)
+                    found = figures
+                    if rule != options.selection:
+                        found = evaluate_network(self.trainer.exported, batches, rule)
                     rules[rule] = {key: found[key] for key in FIGURES}
         curve[str(due[-1])] = scores
         write_json(self.folder / RESULT, self.result)
@@ -154,15 +160,21 @@ class Row:
             file=sys.stderr,
             flush=True,
         )
+        return True
+
+
+@functools.cache
+def pairs_of(size: tuple[int, int] | None, count: int) -> dict[str, list[TrainingBatch]]:
+    """The held-out pairs of each preset in a size, drawn on first use."""
+    presets = {name: load_preset(ROWS.parent / f"{name}.yaml", size) for name in PRESETS}
+    return {name: held_out(preset, PUBLISHED_SEED, count) for name, preset in presets.items()}
 
 
 class Ablation:
-    """The rows so far, and the held-out pairs on which they are scored."""
+    """The training of the rows, which a signal stops."""
 
     def __init__(self, args: argparse.Namespace) -> None:
         self.args, self.stop = args, False
-        self.asked = PUBLISHED_SEED, args.count
-        self._pairs: dict[Any, dict[str, list[TrainingBatch]]] = {}
         for number in (signal.SIGINT, signal.SIGTERM):  # the update at hand ends, with a checkpoint
             signal.signal(number, lambda *_: setattr(self, "stop", True))
 
@@ -180,23 +192,14 @@ class Ablation:
                 batch = batch.to(self.args.device)
                 for row in group:
                     row.trainer.advance(batch)
-                    row.score(self.pairs)
+                if any([row.score() for row in group]):
+                    write_json(self.args.out / "ablation.json", summary(self.args))
                 if group[0].trainer.step == last or self.stop:
                     break
-            write_json(self.args.out / "ablation.json", summary(self.args))
             if self.stop:
                 for row in rows:
                     row.trainer.save()
                 raise KeyboardInterrupt
-
-    def pairs(self, size: tuple[int, int] | None) -> dict[str, list[TrainingBatch]]:
-        """The held-out pairs of each preset in a size, drawn on first use."""
-        if size not in self._pairs:
-            self._pairs[size] = {
-                name: held_out(load_preset(ROWS.parent / f"{name}.yaml", size), *self.asked)
-                for name in PRESETS
-            }
-        return self._pairs[size]
 
 
 def summary(args: argparse.Namespace) -> dict[str, Any]:

@@ -26,7 +26,7 @@ from hybridvo.evaluation.report import number
 from hybridvo.evaluation.scores import paper_protocol
 from hybridvo.network.selection import SELECTION_METHODS
 
-PART = re.compile(r"(<!-- table:(\w+) -->\n)(.*?)(<!-- end:\2 -->)", re.DOTALL)
+PART = re.compile(r"(<!-- table:([\w ]+) -->\n)(.*?)(<!-- end:\2 -->)", re.DOTALL)
 PAGE = {
     "Most of the image moves": ("heavy",),
     "Real surfaces with movers": ("semi_real",),
@@ -90,8 +90,9 @@ def page(results: Results) -> str:
 
 
 def table(made: Any, name: str) -> str:
-    """Text of one table."""
-    text = re.sub(r" +\n", "\n", getattr(made, name)())
+    """Text of one table: the name of its macro and, behind it, the files that it is of."""
+    macro, *files = name.split()
+    text = re.sub(r" +\n", "\n", getattr(made, macro)(*files))
     return re.sub(r"\n{3,}", "\n\n", text).strip()
 
 
@@ -104,8 +105,9 @@ def tables(results: Results) -> Any:
         every = [run["curve"] for run in content["runs"] if run["row"] == row]
         return [curve for curve in every if str(content["samples"]) in curve]
 
-    def at(rows: str, row: str, *keys: str) -> str:
-        """Mean of a figure over the seeds, with its spread."""
+    def at(rows: str, row: str, *keys: str, samples: int | None = None) -> str:
+        """Mean of a figure over the seeds, with its spread; after all samples or so many."""
+        keys = str(samples or results[rows]["samples"]), *keys
         values = [reduce(lambda part, key: part[key], keys, curve) for curve in curves(rows, row)]
         if not values or None in values:
             return "-"
