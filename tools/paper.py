@@ -26,7 +26,6 @@ from hybridvo.commands.generate import write_sheet
 from hybridvo.evaluation.drawing import prediction_panels, saliencies, saliency_panels
 from hybridvo.evaluation.plots import Panel, draw_panels, flow_panel, longest_flow
 from hybridvo.files import atomic_write, write_json
-from hybridvo.network.losses import reconstruct
 from hybridvo.network.models import load_weights
 from hybridvo.network.selection import select_motion
 from hybridvo.network.weights import PRETRAINED, save_weights
@@ -163,7 +162,7 @@ def factorised(network: Any, sample: Any) -> list[Panel]:
     """Ego and object flow of the estimate beside the true ones."""
     batch, output = predict(network, sample)
     T, gt = select_motion(output), batch.targets
-    ego = reconstruct(gt.depth_prev, T, gt.K_prev, gt.K_curr)[0][0].permute(1, 2, 0).numpy()
+    ego = gt.reconstruct(T)[0][0].permute(1, 2, 0).numpy()
     longest = longest_flow(sample.flow)
     flows = {
         "ego flow, estimate": ego,
