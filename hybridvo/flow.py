@@ -9,14 +9,14 @@ import logging
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 
 from hybridvo.calibration import DIS_NOISE, FLOW_CONTRADICTION, MIN_TEXTURED
 from hybridvo.errors import InputError
-from hybridvo.types import Frame, FramePair, to_numpy
+from hybridvo.types import Frame, FramePair
 
 DIS_PRESETS = ("ultrafast", "fast", "medium")  # in OpenCV's order, from 0
 _logger = logging.getLogger(__name__)
@@ -42,7 +42,6 @@ def dis_flow(preset: str = "medium") -> FlowProvider:
 
     It is computed in both directions, whose disagreement gives variance and validity. Where an
     image has no texture (a covered lens, a dropped frame, parallel stripes) there is no flow.
-
     ``preset`` is the effort: ``ultrafast``, ``fast`` or ``medium``.
     """
     if preset not in DIS_PRESETS:
@@ -50,12 +49,9 @@ def dis_flow(preset: str = "medium") -> FlowProvider:
     return _Dis(preset)
 
 
-@dataclass(frozen=True)
-class _Dis:
-    """See :func:`dis_flow`."""
-
+class _Dis(NamedTuple):
     preset: str
-    source = "dis"
+    source: str = "dis"
 
     def __call__(self, prev: Frame, curr: Frame) -> FlowField:
         none = FlowField(None, source="dis")
@@ -131,8 +127,8 @@ def file_flow(
 ) -> FlowProvider:
     """Provider of the flow files of an open sequence, which lead from one frame to the next.
 
-    Where there is none the flow is that of ``otherwise``, or None. A damaged file raises what the
-    reader raises if ``strict``, else it counts as none, with a line in the log.
+    Where there is none, ``otherwise`` is asked. A damaged file raises what the reader raises if
+    ``strict``, else it counts as none, with a line in the log.
     """
 
     def provide(prev: Frame, curr: Frame) -> FlowField:
@@ -182,13 +178,8 @@ def with_flow(
     if pair.flow is not None or provider is None:
         return pair
     field = provider(pair.prev, pair.curr)
-    if not isinstance(field, FlowField):
-        array = None if field is None else to_numpy(field, f"flow ({source})")
-        if array is not None and array.dtype.kind in "fi" and array.ndim == 3:
-            array = np.where(np.isfinite(array).all(axis=2, keepdims=True), array, np.nan)
-        field = FlowField(array, source=source)
-    known = field.flow, field.variance, field.valid, field.source, field.is_true
-    return FramePair(pair.prev, pair.curr, *known, pair.depth_source)
+    field = field if isinstance(field, FlowField) else FlowField(field, source=source)
+    return FramePair(pair.prev, pair.curr, *vars(field).values(), pair.depth_source)
 
 
 def contradiction(pair: FramePair) -> str | None:

@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 import torch
 
-from hybridvo.api import estimate
 from hybridvo.data.sequence import Sequence, iter_pairs
 from hybridvo.errors import InputError
 from hybridvo.evaluation.pair_errors import MOVING_PX, true_motion
@@ -21,9 +20,9 @@ from hybridvo.flow import dis_flow
 from hybridvo.geometry import ego_flow, matrix_to_euler_deg
 from hybridvo.network.inputs import assemble_inputs
 from hybridvo.network.models import Models
-from hybridvo.network.normalization import first_motions
+from hybridvo.network.prediction import first_motions
 from hybridvo.network.selection import select_pose
-from hybridvo.pipeline import DEFAULT_METHOD
+from hybridvo.pipeline import DEFAULT_METHOD, estimate
 from hybridvo.results import PixelwisePrediction, RelativePose
 from hybridvo.types import FramePair
 
