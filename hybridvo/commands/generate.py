@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from rich.console import Console
+from rich.progress import Progress
 
-from hybridvo.commands.progress import Progress
 from hybridvo.evaluation.plots import Panel, draw_panels, flow_colours, longest_flow
 from hybridvo.files import atomic_write
 from hybridvo.synthetic.dataset import load_preset, read_sample, write_samples
@@ -25,9 +26,10 @@ def generate(
     quiet: bool = True,
 ) -> Path:
     """Draw samples, and a contact sheet of the first; goes on where it was interrupted."""
-    with Progress("generate", count, "samples", quiet=quiet) as bar:
+    with Progress(console=Console(stderr=True, quiet=quiet)) as bar:
+        task = bar.add_task("samples", total=count)
         for done in write_samples(load_preset(preset, size), count, out, seed, workers):
-            bar.show(done)
+            bar.update(task, completed=done)
     sheet = Path(out) / "contact_sheet.png"
     write_sheet([read_sample(out, i) for i in range(min(6, count))], sheet)
     return sheet

@@ -7,26 +7,27 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import json
 import os
 import platform
 import re
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
+from rich import progress
+from rich.console import Console
 
 import hybridvo
-from hybridvo.commands.progress import Progress
 from hybridvo.commands.recording import Recording, check_recording
-from hybridvo.commands.run_folder import RESULTS, STATE, RunFolder
 from hybridvo.data.sequence import Sequence
 from hybridvo.errors import InputError
 from hybridvo.evaluation.metrics import evaluate
-from hybridvo.evaluation.pair_errors import mean_pair_errors, step_errors, true_trajectory
+from hybridvo.evaluation.pair_errors import ERRORS, mean_pair_errors, step_errors, true_trajectory
 from hybridvo.evaluation.plots import plot_trajectory
 from hybridvo.files import Mode, atomic_write, fingerprint, held, versions, write_json
 from hybridvo.flow import FlowProvider, MeasuredFlow, dis_flow, file_flow
@@ -37,9 +38,21 @@ from hybridvo.options import Options, RunOptions
 from hybridvo.pipeline import NETWORKS, check_method
 from hybridvo.trajectory import Trajectory
 
-RECORDING = "recording.rrd"
+STATE, STEPS, CHECKPOINT, RECORDING = "run.json", "steps.csv", "checkpoint.json", "recording.rrd"
+RESULTS = (
+    *("trajectory.tum", "trajectory.kitti", "trajectory.png"),
+    *(STEPS, "steps.npz", "metrics.json", RECORDING),
+)
+"""Files that a finished run may leave beside ``run.json``."""
 ARRAYS = ("index", "timestamp", "status", "probability", "T_curr_prev", "covariance")
 """Columns of the steps in ``steps.npz``."""
+STEP_COLUMNS = (
+    *("index", "timestamp", "status", "reason", "probability"),
+    *("tx", "ty", "tz", "rx", "ry", "rz"),
+    *("inlier_ratio", "iterations", "cost", "flow_ms", "motion_ms", "frame_ms"),
+    *("prev_index", "flow_source", "message"),
+    *ERRORS,
+)
 SAVE_EVERY = 50  # frames after which the run can be resumed
 
 
@@ -93,6 +106,67 @@ def run(
     return summary, 3 if too_many else 0
 
 
+class RunFolder:
+    """The output folder of one run: ``rows`` of its finished frames, JSON-ready.
+
+    ``header`` is what ``run.json`` says. ``new`` refuses a folder with results, ``overwrite``
+    removes those (and no other files), ``resume`` goes on where the ``identity`` of the header is
+    the same: ``tracker`` is then the state after the rows, or ``summary`` that of a complete run.
+    """
+
+    def __init__(self, path: Path, header: Mapping[str, Any], mode: Mode = "new") -> None:
+        self.path, self.header = path, json.loads(json.dumps(header))
+        self.rows: list[dict[str, Any]] = []
+        self.tracker = self.summary = None
+        present = [name for name in (STATE, *RESULTS) if os.path.lexists(path / name)]
+        if present and mode == "new":
+            raise InputError(
+                f"{path}: holds results of a run already ({', '.join(present[:3])}). Pass "
+                f"--overwrite to replace them, --resume to go on, or another --out."
+            )
+        if present and mode == "resume":
+            self._load()
+        if self.summary is None:
+            self.save("running")
+            for name in () if self.rows else (CHECKPOINT, *RESULTS):
+                (path / name).unlink(missing_ok=True)
+
+    def _load(self) -> None:
+        """Rows and tracker of an earlier run of the same identity."""
+        try:
+            before = json.loads((self.path / STATE).read_text(encoding="utf-8"))
+            both = pd.json_normalize([before["identity"], self.header["identity"]]).map(str)
+        except (OSError, ValueError, KeyError):
+            raise InputError(
+                f"{self.path}: no {STATE} of a run to resume. Pass --overwrite to start anew."
+            ) from None
+        for key, (then, now) in both.items():
+            if then != now:
+                raise InputError(
+                    f"{self.path}: cannot be resumed: {key} differs ({then[:40]} then, {now[:40]} "
+                    f"now). Pass --overwrite to start anew."
+                )
+        self.summary = before.get("summary")
+        if self.summary is None and (self.path / CHECKPOINT).is_file():
+            self.rows, self.tracker = json.loads((self.path / CHECKPOINT).read_bytes())
+
+    def save(self, state: str, **more: Any) -> None:
+        """Write ``run.json``; ``state`` is ``running`` or ``done``: the results are written."""
+        content = {**self.header, **more, "state": state, "frames_done": len(self.rows)}
+        write_json(self.path / STATE, content)
+        if state == "done":
+            (self.path / CHECKPOINT).unlink(missing_ok=True)
+
+    def save_rows(self, tracker: Mapping[str, Any] | None = None) -> None:
+        """Write ``steps.csv``, and with the tracker's state after the rows the checkpoint."""
+        with atomic_write(self.path / STEPS) as file:
+            table = pd.DataFrame(self.rows, columns=[*STEP_COLUMNS], dtype=object)
+            table.to_csv(file, index=False, lineterminator="\n")
+        if tracker is not None:
+            with atomic_write(self.path / CHECKPOINT) as file:
+                file.write(json.dumps([self.rows, tracker], default=np.ndarray.tolist))
+
+
 def _estimate(
     vo: Odometry,
     flow: MeasuredFlow,
@@ -103,19 +177,29 @@ def _estimate(
     quiet: bool,
 ) -> None:
     """Track the frames that the folder has no rows of yet."""
-    label, rows = f"{sequence.name} [{vo.method}]", folder.rows
-    with Progress(label, len(frames), "frames", quiet=quiet, done=len(rows)) as progress:
+    rows = folder.rows
+    failed = sum(row["status"] == "failed" for row in rows)
+    with progress.Progress(
+        progress.TextColumn("{task.description}", markup=False),  # a folder may be named [x]
+        progress.BarColumn(),
+        progress.TextColumn("{task.completed}/{task.total} frames, {task.fields[failed]} failed"),
+        progress.TimeRemainingColumn(),
+        console=Console(stderr=True, quiet=quiet, soft_wrap=True, markup=False, highlight=False),
+    ) as bar:
+        label = f"{sequence.name} [{vo.method}]"
+        task = bar.add_task(label, total=len(frames), completed=len(rows), failed=failed)
         for warning in sequence.warnings:
-            progress.say(f"warning: {warning}")
+            bar.console.print(f"warning: {warning}")
         if folder.tracker is not None:
             vo.resume(_restored(folder.tracker, sequence))
-            progress.say(f"resumed after {len(rows)} of {len(frames)} frames")
+            bar.console.print(f"resumed after {len(rows)} of {len(frames)} frames")
         for index in frames[len(rows) :]:
             rows.append(row := _track(vo, flow, sequence, index, recording))
             if row["status"] != "ok":
                 text = f"frame {index}: {row['status']} ({row['reason']}), probability "
-                progress.say(f"{text}{row['probability']:.2f}: {row['message']}")
-            progress.show(len(rows), sum(row["status"] == "failed" for row in rows))
+                bar.console.print(f"{text}{row['probability']:.2f}: {row['message']}")
+            failed += row["status"] == "failed"
+            bar.update(task, completed=len(rows), failed=failed)
             if len(rows) % SAVE_EVERY == 0:
                 folder.save_rows(_saved(vo.state))
         folder.save_rows()
@@ -253,9 +337,9 @@ def _header(sequence: Sequence, options: Options, weights: str | None) -> dict[s
     tree, input_hash = dataclasses.asdict(options), fingerprint(sequence.files())
     free = ("max_failed", "strict", "device")
     deciding = tree | {"run": {k: v for k, v in tree["run"].items() if k not in free}}
-    identity = {"input_hash": input_hash, "options": deciding}
+    shared = {"options": deciding, "weights": weights, "hybridvo": hybridvo.__version__}
     return {
-        "identity": identity | {"weights": weights, "hybridvo": hybridvo.__version__},
+        "identity": {"input_hash": input_hash} | shared,
         "input_hash": input_hash,
         "versions": versions(),
         "machine": {"platform": platform.platform(), "cpus": os.cpu_count()},
