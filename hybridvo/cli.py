@@ -19,31 +19,12 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from hybridvo import __version__
-from hybridvo.commands import arguments
-from hybridvo.commands.train import add_train, train
-
-
-def build_parser() -> argparse.ArgumentParser:
-    """Parser of the whole command line."""
-    parser = argparse.ArgumentParser(
-        prog="hybridvo",
-        description="Metric camera motion with covariance from optical flow, depth and intrinsics.",
-    )
-    parser.add_argument("--version", action="version", version=f"hybridvo {__version__}")
-    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    common = argparse.ArgumentParser(add_help=False)
-    common.add_argument("--json", action="store_true", help="print the result as JSON on stdout")
-    loudness = common.add_mutually_exclusive_group()
-    loudness.add_argument("-v", "--verbose", action="store_true", help="tracebacks of errors")
-    loudness.add_argument("-q", "--quiet", action="store_true", help="errors only")
-    for name, (add_arguments, _) in COMMANDS.items():
-        about = add_arguments.__doc__ or ""
-        made = commands.add_parser(name, help=about, description=about, parents=[common])
-        made.set_defaults(call=_execute)
-        add_arguments(made)
-    add_train(commands.add_parser("train", help="train a network"), common, train)
-    return parser
+from hybridvo.commands.arguments import (
+    build_parser,
+    option_defaults,
+    run_options,
+    weight_files,
+)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -57,7 +38,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return int(end.code or 0)
     logging.getLogger("hybridvo").setLevel(logging.ERROR if args.quiet else logging.NOTSET)
     try:
-        content, code = args.call(args, ["hybridvo", *given])
+        content, code = _execute(args, ["hybridvo", *given])
         as_json = json.dumps(content, indent=1, allow_nan=False)
         print(as_json if args.json else text_of(args.command, content) or as_json, flush=True)
         return code
@@ -104,17 +85,17 @@ def _execute(args: argparse.Namespace, command: list[str]) -> tuple[Any, int]:
     from hybridvo.errors import InputError
     from hybridvo.network.models import Models
 
-    given = vars(args) | {"command": command}
+    given = vars(args) | {"args": args, "command": command}
     if "given" in given:
         if "help" in args.given:
-            return arguments.option_defaults(), 0
-        given["options"] = arguments.run_options(args)
+            return option_defaults(), 0
+        given["options"] = run_options(args)
     if "weights" in given:
         device = given["options"].run.device if "options" in given else "cpu"
-        given["models"] = Models(device, arguments.weight_files(args.weights))
+        given["models"] = Models(device, weight_files(args.weights))
     if given.get("path") is not None:
         given["sequence"] = _call(open_sequence, given)
-    module, _, name = COMMANDS[args.command][1].partition(":")
+    module, _, name = args.calls.partition(":")
     found = _call(getattr(importlib.import_module(f"hybridvo.{module}"), name), given)
     if isinstance(found, tuple):
         return found
@@ -123,19 +104,6 @@ def _execute(args: argparse.Namespace, command: list[str]) -> tuple[Any, int]:
     if found.get("matched") == 0:  # the files do not belong together
         raise InputError(f"nothing could be compared: {found['reasons']['ate_rmse_unaligned']}.")
     return found, 0 if found.get("ok", True) else 1
-
-
-COMMANDS: dict[str, tuple[Callable[..., None], str]] = {
-    "run": (arguments.run, "commands.run:run"),
-    "compare": (arguments.compare, "commands.compare:compare"),
-    "show": (arguments.show, "evaluation.drawing:draw"),
-    "evaluate": (arguments.evaluate, "evaluation.metrics:evaluate"),
-    "doctor": (arguments.doctor, "commands.doctor:doctor"),
-    "demo": (arguments.demo, "commands.demo:demo"),
-    "generate": (arguments.generate, "commands.generate:generate"),
-    "init": (arguments.init, "data.camera_file:write_camera_template"),
-}
-"""Name -> what adds its arguments and says what it does, and its function; beside ``train``."""
 
 
 if __name__ == "__main__":

@@ -1,147 +1,70 @@
-"""Arguments of the commands, and options from them. Loads nothing heavy: help must be instant.
+"""The command line's parser, made of ``commands.yaml``, and options from arguments.
 
-The docstring of a command is its help.
+Loads nothing heavy: help must be instant.
 """
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import yaml
+
+from hybridvo import __version__
 
 if TYPE_CHECKING:
     from hybridvo.options import Options
 
-FLOWS = ("auto", "file", "dis")
+TYPES: dict[str, Callable[[str], Any]] = {
+    "int": int,
+    "float": float,
+    "path": Path,
+    "names": lambda text: text.replace(" ", "").split(","),
+}
+"""Types of arguments by their names in ``commands.yaml``."""
 
 
-def _sequence(command: argparse.ArgumentParser, required: bool = True) -> None:
-    """Which sequence, and what its folder does not say."""
-    where = command.add_mutually_exclusive_group(required=required)
-    folder = "folder of the sequence"
-    where.add_argument("path", nargs="?", default=argparse.SUPPRESS, metavar="DIR", help=folder)
-    where.add_argument("--sequence", dest="path", metavar="DIR", help="the same, by name")
-    add = command.add_argument
-    kinds = "sintel, tartanair, 7scenes, folder, kitti or tum (default: detected)"
-    add("--dataset", metavar="KIND", help=kinds)
-    camera = "camera.yaml, ROS camera_info, or numbers"
-    add("--camera", metavar="FILE|fx,fy,cx,cy", help=camera)
-    scale = "depth units per metre, 1000: millimetres"
-    add("--depth-scale", type=float, metavar="N", help=scale)
-    add("--mask", metavar="DIR", help="images that are 0 where pixels do not count")
+def build_parser() -> argparse.ArgumentParser:
+    """Parser of the whole command line."""
+    text = Path(__file__).with_name("commands.yaml").read_text(encoding="utf-8")
+    described = yaml.safe_load(text)
+    parser = argparse.ArgumentParser(prog="hybridvo", description=described["about"])
+    parser.add_argument("--version", action="version", version=f"hybridvo {__version__}")
+    _add_commands(parser, described["commands"], described["shared"])
+    return parser
 
 
-def _weights(command: argparse.ArgumentParser) -> None:
-    own = "network weights instead of the pretrained ones, as in pwvo=mine.safetensors"
-    command.add_argument("--weights", action="append", default=[], metavar="NAME=FILE", help=own)
+def _add_commands(
+    parser: argparse.ArgumentParser, commands: dict[str, Any], shared: dict[str, Any]
+) -> None:
+    below = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    for name, content in commands.items():
+        made = below.add_parser(
+            name,
+            help=content["help"],
+            description=content.get("about", content["help"]),
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        if "commands" in content:
+            _add_commands(made, content["commands"], shared)
+            continue
+        made.set_defaults(calls=content["calls"])
+        for group in ("output", *content.get("shares", ())):
+            _add_arguments(made, shared[group])
+        _add_arguments(made, content["arguments"])
 
 
-def _options(command: argparse.ArgumentParser) -> None:
-    """What ``run`` and ``compare`` share."""
-    add = command.add_argument
-    add("--flow", choices=FLOWS, help="default auto: the sequence's files, else DIS")
-    add("--start", type=int, metavar="N", help="first frame (default 0)")
-    add("--stop", type=int, metavar="N", help="the one after the last frame")
-    add("--stride", type=int, metavar="N", help="step between frames (default 1)")
-    add("--seed", type=int, metavar="N", help="of everything drawn at random")
-    add("--device", choices=("auto", "cpu", "cuda"), help="of the networks (default auto)")
-    _weights(command)
-    add("--config", metavar="FILE", help="YAML file of options")
-    keys = "one option, as in refine.cutoff=2.5; may be repeated; --set help lists the keys"
-    add("--set", action="append", default=[], dest="given", metavar="KEY=VALUE", help=keys)
-    exists = command.add_mutually_exclusive_group()
-    for name, help in (("resume", "go on where it was cut off"), ("overwrite", "start anew")):
-        kind: dict[str, Any] = {"action": "store_const", "const": name, "default": "new"}
-        exists.add_argument(f"--{name}", dest="mode", help=help, **kind)
-
-
-def run(command: argparse.ArgumentParser) -> None:
-    """Estimate the camera motion of a sequence."""
-    _sequence(command)
-    add = command.add_argument
-    add("--out", metavar="DIR", help="output folder (default: runs/NAME)")
-    add("--method", metavar="NAME", help="default: hybrid; `hybridvo doctor` lists all")
-    _options(command)
-    add("--max-failed", type=float, metavar="X", help="fraction of failed motions (default 0.2)")
-    add("--strict", action="store_true", default=None, help="a broken frame ends the run")
-    recording = "Rerun recording (extra 'viz'; default: recording.rrd in the output folder)"
-    add("--rrd", nargs="?", const="", metavar="FILE", help=recording)
-
-
-def compare(command: argparse.ArgumentParser) -> None:
-    """Run methods side by side and write a report."""
-    add = command.add_argument
-    named: dict[str, Any] = {"action": "extend", "nargs": "+", "default": [], "metavar": "DIR"}
-    add("--sequence", dest="sequences", help="the same as DIR, by name; repeatable", **named)
-    many = "sequences, or folders of sequences (MPI Sintel as it was unpacked)"
-    add("sequences", **named | {"nargs": "*", "default": argparse.SUPPRESS}, help=many)
-    add("--dataset", help="kind of the sequences (default: detected)")
-    add("--out", default="runs/compare", metavar="DIR", help="default: runs/compare")
-    names = "comma-separated; default: all that run here"
-    add("--methods", default="all", type=lambda text: text.replace(" ", "").split(","), help=names)
-    _options(command)
-    add("--protocol", choices=("paper",), help="MPI Sintel as PWVO's paper scores it: 992 pairs")
-
-
-def show(command: argparse.ArgumentParser) -> None:
-    """Draw the maps of one pair of a sequence."""
-    _sequence(command)
-    add = command.add_argument
-    add("--pair", type=int, default=0, metavar="N", help="first frame (default 0)")
-    add("--out", default="pair.png", metavar="FILE", help="default: pair.png")
-    add("--method", default="hybrid", metavar="NAME", help="estimator (default: hybrid)")
-    add("--flow", choices=FLOWS, default="auto")
-    _weights(command)
-    add("--overwrite", action="store_true", help="replace the image")
-
-
-def evaluate(command: argparse.ArgumentParser) -> None:
-    """Errors of a trajectory against the truth."""
-    add = command.add_argument
-    add("estimate", metavar="EST", help="estimated trajectory")
-    add("gt", metavar="GT", help="true trajectory")
-    kinds = ("se3", "sim3", "origin", "none")
-    add("--alignment", choices=kinds, default="se3", help="of the ATE")
-    add("--delta", type=float, default=1, metavar="X", help="span of the RPE (default 1)")
-    add("--delta-unit", choices=("frames", "s"), default="frames", help="unit of --delta")
-    matched = "seconds between matches (default 0.02)"
-    add("--max-diff", type=float, default=argparse.SUPPRESS, metavar="S", help=matched)
-
-
-def doctor(command: argparse.ArgumentParser) -> None:
-    """What is missing here, or wrong with a sequence."""
-    _sequence(command, required=False)
-    command.add_argument("--pairs", type=int, default=40, metavar="N", help="pairs (default 40)")
-
-
-def demo(command: argparse.ArgumentParser) -> None:
-    """Render a scene with moving objects and run on it."""
-    add = command.add_argument
-    add("--out", default="runs/demo", metavar="DIR", help="default: runs/demo")
-    add("--overwrite", action="store_true", help="replace the results in --out")
-    add("--frames", type=int, default=20, metavar="N", help="default: 20")
-    add("--seed", type=int, default=0, metavar="N", help="of the scene")
-
-
-def generate(command: argparse.ArgumentParser) -> None:
-    """Draw training samples into a folder."""
-    add = command.add_argument
-    add("--preset", default="paper", help="paper, diverse or a YAML file; default: %(default)s")
-    add("--out", required=True, metavar="DIR", help="folder of the samples")
-    add("--count", type=int, default=1000, metavar="N", help="default: 1000")
-    add("--seed", type=int, default=0, metavar="N")
-    add("--size", type=int, nargs=2, metavar=("H", "W"), help="pixels")
-    add("--workers", type=int, default=1, metavar="N", help="processes")
-
-
-def init(command: argparse.ArgumentParser) -> None:
-    """Write a camera.yaml to fill in for your recording."""
-    command.add_argument("directory", metavar="DIR", help="folder with rgb/ and depth/")
-
-
-# -- options --------------------------------------------------------------------------------------
+def _add_arguments(to: Any, arguments: dict[str, Any]) -> None:
+    for names, how in arguments.items():
+        if names in ("one of", "exactly one of"):
+            required = names == "exactly one of"
+            _add_arguments(to.add_mutually_exclusive_group(required=required), how)
+        else:
+            kind = {"type": TYPES[how["type"]]} if "type" in how else {}
+            to.add_argument(*names.split(), **how | kind)
 
 
 def option_defaults() -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterable
 from typing import Any
 
@@ -11,6 +12,7 @@ import pandas as pd
 from hybridvo.data.base import Sequence
 from hybridvo.data.image_io import UNKNOWN_FLOW
 from hybridvo.data.sequence import resize_camera
+from hybridvo.errors import InputError
 from hybridvo.geometry import (
     backproject,
     ego_flow,
@@ -122,12 +124,11 @@ def mean_pair_errors(pairs: Any) -> dict[str, Any]:
 
     ``reasons`` name every value that is None or leaves pairs out.
     """
-    figures = {name: (name, "mean") for name in ERRORS[:4]}
-    for name in ERRORS[4:]:
-        figures |= {f"{name}_{how}": (name, how) for how in ("mean", "median")}
     table = pd.DataFrame(pairs, columns=list(ERRORS), dtype=float)
+    figures = [(name, name, "mean") for name in ERRORS[:4]]
+    figures += [(f"{name}_{how}", name, how) for name in ERRORS[4:] for how in ("mean", "median")]
     report: dict[str, Any] = {"pairs": len(table), "reasons": {}}
-    for key, (name, how) in figures.items():
+    for key, name, how in figures:
         known = table[name].dropna()
         report[key] = float(known.agg(how)) if len(known) else None
         if len(known) < max(len(table), 1):
@@ -136,32 +137,30 @@ def mean_pair_errors(pairs: Any) -> dict[str, Any]:
     return report
 
 
-def pair_facts(
-    T_gt: np.ndarray | None,
-    depth_prev: np.ndarray | None,
-    camera_prev: Camera,
-    camera_curr: Camera,
-    flow_gt: np.ndarray | None = None,
-) -> dict[str, float]:
+def pair_facts(sequence: Sequence, prev: int, curr: int) -> dict[str, float]:
     """What may explain an error: how much moves, how far, before what. What is unknown is absent.
 
-    ``flow_gt`` (H, W, 2) is the true flow of everything, px, NaN or beyond 1e9 where unknown.
+    The true flow, of everything that moves, serves for this alone: no estimate ever sees it.
     """
-    if T_gt is None or depth_prev is None:
+    T_gt, depth = true_motion(sequence, prev, curr), sequence.frame(prev).depth
+    if T_gt is None or depth is None:
         return {}
     facts = {
         "rotation_deg": float(np.degrees(rotation_angle(T_gt[:3, :3]))),
         "translation_m": float(np.linalg.norm(T_gt[:3, 3])),
     }
-    known = depth_prev[np.isfinite(depth_prev) & (depth_prev > 0)]
+    known = depth[np.isfinite(depth) & (depth > 0)]
     if len(known):
         low, high = np.quantile(known, [0.1, 0.9])
         facts["depth_spread"] = float(high / low)
-    ego = ego_flow(depth_prev, T_gt, camera_prev, camera_curr)
+    ego = ego_flow(depth, T_gt, sequence.camera(prev), sequence.camera(curr))
     valid = np.isfinite(ego).all(axis=2)
     if valid.any():
         facts["flow_magnitude_px"] = float(np.median(np.linalg.norm(ego[valid], axis=1)))
-    if flow_gt is not None:
+    # TartanAir's true flow does not show what moves by itself
+    whole = sequence.flow_is_true and sequence.kind != "tartanair" and curr == prev + 1
+    with contextlib.suppress(InputError, OSError):
+        flow_gt = sequence.flow(prev)[0] if whole else np.full_like(ego, np.nan)
         valid &= (np.abs(flow_gt) < UNKNOWN_FLOW).all(axis=2)
         moving = np.linalg.norm(ego[valid] - flow_gt[valid], axis=1) > MOVING_PX
         facts |= {"dynamic_fraction": float(moving.mean())} if len(moving) else {}
