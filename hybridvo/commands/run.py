@@ -27,8 +27,9 @@ from hybridvo.commands.recording import Recording, check_recording
 from hybridvo.data.sequence import Sequence
 from hybridvo.errors import InputError
 from hybridvo.evaluation.metrics import evaluate
-from hybridvo.evaluation.pair_errors import ERRORS, mean_pair_errors, step_errors, true_trajectory
+from hybridvo.evaluation.pair_errors import ERRORS, step_errors, true_trajectory
 from hybridvo.evaluation.plots import plot_trajectory
+from hybridvo.evaluation.scores import pair_scores, pair_table
 from hybridvo.files import Mode, atomic_write, fingerprint, held, versions, write_json
 from hybridvo.flow import FlowProvider, MeasuredFlow, dis_flow, file_flow
 from hybridvo.geometry import se3_log
@@ -287,9 +288,9 @@ def _write_results(
     summary, metrics = _summarise(table, sequence, options), None
     if gt is not None:
         report = evaluate(trajectory, gt, alignment=options.alignment)
-        pairs = mean_pair_errors([row for row in rows if "rot_err_deg" in row])
-        named = ("method", "failed", "degraded", "flow_source", "depth_source", "oracle")
-        metrics = report | pairs | {key: summary[key] for key in (*named, "sequence")}
+        pairs = pair_scores(pair_table(table[1:].rename(columns={"motion_ms": "ms"})))
+        named = ("method", "degraded", "flow_source", "depth_source", "oracle", "sequence")
+        metrics = report | pairs | {key: summary[key] for key in named}
         metrics["reasons"] = report["reasons"] | pairs["reasons"]
         write_json(folder / "metrics.json", metrics)
     if picture:

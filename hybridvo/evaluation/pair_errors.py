@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterable
-from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from hybridvo.data.base import Sequence
 from hybridvo.data.image_io import UNKNOWN_FLOW
@@ -28,7 +26,6 @@ from hybridvo.types import Camera, Frame
 PAPER_SIZE = (128, 256)  # height and width at which the paper measures its EPE
 MOVING_PX = 1.0  # of the true flow beside the true ego flow: the pixel moves by itself
 ERRORS = ("r_err_deg", "t_err", "epe", "epe_l2_px", "rot_err_deg", "trans_err")
-NO_DEPTH = "no pixel has a valid depth and a true motion that stays in front of the camera"
 
 
 def true_motion(sequence: Sequence, prev: int, curr: int) -> np.ndarray | None:
@@ -117,24 +114,6 @@ def pair_errors(
         "rot_err_deg": float(np.degrees(rotation_angle(T_est[:3, :3] @ T_gt[:3, :3].T))),
         "trans_err": float(np.linalg.norm(translation)),
     }
-
-
-def mean_pair_errors(pairs: Any) -> dict[str, Any]:
-    """Means and medians of :func:`pair_errors` over pairs (dictionaries, or a table).
-
-    ``reasons`` name every value that is None or leaves pairs out.
-    """
-    table = pd.DataFrame(pairs, columns=list(ERRORS), dtype=float)
-    figures = [(name, name, "mean") for name in ERRORS[:4]]
-    figures += [(f"{name}_{how}", name, how) for name in ERRORS[4:] for how in ("mean", "median")]
-    report: dict[str, Any] = {"pairs": len(table), "reasons": {}}
-    for key, name, how in figures:
-        known = table[name].dropna()
-        report[key] = float(known.agg(how)) if len(known) else None
-        if len(known) < max(len(table), 1):
-            missing = f"unknown for {len(table) - len(known)} of {len(table)} pairs: {NO_DEPTH}"
-            report["reasons"][key] = missing if len(table) else "no pair with ground truth"
-    return report
 
 
 def pair_facts(sequence: Sequence, prev: int, curr: int) -> dict[str, float]:

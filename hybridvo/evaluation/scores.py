@@ -16,7 +16,7 @@ import pandas as pd
 from scipy.stats import binomtest
 
 from hybridvo.errors import InputError
-from hybridvo.evaluation.pair_errors import mean_pair_errors
+from hybridvo.evaluation.pair_errors import ERRORS
 from hybridvo.files import parse_yaml
 from hybridvo.types import Camera
 
@@ -51,7 +51,7 @@ def pair_table(pairs: Any) -> pd.DataFrame:
 
 
 def failure_rate(pairs: pd.DataFrame) -> dict[str, Any]:
-    """``pairs``, ``failures``, ``failure_rate`` and its Wilson interval (95 %) over a table.
+    """``failures``, ``failure_rate`` and its Wilson interval (95 %) over a table; None of no pairs.
 
     A failure is a failed estimate or an error above one pixel; unknown errors are left out.
     """
@@ -59,56 +59,61 @@ def failure_rate(pairs: pd.DataFrame) -> dict[str, Any]:
     total, failures = int((failed | epe.notna()).sum()), int((failed | (epe > FAILURE_PX)).sum())
     names = ("failures", "failure_rate", "failure_rate_low", "failure_rate_high")
     if not total:
-        return {"pairs": 0, **dict.fromkeys(names)}
-    interval = binomtest(failures, total).proportion_ci(0.95, method="wilson")
-    values = (failures, failures / total, float(interval.low), float(interval.high))
-    return {"pairs": total, **dict(zip(names, values, strict=True))}
+        return dict.fromkeys(names)
+    low, high = binomtest(failures, total).proportion_ci(0.95, method="wilson")
+    return dict(zip(names, (failures, failures / total, float(low), float(high)), strict=True))
 
 
 def pair_scores(pairs: pd.DataFrame) -> dict[str, Any]:
-    """Everything that is a mean, median or count over the pairs of one method and flow."""
+    """Every mean, median and count over the pairs of one method and flow, JSON-ready.
+
+    ``reasons`` say why a value is None.
+    """
     scored = pairs[pairs["rot_err_deg"].notna()]
-    scores = mean_pair_errors(scored) | failure_rate(pairs)
-    figures = {
+    figures = {name: scored[name].mean() for name in ERRORS[:4]}
+    for name in ERRORS[4:]:
+        figures |= {f"{name}_{how}": scored[name].agg(how) for how in ("mean", "median")}
+    figures |= {
         "epe_l2_px_median": pairs["epe_l2_px"].median(),
         "ms_per_pair_median": pairs["ms"].median(),
         "flow_ms_median": pairs["flow_ms"].median(),
         "dynamic_fraction": pairs["dynamic_fraction"].mean(),
     }
-    scores |= {k: None if math.isnan(value) else float(value) for k, value in figures.items()}
+    known = {name: None if math.isnan(value) else float(value) for name, value in figures.items()}
+    scores = known | failure_rate(pairs) | {"pairs": len(pairs), "pairs_scored": len(scored)}
+    reasons = {
+        name: NO_MOVING if name == "dynamic_fraction" else NO_PAIRS
+        for name, value in scores.items()
+        if value is None
+    }
     failed = int(pairs["status"].str.startswith("failed").sum())
-    scores |= {"pairs": len(pairs), "failed": failed, "pairs_scored": len(scored)}
-    for name in [name for name, value in scores.items() if value is None]:
-        unknown = NO_MOVING if name == "dynamic_fraction" else NO_PAIRS
-        scores["reasons"].setdefault(name, unknown)
-    return scores
+    return scores | {"failed": failed, "reasons": reasons}
 
 
 def sequence_row(
     pairs: pd.DataFrame, path: Mapping[str, Any] | None, named: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Line of one method on one sequence; ``path`` is what ``evaluate`` says, where it can."""
-    scores = pair_scores(pairs)
+    line = {**named, **pair_scores(pairs)}
     path = path or {"alignment": "se3", "reasons": dict.fromkeys(PATH_KEYS, NO_TRUTH)}
-    scores["reasons"] |= {k: v for k, v in path["reasons"].items() if k in PATH_KEYS}
-    scores |= {name: path.get(name) for name in ("alignment", *PATH_KEYS)}
-    return {**named, **scores}
+    line["reasons"] |= {k: v for k, v in path["reasons"].items() if k in PATH_KEYS}
+    return line | {name: path.get(name) for name in ("alignment", *PATH_KEYS)}
 
 
 def total_row(pairs: pd.DataFrame, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Line of one method over all sequences: pairs pooled, trajectory errors as plain means."""
-    scores = pair_scores(pairs)
-    for key in PATH_KEYS:
-        known = [row[key] for row in rows if row[key] is not None]
-        scores[key] = float(np.mean(known)) if known else None
-        missing = [f"{r['sequence']}: {r['reasons'][key]}" for r in rows if r[key] is None]
-        if missing:
-            text = f"mean over {len(known)} of {len(rows)} sequences; without {'; '.join(missing)}"
-            scores["reasons"][key] = text
     depth = ", ".join(dict.fromkeys(row["depth_source"] for row in rows))
     named = {"method": rows[0]["method"], "flow_source": rows[0]["flow_source"]}
     named |= {"sequence": "all", "depth_source": depth, "alignment": "se3"}
-    return {**named, "sequences": len(rows), **scores}
+    line = {**named, "sequences": len(rows), **pair_scores(pairs)}
+    for key in PATH_KEYS:
+        known = [row[key] for row in rows if row[key] is not None]
+        line[key] = float(np.mean(known)) if known else None
+        missing = [f"{r['sequence']}: {r['reasons'][key]}" for r in rows if r[key] is None]
+        if missing:
+            text = f"mean over {len(known)} of {len(rows)} sequences; without {'; '.join(missing)}"
+            line["reasons"][key] = text
+    return line
 
 
 # -- the paper's way of scoring MPI Sintel ---------------------------------------------------------
