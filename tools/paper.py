@@ -22,7 +22,7 @@ import numpy as np
 import torch
 from measuring import ROOT, parser_of, provenance, without_folders
 
-from hybridvo.commands.generate import write_sheet
+from hybridvo.commands.train import write_sheet
 from hybridvo.evaluation.drawing import prediction_panels, saliencies, saliency_panels
 from hybridvo.evaluation.plots import Panel, draw_panels, flow_panel, longest_flow
 from hybridvo.files import atomic_write, write_json

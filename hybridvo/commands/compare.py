@@ -25,8 +25,8 @@ from hybridvo.commands.run import flow_provider, frames_of, run, weights_hash
 from hybridvo.data.sequence import Sequence, open_sequence
 from hybridvo.errors import HybridVOError, InputError
 from hybridvo.evaluation import scores
-from hybridvo.evaluation.pair_errors import ERRORS, pair_facts, true_trajectory
 from hybridvo.evaluation.report import write_report
+from hybridvo.evaluation.scores import ERRORS, pair_facts, true_trajectory
 from hybridvo.files import Mode, atomic_write, held, versions, write_json
 from hybridvo.network.models import Models
 from hybridvo.options import Options

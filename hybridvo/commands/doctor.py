@@ -16,7 +16,7 @@ from hybridvo.calibration import DOUBTFUL_SPREAD
 from hybridvo.commands.compare import methods_to_run
 from hybridvo.data.sequence import Sequence
 from hybridvo.errors import InputError
-from hybridvo.evaluation.pair_errors import true_motion
+from hybridvo.evaluation.scores import true_motion
 from hybridvo.files import versions
 from hybridvo.flow import contradiction, dis_flow, file_flow, with_flow
 from hybridvo.refinement.covariance import direction_is_known

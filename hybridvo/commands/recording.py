@@ -9,9 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from hybridvo.data.sequence import Sequence
 from hybridvo.errors import InputError
 from hybridvo.evaluation.plots import flow_colours
+from hybridvo.evaluation.scores import true_trajectory
 from hybridvo.files import atomic_write
+from hybridvo.geometry import invert
 from hybridvo.results import Step
 from hybridvo.types import Frame
 
@@ -28,25 +31,22 @@ def check_recording(path: str | os.PathLike[str]) -> None:
 
 
 class Recording:
-    """Writes a recording as the frames come in; ``poses`` are the true T_world_cam."""
+    """Writes a recording as the ``frames`` of a sequence come in, beside its true path."""
 
-    def __init__(
-        self, path: str | os.PathLike[str], name: str, frames: int, poses: np.ndarray | None
-    ) -> None:
+    def __init__(self, path: str | os.PathLike[str], sequence: Sequence, frames: range) -> None:
         import rerun
 
         self.path = Path(path)
         with atomic_write(self.path, "wb"):
             pass  # Rerun reports a bad path only later, in a thread
         self._rr = rerun
-        self._stride = max(1, -(-frames // MAX_IMAGES))
+        self._stride = -(-len(frames) // MAX_IMAGES)
         self._positions: list[np.ndarray] = []
-        self._stream = rerun.RecordingStream(f"hybridvo {name}")
+        self._stream = rerun.RecordingStream(f"hybridvo {sequence.name}")
         self._stream.save(self.path)
         self._stream.log("world", rerun.ViewCoordinates.RIGHT_HAND_Y_DOWN, static=True)
-        known = [] if poses is None else poses[np.isfinite(poses).all(axis=(1, 2))]
-        if len(known):
-            line = (np.linalg.inv(known[0]) @ known)[:, :3, 3]
+        if (truth := true_trajectory(sequence, frames)) is not None:
+            line = truth.transformed(invert(truth.T_world_cam[0])).positions
             strip = rerun.LineStrips3D([line], colors=[140, 140, 140])
             self._stream.log("world/ground_truth", strip, static=True)
 

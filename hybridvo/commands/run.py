@@ -9,7 +9,6 @@ import contextlib
 import dataclasses
 import json
 import os
-import platform
 import re
 import time
 from collections.abc import Iterable, Mapping
@@ -22,14 +21,12 @@ import pandas as pd
 from rich import progress
 from rich.console import Console
 
-import hybridvo
 from hybridvo.commands.recording import Recording, check_recording
 from hybridvo.data.sequence import Sequence
 from hybridvo.errors import InputError
 from hybridvo.evaluation.metrics import evaluate
-from hybridvo.evaluation.pair_errors import ERRORS, step_errors, true_trajectory
 from hybridvo.evaluation.plots import plot_trajectory
-from hybridvo.evaluation.scores import pair_scores, pair_table
+from hybridvo.evaluation.scores import ERRORS, pair_scores, pair_table, step_errors, true_trajectory
 from hybridvo.files import Mode, atomic_write, fingerprint, held, versions, write_json
 from hybridvo.flow import FlowProvider, MeasuredFlow, dis_flow, file_flow
 from hybridvo.geometry import se3_log
@@ -54,6 +51,9 @@ STEP_COLUMNS = (
     *("prev_index", "flow_source", "message"),
     *ERRORS,
 )
+DECIDING = ("input_hash", "weights", "options.", "versions.hybridvo")
+FREE = ("options.run.max_failed", "options.run.strict", "options.run.device")
+"""Beginnings of the keys in ``run.json`` that a resumed run shares, and those that it need not."""
 SAVE_EVERY = 50  # frames after which the run can be resumed
 
 
@@ -86,16 +86,21 @@ def run(
         raise InputError(f"{out}: holds frames of the sequence; choose another --out.")
     vo = Odometry(models, flow=flow, method=method, options=options, seed=options.run.seed)
     vo.warm_up()  # before the folder is taken: it may last
-    header = _header(sequence, options, weights_hash(method, models))
-    header["command"] = list(command)
+    header = {
+        "command": list(command),
+        "input_hash": fingerprint(sequence.files()),
+        "versions": versions(),
+        "weights": weights_hash(method, models),
+        "options": dataclasses.asdict(options),
+        "sequence": os.fspath(sequence.root),
+    }
     with held(out), contextlib.ExitStack() as stack:
         folder = RunFolder(out, header, mode)
         summary = folder.summary
         if summary is None:
             recording = None
             if rrd is not None:
-                poses = None if sequence.poses is None else sequence.poses[list(frames)]
-                recording = Recording(rrd or out / RECORDING, sequence.name, len(frames), poses)
+                recording = Recording(rrd or out / RECORDING, sequence, frames)
                 stack.enter_context(recording)
             _estimate(vo, flow, sequence, frames, folder, recording, quiet)
             given = (out, folder.rows, sequence, frames, options.run)
@@ -111,8 +116,8 @@ class RunFolder:
     """The output folder of one run: ``rows`` of its finished frames, JSON-ready.
 
     ``header`` is what ``run.json`` says. ``new`` refuses a folder with results, ``overwrite``
-    removes those (and no other files), ``resume`` goes on where the ``identity`` of the header is
-    the same: ``tracker`` is then the state after the rows, or ``summary`` that of a complete run.
+    removes those (and no other files), ``resume`` goes on where all that decides is the same:
+    ``tracker`` is then the state after the rows, or ``summary`` that of a complete run.
     """
 
     def __init__(self, path: Path, header: Mapping[str, Any], mode: Mode = "new") -> None:
@@ -133,10 +138,11 @@ class RunFolder:
                 (path / name).unlink(missing_ok=True)
 
     def _load(self) -> None:
-        """Rows and tracker of an earlier run of the same identity."""
+        """Rows and tracker of an earlier run of the same input, options and weights."""
         try:
             before = json.loads((self.path / STATE).read_text(encoding="utf-8"))
-            both = pd.json_normalize([before["identity"], self.header["identity"]]).map(str)
+            both = pd.json_normalize([before, {**before, **self.header}]).map(str)
+            both = both[[key for key in both if key.startswith(DECIDING) and key not in FREE]]
         except (OSError, ValueError, KeyError):
             raise InputError(
                 f"{self.path}: no {STATE} of a run to resume. Pass --overwrite to start anew."
@@ -330,22 +336,6 @@ def _summarise(table: pd.DataFrame, sequence: Sequence, options: RunOptions) -> 
         "oracle": oracle,
         **{f"{k}_median": float(x.median()) if len(x) else None for k, x in times.items()},
         "warnings": warnings,
-    }
-
-
-def _header(sequence: Sequence, options: Options, weights: str | None) -> dict[str, Any]:
-    """What ``run.json`` says of a run beside its state; ``identity``: what a resumed one shares."""
-    tree, input_hash = dataclasses.asdict(options), fingerprint(sequence.files())
-    free = ("max_failed", "strict", "device")
-    deciding = tree | {"run": {k: v for k, v in tree["run"].items() if k not in free}}
-    shared = {"options": deciding, "weights": weights, "hybridvo": hybridvo.__version__}
-    return {
-        "identity": {"input_hash": input_hash} | shared,
-        "input_hash": input_hash,
-        "versions": versions(),
-        "machine": {"platform": platform.platform(), "cpus": os.cpu_count()},
-        "options": tree,
-        "sequence": os.fspath(sequence.root),
     }
 
 

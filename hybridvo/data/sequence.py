@@ -14,12 +14,10 @@ import numpy as np
 
 from hybridvo.data.base import Sequence, looks_for
 from hybridvo.data.folder import FolderSequence
+from hybridvo.data.kinect import SevenScenesSequence, TumSequence
 from hybridvo.data.kitti import KittiSequence
 from hybridvo.data.lists import shown
-from hybridvo.data.seven_scenes import SevenScenesSequence
-from hybridvo.data.sintel import SintelSequence
-from hybridvo.data.tartanair import TartanAirSequence
-from hybridvo.data.tum import TumSequence
+from hybridvo.data.rendered import SintelSequence, TartanAirSequence
 from hybridvo.errors import InputError
 from hybridvo.flow import file_flow, with_flow
 from hybridvo.types import Camera, Frame, FramePair

@@ -14,8 +14,8 @@ import torch
 from hybridvo.api import estimate
 from hybridvo.data.sequence import Sequence, iter_pairs
 from hybridvo.errors import InputError
-from hybridvo.evaluation.pair_errors import MOVING_PX, true_motion
 from hybridvo.evaluation.plots import Panel, draw_panels, flow_panel, longest_flow
+from hybridvo.evaluation.scores import MOVING_PX, true_motion
 from hybridvo.files import atomic_write, make_folder
 from hybridvo.flow import dis_flow
 from hybridvo.geometry import ego_flow, matrix_to_euler_deg

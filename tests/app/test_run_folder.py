@@ -23,7 +23,7 @@ IDENTITY = {"input_hash": "abc", "options": {"seed": 0}}
 @contextlib.contextmanager
 def start(path: Path, mode: str = "new", **identity: object) -> Iterator[RunFolder]:
     with held(path):
-        yield RunFolder(path, {"identity": IDENTITY | identity}, mode)  # type: ignore[arg-type]
+        yield RunFolder(path, IDENTITY | identity, mode)  # type: ignore[arg-type]
 
 
 def state(path: Path) -> dict:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hybridvo.evaluation.pair_errors import pair_errors, pair_facts
+from hybridvo.evaluation.scores import pair_errors, pair_facts
 from hybridvo.geometry import ego_flow, invert, make_transform
 from hybridvo.types import Camera
 
