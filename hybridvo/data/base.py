@@ -27,16 +27,15 @@ Files = list[Path | None]
 class Sequence:
     """Frames in time order, read when asked for: ``len``, ``sequence[i]``, ``for frame in``.
 
-    A reader overrides ``_list_files``, which fills in files, stamps and poses, and
-    ``_calibration``; where its files need it, ``_read_depth`` and ``_read_flow``.
+    A reader overrides ``_list_files`` (files, stamps, poses) and ``_calibration``; where its files
+    need it, ``_read_depth`` and ``_read_flow``.
     """
 
     kind = "sequence"  # the key of READERS
-    markers: tuple[tuple[str, ...], ...] = ()
-    """Groups of names (``glob``); a folder with all of one group is of this kind."""
+    markers: tuple[tuple[str, ...], ...] = ()  # groups of names (glob): a folder has all of one
     depth_source = "sensor"  # or stereo, file, true: of a renderer, an oracle
     flow_is_true = False  # whether its flow files are ground truth: an oracle
-    depth_scale: float | None = None  # stored units per metre of the data set's depth; None: 1
+    depth_scale: float | None = None  # stored units per metre of the data set's whole numbers
     frames_per_second = 30.0  # where the files have no stamps
 
     def __init__(
@@ -63,8 +62,9 @@ class Sequence:
         if self._mask_folder is not None:
             frames = [a or b for a, b in zip(self.rgb_files, self.depth_files, strict=True)]
             hint = "Expected PNG or JPEG, 0 where pixels must not be used, named like the images."
-            masks = sorted_files(self._mask_folder, IMAGES)
-            self.mask_files = match_files(frames, masks, self._mask_folder, hint)
+            self.mask_files = match_files(
+                frames, sorted_files(self._mask_folder, IMAGES), self._mask_folder, hint
+            )
         self._look_at_first_images()
         self._warn_of_what_is_missing()
 
@@ -99,10 +99,7 @@ class Sequence:
         return self._camera
 
     def frame(self, index: int) -> Frame:
-        """Frame ``index``; ``rgb`` or ``depth`` is None where its file is missing.
-
-        Neither there is a FileNotFoundError, a file that cannot be decoded a FormatError.
-        """
+        """Frame ``index``; None for image or depth that is missing, FileNotFoundError for both."""
         files = self.rgb_files[index], self.depth_files[index], self.mask_files[index]
         readers: tuple[Callable[[Path], Any], ...] = read_rgb, self._read_depth, read_mask_png
         rgb, depth, mask = (
@@ -121,10 +118,7 @@ class Sequence:
             raise FormatError(f"{where}: {error}") from None
 
     def flow(self, index: int) -> tuple[np.ndarray, np.ndarray | None]:
-        """Flow from frame ``index`` to the next: (H, W, 2) float32 px, and (H, W) bool or None.
-
-        A FileNotFoundError where there is no file for it, a FormatError where it is damaged.
-        """
+        """Flow to the next frame, (H, W, 2) px, and (H, W) valid or None; FileNotFoundError."""
         if index >= len(self) - 1:
             raise IndexError(f"{self.name}: no flow starts at frame {index} of {len(self)}.")
         path = self.flow_files[index] if self.flow_files else None
@@ -150,8 +144,11 @@ class Sequence:
         """(H, W) float32 metres; 0, negative and not finite are invalid."""
         stored = read_depth(path)
         # unless a scale is given, only integers are in the set's unit
-        usual = self.depth_scale if stored.dtype.kind == "u" else None
-        depth = stored.astype(np.float32) / np.float32(self._given_scale or usual or 1.0)
+        scale = self._given_scale or (self.depth_scale if stored.dtype.kind == "u" else 1.0)
+        if scale is None:
+            needed = "'depth_scale' (units per metre) in camera.yaml, or --depth-scale"
+            raise InputError(f"{path}: depth is of whole numbers: expected {needed}.")
+        depth = stored.astype(np.float32) / np.float32(scale)
         depth[stored == SATURATED] = 0.0
         return depth
 
@@ -189,16 +186,15 @@ class Sequence:
         if image is None:
             raise InputError(f"{self.root}: no frames: none of the files is there.")
         self.height, self.width = size = image.shape[:2]
-        given, told = self._given_camera, self.warnings
+        given, told, scale = self._given_camera, self.warnings, self._given_scale
         found = self._calibration() if given is None else parse_camera(given, size, told)
         if found is not None and (found.height, found.width) != size:
             raise InputError(
                 f"{self.root}: images are {self.width}x{self.height}, the camera is for "
                 f"{found.width}x{found.height} pixels: give theirs (--camera fx,fy,cx,cy or FILE)."
             )
-        if self._given_scale is None and found is not None:
-            self._given_scale = found.depth_scale
-        self._calibrated, self._camera = found, None if found is None else found.camera
+        self._calibrated, self._camera = found, found and found.camera
+        self._given_scale = found.depth_scale if scale is None and found is not None else scale
         self._given_scale = units_per_metre(self._given_scale, self.name, told)
         path, depth = _first(self.depth_files, self._read_depth)
         if depth is None:
@@ -249,16 +245,13 @@ def straighten(
     depth: np.ndarray | None,
     mask: np.ndarray | None,
 ) -> tuple[np.ndarray | None, np.ndarray | None, np.ndarray]:
-    """Image (bilinear), depth and mask (nearest: never mixed) of the pinhole with the same K.
-
-    The mask is False where the pinhole sees beyond the distorted image.
-    """
+    """Image, depth and mask of the pinhole with the same K; masked where it sees beyond them."""
     u, v = _lens(calibration)
     height, width = u.shape
     inside: np.ndarray = (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)
     if rgb is not None:
         rgb = cv2.remap(rgb, u, v, cv2.INTER_LINEAR)
-    if depth is not None:
+    if depth is not None:  # neighbours are never mixed
         depth = cv2.remap(depth, u, v, cv2.INTER_NEAREST)
     if mask is not None:
         inside &= cv2.remap(mask.view(np.uint8), u, v, cv2.INTER_NEAREST) > 0
