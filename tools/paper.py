@@ -24,8 +24,8 @@ from measuring import ROOT, parser_of, provenance, without_folders
 
 from hybridvo.commands.train import write_sheet
 from hybridvo.evaluation.drawing import prediction_panels, saliencies, saliency_panels
-from hybridvo.evaluation.plots import Panel, draw_panels, flow_panel, longest_flow
-from hybridvo.files import atomic_write, write_json
+from hybridvo.evaluation.plots import Panel, flow_panel, longest_flow, write_panels
+from hybridvo.files import write_json
 from hybridvo.network.losses import reconstruct
 from hybridvo.network.models import load_weights
 from hybridvo.network.selection import select_motion
@@ -176,8 +176,7 @@ def factorised(network: Any, sample: Any) -> list[Panel]:
 
 def write(path: Path, panels: list[Panel], heading: str) -> None:
     """Panels as a PNG."""
-    with atomic_write(path, "wb") as file:
-        file.write(draw_panels(panels, heading, 2.0))
+    write_panels(path, panels, heading, 2.0)
     print(path)
 
 

@@ -63,7 +63,7 @@ def _add_arguments(to: Any, arguments: dict[str, Any]) -> None:
             required = names == "exactly one of"
             _add_arguments(to.add_mutually_exclusive_group(required=required), how)
         else:
-            made = {"type": TYPES[how["type"]]} if "type" in how else {}
+            made: dict[str, Any] = {"type": TYPES[how["type"]]} if "type" in how else {}
             if how.get("default") == argparse.SUPPRESS:  # which argparse compares by identity
                 made["default"] = argparse.SUPPRESS
             to.add_argument(*names.split(), **how | made)

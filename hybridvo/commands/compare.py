@@ -67,7 +67,7 @@ def compare(
             f"{out}: holds {', '.join(present)}; pass --resume to go on, --overwrite to replace "
             f"them, or another --out."
         )
-    given = {"models": models, "command": list(command), "quiet": quiet}
+    given: dict[str, Any] = {"models": models, "command": list(command), "quiet": quiet}
     given |= {"mode": "resume", "picture": False}
     with held(out):
         if mode == "overwrite":

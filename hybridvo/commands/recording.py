@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -83,18 +82,17 @@ class Recording:
         self._positions.append(T[:3, 3].astype(np.float32))
 
     def _images(self, frame: Frame, step: Step, flow: np.ndarray | None) -> None:
-        rr, log = self._rr, self._stream.log
+        rr, log, weights = self._rr, self._stream.log, step.motion.weights
         stride = -(-max(frame.camera.shape) // MAX_SIDE)
-
-        def shrunk(image: np.ndarray) -> Any:
-            return rr.Image(np.ascontiguousarray(image[::stride, ::stride])).compress(70)
-
         height, width = (-(-size // stride) for size in frame.camera.shape)
         K = np.diag([1 / stride, 1 / stride, 1.0]) @ frame.camera.K
         log("world/camera/image", rr.Pinhole(image_from_camera=K, width=width, height=height))
-        if frame.rgb is not None:
-            log("world/camera/image", shrunk(frame.rgb))
-        if flow is not None:
-            log("flow", shrunk(flow_colours(flow)))
-        if step.motion.weights is not None:
-            log("weights", shrunk((255 * np.clip(step.motion.weights, 0, 1)).astype(np.uint8)))
+        images = {
+            "world/camera/image": frame.rgb,
+            "flow": None if flow is None else flow_colours(flow),
+            "weights": None if weights is None else np.uint8(255 * np.clip(weights, 0, 1)),
+        }
+        for name, image in images.items():
+            if image is not None:
+                small = np.ascontiguousarray(image[::stride, ::stride])
+                log(name, rr.Image(small).compress(70))

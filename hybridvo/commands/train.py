@@ -18,8 +18,8 @@ from rich.console import Console
 from rich.progress import Progress
 
 from hybridvo.errors import InputError
-from hybridvo.evaluation.plots import Panel, draw_panels, flow_colours, longest_flow
-from hybridvo.files import atomic_write, write_json
+from hybridvo.evaluation.plots import Panel, flow_colours, longest_flow, write_panels
+from hybridvo.files import write_json
 from hybridvo.network.models import load_weights, torch_device
 from hybridvo.synthetic.dataset import load_preset, read_sample, write_samples
 from hybridvo.synthetic.layered import Sample
@@ -56,8 +56,7 @@ def write_sheet(samples: Sequence[Sample], path: str | Path) -> None:
     """Write a PNG with the five steps of each sample in a row; depth is bright where near."""
     panels = [panel for sample in samples for panel in _steps(sample)]
     height, width = samples[0].moving.shape
-    with atomic_write(path, "wb") as file:
-        file.write(draw_panels(panels, "", width / height, columns=7, inches=2.0))
+    write_panels(path, panels, "", width / height, columns=7, inches=2.0)
 
 
 def _steps(sample: Sample) -> list[Panel]:

@@ -193,7 +193,7 @@ class Sequence:
                 f"{self.root}: images are {self.width}x{self.height}, the camera is for "
                 f"{found.width}x{found.height} pixels: give theirs (--camera fx,fy,cx,cy or FILE)."
             )
-        self._calibrated, self._camera = found, found and found.camera
+        self._calibrated, self._camera = found, None if found is None else found.camera
         self._given_scale = found.depth_scale if scale is None and found is not None else scale
         self._given_scale = units_per_metre(self._given_scale, self.name, told)
         path, depth = _first(self.depth_files, self._read_depth)

@@ -16,7 +16,7 @@ from hybridvo.errors import FormatError, InputError
 from hybridvo.files import read_text
 from hybridvo.geometry import invert
 from hybridvo.trajectory import COLUMNS, read_poses
-from hybridvo.types import Camera, Frame
+from hybridvo.types import Camera, Frame, as_number
 
 DISPARITY_SIGMA_PX = 0.5  # standard deviation of a block-matched disparity, assumed
 
@@ -119,15 +119,12 @@ def _read_projection(path: Path, number: str) -> np.ndarray:
     """(3, 4) projection of a rectified camera: fx 0 cx tx, 0 fy cy ty, 0 0 1 tz."""
     for line, text in enumerate(read_text(path).split("\n"), start=1):
         name, _, rest = text.partition(":")
-        if name not in (f"P{number}", f"P_rect_0{number}"):
-            continue
-        try:
-            P = np.array(rest.split(), dtype=np.float64).reshape(3, 4)
-        except ValueError:
-            P = np.zeros((3, 4))
-        is_rectified = P[1, 0] == 0 and np.allclose(P[2, :3], (0, 0, 1)) and P[0, 0] * P[1, 1] > 0
-        if is_rectified and np.isfinite(P).all():
-            return P
-        expected = f"{name}: fx 0 cx tx 0 fy cy ty 0 0 1 tz"
-        raise FormatError(f"{path}:{line}: expected {expected}, got {rest[:200]!r}.")
+        if name in (f"P{number}", f"P_rect_0{number}"):
+            numbers = np.array([as_number(word) for word in rest.split()])
+            P = numbers.reshape(3, 4) if numbers.size == 12 else np.zeros((3, 4))
+            is_camera = P[1, 0] == 0 and np.allclose(P[2, :3], (0, 0, 1)) and P[0, 0] * P[1, 1] > 0
+            if is_camera and np.isfinite(P).all():
+                return P
+            expected = f"{name}: fx 0 cx tx 0 fy cy ty 0 0 1 tz"
+            raise FormatError(f"{path}:{line}: expected {expected}, got {rest[:200]!r}.")
     raise FormatError(f"{path}: expected a line 'P{number}: ...', found none.")

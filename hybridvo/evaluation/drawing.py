@@ -14,9 +14,9 @@ import torch
 from hybridvo.api import estimate
 from hybridvo.data.sequence import Sequence, iter_pairs
 from hybridvo.errors import InputError
-from hybridvo.evaluation.plots import Panel, draw_panels, flow_panel, longest_flow
+from hybridvo.evaluation.plots import Panel, flow_panel, longest_flow, write_panels
 from hybridvo.evaluation.scores import MOVING_PX, true_motion
-from hybridvo.files import atomic_write, make_folder
+from hybridvo.files import make_folder
 from hybridvo.flow import dis_flow
 from hybridvo.geometry import ego_flow, matrix_to_euler_deg
 from hybridvo.network.inputs import assemble_inputs
@@ -69,15 +69,12 @@ def draw(
     inputs = assemble_inputs(given)
     T_start = first_motions(network, inputs, "softmax", int(network.options.passes) - 1)
     with torch.no_grad():
-        output = network(inputs, T_start)
-    panels += prediction_panels("PWVO", output, true, moving)
+        panels += prediction_panels("PWVO", network(inputs, T_start), true, moving)
     panels += saliency_panels("PWVO", saliencies(network, inputs, T_start), moving)
     source = f"{given.flow_source} (true)" if given.flow_is_true else given.flow_source
     heading = f"{sequence.name}, pair {pair}; flow: {source}; motion: {method}, {motion.status}"
-    height, width = given.prev.camera.shape
     make_folder(out.parent)
-    with atomic_write(out, "wb") as file:
-        file.write(draw_panels(panels, heading, width / height))
+    write_panels(out, panels, heading, given.prev.camera.width / given.prev.camera.height)
     return out
 
 

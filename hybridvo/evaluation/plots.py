@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 import warnings
 from collections.abc import Sequence
@@ -91,10 +90,16 @@ def flow_panel(title: str, flow: np.ndarray, longest: float) -> Panel:
     return Panel(f"{title} (full colour: {longest:.3g} px)", flow_colours(flow, longest))
 
 
-def draw_panels(
-    panels: Sequence[Panel], heading: str, aspect: float, *, columns: int = 2, inches: float = 5.4
-) -> bytes:
-    """PNG of panels, all with one ratio of width over height, ``columns`` in a row."""
+def write_panels(
+    path: str | os.PathLike[str],
+    panels: Sequence[Panel],
+    heading: str,
+    aspect: float,
+    *,
+    columns: int = 2,
+    inches: float = 5.4,
+) -> None:
+    """Write a PNG of panels, all with one ratio of width over height, ``columns`` in a row."""
     rows = -(-len(panels) // columns)
     height = rows * (inches / aspect * 0.92 + 0.42) + (0.45 if heading else 0.0)
     figure = Figure(figsize=(columns * inches, height), layout="constrained")
@@ -119,9 +124,8 @@ def draw_panels(
         bar.set_label(panel.unit, fontsize=8)
         bar.ax.tick_params(labelsize=8)
     figure.suptitle(heading, fontsize=11, x=0.01, ha="left", parse_math=False)
-    stream = io.BytesIO()
-    figure.savefig(stream, format="png")
-    return stream.getvalue()
+    with atomic_write(path, "wb") as file:
+        figure.savefig(file, format="png")
 
 
 # -- flow in colours ------------------------------------------------------------------------------
