@@ -141,7 +141,7 @@ class RunFolder:
         """Rows and tracker of an earlier run of the same input, options and weights."""
         try:
             before = json.loads((self.path / STATE).read_text(encoding="utf-8"))
-            both = pd.json_normalize([before, {**before, **self.header}]).map(str)
+            both = pd.json_normalize([before, self.header | {"state": before["state"]}]).map(str)
             both = both[[key for key in both if key.startswith(DECIDING) and key not in FREE]]
         except (OSError, ValueError, KeyError):
             raise InputError(

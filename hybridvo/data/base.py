@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Callable
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -109,8 +108,8 @@ class Sequence:
         where = f"{self.name}: frame {index} ({files[0]}, {files[1]})"
         if rgb is None and depth is None:
             raise FileNotFoundError(f"{where}: neither image nor depth is there.")
-        if self._calibrated is not None and any(self._calibrated.distortion):
-            rgb, depth, mask = straighten(self._calibrated, rgb, depth, mask)
+        if self._lens is not None:
+            rgb, depth, mask = straighten(*self._lens, rgb, depth, mask)
         camera, stamp = self.camera(index), float(self.timestamps[index])
         try:
             return Frame(rgb, depth, camera, stamp, index, mask=mask)
@@ -193,7 +192,10 @@ class Sequence:
                 f"{self.root}: images are {self.width}x{self.height}, the camera is for "
                 f"{found.width}x{found.height} pixels: give theirs (--camera fx,fy,cx,cy or FILE)."
             )
-        self._calibrated, self._camera = found, None if found is None else found.camera
+        self._camera, self._lens = None if found is None else found.camera, None
+        if found is not None and any(found.distortion):
+            whole = found.camera.K, np.array(found.distortion), np.eye(3), found.camera.K
+            self._lens = cv2.initUndistortRectifyMap(*whole, size[::-1], cv2.CV_32FC1)
         self._given_scale = found.depth_scale if scale is None and found is not None else scale
         self._given_scale = units_per_metre(self._given_scale, self.name, told)
         path, depth = _first(self.depth_files, self._read_depth)
@@ -240,13 +242,13 @@ def looks_for(kind: type[Sequence]) -> str:
 
 
 def straighten(
-    calibration: Calibration,
+    u: np.ndarray,
+    v: np.ndarray,
     rgb: np.ndarray | None,
     depth: np.ndarray | None,
     mask: np.ndarray | None,
 ) -> tuple[np.ndarray | None, np.ndarray | None, np.ndarray]:
-    """Image, depth and mask of the pinhole with the same K; masked where it sees beyond them."""
-    u, v = _lens(calibration)
+    """Image, depth and mask at columns u and rows v; masked where these lie outside."""
     height, width = u.shape
     inside: np.ndarray = (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)
     if rgb is not None:
@@ -256,12 +258,3 @@ def straighten(
     if mask is not None:
         inside &= cv2.remap(mask.view(np.uint8), u, v, cv2.INTER_NEAREST) > 0
     return rgb, depth, inside
-
-
-@cache
-def _lens(calibration: Calibration) -> tuple[np.ndarray, np.ndarray]:
-    """Columns and rows in the distorted image of the pixels of the pinhole."""
-    K, size = calibration.camera.K, (calibration.width, calibration.height)
-    distortion = np.array(calibration.distortion)
-    u, v = cv2.initUndistortRectifyMap(K, distortion, np.eye(3), K, size, cv2.CV_32FC1)
-    return u, v

@@ -89,30 +89,27 @@ class KittiSequence(Sequence):
     def _read_depth(self, path: Path) -> np.ndarray:
         if self.depth_source != "stereo":
             return super()._read_depth(path)
-        disparity = _disparity(read_rgb(self._left[path]), read_rgb(path), path)
+        left, right = (
+            cv2.cvtColor(read_rgb(x), cv2.COLOR_RGB2GRAY) for x in (self._left[path], path)
+        )
+        if left.shape != right.shape:
+            raise FormatError(f"{path}: expected the size of the left image, got {right.shape}.")
+        matcher = cv2.StereoSGBM.create(
+            minDisparity=0,
+            # 128 px at KITTI's size: all beyond 3 m; narrow images cannot be searched as far
+            numDisparities=min(128, max(16, left.shape[1] // 2 // 16 * 16)),
+            blockSize=5,
+            P1=8 * 5 * 5,
+            P2=32 * 5 * 5,
+            disp12MaxDiff=1,
+            uniquenessRatio=10,
+            speckleWindowSize=100,
+            speckleRange=2,
+            mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
+        )
+        disparity = matcher.compute(left, right).astype(np.float32) / 16  # steps of 1/16 px
         found = disparity > 0
         return np.where(found, self._disparity_at_1m / np.where(found, disparity, 1), 0)
-
-
-def _disparity(left: np.ndarray, right: np.ndarray, path: Path) -> np.ndarray:
-    """(H, W) float32 disparity in pixels of a rectified pair; 0 or less where nothing matches."""
-    if left.shape != right.shape:
-        raise FormatError(f"{path}: expected the size of the left image, got {right.shape}.")
-    matcher = cv2.StereoSGBM.create(
-        minDisparity=0,
-        # 128 px at KITTI's size: everything beyond 3 m; narrow images cannot be searched as far
-        numDisparities=min(128, max(16, left.shape[1] // 2 // 16 * 16)),
-        blockSize=5,
-        P1=8 * 5 * 5,
-        P2=32 * 5 * 5,
-        disp12MaxDiff=1,
-        uniquenessRatio=10,
-        speckleWindowSize=100,
-        speckleRange=2,
-        mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
-    )
-    gray = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (left, right)]
-    return matcher.compute(gray[0], gray[1]).astype(np.float32) / 16  # steps of 1/16 px
 
 
 def _read_projection(path: Path, number: str) -> np.ndarray:

@@ -146,10 +146,5 @@ class TartanAirSequence(Sequence):
         if path.suffix == ".png":  # u, v, mask in OpenCV's order, not in KITTI's
             flow, occluded = read_flow_png(path, (0, 1, 2))
             return flow, occluded == 0
-        mask = _mask_file(path)
+        mask = path.with_name(path.name.removesuffix("_flow.npy") + "_mask.npy")  # 0 is valid
         return read_flow(path)[0], read_npy(mask) == 0 if mask.exists() else None
-
-
-def _mask_file(flow: Path) -> Path:
-    """Mask beside a V1 flow file (000000_000001_mask.npy; 0 is valid)."""
-    return flow.with_name(flow.name.removesuffix("_flow.npy") + "_mask.npy")
