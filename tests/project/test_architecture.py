@@ -58,7 +58,7 @@ ONLY_IN = {
     "pandas": {"evaluation/", "commands/"},
     "rerun": {"commands/recording.py"},
     "rich": {"commands/"},
-    "yaml": {"files.py", "commands/", "options.py"},
+    "yaml": {"files.py", "cli.py"},
     "open3d": {"baselines/"},
     "poselib": {"baselines/"},
     "safetensors": {"network/weights.py"},
