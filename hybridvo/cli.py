@@ -140,7 +140,8 @@ def _execute(args: argparse.Namespace, command: list[str]) -> tuple[Any, int]:
     if "given" in given:
         if "help" in args.given:
             return option_defaults(), 0
-        given["options"] = run_options(args)
+        named = {key: value for key, value in given.items() if "." in key}
+        given["options"] = load_options(args.config, args.given, named)
     if "weights" in given:
         device = given["options"].run.device if "options" in given else "cpu"
         given["models"] = Models(device, weight_files(args.weights))
@@ -169,13 +170,6 @@ def option_defaults() -> dict[str, Any]:
         for group, options in dataclasses.asdict(Options()).items()
         for name, value in options.items()
     }
-
-
-def run_options(args: argparse.Namespace) -> Options:
-    """Options from the arguments of ``run`` or ``compare``."""
-    names = ("method", "start", "stop", "stride", "device", "max_failed", "strict", "seed")
-    named = {f"run.{name}": getattr(args, name, None) for name in names}
-    return load_options(args.config, args.given, named | {"flow.source": args.flow})
 
 
 def load_options(

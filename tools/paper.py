@@ -23,8 +23,15 @@ import torch
 from measuring import ROOT, parser_of, provenance, without_folders
 
 from hybridvo.commands.train import write_sheet
-from hybridvo.evaluation.drawing import prediction_panels, saliencies, saliency_panels
-from hybridvo.evaluation.plots import Panel, flow_panel, longest_flow, write_panels
+from hybridvo.evaluation.drawing import (
+    Panel,
+    flow_panel,
+    longest_flow,
+    prediction_panels,
+    saliencies,
+    saliency_panels,
+    write_panels,
+)
 from hybridvo.files import write_json
 from hybridvo.network.losses import reconstruct
 from hybridvo.network.models import load_weights

@@ -26,7 +26,6 @@ from hybridvo.data.sequence import Sequence, open_sequence
 from hybridvo.errors import HybridVOError, InputError
 from hybridvo.evaluation import scores
 from hybridvo.evaluation.report import write_report
-from hybridvo.evaluation.scores import ERRORS, pair_facts, true_trajectory
 from hybridvo.files import Mode, atomic_write, held, versions, write_json
 from hybridvo.network.models import Models
 from hybridvo.options import Options
@@ -74,29 +73,10 @@ def compare(
             shutil.rmtree(out / "runs", ignore_errors=True)
         for name, reason in missing.items():
             _logger.warning("not run: %s: %s", name, reason)
-        tables, rows, facts = [], [], []
-        for job in jobs:
-            runs = {}
-            for method in names:
-                asked = replace(options, run=replace(options.run, method=method, max_failed=1.0))
-                try:
-                    runs[method], _ = run(job.sequence, job.folder / method, asked, **given)
-                except HybridVOError:
-                    raise
-                except Exception as error:  # a bug of one method costs its run
-                    missing[f"{method} on {job.sequence.name}"] = f"{type(error).__name__}: {error}"
-                    _logger.exception("%s on %s", method, job.sequence.name)
-            table, fact = _read(job, runs, protocol is not None)
-            for method, summary in runs.items():
-                mine = table[table["method"] == method]
-                named = {"sequence": job.sequence.name, "method": method, "flow_source": job.flow}
-                named["depth_source"] = job.sequence.depth_source
-                line = scores.sequence_row(mine, summary["metrics"], named)
-                path = f"runs/{job.folder.name}/{method}/trajectory.tum"
-                rows.append(line | {"trajectory": path})
-            tables.append(table)
-            facts.append(fact)
-        table = pd.concat(tables, ignore_index=True)
+        scored = [_score(job, names, options, given, missing, protocol) for job in jobs]
+        table = pd.concat([found for found, _, _ in scored], ignore_index=True)
+        rows = [row for _, some, _ in scored for row in some]
+        facts = [fact for _, _, fact in scored]
         totals = [
             scores.total_row(pairs, [r for r in rows if (r["method"], r["flow_source"]) == key])
             for key, pairs in table.groupby(["method", "flow_source"], sort=False)
@@ -182,6 +162,35 @@ def _jobs(
     return jobs
 
 
+def _score(
+    job: _Job,
+    methods: Iterable[str],
+    options: Options,
+    given: dict[str, Any],
+    missing: dict[str, str],
+    protocol: str | None,
+) -> tuple[pd.DataFrame, list[dict[str, Any]], dict[str, Any]]:
+    """Run the methods on a sequence: all pairs, a line for each method, what is said of it."""
+    metrics, name = {}, job.sequence.name
+    for method in methods:
+        asked = replace(options, run=replace(options.run, method=method, max_failed=1.0))
+        try:
+            metrics[method] = run(job.sequence, job.folder / method, asked, **given)[0]["metrics"]
+        except HybridVOError:
+            raise
+        except Exception as error:  # a bug of one method costs its run
+            missing[f"{method} on {name}"] = f"{type(error).__name__}: {error}"
+            _logger.exception("%s on %s", method, name)
+    table, fact = _read(job, metrics, protocol is not None)
+    rows = []
+    for method, path in metrics.items():
+        named = {"sequence": name, "method": method, "flow_source": job.flow}
+        named["depth_source"] = job.sequence.depth_source
+        row = scores.sequence_row(table[table["method"] == method], path, named)
+        rows.append(row | {"trajectory": f"runs/{job.folder.name}/{method}/trajectory.tum"})
+    return table, rows, fact
+
+
 def _read(
     job: _Job, methods: Iterable[str], same_camera_only: bool
 ) -> tuple[pd.DataFrame, dict[str, Any]]:
@@ -197,9 +206,9 @@ def _read(
             reason = f"frame cannot be read: {row.message}"
             left_out.append({"index": row.next, "reason": reason})
         else:
-            facts.append({"next": row.next} | pair_facts(sequence, *pair))
+            facts.append({"next": row.next} | scores.pair_facts(sequence, *pair))
     table = table.merge(pd.DataFrame(facts, columns=["next", *scores.FACTORS]), "left", "next")
-    gt = true_trajectory(sequence, range(len(sequence)))
+    gt = scores.true_trajectory(sequence, range(len(sequence)))
     if gt is not None:
         gt.save(job.folder / "ground_truth.tum")
     return scores.pair_table(table.sort_values("index", kind="stable")), {
@@ -222,7 +231,7 @@ def _pairs(job: _Job, method: str) -> pd.DataFrame:
     stride = int(np.diff(steps["index"][:2]).sum())
     steps = steps[steps["prev_index"].notna()].fillna({"reason": "", "message": ""})
     missing = steps["reason"] == "missing_frame"
-    steps.loc[missing, [*ERRORS, "motion_ms", "flow_ms"]] = np.nan
+    steps.loc[missing, [*scores.ERRORS, "motion_ms", "flow_ms"]] = np.nan
     return steps.assign(
         sequence=job.sequence.name,
         method=method,

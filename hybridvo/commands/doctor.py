@@ -1,7 +1,4 @@
-"""``hybridvo doctor``: what is installed here, which methods can run, what is wrong with data.
-
-Of a sequence three questions are asked; what the data do not show is said to be unknown.
-"""
+"""``hybridvo doctor``: what is installed here, which methods can run, what is wrong with data."""
 
 from __future__ import annotations
 

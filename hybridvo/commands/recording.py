@@ -10,7 +10,7 @@ import numpy as np
 
 from hybridvo.data.sequence import Sequence
 from hybridvo.errors import InputError
-from hybridvo.evaluation.plots import flow_colours
+from hybridvo.evaluation.drawing import flow_colours
 from hybridvo.evaluation.scores import true_trajectory
 from hybridvo.files import atomic_write
 from hybridvo.geometry import invert
@@ -90,7 +90,7 @@ class Recording:
         images = {
             "world/camera/image": frame.rgb,
             "flow": None if flow is None else flow_colours(flow),
-            "weights": None if weights is None else np.uint8(255 * np.clip(weights, 0, 1)),
+            "weights": None if weights is None else (255 * np.clip(weights, 0, 1)).astype(np.uint8),
         }
         for name, image in images.items():
             if image is not None:

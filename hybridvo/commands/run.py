@@ -12,6 +12,7 @@ import os
 import re
 import time
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -24,8 +25,8 @@ from rich.console import Console
 from hybridvo.commands.recording import Recording, check_recording
 from hybridvo.data.sequence import Sequence
 from hybridvo.errors import InputError
+from hybridvo.evaluation.drawing import plot_trajectory
 from hybridvo.evaluation.metrics import evaluate
-from hybridvo.evaluation.plots import plot_trajectory
 from hybridvo.evaluation.scores import ERRORS, pair_scores, pair_table, step_errors, true_trajectory
 from hybridvo.files import Mode, atomic_write, fingerprint, held, versions, write_json
 from hybridvo.flow import FlowProvider, MeasuredFlow, dis_flow, file_flow
@@ -98,16 +99,15 @@ def run(
         folder = RunFolder(out, header, mode)
         summary = folder.summary
         if summary is None:
-            recording = None
+            this = _Run(sequence, frames, vo, flow, folder)
             if rrd is not None:
-                recording = Recording(rrd or out / RECORDING, sequence, frames)
-                stack.enter_context(recording)
-            _estimate(vo, flow, sequence, frames, folder, recording, quiet)
-            given = (out, folder.rows, sequence, frames, options.run)
-            summary = _write_results(*given, picture=picture)
+                this.recording = Recording(rrd or out / RECORDING, sequence, frames)
+                stack.enter_context(this.recording)
+            this.estimate(quiet)
+            summary = this.write_results(picture)
             folder.save("done", summary=summary)
-            if recording is not None:
-                summary["recording"] = os.fspath(recording.path)
+            if this.recording is not None:
+                summary["recording"] = os.fspath(this.recording.path)
     too_many = summary["failed_fraction"] > options.run.max_failed
     return summary, 3 if too_many else 0
 
@@ -174,44 +174,6 @@ class RunFolder:
                 file.write(json.dumps([self.rows, tracker], default=np.ndarray.tolist))
 
 
-def _estimate(
-    vo: Odometry,
-    flow: MeasuredFlow,
-    sequence: Sequence,
-    frames: range,
-    folder: RunFolder,
-    recording: Recording | None,
-    quiet: bool,
-) -> None:
-    """Track the frames that the folder has no rows of yet."""
-    rows = folder.rows
-    failed = sum(row["status"] == "failed" for row in rows)
-    with progress.Progress(
-        progress.TextColumn("{task.description}", markup=False),  # a folder may be named [x]
-        progress.BarColumn(),
-        progress.TextColumn("{task.completed}/{task.total} frames, {task.fields[failed]} failed"),
-        progress.TimeRemainingColumn(),
-        console=Console(stderr=True, quiet=quiet, soft_wrap=True, markup=False, highlight=False),
-    ) as bar:
-        label = f"{sequence.name} [{vo.method}]"
-        task = bar.add_task(label, total=len(frames), completed=len(rows), failed=failed)
-        for warning in sequence.warnings:
-            bar.console.print(f"warning: {warning}")
-        if folder.tracker is not None:
-            vo.resume(_restored(folder.tracker, sequence))
-            bar.console.print(f"resumed after {len(rows)} of {len(frames)} frames")
-        for index in frames[len(rows) :]:
-            rows.append(row := _track(vo, flow, sequence, index, recording))
-            if row["status"] != "ok":
-                text = f"frame {index}: {row['status']} ({row['reason']}), probability "
-                bar.console.print(f"{text}{row['probability']:.2f}: {row['message']}")
-            failed += row["status"] == "failed"
-            bar.update(task, completed=len(rows), failed=failed)
-            if len(rows) % SAVE_EVERY == 0:
-                folder.save_rows(_saved(vo.state))
-        folder.save_rows()
-
-
 def _saved(state: TrackerState) -> dict[str, Any]:
     """The state of a tracker, JSON-ready but for its arrays; the frame by its index."""
     frame = None if state.frame is None else state.frame.index
@@ -229,84 +191,119 @@ def _restored(saved: dict[str, Any], sequence: Sequence) -> TrackerState:
     return TrackerState(**arrays(saved) | {"frame": frame, "motion_model": model})
 
 
-def _track(
-    vo: Odometry, flow: MeasuredFlow, sequence: Sequence, index: int, recording: Recording | None
-) -> dict[str, Any]:
-    """What is kept of a frame, JSON-ready: the columns of ``steps.csv`` and more."""
-    prev, frame, ms = vo.state.frame, None, 0.0
-    flow.reset()
-    try:
-        frame = sequence.frame(index)
-    except (InputError, OSError) as error:
-        if vo.options.run.strict:
-            raise InputError(f"frame {index}: {error}") from error
-        step = vo.skip(index, float(sequence.timestamps[index]), str(error))
-    else:
-        started = time.perf_counter()
-        step = vo.track(frame)
-        ms = 1e3 * (time.perf_counter() - started)
-    field = flow.last
-    if frame is not None and recording is not None:
-        recording.add(frame, step, field.flow)
-    motion = step.motion
-    values = [*motion.T_curr_prev[:3, 3].tolist(), *se3_log(motion.T_curr_prev)[3:].tolist()]
-    return {
-        "index": step.index,
-        "timestamp": step.timestamp,
-        "status": step.status.state.value,
-        "reason": step.status.reason.value,
-        "probability": float(motion.probability),
-        **dict(zip("tx ty tz rx ry rz".split(), values, strict=True)),
-        "inlier_ratio": float(motion.inlier_ratio),
-        "iterations": int(motion.iterations),
-        "cost": float(motion.cost),
-        "flow_ms": round(flow.ms, 3),
-        "motion_ms": round(ms - flow.ms, 3),
-        "frame_ms": round(ms, 3),
-        "prev_index": None if prev is None else prev.index,
-        "flow_source": field.source,
-        "message": " ".join(step.status.message.split()),
-        "T_curr_prev": motion.T_curr_prev.tolist(),
-        "T_world_cam": step.T_world_cam.tolist(),
-        "covariance": motion.covariance.tolist(),
-        "flow_is_true": field.flow is not None and field.is_true,
-        **step_errors(sequence, prev, step.index, step.T_curr_prev),
-    }
+@dataclass
+class _Run:
+    """A sequence, what tracks it, and the folder of the results."""
 
+    sequence: Sequence
+    frames: range
+    vo: Odometry
+    flow: MeasuredFlow
+    folder: RunFolder
+    recording: Recording | None = None
 
-def _write_results(
-    folder: Path,
-    rows: list[dict[str, Any]],
-    sequence: Sequence,
-    frames: range,
-    options: RunOptions,
-    *,
-    picture: bool,
-) -> dict[str, Any]:
-    """Write what a finished run leaves beside its steps; its summary, JSON-ready."""
-    table, gt = pd.DataFrame(rows), true_trajectory(sequence, frames)
-    columns: dict[str, Any] = {name: np.array(table[name].tolist()) for name in ARRAYS}
-    trajectory = Trajectory(columns["timestamp"], np.array(table["T_world_cam"].tolist()))
-    trajectory.save(folder / "trajectory.tum")
-    trajectory.save(folder / "trajectory.kitti")
-    with atomic_write(folder / "steps.npz", "wb") as file:
-        np.savez(file, **columns)
-    summary, metrics = _summarise(table, sequence, options), None
-    if gt is not None:
-        report = evaluate(trajectory, gt, alignment=options.alignment)
-        pairs = pair_scores(pair_table(table[1:].rename(columns={"motion_ms": "ms"})))
-        named = ("method", "degraded", "flow_source", "depth_source", "oracle", "sequence")
-        metrics = report | pairs | {key: summary[key] for key in named}
-        metrics["reasons"] = report["reasons"] | pairs["reasons"]
-        write_json(folder / "metrics.json", metrics)
-    if picture:
-        title = f"{sequence.name}, flow: {', '.join(summary['flow_source']) or 'none'}"
-        if summary["oracle"]:
-            title += f" (oracle: {', '.join(summary['oracle'])})"
-        path = folder / "trajectory.png"
-        plot_trajectory(options.method, trajectory, path, truth=gt, title=title)
-    files = [os.fspath(folder / name) for name in (*RESULTS, STATE) if (folder / name).exists()]
-    return summary | {"state": "done", "out": os.fspath(folder), "files": files, "metrics": metrics}
+    def estimate(self, quiet: bool) -> None:
+        """Track the frames that the folder has no rows of yet."""
+        vo, rows, tracker = self.vo, self.folder.rows, self.folder.tracker
+        failed = sum(row["status"] == "failed" for row in rows)
+        console = Console(stderr=True, quiet=quiet, soft_wrap=True, markup=False, highlight=False)
+        counts = "{task.completed}/{task.total} frames, {task.fields[failed]} failed"
+        with progress.Progress(
+            progress.TextColumn("{task.description}", markup=False),  # a folder may be named [x]
+            progress.BarColumn(),
+            progress.TextColumn(counts),
+            progress.TimeRemainingColumn(),
+            console=console,
+        ) as bar:
+            say = console.print
+            label, total = f"{self.sequence.name} [{vo.method}]", len(self.frames)
+            task = bar.add_task(label, total=total, completed=len(rows), failed=failed)
+            for warning in self.sequence.warnings:
+                say(f"warning: {warning}")
+            if tracker is not None:
+                vo.resume(_restored(tracker, self.sequence))
+                say(f"resumed after {len(rows)} of {total} frames")
+            for index in self.frames[len(rows) :]:
+                rows.append(row := self._track(index))
+                if row["status"] != "ok":
+                    text = f"frame {index}: {row['status']} ({row['reason']}), probability "
+                    say(f"{text}{row['probability']:.2f}: {row['message']}")
+                failed += row["status"] == "failed"
+                bar.update(task, completed=len(rows), failed=failed)
+                if len(rows) % SAVE_EVERY == 0:
+                    self.folder.save_rows(_saved(vo.state))
+            self.folder.save_rows()
+
+    def _track(self, index: int) -> dict[str, Any]:
+        """What is kept of a frame, JSON-ready: the columns of ``steps.csv`` and more."""
+        vo, flow, sequence = self.vo, self.flow, self.sequence
+        prev, frame, ms = vo.state.frame, None, 0.0
+        flow.reset()
+        try:
+            frame = sequence.frame(index)
+        except (InputError, OSError) as error:
+            if vo.options.run.strict:
+                raise InputError(f"frame {index}: {error}") from error
+            step = vo.skip(index, float(sequence.timestamps[index]), str(error))
+        else:
+            started = time.perf_counter()
+            step = vo.track(frame)
+            ms = 1e3 * (time.perf_counter() - started)
+        field = flow.last
+        if frame is not None and self.recording is not None:
+            self.recording.add(frame, step, field.flow)
+        motion = step.motion
+        values = [*motion.T_curr_prev[:3, 3].tolist(), *se3_log(motion.T_curr_prev)[3:].tolist()]
+        return {
+            "index": step.index,
+            "timestamp": step.timestamp,
+            "status": step.status.state.value,
+            "reason": step.status.reason.value,
+            "probability": float(motion.probability),
+            **dict(zip("tx ty tz rx ry rz".split(), values, strict=True)),
+            "inlier_ratio": float(motion.inlier_ratio),
+            "iterations": int(motion.iterations),
+            "cost": float(motion.cost),
+            "flow_ms": round(flow.ms, 3),
+            "motion_ms": round(ms - flow.ms, 3),
+            "frame_ms": round(ms, 3),
+            "prev_index": None if prev is None else prev.index,
+            "flow_source": field.source,
+            "message": " ".join(step.status.message.split()),
+            "T_curr_prev": motion.T_curr_prev.tolist(),
+            "T_world_cam": step.T_world_cam.tolist(),
+            "covariance": motion.covariance.tolist(),
+            "flow_is_true": field.flow is not None and field.is_true,
+            **step_errors(sequence, prev, step.index, step.T_curr_prev),
+        }
+
+    def write_results(self, picture: bool) -> dict[str, Any]:
+        """Write what a finished run leaves beside its steps; its summary, JSON-ready."""
+        folder, options = self.folder.path, self.vo.options.run
+        table, gt = pd.DataFrame(self.folder.rows), true_trajectory(self.sequence, self.frames)
+        columns: dict[str, Any] = {name: np.array(table[name].tolist()) for name in ARRAYS}
+        trajectory = Trajectory(columns["timestamp"], np.array(table["T_world_cam"].tolist()))
+        trajectory.save(folder / "trajectory.tum")
+        trajectory.save(folder / "trajectory.kitti")
+        with atomic_write(folder / "steps.npz", "wb") as file:
+            np.savez(file, **columns)
+        summary, metrics = _summarise(table, self.sequence, options), None
+        if gt is not None:
+            metrics = evaluate(trajectory, gt, alignment=options.alignment)
+            pairs = pair_scores(pair_table(table[1:].rename(columns={"motion_ms": "ms"})))
+            reasons = metrics["reasons"] | pairs["reasons"]
+            named = ("method", "degraded", "flow_source", "depth_source", "oracle", "sequence")
+            metrics |= pairs | {key: summary[key] for key in named} | {"reasons": reasons}
+            write_json(folder / "metrics.json", metrics)
+        if picture:
+            title = f"{self.sequence.name}, flow: {', '.join(summary['flow_source']) or 'none'}"
+            if summary["oracle"]:
+                title += f" (oracle: {', '.join(summary['oracle'])})"
+            path = folder / "trajectory.png"
+            plot_trajectory(options.method, trajectory, path, truth=gt, title=title)
+        files = [os.fspath(folder / name) for name in (*RESULTS, STATE) if (folder / name).exists()]
+        summary |= {"state": "done", "out": os.fspath(folder), "files": files}
+        return summary | {"metrics": metrics}
 
 
 def _summarise(table: pd.DataFrame, sequence: Sequence, options: RunOptions) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from hybridvo.errors import InputError
-from hybridvo.evaluation.plots import Panel, flow_colours, longest_flow, write_panels
+from hybridvo.evaluation.drawing import Panel, flow_colours, longest_flow, write_panels
 from hybridvo.files import write_json
 from hybridvo.network.models import load_weights, torch_device
 from hybridvo.synthetic.dataset import load_preset, read_sample, write_samples

@@ -11,7 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from hybridvo.data.camera_file import Calibration, parse_camera, units_per_metre
+from hybridvo.data.camera_file import Calibration, parse_camera
 from hybridvo.data.image_io import read_depth, read_flow, read_mask_png, read_rgb
 from hybridvo.data.lists import IMAGES, match_files, shown, sorted_files
 from hybridvo.errors import FormatError, InputError
@@ -196,8 +196,15 @@ class Sequence:
         if found is not None and any(found.distortion):
             whole = found.camera.K, np.array(found.distortion), np.eye(3), found.camera.K
             self._lens = cv2.initUndistortRectifyMap(*whole, size[::-1], cv2.CV_32FC1)
-        self._given_scale = found.depth_scale if scale is None and found is not None else scale
-        self._given_scale = units_per_metre(self._given_scale, self.name, told)
+        scale = found.depth_scale if scale is None and found is not None else scale
+        if scale is not None and not scale > 0:
+            expected = "units per metre above 0"
+            raise InputError(f"{self.name}: depth_scale: expected {expected}, got {scale}.")
+        if scale is not None and scale < 1:  # RealSense's; 0.001 as single precision prints it
+            units = float(f"{1 / scale:.6g}")
+            self._warn(f"depth_scale {scale:g}: taken as RealSense's, {units:g} units per metre")
+            scale = units
+        self._given_scale = scale
         path, depth = _first(self.depth_files, self._read_depth)
         if depth is None:
             return

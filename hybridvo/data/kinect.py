@@ -90,10 +90,7 @@ class TumSequence(Sequence):
 
 
 class SevenScenesSequence(Sequence):
-    """One sequence such as ``chess/seq-01``: ``frame-000000.{color.png,depth.png,pose.txt}``.
-
-    K = 585 585 320 240 is the data set's own convention. The data has no stamps.
-    """
+    """One sequence such as ``chess/seq-01``: ``frame-000000.{color.png,depth.png,pose.txt}``."""
 
     kind = "7scenes"
     depth_scale = 1000.0
@@ -111,7 +108,7 @@ class SevenScenesSequence(Sequence):
             self._each_pose([files.get(number) for number in numbers], _read_pose)
 
     def _calibration(self) -> Calibration:
-        return Calibration(585, 585, 320, 240, 480, 640)
+        return Calibration(585, 585, 320, 240, 480, 640)  # the data set's own convention
 
 
 def _read_pose(path: Path) -> np.ndarray:

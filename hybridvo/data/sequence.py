@@ -106,10 +106,8 @@ def iter_pairs(
 
 
 def resize_camera(camera: Camera, height: int, width: int) -> Camera:
-    """Camera of the same view with another image size in pixels.
-
-    Pixel (0, 0) is a centre: u' = s (u + 0.5) - 0.5, for the principal point too.
-    """
+    """Camera of the same view with another image size in pixels."""
+    # pixel (0, 0) is a centre: u' = s (u + 0.5) - 0.5, for the principal point too
     sx, sy = width / camera.width, height / camera.height
     cx, cy = sx * (camera.cx + 0.5) - 0.5, sy * (camera.cy + 0.5) - 0.5
     return Camera(camera.fx * sx, camera.fy * sy, cx, cy, height, width)

@@ -202,10 +202,7 @@ def failure_rate(pairs: pd.DataFrame) -> dict[str, Any]:
 
 
 def pair_scores(pairs: pd.DataFrame) -> dict[str, Any]:
-    """Every mean, median and count over the pairs of one method and flow, JSON-ready.
-
-    ``reasons`` say why a value is None.
-    """
+    """Every mean, median and count over the pairs of one method and flow; why some are None."""
     scored = pairs[pairs["rot_err_deg"].notna()]
     figures = {name: scored[name].mean() for name in ERRORS[:4]}
     for name in ERRORS[4:]:

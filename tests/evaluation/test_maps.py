@@ -10,8 +10,16 @@ import torch
 from hybridvo.cli import main
 from hybridvo.data.sequence import open_sequence
 from hybridvo.errors import InputError
-from hybridvo.evaluation.drawing import draw, integrated_gradients, prediction_panels, saliencies
-from hybridvo.evaluation.plots import Panel, flow_colours, flow_panel, write_panels
+from hybridvo.evaluation.drawing import (
+    Panel,
+    draw,
+    flow_colours,
+    flow_panel,
+    integrated_gradients,
+    prediction_panels,
+    saliencies,
+    write_panels,
+)
 from hybridvo.network.inputs import assemble_inputs
 from hybridvo.network.pwvo import NetworkOptions, build_network
 from hybridvo.network.selection import select_motion

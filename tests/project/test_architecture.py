@@ -53,7 +53,7 @@ APPLICATION = {"cli", "commands"}
 
 ONLY_IN = {
     "evo": {"evaluation/metrics.py"},
-    "matplotlib": {"evaluation/plots.py"},
+    "matplotlib": {"evaluation/drawing.py"},
     "plotly": {"evaluation/"},
     "pandas": {"evaluation/", "commands/"},
     "rerun": {"commands/recording.py"},
