@@ -163,7 +163,7 @@ def uncertainty(network: Any, sample: Any) -> list[Panel]:
     longest = longest_flow(sample.flow)
     total = flow_panel("total flow", sample.flow, longest)
     flows = [total, flow_panel("flow of the objects", objects, longest)]
-    return [*flows, *prediction_panels("PWVO", output, true, sample.moving)]
+    return [*flows, *prediction_panels(output, true, sample.moving)]
 
 
 def factorised(network: Any, sample: Any) -> list[Panel]:

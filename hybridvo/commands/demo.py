@@ -36,10 +36,7 @@ def demo(
     command: Iterable[str] = (),
     quiet: bool = False,
 ) -> dict[str, Any]:
-    """Render a scene in Sintel's layout under ``out/data``, run and compare; JSON-ready.
-
-    Flow is OpenCV's DIS, never the true flow that is written beside it; depth is the renderer's.
-    """
+    """Render a scene under ``out/data``, and compare on DIS flow and true depth; JSON-ready."""
     if frames < 2:
         raise InputError(f"demo: expected at least 2 frames, got {frames}.")
     out, name = Path(out), f"{SCENE}_{seed}_{frames}"

@@ -49,10 +49,7 @@ class Recording:
             strip = rerun.LineStrips3D([line], colors=[140, 140, 140])
             self._stream.log("world/ground_truth", strip, static=True)
 
-    def __enter__(self) -> Recording:
-        return self
-
-    def __exit__(self, *error: object) -> None:
+    def close(self) -> None:
         """Write what is still in memory; the file is complete afterwards."""
         if len(self._positions) > 1:
             strip = self._rr.LineStrips3D([np.array(self._positions)], colors=[0, 114, 178])

@@ -102,7 +102,7 @@ def run(
             this = _Run(sequence, frames, vo, flow, folder)
             if rrd is not None:
                 this.recording = Recording(rrd or out / RECORDING, sequence, frames)
-                stack.enter_context(this.recording)
+                stack.callback(this.recording.close)
             this.estimate(quiet)
             summary = this.write_results(picture)
             folder.save("done", summary=summary)

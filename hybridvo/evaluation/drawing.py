@@ -123,7 +123,7 @@ def draw(
     inputs = assemble_inputs(given)
     T_start = first_motions(network, inputs, "softmax", int(network.options.passes) - 1)
     with torch.no_grad():
-        panels += prediction_panels("PWVO", network(inputs, T_start), true, moving)
+        panels += prediction_panels(network(inputs, T_start), true, moving)
     panels += saliency_panels("PWVO", saliencies(network, inputs, T_start), moving)
     source = f"{given.flow_source} (true)" if given.flow_is_true else given.flow_source
     heading = f"{sequence.name}, pair {pair}; flow: {source}; motion: {method}, {motion.status}"
@@ -159,7 +159,6 @@ def _pair_panels(
 
 
 def prediction_panels(
-    name: str,
     prediction: PixelwisePrediction,
     true: tuple[np.ndarray, np.ndarray] | None,
     moving: np.ndarray,
@@ -174,13 +173,11 @@ def prediction_panels(
         scale = getattr(prediction, f"log_scale_{what}")
         if scale is not None:  # beside its own scale: the paper compares where they are large
             U = scale[0].detach().float().mean(0).exp().cpu().numpy()
-            panels.append(
-                Panel(f"{name}: uncertainty of the {what}", U, f"{unit}, U", None, moving)
-            )
+            panels.append(Panel(f"PWVO: uncertainty of the {what}", U, f"{unit}, U", None, moving))
         if true is not None:
             found = getattr(prediction, what)[0].detach().cpu().double().numpy()
             error = np.abs(found - np.reshape(true[k], (3, 1, 1))).mean(axis=0)
-            panels.append(Panel(f"{name}: error of the {what}", error, unit, None, moving))
+            panels.append(Panel(f"PWVO: error of the {what}", error, unit, None, moving))
     return panels
 
 

@@ -144,18 +144,17 @@ def kitti_drift(found: Match, lengths: Sequence[float] = KITTI_LENGTHS) -> dict[
     est, gt = found.est, found.gt
     steps = np.linalg.norm(np.diff(gt[:, :3, 3], axis=0), axis=1)
     distance = np.concatenate([[0.0], np.cumsum(steps)])
-    means, segments = [], 0
+    means = []
     for length in lengths:
         last = np.searchsorted(distance, distance + length, side="right")
         (first,) = np.nonzero(last < len(gt))
         if len(first):
             means.append([e.mean() / length for e in _relative(est, gt, first, last[first])])
-            segments += len(first)
     if not means:
         reason = f"the true path of {distance[-1]:.4g} m is shorter than {min(lengths):g} m"
         raise DegenerateError(reason)
     translation, rotation = np.mean(means, axis=0).tolist()
-    return {"segments": segments, "translation": translation, "rotation_deg_per_m": rotation}
+    return {"translation": translation, "rotation_deg_per_m": rotation}
 
 
 def evaluate(
@@ -188,15 +187,11 @@ def evaluate(
     )
     found = match(estimate, gt, max_diff)
 
-    def relative() -> tuple[float, float, float]:
-        translation, degrees = rpe(found, delta, delta_unit)
-        return _rms(translation), float(translation.mean()), _rms(degrees)
-
     figures: dict[str, Callable[[], Any]] = {
         "ate_rmse_unaligned": lambda: [ate(found, "none").rmse],
         "ate_rmse_origin": lambda: [ate(found, "origin").rmse],
         "ate_rmse scale": lambda: attrgetter("rmse", "scale")(ate(found, alignment)),
-        "rpe_trans_rmse rpe_trans_mean rpe_rot_rmse_deg": relative,
+        "rpe_trans_rmse rpe_rot_rmse_deg": lambda: map(_rms, rpe(found, delta, delta_unit)),
         "kitti_drift": lambda: [kitti_drift(found)],
     }
     report: dict[str, Any] = {

@@ -37,6 +37,25 @@ from hybridvo.types import Camera, Frame
 PAPER_SIZE = (128, 256)  # height and width at which the paper measures its EPE
 MOVING_PX = 1.0  # of the true flow beside the true ego flow: the pixel moves by itself
 ERRORS = ("r_err_deg", "t_err", "epe", "epe_l2_px", "rot_err_deg", "trans_err")
+FAILURE_PX = 1.0  # error of the ego flow at native size above which an estimate has failed
+PATH_KEYS = ("ate_rmse", "rpe_trans_rmse", "rpe_rot_rmse_deg", "ate_rmse_origin")
+NO_PAIRS = "no pair was estimated, or none has ground truth"
+NO_TRUTH = "the sequence has no ground truth for these frames"
+NO_MOVING = "needs true flow of the whole scene (moving objects included) and ground truth"
+FACTORS: Mapping[str, tuple[str, tuple[float, ...]]] = {
+    "dynamic_fraction": ("share of pixels that move", (0, 0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 1)),
+    "flow_magnitude_px": ("median true ego flow [px]", (0, 1, 2, 5, 10, 20, 50, math.inf)),
+    "rotation_deg": ("true rotation [deg]", (0, 0.1, 0.3, 1, 3, 10, 180)),
+    "translation_m": ("true translation [m]", (0, 0.003, 0.01, 0.03, 0.1, 0.3, 1, math.inf)),
+    "depth_spread": ("90th over 10th percentile of depth", (1, 1.5, 2, 4, 8, 16, math.inf)),
+}
+"""What may explain an error, columns of ``pairs.csv`` -> label, edges of the bins."""
+PAIR_COLUMNS = (
+    *("sequence", "index", "method", "flow_source", "status"),
+    *("epe_l2_px", "rot_err_deg", "trans_err", "ms"),
+    *("r_err_deg", "t_err", "epe", "flow_ms", *FACTORS, "prev", "next", "message"),
+)
+"""Columns of ``pairs.csv``."""
 
 
 def true_motion(sequence: Sequence, prev: int, curr: int) -> np.ndarray | None:
@@ -155,27 +174,6 @@ def pair_facts(sequence: Sequence, prev: int, curr: int) -> dict[str, float]:
         moving = np.linalg.norm(ego[valid] - flow_gt[valid], axis=1) > MOVING_PX
         facts |= {"dynamic_fraction": float(moving.mean())} if len(moving) else {}
     return facts
-
-
-FAILURE_PX = 1.0  # error of the ego flow at native size above which an estimate has failed
-PATH_KEYS = ("ate_rmse", "rpe_trans_rmse", "rpe_rot_rmse_deg", "ate_rmse_origin")
-NO_PAIRS = "no pair was estimated, or none has ground truth"
-NO_TRUTH = "the sequence has no ground truth for these frames"
-NO_MOVING = "needs true flow of the whole scene (moving objects included) and ground truth"
-FACTORS: Mapping[str, tuple[str, tuple[float, ...]]] = {
-    "dynamic_fraction": ("share of pixels that move", (0, 0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 1)),
-    "flow_magnitude_px": ("median true ego flow [px]", (0, 1, 2, 5, 10, 20, 50, math.inf)),
-    "rotation_deg": ("true rotation [deg]", (0, 0.1, 0.3, 1, 3, 10, 180)),
-    "translation_m": ("true translation [m]", (0, 0.003, 0.01, 0.03, 0.1, 0.3, 1, math.inf)),
-    "depth_spread": ("90th over 10th percentile of depth", (1, 1.5, 2, 4, 8, 16, math.inf)),
-}
-"""What may explain an error, columns of ``pairs.csv`` -> label, edges of the bins."""
-PAIR_COLUMNS = (
-    *("sequence", "index", "method", "flow_source", "status"),
-    *("epe_l2_px", "rot_err_deg", "trans_err", "ms"),
-    *("r_err_deg", "t_err", "epe", "flow_ms", *FACTORS, "prev", "next", "message"),
-)
-"""Columns of ``pairs.csv``."""
 
 
 def pair_table(pairs: Any) -> pd.DataFrame:
