@@ -43,7 +43,7 @@ class FolderSequence(Sequence):
         flow = sorted_files(root / "flow", (".flo", ".npy", ".png"))
         if not depth:
             expected = "a 16-bit PNG, .npy or .dpt of metric depth for each image in rgb/"
-            raise InputError(f"{root / 'depth'}: no depth: expected {expected}.")
+            raise InputError(f"{root / 'depth'}: no frames with depth: expected {expected}.")
         if flow and self._settings is not None and any(self._settings.distortion):
             raise InputError(f"{root}: flow/ is of distorted images: undistort them, or remove it.")
         if self._mask_folder is None and (root / "mask").is_dir():
