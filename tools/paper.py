@@ -33,7 +33,6 @@ from hybridvo.evaluation.drawing import (
     write_panels,
 )
 from hybridvo.files import write_json
-from hybridvo.network.losses import reconstruct
 from hybridvo.network.models import load_weights
 from hybridvo.network.selection import select_motion
 from hybridvo.network.weights import PRETRAINED, save_weights
@@ -170,7 +169,7 @@ def factorised(network: Any, sample: Any) -> list[Panel]:
     """Ego and object flow of the estimate beside the true ones."""
     batch, output = predict(network, sample)
     T, gt = select_motion(output), batch.targets
-    ego = reconstruct(gt.depth_prev, T, gt.K_prev, gt.K_curr)[0][0].permute(1, 2, 0).numpy()
+    ego = gt.reconstruct(T)[0][0].permute(1, 2, 0).numpy()
     longest = longest_flow(sample.flow)
     flows = {
         "ego flow, estimate": ego,

@@ -169,13 +169,13 @@ def prediction_panels(
     Euler angles X-Y-Z, degrees, and translation, metres. ``moving`` (H, W) is outlined.
     """
     panels = []
-    for k, (what, unit) in enumerate((("rotation", "deg"), ("translation", "m"))):
-        scale = getattr(prediction, f"log_scale_{what}")
-        if scale is not None:  # beside its own scale: the paper compares where they are large
-            U = scale[0].detach().float().mean(0).exp().cpu().numpy()
+    for k, (what, unit) in enumerate(zip(PARTS, ("deg", "m"), strict=True)):
+        half, s = slice(3 * k, 3 * k + 3), prediction.log_scale
+        if s is not None:  # beside its own scale: the paper compares where they are large
+            U = s[0, half].detach().float().mean(0).exp().cpu().numpy()
             panels.append(Panel(f"PWVO: uncertainty of the {what}", U, f"{unit}, U", None, moving))
         if true is not None:
-            found = getattr(prediction, what)[0].detach().cpu().double().numpy()
+            found = prediction.motion[0, half].detach().cpu().double().numpy()
             error = np.abs(found - np.reshape(true[k], (3, 1, 1))).mean(axis=0)
             panels.append(Panel(f"PWVO: error of the {what}", error, unit, None, moving))
     return panels
@@ -226,24 +226,18 @@ def saliencies(
     names = ("flow",) if network.options.scale_free else ("flow", "inverse_depth")
     given = tuple(getattr(inputs, name) for name in names)
 
-    def run(*tensors: torch.Tensor) -> Any:
+    def run(*tensors: torch.Tensor) -> PixelwisePrediction:
         return network(replace(inputs, **dict(zip(names, tensors, strict=True))), T_start)
-
-    def part(output: Any, k: int) -> torch.Tensor:
-        is_map = isinstance(output, PixelwisePrediction)
-        return getattr(output, PARTS[k]) if is_map else output[k]
 
     with torch.no_grad():
         output = run(*given)
     found = {}
     for k, what in enumerate(PARTS):
-        motion = weights = part(output, k).clone().requires_grad_()
-        if isinstance(output, PixelwisePrediction):
-            own: dict[str, Any] = {what: weights}
-            motion = select_pose(replace(output, **own))[k]
+        maps = output.motion.clone().requires_grad_()
+        motion = select_pose(replace(output, motion=maps))[:, 3 * k : 3 * k + 3]
         direction = (motion / motion.norm().clamp(min=1e-12)).detach()
-        (weights,) = torch.autograd.grad((direction * motion).sum(), weights)
-        answer = lambda *x, k=k, w=weights: (w * part(run(*x), k)).sum()  # noqa: E731
+        (weights,) = torch.autograd.grad((direction * motion).sum(), maps)
+        answer = lambda *x, w=weights: (w * run(*x).motion).sum()  # noqa: E731
         attributions = integrated_gradients(answer, given, steps)
         found[what] = torch.cat(attributions, dim=1)[0].abs().sum(0).cpu().numpy()
     return found

@@ -61,16 +61,17 @@ def test_colours_of_lengths() -> None:
 
 
 def test_uncertainty_and_error_maps_by_hand() -> None:
-    maps = torch.zeros(2, 3, 4, 5)
+    maps = torch.zeros(2, 6, 4, 5)
+    maps[:, 3:] += 2.0
     maps[1] += 7.0  # the second pair is not looked at
-    log_rotation = torch.tensor([0.0, 1.0, 2.0])[None, :, None, None].expand(2, 3, 4, 5)
-    prediction = PixelwisePrediction(maps, maps + 2.0, log_rotation, log_rotation - 1.0)
+    s = torch.tensor([0.0, 1.0, 2.0, -1.0, 0.0, 1.0])[None, :, None, None].expand(2, 6, 4, 5)
+    prediction = PixelwisePrediction(maps, s)
     true = np.array([1.0, 2.0, 3.0]), np.array([2.0, 2.0, 0.5])
     panels = prediction_panels(prediction, true, np.ones((4, 5), bool))
     expected = (np.e, 2.0, 1.0, 0.5)  # uncertainty and error of the rotation, of the translation
     for panel, value in zip(panels, expected, strict=True):
         np.testing.assert_allclose(panel.values, np.full((4, 5), value), rtol=1e-6)
-    assert prediction_panels(PixelwisePrediction(maps, maps), None, true[0]) == []
+    assert prediction_panels(PixelwisePrediction(maps), None, true[0]) == []
 
 
 def test_gradients_of_a_linear_answer_are_its_terms() -> None:
