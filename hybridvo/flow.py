@@ -9,7 +9,7 @@ import logging
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -49,9 +49,10 @@ def dis_flow(preset: str = "medium") -> FlowProvider:
     return _Dis(preset)
 
 
-class _Dis(NamedTuple):
+@dataclass(frozen=True)
+class _Dis:
     preset: str
-    source: str = "dis"
+    source = "dis"
 
     def __call__(self, prev: Frame, curr: Frame) -> FlowField:
         none = FlowField(None, source="dis")
@@ -179,7 +180,8 @@ def with_flow(
         return pair
     field = provider(pair.prev, pair.curr)
     field = field if isinstance(field, FlowField) else FlowField(field, source=source)
-    return FramePair(pair.prev, pair.curr, *vars(field).values(), pair.depth_source)
+    known = field.flow, field.variance, field.valid, field.source, field.is_true
+    return FramePair(pair.prev, pair.curr, *known, pair.depth_source)
 
 
 def contradiction(pair: FramePair) -> str | None:

@@ -88,8 +88,8 @@ def _broken(tensors: Mapping[str, torch.Tensor]) -> str:
 
 def weights_file(name_or_path: str | Path) -> Path:
     """The file of a pretrained name, else the path itself; a CheckpointError where it is none."""
-    known = {path.stem: path for path in sorted(PRETRAINED.glob("*.safetensors"))}
+    known = {path.stem: path for path in PRETRAINED.glob("*.safetensors")}
     path = known.get(str(name_or_path), name_or_path)
     if not os.path.isfile(path):  # where Path.is_file() raises: a name that is too long
-        raise CheckpointError(f"{path}: no such weights. Pretrained: {', '.join(known)}.")
+        raise CheckpointError(f"{path}: no such weights. Pretrained: {', '.join(sorted(known))}.")
     return Path(path)
