@@ -213,7 +213,6 @@ def _read(
         gt.save(job.folder / "ground_truth.tum")
     return scores.pair_table(table.sort_values("index", kind="stable")), {
         "name": sequence.name,
-        "kind": sequence.kind,
         "path": str(sequence.root),
         "pairs_scored": table["next"].nunique(),
         "left_out": left_out,

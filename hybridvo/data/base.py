@@ -19,8 +19,8 @@ from hybridvo.trajectory import check_increasing
 from hybridvo.types import Camera, Frame, depth_advice, typical_depth
 
 SATURATED = 65535  # of 16 bits: no depth
-Files = list[Path | None]
-"""A file for each frame, None where it has none."""
+Files = list[Path | None]  # a file for each frame, None where it has none
+Image = np.ndarray | None
 
 
 class Sequence:
@@ -249,12 +249,8 @@ def looks_for(kind: type[Sequence]) -> str:
 
 
 def straighten(
-    u: np.ndarray,
-    v: np.ndarray,
-    rgb: np.ndarray | None,
-    depth: np.ndarray | None,
-    mask: np.ndarray | None,
-) -> tuple[np.ndarray | None, np.ndarray | None, np.ndarray]:
+    u: np.ndarray, v: np.ndarray, rgb: Image, depth: Image, mask: Image
+) -> tuple[Image, Image, np.ndarray]:
     """Image, depth and mask at columns u and rows v; masked where these lie outside."""
     height, width = u.shape
     inside: np.ndarray = (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)

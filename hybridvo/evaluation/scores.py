@@ -267,11 +267,11 @@ def same_intrinsics(first: Camera, second: Camera) -> bool:
 
 def check_protocol(sequences: Several[Any]) -> None:
     """Refuse sequences that the protocol does not score."""
-    for sequence in sequences:
-        if sequence.kind != "sintel" or sequence.name not in paper_protocol()["sequences"]:
-            raise InputError(
-                f"--protocol paper: expected training sequences of MPI Sintel, got {sequence.name}."
-            )
+    known = paper_protocol()["sequences"]
+    wrong = [s.name for s in sequences if s.kind != "sintel" or s.name not in known]
+    if wrong:
+        expected = "training sequences of MPI Sintel"
+        raise InputError(f"--protocol paper: expected {expected}, got {', '.join(wrong)}.")
 
 
 def protocol_summary(scored: Several[Mapping[str, Any]]) -> dict[str, Any]:
