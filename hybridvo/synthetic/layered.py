@@ -76,52 +76,22 @@ class KnownPair:
     world: str = ""
 
 
-class Layers:
-    """Inverse depth, owner and motion of every pixel while surfaces are laid over each other.
-
-    ``rho``: (H, W) inverse depth of the background, 0 for sky; is changed in place, and its type
-    is that of the flows.
-    """
-
-    def __init__(self, K: np.ndarray, rho: np.ndarray) -> None:
-        height, width = rho.shape
-        self.K, self.rho, self.owner = K, rho, np.full(rho.shape, -1, np.int16)
-        # (W,) and (H, 1), the first two components of K^-1 x
-        self.x = ((np.arange(width) - K[0, 2]) / K[0, 0]).astype(rho.dtype)
-        self.y = ((np.arange(height)[:, None] - K[1, 2]) / K[1, 1]).astype(rho.dtype)
-        self.motions: list[np.ndarray | None] = []
-
-    def lay(self, box: tuple[slice, slice], inside: np.ndarray, rho: float) -> None:
-        """Add a flat surface that does not move yet, where it is in front of what is there.
-
-        ``inside``: (h, w) bool, its outline in the box of rows and columns; ``rho``: inverse depth.
-        """
-        shown = inside & (rho > self.rho[box])
-        self.owner[box][shown] = len(self.motions)
-        self.rho[box][shown] = rho
-        self.motions.append(None)
-
-    def flows(
-        self, T_curr_prev: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """(H, W, 2) ego flow, (H, W) its ratio of new depth to old, total flow and its ratio."""
-        focal = (float(self.K[0, 0]), float(self.K[1, 1]))
-        *uv, ego_ratio = rigid_flow(self.x, self.y, self.rho, T_curr_prev, focal)
-        ego_flow = np.stack(uv, axis=-1)
-        flow, ratio = ego_flow.copy(), ego_ratio.copy()
-        for number, motion in enumerate(self.motions):
-            if motion is not None:
-                mine = rows, columns = np.nonzero(self.owner == number)
-                x, y = self.x[columns], self.y[rows, 0]
-                *uv, ratio[mine] = rigid_flow(x, y, self.rho[mine], motion, focal)
-                flow[mine] = np.stack(uv, axis=-1)
-        return ego_flow, ego_ratio, flow, ratio
-
-
 def camera_flow(K: np.ndarray, depth: np.ndarray, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(H, W, 2) flow of the camera motion alone, and (H, W) ratio of the new depth to the old."""
-    inverse = np.divide(1.0, depth, out=np.zeros(depth.shape), where=depth > 0).astype(np.float32)
-    return Layers(K, inverse).flows(T)[:2]
+    inverse = np.divide(1.0, depth, out=np.zeros(depth.shape), where=depth > 0)
+    return image_flow(K, inverse.astype(np.float32), T)
+
+
+def image_flow(K: np.ndarray, rho: np.ndarray, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """:func:`rigid_flow` (H, W, 2) and ratio (H, W) of an image of inverse depth."""
+    x, y = rays(K, rho.shape).astype(rho.dtype)
+    u, v, ratio = rigid_flow(x, y, rho, T, (float(K[0, 0]), float(K[1, 1])))
+    return np.stack([u, v], axis=-1), ratio
+
+
+def rays(K: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
+    """(2, H, W) first two components of K^-1 x of every pixel."""
+    return np.moveaxis((pixel_grid(*size) - K[:2, 2]) / np.diag(K)[:2], -1, 0)
 
 
 def rigid_flow(x: Any, y: Any, inverse_depth: Any, T: Any, focal: Any) -> tuple[Any, Any, Any]:
@@ -304,10 +274,11 @@ def _draw(rng: np.random.Generator, o: PaperOptions) -> LayeredPair:
         for _ in range(o.objects)
     ]
     inverse_depth = (1.0 / np.array([background, *depths])).astype(np.float32)
-    layers = Layers(K, np.full((o.height, o.width), inverse_depth[0]))
-    for rho in inverse_depth[1:]:
-        box, mask = _place(rng, o)
-        layers.lay(box, mask, float(rho))
+    rho = np.full((o.height, o.width), inverse_depth[0])
+    owner = np.zeros(rho.shape, np.uint8)
+    for number, nearness in enumerate(inverse_depth[1:], start=1):
+        shown = _place(rng, o) & (nearness > rho)
+        owner[shown], rho[shown] = number, nearness
 
     # Step 3.
     T = o.motion.draw(rng, min(depths, default=background))
@@ -315,8 +286,8 @@ def _draw(rng: np.random.Generator, o: PaperOptions) -> LayeredPair:
     for number, depth in enumerate(depths, start=1):
         if rng.random() < o.move_probability:
             motions[number], moves[number] = o.motion.draw(rng, depth), True
-    owner, (K32, T32, motions32) = layers.owner + 1, (x.astype(np.float32) for x in (K, T, motions))
-    return LayeredPair(K32, T32, owner.astype(np.uint8), inverse_depth, motions32, moves)
+    K, T, motions = (x.astype(np.float32) for x in (K, T, motions))
+    return LayeredPair(K, T, owner, inverse_depth, motions, moves)
 
 
 def compose(
@@ -362,20 +333,17 @@ def compose(
     }
 
 
-def _place(rng: np.random.Generator, o: PaperOptions) -> tuple[tuple[slice, slice], np.ndarray]:
-    """A silhouette at a uniform position of the canvas: its box in the picture and its mask."""
-    mean, spread, low, high = o.object_size
+def _place(rng: np.random.Generator, o: PaperOptions) -> np.ndarray:
+    """(H, W) bool: a silhouette at a uniform position of the canvas."""
+    size, (mean, spread, low, high) = (o.height, o.width), o.object_size
     share = -np.inf
     while not low <= share <= high:
         share = mean + spread * rng.standard_normal()
     mask = cut_out(rng, max(int(o.width * share), 2))
     if rng.random() < 0.5:
         mask = mask[:, ::-1]
-    box, crop = [], []
-    for size, extent in zip((o.height, o.width), mask.shape, strict=True):
-        margin = int(size * o.canvas_margin)
-        start = int(rng.integers(0, max(size + 2 * margin - extent, 0) + 1)) - margin
-        first, last = np.clip((start, start + extent), 0, size).tolist()
-        box.append(slice(first, last))
-        crop.append(slice(first - start, last - start))
-    return (box[0], box[1]), mask[crop[0], crop[1]]
+    (height, width), margin = mask.shape, [int(side * o.canvas_margin) for side in size]
+    canvas = np.zeros(np.maximum(np.add(size, np.multiply(2, margin)), mask.shape), bool)
+    top, left = (int(rng.integers(room + 1)) for room in np.subtract(canvas.shape, mask.shape))
+    canvas[top : top + height, left : left + width] = mask
+    return canvas[margin[0] : margin[0] + size[0], margin[1] : margin[1] + size[1]]
