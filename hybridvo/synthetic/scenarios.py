@@ -16,7 +16,7 @@ import numpy as np
 from hybridvo.errors import InputError
 from hybridvo.geometry import make_transform
 from hybridvo.synthetic.draws import about, direction, log_uniform, smooth_field, turn
-from hybridvo.synthetic.layered import image_flow, rays, splat
+from hybridvo.synthetic.layered import image_flow, rays, rigid_flow, splat
 from hybridvo.synthetic.sensors import noisy_flow
 from hybridvo.types import Camera, Frame, FramePair
 
@@ -124,11 +124,13 @@ def make_pair(
     length = rng.uniform(cell.min_translation_m, cell.translation_m)
     T = make_transform(turn(rng, angle_deg), length * direction(rng))
     rho = _surfaces(rng, cell, (height, width))
-    owner, motions = _add_objects(rng, cell, rho, camera.K, T)
+    ray = rays(camera.K, rho.shape)
+    owner, motions = _add_objects(rng, cell, rho, ray, T)
     flow, ratio = image_flow(camera.K, rho, T)
     for number, motion in enumerate(motions, start=1):
-        own, mine = image_flow(camera.K, rho, motion), owner == number
-        flow[mine], ratio[mine] = (x[mine] for x in own)
+        mine = owner == number
+        *own, ratio[mine] = rigid_flow(*ray[:, mine], rho[mine], motion, (focal, focal))
+        flow[mine] = np.stack(own, axis=-1)
     seen = splat(flow, rho / ratio)
     depths = [(1.0 / np.where(r > 0, r, np.nan)).astype(np.float32) for r in (rho, seen)]
     measured, outlier = noisy_flow(rng, flow, cell.flow_noise_px, cell.outliers, 60.0)
@@ -181,7 +183,7 @@ def _unit_grid(size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _add_objects(
-    rng: np.random.Generator, cell: Scenario, rho: np.ndarray, K: np.ndarray, T: np.ndarray
+    rng: np.random.Generator, cell: Scenario, rho: np.ndarray, ray: np.ndarray, T: np.ndarray
 ) -> tuple[np.ndarray, list[np.ndarray]]:
     """Lay objects of the wanted share over the scene: who is where, and how each moves."""
     height, width = size = rho.shape
@@ -207,8 +209,7 @@ def _add_objects(
         slope = rng.uniform(-0.5, 0.5, 2)
         surface = (1 + slope[0] * u + slope[1] * v) / log_uniform(rng, (2.0, 12.0))
         rho[mine] = surface[mine]
-        ray = rays(K, size)[:, mine].mean(axis=1)
-        centre = np.array([*ray, 1.0]) / rho[mine].mean()
+        centre = np.array([*ray[:, mine].mean(axis=1), 1.0]) / rho[mine].mean()
         heading = rng.uniform(0, 2 * np.pi)
         towards = np.array([np.cos(heading), np.sin(heading), rng.uniform(-0.5, 0.5)])
         t = rng.uniform(8, 70) / 1120 * centre[2] * towards
