@@ -97,9 +97,7 @@ def rays(K: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
 def rigid_flow(x: Any, y: Any, inverse_depth: Any, T: Any, focal: Any) -> tuple[Any, Any, Any]:
     """Flow (u, v) of a rigid motion in px and the ratio of the new depth to the old.
 
-    Paper, equation 8, written as differences, so that single precision suffices: normalised
-    coordinates, inverse depth, the entries ``T[i, j]`` of the motion and the two focal lengths, all
-    of which broadcast; of numpy or torch.
+    Paper, equation 8, written as differences, so that single precision suffices; of numpy or torch.
     """
     if isinstance(T, np.ndarray):
         T = T.astype(np.asarray(x).dtype)
@@ -112,10 +110,7 @@ def rigid_flow(x: Any, y: Any, inverse_depth: Any, T: Any, focal: Any) -> tuple[
 
 
 def splat(flow: np.ndarray, rho_curr: np.ndarray) -> np.ndarray:
-    """(H, W) inverse depth of the next frame, nearest in front; 0 where nothing lands.
-
-    ``rho_curr``: (H, W) of the moved points on their own grid.
-    """
+    """(H, W) inverse depth of the next frame, nearest in front; 0 where nothing lands."""
     height, width = rho_curr.shape
     place = np.rint(flow + pixel_grid(height, width)).astype(np.int64)
     inside = ((place >= 0) & (place < (width, height))).all(axis=-1)
@@ -133,10 +128,8 @@ def splat(flow: np.ndarray, rho_curr: np.ndarray) -> np.ndarray:
 
 @option_group
 class TailSampler:
-    """Normal core with a heavy tail, truncated to an interval by rejection.
-
-    With ``tail_probability`` the value is sign(g) |g|^power, g ~ N(mean, tail_std), otherwise
-    N(mean, core_std); the branch is chosen once, then values outside [low, high] are drawn again.
+    """Normal core N(mean, core_std); with ``tail_probability`` a tail, sign(g) |g|^power with
+    g ~ N(mean, tail_std); values outside [low, high] are drawn again.
     """
 
     mean: float
@@ -223,7 +216,7 @@ class PaperOptions:
     motion: MotionSamplers = MotionSamplers()
     preset: Literal["paper"] = "paper"
 
-    def draw(self, rng: np.random.Generator) -> LayeredPair:
+    def draw(self, rng: np.random.Generator) -> dict[str, np.ndarray]:
         """One pair by steps 1 to 3: what :func:`compose` makes its flows of."""
         return _draw(rng, self)
 
@@ -231,31 +224,11 @@ class PaperOptions:
         """One pair by the five steps."""
         import torch
 
-        drawn = {k: torch.from_numpy(x)[None] for k, x in vars(self.draw(rng)).items()}
+        drawn = {k: torch.from_numpy(x)[None] for k, x in self.draw(rng).items()}
         return Sample(**{name: value[0].numpy() for name, value in compose(**drawn).items()})
 
 
-@dataclass(frozen=True, eq=False)
-class LayeredPair:
-    """A background and N flat objects, of which the nearest is seen, and how all of them move.
-
-    Args:
-        K, T_curr_prev: (3, 3) and (4, 4) float32 camera and its motion.
-        owner: (H, W) uint8, 0 for the background, else the number of an object.
-        inverse_depth: (N + 1,) float32, of the background and the objects.
-        motions: (N + 1, 4, 4) float32 of each beside the camera's, the identity where it is still.
-        moves: (N + 1,) bool.
-    """
-
-    K: np.ndarray
-    T_curr_prev: np.ndarray
-    owner: np.ndarray
-    inverse_depth: np.ndarray
-    motions: np.ndarray
-    moves: np.ndarray
-
-
-def _draw(rng: np.random.Generator, o: PaperOptions) -> LayeredPair:
+def _draw(rng: np.random.Generator, o: PaperOptions) -> dict[str, np.ndarray]:
     # Step 1. The published code resizes corner to corner, hence fx != fy at 128x256.
     f = o.focal_low + o.focal.draw(rng) * (o.focal_high - o.focal_low)
     fx = f * (o.width - 1) / (o.full_width - 1)
@@ -286,38 +259,37 @@ def _draw(rng: np.random.Generator, o: PaperOptions) -> LayeredPair:
     for number, depth in enumerate(depths, start=1):
         if rng.random() < o.move_probability:
             motions[number], moves[number] = o.motion.draw(rng, depth), True
-    K, T, motions = (x.astype(np.float32) for x in (K, T, motions))
-    return LayeredPair(K, T, owner, inverse_depth, motions, moves)
+    single = {"K": K, "T_curr_prev": T, "motions": motions}
+    drawn = {name: x.astype(np.float32) for name, x in single.items()}
+    return drawn | {"owner": owner, "inverse_depth": inverse_depth, "moves": moves}
 
 
 def compose(
     K: torch.Tensor,
     T_curr_prev: torch.Tensor,
+    motions: torch.Tensor,
     owner: torch.Tensor,
     inverse_depth: torch.Tensor,
-    motions: torch.Tensor,
     moves: torch.Tensor,
 ) -> dict[str, torch.Tensor]:
-    """Steps 4 and 5 for a batch of :class:`LayeredPair`, on any device: :class:`Sample`'s fields.
+    """Steps 4 and 5 for B pairs, on any device: the fields of :class:`Sample`.
 
-    The rigid flow of each pixel's object is **added** to the camera's, as the paper does.
+    ``motions``: (B, N + 1, 4, 4) of the background and of N flat objects beside the camera's;
+    ``owner``: (B, H, W) uint8, 0 where the background is seen, else the number of an object;
+    ``inverse_depth`` and ``moves``: (B, N + 1).
     """
     import torch
 
-    size = owner.shape[1:]
-    pixels, which = owner.flatten(1).long(), torch.arange(len(owner), device=owner.device)[:, None]
-    moving = moves[which, pixels].unflatten(1, size)
-    rho = inverse_depth[which, pixels].unflatten(1, size)
+    pixels = torch.arange(len(owner), device=owner.device)[:, None, None], owner.long()
+    moving, rho = moves[pixels], inverse_depth[pixels]
     focal = [K[:, i, i, None, None] for i in (0, 1)]
-    centre = [K[:, i, 2, None, None] for i in (0, 1)]
-    grid = (torch.arange(n, device=owner.device) for n in reversed(size))
+    grid = (torch.arange(n, device=owner.device) for n in reversed(owner.shape[1:]))
     x, y = (
-        (g - c) / f
-        for g, c, f in zip(torch.meshgrid(*grid, indexing="xy"), centre, focal, strict=True)
+        (g - K[:, i, 2, None, None]) / focal[i]
+        for i, g in enumerate(torch.meshgrid(*grid, indexing="xy"))
     )
     *ego, ego_ratio = rigid_flow(x, y, rho, T_curr_prev.permute(1, 2, 0)[..., None, None], focal)
-    own = motions[which, pixels].permute(2, 3, 0, 1).unflatten(3, size)
-    *added, change = rigid_flow(x, y, rho, own, focal)
+    *added, change = rigid_flow(x, y, rho, motions[pixels].permute(3, 4, 0, 1, 2), focal)
     ego_flow, depth_prev = torch.stack(ego, dim=-1), 1.0 / rho
     depth_curr = (depth_prev * (ego_ratio + change - 1.0)).clip(min=0.0)
     return {

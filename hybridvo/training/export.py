@@ -12,8 +12,8 @@ import numpy as np
 from hybridvo.errors import InputError
 from hybridvo.files import read_text, write_json
 from hybridvo.network.weights import save_weights
-from hybridvo.synthetic.dataset import build_options
-from hybridvo.training.options import SelectorOptions, recorded_run
+from hybridvo.synthetic.dataset import Mixture, build_options, make_preset
+from hybridvo.training.options import PwvoOptions, SelectorOptions
 from hybridvo.training.pwvo_task import PwvoTask
 from hybridvo.training.selector_task import SelectorTask
 from hybridvo.training.trainer import CHECKPOINT, Trainer, read_checkpoint
@@ -39,10 +39,12 @@ def open_run(folder: str | Path) -> Trainer:
     record = read_checkpoint(path)["record"]
     task: PwvoTask | SelectorTask
     if record["options"]["network"]["kind"] == "selector":
-        options = build_options(SelectorOptions, record["options"], str(path))
-        task = SelectorTask(options, Path(record["data"]))
+        chosen = build_options(SelectorOptions, record["options"], str(path))
+        task = SelectorTask(chosen, Path(record["data"]))
     else:
-        task = PwvoTask(*recorded_run(record, str(path)))
+        options = build_options(PwvoOptions, record["options"], str(path))
+        presets = tuple(make_preset(mapping, str(path)) for mapping in record["data"])
+        task = PwvoTask(options, Mixture(presets, options.data_weights))
     trainer = Trainer(task, Path(folder))
     trainer.resume()
     return trainer
@@ -53,12 +55,8 @@ def export_run(
 ) -> dict[str, Any]:
     """Write a run's weights as float16 safetensors, and its card beside them as JSON.
 
-    The card says what the run was trained with, and figures of the stored, rounded weights: over
-    ``count`` held-out pairs of each preset, or of a selector over the shards in ``DATA_held_out``.
-    ``calibrate``: development pairs over which PWVO's scales of the translation are calibrated.
-
-    Raises:
-        CheckpointError, InputError: not the folder of a run.
+    ``count``: held-out pairs of each preset for the figures of the card; ``calibrate``: development
+    pairs over which PWVO's scales of the translation are calibrated.
     """
     trainer = open_run(folder)
     card = {

@@ -83,11 +83,7 @@ class Trainer:
         return json.loads(json.dumps(record))
 
     def update(self, batch: Any, progress: float) -> dict[str, float]:
-        """One step of the optimiser when ``progress`` of the run is done; returns its figures.
-
-        Raises:
-            DegenerateError: the loss or the gradient was not finite :data:`MAX_SKIPPED` times.
-        """
+        """One step of the optimiser when ``progress`` of the run is done; returns its figures."""
         optimizer = self.options.optimizer
         rate = optimizer.learning_rate * self.options.schedule.factor(progress)
         for group in self.optimizer.param_groups:
@@ -117,10 +113,9 @@ class Trainer:
         return figures | {name: float(part) for name, part in parts.items()}
 
     def run(self, time_limit_s: float = math.inf, until: int | None = None) -> str:
-        """Train, save, and say why it ended: ``steps``, ``time`` or ``signal``.
+        """Train, save, and say why it ended: ``steps`` (of which ``until``), ``time``, ``signal``.
 
-        ``time_limit_s`` counts over all interruptions; ``until``: pause at this update, with the
-        schedule of the whole run.
+        ``time_limit_s`` counts over all interruptions.
         """
         options = self.options
         last = min(until or options.steps, options.steps)
@@ -182,11 +177,7 @@ class Trainer:
             self.exported.load_state_dict(weights)
 
     def resume(self) -> bool:
-        """Go on where the folder's checkpoint ended, if there is one of the same options and data.
-
-        Raises:
-            CheckpointError: a damaged file. InputError: of a run of other options or other data.
-        """
+        """Go on where the folder's checkpoint ended, if there is one, of the same options."""
         if self.folder is None or not (self.folder / CHECKPOINT).exists():
             return False
         path = self.folder / CHECKPOINT
