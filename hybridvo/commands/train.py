@@ -101,8 +101,7 @@ def _train(args: argparse.Namespace, command: str, task: Any) -> Any:
 
     from hybridvo.files import write_json
     from hybridvo.network.models import load_weights
-    from hybridvo.training.export import RUN, source_commit
-    from hybridvo.training.trainer import CHECKPOINT, LOG, Trainer
+    from hybridvo.training.trainer import CHECKPOINT, LOG, RUN, Trainer, source_commit
 
     if args.threads is not None:
         torch.set_num_threads(max(1, args.threads))
@@ -127,7 +126,7 @@ def _train(args: argparse.Namespace, command: str, task: Any) -> Any:
 
 
 def _export(args: argparse.Namespace, command: str) -> dict[str, Any]:
-    from hybridvo.training.export import export_run
+    from hybridvo.training.trainer import export_run
 
     card = export_run(args.out, args.export, args.count, args.calibrate)
     return {"file": str(args.export), "held_out": card["held_out"]}
