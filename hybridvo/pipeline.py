@@ -149,7 +149,7 @@ def network_alone(name: str, pair: FramePair, ctx: Context) -> RelativePose:
     """A network alone, by the paper's selection."""
     from hybridvo.network.prediction import estimate_by_network
 
-    return estimate_by_network(with_flow(pair, ctx.flow), name, ctx.models.network(name))
+    return estimate_by_network(with_flow(pair, ctx.flow), SELECTION[name], ctx.models.network(name))
 
 
 def baseline(

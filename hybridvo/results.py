@@ -197,16 +197,13 @@ class Step:
 
 @dataclass(frozen=True, eq=False)
 class PixelwisePrediction:
-    """Raw output of a pixel-wise network for a batch of pairs (paper, section 3.2).
+    """Raw output of a network for a batch of pairs: T_curr_prev at every pixel (paper, 3.2).
 
-    T_curr_prev at every pixel, and s = log of the Laplace scale U of each of its six numbers, None
-    where the network predicts no uncertainty.
+    Channels: Euler angles X-Y-Z in degrees, R = Rx Ry Rz, then metres. VONet's maps have one pixel.
     """
 
-    rotation: torch.Tensor  # (B, 3, h, w) Euler angles X-Y-Z in degrees, R = Rx Ry Rz
-    translation: torch.Tensor  # (B, 3, h, w) metres
-    log_scale_rotation: torch.Tensor | None = None  # (B, 3, h, w)
-    log_scale_translation: torch.Tensor | None = None
+    motion: torch.Tensor  # (B, 6, h, w)
+    log_scale: torch.Tensor | None = None  # (B, 6, h, w) s = log U, U the Laplace scale of each
     image_size: tuple[int, int] | None = None  # (H, W) of the pairs that the network was given
 
 

@@ -15,11 +15,13 @@ from torch import nn
 
 from hybridvo.network.inputs import MIN_DEPTH, NetworkInputs, pinhole
 from hybridvo.network.layers import NetworkOptions
-from hybridvo.network.selection import NetworkOutput, fitted_motion
-from hybridvo.torch_geometry import euler_deg
+from hybridvo.network.selection import fitted_motion
+from hybridvo.results import PixelwisePrediction
+from hybridvo.torch_geometry import euler_motion
 
-OUTPUT_SCALE = 0.01
-"""Without scales of the pair, raw outputs times this are degrees and metres, as published."""
+FLOW_SCALE_PX, OUTPUT_SCALE = 200.0, 0.01
+"""Without scales of the pair, flow is divided by the first, and raw outputs times the second are
+degrees and metres, as published."""
 MIN_MOTION = 5e-5
 """rad; flow smaller than this is not amplified any further: at 2000 px of focal length 0.1 px."""
 MIN_NEARNESS = 1 / 50
@@ -36,9 +38,8 @@ class MotionScale(NamedTuple):
     start: torch.Tensor
 
     def motion(self, raw: torch.Tensor) -> torch.Tensor:
-        """Motions of a network's raw outputs (B, 6) or (B, 6, h, w): the sum of two small ones."""
-        shape = (-1, 6) + (1,) * (raw.ndim - 2)
-        factor, start = (x.to(raw.dtype).view(shape) for x in self)
+        """Motions of a network's raw outputs (B, 6, h, w): the sum of two small ones."""
+        factor, start = (x.to(raw.dtype)[:, :, None, None] for x in self)
         return start + factor * raw
 
 
@@ -50,10 +51,13 @@ def normalize(
     if options.scale_free:
         return remove_scale(inputs, T_start, options.later_quantile)
     factor = torch.full((len(inputs), 6), OUTPUT_SCALE, device=inputs.flow.device)
+    inputs = replace(inputs, flow=inputs.flow / FLOW_SCALE_PX)
     return inputs, MotionScale(factor, torch.zeros_like(factor))
 
 
-def predict(network: nn.Module, inputs: NetworkInputs, selection: str = "softmax") -> NetworkOutput:
+def predict(
+    network: nn.Module, inputs: NetworkInputs, selection: str = "softmax"
+) -> PixelwisePrediction:
     """Output of the last of the network's passes; ``selection``: of the start of the next one."""
     passes: int = network.options.passes  # type: ignore[union-attr, assignment]
     return network(inputs, first_motions(network, inputs, selection, passes - 1))
@@ -86,32 +90,31 @@ def remove_scale(
         depth over m (0 where either is missing); all squashed at 10, finite for any input.
     """
     inverse = torch.nan_to_num(inputs.inverse_depth, 0.0, 0.0, 0.0)
-    flow = torch.nan_to_num(inputs.flow_px, 0.0, 0.0, 0.0)
+    flow = torch.nan_to_num(inputs.flow, 0.0, 0.0, 0.0)
     both = (inverse > 0).all(dim=1, keepdim=True)
     change = -torch.where(both, inverse, 1.0).log().diff(dim=1)
     start = flow.new_zeros(len(inputs), 6)
-    # below one half: movers on half of the image do not set the scale of what is left of the scene
-    quantile = flow.new_full((len(inputs), 1), 0.4)
     if T_start is not None:
         T_start = T_start.to(flow.dtype)
-        start = torch.cat([euler_deg(T_start[:, :3, :3]), T_start[:, :3, 3]], dim=1)
-        quantile = torch.where((start != 0).any(dim=1, keepdim=True), later_quantile, quantile)
+        start = euler_motion(T_start)
         ego, log_ratio = _ego_motion(inputs, inverse[:, 0], T_start)
         # No flow was measured where it is exactly zero in both components and the pixel is invalid.
         seen = inputs.valid[:, None] | (flow != 0).any(dim=1, keepdim=True)
         flow, change = torch.where(seen, flow - ego, flow), change - log_ratio
     angle = flow / pinhole(inputs.K_prev)[0]
     length = (angle.square().sum(dim=1) + 1e-20).sqrt()
-    motion = _quantile(length, inputs.valid, quantile).clamp(MIN_MOTION, 1.0)
+    # below one half: movers on half of the image do not set the scale of what is left of the scene
+    first, later = _quantiles(length, inputs.valid, (0.4, later_quantile))
+    motion = torch.where((start != 0).any(dim=1), later, first).clamp(MIN_MOTION, 1.0)
     # near things tell the translation, and set its scale
-    known = inputs.valid & (inverse[:, 0] > 0)
-    nearness = _quantile(inverse[:, 0], known, torch.full_like(quantile, 0.9))
+    (nearness,) = _quantiles(inverse[:, 0], inputs.valid & (inverse[:, 0] > 0), (0.9,))
     nearness = nearness.clamp(MIN_NEARNESS, 1e3)
     m, near = (x[:, None, None, None] for x in (motion, nearness))
     depth = torch.cat([inverse[:, :1] / near, torch.where(both, change / m, 0.0)], dim=1)
     factor = torch.stack([torch.rad2deg(motion), motion / nearness], dim=1)
     scale = MotionScale(factor.repeat_interleave(3, dim=1), start)
-    return replace(inputs, flow=_squash(angle / m), inverse_depth=_squash(depth)), scale
+    flow, depth = (x / (1 + x.abs() / LIMIT) for x in (angle / m, depth))
+    return replace(inputs, flow=flow, inverse_depth=depth), scale
 
 
 def _ego_motion(
@@ -121,7 +124,7 @@ def _ego_motion(
     # Over its depth, a point is ray + translation * inverse depth: finite for the farthest.
     rays, near = inputs.rays.flatten(2), inverse.flatten(1)[:, None]
     moved = T[:, :3, :2] @ rays + T[:, :3, 2:3] + T[:, :3, 3:] * near
-    moved = moved.unflatten(2, inputs.size)
+    moved = moved.unflatten(2, inverse.shape[1:])
     front = moved[:, 2:] > MIN_DEPTH * inverse[:, None].clamp(min=1e-3)
     z = torch.where(front, moved[:, 2:], 1.0)
     focal, centre = pinhole(inputs.K_curr)
@@ -129,18 +132,7 @@ def _ego_motion(
     return torch.where(front, flow, 0.0), torch.where(front, z.log(), 0.0)
 
 
-def _squash(x: torch.Tensor) -> torch.Tensor:
-    return x / (1 + x.abs() / LIMIT)
-
-
-def _quantile(x: torch.Tensor, mask: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
-    """(B,) quantile (B, 1) of a (B, h, w) map over a mask; 1 where that is empty."""
-    pick = (..., slice(None, None, 2), slice(None, None, 2))  # enough for a scale
-    kept = torch.where(mask, x, torch.nan)[pick].flatten(1)
-    # not torch.nanquantile: it takes one quantile for the whole batch; NaN sort to the end
-    ordered = kept.sort(dim=1).values
-    last = ((~kept.isnan()).sum(dim=1, keepdim=True) - 1).clamp(min=0)
-    place = q * last
-    low = place.floor().long()
-    a, b = (ordered.gather(1, k) for k in (low, torch.minimum(low + 1, last)))
-    return torch.nan_to_num(torch.lerp(a, b, place - low)[:, 0], 1.0, 1.0, 1.0)
+def _quantiles(x: torch.Tensor, mask: torch.Tensor, q: tuple[float, ...]) -> torch.Tensor:
+    """(len(q), B) quantiles of a (B, h, w) map over a mask; 1 where that is empty."""
+    kept = torch.where(mask, x, torch.nan)[..., ::2, ::2]  # enough for a scale
+    return torch.nanquantile(kept.flatten(1), kept.new_tensor(q), dim=1).nan_to_num(1.0, 1.0, 1.0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import time
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -10,17 +10,10 @@ from torch import nn
 
 from hybridvo.network.inputs import assemble_inputs
 from hybridvo.network.layers import plain_torch
-from hybridvo.network.models import SELECTION
 from hybridvo.network.normalization import predict
-from hybridvo.network.selection import (
-    NetworkOutput,
-    fitted_motion,
-    joined,
-    on_grid_of,
-    pixel_weights,
-    select_pose,
-)
-from hybridvo.results import MotionPrediction, PixelwisePrediction, Reason, RelativePose, Status
+from hybridvo.network.selection import fitted_motion, pixel_weights, select_pose
+from hybridvo.refinement.pixels import too_few
+from hybridvo.results import MotionPrediction, Reason, RelativePose, Status
 from hybridvo.torch_geometry import euler_transform
 from hybridvo.types import FramePair
 
@@ -33,8 +26,8 @@ MIN_PIXELS = 64
 
 
 def static_probability(log_scale: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
-    """(B, h, w) logistic in how far log scales (B, 3, h, w) lie above the trusted pixels'."""
-    s = log_scale.mean(dim=1)
+    """(B, h, w) logistic in how far log scales (B, 6, h, w) lie above the trusted pixels'."""
+    s = log_scale[:, :3].mean(dim=1)
     trusted = (pixel_weights(log_scale, valid) * s).flatten(1).sum(dim=1)[:, None, None]
     return ((STATIC_AT - (s - trusted)) * STATIC_SLOPE).sigmoid() * valid
 
@@ -45,67 +38,44 @@ def propose_motion(network: nn.Module, pair: FramePair) -> MotionPrediction | No
         inputs = assemble_inputs(pair)
         if int(inputs.valid.sum()) < MIN_PIXELS:
             return None
-        output = predict(network, inputs)
-        log_scale = getattr(output, "log_scale_rotation", None)
-        if log_scale is None:
+        maps = predict(network, inputs)
+        if maps.log_scale is None:
             return None
-        T = fitted_motion(output, inputs)[0].double().numpy()
-        valid = on_grid_of(log_scale, inputs).valid
-        static = static_probability(log_scale, valid)[0].numpy()
+        T = fitted_motion(maps, inputs)[0].double().numpy()
+        valid = inputs.on_grid_of(maps.log_scale).valid
+        static = static_probability(maps.log_scale, valid)[0].numpy()
     finite = np.isfinite(T).all() and np.isfinite(static).all()
     return MotionPrediction(T, static) if finite else None
 
 
-def estimate_by_network(pair: FramePair, method: str, network: nn.Module) -> RelativePose:
-    """Camera motion of one pair by a network and the paper's selection, without any refinement.
+def estimate_by_network(pair: FramePair, how: str, network: nn.Module) -> RelativePose:
+    """Camera motion of one pair by a network and a selection of the paper, without any refinement.
 
     The covariance is diagonal: of a Laplace variable with the scales that the selected pixels state
     (2 U^2). Bad data give a failed status.
     """
-    started = time.perf_counter()
-
-    def failed(reason: Reason, message: str) -> RelativePose:
-        return RelativePose.failed(reason, message, method, terms=("flow", "depth"))
-
     if pair.flow is None:
-        return failed(Reason.NO_FLOW, "no optical flow for this pair")
+        return RelativePose.failed(Reason.NO_FLOW, "no optical flow for this pair")
     if pair.prev.depth is None:
-        return failed(Reason.NO_VALID_DEPTH, "no depth for this frame")
+        return RelativePose.failed(Reason.NO_VALID_DEPTH, "no depth for this frame")
     with plain_torch():
         inputs = assemble_inputs(pair)
         if (seen := int(inputs.valid.sum())) < MIN_PIXELS:
-            return failed(
-                Reason.NO_VALID_DEPTH,
-                f"{seen} pixels of the network's input have flow and depth, {MIN_PIXELS} needed",
-            )
-        how = SELECTION[method]
-        output = predict(network, inputs, how)
-        T = euler_transform(*(x.double() for x in select_pose(output, how)))[0].numpy()
-        U = np.maximum(_stated_scale(output, how), 1e-4)  # half-precision weights know no better
+            return RelativePose.failed(*too_few(pair.prev.depth, pair.flow, seen, MIN_PIXELS))
+        maps = predict(network, inputs, how)
+        T = euler_transform(select_pose(maps, how).double())[0].numpy()
+        # the largest usual motions, where none are stated: nobody trusts a network that states none
+        U = np.repeat([1.0, 0.3], 3)
+        if maps.log_scale is not None:
+            # the scales go the way of the values: same pixels, same weights
+            stated = select_pose(replace(maps, motion=maps.log_scale.exp()), how)
+            U = np.maximum(stated[0].double().numpy(), 1e-4)  # half-precision knows no better
     if not (np.isfinite(T).all() and np.isfinite(U).all()):
-        return failed(Reason.DEGENERATE_GEOMETRY, "the network's answer is not finite")
+        reason = Reason.DEGENERATE_GEOMETRY, "the network's answer is not finite"
+        return RelativePose.failed(*reason)
     status = Status()
-    if U[3:].max() > 2.0:  # degrees: larger than most motions between frames
-        status = Status.degraded(
-            Reason.LOW_INLIERS, f"the network is uncertain by {U[3:].max():.1f} degrees"
-        )
-    sigma = np.sqrt(2.0) * np.concatenate([U[:3], np.deg2rad(U[3:])])
-    return RelativePose(
-        T_curr_prev=T,
-        covariance=np.diag(sigma**2),
-        status=status,
-        method=method,
-        ms=1e3 * (time.perf_counter() - started),
-        terms=("flow", "depth"),
-    )
-
-
-def _stated_scale(output: NetworkOutput, how: str) -> np.ndarray:
-    """(6,) Laplace scales of a selected motion: of its translation (m) and rotation (degrees)."""
-    if not isinstance(output, PixelwisePrediction) or (s := joined(output)[1]) is None:
-        # the largest usual motions: nobody trusts a network that states none
-        return np.repeat([0.3, 1.0], 3)
-    # The scales go the way of the values: same pixels, same weights.
-    stated = PixelwisePrediction(*s.exp().split(3, dim=1), *s.split(3, dim=1))
-    scale_r, scale_t = select_pose(stated, how)
-    return torch.cat([scale_t, scale_r], dim=1)[0].double().numpy()
+    if U[:3].max() > 2.0:  # degrees: larger than most motions between frames
+        doubt = f"the network is uncertain by {U[:3].max():.1f} degrees"
+        status = Status.degraded(Reason.LOW_INLIERS, doubt)
+    variance = 2 * np.concatenate([U[3:], np.deg2rad(U[:3])]) ** 2
+    return RelativePose(T, np.diag(variance), status, terms=("flow", "depth"))

@@ -130,16 +130,15 @@ class PWVO(nn.Module):
         if not isinstance(inputs, NetworkInputs):
             batch = PairBatch.from_pairs([inputs]) if isinstance(inputs, FramePair) else inputs
             output = predict(self, assemble_inputs(batch).to(device=own.device, dtype=own.dtype))
-            assert isinstance(output, PixelwisePrediction)
             height, width = batch.flow.shape[1:3]
             return replace(output, image_size=(height, width))
         inputs, scale = normalize(inputs, options, T_start)
         x = self.branches(inputs)
         features = self.encoder(x)
         shared = self.decoder(x, features)
-        motion = scale.motion(self.head_motion(shared).to(own.dtype)).split(3, dim=1)
+        motion = scale.motion(self.head_motion(shared).to(own.dtype))
         if self.head_uncertainty is None:
-            return PixelwisePrediction(*motion)
+            return PixelwisePrediction(motion)
         if self.decoder_uncertainty is not None:
             shared = self.decoder_uncertainty(x, features)
         log_scale = self.head_uncertainty(shared).to(own.dtype)
@@ -148,7 +147,7 @@ class PWVO(nn.Module):
         seen = inputs.valid[:, None].to(own.dtype)
         seen = F.max_pool2d(seen, options.head_stride, ceil_mode=True)
         log_scale = torch.where(seen > 0, log_scale, log_scale.clamp(min=INVALID_LOG_SCALE))
-        return PixelwisePrediction(*motion, *log_scale.split(3, dim=1))
+        return PixelwisePrediction(motion, log_scale)
 
 
 def _pose_head(features: int) -> nn.Sequential:
@@ -176,14 +175,14 @@ class VONet(nn.Module):
 
     def forward(
         self, inputs: NetworkInputs, T_start: torch.Tensor | None = None
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """(B, 3) Euler angles X-Y-Z in degrees and (B, 3) metres of T_curr_prev."""
+    ) -> PixelwisePrediction:
+        """One motion of each pair, in maps of one pixel."""
         inputs, scale = normalize(inputs, self.options, T_start)
         embedding = self.attention(self.encoder(self.branches(inputs))[-1])
         features = F.adaptive_avg_pool2d(embedding, self.grid).flatten(1)
         raw = torch.cat([self.head_rotation(features), self.head_translation(features)], dim=1)
-        rotation, translation = scale.motion(raw.to(next(self.parameters()).dtype)).split(3, dim=1)
-        return rotation, translation
+        raw = raw.to(next(self.parameters()).dtype)[:, :, None, None]
+        return PixelwisePrediction(scale.motion(raw))
 
 
 def build_network(options: NetworkOptions | None = None) -> nn.Module:

@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from torch import nn
 from torch.utils.data import DataLoader, Dataset
 
-from hybridvo.network.losses import reconstruct, total_loss
+from hybridvo.network.losses import total_loss
 from hybridvo.network.normalization import first_motions
 from hybridvo.network.pwvo import build_network
 from hybridvo.network.selection import fitted_motion, select_motion
@@ -89,12 +89,10 @@ class PwvoTask:
             starts = self._starts(batch, step)
             output = self.network(batch.inputs, *(() if starts is None else (starts,)))
         o, targets = self.options, batch.targets.subsample(self.options.loss_stride)
-        T = select_motion(output, o.selection) if o.loss.reconstructs else None
-        loss, parts = total_loss(output, targets, o.loss, T)
+        loss, parts = total_loss(output, targets, o.loss, select_motion(output, o.selection))
         extra = {"fit": (o.fit_weight, fit_loss), "moving": (o.moving_weight, separation_loss)}
         for name, (weight, term) in extra.items():
             if weight:
-                assert isinstance(output, PixelwisePrediction)
                 value = term(output, batch, o)
                 loss = loss + weight * value
                 parts[name] = value.detach()
@@ -129,7 +127,7 @@ def fit_loss(
     """
     T = fitted_motion(output, batch.inputs, options.selection)
     gt = batch.targets.subsample(options.loss_stride)
-    flow, _, defined = reconstruct(gt.depth_prev, T, gt.K_prev, gt.K_curr)
+    flow, _, defined = gt.reconstruct(T)
     known = (gt.depth_prev > 0) & torch.isfinite(gt.ego_flow).all(dim=1)
     error = torch.where(known[:, None], flow - gt.ego_flow, 0.0).abs().sum(1)
     error = torch.where(defined, error.clamp(max=FIT_LIMIT_PX), known * FIT_LIMIT_PX)
@@ -144,13 +142,13 @@ def separation_loss(
 
     Over pixels of the whole batch: s has to tell movers apart across pairs as well.
     """
-    s = output.log_scale_rotation
+    s = output.log_scale
     if s is None:
-        return output.rotation.new_zeros(())
+        return output.motion.new_zeros(())
     cells = s.shape[2:]
     moving = F.interpolate(batch.moving[:, None].to(s.dtype), cells, mode="area")[:, 0]
     valid = F.interpolate(batch.inputs.valid[:, None].to(s.dtype), cells, mode="area")[:, 0] > 0.5
-    score = s.mean(1)
+    score = s[:, :3].mean(1)
     kinds = [score[valid & (moving > 0.5)], score[valid & (moving < 0.5)]]
     if not all(len(kind) for kind in kinds):
         return s.new_zeros(())

@@ -12,15 +12,16 @@ import torch.nn.functional as F
 from scipy.stats import mannwhitneyu, spearmanr
 
 from hybridvo.errors import InputError
-from hybridvo.network.inputs import NetworkInputs, assemble_aligned
-from hybridvo.network.losses import LossTargets, NetworkOutput, reconstruct
+from hybridvo.network.inputs import NetworkInputs, assemble_inputs
+from hybridvo.network.losses import LossTargets
 from hybridvo.network.normalization import predict
 from hybridvo.network.selection import select_pose
 from hybridvo.results import PixelwisePrediction
 from hybridvo.synthetic.dataset import Preset
 from hybridvo.synthetic.draws import sample_generator
 from hybridvo.synthetic.layered import Sample, compose
-from hybridvo.torch_geometry import euler_deg, euler_transform
+from hybridvo.torch_geometry import euler_motion, euler_transform
+from hybridvo.types import PairBatch
 
 PUBLISHED_SEED = 1000
 """First seed of published figures; smaller ones are for development. No training sees either."""
@@ -60,9 +61,10 @@ class DrawnBatch:
         of = {name: part.to(device) for name, part in self.parts.items()}
         of = compose(**of) if "motions" in of else of
         K, T = of["K"], of["T_curr_prev"]
-        inputs = assemble_aligned(of["flow"], of["depth_prev"], of["depth_curr"], K)
-        truth = euler_deg(T[:, :3, :3]), T[:, :3, 3], of["ego_flow"].permute(0, 3, 1, 2)
+        pairs = PairBatch(of["flow"], of["depth_prev"], K, K, of["depth_curr"])
+        truth = euler_motion(T), of["ego_flow"].permute(0, 3, 1, 2)
         targets = LossTargets(*truth, of["depth_true"], of["depth_target"], K, K)
+        inputs = assemble_inputs(pairs, None, is_aligned=True)
         return TrainingBatch(inputs, targets, of["moving"])
 
 
@@ -104,7 +106,7 @@ def evaluate_network(
         with torch.inference_mode():
             output = predict(network, batch.inputs, selection)
             errors.append(_errors(output, batch, selection))
-            if isinstance(output, PixelwisePrediction) and output.log_scale_rotation is not None:
+            if output.log_scale is not None:
                 pixels.append(_uncertainty(output, batch))
     ours, zero = np.split(np.concatenate(errors), 2, axis=1)
     result: dict[str, Any] = {"count": len(ours)}
@@ -118,20 +120,19 @@ def evaluate_network(
     return result
 
 
-def _errors(output: NetworkOutput, batch: TrainingBatch, selection: str) -> np.ndarray:
+def _errors(output: PixelwisePrediction, batch: TrainingBatch, selection: str) -> np.ndarray:
     """(B, 6) R_err, T_err and EPE of the network and of zero motion."""
     gt = batch.targets
-    rotation, translation = select_pose(output, selection)
-    T = euler_transform(rotation, translation)
-    flow, _, defined = reconstruct(gt.depth_prev, T, gt.K_prev, gt.K_curr)
+    motion = select_pose(output, selection)
+    flow, _, defined = gt.reconstruct(euler_transform(motion))
     near = gt.ego_flow.norm(dim=1) < EPE_LIMIT_PX
     # Sky has no depth to reproject; a point behind the camera has no flow: neither counts.
     counts = defined & near
     total = (defined | ~near).flatten(1).sum(1).clamp(min=1)
     columns = []
-    for r, t, f in ((rotation, translation, flow), (0.0, 0.0, torch.zeros_like(flow))):
+    for m, f in ((motion, flow), (torch.zeros_like(motion), torch.zeros_like(flow))):
         error = torch.where(counts[:, None], (f - gt.ego_flow).abs(), 0.0).mean(dim=1)
-        columns += [(r - gt.rotation_deg).abs().mean(1), (t - gt.translation).abs().mean(1)]
+        columns += [x.mean(1) for x in (m - gt.motion).abs().split(3, dim=1)]
         columns.append(error.flatten(1).sum(1) / total)
     return torch.stack(columns, dim=1).float().cpu().numpy()
 
@@ -141,12 +142,9 @@ def _uncertainty(output: PixelwisePrediction, batch: TrainingBatch) -> list[list
     gt, size = batch.targets, batch.moving.shape[1:]
     pick = np.s_[..., ::4, ::4]  # enough for the figures
     halves = []
-    for value, s, target in (
-        (output.rotation, output.log_scale_rotation, gt.rotation_deg),
-        (output.translation, output.log_scale_translation, gt.translation),
-    ):
-        assert s is not None
-        error = (value - target[:, :, None, None]).abs()
+    errors = (output.motion - gt.motion[:, :, None, None]).abs()
+    assert output.log_scale is not None
+    for error, s in zip(errors.split(3, 1), output.log_scale.split(3, 1), strict=True):
         maps = [s.mean(1, keepdim=True), error.mean(1, keepdim=True), error * (-s).exp()]
         table = F.interpolate(torch.cat(maps, dim=1).float(), size=size, mode="nearest")
         table = torch.cat([batch.moving[:, None].float(), table], dim=1)[pick].permute(0, 2, 3, 1)

@@ -9,13 +9,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hybridvo.geometry import ego_flow, se3_exp
-from hybridvo.network.inputs import NetworkInputs, assemble_aligned
+from hybridvo.network.inputs import NetworkInputs, assemble_inputs
 from hybridvo.network.losses import LossOptions, LossTargets, total_loss
 from hybridvo.network.normalization import first_motions, predict, remove_scale
 from hybridvo.network.pwvo import NetworkOptions, build_network
 from hybridvo.network.selection import fitted_motion
-from hybridvo.torch_geometry import euler_deg
-from hybridvo.types import Camera
+from hybridvo.results import PixelwisePrediction
+from hybridvo.torch_geometry import euler_motion
+from hybridvo.types import Camera, PairBatch
 
 CAMERA = Camera(60.0, 62.0, 31.5, 15.5, 32, 64)
 MOTION = se3_exp(np.array([0.05, -0.03, 0.08, 0.004, -0.006, 0.01]))
@@ -31,9 +32,10 @@ def inputs_of(
 ) -> NetworkInputs:
     K = torch.tensor(CAMERA.K, dtype=torch.float32)[None]
     depth_curr = depth if depth_curr is None else depth_curr
-    return assemble_aligned(
-        *(torch.tensor(x, dtype=torch.float32)[None] for x in (flow, depth, depth_curr)), K
+    flow, prev, curr = (
+        torch.tensor(x, dtype=torch.float32)[None] for x in (flow, depth, depth_curr)
     )
+    return assemble_inputs(PairBatch(flow, prev, K, K, curr), None, is_aligned=True)
 
 
 def static_inputs(T: np.ndarray = MOTION, scale: float = 1.0) -> NetworkInputs:
@@ -80,11 +82,11 @@ def test_a_scene_twice_as_large_moves_by_twice_as_many_metres(factor):
     network = tiny()
     with torch.inference_mode():
         one, other = network(static_inputs()), network(static_inputs(scale=factor))
-    torch.testing.assert_close(one.rotation, other.rotation, atol=1e-3, rtol=1e-3)
-    torch.testing.assert_close(factor * one.translation, other.translation, atol=1e-3, rtol=2e-3)
-    torch.testing.assert_close(
-        one.log_scale_translation + np.log(factor), other.log_scale_translation, atol=2e-3, rtol=0
-    )
+    (r, t), (other_r, other_t) = (x.motion.split(3, dim=1) for x in (one, other))
+    torch.testing.assert_close(r, other_r, atol=1e-3, rtol=1e-3)
+    torch.testing.assert_close(factor * t, other_t, atol=1e-3, rtol=2e-3)
+    s, other_s = (x.log_scale[:, 3:] for x in (one, other))
+    torch.testing.assert_close(s + np.log(factor), other_s, atol=2e-3, rtol=0)
 
 
 def test_the_true_motion_leaves_nothing_unexplained():
@@ -108,8 +110,8 @@ def test_bad_values_give_finite_predictions(value):
         for T in (None, torch.eye(4)[None], behind):
             for inputs in (inputs_of(flow, depth), static_inputs()):
                 output = network(inputs, T)
-                assert torch.isfinite(output.rotation).all()
-                assert torch.isfinite(output.log_scale_translation).all()
+                assert torch.isfinite(output.motion).all()
+                assert torch.isfinite(output.log_scale).all()
 
 
 def test_passes_are_the_network_on_what_is_left():
@@ -118,7 +120,7 @@ def test_passes_are_the_network_on_what_is_left():
         one = network(inputs)
         two = network(inputs, fitted_motion(one, inputs))
         three = network(inputs, fitted_motion(two, inputs))
-        torch.testing.assert_close(predict(network, inputs).rotation, three.rotation)
+        torch.testing.assert_close(predict(network, inputs).motion, three.motion)
     assert first_motions(network, inputs, "softmax", 0) is None
 
 
@@ -126,9 +128,8 @@ def test_the_truth_has_no_flow_loss_on_fewer_pixels():
     inputs = static_inputs()
     T = torch.tensor(MOTION, dtype=torch.float32)[None]
     targets = LossTargets(
-        rotation_deg=euler_deg(T[:, :3, :3]),
-        translation=T[:, :3, 3],
-        ego_flow=inputs.flow_px,
+        motion=euler_motion(T),
+        ego_flow=inputs.flow,
         depth_prev=1 / inputs.inverse_depth[:, 0],
         depth_curr=1 / inputs.inverse_depth[:, 1],
         K_prev=inputs.K_prev,
@@ -136,7 +137,7 @@ def test_the_truth_has_no_flow_loss_on_fewer_pixels():
     ).subsample(4)
     assert targets.depth_prev.shape == (1, 8, 16)
     options = LossOptions(pose_uncertainty=False, flow_uncertainty=False, depth_uncertainty=False)
-    output = (targets.rotation_deg, targets.translation)
+    output = PixelwisePrediction(targets.motion[:, :, None, None])
     _, parts = total_loss(output, targets, options, T)
     # float32 coordinates of 64 px: 4e-6 px
     assert float(parts["flow"]) < 1e-4

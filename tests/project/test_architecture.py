@@ -53,12 +53,12 @@ APPLICATION = {"cli", "commands"}
 
 ONLY_IN = {
     "evo": {"evaluation/metrics.py"},
-    "matplotlib": {"evaluation/plots.py"},
+    "matplotlib": {"evaluation/drawing.py"},
     "plotly": {"evaluation/"},
     "pandas": {"evaluation/", "commands/"},
     "rerun": {"commands/recording.py"},
     "rich": {"commands/"},
-    "yaml": {"files.py", "commands/", "options.py"},
+    "yaml": {"files.py", "cli.py"},
     "open3d": {"baselines/"},
     "poselib": {"baselines/"},
     "safetensors": {"network/weights.py"},

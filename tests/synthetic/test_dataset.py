@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from hybridvo.commands.generate import generate
+from hybridvo.commands.train import generate
 from hybridvo.errors import FormatError, InputError
 from hybridvo.synthetic import dataset
 from hybridvo.synthetic.diverse import DiverseOptions

@@ -67,7 +67,7 @@ def test_a_batch_holds_its_samples(mixture):
     samples = [mixture.sample(sample_generator(0, i)) for i in range(3)]
     batch = collate(samples)
     assert len(batch) == 3
-    np.testing.assert_allclose(batch.targets.rotation_deg[1], samples[1].rotation_deg, atol=1e-6)
+    np.testing.assert_allclose(batch.targets.motion[1, :3], samples[1].rotation_deg, atol=1e-6)
     np.testing.assert_array_equal(batch.moving[2], samples[2].moving)
 
 

@@ -112,7 +112,7 @@ def test_time_limit_and_request_end_with_a_checkpoint(mixture, tmp_path):
 def test_steps_that_are_not_finite_are_skipped_and_counted(mixture):
     trainer = Trainer(PwvoTask(TINY, mixture))
     good = batch_of(mixture)
-    targets = dataclasses.replace(good.targets, rotation_deg=torch.full((4, 3), torch.nan))
+    targets = dataclasses.replace(good.targets, motion=torch.full((4, 6), torch.nan))
     bad = dataclasses.replace(good, targets=targets)
     before = {k: v.clone() for k, v in trainer.network.state_dict().items()}
     trainer.update(bad, 0.0)
