@@ -79,9 +79,9 @@ def reproject(
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Where the pixels of the previous frame are seen by the current one: x + ego flow.
 
-    ``depth`` (B, H, W) metres; ``T`` T_curr_prev, (B, 4, 4) or pypose SE3 (B, 7). Returns (B, H, W,
-    2) px; (B, H, W) bool: the depth is valid and the point farther than ``min_depth`` (elsewhere
-    the pixels are finite and mean nothing); (B, H, W) depth of the moved point, else 1.
+    For depth (B, H, W) and T_curr_prev, (B, 4, 4) or pypose SE3 (B, 7): (B, H, W, 2) px; (B, H, W)
+    bool: the depth is valid and the point farther than ``min_depth`` (elsewhere the pixels are
+    finite and mean nothing); (B, H, W) depth of the moved point, else 1.
     """
     if isinstance(T, pp.LieTensor):
         T = T.matrix()

@@ -102,9 +102,6 @@ def assemble_inputs(
     Missing or damaged values (no flow, no depth, NaN, inf, depth <= 0, masked pixels) become 0 and
     are marked in ``valid``. Float32 tensors on the CPU; for a batch, its type and device.
     ``is_aligned``: the current depth lies on the previous grid already, as in the paper's samples.
-
-    Raises:
-        InputError: another type, or shapes that do not fit each other.
     """
     if isinstance(pair, FramePair):
         pair = PairBatch.from_pairs([pair])

@@ -14,7 +14,7 @@ from torch import nn
 from torch.utils.data import DataLoader, Dataset
 
 from hybridvo.network.losses import total_loss
-from hybridvo.network.normalization import first_motions
+from hybridvo.network.prediction import first_motions
 from hybridvo.network.pwvo import build_network
 from hybridvo.network.selection import fitted_motion, select_motion
 from hybridvo.results import PixelwisePrediction

@@ -14,7 +14,7 @@ from scipy.stats import mannwhitneyu, spearmanr
 from hybridvo.errors import InputError
 from hybridvo.network.inputs import NetworkInputs, assemble_inputs
 from hybridvo.network.losses import LossTargets
-from hybridvo.network.normalization import predict
+from hybridvo.network.prediction import predict
 from hybridvo.network.selection import select_pose
 from hybridvo.results import PixelwisePrediction
 from hybridvo.synthetic.dataset import Preset

@@ -9,8 +9,12 @@ import torch
 from hybridvo.errors import InputError
 from hybridvo.geometry import ego_flow, rotation_angle, se3_exp
 from hybridvo.network.inputs import assemble_inputs
-from hybridvo.network.normalization import predict
-from hybridvo.network.prediction import estimate_by_network, propose_motion, static_probability
+from hybridvo.network.prediction import (
+    estimate_by_network,
+    predict,
+    propose_motion,
+    static_probability,
+)
 from hybridvo.network.pwvo import NetworkOptions, build_network
 from hybridvo.network.selection import fitted_motion, select_motion
 from hybridvo.results import PixelwisePrediction, Reason, State

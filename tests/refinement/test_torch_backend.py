@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import torch
 
-from hybridvo.api import refine
 from hybridvo.errors import InputError
 from hybridvo.geometry import ego_flow, invert, rotation_angle, se3_exp, se3_log
 from hybridvo.options import RefineOptions
+from hybridvo.pipeline import refine
 from hybridvo.refinement.batch import BatchedPose
 from hybridvo.refinement.torch_backend import refine_batch
 from hybridvo.refinement.torch_factors import KERNELS
