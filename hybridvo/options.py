@@ -68,9 +68,8 @@ class SearchOptions:
 class SelectOptions:
     """Which of the motions is the camera's."""
 
-    consult_below: Share = 0.8  # confidence of the selector below which PWVO is asked; 1: always
     refits: Annotated[int, Field(ge=0, le=16)] = 2  # motions fitted again, in each round
-    min_confidence: Share = MIN_CONFIDENCE  # probability below which a motion is degraded
+    min_confidence: Share = MIN_CONFIDENCE  # below it PWVO is asked and a motion degraded
 
 
 @option_group

@@ -83,7 +83,7 @@ class Context:
         look = partial(NetworkScorer, self.models.network("selector"))
         by_network = partial(select_by_scorer, found, look, self.options, self.prior)
         chosen = by_network()
-        if found.is_ambiguous and chosen.confidence < self.options.select.consult_below:
+        if found.is_ambiguous and chosen.probability < self.options.select.min_confidence:
             chosen = by_network(self.predict(pair))
         return chosen
 

@@ -56,9 +56,8 @@ class Candidate(NamedTuple):
 class Scores(NamedTuple):
     """A scorer's answer."""
 
-    score: np.ndarray  # (N,) larger is more likely the camera's motion
+    score: np.ndarray  # (N,) larger is more likely the camera's motion; 0: none of them is
     static: dict[int, np.ndarray]  # of candidates, best first: probability (h, w) of being static
-    confidence: float  # probability that the candidate with the largest score is right
 
 
 Scorer = Callable[[Sequence[Candidate], int], Scores]
@@ -79,7 +78,7 @@ def select_by_cues(found: HypothesisSet, prior: MotionPrior | None = None) -> Se
     best = int(np.argmax(scores))
     gap = min(seen[best] - np.delete(seen, best).max(initial=-np.inf), NO_RIVAL)
     probability = right((gap,), CUES_RIGHT) if found.is_ambiguous else CLEAR_RIGHT
-    return _selection(found, searched, Scores(scores, {}, probability), gap, probability)
+    return _selection(found, searched, scores, gap, probability)
 
 
 def select_by_scorer(
@@ -95,8 +94,7 @@ def select_by_scorer(
     """
     candidates, static = _searched(found), None
     if not found.is_ambiguous:
-        sure = Scores(np.zeros(1), {}, CLEAR_RIGHT)
-        return _selection(found, candidates, sure, NO_RIVAL, CLEAR_RIGHT)
+        return _selection(found, candidates, np.zeros(1), NO_RIVAL, CLEAR_RIGHT)
     cutoff = options.refine.cutoff
     if prediction is not None:
         static = found.grid.resample(prediction.static_probability)
@@ -116,7 +114,7 @@ def select_by_scorer(
         if int(np.argmax(scores.score)) < len(candidates) - len(refits):
             break
     gap = gap_of(found, [c.pose for c in candidates], scores.score)
-    return _selection(found, candidates, scores, gap, right((gap,), SELECTOR_RIGHT))
+    return _selection(found, candidates, scores.score, gap, right((gap,), SELECTOR_RIGHT))
 
 
 def _searched(found: HypothesisSet) -> list[Candidate]:
@@ -139,10 +137,10 @@ def _refits(
 
 
 def gap_of(found: HypothesisSet, poses: Sequence[np.ndarray], score: np.ndarray) -> float:
-    """By how much the best score exceeds that of any other motion."""
+    """By how much the best score exceeds that of any other motion, and of none being right."""
     best = int(np.argmax(score))
     apart = search.Probes(found.grid).distances(poses, best) > search.OTHER_PX
-    return min(NO_RIVAL, float(score[best] - score[apart].max(initial=-np.inf)))
+    return min(NO_RIVAL, float(score[best] - score[apart].max(initial=0.0)))
 
 
 def mask_weights(probability: np.ndarray) -> np.ndarray:
@@ -183,12 +181,12 @@ def _coverage(found: HypothesisSet, mask: np.ndarray | None) -> float:
 def _selection(
     found: HypothesisSet,
     candidates: Sequence[Candidate],
-    scores: Scores,
+    scores: np.ndarray,
     gap: float,
     probability: float,
 ) -> Selection:
     """The candidate with the largest score."""
-    score = np.nan_to_num(scores.score, nan=-np.inf)
+    score = np.nan_to_num(scores, nan=-np.inf)
     order = np.argsort(-score, kind="stable")
     pose, facts, _, mask = candidates[order[0]]
     motions = hypotheses(found, candidates)
@@ -197,7 +195,6 @@ def _selection(
         noise=(float(facts[search.FLOW_NOISE]), float(facts[search.DEPTH_NOISE])),
         mask=mask,
         coverage=_coverage(found, mask),
-        confidence=float(np.nan_to_num(scores.confidence)),
         gap=gap,
         probability=float(np.nan_to_num(probability)),
         hypotheses=tuple(replace(motions[k], score=float(score[k])) for k in order),

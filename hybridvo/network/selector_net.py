@@ -48,14 +48,13 @@ class SelectorNetworkOptions:
 class SelectorOutput:
     """Answers about N candidates.
 
-    ``score`` (N,): larger is more likely the world, softmax over an image's candidates; ``hidden``
-    (N, D): what the confidence looks at; ``evidence`` (N, 2, h, w) from flow and images; ``common``
-    (B, C, h', w'): the first layer's view of what they share; ``levels``: channels and features,
-    finest first; ``mask`` (N, h, w): logit of each pixel to be static world, if drawn.
+    ``score`` (N,): larger is more likely the world; softmax over an image's candidates and 0, the
+    score of none of them; ``evidence`` (N, 2, h, w) from flow and images; ``common`` (B, C, h',
+    w'): the first layer's view of what they share; ``levels``: channels and features, finest first;
+    ``mask`` (N, h, w): logit of each pixel to be static world, if drawn.
     """
 
     score: torch.Tensor
-    hidden: torch.Tensor
     evidence: torch.Tensor
     common: torch.Tensor
     levels: tuple[torch.Tensor, ...]
@@ -93,8 +92,6 @@ class SelectorNetwork(nn.Module):
         self.summary = nn.Linear(2 * c4 + c3 + SCALARS, hidden)
         self.inner = nn.Linear(hidden, hidden)
         self.score = nn.Linear(hidden, 1)
-        self.doubt = nn.Linear(2 * hidden + 2, hidden)
-        self.trust = nn.Linear(hidden, 1)
         self.up3 = nn.Conv2d(c4, c3, 1)
         self.merge3 = nn.Conv2d(c3, c2, 3, padding=1)
         self.merge2 = nn.Conv2d(c2, c1, 3, padding=1)
@@ -103,7 +100,6 @@ class SelectorNetwork(nn.Module):
         self.pixel = nn.Conv2d(CANDIDATE_CHANNELS, PIXEL_CHANNELS, 1)
         self.mask = nn.Conv2d(PIXEL_CHANNELS, 1, 1)
         nn.init.zeros_(self.score.weight)
-        nn.init.zeros_(self.trust.weight)
 
     def forward(
         self,
@@ -147,7 +143,7 @@ class SelectorNetwork(nn.Module):
         hidden = F.relu(self.summary(torch.cat(pooled, 1)))
         hidden = F.relu(self.inner(hidden))
         score = self.score(hidden)[:, 0]
-        return SelectorOutput(score, hidden, evidence, common, (channels, x1, x2, x3, x4))
+        return SelectorOutput(score, evidence, common, (channels, x1, x2, x3, x4))
 
     def decode(self, levels: tuple[torch.Tensor, ...], size: torch.Size) -> torch.Tensor:
         """(N, h, w) logits of static masks of this size, from the levels of :meth:`encode`."""
@@ -158,18 +154,6 @@ class SelectorNetwork(nn.Module):
         y = F.relu_(self.merge1(F.relu_(y + x1)))
         y = F.interpolate(self.context(y), scale_factor=2.0, mode="bilinear", align_corners=False)
         return self.mask(F.relu_(y + self.pixel(channels)))[:, 0, : size[0], : size[1]]
-
-    def confidence(
-        self, score: torch.Tensor, hidden: torch.Tensor, owner: torch.Tensor, images: int
-    ) -> torch.Tensor:
-        """(B,) logit of the probability that the best of all candidates of an image is right."""
-        out = []
-        for b in range(images):
-            own, mine = score[owner == b], hidden[owner == b]
-            share = torch.softmax(own, 0)
-            extra = torch.stack([share.max(), torch.logsumexp(own, 0).clamp(-20, 20) / 10])
-            out.append(torch.cat([share @ mine, mine[share.argmax()], extra]))
-        return self.trust(F.relu(self.doubt(torch.stack(out))))[:, 0]
 
 
 def _framed(x: torch.Tensor, mirror: torch.Tensor | None, signed: tuple[int, ...]) -> torch.Tensor:
@@ -212,18 +196,13 @@ class NetworkScorer:
                 new = [c for c in candidates[known:] if (c.mask is not None) == refits]
                 if new:
                     self._encode(new)
-            score, hidden = (
-                torch.cat([getattr(output, name) for output in self.seen])
-                for name in ("score", "hidden")
-            )
+            score = torch.cat([output.score for output in self.seen])
             best = score.argsort(descending=True, stable=True)[:masks]
             best = best[score[best] > score.max() - MAX_LAG]
             stages = zip(*(output.levels for output in self.seen), strict=True)
             levels = tuple(torch.cat(stage)[best] for stage in stages)
             drawn = self.network.decode(levels, self.image.depth.shape[1:]).sigmoid().cpu().numpy()
-            trust = self.network.confidence(score, hidden, torch.zeros_like(score).long(), 1)
-        static = dict(zip(best.tolist(), drawn, strict=True))
-        return Scores(score.double().cpu().numpy(), static, float(trust.sigmoid()))
+        return Scores(score.double().cpu().numpy(), dict(zip(best.tolist(), drawn, strict=True)))
 
     def _encode(self, candidates: Sequence[Candidate]) -> None:
         poses = np.stack([c.pose for c in candidates])

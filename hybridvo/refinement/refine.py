@@ -45,7 +45,6 @@ class Selection:
     noise: tuple[float, float] | None = None  # flow px, log depth: standard deviations found so far
     mask: np.ndarray | None = None  # (h, w) weights on the coarse grid that it was fitted with
     coverage: float = 1.0  # share of the usable pixels' weight that the mask leaves
-    confidence: float = 1.0  # the scorer's own, that it is right; low where no motion may be
     gap: float = 0.0  # by how much its score exceeds that of any other motion
     probability: float = 1.0  # that the motion is right, calibrated in the gap
     hypotheses: tuple[Hypothesis, ...] = ()  # all candidates, the one selected first

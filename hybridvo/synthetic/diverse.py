@@ -18,7 +18,15 @@ from hybridvo.flow import dis_flow
 from hybridvo.geometry import invert, make_transform, se3_exp
 from hybridvo.options import Share, option_group
 from hybridvo.synthetic.bodies import BODIES, SHAPES, Mover, draw_look, mover
-from hybridvo.synthetic.draws import about, affine, any_turn, carried, log_uniform, turn
+from hybridvo.synthetic.draws import (
+    about,
+    affine,
+    any_turn,
+    carried,
+    log_uniform,
+    smooth_field,
+    turn,
+)
 from hybridvo.synthetic.layered import KnownPair, Sample, camera_flow
 from hybridvo.synthetic.raycast import BOX, CYLINDER, ELLIPSOID
 from hybridvo.synthetic.render import Scene, Solid
@@ -121,9 +129,11 @@ class _Surroundings:
         self.scatter(count, SHAPES, 0.08, 0.4, (-1.5, 2.2), 0.0, reach, T)
 
 
-def _movers(rng: np.random.Generator, view: np.ndarray, T_world_cam: np.ndarray) -> list[Mover]:
+def _movers(
+    rng: np.random.Generator, view: np.ndarray, T_world_cam: np.ndarray, crowds: float
+) -> list[Mover]:
     """Bodies, each with a motion of its own or a common one."""
-    many = rng.random() < 0.25
+    many = rng.random() < crowds
     count = int(rng.integers(4, 11)) if many else int(rng.integers(1, 4))
     follow, together, alike = rng.random(3) < (0.45, 0.3, 0.5)
     kinds = rng.integers(len(BODIES), size=1 if alike else count)
@@ -146,8 +156,10 @@ def _movers(rng: np.random.Generator, view: np.ndarray, T_world_cam: np.ndarray)
     return movers
 
 
-def training_scene(rng: np.random.Generator, height: int, width: int) -> Scene:
-    """Scene of two frames."""
+def training_scene(
+    rng: np.random.Generator, height: int, width: int, crowds: float = 0.25
+) -> Scene:
+    """Scene of two frames; ``crowds``: of those with movers, how many have four to ten."""
     spread = np.tan(np.radians(rng.uniform(34, 100) / 2))
     aspect = log_uniform(rng, (0.8, 1.25)) if rng.random() < 0.3 else 1.0
     u, v = np.array([width - 1, height - 1]) / 2 + rng.normal(0, 0.03, 2) * width
@@ -165,7 +177,7 @@ def training_scene(rng: np.random.Generator, height: int, width: int) -> Scene:
     scene = Scene(camera, path, solids, texture, tuple(light.tolist()), noise)
     share = rng.choice([0.0, rng.uniform(0, 0.3), rng.uniform(0.3, 0.87)], p=[0.06, 0.3, 0.64])
     if share:
-        scene = sized(scene, _movers(rng, view, T), float(share), (0.15, 6.0))[0]
+        scene = sized(scene, _movers(rng, view, T, crowds), float(share), (0.15, 6.0))[0]
     # from a desk to a street
     s = log_uniform(rng, (0.2, 3.0))
     path[:, :3, 3] *= s
@@ -177,10 +189,10 @@ def training_scene(rng: np.random.Generator, height: int, width: int) -> Scene:
 
 
 def scene_pairs(
-    rng: np.random.Generator, height: int, width: int, images: bool = True
+    rng: np.random.Generator, height: int, width: int, images: bool = True, crowds: float = 0.25
 ) -> dict[str, KnownPair]:
     """A scene with true flow (``rendered``) and, from its images, with DIS flow (``dis``)."""
-    scene = training_scene(rng, height, width)
+    scene = training_scene(rng, height, width, crowds)
     camera, T = scene.camera, invert(scene.T_world_cam[1]) @ scene.T_world_cam[0]
     rgb = [scene.render(k).rgb if images else None for k in (0, 1)]
     depth = [scene.depth(k) for k in (0, 1)]
@@ -206,6 +218,26 @@ def scene_pairs(
         prev, curr = replace(prev, rgb=None), replace(curr, rgb=None)
     exact = FramePair(prev, curr, np.ascontiguousarray(flow))
     return {"rendered": KnownPair(exact, *truth)} | pairs
+
+
+def undetermined_pair(rng: np.random.Generator, height: int, width: int) -> KnownPair:
+    """A scene of which every part goes its own way, and none the camera's."""
+    scene = training_scene(rng, height, width)
+    camera, depth = scene.camera, scene.depth(0)
+    parts = int(rng.integers(2, 9))
+    v, u = np.indices(camera.shape)
+    field = (u, v, smooth_field(rng, camera.shape, int(rng.integers(2, 8))))[int(rng.integers(3))]
+    part = np.digitize(field, np.quantile(field, np.linspace(0, 1, parts + 1)[1:-1]))
+    near = float(np.median(depth[depth > 0])) if (depth > 0).any() else 1.0
+    limit = np.repeat([log_uniform(rng, (0.003, 0.1)) * near, log_uniform(rng, (0.002, 0.05))], 3)
+    flow = np.full((*camera.shape, 2), np.nan, np.float32)
+    for k in range(parts):
+        own = se3_exp(rng.uniform(0.5, 1.0, 6) * rng.choice([-1.0, 1.0], 6) * limit)
+        flow[part == k] = camera_flow(camera.K, depth, own)[0][part == k]
+    if rng.random() < 0.5:
+        flow = noisy_flow(rng, flow, log_uniform(rng, (0.02, 1.0)), 0.0, 0.06 * width)[0]
+    pair = FramePair(Frame(None, depth, camera), Frame(None, None, camera), flow)
+    return KnownPair(pair, np.eye(4), depth, np.ones(camera.shape, bool))
 
 
 @option_group

@@ -121,7 +121,6 @@ class SelectorOptions(RunOptions):
     second_look_from: Share = 0.1
     refits: Count = 2
     mask_weight: NotNegative = 1.0
-    trust_weight: NotNegative = 0.5
     asked_share: Share = 0.5
     files: Count = 48
 

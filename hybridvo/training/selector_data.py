@@ -16,27 +16,34 @@ import torch
 
 from hybridvo.files import atomic_write
 from hybridvo.geometry import se3_exp
-from hybridvo.hypotheses.generate import HypothesisSet, generate
+from hybridvo.hypotheses.generate import HypothesisSet, fit_in_mask, generate
+from hybridvo.hypotheses.search import REFERENCE_WIDTH
 from hybridvo.network.prediction import propose_motion
 from hybridvo.options import Options
 from hybridvo.refinement.pixels import grid_stride
 from hybridvo.results import MotionPrediction, RelativePose
-from hybridvo.synthetic.diverse import scene_pairs
+from hybridvo.synthetic.diverse import scene_pairs, undetermined_pair
 from hybridvo.synthetic.draws import log_uniform
-from hybridvo.synthetic.layered import KnownPair
+from hybridvo.synthetic.layered import KnownPair, camera_flow
 from hybridvo.synthetic.semi_real import Recording, draw_pair
 
 PER_SHARD = 64
 """Seeds of a shard."""
-MAX_MOTIONS = 5
+MAX_MOTIONS = 8
 """Motions of a sample."""
+UNDETERMINED, CROWDS = 0.1, 0.5
+"""Of the drawn scenes, those in which no motion is the camera's; of the others, those with four to
+ten movers."""
 SIZES = ((160, 320), (160, 320), (128, 256), (192, 256), (120, 400), (218, 512))
 """(height, width) of the samples."""
+RIGHT_PX, RIGHT_FACTOR = 1.0, 3.0
+"""px at a width of 1024: mean error of the ego flow up to which a motion is right; or so many times
+that of the fit to the static pixels, where flow, depth or the ground truth allow no better."""
 MOVING, STATIC, UNKNOWN = 0, 1, 255
 """Labels of the pixels."""
-SOURCES = ("diverse", "rendered", "dis", "semi-real")
-"""Where samples come from: drawn scenes (the first kind is no longer made) with true flow and with
-DIS, and recordings with movers cut from others."""
+SOURCES = ("undetermined", "rendered", "dis", "semi-real")
+"""Where samples come from: drawn scenes without an answer, with true flow and with DIS, and
+recordings with movers cut from others."""
 
 
 def draw_samples(
@@ -51,8 +58,10 @@ def draw_samples(
     height, width = SIZES[int(rng.integers(len(SIZES)))]
     if recordings:
         pairs = {"semi-real": draw_pair(rng, recordings)}
+    elif rng.random() < UNDETERMINED:
+        pairs = {"undetermined": undetermined_pair(rng, height, width)}
     else:
-        pairs = scene_pairs(rng, height, width)
+        pairs = scene_pairs(rng, height, width, crowds=CROWDS)
     samples = []
     for source, drawn in pairs.items():
         starts = [np.eye(4)]
@@ -90,6 +99,15 @@ def _record(drawn: KnownPair, found: HypothesisSet) -> dict[str, Any]:
     pick = np.s_[stride // 2 :: stride, stride // 2 :: stride]
     label = np.where(drawn.moving, MOVING, STATIC)
     label = np.where(drawn.depth > 0, label, UNKNOWN)[pick]
+    limit, static = RIGHT_PX, (label == STATIC).astype(np.float32)
+    if static.any():
+        start, cutoff = drawn.T_curr_prev[:3], Options().refine.cutoff
+        pose, _ = fit_in_mask(found.grid.samples, static, found.grid.K, start, cutoff)
+        K = drawn.pair.prev.camera.K
+        flow, truth = (camera_flow(K, drawn.depth, T)[0] for T in (pose, drawn.T_curr_prev))
+        error = np.linalg.norm(flow - truth, axis=2)[drawn.depth > 0].mean()
+        error *= REFERENCE_WIDTH / drawn.depth.shape[1]
+        limit = max(limit, RIGHT_FACTOR * float(np.nan_to_num(error)))
     count = min(len(found.poses), MAX_MOTIONS)
     empty = (0, MAX_MOTIONS - count)
     return vars(found.maps()) | {
@@ -99,6 +117,7 @@ def _record(drawn: KnownPair, found: HypothesisSet) -> dict[str, Any]:
         "facts": np.pad(found.facts[:count], (empty, (0, 0))),
         "count": count,
         "T": drawn.T_curr_prev[:3],
+        "limit": limit,
     }
 
 

@@ -18,6 +18,7 @@ import torch.nn.functional as F
 from hybridvo.errors import FormatError, InputError
 from hybridvo.geometry import pose_matrix
 from hybridvo.hypotheses.generate import GridMaps, fit_in_mask
+from hybridvo.hypotheses.search import OTHER_PX
 from hybridvo.hypotheses.selector import mask_weights, nearest_motion
 from hybridvo.network.selector_inputs import SelectorInputs, stacked_inputs
 from hybridvo.network.selector_net import SelectorNetwork, SelectorOutput
@@ -27,12 +28,9 @@ from hybridvo.training.options import SelectorOptions
 from hybridvo.training.selector_data import MOVING, SOURCES, STATIC, expected_motion
 from hybridvo.training.validation import area_under_curve
 
-RIGHT_PX = 1.0
-"""px at a width of 1024: mean error of the ego flow up to which a motion is right."""
-WORST_RIGHT_PX = 3.0
-"""The same where flow allows no better: three times the error of the best motion, at most this."""
-RIGHT_SLOPE = 0.15
-"""Softness of that limit as a target, of itself."""
+RIGHT_SLOPE, NEARLY = 0.15, 0.2
+"""Shares of the limit up to which a motion is right: its softness as a target, and the difference
+of two errors at which the motions share the choice as 1 to e."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +41,7 @@ class SelectorBatch:
         samples: (B, 8, n) float32 pixel buffers of the solver.
         depth_true: (B, h, w) metres, 0 where unknown. label: (B, h, w) of ``selector_data``.
         T: (B, 3, 4) true T_curr_prev. source: (B,) number in ``SOURCES``.
+        limit: (B,) error of the ego flow up to which a motion is right, px at a width of 1024.
         static: (B, h, w) probability to be static world that a pixel-wise network states.
         proposal: (B, 3, 4) float64 its motion, NaN where it was not asked.
     """
@@ -53,6 +52,7 @@ class SelectorBatch:
     label: torch.Tensor
     T: torch.Tensor
     source: torch.Tensor
+    limit: torch.Tensor
     static: torch.Tensor
     proposal: torch.Tensor
 
@@ -96,7 +96,7 @@ def _collate(p: dict[str, np.ndarray]) -> SelectorBatch:
     inputs = stacked_inputs(GridMaps(**maps), torch.device("cpu"))
     inputs = inputs.asking(p["poses"][there], p["facts"][there], np.arange(len(owner)), owner)
     truth = {"depth_true": np.float32, "label": np.int64, "T": np.float32, "source": np.int64}
-    truth |= {"static": np.float32, "proposal": np.float64}
+    truth |= {"limit": np.float32, "static": np.float32, "proposal": np.float64}
     tensors = {name: torch.as_tensor(p[name].astype(kind)) for name, kind in truth.items()}
     return SelectorBatch(inputs, samples, **tensors)
 
@@ -192,7 +192,7 @@ def refits_of(
 class Looks:
     """What a network answers about the motions of a batch, and about their refits.
 
-    ``owner``, ``score``, ``hidden`` and ``error`` (px) of all motions so far.
+    ``owner``, ``pose``, ``score`` and ``error`` (px) of all motions so far.
     """
 
     def __init__(
@@ -210,8 +210,8 @@ class Looks:
     ) -> SelectorOutput:
         out = self.model(inputs, first, self.mirror)
         error = ego_flow_error(inputs.pose, inputs.owner, self.batch)
-        self.asked.append((inputs.owner, out.score, out.hidden, error))
-        self.owner, self.score, self.hidden, self.error = map(
+        self.asked.append((inputs.owner, inputs.pose, out.score, error))
+        self.owner, self.pose, self.score, self.error = map(
             torch.cat, zip(*self.asked, strict=True)
         )
         return out
@@ -228,26 +228,29 @@ class Looks:
         """Numbers of the motions of each sample."""
         return [torch.nonzero(self.owner == b)[:, 0] for b in range(len(self.batch))]
 
-    def trust(self) -> torch.Tensor:
-        """(B,) logit of the probability that the chosen motion is right."""
-        return self.model.confidence(self.score, self.hidden, self.owner, len(self.batch))
+    def gap(self) -> torch.Tensor:
+        """(B,) by how much the best score exceeds that of any other motion, and of none."""
+        best = torch.stack([mine[self.score[mine].argmax()] for mine in self.motions()])
+        about = replace(self.batch, T=self.pose[best].float())
+        apart = ego_flow_error(self.pose, self.owner, about) > OTHER_PX
+        rivals = [self.score[mine[apart[mine]]] for mine in self.motions()]
+        rival = [F.pad(score, (0, 1)).max() for score in rivals]
+        return self.score[best] - torch.stack(rival)
 
-    def choice_losses(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Losses of the choice and of the probability stated with it.
+    def choice_loss(self) -> torch.Tensor:
+        """Cross entropy of the choice, of which 'none of them' is one.
 
-        Cross entropies against soft targets: motions nearly as good as the best share the choice.
+        Against soft targets: motions nearly as good as the best share the choice.
         """
-        choice, right = [], []
-        for mine in self.motions():
+        losses = []
+        for mine, limit in zip(self.motions(), self.batch.limit, strict=True):
             error, score = self.error[mine], self.score[mine]
             best = error.min()
-            target = torch.softmax(-(error - best) / (0.1 + 0.3 * best), 0)
-            weight = 1.0 / (1.0 + (best / 4.0) ** 2)
-            choice.append(-weight * (target * torch.log_softmax(score, 0)).sum())
-            limit = (3 * best).clamp(RIGHT_PX, WORST_RIGHT_PX)
-            right.append(torch.sigmoid((1 - error[score.argmax()] / limit) / RIGHT_SLOPE))
-        trust = F.binary_cross_entropy_with_logits(self.trust(), torch.stack(right))
-        return torch.stack(choice).mean(), trust
+            right = torch.sigmoid((1 - best / limit) / RIGHT_SLOPE)
+            target = right * torch.softmax((best - error) / (NEARLY * limit), 0)
+            target = torch.cat([target, (1 - right)[None]])
+            losses.append(-(target * torch.log_softmax(F.pad(score, (0, 1)), 0)).sum())
+        return torch.stack(losses).mean()
 
     def mask_loss(self, out: SelectorOutput, inputs: SelectorInputs) -> torch.Tensor:
         """Binary cross entropy of masks over usable pixels of known kind."""
@@ -282,24 +285,22 @@ class SelectorTask:
     def loss(
         self, batch: SelectorBatch, step: int, progress: float
     ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        """Losses of the choice, of the masks and of the stated probability."""
+        """Losses of the choice and of the masks, of both looks."""
         o, count = self.options, len(batch)
         draw = torch.Generator().manual_seed((o.seed << 32) + step)
         asked = torch.rand(count, generator=draw) < o.asked_share
         batch = batch.expecting(np.random.default_rng([o.seed, step])).shown(asked)
         mirror = torch.rand(count, generator=draw) < 0.5
         looks = Looks(self.network, batch, mirror)
-        choice, trust = looks.choice_losses()
         mask = o.mask_weight * looks.mask_loss(looks.first, batch.inputs)
-        losses = {"choice": choice, "mask": mask}
+        losses = {"choice": looks.choice_loss(), "mask": mask}
         if progress >= o.second_look_from:
             # one fit less in half of the updates: cheaper, and the best one is seen most
             fewer = o.refits > 1 and bool(torch.rand((), generator=draw) < 0.5)
             again = looks.again(o.refits - fewer, draw)
             if again is not None:
-                losses["second"], trust = looks.choice_losses()
+                losses["second"] = looks.choice_loss()
                 losses["second_mask"] = 0.5 * o.mask_weight * looks.mask_loss(*again)
-        losses["trust"] = o.trust_weight * trust
         total = torch.stack(list(losses.values())).sum()
         return total, {name: value.detach() for name, value in losses.items()}
 
@@ -315,24 +316,25 @@ def evaluate_selector(network: Any, files: list[Path], refits: int) -> dict[str,
 
     For each source: ``samples``, the share of them whose motion is further from the ground truth
     than is right for ``support`` (the first motion found), ``final`` (the answer) and ``best`` (of
-    all, an oracle), and ``auroc`` of the probability as a detector of right answers.
+    all, an oracle), and ``auroc`` of the gap of the scores as a detector of right answers.
     """
     rows: dict[str, list[list[float]]] = {}
     for batch in read_batches(files, 8, None):
         looks = Looks(network, batch.shown(torch.ones(len(batch), dtype=torch.bool)))
         looks.again(refits)
-        score, error, trust = looks.score, looks.error, looks.trust()
+        score, error, gap = looks.score, looks.error, looks.gap()
         for b, mine in enumerate(looks.motions()):
-            px = error[mine[0]], error[mine[score[mine].argmax()]], error[mine].min(), trust[b]
+            px = error[mine[0]], error[mine[score[mine].argmax()]], error[mine].min()
+            px += batch.limit[b], gap[b]
             rows.setdefault(SOURCES[int(batch.source[b])], []).append([float(x) for x in px])
     figures = {}
     for source, listed in rows.items():
         table = np.array(listed)
-        wrong = table[:, :3] > np.clip(3 * table[:, 2:3], RIGHT_PX, WORST_RIGHT_PX)
+        wrong = table[:, :3] > table[:, 3:4]
         shares = np.round(wrong.mean(axis=0), 4).tolist()
         figures[source] = {
             "samples": len(listed),
             **dict(zip(("support", "final", "best"), shares, strict=True)),
-            "auroc": area_under_curve(table[:, 3], ~wrong[:, 1]),
+            "auroc": area_under_curve(table[:, 4], ~wrong[:, 1]),
         }
     return figures

@@ -34,11 +34,8 @@ SIGMA = np.diag([0.02**2] * 3 + [0.004**2] * 3)
 class Oracle:
     """A scorer that is told where the scene is static; it prefers the latest refit, or none."""
 
-    def __init__(
-        self, static: np.ndarray, refits: bool, confidence: float = 0.9, margin: float = 5.0
-    ) -> None:
-        self.static, self.refits, self.confidence = static, refits, confidence
-        self.margin = margin
+    def __init__(self, static: np.ndarray, refits: bool, margin: float = 5.0) -> None:
+        self.static, self.refits, self.margin = static, refits, margin
 
     def look(self, maps, prior, static) -> Oracle:
         return self
@@ -47,7 +44,7 @@ class Oracle:
         count = len(candidates)
         score = np.zeros(count)
         score[-1 if self.refits else 0] = self.margin
-        return Scores(score, dict.fromkeys(range(min(masks, count)), self.static), self.confidence)
+        return Scores(score, dict.fromkeys(range(min(masks, count)), self.static))
 
 
 @pytest.fixture(scope="module")
@@ -96,12 +93,12 @@ def test_a_prediction_is_one_candidate_more(case) -> None:
     assert gap(answer.T_curr_prev, pair, truth) < gap(weighted.T_curr_prev, pair, truth) + 0.02
 
 
-def test_low_confidence_is_degraded_with_its_probability_and_a_wide_covariance(case) -> None:
+def test_a_small_gap_is_degraded_with_its_probability_and_a_wide_covariance(case) -> None:
     found, pair, _ = case
     nowhere = np.zeros(found.grid.shape[:2], np.float32)
     sure, chosen = (
-        select_by_scorer(found, Oracle(nowhere, False, confidence, margin).look, Options())
-        for confidence, margin in ((0.99, 5.0), (0.05, 0.01))
+        select_by_scorer(found, Oracle(nowhere, False, margin).look, Options())
+        for margin in (5.0, 0.01)
     )
     assert chosen.probability < MIN_CONFIDENCE < sure.probability and chosen.mask is None
     answer = Context().refine(pair, found, chosen)
@@ -123,14 +120,14 @@ def test_the_hybrid_asks_pwvo_below_one_threshold() -> None:
 
     for threshold, calls in ((0.0, 0), (1.0, 1)):
         Asked.calls = 0
-        hybrid_flow(pair, Asked(Options(select=SelectOptions(consult_below=threshold))))
+        hybrid_flow(pair, Asked(Options(select=SelectOptions(min_confidence=threshold))))
         assert Asked.calls == calls
 
 
 def test_an_unambiguous_motion_is_taken_as_it_is() -> None:
     pair, _ = make_pair(Scenario(moving=0.0), 1, **SIZE)
     found = generate(pair, IDENTITY, Options())
-    oracle = Oracle(np.zeros((1, 1)), refits=True, confidence=0.0)
+    oracle = Oracle(np.zeros((1, 1)), refits=True)
     chosen = select_by_scorer(found, oracle.look, Options())
     assert not found.is_ambiguous and chosen.probability == CLEAR_RIGHT
     np.testing.assert_array_equal(chosen.T_curr_prev, select_by_cues(found).T_curr_prev)

@@ -31,9 +31,8 @@ SIZE = {"height": 96, "width": 224}
 def network() -> SelectorNetwork:
     torch.manual_seed(3)
     made = SelectorNetwork()
-    # the last layers start at zero; a selector that says something is wanted here
-    for layer in (made.score, made.trust):
-        torch.nn.init.normal_(layer.weight, std=0.3)
+    # the last layer starts at zero; a selector that says something is wanted here
+    torch.nn.init.normal_(made.score.weight, std=0.3)
     return made.eval()
 
 
