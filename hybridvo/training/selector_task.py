@@ -70,11 +70,16 @@ class SelectorBatch:
         return replace(self, inputs=replace(self.inputs, static=logit, has_static=asked))
 
     def expecting(self, rng: np.random.Generator) -> SelectorBatch:
-        """The same with motions expected by histories of all kinds, or by none."""
+        """The same with motions expected by histories of all kinds, or by none.
+
+        At times of one of the motions found: of a mover that was taken for the world.
+        """
         T_prior, information = self.T.clone(), self.inputs.prior_information.clone()
         known = rng.random(len(self)) < 0.6
         for b in np.flatnonzero(known):
-            T, spread = expected_motion(rng, pose_matrix(self.T[b].numpy().astype(np.float64)))
+            mine = self.inputs.pose[self.inputs.owner == b]
+            followed = mine[int(rng.integers(len(mine)))] if rng.random() < 0.3 else self.T[b]
+            T, spread = expected_motion(rng, pose_matrix(followed.numpy().astype(np.float64)))
             T_prior[b] = torch.as_tensor(T[:3])
             if rng.random() < 0.6:
                 information[b] = torch.diag(torch.as_tensor(1.0 / spread**2))
@@ -324,8 +329,8 @@ def evaluate_selector(network: Any, files: list[Path], refits: int) -> dict[str,
         looks.again(refits)
         score, error, gap = looks.score, looks.error, looks.gap()
         for b, mine in enumerate(looks.motions()):
-            px = error[mine[0]], error[mine[score[mine].argmax()]], error[mine].min()
-            px += batch.limit[b], gap[b]
+            final = mine[score[mine].argmax()]
+            px = error[mine[0]], error[final], error[mine].min(), batch.limit[b], gap[b]
             rows.setdefault(SOURCES[int(batch.source[b])], []).append([float(x) for x in px])
     figures = {}
     for source, listed in rows.items():
