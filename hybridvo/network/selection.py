@@ -23,8 +23,7 @@ import torch.nn.functional as F
 
 from hybridvo.errors import InputError
 from hybridvo.network.inputs import NetworkInputs, pinhole
-from hybridvo.refinement.batch import Pixels
-from hybridvo.refinement.torch_factors import fit_pixels
+from hybridvo.refinement.torch_factors import Pixels, fit_pixels
 from hybridvo.results import PixelwisePrediction
 from hybridvo.torch_geometry import euler_transform, se3
 
