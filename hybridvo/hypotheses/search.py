@@ -296,18 +296,11 @@ def score_poses(samples, n, poses, K):
     b_v, b_w = samples[MV], samples[W]
     one, half = np.float32(1.0), np.float32(0.5)
     for m in range(len(poses)):
-        P = poses[m].astype(np.float32)
-        r00, r01, r02, tx = P[0, 0], P[0, 1], P[0, 2], P[0, 3]
-        r10, r11, r12, ty = P[1, 0], P[1, 1], P[1, 2], P[1, 3]
-        r20, r21, r22, tz = P[2, 0], P[2, 1], P[2, 2], P[2, 3]
+        entries = kernels.pose_entries(poses[m].astype(np.float32))
         score = np.float32(0.0)
         for k in range(n):
-            z = b_z[k]
-            Zc = z * (r20 * b_x[k] + r21 * b_y[k] + r22) + tz
-            front = Zc > np.float32(1e-6)
-            i = one / (Zc if front else one)
-            ru = b_u[k] - (fx * (z * (r00 * b_x[k] + r01 * b_y[k] + r02) + tx) * i + cx)
-            rv = b_v[k] - (fy * (z * (r10 * b_x[k] + r11 * b_y[k] + r12) + ty) * i + cy)
+            a, b, _, front = kernels.see(b_x[k], b_y[k], b_z[k], entries)
+            ru, rv = b_u[k] - (fx * a + cx), b_v[k] - (fy * b + cy)
             r2 = ru * ru + rv * rv
             near = one / (one + np.float32(44.4) * r2)
             mid = one / (one + np.float32(1.2) * r2)

@@ -264,14 +264,11 @@ def parts_dispersion(scores: np.ndarray, model: np.ndarray) -> float:
 
 def node_shares(places: np.ndarray) -> np.ndarray:
     """(N, nodes) bilinear shares of the nodes in places (N, 2): rows and columns among them."""
-    corner = places.astype(np.intp)
-    v, u = (places - corner).T
-    nodes = (corner @ (COLUMNS, 1))[:, None] + (0, 1, COLUMNS, COLUMNS + 1)
-    out = np.zeros((len(places), ROWS * COLUMNS), np.float32)
-    out[np.arange(len(places))[:, None], nodes] = np.stack(
-        [(1 - v) * (1 - u), (1 - v) * u, v * (1 - u), v * u], axis=1
+    v, u = (
+        np.maximum(0, 1 - np.abs(places[:, k, None] - np.arange(n, dtype=np.float32)))
+        for k, n in enumerate((ROWS, COLUMNS))
     )
-    return out
+    return (v[:, :, None] * u[:, None]).reshape(len(places), -1).astype(np.float32)
 
 
 def light_fields(

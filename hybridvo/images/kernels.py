@@ -67,43 +67,31 @@ def strength_row(v, grey, depth, weights, least, out):
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
-def select_pixels(grey, depth, weights, least, cell, per_cell, index):
-    """The ``per_cell`` usable pixels of strongest gradient in every cell of ``cell`` px.
-
-    ``index`` (N, 2) int32 gets (v, u); returns how many. Usable: weight of at least ``least``,
-    valid depth, off the border.
+def select_pixels(grey, depth, weights, least, cell, per_cell):
+    """(N, 2) int32 rows and columns of the ``per_cell`` usable pixels of strongest gradient in each
+    cell of ``cell`` px. Usable: weight of at least ``least``, valid depth, off the border.
     """
-    H, width = grey.shape
-    cells = (width - 2 * MARGIN + cell - 1) // cell
-    best = np.empty((cells, per_cell), np.float32)
-    place = np.empty((cells, per_cell, 2), np.int32)
-    row = np.empty(width, np.float32)
-    last = per_cell - 1
-    n = 0
+    (H, width), n = grey.shape, 0
+    strength = np.zeros((H, width), np.float32)
+    for v in range(MARGIN, H - MARGIN):
+        strength_row(v, grey, depth, weights, least, strength[v])
+    index = np.empty(((H // cell + 1) * (width // cell + 1) * per_cell, 2), np.int32)
     for v0 in range(MARGIN, H - MARGIN, cell):
-        best[:] = ZERO
-        for v in range(v0, min(v0 + cell, H - MARGIN)):
-            strength_row(v, grey, depth, weights, least, row)
-            for c in range(cells):
-                u0 = MARGIN + c * cell
-                for u in range(u0, min(u0 + cell, width - MARGIN)):
-                    strength = row[u]
-                    if not strength > best[c, last]:
+        for u0 in range(MARGIN, width - MARGIN, cell):
+            first, low = n, ZERO
+            for v in range(v0, min(v0 + cell, H)):
+                for u in range(u0, min(u0 + cell, width)):
+                    if not strength[v, u] > low:
                         continue
-                    k = last
-                    while k > 0 and best[c, k - 1] < strength:
-                        best[c, k] = best[c, k - 1]
-                        place[c, k] = place[c, k - 1]
+                    k = min(n, first + per_cell - 1)
+                    while k > first and strength[index[k - 1, 0], index[k - 1, 1]] < strength[v, u]:
+                        index[k] = index[k - 1]
                         k -= 1
-                    best[c, k] = strength
-                    place[c, k, 0] = v
-                    place[c, k, 1] = u
-        for c in range(cells):
-            for k in range(per_cell):
-                if best[c, k] > ZERO and n < index.shape[0]:
-                    index[n] = place[c, k]
-                    n += 1
-    return n
+                    index[k] = v, u
+                    n = min(n + 1, first + per_cell)
+                    if n == first + per_cell:
+                        low = strength[index[n - 1, 0], index[n - 1, 1]]
+    return index[:n]
 
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)

@@ -268,15 +268,11 @@ def choose_pixels(
     grey: np.ndarray, depth: np.ndarray, weights: np.ndarray, count: int
 ) -> np.ndarray:
     """(N, 2) int32 rows and columns of the pixels to use: strong gradients, evenly spread."""
-    height, width = grey.shape
-    cell = max(2, round(np.sqrt(height * width * PER_CELL / count)))
-    cells = (height // cell + 1) * (width // cell + 1)
-    index = np.empty((cells * PER_CELL, 2), np.int32)
-    n = select_pixels(
-        grey, as_contiguous(depth), as_contiguous(weights, np.float32),
-        np.float32(MIN_WEIGHT), cell, PER_CELL, index,
-    )  # fmt: skip
-    return index[:n]
+    cell = max(2, round(np.sqrt(grey.size * PER_CELL / count)))
+    weights = as_contiguous(weights, np.float32)
+    return select_pixels(
+        grey, as_contiguous(depth), weights, np.float32(MIN_WEIGHT), cell, PER_CELL
+    )
 
 
 def reduced(frame: Frame, by: int) -> Frame:
