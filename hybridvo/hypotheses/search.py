@@ -1,8 +1,7 @@
 """Every strong motion in the image, one after the other.
 
 Candidates are poses handed in, robust dense fits of overlapping windows and minimal three-pixel
-samples. The best few of a round are refined, and the pixels that follow the winner, which may be a
-compromise, are set aside before the next one; the others are kept, behind all winners.
+samples. The pixels that follow the winner of a round are set aside before the next one.
 """
 
 from __future__ import annotations
@@ -172,10 +171,8 @@ class _Search:
         """The motion fitted on all pixels that are left, with its noise."""
         pixels = self.samples, self.grid.count, self.K
         steps += coarse_fit.anneal(*pixels, 0.7, 0.5, 0.4, 3, pose)
-        final, caps = pose.copy(), (coarse_fit.FLOW_NOISE_CAP, coarse_fit.DEPTH_NOISE_CAP)
-        sf, sd, share, more = coarse_fit.reestimate(
-            *pixels, 0.5, 0.01, *caps, self.cutoff, 2, 4, coarse_fit.NOISE_PIXELS, final
-        )
+        final, few = pose.copy(), coarse_fit.NOISE_PIXELS
+        sf, sd, share, more = coarse_fit.reestimate(*pixels, self.cutoff, few, final)
         if self._score(final) > 0.95 * self._score(pose):
             pose = final
         return Motion(pose, np.array([share * self.left, sf, sd, source, steps + more], float))

@@ -1,19 +1,12 @@
 """Numba kernels of images and depth maps: residuals and Jacobians of their pixels.
 
-Photometric, per pixel x of the previous image with grey value A, at a pose T (X' = T X,
-a = X'/Z', b = Y'/Z', i = 1/Z'):
-
-- residual r = B(pi(X')) - gain A - offset, B read by cubic convolution (Catmull-Rom): bilinear
-  reading blurs by an amount that depends on the place between the pixels (measured: twice the
-  error on clean images);
-- image gradient G of B at pi(X') from the gradient of A at x, carried over by the warp of a patch
-  of constant depth (inverse compositional, Baker and Matthews, IJCV 2004): the noise of a central
-  difference at x is independent of the noise of A at x, so noise alone moves nothing;
-- Jacobian of r: G^T diag(fx, fy) B_x with respect to the left perturbation (B_x as in
-  :mod:`hybridvo.refinement.kernels`), -A for the gain, -1 for the offset;
-- variance s^2 + sd^2 v_d (G^T q)^2, s the noise of the residual in grey levels, q = d pi(X') /
-  d log Z;
-- robust weight of Geman-McClure, (c^2 / (c^2 + d^2))^2 with d^2 = r^2 / variance.
+- Photometric residual r = B(pi(X')) - gain A - offset, A and B grey values of the previous and the
+  current image, B read by cubic convolution: bilinear reading blurs by an amount that depends on
+  the place between the pixels (measured: twice the error on clean images);
+- gradient of B at pi(X') from that of A at x, carried over by the warp of a patch of constant depth
+  (inverse compositional, Baker and Matthews, IJCV 2004): its noise is independent of that of A;
+- rest as in :mod:`hybridvo.refinement.kernels`; the variance is s^2 + sd^2 v_d (G^T q)^2, s the
+  noise of the residual in grey levels.
 """
 
 from __future__ import annotations

@@ -1,12 +1,8 @@
 """The motion of a pair by its images: one that the flow found made sharper, or one without flow.
 
-With flow its covariance becomes a prior of Student's form around its motion, and the 6x6 normal
-equations of flow, images and depth maps add up. The motion of the flow stays where the images do
-not match along the motion, or lead outside of what the flow allows.
-
-Without flow images and depth maps are followed coarse to fine. Where the motion leaves no region of
-the image unexplained, and the parts of the image agree about it, nothing else moves: it is the
-answer. Else something moves, or the images are too far apart: the flow has to be asked.
+With flow its covariance becomes a prior around its motion, and the 6x6 normal equations of flow,
+images and depth maps add up. Without flow images and depth maps are followed coarse to fine; where
+a region is left unexplained, or the parts of the image disagree, the flow has to be asked.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """Refinement on flow and depth: from a start to a metric motion with covariance and status.
 
-Minimises the ego-flow reprojection error (paper, equations 6 and 8) under a Geman-McClure kernel of
-the Mahalanobis distance. Each pixel's covariance is that of its flow and of its depth, propagated;
-both noise scales are estimated from the pair.
+Minimises the ego-flow reprojection error (paper, equations 6 and 8), weighed by the noise of flow
+and depth, both estimated from the pair, under a Geman-McClure kernel.
 """
 
 from __future__ import annotations

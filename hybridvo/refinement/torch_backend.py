@@ -1,11 +1,8 @@
 """The refinement of a batch of pairs in torch: CPU or GPU, float32 or float64, differentiable.
 
-Every start is refined on a subset of the pixels under a kernel whose scale shrinks; that of least
-cost is fitted to the noise found there, and then to all pixels. Samples never see each other.
-
-The gradient is that of the implicit function theorem: the estimate solves g(T, inputs) = 0 with
-g = sum of w J^T Sigma^-1 r, so d xi = A^-1 dg with A = -dg / d xi, the full derivative. It is
-attached by one Newton step of value zero; noise and covariance carry none.
+The gradient is that of the implicit function theorem: the estimate solves g(T, inputs) = 0, so
+d xi = A^-1 dg with A = -dg / d xi. It is attached by one Newton step of value zero; noise and
+covariance carry none. Samples never see each other.
 """
 
 from __future__ import annotations
@@ -334,11 +331,11 @@ def _noise(
     """(B, 2) noise at a pose, from the coarse grid of the numba refinement; as before where there
     is none.
     """
-    size = batch.depth_prev.shape[1:]
-    step, z = grid_stride(size, options.coarse_pixels), pixels.points[:, 2:]
+    height, width = batch.depth_prev.shape[1:]
+    step, z = grid_stride((height, width), options.coarse_pixels), pixels.points[:, 2:]
     rows = torch.cat([pixels.points[:, :2] / z, z, pixels.target], dim=1)
     more = torch.stack([1 / pixels.flow_variance, pixels.depth_variance, pixels.weight], dim=1)
-    images = torch.cat([rows, more], dim=1).unflatten(2, size)
+    images = torch.cat([rows, more], dim=1).unflatten(2, (height, width))
     samples = images[..., step // 2 :: step, step // 2 :: step].flatten(2).float().cpu().numpy()
     K = batch.K_curr[:, [0, 1, 0, 1], [0, 1, 2, 2]].float().cpu().numpy()
     poses, out = T.matrix()[:, :3].cpu().numpy(), how.noise.tolist()

@@ -53,13 +53,13 @@ class Pixels(NamedTuple):
 
     def map(self, change: Callable[[torch.Tensor], torch.Tensor]) -> Pixels:
         """The same with all but the camera changed."""
-        return Pixels(*(change(x) for x in self[:5]), self.K)
+        return Pixels._make([*(change(x) for x in self[:5]), self.K])
 
     def parts(self, run: int = 1) -> Iterator[Pixels]:
         """All pixels, in whole runs of ``run``, few enough at once to stay in the cache."""
         step = run * max(1, PART // (len(self.weight) * run))
         pieces = [x.split(step, dim=-1) for x in self[:5]]
-        return (Pixels(*piece, self.K) for piece in zip(*pieces, strict=True))
+        return (Pixels._make([*piece, self.K]) for piece in zip(*pieces, strict=True))
 
     def subset(self, count: int) -> Pixels:
         """About ``count`` usable pixels of each sample, spread by the golden section."""
@@ -108,7 +108,7 @@ def gather_pixels(batch: PairBatch, weights: torch.Tensor | None = None) -> Pixe
     target = torch.where(usable[..., None], target, torch.zeros_like(target))
     maps = (points.movedim(3, 1), target.movedim(3, 1), flow_variance, depth_variance)
     weight = torch.where(usable, weight, zero)
-    return Pixels(*(x.flatten(-2) for x in (*maps, weight)), cameras[1])
+    return Pixels._make([*(x.flatten(-2) for x in (*maps, weight)), cameras[1]])
 
 
 def _relative(variance: torch.Tensor, good: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -204,12 +204,15 @@ class Weighted(NamedTuple):
     robust: torch.Tensor
     cost: torch.Tensor  # (B, N) without the external weight; the full one behind the camera
 
-    def jacobian(self) -> torch.Tensor:
-        """J (B, 6, 2, N) of pi(X') in the left tangent."""
+    def rows(self) -> tuple[torch.Tensor, ...]:
+        """Derivatives (B, N) of X'/Z' and Y'/Z' in each direction of the left tangent in turn."""
         (a, b), i = self.ab.unbind(1), self.i
         zero, ab = torch.zeros_like(a), a * b
-        rows = (i, zero, zero, i, -a * i, -b * i, -ab, -1 - b * b, 1 + a * a, ab, -b, a)
-        return torch.stack(rows, dim=1).unflatten(1, (6, 2)) * self.focal[:, None]
+        return (i, zero, zero, i, -a * i, -b * i, -ab, -1 - b * b, 1 + a * a, ab, -b, a)
+
+    def jacobian(self) -> torch.Tensor:
+        """J (B, 6, 2, N) of pi(X') in the left tangent."""
+        return torch.stack(self.rows(), dim=1).unflatten(1, (6, 2)) * self.focal[:, None]
 
     def weighted(self, J: torch.Tensor) -> torch.Tensor:
         """(B, 6, 2, N) w Sigma^-1 J."""
@@ -278,9 +281,10 @@ def newton_matrix(pixels: Pixels, T: pp.LieTensor, how: RobustNoise) -> torch.Te
         matrix.requires_grad_()
         for part in pixels.map(torch.Tensor.detach).parts():
             at = weigh(part, matrix, how)
-            g = at.gradient(at.jacobian()).sum(dim=0)
-            for k in range(6):
-                slopes[k] += torch.autograd.grad(g[k], matrix, retain_graph=k < 5)[0]
+            rows, (u, v) = at.rows(), (at.focal * at.right).unbind(1)
+            for k in range(6):  # each by itself: of a product with all only a sixth would be asked
+                g = (rows[2 * k] * u + rows[2 * k + 1] * v).sum()
+                slopes[k] += torch.autograd.grad(g, matrix, retain_graph=True)[0]
     generators = torch.zeros(6, 4, 4).to(slopes)
     generators[range(3), range(3), 3] = 1
     generators[3:, :3, :3] = pp.vec2skew(torch.eye(3).to(slopes))
