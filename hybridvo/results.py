@@ -98,7 +98,6 @@ class MotionPrediction:
 
     T_curr_prev: np.ndarray
     static_probability: np.ndarray
-    covariance: np.ndarray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,11 +116,11 @@ class Hypothesis:
 
 @dataclass(frozen=True, eq=False)
 class RelativePose:
-    """Camera motion of one pair: the result of every estimator.
+    """Camera motion of one pair: the result of every estimator; the identity where that failed.
 
     ``T_curr_prev`` (4, 4) takes points of the previous camera into the current one, metres; the
     ``covariance`` (6, 6) is that of ``Exp(delta) T_curr_prev``, delta = (translation, rotation) in
-    the current camera; m^2, m rad, rad^2. A failed motion is the identity.
+    the current camera; m^2, m rad, rad^2.
     """
 
     T_curr_prev: np.ndarray = field(default_factory=lambda: np.eye(4))
@@ -197,16 +196,13 @@ class Step:
 
 @dataclass(frozen=True, eq=False)
 class PixelwisePrediction:
-    """Raw output of a pixel-wise network for a batch of pairs (paper, section 3.2).
+    """Raw output of a network for a batch of pairs: T_curr_prev at every pixel (paper, 3.2).
 
-    T_curr_prev at every pixel, and s = log of the Laplace scale U of each of its six numbers, None
-    where the network predicts no uncertainty.
+    Channels: Euler angles X-Y-Z in degrees, R = Rx Ry Rz, then metres. VONet's maps have one pixel.
     """
 
-    rotation: torch.Tensor  # (B, 3, h, w) Euler angles X-Y-Z in degrees, R = Rx Ry Rz
-    translation: torch.Tensor  # (B, 3, h, w) metres
-    log_scale_rotation: torch.Tensor | None = None  # (B, 3, h, w)
-    log_scale_translation: torch.Tensor | None = None
+    motion: torch.Tensor  # (B, 6, h, w)
+    log_scale: torch.Tensor | None = None  # (B, 6, h, w) s = log U, U the Laplace scale of each
     image_size: tuple[int, int] | None = None  # (H, W) of the pairs that the network was given
 
 

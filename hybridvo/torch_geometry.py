@@ -68,9 +68,9 @@ def reproject(
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Where the pixels of the previous frame are seen by the current one: x + ego flow.
 
-    ``depth`` (B, H, W) metres; ``T`` T_curr_prev, (B, 4, 4) or pypose SE3 (B, 7). Returns (B, H, W,
-    2) px; (B, H, W) bool: the depth is valid and the point farther than ``min_depth`` (elsewhere
-    the pixels are finite and mean nothing); (B, H, W) depth of the moved point, else 1.
+    For depth (B, H, W) and T_curr_prev, (B, 4, 4) or pypose SE3 (B, 7): (B, H, W, 2) px; (B, H, W)
+    bool: the depth is valid and the point farther than ``min_depth`` (elsewhere the pixels are
+    finite and mean nothing); (B, H, W) depth of the moved point, else 1.
     """
     if isinstance(T, pp.LieTensor):
         T = T.matrix()
@@ -87,10 +87,10 @@ def reproject(
     return pixels.transpose(1, 2).unflatten(1, depth.shape[1:]), valid & front, z
 
 
-def euler_transform(rotation_deg: torch.Tensor, translation: torch.Tensor) -> torch.Tensor:
-    """(B, 4, 4) of Euler angles X-Y-Z in degrees and metres (B, 3), differentiable everywhere."""
+def euler_transform(motion: torch.Tensor) -> torch.Tensor:
+    """(B, 4, 4) of Euler angles X-Y-Z in degrees, then metres (B, 6); differentiable everywhere."""
     # Written out, not multiplied: a matrix product would run in bfloat16 under autocast.
-    angles = torch.deg2rad(rotation_deg)
+    angles = torch.deg2rad(motion[:, :3])
     cx, cy, cz, sx, sy, sz = torch.cat([angles.cos(), angles.sin()], dim=1).unbind(1)
     rows = (
         (cy * cz, -cy * sz, sy),
@@ -99,11 +99,12 @@ def euler_transform(rotation_deg: torch.Tensor, translation: torch.Tensor) -> to
     )
     R = torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)
     last = R.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(len(R), 1, 4)
-    return torch.cat([torch.cat([R, translation[:, :, None]], dim=2), last], dim=1)
+    return torch.cat([torch.cat([R, motion[:, 3:, None]], dim=2), last], dim=1)
 
 
-def euler_deg(R: torch.Tensor) -> torch.Tensor:
-    """(B, 3) Euler angles X-Y-Z in degrees of rotations (B, 3, 3) = Rx Ry Rz; finite gradient."""
+def euler_motion(T: torch.Tensor) -> torch.Tensor:
+    """(B, 6) of (B, 4, 4), the inverse of :func:`euler_transform`, with a finite gradient."""
+    R = T[:, :3, :3]
     # a quarter turn about y leaves only the sum or difference of the others: rz = 0 there, and no
     # 0 / 0 in the gradient
     locked = R[:, 0, 0] ** 2 + R[:, 0, 1] ** 2 < MIN_COS2
@@ -114,7 +115,7 @@ def euler_deg(R: torch.Tensor) -> torch.Tensor:
         torch.asin(R[:, 0, 2].clamp(-MAX_SIN, MAX_SIN)),
         torch.where(locked, 0.0, -R[:, 0, 1]).atan2(torch.where(locked, 1.0, R[:, 0, 0])),
     )
-    return torch.rad2deg(torch.stack(angles, dim=1))
+    return torch.cat([torch.rad2deg(torch.stack(angles, dim=1)), T[:, :3, 3]], dim=1)
 
 
 def weighted_median(x: torch.Tensor, weight: torch.Tensor, default: float) -> torch.Tensor:

@@ -24,7 +24,7 @@ from scipy.special import logit
 
 from hybridvo import dis_flow, estimate, iter_pairs, open_sequence, refine
 from hybridvo.calibration import MIN_CONFIDENCE, PWVO_RIGHT
-from hybridvo.evaluation.pair_errors import true_motion
+from hybridvo.evaluation.scores import true_motion
 from hybridvo.geometry import pose_matrix
 from hybridvo.hypotheses.selector import select_by_cues
 from hybridvo.images.photometric import direct_start, explained

@@ -22,11 +22,17 @@ import numpy as np
 import torch
 from measuring import ROOT, parser_of, provenance, without_folders
 
-from hybridvo.commands.generate import write_sheet
-from hybridvo.evaluation.drawing import prediction_panels, saliencies, saliency_panels
-from hybridvo.evaluation.plots import Panel, draw_panels, flow_panel, longest_flow
-from hybridvo.files import atomic_write, write_json
-from hybridvo.network.losses import reconstruct
+from hybridvo.commands.train import write_sheet
+from hybridvo.evaluation.drawing import (
+    Panel,
+    flow_panel,
+    longest_flow,
+    prediction_panels,
+    saliencies,
+    saliency_panels,
+    write_panels,
+)
+from hybridvo.files import write_json
 from hybridvo.network.models import load_weights
 from hybridvo.network.selection import select_motion
 from hybridvo.network.weights import PRETRAINED, save_weights
@@ -156,14 +162,14 @@ def uncertainty(network: Any, sample: Any) -> list[Panel]:
     longest = longest_flow(sample.flow)
     total = flow_panel("total flow", sample.flow, longest)
     flows = [total, flow_panel("flow of the objects", objects, longest)]
-    return [*flows, *prediction_panels("PWVO", output, true, sample.moving)]
+    return [*flows, *prediction_panels(output, true, sample.moving)]
 
 
 def factorised(network: Any, sample: Any) -> list[Panel]:
     """Ego and object flow of the estimate beside the true ones."""
     batch, output = predict(network, sample)
     T, gt = select_motion(output), batch.targets
-    ego = reconstruct(gt.depth_prev, T, gt.K_prev, gt.K_curr)[0][0].permute(1, 2, 0).numpy()
+    ego = gt.reconstruct(T)[0][0].permute(1, 2, 0).numpy()
     longest = longest_flow(sample.flow)
     flows = {
         "ego flow, estimate": ego,
@@ -176,8 +182,7 @@ def factorised(network: Any, sample: Any) -> list[Panel]:
 
 def write(path: Path, panels: list[Panel], heading: str) -> None:
     """Panels as a PNG."""
-    with atomic_write(path, "wb") as file:
-        file.write(draw_panels(panels, heading, 2.0))
+    write_panels(path, panels, heading, 2.0)
     print(path)
 
 

@@ -126,7 +126,7 @@ def round_trip(count: int, height: int, width: int) -> tuple[list[hvo.Frame], li
     seen = {k: scene.render(k) for k in set(path)}
     for index, at in enumerate(path):
         depth = np.where(np.isfinite(seen[at].depth), seen[at].depth, 0)
-        frames.append(hvo.Frame(seen[at].rgb, depth, scene.cameras[at], index / 24, index))
+        frames.append(hvo.Frame(seen[at].rgb, depth, scene.camera, index / 24, index))
         truth.append(invert(scene.T_world_cam[0]) @ scene.T_world_cam[at])
     return frames, truth
 

@@ -12,7 +12,7 @@ import os
 import platform
 import re
 import shutil
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from collections.abc import Sequence as Several
 from dataclasses import replace
 from pathlib import Path
@@ -25,9 +25,8 @@ from hybridvo.commands.run import flow_provider, frames_of, run, weights_hash
 from hybridvo.data.sequence import Sequence, open_sequence
 from hybridvo.errors import HybridVOError, InputError
 from hybridvo.evaluation import scores
-from hybridvo.evaluation.pair_errors import ERRORS, pair_facts, true_motion, true_trajectory
 from hybridvo.evaluation.report import write_report
-from hybridvo.files import Mode, atomic_write, held, make_folder, versions, write_json
+from hybridvo.files import Mode, atomic_write, held, versions, write_json
 from hybridvo.network.models import Models
 from hybridvo.options import Options
 from hybridvo.pipeline import METHODS, check_method
@@ -35,7 +34,6 @@ from hybridvo.pipeline import METHODS, check_method
 _logger = logging.getLogger(__name__)
 WRITTEN = ("results.json", "results.csv", "pairs.csv", "report.md", "report.html")
 """What a finished comparison leaves, beside ``runs/``."""
-CAMERA_FLOW_KINDS = ("tartanair",)  # whose true flow does not show what moves by itself
 
 
 def compare(
@@ -68,22 +66,17 @@ def compare(
             f"{out}: holds {', '.join(present)}; pass --resume to go on, --overwrite to replace "
             f"them, or another --out."
         )
-    given = {"models": models, "command": list(command), "quiet": quiet}
+    given: dict[str, Any] = {"models": models, "command": list(command), "quiet": quiet}
     given |= {"mode": "resume", "picture": False}
     with held(out):
         if mode == "overwrite":
             shutil.rmtree(out / "runs", ignore_errors=True)
-        make_folder(out / "runs")
         for name, reason in missing.items():
             _logger.warning("not run: %s: %s", name, reason)
-        tables, rows, facts = [], [], []
-        for job in jobs:
-            runs = _run_all(job, names, options, given, missing)
-            table, fact = _read(job, runs, protocol is not None)
-            rows += [_row(job, table, method, run) for method, run in runs.items()]
-            tables.append(table)
-            facts.append(fact)
-        table = pd.concat(tables, ignore_index=True)
+        scored = [_score(job, names, options, given, missing, protocol) for job in jobs]
+        table = pd.concat([found for found, _, _ in scored], ignore_index=True)
+        rows = [row for _, some, _ in scored for row in some]
+        facts = [fact for _, _, fact in scored]
         totals = [
             scores.total_row(pairs, [r for r in rows if (r["method"], r["flow_source"]) == key])
             for key, pairs in table.groupby(["method", "flow_source"], sort=False)
@@ -144,11 +137,10 @@ def open_all(path: str | os.PathLike[str], dataset: str | None = None) -> list[S
 
 
 class _Job(NamedTuple):
-    """One sequence, and where its runs are."""
+    """One sequence, where its flow comes from, and where its runs are."""
 
     sequence: Sequence
-    name: str  # of its own
-    flow: str  # where it comes from
+    flow: str
     folder: Path
 
 
@@ -159,37 +151,44 @@ def _jobs(
     jobs: list[_Job] = []
     for sequence in (sequence for path in paths for sequence in open_all(path, dataset)):
         frames_of(sequence, options)
-        flow = flow_provider(sequence, options)[1]
-        name, count = sequence.name, 1
-        while name in (job.name for job in jobs):
+        own, count = sequence.name, 1
+        while sequence.name in (job.sequence.name for job in jobs):
             count += 1
-            name = f"{sequence.name}_{count}"
-        folder = out / "runs" / re.sub(r"[^\w.-]", "_", name)
-        jobs.append(_Job(sequence, name, flow, folder))
+            sequence.name = f"{own}_{count}"
+        folder = out / "runs" / re.sub(r"[^\w.-]", "_", sequence.name)
+        jobs.append(_Job(sequence, flow_provider(sequence, options)[1], folder))
     if not jobs:
         raise InputError("compare: expected at least one folder of a sequence, got none.")
     return jobs
 
 
-def _run_all(
+def _score(
     job: _Job,
     methods: Iterable[str],
     options: Options,
     given: dict[str, Any],
     missing: dict[str, str],
-) -> dict[str, dict[str, Any]]:
-    """Summaries of the runs by method; a bug of one costs its run, and is told in ``missing``."""
-    runs = {}
+    protocol: str | None,
+) -> tuple[pd.DataFrame, list[dict[str, Any]], dict[str, Any]]:
+    """Run the methods on a sequence: all pairs, a line for each method, what is said of it."""
+    metrics, name = {}, job.sequence.name
     for method in methods:
         asked = replace(options, run=replace(options.run, method=method, max_failed=1.0))
         try:
-            runs[method], _ = run(job.sequence, job.folder / method, asked, **given)
+            metrics[method] = run(job.sequence, job.folder / method, asked, **given)[0]["metrics"]
         except HybridVOError:
             raise
-        except Exception as error:
-            missing[f"{method} on {job.name}"] = f"{type(error).__name__}: {error}"
-            _logger.exception("%s on %s", method, job.name)
-    return runs
+        except Exception as error:  # a bug of one method costs its run
+            missing[f"{method} on {name}"] = f"{type(error).__name__}: {error}"
+            _logger.exception("%s on %s", method, name)
+    table, fact = _read(job, metrics, protocol is not None)
+    rows = []
+    for method, path in metrics.items():
+        named = {"sequence": name, "method": method, "flow_source": job.flow}
+        named["depth_source"] = job.sequence.depth_source
+        row = scores.sequence_row(table[table["method"] == method], path, named)
+        rows.append(row | {"trajectory": f"runs/{job.folder.name}/{method}/trajectory.tum"})
+    return table, rows, fact
 
 
 def _read(
@@ -207,14 +206,13 @@ def _read(
             reason = f"frame cannot be read: {row.message}"
             left_out.append({"index": row.next, "reason": reason})
         else:
-            facts.append({"next": row.next} | _facts(sequence, *pair))
+            facts.append({"next": row.next} | scores.pair_facts(sequence, *pair))
     table = table.merge(pd.DataFrame(facts, columns=["next", *scores.FACTORS]), "left", "next")
-    gt = true_trajectory(sequence, range(len(sequence)))
+    gt = scores.true_trajectory(sequence, range(len(sequence)))
     if gt is not None:
         gt.save(job.folder / "ground_truth.tum")
     return scores.pair_table(table.sort_values("index", kind="stable")), {
-        "name": job.name,
-        "kind": sequence.kind,
+        "name": sequence.name,
         "path": str(sequence.root),
         "pairs_scored": table["next"].nunique(),
         "left_out": left_out,
@@ -232,9 +230,9 @@ def _pairs(job: _Job, method: str) -> pd.DataFrame:
     stride = int(np.diff(steps["index"][:2]).sum())
     steps = steps[steps["prev_index"].notna()].fillna({"reason": "", "message": ""})
     missing = steps["reason"] == "missing_frame"
-    steps.loc[missing, [*ERRORS, "motion_ms", "flow_ms"]] = np.nan
+    steps.loc[missing, [*scores.ERRORS, "motion_ms", "flow_ms"]] = np.nan
     return steps.assign(
-        sequence=job.name,
+        sequence=job.sequence.name,
         method=method,
         flow_source=job.flow,
         status=steps["status"] + steps["reason"].map(lambda why: f"({why})" if why else ""),
@@ -244,22 +242,3 @@ def _pairs(job: _Job, method: str) -> pd.DataFrame:
         index=steps["index"] - stride,
         missing=missing,
     )
-
-
-def _row(job: _Job, table: pd.DataFrame, method: str, run: Mapping[str, Any]) -> dict[str, Any]:
-    """Line of the results of a run."""
-    source = {"flow_source": job.flow, "depth_source": job.sequence.depth_source}
-    named = {"sequence": job.name, "method": method, **source}
-    line = scores.sequence_row(table[table["method"] == method], run["metrics"], named)
-    return line | {"trajectory": f"runs/{job.folder.name}/{method}/trajectory.tum"}
-
-
-def _facts(sequence: Sequence, prev: int, curr: int) -> dict[str, Any]:
-    """What may explain an error. The true flow serves for this alone: no estimate ever sees it."""
-    T_gt, flow_gt = true_motion(sequence, prev, curr), None
-    whole = sequence.flow_is_true and sequence.kind not in CAMERA_FLOW_KINDS
-    if whole and curr == prev + 1:
-        with contextlib.suppress(InputError, OSError):
-            flow_gt = sequence.flow(prev)[0]
-    cameras = sequence.camera(prev), sequence.camera(curr)
-    return pair_facts(T_gt, sequence.frame(prev).depth, *cameras, flow_gt)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,6 @@ import numpy as np
 
 from hybridvo.commands.compare import compare
 from hybridvo.errors import InputError
-from hybridvo.files import make_folder, write_json
 from hybridvo.options import FlowOptions, Options
 from hybridvo.synthetic.render import write_sintel
 from hybridvo.synthetic.scenes import make_scene
@@ -26,7 +24,6 @@ METHODS = {
     "identity": "identity (no motion)",
 }
 """Methods of the demo and what its table calls them."""
-MARK = "hybridvo_demo.json"  # tells a demo's own folder, which may be replaced
 SCENE, HEIGHT, WIDTH = "light", 218, 512
 
 
@@ -39,22 +36,14 @@ def demo(
     command: Iterable[str] = (),
     quiet: bool = False,
 ) -> dict[str, Any]:
-    """Render a scene in Sintel's layout under ``out/data``, run and compare; JSON-ready.
-
-    Flow is OpenCV's DIS, never the true flow that is written beside it; depth is the renderer's.
-    """
+    """Render a scene under ``out/data``, and compare on DIS flow and true depth; JSON-ready."""
     if frames < 2:
         raise InputError(f"demo: expected at least 2 frames, got {frames}.")
-    out = Path(out)
-    make_folder(out)
-    if any(out.iterdir()) and not (overwrite and (out / MARK).is_file()):
-        raise InputError(f"{out}: is not empty. Pass --overwrite to replace a demo, or --out.")
-    shutil.rmtree(out / "data", ignore_errors=True)
-    write_json(out / MARK, {})
+    out, name = Path(out), f"{SCENE}_{seed}_{frames}"
     scene = make_scene(SCENE, seed, height=HEIGHT, width=WIDTH, frames=frames)
-    write_sintel(scene, out / "data", SCENE)
+    write_sintel(scene, out / "data", name)
     compare(
-        [out / "data" / "training" / "clean" / SCENE],
+        [out / "data" / "training" / "clean" / name],
         out,
         methods=tuple(METHODS),
         options=Options(flow=FlowOptions(source="dis")),
@@ -62,27 +51,22 @@ def demo(
         command=command,
         quiet=quiet,
     )
-    rows = [
-        {
-            "method": METHODS[row["method"]],
-            "ate_cm": 100.0 * row["ate_rmse_origin"],
-            "rotation_deg": row["rot_err_deg_mean"],
-            "epe_px": row["epe_l2_px"],
-            "failed": row["failed"],
-            "frame_ms": row["ms_per_pair_median"] + row["flow_ms_median"],
-        }
-        for row in json.loads((out / "results.json").read_text(encoding="utf-8"))["rows"]
-    ]
-    moving = float(np.median([(scene.object_id(i) > 0).mean() for i in range(scene.frames)]))
-    content = {
-        "command": list(command),
+    results = json.loads((out / "results.json").read_text(encoding="utf-8"))
+    return {
         "scene": {"kind": SCENE, "seed": seed, "frames": frames, "height": HEIGHT, "width": WIDTH},
-        "moving_fraction": moving,
-        "flow_source": "dis",
-        "depth_source": "true",
-        "alignment": "origin",
-        "rows": rows,
+        "moving_fraction": float(
+            np.median([(scene.object_id(i) > 0).mean() for i in range(scene.frames)])
+        ),
+        "rows": [
+            {
+                "method": METHODS[row["method"]],
+                "ate_cm": 100.0 * row["ate_rmse_origin"],
+                "rotation_deg": row["rot_err_deg_mean"],
+                "epe_px": row["epe_l2_px"],
+                "failed": row["failed"],
+                "frame_ms": row["ms_per_pair_median"] + row["flow_ms_median"],
+            }
+            for row in results["rows"]
+        ],
         "report": os.fspath(out / "report.html"),
     }
-    write_json(out / MARK, content)
-    return content

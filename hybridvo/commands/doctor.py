@@ -1,7 +1,4 @@
-"""``hybridvo doctor``: what is installed here, which methods can run, what is wrong with data.
-
-Of a sequence three questions are asked; what the data do not show is said to be unknown.
-"""
+"""``hybridvo doctor``: what is installed here, which methods can run, what is wrong with data."""
 
 from __future__ import annotations
 
@@ -11,14 +8,14 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from hybridvo.api import estimate
 from hybridvo.calibration import DOUBTFUL_SPREAD
 from hybridvo.commands.compare import methods_to_run
 from hybridvo.data.sequence import Sequence
 from hybridvo.errors import InputError
-from hybridvo.evaluation.pair_errors import true_motion
+from hybridvo.evaluation.scores import true_motion
 from hybridvo.files import versions
 from hybridvo.flow import contradiction, dis_flow, file_flow, with_flow
+from hybridvo.pipeline import estimate
 from hybridvo.refinement.covariance import direction_is_known
 from hybridvo.refinement.depth import compare_depths
 from hybridvo.types import Frame, FramePair, depth_advice, typical_depth
@@ -62,14 +59,18 @@ def diagnose(sequence: Sequence, *, pairs: int = 40) -> dict[str, Any]:
         rows[index] = _measure(sequence, *frames)
     columns = ["depth", "length", "depth_ratio", "contradiction"]
     table = pd.DataFrame(list(rows.values()), index=list(rows), columns=columns)
-    findings = [question(table) for question in (_units, _depth_steps, _images_against_flow)]
+    answers = {name: question(table) for name, question in QUESTIONS.items()}
+    states = {None: "cannot_tell", True: "differs", False: "agrees"}
     return {
         "sequence": sequence.name,
         "frames": len(sequence),
         "pairs": len(rows),
         "unreadable": list(dict.fromkeys(unreadable)),
-        "findings": findings,
-        "ok": all(finding["state"] != "differs" for finding in findings),
+        "findings": [
+            {"name": name, "state": states[differs], "message": message}
+            for name, (differs, message) in answers.items()
+        ],
+        "ok": not any(differs for differs, _ in answers.values()),
     }
 
 
@@ -85,8 +86,6 @@ def _measure(sequence: Sequence, prev: Frame, curr: Frame) -> dict[str, Any]:
         on_file = with_flow(bare, file_flow(sequence, strict=False))
         pair["contradiction"] = None if on_file.flow is None else contradiction(on_file) or ""
     by_dis = with_flow(bare, dis_flow())
-    if prev.depth is None or by_dis.flow is None:
-        return pair
     motion = estimate(by_dis, method="refine")
     if not motion.usable:
         return pair
@@ -100,58 +99,54 @@ def _measure(sequence: Sequence, prev: Frame, curr: Frame) -> dict[str, Any]:
     return pair
 
 
-# -- questions: of what is known of the pairs, by their first frame -------------------------------
+# -- questions: of the pairs by their first frame; whether they differ (None: unknown), and why ----
 
 
-def _finding(name: str, differs: bool | None, message: str, value: Any = None) -> dict[str, Any]:
-    state = "cannot_tell" if differs is None else "differs" if differs else "agrees"
-    return {"name": name, "state": state, "message": message, "value": value}
-
-
-def _units(table: pd.DataFrame) -> dict[str, Any]:
-    name, depths = "depth units", table["depth"].dropna().astype(float)
+def _units(table: pd.DataFrame) -> tuple[bool | None, str]:
+    depths, scales = table["depth"].dropna().astype(float), table["length"].dropna().astype(float)
     if depths.empty:
-        return _finding(name, None, "no frame has valid depth")
-    median, scales = float(depths.median()), table["length"].dropna().astype(float)
-    text, advice = f"median depth {median:.3g} m", depth_advice(median)
+        return None, "no frame has valid depth"
+    text, advice = f"median depth {depths.median():.3g} m", depth_advice(float(depths.median()))
     if len(scales) < MIN_PAIRS:
         if advice:
-            text += f", which cannot be metres; probable remedy: {advice}"
-            return _finding(name, True, text, median)
+            return True, f"{text}, which cannot be metres; probable remedy: {advice}"
         # all depths and all translations times s project to the same pixels: no pair can tell
-        text += f"; {len(scales)} pairs with a true motion, {MIN_PAIRS} needed"
-        return _finding(name, None, text, median)
+        return None, f"{text}; {len(scales)} pairs with a true motion, {MIN_PAIRS} needed"
     low, value, high = scales.quantile([0.25, 0.5, 0.75]).tolist()
     text += f"; motions are {value:.4g} times as long as the poses on file say"
-    differs = abs(value - 1) > MAX_SCALE_ERROR and not low < 1 < high
-    if differs:
-        remedy = f"divide by {value:.4g}" if value > 1 else f"multiply by {1 / value:.4g}"
-        text += f": depth: {advice or remedy}"
-    return _finding(name, differs, text, value)
+    if abs(value - 1) <= MAX_SCALE_ERROR or low < 1 < high:
+        return False, text
+    remedy = f"divide by {value:.4g}" if value > 1 else f"multiply by {1 / value:.4g}"
+    return True, f"{text}: depth: {advice or remedy}"
 
 
-def _depth_steps(table: pd.DataFrame) -> dict[str, Any]:
-    name, ratios = "depth from frame to frame", table["depth_ratio"].dropna().astype(float)
+def _depth_steps(table: pd.DataFrame) -> tuple[bool | None, str]:
+    ratios = table["depth_ratio"].dropna().astype(float)
     if ratios.empty:
-        return _finding(name, None, "no pair has a motion and depth in both frames")
+        return None, "no pair has a motion and depth in both frames"
     sizes = np.log(ratios.clip(lower=1e-30)).abs()
     steps, k = int((sizes > DOUBTFUL_SPREAD).sum()), sizes.idxmax()
     text = (
         f"depth changes its scale in {steps} of {len(ratios)} pairs, most from frame {k} "
         f"to the next (times {ratios[k]:.3g})"
     )
-    if steps:
-        text += ": files of several units, or a scale of its own in every frame"
-    return _finding(name, steps > 0, text, float(ratios[k]))
+    cause = ": files of several units, or a scale of its own in every frame"
+    return steps > 0, text + cause * (steps > 0)
 
 
-def _images_against_flow(table: pd.DataFrame) -> dict[str, Any]:
-    name, known = "images against flow", table["contradiction"].dropna()
+def _images_against_flow(table: pd.DataFrame) -> tuple[bool | None, str]:
+    known = table["contradiction"].dropna()
     if known.empty:
-        return _finding(name, None, "no pair has images and a flow on file")
+        return None, "no pair has images and a flow on file"
     against = known[known != ""]
-    share = len(against) / len(known)
     text = f"the flow contradicts the images in {len(against)} of {len(known)} pairs"
-    if share > MAX_CONTRADICTED:
-        text += f"; frame {against.index[0]}: {against.iloc[0]}"
-    return _finding(name, share > MAX_CONTRADICTED, text, share)
+    if len(against) <= MAX_CONTRADICTED * len(known):
+        return False, text
+    return True, f"{text}; frame {against.index[0]}: {against.iloc[0]}"
+
+
+QUESTIONS = {
+    "depth units": _units,
+    "depth from frame to frame": _depth_steps,
+    "images against flow": _images_against_flow,
+}

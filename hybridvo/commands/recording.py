@@ -5,13 +5,15 @@ from __future__ import annotations
 import os
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from hybridvo.data.sequence import Sequence
 from hybridvo.errors import InputError
-from hybridvo.evaluation.plots import flow_colours
+from hybridvo.evaluation.drawing import flow_colours
+from hybridvo.evaluation.scores import true_trajectory
 from hybridvo.files import atomic_write
+from hybridvo.geometry import invert
 from hybridvo.results import Step
 from hybridvo.types import Frame
 
@@ -28,32 +30,26 @@ def check_recording(path: str | os.PathLike[str]) -> None:
 
 
 class Recording:
-    """Writes a recording as the frames come in; ``poses`` are the true T_world_cam."""
+    """Writes a recording as the ``frames`` of a sequence come in, beside its true path."""
 
-    def __init__(
-        self, path: str | os.PathLike[str], name: str, frames: int, poses: np.ndarray | None
-    ) -> None:
+    def __init__(self, path: str | os.PathLike[str], sequence: Sequence, frames: range) -> None:
         import rerun
 
         self.path = Path(path)
         with atomic_write(self.path, "wb"):
             pass  # Rerun reports a bad path only later, in a thread
         self._rr = rerun
-        self._stride = max(1, -(-frames // MAX_IMAGES))
+        self._stride = -(-len(frames) // MAX_IMAGES)
         self._positions: list[np.ndarray] = []
-        self._stream = rerun.RecordingStream(f"hybridvo {name}")
+        self._stream = rerun.RecordingStream(f"hybridvo {sequence.name}")
         self._stream.save(self.path)
         self._stream.log("world", rerun.ViewCoordinates.RIGHT_HAND_Y_DOWN, static=True)
-        known = [] if poses is None else poses[np.isfinite(poses).all(axis=(1, 2))]
-        if len(known):
-            line = (np.linalg.inv(known[0]) @ known)[:, :3, 3]
+        if (truth := true_trajectory(sequence, frames)) is not None:
+            line = truth.transformed(invert(truth.T_world_cam[0])).positions
             strip = rerun.LineStrips3D([line], colors=[140, 140, 140])
             self._stream.log("world/ground_truth", strip, static=True)
 
-    def __enter__(self) -> Recording:
-        return self
-
-    def __exit__(self, *error: object) -> None:
+    def close(self) -> None:
         """Write what is still in memory; the file is complete afterwards."""
         if len(self._positions) > 1:
             strip = self._rr.LineStrips3D([np.array(self._positions)], colors=[0, 114, 178])
@@ -83,18 +79,17 @@ class Recording:
         self._positions.append(T[:3, 3].astype(np.float32))
 
     def _images(self, frame: Frame, step: Step, flow: np.ndarray | None) -> None:
-        rr, log = self._rr, self._stream.log
+        rr, log, weights = self._rr, self._stream.log, step.motion.weights
         stride = -(-max(frame.camera.shape) // MAX_SIDE)
-
-        def shrunk(image: np.ndarray) -> Any:
-            return rr.Image(np.ascontiguousarray(image[::stride, ::stride])).compress(70)
-
         height, width = (-(-size // stride) for size in frame.camera.shape)
         K = np.diag([1 / stride, 1 / stride, 1.0]) @ frame.camera.K
         log("world/camera/image", rr.Pinhole(image_from_camera=K, width=width, height=height))
-        if frame.rgb is not None:
-            log("world/camera/image", shrunk(frame.rgb))
-        if flow is not None:
-            log("flow", shrunk(flow_colours(flow)))
-        if step.motion.weights is not None:
-            log("weights", shrunk((255 * np.clip(step.motion.weights, 0, 1)).astype(np.uint8)))
+        images = {
+            "world/camera/image": frame.rgb,
+            "flow": None if flow is None else flow_colours(flow),
+            "weights": None if weights is None else (255 * np.clip(weights, 0, 1)).astype(np.uint8),
+        }
+        for name, image in images.items():
+            if image is not None:
+                small = np.ascontiguousarray(image[::stride, ::stride])
+                log(name, rr.Image(small).compress(70))

@@ -7,27 +7,27 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import json
 import os
-import platform
 import re
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
+from rich import progress
+from rich.console import Console
 
-import hybridvo
-from hybridvo.commands.progress import Progress
 from hybridvo.commands.recording import Recording, check_recording
-from hybridvo.commands.run_folder import RESULTS, STATE, RunFolder
 from hybridvo.data.sequence import Sequence
 from hybridvo.errors import InputError
+from hybridvo.evaluation.drawing import plot_trajectory
 from hybridvo.evaluation.metrics import evaluate
-from hybridvo.evaluation.pair_errors import mean_pair_errors, step_errors, true_trajectory
-from hybridvo.evaluation.plots import plot_trajectory
+from hybridvo.evaluation.scores import ERRORS, pair_scores, pair_table, step_errors, true_trajectory
 from hybridvo.files import Mode, atomic_write, fingerprint, held, versions, write_json
 from hybridvo.flow import FlowProvider, MeasuredFlow, dis_flow, file_flow
 from hybridvo.geometry import se3_log
@@ -37,9 +37,24 @@ from hybridvo.options import Options, RunOptions
 from hybridvo.pipeline import NETWORKS, check_method
 from hybridvo.trajectory import Trajectory
 
-RECORDING = "recording.rrd"
+STATE, STEPS, CHECKPOINT, RECORDING = "run.json", "steps.csv", "checkpoint.json", "recording.rrd"
+RESULTS = (
+    *("trajectory.tum", "trajectory.kitti", "trajectory.png"),
+    *(STEPS, "steps.npz", "metrics.json", RECORDING),
+)
+"""Files that a finished run may leave beside ``run.json``."""
 ARRAYS = ("index", "timestamp", "status", "probability", "T_curr_prev", "covariance")
 """Columns of the steps in ``steps.npz``."""
+STEP_COLUMNS = (
+    *("index", "timestamp", "status", "reason", "probability"),
+    *("tx", "ty", "tz", "rx", "ry", "rz"),
+    *("inlier_ratio", "iterations", "cost", "flow_ms", "motion_ms", "frame_ms"),
+    *("prev_index", "flow_source", "message"),
+    *ERRORS,
+)
+DECIDING = ("input_hash", "weights", "options.", "versions.hybridvo")
+FREE = ("options.run.max_failed", "options.run.strict", "options.run.device")
+"""Beginnings of the keys in ``run.json`` that a resumed run shares, and those that it need not."""
 SAVE_EVERY = 50  # frames after which the run can be resumed
 
 
@@ -72,53 +87,91 @@ def run(
         raise InputError(f"{out}: holds frames of the sequence; choose another --out.")
     vo = Odometry(models, flow=flow, method=method, options=options, seed=options.run.seed)
     vo.warm_up()  # before the folder is taken: it may last
-    header = _header(sequence, options, weights_hash(method, models))
-    header["command"] = list(command)
+    header = {
+        "command": list(command),
+        "input_hash": fingerprint(sequence.files()),
+        "versions": versions(),
+        "weights": weights_hash(method, models),
+        "options": dataclasses.asdict(options),
+        "sequence": os.fspath(sequence.root),
+    }
     with held(out), contextlib.ExitStack() as stack:
         folder = RunFolder(out, header, mode)
         summary = folder.summary
         if summary is None:
-            recording = None
+            this = _Run(sequence, frames, vo, flow, folder)
             if rrd is not None:
-                poses = None if sequence.poses is None else sequence.poses[list(frames)]
-                recording = Recording(rrd or out / RECORDING, sequence.name, len(frames), poses)
-                stack.enter_context(recording)
-            _estimate(vo, flow, sequence, frames, folder, recording, quiet)
-            given = (out, folder.rows, sequence, frames, options.run)
-            summary = _write_results(*given, picture=picture)
+                this.recording = Recording(rrd or out / RECORDING, sequence, frames)
+                stack.callback(this.recording.close)
+            this.estimate(quiet)
+            summary = this.write_results(picture)
             folder.save("done", summary=summary)
-            if recording is not None:
-                summary["recording"] = os.fspath(recording.path)
+            if this.recording is not None:
+                summary["recording"] = os.fspath(this.recording.path)
     too_many = summary["failed_fraction"] > options.run.max_failed
     return summary, 3 if too_many else 0
 
 
-def _estimate(
-    vo: Odometry,
-    flow: MeasuredFlow,
-    sequence: Sequence,
-    frames: range,
-    folder: RunFolder,
-    recording: Recording | None,
-    quiet: bool,
-) -> None:
-    """Track the frames that the folder has no rows of yet."""
-    label, rows = f"{sequence.name} [{vo.method}]", folder.rows
-    with Progress(label, len(frames), "frames", quiet=quiet, done=len(rows)) as progress:
-        for warning in sequence.warnings:
-            progress.say(f"warning: {warning}")
-        if folder.tracker is not None:
-            vo.resume(_restored(folder.tracker, sequence))
-            progress.say(f"resumed after {len(rows)} of {len(frames)} frames")
-        for index in frames[len(rows) :]:
-            rows.append(row := _track(vo, flow, sequence, index, recording))
-            if row["status"] != "ok":
-                text = f"frame {index}: {row['status']} ({row['reason']}), probability "
-                progress.say(f"{text}{row['probability']:.2f}: {row['message']}")
-            progress.show(len(rows), sum(row["status"] == "failed" for row in rows))
-            if len(rows) % SAVE_EVERY == 0:
-                folder.save_rows(_saved(vo.state))
-        folder.save_rows()
+class RunFolder:
+    """The output folder of one run: ``rows`` of its finished frames, JSON-ready.
+
+    ``header`` is what ``run.json`` says. ``new`` refuses a folder with results, ``overwrite``
+    removes those (and no other files), ``resume`` goes on where all that decides is the same:
+    ``tracker`` is then the state after the rows, or ``summary`` that of a complete run.
+    """
+
+    def __init__(self, path: Path, header: Mapping[str, Any], mode: Mode = "new") -> None:
+        self.path, self.header = path, json.loads(json.dumps(header))
+        self.rows: list[dict[str, Any]] = []
+        self.tracker = self.summary = None
+        present = [name for name in (STATE, *RESULTS) if os.path.lexists(path / name)]
+        if present and mode == "new":
+            raise InputError(
+                f"{path}: holds results of a run already ({', '.join(present[:3])}). Pass "
+                f"--overwrite to replace them, --resume to go on, or another --out."
+            )
+        if present and mode == "resume":
+            self._load()
+        if self.summary is None:
+            self.save("running")
+            for name in () if self.rows else (CHECKPOINT, *RESULTS):
+                (path / name).unlink(missing_ok=True)
+
+    def _load(self) -> None:
+        """Rows and tracker of an earlier run of the same input, options and weights."""
+        try:
+            before = json.loads((self.path / STATE).read_text(encoding="utf-8"))
+            both = pd.json_normalize([before, self.header | {"state": before["state"]}]).map(str)
+            both = both[[key for key in both if key.startswith(DECIDING) and key not in FREE]]
+        except (OSError, ValueError, KeyError):
+            raise InputError(
+                f"{self.path}: no {STATE} of a run to resume. Pass --overwrite to start anew."
+            ) from None
+        for key, (then, now) in both.items():
+            if then != now:
+                raise InputError(
+                    f"{self.path}: cannot be resumed: {key} differs ({then[:40]} then, {now[:40]} "
+                    f"now). Pass --overwrite to start anew."
+                )
+        self.summary = before.get("summary")
+        if self.summary is None and (self.path / CHECKPOINT).is_file():
+            self.rows, self.tracker = json.loads((self.path / CHECKPOINT).read_bytes())
+
+    def save(self, state: str, **more: Any) -> None:
+        """Write ``run.json``; ``state`` is ``running`` or ``done``: the results are written."""
+        content = {**self.header, **more, "state": state, "frames_done": len(self.rows)}
+        write_json(self.path / STATE, content)
+        if state == "done":
+            (self.path / CHECKPOINT).unlink(missing_ok=True)
+
+    def save_rows(self, tracker: Mapping[str, Any] | None = None) -> None:
+        """Write ``steps.csv``, and with the tracker's state after the rows the checkpoint."""
+        with atomic_write(self.path / STEPS) as file:
+            table = pd.DataFrame(self.rows, columns=[*STEP_COLUMNS], dtype=object)
+            table.to_csv(file, index=False, lineterminator="\n")
+        if tracker is not None:
+            with atomic_write(self.path / CHECKPOINT) as file:
+                file.write(json.dumps([self.rows, tracker], default=np.ndarray.tolist))
 
 
 def _saved(state: TrackerState) -> dict[str, Any]:
@@ -138,84 +191,119 @@ def _restored(saved: dict[str, Any], sequence: Sequence) -> TrackerState:
     return TrackerState(**arrays(saved) | {"frame": frame, "motion_model": model})
 
 
-def _track(
-    vo: Odometry, flow: MeasuredFlow, sequence: Sequence, index: int, recording: Recording | None
-) -> dict[str, Any]:
-    """What is kept of a frame, JSON-ready: the columns of ``steps.csv`` and more."""
-    prev, frame, ms = vo.state.frame, None, 0.0
-    flow.reset()
-    try:
-        frame = sequence.frame(index)
-    except (InputError, OSError) as error:
-        if vo.options.run.strict:
-            raise InputError(f"frame {index}: {error}") from error
-        step = vo.skip(index, float(sequence.timestamps[index]), str(error))
-    else:
-        started = time.perf_counter()
-        step = vo.track(frame)
-        ms = 1e3 * (time.perf_counter() - started)
-    field = flow.last
-    if frame is not None and recording is not None:
-        recording.add(frame, step, field.flow)
-    motion = step.motion
-    values = [*motion.T_curr_prev[:3, 3].tolist(), *se3_log(motion.T_curr_prev)[3:].tolist()]
-    return {
-        "index": step.index,
-        "timestamp": step.timestamp,
-        "status": step.status.state.value,
-        "reason": step.status.reason.value,
-        "probability": float(motion.probability),
-        **dict(zip("tx ty tz rx ry rz".split(), values, strict=True)),
-        "inlier_ratio": float(motion.inlier_ratio),
-        "iterations": int(motion.iterations),
-        "cost": float(motion.cost),
-        "flow_ms": round(flow.ms, 3),
-        "motion_ms": round(ms - flow.ms, 3),
-        "frame_ms": round(ms, 3),
-        "prev_index": None if prev is None else prev.index,
-        "flow_source": field.source,
-        "message": " ".join(step.status.message.split()),
-        "T_curr_prev": motion.T_curr_prev.tolist(),
-        "T_world_cam": step.T_world_cam.tolist(),
-        "covariance": motion.covariance.tolist(),
-        "flow_is_true": field.flow is not None and field.is_true,
-        **step_errors(sequence, prev, step.index, step.T_curr_prev),
-    }
+@dataclass
+class _Run:
+    """A sequence, what tracks it, and the folder of the results."""
 
+    sequence: Sequence
+    frames: range
+    vo: Odometry
+    flow: MeasuredFlow
+    folder: RunFolder
+    recording: Recording | None = None
 
-def _write_results(
-    folder: Path,
-    rows: list[dict[str, Any]],
-    sequence: Sequence,
-    frames: range,
-    options: RunOptions,
-    *,
-    picture: bool,
-) -> dict[str, Any]:
-    """Write what a finished run leaves beside its steps; its summary, JSON-ready."""
-    table, gt = pd.DataFrame(rows), true_trajectory(sequence, frames)
-    columns: dict[str, Any] = {name: np.array(table[name].tolist()) for name in ARRAYS}
-    trajectory = Trajectory(columns["timestamp"], np.array(table["T_world_cam"].tolist()))
-    trajectory.save(folder / "trajectory.tum")
-    trajectory.save(folder / "trajectory.kitti")
-    with atomic_write(folder / "steps.npz", "wb") as file:
-        np.savez(file, **columns)
-    summary, metrics = _summarise(table, sequence, options), None
-    if gt is not None:
-        report = evaluate(trajectory, gt, alignment=options.alignment)
-        pairs = mean_pair_errors([row for row in rows if "rot_err_deg" in row])
-        named = ("method", "failed", "degraded", "flow_source", "depth_source", "oracle")
-        metrics = report | pairs | {key: summary[key] for key in (*named, "sequence")}
-        metrics["reasons"] = report["reasons"] | pairs["reasons"]
-        write_json(folder / "metrics.json", metrics)
-    if picture:
-        title = f"{sequence.name}, flow: {', '.join(summary['flow_source']) or 'none'}"
-        if summary["oracle"]:
-            title += f" (oracle: {', '.join(summary['oracle'])})"
-        path = folder / "trajectory.png"
-        plot_trajectory(options.method, trajectory, path, truth=gt, title=title)
-    files = [os.fspath(folder / name) for name in (*RESULTS, STATE) if (folder / name).exists()]
-    return summary | {"state": "done", "out": os.fspath(folder), "files": files, "metrics": metrics}
+    def estimate(self, quiet: bool) -> None:
+        """Track the frames that the folder has no rows of yet."""
+        vo, rows, tracker = self.vo, self.folder.rows, self.folder.tracker
+        failed = sum(row["status"] == "failed" for row in rows)
+        console = Console(stderr=True, quiet=quiet, soft_wrap=True, markup=False, highlight=False)
+        counts = "{task.completed}/{task.total} frames, {task.fields[failed]} failed"
+        with progress.Progress(
+            progress.TextColumn("{task.description}", markup=False),  # a folder may be named [x]
+            progress.BarColumn(),
+            progress.TextColumn(counts),
+            progress.TimeRemainingColumn(),
+            console=console,
+        ) as bar:
+            say = console.print
+            label, total = f"{self.sequence.name} [{vo.method}]", len(self.frames)
+            task = bar.add_task(label, total=total, completed=len(rows), failed=failed)
+            for warning in self.sequence.warnings:
+                say(f"warning: {warning}")
+            if tracker is not None:
+                vo.resume(_restored(tracker, self.sequence))
+                say(f"resumed after {len(rows)} of {total} frames")
+            for index in self.frames[len(rows) :]:
+                rows.append(row := self._track(index))
+                if row["status"] != "ok":
+                    text = f"frame {index}: {row['status']} ({row['reason']}), probability "
+                    say(f"{text}{row['probability']:.2f}: {row['message']}")
+                failed += row["status"] == "failed"
+                bar.update(task, completed=len(rows), failed=failed)
+                if len(rows) % SAVE_EVERY == 0:
+                    self.folder.save_rows(_saved(vo.state))
+            self.folder.save_rows()
+
+    def _track(self, index: int) -> dict[str, Any]:
+        """What is kept of a frame, JSON-ready: the columns of ``steps.csv`` and more."""
+        vo, flow, sequence = self.vo, self.flow, self.sequence
+        prev, frame, ms = vo.state.frame, None, 0.0
+        flow.reset()
+        try:
+            frame = sequence.frame(index)
+        except (InputError, OSError) as error:
+            if vo.options.run.strict:
+                raise InputError(f"frame {index}: {error}") from error
+            step = vo.skip(index, float(sequence.timestamps[index]), str(error))
+        else:
+            started = time.perf_counter()
+            step = vo.track(frame)
+            ms = 1e3 * (time.perf_counter() - started)
+        field = flow.last
+        if frame is not None and self.recording is not None:
+            self.recording.add(frame, step, field.flow)
+        motion = step.motion
+        values = [*motion.T_curr_prev[:3, 3].tolist(), *se3_log(motion.T_curr_prev)[3:].tolist()]
+        return {
+            "index": step.index,
+            "timestamp": step.timestamp,
+            "status": step.status.state.value,
+            "reason": step.status.reason.value,
+            "probability": float(motion.probability),
+            **dict(zip("tx ty tz rx ry rz".split(), values, strict=True)),
+            "inlier_ratio": float(motion.inlier_ratio),
+            "iterations": int(motion.iterations),
+            "cost": float(motion.cost),
+            "flow_ms": round(flow.ms, 3),
+            "motion_ms": round(ms - flow.ms, 3),
+            "frame_ms": round(ms, 3),
+            "prev_index": None if prev is None else prev.index,
+            "flow_source": field.source,
+            "message": " ".join(step.status.message.split()),
+            "T_curr_prev": motion.T_curr_prev.tolist(),
+            "T_world_cam": step.T_world_cam.tolist(),
+            "covariance": motion.covariance.tolist(),
+            "flow_is_true": field.flow is not None and field.is_true,
+            **step_errors(sequence, prev, step.index, step.T_curr_prev),
+        }
+
+    def write_results(self, picture: bool) -> dict[str, Any]:
+        """Write what a finished run leaves beside its steps; its summary, JSON-ready."""
+        folder, options = self.folder.path, self.vo.options.run
+        table, gt = pd.DataFrame(self.folder.rows), true_trajectory(self.sequence, self.frames)
+        columns: dict[str, Any] = {name: np.array(table[name].tolist()) for name in ARRAYS}
+        trajectory = Trajectory(columns["timestamp"], np.array(table["T_world_cam"].tolist()))
+        trajectory.save(folder / "trajectory.tum")
+        trajectory.save(folder / "trajectory.kitti")
+        with atomic_write(folder / "steps.npz", "wb") as file:
+            np.savez(file, **columns)
+        summary, metrics = _summarise(table, self.sequence, options), None
+        if gt is not None:
+            metrics = evaluate(trajectory, gt, alignment=options.alignment)
+            pairs = pair_scores(pair_table(table[1:].rename(columns={"motion_ms": "ms"})))
+            reasons = metrics["reasons"] | pairs["reasons"]
+            named = ("method", "degraded", "flow_source", "depth_source", "oracle", "sequence")
+            metrics |= pairs | {key: summary[key] for key in named} | {"reasons": reasons}
+            write_json(folder / "metrics.json", metrics)
+        if picture:
+            title = f"{self.sequence.name}, flow: {', '.join(summary['flow_source']) or 'none'}"
+            if summary["oracle"]:
+                title += f" (oracle: {', '.join(summary['oracle'])})"
+            path = folder / "trajectory.png"
+            plot_trajectory(options.method, trajectory, path, truth=gt, title=title)
+        files = [os.fspath(folder / name) for name in (*RESULTS, STATE) if (folder / name).exists()]
+        summary |= {"state": "done", "out": os.fspath(folder), "files": files}
+        return summary | {"metrics": metrics}
 
 
 def _summarise(table: pd.DataFrame, sequence: Sequence, options: RunOptions) -> dict[str, Any]:
@@ -245,22 +333,6 @@ def _summarise(table: pd.DataFrame, sequence: Sequence, options: RunOptions) -> 
         "oracle": oracle,
         **{f"{k}_median": float(x.median()) if len(x) else None for k, x in times.items()},
         "warnings": warnings,
-    }
-
-
-def _header(sequence: Sequence, options: Options, weights: str | None) -> dict[str, Any]:
-    """What ``run.json`` says of a run beside its state; ``identity``: what a resumed one shares."""
-    tree, input_hash = dataclasses.asdict(options), fingerprint(sequence.files())
-    free = ("max_failed", "strict", "device")
-    deciding = tree | {"run": {k: v for k, v in tree["run"].items() if k not in free}}
-    identity = {"input_hash": input_hash, "options": deciding}
-    return {
-        "identity": identity | {"weights": weights, "hybridvo": hybridvo.__version__},
-        "input_hash": input_hash,
-        "versions": versions(),
-        "machine": {"platform": platform.platform(), "cpus": os.cpu_count()},
-        "options": tree,
-        "sequence": os.fspath(sequence.root),
     }
 
 

@@ -1,109 +1,104 @@
-"""``hybridvo train``: PWVO and its baselines, and the selector.
-
-    hybridvo train pwvo --config configs/train_paper.yaml --out runs/paper
-    hybridvo train export --out runs/paper --export paper.safetensors
-    hybridvo train selector-data --data runs/selector_data --first-seed 1000000 --seeds 4096
-    hybridvo train selector-data --data runs/selector_data --recordings ../shared/data --seeds 2048
-    hybridvo train selector --data runs/selector_data --out runs/selector --time-limit 50
-
-Started again with the same ``--out`` a training goes on where it was. Seeds of selector-data below
-1000 are for a folder ``DATA_held_out``; ``--propose`` asks PWVO about the samples.
-"""
+"""``hybridvo generate`` and ``hybridvo train``: training samples, PWVO, the selector."""
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
-import math
 import shlex
 import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-CHANGES = ("steps", "batch_size", "seed")
-"""Options of a configuration that the command line changes."""
+import cv2
+import numpy as np
+import torch
+from rich.console import Console
+from rich.progress import Progress
+
+from hybridvo.errors import InputError
+from hybridvo.evaluation.drawing import Panel, flow_colours, longest_flow, write_panels
+from hybridvo.files import write_json
+from hybridvo.network.models import load_weights, torch_device
+from hybridvo.synthetic.dataset import load_preset, read_sample, write_samples
+from hybridvo.synthetic.layered import Sample
+from hybridvo.synthetic.semi_real import load_split
+from hybridvo.training.options import load_pwvo_options, load_selector_options
+from hybridvo.training.pwvo_task import PwvoTask
+from hybridvo.training.selector_data import PER_SHARD, write_shard
+from hybridvo.training.selector_task import SelectorTask
+from hybridvo.training.trainer import CHECKPOINT, LOG, RUN, Trainer, export_run, source_commit
 
 
-def add_train(
-    train: argparse.ArgumentParser, common: argparse.ArgumentParser, call: Callable[..., Any]
-) -> None:
-    """Commands of ``hybridvo train`` and their options."""
-    train.set_defaults(call=call)
-    train.description = __doc__
-    train.formatter_class = argparse.RawDescriptionHelpFormatter
-    commands = train.add_subparsers(required=True, metavar="WHAT")
-
-    def command(name: str, call: Callable[..., Any], help: str) -> Callable[..., Any]:
-        made = commands.add_parser(name, help=help, parents=[common])
-        made.set_defaults(train=call, workers=0, device="cpu")
-        return made.add_argument
-
-    pwvo = command("pwvo", _pwvo, "train a network of the paper")
-    selector = command("selector", _selector, "train the selector")
-    for add in (pwvo, selector):
-        add("--out", type=Path, required=True, help="folder of the run; goes on where it was")
-        add("--time-limit", type=float, default=math.inf, metavar="MIN", help="minutes in all")
-        add("--threads", type=int, help="threads of torch; by default torch's own choice")
-        add("--overwrite", action="store_true", help="start anew where --out has a training")
-        add("--init", metavar="FILE", help="start from these weights: a file, or a pretrained name")
-    pwvo("--config", type=Path, required=True, help="configs/train_*.yaml")
-    pwvo("--workers", type=int, default=0, help="processes that draw samples")
-    pwvo("--device", default="auto", choices=("auto", "cpu", "cuda"))
-    for name in CHANGES:
-        pwvo(f"--{name.replace('_', '-')}", type=int, help="instead of the configuration's")
-    selector("--config", type=Path, default=Path("configs/train_selector.yaml"))
-    selector("--data", type=Path, required=True, help="folder of the shards")
-    export = command("export", _export, "write a network's weights for users (float16)")
-    export("--out", type=Path, required=True, help="folder of the run")
-    export("--export", type=Path, required=True, metavar="FILE", help="*.safetensors")
-    export("--count", type=int, default=1000, help="held-out pairs of each preset")
-    export("--calibrate", type=int, default=0, metavar="N", help="shift PWVO's s by N pairs")
-    data = command("selector-data", _selector_data, "draw samples for the selector")
-    data("--data", type=Path, required=True, help="folder of the shards")
-    data("--first-seed", type=int, default=1_000_000, help="below 1000: held out")
-    data("--seeds", type=int, default=0, help="about as many samples")
-    recordings = "semi-real pairs of the recordings below it"
-    data("--recordings", type=Path, metavar="DIR", help=recordings)
-    data("--split", default="train", help="which of these recordings")
-    data("--propose", metavar="NETWORK", help="ask these weights about the samples")
+def generate(
+    preset: str,
+    count: int,
+    out: str | Path,
+    *,
+    seed: int = 0,
+    size: Sequence[int] | None = None,
+    workers: int = 1,
+    quiet: bool = True,
+) -> Path:
+    """Draw samples, and a contact sheet of the first; goes on where it was interrupted."""
+    with Progress(console=Console(stderr=True, quiet=quiet)) as bar:
+        task = bar.add_task("samples", total=count)
+        for done in write_samples(load_preset(preset, size), count, out, seed, workers):
+            bar.update(task, completed=done)
+    sheet = Path(out) / "contact_sheet.png"
+    write_sheet([read_sample(out, i) for i in range(min(6, count))], sheet)
+    return sheet
 
 
-def train(args: argparse.Namespace, command: list[str]) -> tuple[Any, int]:
-    """Run the command; what it gives, JSON-ready, and the exit code."""
-    return args.train(args, shlex.join(command)), 0
+def write_sheet(samples: Sequence[Sample], path: str | Path) -> None:
+    """Write a PNG with the five steps of each sample in a row; depth is bright where near."""
+    panels = [panel for sample in samples for panel in _steps(sample)]
+    height, width = samples[0].moving.shape
+    write_panels(path, panels, "", width / height, columns=7, inches=2.0)
 
 
-def _pwvo(args: argparse.Namespace, command: str) -> dict[str, Any]:
-    from hybridvo.network.models import torch_device
-    from hybridvo.training.options import load_pwvo_options
-    from hybridvo.training.pwvo_task import PwvoTask
+def _steps(sample: Sample) -> list[Panel]:
+    """Images of the five steps."""
+    height, width = sample.moving.shape
+    x = (np.arange(width) - sample.K[0, 2]) / sample.K[0, 0]
+    y = (np.arange(height) - sample.K[1, 2]) / sample.K[1, 1]
+    rays = np.stack(np.broadcast_arrays(x, y[:, None]), axis=-1)
+    longest = longest_flow(sample.flow)
+    depths = (sample.depth_prev, sample.depth_curr)
+    near = [np.where(z > 0, 1 / np.maximum(z, 1e-9), np.nan) for z in depths]
+    return [
+        Panel("1 rays of K", flow_colours(rays, 1.0)),
+        Panel("2 inverse depth of t", near[0], "1/m"),
+        Panel("3 what moves", sample.moving.astype(float), "", 1.0),
+        Panel("4 camera's flow", flow_colours(sample.ego_flow, longest)),
+        Panel("4 objects' flow", flow_colours(sample.flow - sample.ego_flow, longest)),
+        Panel("5 total flow", flow_colours(sample.flow, longest)),
+        Panel("5 inverse depth of t+1", near[1], "1/m"),
+    ]
 
+
+def train_pwvo(args: argparse.Namespace, command: list[str]) -> dict[str, Any]:
+    """Train a network of the paper."""
     options, mixture = load_pwvo_options(args.config)
-    changes = {n: getattr(args, n) for n in CHANGES if getattr(args, n) is not None}
-    options = dataclasses.replace(options, **changes)
-    args.device = torch_device(args.device)
-    return {"updates": _train(args, command, PwvoTask(options, mixture)).step}
+    given = {name: getattr(args, name) for name in ("steps", "batch_size", "seed")}
+    changes = {name: value for name, value in given.items() if value is not None}
+    task = PwvoTask(dataclasses.replace(options, **changes), mixture)
+    return _train(args, command, task, torch_device(args.device), args.workers)
 
 
-def _selector(args: argparse.Namespace, command: str) -> dict[str, Any]:
-    from hybridvo.training.options import load_selector_options
-    from hybridvo.training.selector_task import SelectorTask
-
-    task = SelectorTask(load_selector_options(args.config), args.data)
-    return {"updates": _train(args, command, task).step}
+def train_selector(args: argparse.Namespace, command: list[str]) -> dict[str, Any]:
+    """Train the selector."""
+    return _train(args, command, SelectorTask(load_selector_options(args.config), args.data))
 
 
-def _train(args: argparse.Namespace, command: str, task: Any) -> Any:
-    import cv2
-    import torch
-
-    from hybridvo.files import write_json
-    from hybridvo.network.models import load_weights
-    from hybridvo.training.export import RUN, source_commit
-    from hybridvo.training.trainer import CHECKPOINT, LOG, Trainer
-
+def _train(
+    args: argparse.Namespace,
+    command: list[str],
+    task: PwvoTask | SelectorTask,
+    device: Any = "cpu",
+    workers: int = 0,
+) -> dict[str, Any]:
     if args.threads is not None:
         torch.set_num_threads(max(1, args.threads))
     cv2.setNumThreads(0)  # samples are small: threads inside OpenCV cost more than they give
@@ -111,34 +106,36 @@ def _train(args: argparse.Namespace, command: str, task: Any) -> Any:
     if args.overwrite:
         for name in (CHECKPOINT, LOG, RUN):
             (args.out / name).unlink(missing_ok=True)
-    trainer = Trainer(task, args.out, args.device, args.workers, report=_report)
+    trainer = Trainer(task, args.out, device, workers, report=_report)
     if trainer.resume():
         print(f"goes on at update {trainer.step}", file=sys.stderr)
     else:
         if args.init is not None:
             trainer.start_from(load_weights(args.init)[0].state_dict(), args.init)
-        about = {"command": command, "commit": source_commit(), "torch": torch.__version__}
-        write_json(args.out / RUN, about)
+        about = {"command": shlex.join(command), "commit": source_commit()}
+        write_json(args.out / RUN, about | {"torch": torch.__version__})
     for number in (signal.SIGINT, signal.SIGTERM):  # the update at hand ends, with a checkpoint
         signal.signal(number, lambda *_: setattr(trainer, "stop_requested", True))
     why = trainer.run(60 * args.time_limit)
     print(f"ended by {why} at update {trainer.step}", file=sys.stderr)
-    return trainer
+    return {"updates": trainer.step}
 
 
-def _export(args: argparse.Namespace, command: str) -> dict[str, Any]:
-    from hybridvo.training.export import export_run
+def _report(entry: dict[str, Any]) -> None:
+    """One line a log entry on stderr."""
+    numbers = {k: v for k, v in entry.items() if isinstance(v, int | float)}
+    line = " ".join(f"{key}={value:.5g}" for key, value in numbers.items())
+    print(line, entry.get("results", ""), file=sys.stderr)
 
-    card = export_run(args.out, args.export, args.count, args.calibrate)
-    return {"file": str(args.export), "held_out": card["held_out"]}
+
+def export(out: Path, export: Path, count: int, calibrate: int) -> dict[str, Any]:
+    """Write a network's weights for users."""
+    card = export_run(out, export, count, calibrate)
+    return {"file": str(export), "held_out": card["held_out"]}
 
 
-def _selector_data(args: argparse.Namespace, command: str) -> dict[str, Any]:
-    from hybridvo.errors import InputError
-    from hybridvo.network.models import load_weights
-    from hybridvo.synthetic.semi_real import load_split
-    from hybridvo.training.selector_data import PER_SHARD, write_shard
-
+def draw_selector_data(args: argparse.Namespace) -> dict[str, Any]:
+    """Draw samples for the selector."""
     if args.first_seed < 0 or args.seeds < 0:
         raise InputError(f"expected --first-seed and --seeds >= 0, got {args.first_seed}.")
     args.data.mkdir(parents=True, exist_ok=True)
@@ -149,10 +146,3 @@ def _selector_data(args: argparse.Namespace, command: str) -> dict[str, Any]:
         total += write_shard(args.data, seed, recordings=recordings, network=network)
         print(f"seeds to {seed + PER_SHARD}: {total} samples", file=sys.stderr, flush=True)
     return {"samples": total}
-
-
-def _report(entry: dict[str, Any]) -> None:
-    """One line a log entry on stderr."""
-    numbers = {k: v for k, v in entry.items() if isinstance(v, int | float)}
-    line = " ".join(f"{key}={value:.5g}" for key, value in numbers.items())
-    print(line, entry.get("results", ""), file=sys.stderr)

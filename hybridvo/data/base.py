@@ -5,14 +5,13 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Callable
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
-from hybridvo.data.camera_file import Calibration, parse_camera, units_per_metre
+from hybridvo.data.camera_file import Calibration, parse_camera
 from hybridvo.data.image_io import read_depth, read_flow, read_mask_png, read_rgb
 from hybridvo.data.lists import IMAGES, match_files, shown, sorted_files
 from hybridvo.errors import FormatError, InputError
@@ -20,23 +19,22 @@ from hybridvo.trajectory import check_increasing
 from hybridvo.types import Camera, Frame, depth_advice, typical_depth
 
 SATURATED = 65535  # of 16 bits: no depth
-Files = list[Path | None]
-"""A file for each frame, None where it has none."""
+Files = list[Path | None]  # a file for each frame, None where it has none
+Image = np.ndarray | None
 
 
 class Sequence:
     """Frames in time order, read when asked for: ``len``, ``sequence[i]``, ``for frame in``.
 
-    A reader overrides ``_list_files``, which fills in files, stamps and poses, and
-    ``_calibration``; where its files need it, ``_read_depth`` and ``_read_flow``.
+    A reader overrides ``_list_files`` (files, stamps, poses) and ``_calibration``; where its files
+    need it, ``_read_depth`` and ``_read_flow``.
     """
 
     kind = "sequence"  # the key of READERS
-    markers: tuple[tuple[str, ...], ...] = ()
-    """Groups of names (``glob``); a folder with all of one group is of this kind."""
+    markers: tuple[tuple[str, ...], ...] = ()  # groups of names (glob): a folder has all of one
     depth_source = "sensor"  # or stereo, file, true: of a renderer, an oracle
     flow_is_true = False  # whether its flow files are ground truth: an oracle
-    depth_scale: float | None = None  # stored units per metre of the data set's depth; None: 1
+    depth_scale: float | None = None  # stored units per metre of the data set's whole numbers
     frames_per_second = 30.0  # where the files have no stamps
 
     def __init__(
@@ -63,8 +61,9 @@ class Sequence:
         if self._mask_folder is not None:
             frames = [a or b for a, b in zip(self.rgb_files, self.depth_files, strict=True)]
             hint = "Expected PNG or JPEG, 0 where pixels must not be used, named like the images."
-            masks = sorted_files(self._mask_folder, IMAGES)
-            self.mask_files = match_files(frames, masks, self._mask_folder, hint)
+            self.mask_files = match_files(
+                frames, sorted_files(self._mask_folder, IMAGES), self._mask_folder, hint
+            )
         self._look_at_first_images()
         self._warn_of_what_is_missing()
 
@@ -99,10 +98,7 @@ class Sequence:
         return self._camera
 
     def frame(self, index: int) -> Frame:
-        """Frame ``index``; ``rgb`` or ``depth`` is None where its file is missing.
-
-        Neither there is a FileNotFoundError, a file that cannot be decoded a FormatError.
-        """
+        """Frame ``index``; None for image or depth that is missing, FileNotFoundError for both."""
         files = self.rgb_files[index], self.depth_files[index], self.mask_files[index]
         readers: tuple[Callable[[Path], Any], ...] = read_rgb, self._read_depth, read_mask_png
         rgb, depth, mask = (
@@ -112,8 +108,8 @@ class Sequence:
         where = f"{self.name}: frame {index} ({files[0]}, {files[1]})"
         if rgb is None and depth is None:
             raise FileNotFoundError(f"{where}: neither image nor depth is there.")
-        if self._calibrated is not None and any(self._calibrated.distortion):
-            rgb, depth, mask = straighten(self._calibrated, rgb, depth, mask)
+        if self._lens is not None:
+            rgb, depth, mask = straighten(*self._lens, rgb, depth, mask)
         camera, stamp = self.camera(index), float(self.timestamps[index])
         try:
             return Frame(rgb, depth, camera, stamp, index, mask=mask)
@@ -121,10 +117,7 @@ class Sequence:
             raise FormatError(f"{where}: {error}") from None
 
     def flow(self, index: int) -> tuple[np.ndarray, np.ndarray | None]:
-        """Flow from frame ``index`` to the next: (H, W, 2) float32 px, and (H, W) bool or None.
-
-        A FileNotFoundError where there is no file for it, a FormatError where it is damaged.
-        """
+        """Flow to the next frame, (H, W, 2) px, and (H, W) valid or None; FileNotFoundError."""
         if index >= len(self) - 1:
             raise IndexError(f"{self.name}: no flow starts at frame {index} of {len(self)}.")
         path = self.flow_files[index] if self.flow_files else None
@@ -150,8 +143,11 @@ class Sequence:
         """(H, W) float32 metres; 0, negative and not finite are invalid."""
         stored = read_depth(path)
         # unless a scale is given, only integers are in the set's unit
-        usual = self.depth_scale if stored.dtype.kind == "u" else None
-        depth = stored.astype(np.float32) / np.float32(self._given_scale or usual or 1.0)
+        scale = self._given_scale or (self.depth_scale if stored.dtype.kind == "u" else 1.0)
+        if scale is None:
+            needed = "'depth_scale' (units per metre) in camera.yaml, or --depth-scale"
+            raise InputError(f"{path}: depth is of whole numbers: expected {needed}.")
+        depth = stored.astype(np.float32) / np.float32(scale)
         depth[stored == SATURATED] = 0.0
         return depth
 
@@ -189,17 +185,26 @@ class Sequence:
         if image is None:
             raise InputError(f"{self.root}: no frames: none of the files is there.")
         self.height, self.width = size = image.shape[:2]
-        given, told = self._given_camera, self.warnings
+        given, told, scale = self._given_camera, self.warnings, self._given_scale
         found = self._calibration() if given is None else parse_camera(given, size, told)
         if found is not None and (found.height, found.width) != size:
             raise InputError(
                 f"{self.root}: images are {self.width}x{self.height}, the camera is for "
                 f"{found.width}x{found.height} pixels: give theirs (--camera fx,fy,cx,cy or FILE)."
             )
-        if self._given_scale is None and found is not None:
-            self._given_scale = found.depth_scale
-        self._calibrated, self._camera = found, None if found is None else found.camera
-        self._given_scale = units_per_metre(self._given_scale, self.name, told)
+        self._camera, self._lens = None if found is None else found.camera, None
+        if found is not None and any(found.distortion):
+            whole = found.camera.K, np.array(found.distortion), np.eye(3), found.camera.K
+            self._lens = cv2.initUndistortRectifyMap(*whole, size[::-1], cv2.CV_32FC1)
+        scale = found.depth_scale if scale is None and found is not None else scale
+        if scale is not None and not scale > 0:
+            expected = "units per metre above 0"
+            raise InputError(f"{self.name}: depth_scale: expected {expected}, got {scale}.")
+        if scale is not None and scale < 1:  # RealSense's; 0.001 as single precision prints it
+            units = float(f"{1 / scale:.6g}")
+            self._warn(f"depth_scale {scale:g}: taken as RealSense's, {units:g} units per metre")
+            scale = units
+        self._given_scale = scale
         path, depth = _first(self.depth_files, self._read_depth)
         if depth is None:
             return
@@ -244,31 +249,15 @@ def looks_for(kind: type[Sequence]) -> str:
 
 
 def straighten(
-    calibration: Calibration,
-    rgb: np.ndarray | None,
-    depth: np.ndarray | None,
-    mask: np.ndarray | None,
-) -> tuple[np.ndarray | None, np.ndarray | None, np.ndarray]:
-    """Image (bilinear), depth and mask (nearest: never mixed) of the pinhole with the same K.
-
-    The mask is False where the pinhole sees beyond the distorted image.
-    """
-    u, v = _lens(calibration)
+    u: np.ndarray, v: np.ndarray, rgb: Image, depth: Image, mask: Image
+) -> tuple[Image, Image, np.ndarray]:
+    """Image, depth and mask at columns u and rows v; masked where these lie outside."""
     height, width = u.shape
     inside: np.ndarray = (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)
     if rgb is not None:
         rgb = cv2.remap(rgb, u, v, cv2.INTER_LINEAR)
-    if depth is not None:
+    if depth is not None:  # neighbours are never mixed
         depth = cv2.remap(depth, u, v, cv2.INTER_NEAREST)
     if mask is not None:
         inside &= cv2.remap(mask.view(np.uint8), u, v, cv2.INTER_NEAREST) > 0
     return rgb, depth, inside
-
-
-@cache
-def _lens(calibration: Calibration) -> tuple[np.ndarray, np.ndarray]:
-    """Columns and rows in the distorted image of the pixels of the pinhole."""
-    K, size = calibration.camera.K, (calibration.width, calibration.height)
-    distortion = np.array(calibration.distortion)
-    u, v = cv2.initUndistortRectifyMap(K, distortion, np.eye(3), K, size, cv2.CV_32FC1)
-    return u, v

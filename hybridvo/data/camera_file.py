@@ -103,17 +103,6 @@ def read_camera_file(path: Path, told: list[str]) -> Calibration:
     return found
 
 
-def units_per_metre(scale: float | None, where: str, told: list[str]) -> float | None:
-    """Stored units per metre; below 1 it is RealSense's number, metres per unit, with a warning."""
-    if scale is None or scale >= 1:
-        return scale
-    if not scale > 0:
-        raise InputError(f"{where}: depth_scale: expected units per metre above 0, got {scale}.")
-    units = float(f"{1 / scale:.6g}")  # 0.001 as single precision prints it is 1000
-    told.append(f"{where}: depth_scale {scale:g}: taken as RealSense's, {units:g} units per metre.")
-    return units
-
-
 def write_camera_template(directory: str | os.PathLike[str]) -> Path:
     """Write a ``camera.yaml`` to fill in."""
     path = Path(directory) / CAMERA_FILE

@@ -31,8 +31,8 @@ class FolderSequence(Sequence):
     markers = ((CAMERA_FILE,),)
 
     def _list_files(self) -> None:
-        root, settings, told = self.root, self.root / CAMERA_FILE, self.warnings
-        self._settings = read_camera_file(settings, told) if settings.exists() else None
+        root, settings = self.root, self.root / CAMERA_FILE
+        self._settings = read_camera_file(settings, self.warnings) if settings.exists() else None
         if self._settings is None and self._given_camera is None:
             remedy = f"write one with 'hybridvo init {root}', or give --camera fx,fy,cx,cy or FILE"
             raise InputError(f"{root}: no {CAMERA_FILE}, and no camera is given: {remedy}.")
@@ -41,7 +41,11 @@ class FolderSequence(Sequence):
         rgb = sorted_files(root / "rgb", IMAGES)
         depth = sorted_files(root / "depth", (".png", ".npy", ".dpt"))
         flow = sorted_files(root / "flow", (".flo", ".npy", ".png"))
-        self._check_found(rgb, depth, flow)
+        if not depth:
+            expected = "a 16-bit PNG, .npy or .dpt of metric depth for each image in rgb/"
+            raise InputError(f"{root / 'depth'}: no frames with depth: expected {expected}.")
+        if flow and self._settings is not None and any(self._settings.distortion):
+            raise InputError(f"{root}: flow/ is of distorted images: undistort them, or remove it.")
         if self._mask_folder is None and (root / "mask").is_dir():
             self._mask_folder = root / "mask"
         frames = rgb or depth
@@ -53,23 +57,10 @@ class FolderSequence(Sequence):
         self.depth_files = [*depth_of.values()]
         self.flow_files = [flow_of[i] if i + 1 in depth_of else None for i in kept]
         self.timestamps, self.poses = stamps[kept], None if poses is None else poses[kept]
-        self.warnings = list(dict.fromkeys(told))
+        self.warnings = list(dict.fromkeys(self.warnings))
 
     def _calibration(self) -> Calibration | None:
         return self._settings
-
-    def _check_found(self, rgb: list[Path], depth: list[Path], flow: list[Path]) -> None:
-        """Refuse what no frame can be made of, before anything is matched."""
-        root, settings = self.root, self._settings
-        if not depth:
-            what = "depth" if rgb else "frames"
-            expected = "a 16-bit PNG, .npy or .dpt of metric depth for each image in rgb/"
-            raise InputError(f"{root / 'depth'}: no {what}: expected {expected}.")
-        if self._given_scale is None and any(path.suffix.lower() == ".png" for path in depth):
-            needed = "'depth_scale' (units per metre) must be given, there or with --depth-scale"
-            raise InputError(f"{root / CAMERA_FILE}: depth/ holds PNG files: {needed}.")
-        if flow and settings is not None and any(settings.distortion):
-            raise InputError(f"{root}: flow/ is of distorted images: undistort them, or remove it.")
 
     def _match_depth(self, frames: list[Path], files: list[Path]) -> dict[int, Path | None]:
         """Index of each frame that is kept -> its depth."""
@@ -87,9 +78,9 @@ class FolderSequence(Sequence):
         if not files:
             return [None] * len(frames)
         last = len(frames) - (len(files) == len(frames) - 1)  # none starts at the last image
-        hint = "Give both the same names."
-        matched = match_files(frames[:last], files, self.root / "flow", hint)
-        matched += [None] * (len(frames) - last)
+        matched = match_files(
+            frames[:last], files, self.root / "flow", "Give both the same names."
+        ) + [None] * (len(frames) - last)
         known = {path.stem for path in (*frames, *files)}
         if len(known) < len(frames) + len(files) and all(x.isdecimal() for x in known):
             step = min(np.diff(sorted(map(int, known))), default=1)
@@ -107,9 +98,8 @@ class FolderSequence(Sequence):
             return truth
         stamps = self._stamps("timestamps.txt", frames)
         if stamps is None:
-            fps = self._settings and self._settings.fps
-            if not fps:
-                fps = self.frames_per_second
+            fps = (self._settings and self._settings.fps) or self.frames_per_second
+            if self._settings is None or not self._settings.fps:
                 self._warn(f"no time stamps; {fps:g} frames a second assumed")
             stamps = np.arange(len(frames)) / fps
         return stamps, truth and poses_at(stamps, *truth)

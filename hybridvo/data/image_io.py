@@ -1,7 +1,4 @@
-"""Readers and writers of image, depth, flow and camera files.
-
-A file that does not fit its format is a FormatError; none is a ``FileNotFoundError``.
-"""
+"""Readers and writers of image, depth, flow and camera files; damage is a FormatError."""
 
 from __future__ import annotations
 
@@ -80,10 +77,7 @@ def read_flow(path: PathLike) -> tuple[np.ndarray, np.ndarray | None]:
 
 
 def read_flow_png(path: PathLike, order: tuple[int, int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Flow (H, W, 2) in px and mask (H, W) of a 16-bit PNG, which holds 64 u + 32768 and so v.
-
-    ``order``: of u, v and the mask among OpenCV's channels.
-    """
+    """Flow (H, W, 2) in px and mask of a 16-bit PNG: channels 64 u + 32768, so v, and the mask."""
     u, v, mask = np.moveaxis(read_png(path, np.uint16, 3, "a 16-bit flow PNG"), 2, 0)[[*order]]
     return (np.dstack([u, v]).astype(np.float32) - np.float32(32768)) / np.float32(64), mask
 

@@ -16,7 +16,7 @@ from hybridvo.errors import FormatError, InputError
 from hybridvo.files import read_text
 from hybridvo.geometry import invert
 from hybridvo.trajectory import COLUMNS, read_poses
-from hybridvo.types import Camera, Frame
+from hybridvo.types import Camera, Frame, as_number
 
 DISPARITY_SIGMA_PX = 0.5  # standard deviation of a block-matched disparity, assumed
 
@@ -89,45 +89,39 @@ class KittiSequence(Sequence):
     def _read_depth(self, path: Path) -> np.ndarray:
         if self.depth_source != "stereo":
             return super()._read_depth(path)
-        disparity = _disparity(read_rgb(self._left[path]), read_rgb(path), path)
+        left, right = (
+            cv2.cvtColor(read_rgb(x), cv2.COLOR_RGB2GRAY) for x in (self._left[path], path)
+        )
+        if left.shape != right.shape:
+            raise FormatError(f"{path}: expected the size of the left image, got {right.shape}.")
+        matcher = cv2.StereoSGBM.create(
+            minDisparity=0,
+            # 128 px at KITTI's size: all beyond 3 m; narrow images cannot be searched as far
+            numDisparities=min(128, max(16, left.shape[1] // 2 // 16 * 16)),
+            blockSize=5,
+            P1=8 * 5 * 5,
+            P2=32 * 5 * 5,
+            disp12MaxDiff=1,
+            uniquenessRatio=10,
+            speckleWindowSize=100,
+            speckleRange=2,
+            mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
+        )
+        disparity = matcher.compute(left, right).astype(np.float32) / 16  # steps of 1/16 px
         found = disparity > 0
         return np.where(found, self._disparity_at_1m / np.where(found, disparity, 1), 0)
-
-
-def _disparity(left: np.ndarray, right: np.ndarray, path: Path) -> np.ndarray:
-    """(H, W) float32 disparity in pixels of a rectified pair; 0 or less where nothing matches."""
-    if left.shape != right.shape:
-        raise FormatError(f"{path}: expected the size of the left image, got {right.shape}.")
-    matcher = cv2.StereoSGBM.create(
-        minDisparity=0,
-        # 128 px at KITTI's size: everything beyond 3 m; narrow images cannot be searched as far
-        numDisparities=min(128, max(16, left.shape[1] // 2 // 16 * 16)),
-        blockSize=5,
-        P1=8 * 5 * 5,
-        P2=32 * 5 * 5,
-        disp12MaxDiff=1,
-        uniquenessRatio=10,
-        speckleWindowSize=100,
-        speckleRange=2,
-        mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
-    )
-    gray = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (left, right)]
-    return matcher.compute(gray[0], gray[1]).astype(np.float32) / 16  # steps of 1/16 px
 
 
 def _read_projection(path: Path, number: str) -> np.ndarray:
     """(3, 4) projection of a rectified camera: fx 0 cx tx, 0 fy cy ty, 0 0 1 tz."""
     for line, text in enumerate(read_text(path).split("\n"), start=1):
         name, _, rest = text.partition(":")
-        if name not in (f"P{number}", f"P_rect_0{number}"):
-            continue
-        try:
-            P = np.array(rest.split(), dtype=np.float64).reshape(3, 4)
-        except ValueError:
-            P = np.zeros((3, 4))
-        is_rectified = P[1, 0] == 0 and np.allclose(P[2, :3], (0, 0, 1)) and P[0, 0] * P[1, 1] > 0
-        if is_rectified and np.isfinite(P).all():
-            return P
-        expected = f"{name}: fx 0 cx tx 0 fy cy ty 0 0 1 tz"
-        raise FormatError(f"{path}:{line}: expected {expected}, got {rest[:200]!r}.")
+        if name in (f"P{number}", f"P_rect_0{number}"):
+            numbers = np.array([as_number(word) for word in rest.split()])
+            P = numbers.reshape(3, 4) if numbers.size == 12 else np.zeros((3, 4))
+            is_camera = P[1, 0] == 0 and np.allclose(P[2, :3], (0, 0, 1)) and P[0, 0] * P[1, 1] > 0
+            if is_camera and np.isfinite(P).all():
+                return P
+            expected = f"{name}: fx 0 cx tx 0 fy cy ty 0 0 1 tz"
+            raise FormatError(f"{path}:{line}: expected {expected}, got {rest[:200]!r}.")
     raise FormatError(f"{path}: expected a line 'P{number}: ...', found none.")

@@ -14,12 +14,10 @@ import numpy as np
 
 from hybridvo.data.base import Sequence, looks_for
 from hybridvo.data.folder import FolderSequence
+from hybridvo.data.kinect import SevenScenesSequence, TumSequence
 from hybridvo.data.kitti import KittiSequence
 from hybridvo.data.lists import shown
-from hybridvo.data.seven_scenes import SevenScenesSequence
-from hybridvo.data.sintel import SintelSequence
-from hybridvo.data.tartanair import TartanAirSequence
-from hybridvo.data.tum import TumSequence
+from hybridvo.data.rendered import SintelSequence, TartanAirSequence
 from hybridvo.errors import InputError
 from hybridvo.flow import file_flow, with_flow
 from hybridvo.types import Camera, Frame, FramePair
@@ -108,10 +106,8 @@ def iter_pairs(
 
 
 def resize_camera(camera: Camera, height: int, width: int) -> Camera:
-    """Camera of the same view with another image size in pixels.
-
-    Pixel (0, 0) is a centre: u' = s (u + 0.5) - 0.5, for the principal point too.
-    """
+    """Camera of the same view with another image size in pixels."""
+    # pixel (0, 0) is a centre: u' = s (u + 0.5) - 0.5, for the principal point too
     sx, sy = width / camera.width, height / camera.height
     cx, cy = sx * (camera.cx + 0.5) - 0.5, sy * (camera.cy + 0.5) - 0.5
     return Camera(camera.fx * sx, camera.fy * sy, cx, cy, height, width)

@@ -48,19 +48,16 @@ def match(est: Trajectory, gt: Trajectory, max_diff: float = MAX_STAMP_DIFFERENC
     if est.has_timestamps and gt.has_timestamps:
         pairs = associate(est.timestamps, gt.timestamps, max_diff)
         if 2 * len(pairs) < total:
-            reason = (
-                f"only {len(pairs)} of {total} poses match within {max_diff:.4g} s (estimate "
-                f"{est.timestamps[0]:.6f} to {est.timestamps[-1]:.6f} s, ground truth "
-                f"{gt.timestamps[0]:.6f} to {gt.timestamps[-1]:.6f} s)"
-            )
+            spans = (f"{path.timestamps[0]:.6f} to {path.timestamps[-1]:.6f}" for path in (est, gt))
+            reason = f"only {len(pairs)} of {total} poses match within {max_diff:.4g} s "
+            reason += "(estimate {} s, ground truth {} s)".format(*spans)
     else:
-        by, pairs = "index", [(i, i) for i in range(total)]
-        if len(est) != len(gt):
+        by, pairs = "index", [(i, i) for i in range(total if len(est) == len(gt) else 0)]
+        if not pairs:
             reason = (
                 f"poses without timestamps can only be matched one by one, but the estimate has "
                 f"{len(est)} and the ground truth {len(gt)}"
             )
-            pairs = []
     i, j = np.array(pairs, dtype=int).reshape(-1, 2).T
     return Match(est.T_world_cam[i], gt.T_world_cam[j], gt.timestamps[j], by, reason)
 
@@ -75,8 +72,6 @@ def ate(found: Match, alignment: Alignment = "se3") -> PathError:
     ``se3`` (rigid, least squares) is the rule for metric methods; ``sim3`` has a scale, ``origin``
     makes the first matched poses equal. A DegenerateError where poses determine no alignment.
     """
-    if found.reason:
-        raise DegenerateError(found.reason)
     est, gt = found.est[:, :3, 3], found.gt[:, :3, 3]
     T, scale = np.eye(4), 1.0
     if alignment == "origin":
@@ -99,10 +94,11 @@ def aligned(est: Trajectory, gt: Trajectory) -> tuple[Trajectory, PathError | No
 
     Paths of which nothing matches start at the same place, and their error is None.
     """
-    kinds: tuple[Alignment, ...] = ("se3", "origin")
+    found = match(est, gt)
+    kinds: tuple[Alignment, ...] = () if found.reason else ("se3", "origin")
     for kind in kinds:
         with contextlib.suppress(DegenerateError):
-            error = ate(match(est, gt), kind)
+            error = ate(found, kind)
             return est.transformed(error.T_gt_est), error, kind
     return est.transformed(gt.T_world_cam[0] @ invert(est.T_world_cam[0])), None, "origin"
 
@@ -122,8 +118,6 @@ def rpe(
 
     In seconds the partner is the pose nearest to that time, at most half a frame away.
     """
-    if found.reason:
-        raise DegenerateError(found.reason)
     first = np.arange(len(found.stamps))
     last = first + int(delta)
     if delta_unit == "s":
@@ -147,23 +141,20 @@ def kitti_drift(found: Match, lengths: Sequence[float] = KITTI_LENGTHS) -> dict[
     along the true path exceeds L; translation (a fraction) and angle of its relative error are
     divided by L and averaged within each length, then over the lengths. Nothing is aligned.
     """
-    if found.reason:
-        raise DegenerateError(found.reason)
     est, gt = found.est, found.gt
     steps = np.linalg.norm(np.diff(gt[:, :3, 3], axis=0), axis=1)
     distance = np.concatenate([[0.0], np.cumsum(steps)])
-    means, segments = [], 0
+    means = []
     for length in lengths:
         last = np.searchsorted(distance, distance + length, side="right")
         (first,) = np.nonzero(last < len(gt))
         if len(first):
             means.append([e.mean() / length for e in _relative(est, gt, first, last[first])])
-            segments += len(first)
     if not means:
         reason = f"the true path of {distance[-1]:.4g} m is shorter than {min(lengths):g} m"
         raise DegenerateError(reason)
     translation, rotation = np.mean(means, axis=0).tolist()
-    return {"segments": segments, "translation": translation, "rotation_deg_per_m": rotation}
+    return {"translation": translation, "rotation_deg_per_m": rotation}
 
 
 def evaluate(
@@ -195,27 +186,27 @@ def evaluate(
         path if isinstance(path, Trajectory) else read_trajectory(path) for path in (estimate, gt)
     )
     found = match(estimate, gt, max_diff)
-    report: dict[str, Any] = {"alignment": alignment, "delta": float(delta)}
-    report |= {"delta_unit": delta_unit, "matched": len(found.est), "matched_by": found.by}
-    report["total"] = min(len(estimate), len(gt))
-    report["warnings"] = [*estimate.warnings, *gt.warnings]
-    reasons: dict[str, str] = {}
 
-    def relative() -> tuple[float, float, float]:
-        translation, degrees = rpe(found, delta, delta_unit)
-        return _rms(translation), float(translation.mean()), _rms(degrees)
-
-    computed: dict[str, Callable[[], Any]] = {
+    figures: dict[str, Callable[[], Any]] = {
         "ate_rmse_unaligned": lambda: [ate(found, "none").rmse],
         "ate_rmse_origin": lambda: [ate(found, "origin").rmse],
         "ate_rmse scale": lambda: attrgetter("rmse", "scale")(ate(found, alignment)),
-        "rpe_trans_rmse rpe_trans_mean rpe_rot_rmse_deg": relative,
+        "rpe_trans_rmse rpe_rot_rmse_deg": lambda: map(_rms, rpe(found, delta, delta_unit)),
         "kitti_drift": lambda: [kitti_drift(found)],
     }
-    for names, compute in computed.items():
+    report: dict[str, Any] = {
+        **{"alignment": alignment, "delta": float(delta), "delta_unit": delta_unit},
+        **{"matched": len(found.est), "matched_by": found.by},
+        **{"total": min(len(estimate), len(gt)), "reasons": {}},
+        "warnings": [*estimate.warnings, *gt.warnings],
+    }
+    for key, compute in figures.items():
+        names = key.split()
         try:
-            report |= zip(names.split(), compute(), strict=True)
+            if found.reason:
+                raise DegenerateError(found.reason)
+            report |= zip(names, compute(), strict=True)
         except DegenerateError as error:
-            report |= dict.fromkeys(names.split())
-            reasons |= dict.fromkeys(names.split(), str(error))
-    return report | {"reasons": reasons}
+            report |= dict.fromkeys(names)
+            report["reasons"] |= dict.fromkeys(names, str(error))
+    return report

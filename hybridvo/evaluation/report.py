@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from collections.abc import Sequence as Several
 from pathlib import Path
 from typing import Any
 
@@ -63,15 +64,17 @@ def write_report(folder: Path, result: Mapping[str, Any], pairs: pd.DataFrame) -
     totals, every = (sorted(result[key], key=_rank) for key in ("totals", "rows"))
     methods = list(dict.fromkeys(row["method"] for row in result["rows"]))
     flow = totals[0]["flow_source"]  # an oracle is never pooled with what a sensor gives
-    pooled = pairs[pairs["flow_source"] == flow]
+    known = pairs.dropna(subset=["epe_l2_px"])
+    pooled = known[known["flow_source"] == flow]
     sections = {
         f"How the errors are distributed, {flow} flow": error_distribution(pooled, methods),
         f"What makes it fail, {flow} flow": factor_charts(pooled, methods),
     }
     paths = {
-        facts["name"]: path_charts(folder, facts, result["rows"], pairs, methods)
+        facts["name"]: path_charts(folder, facts, result["rows"], known, methods)
         for facts in result["sequences"]
     }
+    protocol, named = result["protocol"], ("name", "inputs", "source", "note")
     content = {
         "result": result,
         "pairs": len(pairs.drop_duplicates(["sequence", "index"])),
@@ -79,7 +82,7 @@ def write_report(folder: Path, result: Mapping[str, Any], pairs: pd.DataFrame) -
         "totals": (totals, COLUMNS, ("method", "flow_source")),
         "sections": [(name, _json(some)) for name, some in sections.items() if some],
         "sequences": [(name, _json(some)) for name, some in paths.items()],
-        "published": _published(result["protocol"]),
+        "published": protocol and (protocol["published"], protocol["columns"], named),
         "numbers": (every, COLUMNS, ("sequence", "method", "flow_source")),
         "number": number,
     }
@@ -105,15 +108,7 @@ def number(value: float | None, digits: int = 3) -> str:
     return f"{value:.{digits}g}"
 
 
-def _published(protocol: Mapping[str, Any] | None) -> Any:
-    """What others published under a protocol: rows, columns, names."""
-    if protocol is None:
-        return None
-    columns = [(m["key"], f"{m['label']} [{m['unit']}]", 1.0) for m in protocol["metrics"]]
-    return protocol["published"], columns, ("name", "inputs", "source", "note")
-
-
-def _json(figures: Sequence[Any]) -> list[str]:
+def _json(figures: Several[Any]) -> list[str]:
     """JSON that may stand inside of a script element."""
     return [figure.to_json().replace("<", "\\u003c") for figure in figures]
 
@@ -121,7 +116,7 @@ def _json(figures: Sequence[Any]) -> list[str]:
 # -- charts ----------------------------------------------------------------------------------------
 
 
-def _chart(kind: Any, rows: pd.DataFrame, methods: Sequence[str], **more: Any) -> Figure:
+def _chart(kind: Any, rows: pd.DataFrame, methods: Several[str], **more: Any) -> Figure:
     """A chart with a colour for each method, black for the truth, and a line at one pixel."""
     palette = px.colors.qualitative.Dark24
     colours = {method: palette[k % len(palette)] for k, method in enumerate(methods)}
@@ -143,19 +138,17 @@ def _chart(kind: Any, rows: pd.DataFrame, methods: Sequence[str], **more: Any) -
     return figure
 
 
-def error_distribution(pairs: pd.DataFrame, methods: Sequence[str]) -> list[Figure]:
+def error_distribution(known: pd.DataFrame, methods: Several[str]) -> list[Figure]:
     """Share of the pairs below an error."""
-    known = pairs.dropna(subset=["epe_l2_px"])
     if known.empty:
         return []
     figure = _chart(px.ecdf, known, methods, x="epe_l2_px", ecdfnorm="percent")
     return [figure.update_yaxes(title="pairs below it [%]")]
 
 
-def factor_charts(pairs: pd.DataFrame, methods: Sequence[str]) -> list[Figure]:
+def factor_charts(known: pd.DataFrame, methods: Several[str]) -> list[Figure]:
     """Median error over the bins of each factor; a factor with one bin tells nothing."""
     figures = []
-    known = pairs.dropna(subset=["epe_l2_px"])
     for name, (label, edges) in FACTORS.items():
         bins = pd.cut(known[name], edges, include_lowest=True)
         groups = known.groupby(["method", bins], observed=True)["epe_l2_px"]
@@ -170,35 +163,28 @@ def factor_charts(pairs: pd.DataFrame, methods: Sequence[str]) -> list[Figure]:
 def path_charts(
     folder: Path,
     facts: Mapping[str, Any],
-    rows: Sequence[Mapping[str, Any]],
-    pairs: pd.DataFrame,
-    methods: Sequence[str],
+    rows: Several[Mapping[str, Any]],
+    known: pd.DataFrame,
+    methods: Several[str],
 ) -> list[Figure]:
-    """Path from above and error of every pair of one of the ``sequences`` of a result."""
+    """Path from above, in the first true camera, and error of every pair of one sequence."""
     name, truth = facts["name"], facts["ground_truth"]
-    files = {TRUTH: truth} if truth else {}
-    files |= {row["method"]: row["trajectory"] for row in rows if row["sequence"] == name}
-    paths = _positions({method: folder / file for method, file in files.items()})
-    axes = {"x": "right", "y": "forward", "title": "From above"}
-    figures = [_chart(px.line, paths, methods, **axes).update_yaxes(scaleanchor="x")]
-    known = pairs[pairs["sequence"] == name].dropna(subset=["epe_l2_px"])
-    if len(known):
-        axes = {"x": "index", "y": "epe_l2_px", "title": "Error of every pair"}
-        figures.append(_chart(px.line, known, methods, **axes))
-    return figures
-
-
-def _positions(files: Mapping[str, Path]) -> pd.DataFrame:
-    """``method, right, forward`` of every path in the first true camera, metres."""
-    paths = {name: read_trajectory(file) for name, file in files.items()}
-    gt = paths.get(TRUTH)
+    files = {row["method"]: row["trajectory"] for row in rows if row["sequence"] == name}
+    paths = {method: read_trajectory(folder / file) for method, file in files.items()}
+    if truth:
+        gt = read_trajectory(folder / truth)
+        paths = {TRUTH: gt} | {method: aligned(path, gt)[0] for method, path in paths.items()}
     tables = []
     for method, path in paths.items():
-        if gt is not None:
-            path = aligned(path, gt)[0]
-        first = path if gt is None else gt
+        first = gt if truth else path
         x, _, z = path.transformed(invert(first.T_world_cam[0])).positions.T
         thinned = slice(None, None, len(path) // 1500 + 1)
-        rows = {"method": method, "right": x[thinned], "forward": z[thinned]}
-        tables.append(pd.DataFrame(rows))
-    return pd.concat(tables)
+        rows_of = {"method": method, "right": x[thinned], "forward": z[thinned]}
+        tables.append(pd.DataFrame(rows_of))
+    axes = {"x": "right", "y": "forward", "title": "From above"}
+    above = _chart(px.line, pd.concat(tables), methods, **axes).update_yaxes(scaleanchor="x")
+    mine = known[known["sequence"] == name]
+    if mine.empty:
+        return [above]
+    axes = {"x": "index", "y": "epe_l2_px", "title": "Error of every pair"}
+    return [above, _chart(px.line, mine, methods, **axes)]

@@ -1,13 +1,15 @@
-"""Lines of ``results.json``: one method on one sequence, and one method on all of them.
+"""Errors of relative poses, and lines of ``results.json`` over many of them.
 
 A failed estimate counts with the motion it carries, which is none, in every mean and median.
 """
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
+from collections.abc import Sequence as Several
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +17,26 @@ import numpy as np
 import pandas as pd
 from scipy.stats import binomtest
 
+from hybridvo.data.base import Sequence
+from hybridvo.data.image_io import UNKNOWN_FLOW
+from hybridvo.data.sequence import resize_camera
 from hybridvo.errors import InputError
-from hybridvo.evaluation.pair_errors import mean_pair_errors
 from hybridvo.files import parse_yaml
-from hybridvo.types import Camera
+from hybridvo.geometry import (
+    backproject,
+    ego_flow,
+    invert,
+    matrix_to_euler_deg,
+    pixel_grid,
+    pose_matrix,
+    rotation_angle,
+)
+from hybridvo.trajectory import Trajectory
+from hybridvo.types import Camera, Frame
 
+PAPER_SIZE = (128, 256)  # height and width at which the paper measures its EPE
+MOVING_PX = 1.0  # of the true flow beside the true ego flow: the pixel moves by itself
+ERRORS = ("r_err_deg", "t_err", "epe", "epe_l2_px", "rot_err_deg", "trans_err")
 FAILURE_PX = 1.0  # error of the ego flow at native size above which an estimate has failed
 PATH_KEYS = ("ate_rmse", "rpe_trans_rmse", "rpe_rot_rmse_deg", "ate_rmse_origin")
 NO_PAIRS = "no pair was estimated, or none has ground truth"
@@ -41,6 +58,124 @@ PAIR_COLUMNS = (
 """Columns of ``pairs.csv``."""
 
 
+def true_motion(sequence: Sequence, prev: int, curr: int) -> np.ndarray | None:
+    """True T_curr_prev (4, 4) between two frames of a sequence, or None where it is not known."""
+    if sequence.poses is None:
+        return None
+    T = invert(sequence.poses[curr]) @ sequence.poses[prev]
+    return T if np.isfinite(T).all() else None
+
+
+def true_trajectory(sequence: Sequence, indices: Iterable[int]) -> Trajectory | None:
+    """True poses of those frames that have one; None where there are none."""
+    poses = sequence.poses
+    known = [] if poses is None else [i for i in indices if np.isfinite(poses[i]).all()]
+    if poses is None or not known:
+        return None
+    # text files carry six digits: made orthonormal as the trajectory demands
+    T = np.stack([pose_matrix(poses[i][:3]) for i in known])
+    return Trajectory(sequence.timestamps[known], T)
+
+
+def step_errors(
+    sequence: Sequence, prev: Frame | None, curr: int, T_curr_prev: np.ndarray
+) -> dict[str, float | None]:
+    """:func:`pair_errors` of a motion from a frame to frame ``curr``; none without a true one."""
+    T_gt = None if prev is None else true_motion(sequence, prev.index, curr)
+    if prev is None or T_gt is None:
+        return {}
+    depth = prev.depth if prev.depth is not None else np.full(prev.camera.shape, np.nan)
+    return pair_errors(T_curr_prev, T_gt, depth, prev.camera, sequence.camera(curr))
+
+
+@np.errstate(divide="ignore", invalid="ignore", over="ignore")
+def _paper_epe(
+    T_est: np.ndarray, T_gt: np.ndarray, depth: np.ndarray, prev: Camera, curr: Camera
+) -> float | None:
+    """Mean over pixels *and components* of |F_ego - F~_ego| at 128x256; invalid ones count as 0."""
+    # nearest at pixel centres: centre i of the small grid lies at (i + 0.5) / s - 0.5
+    rows, columns = (
+        ((np.arange(small) + 0.5) * size / small).astype(int)
+        for small, size in zip(PAPER_SIZE, prev.shape, strict=True)
+    )
+    small = np.asarray(depth[np.ix_(rows, columns)], dtype=np.float64)
+    valid = np.isfinite(small) & (small > 0)
+    if not valid.any():
+        return None
+    prev, curr = (resize_camera(camera, *PAPER_SIZE) for camera in (prev, curr))
+    points = backproject(np.where(valid, small, np.nan), prev)
+    flows = []
+    for T in (T_est, T_gt):
+        moved = (points @ T[:3, :3].T + T[:3, 3]) @ curr.K.T
+        # as in the published code ("to avoid reflection"): never undefined
+        moved = moved[..., :2] / (np.abs(moved[..., 2:]) + 1e-12)
+        flows.append(moved - pixel_grid(*PAPER_SIZE))
+    counted = valid & (np.linalg.norm(flows[1], axis=2) < 400.0)  # longer true flow counts as right
+    return float(np.abs(flows[0] - flows[1])[counted].sum()) / (2 * valid.size)
+
+
+def pair_errors(
+    T_est: np.ndarray,
+    T_gt: np.ndarray,
+    depth_prev: np.ndarray,
+    camera_prev: Camera,
+    camera_curr: Camera,
+) -> dict[str, float | None]:
+    """Errors of one estimated ``T_curr_prev`` (4, 4), metres.
+
+    The paper's: ``r_err_deg``, mean absolute difference of the Euler angles X-Y-Z; ``t_err``, that
+    of the translation's components; ``epe``, px at 128x256. ``epe_l2_px``: mean distance of the ego
+    flows at native size; a pixel that the estimate puts behind the camera counts with the image
+    diagonal. ``rot_err_deg``: geodesic angle; ``trans_err``: norm of the difference. Both EPE are
+    None where no pixel has a valid ``depth_prev`` (H, W), metres.
+    """
+    depth = np.asarray(depth_prev)
+    euler = matrix_to_euler_deg(T_est[:3, :3]) - matrix_to_euler_deg(T_gt[:3, :3])
+    euler = (euler + 180.0) % 360.0 - 180.0
+    translation = T_est[:3, 3] - T_gt[:3, 3]
+    est, gt = (ego_flow(depth, T, camera_prev, camera_curr) for T in (T_est, T_gt))
+    native = np.linalg.norm(est - gt, axis=2)[np.isfinite(gt).all(axis=2)]
+    native[~np.isfinite(native)] = np.hypot(*camera_prev.shape)
+    return {
+        "r_err_deg": float(np.abs(euler).mean()),
+        "t_err": float(np.abs(translation).mean()),
+        "epe": _paper_epe(T_est, T_gt, depth, camera_prev, camera_curr),
+        "epe_l2_px": float(native.mean()) if len(native) else None,
+        "rot_err_deg": float(np.degrees(rotation_angle(T_est[:3, :3] @ T_gt[:3, :3].T))),
+        "trans_err": float(np.linalg.norm(translation)),
+    }
+
+
+def pair_facts(sequence: Sequence, prev: int, curr: int) -> dict[str, float]:
+    """What may explain an error: how much moves, how far, before what. What is unknown is absent.
+
+    The true flow, of everything that moves, serves for this alone: no estimate ever sees it.
+    """
+    T_gt, depth = true_motion(sequence, prev, curr), sequence.frame(prev).depth
+    if T_gt is None or depth is None:
+        return {}
+    facts = {
+        "rotation_deg": float(np.degrees(rotation_angle(T_gt[:3, :3]))),
+        "translation_m": float(np.linalg.norm(T_gt[:3, 3])),
+    }
+    known = depth[np.isfinite(depth) & (depth > 0)]
+    if len(known):
+        low, high = np.quantile(known, [0.1, 0.9])
+        facts["depth_spread"] = float(high / low)
+    ego = ego_flow(depth, T_gt, sequence.camera(prev), sequence.camera(curr))
+    valid = np.isfinite(ego).all(axis=2)
+    if valid.any():
+        facts["flow_magnitude_px"] = float(np.median(np.linalg.norm(ego[valid], axis=1)))
+    # TartanAir's true flow does not show what moves by itself
+    whole = sequence.flow_is_true and sequence.kind != "tartanair" and curr == prev + 1
+    with contextlib.suppress(InputError, OSError):
+        flow_gt = sequence.flow(prev)[0] if whole else np.full_like(ego, np.nan)
+        valid &= (np.abs(flow_gt) < UNKNOWN_FLOW).all(axis=2)
+        moving = np.linalg.norm(ego[valid] - flow_gt[valid], axis=1) > MOVING_PX
+        facts |= {"dynamic_fraction": float(moving.mean())} if len(moving) else {}
+    return facts
+
+
 def pair_table(pairs: Any) -> pd.DataFrame:
     """Pairs (dictionaries, or a table) with every column and no other; unknown numbers are NaN."""
     table = pd.DataFrame(pairs, columns=list(PAIR_COLUMNS))
@@ -51,7 +186,7 @@ def pair_table(pairs: Any) -> pd.DataFrame:
 
 
 def failure_rate(pairs: pd.DataFrame) -> dict[str, Any]:
-    """``pairs``, ``failures``, ``failure_rate`` and its Wilson interval (95 %) over a table.
+    """``failures``, ``failure_rate`` and its Wilson interval (95 %) over a table; None of no pairs.
 
     A failure is a failed estimate or an error above one pixel; unknown errors are left out.
     """
@@ -59,56 +194,58 @@ def failure_rate(pairs: pd.DataFrame) -> dict[str, Any]:
     total, failures = int((failed | epe.notna()).sum()), int((failed | (epe > FAILURE_PX)).sum())
     names = ("failures", "failure_rate", "failure_rate_low", "failure_rate_high")
     if not total:
-        return {"pairs": 0, **dict.fromkeys(names)}
-    interval = binomtest(failures, total).proportion_ci(0.95, method="wilson")
-    values = (failures, failures / total, float(interval.low), float(interval.high))
-    return {"pairs": total, **dict(zip(names, values, strict=True))}
+        return dict.fromkeys(names)
+    low, high = binomtest(failures, total).proportion_ci(0.95, method="wilson")
+    return dict(zip(names, (failures, failures / total, float(low), float(high)), strict=True))
 
 
 def pair_scores(pairs: pd.DataFrame) -> dict[str, Any]:
-    """Everything that is a mean, median or count over the pairs of one method and flow."""
+    """Every mean, median and count over the pairs of one method and flow; why some are None."""
     scored = pairs[pairs["rot_err_deg"].notna()]
-    scores = mean_pair_errors(scored) | failure_rate(pairs)
-    figures = {
+    figures = {name: scored[name].mean() for name in ERRORS[:4]}
+    for name in ERRORS[4:]:
+        figures |= {f"{name}_{how}": scored[name].agg(how) for how in ("mean", "median")}
+    figures |= {
         "epe_l2_px_median": pairs["epe_l2_px"].median(),
         "ms_per_pair_median": pairs["ms"].median(),
         "flow_ms_median": pairs["flow_ms"].median(),
         "dynamic_fraction": pairs["dynamic_fraction"].mean(),
     }
-    scores |= {k: None if math.isnan(value) else float(value) for k, value in figures.items()}
+    known = {name: None if math.isnan(value) else float(value) for name, value in figures.items()}
+    scores = known | failure_rate(pairs) | {"pairs": len(pairs), "pairs_scored": len(scored)}
+    reasons = {
+        name: NO_MOVING if name == "dynamic_fraction" else NO_PAIRS
+        for name, value in scores.items()
+        if value is None
+    }
     failed = int(pairs["status"].str.startswith("failed").sum())
-    scores |= {"pairs": len(pairs), "failed": failed, "pairs_scored": len(scored)}
-    for name in [name for name, value in scores.items() if value is None]:
-        unknown = NO_MOVING if name == "dynamic_fraction" else NO_PAIRS
-        scores["reasons"].setdefault(name, unknown)
-    return scores
+    return scores | {"failed": failed, "reasons": reasons}
 
 
 def sequence_row(
     pairs: pd.DataFrame, path: Mapping[str, Any] | None, named: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Line of one method on one sequence; ``path`` is what ``evaluate`` says, where it can."""
-    scores = pair_scores(pairs)
+    line = {**named, **pair_scores(pairs)}
     path = path or {"alignment": "se3", "reasons": dict.fromkeys(PATH_KEYS, NO_TRUTH)}
-    scores["reasons"] |= {k: v for k, v in path["reasons"].items() if k in PATH_KEYS}
-    scores |= {name: path.get(name) for name in ("alignment", *PATH_KEYS)}
-    return {**named, **scores}
+    line["reasons"] |= {k: v for k, v in path["reasons"].items() if k in PATH_KEYS}
+    return line | {name: path.get(name) for name in ("alignment", *PATH_KEYS)}
 
 
-def total_row(pairs: pd.DataFrame, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def total_row(pairs: pd.DataFrame, rows: Several[Mapping[str, Any]]) -> dict[str, Any]:
     """Line of one method over all sequences: pairs pooled, trajectory errors as plain means."""
-    scores = pair_scores(pairs)
-    for key in PATH_KEYS:
-        known = [row[key] for row in rows if row[key] is not None]
-        scores[key] = float(np.mean(known)) if known else None
-        missing = [f"{r['sequence']}: {r['reasons'][key]}" for r in rows if r[key] is None]
-        if missing:
-            text = f"mean over {len(known)} of {len(rows)} sequences; without {'; '.join(missing)}"
-            scores["reasons"][key] = text
     depth = ", ".join(dict.fromkeys(row["depth_source"] for row in rows))
     named = {"method": rows[0]["method"], "flow_source": rows[0]["flow_source"]}
     named |= {"sequence": "all", "depth_source": depth, "alignment": "se3"}
-    return {**named, "sequences": len(rows), **scores}
+    line = {**named, "sequences": len(rows), **pair_scores(pairs)}
+    for key in PATH_KEYS:
+        known = [row[key] for row in rows if row[key] is not None]
+        line[key] = float(np.mean(known)) if known else None
+        missing = [f"{r['sequence']}: {r['reasons'][key]}" for r in rows if r[key] is None]
+        if missing:
+            text = f"mean over {len(known)} of {len(rows)} sequences; without {'; '.join(missing)}"
+            line["reasons"][key] = text
+    return line
 
 
 # -- the paper's way of scoring MPI Sintel ---------------------------------------------------------
@@ -128,16 +265,16 @@ def same_intrinsics(first: Camera, second: Camera) -> bool:
     return first.shape == second.shape and close
 
 
-def check_protocol(sequences: Sequence[Any]) -> None:
+def check_protocol(sequences: Several[Any]) -> None:
     """Refuse sequences that the protocol does not score."""
-    for sequence in sequences:
-        if sequence.kind != "sintel" or sequence.name not in paper_protocol()["sequences"]:
-            raise InputError(
-                f"--protocol paper: expected training sequences of MPI Sintel, got {sequence.name}."
-            )
+    known = paper_protocol()["sequences"]
+    wrong = [s.name for s in sequences if s.kind != "sintel" or s.name not in known]
+    if wrong:
+        expected = "training sequences of MPI Sintel"
+        raise InputError(f"--protocol paper: expected {expected}, got {', '.join(wrong)}.")
 
 
-def protocol_summary(scored: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def protocol_summary(scored: Several[Mapping[str, Any]]) -> dict[str, Any]:
     """What stands under ``protocol`` in ``results.json``: published lines, what is missing."""
     protocol = paper_protocol()
     names, count = [s["name"] for s in scored], sum(s["pairs_scored"] for s in scored)

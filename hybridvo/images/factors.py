@@ -16,7 +16,7 @@ import numpy as np
 from scipy.optimize import nnls
 
 from hybridvo.calibration import EVEN_PARTS, UNEVEN_LIGHT
-from hybridvo.geometry import as_contiguous, points_at
+from hybridvo.geometry import as_contiguous, backproject
 from hybridvo.images import kernels
 from hybridvo.refinement.kernels import MAX_VALUE
 from hybridvo.refinement.pixels import typical
@@ -323,7 +323,7 @@ class PlaneFactor:
         used = (z > 0) & np.isfinite(z) & (weight >= least)
         self.cells, self._grid = np.nonzero(used), used.shape  # rows and columns on the grid
         self.index = np.stack([rows[used], columns[used]], 1)  # (N, 2) the same in px
-        self.points = points_at(np.asarray(pair.prev.depth), pair.prev.camera, self.index)
+        self.points = backproject(np.asarray(pair.prev.depth), pair.prev.camera, self.index)
         self._weight, self._tiles = weight[used].astype(np.float64), Tiles(self._shape, self.index)
         self._K = np.array([curr.fx, curr.fy, curr.cx, curr.cy])
         self._depth = as_contiguous(np.asarray(pair.curr.depth))

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from hybridvo.calibration import DIRECT_RIGHT
-from hybridvo.geometry import as_contiguous, points_at, pose_matrix, projection_rows
+from hybridvo.geometry import as_contiguous, backproject, pose_matrix, projection_rows
 from hybridvo.images.factors import MIN_POINTS, ImageFactor, PlaneFactor
 from hybridvo.images.kernels import select_pixels
 from hybridvo.refinement.solver import Factor, PriorFactor, gauss_newton, positive_inverse
@@ -138,7 +138,7 @@ def _refused(pose: RelativePose, report: PhotometricReport) -> RelativePose:
 def _spread_px(pair: FramePair, index: np.ndarray, covariance: np.ndarray) -> float:
     """How far a covariance (6, 6) lets the pixels move in the image, root mean square, px."""
     few = index[:: max(1, len(index) // 200)]
-    points = points_at(np.asarray(pair.prev.depth), pair.prev.camera, few)
+    points = backproject(np.asarray(pair.prev.depth), pair.prev.camera, few)
     J = np.stack(projection_rows(points, pair.curr.camera))
     return float(np.sqrt(np.einsum("cnp,pq,cnq->", J, covariance, J) / len(few)))
 

@@ -15,8 +15,6 @@ from hybridvo.errors import InputError
 from hybridvo.refinement.torch_factors import checked_batch
 from hybridvo.types import FramePair, PairBatch
 
-FLOW_SCALE_PX = 200.0
-"""Flow is divided by this before it enters a network."""
 NETWORK_SIZE = (128, 256)
 """Height and width of the paper's inputs."""
 MIN_DEPTH = 1e-2
@@ -58,25 +56,14 @@ class TensorBatch:
 
 @dataclass(frozen=True, eq=False)
 class NetworkInputs(TensorBatch):
-    """Inputs of a batch of pairs at the network's size (h, w); what is invalid is 0.
+    """Inputs of a batch of pairs at the network's size (h, w); what is invalid is 0."""
 
-    ``flow`` (B, 2, h, w): pixels of this size over ``FLOW_SCALE_PX``; ``inverse_depth``
-    (B, 2, h, w): 1 / metres of the previous depth, and of the current one at x + F; ``rays``
-    (B, 2, h, w): first two components of K^-1 x; ``valid`` (B, h, w): flow and previous depth are
-    both usable; intrinsics (B, 3, 3) of this size.
-    """
-
-    flow: torch.Tensor
-    inverse_depth: torch.Tensor
-    rays: torch.Tensor
-    valid: torch.Tensor
-    K_prev: torch.Tensor
+    flow: torch.Tensor  # (B, 2, h, w) pixels of this size
+    inverse_depth: torch.Tensor  # (B, 2, h, w) 1 / metres: previous, and current at x + F
+    rays: torch.Tensor  # (B, 2, h, w) first two components of K^-1 x
+    valid: torch.Tensor  # (B, h, w) bool: flow and previous depth are both usable
+    K_prev: torch.Tensor  # (B, 3, 3) of this size
     K_curr: torch.Tensor
-
-    @property
-    def flow_px(self) -> torch.Tensor:
-        """(B, 2, h, w) flow in pixels of the network's size; 0 if invalid."""
-        return self.flow * FLOW_SCALE_PX
 
     @property
     def pixels(self) -> torch.Tensor:
@@ -84,10 +71,9 @@ class NetworkInputs(TensorBatch):
         focal, centre = pinhole(self.K_prev)
         return self.rays * focal + centre
 
-    @property
-    def size(self) -> tuple[int, int]:
-        """(h, w)."""
-        return self.flow.shape[2], self.flow.shape[3]
+    def on_grid_of(self, maps: torch.Tensor) -> NetworkInputs:
+        """Every n-th pixel of the inputs, one for each cell of maps (B, C, h', w')."""
+        return self.subsample(max(1, round(self.flow.shape[2] / maps.shape[2])))
 
 
 def pinhole(K: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -106,15 +92,16 @@ def scaled_intrinsics(
 
 
 def assemble_inputs(
-    pair: FramePair | PairBatch, size: tuple[int, int] = NETWORK_SIZE
+    pair: FramePair | PairBatch,
+    size: tuple[int, int] | None = NETWORK_SIZE,
+    *,
+    is_aligned: bool = False,
 ) -> NetworkInputs:
-    """Inputs of one pair or of a batch.
+    """Inputs of one pair or of a batch, of its own size where none is given.
 
     Missing or damaged values (no flow, no depth, NaN, inf, depth <= 0, masked pixels) become 0 and
     are marked in ``valid``. Float32 tensors on the CPU; for a batch, its type and device.
-
-    Raises:
-        InputError: another type, or shapes that do not fit each other.
+    ``is_aligned``: the current depth lies on the previous grid already, as in the paper's samples.
     """
     if isinstance(pair, FramePair):
         pair = PairBatch.from_pairs([pair])
@@ -123,45 +110,37 @@ def assemble_inputs(
         raise InputError(f"assemble_inputs: expected a FramePair or a PairBatch, got {got}.")
     batch = checked_batch(pair, where="assemble_inputs")[0]
     height, width = batch.flow.shape[1:3]
+    size = size or (height, width)
     rows = _nearest(height, size[0]).to(batch.flow.device)
     cols = _nearest(width, size[1]).to(batch.flow.device)
 
     def pick(x: torch.Tensor) -> torch.Tensor:
         return x.index_select(1, rows).index_select(2, cols)
 
-    flow, depth_curr = pick(batch.flow), None
-    if batch.depth_curr is not None:
-        depth_curr = _sample_at_flow(batch.depth_curr, flow, rows, cols)
+    flow, prev = pick(batch.flow), pick(batch.depth_prev)
+    if batch.depth_curr is None:
+        curr = torch.full_like(prev, torch.nan)
+    elif is_aligned:
+        curr = pick(batch.depth_curr)
+    else:
+        curr = _sample_at_flow(batch.depth_curr, flow, rows, cols)
     scale = flow.new_tensor([size[1] / width, size[0] / height])
     # pixel centres lie at whole coordinates: c' = s (c + 0.5) - 0.5
-    K_prev, K_curr = (
-        scaled_intrinsics(K, scale, 0.5 * scale - 0.5) for K in (batch.K_prev, batch.K_curr)
-    )
-    valid = None if batch.valid is None else pick(batch.valid)
-    depth = pick(batch.depth_prev)
-    resized = PairBatch(flow * scale, depth, K_prev, K_curr, depth_curr=depth_curr, valid=valid)
-    return _normalize(resized, _rays(rows, cols, batch.K_prev))
-
-
-def assemble_aligned(
-    flow: torch.Tensor, depth_prev: torch.Tensor, depth_curr: torch.Tensor, K: torch.Tensor
-) -> NetworkInputs:
-    """Inputs from samples of the network's size, as the paper trains on.
-
-    Flow (B, h, w, 2) px, depths (B, h, w) metres of the same scene points one step apart, both on
-    the previous grid, K (B, 3, 3) of both frames.
-    """
-    batch = PairBatch(flow, depth_prev, K, K, depth_curr=depth_curr)
-    batch = checked_batch(batch, where="assemble_aligned")[0]
-    rows, cols = (torch.arange(n, device=flow.device) for n in flow.shape[1:3])
-    return _normalize(batch, _rays(rows, cols, batch.K_prev))
-
-
-def _rays(rows: torch.Tensor, cols: torch.Tensor, K: torch.Tensor) -> torch.Tensor:
-    """(B, 2, h, w) first two components of K^-1 x at rows (h,) and columns (w,) of pixels."""
+    cameras = (scaled_intrinsics(K, scale, 0.5 * scale - 0.5) for K in (batch.K_prev, batch.K_curr))
     v, u = torch.meshgrid(rows, cols, indexing="ij")
-    focal, centre = pinhole(K)
-    return (torch.stack([u, v]).to(K.dtype) - centre) / focal
+    focal, centre = pinhole(batch.K_prev)
+    rays = (torch.stack([u, v]).to(flow.dtype) - centre) / focal
+    usable = torch.ones_like(prev).bool() if batch.valid is None else pick(batch.valid)
+    flow_ok = torch.isfinite(flow).all(-1) & usable
+    prev_ok = torch.isfinite(prev) & (prev >= MIN_DEPTH) & usable
+    curr_ok = torch.isfinite(curr) & (curr >= MIN_DEPTH) & flow_ok
+    inverse = [
+        # no 1 / 0 in the gradient of what is not selected
+        torch.where(ok, 1.0 / torch.where(ok, depth, 1.0), 0.0)
+        for depth, ok in ((prev, prev_ok), (curr, curr_ok))
+    ]
+    flow = torch.where(flow_ok[..., None], flow * scale, 0.0).permute(0, 3, 1, 2)
+    return NetworkInputs(flow, torch.stack(inverse, dim=1), rays, flow_ok & prev_ok, *cameras)
 
 
 def _nearest(native: int, target: int) -> torch.Tensor:
@@ -183,22 +162,3 @@ def _sample_at_flow(
     row = torch.where(inside, v, 0.0).round().long().clamp(0, height - 1)
     sampled = depth_curr.flatten(1).gather(1, (row * width + col).flatten(1)).view_as(u)
     return torch.where(inside, sampled, torch.nan)
-
-
-def _normalize(batch: PairBatch, rays: torch.Tensor) -> NetworkInputs:
-    """Inputs of a batch of the network's size, whose pixels have the rays (B, 2, h, w)."""
-    flow, prev, curr = batch.flow, batch.depth_prev, batch.depth_curr
-    flow_ok = torch.isfinite(flow).all(-1)
-    prev_ok = torch.isfinite(prev) & (prev >= MIN_DEPTH)
-    if batch.valid is not None:
-        flow_ok, prev_ok = flow_ok & batch.valid, prev_ok & batch.valid
-    curr = torch.full_like(prev, torch.nan) if curr is None else curr
-    curr_ok = torch.isfinite(curr) & (curr >= MIN_DEPTH) & flow_ok
-    flow = torch.where(flow_ok[..., None], flow, 0.0).permute(0, 3, 1, 2) / FLOW_SCALE_PX
-    inverse = [
-        # no 1 / 0 in the gradient of what is not selected
-        torch.where(ok, 1.0 / torch.where(ok, depth, 1.0), 0.0)
-        for depth, ok in ((prev, prev_ok), (curr, curr_ok))
-    ]
-    depths, valid = torch.stack(inverse, dim=1), flow_ok & prev_ok
-    return NetworkInputs(flow, depths, rays, valid, batch.K_prev, batch.K_curr)

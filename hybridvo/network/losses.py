@@ -1,10 +1,9 @@
 """Losses of PWVO and its baselines (paper, sections 3.2.2 and 3.4) in log form, s = log U.
 
-Four terms, each plain or weighed by uncertainty: rotation L^R and translation L^T, every pixel must
-name the pair's motion; ego flow L^F and depth L^D, the *selected* motion, applied to the true
-depth, must reproduce what the camera motion alone causes. They are those of the published code, but
-pixels without depth are left out, a point that the motion brings behind the camera is charged, and
-s may have a coarser grid than the flow.
+Rotation L^R and translation L^T: every pixel must name the pair's motion. Ego flow L^F and depth
+L^D: the *selected* motion, applied to the true depth, must reproduce what the camera motion causes.
+They are those of the published code, but pixels without depth are left out, a point that the motion
+brings behind the camera is charged, and s may have a coarser grid than the flow.
 """
 
 from __future__ import annotations
@@ -17,44 +16,32 @@ import torch.nn.functional as F
 from pydantic import Field
 
 from hybridvo.network.inputs import MIN_DEPTH, TensorBatch
-from hybridvo.network.selection import NetworkOutput, joined
 from hybridvo.options import Positive, option_group
 from hybridvo.results import PixelwisePrediction
 from hybridvo.torch_geometry import pixel_grid, reproject
 
+Scales = torch.Tensor | None
 MAX_EXPONENT = 30.0
 """exp(-s) goes on as a straight line beyond this."""
 
 
 @option_group
 class LossOptions:
-    """Which terms are on, and how.
+    """Which terms are on, and how."""
 
-    Args:
-        pose_uncertainty: weigh L^R and L^T by U^R and U^T (distribution learning).
-        flow_uncertainty, depth_uncertainty: weigh L^F and L^D by U^F and U^D, which are exp of 0.1
-            and 0.25 times s, as published.
-        translation_form: ``direction`` (the paper's: direction and length) or ``laplace`` (L1 of
-            each component in metres with its own s, so that exp(s) is in metres).
-        flow_limit_px: flow errors of a component at or above this do not count.
-        direction_floor: metres; below this length of the translation its direction fades out.
-            1e-6 as published; larger values calm the gradient near zero translation.
-    """
-
-    pose_uncertainty: bool = True
+    pose_uncertainty: bool = True  # weigh L^R and L^T by U^R and U^T (distribution learning)
     flow: bool = True
     depth: bool = True
-    flow_uncertainty: bool = True
-    depth_uncertainty: bool = True
+    flow_uncertainty: bool = True  # weigh L^F by U^F = exp(0.1 s), as published
+    depth_uncertainty: bool = True  # weigh L^D by U^D = exp(0.25 s)
     flow_weight: Annotated[float, Field(ge=0)] = 1.0
+    # direction (the paper's: direction and length), or laplace: L1 of each component in metres with
+    # its own s, so that exp(s) is in metres
     translation_form: Literal["direction", "laplace"] = "direction"
-    flow_limit_px: Positive = 20.0
+    flow_limit_px: Positive = 20.0  # errors of a component at or above this do not count
+    # metres; below this length of the translation its direction fades out: larger values than the
+    # published one calm the gradient near zero translation
     direction_floor: Positive = 1e-6
-
-    @property
-    def reconstructs(self) -> bool:
-        """Whether a term needs the selected transform."""
-        return self.flow or self.depth
 
     @property
     def needs_uncertainty(self) -> bool:
@@ -65,68 +52,42 @@ class LossOptions:
 
 @dataclass(frozen=True, eq=False)
 class LossTargets(TensorBatch):
-    """Ground truth of a batch, at the network's input size (h, w).
+    """Ground truth of a batch, at the network's input size (h, w)."""
 
-    ``rotation_deg`` (B, 3) Euler angles X-Y-Z and ``translation`` (B, 3) metres of T_curr_prev;
-    ``ego_flow`` (B, 2, h, w) px that the camera motion alone causes, NaN does not count; depths
-    (B, h, w) metres of the same scene points, both on the previous grid; intrinsics (B, 3, 3).
-    """
-
-    rotation_deg: torch.Tensor
-    translation: torch.Tensor
-    ego_flow: torch.Tensor
-    depth_prev: torch.Tensor
-    depth_curr: torch.Tensor
-    K_prev: torch.Tensor
+    motion: torch.Tensor  # (B, 6) Euler angles X-Y-Z in degrees, then metres, of T_curr_prev
+    ego_flow: torch.Tensor  # (B, 2, h, w) px by the camera motion alone; NaN does not count
+    depth_prev: torch.Tensor  # (B, h, w) metres of the same scene points,
+    depth_curr: torch.Tensor  # both on the previous grid
+    K_prev: torch.Tensor  # (B, 3, 3)
     K_curr: torch.Tensor
 
-
-def reconstruct(
-    depth_prev: torch.Tensor, T_curr_prev: torch.Tensor, K_prev: torch.Tensor, K_curr: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Flow and depth that a camera motion causes (paper, equation 8), differentiable.
-
-    Returns:
-        (B, 2, h, w) ego flow pi(K_curr, T D K_prev^-1 x) - x in px; (B, h, w) depth of the moved
-        point, below ``MIN_DEPTH`` behind the camera, 1 where ``depth_prev`` is invalid; (B, h, w)
-        bool: valid and in front of the camera. Elsewhere the flow is finite and means nothing.
-    """
-    pixels, valid, z = reproject(depth_prev, T_curr_prev, K_prev, K_curr, MIN_DEPTH)
-    flow = pixels - pixel_grid(depth_prev.shape[1], depth_prev.shape[2], depth_prev)
-    return flow.permute(0, 3, 1, 2), z, valid
+    def reconstruct(self, T: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Ego flow (B, 2, h, w), depth and validity (B, h, w) by a motion, as of ``reproject``."""
+        depth = self.depth_prev
+        pixels, valid, z = reproject(depth, T, self.K_prev, self.K_curr, MIN_DEPTH)
+        flow = pixels - pixel_grid(depth.shape[1], depth.shape[2], depth)
+        return flow.permute(0, 3, 1, 2), z, valid
 
 
 def total_loss(
-    output: NetworkOutput,
+    output: PixelwisePrediction,
     targets: LossTargets,
     options: LossOptions,
-    T_curr_prev: torch.Tensor | None = None,
+    T_curr_prev: torch.Tensor,
 ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-    """Weighted sum of the terms that are on; L^F and L^D need the selected motion (B, 4, 4).
+    """Weighted sum of the terms that are on, L^F and L^D of the selected motion (B, 4, 4).
 
-    Returns:
-        Scalar loss, and its unweighted terms without gradient under ``rotation``, ``translation``,
-        ``flow`` and ``depth``.
+    Also these terms, unweighted and without gradient: rotation, translation, flow, depth.
     """
-    s = None
-    if isinstance(output, PixelwisePrediction):
-        _, s = joined(output)
-        parts = _pose_losses(output, targets, s if options.pose_uncertainty else None, options)
-    else:
-        pairs = zip(output, (targets.rotation_deg, targets.translation), strict=True)
-        rotation, translation = ((value - true).abs().mean() for value, true in pairs)
-        parts = {"rotation": rotation, "translation": translation}
-    if options.reconstructs:
-        assert T_curr_prev is not None
-        cameras = targets.K_prev, targets.K_curr
-        flow, depth, defined = reconstruct(targets.depth_prev, T_curr_prev, *cameras)
-        known = torch.isfinite(targets.depth_prev) & (targets.depth_prev > 0)
-        if options.flow:
-            s_flow, limit = s if options.flow_uncertainty else None, options.flow_limit_px
-            parts["flow"] = _flow_loss(flow, targets.ego_flow, defined, known, s_flow, limit)
-        if options.depth:
-            s_depth = s if options.depth_uncertainty else None
-            parts["depth"] = _depth_loss(depth, targets.depth_curr, known, s_depth)
+    s = output.log_scale
+    parts = _pose_losses(output.motion, targets, s if options.pose_uncertainty else None, options)
+    flow, depth, defined = targets.reconstruct(T_curr_prev)
+    if options.flow:
+        s_flow = s if options.flow_uncertainty else None
+        parts["flow"] = _flow_loss(flow, defined, targets, s_flow, options.flow_limit_px)
+    if options.depth:
+        s_depth = s if options.depth_uncertainty else None
+        parts["depth"] = _depth_loss(depth, targets, s_depth)
     loss = sum((options.flow_weight if k == "flow" else 1.0) * x for k, x in parts.items())
     return torch.as_tensor(loss), {name: part.detach() for name, part in parts.items()}
 
@@ -142,38 +103,37 @@ def _norm(x: torch.Tensor) -> torch.Tensor:
     return (x.square().sum(dim=1, keepdim=True) + 1e-12).sqrt()
 
 
-def _direction(x: torch.Tensor, floor: float) -> torch.Tensor:
-    return x * x.square().sum(dim=1, keepdim=True).clamp(min=floor**2).rsqrt()
-
-
 def _pose_losses(
-    output: PixelwisePrediction, targets: LossTargets, s: torch.Tensor | None, options: LossOptions
+    motion: torch.Tensor, targets: LossTargets, s: Scales, options: LossOptions
 ) -> dict[str, torch.Tensor]:
-    """L^R and L^T of pixel maps, weighed by s (B, 6, ..) unless it is None; as published."""
-    true_r, true_t = (x[:, :, None, None] for x in (targets.rotation_deg, targets.translation))
-    laplace = options.translation_form == "laplace"
-    errors = [(true_r - output.rotation).abs(), (output.translation - true_t).abs()]
+    """L^R and L^T of maps (B, 6, h, w), weighed by s unless it is None; as published."""
+    true = targets.motion[:, :, None, None]
+    errors = list((motion - true).abs().split(3, dim=1))
+    # VONet, which names one motion: plain L1
+    laplace = options.translation_form == "laplace" or motion.shape[2:] == (1, 1)
     if not laplace:
-        floor = options.direction_floor
-        length = (_norm(true_t) - _norm(output.translation)).square()
-        turn = _direction(true_t, floor) - _direction(output.translation, floor)
-        errors[1] = length + _norm(turn)
+        found, t = motion[:, 3:], true[:, 3:]
+        turn = [
+            x * x.square().sum(dim=1, keepdim=True).clamp(min=options.direction_floor**2).rsqrt()
+            for x in (t, found)
+        ]
+        errors[1] = (_norm(t) - _norm(found)).square() + _norm(turn[0] - turn[1])
     if s is not None:
         halves = zip(errors, s.split(3, dim=1), (0.5, 0.5 if laplace else 1.0), strict=True)
         errors = [0.5 * _inverse_scale(x) * error + half * x for error, x, half in halves]
     return {"rotation": errors[0].mean(), "translation": errors[1].mean()}
 
 
+def _has_depth(targets: LossTargets) -> torch.Tensor:
+    return torch.isfinite(targets.depth_prev) & (targets.depth_prev > 0)
+
+
 def _flow_loss(
-    flow: torch.Tensor,
-    target: torch.Tensor,
-    defined: torch.Tensor,
-    known: torch.Tensor,
-    s: torch.Tensor | None,
-    limit_px: float,
+    flow: torch.Tensor, defined: torch.Tensor, targets: LossTargets, s: Scales, limit_px: float
 ) -> torch.Tensor:
     """L^F; with s (B, 6, ..) weighed by 1 / U^F = exp(-0.1 s)."""
-    known = known & torch.isfinite(target).all(dim=1)
+    target = targets.ego_flow
+    known = _has_depth(targets) & torch.isfinite(target).all(dim=1)
     error = (flow - torch.where(known[:, None], target, 0.0)).abs()
     counts = (defined & known)[:, None] & (error < limit_px)
     error = torch.where(counts, error, 0.0) + (known & ~defined)[:, None] * limit_px
@@ -185,14 +145,10 @@ def _flow_loss(
     return _weighed(torch.stack([a + b, a + b, a + b, a, b, a + b], dim=1), known, 0.1 * s, share)
 
 
-def _depth_loss(
-    depth: torch.Tensor, target: torch.Tensor, known: torch.Tensor, s: torch.Tensor | None
-) -> torch.Tensor:
-    """L^D of inverse depths; with s (B, 6, ..) weighed by 1 / U^D = exp(-0.25 s).
-
-    Only what changes a depth counts there: rx, ry, tz.
-    """
-    known = known & torch.isfinite(target) & (target >= MIN_DEPTH)
+def _depth_loss(depth: torch.Tensor, targets: LossTargets, s: Scales) -> torch.Tensor:
+    """L^D of inverse depths; with s (B, 6, ..) weighed by 1 / U^D = exp(-0.25 s)."""
+    target = targets.depth_curr
+    known = _has_depth(targets) & torch.isfinite(target) & (target >= MIN_DEPTH)
     target = torch.where(known, target, 1.0)
     front = depth >= MIN_DEPTH
     exact = 1.0 / target - 1.0 / torch.where(front, depth, 1.0)
@@ -201,6 +157,7 @@ def _depth_loss(
     error = torch.where(known, error, 0.0)
     if s is None:
         return error.sum() / known.sum().clamp(min=1)
+    # only rx, ry and tz change a depth
     return _weighed(error[:, None], known, 0.25 * s[:, [0, 1, 5]], 0.5)
 
 
@@ -208,17 +165,10 @@ def _weighed(
     error: torch.Tensor, known: torch.Tensor, s: torch.Tensor, share: torch.Tensor | float
 ) -> torch.Tensor:
     """Errors (B, C, h, w) over their scales exp(s), which may have a coarser grid, plus s."""
-    pixels = _to_cells(known[:, None].to(s.dtype), s.shape[2:])
-    error = _to_cells(error, s.shape[2:])
-    total = (0.5 * _inverse_scale(s) * error + share * s * pixels).sum()
-    return total / known.sum().clamp(min=1)
-
-
-def _to_cells(x: torch.Tensor, cells: torch.Size) -> torch.Tensor:
-    """Sum of (B, C, h, w) maps over the pixels of each cell of a coarser grid ``cells``."""
-    height, width = x.shape[2:]
-    side = -(-height // cells[0])
-    if side == 1:
-        return x
-    x = F.pad(x, (0, cells[1] * side - width, 0, cells[0] * side - height))
-    return F.avg_pool2d(x, side) * side**2
+    side = -(-error.shape[2] // s.shape[2])
+    pad = (0, s.shape[3] * side - error.shape[3], 0, s.shape[2] * side - error.shape[2])
+    # sums over the pixels of each cell
+    error, pixels = (
+        F.avg_pool2d(F.pad(x.to(s.dtype), pad), side) * side**2 for x in (error, known[:, None])
+    )
+    return (0.5 * _inverse_scale(s) * error + share * s * pixels).sum() / known.sum().clamp(min=1)

@@ -25,7 +25,7 @@ from hybridvo.network.layers import (
     initialize,
     scaled,
 )
-from hybridvo.network.normalization import normalize, predict
+from hybridvo.network.prediction import normalize, predict
 from hybridvo.network.weights import read_network
 from hybridvo.results import PixelwisePrediction
 from hybridvo.types import FramePair, PairBatch
@@ -95,16 +95,11 @@ class PWVO(nn.Module):
         channels = scaled(32, width)
         self.head_motion = _map_head(channels)
         self.head_uncertainty = _map_head(channels) if options.uncertainty else None
-        heads = [h for h in (self.head_motion, self.head_uncertainty) if h is not None]
-        initialize(self, tuple(heads))
+        initialize(self)
 
     @classmethod
     def from_pretrained(cls, name_or_path: str | Path = "pwvo") -> PWVO:
-        """A network in evaluation mode on the CPU, by the name or file of its weights.
-
-        Raises:
-            CheckpointError: no such weights, damaged ones, or another network's.
-        """
+        """A network in evaluation mode on the CPU, by the name or file of its weights."""
         network, _ = read_network(name_or_path, lambda o: build_network(NetworkOptions(**o)))
         if not isinstance(network, cls):
             raise CheckpointError(f"{name_or_path}: expected the weights of a PWVO, got another's.")
@@ -116,30 +111,23 @@ class PWVO(nn.Module):
         """Pose and log scale at every pixel: of assembled inputs in one pass, of pairs in all.
 
         Where flow or depth is missing the log scale is at least ``INVALID_LOG_SCALE``: no selection
-        prefers such a pixel.
-
-        Args:
-            inputs: pairs of any size; or inputs of size (h, w), multiples of 32 waste no border.
-            T_start: (B, 4, 4) a first motion, for scale-free networks: they look at what it leaves.
-
-        Returns:
-            Maps of (ceil(h / n), ceil(w / n)), n = input_stride * head_stride; in the network's own
-            type, also under autocast. Finite for any input.
+        prefers such a pixel. ``T_start`` (B, 4, 4): a first motion, for scale-free networks: they
+        look at what it leaves. Maps of (ceil(h / n), ceil(w / n)), n = input_stride * head_stride,
+        in the network's own type, also under autocast; finite for any input.
         """
         options, own = self.options, next(self.parameters())
         if not isinstance(inputs, NetworkInputs):
             batch = PairBatch.from_pairs([inputs]) if isinstance(inputs, FramePair) else inputs
             output = predict(self, assemble_inputs(batch).to(device=own.device, dtype=own.dtype))
-            assert isinstance(output, PixelwisePrediction)
             height, width = batch.flow.shape[1:3]
             return replace(output, image_size=(height, width))
         inputs, scale = normalize(inputs, options, T_start)
         x = self.branches(inputs)
         features = self.encoder(x)
         shared = self.decoder(x, features)
-        motion = scale.motion(self.head_motion(shared).to(own.dtype)).split(3, dim=1)
+        motion = scale.motion(self.head_motion(shared).to(own.dtype))
         if self.head_uncertainty is None:
-            return PixelwisePrediction(*motion)
+            return PixelwisePrediction(motion)
         if self.decoder_uncertainty is not None:
             shared = self.decoder_uncertainty(x, features)
         log_scale = self.head_uncertainty(shared).to(own.dtype)
@@ -148,13 +136,12 @@ class PWVO(nn.Module):
         seen = inputs.valid[:, None].to(own.dtype)
         seen = F.max_pool2d(seen, options.head_stride, ceil_mode=True)
         log_scale = torch.where(seen > 0, log_scale, log_scale.clamp(min=INVALID_LOG_SCALE))
-        return PixelwisePrediction(*motion, *log_scale.split(3, dim=1))
+        return PixelwisePrediction(motion, log_scale)
 
 
 def _pose_head(features: int) -> nn.Sequential:
-    """Fully connected 128-32-3."""
-    sizes = nn.Linear(features, 128), nn.Linear(128, 32), nn.Linear(32, 3)
-    return nn.Sequential(sizes[0], nn.ELU(), sizes[1], nn.ELU(), sizes[2])
+    layers = nn.Linear(features, 128), nn.ELU(), nn.Linear(128, 32), nn.ELU(), nn.Linear(32, 3)
+    return nn.Sequential(*layers)
 
 
 class VONet(nn.Module):
@@ -162,31 +149,30 @@ class VONet(nn.Module):
 
     grid = (2, 4)  # of the embedding of a 128x256 input; others are averaged to it
 
-    def __init__(self, options: NetworkOptions | None = None) -> None:
+    def __init__(self, options: NetworkOptions) -> None:
         super().__init__()
-        self.options = options = options or NetworkOptions(kind="vonet")
+        self.options = options
         self.branches = InputBranches()
-        self.encoder = Encoder(InputBranches.out_channels, options.width, inner_activation=False)
+        self.encoder = Encoder(InputBranches.out_channels, options.width, inner=False)
         channels, attends = self.encoder.channels[-1], options.kind == "vonet-attention"
         self.attention = SelfAttention(channels) if attends else nn.Identity()
         features = channels * math.prod(self.grid)
         self.head_rotation = _pose_head(features)
         self.head_translation = _pose_head(features)
-        initialize(self, (self.head_rotation, self.head_translation))
+        initialize(self)
 
     def forward(
         self, inputs: NetworkInputs, T_start: torch.Tensor | None = None
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """(B, 3) Euler angles X-Y-Z in degrees and (B, 3) metres of T_curr_prev."""
+    ) -> PixelwisePrediction:
+        """One motion of each pair, in maps of one pixel."""
         inputs, scale = normalize(inputs, self.options, T_start)
         embedding = self.attention(self.encoder(self.branches(inputs))[-1])
         features = F.adaptive_avg_pool2d(embedding, self.grid).flatten(1)
         raw = torch.cat([self.head_rotation(features), self.head_translation(features)], dim=1)
-        rotation, translation = scale.motion(raw.to(next(self.parameters()).dtype)).split(3, dim=1)
-        return rotation, translation
+        raw = raw.to(next(self.parameters()).dtype)[:, :, None, None]
+        return PixelwisePrediction(scale.motion(raw))
 
 
-def build_network(options: NetworkOptions | None = None) -> nn.Module:
+def build_network(options: NetworkOptions) -> nn.Module:
     """A :class:`PWVO` or :class:`VONet` with fresh weights, from torch's global generator."""
-    options = options or NetworkOptions()
     return PWVO(options) if options.kind == "pwvo" else VONet(options)

@@ -6,7 +6,7 @@ s = log U, U the Laplace scale that the network predicts:
 ``softmax``     weights softmax(-s), that is 1/U, as the published code: one over-confident patch
                 cannot silence the rest as it does with 1/U^2.
 ``argmin``      the chosen pixels of all patches weigh alike.
-``mean``        plain mean of all pixels, no patches: PWVO (naive), pixel-wise.
+``mean``        plain mean of all pixels, no patches: PWVO (naive), pixel-wise, VONet.
 ``exp_plus_u``  softmax(+U), as the paper prints it: it prefers the most uncertain pixels.
 ``joint``       softmax(-s) with one s for all six numbers, their mean: one pixel a patch.
 
@@ -23,7 +23,7 @@ import torch.nn.functional as F
 
 from hybridvo.errors import InputError
 from hybridvo.network.inputs import NetworkInputs, pinhole
-from hybridvo.refinement.torch_factors import Pixels, fit_pixels
+from hybridvo.refinement.torch_factors import Pixels, fit_pixels, to_tiles
 from hybridvo.results import PixelwisePrediction
 from hybridvo.torch_geometry import euler_transform, se3
 
@@ -42,111 +42,82 @@ MIN_WEIGHT = 1e-4
 MIN_SCALE = 1e-4
 """Least scale of the fit's kernel in focal lengths: 0.1 px at a focal length of 1000."""
 
-NetworkOutput = PixelwisePrediction | tuple[torch.Tensor, torch.Tensor]
-
 
 class PoseSeed(NamedTuple):
-    """Where a refinement starts, and how much it heeds each pixel.
+    """Where a refinement starts, and how much it heeds each pixel."""
 
-    ``T_curr_prev`` (B, 4, 4), metres; ``weights`` (B, H, W) in (0, 1], at the size of the images:
-    they carry the gradient of the log scales of the rotation; None where there is no uncertainty.
-    """
-
-    T_curr_prev: torch.Tensor
+    T_curr_prev: torch.Tensor  # (B, 4, 4) metres
+    # (B, H, W) in (0, 1], at the size of the images: they carry the gradient of the log scales of
+    # the rotation; None where there is no uncertainty
     weights: torch.Tensor | None
 
 
 def select(maps: PixelwisePrediction, method: str = "softmax") -> PoseSeed:
     """The paper's selection as the start of a refinement, with weights from the uncertainty.
 
-    Raises:
-        InputError: an unknown method.
-
-    Example:
-        >>> import torch
-        >>> maps = PixelwisePrediction(*(torch.zeros(1, 3, 8, 16) for _ in range(4)))
-        >>> select(maps).weights.shape
-        torch.Size([1, 8, 16])
+    ``method``: ``softmax``, ``argmin``, ``mean``, ``exp_plus_u`` or ``joint``; an InputError
+    refuses another.
     """
     T = select_motion(maps, method)
-    if maps.log_scale_rotation is None:
+    if maps.log_scale is None:
         return PoseSeed(T, None)
-    s = _doubt(maps.log_scale_rotation)
+    s = _doubt(maps.log_scale)
     least = s.flatten(1).amin(dim=1)[:, None, None]
     weights = torch.exp(-SHARPNESS * (s - least)).clamp(min=MIN_WEIGHT)
-    if maps.image_size is not None and maps.image_size != tuple(weights.shape[1:]):
-        weights = F.interpolate(
-            weights[:, None], maps.image_size, mode="bilinear", align_corners=False
-        )[:, 0]
+    if maps.image_size is not None:
+        weights = F.interpolate(weights[:, None], maps.image_size, mode="bilinear")[:, 0]
     return PoseSeed(T, weights)
 
 
 def _doubt(log_scale: torch.Tensor) -> torch.Tensor:
-    """(B, h, w) mean log scale of a pixel, finite."""
+    """(B, h, w) mean log scale of a pixel's rotation, finite."""
     limit = MAX_LOG_SCALE
-    return torch.nan_to_num(log_scale.mean(dim=1), limit, limit, -limit).clamp(-limit, limit)
+    return torch.nan_to_num(log_scale[:, :3].mean(dim=1), limit, limit, -limit).clamp(-limit, limit)
 
 
-def select_motion(output: NetworkOutput, method: str = "softmax") -> torch.Tensor:
-    """(B, 4, 4) T_curr_prev of any network's output, see :func:`select_pose`."""
-    return euler_transform(*select_pose(output, method))
+def select_motion(maps: PixelwisePrediction, method: str = "softmax") -> torch.Tensor:
+    """(B, 4, 4) T_curr_prev of a prediction, see :func:`select_pose`."""
+    return euler_transform(select_pose(maps, method))
 
 
 def select_pose(
-    output: NetworkOutput,
-    method: str = "softmax",
-    patch: int | None = None,
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """One motion of each pair: (B, 3) Euler angles X-Y-Z in degrees, (B, 3) translation in metres.
+    maps: PixelwisePrediction, method: str = "softmax", patch: int | None = None
+) -> torch.Tensor:
+    """One motion of each pair: (B, 6) Euler angles X-Y-Z in degrees, then metres; differentiable.
 
-    Each of the six numbers has its own pixels and weights; those of ``joint`` share theirs.
-    Differentiable in the predictions and, through the weights, in the log scales. Values that are
-    not finite are never chosen while their patch has another; a pair without any gives zero motion.
-    Without uncertainty the method is always ``mean``. ``patch``: side of the square patches in
-    cells of the maps, a quarter of the height by default: 32 at 128x256 (the paper).
+    Each of the six numbers has its own pixels and weights; those of ``joint`` share theirs. Values
+    that are not finite are never chosen while their patch has another; a pair without any gives
+    zero motion. Without uncertainty the method is always ``mean``. ``patch``: side of the square
+    patches in cells of the maps, a quarter of the height by default: 32 at 128x256 (the paper).
     """
-    if isinstance(output, tuple):
-        return output
     if method not in SELECTION_METHODS:
         raise InputError(
             f"select: method {method!r} unknown; known: {', '.join(SELECTION_METHODS)}."
         )
-    value, log_scale = joined(output)
-    if log_scale is None or method == "mean":
+    value, s = maps.motion, maps.log_scale
+    if s is None or method == "mean":
         finite = torch.isfinite(value)
         total = torch.where(finite, value, 0.0).sum(dim=(2, 3))
-        motion = total / finite.sum(dim=(2, 3)).clamp(min=1)
-    else:
-        height, width = value.shape[2:]
-        patch = min(patch or -(-height // PATCH_ROWS), max(height, width))
-        motion = _vote(value, log_scale, method, patch)
-    return motion[:, :3], motion[:, 3:]
-
-
-def joined(maps: PixelwisePrediction) -> tuple[torch.Tensor, torch.Tensor | None]:
-    """(B, 6, h, w) values and, where the network predicts them, log scales."""
-    motion = torch.cat([maps.rotation, maps.translation], dim=1)
-    if maps.log_scale_rotation is None or maps.log_scale_translation is None:
-        return motion, None
-    return motion, torch.cat([maps.log_scale_rotation, maps.log_scale_translation], dim=1)
-
-
-def _vote(value: torch.Tensor, log_scale: torch.Tensor, method: str, patch: int) -> torch.Tensor:
-    """(B, 6, h, w) values and log scales -> (B, 6)."""
-    usable = torch.isfinite(value) & torch.isfinite(log_scale)
+        return total / finite.sum(dim=(2, 3)).clamp(min=1)
+    usable = torch.isfinite(value) & torch.isfinite(s)
     if method == "joint":
         usable = usable.all(dim=1, keepdim=True).expand_as(usable)
     value = torch.where(usable, value, 0.0)
-    log_scale = torch.where(usable, log_scale, 0.0).clamp(-MAX_LOG_SCALE, MAX_LOG_SCALE)
+    s = torch.where(usable, s, 0.0).clamp(-MAX_LOG_SCALE, MAX_LOG_SCALE)
     if method == "joint":
-        log_scale = log_scale.mean(dim=1, keepdim=True).expand_as(log_scale)
+        s = s.mean(dim=1, keepdim=True).expand_as(s)
+    height, width = value.shape[2:]
+    side = min(patch or -(-height // PATCH_ROWS), max(height, width))
+
+    def patches(x: torch.Tensor, fill: float = 0.0) -> torch.Tensor:
+        return to_tiles(x, side, fill)
+
     # Padding that completes the last patches is infinitely uncertain: as every patch holds at least
     # one real pixel, and real ones rank below infinity, padding never wins.
-    rank = torch.where(usable, log_scale, torch.finfo(log_scale.dtype).max).detach()
-    winner = _patches(rank, patch, torch.inf).argmin(dim=-1, keepdim=True)
+    rank = torch.where(usable, s, torch.finfo(s.dtype).max).detach()
+    winner = patches(rank, torch.inf).argmin(dim=-1, keepdim=True)
     chosen, s, known = (
-        _patches(x, patch, 0.0).gather(-1, winner)[..., 0]
-        for x in (value, log_scale, usable.to(value.dtype))
+        patches(x).gather(-1, winner)[..., 0] for x in (value, s, usable.to(value.dtype))
     )
     logits = {"argmin": 0 * s, "exp_plus_u": s.exp()}.get(method, -s)
     # where no patch is known the weights are uniform over zeros
@@ -154,29 +125,19 @@ def _vote(value: torch.Tensor, log_scale: torch.Tensor, method: str, patch: int)
     return (torch.softmax(logits.masked_fill(~known, -torch.inf), dim=-1) * chosen).sum(dim=-1)
 
 
-def _patches(x: torch.Tensor, patch: int, fill: float) -> torch.Tensor:
-    """(B, 6, h, w) -> (B, 6, patches, patch * patch), the border completed with ``fill``."""
-    batch, channels, height, width = x.shape
-    rows, cols = -(-height // patch), -(-width // patch)
-    x = F.pad(x, (0, cols * patch - width, 0, rows * patch - height), value=fill)
-    x = x.reshape(batch, channels, rows, patch, cols, patch).transpose(3, 4)
-    return x.reshape(batch, channels, rows * cols, patch * patch)
-
-
 def fitted_motion(
-    output: NetworkOutput, inputs: NetworkInputs, selection: str = "softmax"
+    maps: PixelwisePrediction, inputs: NetworkInputs, selection: str = "softmax"
 ) -> torch.Tensor:
     """(B, 4, 4) motion that the pixels agree on which a prediction of these inputs trusts.
 
-    The selected pose is the start; the log scales of the rotation are the weights, and carry the
-    gradient. Refuses a prediction without uncertainty.
+    From the selected pose; the log scales of the rotation are the weights, and carry the gradient.
     """
-    if not isinstance(output, PixelwisePrediction) or output.log_scale_rotation is None:
+    if maps.log_scale is None:
         raise InputError("fitted_motion: expected a prediction with uncertainty.")
-    inputs = on_grid_of(output.log_scale_rotation, inputs)
+    inputs = inputs.on_grid_of(maps.log_scale)
     focal, centre = pinhole(inputs.K_curr)
-    target = (inputs.pixels + inputs.flow_px - centre) / focal
-    weights = pixel_weights(output.log_scale_rotation, inputs.valid)
+    target = (inputs.pixels + inputs.flow - centre) / focal
+    weights = pixel_weights(maps.log_scale, inputs.valid)
     depth = 1 / torch.where(inputs.valid, inputs.inverse_depth[:, 0], 1.0)[:, None]
     points = torch.cat([inputs.rays * depth, depth], dim=1)
     with torch.autocast(points.device.type, enabled=False):
@@ -186,16 +147,11 @@ def fitted_motion(
         pixels = Pixels(
             points.flatten(2), target.flatten(2), one, one, weights.flatten(1).to(one), unit
         )
-        T = fit_pixels(pixels, se3(select_motion(output, selection).detach().double()), MIN_SCALE)
+        T = fit_pixels(pixels, se3(select_motion(maps, selection).detach().double()), MIN_SCALE)
     return T.matrix().to(one)
 
 
-def on_grid_of(prediction: torch.Tensor, inputs: NetworkInputs) -> NetworkInputs:
-    """Every n-th pixel of the inputs, one for each cell (.., h, w) of a prediction."""
-    return inputs.subsample(max(1, round(inputs.size[0] / prediction.shape[-2])))
-
-
 def pixel_weights(log_scale: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
-    """(B, h, w) weights of a fit from log scales (B, C, h, w): 0 where invalid, their sum one."""
+    """(B, h, w) weights of a fit from log scales (B, 6, h, w): 0 where invalid, their sum one."""
     s = torch.where(valid, -SHARPNESS * _doubt(log_scale), -1e4)
     return torch.softmax(s.flatten(1), dim=1).view_as(s) * valid

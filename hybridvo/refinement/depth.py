@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hybridvo.calibration import DOUBTFUL_SPREAD, NO_SPREAD
-from hybridvo.geometry import as_contiguous, njit, points_at
+from hybridvo.geometry import as_contiguous, backproject, njit
 from hybridvo.refinement import kernels
 from hybridvo.refinement.kernels import FASTMATH, MAX_VALUE, MIN_DEPTH, W
 from hybridvo.results import Reason, Status
@@ -89,7 +89,7 @@ def compare_depths(
     (height, width), step = prev.depth.shape, max(1, math.isqrt(prev.depth.size // COMPARED))
     first = step // 2
     v, u = (first + step * k for k in np.nonzero(weights[first::step, first::step] > 0.5))
-    points = points_at(prev.depth, prev.camera, np.stack([v, u], axis=1))
+    points = backproject(prev.depth, prev.camera, np.stack([v, u], axis=1))
     moved = points @ T_curr_prev[2, :3] + T_curr_prev[2, 3]
     column, row = np.rint(u + flow[v, u, 0]), np.rint(v + flow[v, u, 1])
     inside = (row >= 0) & (column >= 0) & (row < height) & (column < width) & (moved > MIN_DEPTH)

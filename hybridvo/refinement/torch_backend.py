@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 
 from hybridvo.errors import InputError
 from hybridvo.options import RefineOptions
@@ -35,6 +34,7 @@ from hybridvo.refinement.torch_factors import (
     newton_matrix,
     solve_small,
     stepped,
+    to_tiles,
     typical_residual,
     weigh,
 )
@@ -251,19 +251,16 @@ def _covariances(
     for part in pixels.parts(tile * width):
         at = weigh(part, T.matrix(), how)
         J = at.jacobian()
-        columns = []
-        for x in (J, torch.cat([at.weighted(J), at.right[:, None]], dim=1)):
-            x = x.unflatten(-1, (-1, width))
-            x = F.pad(x, (0, -width % tile, 0, -x.shape[-2] % tile))
-            columns.append(x.unflatten(-1, (-1, tile)).unflatten(-3, (-1, tile)))
-        sums.append(torch.einsum("bprhiwj,bqrhiwj->bhwpq", *columns))
+        both = J, torch.cat([at.weighted(J), at.right[:, None]], dim=1)
+        tiles = (to_tiles(x.unflatten(-1, (-1, width)), tile) for x in both)
+        sums.append(torch.einsum("bprcn,bqrcn->bcpq", *tiles))
         seen.append((at.robust, at.distance2, at.cost))
     # 1 / typical depth, as of the coarse grid: half of the weight may lie on a sky at 30 km
     usable, z = few.weight > 0, few.points[:, 2]
     inverse = ((usable / z**2).sum(dim=1) / usable.sum(dim=1).clamp(min=1)).sqrt().clamp(min=1e-9)
-    both = torch.cat(sums, dim=1)  # (B, rows, columns, 6, 7): H and g of each tile
-    tiles = torch.cat([both[..., UPPER[0], UPPER[1]], both[..., 6]], dim=3)
-    values = (tiles, *spread, inverse, pixels.total, pixels.K[:, 0, 0], T.translation(), how.noise)
+    Hg = torch.cat(sums, dim=1).unflatten(1, (-1, -(-width // tile)))  # (B, rows, columns, 6, 7)
+    image = torch.cat([Hg[..., UPPER[0], UPPER[1]], Hg[..., 6]], dim=3)
+    values = (image, *spread, inverse, pixels.total, pixels.K[:, 0, 0], T.translation(), how.noise)
     found = []
     for sample in zip(*(x.double().cpu().numpy() for x in values), strict=True):
         covariance, occupied = NOTHING, 0

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import torch
+import torch.nn.functional as F
 
 from hybridvo.errors import InputError
 from hybridvo.refinement import kernels
@@ -109,6 +110,13 @@ def gather_pixels(batch: PairBatch, weights: torch.Tensor | None = None) -> Pixe
     maps = (points.movedim(3, 1), target.movedim(3, 1), flow_variance, depth_variance)
     weight = torch.where(usable, weight, zero)
     return Pixels._make([*(x.flatten(-2) for x in (*maps, weight)), cameras[1]])
+
+
+def to_tiles(x: torch.Tensor, tile: int, fill: float = 0.0) -> torch.Tensor:
+    """(..., H, W) -> (..., tiles, tile * tile), the border completed with ``fill``."""
+    x = F.pad(x, (0, -x.shape[-1] % tile, 0, -x.shape[-2] % tile), value=fill)
+    x = x.unflatten(-1, (-1, tile)).unflatten(-3, (-1, tile)).transpose(-3, -2)
+    return x.flatten(-4, -3).flatten(-2)
 
 
 def _relative(variance: torch.Tensor, good: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

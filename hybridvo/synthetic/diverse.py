@@ -162,7 +162,7 @@ def training_scene(rng: np.random.Generator, height: int, width: int) -> Scene:
     noise = float(rng.choice([0.0, rng.uniform(0, 4)]))
     path, solids = np.stack([np.eye(4), T]), tuple(_Surroundings(rng, view).solids)
     texture = int(rng.integers(2**31))
-    scene = Scene((camera, camera), path, solids, texture, tuple(light.tolist()), noise)
+    scene = Scene(camera, path, solids, texture, tuple(light.tolist()), noise)
     share = rng.choice([0.0, rng.uniform(0, 0.3), rng.uniform(0.3, 0.87)], p=[0.06, 0.3, 0.64])
     if share:
         scene = sized(scene, _movers(rng, view, T), float(share), (0.15, 6.0))[0]
@@ -181,10 +181,10 @@ def scene_pairs(
 ) -> dict[str, KnownPair]:
     """A scene with true flow (``rendered``) and, from its images, with DIS flow (``dis``)."""
     scene = training_scene(rng, height, width)
-    camera, T = scene.cameras[0], invert(scene.T_world_cam[1]) @ scene.T_world_cam[0]
+    camera, T = scene.camera, invert(scene.T_world_cam[1]) @ scene.T_world_cam[0]
     rgb = [scene.render(k).rgb if images else None for k in (0, 1)]
     depth = [scene.depth(k) for k in (0, 1)]
-    flow, _, moving = scene.flow(0)
+    flow, moving = scene.flow(0)
     # of the movers' pixels those whose flow the camera alone does not explain
     own = np.nan_to_num(flow) - camera_flow(camera.K, depth[0], T)[0]
     moving &= np.square(own).sum(axis=2) > (0.5 * camera.width / 1024) ** 2

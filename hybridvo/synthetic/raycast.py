@@ -1,4 +1,4 @@
-"""Ray casting of textured boxes, ellipsoids and cylinders: exact depth at any place of an image.
+"""Ray casting of textured boxes, ellipsoids and cylinders: exact depth of an image.
 
 A ray is (x, y, 1) t in the camera frame: its parameter t *is* the depth, and an affine map leaves
 it unchanged. P solids are given by ``shapes`` (P,) int64, ``A`` (P, 3, 4) maps from the unit shape
@@ -22,38 +22,34 @@ NEAR = 0.05
 
 
 def cast(
-    shapes: np.ndarray, A: np.ndarray, B: np.ndarray, K: np.ndarray, uv: np.ndarray
+    shapes: np.ndarray, A: np.ndarray, B: np.ndarray, K: np.ndarray, size: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Nearest solid at each place (H, W, 2) of an image: its depth (H, W) float64, inf where
-    nothing is hit, and its index (H, W) int32, -1 there.
+    """Nearest solid at each pixel of an image: its depth (H, W) float64, inf where nothing is hit,
+    and its index (H, W) int32, -1 there.
     """
     cube = np.array(list(itertools.product((-1.0, 1.0), repeat=3))).T
     corners = A[:, :, :3] @ cube + A[:, :, 3:]
     z = corners[:, 2]
     seen = K[:2] @ (corners / np.maximum(z, NEAR)[:, None])  # a box around each solid, px
-    low, high = seen.min(axis=2) - 1, seen.max(axis=2) + 1
+    low, high = np.clip([seen.min(axis=2) - 1, seen.max(axis=2) + 2], 0, size[::-1]).astype(int)
     reaches = (z <= NEAR).any(axis=1)
-    low[reaches], high[reaches] = -np.inf, np.inf
-    return _cast(shapes, B, np.hstack([low, high]), K, uv)
+    low[reaches], high[reaches] = 0, size[::-1]
+    return _cast(shapes, B, np.hstack([low, high]), K, *size)
 
 
 @njit(cache=True, nogil=True)
-def _cast(shapes, B_body_cam, bounds, K, uv):  # pragma: no cover - compiled
-    height, width = uv.shape[:2]
+def _cast(shapes, B_body_cam, bounds, K, height, width):  # pragma: no cover - compiled
     depth = np.full((height, width), np.inf)
     index = np.full((height, width), -1, dtype=np.int32)
     for p in range(shapes.shape[0]):
         left, top, right, bottom = bounds[p]
-        for i in range(height):
-            for j in range(width):
-                u, v = uv[i, j]
-                if not (left <= u <= right and top <= v <= bottom):
-                    continue
+        for v in range(top, bottom):
+            for u in range(left, right):
                 x, y = (u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]
                 t = _hit(shapes[p], B_body_cam[p], x, y)
-                if t < depth[i, j]:
-                    depth[i, j] = t
-                    index[i, j] = p
+                if t < depth[v, u]:
+                    depth[v, u] = t
+                    index[v, u] = p
     return depth, index
 
 

@@ -1,7 +1,4 @@
-"""Scenes of textured solids, rendered with exact depth, flow, visibility and moving objects.
-
-Everything here is ground truth by construction: an oracle, and named so wherever it is used.
-"""
+"""Scenes of textured solids, rendered with exact depth, flow and moving objects: oracles."""
 
 from __future__ import annotations
 
@@ -17,7 +14,6 @@ from numpy.typing import ArrayLike
 from hybridvo.data.base import Sequence
 from hybridvo.data.image_io import write_cam, write_dpt, write_flo
 from hybridvo.data.sequence import resize_camera
-from hybridvo.errors import InputError
 from hybridvo.files import atomic_write, make_folder
 from hybridvo.geometry import backproject, invert, pixel_grid, project
 from hybridvo.synthetic.draws import carried
@@ -54,7 +50,7 @@ class RenderedFrame(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Cameras of one size, camera path and solids of N frames.
+    """A camera, its path and the solids of N frames.
 
     Args:
         T_world_cam: (N, 4, 4) metres.
@@ -63,7 +59,7 @@ class Scene:
         noise: standard deviation of the sensor noise, grey levels.
     """
 
-    cameras: tuple[Camera, ...]
+    camera: Camera
     T_world_cam: np.ndarray
     solids: tuple[Solid, ...]
     seed: int = 0
@@ -73,53 +69,40 @@ class Scene:
     @property
     def frames(self) -> int:
         """Number of frames."""
-        return len(self.cameras)
-
-    @property
-    def object_ids(self) -> np.ndarray:
-        """(P,) int32 object number of every solid; 0 is static."""
-        return np.array([s.object_id for s in self.solids], dtype=np.int32)
+        return len(self.T_world_cam)
 
     @property
     def _shapes(self) -> np.ndarray:
         return np.array([s.shape for s in self.solids], dtype=np.int64)
 
-    def _maps(self, index: int, camera_index: int) -> tuple[np.ndarray, np.ndarray]:
-        """Maps (P, 3, 4) of the solids of a frame to a camera, and their inverses."""
+    def _maps(self, index: int, camera_index: int) -> np.ndarray:
+        """(P, 3, 4) maps of the solids of a frame to a camera."""
         solids = [s.A_world_body for s in self.solids]
         A = np.stack([A if A.ndim == 2 else A[index] for A in solids])
-        A = carried(invert(self.T_world_cam[camera_index]), A)
-        inverse = np.linalg.inv(A[:, :, :3])
-        return A, np.concatenate([inverse, -inverse @ A[:, :, 3:]], axis=2)
+        return carried(invert(self.T_world_cam[camera_index]), A)
 
     def _cast(self, index: int, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Maps to unit shapes, depth and index of the solid of each pixel of a frame."""
-        A, B = self._maps(index, index)
-        return B, *cast(self._shapes, A, B, camera.K, pixel_grid(*camera.shape))
+        A = self._maps(index, index)
+        inverse = np.linalg.inv(A[:, :, :3])
+        B = np.concatenate([inverse, -inverse @ A[:, :, 3:]], axis=2)
+        return B, *cast(self._shapes, A, B, camera.K, camera.shape)
 
-    def _motion(
-        self, index: int, moved: tuple[int, int], prev: Camera, curr: Camera
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Flow of a frame to what ``moved`` says, what is hidden, and the solid of each pixel."""
-        B, depth, solid = self._cast(index, prev)
-        A1, B1 = self._maps(*moved)
-        points = backproject(np.where(solid >= 0, depth, np.nan), prev)
-        change = carried(A1, B)[solid]
+    def _flow(self, index: int, camera: Camera, at: int) -> tuple[np.ndarray, np.ndarray]:
+        """Flow to the next view of the solids as in the frame ``at``, and which of them is seen."""
+        B, depth, solid = self._cast(index, camera)
+        change = carried(self._maps(at, index + 1), B)[solid]
+        points = backproject(np.where(solid >= 0, depth, np.nan), camera)
         points = (change[..., :3] @ points[..., None])[..., 0] + change[..., 3]
-        z = points[..., 2]
-        points[~(z > NEAR)] = np.nan
-        target = project(points, curr)
-        inside = ((target >= -0.5) & (target <= np.array(prev.shape[::-1]) - 0.5)).all(axis=-1)
-        nearest, _ = cast(self._shapes, A1, B1, curr.K, target)
-        seen = inside & (nearest >= z * (1.0 - 1e-6))  # a surface does not hide itself
-        return target - pixel_grid(*prev.shape), ~seen, solid
+        points[~(points[..., 2] > NEAR)] = np.nan
+        return project(points, camera) - pixel_grid(*camera.shape), solid
 
     def _object_id(self, solid: np.ndarray) -> np.ndarray:
-        return np.where(solid < 0, np.int32(-1), self.object_ids[solid])
+        return np.array([*(s.object_id for s in self.solids), -1], np.int32)[solid]
 
     def render(self, index: int) -> RenderedFrame:
         """One frame: depth and object of the ray through a centre, colour of four rays a pixel."""
-        camera = self.cameras[index]
+        camera = self.camera
         _, depth, solid = self._cast(index, camera)
         fine = resize_camera(camera, 2 * camera.height, 2 * camera.width)
         B, depth2, solid2 = self._cast(index, fine)
@@ -141,44 +124,40 @@ class Scene:
         offset = np.random.default_rng([self.seed, 1]).uniform(0, 500, (len(self.solids), 3))
         return scale, offset, np.array([s.colours for s in self.solids], dtype=float)
 
-    def flow(self, index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def flow(self, index: int) -> tuple[np.ndarray, np.ndarray]:
         """(H, W, 2) float32 px exact flow from a frame to the next one, NaN where nothing is hit;
-        (H, W) bool, True where the point is hidden or outside in the next frame; (H, W) bool,
-        True on moving objects.
+        (H, W) bool, True on moving objects.
         """
-        cameras = self.cameras[index], self.cameras[index + 1]
-        flow, hidden, solid = self._motion(index, (index + 1, index + 1), *cameras)
-        return flow.astype(np.float32), hidden, self._object_id(solid) > 0
+        flow, solid = self._flow(index, self.camera, index + 1)
+        return flow.astype(np.float32), self._object_id(solid) > 0
 
     def depth(self, index: int) -> np.ndarray:
         """(H, W) float32 metres of a frame, 0 where nothing is hit."""
-        depth = self._cast(index, self.cameras[index])[1]
+        depth = self._cast(index, self.camera)[1]
         return np.where(np.isfinite(depth), depth, 0.0).astype(np.float32)
 
     def object_id(self, index: int) -> np.ndarray:
         """(H, W) int32 object numbers of a frame."""
-        return self._object_id(self._cast(index, self.cameras[index])[-1])
+        return self._object_id(self._cast(index, self.camera)[-1])
 
     def moving_share(self, index: int, width: int = 96) -> tuple[float, float]:
         """Share of the pixels of a frame on movers, and the smallest depth; in a small image."""
-        _, depth, solid = self._cast(index, _small(self.cameras[index], width))
+        _, depth, solid = self._cast(index, self._small(width))
         return float(np.mean(self._object_id(solid) > 0)), float(depth.min())
 
     def dynamic_share(self, index: int, width: int = 96, threshold_px: float = 1.0) -> float:
         """Share of the pixels whose flow differs from the camera's, in px of the full image."""
-        small = [_small(camera, width) for camera in self.cameras[index : index + 2]]
-        flows = [self._motion(index, (at, index + 1), *small)[0] for at in (index + 1, index)]
-        difference = np.linalg.norm(flows[0] - flows[1], axis=-1)
-        ratio = small[0].width / self.cameras[index].width
-        return float(np.mean(difference > threshold_px * ratio))
+        small = self._small(width)
+        flow, ego_flow = (self._flow(index, small, at)[0] for at in (index + 1, index))
+        ratio = small.width / self.camera.width
+        return float(np.mean(np.linalg.norm(flow - ego_flow, axis=-1) > threshold_px * ratio))
 
-
-def _small(camera: Camera, columns: int) -> Camera:
-    """The camera of an image of at most so many columns."""
-    width = min(camera.width, columns)
-    height = max(1, round(camera.height * width / camera.width))
-    u, v = width / camera.width, height / camera.height
-    return Camera(u * camera.fx, v * camera.fy, u * camera.cx, v * camera.cy, height, width)
+    def _small(self, columns: int) -> Camera:
+        """The camera of an image of at most so many columns."""
+        c, width = self.camera, min(self.camera.width, columns)
+        height = max(1, round(c.height * width / c.width))
+        u, v = width / c.width, height / c.height
+        return Camera(u * c.fx, v * c.fy, u * c.cx, v * c.cy, height, width)
 
 
 class SyntheticSequence(Sequence):
@@ -189,22 +168,16 @@ class SyntheticSequence(Sequence):
     has_flow = True
     flow_is_true = True
 
-    def __init__(self, scene: Scene, name: str = "synthetic", fps: float = 24.0) -> None:
+    def __init__(self, scene: Scene, name: str = "synthetic") -> None:
         self.scene, self.name, self.root = scene, name, Path(name)
-        self.timestamps = np.arange(scene.frames) / fps
+        self.timestamps = np.arange(scene.frames) / 24.0
         self.poses, self.warnings = scene.T_world_cam, []
-
-    def __len__(self) -> int:
-        return self.scene.frames
-
-    def camera(self, index: int) -> Camera:
-        """Intrinsics of one frame."""
-        return self.scene.cameras[index]
+        self._camera = scene.camera
 
     def frame(self, index: int) -> Frame:
         """Image and true depth."""
-        rendered, stamp = self.scene.render(index), float(self.timestamps[index])
-        return Frame(rendered.rgb, rendered.depth, self.camera(index), stamp, int(index))
+        rgb, depth, _ = self.scene.render(index)
+        return Frame(rgb, depth, self.scene.camera, float(self.timestamps[index]), int(index))
 
     def flow(self, index: int) -> tuple[np.ndarray, None]:
         """True flow from frame ``index`` to the next, (H, W, 2) float32, and no variance."""
@@ -216,37 +189,21 @@ class SyntheticSequence(Sequence):
 
 
 def write_sintel(scene: Scene, root: str | os.PathLike[str], name: str) -> None:
-    """Write a scene in the layout of MPI Sintel.
+    """Write a scene as MPI Sintel does: ``root/training/PART/NAME/frame_0001.*`` for every frame.
 
-    ``root/training/{clean,depth,camdata_left,invalid}/NAME/frame_0001.*`` for each frame,
-    ``{flow,occlusions}`` for each but the last, and ``moving`` (ours: 255 on moving objects).
-
-    Raises:
-        InputError: a name that is not a plain folder name.
-        OutputError: a file that cannot be written.
+    The parts are clean, depth and camdata_left, and flow of all frames but the last.
     """
-    if Path(name).name != name or name in ("", ".."):
-        raise InputError(f"sequence name: expected a plain folder name, got {name!r}.")
 
     def place(part: str, ending: str) -> Path:
         folder = Path(root) / "training" / part / name
         make_folder(folder)
         return folder / f"frame_{index + 1:04d}.{ending}"
 
-    def write_png(part: str, image: np.ndarray) -> None:
-        image = np.where(image, np.uint8(255), np.uint8(0)) if image.dtype == bool else image
-        with atomic_write(place(part, "png"), "wb") as file:
-            file.write(cv2.imencode(".png", np.ascontiguousarray(image))[1].tobytes())
-
-    for index in range(scene.frames):
+    for index, T_world_cam in enumerate(scene.T_world_cam):
         rendered = scene.render(index)
-        write_png("clean", rendered.rgb[:, :, ::-1])
+        with atomic_write(place("clean", "png"), "wb") as file:
+            file.write(cv2.imencode(".png", rendered.rgb[:, :, ::-1])[1].tobytes())
         write_dpt(place("depth", "dpt"), rendered.depth)
-        extrinsic = invert(scene.T_world_cam[index])
-        write_cam(place("camdata_left", "cam"), scene.cameras[index].K, extrinsic)
-        write_png("moving", rendered.object_id > 0)
-        write_png("invalid", rendered.object_id < 0)
+        write_cam(place("camdata_left", "cam"), scene.camera.K, invert(T_world_cam))
         if index + 1 < scene.frames:
-            flow, occlusion, _ = scene.flow(index)
-            write_flo(place("flow", "flo"), flow)
-            write_png("occlusions", occlusion)
+            write_flo(place("flow", "flo"), scene.flow(index)[0])

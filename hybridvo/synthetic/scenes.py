@@ -177,15 +177,12 @@ def make_scene(
     height: int = 218,
     width: int = 512,
     frames: int = 20,
-    zoom: float = 0.0,
-    noise: float = 0.0,
 ) -> Scene:
     """Scene of a family, drawn from a seed.
 
     Families: ``static``; ``light`` (several movers, about 30 % of the pixels); :data:`HEAVY`: 46 to
     75 % of the pixels on movers in every frame, and at least 46 % whose flow differs from the
-    camera's by over 1/512 of the width. ``zoom``: relative amplitude of a slow change of focal
-    length; ``noise``: standard deviation of the sensor noise in grey levels.
+    camera's by over 1/512 of the width.
     """
     if kind not in FAMILIES:
         raise InputError(f"scene kind: expected one of {', '.join(FAMILIES)}, got {kind!r}.")
@@ -196,7 +193,7 @@ def make_scene(
         )
     for attempt in range(ATTEMPTS):
         rng = np.random.default_rng([FAMILIES[kind][0], seed, attempt])
-        scene = _draw_scene(rng, kind, (height, width), frames, zoom, noise)
+        scene = _draw_scene(rng, kind, (height, width), frames)
         if scene is not None:
             return scene
     raise InputError(
@@ -206,26 +203,18 @@ def make_scene(
 
 
 def _draw_scene(
-    rng: np.random.Generator,
-    kind: str,
-    size: tuple[int, int],
-    frames: int,
-    zoom: float,
-    noise: float,
+    rng: np.random.Generator, kind: str, size: tuple[int, int], frames: int
 ) -> Scene | None:
     """One draw of a family, or None where it leaves its band or a surface comes too close."""
     height, width = size
     focal = rng.uniform(1.0, 1.2) * width
-    period, phase = rng.uniform(40, 80), rng.uniform(0, 2 * np.pi)
-    cameras = tuple(
-        Camera(f, f, (width - 1) / 2, (height - 1) / 2, height, width)
-        for f in focal * (1 + zoom * np.sin(2 * np.pi * np.arange(frames) / period + phase))
-    )
+    rng.random(2)  # once of a zoom; without them every scene would be another
+    camera = Camera(focal, focal, (width - 1) / 2, (height - 1) / 2, height, width)
     view = np.array([width / 2, height / 2]) / focal
     path, guide = camera_path(rng, frames + 2 * LAG, rng.uniform(0.06, 0.13), rng.uniform(0.5, 1.4))
     furniture = tuple(_furnish(rng, *view))
     seed = int(rng.integers(2**31))
-    scene = Scene(cameras, path[LAG : LAG + frames], furniture, seed, noise=noise)
+    scene = Scene(camera, path[LAG : LAG + frames], furniture, seed)
     movers = [] if kind == "static" else _Movers(rng, guide, frames, view).draw(kind)
     if movers:
         share = FAMILIES[kind][1]
@@ -259,7 +248,7 @@ def _keeps_band(scene: Scene, kind: str) -> bool:
         if nearest < 1.2 or not low <= share <= high:
             return False
     # one pixel of an image 512 wide: small images are judged alike
-    threshold = scene.cameras[0].width / 512
+    threshold = scene.camera.width / 512
     return kind not in HEAVY or all(
         scene.dynamic_share(index, 64, threshold) >= 0.47 for index in range(scene.frames - 1)
     )

@@ -95,11 +95,7 @@ class Recording:
 
 @functools.cache
 def load_split(folder: str | Path, split: str) -> tuple[Recording, ...]:
-    """Recordings of a part of :data:`SPLITS` that lie below a folder.
-
-    Raises:
-        InputError: another part, or none of its recordings is there.
-    """
+    """Recordings of a part of :data:`SPLITS` that lie below a folder."""
     if split not in SPLITS:
         raise InputError(f"split: expected {', '.join(SPLITS)}, got {split!r}.")
     there = [s for s in SPLITS[split] if (Path(folder) / s.path).is_dir()]

@@ -1,13 +1,9 @@
-"""Batches of samples, and figures of a network on held-out synthetic pairs.
-
-Seeds 0 to 999 are for development, 1000 and up for published figures; no training run has seen
-either.
-"""
+"""Batches of samples, and figures of a network on held-out synthetic pairs."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,18 +12,19 @@ import torch.nn.functional as F
 from scipy.stats import mannwhitneyu, spearmanr
 
 from hybridvo.errors import InputError
-from hybridvo.network.inputs import NetworkInputs, assemble_aligned
-from hybridvo.network.losses import LossTargets, NetworkOutput, reconstruct
-from hybridvo.network.normalization import predict
+from hybridvo.network.inputs import NetworkInputs, assemble_inputs
+from hybridvo.network.losses import LossTargets
+from hybridvo.network.prediction import predict
 from hybridvo.network.selection import select_pose
 from hybridvo.results import PixelwisePrediction
 from hybridvo.synthetic.dataset import Preset
 from hybridvo.synthetic.draws import sample_generator
-from hybridvo.synthetic.layered import LayeredPair, Sample, compose
-from hybridvo.torch_geometry import euler_deg, euler_transform
+from hybridvo.synthetic.layered import Sample, compose
+from hybridvo.torch_geometry import euler_motion, euler_transform
+from hybridvo.types import PairBatch
 
 PUBLISHED_SEED = 1000
-"""First seed of published figures; smaller ones are for development."""
+"""First seed of published figures; smaller ones are for development. No training sees either."""
 EPE_LIMIT_PX = 400.0
 """Pixels with a true ego flow of this length or more count as 0 in EPE, as published."""
 FIGURES = ("r_err_deg", "t_err", "epe")
@@ -51,41 +48,33 @@ class TrainingBatch:
 
 
 class DrawnBatch:
-    """Pairs of the paper's five steps before their flows: these are computed where they go."""
+    """Fields of B samples, or of pairs before :func:`compose`, which computes where they go."""
 
-    def __init__(self, pairs: Sequence[LayeredPair]) -> None:
-        self.parts = _stacked(pairs)
+    def __init__(self, rows: Sequence[dict[str, np.ndarray]]) -> None:
+        self.parts = {n: torch.from_numpy(np.stack([row[n] for row in rows])) for n in rows[0]}
 
     def __len__(self) -> int:
         return len(self.parts["K"])
 
     def to(self, device: torch.device | str) -> TrainingBatch:
         """The training batch, on a device."""
-        return _assemble(compose(**{name: part.to(device) for name, part in self.parts.items()}))
+        of = {name: part.to(device) for name, part in self.parts.items()}
+        of = compose(**of) if "motions" in of else of
+        K, T = of["K"], of["T_curr_prev"]
+        pairs = PairBatch(of["flow"], of["depth_prev"], K, K, of["depth_curr"])
+        truth = euler_motion(T), of["ego_flow"].permute(0, 3, 1, 2)
+        targets = LossTargets(*truth, of["depth_true"], of["depth_target"], K, K)
+        inputs = assemble_inputs(pairs, None, is_aligned=True)
+        return TrainingBatch(inputs, targets, of["moving"])
 
 
 def collate(samples: Sequence[Sample]) -> TrainingBatch:
     """Batch of at least one sample, all of one size."""
-    return _assemble(_stacked(samples))
-
-
-def _stacked(samples: Sequence[Any]) -> dict[str, torch.Tensor]:
-    """Fields of samples as tensors with a row for each."""
-    names = [field.name for field in fields(samples[0])]
-    return {n: torch.from_numpy(np.stack([getattr(s, n) for s in samples])) for n in names}
-
-
-def _assemble(of: dict[str, torch.Tensor]) -> TrainingBatch:
-    """Batch of the stacked fields of samples."""
-    K, T = of["K"], of["T_curr_prev"]
-    inputs = assemble_aligned(of["flow"], of["depth_prev"], of["depth_curr"], K)
-    truth = euler_deg(T[:, :3, :3]), T[:, :3, 3], of["ego_flow"].permute(0, 3, 1, 2)
-    targets = LossTargets(*truth, of["depth_true"], of["depth_target"], K, K)
-    return TrainingBatch(inputs, targets, of["moving"])
+    return DrawnBatch([vars(sample) for sample in samples]).to("cpu")
 
 
 def held_out(preset: Preset, seed: int, count: int) -> list[TrainingBatch]:
-    """Batches of the samples 0 to ``count`` - 1 of a seed; of a folder, of its held-out ones."""
+    """Batches of the samples 0 to ``count`` - 1 of a seed; of a folder, as it was drawn."""
     preset = preset.for_evaluation() if hasattr(preset, "for_evaluation") else preset
     samples = [preset.sample(sample_generator(seed, i)) for i in range(count)]
     return [collate(samples[first : first + BATCH]) for first in range(0, count, BATCH)]
@@ -104,13 +93,10 @@ def evaluate_network(
 ) -> dict[str, Any]:
     """Errors of a network's selected pose on :func:`held_out` samples.
 
-    Returns:
-        ``r_err_deg``, ``t_err`` (metres) and ``epe`` (px at the sample's size), the paper's
-        component means; the same of zero motion under ``zero_*``, medians under ``median_*``, the
-        EPE of each pair under ``epe_of_pairs``. Of the uncertainty of rotation and translation,
-        None without: ``auroc_*`` of the mean log scale as a detector of moving pixels,
-        ``spearman_*`` with the pixel's own error, ``laplace_ratio_*`` and ``median_ratio_*``, the
-        mean and the median of |error| / exp(s): 1 and 0.69 for calibrated Laplace scales.
+    ``r_err_deg``, ``t_err`` (metres), ``epe`` (px at the sample's size): the paper's component
+    means; ``zero_*``: of zero motion. Of the uncertainty: ``auroc_*`` of s as a detector of moving
+    pixels, ``spearman_*`` with the pixel's own error, ``laplace_ratio_*`` and ``median_ratio_*``,
+    mean and median of |error| / exp(s): 1 and 0.69 for calibrated Laplace scales.
     """
     if not batches:
         raise InputError("evaluate_network: expected at least one batch of samples, got none.")
@@ -120,7 +106,7 @@ def evaluate_network(
         with torch.inference_mode():
             output = predict(network, batch.inputs, selection)
             errors.append(_errors(output, batch, selection))
-            if isinstance(output, PixelwisePrediction) and output.log_scale_rotation is not None:
+            if output.log_scale is not None:
                 pixels.append(_uncertainty(output, batch))
     ours, zero = np.split(np.concatenate(errors), 2, axis=1)
     result: dict[str, Any] = {"count": len(ours)}
@@ -134,20 +120,19 @@ def evaluate_network(
     return result
 
 
-def _errors(output: NetworkOutput, batch: TrainingBatch, selection: str) -> np.ndarray:
+def _errors(output: PixelwisePrediction, batch: TrainingBatch, selection: str) -> np.ndarray:
     """(B, 6) R_err, T_err and EPE of the network and of zero motion."""
     gt = batch.targets
-    rotation, translation = select_pose(output, selection)
-    T = euler_transform(rotation, translation)
-    flow, _, defined = reconstruct(gt.depth_prev, T, gt.K_prev, gt.K_curr)
+    motion = select_pose(output, selection)
+    flow, _, defined = gt.reconstruct(euler_transform(motion))
     near = gt.ego_flow.norm(dim=1) < EPE_LIMIT_PX
     # Sky has no depth to reproject; a point behind the camera has no flow: neither counts.
     counts = defined & near
     total = (defined | ~near).flatten(1).sum(1).clamp(min=1)
     columns = []
-    for r, t, f in ((rotation, translation, flow), (0.0, 0.0, torch.zeros_like(flow))):
+    for m, f in ((motion, flow), (torch.zeros_like(motion), torch.zeros_like(flow))):
         error = torch.where(counts[:, None], (f - gt.ego_flow).abs(), 0.0).mean(dim=1)
-        columns += [(r - gt.rotation_deg).abs().mean(1), (t - gt.translation).abs().mean(1)]
+        columns += [x.mean(1) for x in (m - gt.motion).abs().split(3, dim=1)]
         columns.append(error.flatten(1).sum(1) / total)
     return torch.stack(columns, dim=1).float().cpu().numpy()
 
@@ -157,12 +142,9 @@ def _uncertainty(output: PixelwisePrediction, batch: TrainingBatch) -> list[list
     gt, size = batch.targets, batch.moving.shape[1:]
     pick = np.s_[..., ::4, ::4]  # enough for the figures
     halves = []
-    for value, s, target in (
-        (output.rotation, output.log_scale_rotation, gt.rotation_deg),
-        (output.translation, output.log_scale_translation, gt.translation),
-    ):
-        assert s is not None
-        error = (value - target[:, :, None, None]).abs()
+    errors = (output.motion - gt.motion[:, :, None, None]).abs()
+    assert output.log_scale is not None
+    for error, s in zip(errors.split(3, 1), output.log_scale.split(3, 1), strict=True):
         maps = [s.mean(1, keepdim=True), error.mean(1, keepdim=True), error * (-s).exp()]
         table = F.interpolate(torch.cat(maps, dim=1).float(), size=size, mode="nearest")
         table = torch.cat([batch.moving[:, None].float(), table], dim=1)[pick].permute(0, 2, 3, 1)
@@ -192,9 +174,6 @@ def calibrate_scales(
     """Add to s of the translation what makes the mean of |error| / exp(s) one; says how much.
 
     The scales of the rotation are left alone: they are the weights of the fit.
-
-    Raises:
-        InputError: a network without uncertainty.
     """
     head = getattr(network, "head_uncertainty", None)
     if head is None:

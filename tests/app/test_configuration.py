@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from hybridvo.commands.arguments import load_options, option_defaults
+from hybridvo.cli import load_options, option_defaults
 from hybridvo.errors import FormatError, InputError
 from hybridvo.options import Options
 

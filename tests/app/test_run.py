@@ -12,7 +12,7 @@ import pytest
 
 import hybridvo as hvo
 from hybridvo.cli import main
-from hybridvo.commands.run_folder import CHECKPOINT, STATE
+from hybridvo.commands.run import CHECKPOINT, STATE
 from hybridvo.synthetic.scenes import make_scene
 from hybridvo.trajectory import read_trajectory
 

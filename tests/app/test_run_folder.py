@@ -12,8 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hybridvo.commands.progress import Progress
-from hybridvo.commands.run_folder import STATE, STEPS, RunFolder
+from hybridvo.commands.run import STATE, STEPS, RunFolder
 from hybridvo.errors import InputError, LockedError, OutputError
 from hybridvo.files import held
 from hybridvo.trajectory import read_trajectory
@@ -24,7 +23,7 @@ IDENTITY = {"input_hash": "abc", "options": {"seed": 0}}
 @contextlib.contextmanager
 def start(path: Path, mode: str = "new", **identity: object) -> Iterator[RunFolder]:
     with held(path):
-        yield RunFolder(path, {"identity": IDENTITY | identity}, mode)  # type: ignore[arg-type]
+        yield RunFolder(path, IDENTITY | identity, mode)  # type: ignore[arg-type]
 
 
 def state(path: Path) -> dict:
@@ -112,20 +111,6 @@ def test_a_file_in_place_of_the_folder(tmp_path):
     with pytest.raises(OutputError, match="out: cannot be created"):
         with start(tmp_path / "out"):
             pass
-
-
-def test_progress_on_a_terminal_is_a_bar():
-    import io
-
-    from rich.console import Console
-
-    text = io.StringIO()
-    console = Console(file=text, force_terminal=True, width=120)
-    with Progress("static [x]", 4, "frames", console=console) as progress:
-        progress.say("a line")
-        progress.show(4, 1)
-    assert "static [x]" in text.getvalue() and "4/4" in text.getvalue()
-    assert "1 failed" in text.getvalue() and "a line" in text.getvalue()
 
 
 @pytest.mark.slow

@@ -10,8 +10,16 @@ import torch
 from hybridvo.cli import main
 from hybridvo.data.sequence import open_sequence
 from hybridvo.errors import InputError
-from hybridvo.evaluation.drawing import draw, integrated_gradients, prediction_panels, saliencies
-from hybridvo.evaluation.plots import Panel, draw_panels, flow_colours, flow_panel
+from hybridvo.evaluation.drawing import (
+    Panel,
+    draw,
+    flow_colours,
+    flow_panel,
+    integrated_gradients,
+    prediction_panels,
+    saliencies,
+    write_panels,
+)
 from hybridvo.network.inputs import assemble_inputs
 from hybridvo.network.pwvo import NetworkOptions, build_network
 from hybridvo.network.selection import select_motion
@@ -53,16 +61,17 @@ def test_colours_of_lengths() -> None:
 
 
 def test_uncertainty_and_error_maps_by_hand() -> None:
-    maps = torch.zeros(2, 3, 4, 5)
+    maps = torch.zeros(2, 6, 4, 5)
+    maps[:, 3:] += 2.0
     maps[1] += 7.0  # the second pair is not looked at
-    log_rotation = torch.tensor([0.0, 1.0, 2.0])[None, :, None, None].expand(2, 3, 4, 5)
-    prediction = PixelwisePrediction(maps, maps + 2.0, log_rotation, log_rotation - 1.0)
+    s = torch.tensor([0.0, 1.0, 2.0, -1.0, 0.0, 1.0])[None, :, None, None].expand(2, 6, 4, 5)
+    prediction = PixelwisePrediction(maps, s)
     true = np.array([1.0, 2.0, 3.0]), np.array([2.0, 2.0, 0.5])
-    panels = prediction_panels("a", prediction, true, np.ones((4, 5), bool))
+    panels = prediction_panels(prediction, true, np.ones((4, 5), bool))
     expected = (np.e, 2.0, 1.0, 0.5)  # uncertainty and error of the rotation, of the translation
     for panel, value in zip(panels, expected, strict=True):
         np.testing.assert_allclose(panel.values, np.full((4, 5), value), rtol=1e-6)
-    assert prediction_panels("a", PixelwisePrediction(maps, maps), None, true[0]) == []
+    assert prediction_panels(PixelwisePrediction(maps), None, true[0]) == []
 
 
 def test_gradients_of_a_linear_answer_are_its_terms() -> None:
@@ -119,7 +128,7 @@ def test_the_saliency_is_of_what_the_network_reads(known, options: NetworkOption
 # -- the picture and the tool ---------------------------------------------------------------------
 
 
-def test_the_picture_has_all_panels() -> None:
+def test_the_picture_has_all_panels(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     flow = rng.standard_normal((20, 40, 2))
     mask = np.zeros((20, 40), bool)
@@ -131,9 +140,9 @@ def test_the_picture_has_all_panels() -> None:
         Panel("nothing known", np.full((5, 10), np.nan), "px"),
         Panel("zeros", np.zeros((5, 10)), "px"),
     ]
-    content = draw_panels(panels, "heading", 2.0)
-    picture = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
-    few = cv2.imdecode(np.frombuffer(draw_panels(panels[:2], "h", 2.0), np.uint8), cv2.IMREAD_COLOR)
+    write_panels(tmp_path / "all.png", panels, "heading", 2.0)
+    write_panels(tmp_path / "few.png", panels[:2], "h", 2.0)
+    picture, few = (cv2.imread(str(tmp_path / f"{name}.png")) for name in ("all", "few"))
     assert picture.shape[1] == few.shape[1] > 1000
     assert picture.shape[0] > 2.4 * few.shape[0]
 

@@ -1,14 +1,13 @@
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
-from hybridvo.evaluation.pair_errors import (
-    mean_pair_errors,
-    pair_errors,
-    pair_facts,
-)
-from hybridvo.geometry import ego_flow, make_transform
+from hybridvo.evaluation.scores import pair_errors, pair_facts
+from hybridvo.geometry import ego_flow, invert, make_transform
 from hybridvo.types import Camera
 
 CAMERA = Camera(200.0, 200.0, 127.5, 63.5, 128, 256)
@@ -81,12 +80,6 @@ def test_no_valid_depth_is_none_not_nan():
     depth = np.zeros(CAMERA.shape)
     errors = pair_errors(np.eye(4), np.eye(4), depth, CAMERA, CAMERA)
     assert errors["epe"] is None and errors["epe_l2_px"] is None
-    good = pair_errors(np.eye(4), np.eye(4), depth + 1, CAMERA, CAMERA)
-    report = mean_pair_errors([errors, good])
-    assert report["epe"] == 0.0
-    assert "1 of 2 pairs" in report["reasons"]["epe"]
-    empty = mean_pair_errors([])
-    assert empty["pairs"] == 0 and empty["epe"] is None and "epe" in empty["reasons"]
 
 
 def test_estimate_behind_the_camera_is_finite_and_costs_the_diagonal():
@@ -96,9 +89,22 @@ def test_estimate_behind_the_camera_is_finite_and_costs_the_diagonal():
     assert np.isfinite(errors["epe"])
 
 
+def facts_of(T: np.ndarray, depth: np.ndarray | None, flow: np.ndarray | None = None) -> Any:
+    """Facts of the first pair of a sequence of two frames."""
+    sequence: Any = SimpleNamespace(
+        poses=np.stack([np.eye(4), invert(T)]),
+        frame=lambda i: SimpleNamespace(depth=depth),
+        camera=lambda i: CAMERA,
+        flow=lambda i: (flow, None),
+        flow_is_true=flow is not None,
+        kind="sintel",
+    )
+    return pair_facts(sequence, 0, 1)
+
+
 def test_dynamic_fraction_by_hand():
     def dynamic_fraction(flow, depth):
-        return pair_facts(T, depth, CAMERA, CAMERA, flow).get("dynamic_fraction")
+        return facts_of(T, depth, flow).get("dynamic_fraction")
 
     depth = np.full(CAMERA.shape, 4.0)
     T = make_transform(np.eye(3), np.array([0.02, 0.0, 0.0]))
@@ -120,9 +126,9 @@ def test_facts_of_a_pair_by_hand():
     depth[:, :64] = 8.0
     depth[:, 200:] = np.nan
     T = make_transform(np.eye(3), np.array([0.02, 0.0, 0.0]))
-    facts = pair_facts(T, depth, CAMERA, CAMERA)
+    facts = facts_of(T, depth)
     assert "dynamic_fraction" not in facts  # no true flow of the scene
     assert facts["translation_m"] == pytest.approx(0.02) and facts["rotation_deg"] == 0.0
     assert facts["flow_magnitude_px"] == pytest.approx(1.0)  # at 4 m, two thirds of what is known
     assert facts["depth_spread"] == pytest.approx(2.0)
-    assert pair_facts(None, None, CAMERA, CAMERA) == {}
+    assert facts_of(T, None) == {}

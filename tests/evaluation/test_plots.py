@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hybridvo.errors import OutputError
-from hybridvo.evaluation.plots import plot_trajectory
+from hybridvo.evaluation.drawing import plot_trajectory
 from hybridvo.geometry import se3_exp
 from hybridvo.trajectory import Trajectory
 from tests.walks import chained

@@ -9,15 +9,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hybridvo.geometry import ego_flow, se3_exp
-from hybridvo.network.inputs import NetworkInputs, assemble_aligned
+from hybridvo.network.inputs import NetworkInputs, assemble_inputs
 from hybridvo.network.losses import LossOptions, LossTargets, total_loss
-from hybridvo.network.normalization import first_motions, predict, remove_scale
+from hybridvo.network.prediction import first_motions, normalize, predict
 from hybridvo.network.pwvo import NetworkOptions, build_network
 from hybridvo.network.selection import fitted_motion
-from hybridvo.torch_geometry import euler_deg
-from hybridvo.types import Camera
+from hybridvo.results import PixelwisePrediction
+from hybridvo.torch_geometry import euler_motion
+from hybridvo.types import Camera, PairBatch
 
 CAMERA = Camera(60.0, 62.0, 31.5, 15.5, 32, 64)
+SCALE_FREE = NetworkOptions(scale_free=True)
 MOTION = se3_exp(np.array([0.05, -0.03, 0.08, 0.004, -0.006, 0.01]))
 
 
@@ -31,9 +33,10 @@ def inputs_of(
 ) -> NetworkInputs:
     K = torch.tensor(CAMERA.K, dtype=torch.float32)[None]
     depth_curr = depth if depth_curr is None else depth_curr
-    return assemble_aligned(
-        *(torch.tensor(x, dtype=torch.float32)[None] for x in (flow, depth, depth_curr)), K
+    flow, prev, curr = (
+        torch.tensor(x, dtype=torch.float32)[None] for x in (flow, depth, depth_curr)
     )
+    return assemble_inputs(PairBatch(flow, prev, K, K, curr), None, is_aligned=True)
 
 
 def static_inputs(T: np.ndarray = MOTION, scale: float = 1.0) -> NetworkInputs:
@@ -55,7 +58,7 @@ def test_scales_by_hand():
     # 3 px of flow everywhere at 60 px focal length: 0.05 rad; depth 2 m everywhere
     flow = np.zeros((32, 64, 2))
     flow[..., 0] = 3.0
-    inputs, scale = remove_scale(inputs_of(flow, np.full((32, 64), 2.0)))
+    inputs, scale = normalize(inputs_of(flow, np.full((32, 64), 2.0)), SCALE_FREE)
     expected = [np.rad2deg(0.05)] * 3 + [0.1] * 3
     np.testing.assert_allclose(scale.factor[0], expected, rtol=1e-5)
     # flow over itself is 1, squashed at 10: 1 / 1.1
@@ -68,7 +71,9 @@ def test_scales_by_hand():
 def test_change_of_depth_is_counted_in_units_of_the_motion():
     flow = np.zeros((32, 64, 2))
     flow[..., 0] = 3.0
-    inputs, _ = remove_scale(inputs_of(flow, np.full((32, 64), 2.0), np.full((32, 64), 2.2)))
+    inputs, _ = normalize(
+        inputs_of(flow, np.full((32, 64), 2.0), np.full((32, 64), 2.2)), SCALE_FREE
+    )
     change = np.log(1.1) / 0.05
     np.testing.assert_allclose(inputs.inverse_depth[0, 1], change / (1 + change / 10), rtol=1e-4)
 
@@ -80,17 +85,17 @@ def test_a_scene_twice_as_large_moves_by_twice_as_many_metres(factor):
     network = tiny()
     with torch.inference_mode():
         one, other = network(static_inputs()), network(static_inputs(scale=factor))
-    torch.testing.assert_close(one.rotation, other.rotation, atol=1e-3, rtol=1e-3)
-    torch.testing.assert_close(factor * one.translation, other.translation, atol=1e-3, rtol=2e-3)
-    torch.testing.assert_close(
-        one.log_scale_translation + np.log(factor), other.log_scale_translation, atol=2e-3, rtol=0
-    )
+    (r, t), (other_r, other_t) = (x.motion.split(3, dim=1) for x in (one, other))
+    torch.testing.assert_close(r, other_r, atol=1e-3, rtol=1e-3)
+    torch.testing.assert_close(factor * t, other_t, atol=1e-3, rtol=2e-3)
+    s, other_s = (x.log_scale[:, 3:] for x in (one, other))
+    torch.testing.assert_close(s + np.log(factor), other_s, atol=2e-3, rtol=0)
 
 
 def test_the_true_motion_leaves_nothing_unexplained():
     inputs = static_inputs()
     T = torch.tensor(MOTION, dtype=torch.float32)[None]
-    left, scale = remove_scale(inputs, T)
+    left, scale = normalize(inputs, SCALE_FREE, T)
     # what is left is rounding: far below the smallest scale, 5e-5 rad
     assert float(scale.factor[0, 0]) == pytest.approx(np.rad2deg(5e-5))
     assert float(left.flow.abs().max()) < 0.1
@@ -108,8 +113,8 @@ def test_bad_values_give_finite_predictions(value):
         for T in (None, torch.eye(4)[None], behind):
             for inputs in (inputs_of(flow, depth), static_inputs()):
                 output = network(inputs, T)
-                assert torch.isfinite(output.rotation).all()
-                assert torch.isfinite(output.log_scale_translation).all()
+                assert torch.isfinite(output.motion).all()
+                assert torch.isfinite(output.log_scale).all()
 
 
 def test_passes_are_the_network_on_what_is_left():
@@ -118,7 +123,7 @@ def test_passes_are_the_network_on_what_is_left():
         one = network(inputs)
         two = network(inputs, fitted_motion(one, inputs))
         three = network(inputs, fitted_motion(two, inputs))
-        torch.testing.assert_close(predict(network, inputs).rotation, three.rotation)
+        torch.testing.assert_close(predict(network, inputs).motion, three.motion)
     assert first_motions(network, inputs, "softmax", 0) is None
 
 
@@ -126,9 +131,8 @@ def test_the_truth_has_no_flow_loss_on_fewer_pixels():
     inputs = static_inputs()
     T = torch.tensor(MOTION, dtype=torch.float32)[None]
     targets = LossTargets(
-        rotation_deg=euler_deg(T[:, :3, :3]),
-        translation=T[:, :3, 3],
-        ego_flow=inputs.flow_px,
+        motion=euler_motion(T),
+        ego_flow=inputs.flow,
         depth_prev=1 / inputs.inverse_depth[:, 0],
         depth_curr=1 / inputs.inverse_depth[:, 1],
         K_prev=inputs.K_prev,
@@ -136,7 +140,7 @@ def test_the_truth_has_no_flow_loss_on_fewer_pixels():
     ).subsample(4)
     assert targets.depth_prev.shape == (1, 8, 16)
     options = LossOptions(pose_uncertainty=False, flow_uncertainty=False, depth_uncertainty=False)
-    output = (targets.rotation_deg, targets.translation)
+    output = PixelwisePrediction(targets.motion[:, :, None, None])
     _, parts = total_loss(output, targets, options, T)
     # float32 coordinates of 64 px: 4e-6 px
     assert float(parts["flow"]) < 1e-4

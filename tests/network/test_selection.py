@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,13 +13,13 @@ from hybridvo.errors import InputError
 from hybridvo.geometry import euler_deg_to_matrix
 from hybridvo.network.selection import SELECTION_METHODS, select_pose
 from hybridvo.results import PixelwisePrediction
-from hybridvo.torch_geometry import euler_transform
+from hybridvo.torch_geometry import euler_motion, euler_transform
 
 
-def random_prediction(seed: int, shape=(2, 3, 7, 9), dtype=torch.float64) -> PixelwisePrediction:
+def random_prediction(seed: int, shape=(2, 6, 7, 9), dtype=torch.float64) -> PixelwisePrediction:
     generator = torch.Generator().manual_seed(seed)
     return PixelwisePrediction(
-        *(torch.randn(shape, generator=generator, dtype=dtype) for _ in range(4))
+        *(torch.randn(shape, generator=generator, dtype=dtype) for _ in range(2))
     )
 
 
@@ -50,20 +51,19 @@ def by_loop(value, s, method, patch):
 @pytest.mark.parametrize("method", SELECTION_METHODS)
 @pytest.mark.parametrize(("shape", "patch"), [((8, 8), 4), ((7, 9), 4), ((5, 6), 10), ((3, 2), 1)])
 def test_equals_a_loop(method, shape, patch):
-    prediction = random_prediction(5, (2, 3, *shape))
-    got = torch.cat(select_pose(prediction, method, patch), dim=1)
-    value = np.concatenate([prediction.rotation, prediction.translation], axis=1)
-    s = np.concatenate([prediction.log_scale_rotation, prediction.log_scale_translation], axis=1)
+    prediction = random_prediction(5, (2, 6, *shape))
+    got = select_pose(prediction, method, patch)
     for b in range(2):
-        expected = by_loop(value[b], s[b], method, patch)
+        value, s = prediction.motion[b].numpy(), prediction.log_scale[b].numpy()
+        expected = by_loop(value, s, method, patch)
         np.testing.assert_allclose(got[b], expected, rtol=1e-12, atol=1e-12)
 
 
 def worked_example() -> PixelwisePrediction:
     """2x4 maps, patches of 2: left winner 1.0 with U = 1, right winner 4.0 with U = 2."""
-    value = torch.tensor([[1.0, 9, 9, 9], [9, 9, 9, 4]]).expand(1, 3, 2, 4)
-    scale = torch.tensor([[1.0, 5, 7, 5], [3, 4, 6, 2]]).log().expand(1, 3, 2, 4)
-    return PixelwisePrediction(value, 10 * value, scale, scale)
+    value = torch.tensor([[1.0, 9, 9, 9], [9, 9, 9, 4]]).expand(1, 6, 2, 4)
+    scale = torch.tensor([[1.0, 5, 7, 5], [3, 4, 6, 2]]).log().expand(1, 6, 2, 4)
+    return PixelwisePrediction(value, scale)
 
 
 @pytest.mark.parametrize(
@@ -77,22 +77,18 @@ def worked_example() -> PixelwisePrediction:
     ],
 )
 def test_worked_by_hand(method, expected):
-    rotation, translation = select_pose(worked_example(), method, patch=2)
-    torch.testing.assert_close(rotation, torch.full((1, 3), expected))
-    torch.testing.assert_close(translation, torch.full((1, 3), 10 * expected))
+    motion = select_pose(worked_example(), method, patch=2)
+    torch.testing.assert_close(motion, torch.full((1, 6), expected))
 
 
 def test_padding_never_wins():
     # Every real s is far above the zero that padding would have; values are all 3.
-    shape = (1, 3, 5, 5)
-    value, s = torch.full(shape, 3.0), torch.full(shape, 40.0)
-    prediction = PixelwisePrediction(value, value, s, s)
+    value, expected = torch.full((1, 6, 5, 5), 3.0), torch.full((1, 6), 3.0)
+    prediction = PixelwisePrediction(value, torch.full_like(value, 40.0))
     for method in SELECTION_METHODS:
-        torch.testing.assert_close(
-            select_pose(prediction, method, patch=4)[0], torch.full((1, 3), 3.0)
-        )
-    extreme = PixelwisePrediction(value, value, torch.full(shape, 3e38), torch.full(shape, 3e38))
-    torch.testing.assert_close(select_pose(extreme, patch=4)[0], torch.full((1, 3), 3.0))
+        torch.testing.assert_close(select_pose(prediction, method, patch=4), expected)
+    extreme = PixelwisePrediction(value, torch.full_like(value, 3e38))
+    torch.testing.assert_close(select_pose(extreme, patch=4), expected)
 
 
 @settings(max_examples=40, deadline=None)
@@ -104,87 +100,76 @@ def test_padding_never_wins():
     method=st.sampled_from(SELECTION_METHODS),
 )
 def test_result_lies_within_the_values_and_is_equivariant(seed, height, width, patch, method):
-    prediction = random_prediction(seed, (1, 3, height, width))
-    rotation, _ = select_pose(prediction, method, patch)
-    flat = prediction.rotation.flatten(2)
-    assert (rotation >= flat.min(-1).values - 1e-12).all()
-    assert (rotation <= flat.max(-1).values + 1e-12).all()
-    moved = PixelwisePrediction(
-        2 * prediction.rotation + 5,
-        prediction.translation,
-        prediction.log_scale_rotation,
-        prediction.log_scale_translation,
-    )
-    torch.testing.assert_close(select_pose(moved, method, patch)[0], 2 * rotation + 5)
+    prediction = random_prediction(seed, (1, 6, height, width))
+    motion = select_pose(prediction, method, patch)
+    flat = prediction.motion.flatten(2)
+    assert (motion >= flat.min(-1).values - 1e-12).all()
+    assert (motion <= flat.max(-1).values + 1e-12).all()
+    moved = replace(prediction, motion=2 * prediction.motion + 5)
+    torch.testing.assert_close(select_pose(moved, method, patch), 2 * motion + 5)
     if method in ("softmax", "argmin"):
-        louder = PixelwisePrediction(
-            prediction.rotation,
-            prediction.translation,
-            prediction.log_scale_rotation + 3,
-            prediction.log_scale_translation,
-        )
-        torch.testing.assert_close(select_pose(louder, method, patch)[0], rotation)
+        louder = replace(prediction, log_scale=prediction.log_scale + 3)
+        torch.testing.assert_close(select_pose(louder, method, patch), motion)
 
 
 @pytest.mark.parametrize("method", SELECTION_METHODS)
 def test_damage_is_not_heard(method):
-    clean = random_prediction(2, (2, 3, 8, 8))
-    maps = [v.clone() for v in list(vars(clean).values())[:4]]
-    for i, broken in enumerate((torch.nan, torch.inf, torch.nan, -torch.inf)):
-        maps[i][0, :, :4, :4] = broken  # a whole patch, and one pixel of another
-        maps[i][0, :, 6, 6] = broken
+    clean = random_prediction(2, (2, 6, 8, 8))
+    maps = [clean.motion.clone(), clean.log_scale.clone()]
+    for x, first, second in ((maps[0], torch.nan, torch.inf), (maps[1], torch.nan, -torch.inf)):
+        for half, broken in ((slice(0, 3), first), (slice(3, 6), second)):
+            x[0, half, :4, :4] = broken  # a whole patch, and one pixel of another
+            x[0, half, 6, 6] = broken
     prediction = PixelwisePrediction(*maps)
-    rotation, translation = select_pose(prediction, method, 4)
-    reference = select_pose(clean, method, 4)
-    assert torch.isfinite(rotation).all()
-    assert torch.isfinite(translation).all()
-    torch.testing.assert_close(rotation[1], reference[0][1])
+    motion = select_pose(prediction, method, 4)
+    assert torch.isfinite(motion).all()
+    torch.testing.assert_close(motion[1], select_pose(clean, method, 4)[1])
     # Of three patches, of which the last lacks one pixel, something is chosen among real values.
-    real = prediction.rotation[0][torch.isfinite(prediction.rotation[0])]
-    assert rotation[0].min() >= real.min() and rotation[0].max() <= real.max()
+    real = prediction.motion[0][torch.isfinite(prediction.motion[0])]
+    assert motion[0].min() >= real.min() and motion[0].max() <= real.max()
 
 
 def test_extreme_scales_stay_finite_in_value_and_gradient():
     for extreme in (-1e4, 1e4):
-        value = torch.randn(1, 3, 8, 8, requires_grad=True)
-        s = torch.full((1, 3, 8, 8), extreme, requires_grad=True)
+        value = torch.randn(1, 6, 8, 8, requires_grad=True)
+        s = torch.full((1, 6, 8, 8), extreme, requires_grad=True)
         for method in SELECTION_METHODS:
-            rotation, translation = select_pose(PixelwisePrediction(value, value, s, s), method, 4)
-            assert torch.isfinite(rotation).all()
-            (rotation.sum() + translation.sum()).backward()
+            motion = select_pose(PixelwisePrediction(value, s), method, 4)
+            assert torch.isfinite(motion).all()
+            motion.sum().backward()
         assert torch.isfinite(value.grad).all()
         assert s.grad is None or torch.isfinite(s.grad).all()
 
 
 @pytest.mark.parametrize("method", SELECTION_METHODS)
 def test_gradcheck(method):
-    maps = [v.requires_grad_() for v in list(vars(random_prediction(3, (1, 3, 3, 4))).values())[:4]]
+    maps = [v.requires_grad_() for v in list(vars(random_prediction(3, (1, 6, 3, 4))).values())[:2]]
 
     def pose(*values):
-        return torch.cat(select_pose(PixelwisePrediction(*values), method, 2), dim=1)
+        return select_pose(PixelwisePrediction(*values), method, 2)
 
     torch.autograd.gradcheck(pose, maps)
     if method in ("softmax", "exp_plus_u", "joint"):
         pose(*maps).sum().backward()
-        assert maps[2].grad.abs().sum() > 0
+        assert maps[1].grad.abs().sum() > 0
 
 
 def test_transform_matches_scipy_and_is_differentiable():
     angles = torch.tensor([[10.0, -20, 30], [0, 0, 0], [179, 60, -100]], dtype=torch.float64)
     translation = torch.tensor([[1.0, 2, 3], [0, 0, 0], [-1, 5, 2]], dtype=torch.float64)
-    T = euler_transform(angles, translation)
+    motion = torch.cat([angles, translation], dim=1)
+    T = euler_transform(motion)
+    torch.testing.assert_close(euler_motion(T), motion)
     np.testing.assert_allclose(T[:, :3, :3], euler_deg_to_matrix(angles.numpy()), atol=1e-15)
     np.testing.assert_allclose(T[:, :3, 3], translation)
     assert T[:, 3].tolist() == [[0, 0, 0, 1]] * 3
-    torch.autograd.gradcheck(
-        euler_transform, (angles.requires_grad_(), translation.requires_grad_())
-    )
+    torch.autograd.gradcheck(euler_transform, motion.requires_grad_())
 
 
 def test_bad_arguments_are_refused():
     prediction = random_prediction(0)
     with pytest.raises(InputError, match="known: softmax"):
         select_pose(prediction, "best")
-    bare = PixelwisePrediction(prediction.rotation, prediction.translation)
+    bare = replace(prediction, log_scale=None)
     for method in ("mean", "softmax"):  # without uncertainty there is only the mean
-        assert torch.equal(select_pose(bare, method)[0], prediction.rotation.mean(dim=(2, 3)))
+        assert torch.equal(select_pose(bare, method), prediction.motion.mean(dim=(2, 3)))

@@ -47,7 +47,7 @@ def imported(tree: ast.AST) -> frozenset[str]:
 
 
 def module_name(path: str) -> str:
-    """``hybridvo.data.tum`` of ``data/tum.py``."""
+    """``hybridvo.data.base`` of ``data/base.py``."""
     parts = ["hybridvo", *path.removesuffix(".py").split("/")]
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 

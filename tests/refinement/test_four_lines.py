@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import kornia
 import numpy as np
 import pypose as pp
@@ -10,7 +12,6 @@ import torch
 
 import hybridvo as hvo
 from hybridvo import torch_geometry
-from hybridvo.results import PixelwisePrediction
 from hybridvo.synthetic.dataset import Mixture
 from hybridvo.synthetic.diverse import DiverseOptions
 from hybridvo.synthetic.scenarios import make_pair
@@ -65,17 +66,12 @@ def test_gradients_reach_flow_depth_weights_and_maps(pairs) -> None:
     values = {
         "flow": batch.flow,
         "depth_prev": torch.nan_to_num(batch.depth_prev, 0.0),
-        "log_scale_rotation": maps.log_scale_rotation,
+        "log_scale": maps.log_scale,
     }
 
-    def loss(flow, depth_prev, log_scale_rotation):
+    def loss(flow, depth_prev, log_scale):
         changed = hvo.PairBatch(flow, depth_prev, batch.K_prev, batch.K_curr)
-        seed = hvo.select(
-            PixelwisePrediction(
-                maps.rotation, maps.translation, log_scale_rotation, maps.log_scale_translation,
-                maps.image_size,
-            )
-        )  # fmt: skip
+        seed = hvo.select(replace(maps, log_scale=log_scale))
         from hybridvo.refinement.torch_backend import refine_batch
 
         motion = refine_batch(changed, seed.T_curr_prev, seed.weights, noise=(0.3, 0.02))
@@ -145,7 +141,7 @@ def test_one_training_step_of_a_narrow_network_in_channels_last() -> None:
         hvo.PairBatch.from_pairs([make_pair("moving30", k, 128, 256)[0] for k in (0, 1)])
     )
     before = [p.detach().clone() for p in network.parameters()]
-    network(inputs).rotation.square().mean().backward()
+    network(inputs).motion.square().mean().backward()
     optimizer.step()
     assert all(torch.isfinite(p).all() for p in network.parameters())
     assert any(not torch.equal(a, b) for a, b in zip(before, network.parameters(), strict=True))

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import os
 
 import cv2
@@ -8,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hybridvo.data.image_io import read_cam, read_depth, read_flow, read_mask_png, read_rgb
+from hybridvo.data.image_io import read_cam, read_depth, read_flow, read_rgb
 from hybridvo.data.sequence import Sequence
 from hybridvo.errors import InputError, OutputError
 from hybridvo.geometry import ego_flow, invert, pixel_grid
@@ -26,7 +27,7 @@ def affine(half, centre):
 
 def single(solid, *, frames=1, camera=CAMERA, poses=None):
     poses = np.tile(np.eye(4), (frames, 1, 1)) if poses is None else poses
-    return Scene((camera,) * frames, poses, (solid,))
+    return Scene(camera, poses, (solid,))
 
 
 @pytest.fixture(scope="module")
@@ -50,12 +51,11 @@ def test_depth_of_a_sphere_by_hand():
 def test_nothing_hit_is_invalid_everywhere():
     scene = single(Solid(ELLIPSOID, affine((1, 1, 1), (0, 0, -5)), object_id=1), frames=2)
     frame = scene.render(0)
-    flow, occlusion, moving = scene.flow(0)
+    flow, moving = scene.flow(0)
     assert np.isinf(frame.depth).all()
     assert (frame.object_id == -1).all()
     assert not frame.rgb.any()
     assert np.isnan(flow).all()
-    assert occlusion.all()
     assert not moving.any()
 
 
@@ -64,26 +64,21 @@ def test_nothing_hit_is_invalid_everywhere():
 
 def test_flow_of_a_translating_wall_by_hand():
     A = np.stack([affine((50, 50, 1), (0, 0, 5)), affine((50, 50, 1), (0.4, -0.2, 5))])
-    flow, occlusion, moving = single(Solid(BOX, A, object_id=1), frames=2).flow(0)
+    flow, moving = single(Solid(BOX, A, object_id=1), frames=2).flow(0)
     # wall at depth 4, f = 20: 0.4 m is 2 px, -0.2 m is -1 px
     np.testing.assert_allclose(flow[..., 0], 2.0, atol=1e-5)
     np.testing.assert_allclose(flow[..., 1], -1.0, atol=1e-5)
-    expected = np.zeros((11, 21), dtype=bool)
-    expected[0], expected[:, 19:] = True, True
-    np.testing.assert_array_equal(occlusion, expected)
     assert moving.all()
 
 
 def test_static_flow_equals_ego_flow(scenes):
     # float32 rounding of depth and flow; measured 8e-7 px over 8 seeds at this size
-    zooming = make_scene("static", 1, height=32, width=64, frames=4, zoom=0.2)
-    assert zooming.cameras[0].fx != zooming.cameras[1].fx
-    for kind, scene in {**scenes, "zooming": zooming}.items():
+    for kind, scene in scenes.items():
         for index in range(scene.frames - 1):
             frame = scene.render(index)
             T = invert(scene.T_world_cam[index + 1]) @ scene.T_world_cam[index]
-            ego = ego_flow(frame.depth, T, scene.cameras[index], scene.cameras[index + 1])
-            flow, _, moving = scene.flow(index)
+            ego = ego_flow(frame.depth, T, scene.camera, scene.camera)
+            flow, moving = scene.flow(index)
             error = np.abs(flow - ego).max(axis=-1)
             assert error[~moving].max() < 1e-5, kind
             if kind.startswith("heavy"):
@@ -97,8 +92,8 @@ def test_flow_of_a_mover_equals_its_own_rigid_motion(scenes):
     motion = A1 @ np.linalg.inv(A0)
     np.testing.assert_allclose(motion[:3, :3] @ motion[:3, :3].T, np.eye(3), atol=1e-9)
     T = invert(scene.T_world_cam[1]) @ motion @ scene.T_world_cam[0]
-    expected = ego_flow(scene.render(0).depth, T, scene.cameras[0], scene.cameras[1])
-    flow, _, moving = scene.flow(0)
+    expected = ego_flow(scene.render(0).depth, T, scene.camera, scene.camera)
+    flow, moving = scene.flow(0)
     np.testing.assert_allclose(flow[moving], expected[moving], atol=1e-4)
 
 
@@ -109,20 +104,19 @@ def test_flow_of_a_mover_equals_its_own_rigid_motion(scenes):
 def test_brightness_constancy(scenes, kind):
     scene = scenes[kind]
     first, second = scene.render(0).rgb, scene.render(1).rgb
-    flow, occlusion, _ = scene.flow(0)
-    target = (pixel_grid(*occlusion.shape) + flow).astype(np.float32)
+    target = (pixel_grid(*first.shape[:2]) + scene.flow(0)[0]).astype(np.float32)
     warped = cv2.remap(second, target[..., 0], target[..., 1], cv2.INTER_LINEAR)
-    error = np.abs(warped.astype(float) - first).mean(axis=2)[~occlusion]
-    still = np.abs(second.astype(float) - first).mean(axis=2)[~occlusion]
-    # measured over 8 seeds of each kind, largest values: 1.7 grey levels; 0.30 of the difference
-    # without warping; 0.046 of the pixels (interpolation across the edges of things)
+    inside = ((target >= 0) & (target <= (127, 53))).all(axis=-1)
+    error = np.abs(warped.astype(float) - first).mean(axis=2)[inside]
+    still = np.abs(second.astype(float) - first).mean(axis=2)[inside]
     assert np.median(error) < 2.5
     assert np.median(error) < 0.4 * np.median(still)
-    assert np.mean(error > 20) < 0.08
+    assert np.mean(error > 20) < 0.12
 
 
 def test_noise_has_the_asked_spread_and_is_repeatable():
-    quiet, noisy = (make_scene("static", 0, height=64, width=96, noise=n) for n in (0.0, 4.0))
+    quiet = make_scene("static", 0, height=64, width=96)
+    noisy = dataclasses.replace(quiet, noise=4.0)
     image = quiet.render(1).rgb.astype(float)
     difference = noisy.render(1).rgb - image
     difference = difference[(image > 30) & (image < 225)]
@@ -130,59 +124,6 @@ def test_noise_has_the_asked_spread_and_is_repeatable():
     assert difference.std() == pytest.approx(4.02, rel=0.05)
     np.testing.assert_array_equal(noisy.render(1).rgb, noisy.render(1).rgb)
     assert (noisy.render(0).rgb != noisy.render(1).rgb).any()
-
-
-# ---------------------------------------------------------------- visibility
-
-
-def moved_points(scene, index):
-    """(H, W, 3) points of a frame in the next camera, each carried by its rigid object."""
-    frame = scene.render(index)
-    height, width = frame.depth.shape
-    rays = np.concatenate([pixel_grid(height, width), np.ones((height, width, 1))], axis=-1)
-    points = rays @ np.linalg.inv(scene.cameras[index].K).T * frame.depth[..., None].astype(float)
-    out = np.full(points.shape, np.nan)
-    for number in np.unique(frame.object_id):
-        T = np.eye(4)
-        if number > 0:
-            A = next(s.A_world_body for s in scene.solids if s.object_id == number)
-            first, second = (np.vstack([A[i], (0, 0, 0, 1)]) for i in (index, index + 1))
-            T = second @ np.linalg.inv(first)
-        T = invert(scene.T_world_cam[index + 1]) @ T @ scene.T_world_cam[index]
-        on = frame.object_id == number
-        out[on] = points[on] @ T[:3, :3].T + T[:3, 3]
-    return out
-
-
-@pytest.mark.parametrize("kind", [kind for kind in FAMILIES if kind != "heavy_deforming"])
-def test_occlusion_agrees_with_a_forward_depth_buffer(scenes, kind):
-    """Independent test: depth of the moved point against the next rendered depth map."""
-    scene = scenes[kind]
-    _, occlusion, _ = scene.flow(0)
-    height, width = occlusion.shape
-    points = moved_points(scene, 0)
-    K = scene.cameras[1].K
-    u, v = (points[..., i] / points[..., 2] * K[i, i] + K[i, 2] for i in (0, 1))
-    outside = (u < -0.5) | (u > width - 0.5) | (v < -0.5) | (v > height - 0.5)
-    assert occlusion[outside].all()
-
-    # all 3 x 3 neighbours must agree: at an edge the nearest pixel says nothing
-    following = np.pad(scene.render(1).depth.astype(float), 1, constant_values=np.inf)
-    window = np.stack(
-        [following[i : i + height, j : j + width] for i in range(3) for j in range(3)]
-    )
-    column = np.clip(np.rint(u), 0, width - 1).astype(int)
-    row = np.clip(np.rint(v), 0, height - 1).astype(int)
-    nearest, farthest = window.min(axis=0)[row, column], window.max(axis=0)[row, column]
-    smooth = ~outside & (farthest < 1.1 * nearest)
-    hidden = smooth & (points[..., 2] > 1.1 * farthest)
-    seen = smooth & (points[..., 2] < 1.002 * nearest)
-    assert smooth.mean() > 0.4
-    # measured over 6 seeds: 603 to 3288 pixels surely seen, at most 2 of them marked (a thing
-    # thinner than a pixel, which the rendered map misses); every surely hidden pixel marked
-    assert seen.sum() > 500
-    assert np.mean(occlusion[seen]) < 0.004
-    assert occlusion[hidden].all()
 
 
 # ---------------------------------------------------------------- families
@@ -194,15 +135,15 @@ def test_heavy_families_keep_their_share_in_every_pair(kind):
     shares = [scene.moving_share(i)[0] for i in range(20)]
     assert min(shares) >= 0.46
     assert max(shares) <= 0.75
-    flow, _, moving = scene.flow(17)
+    flow, moving = scene.flow(17)
     assert np.mean(moving) == pytest.approx(shares[17], abs=0.02)
     T = invert(scene.T_world_cam[18]) @ scene.T_world_cam[17]
-    ego = ego_flow(scene.render(17).depth, T, scene.cameras[17], scene.cameras[18])
+    ego = ego_flow(scene.render(17).depth, T, scene.camera, scene.camera)
     dynamic = np.mean(np.linalg.norm(flow - ego, axis=-1) > 1.0)
     assert scene.dynamic_share(17) == pytest.approx(dynamic, abs=0.02)
     assert min(scene.dynamic_share(i) for i in range(19)) >= 0.46
     movers = {"heavy_rigid": 1, "heavy_deforming": 1, "heavy_two": 2, "heavy_ten": 10}[kind]
-    assert len(set(scene.object_ids)) == movers + 1
+    assert len({s.object_id for s in scene.solids}) == movers + 1
 
 
 @settings(max_examples=12, deadline=None)
@@ -237,17 +178,17 @@ def test_bad_arguments_name_themselves(change, words):
 
 def test_sequence(scenes):
     scene = scenes["light"]
-    sequence = SyntheticSequence(scene, name="demo", fps=10.0)
+    sequence = SyntheticSequence(scene, name="demo")
     assert (len(sequence), sequence.kind, sequence.depth_source) == (6, "synthetic", "true")
     assert sequence.has_flow
     assert sequence.flow_is_true
-    np.testing.assert_allclose(sequence.timestamps, np.arange(6) / 10)
+    np.testing.assert_allclose(sequence.timestamps, np.arange(6) / 24)
     frame = sequence.frame(2)
-    assert (frame.index, frame.timestamp, frame.camera) == (2, 0.2, scene.cameras[2])
+    assert (frame.index, frame.timestamp, frame.camera) == (2, 2 / 24, scene.camera)
     np.testing.assert_array_equal(frame.rgb, scene.render(2).rgb)
     flow, variance = sequence.flow(2)
     assert variance is None
-    truth, _, moving = scene.flow(2)
+    truth, moving = scene.flow(2)
     np.testing.assert_array_equal(flow, truth)
     np.testing.assert_array_equal(scene.object_id(2) > 0, moving)
     assert sequence.files() == []
@@ -257,14 +198,11 @@ def test_sequence(scenes):
 
 
 def test_write_sintel_sizes_and_round_trip(tmp_path):
-    scene = make_scene("light", 0, height=32, width=64, frames=3, zoom=0.1)
+    scene = make_scene("light", 0, height=32, width=64, frames=3)
     write_sintel(scene, tmp_path, "demo")
     base = tmp_path / "training"
     counts = {part.name: len(list((part / "demo").iterdir())) for part in base.iterdir()}
-    assert counts == {
-        "clean": 3, "depth": 3, "camdata_left": 3, "invalid": 3, "moving": 3, "flow": 2,
-        "occlusions": 2,
-    }  # fmt: skip
+    assert counts == {"clean": 3, "depth": 3, "camdata_left": 3, "flow": 2}
     for index in range(3):
         stem = f"frame_{index + 1:04d}"
         rendered = scene.render(index)
@@ -274,26 +212,18 @@ def test_write_sintel_sizes_and_round_trip(tmp_path):
         assert os.path.getsize(camera) == 172
         np.testing.assert_array_equal(read_depth(depth), rendered.depth)
         K, T_cam_world = read_cam(camera)
-        np.testing.assert_array_equal(K, scene.cameras[index].K)
+        np.testing.assert_array_equal(K, scene.camera.K)
         np.testing.assert_allclose(invert(T_cam_world), scene.T_world_cam[index], atol=1e-12)
         picture = read_rgb(base / "clean/demo" / f"{stem}.png")
         np.testing.assert_array_equal(picture, rendered.rgb)
-        moving = read_mask_png(base / "moving/demo" / f"{stem}.png")
-        np.testing.assert_array_equal(moving, rendered.object_id > 0)
-        assert not read_mask_png(base / "invalid/demo" / f"{stem}.png").any()
         if index < 2:
-            flow, occlusion, _ = scene.flow(index)
+            flow = scene.flow(index)[0]
             path = base / "flow/demo" / f"{stem}.flo"
             assert os.path.getsize(path) == 12 + 8 * 32 * 64
             np.testing.assert_array_equal(read_flow(path)[0], flow)
-            mask = read_mask_png(base / "occlusions/demo" / f"{stem}.png")
-            np.testing.assert_array_equal(mask, occlusion)
 
 
 def test_write_sintel_refuses_bad_places(tmp_path, scenes):
-    for name in ("", "a/b", "..", "."):
-        with pytest.raises(InputError, match="plain folder name"):
-            write_sintel(scenes["static"], tmp_path, name)
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="cannot be created"):
         write_sintel(scenes["static"], tmp_path / "file", "demo")

@@ -15,7 +15,7 @@ from hybridvo.network.losses import LossOptions
 from hybridvo.synthetic.dataset import Mixture
 from hybridvo.synthetic.layered import PaperOptions
 from hybridvo.training.options import OptimizerOptions, PwvoOptions, ScheduleOptions
-from hybridvo.training.pwvo_task import PwvoTask, SampleStream
+from hybridvo.training.pwvo_task import PwvoTask, sample_stream
 from hybridvo.training.trainer import Trainer
 
 TINY = PwvoOptions(
@@ -39,7 +39,7 @@ def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
 
 
 def batch_of(mixture: Mixture):
-    return next(iter(SampleStream(mixture, 0, 0, 4)))
+    return next(sample_stream(mixture, 0, 0, 4)).to("cpu")
 
 
 def test_resume_is_equal(mixture, tmp_path):
@@ -112,7 +112,7 @@ def test_time_limit_and_request_end_with_a_checkpoint(mixture, tmp_path):
 def test_steps_that_are_not_finite_are_skipped_and_counted(mixture):
     trainer = Trainer(PwvoTask(TINY, mixture))
     good = batch_of(mixture)
-    targets = dataclasses.replace(good.targets, rotation_deg=torch.full((4, 3), torch.nan))
+    targets = dataclasses.replace(good.targets, motion=torch.full((4, 6), torch.nan))
     bad = dataclasses.replace(good, targets=targets)
     before = {k: v.clone() for k, v in trainer.network.state_dict().items()}
     trainer.update(bad, 0.0)

@@ -34,12 +34,9 @@ class Oracle(torch.nn.Module):
         self.truth, self.share = truth, share
 
     def forward(self, inputs, T_start=None):
-        maps = self.truth.moving[:, None].expand(-1, 3, -1, -1).float()
-        rotation, translation = (
-            (self.share * x)[:, :, None, None].expand_as(maps)
-            for x in (self.truth.targets.rotation_deg, self.truth.targets.translation)
-        )
-        return PixelwisePrediction(rotation, translation, maps, maps)
+        maps = self.truth.moving[:, None].expand(-1, 6, -1, -1).float()
+        motion = self.share * self.truth.targets.motion
+        return PixelwisePrediction(motion[:, :, None, None].expand_as(maps), maps)
 
 
 @pytest.mark.parametrize("share", [1.0, 0.0])

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 import hybridvo
-from hybridvo.api import warm_up
 from hybridvo.errors import CheckpointError, InputError
 from hybridvo.flow import FlowField, dis_flow
 from hybridvo.geometry import ego_flow, invert, se3_exp
-from hybridvo.odometry import Odometry
+from hybridvo.odometry import Odometry, warm_up
 from hybridvo.options import Options, TrackOptions
 from hybridvo.pipeline import DEFAULT_METHOD
 from hybridvo.results import Reason, State
@@ -244,7 +243,7 @@ def test_a_frame_that_shows_something_else_is_spanned() -> None:
     for i in range(4):
         seen = scene.render(i)
         rgb = np.full_like(seen.rgb, 90) if i == 2 else seen.rgb  # a hand before the lens
-        steps.append(vo.track(Frame(rgb, seen.depth, scene.cameras[i], 0.1 * i, i)))
+        steps.append(vo.track(Frame(rgb, seen.depth, scene.camera, 0.1 * i, i)))
     assert [step.usable for step in steps] == [True, True, False, True]
     true = invert(scene.T_world_cam[0]) @ scene.T_world_cam[3]
     assert np.linalg.norm(steps[3].T_world_cam[:3, 3] - true[:3, 3]) < 0.01
@@ -373,7 +372,7 @@ def test_the_motion_model_cannot_hold_the_tracker(kind: str) -> None:
         for step, at in enumerate(path):
             seen = there[at]
             depth_m = np.where(np.isfinite(seen.depth), seen.depth, 0).astype(np.float32)
-            result = vo.track(Frame(seen.rgb, depth_m, scene.cameras[at], 0.1 * step, step))
+            result = vo.track(Frame(seen.rgb, depth_m, scene.camera, 0.1 * step, step))
             if step == 3 and history:
                 # and a last motion that is quite another one
                 wrong = se3_exp(np.array([0.3, 0.2, -0.4, 0.05, -0.08, 0.02]))
@@ -381,7 +380,7 @@ def test_the_motion_model_cannot_hold_the_tracker(kind: str) -> None:
                 vo.resume(replace(vo.state, motion_model=trapped))
             before = path[max(step - 1, 0)]
             true = invert(scene.T_world_cam[at]) @ scene.T_world_cam[before]
-            camera = scene.cameras[before]
+            camera = scene.camera
             z = there[before].depth
             flows = [ego_flow(z, T, camera, camera) for T in (result.T_curr_prev, true)]
             errors[step, history] = np.nanmean(np.linalg.norm(flows[0] - flows[1], axis=2))
