@@ -116,21 +116,11 @@ def se3_exp(delta: np.ndarray) -> np.ndarray:
 def se3_log(T: np.ndarray) -> np.ndarray:
     """6-vector (translation, rotation) with ``se3_exp(se3_log(T)) == T``."""
     T = np.asarray(T, dtype=np.float64)
-    R = T[:3, :3]
-    phi = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    sine, cosine = np.sqrt(phi @ phi), 0.5 * (R[0, 0] + R[1, 1] + R[2, 2] - 1)
-    if cosine > 0:  # scipy takes ten times as long, in every step of a pose graph
-        phi *= np.arctan2(sine, cosine) / sine if sine > 1e-12 else 1.0
-    else:  # near a half turn the sines are lost
-        phi = Rotation.from_matrix(R).as_rotvec()
-    theta2 = float(phi @ phi)
-    if theta2 < 1e-8:
-        c = 1 / 12 + theta2 / 720
-    else:
-        theta = np.sqrt(theta2)
-        c = (1 - theta / (2 * np.tan(theta / 2))) / theta2
+    phi = Rotation.from_matrix(T[:3, :3]).as_rotvec()
+    theta = np.linalg.norm(phi)
+    c = 1 / 12 if theta < 1e-3 else (1 - theta / (2 * np.tan(theta / 2))) / theta**2
     x, y, z = phi
-    W = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])  # np.cross takes ten times as long
+    W = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     V_inverse = np.eye(3) - 0.5 * W + c * (W @ W)
     return np.concatenate([V_inverse @ T[:3, 3], phi])
 

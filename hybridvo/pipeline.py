@@ -254,8 +254,9 @@ def refine(
 
     Of a :class:`FramePair` a ``RelativePose``; of a :class:`PairBatch` (torch) a ``BatchedPose``,
     differentiable: see :func:`hybridvo.refinement.torch_backend.refine_batch`. ``T_init`` (4, 4)
-    T_curr_prev is the only start; without one this is the method ``refine``. ``weights`` (H, W) are
-    factors on the information of each pixel; 0 and NaN switch one off.
+    T_curr_prev is the only start; without one every strong motion is searched, and hand-made cues
+    say which is the camera's. ``weights`` (H, W) are factors on the information of each pixel; 0
+    and NaN switch one off.
     """
     options = Options() if options is None else options
     check_kind("refine.options", options, Options)
@@ -268,4 +269,6 @@ def refine(
     if weights is not None and np.shape(weights) != shape:
         raise InputError(f"refine: expected weights of shape {shape}, got {np.shape(weights)}.")
     start = None if T_init is None else as_rigid(T_init, "refine.T_init")
-    return run_method(pair, "refine", Context(options, None, seed, weights, start=start))
+    started = time.perf_counter()
+    motion = classical(pair, Context(options, None, seed, weights, start=start))
+    return motion.replace(ms=1e3 * (time.perf_counter() - started))

@@ -86,8 +86,8 @@ def scaled_intrinsics(
 ) -> torch.Tensor:
     """(B, 3, 3) intrinsics after pixel coordinates x became scale * x + offset, of both axes."""
     out = K.clone()
-    out[:, 0, 0], out[:, 1, 1] = (K.diagonal(dim1=1, dim2=2)[:, :2] * scale).unbind(1)
-    out[:, :2, 2] = scale * K[:, :2, 2] + offset
+    out[:, :2] *= torch.as_tensor(scale).to(K).reshape(-1, 1)
+    out[:, :2, 2] += offset
     return out
 
 

@@ -161,9 +161,7 @@ def propose_motion(network: nn.Module, pair: FramePair) -> MotionPrediction | No
             return None
         T = fitted_motion(maps, inputs)[0].double().numpy()
         valid = inputs.on_grid_of(maps.log_scale).valid
-        static = static_probability(maps.log_scale, valid)[0].numpy()
-    finite = np.isfinite(T).all() and np.isfinite(static).all()
-    return MotionPrediction(T, static) if finite else None
+        return MotionPrediction(T, static_probability(maps.log_scale, valid)[0].numpy())
 
 
 def estimate_by_network(pair: FramePair, how: str, network: nn.Module) -> RelativePose:
@@ -187,9 +185,6 @@ def estimate_by_network(pair: FramePair, how: str, network: nn.Module) -> Relati
             # the scales go the way of the values: same pixels, same weights
             stated = select_pose(replace(maps, motion=maps.log_scale.exp()), how)
             U = np.maximum(stated[0].double().numpy(), 1e-4)  # half-precision knows no better
-    if not (np.isfinite(T).all() and np.isfinite(U).all()):
-        reason = Reason.DEGENERATE_GEOMETRY, "the network's answer is not finite"
-        return RelativePose.failed(*reason)
     status = Status()
     if U[:3].max() > 2.0:  # degrees: larger than most motions between frames
         doubt = f"the network is uncertain by {U[:3].max():.1f} degrees"
