@@ -59,17 +59,6 @@ def project(points: torch.Tensor, K: torch.Tensor) -> torch.Tensor:
     return project_points(points.transpose(1, 2), K[:, None]).transpose(1, 2)
 
 
-def projection_rows(
-    a: torch.Tensor, b: torch.Tensor, i: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Derivatives (B, 6, N) of a = X/Z and b = Y/Z in the left tangent, i = 1/Z."""
-    zero, ab = torch.zeros_like(a), a * b
-    return (
-        torch.stack([i, zero, -a * i, -ab, 1 + a * a, -b], dim=1),
-        torch.stack([zero, i, -b * i, -1 - b * b, ab, a], dim=1),
-    )
-
-
 def reproject(
     depth: torch.Tensor,
     T: torch.Tensor,

@@ -12,7 +12,7 @@ from typing import Self
 import torch
 
 from hybridvo.errors import InputError
-from hybridvo.refinement.batch import checked_batch
+from hybridvo.refinement.torch_factors import checked_batch
 from hybridvo.types import FramePair, PairBatch
 
 NETWORK_SIZE = (128, 256)

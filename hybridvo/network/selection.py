@@ -23,8 +23,7 @@ import torch.nn.functional as F
 
 from hybridvo.errors import InputError
 from hybridvo.network.inputs import NetworkInputs, pinhole
-from hybridvo.refinement.batch import Pixels, to_tiles
-from hybridvo.refinement.torch_factors import fit_pixels
+from hybridvo.refinement.torch_factors import Pixels, fit_pixels, to_tiles
 from hybridvo.results import PixelwisePrediction
 from hybridvo.torch_geometry import euler_transform, se3
 
@@ -111,7 +110,7 @@ def select_pose(
     side = min(patch or -(-height // PATCH_ROWS), max(height, width))
 
     def patches(x: torch.Tensor, fill: float = 0.0) -> torch.Tensor:
-        return to_tiles(x, side, fill).unflatten(-1, (-1, side**2))
+        return to_tiles(x, side, fill)
 
     # Padding that completes the last patches is infinitely uncertain: as every patch holds at least
     # one real pixel, and real ones rank below infinity, padding never wins.

@@ -65,15 +65,12 @@ def carried(T: np.ndarray, A: np.ndarray) -> np.ndarray:
 def camera_path(
     rng: np.random.Generator, frames: int, step: float, turn_deg: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(N, 4, 4) smooth, bounded T_world_cam, with and without hand shake.
-
-    Position and orientation run on ellipses, so that neither speed passes through zero, by about
-    ``step`` metres and ``turn_deg`` degrees a frame.
+    """(N, 4, 4) T_world_cam on ellipses, by about ``step`` metres and ``turn_deg`` degrees a frame,
+    with and without hand shake.
     """
     t = np.arange(frames)
 
     def wave(rate: float, low: float, high: float) -> tuple[np.ndarray, np.ndarray]:
-        """Two sinusoids in quadrature that change by ``rate`` per frame at their fastest."""
         period = rng.uniform(low, high)
         phase = 2 * np.pi * (t / period + rng.uniform())
         sign, amplitude = rng.choice([-1.0, 1.0]), rate * period / (2 * np.pi)

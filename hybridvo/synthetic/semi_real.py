@@ -1,8 +1,7 @@
 """Pairs whose surfaces are real: recordings as the world, cuts from other recordings as movers.
 
-The world is two frames of a static recording, or one frame seen from two places. Movers are cut
-out along irregular outlines, placed in front of the world or partly behind it, and each moves by
-itself. Both images and depth maps then get a sensor's errors, the movers no less than the world.
+The world is two frames of a static recording, or one frame seen from two places. Both images and
+depth maps get a sensor's errors, the movers no less than the world.
 """
 
 from __future__ import annotations
