@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import shlex
 import signal
 import sys
+from argparse import Namespace
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -79,23 +79,22 @@ def _steps(sample: Sample) -> list[Panel]:
     ]
 
 
-def train_pwvo(args: argparse.Namespace, command: list[str]) -> dict[str, Any]:
+def train_pwvo(args: Namespace) -> dict[str, Any]:
     """Train a network of the paper."""
     options, mixture = load_pwvo_options(args.config)
     given = {name: getattr(args, name) for name in ("steps", "batch_size", "seed")}
     changes = {name: value for name, value in given.items() if value is not None}
     task = PwvoTask(dataclasses.replace(options, **changes), mixture)
-    return _train(args, command, task, torch_device(args.device), args.workers)
+    return _train(args, task, torch_device(args.device), args.workers)
 
 
-def train_selector(args: argparse.Namespace, command: list[str]) -> dict[str, Any]:
+def train_selector(args: Namespace) -> dict[str, Any]:
     """Train the selector."""
-    return _train(args, command, SelectorTask(load_selector_options(args.config), args.data))
+    return _train(args, SelectorTask(load_selector_options(args.config), args.data))
 
 
 def _train(
-    args: argparse.Namespace,
-    command: list[str],
+    args: Namespace,
     task: PwvoTask | SelectorTask,
     device: Any = "cpu",
     workers: int = 0,
@@ -113,7 +112,7 @@ def _train(
     else:
         if args.init is not None:
             trainer.start_from(load_weights(args.init)[0].state_dict(), args.init)
-        about = {"command": shlex.join(command), "commit": source_commit()}
+        about = {"command": shlex.join(args.words), "commit": source_commit()}
         write_json(args.out / RUN, about | {"torch": torch.__version__})
     for number in (signal.SIGINT, signal.SIGTERM):  # the update at hand ends, with a checkpoint
         signal.signal(number, lambda *_: setattr(trainer, "stop_requested", True))
@@ -129,13 +128,13 @@ def _report(entry: dict[str, Any]) -> None:
     print(line, entry.get("results", ""), file=sys.stderr)
 
 
-def export(out: Path, export: Path, count: int, calibrate: int) -> dict[str, Any]:
+def export(args: Namespace) -> dict[str, Any]:
     """Write a network's weights for users."""
-    card = export_run(out, export, count, calibrate)
-    return {"file": str(export), "held_out": card["held_out"]}
+    card = export_run(args.out, args.export, args.count, args.calibrate)
+    return {"file": str(args.export), "held_out": card["held_out"]}
 
 
-def draw_selector_data(args: argparse.Namespace) -> dict[str, Any]:
+def draw_selector_data(args: Namespace) -> dict[str, Any]:
     """Draw samples for the selector."""
     if args.first_seed < 0 or args.seeds < 0:
         raise InputError(f"expected --first-seed and --seeds >= 0, got {args.first_seed}.")

@@ -41,7 +41,7 @@ class Models:
     """Networks by name, read on first use; ``weights``: files instead of the pretrained ones.
 
     Raises:
-        InputError: a device that is not there.
+        InputError: a device, a network or a file that is not there.
     """
 
     def __init__(
@@ -49,6 +49,11 @@ class Models:
     ) -> None:
         self.device = torch_device(device)
         self.weights = {name: Path(file) for name, file in (weights or {}).items()}
+        known = ("selector", *SELECTION)
+        for name, path in self.weights.items():
+            if name not in known or not path.is_file():
+                expected = f"NAME=FILE with {' or '.join(known)} and a file that exists"
+                raise InputError(f"--weights: expected {expected}, got {name}={path}.")
         self._networks: dict[str, Any] = {}
 
     def path(self, name: str) -> Path:
