@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from argparse import SUPPRESS, ArgumentParser, Namespace, RawDescriptionHelpFormatter
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -68,22 +69,18 @@ def _command(
 # -- groups of arguments that commands share, and what is made of them -----------------------------
 
 
-def _one_sequence(command: ArgumentParser, required: bool = True) -> None:
+def _sequence(command: ArgumentParser, required: bool = True) -> None:
     folder = command.add_mutually_exclusive_group(required=required).add_argument
     folder("path", nargs="?", default=SUPPRESS, metavar="DIR", help="folder of the sequence")
     folder("--sequence", dest="path", metavar="DIR", help="the same, by name")
     kinds = "sintel, tartanair, 7scenes, folder, kitti or tum (default: detected)"
     camera = "camera.yaml, ROS camera_info, or numbers"
     units = "depth units per metre, 1000: millimetres"
-    command.add_argument("--dataset", metavar="KIND", help=kinds)
-    command.add_argument("--camera", metavar="FILE|fx,fy,cx,cy", help=camera)
-    command.add_argument("--depth-scale", type=float, metavar="N", help=units)
-    masks = "images that are 0 where pixels do not count"
-    command.add_argument("--mask", metavar="DIR", help=masks)
-
-
-def _sequence_or_none(command: ArgumentParser) -> None:
-    _one_sequence(command, required=False)
+    add = command.add_argument
+    add("--dataset", metavar="KIND", help=kinds)
+    add("--camera", metavar="FILE|fx,fy,cx,cy", help=camera)
+    add("--depth-scale", type=float, metavar="N", help=units)
+    add("--mask", metavar="DIR", help="images that are 0 where pixels do not count")
 
 
 def _opened(args: Namespace) -> Sequence:
@@ -162,7 +159,7 @@ def _run(commands: Any) -> None:
         )
 
     about = "Estimate the camera motion of a sequence."
-    add = _command(commands, call, "run", about, _one_sequence, _option_tree, _weights)
+    add = _command(commands, call, "run", about, _sequence, _option_tree, _weights)
     methods = "default: hybrid; `hybridvo doctor` lists all"
     failed = "fraction of failed motions (default 0.2)"
     recording = "Rerun recording (extra 'viz'; default: recording.rrd in the output folder)"
@@ -221,7 +218,7 @@ def _show(commands: Any) -> None:
         return _files(image)
 
     about = "Draw the maps of one pair of a sequence."
-    add = _command(commands, call, "show", about, _one_sequence, _weights)
+    add = _command(commands, call, "show", about, _sequence, _weights)
     add("--pair", default=0, help="first frame (default 0)", **COUNT)
     add("--out", default="pair.png", metavar="FILE", help="default: %(default)s")
     add("--method", default="hybrid", metavar="NAME", help="estimator (default: hybrid)")
@@ -265,7 +262,8 @@ def _doctor(commands: Any) -> None:
         return found, 0 if found.get("ok", True) else 1
 
     about = "What is missing here, or wrong with a sequence."
-    add = _command(commands, call, "doctor", about, _sequence_or_none)
+    sequence = partial(_sequence, required=False)
+    add = _command(commands, call, "doctor", about, sequence)
     add("--pairs", default=40, help="pairs (default 40)", **COUNT)
 
 

@@ -19,7 +19,7 @@ from rich.progress import Progress
 
 from hybridvo.errors import InputError
 from hybridvo.evaluation.drawing import Panel, flow_colours, longest_flow, write_panels
-from hybridvo.files import write_json
+from hybridvo.files import make_folder, remove, write_json
 from hybridvo.network.models import load_weights, torch_device
 from hybridvo.synthetic.dataset import load_preset, read_sample, write_samples
 from hybridvo.synthetic.layered import Sample
@@ -102,10 +102,9 @@ def _train(
     if args.threads is not None:
         torch.set_num_threads(max(1, args.threads))
     cv2.setNumThreads(0)  # samples are small: threads inside OpenCV cost more than they give
-    args.out.mkdir(parents=True, exist_ok=True)
+    make_folder(args.out)
     if args.overwrite:
-        for name in (CHECKPOINT, LOG, RUN):
-            (args.out / name).unlink(missing_ok=True)
+        remove(*(args.out / name for name in (CHECKPOINT, LOG, RUN)))
     trainer = Trainer(task, args.out, device, workers, report=_report)
     if trainer.resume():
         print(f"goes on at update {trainer.step}", file=sys.stderr)
@@ -138,7 +137,7 @@ def draw_selector_data(args: Namespace) -> dict[str, Any]:
     """Draw samples for the selector."""
     if args.first_seed < 0 or args.seeds < 0:
         raise InputError(f"expected --first-seed and --seeds >= 0, got {args.first_seed}.")
-    args.data.mkdir(parents=True, exist_ok=True)
+    make_folder(args.data)
     recordings = () if args.recordings is None else load_split(args.recordings, args.split)
     network = None if args.propose is None else load_weights(args.propose)[0]
     total = 0

@@ -53,7 +53,7 @@ class Models:
         for name, path in self.weights.items():
             if name not in known or not path.is_file():
                 expected = f"NAME=FILE with {' or '.join(known)} and a file that exists"
-                raise InputError(f"--weights: expected {expected}, got {name}={path}.")
+                raise InputError(f"weights: expected {expected}, got {name}={path}.")
         self._networks: dict[str, Any] = {}
 
     def path(self, name: str) -> Path:
