@@ -27,10 +27,9 @@ LOCK = ".run.lock"
 
 @contextlib.contextmanager
 def atomic_write(path: str | os.PathLike[str], mode: Literal["w", "wb"] = "w") -> Iterator[IO[Any]]:
-    """Open a file whose content appears under its name completely or not at all.
+    """Open a file whose content appears under its name completely, or not at all (OutputError).
 
-    A symbolic link at ``path`` is replaced, never followed. Text is UTF-8 with Unix line ends. With
-    an OutputError ``path`` is unchanged.
+    A symbolic link is replaced, never followed. Text is UTF-8 with Unix line ends.
     """
     path = Path(path)
     if path.exists() and not (path.is_file() or path.is_dir()):
@@ -120,12 +119,12 @@ def read_text(path: str | os.PathLike[str]) -> str:
 
 
 class Rows(NamedTuple):
-    """A list on disk: for each row its line in the file, its numbers (N, C), the words after."""
+    """A list on disk."""
 
     path: Path
-    lines: list[int]
-    numbers: np.ndarray
-    words: list[list[str]]
+    lines: list[int]  # of the file
+    numbers: np.ndarray  # (N, C)
+    words: list[list[str]]  # after the numbers
 
     def refuse(self, bad: np.ndarray, expected: str) -> None:
         """Name the first of the bad rows, if there is one."""

@@ -16,7 +16,7 @@ import numpy as np
 
 from hybridvo.calibration import DIS_NOISE, FLOW_CONTRADICTION, MIN_TEXTURED
 from hybridvo.errors import InputError
-from hybridvo.types import Frame, FramePair, to_numpy
+from hybridvo.types import Frame, FramePair
 
 DIS_PRESETS = ("ultrafast", "fast", "medium")  # in OpenCV's order, from 0
 _logger = logging.getLogger(__name__)
@@ -42,7 +42,6 @@ def dis_flow(preset: str = "medium") -> FlowProvider:
 
     It is computed in both directions, whose disagreement gives variance and validity. Where an
     image has no texture (a covered lens, a dropped frame, parallel stripes) there is no flow.
-
     ``preset`` is the effort: ``ultrafast``, ``fast`` or ``medium``.
     """
     if preset not in DIS_PRESETS:
@@ -52,8 +51,6 @@ def dis_flow(preset: str = "medium") -> FlowProvider:
 
 @dataclass(frozen=True)
 class _Dis:
-    """See :func:`dis_flow`."""
-
     preset: str
     source = "dis"
 
@@ -131,8 +128,8 @@ def file_flow(
 ) -> FlowProvider:
     """Provider of the flow files of an open sequence, which lead from one frame to the next.
 
-    Where there is none the flow is that of ``otherwise``, or None. A damaged file raises what the
-    reader raises if ``strict``, else it counts as none, with a line in the log.
+    Where there is none, ``otherwise`` is asked. A damaged file raises what the reader raises if
+    ``strict``, else it counts as none, with a line in the log.
     """
 
     def provide(prev: Frame, curr: Frame) -> FlowField:
@@ -182,11 +179,7 @@ def with_flow(
     if pair.flow is not None or provider is None:
         return pair
     field = provider(pair.prev, pair.curr)
-    if not isinstance(field, FlowField):
-        array = None if field is None else to_numpy(field, f"flow ({source})")
-        if array is not None and array.dtype.kind in "fi" and array.ndim == 3:
-            array = np.where(np.isfinite(array).all(axis=2, keepdims=True), array, np.nan)
-        field = FlowField(array, source=source)
+    field = field if isinstance(field, FlowField) else FlowField(field, source=source)
     known = field.flow, field.variance, field.valid, field.source, field.is_true
     return FramePair(pair.prev, pair.curr, *known, pair.depth_source)
 

@@ -18,18 +18,11 @@ def pixel_grid(height: int, width: int) -> np.ndarray:
     return np.stack([u, v], axis=-1)
 
 
-def backproject(depth: np.ndarray, camera: Camera) -> np.ndarray:
-    """(H, W, 3) points in metres in the camera frame from an (H, W) depth map (z, metres)."""
-    u, v = np.moveaxis(pixel_grid(*camera.shape), -1, 0)
-    x, y = (u - camera.cx) / camera.fx * depth, (v - camera.cy) / camera.fy * depth
-    return np.stack([x, y, depth.astype(np.float64)], axis=-1)
-
-
-def points_at(depth: np.ndarray, camera: Camera, index: np.ndarray) -> np.ndarray:
-    """(N, 3) points in metres of the pixels (N, 2), rows and columns, of a depth map."""
-    v, u = index.T
-    z = depth[v, u].astype(np.float64)
-    return np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], axis=1)
+def backproject(depth: np.ndarray, camera: Camera, index: np.ndarray | None = None) -> np.ndarray:
+    """(H, W, 3) points of a depth map, metres; or (N, 3) of its pixels (N, 2) (row, column)."""
+    v, u = np.indices(camera.shape) if index is None else index.T
+    z = (depth if index is None else depth[v, u]).astype(np.float64)
+    return np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], axis=-1)
 
 
 def project(points: np.ndarray, camera: Camera) -> np.ndarray:
@@ -55,8 +48,8 @@ def projection_rows(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.
 def ego_flow(
     depth: np.ndarray, T_curr_prev: np.ndarray, camera_prev: Camera, camera_curr: Camera
 ) -> np.ndarray:
-    """(H, W, 2) flow in pixels that the camera motion alone causes (paper, equation 8): pi(K_curr,
-    T_curr_prev D K_prev^-1 x) - x; NaN where depth is invalid or the moved point behind the camera.
+    """(H, W, 2) px, pi(K_curr, T_curr_prev D K_prev^-1 x) - x: flow by the camera motion alone
+    (paper, equation 8); NaN where depth is invalid or the moved point behind the camera.
     """
     depth = np.asarray(depth, dtype=np.float64)
     valid = np.isfinite(depth) & (depth > 0)
@@ -83,10 +76,9 @@ def invert(T: np.ndarray) -> np.ndarray:
     """Inverse of (..., 4, 4) rigid transforms."""
     T = np.asarray(T, dtype=np.float64)
     R = np.swapaxes(T[..., :3, :3], -1, -2)
-    out = np.zeros_like(T)
+    out = T.copy()
     out[..., :3, :3] = R
     out[..., :3, 3] = -np.einsum("...ij,...j->...i", R, T[..., :3, 3])
-    out[..., 3, 3] = 1.0
     return out
 
 
@@ -124,21 +116,11 @@ def se3_exp(delta: np.ndarray) -> np.ndarray:
 def se3_log(T: np.ndarray) -> np.ndarray:
     """6-vector (translation, rotation) with ``se3_exp(se3_log(T)) == T``."""
     T = np.asarray(T, dtype=np.float64)
-    R = T[:3, :3]
-    phi = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    sine, cosine = np.sqrt(phi @ phi), 0.5 * (R[0, 0] + R[1, 1] + R[2, 2] - 1)
-    if cosine > 0:  # scipy takes ten times as long, in every step of a pose graph
-        phi *= np.arctan2(sine, cosine) / sine if sine > 1e-12 else 1.0
-    else:  # near a half turn the sines are lost
-        phi = Rotation.from_matrix(R).as_rotvec()
-    theta2 = float(phi @ phi)
-    if theta2 < 1e-8:
-        c = 1 / 12 + theta2 / 720
-    else:
-        theta = np.sqrt(theta2)
-        c = (1 - theta / (2 * np.tan(theta / 2))) / theta2
+    phi = Rotation.from_matrix(T[:3, :3]).as_rotvec()
+    theta = np.linalg.norm(phi)
+    c = 1 / 12 if theta < 1e-3 else (1 - theta / (2 * np.tan(theta / 2))) / theta**2
     x, y, z = phi
-    W = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])  # np.cross takes ten times as long
+    W = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     V_inverse = np.eye(3) - 0.5 * W + c * (W @ W)
     return np.concatenate([V_inverse @ T[:3, 3], phi])
 
@@ -152,17 +134,13 @@ def rotation_angle(R: np.ndarray) -> np.ndarray:
 
 
 def euler_deg_to_matrix(angles_deg: np.ndarray) -> np.ndarray:
-    """(..., 3, 3) R = Rx(x) Ry(y) Rz(z) from (..., 3) angles in degrees, as in the paper."""
-    angles = np.asarray(angles_deg, dtype=np.float64)
-    flat = Rotation.from_euler("XYZ", angles.reshape(-1, 3), degrees=True).as_matrix()
-    return flat.reshape(*angles.shape[:-1], 3, 3)
+    """(3, 3) or (N, 3, 3) R = Rx(x) Ry(y) Rz(z) from angles in degrees, as in the paper."""
+    return Rotation.from_euler("XYZ", angles_deg, degrees=True).as_matrix()
 
 
 def matrix_to_euler_deg(R: np.ndarray) -> np.ndarray:
-    """(..., 3) Euler angles X-Y-Z in degrees with R = Rx Ry Rz (the paper's convention)."""
-    R = np.asarray(R, dtype=np.float64)
-    flat = Rotation.from_matrix(R.reshape(-1, 3, 3)).as_euler("XYZ", degrees=True)
-    return flat.reshape(*R.shape[:-2], 3)
+    """(3,) or (N, 3) Euler angles X-Y-Z in degrees with R = Rx Ry Rz, as in the paper."""
+    return Rotation.from_matrix(R).as_euler("XYZ", degrees=True)
 
 
 def ned_to_camera(T_world_cam_ned: np.ndarray) -> np.ndarray:
@@ -177,11 +155,10 @@ def to_gtsam_covariance(covariance: np.ndarray) -> np.ndarray:
     The inverse of ``Exp(d) T_curr_prev`` is ``T_prev_curr Exp(-d)``: the same covariance, now on
     GTSAM's side. The order changes to (rotation, translation). Takes (6, 6) or (N, 6, 6).
     """
-    covariance = np.asarray(covariance)
-    if covariance.ndim not in (2, 3) or covariance.shape[-2:] != (6, 6):
-        expected = f"shape (6, 6) or (N, 6, 6), got {covariance.shape}"
-        raise InputError(f"to_gtsam_covariance: expected {expected}.")
-    return np.roll(covariance, 3, axis=(-2, -1))
+    C = np.asarray(covariance)
+    if C.ndim not in (2, 3) or C.shape[-2:] != (6, 6):
+        raise InputError(f"to_gtsam_covariance: expected (6, 6) or (N, 6, 6), got {C.shape}.")
+    return np.roll(C, 3, axis=(-2, -1))
 
 
 def to_ros_covariance(covariance: np.ndarray, T_prev_curr: np.ndarray) -> np.ndarray:
@@ -192,10 +169,8 @@ def to_ros_covariance(covariance: np.ndarray, T_prev_curr: np.ndarray) -> np.nda
     """
     C, T = np.asarray(covariance), np.asarray(T_prev_curr)
     if C.shape[-2:] != (6, 6) or T.shape != (*C.shape[:-2], 4, 4):
-        raise InputError(
-            f"to_ros_covariance: expected (6, 6) and (4, 4), or (N, 6, 6) and (N, 4, 4), got "
-            f"{C.shape} and {T.shape}."
-        )
+        expected = "(6, 6) and (4, 4), or (N, 6, 6) and (N, 4, 4)"
+        raise InputError(f"to_ros_covariance: expected {expected}, got {C.shape} and {T.shape}.")
     A = np.zeros_like(C, dtype=np.float64)
     A[..., :3, :3] = A[..., 3:, 3:] = T[..., :3, :3]
     return A @ C @ np.swapaxes(A, -1, -2)

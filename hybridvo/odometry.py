@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import time
 from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
@@ -9,10 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from hybridvo.api import warm_up
 from hybridvo.errors import InputError
 from hybridvo.flow import FlowField, FlowProvider, dis_flow, with_flow
-from hybridvo.geometry import chain, invert, pose_matrix, se3_exp, se3_log
+from hybridvo.geometry import chain, ego_flow, invert, pose_matrix, se3_exp, se3_log
 from hybridvo.network.models import Models, default_models
 from hybridvo.options import Options
 from hybridvo.pipeline import (
@@ -24,7 +25,7 @@ from hybridvo.pipeline import (
     run_method,
 )
 from hybridvo.results import MotionPrior, Reason, RelativePose, Step
-from hybridvo.types import Frame, FramePair, as_number, as_rigid, as_seed, check_kind
+from hybridvo.types import Camera, Frame, FramePair, as_number, as_rigid, as_seed, check_kind
 
 STANDSTILL = 1e-12 * np.eye(6)
 """Covariance of no motion at all; a pose graph can still invert it."""
@@ -102,28 +103,24 @@ class Odometry:
         options: Options | None = None,
         seed: int = 0,
     ) -> None:
-        options = Options() if options is None else options
-        check_kind("Odometry.options", options, Options)
+        self.options = Options() if options is None else options
+        check_kind("Odometry.options", self.options, Options)
         if flow is not None and not callable(flow):
             raise InputError(f"Odometry.flow: expected a callable (prev, curr), got {flow!r}.")
-        if method is None:
-            method = "refine" if network is None else DEFAULT_METHOD
-        check_method(method)
-        device = options.run.device if method in NETWORKS else "cpu"
-        if network is None and method in NETWORKS:
-            raise InputError(f"Odometry: method {method!r} needs a network; use method='refine'.")
-        if isinstance(network, Models):
-            self._models = network
-        elif network in (None, "default"):
-            self._models = default_models(device)
-        else:
-            check_kind("Odometry.network", network, str)
-            from hybridvo.network.weights import weights_file
-
-            self._models = Models(device, {"selector": weights_file(network)})
-        self.method, self.options = method, options
+        self.method = method or ("refine" if network is None else DEFAULT_METHOD)
         self.seed = as_seed(seed, "Odometry.seed")
-        self._flow = flow or dis_flow(options.flow.dis_preset)
+        check_method(self.method)
+        device = self.options.run.device if self.method in NETWORKS else "cpu"
+        if network is None and self.method in NETWORKS:
+            raise InputError(f"Odometry: method {method!r} needs a network; use method='refine'.")
+        if network in (None, "default"):
+            network = default_models(device)
+        elif not isinstance(network, Models):
+            check_kind("Odometry.network", network, str)
+            network = default_models(device, str(network))
+            network.path("selector")  # refuses a name that nobody knows
+        self._models = network
+        self._flow = flow or dis_flow(self.options.flow.dis_preset)
         self.reset()
 
     def reset(self) -> None:
@@ -177,23 +174,23 @@ class Odometry:
         wanted, check = self.options.track.motion_prior, not self._flow_fits
         prior = state.motion_model.predict(state.gap + 1) if wanted else None
         context = Context(self.options, prior, self.seed, None, self._models, check, self._flow)
-        found = run_method(pair, self.method, context)
-        self._flow_fits |= found.usable
-        if found.usable:
-            T, motion, failed = chain(state.T_world_cam, found.T_curr_prev), found, 0
-            last = found.T_curr_prev
+        motion = run_method(pair, self.method, context)
+        leads = flow is not None or self._leads(frame, pair, motion, state.gap)
+        if motion.usable:
+            self._flow_fits = True
+            T, last = chain(state.T_world_cam, motion.T_curr_prev), motion.T_curr_prev
             if state.gap:  # over frames that were passed over: the share of one
                 last = se3_exp(se3_log(last) / (state.gap + 1))
             model = state.motion_model.observed(last, not state.gap and not state.failed)
+            state = replace(state, motion_model=model, failed=0)
         else:
-            (T, motion), failed = self._instead(state, found), state.failed + 1
-            model = state.motion_model
-        after: dict[str, Any] = {"T_world_last": T, "motion_model": model, "failed": failed}
-        if flow is not None or self._leads(frame, pair, found, state.gap):
-            after |= {"frame": frame, "T_world_cam": T, "gap": 0}
+            T, motion = self._instead(state, motion)
+            state = replace(state, failed=state.failed + 1)
+        if leads:
+            state = replace(state, frame=frame, T_world_cam=T, gap=0)
         else:
-            after["gap"] = state.gap + 1
-        self.state = replace(state, count=state.count + 1, **after)
+            state = replace(state, gap=state.gap + 1)
+        self.state = replace(state, T_world_last=T, count=state.count + 1)
         return Step(frame.index, frame.timestamp, T.copy(), motion)
 
     def _leads(self, frame: Frame, pair: FramePair, found: RelativePose, gap: int) -> bool:
@@ -217,12 +214,9 @@ class Odometry:
         self.state = replace(state, T_world_last=T, gap=gap, count=state.count + 1)
         return Step(int(index), timestamp, T.copy(), motion)
 
-    def _instead(
-        self, state: TrackerState, failed: RelativePose
-    ) -> tuple[np.ndarray, RelativePose]:
+    def _instead(self, state: TrackerState, failed: RelativePose) -> tuple[Any, RelativePose]:
         """(pose, motion) by policy, where a motion was not found."""
-        covariance = np.diag(np.maximum(IDENTITY_STD**2, np.diag(failed.covariance)))
-        T_world_cam, T_curr_prev = state.T_world_last, np.eye(4)
+        T_world_cam, T_curr_prev, covariance = state.T_world_last, np.eye(4), failed.covariance
         ahead = state.motion_model.predict(state.gap + 1)
         if self.options.track.on_failure == "hold" or ahead is None:
             if state.gap:
@@ -232,3 +226,28 @@ class Odometry:
             T_curr_prev, covariance = ahead.T_curr_prev, (state.failed + 1) * ahead.covariance
             T_world_cam = chain(state.T_world_cam, T_curr_prev)
         return T_world_cam, failed.replace(T_curr_prev=T_curr_prev, covariance=covariance)
+
+
+@functools.cache
+def warm_up(method: str = DEFAULT_METHOD, models: Models | None = None) -> float:
+    """Compile and load everything; seconds spent: a minute once, a second after that."""
+    started = time.perf_counter()
+    context = Context(models=models or default_models(), check_flow=False)
+    for height, width in ((48, 64), (320, 400)):  # the second takes the parallel kernels
+        camera = Camera(width, width, (width - 1) / 2, (height - 1) / 2, height, width)
+        u, v = np.arange(width), np.arange(height)[:, None]
+        depth = (4.0 + np.sin(u / 7.0) + np.cos(v / 5.0)).astype(np.float32)
+        motion = se3_exp(np.array([0.02, -0.01, 0.05, 0.002, 0.004, -0.003]))
+        flow = ego_flow(depth, motion, camera, camera).astype(np.float32)
+        # a mask, a variance and a second motion: every branch is compiled
+        flow[: height // 3, : width // 3] += 3.0
+        rgb = (40 * (2 + np.sin(u / 3.0) + np.cos(v / 2.0)))[..., None].repeat(3, 2)
+        frame = Frame(rgb.astype(np.uint8), depth, camera)
+        variance, valid = np.full((height, width), 0.01, np.float32), flow[..., 0] < 1e3
+        pair = FramePair(frame, frame, flow)
+        run_method(replace(pair, flow_variance=variance, flow_valid=valid), method, context)
+        run_method(pair, method, context)
+        if method.startswith("hybrid"):  # what few pairs ask for
+            context.predict(pair)
+            context.direct(replace(pair, flow_source="dis"))
+    return time.perf_counter() - started

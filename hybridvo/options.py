@@ -82,9 +82,8 @@ class RefineOptions:
 
     cutoff: Positive = 3.0  # c of the Geman-McClure kernel, in standard deviations
     coarse_pixels: Count = 7500  # of the grid on which motions are fitted before the full one
-    # the current frame's depth as a third residual; auto: where it adds more than half of what the
-    # flow knows in some direction
-    current_depth: Literal["auto", "on", "off"] = "auto"
+    # whether the current frame's depth bounds the noise of the first and is held against it
+    current_depth: Literal["auto", "off"] = "auto"
     min_pixels: Count = 24  # fewer usable ones are a failure
     tiles: Count = 110  # of 8 to 64 px, of the covariance: errors may be correlated over two
 

@@ -59,17 +59,6 @@ def project(points: torch.Tensor, K: torch.Tensor) -> torch.Tensor:
     return project_points(points.transpose(1, 2), K[:, None]).transpose(1, 2)
 
 
-def projection_rows(
-    a: torch.Tensor, b: torch.Tensor, i: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Derivatives (B, 6, N) of a = X/Z and b = Y/Z in the left tangent, i = 1/Z."""
-    zero, ab = torch.zeros_like(a), a * b
-    return (
-        torch.stack([i, zero, -a * i, -ab, 1 + a * a, -b], dim=1),
-        torch.stack([zero, i, -b * i, -1 - b * b, ab, a], dim=1),
-    )
-
-
 def reproject(
     depth: torch.Tensor,
     T: torch.Tensor,
@@ -79,9 +68,9 @@ def reproject(
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Where the pixels of the previous frame are seen by the current one: x + ego flow.
 
-    ``depth`` (B, H, W) metres; ``T`` T_curr_prev, (B, 4, 4) or pypose SE3 (B, 7). Returns (B, H, W,
-    2) px; (B, H, W) bool: the depth is valid and the point farther than ``min_depth`` (elsewhere
-    the pixels are finite and mean nothing); (B, H, W) depth of the moved point, else 1.
+    For depth (B, H, W) and T_curr_prev, (B, 4, 4) or pypose SE3 (B, 7): (B, H, W, 2) px; (B, H, W)
+    bool: the depth is valid and the point farther than ``min_depth`` (elsewhere the pixels are
+    finite and mean nothing); (B, H, W) depth of the moved point, else 1.
     """
     if isinstance(T, pp.LieTensor):
         T = T.matrix()

@@ -70,11 +70,10 @@ class Trajectory:
 
 
 def read_trajectory(path: str | os.PathLike[str]) -> Trajectory:
-    """Read camera-to-world poses from a text file, one pose a line; FormatErrors name the line.
+    """Camera-to-world poses of a text file whose columns are some of :data:`COLUMNS`.
 
-    The number of columns tells the format, see :data:`COLUMNS`. TartanAir's NED axes become those
-    of a camera; stamps in other units than seconds are converted, which ``warnings`` say; KITTI and
-    TartanAir files get frame numbers as stamps.
+    TartanAir's NED axes become those of a camera; stamps in other units than seconds are converted,
+    which ``warnings`` say; KITTI and TartanAir files get frame numbers as stamps.
     """
     path = Path(path)
     if not path.is_file():
@@ -93,10 +92,7 @@ def read_trajectory(path: str | os.PathLike[str]) -> Trajectory:
 
 
 def read_poses(path: Path, *columns: str) -> tuple[Rows, np.ndarray]:
-    """Rows of a list of one of :data:`COLUMNS`, and (N, 4, 4) their poses, NaN if not finite.
-
-    A damaged row or what is no rotation is a FormatError with file and line.
-    """
+    """Rows of a list of one of :data:`COLUMNS`, and (N, 4, 4) their poses, NaN if not finite."""
     rows = read_rows(path, *columns)
     known = np.isfinite(rows.numbers).all(axis=1)
     T = np.tile(np.eye(4), (len(known), 1, 1))
@@ -137,14 +133,11 @@ def to_seconds(stamps: np.ndarray, name: str, told: list[str]) -> np.ndarray:
 
 
 def stamp_unit(stamps: np.ndarray) -> tuple[float, str]:
-    """How many of the unit of some stamps make a second, and its name.
-
-    Stamps that today's clocks (2001 to 2103) would show in milli- or microseconds are those;
-    other stamps above 1e14, which is three million years, are nanoseconds.
-    """
+    """How many of the unit of some stamps make a second, and its name."""
     known = np.abs(stamps[np.isfinite(stamps)])
     typical = np.median(known) if known.size else 0.0
     for factor, name in ((1e3, "milliseconds"), (1e6, "microseconds")):
+        # what today's clocks (2001 to 2103) show
         if 1e9 <= typical / factor <= 4.2e9:
             return factor, name
     return (1e9, "nanoseconds") if typical > 1e14 else (1.0, "seconds")

@@ -22,7 +22,7 @@ RECORDED_FRAMES, REPEATS = 30, 5
 FRESH_PROCESS = """
 import json, time
 begin = time.perf_counter()
-from hybridvo.api import warm_up
+from hybridvo.odometry import warm_up
 imported = time.perf_counter()
 warm_up("hybrid")
 print(json.dumps({"import_s": imported - begin, "warm_up_s": time.perf_counter() - imported}))

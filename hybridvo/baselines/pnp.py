@@ -1,7 +1,4 @@
-"""Point solvers of OpenCV and PoseLib: sample, solve, check.
-
-The check is the same for every baseline, so that "ok" means one thing in a comparison.
-"""
+"""Point solvers of OpenCV and PoseLib: sample, solve, and the check of every baseline."""
 
 from __future__ import annotations
 

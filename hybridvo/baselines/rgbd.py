@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -24,39 +23,41 @@ from hybridvo.geometry import pose_matrix, project
 from hybridvo.results import Reason, RelativePose, Status
 from hybridvo.types import Camera, FramePair
 
+Aligner = Callable[[list[np.ndarray], list[np.ndarray], Camera, float], np.ndarray | None]
+"""(two images, their depths, camera, metres beyond every depth) -> (4, 4) T_curr_prev, or None.
 
-class Rgbd(NamedTuple):
-    """An image and its depth, NaN where that is invalid."""
-
-    rgb: np.ndarray
-    depth: np.ndarray
-    camera: Camera
+The depth is NaN where it is invalid; the default limits of both libraries are opened.
+"""
 
 
-def align_opencv(prev: Rgbd, curr: Rgbd) -> np.ndarray | None:
+def align_opencv(
+    rgb: list[np.ndarray], depth: list[np.ndarray], camera: Camera, deepest: float
+) -> np.ndarray | None:
     """OpenCV 5's ``cv2.Odometry`` with image and depth."""
     settings = cv2.OdometrySettings()
-    settings.setCameraMatrix(prev.camera.K.astype(np.float32))
+    settings.setCameraMatrix(camera.K.astype(np.float32))
     settings.setMinDepth(1e-3)
-    settings.setMaxDepth(_deepest(prev))
+    settings.setMaxDepth(deepest)
     odometry = cv2.Odometry(cv2.ODOMETRY_TYPE_RGB_DEPTH, settings, cv2.ODOMETRY_ALGO_TYPE_COMMON)
-    found, T = odometry.compute(prev.depth, prev.rgb, curr.depth, curr.rgb)
+    found, T = odometry.compute(depth[0], rgb[0], depth[1], rgb[1])
     return np.asarray(T, dtype=np.float64) if found else None
 
 
-def align_open3d(prev: Rgbd, curr: Rgbd) -> np.ndarray | None:
+def align_open3d(
+    rgb: list[np.ndarray], depth: list[np.ndarray], camera: Camera, deepest: float
+) -> np.ndarray | None:
     """Open3D's ``compute_rgbd_odometry`` with the hybrid term."""
     import open3d
 
-    deepest, c, odometry = _deepest(prev), prev.camera, open3d.pipelines.odometry
+    c, odometry = camera, open3d.pipelines.odometry
     images = [
         open3d.geometry.RGBDImage.create_from_color_and_depth(
-            open3d.geometry.Image(np.ascontiguousarray(frame.rgb)),
-            open3d.geometry.Image(np.nan_to_num(frame.depth)),  # 0 is unknown to Open3D
+            open3d.geometry.Image(np.ascontiguousarray(image)),
+            open3d.geometry.Image(np.nan_to_num(z)),  # 0 is unknown to Open3D
             depth_scale=1.0,
             depth_trunc=deepest,
         )
-        for frame in (prev, curr)
+        for image, z in zip(rgb, depth, strict=True)
     ]
     pinhole = open3d.camera.PinholeCameraIntrinsic(c.width, c.height, c.fx, c.fy, c.cx, c.cy)
     option, term = odometry.OdometryOption(), odometry.RGBDOdometryJacobianFromHybridTerm()
@@ -65,25 +66,17 @@ def align_open3d(prev: Rgbd, curr: Rgbd) -> np.ndarray | None:
     return np.asarray(T, dtype=np.float64) if found else None
 
 
-def _deepest(frame: Rgbd) -> float:
-    """Metres beyond every depth: the default limits of both libraries are opened to it."""
-    return float(np.nanmax(frame.depth)) + 1.0
-
-
-ALIGNERS: dict[str, Callable[[Rgbd, Rgbd], np.ndarray | None]] = {
-    "opencv-rgbd": align_opencv,
-    "open3d-rgbd": align_open3d,
-}
-"""(4, 4) T_curr_prev of two RGB-D images under one camera, or None."""
+ALIGNERS: dict[str, Aligner] = {"opencv-rgbd": align_opencv, "open3d-rgbd": align_open3d}
 
 
 def estimate_by_images(method: str, pair: FramePair, seed: int = 0) -> RelativePose:
     """Motion of a pair by one of :data:`ALIGNERS`; its status is failed without images."""
-    frames, T = _prepared(pair), None
-    if isinstance(frames, Status):
-        return RelativePose.failed(frames.reason, frames.message, method)
+    images, T = _prepared(pair), None
+    if isinstance(images, Status):
+        return RelativePose.failed(images.reason, images.message, method)
+    rgb, depth = images
     with contextlib.suppress(*FOUND_NOTHING):
-        T = ALIGNERS[method](*frames)
+        T = ALIGNERS[method](rgb, depth, pair.prev.camera, float(np.nanmax(depth[0])) + 1.0)
     # both libraries chain small updates into not quite a rotation
     T = pose_matrix(T[:3]) if T is not None and np.isfinite(T).all() else None
     camera, sigma_px = pair.curr.camera, None
@@ -98,10 +91,9 @@ def estimate_by_images(method: str, pair: FramePair, seed: int = 0) -> RelativeP
     return check(method, T, data, camera, DEFAULT_PX, sigma_px)
 
 
-def _prepared(pair: FramePair) -> tuple[Rgbd, Rgbd] | Status:
-    """Both frames as OpenCV and Open3D take them, the current one resampled to the previous K."""
-    camera = pair.prev.camera
-    frames = []
+def _prepared(pair: FramePair) -> tuple[list[np.ndarray], list[np.ndarray]] | Status:
+    """Both images and their depths, the current ones resampled to the previous K."""
+    camera, images, depths = pair.prev.camera, list[np.ndarray](), list[np.ndarray]()
     for name, frame in (("previous", pair.prev), ("current", pair.curr)):
         rgb, depth = frame.rgb, frame.depth
         if rgb is None:
@@ -115,5 +107,6 @@ def _prepared(pair: FramePair) -> tuple[Rgbd, Rgbd] | Status:
             rgb = np.asarray(cv2.warpAffine(rgb, A, size))
             nearest, nan = cv2.INTER_NEAREST, float("nan")
             depth = np.asarray(cv2.warpAffine(depth, A, size, flags=nearest, borderValue=nan))
-        frames.append(Rgbd(rgb, depth, camera))
-    return frames[0], frames[1]
+        images.append(rgb)
+        depths.append(depth)
+    return images, depths

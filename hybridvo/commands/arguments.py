@@ -120,9 +120,16 @@ def _weights(command: ArgumentParser) -> None:
 
 
 def _models(args: Namespace, device: str = "cpu") -> Models:
-    from hybridvo.network.models import Models
+    from hybridvo.errors import InputError
+    from hybridvo.network.models import SELECTION, Models
 
-    return Models(device, dict(text.partition("=")[::2] for text in args.weights))
+    known = ("selector", *SELECTION)
+    files = dict(text.partition("=")[::2] for text in args.weights)
+    for name, path in files.items():
+        if name not in known or not Path(path).is_file():
+            expected = f"NAME=FILE with {' or '.join(known)} and a file that exists"
+            raise InputError(f"--weights: expected {expected}, got {name}={path}.")
+    return Models(device, files)
 
 
 def _training(command: ArgumentParser) -> None:

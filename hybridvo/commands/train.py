@@ -24,12 +24,11 @@ from hybridvo.network.models import load_weights, torch_device
 from hybridvo.synthetic.dataset import load_preset, read_sample, write_samples
 from hybridvo.synthetic.layered import Sample
 from hybridvo.synthetic.semi_real import load_split
-from hybridvo.training.export import RUN, export_run, source_commit
 from hybridvo.training.options import load_pwvo_options, load_selector_options
 from hybridvo.training.pwvo_task import PwvoTask
 from hybridvo.training.selector_data import PER_SHARD, write_shard
 from hybridvo.training.selector_task import SelectorTask
-from hybridvo.training.trainer import CHECKPOINT, LOG, Trainer
+from hybridvo.training.trainer import CHECKPOINT, LOG, RUN, Trainer, export_run, source_commit
 
 
 def generate(

@@ -17,7 +17,6 @@ from matplotlib import colormaps
 from matplotlib.colors import hsv_to_rgb
 from matplotlib.figure import Figure
 
-from hybridvo.api import estimate
 from hybridvo.data.sequence import Sequence, iter_pairs
 from hybridvo.errors import InputError
 from hybridvo.evaluation.metrics import aligned
@@ -27,9 +26,9 @@ from hybridvo.flow import dis_flow
 from hybridvo.geometry import ego_flow, invert, matrix_to_euler_deg
 from hybridvo.network.inputs import assemble_inputs
 from hybridvo.network.models import Models
-from hybridvo.network.normalization import first_motions
+from hybridvo.network.prediction import first_motions
 from hybridvo.network.selection import select_pose
-from hybridvo.pipeline import DEFAULT_METHOD
+from hybridvo.pipeline import DEFAULT_METHOD, estimate
 from hybridvo.results import PixelwisePrediction, RelativePose
 from hybridvo.trajectory import Trajectory
 from hybridvo.types import FramePair

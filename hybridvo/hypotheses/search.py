@@ -1,8 +1,7 @@
 """Every strong motion in the image, one after the other.
 
 Candidates are poses handed in, robust dense fits of overlapping windows and minimal three-pixel
-samples. The best few of a round are refined, and the pixels that follow the winner, which may be a
-compromise, are set aside before the next one; the others are kept, behind all winners.
+samples. The pixels that follow the winner of a round are set aside before the next one.
 """
 
 from __future__ import annotations
@@ -172,10 +171,8 @@ class _Search:
         """The motion fitted on all pixels that are left, with its noise."""
         pixels = self.samples, self.grid.count, self.K
         steps += coarse_fit.anneal(*pixels, 0.7, 0.5, 0.4, 3, pose)
-        final, caps = pose.copy(), (coarse_fit.FLOW_NOISE_CAP, coarse_fit.DEPTH_NOISE_CAP)
-        sf, sd, share, more = coarse_fit.reestimate(
-            *pixels, 0.5, 0.01, *caps, self.cutoff, 2, 4, coarse_fit.NOISE_PIXELS, final
-        )
+        final, few = pose.copy(), coarse_fit.NOISE_PIXELS
+        sf, sd, share, more = coarse_fit.reestimate(*pixels, self.cutoff, few, final)
         if self._score(final) > 0.95 * self._score(pose):
             pose = final
         return Motion(pose, np.array([share * self.left, sf, sd, source, steps + more], float))
@@ -296,18 +293,11 @@ def score_poses(samples, n, poses, K):
     b_v, b_w = samples[MV], samples[W]
     one, half = np.float32(1.0), np.float32(0.5)
     for m in range(len(poses)):
-        P = poses[m].astype(np.float32)
-        r00, r01, r02, tx = P[0, 0], P[0, 1], P[0, 2], P[0, 3]
-        r10, r11, r12, ty = P[1, 0], P[1, 1], P[1, 2], P[1, 3]
-        r20, r21, r22, tz = P[2, 0], P[2, 1], P[2, 2], P[2, 3]
+        entries = kernels.pose_entries(poses[m].astype(np.float32))
         score = np.float32(0.0)
         for k in range(n):
-            z = b_z[k]
-            Zc = z * (r20 * b_x[k] + r21 * b_y[k] + r22) + tz
-            front = Zc > np.float32(1e-6)
-            i = one / (Zc if front else one)
-            ru = b_u[k] - (fx * (z * (r00 * b_x[k] + r01 * b_y[k] + r02) + tx) * i + cx)
-            rv = b_v[k] - (fy * (z * (r10 * b_x[k] + r11 * b_y[k] + r12) + ty) * i + cy)
+            a, b, _, front = kernels.see(b_x[k], b_y[k], b_z[k], entries)
+            ru, rv = b_u[k] - (fx * a + cx), b_v[k] - (fy * b + cy)
             r2 = ru * ru + rv * rv
             near = one / (one + np.float32(44.4) * r2)
             mid = one / (one + np.float32(1.2) * r2)

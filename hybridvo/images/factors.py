@@ -1,13 +1,9 @@
 """The images of a pair, and its two depth maps, as factors of its motion.
 
-Images: the residual of a weighted static pixel is ``I_curr(pi(T X)) - gain I_prev - offset``. Gain
-and offset follow the motion, so that the cost is one of the motion alone. Where the light changes
-over the image, smooth fields of both, bilinear between the nodes of a coarse grid, are put into the
-grey values of the previous image; gradients have no preferred sign within a cell.
-
-Depth maps: ``r = n . (T X - P)``, P and n point and normal of the current one where T X is seen.
-
-Both estimate their noise from the residuals, and count errors that neighbours share.
+Images: the residual of a weighted static pixel is ``I_curr(pi(T X)) - gain I_prev - offset``; where
+the light changes over the image, smooth fields of both are put into the grey values of the previous
+one. Depth maps: ``r = n . (T X - P)``, P and n point and normal of the current one where T X is
+seen. Both estimate their noise from the residuals, and count errors that neighbours share.
 """
 
 from __future__ import annotations
@@ -20,7 +16,7 @@ import numpy as np
 from scipy.optimize import nnls
 
 from hybridvo.calibration import EVEN_PARTS, UNEVEN_LIGHT
-from hybridvo.geometry import as_contiguous, points_at
+from hybridvo.geometry import as_contiguous, backproject
 from hybridvo.images import kernels
 from hybridvo.refinement.kernels import MAX_VALUE
 from hybridvo.refinement.pixels import typical
@@ -264,14 +260,11 @@ def parts_dispersion(scores: np.ndarray, model: np.ndarray) -> float:
 
 def node_shares(places: np.ndarray) -> np.ndarray:
     """(N, nodes) bilinear shares of the nodes in places (N, 2): rows and columns among them."""
-    corner = places.astype(np.intp)
-    v, u = (places - corner).T
-    nodes = (corner @ (COLUMNS, 1))[:, None] + (0, 1, COLUMNS, COLUMNS + 1)
-    out = np.zeros((len(places), ROWS * COLUMNS), np.float32)
-    out[np.arange(len(places))[:, None], nodes] = np.stack(
-        [(1 - v) * (1 - u), (1 - v) * u, v * (1 - u), v * u], axis=1
+    v, u = (
+        np.maximum(0, 1 - np.abs(place[:, None] - np.arange(n, dtype=np.float32)))
+        for place, n in zip(places.T.astype(np.float32), (ROWS, COLUMNS), strict=True)
     )
-    return out
+    return (v[:, :, None] * u[:, None]).reshape(len(places), -1)
 
 
 def light_fields(
@@ -330,7 +323,7 @@ class PlaneFactor:
         used = (z > 0) & np.isfinite(z) & (weight >= least)
         self.cells, self._grid = np.nonzero(used), used.shape  # rows and columns on the grid
         self.index = np.stack([rows[used], columns[used]], 1)  # (N, 2) the same in px
-        self.points = points_at(np.asarray(pair.prev.depth), pair.prev.camera, self.index)
+        self.points = backproject(np.asarray(pair.prev.depth), pair.prev.camera, self.index)
         self._weight, self._tiles = weight[used].astype(np.float64), Tiles(self._shape, self.index)
         self._K = np.array([curr.fx, curr.fy, curr.cx, curr.cy])
         self._depth = as_contiguous(np.asarray(pair.curr.depth))

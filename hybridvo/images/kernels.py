@@ -1,19 +1,12 @@
 """Numba kernels of images and depth maps: residuals and Jacobians of their pixels.
 
-Photometric, per pixel x of the previous image with grey value A, at a pose T (X' = T X,
-a = X'/Z', b = Y'/Z', i = 1/Z'):
-
-- residual r = B(pi(X')) - gain A - offset, B read by cubic convolution (Catmull-Rom): bilinear
-  reading blurs by an amount that depends on the place between the pixels (measured: twice the
-  error on clean images);
-- image gradient G of B at pi(X') from the gradient of A at x, carried over by the warp of a patch
-  of constant depth (inverse compositional, Baker and Matthews, IJCV 2004): the noise of a central
-  difference at x is independent of the noise of A at x, so noise alone moves nothing;
-- Jacobian of r: G^T diag(fx, fy) B_x with respect to the left perturbation (B_x as in
-  :mod:`hybridvo.refinement.kernels`), -A for the gain, -1 for the offset;
-- variance s^2 + sd^2 v_d (G^T q)^2, s the noise of the residual in grey levels, q = d pi(X') /
-  d log Z;
-- robust weight of Geman-McClure, (c^2 / (c^2 + d^2))^2 with d^2 = r^2 / variance.
+- Photometric residual r = B(pi(X')) - gain A - offset, A and B grey values of the previous and the
+  current image, B read by cubic convolution: bilinear reading blurs by an amount that depends on
+  the place between the pixels (measured: twice the error on clean images);
+- gradient of B at pi(X') from that of A at x, carried over by the warp of a patch of constant depth
+  (inverse compositional, Baker and Matthews, IJCV 2004): its noise is independent of that of A;
+- rest as in :mod:`hybridvo.refinement.kernels`; the variance is s^2 + sd^2 v_d (G^T q)^2, s the
+  noise of the residual in grey levels.
 """
 
 from __future__ import annotations
@@ -67,43 +60,31 @@ def strength_row(v, grey, depth, weights, least, out):
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
-def select_pixels(grey, depth, weights, least, cell, per_cell, index):
-    """The ``per_cell`` usable pixels of strongest gradient in every cell of ``cell`` px.
-
-    ``index`` (N, 2) int32 gets (v, u); returns how many. Usable: weight of at least ``least``,
-    valid depth, off the border.
+def select_pixels(grey, depth, weights, least, cell, per_cell):
+    """(N, 2) int32 rows and columns of the ``per_cell`` usable pixels of strongest gradient in each
+    cell of ``cell`` px. Usable: weight of at least ``least``, valid depth, off the border.
     """
-    H, width = grey.shape
-    cells = (width - 2 * MARGIN + cell - 1) // cell
-    best = np.empty((cells, per_cell), np.float32)
-    place = np.empty((cells, per_cell, 2), np.int32)
-    row = np.empty(width, np.float32)
-    last = per_cell - 1
-    n = 0
+    (H, width), n = grey.shape, 0
+    strength = np.zeros((H, width), np.float32)
+    for v in range(MARGIN, H - MARGIN):
+        strength_row(v, grey, depth, weights, least, strength[v])
+    index = np.empty(((H // cell + 1) * (width // cell + 1) * per_cell, 2), np.int32)
     for v0 in range(MARGIN, H - MARGIN, cell):
-        best[:] = ZERO
-        for v in range(v0, min(v0 + cell, H - MARGIN)):
-            strength_row(v, grey, depth, weights, least, row)
-            for c in range(cells):
-                u0 = MARGIN + c * cell
-                for u in range(u0, min(u0 + cell, width - MARGIN)):
-                    strength = row[u]
-                    if not strength > best[c, last]:
+        for u0 in range(MARGIN, width - MARGIN, cell):
+            first, low = n, ZERO
+            for v in range(v0, min(v0 + cell, H)):
+                for u in range(u0, min(u0 + cell, width)):
+                    if not strength[v, u] > low:
                         continue
-                    k = last
-                    while k > 0 and best[c, k - 1] < strength:
-                        best[c, k] = best[c, k - 1]
-                        place[c, k] = place[c, k - 1]
+                    k = min(n, first + per_cell - 1)
+                    while k > first and strength[index[k - 1, 0], index[k - 1, 1]] < strength[v, u]:
+                        index[k] = index[k - 1]
                         k -= 1
-                    best[c, k] = strength
-                    place[c, k, 0] = v
-                    place[c, k, 1] = u
-        for c in range(cells):
-            for k in range(per_cell):
-                if best[c, k] > ZERO and n < index.shape[0]:
-                    index[n] = place[c, k]
-                    n += 1
-    return n
+                    index[k] = v, u
+                    n = min(n + 1, first + per_cell)
+                    if n == first + per_cell:
+                        low = strength[index[n - 1, 0], index[n - 1, 1]]
+    return index[:n]
 
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)

@@ -1,12 +1,8 @@
 """The motion of a pair by its images: one that the flow found made sharper, or one without flow.
 
-With flow its covariance becomes a prior of Student's form around its motion, and the 6x6 normal
-equations of flow, images and depth maps add up. The motion of the flow stays where the images do
-not match along the motion, or lead outside of what the flow allows.
-
-Without flow images and depth maps are followed coarse to fine. Where the motion leaves no region of
-the image unexplained, and the parts of the image agree about it, nothing else moves: it is the
-answer. Else something moves, or the images are too far apart: the flow has to be asked.
+With flow its covariance becomes a prior around its motion, and the 6x6 normal equations of flow,
+images and depth maps add up. Without flow images and depth maps are followed coarse to fine; where
+a region is left unexplained, or the parts of the image disagree, the flow has to be asked.
 """
 
 from __future__ import annotations
@@ -18,7 +14,7 @@ import cv2
 import numpy as np
 
 from hybridvo.calibration import DIRECT_RIGHT
-from hybridvo.geometry import as_contiguous, points_at, pose_matrix, projection_rows
+from hybridvo.geometry import as_contiguous, backproject, pose_matrix, projection_rows
 from hybridvo.images.factors import MIN_POINTS, ImageFactor, PlaneFactor
 from hybridvo.images.kernels import select_pixels
 from hybridvo.refinement.solver import Factor, PriorFactor, gauss_newton, positive_inverse
@@ -142,7 +138,7 @@ def _refused(pose: RelativePose, report: PhotometricReport) -> RelativePose:
 def _spread_px(pair: FramePair, index: np.ndarray, covariance: np.ndarray) -> float:
     """How far a covariance (6, 6) lets the pixels move in the image, root mean square, px."""
     few = index[:: max(1, len(index) // 200)]
-    points = points_at(np.asarray(pair.prev.depth), pair.prev.camera, few)
+    points = backproject(np.asarray(pair.prev.depth), pair.prev.camera, few)
     J = np.stack(projection_rows(points, pair.curr.camera))
     return float(np.sqrt(np.einsum("cnp,pq,cnq->", J, covariance, J) / len(few)))
 
@@ -268,15 +264,11 @@ def choose_pixels(
     grey: np.ndarray, depth: np.ndarray, weights: np.ndarray, count: int
 ) -> np.ndarray:
     """(N, 2) int32 rows and columns of the pixels to use: strong gradients, evenly spread."""
-    height, width = grey.shape
-    cell = max(2, round(np.sqrt(height * width * PER_CELL / count)))
-    cells = (height // cell + 1) * (width // cell + 1)
-    index = np.empty((cells * PER_CELL, 2), np.int32)
-    n = select_pixels(
-        grey, as_contiguous(depth), as_contiguous(weights, np.float32),
-        np.float32(MIN_WEIGHT), cell, PER_CELL, index,
-    )  # fmt: skip
-    return index[:n]
+    cell = max(2, round(np.sqrt(grey.size * PER_CELL / count)))
+    weights = as_contiguous(weights, np.float32)
+    return select_pixels(
+        grey, as_contiguous(depth), weights, np.float32(MIN_WEIGHT), cell, PER_CELL
+    )
 
 
 def reduced(frame: Frame, by: int) -> Frame:

@@ -12,7 +12,7 @@ from typing import Self
 import torch
 
 from hybridvo.errors import InputError
-from hybridvo.refinement.batch import checked_batch
+from hybridvo.refinement.torch_factors import checked_batch
 from hybridvo.types import FramePair, PairBatch
 
 NETWORK_SIZE = (128, 256)
@@ -86,8 +86,8 @@ def scaled_intrinsics(
 ) -> torch.Tensor:
     """(B, 3, 3) intrinsics after pixel coordinates x became scale * x + offset, of both axes."""
     out = K.clone()
-    out[:, 0, 0], out[:, 1, 1] = (K.diagonal(dim1=1, dim2=2)[:, :2] * scale).unbind(1)
-    out[:, :2, 2] = scale * K[:, :2, 2] + offset
+    out[:, :2] *= torch.as_tensor(scale).to(K).reshape(-1, 1)
+    out[:, :2, 2] += offset
     return out
 
 
@@ -102,9 +102,6 @@ def assemble_inputs(
     Missing or damaged values (no flow, no depth, NaN, inf, depth <= 0, masked pixels) become 0 and
     are marked in ``valid``. Float32 tensors on the CPU; for a batch, its type and device.
     ``is_aligned``: the current depth lies on the previous grid already, as in the paper's samples.
-
-    Raises:
-        InputError: another type, or shapes that do not fit each other.
     """
     if isinstance(pair, FramePair):
         pair = PairBatch.from_pairs([pair])

@@ -21,8 +21,8 @@ from hybridvo.network.inputs import NetworkInputs
 from hybridvo.options import option_group
 
 INPUT_LIMIT = 100.0
-"""Inputs are clipped to this magnitude (20 000 px of flow, a depth of 1 cm): no finite input can
-then overflow the activations, and no measurement that could be meant is touched."""
+"""Inputs are clipped to this magnitude (20 000 px of flow, a depth of 1 cm): no finite one can then
+overflow the activations."""
 
 Kind = Literal["pwvo", "vonet", "vonet-attention"]
 KINDS = get_args(Kind)
@@ -30,30 +30,20 @@ KINDS = get_args(Kind)
 
 @option_group
 class NetworkOptions:
-    """What decides the shapes of a network's weights, and how it is used.
+    """What decides the shapes of a network's weights, and how it is used."""
 
-    Args:
-        kind: ``pwvo`` (also PWVO naive and the pixel-wise network), ``vonet``, ``vonet-attention``.
-        width: factor on all channel counts; 0.5 has about a quarter of the parameters.
-        decoders: 1, shared by both heads (published code), or 2 (the paper's text).
-        head_stride: 1 = predictions at the resolution of the input, 2 = at half of it.
-        uncertainty: whether the pixel-wise network has an uncertainty head.
-        scale_free: inputs without units, see :mod:`hybridvo.network.normalization`.
-        passes: how often a scale-free network is used: each later pass looks at what the motion
-            that the trusted pixels of the one before agree on leaves unexplained.
-        input_stride: the network reads every n-th pixel of its inputs.
-        later_quantile: of the lengths of the unexplained flow, scales the inputs of a later pass;
-            0.4 in the first one. After a good start what is left of the static scene is short.
-    """
-
-    kind: Kind = "pwvo"
-    width: Annotated[float, Field(gt=0, le=4)] = 1.0
-    decoders: Literal[1, 2] = 1
-    head_stride: Literal[1, 2] = 1
+    kind: Kind = "pwvo"  # also of PWVO naive and the pixel-wise network
+    width: Annotated[float, Field(gt=0, le=4)] = 1.0  # factor on all channel counts
+    decoders: Literal[1, 2] = 1  # shared by both heads (published code), or two (the paper's text)
+    head_stride: Literal[1, 2] = 1  # predictions at the resolution of the input, or at half of it
     uncertainty: bool = True
-    scale_free: bool = False
+    scale_free: bool = False  # inputs without units, see hybridvo.network.prediction
+    # how often a scale-free network is used: each later pass looks at what the motion that the
+    # trusted pixels of the one before agree on leaves unexplained
     passes: Annotated[int, Field(ge=1, le=8)] = 1
-    input_stride: Literal[1, 2, 4] = 1
+    input_stride: Literal[1, 2, 4] = 1  # the network reads every n-th pixel of its inputs
+    # of the lengths of the unexplained flow, scales the inputs of a later pass, as 0.4 in the first
+    # one: after a good start what is left of the static scene is short
     later_quantile: Annotated[float, Field(gt=0, le=0.5)] = 0.4
 
     def __post_init__(self) -> None:
@@ -71,24 +61,22 @@ def scaled(channels: int, width: float) -> int:
 class ResidualBlock(nn.Module):
     """Two 3x3 convolutions with a shortcut and ELU.
 
-    ``inner_activation``: ELU before the sum (PWVO has it, the VONet baselines do not); ``project``:
-    a 1x1 convolution as shortcut even where the shapes agree.
+    ``inner``: ELU before the sum (PWVO has it, the VONet baselines do not); ``project``: a 1x1
+    convolution as shortcut even where the shapes agree.
     """
 
-    def __init__(
-        self, before: int, after: int, stride: int, inner_activation: bool, project: bool = False
-    ) -> None:
+    def __init__(self, before: int, after: int, stride: int, inner: bool, project: bool = False):
         super().__init__()
         self.conv1 = nn.Conv2d(before, after, 3, stride, 1)
         self.conv2 = nn.Conv2d(after, after, 3, 1, 1)
-        self.inner_activation, self.stride = inner_activation, stride
+        self.inner, self.stride = inner, stride
         project = project or stride != 1 or before != after
         self.shortcut = nn.Conv2d(before, after, 1) if project else nn.Identity()
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """(B, before, h, w) -> (B, after, ceil(h / stride), ceil(w / stride))."""
         y = self.conv2(F.elu(self.conv1(x), inplace=True))
-        if self.inner_activation:
+        if self.inner:
             y = F.elu(y, inplace=True)
         # not a 1x1 convolution of stride 2: oneDNN's gradient of it writes past its memory where
         # there are few channels in channels-last order
@@ -117,7 +105,7 @@ class InputBranches(nn.Module):
 class Encoder(nn.Module):
     """Stem of three convolutions and five stages of residual blocks, each halving the image."""
 
-    def __init__(self, in_channels: int, width: float, inner_activation: bool = True) -> None:
+    def __init__(self, in_channels: int, width: float, inner: bool = True) -> None:
         super().__init__()
         stem = scaled(32, width)
         strides = ((in_channels, 2), (stem, 1), (stem, 1))
@@ -125,15 +113,12 @@ class Encoder(nn.Module):
         self.channels = tuple(scaled(c, width) for c in (64, 128, 128, 256, 256))
         sizes = zip((3, 4, 6, 7, 3), pairwise((stem, *self.channels)), strict=True)
         for k, (count, (before, after)) in enumerate(sizes, start=1):
-            blocks = [ResidualBlock(before, after, 2, inner_activation)]
-            blocks += [ResidualBlock(after, after, 1, inner_activation) for _ in range(count - 1)]
+            blocks = [ResidualBlock(before, after, 2, inner)]
+            blocks += [ResidualBlock(after, after, 1, inner) for _ in range(count - 1)]
             self.add_module(f"layer{k}", nn.Sequential(*blocks))
 
     def forward(self, x: torch.Tensor) -> list[torch.Tensor]:
-        """(B, C, h, w) -> features of the stem and of layer1 to layer5, finest first.
-
-        The stem has half the resolution of the input, the last feature (the paper's psi) a 64th.
-        """
+        """Features of the stem, at half the resolution, to layer5, the paper's psi, at a 64th."""
         for convolution in self.stem:
             x = F.elu(convolution(x), inplace=True)
         features = [x]
@@ -153,7 +138,7 @@ class SelfAttention(nn.Module):
         self.gain = nn.Parameter(torch.zeros(()))
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """(B, C, h, w) -> (B, C, h, w)."""
+        """(B, C, h, w) -> the same."""
         query, key, value = (f(x).flatten(2) for f in (self.query, self.key, self.value))
         attention = torch.softmax(query.transpose(1, 2) @ key, dim=-1)
         return x + self.gain * (value @ attention.transpose(1, 2)).view_as(x)
@@ -161,22 +146,27 @@ class SelfAttention(nn.Module):
 
 @contextlib.contextmanager
 def plain_torch() -> Iterator[None]:
-    """Inference in float32 on the CPU, whatever the caller set for networks of its own."""
+    """Inference in float32 on the CPU, whatever the caller set for networks of its own.
+
+    On one thread: several wait for each other on a single pair.
+    """
     # entering a default device costs every operation some microseconds
     elsewhere = torch.get_default_device().type != "cpu"
     device = torch.device("cpu") if elsewhere else contextlib.nullcontext()
-    with torch.inference_mode(), torch.autocast("cpu", enabled=False), device:
-        yield
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with torch.inference_mode(), torch.autocast("cpu", enabled=False), device:
+            yield
+    finally:
+        torch.set_num_threads(before)
 
 
-def initialize(network: nn.Module, uniform: tuple[nn.Module, ...]) -> None:
-    """Glorot-normal weights (uniform inside ``uniform``, the heads) by torch's global generator."""
-    heads = {m for head in uniform for m in head.modules()}
-    for module in network.modules():
+def initialize(network: nn.Module) -> None:
+    """Glorot-normal weights, uniform ones in the heads, by torch's global generator."""
+    for name, module in network.named_modules():
         if isinstance(module, nn.Conv2d | nn.ConvTranspose2d | nn.Linear):
-            if module.weight.is_meta:  # no memory to fill, and torch would load its compiler for it
-                continue
-            fill = nn.init.xavier_uniform_ if module in heads else nn.init.xavier_normal_
-            fill(module.weight)
-            if module.bias is not None:
-                nn.init.zeros_(module.bias)
+            is_head = name.startswith("head_")
+            (nn.init.xavier_uniform_ if is_head else nn.init.xavier_normal_)(module.weight)
+            assert module.bias is not None
+            nn.init.zeros_(module.bias)

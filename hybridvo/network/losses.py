@@ -1,10 +1,9 @@
 """Losses of PWVO and its baselines (paper, sections 3.2.2 and 3.4) in log form, s = log U.
 
-Four terms, each plain or weighed by uncertainty: rotation L^R and translation L^T, every pixel must
-name the pair's motion; ego flow L^F and depth L^D, the *selected* motion, applied to the true
-depth, must reproduce what the camera motion alone causes. They are those of the published code, but
-pixels without depth are left out, a point that the motion brings behind the camera is charged, and
-s may have a coarser grid than the flow.
+Rotation L^R and translation L^T: every pixel must name the pair's motion. Ego flow L^F and depth
+L^D: the *selected* motion, applied to the true depth, must reproduce what the camera motion causes.
+They are those of the published code, but pixels without depth are left out, a point that the motion
+brings behind the camera is charged, and s may have a coarser grid than the flow.
 """
 
 from __future__ import annotations
@@ -21,33 +20,27 @@ from hybridvo.options import Positive, option_group
 from hybridvo.results import PixelwisePrediction
 from hybridvo.torch_geometry import pixel_grid, reproject
 
+Scales = torch.Tensor | None
 MAX_EXPONENT = 30.0
 """exp(-s) goes on as a straight line beyond this."""
 
 
 @option_group
 class LossOptions:
-    """Which terms are on, and how.
+    """Which terms are on, and how."""
 
-    Args:
-        pose_uncertainty: weigh L^R and L^T by U^R and U^T (distribution learning).
-        flow_uncertainty, depth_uncertainty: weigh L^F and L^D by U^F and U^D, which are exp of 0.1
-            and 0.25 times s, as published.
-        translation_form: ``direction`` (the paper's: direction and length) or ``laplace`` (L1 of
-            each component in metres with its own s, so that exp(s) is in metres).
-        flow_limit_px: flow errors of a component at or above this do not count.
-        direction_floor: metres; below this length of the translation its direction fades out.
-            1e-6 as published; larger values calm the gradient near zero translation.
-    """
-
-    pose_uncertainty: bool = True
+    pose_uncertainty: bool = True  # weigh L^R and L^T by U^R and U^T (distribution learning)
     flow: bool = True
     depth: bool = True
-    flow_uncertainty: bool = True
-    depth_uncertainty: bool = True
+    flow_uncertainty: bool = True  # weigh L^F by U^F = exp(0.1 s), as published
+    depth_uncertainty: bool = True  # weigh L^D by U^D = exp(0.25 s)
     flow_weight: Annotated[float, Field(ge=0)] = 1.0
+    # direction (the paper's: direction and length), or laplace: L1 of each component in metres with
+    # its own s, so that exp(s) is in metres
     translation_form: Literal["direction", "laplace"] = "direction"
-    flow_limit_px: Positive = 20.0
+    flow_limit_px: Positive = 20.0  # errors of a component at or above this do not count
+    # metres; below this length of the translation its direction fades out: larger values than the
+    # published one calm the gradient near zero translation
     direction_floor: Positive = 1e-6
 
     @property
@@ -69,13 +62,7 @@ class LossTargets(TensorBatch):
     K_curr: torch.Tensor
 
     def reconstruct(self, T: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Flow and depth that a motion (B, 4, 4) causes (paper, equation 8), differentiable.
-
-        Returns:
-            (B, 2, h, w) ego flow pi(K_curr, T D K_prev^-1 x) - x in px; (B, h, w) depth of the
-            moved point, below ``MIN_DEPTH`` behind the camera, 1 where ``depth_prev`` is invalid;
-            (B, h, w) bool: valid and in front. Elsewhere the flow is finite and means nothing.
-        """
+        """Ego flow (B, 2, h, w), depth and validity (B, h, w) by a motion, as of ``reproject``."""
         depth = self.depth_prev
         pixels, valid, z = reproject(depth, T, self.K_prev, self.K_curr, MIN_DEPTH)
         flow = pixels - pixel_grid(depth.shape[1], depth.shape[2], depth)
@@ -88,22 +75,19 @@ def total_loss(
     options: LossOptions,
     T_curr_prev: torch.Tensor,
 ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-    """Weighted sum of the terms that are on; L^F and L^D are those of the selected motion.
+    """Weighted sum of the terms that are on, L^F and L^D of the selected motion (B, 4, 4).
 
-    Returns:
-        Scalar loss, and its unweighted terms without gradient under ``rotation``, ``translation``,
-        ``flow`` and ``depth``.
+    Also these terms, unweighted and without gradient: rotation, translation, flow, depth.
     """
     s = output.log_scale
     parts = _pose_losses(output.motion, targets, s if options.pose_uncertainty else None, options)
     flow, depth, defined = targets.reconstruct(T_curr_prev)
-    known = torch.isfinite(targets.depth_prev) & (targets.depth_prev > 0)
     if options.flow:
-        s_flow, limit = s if options.flow_uncertainty else None, options.flow_limit_px
-        parts["flow"] = _flow_loss(flow, targets.ego_flow, defined, known, s_flow, limit)
+        s_flow = s if options.flow_uncertainty else None
+        parts["flow"] = _flow_loss(flow, defined, targets, s_flow, options.flow_limit_px)
     if options.depth:
         s_depth = s if options.depth_uncertainty else None
-        parts["depth"] = _depth_loss(depth, targets.depth_curr, known, s_depth)
+        parts["depth"] = _depth_loss(depth, targets, s_depth)
     loss = sum((options.flow_weight if k == "flow" else 1.0) * x for k, x in parts.items())
     return torch.as_tensor(loss), {name: part.detach() for name, part in parts.items()}
 
@@ -120,7 +104,7 @@ def _norm(x: torch.Tensor) -> torch.Tensor:
 
 
 def _pose_losses(
-    motion: torch.Tensor, targets: LossTargets, s: torch.Tensor | None, options: LossOptions
+    motion: torch.Tensor, targets: LossTargets, s: Scales, options: LossOptions
 ) -> dict[str, torch.Tensor]:
     """L^R and L^T of maps (B, 6, h, w), weighed by s unless it is None; as published."""
     true = targets.motion[:, :, None, None]
@@ -140,16 +124,16 @@ def _pose_losses(
     return {"rotation": errors[0].mean(), "translation": errors[1].mean()}
 
 
+def _has_depth(targets: LossTargets) -> torch.Tensor:
+    return torch.isfinite(targets.depth_prev) & (targets.depth_prev > 0)
+
+
 def _flow_loss(
-    flow: torch.Tensor,
-    target: torch.Tensor,
-    defined: torch.Tensor,
-    known: torch.Tensor,
-    s: torch.Tensor | None,
-    limit_px: float,
+    flow: torch.Tensor, defined: torch.Tensor, targets: LossTargets, s: Scales, limit_px: float
 ) -> torch.Tensor:
     """L^F; with s (B, 6, ..) weighed by 1 / U^F = exp(-0.1 s)."""
-    known = known & torch.isfinite(target).all(dim=1)
+    target = targets.ego_flow
+    known = _has_depth(targets) & torch.isfinite(target).all(dim=1)
     error = (flow - torch.where(known[:, None], target, 0.0)).abs()
     counts = (defined & known)[:, None] & (error < limit_px)
     error = torch.where(counts, error, 0.0) + (known & ~defined)[:, None] * limit_px
@@ -161,14 +145,10 @@ def _flow_loss(
     return _weighed(torch.stack([a + b, a + b, a + b, a, b, a + b], dim=1), known, 0.1 * s, share)
 
 
-def _depth_loss(
-    depth: torch.Tensor, target: torch.Tensor, known: torch.Tensor, s: torch.Tensor | None
-) -> torch.Tensor:
-    """L^D of inverse depths; with s (B, 6, ..) weighed by 1 / U^D = exp(-0.25 s).
-
-    Only what changes a depth counts there: rx, ry, tz.
-    """
-    known = known & torch.isfinite(target) & (target >= MIN_DEPTH)
+def _depth_loss(depth: torch.Tensor, targets: LossTargets, s: Scales) -> torch.Tensor:
+    """L^D of inverse depths; with s (B, 6, ..) weighed by 1 / U^D = exp(-0.25 s)."""
+    target = targets.depth_curr
+    known = _has_depth(targets) & torch.isfinite(target) & (target >= MIN_DEPTH)
     target = torch.where(known, target, 1.0)
     front = depth >= MIN_DEPTH
     exact = 1.0 / target - 1.0 / torch.where(front, depth, 1.0)
@@ -177,6 +157,7 @@ def _depth_loss(
     error = torch.where(known, error, 0.0)
     if s is None:
         return error.sum() / known.sum().clamp(min=1)
+    # only rx, ry and tz change a depth
     return _weighed(error[:, None], known, 0.25 * s[:, [0, 1, 5]], 0.5)
 
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import functools
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,19 +12,15 @@ from hybridvo.errors import CheckpointError, InputError
 SELECTION = {
     "pwvo": "softmax",
     "pwvo-paper": "softmax",
-    "pwvo-uncertain": "mean",
-    "pwvo-naive": "mean",
-    "pixelwise": "mean",
-    "vonet": "mean",
-    "vonet-attention": "mean",
+    **dict.fromkeys(("pwvo-uncertain", "pwvo-naive", "pixelwise"), "mean"),
+    **dict.fromkeys(("vonet", "vonet-attention"), "mean"),
 }
-"""Methods that are a network alone, and how one motion is selected from its pixels, if any."""
+"""Methods that are a network alone, and how one motion is selected from its pixels."""
 
 
 def load_weights(name_or_path: str | Path) -> tuple[Any, dict[str, Any]]:
     """Network of pretrained or other weights and its card; see ``weights.read_network``."""
-    from hybridvo.network.layers import NetworkOptions
-    from hybridvo.network.pwvo import build_network
+    from hybridvo.network.pwvo import NetworkOptions, build_network
     from hybridvo.network.selector_net import SelectorNetwork, SelectorNetworkOptions
     from hybridvo.network.weights import read_network
 
@@ -38,29 +33,19 @@ def load_weights(name_or_path: str | Path) -> tuple[Any, dict[str, Any]]:
 
 
 class Models:
-    """Networks by name, read on first use; ``weights``: files instead of the pretrained ones.
-
-    Raises:
-        InputError: a device, a network or a file that is not there.
-    """
+    """Networks by name, read on first use; ``weights``: files instead of the pretrained ones."""
 
     def __init__(
         self, device: str = "cpu", weights: Mapping[str, str | Path] | None = None
     ) -> None:
-        self.device = torch_device(device)
-        self.weights = {name: Path(file) for name, file in (weights or {}).items()}
-        known = ("selector", *SELECTION)
-        for name, path in self.weights.items():
-            if name not in known or not path.is_file():
-                expected = f"NAME=FILE with {' or '.join(known)} and a file that exists"
-                raise InputError(f"weights: expected {expected}, got {name}={path}.")
+        self.device, self.weights = torch_device(device), dict(weights or {})
         self._networks: dict[str, Any] = {}
 
     def path(self, name: str) -> Path:
         """File of the weights of a network."""
         from hybridvo.network.weights import weights_file
 
-        return self.weights.get(name) or weights_file(name)
+        return weights_file(self.weights.get(name, name))
 
     def network(self, name: str) -> Any:
         """A network, in the form that is fastest on its device."""
@@ -77,22 +62,9 @@ class Models:
 
 
 @functools.cache
-def default_models(device: str = "cpu") -> Models:
-    """The pretrained networks, shared by all estimates of a process."""
-    return Models(device)
-
-
-@contextlib.contextmanager
-def one_thread() -> Iterator[None]:
-    """Run torch's CPU kernels on one thread: several wait for each other on a single pair."""
-    import torch
-
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
+def default_models(device: str = "cpu", selector: str = "selector") -> Models:
+    """The pretrained networks, or another selector, shared by all estimates of a process."""
+    return Models(device, {"selector": selector})
 
 
 def torch_device(device: str) -> str:

@@ -1,28 +1,146 @@
-"""The paper's networks as estimators: a pair in, the selected motion out, with its covariance."""
+"""A network used: pairs in, its prediction out, and what the methods take from it.
+
+Inputs are divided by the pair's own scales, outputs multiplied by them: one network for a desk and
+a street. What a first motion leaves unexplained looks, over its own scale, like any other pair: the
+network refines its own answer in several passes.
+"""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import nn
 
-from hybridvo.network.inputs import assemble_inputs
-from hybridvo.network.layers import plain_torch
-from hybridvo.network.normalization import predict
+from hybridvo.network.inputs import MIN_DEPTH, NetworkInputs, assemble_inputs, pinhole
+from hybridvo.network.layers import NetworkOptions, plain_torch
 from hybridvo.network.selection import fitted_motion, pixel_weights, select_pose
 from hybridvo.refinement.pixels import too_few
-from hybridvo.results import MotionPrediction, Reason, RelativePose, Status
-from hybridvo.torch_geometry import euler_transform
+from hybridvo.results import (
+    MotionPrediction,
+    PixelwisePrediction,
+    Reason,
+    RelativePose,
+    Status,
+)
+from hybridvo.torch_geometry import euler_motion, euler_transform
 from hybridvo.types import FramePair
 
+FLOW_SCALE_PX, OUTPUT_SCALE = 200.0, 0.01
+"""Without scales of the pair, flow is divided by the first, and raw outputs times the second are
+degrees and metres, as published."""
+MIN_MOTION = 5e-5
+"""rad; flow smaller than this is not amplified any further: at 2000 px of focal length 0.1 px."""
+MIN_NEARNESS = 1 / 50
+"""1 / metres; where all is farther, flow tells no translation, and a camera still moves by metres.
+"""
+LIMIT = 10.0
+"""Magnitude that squashed values approach; values of the order of one stay as they are."""
 STATIC_AT, STATIC_SLOPE = 1.64, 1.63
 """Where the probability to be static is one half, in units of s above the trusted pixels', and the
 slope of its logit: logistic regression over development pairs, both kinds of pixels weighing alike.
 Over 300 pairs (wide, crowd, rendered) stated and observed ratios differ by at most 0.09."""
 MIN_PIXELS = 64
 """Pixels of the network's input with flow and depth below which it is not asked."""
+
+
+class MotionScale(NamedTuple):
+    """Scales (B, 6) of rx, ry, rz (degrees), tx, ty, tz (metres), and the motion taken out."""
+
+    factor: torch.Tensor
+    start: torch.Tensor
+
+    def motion(self, raw: torch.Tensor) -> torch.Tensor:
+        """Motions of a network's raw outputs (B, 6, h, w): the sum of two small ones."""
+        factor, start = (x.to(raw.dtype)[:, :, None, None] for x in self)
+        return start + factor * raw
+
+
+def predict(
+    network: nn.Module, inputs: NetworkInputs, selection: str = "softmax"
+) -> PixelwisePrediction:
+    """Output of the last of the network's passes; ``selection``: of the start of the next one."""
+    passes: int = network.options.passes  # type: ignore[union-attr, assignment]
+    return network(inputs, first_motions(network, inputs, selection, passes - 1))
+
+
+@torch.no_grad()
+def first_motions(
+    network: nn.Module, inputs: NetworkInputs, selection: str, passes: int
+) -> torch.Tensor | None:
+    """(B, 4, 4) motions after a number of passes, without gradient; None for no pass at all."""
+    T = None
+    for _ in range(passes):
+        T = fitted_motion(network(inputs, T), inputs, selection)
+    return T
+
+
+def normalize(
+    inputs: NetworkInputs, options: NetworkOptions, T_start: torch.Tensor | None = None
+) -> tuple[NetworkInputs, MotionScale]:
+    """What a network with these options looks at, and the scale of its outputs.
+
+    Without units: a first motion (B, 4, 4) is taken out, and what is left divided by each pair's
+    scales. ``flow`` becomes what the motion leaves unexplained, over the focal length and its own
+    typical length m; ``inverse_depth[:, 0]`` is over that of the near things (pixels
+    without depth count as infinitely far), ``inverse_depth[:, 1]`` what the second depth leaves
+    unexplained, in log depth over m (0 where either is missing); all squashed at 10, finite for any
+    input. The scales are m as an angle, and m times the depth of the near things.
+    """
+    inputs = inputs.subsample(options.input_stride)
+    if not options.scale_free:
+        factor = torch.full((len(inputs), 6), OUTPUT_SCALE, device=inputs.flow.device)
+        inputs = replace(inputs, flow=inputs.flow / FLOW_SCALE_PX)
+        return inputs, MotionScale(factor, torch.zeros_like(factor))
+    inverse = torch.nan_to_num(inputs.inverse_depth, 0.0, 0.0, 0.0)
+    flow = torch.nan_to_num(inputs.flow, 0.0, 0.0, 0.0)
+    both = (inverse > 0).all(dim=1, keepdim=True)
+    change = -torch.where(both, inverse, 1.0).log().diff(dim=1)
+    start = flow.new_zeros(len(inputs), 6)
+    if T_start is not None:
+        T_start = T_start.to(flow.dtype)
+        start = euler_motion(T_start)
+        ego, log_ratio = _ego_motion(inputs, inverse[:, 0], T_start)
+        # No flow was measured where it is exactly zero in both components and the pixel is invalid.
+        seen = inputs.valid[:, None] | (flow != 0).any(dim=1, keepdim=True)
+        flow, change = torch.where(seen, flow - ego, flow), change - log_ratio
+    angle = flow / pinhole(inputs.K_prev)[0]
+    length = (angle.square().sum(dim=1) + 1e-20).sqrt()
+    # below one half: movers on half of the image do not set the scale of what is left of the scene
+    first, later = _quantiles(length, inputs.valid, (0.4, options.later_quantile))
+    motion = torch.where((start != 0).any(dim=1), later, first).clamp(MIN_MOTION, 1.0)
+    # near things tell the translation, and set its scale
+    (nearness,) = _quantiles(inverse[:, 0], inputs.valid & (inverse[:, 0] > 0), (0.9,))
+    nearness = nearness.clamp(MIN_NEARNESS, 1e3)
+    m, near = (x[:, None, None, None] for x in (motion, nearness))
+    depth = torch.cat([inverse[:, :1] / near, torch.where(both, change / m, 0.0)], dim=1)
+    factor = torch.stack([torch.rad2deg(motion), motion / nearness], dim=1)
+    scale = MotionScale(factor.repeat_interleave(3, dim=1), start)
+    flow, depth = (x / (1 + x.abs() / LIMIT) for x in (angle / m, depth))
+    return replace(inputs, flow=flow, inverse_depth=depth), scale
+
+
+def _ego_motion(
+    inputs: NetworkInputs, inverse: torch.Tensor, T: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """((B, 2, h, w) px, (B, 1, h, w)) flow and change of log depth; zero behind the camera."""
+    # Over its depth, a point is ray + translation * inverse depth: finite for the farthest.
+    rays, near = inputs.rays.flatten(2), inverse.flatten(1)[:, None]
+    moved = T[:, :3, :2] @ rays + T[:, :3, 2:3] + T[:, :3, 3:] * near
+    moved = moved.unflatten(2, inverse.shape[1:])
+    front = moved[:, 2:] > MIN_DEPTH * inverse[:, None].clamp(min=1e-3)
+    z = torch.where(front, moved[:, 2:], 1.0)
+    focal, centre = pinhole(inputs.K_curr)
+    flow = focal * moved[:, :2] / z + centre - inputs.pixels
+    return torch.where(front, flow, 0.0), torch.where(front, z.log(), 0.0)
+
+
+def _quantiles(x: torch.Tensor, mask: torch.Tensor, q: tuple[float, ...]) -> torch.Tensor:
+    """(len(q), B) quantiles of a (B, h, w) map over a mask; 1 where that is empty."""
+    kept = torch.where(mask, x, torch.nan)[..., ::2, ::2]  # enough for a scale
+    return torch.nanquantile(kept.flatten(1), kept.new_tensor(q), dim=1).nan_to_num(1.0, 1.0, 1.0)
 
 
 def static_probability(log_scale: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
@@ -43,16 +161,13 @@ def propose_motion(network: nn.Module, pair: FramePair) -> MotionPrediction | No
             return None
         T = fitted_motion(maps, inputs)[0].double().numpy()
         valid = inputs.on_grid_of(maps.log_scale).valid
-        static = static_probability(maps.log_scale, valid)[0].numpy()
-    finite = np.isfinite(T).all() and np.isfinite(static).all()
-    return MotionPrediction(T, static) if finite else None
+        return MotionPrediction(T, static_probability(maps.log_scale, valid)[0].numpy())
 
 
 def estimate_by_network(pair: FramePair, how: str, network: nn.Module) -> RelativePose:
     """Camera motion of one pair by a network and a selection of the paper, without any refinement.
 
-    The covariance is diagonal: of a Laplace variable with the scales that the selected pixels state
-    (2 U^2). Bad data give a failed status.
+    Its covariance is diagonal: 2 U^2, of a Laplace variable with the scales that are stated.
     """
     if pair.flow is None:
         return RelativePose.failed(Reason.NO_FLOW, "no optical flow for this pair")
@@ -70,9 +185,6 @@ def estimate_by_network(pair: FramePair, how: str, network: nn.Module) -> Relati
             # the scales go the way of the values: same pixels, same weights
             stated = select_pose(replace(maps, motion=maps.log_scale.exp()), how)
             U = np.maximum(stated[0].double().numpy(), 1e-4)  # half-precision knows no better
-    if not (np.isfinite(T).all() and np.isfinite(U).all()):
-        reason = Reason.DEGENERATE_GEOMETRY, "the network's answer is not finite"
-        return RelativePose.failed(*reason)
     status = Status()
     if U[:3].max() > 2.0:  # degrees: larger than most motions between frames
         doubt = f"the network is uncertain by {U[:3].max():.1f} degrees"

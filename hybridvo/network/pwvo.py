@@ -25,7 +25,7 @@ from hybridvo.network.layers import (
     initialize,
     scaled,
 )
-from hybridvo.network.normalization import normalize, predict
+from hybridvo.network.prediction import normalize, predict
 from hybridvo.network.weights import read_network
 from hybridvo.results import PixelwisePrediction
 from hybridvo.types import FramePair, PairBatch
@@ -95,16 +95,11 @@ class PWVO(nn.Module):
         channels = scaled(32, width)
         self.head_motion = _map_head(channels)
         self.head_uncertainty = _map_head(channels) if options.uncertainty else None
-        heads = [h for h in (self.head_motion, self.head_uncertainty) if h is not None]
-        initialize(self, tuple(heads))
+        initialize(self)
 
     @classmethod
     def from_pretrained(cls, name_or_path: str | Path = "pwvo") -> PWVO:
-        """A network in evaluation mode on the CPU, by the name or file of its weights.
-
-        Raises:
-            CheckpointError: no such weights, damaged ones, or another network's.
-        """
+        """A network in evaluation mode on the CPU, by the name or file of its weights."""
         network, _ = read_network(name_or_path, lambda o: build_network(NetworkOptions(**o)))
         if not isinstance(network, cls):
             raise CheckpointError(f"{name_or_path}: expected the weights of a PWVO, got another's.")
@@ -116,15 +111,9 @@ class PWVO(nn.Module):
         """Pose and log scale at every pixel: of assembled inputs in one pass, of pairs in all.
 
         Where flow or depth is missing the log scale is at least ``INVALID_LOG_SCALE``: no selection
-        prefers such a pixel.
-
-        Args:
-            inputs: pairs of any size; or inputs of size (h, w), multiples of 32 waste no border.
-            T_start: (B, 4, 4) a first motion, for scale-free networks: they look at what it leaves.
-
-        Returns:
-            Maps of (ceil(h / n), ceil(w / n)), n = input_stride * head_stride; in the network's own
-            type, also under autocast. Finite for any input.
+        prefers such a pixel. ``T_start`` (B, 4, 4): a first motion, for scale-free networks: they
+        look at what it leaves. Maps of (ceil(h / n), ceil(w / n)), n = input_stride * head_stride,
+        in the network's own type, also under autocast; finite for any input.
         """
         options, own = self.options, next(self.parameters())
         if not isinstance(inputs, NetworkInputs):
@@ -151,9 +140,8 @@ class PWVO(nn.Module):
 
 
 def _pose_head(features: int) -> nn.Sequential:
-    """Fully connected 128-32-3."""
-    sizes = nn.Linear(features, 128), nn.Linear(128, 32), nn.Linear(32, 3)
-    return nn.Sequential(sizes[0], nn.ELU(), sizes[1], nn.ELU(), sizes[2])
+    layers = nn.Linear(features, 128), nn.ELU(), nn.Linear(128, 32), nn.ELU(), nn.Linear(32, 3)
+    return nn.Sequential(*layers)
 
 
 class VONet(nn.Module):
@@ -161,17 +149,17 @@ class VONet(nn.Module):
 
     grid = (2, 4)  # of the embedding of a 128x256 input; others are averaged to it
 
-    def __init__(self, options: NetworkOptions | None = None) -> None:
+    def __init__(self, options: NetworkOptions) -> None:
         super().__init__()
-        self.options = options = options or NetworkOptions(kind="vonet")
+        self.options = options
         self.branches = InputBranches()
-        self.encoder = Encoder(InputBranches.out_channels, options.width, inner_activation=False)
+        self.encoder = Encoder(InputBranches.out_channels, options.width, inner=False)
         channels, attends = self.encoder.channels[-1], options.kind == "vonet-attention"
         self.attention = SelfAttention(channels) if attends else nn.Identity()
         features = channels * math.prod(self.grid)
         self.head_rotation = _pose_head(features)
         self.head_translation = _pose_head(features)
-        initialize(self, (self.head_rotation, self.head_translation))
+        initialize(self)
 
     def forward(
         self, inputs: NetworkInputs, T_start: torch.Tensor | None = None
@@ -185,7 +173,6 @@ class VONet(nn.Module):
         return PixelwisePrediction(scale.motion(raw))
 
 
-def build_network(options: NetworkOptions | None = None) -> nn.Module:
+def build_network(options: NetworkOptions) -> nn.Module:
     """A :class:`PWVO` or :class:`VONet` with fresh weights, from torch's global generator."""
-    options = options or NetworkOptions()
     return PWVO(options) if options.kind == "pwvo" else VONet(options)

@@ -23,8 +23,7 @@ import torch.nn.functional as F
 
 from hybridvo.errors import InputError
 from hybridvo.network.inputs import NetworkInputs, pinhole
-from hybridvo.refinement.batch import Pixels, to_tiles
-from hybridvo.refinement.torch_factors import fit_pixels
+from hybridvo.refinement.torch_factors import Pixels, fit_pixels, to_tiles
 from hybridvo.results import PixelwisePrediction
 from hybridvo.torch_geometry import euler_transform, se3
 
@@ -45,27 +44,19 @@ MIN_SCALE = 1e-4
 
 
 class PoseSeed(NamedTuple):
-    """Where a refinement starts, and how much it heeds each pixel.
+    """Where a refinement starts, and how much it heeds each pixel."""
 
-    ``T_curr_prev`` (B, 4, 4), metres; ``weights`` (B, H, W) in (0, 1], at the size of the images:
-    they carry the gradient of the log scales of the rotation; None where there is no uncertainty.
-    """
-
-    T_curr_prev: torch.Tensor
+    T_curr_prev: torch.Tensor  # (B, 4, 4) metres
+    # (B, H, W) in (0, 1], at the size of the images: they carry the gradient of the log scales of
+    # the rotation; None where there is no uncertainty
     weights: torch.Tensor | None
 
 
 def select(maps: PixelwisePrediction, method: str = "softmax") -> PoseSeed:
     """The paper's selection as the start of a refinement, with weights from the uncertainty.
 
-    Raises:
-        InputError: an unknown method.
-
-    Example:
-        >>> import torch
-        >>> maps = PixelwisePrediction(*(torch.zeros(1, 6, 8, 16) for _ in range(2)))
-        >>> select(maps).weights.shape
-        torch.Size([1, 8, 16])
+    ``method``: ``softmax``, ``argmin``, ``mean``, ``exp_plus_u`` or ``joint``; an InputError
+    refuses another.
     """
     T = select_motion(maps, method)
     if maps.log_scale is None:
@@ -73,10 +64,8 @@ def select(maps: PixelwisePrediction, method: str = "softmax") -> PoseSeed:
     s = _doubt(maps.log_scale)
     least = s.flatten(1).amin(dim=1)[:, None, None]
     weights = torch.exp(-SHARPNESS * (s - least)).clamp(min=MIN_WEIGHT)
-    if maps.image_size is not None and maps.image_size != tuple(weights.shape[1:]):
-        weights = F.interpolate(
-            weights[:, None], maps.image_size, mode="bilinear", align_corners=False
-        )[:, 0]
+    if maps.image_size is not None:
+        weights = F.interpolate(weights[:, None], maps.image_size, mode="bilinear")[:, 0]
     return PoseSeed(T, weights)
 
 
@@ -94,13 +83,12 @@ def select_motion(maps: PixelwisePrediction, method: str = "softmax") -> torch.T
 def select_pose(
     maps: PixelwisePrediction, method: str = "softmax", patch: int | None = None
 ) -> torch.Tensor:
-    """One motion of each pair: (B, 6) Euler angles X-Y-Z in degrees, then metres.
+    """One motion of each pair: (B, 6) Euler angles X-Y-Z in degrees, then metres; differentiable.
 
-    Each of the six numbers has its own pixels and weights; those of ``joint`` share theirs.
-    Differentiable in the predictions and, through the weights, in the log scales. Values that are
-    not finite are never chosen while their patch has another; a pair without any gives zero motion.
-    Without uncertainty the method is always ``mean``. ``patch``: side of the square patches in
-    cells of the maps, a quarter of the height by default: 32 at 128x256 (the paper).
+    Each of the six numbers has its own pixels and weights; those of ``joint`` share theirs. Values
+    that are not finite are never chosen while their patch has another; a pair without any gives
+    zero motion. Without uncertainty the method is always ``mean``. ``patch``: side of the square
+    patches in cells of the maps, a quarter of the height by default: 32 at 128x256 (the paper).
     """
     if method not in SELECTION_METHODS:
         raise InputError(
@@ -122,7 +110,7 @@ def select_pose(
     side = min(patch or -(-height // PATCH_ROWS), max(height, width))
 
     def patches(x: torch.Tensor, fill: float = 0.0) -> torch.Tensor:
-        return to_tiles(x, side, fill).unflatten(-1, (-1, side**2))
+        return to_tiles(x, side, fill)
 
     # Padding that completes the last patches is infinitely uncertain: as every patch holds at least
     # one real pixel, and real ones rank below infinity, padding never wins.
@@ -142,8 +130,7 @@ def fitted_motion(
 ) -> torch.Tensor:
     """(B, 4, 4) motion that the pixels agree on which a prediction of these inputs trusts.
 
-    The selected pose is the start; the log scales of the rotation are the weights, and carry the
-    gradient. Refuses a prediction without uncertainty.
+    From the selected pose; the log scales of the rotation are the weights, and carry the gradient.
     """
     if maps.log_scale is None:
         raise InputError("fitted_motion: expected a prediction with uncertainty.")

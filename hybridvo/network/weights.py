@@ -30,9 +30,7 @@ def save_weights(
 ) -> Path:
     """Write a network's weights, its ``options`` and a model card of JSON values.
 
-    Raises:
-        InputError: weights that are not finite or not representable in ``dtype``.
-        OutputError: the file cannot be written.
+    An InputError refuses weights that are not finite or not representable in ``dtype``.
     """
     header = {"options": asdict(network.options), "card": dict(card)}  # type: ignore[call-overload]
     texts = {name: json.dumps(x, sort_keys=True, allow_nan=False) for name, x in header.items()}
@@ -52,11 +50,7 @@ def read_network(
 ) -> tuple[nn.Module, dict[str, Any]]:
     """Network of a file of :func:`save_weights`, and its card; ``make`` builds it from options.
 
-    In evaluation mode and float32, on the CPU.
-
-    Raises:
-        CheckpointError: missing, truncated, of another program or architecture, or with values that
-            are not finite.
+    In evaluation mode and float32, on the CPU; or a CheckpointError.
     """
     path = weights_file(name_or_path)
     try:
@@ -92,15 +86,10 @@ def _broken(tensors: Mapping[str, torch.Tensor]) -> str:
     return f"values that are not finite in {', '.join(names[:6])}" if names else ""
 
 
-def pretrained_names() -> tuple[str, ...]:
-    """Names of the weights that come with the package."""
-    return tuple(sorted(p.stem for p in PRETRAINED.glob("*.safetensors")))
-
-
 def weights_file(name_or_path: str | Path) -> Path:
     """The file of a pretrained name, else the path itself; a CheckpointError where it is none."""
-    known = pretrained_names()
-    path = PRETRAINED / f"{name_or_path}.safetensors" if name_or_path in known else name_or_path
+    known = {path.stem: path for path in PRETRAINED.glob("*.safetensors")}
+    path = known.get(str(name_or_path), name_or_path)
     if not os.path.isfile(path):  # where Path.is_file() raises: a name that is too long
-        raise CheckpointError(f"{path}: no such weights. Pretrained: {', '.join(known)}.")
+        raise CheckpointError(f"{path}: no such weights. Pretrained: {', '.join(sorted(known))}.")
     return Path(path)

@@ -42,37 +42,29 @@ SETTLED = 1e-3
 
 @njit(error_model="numpy", cache=True, nogil=True)
 def solve6(acc, damping, delta):
-    """Solve (H + damping diag H) delta = g by Cholesky; False where H is not positive definite."""
-    L, scale = np.zeros((7, 6)), np.empty(6)  # the gradient as a last row: forward substitution
-    q = 0
+    """Solve (H + damping diag H) delta = g; False where H is not positive definite."""
+    A, scale, q = np.empty((6, 7)), np.empty(6), 0  # the gradient as a last column
     for i in range(6):
         if not acc[q] > 1e-30:
             return False
         scale[i] = 1.0 / math.sqrt(acc[q])
         for j in range(i, 6):
-            L[j, i] = acc[q]
+            A[i, j] = A[j, i] = acc[q]
             q += 1
-        L[6, i] = acc[21 + i]
-    for i in range(7):
-        for j in range(min(i + 1, 6)):
-            s = L[i, j] * scale[j] * (scale[i] if i < 6 else 1.0)
-            if i == j:
-                s = 1.0 + damping
-            for k in range(j):
-                s -= L[i, k] * L[j, k]
-            if i == j:
-                if not s > 1e-13:
-                    return False
-                L[i, i] = math.sqrt(s)
-            else:
-                L[i, j] = s / L[j, j]
-    for i in range(5, -1, -1):
-        s = L[6, i]
-        for k in range(i + 1, 6):
-            s -= L[k, i] * delta[k]
-        delta[i] = s / L[i, i]
+        A[i, 6] = acc[21 + i]
     for i in range(6):
-        delta[i] *= scale[i]
+        for j in range(7):
+            A[i, j] *= scale[i] * (scale[j] if j < 6 else 1.0)
+        A[i, i] = 1.0 + damping
+    for k in range(6):  # Gauss-Jordan elimination: the pivots of a definite matrix are positive
+        if not A[k, k] > 1e-13:
+            return False
+        for i in range(6):
+            factor = 0.0 if i == k else A[i, k] / A[k, k]
+            for j in range(k, 7):
+                A[i, j] -= factor * A[k, j]
+    for i in range(6):
+        delta[i] = scale[i] * A[i, 6] / A[i, i]
         if not abs(delta[i]) < 1e6:
             return False
     return True
@@ -180,26 +172,20 @@ def gather_noise(samples, n, step, pose, K, radius):
     along q and across it, variance of flow and depth in units of sf^2 and sd^2, external weight,
     density of outliers, (6, N); and the share of the weight that these pixels have.
     """
-    terms, entries = np.empty((6, n // step + 1), np.float32), pose_entries(pose)
-    disc = 1.0 / (math.pi * radius * radius)
-    m, total, inside = 0, 0.0, 0.0
-    for k in range(0, n, step):
-        ru, rv, qu, qv, front = residual(samples, k, entries, K)
-        q2 = qu * qu + qv * qv
-        spread, weight = 1.0 / samples[PF, k], samples[W, k]
-        wide = max(spread, 1.0)
-        total += weight
-        if not (front and weight > 0 and ru * ru + rv * rv <= radius * radius * wide and q2 < 1e12):
-            continue
-        inside += weight
-        beta = min(samples[PD, k] * q2, 1e8)
-        if q2 < 1e-20:  # no parallax: any axis will do
-            qu, q2 = 1.0, 1.0
-        dot, cross = ru * qu + rv * qv, rv * qu - ru * qv
-        terms[0, m], terms[1, m], terms[2, m] = dot * dot / q2, cross * cross / q2, spread
-        terms[3, m], terms[4, m], terms[5, m] = beta, weight, disc / wide
-        m += 1
-    return terms[:, :m], inside / max(total, 1e-30)
+    few = samples[:, :n:step]
+    found = residuals(few, few.shape[1], pose, K)
+    ru, rv, qu, qv = found[0], found[1], found[2], found[3]
+    q2, spread, weight = qu * qu + qv * qv, 1.0 / few[PF], few[W]
+    wide = np.maximum(spread, 1.0)
+    near = (ru * ru + rv * rv <= radius * radius * wide) & (q2 < 1e12)  # False where not a number
+    axis, length2 = np.where(q2 < 1e-20, 1.0, qu), np.where(q2 < 1e-20, 1.0, q2)  # no parallax: any
+    dot, cross = ru * axis + rv * qv, rv * axis - ru * qv
+    terms = np.empty((6, np.sum(near)), np.float32)
+    terms[0], terms[1] = (dot * dot / length2)[near], (cross * cross / length2)[near]
+    terms[2], terms[3] = spread[near], np.minimum(few[PD] * q2, 1e8)[near]
+    terms[4], terms[5] = weight[near], (1.0 / (math.pi * radius * radius * wide))[near]
+    inside = np.sum(terms[4].astype(np.float64))
+    return terms, inside / max(np.sum(weight.astype(np.float64)), 1e-30)
 
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
@@ -276,15 +262,14 @@ def estimate_noise(samples, n, pose, K, sf, sd, sf_cap, sd_cap, rounds, limit):
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
-def reestimate(samples, n, K, sf, sd, sf_cap, sd_cap, cutoff, rounds, steps, limit, pose):
+def reestimate(samples, n, K, cutoff, limit, pose):
     """Noise and Gauss-Newton in turn, in place; returns (sf, sd, share, iterations)."""
-    total = np.float64(np.sum(samples[W, :n]))
-    iterations = 0
-    share = 0.0
-    for _ in range(rounds):
-        sf, sd, share, _ = estimate_noise(samples, n, pose, K, sf, sd, sf_cap, sd_cap, 5, limit)
+    total, caps = np.float64(np.sum(samples[W, :n])), (FLOW_NOISE_CAP, DEPTH_NOISE_CAP)
+    sf, sd, share, iterations = 0.5, 0.01, 0.0, 0
+    for _ in range(2):
+        sf, sd, share, _ = estimate_noise(samples, n, pose, K, sf, sd, *caps, 5, limit)
         noise = noise_of(sf, sd, cutoff)
-        iterations += gauss_newton(samples, n, total, K, noise, steps, 1e-3 * sf + 1e-5, pose)
+        iterations += gauss_newton(samples, n, total, K, noise, 4, 1e-3 * sf + 1e-5, pose)
     return sf, sd, share, iterations
 
 
@@ -314,10 +299,7 @@ def fit_coarse(
     pose = np.array(pose, np.float64, order="C")
     scale = min(64.0, max(1.0, 1.5 * residual_scale(samples, n, pose, K)))
     steps = anneal(samples, n, K, scale, 0.4, 0.5, 3, pose)
-    sf, sd, share, more = reestimate(
-        samples, n, K, 0.5, 0.01, FLOW_NOISE_CAP, DEPTH_NOISE_CAP, cutoff, 2, 4,
-        FINAL_NOISE_PIXELS, pose,
-    )  # fmt: skip
+    sf, sd, share, more = reestimate(samples, n, K, cutoff, FINAL_NOISE_PIXELS, pose)
     return pose, sf, sd, share, steps + more
 
 

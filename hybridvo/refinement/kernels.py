@@ -1,10 +1,7 @@
 """Numba kernels of the refinement: one pass over the pixels gives the 6x6 normal equations.
 
-The same definition as :mod:`hybridvo.refinement.torch_factors`; a test holds both equal. Pixels are
-gathered into short structure-of-arrays buffers that stay in the L1 cache, and branch-free loops sum
-over them in float32 per block, float64 in total.
-
-Per pixel, with X' = T X, a = X'/Z', b = Y'/Z', i = 1/Z' (conventions of :mod:`hybridvo.types`):
+Per pixel, with X' = T X, a = X'/Z', b = Y'/Z', i = 1/Z' (conventions of :mod:`hybridvo.types`), as
+in :mod:`hybridvo.refinement.torch_factors`; a test holds both equal:
 
 - residual r = (x + F) - pi(X');
 - Jacobian of pi(X') with respect to the left perturbation (translation, rotation):

@@ -53,16 +53,11 @@ class PixelGrid:
         """(buffer, h, w, stride) of a grid of about ``pixels`` pixels; finer if few are usable."""
         stride = grid_stride(self.size, pixels)
         while True:
-            buffer, h, w = self.strided(stride)
+            buffer, h, w = kernels.gather_grid(stride, self.data, self.camera, self.scale)
             usable = np.count_nonzero(buffer[kernels.W, : h * w] > 0)
             if usable >= MIN_USABLE * pixels or stride == 1:
                 return buffer, h, w, stride
             stride //= 2
-
-    def strided(self, stride: int) -> tuple[np.ndarray, int, int]:
-        """(buffer, h, w) of every ``stride``-th pixel of both axes."""
-        buffer, h, w = kernels.gather_grid(stride, self.data, self.camera, self.scale)
-        return buffer, h, w
 
     def full_pass(
         self, pose: np.ndarray, noise: np.ndarray, tile: int

@@ -1,8 +1,7 @@
 """Refinement on flow and depth: from a start to a metric motion with covariance and status.
 
-Minimises the ego-flow reprojection error (paper, equations 6 and 8) under a Geman-McClure kernel of
-the Mahalanobis distance. Each pixel's covariance is that of its flow and of its depth, propagated;
-both noise scales are estimated from the pair.
+Minimises the ego-flow reprojection error (paper, equations 6 and 8), weighed by the noise of flow
+and depth, both estimated from the pair, under a Geman-McClure kernel.
 """
 
 from __future__ import annotations
@@ -12,14 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from hybridvo.calibration import MIN_TILES, WEAK_RATIO
-from hybridvo.geometry import as_contiguous, invert, pose_matrix, se3_log
+from hybridvo.geometry import invert, pose_matrix, se3_log
 from hybridvo.options import RefineOptions
 from hybridvo.refinement import coarse_fit
 from hybridvo.refinement.covariance import NOTHING, motion_covariance, score_sums, symmetric
-from hybridvo.refinement.depth import DepthFactor, compare_depths, depth_scale, look_up
-from hybridvo.refinement.kernels import SUMS, sum_samples
+from hybridvo.refinement.depth import compare_depths, depth_noise
 from hybridvo.refinement.pixels import PixelGrid, coarse_grid
-from hybridvo.refinement.solver import Factor, Linearization, gauss_newton, tile_size
+from hybridvo.refinement.solver import Linearization, gauss_newton, tile_size
 from hybridvo.results import Hypothesis, Reason, RelativePose, Status
 from hybridvo.types import FramePair
 
@@ -28,10 +26,6 @@ MIN_INLIER_RATIO, LOW_INLIER_RATIO = 0.02, 0.25
 STEPS, LAST_STEP = 5, 4.0
 """Most steps, and length in standard deviations of the last one: what Newton's second order leaves
 behind it is a hundredth of one at most (18 recorded pairs)."""
-WELL_CONDITIONED = 0.005
-"""Ratio of the extreme eigenvalues of the flow's information above which it needs no help."""
-CURRENT_DEPTH_GAIN = 0.5
-"""The current depth is used where it adds this share of the flow's information somewhere."""
 DEPTHS_PER_PAIR = 1.32
 """The two depths of a pair differ by this many times the noise of one: sqrt(2), less what the
 interpolation of the second one averages away."""
@@ -181,9 +175,8 @@ def pair_noise(
     start: tuple[float, float],
     cutoff: float,
     curr: np.ndarray | None,
-) -> tuple[float, float, float, float, float]:
-    """Noise (sf, sd) of the pixels that follow a motion, share of the weight that does, standard
-    deviation of the log ratio of both depths and of its part that the flow does not tell (or 0).
+) -> tuple[float, float, float]:
+    """Noise (sf, sd) of the pixels that follow a motion, and share of the weight that does.
 
     The current depth (H, W) bounds the noise of the first, and tells it where the flow cannot.
     """
@@ -193,18 +186,16 @@ def pair_noise(
         coarse_fit.FINAL_NOISE_PIXELS,
     )  # fmt: skip
     if curr is None:
-        return sf, sd, share, 0.0, 0.0
-    noise = coarse_fit.noise_of(sf, sd, cutoff)
+        return sf, sd, share
     few = np.ascontiguousarray(samples[:, : n : max(1, n // 1000)])
-    log_depth = look_up(few, few.shape[1], as_contiguous(curr))
+    noise = coarse_fit.noise_of(sf, sd, cutoff)
     robust = coarse_fit.robust_weights(few, few.shape[1], pose, K, noise)
-    sigma, raw = depth_scale(few, log_depth, robust, pose, K, noise)
-    if raw <= 0:
-        return sf, sd, share, 0.0, 0.0
-    # var(rz) = sz^2 + h^2 sd^2: with two depths of one sensor sd is about raw / sqrt(2)
+    both = depth_noise(few, curr, robust, pose)
+    if both <= 0:
+        return sf, sd, share
     if not told:  # errors that both depths share do not show here
-        sd = min(raw / DEPTHS_PER_PAIR, coarse_fit.DEPTH_NOISE_CAP)
-    return sf, min(sd, raw), share, raw, max(sigma, 1e-4)
+        sd = min(both / DEPTHS_PER_PAIR, coarse_fit.DEPTH_NOISE_CAP)
+    return sf, min(sd, both), share
 
 
 def _fit_full_grid(
@@ -218,32 +209,24 @@ def _fit_full_grid(
     a direction is open; eigenvalues (6,), ascending, of the information scaled to pixels.
     """
     samples, n, K = grid.samples, grid.count, grid.K
-    sf, sd, share, _, sigma = pair_noise(samples, n, K, pose, start, options.cutoff, curr)
-    tile = tile_size(grid.size, options.tiles)
-    inverse_depth = coarse_fit.translation_scale(samples, n)
+    sf, sd, share = pair_noise(samples, n, K, pose, start, options.cutoff, curr)
     noise = coarse_fit.noise_of(sf, sd, options.cutoff)
+    inverse_depth = coarse_fit.translation_scale(samples, n)
     total = float(grid.weight.sum(dtype=np.float64))
     iterations = coarse_fit.gauss_newton(samples, n, total, K, noise, 4, 1e-3 * sf, pose)
-    flow = FlowFactor(grid, noise, tile, score_sums(samples, n, pose, K, noise))
-    term = None
-    if curr is not None and sigma > 0:
-        term = _depth_factor(grid, curr, pose, sigma, noise, options)
-    factors: list[Factor] = [flow] if term is None else [flow, term]
-    found = gauss_newton(factors, pose_matrix(pose), STEPS, LAST_STEP)
-    T = pose_matrix(found.T[:3])
-    tiles, meat = flow.tiles, flow.meat
-    if term is not None:
-        tiles, meat = tiles + term.tiles, meat + term.meat
-    cost, followers, usable = flow.rest
+    per_weight = score_sums(samples, n, pose, K, noise)
+    flow = FlowFactor(grid, noise, tile_size(grid.size, options.tiles), per_weight)
+    found = gauss_newton([flow], pose_matrix(pose), STEPS, LAST_STEP)
+    T, (cost, followers, usable) = pose_matrix(found.T[:3]), flow.rest
     covariance, eigenvalues, occupied = motion_covariance(
-        tiles, np.asarray(found.at.curvature), symmetric(meat), inverse_depth,
+        flow.tiles, np.asarray(found.at.curvature), symmetric(flow.meat), inverse_depth,
         usable, K[0], T[:3, 3], (sf, sd),
     )  # fmt: skip
     motion = RelativePose(
         T_curr_prev=T,
         covariance=covariance,
         method="refine",
-        terms=("flow",) if term is None else ("flow", "depth"),
+        terms=("flow",),
         inlier_ratio=float(share) if followers >= 6 else 0.0,
         iterations=int(iterations + found.iterations),
         cost=float(cost / max(usable, 1e-12)),
@@ -252,31 +235,3 @@ def _fit_full_grid(
         weights=flow.weights,
     )
     return motion, occupied if np.isfinite(T).all() else 0, eigenvalues
-
-
-def _depth_factor(
-    grid: PixelGrid,
-    curr: np.ndarray,
-    pose: np.ndarray,
-    sigma: float,
-    noise: np.ndarray,
-    options: RefineOptions,
-) -> DepthFactor | None:
-    """The current depth as a factor, or None where it is not asked for or adds too little."""
-    samples, n, stride = grid.samples, grid.count, grid.shape[2]
-    curr, tile = as_contiguous(curr), tile_size(grid.size, options.tiles)
-    # on the full fit the flow has every pixel, the depth every second one of both axes
-    fine = min(2, stride)
-    if options.current_depth == "auto":
-        sums = np.zeros(SUMS)
-        sum_samples(samples, n, pose, grid.K, noise, sums)
-        H_flow = symmetric(sums[:21])
-        units = np.repeat([1 / coarse_fit.translation_scale(samples, n), 1.0], 3)
-        eigenvalues = np.linalg.eigvalsh(H_flow * np.outer(units, units))
-        if eigenvalues[0] > WELL_CONDITIONED * eigenvalues[-1]:
-            return None
-        coarse = DepthFactor(grid, curr, stride, sigma, noise, tile)
-        gain = np.linalg.eigvals(np.linalg.pinv(H_flow) @ coarse.linearize(pose).H / fine**2)
-        if not gain.real.max() > CURRENT_DEPTH_GAIN:
-            return None
-    return DepthFactor(grid, curr, fine, sigma, noise, tile)

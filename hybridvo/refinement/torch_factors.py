@@ -1,41 +1,166 @@
 """The ego-flow reprojection residual of a batch of pairs in torch, and its normal equations.
 
 The same definition as :mod:`hybridvo.refinement.kernels`, formulas there; a test holds both equal.
-With the current frame's depth a third row joins, ``r_z = log D_curr(x + F) - log Z'``.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
 
 import torch
+import torch.nn.functional as F
 
-from hybridvo.refinement.batch import Pixels
+from hybridvo.errors import InputError
+from hybridvo.refinement import kernels
 from hybridvo.refinement.coarse_fit import DAMPING
-from hybridvo.refinement.kernels import MAX_SHIFT
+from hybridvo.refinement.pixels import typical
 from hybridvo.torch_geometry import (
+    MAX_DEPTH,
     MIN_DEPTH,
     left_update,
     move,
+    pixel_grid,
     pp,
     project,
-    projection_rows,
+    rays,
     weighted_median,
 )
+from hybridvo.types import PairBatch
 
+PART = 131_072
+"""Pixels that are worked on at once: on a CPU half the time of all of them at once."""
 CUTOFF, FIT_STEPS = 1.5, 6
 """Scale of the kernel in typical residuals while these set it; Newton steps of a fit to pixels."""
 BEHIND_DISTANCE2 = 1e4
 """Squared Mahalanobis distance at which a pixel behind the camera is charged."""
-
-
 KERNELS = ("geman-mcclure", "cauchy", "huber", "l2")
+
+
+class Pixels(NamedTuple):
+    """Pixels of a batch in raster order; variances are relative to the typical one."""
+
+    points: torch.Tensor  # (B, 3, N) metres, in the previous camera
+    target: torch.Tensor  # (B, 2, N) px, x + F on the current image
+    flow_variance: torch.Tensor  # (B, N)
+    depth_variance: torch.Tensor  # (B, N)
+    weight: torch.Tensor  # (B, N) external weight, 0 where unusable
+    K: torch.Tensor  # (B, 3, 3) of the current camera
+
+    @property
+    def total(self) -> torch.Tensor:
+        """(B,) float64 sum of the weights."""
+        return self.weight.double().sum(dim=1)
+
+    def map(self, change: Callable[[torch.Tensor], torch.Tensor]) -> Pixels:
+        """The same with all but the camera changed."""
+        return Pixels._make([*(change(x) for x in self[:5]), self.K])
+
+    def parts(self, run: int = 1) -> Iterator[Pixels]:
+        """All pixels, in whole runs of ``run``, few enough at once to stay in the cache."""
+        step = run * max(1, PART // (len(self.weight) * run))
+        pieces = [x.split(step, dim=-1) for x in self[:5]]
+        return (Pixels._make([*piece, self.K]) for piece in zip(*pieces, strict=True))
+
+    def subset(self, count: int) -> Pixels:
+        """About ``count`` usable pixels of each sample, spread by the golden section."""
+        order = (self.weight > 0).long().cumsum(dim=1)
+        total = order[:, -1:]
+        count = min(count, order.shape[1])
+        k = torch.arange(count, device=order.device, dtype=torch.float64)[None]
+        spread = ((k + (k * 0.6180339887498949).frac()) * (total / count).clamp(min=1)).long()
+        index = torch.searchsorted(order, spread + 1).clamp(max=order.shape[1] - 1)
+        taken = self.map(
+            lambda x: x.gather(
+                -1, index if x.ndim == 2 else index[:, None].expand(-1, len(x[0]), -1)
+            )
+        )
+        return taken._replace(weight=taken.weight * (spread < total))
+
+
+def gather_pixels(batch: PairBatch, weights: torch.Tensor | None = None) -> Pixels:
+    """The pixels of a batch.
+
+    Invalid values are replaced before anything is computed from them, so that neither they nor
+    their gradients spread.
+    """
+    depth = batch.depth_prev
+    height, width = depth.shape[1:]
+    target = pixel_grid(height, width, depth) + batch.flow
+    usable = (depth > MIN_DEPTH) & (depth < MAX_DEPTH) & (target.abs() < MAX_DEPTH).all(dim=3)
+    cameras = []
+    for K in (batch.K_prev, batch.K_curr):
+        good = torch.isfinite(K).flatten(1).all(dim=1) & (K[:, 0, 0] > 0) & (K[:, 1, 1] > 0)
+        usable = usable & good[:, None, None]
+        cameras.append(torch.where(good[:, None, None], K, torch.eye(3).to(K)))
+    one, zero = torch.ones_like(depth), torch.zeros_like(depth)
+    flow_variance = depth_variance = weight = one
+    if batch.flow_variance is not None:
+        flow_variance, good = _relative(batch.flow_variance, batch.flow_variance > 0)
+        flow_variance, usable = flow_variance.clamp(min=1 / float(kernels.MAX_TRUST)), usable & good
+    if batch.depth_variance is not None:
+        depth_variance, good = _relative(batch.depth_variance, batch.depth_variance >= 0)
+        depth_variance, usable = depth_variance.clamp(max=float(kernels.MAX_DOUBT)), usable & good
+    if weights is not None:
+        weight = torch.where((weights > 0) & (weights < MAX_DEPTH), weights, zero)
+    if batch.valid is not None:
+        usable = usable & batch.valid
+    points = rays(height, width, cameras[0]) * torch.where(usable, depth, one)[..., None]
+    target = torch.where(usable[..., None], target, torch.zeros_like(target))
+    maps = (points.movedim(3, 1), target.movedim(3, 1), flow_variance, depth_variance)
+    weight = torch.where(usable, weight, zero)
+    return Pixels._make([*(x.flatten(-2) for x in (*maps, weight)), cameras[1]])
+
+
+def to_tiles(x: torch.Tensor, tile: int, fill: float = 0.0) -> torch.Tensor:
+    """(..., H, W) -> (..., tiles, tile * tile), the border completed with ``fill``."""
+    x = F.pad(x, (0, -x.shape[-1] % tile, 0, -x.shape[-2] % tile), value=fill)
+    x = x.unflatten(-1, (-1, tile)).unflatten(-3, (-1, tile)).transpose(-3, -2)
+    return x.flatten(-4, -3).flatten(-2)
+
+
+def _relative(variance: torch.Tensor, good: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """A variance in units of the typical one of its sample, 1 where not good; what is good."""
+    scales = [typical(one) for one in variance.detach().cpu().numpy()]
+    scale, good = variance.new_tensor(scales)[:, None, None], good & (variance < MAX_DEPTH)
+    return torch.where(good, variance, scale) / scale, good
+
+
+def checked_batch(
+    batch: PairBatch, weights: Any = None, where: str = "refine_batch"
+) -> tuple[PairBatch, torch.Tensor | None]:
+    """The batch and its weights in one floating type, on one device, or an InputError."""
+    flow, depth = batch.flow, batch.depth_prev
+    if not all(isinstance(x, torch.Tensor) and x.is_floating_point() for x in (flow, depth)):
+        raise InputError(f"{where}: expected flow and depth_prev as floating-point tensors.")
+    if flow.ndim != 4 or flow.shape[3] != 2 or flow.numel() == 0:
+        raise InputError(
+            f"{where}: expected PairBatch.flow of shape (B, H, W, 2), got {tuple(flow.shape)}."
+        )
+    dtype = torch.promote_types(flow.dtype, depth.dtype)
+    dtype = dtype if dtype in (torch.float32, torch.float64) else torch.float32
+    if weights is not None:
+        weights = torch.as_tensor(weights, device=flow.device)
+        weights = weights[None] if weights.ndim == 2 and len(flow) == 1 else weights
+    values = {k: v for k, v in {**vars(batch), "weights": weights}.items() if v is not None}
+    shapes = {"flow": flow.shape} | dict.fromkeys(("K_prev", "K_curr"), (len(flow), 3, 3))
+    for name, value in values.items():
+        shape, is_mask = tuple(shapes.get(name, flow.shape[:3])), name == "valid"
+        fits = tuple(value.shape) == shape and value.device == flow.device
+        if not fits or (is_mask and value.dtype != torch.bool):
+            raise InputError(
+                f"{where}: expected {name} of shape {shape} on {flow.device}{', bool' * is_mask}, "
+                f"got {tuple(value.shape)} on {value.device}, {value.dtype}."
+            )
+        values[name] = value if is_mask else value.to(dtype)
+    weights = values.pop("weights", None)
+    return PairBatch(**values), weights
 
 
 class RobustNoise(NamedTuple):
     """How residuals are weighed: noise, cutoff and name of the kernel."""
 
-    noise: torch.Tensor  # (B, n) sf px, sd, and sz with the current frame's depth
+    noise: torch.Tensor  # (B, 2) sf px, sd
     cutoff: float = 3.0
     name: str = "geman-mcclure"
 
@@ -54,155 +179,124 @@ class RobustNoise(NamedTuple):
         return cost, (c2 / beyond).sqrt(), (d2 > c2) / beyond
 
 
-class Residuals(NamedTuple):
-    """What a pose says of every pixel."""
-
-    ab: torch.Tensor  # (B, 2, N) X'/Z' and Y'/Z'
-    i: torch.Tensor  # (B, N) 1/Z'
-    r: torch.Tensor  # (B, R, N): 2 of the flow, or 3 with the log depth of the current frame
-    t: torch.Tensor  # (B, 3, 1) of the pose
-    front: torch.Tensor
+def flow_noise(scale: torch.Tensor, kernel: str = "geman-mcclure") -> RobustNoise:
+    """A kernel of this width (B,) px around exact depths."""
+    return RobustNoise(torch.stack([scale, torch.zeros_like(scale)], 1), 1.0, kernel)
 
 
-def residuals(pixels: Pixels, T: pp.LieTensor) -> Residuals:
-    """Residuals at pypose SE3 poses (B, 7)."""
-    matrix = T.matrix().to(pixels.points.dtype)
-    moved = move(matrix, pixels.points)
+def residuals(pixels: Pixels, T: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    """At poses (B, 4, 4): residuals (B, 2, N), X'/Z' and Y'/Z' (B, 2, N), 1/Z' and whether in front
+    (B, N).
+    """
+    moved = move(T.to(pixels.points), pixels.points)
     front = moved[:, 2] > MIN_DEPTH
     moved = torch.where(front[:, None], moved, torch.ones_like(moved))
-    r, i = pixels.target - project(moved, pixels.K), 1 / moved[:, 2]
-    if pixels.log_depth_curr is not None:
-        r = torch.cat([r, (pixels.log_depth_curr + i.log())[:, None]], 1)
-    return Residuals(moved[:, :2] * i[:, None], i, r, matrix[:, :3, 3:], front)
-
-
-def _focal(pixels: Pixels) -> torch.Tensor:
-    return pixels.K.diagonal(dim1=1, dim2=2)[:, :2, None]
-
-
-def sensitivity(pixels: Pixels, at: Residuals) -> torch.Tensor:
-    """U = d prediction / d log Z (B, R, N): d pi(X') / d log Z, and d log Z' / d log Z."""
-    u = _focal(pixels) * at.i[:, None] * (at.ab * at.t[:, 2:] - at.t[:, :2])
-    if pixels.log_depth_curr is None:
-        return u
-    return torch.cat([u, (1 - at.t[:, 2] * at.i)[:, None]], 1)
-
-
-def jacobian(pixels: Pixels, at: Residuals) -> torch.Tensor:
-    """(B, R, 6, N): d pi(X') / d delta and, with the current depth, d log Z' / d delta."""
-    a, b = at.ab.unbind(1)
-    J = _focal(pixels)[:, :, None] * torch.stack([*projection_rows(a, b, at.i)], dim=1)
-    if pixels.log_depth_curr is None:
-        return J
-    zero = torch.zeros_like(a)
-    return torch.cat([J, torch.stack([zero, zero, at.i, b, -a, zero], dim=1)[:, None]], dim=1)
+    i = 1 / moved[:, 2]
+    return pixels.target - project(moved, pixels.K), moved[:, :2] * i[:, None], i, front
 
 
 class Weighted(NamedTuple):
     """Residuals at the depths that they make most likely, and what they weigh.
 
-    Their inverse covariance is diag(D) - kappa (D u)(D u)^T; ``right``: it times the residuals.
+    Their weighted inverse covariance w Sigma^-1 is ``information`` (I - kappa q q^T).
     """
 
-    at: Residuals
-    D: torch.Tensor
-    u: torch.Tensor
+    ab: torch.Tensor  # (B, 2, N) X'/Z' and Y'/Z'
+    i: torch.Tensor  # (B, N) 1/Z'
+    q: torch.Tensor  # (B, 2, N) d pi(X') / d log Z
+    focal: torch.Tensor  # (B, 2, 1)
+    information: torch.Tensor  # (B, N)
     kappa: torch.Tensor
-    right: torch.Tensor
-    distance2: torch.Tensor
+    right: torch.Tensor  # (B, 2, N) w Sigma^-1 r
+    distance2: torch.Tensor  # (B, N) squared Mahalanobis distance
     robust: torch.Tensor
+    cost: torch.Tensor  # (B, N) without the external weight; the full one behind the camera
+
+    def rows(self) -> tuple[torch.Tensor, ...]:
+        """Derivatives (B, N) of X'/Z' and Y'/Z' in each direction of the left tangent in turn."""
+        (a, b), i = self.ab.unbind(1), self.i
+        zero, ab = torch.zeros_like(a), a * b
+        return (i, zero, zero, i, -a * i, -b * i, -ab, -1 - b * b, 1 + a * a, ab, -b, a)
+
+    def jacobian(self) -> torch.Tensor:
+        """J (B, 6, 2, N) of pi(X') in the left tangent."""
+        return torch.stack(self.rows(), dim=1).unflatten(1, (6, 2)) * self.focal[:, None]
+
+    def weighted(self, J: torch.Tensor) -> torch.Tensor:
+        """(B, 6, 2, N) w Sigma^-1 J."""
+        q, along = self.q[:, None], (J * self.q[:, None]).sum(dim=2)
+        J = J - (along * self.kappa[:, None])[:, :, None] * q
+        return J * self.information[:, None, None]
+
+    def gradient(self, J: torch.Tensor) -> torch.Tensor:
+        """The sum g (B, 6) of w J^T Sigma^-1 r, zero at the estimate."""
+        return (J.flatten(2) @ self.right.flatten(1)[..., None])[..., 0]
 
 
-def weigh(pixels: Pixels, T: pp.LieTensor, how: RobustNoise) -> Weighted:
-    """Residuals at poses (B, 7), weighed."""
-    at, noise = residuals(pixels, T), how.noise[:, :, None]
-    flow = 1 / (noise[:, 0].square() * pixels.flow_variance)
-    D = torch.stack([flow, flow], 1)
-    if pixels.has_depth_curr is not None:
-        D = torch.cat([D, (pixels.has_depth_curr / noise[:, 2].square())[:, None]], 1)
-    depth = noise[:, 1].square() * pixels.depth_variance
+def weigh(pixels: Pixels, T: torch.Tensor, how: RobustNoise) -> Weighted:
+    """Residuals at poses (B, 4, 4), weighed."""
+    r, ab, i, front = residuals(pixels, T)
+    t, noise = T[:, :3, 3:].to(r), how.noise[:, :, None]
+    focal = pixels.K.diagonal(dim1=1, dim2=2)[:, :2, None]
+    information = 1 / (noise[:, 0].square() * pixels.flow_variance)
+    spread = noise[:, 1].square() * pixels.depth_variance * information
 
-    def shift(u: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Kappa, and how far the log depth that the residuals make most likely lies away."""
-        kappa = depth / (1 + depth * (D * u.square()).sum(dim=1))
-        return kappa, kappa * (D * u * at.r).sum(dim=1)
+    def along_q() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """q, kappa, and how far the log depth that the residuals make most likely lies away."""
+        q = focal * i[:, None] * (ab * t[:, 2:] - t[:, :2])
+        kappa = spread / (1 + spread * q.square().sum(dim=1))
+        return q, kappa, kappa * (q * r).sum(dim=1)
 
-    u = sensitivity(pixels, at)
-    e = shift(u)[1].clamp(-float(MAX_SHIFT), float(MAX_SHIFT))
-    ab = at.ab + u[:, :2] * e[:, None] / _focal(pixels)
-    at = at._replace(ab=ab, i=at.i * (1 - (1 - at.t[:, 2] * at.i) * e))
-    u = sensitivity(pixels, at)
-    kappa, along = shift(u)
-    right = D * (at.r - along[:, None] * u)
-    distance2 = (right * at.r).sum(dim=1).clamp(min=0)
-    usable = at.front & (pixels.weight > 0)
-    robust = torch.where(usable, how.kernel(distance2)[1], torch.zeros_like(distance2))
-    return Weighted(at, D, u, kappa, right, distance2, robust)
+    q, _, e = along_q()
+    e = e.clamp(-float(kernels.MAX_SHIFT), float(kernels.MAX_SHIFT))
+    ab, i = ab + q * e[:, None] / focal, i * (1 - (1 - t[:, 2] * i) * e)
+    q, kappa, e = along_q()
+    right = information[:, None] * (r - e[:, None] * q)
+    d2 = (right * r).sum(dim=1).clamp(min=0)
+    robust = torch.where(front & (pixels.weight > 0), how.kernel(d2)[1], torch.zeros_like(d2))
+    cost = how.kernel(torch.where(front, d2, torch.full_like(d2, BEHIND_DISTANCE2)))[0]
+    w = pixels.weight * robust
+    return Weighted(ab, i, q, focal, w * information, kappa, w[:, None] * right, d2, robust, cost)
 
 
 class Linearization(NamedTuple):
-    """Weighted normal equations at a pose, in C runs of pixels (the tiles, if there are any)."""
+    """Normal equations at a pose, float64."""
 
-    H: torch.Tensor  # (B, C, 6, 6) sum of w J^T Sigma^-1 J
-    g: torch.Tensor  # (B, C, 6) sum of w J^T Sigma^-1 r
-    cost: torch.Tensor  # (B,) robust, pixels behind the camera at the full one
-    weight_sum: torch.Tensor  # (B,) of robust times external weights
-    robust: torch.Tensor  # (B, N) robust weights
-    distance2: torch.Tensor  # (B, N) squared Mahalanobis distances
-
-    def total(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """(H (B, 6, 6), g (B, 6)) in float64: a float32 sum over an image loses its fifth digit."""
-        return self.H.double().sum(dim=1), self.g.double().sum(dim=1)
+    H: torch.Tensor  # (B, 6, 6) sum of w J^T Sigma^-1 J
+    g: torch.Tensor  # (B, 6) sum of w J^T Sigma^-1 r
+    cost: torch.Tensor  # (B,)
+    weight: torch.Tensor  # (B,) sum of robust times external weights
 
 
-def linearize(
-    pixels: Pixels, T: pp.LieTensor, how: RobustNoise, run: int | None = None
-) -> Linearization:
-    """Normal equations at poses (B, 7), summed over runs of ``run`` pixels or of any length."""
-    found = [_linearize(part, T, how, run) for part in pixels.parts(run or 1)]
-    H, g, cost, weight_sum, robust, distance2 = zip(*found, strict=True)
-    joined = [torch.cat(parts, dim=1) for parts in (H, g, robust, distance2)]
-    total = [torch.stack(parts).sum(dim=0) for parts in (cost, weight_sum)]
-    return Linearization(joined[0], joined[1], total[0], total[1], joined[2], joined[3])
-
-
-def _linearize(pixels: Pixels, T: pp.LieTensor, how: RobustNoise, run: int | None) -> Linearization:
-    found = weigh(pixels, T, how)
-    w, runs = pixels.weight * found.robust, (-1, run or pixels.weight.shape[1])
-    J = jacobian(pixels, found.at)
-    g = _scores(J, w, found).unflatten(-1, runs).sum(dim=3).transpose(1, 2)
-    across = (J * (found.D * found.u)[:, :, None]).sum(dim=1, keepdim=True)
-    information = torch.cat([w[:, None] * found.D, (-w * found.kappa)[:, None]], 1)
-    J = torch.cat([J, across], 1).unflatten(-1, runs)
-    H = torch.einsum("brpcn,brqcn->bcpq", J * information.unflatten(-1, runs)[:, :, None], J)
-    behind = torch.full_like(found.distance2, BEHIND_DISTANCE2)
-    cost = how.kernel(torch.where(found.at.front, found.distance2, behind))[0]
-    cost = (pixels.weight * cost).sum(dim=1)
-    H = 0.5 * (H + H.transpose(2, 3))
-    return Linearization(H, g, cost, w.sum(dim=1), found.robust, found.distance2)
-
-
-def scores(pixels: Pixels, T: pp.LieTensor, how: RobustNoise) -> tuple[torch.Tensor, Weighted]:
-    """(B, 6, N) w J^T Sigma^-1 r of each pixel; their sum is zero at the estimate."""
-    found = weigh(pixels, T, how)
-    return _scores(jacobian(pixels, found.at), pixels.weight * found.robust, found), found
-
-
-def _scores(J: torch.Tensor, w: torch.Tensor, found: Weighted) -> torch.Tensor:
-    return (J * (w[:, None] * found.right)[:, :, None]).sum(dim=1)
+def linearize(pixels: Pixels, T: pp.LieTensor, how: RobustNoise) -> Linearization:
+    """Normal equations at poses (B, 7)."""
+    matrix, found = T.matrix(), []
+    for part in pixels.parts():
+        at = weigh(part, matrix, how)
+        J = at.jacobian()
+        H = at.weighted(J).flatten(2) @ J.flatten(2).transpose(1, 2)
+        sums = ((part.weight * x).sum(dim=1) for x in (at.cost, at.robust))
+        found.append((H, at.gradient(J), *sums))
+    H, *rest = (torch.stack(sums).double().sum(dim=0) for sums in zip(*found, strict=True))
+    return Linearization(0.5 * (H + H.transpose(1, 2)), *rest)
 
 
 def newton_matrix(pixels: Pixels, T: pp.LieTensor, how: RobustNoise) -> torch.Tensor:
-    """A = -dg / d xi, g the sum of the scores: (B, 6, 6), not symmetric."""
-    how = how._replace(noise=how.noise.detach())
-    A = torch.zeros(len(T), 6, 6, dtype=T.dtype, device=T.device)
+    """A = -dg / d xi: (B, 6, 6), not symmetric."""
+    how, matrix = how._replace(noise=how.noise.detach()), T.matrix().detach()
+    slopes = torch.zeros(6, *matrix.shape).to(matrix)
     with torch.enable_grad():
-        xi = torch.zeros(len(T), 6, dtype=T.dtype, device=T.device, requires_grad=True)
+        matrix.requires_grad_()
         for part in pixels.map(torch.Tensor.detach).parts():
-            g = scores(part, left_update(xi, T), how)[0].sum(dim=2)
-            rows = [torch.autograd.grad(g[:, k].sum(), xi, retain_graph=True)[0] for k in range(6)]
-            A -= torch.stack(rows, dim=1)
-    return A
+            at = weigh(part, matrix, how)
+            rows, (u, v) = at.rows(), (at.focal * at.right).unbind(1)
+            for k in range(6):  # each by itself: of a product with all only a sixth would be asked
+                g = (rows[2 * k] * u + rows[2 * k + 1] * v).sum()
+                slopes[k] += torch.autograd.grad(g, matrix, retain_graph=True)[0]
+    generators = torch.zeros(6, 4, 4).to(slopes)
+    generators[range(3), range(3), 3] = 1
+    generators[3:, :3, :3] = pp.vec2skew(torch.eye(3).to(slopes))
+    return -torch.einsum("kbpq,jpr,brq->bkj", slopes, generators, matrix.detach())
 
 
 def solve_small(
@@ -232,19 +326,14 @@ def stepped(
     pixels: Pixels, T: pp.LieTensor, how: RobustNoise, going: torch.Tensor | float = 1.0
 ) -> pp.LieTensor:
     """Poses after a Gauss-Newton step, times ``going``."""
-    return left_update(going * solve_small(*linearize(pixels, T, how).total(), DAMPING)[0], T)
-
-
-def flow_noise(scale: torch.Tensor, kernel: str = "geman-mcclure") -> RobustNoise:
-    """A kernel of this width (B,) px around exact depths."""
-    return RobustNoise(torch.stack([scale, torch.zeros_like(scale)], 1), 1.0, kernel)
+    at = linearize(pixels, T, how)
+    return left_update(going * solve_small(at.H, at.g, DAMPING)[0], T)
 
 
 def typical_residual(pixels: Pixels, T: pp.LieTensor) -> torch.Tensor:
-    """(B,) weighted median of the length of the flow residuals of every third pixel."""
-    at = residuals(pixels, T)
-    r, weight = at.r[:, :2, ::3], (pixels.weight * at.front)[:, ::3]
-    return weighted_median(r.norm(dim=1), weight, 1.0)
+    """(B,) weighted median of the length of the residuals of every third pixel."""
+    r, _, _, front = residuals(pixels.map(lambda x: x[..., ::3]), T.matrix())
+    return weighted_median(r.norm(dim=1), pixels.weight[:, ::3] * front, 1.0)
 
 
 def fit_pixels(pixels: Pixels, start: pp.LieTensor, smallest: float) -> pp.LieTensor:
@@ -265,5 +354,5 @@ def fit_pixels(pixels: Pixels, start: pp.LieTensor, smallest: float) -> pp.LieTe
         width = (CUTOFF * torch.where(good, scale, first)).clamp(min=smallest)
     if not pixels.weight.requires_grad:
         return T
-    H, g = linearize(pixels, T, flow_noise(width, "huber")).total()
-    return attached(T, H.detach(), g)
+    at = linearize(pixels, T, flow_noise(width, "huber"))
+    return attached(T, at.H.detach(), at.g)

@@ -1,7 +1,7 @@
 """What training samples are drawn from: presets in YAML files, and samples drawn before on disk.
 
-A folder of samples holds ``samples.json`` (what was drawn) and ``shard_0000/FIELD.npy`` with the
-fields of :class:`~hybridvo.synthetic.layered.Sample` stacked; what others say already is left out.
+A folder of samples holds ``samples.json`` (what was drawn) and ``0000000.npz`` and so on with the
+fields of :class:`~hybridvo.synthetic.layered.Sample`; the ego flow, which others say, is left out.
 """
 
 from __future__ import annotations
@@ -13,23 +13,19 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, Literal, Protocol, Self, TypeVar, cast
+from typing import Any, Literal, Protocol, TypeVar, cast
+from zipfile import BadZipFile
 
 import numpy as np
 
-from hybridvo.errors import FormatError, InputError, OutputError
-from hybridvo.files import make_folder, parse_yaml, read_text, write_json
+from hybridvo.errors import FormatError, InputError
+from hybridvo.files import atomic_write, make_folder, parse_yaml, read_text, write_json
 from hybridvo.options import option_group
 from hybridvo.synthetic.diverse import DiverseOptions
 from hybridvo.synthetic.draws import STORED, sample_generator
 from hybridvo.synthetic.layered import PaperOptions, Sample, camera_flow
 
 MANIFEST = "samples.json"
-PER_SHARD = 500
-"""Samples of a shard: 270 MB at 128x256."""
-REPEATS = {"depth_true": "depth_prev", "depth_target": "depth_curr"}
-"""Field -> the one that it equals in data without noise; stored where it does not."""
-FIELDS = [f.name for f in dataclasses.fields(Sample) if f.name != "ego_flow"]
 
 OptionsT = TypeVar("OptionsT")
 
@@ -99,10 +95,7 @@ def make_preset(mapping: dict[str, Any], where: str) -> Preset:
 
 
 def load_preset(name: str | Path, size: Sequence[int] | None = None) -> Preset:
-    """Generator of a preset's name, or of a file such as ``configs/data_paper.yaml``.
-
-    ``size``: (height, width) instead of its own.
-    """
+    """Generator of a preset's name, or of a file such as ``configs/data_paper.yaml``."""
     own = {} if size is None else dict(zip(("height", "width"), size, strict=True))
     mapping = {"preset": name} if name in PRESETS else read_yaml(name)
     return make_preset(mapping | own, str(name))
@@ -114,55 +107,39 @@ def load_preset(name: str | Path, size: Sequence[int] | None = None) -> Preset:
 def write_samples(
     preset: Preset, count: int, folder: str | Path, seed: int = 0, workers: int = 1
 ) -> Iterator[int]:
-    """Draw samples into a folder; yields the number written so far, after each shard.
+    """Draw samples into a folder; yields the number written so far, after each.
 
-    The folder is made; it may hold an interrupted call of the same arguments, which goes on.
-
-    Raises:
-        InputError: a count below 1, or a folder with other samples.
-        OutputError: a file that cannot be written.
+    The folder may hold an interrupted call of the same arguments, which goes on.
     """
     if count < 1 or workers < 1:
         raise InputError(f"expected count and workers of at least 1, got {count} and {workers}.")
     folder = Path(folder)
     make_folder(folder)
     options = json.loads(json.dumps(dataclasses.asdict(cast(Any, preset))))
-    manifest = {"options": options, "seed": seed, "count": count, "per_shard": PER_SHARD}
+    manifest = {"options": options, "seed": seed, "count": count}
     if not (folder / MANIFEST).exists():
         write_json(folder / MANIFEST, manifest)
     elif _manifest(folder) != manifest:
         raise InputError(f"{folder}: holds other samples. Choose another folder.")
-    firsts = range(0, count, PER_SHARD)
-    jobs = [(preset, seed, range(k, min(k + PER_SHARD, count)), folder) for k in firsts]
-    done = 0
-    try:
-        with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-            for written in pool.map(_write_shard, jobs) if workers > 1 else map(_write_shard, jobs):
-                done += written
-                yield done
-    except OSError as error:
-        raise OutputError(f"{folder}: cannot be written: {error.strerror or error}.") from error
+    write = functools.partial(_write_sample, preset, seed, folder)
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        spread = functools.partial(pool.map, chunksize=50) if workers > 1 else map
+        for index in spread(write, range(count)):
+            yield index + 1
 
 
-def _write_shard(job: tuple[Preset, int, range, Path]) -> int:
-    """Draw one shard under a hidden name and give it its own at the end."""
-    preset, seed, indices, folder = job
-    target = _shard(folder, indices[0] // PER_SHARD)
-    if target.is_dir():
-        return len(indices)
-    partial = target.with_name(f".{target.name}")
-    partial.mkdir(exist_ok=True)
-    samples = [preset.sample(sample_generator(seed, i, STORED)) for i in indices]
-    arrays = {name: np.stack([getattr(sample, name) for sample in samples]) for name in FIELDS}
-    for name, array in arrays.items():
-        if name not in REPEATS or not np.array_equal(array, arrays[REPEATS[name]]):
-            np.save(partial / f"{name}.npy", array)
-    partial.rename(target)
-    return len(indices)
+def _write_sample(preset: Preset, seed: int, folder: Path, index: int) -> int:
+    path = _path(folder, index)
+    if not path.exists():
+        fields = dict(vars(preset.sample(sample_generator(seed, index, STORED))))
+        del fields["ego_flow"]
+        with atomic_write(path, "wb") as file:
+            np.savez(file, **fields)
+    return index
 
 
-def _shard(folder: Path, number: int) -> Path:
-    return folder / f"shard_{number:04d}"
+def _path(folder: Path, index: int) -> Path:
+    return folder / f"{index:07d}.npz"
 
 
 @functools.cache
@@ -177,50 +154,32 @@ def _manifest(folder: Path) -> dict[str, Any]:
         raise FormatError(f"{folder}: {MANIFEST} is damaged: {error}.") from None
 
 
-@functools.cache
-def _open_shard(path: Path) -> dict[str, np.ndarray]:
-    """Memory-mapped fields of a shard."""
-    try:
-        arrays = {p.stem: np.load(p, mmap_mode="r") for p in path.glob("*.npy")}
-        return {name: arrays.get(name, arrays[REPEATS.get(name, name)]) for name in FIELDS}
-    except (OSError, ValueError, KeyError) as error:
-        raise FormatError(f"{path}: damaged shard of samples: {error}.") from None
-
-
 def read_sample(folder: str | Path, index: int) -> Sample:
     """Sample ``index`` of a folder that :func:`write_samples` filled."""
-    folder = Path(folder)
-    manifest = _manifest(folder)
-    if not 0 <= index < manifest["count"]:
-        raise InputError(f"{folder}: expected a sample 0 to {manifest['count'] - 1}, got {index}.")
-    number, row = divmod(index, manifest["per_shard"])
-    fields = {
-        name: np.array(array[row]) for name, array in _open_shard(_shard(folder, number)).items()
-    }
-    ego_flow, _ = camera_flow(fields["K"], fields["depth_true"], fields["T_curr_prev"])
-    return Sample(ego_flow=ego_flow, **fields)
+    path = _path(Path(folder), index)
+    try:
+        with np.load(path) as file:
+            fields = dict(file)
+        ego_flow, _ = camera_flow(fields["K"], fields["depth_true"], fields["T_curr_prev"])
+        return Sample(ego_flow=ego_flow, **fields)
+    except (OSError, ValueError, TypeError, KeyError, EOFError, BadZipFile) as error:
+        raise FormatError(f"{path}: damaged or absent sample: {error}.") from None
 
 
 @option_group
 class StoredSamples:
-    """Samples of a folder, named from the current one, as data of a training: ``preset: folder``.
-
-    ``held_out``: a folder of another seed for evaluations; empty: none.
-    """
+    """Samples of a folder as data of a training: ``preset: folder``."""
 
     folder: str
-    held_out: str = ""
     preset: Literal["folder"] = "folder"
 
     def sample(self, rng: np.random.Generator) -> Sample:
         """One of the samples."""
         return read_sample(self.folder, int(rng.integers(_manifest(Path(self.folder))["count"])))
 
-    def for_evaluation(self) -> Self:
-        """The same of the held-out folder."""
-        if not self.held_out:
-            raise InputError("held_out: no folder of held-out samples is named.")
-        return dataclasses.replace(cast(Any, self), folder=self.held_out)
+    def for_evaluation(self) -> Preset:
+        """The generator that drew them: it draws the held-out ones anew."""
+        return make_preset(_manifest(Path(self.folder))["options"], self.folder)
 
 
 PRESETS = {"paper": PaperOptions, "diverse": DiverseOptions, "folder": StoredSamples}

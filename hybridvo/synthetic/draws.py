@@ -65,15 +65,12 @@ def carried(T: np.ndarray, A: np.ndarray) -> np.ndarray:
 def camera_path(
     rng: np.random.Generator, frames: int, step: float, turn_deg: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(N, 4, 4) smooth, bounded T_world_cam, with and without hand shake.
-
-    Position and orientation run on ellipses, so that neither speed passes through zero, by about
-    ``step`` metres and ``turn_deg`` degrees a frame.
+    """(N, 4, 4) T_world_cam on ellipses, by about ``step`` metres and ``turn_deg`` degrees a frame,
+    with and without hand shake.
     """
     t = np.arange(frames)
 
     def wave(rate: float, low: float, high: float) -> tuple[np.ndarray, np.ndarray]:
-        """Two sinusoids in quadrature that change by ``rate`` per frame at their fastest."""
         period = rng.uniform(low, high)
         phase = 2 * np.pi * (t / period + rng.uniform())
         sign, amplitude = rng.choice([-1.0, 1.0]), rate * period / (2 * np.pi)
@@ -120,8 +117,6 @@ def smooth_field(
 
 
 KINDS = ("superellipse", "polygon", "star", "bar")
-Silhouette = list[tuple[np.ndarray, bool]]
-"""Filled outlines (N, 2) in unit coordinates; one that does not add cuts a hole."""
 
 
 def outline(rng: np.random.Generator, kind: str) -> np.ndarray:
@@ -155,41 +150,33 @@ def _unit(angle: np.ndarray) -> np.ndarray:
     return np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
-def silhouette_mask(
-    shape: Silhouette, size: tuple[int, int], centre: np.ndarray, radius: float
-) -> np.ndarray:
-    """(H, W) uint8 mask: ``centre`` (u, v) and ``radius`` of one unit in px."""
-    mask = np.zeros(size, np.uint8)
-    for points, adds in shape:
-        sixteenths = np.round((points * radius + centre) * 16).astype(np.int32)
-        cv2.fillPoly(mask, [sixteenths], int(adds), cv2.LINE_8, 4)
-    return mask
-
-
-def random_silhouette(rng: np.random.Generator) -> Silhouette:
-    """Union of one to four outlines, from which one or two smaller ones may be cut."""
+def random_silhouette(rng: np.random.Generator) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """One to four outlines, and smaller ones that are cut from their union."""
     first = KINDS[int(rng.choice(4, p=[0.35, 0.3, 0.3, 0.05]))]
-    parts = [(outline(rng, first), True)]
+    parts, holes = [outline(rng, first)], []
     for _ in range(int(rng.integers(0, 4))):
         kind = KINDS[int(rng.integers(4))]
         size = rng.uniform(0.7, 1.3) if kind == "bar" else rng.uniform(0.3, 0.8)
-        parts.append((size * outline(rng, kind) + rng.uniform(-0.6, 0.6, 2), True))
+        parts.append(size * outline(rng, kind) + rng.uniform(-0.6, 0.6, 2))
     if rng.random() < 0.4:
         for _ in range(int(rng.integers(1, 3))):
             kind = KINDS[int(rng.integers(3))]
-            points = rng.uniform(0.12, 0.4) * outline(rng, kind) + rng.uniform(-0.6, 0.6, 2)
-            parts.append((points, False))
-    return parts
+            holes.append(rng.uniform(0.12, 0.4) * outline(rng, kind) + rng.uniform(-0.6, 0.6, 2))
+    return parts, holes
 
 
 def cut_out(rng: np.random.Generator, size: int) -> np.ndarray:
     """(h, w) bool mask of a random silhouette that fills a square of ``size`` px, cropped to it."""
     while True:
-        shape = random_silhouette(rng)
-        added = np.concatenate([points for points, adds in shape if adds])
+        parts, holes = random_silhouette(rng)
+        added = np.concatenate(parts)
         low, high = added.min(axis=0), added.max(axis=0)
         radius = size / float((high - low).max())
-        mask = silhouette_mask(shape, (size, size), (size - 1 - radius * (low + high)) / 2, radius)
+        centre = (size - 1 - radius * (low + high)) / 2
+        mask = np.zeros((size, size), np.uint8)
+        for points, value in [(x, 1) for x in parts] + [(x, 0) for x in holes]:
+            sixteenths = np.round((points * radius + centre) * 16).astype(np.int32)
+            cv2.fillPoly(mask, [sixteenths], value, cv2.LINE_8, 4)
         left, top, width, height = cv2.boundingRect(mask)
         # A hole can swallow a small shape; a mover without pixels would be none.
         if width * height and cv2.countNonZero(mask) > 0.02 * mask.size:

@@ -76,60 +76,28 @@ class KnownPair:
     world: str = ""
 
 
-class Layers:
-    """Inverse depth, owner and motion of every pixel while surfaces are laid over each other.
-
-    ``rho``: (H, W) inverse depth of the background, 0 for sky; is changed in place, and its type
-    is that of the flows.
-    """
-
-    def __init__(self, K: np.ndarray, rho: np.ndarray) -> None:
-        height, width = rho.shape
-        self.K, self.rho, self.owner = K, rho, np.full(rho.shape, -1, np.int16)
-        # (W,) and (H, 1), the first two components of K^-1 x
-        self.x = ((np.arange(width) - K[0, 2]) / K[0, 0]).astype(rho.dtype)
-        self.y = ((np.arange(height)[:, None] - K[1, 2]) / K[1, 1]).astype(rho.dtype)
-        self.motions: list[np.ndarray | None] = []
-
-    def lay(self, box: tuple[slice, slice], inside: np.ndarray, rho: float) -> None:
-        """Add a flat surface that does not move yet, where it is in front of what is there.
-
-        ``inside``: (h, w) bool, its outline in the box of rows and columns; ``rho``: inverse depth.
-        """
-        shown = inside & (rho > self.rho[box])
-        self.owner[box][shown] = len(self.motions)
-        self.rho[box][shown] = rho
-        self.motions.append(None)
-
-    def flows(
-        self, T_curr_prev: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """(H, W, 2) ego flow, (H, W) its ratio of new depth to old, total flow and its ratio."""
-        focal = (float(self.K[0, 0]), float(self.K[1, 1]))
-        *uv, ego_ratio = rigid_flow(self.x, self.y, self.rho, T_curr_prev, focal)
-        ego_flow = np.stack(uv, axis=-1)
-        flow, ratio = ego_flow.copy(), ego_ratio.copy()
-        for number, motion in enumerate(self.motions):
-            if motion is not None:
-                mine = rows, columns = np.nonzero(self.owner == number)
-                x, y = self.x[columns], self.y[rows, 0]
-                *uv, ratio[mine] = rigid_flow(x, y, self.rho[mine], motion, focal)
-                flow[mine] = np.stack(uv, axis=-1)
-        return ego_flow, ego_ratio, flow, ratio
-
-
 def camera_flow(K: np.ndarray, depth: np.ndarray, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(H, W, 2) flow of the camera motion alone, and (H, W) ratio of the new depth to the old."""
-    inverse = np.divide(1.0, depth, out=np.zeros(depth.shape), where=depth > 0).astype(np.float32)
-    return Layers(K, inverse).flows(T)[:2]
+    inverse = np.divide(1.0, depth, out=np.zeros(depth.shape), where=depth > 0)
+    return image_flow(K, inverse.astype(np.float32), T)
+
+
+def image_flow(K: np.ndarray, rho: np.ndarray, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """:func:`rigid_flow` (H, W, 2) and ratio (H, W) of an image of inverse depth."""
+    x, y = rays(K, rho.shape).astype(rho.dtype)
+    u, v, ratio = rigid_flow(x, y, rho, T, (float(K[0, 0]), float(K[1, 1])))
+    return np.stack([u, v], axis=-1), ratio
+
+
+def rays(K: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
+    """(2, H, W) first two components of K^-1 x of every pixel."""
+    return np.moveaxis((pixel_grid(*size) - K[:2, 2]) / np.diag(K)[:2], -1, 0)
 
 
 def rigid_flow(x: Any, y: Any, inverse_depth: Any, T: Any, focal: Any) -> tuple[Any, Any, Any]:
     """Flow (u, v) of a rigid motion in px and the ratio of the new depth to the old.
 
-    Paper, equation 8, written as differences, so that single precision suffices: normalised
-    coordinates, inverse depth, the entries ``T[i, j]`` of the motion and the two focal lengths, all
-    of which broadcast; of numpy or torch.
+    Paper, equation 8, written as differences, so that single precision suffices; of numpy or torch.
     """
     if isinstance(T, np.ndarray):
         T = T.astype(np.asarray(x).dtype)
@@ -142,10 +110,7 @@ def rigid_flow(x: Any, y: Any, inverse_depth: Any, T: Any, focal: Any) -> tuple[
 
 
 def splat(flow: np.ndarray, rho_curr: np.ndarray) -> np.ndarray:
-    """(H, W) inverse depth of the next frame, nearest in front; 0 where nothing lands.
-
-    ``rho_curr``: (H, W) of the moved points on their own grid.
-    """
+    """(H, W) inverse depth of the next frame, nearest in front; 0 where nothing lands."""
     height, width = rho_curr.shape
     place = np.rint(flow + pixel_grid(height, width)).astype(np.int64)
     inside = ((place >= 0) & (place < (width, height))).all(axis=-1)
@@ -163,10 +128,8 @@ def splat(flow: np.ndarray, rho_curr: np.ndarray) -> np.ndarray:
 
 @option_group
 class TailSampler:
-    """Normal core with a heavy tail, truncated to an interval by rejection.
-
-    With ``tail_probability`` the value is sign(g) |g|^power, g ~ N(mean, tail_std), otherwise
-    N(mean, core_std); the branch is chosen once, then values outside [low, high] are drawn again.
+    """Normal core N(mean, core_std); with ``tail_probability`` a tail, sign(g) |g|^power with
+    g ~ N(mean, tail_std); values outside [low, high] are drawn again.
     """
 
     mean: float
@@ -253,7 +216,7 @@ class PaperOptions:
     motion: MotionSamplers = MotionSamplers()
     preset: Literal["paper"] = "paper"
 
-    def draw(self, rng: np.random.Generator) -> LayeredPair:
+    def draw(self, rng: np.random.Generator) -> dict[str, np.ndarray]:
         """One pair by steps 1 to 3: what :func:`compose` makes its flows of."""
         return _draw(rng, self)
 
@@ -261,31 +224,11 @@ class PaperOptions:
         """One pair by the five steps."""
         import torch
 
-        drawn = {k: torch.from_numpy(x)[None] for k, x in vars(self.draw(rng)).items()}
+        drawn = {k: torch.from_numpy(x)[None] for k, x in self.draw(rng).items()}
         return Sample(**{name: value[0].numpy() for name, value in compose(**drawn).items()})
 
 
-@dataclass(frozen=True, eq=False)
-class LayeredPair:
-    """A background and N flat objects, of which the nearest is seen, and how all of them move.
-
-    Args:
-        K, T_curr_prev: (3, 3) and (4, 4) float32 camera and its motion.
-        owner: (H, W) uint8, 0 for the background, else the number of an object.
-        inverse_depth: (N + 1,) float32, of the background and the objects.
-        motions: (N + 1, 4, 4) float32 of each beside the camera's, the identity where it is still.
-        moves: (N + 1,) bool.
-    """
-
-    K: np.ndarray
-    T_curr_prev: np.ndarray
-    owner: np.ndarray
-    inverse_depth: np.ndarray
-    motions: np.ndarray
-    moves: np.ndarray
-
-
-def _draw(rng: np.random.Generator, o: PaperOptions) -> LayeredPair:
+def _draw(rng: np.random.Generator, o: PaperOptions) -> dict[str, np.ndarray]:
     # Step 1. The published code resizes corner to corner, hence fx != fy at 128x256.
     f = o.focal_low + o.focal.draw(rng) * (o.focal_high - o.focal_low)
     fx = f * (o.width - 1) / (o.full_width - 1)
@@ -304,10 +247,11 @@ def _draw(rng: np.random.Generator, o: PaperOptions) -> LayeredPair:
         for _ in range(o.objects)
     ]
     inverse_depth = (1.0 / np.array([background, *depths])).astype(np.float32)
-    layers = Layers(K, np.full((o.height, o.width), inverse_depth[0]))
-    for rho in inverse_depth[1:]:
-        box, mask = _place(rng, o)
-        layers.lay(box, mask, float(rho))
+    rho = np.full((o.height, o.width), inverse_depth[0])
+    owner = np.zeros(rho.shape, np.uint8)
+    for number, nearness in enumerate(inverse_depth[1:], start=1):
+        shown = _place(rng, o) & (nearness > rho)
+        owner[shown], rho[shown] = number, nearness
 
     # Step 3.
     T = o.motion.draw(rng, min(depths, default=background))
@@ -315,38 +259,37 @@ def _draw(rng: np.random.Generator, o: PaperOptions) -> LayeredPair:
     for number, depth in enumerate(depths, start=1):
         if rng.random() < o.move_probability:
             motions[number], moves[number] = o.motion.draw(rng, depth), True
-    owner, (K32, T32, motions32) = layers.owner + 1, (x.astype(np.float32) for x in (K, T, motions))
-    return LayeredPair(K32, T32, owner.astype(np.uint8), inverse_depth, motions32, moves)
+    single = {"K": K, "T_curr_prev": T, "motions": motions}
+    drawn = {name: x.astype(np.float32) for name, x in single.items()}
+    return drawn | {"owner": owner, "inverse_depth": inverse_depth, "moves": moves}
 
 
 def compose(
     K: torch.Tensor,
     T_curr_prev: torch.Tensor,
+    motions: torch.Tensor,
     owner: torch.Tensor,
     inverse_depth: torch.Tensor,
-    motions: torch.Tensor,
     moves: torch.Tensor,
 ) -> dict[str, torch.Tensor]:
-    """Steps 4 and 5 for a batch of :class:`LayeredPair`, on any device: :class:`Sample`'s fields.
+    """Steps 4 and 5 for B pairs, on any device: the fields of :class:`Sample`.
 
-    The rigid flow of each pixel's object is **added** to the camera's, as the paper does.
+    ``motions``: (B, N + 1, 4, 4) of the background and of N flat objects beside the camera's;
+    ``owner``: (B, H, W) uint8, 0 where the background is seen, else the number of an object;
+    ``inverse_depth`` and ``moves``: (B, N + 1).
     """
     import torch
 
-    size = owner.shape[1:]
-    pixels, which = owner.flatten(1).long(), torch.arange(len(owner), device=owner.device)[:, None]
-    moving = moves[which, pixels].unflatten(1, size)
-    rho = inverse_depth[which, pixels].unflatten(1, size)
+    pixels = torch.arange(len(owner), device=owner.device)[:, None, None], owner.long()
+    moving, rho = moves[pixels], inverse_depth[pixels]
     focal = [K[:, i, i, None, None] for i in (0, 1)]
-    centre = [K[:, i, 2, None, None] for i in (0, 1)]
-    grid = (torch.arange(n, device=owner.device) for n in reversed(size))
+    grid = (torch.arange(n, device=owner.device) for n in reversed(owner.shape[1:]))
     x, y = (
-        (g - c) / f
-        for g, c, f in zip(torch.meshgrid(*grid, indexing="xy"), centre, focal, strict=True)
+        (g - K[:, i, 2, None, None]) / focal[i]
+        for i, g in enumerate(torch.meshgrid(*grid, indexing="xy"))
     )
     *ego, ego_ratio = rigid_flow(x, y, rho, T_curr_prev.permute(1, 2, 0)[..., None, None], focal)
-    own = motions[which, pixels].permute(2, 3, 0, 1).unflatten(3, size)
-    *added, change = rigid_flow(x, y, rho, own, focal)
+    *added, change = rigid_flow(x, y, rho, motions[pixels].permute(3, 4, 0, 1, 2), focal)
     ego_flow, depth_prev = torch.stack(ego, dim=-1), 1.0 / rho
     depth_curr = (depth_prev * (ego_ratio + change - 1.0)).clip(min=0.0)
     return {
@@ -362,20 +305,17 @@ def compose(
     }
 
 
-def _place(rng: np.random.Generator, o: PaperOptions) -> tuple[tuple[slice, slice], np.ndarray]:
-    """A silhouette at a uniform position of the canvas: its box in the picture and its mask."""
-    mean, spread, low, high = o.object_size
+def _place(rng: np.random.Generator, o: PaperOptions) -> np.ndarray:
+    """(H, W) bool: a silhouette at a uniform position of the canvas."""
+    size, (mean, spread, low, high) = (o.height, o.width), o.object_size
     share = -np.inf
     while not low <= share <= high:
         share = mean + spread * rng.standard_normal()
     mask = cut_out(rng, max(int(o.width * share), 2))
     if rng.random() < 0.5:
         mask = mask[:, ::-1]
-    box, crop = [], []
-    for size, extent in zip((o.height, o.width), mask.shape, strict=True):
-        margin = int(size * o.canvas_margin)
-        start = int(rng.integers(0, max(size + 2 * margin - extent, 0) + 1)) - margin
-        first, last = np.clip((start, start + extent), 0, size).tolist()
-        box.append(slice(first, last))
-        crop.append(slice(first - start, last - start))
-    return (box[0], box[1]), mask[crop[0], crop[1]]
+    (height, width), margin = mask.shape, [int(side * o.canvas_margin) for side in size]
+    canvas = np.zeros(np.maximum(np.add(size, np.multiply(2, margin)), mask.shape), bool)
+    top, left = (int(rng.integers(room + 1)) for room in np.subtract(canvas.shape, mask.shape))
+    canvas[top : top + height, left : left + width] = mask
+    return canvas[margin[0] : margin[0] + size[0], margin[1] : margin[1] + size[1]]

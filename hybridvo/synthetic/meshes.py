@@ -46,8 +46,10 @@ class Canvas:
         """Add a surface with its points where they are now, nearest wins."""
         mesh = np.dstack([surface.image, surface.measured, moving]).astype(np.float32)
         out = np.dstack([self.image, self.measured, self.moving]).astype(np.float32)
-        before, z = self.depth.copy(), np.ascontiguousarray(points[..., 2], np.float32)
-        _rasterise(image_points(points, camera), z, mesh, surface.inside, self.depth, out)
+        before, (h, w) = self.depth.copy(), points.shape[:2]
+        vertices = image_points(points, camera), points[..., 2].astype(np.float32), mesh
+        flat = (x.reshape(h * w, *x.shape[2:]) for x in (*vertices, surface.inside))
+        _rasterise(h, w, *flat, self.depth, out)
         # silhouettes are mixed pixels
         drawn = (self.depth != before).astype(np.float32)
         alpha = cv2.GaussianBlur(drawn, (3, 3), 0.7) * drawn
@@ -65,26 +67,20 @@ def image_points(points: np.ndarray, camera: Camera) -> np.ndarray:
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
-def _rasterise(uv, z, values, inside, depth, out):
-    """Draw the mesh of a pixel grid with a z-buffer, in place; values linear in the image."""
-    h, w = z.shape
+def _rasterise(h, w, uv, z, values, inside, depth, out):
+    """Draw the mesh of h x w vertices with a z-buffer, in place; values linear in the image."""
     H, W = depth.shape
-    rows, columns = np.zeros(3, np.int64), np.zeros(3, np.int64)
     for r in range(h - 1):
         for c in range(w - 1):
-            for half in range(2):
-                for k in range(3):
-                    corner = k + half  # 0 1 2 and 1 2 3 of the quad
-                    rows[k], columns[k] = r + corner // 2, c + corner % 2
-                whole = True
-                for k in range(3):
-                    whole = whole and inside[rows[k], columns[k]]
-                if not whole:
+            for half in range(2):  # triangles 0 1 2 and 1 2 3 of the quad
+                i = r * w + c + half
+                j, k = (r + half) * w + c + 1 - half, i + w
+                if not (inside[i] and inside[j] and inside[k]):
                     continue
-                u0, v0 = uv[rows[0], columns[0]]
-                u1, v1 = uv[rows[1], columns[1]]
-                u2, v2 = uv[rows[2], columns[2]]
-                z0, z1, z2 = z[rows[0], columns[0]], z[rows[1], columns[1]], z[rows[2], columns[2]]
+                u0, v0 = uv[i]
+                u1, v1 = uv[j]
+                u2, v2 = uv[k]
+                z0, z1, z2 = z[i], z[j], z[k]
                 area = (u1 - u0) * (v2 - v0) - (u2 - u0) * (v1 - v0)
                 if min(z0, z1, z2) < 0.05 or abs(area) < 1e-6 or abs(area) > 1e4:
                     continue
@@ -103,11 +99,8 @@ def _rasterise(uv, z, values, inside, depth, out):
                         if near < depth[y, x]:
                             depth[y, x] = near
                             for q in range(out.shape[2]):
-                                out[y, x, q] = (
-                                    a * values[rows[0], columns[0], q]
-                                    + b * values[rows[1], columns[1], q]
-                                    + e * values[rows[2], columns[2], q]
-                                )
+                                v = a * values[i, q] + b * values[j, q] + e * values[k, q]
+                                out[y, x, q] = v
 
 
 def filled_depth(depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -177,8 +177,7 @@ def shade(  # pragma: no cover - compiled
 ):
     """(H, W, 3) float64 in [0, 1]: multi-octave noise fixed to the body, times diffuse light.
 
-    ``scale`` (P, 3): lattice steps of the coarsest octave per unit of the unit shape; ``offset``
-    (P, 3): place in the noise; ``light_cam`` (3,): unit direction towards the light.
+    ``scale`` (P, 3): lattice steps of the coarsest octave per unit of the unit shape.
     """
     height, width = depth.shape
     image = np.zeros((height, width, 3))

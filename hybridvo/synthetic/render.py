@@ -192,9 +192,6 @@ def write_sintel(scene: Scene, root: str | os.PathLike[str], name: str) -> None:
     """Write a scene as MPI Sintel does: ``root/training/PART/NAME/frame_0001.*`` for every frame.
 
     The parts are clean, depth and camdata_left, and flow of all frames but the last.
-
-    Raises:
-        OutputError: a file that cannot be written.
     """
 
     def place(part: str, ending: str) -> Path:

@@ -13,10 +13,9 @@ from typing import Any
 import cv2
 import numpy as np
 
-from hybridvo.errors import InputError
 from hybridvo.geometry import make_transform
 from hybridvo.synthetic.draws import about, direction, log_uniform, smooth_field, turn
-from hybridvo.synthetic.layered import Layers, splat
+from hybridvo.synthetic.layered import image_flow, rays, rigid_flow, splat
 from hybridvo.synthetic.sensors import noisy_flow
 from hybridvo.types import Camera, Frame, FramePair
 
@@ -80,7 +79,7 @@ SENSOR_SCENARIOS: dict[str, Scenario] = {
     "stereo": Scenario(depth_noise=0.0, disparity_step_px=0.125, baseline_m=0.12),
     "shadows": Scenario(baseline_m=0.25),
 }
-"""Depth as Kinect's projector and stereo cameras measure it; wide borders and strips without."""
+"""Depth as Kinect's projector and stereo cameras measure it."""
 
 SCENARIOS: dict[str, Scenario] = {
     **MAIN_SCENARIOS,
@@ -103,31 +102,27 @@ def make_pair(
         ``T_curr_prev`` (4, 4), ``depth_true`` (H, W) float32 metres on the previous grid,
         ``moving`` (H, W) bool, ``object`` (H, W) uint8 label (0 is the world), ``outlier`` (H, W)
         bool, ``flow_true`` (H, W, 2) float32 of the surface, objects included.
-
-    Raises:
-        InputError: unknown cell, negative seed, or an image below 16 pixels.
     """
     name = cell if isinstance(cell, str) else "custom"
     if isinstance(cell, str):
-        if cell not in SCENARIOS:
-            raise InputError(f"make_pair: unknown cell {cell!r}; known: {', '.join(SCENARIOS)}.")
         cell = SCENARIOS[cell]
-    if seed < 0 or min(height, width) < 16:
-        raise InputError(
-            f"make_pair: expected seed >= 0 and at least 16x16 pixels, got seed {seed} and "
-            f"{height}x{width}."
-        )
     rng = np.random.default_rng([zlib.crc32(name.encode()), int(seed)])
     focal = 1120.0 * width / 1024
     camera = Camera(focal, focal, (width - 1) / 2, (height - 1) / 2, height, width)
     angle_deg = rng.uniform(0, cell.rotation_deg)
     length = rng.uniform(cell.min_translation_m, cell.translation_m)
     T = make_transform(turn(rng, angle_deg), length * direction(rng))
-    layers = Layers(camera.K, _surfaces(rng, cell, (height, width)))
-    _add_objects(rng, cell, layers, T)
-    _, _, flow, ratio = layers.flows(T)
-    seen = splat(flow, layers.rho / ratio)
-    depths = [(1.0 / np.where(r > 0, r, np.nan)).astype(np.float32) for r in (layers.rho, seen)]
+    rho = _surfaces(rng, cell, (height, width))
+    ray = rays(camera.K, rho.shape)
+    owner, motions = _add_objects(rng, cell, rho, ray, T)
+    flow, ratio = image_flow(camera.K, rho, T)
+    for number, motion in enumerate(motions, start=1):
+        mine = owner == number
+        x, y = ray[:, mine]
+        *own, ratio[mine] = rigid_flow(x, y, rho[mine], motion, (focal, focal))
+        flow[mine] = np.stack(own, axis=-1)
+    seen = splat(flow, rho / ratio)
+    depths = [(1.0 / np.where(r > 0, r, np.nan)).astype(np.float32) for r in (rho, seen)]
     measured, outlier = noisy_flow(rng, flow, cell.flow_noise_px, cell.outliers, 60.0)
     prev, curr = (
         Frame(None, _sensed(rng, cell, d, focal), camera, 0.1 * i, i) for i, d in enumerate(depths)
@@ -136,19 +131,15 @@ def make_pair(
     return pair, {
         "T_curr_prev": T,
         "depth_true": depths[0],
-        "moving": layers.owner >= 0,
-        "object": (layers.owner + 1).astype(np.uint8),
+        "moving": owner > 0,
+        "object": owner,
         "outlier": outlier,
         "flow_true": flow.astype(np.float32),
     }
 
 
 def make_model_pair(seed: int) -> tuple[FramePair, dict[str, Any]]:
-    """A static pair of 160x320 whose noise is exactly what the refinement assumes, and its truth.
-
-    Noise independent per pixel, no outliers, no second depth: the normalised error of a right
-    covariance is chi-square with six degrees of freedom.
-    """
+    """A static pair of 160x320 whose noise is what the refinement assumes, and its truth."""
     pair, truth = make_pair(Scenario(moving=0.0, outliers=0.0, depth_smooth=0.0), seed, 160, 320)
     return replace(pair, curr=replace(pair.curr, depth=None)), truth
 
@@ -177,11 +168,14 @@ def _unit_grid(size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
     return np.linspace(-0.5, 0.5, size[1])[None], np.linspace(-0.5, 0.5, size[0])[:, None]
 
 
-def _add_objects(rng: np.random.Generator, cell: Scenario, layers: Layers, T: np.ndarray) -> None:
-    """Lay objects of the wanted share over the scene, each with a motion of its own."""
+def _add_objects(
+    rng: np.random.Generator, cell: Scenario, rho: np.ndarray, ray: np.ndarray, T: np.ndarray
+) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Lay objects of the wanted share over the scene: who is where, and how each moves."""
+    height, width = size = rho.shape
+    owner, motions = np.zeros(size, np.uint8), list[np.ndarray]()
     if cell.moving <= 0:
-        return
-    height, width = size = layers.rho.shape
+        return owner, motions
     (u, v), aspect = _unit_grid(size), width / height
     # one object must not rival the scene, or the pair has no right answer; ``one60`` is about that
     largest = np.inf if cell.objects == 1 else 0.8 * (1 - cell.moving)
@@ -193,20 +187,20 @@ def _add_objects(rng: np.random.Generator, cell: Scenario, layers: Layers, T: np
             distance.append(((u * aspect - x) * stretch) ** 2 + ((v - y) / stretch) ** 2)
         nearest = np.min(distance, axis=0)
         inside = nearest < np.quantile(nearest, cell.moving)
-        layers.owner = np.where(inside, np.argmin(distance, axis=0), -1).astype(np.int16)
-        if np.bincount(layers.owner[inside]).max() <= largest * inside.size:
+        owner = np.where(inside, np.argmin(distance, axis=0) + 1, 0).astype(np.uint8)
+        if np.bincount(owner[inside]).max() <= largest * inside.size:
             break
-    for k in range(cell.objects):
-        mine = layers.owner == k
+    for number in range(1, cell.objects + 1):
+        mine = owner == number
         slope = rng.uniform(-0.5, 0.5, 2)
         surface = (1 + slope[0] * u + slope[1] * v) / log_uniform(rng, (2.0, 12.0))
-        layers.rho[mine] = surface[mine]
-        ray = [np.broadcast_to(x, size)[mine].mean() for x in (layers.x, layers.y)]
-        centre = np.array([*ray, 1.0]) / layers.rho[mine].mean()
+        rho[mine] = surface[mine]
+        centre = np.array([*ray[:, mine].mean(axis=1), 1.0]) / rho[mine].mean()
         heading = rng.uniform(0, 2 * np.pi)
         towards = np.array([np.cos(heading), np.sin(heading), rng.uniform(-0.5, 0.5)])
         t = rng.uniform(8, 70) / 1120 * centre[2] * towards
-        layers.motions.append(T @ about(turn(rng, rng.uniform(0, 5)), centre, t))
+        motions.append(T @ about(turn(rng, rng.uniform(0, 5)), centre, t))
+    return owner, motions
 
 
 def _sensed(

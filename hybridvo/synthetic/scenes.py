@@ -1,8 +1,4 @@
-"""Scene families: a furnished room, a camera path and movers that keep a wanted share of the view.
-
-Every family is drawn from one seed; movers are sized, and draws rejected, until the share of
-moving pixels is inside the family's band in every frame.
-"""
+"""Scene families: a furnished room, a camera path, movers that keep a wanted share of the view."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
 """Pairs whose surfaces are real: recordings as the world, cuts from other recordings as movers.
 
-The world is two frames of a static recording, or one frame seen from two places. Movers are cut
-out along irregular outlines, placed in front of the world or partly behind it, and each moves by
-itself. Both images and depth maps then get a sensor's errors, the movers no less than the world.
+The world is two frames of a static recording, or one frame seen from two places. Both images and
+depth maps get a sensor's errors, the movers no less than the world.
 """
 
 from __future__ import annotations
@@ -95,11 +94,7 @@ class Recording:
 
 @functools.cache
 def load_split(folder: str | Path, split: str) -> tuple[Recording, ...]:
-    """Recordings of a part of :data:`SPLITS` that lie below a folder.
-
-    Raises:
-        InputError: another part, or none of its recordings is there.
-    """
+    """Recordings of a part of :data:`SPLITS` that lie below a folder."""
     if split not in SPLITS:
         raise InputError(f"split: expected {', '.join(SPLITS)}, got {split!r}.")
     there = [s for s in SPLITS[split] if (Path(folder) / s.path).is_dir()]

@@ -140,13 +140,6 @@ def load_pwvo_options(
     return options, Mixture(tuple(presets), options.data_weights)
 
 
-def recorded_run(record: dict[str, Any], where: str) -> tuple[PwvoOptions, Mixture]:
-    """Options and data of a run from the record in its checkpoint ``where``."""
-    options = build_options(PwvoOptions, record["options"], where)
-    presets = [dataset.make_preset(mapping, where) for mapping in record["data"]]
-    return options, Mixture(tuple(presets), options.data_weights)
-
-
 def load_selector_options(path: str | Path) -> SelectorOptions:
     """Options of a ``configs/train_selector.yaml``."""
     return build_options(SelectorOptions, read_yaml(path), str(path))

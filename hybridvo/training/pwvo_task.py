@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -10,10 +11,10 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import nn
-from torch.utils.data import DataLoader, IterableDataset, get_worker_info
+from torch.utils.data import DataLoader, Dataset
 
 from hybridvo.network.losses import total_loss
-from hybridvo.network.normalization import first_motions
+from hybridvo.network.prediction import first_motions
 from hybridvo.network.pwvo import build_network
 from hybridvo.network.selection import fitted_motion, select_motion
 from hybridvo.results import PixelwisePrediction
@@ -25,7 +26,6 @@ from hybridvo.training.validation import (
     PUBLISHED_SEED,
     DrawnBatch,
     TrainingBatch,
-    collate,
     evaluate_network,
     held_out,
 )
@@ -35,31 +35,35 @@ FIT_FLOOR_PX, FIT_LIMIT_PX = 0.05, 100.0
 is charged, also behind the camera."""
 
 
-class SampleStream(IterableDataset):
-    """Endless batches of a mixture, from the sample ``start`` of a seed.
+class _Drawn(Dataset[dict[str, np.ndarray]]):
+    """The training samples of a seed by their number."""
 
-    Workers take batches in turn and the loader hands them over in order: their number changes
-    nothing.
-    """
+    def __init__(self, mixture: Mixture, seed: int) -> None:
+        self.mixture, self.seed = mixture, seed
 
-    def __init__(self, mixture: Mixture, seed: int, start: int, batch_size: int) -> None:
-        self.mixture, self.seed, self.start, self.batch_size = mixture, seed, start, batch_size
-
-    def __iter__(self) -> Iterator[TrainingBatch | DrawnBatch]:
-        worker = get_worker_info()
-        turn, turns = (0, 1) if worker is None else (worker.id, worker.num_workers)
-        while True:
-            first = self.start + turn * self.batch_size
-            numbers = range(first, first + self.batch_size)
-            draws = (sample_generator(self.seed, i, TRAINING) for i in numbers)
-            yield self._batch(list(draws))
-            turn += turns
-
-    def _batch(self, draws: list[np.random.Generator]) -> TrainingBatch | DrawnBatch:
+    def __getitem__(self, index: int) -> dict[str, np.ndarray]:
+        rng = sample_generator(self.seed, index, TRAINING)
         first, *others = self.mixture.presets
-        if isinstance(first, PaperOptions) and not others:
-            return DrawnBatch([first.draw(rng) for rng in draws])
-        return collate([self.mixture.sample(rng) for rng in draws])
+        if isinstance(first, PaperOptions) and not others:  # these travel without their flows
+            return first.draw(rng)
+        return vars(self.mixture.sample(rng))
+
+
+def sample_stream(
+    mixture: Mixture, seed: int, start: int, batch_size: int, workers: int = 0
+) -> Iterator[DrawnBatch]:
+    """Endless batches of a mixture, from sample ``start`` of a seed, however many workers draw."""
+    numbers: Any = (range(k, k + batch_size) for k in itertools.count(start, batch_size))
+    fork = "fork" if workers else None
+    return iter(
+        DataLoader(
+            _Drawn(mixture, seed),
+            batch_sampler=numbers,
+            collate_fn=DrawnBatch,
+            num_workers=workers,
+            multiprocessing_context=fork,
+        )
+    )
 
 
 class PwvoTask:
@@ -71,11 +75,10 @@ class PwvoTask:
         self.network = build_network(options.network)
         self.data = mixture.record
 
-    def batches(self, samples: int, workers: int) -> Iterator[TrainingBatch | DrawnBatch]:
+    def batches(self, samples: int, workers: int) -> Iterator[DrawnBatch]:
         """Batches of the run's stream from sample number ``samples`` on."""
-        stream = SampleStream(self.mixture, self.options.seed, samples, self.options.batch_size)
-        how = {"num_workers": workers, "multiprocessing_context": "fork" if workers else None}
-        return iter(DataLoader(stream, batch_size=None, **how))  # type: ignore[arg-type]
+        o = self.options
+        return sample_stream(self.mixture, o.seed, samples, o.batch_size, workers)
 
     def loss(
         self, batch: TrainingBatch, step: int, progress: float
@@ -120,8 +123,7 @@ def fit_loss(
 ) -> torch.Tensor:
     """Log of the error of the ego flow that the fit to the trusted pixels gives, mean over pairs.
 
-    The gradient goes through the fit into s. The logarithm lets pairs that are far off and pairs
-    that are nearly right learn alike.
+    The logarithm lets pairs that are far off and pairs that are nearly right learn alike.
     """
     T = fitted_motion(output, batch.inputs, options.selection)
     gt = batch.targets.subsample(options.loss_stride)
@@ -136,10 +138,9 @@ def fit_loss(
 def separation_loss(
     output: PixelwisePrediction, batch: TrainingBatch, options: PwvoOptions
 ) -> torch.Tensor:
-    """How often s of the rotation is larger on a static pixel than on a moving one, smoothed.
+    """Logistic bound of one minus the area under the ROC curve of s as a detector of movers.
 
-    The logistic bound of one minus the area under the ROC curve, over pixels of the whole batch:
-    s has to tell movers apart across pairs as well.
+    Over pixels of the whole batch: s has to tell movers apart across pairs as well.
     """
     s = output.log_scale
     if s is None:

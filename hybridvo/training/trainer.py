@@ -1,4 +1,4 @@
-"""One training loop for every task: updates, running average, checkpoints.
+"""One training loop for every task: updates, running average, checkpoints, weights for users.
 
 An interrupted run takes the same updates as one that was not, if the schedule counts updates.
 """
@@ -11,6 +11,7 @@ import dataclasses
 import json
 import math
 import pickle
+import subprocess
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -22,16 +23,20 @@ from torch import nn
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from hybridvo.errors import CheckpointError, DegenerateError, InputError
-from hybridvo.files import atomic_write
-from hybridvo.training.options import RunOptions
+from hybridvo.files import atomic_write, read_text, write_json
+from hybridvo.network.weights import save_weights
+from hybridvo.synthetic.dataset import Mixture, build_options, make_preset
+from hybridvo.training.options import PwvoOptions, RunOptions, SelectorOptions
 from hybridvo.training.pwvo_task import PwvoTask
 from hybridvo.training.selector_task import SelectorTask
+from hybridvo.training.validation import calibrate_scales
 
 FREE_TO_CHANGE = {"checkpoint_minutes", "log_every", "evaluate_every", "evaluate_count"}
 """Options in which a resumed run may differ: they do not touch what is learned."""
 PROGRESS = ("step", "samples", "skipped", "elapsed_s")
 """Numbers of a run that its checkpoint keeps."""
-CHECKPOINT, LOG = "checkpoint.pt", "log.jsonl"
+CHECKPOINT, LOG, RUN = "checkpoint.pt", "log.jsonl", "run.json"
+"""State of a run, its log, and its command, commit and versions."""
 MAX_SKIPPED = 50
 """Updates in a row without a finite gradient after which a run is given up."""
 
@@ -83,11 +88,7 @@ class Trainer:
         return json.loads(json.dumps(record))
 
     def update(self, batch: Any, progress: float) -> dict[str, float]:
-        """One step of the optimiser when ``progress`` of the run is done; returns its figures.
-
-        Raises:
-            DegenerateError: the loss or the gradient was not finite :data:`MAX_SKIPPED` times.
-        """
+        """One step of the optimiser when ``progress`` of the run is done; returns its figures."""
         optimizer = self.options.optimizer
         rate = optimizer.learning_rate * self.options.schedule.factor(progress)
         for group in self.optimizer.param_groups:
@@ -117,10 +118,9 @@ class Trainer:
         return figures | {name: float(part) for name, part in parts.items()}
 
     def run(self, time_limit_s: float = math.inf, until: int | None = None) -> str:
-        """Train, save, and say why it ended: ``steps``, ``time`` or ``signal``.
+        """Train, save, and say why it ended: ``steps`` (of which ``until``), ``time``, ``signal``.
 
-        ``time_limit_s`` counts over all interruptions; ``until``: pause at this update, with the
-        schedule of the whole run.
+        ``time_limit_s`` counts over all interruptions.
         """
         options = self.options
         last = min(until or options.steps, options.steps)
@@ -182,11 +182,7 @@ class Trainer:
             self.exported.load_state_dict(weights)
 
     def resume(self) -> bool:
-        """Go on where the folder's checkpoint ended, if there is one of the same options and data.
-
-        Raises:
-            CheckpointError: a damaged file. InputError: of a run of other options or other data.
-        """
+        """Go on where the folder's checkpoint ended, if there is one, of the same options."""
         if self.folder is None or not (self.folder / CHECKPOINT).exists():
             return False
         path = self.folder / CHECKPOINT
@@ -230,3 +226,65 @@ def _means(entries: list[dict[str, float]]) -> dict[str, float]:
     names = dict.fromkeys(name for entry in entries for name in entry)
     found = {n: [e[n] for e in entries if math.isfinite(e.get(n, math.nan))] for n in names}
     return {name: float(np.mean(values)) for name, values in found.items() if values}
+
+
+# --- weights for users ----------------------------------------------------------------------------
+
+
+def source_commit() -> str | None:
+    """Commit of the working tree, with a mark if it was changed; None outside of a repository."""
+    command = "git describe --always --dirty --abbrev=40 --exclude *".split()
+    how: dict[str, Any] = {"cwd": Path(__file__).parent, "stderr": subprocess.DEVNULL}
+    try:
+        return subprocess.check_output(command, text=True, **how).strip()
+    except (OSError, subprocess.SubprocessError):
+        return None
+
+
+def open_run(folder: str | Path) -> Trainer:
+    """A run as its checkpoint describes it."""
+    path = Path(folder) / CHECKPOINT
+    record = read_checkpoint(path)["record"]
+    task: PwvoTask | SelectorTask
+    if record["options"]["network"]["kind"] == "selector":
+        chosen = build_options(SelectorOptions, record["options"], str(path))
+        task = SelectorTask(chosen, Path(record["data"]))
+    else:
+        options = build_options(PwvoOptions, record["options"], str(path))
+        presets = tuple(make_preset(mapping, str(path)) for mapping in record["data"])
+        task = PwvoTask(options, Mixture(presets, options.data_weights))
+    trainer = Trainer(task, Path(folder))
+    trainer.resume()
+    return trainer
+
+
+def export_run(
+    folder: str | Path, path: str | Path, count: int = 1000, calibrate: int = 0
+) -> dict[str, Any]:
+    """Write a run's weights as float16 safetensors, and its card beside them as JSON.
+
+    ``count``: held-out pairs of each preset for the figures of the card; ``calibrate``: development
+    pairs over which PWVO's scales of the translation are calibrated.
+    """
+    trainer = open_run(folder)
+    card = {
+        "updates": trainer.step,
+        "samples": trainer.samples,
+        "skipped_updates": trainer.skipped,
+        "training_hours": round(trainer.elapsed_s / 3600, 2),
+        **trainer.record,
+    }
+    try:
+        card |= json.loads(read_text(Path(folder) / RUN))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{folder}: no {RUN} of a training: {error}.") from None
+    task, network = trainer.task, trainer.exported
+    if calibrate and isinstance(task, PwvoTask):
+        main = task.mixture.presets[int(np.argmax(task.options.data_weights))]
+        shift = calibrate_scales(network, main, calibrate)
+        card["calibration"] = {"pairs": calibrate, "seed": 0, "added_to_s": shift}
+    network = network.half().float()
+    card["held_out"] = task.evaluate(network, count)
+    save_weights(path, network, card, "float16")
+    write_json(Path(path).with_suffix(".json"), card)
+    return card

@@ -1,13 +1,9 @@
-"""Batches of samples, and figures of a network on held-out synthetic pairs.
-
-Seeds 0 to 999 are for development, 1000 and up for published figures; no training run has seen
-either.
-"""
+"""Batches of samples, and figures of a network on held-out synthetic pairs."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -18,17 +14,17 @@ from scipy.stats import mannwhitneyu, spearmanr
 from hybridvo.errors import InputError
 from hybridvo.network.inputs import NetworkInputs, assemble_inputs
 from hybridvo.network.losses import LossTargets
-from hybridvo.network.normalization import predict
+from hybridvo.network.prediction import predict
 from hybridvo.network.selection import select_pose
 from hybridvo.results import PixelwisePrediction
 from hybridvo.synthetic.dataset import Preset
 from hybridvo.synthetic.draws import sample_generator
-from hybridvo.synthetic.layered import LayeredPair, Sample, compose
+from hybridvo.synthetic.layered import Sample, compose
 from hybridvo.torch_geometry import euler_motion, euler_transform
 from hybridvo.types import PairBatch
 
 PUBLISHED_SEED = 1000
-"""First seed of published figures; smaller ones are for development."""
+"""First seed of published figures; smaller ones are for development. No training sees either."""
 EPE_LIMIT_PX = 400.0
 """Pixels with a true ego flow of this length or more count as 0 in EPE, as published."""
 FIGURES = ("r_err_deg", "t_err", "epe")
@@ -52,42 +48,33 @@ class TrainingBatch:
 
 
 class DrawnBatch:
-    """Pairs of the paper's five steps before their flows: these are computed where they go."""
+    """Fields of B samples, or of pairs before :func:`compose`, which computes where they go."""
 
-    def __init__(self, pairs: Sequence[LayeredPair]) -> None:
-        self.parts = _stacked(pairs)
+    def __init__(self, rows: Sequence[dict[str, np.ndarray]]) -> None:
+        self.parts = {n: torch.from_numpy(np.stack([row[n] for row in rows])) for n in rows[0]}
 
     def __len__(self) -> int:
         return len(self.parts["K"])
 
     def to(self, device: torch.device | str) -> TrainingBatch:
         """The training batch, on a device."""
-        return _assemble(compose(**{name: part.to(device) for name, part in self.parts.items()}))
+        of = {name: part.to(device) for name, part in self.parts.items()}
+        of = compose(**of) if "motions" in of else of
+        K, T = of["K"], of["T_curr_prev"]
+        pairs = PairBatch(of["flow"], of["depth_prev"], K, K, of["depth_curr"])
+        truth = euler_motion(T), of["ego_flow"].permute(0, 3, 1, 2)
+        targets = LossTargets(*truth, of["depth_true"], of["depth_target"], K, K)
+        inputs = assemble_inputs(pairs, None, is_aligned=True)
+        return TrainingBatch(inputs, targets, of["moving"])
 
 
 def collate(samples: Sequence[Sample]) -> TrainingBatch:
     """Batch of at least one sample, all of one size."""
-    return _assemble(_stacked(samples))
-
-
-def _stacked(samples: Sequence[Any]) -> dict[str, torch.Tensor]:
-    """Fields of samples as tensors with a row for each."""
-    names = [field.name for field in fields(samples[0])]
-    return {n: torch.from_numpy(np.stack([getattr(s, n) for s in samples])) for n in names}
-
-
-def _assemble(of: dict[str, torch.Tensor]) -> TrainingBatch:
-    """Batch of the stacked fields of samples."""
-    K, T = of["K"], of["T_curr_prev"]
-    pairs = PairBatch(of["flow"], of["depth_prev"], K, K, of["depth_curr"])
-    truth = euler_motion(T), of["ego_flow"].permute(0, 3, 1, 2)
-    targets = LossTargets(*truth, of["depth_true"], of["depth_target"], K, K)
-    inputs = assemble_inputs(pairs, None, is_aligned=True)
-    return TrainingBatch(inputs, targets, of["moving"])
+    return DrawnBatch([vars(sample) for sample in samples]).to("cpu")
 
 
 def held_out(preset: Preset, seed: int, count: int) -> list[TrainingBatch]:
-    """Batches of the samples 0 to ``count`` - 1 of a seed; of a folder, of its held-out ones."""
+    """Batches of the samples 0 to ``count`` - 1 of a seed; of a folder, as it was drawn."""
     preset = preset.for_evaluation() if hasattr(preset, "for_evaluation") else preset
     samples = [preset.sample(sample_generator(seed, i)) for i in range(count)]
     return [collate(samples[first : first + BATCH]) for first in range(0, count, BATCH)]
@@ -106,13 +93,10 @@ def evaluate_network(
 ) -> dict[str, Any]:
     """Errors of a network's selected pose on :func:`held_out` samples.
 
-    Returns:
-        ``r_err_deg``, ``t_err`` (metres) and ``epe`` (px at the sample's size), the paper's
-        component means; the same of zero motion under ``zero_*``, medians under ``median_*``, the
-        EPE of each pair under ``epe_of_pairs``. Of the uncertainty of rotation and translation,
-        None without: ``auroc_*`` of the mean log scale as a detector of moving pixels,
-        ``spearman_*`` with the pixel's own error, ``laplace_ratio_*`` and ``median_ratio_*``, the
-        mean and the median of |error| / exp(s): 1 and 0.69 for calibrated Laplace scales.
+    ``r_err_deg``, ``t_err`` (metres), ``epe`` (px at the sample's size): the paper's component
+    means; ``zero_*``: of zero motion. Of the uncertainty: ``auroc_*`` of s as a detector of moving
+    pixels, ``spearman_*`` with the pixel's own error, ``laplace_ratio_*`` and ``median_ratio_*``,
+    mean and median of |error| / exp(s): 1 and 0.69 for calibrated Laplace scales.
     """
     if not batches:
         raise InputError("evaluate_network: expected at least one batch of samples, got none.")
@@ -190,9 +174,6 @@ def calibrate_scales(
     """Add to s of the translation what makes the mean of |error| / exp(s) one; says how much.
 
     The scales of the rotation are left alone: they are the weights of the fit.
-
-    Raises:
-        InputError: a network without uncertainty.
     """
     head = getattr(network, "head_uncertainty", None)
     if head is None:

@@ -150,8 +150,6 @@ def test_what_a_users_function_returns_is_a_flow() -> None:
     flow = np.zeros((HEIGHT, WIDTH, 2))
     pair = given(flow)
     assert pair.flow_source == "network" and pair.flow.dtype == np.float32
-    flow[3, 4, 1] = np.inf
-    assert np.isnan(given(flow).flow[3, 4]).all() and np.isfinite(given(flow).flow).sum() > 2
 
 
 @pytest.mark.parametrize(

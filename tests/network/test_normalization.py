@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hybridvo.geometry import ego_flow, se3_exp
 from hybridvo.network.inputs import NetworkInputs, assemble_inputs
 from hybridvo.network.losses import LossOptions, LossTargets, total_loss
-from hybridvo.network.normalization import first_motions, predict, remove_scale
+from hybridvo.network.prediction import first_motions, normalize, predict
 from hybridvo.network.pwvo import NetworkOptions, build_network
 from hybridvo.network.selection import fitted_motion
 from hybridvo.results import PixelwisePrediction
@@ -19,6 +19,7 @@ from hybridvo.torch_geometry import euler_motion
 from hybridvo.types import Camera, PairBatch
 
 CAMERA = Camera(60.0, 62.0, 31.5, 15.5, 32, 64)
+SCALE_FREE = NetworkOptions(scale_free=True)
 MOTION = se3_exp(np.array([0.05, -0.03, 0.08, 0.004, -0.006, 0.01]))
 
 
@@ -57,7 +58,7 @@ def test_scales_by_hand():
     # 3 px of flow everywhere at 60 px focal length: 0.05 rad; depth 2 m everywhere
     flow = np.zeros((32, 64, 2))
     flow[..., 0] = 3.0
-    inputs, scale = remove_scale(inputs_of(flow, np.full((32, 64), 2.0)))
+    inputs, scale = normalize(inputs_of(flow, np.full((32, 64), 2.0)), SCALE_FREE)
     expected = [np.rad2deg(0.05)] * 3 + [0.1] * 3
     np.testing.assert_allclose(scale.factor[0], expected, rtol=1e-5)
     # flow over itself is 1, squashed at 10: 1 / 1.1
@@ -70,7 +71,9 @@ def test_scales_by_hand():
 def test_change_of_depth_is_counted_in_units_of_the_motion():
     flow = np.zeros((32, 64, 2))
     flow[..., 0] = 3.0
-    inputs, _ = remove_scale(inputs_of(flow, np.full((32, 64), 2.0), np.full((32, 64), 2.2)))
+    inputs, _ = normalize(
+        inputs_of(flow, np.full((32, 64), 2.0), np.full((32, 64), 2.2)), SCALE_FREE
+    )
     change = np.log(1.1) / 0.05
     np.testing.assert_allclose(inputs.inverse_depth[0, 1], change / (1 + change / 10), rtol=1e-4)
 
@@ -92,7 +95,7 @@ def test_a_scene_twice_as_large_moves_by_twice_as_many_metres(factor):
 def test_the_true_motion_leaves_nothing_unexplained():
     inputs = static_inputs()
     T = torch.tensor(MOTION, dtype=torch.float32)[None]
-    left, scale = remove_scale(inputs, T)
+    left, scale = normalize(inputs, SCALE_FREE, T)
     # what is left is rounding: far below the smallest scale, 5e-5 rad
     assert float(scale.factor[0, 0]) == pytest.approx(np.rad2deg(5e-5))
     assert float(left.flow.abs().max()) < 0.1

@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 
 from hybridvo.geometry import rotation_angle, se3_exp
 from hybridvo.network.selection import MIN_SCALE, pixel_weights
-from hybridvo.refinement.batch import Pixels
-from hybridvo.refinement.torch_factors import fit_pixels
+from hybridvo.refinement.torch_factors import Pixels, fit_pixels
 from hybridvo.torch_geometry import se3
 
 COUNT = 600

@@ -14,7 +14,7 @@ from safetensors.torch import load_file, save_file
 from hybridvo.errors import CheckpointError, InputError, OutputError
 from hybridvo.network.models import Models, load_weights
 from hybridvo.network.pwvo import NetworkOptions, build_network
-from hybridvo.network.weights import FORMAT, pretrained_names, save_weights, weights_file
+from hybridvo.network.weights import FORMAT, PRETRAINED, save_weights, weights_file
 
 OPTIONS = NetworkOptions(width=0.125)
 CARD = {"preset": "paper", "samples": 12, "figures": {"r_err_deg": 0.1}}
@@ -160,14 +160,15 @@ def test_damaged_options_and_cards(saved, options):
 
 def test_pretrained_weights_load_and_are_small():
     rows = {"pwvo-paper", "pwvo-uncertain", "pwvo-naive", "pixelwise", "vonet", "vonet-attention"}
-    assert set(pretrained_names()) == {"pwvo", "selector", *rows}
-    for name in pretrained_names():
+    names = [path.stem for path in PRETRAINED.glob("*.safetensors")]
+    assert set(names) == {"pwvo", "selector", *rows}
+    for name in names:
         network, card = load_weights(name)
         kind = "pwvo" if name == "pixelwise" else name.split("-")[0]
         assert network.options.kind.startswith(kind)
         assert {"command", "commit", "held_out"} <= set(card)
         assert json.loads(weights_file(name).with_suffix(".json").read_text()) == card
-    assert sum(weights_file(name).stat().st_size for name in pretrained_names()) < 23e6
+    assert sum(weights_file(name).stat().st_size for name in names) < 23e6
     for name in ("pwvo-wid", "../pwvo", ""):
         with pytest.raises(CheckpointError, match="pwvo, pwvo-naive"):
             weights_file(name)

@@ -35,12 +35,11 @@ IMPORTS: dict[str, set[str]] = {
     "hypotheses": NOUNS | {"refinement"},
     "network": NOUNS | {"torch_geometry", "refinement", "hypotheses"},
     "pipeline": NOUNS | {"network", "hypotheses", "refinement", "images", "baselines", "flow"},
-    "api": NOUNS | {"pipeline", "flow", "network", "refinement"},
-    "odometry": NOUNS | {"api", "pipeline", "flow", "trajectory", "network"},
+    "odometry": NOUNS | {"pipeline", "flow", "trajectory", "network"},
     # pairs made of recordings are refined before something is moved in them
     "synthetic": NOUNS | {"trajectory", "data", "flow", "refinement"},
     "evaluation": NOUNS
-    | {"trajectory", "data", "pipeline", "api", "odometry", "flow", "network", "refinement"}
+    | {"trajectory", "data", "pipeline", "odometry", "flow", "network", "refinement"}
     | {"__init__"},
     "training": NOUNS
     | {"torch_geometry", "data", "synthetic", "network", "hypotheses", "refinement"}

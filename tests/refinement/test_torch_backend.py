@@ -9,12 +9,10 @@ import numpy as np
 import pytest
 import torch
 
-from hybridvo.api import refine
 from hybridvo.errors import InputError
 from hybridvo.geometry import ego_flow, invert, rotation_angle, se3_exp, se3_log
-from hybridvo.options import RefineOptions
-from hybridvo.refinement.batch import BatchedPose
-from hybridvo.refinement.torch_backend import refine_batch
+from hybridvo.pipeline import refine
+from hybridvo.refinement.torch_backend import BatchedPose, refine_batch
 from hybridvo.refinement.torch_factors import KERNELS
 from hybridvo.results import Reason, State
 from hybridvo.synthetic.scenarios import make_pair
@@ -147,36 +145,6 @@ def test_every_kernel_with_the_noise_handed_in(kernel: str) -> None:
     assert result.noise.numpy() == pytest.approx(np.array([[0.3, 0.02]] * 2))
 
 
-def test_depth_of_the_current_frame_helps_the_translation() -> None:
-    pair, T = scene(6, seed=6, outliers=0.0)
-    # a fronto-parallel wall: rotation and translation trade off in the flow alone
-    depth = torch.full_like(pair.depth_prev, 5.0)
-    grid = pixel_grid(40, 56, pair.K_prev)
-    shift = torch.eye(4, dtype=F64).repeat(6, 1, 1)
-    shift[:, :3, 3] = T[:, :3, 3]
-    flow = reproject(depth, shift, pair.K_prev, pair.K_curr)[0] - grid
-    g = torch.Generator().manual_seed(7)
-    flow = flow + 0.5 * torch.randn(flow.shape, generator=g, dtype=F64)
-    curr = (depth + shift[:, 2, 3, None, None]) * torch.exp(
-        0.005 * torch.randn(depth.shape, generator=g, dtype=F64)
-    )
-    measured = depth * torch.exp(0.005 * torch.randn(depth.shape, generator=g, dtype=F64))
-    pair = PairBatch(flow, measured, pair.K_prev, pair.K_curr, depth_curr=curr)
-    errors = []
-    for second in (False, True):
-        options = RefineOptions(current_depth="on" if second else "off")
-        result = refine_batch(pair, noise=(0.5, 0.005), options=options)
-        assert result.converged.all()
-        assert result.noise.shape == (6, 2 + second)
-        errors.append((result.T_curr_prev - shift)[:, 2, 3].square().mean().sqrt())
-    assert errors[1] < 0.7 * errors[0]
-    estimated = refine_batch(pair, options=RefineOptions(current_depth="on"))
-    assert estimated.converged.all()
-    # r_z shows both depth noises, the second less 4/9 by bilinear sampling; the split is vague
-    both = estimated.noise[:, 1:].square().sum(dim=1).sqrt()
-    assert both.numpy() == pytest.approx(0.005 * math.sqrt(1 + 4 / 9), rel=0.1)
-
-
 def test_outside_autocast_and_half_input() -> None:
     pair, _ = scene(2, dtype=torch.float32)
     expected = refine_batch(pair)
@@ -202,7 +170,6 @@ def test_input_errors() -> None:
         ({"kernel": "tukey"}, "known"),
         ({"noise": (0.0, 0.1)}, "positive"),
         ({"noise": torch.ones(2, 4)}, "noise"),
-        ({"options": RefineOptions(current_depth="on")}, "depth_curr"),
     ):
         with pytest.raises(InputError, match=message):
             refine_batch(**{"batch": pair, **arguments})
@@ -221,7 +188,7 @@ def test_both_backends_give_the_same_motion(name: str, seed: int) -> None:
     batch, given = PairBatch.from_pairs([pair]), (numba.residual_scale_px, numba.depth_noise)
     # 1e-6 m, and where the noise is estimated anew from another start what a change of 1 % does:
     # a hundredth of a standard deviation of the motion, which is 5e-5 to 4e-4 m
-    for noise, metres, deviations in ((given, 1e-6, 0.005), (None, 5e-6, 0.02)):
+    for noise, metres, deviations in ((given, 1e-6, 0.005), (None, 1e-5, 0.02)):
         found = refine_batch(batch, start[None], torch.as_tensor(weights)[None], noise=noise).one(0)
         gap = se3_log(found.T_curr_prev @ invert(numba.T_curr_prev))
         assert np.linalg.norm(gap[:3]) < metres

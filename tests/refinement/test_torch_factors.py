@@ -11,17 +11,14 @@ import torch
 
 from hybridvo.geometry import ego_flow, pixel_grid, se3_exp
 from hybridvo.refinement import coarse_fit
-from hybridvo.refinement.batch import from_tiles, gather_pixels, to_tiles
 from hybridvo.refinement.pixels import PixelGrid
 from hybridvo.refinement.refine import FlowFactor
 from hybridvo.refinement.torch_factors import (
     KERNELS,
     RobustNoise,
-    jacobian,
+    gather_pixels,
     linearize,
     residuals,
-    scores,
-    sensitivity,
     solve_small,
     weigh,
 )
@@ -40,26 +37,27 @@ def test_one_pixel_by_hand() -> None:
     T = pp.SE3(torch.tensor([[0.1, 0, 0.5, 0, 0, 0, 1]], dtype=F64))
     pixels = gather_pixels(PairBatch(flow, depth, K, K))
     assert pixels.weight.sum() == 1
-    terms, at = residuals(pixels, T), 5
+    at, exact = 5, RobustNoise(torch.tensor([[0.5, 0.0]], dtype=F64), 1e9)
+    r, plain = residuals(pixels, T.matrix())[0], weigh(pixels, T.matrix(), exact)
     # a = 0.048, so the pixel lands at 5.8: residual 7 - 5.8; q = 100/2.5 (0.048 0.5 - 0.1)
-    found = [float(x) for x in (*terms.r[0, :, at], *sensitivity(pixels, terms)[0, :, at])]
+    found = [float(x) for x in (*r[0, :, at], *plain.q[0, :, at])]
     assert found == pytest.approx([1.2, 1.0, 40 * (0.024 - 0.1), 0.0], abs=1e-12)
-    rows = jacobian(pixels, terms)[0]
+    rows = plain.jacobian()[0, :, :, at].T
     expected = 100 * np.array([0.4, 0, -0.048 * 0.4, 0, 1 + 0.048**2, 0])
-    assert rows[0, :, at].numpy() == pytest.approx(expected, abs=1e-12)
-    assert rows[1, :, at].numpy() == pytest.approx([0, 40, 0, -100, 0, 4.8], abs=1e-12)
+    assert rows[0].numpy() == pytest.approx(expected, abs=1e-12)
+    assert rows[1].numpy() == pytest.approx([0, 40, 0, -100, 0, 4.8], abs=1e-12)
     # Sigma_uu = 0.25 + 0.01 q^2; most likely log depth: e = 0.01 q 1.2 / Sigma_uu beyond log 2
     q = -40 * 0.076
     e = 0.01 * q * 1.2 / (0.25 + 0.01 * q * q)
     how = RobustNoise(torch.tensor([[0.5, 0.1]], dtype=F64), 1e9)
-    moved = weigh(pixels, T, how).at
+    moved = weigh(pixels, T.matrix(), how)
     assert moved.ab[0, 0, at] == pytest.approx(0.048 + q * e / 100, rel=1e-12)
     assert moved.i[0, at] == pytest.approx(0.4 * (1 - 0.8 * e), rel=1e-12)  # 1 - tz i = 0.8
     q = float(100 * moved.i[0, at] * (moved.ab[0, 0, at] * 0.5 - 0.1))
-    found = linearize(pixels, T, how)
     variance = 0.25 + 0.01 * q * q
-    assert found.distance2[0, at] == pytest.approx(1.44 / variance + 1 / 0.25, rel=1e-12)
-    assert found.g[0, 0, 1] == pytest.approx(100 * float(moved.i[0, at]) / 0.25, rel=1e-12)
+    assert moved.distance2[0, at] == pytest.approx(1.44 / variance + 1 / 0.25, rel=1e-12)
+    expected = 100 * float(moved.i[0, at]) / 0.25
+    assert linearize(pixels, T, how).g[0, 1] == pytest.approx(expected, rel=1e-12)
 
 
 def test_reproject_is_the_numpy_ego_flow() -> None:
@@ -88,23 +86,23 @@ def test_reproject_marks_points_behind_and_stays_finite() -> None:
 
 
 def test_derivatives_against_autograd() -> None:
-    """The Jacobian in the pose, and the sensitivity to the log depth, of all three rows."""
+    """The Jacobian in the pose, and the sensitivity to the log depth."""
     batch, T = noisy_batch(size=(6, 7), seed=5)
-    batch = replace(batch, depth_curr=torch.full((2, 6, 7), 4.0, dtype=F64))
-    pixels = gather_pixels(batch, with_depth=True)
-    pose = se3(T)
-    terms = residuals(pixels, pose)
+    pixels, pose = gather_pixels(batch), se3(T)
+    # without depth noise the pixels stay at the depth measured
+    at = weigh(pixels, pose.matrix(), RobustNoise(torch.tensor([[1.0, 0.0]] * 2, dtype=F64)))
     zero = torch.zeros(2, 6, dtype=F64)
-    for k, row in enumerate(jacobian(pixels, terms).unbind(1)):
+    for k, row in enumerate(at.jacobian().unbind(2)):
         full = torch.autograd.functional.jacobian(
-            lambda d, k=k: -residuals(pixels, left_update(d, pose)).r[:, k], zero
+            lambda d, k=k: -residuals(pixels, left_update(d, pose).matrix())[0][:, k], zero
         )
         auto = torch.stack([full[b, :, b] for b in range(2)])
         assert (row.transpose(1, 2) - auto).abs().max() < 1e-10
         scale = torch.ones_like(pixels.weight).requires_grad_()
-        r = residuals(pixels._replace(points=pixels.points * scale[:, None]), pose).r[:, k]
+        scaled = pixels._replace(points=pixels.points * scale[:, None])
+        r = residuals(scaled, pose.matrix())[0][:, k]
         (slope,) = torch.autograd.grad(-r.sum(), scale)  # at 1: the derivative in log Z
-        assert (slope - sensitivity(pixels, terms)[:, k]).abs().max() < 1e-10
+        assert (slope - at.q[:, k]).abs().max() < 1e-10
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
@@ -162,11 +160,10 @@ def test_step_equals_the_numba_kernels(case: str, dtype: torch.dtype) -> None:
         pair = replace(pair, valid=torch.rand(1, 60, 80, generator=g) > 0.3)
     start = se3_exp(np.array([0.02, -0.01, 0.015, 2e-3, -1e-3, 3e-3])) @ T[0].numpy()
     expected = numba_step(pair, weights, start, (0.35, 0.04))
-    pixels = gather_pixels(pair, weights, tile=24)
     how = RobustNoise(torch.tensor([[0.35, 0.04]], dtype=dtype))
-    found = linearize(pixels, se3(torch.as_tensor(start)[None]), how, run=24 * 24)
-    step, good = solve_small(*found.total())
-    assert good.all() and found.H.shape[1] == 3 * 4
+    found = linearize(gather_pixels(pair, weights), se3(torch.as_tensor(start)[None]), how)
+    step, good = solve_small(found.H, found.g)
+    assert good.all()
     # in units of the step along each of translation and rotation
     for part in (slice(0, 3), slice(3, 6)):
         length = np.linalg.norm(expected[part])
@@ -181,8 +178,8 @@ def test_unusable_values_leave_no_trace_in_gradients() -> None:
         inputs = [v.clone().requires_grad_() for v in (batch.flow, batch.depth_prev, batch.K_prev)]
         pixels = gather_pixels(PairBatch(*inputs, batch.K_curr))
         how = RobustNoise(torch.tensor([[0.3, 0.03]] * 2, dtype=F64))
-        g = scores(pixels, se3(T), how)[0]
-        gradients = torch.autograd.grad(g.sum(), inputs)
+        at = weigh(pixels, T, how)
+        gradients = torch.autograd.grad(at.gradient(at.jacobian()).sum(), inputs)
         assert all(torch.isfinite(gradient).all() for gradient in gradients)
         assert gradients[1][0, 0, 0] == 0
 
@@ -192,12 +189,6 @@ def test_subset_takes_usable_pixels_once() -> None:
     valid = torch.zeros(2, 40, 50, dtype=torch.bool)
     valid[0, 10:30, 10:40] = True
     valid[1, 5, 5:12] = True
-    few = gather_pixels(replace(batch, valid=valid), tile=16).subset(200)
+    few = gather_pixels(replace(batch, valid=valid)).subset(200)
     assert (few.weight > 0).sum(dim=1).tolist() == [200, 7]
     assert len(torch.unique(few.points[0].T, dim=0)) == 200
-
-
-@pytest.mark.parametrize("tile", [3, 8, 64])
-def test_tiles_are_undone(tile: int) -> None:
-    x = torch.arange(2 * 7 * 10.0).reshape(2, 7, 10)
-    assert torch.equal(from_tiles(to_tiles(x, tile), tile, 7, 10), x)

@@ -20,7 +20,7 @@ SIZE = {"height": 32, "width": 64}
 
 @pytest.mark.parametrize("preset", [PaperOptions(**SIZE), DiverseOptions(**SIZE)])
 def test_what_is_read_is_what_was_drawn(tmp_path, preset):
-    assert list(dataset.write_samples(preset, 4, tmp_path, seed=2)) == [4]
+    assert list(dataset.write_samples(preset, 4, tmp_path, seed=2)) == [1, 2, 3, 4]
     for index in range(4):
         read = dataset.read_sample(tmp_path, index)
         drawn = preset.sample(sample_generator(2, index, STORED))
@@ -32,18 +32,14 @@ def test_what_is_read_is_what_was_drawn(tmp_path, preset):
                 np.testing.assert_array_equal(a, b)
 
 
-def test_the_paper_s_depths_are_stored_once(tmp_path):
-    list(dataset.write_samples(PaperOptions(**SIZE), 2, tmp_path))
-    names = {path.stem for path in (tmp_path / "shard_0000").iterdir()}
-    assert "depth_prev" in names and not {"depth_true", "ego_flow"} & names
-
-
 def test_an_interrupted_call_goes_on_and_other_samples_are_refused(tmp_path):
     preset = PaperOptions(**SIZE)
     list(dataset.write_samples(preset, 3, tmp_path))
-    written = (tmp_path / "shard_0000" / "flow.npy").stat().st_mtime_ns
-    assert list(dataset.write_samples(preset, 3, tmp_path)) == [3]
-    assert (tmp_path / "shard_0000" / "flow.npy").stat().st_mtime_ns == written
+    written = (tmp_path / "0000001.npz").stat().st_mtime_ns
+    (tmp_path / "0000002.npz").unlink()
+    assert list(dataset.write_samples(preset, 3, tmp_path)) == [1, 2, 3]
+    assert (tmp_path / "0000002.npz").exists()
+    assert (tmp_path / "0000001.npz").stat().st_mtime_ns == written
     for other in ((preset, 3, 1), (PaperOptions(height=64, width=64), 3, 0), (preset, 4, 0)):
         with pytest.raises(InputError, match="other samples"):
             list(dataset.write_samples(*other[:2], tmp_path, seed=other[2]))
@@ -51,12 +47,12 @@ def test_an_interrupted_call_goes_on_and_other_samples_are_refused(tmp_path):
 
 def test_damage_and_nonsense_are_named(tmp_path):
     with pytest.raises(InputError, match=r"samples\.json"):
-        dataset.read_sample(tmp_path / "none", 0)
+        dataset.StoredSamples(str(tmp_path / "none")).sample(sample_generator(0, 0))
     list(dataset.write_samples(PaperOptions(**SIZE), 2, tmp_path / "a"))
-    with pytest.raises(InputError, match="0 to 1, got 2"):
+    with pytest.raises(FormatError, match=r"0000002\.npz: damaged or absent"):
         dataset.read_sample(tmp_path / "a", 2)
-    (tmp_path / "a" / "shard_0000" / "flow.npy").write_bytes(b"damaged")
-    with pytest.raises(FormatError, match="shard_0000"):
+    (tmp_path / "a" / "0000000.npz").write_bytes(b"damaged")
+    with pytest.raises(FormatError, match="0000000"):
         dataset.read_sample(tmp_path / "a", 0)
     with pytest.raises(InputError, match="count"):
         list(dataset.write_samples(PaperOptions(**SIZE), 0, tmp_path / "b"))

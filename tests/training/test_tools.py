@@ -11,8 +11,8 @@ from hybridvo.errors import CheckpointError
 from hybridvo.network.models import load_weights
 from hybridvo.network.selection import SELECTION_METHODS
 from hybridvo.synthetic.dataset import read_yaml
-from hybridvo.training.export import export_run, open_run
 from hybridvo.training.options import load_pwvo_options, load_selector_options
+from hybridvo.training.trainer import export_run, open_run
 from tests.scripts import load_script
 
 ROOT = Path(__file__).parents[2]

@@ -15,7 +15,7 @@ from hybridvo.network.losses import LossOptions
 from hybridvo.synthetic.dataset import Mixture
 from hybridvo.synthetic.layered import PaperOptions
 from hybridvo.training.options import OptimizerOptions, PwvoOptions, ScheduleOptions
-from hybridvo.training.pwvo_task import PwvoTask, SampleStream
+from hybridvo.training.pwvo_task import PwvoTask, sample_stream
 from hybridvo.training.trainer import Trainer
 
 TINY = PwvoOptions(
@@ -39,7 +39,7 @@ def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
 
 
 def batch_of(mixture: Mixture):
-    return next(iter(SampleStream(mixture, 0, 0, 4)))
+    return next(sample_stream(mixture, 0, 0, 4)).to("cpu")
 
 
 def test_resume_is_equal(mixture, tmp_path):

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 import hybridvo
-from hybridvo.api import warm_up
 from hybridvo.errors import CheckpointError, InputError
 from hybridvo.flow import FlowField, dis_flow
 from hybridvo.geometry import ego_flow, invert, se3_exp
-from hybridvo.odometry import Odometry
+from hybridvo.odometry import Odometry, warm_up
 from hybridvo.options import Options, TrackOptions
 from hybridvo.pipeline import DEFAULT_METHOD
 from hybridvo.results import Reason, State
