@@ -78,6 +78,15 @@ def held(folder: Path) -> Iterator[None]:
         lock.release()
 
 
+def remove(*paths: Path) -> None:
+    """Delete files of results that are there."""
+    for path in paths:
+        try:
+            path.unlink(missing_ok=True)
+        except OSError as error:
+            raise OutputError(f"{path}: cannot be replaced: {error.strerror}.") from error
+
+
 def write_json(path: str | os.PathLike[str], value: Any) -> None:
     """Write a value as indented JSON; a number that is not finite is refused by ``json``."""
     text = json.dumps(value, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
@@ -161,6 +170,14 @@ def versions() -> dict[str, str]:
         with contextlib.suppress(PackageNotFoundError):
             found[name] = version(name)
     return found
+
+
+def made_with() -> dict[str, Any]:
+    """What a record of results says of where they were made: versions, and the machine."""
+    return {
+        "versions": versions(),
+        "machine": {"platform": platform.platform(), "cpus": os.cpu_count()},
+    }
 
 
 def parse_yaml(text: str, where: str) -> Any:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import dataclasses
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, dataclass_transform
 
 from pydantic import ConfigDict, Field, ValidationError
 from pydantic.dataclasses import dataclass
 
 from hybridvo.calibration import MIN_CONFIDENCE
-from hybridvo.errors import InputError
+from hybridvo.errors import FormatError, InputError
+from hybridvo.files import parse_yaml, read_text
 
 T = TypeVar("T")
 Positive = Annotated[float, Field(gt=0)]
@@ -126,3 +129,44 @@ class Options:
     photometric: PhotometricOptions = PhotometricOptions()
     track: TrackOptions = TrackOptions()
     run: RunOptions = RunOptions()
+
+
+def option_defaults() -> dict[str, Any]:
+    """Every key that ``--set`` knows, such as ``refine.cutoff``, with its default."""
+    return {
+        f"{group}.{name}": value
+        for group, options in dataclasses.asdict(Options()).items()
+        for name, value in options.items()
+    }
+
+
+def load_options(
+    path: str | Path | None = None,
+    assignments: Iterable[str] = (),
+    given: Mapping[str, Any] | None = None,
+) -> Options:
+    """Options from a YAML file, then from ``group.key=value`` texts, then from named values."""
+    groups: dict[str, Any] = {}
+    if path is not None:
+        try:
+            groups = parse_yaml(read_text(path), str(path)) or {}
+        except FileNotFoundError:
+            raise InputError(f"{path}: no such file.") from None
+        if not isinstance(groups, dict):
+            raise FormatError(f"{path}: expected 'group:' lines, got a {type(groups).__name__}.")
+    values: dict[str, Any] = {}
+    for text in assignments:
+        key, sign, value = text.partition("=")
+        if not sign or "." not in key:
+            raise InputError(f"--set: expected group.key=value, as refine.cutoff=3, got {text!r}.")
+        values[key.strip()] = parse_yaml(value, f"--set {key}")
+    values |= {key: value for key, value in (given or {}).items() if value is not None}
+    for key, value in values.items():
+        group, _, name = key.partition(".")
+        if isinstance(entries := groups.setdefault(group, {}), dict):
+            entries[name] = value
+    try:
+        return Options(**groups)
+    except InputError as error:
+        where = " and ".join(str(x) for x in (path, assignments and "--set") if x)
+        raise InputError(f"{where or 'options'}: {error} --set help lists the keys.") from None

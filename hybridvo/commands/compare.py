@@ -9,7 +9,6 @@ import contextlib
 import dataclasses
 import logging
 import os
-import platform
 import re
 import shutil
 from collections.abc import Iterable
@@ -23,10 +22,10 @@ import pandas as pd
 
 from hybridvo.commands.run import flow_provider, frames_of, run, weights_hash
 from hybridvo.data.sequence import Sequence, open_sequence
-from hybridvo.errors import HybridVOError, InputError
+from hybridvo.errors import HybridVOError, InputError, OutputError
 from hybridvo.evaluation import scores
 from hybridvo.evaluation.report import write_report
-from hybridvo.files import Mode, atomic_write, held, versions, write_json
+from hybridvo.files import Mode, atomic_write, held, made_with, make_folder, write_json
 from hybridvo.network.models import Models
 from hybridvo.options import Options
 from hybridvo.pipeline import METHODS, check_method
@@ -71,10 +70,12 @@ def compare(
     with held(out):
         if mode == "overwrite":
             shutil.rmtree(out / "runs", ignore_errors=True)
+            if os.path.lexists(out / "runs"):
+                raise OutputError(f"{out / 'runs'}: cannot be replaced.")
         for name, reason in missing.items():
             _logger.warning("not run: %s: %s", name, reason)
         scored = [_score(job, names, options, given, missing, protocol) for job in jobs]
-        table = pd.concat([found for found, _, _ in scored], ignore_index=True)
+        table = scores.pair_table([pair for pairs, _, _ in scored for pair in pairs])
         rows = [row for _, some, _ in scored for row in some]
         facts = [fact for _, _, fact in scored]
         totals = [
@@ -83,8 +84,7 @@ def compare(
         ]
         result: dict[str, Any] = {
             "command": list(command),
-            "versions": versions(),
-            "machine": {"platform": platform.platform(), "cpus": os.cpu_count()},
+            **made_with(),
             "options": dataclasses.asdict(options),
             "weights": {name: weights_hash(name, models) for name in names},
             "missing": missing,
@@ -94,11 +94,13 @@ def compare(
             "protocol": None if protocol is None else scores.protocol_summary(facts),
         }
         write_json(out / "results.json", result)
-        lines = pd.DataFrame(rows, dtype=object).drop(columns="reasons")
+        lines = pd.DataFrame(rows, dtype=object).drop(columns="reasons", errors="ignore")
         for name, data in (("results.csv", lines), ("pairs.csv", table)):
             with atomic_write(out / name) as file:
                 data.to_csv(file, index=False, lineterminator="\n")
         write_report(out, result, table)
+    if not rows:
+        raise RuntimeError(f"every method failed; {out / 'report.md'} says how.")
     return [out / name for name in WRITTEN]
 
 
@@ -169,7 +171,7 @@ def _score(
     given: dict[str, Any],
     missing: dict[str, str],
     protocol: str | None,
-) -> tuple[pd.DataFrame, list[dict[str, Any]], dict[str, Any]]:
+) -> tuple[list[Any], list[dict[str, Any]], dict[str, Any]]:
     """Run the methods on a sequence: all pairs, a line for each method, what is said of it."""
     metrics, name = {}, job.sequence.name
     for method in methods:
@@ -188,7 +190,7 @@ def _score(
         named["depth_source"] = job.sequence.depth_source
         row = scores.sequence_row(table[table["method"] == method], path, named)
         rows.append(row | {"trajectory": f"runs/{job.folder.name}/{method}/trajectory.tum"})
-    return table, rows, fact
+    return table.to_dict("records"), rows, fact
 
 
 def _read(
@@ -196,7 +198,8 @@ def _read(
 ) -> tuple[pd.DataFrame, dict[str, Any]]:
     """Pairs of all runs as one table, and what is said of the sequence."""
     sequence, left_out, facts = job.sequence, [], []
-    table = pd.concat([_pairs(job, method) for method in methods])
+    runs = [_pairs(job, method) for method in methods]
+    table = pd.concat(runs) if runs else pd.DataFrame(columns=["index", "next", "missing"])
     for row in table.drop_duplicates("next").itertuples():
         pair: Any = (row.prev, row.next)
         if same_camera_only and not scores.same_intrinsics(*map(sequence.camera, pair)):
@@ -210,6 +213,7 @@ def _read(
     table = table.merge(pd.DataFrame(facts, columns=["next", *scores.FACTORS]), "left", "next")
     gt = scores.true_trajectory(sequence, range(len(sequence)))
     if gt is not None:
+        make_folder(job.folder)  # where every method fails before it has one
         gt.save(job.folder / "ground_truth.tum")
     return scores.pair_table(table.sort_values("index", kind="stable")), {
         "name": sequence.name,

@@ -10,8 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from hybridvo.commands.compare import compare
+from hybridvo.commands.compare import WRITTEN, compare
+from hybridvo.data.lists import shown
 from hybridvo.errors import InputError
+from hybridvo.files import LOCK
 from hybridvo.options import FlowOptions, Options
 from hybridvo.synthetic.render import write_sintel
 from hybridvo.synthetic.scenes import make_scene
@@ -40,6 +42,12 @@ def demo(
     if frames < 2:
         raise InputError(f"demo: expected at least 2 frames, got {frames}.")
     out, name = Path(out), f"{SCENE}_{seed}_{frames}"
+    present = {path.name for path in out.glob("*")}
+    if present and not (overwrite and {"data"} <= present <= {"data", "runs", LOCK, *WRITTEN}):
+        raise InputError(
+            f"{out}: holds {shown(sorted(present))}; pass --overwrite to replace what a demo has "
+            f"written, and nothing else, or another --out."
+        )
     scene = make_scene(SCENE, seed, height=HEIGHT, width=WIDTH, frames=frames)
     write_sintel(scene, out / "data", name)
     compare(

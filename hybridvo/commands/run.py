@@ -28,7 +28,7 @@ from hybridvo.errors import InputError
 from hybridvo.evaluation.drawing import plot_trajectory
 from hybridvo.evaluation.metrics import evaluate
 from hybridvo.evaluation.scores import ERRORS, pair_scores, pair_table, step_errors, true_trajectory
-from hybridvo.files import Mode, atomic_write, fingerprint, held, versions, write_json
+from hybridvo.files import Mode, atomic_write, fingerprint, held, made_with, remove, write_json
 from hybridvo.flow import FlowProvider, MeasuredFlow, dis_flow, file_flow
 from hybridvo.geometry import se3_log
 from hybridvo.network.models import Models
@@ -90,7 +90,7 @@ def run(
     header = {
         "command": list(command),
         "input_hash": fingerprint(sequence.files()),
-        "versions": versions(),
+        **made_with(),
         "weights": weights_hash(method, models),
         "options": dataclasses.asdict(options),
         "sequence": os.fspath(sequence.root),
@@ -134,8 +134,8 @@ class RunFolder:
             self._load()
         if self.summary is None:
             self.save("running")
-            for name in () if self.rows else (CHECKPOINT, *RESULTS):
-                (path / name).unlink(missing_ok=True)
+            if not self.rows:
+                remove(*(path / name for name in (CHECKPOINT, *RESULTS)))
 
     def _load(self) -> None:
         """Rows and tracker of an earlier run of the same input, options and weights."""
@@ -162,7 +162,7 @@ class RunFolder:
         content = {**self.header, **more, "state": state, "frames_done": len(self.rows)}
         write_json(self.path / STATE, content)
         if state == "done":
-            (self.path / CHECKPOINT).unlink(missing_ok=True)
+            remove(self.path / CHECKPOINT)
 
     def save_rows(self, tracker: Mapping[str, Any] | None = None) -> None:
         """Write ``steps.csv``, and with the tracker's state after the rows the checkpoint."""

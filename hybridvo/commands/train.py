@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import shlex
 import signal
 import sys
+from argparse import Namespace
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from rich.progress import Progress
 
 from hybridvo.errors import InputError
 from hybridvo.evaluation.drawing import Panel, flow_colours, longest_flow, write_panels
-from hybridvo.files import write_json
+from hybridvo.files import make_folder, remove, write_json
 from hybridvo.network.models import load_weights, torch_device
 from hybridvo.synthetic.dataset import load_preset, read_sample, write_samples
 from hybridvo.synthetic.layered import Sample
@@ -78,23 +78,22 @@ def _steps(sample: Sample) -> list[Panel]:
     ]
 
 
-def train_pwvo(args: argparse.Namespace, command: list[str]) -> dict[str, Any]:
+def train_pwvo(args: Namespace) -> dict[str, Any]:
     """Train a network of the paper."""
     options, mixture = load_pwvo_options(args.config)
     given = {name: getattr(args, name) for name in ("steps", "batch_size", "seed")}
     changes = {name: value for name, value in given.items() if value is not None}
     task = PwvoTask(dataclasses.replace(options, **changes), mixture)
-    return _train(args, command, task, torch_device(args.device), args.workers)
+    return _train(args, task, torch_device(args.device), args.workers)
 
 
-def train_selector(args: argparse.Namespace, command: list[str]) -> dict[str, Any]:
+def train_selector(args: Namespace) -> dict[str, Any]:
     """Train the selector."""
-    return _train(args, command, SelectorTask(load_selector_options(args.config), args.data))
+    return _train(args, SelectorTask(load_selector_options(args.config), args.data))
 
 
 def _train(
-    args: argparse.Namespace,
-    command: list[str],
+    args: Namespace,
     task: PwvoTask | SelectorTask,
     device: Any = "cpu",
     workers: int = 0,
@@ -102,17 +101,16 @@ def _train(
     if args.threads is not None:
         torch.set_num_threads(max(1, args.threads))
     cv2.setNumThreads(0)  # samples are small: threads inside OpenCV cost more than they give
-    args.out.mkdir(parents=True, exist_ok=True)
+    make_folder(args.out)
     if args.overwrite:
-        for name in (CHECKPOINT, LOG, RUN):
-            (args.out / name).unlink(missing_ok=True)
+        remove(*(args.out / name for name in (CHECKPOINT, LOG, RUN)))
     trainer = Trainer(task, args.out, device, workers, report=_report)
     if trainer.resume():
         print(f"goes on at update {trainer.step}", file=sys.stderr)
     else:
         if args.init is not None:
             trainer.start_from(load_weights(args.init)[0].state_dict(), args.init)
-        about = {"command": shlex.join(command), "commit": source_commit()}
+        about = {"command": shlex.join(args.words), "commit": source_commit()}
         write_json(args.out / RUN, about | {"torch": torch.__version__})
     for number in (signal.SIGINT, signal.SIGTERM):  # the update at hand ends, with a checkpoint
         signal.signal(number, lambda *_: setattr(trainer, "stop_requested", True))
@@ -128,17 +126,17 @@ def _report(entry: dict[str, Any]) -> None:
     print(line, entry.get("results", ""), file=sys.stderr)
 
 
-def export(out: Path, export: Path, count: int, calibrate: int) -> dict[str, Any]:
+def export(args: Namespace) -> dict[str, Any]:
     """Write a network's weights for users."""
-    card = export_run(out, export, count, calibrate)
-    return {"file": str(export), "held_out": card["held_out"]}
+    card = export_run(args.out, args.export, args.count, args.calibrate)
+    return {"file": str(args.export), "held_out": card["held_out"]}
 
 
-def draw_selector_data(args: argparse.Namespace) -> dict[str, Any]:
+def draw_selector_data(args: Namespace) -> dict[str, Any]:
     """Draw samples for the selector."""
     if args.first_seed < 0 or args.seeds < 0:
         raise InputError(f"expected --first-seed and --seeds >= 0, got {args.first_seed}.")
-    args.data.mkdir(parents=True, exist_ok=True)
+    make_folder(args.data)
     recordings = () if args.recordings is None else load_split(args.recordings, args.split)
     network = None if args.propose is None else load_weights(args.propose)[0]
     total = 0

@@ -145,7 +145,7 @@ class Sequence:
         # unless a scale is given, only integers are in the set's unit
         scale = self._given_scale or (self.depth_scale if stored.dtype.kind == "u" else 1.0)
         if scale is None:
-            needed = "'depth_scale' (units per metre) in camera.yaml, or --depth-scale"
+            needed = "'depth_scale' in camera.yaml, or --depth-scale: units per metre, 1000 for mm"
             raise InputError(f"{path}: depth is of whole numbers: expected {needed}.")
         depth = stored.astype(np.float32) / np.float32(scale)
         depth[stored == SATURATED] = 0.0

@@ -63,7 +63,9 @@ def write_report(folder: Path, result: Mapping[str, Any], pairs: pd.DataFrame) -
     )
     totals, every = (sorted(result[key], key=_rank) for key in ("totals", "rows"))
     methods = list(dict.fromkeys(row["method"] for row in result["rows"]))
-    flow = totals[0]["flow_source"]  # an oracle is never pooled with what a sensor gives
+    flow = (
+        totals[0]["flow_source"] if totals else "no"
+    )  # an oracle is never pooled with what a sensor gives
     known = pairs.dropna(subset=["epe_l2_px"])
     pooled = known[known["flow_source"] == flow]
     sections = {
@@ -174,6 +176,8 @@ def path_charts(
     if truth:
         gt = read_trajectory(folder / truth)
         paths = {TRUTH: gt} | {method: aligned(path, gt)[0] for method, path in paths.items()}
+    if not paths:
+        return []
     tables = []
     for method, path in paths.items():
         first = gt if truth else path

@@ -77,6 +77,9 @@ def test_exit_codes_1_4_5_and_130(dataset, tmp_path, monkeypatch, capsys):
     arguments = ["run", str(dataset), "--method", "identity", "-q", "--out"]
     (tmp_path / "file").write_text("")
     assert main([*arguments, str(tmp_path / "file" / "out")]) == 5
+    for name in ("metrics.json", "trajectory.tum"):  # can neither be written nor deleted
+        (tmp_path / name / name).mkdir(parents=True)
+        assert main([*arguments, str(tmp_path / name), "--overwrite"]) == 5
     (tmp_path / "held").mkdir()
     with filelock.FileLock(tmp_path / "held" / LOCK):
         assert main([*arguments, str(tmp_path / "held")]) == 4
@@ -129,6 +132,15 @@ def test_init_writes_a_camera_file(tmp_path, capsys):
     assert main(["init", str(tmp_path / "mine")]) == 0
     assert (tmp_path / "mine" / "camera.yaml").is_file()
     assert main(["init", str(tmp_path / "mine")]) == 2
+
+
+def test_a_demo_replaces_nothing_but_a_demo(tmp_path, capsys):
+    (tmp_path / "mine.txt").write_text("")
+    for more in ([], ["--overwrite"]):
+        assert main(["demo", "--out", str(tmp_path), *more]) == 2
+        said = capsys.readouterr().err
+        assert str(tmp_path) in said and "mine.txt" in said and "--overwrite" in said
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
 
 
 @pytest.mark.slow

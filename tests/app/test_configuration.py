@@ -4,9 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from hybridvo.cli import load_options, option_defaults
 from hybridvo.errors import FormatError, InputError
-from hybridvo.options import Options
+from hybridvo.options import Options, load_options, option_defaults
 
 CONFIG = Path(__file__).parents[2] / "configs" / "odometry.yaml"
 

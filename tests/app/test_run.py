@@ -84,6 +84,7 @@ def test_columns_and_arrays(dataset, tmp_path):
     assert state["state"] == "done" and state["frames_done"] == 3
     assert state["options"]["run"]["method"] == "refine" and len(state["input_hash"]) == 64
     assert {"numpy", "numba", "python", "hybridvo"} <= set(state["versions"])
+    assert set(state["machine"]) == {"platform", "cpus"}
 
 
 def test_ground_truth_never_enters_the_estimate(dataset, own, tmp_path):

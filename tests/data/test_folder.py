@@ -215,6 +215,10 @@ def test_doubtful_units_are_told_with_their_remedy(tmp_path):
         open_sequence(root)
     for i in range(2):  # floating point is in metres, unless said otherwise
         (root / "depth" / f"{i}.png").unlink()
+        np.save(root / "depth" / f"{i}.npy", np.full(SIZE, 2000, np.uint16))
+    with pytest.raises(InputError, match=r"npy: .*--depth-scale"):
+        open_sequence(root)
+    for i in range(2):
         np.save(root / "depth" / f"{i}.npy", np.full(SIZE, 2000.0))
     assert "divide by 1000" in told(root)
     assert open_sequence(root, depth_scale=1000)[1].depth[0, 0] == 2.0

@@ -183,6 +183,20 @@ def test_a_bug_of_a_method_costs_its_run(tiny: Path, tmp_path: Path, monkeypatch
     assert [row["method"] for row in result["rows"]] == ["identity"]
 
 
+def test_where_every_method_fails_the_report_says_so(tiny, tmp_path, monkeypatch, capsys) -> None:
+    def broken(pair: Any, context: Any) -> RelativePose:
+        raise ZeroDivisionError("a bug")
+
+    monkeypatch.setitem(METHODS, "identity", broken)
+    out = tmp_path / "out"
+    assert main(["compare", str(tiny), "--out", str(out), "--methods", "identity", "-q"]) == 1
+    assert "every method failed" in capsys.readouterr().err
+    result = json.loads((out / "results.json").read_text())
+    assert result["rows"] == [] and all((out / name).is_file() for name in WRITTEN)
+    for name in ("report.md", "report.html"):
+        assert "identity on tiny: ZeroDivisionError: a bug" in (out / name).read_text()
+
+
 def test_true_flow_is_named_and_equal_names_are_told_apart(tiny: Path, tmp_path: Path) -> None:
     run(tiny, tiny, out=tmp_path / "out", methods=("identity",))
     result = json.loads((tmp_path / "out" / "results.json").read_text())

@@ -8,7 +8,7 @@ import shlex
 import pytest
 
 import hybridvo
-from hybridvo.cli import build_parser
+from hybridvo.commands.arguments import build_parser
 from tests.scripts import ROOT, load_script
 
 PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")])

@@ -1,0 +1,369 @@
+"""What every command is called with and which function it runs; help loads nothing heavy.
+
+A ``dest`` with a dot, such as ``run.stride``, is the place of an option in :mod:`hybridvo.options`.
+"""
+
+from __future__ import annotations
+
+from argparse import SUPPRESS, ArgumentParser, Namespace, RawDescriptionHelpFormatter
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from hybridvo import __version__
+
+if TYPE_CHECKING:
+    from hybridvo.data.sequence import Sequence
+    from hybridvo.network.models import Models
+    from hybridvo.options import Options
+
+Answer = tuple[Any, int]
+"""What a command has found, JSON-ready, and the exit code."""
+FLOWS, DEVICES = ("auto", "file", "dis"), ("auto", "cpu", "cuda")
+COUNT: dict[str, Any] = {"type": int, "metavar": "N"}
+FLAG: dict[str, Any] = {"action": "store_true"}
+TRAINING = """Train PWVO and its baselines, or the selector.
+
+    hybridvo train pwvo --config configs/train_paper.yaml --out runs/paper
+    hybridvo train export --out runs/paper --export paper.safetensors
+    hybridvo train selector-data --data runs/selector_data --first-seed 1000000 --seeds 4096
+    hybridvo train selector-data --data runs/selector_data --recordings ../shared/data --seeds 2048
+    hybridvo train selector --data runs/selector_data --out runs/selector --time-limit 50
+
+Started again with the same --out a training goes on where it was. Seeds of selector-data below
+1000 are for a folder DATA_held_out; --propose asks PWVO about the samples.
+"""
+
+
+def build_parser() -> ArgumentParser:
+    """Parser of the whole command line; ``call`` of what it gives runs the command."""
+    about = "Metric camera motion with covariance from optical flow, depth and intrinsics."
+    parser = ArgumentParser(prog="hybridvo", description=about)
+    parser.add_argument("--version", action="version", version=f"hybridvo {__version__}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    for add in (_run, _compare, _show, _evaluate, _doctor, _demo, _train, _generate, _init):
+        add(commands)
+    return parser
+
+
+def _command(
+    commands: Any,
+    call: Callable[[Namespace], Answer],
+    name: str,
+    about: str,
+    *groups: Callable[[ArgumentParser], None],
+) -> Callable[..., Any]:
+    """Add a command with the arguments of groups; gives what adds its own."""
+    made: ArgumentParser = commands.add_parser(name, help=about, description=about)
+    made.set_defaults(call=call)
+    made.add_argument("--json", help="print the result as JSON on stdout", **FLAG)
+    loudness = made.add_mutually_exclusive_group()
+    loudness.add_argument("-v", "--verbose", help="tracebacks of errors", **FLAG)
+    loudness.add_argument("-q", "--quiet", help="errors only", **FLAG)
+    for add_group in groups:
+        add_group(made)
+    return made.add_argument
+
+
+# -- groups of arguments that commands share, and what is made of them -----------------------------
+
+
+def _sequence(command: ArgumentParser, required: bool = True) -> None:
+    folder = command.add_mutually_exclusive_group(required=required).add_argument
+    folder("path", nargs="?", default=SUPPRESS, metavar="DIR", help="folder of the sequence")
+    folder("--sequence", dest="path", metavar="DIR", help="the same, by name")
+    kinds = "sintel, tartanair, 7scenes, folder, kitti or tum (default: detected)"
+    camera = "camera.yaml, ROS camera_info, or numbers"
+    units = "depth units per metre, 1000: millimetres"
+    add = command.add_argument
+    add("--dataset", metavar="KIND", help=kinds)
+    add("--camera", metavar="FILE|fx,fy,cx,cy", help=camera)
+    add("--depth-scale", type=float, metavar="N", help=units)
+    add("--mask", metavar="DIR", help="images that are 0 where pixels do not count")
+
+
+def _opened(args: Namespace) -> Sequence:
+    from hybridvo.data.sequence import open_sequence
+
+    return open_sequence(args.path, args.dataset, args.camera, args.depth_scale, args.mask)
+
+
+def _option_tree(command: ArgumentParser) -> None:
+    flow = "default auto: the sequence's files, else DIS"
+    keys = "one option, as in refine.cutoff=2.5; may be repeated; --set help lists the keys"
+    add = command.add_argument
+    add("--flow", dest="flow.source", choices=FLOWS, help=flow)
+    add("--start", dest="run.start", help="first frame (default 0)", **COUNT)
+    add("--stop", dest="run.stop", help="the one after the last frame", **COUNT)
+    add("--stride", dest="run.stride", help="step between frames (default 1)", **COUNT)
+    add("--seed", dest="run.seed", help="of everything drawn at random", **COUNT)
+    add("--device", dest="run.device", choices=DEVICES, help="of the networks (default auto)")
+    add("--config", metavar="FILE", help="YAML file of options")
+    add("--set", action="append", default=[], dest="given", metavar="KEY=VALUE", help=keys)
+    exists = command.add_mutually_exclusive_group().add_argument
+    mode: dict[str, Any] = {"dest": "mode", "action": "store_const", "default": "new"}
+    exists("--resume", const="resume", help="go on where it was cut off", **mode)
+    exists("--overwrite", const="overwrite", help="start anew", **mode)
+
+
+def _options(args: Namespace) -> Options:
+    from hybridvo.options import load_options
+
+    named = {place: value for place, value in vars(args).items() if "." in place}
+    return load_options(args.config, args.given, named)
+
+
+def _weights(command: ArgumentParser) -> None:
+    own = "network weights instead of the pretrained ones, as in pwvo=mine.safetensors"
+    command.add_argument("--weights", action="append", default=[], metavar="NAME=FILE", help=own)
+
+
+def _models(args: Namespace, device: str = "cpu") -> Models:
+    from hybridvo.errors import InputError
+    from hybridvo.network.models import SELECTION, Models
+
+    known = ("selector", *SELECTION)
+    files = dict(text.partition("=")[::2] for text in args.weights)
+    for name, path in files.items():
+        if name not in known or not Path(path).is_file():
+            expected = f"NAME=FILE with {' or '.join(known)} and a file that exists"
+            raise InputError(f"--weights: expected {expected}, got {name}={path}.")
+    return Models(device, files)
+
+
+def _training(command: ArgumentParser) -> None:
+    add = command.add_argument
+    add("--out", type=Path, required=True, help="folder of the run; goes on where it was")
+    add("--time-limit", type=float, default=float("inf"), metavar="MIN", help="minutes in all")
+    add("--threads", type=int, help="threads of torch; by default torch's own choice")
+    add("--overwrite", help="start anew where --out has a training", **FLAG)
+    init = "start from these weights: a file, or a pretrained name"
+    add("--init", metavar="FILE", help=init)
+
+
+def _files(*paths: Path) -> Answer:
+    return {"files": [str(path) for path in paths]}, 0
+
+
+# -- commands: each adds its arguments, and has the function that calls what it does ---------------
+
+
+def _run(commands: Any) -> None:
+    def call(args: Namespace) -> Answer:
+        from hybridvo.commands.run import run
+
+        options = _options(args)
+        return run(
+            models=_models(args, options.run.device),
+            sequence=_opened(args),
+            out=args.out,
+            options=options,
+            mode=args.mode,
+            command=args.words,
+            quiet=args.quiet,
+            rrd=args.rrd,
+        )
+
+    about = "Estimate the camera motion of a sequence."
+    add = _command(commands, call, "run", about, _sequence, _option_tree, _weights)
+    methods = "default: hybrid; `hybridvo doctor` lists all"
+    failed = "fraction of failed motions (default 0.2)"
+    recording = "Rerun recording (extra 'viz'; default: recording.rrd in the output folder)"
+    add("--out", metavar="DIR", help="output folder (default: runs/NAME)")
+    add("--method", dest="run.method", metavar="NAME", help=methods)
+    add("--max-failed", dest="run.max_failed", type=float, metavar="X", help=failed)
+    add("--strict", dest="run.strict", default=None, help="a broken frame ends the run", **FLAG)
+    add("--rrd", nargs="?", const="", metavar="FILE", help=recording)
+
+
+def _compare(commands: Any) -> None:
+    def call(args: Namespace) -> Answer:
+        from hybridvo.commands.compare import compare
+
+        options = _options(args)
+        written = compare(
+            models=_models(args, options.run.device),
+            sequences=args.sequences,
+            out=args.out,
+            methods=args.methods.replace(" ", "").split(","),
+            options=options,
+            dataset=args.dataset,
+            protocol=args.protocol,
+            mode=args.mode,
+            command=args.words,
+            quiet=args.quiet,
+        )
+        return _files(*written)
+
+    about = "Run methods side by side and write a report."
+    add = _command(commands, call, "compare", about, _option_tree, _weights)
+    several: dict[str, Any] = {"action": "extend", "metavar": "DIR"}
+    name = "the same as DIR, by name; repeatable"
+    many = "sequences, or folders of sequences (MPI Sintel as it was unpacked)"
+    add("--sequence", dest="sequences", nargs="+", default=[], help=name, **several)
+    add("sequences", nargs="*", default=SUPPRESS, help=many, **several)
+    add("--dataset", help="kind of the sequences (default: detected)")
+    add("--out", default="runs/compare", metavar="DIR", help="default: %(default)s")
+    add("--methods", default="all", help="comma-separated; default: all that run here")
+    add("--protocol", choices=["paper"], help="MPI Sintel as PWVO's paper scores it: 992 pairs")
+
+
+def _show(commands: Any) -> None:
+    def call(args: Namespace) -> Answer:
+        from hybridvo.evaluation.drawing import draw
+
+        image = draw(
+            models=_models(args),
+            sequence=_opened(args),
+            pair=args.pair,
+            out=args.out,
+            flow=args.flow,
+            method=args.method,
+            overwrite=args.overwrite,
+        )
+        return _files(image)
+
+    about = "Draw the maps of one pair of a sequence."
+    add = _command(commands, call, "show", about, _sequence, _weights)
+    add("--pair", default=0, help="first frame (default 0)", **COUNT)
+    add("--out", default="pair.png", metavar="FILE", help="default: %(default)s")
+    add("--method", default="hybrid", metavar="NAME", help="estimator (default: hybrid)")
+    add("--flow", choices=FLOWS, default="auto")
+    add("--overwrite", help="replace the image", **FLAG)
+
+
+def _evaluate(commands: Any) -> None:
+    def call(args: Namespace) -> Answer:
+        from hybridvo.errors import InputError
+        from hybridvo.evaluation.metrics import evaluate
+
+        found = evaluate(
+            args.estimate,
+            args.gt,
+            alignment=args.alignment,
+            delta=args.delta,
+            delta_unit=args.delta_unit,
+            max_diff=args.max_diff,
+        )
+        if found["matched"] == 0:  # the files do not belong together
+            why = found["reasons"]["ate_rmse_unaligned"]
+            raise InputError(f"nothing could be compared: {why}.")
+        return found, 0
+
+    add = _command(commands, call, "evaluate", "Errors of a trajectory against the truth.")
+    kinds, matched = ("se3", "sim3", "origin", "none"), "seconds between matches (default 0.02)"
+    add("estimate", metavar="EST", help="estimated trajectory")
+    add("gt", metavar="GT", help="true trajectory")
+    add("--alignment", choices=kinds, default="se3", help="of the ATE")
+    add("--delta", type=float, default=1, metavar="X", help="span of the RPE (default 1)")
+    add("--delta-unit", choices=("frames", "s"), default="frames", help="unit of --delta")
+    add("--max-diff", type=float, default=0.02, metavar="S", help=matched)
+
+
+def _doctor(commands: Any) -> None:
+    def call(args: Namespace) -> Answer:
+        from hybridvo.commands.doctor import doctor
+
+        found = doctor(None if args.path is None else _opened(args), args.pairs)
+        return found, 0 if found.get("ok", True) else 1
+
+    about = "What is missing here, or wrong with a sequence."
+    sequence = partial(_sequence, required=False)
+    add = _command(commands, call, "doctor", about, sequence)
+    add("--pairs", default=40, help="pairs (default 40)", **COUNT)
+
+
+def _demo(commands: Any) -> None:
+    def call(args: Namespace) -> Answer:
+        from hybridvo.commands.demo import demo
+
+        found = demo(
+            args.out,
+            frames=args.frames,
+            seed=args.seed,
+            overwrite=args.overwrite,
+            command=args.words,
+            quiet=args.quiet,
+        )
+        return found, 0
+
+    add = _command(commands, call, "demo", "Render a scene with moving objects and run on it.")
+    add("--out", default="runs/demo", metavar="DIR", help="default: %(default)s")
+    add("--overwrite", help="replace the results in --out", **FLAG)
+    add("--frames", default=20, help="default: 20", **COUNT)
+    add("--seed", default=0, help="of the scene", **COUNT)
+
+
+def _train(commands: Any) -> None:
+    def call(args: Namespace) -> Answer:
+        from hybridvo.commands import train
+
+        trainings = {"pwvo": train.train_pwvo, "selector": train.train_selector}
+        others = {"export": train.export, "selector-data": train.draw_selector_data}
+        return (trainings | others)[args.training](args), 0
+
+    raw = {"formatter_class": RawDescriptionHelpFormatter, "description": TRAINING}
+    train = commands.add_parser("train", help="train a network", **raw)
+    below = train.add_subparsers(dest="training", required=True, metavar="COMMAND")
+
+    add = _command(below, call, "pwvo", "train a network of the paper", _training)
+    add("--config", type=Path, required=True, help="configs/train_*.yaml")
+    add("--workers", type=int, default=0, help="processes that draw samples")
+    add("--device", choices=DEVICES, default="auto")
+    for name in ("steps", "batch-size", "seed"):
+        add(f"--{name}", type=int, help="instead of the configuration's")
+
+    add = _command(below, call, "selector", "train the selector", _training)
+    add("--config", type=Path, default=Path("configs/train_selector.yaml"))
+    add("--data", type=Path, required=True, help="folder of the shards")
+
+    add = _command(below, call, "export", "write a network's weights for users (float16)")
+    add("--out", type=Path, required=True, help="folder of the run")
+    add("--export", type=Path, required=True, metavar="FILE", help="*.safetensors")
+    add("--count", type=int, default=1000, help="held-out pairs of each preset")
+    add("--calibrate", default=0, help="shift PWVO's s by N pairs", **COUNT)
+
+    add = _command(below, call, "selector-data", "draw samples for the selector")
+    recordings = "semi-real pairs of the recordings below it"
+    add("--data", type=Path, required=True, help="folder of the shards")
+    add("--first-seed", type=int, default=1000000, help="below 1000: held out")
+    add("--seeds", type=int, default=0, help="about as many samples")
+    add("--recordings", type=Path, metavar="DIR", help=recordings)
+    add("--split", default="train", help="which of these recordings")
+    add("--propose", metavar="NETWORK", help="ask these weights about the samples")
+
+
+def _generate(commands: Any) -> None:
+    def call(args: Namespace) -> Answer:
+        from hybridvo.commands.train import generate
+
+        sheet = generate(
+            args.preset,
+            args.count,
+            args.out,
+            seed=args.seed,
+            size=args.size,
+            workers=args.workers,
+            quiet=args.quiet,
+        )
+        return _files(sheet)
+
+    add = _command(commands, call, "generate", "Draw training samples into a folder.")
+    add("--preset", default="paper", help="paper, diverse or a YAML file; default: %(default)s")
+    add("--out", required=True, metavar="DIR", help="folder of the samples")
+    add("--count", default=1000, help="default: 1000", **COUNT)
+    add("--seed", default=0, **COUNT)
+    add("--size", type=int, nargs=2, metavar=("H", "W"), help="pixels")
+    add("--workers", default=1, help="processes", **COUNT)
+
+
+def _init(commands: Any) -> None:
+    def call(args: Namespace) -> Answer:
+        from hybridvo.data.camera_file import write_camera_template
+
+        return _files(write_camera_template(args.directory))
+
+    about = "Write a camera.yaml to fill in for your recording."
+    add = _command(commands, call, "init", about)
+    add("directory", metavar="DIR", help="folder with rgb/ and depth/")
