@@ -11,7 +11,6 @@ from hybridvo.errors import InputError
 from hybridvo.geometry import ego_flow, se3_exp
 from hybridvo.hypotheses.generate import HypothesisSet, generate
 from hybridvo.hypotheses.selector import (
-    NO_RIVAL,
     Candidate,
     Scores,
     gap_of,
@@ -207,4 +206,5 @@ def test_only_another_motion_is_a_rival(case) -> None:
     # a rival that looks as good leaves less to believe
     score[1] = 2.9
     assert gap_of(found, poses, score) == pytest.approx(0.1)
-    assert gap_of(found, [poses[0], poses[-1]], score[[0, -1]]) == NO_RIVAL
+    # alone it is measured against none of them being right
+    assert gap_of(found, [poses[0], poses[-1]], score[[0, -1]]) == 3.0
