@@ -21,7 +21,7 @@ _HOME = {
         "network.selection": "select",
         "odometry": "Odometry",
         "trajectory": "Trajectory",
-        "pipeline": "estimate refine",
+        "api": "estimate refine",
         "data.sequence": "open_sequence iter_pairs",
         "flow": "dis_flow",
         "evaluation.metrics": "evaluate",

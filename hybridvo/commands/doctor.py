@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from hybridvo.api import estimate
 from hybridvo.calibration import DOUBTFUL_SPREAD
 from hybridvo.commands.compare import methods_to_run
 from hybridvo.data.sequence import Sequence
@@ -15,7 +16,6 @@ from hybridvo.errors import InputError
 from hybridvo.evaluation.scores import true_motion
 from hybridvo.files import versions
 from hybridvo.flow import contradiction, dis_flow, file_flow, with_flow
-from hybridvo.pipeline import estimate
 from hybridvo.refinement.covariance import direction_is_known
 from hybridvo.refinement.depth import compare_depths
 from hybridvo.types import Frame, FramePair, depth_advice, typical_depth

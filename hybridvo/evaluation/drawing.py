@@ -17,6 +17,7 @@ from matplotlib import colormaps
 from matplotlib.colors import hsv_to_rgb
 from matplotlib.figure import Figure
 
+from hybridvo.api import estimate
 from hybridvo.data.sequence import Sequence, iter_pairs
 from hybridvo.errors import InputError
 from hybridvo.evaluation.metrics import aligned
@@ -28,7 +29,7 @@ from hybridvo.network.inputs import assemble_inputs
 from hybridvo.network.models import Models
 from hybridvo.network.prediction import first_motions
 from hybridvo.network.selection import select_pose
-from hybridvo.pipeline import DEFAULT_METHOD, estimate
+from hybridvo.pipeline import DEFAULT_METHOD
 from hybridvo.results import PixelwisePrediction, RelativePose
 from hybridvo.trajectory import Trajectory
 from hybridvo.types import FramePair

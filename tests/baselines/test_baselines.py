@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from hybridvo.api import estimate
 from hybridvo.baselines import pnp
 from hybridvo.baselines.pnp import Correspondences, check, missing, sample
 from hybridvo.errors import InputError
 from hybridvo.geometry import ego_flow, invert, make_transform, rotation_angle, se3_exp, se3_log
-from hybridvo.pipeline import check_method, estimate
+from hybridvo.pipeline import check_method
 from hybridvo.results import Reason, RelativePose, State
 from hybridvo.synthetic.scenarios import Scenario, make_pair
 from hybridvo.types import Camera, Frame, FramePair

@@ -14,9 +14,10 @@ from functools import cache
 import numpy as np
 import pytest
 
+from hybridvo.api import estimate
 from hybridvo.errors import InputError
 from hybridvo.geometry import se3_exp
-from hybridvo.pipeline import DEFAULT_METHOD, METHODS, check_method, estimate
+from hybridvo.pipeline import DEFAULT_METHOD, METHODS, check_method
 from hybridvo.results import MotionPrior, Reason, State
 from hybridvo.types import FramePair
 from tests import worlds

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from hybridvo.api import estimate, refine
 from hybridvo.calibration import CLEAR_RIGHT, MIN_CONFIDENCE
 from hybridvo.errors import InputError
 from hybridvo.geometry import ego_flow, se3_exp
@@ -18,7 +19,7 @@ from hybridvo.hypotheses.selector import (
     select_by_scorer,
 )
 from hybridvo.options import Options, SelectOptions
-from hybridvo.pipeline import Context, estimate, refine
+from hybridvo.pipeline import Context
 from hybridvo.results import MotionPrediction, MotionPrior, RelativePose, State
 from hybridvo.synthetic.render import SyntheticSequence
 from hybridvo.synthetic.scenarios import Scenario, make_pair

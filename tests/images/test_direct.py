@@ -7,11 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hybridvo.api import estimate
 from hybridvo.flow import FlowField, dis_flow, with_flow
 from hybridvo.geometry import pose_matrix, project
 from hybridvo.images.photometric import direct_start, reduced
 from hybridvo.options import DirectOptions, Options
-from hybridvo.pipeline import Context, estimate, run_method
+from hybridvo.pipeline import Context, run_method
 from hybridvo.types import FramePair
 from tests.images.test_photometric import error_px, made_pair
 

@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 import pytest
 
+from hybridvo.api import refine
 from hybridvo.flow import dis_flow
 from hybridvo.geometry import ego_flow, invert
 from hybridvo.images.factors import correlation
 from hybridvo.images.photometric import refine_photometric
-from hybridvo.pipeline import refine
 from hybridvo.synthetic.render import SyntheticSequence
 from hybridvo.synthetic.scenes import make_scene
 from hybridvo.types import Frame, FramePair

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hybridvo.api import refine
 from hybridvo.flow import dis_flow
 from hybridvo.geometry import ego_flow, invert, se3_exp
 from hybridvo.images import kernels
 from hybridvo.images.factors import ImageFactor
 from hybridvo.images.photometric import blurred, choose_pixels, refine_photometric
-from hybridvo.pipeline import refine
 from hybridvo.results import RelativePose, Status
 from hybridvo.synthetic.render import SyntheticSequence
 from hybridvo.synthetic.scenes import make_scene

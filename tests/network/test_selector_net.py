@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from hybridvo.api import refine
 from hybridvo.geometry import pixel_grid, se3_exp
 from hybridvo.hypotheses.generate import HypothesisSet, generate
 from hybridvo.hypotheses.search import FACTS
@@ -19,7 +20,6 @@ from hybridvo.network.selector_inputs import (
 )
 from hybridvo.network.selector_net import SelectorNetwork
 from hybridvo.options import Options
-from hybridvo.pipeline import refine
 from hybridvo.synthetic.scenarios import Scenario, make_pair
 from hybridvo.types import Camera, Frame, FramePair
 

@@ -35,11 +35,12 @@ IMPORTS: dict[str, set[str]] = {
     "hypotheses": NOUNS | {"refinement"},
     "network": NOUNS | {"torch_geometry", "refinement", "hypotheses"},
     "pipeline": NOUNS | {"network", "hypotheses", "refinement", "images", "baselines", "flow"},
+    "api": NOUNS | {"pipeline", "flow", "network", "refinement"},
     "odometry": NOUNS | {"pipeline", "flow", "trajectory", "network"},
     # pairs made of recordings are refined before something is moved in them
     "synthetic": NOUNS | {"trajectory", "data", "flow", "refinement"},
     "evaluation": NOUNS
-    | {"trajectory", "data", "pipeline", "odometry", "flow", "network", "refinement"}
+    | {"trajectory", "data", "pipeline", "api", "odometry", "flow", "network", "refinement"}
     | {"__init__"},
     "training": NOUNS
     | {"torch_geometry", "data", "synthetic", "network", "hypotheses", "refinement"}
@@ -74,7 +75,7 @@ MAX_FUNCTION_LINES = 70
 MAX_FOLDER_FILES = 16
 MAX_CONSTANTS = 220
 """Module-level names in capitals that hold numbers, outside ``calibration.py``."""
-MAX_LINES = {"hybridvo": 17_000, "tests": 12_000, "tools": 2_500}
+MAX_LINES = {"hybridvo": 16_000, "tests": 12_000, "tools": 2_500}
 MAX_PUBLIC_NAMES = 24
 
 

@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hybridvo.api import refine
 from hybridvo.calibration import LONG_GROWTH
 from hybridvo.geometry import invert, se3_log
-from hybridvo.pipeline import refine
 from hybridvo.refinement.covariance import UPPER, block_sums, long_range, motion_covariance
 from hybridvo.refinement.refine import widened
 from hybridvo.results import Reason, State, Status

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hybridvo.api import estimate, refine
 from hybridvo.geometry import ego_flow, se3_exp
 from hybridvo.options import Options, RefineOptions
-from hybridvo.pipeline import estimate, refine
 from hybridvo.refinement.depth import DepthAgreement, compare_depths
 from hybridvo.results import Reason
 from hybridvo.types import Camera, Frame, FramePair

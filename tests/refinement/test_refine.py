@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from hybridvo.api import refine
 from hybridvo.geometry import ego_flow, invert, rotation_angle, se3_exp, se3_log
-from hybridvo.pipeline import refine
 from hybridvo.results import State
 from hybridvo.synthetic.scenarios import make_pair
 from hybridvo.types import Camera, Frame, FramePair

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 
+from hybridvo.api import refine
 from hybridvo.errors import InputError
 from hybridvo.geometry import ego_flow, invert, rotation_angle, se3_exp, se3_log
-from hybridvo.pipeline import refine
 from hybridvo.refinement.torch_backend import BatchedPose, refine_batch
 from hybridvo.refinement.torch_factors import KERNELS
 from hybridvo.results import Reason, State
