@@ -205,6 +205,16 @@ class PixelwisePrediction:
     log_scale: torch.Tensor | None = None  # (B, 6, h, w) s = log U, U the Laplace scale of each
     image_size: tuple[int, int] | None = None  # (H, W) of the pairs that the network was given
 
+    @property
+    def rotation(self) -> torch.Tensor:
+        """(B, 3, h, w) degrees."""
+        return self.motion[:, :3]
+
+    @property
+    def translation(self) -> torch.Tensor:
+        """(B, 3, h, w) metres."""
+        return self.motion[:, 3:]
+
 
 def right(evidence: Sequence[float], weights: Sequence[float]) -> float:
     """Probability that a motion is right: logistic in its evidence; the last weight is alone."""

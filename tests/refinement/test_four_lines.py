@@ -141,7 +141,7 @@ def test_one_training_step_of_a_narrow_network_in_channels_last() -> None:
         hvo.PairBatch.from_pairs([make_pair("moving30", k, 128, 256)[0] for k in (0, 1)])
     )
     before = [p.detach().clone() for p in network.parameters()]
-    network(inputs).motion.square().mean().backward()
+    network(inputs).rotation.square().mean().backward()
     optimizer.step()
     assert all(torch.isfinite(p).all() for p in network.parameters())
     assert any(not torch.equal(a, b) for a, b in zip(before, network.parameters(), strict=True))
