@@ -1,7 +1,7 @@
 """The right motion on real surfaces, and whether the stated probability can be believed.
 
     python tools/benchmark_semi_real.py --pairs 160 --out docs/results/semi_real.json
-    python tools/benchmark_semi_real.py --split development --methods hybrid-flow
+    python tools/benchmark_semi_real.py --split development --methods hybrid-flow --ablation
 
 Pairs of :mod:`hybridvo.synthetic.semi_real` on DIS flow, drawn from fixed seeds. An answer is wrong
 when its ego flow over the static pixels errs by more than 1 px and more than three times as much as
@@ -11,9 +11,11 @@ when its ego flow over the static pixels errs by more than 1 px and more than th
 from __future__ import annotations
 
 import argparse
-import functools
 import itertools
 import sys
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +23,8 @@ import numpy as np
 from measuring import auroc, digits, ego_flow_error, parser_of, proportion, provenance, timed
 
 METHODS = ("refine", "hybrid-flow", "poselib")
+ABLATION = ("images", "second depth", "PWVO", "fits in its masks")
+"""What ``hybrid-flow`` has to do without, one at a time."""
 WRONG_PX, WRONG_FACTOR = 1.0, 3.0
 LEAST_MOVING = 0.2
 """Share of the image that moves at least where anything does."""
@@ -36,7 +40,14 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--first", type=int, default=0, help="number of the first pair")
     parser.add_argument("--split", default="test", choices=SEEDS)
     parser.add_argument("--methods", default=",".join(METHODS))
-    parser.add_argument("--selector", metavar="FILE", help="weights instead of the shipped ones")
+    parser.add_argument(
+        "--selector",
+        action="append",
+        default=[],
+        metavar="NAME=FILE",
+        help="a row of hybrid-flow with other weights",
+    )
+    parser.add_argument("--ablation", action="store_true", help="rows without parts of the method")
     parser.add_argument("--data", type=Path, default=Path("../shared/data"), metavar="DIR")
     parser.add_argument("--out", type=Path, metavar="FILE")
     return parser
@@ -48,8 +59,8 @@ def main(argv: list[str] | None = None) -> int:
     from hybridvo.synthetic.semi_real import load_split
 
     recordings = load_split(args.data, args.split)
-    rows = measure(args, recordings)
-    methods = args.methods.split(",")
+    methods = competitors(args)
+    rows = measure(args, recordings, methods)
     result = provenance("benchmark_semi_real.py", argv) | {
         "split": args.split,
         "recordings": {r.source.path: len(r.frames) for r in recordings},
@@ -66,12 +77,38 @@ def main(argv: list[str] | None = None) -> int:
     return 0
 
 
-def measure(args: argparse.Namespace, recordings: Any) -> list[dict[str, Any]]:
-    """Errors, statuses and probabilities of every method on every pair."""
-    from hybridvo import estimate
+def competitors(args: argparse.Namespace) -> dict[str, Callable[[Any], Any]]:
+    """What is measured, by name: from a pair to its motion."""
+    from hybridvo import Options, estimate
     from hybridvo.network.models import Models
 
-    models = Models(weights={"selector": args.selector}) if args.selector else None
+    def without(part: str, pair: Any) -> Any:
+        select = Options().select
+        if part == "images":
+            prev, curr = (replace(frame, rgb=None) for frame in (pair.prev, pair.curr))
+            pair = replace(pair, prev=prev, curr=curr)
+        elif part == "second depth":
+            pair = replace(pair, curr=replace(pair.curr, depth=None))
+        elif part == "PWVO":
+            select = replace(select, min_confidence=0)
+        else:
+            select = replace(select, refits=0)
+        return estimate(pair, method="hybrid-flow", options=Options(select=select))
+
+    found = {name: partial(estimate, method=name) for name in args.methods.split(",")}
+    for text in args.selector:
+        name, _, file = text.partition("=")
+        models = Models(weights={"selector": file})
+        found[f"selector {name}"] = partial(estimate, method="hybrid-flow", models=models)
+    if args.ablation:
+        found |= {f"without {part}": partial(without, part) for part in ABLATION}
+    return found
+
+
+def measure(
+    args: argparse.Namespace, recordings: Any, methods: dict[str, Callable[[Any], Any]]
+) -> list[dict[str, Any]]:
+    """Errors, statuses and probabilities of every method on every pair."""
     rows = []
     for k in range(args.first, args.first + args.pairs):
         drawn = draw(args.split, k, recordings)
@@ -84,8 +121,8 @@ def measure(args: argparse.Namespace, recordings: Any) -> list[dict[str, Any]]:
             "static_usable": digits((usable & ~drawn.moving).sum() / max(usable.sum(), 1)),
             "oracle_px": digits(limit),
         }
-        for method in args.methods.split(","):
-            motion, ms = timed(functools.partial(estimate, pair, method=method, models=models))
+        for method, solve in methods.items():
+            motion, ms = timed(partial(solve, pair))
             error = ego_flow_error(motion.T_curr_prev, T, depth, pair)
             others = [ego_flow_error(h.T_curr_prev, T, depth, pair) for h in motion.hypotheses]
             row[method] = {
