@@ -32,7 +32,7 @@ CUE_WEIGHTS = {
 }
 """Weights of the cues of :mod:`hybridvo.hypotheses.selector`, by hand on seeds 900-905 of the heavy
 scenes and the scenario ``one60``; ``python tools/golden.py --only /refine`` shows the result."""
-MIN_CONFIDENCE = 0.85
+MIN_CONFIDENCE = 0.9
 """Probability of being right below which a motion is degraded."""
 CLEAR_COHERENCE = 0.5
 """Spatial correlation of the residuals above which a motion that most of the image follows may be a
