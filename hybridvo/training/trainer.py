@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import copy
 import dataclasses
+import itertools
 import json
 import math
 import pickle
@@ -18,7 +19,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import torch
 from torch import nn
 from torch.optim.swa_utils import get_ema_multi_avg_fn
@@ -144,9 +144,10 @@ class Trainer:
         self.elapsed_s += time.monotonic() - started
         if self.step % options.log_every == 0:
             rate = options.batch_size * len(self._seen) / (self.elapsed_s - self._logged_s)
-            # of the updates in which a figure is finite
-            means = pd.DataFrame(self._seen).replace([math.inf, -math.inf], math.nan).mean()
-            self._log({"event": "train", **means.dropna(), "samples_per_s": rate})
+            taken = [e for e in self._seen if math.isfinite(e["grad_norm"])]
+            names = dict.fromkeys(itertools.chain(*taken))
+            means = {n: float(np.mean([e[n] for e in taken if n in e])) for n in names}
+            self._log({"event": "train", **means, "samples_per_s": rate})
             self._seen, self._logged_s = [], self.elapsed_s
         if options.evaluate_every and self.step % options.evaluate_every == 0:
             self.evaluate()
