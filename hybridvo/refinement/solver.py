@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
+from scipy.linalg.lapack import dpotrf, dpotri
 
 from hybridvo.geometry import invert, se3_exp, se3_log
 from hybridvo.options import RefineOptions
@@ -100,13 +101,13 @@ def positive_inverse(matrix: np.ndarray) -> np.ndarray | None:
     if not (np.isfinite(matrix).all() and (diagonal > 0).all()):
         return None
     scale = 1 / np.sqrt(diagonal)
-    scaled = matrix * np.outer(scale, scale)
-    try:
-        np.linalg.cholesky(scaled)
-    except np.linalg.LinAlgError:
+    scales = scale[:, None] * scale
+    factor, failed = dpotrf(matrix * scales)
+    if failed:
         return None
-    inverse = np.linalg.inv(scaled) * np.outer(scale, scale)
-    return 0.5 * (inverse + inverse.T) if np.isfinite(inverse).all() else None
+    upper = dpotri(factor)[0]  # zeros below the diagonal
+    inverse = (upper + upper.T - np.diag(upper.diagonal())) * scales
+    return inverse if np.isfinite(inverse).all() else None
 
 
 def tile_size(shape: tuple[int, int], tiles: int = RefineOptions.tiles) -> int:
