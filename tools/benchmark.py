@@ -162,7 +162,7 @@ def heavy_pairs(kind: str, seed: int) -> Iterator[tuple[str, Any, np.ndarray, np
     """(flow, pair, true motion, static pixels): pairs spread over a scene, each with both flows."""
     sequence = rendered(kind, seed, SIZE, HEAVY_FRAMES)
     for i, case in zip(HEAVY_AT, heavy_inputs(sequence), strict=True):
-        static = (sequence.scene.render(i).object_id <= 0).astype(np.float32)
+        static = (sequence.scene.object_id(i) <= 0).astype(np.float32)
         for flow in ("dis", "true"):
             yield flow, case.pairs[flow], case.T_curr_prev, static
 

@@ -132,6 +132,10 @@ class Scene:
         depth = self._cast(index, self.camera)[2]
         return np.where(np.isfinite(depth), depth, 0.0).astype(np.float32)
 
+    def object_id(self, index: int) -> np.ndarray:
+        """(H, W) int32 object numbers of a frame."""
+        return self._object_id(self._cast(index, self.camera)[-1])
+
     def moving_share(self, index: int, width: int = 96) -> tuple[float, float]:
         """Share of the pixels of a frame on movers, and the smallest depth; in a small image."""
         *_, depth, solid = self._cast(index, self._small(width))

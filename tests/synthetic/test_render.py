@@ -190,7 +190,7 @@ def test_sequence(scenes):
     assert variance is None
     truth, moving = scene.flow(2)
     np.testing.assert_array_equal(flow, truth)
-    np.testing.assert_array_equal(scene.render(2).object_id > 0, moving)
+    np.testing.assert_array_equal(scene.object_id(2) > 0, moving)
     assert sequence.files() == []
     assert isinstance(sequence, Sequence)
     with pytest.raises(IndexError):
