@@ -57,8 +57,8 @@ class Tiles:
         self._number = index[:, 0] // size * self.shape[1] + index[:, 1] // size
 
     def sums(self, scores: np.ndarray) -> np.ndarray:
-        """(rows, columns, 6) sums of (6, N) scores over each."""
-        return kernels.sum_by(self._number, scores, np.zeros((*self.shape, 6)))
+        """(rows, columns, M) sums of (M, N) scores over each."""
+        return kernels.sum_by(self._number, scores, np.zeros((*self.shape, len(scores))))
 
 
 def spread(lengths: np.ndarray) -> float:
@@ -130,12 +130,13 @@ class ImageFactor:
         self, prev: np.ndarray, curr: np.ndarray, T: np.ndarray, uneven_light: bool = True
     ) -> None:
         """Take two images (H, W) and estimate noise and light at a motion."""
-        rows, columns = self._index.T
-        self._buffer[kernels.GX] = 0.5 * (prev[rows, columns + 1] - prev[rows, columns - 1])
-        self._buffer[kernels.GY] = 0.5 * (prev[rows + 1, columns] - prev[rows - 1, columns])
+        width, at = prev.shape[1], self._index @ [prev.shape[1], 1]
+        right, left, below, above = (prev.take(at + step) for step in (1, -1, width, -width))
+        self._buffer[kernels.GX] = 0.5 * (right - left)
+        self._buffer[kernels.GY] = 0.5 * (below - above)
         self._curr, self._at = curr, np.empty(0)
         # without the fields of light that may be put into the buffer's
-        self._even = self._buffer[kernels.GREY] = prev[rows, columns]
+        self._even = self._buffer[kernels.GREY] = prev.take(at)
         self._project(T)
         for _ in range(2):
             self._settle()
@@ -153,11 +154,12 @@ class ImageFactor:
         model, self._scale = positive_inverse(H), 0.0
         if model is None:
             return
-        rows = self._J[:6].astype(np.float64) - light @ self._J[6:8]
-        pull = rows * self._wr
+        free, J = np.hstack([np.eye(6), -light]).astype(np.float32), self._J[: kernels.GQ]
+        pull = J * self._wr
         # as at the optimum of the images alone, to first order: the flow pulls away from it
-        sums = self._tiles.sums(pull - rows * (self._w * ((model @ pull.sum(axis=1)) @ rows)))
-        share = independent_share(sums, pull @ pull.T, model)
+        step = model.astype(np.float32) @ (free @ (J @ self._wr))
+        sums = self._tiles.sums(pull - J * (self._w * (step @ free @ J))) @ free.T
+        share = independent_share(sums, free @ (pull @ pull.T) @ free.T, model)
         if share > 0:
             parts = share * parts_dispersion(sums, model)
             # what the parts disagree about is seen; as much again is common to them and is not
@@ -228,10 +230,13 @@ class ImageFactor:
 
     def _even_light(self, least: float) -> bool:
         """Put fields of gain and offset into the grey values where they explain enough."""
-        buffer, (gain, _), r, w, shares = self._buffer, self._light, self._r, self._w, self._shares
-        grey, few = buffer[kernels.GREY], np.s_[::4]
-        if least > 0 and light_fields(shares[few], grey[few], r[few], w[few], least) is None:
-            return False
+        buffer, (gain, _), r, w, few = self._buffer, self._light, self._r, self._w, np.s_[::4]
+        grey = buffer[kernels.GREY]
+        if least > 0:
+            some = node_shares(self._places[few]), grey[few], r[few], w[few]
+            if light_fields(*some, least) is None:
+                return False
+        shares = self._shares
         fields = light_fields(shares, grey, r, w)
         if fields is None:
             return False

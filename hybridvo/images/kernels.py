@@ -192,10 +192,10 @@ def weigh_pixels(weight, relative, along, r, noise, w, wr):
 
 @njit(error_model="numpy", cache=True, nogil=True)
 def sum_by(number, scores, out):
-    """Sums of scores (6, N) over the pixels of each number, added to ``out`` (.., 6)."""
-    flat = out.reshape(-1, 6)
+    """Sums of scores (M, N) over the pixels of each number, added to ``out`` (.., M)."""
+    flat = out.reshape(-1, len(scores))
     for k in range(len(number)):
-        for p in range(6):
+        for p in range(len(scores)):
             flat[number[k], p] += scores[p, k]
     return out
 

@@ -86,7 +86,7 @@ def gauss_newton(
 def _step(at: Linearization, damping: float) -> tuple[np.ndarray, float]:
     """(Newton step, its squared length in standard deviations); infinite where there is none."""
     for H in (at.H - at.curvature, at.H):
-        inverse = positive_inverse(H + damping * np.diag(np.diag(H)))
+        inverse = positive_inverse(H * (1 + damping * np.eye(6)))
         if inverse is None:
             continue
         step = inverse @ at.g
@@ -106,7 +106,8 @@ def positive_inverse(matrix: np.ndarray) -> np.ndarray | None:
     if failed:
         return None
     upper = dpotri(factor)[0]  # zeros below the diagonal
-    inverse = (upper + upper.T - np.diag(upper.diagonal())) * scales
+    inverse = (upper + upper.T) * scales
+    inverse.flat[:: len(scale) + 1] *= 0.5
     return inverse if np.isfinite(inverse).all() else None
 
 
