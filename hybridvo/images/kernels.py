@@ -168,6 +168,38 @@ def project_pixels(buf, image, pose, K, scale, light, J, r):
         r[k] = read_cubic(image, u, v) - gain * grey - offset
 
 
+@njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
+def weigh_pixels(weight, relative, along, r, noise, w, wr):
+    """Weights of projected pixels and their products with the residuals, 0 where unseen, into ``w``
+    and ``wr`` (N,); returns the cost, the highest where unseen.
+
+    ``relative`` variance of depth, ``along``: G^T q; ``noise`` = (grey levels, log depth, c of the
+    Geman-McClure kernel).
+    """
+    s2, sd, c2, cost = noise[0] * noise[0], noise[1], noise[2] * noise[2], 0.0
+    for k in range(len(r)):
+        q = sd * along[k]
+        information = ONE / (s2 + relative[k] * q * q)
+        d2 = r[k] * r[k] * information
+        seen = d2 < MAX_VALUE  # False for NaN
+        robust = c2 / (c2 + (d2 if seen else ZERO))
+        factor = weight[k] * robust * robust * information if seen else ZERO
+        w[k] = factor
+        wr[k] = factor * (r[k] if seen else ZERO)
+        cost += HALF * weight[k] * (robust * d2 if seen else c2)
+    return cost
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def sum_by(number, scores, out):
+    """Sums of scores (M, N) over the pixels of each number, added to ``out`` (.., M)."""
+    flat = out.reshape(-1, len(scores))
+    for k in range(len(number)):
+        for p in range(len(scores)):
+            flat[number[k], p] += scores[p, k]
+    return out
+
+
 @njit(cache=True, nogil=True)
 def point(depth, u, v, K):
     """The point of a pixel, metres."""

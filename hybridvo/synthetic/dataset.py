@@ -1,7 +1,7 @@
 """What training samples are drawn from: presets in YAML files, and samples drawn before on disk.
 
 A folder of samples holds ``samples.json`` (what was drawn) and ``0000000.npz`` and so on with the
-fields of :class:`~hybridvo.synthetic.layered.Sample`; the ego flow, which others say, is left out.
+fields of :class:`~hybridvo.synthetic.layered.Sample`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from hybridvo.files import atomic_write, make_folder, parse_yaml, read_text, wri
 from hybridvo.options import option_group
 from hybridvo.synthetic.diverse import DiverseOptions
 from hybridvo.synthetic.draws import STORED, sample_generator
-from hybridvo.synthetic.layered import PaperOptions, Sample, camera_flow
+from hybridvo.synthetic.layered import PaperOptions, Sample
 
 MANIFEST = "samples.json"
 
@@ -131,10 +131,8 @@ def write_samples(
 def _write_sample(preset: Preset, seed: int, folder: Path, index: int) -> int:
     path = _path(folder, index)
     if not path.exists():
-        fields = dict(vars(preset.sample(sample_generator(seed, index, STORED))))
-        del fields["ego_flow"]
         with atomic_write(path, "wb") as file:
-            np.savez(file, **fields)
+            np.savez(file, **vars(preset.sample(sample_generator(seed, index, STORED))))
     return index
 
 
@@ -159,10 +157,8 @@ def read_sample(folder: str | Path, index: int) -> Sample:
     path = _path(Path(folder), index)
     try:
         with np.load(path) as file:
-            fields = dict(file)
-        ego_flow, _ = camera_flow(fields["K"], fields["depth_true"], fields["T_curr_prev"])
-        return Sample(ego_flow=ego_flow, **fields)
-    except (OSError, ValueError, TypeError, KeyError, EOFError, BadZipFile) as error:
+            return Sample(**file)
+    except (OSError, ValueError, TypeError, EOFError, BadZipFile) as error:
         raise FormatError(f"{path}: damaged or absent sample: {error}.") from None
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from hybridvo.geometry import make_transform
 from hybridvo.synthetic.draws import about, direction, log_uniform, smooth_field, turn
-from hybridvo.synthetic.layered import image_flow, rays, rigid_flow, splat
+from hybridvo.synthetic.layered import rays, rigid_flow, splat
 from hybridvo.synthetic.sensors import noisy_flow
 from hybridvo.types import Camera, Frame, FramePair
 
@@ -115,12 +115,10 @@ def make_pair(
     rho = _surfaces(rng, cell, (height, width))
     ray = rays(camera.K, rho.shape)
     owner, motions = _add_objects(rng, cell, rho, ray, T)
-    flow, ratio = image_flow(camera.K, rho, T)
+    flow, ratio = rigid_flow(camera.K, rho, T, ray)
     for number, motion in enumerate(motions, start=1):
         mine = owner == number
-        x, y = ray[:, mine]
-        *own, ratio[mine] = rigid_flow(x, y, rho[mine], motion, (focal, focal))
-        flow[mine] = np.stack(own, axis=-1)
+        flow[mine], ratio[mine] = rigid_flow(camera.K, rho[mine], motion, ray[:, mine])
     seen = splat(flow, rho / ratio)
     depths = [(1.0 / np.where(r > 0, r, np.nan)).astype(np.float32) for r in (rho, seen)]
     measured, outlier = noisy_flow(rng, flow, cell.flow_noise_px, cell.outliers, 60.0)

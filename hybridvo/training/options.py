@@ -67,7 +67,6 @@ class RunOptions:
     seed: int = 0
     steps: Count = 100_000
     batch_size: Count = 100
-    channels_last: bool = True
     ema_decay: Below1 = 0.0
     optimizer: OptimizerOptions = OptimizerOptions()
     schedule: ScheduleOptions = ScheduleOptions()

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import nn
@@ -20,12 +20,12 @@ from hybridvo.network.selection import fitted_motion, select_motion
 from hybridvo.results import PixelwisePrediction
 from hybridvo.synthetic.dataset import Mixture
 from hybridvo.synthetic.draws import TRAINING, sample_generator
-from hybridvo.synthetic.layered import PaperOptions
+from hybridvo.synthetic.layered import Sample
 from hybridvo.training.options import PwvoOptions
 from hybridvo.training.validation import (
     PUBLISHED_SEED,
-    DrawnBatch,
     TrainingBatch,
+    collate,
     evaluate_network,
     held_out,
 )
@@ -35,33 +35,29 @@ FIT_FLOOR_PX, FIT_LIMIT_PX = 0.05, 100.0
 is charged, also behind the camera."""
 
 
-class _Drawn(Dataset[dict[str, np.ndarray]]):
+@dataclass
+class _Drawn(Dataset[Sample]):
     """The training samples of a seed by their number."""
 
-    def __init__(self, mixture: Mixture, seed: int) -> None:
-        self.mixture, self.seed = mixture, seed
+    mixture: Mixture
+    seed: int
 
-    def __getitem__(self, index: int) -> dict[str, np.ndarray]:
-        rng = sample_generator(self.seed, index, TRAINING)
-        first, *others = self.mixture.presets
-        if isinstance(first, PaperOptions) and not others:  # these travel without their flows
-            return first.draw(rng)
-        return vars(self.mixture.sample(rng))
+    def __getitem__(self, index: int) -> Sample:
+        return self.mixture.sample(sample_generator(self.seed, index, TRAINING))
 
 
 def sample_stream(
     mixture: Mixture, seed: int, start: int, batch_size: int, workers: int = 0
-) -> Iterator[DrawnBatch]:
+) -> Iterator[TrainingBatch]:
     """Endless batches of a mixture, from sample ``start`` of a seed, however many workers draw."""
     numbers: Any = (range(k, k + batch_size) for k in itertools.count(start, batch_size))
-    fork = "fork" if workers else None
     return iter(
         DataLoader(
             _Drawn(mixture, seed),
             batch_sampler=numbers,
-            collate_fn=DrawnBatch,
+            collate_fn=collate,
             num_workers=workers,
-            multiprocessing_context=fork,
+            multiprocessing_context="fork" if workers else None,
         )
     )
 
@@ -75,7 +71,7 @@ class PwvoTask:
         self.network = build_network(options.network)
         self.data = mixture.record
 
-    def batches(self, samples: int, workers: int) -> Iterator[DrawnBatch]:
+    def batches(self, samples: int, workers: int) -> Iterator[TrainingBatch]:
         """Batches of the run's stream from sample number ``samples`` on."""
         o = self.options
         return sample_stream(self.mixture, o.seed, samples, o.batch_size, workers)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import copy
 import dataclasses
+import itertools
 import json
 import math
 import pickle
@@ -60,9 +61,8 @@ class Trainer:
         self.task, self.folder = task, folder
         self.options: RunOptions = task.options
         self.device, self.workers, self.report = torch.device(device), workers, report
-        self.network = task.network.to(self.device)
-        if self.options.channels_last:
-            self.network = self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        # the order of memory that convolutions prefer
+        self.network = task.network.to(self.device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         # the network that a user should get: the running average
         self.exported = copy.deepcopy(self.network).requires_grad_(False)
         how = self.options.optimizer
@@ -117,16 +117,14 @@ class Trainer:
         figures = {"loss": float(loss.detach()), "grad_norm": float(norm), "lr": rate}
         return figures | {name: float(part) for name, part in parts.items()}
 
-    def run(self, time_limit_s: float = math.inf, until: int | None = None) -> str:
-        """Train, save, and say why it ended: ``steps`` (of which ``until``), ``time``, ``signal``.
+    def run(self, time_limit_s: float = math.inf) -> str:
+        """Train, save, and say why it ended: ``steps``, ``time``, ``signal``.
 
         ``time_limit_s`` counts over all interruptions.
         """
-        options = self.options
-        last = min(until or options.steps, options.steps)
         batches = self.task.batches(self.samples, self.workers)
         why = "steps"
-        while self.step < last and why == "steps":
+        while self.step < self.options.steps and why == "steps":
             started = time.monotonic()
             batch = next(batches)
             self.elapsed_s += time.monotonic() - started
@@ -146,7 +144,10 @@ class Trainer:
         self.elapsed_s += time.monotonic() - started
         if self.step % options.log_every == 0:
             rate = options.batch_size * len(self._seen) / (self.elapsed_s - self._logged_s)
-            self._log({"event": "train", **_means(self._seen), "samples_per_s": rate})
+            taken = [e for e in self._seen if math.isfinite(e["grad_norm"])]
+            names = dict.fromkeys(itertools.chain(*taken))
+            means = {n: float(np.mean([e[n] for e in taken if n in e])) for n in names}
+            self._log({"event": "train", **means, "samples_per_s": rate})
             self._seen, self._logged_s = [], self.elapsed_s
         if options.evaluate_every and self.step % options.evaluate_every == 0:
             self.evaluate()
@@ -219,13 +220,6 @@ def read_checkpoint(path: Path, device: torch.device | str = "cpu") -> dict[str,
     with _reading(str(path)):
         state = torch.load(path, map_location=device, weights_only=True)
         return {**state, "record": state["record"]}
-
-
-def _means(entries: list[dict[str, float]]) -> dict[str, float]:
-    """Mean of each figure over the updates in which it is finite."""
-    names = dict.fromkeys(name for entry in entries for name in entry)
-    found = {n: [e[n] for e in entries if math.isfinite(e.get(n, math.nan))] for n in names}
-    return {name: float(np.mean(values)) for name, values in found.items() if values}
 
 
 # --- weights for users ----------------------------------------------------------------------------

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -10,6 +11,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from scipy.stats import mannwhitneyu, spearmanr
+from torch.utils.data import default_collate
 
 from hybridvo.errors import InputError
 from hybridvo.network.inputs import NetworkInputs, assemble_inputs
@@ -19,7 +21,7 @@ from hybridvo.network.selection import select_pose
 from hybridvo.results import PixelwisePrediction
 from hybridvo.synthetic.dataset import Preset
 from hybridvo.synthetic.draws import sample_generator
-from hybridvo.synthetic.layered import Sample, compose
+from hybridvo.synthetic.layered import Sample
 from hybridvo.torch_geometry import euler_motion, euler_transform
 from hybridvo.types import PairBatch
 
@@ -31,46 +33,42 @@ FIGURES = ("r_err_deg", "t_err", "epe")
 BATCH = 20
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class TrainingBatch:
-    """Inputs and ground truth of B samples; ``moving``: (B, h, w) bool, pixels that move."""
+    """Fields of B samples; what networks and losses take of them is made where they are."""
 
-    inputs: NetworkInputs
-    targets: LossTargets
-    moving: torch.Tensor
+    fields: dict[str, torch.Tensor]
 
     def __len__(self) -> int:
-        return len(self.inputs)
+        return len(self.moving)
 
     def to(self, device: torch.device | str) -> TrainingBatch:
         """Copy on another device."""
-        return TrainingBatch(*(part.to(device) for part in vars(self).values()))
+        return TrainingBatch({name: field.to(device) for name, field in self.fields.items()})
 
+    @property
+    def moving(self) -> torch.Tensor:
+        """(B, h, w) bool, pixels that move."""
+        return self.fields["moving"]
 
-class DrawnBatch:
-    """Fields of B samples, or of pairs before :func:`compose`, which computes where they go."""
-
-    def __init__(self, rows: Sequence[dict[str, np.ndarray]]) -> None:
-        self.parts = {n: torch.from_numpy(np.stack([row[n] for row in rows])) for n in rows[0]}
-
-    def __len__(self) -> int:
-        return len(self.parts["K"])
-
-    def to(self, device: torch.device | str) -> TrainingBatch:
-        """The training batch, on a device."""
-        of = {name: part.to(device) for name, part in self.parts.items()}
-        of = compose(**of) if "motions" in of else of
-        K, T = of["K"], of["T_curr_prev"]
+    @functools.cached_property
+    def inputs(self) -> NetworkInputs:
+        """Inputs of a network."""
+        of, K = self.fields, self.fields["K"]
         pairs = PairBatch(of["flow"], of["depth_prev"], K, K, of["depth_curr"])
-        truth = euler_motion(T), of["ego_flow"].permute(0, 3, 1, 2)
-        targets = LossTargets(*truth, of["depth_true"], of["depth_target"], K, K)
-        inputs = assemble_inputs(pairs, None, is_aligned=True)
-        return TrainingBatch(inputs, targets, of["moving"])
+        return assemble_inputs(pairs, None, is_aligned=True)
+
+    @functools.cached_property
+    def targets(self) -> LossTargets:
+        """Ground truth of the losses."""
+        of, K = self.fields, self.fields["K"]
+        truth = euler_motion(of["T_curr_prev"]), of["ego_flow"].permute(0, 3, 1, 2)
+        return LossTargets(*truth, of["depth_true"], of["depth_target"], K, K)
 
 
 def collate(samples: Sequence[Sample]) -> TrainingBatch:
     """Batch of at least one sample, all of one size."""
-    return DrawnBatch([vars(sample) for sample in samples]).to("cpu")
+    return TrainingBatch(default_collate([vars(sample) for sample in samples]))
 
 
 def held_out(preset: Preset, seed: int, count: int) -> list[TrainingBatch]:
