@@ -35,6 +35,7 @@ from hybridvo.refinement.torch_factors import (
     solve_small,
     stepped,
     to_tiles,
+    total_score,
     typical_residual,
     weigh,
 )
@@ -137,8 +138,7 @@ def refine_batch(
             return result
         pixels, T = gather_pixels(batch, weights), result.SE3.detach()
         how = how._replace(noise=result.noise if given is None else given)
-        A, at = newton_matrix(pixels, T, how), weigh(pixels, T.matrix(), how)
-        g = at.gradient(at.jacobian())
+        A, g = newton_matrix(pixels, T, how), total_score(pixels, T.matrix(), how)
         return replace(result, SE3=attached(T, A, g, ~result.failed[:, None]))
 
 
@@ -228,7 +228,7 @@ def _solve(
         probability=torch.where(failed, torch.zeros_like(own), probability),
         iterations=iterations,
         cost=torch.nan_to_num((weight * cost).sum(dim=1) / total),
-        weights=torch.nan_to_num(robust).view_as(batch.depth_prev),
+        weights=(torch.nan_to_num(robust) * (weight > 0)).view_as(batch.depth_prev),
         noise=torch.where(torch.isfinite(how.noise), how.noise, torch.ones_like(how.noise)),
         inlier_ratio=ratio,
     )
@@ -250,10 +250,12 @@ def _covariances(
     tile, sums, seen = tile_size((height, width), options.tiles), [], []
     for part in pixels.parts(tile * width):
         at = weigh(part, T.matrix(), how)
-        J = at.jacobian()
-        both = J, torch.cat([at.weighted(J), at.right[:, None]], dim=1)
-        tiles = (to_tiles(x.unflatten(-1, (-1, width)), tile) for x in both)
-        sums.append(torch.einsum("bprcn,bqrcn->bcpq", *tiles))
+        roots, scores = (
+            to_tiles(x.unflatten(-1, (-1, width)), tile)
+            for x in (at.roots(), torch.stack(at.scores(), dim=1))
+        )
+        H = torch.einsum("rbpcn,rbqcn->bcpq", roots, roots)
+        sums.append(torch.cat([H, scores.sum(dim=3).transpose(1, 2)[..., None]], dim=3))
         seen.append((at.robust, at.distance2, at.cost))
     # 1 / typical depth, as of the coarse grid: half of the weight may lie on a sky at 30 km
     usable, z = few.weight > 0, few.points[:, 2]
@@ -353,10 +355,7 @@ def _curvature(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """(B, 6, 6) curvature of the robust weights, and the scores' outer products, of all pixels."""
     at = weigh(few, T.matrix(), how)
-    s, w = (
-        (at.jacobian() * at.right[:, None]).sum(dim=2).double(),
-        (few.weight * at.robust)[:, None],
-    )
+    s, w = torch.stack(at.scores(), dim=1).double(), (few.weight * at.robust)[:, None]
     factor = torch.where(w > 1e-12, how.kernel(at.distance2)[2][:, None] / w.clamp(min=1e-12), 0.0)
     scale = (pixels.total / few.total.clamp(min=1e-12))[:, None, None]
     return scale * (s * factor) @ s.transpose(1, 2), scale * s @ s.transpose(1, 2)
