@@ -1,7 +1,6 @@
 """What every generator of scenes draws with: numbers, turns, smooth paths and fields, silhouettes.
 
-Silhouettes stand in for the chair photographs that the paper cut its object masks from: unions and
-differences of superellipses, polygons, stars and thin bars, of every degree of concavity.
+Silhouettes stand in for the chair photographs that the paper cut its object masks from.
 """
 
 from __future__ import annotations
@@ -141,13 +140,12 @@ def outline(rng: np.random.Generator, kind: str) -> np.ndarray:
             radius += amplitude * np.cos(k * angle + rng.uniform(0.0, 2 * np.pi))
         points = np.maximum(radius, 0.15)[:, None] * _unit(angle)
     points /= np.sqrt((points**2).sum(axis=1).max())
-    heading = rng.uniform(0.0, 2 * np.pi)
-    c, s = np.cos(heading), np.sin(heading)
+    c, s = _unit(rng.uniform(0.0, 2 * np.pi))
     return points @ np.array([[c, s], [-s, c]])
 
 
-def _unit(angle: np.ndarray) -> np.ndarray:
-    return np.stack([np.cos(angle), np.sin(angle)], axis=1)
+def _unit(angle: ArrayLike) -> np.ndarray:
+    return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
 
 def random_silhouette(rng: np.random.Generator) -> tuple[list[np.ndarray], list[np.ndarray]]:

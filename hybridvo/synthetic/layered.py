@@ -1,10 +1,8 @@
 """Training pairs of surfaces laid over each other, and the paper's five steps of drawing them.
 
-Everything is computed in inverse depth on normalised rays, so that sky is exact (0) and single
-precision suffices. The paper (section 3.4; samplers as published): 1. intrinsics; 2. depth, a
+In inverse depth on normalised rays: sky is exact (0). The paper (section 3.4): 1. intrinsics; 2. a
 constant background and five constant objects; 3. motions of camera and objects; 4. the rigid flow
 of each; 5. composition, nearest in front, **adding** an object's own flow to the camera's.
-Silhouettes are procedural: the published photographs are a download of a third party.
 """
 
 from __future__ import annotations

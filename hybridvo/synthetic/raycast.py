@@ -149,12 +149,10 @@ def _normal(shape, body, normal):  # pragma: no cover - compiled
 
 @njit(cache=True, nogil=True)
 def _texture(body, scale, offset, pixels):  # pragma: no cover - compiled
-    """Seven octaves of noise at a point, and the second alone; ``pixels`` a step of the first.
-
-    Octaves finer than about three pixels fade out, so that the picture does not alias.
-    """
+    """Seven octaves of noise at a point, and the second alone; ``pixels`` a step of the first."""
     value, coarse, amplitude, frequency = 0.0, 0.0, 1.0, 1.0
     for octave in range(7):
+        # finer than about three pixels they fade out, so that the picture does not alias
         fade = min(max((pixels / frequency - 1.5) / 2.0, 0.0), 1.0)
         if fade <= 0.0:
             break

@@ -61,7 +61,6 @@ class RunOptions:
     """What every training has; the defaults are the paper's.
 
     ``ema_decay``: of the running average of the weights, which is what is exported.
-    ``evaluate_every``: updates between evaluations over ``evaluate_count`` samples of each preset.
     """
 
     seed: int = 0
@@ -72,8 +71,6 @@ class RunOptions:
     schedule: ScheduleOptions = ScheduleOptions()
     checkpoint_minutes: Positive = 5.0
     log_every: Count = 50
-    evaluate_every: Annotated[int, Field(ge=0)] = 0
-    evaluate_count: Count = 200
 
 
 @option_group

@@ -104,12 +104,12 @@ class PwvoTask:
         assert made is not None
         return torch.cat([torch.eye(4).to(made).repeat(first, 1, 1), made])
 
-    def evaluate(self, network: nn.Module, published: int = 0) -> dict[str, Any]:
-        """Figures on development pairs of each preset, or on so many for publishing."""
+    def evaluate(self, network: nn.Module, count: int) -> dict[str, Any]:
+        """Figures on so many held-out pairs of each preset."""
         options, found = self.options, {}
-        seed, count = (PUBLISHED_SEED, published) if published else (0, options.evaluate_count)
         for name, preset in zip(options.data, self.mixture.presets, strict=True):
-            figures = evaluate_network(network, held_out(preset, seed, count), options.selection)
+            batches = held_out(preset, PUBLISHED_SEED, count)
+            figures = evaluate_network(network, batches, options.selection)
             found[Path(name).stem] = {k: v for k, v in figures.items() if k != "epe_of_pairs"}
         return found
 
