@@ -173,7 +173,7 @@ def _texture(body, scale, offset, pixels):  # pragma: no cover - compiled
 
 @njit(cache=True, nogil=True)
 def shade(  # pragma: no cover - compiled
-    depth, index, shapes, B_body_cam, K, scale, offset, colours, light_cam
+    shapes, B_body_cam, depth, index, K, scale, offset, colours, light_cam
 ):
     """(H, W, 3) float64 in [0, 1]: multi-octave noise fixed to the body, times diffuse light.
 

@@ -71,26 +71,23 @@ class Scene:
         """Number of frames."""
         return len(self.T_world_cam)
 
-    @property
-    def _shapes(self) -> np.ndarray:
-        return np.array([s.shape for s in self.solids], dtype=np.int64)
-
     def _maps(self, index: int, camera_index: int) -> np.ndarray:
         """(P, 3, 4) maps of the solids of a frame to a camera."""
         solids = [s.A_world_body for s in self.solids]
         A = np.stack([A if A.ndim == 2 else A[index] for A in solids])
         return carried(invert(self.T_world_cam[camera_index]), A)
 
-    def _cast(self, index: int, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Maps to unit shapes, depth and index of the solid of each pixel of a frame."""
+    def _cast(self, index: int, camera: Camera) -> tuple[np.ndarray, ...]:
+        """Shapes, maps to them, depth and index of the solid of each pixel of a frame."""
         A = self._maps(index, index)
         inverse = np.linalg.inv(A[:, :, :3])
         B = np.concatenate([inverse, -inverse @ A[:, :, 3:]], axis=2)
-        return B, *cast(self._shapes, A, B, camera.K, camera.shape)
+        shapes = np.array([s.shape for s in self.solids], dtype=np.int64)
+        return shapes, B, *cast(shapes, A, B, camera.K, camera.shape)
 
     def _flow(self, index: int, camera: Camera, at: int) -> tuple[np.ndarray, np.ndarray]:
         """Flow to the next view of the solids as in the frame ``at``, and which of them is seen."""
-        B, depth, solid = self._cast(index, camera)
+        _, B, depth, solid = self._cast(index, camera)
         change = carried(self._maps(at, index + 1), B)[solid]
         points = backproject(np.where(solid >= 0, depth, np.nan), camera)
         points = (change[..., :3] @ points[..., None])[..., 0] + change[..., 3]
@@ -103,12 +100,11 @@ class Scene:
     def render(self, index: int) -> RenderedFrame:
         """One frame: depth and object of the ray through a centre, colour of four rays a pixel."""
         camera = self.camera
-        _, depth, solid = self._cast(index, camera)
+        *_, depth, solid = self._cast(index, camera)
         fine = resize_camera(camera, 2 * camera.height, 2 * camera.width)
-        B, depth2, solid2 = self._cast(index, fine)
         light = self.T_world_cam[index][:3, :3].T @ np.asarray(self.light, dtype=float)
         light /= np.linalg.norm(light)
-        colour = shade(depth2, solid2, self._shapes, B, fine.K, *self._texture(), light)
+        colour = shade(*self._cast(index, fine), fine.K, *self._texture(), light)
         image = 255.0 * colour.reshape(camera.height, 2, camera.width, 2, 3).mean(axis=(1, 3))
         if self.noise > 0:
             rng = np.random.default_rng([self.seed, index])
@@ -133,7 +129,7 @@ class Scene:
 
     def depth(self, index: int) -> np.ndarray:
         """(H, W) float32 metres of a frame, 0 where nothing is hit."""
-        depth = self._cast(index, self.camera)[1]
+        depth = self._cast(index, self.camera)[2]
         return np.where(np.isfinite(depth), depth, 0.0).astype(np.float32)
 
     def object_id(self, index: int) -> np.ndarray:
@@ -142,7 +138,7 @@ class Scene:
 
     def moving_share(self, index: int, width: int = 96) -> tuple[float, float]:
         """Share of the pixels of a frame on movers, and the smallest depth; in a small image."""
-        _, depth, solid = self._cast(index, self._small(width))
+        *_, depth, solid = self._cast(index, self._small(width))
         return float(np.mean(self._object_id(solid) > 0)), float(depth.min())
 
     def dynamic_share(self, index: int, width: int = 96, threshold_px: float = 1.0) -> float:
@@ -170,9 +166,8 @@ class SyntheticSequence(Sequence):
 
     def __init__(self, scene: Scene, name: str = "synthetic") -> None:
         self.scene, self.name, self.root = scene, name, Path(name)
-        self.timestamps = np.arange(scene.frames) / 24.0
-        self.poses, self.warnings = scene.T_world_cam, []
-        self._camera = scene.camera
+        self.timestamps, self.poses = np.arange(scene.frames) / 24.0, scene.T_world_cam
+        self.warnings, self._camera = [], scene.camera
 
     def frame(self, index: int) -> Frame:
         """Image and true depth."""
@@ -189,10 +184,7 @@ class SyntheticSequence(Sequence):
 
 
 def write_sintel(scene: Scene, root: str | os.PathLike[str], name: str) -> None:
-    """Write a scene as MPI Sintel does: ``root/training/PART/NAME/frame_0001.*`` for every frame.
-
-    The parts are clean, depth and camdata_left, and flow of all frames but the last.
-    """
+    """Write a scene as MPI Sintel does: ``root/training/PART/NAME/frame_0001.*`` and on."""
 
     def place(part: str, ending: str) -> Path:
         folder = Path(root) / "training" / part / name

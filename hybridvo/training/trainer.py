@@ -66,12 +66,12 @@ class Trainer:
         # the network that a user should get: the running average
         self.exported = copy.deepcopy(self.network).requires_grad_(False)
         how = self.options.optimizer
+        about: dict[str, Any] = {
+            "weight_decay": how.weight_decay,
+            "fused": self.device.type == "cuda",
+        }
         self.optimizer = torch.optim.AdamW(
-            self.network.parameters(),
-            how.learning_rate,
-            how.betas,
-            weight_decay=how.weight_decay,
-            fused=self.device.type == "cuda",
+            self.network.parameters(), how.learning_rate, how.betas, **about
         )
         self._parts: dict[str, Any] = {
             "network": self.network, "optimizer": self.optimizer, "ema": self.exported,
@@ -198,8 +198,7 @@ class Trainer:
         with _reading(str(path)):
             for name, part in self._parts.items():
                 part.load_state_dict(state[name])
-            for key in PROGRESS:
-                setattr(self, key, state["progress"][key])
+            vars(self).update(state["progress"])
         self._saved_s = self._logged_s = self.elapsed_s
         return True
 
@@ -228,11 +227,10 @@ def read_checkpoint(path: Path, device: torch.device | str = "cpu") -> dict[str,
 def source_commit() -> str | None:
     """Commit of the working tree, with a mark if it was changed; None outside of a repository."""
     command = "git describe --always --dirty --abbrev=40 --exclude *".split()
-    how: dict[str, Any] = {"cwd": Path(__file__).parent, "stderr": subprocess.DEVNULL}
-    try:
-        return subprocess.check_output(command, text=True, **how).strip()
-    except (OSError, subprocess.SubprocessError):
-        return None
+    with contextlib.suppress(OSError):
+        done = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True)
+        return done.stdout.strip() or None
+    return None
 
 
 def open_run(folder: str | Path) -> Trainer:
@@ -275,8 +273,7 @@ def export_run(
     task, network = trainer.task, trainer.exported
     if calibrate and isinstance(task, PwvoTask):
         main = task.mixture.presets[int(np.argmax(task.options.data_weights))]
-        shift = calibrate_scales(network, main, calibrate)
-        card["calibration"] = {"pairs": calibrate, "seed": 0, "added_to_s": shift}
+        card["calibration"] = calibrate_scales(network, main, calibrate)
     network = network.half().float()
     card["held_out"] = task.evaluate(network, count)
     save_weights(path, network, card, "float16")
