@@ -131,12 +131,13 @@ def refine_batch(
     tensors = (*vars(batch).values(), weights, given)
     wanted = torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in tensors)
     with torch.autocast(batch.flow.device.type, enabled=False):
+        pixels = gather_pixels(batch, weights)
         with torch.no_grad():
-            pixels = gather_pixels(batch, weights)
-            result = _solve(batch, pixels, starts, given, how, options, tight=wanted)
+            fixed = pixels.map(torch.Tensor.detach)
+            result = _solve(batch, fixed, starts, given, how, options, tight=wanted)
         if not wanted:
             return result
-        pixels, T = gather_pixels(batch, weights), result.SE3.detach()
+        T = result.SE3.detach()
         how = how._replace(noise=result.noise if given is None else given)
         A, g = newton_matrix(pixels, T, how), total_score(pixels, T.matrix(), how)
         return replace(result, SE3=attached(T, A, g, ~result.failed[:, None]))
@@ -331,11 +332,13 @@ def _noise(
     is none.
     """
     height, width = batch.depth_prev.shape[1:]
-    step, z = grid_stride((height, width), options.coarse_pixels), pixels.points[:, 2:]
-    rows = torch.cat([pixels.points[:, :2] / z, z, pixels.target], dim=1)
-    more = torch.stack([1 / pixels.flow_variance, pixels.depth_variance, pixels.weight], dim=1)
-    images = torch.cat([rows, more], dim=1).unflatten(2, (height, width))
-    samples = images[..., step // 2 :: step, step // 2 :: step].flatten(2).float().cpu().numpy()
+    step = grid_stride((height, width), options.coarse_pixels)
+    every = slice(step // 2, None, step)
+    few = pixels.map(lambda x: x.unflatten(-1, (height, width))[..., every, every].flatten(-2))
+    z = few.points[:, 2:]
+    more = torch.stack([1 / few.flow_variance, few.depth_variance, few.weight], dim=1)
+    rows = torch.cat([few.points[:, :2] / z, z, few.target, more], dim=1)
+    samples = rows.float().cpu().numpy()
     K = batch.K_curr[:, [0, 1, 0, 1], [0, 1, 2, 2]].float().cpu().numpy()
     poses, out = T.matrix()[:, :3].cpu().numpy(), how.noise.tolist()
     for k, buffer in enumerate(samples):
