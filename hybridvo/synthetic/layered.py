@@ -27,25 +27,19 @@ MIN_RATIO = 1e-6
 class Sample:
     """One training pair on the pixel grid of t; float32, px and metres, depth 0 is invalid.
 
-    Args:
-        flow, depth_prev: (H, W, 2) and (H, W) as the network is given them.
-        depth_curr: (H, W) depth of t+1 **on the grid of t** (what lies at x + flow).
-        ego_flow, depth_true: of the camera motion alone, and of t; without noise or holes.
-        depth_target: (H, W) what L^D compares with. It includes the object's own motion in the
-            paper's five steps, not in the diverse preset.
-        K: (3, 3) intrinsics of both frames.
-        moving: (H, W) bool, pixels whose true flow differs from the ego flow.
+    ``flow``, ``depth_prev`` and ``depth_curr`` are what a network is given.
     """
 
-    flow: np.ndarray
-    ego_flow: np.ndarray
-    depth_prev: np.ndarray
-    depth_curr: np.ndarray
-    depth_true: np.ndarray
+    flow: np.ndarray  # (H, W, 2)
+    ego_flow: np.ndarray  # (H, W, 2) of the camera motion alone
+    depth_prev: np.ndarray  # (H, W)
+    depth_curr: np.ndarray  # (H, W) of t+1 on the grid of t: what lies at x + flow
+    depth_true: np.ndarray  # (H, W) of t, without noise or holes
+    # (H, W) what L^D compares with; with the object's own motion in the paper's five steps alone
     depth_target: np.ndarray
-    K: np.ndarray
-    T_curr_prev: np.ndarray
-    moving: np.ndarray
+    K: np.ndarray  # (3, 3) of both frames
+    T_curr_prev: np.ndarray  # (4, 4)
+    moving: np.ndarray  # (H, W) bool, where the true flow differs from the ego flow
 
     @property
     def rotation_deg(self) -> np.ndarray:

@@ -46,17 +46,13 @@ STILL_PX = 0.5
 
 @dataclass(frozen=True)
 class Source:
-    """Frames ``start`` to ``stop`` of a recording below the data folder.
-
-    ``strides``: frames between the two of a pair; none: its frames are seen from two places only.
-    ``world``: whether it serves as a world; all serve as movers.
-    """
+    """Frames ``start`` to ``stop`` of a recording below the data folder."""
 
     path: str
     start: int = 0
     stop: int | None = None
-    strides: tuple[int, ...] = ()
-    world: bool = True
+    strides: tuple[int, ...] = ()  # between the frames of a pair; none: each is a world alone
+    world: bool = True  # whether it serves as a world; all serve as movers
 
 
 SPLITS = {
