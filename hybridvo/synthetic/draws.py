@@ -64,9 +64,7 @@ def carried(T: np.ndarray, A: np.ndarray) -> np.ndarray:
 def camera_path(
     rng: np.random.Generator, frames: int, step: float, turn_deg: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(N, 4, 4) T_world_cam on ellipses, by about ``step`` metres and ``turn_deg`` degrees a frame,
-    with and without hand shake.
-    """
+    """(N, 4, 4) T_world_cam, about ``step`` metres a frame, with and without hand shake."""
     t = np.arange(frames)
 
     def wave(rate: float, low: float, high: float) -> tuple[np.ndarray, np.ndarray]:

@@ -54,15 +54,13 @@ class Sample:
 
 @dataclass(frozen=True, eq=False)
 class KnownPair:
-    """A pair and its truth: ``depth`` (H, W) metres of the previous frame without the sensor's
-    errors, 0 where unknown; ``moving`` (H, W) bool; ``world``: path of the recording.
-    """
+    """A pair and its truth."""
 
     pair: FramePair
     T_curr_prev: np.ndarray
-    depth: np.ndarray
-    moving: np.ndarray
-    world: str = ""
+    depth: np.ndarray  # (H, W) metres, of the previous frame, without errors; 0 where unknown
+    moving: np.ndarray  # (H, W) bool
+    world: str = ""  # path of the recording
 
 
 def camera_flow(K: np.ndarray, depth: np.ndarray, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -112,9 +110,7 @@ def splat(flow: np.ndarray, rho_curr: np.ndarray) -> np.ndarray:
 
 @option_group
 class TailSampler:
-    """Normal core N(mean, core_std); with ``tail_probability`` a tail, sign(g) |g|^power with
-    g ~ N(mean, tail_std); values outside [low, high] are drawn again.
-    """
+    """Numbers whose distribution ``configs/data_paper.yaml`` explains."""
 
     mean: float
     tail_std: Positive

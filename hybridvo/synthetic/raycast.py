@@ -24,9 +24,7 @@ NEAR = 0.05
 def cast(
     shapes: np.ndarray, A: np.ndarray, B: np.ndarray, K: np.ndarray, size: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Nearest solid at each pixel of an image: its depth (H, W) float64, inf where nothing is hit,
-    and its index (H, W) int32, -1 there.
-    """
+    """Depth (H, W) of the nearest solid, inf where nothing is hit, and its index (H, W), or -1."""
     cube = np.array(list(itertools.product((-1.0, 1.0), repeat=3))).T
     corners = A[:, :, :3] @ cube + A[:, :, 3:]
     z = corners[:, 2]

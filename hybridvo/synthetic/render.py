@@ -108,9 +108,7 @@ class Scene:
         return scale, offset, np.array([s.colours for s in self.solids], dtype=float)
 
     def flow(self, index: int) -> tuple[np.ndarray, np.ndarray]:
-        """(H, W, 2) float32 px exact flow from a frame to the next one, NaN where nothing is hit;
-        (H, W) bool, True on moving objects.
-        """
+        """(H, W, 2) float32 px true flow to the next frame, else NaN; (H, W) bool, what moves."""
         flow, solid = self._flow(index, self.camera, index + 1)
         return flow.astype(np.float32), self._object_id(solid) > 0
 

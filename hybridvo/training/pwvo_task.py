@@ -117,10 +117,7 @@ class PwvoTask:
 def fit_loss(
     output: PixelwisePrediction, batch: TrainingBatch, options: PwvoOptions
 ) -> torch.Tensor:
-    """Log of the error of the ego flow that the fit to the trusted pixels gives, mean over pairs.
-
-    The logarithm lets pairs that are far off and pairs that are nearly right learn alike.
-    """
+    """Log error of the ego flow that the fit to the trusted pixels gives, mean over pairs."""
     T = fitted_motion(output, batch.inputs, options.selection)
     gt = batch.targets.subsample(options.loss_stride)
     flow, _, defined = gt.reconstruct(T)

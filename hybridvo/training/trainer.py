@@ -43,11 +43,9 @@ MAX_SKIPPED = 50
 
 
 class Trainer:
-    """A run: task, optimiser, and their state on disk.
+    """A run: task, optimiser, and their state in a folder; without one nothing is written.
 
-    ``folder``: of ``checkpoint.pt`` and ``log.jsonl``; None writes nothing. ``workers``: processes
-    that draw samples; 0 draws them in this one. ``report`` is called with every entry of the log.
-    ``stop_requested`` ends :meth:`run` after the update at hand.
+    ``workers``: processes that draw samples; 0: this one. ``report`` gets every entry of the log.
     """
 
     def __init__(
@@ -79,7 +77,7 @@ class Trainer:
         self.step = self.samples = self.skipped = self.skipped_in_a_row = 0
         self.elapsed_s = self._saved_s = self._logged_s = 0.0
         self._seen: list[dict[str, float]] = []
-        self.stop_requested = False
+        self.stop_requested = False  # ends a run after the update at hand
 
     @property
     def record(self) -> dict[str, Any]:
