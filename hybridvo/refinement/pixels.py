@@ -60,19 +60,16 @@ class PixelGrid:
             stride //= 2
 
     def full_pass(
-        self, pose: np.ndarray, noise: np.ndarray, tile: int
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Normal equations over every pixel at a (3, 4) pose.
+        self, pose: np.ndarray, noise: np.ndarray, tile: int, weights: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Normal equations over every pixel at a (3, 4) pose; robust weights into (H, W).
 
-        Returns:
-            Sums of each tile (rows, columns, 27), cost and the two sums of weights (3,), robust
-            weights (H, W).
+        Returns: sums of each tile (rows, columns, 27), cost and the two sums of weights (3,).
         """
         height, width = self.size
         bands = -(-height // tile)
         sums = np.zeros((bands, -(-width // tile), kernels.COST))
         totals = np.zeros((bands, kernels.SUMS))
-        weights = np.empty((height, width), np.float32)
         inputs: tuple[Any, ...] = (self.data, self.camera, self.scale)
 
         def work(first: int, last: int) -> None:
@@ -83,7 +80,7 @@ class PixelGrid:
         other.start()
         work(bands // 2, bands)
         other.join()
-        return sums, totals[:, kernels.COST :].sum(axis=0), weights
+        return sums, totals[:, kernels.COST :].sum(axis=0)
 
     @property
     def count(self) -> int:
