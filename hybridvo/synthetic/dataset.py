@@ -13,7 +13,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, Literal, Protocol, TypeVar, cast
+from typing import Any, Literal, TypeAlias, TypeVar
 from zipfile import BadZipFile
 
 import numpy as np
@@ -28,13 +28,6 @@ from hybridvo.synthetic.layered import PaperOptions, Sample
 MANIFEST = "samples.json"
 
 OptionsT = TypeVar("OptionsT")
-
-
-class Preset(Protocol):
-    """What training samples are drawn from."""
-
-    def sample(self, rng: np.random.Generator) -> Sample:
-        """One pair; depends on the generator alone."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,7 +45,7 @@ class Mixture:
     @property
     def record(self) -> list[dict[str, Any]]:
         """The presets as plain values, as :func:`make_preset` takes them."""
-        return [dataclasses.asdict(cast(Any, preset)) for preset in self.presets]
+        return [dataclasses.asdict(preset) for preset in self.presets]
 
 
 # --- files of options -----------------------------------------------------------------------------
@@ -115,7 +108,7 @@ def write_samples(
         raise InputError(f"expected count and workers of at least 1, got {count} and {workers}.")
     folder = Path(folder)
     make_folder(folder)
-    options = json.loads(json.dumps(dataclasses.asdict(cast(Any, preset))))
+    options = json.loads(json.dumps(dataclasses.asdict(preset)))
     manifest = {"options": options, "seed": seed, "count": count}
     if not (folder / MANIFEST).exists():
         write_json(folder / MANIFEST, manifest)
@@ -129,15 +122,11 @@ def write_samples(
 
 
 def _write_sample(preset: Preset, seed: int, folder: Path, index: int) -> int:
-    path = _path(folder, index)
+    path = folder / f"{index:07d}.npz"
     if not path.exists():
         with atomic_write(path, "wb") as file:
             np.savez(file, **vars(preset.sample(sample_generator(seed, index, STORED))))
     return index
-
-
-def _path(folder: Path, index: int) -> Path:
-    return folder / f"{index:07d}.npz"
 
 
 @functools.cache
@@ -154,7 +143,7 @@ def _manifest(folder: Path) -> dict[str, Any]:
 
 def read_sample(folder: str | Path, index: int) -> Sample:
     """Sample ``index`` of a folder that :func:`write_samples` filled."""
-    path = _path(Path(folder), index)
+    path = Path(folder) / f"{index:07d}.npz"
     try:
         with np.load(path) as file:
             return Sample(**file)
@@ -178,5 +167,8 @@ class StoredSamples:
         return make_preset(_manifest(Path(self.folder))["options"], self.folder)
 
 
-PRESETS = {"paper": PaperOptions, "diverse": DiverseOptions, "folder": StoredSamples}
+Preset: TypeAlias = PaperOptions | DiverseOptions | StoredSamples
+PRESETS: dict[Any, type[Preset]] = {
+    "paper": PaperOptions, "diverse": DiverseOptions, "folder": StoredSamples,
+}  # fmt: skip
 """Generators, and samples drawn before, by the name that a file gives under ``preset``."""
