@@ -114,11 +114,9 @@ def train_network(
     return {"updates": trainer.step}
 
 
-def _report(entry: dict[str, Any]) -> None:
+def _report(entry: dict[str, float]) -> None:
     """One line a log entry on stderr."""
-    numbers = {k: v for k, v in entry.items() if isinstance(v, int | float)}
-    line = " ".join(f"{key}={value:.5g}" for key, value in numbers.items())
-    print(line, entry.get("results", ""), file=sys.stderr)
+    print(*(f"{key}={value:.5g}" for key, value in entry.items()), file=sys.stderr)
 
 
 def draw_selector_data(

@@ -1,10 +1,8 @@
 """Training pairs of surfaces laid over each other, and the paper's five steps of drawing them.
 
-Everything is computed in inverse depth on normalised rays, so that sky is exact (0) and single
-precision suffices. The paper (section 3.4; samplers as published): 1. intrinsics; 2. depth, a
+In inverse depth on normalised rays: sky is exact (0). The paper (section 3.4): 1. intrinsics; 2. a
 constant background and five constant objects; 3. motions of camera and objects; 4. the rigid flow
 of each; 5. composition, nearest in front, **adding** an object's own flow to the camera's.
-Silhouettes are procedural: the published photographs are a download of a third party.
 """
 
 from __future__ import annotations
@@ -29,25 +27,19 @@ MIN_RATIO = 1e-6
 class Sample:
     """One training pair on the pixel grid of t; float32, px and metres, depth 0 is invalid.
 
-    Args:
-        flow, depth_prev: (H, W, 2) and (H, W) as the network is given them.
-        depth_curr: (H, W) depth of t+1 **on the grid of t** (what lies at x + flow).
-        ego_flow, depth_true: of the camera motion alone, and of t; without noise or holes.
-        depth_target: (H, W) what L^D compares with. It includes the object's own motion in the
-            paper's five steps, not in the diverse preset.
-        K: (3, 3) intrinsics of both frames.
-        moving: (H, W) bool, pixels whose true flow differs from the ego flow.
+    ``flow``, ``depth_prev`` and ``depth_curr`` are what a network is given.
     """
 
-    flow: np.ndarray
-    ego_flow: np.ndarray
-    depth_prev: np.ndarray
-    depth_curr: np.ndarray
-    depth_true: np.ndarray
+    flow: np.ndarray  # (H, W, 2)
+    ego_flow: np.ndarray  # (H, W, 2) of the camera motion alone
+    depth_prev: np.ndarray  # (H, W)
+    depth_curr: np.ndarray  # (H, W) of t+1 on the grid of t: what lies at x + flow
+    depth_true: np.ndarray  # (H, W) of t, without noise or holes
+    # (H, W) what L^D compares with; with the object's own motion in the paper's five steps alone
     depth_target: np.ndarray
-    K: np.ndarray
-    T_curr_prev: np.ndarray
-    moving: np.ndarray
+    K: np.ndarray  # (3, 3) of both frames
+    T_curr_prev: np.ndarray  # (4, 4)
+    moving: np.ndarray  # (H, W) bool, where the true flow differs from the ego flow
 
     @property
     def rotation_deg(self) -> np.ndarray:
@@ -62,15 +54,13 @@ class Sample:
 
 @dataclass(frozen=True, eq=False)
 class KnownPair:
-    """A pair and its truth: ``depth`` (H, W) metres of the previous frame without the sensor's
-    errors, 0 where unknown; ``moving`` (H, W) bool; ``world``: path of the recording.
-    """
+    """A pair and its truth."""
 
     pair: FramePair
     T_curr_prev: np.ndarray
-    depth: np.ndarray
-    moving: np.ndarray
-    world: str = ""
+    depth: np.ndarray  # (H, W) metres, of the previous frame, without errors; 0 where unknown
+    moving: np.ndarray  # (H, W) bool
+    world: str = ""  # path of the recording
 
 
 def camera_flow(K: np.ndarray, depth: np.ndarray, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -120,9 +110,7 @@ def splat(flow: np.ndarray, rho_curr: np.ndarray) -> np.ndarray:
 
 @option_group
 class TailSampler:
-    """Normal core N(mean, core_std); with ``tail_probability`` a tail, sign(g) |g|^power with
-    g ~ N(mean, tail_std); values outside [low, high] are drawn again.
-    """
+    """Numbers whose distribution ``configs/data_paper.yaml`` explains."""
 
     mean: float
     tail_std: Positive

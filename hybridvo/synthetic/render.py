@@ -23,20 +23,14 @@ from hybridvo.types import Camera, Frame
 
 @dataclass(frozen=True, eq=False)
 class Solid:
-    """One textured BOX, ELLIPSOID or CYLINDER of :mod:`hybridvo.synthetic.raycast`.
-
-    Args:
-        A_world_body: (3, 4), or (N, 3, 4) for one that moves or deforms; metres. The columns are
-            the half axes and the centre.
-        object_id: 0 for static solids; solids of one mover share a positive number.
-        wavelength: metres of the coarsest texture octave.
-        colours: (2, 3) in [0, 1], mixed by the texture.
-    """
+    """One textured BOX, ELLIPSOID or CYLINDER of :mod:`hybridvo.synthetic.raycast`."""
 
     shape: int
+    # (3, 4), or (N, 3, 4) where it moves or deforms; metres: the half axes and the centre
     A_world_body: np.ndarray
-    object_id: int = 0
-    wavelength: float = 1.6
+    object_id: int = 0  # of static solids; those of one mover share a positive number
+    wavelength: float = 1.6  # metres of the coarsest texture octave
+    # (2, 3) in [0, 1], mixed by the texture
     colours: tuple[ArrayLike, ArrayLike] = ((0.9, 0.8, 0.7), (0.6, 0.8, 0.9))
 
 
@@ -50,21 +44,14 @@ class RenderedFrame(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A camera, its path and the solids of N frames.
-
-    Args:
-        T_world_cam: (N, 4, 4) metres.
-        seed: of the texture and the noise.
-        light: direction towards the light, world frame.
-        noise: standard deviation of the sensor noise, grey levels.
-    """
+    """A camera, its path and the solids of N frames."""
 
     camera: Camera
-    T_world_cam: np.ndarray
+    T_world_cam: np.ndarray  # (N, 4, 4) metres
     solids: tuple[Solid, ...]
-    seed: int = 0
-    light: tuple[float, float, float] = (0.4, -0.8, -0.45)
-    noise: float = 0.0
+    seed: int = 0  # of the texture and the noise
+    light: tuple[float, float, float] = (0.4, -0.8, -0.45)  # towards it, world frame
+    noise: float = 0.0  # standard deviation of the sensor noise, grey levels
 
     @property
     def frames(self) -> int:
@@ -121,9 +108,7 @@ class Scene:
         return scale, offset, np.array([s.colours for s in self.solids], dtype=float)
 
     def flow(self, index: int) -> tuple[np.ndarray, np.ndarray]:
-        """(H, W, 2) float32 px exact flow from a frame to the next one, NaN where nothing is hit;
-        (H, W) bool, True on moving objects.
-        """
+        """(H, W, 2) float32 px true flow to the next frame, else NaN; (H, W) bool, what moves."""
         flow, solid = self._flow(index, self.camera, index + 1)
         return flow.astype(np.float32), self._object_id(solid) > 0
 

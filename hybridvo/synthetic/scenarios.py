@@ -22,35 +22,25 @@ from hybridvo.types import Camera, Frame, FramePair
 
 @dataclass(frozen=True)
 class Scenario:
-    """One row of conditions.
+    """One row of conditions."""
 
-    Args:
-        moving: share of the pixels on ``objects`` that move by themselves.
-        flow_noise_px: standard deviation of each flow component, independent per pixel.
-        depth_noise: standard deviation of log depth; of its variance the share ``depth_smooth`` is
-            correlated in space.
-        outliers: share of the pixels whose flow has a gross error of up to 60 px.
-        rotation_deg, translation_m: largest angle and length.
-        scene: ``structured`` (1-30 m), ``plane`` (one oblique plane) or ``far`` (60-200 m).
-        depth_quadratic: c of a further error of depth with the standard deviation c z^2, 1/m.
-        baseline_m: of a depth sensor of two eyes, or of an eye and a projector, the second one on
-            the right: what only one of them sees has no depth. 0: all has. At a width of 1024:
-        disparity_step_px: of the disparities that it states; 0: exact.
-    """
-
-    moving: float = 0.3
+    moving: float = 0.3  # share of the pixels on objects that move by themselves
     objects: int = 5
-    flow_noise_px: float = 0.5
-    depth_noise: float = 0.02
-    depth_smooth: float = 0.5
-    outliers: float = 0.05
-    rotation_deg: float = 3.0
-    translation_m: float = 0.3
+    flow_noise_px: float = 0.5  # standard deviation of each component, independent per pixel
+    depth_noise: float = 0.02  # standard deviation of log depth
+    depth_smooth: float = 0.5  # share of its variance that is correlated in space
+    outliers: float = 0.05  # share of the pixels whose flow has a gross error of up to 60 px
+    rotation_deg: float = 3.0  # largest angle
+    translation_m: float = 0.3  # largest length
     min_translation_m: float = 0.0
-    scene: str = "structured"
-    depth_quadratic: float = 0.0
+    scene: str = "structured"  # 1-30 m; plane: one oblique plane; far: 60-200 m
+    depth_quadratic: float = 0.0  # 1/m, c of a further error of the standard deviation c z^2
+    # of a depth sensor of two eyes, or of an eye and a projector, the second one on the right: what
+    # only one of them sees has no depth; 0: all has
     baseline_m: float = 0.0
-    disparity_step_px: float = 0.0
+    disparity_step_px: float = (
+        0.0  # of the disparities that it states, at a width of 1024; 0: exact
+    )
 
 
 MAIN_SCENARIOS: dict[str, Scenario] = {

@@ -1,7 +1,6 @@
 """Pairs whose surfaces are real: recordings as the world, cuts from other recordings as movers.
 
-The world is two frames of a static recording, or one frame seen from two places. Both images and
-depth maps get a sensor's errors, the movers no less than the world.
+The world is two frames of a static recording, or one frame seen from two places.
 """
 
 from __future__ import annotations
@@ -46,17 +45,13 @@ STILL_PX = 0.5
 
 @dataclass(frozen=True)
 class Source:
-    """Frames ``start`` to ``stop`` of a recording below the data folder.
-
-    ``strides``: frames between the two of a pair; none: its frames are seen from two places only.
-    ``world``: whether it serves as a world; all serve as movers.
-    """
+    """Frames ``start`` to ``stop`` of a recording below the data folder."""
 
     path: str
     start: int = 0
     stop: int | None = None
-    strides: tuple[int, ...] = ()
-    world: bool = True
+    strides: tuple[int, ...] = ()  # between the frames of a pair; none: each is a world alone
+    world: bool = True  # whether it serves as a world; all serve as movers
 
 
 SPLITS = {
@@ -84,13 +79,11 @@ SPLITS = {
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """A source's frames, of about :data:`PIXELS` / :data:`MARGIN` ** 2 pixels, and (first, second,
-    T_curr_prev) of those whose motion is known.
-    """
+    """A source's frames, and those whose motion is known."""
 
     source: Source
-    frames: tuple[Frame, ...]
-    pairs: tuple[tuple[int, int, np.ndarray], ...]
+    frames: tuple[Frame, ...]  # of about PIXELS / MARGIN ** 2 pixels
+    pairs: tuple[tuple[int, int, np.ndarray], ...]  # first, second, T_curr_prev
 
 
 @functools.cache

@@ -1,6 +1,4 @@
-"""What measuring does to flow and depth: white noise and gross errors of flow; depth whose noise
-grows with distance, with a smooth bias, edges in the wrong place and holes.
-"""
+"""What measuring does to flow and depth."""
 
 from __future__ import annotations
 

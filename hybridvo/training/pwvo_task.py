@@ -104,12 +104,12 @@ class PwvoTask:
         assert made is not None
         return torch.cat([torch.eye(4).to(made).repeat(first, 1, 1), made])
 
-    def evaluate(self, network: nn.Module, published: int = 0) -> dict[str, Any]:
-        """Figures on development pairs of each preset, or on so many for publishing."""
+    def evaluate(self, network: nn.Module, count: int) -> dict[str, Any]:
+        """Figures on so many held-out pairs of each preset."""
         options, found = self.options, {}
-        seed, count = (PUBLISHED_SEED, published) if published else (0, options.evaluate_count)
         for name, preset in zip(options.data, self.mixture.presets, strict=True):
-            figures = evaluate_network(network, held_out(preset, seed, count), options.selection)
+            batches = held_out(preset, PUBLISHED_SEED, count)
+            figures = evaluate_network(network, batches, options.selection)
             found[Path(name).stem] = {k: v for k, v in figures.items() if k != "epe_of_pairs"}
         return found
 
@@ -117,10 +117,7 @@ class PwvoTask:
 def fit_loss(
     output: PixelwisePrediction, batch: TrainingBatch, options: PwvoOptions
 ) -> torch.Tensor:
-    """Log of the error of the ego flow that the fit to the trusted pixels gives, mean over pairs.
-
-    The logarithm lets pairs that are far off and pairs that are nearly right learn alike.
-    """
+    """Log error of the ego flow that the fit to the trusted pixels gives, mean over pairs."""
     T = fitted_motion(output, batch.inputs, options.selection)
     gt = batch.targets.subsample(options.loss_stride)
     flow, _, defined = gt.reconstruct(T)

@@ -32,7 +32,7 @@ from hybridvo.training.pwvo_task import PwvoTask
 from hybridvo.training.selector_task import SelectorTask
 from hybridvo.training.validation import calibrate_scales
 
-FREE_TO_CHANGE = {"checkpoint_minutes", "log_every", "evaluate_every", "evaluate_count"}
+FREE_TO_CHANGE = {"checkpoint_minutes", "log_every"}
 """Options in which a resumed run may differ: they do not touch what is learned."""
 PROGRESS = ("step", "samples", "skipped", "elapsed_s")
 """Numbers of a run that its checkpoint keeps."""
@@ -43,11 +43,9 @@ MAX_SKIPPED = 50
 
 
 class Trainer:
-    """A run: task, optimiser, and their state on disk.
+    """A run: task, optimiser, and their state in a folder; without one nothing is written.
 
-    ``folder``: of ``checkpoint.pt`` and ``log.jsonl``; None writes nothing. ``workers``: processes
-    that draw samples; 0 draws them in this one. ``report`` is called with every entry of the log.
-    ``stop_requested`` ends :meth:`run` after the update at hand.
+    ``workers``: processes that draw samples; 0: this one. ``report`` gets every entry of the log.
     """
 
     def __init__(
@@ -56,7 +54,7 @@ class Trainer:
         folder: Path | None = None,
         device: torch.device | str = "cpu",
         workers: int = 0,
-        report: Callable[[dict[str, Any]], None] = lambda entry: None,
+        report: Callable[[dict[str, float]], None] = lambda entry: None,
     ) -> None:
         self.task, self.folder = task, folder
         self.options: RunOptions = task.options
@@ -79,7 +77,7 @@ class Trainer:
         self.step = self.samples = self.skipped = self.skipped_in_a_row = 0
         self.elapsed_s = self._saved_s = self._logged_s = 0.0
         self._seen: list[dict[str, float]] = []
-        self.stop_requested = False
+        self.stop_requested = False  # ends a run after the update at hand
 
     @property
     def record(self) -> dict[str, Any]:
@@ -135,7 +133,7 @@ class Trainer:
         return why
 
     def advance(self, batch: Any, time_limit_s: float = math.inf) -> None:
-        """One update on a batch, and what is due after it: log, evaluation, checkpoint."""
+        """One update on a batch, and what is due after it: log, checkpoint."""
         options, started = self.options, time.monotonic()
         progress = self.step / options.steps
         if options.schedule.by == "time" and math.isfinite(time_limit_s):
@@ -147,22 +145,14 @@ class Trainer:
             taken = [e for e in self._seen if math.isfinite(e["grad_norm"])]
             names = dict.fromkeys(itertools.chain(*taken))
             means = {n: float(np.mean([e[n] for e in taken if n in e])) for n in names}
-            self._log({"event": "train", **means, "samples_per_s": rate})
+            self._log(means | {"samples_per_s": rate})
             self._seen, self._logged_s = [], self.elapsed_s
-        if options.evaluate_every and self.step % options.evaluate_every == 0:
-            self.evaluate()
         if self.elapsed_s - self._saved_s > 60 * options.checkpoint_minutes:
             self.save()
             self._saved_s = self.elapsed_s
 
-    def evaluate(self) -> dict[str, Any]:
-        """Figures of the exported network on development samples, also into the log."""
-        results = self.task.evaluate(self.exported)
-        self._log({"event": "evaluation", "results": results})
-        return results
-
-    def _log(self, entry: dict[str, Any]) -> None:
-        entry = {key: getattr(self, key) for key in PROGRESS} | entry
+    def _log(self, figures: dict[str, float]) -> None:
+        entry = {key: getattr(self, key) for key in PROGRESS} | figures
         if self.folder is not None:
             with (self.folder / LOG).open("a", encoding="utf-8") as file:
                 file.write(json.dumps(entry) + "\n")

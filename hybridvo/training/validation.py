@@ -91,10 +91,10 @@ def evaluate_network(
 ) -> dict[str, Any]:
     """Errors of a network's selected pose on :func:`held_out` samples.
 
-    ``r_err_deg``, ``t_err`` (metres), ``epe`` (px at the sample's size): the paper's component
-    means; ``zero_*``: of zero motion. Of the uncertainty: ``auroc_*`` of s as a detector of moving
-    pixels, ``spearman_*`` with the pixel's own error, ``laplace_ratio_*`` and ``median_ratio_*``,
-    mean and median of |error| / exp(s): 1 and 0.69 for calibrated Laplace scales.
+    The paper's component means, EPE in px at the sample's size; ``zero_*``: of zero motion;
+    ``auroc_*``: of s as a detector of moving pixels; ``spearman_*``: of s and the pixel's error;
+    ``laplace_ratio_*``, ``median_ratio_*``: mean and median of |error| / exp(s), 1 and 0.69 where s
+    is calibrated.
     """
     if not batches:
         raise InputError("evaluate_network: expected at least one batch of samples, got none.")

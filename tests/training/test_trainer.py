@@ -28,7 +28,6 @@ TINY = PwvoOptions(
     data=("paper", "diverse"),
     data_weights=(0.5, 0.5),
     log_every=2,
-    evaluate_count=4,
 )
 
 
@@ -149,7 +148,7 @@ def test_the_baselines_train(mixture, kind):
     run = changed(network=network, loss=plain, selection="mean", steps=2)
     trainer = Trainer(PwvoTask(run, mixture))
     trainer.run()
-    result = trainer.evaluate()["paper"]
+    result = trainer.task.evaluate(trainer.exported, 4)["paper"]
     assert trainer.skipped == 0 and np.isfinite(result["epe"])
     assert result["auroc_rotation"] is None
 
