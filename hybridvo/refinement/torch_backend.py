@@ -255,8 +255,9 @@ def _covariances(
             to_tiles(x.unflatten(-1, (-1, width)), tile)
             for x in (at.roots(), torch.stack(at.scores(), dim=1))
         )
-        H = torch.einsum("rbpcn,rbqcn->bcpq", roots, roots)
-        sums.append(torch.cat([H, scores.sum(dim=3).transpose(1, 2)[..., None]], dim=3))
+        roots = roots.permute(1, 3, 2, 0, 4).flatten(3)  # (B, tiles, 6, 2 n)
+        H, g = roots @ roots.mT, scores.sum(dim=3).mT
+        sums.append(torch.cat([H, g[..., None]], dim=3))
         seen.append((at.robust, at.distance2, at.cost))
     # 1 / typical depth, as of the coarse grid: half of the weight may lie on a sky at 30 km
     usable, z = few.weight > 0, few.points[:, 2]
