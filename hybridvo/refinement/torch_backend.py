@@ -71,9 +71,6 @@ class BatchedPose:
     noise: torch.Tensor  # (B, 2) px and log depth
     inlier_ratio: torch.Tensor  # (B,) share of the external weight within three standard deviations
 
-    def __len__(self) -> int:
-        return len(self.status)
-
     @property
     def T_curr_prev(self) -> torch.Tensor:
         """(B, 4, 4) points of the previous camera into the current one, metres."""
@@ -186,9 +183,7 @@ def _solve(
     options: RefineOptions,
     tight: bool,
 ) -> BatchedPose:
-    """From the starts (B, S, 7) to the pose of every sample; ``how``: the kernel, without noise;
-    ``tight``: to the precision that a gradient needs.
-    """
+    """From the starts (B, S, 7) to every sample's pose; ``tight``: as exact as a gradient needs."""
     weight, few = pixels.weight, pixels.subset(SUBSET_PIXELS)
     end = weight.new_full((len(starts),), SMALLEST_PX)
     if given is not None:
@@ -210,8 +205,8 @@ def _solve(
     ratio = torch.nan_to_num((weight * near).sum(dim=1) / total)
     probability = own**2 / (own**2 + rival**2).clamp(min=1e-12)
     covariances, status = [], []
+    doubt = Status.degraded(Reason.SOLVER_DIVERGED, f"not converged after {STEPS} steps")
     for k, (covariance, definite) in enumerate(found):
-        doubt = Status.degraded(Reason.SOLVER_DIVERGED, f"not converged after {STEPS} steps")
         sure = float(probability[k]), MIN_PROBABILITY
         judged = _bad_input(batch, pixels, k, options.min_pixels) or status_of(
             definite, float(ratio[k]), Status() if converged[k] else doubt, *sure
@@ -244,9 +239,7 @@ def _covariances(
     spread: tuple[torch.Tensor, torch.Tensor],
     options: RefineOptions,
 ) -> tuple[list[tuple[np.ndarray, bool]], tuple[torch.Tensor, ...]]:
-    """Covariance of each sample by the numpy function, and whether it is definite; robust weight,
-    squared distance and cost (B, N) of the pixels.
-    """
+    """Covariance of each sample, if definite; robust weight, squared distance, cost of a pixel."""
     height, width = batch.depth_prev.shape[1:]
     tile, sums, seen = tile_size((height, width), options.tiles), [], []
     for part in pixels.parts(tile * width):
@@ -255,8 +248,9 @@ def _covariances(
             to_tiles(x.unflatten(-1, (-1, width)), tile)
             for x in (at.roots(), torch.stack(at.scores(), dim=1))
         )
-        H = torch.einsum("rbpcn,rbqcn->bcpq", roots, roots)
-        sums.append(torch.cat([H, scores.sum(dim=3).transpose(1, 2)[..., None]], dim=3))
+        roots = roots.permute(1, 3, 2, 0, 4).flatten(3)  # (B, tiles, 6, 2 n)
+        H, g = roots @ roots.mT, scores.sum(dim=3).mT
+        sums.append(torch.cat([H, g[..., None]], dim=3))
         seen.append((at.robust, at.distance2, at.cost))
     # 1 / typical depth, as of the coarse grid: half of the weight may lie on a sky at 30 km
     usable, z = few.weight > 0, few.points[:, 2]
@@ -328,9 +322,7 @@ def _shares(
 def _noise(
     batch: PairBatch, pixels: Pixels, T: pp.LieTensor, how: RobustNoise, options: RefineOptions
 ) -> torch.Tensor:
-    """(B, 2) noise at a pose, from the coarse grid of the numba refinement; as before where there
-    is none.
-    """
+    """(B, 2) noise at a pose, from the coarse grid of the numba refinement; else as before."""
     height, width = batch.depth_prev.shape[1:]
     step = grid_stride((height, width), options.coarse_pixels)
     every = slice(step // 2, None, step)

@@ -42,11 +42,6 @@ class Mixture:
         share = np.divide(self.weights, sum(self.weights))
         return self.presets[int(rng.choice(len(self.presets), p=share))].sample(rng)
 
-    @property
-    def record(self) -> list[dict[str, Any]]:
-        """The presets as plain values, as :func:`make_preset` takes them."""
-        return [dataclasses.asdict(preset) for preset in self.presets]
-
 
 # --- files of options -----------------------------------------------------------------------------
 

@@ -85,17 +85,11 @@ def make_pair(
 ) -> tuple[FramePair, dict[str, Any]]:
     """A pair of a row of :data:`SCENARIOS`, or of conditions of one's own, and its truth.
 
-    The focal length scales with the width: 1120 px at 1024.
-
-    Returns:
-        The pair (the current depth is NaN where the previous frame saw nothing) and the truth:
-        ``T_curr_prev`` (4, 4), ``depth_true`` (H, W) float32 metres on the previous grid,
-        ``moving`` (H, W) bool, ``object`` (H, W) uint8 label (0 is the world), ``outlier`` (H, W)
-        bool, ``flow_true`` (H, W, 2) float32 of the surface, objects included.
+    The current depth is NaN where the previous frame saw nothing. The truth: ``T_curr_prev``,
+    ``depth_true`` and ``flow_true`` (objects included) on the previous grid, ``moving`` (H, W)
+    bool, ``object`` (H, W) uint8, 0 is the world, and ``outlier`` (H, W) bool.
     """
-    name = cell if isinstance(cell, str) else "custom"
-    if isinstance(cell, str):
-        cell = SCENARIOS[cell]
+    name, cell = (cell, SCENARIOS[cell]) if isinstance(cell, str) else ("custom", cell)
     rng = np.random.default_rng([zlib.crc32(name.encode()), int(seed)])
     focal = 1120.0 * width / 1024
     camera = Camera(focal, focal, (width - 1) / 2, (height - 1) / 2, height, width)

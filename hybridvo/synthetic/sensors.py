@@ -31,8 +31,7 @@ def sample_at(
 
 def depth_jump(depth: np.ndarray) -> np.ndarray:
     """(H, W) largest difference of depth among a pixel and its neighbours."""
-    kernel = np.ones((3, 3), np.uint8)
-    return cv2.dilate(depth, kernel) - cv2.erode(depth, kernel)
+    return cv2.morphologyEx(depth, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8))
 
 
 def degrade_depth(rng: np.random.Generator, depths: list[np.ndarray]) -> list[np.ndarray]:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +35,7 @@ FIT_FLOOR_PX, FIT_LIMIT_PX = 0.05, 100.0
 is charged, also behind the camera."""
 
 
-@dataclass
+@dataclasses.dataclass
 class _Drawn(Dataset[Sample]):
     """The training samples of a seed by their number."""
 
@@ -69,7 +69,7 @@ class PwvoTask:
         self.options, self.mixture = options, mixture
         torch.manual_seed(options.seed)
         self.network = build_network(options.network)
-        self.data = mixture.record
+        self.data = [dataclasses.asdict(preset) for preset in mixture.presets]
 
     def batches(self, samples: int, workers: int) -> Iterator[TrainingBatch]:
         """Batches of the run's stream from sample number ``samples`` on."""

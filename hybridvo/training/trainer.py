@@ -223,23 +223,6 @@ def source_commit() -> str | None:
     return None
 
 
-def open_run(folder: str | Path) -> Trainer:
-    """A run as its checkpoint describes it."""
-    path = Path(folder) / CHECKPOINT
-    record = read_checkpoint(path)["record"]
-    task: PwvoTask | SelectorTask
-    if record["options"]["network"]["kind"] == "selector":
-        chosen = build_options(SelectorOptions, record["options"], str(path))
-        task = SelectorTask(chosen, Path(record["data"]))
-    else:
-        options = build_options(PwvoOptions, record["options"], str(path))
-        presets = tuple(make_preset(mapping, str(path)) for mapping in record["data"])
-        task = PwvoTask(options, Mixture(presets, options.data_weights))
-    trainer = Trainer(task, Path(folder))
-    trainer.resume()
-    return trainer
-
-
 def export_run(
     folder: str | Path, path: str | Path, count: int = 1000, calibrate: int = 0
 ) -> dict[str, Any]:
@@ -248,7 +231,18 @@ def export_run(
     ``count``: held-out pairs of each preset for the figures of the card; ``calibrate``: development
     pairs over which PWVO's scales of the translation are calibrated.
     """
-    trainer = open_run(folder)
+    checkpoint = Path(folder) / CHECKPOINT
+    record = read_checkpoint(checkpoint)["record"]
+    task: PwvoTask | SelectorTask
+    if record["options"]["network"]["kind"] == "selector":
+        chosen = build_options(SelectorOptions, record["options"], str(checkpoint))
+        task = SelectorTask(chosen, Path(record["data"]))
+    else:
+        options = build_options(PwvoOptions, record["options"], str(checkpoint))
+        presets = tuple(make_preset(mapping, str(checkpoint)) for mapping in record["data"])
+        task = PwvoTask(options, Mixture(presets, options.data_weights))
+    trainer = Trainer(task, Path(folder))
+    trainer.resume()
     card = {
         "updates": trainer.step,
         "samples": trainer.samples,
@@ -260,7 +254,7 @@ def export_run(
         card |= json.loads(read_text(Path(folder) / RUN))
     except (OSError, ValueError) as error:
         raise InputError(f"{folder}: no {RUN} of a training: {error}.") from None
-    task, network = trainer.task, trainer.exported
+    network = trainer.exported
     if calibrate and isinstance(task, PwvoTask):
         main = task.mixture.presets[int(np.argmax(task.options.data_weights))]
         card["calibration"] = calibrate_scales(network, main, calibrate)
