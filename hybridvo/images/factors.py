@@ -304,7 +304,7 @@ class Residuals(NamedTuple):
     """Points of the previous depth map at a motion, metres."""
 
     r: np.ndarray  # (N,) signed distance to the plane, 0 where not seen
-    J: np.ndarray  # (N, 6) its derivative
+    J: np.ndarray  # (6, N) its derivative
     z: np.ndarray  # (N,) depth of the plane, 1 where not seen
     seen: np.ndarray  # (N,) bool, the current depth map has a surface there
     at: np.ndarray  # (N, 2) px, where the point falls in the current image
@@ -362,8 +362,8 @@ class PlaneFactor:
             self._law = nnls(columns[near] * share, lengths[near] * share[:, 0])[0] / mean_length
             usual = self.noise(z)
         _, w = self.weigh(T)
-        scores = (found.J * (w * found.r)[:, None]).T
-        model = positive_inverse((found.J * w[:, None]).T @ found.J)
+        scores = found.J * (w * found.r)
+        model = positive_inverse((found.J * w) @ found.J.T)
         sums, meat = self._tiles.sums(scores), scores @ scores.T
         self._scale = 0.0 if model is None else independent_share(sums, meat, model)
         return self._scale > 0
@@ -387,8 +387,8 @@ class PlaneFactor:
         found, scale = self.residuals(T), self._scale
         robust, information = self.weigh(T)
         cost = 0.5 * CUTOFF**2 * float(self._weight @ (1 - robust))
-        weighted = scale * (found.J * information[:, None]).T
-        return Linearization(weighted @ found.J, -(weighted @ found.r), scale * cost)
+        weighted = found.J * (scale * information)
+        return Linearization(weighted @ found.J.T, -(weighted @ found.r), scale * cost)
 
     def residuals(self, T: np.ndarray) -> Residuals:
         """At a motion; the last one's are kept."""

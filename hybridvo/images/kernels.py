@@ -211,7 +211,7 @@ def point(depth, u, v, K):
 def measure(points, T, depth, K):
     """:class:`hybridvo.images.factors.Residuals` of moved points (N, 3) on a depth map."""
     (height, width), n = depth.shape, len(points)
-    r, J, z = np.zeros(n), np.zeros((n, 6)), np.ones(n)
+    r, J, z = np.zeros(n), np.zeros((6, n)), np.ones(n)
     seen, at = np.zeros(n, np.bool_), np.full((n, 2), -1.0)
     for k in range(n):
         a, b, c = points[k]
@@ -240,7 +240,7 @@ def measure(points, T, depth, K):
         length = max(np.sqrt(nx * nx + ny * ny + nz * nz), 1e-12)
         nx, ny, nz = nx / length, ny / length, nz / length
         r[k] = (X - px) * nx + (Y - py) * ny + (Z - pz) * nz
-        J[k, 0], J[k, 1], J[k, 2] = nx, ny, nz
-        J[k, 3], J[k, 4], J[k, 5] = Y * nz - Z * ny, Z * nx - X * nz, X * ny - Y * nx
+        J[0, k], J[1, k], J[2, k] = nx, ny, nz
+        J[3, k], J[4, k], J[5, k] = Y * nz - Z * ny, Z * nx - X * nz, X * ny - Y * nx
         z[k], seen[k] = pz, True
     return r, J, z, seen, at
